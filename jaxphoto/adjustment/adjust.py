@@ -1,0 +1,108 @@
+"""The adjustment itself: block, start and priors in; unknowns with their normal equations out."""
+
+import time
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxphoto.adjustment.datum import close_datum
+from jaxphoto.adjustment.normal import factor_reduced, reduce_normal
+from jaxphoto.adjustment.optimum import Optimum, column_scale, find_optimum, linearise, unit_scale, zero_increments
+from jaxphoto.adjustment.rank import check_rank
+from jaxphoto.adjustment.residuals import Increments, Residuals, State, Values, state_at
+from jaxphoto.adjustment.result import Adjustment, Factored
+from jaxphoto.adjustment.structure import Structure, structure_of
+from jaxphoto.adjustment.values import at_state, unknowns_of, values_of, with_datum
+from jaxphoto.block import Block
+from jaxphoto.unknowns import Unknowns
+
+MAX_STEPS = 100
+
+
+def solve(block: Block, start: Unknowns, priors: Unknowns, max_steps: int = MAX_STEPS) -> Adjustment:
+    """Least-squares adjustment of `block` from `start`, with what `priors` leaves free.
+
+    A pure function of the numbers in its arguments: `jax.grad`, `jax.jvp` and `jax.vmap` go through it (by the implicit
+    function theorem, exactly), as long as ids and index arrays stay concrete. `start` needs all images and points;
+    `jaxphoto.adjust` finds what is missing first.
+
+    Raises DatumError where the observations leave the datum open and no constraint closes it, RankError where they
+    cannot tell unknowns apart.
+    """
+    structure = structure_of(block, priors)
+    values = values_of(block, start, priors, structure)
+    open_motions, constraints = close_datum(block, concrete(values), structure)
+    values = with_datum(values, constraints.eop, constraints.points)
+    seconds: dict[str, float] = {}
+    motions = (jnp.asarray(open_motions.eop), jnp.asarray(open_motions.points))
+    arguments = (values, structure, max_steps)
+    optimum, state = _run(_optimise, arguments, seconds, "solve")
+    square_sum, residuals, factored = _run(_finish, (values, state, structure, motions), seconds, "covariance")
+    adjusted = Adjustment(
+        block=block,
+        priors=priors,
+        unknowns=unknowns_of(state, start, structure),
+        residuals=residuals,
+        values=at_state(values, state),
+        structure=structure,
+        factored=factored,
+        square_sum=square_sum,
+        steps=optimum.steps,
+        converged=optimum.converged,
+        seconds=seconds,
+    )
+    if not isinstance(square_sum, jax.core.Tracer):
+        check_rank(adjusted)
+    return adjusted
+
+
+@eqx.filter_jit
+def _optimise(values: Values, structure: Structure, max_steps: int) -> tuple[Optimum, State]:
+    optimum = find_optimum(values, structure=structure, max_steps=max_steps)
+    return optimum, state_at(optimum.increments, unit_scale(structure), values, structure)
+
+
+@eqx.filter_jit
+def _finish(
+    values: Values, state: State, structure: Structure, motions: tuple[jax.Array, jax.Array]
+) -> tuple[jax.Array, Residuals, Factored]:
+    """Residuals and the factored, undamped normal equations at the optimum."""
+    values, zero, unit = at_state(values, state), zero_increments(structure), unit_scale(structure)
+    first, residuals = linearise(zero, unit, values, structure)
+    scale = column_scale(first)
+    normal, _ = linearise(zero, scale, values, structure)
+    reduced = reduce_normal(normal, 0.0, structure)
+    inverse = jax.tree.map(lambda k: jnp.where(k > 0, 1 / jnp.where(k > 0, k, 1.0), 0.0), scale)
+    scaled = Increments(
+        motions[0] * inverse.eop, jnp.zeros((len(motions[0]), structure.n_shared)), motions[1] * inverse.points
+    )
+    observed = [v for name, v in residuals._asdict().items() if name != "datum"]
+    square_sum = sum(jnp.sum(v**2) for v in observed)
+    return square_sum, residuals, Factored(normal, reduced, factor_reduced(reduced), scale, scaled)
+
+
+def concrete(tree: Values) -> Values:
+    """The same values with zeros for what is being traced: the datum depends on no observed value."""
+    return jax.tree.map(lambda v: np.zeros(v.shape) if isinstance(v, jax.core.Tracer) else np.asarray(v), tree)
+
+
+_compiled: dict[object, object] = {}
+
+
+def _run(function, arguments, seconds: dict[str, float], name: str):
+    """Call a compiled function, compiling it first and apart, so that `seconds` tells the two times."""
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(arguments)):
+        return function(*arguments)
+    began = time.perf_counter()
+    dynamic, static = eqx.partition(arguments, eqx.is_array)
+    shapes = tuple((v.shape, v.dtype) for v in jax.tree.leaves(dynamic))
+    key = (function, shapes, jax.tree.structure(dynamic), tuple(jax.tree.leaves(static)), jax.tree.structure(static))
+    if key not in _compiled:
+        _compiled[key] = function.lower(*arguments).compile()
+    ready = time.perf_counter()
+    out = jax.block_until_ready(_compiled[key](*arguments))
+    seconds["compile"] = seconds.get("compile", 0.0) + ready - began
+    seconds[name] = time.perf_counter() - ready
+    return out

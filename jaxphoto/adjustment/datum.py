@@ -1,0 +1,239 @@
+"""The datum: what position, orientation and scale observations leave open, and the constraints that close it.
+
+The seven parameters of a similarity (3 shifts, 3 rotations, scale) move images and points together without
+changing any image coordinate. Only control, stations, attitudes, distances and fixed unknowns see them, perhaps
+together with a free shift or lever arm. What none sees is the datum defect; inner or minimal constraints fill it.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxphoto.adjustment.residuals import State, Values, georeferencing_residuals
+from jaxphoto.adjustment.structure import Structure
+from jaxphoto.block import Block
+from jaxphoto.errors import DatumError
+from jaxphoto.rotation import small_angles, small_rotation
+
+MOTIONS = ("shift in X", "shift in Y", "shift in Z", "rotation about X", "rotation about Y", "rotation about Z", "scale")
+# Singular values of the unit-column sensitivity below this are zero.
+_OPEN = 1e-9
+
+
+class Motions(NamedTuple):
+    """How each increment moves under the seven motions (about the centroid, shifts in units of the block's size)."""
+
+    eop: Float[np.ndarray, "7 6 images"]
+    points: Float[np.ndarray, "7 3 points"]
+
+
+def close_datum(block: Block, values: Values, structure: Structure) -> tuple[Motions, Motions]:
+    """The motions that the observations leave open, and the constraints that close them (leading axis: defect).
+
+    Raises DatumError where the block's datum is open and its kind
+    "control", or where the constraints asked for cannot close it.
+    """
+    if _plainly_closed(block, values, structure):
+        none = Motions(np.zeros((0, 6, structure.n_images)), np.zeros((0, 3, structure.n_points)))
+        return none, none
+    motions, centre, size = _motions(values)
+    sensitivity, named = _datum_sensitivity(values, structure, motions, centre, size)
+    open_motions = _null_motions(sensitivity)
+    null = _combine(motions, open_motions)
+    kind, over = block.datum.kind, block.datum.over
+    if kind == "control":
+        if len(open_motions):
+            raise DatumError(_sentence(open_motions, block, named))
+        return null, null
+    if block.datum.scale is not None:
+        scale_open = bool(len(open_motions)) and bool(np.abs(open_motions[:, 6]).max() > 1e-6)
+        if scale_open != block.datum.scale:
+            raise DatumError(
+                "[datum] scale = false, but nothing in the block gives it a scale: add a distance, stations or control, "
+                "or set scale = true"
+                if scale_open
+                else "[datum] scale = true, but distances, stations or control already give the scale: set scale = false"
+            )
+    if kind == "minimal":
+        constraints = _minimal(null, values, structure)
+    else:
+        constraints = _inner(null, block, over)
+    product = np.einsum("kci,jci->kj", constraints.eop, null.eop) + np.einsum(
+        "kcp,jcp->kj", constraints.points, null.points
+    )
+    if len(open_motions) and np.linalg.svd(product, compute_uv=False)[-1] < 1e-9 * np.abs(product).max():
+        raise DatumError(
+            f'[datum] over = "{over}" cannot fix the datum (they lie on a line or in a point): constrain over all points'
+        )
+    return null, constraints
+
+
+def _plainly_closed(block: Block, values: Values, structure: Structure) -> bool:
+    """Three full control points (or stations without free mounts and strips) that do not lie on a line will do."""
+    seen = np.zeros((3, structure.n_points))
+    seen[structure.control_axis, structure.control_point] = 1
+    seen[structure.point_free == 0] = 1
+    sets = [np.asarray(values.points)[:, seen.all(0)]]
+    if not any(k >= structure.mount_offset for k in structure.free):
+        stations = np.zeros((3, structure.n_images))
+        stations[structure.station_axis, structure.station_image] = 1
+        sets.append(np.asarray(values.position)[:, stations.all(0)])
+    for places in sets:
+        if places.shape[1] >= 3:
+            spread = np.linalg.svd(places - places.mean(1, keepdims=True), compute_uv=False)
+            if spread[1] > 1e-6 * spread[0]:
+                return True
+    return False
+
+
+def similarity(
+    parameters: Float[Array, "7"], position: Float[Array, "3"], rotation: Float[Array, "3 3"], centre, size
+) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
+    """An image moved by a similarity about `centre`: shifts and scale in units of `size`, rotations in rad."""
+    turn = small_rotation(parameters[3:6])
+    moved = centre + size * parameters[:3] + (1 + parameters[6]) * turn @ (position - centre)
+    return moved, rotation @ turn.T
+
+
+@jax.jit
+def _motions_of(position, rotation, points, centre, size):
+    zero, seeds = jnp.zeros(7), jnp.eye(7)
+
+    def image(p, position, rotation):
+        moved, turned = similarity(p, position, rotation, centre, size)
+        return jnp.concatenate([moved, small_angles(turned @ rotation.T)])
+
+    def derivative(fn):
+        return jax.vmap(lambda seed: jax.jvp(fn, (zero,), (seed,))[1])(seeds)
+
+    eop = jax.vmap(lambda x, r: derivative(lambda p: image(p, x, r)), in_axes=(1, 2), out_axes=2)(position, rotation)
+    still = jnp.eye(3)
+    moved = lambda x: derivative(lambda p: similarity(p, x, still, centre, size)[0])  # noqa: E731
+    return eop, jax.vmap(moved, in_axes=1, out_axes=2)(points)
+
+
+def _motions(values: Values) -> tuple[Motions, np.ndarray, float]:
+    points = np.asarray(values.points)
+    centre = points.mean(axis=1)
+    size = float(np.sqrt(((points - centre[:, None]) ** 2).sum(0).mean())) or 1.0
+    eop, pts = _motions_of(values.position, values.rotation, values.points, centre, size)
+    return Motions(np.asarray(eop), np.asarray(pts)), centre, size
+
+
+def _datum_sensitivity(values: Values, structure: Structure, motions: Motions, centre, size):
+    """d(datum rows / sigma) / d(seven motions, free mount and strip unknowns), and the names of the latter."""
+    shared = [j for j, k in enumerate(structure.free) if k >= structure.mount_offset and j not in structure.weighted]
+    if len(values.stations) + values.attitudes.shape[1] + len(values.distances) == 0:
+        # Control alone: nothing to differentiate, its rows are the motions of its points.
+        rows = motions.points[:, structure.control_axis, structure.control_point].T / np.asarray(values.sigma_control)[:, None]
+    else:
+        rows = np.asarray(_georeferencing_sensitivity(values, structure, np.array(shared, int), centre, size))
+    fixed_p = np.argwhere(structure.point_free.T == 0)
+    fixed_e = np.argwhere(structure.eop_free.T == 0)
+    held = np.concatenate(
+        [motions.points[:, fixed_p[:, 1], fixed_p[:, 0]].T, motions.eop[:, fixed_e[:, 1], fixed_e[:, 0]].T]
+    )
+    held = np.concatenate([held, np.zeros((len(held), rows.shape[1] - 7))], axis=1)
+    weight = 1 / np.asarray(values.sigma_control).min(initial=0.01)
+    return np.concatenate([rows, held * weight]), [structure.labels[j] for j in shared]
+
+
+@jax.jit
+def _georeferencing_sensitivity(values: Values, structure: Structure, shared, centre, size):
+    def rows(parameters, moved):
+        image = lambda x, r: similarity(parameters, x, r, centre, size)  # noqa: E731
+        position, rotation = jax.vmap(image, in_axes=(1, 2), out_axes=(1, 2))(values.position, values.rotation)
+        points = jax.vmap(lambda x: similarity(parameters, x, jnp.eye(3), centre, size)[0], 1, 1)(values.points)
+        vector = values.shared.at[structure.free[shared]].add(moved)
+        v = values
+        stations, attitudes, control, distances = georeferencing_residuals(
+            State(position, rotation, vector, points), v, structure
+        )
+        return jnp.concatenate(
+            [
+                stations / v.sigma_stations,
+                (attitudes / v.sigma_attitudes).ravel(),
+                control / v.sigma_control,
+                distances / v.sigma_distances,
+            ]
+        )
+
+    by_motion, by_shared = jax.jacfwd(rows, argnums=(0, 1))(jnp.zeros(7), jnp.zeros(len(shared)))
+    return jnp.concatenate([by_motion, by_shared], axis=1)
+
+
+def _null_motions(sensitivity: np.ndarray) -> np.ndarray:
+    """Combinations of the seven motions that no row sees, orthonormal; free shared unknowns may go along."""
+    if not len(sensitivity):
+        return np.eye(7)
+    norm = np.sqrt((sensitivity**2).sum(0))
+    columns = sensitivity / np.where(norm > 0, norm, 1.0)
+    _, s, vt = np.linalg.svd(columns, full_matrices=True)
+    rank = int((s > _OPEN * max(s.max(initial=0.0), 1e-300)).sum())
+    null = (vt[rank:] / np.where(norm > 0, norm, 1.0))[:, :7]
+    _, s2, basis = np.linalg.svd(null / max(np.abs(null).max(initial=0.0), 1e-300), full_matrices=False)
+    return basis[s2 > 1e-9]
+
+
+def _combine(motions: Motions, combinations: np.ndarray) -> Motions:
+    return Motions(
+        np.einsum("km,mci->kci", combinations, motions.eop), np.einsum("km,mcp->kcp", combinations, motions.points)
+    )
+
+
+def _inner(null: Motions, block: Block, over) -> Motions:
+    """Inner constraints: the open motions themselves, restricted to the positions or points they are taken over."""
+    if over == "images":
+        eop = null.eop.copy()
+        eop[:, 3:] = 0.0
+        return _orthonormal(Motions(eop, np.zeros_like(null.points)))
+    chosen = np.ones(len(block.points)) if over == "points" else np.isin(block.points, over).astype(float)
+    return _orthonormal(Motions(np.zeros_like(null.eop), null.points * chosen))
+
+
+def _orthonormal(rows: Motions) -> Motions:
+    k = len(rows.eop)
+    flat = np.concatenate([rows.eop.reshape(k, -1), rows.points.reshape(k, -1)], axis=1)
+    q = np.linalg.qr(flat.T)[0].T
+    split = rows.eop[0].size if k else 0
+    return Motions(q[:, :split].reshape(rows.eop.shape), q[:, split:].reshape(rows.points.shape))
+
+
+def _minimal(null: Motions, values: Values, structure: Structure) -> Motions:
+    """As few point coordinates as the defect asks for, chosen by pivoting so that they fix it best."""
+    k = len(null.points)
+    flat = null.points.transpose(0, 2, 1).reshape(k, -1) * structure.point_free.T.reshape(-1)
+    rows = np.zeros_like(flat)
+    left = flat.copy()
+    for row in rows:
+        best = int(np.argmax((left**2).sum(0)))
+        row[best] = 1.0
+        direction = left[:, best] / max(np.sqrt((left[:, best] ** 2).sum()), 1e-300)
+        left -= np.outer(direction, direction @ left)
+    points = rows.reshape(k, structure.n_points, 3).transpose(0, 2, 1)
+    return Motions(np.zeros_like(null.eop), points)
+
+
+def _sentence(open_motions: np.ndarray, block: Block, named: list[str]) -> str:
+    shares = np.sqrt((open_motions**2).sum(0))
+    names = [m for m, share in zip(MOTIONS, shares, strict=True) if share > 0.05]
+    observed = [
+        f"{n} {what}"
+        for n, what in (
+            (len(block.control.who) + len(block.fixed.who), "control coordinates"),
+            (len(block.stations.who), "station coordinates"),
+            (3 * len(block.attitudes.image), "attitude angles"),
+            (len(block.distances.value), "distances"),
+        )
+        if n
+    ]
+    mends = "add control points or camera stations, or set [datum] kind = \"inner\" (or \"minimal\") in block.toml"
+    if named:
+        mends = "add control points, or fix " + ", ".join(named[:3]) + (" ..." if len(named) > 3 else "")
+    return (
+        f"the datum of the block has a defect of {len(open_motions)}: {', '.join(names)} cannot be determined from "
+        f"{' and '.join(observed) if observed else 'image coordinates alone'}; {mends}"
+    )

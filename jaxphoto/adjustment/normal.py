@@ -1,0 +1,224 @@
+"""Normal equations with the points eliminated: sums, reduction, solution, inverse.
+
+In scaled increments, with e the exterior orientations, s the shared unknowns and p the points,
+
+        [ U    Us   W  ] [e]   [b_e]
+    N = [ Us'  Uss  Ws'] [s] = [b_s]        V block-diagonal (3 x 3 a point), W 6 x 3 a (image, point) that met
+        [ W'   Ws   V  ] [p]   [b_p]
+
+Few rows couple many points: distances and the constraints of the datum, D. They are carried as extra unknowns
+mu = D x - d with the block -I, so V stays block-diagonal. With V = L L', Y = W L^-T, Ys = L^-1 Ws, Yd = L^-1 D':
+
+    S   = [U Us; Us' Uss] - [Y; Ys'] [Y; Ys']'        the reduced normal matrix
+    g   = D_e' - Y Yd,   K = I + Yd' Yd               the coupling of mu
+    A   = S + g K^-1 g'                               positive definite where the datum is fixed
+
+Once a block: the lists of `Structure`. Once an iterate: the sums (`sum_normal`). Once a damping: `reduce_normal`
+and `factor_reduced`. Once a right-hand side: `solve_factored`.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxphoto.adjustment.colouring import Jacobian
+from jaxphoto.adjustment.residuals import Increments, Residuals
+from jaxphoto.adjustment.structure import Structure
+
+
+class Normal(NamedTuple):
+    """The undamped sums; see the module's head. `rows_*` are D and d."""
+
+    u: Float[Array, "images 6 6"]
+    us: Float[Array, "images 6 shared"]
+    uss: Float[Array, "shared shared"]
+    v: Float[Array, "3 3 points"]
+    w: Float[Array, "6 3 rows"]
+    ws: Float[Array, "shared 3 points"]
+    b_e: Float[Array, "images 6"]
+    b_s: Float[Array, "shared"]
+    b_p: Float[Array, "3 points"]
+    rows_e: Float[Array, "constraints images 6"]
+    rows_p: Float[Array, "constraints 3 points"]
+    rows_b: Float[Array, "constraints"]
+
+
+class Reduced(NamedTuple):
+    """The reduced normal matrix and what takes vectors down to it and back to the points."""
+
+    a: Float[Array, "reduced reduced"]
+    """Lower triangle of A (the upper is not filled)."""
+    g: Float[Array, "reduced constraints"]
+    k: Float[Array, "constraints constraints"]
+    l: Float[Array, "6 points"]  # noqa: E741
+    """Cholesky factors of V: l11, l21, l22, l31, l32, l33."""
+
+
+def sum_normal(
+    jacobian: Jacobian, residuals: Residuals, datum: tuple[Array, Array], structure: Structure
+) -> Normal:
+    """The sums of N x = b from Jacobian blocks and residuals (so b = J' r); `datum` is D over images and points."""
+    s, j, r = structure, jacobian, residuals
+    q = s.n_colours
+    pad = jnp.zeros((q - s.n_image_colours, 2, len(s.image)))
+    image_rows = jnp.concatenate([j.image_eop, j.image_shared, pad, r.image[None]])
+    station_rows = jnp.concatenate([j.station_eop, j.station_shared, r.stations[None]])[:, None]
+    attitude_rows = jnp.concatenate([j.attitude_eop, j.attitude_shared, r.attitudes[None]])
+    m = (
+        _products(image_rows, s.image, s.n_images)
+        + _products(station_rows, s.station_image, s.n_images)
+        + _products(attitude_rows, s.attitude_image, s.n_images)
+    )
+    us, uss, b_s = _shared_sums(m, s)
+    uss = uss.at[s.weighted, s.weighted].add(j.priors**2)
+    b_s = b_s.at[s.weighted].add(j.priors * r.priors)
+
+    point_rows = jnp.concatenate([j.image_point, r.image[None]])
+    vp = _products(point_rows, s.point, s.n_points, is_sorted=True)
+    vp = vp + _products(jnp.concatenate([j.control, r.control[None]])[:, None], s.control_point, s.n_points)
+    vp = vp.transpose(1, 2, 0)
+    ws = _shared_point_sums(jnp.einsum("qon,bon->nqb", j.image_shared, j.image_point), s)
+
+    each = jnp.arange(len(s.distance_points))
+    spans = jnp.zeros((len(s.distance_points), 3, s.n_points))
+    for end in range(2):
+        spans = spans.at[each, :, s.distance_points[:, end]].add(j.distances[end].T)
+    datum_e = datum[0].transpose(0, 2, 1)
+    return Normal(
+        u=m[:, :6, :6],
+        us=us,
+        uss=uss,
+        v=vp[:3, :3],
+        w=jnp.einsum("aon,bon->abn", j.image_eop, j.image_point),
+        ws=ws,
+        b_e=m[:, :6, -1],
+        b_s=b_s,
+        b_p=vp[:3, 3],
+        rows_e=jnp.concatenate([jnp.zeros((len(each), *datum_e.shape[1:])), datum_e]),
+        rows_p=jnp.concatenate([spans, datum[1]]),
+        rows_b=jnp.concatenate([r.distances, r.datum]),
+    )
+
+
+def reduce_normal(normal: Normal, damping, structure: Structure) -> Reduced:
+    """Eliminate the points of N + damping I. Unknowns held fixed (zero columns) get a unit diagonal."""
+    n, s = normal, structure
+    v = n.v + (damping + jnp.where(jnp.einsum("iip->ip", n.v) == 0, 1.0, 0.0))[:, None] * jnp.eye(3)[:, :, None]
+    u = n.u + (damping + jnp.where(jnp.einsum("nii->ni", n.u) == 0, 1.0, 0.0))[:, :, None] * jnp.eye(6)
+    uss = n.uss + damping * jnp.eye(s.n_shared)
+    l = _cholesky_3x3(v)  # noqa: E741
+    y = _whiten(n.w, l[:, s.point])
+    ys, yd = _whiten(n.ws, l), _whiten(n.rows_p, l)
+
+    rows = y.transpose(2, 0, 1)
+    product = jnp.einsum("nak,nbk->nab", rows[s.pair_a], rows[s.pair_b])
+    blocks = -jax.ops.segment_sum(
+        product.reshape(-1, 36), s.pair_block, len(s.block_row), indices_are_sorted=True
+    ).reshape(-1, 6, 6)
+    see = jnp.zeros((s.n_images, 6, s.n_images, 6))
+    see = see.at[s.block_row, :, s.block_column, :].set(blocks, unique_indices=True)
+    each = jnp.arange(s.n_images)
+    see = see.at[each, :, each, :].add(u, unique_indices=True)
+
+    # What meets an image through its points: shared unknowns and mu.
+    across = jnp.concatenate([ys, yd])
+    met = jax.ops.segment_sum(
+        jnp.einsum("akn,ckn->nac", y, across[:, :, s.point]).reshape(len(s.point), -1), s.image, s.n_images
+    ).reshape(s.n_images, 6, -1)
+    flat = across.reshape(len(across), -1)
+    own = flat @ flat.T
+    q, k, size = s.n_shared, len(yd), 6 * s.n_images
+    se = (n.us - met[:, :, :q]).reshape(size, q)
+    a = jnp.block([[see.reshape(size, size), jnp.zeros((size, q))], [se.T, uss - own[:q, :q]]])
+    ge = n.rows_e.transpose(1, 2, 0) - met[:, :, q:]
+    g = jnp.concatenate([ge.reshape(size, k), -own[:q, q:]])
+    kk = jnp.eye(k) + own[q:, q:]
+    if k:
+        a = a + g @ jnp.linalg.solve(kk, g.T)
+    return Reduced(a, g, kk, l)
+
+
+def factor_reduced(reduced: Reduced) -> Float[Array, "reduced reduced"]:
+    """Lower Cholesky factor of A; NaN where A is not positive definite."""
+    return jax.lax.linalg.cholesky(reduced.a, symmetrize_input=False)
+
+
+def solve_factored(
+    normal: Normal, reduced: Reduced, lower: Float[Array, "reduced reduced"], structure: Structure
+) -> Increments:
+    """x of (N + damping I) x = b for the right-hand side in `normal`: down to the reduced unknowns, and back."""
+    n, r, s = normal, reduced, structure
+    z = solve_3x3(r.l, n.b_p)
+    down = jnp.einsum("akn,kn->na", n.w, z[:, s.point])
+    b_e = n.b_e - jax.ops.segment_sum(down, s.image, s.n_images)
+    b = jnp.concatenate([b_e.reshape(-1), n.b_s - jnp.einsum("qkp,kp->q", n.ws, z)])
+    d = n.rows_b - jnp.einsum("ckp,kp->c", n.rows_p, z)
+    if len(d):
+        b = b + r.g @ jnp.linalg.solve(r.k, d)
+    x = jax.scipy.linalg.cho_solve((lower, True), b)
+
+    e, sh = x[: 6 * s.n_images].reshape(s.n_images, 6).T, x[6 * s.n_images :]
+    seen = jnp.einsum("akn,an->nk", n.w, e[:, s.image])
+    b_p = n.b_p - jax.ops.segment_sum(seen, s.point, s.n_points, indices_are_sorted=True).T
+    b_p = b_p - jnp.einsum("qkp,q->kp", n.ws, sh)
+    if len(d):
+        b_p = b_p - jnp.einsum("ckp,c->kp", n.rows_p, jnp.linalg.solve(r.k, r.g.T @ x - d))
+    return Increments(e, sh, solve_3x3(r.l, b_p))
+
+
+def solve_3x3(l: Float[Array, "6 points"], b: Float[Array, "3 points"]) -> Float[Array, "3 points"]:  # noqa: E741
+    """V^-1 b from the Cholesky factors of V."""
+    l11, l21, l22, l31, l32, l33 = l
+    y1, y2, y3 = _whiten(b[None], l)[0]
+    x3 = y3 / l33
+    x2 = (y2 - l32 * x3) / l22
+    return jnp.stack([(y1 - l21 * x2 - l31 * x3) / l11, x2, x3])
+
+
+def _products(rows: Float[Array, "m c n"], owner, n_owners: int, is_sorted: bool = False):
+    """Sum over rows and components of the outer products of `rows`, by owner: (owners, m, m)."""
+    product = jnp.einsum("aon,bon->nab", rows, rows)
+    m = len(rows)
+    sums = jax.ops.segment_sum(product.reshape(-1, m * m), owner, n_owners, indices_are_sorted=is_sorted)
+    return sums.reshape(n_owners, m, m)
+
+
+def _shared_sums(m: Float[Array, "images m m"], s: Structure):
+    """Per-image sums by colour, brought to the columns of the shared unknowns (a dummy column is cut off)."""
+    q, n = s.n_colours, s.n_shared
+    each = jnp.arange(s.n_images)
+    us = jnp.zeros((s.n_images, 6, n + 1)).at[each[:, None], :, s.column].add(m[:, :6, 6 : 6 + q].transpose(0, 2, 1))
+    uss = jnp.zeros((n + 1, n + 1)).at[s.column[:, :, None], s.column[:, None, :]].add(m[:, 6 : 6 + q, 6 : 6 + q])
+    b_s = jnp.zeros(n + 1).at[s.column].add(m[:, 6 : 6 + q, -1])
+    return us[:, :, :n], uss[:n, :n], b_s[:n]
+
+
+def _shared_point_sums(product: Float[Array, "rows colours 3"], s: Structure) -> Float[Array, "shared 3 points"]:
+    q, n = s.n_image_colours, s.n_shared
+    if len(s.groups) == 1 and len(s.groups[0].names) == 1:
+        # One camera: a colour means the same unknown in every image, so a sorted sum over points will do.
+        sums = jax.ops.segment_sum(product.reshape(-1, 3 * q), s.point, s.n_points, indices_are_sorted=True)
+        sums = sums.reshape(s.n_points, q, 3).transpose(1, 2, 0)
+        return jnp.concatenate([sums, jnp.zeros((n - q, 3, s.n_points))])
+    columns = s.column[s.image][:, :q]
+    sums = jnp.zeros((n + 1, s.n_points, 3)).at[columns, s.point[:, None]].add(product)
+    return sums[:n].transpose(0, 2, 1)
+
+
+def _cholesky_3x3(v: Float[Array, "3 3 points"]) -> Float[Array, "6 points"]:
+    """Closed form: LAPACK on a batch of 3 x 3 matrices is many times slower."""
+    l11 = jnp.sqrt(v[0, 0])
+    l21, l31 = v[1, 0] / l11, v[2, 0] / l11
+    l22 = jnp.sqrt(v[1, 1] - l21**2)
+    l32 = (v[2, 1] - l31 * l21) / l22
+    return jnp.stack([l11, l21, l22, l31, l32, jnp.sqrt(v[2, 2] - l31**2 - l32**2)])
+
+
+def _whiten(w: Float[Array, "m 3 n"], l: Float[Array, "6 n"]) -> Float[Array, "m 3 n"]:  # noqa: E741
+    """w L^-T for each of n factors."""
+    l11, l21, l22, l31, l32, l33 = l
+    y1 = w[:, 0] / l11
+    y2 = (w[:, 1] - y1 * l21) / l22
+    return jnp.stack([y1, y2, (w[:, 2] - y1 * l31 - y2 * l32) / l33], axis=1)

@@ -1,0 +1,33 @@
+"""Rank: unknowns that the observations cannot tell apart, named."""
+
+import numpy as np
+
+from jaxphoto.adjustment.result import Adjustment
+from jaxphoto.errors import RankError
+
+# A pivot of the unit-diagonal reduced matrix below this is a rank defect: at float64 it is rounding, not geometry.
+_DEFECT = 1e-13
+
+
+def check_rank(adjusted: Adjustment) -> None:
+    """Raise RankError where the normal matrix at the optimum is singular; the message names the unknowns."""
+    if not bool(adjusted.converged):
+        return
+    s = adjusted.structure
+    lower = np.asarray(adjusted.factored.lower)
+    a = np.asarray(adjusted.factored.reduced.a)
+    diagonal = np.diagonal(a)
+    pivots = np.diagonal(lower) ** 2 / np.where(diagonal > 0, diagonal, 1.0)
+    if len(pivots) == 0 or pivots.min() > _DEFECT:
+        return
+    full = np.tril(a) + np.tril(a, -1).T
+    d = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+    weakest, vectors = np.linalg.eigh(full * d[:, None] * d[None, :])
+    null = np.abs(vectors[:, 0])
+    names = [f"exterior[{i}].{n}" for i in adjusted.block.images for n in ("X", "Y", "Z", "rx", "ry", "rz")]
+    names += list(s.labels)
+    worst = [names[k] for k in np.argsort(-null, kind="stable")[:6] if null[k] > 0.05]
+    raise RankError(
+        f"the observations cannot tell these unknowns apart: {', '.join(worst)}; hold one of them fixed, or give it a "
+        f"weight, or add observations that see it (smallest eigenvalue of the scaled normal matrix {weakest[0]:.1e})"
+    )

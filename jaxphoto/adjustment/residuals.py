@@ -1,0 +1,166 @@
+"""Residuals of a block: every observation, divided by its standard deviation, as a function of increments.
+
+Increments are scaled and small: `unknown = start (+) scale * increment`, rotations by a small rotation in the
+camera frame. Arrays are batch-last (components first, rows last), which XLA vectorises best on a CPU.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxphoto.adjustment.structure import Structure, interior_of
+from jaxphoto.collinearity import ExteriorOrientation, image_residual
+from jaxphoto.georeferencing import Mount, StripBias, attitude_residual, sensor_position
+from jaxphoto.rotation import matrix_from_roll_pitch_yaw, small_rotation
+
+
+class Increments(NamedTuple):
+    """Scaled changes of the unknowns since the start: what the solver iterates on."""
+
+    eop: Float[Array, "6 images"]
+    shared: Float[Array, "shared"]
+    points: Float[Array, "3 points"]
+
+
+class Residuals(NamedTuple):
+    """Observed minus computed over sigma, by group. `datum` holds the constraints that observations leave open."""
+
+    image: Float[Array, "2 rows"]
+    stations: Float[Array, "stations"]
+    attitudes: Float[Array, "3 attitudes"]
+    control: Float[Array, "control"]
+    distances: Float[Array, "distances"]
+    priors: Float[Array, "weighted"]
+    datum: Float[Array, "constraints"]
+
+
+class Values(eqx.Module):
+    """The numbers of an adjustment, batch-last: observations, sigmas, start, and constraint rows of the datum."""
+
+    xy: Float[Array, "2 rows"]
+    sigma_xy: Float[Array, "2 rows"]
+    stations: Float[Array, "stations"]
+    sigma_stations: Float[Array, "stations"]
+    time: Float[Array, "images"]
+    attitudes: Float[Array, "3 attitudes"]
+    sigma_attitudes: Float[Array, "3 attitudes"]
+    control: Float[Array, "control"]
+    sigma_control: Float[Array, "control"]
+    distances: Float[Array, "distances"]
+    sigma_distances: Float[Array, "distances"]
+    priors: Float[Array, "weighted"]
+    sigma_priors: Float[Array, "weighted"]
+    position: Float[Array, "3 images"]
+    rotation: Float[Array, "3 3 images"]
+    shared: Float[Array, "parameters"]
+    points: Float[Array, "3 points"]
+    datum_eop: Float[Array, "constraints 6 images"]
+    datum_points: Float[Array, "constraints 3 points"]
+
+
+class State(NamedTuple):
+    """The unknowns themselves, batch-last."""
+
+    position: Float[Array, "3 images"]
+    rotation: Float[Array, "3 3 images"]
+    shared: Float[Array, "parameters"]
+    points: Float[Array, "3 points"]
+
+
+def state_at(increments: Increments, scale: Increments, values: Values, structure: Structure) -> State:
+    """Start values moved by scaled increments; what is fixed does not move."""
+    eop = increments.eop * scale.eop
+    turn = jax.vmap(small_rotation, in_axes=-1, out_axes=-1)(eop[3:])
+    rotation = jnp.stack([jnp.stack([jnp.sum(turn[i] * values.rotation[:, j], 0) for j in range(3)]) for i in range(3)])
+    return State(
+        values.position + eop[:3],
+        rotation,
+        values.shared.at[structure.free].add(increments.shared * scale.shared, unique_indices=True),
+        values.points + increments.points * scale.points,
+    )
+
+
+def residuals_at(
+    increments: Increments, scale: Increments, values: Values, structure: Structure
+) -> Residuals:
+    """All residuals over their sigmas, at start + scale * increments."""
+    state = state_at(increments, scale, values, structure)
+    stations, attitudes, control, distances = georeferencing_residuals(state, values, structure)
+    datum = jnp.einsum("kci,ci->k", values.datum_eop * scale.eop, increments.eop)
+    datum += jnp.einsum("kcp,cp->k", values.datum_points * scale.points, increments.points)
+    priors = (values.priors - state.shared[structure.free[structure.weighted]]) / values.sigma_priors
+    return Residuals(
+        image_residuals(state, values, structure) / values.sigma_xy,
+        stations / values.sigma_stations,
+        attitudes / values.sigma_attitudes,
+        control / values.sigma_control,
+        distances / values.sigma_distances,
+        priors,
+        datum,
+    )
+
+
+def image_residuals(state: State, values: Values, structure: Structure) -> Float[Array, "2 rows"]:
+    """Collinearity residuals in mm, one group of cameras at a time."""
+    parts = []
+    for group in structure.groups:
+        pick = (lambda a: a) if group.rows is None else (lambda a, rows=group.rows: a[..., rows])
+        n, m = len(group.names), group.treedef.num_leaves
+        table = state.shared[group.offset : group.offset + n * m].reshape(n, m)
+        columns, axis = (list(table[0]), None) if n == 1 else (list(table[group.camera].T), -1)
+
+        def one(parameters, position, rotation, point, xy, group=group):
+            exterior = ExteriorOrientation(position, rotation)
+            return image_residual(interior_of(group, parameters), exterior, point, xy)
+
+        image, point = pick(structure.image), pick(structure.point)
+        parts.append(
+            jax.vmap(one, in_axes=(axis, -1, -1, -1, -1), out_axes=-1)(
+                columns,
+                state.position[:, image],
+                state.rotation[:, :, image],
+                state.points[:, point],
+                pick(values.xy),
+            )
+        )
+    joined = jnp.concatenate(parts, axis=1) if len(parts) > 1 else parts[0]
+    return joined if structure.unsort is None else joined[:, structure.unsort]
+
+
+def georeferencing_residuals(state: State, values: Values, structure: Structure) -> tuple[Array, ...]:
+    """Residuals of stations (m), attitudes (rad), control (m) and distances (m), not divided by their sigmas."""
+    mounts, strips = _mounts(state, structure)
+
+    def station(image, axis, observed):
+        rotation = state.rotation[:, :, image]
+        mount, strip = jax.tree.map(lambda v: v[:, image], (mounts, strips))
+        computed = sensor_position(state.position[:, image], rotation, mount, strip, values.time[image])
+        return observed - computed[axis]
+
+    def attitude(image, observed):
+        matrix = matrix_from_roll_pitch_yaw(observed)
+        return attitude_residual(matrix, state.rotation[:, :, image], mounts.boresight[:, image])
+
+    stations = jax.vmap(station)(structure.station_image, structure.station_axis, values.stations)
+    attitudes = jax.vmap(attitude, in_axes=(0, -1), out_axes=-1)(structure.attitude_image, values.attitudes)
+    control = values.control - state.points[structure.control_axis, structure.control_point]
+    a, b = structure.distance_points.T
+    length = jnp.sqrt(jnp.sum((state.points[:, a] - state.points[:, b]) ** 2, axis=0))
+    return stations, attitudes, control, values.distances - length
+
+
+def _mounts(state: State, structure: Structure) -> tuple[Mount, StripBias]:
+    """Mount and strip bias of every image (3, images); zeros where the block has none."""
+
+    def table(start: int, stop: int, index) -> tuple[Array, Array]:
+        # The last row, of zeros, serves images that have no mount or strip of their own.
+        rows = jnp.concatenate([state.shared[start:stop].reshape(-1, 6), jnp.zeros((1, 6))])[index].T
+        return rows[:3], rows[3:]
+
+    end = state.shared.shape[0]
+    arm, boresight = table(structure.mount_offset, structure.strip_offset, structure.mount)
+    shift, drift = table(structure.strip_offset, end, structure.strip)
+    return Mount(arm, boresight), StripBias(shift, drift)

@@ -1,0 +1,95 @@
+"""What an adjustment gives: unknowns, residuals, sigma naught, redundancy, the factored normal matrix, an outcome."""
+
+import enum
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxphoto.adjustment.normal import Normal, Reduced
+from jaxphoto.adjustment.residuals import Increments, Residuals, Values
+from jaxphoto.adjustment.structure import Structure
+from jaxphoto.block import Block
+from jaxphoto.unknowns import Unknowns
+
+
+class Outcome(enum.Enum):
+    """How the adjustment ended; the member's value is the sentence shown to the user."""
+
+    CONVERGED = "converged: the last step moved no unknown by more than a ten-thousandth of its standard deviation"
+    STEPS = (
+        "not converged: the step limit was reached; check the approximate values and look for blunders among the largest "
+        "residuals, or hold weakly determined unknowns fixed"
+    )
+    DIVERGED = (
+        "not converged: the numbers became infinite; check units, approximate values, and whether points lie behind "
+        "their cameras"
+    )
+
+
+class Factored(eqx.Module):
+    """The normal equations at the optimum in scaled increments, undamped, factored: all statistics come from here."""
+
+    normal: Normal
+    reduced: Reduced
+    lower: Float[Array, "reduced reduced"]
+    scale: Increments
+    open_motions: Increments
+    """Motions of the unknowns that only the datum's constraints hold, leading axis the defect; in scaled increments."""
+
+
+class Adjustment(eqx.Module):
+    """The result of `jaxphoto.adjust`; see `jaxphoto.statistics` for what can be asked of it.
+
+    `residuals` are observed minus computed over the a priori sigma, by group. `sigma0` is the square root of the a
+    posteriori variance factor v'Pv / redundancy.
+    """
+
+    block: Block
+    priors: Unknowns
+    unknowns: Unknowns
+    residuals: Residuals
+    values: Values
+    structure: Structure
+    factored: Factored
+    square_sum: Float[Array, ""]
+    steps: Int[Array, ""]
+    converged: Array
+    seconds: dict[str, float]
+
+    @property
+    def outcome(self) -> Outcome:
+        """Converged or not, and why; a member of `Outcome`."""
+        if bool(self.converged):
+            return Outcome.CONVERGED
+        return Outcome.STEPS if np.isfinite(float(self.square_sum)) else Outcome.DIVERGED
+
+    @property
+    def n_observations(self) -> dict[str, int]:
+        """Observations by group: image, stations, attitudes, control, distances, priors."""
+        return {name: int(np.size(v)) for name, v in self.residuals._asdict().items() if name != "datum"}
+
+    @property
+    def n_unknowns(self) -> dict[str, int]:
+        """Unknowns by group: interior, mounts, strips, exterior, points."""
+        s = self.structure
+        interior = int((s.free < s.mount_offset).sum())
+        mounts = int(((s.free >= s.mount_offset) & (s.free < s.strip_offset)).sum())
+        return {
+            "interior": interior,
+            "mounts": mounts,
+            "strips": s.n_shared - interior - mounts,
+            "exterior": int(s.eop_free.sum()),
+            "points": int(s.point_free.sum()),
+        }
+
+    @property
+    def redundancy(self) -> int:
+        """Observations plus constraints of the datum minus unknowns."""
+        return sum(self.n_observations.values()) + self.residuals.datum.shape[0] - sum(self.n_unknowns.values())
+
+    @property
+    def sigma0(self) -> Float[Array, ""]:
+        """Square root of the a posteriori variance factor; 1 where there is no redundancy."""
+        redundancy = self.redundancy
+        return (self.square_sum / redundancy) ** 0.5 if redundancy > 0 else self.square_sum * 0 + 1.0

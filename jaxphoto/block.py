@@ -1,0 +1,119 @@
+"""The block: observations as rows, and who observed what.
+
+A row of `Rows` is (who, axis, value, sigma). "Vertical control" is then rows with axis 2: there is no NaN and no
+infinite sigma, and the redundancy is a count. Units are metres, radians and millimetres on the image.
+"""
+
+import dataclasses
+from typing import Literal
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxphoto.camera import Sensor
+from jaxphoto.unknowns import Unknowns
+
+AXES = ("X", "Y", "Z")
+ATTITUDE_AXES = ("roll", "pitch", "yaw")
+
+
+class ImageRows(eqx.Module):
+    """Measured image coordinates (mm, from the image centre) of `point` in `image`, sorted by point."""
+
+    image: Int[np.ndarray, "n"]
+    point: Int[np.ndarray, "n"]
+    xy: Float[Array, "n 2"]
+    sigma: Float[Array, "n 2"]
+
+
+class Rows(eqx.Module):
+    """One scalar each: `who` (index of a point or an image), `axis` (0, 1, 2), `value` and `sigma`."""
+
+    who: Int[np.ndarray, "n"]
+    axis: Int[np.ndarray, "n"]
+    value: Float[Array, "n"]
+    sigma: Float[Array, "n"]
+
+    @staticmethod
+    def none() -> "Rows":
+        """No rows."""
+        return Rows(np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros(0))
+
+
+class Attitudes(eqx.Module):
+    """Observed roll, pitch, yaw (rad, all three) of `image` with their sigmas (rad)."""
+
+    image: Int[np.ndarray, "n"]
+    roll_pitch_yaw: Float[Array, "n 3"]
+    sigma: Float[Array, "n 3"]
+
+    @staticmethod
+    def none() -> "Attitudes":
+        """No rows."""
+        return Attitudes(np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 3)))
+
+
+class Distances(eqx.Module):
+    """Scale bars: the distance (m) between two points."""
+
+    points: Int[np.ndarray, "n 2"]
+    value: Float[Array, "n"]
+    sigma: Float[Array, "n"]
+
+    @staticmethod
+    def none() -> "Distances":
+        """No rows."""
+        return Distances(np.zeros((0, 2), int), np.zeros(0), np.zeros(0))
+
+
+@dataclasses.dataclass(frozen=True)
+class Datum:
+    """How position, orientation and scale are fixed where observations leave them open.
+
+    `control`: they must not be open. `minimal`: just enough coordinates of points held at their start values.
+    `inner`: inner constraints over all points, all images or the points named (`over`); `scale` None means
+    "constrain the scale if it is open".
+    """
+
+    kind: Literal["control", "minimal", "inner"] = "control"
+    over: Literal["points", "images"] | tuple[str, ...] = "points"
+    scale: bool | None = None
+
+
+class Start(eqx.Module):
+    """Approximate unknowns, and which images and points they are truly known for.
+
+    The arrays of unknown images and points hold zeros (identity rotations) until approximations are found.
+    """
+
+    unknowns: Unknowns
+    image_known: np.ndarray
+    point_known: np.ndarray
+
+
+class Block(eqx.Module):
+    """A block of images: ids, observations, and what is known and free beforehand.
+
+    Index arrays refer to `images`, `points`, `strips` in their order. `start` and `priors` are what
+    `jaxphoto.adjust` uses unless told otherwise. Check points never enter an adjustment.
+    """
+
+    title: str = eqx.field(static=True)
+    images: tuple[str, ...] = eqx.field(static=True)
+    points: tuple[str, ...] = eqx.field(static=True)
+    sensors: dict[str, Sensor] = eqx.field(static=True)
+    image_camera: tuple[str, ...] = eqx.field(static=True)
+    image_mount: tuple[str, ...] = eqx.field(static=True)
+    image_strip: tuple[str, ...] = eqx.field(static=True)
+    image_time: Float[Array, "images"]
+    image_points: ImageRows
+    control: Rows
+    fixed: Rows
+    check: Rows
+    stations: Rows
+    attitudes: Attitudes
+    distances: Distances
+    datum: Datum = eqx.field(static=True)
+    start: Start
+    priors: Unknowns

@@ -1,0 +1,39 @@
+"""The balanced radial model of close-range metrology, in the ideal coordinate, added."""
+
+from typing import ClassVar, Literal
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxphoto.camera.distortion.base import AbstractDistortion, decentring
+
+
+class Balanced(AbstractDistortion):
+    """Radial A1-A3 balanced at R0, decentring B1, B2, affinity C1 and shear C2; `measured = ideal + delta(ideal)`.
+
+        delta_x = x dr + B1 (r^2 + 2 x^2) + 2 B2 x y + C1 x + C2 y
+        delta_y = y dr + B2 (r^2 + 2 y^2) + 2 B1 x y
+        dr = A1 (r^2 - R0^2) + A2 (r^4 - R0^4) + A3 (r^6 - R0^6)
+
+    Units: A1 mm^-2, A2 mm^-4, A3 mm^-6, B1 and B2 mm^-1, C1 and C2 none, R0 mm (a constant of the model).
+    Source: the AICON / JAG3D bundle adjustment, whose report the tests reproduce.
+    """
+
+    a1: Float[Array, ""] | float = 0.0
+    a2: Float[Array, ""] | float = 0.0
+    a3: Float[Array, ""] | float = 0.0
+    b1: Float[Array, ""] | float = 0.0
+    b2: Float[Array, ""] | float = 0.0
+    c1: Float[Array, ""] | float = 0.0
+    c2: Float[Array, ""] | float = 0.0
+    r0: Float[Array, ""] | float = 0.0
+
+    domain: ClassVar[Literal["measured", "ideal"]] = "ideal"
+    coefficients: ClassVar[tuple[str, ...]] = ("a1", "a2", "a3", "b1", "b2", "c1", "c2")
+
+    def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
+        x, y = xy
+        r2, s2 = x * x + y * y, self.r0 * self.r0
+        dr = self.a1 * (r2 - s2) + self.a2 * (r2**2 - s2**2) + self.a3 * (r2**3 - s2**3)
+        affine = jnp.stack([self.c1 * x + self.c2 * y, jnp.zeros_like(y)])
+        return xy + xy * dr + decentring(self.b1, self.b2, xy) + affine

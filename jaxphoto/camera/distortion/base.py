@@ -1,0 +1,104 @@
+"""What every lens distortion model is: one polynomial map between measured and ideal image coordinates.
+
+Coordinates are in millimetres, reduced to the principal point. A model writes down one direction in closed
+form and says which (`domain`); the other direction is found by `invert`. Which way a distortion runs, and
+with which sign, is thereby part of its type (docs/conventions.md).
+"""
+
+import abc
+from typing import Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+# Newton's steps at most; a model inside its monotone range needs 4 to 8.
+_STEPS = 50
+# Places along the ray from the principal point at which the map must keep its orientation.
+_PROBES = 64
+
+
+class AbstractDistortion(eqx.Module):
+    """A lens distortion; its fields are scalars, its `domain` says where the polynomial lives.
+
+    `domain == "measured"`: `closed_form` takes measured to ideal coordinates (the photogrammetric habit).
+    `domain == "ideal"`: it takes ideal to measured ones.
+    `coefficients` names the fields an adjustment may estimate; other fields are constants of the model.
+    """
+
+    domain: eqx.AbstractClassVar[Literal["measured", "ideal"]]
+    coefficients: eqx.AbstractClassVar[tuple[str, ...]]
+
+    @abc.abstractmethod
+    def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
+        """The model's own direction, of one reduced coordinate in mm."""
+
+    def ideal_from_measured(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
+        """Ideal (distortion-free) from measured coordinate, both reduced to the principal point, in mm."""
+        return self.closed_form(xy) if self.domain == "measured" else invert(self, xy)[0]
+
+    def measured_from_ideal(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
+        """Measured from ideal coordinate, both reduced to the principal point, in mm.
+
+        Where the model is not invertible the value is meaningless: ask `invert` whether it is.
+        """
+        return invert(self, xy)[0] if self.domain == "measured" else self.closed_form(xy)
+
+
+def invert(
+    distortion: AbstractDistortion, target: Float[Array, "2"]
+) -> tuple[Float[Array, "2"], Bool[Array, ""]]:
+    """The coordinate that `closed_form` takes to `target`, and whether it lies in the monotone range.
+
+    Newton's method from the linear part of the map, differentiable to any order by the implicit function
+    theorem. The second value is False where Newton does not converge or where the map folds (its Jacobian
+    determinant changes sign) between the principal point and the coordinate found: there the model says
+    nothing, whatever the first value is.
+    """
+
+    def error(xy: Float[Array, "2"]) -> Float[Array, "2"]:
+        return distortion.closed_form(xy) - target
+
+    def newton(fn, start):
+        def unsettled(state):
+            xy, step, k = state
+            return (k < _STEPS) & (jnp.max(jnp.abs(step)) > 1e-14 * (1 + jnp.max(jnp.abs(xy))))
+
+        def body(state):
+            xy, _, k = state
+            step = _solve_2x2(jax.jacfwd(fn)(xy), fn(xy))
+            return xy - step, step, k + 1
+
+        return jax.lax.while_loop(unsettled, body, (start, jnp.ones(2), 0))[0]
+
+    def tangent(linear, b):
+        return _solve_2x2(jax.jacfwd(linear)(jnp.zeros(2)), b)
+
+    zero = jnp.zeros(2)
+    start = _solve_2x2(jax.jacfwd(distortion.closed_form)(zero), target - distortion.closed_form(zero))
+    xy = jax.lax.custom_root(error, jax.lax.stop_gradient(start), newton, tangent)
+    return xy, _monotone(distortion, xy) & (jnp.max(jnp.abs(error(xy))) < 1e-9 * (1 + jnp.max(jnp.abs(target))))
+
+
+def _monotone(distortion: AbstractDistortion, xy: Float[Array, "2"]) -> Bool[Array, ""]:
+    """True where the map keeps its orientation all along the ray from the principal point to `xy`."""
+
+    def determinant(fraction):
+        j = jax.jacfwd(distortion.closed_form)(fraction * xy)
+        return j[0, 0] * j[1, 1] - j[0, 1] * j[1, 0]
+
+    return jnp.all(jax.vmap(determinant)(jnp.linspace(0.0, 1.0, _PROBES)) > 0)
+
+
+def _solve_2x2(a: Float[Array, "2 2"], b: Float[Array, "2"]) -> Float[Array, "2"]:
+    determinant = a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0]
+    return jnp.stack([a[1, 1] * b[0] - a[0, 1] * b[1], a[0, 0] * b[1] - a[1, 0] * b[0]]) / determinant
+
+
+def decentring(p1, p2, xy: Float[Array, "2"]) -> Float[Array, "2"]:
+    """Decentring distortion P1 (r^2 + 2 x^2) + 2 P2 x y, 2 P1 x y + P2 (r^2 + 2 y^2)."""
+    x, y = xy
+    r2 = x * x + y * y
+    return jnp.stack([p1 * (r2 + 2 * x * x) + 2 * p2 * x * y, 2 * p1 * x * y + p2 * (r2 + 2 * y * y)])
+

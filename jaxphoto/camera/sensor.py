@@ -1,0 +1,43 @@
+"""The sensor: its format in pixels and millimetres, and image coordinates in either."""
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+
+class Sensor(eqx.Module):
+    """A frame sensor of `width_px` x `height_px` square pixels of `pixel_mm` millimetres."""
+
+    width_px: int
+    height_px: int
+    pixel_mm: float
+
+    def __check_init__(self) -> None:
+        if self.width_px <= 0 or self.height_px <= 0 or not self.pixel_mm > 0:
+            raise ValueError(
+                f"a sensor has a positive width, height and pixel size, got {self.width_px} x "
+                f"{self.height_px} px of {self.pixel_mm} mm"
+            )
+
+    @property
+    def width_mm(self) -> float:
+        """Format along x, in millimetres."""
+        return self.width_px * self.pixel_mm
+
+    @property
+    def height_mm(self) -> float:
+        """Format along y, in millimetres."""
+        return self.height_px * self.pixel_mm
+
+    def mm_from_px(self, column_row: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+        """Millimetres, origin at the image centre, x right, y up, from (column, row) in pixels.
+
+        The centre of the upper-left pixel is (0.5, 0.5) (docs/conventions.md).
+        """
+        centre = np.array([self.width_px, self.height_px]) / 2
+        return (np.asarray(column_row) - centre) * np.array([self.pixel_mm, -self.pixel_mm])
+
+    def px_from_mm(self, xy_mm: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+        """(column, row) in pixels from millimetres: the inverse of `mm_from_px`."""
+        centre = np.array([self.width_px, self.height_px]) / 2
+        return np.asarray(xy_mm) / np.array([self.pixel_mm, -self.pixel_mm]) + centre

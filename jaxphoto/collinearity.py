@@ -1,0 +1,105 @@
+"""Collinearity: from an object point to its image, from an image to its ray, from rays to a point.
+
+Each function is of one image and one point (intersection: of one point and its rays); map over rows with
+`jax.vmap`. Frames, signs and units: docs/conventions.md. Source of the equations: paper 001, equation (1).
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxphoto.camera import InteriorOrientation
+from jaxphoto.rotation import matrix_from_omega_phi_kappa, omega_phi_kappa_from_matrix, rotate
+
+
+class ExteriorOrientation(eqx.Module):
+    """Projection centre (m) and rotation of one image, or of many with a leading axis."""
+
+    position: Float[Array, "*images 3"]
+    camera_from_object: Float[Array, "*images 3 3"]
+
+    @staticmethod
+    def from_angles(
+        position: Float[Array, "*images 3"], omega_phi_kappa: Float[Array, "*images 3"]
+    ) -> "ExteriorOrientation":
+        """From the projection centre (m) and (omega, phi, kappa) in radians."""
+        angles = jnp.asarray(omega_phi_kappa, float)
+        matrices = jnp.vectorize(matrix_from_omega_phi_kappa, signature="(i)->(i,j)")(angles)
+        return ExteriorOrientation(jnp.asarray(position, float), matrices)
+
+    @property
+    def omega_phi_kappa(self) -> Float[Array, "*images 3"]:
+        """(omega, phi, kappa) in radians."""
+        return jnp.vectorize(omega_phi_kappa_from_matrix, signature="(i,j)->(i)")(self.camera_from_object)
+
+
+def camera_coordinates(exterior: ExteriorOrientation, point: Float[Array, "3"]) -> Float[Array, "3"]:
+    """Object point (m) in the camera frame: x right, y up, z out of the camera's back; z < 0 is in front."""
+    return rotate(exterior.camera_from_object, point - exterior.position)
+
+
+def project_ideal(c, exterior: ExteriorOrientation, point: Float[Array, "3"]) -> Float[Array, "2"]:
+    """Ideal image coordinate (mm, from the principal point): x = -c U / W, y = -c V / W."""
+    u, v, w = camera_coordinates(exterior, point)
+    return jnp.stack([u, v]) * (-c / w)
+
+
+def project(
+    interior: InteriorOrientation, exterior: ExteriorOrientation, point: Float[Array, "3"]
+) -> Float[Array, "2"]:
+    """Measured image coordinate (mm, from the image centre) of an object point (m).
+
+    Where the ideal coordinate lies outside the distortion's monotone range (`InteriorOrientation.valid`), or the
+    point behind the camera (`camera_coordinates`), the value is meaningless.
+    """
+    return interior.measured_from_ideal(project_ideal(interior.c, exterior, point))
+
+
+def image_ray(
+    interior: InteriorOrientation, exterior: ExteriorOrientation, xy: Float[Array, "2"]
+) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+    """Origin (m) and unit direction, in the object frame, of the ray of a measured image coordinate (mm)."""
+    x, y = interior.ideal_from_measured(xy)
+    direction = rotate(exterior.camera_from_object.T, jnp.stack([x, y, -jnp.asarray(interior.c, x.dtype)]))
+    return exterior.position, direction / jnp.sqrt(jnp.sum(direction**2))
+
+
+def image_residual(
+    interior: InteriorOrientation,
+    exterior: ExteriorOrientation,
+    point: Float[Array, "3"],
+    xy: Float[Array, "2"],
+) -> Float[Array, "2"]:
+    """Observed minus computed image coordinate, in mm, in the domain where the distortion has a closed form.
+
+    `ideal(measured) - projection` for models in the measured coordinate; `measured - distorted projection` for
+    models in the ideal one.
+    """
+    projection = project_ideal(interior.c, exterior, point)
+    reduced = xy - interior.principal_point
+    if interior.distortion.domain == "measured":
+        return interior.distortion.closed_form(reduced) - projection
+    return reduced - interior.distortion.closed_form(projection)
+
+
+def intersect(
+    origins: Float[Array, "rays 3"],
+    directions: Float[Array, "rays 3"],
+    weights: Float[Array, "rays"] | None = None,
+) -> Float[Array, "3"]:
+    """Forward intersection: the point (m) nearest to all rays, `sum w (I - d d') (X - origin) = 0`.
+
+    `directions` are unit vectors; rays of weight zero do not count. Parallel rays give no point: NaN or far away.
+    """
+    w = jnp.ones(len(origins)) if weights is None else weights
+    across = w[:, None, None] * (jnp.eye(3) - directions[:, :, None] * directions[:, None, :])
+    # Solved about the first origin, so that large coordinates lose no digits.
+    b = jnp.einsum("nij,nj->i", across, origins - origins[0])
+    return origins[0] + jnp.linalg.solve(jnp.sum(across, 0), b)
+
+
+def intersection_angle(directions: Float[Array, "rays 3"]) -> Float[Array, ""]:
+    """The largest angle between any two rays (radians): how well they meet."""
+    cosine = jnp.clip(directions @ directions.T, -1.0, 1.0)
+    return jnp.arccos(jnp.min(jax.lax.stop_gradient(cosine)))

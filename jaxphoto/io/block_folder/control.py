@@ -1,0 +1,121 @@
+"""control_points.csv and object_points.csv -> control, fixed and check coordinates, and where points start."""
+
+import warnings
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxphoto.block import AXES, Rows
+from jaxphoto.errors import InputError
+from jaxphoto.io.block_folder.image_points import Points
+from jaxphoto.io.block_folder.images import refuse_duplicates
+from jaxphoto.io.block_folder.layout import SIGMA_XYZ, XYZ
+from jaxphoto.io.block_folder.settings import Settings
+from jaxphoto.io.tables import Table
+
+ROLES = ("control", "fixed", "check")
+
+
+class Control(NamedTuple):
+    """Object coordinates by role, starting coordinates (points, 3) and for which points all three are known."""
+
+    control: Rows
+    fixed: Rows
+    check: Rows
+    start: np.ndarray
+    known: np.ndarray
+    held: np.ndarray
+
+
+def read_control(table: Table, approximations: Table, points: Points, settings: Settings) -> Control:
+    """Control of each role; a point that no image shows is dropped with a UserWarning.
+
+    Starting coordinates are those of control and fixed points, axis by axis, then those of object_points.csv.
+    A point may stand in two rows if these give different axes (control in X and Y, check in Z).
+    """
+    start = np.full((len(points.ids), 3), np.nan)
+    seen, where = _observed(approximations, points)
+    refuse_duplicates(seen, {"point": seen.text("point")}, "point {point} is listed twice")
+    start[where] = np.stack([seen.numbers(name) for name in XYZ], axis=1).reshape(-1, 3)
+
+    # Every row is checked, also of points that are then dropped.
+    _read_rows(table, np.arange(len(table)), settings)
+    seen, where = _observed(table, points)
+    role, rows = _read_rows(seen, where, settings)
+    by_role = {name: _take(rows, role == name) for name in ROLES}
+    held = np.zeros(len(points.ids), bool)
+    for name in ("control", "fixed"):
+        given = by_role[name]
+        start[given.who, given.axis] = given.value
+        held[given.who] = True
+    known = ~np.isnan(start).any(axis=1)
+    start[~known] = 0.0
+    return Control(by_role["control"], by_role["fixed"], by_role["check"], start, known, held)
+
+
+def default_sigma(table: Table, line: int, column: str, settings: Settings, *keys: str) -> float:
+    """The first of `keys` that [sigmas] has. Raises InputError, naming all that would help, if none."""
+    for key in keys:
+        if key in settings.sigmas:
+            return settings.sigmas[key]
+    raise table.bad(
+        line,
+        f"there is no standard deviation; fill in the column {column}, or add {' or '.join(keys)} under [sigmas] in "
+        f"{settings.file}",
+    )
+
+
+def _observed(table: Table, points: Points) -> tuple[Table, np.ndarray]:
+    """The lines whose point is seen in an image, and the index of that point."""
+    named = table.ids("point")
+    index = points.find(named)
+    missing = np.flatnonzero(index < 0)
+    if len(missing):
+        listed = ", ".join(named[missing][:5]) + (", ..." if len(missing) > 5 else "")
+        warnings.warn(
+            f"{table.file}: {len(missing)} point(s) are measured in no image and are not used: {listed}",
+            UserWarning,
+            stacklevel=3,
+        )
+    return table.take(index >= 0), index[index >= 0]
+
+
+def _read_rows(table: Table, point: np.ndarray, settings: Settings) -> tuple[np.ndarray, Rows]:
+    """The role of each row and the rows, one per given coordinate."""
+    role = np.where(table.text("role") == "", "control", table.text("role"))
+    for line in np.flatnonzero(~np.isin(role, ROLES)):
+        raise table.bad(line, f"the role {role[line]!r} is unknown; write control, fixed or check")
+    value = np.stack([table.numbers(name, empty=True) for name in XYZ], axis=1)
+    sigma = np.stack([table.sigmas(name) for name in SIGMA_XYZ], axis=1)
+    for line in np.flatnonzero(np.isnan(value).all(axis=1)):
+        raise table.bad(line, "the point has no coordinate; give at least one, or delete the row")
+    line, axis = np.nonzero(~np.isnan(value))
+    refuse_duplicates(
+        table.take(line),
+        {"point": table.text("point")[line], "axis": np.array(AXES, object)[axis]},
+        "{axis} of point {point} is given twice",
+    )
+    for i, a in zip(line, axis, strict=True):
+        if role[i] == "fixed":
+            sigma[i, a] = 0.0
+        elif np.isnan(sigma[i, a]) and role[i] == "control":
+            keys = (f"control_{AXES[a]}_m", "control_m")
+            sigma[i, a] = default_sigma(table, i, SIGMA_XYZ[a], settings, *keys)
+    # A check coordinate needs no sigma: it never enters an adjustment.
+    sigma = np.nan_to_num(sigma)
+    rows = Rows(point[line], axis, value[line, axis], sigma[line, axis])
+    return role[line], rows
+
+
+def _take(rows: Rows, chosen: np.ndarray) -> Rows:
+    who, axis = np.asarray(rows.who)[chosen], np.asarray(rows.axis)[chosen]
+    return Rows(who, axis, jnp.asarray(rows.value)[chosen], jnp.asarray(rows.sigma)[chosen])
+
+
+def check_datum_points(over: object, points: Points, file: str) -> None:
+    """Raise InputError for a datum over points that no image shows."""
+    if isinstance(over, tuple):
+        for name, index in zip(over, points.find(np.array(over, object)), strict=True):
+            if index < 0:
+                raise InputError(f"{file}, [datum] over: point {name} is measured in no image; remove it from the list")

@@ -1,0 +1,116 @@
+"""images.csv -> the images, their cameras, strips and times, and what is known of their orientation."""
+
+import warnings
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+
+from jaxphoto.collinearity import ExteriorOrientation
+from jaxphoto.errors import BlockError
+from jaxphoto.io.block_folder.layout import ANGLES, XYZ
+from jaxphoto.io.block_folder.settings import Settings
+from jaxphoto.io.tables import Table
+from jaxphoto.unknowns import FIXED
+
+_from_angles = eqx.filter_jit(ExteriorOrientation.from_angles)
+
+
+class Images(NamedTuple):
+    """One entry per image, in the order of the file; `time_known` where the file has a time."""
+
+    table: Table
+    ids: tuple[str, ...]
+    cameras: tuple[str, ...]
+    strips: tuple[str, ...]
+    times: np.ndarray
+    time_known: np.ndarray
+    exterior: ExteriorOrientation
+    known: np.ndarray
+
+    def index(self, table: Table, column: str = "image") -> np.ndarray:
+        """The index of the image each line of `table` names. Raises BlockError for one that is not listed."""
+        named = table.ids(column)
+        index = pd.Index(self.ids).get_indexer(pd.Index(named))
+        for line in np.flatnonzero(index < 0):
+            raise table.misfit(
+                line, f"image {named[line]} is not in {self.table.file}; add it there or delete this row"
+            )
+        return index
+
+
+def read_images(table: Table, settings: Settings) -> Images:
+    """The images. Raises InputError or BlockError for duplicates, cameras without a section and impossible angles."""
+    ids = table.ids("image")
+    if not len(ids):
+        raise BlockError(f"{table.file}: there are no images; list at least two")
+    refuse_duplicates(table, {"image": ids}, "image {image} is listed twice")
+    cameras = table.ids("camera")
+    for line, camera in enumerate(cameras):
+        if camera not in settings.cameras:
+            known = ", ".join(settings.cameras)
+            raise table.misfit(
+                line, f"camera {camera} has no table [cameras.{camera}] in {settings.file}; add it or use one of {known}"
+            )
+    strips = table.text("strip")
+    for line in np.flatnonzero(strips == "default"):
+        raise table.bad(line, f"the strip name default means every strip in {settings.file}; give it another name")
+    times = table.numbers("time_s", empty=True)
+    exterior, known = _exterior(table)
+    return Images(
+        table, tuple(ids), tuple(cameras), tuple(strips), _centred(times, strips), ~np.isnan(times), exterior, known
+    )
+
+
+def check_times(images: Images, strips: dict, priors: dict) -> None:
+    """Raise BlockError where a drift needs a time that is missing."""
+    for line, strip in enumerate(images.strips):
+        if strip in strips and not images.time_known[line]:
+            drifts = priors[strip].drift is not FIXED or np.any(np.asarray(strips[strip].drift) != 0)
+            if drifts:
+                raise images.table.misfit(
+                    line,
+                    f"image {images.ids[line]} has no time_s, but its strip {strip} drifts; add the time, or make the "
+                    'drift "fixed"',
+                )
+
+
+def refuse_duplicates(table: Table, keys: dict[str, np.ndarray], message: str) -> None:
+    """Raise InputError where two lines agree in all `keys`; `message` is filled with them."""
+    frame = pd.DataFrame(keys)
+    for line in np.flatnonzero(frame.duplicated()):
+        same = np.flatnonzero((frame == frame.iloc[line]).all(axis=1))
+        names = {name: values[line] for name, values in keys.items()}
+        raise table.bad(line, f"{message.format(**names)}, first in {table.place(same[0])}; delete one of the rows")
+
+
+def _centred(times: np.ndarray, strips: np.ndarray) -> np.ndarray:
+    """Seconds from the mean time of the image's strip, zero where there is no time."""
+    seconds = pd.Series(times)
+    return (seconds - seconds.groupby(strips).transform("mean")).fillna(0.0).to_numpy()
+
+
+def _exterior(table: Table) -> tuple[ExteriorOrientation, np.ndarray]:
+    values = np.stack([table.numbers(name, empty=True) for name in (*XYZ, *ANGLES)], axis=1)
+    known = ~np.isnan(values).any(axis=1)
+    partly = np.flatnonzero(~known & ~np.isnan(values).all(axis=1))
+    if len(partly):
+        warnings.warn(
+            f"{table.place(partly[0])}: the approximate orientation of {len(partly)} image(s) is incomplete and is not "
+            "used; give all six values or none",
+            UserWarning,
+            stacklevel=2,
+        )
+    values[~known] = 0.0
+    check_angles(table, values[:, 3:], ANGLES)
+    return _from_angles(jnp.asarray(values[:, :3]), jnp.asarray(np.deg2rad(values[:, 3:]))), known
+
+
+def check_angles(table: Table, degrees: np.ndarray, columns: tuple[str, ...]) -> None:
+    """Raise InputError for an angle beyond one turn: it is in another unit than degrees."""
+    for line, axis in np.argwhere(np.abs(degrees) > 360):
+        raise table.bad(
+            line, f"{columns[axis]} = {degrees[line, axis]:g} is more than a turn; give the angle in degrees"
+        )

@@ -1,0 +1,73 @@
+"""The [mounts.X] and [strips.X] tables of block.toml: lever arm, boresight, shift and drift."""
+
+from collections.abc import Iterable
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxphoto.georeferencing import Mount, StripBias
+from jaxphoto.io.block_folder.camera_section import status
+from jaxphoto.io.block_folder.section import Section
+
+_DEG = np.pi / 180
+
+
+def read_mounts(section: Section, cameras: Iterable[str]) -> tuple[dict[str, Mount], dict[str, Mount]]:
+    """Mounts (start values) and their priors by name: "default" or the id of a camera."""
+    section.known("default", *cameras)
+    mounts, priors = {}, {}
+    for name in section:
+        table = section.section(name)
+        table.known("lever_arm_m", "boresight_deg", "lever_arm", "boresight")
+        arm, boresight = table.vector("lever_arm_m"), table.vector("boresight_deg") * _DEG
+        if np.any(np.abs(arm) > 100):
+            raise table.error("lever_arm_m", f"{arm.tolist()} m is no lever arm; give it in metres")
+        mounts[name] = Mount(jnp.asarray(arm), jnp.asarray(boresight))
+        priors[name] = Mount(
+            table.prior("lever_arm", arm, "_m"),  # type: ignore[arg-type]
+            table.prior("boresight", boresight, "_deg", _DEG),  # type: ignore[arg-type]
+        )
+    return mounts, priors
+
+
+def read_strips(section: Section, strips: Iterable[str]) -> tuple[dict[str, StripBias], dict[str, StripBias]]:
+    """Shift and drift (start values) and their priors of every strip that has a table or the default's."""
+    named = tuple(strips)
+    if section.values and not named:
+        raise section.error("", "images.csv names no strips; add its column strip or remove the tables")
+    section.known("default", *named)
+    biases, priors = {}, {}
+    for strip in named:
+        key = strip if strip in section else "default"
+        if key not in section:
+            continue
+        table = section.section(key)
+        table.known("shift_m", "drift_m_per_s", "shift", "drift")
+        shift, drift = table.vector("shift_m"), table.vector("drift_m_per_s")
+        biases[strip] = StripBias(jnp.asarray(shift), jnp.asarray(drift))
+        priors[strip] = StripBias(
+            table.prior("shift", shift, "_m"),  # type: ignore[arg-type]
+            table.prior("drift", drift, "_m_per_s"),  # type: ignore[arg-type]
+        )
+    return biases, priors
+
+
+def mount_section(mount: Mount, prior: Mount) -> dict[str, Any]:
+    """The [mounts.X] table that `read_mounts` reads as `mount`."""
+    return {
+        "lever_arm_m": np.asarray(mount.lever_arm).tolist(),
+        "boresight_deg": (np.asarray(mount.boresight) / _DEG).tolist(),
+        "lever_arm": status(prior.lever_arm, mount.lever_arm),
+        "boresight": status(prior.boresight, mount.boresight, _DEG),
+    }
+
+
+def strip_section(bias: StripBias, prior: StripBias) -> dict[str, Any]:
+    """The [strips.X] table that `read_strips` reads as `bias`."""
+    return {
+        "shift_m": np.asarray(bias.shift).tolist(),
+        "drift_m_per_s": np.asarray(bias.drift).tolist(),
+        "shift": status(prior.shift, bias.shift),
+        "drift": status(prior.drift, bias.drift),
+    }

@@ -1,0 +1,149 @@
+"""block.toml: title, frame, cameras, default sigmas, mounts, strips and datum."""
+
+import tomllib
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxphoto.block import Datum
+from jaxphoto.errors import InputError
+from jaxphoto.io.block_folder.camera_section import Camera, read_camera
+from jaxphoto.io.block_folder.layout import TOML
+from jaxphoto.io.block_folder.section import Section
+
+_KEYS = ("title", "frame", "sigmas", "cameras", "mounts", "strips", "datum")
+_SIGMAS = (
+    "image_mm", "image_px", "control_m", "control_X_m", "control_Y_m", "control_Z_m", "station_m", "attitude_deg",
+    "distance_m",
+)  # fmt: skip
+
+
+class Settings(NamedTuple):
+    """What block.toml says; `mounts` and `strips` are read when the strips are known."""
+
+    file: str
+    title: str
+    sigmas: dict[str, float]
+    cameras: dict[str, Camera]
+    mounts: Section
+    strips: Section
+    datum: Datum
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """A TOML file as it stands. Raises InputError with the line of a syntax error."""
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except UnicodeDecodeError:
+        raise InputError(f"{path.name}: the text is not UTF-8; save the file as UTF-8") from None
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{path.name}: {error}; correct the TOML there") from None
+
+
+def read_settings(values: dict[str, Any], file: str = TOML) -> Settings:
+    """The settings in the content of block.toml; `file` is what messages call it."""
+    top = Section(file, "", values)
+    top.known(*_KEYS)
+    _check_frame(top.section("frame"))
+    sigmas = top.section("sigmas")
+    sigmas.known(*_SIGMAS)
+    cameras = top.section("cameras")
+    if not cameras.values:
+        raise top.error("", "there is no camera; add a table [cameras.NAME] with its format and interior orientation")
+    if "default" in cameras:
+        raise cameras.error("default", "this name means every camera in [mounts]; give the camera another one")
+    return Settings(
+        file,
+        top.text("title", ""),
+        {name: sigmas.positive(name) for name in sigmas},
+        {name: read_camera(cameras.section(name)) for name in cameras},
+        top.section("mounts"),
+        top.section("strips"),
+        _read_datum(top.section("datum")),
+    )
+
+
+def datum_section(datum: Datum) -> dict[str, Any]:
+    """The [datum] table that `read_settings` reads as `datum`."""
+    written: dict[str, Any] = {"kind": datum.kind}
+    if datum.kind == "inner":
+        written["over"] = datum.over if isinstance(datum.over, str) else list(datum.over)
+        if datum.scale is not None:
+            written["scale"] = datum.scale
+    return written
+
+
+def toml_text(values: dict[str, Any]) -> str:
+    """Nested tables as TOML; numbers are written so that they come back exactly."""
+    return "\n".join(_table_lines("", values)).lstrip("\n") + "\n"
+
+
+def _check_frame(section: Section) -> None:
+    kind = section.text("kind", "local")
+    if kind == "epsg":
+        raise section.error(
+            "kind", "this version reads local and enu frames only; convert the coordinates to a local east-north-up frame"
+        )
+    if kind not in ("local", "enu"):
+        raise section.error("kind", f'{kind!r} is no frame; write "local" or "enu"')
+
+
+def _read_datum(section: Section) -> Datum:
+    section.known("kind", "over", "scale")
+    kind = section.text("kind", "control")
+    if kind not in ("control", "minimal", "inner"):
+        raise section.error("kind", f'{kind!r} is no datum; write "control", "minimal" or "inner"')
+    if kind != "inner":
+        for key in ("over", "scale"):
+            if key in section:
+                raise section.error(key, f'only kind = "inner" has it; remove it or change kind from "{kind}"')
+        return Datum(kind)  # type: ignore[arg-type]
+    over = section.values.get("over", "points")
+    if isinstance(over, list):
+        if not over or not all(isinstance(point, str) for point in over):
+            raise section.error("over", f'{over!r} is no list of point ids; write them as text, like ["1", "2", "3"]')
+        over = tuple(over)
+    elif over not in ("points", "images"):
+        raise section.error("over", f'{over!r} is unknown; write "points", "images" or a list of point ids')
+    scale = section.values.get("scale")
+    if scale is not None and not isinstance(scale, bool):
+        raise section.error("scale", f"{scale!r} is neither true nor false; write one of them")
+    return Datum("inner", over, scale)
+
+
+def _table_lines(path: str, values: dict[str, Any]) -> list[str]:
+    lines = [f"{_key(k)} = {_value(v)}" for k, v in values.items() if not _is_table(v)]
+    if path and (lines or not values):
+        lines = ["", f"[{path}]", *lines]
+    for key, value in values.items():
+        if _is_table(value):
+            lines += _table_lines(f"{path}.{_key(key)}" if path else _key(key), value)
+    return lines
+
+
+def _is_table(value: Any) -> bool:
+    # A weighted status is the one table that stands on a line of its key.
+    return isinstance(value, dict) and "sigma" not in value
+
+
+def _key(key: str) -> str:
+    bare = key.isascii() and key.replace("-", "").replace("_", "").isalnum()
+    return key if bare else _text(key)
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{_key(k)} = {_value(v)}" for k, v in value.items()) + " }"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(map(_value, value)) + "]"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        return _text(value)
+    return repr(float(value)) if isinstance(value, float | np.floating) else str(value)
+
+
+def _text(text: str) -> str:
+    escaped = {c: f"\\u{ord(c):04x}" for c in text if ord(c) < 32 or ord(c) == 127} | {'"': '\\"', "\\": "\\\\"}
+    return '"' + "".join(escaped.get(c, c) for c in text) + '"'

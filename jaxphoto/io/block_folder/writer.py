@@ -1,0 +1,146 @@
+"""`Block` -> a block folder, made whole beside its place and then moved there."""
+
+import math
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pandas as pd
+
+from jaxphoto.block import Block, Rows
+from jaxphoto.errors import BlockError, InputError
+from jaxphoto.io.block_folder.camera_section import Camera, camera_section
+from jaxphoto.io.block_folder.layout import ANGLES, ATTITUDE, LAYOUTS, SIGMA_ATTITUDE, SIGMA_XYZ, TOML, XYZ
+from jaxphoto.io.block_folder.mount_sections import mount_section, strip_section
+from jaxphoto.io.block_folder.settings import datum_section, toml_text
+from jaxphoto.unknowns import FREE
+
+
+def write_block(block: Block, folder: str | Path) -> None:
+    """Write `block` as a folder that `read_block` reads as the same block; numbers come back exactly.
+
+    Angles are written in degrees and come back to rounding. A block folder of that name is replaced.
+
+    Raises InputError where `folder` holds anything else, BlockError for priors that block.toml cannot express.
+    """
+    folder = Path(folder).absolute()
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder} is a file; give the name of a folder")
+    if folder.is_dir() and any(folder.iterdir()) and not (folder / TOML).is_file():
+        raise InputError(f"{folder} is not empty and holds no block; empty it or give another folder")
+    settings, tables = _settings(block), _tables(block)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    made = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+    try:
+        (made / TOML).write_text(toml_text(settings), encoding="utf-8")
+        for name, frame in tables.items():
+            if LAYOUTS[name].needed or len(frame):
+                frame.to_csv(made / f"{name}.csv", index=False)
+        made.chmod(0o755)
+        _replace(folder, made)
+    finally:
+        shutil.rmtree(made, ignore_errors=True)
+
+
+def _replace(folder: Path, made: Path) -> None:
+    """Put `made` in the place of `folder`; whatever else the old folder holds moves along."""
+    if not folder.exists():
+        made.rename(folder)
+        return
+    written = {TOML, *(f"{name}.csv" for name in LAYOUTS)}
+    for path in folder.iterdir():
+        if path.name not in written:
+            _copy(path, made / path.name)
+    old = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+    folder.rename(old / "block")
+    made.rename(folder)
+    shutil.rmtree(old)
+
+
+def _copy(path: Path, to: Path) -> None:
+    if path.is_dir():
+        shutil.copytree(path, to, symlinks=True)
+    else:
+        shutil.copy2(path, to, follow_symlinks=False)
+
+
+def _settings(block: Block) -> dict[str, Any]:
+    start, priors = block.start.unknowns, block.priors
+    if any(p is not FREE for p in jax.tree.leaves((priors.exterior, priors.points))):
+        raise BlockError("block.toml can only say FREE of exterior orientation and object points; reset their priors")
+    cameras = {
+        name: camera_section(Camera(block.sensors[name], start.interior[name], priors.interior[name]))
+        for name in start.interior
+    }
+    return {
+        "title": block.title,
+        "frame": {"kind": "local"},
+        "cameras": cameras,
+        "mounts": {name: mount_section(mount, priors.mounts[name]) for name, mount in start.mounts.items()},
+        "strips": {name: strip_section(bias, priors.strips[name]) for name, bias in start.strips.items()},
+        "datum": datum_section(block.datum),
+    }
+
+
+def _tables(block: Block) -> dict[str, pd.DataFrame]:
+    images, points = np.array(block.images, object), np.array(block.points, object)
+    rows, distances = block.image_points, block.distances
+    xy, sigma = np.asarray(rows.xy), np.asarray(rows.sigma)
+    ends = np.asarray(distances.points)
+    position = np.asarray(block.start.unknowns.points)[block.start.point_known]
+    return {
+        "images": _images(block),
+        "image_points": pd.DataFrame(
+            {"image": images[rows.image], "point": points[rows.point]}
+            | {"x_mm": xy[:, 0], "y_mm": xy[:, 1], "sigma_x_mm": sigma[:, 0], "sigma_y_mm": sigma[:, 1]}
+        ),
+        "control_points": pd.concat(
+            [
+                _xyz_rows("point", points, given).assign(role=role)
+                for role, given in (("control", block.control), ("fixed", block.fixed), ("check", block.check))
+            ],
+            ignore_index=True,
+        ),
+        "stations": _xyz_rows("image", images, block.stations),
+        "attitudes": pd.DataFrame(
+            {"image": images[block.attitudes.image]}
+            | _columns(ATTITUDE, np.rad2deg(block.attitudes.roll_pitch_yaw))
+            | _columns(SIGMA_ATTITUDE, np.rad2deg(block.attitudes.sigma))
+        ),
+        "object_points": pd.DataFrame({"point": points[block.start.point_known]} | _columns(XYZ, position)),
+        "distances": pd.DataFrame(
+            {"point_a": points[ends[:, 0]], "point_b": points[ends[:, 1]]}
+            | {"distance_m": np.asarray(distances.value), "sigma_m": np.asarray(distances.sigma)}
+        ),
+    }
+
+
+def _images(block: Block) -> pd.DataFrame:
+    exterior, known = block.start.unknowns.exterior, block.start.image_known
+    columns: dict[str, Any] = {"image": block.images, "camera": block.image_camera}
+    if any(block.image_strip):
+        columns["strip"] = block.image_strip
+    times = np.asarray(block.image_time)
+    if times.any() or block.start.unknowns.strips:
+        columns["time_s"] = times
+    if known.any():
+        values = np.hstack([np.asarray(exterior.position), np.rad2deg(exterior.omega_phi_kappa)])
+        values = np.where(known[:, None], values, math.nan)
+        columns |= _columns((*XYZ, *ANGLES), values)
+    return pd.DataFrame(columns)
+
+
+def _xyz_rows(id_column: str, ids: np.ndarray, rows: Rows) -> pd.DataFrame:
+    """One line per point or image; coordinates that are not observed, and sigmas of zero, are left empty."""
+    who, line = np.unique(np.asarray(rows.who), return_inverse=True)
+    table = np.full((len(who), 6), math.nan)
+    table[line, rows.axis] = rows.value
+    table[line, np.asarray(rows.axis) + 3] = np.where(np.asarray(rows.sigma) > 0, rows.sigma, math.nan)
+    return pd.DataFrame({id_column: ids[who]} | _columns((*XYZ, *SIGMA_XYZ), table))
+
+
+def _columns(names: tuple[str, ...], values: np.ndarray) -> dict[str, np.ndarray]:
+    return {name: np.asarray(values)[:, j] for j, name in enumerate(names)}

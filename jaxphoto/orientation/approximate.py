@@ -1,0 +1,218 @@
+"""Approximate values of a whole block: images from points, points from images, until everything is known.
+
+1. An image with an observed position and attitude is oriented directly.
+2. Points with enough rays from known images are intersected.
+3. Unknown images that see at least four known points are resected, those with the most known points first, and back to
+   2. First only points whose rays meet at 1 degree or more serve; where nothing moves any more, narrower ones do.
+
+Where everything is known beforehand, only the check that every point lies in front of its cameras runs, in NumPy.
+"""
+
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxphoto.block import Block, Rows
+from jaxphoto.errors import BlockError
+from jaxphoto.georeferencing import Mount, StripBias, body_from_camera, sensor_position
+from jaxphoto.orientation.intersection import intersect_points
+from jaxphoto.orientation.rays import ideal_coordinates, turn_to_object, unit_rays
+from jaxphoto.orientation.resection import resect_ideal
+from jaxphoto.rotation import matrix_from_roll_pitch_yaw
+from jaxphoto.unknowns import Unknowns
+
+_ANGLES = np.deg2rad([1.0, 0.02])  # between rays that make a point: wanted, and just bearable
+_MEND = "give their X_m, Y_m, Z_m, omega_deg, phi_deg, kappa_deg in images.csv, or measure more control points in them"
+
+
+def approximate(block: Block) -> Unknowns:
+    """`block.start` with every image and every point that was unknown found.
+
+    Images are resected from known points or taken from observed positions and attitudes, points are intersected.
+    What `block.start` says is known stays as it is.
+
+    Raises BlockError, naming the first few and the mend, where images never see four known points, where the rays of a
+    point do not meet at an angle, and where a point lies behind a camera that measured it.
+    """
+    state = _State(block)
+    if not (state.image_known.all() and state.point_known.all()):
+        state.complete()
+    _check_in_front(block, state.positions, state.matrices, state.points)
+    if block.start.image_known.all() and block.start.point_known.all():
+        return block.start.unknowns
+    places = lambda u: (u.exterior.position, u.exterior.camera_from_object, u.points)  # noqa: E731
+    found = (jnp.asarray(state.positions), jnp.asarray(state.matrices), jnp.asarray(state.points))
+    return eqx.tree_at(places, block.start.unknowns, found)
+
+
+class _State:
+    """What is known so far. A working table of one call, not a value: it is filled in place."""
+
+    def __init__(self, block: Block) -> None:
+        start = block.start.unknowns
+        self.block = block
+        self.image, self.point = np.asarray(block.image_points.image), np.asarray(block.image_points.point)
+        self.positions = np.array(start.exterior.position, float).reshape(-1, 3)
+        self.matrices = np.array(start.exterior.camera_from_object, float).reshape(-1, 3, 3)
+        self.points = np.array(start.points, float).reshape(-1, 3)
+        self.image_known = np.array(block.start.image_known, bool)
+        self.point_known = np.array(block.start.point_known, bool)
+        self.point_given = self.point_known.copy()
+        self.refused: BlockError | None = None
+
+    def complete(self) -> None:
+        self._orient_directly()
+        self._image_space()
+        for min_angle in _ANGLES:
+            while True:
+                self._intersect(~self.point_known, min_angle)
+                if not self._resect_best():
+                    break
+        if not self.image_known.all():
+            raise self._images_left()
+        # Once more with all rays: the points met first were met by few.
+        self._intersect(~self.point_given, _ANGLES[-1])
+        if not self.point_known.all():
+            raise self._points_left()
+
+    def _orient_directly(self) -> None:
+        """Step 1: X = GNSS - R l - shift - drift t, and the attitude through the boresight."""
+        block, n = self.block, len(self.block.images)
+        station, attitude = _scattered(block.stations, n), np.full((n, 3), np.nan)
+        attitude[np.asarray(block.attitudes.image)] = np.asarray(block.attitudes.roll_pitch_yaw)
+        usable = ~self.image_known & np.isfinite(station).all(1) & np.isfinite(attitude).all(1)
+        who = np.flatnonzero(usable)
+        if not len(who):
+            return
+        unknowns = block.start.unknowns
+        none = jnp.zeros(3)
+        mounts = [unknowns.mounts.get(block.image_mount[i]) or Mount(none, none) for i in who]
+        strips = [unknowns.strips.get(block.image_strip[i]) or StripBias(none, none) for i in who]
+        time = np.nan_to_num(np.asarray(block.image_time, float)[who])
+        rows = (station[who], attitude[who], _stacked(mounts), _stacked(strips), time)
+        positions, matrices = jax.jit(jax.vmap(_direct))(*rows)
+        self.positions[who], self.matrices[who] = np.asarray(positions), np.asarray(matrices)
+        self.image_known[who] = True
+
+    def _image_space(self) -> None:
+        """Ideal coordinates and camera rays of all rows, camera by camera."""
+        interior, xy = self.block.start.unknowns.interior, np.asarray(self.block.image_points.xy, float)
+        names = sorted(set(self.block.image_camera))
+        camera = np.array([names.index(c) for c in self.block.image_camera], int)[self.image]
+        self.c = np.array([float(interior[name].c) for name in names])[camera]
+        self.ideal = np.zeros_like(xy)
+        for k, name in enumerate(names):
+            rows = camera == k
+            if rows.any():
+                self.ideal[rows] = ideal_coordinates(interior[name], xy[rows])
+        self.rays = unit_rays(self.c, self.ideal)
+        self.rows_of_image = np.argsort(self.image, kind="stable")
+        self.first_row = np.searchsorted(self.image[self.rows_of_image], np.arange(len(self.image_known) + 1))
+
+    def _intersect(self, wanted, min_angle: float) -> None:
+        """Step 2, of the points `wanted`."""
+        rows = np.flatnonzero(self.image_known[self.image] & wanted[self.point])
+        image, point = self.image[rows], self.point[rows]
+        directions = turn_to_object(self.matrices, image, self.rays[rows])
+        rows_of = partial(_rows_of, wanted=wanted)
+        control, fixed = rows_of(self.block.control), rows_of(self.block.fixed)
+        who, axis, value = (np.concatenate(parts) for parts in zip(control, fixed, strict=True))
+        found, good = intersect_points(
+            self.positions[image], directions, point, len(self.points), (who, axis, value), min_angle
+        )
+        who, axis, value = fixed
+        found[who, axis] = value
+        good &= wanted
+        self.points[good], self.point_known[good] = found[good], True
+
+    def _resect_best(self) -> bool:
+        """Step 3, of the images with at least half as many known points as the best; False where none could be."""
+        useful = self.point_known[self.point] & ~self.image_known[self.image]
+        count = np.bincount(self.image[useful], minlength=len(self.image_known))
+        progress = False
+        for i in np.argsort(-count, kind="stable"):
+            if count[i] < max(4, count.max() / 2) and (progress or count[i] < 4):
+                break
+            rows = self.rows_of_image[self.first_row[i] : self.first_row[i + 1]]
+            rows = rows[useful[rows]]
+            try:
+                exterior = resect_ideal(
+                    self.c[rows[0]], self.ideal[rows], self.points[self.point[rows]], self.block.images[i]
+                )
+            except BlockError as error:
+                self.refused = error
+                continue
+            self.positions[i], self.matrices[i] = exterior.position, exterior.camera_from_object
+            self.image_known[i] = progress = True
+        return progress
+
+    def _images_left(self) -> BlockError:
+        left = np.flatnonzero(~self.image_known)
+        seen = np.bincount(self.image[self.point_known[self.point]], minlength=len(self.image_known))
+        if self.refused is not None and seen[left].max() >= 4:
+            return self.refused
+        return BlockError(
+            f"{len(left)} of {len(self.image_known)} images have no approximate orientation and see fewer than 4 known "
+            f"points, so they cannot be resected ({_few(self.block.images, left)}): {_MEND}"
+        )
+
+    def _points_left(self) -> BlockError:
+        left = np.flatnonzero(~self.point_known)
+        rays = np.bincount(self.point, minlength=len(self.points))
+        name = self.block.points[left[0]]
+        more = f"; so it is with {len(left) - 1} more ({_few(self.block.points, left[1:])})" if len(left) > 1 else ""
+        if rays[left[0]] < 2:
+            return BlockError(
+                f"point {name} is measured in {rays[left[0]]} image(s) and has no known coordinates, so it has no "
+                f"position{more}: measure it in a second image, give its coordinates, or remove it"
+            )
+        return BlockError(
+            f"the rays of point {name} from {rays[left[0]]} images are nearly parallel, so they do not meet in a "
+            f"point{more}: measure it from another position, give its coordinates, or remove it"
+        )
+
+
+def _direct(station, roll_pitch_yaw, mount: Mount, bias: StripBias, time):
+    body_from_object = matrix_from_roll_pitch_yaw(roll_pitch_yaw).T
+    camera_from_object = body_from_camera(mount.boresight).T @ body_from_object
+    return station - sensor_position(jnp.zeros(3), camera_from_object, mount, bias, time), camera_from_object
+
+
+def _stacked(trees: list):
+    """One tree with a leading axis, of trees of one shape."""
+    return jax.tree.map(lambda *leaves: np.stack([np.asarray(v, float) for v in leaves]), *trees)
+
+
+def _scattered(rows: Rows, n: int) -> np.ndarray:
+    """Rows as a table (n, 3), NaN where there is none."""
+    table = np.full((n, 3), np.nan)
+    table[np.asarray(rows.who), np.asarray(rows.axis)] = np.asarray(rows.value)
+    return table
+
+
+def _rows_of(rows: Rows, wanted):
+    """(who, axis, value) of the rows of the points `wanted`."""
+    who = np.asarray(rows.who, int)
+    use = wanted[who]
+    return who[use], np.asarray(rows.axis, int)[use], np.asarray(rows.value, float)[use]
+
+
+def _check_in_front(block: Block, positions, matrices, points) -> None:
+    image, point = np.asarray(block.image_points.image), np.asarray(block.image_points.point)
+    depth = np.einsum("ni,ni->n", matrices[:, 2][image], points[point] - positions[image])
+    bad = np.flatnonzero(~(depth < 0))
+    if len(bad):
+        first = bad[0]
+        raise BlockError(
+            f"point {block.points[point[first]]} lies behind image {block.images[image[first]]}, which measured it "
+            f"({len(bad)} of {len(image)} image points are so): check the approximate angles and their units, the "
+            "position of the image, and that the point's coordinates are in the same frame"
+        )
+
+
+def _few(names, indices) -> str:
+    shown = ", ".join(names[i] for i in indices[:5])
+    return shown + (", ..." if len(indices) > 5 else "")

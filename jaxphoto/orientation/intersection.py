@@ -1,0 +1,46 @@
+"""Forward intersection of all points of a block at once: 3 x 3 normal equations summed over rows, in NumPy."""
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+
+def intersect_points(
+    origins: Float[np.ndarray, "rows 3"],
+    directions: Float[np.ndarray, "rows 3"],
+    point: Int[np.ndarray, " rows"],
+    n_points: int,
+    coordinates: tuple[Int[np.ndarray, " known"], Int[np.ndarray, " known"], Float[np.ndarray, " known"]] | None = None,
+    min_angle: float = np.deg2rad(0.02),
+) -> tuple[Float[np.ndarray, "points 3"], Bool[np.ndarray, " points"]]:
+    """The point (m) nearest to its rays, for every point, and whether its rays determine it.
+
+        sum over rays (I - d d') (X - origin) = 0
+
+    `origins` (m) and unit `directions` are of the ray of each row, `point` is the point it belongs to. `coordinates`
+    (point, axis, value in m) are single known coordinates, such as a height: each is one more plane of the weight of
+    a ray. Where all rays of a point are within `min_angle` (rad) of each other, or there is only one, the point is not
+    determined and its coordinates are NaN. `jaxphoto.collinearity.intersect` is the same of one point, for derivatives.
+    """
+    # About the centre of the cameras, so that map coordinates lose no digits.
+    centre = origins.mean(axis=0) if len(origins) else np.zeros(3)
+    local = origins - centre
+    along = np.sum(directions * local, axis=1)
+    normal = np.zeros((n_points, 3, 3))
+    right = np.zeros((n_points, 3))
+    count = np.bincount(point, minlength=n_points).astype(float)
+    for i in range(3):
+        right[:, i] = np.bincount(point, local[:, i] - directions[:, i] * along, n_points)
+        for j in range(i, 3):
+            outer = np.bincount(point, directions[:, i] * directions[:, j], n_points)
+            normal[:, i, j] = normal[:, j, i] = (count if i == j else 0.0) - outer
+    if coordinates is not None:
+        who, axis, value = coordinates
+        np.add.at(normal, (who, axis, axis), 1.0)
+        np.add.at(right, (who, axis), value - centre[axis])
+    # Two rays at the angle a have the smallest eigenvalue a^2 / 2.
+    some = np.flatnonzero(np.trace(normal, axis1=1, axis2=2) > 0)
+    some = some[np.linalg.eigvalsh(normal[some])[:, 0] > 0.5 * min_angle**2]
+    result, determined = np.full((n_points, 3), np.nan), np.zeros(n_points, bool)
+    determined[some] = True
+    result[some] = centre + np.linalg.solve(normal[some], right[some][..., None])[..., 0]
+    return result, determined

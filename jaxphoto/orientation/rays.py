@@ -1,0 +1,49 @@
+"""Ideal image coordinates of many rows at once, and the rays they are in object space."""
+
+from functools import partial
+
+import jax
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxphoto.camera import InteriorOrientation
+
+
+@jax.jit
+def _ideal(interior: InteriorOrientation, xy):
+    return jax.vmap(interior.ideal_from_measured)(xy)
+
+
+def ideal_coordinates(interior: InteriorOrientation, xy_mm: Float[np.ndarray, "rows 2"]) -> Float[np.ndarray, "rows 2"]:
+    """Ideal image coordinates (mm, from the principal point) of the measured rows of one camera."""
+    n = len(xy_mm)
+    padded = np.zeros((padded_length(n), 2))
+    padded[:n] = xy_mm
+    # Numbers as arrays: a float in the tree would be compiled in, and every camera compiled anew.
+    numbers = jax.tree.map(partial(np.asarray, dtype=float), interior)
+    return np.asarray(_ideal(numbers, padded))[:n]
+
+
+def padded_length(n: int) -> int:
+    """The next of 32, 128, 512, ...: a block of a hundred images compiles two or three times, not a hundred."""
+    length = 32
+    while length < n:
+        length *= 4
+    return length
+
+
+def unit_rays(
+    c_mm: Float[np.ndarray, " rows"] | float, ideal: Float[np.ndarray, "rows 2"]
+) -> Float[np.ndarray, "rows 3"]:
+    """Unit directions (x, y, -c) in the camera frame."""
+    rays = np.column_stack([ideal, -np.broadcast_to(c_mm, len(ideal))])
+    return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+
+
+def turn_to_object(
+    camera_from_object: Float[np.ndarray, "images 3 3"],
+    image: Int[np.ndarray, " rows"],
+    rays: Float[np.ndarray, "rows 3"],
+) -> Float[np.ndarray, "rows 3"]:
+    """Directions in the object frame of rays in the camera frames of their images."""
+    return np.einsum("nij,ni->nj", camera_from_object[image], rays)

@@ -1,0 +1,150 @@
+"""Rotations: omega-phi-kappa, roll-pitch-yaw, quaternions and small rotations to matrices and back.
+
+Frames, signs and units are those of docs/conventions.md: angles in radians; a matrix says what it takes to
+what. Every function is of one rotation and is differentiable where the rotation itself is.
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+# Body axes (right, forward, up) <-> (forward, right, down), and equally ENU <-> NED: its own inverse.
+_RFU_FRD = jnp.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+
+
+def rotate(matrix: Float[Array, "3 3"], vector: Float[Array, "3"]) -> Float[Array, "3"]:
+    """`matrix @ vector`, written out by component.
+
+    Under `vmap` over the last axis this stays a handful of elementwise operations, several times faster on
+    a CPU than a batch of 3 x 3 products.
+    """
+    return jnp.stack([sum(matrix[i, j] * vector[j] for j in range(3)) for i in range(3)])
+
+
+def matrix_from_omega_phi_kappa(angles: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    """`camera_from_object = R3(kappa) R2(phi) R1(omega)` from (omega, phi, kappa) in radians.
+
+    Source: paper 001, equation (1); the rows are written out in docs/models.md.
+    """
+    (so, sp, sk), (co, cp, ck) = jnp.sin(angles), jnp.cos(angles)
+    return jnp.stack(
+        [
+            jnp.stack([cp * ck, co * sk + so * sp * ck, so * sk - co * sp * ck]),
+            jnp.stack([-cp * sk, co * ck - so * sp * sk, so * ck + co * sp * sk]),
+            jnp.stack([sp, -so * cp, co * cp]),
+        ]
+    )
+
+
+def omega_phi_kappa_from_matrix(camera_from_object: Float[Array, "3 3"]) -> Float[Array, "3"]:
+    """(omega, phi, kappa) in radians of `camera_from_object`; omega and kappa in (-pi, pi], |phi| <= pi/2.
+
+    At phi = +-pi/2 only omega +- kappa is determined: omega and kappa are then one choice of many.
+    """
+    m = camera_from_object
+    return jnp.stack(
+        [
+            jnp.arctan2(-m[2, 1], m[2, 2]),
+            jnp.arctan2(m[2, 0], _norm(m[2, 1], m[2, 2])),
+            jnp.arctan2(-m[1, 0], m[0, 0]),
+        ]
+    )
+
+
+def matrix_from_roll_pitch_yaw(angles: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    """`object_from_body` from (roll, pitch, yaw) in radians; body right-forward-up, object east-north-up.
+
+    Roll is right wing down positive, pitch nose up positive, yaw clockwise from north, in the sequence of
+    airborne IMUs, `P Rz(yaw) Ry(pitch) Rx(roll) P` with P between right-forward-up and forward-right-down
+    (paper 000, equations (1)-(4)).
+    """
+    (sr, sp, sy), (cr, cp, cy) = jnp.sin(angles), jnp.cos(angles)
+    ned_from_frd = jnp.stack(
+        [
+            jnp.stack([cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr]),
+            jnp.stack([sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr]),
+            jnp.stack([-sp, cp * sr, cp * cr]),
+        ]
+    )
+    return _RFU_FRD @ ned_from_frd @ _RFU_FRD
+
+
+def roll_pitch_yaw_from_matrix(object_from_body: Float[Array, "3 3"]) -> Float[Array, "3"]:
+    """(roll, pitch, yaw) in radians of `object_from_body`; the inverse of `matrix_from_roll_pitch_yaw`."""
+    m = _RFU_FRD @ object_from_body @ _RFU_FRD
+    return jnp.stack(
+        [
+            jnp.arctan2(m[2, 1], m[2, 2]),
+            jnp.arctan2(-m[2, 0], _norm(m[2, 1], m[2, 2])),
+            jnp.arctan2(m[1, 0], m[0, 0]),
+        ]
+    )
+
+
+def matrix_from_quaternion(quaternion: Float[Array, "4"]) -> Float[Array, "3 3"]:
+    """Rotation matrix of the quaternion (w, x, y, z), of any length but zero."""
+    w, x, y, z = quaternion / jnp.sqrt(jnp.sum(quaternion**2))
+    return jnp.stack(
+        [
+            jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)]),
+            jnp.stack([2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)]),
+            jnp.stack([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)]),
+        ]
+    )
+
+
+def quaternion_from_matrix(matrix: Float[Array, "3 3"]) -> Float[Array, "4"]:
+    """Unit quaternion (w, x, y, z), w >= 0, of a rotation matrix.
+
+    Of the four equivalent formulas the one with the largest divisor is taken, so none loses digits at
+    rotations by half a turn.
+    """
+    m = matrix
+    t = jnp.stack([m[0, 0] + m[1, 1] + m[2, 2], m[0, 0], m[1, 1], m[2, 2]])
+    rows = jnp.stack(
+        [
+            jnp.stack([1 + t[0], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]]),
+            jnp.stack([m[2, 1] - m[1, 2], 1 + 2 * t[1] - t[0], m[1, 0] + m[0, 1], m[0, 2] + m[2, 0]]),
+            jnp.stack([m[0, 2] - m[2, 0], m[1, 0] + m[0, 1], 1 + 2 * t[2] - t[0], m[2, 1] + m[1, 2]]),
+            jnp.stack([m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[2, 1] + m[1, 2], 1 + 2 * t[3] - t[0]]),
+        ]
+    )
+    q = rows[jnp.argmax(t)]
+    q = q / jnp.sqrt(jnp.sum(q**2))
+    return jnp.where(q[0] < 0, -q, q)
+
+
+def small_rotation(theta: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    """`exp(-[theta]x)`: the rotation that takes V to `V - theta x V` to first order (docs/models.md).
+
+    Exact for any angle, smooth at zero. It is how the adjustment updates every rotation, on the camera's
+    side: `camera_from_object = small_rotation(theta) @ start`, so phi = 90 degrees is no singularity.
+    """
+    t2 = jnp.sum(theta**2)
+    # Double where: the series serves where the closed form is 0/0, and neither branch's derivative is NaN.
+    small = t2 < 1e-6
+    safe = jnp.where(small, 1.0, t2)
+    t = jnp.sqrt(safe)
+    a = jnp.where(small, 1 - t2 / 6 * (1 - t2 / 20), jnp.sin(t) / t)
+    b = jnp.where(small, 0.5 - t2 / 24 * (1 - t2 / 30), (1 - jnp.cos(t)) / safe)
+    x, y, z = theta
+    cross = jnp.stack([jnp.stack([0 * x, -z, y]), jnp.stack([z, 0 * x, -x]), jnp.stack([-y, x, 0 * x])])
+    return jnp.eye(3) - a * cross + b * (jnp.outer(theta, theta) - t2 * jnp.eye(3))
+
+
+def small_angles(matrix: Float[Array, "3 3"]) -> Float[Array, "3"]:
+    """The rotation vector theta of `small_rotation(theta) = matrix`; |theta| below half a turn."""
+    m = matrix
+    s = 0.5 * jnp.stack([m[1, 2] - m[2, 1], m[2, 0] - m[0, 2], m[0, 1] - m[1, 0]])
+    cosine = 0.5 * (m[0, 0] + m[1, 1] + m[2, 2] - 1)
+    s2 = jnp.sum(s**2)
+    small = (s2 < 1e-6) & (cosine > 0)
+    sine = jnp.sqrt(jnp.where(small, 1.0, s2))
+    series = 1 + s2 / 6 * (1 + 9 * s2 / 20)
+    return s * jnp.where(small, series, jnp.arctan2(sine, cosine) / sine)
+
+
+def _norm(a: Float[Array, ""], b: Float[Array, ""]) -> Float[Array, ""]:
+    """sqrt(a^2 + b^2) with derivative zero, not NaN, at the origin."""
+    s = a * a + b * b
+    zero = s == 0
+    return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, s)))
