@@ -1,10 +1,50 @@
-"""jaxphoto: differentiable photogrammetry on JAX."""
+"""jaxphoto: differentiable photogrammetry on JAX.
+
+Importing it switches JAX to float64 (docs/precision.md) and, unless you chose otherwise, keeps compiled code in a
+cache on disk.
+"""
 
 import os
+from pathlib import Path
 
-# SciPy's OpenBLAS, which jax uses for LAPACK, spins threads that fight XLA's own pool (docs/solver.md).
+# SciPy's OpenBLAS, which JAX uses for LAPACK, spins threads that fight XLA's own pool (docs/solver.md).
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import jax
 
 jax.config.update("jax_enable_x64", True)
+if jax.config.jax_compilation_cache_dir is None:
+    _cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jaxphoto"
+    jax.config.update("jax_compilation_cache_dir", str(_cache))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+
+from jaxphoto.adjustment import MAX_STEPS, Adjustment, Outcome
+from jaxphoto.block import Block
+from jaxphoto.camera import (
+    AbstractDistortion,
+    AffineBrown,
+    Balanced,
+    Brown,
+    InteriorOrientation,
+    Sensor,
+    Smac,
+    rebalance,
+    rebalance_covariance,
+)
+from jaxphoto.collinearity import ExteriorOrientation, image_ray, intersect, project
+from jaxphoto.errors import BlockError, DatumError, InputError, JaxphotoError, RankError
+from jaxphoto.io import convert, read_block, read_source, write_block
+from jaxphoto.procedures import adjust
+from jaxphoto.report import Tables
+from jaxphoto.statistics import angle_differences, covariance, point_differences
+from jaxphoto.unknowns import FIXED, FREE, Unknowns, Weighted
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "FIXED", "FREE", "MAX_STEPS", "AbstractDistortion", "Adjustment", "AffineBrown", "Balanced", "Block", "BlockError", "Brown",
+    "DatumError", "ExteriorOrientation", "InputError", "InteriorOrientation", "JaxphotoError", "Outcome",
+    "RankError", "Sensor", "Smac", "Tables", "Unknowns", "Weighted", "adjust", "angle_differences", "convert",
+    "covariance", "image_ray", "intersect", "point_differences", "project", "read_block", "read_source", "rebalance",
+    "rebalance_covariance", "write_block",
+]  # fmt: skip

@@ -1,15 +1,22 @@
 """The adjustment itself: block, start and priors in; unknowns with their normal equations out."""
 
-import time
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxphoto.adjustment.compiled import run_compiled
 from jaxphoto.adjustment.datum import close_datum
 from jaxphoto.adjustment.normal import factor_reduced, reduce_normal
-from jaxphoto.adjustment.optimum import Optimum, column_scale, find_optimum, linearise, unit_scale, zero_increments
+from jaxphoto.adjustment.optimum import (
+    Optimum,
+    find_optimum,
+    linearise,
+    typical_scale,
+    unit_scale,
+    weigh_datum,
+    zero_increments,
+)
 from jaxphoto.adjustment.rank import check_rank
 from jaxphoto.adjustment.residuals import Increments, Residuals, State, Values, state_at
 from jaxphoto.adjustment.result import Adjustment, Factored
@@ -36,10 +43,9 @@ def solve(block: Block, start: Unknowns, priors: Unknowns, max_steps: int = MAX_
     open_motions, constraints = close_datum(block, concrete(values), structure)
     values = with_datum(values, constraints.eop, constraints.points)
     seconds: dict[str, float] = {}
-    motions = (jnp.asarray(open_motions.eop), jnp.asarray(open_motions.points))
-    arguments = (values, structure, max_steps)
-    optimum, state = _run(_optimise, arguments, seconds, "solve")
-    square_sum, residuals, factored = _run(_finish, (values, state, structure, motions), seconds, "covariance")
+    optimum, state = run_compiled(_optimise, (values, structure, max_steps), seconds, "solve")
+    finish = (values, state, structure, tuple(open_motions))
+    square_sum, residuals, factored = run_compiled(_finish, finish, seconds, "covariance")
     adjusted = Adjustment(
         block=block,
         priors=priors,
@@ -60,6 +66,7 @@ def solve(block: Block, start: Unknowns, priors: Unknowns, max_steps: int = MAX_
 
 @eqx.filter_jit
 def _optimise(values: Values, structure: Structure, max_steps: int) -> tuple[Optimum, State]:
+    values = weigh_datum(values, structure)
     optimum = find_optimum(values, structure=structure, max_steps=max_steps)
     return optimum, state_at(optimum.increments, unit_scale(structure), values, structure)
 
@@ -69,10 +76,9 @@ def _finish(
     values: Values, state: State, structure: Structure, motions: tuple[jax.Array, jax.Array]
 ) -> tuple[jax.Array, Residuals, Factored]:
     """Residuals and the factored, undamped normal equations at the optimum."""
-    values, zero, unit = at_state(values, state), zero_increments(structure), unit_scale(structure)
-    first, residuals = linearise(zero, unit, values, structure)
-    scale = column_scale(first)
-    normal, _ = linearise(zero, scale, values, structure)
+    values = weigh_datum(at_state(values, state), structure)
+    scale = typical_scale(values, structure)
+    normal, residuals = linearise(zero_increments(structure), scale, values, structure)
     reduced = reduce_normal(normal, 0.0, structure)
     inverse = jax.tree.map(lambda k: jnp.where(k > 0, 1 / jnp.where(k > 0, k, 1.0), 0.0), scale)
     scaled = Increments(
@@ -86,23 +92,3 @@ def _finish(
 def concrete(tree: Values) -> Values:
     """The same values with zeros for what is being traced: the datum depends on no observed value."""
     return jax.tree.map(lambda v: np.zeros(v.shape) if isinstance(v, jax.core.Tracer) else np.asarray(v), tree)
-
-
-_compiled: dict[object, object] = {}
-
-
-def _run(function, arguments, seconds: dict[str, float], name: str):
-    """Call a compiled function, compiling it first and apart, so that `seconds` tells the two times."""
-    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(arguments)):
-        return function(*arguments)
-    began = time.perf_counter()
-    dynamic, static = eqx.partition(arguments, eqx.is_array)
-    shapes = tuple((v.shape, v.dtype) for v in jax.tree.leaves(dynamic))
-    key = (function, shapes, jax.tree.structure(dynamic), tuple(jax.tree.leaves(static)), jax.tree.structure(static))
-    if key not in _compiled:
-        _compiled[key] = function.lower(*arguments).compile()
-    ready = time.perf_counter()
-    out = jax.block_until_ready(_compiled[key](*arguments))
-    seconds["compile"] = seconds.get("compile", 0.0) + ready - began
-    seconds[name] = time.perf_counter() - ready
-    return out

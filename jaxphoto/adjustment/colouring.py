@@ -33,23 +33,18 @@ class Jacobian(NamedTuple):
 
 def jacobian_blocks(product: Callable[[Increments], Residuals], structure: Structure) -> Jacobian:
     """All blocks of the linear map `product`, which takes increments to residuals."""
-    s = structure
-    zero = Increments(jnp.zeros((6, s.n_images)), jnp.zeros(s.n_shared), jnp.zeros((3, s.n_points)))
-
-    def eop(seed):
-        return product(zero._replace(eop=jnp.broadcast_to(seed[:, None], (6, s.n_images))))
-
-    def shared(colour):
-        return product(zero._replace(shared=jnp.where(s.colour == colour, 1.0, 0.0)))
-
-    def points(seed, point_class):
-        chosen = jnp.where(s.point_class == point_class, 1.0, 0.0)
-        return product(zero._replace(points=seed[:, None] * chosen))
-
-    by_eop = jax.vmap(eop)(jnp.eye(6))
-    by_shared = jax.vmap(shared)(jnp.arange(s.n_colours))
-    classes = jnp.repeat(jnp.arange(s.n_classes), 3)
-    by_point = jax.vmap(points)(jnp.tile(jnp.eye(3), (s.n_classes, 1)), classes)
+    s, q = structure, structure.n_colours
+    n = 6 + q + 3 * s.n_classes
+    colour, own = jnp.arange(n), jnp.arange(6 + q, n) - 6 - q
+    # Seeds, colours first: one component of every image, one shared colour, one component of a class of points.
+    eop = jnp.broadcast_to((colour[:, None] == jnp.arange(6))[:, :, None], (n, 6, s.n_images))
+    shared = colour[:, None] == 6 + s.colour
+    points = (own[:, None, None] // 3 == s.point_class) & (own[:, None] % 3 == jnp.arange(3))[:, :, None]
+    points = jnp.concatenate([jnp.zeros((6 + q, *points.shape[1:]), bool), points])
+    by_colour = jax.vmap(product)(Increments(*(v.astype(float) for v in (eop, shared, points))))
+    by_eop, by_shared, by_point = (
+        jax.tree.map(lambda v, i=i, j=j: v[i:j], by_colour) for i, j in ((0, 6), (6, 6 + q), (6 + q, n))
+    )
     by_point = jax.tree.map(lambda v: v.reshape(s.n_classes, 3, *v.shape[1:]), by_point)
     each = jnp.arange(len(s.distance_points))
     ends = s.point_class[s.distance_points]

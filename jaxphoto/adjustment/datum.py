@@ -19,7 +19,7 @@ from jaxphoto.errors import DatumError
 from jaxphoto.rotation import small_angles, small_rotation
 
 MOTIONS = ("shift in X", "shift in Y", "shift in Z", "rotation about X", "rotation about Y", "rotation about Z", "scale")
-# Singular values of the unit-column sensitivity below this are zero.
+# Singular values of the scaled sensitivity below this are zero.
 _OPEN = 1e-9
 
 
@@ -169,7 +169,9 @@ def _null_motions(sensitivity: np.ndarray) -> np.ndarray:
     """Combinations of the seven motions that no row sees, orthonormal; free shared unknowns may go along."""
     if not len(sensitivity):
         return np.eye(7)
+    # The motions are alike in size by construction; the shared unknowns are brought to the same.
     norm = np.sqrt((sensitivity**2).sum(0))
+    norm[:7] = norm[:7].max()
     columns = sensitivity / np.where(norm > 0, norm, 1.0)
     _, s, vt = np.linalg.svd(columns, full_matrices=True)
     rank = int((s > _OPEN * max(s.max(initial=0.0), 1e-300)).sum())

@@ -125,10 +125,9 @@ def reduce_normal(normal: Normal, damping, structure: Structure) -> Reduced:
     # What meets an image through its points: shared unknowns and mu.
     across = jnp.concatenate([ys, yd])
     met = jax.ops.segment_sum(
-        jnp.einsum("akn,ckn->nac", y, across[:, :, s.point]).reshape(len(s.point), -1), s.image, s.n_images
-    ).reshape(s.n_images, 6, -1)
-    flat = across.reshape(len(across), -1)
-    own = flat @ flat.T
+        jnp.einsum("akn,ckn->nac", y, across[:, :, s.point]), s.image, s.n_images
+    )
+    own = jnp.einsum("akp,bkp->ab", across, across)
     q, k, size = s.n_shared, len(yd), 6 * s.n_images
     se = (n.us - met[:, :, :q]).reshape(size, q)
     a = jnp.block([[see.reshape(size, size), jnp.zeros((size, q))], [se.T, uss - own[:q, :q]]])
@@ -197,6 +196,8 @@ def _shared_sums(m: Float[Array, "images m m"], s: Structure):
 
 def _shared_point_sums(product: Float[Array, "rows colours 3"], s: Structure) -> Float[Array, "shared 3 points"]:
     q, n = s.n_image_colours, s.n_shared
+    if not q:
+        return jnp.zeros((n, 3, s.n_points))
     if len(s.groups) == 1 and len(s.groups[0].names) == 1:
         # One camera: a colour means the same unknown in every image, so a sorted sum over points will do.
         sums = jax.ops.segment_sum(product.reshape(-1, 3 * q), s.point, s.n_points, indices_are_sorted=True)

@@ -17,7 +17,8 @@ from jaxphoto.adjustment.colouring import jacobian_blocks
 from jaxphoto.adjustment.normal import Normal, factor_reduced, reduce_normal, solve_factored, sum_normal
 from jaxphoto.adjustment.residuals import Increments, Residuals, Values, residuals_at
 from jaxphoto.adjustment.solver import LevenbergMarquardt, PointElimination
-from jaxphoto.adjustment.structure import Structure
+from jaxphoto.adjustment.structure import Structure, interior_of
+from jaxphoto.collinearity import ExteriorOrientation, image_residual
 
 # The first damping relative to the normal matrix is the square of this: almost Gauss-Newton.
 _FIRST_DAMPING = 1e-4
@@ -37,7 +38,8 @@ def linearise(
     increments: Increments, scale: Increments, values: Values, structure: Structure
 ) -> tuple[Normal, Residuals]:
     """Undamped normal equations and residuals at start + scale * increments."""
-    fn = lambda y: residuals_at(y, scale, values, structure)  # noqa: E731
+    # Traced once: jit keeps the trace, and everything below uses it again.
+    fn = jax.jit(lambda y: residuals_at(y, scale, values, structure))
     residuals, product = jax.linearize(fn, increments)
     blocks = jacobian_blocks(product, structure)
     datum = (values.datum_eop * scale.eop, values.datum_points * scale.points)
@@ -56,31 +58,19 @@ def unit_scale(structure: Structure) -> Increments:
     return Increments(jnp.asarray(s.eop_free), jnp.ones(s.n_shared), jnp.asarray(s.point_free))
 
 
-def column_scale(normal: Normal) -> Increments:
-    """The reciprocal column norms of the Jacobian; zero for what is held fixed."""
-
-    def reciprocal(diagonal):
-        return jnp.where(diagonal > 0, 1 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1.0)), 0.0)
-
-    return Increments(
-        reciprocal(jnp.einsum("nii->in", normal.u)),
-        reciprocal(jnp.diagonal(normal.uss)),
-        reciprocal(jnp.einsum("iip->ip", normal.v)),
-    )
-
-
 @eqx.filter_custom_jvp
 def find_optimum(values: Values, *, structure: Structure, max_steps: int) -> Optimum:
     """Levenberg-Marquardt from the start in `values`. Differentiable in every number of `values`."""
     zero = zero_increments(structure)
-    scale = starting_scale(values, structure)
+    scale = jax.tree.map(lambda k: k / _FIRST_DAMPING, typical_scale(values, structure))
     datum = (values.datum_eop * scale.eop, values.datum_points * scale.points)
     solver = LevenbergMarquardt(PointElimination(structure, datum), TOLERANCE)
+    fn = jax.jit(lambda y, scale, values: residuals_at(y, scale, values, structure))
     solution = optx.least_squares(
-        lambda y, args: residuals_at(y, *args),
+        lambda y, args: fn(y, *args),
         solver,
         zero,
-        args=(scale, values, structure),
+        args=(scale, values),
         max_steps=max_steps,
         throw=False,
     )
@@ -101,7 +91,7 @@ def _find_optimum_jvp(primals, tangents, *, structure: Structure, max_steps: int
 
     moved, still = eqx.partition(values, jax.tree.map(lambda t: t is not None, direction, is_leaf=lambda t: t is None))
     _, change = jax.jvp(lambda m: gradient(at, eqx.combine(m, still)), (moved,), (direction,))
-    scale = column_scale(linearise(at, unit, values, structure)[0])
+    scale = typical_scale(values, structure)
     normal = linearise(at, scale, values, structure)[0]
     reduced = reduce_normal(normal, 0.0, structure)
     lower = factor_reduced(reduced)
@@ -124,7 +114,48 @@ def _find_optimum_jvp(primals, tangents, *, structure: Structure, max_steps: int
     return optimum, Optimum(increments, None, None)
 
 
-def starting_scale(values: Values, structure: Structure) -> Increments:
-    """Column norms at the start, times the square root of the first relative damping."""
-    normal, _ = linearise(zero_increments(structure), unit_scale(structure), values, structure)
-    return jax.tree.map(lambda k: jax.lax.stop_gradient(k) / _FIRST_DAMPING, column_scale(normal))
+def weigh_datum(values: Values, structure: Structure) -> Values:
+    """The same constraints of the datum, each of unit length in scaled increments.
+
+    Their weight does not change the optimum (no observation speaks against them); this one keeps N well-conditioned.
+    """
+    if not values.datum_eop.shape[0]:
+        return values
+    scale = typical_scale(values, structure)
+    square = jnp.sum((values.datum_eop * scale.eop) ** 2, (1, 2)) + jnp.sum(
+        (values.datum_points * scale.points) ** 2, (1, 2)
+    )
+    weight = (1 / jnp.sqrt(square))[:, None, None]
+    where = lambda v: (v.datum_eop, v.datum_points)  # noqa: E731
+    return eqx.tree_at(where, values, (values.datum_eop * weight, values.datum_points * weight))
+
+
+def typical_scale(values: Values, structure: Structure) -> Increments:
+    """What moves an image point by about its standard deviation; zero for what is held fixed.
+
+    Scaling by these makes columns of the Jacobian alike within a factor of some tens, which is all that the damping and
+    the factorisation need: unknowns run from 1e-7 (k2) to 1e3 m.
+    """
+    s, v = structure, jax.tree.map(jax.lax.stop_gradient, values)
+    sigma = jnp.mean(v.sigma_xy)
+    corner = jnp.max(jnp.abs(v.xy), axis=1)
+    vector = jnp.ones(v.shared.shape)
+    for group in s.groups:
+        m = group.treedef.num_leaves
+        first = v.shared[group.offset : group.offset + m]
+        aim = jnp.array([0.1, 0.1, -1.0])
+        centre = ExteriorOrientation(jnp.zeros(3), jnp.eye(3))
+        by_parameter = jax.jacfwd(lambda p, g=group: image_residual(interior_of(g, list(p)), centre, aim, corner))(first)
+        typical = sigma / jnp.maximum(jnp.max(jnp.abs(by_parameter), axis=0), 1e-30)
+        typical = jnp.where(jnp.isfinite(typical), typical, 1.0)
+        stop = group.offset + m * len(group.names)
+        vector = vector.at[group.offset : stop].set(jnp.tile(typical, len(group.names)))
+    c = v.shared[s.groups[0].offset]
+    depth = jnp.mean(jnp.sqrt(jnp.sum((v.points[:, s.point] - v.position[:, s.image]) ** 2, axis=0)))
+    ground, angle = sigma * depth / c, sigma / c
+    eop = jnp.stack([ground, ground, ground, angle, angle, angle])
+    seconds = jnp.maximum(jnp.max(jnp.abs(v.time)), 1.0)
+    mount = jnp.tile(eop, (s.strip_offset - s.mount_offset) // 6)
+    strip = jnp.tile(jnp.repeat(jnp.stack([ground, ground / seconds]), 3), (len(vector) - s.strip_offset) // 6)
+    vector = vector.at[s.mount_offset :].set(jnp.concatenate([mount, strip]))
+    return Increments(eop[:, None] * s.eop_free, vector[s.free], ground * s.point_free)

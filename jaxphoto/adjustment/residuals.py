@@ -37,6 +37,17 @@ class Residuals(NamedTuple):
     datum: Float[Array, "constraints"]
 
 
+GROUPS = {
+    "image": "image_points",
+    "stations": "stations",
+    "attitudes": "attitudes",
+    "control": "control_points",
+    "distances": "distances",
+    "priors": "priors",
+}
+"""Groups of observations: field of `Residuals` -> the name tables and files give it."""
+
+
 class Values(eqx.Module):
     """The numbers of an adjustment, batch-last: observations, sigmas, start, and constraint rows of the datum."""
 
@@ -144,12 +155,17 @@ def georeferencing_residuals(state: State, values: Values, structure: Structure)
         matrix = matrix_from_roll_pitch_yaw(observed)
         return attitude_residual(matrix, state.rotation[:, :, image], mounts.boresight[:, image])
 
-    stations = jax.vmap(station)(structure.station_image, structure.station_axis, values.stations)
-    attitudes = jax.vmap(attitude, in_axes=(0, -1), out_axes=-1)(structure.attitude_image, values.attitudes)
+    # Groups without rows are left out of the program: what is not there need not be compiled.
+    stations, attitudes, distances = jnp.zeros(0), jnp.zeros((3, 0)), jnp.zeros(0)
+    if len(structure.station_image):
+        stations = jax.vmap(station)(structure.station_image, structure.station_axis, values.stations)
+    if len(structure.attitude_image):
+        attitudes = jax.vmap(attitude, in_axes=(0, -1), out_axes=-1)(structure.attitude_image, values.attitudes)
     control = values.control - state.points[structure.control_axis, structure.control_point]
-    a, b = structure.distance_points.T
-    length = jnp.sqrt(jnp.sum((state.points[:, a] - state.points[:, b]) ** 2, axis=0))
-    return stations, attitudes, control, values.distances - length
+    if len(structure.distance_points):
+        a, b = structure.distance_points.T
+        distances = values.distances - jnp.sqrt(jnp.sum((state.points[:, a] - state.points[:, b]) ** 2, axis=0))
+    return stations, attitudes, control, distances
 
 
 def _mounts(state: State, structure: Structure) -> tuple[Mount, StripBias]:

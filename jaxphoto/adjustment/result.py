@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxphoto.adjustment.normal import Normal, Reduced
-from jaxphoto.adjustment.residuals import Increments, Residuals, Values
+from jaxphoto.adjustment.residuals import GROUPS, Increments, Residuals, Values
 from jaxphoto.adjustment.structure import Structure
 from jaxphoto.block import Block
 from jaxphoto.unknowns import Unknowns
@@ -66,8 +66,8 @@ class Adjustment(eqx.Module):
 
     @property
     def n_observations(self) -> dict[str, int]:
-        """Observations by group: image, stations, attitudes, control, distances, priors."""
-        return {name: int(np.size(v)) for name, v in self.residuals._asdict().items() if name != "datum"}
+        """Observations by group: image_points, stations, attitudes, control_points, distances, priors."""
+        return {name: int(np.size(getattr(self.residuals, field))) for field, name in GROUPS.items()}
 
     @property
     def n_unknowns(self) -> dict[str, int]:
@@ -84,9 +84,14 @@ class Adjustment(eqx.Module):
         }
 
     @property
+    def n_constraints(self) -> int:
+        """Constraints that close the datum."""
+        return self.residuals.datum.shape[0]
+
+    @property
     def redundancy(self) -> int:
         """Observations plus constraints of the datum minus unknowns."""
-        return sum(self.n_observations.values()) + self.residuals.datum.shape[0] - sum(self.n_unknowns.values())
+        return sum(self.n_observations.values()) + self.n_constraints - sum(self.n_unknowns.values())
 
     @property
     def sigma0(self) -> Float[Array, ""]:

@@ -16,33 +16,42 @@ def values_of(block: Block, start: Unknowns, priors: Unknowns, structure: Struct
     """Observations and start values as arrays; numbers only, so derivatives with respect to each exist."""
     rows, s = block.image_points, structure
     weights = _weights(priors, s)
-    points = _hold(jnp.asarray(start.points).T, block)
     return Values(
-        xy=jnp.asarray(rows.xy).T,
-        sigma_xy=jnp.asarray(rows.sigma).T,
-        stations=jnp.asarray(block.stations.value),
-        sigma_stations=jnp.asarray(block.stations.sigma),
-        time=jnp.asarray(block.image_time),
-        attitudes=jnp.asarray(block.attitudes.roll_pitch_yaw).T,
-        sigma_attitudes=jnp.asarray(block.attitudes.sigma).T,
-        control=jnp.asarray(block.control.value),
-        sigma_control=jnp.asarray(block.control.sigma),
-        distances=jnp.asarray(block.distances.value),
-        sigma_distances=jnp.asarray(block.distances.sigma),
-        priors=jnp.asarray([w.value for w in weights], float),
-        sigma_priors=jnp.asarray([w.sigma for w in weights], float),
-        position=jnp.asarray(start.exterior.position).T,
-        rotation=jnp.moveaxis(jnp.asarray(start.exterior.camera_from_object), 0, -1),
-        shared=jnp.asarray(shared_vector(start, s.groups), float),
-        points=points,
-        datum_eop=jnp.zeros((0, 6, s.n_images)),
-        datum_points=jnp.zeros((0, 3, s.n_points)),
+        xy=_floats(rows.xy).T,
+        sigma_xy=_floats(rows.sigma).T,
+        stations=_floats(block.stations.value),
+        sigma_stations=_floats(block.stations.sigma),
+        time=_floats(block.image_time),
+        attitudes=_floats(block.attitudes.roll_pitch_yaw).T,
+        sigma_attitudes=_floats(block.attitudes.sigma).T,
+        control=_floats(block.control.value),
+        sigma_control=_floats(block.control.sigma),
+        distances=_floats(block.distances.value),
+        sigma_distances=_floats(block.distances.sigma),
+        priors=_vector([w.value for w in weights]),
+        sigma_priors=_vector([w.sigma for w in weights]),
+        position=_floats(start.exterior.position).T,
+        rotation=_floats(start.exterior.camera_from_object).transpose(1, 2, 0),
+        shared=_vector(shared_vector(start, s.groups)),
+        points=_hold(_floats(start.points).T, block),
+        datum_eop=np.zeros((0, 6, s.n_images)),
+        datum_points=np.zeros((0, 3, s.n_points)),
     )
 
 
-def with_datum(values: Values, eop, points) -> Values:
+def _floats(x):
+    """A float64 array: numpy's where nothing is traced, because its operations need no compilation."""
+    return x if isinstance(x, jax.core.Tracer) else np.asarray(x, float)
+
+
+def _vector(scalars: list):
+    traced = any(isinstance(x, jax.core.Tracer) for x in scalars)
+    return jnp.stack([jnp.asarray(x, float) for x in scalars]) if traced else np.array(scalars, float)
+
+
+def with_datum(values: Values, eop: np.ndarray, points: np.ndarray) -> Values:
     """The same values with constraint rows of the datum."""
-    return eqx.tree_at(lambda v: (v.datum_eop, v.datum_points), values, (jnp.asarray(eop), jnp.asarray(points)))
+    return eqx.tree_at(lambda v: (v.datum_eop, v.datum_points), values, (eop, points))
 
 
 def at_state(values: Values, state: State) -> Values:
@@ -53,6 +62,7 @@ def at_state(values: Values, state: State) -> Values:
 
 def unknowns_of(state: State, like: Unknowns, structure: Structure) -> Unknowns:
     """The state as the tree a user knows."""
+    state = State(*map(_floats, state))
     interior = {}
     for group in structure.groups:
         m = group.treedef.num_leaves
@@ -65,18 +75,19 @@ def unknowns_of(state: State, like: Unknowns, structure: Structure) -> Unknowns:
     mounts, strips = fill(list(like.mounts.values())), fill(list(like.strips.values()))
     return Unknowns(
         {name: interior[name] for name in like.interior},
-        ExteriorOrientation(state.position.T, jnp.moveaxis(state.rotation, -1, 0)),
+        ExteriorOrientation(state.position.T, state.rotation.transpose(2, 0, 1)),
         state.points.T,
         dict(zip(like.mounts, mounts, strict=True)),
         dict(zip(like.strips, strips, strict=True)),
     )
 
 
-def _hold(points: jax.Array, block: Block) -> jax.Array:
+def _hold(points, block: Block):
     """Fixed coordinates are what the block says, whatever the start."""
     if not len(block.fixed.who):
         return points
-    return points.at[np.asarray(block.fixed.axis), np.asarray(block.fixed.who)].set(jnp.asarray(block.fixed.value))
+    held = jnp.asarray(points).at[block.fixed.axis, block.fixed.who].set(block.fixed.value)
+    return _floats(held)
 
 
 def _weights(priors: Unknowns, structure: Structure) -> list[Weighted]:

@@ -13,7 +13,8 @@ import numpy as np
 
 from jaxphoto.errors import BlockError, InputError
 
-
+# The index of a line in its table, from Python or from numpy.
+Line = int | np.integer
 # The columns in which a comma is not a decimal comma.
 _TEXT = frozenset({"image", "camera", "strip", "point", "point_a", "point_b", "role"})
 
@@ -47,15 +48,15 @@ class Table:
         columns = {name: values[chosen] for name, values in self.columns.items()}
         return Table(self.file, columns, self.files[chosen], self.rows[chosen])
 
-    def place(self, line: int) -> str:
+    def place(self, line: Line) -> str:
         """The file and row of a line, as messages name it."""
         return f"{self.files[line]}, row {self.rows[line]}"
 
-    def bad(self, line: int, message: str) -> InputError:
+    def bad(self, line: Line, message: str) -> InputError:
         """An error about the content of one line."""
         return InputError(f"{self.place(line)}: {message}")
 
-    def misfit(self, line: int, message: str) -> BlockError:
+    def misfit(self, line: Line, message: str) -> BlockError:
         """An error about how one line fits the others."""
         return BlockError(f"{self.place(line)}: {message}")
 
@@ -100,10 +101,12 @@ class Table:
         try:
             # Python's own conversion: it rounds correctly, so a number written by repr comes back exactly.
             values[filled] = cells[filled].astype(float)
+            # The one thing it reads that is no number in a table is 1_000.
+            bad = np.array(["_" in cell for cell in cells], bool)
         except ValueError:
-            for line in np.flatnonzero(filled):
-                if not _is_number(cells[line]):
-                    raise self.bad(line, f"{column} is {cells[line]!r}, not a number; write it like 12.34") from None
+            bad = np.array([cell != "" and not is_number(cell) for cell in cells], bool)
+        for line in np.flatnonzero(bad):
+            raise self.bad(line, f"{column} is {cells[line]!r}, not a number; write it like 12.34")
         for line in np.flatnonzero(filled & ~np.isfinite(values)):
             raise self.bad(
                 line, f"{column} is {cells[line]!r}; give a finite number, or leave the cell empty if it is unknown"
@@ -190,20 +193,22 @@ def content_lines(path: Path) -> tuple[list[str], list[int]]:
 
 
 def _records(path: Path, lines: list[str], rows: list[int], separator: str) -> list[list[str]]:
-    records = list(csv.reader(lines, delimiter=separator, skipinitialspace=True))
+    try:
+        records = list(csv.reader(lines, delimiter=separator, skipinitialspace=True, strict=True))
+    except csv.Error:
+        records = []
     if len(records) != len(lines):
-        row = next(row for line, row in zip(lines, rows, strict=True) if line.count('"') % 2)
-        raise InputError(f"{path.name}, row {row}: a quotation mark is not closed; close it in the same row")
+        row = next((row for line, row in zip(lines, rows, strict=True) if line.count('"') % 2), rows[0])
+        raise InputError(f"{path.name}, row {row}: the quotation marks do not pair; close or remove them in that row")
     width = len(records[0])
     for record, row in zip(records, rows, strict=True):
-        if len(record) != width:
-            # Spreadsheets end shorter rows with separators, or leave them out.
-            if len(record) > width and any(cell.strip() for cell in record[width:]):
-                raise InputError(
-                    f"{path.name}, row {row}: {len(record)} cells, but the header has {width}; remove the surplus ones"
-                    + (" (decimal commas need semicolons between the columns)" if separator == "," else "")
-                )
-            record.extend([""] * (width - len(record)))
+        if len(record) > width:
+            raise InputError(
+                f"{path.name}, row {row}: {len(record)} cells, but the header has {width}; remove the surplus ones"
+                + (" (decimal commas need semicolons between the columns)" if separator == "," else "")
+            )
+        # Some spreadsheets leave out empty cells at the end of a row.
+        record.extend([""] * (width - len(record)))
     return records
 
 
@@ -213,7 +218,8 @@ def _objects(cells: list[str]) -> np.ndarray:
     return values
 
 
-def _is_number(cell: str) -> bool:
+def is_number(cell: str) -> bool:
+    """Whether a cell reads as a number."""
     try:
         float(cell)
     except ValueError:

@@ -19,7 +19,7 @@ from jaxphoto.block import Block, Rows
 from jaxphoto.errors import BlockError
 from jaxphoto.georeferencing import Mount, StripBias, body_from_camera, sensor_position
 from jaxphoto.orientation.intersection import intersect_points
-from jaxphoto.orientation.rays import ideal_coordinates, turn_to_object, unit_rays
+from jaxphoto.orientation.rays import QUICK_TO_COMPILE, ideal_coordinates, turn_to_object, unit_rays
 from jaxphoto.orientation.resection import resect_ideal
 from jaxphoto.rotation import matrix_from_roll_pitch_yaw
 from jaxphoto.unknowns import Unknowns
@@ -62,6 +62,7 @@ class _State:
         self.point_known = np.array(block.start.point_known, bool)
         self.point_given = self.point_known.copy()
         self.refused: BlockError | None = None
+        self.resected = False
 
     def complete(self) -> None:
         self._orient_directly()
@@ -73,8 +74,9 @@ class _State:
                     break
         if not self.image_known.all():
             raise self._images_left()
-        # Once more with all rays: the points met first were met by few.
-        self._intersect(~self.point_given, _ANGLES[-1])
+        if self.resected:
+            # Once more with all rays: the points met first were met by few.
+            self._intersect(~self.point_given, _ANGLES[-1])
         if not self.point_known.all():
             raise self._points_left()
 
@@ -93,7 +95,7 @@ class _State:
         strips = [unknowns.strips.get(block.image_strip[i]) or StripBias(none, none) for i in who]
         time = np.nan_to_num(np.asarray(block.image_time, float)[who])
         rows = (station[who], attitude[who], _stacked(mounts), _stacked(strips), time)
-        positions, matrices = jax.jit(jax.vmap(_direct))(*rows)
+        positions, matrices = jax.jit(jax.vmap(_direct), compiler_options=QUICK_TO_COMPILE)(*rows)
         self.positions[who], self.matrices[who] = np.asarray(positions), np.asarray(matrices)
         self.image_known[who] = True
 
@@ -114,6 +116,8 @@ class _State:
 
     def _intersect(self, wanted, min_angle: float) -> None:
         """Step 2, of the points `wanted`."""
+        if not wanted.any():
+            return
         rows = np.flatnonzero(self.image_known[self.image] & wanted[self.point])
         image, point = self.image[rows], self.point[rows]
         directions = turn_to_object(self.matrices, image, self.rays[rows])
@@ -146,7 +150,7 @@ class _State:
                 self.refused = error
                 continue
             self.positions[i], self.matrices[i] = exterior.position, exterior.camera_from_object
-            self.image_known[i] = progress = True
+            self.image_known[i] = self.resected = progress = True
         return progress
 
     def _images_left(self) -> BlockError:
@@ -202,7 +206,7 @@ def _rows_of(rows: Rows, wanted):
 
 def _check_in_front(block: Block, positions, matrices, points) -> None:
     image, point = np.asarray(block.image_points.image), np.asarray(block.image_points.point)
-    depth = np.einsum("ni,ni->n", matrices[:, 2][image], points[point] - positions[image])
+    depth = np.einsum("ni,ni->n", matrices[:, 2].take(image, 0), points.take(point, 0) - positions.take(image, 0))
     bad = np.flatnonzero(~(depth < 0))
     if len(bad):
         first = bad[0]

@@ -1,12 +1,13 @@
 """Resection of one image from known points, without approximate values.
 
-1. Three-point resections of some thirty triangles, the largest in the image and some at random (so that one wrong
-   point does not spoil all), each in its three cyclic orders.
+1. Three-point resections of some thirty triangles, the largest in the image and some at random (so that a few wrong
+   points do not spoil all).
 2. The few solutions with the smallest robust reprojection error over all points.
 3. Levenberg-Marquardt steps on (position, small rotation in the camera frame) over all points from each of them, with
-   Huber's weights, in the domain of ideal image coordinates; the best is the result.
+   Cauchy's weights, in the domain of ideal image coordinates; the best is the result.
 """
 
+from functools import partial
 from itertools import combinations
 
 import jax
@@ -17,11 +18,12 @@ from jaxtyping import Float
 from jaxphoto.camera import InteriorOrientation
 from jaxphoto.collinearity import ExteriorOrientation, project_ideal
 from jaxphoto.errors import BlockError
-from jaxphoto.orientation.rays import ideal_coordinates, padded_length, unit_rays
+from jaxphoto.orientation.rays import QUICK_TO_COMPILE, ideal_coordinates, padded_length, unit_rays
 from jaxphoto.orientation.three_points import three_point_resections
 from jaxphoto.rotation import small_rotation
 
 _TRIANGLES = 16  # largest, and as many at random
+_JUDGES = 60  # points at most that choose among the solutions
 _STARTS = 4
 _STEPS = 40
 # Ideal image errors, as fractions of c: those that count as small when solutions are compared, and the typical one
@@ -82,40 +84,43 @@ def _on_a_line(centred: Float[np.ndarray, "n axes"]) -> bool:
 def _candidates(c_mm, ideal, points):
     """The solutions of the triangles with the smallest robust reprojection error, best first, `_STARTS` at most."""
     triples = _triples(ideal, points)
-    triples = np.concatenate([np.roll(triples, k, axis=1) for k in range(3)])
     positions, matrices = three_point_resections(unit_rays(c_mm, ideal)[triples], points[triples])
-    errors = _reprojection_errors(c_mm, ideal, points, positions, matrices)
+    some = np.linspace(0, len(ideal) - 1, min(len(ideal), _JUDGES)).astype(int)
+    errors = _reprojection_errors(c_mm, ideal[some], points[some], positions, matrices)
     order = np.argsort(np.sum(np.log1p((errors / (_SMALL * c_mm)) ** 2), axis=1))[:_STARTS]
     return positions[order], matrices[order]
 
 
 def _triples(ideal, points):
-    """Indices (triples, 3) of triangles that are large in the image and no lines in the object."""
-    if len(ideal) <= 12:
-        all_triples = np.array(list(combinations(range(len(ideal)), 3)))
-    else:
-        angles = np.arange(12) * np.pi / 6
-        extreme = np.unique(np.argmax(ideal @ np.stack([np.cos(angles), np.sin(angles)]), axis=0))
-        drawn = np.random.default_rng(0).integers(len(ideal), size=(200, 3))
-        all_triples = np.concatenate([np.array(list(combinations(extreme, 3))), drawn])
-    a, b, c = (ideal[all_triples[:, k]] for k in range(3))
+    """Indices (triples, 3) of the largest triangles in the image and of some random ones; no lines in the object."""
+    angles = np.arange(12) * np.pi / 6
+    extreme = np.unique(np.argmax(ideal @ np.stack([np.cos(angles), np.sin(angles)]), axis=0))
+    among = np.arange(len(ideal)) if len(ideal) <= 12 else extreme
+    large = np.array(list(combinations(among, 3)))
+    random = np.random.default_rng(0).integers(len(ideal), size=(200, 3))
+    area = _area(ideal, points, large)
+    large = large[np.argsort(-area)[:_TRIANGLES]]
+    random = random[_area(ideal, points, random) > 0.1 * area.max()][:_TRIANGLES]
+    triples = np.unique(np.sort(np.concatenate([large, random]), axis=1), axis=0)
+    return triples[_area(ideal, points, triples) > 0]
+
+
+def _area(ideal, points, triples):
+    """Twice the area of triangles in the image; zero where they are lines in the object."""
+    a, b, c = (ideal[triples[:, k]] for k in range(3))
+    sides = points[triples[:, [1, 2, 0]]] - points[triples]
+    longest = np.max(np.sum(sides**2, axis=2), axis=1)
+    flat = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1) <= 1e-3 * longest
     area = np.abs((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
-    sides = points[all_triples[:, [1, 2, 0]]] - points[all_triples]
-    long = np.max(np.sum(sides**2, axis=2), axis=1)
-    flat = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1) <= 1e-3 * long
-    area = np.where(flat, 0.0, area)
-    largest = np.argsort(-area)
-    random = np.random.default_rng(1).permutation(np.flatnonzero(area > 0.1 * area.max()))
-    chosen = np.unique(np.concatenate([largest[:_TRIANGLES], random[:_TRIANGLES]]))
-    return all_triples[chosen[area[chosen] > 0]]
+    return np.where(flat, 0.0, area)
 
 
 def _reprojection_errors(c_mm, ideal, points, positions, matrices):
     """Errors (mm) of every point in every solution; a point behind the camera counts as c."""
-    camera = np.einsum("sij,snj->sni", matrices, points[None] - positions[:, None])
-    in_front = camera[..., 2] < 0
-    projected = -c_mm * camera[..., :2] / np.where(in_front, camera[..., 2], -1.0)[..., None]
-    return np.where(in_front, np.minimum(np.linalg.norm(projected - ideal, axis=2), c_mm), c_mm)
+    camera = (matrices.reshape(-1, 3) @ points.T).reshape(-1, 3, len(points)) - matrices @ positions[:, :, None]
+    in_front = camera[:, 2] < 0
+    error = ideal.T + c_mm * camera[:, :2] / np.where(in_front, camera[:, 2], -1.0)[:, None]
+    return np.where(in_front, np.minimum(np.hypot(error[:, 0], error[:, 1]), c_mm), c_mm)
 
 
 def _best_refined(c_mm, ideal, points, positions, matrices):
@@ -126,7 +131,9 @@ def _best_refined(c_mm, ideal, points, positions, matrices):
     if not len(positions):
         return np.zeros(3), np.eye(3), np.inf
     errors = _reprojection_errors(c_mm, ideal, points, positions, matrices)
-    limit = max(3 * 1.4826 * float(np.median(errors[0])), 0.5 * _SMALL * c_mm)
+    # Of a few points the triangle fits three exactly, so the others are no blunders for being worse.
+    typical = np.median(errors[0]) if len(points) >= 8 else np.max(errors[0])
+    limit = max(3 * 1.4826 * float(typical), 0.5 * _SMALL * c_mm)
     start = np.arange(_STARTS) % len(positions)
     distance = np.linalg.norm(positions[start], axis=1)  # the points are about the origin
     steps, damping = np.zeros((_STARTS, 6)), np.full(_STARTS, 1e-6)
@@ -156,17 +163,17 @@ def _normal_equations(c_mm, ideal, points, limit, distance, positions, matrices,
     args = (positions, matrices, distance, steps, np.float64(c_mm), points[some])
     positions, matrices, projected, slope = (np.asarray(v) for v in _linearised(*args))
     residual, slope = (ideal.T - projected[:, :, :n]) / c_mm, slope[:, :, :n] / c_mm
-    size, limit = np.linalg.norm(residual, axis=1), limit / c_mm
-    weight = limit / np.maximum(size, limit)
-    huber = np.where(size < limit, size**2, 2 * size * limit - limit**2).sum(axis=1)
+    size, limit = np.hypot(residual[:, 0], residual[:, 1]), limit / c_mm
+    weight, robust = 1 / (1 + (size / limit) ** 2), limit**2 * np.log1p((size / limit) ** 2).sum(axis=1)
     # A blunder may lie behind the best candidate, but no step may take more points there.
-    behind = np.einsum("sk,snk->sn", matrices[:, 2], points - positions[:, None]) >= 0
-    cost = np.where(np.isfinite(huber), huber, np.inf) + behind.sum(axis=1) * n
-    normal = np.einsum("sank,sn,sanl->skl", slope, weight, slope)
-    return positions, matrices, cost, normal, np.einsum("sank,sn,san->sk", slope, weight, residual)
+    behind = matrices[:, 2] @ points.T >= np.sum(matrices[:, 2] * positions, axis=1)[:, None]
+    cost = np.where(np.isfinite(robust), robust, np.inf) + behind.sum(axis=1) * n
+    rows = slope.reshape(_STARTS, 2 * n, 6)
+    weighted = (slope * weight[:, None, :, None]).reshape(_STARTS, 2 * n, 6).transpose(0, 2, 1)
+    return positions, matrices, cost, weighted @ rows, (weighted @ residual.reshape(_STARTS, 2 * n, 1))[..., 0]
 
 
-@jax.jit
+@partial(jax.jit, compiler_options=QUICK_TO_COMPILE)
 def _linearised(positions, matrices, distances, steps, c, points):
     """Orientations moved by `steps`, projections (2, n) from there, and their derivatives (2, n, 6), per candidate.
 

@@ -67,9 +67,7 @@ def camera_section(camera: Camera) -> dict[str, Any]:
     constants = {name: getattr(distortion, field) for name, field in constant_names(type(distortion)).items()}
     written["interior"] = {name: float(get_parameter(interior, name)) for name in names}
     written["interior"] |= {name: float(value) for name, value in constants.items()}
-    written["unknowns"] = {
-        name: status(get_parameter(priors, name), get_parameter(interior, name)) for name in names
-    }
+    written["unknowns"] = {name: status(get_parameter(priors, name), get_parameter(interior, name)) for name in names}
     return written
 
 

@@ -12,7 +12,7 @@ from jaxphoto.io.block_folder.image_points import Points
 from jaxphoto.io.block_folder.images import refuse_duplicates
 from jaxphoto.io.block_folder.layout import SIGMA_XYZ, XYZ
 from jaxphoto.io.block_folder.settings import Settings
-from jaxphoto.io.tables import Table
+from jaxphoto.io.tables import Line, Table
 
 ROLES = ("control", "fixed", "check")
 
@@ -35,14 +35,14 @@ def read_control(table: Table, approximations: Table, points: Points, settings: 
     A point may stand in two rows if these give different axes (control in X and Y, check in Z).
     """
     start = np.full((len(points.ids), 3), np.nan)
-    seen, where = _observed(approximations, points)
-    refuse_duplicates(seen, {"point": seen.text("point")}, "point {point} is listed twice")
-    start[where] = np.stack([seen.numbers(name) for name in XYZ], axis=1).reshape(-1, 3)
+    where = _find(approximations, points)
+    refuse_duplicates(approximations, {"point": approximations.text("point")}, "point {point} is listed twice")
+    values = np.stack([approximations.numbers(name) for name in XYZ], axis=1)
+    start[where[where >= 0]] = values[where >= 0]
 
-    # Every row is checked, also of points that are then dropped.
-    _read_rows(table, np.arange(len(table)), settings)
-    seen, where = _observed(table, points)
-    role, rows = _read_rows(seen, where, settings)
+    # Rows of points that no image shows are checked like the others before they are dropped.
+    role, rows = _read_rows(table, _find(table, points), settings)
+    role, rows = role[rows.who >= 0], _take(rows, rows.who >= 0)
     by_role = {name: _take(rows, role == name) for name in ROLES}
     held = np.zeros(len(points.ids), bool)
     for name in ("control", "fixed"):
@@ -54,7 +54,7 @@ def read_control(table: Table, approximations: Table, points: Points, settings: 
     return Control(by_role["control"], by_role["fixed"], by_role["check"], start, known, held)
 
 
-def default_sigma(table: Table, line: int, column: str, settings: Settings, *keys: str) -> float:
+def default_sigma(table: Table, line: Line, column: str, settings: Settings, *keys: str) -> float:
     """The first of `keys` that [sigmas] has. Raises InputError, naming all that would help, if none."""
     for key in keys:
         if key in settings.sigmas:
@@ -66,19 +66,19 @@ def default_sigma(table: Table, line: int, column: str, settings: Settings, *key
     )
 
 
-def _observed(table: Table, points: Points) -> tuple[Table, np.ndarray]:
-    """The lines whose point is seen in an image, and the index of that point."""
+def _find(table: Table, points: Points) -> np.ndarray:
+    """The index of each line's point, -1 (and a warning) where no image shows it."""
     named = table.ids("point")
     index = points.find(named)
-    missing = np.flatnonzero(index < 0)
-    if len(missing):
-        listed = ", ".join(named[missing][:5]) + (", ..." if len(missing) > 5 else "")
+    missing = list(dict.fromkeys(named[index < 0]))
+    if missing:
+        listed = ", ".join(missing[:5]) + (", ..." if len(missing) > 5 else "")
         warnings.warn(
             f"{table.file}: {len(missing)} point(s) are measured in no image and are not used: {listed}",
             UserWarning,
-            stacklevel=3,
+            stacklevel=2,
         )
-    return table.take(index >= 0), index[index >= 0]
+    return index
 
 
 def _read_rows(table: Table, point: np.ndarray, settings: Settings) -> tuple[np.ndarray, Rows]:
@@ -90,13 +90,13 @@ def _read_rows(table: Table, point: np.ndarray, settings: Settings) -> tuple[np.
     sigma = np.stack([table.sigmas(name) for name in SIGMA_XYZ], axis=1)
     for line in np.flatnonzero(np.isnan(value).all(axis=1)):
         raise table.bad(line, "the point has no coordinate; give at least one, or delete the row")
-    line, axis = np.nonzero(~np.isnan(value))
+    lines, axes = np.nonzero(~np.isnan(value))
     refuse_duplicates(
-        table.take(line),
-        {"point": table.text("point")[line], "axis": np.array(AXES, object)[axis]},
+        table.take(lines),
+        {"point": table.text("point")[lines], "axis": np.array(AXES, object)[axes]},
         "{axis} of point {point} is given twice",
     )
-    for i, a in zip(line, axis, strict=True):
+    for i, a in zip(lines, axes, strict=True):
         if role[i] == "fixed":
             sigma[i, a] = 0.0
         elif np.isnan(sigma[i, a]) and role[i] == "control":
@@ -104,13 +104,13 @@ def _read_rows(table: Table, point: np.ndarray, settings: Settings) -> tuple[np.
             sigma[i, a] = default_sigma(table, i, SIGMA_XYZ[a], settings, *keys)
     # A check coordinate needs no sigma: it never enters an adjustment.
     sigma = np.nan_to_num(sigma)
-    rows = Rows(point[line], axis, value[line, axis], sigma[line, axis])
-    return role[line], rows
+    rows = Rows(point[lines], axes, jnp.asarray(value[lines, axes]), jnp.asarray(sigma[lines, axes]))
+    return role[lines], rows
 
 
 def _take(rows: Rows, chosen: np.ndarray) -> Rows:
-    who, axis = np.asarray(rows.who)[chosen], np.asarray(rows.axis)[chosen]
-    return Rows(who, axis, jnp.asarray(rows.value)[chosen], jnp.asarray(rows.sigma)[chosen])
+    value, sigma = (jnp.asarray(np.asarray(v)[chosen]) for v in (rows.value, rows.sigma))
+    return Rows(rows.who[chosen], rows.axis[chosen], value, sigma)
 
 
 def check_datum_points(over: object, points: Points, file: str) -> None:

@@ -14,22 +14,22 @@ from jaxphoto.io.tables import Table
 
 def read_stations(table: Table, images: Images, settings: Settings) -> Rows:
     """Observed positions, one row per coordinate given."""
-    image = images.index(table)
+    image = images.find(table)
     refuse_duplicates(table, {"image": table.text("image")}, "image {image} has two stations")
     value = np.stack([table.numbers(name, empty=True) for name in XYZ], axis=1)
     sigma = np.stack([table.sigmas(name) for name in SIGMA_XYZ], axis=1)
     for line in np.flatnonzero(np.isnan(value).all(axis=1)):
         raise table.bad(line, "the station has no coordinate; give at least one, or delete the row")
-    line, axis = np.nonzero(~np.isnan(value))
-    for i, a in zip(line, axis, strict=True):
+    lines, axes = np.nonzero(~np.isnan(value))
+    for i, a in zip(lines, axes, strict=True):
         if np.isnan(sigma[i, a]):
             sigma[i, a] = default_sigma(table, i, SIGMA_XYZ[a], settings, "station_m")
-    return Rows(image[line], axis, jnp.asarray(value[line, axis]), jnp.asarray(sigma[line, axis]))
+    return Rows(image[lines], axes, jnp.asarray(value[lines, axes]), jnp.asarray(sigma[lines, axes]))
 
 
 def read_attitudes(table: Table, images: Images, settings: Settings) -> Attitudes:
     """Observed attitudes, in radians."""
-    image = images.index(table)
+    image = images.find(table)
     refuse_duplicates(table, {"image": table.text("image")}, "image {image} has two attitudes")
     degrees = np.stack([table.numbers(name) for name in ATTITUDE], axis=1)
     check_angles(table, degrees, ATTITUDE)

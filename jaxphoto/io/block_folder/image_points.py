@@ -34,9 +34,11 @@ def read_image_points(table: Table, images: Images, settings: Settings) -> Point
     """The measurements, sorted by point and image. Raises InputError and BlockError (see `tests/io`)."""
     if not len(table):
         raise BlockError(f"{table.file}: there are no image points; list what was measured in the images")
-    image = images.index(table)
+    image = images.find(table)
     named = table.ids("point")
-    refuse_duplicates(table, {"image": table.text("image"), "point": named}, "point {point} is measured twice in image {image}")
+    refuse_duplicates(
+        table, {"image": table.text("image"), "point": named}, "point {point} is measured twice in image {image}"
+    )
     sensors = [settings.cameras[camera].sensor for camera in images.cameras]
     pixel = np.array([s.pixel_mm for s in sensors])[image]
     xy = _coordinates(table, image, sensors)
@@ -74,8 +76,8 @@ def _coordinates(table: Table, image: np.ndarray, sensors: list[Sensor]) -> np.n
     pairs = [pair for pair in (("x_mm", "y_mm"), ("column_px", "row_px")) if any(name in table for name in pair)]
     if len(pairs) != 1 or not all(name in table for name in pairs[0]):
         raise InputError(
-            f"{table.file}: the coordinates are not given by one pair of columns; use either x_mm and y_mm or column_px "
-            "and row_px"
+            f"{table.file}: the coordinates are not given by one pair of columns; use either x_mm and y_mm or "
+            "column_px and row_px"
         )
     values = np.stack([table.numbers(name) for name in pairs[0]], axis=1)
     half = np.array([(s.width_mm, s.height_mm) for s in sensors])[image] / 2

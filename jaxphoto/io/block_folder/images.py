@@ -30,7 +30,7 @@ class Images(NamedTuple):
     exterior: ExteriorOrientation
     known: np.ndarray
 
-    def index(self, table: Table, column: str = "image") -> np.ndarray:
+    def find(self, table: Table, column: str = "image") -> np.ndarray:
         """The index of the image each line of `table` names. Raises BlockError for one that is not listed."""
         named = table.ids(column)
         index = pd.Index(self.ids).get_indexer(pd.Index(named))
@@ -48,31 +48,32 @@ def read_images(table: Table, settings: Settings) -> Images:
         raise BlockError(f"{table.file}: there are no images; list at least two")
     refuse_duplicates(table, {"image": ids}, "image {image} is listed twice")
     cameras = table.ids("camera")
-    for line, camera in enumerate(cameras):
+    for number, camera in enumerate(cameras):
         if camera not in settings.cameras:
             known = ", ".join(settings.cameras)
             raise table.misfit(
-                line, f"camera {camera} has no table [cameras.{camera}] in {settings.file}; add it or use one of {known}"
+                number,
+                f"camera {camera} has no table [cameras.{camera}] in {settings.file}; add it or use one of {known}",
             )
     strips = table.text("strip")
-    for line in np.flatnonzero(strips == "default"):
-        raise table.bad(line, f"the strip name default means every strip in {settings.file}; give it another name")
+    for i in np.flatnonzero(strips == "default"):
+        raise table.bad(i, f"the strip name default means every strip in {settings.file}; give it another name")
     times = table.numbers("time_s", empty=True)
-    exterior, known = _exterior(table)
+    exterior, oriented = _exterior(table)
     return Images(
-        table, tuple(ids), tuple(cameras), tuple(strips), _centred(times, strips), ~np.isnan(times), exterior, known
+        table, tuple(ids), tuple(cameras), tuple(strips), _centred(times, strips), ~np.isnan(times), exterior, oriented
     )
 
 
 def check_times(images: Images, strips: dict, priors: dict) -> None:
     """Raise BlockError where a drift needs a time that is missing."""
-    for line, strip in enumerate(images.strips):
-        if strip in strips and not images.time_known[line]:
+    for i, strip in enumerate(images.strips):
+        if strip in strips and not images.time_known[i]:
             drifts = priors[strip].drift is not FIXED or np.any(np.asarray(strips[strip].drift) != 0)
             if drifts:
                 raise images.table.misfit(
-                    line,
-                    f"image {images.ids[line]} has no time_s, but its strip {strip} drifts; add the time, or make the "
+                    i,
+                    f"image {images.ids[i]} has no time_s, but its strip {strip} drifts; add the time, or make the "
                     'drift "fixed"',
                 )
 

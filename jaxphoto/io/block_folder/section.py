@@ -88,7 +88,7 @@ class Section:
         shape = np.shape(start)
         sigma = self._array(key, status[names["sigma"][0]], shape) * scale
         if not np.all(sigma > 0):
-            raise self.error(key, f"sigma = {status[names['sigma'][0]]} is not positive; give the true one or \"fixed\"")
+            raise self.error(key, f'sigma = {status[names["sigma"][0]]} is not positive; give the true one or "fixed"')
         value = self._array(key, status[names["value"][0]], shape) * scale if names["value"] else np.asarray(start)
         return Weighted(jnp.asarray(value, float), jnp.asarray(sigma, float))
 
@@ -97,7 +97,7 @@ class Section:
         numbers = np.array([self._finite(key, v) for v in values])
         if len(numbers) not in (1, *shape):
             raise self.error(key, f"{value!r} has {len(numbers)} numbers; give one, or one per axis")
-        return np.broadcast_to(numbers, shape).copy() if shape else numbers[0]
+        return np.broadcast_to(numbers, shape).copy() if shape else numbers.reshape(())
 
     def _finite(self, key: str, value) -> float:
         if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):

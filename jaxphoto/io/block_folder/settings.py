@@ -83,7 +83,8 @@ def _check_frame(section: Section) -> None:
     kind = section.text("kind", "local")
     if kind == "epsg":
         raise section.error(
-            "kind", "this version reads local and enu frames only; convert the coordinates to a local east-north-up frame"
+            "kind",
+            "this version reads local and enu frames only; convert the coordinates to a local east-north-up frame",
         )
     if kind not in ("local", "enu"):
         raise section.error("kind", f'{kind!r} is no frame; write "local" or "enu"')
@@ -114,7 +115,7 @@ def _read_datum(section: Section) -> Datum:
 
 def _table_lines(path: str, values: dict[str, Any]) -> list[str]:
     lines = [f"{_key(k)} = {_value(v)}" for k, v in values.items() if not _is_table(v)]
-    if path and (lines or not values):
+    if path and lines:
         lines = ["", f"[{path}]", *lines]
     for key, value in values.items():
         if _is_table(value):

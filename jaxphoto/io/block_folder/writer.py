@@ -1,10 +1,11 @@
 """`Block` -> a block folder, made whole beside its place and then moved there."""
 
+import csv
 import math
 import shutil
 import tempfile
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import numpy as np
@@ -38,7 +39,10 @@ def write_block(block: Block, folder: str | Path) -> None:
         (made / TOML).write_text(toml_text(settings), encoding="utf-8")
         for name, frame in tables.items():
             if LAYOUTS[name].needed or len(frame):
-                frame.to_csv(made / f"{name}.csv", index=False)
+                # A first id that starts with # is quoted, or its line would be a comment.
+                comment = frame.iloc[:, 0].astype(str).str.startswith("#").any()
+                quoting: Literal[0, 2] = csv.QUOTE_NONNUMERIC if comment else csv.QUOTE_MINIMAL
+                frame.to_csv(made / f"{name}.csv", index=False, quoting=quoting)
         made.chmod(0o755)
         _replace(folder, made)
     finally:
@@ -135,7 +139,7 @@ def _images(block: Block) -> pd.DataFrame:
 
 def _xyz_rows(id_column: str, ids: np.ndarray, rows: Rows) -> pd.DataFrame:
     """One line per point or image; coordinates that are not observed, and sigmas of zero, are left empty."""
-    who, line = np.unique(np.asarray(rows.who), return_inverse=True)
+    line, who = pd.factorize(np.asarray(rows.who))
     table = np.full((len(who), 6), math.nan)
     table[line, rows.axis] = rows.value
     table[line, np.asarray(rows.axis) + 3] = np.where(np.asarray(rows.sigma) > 0, rows.sigma, math.nan)

@@ -1,0 +1,63 @@
+"""Any format that is known -> `Block`, or -> a block folder."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from jaxphoto.block import Block
+from jaxphoto.errors import InputError
+from jaxphoto.io import aicon, dbat, photomodeler
+from jaxphoto.io.block_folder import BlockTables, assemble, write_block
+from jaxphoto.io.block_folder.layout import TOML
+from jaxphoto.io.block_folder.reader import read_folder
+
+
+class Format(NamedTuple):
+    """A format: what tells it, and its reader."""
+
+    recognises: Callable[[Path], bool]
+    read: Callable[[Path], BlockTables]
+
+
+FORMATS = {
+    "block": Format(lambda source: (source / TOML).is_file(), read_folder),
+    "dbat": Format(dbat.recognises, dbat.read_dbat),
+    "photomodeler": Format(photomodeler.recognises, photomodeler.read_photomodeler),
+    "aicon": Format(aicon.recognises, aicon.read_aicon),
+}
+
+
+def read_source(source: str | Path, format: str | None = None, *, stations: bool = True) -> Block:
+    """The block in a file or folder of any format of `FORMATS`, recognised unless `format` names it.
+
+    `stations` False leaves observed camera positions out. Raises InputError for an unknown format, and what
+    `jaxphoto.io.read_block` raises.
+    """
+    source = Path(source)
+    if not source.exists():
+        raise InputError(f"there is no file or folder {source}; correct the name")
+    tables = FORMATS[_format(source, format)].read(source)
+    if not stations:
+        kept = {name: table for name, table in tables.tables.items() if name != "stations"}
+        tables = BlockTables(tables.settings, kept, tables.file)
+    return assemble(tables)
+
+
+def convert(source: str | Path, folder: str | Path, format: str | None = None, *, stations: bool = True) -> Block:
+    """Write what `read_source` reads as a block folder, and return it. Raises what these two raise."""
+    block = read_source(source, format, stations=stations)
+    write_block(block, folder)
+    return block
+
+
+def _format(source: Path, name: str | None) -> str:
+    known = ", ".join(FORMATS)
+    if name is None:
+        found = [name for name, format in FORMATS.items() if format.recognises(source)]
+        if len(found) != 1:
+            what = f"is of several formats at once ({', '.join(found)})" if found else "is of no format that is known"
+            raise InputError(f"{source} {what}; name the format, one of {known}")
+        return found[0]
+    if name not in FORMATS:
+        raise InputError(f"the format {name!r} is unknown; choose one of {known}")
+    return name

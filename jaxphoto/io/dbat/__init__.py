@@ -1,0 +1,5 @@
+"""DBAT (Damped Bundle Adjustment Toolbox) scripts."""
+
+from jaxphoto.io.dbat.reader import CAMERA, control_table, read_dbat, recognises
+
+__all__ = ["CAMERA", "control_table", "read_dbat", "recognises"]

@@ -1,0 +1,25 @@
+"""The main job: complete the start values of a block and adjust it."""
+
+from jaxphoto.adjustment import MAX_STEPS, Adjustment, solve
+from jaxphoto.block import Block
+from jaxphoto.orientation import approximate
+from jaxphoto.unknowns import Unknowns
+
+
+def adjust(
+    block: Block, start: Unknowns | None = None, priors: Unknowns | None = None, *, max_steps: int = MAX_STEPS
+) -> Adjustment:
+    """Self-calibrating bundle adjustment of `block`.
+
+    `start` gives every unknown an approximate value; where it is None, those of the block are completed by resection
+    and intersection. `priors` says what is FREE, FIXED or Weighted; where it is None, what the block says.
+
+    With `start` given it is a pure function of the numbers in its arguments: `jax.grad` and `jax.vmap` go through it.
+
+    Raises BlockError where no approximate values can be found, DatumError where position, orientation or scale are left
+    open, RankError where the observations cannot tell unknowns apart. A solve that does not converge is no error: see
+    `Adjustment.outcome`.
+    """
+    if start is None:
+        start = approximate(block)
+    return solve(block, start, block.priors if priors is None else priors, max_steps)

@@ -1,0 +1,13 @@
+"""Tables, plots, the HTML report and the result folder of an adjustment."""
+
+from jaxphoto.report.page import report_page
+from jaxphoto.report.plots import correlation_figure, layout_figure, residuals_figure
+from jaxphoto.report.results import check_target, summary_of, write_results
+from jaxphoto.report.tables import Tables
+from jaxphoto.report.terminal import print_adjustment
+from jaxphoto.report.verdict import warnings_of
+
+__all__ = [
+    "Tables", "check_target", "correlation_figure", "layout_figure", "print_adjustment", "report_page",
+    "residuals_figure", "summary_of", "warnings_of", "write_results",
+]  # fmt: skip

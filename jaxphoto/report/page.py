@@ -1,0 +1,86 @@
+"""The HTML report: one file that opens offline, judgement first, then tables and pictures."""
+
+import base64
+import io
+
+import numpy as np
+import pandas as pd
+from jinja2 import Environment
+from markupsafe import Markup
+from matplotlib.figure import Figure
+
+from jaxphoto.report.plots import correlation_figure, layout_figure, residuals_figure
+from jaxphoto.report.tables import Tables
+
+_PAGE = """<!DOCTYPE html>
+<html lang="en"><head><meta charset="utf-8"><title>{{ title }}</title><style>
+body { font: 15px/1.45 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: #222 }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; margin: .5rem 0 1.5rem; font-size: 13px }
+th, td { padding: .2rem .7rem; border-bottom: 1px solid #ddd; text-align: right } th { background: #f4f4f4 }
+th:first-child, td:first-child { text-align: left } img { max-width: 100% }
+.good { color: #176b2c } .bad { color: #a11 } .warning { border-left: 4px solid #d90; padding-left: .6rem; margin: .4rem 0 }
+</style></head><body>
+<h1>{{ title }}</h1>
+<p class="{{ 'good' if converged else 'bad' }}"><b>{{ outcome }}</b> ({{ steps }} iterations)</p>
+<p>&sigma;<sub>0</sub> = <b>{{ sigma0 }}</b>, redundancy {{ redundancy }}: {{ counts }}.
+Standard deviations are a posteriori (times &sigma;<sub>0</sub>). Correlations refer to the rotations {{ rotations }}.</p>
+{% for w in warnings %}<p class="warning">{{ w }}</p>{% else %}<p>No warnings.</p>{% endfor %}
+<h2>Interior orientation</h2>{{ interior }}
+{% for figure in correlation %}<img alt="correlations" src="{{ figure }}">{% endfor %}
+<h2>Block</h2><img alt="block layout" src="{{ layout }}">
+<h2>Residuals</h2>{{ spread }}
+{% for figure in residuals %}<img alt="image residuals" src="{{ figure }}">{% endfor %}
+<h3>Largest normalised residuals</h3>{{ largest }}
+{% if check %}<h2>Check points: surveyed minus computed</h2>{{ check_spread }}{{ check }}{% endif %}
+<h2>Exterior orientation</h2>{{ exterior }}
+<h2>Correlation of exterior and interior orientation over the images</h2>{{ summary }}
+</body></html>
+"""
+_LARGEST = 20
+
+
+def report_page(tables: Tables, warnings: list[str]) -> str:
+    """The whole report as HTML, pictures inside."""
+    a = tables.adjusted
+    counts = [f"{n} {group.replace('_', ' ')}" for group, n in a.n_observations.items() if n]
+    counts += [f"{a.n_constraints} constraints of the datum"] if a.n_constraints else []
+    used = [c for c, corr in tables.correlations.items() if corr.parameters and corr.images]
+    largest = tables.residuals.assign(size=tables.residuals["w"].abs()).nlargest(_LARGEST, "size")
+    check = tables.check_points
+    return Environment(autoescape=True).from_string(_PAGE).render(
+        title=a.block.title or "jaxphoto adjustment",
+        converged=bool(a.converged),
+        outcome=a.outcome.value,
+        steps=int(a.steps),
+        sigma0=f"{float(a.sigma0):.6g}",
+        redundancy=a.redundancy,
+        counts=", ".join(counts) + f"; {sum(a.n_unknowns.values())} unknowns",
+        rotations=tables.rotations.replace("_", ", "),
+        warnings=warnings,
+        interior=_html(tables.interior),
+        correlation=[_picture(correlation_figure(tables, c)) for c in used],
+        layout=_picture(layout_figure(tables)),
+        spread=_html(tables.residual_spread),
+        residuals=[_picture(residuals_figure(tables, c)) for c in a.unknowns.interior],
+        largest=_html(largest.drop(columns="size")),
+        check=_html(check) if len(check) else "",
+        check_spread=_html(_check_spread(check)) if len(check) else "",
+        exterior=_html(tables.exterior),
+        summary=_html(tables.correlation_summary),
+    )
+
+
+def _check_spread(check: pd.DataFrame) -> pd.DataFrame:
+    values = check.drop(columns="point")
+    rows = {"mean": values.mean(), "rmse": np.sqrt((values**2).mean()), "max_abs": values.abs().max()}
+    return pd.DataFrame(rows).T.reset_index(names="check points")
+
+
+def _html(table: pd.DataFrame) -> Markup:
+    return Markup(table.to_html(index=False, border=0, na_rep="", float_format=lambda v: f"{v:.8g}"))
+
+
+def _picture(figure: Figure) -> str:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png")
+    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()

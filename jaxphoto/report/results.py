@@ -1,0 +1,76 @@
+"""The result folder of an adjustment: written whole beside its place, then moved into it."""
+
+import json
+import shutil
+import tempfile
+import time
+from importlib.metadata import version
+from pathlib import Path
+
+from jaxphoto.adjustment import Adjustment
+from jaxphoto.errors import InputError
+from jaxphoto.report.page import report_page
+from jaxphoto.report.tables import Tables
+
+_TABLES = (
+    "interior",
+    "exterior",
+    "object_points",
+    "residuals",
+    "check_points",
+    "correlation",
+    "correlation_summary",
+)
+_PACKAGES = ("jaxphoto", "jax", "optimistix", "equinox", "lineax", "numpy", "pandas")
+
+
+def check_target(directory: Path) -> None:
+    """Raise InputError where results must not be written: a file, or a folder that holds something else."""
+    if directory.is_file():
+        raise InputError(f"{directory} is a file: name a folder for the results")
+    if directory.is_dir() and any(directory.iterdir()) and not (directory / "summary.json").is_file():
+        raise InputError(f"{directory} is not empty and holds no earlier results: name a new folder")
+
+
+def write_results(tables: Tables, warnings: list[str], directory: Path, seconds: dict[str, float]) -> None:
+    """Write the files of docs/block_folder.md into `directory`, replacing earlier results only when all is written.
+
+    `seconds` (read, compile, solve, covariance) goes into summary.json with the time of writing. Raises InputError
+    where `directory` holds something that is not an earlier result.
+    """
+    check_target(directory)
+    began = time.perf_counter()
+    directory.parent.mkdir(parents=True, exist_ok=True)
+    work = Path(tempfile.mkdtemp(prefix=f".{directory.name}-", dir=directory.parent))
+    try:
+        work.chmod(0o755)
+        for name in _TABLES:
+            getattr(tables, name).to_csv(work / f"{name}.csv", index=False)
+        (work / "report.html").write_text(report_page(tables, warnings), encoding="utf-8")
+        summary = summary_of(tables.adjusted, warnings, seconds | {"write": time.perf_counter() - began})
+        (work / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+        if directory.exists():
+            shutil.rmtree(directory)
+        work.rename(directory)
+    except BaseException:
+        shutil.rmtree(work, ignore_errors=True)
+        raise
+
+
+def summary_of(adjusted: Adjustment, warnings: list[str], seconds: dict[str, float]) -> dict:
+    """What summary.json says."""
+    observations, unknowns = adjusted.n_observations, adjusted.n_unknowns
+    return {
+        "title": adjusted.block.title,
+        "converged": bool(adjusted.converged),
+        "outcome": adjusted.outcome.value,
+        "sigma0": float(adjusted.sigma0),
+        "redundancy": adjusted.redundancy,
+        "n_observations": {"total": sum(observations.values()), **observations},
+        "n_constraints": adjusted.n_constraints,
+        "n_unknowns": {"total": sum(unknowns.values()), **unknowns},
+        "iterations": int(adjusted.steps),
+        "seconds": {name: round(value, 6) for name, value in seconds.items()},
+        "warnings": warnings,
+        "versions": {name: version(name) for name in _PACKAGES},
+    }

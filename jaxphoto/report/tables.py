@@ -1,0 +1,192 @@
+"""The tables of an adjustment as pandas frames: the columns of the result folder (docs/block_folder.md)."""
+
+from functools import cached_property
+
+import jax
+import numpy as np
+import pandas as pd
+
+from jaxphoto.adjustment import Adjustment
+from jaxphoto.adjustment.residuals import Residuals
+from jaxphoto.block import ATTITUDE_AXES, AXES
+from jaxphoto.camera import constant_names, get_parameter, parameter_names
+from jaxphoto.rotation import omega_phi_kappa_from_matrix
+from jaxphoto.statistics import (
+    Correlations,
+    Covariance,
+    Rotations,
+    Significance,
+    a_priori_sigmas,
+    check_discrepancies,
+    correlations,
+    covariance,
+    normalised_residuals,
+    physical_residuals,
+    redundancy_numbers,
+    residual_spread,
+    significance,
+)
+
+_ANGLES = jax.jit(jax.vmap(omega_phi_kappa_from_matrix))
+
+
+class Tables:
+    """An adjustment as tables, each computed when first asked for.
+
+    `rotations` says which rotations the correlations mean (see `jaxphoto.covariance`). Sigmas are a posteriori (times
+    sigma0) unless a column says otherwise; units stand in the column names or in a column `unit`.
+    """
+
+    def __init__(self, adjusted: Adjustment, rotations: Rotations = "omega_phi_kappa"):
+        self.adjusted = adjusted
+        self.rotations: Rotations = rotations
+
+    @cached_property
+    def covariance(self) -> Covariance:
+        """Covariance with omega, phi, kappa."""
+        return covariance(self.adjusted)
+
+    @cached_property
+    def redundancy(self) -> Residuals:
+        """Redundancy number of every observation."""
+        return redundancy_numbers(self.adjusted)
+
+    @cached_property
+    def w(self) -> Residuals:
+        """Normalised residual of every observation."""
+        return normalised_residuals(self.adjusted, self.redundancy)
+
+    @cached_property
+    def correlations(self) -> dict[str, Correlations]:
+        """Correlations by camera, as arrays."""
+        chosen = self.covariance if self.rotations == "omega_phi_kappa" else covariance(self.adjusted, self.rotations)
+        return correlations(self.adjusted, chosen)
+
+    @cached_property
+    def significance(self) -> list[Significance]:
+        """Ratio and t-test of every estimated interior parameter."""
+        return significance(self.adjusted, self.covariance)
+
+    @cached_property
+    def interior(self) -> pd.DataFrame:
+        """camera, parameter, value, sigma, significant; fixed parameters have neither of the latter two."""
+        tested = {(s.camera, s.parameter): s for s in self.significance}
+        rows = []
+        for camera, interior in self.adjusted.unknowns.interior.items():
+            for name in (*parameter_names(interior), *constant_names(type(interior.distortion))):
+                test = tested.get((camera, name))
+                known = (test.sigma, test.significant) if test else (np.nan, None)
+                rows.append((camera, name, float(get_parameter(interior, name)), *known))
+        return pd.DataFrame(rows, columns=["camera", "parameter", "value", "sigma", "significant"])
+
+    @cached_property
+    def exterior(self) -> pd.DataFrame:
+        """image, X_m ... kappa_deg and their sigmas."""
+        exterior = self.adjusted.unknowns.exterior
+        angles = np.degrees(np.asarray(_ANGLES(exterior.camera_from_object)))
+        sigma = np.asarray(self.covariance.exterior_sigma) * [1, 1, 1, *[180 / np.pi] * 3]
+        names = ["X_m", "Y_m", "Z_m", "omega_deg", "phi_deg", "kappa_deg"]
+        values = np.hstack([np.asarray(exterior.position), angles, sigma])
+        table = pd.DataFrame(values, columns=[*names, *(f"sigma_{n}" for n in names)])
+        table.insert(0, "image", self.adjusted.block.images)
+        return table
+
+    @cached_property
+    def object_points(self) -> pd.DataFrame:
+        """point, coordinates, sigmas, and in how many images it was measured."""
+        names = [f"{a}_m" for a in AXES]
+        values = np.hstack([np.asarray(self.adjusted.unknowns.points), np.asarray(self.covariance.point_sigma)])
+        table = pd.DataFrame(values, columns=[*names, *(f"sigma_{n}" for n in names)])
+        table.insert(0, "point", self.adjusted.block.points)
+        table["n_images"] = np.bincount(self.adjusted.structure.point, minlength=len(table))
+        return table
+
+    @cached_property
+    def residuals(self) -> pd.DataFrame:
+        """One row an observation: group, image, point, axis, residual, sigma, unit, redundancy_number, w.
+
+        `sigma` is a priori; `w` is the residual over its own standard deviation, sigma0 sigma sqrt(redundancy_number).
+        """
+        residual, sigma = physical_residuals(self.adjusted), a_priori_sigmas(self.adjusted)
+        frames = []
+        for (group, image, point, axis, factor, unit), r, w in zip(
+            self._groups(), self.redundancy[:-1], self.w[:-1], strict=True
+        ):
+            # Rows run along the last axis; the components of a row stand together.
+            flat = lambda v, shape=r.shape: np.broadcast_to(np.asarray(v), shape).T.ravel()  # noqa: E731
+            columns = {
+                "group": group,
+                "image": flat(image),
+                "point": flat(point),
+                "axis": flat(axis),
+                "residual": factor * flat(residual[group]),
+                "sigma": factor * flat(sigma[group]),
+                "unit": unit,
+                "redundancy_number": flat(r),
+                "w": flat(w),
+            }
+            if r.size:
+                frames.append(pd.DataFrame(columns))
+        return pd.concat(frames, ignore_index=True)
+
+    def _groups(self) -> tuple[tuple, ...]:
+        """Group, image, point, axis, factor to the unit and unit, in the order of `Residuals`."""
+        block, s = self.adjusted.block, self.adjusted.structure
+        images, points, axes, nobody = np.array(block.images), np.array(block.points), np.array(AXES), ""
+        ends = np.array([f"{points[a]}-{points[b]}" for a, b in s.distance_points], dtype=object)
+        labels = np.array([s.labels[j] for j in s.weighted], dtype=object)
+        attitude_axes = np.array(ATTITUDE_AXES)[:, None]
+        return (
+            ("image_points", images[s.image], points[s.point], np.array([["x"], ["y"]]), 1.0, "mm"),
+            ("stations", images[s.station_image], nobody, axes[s.station_axis], 1.0, "m"),
+            ("attitudes", images[s.attitude_image], nobody, attitude_axes, 180 / np.pi, "deg"),
+            ("control_points", nobody, points[s.control_point], axes[s.control_axis], 1.0, "m"),
+            ("distances", nobody, ends, nobody, 1.0, "m"),
+            ("priors", nobody, nobody, labels, 1.0, nobody),
+        )
+
+    @cached_property
+    def check_points(self) -> pd.DataFrame:
+        """point, dX_m, dY_m, dZ_m: surveyed minus computed; empty where an axis was not surveyed."""
+        rows = check_discrepancies(self.adjusted)
+        points = list(dict.fromkeys(rows.who.tolist()))
+        place = {p: k for k, p in enumerate(points)}
+        values = np.full((len(points), 3), np.nan)
+        values[[place[p] for p in rows.who.tolist()], rows.axis] = rows.value
+        table = pd.DataFrame(values, columns=[f"d{a}_m" for a in AXES])
+        table.insert(0, "point", [self.adjusted.block.points[p] for p in points])
+        return table
+
+    @cached_property
+    def correlation(self) -> pd.DataFrame:
+        """parameter_a, parameter_b, rho: every IOP with every other, and each image's EOP with its camera's IOP."""
+        rows = []
+        for camera, c in self.correlations.items():
+            labels = [f"interior[{camera}].{p}" for p in c.parameters]
+            rows += [(a, b, c.interior[i, j]) for i, a in enumerate(labels) for j, b in enumerate(labels) if i != j]
+            for image, rho in zip(c.images, c.exterior, strict=True):
+                for name, row in zip(c.eop_names, rho, strict=True):
+                    rows += [(f"exterior[{image}].{name}", b, value) for b, value in zip(labels, row, strict=True)]
+        return pd.DataFrame(rows, columns=["parameter_a", "parameter_b", "rho"])
+
+    @cached_property
+    def correlation_summary(self) -> pd.DataFrame:
+        """camera, exterior, interior, mean_abs_rho, max_abs_rho over the camera's images (paper 000, Table 4)."""
+        rows = []
+        for camera, c in self.correlations.items():
+            if c.images and c.parameters:
+                mean, largest = c.mean_abs, c.max_abs
+                rows += [
+                    (camera, name, parameter, mean[i, j], largest[i, j])
+                    for i, name in enumerate(c.eop_names)
+                    for j, parameter in enumerate(c.parameters)
+                ]
+        return pd.DataFrame(rows, columns=["camera", "exterior", "interior", "mean_abs_rho", "max_abs_rho"])
+
+    @cached_property
+    def residual_spread(self) -> pd.DataFrame:
+        """group, axis, n, mean, rmse, max_abs, unit (paper 000, Table 3)."""
+        columns = ["group", "axis", "n", "mean", "rmse", "max_abs", "unit"]
+        return pd.DataFrame(
+            [[getattr(s, c) for c in columns] for s in residual_spread(self.adjusted)], columns=columns
+        )

@@ -1,0 +1,80 @@
+"""What a person should know first: warnings about an adjustment, most serious first, each with what to do."""
+
+import jax
+import numpy as np
+
+from jaxphoto.adjustment import Adjustment
+from jaxphoto.camera import Sensor
+from jaxphoto.report.tables import Tables
+from jaxphoto.statistics import SIGNIFICANT_RATIO, Correlations
+
+HIGH_CORRELATION = 0.9
+LARGE_W = 4.0
+_SHOWN = 4
+
+
+def warnings_of(tables: Tables) -> list[str]:
+    """Non-convergence, high correlations, insignificant IOP, large residuals, range of the distortion model."""
+    adjusted, found = tables.adjusted, []
+    if not bool(adjusted.converged):
+        found.append(adjusted.outcome.value)
+    for camera, c in tables.correlations.items():
+        found += _correlated(camera, c)
+    weak = [s for s in tables.significance if not s.significant]
+    found += [
+        f"{s.parameter} of camera {s.camera} is not significant: |value| is {s.ratio:.1f} sigma (asked: {SIGNIFICANT_RATIO:.0f}"
+        f"; t-test p = {s.p_value:.2g}); consider holding it fixed"
+        for s in weak
+    ]
+    found += _large_residuals(tables)
+    found += [
+        f"camera {name}: its distortion folds inside the format; image points beyond the fold mean nothing, use fewer "
+        "coefficients or more points in the corners"
+        for name, sensor in adjusted.block.sensors.items()
+        if _folds(adjusted, name, sensor)
+    ]
+    return found
+
+
+def _correlated(camera: str, c: Correlations) -> list[str]:
+    found = []
+    pairs = [
+        (abs(c.interior[i, j]), c.interior[i, j], a, c.parameters[j])
+        for i, a in enumerate(c.parameters)
+        for j in range(i)
+        if abs(c.interior[i, j]) > HIGH_CORRELATION
+    ]
+    for _, rho, a, b in sorted(pairs, reverse=True)[:_SHOWN]:
+        found.append(f"high correlation of {a} and {b} of camera {camera}: {rho:+.3f}; their sum is known better than each")
+    if len(c.images) == 0 or not c.parameters:
+        return found
+    worst = c.max_abs
+    for i, j in sorted(np.argwhere(worst > HIGH_CORRELATION).tolist(), key=lambda k: -worst[k[0], k[1]])[:_SHOWN]:
+        image = c.images[int(np.abs(c.exterior[:, i, j]).argmax())]
+        found.append(
+            f"high correlation of {c.eop_names[i]} with {c.parameters[j]} of camera {camera}: up to {worst[i, j]:.3f} (image "
+            f"{image}); add cross strips, control or height differences"
+        )
+    return found
+
+
+def _large_residuals(tables: Tables) -> list[str]:
+    w, block = np.asarray(tables.w.image), tables.adjusted.block
+    rows = block.image_points
+    size = np.nan_to_num(np.abs(w)).max(axis=0)
+    large = np.flatnonzero(size > LARGE_W)
+    if not len(large):
+        return []
+    shown = large[np.argsort(-size[large])][:_SHOWN]
+    names = ", ".join(f"point {block.points[rows.point[k]]} in image {block.images[rows.image[k]]} ({size[k]:.1f})" for k in shown)
+    return [f"{len(large)} image points have residuals over {LARGE_W:.0f} of their standard deviations: {names}; check for blunders"]
+
+
+def _folds(adjusted: Adjustment, name: str, sensor: Sensor) -> bool:
+    """Whether the corner of the format lies beyond the monotone range of the adjusted distortion."""
+    interior = adjusted.unknowns.interior[name]
+    corner = np.array([sensor.width_mm, sensor.height_mm]) / 2
+    r = np.linspace(0.0, 1.0, 65)[:, None] * corner
+    out = np.asarray(jax.vmap(interior.distortion.closed_form)(r))
+    return bool((np.diff(np.linalg.norm(out, axis=1)) <= 0).any())
+

@@ -1,0 +1,71 @@
+"""Measure a block anew: the same rows, computed from known unknowns, with fresh noise of their own sigmas."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from jaxphoto.block import Block
+from jaxphoto.collinearity import ExteriorOrientation, project
+from jaxphoto.georeferencing import Mount, StripBias, object_from_body, sensor_position
+from jaxphoto.rotation import roll_pitch_yaw_from_matrix
+from jaxphoto.unknowns import Unknowns
+
+
+def remeasure(block: Block, truth: Unknowns, key: PRNGKeyArray) -> Block:
+    """`block` with every observation replaced by its true value under `truth` plus normal noise of its sigma.
+
+    Image points, stations, attitudes, control and distances are drawn independently; check and fixed coordinates become
+    true ones; weighted priors stay. Pure and differentiable in `truth`; `vmap` over keys gives many blocks at once.
+    Which unknowns it is called with is what an adjustment of it should recover.
+    """
+    keys = jax.random.split(key, 5)
+    draw = lambda k, value, sigma: value + jnp.asarray(sigma) * jax.random.normal(k, value.shape)  # noqa: E731
+    rows, points = block.image_points, jnp.asarray(truth.points)
+    stations, attitudes = _georeferenced(block, truth)
+    a, b = np.asarray(block.distances.points).reshape(-1, 2).T
+    length = jnp.sqrt(jnp.sum((points[a] - points[b]) ** 2, axis=1))
+    where = lambda x: (  # noqa: E731
+        x.image_points.xy, x.stations.value, x.attitudes.roll_pitch_yaw, x.control.value, x.distances.value,
+        x.check.value, x.fixed.value,
+    )  # fmt: skip
+    new = (
+        draw(keys[0], image_coordinates(block, truth), rows.sigma),
+        draw(keys[1], stations, block.stations.sigma),
+        draw(keys[2], attitudes, block.attitudes.sigma),
+        draw(keys[3], points[block.control.who, block.control.axis], block.control.sigma),
+        draw(keys[4], length, block.distances.sigma),
+        points[block.check.who, block.check.axis],
+        points[block.fixed.who, block.fixed.axis],
+    )
+    return eqx.tree_at(where, block, new)
+
+
+def image_coordinates(block: Block, truth: Unknowns) -> Float[Array, "rows 2"]:
+    """Measured image coordinates (mm, without noise) of every image row under `truth`."""
+    image, point = np.asarray(block.image_points.image), np.asarray(block.image_points.point)
+    camera = np.array(block.image_camera)[image]
+    exterior, points = jax.tree.map(jnp.asarray, (truth.exterior, truth.points))
+    xy = jnp.zeros((len(image), 2))
+    for name, interior in truth.interior.items():
+        mine = np.flatnonzero(camera == name)
+        eo = ExteriorOrientation(exterior.position[image[mine]], exterior.camera_from_object[image[mine]])
+        xy = xy.at[mine].set(jax.vmap(project, in_axes=(None, 0, 0))(interior, eo, points[point[mine]]))
+    return xy
+
+
+def _georeferenced(block: Block, truth: Unknowns) -> tuple[Float[Array, "stations"], Float[Array, "attitudes 3"]]:
+    """What GNSS and IMU would observe, without noise."""
+    zero = jnp.zeros(3)
+    mounts = [truth.mounts.get(m, Mount(zero, zero)) for m in block.image_mount]
+    strips = [truth.strips.get(s, StripBias(zero, zero)) for s in block.image_strip]
+    stack = lambda trees: jax.tree.map(lambda *v: jnp.stack([jnp.asarray(x) for x in v]), *trees)  # noqa: E731
+    mount, strip = stack(mounts), stack(strips)
+    exterior = jax.tree.map(jnp.asarray, truth.exterior)
+    sensors = jax.vmap(sensor_position)(
+        exterior.position, exterior.camera_from_object, mount, strip, jnp.asarray(block.image_time)
+    )
+    bodies = jax.vmap(object_from_body)(exterior.camera_from_object, mount.boresight)
+    angles = jax.vmap(roll_pitch_yaw_from_matrix)(bodies)
+    return sensors[block.stations.who, block.stations.axis], angles[np.asarray(block.attitudes.image)]

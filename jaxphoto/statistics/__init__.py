@@ -1,0 +1,23 @@
+"""What an adjustment is worth: covariance, correlation, reliability, significance, discrepancies."""
+
+from jaxphoto.statistics.correlation import Correlations, correlation_matrix, correlations
+from jaxphoto.statistics.covariance import EOP_NAMES, Covariance, Rotations, covariance
+from jaxphoto.statistics.discrepancy import (
+    Spread,
+    a_priori_sigmas,
+    angle_differences,
+    check_discrepancies,
+    physical_residuals,
+    point_differences,
+    residual_spread,
+    spread_of,
+)
+from jaxphoto.statistics.reliability import normalised_residuals, redundancy_numbers
+from jaxphoto.statistics.significance import SIGNIFICANT_RATIO, Significance, significance
+
+__all__ = [
+    "EOP_NAMES", "SIGNIFICANT_RATIO", "Correlations", "Covariance", "Rotations", "Significance", "Spread",
+    "a_priori_sigmas", "angle_differences", "check_discrepancies", "correlation_matrix", "correlations", "covariance",
+    "normalised_residuals", "physical_residuals", "point_differences", "redundancy_numbers", "residual_spread",
+    "significance", "spread_of",
+]  # fmt: skip

@@ -1,0 +1,62 @@
+"""Correlations: interior with interior orientation, and each image's exterior with its camera's interior.
+
+Source: paper 000, Table 4 (mean absolute correlation over the images, per angle or coordinate and IOP).
+"""
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from jaxphoto.adjustment import Adjustment
+from jaxphoto.statistics.covariance import EOP_NAMES, Covariance
+
+
+class Correlations(eqx.Module):
+    """Correlation coefficients of one camera, as arrays with the names of their axes."""
+
+    camera: str = eqx.field(static=True)
+    parameters: tuple[str, ...] = eqx.field(static=True)
+    """The camera's estimated interior parameters (c_mm ...)."""
+    eop_names: tuple[str, ...] = eqx.field(static=True)
+    images: tuple[str, ...] = eqx.field(static=True)
+    interior: Float[np.ndarray, "iop iop"]
+    exterior: Float[np.ndarray, "images 6 iop"]
+
+    @property
+    def mean_abs(self) -> Float[np.ndarray, "6 iop"]:
+        """Mean over the camera's images of |rho| (paper 000, Table 4)."""
+        return np.abs(self.exterior).mean(axis=0)
+
+    @property
+    def max_abs(self) -> Float[np.ndarray, "6 iop"]:
+        """Maximum over the camera's images of |rho|."""
+        return np.abs(self.exterior).max(axis=0)
+
+
+def correlation_matrix(covariance: Covariance) -> Float[np.ndarray, "reduced reduced"]:
+    """Correlations of everything in `covariance.labels`; zero for what is fixed."""
+    matrix = np.asarray(covariance.matrix)
+    sigma = np.sqrt(np.maximum(np.diagonal(matrix), 0.0))
+    inverse = np.where(sigma > 0, 1 / np.where(sigma > 0, sigma, 1.0), 0.0)
+    return matrix * inverse[:, None] * inverse[None, :]
+
+
+def correlations(adjusted: Adjustment, covariance: Covariance) -> dict[str, Correlations]:
+    """By camera: IOP x IOP, and EOP x IOP of each of its images."""
+    rho, n = correlation_matrix(covariance), 6 * covariance.n_images
+    names = EOP_NAMES[covariance.rotations]
+    result = {}
+    for camera in adjusted.unknowns.interior:
+        prefix = f"interior[{camera}]."
+        columns = [k for k, label in enumerate(covariance.labels) if k >= n and label.startswith(prefix)]
+        images = [i for i, c in enumerate(adjusted.block.image_camera) if c == camera]
+        exterior = rho[:n].reshape(-1, 6, rho.shape[1])[images][:, :, columns]
+        result[camera] = Correlations(
+            camera,
+            tuple(covariance.labels[k].removeprefix(prefix) for k in columns),
+            names,
+            tuple(adjusted.block.images[i] for i in images),
+            rho[np.ix_(columns, columns)],
+            exterior,
+        )
+    return result

@@ -1,0 +1,53 @@
+"""Is an interior orientation parameter significant? The ratio to its sigma, and the t-test."""
+
+import equinox as eqx
+import numpy as np
+from jax.scipy.special import betainc
+
+from jaxphoto.adjustment import Adjustment
+from jaxphoto.camera import get_parameter
+from jaxphoto.statistics.covariance import Covariance
+
+SIGNIFICANT_RATIO = 10.0
+"""Paper 000: significant where the standard deviation is at least ten times smaller than the value."""
+
+
+class Significance(eqx.Module):
+    """One estimated interior parameter: value, a posteriori sigma, ratio |value| / sigma and two-sided p of value = 0."""
+
+    camera: str
+    parameter: str
+    value: float
+    sigma: float
+    ratio: float
+    p_value: float
+
+    @property
+    def significant(self) -> bool:
+        """Whether the ratio reaches `SIGNIFICANT_RATIO`."""
+        return self.ratio >= SIGNIFICANT_RATIO
+
+
+def significance(adjusted: Adjustment, covariance: Covariance) -> list[Significance]:
+    """Of every estimated interior parameter, in the order of the cameras and their models."""
+    sigma = dict(
+        zip(covariance.labels[6 * covariance.n_images :], np.asarray(covariance.shared_sigma).tolist(), strict=True)
+    )
+    result = []
+    for label, s in sigma.items():
+        if not label.startswith("interior["):
+            continue
+        camera, parameter = label.removeprefix("interior[").rsplit("].", 1)
+        value = float(get_parameter(adjusted.unknowns.interior[camera], parameter))
+        ratio = abs(value) / s if s > 0 else np.inf
+        result.append(Significance(camera, parameter, value, s, ratio, student_p(ratio, adjusted.redundancy)))
+    return result
+
+
+def student_p(t: float, degrees_of_freedom: int) -> float:
+    """Two-sided p-value of Student's t; 1 where there is no redundancy to test with."""
+    if degrees_of_freedom <= 0:
+        return 1.0
+    if not np.isfinite(t):
+        return 0.0
+    return float(betainc(degrees_of_freedom / 2, 0.5, degrees_of_freedom / (degrees_of_freedom + t * t)))

@@ -1,0 +1,257 @@
+"""Other programs' projects -> blocks, on real data: counts as published, and published orientations reproject."""
+
+import re
+import shutil
+
+import jax
+import numpy as np
+import pytest
+
+from jaxphoto.block import Datum
+from jaxphoto.camera import Balanced, Brown, get_parameter, parameter_names
+from jaxphoto.collinearity import ExteriorOrientation, project
+from jaxphoto.errors import InputError
+from jaxphoto.io import FORMATS, convert, read_block, read_source, write_block
+from jaxphoto.unknowns import FIXED, FREE
+
+
+def residuals(block, exterior, points):
+    """Measured minus projected, in millimetres."""
+    rows = block.image_points
+    camera = block.start.unknowns.interior[block.image_camera[0]]
+    at = jax.tree.map(lambda leaf: leaf[rows.image], exterior)
+    return np.asarray(rows.xy - jax.jit(jax.vmap(lambda e, p: project(camera, e, p)))(at, points[rows.point]))
+
+
+def reported(text, name):
+    """The values of a quantity of DBAT's report, one per image."""
+    return [float(value) for value in re.findall(name + r":\s+Value:\s+(\S+)", text)]
+
+
+def free(block):
+    (priors,) = block.priors.interior.values()
+    return {name for name in parameter_names(priors) if get_parameter(priors, name) is FREE}
+
+
+def test_sxb(data_dir):
+    block = read_source(data_dir / "sxb" / "sxb.xml")
+    report = (data_dir / "sxb" / "result" / "report.txt").read_text()
+
+    assert block.images == ("8811", "8936", "8937", "8938", "9111")
+    assert len(block.points) == 381
+    assert 2 * len(block.image_points.point) == 2392
+    assert len(block.control.who) == 42
+    assert {block.points[i] for i in block.check.who} == {"351", "410"}
+    assert len(block.fixed.who) == 0
+    camera = block.start.unknowns.interior["camera"]
+    assert float(camera.c) == 123.9392
+    np.testing.assert_allclose([camera.x_p, camera.y_p], [0.0, 0.18], atol=1e-12)
+    assert free(block) == set()
+    np.testing.assert_allclose(np.unique(np.round(block.image_points.sigma, 12)), [0.003, 0.006])
+    # Observations minus unknowns: the redundancy of the report.
+    assert int(re.findall(r"Redundancy\s+(\d+)", report)[0]) == 2392 + 42 - 5 * 6 - 381 * 3
+
+    # x = 0.006 col - 26.577, y = -(0.006 row - 38.811), both from the principal point.
+    first = block.points.index("317")
+    line = np.flatnonzero((block.image_points.point == first) & (block.image_points.image == 0))[0]
+    xy = np.asarray(block.image_points.xy)[line] - np.array([camera.x_p, camera.y_p])
+    np.testing.assert_allclose(xy, [0.006 * 5007.6667 - 26.577, -(0.006 * 7275.6667 - 38.811)], atol=1e-12)
+
+    angles = np.deg2rad(np.stack([reported(report, name) for name in ("Omega", "Phi", "Kappa")], axis=1))
+    position = np.stack([reported(report, name) for name in ("Xc", "Yc", "Zc")], axis=1)
+    points = block.start.unknowns.points
+    shown = block.start.point_known[block.image_points.point]
+    v = residuals(block, ExteriorOrientation.from_angles(position, angles), points)[shown]
+    # Control as surveyed, not as adjusted (it moves by up to 7 cm, nearly a pixel).
+    assert np.sqrt(np.mean(v**2)) < 1.2 * 0.006
+
+
+def test_prior_eo_has_the_measurements_of_sxb(data_dir):
+    block = read_source(data_dir / "sxb" / "prior_eo")
+    same = read_source(data_dir / "sxb")
+
+    assert len(block.control.who) == 48
+    assert len(block.stations.who) == 12
+    np.testing.assert_array_equal(block.stations.sigma, [0.05] * 12)
+    assert {block.images[i] for i in block.stations.who} == {"8811", "8936", "8937", "8938"}
+    np.testing.assert_allclose(block.image_points.sigma, 0.006)
+    assert not block.start.image_known.any()
+    assert 2392 + 48 + 12 - 5 * 6 - 381 * 3 == 1279
+    measured = [
+        {
+            (b.images[i], b.points[p]): xy
+            for i, p, xy in zip(b.image_points.image, b.image_points.point, np.asarray(b.image_points.xy), strict=True)
+        }
+        for b in (block, same)
+    ]
+    assert measured[0].keys() == measured[1].keys()
+    for key, xy in measured[0].items():
+        np.testing.assert_allclose(xy, measured[1][key], atol=1e-12)
+
+    without = read_source(data_dir / "sxb" / "prior_eo", "photomodeler", stations=False)
+    assert len(without.stations.who) == 0
+
+
+def test_camcal(data_dir):
+    block = read_source(data_dir / "camcal")
+
+    assert len(block.images) == 21
+    assert block.images[0] == "P8250021"
+    assert len(block.points) == 100
+    assert 2 * len(block.image_points.point) == 4148
+    assert {block.points[i] for i in block.fixed.who} == {"1001", "1002", "1003", "1004"}
+    assert len(block.control.who) == len(block.check.who) == 0
+    assert free(block) == {"c_mm", "xp_mm", "yp_mm", "k1", "k2", "k3", "p1", "p2", "b1"}
+    camera = block.start.unknowns.interior["camera"]
+    assert isinstance(camera.distortion, Brown)
+    assert (float(camera.c), float(camera.x_p), float(camera.y_p)) == (7.5, 0.0, 0.0)
+    np.testing.assert_allclose(block.sensors["camera"].pixel_mm, 5.43764 / 1704)
+    np.testing.assert_allclose(block.image_points.sigma, 0.1 * 5.43764 / 1704)
+    assert 4148 - (9 + 126 + 96 * 3) == 3725
+
+
+def test_aicon(data_dir):
+    block = read_source(data_dir / "aicon")
+
+    assert len(block.images) == 115
+    assert len(block.points) == 150
+    assert len(block.image_points.point) == 9972
+    assert block.datum == Datum("inner", "points", False)
+    np.testing.assert_allclose(block.distances.value, [1.389688])
+    np.testing.assert_allclose(block.distances.sigma, [1e-5])
+    np.testing.assert_array_equal(block.image_points.sigma, 0.0005)
+    assert block.start.image_known.all()
+    assert block.start.point_known.all()
+    assert free(block) == {"c_mm", "xp_mm", "yp_mm", "a1", "a2", "b1", "b2"}
+    camera = block.start.unknowns.interior["1"]
+    assert isinstance(camera.distortion, Balanced)
+    assert (float(camera.c), float(camera.distortion.r0)) == (28.78507, 13.488)
+    assert block.priors.interior["1"].distortion.r0 is FIXED
+
+    # The files hold the adjusted values to 1e-4 mm and 1e-8 rad: their residuals are the report's.
+    v = residuals(block, block.start.unknowns.exterior, block.start.unknowns.points)
+    s0 = np.sqrt(np.sum(v**2) / 18804)
+    np.testing.assert_allclose(s0, 0.0004056, rtol=2e-3)
+    # Per image: rays and rms vx, vy of images 1 and 3 as the report prints them.
+    for image, rays, rms in ((0, 81, (0.000409, 0.000411)), (2, 129, (0.000442, 0.000314))):
+        of = block.image_points.image == image
+        assert of.sum() == rays
+        np.testing.assert_allclose(np.sqrt(np.mean(v[of] ** 2, axis=0)), rms, atol=1e-6)
+
+
+@pytest.mark.parametrize("file", ["example.ior", "example.phc", "example.eor", "example.obc", "example.scale"])
+def test_any_file_of_an_aicon_project_names_it(data_dir, file):
+    assert len(read_source(data_dir / "aicon" / file).images) == 115
+
+
+@pytest.mark.parametrize("source", ["sxb", "sxb/prior_eo", "camcal/camcaldemo.xml", "aicon"])
+def test_convert_writes_what_it_read(data_dir, tmp_path, source):
+    block = convert(data_dir / source, tmp_path / "block")
+    again = read_block(tmp_path / "block")
+    assert jax.tree.structure(again) == jax.tree.structure(block)
+    for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(block), strict=True):
+        if isinstance(b, np.ndarray | jax.Array):
+            np.testing.assert_allclose(a, b, rtol=1e-15, atol=1e-15)
+
+
+def test_a_block_folder_is_a_format_too(write_folder, tmp_path):
+    folder = write_folder()
+    write_block(read_block(folder), tmp_path / "copy")
+    assert read_source(tmp_path / "copy").points == read_source(folder, "block").points
+
+
+def test_unknown_formats_list_the_known_ones(tmp_path):
+    (tmp_path / "photo.jpg").write_text("")
+    for source, name in ((tmp_path / "photo.jpg", None), (tmp_path, "colmap")):
+        with pytest.raises(InputError) as caught:
+            read_source(source, name)
+        assert all(known in str(caught.value) for known in FORMATS)
+    with pytest.raises(InputError, match="correct the name"):
+        read_source(tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("</document>", "", ("project.xml", "line", "correct the XML")),
+        ("<model>3</model>", "<model>4</model>", ("project.xml", "model 4", "use one of")),
+        ("<image>2272,1704</image>", "<image>2272</image>", ("project.xml", "<image>", "2 numbers")),
+        ("auto,5.43764", "auto,auto", ("project.xml", "<sensor>", "give width,height")),
+        ("<skew>false</skew>", "<focus>false</focus>", ("project.xml", "<focus>", "use all")),
+        ("<skew>false</skew>", "<skew>no</skew>", ("project.xml", "<skew>", "true or false")),
+        ("im,id,x,y,sxy", "im,id,x,y,s", ("project.xml", "markpts.txt", "add sxy")),
+        ("im,id,x,y,sxy", "im,id,x,y", ("markpts.txt, row 3", "5 cells", "correct the format")),
+        ("im,id,x,y,sxy", "im,label,x,y,sxy", ("project.xml", "image_pts", "no id")),
+        ("camcal-fixed.txt", "camcal-free.txt", ("camcal-free.txt", "add it")),
+        ("<ctrl_pts>", "<prior_eo/><ctrl_pts>", ("project.xml", "<prior_eo>", "remove it")),
+        ('base_dir="$HERE"', 'base_dir="$DBAT"', ("project.xml", "$DBAT", "$HERE")),
+        ("<project_unit>m<", "<project_unit>ft<", ("project.xml", "'ft'", "use one of m")),
+    ],
+)
+def test_a_bad_script_is_refused(data_dir, tmp_path, old, new, words):
+    folder = tmp_path / "camcal"
+    for name in ("images", "measurements", "reference"):
+        shutil.copytree(data_dir / "camcal" / name, folder / name)
+    text = (data_dir / "camcal" / "camcaldemo.xml").read_text()
+    assert old in text
+    (folder / "project.xml").write_text(text.replace(old, new))
+    with pytest.raises(InputError) as caught:
+        read_source(folder)
+    for word in words:
+        assert word in str(caught.value), str(caught.value)
+
+
+def test_a_bad_row_of_an_aicon_file_is_named(data_dir, tmp_path):
+    folder = tmp_path / "aicon"
+    shutil.copytree(data_dir / "aicon", folder)
+    lines = (folder / "example.phc").read_text().split("\n")
+    lines[9] = lines[9].replace(lines[9].split()[2], "x")
+    (folder / "example.phc").write_text("\n".join(lines))
+    with pytest.raises(InputError, match=r"example\.phc, row 10: x is 'x'"):
+        read_source(folder)
+
+
+@pytest.mark.parametrize(
+    ("line", "old", "new", "message"),
+    [
+        (0, "28.78507", "28.7 8507", r"example\.ior: the five lines of one camera"),
+        (0, "-28.78507", "c", r"example\.ior, row 1: a cell is not a number; correct it"),
+        (4, "35.96800", "0.035968", r"pixel_mm: a pixel of .* cannot be"),
+    ],
+)
+def test_a_bad_camera_of_an_aicon_project_is_named(data_dir, tmp_path, line, old, new, message):
+    folder = tmp_path / "aicon"
+    shutil.copytree(data_dir / "aicon", folder)
+    lines = (folder / "example.ior").read_text().split("\n")
+    assert old in lines[line]
+    lines[line] = lines[line].replace(old, new)
+    if line == 4:
+        lines[line] = lines[line].replace("23.97900", "0.023979")
+    (folder / "example.ior").write_text("\n".join(lines))
+    with pytest.raises(InputError, match=message):
+        read_source(folder)
+
+
+def test_an_aicon_project_needs_its_files(data_dir, tmp_path):
+    shutil.copy(data_dir / "aicon" / "example.phc", tmp_path)
+    with pytest.raises(InputError, match=r"holds 0 AICON projects .*; name one file"):
+        read_source(tmp_path / "example.phc", "aicon")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("   0      333 2158.2500", "   9      333 2158.2500", r"pmexport\.txt, row \d+: image 9 is not among"),
+        ("53.14800 77.97600 0.00000", "53.14800 77.97600 0.00100", r"pmexport\.txt, row 4: lens distortion"),
+        ("0.000500 20 8858 12996", "0.000500 20 8858", r"pmexport\.txt, row 2: 4 numbers are expected"),
+    ],
+)
+def test_a_bad_export_is_refused(data_dir, tmp_path, old, new, message):
+    folder = tmp_path / "prior_eo"
+    shutil.copytree(data_dir / "sxb" / "prior_eo", folder)
+    path = next(folder.glob("*pmexport*"))
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+    with pytest.raises(InputError, match=message):
+        read_source(folder)

@@ -1,0 +1,221 @@
+"""What `read_block` makes of a good folder, in every spelling that is allowed."""
+
+import warnings
+
+import jax
+import numpy as np
+import pytest
+
+from jaxphoto.block import Datum
+from jaxphoto.camera import Smac
+from jaxphoto.io import read_block
+from jaxphoto.unknowns import FIXED, FREE, Weighted
+
+
+def test_observations(write_folder):
+    block = read_block(write_folder())
+
+    assert block.title == "small"
+    assert block.images == ("a", "b", "c")
+    assert block.points == ("p1", "p2", "p3", "p4")
+    rows = block.image_points
+    np.testing.assert_array_equal(rows.point, [0, 0, 0, 1, 1, 1, 2, 2, 3, 3, 3])
+    np.testing.assert_array_equal(rows.image, [0, 1, 2, 0, 1, 2, 0, 1, 0, 1, 2])
+    np.testing.assert_array_equal(rows.xy[:3], [[0.1, 0.2], [0.15, 0.2], [0.2, 0.2]])
+    np.testing.assert_array_equal(rows.sigma[:2], [[0.003, 0.002], [0.004, 0.004]])
+    np.testing.assert_array_equal(block.control.who, [0, 0, 0, 1])
+    np.testing.assert_array_equal(block.control.axis, [0, 1, 2, 2])
+    np.testing.assert_array_equal(block.control.value, [1, 2, 3, 4])
+    np.testing.assert_array_equal(block.control.sigma, [0.01, 0.01, 0.02, 0.03])
+    np.testing.assert_array_equal(block.fixed.who, [2, 2, 2])
+    np.testing.assert_array_equal(block.fixed.value, [5, 6, 7])
+    np.testing.assert_array_equal(block.check.who, [3, 3, 3])
+    np.testing.assert_array_equal(block.check.value, [8, 9, 10])
+    np.testing.assert_array_equal(block.stations.value, [0, 0, 100, 10, 0, 100])
+    np.testing.assert_array_equal(block.stations.sigma, [0.05, 0.05, 0.1, 0.1, 0.1, 0.1])
+    np.testing.assert_allclose(block.attitudes.roll_pitch_yaw[0], np.deg2rad([1, -2, 45]))
+    np.testing.assert_allclose(block.attitudes.sigma, np.deg2rad([[0.005, 0.005, 0.01], [0.01] * 3]))
+    np.testing.assert_array_equal(block.distances.points, [[0, 1], [1, 2]])
+    np.testing.assert_array_equal(block.distances.sigma, [0.001, 0.002])
+    assert block.datum == Datum("inner", ("p1", "p2", "p3"), False)
+
+
+def test_start_and_priors(write_folder):
+    block = read_block(write_folder())
+    start, priors = block.start.unknowns, block.priors
+
+    np.testing.assert_array_equal(block.start.image_known, [True, True, False])
+    np.testing.assert_allclose(np.rad2deg(start.exterior.omega_phi_kappa[0]), [0.5, -0.25, 90.0])
+    np.testing.assert_array_equal(start.exterior.camera_from_object[2], np.eye(3))
+    # Control goes before object_points.csv, axis by axis; a check point gives no start.
+    np.testing.assert_array_equal(block.start.point_known, [True, True, True, False])
+    np.testing.assert_array_equal(start.points, [[1, 2, 3], [2.5, 2.5, 4], [5, 6, 7], [0, 0, 0]])
+    assert float(start.interior["kodak"].distortion.k1) == -1e-4
+    assert priors.interior["kodak"].c is FREE
+    assert priors.interior["kodak"].x_p is FIXED
+    weighted = priors.interior["kodak"].distortion.k1
+    assert isinstance(weighted, Weighted)
+    assert (float(weighted.value), float(weighted.sigma)) == (-1e-4, 2e-5)
+    assert all(isinstance(leaf, jax.Array) and leaf.dtype == float for leaf in jax.tree.leaves(start))
+
+    assert block.image_mount == ("default",) * 3
+    np.testing.assert_array_equal(start.mounts["default"].lever_arm, [0.1, 0.2, -0.3])
+    np.testing.assert_allclose(start.mounts["default"].boresight, np.deg2rad([0.5, 0, -0.25]))
+    np.testing.assert_array_equal(priors.mounts["default"].lever_arm.sigma, [0.01] * 3)
+    assert priors.mounts["default"].boresight is FREE
+    assert block.image_strip == ("one", "one", "two")
+    assert set(start.strips) == {"one", "two"}
+    np.testing.assert_array_equal(block.image_time, [-1, 1, 0])
+    assert priors.exterior.position is FREE
+    assert priors.points is FREE
+
+
+def test_angles_use_the_files_unit(write_folder):
+    change = ("block.toml", 'boresight = "free"', "boresight = { sigma_deg = 0.1, value_deg = [1.0, 0.0, 0.0] }")
+    prior = read_block(write_folder(change)).priors.mounts["default"].boresight
+    np.testing.assert_allclose(prior.sigma, np.deg2rad([0.1] * 3))
+    np.testing.assert_allclose(prior.value, np.deg2rad([1.0, 0, 0]))
+
+
+def test_own_mount_and_strip_override_the_default(write_folder):
+    block = read_block(
+        write_folder(
+            (
+                "block.toml",
+                "[datum]",
+                '[mounts.kodak]\nlever_arm_m = [1.0, 1.0, 1.0]\n[strips.two]\ndrift = "fixed"\n[datum]',
+            )
+        )
+    )
+    assert block.image_mount == ("kodak",) * 3
+    assert set(block.start.unknowns.mounts) == set(block.priors.mounts) == {"kodak"}
+    assert block.priors.strips["one"].drift is FREE
+    assert block.priors.strips["two"].drift is FIXED
+
+
+def test_smallest_folder(write_folder):
+    """Only what is needed: no mounts, strips, control, approximations."""
+    optional = ("control_points", "stations", "attitudes", "object_points", "distances")
+    block = read_block(
+        write_folder(
+            *((f"{name}.csv", "", None) for name in optional),
+            ("images.csv", "", "image,camera\na,kodak\nb,kodak\nc,kodak\n"),
+            ("block.toml", "[mounts.default]\nlever_arm_m = [0.1, 0.2, -0.3]\nlever_arm = { sigma_m = 0.01 }\n", ""),
+            ("block.toml", 'boresight_deg = [0.5, 0.0, -0.25]\nboresight = "free"\n', ""),
+            ("block.toml", '[strips.default]\nshift = "free"\ndrift = "free"\n', ""),
+            ("block.toml", '[datum]\nkind = "inner"\nover = ["p1", "p2", "p3"]\nscale = false\n', ""),
+        )
+    )
+    assert block.image_mount == block.image_strip == ("", "", "")
+    assert block.start.unknowns.mounts == block.start.unknowns.strips == {}
+    assert not block.start.image_known.any()
+    assert not block.start.point_known.any()
+    np.testing.assert_array_equal(block.image_time, [0, 0, 0])
+    assert len(block.control.who) == len(block.stations.who) == len(block.distances.value) == 0
+    assert block.datum == Datum()
+
+
+def test_pixels(write_folder):
+    """The centre of the upper left pixel is (0.5, 0.5); sigma_px and image_px are multiples of the pixel."""
+    text = "image,point,column_px,row_px,sigma_px\n" + "".join(
+        f"{image},{point},{200 + 10 * i},{150 - 20 * i},{'0.5' if i == 0 else ''}\n"
+        for image in "abc"
+        for i, point in enumerate(("p1", "p2", "p3", "p4"))
+    )
+    block = read_block(
+        write_folder(("image_points.csv", "", text), ("block.toml", "image_mm = 0.004", "image_px = 0.3"))
+    )
+    np.testing.assert_allclose(block.image_points.xy[0], [0.0, 0.0], atol=1e-15)
+    np.testing.assert_allclose(block.image_points.xy[3], [0.1, 0.2])
+    np.testing.assert_allclose(block.image_points.sigma[::3][:2], [[0.005, 0.005], [0.003, 0.003]])
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+@pytest.mark.parametrize("mark", ["", "\ufeff"])
+def test_spellings_of_a_spreadsheet(write_folder, end, mark):
+    """Semicolons with decimal commas, a byte order mark, Windows line ends, blanks, another order of columns."""
+    folder = write_folder()
+    expected = read_block(folder)
+    for name in ("image_points", "control_points"):
+        path = folder / f"{name}.csv"
+        lines = [line for line in path.read_text().splitlines() if not line.startswith("#")]
+        cells = [line.split(",")[::-1] for line in lines]
+        spelt = [" ; ".join(cell.replace(".", ",") for cell in row) for row in cells]
+        path.write_bytes((mark + end.join(["# comment, with a comma", "", *spelt, ""])).encode())
+    block = read_block(folder)
+    assert block.points == expected.points
+    for got, want in zip(jax.tree.leaves(block), jax.tree.leaves(expected), strict=True):
+        if isinstance(want, np.ndarray | jax.Array):
+            np.testing.assert_array_equal(got, want)
+
+
+def test_ids_are_text(write_folder):
+    folder = write_folder()
+    for path in folder.iterdir():
+        path.write_text(
+            path.read_text().replace("p1", "007").replace("p2", "1e3").replace("p3", "Ω, 3".replace(",", ""))
+        )
+    assert read_block(folder).points == ("007", "1e3", "Ω 3", "p4")
+
+
+def test_an_image_may_be_in_no_strip(write_folder):
+    block = read_block(write_folder(("images.csv", "c,kodak,two,20.0", "c,kodak,,")))
+    assert block.image_strip == ("one", "one", "")
+    assert set(block.start.unknowns.strips) == {"one"}
+    np.testing.assert_array_equal(block.image_time, [-1, 1, 0])
+
+
+def test_a_local_frame_may_be_called_enu(write_folder):
+    assert read_block(write_folder(("block.toml", '"local"', '"enu"'))).title == "small"
+
+
+def test_smac_has_a_balance_radius_and_a_sign(write_folder):
+    block = read_block(
+        write_folder(
+            ("block.toml", 'distortion = "brown"', 'distortion = "smac"\nsign = "add"'),
+            ("block.toml", "k1 = -1e-4", "k1 = -1e-4\nr0_mm = 1.5"),
+        )
+    )
+    distortion = block.start.unknowns.interior["kodak"].distortion
+    assert isinstance(distortion, Smac)
+    assert (distortion.sign, float(distortion.r0)) == ("add", 1.5)
+    assert block.priors.interior["kodak"].distortion.r0 is FIXED
+
+
+IDLE = """\
+[cameras.idle]
+width_px = 400
+height_px = 300
+pixel_mm = 0.01
+distortion = "brown"
+interior.c_mm = 5.0
+"""
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (("stations.csv", "sigma_Z_m", "remark"), ("stations.csv", "remark")),
+        (("object_points.csv", "p2,", "p9,"), ("object_points.csv", "p9")),
+        (("control_points.csv", "p4,8.0,9.0,10.0", "p8,8.0,9.0,10.0"), ("control_points.csv", "p8")),
+        (("images.csv", "0.5,-0.25,90.0", "0.5,,90.0"), ("images.csv, row 2", "all six")),
+        (
+            ("block.toml", "[mounts", IDLE + "[mounts"),
+            ("block.toml", "idle"),
+        ),
+    ],
+)  # fmt: skip
+def test_what_is_not_used_is_said(write_folder, change, words):
+    with pytest.warns(UserWarning, match="not.* used") as caught:
+        block = read_block(write_folder(change))
+    assert len(caught) == 1
+    for word in words:
+        assert word in str(caught[0].message)
+    assert set(block.sensors) == {"kodak"}
+    assert len(block.points) == 4
+
+
+def test_nothing_is_said_of_a_good_folder(write_folder):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        read_block(write_folder())
