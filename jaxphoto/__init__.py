@@ -13,7 +13,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import jax
 
 jax.config.update("jax_enable_x64", True)
-if jax.config.jax_compilation_cache_dir is None:
+if jax.config.values["jax_compilation_cache_dir"] is None:
     _cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jaxphoto"
     jax.config.update("jax_compilation_cache_dir", str(_cache))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
@@ -42,9 +42,9 @@ from jaxphoto.unknowns import FIXED, FREE, Unknowns, Weighted
 __version__ = "0.1.0"
 
 __all__ = [
-    "FIXED", "FREE", "MAX_STEPS", "AbstractDistortion", "Adjustment", "AffineBrown", "Balanced", "Block", "BlockError", "Brown",
-    "DatumError", "ExteriorOrientation", "InputError", "InteriorOrientation", "JaxphotoError", "Outcome",
-    "RankError", "Sensor", "Smac", "Tables", "Unknowns", "Weighted", "adjust", "angle_differences", "convert",
-    "covariance", "image_ray", "intersect", "point_differences", "project", "read_block", "read_source", "rebalance",
-    "rebalance_covariance", "write_block",
+    "FIXED", "FREE", "MAX_STEPS", "AbstractDistortion", "Adjustment", "AffineBrown", "Balanced", "Block",
+    "BlockError", "Brown", "DatumError", "ExteriorOrientation", "InputError", "InteriorOrientation",
+    "JaxphotoError", "Outcome", "RankError", "Sensor", "Smac", "Tables", "Unknowns", "Weighted", "adjust",
+    "angle_differences", "convert", "covariance", "image_ray", "intersect", "point_differences", "project",
+    "read_block", "read_source", "rebalance", "rebalance_covariance", "write_block",
 ]  # fmt: skip

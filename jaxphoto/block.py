@@ -9,8 +9,9 @@ from typing import Literal
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
+from jaxphoto.arrays import Numbers
 from jaxphoto.camera import Sensor
 from jaxphoto.unknowns import Unknowns
 
@@ -23,8 +24,8 @@ class ImageRows(eqx.Module):
 
     image: Int[np.ndarray, "n"]
     point: Int[np.ndarray, "n"]
-    xy: Float[Array, "n 2"]
-    sigma: Float[Array, "n 2"]
+    xy: Float[Numbers, "n 2"]
+    sigma: Float[Numbers, "n 2"]
 
 
 class Rows(eqx.Module):
@@ -32,8 +33,8 @@ class Rows(eqx.Module):
 
     who: Int[np.ndarray, "n"]
     axis: Int[np.ndarray, "n"]
-    value: Float[Array, "n"]
-    sigma: Float[Array, "n"]
+    value: Float[Numbers, "n"]
+    sigma: Float[Numbers, "n"]
 
     @staticmethod
     def none() -> "Rows":
@@ -45,8 +46,8 @@ class Attitudes(eqx.Module):
     """Observed roll, pitch, yaw (rad, all three) of `image` with their sigmas (rad)."""
 
     image: Int[np.ndarray, "n"]
-    roll_pitch_yaw: Float[Array, "n 3"]
-    sigma: Float[Array, "n 3"]
+    roll_pitch_yaw: Float[Numbers, "n 3"]
+    sigma: Float[Numbers, "n 3"]
 
     @staticmethod
     def none() -> "Attitudes":
@@ -58,8 +59,8 @@ class Distances(eqx.Module):
     """Scale bars: the distance (m) between two points."""
 
     points: Int[np.ndarray, "n 2"]
-    value: Float[Array, "n"]
-    sigma: Float[Array, "n"]
+    value: Float[Numbers, "n"]
+    sigma: Float[Numbers, "n"]
 
     @staticmethod
     def none() -> "Distances":
@@ -106,7 +107,7 @@ class Block(eqx.Module):
     image_camera: tuple[str, ...] = eqx.field(static=True)
     image_mount: tuple[str, ...] = eqx.field(static=True)
     image_strip: tuple[str, ...] = eqx.field(static=True)
-    image_time: Float[Array, "images"]
+    image_time: Float[Numbers, "images"]
     image_points: ImageRows
     control: Rows
     fixed: Rows

@@ -52,7 +52,8 @@ def adjust_command(
         read = read_block(block)
         seconds = {"read": time.perf_counter() - began}
         status.update(
-            f"adjusting {len(read.images)} images, {len(read.points)} points, {len(read.image_points.image)} image points"
+            f"adjusting {len(read.images)} images, {len(read.points)} points, "
+            f"{len(read.image_points.image)} image points"
         )
         adjusted = adjust(read, max_steps=max_steps)
         status.update("computing statistics")

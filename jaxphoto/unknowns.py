@@ -13,8 +13,9 @@ import enum
 
 import equinox as eqx
 import jax
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from jaxphoto.arrays import Numbers
 from jaxphoto.camera import InteriorOrientation
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.georeferencing import Mount, StripBias
@@ -36,8 +37,8 @@ FREE, FIXED = Prior.FREE, Prior.FIXED
 class Weighted(eqx.Module):
     """An unknown observed beforehand as `value` with standard deviation `sigma` (its own units, arrays allowed)."""
 
-    value: Float[Array, "..."] | float
-    sigma: Float[Array, "..."] | float
+    value: Float[Numbers, "..."] | float
+    sigma: Float[Numbers, "..."] | float
 
 
 class Unknowns(eqx.Module):
@@ -48,7 +49,7 @@ class Unknowns(eqx.Module):
 
     interior: dict[str, InteriorOrientation]
     exterior: ExteriorOrientation
-    points: Float[Array, "points 3"]
+    points: Float[Numbers, "points 3"]
     mounts: dict[str, Mount]
     strips: dict[str, StripBias]
 

@@ -84,8 +84,7 @@ def _finish(
     scaled = Increments(
         motions[0] * inverse.eop, jnp.zeros((len(motions[0]), structure.n_shared)), motions[1] * inverse.points
     )
-    observed = [v for name, v in residuals._asdict().items() if name != "datum"]
-    square_sum = sum(jnp.sum(v**2) for v in observed)
+    square_sum = sum((jnp.sum(v**2) for v in residuals[:-1]), jnp.zeros(()))
     return square_sum, residuals, Factored(normal, reduced, factor_reduced(reduced), scale, scaled)
 
 

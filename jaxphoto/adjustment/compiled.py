@@ -1,7 +1,6 @@
 """Calling compiled functions so that compiling and computing are told apart."""
 
 import time
-from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -10,7 +9,7 @@ import jax
 _executables: dict[object, Any] = {}
 
 
-def run_compiled(function: Callable[..., Any], arguments: tuple, seconds: dict[str, float], name: str) -> Any:
+def run_compiled(function: Any, arguments: tuple, seconds: dict[str, float], name: str) -> Any:
     """Call `function` (made by `eqx.filter_jit`), compiling it first and apart.
 
     Adds to `seconds["compile"]` what compiling took, and to `seconds[name]` what the call took. Under a

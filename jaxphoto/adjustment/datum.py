@@ -18,7 +18,15 @@ from jaxphoto.block import Block
 from jaxphoto.errors import DatumError
 from jaxphoto.rotation import small_angles, small_rotation
 
-MOTIONS = ("shift in X", "shift in Y", "shift in Z", "rotation about X", "rotation about Y", "rotation about Z", "scale")
+MOTIONS = (
+    "shift in X",
+    "shift in Y",
+    "shift in Z",
+    "rotation about X",
+    "rotation about Y",
+    "rotation about Z",
+    "scale",
+)
 # Singular values of the scaled sensitivity below this are zero.
 _OPEN = 1e-9
 
@@ -52,21 +60,18 @@ def close_datum(block: Block, values: Values, structure: Structure) -> tuple[Mot
         scale_open = bool(len(open_motions)) and bool(np.abs(open_motions[:, 6]).max() > 1e-6)
         if scale_open != block.datum.scale:
             raise DatumError(
-                "[datum] scale = false, but nothing in the block gives it a scale: add a distance, stations or control, "
-                "or set scale = true"
+                "[datum] scale = false, but nothing in the block gives it a scale: add a distance, stations or "
+                "control, or set scale = true"
                 if scale_open
-                else "[datum] scale = true, but distances, stations or control already give the scale: set scale = false"
+                else "[datum] scale = true, but distances, stations or control give it already: set scale = false"
             )
-    if kind == "minimal":
-        constraints = _minimal(null, values, structure)
-    else:
-        constraints = _inner(null, block, over)
+    constraints = _minimal(null, structure) if kind == "minimal" else _inner(null, block, over)
     product = np.einsum("kci,jci->kj", constraints.eop, null.eop) + np.einsum(
         "kcp,jcp->kj", constraints.points, null.points
     )
     if len(open_motions) and np.linalg.svd(product, compute_uv=False)[-1] < 1e-9 * np.abs(product).max():
         raise DatumError(
-            f'[datum] over = "{over}" cannot fix the datum (they lie on a line or in a point): constrain over all points'
+            f'[datum] over = "{over}" cannot fix the datum (they lie on a line or in a point): take all points'
         )
     return null, constraints
 
@@ -128,7 +133,10 @@ def _datum_sensitivity(values: Values, structure: Structure, motions: Motions, c
     shared = [j for j, k in enumerate(structure.free) if k >= structure.mount_offset and j not in structure.weighted]
     if len(values.stations) + values.attitudes.shape[1] + len(values.distances) == 0:
         # Control alone: nothing to differentiate, its rows are the motions of its points.
-        rows = motions.points[:, structure.control_axis, structure.control_point].T / np.asarray(values.sigma_control)[:, None]
+        rows = (
+            motions.points[:, structure.control_axis, structure.control_point].T
+            / np.asarray(values.sigma_control)[:, None]
+        )
     else:
         rows = np.asarray(_georeferencing_sensitivity(values, structure, np.array(shared, int), centre, size))
     fixed_p = np.argwhere(structure.point_free.T == 0)
@@ -204,7 +212,7 @@ def _orthonormal(rows: Motions) -> Motions:
     return Motions(q[:, :split].reshape(rows.eop.shape), q[:, split:].reshape(rows.points.shape))
 
 
-def _minimal(null: Motions, values: Values, structure: Structure) -> Motions:
+def _minimal(null: Motions, structure: Structure) -> Motions:
     """As few point coordinates as the defect asks for, chosen by pivoting so that they fix it best."""
     k = len(null.points)
     flat = null.points.transpose(0, 2, 1).reshape(k, -1) * structure.point_free.T.reshape(-1)
@@ -232,7 +240,7 @@ def _sentence(open_motions: np.ndarray, block: Block, named: list[str]) -> str:
         )
         if n
     ]
-    mends = "add control points or camera stations, or set [datum] kind = \"inner\" (or \"minimal\") in block.toml"
+    mends = 'add control points or camera stations, or set [datum] kind = "inner" (or "minimal") in block.toml'
     if named:
         mends = "add control points, or fix " + ", ".join(named[:3]) + (" ..." if len(named) > 3 else "")
     return (

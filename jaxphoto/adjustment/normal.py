@@ -6,8 +6,8 @@ In scaled increments, with e the exterior orientations, s the shared unknowns an
     N = [ Us'  Uss  Ws'] [s] = [b_s]        V block-diagonal (3 x 3 a point), W 6 x 3 a (image, point) that met
         [ W'   Ws   V  ] [p]   [b_p]
 
-Few rows couple many points: distances and the constraints of the datum, D. They are carried as extra unknowns
-mu = D x - d with the block -I, so V stays block-diagonal. With V = L L', Y = W L^-T, Ys = L^-1 Ws, Yd = L^-1 D':
+Few rows couple many points: distances and the constraints of the datum, D. Their part D'D of N is carried by extra
+unknowns mu = D x with the block -I, so V stays block-diagonal. With V = L L', Y = W L^-T, Ys = L^-1 Ws, Yd = L^-1 D':
 
     S   = [U Us; Us' Uss] - [Y; Ys'] [Y; Ys']'        the reduced normal matrix
     g   = D_e' - Y Yd,   K = I + Yd' Yd               the coupling of mu
@@ -29,7 +29,7 @@ from jaxphoto.adjustment.structure import Structure
 
 
 class Normal(NamedTuple):
-    """The undamped sums; see the module's head. `rows_*` are D and d."""
+    """The undamped sums; see the module's head. `rows_*` are D; `b` is the whole right-hand side J' r."""
 
     u: Float[Array, "images 6 6"]
     us: Float[Array, "images 6 shared"]
@@ -37,12 +37,9 @@ class Normal(NamedTuple):
     v: Float[Array, "3 3 points"]
     w: Float[Array, "6 3 rows"]
     ws: Float[Array, "shared 3 points"]
-    b_e: Float[Array, "images 6"]
-    b_s: Float[Array, "shared"]
-    b_p: Float[Array, "3 points"]
+    b: Increments
     rows_e: Float[Array, "constraints images 6"]
     rows_p: Float[Array, "constraints 3 points"]
-    rows_b: Float[Array, "constraints"]
 
 
 class Reduced(NamedTuple):
@@ -56,9 +53,7 @@ class Reduced(NamedTuple):
     """Cholesky factors of V: l11, l21, l22, l31, l32, l33."""
 
 
-def sum_normal(
-    jacobian: Jacobian, residuals: Residuals, datum: tuple[Array, Array], structure: Structure
-) -> Normal:
+def sum_normal(jacobian: Jacobian, residuals: Residuals, datum: tuple[Array, Array], structure: Structure) -> Normal:
     """The sums of N x = b from Jacobian blocks and residuals (so b = J' r); `datum` is D over images and points."""
     s, j, r = structure, jacobian, residuals
     q = s.n_colours
@@ -86,6 +81,9 @@ def sum_normal(
     for end in range(2):
         spans = spans.at[each, :, s.distance_points[:, end]].add(j.distances[end].T)
     datum_e = datum[0].transpose(0, 2, 1)
+    rows_e = jnp.concatenate([jnp.zeros((len(each), *datum_e.shape[1:])), datum_e])
+    rows_p = jnp.concatenate([spans, datum[1]])
+    d = jnp.concatenate([r.distances, r.datum])
     return Normal(
         u=m[:, :6, :6],
         us=us,
@@ -93,13 +91,43 @@ def sum_normal(
         v=vp[:3, :3],
         w=jnp.einsum("aon,bon->abn", j.image_eop, j.image_point),
         ws=ws,
-        b_e=m[:, :6, -1],
-        b_s=b_s,
-        b_p=vp[:3, 3],
-        rows_e=jnp.concatenate([jnp.zeros((len(each), *datum_e.shape[1:])), datum_e]),
-        rows_p=jnp.concatenate([spans, datum[1]]),
-        rows_b=jnp.concatenate([r.distances, r.datum]),
+        b=Increments(
+            m[:, :6, -1].T + jnp.einsum("cna,c->an", rows_e, d), b_s, vp[:3, 3] + jnp.einsum("ckp,c->kp", rows_p, d)
+        ),
+        rows_e=rows_e,
+        rows_p=rows_p,
     )
+
+
+def zero_normal(structure: Structure, n_constraints: int) -> Normal:
+    """No sums at all, in the right shapes."""
+    s, k = structure, len(structure.distance_points) + n_constraints
+    n, q, p = s.n_images, s.n_shared, s.n_points
+    return Normal(
+        u=jnp.zeros((n, 6, 6)),
+        us=jnp.zeros((n, 6, q)),
+        uss=jnp.zeros((q, q)),
+        v=jnp.zeros((3, 3, p)),
+        w=jnp.zeros((6, 3, len(s.image))),
+        ws=jnp.zeros((q, 3, p)),
+        b=Increments(jnp.zeros((6, n)), jnp.zeros(q), jnp.zeros((3, p))),
+        rows_e=jnp.zeros((k, n, 6)),
+        rows_p=jnp.zeros((k, 3, p)),
+    )
+
+
+def multiply_normal(normal: Normal, x: Increments, structure: Structure) -> Increments:
+    """N x, block by block."""
+    n, s = normal, structure
+    mu = jnp.einsum("cna,an->c", n.rows_e, x.eop) + jnp.einsum("ckp,kp->c", n.rows_p, x.points)
+    met = jnp.einsum("akn,kn->na", n.w, x.points[:, s.point])
+    seen = jnp.einsum("akn,an->nk", n.w, x.eop[:, s.image])
+    eop = jnp.einsum("nab,bn->an", n.u, x.eop) + jnp.einsum("naq,q->an", n.us, x.shared)
+    eop += jax.ops.segment_sum(met, s.image, s.n_images).T + jnp.einsum("cna,c->an", n.rows_e, mu)
+    shared = jnp.einsum("naq,an->q", n.us, x.eop) + n.uss @ x.shared + jnp.einsum("qkp,kp->q", n.ws, x.points)
+    points = jnp.einsum("kjp,jp->kp", n.v, x.points) + jnp.einsum("qkp,q->kp", n.ws, x.shared)
+    points += jax.ops.segment_sum(seen, s.point, s.n_points, indices_are_sorted=True).T
+    return Increments(eop, shared, points + jnp.einsum("ckp,c->kp", n.rows_p, mu))
 
 
 def reduce_normal(normal: Normal, damping, structure: Structure) -> Reduced:
@@ -124,9 +152,7 @@ def reduce_normal(normal: Normal, damping, structure: Structure) -> Reduced:
 
     # What meets an image through its points: shared unknowns and mu.
     across = jnp.concatenate([ys, yd])
-    met = jax.ops.segment_sum(
-        jnp.einsum("akn,ckn->nac", y, across[:, :, s.point]), s.image, s.n_images
-    )
+    met = jax.ops.segment_sum(jnp.einsum("akn,ckn->nac", y, across[:, :, s.point]), s.image, s.n_images)
     own = jnp.einsum("akp,bkp->ab", across, across)
     q, k, size = s.n_shared, len(yd), 6 * s.n_images
     se = (n.us - met[:, :, :q]).reshape(size, q)
@@ -145,25 +171,25 @@ def factor_reduced(reduced: Reduced) -> Float[Array, "reduced reduced"]:
 
 
 def solve_factored(
-    normal: Normal, reduced: Reduced, lower: Float[Array, "reduced reduced"], structure: Structure
+    normal: Normal, reduced: Reduced, lower: Float[Array, "reduced reduced"], b: Increments, structure: Structure
 ) -> Increments:
-    """x of (N + damping I) x = b for the right-hand side in `normal`: down to the reduced unknowns, and back."""
+    """x of (N + damping I) x = b: down to the reduced unknowns, and back to the points."""
     n, r, s = normal, reduced, structure
-    z = solve_3x3(r.l, n.b_p)
+    z = solve_3x3(r.l, b.points)
     down = jnp.einsum("akn,kn->na", n.w, z[:, s.point])
-    b_e = n.b_e - jax.ops.segment_sum(down, s.image, s.n_images)
-    b = jnp.concatenate([b_e.reshape(-1), n.b_s - jnp.einsum("qkp,kp->q", n.ws, z)])
-    d = n.rows_b - jnp.einsum("ckp,kp->c", n.rows_p, z)
+    b_e = b.eop.T - jax.ops.segment_sum(down, s.image, s.n_images)
+    right = jnp.concatenate([b_e.reshape(-1), b.shared - jnp.einsum("qkp,kp->q", n.ws, z)])
+    d = jnp.einsum("ckp,kp->c", n.rows_p, z)
     if len(d):
-        b = b + r.g @ jnp.linalg.solve(r.k, d)
-    x = jax.scipy.linalg.cho_solve((lower, True), b)
+        right = right - r.g @ jnp.linalg.solve(r.k, d)
+    x = jax.scipy.linalg.cho_solve((lower, True), right)
 
     e, sh = x[: 6 * s.n_images].reshape(s.n_images, 6).T, x[6 * s.n_images :]
     seen = jnp.einsum("akn,an->nk", n.w, e[:, s.image])
-    b_p = n.b_p - jax.ops.segment_sum(seen, s.point, s.n_points, indices_are_sorted=True).T
+    b_p = b.points - jax.ops.segment_sum(seen, s.point, s.n_points, indices_are_sorted=True).T
     b_p = b_p - jnp.einsum("qkp,q->kp", n.ws, sh)
     if len(d):
-        b_p = b_p - jnp.einsum("ckp,c->kp", n.rows_p, jnp.linalg.solve(r.k, r.g.T @ x - d))
+        b_p = b_p - jnp.einsum("ckp,c->kp", n.rows_p, jnp.linalg.solve(r.k, r.g.T @ x + d))
     return Increments(e, sh, solve_3x3(r.l, b_p))
 
 

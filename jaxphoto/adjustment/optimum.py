@@ -11,12 +11,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, Int
+from jaxtyping import Array, Bool, Int
 
 from jaxphoto.adjustment.colouring import jacobian_blocks
 from jaxphoto.adjustment.normal import Normal, factor_reduced, reduce_normal, solve_factored, sum_normal
 from jaxphoto.adjustment.residuals import Increments, Residuals, Values, residuals_at
-from jaxphoto.adjustment.solver import LevenbergMarquardt, PointElimination
+from jaxphoto.adjustment.solver import BlockDescent, LevenbergMarquardt
 from jaxphoto.adjustment.structure import Structure, interior_of
 from jaxphoto.collinearity import ExteriorOrientation, image_residual
 
@@ -27,11 +27,14 @@ TOLERANCE = 1e-4
 
 
 class Optimum(NamedTuple):
-    """Where the solver ended, after how many steps, and whether the last step was negligible."""
+    """Where the solver ended, after how many steps, and whether the last step was negligible.
+
+    In a tangent only the increments have a derivative; the others are None.
+    """
 
     increments: Increments
-    steps: Int[Array, ""]
-    converged: Array
+    steps: Int[Array, ""] | None
+    converged: Bool[Array, ""] | None
 
 
 def linearise(
@@ -64,9 +67,9 @@ def find_optimum(values: Values, *, structure: Structure, max_steps: int) -> Opt
     zero = zero_increments(structure)
     scale = jax.tree.map(lambda k: k / _FIRST_DAMPING, typical_scale(values, structure))
     datum = (values.datum_eop * scale.eop, values.datum_points * scale.points)
-    solver = LevenbergMarquardt(PointElimination(structure, datum), TOLERANCE)
+    solver = LevenbergMarquardt(BlockDescent(structure, datum), TOLERANCE)
     fn = jax.jit(lambda y, scale, values: residuals_at(y, scale, values, structure))
-    solution = optx.least_squares(
+    solution: optx.Solution = optx.least_squares(
         lambda y, args: fn(y, *args),
         solver,
         zero,
@@ -102,8 +105,7 @@ def _find_optimum_jvp(primals, tangents, *, structure: Structure, max_steps: int
         return jax.tree.map(jnp.multiply, product, scale)
 
     def precondition(b: Increments) -> Increments:
-        right = normal._replace(b_e=b.eop.T, b_s=b.shared, b_p=b.points, rows_b=jnp.zeros_like(normal.rows_b))
-        return solve_factored(right, reduced, lower, structure)
+        return solve_factored(normal, reduced, lower, b, structure)
 
     def solve(product, b: Increments) -> Increments:
         return jax.scipy.sparse.linalg.cg(product, b, tol=1e-13, maxiter=100, M=precondition)[0]
@@ -140,12 +142,14 @@ def typical_scale(values: Values, structure: Structure) -> Increments:
     sigma = jnp.mean(v.sigma_xy)
     corner = jnp.max(jnp.abs(v.xy), axis=1)
     vector = jnp.ones(v.shared.shape)
+    # A point halfway to the corner and a ray beside it: c moves the one, coefficients the other.
+    aim, centre = jnp.array([0.1, 0.1, -1.0]), ExteriorOrientation(jnp.zeros(3), jnp.eye(3))
     for group in s.groups:
         m = group.treedef.num_leaves
         first = v.shared[group.offset : group.offset + m]
-        aim = jnp.array([0.1, 0.1, -1.0])
-        centre = ExteriorOrientation(jnp.zeros(3), jnp.eye(3))
-        by_parameter = jax.jacfwd(lambda p, g=group: image_residual(interior_of(g, list(p)), centre, aim, corner))(first)
+        by_parameter = jax.jacfwd(lambda p, g=group: image_residual(interior_of(g, list(p)), centre, aim, corner))(
+            first
+        )
         typical = sigma / jnp.maximum(jnp.max(jnp.abs(by_parameter), axis=0), 1e-30)
         typical = jnp.where(jnp.isfinite(typical), typical, 1.0)
         stop = group.offset + m * len(group.names)

@@ -94,9 +94,7 @@ def state_at(increments: Increments, scale: Increments, values: Values, structur
     )
 
 
-def residuals_at(
-    increments: Increments, scale: Increments, values: Values, structure: Structure
-) -> Residuals:
+def residuals_at(increments: Increments, scale: Increments, values: Values, structure: Structure) -> Residuals:
     """All residuals over their sigmas, at start + scale * increments."""
     state = state_at(increments, scale, values, structure)
     stations, attitudes, control, distances = georeferencing_residuals(state, values, structure)
@@ -118,7 +116,7 @@ def image_residuals(state: State, values: Values, structure: Structure) -> Float
     """Collinearity residuals in mm, one group of cameras at a time."""
     parts = []
     for group in structure.groups:
-        pick = (lambda a: a) if group.rows is None else (lambda a, rows=group.rows: a[..., rows])
+        rows = slice(None) if group.rows is None else group.rows
         n, m = len(group.names), group.treedef.num_leaves
         table = state.shared[group.offset : group.offset + n * m].reshape(n, m)
         columns, axis = (list(table[0]), None) if n == 1 else (list(table[group.camera].T), -1)
@@ -127,14 +125,14 @@ def image_residuals(state: State, values: Values, structure: Structure) -> Float
             exterior = ExteriorOrientation(position, rotation)
             return image_residual(interior_of(group, parameters), exterior, point, xy)
 
-        image, point = pick(structure.image), pick(structure.point)
+        image, point = structure.image[rows], structure.point[rows]
         parts.append(
             jax.vmap(one, in_axes=(axis, -1, -1, -1, -1), out_axes=-1)(
                 columns,
                 state.position[:, image],
                 state.rotation[:, :, image],
                 state.points[:, point],
-                pick(values.xy),
+                values.xy[:, rows],
             )
         )
     joined = jnp.concatenate(parts, axis=1) if len(parts) > 1 else parts[0]

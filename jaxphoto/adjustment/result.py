@@ -18,7 +18,7 @@ class Outcome(enum.Enum):
 
     CONVERGED = "converged: the last step moved no unknown by more than a ten-thousandth of its standard deviation"
     STEPS = (
-        "not converged: the step limit was reached; check the approximate values and look for blunders among the largest "
+        "not converged: the step limit was reached; check the approximate values, look for blunders among the largest "
         "residuals, or hold weakly determined unknowns fixed"
     )
     DIVERGED = (

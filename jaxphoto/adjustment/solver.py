@@ -1,58 +1,134 @@
 """Levenberg-Marquardt through optimistix, over a lineax solver that knows the structure of a block.
 
-`optx.LevenbergMarquardt` hands its linear solver the operator [J; sqrt(lambda) I] and the vector (r, 0).
-`PointElimination` reads J's blocks and lambda off that operator by coloured products, eliminates the points and
-solves (J'J + lambda I) x = J'r exactly.
+optimistix runs the iteration; `BlockDescent` gives it steps. At an accepted iterate it reads the Jacobian's blocks
+off the linearised residuals by coloured products and sums the normal equations once; each damping is then one
+`lx.linear_solve` of the operator `NormalMatrix` by `PointElimination`.
 """
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
+import jax.flatten_util
 import jax.numpy as jnp
 import lineax as lx
 import optimistix as optx
 from jaxtyping import Array, Float, PyTree, Scalar
 
 from jaxphoto.adjustment.colouring import jacobian_blocks
-from jaxphoto.adjustment.normal import factor_reduced, reduce_normal, solve_factored, sum_normal
-from jaxphoto.adjustment.residuals import Increments, Residuals
+from jaxphoto.adjustment.normal import (
+    Normal,
+    Reduced,
+    factor_reduced,
+    multiply_normal,
+    reduce_normal,
+    solve_factored,
+    sum_normal,
+    zero_normal,
+)
+from jaxphoto.adjustment.residuals import Increments
 from jaxphoto.adjustment.structure import Structure
 
 
-class PointElimination(lx.AbstractLinearSolver[lx.AbstractLinearOperator]):
-    """Least squares of a damped block Jacobian by its normal equations, points first."""
+class NormalMatrix(lx.AbstractLinearOperator):
+    """N + damping I of a block, by its blocks."""
+
+    normal: Normal
+    damping: Scalar
+    structure: Structure
+
+    def mv(self, vector: Increments) -> Increments:
+        """(N + damping I) x."""
+        product = multiply_normal(self.normal, vector, self.structure)
+        return jax.tree.map(lambda p, x: p + self.damping * x, product, vector)
+
+    def as_matrix(self) -> Float[Array, "n n"]:
+        """The dense matrix: for small blocks and tests."""
+        flat, unravel = jax.flatten_util.ravel_pytree(self.normal.b)
+        return jax.vmap(lambda row: jax.flatten_util.ravel_pytree(self.mv(unravel(row)))[0])(jnp.eye(len(flat)))
+
+    def transpose(self) -> "NormalMatrix":
+        """Itself: it is symmetric."""
+        return self
+
+    def in_structure(self) -> Increments:
+        """Shapes of what it multiplies."""
+        return jax.eval_shape(lambda: self.normal.b)
+
+    def out_structure(self) -> Increments:
+        """Shapes of the product."""
+        return self.in_structure()
+
+
+@lx.is_symmetric.register(NormalMatrix)
+@lx.is_positive_semidefinite.register(NormalMatrix)
+def _(operator: NormalMatrix) -> bool:
+    return True
+
+
+@lx.is_negative_semidefinite.register(NormalMatrix)
+def _(operator: NormalMatrix) -> bool:
+    return False
+
+
+class _Factor(NamedTuple):
+    """A normal matrix with its points eliminated, and the Cholesky factor of what is left."""
+
+    matrix: NormalMatrix
+    reduced: Reduced
+    lower: Float[Array, "reduced reduced"]
+
+
+class PointElimination(lx.AbstractLinearSolver[_Factor]):
+    """Cholesky of a block's normal matrix, points first (the Schur complement)."""
+
+    def init(self, operator: NormalMatrix, options: dict[str, Any]) -> _Factor:
+        """Eliminate the points and factor the reduced matrix."""
+        reduced = reduce_normal(operator.normal, operator.damping, operator.structure)
+        return _Factor(operator, reduced, factor_reduced(reduced))
+
+    def compute(
+        self, state: _Factor, vector: Increments, options: dict[str, Any]
+    ) -> tuple[Increments, lx.RESULTS, dict[str, Any]]:
+        """The solution; not finite where the matrix is singular."""
+        matrix = state.matrix
+        x = solve_factored(matrix.normal, state.reduced, state.lower, vector, matrix.structure)
+        return x, lx.RESULTS.successful, {}
+
+    def transpose(self, state: _Factor, options: dict[str, Any]) -> tuple[_Factor, dict[str, Any]]:
+        """The same: the matrix is symmetric."""
+        return state, options
+
+    def conj(self, state: _Factor, options: dict[str, Any]) -> tuple[_Factor, dict[str, Any]]:
+        """The same: the matrix is real."""
+        return state, options
+
+    def assume_full_rank(self) -> bool:
+        """A singular matrix gives numbers that are not finite, and so a result that says so."""
+        return True
+
+
+class BlockDescent(optx.AbstractDescent):
+    """The damped Gauss-Newton step of a block; the normal equations are summed once an accepted iterate."""
 
     structure: Structure
     datum: tuple[Float[Array, "constraints 6 images"], Float[Array, "constraints 3 points"]]
 
-    def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]) -> lx.AbstractLinearOperator:
-        """The state is the operator itself."""
-        return operator
+    def init(self, y: Increments, f_info_struct: Any) -> Normal:
+        """Normal equations of the right shapes; replaced before use."""
+        return zero_normal(self.structure, len(self.datum[0]))
 
-    def compute(
-        self, state: lx.AbstractLinearOperator, vector: tuple[Residuals, Increments], options: dict[str, Any]
-    ) -> tuple[Increments, lx.RESULTS, dict[str, Any]]:
-        """The increments x of least |J x - r|^2 + lambda |x|^2."""
-        s = self.structure
-        blocks = jacobian_blocks(lambda x: state.mv(x)[0], s)
-        one = Increments(jnp.ones((6, s.n_images)), jnp.ones(s.n_shared), jnp.ones((3, s.n_points)))
-        damping = state.mv(one)[1].points[0, 0] ** 2
-        normal = sum_normal(blocks, vector[0], self.datum, s)
-        reduced = reduce_normal(normal, damping, s)
-        return solve_factored(normal, reduced, factor_reduced(reduced), s), lx.RESULTS.successful, {}
+    def query(self, y: Increments, f_info: Any, state: Normal) -> Normal:
+        """Sum the normal equations at `y`."""
+        blocks = jacobian_blocks(f_info.jac.mv, self.structure)
+        return sum_normal(blocks, f_info.residual, self.datum, self.structure)
 
-    def transpose(self, state: lx.AbstractLinearOperator, options: dict[str, Any]) -> Any:
-        """Not defined: derivatives of an adjustment go through `jaxphoto.adjustment.implicit`."""
-        raise ValueError("the least-squares operator of a block has no transposed solve")
-
-    def conj(self, state: lx.AbstractLinearOperator, options: dict[str, Any]) -> Any:
-        """Real operators are their own conjugates."""
-        return state, options
-
-    def assume_full_rank(self) -> bool:
-        """Damping makes every solve full rank."""
-        return True
+    def step(self, step_size: Scalar, state: Normal) -> tuple[Increments, optx.RESULTS]:
+        """-(N + I / step_size)^-1 J' r."""
+        matrix = NormalMatrix(state, 1 / step_size, self.structure)
+        solution = lx.linear_solve(matrix, state.b, PointElimination(), throw=False)
+        return jax.tree.map(jnp.negative, solution.value), optx.RESULTS.promote(solution.result)
 
 
 class _Trust(NamedTuple):
@@ -90,7 +166,7 @@ class PromisedReduction(optx.AbstractSearch):
 class LevenbergMarquardt(optx.AbstractGaussNewton):
     """optimistix' Levenberg-Marquardt, stopped by what the next step would do to the unknowns.
 
-    The length of a step d in the metric of the normal matrix, sqrt(d' J'J d), bounds |d| / sigma of every single
+    The length of a step d in the metric of the normal matrix, sqrt(d' N d), bounds |d| / sigma of every single
     unknown. Once a proposed, practically undamped step is shorter than `tolerance`, it is taken and the work ends: no
     unknown still moves by more than that fraction of its standard deviation.
     """
@@ -98,15 +174,15 @@ class LevenbergMarquardt(optx.AbstractGaussNewton):
     rtol: float
     atol: float
     norm: Callable[[PyTree], Scalar]
-    descent: optx.DampedNewtonDescent
+    descent: BlockDescent
     search: PromisedReduction
     verbose: Callable[..., None]
     tolerance: float
 
-    def __init__(self, linear_solver: lx.AbstractLinearSolver, tolerance: float):
+    def __init__(self, descent: BlockDescent, tolerance: float):
         # The Cauchy test of optimistix is switched off by zero tolerances: `step` below decides.
         self.rtol, self.atol, self.norm = 0.0, 0.0, optx.max_norm
-        self.descent = optx.DampedNewtonDescent(linear_solver=linear_solver)
+        self.descent = descent
         self.search = PromisedReduction()
         self.verbose = _silent
         self.tolerance = tolerance
@@ -114,19 +190,18 @@ class LevenbergMarquardt(optx.AbstractGaussNewton):
     def step(self, fn, y, args, options, state, tags):
         """One step of optimistix; afterwards `terminate` says whether the step just proposed is negligible."""
         new_y, new, aux = super().step(fn, y, args, options, state, tags)
-        proposal = _difference(new.y_eval, new_y)
-        seen = _square(new.f_info.jac.mv(proposal))
-        damped = _square(proposal) / new.search_state.step_size
-        # (J'J + lambda) d = -J'r, so the linear model promises half of d'J'J d + 2 lambda d'd.
-        promised = 0.5 * seen + damped
+        proposal = jax.tree.map(jnp.subtract, new.y_eval, new_y)
+        # (N + damping) d = -b, so d'N d = -d'b - damping d'd, and the linear model promises d'N d / 2 + damping d'd.
+        damped = _dot(proposal, proposal) / new.search_state.step_size
+        seen = -_dot(proposal, new.descent_state.b) - damped
         accepted = new.num_steps_since_acceptance == 0
         settled = accepted & (seen <= self.tolerance**2) & (damped <= seen + self.tolerance**2)
         where = lambda s: (s.terminate, s.search_state.promised)  # noqa: E731
-        return new_y, eqx.tree_at(where, new, (settled, promised)), aux
+        return new_y, eqx.tree_at(where, new, (settled, 0.5 * seen + damped)), aux
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
         """The last proposal is part of the answer: it was computed from an accepted iterate and is negligible."""
-        y = _where(state.terminate, state.y_eval, y)
+        y = jax.tree.map(lambda a, b: jnp.where(state.terminate, a, b), state.y_eval, y)
         return y, aux, {}
 
 
@@ -134,15 +209,5 @@ def _silent(**_: Any) -> None:
     """Progress is reported by the caller, after the solve."""
 
 
-def _difference(a: Increments, b: Increments) -> Increments:
-    """a - b."""
-    return Increments(*(x - y for x, y in zip(a, b, strict=True)))
-
-
-def _where(condition: Array, a: Increments, b: Increments) -> Increments:
-    """`a` where the condition holds, else `b`."""
-    return Increments(*(jnp.where(condition, x, y) for x, y in zip(a, b, strict=True)))
-
-
-def _square(tree: tuple[Array, ...]) -> Array:
-    return sum((jnp.sum(x**2) for x in tree), jnp.zeros(()))
+def _dot(a: Increments, b: Increments) -> Array:
+    return sum((jnp.sum(x * y) for x, y in zip(a, b, strict=True)), jnp.zeros(()))

@@ -11,6 +11,8 @@ All arrays are arguments of the compiled functions, never constants in them: a n
 compiles nothing.
 """
 
+from collections.abc import Iterable
+
 import equinox as eqx
 import jax
 import numpy as np
@@ -163,10 +165,10 @@ def structure_of(block: Block, priors: Unknowns) -> Structure:
     )
 
 
-def _index(names: tuple[str, ...], table: dict[str, object]) -> np.ndarray:
+def _index(names: tuple[str, ...], table: Iterable[str]) -> np.ndarray:
     """Place of each name in the table; one past the end where the table lacks it."""
     place = {name: k for k, name in enumerate(table)}
-    return np.array([place.get(n, len(table)) for n in names], np.int32)
+    return np.array([place.get(n, len(place)) for n in names], np.int32)
 
 
 class _Entry(eqx.Module):
@@ -182,7 +184,7 @@ def _is_prior(x: object) -> bool:
 
 
 def _groups(block: Block, row_camera: np.ndarray) -> tuple[tuple[CameraGroup, ...], np.ndarray | None]:
-    by_model: dict[object, list[str]] = {}
+    by_model: dict[jax.tree_util.PyTreeDef, list[str]] = {}
     for name, interior in block.start.unknowns.interior.items():
         by_model.setdefault(jax.tree.structure(interior), []).append(name)
     groups, offset, sequence = [], 0, []

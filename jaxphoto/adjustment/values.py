@@ -1,5 +1,7 @@
 """From a block, a start and priors to the batch-last numbers that the adjustment computes with, and back."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -34,12 +36,12 @@ def values_of(block: Block, start: Unknowns, priors: Unknowns, structure: Struct
         rotation=_floats(start.exterior.camera_from_object).transpose(1, 2, 0),
         shared=_vector(shared_vector(start, s.groups)),
         points=_hold(_floats(start.points).T, block),
-        datum_eop=np.zeros((0, 6, s.n_images)),
-        datum_points=np.zeros((0, 3, s.n_points)),
+        datum_eop=_floats(np.zeros((0, 6, s.n_images))),
+        datum_points=_floats(np.zeros((0, 3, s.n_points))),
     )
 
 
-def _floats(x):
+def _floats(x: Any) -> Any:
     """A float64 array: numpy's where nothing is traced, because its operations need no compilation."""
     return x if isinstance(x, jax.core.Tracer) else np.asarray(x, float)
 

@@ -32,9 +32,7 @@ def body_from_camera(boresight: Float[Array, "3"]) -> Float[Array, "3 3"]:
     return _BODY_FROM_CAMERA @ small_rotation(boresight)
 
 
-def object_from_body(
-    camera_from_object: Float[Array, "3 3"], boresight: Float[Array, "3"]
-) -> Float[Array, "3 3"]:
+def object_from_body(camera_from_object: Float[Array, "3 3"], boresight: Float[Array, "3"]) -> Float[Array, "3 3"]:
     """Attitude of the body from the orientation of the camera and the boresight misalignment."""
     return camera_from_object.T @ body_from_camera(boresight).T
 

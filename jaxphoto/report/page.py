@@ -47,26 +47,30 @@ def report_page(tables: Tables, warnings: list[str]) -> str:
     used = [c for c, corr in tables.correlations.items() if corr.parameters and corr.images]
     largest = tables.residuals.assign(size=tables.residuals["w"].abs()).nlargest(_LARGEST, "size")
     check = tables.check_points
-    return Environment(autoescape=True).from_string(_PAGE).render(
-        title=a.block.title or "jaxphoto adjustment",
-        converged=bool(a.converged),
-        outcome=a.outcome.value,
-        steps=int(a.steps),
-        sigma0=f"{float(a.sigma0):.6g}",
-        redundancy=a.redundancy,
-        counts=", ".join(counts) + f"; {sum(a.n_unknowns.values())} unknowns",
-        rotations=tables.rotations.replace("_", ", "),
-        warnings=warnings,
-        interior=_html(tables.interior),
-        correlation=[_picture(correlation_figure(tables, c)) for c in used],
-        layout=_picture(layout_figure(tables)),
-        spread=_html(tables.residual_spread),
-        residuals=[_picture(residuals_figure(tables, c)) for c in a.unknowns.interior],
-        largest=_html(largest.drop(columns="size")),
-        check=_html(check) if len(check) else "",
-        check_spread=_html(_check_spread(check)) if len(check) else "",
-        exterior=_html(tables.exterior),
-        summary=_html(tables.correlation_summary),
+    return (
+        Environment(autoescape=True)
+        .from_string(_PAGE)
+        .render(
+            title=a.block.title or "jaxphoto adjustment",
+            converged=bool(a.converged),
+            outcome=a.outcome.value,
+            steps=int(a.steps),
+            sigma0=f"{float(a.sigma0):.6g}",
+            redundancy=a.redundancy,
+            counts=", ".join(counts) + f"; {sum(a.n_unknowns.values())} unknowns",
+            rotations=tables.rotations.replace("_", ", "),
+            warnings=warnings,
+            interior=_html(tables.interior),
+            correlation=[_picture(correlation_figure(tables, c)) for c in used],
+            layout=_picture(layout_figure(tables)),
+            spread=_html(tables.residual_spread),
+            residuals=[_picture(residuals_figure(tables, c)) for c in a.unknowns.interior],
+            largest=_html(largest.drop(columns="size")),
+            check=_html(check) if len(check) else "",
+            check_spread=_html(_check_spread(check)) if len(check) else "",
+            exterior=_html(tables.exterior),
+            summary=_html(tables.correlation_summary),
+        )
     )
 
 

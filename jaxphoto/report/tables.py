@@ -49,7 +49,7 @@ class Tables:
     @cached_property
     def redundancy(self) -> Residuals:
         """Redundancy number of every observation."""
-        return redundancy_numbers(self.adjusted)
+        return redundancy_numbers(self.adjusted, self.covariance)
 
     @cached_property
     def w(self) -> Residuals:
@@ -159,14 +159,15 @@ class Tables:
 
     @cached_property
     def correlation(self) -> pd.DataFrame:
-        """parameter_a, parameter_b, rho: every IOP with every other, and each image's EOP with its camera's IOP."""
+        """parameter_a, parameter_b, rho: every IOP with every other; each image's EOP with its IOP and itself."""
         rows = []
         for camera, c in self.correlations.items():
             labels = [f"interior[{camera}].{p}" for p in c.parameters]
             rows += [(a, b, c.interior[i, j]) for i, a in enumerate(labels) for j, b in enumerate(labels) if i != j]
-            for image, rho in zip(c.images, c.exterior, strict=True):
-                for name, row in zip(c.eop_names, rho, strict=True):
-                    rows += [(f"exterior[{image}].{name}", b, value) for b, value in zip(labels, row, strict=True)]
+            for image, rho, own in zip(c.images, c.exterior, c.within_image, strict=True):
+                eop = [f"exterior[{image}].{name}" for name in c.eop_names]
+                rows += [(a, b, rho[i, j]) for i, a in enumerate(eop) for j, b in enumerate(labels)]
+                rows += [(a, b, own[i, j]) for i, a in enumerate(eop) for j, b in enumerate(eop) if i != j]
         return pd.DataFrame(rows, columns=["parameter_a", "parameter_b", "rho"])
 
     @cached_property
@@ -187,6 +188,4 @@ class Tables:
     def residual_spread(self) -> pd.DataFrame:
         """group, axis, n, mean, rmse, max_abs, unit (paper 000, Table 3)."""
         columns = ["group", "axis", "n", "mean", "rmse", "max_abs", "unit"]
-        return pd.DataFrame(
-            [[getattr(s, c) for c in columns] for s in residual_spread(self.adjusted)], columns=columns
-        )
+        return pd.DataFrame([[getattr(s, c) for c in columns] for s in residual_spread(self.adjusted)], columns=columns)

@@ -26,11 +26,15 @@ def print_adjustment(tables: Tables, warnings: list[str], console: Console) -> N
     if len(warnings) > _WARNINGS:
         console.print(f"[yellow]![/yellow] and {len(warnings) - _WARNINGS} more in report.html")
     if tables.significance:
-        table = Table("camera", "parameter", "value", "sigma", "|value| / sigma", "p", title="interior orientation (a posteriori)")
+        table = Table(
+            "camera", "parameter", "value", "sigma", "|value| / sigma", "p", title="interior orientation (a posteriori)"
+        )
         for s in tables.significance:
-            table.add_row(s.camera, s.parameter, f"{s.value:.8g}", f"{s.sigma:.3g}", f"{s.ratio:.4g}", f"{s.p_value:.2g}")
+            table.add_row(
+                s.camera, s.parameter, f"{s.value:.8g}", f"{s.sigma:.3g}", f"{s.ratio:.4g}", f"{s.p_value:.2g}"
+            )
         console.print(table)
     spread = Table("group", "axis", "n", "RMSE", "maximum", "unit", title="residuals")
-    for s in residual_spread(adjusted):
-        spread.add_row(s.group, s.axis, str(s.n), f"{s.rmse:.4g}", f"{s.max_abs:.4g}", s.unit)
+    for v in residual_spread(adjusted):
+        spread.add_row(v.group, v.axis, str(v.n), f"{v.rmse:.4g}", f"{v.max_abs:.4g}", v.unit)
     console.print(spread)

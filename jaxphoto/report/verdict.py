@@ -1,6 +1,7 @@
 """What a person should know first: warnings about an adjustment, most serious first, each with what to do."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxphoto.adjustment import Adjustment
@@ -9,6 +10,7 @@ from jaxphoto.report.tables import Tables
 from jaxphoto.statistics import SIGNIFICANT_RATIO, Correlations
 
 HIGH_CORRELATION = 0.9
+HIGH_OWN_CORRELATION = 0.95
 LARGE_W = 4.0
 _SHOWN = 4
 
@@ -22,8 +24,8 @@ def warnings_of(tables: Tables) -> list[str]:
         found += _correlated(camera, c)
     weak = [s for s in tables.significance if not s.significant]
     found += [
-        f"{s.parameter} of camera {s.camera} is not significant: |value| is {s.ratio:.1f} sigma (asked: {SIGNIFICANT_RATIO:.0f}"
-        f"; t-test p = {s.p_value:.2g}); consider holding it fixed"
+        f"{s.parameter} of camera {s.camera} is not significant: |value| is {s.ratio:.1f} sigma (asked: "
+        f"{SIGNIFICANT_RATIO:.0f}; t-test p = {s.p_value:.2g}); consider holding it fixed"
         for s in weak
     ]
     found += _large_residuals(tables)
@@ -45,15 +47,25 @@ def _correlated(camera: str, c: Correlations) -> list[str]:
         if abs(c.interior[i, j]) > HIGH_CORRELATION
     ]
     for _, rho, a, b in sorted(pairs, reverse=True)[:_SHOWN]:
-        found.append(f"high correlation of {a} and {b} of camera {camera}: {rho:+.3f}; their sum is known better than each")
-    if len(c.images) == 0 or not c.parameters:
+        found.append(
+            f"high correlation of {a} and {b} of camera {camera}: {rho:+.3f}; their sum is known better than each"
+        )
+    if len(c.images) == 0:
         return found
     worst = c.max_abs
     for i, j in sorted(np.argwhere(worst > HIGH_CORRELATION).tolist(), key=lambda k: -worst[k[0], k[1]])[:_SHOWN]:
         image = c.images[int(np.abs(c.exterior[:, i, j]).argmax())]
         found.append(
-            f"high correlation of {c.eop_names[i]} with {c.parameters[j]} of camera {camera}: up to {worst[i, j]:.3f} (image "
-            f"{image}); add cross strips, control or height differences"
+            f"high correlation of {c.eop_names[i]} with {c.parameters[j]} of camera {camera}: up to {worst[i, j]:.3f} "
+            f"(image {image}); add cross strips, control or height differences"
+        )
+    own = np.abs(c.within_image).max(axis=0)
+    strong = [(own[i, j], i, j) for i in range(6) for j in range(i) if own[i, j] > HIGH_OWN_CORRELATION]
+    if strong:
+        names = ", ".join(f"{c.eop_names[j]} and {c.eop_names[i]} (up to {r:.3f})" for r, i, j in sorted(strong)[::-1])
+        found.append(
+            f"exterior orientation of single images is highly correlated: {names}; usual without camera stations or "
+            "attitudes, their effects on the ground cancel"
         )
     return found
 
@@ -66,8 +78,13 @@ def _large_residuals(tables: Tables) -> list[str]:
     if not len(large):
         return []
     shown = large[np.argsort(-size[large])][:_SHOWN]
-    names = ", ".join(f"point {block.points[rows.point[k]]} in image {block.images[rows.image[k]]} ({size[k]:.1f})" for k in shown)
-    return [f"{len(large)} image points have residuals over {LARGE_W:.0f} of their standard deviations: {names}; check for blunders"]
+    names = ", ".join(
+        f"point {block.points[rows.point[k]]} in image {block.images[rows.image[k]]} ({size[k]:.1f})" for k in shown
+    )
+    return [
+        f"{len(large)} image points have residuals over {LARGE_W:.0f} of their standard deviations: {names}; look for "
+        "blunders"
+    ]
 
 
 def _folds(adjusted: Adjustment, name: str, sensor: Sensor) -> bool:
@@ -75,6 +92,5 @@ def _folds(adjusted: Adjustment, name: str, sensor: Sensor) -> bool:
     interior = adjusted.unknowns.interior[name]
     corner = np.array([sensor.width_mm, sensor.height_mm]) / 2
     r = np.linspace(0.0, 1.0, 65)[:, None] * corner
-    out = np.asarray(jax.vmap(interior.distortion.closed_form)(r))
+    out = np.asarray(jax.vmap(interior.distortion.closed_form)(jnp.asarray(r)))
     return bool((np.diff(np.linalg.norm(out, axis=1)) <= 0).any())
-

@@ -21,6 +21,8 @@ class Correlations(eqx.Module):
     images: tuple[str, ...] = eqx.field(static=True)
     interior: Float[np.ndarray, "iop iop"]
     exterior: Float[np.ndarray, "images 6 iop"]
+    within_image: Float[np.ndarray, "images 6 6"]
+    """Of each image's exterior orientation with itself."""
 
     @property
     def mean_abs(self) -> Float[np.ndarray, "6 iop"]:
@@ -58,5 +60,6 @@ def correlations(adjusted: Adjustment, covariance: Covariance) -> dict[str, Corr
             tuple(adjusted.block.images[i] for i in images),
             rho[np.ix_(columns, columns)],
             exterior,
+            np.array([rho[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] for i in images]).reshape(-1, 6, 6),
         )
     return result

@@ -21,6 +21,7 @@ from jaxtyping import Array, Float
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.adjustment.compiled import run_compiled
 from jaxphoto.adjustment.normal import solve_3x3
+from jaxphoto.adjustment.residuals import Increments
 from jaxphoto.adjustment.result import Factored
 from jaxphoto.adjustment.structure import Structure
 from jaxphoto.rotation import omega_phi_kappa_from_matrix, small_rotation
@@ -33,17 +34,28 @@ EOP_NAMES: dict[str, tuple[str, ...]] = {
 }
 
 
+class Cofactors(NamedTuple):
+    """Cofactors in scaled increments: reduced unknowns, points, and points with what they met."""
+
+    reduced: Float[Array, "reduced reduced"]
+    points: Float[Array, "points 3 3"]
+    point_eop: Float[Array, "rows 3 6"]
+    """Of each image row's point with its image."""
+    point_shared: Float[Array, "points 3 shared"]
+
+
 class Covariance(eqx.Module):
     """A priori covariances (sigma naught 1), in metres, radians, mm and the coefficients' own units.
 
-    `matrix` is of the exterior orientations (6 an image, in the block's order: X, Y, Z, then three rotations of the kind
-    `rotations`) followed by the shared unknowns. Fixed unknowns have zero rows. Multiply by `variance_factor` for a
-    posteriori values.
+    `matrix` is of the exterior orientations (6 an image, in the block's order: X, Y, Z, then three rotations of the
+    kind `rotations`) followed by the shared unknowns. Fixed unknowns have zero rows. Multiply by `variance_factor`
+    for a posteriori values.
     """
 
     matrix: Float[Array, "reduced reduced"]
     points: Float[Array, "points 3 3"]
     variance_factor: Float[Array, ""]
+    cofactors: Cofactors
     labels: tuple[str, ...] = eqx.field(static=True)
     n_images: int = eqx.field(static=True)
     rotations: Rotations = eqx.field(static=True)
@@ -67,16 +79,6 @@ class Covariance(eqx.Module):
         return jnp.sqrt(jnp.maximum(variance, 0.0) * self.variance_factor)
 
 
-class Cofactors(NamedTuple):
-    """Cofactors in scaled increments: reduced unknowns, points, and points with what they met."""
-
-    reduced: Float[Array, "reduced reduced"]
-    points: Float[Array, "points 3 3"]
-    point_eop: Float[Array, "rows 3 6"]
-    """Of each image row's point with its image."""
-    point_shared: Float[Array, "points 3 shared"]
-
-
 def covariance(adjusted: Adjustment, rotations: Rotations = "omega_phi_kappa") -> Covariance:
     """Covariance of exterior orientations, shared unknowns and points.
 
@@ -85,13 +87,15 @@ def covariance(adjusted: Adjustment, rotations: Rotations = "omega_phi_kappa") -
     """
     if rotations not in EOP_NAMES:
         raise ValueError(f"rotations is one of {', '.join(EOP_NAMES)}, got {rotations!r}")
-    arguments = (adjusted.factored, adjusted.structure, adjusted.values.rotation, rotations)
+    cofactors = run_compiled(_cofactors, (adjusted.factored, adjusted.structure), adjusted.seconds, "covariance")
+    arguments = (cofactors, adjusted.factored.scale, adjusted.values.rotation, rotations)
     matrix, points = run_compiled(_physical, arguments, adjusted.seconds, "covariance")
     labels = [f"exterior[{i}].{n}" for i in adjusted.block.images for n in EOP_NAMES[rotations]]
     return Covariance(
         matrix=matrix,
         points=points,
         variance_factor=adjusted.sigma0**2,
+        cofactors=cofactors,
         labels=(*labels, *adjusted.structure.labels),
         n_images=adjusted.structure.n_images,
         rotations=rotations,
@@ -99,8 +103,8 @@ def covariance(adjusted: Adjustment, rotations: Rotations = "omega_phi_kappa") -
 
 
 @eqx.filter_jit
-def _physical(factored: Factored, structure: Structure, rotation, rotations: Rotations):
-    q, scale, n = cofactors(factored, structure), factored.scale, structure.n_images
+def _physical(q: Cofactors, scale: Increments, rotation: Float[Array, "3 3 images"], rotations: Rotations):
+    n = rotation.shape[2]
     factors = jnp.concatenate([scale.eop.T.reshape(-1), scale.shared])
     matrix = q.reduced * factors[:, None] * factors[None, :]
 
@@ -123,7 +127,8 @@ def _physical(factored: Factored, structure: Structure, rotation, rotations: Rot
     return matrix, points
 
 
-def cofactors(factored: Factored, structure: Structure) -> Cofactors:
+@eqx.filter_jit
+def _cofactors(factored: Factored, structure: Structure) -> Cofactors:
     """All cofactors of one factored block; see the module's head."""
     s, normal, reduced = structure, factored.normal, factored.reduced
     n, q, k = 6 * s.n_images, s.n_shared, reduced.g.shape[1]
@@ -141,9 +146,7 @@ def cofactors(factored: Factored, structure: Structure) -> Cofactors:
     blocks = in_images[s.block_row, :, s.block_column, :][s.pair_block]
     own = jnp.where((s.pair_a == s.pair_b)[:, None, None], 0.0, 1.0)
     met = jax.ops.segment_sum(jnp.einsum("nkc,ncd->nkd", w[s.pair_a], blocks), s.pair_b, len(s.point))
-    met += jax.ops.segment_sum(
-        own * jnp.einsum("nkc,ndc->nkd", w[s.pair_b], blocks), s.pair_a, len(s.point)
-    )
+    met += jax.ops.segment_sum(own * jnp.einsum("nkc,ndc->nkd", w[s.pair_b], blocks), s.pair_a, len(s.point))
     to_border = full[:n, n:].reshape(s.n_images, 6, -1)
     met += jnp.einsum("nkb,ndb->nkd", border[s.point], to_border[s.image])
     met_border = jax.ops.segment_sum(
@@ -153,9 +156,7 @@ def cofactors(factored: Factored, structure: Structure) -> Cofactors:
     l = reduced.l  # noqa: E741
     point_eop = -_solve(l[:, s.point], met)
     point_border = -_solve(l, met_border)
-    across = jax.ops.segment_sum(
-        jnp.einsum("nkc,njc->nkj", point_eop, w), s.point, s.n_points, indices_are_sorted=True
-    )
+    across = jax.ops.segment_sum(jnp.einsum("nkc,njc->nkj", point_eop, w), s.point, s.n_points, indices_are_sorted=True)
     across += jnp.einsum("pkb,pjb->pkj", point_border, border)
     eye = jnp.broadcast_to(jnp.eye(3), (s.n_points, 3, 3))
     points = _solve(l, (eye - across).transpose(0, 2, 1)).transpose(0, 2, 1)

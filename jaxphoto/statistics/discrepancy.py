@@ -74,7 +74,13 @@ def angle_differences(first: Adjustment, second: Adjustment) -> tuple[tuple[str,
 def spread_of(group: str, axis: str, values: np.ndarray, unit: str) -> Spread:
     """Mean, RMSE (over n) and maximum of some values; they must not be empty."""
     return Spread(
-        group, axis, len(values), float(values.mean()), float(np.sqrt((values**2).mean())), float(np.abs(values).max()), unit
+        group,
+        axis,
+        len(values),
+        float(values.mean()),
+        float(np.sqrt((values**2).mean())),
+        float(np.abs(values).max()),
+        unit,
     )
 
 

@@ -14,18 +14,18 @@ from jaxphoto.adjustment.colouring import jacobian_blocks
 from jaxphoto.adjustment.compiled import run_compiled
 from jaxphoto.adjustment.normal import solve_factored
 from jaxphoto.adjustment.optimum import zero_increments
-from jaxphoto.adjustment.residuals import Increments, Residuals, Values, residuals_at
+from jaxphoto.adjustment.residuals import Residuals, Values, residuals_at
 from jaxphoto.adjustment.result import Factored
 from jaxphoto.adjustment.structure import Structure
-from jaxphoto.statistics.covariance import cofactors
+from jaxphoto.statistics.covariance import Cofactors, Covariance
 
 # Below this redundancy number an observation is not checked at all: no normalised residual is given.
 _UNCHECKED = 1e-6
 
 
-def redundancy_numbers(adjusted: Adjustment) -> Residuals:
+def redundancy_numbers(adjusted: Adjustment, covariance: Covariance) -> Residuals:
     """Redundancy number of every observation, shaped like `adjusted.residuals` (zero for the datum's constraints)."""
-    arguments = (adjusted.values, adjusted.factored, adjusted.structure)
+    arguments = (adjusted.values, covariance.cofactors, adjusted.factored, adjusted.structure)
     return run_compiled(_redundancy, arguments, adjusted.seconds, "covariance")
 
 
@@ -43,8 +43,8 @@ def normalised_residuals(adjusted: Adjustment, redundancy: Residuals) -> Residua
 
 
 @eqx.filter_jit
-def _redundancy(values: Values, factored: Factored, s: Structure) -> Residuals:
-    q, scale = cofactors(factored, s), factored.scale
+def _redundancy(values: Values, q: Cofactors, factored: Factored, s: Structure) -> Residuals:
+    scale = factored.scale
     product = jax.linearize(lambda y: residuals_at(y, scale, values, s), zero_increments(s))[1]
     j = jacobian_blocks(product, s)
     n = 6 * s.n_images
@@ -88,17 +88,13 @@ def _redundancy(values: Values, factored: Factored, s: Structure) -> Residuals:
 
 def _distances(ends: jax.Array, factored: Factored, s: Structure) -> jax.Array:
     """diag(J Q J') of the distances, by one solve each: they join two points that never met otherwise."""
+
     def one(k):
         points = jnp.zeros((3, s.n_points))
         for end in range(2):
             points = points.at[:, s.distance_points[k, end]].add(ends[end, :, k])
-        right = factored.normal._replace(
-            b_e=jnp.zeros_like(factored.normal.b_e),
-            b_s=jnp.zeros_like(factored.normal.b_s),
-            b_p=points,
-            rows_b=jnp.zeros_like(factored.normal.rows_b),
-        )
-        x: Increments = solve_factored(right, factored.reduced, factored.lower, s)
+        b = zero_increments(s)._replace(points=points)
+        x = solve_factored(factored.normal, factored.reduced, factored.lower, b, s)
         return jnp.sum(points * x.points)
 
     if not len(s.distance_points):

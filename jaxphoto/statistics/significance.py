@@ -13,7 +13,7 @@ SIGNIFICANT_RATIO = 10.0
 
 
 class Significance(eqx.Module):
-    """One estimated interior parameter: value, a posteriori sigma, ratio |value| / sigma and two-sided p of value = 0."""
+    """One estimated interior parameter: value, a posteriori sigma, |value| / sigma, and two-sided p of value = 0."""
 
     camera: str
     parameter: str

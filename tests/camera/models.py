@@ -2,11 +2,15 @@
 
 import numpy as np
 
-from jaxphoto.camera import Balanced, Brown, Smac
+from jaxphoto.camera import Balanced, Brown, Smac, constant_names
+from jaxphoto.camera.distortion import AffineBrown
 
 # Per model: the coefficients in units of the size they have on a sensor of 36 mm x 24 mm.
+_BROWN = {"k1": 1e-4, "k2": 1e-7, "k3": 1e-10, "p1": 1e-5, "p2": 1e-5, "b1": 1e-3, "b2": 1e-3}
+_SMAC = {"k0": 1e-2, "k1": 1e-4, "k2": 1e-7, "k3": 1e-10, "k4": 1e-13, "p1": 1e-5, "p2": 1e-5, "p3": 1e-3, "p4": 1e-6}
 UNITS = {
-    Brown: {"k1": 1e-4, "k2": 1e-7, "k3": 1e-10, "p1": 1e-5, "p2": 1e-5, "b1": 1e-3, "b2": 1e-3},
+    Brown: _BROWN,
+    AffineBrown: _BROWN,
     Smac: {
         "k0": 1e-2,
         "k1": 1e-4,
@@ -22,10 +26,11 @@ UNITS = {
 }
 
 
-def build(model, numbers, **constants):
-    """A model from its coefficients as multiples of `UNITS`, in the order of `coefficients`."""
+def build(model, numbers):
+    """A model from its coefficients as multiples of `UNITS`, in the model's order; R0 = 8 mm where it has one."""
     units = UNITS[model]
     assert tuple(units) == model.coefficients, "UNITS and the model disagree"
+    constants = dict.fromkeys(constant_names(model).values(), 8.0)
     return model(**{name: numbers[i] * unit for i, (name, unit) in enumerate(units.items())}, **constants)
 
 

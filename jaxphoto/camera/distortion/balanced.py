@@ -32,6 +32,7 @@ class Balanced(AbstractDistortion):
     coefficients: ClassVar[tuple[str, ...]] = ("a1", "a2", "a3", "b1", "b2", "c1", "c2")
 
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
+        """Measured coordinate (mm) of an ideal one, both reduced to the principal point."""
         x, y = xy
         r2, s2 = x * x + y * y, self.r0 * self.r0
         dr = self.a1 * (r2 - s2) + self.a2 * (r2**2 - s2**2) + self.a3 * (r2**3 - s2**3)

@@ -46,9 +46,7 @@ class AbstractDistortion(eqx.Module):
         return invert(self, xy)[0] if self.domain == "measured" else self.closed_form(xy)
 
 
-def invert(
-    distortion: AbstractDistortion, target: Float[Array, "2"]
-) -> tuple[Float[Array, "2"], Bool[Array, ""]]:
+def invert(distortion: AbstractDistortion, target: Float[Array, "2"]) -> tuple[Float[Array, "2"], Bool[Array, ""]]:
     """The coordinate that `closed_form` takes to `target`, and whether it lies in the monotone range.
 
     Newton's method from the linear part of the map, differentiable to any order by the implicit function
@@ -101,4 +99,3 @@ def decentring(p1, p2, xy: Float[Array, "2"]) -> Float[Array, "2"]:
     x, y = xy
     r2 = x * x + y * y
     return jnp.stack([p1 * (r2 + 2 * x * x) + 2 * p2 * x * y, 2 * p1 * x * y + p2 * (r2 + 2 * y * y)])
-

@@ -30,6 +30,7 @@ class Brown(AbstractDistortion):
     coefficients: ClassVar[tuple[str, ...]] = ("k1", "k2", "k3", "p1", "p2", "b1", "b2")
 
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
+        """Ideal coordinate (mm) of a measured one, both reduced to the principal point."""
         x, y = xy
         r2 = x * x + y * y
         radial = r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
