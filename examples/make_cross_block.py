@@ -22,7 +22,7 @@ import pandas as pd
 from jaxphoto import Brown, ExteriorOrientation, InteriorOrientation, Sensor, project
 from jaxphoto.collinearity import camera_coordinates, project_ideal
 
-SEED = 2
+SEED = 5
 TRUTH = InteriorOrientation(34.25, 0.064, 0.273, Brown(k1=-9.12e-5, k2=1.0435e-7))
 SENSOR = Sensor(4500, 3000, 0.008)
 HEIGHT_M = 1000.0

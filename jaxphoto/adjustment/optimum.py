@@ -22,12 +22,12 @@ from jaxphoto.collinearity import ExteriorOrientation, image_residual
 
 # The first damping relative to the normal matrix is the square of this: almost Gauss-Newton.
 _FIRST_DAMPING = 1e-4
-# The last step moves no unknown by more than this fraction of its standard deviation.
-TOLERANCE = 1e-4
+# No unknown misses its optimum by more than this fraction of its standard deviation.
+TOLERANCE = 1e-5
 
 
 class Optimum(NamedTuple):
-    """Where the solver ended, after how many steps, and whether the last step was negligible.
+    """Where the solver ended, after how many steps, and whether it is the optimum.
 
     In a tangent only the increments have a derivative; the others are None.
     """

@@ -16,7 +16,7 @@ from jaxphoto.unknowns import Unknowns
 class Outcome(enum.Enum):
     """How the adjustment ended; the member's value is the sentence shown to the user."""
 
-    CONVERGED = "converged: the last step moved no unknown by more than a ten-thousandth of its standard deviation"
+    CONVERGED = "converged: every unknown is within a hundred-thousandth of its standard deviation of the optimum"
     STEPS = (
         "not converged: the step limit was reached; check the approximate values, look for blunders among the largest "
         "residuals, or hold weakly determined unknowns fixed"

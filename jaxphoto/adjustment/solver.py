@@ -132,10 +132,11 @@ class BlockDescent(optx.AbstractDescent):
 
 
 class _Trust(NamedTuple):
-    """Damping 1 / step_size, and the reduction of half the square sum that the proposed step promises."""
+    """Damping 1 / step_size; what the proposed step promises to take off half the square sum; its length."""
 
     step_size: Scalar
     promised: Scalar
+    length: Scalar
 
 
 class PromisedReduction(optx.AbstractSearch):
@@ -151,7 +152,7 @@ class PromisedReduction(optx.AbstractSearch):
 
     def init(self, y: Increments, f_info_struct: Any) -> _Trust:
         """Step size 1: the first damping is the scaling's business."""
-        return _Trust(jnp.ones(()), jnp.zeros(()))
+        return _Trust(jnp.ones(()), jnp.zeros(()), jnp.array(jnp.inf))
 
     def step(self, first_step, y, y_eval, f_info, f_eval_info, state: _Trust):
         """Accept or reject the proposal, and adapt the damping."""
@@ -160,15 +161,15 @@ class PromisedReduction(optx.AbstractSearch):
         good = ~first_step & (change < -self.high_cutoff * state.promised)
         factor = jnp.where(accept, jnp.where(good, self.high_constant, 1.0), self.low_constant)
         size = state.step_size * factor
-        return size, accept, optx.RESULTS.successful, _Trust(size, state.promised)
+        return size, accept, optx.RESULTS.successful, _Trust(size, state.promised, state.length)
 
 
 class LevenbergMarquardt(optx.AbstractGaussNewton):
-    """optimistix' Levenberg-Marquardt, stopped by what the next step would do to the unknowns.
+    """optimistix' Levenberg-Marquardt, stopped by what is still missing to the optimum, in standard deviations.
 
     The length of a step d in the metric of the normal matrix, sqrt(d' N d), bounds |d| / sigma of every single
-    unknown. Once a proposed, practically undamped step is shorter than `tolerance`, it is taken and the work ends: no
-    unknown still moves by more than that fraction of its standard deviation.
+    unknown. Steps shrink at least in geometric progression, so after a step of length l that follows one of length k
+    about l (l / k) is missing. Once that is below `tolerance`, the practically undamped step is taken and the work ends.
     """
 
     rtol: float
@@ -188,19 +189,22 @@ class LevenbergMarquardt(optx.AbstractGaussNewton):
         self.tolerance = tolerance
 
     def step(self, fn, y, args, options, state, tags):
-        """One step of optimistix; afterwards `terminate` says whether the step just proposed is negligible."""
+        """One step of optimistix; afterwards `terminate` says whether the step just proposed is the last."""
         new_y, new, aux = super().step(fn, y, args, options, state, tags)
         proposal = jax.tree.map(jnp.subtract, new.y_eval, new_y)
         # (N + damping) d = -b, so d'N d = -d'b - damping d'd, and the linear model promises d'N d / 2 + damping d'd.
         damped = _dot(proposal, proposal) / new.search_state.step_size
         seen = -_dot(proposal, new.descent_state.b) - damped
         accepted = new.num_steps_since_acceptance == 0
-        settled = accepted & (seen <= self.tolerance**2) & (damped <= seen + self.tolerance**2)
-        where = lambda s: (s.terminate, s.search_state.promised)  # noqa: E731
-        return new_y, eqx.tree_at(where, new, (settled, 0.5 * seen + damped)), aux
+        length, trust = jnp.sqrt(jnp.maximum(seen, 0.0)), new.search_state
+        missing = length * jnp.minimum(1.0, length / trust.length)
+        settled = accepted & (jnp.where(jnp.isinf(trust.length), length, missing) <= self.tolerance)
+        settled = settled & (length < 1.0) & (damped <= seen + self.tolerance**2)
+        trust = _Trust(trust.step_size, 0.5 * seen + damped, jnp.where(accepted, length, trust.length))
+        return new_y, eqx.tree_at(lambda s: (s.terminate, s.search_state), new, (settled, trust)), aux
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
-        """The last proposal is part of the answer: it was computed from an accepted iterate and is negligible."""
+        """The last proposal is part of the answer: it was computed from an accepted iterate and is short."""
         y = jax.tree.map(lambda a, b: jnp.where(state.terminate, a, b), state.y_eval, y)
         return y, aux, {}
 

@@ -27,6 +27,7 @@ Standard deviations are a posteriori (times &sigma;<sub>0</sub>). Correlations r
 {% for w in warnings %}<p class="warning">{{ w }}</p>{% else %}<p>No warnings.</p>{% endfor %}
 <h2>Interior orientation</h2>{{ interior }}
 {% for figure in correlation %}<img alt="correlations" src="{{ figure }}">{% endfor %}
+{% if georeferencing %}<h2>Mounts and strips</h2>{{ georeferencing }}{% endif %}
 <h2>Block</h2><img alt="block layout" src="{{ layout }}">
 <h2>Residuals</h2>{{ spread }}
 {% for figure in residuals %}<img alt="image residuals" src="{{ figure }}">{% endfor %}
@@ -62,6 +63,7 @@ def report_page(tables: Tables, warnings: list[str]) -> str:
             warnings=warnings,
             interior=_html(tables.interior),
             correlation=[_picture(correlation_figure(tables, c)) for c in used],
+            georeferencing=_html(tables.georeferencing) if len(tables.georeferencing) else "",
             layout=_picture(layout_figure(tables)),
             spread=_html(tables.residual_spread),
             residuals=[_picture(residuals_figure(tables, c)) for c in a.unknowns.interior],

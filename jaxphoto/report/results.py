@@ -7,7 +7,6 @@ import time
 from importlib.metadata import version
 from pathlib import Path
 
-from jaxphoto.adjustment import Adjustment
 from jaxphoto.errors import InputError
 from jaxphoto.report.page import report_page
 from jaxphoto.report.tables import Tables
@@ -47,7 +46,7 @@ def write_results(tables: Tables, warnings: list[str], directory: Path, seconds:
         for name in _TABLES:
             getattr(tables, name).to_csv(work / f"{name}.csv", index=False)
         (work / "report.html").write_text(report_page(tables, warnings), encoding="utf-8")
-        summary = summary_of(tables.adjusted, warnings, seconds | {"write": time.perf_counter() - began})
+        summary = summary_of(tables, warnings, seconds | {"write": time.perf_counter() - began})
         (work / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
         if directory.exists():
             shutil.rmtree(directory)
@@ -57,8 +56,9 @@ def write_results(tables: Tables, warnings: list[str], directory: Path, seconds:
         raise
 
 
-def summary_of(adjusted: Adjustment, warnings: list[str], seconds: dict[str, float]) -> dict:
+def summary_of(tables: Tables, warnings: list[str], seconds: dict[str, float]) -> dict:
     """What summary.json says."""
+    adjusted = tables.adjusted
     observations, unknowns = adjusted.n_observations, adjusted.n_unknowns
     return {
         "title": adjusted.block.title,
@@ -70,6 +70,7 @@ def summary_of(adjusted: Adjustment, warnings: list[str], seconds: dict[str, flo
         "n_constraints": adjusted.n_constraints,
         "n_unknowns": {"total": sum(unknowns.values()), **unknowns},
         "iterations": int(adjusted.steps),
+        "georeferencing": {p: {"value": v, "sigma": s} for p, v, s in tables.georeferencing.itertuples(index=False)},
         "seconds": {name: round(value, 6) for name, value in seconds.items()},
         "warnings": warnings,
         "versions": {name: version(name) for name in _PACKAGES},

@@ -80,6 +80,18 @@ class Tables:
         return pd.DataFrame(rows, columns=["camera", "parameter", "value", "sigma", "significant"])
 
     @cached_property
+    def georeferencing(self) -> pd.DataFrame:
+        """parameter, value, sigma of what was estimated of mounts and strips; units stand in the parameter's name."""
+        s = self.adjusted.structure
+        rows = []
+        for k, label, sigma in zip(s.free, s.labels, np.asarray(self.covariance.shared_sigma), strict=True):
+            if k >= s.mount_offset:
+                factor = 180 / np.pi if label.endswith("_rad") else 1.0
+                value = float(self.adjusted.values.shared[k])
+                rows.append((label.replace("_rad", "_deg"), factor * value, factor * float(sigma)))
+        return pd.DataFrame(rows, columns=["parameter", "value", "sigma"])
+
+    @cached_property
     def exterior(self) -> pd.DataFrame:
         """image, X_m ... kappa_deg and their sigmas."""
         exterior = self.adjusted.unknowns.exterior

@@ -7,6 +7,7 @@ from jaxphoto.report.tables import Tables
 from jaxphoto.statistics import residual_spread
 
 _WARNINGS = 12
+_PARAMETERS = 18
 
 
 def print_adjustment(tables: Tables, warnings: list[str], console: Console) -> None:
@@ -33,6 +34,11 @@ def print_adjustment(tables: Tables, warnings: list[str], console: Console) -> N
             table.add_row(
                 s.camera, s.parameter, f"{s.value:.8g}", f"{s.sigma:.3g}", f"{s.ratio:.4g}", f"{s.p_value:.2g}"
             )
+        console.print(table)
+    if len(tables.georeferencing):
+        table = Table("parameter", "value", "sigma", title="mounts and strips (a posteriori)")
+        for parameter, value, sigma in tables.georeferencing.head(_PARAMETERS).itertuples(index=False):
+            table.add_row(parameter, f"{value:.6g}", f"{sigma:.3g}")
         console.print(table)
     spread = Table("group", "axis", "n", "RMSE", "maximum", "unit", title="residuals")
     for v in residual_spread(adjusted):
