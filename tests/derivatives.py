@@ -11,7 +11,7 @@ from jax.flatten_util import ravel_pytree
 _STEP = 1e-3
 _TIMES, _WEIGHTS = np.array([-2.0, -1.0, 1.0, 2.0]), np.array([1.0, -8.0, 8.0, -1.0]) / 12
 # Half to a sixth of the compile time of the default, measured on jax 0.10.2.
-_QUICKLY = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
+QUICKLY = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
 
 
 @functools.cache
@@ -28,12 +28,12 @@ def _three_ways(fn):
         forward, value = jax.jacfwd(lambda v: (flat(v),) * 2, has_aux=True)(vector)
         return value, forward, jax.jacrev(flat)(vector), numerical
 
-    return jax.jit(jax.vmap(of_one_case), compiler_options=_QUICKLY)
+    return jax.jit(jax.vmap(of_one_case), compiler_options=QUICKLY)
 
 
 def compiled(fn):
     """`fn` compiled quickly, from and to NumPy: eager JAX would compile every single operation of a test."""
-    jitted = jax.jit(fn, compiler_options=_QUICKLY)
+    jitted = jax.jit(fn, compiler_options=QUICKLY)
 
     def call(*args):
         arrays = [np.asarray(a, float) if type(a) in (list, tuple, float, int) else a for a in args]

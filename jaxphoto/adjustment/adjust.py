@@ -18,7 +18,7 @@ from jaxphoto.adjustment.optimum import (
     zero_increments,
 )
 from jaxphoto.adjustment.rank import check_rank
-from jaxphoto.adjustment.residuals import Increments, Residuals, State, Values, state_at
+from jaxphoto.adjustment.residuals import Increments, Residuals, State, Values, residuals_at, state_at
 from jaxphoto.adjustment.result import Adjustment, Factored
 from jaxphoto.adjustment.structure import Structure, structure_of
 from jaxphoto.adjustment.values import at_state, unknowns_of, values_of, with_datum
@@ -44,22 +44,26 @@ def solve(block: Block, start: Unknowns, priors: Unknowns, max_steps: int = MAX_
     values = with_datum(values, constraints.eop, constraints.points)
     seconds: dict[str, float] = {}
     optimum, state = run_compiled(_optimise, (values, structure, max_steps), seconds, "solve")
-    finish = (values, state, structure, tuple(open_motions))
-    square_sum, residuals, factored = run_compiled(_finish, finish, seconds, "covariance")
+    values = at_state(values, state)
+    # Statistics need the factored normal matrix; a derivative of the unknowns does not, and would pay for it dearly.
+    traced = isinstance(state.position, jax.core.Tracer)
+    factored = None
+    if not traced:
+        factored = run_compiled(_factor, (values, structure, tuple(open_motions)), seconds, "covariance")
+    residuals = run_compiled(_residuals, (values, structure), seconds, "solve")
     adjusted = Adjustment(
         block=block,
         priors=priors,
         unknowns=unknowns_of(state, start, structure),
         residuals=residuals,
-        values=at_state(values, state),
+        values=values,
         structure=structure,
         factored=factored,
-        square_sum=square_sum,
         steps=optimum.steps,
         converged=optimum.converged,
         seconds=seconds,
     )
-    if not isinstance(square_sum, jax.core.Tracer):
+    if not traced:
         check_rank(adjusted)
     return adjusted
 
@@ -72,20 +76,22 @@ def _optimise(values: Values, structure: Structure, max_steps: int) -> tuple[Opt
 
 
 @eqx.filter_jit
-def _finish(
-    values: Values, state: State, structure: Structure, motions: tuple[jax.Array, jax.Array]
-) -> tuple[jax.Array, Residuals, Factored]:
-    """Residuals and the factored, undamped normal equations at the optimum."""
-    values = weigh_datum(at_state(values, state), structure)
+def _residuals(values: Values, structure: Structure) -> Residuals:
+    return residuals_at(zero_increments(structure), unit_scale(structure), values, structure)
+
+
+@eqx.filter_jit
+def _factor(values: Values, structure: Structure, motions: tuple[jax.Array, jax.Array]) -> Factored:
+    """The undamped normal equations at the optimum, factored."""
+    values = weigh_datum(values, structure)
     scale = typical_scale(values, structure)
-    normal, residuals = linearise(zero_increments(structure), scale, values, structure)
+    normal, _ = linearise(zero_increments(structure), scale, values, structure)
     reduced = reduce_normal(normal, 0.0, structure)
     inverse = jax.tree.map(lambda k: jnp.where(k > 0, 1 / jnp.where(k > 0, k, 1.0), 0.0), scale)
     scaled = Increments(
         motions[0] * inverse.eop, jnp.zeros((len(motions[0]), structure.n_shared)), motions[1] * inverse.points
     )
-    square_sum = sum((jnp.sum(v**2) for v in residuals[:-1]), jnp.zeros(()))
-    return square_sum, residuals, Factored(normal, reduced, factor_reduced(reduced), scale, scaled)
+    return Factored(normal, reduced, factor_reduced(reduced), scale, scaled)
 
 
 def concrete(tree: Values) -> Values:

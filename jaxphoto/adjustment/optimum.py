@@ -11,6 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Int
 
 from jaxphoto.adjustment.colouring import jacobian_blocks
@@ -99,19 +100,22 @@ def _find_optimum_jvp(primals, tangents, *, structure: Structure, max_steps: int
     reduced = reduce_normal(normal, 0.0, structure)
     lower = factor_reduced(reduced)
 
-    def hessian(x: Increments) -> Increments:
-        scaled = jax.tree.map(jnp.multiply, x, scale)
+    right, unravel = ravel_pytree(jax.tree.map(lambda c, k: -c * k, change, scale))
+    # One flat vector: the transposed solve wants all of its right-hand side to depend on the direction, or none.
+    flat = lambda tree: ravel_pytree(tree)[0]  # noqa: E731
+
+    def hessian(x):
+        scaled = jax.tree.map(jnp.multiply, unravel(x), scale)
         product = jax.jvp(lambda y: gradient(y, values), (at,), (scaled,))[1]
-        return jax.tree.map(jnp.multiply, product, scale)
+        return flat(jax.tree.map(jnp.multiply, product, scale))
 
-    def precondition(b: Increments) -> Increments:
-        return solve_factored(normal, reduced, lower, b, structure)
+    def precondition(b):
+        return flat(solve_factored(normal, reduced, lower, unravel(b), structure))
 
-    def solve(product, b: Increments) -> Increments:
+    def solve(product, b):
         return jax.scipy.sparse.linalg.cg(product, b, tol=1e-13, maxiter=100, M=precondition)[0]
 
-    right = jax.tree.map(lambda c, k: -c * k, change, scale)
-    x = jax.lax.custom_linear_solve(hessian, right, solve, symmetric=True)
+    x = unravel(jax.lax.custom_linear_solve(hessian, right, solve, symmetric=True))
     increments = jax.tree.map(jnp.multiply, x, scale)
     return optimum, Optimum(increments, None, None)
 

@@ -11,7 +11,7 @@ _DEFECT = 1e-13
 
 def check_rank(adjusted: Adjustment) -> None:
     """Raise RankError where the normal matrix at the optimum is singular; the message names the unknowns."""
-    if not bool(adjusted.converged):
+    if adjusted.factored is None or not bool(adjusted.converged):
         return
     s = adjusted.structure
     lower = np.asarray(adjusted.factored.lower)

@@ -9,6 +9,7 @@ from jaxtyping import Array, Float, Int
 from jaxphoto.adjustment.normal import Normal, Reduced
 from jaxphoto.adjustment.residuals import GROUPS, Increments, Residuals, Values
 from jaxphoto.adjustment.structure import Structure
+from jaxphoto.arrays import Numbers
 from jaxphoto.block import Block
 from jaxphoto.unknowns import Unknowns
 
@@ -51,11 +52,16 @@ class Adjustment(eqx.Module):
     residuals: Residuals
     values: Values
     structure: Structure
-    factored: Factored
-    square_sum: Float[Array, ""]
+    factored: Factored | None
+    """None in an adjustment that is being differentiated or mapped over."""
     steps: Int[Array, ""]
     converged: Array
     seconds: dict[str, float]
+
+    @property
+    def square_sum(self) -> Float[Numbers, ""]:
+        """v'Pv: the weighted square sum of all observations' residuals."""
+        return sum(((v**2).sum() for v in self.residuals[:-1]), np.zeros(()))
 
     @property
     def outcome(self) -> Outcome:
@@ -94,7 +100,7 @@ class Adjustment(eqx.Module):
         return sum(self.n_observations.values()) + self.n_constraints - sum(self.n_unknowns.values())
 
     @property
-    def sigma0(self) -> Float[Array, ""]:
+    def sigma0(self) -> Float[Numbers, ""]:
         """Square root of the a posteriori variance factor; 1 where there is no redundancy."""
         redundancy = self.redundancy
         return (self.square_sum / redundancy) ** 0.5 if redundancy > 0 else self.square_sum * 0 + 1.0

@@ -165,11 +165,12 @@ class PromisedReduction(optx.AbstractSearch):
 
 
 class LevenbergMarquardt(optx.AbstractGaussNewton):
-    """optimistix' Levenberg-Marquardt, stopped by what is still missing to the optimum, in standard deviations.
+    """Levenberg-Marquardt of optimistix, stopped by what is still missing to the optimum in standard deviations.
 
     The length of a step d in the metric of the normal matrix, sqrt(d' N d), bounds |d| / sigma of every single
     unknown. Steps shrink at least in geometric progression, so after a step of length l that follows one of length k
-    about l (l / k) is missing. Once that is below `tolerance`, the practically undamped step is taken and the work ends.
+    about l (l / k) is missing. Once that is below `tolerance`, the (practically undamped) step is taken, and is the
+    last.
     """
 
     rtol: float

@@ -87,6 +87,8 @@ def covariance(adjusted: Adjustment, rotations: Rotations = "omega_phi_kappa") -
     """
     if rotations not in EOP_NAMES:
         raise ValueError(f"rotations is one of {', '.join(EOP_NAMES)}, got {rotations!r}")
+    if adjusted.factored is None:
+        raise ValueError("covariance of an adjustment inside jax.grad, jax.jvp or jax.vmap: adjust outside of it first")
     cofactors = run_compiled(_cofactors, (adjusted.factored, adjusted.structure), adjusted.seconds, "covariance")
     arguments = (cofactors, adjusted.factored.scale, adjusted.values.rotation, rotations)
     matrix, points = run_compiled(_physical, arguments, adjusted.seconds, "covariance")

@@ -1,0 +1,368 @@
+"""Small blocks with known truth for the tests of the core: seeded, simulated by the library's own models.
+
+`simulated(name)` gives one of `VARIANTS`: the block with noisy observations and rough start values, and its truth. All
+aerial variants show the same points in the same images, so that what is compiled for one serves the next where only
+numbers differ.
+"""
+
+import dataclasses
+import functools
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from jaxphoto import FIXED, FREE, Unknowns, Weighted
+from jaxphoto.block import Attitudes, Block, Datum, Distances, ImageRows, Rows, Start
+from jaxphoto.camera import Balanced, Brown, InteriorOrientation, Sensor, Smac, set_parameter
+from jaxphoto.collinearity import ExteriorOrientation
+from jaxphoto.georeferencing import Mount, StripBias
+from jaxphoto.simulation import remeasure
+from jaxphoto.unknowns import default_priors
+from tests.derivatives import QUICKLY
+from tests.formulas import camera_from_object, collinearity
+
+SENSOR = Sensor(4500, 3000, 0.008)
+BROWN = InteriorOrientation(35.1, 0.05, -0.08, Brown(k1=-9e-5, k2=1.0e-7))
+SMAC = InteriorOrientation(34.8, -0.04, 0.06, Smac(k1=-8e-5, k2=9e-8, p1=1e-5, r0=9.0))
+BALANCED = InteriorOrientation(35.4, 0.02, 0.03, Balanced(a1=8e-5, a2=-5e-8, b1=1e-5, c1=1e-4, r0=10.0))
+FIVE = ("c_mm", "xp_mm", "yp_mm", "k1", "k2")
+LEVER_ARM = np.array([0.35, -0.52, 1.10])
+BORESIGHT = np.array([0.006, -0.009, 0.013])
+
+
+class Simulated(NamedTuple):
+    block: Block
+    truth: Unknowns
+
+
+@dataclasses.dataclass
+class Scene:
+    """Truth of exterior orientation and points, and a rough idea of it."""
+
+    positions: np.ndarray
+    angles: np.ndarray
+    points: np.ndarray
+    metres: float
+    """How far start values are off."""
+
+
+@functools.cache
+def aerial(seed: int = 5) -> Scene:
+    """Two crossing strips of five images 1000 m over ground with 150 m of relief."""
+    rng = np.random.default_rng(seed)
+    along = np.linspace(-420.0, 420.0, 5)
+    across = rng.normal(0.0, 25.0, 5)
+    height = 1000 + rng.normal(0.0, 20.0, 10)
+    east, north = np.column_stack([along, across]), np.column_stack([-across, along])
+    positions = np.column_stack([np.concatenate([east, north]), height])
+    angles = rng.normal(0.0, 0.03, (10, 3)) + np.repeat([[0, 0, 0.2], [0, 0, 1.7]], 5, axis=0)
+    grid = np.stack(np.meshgrid(np.linspace(-420, 420, 7), np.linspace(-420, 420, 7)), axis=-1).reshape(-1, 2)
+    points = np.column_stack([grid + rng.normal(0, 20, grid.shape), rng.uniform(0, 150, len(grid))])
+    return Scene(positions, angles, points, 2.0)
+
+
+@functools.cache
+def close_range(seed: int = 6) -> Scene:
+    """Eight convergent images, rolled by quarter turns, around an object of 2 m."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-1.0, 1.0, (36, 3)) * [1.0, 0.8, 0.5]
+    positions, angles = [], []
+    for k in range(8):
+        azimuth, up = 2 * np.pi * k / 8, 0.5 + 0.4 * (k % 3)
+        back = np.array([np.cos(azimuth) * np.cos(up), np.sin(azimuth) * np.cos(up), np.sin(up)])
+        right = np.cross([0, 0, 1.0], back)
+        right /= np.linalg.norm(right)
+        matrix = np.stack([right, np.cross(back, right), back])
+        roll = k % 4 * np.pi / 2
+        matrix = camera_from_object(0.0, 0.0, roll) @ matrix
+        phi = np.arcsin(matrix[2, 0])
+        angles.append([np.arctan2(-matrix[2, 1], matrix[2, 2]), phi, np.arctan2(-matrix[1, 0], matrix[0, 0])])
+        positions.append(4.0 * back + rng.normal(0, 0.1, 3))
+    return Scene(np.array(positions), np.array(angles), points, 0.01)
+
+
+def bare(scene: Scene, cameras: dict[str, InteriorOrientation], of_image, mounts=None, strips=None) -> Simulated:
+    """A block in which nothing but image points is observed and no camera is free; image points hold zeros."""
+    n_images, n_points = len(scene.positions), len(scene.points)
+    of_image = tuple(of_image)
+    rows = []
+    for p, point in enumerate(scene.points):
+        seen = []
+        for i in range(n_images):
+            c = float(cameras[of_image[i]].c)
+            x, y = collinearity(c, scene.angles[i], scene.positions[i], point)
+            if abs(x) < 17 and abs(y) < 11:
+                seen.append((i, p))
+        rows += seen if len(seen) >= 2 else []
+    image, point = np.array(rows).T
+    n = len(image)
+    used, point = np.unique(point, return_inverse=True)
+    mounts, strips = mounts or {}, strips or {}
+    exterior = ExteriorOrientation.from_angles(scene.positions, scene.angles)
+    truth = Unknowns(
+        {name: jax.tree.map(np.float64, camera) for name, camera in cameras.items()},
+        jax.tree.map(np.asarray, exterior),
+        scene.points[used],
+        mounts,
+        strips,
+    )
+    n_points = len(used)
+    half = n_images // 2
+    time = np.concatenate([np.linspace(-6, 6, half), np.linspace(-7, 7, n_images - half)])
+    block = Block(
+        title="simulated",
+        images=tuple(f"i{k}" for k in range(n_images)),
+        points=tuple(f"p{k}" for k in range(n_points)),
+        sensors=dict.fromkeys(cameras, SENSOR),
+        image_camera=of_image,
+        image_mount=(next(iter(mounts), ""),) * n_images,
+        image_strip=("a",) * half + ("b",) * (n_images - half) if strips else ("",) * n_images,
+        image_time=time if strips else np.zeros(n_images),
+        image_points=ImageRows(image, point, np.zeros((n, 2)), np.full((n, 2), 0.004)),
+        control=Rows.none(),
+        fixed=Rows.none(),
+        check=Rows.none(),
+        stations=Rows.none(),
+        attitudes=Attitudes.none(),
+        distances=Distances.none(),
+        datum=Datum(),
+        start=Start(truth, np.ones(n_images, bool), np.ones(n_points, bool)),
+        priors=default_priors(truth),
+    )
+    return Simulated(block, truth)
+
+
+def rows(who, axes=(0, 1, 2), sigma=0.03) -> Rows:
+    """Every axis of `axes` of `who`; values are for `measured` to fill."""
+    who, axis = (v.ravel() for v in np.meshgrid(np.asarray(who, int), axes, indexing="ij"))
+    return Rows(who, axis, np.zeros(len(who)), np.full(len(who), sigma))
+
+
+def all_stations(block: Block, sigma=0.10) -> Rows:
+    return rows(range(len(block.images)), sigma=sigma)
+
+
+def all_attitudes(block: Block, sigma=1e-4) -> Attitudes:
+    n = len(block.images)
+    return Attitudes(np.arange(n), np.zeros((n, 3)), np.full((n, 3), sigma) * [1, 1, 2])
+
+
+def with_priors(block: Block, camera: str, **priors) -> Block:
+    """The block with priors of one camera's parameters."""
+    tree = block.priors.interior[camera]
+    for name, prior in priors.items():
+        tree = set_parameter(tree, name, prior)
+    return eqx.tree_at(lambda b: b.priors.interior[camera], block, tree)
+
+
+def free(block: Block, camera: str, names=FIVE) -> Block:
+    return with_priors(block, camera, **dict.fromkeys(names, FREE))
+
+
+def measured(simulated: Simulated, seed: int = 1, noise: bool = True) -> Simulated:
+    """The block with observations of its truth, and start values that are off."""
+    block, truth = simulated
+    block = _remeasured(block, truth, jax.random.key(seed))
+    if not noise:
+        block = _remeasured(_noiseless(block), truth, jax.random.key(seed))
+        block = eqx.tree_at(_sigmas, block, _sigmas(simulated.block))
+    return Simulated(eqx.tree_at(lambda b: b.start.unknowns, block, rough(block, truth)), truth)
+
+
+def _remeasured(block: Block, truth: Unknowns, key) -> Block:
+    # Compiled, because eager JAX would compile every operation.
+    once = jax.jit(lambda u, k: _observed(remeasure(block, u, k)), compiler_options=QUICKLY)
+    return eqx.tree_at(_observed, block, jax.tree.map(np.asarray, once(truth, key)))
+
+
+def _observed(b: Block):
+    rows = (b.stations, b.control, b.fixed, b.check, b.distances)
+    return b.image_points.xy, b.attitudes.roll_pitch_yaw, *(r.value for r in rows)
+
+
+def _sigmas(b: Block):
+    return b.image_points.sigma, b.stations.sigma, b.attitudes.sigma, b.control.sigma, b.distances.sigma
+
+
+def _noiseless(block: Block) -> Block:
+    return eqx.tree_at(_sigmas, block, tuple(0.0 * np.asarray(s) for s in _sigmas(block)))
+
+
+def rough(block: Block, truth: Unknowns, seed: int = 2) -> Unknowns:
+    """Start values: every free unknown off by far more than its standard deviation."""
+    rng = np.random.default_rng(seed)
+    metres = 2.0 if np.ptp(truth.points[:, 2]) > 10 else 0.01
+    angles = np.asarray(truth.exterior.omega_phi_kappa) + rng.normal(0, 0.004, (len(block.images), 3))
+    position = truth.exterior.position + rng.normal(0, metres, truth.exterior.position.shape)
+    points = truth.points + rng.normal(0, metres, truth.points.shape)
+
+    def moved(value, prior, step):
+        return value + step * np.sign(rng.normal()) if prior is not FIXED else value
+
+    interior = {}
+    for name, camera in truth.interior.items():
+        priors = block.priors.interior[name]
+        camera = InteriorOrientation(
+            moved(camera.c, priors.c, 0.2),
+            moved(camera.x_p, priors.x_p, 0.05),
+            moved(camera.y_p, priors.y_p, 0.05),
+            jax.tree.map(
+                lambda v, p: v if p is FIXED else np.float64(0.5 * v), camera.distortion, priors.distortion
+            ),
+        )
+        interior[name] = jax.tree.map(np.float64, camera)
+    return Unknowns(
+        interior,
+        jax.tree.map(np.asarray, ExteriorOrientation.from_angles(position, angles)),
+        points,
+        jax.tree.map(lambda v, p: v if p is FIXED else v + 0.01, truth.mounts, block.priors.mounts),
+        jax.tree.map(lambda v, p: v if p is FIXED else 0.0 * v, truth.strips, block.priors.strips),
+    )
+
+
+CONTROL = (0, 6, 24, 42, 48)
+CHECK = (10, 30)
+
+
+def _aerial(cameras=None, of_image=("one",) * 10, **more) -> Simulated:
+    block, truth = bare(aerial(), cameras or {"one": BROWN}, of_image, **more)
+    block = dataclasses.replace(
+        block, control=rows(CONTROL), check=rows(CHECK, sigma=0.0), stations=all_stations(block)
+    )
+    return Simulated(block, truth)
+
+
+def _cross() -> Simulated:
+    block, truth = _aerial()
+    return Simulated(free(block, "one"), truth)
+
+
+def _two_cameras() -> Simulated:
+    """One model twice, not sorted by image, with different free parameters and one of them weighted."""
+    other = InteriorOrientation(34.6, 0.1, 0.02, Brown(k1=-7e-5, k2=5e-8, p1=1e-5))
+    block, truth = _aerial({"one": BROWN, "two": other}, ("one", "two", "two", "one", "one") * 2)
+    block = with_priors(free(block, "two", ("c_mm", "xp_mm", "yp_mm", "k1")), "two", p1=Weighted(1.2e-5, 5e-6))
+    return Simulated(free(block, "one"), truth)
+
+
+def _three_models() -> Simulated:
+    cameras = {"smac": SMAC, "brown": BROWN, "balanced": BALANCED}
+    block, truth = _aerial(cameras, ("brown", "smac", "balanced", "smac", "brown", "balanced") + ("smac",) * 4)
+    block = free(free(block, "brown"), "smac", (*FIVE, "p1"))
+    return Simulated(free(block, "balanced", ("c_mm", "xp_mm", "yp_mm", "a1", "a2", "b1")), truth)
+
+
+def _mount() -> Simulated:
+    """Lever arm and boresight free, attitudes observed, rotations of the images tilted by boresight."""
+    block, truth = _aerial(mounts={"imu": Mount(LEVER_ARM, BORESIGHT)})
+    block = dataclasses.replace(block, attitudes=all_attitudes(block), stations=all_stations(block, 0.02))
+    block = eqx.tree_at(lambda b: b.priors.mounts["imu"], block, Mount(FREE, FREE))
+    return Simulated(free(block, "one"), truth)
+
+
+def _strips() -> Simulated:
+    """Shift and drift of two strips free."""
+    strips = {
+        "a": StripBias(np.array([0.8, -0.5, 0.6]), np.array([0.03, 0.02, -0.04])),
+        "b": StripBias(np.array([-0.7, 0.9, -0.4]), np.array([-0.02, 0.05, 0.03])),
+    }
+    block, truth = _aerial(strips=strips)
+    block = dataclasses.replace(block, stations=all_stations(block, 0.02))
+    priors = {name: StripBias(FREE, FREE) for name in strips}
+    block = eqx.tree_at(lambda b: b.priors.strips, block, priors)
+    return Simulated(free(block, "one"), truth)
+
+
+def _everything() -> Simulated:
+    """All groups of observations and unknowns at once; weighted interior, lever arm and shift; vertical and fixed control."""
+    strips = {
+        "a": StripBias(np.array([0.2, -0.1, 0.3]), np.array([0.0, 0.01, 0.0])),
+        "b": StripBias(np.array([-0.3, 0.2, -0.2]), np.zeros(3)),
+    }
+    other = InteriorOrientation(34.6, 0.1, 0.02, Brown(k1=-7e-5, k2=5e-8))
+    block, truth = _aerial(
+        {"one": BROWN, "two": other, "smac": SMAC},
+        ("one", "two", "smac", "one", "two") * 2,
+        mounts={"imu": Mount(LEVER_ARM, BORESIGHT)},
+        strips=strips,
+    )
+    ends = np.array([[3, 17], [17, 40], [5, 45]])
+    block = dataclasses.replace(
+        block,
+        attitudes=jax.tree.map(lambda v: v[1:7], all_attitudes(block)),
+        control=Rows(*(np.concatenate(v) for v in zip(*map(_fields, (rows(CONTROL), rows((3, 21, 33), (2,)))), strict=True))),
+        fixed=rows((17,), (0, 1), 0.0),
+        distances=Distances(ends, np.zeros(3), np.array([0.02, 0.03, 0.01])),
+    )
+    block = free(with_priors(block, "one", c_mm=Weighted(35.0, 0.05), k1=Weighted(-9.5e-5, 1e-5)), "one", FIVE[1:3])
+    block = free(free(block, "smac"), "two", ("c_mm", "k1"))
+    priors = {
+        "a": StripBias(FREE, Weighted(np.zeros(3), np.full(3, 0.02))),
+        "b": StripBias(Weighted(np.zeros(3), 0.5), FIXED),
+    }
+    block = eqx.tree_at(
+        lambda b: (b.priors.mounts["imu"], b.priors.strips),
+        block,
+        (Mount(Weighted(np.array([0.3, -0.5, 1.0]), np.array([0.05, 0.06, 0.07])), FREE), priors),
+    )
+    return Simulated(block, truth)
+
+
+def _fields(r: Rows):
+    return r.who, r.axis, r.value, r.sigma
+
+
+def _weighted_interior() -> Simulated:
+    block, truth = _aerial()
+    block = with_priors(block, "one", c_mm=Weighted(35.0, 0.1), xp_mm=Weighted(0.0, 0.05), k2=Weighted(1e-7, 1e-8))
+    return Simulated(with_priors(block, "one", yp_mm=FREE, k1=FREE), truth)
+
+
+def _fixed_interior() -> Simulated:
+    return _aerial()
+
+
+def _vertical_control() -> Simulated:
+    block, truth = _cross()
+    return Simulated(dataclasses.replace(block, control=rows(CONTROL, (2,))), truth)
+
+
+def _fixed_control() -> Simulated:
+    """Control without error, among it a point that is fixed in height only; no stations."""
+    block, truth = _cross()
+    joined = Rows(*(np.concatenate(v) for v in zip(_fields(rows(CONTROL, sigma=0)), _fields(rows((20,), (2,), 0)), strict=True)))
+    return Simulated(dataclasses.replace(block, control=Rows.none(), fixed=joined, stations=Rows.none()), truth)
+
+
+def _close(datum: Datum, bars: bool = True) -> Simulated:
+    block, truth = bare(close_range(), {"one": BROWN}, ("one",) * 8)
+    ends = np.array([[0, 1], [1, 2], [5, 30]])
+    distances = Distances(ends, np.zeros(3), np.full(3, 1e-4)) if bars else Distances.none()
+    return Simulated(free(dataclasses.replace(block, distances=distances, datum=datum), "one"), truth)
+
+
+VARIANTS = {
+    "cross": _cross,
+    "two_cameras": _two_cameras,
+    "three_models": _three_models,
+    "mount": _mount,
+    "strips": _strips,
+    "everything": _everything,
+    "weighted_interior": _weighted_interior,
+    "fixed_interior": _fixed_interior,
+    "vertical_control": _vertical_control,
+    "fixed_control": _fixed_control,
+    "inner": lambda: _close(Datum("inner", "points", False)),
+    "inner_images": lambda: _close(Datum("inner", "images")),
+    "inner_some": lambda: _close(Datum("inner", tuple(f"p{k}" for k in range(4, 16)))),
+    "inner_scale": lambda: _close(Datum("inner", "points", True), bars=False),
+    "minimal": lambda: _close(Datum("minimal")),
+}
+
+
+@functools.cache
+def simulated(name: str) -> Simulated:
+    """One of `VARIANTS` with noisy observations."""
+    return measured(VARIANTS[name]())
