@@ -99,7 +99,13 @@ def main(folder: Path) -> None:
     write(measured, folder / "image_points.csv", 4)
     write(surveyed, folder / "control_points.csv", 3)
     write(stations, folder / "stations.csv", 3)
-    truth = {"c_mm": TRUTH.c, "xp_mm": TRUTH.x_p, "yp_mm": TRUTH.y_p, "k1": TRUTH.distortion.k1, "k2": TRUTH.distortion.k2}
+    truth = {
+        "c_mm": TRUTH.c,
+        "xp_mm": TRUTH.x_p,
+        "yp_mm": TRUTH.y_p,
+        "k1": TRUTH.distortion.k1,
+        "k2": TRUTH.distortion.k2,
+    }
     table = pd.DataFrame({"camera": "kodak", "parameter": truth.keys(), "value": truth.values()})
     table.to_csv(folder.parent / f"{folder.name}_truth.csv", index=False)
 
@@ -115,7 +121,9 @@ def fly(rng: np.random.Generator) -> pd.DataFrame:
             omega, phi = rng.normal(0, 2, 2)
             kappa = (direction + rng.normal(0, 3) + 180) % 360 - 180
             time = clock + k * BASE_M / SPEED_M_PER_S
-            rows.append((f"{strip}{k + 1}", "kodak", strip, time, x, y, HEIGHT_M + rng.normal(0, 15), omega, phi, kappa))
+            rows.append(
+                (f"{strip}{k + 1}", "kodak", strip, time, x, y, HEIGHT_M + rng.normal(0, 15), omega, phi, kappa)
+            )
         clock += 300.0
     columns = ["image", "camera", "strip", "time_s", "X_m", "Y_m", "Z_m", "omega_deg", "phi_deg", "kappa_deg"]
     return pd.DataFrame(rows, columns=columns)

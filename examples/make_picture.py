@@ -54,7 +54,9 @@ def draw_residuals(axes, tables: Tables) -> None:
     table = tables.residuals
     of_images = table[table["group"] == "image_points"]
     v = np.stack([of_images.loc[of_images["axis"] == a, "residual"].to_numpy() for a in "xy"])
-    arrows = axes.quiver(*np.asarray(rows.xy).T, *v, angles="xy", scale_units="xy", scale=0.006, width=0.0022, color=BLUE)
+    arrows = axes.quiver(
+        *np.asarray(rows.xy).T, *v, angles="xy", scale_units="xy", scale=0.006, width=0.0022, color=BLUE
+    )
     axes.quiverkey(arrows, 0.85, 1.045, 0.01, "10 µm", labelpos="E", fontproperties={"size": 8})
     w, h = sensor.width_mm / 2, sensor.height_mm / 2
     axes.plot([-w, w, w, -w, -w], [-h, -h, h, h, -h], color="0.4", lw=0.8)

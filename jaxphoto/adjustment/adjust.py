@@ -2,7 +2,6 @@
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxphoto.adjustment.compiled import run_compiled
@@ -18,7 +17,7 @@ from jaxphoto.adjustment.optimum import (
     zero_increments,
 )
 from jaxphoto.adjustment.rank import check_rank
-from jaxphoto.adjustment.residuals import Increments, Residuals, State, Values, residuals_at, state_at
+from jaxphoto.adjustment.residuals import Residuals, State, Values, residuals_at, state_at
 from jaxphoto.adjustment.result import Adjustment, Factored
 from jaxphoto.adjustment.structure import Structure, structure_of
 from jaxphoto.adjustment.values import at_state, unknowns_of, values_of, with_datum
@@ -40,7 +39,7 @@ def solve(block: Block, start: Unknowns, priors: Unknowns, max_steps: int = MAX_
     """
     structure = structure_of(block, priors)
     values = values_of(block, start, priors, structure)
-    open_motions, constraints = close_datum(block, concrete(values), structure)
+    constraints = close_datum(block, concrete(values), structure)
     values = with_datum(values, constraints.eop, constraints.points)
     seconds: dict[str, float] = {}
     optimum, state = run_compiled(_optimise, (values, structure, max_steps), seconds, "solve")
@@ -49,7 +48,7 @@ def solve(block: Block, start: Unknowns, priors: Unknowns, max_steps: int = MAX_
     traced = isinstance(state.position, jax.core.Tracer)
     factored = None
     if not traced:
-        factored = run_compiled(_factor, (values, structure, tuple(open_motions)), seconds, "covariance")
+        factored = run_compiled(_factor, (values, structure), seconds, "covariance")
     residuals = run_compiled(_residuals, (values, structure), seconds, "solve")
     adjusted = Adjustment(
         block=block,
@@ -81,17 +80,13 @@ def _residuals(values: Values, structure: Structure) -> Residuals:
 
 
 @eqx.filter_jit
-def _factor(values: Values, structure: Structure, motions: tuple[jax.Array, jax.Array]) -> Factored:
+def _factor(values: Values, structure: Structure) -> Factored:
     """The undamped normal equations at the optimum, factored."""
     values = weigh_datum(values, structure)
     scale = typical_scale(values, structure)
     normal, _ = linearise(zero_increments(structure), scale, values, structure)
     reduced = reduce_normal(normal, 0.0, structure)
-    inverse = jax.tree.map(lambda k: jnp.where(k > 0, 1 / jnp.where(k > 0, k, 1.0), 0.0), scale)
-    scaled = Increments(
-        motions[0] * inverse.eop, jnp.zeros((len(motions[0]), structure.n_shared)), motions[1] * inverse.points
-    )
-    return Factored(normal, reduced, factor_reduced(reduced), scale, scaled)
+    return Factored(normal, reduced, factor_reduced(reduced), scale, values.datum_eop.shape[0])
 
 
 def concrete(tree: Values) -> Values:

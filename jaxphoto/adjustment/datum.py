@@ -38,15 +38,14 @@ class Motions(NamedTuple):
     points: Float[np.ndarray, "7 3 points"]
 
 
-def close_datum(block: Block, values: Values, structure: Structure) -> tuple[Motions, Motions]:
-    """The motions that the observations leave open, and the constraints that close them (leading axis: defect).
+def close_datum(block: Block, values: Values, structure: Structure) -> Motions:
+    """The constraints that close what the observations leave open (leading axis: the defect).
 
     Raises DatumError where the block's datum is open and its kind
     "control", or where the constraints asked for cannot close it.
     """
     if _plainly_closed(block, values, structure):
-        none = Motions(np.zeros((0, 6, structure.n_images)), np.zeros((0, 3, structure.n_points)))
-        return none, none
+        return Motions(np.zeros((0, 6, structure.n_images)), np.zeros((0, 3, structure.n_points)))
     motions, centre, size = _motions(values)
     sensitivity, named = _datum_sensitivity(values, structure, motions, centre, size)
     open_motions = _null_motions(sensitivity)
@@ -55,7 +54,7 @@ def close_datum(block: Block, values: Values, structure: Structure) -> tuple[Mot
     if kind == "control":
         if len(open_motions):
             raise DatumError(_sentence(open_motions, block, named))
-        return null, null
+        return null
     if block.datum.scale is not None:
         scale_open = bool(len(open_motions)) and bool(np.abs(open_motions[:, 6]).max() > 1e-6)
         if scale_open != block.datum.scale:
@@ -73,7 +72,7 @@ def close_datum(block: Block, values: Values, structure: Structure) -> tuple[Mot
         raise DatumError(
             f'[datum] over = "{over}" cannot fix the datum (they lie on a line or in a point): take all points'
         )
-    return null, constraints
+    return constraints
 
 
 def _plainly_closed(block: Block, values: Values, structure: Structure) -> bool:

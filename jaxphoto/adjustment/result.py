@@ -35,8 +35,8 @@ class Factored(eqx.Module):
     reduced: Reduced
     lower: Float[Array, "reduced reduced"]
     scale: Increments
-    open_motions: Increments
-    """Motions of the unknowns that only the datum's constraints hold, leading axis the defect; in scaled increments."""
+    n_constraints: int = eqx.field(static=True)
+    """Constraints of the datum: the last of `normal`'s rows."""
 
 
 class Adjustment(eqx.Module):

@@ -20,10 +20,11 @@ from jaxtyping import Array, Float
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.adjustment.compiled import run_compiled
-from jaxphoto.adjustment.normal import solve_3x3
+from jaxphoto.adjustment.normal import solve_3x3, solve_factored
 from jaxphoto.adjustment.residuals import Increments
 from jaxphoto.adjustment.result import Factored
 from jaxphoto.adjustment.structure import Structure
+from jaxphoto.arrays import Numbers
 from jaxphoto.rotation import omega_phi_kappa_from_matrix, small_rotation
 
 Rotations = Literal["omega_phi_kappa", "object", "camera"]
@@ -54,7 +55,7 @@ class Covariance(eqx.Module):
 
     matrix: Float[Array, "reduced reduced"]
     points: Float[Array, "points 3 3"]
-    variance_factor: Float[Array, ""]
+    variance_factor: Float[Numbers, ""]
     cofactors: Cofactors
     labels: tuple[str, ...] = eqx.field(static=True)
     n_images: int = eqx.field(static=True)
@@ -168,17 +169,19 @@ def _cofactors(factored: Factored, structure: Structure) -> Cofactors:
 
 
 def _without_open_motions(q: Cofactors, factored: Factored, s: Structure) -> Cofactors:
-    """Subtract H M^-1 M^-T H', M = D H: what the datum's constraints, taken as observations, leave along H."""
-    h = factored.open_motions
-    defect = h.eop.shape[0]
+    """Subtract E E': what the constraints D of the datum, taken as observations, leave along the motions they hold.
+
+    E = (N + D'D)^-1 D' spans those motions exactly, because N does not see them; no motion need be known.
+    """
+    defect = factored.n_constraints
     if not defect:
         return q
-    rows_e, rows_p = factored.normal.rows_e[-defect:], factored.normal.rows_p[-defect:]
-    m = jnp.einsum("knc,jcn->kj", rows_e, h.eop) + jnp.einsum("kcp,jcp->kj", rows_p, h.points)
-    inverse = jnp.linalg.inv(m)
-    e_eop = jnp.einsum("jcn,jk->nck", h.eop, inverse)
-    e_shared = h.shared.T @ inverse
-    e_points = jnp.einsum("jcp,jk->pck", h.points, inverse)
+    normal = factored.normal
+    rows = Increments(
+        normal.rows_e[-defect:].transpose(0, 2, 1), jnp.zeros((defect, s.n_shared)), normal.rows_p[-defect:]
+    )
+    e = jax.vmap(lambda row: solve_factored(normal, factored.reduced, factored.lower, row, s))(rows)
+    e_eop, e_shared, e_points = e.eop.transpose(2, 1, 0), e.shared.T, e.points.transpose(2, 1, 0)
     e_reduced = jnp.concatenate([e_eop.reshape(-1, defect), e_shared])
     return Cofactors(
         q.reduced - e_reduced @ e_reduced.T,

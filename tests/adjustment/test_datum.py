@@ -1,0 +1,197 @@
+"""The datum: what observations leave open is counted and named; how it is closed changes nothing that can be estimated."""
+
+import dataclasses
+import re
+
+import equinox as eqx
+import numpy as np
+import pytest
+
+from jaxphoto import FREE, DatumError
+from jaxphoto.adjustment.datum import MOTIONS
+from jaxphoto.block import Attitudes, Datum, Distances, Rows
+from jaxphoto.georeferencing import StripBias
+from tests.adjustment.dense import prepared
+from tests.blocks import (
+    BROWN,
+    adjusted,
+    aerial,
+    all_attitudes,
+    all_stations,
+    bare,
+    covariance_of,
+    free,
+    joined,
+    measured,
+    rows,
+    simulated,
+)
+
+SHIFTS, ROTATIONS = set(MOTIONS[:3]), set(MOTIONS[3:6])
+BARE = bare(aerial(), {"one": BROWN}, ("one",) * 10)
+
+
+def block_with(**observations):
+    """The aerial block with only these observations beside image points, at its true values."""
+    observations.setdefault("stations", Rows.none())
+    return measured(BARE._replace(block=dataclasses.replace(BARE.block, **observations))).block
+
+
+def defect_of(block):
+    """Defect and motions that the sentence names."""
+    with pytest.raises(DatumError) as caught:
+        prepared(block)
+    text = str(caught.value)
+    count = int(re.search(r"defect of (\d)", text)[1])
+    return count, {m for m in MOTIONS if re.search(rf"\b{m}\b", text.split(" cannot be")[0])}, text
+
+
+BAR = Distances(np.array([[3, 37]]), np.zeros(1), np.array([0.01]))
+
+
+def test_image_coordinates_alone_leave_seven():
+    count, named, text = defect_of(block_with())
+    assert (count, named) == (7, set(MOTIONS))
+    assert "image coordinates alone" in text
+    assert '[datum] kind = "inner"' in text
+
+
+def test_a_scale_bar_leaves_six():
+    count, named, text = defect_of(block_with(distances=BAR))
+    assert (count, named) == (6, set(MOTIONS) - {"scale"})
+    assert "1 distances" in text
+
+
+def test_attitudes_leave_shifts_and_scale():
+    count, named, _ = defect_of(block_with(attitudes=all_attitudes(BARE.block)))
+    assert (count, named) == (4, SHIFTS | {"scale"})
+
+
+def test_one_control_point_leaves_rotations_and_scale():
+    count, named, _ = defect_of(block_with(control=rows((20,))))
+    assert count == 4
+    assert named >= ROTATIONS | {"scale"}
+
+
+def test_two_control_points_leave_a_rotation_about_their_line():
+    """Two points along X at one height: a turn about X; scale and the other turns are seen."""
+    points = np.array(BARE.truth.points)
+    points[37] = points[3] + [300.0, 0.0, 0.0]
+    block = eqx.tree_at(lambda b: b.start.unknowns.points, block_with(control=rows((3, 37))), points)
+    count, named, _ = defect_of(block)
+    assert count == 1
+    assert "rotation about X" in named
+    assert named.isdisjoint({"rotation about Y", "rotation about Z", "scale"})
+
+
+def test_control_in_height_only():
+    """Three heights are a plane, which any scale keeps; more of them, on relief, give the scale."""
+    count, named, _ = defect_of(block_with(control=rows((3, 4, 20), (2,))))
+    assert count == 4
+    assert named >= {"shift in X", "shift in Y", "rotation about Z", "scale"}
+    count, named, _ = defect_of(block_with(control=rows((3, 4, 20, 36, 37), (2,))))
+    assert (count, named) == (3, {"shift in X", "shift in Y", "rotation about Z"})
+
+
+def test_stations_on_a_line_leave_a_rotation():
+    block = block_with(stations=rows(range(5), sigma=0.1))
+    position = np.array(block.start.unknowns.exterior.position)
+    position[:5] = np.linspace([-400.0, 0.0, 1000.0], [400.0, 0.0, 1000.0], 5)
+    block = eqx.tree_at(lambda b: b.start.unknowns.exterior.position, block, position)
+    count, named, _ = defect_of(block)
+    assert count == 1
+    assert "rotation about X" in named
+    # One station beside the line closes it.
+    position[2] += [0.0, 30.0, 0.0]
+    prepared(eqx.tree_at(lambda b: b.start.unknowns.exterior.position, block, position))
+
+
+def test_free_shifts_leave_the_position():
+    strips = {name: StripBias(np.zeros(3), np.zeros(3)) for name in "ab"}
+    block, truth = bare(aerial(), {"one": BROWN}, ("one",) * 10, strips=strips)
+    block = dataclasses.replace(block, stations=all_stations(block))
+    priors = {"a": StripBias(FREE, block.priors.strips["a"].drift), "b": StripBias(FREE, block.priors.strips["b"].drift)}
+    shifted = eqx.tree_at(lambda b: b.priors.strips, block, priors)
+    count, named, text = defect_of(measured(type(BARE)(shifted, truth)).block)
+    assert (count, named) == (3, SHIFTS)
+    assert "strips[a].shift_X_m" in text
+    # One shift alone, or one control point, closes it.
+    prepared(measured(type(BARE)(eqx.tree_at(lambda b: b.priors.strips["a"].shift, block, FREE), truth)).block)
+    prepared(measured(type(BARE)(dataclasses.replace(shifted, control=rows((20,))), truth)).block)
+
+
+@pytest.mark.parametrize(
+    "observations",
+    [
+        {"control": rows((3, 4, 37))},
+        {"control": joined(rows((3, 4), (0, 1)), rows((3, 20, 36), (2,)))},
+        {"fixed": rows((3, 4, 37), sigma=0.0)},
+        {"stations": rows(range(10), sigma=0.1)},
+        {"attitudes": all_attitudes(BARE.block), "control": rows((20,)), "distances": BAR},
+    ],
+    ids=["full", "plan-and-height", "fixed", "stations", "attitudes-and-bar"],
+)
+def test_what_closes_the_datum(observations):
+    values, _ = prepared(block_with(**observations))
+    assert values.datum_points.shape[0] == 0
+
+
+@pytest.mark.parametrize("kind", ["inner", "minimal"])
+def test_constraints_fill_the_defect_and_no_more(kind):
+    for observations, defect in (({}, 7), ({"distances": BAR}, 6), ({"control": rows((3, 37))}, 1)):
+        values, _ = prepared(dataclasses.replace(block_with(**observations), datum=Datum(kind)))
+        assert values.datum_points.shape[0] == defect
+
+
+@pytest.mark.parametrize(
+    ("datum", "distances", "words"),
+    [
+        (Datum("inner", "points", True), BAR, "scale = true"),
+        (Datum("inner", "points", False), Distances.none(), "scale = false"),
+        (Datum("inner", ("p3",)), BAR, "cannot fix the datum"),
+        (Datum("inner", ("p3", "p4")), BAR, "cannot fix the datum"),
+    ],
+)
+def test_constraints_that_cannot_be(datum, distances, words):
+    with pytest.raises(DatumError, match=words):
+        prepared(dataclasses.replace(block_with(distances=distances), datum=datum))
+
+
+@pytest.mark.parametrize("name", ["inner_images", "inner_some", "minimal"])
+def test_what_can_be_estimated_does_not_depend_on_the_datum(name):
+    one, other = adjusted("inner"), adjusted(name)
+    assert float(one.sigma0) == pytest.approx(float(other.sigma0), rel=1e-9)
+    assert one.redundancy == other.redundancy == 414
+    np.testing.assert_allclose(other.residuals.image, one.residuals.image, atol=1e-4)
+    np.testing.assert_allclose(other.residuals.distances, one.residuals.distances, atol=1e-4)
+    sigma = np.asarray(covariance_of("inner").shared_sigma)
+    np.testing.assert_allclose(covariance_of(name).shared_sigma, sigma, rtol=1e-6)
+    free_of = lambda a: np.asarray(a.values.shared)[a.structure.free]  # noqa: E731
+    np.testing.assert_array_less(np.abs(free_of(one) - free_of(other)) / sigma, 3e-5)
+    # Coordinates and their sigmas do depend on it.
+    assert np.abs(np.asarray(one.unknowns.points) - np.asarray(other.unknowns.points)).max() > 1e-4
+    assert np.abs(np.asarray(covariance_of(name).point_sigma) / np.asarray(covariance_of("inner").point_sigma) - 1).max() > 0.1
+
+
+def test_minimal_constraints_hold_coordinates_at_their_start():
+    held = np.isclose(np.asarray(covariance_of("minimal").point_sigma), 0.0, atol=1e-12)
+    assert held.sum() == 6
+    moved = np.asarray(adjusted("minimal").unknowns.points) - simulated("minimal").block.start.unknowns.points
+    np.testing.assert_allclose(moved[held], 0.0, atol=1e-9)
+    assert np.abs(moved[~held]).min() > 1e-7
+
+
+def test_a_shorter_bar_makes_a_smaller_block():
+    """The scale of a free network is its bars': halve them, and every distance halves."""
+    block = adjusted("inner").block
+    half = eqx.tree_at(lambda b: b.distances.value, block, 0.5 * np.asarray(block.distances.value))
+    from jaxphoto import adjust
+
+    small = adjust(half, block.start.unknowns)
+    spread = lambda a: np.linalg.norm(np.asarray(a.unknowns.points)[1:] - np.asarray(a.unknowns.points)[0], axis=1)  # noqa: E731
+    np.testing.assert_allclose(spread(small) / spread(adjusted("inner")), 0.5, rtol=1e-4)
+
+
+def test_a_free_network_has_no_attitudes_to_start_with():
+    assert len(Attitudes.none().image) == 0
+    assert free(BARE.block, "one").datum == Datum()

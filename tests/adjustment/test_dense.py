@@ -1,0 +1,183 @@
+"""The structured adjustment against dense linear algebra, on every kind of block."""
+
+import jax
+import numpy as np
+import pytest
+import scipy.linalg
+import scipy.optimize
+from jax.flatten_util import ravel_pytree
+
+from jaxphoto import adjust, covariance
+from jaxphoto.adjustment.optimum import typical_scale, unit_scale, weigh_datum, zero_increments
+from jaxphoto.adjustment.residuals import residuals_at, state_at
+from jaxphoto.statistics import redundancy_numbers
+from tests.adjustment.dense import DAMPINGS, assemble, at_optimum, prepared, split
+from tests.blocks import VARIANTS, adjusted, covariance_of, simulated
+
+# The defect of each.
+FREE_NETWORKS = {"inner": 6, "inner_images": 6, "inner_some": 6, "inner_scale": 7, "inner_shift": 3, "minimal": 6}
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_colouring_gives_the_jacobian_entry_by_entry(name):
+    a, dense = adjusted(name), at_optimum(name)
+    blocks, expected = assemble(dense.blocks, a.structure), dense.observed(a.n_constraints)
+    scale = np.abs(expected).max()
+    assert scale > 0
+    np.testing.assert_allclose(blocks, expected, rtol=1e-12, atol=1e-13 * scale)
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_sums_are_the_normal_matrix_and_the_gradient(name):
+    dense = at_optimum(name)
+    product = dense.jacobian.T @ (dense.jacobian @ dense.vector)
+    np.testing.assert_allclose(dense.products, product, atol=1e-12 * np.abs(product).max())
+    terms = np.abs(dense.jacobian).T @ np.abs(dense.residuals)
+    np.testing.assert_allclose(dense.gradient, dense.jacobian.T @ dense.residuals, atol=1e-13 * terms.max())
+
+
+@pytest.mark.parametrize("damping", DAMPINGS)
+@pytest.mark.parametrize("name", VARIANTS)
+def test_elimination_solves_the_dense_normal_equations(name, damping):
+    dense = at_optimum(name)
+    j = dense.jacobian[:, dense.free]
+    n = j.T @ j + damping * np.eye(j.shape[1])
+    # By Cholesky of the whole matrix; the error is measured in the matrix' own metric.
+    expected = scipy.linalg.cho_solve(scipy.linalg.cho_factor(n), dense.vector[dense.free])
+    found = dense.solutions[DAMPINGS.index(damping)]
+    assert (found[~dense.free] == 0).all()
+    error = found[dense.free] - expected
+    assert np.sqrt(error @ n @ error) < 1e-9 * np.sqrt(expected @ n @ expected)
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_gradient_vanishes_at_the_result(name):
+    """What a dense Gauss-Newton step would still change, in units of each unknown's standard deviation."""
+    dense = at_optimum(name)
+    j = dense.jacobian[:, dense.free]
+    step = np.linalg.lstsq(j, dense.residuals, rcond=None)[0]
+    sigma = np.sqrt(np.diag(np.linalg.inv(j.T @ j)))
+    np.testing.assert_array_less(np.abs(step) / sigma, 1e-5)
+
+
+def dense_covariance(name):
+    """Inverse of the dense normal matrix with the datum's constraints imposed exactly, in scaled increments."""
+    dense, k = at_optimum(name), adjusted(name).n_constraints
+    free, n_free = dense.free, int(dense.free.sum())
+    observed, constraints = dense.observed(k)[:, free], dense.jacobian[len(dense.jacobian) - k :, free]
+    bordered = np.block([[observed.T @ observed, constraints.T], [constraints, np.zeros((k, k))]])
+    q = np.zeros((len(free), len(free)))
+    q[np.ix_(free, free)] = np.linalg.inv(bordered)[:n_free, :n_free]
+    return q, dense
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_covariance(name):
+    """Every entry of the reduced matrix and of the points' blocks, against the bordered dense inverse."""
+    q, at = dense_covariance(name)
+    s, cov = adjusted(name).structure, covariance_of(name)
+    physical = q * at.scale[:, None] * at.scale[None, :]
+    index = split(np.arange(len(at.scale)), s)
+    reduced = np.concatenate([index.eop.T.reshape(-1), index.shared])
+    expected, found = physical[np.ix_(reduced, reduced)], np.asarray(cov.matrix)
+    sigma = np.sqrt(np.diag(expected))
+    unit = np.where(sigma > 0, sigma, 1.0)
+    assert (found[sigma == 0] == 0).all()
+    np.testing.assert_allclose(found / np.outer(unit, unit), expected / np.outer(unit, unit), atol=1e-7)
+    points = np.asarray(cov.points)
+    for p in range(s.n_points):
+        own = index.points[:, p]
+        block = physical[np.ix_(own, own)]
+        np.testing.assert_allclose(points[p], block, atol=1e-7 * max(np.trace(block), 1e-30))
+    np.testing.assert_allclose(cov.point_sigma[0], float(adjusted(name).sigma0) * np.sqrt(np.diag(points[0])))
+
+
+@pytest.mark.parametrize("name", FREE_NETWORKS)
+def test_covariance_of_a_free_network_does_not_move_along_its_datum(name):
+    """Constraints C x = 0 hold exactly, so C Q = 0; over all points, inner constraints give the least trace."""
+    q, at = dense_covariance(name)
+    n_datum = adjusted(name).n_constraints
+    constraints = at.jacobian[len(at.jacobian) - n_datum :]
+    assert n_datum == FREE_NETWORKS[name]
+    np.testing.assert_allclose(constraints @ q, 0.0, atol=1e-6 * np.abs(q).max())
+
+
+def test_inner_constraints_over_all_points_have_the_least_trace():
+    trace = {name: float(np.trace(np.asarray(covariance_of(name).points).sum(0))) for name in FREE_NETWORKS}
+    assert all(trace[name] > 1.001 * trace["inner"] for name in ("inner_images", "inner_some", "minimal"))
+
+
+def test_inner_constraints_over_all_points_are_the_pseudo_inverse():
+    """About the result itself: the points' covariance is the pseudo-inverse of the normal matrix reduced to them."""
+    a, dense = adjusted("inner"), at_optimum("inner")
+    again = covariance(adjust(a.block, a.unknowns))
+    observed, n_points = dense.observed(a.n_constraints), 3 * a.structure.n_points
+    rest, points = observed[:, :-n_points], observed[:, -n_points:]
+    projected = points - rest @ np.linalg.lstsq(rest, points, rcond=None)[0]
+    values, vectors = np.linalg.eigh(projected.T @ projected)
+    assert values[6] > 1e4 * abs(values[5])
+    pseudo = (vectors[:, 6:] / values[6:]) @ vectors[:, 6:].T * dense.scale[-1] ** 2
+    for p in range(a.structure.n_points):
+        own = np.arange(3) * a.structure.n_points + p
+        expected = pseudo[np.ix_(own, own)]
+        np.testing.assert_allclose(again.points[p], expected, atol=1e-6 * np.trace(expected))
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_redundancy_numbers(name):
+    q, at = dense_covariance(name)
+    observed = at.observed(adjusted(name).n_constraints)
+    expected = 1 - ((observed @ q) * observed).sum(1)
+    numbers = redundancy_numbers(adjusted(name), covariance_of(name))
+    found = np.concatenate([np.ravel(v) for v in numbers[:-1]])
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+    assert abs(found.sum() - adjusted(name).redundancy) < 1e-4
+    assert (found > -1e-6).all()
+    assert (found < 1 + 1e-9).all()
+
+
+@pytest.mark.parametrize("name", ["everything", "inner"])
+def test_scipy_finds_the_same_optimum(name):
+    """scipy's dense least squares on the same residuals, from the same start."""
+    values, s = prepared(simulated(name).block)
+    _, back = ravel_pytree(zero_increments(s))
+
+    def setup(values):
+        values = weigh_datum(values, s)
+        return values, typical_scale(values, s)
+
+    values, scale = jax.jit(setup)(values)
+    of = lambda x: ravel_pytree(residuals_at(back(x), scale, values, s))[0]  # noqa: E731
+    fn = jax.jit(of)
+    jac = jax.jit(jax.jacfwd(of))
+    free = np.asarray(ravel_pytree(scale)[0]) > 0
+
+    def spread(x):
+        full = np.zeros(len(free))
+        full[free] = x
+        return full
+
+    found = scipy.optimize.least_squares(
+        lambda x: np.asarray(fn(spread(x))),
+        np.zeros(free.sum()),
+        lambda x: np.asarray(jac(spread(x)))[:, free],
+        method="trf",
+        x_scale="jac",
+        ftol=1e-15,
+        xtol=1e-15,
+        gtol=1e-15,
+    )
+    a = adjusted(name)
+    assert abs(2 * found.cost / float(a.square_sum) - 1) < 1e-9
+    increments = jax.tree.map(lambda y, k: y * k, back(spread(found.x)), scale)
+    state = jax.jit(lambda x: state_at(x, unit_scale(s), values, s))(increments)
+    cov = covariance_of(name)
+    sigma = np.sqrt(np.diag(np.asarray(cov.matrix)))
+    exterior = sigma[: 6 * s.n_images].reshape(-1, 6)
+    position = (np.asarray(state.position).T - np.asarray(a.unknowns.exterior.position)) / exterior[:, :3]
+    np.testing.assert_array_less(np.abs(position), 1e-3)
+    shared = np.asarray(state.shared)[s.free] - np.asarray(a.values.shared)[s.free]
+    np.testing.assert_array_less(np.abs(shared) / sigma[6 * s.n_images :], 1e-3)
+    points = np.asarray(state.points).T - np.asarray(a.unknowns.points)
+    point_sigma = np.sqrt(np.diagonal(np.asarray(cov.points), axis1=1, axis2=2))
+    np.testing.assert_array_less(np.abs(points), 1e-3 * point_sigma + 1e-12)

@@ -1,0 +1,83 @@
+"""Derivatives through the whole adjustment: exact, against re-adjusted central differences; and vmap over it."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxphoto import adjust
+from tests.blocks import adjusted, simulated
+
+STATION = 3 * 4 + 2  # Z of image i4
+IMAGE_POINT = 40
+# Steps of the differences: about one standard deviation of each observation.
+STEPS = np.array([0.1, 0.004, 1e-10, 0.03])
+
+
+def perturbed(p):
+    """The cross block with a station's height, an image coordinate, the fixed k3 and a control coordinate moved."""
+    block = simulated("cross").block
+    start = adjusted("cross").unknowns
+    height = jnp.asarray(block.stations.value).at[STATION].add(p[0])
+    xy = jnp.asarray(block.image_points.xy).at[IMAGE_POINT, 0].add(p[1])
+    control = jnp.asarray(block.control.value).at[4].add(p[3])
+    where = lambda b: (b.stations.value, b.image_points.xy, b.control.value)  # noqa: E731
+    moved = eqx.tree_at(where, block, (height, xy, control))
+    return moved, eqx.tree_at(lambda u: u.interior["one"].distortion.k3, start, p[2])
+
+
+def outcomes(unknowns):
+    """Principal distance, k1, a projection centre, a rotation, a point: all scaled to be of the order of one."""
+    camera = unknowns.interior["one"]
+    return jnp.stack(
+        [
+            camera.c,
+            1e5 * camera.distortion.k1,
+            unknowns.exterior.position[2, 0],
+            1e3 * unknowns.exterior.camera_from_object[2, 0, 1],
+            unknowns.points[7, 2],
+        ]
+    )
+
+
+def result(p):
+    block, start = perturbed(p)
+    return outcomes(adjust(block, start).unknowns)
+
+
+def readjusted(p):
+    """As `result`, adjusted thrice in a row, so that nothing of the iteration is left."""
+    block, start = jax.tree.map(lambda x: np.asarray(x) if isinstance(x, jax.Array) else x, perturbed(p))
+    for _ in range(3):
+        start = adjust(block, start).unknowns
+    return np.asarray(outcomes(start))
+
+
+@pytest.fixture(scope="module")
+def differences():
+    """Fourth-order central differences, by parameter."""
+    columns = []
+    for k, step in enumerate(STEPS):
+        at = {m: readjusted(m * step * np.eye(4)[k]) for m in (-2, -1, 1, 2)}
+        columns.append((at[-2] - 8 * at[-1] + 8 * at[1] - at[2]) / (12 * step))
+    return np.stack(columns, axis=1)
+
+
+def test_forward(differences):
+    found = np.asarray(jax.jit(jax.jacfwd(result))(jnp.zeros(4)))
+    np.testing.assert_allclose(found, differences, rtol=1e-6, atol=1e-7 * np.abs(differences).max(axis=0))
+
+
+def test_principal_distance_by_station_height_backwards(differences):
+    gradient = np.asarray(jax.jit(jax.grad(lambda p: result(p)[0]))(jnp.zeros(4)))
+    np.testing.assert_allclose(gradient, differences[0], rtol=1e-6)
+    assert abs(gradient[0]) > 1e-5
+
+
+def test_many_adjustments_at_once():
+    heights = np.array([[-0.3, 0, 0, 0], [0.0, 0, 0, 0], [0.8, 0.002, 0, 0]])
+    together = np.asarray(jax.jit(jax.vmap(result))(heights))
+    apart = np.stack([readjusted(p) for p in heights])
+    np.testing.assert_allclose(together, apart, atol=1e-6)
+    assert np.abs(apart[0] - apart[1]).max() > 1e-4

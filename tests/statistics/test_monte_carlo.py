@@ -1,0 +1,103 @@
+"""Are the predicted standard deviations true? Five hundred simulated re-measurements of one block answer."""
+
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+from scipy import stats
+
+from jaxphoto import adjust, covariance
+from jaxphoto.camera import get_parameter, parameter_names
+from jaxphoto.rotation import small_angles
+from jaxphoto.simulation import remeasure
+from jaxphoto.statistics import redundancy_numbers
+from tests.blocks import observed, simulated
+
+DRAWS = 500
+# All bounds below together fail for one in a thousand seeds if everything is right.
+FALSE_ALARM = 1e-3
+
+_turn = jax.jit(jax.vmap(lambda estimated, true: small_angles(estimated @ true.T)))
+
+
+class Draws(eqx.Module):
+    """Errors over predicted sigmas, one row a draw and one column an unknown, and v'Pv of every draw."""
+
+    standardised: np.ndarray
+    square_sums: np.ndarray
+    redundancy: int
+    expected: np.ndarray
+    """What each observation is expected to add to v'Pv."""
+
+
+@pytest.fixture(scope="module")
+def draws() -> Draws:
+    block, truth = simulated("cross")
+    numbers = jax.jit(lambda key: observed(remeasure(block, truth, key)))
+
+    def adjusted_draw(seed: int):
+        new = jax.tree.map(np.asarray, numbers(jax.random.key(seed)))
+        return adjust(eqx.tree_at(observed, block, new), truth)
+
+    # Predicted a priori: nothing of the drawn observations enters but the place where N was formed.
+    nominal = adjusted_draw(10**6)
+    sigma = np.sqrt(np.diagonal(np.asarray(covariance(nominal, "camera").matrix)))
+    errors, square_sums = [], []
+    for seed in range(DRAWS):
+        adjusted = adjusted_draw(seed)
+        assert bool(adjusted.converged)
+        errors.append(_errors(adjusted, truth, nominal))
+        square_sums.append(float(adjusted.square_sum))
+    return Draws(np.array(errors) / sigma, np.array(square_sums), nominal.redundancy, _expected(nominal))
+
+
+def _expected(nominal) -> np.ndarray:
+    r = redundancy_numbers(nominal, covariance(nominal))
+    interior = nominal.unknowns.interior["one"]
+    stretch = jax.jit(jax.vmap(jax.jacfwd(interior.ideal_from_measured)))(np.asarray(nominal.values.xy).T)
+    image = np.asarray(r.image) * np.einsum("nij,nij->in", stretch, stretch)
+    return np.concatenate([image.ravel(), r.stations, r.control])
+
+
+def _errors(adjusted, truth, nominal) -> np.ndarray:
+    """Estimate minus truth of X, Y, Z, small rotations by image, then of what is free of the interior orientation."""
+    found = adjusted.unknowns
+    position = np.asarray(found.exterior.position) - np.asarray(truth.exterior.position)
+    turns = _turn(found.exterior.camera_from_object, truth.exterior.camera_from_object)
+    interior = []
+    for camera, estimated in found.interior.items():
+        for name in parameter_names(estimated):
+            if f"interior[{camera}].{name}" in nominal.structure.labels:
+                interior.append(get_parameter(estimated, name) - get_parameter(truth.interior[camera], name))
+    return np.concatenate([np.hstack([position, turns]).ravel(), np.array(interior, float)])
+
+
+def test_scatter_of_every_unknown_is_its_predicted_sigma(draws):
+    share = FALSE_ALARM / (3 * draws.standardised.shape[1])
+    low, high = stats.chi2.ppf([share / 2, 1 - share / 2], DRAWS - 1) / (DRAWS - 1)
+    scatter = draws.standardised.var(axis=0, ddof=1)
+    # The bound has teeth: a predicted sigma wrong by a fifth would not pass.
+    assert high < 1.2**2
+    assert low > 0.8**2
+    assert (scatter > low).all(), scatter.min()
+    assert (scatter < high).all(), scatter.max()
+
+
+def test_estimates_are_unbiased(draws):
+    bound = stats.norm.isf(FALSE_ALARM / (6 * draws.standardised.shape[1]))
+    means = draws.standardised.mean(axis=0) * np.sqrt(DRAWS)
+    assert (np.abs(means) < bound).all(), np.abs(means).max()
+
+
+def test_square_sums_are_what_redundancy_numbers_predict(draws):
+    """v'Pv has the mean sum r d and nearly the variance 2 sum r d^2, d the stretch of the image by the distortion.
+
+    Residuals are of ideal coordinates and weights of measured ones (docs/conventions.md): noise of a measured coordinate
+    is stretched by the derivative of the map between them, in this block by up to a tenth in the corners.
+    """
+    mean = np.sum(draws.expected)
+    spread = np.sqrt(2 * mean)
+    assert mean > 1.02 * draws.redundancy
+    bound = stats.norm.isf(FALSE_ALARM / 6) * spread / np.sqrt(DRAWS)
+    assert abs(draws.square_sums.mean() - mean) < bound
+    assert abs(draws.square_sums.std(ddof=1) / spread - 1) < 0.15
