@@ -16,7 +16,7 @@ from jaxphoto.adjustment.optimum import (
     weigh_datum,
     zero_increments,
 )
-from jaxphoto.adjustment.rank import check_rank
+from jaxphoto.adjustment.rank import check_priors, check_rank
 from jaxphoto.adjustment.residuals import Residuals, State, Values, residuals_at, state_at
 from jaxphoto.adjustment.result import Adjustment, Factored
 from jaxphoto.adjustment.structure import Structure, structure_of
@@ -37,6 +37,7 @@ def solve(block: Block, start: Unknowns, priors: Unknowns, max_steps: int = MAX_
     Raises DatumError where the observations leave the datum open and no constraint closes it, RankError where they
     cannot tell unknowns apart.
     """
+    check_priors(priors)
     structure = structure_of(block, priors)
     values = values_of(block, start, priors, structure)
     constraints = close_datum(block, concrete(values), structure)

@@ -72,7 +72,7 @@ def close_datum(block: Block, values: Values, structure: Structure) -> Motions:
         raise DatumError(
             f'[datum] over = "{over}" cannot fix the datum (they lie on a line or in a point): take all points'
         )
-    return constraints
+    return _orthonormal(constraints)
 
 
 def _plainly_closed(block: Block, values: Values, structure: Structure) -> bool:
@@ -198,9 +198,9 @@ def _inner(null: Motions, block: Block, over) -> Motions:
     if over == "images":
         eop = null.eop.copy()
         eop[:, 3:] = 0.0
-        return _orthonormal(Motions(eop, np.zeros_like(null.points)))
+        return Motions(eop, np.zeros_like(null.points))
     chosen = np.ones(len(block.points)) if over == "points" else np.isin(block.points, over).astype(float)
-    return _orthonormal(Motions(np.zeros_like(null.eop), null.points * chosen))
+    return Motions(np.zeros_like(null.eop), null.points * chosen)
 
 
 def _orthonormal(rows: Motions) -> Motions:

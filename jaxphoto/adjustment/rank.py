@@ -4,9 +4,25 @@ import numpy as np
 
 from jaxphoto.adjustment.result import Adjustment
 from jaxphoto.errors import RankError
+from jaxphoto.unknowns import FREE, Unknowns
 
 # A pivot of the unit-diagonal reduced matrix below this is a rank defect: at float64 it is rounding, not geometry.
 _DEFECT = 1e-13
+
+
+def check_priors(priors: Unknowns) -> None:
+    """Raise RankError where a camera's principal distance and a coefficient that does the same are both free.
+
+    The normal matrix would not show it: residuals are of ideal coordinates, so a smaller scale makes smaller residuals
+    and the square sum has no minimum at all.
+    """
+    for camera, interior in priors.interior.items():
+        for name in interior.distortion.scales:
+            if interior.c is FREE and getattr(interior.distortion, name) is FREE:
+                raise RankError(
+                    f"interior[{camera}].c_mm and interior[{camera}].{name} are one scale and cannot both "
+                    f"be estimated: hold {name} fixed"
+                )
 
 
 def check_rank(adjusted: Adjustment) -> None:

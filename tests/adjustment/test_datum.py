@@ -1,4 +1,4 @@
-"""The datum: what observations leave open is counted and named; how it is closed changes nothing that can be estimated."""
+"""The datum: what observations leave open is counted and named; how it is closed changes nothing estimable."""
 
 import dataclasses
 import re
@@ -110,7 +110,10 @@ def test_free_shifts_leave_the_position():
     strips = {name: StripBias(np.zeros(3), np.zeros(3)) for name in "ab"}
     block, truth = bare(aerial(), {"one": BROWN}, ("one",) * 10, strips=strips)
     block = dataclasses.replace(block, stations=all_stations(block))
-    priors = {"a": StripBias(FREE, block.priors.strips["a"].drift), "b": StripBias(FREE, block.priors.strips["b"].drift)}
+    priors = {
+        "a": StripBias(FREE, block.priors.strips["a"].drift),
+        "b": StripBias(FREE, block.priors.strips["b"].drift),
+    }
     shifted = eqx.tree_at(lambda b: b.priors.strips, block, priors)
     count, named, text = defect_of(measured(type(BARE)(shifted, truth)).block)
     assert (count, named) == (3, SHIFTS)
@@ -170,7 +173,10 @@ def test_what_can_be_estimated_does_not_depend_on_the_datum(name):
     np.testing.assert_array_less(np.abs(free_of(one) - free_of(other)) / sigma, 3e-5)
     # Coordinates and their sigmas do depend on it.
     assert np.abs(np.asarray(one.unknowns.points) - np.asarray(other.unknowns.points)).max() > 1e-4
-    assert np.abs(np.asarray(covariance_of(name).point_sigma) / np.asarray(covariance_of("inner").point_sigma) - 1).max() > 0.1
+    assert (
+        np.abs(np.asarray(covariance_of(name).point_sigma) / np.asarray(covariance_of("inner").point_sigma) - 1).max()
+        > 0.1
+    )
 
 
 def test_minimal_constraints_hold_coordinates_at_their_start():

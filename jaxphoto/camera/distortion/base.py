@@ -6,7 +6,7 @@ with which sign, is thereby part of its type (docs/conventions.md).
 """
 
 import abc
-from typing import Literal
+from typing import ClassVar, Literal
 
 import equinox as eqx
 import jax
@@ -24,11 +24,13 @@ class AbstractDistortion(eqx.Module):
 
     `domain == "measured"`: `closed_form` takes measured to ideal coordinates (the photogrammetric habit).
     `domain == "ideal"`: it takes ideal to measured ones.
-    `coefficients` names the fields an adjustment may estimate; other fields are constants of the model.
+    `coefficients` names the fields an adjustment may estimate; other fields are constants of the model. `scales` names
+    coefficients that change the scale of the image as the principal distance does: never both can be free.
     """
 
     domain: eqx.AbstractClassVar[Literal["measured", "ideal"]]
     coefficients: eqx.AbstractClassVar[tuple[str, ...]]
+    scales: ClassVar[tuple[str, ...]] = ()
 
     @abc.abstractmethod
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:

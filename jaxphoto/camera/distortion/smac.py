@@ -32,6 +32,7 @@ class Smac(AbstractDistortion):
     sign: Literal["subtract", "add"] = eqx.field(static=True, default="subtract")
 
     domain: ClassVar[Literal["measured", "ideal"]] = "measured"
+    scales: ClassVar[tuple[str, ...]] = ("k0",)
     coefficients: ClassVar[tuple[str, ...]] = ("k0", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
 
     def __check_init__(self) -> None:

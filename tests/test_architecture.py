@@ -1,0 +1,58 @@
+"""The house: floors, room sizes, where pandas may live, and that every public name says what it is."""
+
+import ast
+import inspect
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import jaxphoto
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "jaxphoto"
+TABLES_AND_FILES = ("io", "report", "cli.py")
+
+
+def imported(path: Path) -> set[str]:
+    """Top-level packages that a module imports, anywhere in it."""
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            names |= {alias.name.split(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            names.add((node.module or "").split(".")[0])
+    return names
+
+
+def test_each_floor_imports_only_floors_below():
+    command = shutil.which("lint-imports", path=str(Path(sys.executable).parent)) or "lint-imports"
+    done = subprocess.run([command, "--no-cache"], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "1 kept, 0 broken" in done.stdout
+
+
+def test_modules_can_be_read_at_one_sitting():
+    long = {p.name: n for p in PACKAGE.rglob("*.py") if (n := len(p.read_text().splitlines())) > 350}
+    assert not long
+
+
+def test_tables_pictures_and_progress_live_upstairs_only():
+    for path in PACKAGE.rglob("*.py"):
+        if path.relative_to(PACKAGE).parts[0] not in TABLES_AND_FILES:
+            assert not imported(path) & {"pandas", "matplotlib", "rich", "typer", "jinja2"}, path
+
+
+def test_no_import_hides_in_a_function():
+    for path in PACKAGE.rglob("*.py"):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        inner = [n for f in ast.walk(tree) if isinstance(f, ast.FunctionDef) for n in ast.walk(f)]
+        assert not [n for n in inner if isinstance(n, ast.Import | ast.ImportFrom)], path
+
+
+def test_public_names_exist_and_are_documented():
+    assert len(jaxphoto.__all__) < 60
+    for name in jaxphoto.__all__:
+        thing = getattr(jaxphoto, name)
+        if inspect.isclass(thing) or inspect.isfunction(thing):
+            assert inspect.getdoc(thing), name

@@ -1,0 +1,201 @@
+"""The command line: files written, exit codes, and one sentence for every mistake."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import jaxphoto
+from jaxphoto import cli
+from jaxphoto.io import write_block
+from tests.blocks import simulated
+
+FILES = {
+    "summary.json",
+    "interior.csv",
+    "exterior.csv",
+    "object_points.csv",
+    "residuals.csv",
+    "check_points.csv",
+    "correlation.csv",
+    "correlation_summary.csv",
+    "report.html",
+}
+XYZ = ["X_m", "Y_m", "Z_m"]
+EOP = [*XYZ, "omega_deg", "phi_deg", "kappa_deg"]
+COLUMNS = {
+    "interior": ["camera", "parameter", "value", "sigma", "significant"],
+    "exterior": ["image", *EOP, *(f"sigma_{n}" for n in EOP)],
+    "object_points": ["point", *XYZ, *(f"sigma_{n}" for n in XYZ), "n_images"],
+    "residuals": ["group", "image", "point", "axis", "residual", "sigma", "unit", "redundancy_number", "w"],
+    "check_points": ["point", "dX_m", "dY_m", "dZ_m"],
+    "correlation": ["parameter_a", "parameter_b", "rho"],
+    "correlation_summary": ["camera", "exterior", "interior", "mean_abs_rho", "max_abs_rho"],
+}
+
+
+def run(monkeypatch, capsys, *arguments) -> tuple[int, str, str]:
+    """Exit code, standard output and standard error of `jaxphoto ...`, in this process."""
+    monkeypatch.setattr(sys, "argv", ["jaxphoto", *map(str, arguments)])
+    with pytest.raises(SystemExit) as stop:
+        cli.main()
+    captured = capsys.readouterr()
+    return stop.value.code or 0, captured.out, captured.err
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("cli") / "block"
+    write_block(simulated("cross").block, path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def results(folder):
+    """The results of one run as a user starts it: another process, no terminal."""
+    out = folder.parent / "results"
+    done = subprocess.run(
+        [sys.executable, "-c", "from jaxphoto.cli import main; main()", "adjust", folder, "--out", out],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    return out, done.stdout
+
+
+def test_exactly_the_promised_files_with_the_promised_columns(results):
+    out, _ = results
+    assert {p.name for p in out.iterdir()} == FILES
+    for name, columns in COLUMNS.items():
+        assert list(pd.read_csv(out / f"{name}.csv").columns) == columns, name
+
+
+def test_files_say_what_the_adjustment_says(results, folder):
+    out, screen = results
+    adjusted = jaxphoto.adjust(jaxphoto.read_block(folder))
+    tables = jaxphoto.Tables(adjusted)
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["sigma0"] == pytest.approx(float(adjusted.sigma0), rel=1e-9)
+    assert summary["redundancy"] == adjusted.redundancy
+    assert summary["converged"] is True
+    assert summary["outcome"].startswith("converged")
+    counts = summary["n_observations"]
+    assert counts["total"] == sum(n for group, n in counts.items() if group != "total")
+    assert counts["total"] - summary["n_unknowns"]["total"] == summary["redundancy"]
+    assert list(summary["seconds"]) == ["read", "compile", "solve", "covariance", "write"]
+    assert all(s >= 0 for s in summary["seconds"].values())
+    assert summary["versions"]["jaxphoto"] == jaxphoto.__version__
+    for name in ("interior", "exterior", "object_points", "check_points", "correlation"):
+        written, ours = pd.read_csv(out / f"{name}.csv"), getattr(tables, name)
+        numbers = ours.select_dtypes("number").columns
+        np.testing.assert_allclose(written[numbers], ours[numbers], rtol=1e-5, atol=1e-9)
+    residuals = pd.read_csv(out / "residuals.csv")
+    assert residuals["redundancy_number"].sum() == pytest.approx(adjusted.redundancy, abs=1e-6)
+    weighted = residuals["residual"] / residuals["sigma"]
+    assert (weighted**2).sum() == pytest.approx(float(adjusted.square_sum), rel=1e-6)
+    assert f"{float(adjusted.sigma0):.6g}" in screen
+    assert "c_mm" in screen
+
+
+def test_report_opens_without_a_network(results):
+    page = (results[0] / "report.html").read_text()
+    assert page.startswith("<!DOCTYPE html>")
+    assert "http" not in page
+    assert page.count("data:image/png;base64,") >= 3
+
+
+def test_results_replace_earlier_results_and_nothing_else(results, folder, monkeypatch, capsys, tmp_path):
+    other = tmp_path / "thesis"
+    other.mkdir()
+    (other / "chapter.txt").write_text("years of work")
+    code, _, error = run(monkeypatch, capsys, "adjust", folder, "--out", other)
+    assert code == 2
+    assert "thesis" in error
+    assert (other / "chapter.txt").read_text() == "years of work"
+    stale = results[0] / "stale.csv"
+    stale.write_text("")
+    code, _, _ = run(monkeypatch, capsys, "adjust", folder, "--out", results[0])
+    assert code == 0
+    assert {p.name for p in results[0].iterdir()} == FILES
+
+
+def test_not_converged_is_written_and_exit_code_one(folder, monkeypatch, capsys, tmp_path):
+    code, screen, _ = run(monkeypatch, capsys, "adjust", folder, "--out", tmp_path / "out", "--max-steps", 1)
+    assert code == 1
+    assert "not converged" in screen
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["converged"] is False
+    assert "step limit" in summary["outcome"]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda f: (f / "images.csv").unlink(), ["images.csv"]),
+        (lambda f: _replace(f / "block.toml", 'distortion = "brown"', 'distortion = "brawn"'), ["block.toml", "brawn"]),
+        (lambda f: [(f / n).unlink() for n in ("stations.csv", "control_points.csv")], ["datum", "7", "stations"]),
+    ],
+)
+def test_bad_input_is_one_sentence_and_nothing_written(spoil, words, monkeypatch, capsys, tmp_path):
+    folder, out = tmp_path / "block", tmp_path / "out"
+    write_block(simulated("cross").block, folder)
+    spoil(folder)
+    code, screen, error = run(monkeypatch, capsys, "adjust", folder, "--out", out)
+    assert code == 2
+    assert screen == ""
+    sentence = [line for line in error.splitlines() if line.startswith("jaxphoto: ")]
+    assert len(sentence) == 1
+    assert "Traceback" not in error
+    assert all(word in sentence[0] for word in words), sentence[0]
+    assert {p.name for p in tmp_path.iterdir()} == {"block"}
+
+
+def test_unknowns_that_cannot_be_told_apart_are_named(monkeypatch, capsys, tmp_path):
+    folder = tmp_path / "block"
+    write_block(simulated("cross").block, folder)
+    _replace(folder / "block.toml", 'distortion = "brown"', 'distortion = "smac"')
+    text = (folder / "block.toml").read_text()
+    lines = [line for line in text.splitlines() if not line.startswith(("k3", "p1", "p2", "b1", "b2"))]
+    text = "\n".join(lines).replace("unknowns]\n", 'unknowns]\nk0 = "free"\n')
+    (folder / "block.toml").write_text(text)
+    code, _, error = run(monkeypatch, capsys, "adjust", folder, "--out", tmp_path / "out")
+    assert code == 2
+    assert "interior[one].c_mm" in error
+    assert "interior[one].k0" in error
+    assert not (tmp_path / "out").exists()
+
+
+def test_rotations_of_the_correlations(folder, monkeypatch, capsys, tmp_path):
+    out = tmp_path / "out"
+    assert run(monkeypatch, capsys, "adjust", folder, "--out", out, "--rotations", "object")[0] == 0
+    summary = pd.read_csv(out / "correlation_summary.csv")
+    assert set(summary["exterior"]) == {"X", "Y", "Z", "rX", "rY", "rZ"}
+    assert run(monkeypatch, capsys, "adjust", folder, "--out", out, "--rotations", "gimbal")[0] == 2
+
+
+def test_convert_writes_a_block_that_reads_the_same(folder, monkeypatch, capsys, tmp_path):
+    copy = tmp_path / "copy"
+    code, screen, _ = run(monkeypatch, capsys, "convert", folder, copy)
+    assert code == 0
+    assert "copy" in screen
+    one, two = jaxphoto.read_block(folder), jaxphoto.read_block(copy)
+    np.testing.assert_array_equal(one.image_points.xy, two.image_points.xy)
+    code, _, error = run(monkeypatch, capsys, "convert", folder, tmp_path / "else", "--format", "bingo")
+    assert code == 2
+    assert "bingo" in error
+
+
+def test_version_and_help(monkeypatch, capsys):
+    assert run(monkeypatch, capsys, "--version")[1].strip() == f"jaxphoto {jaxphoto.__version__}"
+    assert "adjust" in run(monkeypatch, capsys, "--help")[1]
+
+
+def _replace(path, old: str, new: str) -> None:
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
