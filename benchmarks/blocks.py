@@ -2,8 +2,8 @@
 
 A `Problem` is plain numpy and says nothing about any solver: every peer gets the same numbers. Model: collinearity with
 `corrected = (xy - pp) (1 + k1 r^2 + k2 r^4)` (k1, k2 added: the opposite of `Brown`), rotations R3(kappa) R2(phi)
-R1(omega), weighted control and camera stations. Unknowns in this order: c, x_p, y_p, k1, k2; omega, phi, kappa, X, Y, Z an
-image; X, Y, Z a point.
+R1(omega), weighted control and camera stations. Unknowns in this order: c, x_p, y_p, k1, k2; omega, phi, kappa, X, Y, Z
+an image; X, Y, Z a point.
 """
 
 import struct

@@ -1,6 +1,6 @@
 """The solvers we are measured against; each solves in a process of its own and prints one JSON object.
 
-    python benchmarks/peers.py scipy FILE.npz        least_squares (trf, lsmr) with an exact sparse Jacobian
+python benchmarks/peers.py scipy FILE.npz        least_squares (trf, lsmr) with an exact sparse Jacobian
 """
 
 import json

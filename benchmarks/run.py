@@ -1,6 +1,6 @@
 """Ours against the peers on the same block, in one interleaved run. See README.md.
 
-    python benchmarks/run.py [--problem P31] [--npz FILE] [--ceres BIN [--bin FILE]] [--rounds 7]
+python benchmarks/run.py [--problem P31] [--npz FILE] [--ceres BIN [--bin FILE]] [--rounds 7]
 """
 
 import argparse
@@ -228,8 +228,8 @@ def table(records: list[dict]) -> list[str]:
     base = statistics.median(r["solve_s"] for r in reference)
     loads = [r["load"] for r in solves]
     lines = [
-        f"### {head['problem']}: {head['images']} images, {head['points']} points, {head['image_points']} image points, "
-        f"{head['unknowns']} unknowns",
+        f"### {head['problem']}: {head['images']} images, {head['points']} points, "
+        f"{head['image_points']} image points, {head['unknowns']} unknowns",
         "",
         f"{head['date']}; {head['cpu']}, {head['cores']} cores, load {min(loads):.1f} to {max(loads):.1f}; "
         f"Python {head['python']}, jax {head['jax']}, jaxphoto {head['jaxphoto']}; "
@@ -237,8 +237,8 @@ def table(records: list[dict]) -> list[str]:
         "",
         f"`{head['command']}`",
         "",
-        f"| solver | solve ms | ratio to {reference[0]['solver']} | steps | cost above the best (relative) | covariance ms | "
-        "peak memory MB |",
+        f"| solver | solve ms | ratio to {reference[0]['solver']} | steps | cost above the best (relative) | "
+        "covariance ms | peak memory MB |",
         "| --- | --- | --- | --- | --- | --- | --- |",
     ]
     for name, rows in by_solver.items():

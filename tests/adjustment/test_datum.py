@@ -1,4 +1,4 @@
-"""The datum: what observations leave open is counted and named; how it is closed changes nothing estimable."""
+"""The datum: what observations leave open is counted and named; closing it changes nothing that can be estimated."""
 
 import dataclasses
 import re
@@ -7,9 +7,9 @@ import equinox as eqx
 import numpy as np
 import pytest
 
-from jaxphoto import FREE, DatumError
+from jaxphoto import FIXED, FREE, DatumError, adjust
 from jaxphoto.adjustment.datum import MOTIONS
-from jaxphoto.block import Attitudes, Datum, Distances, Rows
+from jaxphoto.block import Datum, Distances, Rows
 from jaxphoto.georeferencing import StripBias
 from tests.adjustment.dense import prepared
 from tests.blocks import (
@@ -20,7 +20,6 @@ from tests.blocks import (
     all_stations,
     bare,
     covariance_of,
-    free,
     joined,
     measured,
     rows,
@@ -110,11 +109,7 @@ def test_free_shifts_leave_the_position():
     strips = {name: StripBias(np.zeros(3), np.zeros(3)) for name in "ab"}
     block, truth = bare(aerial(), {"one": BROWN}, ("one",) * 10, strips=strips)
     block = dataclasses.replace(block, stations=all_stations(block))
-    priors = {
-        "a": StripBias(FREE, block.priors.strips["a"].drift),
-        "b": StripBias(FREE, block.priors.strips["b"].drift),
-    }
-    shifted = eqx.tree_at(lambda b: b.priors.strips, block, priors)
+    shifted = eqx.tree_at(lambda b: b.priors.strips, block, {name: StripBias(FREE, FIXED) for name in "ab"})
     count, named, text = defect_of(measured(type(BARE)(shifted, truth)).block)
     assert (count, named) == (3, SHIFTS)
     assert "strips[a].shift_X_m" in text
@@ -173,31 +168,27 @@ def test_what_can_be_estimated_does_not_depend_on_the_datum(name):
     np.testing.assert_array_less(np.abs(free_of(one) - free_of(other)) / sigma, 3e-5)
     # Coordinates and their sigmas do depend on it.
     assert np.abs(np.asarray(one.unknowns.points) - np.asarray(other.unknowns.points)).max() > 1e-4
-    assert (
-        np.abs(np.asarray(covariance_of(name).point_sigma) / np.asarray(covariance_of("inner").point_sigma) - 1).max()
-        > 0.1
-    )
+    sigmas = [np.asarray(covariance_of(n).point_sigma) for n in ("inner", name)]
+    assert np.abs(sigmas[1] / sigmas[0] - 1).max() > 0.1
 
 
 def test_minimal_constraints_hold_coordinates_at_their_start():
-    held = np.isclose(np.asarray(covariance_of("minimal").point_sigma), 0.0, atol=1e-12)
+    sigma = np.asarray(covariance_of("minimal").point_sigma)
+    # The variance is a difference: what rounding leaves of it is below 1e-8 of the others.
+    held = sigma < 1e-4 * np.median(sigma)
     assert held.sum() == 6
     moved = np.asarray(adjusted("minimal").unknowns.points) - simulated("minimal").block.start.unknowns.points
     np.testing.assert_allclose(moved[held], 0.0, atol=1e-9)
-    assert np.abs(moved[~held]).min() > 1e-7
+    assert np.abs(moved[~held]).min() > 1e-6
 
 
-def test_a_shorter_bar_makes_a_smaller_block():
-    """The scale of a free network is its bars': halve them, and every distance halves."""
+def test_scale_bars_give_the_scale():
+    """Halve the bars and their sigmas, and every distance between points halves."""
     block = adjusted("inner").block
-    half = eqx.tree_at(lambda b: b.distances.value, block, 0.5 * np.asarray(block.distances.value))
-    from jaxphoto import adjust
-
-    small = adjust(half, block.start.unknowns)
-    spread = lambda a: np.linalg.norm(np.asarray(a.unknowns.points)[1:] - np.asarray(a.unknowns.points)[0], axis=1)  # noqa: E731
-    np.testing.assert_allclose(spread(small) / spread(adjusted("inner")), 0.5, rtol=1e-4)
-
-
-def test_a_free_network_has_no_attitudes_to_start_with():
-    assert len(Attitudes.none().image) == 0
-    assert free(BARE.block, "one").datum == Datum()
+    where = lambda b: (b.distances.value, b.distances.sigma)  # noqa: E731
+    half = eqx.tree_at(where, block, tuple(0.5 * np.asarray(v) for v in where(block)))
+    small, large = (
+        np.linalg.norm(np.diff(np.asarray(a.unknowns.points), axis=0), axis=1)
+        for a in (adjust(half, block.start.unknowns), adjusted("inner"))
+    )
+    np.testing.assert_allclose(small / large, 0.5, rtol=1e-6)

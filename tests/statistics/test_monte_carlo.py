@@ -92,8 +92,8 @@ def test_estimates_are_unbiased(draws):
 def test_square_sums_are_what_redundancy_numbers_predict(draws):
     """v'Pv has the mean sum r d and nearly the variance 2 sum r d^2, d the stretch of the image by the distortion.
 
-    Residuals are of ideal coordinates and weights of measured ones (docs/conventions.md): noise of a
-    measured coordinate is stretched by the derivative of the map between them, in this block by up to a tenth in the corners.
+    Residuals are of ideal coordinates and weights of measured ones (docs/conventions.md): noise of a measured
+    coordinate is stretched by the derivative of the map between them, in this block by up to a tenth in the corners.
     """
     mean = np.sum(draws.expected)
     spread = np.sqrt(2 * mean)
