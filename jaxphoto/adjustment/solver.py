@@ -164,13 +164,17 @@ class PromisedReduction(optx.AbstractSearch):
         return size, accept, optx.RESULTS.successful, _Trust(size, state.promised, state.length)
 
 
+# Ratio of successive steps that is assumed at least when the missing part is estimated.
+_SLOWEST_SHOWN = 0.1
+
+
 class LevenbergMarquardt(optx.AbstractGaussNewton):
     """Levenberg-Marquardt of optimistix, stopped by what is still missing to the optimum in standard deviations.
 
     The length of a step d in the metric of the normal matrix, sqrt(d' N d), bounds |d| / sigma of every single
-    unknown. Steps shrink at least in geometric progression, so after a step of length l that follows one of length k
-    about l (l / k) is missing. Once that is below `tolerance`, the (practically undamped) step is taken, and is the
-    last.
+    unknown. After a step of length l that follows one of length k about l (l / k) is missing; a tenth of l is assumed
+    at least, because the first ratios flatter: they shrink quadratically until the residuals' curvature tells. Once the
+    missing part is below `tolerance`, the (practically undamped) step is taken, and is the last.
     """
 
     rtol: float
@@ -198,9 +202,8 @@ class LevenbergMarquardt(optx.AbstractGaussNewton):
         seen = -_dot(proposal, new.descent_state.b) - damped
         accepted = new.num_steps_since_acceptance == 0
         length, trust = jnp.sqrt(jnp.maximum(seen, 0.0)), new.search_state
-        missing = length * jnp.minimum(1.0, length / trust.length)
-        settled = accepted & (jnp.where(jnp.isinf(trust.length), length, missing) <= self.tolerance)
-        settled = settled & (length < 1.0) & (damped <= seen + self.tolerance**2)
+        missing = length * jnp.clip(length / trust.length, _SLOWEST_SHOWN, 1.0)
+        settled = accepted & (missing <= self.tolerance) & (damped <= seen + self.tolerance**2)
         trust = _Trust(trust.step_size, 0.5 * seen + damped, jnp.where(accepted, length, trust.length))
         return new_y, eqx.tree_at(lambda s: (s.terminate, s.search_state), new, (settled, trust)), aux
 

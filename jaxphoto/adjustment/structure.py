@@ -98,6 +98,7 @@ def interior_of(group: CameraGroup, table) -> InteriorOrientation:
 def structure_of(block: Block, priors: Unknowns) -> Structure:
     """Everything about the adjustment of `block` that does not depend on a measured value."""
     image, point = np.asarray(block.image_points.image), np.asarray(block.image_points.point)
+    _check_rows(image, point)
     camera_names = np.array(block.image_camera)
 
     groups, unsort = _groups(block, camera_names[image])
@@ -238,6 +239,17 @@ def _leaf_names(interior: InteriorOrientation) -> list[str]:
     return [estimable.get(path[-1].name, path[-1].name) for path, _ in paths]
 
 
+def _check_rows(image: np.ndarray, point: np.ndarray) -> None:
+    """Raise ValueError for image rows that are not sorted by point, or hold a point twice in one image."""
+    if (np.diff(point) < 0).any():
+        raise ValueError(
+            "the rows of image_points must be sorted by point: take them in the order of np.argsort(point)"
+        )
+    key = point.astype(np.int64) * (int(image.max(initial=0)) + 1) + image
+    if len(np.unique(key)) < len(key):
+        raise ValueError("image_points holds a point twice in one image: keep one row of each")
+
+
 def _pairs(image: np.ndarray, point: np.ndarray) -> tuple[np.ndarray, ...]:
     """Rows (a, b) of one point with image[a] >= image[b], and the lower 6 x 6 blocks they fill, sorted by block."""
     n = len(point)
@@ -245,6 +257,8 @@ def _pairs(image: np.ndarray, point: np.ndarray) -> tuple[np.ndarray, ...]:
     count = np.arange(n) - first + 1
     a = np.repeat(np.arange(n), count)
     b = np.arange(len(a)) - np.repeat(np.cumsum(count) - count, count) + np.repeat(first, count)
+    upper = image[a] < image[b]
+    a, b = np.where(upper, b, a), np.where(upper, a, b)
     key = image[a].astype(np.int64) * (int(image.max(initial=0)) + 1) + image[b]
     order = np.argsort(key, kind="stable")
     unique, block = np.unique(key[order], return_inverse=True)

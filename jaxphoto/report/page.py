@@ -11,13 +11,14 @@ from matplotlib.figure import Figure
 
 from jaxphoto.report.plots import correlation_figure, layout_figure, residuals_figure
 from jaxphoto.report.tables import Tables
+from jaxphoto.report.verdict import LEAST_CHECKED
 
 _PAGE = """<!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8"><title>{{ title }}</title><style>
 body { font: 15px/1.45 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: #222 }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; margin: .5rem 0 1.5rem; font-size: 13px }
 th, td { padding: .2rem .7rem; border-bottom: 1px solid #ddd; text-align: right } th { background: #f4f4f4 }
-th:first-child, td:first-child { text-align: left } img { max-width: 100% }
+th:first-child, td:first-child { text-align: left } img { max-width: 100% } .wide { overflow-x: auto }
 .good { color: #176b2c } .bad { color: #a11 } .warning { border-left: 4px solid #d90; padding-left: .6rem; margin: .4rem 0 }
 </style></head><body>
 <h1>{{ title }}</h1>
@@ -43,10 +44,13 @@ _LARGEST = 20
 def report_page(tables: Tables, warnings: list[str]) -> str:
     """The whole report as HTML, pictures inside."""
     a = tables.adjusted
-    counts = [f"{n} {group.replace('_', ' ')}" for group, n in a.n_observations.items() if n]
+    counts = [f"{n} observations of {group.replace('_', ' ')}" for group, n in a.n_observations.items() if n]
     counts += [f"{a.n_constraints} constraints of the datum"] if a.n_constraints else []
     used = [c for c, corr in tables.correlations.items() if corr.parameters and corr.images]
-    largest = tables.residuals.assign(size=tables.residuals["w"].abs()).nlargest(_LARGEST, "size")
+    checked = tables.residuals[tables.residuals["redundancy_number"] > LEAST_CHECKED]
+    largest = checked.assign(size=checked["w"].abs()).nlargest(_LARGEST, "size")
+    interior = tables.interior
+    interior = interior[interior["sigma"].notna() | (interior["value"] != 0)]
     check = tables.check_points
     return (
         Environment(autoescape=True)
@@ -61,7 +65,7 @@ def report_page(tables: Tables, warnings: list[str]) -> str:
             counts=", ".join(counts) + f"; {sum(a.n_unknowns.values())} unknowns",
             rotations=tables.rotations.replace("_", ", "),
             warnings=warnings,
-            interior=_html(tables.interior),
+            interior=_html(interior.replace({True: "yes", False: "no", None: ""})),
             correlation=[_picture(correlation_figure(tables, c)) for c in used],
             georeferencing=_html(tables.georeferencing) if len(tables.georeferencing) else "",
             layout=_picture(layout_figure(tables)),
@@ -83,7 +87,11 @@ def _check_spread(check: pd.DataFrame) -> pd.DataFrame:
 
 
 def _html(table: pd.DataFrame) -> Markup:
-    return Markup(table.to_html(index=False, border=0, na_rep="", float_format=lambda v: f"{v:.8g}"))
+    """A table; values with eight digits, standard deviations and residuals with three."""
+    short = ("sigma", "rho", "residual", "w", "rmse", "mean", "max_abs", "redundancy_number", "d")
+    three = {c: "{:.3g}".format for c in table.select_dtypes("number") if str(c).split("_")[0] in short or c in short}
+    page = table.to_html(index=False, border=0, na_rep="", float_format="{:.8g}".format, formatters=three)
+    return Markup(f'<div class="wide">{page}</div>')
 
 
 def _picture(figure: Figure) -> str:

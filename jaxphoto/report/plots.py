@@ -18,6 +18,9 @@ def layout_figure(tables: Tables) -> Figure:
     check = np.unique(a.block.check.who)
     axes.plot(points[:, 0], points[:, 1], ".", ms=2, color="0.65", label="object points")
     axes.plot(stations[:, 0], stations[:, 1], "+", ms=8, color="tab:blue", label="camera stations")
+    strips = np.array(a.block.image_strip)
+    for strip in dict.fromkeys(strips[strips != ""]):
+        axes.plot(*stations[strips == strip, :2].T, "-", lw=0.7, color="tab:blue", alpha=0.5)
     if len(control):
         axes.plot(*points[control, :2].T, "^", ms=6, color="tab:red", label="control points")
     if len(check):
@@ -36,10 +39,12 @@ def residuals_figure(tables: Tables, camera: str) -> Figure:
     sensor = a.block.sensors[camera]
     figure = Figure(figsize=(6.4, 5.0), dpi=_DPI, layout="constrained")
     axes = figure.subplots()
-    rms = float(np.sqrt((v**2).mean())) if v.size else 1.0
-    scale = 0.03 * sensor.width_mm / max(3 * rms, 1e-12)
+    # The key is a round number near three times the RMS, and six per cent of the format long.
+    rms = max(float(np.sqrt((v**2).mean())), 1e-12) if v.size else 1.0
+    key = float(f"{3 * rms:.0e}")
+    scale = 0.06 * sensor.width_mm / key
     arrows = axes.quiver(*xy, *v, angles="xy", scale_units="xy", scale=1 / scale, width=0.0015, color="tab:blue")
-    axes.quiverkey(arrows, 0.85, 1.03, 3 * rms, f"{3000 * rms:.2g} um", labelpos="E")
+    axes.quiverkey(arrows, 0.85, 1.03, key, f"{1000 * key:g} µm", labelpos="E")
     w, h = sensor.width_mm / 2, sensor.height_mm / 2
     axes.plot([-w, w, w, -w, -w], [-h, -h, h, h, -h], color="0.4", lw=0.8)
     axes.set(xlabel="x [mm]", ylabel="y [mm]", title=f"image residuals of camera {camera}")

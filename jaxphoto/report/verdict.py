@@ -12,6 +12,8 @@ from jaxphoto.statistics import SIGNIFICANT_RATIO, Correlations
 HIGH_CORRELATION = 0.9
 HIGH_OWN_CORRELATION = 0.95
 LARGE_W = 4.0
+LEAST_CHECKED = 0.01
+"""Redundancy number below which a normalised residual is mostly rounding and judges nothing."""
 _SHOWN = 4
 
 
@@ -48,7 +50,7 @@ def _correlated(camera: str, c: Correlations) -> list[str]:
     ]
     for _, rho, a, b in sorted(pairs, reverse=True)[:_SHOWN]:
         found.append(
-            f"high correlation of {a} and {b} of camera {camera}: {rho:+.3f}; their sum is known better than each"
+            f"high correlation of {a} and {b} of camera {camera}: {rho:+.3f}; a combination of them is better known"
         )
     if len(c.images) == 0:
         return found
@@ -71,20 +73,19 @@ def _correlated(camera: str, c: Correlations) -> list[str]:
 
 
 def _large_residuals(tables: Tables) -> list[str]:
-    w, block = np.asarray(tables.w.image), tables.adjusted.block
-    rows = block.image_points
-    size = np.nan_to_num(np.abs(w)).max(axis=0)
-    large = np.flatnonzero(size > LARGE_W)
+    residuals = tables.residuals
+    checked = residuals[(residuals["group"] == "image_points") & (residuals["redundancy_number"] > LEAST_CHECKED)]
+    # A point in an image is one blunder, whichever of its coordinates shows it.
+    size = checked["w"].abs().groupby([checked["point"], checked["image"]], sort=False).max()
+    large = size[size > LARGE_W].sort_values(ascending=False)
     if not len(large):
         return []
-    shown = large[np.argsort(-size[large])][:_SHOWN]
+    shown = large.head(_SHOWN)
     names = ", ".join(
-        f"point {block.points[rows.point[k]]} in image {block.images[rows.image[k]]} ({size[k]:.1f})" for k in shown
+        f"point {where[0]} in image {where[1]} ({w:.1f})" for where, w in zip(shown.index.tolist(), shown, strict=True)
     )
-    return [
-        f"{len(large)} image points have residuals over {LARGE_W:.0f} of their standard deviations: {names}; look for "
-        "blunders"
-    ]
+    count = "1 image point has a residual" if len(large) == 1 else f"{len(large)} image points have residuals"
+    return [f"{count} over {LARGE_W:.0f} of its own standard deviations: {names}; look for blunders"]
 
 
 def _folds(adjusted: Adjustment, name: str, sensor: Sensor) -> bool:

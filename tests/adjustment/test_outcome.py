@@ -5,6 +5,7 @@ import dataclasses
 import equinox as eqx
 import numpy as np
 import pytest
+from scipy import stats
 
 from jaxphoto import Outcome, RankError, Weighted, adjust, covariance, rebalance, rebalance_covariance
 from jaxphoto.camera import get_parameter, parameter_names
@@ -54,24 +55,19 @@ def test_truth_is_recovered(name):
     # It started elsewhere.
     assert np.max(np.abs(start - true) / sigma) > 10
 
-    eop = np.asarray(cov.exterior_sigma) * a_priori
     moved = np.asarray(a.unknowns.exterior.position) - truth.exterior.position
-    turned = [
-        small_angles(one @ two.T)
-        for one, two in zip(
-            np.asarray(a.unknowns.exterior.camera_from_object), truth.exterior.camera_from_object, strict=True
-        )
-    ]
-    z = np.hstack([moved, np.array(turned)]) / eop
-    assert np.abs(z).max() < 4.5
-    assert 0.4 < np.mean(z**2) < 2.2
+    matrices = zip(np.asarray(a.unknowns.exterior.camera_from_object), truth.exterior.camera_from_object, strict=True)
+    turned = [small_angles(one @ two.T) for one, two in matrices]
+    # Exterior orientation and shared unknowns together: a quadratic form that is chi-square distributed.
+    error = np.concatenate([np.hstack([moved, np.array(turned)]).ravel(), shared - true])
+    q = np.asarray(cov.matrix)
+    d = 1 / np.sqrt(np.diag(q))
+    chi2 = (error * d) @ np.linalg.solve(q * np.outer(d, d), error * d)
+    assert 1e-4 < stats.chi2.cdf(chi2, len(error)) < 1 - 1e-4
     points = np.asarray(a.unknowns.points) - truth.points
     sigma = np.asarray(cov.point_sigma) * a_priori
-    seen = sigma > 0
-    assert (points[~seen] == 0).all()
-    z = points[seen] / sigma[seen]
-    assert np.abs(z).max() < 4.5
-    assert 0.6 < np.mean(z**2) < 1.6
+    assert (points[sigma == 0] == 0).all()
+    assert np.abs(points[sigma > 0] / sigma[sigma > 0]).max() < 4.5
 
 
 def smac(r0):
@@ -88,15 +84,21 @@ NAMES = ("c_mm", "xp_mm", "yp_mm", "k1", "k2", "p1")
 
 @pytest.fixture(scope="module")
 def balanced():
-    """The same block adjusted with R0 = 0 and R0 = 3 mm."""
-    return [adjust(b, b.start.unknowns) for b in map(smac, (0.0, 3.0))]
+    """The same block adjusted with R0 = 0 and with R0 = 3 mm.
+
+    Residuals are of ideal coordinates, which R0 = 3 mm scales by less than a thousandth: sigmas are scaled along.
+    """
+    zero, three = map(smac, (0.0, 3.0))
+    scale = float(rebalance(SMAC, 3.0).c / rebalance(SMAC, 0.0).c)
+    assert 1e-4 < abs(scale - 1) < 1e-3
+    three = eqx.tree_at(lambda b: b.image_points.sigma, three, scale * np.asarray(three.image_points.sigma))
+    return [adjust(b, b.start.unknowns) for b in (zero, three)]
 
 
 def test_the_balance_radius_does_not_change_the_bundle(balanced):
     zero, three = balanced
-    assert float(three.sigma0) == pytest.approx(float(zero.sigma0), rel=1e-9)
-    # Residuals are in the ideal domain, whose scale R0 changes by less than a thousandth.
-    np.testing.assert_allclose(three.residuals.image, zero.residuals.image, atol=1e-2)
+    assert float(three.sigma0) == pytest.approx(float(zero.sigma0), rel=2e-5)
+    np.testing.assert_allclose(three.residuals.image, zero.residuals.image, atol=2e-3)
     mapped, found = rebalance(zero.unknowns.interior["one"], 3.0), three.unknowns.interior["one"]
     cov = [covariance(a) for a in balanced]
     n = 6 * cov[0].n_images
@@ -110,7 +112,7 @@ def test_the_balance_radius_does_not_change_the_bundle(balanced):
     sigma = np.sqrt(np.diag(theirs))
     np.testing.assert_allclose(transported / np.outer(sigma, sigma), theirs / np.outer(sigma, sigma), atol=1e-4)
     for name, s in zip(NAMES, sigma, strict=True):
-        assert abs(float(get_parameter(mapped, name)) - float(get_parameter(found, name))) < 1e-3 * s, name
+        assert abs(float(get_parameter(mapped, name)) - float(get_parameter(found, name))) < 1e-2 * s, name
     # They are different numbers.
     assert abs(float(found.c) - float(zero.unknowns.interior["one"].c)) > sigma[0]
 

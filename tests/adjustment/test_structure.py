@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 
 import equinox as eqx
+import jax
 import numpy as np
 import pytest
 
@@ -134,3 +135,13 @@ def test_names_of_cameras_do_not_matter():
             float(one.unknowns.interior[name].c), abs=1e-6
         )
     assert abs(float(one.unknowns.interior["one"].c) - float(one.unknowns.interior["two"].c)) > 0.1
+
+
+def test_rows_that_cannot_be_are_refused():
+    block = simulated("cross").block
+    backwards = jax.tree.map(lambda v: v[::-1], block.image_points)
+    with pytest.raises(ValueError, match="sorted by point"):
+        structure_of(eqx.tree_at(lambda b: b.image_points, block, backwards), block.priors)
+    twice = jax.tree.map(lambda v: np.concatenate([v[:1], v]), block.image_points)
+    with pytest.raises(ValueError, match="twice"):
+        structure_of(eqx.tree_at(lambda b: b.image_points, block, twice), block.priors)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxphoto.block import Datum
-from jaxphoto.camera import Balanced, Brown, get_parameter, parameter_names
+from jaxphoto.camera import AffineBrown, Balanced, get_parameter, parameter_names
 from jaxphoto.collinearity import ExteriorOrientation, project
 from jaxphoto.errors import InputError
 from jaxphoto.io import FORMATS, convert, read_block, read_source, write_block
@@ -103,7 +103,7 @@ def test_camcal(data_dir):
     assert len(block.control.who) == len(block.check.who) == 0
     assert free(block) == {"c_mm", "xp_mm", "yp_mm", "k1", "k2", "k3", "p1", "p2", "b1"}
     camera = block.start.unknowns.interior["camera"]
-    assert isinstance(camera.distortion, Brown)
+    assert isinstance(camera.distortion, AffineBrown)
     assert (float(camera.c), float(camera.x_p), float(camera.y_p)) == (7.5, 0.0, 0.0)
     np.testing.assert_allclose(block.sensors["camera"].pixel_mm, 5.43764 / 1704)
     np.testing.assert_allclose(block.image_points.sigma, 0.1 * 5.43764 / 1704)

@@ -1,0 +1,128 @@
+"""Residuals by group and axis, check points that take no part, differences of two adjustments, normalised residuals."""
+
+import dataclasses
+
+import equinox as eqx
+import numpy as np
+import pytest
+
+from jaxphoto import adjust, angle_differences, point_differences
+from jaxphoto.collinearity import ExteriorOrientation
+from jaxphoto.simulation import image_coordinates
+from jaxphoto.statistics import (
+    a_priori_sigmas,
+    check_discrepancies,
+    normalised_residuals,
+    physical_residuals,
+    redundancy_numbers,
+    residual_spread,
+)
+from tests.blocks import adjusted, covariance_of, simulated
+
+
+def test_physical_residuals_are_observed_minus_computed():
+    a = adjusted("everything")
+    v, u, block = physical_residuals(a), a.unknowns, a.block
+    points = np.asarray(u.points)
+    np.testing.assert_allclose(
+        v["control_points"], block.control.value - points[block.control.who, block.control.axis], atol=1e-9
+    )
+    ends = points[block.distances.points]
+    length = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)
+    np.testing.assert_allclose(v["distances"], block.distances.value - length, atol=1e-9)
+    # Image residuals in the ideal domain; to first order those of the measured coordinate, scaled by the distortion.
+    measured = (np.asarray(block.image_points.xy) - np.asarray(image_coordinates(block, u))).T
+    np.testing.assert_allclose(v["image_points"], measured, atol=0.2 * np.abs(measured).max())
+    assert np.corrcoef(np.ravel(v["image_points"]), np.ravel(measured))[0, 1] > 0.999
+    sigmas = a_priori_sigmas(a)
+    square = sum(float(np.sum((v[group] / sigmas[group]) ** 2)) for group in v)
+    assert square == pytest.approx(float(a.square_sum), rel=1e-12)
+    assert float(a.sigma0) == pytest.approx(np.sqrt(square / a.redundancy), rel=1e-12)
+
+
+def test_residual_spread():
+    a = adjusted("everything")
+    v, spreads = physical_residuals(a), residual_spread(a)
+    assert [(s.group, s.axis) for s in spreads] == [
+        *(("image_points", axis) for axis in "xy"),
+        *(("stations", axis) for axis in "XYZ"),
+        *(("attitudes", axis) for axis in ("roll", "pitch", "yaw")),
+        *(("control_points", axis) for axis in "XYZ"),
+        ("distances", ""),
+    ]
+    by_axis = {(s.group, s.axis): s for s in spreads}
+    z = v["control_points"][np.asarray(a.block.control.axis) == 2]
+    s = by_axis["control_points", "Z"]
+    assert (s.n, s.unit) == (8, "m")
+    assert s.mean == pytest.approx(z.sum() / 8)
+    assert s.rmse == pytest.approx(np.sqrt((z**2).sum() / 8))
+    assert s.max_abs == pytest.approx(np.abs(z).max())
+    assert by_axis["attitudes", "yaw"].n == 6
+    assert by_axis["image_points", "y"].rmse == pytest.approx(np.sqrt(np.mean(v["image_points"][1] ** 2)))
+    assert sum(s.n for s in spreads) == sum(a.n_observations.values()) - a.n_observations["priors"]
+
+
+def test_check_points_are_surveyed_minus_computed():
+    a, truth = adjusted("cross"), simulated("cross").truth
+    rows = check_discrepancies(a)
+    assert len(rows.who) == 6
+    computed = np.asarray(a.unknowns.points)[rows.who, rows.axis]
+    np.testing.assert_allclose(rows.value, truth.points[rows.who, rows.axis] - computed, atol=1e-9)
+    sigma = np.asarray(covariance_of("cross").point_sigma)[rows.who, rows.axis]
+    assert (np.abs(rows.value) < 4 * sigma).all()
+
+
+def test_check_points_do_not_take_part():
+    """A check point in error by a metre changes its own discrepancy by a metre and nothing else."""
+    block = simulated("cross").block
+    wrong = eqx.tree_at(lambda b: b.check.value, block, np.asarray(block.check.value) + 1.0)
+    a = adjust(wrong, wrong.start.unknowns)
+    one = adjusted("cross")
+    assert float(a.square_sum) == float(one.square_sum)
+    np.testing.assert_allclose(
+        check_discrepancies(a).value, np.asarray(check_discrepancies(one).value) + 1.0, atol=1e-12
+    )
+
+
+def test_point_differences_are_first_minus_second_of_the_common():
+    one, other = adjusted("cross"), adjusted("strips")
+    fewer = eqx.tree_at(lambda x: x.unknowns.points, other, np.asarray(other.unknowns.points)[2:])
+    fewer = dataclasses.replace(fewer, block=dataclasses.replace(other.block, points=other.block.points[2:]))
+    names, difference = point_differences(one, fewer)
+    assert names == one.block.points[2:]
+    np.testing.assert_allclose(difference, np.asarray(one.unknowns.points)[2:] - np.asarray(other.unknowns.points)[2:])
+    assert np.abs(difference).max() > 1e-3
+
+
+def test_angle_differences_are_small_across_the_half_turn():
+    """kappa = +179.9 and -179.9 degrees differ by 0.2 degrees."""
+    a = adjusted("cross")
+    n = len(a.block.images)
+
+    def with_angles(degrees):
+        exterior = ExteriorOrientation.from_angles(np.zeros((n, 3)), np.tile(np.deg2rad(degrees), (n, 1)))
+        return eqx.tree_at(lambda x: x.unknowns.exterior, a, exterior)
+
+    names, difference = angle_differences(with_angles([1.0, 2.0, 179.9]), with_angles([0.5, 2.5, -179.9]))
+    assert names == a.block.images
+    np.testing.assert_allclose(np.rad2deg(difference), np.tile([0.5, -0.5, -0.2], (n, 1)), atol=1e-9)
+
+
+def test_normalised_residuals():
+    a = adjusted("everything")
+    numbers = redundancy_numbers(a, covariance_of("everything"))
+    w = normalised_residuals(a, numbers)
+    for v, r, found in zip(a.residuals[:-1], numbers[:-1], w[:-1], strict=True):
+        np.testing.assert_allclose(found, np.asarray(v) / (float(a.sigma0) * np.sqrt(np.asarray(r))), rtol=1e-9)
+    everything = np.concatenate([np.ravel(x) for x in w[:-1]])
+    # Standard normal but for their correlation.
+    assert 0.9 < np.std(everything) < 1.1
+    assert np.abs(everything).max() < 4.5
+
+
+def test_observations_that_nothing_checks_have_no_normalised_residual():
+    a = adjusted("inner")
+    numbers = redundancy_numbers(a, covariance_of("inner"))
+    unchecked = numbers._replace(distances=np.zeros(3))
+    assert np.isnan(normalised_residuals(a, unchecked).distances).all()
+    assert np.isfinite(normalised_residuals(a, numbers).distances).all()
