@@ -41,8 +41,8 @@ class Dense(NamedTuple):
     products: np.ndarray
     """The normal matrix times `vector`."""
     gradient: np.ndarray
-    solutions: tuple[np.ndarray, ...]
-    """x of (N + damping I) x = vector for each of `DAMPINGS`."""
+    solutions: np.ndarray
+    """x of (N + damping I) x = vector, a row for each of `DAMPINGS`."""
     scale: np.ndarray
 
     @property
@@ -85,7 +85,7 @@ def _dense(values, scale, structure) -> Dense:
         vector=vector,
         products=ravel_pytree(multiply_normal(normal, back(vector), structure))[0],
         gradient=ravel_pytree(normal.b)[0],
-        solutions=tuple(solution(damping) for damping in DAMPINGS),
+        solutions=jax.vmap(solution)(jnp.array(DAMPINGS)),
         scale=flat_scale,
     )
 
