@@ -1,5 +1,7 @@
 """The adjustment itself: block, start and priors in; unknowns with their normal equations out."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import numpy as np
@@ -40,7 +42,7 @@ def solve(block: Block, start: Unknowns, priors: Unknowns, max_steps: int = MAX_
     check_priors(priors)
     structure = structure_of(block, priors)
     values = values_of(block, start, priors, structure)
-    constraints = close_datum(block, concrete(values), structure)
+    constraints = close_datum(block, concrete(values, block), structure)
     values = with_datum(values, constraints.eop, constraints.points)
     seconds: dict[str, float] = {}
     optimum, state = run_compiled(_optimise, (values, structure, max_steps), seconds, "solve")
@@ -90,6 +92,15 @@ def _factor(values: Values, structure: Structure) -> Factored:
     return Factored(normal, reduced, factor_reduced(reduced), scale, values.datum_eop.shape[0])
 
 
-def concrete(tree: Values) -> Values:
-    """The same values with zeros for what is being traced: the datum depends on no observed value."""
-    return jax.tree.map(lambda v: np.zeros(v.shape) if isinstance(v, jax.core.Tracer) else np.asarray(v), tree)
+def concrete(tree: Values, block: Block) -> Values:
+    """The same values with numbers for what is being traced: the datum depends on where things are, roughly."""
+    known = block.start.unknowns
+    place = {"position": known.exterior.position, "points": known.points}
+    still = {k: np.asarray(v, float).T for k, v in place.items() if not isinstance(v, jax.core.Tracer)}
+
+    def number(name: str, v):
+        if not isinstance(v, jax.core.Tracer):
+            return np.asarray(v)
+        return still.get(name, np.zeros(v.shape))
+
+    return Values(**{f.name: number(f.name, getattr(tree, f.name)) for f in dataclasses.fields(tree)})

@@ -230,7 +230,7 @@ def _sentence(open_motions: np.ndarray, block: Block, named: list[str]) -> str:
     shares = np.sqrt((open_motions**2).sum(0))
     names = [m for m, share in zip(MOTIONS, shares, strict=True) if share > 0.05]
     observed = [
-        f"{n} {what}"
+        f"{n} {what[:-1] if n == 1 else what}"
         for n, what in (
             (len(block.control.who) + len(block.fixed.who), "control coordinates"),
             (len(block.stations.who), "station coordinates"),

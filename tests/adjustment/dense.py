@@ -24,7 +24,7 @@ def prepared(block):
     """Structure and values at the start, with the constraints of the datum."""
     structure = structure_of(block, block.priors)
     values = values_of(block, block.start.unknowns, block.priors, structure)
-    constraints = close_datum(block, concrete(values), structure)
+    constraints = close_datum(block, concrete(values, block), structure)
     return with_datum(values, constraints.eop, constraints.points), structure
 
 

@@ -58,7 +58,7 @@ def test_image_coordinates_alone_leave_seven():
 def test_a_scale_bar_leaves_six():
     count, named, text = defect_of(block_with(distances=BAR))
     assert (count, named) == (6, set(MOTIONS) - {"scale"})
-    assert "1 distances" in text
+    assert "1 distance;" in text
 
 
 def test_attitudes_leave_shifts_and_scale():

@@ -85,3 +85,21 @@ def test_many_adjustments_at_once():
     apart = np.stack([readjusted(p) for p in heights])
     np.testing.assert_allclose(together, apart, atol=1e-6)
     assert np.abs(apart[0] - apart[1]).max() > 1e-4
+
+
+def test_a_fixed_control_coordinate_moves_what_hangs_on_it():
+    block, start = simulated("fixed_control").block, adjusted("fixed_control").unknowns
+
+    def height(rise):
+        value = jnp.asarray(block.fixed.value).at[2].add(rise)
+        return adjust(eqx.tree_at(lambda b: b.fixed.value, block, value), start).unknowns.exterior.position[0, 2]
+
+    def readjusted_height(rise: float) -> float:
+        value = np.asarray(block.fixed.value) + rise * (np.arange(len(block.fixed.value)) == 2)
+        return float(adjust(eqx.tree_at(lambda b: b.fixed.value, block, value), start).unknowns.exterior.position[0, 2])
+
+    step = 0.02
+    slope = float(jax.jvp(jax.jit(height), (0.0,), (1.0,))[1])
+    difference = (readjusted_height(step) - readjusted_height(-step)) / (2 * step)
+    assert slope == pytest.approx(difference, rel=1e-4)
+    assert abs(slope) > 1e-3
