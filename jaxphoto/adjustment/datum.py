@@ -41,8 +41,8 @@ class Motions(NamedTuple):
 def close_datum(block: Block, values: Values, structure: Structure) -> Motions:
     """The constraints that close what the observations leave open (leading axis: the defect).
 
-    Raises DatumError where the block's datum is open and its kind
-    "control", or where the constraints asked for cannot close it.
+    Raises DatumError where the block's datum is open and its kind "control", or where the constraints asked for cannot
+    close it.
     """
     if _plainly_closed(block, values, structure):
         return Motions(np.zeros((0, 6, structure.n_images)), np.zeros((0, 3, structure.n_points)))

@@ -96,7 +96,9 @@ def _find_optimum_jvp(primals, tangents, *, structure: Structure, max_steps: int
     moved, still = eqx.partition(values, jax.tree.map(lambda t: t is not None, direction, is_leaf=lambda t: t is None))
     _, change = jax.jvp(lambda m: gradient(at, eqx.combine(m, still)), (moved,), (direction,))
     scale = typical_scale(values, structure)
-    normal = linearise(at, scale, values, structure)[0]
+    # The preconditioner belongs to the optimum: `linearise` wants its place in scaled increments.
+    place = jax.tree.map(lambda a, k: jnp.where(k > 0, a / jnp.where(k > 0, k, 1.0), 0.0), at, scale)
+    normal = linearise(place, scale, values, structure)[0]
     reduced = reduce_normal(normal, 0.0, structure)
     lower = factor_reduced(reduced)
 

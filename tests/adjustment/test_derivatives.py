@@ -103,3 +103,16 @@ def test_a_fixed_control_coordinate_moves_what_hangs_on_it():
     difference = (readjusted_height(step) - readjusted_height(-step)) / (2 * step)
     assert slope == pytest.approx(difference, rel=1e-4)
     assert abs(slope) > 1e-3
+
+
+def test_derivatives_do_not_depend_on_the_start():
+    """From rough start values as from the optimum, although everything is linearised somewhere."""
+    block, near = simulated("cross").block, adjusted("cross").unknowns
+
+    def outcome(rise, start):
+        value = jnp.asarray(block.stations.value).at[STATION].add(rise)
+        return outcomes(adjust(eqx.tree_at(lambda b: b.stations.value, block, value), start).unknowns)
+
+    slope = jax.jit(lambda start: jax.jvp(lambda rise: outcome(rise, start), (0.0,), (1.0,))[1])
+    far = np.asarray(slope(block.start.unknowns))
+    np.testing.assert_allclose(far, np.asarray(slope(near)), rtol=1e-6)
