@@ -25,11 +25,20 @@ from jaxphoto.camera import (
     AffineBrown,
     Balanced,
     Brown,
+    Brown14,
+    Ebner,
+    Gruen,
     InteriorOrientation,
+    PpsRadial,
+    RadialPolynomial,
     Sensor,
     Smac,
+    conversion_error,
+    decentring_from_symmetry,
+    principal_points,
     rebalance,
     rebalance_covariance,
+    symmetry_from_decentring,
 )
 from jaxphoto.collinearity import ExteriorOrientation, image_ray, intersect, project
 from jaxphoto.errors import BlockError, DatumError, InputError, JaxphotoError, RankError
@@ -43,8 +52,9 @@ __version__ = "0.1.0"
 
 __all__ = [
     "FIXED", "FREE", "MAX_STEPS", "AbstractDistortion", "Adjustment", "AffineBrown", "Balanced", "Block",
-    "BlockError", "Brown", "DatumError", "ExteriorOrientation", "InputError", "InteriorOrientation",
-    "JaxphotoError", "Outcome", "RankError", "Sensor", "Smac", "Tables", "Unknowns", "Weighted", "adjust",
-    "angle_differences", "convert", "covariance", "image_ray", "intersect", "point_differences", "project",
-    "read_block", "read_source", "rebalance", "rebalance_covariance", "write_block",
+    "BlockError", "Brown", "Brown14", "DatumError", "Ebner", "ExteriorOrientation", "Gruen", "InputError",
+    "InteriorOrientation", "JaxphotoError", "Outcome", "PpsRadial", "RadialPolynomial", "RankError", "Sensor", "Smac",
+    "Tables", "Unknowns", "Weighted", "adjust", "angle_differences", "conversion_error", "convert", "covariance",
+    "decentring_from_symmetry", "image_ray", "intersect", "point_differences", "principal_points", "project",
+    "read_block", "read_source", "rebalance", "rebalance_covariance", "symmetry_from_decentring", "write_block",
 ]  # fmt: skip

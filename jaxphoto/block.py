@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 
 from jaxphoto.arrays import Numbers
 from jaxphoto.camera import Sensor
+from jaxphoto.georeferencing import NOMINAL, Corrections, Exposure
 from jaxphoto.unknowns import Unknowns
 
 AXES = ("X", "Y", "Z")
@@ -82,6 +83,30 @@ class Datum:
     scale: bool | None = None
 
 
+class Motion(eqx.Module):
+    """How the GNSS/IMU moves at each exposure, for a time offset to act on (`georeferencing.Exposure`)."""
+
+    velocity: Float[Numbers, "images 3"]
+    """In the object frame, m/s."""
+    rate: Float[Numbers, "images 3"]
+    """About the body's right, forward and up axes, rad/s."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Frame:
+    """The object frame of a block, and how to come back to the frame of its files.
+
+    `local`, `enu`: Cartesian, as the files give it. `grid`: map-grid coordinates taken as they stand, which is no
+    Cartesian frame. `epsg`: files in the system `code` with heights of `vertical` were brought to the local
+    east-north-up frame whose origin is (longitude, latitude in degrees, ellipsoidal height in m).
+    """
+
+    kind: Literal["local", "enu", "grid", "epsg"] = "local"
+    code: int | None = None
+    vertical: int | None = None
+    origin: tuple[float, float, float] | None = None
+
+
 class Start(eqx.Module):
     """Approximate unknowns, and which images and points they are truly known for.
 
@@ -118,3 +143,15 @@ class Block(eqx.Module):
     datum: Datum = eqx.field(static=True)
     start: Start
     priors: Unknowns
+    motion: Motion | None = None
+    frame: Frame = eqx.field(static=True, default=Frame())
+    corrections: Corrections = eqx.field(static=True, default=Corrections())
+
+
+def exposures(block: Block) -> Exposure:
+    """What is known of every exposure besides its observations, with a leading axis over the images."""
+    still = np.zeros((len(block.images), 3))
+    motion = block.motion if block.motion is not None else Motion(still, still)
+    mounts = block.start.unknowns.mounts
+    nominal = np.stack([mounts[name].nominal if name in mounts else NOMINAL["forward"] for name in block.image_mount])
+    return Exposure(block.image_time, motion.velocity, motion.rate, nominal)  # type: ignore[arg-type]

@@ -248,7 +248,7 @@ def _mount() -> Simulated:
     """Lever arm and boresight free, attitudes observed, rotations of the images tilted by boresight."""
     block, truth = _aerial(mounts={"imu": Mount(LEVER_ARM, BORESIGHT)})
     block = dataclasses.replace(block, attitudes=all_attitudes(block), stations=all_stations(block, 0.02))
-    block = eqx.tree_at(lambda b: b.priors.mounts["imu"], block, Mount(FREE, FREE))
+    block = eqx.tree_at(lambda b: b.priors.mounts["imu"], block, Mount(FREE, FREE, FIXED))
     return Simulated(free(block, "one"), truth)
 
 
@@ -303,7 +303,7 @@ def _everything() -> Simulated:
     block = eqx.tree_at(
         lambda b: (b.priors.mounts["imu"], b.priors.strips),
         block,
-        (Mount(Weighted(np.array([0.3, -0.5, 1.0]), np.array([0.05, 0.06, 0.07])), FREE), priors),
+        (Mount(Weighted(np.array([0.3, -0.5, 1.0]), np.array([0.05, 0.06, 0.07])), FREE, FIXED), priors),
     )
     return Simulated(block, truth)
 

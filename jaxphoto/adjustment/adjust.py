@@ -18,9 +18,10 @@ from jaxphoto.adjustment.optimum import (
     weigh_datum,
     zero_increments,
 )
+from jaxphoto.adjustment.padding import crop_residuals, crop_state, pad_structure, pad_values
 from jaxphoto.adjustment.rank import check_priors, check_rank
 from jaxphoto.adjustment.residuals import Residuals, State, Values, residuals_at, state_at
-from jaxphoto.adjustment.result import Adjustment, Factored
+from jaxphoto.adjustment.result import Adjustment, Factored, Padded
 from jaxphoto.adjustment.structure import Structure, structure_of
 from jaxphoto.adjustment.values import at_state, unknowns_of, values_of, with_datum
 from jaxphoto.block import Block
@@ -44,23 +45,28 @@ def solve(block: Block, start: Unknowns, priors: Unknowns, max_steps: int = MAX_
     values = values_of(block, start, priors, structure)
     constraints = close_datum(block, concrete(values, block), structure)
     values = with_datum(values, constraints.eop, constraints.points)
+    wide = pad_structure(structure)
+    numbers = pad_values(values, structure, wide)
     seconds: dict[str, float] = {}
-    optimum, state = run_compiled(_optimise, (values, structure, max_steps), seconds, "solve")
-    values = at_state(values, state)
+    optimum, state = run_compiled(_optimise, (numbers, wide, max_steps), seconds, "solve")
+    numbers = at_state(numbers, state)
     # Statistics need the factored normal matrix; a derivative of the unknowns does not, and would pay for it dearly.
     traced = isinstance(state.position, jax.core.Tracer)
-    factored = None
-    if not traced:
-        factored = run_compiled(_factor, (values, structure), seconds, "covariance")
-    residuals = run_compiled(_residuals, (values, structure), seconds, "solve")
+    padded = None
+    if traced:
+        residuals = _residuals(numbers, wide)
+    else:
+        factored, residuals = run_compiled(_factor, (numbers, wide), seconds, "covariance")
+        padded = Padded(wide, numbers, factored)
+    state = crop_state(state, structure)
     adjusted = Adjustment(
         block=block,
         priors=priors,
         unknowns=unknowns_of(state, start, structure),
-        residuals=residuals,
-        values=values,
+        residuals=crop_residuals(residuals, structure),
+        values=at_state(values, state),
         structure=structure,
-        factored=factored,
+        padded=padded,
         steps=optimum.steps,
         converged=optimum.converged,
         seconds=seconds,
@@ -83,13 +89,13 @@ def _residuals(values: Values, structure: Structure) -> Residuals:
 
 
 @eqx.filter_jit
-def _factor(values: Values, structure: Structure) -> Factored:
-    """The undamped normal equations at the optimum, factored."""
-    values = weigh_datum(values, structure)
-    scale = typical_scale(values, structure)
-    normal, _ = linearise(zero_increments(structure), scale, values, structure)
+def _factor(values: Values, structure: Structure) -> tuple[Factored, Residuals]:
+    """The undamped normal equations at the optimum, factored; and the residuals there."""
+    weighed = weigh_datum(values, structure)
+    scale = typical_scale(weighed, structure)
+    normal, residuals = linearise(zero_increments(structure), scale, weighed, structure)
     reduced = reduce_normal(normal, 0.0, structure)
-    return Factored(normal, reduced, factor_reduced(reduced), scale, values.datum_eop.shape[0])
+    return Factored(normal, reduced, factor_reduced(reduced), scale, values.datum_eop.shape[0]), residuals
 
 
 def concrete(tree: Values, block: Block) -> Values:

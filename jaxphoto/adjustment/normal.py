@@ -62,7 +62,7 @@ def sum_normal(jacobian: Jacobian, residuals: Residuals, datum: tuple[Array, Arr
     station_rows = jnp.concatenate([j.station_eop, j.station_shared, r.stations[None]])[:, None]
     attitude_rows = jnp.concatenate([j.attitude_eop, j.attitude_shared, r.attitudes[None]])
     m = (
-        _products(image_rows, s.image, s.n_images)
+        _image_products(image_rows, s)
         + _products(station_rows, s.station_image, s.n_images)
         + _products(attitude_rows, s.attitude_image, s.n_images)
     )
@@ -89,7 +89,7 @@ def sum_normal(jacobian: Jacobian, residuals: Residuals, datum: tuple[Array, Arr
         us=us,
         uss=uss,
         v=vp[:3, :3],
-        w=jnp.einsum("aon,bon->abn", j.image_eop, j.image_point),
+        w=j.image_eop[:, None, 0] * j.image_point[None, :, 0] + j.image_eop[:, None, 1] * j.image_point[None, :, 1],
         ws=ws,
         b=Increments(
             m[:, :6, -1].T + jnp.einsum("cna,c->an", rows_e, d), b_s, vp[:3, 3] + jnp.einsum("ckp,c->kp", rows_p, d)
@@ -140,11 +140,8 @@ def reduce_normal(normal: Normal, damping, structure: Structure) -> Reduced:
     y = _whiten(n.w, l[:, s.point])
     ys, yd = _whiten(n.ws, l), _whiten(n.rows_p, l)
 
-    rows = y.transpose(2, 0, 1)
-    product = jnp.einsum("nak,nbk->nab", rows[s.pair_a], rows[s.pair_b])
-    blocks = -jax.ops.segment_sum(
-        product.reshape(-1, 36), s.pair_block, len(s.block_row), indices_are_sorted=True
-    ).reshape(-1, 6, 6)
+    rows = _with_zero_row(y)
+    blocks = -_pair_sums(rows, s)
     see = jnp.zeros((s.n_images, 6, s.n_images, 6))
     see = see.at[s.block_row, :, s.block_column, :].set(blocks, unique_indices=True)
     each = jnp.arange(s.n_images)
@@ -152,7 +149,7 @@ def reduce_normal(normal: Normal, damping, structure: Structure) -> Reduced:
 
     # What meets an image through its points: shared unknowns and mu.
     across = jnp.concatenate([ys, yd])
-    met = jax.ops.segment_sum(jnp.einsum("akn,ckn->nac", y, across[:, :, s.point]), s.image, s.n_images)
+    met = _met(rows, across, s)
     own = jnp.einsum("akp,bkp->ab", across, across)
     q, k, size = s.n_shared, len(yd), 6 * s.n_images
     se = (n.us - met[:, :, :q]).reshape(size, q)
@@ -208,6 +205,63 @@ def _products(rows: Float[Array, "m c n"], owner, n_owners: int, is_sorted: bool
     m = len(rows)
     sums = jax.ops.segment_sum(product.reshape(-1, m * m), owner, n_owners, indices_are_sorted=is_sorted)
     return sums.reshape(n_owners, m, m)
+
+
+def _take_rows(table, index):
+    return table.at[index].get(mode="promise_in_bounds")
+
+
+def _with_zero_row(m: Float[Array, "m c n"]) -> Float[Array, "n+1 c*m"]:
+    """Row by row, components before columns, and a row of zeros for padding."""
+    flat = m.transpose(2, 1, 0).reshape(m.shape[2], -1)
+    return jnp.concatenate([flat, jnp.zeros((1, flat.shape[1]))])
+
+
+# So many numbers, at most, are gathered at a time: they stay in the cache of a core, and memory stays small.
+_PIECE = 1 << 20
+
+
+def _piecewise(function, lists, numbers: int):
+    """`function` of each entry of `lists`, as many at a time as the cache holds, `numbers` gathered by each."""
+    size = min(len(jax.tree.leaves(lists)[0]), max(1, _PIECE // max(numbers, 1)))
+    return jax.lax.map(function, lists, batch_size=size)
+
+
+def _image_products(rows: Float[Array, "m c n"], s: Structure) -> Float[Array, "images m m"]:
+    """Sum of the outer products of image rows, by image: one product of matrices each."""
+    table, m = _with_zero_row(rows), len(rows)
+
+    def one(index):
+        own = _take_rows(table, index).reshape(-1, m)
+        return own.T @ own
+
+    return _piecewise(one, s.image_rows, s.image_rows.shape[1] * table.shape[1])
+
+
+def _met(rows, across: Float[Array, "c 3 points"], s: Structure) -> Float[Array, "images 6 c"]:
+    """Sum of Y across' over the points of an image."""
+    c = len(across)
+    if not c:
+        return jnp.zeros((s.n_images, 6, 0))
+    table = across.transpose(2, 1, 0).reshape(-1, 3 * c)
+
+    def one(index):
+        return _take_rows(rows, index[0]).reshape(-1, 6).T @ _take_rows(table, index[1]).reshape(-1, c)
+
+    return _piecewise(one, (s.image_rows, s.image_points), s.image_rows.shape[1] * 3 * (6 + c))
+
+
+def _pair_sums(rows: Float[Array, "n+1 18"], s: Structure) -> Float[Array, "blocks 6 6"]:
+    """Sum over common points of Y_a Y_b', by pair of images: products of chunks of points, then their sum."""
+
+    def one(index):
+        return _take_rows(rows, index[0]).reshape(-1, 6).T @ _take_rows(rows, index[1]).reshape(-1, 6)
+
+    products = _piecewise(one, (s.chunk_a, s.chunk_b), 36 * s.chunk_a.shape[1]).reshape(-1, 36)
+    sums = jax.ops.segment_sum(
+        products, s.chunk_block, len(s.block_row), indices_are_sorted=True, mode="promise_in_bounds"
+    )
+    return sums.reshape(-1, 6, 6)
 
 
 def _shared_sums(m: Float[Array, "images m m"], s: Structure):

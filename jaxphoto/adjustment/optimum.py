@@ -14,11 +14,11 @@ import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Int
 
-from jaxphoto.adjustment.colouring import jacobian_blocks
+from jaxphoto.adjustment.local import blocks_at
 from jaxphoto.adjustment.normal import Normal, factor_reduced, reduce_normal, solve_factored, sum_normal
 from jaxphoto.adjustment.residuals import Increments, Residuals, Values, residuals_at
 from jaxphoto.adjustment.solver import BlockDescent, LevenbergMarquardt
-from jaxphoto.adjustment.structure import Structure, interior_of
+from jaxphoto.adjustment.structure import MOUNT_SIZE, STRIP_SIZE, Structure, interior_of
 from jaxphoto.collinearity import ExteriorOrientation, image_residual
 
 # The first damping relative to the normal matrix is the square of this: almost Gauss-Newton.
@@ -43,9 +43,7 @@ def linearise(
 ) -> tuple[Normal, Residuals]:
     """Undamped normal equations and residuals at start + scale * increments."""
     # Traced once: jit keeps the trace, and everything below uses it again.
-    fn = jax.jit(lambda y: residuals_at(y, scale, values, structure))
-    residuals, product = jax.linearize(fn, increments)
-    blocks = jacobian_blocks(product, structure)
+    blocks, residuals = blocks_at(increments, scale, values, structure)
     datum = (values.datum_eop * scale.eop, values.datum_points * scale.points)
     return sum_normal(blocks, residuals, datum, structure), residuals
 
@@ -67,11 +65,11 @@ def find_optimum(values: Values, *, structure: Structure, max_steps: int) -> Opt
     """Levenberg-Marquardt from the start in `values`. Differentiable in every number of `values`."""
     zero = zero_increments(structure)
     scale = jax.tree.map(lambda k: k / _FIRST_DAMPING, typical_scale(values, structure))
-    datum = (values.datum_eop * scale.eop, values.datum_points * scale.points)
-    solver = LevenbergMarquardt(BlockDescent(structure, datum), TOLERANCE)
+    solver = LevenbergMarquardt(BlockDescent(structure, values, scale), TOLERANCE)
     fn = jax.jit(lambda y, scale, values: residuals_at(y, scale, values, structure))
     solution: optx.Solution = optx.least_squares(
-        lambda y, args: fn(y, *args),
+        # The descent differentiates for itself: optimistix is told that there is nothing to linearise.
+        lambda y, args: jax.lax.stop_gradient(fn(y, *args)),
         solver,
         zero,
         args=(scale, values),
@@ -145,7 +143,8 @@ def typical_scale(values: Values, structure: Structure) -> Increments:
     the factorisation need: unknowns run from 1e-7 (k2) to 1e3 m.
     """
     s, v = structure, jax.tree.map(jax.lax.stop_gradient, values)
-    sigma = jnp.mean(v.sigma_xy)
+    weight = 1 / v.sigma_xy
+    sigma = jnp.sum(weight > 0) / jnp.sum(weight)
     corner = jnp.max(jnp.abs(v.xy), axis=1)
     vector = jnp.ones(v.shared.shape)
     # A point halfway to the corner and a ray beside it: c moves the one, coefficients the other.
@@ -165,7 +164,9 @@ def typical_scale(values: Values, structure: Structure) -> Increments:
     ground, angle = sigma * depth / c, sigma / c
     eop = jnp.stack([ground, ground, ground, angle, angle, angle])
     seconds = jnp.maximum(jnp.max(jnp.abs(v.time)), 1.0)
-    mount = jnp.tile(eop, (s.strip_offset - s.mount_offset) // 6)
-    strip = jnp.tile(jnp.repeat(jnp.stack([ground, ground / seconds]), 3), (len(vector) - s.strip_offset) // 6)
+    speed = jnp.maximum(jnp.max(jnp.abs(v.velocity)), 1.0)
+    mount = jnp.tile(jnp.append(eop, ground / speed), (s.strip_offset - s.mount_offset) // MOUNT_SIZE)
+    strip = jnp.repeat(jnp.stack([ground, ground / seconds]), 3)
+    strip = jnp.tile(strip, (len(vector) - s.strip_offset) // STRIP_SIZE)
     vector = vector.at[s.mount_offset :].set(jnp.concatenate([mount, strip]))
     return Increments(eop[:, None] * s.eop_free, vector[s.free], ground * s.point_free)

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from jaxphoto.adjustment.padding import crop_reduced
 from jaxphoto.adjustment.result import Adjustment
 from jaxphoto.errors import RankError
 from jaxphoto.unknowns import FREE, Unknowns
@@ -27,11 +28,11 @@ def check_priors(priors: Unknowns) -> None:
 
 def check_rank(adjusted: Adjustment) -> None:
     """Raise RankError where the normal matrix at the optimum is singular; the message names the unknowns."""
-    if adjusted.factored is None or not bool(adjusted.converged):
+    if adjusted.padded is None or not bool(adjusted.converged):
         return
     s = adjusted.structure
-    lower = np.asarray(adjusted.factored.lower)
-    a = np.asarray(adjusted.factored.reduced.a)
+    lower = crop_reduced(adjusted.padded.factored.lower, s)
+    a = crop_reduced(adjusted.padded.factored.reduced.a, s)
     diagonal = np.diagonal(a)
     pivots = np.diagonal(lower) ** 2 / np.where(diagonal > 0, diagonal, 1.0)
     if len(pivots) == 0 or pivots.min() > _DEFECT:

@@ -11,9 +11,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxphoto.adjustment.structure import Structure, interior_of
+from jaxphoto.adjustment.structure import MOUNT_SIZE, STRIP_SIZE, Structure, interior_of
 from jaxphoto.collinearity import ExteriorOrientation, image_residual
-from jaxphoto.georeferencing import Mount, StripBias, attitude_residual, sensor_position
+from jaxphoto.georeferencing import (
+    Exposure,
+    Mount,
+    StripBias,
+    apparent_point,
+    attitude_residual,
+    recorded_attitude,
+    sensor_position,
+)
 from jaxphoto.rotation import matrix_from_roll_pitch_yaw, small_rotation
 
 
@@ -56,6 +64,9 @@ class Values(eqx.Module):
     stations: Float[Array, "stations"]
     sigma_stations: Float[Array, "stations"]
     time: Float[Array, "images"]
+    velocity: Float[Array, "3 images"]
+    rate: Float[Array, "3 images"]
+    nominal: Float[Array, "3 3 images"]
     attitudes: Float[Array, "3 attitudes"]
     sigma_attitudes: Float[Array, "3 attitudes"]
     control: Float[Array, "control"]
@@ -96,13 +107,20 @@ def state_at(increments: Increments, scale: Increments, values: Values, structur
 
 def residuals_at(increments: Increments, scale: Increments, values: Values, structure: Structure) -> Residuals:
     """All residuals over their sigmas, at start + scale * increments."""
+    others = other_residuals(increments, scale, values, structure)
+    state = state_at(increments, scale, values, structure)
+    return others._replace(image=image_residuals(state, values, structure) / values.sigma_xy)
+
+
+def other_residuals(increments: Increments, scale: Increments, values: Values, structure: Structure) -> Residuals:
+    """All residuals but those of the image rows, which are left empty."""
     state = state_at(increments, scale, values, structure)
     stations, attitudes, control, distances = georeferencing_residuals(state, values, structure)
     datum = jnp.einsum("kci,ci->k", values.datum_eop * scale.eop, increments.eop)
     datum += jnp.einsum("kcp,cp->k", values.datum_points * scale.points, increments.points)
     priors = (values.priors - state.shared[structure.free[structure.weighted]]) / values.sigma_priors
     return Residuals(
-        image_residuals(state, values, structure) / values.sigma_xy,
+        jnp.zeros((2, 0)),
         stations / values.sigma_stations,
         attitudes / values.sigma_attitudes,
         control / values.sigma_control,
@@ -123,7 +141,8 @@ def image_residuals(state: State, values: Values, structure: Structure) -> Float
 
         def one(parameters, position, rotation, point, xy, group=group):
             exterior = ExteriorOrientation(position, rotation)
-            return image_residual(interior_of(group, parameters), exterior, point, xy)
+            aim = apparent_point(position, point, structure.corrections)
+            return image_residual(interior_of(group, parameters), exterior, aim, xy)
 
         image, point = structure.image[rows], structure.point[rows]
         parts.append(
@@ -142,20 +161,24 @@ def image_residuals(state: State, values: Values, structure: Structure) -> Float
 def georeferencing_residuals(state: State, values: Values, structure: Structure) -> tuple[Array, ...]:
     """Residuals of stations (m), attitudes (rad), control (m) and distances (m), not divided by their sigmas."""
     mounts, strips = _mounts(state, structure)
+    exposures = Exposure(values.time, values.velocity, values.rate, values.nominal)
 
     def station(image, axis, observed):
         rotation = state.rotation[:, :, image]
-        mount, strip = jax.tree.map(lambda v: v[:, image], (mounts, strips))
-        computed = sensor_position(state.position[:, image], rotation, mount, strip, values.time[image])
-        return observed - computed[axis]
+        mount, strip, exposure = jax.tree.map(lambda v: v[..., image], (mounts, strips, exposures))
+        return observed - sensor_position(state.position[:, image], rotation, mount, strip, exposure)[axis]
 
     def attitude(image, observed):
-        matrix = matrix_from_roll_pitch_yaw(observed)
-        return attitude_residual(matrix, state.rotation[:, :, image], mounts.boresight[:, image])
+        mount, exposure = jax.tree.map(lambda v: v[..., image], (mounts, exposures))
+        computed = recorded_attitude(state.rotation[:, :, image], mount, exposure)
+        return attitude_residual(matrix_from_roll_pitch_yaw(observed), computed)
 
     # Groups without rows are left out of the program: what is not there need not be compiled.
     stations, attitudes, distances = jnp.zeros(0), jnp.zeros((3, 0)), jnp.zeros(0)
-    if len(structure.station_image):
+    if structure.mount_offset == state.shared.shape[0]:
+        # Neither mounts nor strips: a station is the projection centre itself.
+        stations = values.stations - state.position[structure.station_axis, structure.station_image]
+    elif len(structure.station_image):
         stations = jax.vmap(station)(structure.station_image, structure.station_axis, values.stations)
     if len(structure.attitude_image):
         attitudes = jax.vmap(attitude, in_axes=(0, -1), out_axes=-1)(structure.attitude_image, values.attitudes)
@@ -169,12 +192,10 @@ def georeferencing_residuals(state: State, values: Values, structure: Structure)
 def _mounts(state: State, structure: Structure) -> tuple[Mount, StripBias]:
     """Mount and strip bias of every image (3, images); zeros where the block has none."""
 
-    def table(start: int, stop: int, index) -> tuple[Array, Array]:
+    def table(start: int, stop: int, size: int, index) -> Array:
         # The last row, of zeros, serves images that have no mount or strip of their own.
-        rows = jnp.concatenate([state.shared[start:stop].reshape(-1, 6), jnp.zeros((1, 6))])[index].T
-        return rows[:3], rows[3:]
+        return jnp.concatenate([state.shared[start:stop].reshape(-1, size), jnp.zeros((1, size))])[index].T
 
-    end = state.shared.shape[0]
-    arm, boresight = table(structure.mount_offset, structure.strip_offset, structure.mount)
-    shift, drift = table(structure.strip_offset, end, structure.strip)
-    return Mount(arm, boresight), StripBias(shift, drift)
+    mount = table(structure.mount_offset, structure.strip_offset, MOUNT_SIZE, structure.mount)
+    strip = table(structure.strip_offset, state.shared.shape[0], STRIP_SIZE, structure.strip)
+    return Mount(mount[:3], mount[3:6], mount[6]), StripBias(strip[:3], strip[3:])

@@ -39,6 +39,14 @@ class Factored(eqx.Module):
     """Constraints of the datum: the last of `normal`'s rows."""
 
 
+class Padded(eqx.Module):
+    """The adjustment as it was computed: everything in the sizes of `padding.pad_structure`."""
+
+    structure: Structure
+    values: Values
+    factored: Factored
+
+
 class Adjustment(eqx.Module):
     """The result of `jaxphoto.adjust`; see `jaxphoto.statistics` for what can be asked of it.
 
@@ -52,11 +60,20 @@ class Adjustment(eqx.Module):
     residuals: Residuals
     values: Values
     structure: Structure
-    factored: Factored | None
-    """None in an adjustment that is being differentiated or mapped over."""
+    padded: Padded | None
+    """None in an adjustment that is being differentiated or mapped over; see `computed`."""
     steps: Int[Array, ""]
     converged: Array
     seconds: dict[str, float]
+
+    @property
+    def computed(self) -> Padded:
+        """What statistics are computed from. Raises ValueError inside a transformation of JAX."""
+        if self.padded is None:
+            raise ValueError(
+                "statistics of an adjustment inside jax.grad, jax.jvp or jax.vmap: adjust outside of it first"
+            )
+        return self.padded
 
     @property
     def square_sum(self) -> Float[Numbers, ""]:

@@ -16,7 +16,7 @@ import lineax as lx
 import optimistix as optx
 from jaxtyping import Array, Float, PyTree, Scalar
 
-from jaxphoto.adjustment.colouring import jacobian_blocks
+from jaxphoto.adjustment.local import blocks_at
 from jaxphoto.adjustment.normal import (
     Normal,
     Reduced,
@@ -27,7 +27,7 @@ from jaxphoto.adjustment.normal import (
     sum_normal,
     zero_normal,
 )
-from jaxphoto.adjustment.residuals import Increments
+from jaxphoto.adjustment.residuals import Increments, Values
 from jaxphoto.adjustment.structure import Structure
 
 
@@ -113,16 +113,18 @@ class BlockDescent(optx.AbstractDescent):
     """The damped Gauss-Newton step of a block; the normal equations are summed once an accepted iterate."""
 
     structure: Structure
-    datum: tuple[Float[Array, "constraints 6 images"], Float[Array, "constraints 3 points"]]
+    values: Values
+    scale: Increments
 
     def init(self, y: Increments, f_info_struct: Any) -> Normal:
         """Normal equations of the right shapes; replaced before use."""
-        return zero_normal(self.structure, len(self.datum[0]))
+        return zero_normal(self.structure, len(self.values.datum_eop))
 
     def query(self, y: Increments, f_info: Any, state: Normal) -> Normal:
         """Sum the normal equations at `y`."""
-        blocks = jacobian_blocks(f_info.jac.mv, self.structure)
-        return sum_normal(blocks, f_info.residual, self.datum, self.structure)
+        blocks, residuals = blocks_at(y, self.scale, self.values, self.structure)
+        datum = (self.values.datum_eop * self.scale.eop, self.values.datum_points * self.scale.points)
+        return sum_normal(blocks, residuals, datum, self.structure)
 
     def step(self, step_size: Scalar, state: Normal) -> tuple[Increments, optx.RESULTS]:
         """-(N + I / step_size)^-1 J' r."""

@@ -11,6 +11,7 @@ All arrays are arguments of the compiled functions, never constants in them: a n
 compiles nothing.
 """
 
+import dataclasses
 from collections.abc import Iterable
 
 import equinox as eqx
@@ -20,8 +21,8 @@ from jaxtyping import Float, Int
 
 from jaxphoto.block import Block
 from jaxphoto.camera import InteriorOrientation, parameter_names
-from jaxphoto.georeferencing import Mount, StripBias
-from jaxphoto.unknowns import FIXED, Unknowns, Weighted
+from jaxphoto.georeferencing import Corrections, Mount, StripBias
+from jaxphoto.unknowns import FIXED, Prior, Unknowns, Weighted
 
 
 class CameraGroup(eqx.Module):
@@ -32,6 +33,7 @@ class CameraGroup(eqx.Module):
     offset: int = eqx.field(static=True)
     camera: Int[np.ndarray, "rows"]
     """Camera (within the group) of each of the group's image rows."""
+    free_leaves: tuple[int, ...] = eqx.field(static=True)
     rows: Int[np.ndarray, "rows"] | None
     """The group's image rows, or None where there is one group and they are all rows."""
 
@@ -44,6 +46,7 @@ class Structure(eqx.Module):
     strip_offset: int = eqx.field(static=True)
     n_images: int = eqx.field(static=True)
     n_points: int = eqx.field(static=True)
+    corrections: Corrections = eqx.field(static=True)
     n_image_colours: int = eqx.field(static=True)
     n_colours: int = eqx.field(static=True)
     n_classes: int = eqx.field(static=True)
@@ -53,6 +56,13 @@ class Structure(eqx.Module):
     pair_a: Int[np.ndarray, "pairs"]
     pair_b: Int[np.ndarray, "pairs"]
     pair_block: Int[np.ndarray, "pairs"]
+    image_rows: Int[np.ndarray, "images most"]
+    """Image rows of each image, padded with the number of rows."""
+    image_points: Int[np.ndarray, "images most"]
+    """Their points."""
+    chunk_a: Int[np.ndarray, "chunks size"]
+    chunk_b: Int[np.ndarray, "chunks size"]
+    chunk_block: Int[np.ndarray, "chunks"]
     block_row: Int[np.ndarray, "blocks"]
     block_column: Int[np.ndarray, "blocks"]
     free: Int[np.ndarray, "shared"]
@@ -85,8 +95,8 @@ class Structure(eqx.Module):
 def shared_vector(unknowns: Unknowns, groups: tuple[CameraGroup, ...]) -> list:
     """All shared parameters as a list of scalars: cameras by group, then mounts, then strips."""
     cameras = [leaf for g in groups for name in g.names for leaf in jax.tree.leaves(unknowns.interior[name])]
-    mounts = [m for mount in unknowns.mounts.values() for v in (mount.lever_arm, mount.boresight) for m in v]
-    strips = [s for strip in unknowns.strips.values() for v in (strip.shift, strip.drift) for s in v]
+    mounts = [v for m in unknowns.mounts.values() for v in (*m.lever_arm, *m.boresight, m.time_offset)]
+    strips = [v for s in unknowns.strips.values() for v in (*s.shift, *s.drift)]
     return cameras + mounts + strips
 
 
@@ -114,6 +124,7 @@ def structure_of(block: Block, priors: Unknowns) -> Structure:
     counts = [max((ranks[o] + 1 for o in ranks if o.startswith(kind)), default=0) for kind in ("c:", "m:", "s:")]
     base = {"c": 0, "m": counts[0], "s": counts[0] + counts[1]}
     colour += np.array([base[o[0]] for o in owners], np.int32) if owners else colour
+    groups = tuple(_with_free(g, free) for g in groups)
     column = np.full((len(block.images), sum(counts)), len(free), np.int32)
     of_owner: dict[str, list[int]] = {}
     for j, o in enumerate(owners):
@@ -133,9 +144,10 @@ def structure_of(block: Block, priors: Unknowns) -> Structure:
     return Structure(
         groups=groups,
         mount_offset=mount_offset,
-        strip_offset=mount_offset + 6 * len(priors.mounts),
+        strip_offset=mount_offset + MOUNT_SIZE * len(priors.mounts),
         n_images=len(block.images),
         n_points=len(block.points),
+        corrections=block.corrections,
         n_image_colours=counts[0],
         n_colours=sum(counts),
         n_classes=int(classes.max(initial=0)) + 1,
@@ -145,6 +157,8 @@ def structure_of(block: Block, priors: Unknowns) -> Structure:
         pair_a=pairs[0],
         pair_b=pairs[1],
         pair_block=pairs[2],
+        **rows_by_image(image, point, len(block.images), len(image)),
+        **chunks_of(pairs[:3], len(image)),
         block_row=pairs[3],
         block_column=pairs[4],
         free=free,
@@ -194,11 +208,18 @@ def _groups(block: Block, row_camera: np.ndarray) -> tuple[tuple[CameraGroup, ..
         rows = np.flatnonzero(np.isin(row_camera, names)).astype(np.int32)
         ordered = np.array(sorted(names))
         camera = np.array([place[n] for n in ordered], np.int32)[np.searchsorted(ordered, row_camera[rows])]
-        groups.append(CameraGroup(tuple(names), treedef, offset, camera, rows if len(by_model) > 1 else None))
+        groups.append(CameraGroup(tuple(names), treedef, offset, camera, (), rows if len(by_model) > 1 else None))
         offset += len(names) * treedef.num_leaves
         sequence.append(rows)
     unsort = np.argsort(np.concatenate(sequence)).astype(np.int32) if len(groups) > 1 else None
     return tuple(groups), unsort
+
+
+def _with_free(group: CameraGroup, free: np.ndarray) -> CameraGroup:
+    """The group with its list of parameters that are free in any of its cameras."""
+    m = group.treedef.num_leaves
+    own = free[(free >= group.offset) & (free < group.offset + m * len(group.names))] - group.offset
+    return dataclasses.replace(group, free_leaves=tuple(sorted({int(k) % m for k in own})))
 
 
 def _shared_entries(block: Block, priors: Unknowns, groups: tuple[CameraGroup, ...]) -> list[_Entry]:
@@ -209,23 +230,31 @@ def _shared_entries(block: Block, priors: Unknowns, groups: tuple[CameraGroup, .
         entries += [
             _Entry(f"c:{name}", f"interior[{name}].{label}", leaf) for label, leaf in zip(labels, leaves, strict=True)
         ]
-    for kind, table, fields, units in (
-        ("m", priors.mounts, Mount.__annotations__, {"lever_arm": "m", "boresight": "rad"}),
-        ("s", priors.strips, StripBias.__annotations__, {"shift": "m", "drift": "m_per_s"}),
-    ):
-        for name, item in table.items():
-            for field in fields:
-                for axis, prior in zip(_AXES[field], spread(getattr(item, field)), strict=True):
-                    label = f"{'mounts' if kind == 'm' else 'strips'}[{name}].{field}_{axis}_{units[field]}"
-                    entries.append(_Entry(f"{kind}:{name}", label, prior))
+    for kind, items, names in (("mounts", priors.mounts, _MOUNT), ("strips", priors.strips, _STRIP)):
+        for name, item in items.items():
+            for label, prior in zip(names, spread(item), strict=True):
+                if not isinstance(prior, Prior | Weighted):
+                    raise ValueError(f"{kind}[{name}].{label}: {prior!r} is no prior; use FREE, FIXED or Weighted")
+                entries.append(_Entry(f"{kind[0]}:{name}", f"{kind}[{name}].{label}", prior))
     return entries
 
 
-_AXES = {"lever_arm": ("right", "forward", "up"), "boresight": "xyz", "shift": "XYZ", "drift": "XYZ"}
+_MOUNT = (
+    *(f"lever_arm_{axis}_m" for axis in ("right", "forward", "up")), *(f"boresight_{axis}_rad" for axis in "xyz"),
+    "time_offset_s",
+)  # fmt: skip
+_STRIP = (*(f"shift_{axis}_m" for axis in "XYZ"), *(f"drift_{axis}_m_per_s" for axis in "XYZ"))
+MOUNT_SIZE, STRIP_SIZE = len(_MOUNT), len(_STRIP)
 
 
-def spread(prior: object) -> list[object]:
-    """One prior per component of a vector of three."""
+def spread(item: Mount | StripBias) -> list[object]:
+    """One prior per number of a mount's or strip's tree of priors."""
+    if isinstance(item, Mount):
+        return [*_components(item.lever_arm), *_components(item.boresight), item.time_offset]
+    return [*_components(item.shift), *_components(item.drift)]
+
+
+def _components(prior: object) -> list[object]:
     if not isinstance(prior, Weighted):
         return [prior] * 3
     value, sigma = np.broadcast_to(prior.value, 3), np.broadcast_to(prior.sigma, 3)
@@ -264,6 +293,36 @@ def _pairs(image: np.ndarray, point: np.ndarray) -> tuple[np.ndarray, ...]:
     unique, block = np.unique(key[order], return_inverse=True)
     rows, columns = np.divmod(unique, int(image.max(initial=0)) + 1)
     return tuple(v.astype(np.int32) for v in (a[order], b[order], block, rows, columns))
+
+
+def rows_by_image(image: np.ndarray, point: np.ndarray, n_images: int, no_row: int) -> dict[str, np.ndarray]:
+    """The rows of each image and their points, as tables filled up with `no_row`."""
+    count = np.bincount(image, minlength=n_images)
+    order = np.argsort(image, kind="stable")
+    place = np.arange(len(image)) - np.repeat(np.cumsum(count) - count, count)
+    rows = np.full((n_images, count.max(initial=0)), no_row, np.int32)
+    rows[image[order], place] = order
+    points = np.zeros_like(rows)
+    points[image[order], place] = point[order]
+    return {"image_rows": rows, "image_points": points}
+
+
+# Common points of two images that are multiplied at once.
+_CHUNK = 32
+
+
+def chunks_of(pairs: tuple[np.ndarray, ...], no_row: int) -> dict[str, np.ndarray]:
+    """The pairs of each block in chunks of equal size, filled up with `no_row`."""
+    a, b, block = pairs
+    count = np.bincount(block)
+    size = _CHUNK
+    chunks = -(-count // size)
+    owner = np.repeat(np.arange(len(count)), chunks)
+    place = np.arange(len(a)) - np.repeat(np.cumsum(count) - count, count)
+    at = np.repeat(np.cumsum(chunks) - chunks, count) + place // size
+    filled = np.full((2, len(owner), size), no_row, np.int32)
+    filled[:, at, place % size] = a, b
+    return {"chunk_a": filled[0], "chunk_b": filled[1], "chunk_block": owner.astype(np.int32)}
 
 
 def _point_classes(pairs: np.ndarray, n_points: int) -> np.ndarray:

@@ -8,22 +8,26 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxphoto.adjustment.residuals import State, Values
-from jaxphoto.adjustment.structure import Structure, shared_vector, spread
-from jaxphoto.block import Block
+from jaxphoto.adjustment.structure import MOUNT_SIZE, STRIP_SIZE, Structure, shared_vector, spread
+from jaxphoto.block import Block, exposures
 from jaxphoto.collinearity import ExteriorOrientation
+from jaxphoto.georeferencing import Mount, StripBias
 from jaxphoto.unknowns import Unknowns, Weighted
 
 
 def values_of(block: Block, start: Unknowns, priors: Unknowns, structure: Structure) -> Values:
     """Observations and start values as arrays; numbers only, so derivatives with respect to each exist."""
     rows, s = block.image_points, structure
-    weights = _weights(priors, s)
+    weights, known = _weights(priors, s), exposures(block)
     return Values(
         xy=_floats(rows.xy).T,
         sigma_xy=_floats(rows.sigma).T,
         stations=_floats(block.stations.value),
         sigma_stations=_floats(block.stations.sigma),
-        time=_floats(block.image_time),
+        time=_floats(known.time),
+        velocity=_floats(known.velocity).T,
+        rate=_floats(known.rate).T,
+        nominal=_floats(known.nominal).transpose(1, 2, 0),
         attitudes=_floats(block.attitudes.roll_pitch_yaw).T,
         sigma_attitudes=_floats(block.attitudes.sigma).T,
         control=_floats(block.control.value),
@@ -71,10 +75,10 @@ def unknowns_of(state: State, like: Unknowns, structure: Structure) -> Unknowns:
         for k, name in enumerate(group.names):
             first = group.offset + k * m
             interior[name] = jax.tree.unflatten(group.treedef, [state.shared[first + j] for j in range(m)])
-    vectors = state.shared[structure.mount_offset :].reshape(-1, 3)
-    rest = iter(vectors)
-    fill = lambda tree: jax.tree.map(lambda _: next(rest), tree)  # noqa: E731
-    mounts, strips = fill(list(like.mounts.values())), fill(list(like.strips.values()))
+    mount = state.shared[structure.mount_offset : structure.strip_offset].reshape(-1, MOUNT_SIZE)
+    strip = state.shared[structure.strip_offset :].reshape(-1, STRIP_SIZE)
+    mounts = [Mount(v[:3], v[3:6], v[6], m.image_x) for v, m in zip(mount, like.mounts.values(), strict=True)]
+    strips = [StripBias(v[:3], v[3:]) for v in strip]
     return Unknowns(
         {name: interior[name] for name in like.interior},
         ExteriorOrientation(state.position.T, state.rotation.transpose(2, 0, 1)),
@@ -101,6 +105,6 @@ def _weights(priors: Unknowns, structure: Structure) -> list[Weighted]:
         for name in g.names
         for leaf in jax.tree.leaves(priors.interior[name], is_leaf=is_weighted)
     ]
-    for item in (*priors.mounts.values(), *priors.strips.values()):
-        flat += [p for vector in jax.tree.leaves(item, is_leaf=is_weighted) for p in spread(vector)]
+    flat += [p for mount in priors.mounts.values() for p in spread(mount)]
+    flat += [p for strip in priors.strips.values() for p in spread(strip)]
     return [flat[k] for k in structure.free if is_weighted(flat[k])]

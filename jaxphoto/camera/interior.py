@@ -63,13 +63,19 @@ def set_parameter(interior: InteriorOrientation, name: str, value) -> InteriorOr
 
 
 _FIELDS = {"c_mm": "c", "xp_mm": "x_p", "yp_mm": "y_p"}
-_CONSTANTS = {"r0_mm": "r0"}
+_CONSTANTS = {"r0_mm": "r0", "b_mm": "b", "f_mm": "f"}
 
 
 def constant_names(distortion: type[AbstractDistortion]) -> dict[str, str]:
     """The constants of a model: name in a file -> field (`r0_mm` -> `r0`)."""
     fields = {f.name for f in dataclasses.fields(distortion)}
     return {name: field for name, field in _CONSTANTS.items() if field in fields}
+
+
+def needed_constants(distortion: type[AbstractDistortion]) -> dict[str, str]:
+    """Those of `constant_names` that have no default: positive lengths without which the model says nothing."""
+    needed = {f.name for f in dataclasses.fields(distortion) if f.default is dataclasses.MISSING}
+    return {name: field for name, field in constant_names(distortion).items() if field in needed}
 
 
 def _place(interior: InteriorOrientation, name: str) -> tuple[object, str]:

@@ -15,13 +15,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxphoto.block import Block, Rows
+from jaxphoto.block import Block, Rows, exposures
 from jaxphoto.errors import BlockError
-from jaxphoto.georeferencing import Mount, StripBias, body_from_camera, sensor_position
+from jaxphoto.georeferencing import Mount, StripBias, direct_orientation
 from jaxphoto.orientation.intersection import intersect_points
 from jaxphoto.orientation.rays import QUICK_TO_COMPILE, ideal_coordinates, turn_to_object, unit_rays
 from jaxphoto.orientation.resection import resect_ideal
-from jaxphoto.rotation import matrix_from_roll_pitch_yaw
 from jaxphoto.unknowns import Unknowns
 
 _ANGLES = np.deg2rad([1.0, 0.02])  # between rays that make a point: wanted, and just bearable
@@ -93,10 +92,12 @@ class _State:
         none = jnp.zeros(3)
         mounts = [unknowns.mounts.get(block.image_mount[i]) or Mount(none, none) for i in who]
         strips = [unknowns.strips.get(block.image_strip[i]) or StripBias(none, none) for i in who]
-        time = np.nan_to_num(np.asarray(block.image_time, float)[who])
-        rows = (station[who], attitude[who], _stacked(mounts), _stacked(strips), time)
-        positions, matrices = jax.jit(jax.vmap(_direct), compiler_options=QUICK_TO_COMPILE)(*rows)
-        self.positions[who], self.matrices[who] = np.asarray(positions), np.asarray(matrices)
+        exposure = jax.tree.map(lambda v: np.asarray(v, float)[who], exposures(block))
+        # The nominal mount is in `exposure`; a stack wants trees of one shape.
+        mounts = [Mount(m.lever_arm, m.boresight, m.time_offset) for m in mounts]
+        rows = (station[who], attitude[who], _stacked(mounts), _stacked(strips), exposure)
+        exterior = jax.jit(jax.vmap(direct_orientation), compiler_options=QUICK_TO_COMPILE)(*rows)
+        self.positions[who], self.matrices[who] = np.asarray(exterior.position), np.asarray(exterior.camera_from_object)
         self.image_known[who] = True
 
     def _image_space(self) -> None:
@@ -177,12 +178,6 @@ class _State:
             f"the rays of point {name} from {rays[left[0]]} images are nearly parallel, so they do not meet in a "
             f"point{more}: measure it from another position, give its coordinates, or remove it"
         )
-
-
-def _direct(station, roll_pitch_yaw, mount: Mount, bias: StripBias, time):
-    body_from_object = matrix_from_roll_pitch_yaw(roll_pitch_yaw).T
-    camera_from_object = body_from_camera(mount.boresight).T @ body_from_object
-    return station - sensor_position(jnp.zeros(3), camera_from_object, mount, bias, time), camera_from_object
 
 
 def _stacked(trees: list):

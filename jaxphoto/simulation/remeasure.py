@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxphoto.block import Block
+from jaxphoto.block import Block, exposures
 from jaxphoto.collinearity import ExteriorOrientation, project
-from jaxphoto.georeferencing import Mount, StripBias, object_from_body, sensor_position
+from jaxphoto.georeferencing import Mount, StripBias, apparent_point, recorded_attitude, sensor_position
 from jaxphoto.rotation import roll_pitch_yaw_from_matrix
 from jaxphoto.unknowns import Unknowns
 
@@ -51,7 +51,8 @@ def image_coordinates(block: Block, truth: Unknowns) -> Float[Array, "rows 2"]:
     for name, interior in truth.interior.items():
         mine = np.flatnonzero(camera == name)
         eo = ExteriorOrientation(exterior.position[image[mine]], exterior.camera_from_object[image[mine]])
-        xy = xy.at[mine].set(jax.vmap(project, in_axes=(None, 0, 0))(interior, eo, points[point[mine]]))
+        aim = jax.vmap(apparent_point, in_axes=(0, 0, None))(eo.position, points[point[mine]], block.corrections)
+        xy = xy.at[mine].set(jax.vmap(project, in_axes=(None, 0, 0))(interior, eo, aim))
     return xy
 
 
@@ -60,12 +61,11 @@ def _georeferenced(block: Block, truth: Unknowns) -> tuple[Float[Array, "station
     zero = jnp.zeros(3)
     mounts = [truth.mounts.get(m, Mount(zero, zero)) for m in block.image_mount]
     strips = [truth.strips.get(s, StripBias(zero, zero)) for s in block.image_strip]
+    mounts = [Mount(m.lever_arm, m.boresight, m.time_offset) for m in mounts]
     stack = lambda trees: jax.tree.map(lambda *v: jnp.stack([jnp.asarray(x) for x in v]), *trees)  # noqa: E731
     mount, strip = stack(mounts), stack(strips)
-    exterior = jax.tree.map(jnp.asarray, truth.exterior)
-    sensors = jax.vmap(sensor_position)(
-        exterior.position, exterior.camera_from_object, mount, strip, jnp.asarray(block.image_time)
-    )
-    bodies = jax.vmap(object_from_body)(exterior.camera_from_object, mount.boresight)
+    exterior, exposure = jax.tree.map(jnp.asarray, (truth.exterior, exposures(block)))
+    sensors = jax.vmap(sensor_position)(exterior.position, exterior.camera_from_object, mount, strip, exposure)
+    bodies = jax.vmap(recorded_attitude)(exterior.camera_from_object, mount, exposure)
     angles = jax.vmap(roll_pitch_yaw_from_matrix)(bodies)
     return sensors[block.stations.who, block.stations.axis], angles[np.asarray(block.attitudes.image)]

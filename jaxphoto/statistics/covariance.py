@@ -16,11 +16,13 @@ from typing import Literal, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.adjustment.compiled import run_compiled
 from jaxphoto.adjustment.normal import solve_3x3, solve_factored
+from jaxphoto.adjustment.padding import crop_reduced
 from jaxphoto.adjustment.residuals import Increments
 from jaxphoto.adjustment.result import Factored
 from jaxphoto.adjustment.structure import Structure
@@ -53,10 +55,11 @@ class Covariance(eqx.Module):
     for a posteriori values.
     """
 
-    matrix: Float[Array, "reduced reduced"]
-    points: Float[Array, "points 3 3"]
+    matrix: Float[np.ndarray, "reduced reduced"]
+    points: Float[np.ndarray, "points 3 3"]
     variance_factor: Float[Numbers, ""]
     cofactors: Cofactors
+    """In the sizes of `Adjustment.padded`."""
     labels: tuple[str, ...] = eqx.field(static=True)
     n_images: int = eqx.field(static=True)
     rotations: Rotations = eqx.field(static=True)
@@ -88,15 +91,14 @@ def covariance(adjusted: Adjustment, rotations: Rotations = "omega_phi_kappa") -
     """
     if rotations not in EOP_NAMES:
         raise ValueError(f"rotations is one of {', '.join(EOP_NAMES)}, got {rotations!r}")
-    if adjusted.factored is None:
-        raise ValueError("covariance of an adjustment inside jax.grad, jax.jvp or jax.vmap: adjust outside of it first")
-    cofactors = run_compiled(_cofactors, (adjusted.factored, adjusted.structure), adjusted.seconds, "covariance")
-    arguments = (cofactors, adjusted.factored.scale, adjusted.values.rotation, rotations)
+    padded = adjusted.computed
+    cofactors = run_compiled(_cofactors, (padded.factored, padded.structure), adjusted.seconds, "covariance")
+    arguments = (cofactors, padded.factored.scale, padded.values.rotation, rotations)
     matrix, points = run_compiled(_physical, arguments, adjusted.seconds, "covariance")
     labels = [f"exterior[{i}].{n}" for i in adjusted.block.images for n in EOP_NAMES[rotations]]
     return Covariance(
-        matrix=matrix,
-        points=points,
+        matrix=crop_reduced(matrix, adjusted.structure),
+        points=np.asarray(points)[: adjusted.structure.n_points],
         variance_factor=adjusted.sigma0**2,
         cofactors=cofactors,
         labels=(*labels, *adjusted.structure.labels),
@@ -146,7 +148,8 @@ def _cofactors(factored: Factored, structure: Structure) -> Cofactors:
     border = jnp.concatenate([normal.ws, normal.rows_p]).transpose(2, 1, 0)
     w = normal.w.transpose(2, 1, 0)
     in_images = full[:n, :n].reshape(s.n_images, 6, s.n_images, 6)
-    blocks = in_images[s.block_row, :, s.block_column, :][s.pair_block]
+    # Blocks outside the matrix are padding: what is read in their stead meets rows of zeros.
+    blocks = in_images.at[s.block_row, :, s.block_column, :].get(mode="clip")[s.pair_block]
     own = jnp.where((s.pair_a == s.pair_b)[:, None, None], 0.0, 1.0)
     met = jax.ops.segment_sum(jnp.einsum("nkc,ncd->nkd", w[s.pair_a], blocks), s.pair_b, len(s.point))
     met += jax.ops.segment_sum(own * jnp.einsum("nkc,ndc->nkd", w[s.pair_b], blocks), s.pair_a, len(s.point))

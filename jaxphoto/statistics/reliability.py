@@ -10,11 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxphoto.adjustment import Adjustment
-from jaxphoto.adjustment.colouring import jacobian_blocks
 from jaxphoto.adjustment.compiled import run_compiled
+from jaxphoto.adjustment.local import blocks_at
 from jaxphoto.adjustment.normal import solve_factored
 from jaxphoto.adjustment.optimum import zero_increments
-from jaxphoto.adjustment.residuals import Residuals, Values, residuals_at
+from jaxphoto.adjustment.padding import crop_residuals
+from jaxphoto.adjustment.residuals import Residuals, Values
 from jaxphoto.adjustment.result import Factored
 from jaxphoto.adjustment.structure import Structure
 from jaxphoto.statistics.covariance import Cofactors, Covariance
@@ -25,8 +26,10 @@ _UNCHECKED = 1e-6
 
 def redundancy_numbers(adjusted: Adjustment, covariance: Covariance) -> Residuals:
     """Redundancy number of every observation, shaped like `adjusted.residuals` (zero for the datum's constraints)."""
-    arguments = (adjusted.values, covariance.cofactors, adjusted.factored, adjusted.structure)
-    return run_compiled(_redundancy, arguments, adjusted.seconds, "covariance")
+    padded = adjusted.computed
+    arguments = (padded.values, covariance.cofactors, padded.factored, padded.structure)
+    numbers = run_compiled(_redundancy, arguments, adjusted.seconds, "covariance")
+    return crop_residuals(numbers, adjusted.structure)
 
 
 def normalised_residuals(adjusted: Adjustment, redundancy: Residuals) -> Residuals:
@@ -45,8 +48,7 @@ def normalised_residuals(adjusted: Adjustment, redundancy: Residuals) -> Residua
 @eqx.filter_jit
 def _redundancy(values: Values, q: Cofactors, factored: Factored, s: Structure) -> Residuals:
     scale = factored.scale
-    product = jax.linearize(lambda y: residuals_at(y, scale, values, s), zero_increments(s))[1]
-    j = jacobian_blocks(product, s)
+    j = blocks_at(zero_increments(s), scale, values, s)[0]
     n = 6 * s.n_images
     # A last row and column of zeros serves colours that mean nothing in an image.
     shared = jnp.pad(q.reduced[n:, n:], (0, 1))

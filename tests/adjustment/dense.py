@@ -10,10 +10,11 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from jaxphoto.adjustment.adjust import concrete
-from jaxphoto.adjustment.colouring import Jacobian, jacobian_blocks
+from jaxphoto.adjustment.colouring import Jacobian
 from jaxphoto.adjustment.datum import close_datum
+from jaxphoto.adjustment.local import blocks_at
 from jaxphoto.adjustment.normal import factor_reduced, multiply_normal, reduce_normal, solve_factored, sum_normal
-from jaxphoto.adjustment.optimum import weigh_datum, zero_increments
+from jaxphoto.adjustment.optimum import typical_scale, weigh_datum, zero_increments
 from jaxphoto.adjustment.residuals import Increments, residuals_at
 from jaxphoto.adjustment.structure import structure_of
 from jaxphoto.adjustment.values import values_of, with_datum
@@ -58,17 +59,18 @@ class Dense(NamedTuple):
 def at_optimum(name: str) -> Dense:
     """Of one of the variants of `tests.blocks`."""
     a = adjusted(name)
-    return jax.tree.map(np.asarray, _dense(a.values, a.factored.scale, a.structure))
+    return jax.tree.map(np.asarray, _dense(a.values, a.structure))
 
 
 @eqx.filter_jit
-def _dense(values, scale, structure) -> Dense:
+def _dense(values, structure) -> Dense:
     values = weigh_datum(values, structure)
+    scale = typical_scale(values, structure)
     zero = zero_increments(structure)
     flat, back = ravel_pytree(zero)
     fn = jax.jit(lambda y: residuals_at(y, scale, values, structure))
     residuals, product = jax.linearize(fn, zero)
-    blocks = jacobian_blocks(product, structure)
+    blocks, _ = blocks_at(zero, scale, values, structure)
     datum = (values.datum_eop * scale.eop, values.datum_points * scale.points)
     normal = sum_normal(blocks, residuals, datum, structure)
     flat_scale = ravel_pytree(scale)[0]

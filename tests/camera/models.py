@@ -2,20 +2,31 @@
 
 import numpy as np
 
-from jaxphoto.camera import Balanced, Brown, Smac, constant_names
-from jaxphoto.camera.distortion import AffineBrown
+from jaxphoto.camera import (
+    AffineBrown,
+    Balanced,
+    Brown,
+    Brown14,
+    Ebner,
+    Gruen,
+    PpsRadial,
+    RadialPolynomial,
+    Smac,
+    constant_names,
+)
 
 # Per model: the coefficients in units of the size they have on a sensor of 36 mm x 24 mm.
-_BROWN = {"k1": 1e-4, "k2": 1e-7, "k3": 1e-10, "p1": 1e-5, "p2": 1e-5, "b1": 1e-3, "b2": 1e-3}
-_SMAC = {"k0": 1e-2, "k1": 1e-4, "k2": 1e-7, "k3": 1e-10, "k4": 1e-13, "p1": 1e-5, "p2": 1e-5, "p3": 1e-3, "p4": 1e-6}
+_RADIAL = {"k1": 1e-4, "k2": 1e-7, "k3": 1e-10}
+_BROWN = {**_RADIAL, "p1": 1e-5, "p2": 1e-5, "b1": 1e-3, "b2": 1e-3}
+# Gruen's polynomials at 15 mm from the centre of a grid of 12 mm: a coefficient moves that corner by 0.03 mm.
+_POLYNOMIALS = (1, 15, 150, 1500, 17000)
+_GRUEN = {name: 0.03 / (_POLYNOMIALS[int(name[1]) - 1] * _POLYNOMIALS[int(name[2]) - 1]) for name in Gruen.coefficients}
 UNITS = {
     Brown: _BROWN,
     AffineBrown: _BROWN,
     Smac: {
         "k0": 1e-2,
-        "k1": 1e-4,
-        "k2": 1e-7,
-        "k3": 1e-10,
+        **_RADIAL,
         "k4": 1e-13,
         "p1": 1e-5,
         "p2": 1e-5,
@@ -23,14 +34,25 @@ UNITS = {
         "p4": 1e-6,
     },
     Balanced: {"a1": 1e-4, "a2": 1e-7, "a3": 1e-10, "b1": 1e-5, "b2": 1e-5, "c1": 1e-3, "c2": 1e-3},
+    RadialPolynomial: _RADIAL,
+    PpsRadial: {**_RADIAL, "pps_x": 0.5, "pps_y": 0.5},
+    Ebner: {f"b{i}": 1e-3 if i < 3 else 2e-4 if i < 7 else 2e-5 if i < 11 else 1e-6 for i in range(1, 13)},
+    Gruen: _GRUEN,
+    Brown14: {
+        f"a{i}": 1e-3 if i < 3 else 2e-4 if i in (3, 4, 8, 9) else 1e-6 if i in (7, 12, 13) else 2e-5
+        for i in range(1, 15)
+    },
 }
+MOST = max(map(len, UNITS.values()))
+# Of such a camera: the balance radius, Ebner's and Gruen's grid, the scale of Brown's a13.
+CONSTANTS = {"r0": 8.0, "b": 12.0, "f": 35.0}
 
 
 def build(model, numbers):
-    """A model from its coefficients as multiples of `UNITS`, in the model's order; R0 = 8 mm where it has one."""
+    """A model from its coefficients as multiples of `UNITS`, in the model's order, and `CONSTANTS`."""
     units = UNITS[model]
     assert tuple(units) == model.coefficients, "UNITS and the model disagree"
-    constants = dict.fromkeys(constant_names(model).values(), 8.0)
+    constants = {field: CONSTANTS[field] for field in constant_names(model).values()}
     return model(**{name: numbers[i] * unit for i, (name, unit) in enumerate(units.items())}, **constants)
 
 

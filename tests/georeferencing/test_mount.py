@@ -4,11 +4,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxphoto.georeferencing import (
+    Exposure,
     Mount,
     StripBias,
     attitude_residual,
     body_from_camera,
     object_from_body,
+    recorded_attitude,
     sensor_position,
 )
 from jaxphoto.rotation import matrix_from_omega_phi_kappa, matrix_from_roll_pitch_yaw, small_rotation
@@ -18,16 +20,22 @@ bounded = settings(max_examples=50, deadline=None, derandomize=True, database=No
 ARM = np.array([-0.035, 0.244, -0.055])  # paper 000, table 1
 NONE = StripBias(np.zeros(3), np.zeros(3))
 LEVEL = np.zeros(3)
+FORWARD = Mount(LEVEL, LEVEL).nominal
+STILL = Exposure(0.0, LEVEL, LEVEL, FORWARD)
 
 attitude = compiled(matrix_from_roll_pitch_yaw)
 observed_position = compiled(sensor_position)
-residual_of = compiled(attitude_residual)
+
+
+@compiled
+def residual_of(observed, camera, boresight):
+    return attitude_residual(observed, recorded_attitude(camera, Mount(LEVEL, boresight), STILL))
 
 
 @compiled
 def camera_of(roll_pitch_yaw, boresight):
     """The camera orientation under which the body has this attitude."""
-    return (matrix_from_roll_pitch_yaw(roll_pitch_yaw) @ body_from_camera(boresight)).T
+    return (matrix_from_roll_pitch_yaw(roll_pitch_yaw) @ body_from_camera(boresight, FORWARD)).T
 
 
 def test_nominal_mount_has_camera_x_forward_y_left_z_up():
@@ -45,32 +53,34 @@ def test_lever_arm_in_level_flight_is_a_bearing_and_a_distance(yaw, right, forwa
     expected = np.array([distance * np.sin(bearing), distance * np.cos(bearing), up])
     mount = Mount(np.array([right, forward, up]), LEVEL)
     position = np.array([10.0, 20.0, 1000.0])
-    got = observed_position(position, camera_of([0, 0, yaw], LEVEL), mount, NONE, 0.0)
+    got = observed_position(position, camera_of([0, 0, yaw], LEVEL), mount, NONE, STILL)
     np.testing.assert_allclose(got - position, expected, rtol=0, atol=1e-12)
 
 
 def test_lever_arm_moves_with_roll_and_pitch():
     # First order (docs/models.md): dz = -l_right sin(roll) + l_forward sin(pitch).
     mount, level = Mount(ARM, LEVEL), camera_of([0, 0, 0.7], LEVEL)
-    still = observed_position(LEVEL, level, mount, NONE, 0.0)
+    still = observed_position(LEVEL, level, mount, NONE, STILL)
     for angles, dz in (([0.02, 0, 0.7], -ARM[0] * np.sin(0.02)), ([0, 0.02, 0.7], ARM[1] * np.sin(0.02))):
-        tilted = observed_position(LEVEL, camera_of(angles, LEVEL), mount, NONE, 0.0)
+        tilted = observed_position(LEVEL, camera_of(angles, LEVEL), mount, NONE, STILL)
         assert tilted[2] - still[2] == pytest.approx(dz, abs=0.055 * 0.02**2)
 
 
 def test_shift_and_drift_of_a_strip():
     bias = StripBias(np.array([0.1, -0.2, 0.3]), np.array([0.01, 0.02, -0.03]))
     mount = Mount(np.zeros(3), LEVEL)
-    got = observed_position(np.array([1.0, 2, 3]), camera_of([0.1, 0.2, 0.3], LEVEL), mount, bias, 10.0)
+    got = observed_position(
+        np.array([1.0, 2, 3]), camera_of([0.1, 0.2, 0.3], LEVEL), mount, bias, Exposure(10.0, LEVEL, LEVEL, FORWARD)
+    )
     np.testing.assert_allclose(got, [1.2, 2.0, 3.0], rtol=0, atol=1e-15)
 
 
 def test_boresight_turns_the_lever_arm_with_the_body_not_with_the_camera():
     boresight = np.array([0.01, -0.02, 0.03])
     camera = camera_of([0.1, -0.1, 2.0], boresight)
-    body = compiled(object_from_body)(camera, boresight)
+    body = compiled(object_from_body)(camera, boresight, FORWARD)
     np.testing.assert_allclose(body, attitude([0.1, -0.1, 2.0]), rtol=0, atol=1e-15)
-    got = observed_position(LEVEL, camera, Mount(ARM, boresight), NONE, 0.0)
+    got = observed_position(LEVEL, camera, Mount(ARM, boresight), NONE, STILL)
     np.testing.assert_allclose(got, attitude([0.1, -0.1, 2.0]) @ ARM, rtol=0, atol=1e-15)
 
 
@@ -110,11 +120,13 @@ def test_boresight_changes_the_residual_by_itself():
 # Derivatives ----------------------------------------------------------------------------------------------
 
 
-def station_and_attitude(position, theta, angles, arm, boresight, shift, drift, time, observed):
+def station_and_attitude(position, theta, angles, arm, boresight, offset, shift, drift, time, velocity, rate, observed):
     camera = small_rotation(theta) @ matrix_from_omega_phi_kappa(angles)
-    station = sensor_position(position, camera, Mount(arm, boresight), StripBias(shift, drift), time)
-    body = matrix_from_roll_pitch_yaw(observed) @ object_from_body(camera, boresight)
-    return station, attitude_residual(body, camera, boresight), object_from_body(camera, boresight)
+    mount, exposure = Mount(arm, boresight, offset), Exposure(time, velocity, rate, FORWARD)
+    station = sensor_position(position, camera, mount, StripBias(shift, drift), exposure)
+    computed = recorded_attitude(camera, mount, exposure)
+    body = matrix_from_roll_pitch_yaw(observed) @ object_from_body(camera, boresight, FORWARD)
+    return station, attitude_residual(body, computed), computed
 
 
 def test_derivatives_of_station_and_attitude():
@@ -123,10 +135,11 @@ def test_derivatives_of_station_and_attitude():
     angles = np.concatenate([rng.uniform(-3, 3, (4, 3)), [[0, 0, 0], [0.3, np.pi / 2, 1], [0.7, 0.6, -2], [0, 0, 2]]])
     small = 0.1 * rng.normal(size=(n, 3))
     zero_at_last = np.ones((n, 1))
-    zero_at_last[-2:] = 0  # theta = 0, boresight = 0 and no residual at all
-    vectors = [rng.normal(size=(n, 3)) for _ in range(4)]
+    zero_at_last[-2:] = 0  # theta = 0, boresight = 0, no time offset and no residual at all
+    vectors = [rng.normal(size=(n, 3)) for _ in range(6)]
     check_derivatives(
         station_and_attitude,
-        vectors[0], small * zero_at_last, angles, vectors[1], small[::-1] * zero_at_last, vectors[2], vectors[3],
-        rng.normal(size=n), small * zero_at_last,
+        vectors[0], small * zero_at_last, angles, vectors[1], small[::-1] * zero_at_last,
+        0.1 * rng.normal(size=n) * zero_at_last[:, 0], vectors[2], vectors[3], rng.normal(size=n), vectors[4],
+        vectors[5], small * zero_at_last,
     )  # fmt: skip

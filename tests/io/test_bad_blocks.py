@@ -118,6 +118,16 @@ CASES = {
     "weight without sigma": ([(T, "sigma = 2e-5", "value = 2e-5")], ["block.toml", "unknowns] k1", "sigma"]),
     "sign of brown": ([(T, '"brown"', '"brown"\nsign = "add"')], ["block.toml", "sign", "remove"]),
     "sign of smac": ([(T, '"brown"', '"smac"\nsign = "plus"')], ["block.toml", "sign", '"subtract"']),
+    "no grid of Ebner": ([(T, '"brown"', '"ebner"')], ["block.toml", "[cameras.kodak.interior] b_mm", "add it"]),
+    "grid of Gruen": (
+        [(T, '"brown"', '"gruen"'), (T, "k1 = -1e-4", "b_mm = 0.0")], ["block.toml", "b_mm", "0 is not positive"],
+    ),
+    "scale of Brown's fourteen": (
+        [(T, '"brown"', '"brown14"'), (T, "k1 = -1e-4", "f_mm = -5.0")], ["block.toml", "f_mm", "not positive"],
+    ),
+    "constant of another model": (
+        [(T, '"brown"', '"radial"'), (T, "k1 = -1e-4", "b_mm = 2.0")], ["block.toml", "b_mm", "remove"],
+    ),
     "a vector of two": ([(T, "[0.1, 0.2, -0.3]", "[0.1, 0.2]")], ["block.toml", "lever_arm_m", "three numbers"]),
     "sigma of two": ([(T, "sigma_m = 0.01", "sigma_m = [0.1, 0.2]")], ["block.toml", "lever_arm", "one per axis"]),
     "no camera": ([(T, "", 'title = "x"\n')], ["block.toml", "no camera", "add"]),

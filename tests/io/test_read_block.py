@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jaxphoto.block import Datum
-from jaxphoto.camera import Smac
+from jaxphoto.camera import Brown14, Ebner, Gruen, Smac
 from jaxphoto.io import read_block
 from jaxphoto.unknowns import FIXED, FREE, Weighted
 
@@ -180,6 +180,25 @@ def test_smac_has_a_balance_radius_and_a_sign(write_folder):
     assert isinstance(distortion, Smac)
     assert (distortion.sign, float(distortion.r0)) == ("add", 1.5)
     assert block.priors.interior["kodak"].distortion.r0 is FIXED
+
+
+@pytest.mark.parametrize(
+    ("name", "model", "constant", "coefficient"),
+    [("ebner", Ebner, "b", "b12"), ("gruen", Gruen, "b", "a55"), ("brown14", Brown14, "f", "a13")],
+)
+def test_additional_parameters_have_a_constant_that_is_given(write_folder, name, model, constant, coefficient):
+    block = read_block(
+        write_folder(
+            ("block.toml", '"brown"', f'"{name}"'),
+            ("block.toml", "k1 = -1e-4", f"{constant}_mm = 1.5\n{coefficient} = 1e-9"),
+            ("block.toml", "k1 = { sigma = 2e-5 }", f'{coefficient} = "free"'),
+        )
+    )
+    distortion, priors = (tree.interior["kodak"].distortion for tree in (block.start.unknowns, block.priors))
+    assert type(distortion) is model
+    assert (float(getattr(distortion, constant)), float(getattr(distortion, coefficient))) == (1.5, 1e-9)
+    assert getattr(priors, constant) is FIXED
+    assert [name for name in model.coefficients if getattr(priors, name) is FREE] == [coefficient]
 
 
 IDLE = """\

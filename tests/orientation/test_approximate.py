@@ -4,10 +4,10 @@ import equinox as eqx
 import numpy as np
 import pytest
 
-from jaxphoto.block import Attitudes, ImageRows
+from jaxphoto.block import Attitudes, ImageRows, Motion
 from jaxphoto.camera import Brown, InteriorOrientation
 from jaxphoto.errors import BlockError
-from jaxphoto.georeferencing import Mount, StripBias, body_from_camera, sensor_position
+from jaxphoto.georeferencing import Exposure, Mount, StripBias, recorded_attitude, sensor_position
 from jaxphoto.orientation import approximate
 from jaxphoto.orientation.resection import resect_ideal
 from jaxphoto.rotation import roll_pitch_yaw_from_matrix
@@ -121,27 +121,33 @@ def test_fixed_coordinates_stay_exactly_as_given():
     assert (points[[3, 5], 1] != truth.points[[3, 5], 1]).all()
 
 
+VELOCITY, RATE = np.array([60.0, -20.0, 1.0]), np.array([0.02, -0.03, 0.01])
+
+
 @compiled
 def observed(position, camera_from_object, mount, bias):
-    attitude = camera_from_object.T @ body_from_camera(mount.boresight).T
-    station = sensor_position(position, camera_from_object, mount, bias, 2.0)
-    return station, roll_pitch_yaw_from_matrix(attitude)
+    exposure = Exposure(2.0, VELOCITY, RATE, mount.nominal)
+    station = sensor_position(position, camera_from_object, mount, bias, exposure)
+    return station, roll_pitch_yaw_from_matrix(recorded_attitude(camera_from_object, mount, exposure))
 
 
 def test_stations_and_attitudes_orient_images_directly():
     block, truth = strip()
     n = len(block.images)
-    mount = Mount(np.array([0.3, -0.2, 1.5]), np.array([0.01, -0.02, 0.015]))
+    mount = Mount(np.array([0.3, -0.2, 1.5]), np.array([0.01, -0.02, 0.015]), 0.05, "left")
     bias = StripBias(np.array([1.0, -2.0, 3.0]), np.array([0.1, 0.2, -0.1]))
     stations, attitudes = zip(
         *(observed(truth.positions[i], truth.matrices[i], mount, bias) for i in range(n)), strict=True
     )
     places = lambda b: (  # noqa: E731
-        b.stations, b.attitudes, b.image_time, b.start.unknowns.mounts["default"], b.start.unknowns.strips["default"]
+        b.stations, b.attitudes, b.image_time, b.start.unknowns.mounts["default"], b.start.unknowns.strips["default"],
+        b.motion,
     )  # fmt: skip
     rows = coordinate_rows(np.array(stations), all_of(block.images))
     angles = Attitudes(all_of(block.images), np.array(attitudes), np.full((n, 3), 1e-4))
-    assert_true(approximate(eqx.tree_at(places, block, (rows, angles, np.full(n, 2.0), mount, bias))), truth)
+    motion = Motion(np.tile(VELOCITY, (n, 1)), np.tile(RATE, (n, 1)))
+    new = (rows, angles, np.full(n, 2.0), mount, bias, motion)
+    assert_true(approximate(eqx.tree_at(places, block, new, is_leaf=lambda v: v is None)), truth)
 
 
 def test_stations_alone_do_not_orient_an_image():

@@ -4,6 +4,11 @@ from jaxphoto.camera.distortion.affine_brown import AffineBrown
 from jaxphoto.camera.distortion.balanced import Balanced
 from jaxphoto.camera.distortion.base import AbstractDistortion, invert
 from jaxphoto.camera.distortion.brown import Brown
+from jaxphoto.camera.distortion.brown14 import Brown14
+from jaxphoto.camera.distortion.ebner import Ebner
+from jaxphoto.camera.distortion.gruen import Gruen
+from jaxphoto.camera.distortion.pps_radial import PpsRadial
+from jaxphoto.camera.distortion.radial_polynomial import RadialPolynomial
 from jaxphoto.camera.distortion.smac import Smac
 
 DISTORTIONS: dict[str, type[AbstractDistortion]] = {
@@ -11,6 +16,14 @@ DISTORTIONS: dict[str, type[AbstractDistortion]] = {
     "affine_brown": AffineBrown,
     "smac": Smac,
     "balanced": Balanced,
+    "radial": RadialPolynomial,
+    "pps_radial": PpsRadial,
+    "ebner": Ebner,
+    "gruen": Gruen,
+    "brown14": Brown14,
 }
 
-__all__ = ["DISTORTIONS", "AbstractDistortion", "AffineBrown", "Balanced", "Brown", "Smac", "invert"]
+__all__ = [
+    "DISTORTIONS", "AbstractDistortion", "AffineBrown", "Balanced", "Brown", "Brown14", "Ebner", "Gruen", "PpsRadial",
+    "RadialPolynomial", "Smac", "invert",
+]  # fmt: skip

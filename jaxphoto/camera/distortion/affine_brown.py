@@ -5,7 +5,7 @@ from typing import ClassVar, Literal
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxphoto.camera.distortion.base import AbstractDistortion, decentring
+from jaxphoto.camera.distortion.base import AbstractDistortion, decentring, radial
 
 
 class AffineBrown(AbstractDistortion):
@@ -33,4 +33,4 @@ class AffineBrown(AbstractDistortion):
         """Ideal coordinate (mm) of a measured one, both reduced to the principal point."""
         m = jnp.stack([xy[0] - self.b1 * xy[0] - self.b2 * xy[1], xy[1]])
         r2 = m[0] * m[0] + m[1] * m[1]
-        return m - m * (r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))) - decentring(self.p1, self.p2, m)
+        return m - m * radial(r2, self.k1, self.k2, self.k3) - decentring(self.p1, self.p2, m)

@@ -96,8 +96,23 @@ def _solve_2x2(a: Float[Array, "2 2"], b: Float[Array, "2"]) -> Float[Array, "2"
     return jnp.stack([a[1, 1] * b[0] - a[0, 1] * b[1], a[0, 0] * b[1] - a[1, 0] * b[0]]) / determinant
 
 
+def radial(r2: Float[Array, ""], *k) -> Float[Array, ""]:
+    """K1 r^2 + K2 r^4 + K3 r^6 + ..., from the square of the radius and as many coefficients as are given."""
+    total = jnp.zeros_like(r2)
+    for coefficient in reversed(k):
+        total = r2 * (coefficient + total)
+    return total
+
+
 def decentring(p1, p2, xy: Float[Array, "2"]) -> Float[Array, "2"]:
     """Decentring distortion P1 (r^2 + 2 x^2) + 2 P2 x y, 2 P1 x y + P2 (r^2 + 2 y^2)."""
     x, y = xy
     r2 = x * x + y * y
     return jnp.stack([p1 * (r2 + 2 * x * x) + 2 * p2 * x * y, 2 * p1 * x * y + p2 * (r2 + 2 * y * y)])
+
+
+def check_positive(distortion: AbstractDistortion, field: str, meaning: str) -> None:
+    """Raise ValueError where the constant `field` of a model is not positive; under jit its value is not known yet."""
+    value = getattr(distortion, field)
+    if not isinstance(value, jax.core.Tracer) and not value > 0:
+        raise ValueError(f"{field} of {type(distortion).__name__}, {meaning}, is positive and in mm, got {value}")

@@ -5,7 +5,7 @@ from typing import ClassVar, Literal
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxphoto.camera.distortion.base import AbstractDistortion, decentring
+from jaxphoto.camera.distortion.base import AbstractDistortion, decentring, radial
 
 
 class Brown(AbstractDistortion):
@@ -33,6 +33,5 @@ class Brown(AbstractDistortion):
         """Ideal coordinate (mm) of a measured one, both reduced to the principal point."""
         x, y = xy
         r2 = x * x + y * y
-        radial = r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
         affine = jnp.stack([self.b1 * x + self.b2 * y, jnp.zeros_like(y)])
-        return xy - xy * radial - decentring(self.p1, self.p2, xy) - affine
+        return xy - xy * radial(r2, self.k1, self.k2, self.k3) - decentring(self.p1, self.p2, xy) - affine

@@ -13,6 +13,7 @@ from jaxphoto.camera import (
     Smac,
     constant_names,
     get_parameter,
+    needed_constants,
     parameter_names,
     set_parameter,
 )
@@ -92,7 +93,9 @@ def _empty_interior(section: Section) -> InteriorOrientation:
     if kind is not Smac:
         if "sign" in section:
             raise section.error("sign", f"the model {model} has its sign by definition; remove the key")
-        return _as_arrays(InteriorOrientation(0.0, 0.0, 0.0, kind()))
+        values = section.section("interior")
+        constants = {field: values.positive(name) for name, field in needed_constants(kind).items()}
+        return _as_arrays(InteriorOrientation(0.0, 0.0, 0.0, kind(**constants)))
     sign = section.text("sign", "subtract")
     if sign not in ("subtract", "add"):
         raise section.error("sign", f'{sign!r} is neither "subtract" nor "add"; choose one of them')

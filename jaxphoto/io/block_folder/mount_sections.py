@@ -6,7 +6,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jaxphoto.georeferencing import Mount, StripBias
+from jaxphoto.georeferencing import IMAGE_X, Mount, StripBias
 from jaxphoto.io.block_folder.camera_section import status
 from jaxphoto.io.block_folder.section import Section
 
@@ -19,14 +19,22 @@ def read_mounts(section: Section, cameras: Iterable[str]) -> tuple[dict[str, Mou
     mounts, priors = {}, {}
     for name in section:
         table = section.section(name)
-        table.known("lever_arm_m", "boresight_deg", "lever_arm", "boresight")
+        table.known("lever_arm_m", "boresight_deg", "time_offset_s", "image_x", "lever_arm", "boresight", "time_offset")
         arm, boresight = table.vector("lever_arm_m"), table.vector("boresight_deg") * _DEG
         if np.any(np.abs(arm) > 100):
             raise table.error("lever_arm_m", f"{arm.tolist()} m is no lever arm; give it in metres")
-        mounts[name] = Mount(jnp.asarray(arm), jnp.asarray(boresight))
+        image_x = table.text("image_x", "forward")
+        if image_x not in IMAGE_X:
+            raise table.error(
+                "image_x", f"{image_x!r} is no direction of the camera's x axis; use {', '.join(IMAGE_X)}"
+            )
+        offset = table.number("time_offset_s", 0.0)
+        mounts[name] = Mount(jnp.asarray(arm), jnp.asarray(boresight), jnp.asarray(offset), image_x)  # type: ignore[arg-type]
         priors[name] = Mount(
             table.prior("lever_arm", arm, "_m"),  # type: ignore[arg-type]
             table.prior("boresight", boresight, "_deg", _DEG),  # type: ignore[arg-type]
+            table.prior("time_offset", offset, "_s"),  # type: ignore[arg-type]
+            image_x,  # type: ignore[arg-type]
         )
     return mounts, priors
 
@@ -58,8 +66,11 @@ def mount_section(mount: Mount, prior: Mount) -> dict[str, Any]:
     return {
         "lever_arm_m": np.asarray(mount.lever_arm).tolist(),
         "boresight_deg": (np.asarray(mount.boresight) / _DEG).tolist(),
+        "time_offset_s": float(mount.time_offset),
+        "image_x": mount.image_x,
         "lever_arm": status(prior.lever_arm, mount.lever_arm),
         "boresight": status(prior.boresight, mount.boresight, _DEG),
+        "time_offset": status(prior.time_offset, mount.time_offset),
     }
 
 

@@ -1,8 +1,6 @@
-"""The command line: read, do, write; one sentence and exit code 2 for what a user can mend."""
+"""`jaxphoto adjust`: a block in, tables and a report out."""
 
-import sys
 import time
-import warnings
 from pathlib import Path
 from typing import Annotated
 
@@ -10,27 +8,12 @@ import typer
 from rich.console import Console
 
 import jaxphoto
+from jaxphoto.cli.app import app
 from jaxphoto.errors import JaxphotoError
-from jaxphoto.io import convert, read_block
+from jaxphoto.io import read_block
 from jaxphoto.procedures import adjust
 from jaxphoto.report import Tables, check_target, print_adjustment, warnings_of, write_results
 from jaxphoto.statistics import EOP_NAMES
-
-app = typer.Typer(
-    help="Differentiable photogrammetry: calibrate a camera as it flies.",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-)
-
-
-@app.callback(invoke_without_command=True)
-def _root(
-    show_version: Annotated[bool, typer.Option("--version", help="Print the version and stop.")] = False,
-) -> None:
-    if show_version:
-        typer.echo(f"jaxphoto {jaxphoto.__version__}")
-        raise typer.Exit
 
 
 @app.command("adjust")
@@ -67,31 +50,3 @@ def adjust_command(
     console.print(f"results in {out} (open report.html)", highlight=False)
     if not bool(adjusted.converged):
         raise typer.Exit(1)
-
-
-@app.command("convert")
-def convert_command(
-    source: Annotated[Path, typer.Argument(help="File or folder of another program.")],
-    block: Annotated[Path, typer.Argument(help="Block folder to write.")],
-    source_format: Annotated[
-        str | None, typer.Option("--format", help="Format of the source; recognised when not given.")
-    ] = None,
-) -> None:
-    """Turn another program's files into a block folder."""
-    convert(source, block, source_format)
-    typer.echo(f"wrote {block}")
-
-
-def main() -> None:
-    """Entry point of the command `jaxphoto`."""
-    warnings.showwarning = _show_warning
-    try:
-        app(standalone_mode=True)
-    except JaxphotoError as error:
-        typer.echo(f"jaxphoto: {error}", err=True)
-        sys.exit(2)
-
-
-def _show_warning(message, category, filename, lineno, file=None, line=None) -> None:
-    """Warnings for the user in one line, without the place in our code."""
-    typer.echo(f"warning: {message}", err=True)

@@ -1,0 +1,65 @@
+"""Ebner's twelve additional parameters, in the measured coordinate, subtracted."""
+
+from typing import ClassVar, Literal
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxphoto.camera.distortion.base import AbstractDistortion, check_positive
+
+
+class Ebner(AbstractDistortion):
+    """Twelve parameters orthogonal on the 3 x 3 points {-b, 0, b}^2; `ideal = measured - delta(measured)`.
+
+        delta_x =  b1 x + b2 y - 2 b3 k + b4 x y + b5 l + b7 x l + b9 y k + b11 k l
+        delta_y = -b1 y + b2 x + b3 x y - 2 b4 l + b6 k + b8 y k + b10 x l + b12 k l
+        k = x^2 - 2 b^2 / 3,   l = y^2 - 2 b^2 / 3
+
+    Units: b1 and b2 none, b3 to b6 mm^-1, b7 to b10 mm^-2, b11 and b12 mm^-3; b, the spacing of the 3 x 3 points, in
+    mm (a constant of the model that must be given). On those points the twelve are also orthogonal to what c, x_p,
+    y_p and the three rotations of the image do: b1 and b2 are the affinity and shear that are left when c takes the
+    scale and kappa the rotation, b3 to b6 are the quadratic terms that the two tilts leave. So none of them acts as c
+    does and all may be free with c, x_p and y_p. They are for what is left of a calibrated camera: without x^3 and y^3
+    they cannot stand for the radial distortion of an ordinary lens.
+
+    Source: Ebner (1976), Self calibrating block adjustment; the formula as MicMac writes it, there with the sign +.
+    """
+
+    b: Float[Array, ""] | float
+    b1: Float[Array, ""] | float = 0.0
+    b2: Float[Array, ""] | float = 0.0
+    b3: Float[Array, ""] | float = 0.0
+    b4: Float[Array, ""] | float = 0.0
+    b5: Float[Array, ""] | float = 0.0
+    b6: Float[Array, ""] | float = 0.0
+    b7: Float[Array, ""] | float = 0.0
+    b8: Float[Array, ""] | float = 0.0
+    b9: Float[Array, ""] | float = 0.0
+    b10: Float[Array, ""] | float = 0.0
+    b11: Float[Array, ""] | float = 0.0
+    b12: Float[Array, ""] | float = 0.0
+
+    domain: ClassVar[Literal["measured", "ideal"]] = "measured"
+    coefficients: ClassVar[tuple[str, ...]] = tuple(f"b{i}" for i in range(1, 13))
+
+    def __check_init__(self) -> None:
+        check_positive(self, "b", "the spacing of its points")
+
+    def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
+        """Ideal coordinate (mm) of a measured one, both reduced to the principal point."""
+        x, y = xy
+        k, l = x * x - 2 * self.b**2 / 3, y * y - 2 * self.b**2 / 3  # noqa: E741
+        linear = jnp.stack([self.b1 * x + self.b2 * y, self.b2 * x - self.b1 * y])
+        quadratic = jnp.stack(
+            [
+                -2 * self.b3 * k + self.b4 * x * y + self.b5 * l,
+                -2 * self.b4 * l + self.b3 * x * y + self.b6 * k,
+            ]
+        )
+        higher = jnp.stack(
+            [
+                self.b7 * x * l + self.b9 * y * k + self.b11 * k * l,
+                self.b8 * y * k + self.b10 * x * l + self.b12 * k * l,
+            ]
+        )
+        return xy - linear - quadratic - higher

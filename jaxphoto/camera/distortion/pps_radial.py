@@ -1,0 +1,42 @@
+"""Radial distortion about a principal point of symmetry that is not the principal point, subtracted."""
+
+from typing import ClassVar, Literal
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxphoto.camera.distortion.base import AbstractDistortion, radial
+
+
+class PpsRadial(AbstractDistortion):
+    """Radial K1-K3 about the principal point of symmetry (PPS); `ideal = measured - delta(measured)`.
+
+        delta = (x - S) (K1 |x - S|^2 + K2 |x - S|^4 + K3 |x - S|^6),   S = (pps_x, pps_y)
+
+    x is reduced, as everywhere, to (x_p, y_p), which is the principal point of autocollimation (PPA): S is the PPS
+    *from the PPA*, and the PPS lies at (x_p + pps_x, y_p + pps_y) in the image. Units: K1 mm^-2, K2 mm^-4, K3 mm^-6,
+    pps_x and pps_y mm.
+
+    A lens without radial distortion has its PPS anywhere: pps_x and pps_y are only determined with K1. To first order
+    they do what decentring distortion does with P = -K1 S (`jaxphoto.camera.principal_points`).
+    Source: paper 003, section 2.4, for the two points; derivation in docs/models.md.
+    """
+
+    k1: Float[Array, ""] | float = 0.0
+    k2: Float[Array, ""] | float = 0.0
+    k3: Float[Array, ""] | float = 0.0
+    pps_x: Float[Array, ""] | float = 0.0
+    pps_y: Float[Array, ""] | float = 0.0
+
+    domain: ClassVar[Literal["measured", "ideal"]] = "measured"
+    coefficients: ClassVar[tuple[str, ...]] = ("k1", "k2", "k3", "pps_x", "pps_y")
+
+    @property
+    def symmetry_point(self) -> Float[Array, "2"]:
+        """The PPS from the PPA, in mm."""
+        return jnp.stack([jnp.asarray(self.pps_x, float), jnp.asarray(self.pps_y, float)])
+
+    def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
+        """Ideal coordinate (mm) of a measured one, both reduced to the principal point of autocollimation."""
+        from_pps = xy - self.symmetry_point
+        return xy - from_pps * radial(from_pps @ from_pps, self.k1, self.k2, self.k3)

@@ -1,0 +1,31 @@
+"""The radial polynomial of odd degree, in the measured coordinate, added."""
+
+from typing import ClassVar, Literal
+
+from jaxtyping import Array, Float
+
+from jaxphoto.camera.distortion.base import AbstractDistortion, radial
+
+
+class RadialPolynomial(AbstractDistortion):
+    """Radial correction of odd powers of the radius; `ideal = measured (1 + dr / r)`.
+
+        dr = k1 r^3 + k2 r^5 (+ k3 r^7)
+
+    The correction is *added*: k1 > 0 is a barrel, and k1, k2, k3 are those of `Brown` with the opposite sign. At r = 0
+    the factor is 1. The fifth degree is k3 = 0, fixed. Units: k1 mm^-2, k2 mm^-4, k3 mm^-6.
+
+    Source: paper 001 (after Chikatsu), which says no more than "radial polynomial 5th degree": that the polynomial is
+    odd, that it is added and that it is one of the measured coordinate are the usual reading, not the paper's words.
+    """
+
+    k1: Float[Array, ""] | float = 0.0
+    k2: Float[Array, ""] | float = 0.0
+    k3: Float[Array, ""] | float = 0.0
+
+    domain: ClassVar[Literal["measured", "ideal"]] = "measured"
+    coefficients: ClassVar[tuple[str, ...]] = ("k1", "k2", "k3")
+
+    def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
+        """Ideal coordinate (mm) of a measured one, both reduced to the principal point."""
+        return xy + xy * radial(xy @ xy, self.k1, self.k2, self.k3)

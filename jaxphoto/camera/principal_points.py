@@ -1,0 +1,143 @@
+"""The principal points of autocollimation (PPA) and of symmetry (PPS), and decentring in place of the latter.
+
+The PPA is the foot of the perpendicular from the projection centre: (x_p, y_p) of every camera here. The PPS is the
+centre of the radial distortion, S from the PPA. With delta_i(x) = x |x|^2i, to first order in S,
+
+    sum Ki delta_i(x - S) = sum Ki delta_i(x) - K1 (S r^2 + 2 x (x.S)) - K2 r^2 (S r^2 + 4 x (x.S)) - ...
+
+The K1 term is decentring distortion with P = -K1 S, so a lens may be written either way; the terms of K2, K3 and of
+S^2 are not of that form. A conversion drops them, and `conversion_error` says how much that is. Source: maths in
+docs/models.md; the two points in paper 003, section 2.4.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxphoto.camera.distortion import Brown, PpsRadial
+from jaxphoto.camera.interior import InteriorOrientation, get_parameter, parameter_names, set_parameter
+from jaxphoto.camera.sensor import Sensor
+from jaxphoto.rotation import small_rotation
+
+# Image points along each side of the format, corners included, at which two cameras are compared.
+_SIDE = 25
+# Gauss-Newton steps of a re-fit: it is nearly linear, and the tests find nothing left to improve after these.
+_STEPS = 6
+# Columns of a re-fit nearer to dependence than this say nothing of either: the shortest solution is taken.
+_DEPENDENT = 1e-10
+
+
+class PrincipalPoints(NamedTuple):
+    """Both principal points in the image, in mm from the image centre."""
+
+    autocollimation: Float[Array, "2"]
+    symmetry: Float[Array, "2"]
+
+
+class ConversionError(NamedTuple):
+    """What one camera misses of another: the largest and RMS image displacement over the format, in mm.
+
+    `interior` is the second camera, as compared.
+    """
+
+    largest_mm: Float[Array, ""]
+    rms_mm: Float[Array, ""]
+    interior: InteriorOrientation
+
+
+def principal_points(interior: InteriorOrientation) -> PrincipalPoints:
+    """PPA and PPS of a camera with `PpsRadial` (exact) or `Brown` (to first order: S = -P / K1).
+
+    Raises ValueError for other distortions, and an equinox error for decentring without K1, which has no PPS.
+    """
+    ppa = interior.principal_point
+    d = interior.distortion
+    if isinstance(d, PpsRadial):
+        return PrincipalPoints(ppa, ppa + d.symmetry_point)
+    return PrincipalPoints(ppa, ppa + _symmetry_point(_checked(interior, Brown)))
+
+
+def symmetry_from_decentring(interior: InteriorOrientation) -> InteriorOrientation:
+    """The camera with `PpsRadial` in place of `Brown`: S = -P / K1; c, the PPA and K1 to K3 stay.
+
+    First order in S. Neglected: the K2 and K3 terms, of which the K2 term -K2 r^2 (S r^2 + 4 x (x.S)) is not of
+    decentring form, and everything of order S^2; `conversion_error` gives their size.
+    Raises ValueError for a distortion other than Brown, and an equinox error for decentring without K1 and for affinity
+    or shear, which `PpsRadial` does not have.
+    """
+    d = _checked(interior, Brown)
+    s = _symmetry_point(d)
+    affine = (jnp.asarray(d.b1) != 0) | (jnp.asarray(d.b2) != 0)
+    s = eqx.error_if(s, affine, "PpsRadial has no affinity and shear: convert a Brown whose b1 and b2 are 0")
+    return _with_distortion(interior, PpsRadial(k1=d.k1, k2=d.k2, k3=d.k3, pps_x=s[0], pps_y=s[1]))
+
+
+def decentring_from_symmetry(interior: InteriorOrientation) -> InteriorOrientation:
+    """The camera with `Brown` in place of `PpsRadial`: P = -K1 S; c, the PPA and K1 to K3 stay.
+
+    Neglects what `symmetry_from_decentring`, its inverse, neglects. Raises ValueError for a distortion other than
+    PpsRadial.
+    """
+    d = _checked(interior, PpsRadial)
+    p1, p2 = -d.k1 * d.symmetry_point
+    return _with_distortion(interior, Brown(k1=d.k1, k2=d.k2, k3=d.k3, p1=p1, p2=p2))
+
+
+def conversion_error(
+    before: InteriorOrientation, after: InteriorOrientation, sensor: Sensor, refit: bool = False
+) -> ConversionError:
+    """Largest and RMS displacement between the ideal coordinates that two cameras give to the same image points.
+
+    Taken over 25 x 25 points of the format, to its corners, at the scale of `before.c`; both cameras as they are. With
+    `refit`, c, x_p, y_p, every coefficient of `after` and a small rotation of the camera are first fitted to `before`
+    by least squares: what is left is what no self-calibration of `after` can take up.
+    """
+    x, y = (np.linspace(-0.5, 0.5, _SIDE) * side for side in (sensor.width_mm, sensor.height_mm))
+    points = jnp.asarray(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
+    wanted = jax.vmap(before.ideal_from_measured)(points)
+    names = parameter_names(after)
+
+    def camera(parameters) -> InteriorOrientation:
+        tree = after
+        for name, value in zip(names, parameters, strict=True):
+            tree = set_parameter(tree, name, value)
+        return tree
+
+    def displacement(unknowns):
+        theta, interior = unknowns[:3], camera(unknowns[3:])
+        ideal = jax.vmap(interior.ideal_from_measured)(points)
+        rays = jnp.column_stack([ideal, jnp.full(len(points), -interior.c)]) @ small_rotation(theta).T
+        return (-before.c * rays[:, :2] / rays[:, 2:] - wanted).ravel()
+
+    def improved(_, unknowns):
+        jacobian = jax.jacfwd(displacement)(unknowns)
+        length = jnp.linalg.norm(jacobian, axis=0)
+        length = jnp.where(length > 0, length, 1.0)
+        return unknowns - jnp.linalg.lstsq(jacobian / length, displacement(unknowns), rcond=_DEPENDENT)[0] / length
+
+    unknowns = jnp.stack([*jnp.zeros(3), *(jnp.asarray(get_parameter(after, name), float) for name in names)])
+    if refit:
+        unknowns = jax.lax.fori_loop(0, _STEPS, improved, unknowns)
+    moved = jnp.linalg.norm(displacement(unknowns).reshape(-1, 2), axis=1)
+    return ConversionError(jnp.max(moved), jnp.sqrt(jnp.mean(moved**2)), camera(unknowns[3:]))
+
+
+def _symmetry_point(d: Brown) -> Float[Array, "2"]:
+    k1, p = jnp.asarray(d.k1, float), jnp.stack([jnp.asarray(d.p1, float), jnp.asarray(d.p2, float)])
+    nowhere = (k1 == 0) & jnp.any(p != 0)
+    p = eqx.error_if(p, nowhere, "decentring without K1 has no principal point of symmetry: estimate or give K1")
+    return -p / jnp.where(k1 == 0, 1.0, k1)
+
+
+def _checked(interior: InteriorOrientation, kind):
+    if not isinstance(interior.distortion, kind):
+        raise ValueError(f"this is of {kind.__name__} cameras, this camera has {type(interior.distortion).__name__}")
+    return interior.distortion
+
+
+def _with_distortion(interior: InteriorOrientation, distortion) -> InteriorOrientation:
+    return InteriorOrientation(interior.c, interior.x_p, interior.y_p, distortion)

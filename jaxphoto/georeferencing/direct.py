@@ -1,0 +1,66 @@
+"""Direct georeferencing: from GNSS/IMU and mount to the exterior orientation, with its covariance.
+
+Functions of one image. Frames and signs: docs/conventions.md; source: papers 000 and 004, equation (1).
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxphoto.collinearity import ExteriorOrientation
+from jaxphoto.georeferencing.mount import Exposure, Mount, StripBias, body_from_camera, sensor_position
+from jaxphoto.rotation import matrix_from_roll_pitch_yaw, small_angles, small_rotation
+
+
+class SensorCovariance(eqx.Module):
+    """Covariances of what direct georeferencing starts from: each is known independently of the others."""
+
+    station: Float[Array, "3 3"]
+    """Of the GNSS position (m)."""
+    attitude: Float[Array, "3 3"]
+    """Of roll, pitch and yaw (rad)."""
+    mount: Float[Array, "7 7"]
+    """Of lever arm (m), boresight (rad) and time offset (s), in this order; zeros where the mount is taken as given."""
+
+
+def direct_orientation(
+    station: Float[Array, "3"],
+    roll_pitch_yaw: Float[Array, "3"],
+    mount: Mount,
+    bias: StripBias,
+    exposure: Exposure,
+) -> ExteriorOrientation:
+    """Exterior orientation from the GNSS position (m) and the attitude (rad) at the recorded time.
+
+    X = GNSS - R l - shift - drift (t - t0) + v tau, the attitude turned on by rate tau and then through the boresight
+    (papers 000 and 004, equation (1)).
+    """
+    turned = matrix_from_roll_pitch_yaw(roll_pitch_yaw) @ small_rotation(exposure.rate * mount.time_offset).T
+    camera_from_object = (turned @ body_from_camera(mount.boresight, exposure.nominal)).T
+    origin = sensor_position(jnp.zeros(3), camera_from_object, mount, bias, exposure)
+    return ExteriorOrientation(station - origin, camera_from_object)
+
+
+def direct_covariance(
+    station: Float[Array, "3"],
+    roll_pitch_yaw: Float[Array, "3"],
+    mount: Mount,
+    bias: StripBias,
+    exposure: Exposure,
+    covariance: SensorCovariance,
+) -> Float[Array, "6 6"]:
+    """Covariance of the result of `direct_orientation`: X, Y, Z (m) and a small rotation in the camera frame (rad).
+
+    First-order propagation. Images of one mount share its error, so they are correlated, which this does not say.
+    """
+    at = direct_orientation(station, roll_pitch_yaw, mount, bias, exposure)
+
+    def moved(d_station, d_attitude, d_mount):
+        m = Mount(mount.lever_arm + d_mount[:3], mount.boresight + d_mount[3:6], mount.time_offset + d_mount[6])
+        new = direct_orientation(station + d_station, roll_pitch_yaw + d_attitude, m, bias, exposure)
+        return jnp.concatenate([new.position, small_angles(new.camera_from_object @ at.camera_from_object.T)])
+
+    by = jax.jacfwd(moved, argnums=(0, 1, 2))(jnp.zeros(3), jnp.zeros(3), jnp.zeros(7))
+    parts = zip(by, (covariance.station, covariance.attitude, covariance.mount), strict=True)
+    return sum(j @ q @ j.T for j, q in parts)
