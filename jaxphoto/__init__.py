@@ -43,7 +43,7 @@ from jaxphoto.camera import (
 from jaxphoto.collinearity import ExteriorOrientation, image_ray, intersect, project
 from jaxphoto.errors import BlockError, DatumError, InputError, JaxphotoError, RankError
 from jaxphoto.io import convert, read_block, read_source, write_block
-from jaxphoto.procedures import adjust
+from jaxphoto.procedures import adjust, boresight, georeference
 from jaxphoto.report import Tables
 from jaxphoto.statistics import angle_differences, covariance, point_differences
 from jaxphoto.unknowns import FIXED, FREE, Unknowns, Weighted
@@ -53,8 +53,9 @@ __version__ = "0.1.0"
 __all__ = [
     "FIXED", "FREE", "MAX_STEPS", "AbstractDistortion", "Adjustment", "AffineBrown", "Balanced", "Block",
     "BlockError", "Brown", "Brown14", "DatumError", "Ebner", "ExteriorOrientation", "Gruen", "InputError",
-    "InteriorOrientation", "JaxphotoError", "Outcome", "PpsRadial", "RadialPolynomial", "RankError", "Sensor", "Smac",
-    "Tables", "Unknowns", "Weighted", "adjust", "angle_differences", "conversion_error", "convert", "covariance",
-    "decentring_from_symmetry", "image_ray", "intersect", "point_differences", "principal_points", "project",
-    "read_block", "read_source", "rebalance", "rebalance_covariance", "symmetry_from_decentring", "write_block",
+    "InteriorOrientation", "JaxphotoError", "Outcome", "PpsRadial", "RadialPolynomial", "RankError", "Sensor",
+    "Smac", "Tables", "Unknowns", "Weighted", "adjust", "angle_differences", "boresight", "conversion_error",
+    "convert", "covariance", "decentring_from_symmetry", "georeference", "image_ray", "intersect",
+    "point_differences", "principal_points", "project", "read_block", "read_source", "rebalance",
+    "rebalance_covariance", "symmetry_from_decentring", "write_block",
 ]  # fmt: skip

@@ -137,11 +137,6 @@ def rows(who, axes=(0, 1, 2), sigma=0.03) -> Rows:
     return Rows(who, axis, np.zeros(len(who)), np.full(len(who), sigma))
 
 
-def joined(*parts: Rows) -> Rows:
-    fields = [(r.who, r.axis, r.value, r.sigma) for r in parts]
-    return Rows(*(np.concatenate(v) for v in zip(*fields, strict=True)))
-
-
 def all_stations(block: Block, sigma=0.10) -> Rows:
     return rows(range(len(block.images)), sigma=sigma)
 
@@ -290,7 +285,7 @@ def _everything() -> Simulated:
     block = dataclasses.replace(
         block,
         attitudes=jax.tree.map(lambda v: v[1:7], all_attitudes(block)),
-        control=joined(rows(CONTROL), rows((5, 21, 33), (2,))),
+        control=Rows.joined(rows(CONTROL), rows((5, 21, 33), (2,))),
         fixed=rows((17,), (0, 1), 0.0),
         distances=Distances(ends, np.zeros(3), np.array([0.02, 0.03, 0.01])),
     )
@@ -315,7 +310,7 @@ def _fixed_interior() -> Simulated:
 def _fixed_control() -> Simulated:
     """Control without error, among it a point that is fixed in height only; no stations."""
     block, truth = _cross()
-    fixed = joined(rows(CONTROL, sigma=0.0), rows((21,), (2,), 0.0))
+    fixed = Rows.joined(rows(CONTROL, sigma=0.0), rows((21,), (2,), 0.0))
     return Simulated(dataclasses.replace(block, control=Rows.none(), fixed=fixed, stations=Rows.none()), truth)
 
 

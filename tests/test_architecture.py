@@ -11,7 +11,7 @@ import jaxphoto
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "jaxphoto"
-TABLES_AND_FILES = ("io", "report", "cli")
+TABLES_AND_FILES = ("io", "report", "experiment", "cli")
 
 
 def imported(path: Path) -> set[str]:

@@ -38,9 +38,9 @@ def solve(block: Block, start: Unknowns, priors: Unknowns, max_steps: int = MAX_
     `jaxphoto.adjust` finds what is missing first.
 
     Raises DatumError where the observations leave the datum open and no constraint closes it, RankError where they
-    cannot tell unknowns apart.
+    do not see an unknown or cannot tell unknowns apart.
     """
-    check_priors(priors)
+    check_priors(block, priors)
     structure = structure_of(block, priors)
     values = values_of(block, start, priors, structure)
     constraints = close_datum(block, concrete(values, block), structure)

@@ -1,18 +1,34 @@
 """Rank: unknowns that the observations cannot tell apart, named."""
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from jaxphoto.adjustment.padding import crop_reduced
 from jaxphoto.adjustment.result import Adjustment
-from jaxphoto.errors import RankError
+from jaxphoto.block import Block
+from jaxphoto.errors import DatumError, RankError
 from jaxphoto.unknowns import FREE, Unknowns
 
 # A pivot of the unit-diagonal reduced matrix below this is a rank defect: at float64 it is rounding, not geometry.
 _DEFECT = 1e-13
 
 
-def check_priors(priors: Unknowns) -> None:
-    """Raise RankError where a camera's principal distance and a coefficient that does the same are both free.
+def check_priors(block: Block, priors: Unknowns) -> None:
+    """Raise RankError or DatumError where something is free that nothing in the block can see.
+
+    It looks at who observed what, not at numbers, so nothing need be compiled to find it.
+    """
+    _check_scales(priors)
+    with_station = set(np.asarray(block.stations.who).tolist())
+    with_attitude = set(np.asarray(block.attitudes.image).tolist())
+    _check_mounts(block, priors, with_station, with_attitude)
+    _check_strips(block, priors, with_station)
+    _check_shifts(block, priors, with_station)
+
+
+def _check_scales(priors: Unknowns) -> None:
+    """A camera's principal distance and a coefficient that does the same cannot both be free.
 
     The normal matrix would not show it: residuals are of ideal coordinates, so a smaller scale makes smaller residuals
     and the square sum has no minimum at all.
@@ -24,6 +40,61 @@ def check_priors(priors: Unknowns) -> None:
                     f"interior[{camera}].c_mm and interior[{camera}].{name} are one scale and cannot both "
                     f"be estimated: hold {name} fixed"
                 )
+
+
+def _check_mounts(block: Block, priors: Unknowns, with_station: set[int], with_attitude: set[int]) -> None:
+    for name, prior in priors.mounts.items():
+        images = _images_of(name, block.image_mount)
+        stations, attitudes = images & with_station, images & with_attitude
+        if prior.boresight is FREE and not attitudes:
+            raise RankError(
+                f"mounts[{name}].boresight is free, but none of its images has an observed attitude: add attitudes, "
+                "or hold the boresight fixed"
+            )
+        if prior.lever_arm is FREE and not stations:
+            raise RankError(
+                f"mounts[{name}].lever_arm is free, but none of its images has an observed station: add stations, "
+                "or hold the lever arm fixed"
+            )
+        if prior.time_offset is FREE and not (stations or attitudes):
+            raise RankError(
+                f"mounts[{name}].time_offset is free, but none of its images has an observed station or attitude: "
+                "add them, or hold the time offset fixed"
+            )
+        if prior.time_offset is FREE and block.motion is None:
+            raise RankError(
+                f"mounts[{name}].time_offset is free, but nothing says how the sensor moved at the exposures: give "
+                "its velocity and rates of turn (Block.motion), or hold the time offset fixed"
+            )
+
+
+def _check_strips(block: Block, priors: Unknowns, with_station: set[int]) -> None:
+    for name, prior in priors.strips.items():
+        n = len(_images_of(name, block.image_strip) & with_station)
+        for what, least in (("shift", 1), ("drift", 2)):
+            if getattr(prior, what) is FREE and n < least:
+                found = "one image with an observed station" if n else "no image with an observed station"
+                raise RankError(
+                    f"strips[{name}].{what} is free, but the strip has {found}: hold the {what} of strip {name} fixed, "
+                    f"or add stations of {least} of its images or more"
+                )
+
+
+def _check_shifts(block: Block, priors: Unknowns, with_station: set[int]) -> None:
+    """Stations that may all shift do not hold the block."""
+    if block.datum.kind != "control" or len(block.control.who) + len(block.fixed.who) or not with_station:
+        return
+    shifted = [name for name, prior in priors.strips.items() if prior.shift is FREE]
+    if {block.image_strip[i] for i in with_station} <= set(shifted):
+        raise DatumError(
+            f"the shift of every strip is free (strips {', '.join(shifted)}) and the block has no control, so its "
+            f"position is open: add control points, or hold the shift of one strip fixed, such as that of {shifted[0]}"
+        )
+
+
+def _images_of(name: str, names: Iterable[str]) -> set[int]:
+    """Indices of the images whose mount or strip is `name`."""
+    return {i for i, other in enumerate(names) if other == name}
 
 
 def check_rank(adjusted: Adjustment) -> None:

@@ -5,7 +5,8 @@ import warnings
 
 import typer
 
-from jaxphoto.cli import adjust, convert, simulate  # noqa: F401  (importing a command registers it)
+# Importing a command registers it.
+from jaxphoto.cli import adjust, boresight, convert, experiment, simulate  # noqa: F401
 from jaxphoto.cli.app import app
 from jaxphoto.errors import JaxphotoError
 

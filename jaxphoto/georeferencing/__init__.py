@@ -1,7 +1,21 @@
-"""Where the camera is: mounting (lever arm, boresight, time offset), shift and drift, direct georeferencing."""
+"""Where the camera is: trajectory, mounting (lever arm, boresight, time offset), shift and drift, corrections."""
 
 from jaxphoto.georeferencing.corrections import Corrections, apparent_point, refraction_constant
-from jaxphoto.georeferencing.direct import SensorCovariance, direct_covariance, direct_orientation
+from jaxphoto.georeferencing.direct import (
+    DirectPartials,
+    SensorCovariance,
+    direct_covariance,
+    direct_orientation,
+    direct_partials,
+)
+from jaxphoto.georeferencing.ground import RayCovariance, Surface, ground_covariance, ground_point
+from jaxphoto.georeferencing.lever_arm import (
+    arm_to_camera,
+    exact_offset,
+    level_error,
+    level_offset,
+    worst_level_error,
+)
 from jaxphoto.georeferencing.mount import (
     IMAGE_X,
     NOMINAL,
@@ -14,9 +28,12 @@ from jaxphoto.georeferencing.mount import (
     recorded_attitude,
     sensor_position,
 )
+from jaxphoto.georeferencing.trajectory import Poses, Trajectory, covered, interpolate
 
 __all__ = [
-    "IMAGE_X", "NOMINAL", "Corrections", "Exposure", "Mount", "SensorCovariance", "StripBias", "apparent_point",
-    "attitude_residual", "body_from_camera", "direct_covariance", "direct_orientation", "object_from_body",
-    "recorded_attitude", "refraction_constant", "sensor_position",
+    "IMAGE_X", "NOMINAL", "Corrections", "DirectPartials", "Exposure", "Mount", "Poses", "RayCovariance",
+    "SensorCovariance", "StripBias", "Surface", "Trajectory", "apparent_point", "arm_to_camera", "attitude_residual",
+    "body_from_camera", "covered", "direct_covariance", "direct_orientation", "direct_partials", "exact_offset",
+    "ground_covariance", "ground_point", "interpolate", "level_error", "level_offset", "object_from_body",
+    "recorded_attitude", "refraction_constant", "sensor_position", "worst_level_error",
 ]  # fmt: skip

@@ -21,13 +21,16 @@ class Corrections:
     sea_level_m: float = 0.0
 
 
+NO_CORRECTIONS = Corrections()
+
+
 def apparent_point(
     position: Float[Array, "3"], point: Float[Array, "3"], corrections: Corrections
 ) -> Float[Array, "3"]:
     """Where a straight ray from the projection centre aims to meet the image of `point` (m).
 
-    Curvature lowers the point by d^2 / 2R, with d its horizontal distance. Refraction turns the ray outward by K tan(a),
-    a its angle off the nadir: the point moves by K d (1 + tan(a)^2).
+    Curvature lowers the point by d^2 / 2R, with d its horizontal distance. Refraction turns the ray outward by
+    K tan(a), a its angle off the nadir: the point moves by K d (1 + tan(a)^2).
     """
     if not (corrections.refraction or corrections.curvature):
         return point

@@ -3,6 +3,8 @@
 Functions of one image. Frames and signs: docs/conventions.md; source: papers 000 and 004, equation (1).
 """
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -42,6 +44,33 @@ def direct_orientation(
     return ExteriorOrientation(station - origin, camera_from_object)
 
 
+class DirectPartials(NamedTuple):
+    """Derivatives of X, Y, Z (m) and of a small rotation in the camera frame (rad), by what they come from."""
+
+    station: Float[Array, "6 3"]
+    attitude: Float[Array, "6 3"]
+    mount: Float[Array, "6 7"]
+    """By lever arm (m), boresight (rad) and time offset (s), in this order."""
+
+
+def direct_partials(
+    station: Float[Array, "3"],
+    roll_pitch_yaw: Float[Array, "3"],
+    mount: Mount,
+    bias: StripBias,
+    exposure: Exposure,
+) -> DirectPartials:
+    """How the result of `direct_orientation` moves with its arguments."""
+    at = direct_orientation(station, roll_pitch_yaw, mount, bias, exposure)
+
+    def moved(d_station, d_attitude, d_mount):
+        m = Mount(mount.lever_arm + d_mount[:3], mount.boresight + d_mount[3:6], mount.time_offset + d_mount[6])
+        new = direct_orientation(station + d_station, roll_pitch_yaw + d_attitude, m, bias, exposure)
+        return jnp.concatenate([new.position, small_angles(new.camera_from_object @ at.camera_from_object.T)])
+
+    return DirectPartials(*jax.jacfwd(moved, argnums=(0, 1, 2))(jnp.zeros(3), jnp.zeros(3), jnp.zeros(7)))
+
+
 def direct_covariance(
     station: Float[Array, "3"],
     roll_pitch_yaw: Float[Array, "3"],
@@ -52,15 +81,9 @@ def direct_covariance(
 ) -> Float[Array, "6 6"]:
     """Covariance of the result of `direct_orientation`: X, Y, Z (m) and a small rotation in the camera frame (rad).
 
-    First-order propagation. Images of one mount share its error, so they are correlated, which this does not say.
+    First-order propagation. Images of one mount share its error, so they are correlated, which this does not say:
+    `direct_partials` lets one carry it along.
     """
-    at = direct_orientation(station, roll_pitch_yaw, mount, bias, exposure)
-
-    def moved(d_station, d_attitude, d_mount):
-        m = Mount(mount.lever_arm + d_mount[:3], mount.boresight + d_mount[3:6], mount.time_offset + d_mount[6])
-        new = direct_orientation(station + d_station, roll_pitch_yaw + d_attitude, m, bias, exposure)
-        return jnp.concatenate([new.position, small_angles(new.camera_from_object @ at.camera_from_object.T)])
-
-    by = jax.jacfwd(moved, argnums=(0, 1, 2))(jnp.zeros(3), jnp.zeros(3), jnp.zeros(7))
-    parts = zip(by, (covariance.station, covariance.attitude, covariance.mount), strict=True)
-    return sum(j @ q @ j.T for j, q in parts)
+    by = direct_partials(station, roll_pitch_yaw, mount, bias, exposure)
+    sensors = by.station @ covariance.station @ by.station.T + by.attitude @ covariance.attitude @ by.attitude.T
+    return sensors + by.mount @ covariance.mount @ by.mount.T

@@ -2,5 +2,8 @@
 
 from jaxphoto.io.block_folder import read_block, write_block
 from jaxphoto.io.convert import FORMATS, convert, read_source
+from jaxphoto.io.recipe import read_recipe, recipe_from, write_simulation
 
-__all__ = ["FORMATS", "convert", "read_block", "read_source", "write_block"]
+__all__ = [
+    "FORMATS", "convert", "read_block", "read_recipe", "read_source", "recipe_from", "write_block", "write_simulation",
+]  # fmt: skip

@@ -11,15 +11,13 @@ Where everything is known beforehand, only the check that every point lies in fr
 from functools import partial
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxphoto.block import Block, Rows, exposures
+from jaxphoto.block import Block, Rows, direct_exterior, sensor_rows
 from jaxphoto.errors import BlockError
-from jaxphoto.georeferencing import Mount, StripBias, direct_orientation
 from jaxphoto.orientation.intersection import intersect_points
-from jaxphoto.orientation.rays import QUICK_TO_COMPILE, ideal_coordinates, turn_to_object, unit_rays
+from jaxphoto.orientation.rays import ideal_coordinates, turn_to_object, unit_rays
 from jaxphoto.orientation.resection import resect_ideal
 from jaxphoto.unknowns import Unknowns
 
@@ -81,23 +79,14 @@ class _State:
 
     def _orient_directly(self) -> None:
         """Step 1: X = GNSS - R l - shift - drift t, and the attitude through the boresight."""
-        block, n = self.block, len(self.block.images)
-        station, attitude = _scattered(block.stations, n), np.full((n, 3), np.nan)
-        attitude[np.asarray(block.attitudes.image)] = np.asarray(block.attitudes.roll_pitch_yaw)
-        usable = ~self.image_known & np.isfinite(station).all(1) & np.isfinite(attitude).all(1)
-        who = np.flatnonzero(usable)
-        if not len(who):
+        rows = sensor_rows(self.block, self.block.start.unknowns)
+        new = ~self.image_known[rows.image]
+        if not new.any():
             return
-        unknowns = block.start.unknowns
-        none = jnp.zeros(3)
-        mounts = [unknowns.mounts.get(block.image_mount[i]) or Mount(none, none) for i in who]
-        strips = [unknowns.strips.get(block.image_strip[i]) or StripBias(none, none) for i in who]
-        exposure = jax.tree.map(lambda v: np.asarray(v, float)[who], exposures(block))
-        # The nominal mount is in `exposure`; a stack wants trees of one shape.
-        mounts = [Mount(m.lever_arm, m.boresight, m.time_offset) for m in mounts]
-        rows = (station[who], attitude[who], _stacked(mounts), _stacked(strips), exposure)
-        exterior = jax.jit(jax.vmap(direct_orientation), compiler_options=QUICK_TO_COMPILE)(*rows)
-        self.positions[who], self.matrices[who] = np.asarray(exterior.position), np.asarray(exterior.camera_from_object)
+        exterior = direct_exterior(rows)
+        who = rows.image[new]
+        self.positions[who] = np.asarray(exterior.position)[new]
+        self.matrices[who] = np.asarray(exterior.camera_from_object)[new]
         self.image_known[who] = True
 
     def _image_space(self) -> None:
@@ -178,18 +167,6 @@ class _State:
             f"the rays of point {name} from {rays[left[0]]} images are nearly parallel, so they do not meet in a "
             f"point{more}: measure it from another position, give its coordinates, or remove it"
         )
-
-
-def _stacked(trees: list):
-    """One tree with a leading axis, of trees of one shape."""
-    return jax.tree.map(lambda *leaves: np.stack([np.asarray(v, float) for v in leaves]), *trees)
-
-
-def _scattered(rows: Rows, n: int) -> np.ndarray:
-    """Rows as a table (n, 3), NaN where there is none."""
-    table = np.full((n, 3), np.nan)
-    table[np.asarray(rows.who), np.asarray(rows.axis)] = np.asarray(rows.value)
-    return table
 
 
 def _rows_of(rows: Rows, wanted):

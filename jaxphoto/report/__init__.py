@@ -1,6 +1,7 @@
 """Tables, plots, the HTML report and the result folder of an adjustment."""
 
-from jaxphoto.report.page import report_page
+from jaxphoto.report.boresight import print_boresight, write_boresight
+from jaxphoto.report.page import STYLE, report_page
 from jaxphoto.report.plots import correlation_figure, layout_figure, residuals_figure
 from jaxphoto.report.results import check_target, summary_of, write_results
 from jaxphoto.report.tables import Tables
@@ -8,6 +9,6 @@ from jaxphoto.report.terminal import print_adjustment
 from jaxphoto.report.verdict import warnings_of
 
 __all__ = [
-    "Tables", "check_target", "correlation_figure", "layout_figure", "print_adjustment", "report_page",
-    "residuals_figure", "summary_of", "warnings_of", "write_results",
+    "STYLE", "Tables", "check_target", "correlation_figure", "layout_figure", "print_adjustment", "print_boresight",
+    "report_page", "residuals_figure", "summary_of", "warnings_of", "write_boresight", "write_results",
 ]  # fmt: skip

@@ -11,16 +11,17 @@ from matplotlib.figure import Figure
 
 from jaxphoto.report.plots import correlation_figure, layout_figure, residuals_figure
 from jaxphoto.report.tables import Tables
-from jaxphoto.report.verdict import LEAST_CHECKED
+from jaxphoto.statistics import LEAST_CHECKED
 
-_PAGE = """<!DOCTYPE html>
-<html lang="en"><head><meta charset="utf-8"><title>{{ title }}</title><style>
+STYLE = """\
 body { font: 15px/1.45 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: #222 }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; margin: .5rem 0 1.5rem; font-size: 13px }
 th, td { padding: .2rem .7rem; border-bottom: 1px solid #ddd; text-align: right } th { background: #f4f4f4 }
 th:first-child, td:first-child { text-align: left } img { max-width: 100% } .wide { overflow-x: auto }
 .good { color: #176b2c } .bad { color: #a11 } .warning { border-left: 4px solid #d90; padding-left: .6rem; margin: .4rem 0 }
-</style></head><body>
+"""
+_PAGE = """<!DOCTYPE html>
+<html lang="en"><head><meta charset="utf-8"><title>{{ title }}</title><style>{{ style }}</style></head><body>
 <h1>{{ title }}</h1>
 <p class="{{ 'good' if converged else 'bad' }}"><b>{{ outcome }}</b> ({{ steps }} iterations)</p>
 <p>&sigma;<sub>0</sub> = <b>{{ sigma0 }}</b>, redundancy {{ redundancy }}: {{ counts }}.
@@ -56,6 +57,7 @@ def report_page(tables: Tables, warnings: list[str]) -> str:
         Environment(autoescape=True)
         .from_string(_PAGE)
         .render(
+            style=STYLE,
             title=a.block.title or "jaxphoto adjustment",
             converged=bool(a.converged),
             outcome=a.outcome.value,

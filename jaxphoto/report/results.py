@@ -4,6 +4,8 @@ import json
 import shutil
 import tempfile
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 
@@ -20,6 +22,8 @@ _TABLES = (
     "correlation",
     "correlation_summary",
 )
+# Written beside them where the files of the block were in an EPSG system.
+_MAP_TABLES = ("exterior_map", "object_points_map")
 _PACKAGES = ("jaxphoto", "jax", "optimistix", "equinox", "lineax", "numpy", "pandas")
 
 
@@ -37,23 +41,39 @@ def write_results(tables: Tables, warnings: list[str], directory: Path, seconds:
     `seconds` (read, compile, solve, covariance) goes into summary.json with the time of writing. Raises InputError
     where `directory` holds something that is not an earlier result.
     """
-    check_target(directory)
     began = time.perf_counter()
+    with made_whole(directory) as work:
+        in_map = tables.adjusted.block.frame.kind == "epsg"
+        for name in (*_TABLES, *(_MAP_TABLES if in_map else ())):
+            getattr(tables, name).to_csv(work / f"{name}.csv", index=False)
+        (work / "report.html").write_text(report_page(tables, warnings), encoding="utf-8")
+        summary = summary_of(tables, warnings, seconds | {"write": time.perf_counter() - began})
+        write_summary(summary, work)
+
+
+@contextmanager
+def made_whole(directory: Path) -> Iterator[Path]:
+    """A folder to write into, which takes the place of `directory` when all is written, and is removed on an error.
+
+    Raises InputError where `directory` holds something that is not an earlier result.
+    """
+    check_target(directory)
     directory.parent.mkdir(parents=True, exist_ok=True)
     work = Path(tempfile.mkdtemp(prefix=f".{directory.name}-", dir=directory.parent))
     try:
         work.chmod(0o755)
-        for name in _TABLES:
-            getattr(tables, name).to_csv(work / f"{name}.csv", index=False)
-        (work / "report.html").write_text(report_page(tables, warnings), encoding="utf-8")
-        summary = summary_of(tables, warnings, seconds | {"write": time.perf_counter() - began})
-        (work / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+        yield work
         if directory.exists():
             shutil.rmtree(directory)
         work.rename(directory)
     except BaseException:
         shutil.rmtree(work, ignore_errors=True)
         raise
+
+
+def write_summary(summary: dict, directory: Path) -> None:
+    """summary.json, by which a folder of results is known."""
+    (directory / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
 
 
 def summary_of(tables: Tables, warnings: list[str], seconds: dict[str, float]) -> dict:
@@ -73,5 +93,10 @@ def summary_of(tables: Tables, warnings: list[str], seconds: dict[str, float]) -
         "georeferencing": {p: {"value": v, "sigma": s} for p, v, s in tables.georeferencing.itertuples(index=False)},
         "seconds": {name: round(value, 6) for name, value in seconds.items()},
         "warnings": warnings,
-        "versions": {name: version(name) for name in _PACKAGES},
+        "versions": versions(),
     }
+
+
+def versions() -> dict[str, str]:
+    """Versions of jaxphoto and of what its numbers depend on."""
+    return {name: version(name) for name in _PACKAGES}

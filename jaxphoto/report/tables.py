@@ -104,6 +104,29 @@ class Tables:
         return table
 
     @cached_property
+    def exterior_map(self) -> pd.DataFrame:
+        """image, position in the system of the block's files, and omega, phi, kappa against grid east, north and up."""
+        exterior, system = self.adjusted.unknowns.exterior, self.adjusted.block.frame.map
+        position = np.asarray(exterior.position)
+        camera_from_grid = np.asarray(exterior.camera_from_object) @ system.local_from_grid(position)
+        table = self._map_coordinates(position)
+        table[["omega_deg", "phi_deg", "kappa_deg"]] = np.degrees(np.asarray(_ANGLES(camera_from_grid)))
+        table.insert(0, "image", self.adjusted.block.images)
+        return table
+
+    @cached_property
+    def object_points_map(self) -> pd.DataFrame:
+        """point and its coordinates in the system of the block's files."""
+        table = self._map_coordinates(np.asarray(self.adjusted.unknowns.points))
+        table.insert(0, "point", self.adjusted.block.points)
+        return table
+
+    def _map_coordinates(self, local: np.ndarray) -> pd.DataFrame:
+        system = self.adjusted.block.frame.map
+        names = ["longitude_deg", "latitude_deg", "height_m"] if system.geographic else ["E_m", "N_m", "H_m"]
+        return pd.DataFrame(system.map(local), columns=names)
+
+    @cached_property
     def object_points(self) -> pd.DataFrame:
         """point, coordinates, sigmas, and in how many images it was measured."""
         names = [f"{a}_m" for a in AXES]

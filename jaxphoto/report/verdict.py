@@ -7,28 +7,29 @@ import numpy as np
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.camera import Sensor
 from jaxphoto.report.tables import Tables
-from jaxphoto.statistics import SIGNIFICANT_RATIO, Correlations
+from jaxphoto.report.weakness import weaknesses
+from jaxphoto.statistics import LEAST_CHECKED, SIGNIFICANT_RATIO, Correlations
 
 HIGH_CORRELATION = 0.9
 HIGH_OWN_CORRELATION = 0.95
 LARGE_W = 4.0
-LEAST_CHECKED = 0.01
-"""Redundancy number below which a normalised residual is mostly rounding and judges nothing."""
 _SHOWN = 4
 
 
 def warnings_of(tables: Tables) -> list[str]:
-    """Non-convergence, high correlations, insignificant IOP, large residuals, range of the distortion model."""
+    """Non-convergence, weaknesses, high correlations, insignificant IOP, large residuals, range of the distortion."""
     adjusted, found = tables.adjusted, []
     if not bool(adjusted.converged):
         found.append(adjusted.outcome.value)
     for camera, c in tables.correlations.items():
-        found += _correlated(camera, c)
-    weak = [s for s in tables.significance if not s.significant]
+        weak = weaknesses(tables, camera, c)
+        found += [w.sentence for w in weak]
+        found += _correlated(camera, c, frozenset().union(*(w.explains for w in weak)))
     found += [
         f"{s.parameter} of camera {s.camera} is not significant: |value| is {s.ratio:.1f} sigma (asked: "
         f"{SIGNIFICANT_RATIO:.0f}; t-test p = {s.p_value:.2g}); consider holding it fixed"
-        for s in weak
+        for s in tables.significance
+        if not s.significant
     ]
     found += _large_residuals(tables)
     found += [
@@ -40,7 +41,8 @@ def warnings_of(tables: Tables) -> list[str]:
     return found
 
 
-def _correlated(camera: str, c: Correlations) -> list[str]:
+def _correlated(camera: str, c: Correlations, explained: frozenset[tuple[str, str]]) -> list[str]:
+    """High correlations, but for the pairs of exterior and interior orientation that are `explained` already."""
     found = []
     pairs = [
         (abs(c.interior[i, j]), c.interior[i, j], a, c.parameters[j])
@@ -54,7 +56,8 @@ def _correlated(camera: str, c: Correlations) -> list[str]:
         )
     if len(c.images) == 0:
         return found
-    worst = c.max_abs
+    told = [[(e, p) in explained for p in c.parameters] for e in c.eop_names]
+    worst = np.where(np.reshape(told, c.max_abs.shape), 0.0, c.max_abs)
     for i, j in sorted(np.argwhere(worst > HIGH_CORRELATION).tolist(), key=lambda k: -worst[k[0], k[1]])[:_SHOWN]:
         image = c.images[int(np.abs(c.exterior[:, i, j]).argmax())]
         found.append(

@@ -8,8 +8,8 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxphoto.block import Block, exposures
 from jaxphoto.collinearity import ExteriorOrientation, project
-from jaxphoto.georeferencing import Mount, StripBias, apparent_point, recorded_attitude, sensor_position
-from jaxphoto.rotation import roll_pitch_yaw_from_matrix
+from jaxphoto.georeferencing import Mount, StripBias, apparent_point
+from jaxphoto.simulation.flight import recorded
 from jaxphoto.unknowns import Unknowns
 
 
@@ -65,7 +65,5 @@ def _georeferenced(block: Block, truth: Unknowns) -> tuple[Float[Array, "station
     stack = lambda trees: jax.tree.map(lambda *v: jnp.stack([jnp.asarray(x) for x in v]), *trees)  # noqa: E731
     mount, strip = stack(mounts), stack(strips)
     exterior, exposure = jax.tree.map(jnp.asarray, (truth.exterior, exposures(block)))
-    sensors = jax.vmap(sensor_position)(exterior.position, exterior.camera_from_object, mount, strip, exposure)
-    bodies = jax.vmap(recorded_attitude)(exterior.camera_from_object, mount, exposure)
-    angles = jax.vmap(roll_pitch_yaw_from_matrix)(bodies)
+    sensors, angles = jax.vmap(recorded)(exterior.position, exterior.camera_from_object, mount, strip, exposure)
     return sensors[block.stations.who, block.stations.axis], angles[np.asarray(block.attitudes.image)]

@@ -20,6 +20,8 @@ from jaxphoto.adjustment.result import Factored
 from jaxphoto.adjustment.structure import Structure
 from jaxphoto.statistics.covariance import Cofactors, Covariance
 
+LEAST_CHECKED = 0.01
+"""Redundancy number below which a normalised residual is mostly rounding and judges nothing."""
 # Below this redundancy number an observation is not checked at all: no normalised residual is given.
 _UNCHECKED = 1e-6
 

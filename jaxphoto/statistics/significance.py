@@ -1,8 +1,8 @@
-"""Is an interior orientation parameter significant? The ratio to its sigma, and the t-test."""
+"""Is an interior orientation parameter significant, sigma naught too large, a residual a blunder? Ratio and tests."""
 
 import equinox as eqx
 import numpy as np
-from jax.scipy.special import betainc
+from jax.scipy.special import betainc, gammaincc, ndtri
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.camera import get_parameter
@@ -51,3 +51,13 @@ def student_p(t: float, degrees_of_freedom: int) -> float:
     if not np.isfinite(t):
         return 0.0
     return float(betainc(degrees_of_freedom / 2, 0.5, degrees_of_freedom / (degrees_of_freedom + t * t)))
+
+
+def chi_square_p(square_sum: float, redundancy: int) -> float:
+    """Probability that v'Pv is as large as this or larger if the a priori sigmas are true; 1 without redundancy."""
+    return float(gammaincc(redundancy / 2, square_sum / 2)) if redundancy > 0 else 1.0
+
+
+def critical_value(level: float) -> float:
+    """What a standard normal value exceeds in size with probability `level`."""
+    return float(-ndtri(level / 2))

@@ -20,7 +20,6 @@ from tests.blocks import (
     all_stations,
     bare,
     covariance_of,
-    joined,
     measured,
     rows,
     simulated,
@@ -122,7 +121,7 @@ def test_free_shifts_leave_the_position():
     "observations",
     [
         {"control": rows((3, 4, 37))},
-        {"control": joined(rows((3, 4), (0, 1)), rows((3, 20, 36), (2,)))},
+        {"control": Rows.joined(rows((3, 4), (0, 1)), rows((3, 20, 36), (2,)))},
         {"fixed": rows((3, 4, 37), sigma=0.0)},
         {"stations": rows(range(10), sigma=0.1)},
         {"attitudes": all_attitudes(BARE.block), "control": rows((20,)), "distances": BAR},

@@ -133,7 +133,6 @@ CASES = {
     "no camera": ([(T, "", 'title = "x"\n')], ["block.toml", "no camera", "add"]),
     "camera default": ([(T, "[mounts.default]", "[cameras.default]")], ["block.toml", "default", "another"]),
     "strip default": ([(I, "kodak,two", "kodak,default")], ["images.csv, row 4", "default", "another name"]),
-    "map frame": ([(T, '"local"', '"epsg"')], ["block.toml", "[frame] kind", "convert"]),
     "unknown frame": ([(T, '"local"', '"utm"')], ["block.toml", "utm", '"enu"']),
     "unknown datum": ([(T, '"inner"', '"outer"')], ["block.toml", "[datum] kind", '"minimal"']),
     "over without inner": ([(T, '"inner"', '"control"')], ["block.toml", "[datum] over", "remove"]),

@@ -42,8 +42,8 @@ def read_control(table: Table, approximations: Table, points: Points, settings: 
 
     # Rows of points that no image shows are checked like the others before they are dropped.
     role, rows = _read_rows(table, _find(table, points), settings)
-    role, rows = role[rows.who >= 0], _take(rows, rows.who >= 0)
-    by_role = {name: _take(rows, role == name) for name in ROLES}
+    role, rows = role[rows.who >= 0], rows.take(rows.who >= 0)
+    by_role = {name: rows.take(role == name) for name in ROLES}
     held = np.zeros(len(points.ids), bool)
     for name in ("control", "fixed"):
         given = by_role[name]
@@ -106,11 +106,6 @@ def _read_rows(table: Table, point: np.ndarray, settings: Settings) -> tuple[np.
     sigma = np.nan_to_num(sigma)
     rows = Rows(point[lines], axes, jnp.asarray(value[lines, axes]), jnp.asarray(sigma[lines, axes]))
     return role[lines], rows
-
-
-def _take(rows: Rows, chosen: np.ndarray) -> Rows:
-    value, sigma = (jnp.asarray(np.asarray(v)[chosen]) for v in (rows.value, rows.sigma))
-    return Rows(rows.who[chosen], rows.axis[chosen], value, sigma)
 
 
 def check_datum_points(over: object, points: Points, file: str) -> None:

@@ -2,12 +2,18 @@
 
 from typing import NamedTuple
 
+from jaxphoto.block import Frame
+from jaxphoto.georeferencing.map_frame import map_system
+
 TOML = "block.toml"
 XYZ = ("X_m", "Y_m", "Z_m")
+PLACE = ("longitude_deg", "latitude_deg", "height_m")
 SIGMA_XYZ = ("sigma_X_m", "sigma_Y_m", "sigma_Z_m")
 ANGLES = ("omega_deg", "phi_deg", "kappa_deg")
 ATTITUDE = ("roll_deg", "pitch_deg", "yaw_deg")
 SIGMA_ATTITUDE = ("sigma_roll_deg", "sigma_pitch_deg", "sigma_yaw_deg")
+VELOCITY = ("vX_m_per_s", "vY_m_per_s", "vZ_m_per_s")
+RATE = ("rate_right_deg_per_s", "rate_forward_deg_per_s", "rate_up_deg_per_s")
 
 
 class Layout(NamedTuple):
@@ -26,8 +32,21 @@ LAYOUTS = {
         ("x_mm", "y_mm", "column_px", "row_px", "sigma_x_mm", "sigma_y_mm", "sigma_px"),
     ),
     "control_points": Layout(False, ("point",), (*XYZ, *SIGMA_XYZ, "role")),
-    "stations": Layout(False, ("image", *XYZ), SIGMA_XYZ),
-    "attitudes": Layout(False, ("image", *ATTITUDE), SIGMA_ATTITUDE),
+    "stations": Layout(False, ("image", *XYZ), (*SIGMA_XYZ, *VELOCITY)),
+    "attitudes": Layout(False, ("image", *ATTITUDE), (*SIGMA_ATTITUDE, *RATE)),
     "object_points": Layout(False, ("point", *XYZ)),
     "distances": Layout(False, ("point_a", "point_b", "distance_m"), ("sigma_m",)),
 }
+
+
+def coordinate_names(frame: Frame) -> tuple[str, ...]:
+    """The columns in which the files of a block in `frame` give coordinates."""
+    geographic = frame.code is not None and map_system(frame.code).is_geographic
+    return PLACE if geographic else XYZ
+
+
+def layout_in(frame: Frame, name: str) -> Layout:
+    """The layout of a table of a block in `frame`."""
+    layout, names = LAYOUTS[name], dict(zip(XYZ, coordinate_names(frame), strict=True))
+    needed, optional = (tuple(names.get(c, c) for c in columns) for columns in (layout.columns, layout.optional))
+    return Layout(layout.needed, needed, optional)

@@ -12,30 +12,39 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jaxphoto.block import Block, Start
+from jaxphoto.block import Block, Frame, Start
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import Mount
+from jaxphoto.io.block_folder.attitude_units import check_attitude_units
 from jaxphoto.io.block_folder.control import check_datum_points, read_control
+from jaxphoto.io.block_folder.flight import read_flight
+from jaxphoto.io.block_folder.frame_sections import read_corrections, read_frame
 from jaxphoto.io.block_folder.georeferencing import read_attitudes, read_distances, read_stations
 from jaxphoto.io.block_folder.image_points import check_rays, read_image_points
-from jaxphoto.io.block_folder.images import check_times, read_images
-from jaxphoto.io.block_folder.layout import LAYOUTS, TOML
+from jaxphoto.io.block_folder.images import Images, check_times, read_images
+from jaxphoto.io.block_folder.layout import LAYOUTS, TOML, layout_in
+from jaxphoto.io.block_folder.map_tables import origin_of, tables_to_local
+from jaxphoto.io.block_folder.motion import Flight, check_time_offsets, read_motion
 from jaxphoto.io.block_folder.mount_sections import read_mounts, read_strips
-from jaxphoto.io.block_folder.settings import read_settings, read_toml
+from jaxphoto.io.block_folder.section import Section
+from jaxphoto.io.block_folder.settings import Settings, read_settings, read_toml
 from jaxphoto.io.tables import Table, read_csv
+from jaxphoto.io.trajectory import Records, read_records
 from jaxphoto.unknowns import Unknowns, default_priors
+from jaxphoto.variants import MODES
 
 
 @dataclasses.dataclass(frozen=True)
 class BlockTables:
     """What a block folder says, not yet checked: the content of block.toml and the tables by name of `LAYOUTS`.
 
-    `file` is what messages call the settings.
+    `file` is what messages call the settings; `trajectory` is what the file named under [trajectory] gives.
     """
 
     settings: Mapping[str, Any]
     tables: Mapping[str, Table]
     file: str = TOML
+    trajectory: Records | None = None
 
 
 def read_block(folder: str | Path) -> Block:
@@ -55,18 +64,27 @@ def read_folder(folder: Path) -> BlockTables:
     for file in needed:
         if not (folder / file).is_file():
             raise InputError(f"{folder} has no file {file}; add it ({', '.join(needed)} are needed)")
-    tables = {}
-    for name, layout in LAYOUTS.items():
-        path = folder / f"{name}.csv"
+    settings, tables = read_toml(folder / TOML), {}
+    top = Section(TOML, "", settings)
+    frame, flight = read_frame(top.section("frame")), top.section("trajectory")
+    for name in LAYOUTS:
+        path, layout = folder / f"{name}.csv", layout_in(frame, name)
         if path.exists():
             tables[name] = read_csv(path, layout.columns, layout.optional)
-    return BlockTables(read_toml(folder / TOML), tables)
+    trajectory = read_records(folder / flight.text("file")) if flight.values else None
+    return BlockTables(settings, tables, trajectory=trajectory)
 
 
 def assemble(source: BlockTables) -> Block:
     """The block that settings and tables describe; all checks that need more than one line are made here."""
-    tables = {name: source.tables.get(name, _empty(name)) for name in LAYOUTS}
     settings = read_settings(dict(source.settings), source.file)
+    given = {name: source.tables.get(name, _empty(name, settings.frame)) for name in LAYOUTS}
+    frame = _located(settings.frame, given, source)
+    tables = tables_to_local(given, frame) if frame.kind == "epsg" else given
+    if frame.kind == "grid":
+        message = f'{source.file}: map-grid coordinates are not Cartesian; [frame] kind = "epsg" converts them exactly'
+        warnings.warn(message, UserWarning, stacklevel=3)
+    corrections = read_corrections(settings.corrections, frame)
     images = read_images(tables["images"], settings)
     points = read_image_points(tables["image_points"], images, settings)
     control = read_control(tables["control_points"], tables["object_points"], points, settings)
@@ -82,6 +100,11 @@ def assemble(source: BlockTables) -> Block:
     used = {mount for mount in mount_of.values() if mount}
     strips, strip_priors = read_strips(settings.strips, _distinct(images.strips))
     check_times(images, strips, strip_priors)
+    image_mount = tuple(mount_of[camera] for camera in images.cameras)
+    flight = _flight(source, tables, images, frame, settings)
+    check_time_offsets(flight, image_mount, mounts, mount_priors, images, source.file)
+    if source.trajectory is None:
+        check_attitude_units(given["attitudes"], flight.stations, images)
 
     start = Unknowns(
         {name: camera.interior for name, camera in cameras.items()},
@@ -96,30 +119,64 @@ def assemble(source: BlockTables) -> Block:
         mounts=_only(mount_priors, used),
         strips=strip_priors,
     )
-    return Block(
+    block = Block(
         title=settings.title,
         images=images.ids,
         points=points.ids,
         sensors={name: camera.sensor for name, camera in cameras.items()},
         image_camera=images.cameras,
-        image_mount=tuple(mount_of[camera] for camera in images.cameras),
+        image_mount=image_mount,
         image_strip=images.strips,
         image_time=jnp.asarray(images.times),
         image_points=points.rows,
         control=control.control,
         fixed=control.fixed,
         check=control.check,
-        stations=read_stations(tables["stations"], images, settings),
-        attitudes=read_attitudes(tables["attitudes"], images, settings),
+        stations=flight.stations,
+        attitudes=flight.attitudes,
         distances=read_distances(tables["distances"], points, settings),
         datum=settings.datum,
         start=Start(start, images.known, control.known),
         priors=priors,
+        motion=flight.motion,
+        frame=frame,
+        corrections=corrections,
     )
+    return MODES[settings.mode](block)
 
 
-def _empty(name: str) -> Table:
-    columns = LAYOUTS[name].columns
+def _located(frame: Frame, tables: Mapping[str, Table], source: BlockTables) -> Frame:
+    """The frame with an origin: what block.toml gives, else a place amid the block."""
+    if frame.kind != "epsg" or frame.origin is not None:
+        return frame
+    origin = origin_of(tables, frame, source.trajectory)
+    if origin is None:
+        raise InputError(
+            f"{source.file}, [frame]: no coordinate tells where the block lies; add "
+            "origin = [longitude, latitude, height] in degrees and metres"
+        )
+    return dataclasses.replace(frame, origin=origin)
+
+
+def _flight(
+    source: BlockTables, tables: Mapping[str, Table], images: Images, frame: Frame, settings: Settings
+) -> Flight:
+    """Stations, attitudes and motion, from the trajectory or from their tables."""
+    stations, attitudes = tables["stations"], tables["attitudes"]
+    if source.trajectory is None:
+        motion = read_motion(stations, attitudes, images)
+        return Flight(read_stations(stations, images, settings), read_attitudes(attitudes, images, settings), *motion)
+    for table in (stations, attitudes):
+        if len(table):
+            raise InputError(
+                f"{table.file}: stations and attitudes are interpolated in {source.trajectory.file}; remove this file, "
+                f"or [trajectory] from {source.file}"
+            )
+    return read_flight(source.trajectory, images, frame, settings)
+
+
+def _empty(name: str, frame: Frame) -> Table:
+    columns = layout_in(frame, name).columns
     return Table.of(f"{name}.csv", {column: np.zeros(0, object) for column in columns})
 
 

@@ -1,4 +1,4 @@
-"""block.toml: title, frame, cameras, default sigmas, mounts, strips and datum."""
+"""block.toml: title, frame, corrections, trajectory, cameras, default sigmas, mounts, strips and datum."""
 
 import tomllib
 from pathlib import Path
@@ -6,13 +6,26 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxphoto.block import Datum
+from jaxphoto.block import Datum, Frame
 from jaxphoto.errors import InputError
 from jaxphoto.io.block_folder.camera_section import Camera, read_camera
+from jaxphoto.io.block_folder.frame_sections import read_frame
 from jaxphoto.io.block_folder.layout import TOML
 from jaxphoto.io.block_folder.section import Section
+from jaxphoto.variants import MODES
 
-_KEYS = ("title", "frame", "sigmas", "cameras", "mounts", "strips", "datum")
+_KEYS = (
+    "title",
+    "frame",
+    "corrections",
+    "trajectory",
+    "sigmas",
+    "cameras",
+    "mounts",
+    "strips",
+    "datum",
+    "georeferencing",
+)
 _SIGMAS = (
     "image_mm", "image_px", "control_m", "control_X_m", "control_Y_m", "control_Z_m", "station_m", "attitude_deg",
     "distance_m",
@@ -20,15 +33,20 @@ _SIGMAS = (
 
 
 class Settings(NamedTuple):
-    """What block.toml says; `mounts` and `strips` are read when the strips are known."""
+    """What block.toml says; sections are read when what they depend on is known."""
 
     file: str
     title: str
+    frame: Frame
+    corrections: Section
+    trajectory: Section
     sigmas: dict[str, float]
     cameras: dict[str, Camera]
     mounts: Section
     strips: Section
     datum: Datum
+    mode: str
+    """Of georeferencing: a name of `variants.MODES`."""
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -45,7 +63,6 @@ def read_settings(values: dict[str, Any], file: str = TOML) -> Settings:
     """The settings in the content of block.toml; `file` is what messages call it."""
     top = Section(file, "", values)
     top.known(*_KEYS)
-    _check_frame(top.section("frame"))
     sigmas = top.section("sigmas")
     sigmas.known(*_SIGMAS)
     cameras = top.section("cameras")
@@ -56,11 +73,15 @@ def read_settings(values: dict[str, Any], file: str = TOML) -> Settings:
     return Settings(
         file,
         top.text("title", ""),
+        read_frame(top.section("frame")),
+        top.section("corrections"),
+        top.section("trajectory"),
         {name: sigmas.positive(name) for name in sigmas},
         {name: read_camera(cameras.section(name)) for name in cameras},
         top.section("mounts"),
         top.section("strips"),
         _read_datum(top.section("datum")),
+        _read_mode(top.section("georeferencing")),
     )
 
 
@@ -77,17 +98,6 @@ def datum_section(datum: Datum) -> dict[str, Any]:
 def toml_text(values: dict[str, Any]) -> str:
     """Nested tables as TOML; numbers are written so that they come back exactly."""
     return "\n".join(_table_lines("", values)).lstrip("\n") + "\n"
-
-
-def _check_frame(section: Section) -> None:
-    kind = section.text("kind", "local")
-    if kind == "epsg":
-        raise section.error(
-            "kind",
-            "this version reads local and enu frames only; convert the coordinates to a local east-north-up frame",
-        )
-    if kind not in ("local", "enu"):
-        raise section.error("kind", f'{kind!r} is no frame; write "local" or "enu"')
 
 
 def _read_datum(section: Section) -> Datum:
@@ -111,6 +121,14 @@ def _read_datum(section: Section) -> Datum:
     if scale is not None and not isinstance(scale, bool):
         raise section.error("scale", f"{scale!r} is neither true nor false; write one of them")
     return Datum("inner", over, scale)
+
+
+def _read_mode(section: Section) -> str:
+    section.known("mode")
+    mode = section.text("mode", "integrated")
+    if mode not in MODES:
+        raise section.error("mode", f"{mode!r} is no mode; write {', '.join(MODES)}")
+    return mode
 
 
 def _table_lines(path: str, values: dict[str, Any]) -> list[str]:

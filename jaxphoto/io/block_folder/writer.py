@@ -14,16 +14,30 @@ import pandas as pd
 from jaxphoto.block import Block, Rows
 from jaxphoto.errors import BlockError, InputError
 from jaxphoto.io.block_folder.camera_section import Camera, camera_section
-from jaxphoto.io.block_folder.layout import ANGLES, ATTITUDE, LAYOUTS, SIGMA_ATTITUDE, SIGMA_XYZ, TOML, XYZ
+from jaxphoto.io.block_folder.frame_sections import corrections_section, frame_section
+from jaxphoto.io.block_folder.layout import (
+    ANGLES,
+    ATTITUDE,
+    LAYOUTS,
+    RATE,
+    SIGMA_ATTITUDE,
+    SIGMA_XYZ,
+    TOML,
+    VELOCITY,
+    XYZ,
+)
+from jaxphoto.io.block_folder.map_tables import tables_to_map
 from jaxphoto.io.block_folder.mount_sections import mount_section, strip_section
 from jaxphoto.io.block_folder.settings import datum_section, toml_text
-from jaxphoto.unknowns import FREE
+from jaxphoto.unknowns import FIXED, FREE
 
 
 def write_block(block: Block, folder: str | Path) -> None:
     """Write `block` as a folder that `read_block` reads as the same block; numbers come back exactly.
 
-    Angles are written in degrees and come back to rounding. A block folder of that name is replaced.
+    Angles are written in degrees and come back to rounding, as do coordinates of a frame of kind epsg, which are
+    written in its system (1e-6 m). Velocities are written for images with a station, rates for those with an attitude.
+    A block folder of that name is replaced.
 
     Raises InputError where `folder` holds anything else, BlockError for priors that block.toml cannot express.
     """
@@ -33,6 +47,8 @@ def write_block(block: Block, folder: str | Path) -> None:
     if folder.is_dir() and any(folder.iterdir()) and not (folder / TOML).is_file():
         raise InputError(f"{folder} is not empty and holds no block; empty it or give another folder")
     settings, tables = _settings(block), _tables(block)
+    if block.frame.kind == "epsg":
+        tables = tables_to_map(tables, block.frame)
     folder.parent.mkdir(parents=True, exist_ok=True)
     made = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
     try:
@@ -73,20 +89,36 @@ def _copy(path: Path, to: Path) -> None:
 
 def _settings(block: Block) -> dict[str, Any]:
     start, priors = block.start.unknowns, block.priors
-    if any(p is not FREE for p in jax.tree.leaves((priors.exterior, priors.points))):
-        raise BlockError("block.toml can only say FREE of exterior orientation and object points; reset their priors")
+    if any(p is not FREE for p in jax.tree.leaves(priors.points)):
+        raise BlockError("block.toml can only say FREE of object points; reset their priors")
     cameras = {
         name: camera_section(Camera(block.sensors[name], start.interior[name], priors.interior[name]))
         for name in start.interior
     }
     return {
         "title": block.title,
-        "frame": {"kind": "local"},
+        "frame": frame_section(block.frame),
+        "corrections": corrections_section(block.corrections, block.frame),
         "cameras": cameras,
         "mounts": {name: mount_section(mount, priors.mounts[name]) for name, mount in start.mounts.items()},
         "strips": {name: strip_section(bias, priors.strips[name]) for name, bias in start.strips.items()},
         "datum": datum_section(block.datum),
+        "georeferencing": _mode_section(block),
     }
+
+
+def _mode_section(block: Block) -> dict[str, str]:
+    """Nothing, or that the exterior orientation is held; what it was computed from must be gone (`variants.direct`)."""
+    priors = set(jax.tree.leaves(block.priors.exterior))
+    if priors == {FREE}:
+        return {}
+    sensors = len(block.stations.who) or len(block.attitudes.image)
+    if priors == {FIXED} and block.start.image_known.all() and not sensors:
+        return {"mode": "direct"}
+    raise BlockError(
+        "block.toml can say of exterior orientation that all of it is FREE, or FIXED at known values and no station or "
+        "attitude observed; reset its priors, or hold it by jaxphoto.variants.direct"
+    )
 
 
 def _tables(block: Block) -> dict[str, pd.DataFrame]:
@@ -95,6 +127,11 @@ def _tables(block: Block) -> dict[str, pd.DataFrame]:
     xy, sigma = np.asarray(rows.xy), np.asarray(rows.sigma)
     ends = np.asarray(distances.points)
     position = np.asarray(block.start.unknowns.points)[block.start.point_known]
+    attitudes = pd.DataFrame(
+        {"image": images[block.attitudes.image]}
+        | _columns(ATTITUDE, np.rad2deg(block.attitudes.roll_pitch_yaw))
+        | _columns(SIGMA_ATTITUDE, np.rad2deg(block.attitudes.sigma))
+    )
     return {
         "images": _images(block),
         "image_points": pd.DataFrame(
@@ -108,12 +145,8 @@ def _tables(block: Block) -> dict[str, pd.DataFrame]:
             ],
             ignore_index=True,
         ),
-        "stations": _xyz_rows("image", images, block.stations),
-        "attitudes": pd.DataFrame(
-            {"image": images[block.attitudes.image]}
-            | _columns(ATTITUDE, np.rad2deg(block.attitudes.roll_pitch_yaw))
-            | _columns(SIGMA_ATTITUDE, np.rad2deg(block.attitudes.sigma))
-        ),
+        "stations": _with_motion(_xyz_rows("image", images, block.stations), block, VELOCITY),
+        "attitudes": _with_motion(attitudes, block, RATE),
         "object_points": pd.DataFrame({"point": points[block.start.point_known]} | _columns(XYZ, position)),
         "distances": pd.DataFrame(
             {"point_a": points[ends[:, 0]], "point_b": points[ends[:, 1]]}
@@ -135,6 +168,14 @@ def _images(block: Block) -> pd.DataFrame:
         values = np.where(known[:, None], values, math.nan)
         columns |= _columns((*XYZ, *ANGLES), values)
     return pd.DataFrame(columns)
+
+
+def _with_motion(table: pd.DataFrame, block: Block, columns: tuple[str, ...]) -> pd.DataFrame:
+    if block.motion is None:
+        return table
+    values = block.motion.velocity if columns == VELOCITY else np.rad2deg(block.motion.rate)
+    place = pd.Index(block.images).get_indexer(pd.Index(table["image"]))
+    return table.assign(**_columns(columns, np.asarray(values)[place]))
 
 
 def _xyz_rows(id_column: str, ids: np.ndarray, rows: Rows) -> pd.DataFrame:

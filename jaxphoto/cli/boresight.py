@@ -1,0 +1,40 @@
+"""`jaxphoto boresight`: a block in, the misalignment of its camera in four steps out."""
+
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+import jaxphoto
+from jaxphoto.cli.app import app
+from jaxphoto.io import read_block
+from jaxphoto.procedures import boresight
+from jaxphoto.report import check_target, print_boresight, write_boresight
+
+
+@app.command("boresight")
+def boresight_command(
+    block: Annotated[Path, typer.Argument(help="Block folder (see docs/block_folder.md).")],
+    out: Annotated[Path, typer.Option(help="Folder for the results; earlier results in it are replaced.")],
+    go_on: Annotated[
+        bool, typer.Option("--go-on", help="Go on after a step that it makes no sense to go on from.")
+    ] = False,
+    max_steps: Annotated[int, typer.Option(min=1, help="Most iterations of each adjustment.")] = jaxphoto.MAX_STEPS,
+) -> None:
+    """Boresight misalignment in four steps. Exit code 1: written, but a step is not passed or not converged."""
+    check_target(out)
+    console, errors = Console(), Console(stderr=True)
+    began = time.perf_counter()
+    with errors.status("reading the block") as status:
+        read = read_block(block)
+        seconds = {"read": time.perf_counter() - began}
+        status.update(f"four adjustments of {len(read.images)} images, {len(read.points)} points")
+        steps = boresight(read, go_on=go_on, max_steps=max_steps)
+        status.update(f"writing {out}")
+        write_boresight(steps, out, seconds)
+    print_boresight(steps, console)
+    console.print(f"results in {out} (open report.html)", highlight=False)
+    if not all(step.go_on for step in steps):
+        raise typer.Exit(1)

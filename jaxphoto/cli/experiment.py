@@ -1,0 +1,54 @@
+"""`jaxphoto experiment`: published experiments, or your own, run again and printed beside what was published."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from jaxphoto.cli.app import app
+from jaxphoto.experiment import (
+    check_run_target,
+    compare,
+    find_experiments,
+    load_experiment,
+    run_experiment,
+    write_run,
+)
+
+
+@app.command("experiment")
+def experiment_command(
+    name: Annotated[str, typer.Argument(help="Folder of the experiment (000, 003, 004), or all.")],
+    out: Annotated[Path, typer.Option(help="Folder for the results, one sub-folder an experiment.")] = Path("results"),
+    experiments: Annotated[Path, typer.Option(help="Folder that holds the experiments.")] = Path("experiments"),
+    layouts: Annotated[int | None, typer.Option(min=1, help="Simulated layouts; the experiment's own number if not given.")] = None,
+) -> None:
+    """Run experiments; write tables.csv and report.html, ours beside what the paper prints."""
+    chosen = find_experiments(experiments, name)
+    for folder in chosen:
+        check_run_target(out / folder.name)
+    console, errors = Console(), Console(stderr=True)
+    for folder in chosen:
+        experiment = load_experiment(folder)
+        with errors.status(folder.name) as status:
+            run = run_experiment(experiment, folder, layouts, lambda text, f=folder: status.update(f"{f.name}: {text}"))
+        write_run(run, folder, out / folder.name)
+        table = compare(run, folder)
+        console.print(_judgement(experiment.title, table))
+        for failure in run.failures:
+            console.print(f"left out: {failure}", highlight=False)
+        console.print(f"results in {out / folder.name} (open report.html)", highlight=False)
+
+
+def _judgement(title: str, table) -> Table:
+    """How many cells of each table are within their tolerance, and which are not."""
+    shown = Table(title=title)
+    for heading in ("table", "within", "of", "not within (ours, published)"):
+        shown.add_column(heading)
+    for name, cells in table.groupby("table", sort=False):
+        judged, bad = cells[cells["within"] != ""], cells[cells["within"] == "no"]
+        listed = "; ".join(f"{r.row} {r.column} ({r.ours:.4g}, {r.published:.4g})" for r in bad.itertuples())
+        shown.add_row(str(name), str((judged["within"] == "yes").sum()), str(len(judged)), listed)
+    return shown

@@ -1,0 +1,26 @@
+"""Experiments: variants of simulated blocks whose tables stand beside what papers print."""
+
+from jaxphoto.experiment.comparison import compare, read_published
+from jaxphoto.experiment.declaration import Cells, Experiment, Measure, Results, Variant
+from jaxphoto.experiment.folder import check_run_target, find_experiments, load_experiment, write_run
+from jaxphoto.experiment.measures import (
+    boresight_correlation,
+    check_points,
+    iops,
+    mean_correlations,
+    misalignment,
+    misalignment_agreement,
+    named,
+    orientation_differences,
+    principal_point,
+    residuals,
+    tie_point_differences,
+)
+from jaxphoto.experiment.runner import Run, run_experiment, simulated, summary
+
+__all__ = [
+    "Cells", "Experiment", "Measure", "Results", "Run", "Variant", "boresight_correlation", "check_points",
+    "check_run_target", "compare", "find_experiments", "iops", "load_experiment", "mean_correlations", "misalignment",
+    "misalignment_agreement", "named", "orientation_differences", "principal_point", "read_published", "residuals",
+    "run_experiment", "simulated", "summary", "tie_point_differences", "write_run",
+]  # fmt: skip

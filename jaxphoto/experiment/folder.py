@@ -1,0 +1,72 @@
+"""Experiments on disk: found by name, run, and written down whole."""
+
+import importlib.util
+import shutil
+import tempfile
+from pathlib import Path
+
+from jaxphoto.errors import InputError
+from jaxphoto.experiment.comparison import compare
+from jaxphoto.experiment.declaration import Experiment
+from jaxphoto.experiment.page import experiment_page
+from jaxphoto.experiment.runner import Run
+
+FILE = "experiment.py"
+
+
+def find_experiments(directory: Path, name: str) -> list[Path]:
+    """The folders of the experiment `name`, or of `all`, in `directory`. Raises InputError where there is none."""
+    known = sorted(path.parent for path in directory.glob(f"*/{FILE}"))
+    if not known:
+        raise InputError(
+            f"{directory} holds no experiments (folders with {FILE}); go to the folder that has experiments/, or name it "
+            "with --experiments"
+        )
+    chosen = known if name == "all" else [path for path in known if path.name == name]
+    if not chosen:
+        raise InputError(f"there is no experiment {name} in {directory}; choose {', '.join(p.name for p in known)} or all")
+    return chosen
+
+
+def load_experiment(folder: Path) -> Experiment:
+    """The EXPERIMENT that experiment.py in `folder` declares. Raises InputError where it does not."""
+    path = folder / FILE
+    spec = importlib.util.spec_from_file_location(f"jaxphoto_experiment_{folder.name}", path)
+    if spec is None or spec.loader is None or not path.is_file():
+        raise InputError(f"there is no file {path}; an experiment is a folder with {FILE}")
+    module = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        raise InputError(f"{path} cannot be run ({type(error).__name__}: {error}); correct it") from error
+    experiment = getattr(module, "EXPERIMENT", None)
+    if not isinstance(experiment, Experiment):
+        raise InputError(f"{path} declares no EXPERIMENT; end it with EXPERIMENT = Experiment(...)")
+    return experiment
+
+
+def write_run(run: Run, folder: Path, out: Path) -> None:
+    """tables.csv, cells.csv (every layout) and report.html in `out`, made whole and then moved into place.
+
+    `folder` is the experiment's. Raises InputError where `out` holds something else than an earlier run.
+    """
+    check_run_target(out)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as place:
+        made = Path(place) / "run"
+        made.mkdir()
+        table = compare(run, folder)
+        table.to_csv(made / "tables.csv", index=False)
+        run.cells.to_csv(made / "cells.csv", index=False)
+        (made / "report.html").write_text(experiment_page(run, table), encoding="utf-8")
+        if out.exists():
+            shutil.move(out, Path(place) / "old")
+        made.rename(out)
+
+
+def check_run_target(out: Path) -> None:
+    """Raise InputError where a run must not be written."""
+    if out.is_file():
+        raise InputError(f"{out} is a file: name a folder for the results")
+    if out.is_dir() and any(out.iterdir()) and not (out / "tables.csv").is_file():
+        raise InputError(f"{out} is not empty and holds no earlier run: name a new folder")

@@ -1,0 +1,104 @@
+"""Running an experiment: draw layouts, adjust every variant of each, average what the tables ask for."""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from jaxphoto.errors import InputError, JaxphotoError
+from jaxphoto.experiment.declaration import Experiment, Variant
+from jaxphoto.io.block_folder.settings import read_toml
+from jaxphoto.io.recipe import recipe_from
+from jaxphoto.procedures import adjust
+from jaxphoto.report import Tables
+from jaxphoto.simulation import Recipe, Simulation, simulate
+
+Progress = Callable[[str], None]
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """What an experiment gave: the cells of every layout, the first layout's adjustments, and what went wrong.
+
+    `cells` has the columns table, row, column, layout, value.
+    """
+
+    experiment: Experiment
+    cells: pd.DataFrame
+    first: Mapping[str, Tables]
+    failures: tuple[str, ...]
+
+
+def run_experiment(
+    experiment: Experiment, folder: Path, layouts: int | None = None, progress: Progress = lambda _: None
+) -> Run:
+    """Run `experiment`, whose recipes lie in `folder`. `progress` is told of every adjustment.
+
+    A layout in which a variant cannot be adjusted is left out and told of in `failures`. Raises InputError where no
+    layout is left, and for recipes that cannot be read.
+    """
+    recipes = {name: _recipe(variant, folder) for name, variant in experiment.variants.items()}
+    rows, failures, first = [], [], {}
+    for layout in range(layouts or experiment.layouts):
+        try:
+            results = _adjusted(experiment, recipes, layout, progress)
+        except JaxphotoError as error:
+            failures.append(f"layout {layout}: {error}")
+            continue
+        first = first or results
+        rows += [
+            (table, row, column, layout, value)
+            for table, measure in experiment.tables.items()
+            for (row, column), value in measure(results).items()
+        ]
+    if not first:
+        raise InputError(f"{folder}: no layout could be adjusted; the first says: {failures[0]}")
+    cells = pd.DataFrame(rows, columns=["table", "row", "column", "layout", "value"])
+    return Run(experiment, cells, first, tuple(failures))
+
+
+def simulated(experiment: Experiment, folder: Path, variant: str, layout: int = 0) -> Simulation:
+    """The block of one variant, before `Variant.change`, with its truth."""
+    return simulate(_recipe(experiment.variants[variant], folder), layout)
+
+
+def _adjusted(
+    experiment: Experiment, recipes: Mapping[str, Recipe], layout: int, progress: Progress
+) -> dict[str, Tables]:
+    blocks: dict[Any, Simulation] = {}
+    results = {}
+    for name, variant in experiment.variants.items():
+        progress(f"layout {layout}, {name}")
+        key = (variant.file, repr(variant.recipe))
+        if key not in blocks:
+            blocks[key] = simulate(recipes[name], layout)
+        adjusted = adjust(variant.change(blocks[key].block))
+        if not bool(adjusted.converged):
+            raise InputError(f"{name}: {adjusted.outcome.value}")
+        results[name] = Tables(adjusted)
+    return results
+
+
+def _recipe(variant: Variant, folder: Path) -> Recipe:
+    path = folder / variant.file
+    if not path.is_file():
+        raise InputError(f"there is no recipe {path}; add it, or correct the variant's file")
+    values = read_toml(path)
+    return recipe_from(_merged(values, variant.recipe), f"{folder.name}/{variant.file}")
+
+
+def _merged(values: Any, changes: Any) -> Any:
+    """Nested tables with `changes` in place of what they name."""
+    if not isinstance(values, Mapping) or not isinstance(changes, Mapping):
+        return changes
+    return {**values, **{key: _merged(values.get(key, {}), change) for key, change in changes.items()}}
+
+
+def summary(cells: pd.DataFrame) -> pd.DataFrame:
+    """Mean and standard deviation of every cell over the layouts: table, row, column, ours, spread, n_layouts."""
+    groups = cells.groupby(["table", "row", "column"], sort=False)["value"]
+    table = groups.agg(ours="mean", spread=lambda v: np.std(v, ddof=1) if len(v) > 1 else np.nan, n_layouts="size")
+    return table.reset_index()

@@ -1,0 +1,150 @@
+"""From an image coordinate to the ground: on a horizontal plane or a surface, with its covariance.
+
+Functions of one image and one point (monoplotting). Frames and units: docs/conventions.md, equations: docs/models.md.
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxphoto.camera import InteriorOrientation, get_parameter, parameter_names, set_parameter
+from jaxphoto.collinearity import ExteriorOrientation, image_ray
+from jaxphoto.georeferencing.corrections import NO_CORRECTIONS, Corrections, apparent_point
+from jaxphoto.rotation import small_rotation
+
+# Refraction and curvature bend a ray by some 1e-4: each round gains four digits.
+_ROUNDS = 4
+_MAX_STEPS = 60
+
+
+class Surface(eqx.Module):
+    """The ground as a height Z (m) over X and Y (m), differentiable, between the heights `low` and `high`."""
+
+    height: Callable[[Float[Array, ""], Float[Array, ""]], Float[Array, ""]]
+    low: Float[Array, ""] | float
+    high: Float[Array, ""] | float
+
+
+Ground = Surface | Float[Array, ""] | float
+"""A surface, or the Z (m) of a horizontal plane."""
+
+
+class RayCovariance(eqx.Module):
+    """Covariances of what a ground point comes from: each is known independently of the others."""
+
+    exterior: Float[Array, "6 6"]
+    """Of X, Y, Z (m) and a small rotation in the camera frame (rad), as `direct_covariance` gives it."""
+    interior: Float[Array, "k k"]
+    """Of the interior orientation, in the order of `camera.parameter_names`; zeros where it is taken as given."""
+    image: Float[Array, "2 2"]
+    """Of the measured image coordinate (mm)."""
+    height: Float[Array, ""] | float
+    """Variance of the height of plane or surface (m^2)."""
+
+
+def ground_point(
+    interior: InteriorOrientation,
+    exterior: ExteriorOrientation,
+    xy: Float[Array, "2"],
+    ground: Ground,
+    corrections: Corrections = NO_CORRECTIONS,
+) -> tuple[Float[Array, "3"], Bool[Array, ""]]:
+    """Where the ray of the measured image coordinate `xy` (mm) meets the ground (m), and whether it does.
+
+        X = X_s + s M' (x', y', -c)',    s = (Z - Z_s) / third component
+
+    On a surface, safeguarded Newton on the height finds Z = height(X, Y), and the implicit function theorem its
+    derivatives. It needs a surface that is continuous along the ray; of several meetings, as behind a ridge, it finds
+    some one. False, and a point that means nothing, where the ray is parallel to the plane or meets the ground behind
+    the camera or nowhere between `low` and `high`. Source: paper 001, equation (1), inverted.
+    """
+    origin, direction = image_ray(interior, exterior, xy)
+    upright = direction[2] == 0
+    # Double where: a horizontal ray has no NaN derivative either.
+    fall = jnp.where(upright, 1.0, direction[2])
+
+    def at_height(height: Float[Array, ""]) -> Float[Array, "3"]:
+        meet = lambda z: origin + direction * ((z - origin[2]) / fall)  # noqa: E731
+        point = meet(height)
+        for _ in range(_ROUNDS if corrections.refraction or corrections.curvature else 0):
+            aim = apparent_point(origin, point, corrections)
+            point = point + meet(aim[2]) - aim
+        return point
+
+    if isinstance(ground, Surface):
+        # In front of the camera only.
+        low = jnp.where(fall > 0, jnp.maximum(ground.low, origin[2]), ground.low)
+        high = jnp.where(fall < 0, jnp.minimum(ground.high, origin[2]), ground.high)
+        height, met = _root(lambda z: z - ground.height(*at_height(z)[:2]), low, high)
+    else:
+        height, met = jnp.asarray(ground, float), jnp.array(True)
+    return at_height(height), ~upright & ((height - origin[2]) / fall > 0) & met
+
+
+def ground_covariance(
+    interior: InteriorOrientation,
+    exterior: ExteriorOrientation,
+    xy: Float[Array, "2"],
+    ground: Ground,
+    covariance: RayCovariance,
+    corrections: Corrections = NO_CORRECTIONS,
+) -> Float[Array, "3 3"]:
+    """Covariance (m^2) of the result of `ground_point`, by first-order propagation.
+
+    On a surface, the error of its height shifts it as a whole: the point moves along the ray.
+    """
+
+    def moved(d_exterior, d_interior, d_xy, d_height):
+        new = moved_exterior(exterior, d_exterior)
+        raised = (
+            Surface(lambda x, y: ground.height(x, y) + d_height, ground.low, ground.high)
+            if isinstance(ground, Surface)
+            else ground + d_height
+        )
+        return ground_point(moved_interior(interior, d_interior), new, xy + d_xy, raised, corrections)[0]
+
+    zeros = (jnp.zeros(6), jnp.zeros(len(parameter_names(interior))), jnp.zeros(2), jnp.zeros(()))
+    by_exterior, by_interior, by_xy, by_height = jax.jacfwd(moved, argnums=(0, 1, 2, 3))(*zeros)
+    from_images = by_exterior @ covariance.exterior @ by_exterior.T + by_xy @ covariance.image @ by_xy.T
+    from_camera = by_interior @ covariance.interior @ by_interior.T
+    return from_images + from_camera + covariance.height * jnp.outer(by_height, by_height)
+
+
+def moved_exterior(exterior: ExteriorOrientation, step: Float[Array, "6"]) -> ExteriorOrientation:
+    """The orientation after a shift (m) and a small rotation in the camera frame (rad)."""
+    return ExteriorOrientation(
+        exterior.position + step[:3], small_rotation(step[3:]) @ jnp.asarray(exterior.camera_from_object)
+    )
+
+
+def moved_interior(interior: InteriorOrientation, step: Float[Array, "k"]) -> InteriorOrientation:
+    """The interior orientation with `step` added to its parameters, in the order of `camera.parameter_names`."""
+    for k, name in enumerate(parameter_names(interior)):
+        interior = set_parameter(interior, name, get_parameter(interior, name) + step[k])
+    return interior
+
+
+def _root(f: Callable, low: Float[Array, ""], high: Float[Array, ""]) -> tuple[Float[Array, ""], Bool[Array, ""]]:
+    """The z in [low, high] with f(z) = 0, f(low) <= 0 <= f(high), and whether there is one; differentiable."""
+    low, high = jax.lax.stop_gradient((low, high))
+    enough = 1e-12 * (1 + jnp.maximum(jnp.abs(low), jnp.abs(high)))
+
+    def newton(f, z):
+        def unfinished(state):
+            k, _, low, high, value, _ = state
+            return (k < _MAX_STEPS) & (jnp.abs(value) > enough) & (high - low > enough)
+
+        def step(state):
+            k, z, low, high, value, slope = state
+            low, high = jnp.where(value < 0, z, low), jnp.where(value < 0, high, z)
+            new = z - value / slope
+            new = jnp.where((new > low) & (new < high), new, 0.5 * (low + high))
+            return k + 1, new, low, high, *jax.jvp(f, (new,), (jnp.ones(()),))
+
+        return jax.lax.while_loop(unfinished, step, (0, z, low, high, *jax.jvp(f, (z,), (jnp.ones(()),))))[1]
+
+    z = jax.lax.custom_root(f, 0.5 * (low + high), newton, lambda g, y: y / g(jnp.ones(())))
+    return z, (low <= high) & (jnp.abs(f(z)) <= 1e3 * enough)

@@ -1,0 +1,95 @@
+"""Forward intersection of held images with the covariance of the points, correlations by common errors included.
+
+The residual r (mm) of a ray depends on its point X, on errors e of its own (image noise, its image's orientation) and
+on errors m that many rays share (a mount, a camera). Weighted by the image sigmas, as an adjustment with held images
+does,
+
+    dX = - sum J r,    J = (sum A' P A)^-1 A' P,    A = dr / dX
+    Q  = sum J (dr/de Q_e dr/de') J' + (sum J dr/dm) Q_m (sum J dr/dm)'
+
+`ray_partials` is of one image and one point; the others are of all rows at once, summed over the rows of each point.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxphoto.camera import InteriorOrientation, parameter_names
+from jaxphoto.collinearity import ExteriorOrientation, image_residual
+from jaxphoto.georeferencing.corrections import NO_CORRECTIONS, Corrections, apparent_point
+from jaxphoto.georeferencing.ground import moved_exterior, moved_interior
+
+
+class RayPartials(NamedTuple):
+    """Residual (mm) of one ray, as in an adjustment, and its derivatives; of many rows with a leading axis."""
+
+    residual: Float[Array, "*rows 2"]
+    point: Float[Array, "*rows 2 3"]
+    exterior: Float[Array, "*rows 2 6"]
+    """By X, Y, Z (m) and a small rotation in the camera frame (rad)."""
+    interior: Float[Array, "*rows 2 k"]
+    """In the order of `camera.parameter_names`."""
+
+
+def ray_partials(
+    interior: InteriorOrientation,
+    exterior: ExteriorOrientation,
+    point: Float[Array, "3"],
+    xy: Float[Array, "2"],
+    corrections: Corrections = NO_CORRECTIONS,
+) -> RayPartials:
+    """How the residual of the measured image coordinate `xy` (mm) of `point` (m) moves with everything."""
+
+    def residual(d_point, d_exterior, d_interior):
+        image = moved_exterior(exterior, d_exterior)
+        aim = apparent_point(image.position, point + d_point, corrections)
+        value = image_residual(moved_interior(interior, d_interior), image, aim, xy)
+        return value, value
+
+    zeros = (jnp.zeros(3), jnp.zeros(6), jnp.zeros(len(parameter_names(interior))))
+    by, value = jax.jacfwd(residual, argnums=(0, 1, 2), has_aux=True)(*zeros)
+    return RayPartials(value, *by)
+
+
+def intersection_gain(
+    by_point: Float[Array, "rows 2 3"], sigma: Float[Array, "rows 2"], point: Int[Array, "rows"], n_points: int
+) -> Float[Array, "rows 3 2"]:
+    """J of every row: a point moves by -sum J r. `sigma` (mm) of the image coordinates, `point` of each row.
+
+    NaN or huge where the rays of a point are parallel.
+    """
+    weighted = by_point.transpose(0, 2, 1) / sigma[:, None, :] ** 2
+    normal = jax.ops.segment_sum(weighted @ by_point, point, n_points)
+    # A point without rows has no normal matrix, and no row to ask for its inverse.
+    return jnp.linalg.inv(normal)[point] @ weighted
+
+
+def intersection_step(
+    gain: Float[Array, "rows 3 2"], residual: Float[Array, "rows 2"], point: Int[Array, "rows"], n_points: int
+) -> Float[Array, "points 3"]:
+    """The Gauss-Newton step (m) of every point."""
+    return -jax.ops.segment_sum(jnp.einsum("nij,nj->ni", gain, residual), point, n_points)
+
+
+def own_covariance(
+    gain: Float[Array, "rows 3 2"], own: Float[Array, "rows 2 2"], point: Int[Array, "rows"], n_points: int
+) -> Float[Array, "points 3 3"]:
+    """What errors that each ray has alone, of covariance `own` (mm^2) in its residual, do to the points (m^2)."""
+    return jax.ops.segment_sum(gain @ own @ gain.transpose(0, 2, 1), point, n_points)
+
+
+def shared_covariance(
+    gain: Float[Array, "rows 3 2"],
+    by_shared: Float[Array, "rows 2 m"],
+    covariance: Float[Array, "m m"],
+    point: Int[Array, "rows"],
+    n_points: int,
+) -> Float[Array, "points 3 3"]:
+    """What errors of the given `covariance` that the rays share do to the points (m^2).
+
+    `by_shared` is dr/dm; zeros for rays that do not have the error.
+    """
+    by = jax.ops.segment_sum(gain @ by_shared, point, n_points)
+    return by @ covariance @ by.transpose(0, 2, 1)

@@ -1,0 +1,170 @@
+"""Coordinates of a map or geographic system to and from a local east-north-up frame, by PROJ.
+
+The local frame is Cartesian: its origin is a place, Z the normal of the ellipsoid there, Y towards true north. No datum
+is changed on the way: longitudes, latitudes and ellipsoidal heights are those of the system's own datum.
+"""
+
+import functools
+import warnings
+
+import numpy as np
+from jaxtyping import Float
+from pyproj import CRS, Transformer
+from pyproj.exceptions import CRSError
+from pyproj.transformer import TransformerGroup
+
+from jaxphoto.errors import InputError
+
+# Half the step along a grid line that tells its direction: rounding is then 1e-11 rad, curvature of the line less.
+_STEP_M, _STEP_DEG = 50.0, 5e-4
+
+Place = tuple[float, float, float]
+"""Longitude and latitude (degrees), ellipsoidal height (m)."""
+
+
+class MapFrame:
+    """The local frame at `origin` of files in the EPSG system `code`, heights of the EPSG system `vertical`.
+
+    `vertical` None means heights above the ellipsoid. Map coordinates are (easting, northing, height) in m, or
+    (longitude, latitude, height) in degrees and m where `geographic`. Where a system does not reach, results are
+    infinite. Raises InputError for codes that are unknown or serve another purpose, and for heights whose geoid is not
+    at hand.
+    """
+
+    def __init__(self, code: int, vertical: int | None, origin: Place):
+        self.code, self.vertical, self.origin = code, vertical, origin
+        system = map_system(code)
+        self.geographic = system.is_geographic
+        self._to_place = _to_place(code, vertical)
+        self._to_local = _topocentric(system, origin)
+
+    def place(self, coordinates: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Longitude, latitude (degrees) and ellipsoidal height (m) of map coordinates."""
+        return _transformed(self._to_place, coordinates, "FORWARD")
+
+    def local_from_place(self, place: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Local X, Y, Z (m) of longitude, latitude and ellipsoidal height."""
+        return _transformed(self._to_local, place, "FORWARD")
+
+    def local(self, coordinates: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Local X, Y, Z (m) of map coordinates."""
+        return self.local_from_place(self.place(coordinates))
+
+    def map(self, local: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Map coordinates of local X, Y, Z (m); the inverse of `local`."""
+        return _transformed(self._to_place, self._place_from_local(local), "INVERSE")
+
+    def local_from_level(self, local: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 3"]:
+        """From axes east, true north, up (normal of the ellipsoid) at local positions to those of the local frame."""
+        here = _geocentric_from_level(np.array([self.origin]))[0]
+        return here.T @ _geocentric_from_level(self._place_from_local(local))
+
+    def local_from_grid(self, local: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 3"]:
+        """The same from axes right of grid north, grid north, up: turned by the convergence of the meridians."""
+        g = self.convergence(local)
+        c, s, zero, one = np.cos(g), np.sin(g), np.zeros(len(g)), np.ones(len(g))
+        level_from_grid = np.stack([c, s, zero, -s, c, zero, zero, zero, one], axis=1).reshape(-1, 3, 3)
+        return self.local_from_level(local) @ level_from_grid
+
+    def convergence(self, local: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+        """Convergence of the meridians (rad) at local positions: grid north lies so far east of true north."""
+        step = np.array([0.0, _STEP_DEG if self.geographic else _STEP_M, 0.0])
+        at = self.map(local)
+        line = self.local(at + step) - self.local(at - step)
+        east, north, _ = np.einsum("nji,nj->in", self.local_from_level(local), line)
+        return np.arctan2(east, north)
+
+    def sea_level(self) -> float:
+        """Local Z (m) of height zero at the origin; of the ellipsoid where heights are above it."""
+        easting, northing, _ = self.map(np.zeros((1, 3)))[0]
+        return float(self.local(np.array([[easting, northing, 0.0]]))[0, 2])
+
+    def _place_from_local(self, local: np.ndarray) -> np.ndarray:
+        return _transformed(self._to_local, local, "INVERSE")
+
+
+@functools.cache
+def map_system(code: int) -> CRS:
+    """The projected or geographic system of an EPSG code. Raises InputError for any other code."""
+    try:
+        system = CRS.from_epsg(code)
+    except CRSError:
+        raise InputError(f"the EPSG code {code} is unknown; correct it (epsg.io lists them)") from None
+    if not (system.is_projected or system.is_geographic) or system.is_compound:
+        raise InputError(
+            f"EPSG:{code} ({system.name}) is no map or geographic system; give the code of one, and the system of the "
+            "heights as vertical"
+        )
+    plane = system.axis_info[:2]
+    if system.is_projected and any(axis.unit_conversion_factor != 1 for axis in plane):
+        raise InputError(
+            f"EPSG:{code} ({system.name}) counts in {plane[0].unit_name}, not in metres; convert the coordinates to a "
+            "system in metres"
+        )
+    if system.is_projected and {axis.direction for axis in plane} & {"south", "west"}:
+        raise InputError(
+            f"EPSG:{code} ({system.name}) counts southwards or westwards; convert the coordinates to a system of "
+            "eastings and northings"
+        )
+    return system
+
+
+@functools.cache
+def _to_place(code: int, vertical: int | None) -> Transformer:
+    """From map coordinates to longitude, latitude and ellipsoidal height of the same datum."""
+    system = map_system(code)
+    geodetic = system.geodetic_crs
+    assert geodetic is not None
+    if vertical is None:
+        return Transformer.from_crs(system.to_3d(), geodetic.to_3d(), always_xy=True)
+    try:
+        heights = CRS.from_epsg(vertical)
+    except CRSError:
+        raise InputError(
+            f'the EPSG code {vertical} of vertical is unknown; correct it or write "ellipsoidal"'
+        ) from None
+    if not heights.is_vertical:
+        raise InputError(
+            f"EPSG:{vertical} ({heights.name}) is no system of heights; give the code of one (5773 is EGM96) or "
+            '"ellipsoidal"'
+        )
+    # pyproj warns of what is said below as an error.
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        group = TransformerGroup(f"EPSG:{code}+{vertical}", geodetic.to_3d(), always_xy=True)
+    if not group.best_available or not group.transformers:
+        grids = [grid for operation in group.unavailable_operations for grid in operation.grids if not grid.available]
+        if not grids:
+            raise InputError(
+                f"PROJ knows no way from the heights of EPSG:{vertical} ({heights.name}) to the ellipsoid of "
+                f'EPSG:{code}; convert the heights and write vertical = "ellipsoidal"'
+            )
+        name = grids[0].short_name
+        raise InputError(
+            f"the heights of EPSG:{vertical} ({heights.name}) need the geoid {name}, which is not on this computer; "
+            f'get it by "pyproj sync --file {name}", or convert the heights and write vertical = "ellipsoidal"'
+        )
+    return group.transformers[0]
+
+
+def _topocentric(system: CRS, origin: Place) -> Transformer:
+    ellipsoid = system.ellipsoid
+    assert ellipsoid is not None
+    size = f"+a={ellipsoid.semi_major_metre!r} +b={ellipsoid.semi_minor_metre!r}"
+    longitude, latitude, height = (repr(float(value)) for value in origin)
+    return Transformer.from_pipeline(
+        f"+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart {size} "
+        f"+step +proj=topocentric {size} +lon_0={longitude} +lat_0={latitude} +h_0={height}"
+    )
+
+
+def _transformed(transformer: Transformer, values: np.ndarray, direction: str) -> np.ndarray:
+    x, y, z = np.asarray(values, float).T
+    return np.stack(transformer.transform(x, y, z, direction=direction), axis=1)
+
+
+def _geocentric_from_level(places: np.ndarray) -> np.ndarray:
+    """Columns: east, north and up at longitude and latitude, in geocentric axes."""
+    (sl, sp), (cl, cp) = np.sin(np.deg2rad(places[:, :2])).T, np.cos(np.deg2rad(places[:, :2])).T
+    rows = [-sl, -sp * cl, cp * cl, cl, -sp * sl, cp * sl, 0 * sl, cp, sp]
+    return np.stack(rows, axis=1).reshape(-1, 3, 3)

@@ -1,0 +1,170 @@
+"""A GNSS/IMU trajectory at the times of exposure, with its motion and the uncertainty of the interpolation itself.
+
+Positions and the unit quaternions of the attitudes are cubic splines with continuous second derivatives; a quaternion
+is brought back to unit length. The curve of attitudes so does not depend on the axes in which it is written, and both
+errors fall with the fourth power of the spacing h.
+
+The spline over every second record misses the records left out by e(2h), that over every fourth by e(4h). If the error
+is a power of the spacing, as it is for smooth motion (16 = 2^4) and for turbulence (about 2^1.5), then
+e(h) = e(2h) / [e(4h) / e(2h)]. The quotient is taken over the whole trajectory, e(2h) where the exposure is.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxphoto.rotation import matrix_from_quaternion, small_angles
+
+SHORTEST = 9
+"""The fewest records from which the uncertainty of the interpolation can be told."""
+# e(2h) is averaged over so many records to either side.
+_HALF_WINDOW = 8
+
+
+class Trajectory(eqx.Module):
+    """Records of a GNSS/IMU in the object frame; at least `SHORTEST`, in the order of time."""
+
+    time: Float[Array, "records"]
+    """Seconds."""
+    position: Float[Array, "records 3"]
+    """Metres."""
+    quaternion: Float[Array, "records 4"]
+    """(w, x, y, z) of `object_from_body`; body axes right, forward, up."""
+    sigma_position: Float[Array, "records 3"]
+    """Metres."""
+    sigma_attitude: Float[Array, "records 3"]
+    """Of roll, pitch and yaw, radians."""
+
+    def __check_init__(self) -> None:
+        if len(self.time) < SHORTEST:
+            raise ValueError(f"a trajectory has at least {SHORTEST} records, got {len(self.time)}")
+
+
+class Poses(NamedTuple):
+    """What a trajectory says of each exposure; `rate` and the signs are those of `georeferencing.Exposure`."""
+
+    position: Float[Array, "times 3"]
+    velocity: Float[Array, "times 3"]
+    object_from_body: Float[Array, "times 3 3"]
+    rate: Float[Array, "times 3"]
+    sigma_position: Float[Array, "times 3"]
+    """Of the trajectory and of the interpolation together (m)."""
+    sigma_attitude: Float[Array, "times 3"]
+    """The same of roll, pitch, yaw (rad)."""
+
+
+def interpolate(trajectory: Trajectory, times: Float[Array, "times"], max_gap: float) -> Poses:
+    """Position, attitude and motion at `times` (s), differentiable with respect to them.
+
+    No spline runs across an interval longer than `max_gap` (s): what is returned for times there, and for times before
+    the first or after the last record, is not to be used (`covered`).
+    """
+    joined = _joined(trajectory, max_gap)
+    trajectory = jax.tree.map(jnp.asarray, trajectory)
+    origin = trajectory.time[0]
+    times, nodes = times - origin, trajectory.time - origin
+    values = jnp.concatenate([trajectory.position, _continuous(trajectory.quaternion)], axis=1)
+    at, dot = _spline(nodes, values, joined, times)
+    matrix, matrix_dot = jax.jvp(jax.vmap(matrix_from_quaternion), (at[:, 3:],), (dot[:, 3:],))
+    # R' dR/dt is the cross product with the rate of turn about the body's axes.
+    turn = jnp.einsum("nji,njk->nik", matrix, matrix_dot)
+    rate = jnp.stack([turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]], axis=1)
+
+    error = _interpolation_error(nodes, values, joined)
+    interval = _interval(nodes, joined, times)
+    part = ((times - nodes[interval]) / (nodes[interval + 1] - nodes[interval]))[:, None]
+    # Nothing at the records, all of it half way between them.
+    sigma = 4 * part * (1 - part) * ((1 - part) * error[interval] + part * error[interval + 1])
+    given = jnp.concatenate([trajectory.sigma_position, trajectory.sigma_attitude], axis=1)
+    given = (1 - part) * given[interval] + part * given[interval + 1]
+    sigma = jnp.sqrt(given**2 + sigma**2)
+    return Poses(at[:, :3], dot[:, :3], matrix, rate, sigma[:, :3], sigma[:, 3:])
+
+
+def covered(trajectory: Trajectory, times: Float[Array, "times"], max_gap: float) -> Bool[Array, "times"]:
+    """Whether each time lies within the trajectory and in no gap of it."""
+    inside = (times >= trajectory.time[0]) & (times <= trajectory.time[-1])
+    joined = _joined(trajectory, max_gap)
+    return inside & joined[_interval(jnp.asarray(trajectory.time), joined, times)]
+
+
+def _joined(trajectory: Trajectory, max_gap: float) -> Bool[Array, "records-1"]:
+    """Which intervals between records are no gap."""
+    return jnp.diff(trajectory.time) <= max_gap
+
+
+def _continuous(quaternion: Float[Array, "n 4"]) -> Float[Array, "n 4"]:
+    """The same rotations, with the sign of each quaternion that is nearer to the one before."""
+    turned = jnp.sum(quaternion[1:] * quaternion[:-1], axis=1) < 0
+    sign = jnp.cumprod(jnp.where(turned, -1.0, 1.0))
+    return quaternion * jnp.concatenate([jnp.ones(1), sign])[:, None]
+
+
+def _interval(nodes: Float[Array, "n"], joined: Bool[Array, "n-1"], times: Float[Array, "m"]) -> Int[Array, "m"]:
+    """The interval that each time is in; that before a record where a gap begins, for the time of this record."""
+    i = jnp.clip(jnp.searchsorted(nodes, times, side="right") - 1, 0, len(nodes) - 2)
+    return jnp.where((times == nodes[i]) & ~joined[i], jnp.maximum(i - 1, 0), i)
+
+
+def _spline(nodes, values, joined, times) -> tuple[Float[Array, "m k"], Float[Array, "m k"]]:
+    """Values and derivatives at `times` of the cubic spline through `values` (n, k).
+
+    The second derivatives s of the pieces are continuous, h0 s0 + 2 (h0 + h1) s1 + h1 s2 = 6 (d1 - d0) with d the
+    divided differences; a piece next to an end, or to a gap (`joined` false), is a parabola.
+    """
+    h, zero, no = jnp.diff(nodes), jnp.zeros(1), jnp.zeros(1, bool)
+    slope = jnp.diff(values, axis=0) / h[:, None]
+    left, right = jnp.concatenate([no, joined]), jnp.concatenate([joined, no])
+    inner, first, last = left & right, ~left & right, left & ~right
+    h0, h1 = jnp.concatenate([zero, h]), jnp.concatenate([h, zero])
+    # Of two records that stand alone both would say the same; the second then says that the piece is straight.
+    alone = last & jnp.concatenate([no, first[:-1]])
+    lower = jnp.where(inner, h0, jnp.where(last & ~alone, -1.0, 0.0))
+    upper = jnp.where(inner, h1, jnp.where(first, -1.0, 0.0))
+    diagonal = jnp.where(inner, 2 * (h0 + h1), 1.0)
+    pad = jnp.zeros((1, values.shape[1]))
+    bend = 6 * (jnp.concatenate([slope, pad]) - jnp.concatenate([pad, slope]))
+    second = jax.lax.linalg.tridiagonal_solve(lower, diagonal, upper, jnp.where(inner[:, None], bend, 0.0))
+
+    i = _interval(nodes, joined, times)
+    step, t = h[i][:, None], (times - nodes[i])[:, None]
+    s0, s1 = second[i], second[i + 1]
+    b = slope[i] - step * (2 * s0 + s1) / 6
+    d = (s1 - s0) / (6 * step)
+    return values[i] + t * (b + t * (s0 / 2 + t * d)), b + t * (s0 + 3 * t * d)
+
+
+def _interpolation_error(nodes, values, joined) -> Float[Array, "n 6"]:
+    """The error half way to the next record, near each record: X, Y, Z (m), roll, pitch, yaw (rad)."""
+    half, quarter = (
+        [sum(part) for part in zip(*(_misfit(nodes, values, joined, every, start) for start in (0, 1)), strict=True)]
+        for every in (2, 4)
+    )
+    # The median, because next to ends and gaps a spline misses by more, and not by the same power.
+    fine, coarse = (
+        jnp.nanmedian(jnp.where(known[:, None] > 0, squares, jnp.nan), axis=0) for squares, known in (half, quarter)
+    )
+    # 16 is what a smooth curve can gain, 1 what noise of the records can.
+    gain = jnp.sqrt(jnp.clip(jnp.where(fine > 0, coarse / jnp.where(fine > 0, fine, 1.0), 1.0), 1.0, 16.0**2))
+    near = jax.vmap(lambda v: jnp.convolve(v, jnp.ones(2 * _HALF_WINDOW + 1), "same"), 1, 1)
+    squares, known = near(half[0]), near(half[1][:, None])
+    return jnp.sqrt(squares / jnp.maximum(known, 1.0)) / gain
+
+
+def _misfit(nodes, values, joined, every: int, start: int) -> tuple[Float[Array, "n 6"], Float[Array, "n"]]:
+    """Squared misses of the spline over every `every`-th record at the records half way between, and which these are.
+
+    Both are zero at other records, and where a gap is near.
+    """
+    kept = jnp.arange(start, len(nodes), every)
+    middle = kept[:-1] + every // 2
+    whole = jnp.all(joined[kept[:-1, None] + jnp.arange(every)], axis=1)
+    at, _ = _spline(nodes[kept], values[kept], whole, nodes[middle])
+    turned = jnp.einsum("nji,njk->nik", *(jax.vmap(matrix_from_quaternion)(v[:, 3:]) for v in (at, values[middle])))
+    right, forward, up = jax.vmap(small_angles, out_axes=1)(turned)
+    miss = jnp.concatenate([at[:, :3] - values[middle, :3], jnp.stack([forward, right, up], axis=1)], axis=1)
+    squares = jnp.zeros((len(nodes), 6)).at[middle].set(jnp.where(whole[:, None], miss**2, 0.0))
+    return squares, jnp.zeros(len(nodes)).at[middle].set(jnp.where(whole, 1.0, 0.0))

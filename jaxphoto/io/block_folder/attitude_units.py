@@ -1,0 +1,59 @@
+"""Attitudes in radians under columns in degrees, told by the direction of flight."""
+
+import warnings
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxphoto.block import Rows
+from jaxphoto.errors import InputError
+from jaxphoto.io.block_folder.images import Images
+from jaxphoto.io.tables import Table
+
+# Means of the cosine between yaw and course: the crab angle leaves more than the first, and both readings are told
+# apart below the second.
+_ALIKE, _UNLIKE = 0.8, 0.7
+# Courses of one direction have a resultant of 1; below this, strips run in different directions.
+_ONE_WAY = 0.8
+_FEWEST = 4
+
+
+def check_attitude_units(table: Table, stations: Rows, images: Images) -> None:
+    """`check_yaw` of the attitudes as attitudes.csv gives them, against the flight from image to image of a strip."""
+    yaw = np.full(len(images.ids), np.nan)
+    yaw[images.find(table)] = table.numbers("yaw_deg")
+    position = np.where(images.known[:, None], np.asarray(images.exterior.position), np.nan)
+    position[stations.who, stations.axis] = stations.value
+    first, second = _consecutive(images)
+    check_yaw(yaw[first], position[second] - position[first], table.file)
+
+
+def check_yaw(yaw: Float[np.ndarray, "n"], flown: Float[np.ndarray, "n 3"], file: str) -> None:
+    """Raise InputError where `yaw` follows the way `flown` when read as radians, and does not when read as degrees.
+
+    Honest degrees are safe: that all of them lie within +-2 pi, follow as radians strips of several directions and yet
+    disagree with them as degrees would be chance. With strips of one direction only it may be, and is a UserWarning.
+    """
+    course = np.arctan2(flown[:, 0], flown[:, 1])
+    known = ~np.isnan(course) & ~np.isnan(yaw)
+    course, yaw = course[known], yaw[known]
+    if len(course) < _FEWEST or np.abs(yaw).max() > 2 * np.pi:
+        return
+    as_radians, as_degrees = np.cos(yaw - course).mean(), np.cos(np.deg2rad(yaw) - course).mean()
+    if as_radians < _ALIKE or as_degrees > _UNLIKE:
+        return
+    message = (
+        f"{file}: the yaw angles lie between {yaw.min():.2f} and {yaw.max():.2f} and follow the direction of flight as "
+        "radians, not as degrees; convert roll, pitch and yaw to degrees"
+    )
+    if abs(np.exp(1j * course).mean()) < _ONE_WAY:
+        raise InputError(message)
+    warnings.warn(message, UserWarning, stacklevel=3)
+
+
+def _consecutive(images: Images) -> tuple[np.ndarray, np.ndarray]:
+    """Images that follow each other in a strip, by time where it is known, else as the file lists them."""
+    strips = np.unique(np.array(images.strips, object).astype(str), return_inverse=True)[1]
+    order = np.lexsort((np.arange(len(strips)), images.times, strips))
+    same = strips[order[1:]] == strips[order[:-1]]
+    return order[:-1][same], order[1:][same]

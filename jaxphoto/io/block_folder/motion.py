@@ -1,0 +1,70 @@
+"""Velocity and rate of turn at the exposures, from columns of stations.csv and attitudes.csv."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxphoto.block import Attitudes, Motion, Rows
+from jaxphoto.georeferencing import Mount
+from jaxphoto.io.block_folder.images import Images
+from jaxphoto.io.block_folder.layout import RATE, VELOCITY
+from jaxphoto.io.tables import Table
+from jaxphoto.unknowns import FIXED
+
+
+class Flight(NamedTuple):
+    """What is observed of stations, attitudes and motion, and of which images velocity and rate are known."""
+
+    stations: Rows
+    attitudes: Attitudes
+    motion: Motion | None
+    velocity_known: np.ndarray
+    rate_known: np.ndarray
+
+
+def read_motion(stations: Table, attitudes: Table, images: Images) -> tuple[Motion | None, np.ndarray, np.ndarray]:
+    """The motion that the tables give (None where they have no such columns), and the images whose parts are known."""
+    velocity, velocity_known = _columns(stations, VELOCITY, images)
+    rate, rate_known = _columns(attitudes, RATE, images)
+    motion = None
+    if velocity_known.any() or rate_known.any():
+        motion = Motion(jnp.asarray(velocity), jnp.asarray(np.deg2rad(rate)))
+    return motion, velocity_known, rate_known
+
+
+def check_time_offsets(
+    flight: Flight,
+    image_mount: tuple[str, ...],
+    mounts: dict[str, Mount],
+    priors: dict[str, Mount],
+    images: Images,
+    file: str,
+) -> None:
+    """Raise BlockError where a time offset should act on a station or attitude whose motion is not known."""
+    offset = {
+        name for name, mount in mounts.items() if priors[name].time_offset is not FIXED or float(mount.time_offset) != 0
+    }
+    uses = np.array([mount in offset for mount in image_mount])
+    for who, known, table, columns in (
+        (flight.stations.who, flight.velocity_known, "stations.csv", VELOCITY),
+        (flight.attitudes.image, flight.rate_known, "attitudes.csv", RATE),
+    ):
+        for image in who[uses[who] & ~known[who]][:1]:
+            raise images.table.misfit(
+                image,
+                f"the time_offset of [mounts.{image_mount[image]}] in {file} needs the motion of image "
+                f"{images.ids[image]}; give a [trajectory], add {', '.join(columns)} to {table}, or make time_offset "
+                '"fixed" at zero',
+            )
+
+
+def _columns(table: Table, columns: tuple[str, ...], images: Images) -> tuple[np.ndarray, np.ndarray]:
+    """Values by image, zero where unknown, and where they are known."""
+    values = np.full((len(images.ids), 3), np.nan)
+    given = np.stack([table.numbers(column, empty=True) for column in columns], axis=1)
+    for line in np.flatnonzero(np.isnan(given).any(axis=1) & ~np.isnan(given).all(axis=1)):
+        raise table.bad(line, f"the motion is given in part; fill in {', '.join(columns)}, or none of them")
+    values[images.find(table)] = given
+    known = ~np.isnan(values).any(axis=1)
+    return np.nan_to_num(values), known

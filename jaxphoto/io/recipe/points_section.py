@@ -1,0 +1,157 @@
+"""[terrain], [points], [[targets]], [sigmas], [noise], [jitter] and [start] of a recipe."""
+
+import dataclasses
+
+from jaxphoto.errors import InputError
+from jaxphoto.io.block_folder.section import Section
+from jaxphoto.io.recipe.keys import flag, not_negative, places, sigmas, tables, whole
+from jaxphoto.simulation import (
+    ROLES,
+    ROLLING,
+    Approximation,
+    Choice,
+    Jitter,
+    Points,
+    RandomWaves,
+    Sigmas,
+    Targets,
+    Terrain,
+    Wave,
+)
+from jaxphoto.simulation.recipe import Role
+
+_ZERO = (0.0, 0.0, 0.0)
+_KINDS = {
+    "flat": ("height_m", "roughness_m"),
+    "plane": ("height_m", "roughness_m", "slope_east_percent", "slope_north_percent"),
+    "waves": ("height_m", "roughness_m", "waves"),
+    "random": ("height_m", "roughness_m", "count", "rms_m", "length_m", "seed"),
+    "rolling": (),
+}
+
+
+def read_terrain(section: Section) -> Terrain:
+    """The ground; flat at Z = 0 where nothing is said."""
+    kind = section.text("kind", "flat")
+    if kind not in _KINDS:
+        raise section.error("kind", f"no terrain is called {kind!r}; use {', '.join(_KINDS)}")
+    section.known("kind", *_KINDS[kind])
+    if kind == "rolling":
+        return ROLLING
+    ground = Terrain(height_m=section.number("height_m", 0.0), roughness_m=not_negative(section, "roughness_m", 0.0))
+    if kind == "plane":
+        slope = [section.number(f"slope_{side}_percent", 0.0) / 100 for side in ("east", "north")]
+        return dataclasses.replace(ground, slope=(slope[0], slope[1]))
+    if kind == "random":
+        waves = RandomWaves(section.count("count"), section.positive("rms_m"), section.positive("length_m"))
+        seed = whole(section, "seed", 0) if "seed" in section else None
+        return dataclasses.replace(ground, random=waves, seed=seed)
+    return dataclasses.replace(ground, waves=tuple(map(_wave, tables(section, "waves"))))
+
+
+def read_points(section: Section) -> Points:
+    """Tie points and what of them is measured."""
+    section.known("ties", "min_images", "mean_rays", "across", "ends", "margin_mm")
+    minimum = section.count("min_images") if "min_images" in section else Points.min_images
+    if minimum < 2:
+        raise section.error("min_images", "a point in one image has no position; give 2 or more")
+    rays = section.positive("mean_rays") if "mean_rays" in section else None
+    if rays is not None and rays < minimum:
+        raise section.error("mean_rays", f"{rays:g} is less than min_images = {minimum}; raise it or lower min_images")
+    return Points(
+        ties=whole(section, "ties", 0),
+        min_images=minimum,
+        mean_rays=rays,
+        across=section.positive("across") if "across" in section else Points.across,
+        ends=not_negative(section, "ends", Points.ends),
+        margin_mm=not_negative(section, "margin_mm", Points.margin_mm),
+    )
+
+
+def read_targets(section: Section) -> Targets:
+    """One group of targets."""
+    section.known("role", "prefix", "count", "at_m", "at", "choice")
+    prefix = section.text("prefix", Targets.prefix)
+    if not prefix or prefix[-1].isdigit() or prefix[0] == "#":
+        raise section.error("prefix", f'{prefix!r} does not tell targets apart; use letters, like "T"')
+    choice = None
+    if "choice" in section:
+        table = section.section("choice")
+        table.known("role", "outermost", "centre", "first")
+        outermost, first = whole(table, "outermost", 0), whole(table, "first", 0)
+        choice = Choice(_role(table), outermost, flag(table, "centre"), first)
+    return Targets(
+        role=_role(section),
+        prefix=prefix,
+        count=whole(section, "count", 0),
+        at_m=places(section, "at_m", (2, 3)),
+        at=places(section, "at", (2,)),  # type: ignore[arg-type]
+        choice=choice,
+    )
+
+
+def read_sigmas(top: Section, targets: tuple[Targets, ...]) -> tuple[Sigmas, Sigmas]:
+    """The stated sigmas, and the true ones, which are the same where [noise] does not say otherwise."""
+    keys = ("image_mm", "target_mm", "control_m", "station_m", "attitude_deg")
+    said, true = top.section("sigmas"), top.section("noise")
+    said.known(*keys)
+    true.known(*keys)
+    image = said.positive("image_mm")
+    stated = Sigmas(
+        image,
+        said.positive("target_mm") if "target_mm" in said else image,
+        *(sigmas(said, key, positive=True) for key in keys[2:]),
+    )
+    for key in keys[2:]:
+        if key in true and getattr(stated, key) is None:
+            raise true.error(key, f"this is not observed; add {key} under [sigmas] too, or remove it")
+    roles = {role for group in targets for role in (group.role, *([group.choice.role] if group.choice else []))}
+    if stated.control_m is None and roles & {"control", "vertical"}:
+        raise said.error("control_m", "the key is missing, but there are control points; add it")
+    image = not_negative(true, "image_mm", stated.image_mm)
+    noise = Sigmas(
+        image,
+        # Targets are measured as well as ties, unless one of the tables tells them apart.
+        not_negative(true, "target_mm", stated.target_mm if "target_mm" in said else image),
+        *(sigmas(true, key, getattr(stated, key)) for key in keys[2:]),
+    )
+    return stated, noise
+
+
+def read_jitter(section: Section) -> Jitter:
+    """How a flight leaves its plan."""
+    section.known("position_m", "angle_deg", "crab_deg", "rate_deg_per_s")
+    numbers = [not_negative(section, key, 0.0) for key in ("angle_deg", "crab_deg", "rate_deg_per_s")]
+    return Jitter(sigmas(section, "position_m") or _ZERO, *numbers)
+
+
+def read_start(section: Section) -> Approximation:
+    """How far approximate values are off."""
+    section.known("position_m", "angle_deg", "points_m")
+    return Approximation(
+        not_negative(section, "position_m", Approximation.position_m),
+        not_negative(section, "angle_deg", Approximation.angle_deg),
+        not_negative(section, "points_m") if "points_m" in section else None,
+    )
+
+
+def check_points(top: Section, points: Points, targets: tuple[Targets, ...]) -> None:
+    """Raise InputError where there is nothing to measure."""
+    n = points.ties + sum(t.count + len(t.at) + len(t.at_m) for t in targets)
+    if n < 3:
+        raise InputError(
+            f"{top.file}, [points] ties: there are {n} points in all; an orientation needs 3, so ask for more"
+        )
+
+
+def _role(section: Section) -> Role:
+    role = section.text("role")
+    if role not in ROLES:
+        raise section.error("role", f"the role {role!r} is unknown; write {', '.join(ROLES)}")
+    return role
+
+
+def _wave(section: Section) -> Wave:
+    section.known("amplitude_m", "length_m", "heading_deg", "phase_deg")
+    heading, phase = section.number("heading_deg", Wave.heading_deg), section.number("phase_deg", Wave.phase_deg)
+    return Wave(section.positive("amplitude_m"), section.positive("length_m"), heading, phase)

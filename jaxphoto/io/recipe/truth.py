@@ -1,0 +1,73 @@
+"""A simulation -> its block folder, and beside the block's tables the truth, in the columns of the result tables."""
+
+import shutil
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from jaxphoto.block import AXES
+from jaxphoto.camera import constant_names, get_parameter, parameter_names
+from jaxphoto.io.block_folder import write_block
+from jaxphoto.io.block_folder.layout import ANGLES, XYZ
+from jaxphoto.simulation import Simulation
+from jaxphoto.simulation.flight import omega_phi_kappa
+
+FOLDER = "truth"
+
+
+def write_simulation(simulation: Simulation, folder: str | Path) -> None:
+    """Write the block as `write_block` does, with the truth in its sub-folder `truth` (docs/simulation.md).
+
+    The truth is made whole before anything is replaced. Raises what `write_block` raises.
+    """
+    folder = Path(folder).absolute()
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f".{folder.name}-", dir=folder.parent) as place:
+        made = Path(place) / FOLDER
+        made.mkdir()
+        for name, table in truth_tables(simulation).items():
+            table.to_csv(made / f"{name}.csv", index=False)
+        write_block(simulation.block, folder)
+        if (folder / FOLDER).exists():
+            shutil.move(folder / FOLDER, Path(place) / "old")
+        made.rename(folder / FOLDER)
+
+
+def truth_tables(simulation: Simulation) -> dict[str, pd.DataFrame]:
+    """The truth by name of the result table that it joins: interior, exterior, object_points, georeferencing."""
+    block, truth = simulation.block, simulation.truth
+    interior = [
+        (camera, name, float(get_parameter(one, name)))
+        for camera, one in truth.interior.items()
+        for name in (*parameter_names(one), *constant_names(type(one.distortion)))
+    ]
+    angles = np.degrees(omega_phi_kappa(truth.exterior))
+    return {
+        "interior": pd.DataFrame(interior, columns=["camera", "parameter", "value"]),
+        "exterior": _table("image", block.images, (*XYZ, *ANGLES), np.hstack([truth.exterior.position, angles])),
+        "object_points": _table("point", block.points, XYZ, np.asarray(truth.points)),
+        "georeferencing": pd.DataFrame(_georeferencing(simulation), columns=["parameter", "value"]),
+    }
+
+
+def _table(id_column: str, ids: tuple[str, ...], names: tuple[str, ...], values: np.ndarray) -> pd.DataFrame:
+    table = pd.DataFrame(values, columns=list(names))
+    table.insert(0, id_column, list(ids))
+    return table
+
+
+def _georeferencing(simulation: Simulation) -> list[tuple[str, float]]:
+    rows = []
+    for name, mount in simulation.truth.mounts.items():
+        arm, boresight = np.asarray(mount.lever_arm), np.degrees(mount.boresight)
+        rows += [
+            (f"mounts[{name}].lever_arm_{axis}_m", v) for axis, v in zip(("right", "forward", "up"), arm, strict=True)
+        ]
+        rows += [(f"mounts[{name}].boresight_{axis}_deg", v) for axis, v in zip("xyz", boresight, strict=True)]
+        rows.append((f"mounts[{name}].time_offset_s", float(mount.time_offset)))
+    for name, bias in simulation.truth.strips.items():
+        rows += [(f"strips[{name}].shift_{a}_m", v) for a, v in zip(AXES, np.asarray(bias.shift), strict=True)]
+        rows += [(f"strips[{name}].drift_{a}_m_per_s", v) for a, v in zip(AXES, np.asarray(bias.drift), strict=True)]
+    return rows + [(f"datum_offset_{a}_m", v) for a, v in zip(AXES, simulation.datum_offset_m, strict=True)]

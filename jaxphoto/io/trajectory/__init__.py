@@ -1,0 +1,19 @@
+"""GNSS/IMU trajectories from CSV and Applanix SBET, and back (docs/trajectory.md)."""
+
+from pathlib import Path
+
+from jaxphoto.io.trajectory.flight_csv import read_flight_csv, write_flight_csv
+from jaxphoto.io.trajectory.records import Records
+from jaxphoto.io.trajectory.sbet import FIELDS, read_sbet, sbet_records, write_sbet
+
+__all__ = [
+    "FIELDS", "Records", "read_flight_csv", "read_records", "read_sbet", "sbet_records", "write_flight_csv",
+    "write_sbet",
+]  # fmt: skip
+
+
+def read_records(path: Path) -> Records:
+    """The records of a trajectory: SBET where the file is called .sbet or .out (POSPac's ending), CSV otherwise."""
+    if path.suffix.lower() in (".sbet", ".out"):
+        return sbet_records(read_sbet(path), path.name)
+    return read_flight_csv(path)

@@ -1,0 +1,82 @@
+"""Does an adjustment fit the standard deviations it was given: sigma naught, blunders, residuals of control."""
+
+import numpy as np
+
+from jaxphoto.adjustment import Adjustment
+from jaxphoto.adjustment.residuals import GROUPS, Residuals
+from jaxphoto.block import ATTITUDE_AXES, AXES
+from jaxphoto.statistics import (
+    LEAST_CHECKED,
+    Covariance,
+    chi_square_p,
+    critical_value,
+    normalised_residuals,
+    redundancy_numbers,
+    residual_spread,
+)
+
+LEVEL = 1e-3
+"""Error probability of the chi-square test of sigma0, and of the blunder test over all observations together."""
+LARGE_SIGMA0 = 1.5
+"""A rejected sigma0 is a contradiction only above this: below, the a priori sigmas are merely somewhat hopeful."""
+_SHOWN = 4
+
+
+def fit(adjusted: Adjustment, cov: Covariance) -> tuple[list[str], bool]:
+    """sigma0 against the a priori sigmas, blunders and residuals of control in words; and whether all that is sound."""
+    sigma0, redundancy = float(adjusted.sigma0), adjusted.redundancy
+    p = chi_square_p(float(adjusted.square_sum), redundancy)
+    found = f"sigma0 {sigma0:.3f} with redundancy {redundancy}"
+    test = f"(chi-square test, p = {p:.2g})"
+    large = p < LEVEL and sigma0 > LARGE_SIGMA0
+    if large:
+        found += f" contradicts the a priori standard deviations {test}: observations are worse than announced"
+    elif p < LEVEL:
+        found += f" is above what the a priori standard deviations announce {test}: enlarge them by that factor"
+    elif p > 1 - LEVEL:
+        found += f" is below what the a priori standard deviations announce {test}: they are too large"
+    else:
+        found += f" agrees with the a priori standard deviations {test}"
+    redundancies = redundancy_numbers(adjusted, cov)
+    blunders, limit, n = _blunders(adjusted, normalised_residuals(adjusted, redundancies), redundancies)
+    if blunders:
+        shown = ", ".join(f"{name} ({w:.1f})" for w, name in blunders[:_SHOWN])
+        count = "1 blunder" if len(blunders) == 1 else f"{len(blunders)} blunders, the largest first"
+        sentence = f"{count}: {shown}; normalised residuals above {limit:.1f}"
+    else:
+        sentence = f"no blunder: none of {n} normalised residuals is above {limit:.1f}"
+    control = [s for s in residual_spread(adjusted) if s.group == "control_points"]
+    on_control = ["residuals at control, RMSE: " + ", ".join(f"{s.axis} {s.rmse:.3f} m" for s in control)]
+    return [found, sentence, *(on_control if control else [])], not (large or blunders)
+
+
+def _blunders(adjusted: Adjustment, w: Residuals, numbers: Residuals) -> tuple[list[tuple[float, str]], float, int]:
+    """Observations whose |w| no correct observation reaches, largest first; that limit, and how many were tested."""
+    size = {f: np.where(getattr(numbers, f) > LEAST_CHECKED, np.abs(getattr(w, f)), 0.0) for f in GROUPS}
+    n = sum(int((v > 0).sum()) for v in size.values())
+    limit = critical_value(LEVEL / max(n, 1))
+    s, block = adjusted.structure, adjusted.block
+    images, points = block.images, block.points
+    # A point in an image is one blunder, whichever of its coordinates shows it.
+    large = [
+        (v, f"point {points[p]} in image {images[i]}")
+        for v, i, p in zip(size["image"].max(axis=0), s.image, s.point, strict=True)
+    ]
+    large += [
+        (v, f"station of image {images[i]} in {AXES[a]}")
+        for v, i, a in zip(size["stations"], s.station_image, s.station_axis, strict=True)
+    ]
+    large += [
+        (v, f"{name} of image {images[i]}")
+        for name, row in zip(ATTITUDE_AXES, size["attitudes"], strict=True)
+        for v, i in zip(row, s.attitude_image, strict=True)
+    ]
+    large += [
+        (v, f"control point {points[p]} in {AXES[a]}")
+        for v, p, a in zip(size["control"], s.control_point, s.control_axis, strict=True)
+    ]
+    large += [
+        (v, f"distance {points[a]} to {points[b]}")
+        for v, (a, b) in zip(size["distances"], s.distance_points, strict=True)
+    ]
+    return sorted(((float(v), name) for v, name in large if v > limit), reverse=True), limit, n

@@ -1,0 +1,204 @@
+"""Direct georeferencing of a block: orientation from the sensors, ground from the images, each with its covariance.
+
+    from jaxphoto import georeference, read_block
+    found = georeference(read_block("block"))
+    found.exterior_sigma, found.point_sigma, found.discrepancies.value
+
+Nothing is adjusted: control says only how good it is. The points are those that an adjustment of `variants.direct`
+without control would find.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxphoto.adjustment.structure import spread
+from jaxphoto.arrays import Numbers
+from jaxphoto.block import Block, Rows, SensorRows, direct_exterior, sensor_rows
+from jaxphoto.camera import InteriorOrientation, get_parameter, parameter_names
+from jaxphoto.collinearity import ExteriorOrientation
+from jaxphoto.errors import BlockError
+from jaxphoto.georeferencing import Corrections, DirectPartials, direct_partials
+from jaxphoto.georeferencing.intersection import (
+    RayPartials,
+    intersection_gain,
+    intersection_step,
+    own_covariance,
+    ray_partials,
+    shared_covariance,
+)
+from jaxphoto.orientation import intersect_points
+from jaxphoto.orientation.rays import QUICK_TO_COMPILE, ideal_coordinates, padded_length, turn_to_object, unit_rays
+from jaxphoto.unknowns import Weighted
+
+# From the point nearest to the rays the first step leaves micrometres, the second nothing.
+_STEPS = 4
+
+
+class Georeferenced(eqx.Module):
+    """What GNSS, IMU, mount and camera give without an adjustment. All covariances are a priori."""
+
+    images: tuple[str, ...] = eqx.field(static=True)
+    """The images that have both a whole station and an attitude."""
+    points: tuple[str, ...] = eqx.field(static=True)
+    """The points that at least two of them show from two sides."""
+    exterior: ExteriorOrientation
+    exterior_covariance: Float[Numbers, "images 6 6"]
+    """Of X, Y, Z (m) and a small rotation in the camera frame (rad)."""
+    positions: Float[np.ndarray, "points 3"]
+    """Of `points`, m."""
+    covariance: Float[np.ndarray, "points 3 3"]
+    """Of `positions` (m^2), errors that images share by a mount or a camera included."""
+    discrepancies: Rows
+    """Surveyed minus computed (m) at control, fixed and check points, with the survey's sigmas; `who`: of `points`."""
+
+    @property
+    def exterior_sigma(self) -> Float[np.ndarray, "images 6"]:
+        """Standard deviations of X, Y, Z (m) and of the rotations about the camera's axes (rad)."""
+        return np.sqrt(np.diagonal(self.exterior_covariance, axis1=1, axis2=2))
+
+    @property
+    def point_sigma(self) -> Float[np.ndarray, "points 3"]:
+        """Standard deviations of the points (m)."""
+        return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
+
+
+def georeference(block: Block) -> Georeferenced:
+    """Exterior orientation of the images of `block` from stations, attitudes and mounts, and its points from them.
+
+    Mounts, cameras and strips are those of `block.start`. What `block.priors` says is Weighted has an error of that
+    sigma (strips excepted), everything else is taken as given. Raises BlockError where no image has both a whole
+    station and an attitude.
+    """
+    sensors = sensor_rows(block, block.start.unknowns)
+    if not len(sensors.image):
+        raise BlockError(
+            "no image has both a whole station and an attitude, so none can be georeferenced directly: give stations "
+            "and attitudes, or adjust the block"
+        )
+    exterior = jax.tree.map(np.asarray, direct_exterior(sensors))
+    by = jax.tree.map(np.asarray, _direct_partials(sensors))
+    own = _propagated(by.station, sensors.station_sigma) + _propagated(by.attitude, sensors.attitude_sigma)
+    mount_of = np.array(block.image_mount, object)[sensors.image]
+    mount_sigma = {name: _sigmas(spread(prior)) for name, prior in block.priors.mounts.items()}
+    of_image = np.stack([mount_sigma.get(name, np.zeros(by.mount.shape[2])) for name in mount_of])
+
+    rays, positions, shown = _intersected(block, sensors.image, exterior)
+    point, n = rays.point, len(shown)
+    own_of_ray = rays.exterior @ own[rays.image] @ rays.exterior.transpose(0, 2, 1)
+    own_of_ray += rays.sigma[:, :, None] ** 2 * np.eye(2)
+    covariance = _own_covariance(rays.gain, own_of_ray, point, n)
+    for name, sigma in mount_sigma.items():
+        rows = np.flatnonzero(mount_of[rays.image] == name)
+        by_mount = rays.exterior[rows] @ by.mount[rays.image[rows]]
+        covariance += _shared_covariance(rays.gain[rows], by_mount, np.diag(sigma**2), point[rows], n)
+    for name, (rows, by_interior) in rays.interior.items():
+        interior = block.priors.interior[name]
+        sigma = _sigmas([get_parameter(interior, parameter) for parameter in parameter_names(interior)])
+        covariance += _shared_covariance(rays.gain[rows], by_interior, np.diag(sigma**2), point[rows], n)
+
+    surveyed = Rows.joined(block.control, block.fixed, block.check)
+    place = np.full(len(block.points), -1)
+    place[shown] = np.arange(n)
+    known = surveyed.take(place[surveyed.who] >= 0)
+    who = place[known.who]
+    return Georeferenced(
+        images=tuple(block.images[i] for i in sensors.image),
+        points=tuple(block.points[p] for p in shown),
+        exterior=exterior,
+        exterior_covariance=own + _propagated(by.mount, of_image),
+        positions=positions,
+        covariance=np.asarray(covariance),
+        discrepancies=Rows(who, known.axis, np.asarray(known.value) - positions[who, known.axis], known.sigma),
+    )
+
+
+class _Rays(NamedTuple):
+    """The rays that meet in points: oriented image, point, gain, image sigma (mm), derivatives; see `ray_partials`."""
+
+    image: Int[np.ndarray, "rows"]
+    point: Int[np.ndarray, "rows"]
+    gain: Float[np.ndarray, "rows 3 2"]
+    sigma: Float[np.ndarray, "rows 2"]
+    exterior: Float[np.ndarray, "rows 2 6"]
+    interior: dict[str, tuple[np.ndarray, np.ndarray]]
+    """The rows of each camera, and their derivatives by its parameters."""
+
+
+def _intersected(
+    block: Block, oriented: Int[np.ndarray, "images"], exterior: ExteriorOrientation
+) -> tuple[_Rays, Float[np.ndarray, "points 3"], Int[np.ndarray, "points"]]:
+    """Rays of the images `oriented`, the points (m) they determine, and which of the block's points these are."""
+    observed = block.image_points
+    place = np.full(len(block.images), -1)
+    place[oriented] = np.arange(len(oriented))
+    rows = np.flatnonzero(place[observed.image] >= 0)
+    image, point = place[observed.image[rows]], observed.point[rows]
+    xy, sigma = np.asarray(observed.xy)[rows], np.asarray(observed.sigma)[rows]
+    camera = np.array(block.image_camera, object)[oriented][image]
+    position, matrix = np.asarray(exterior.position), np.asarray(exterior.camera_from_object)
+
+    directions = np.zeros((len(rows), 3))
+    interior = block.start.unknowns.interior
+    for name, of in interior.items():
+        mine = camera == name
+        rays = unit_rays(float(of.c), ideal_coordinates(of, xy[mine]))
+        directions[mine] = turn_to_object(matrix, image[mine], rays)
+    found, good = intersect_points(position[image], directions, point, len(block.points))
+    behind = np.einsum("ni,ni->n", directions, found[point] - position[image]) <= 0
+    good[point[behind]] = False
+
+    shown = np.flatnonzero(good)
+    kept = good[point]
+    image, xy, sigma, camera = image[kept], xy[kept], sigma[kept], camera[kept]
+    number = np.cumsum(good) - 1
+    point, points, n = number[point[kept]], found[shown], len(shown)
+    mine = {name: np.flatnonzero(camera == name) for name in interior if name in camera}
+    residual, by_point, by_exterior = np.zeros((len(xy), 2)), np.zeros((len(xy), 2, 3)), np.zeros((len(xy), 2, 6))
+    by_interior: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+    for _ in range(_STEPS):
+        for name, r in mine.items():
+            # Filled up with rows that are dropped again, so that cameras of one model share compiled code.
+            rows = np.resize(r, padded_length(len(r)))
+            of_rows = ExteriorOrientation(position[image[rows]], matrix[image[rows]])  # type: ignore[arg-type]
+            by = _ray_partials(_numbers(interior[name]), of_rows, points[point[rows]], xy[rows], block.corrections)
+            new = [np.asarray(v)[: len(r)] for v in by]
+            residual[r], by_point[r], by_exterior[r], by_interior[name] = *new[:3], (r, new[3])
+        gain = np.asarray(_gain(by_point, sigma, point, n))
+        points = points + np.asarray(_step(gain, residual, point, n))
+    return _Rays(image, point, gain, sigma, by_exterior, by_interior), points, shown
+
+
+def _propagated(by: Float[np.ndarray, "n 6 m"], sigma: Float[Numbers, "n m"]) -> Float[np.ndarray, "n 6 6"]:
+    return np.einsum("nij,nj,nkj->nik", by, np.asarray(sigma) ** 2, by)
+
+
+def _sigmas(priors: list) -> np.ndarray:
+    """The sigma of each prior that has one, zero for the others."""
+    return np.array([float(p.sigma) if isinstance(p, Weighted) else 0.0 for p in priors])
+
+
+def _numbers(interior: InteriorOrientation) -> InteriorOrientation:
+    """Numbers as arrays: a float in the tree would be compiled in, and every camera compiled anew."""
+    return jax.tree.map(partial(np.asarray, dtype=float), interior)
+
+
+_of_rows = partial(jax.jit, static_argnums=3, compiler_options=QUICK_TO_COMPILE)
+_gain, _step, _own_covariance = _of_rows(intersection_gain), _of_rows(intersection_step), _of_rows(own_covariance)
+_shared_covariance = jax.jit(shared_covariance, static_argnums=4, compiler_options=QUICK_TO_COMPILE)
+
+
+@partial(jax.jit, static_argnums=4, compiler_options=QUICK_TO_COMPILE)
+def _ray_partials(interior, exterior, points, xy, corrections: Corrections) -> RayPartials:
+    one = lambda e, point, measured: ray_partials(interior, e, point, measured, corrections)  # noqa: E731
+    return jax.vmap(one)(exterior, points, xy)
+
+
+@partial(jax.jit, compiler_options=QUICK_TO_COMPILE)
+def _direct_partials(sensors: SensorRows) -> DirectPartials:
+    one = lambda s: direct_partials(s.station, s.roll_pitch_yaw, s.mount, s.bias, s.exposure)  # noqa: E731
+    return jax.vmap(one)(sensors)

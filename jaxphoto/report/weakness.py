@@ -1,0 +1,108 @@
+"""Interior orientations that a block cannot see, in words: what it means, and what would cure it.
+
+Over flat ground, in near-vertical images, a longer principal distance and a higher flight make the same images, and so
+do a moved principal point and a moved, tilted camera. Only stations, relief, two flying heights or oblique images tell
+them apart (docs/models.md, principal points; docs/statistics.md).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxphoto.adjustment import Adjustment
+from jaxphoto.report.tables import Tables
+from jaxphoto.statistics import Correlations
+from jaxphoto.unknowns import FREE
+
+WEAK_CORRELATION = 0.9
+FLAT = 0.2
+"""Range of the heights over the flying height, up to which the ground is called nearly flat."""
+NEAR_VERTICAL_DEG = 15.0
+# Rows of the correlations: positions stand first, then rotations of whichever kind.
+_PLAN, _HEIGHT, _TILTS = slice(0, 2), slice(2, 3), slice(3, 5)
+_C, _POINT = ("c_mm",), ("xp_mm", "yp_mm")
+
+
+class Weakness(NamedTuple):
+    """One weakness of one camera, and the (exterior, interior) pairs whose high correlation it explains."""
+
+    sentence: str
+    explains: frozenset[tuple[str, str]]
+
+
+class _Geometry(NamedTuple):
+    """Of one camera's images: relief over flying height, and the largest tilt in degrees."""
+
+    relief: float
+    tilt_deg: float
+
+    @property
+    def weak(self) -> bool:
+        """Nearly flat, and nearly vertical."""
+        return self.relief < FLAT and self.tilt_deg < NEAR_VERTICAL_DEG
+
+    def __str__(self) -> str:
+        return f"nearly flat ground (relief {100 * self.relief:.0f} % of the flying height) in near-vertical images"
+
+
+def weaknesses(tables: Tables, camera: str, c: Correlations) -> list[Weakness]:
+    """What flat ground and near-vertical images leave open of the interior orientation of `camera`."""
+    adjusted = tables.adjusted
+    images = np.flatnonzero(np.array(adjusted.block.image_camera) == camera)
+    geometry = _geometry(adjusted, images)
+    if geometry is None or not geometry.weak:
+        return []
+    sigma = {s.parameter: s.sigma for s in tables.significance if s.camera == camera}
+    found = []
+    rho = _strongest(c, _HEIGHT, _C)
+    if rho > WEAK_CORRELATION and not _stations(adjusted, images, (2,)):
+        share = 100 * sigma["c_mm"] / float(adjusted.unknowns.interior[camera].c)
+        sentence = (
+            f"c of camera {camera} is hardly determined: sigma {sigma['c_mm']:.3g} mm ({share:.2g} % of c), |rho| with "
+            f"Z up to {rho:.4f}; over {geometry} a longer c and a higher flight give the same image coordinates, and "
+            "no station tells them apart: add camera stations (GNSS), relief or a second flying height, or oblique "
+            "images, or hold c fixed"
+        )
+        found.append(Weakness(sentence, _pairs(c, _HEIGHT, _C)))
+    turned, moved = _strongest(c, _TILTS, _POINT), _strongest(c, _PLAN, _POINT)
+    if max(turned, moved) > WEAK_CORRELATION and not _stations(adjusted, images, (0, 1)):
+        sigmas = ", ".join(f"sigma of {name} {sigma[name]:.3g} mm" for name in _POINT if name in sigma)
+        sentence = (
+            f"the principal point of camera {camera} is hardly determined: {sigmas}, |rho| with "
+            f"{' and '.join(c.eop_names[_TILTS])} up to {turned:.4f}, with X and Y up to {moved:.4f}; over {geometry} "
+            "a tilt and a shift of every image make good for it: add camera stations (GNSS) with strips flown in "
+            "opposite directions, relief or oblique images, or hold it fixed"
+        )
+        found.append(Weakness(sentence, _pairs(c, _TILTS, _POINT) | _pairs(c, _PLAN, _POINT)))
+    return found
+
+
+def _geometry(adjusted: Adjustment, images: np.ndarray) -> _Geometry | None:
+    """None where no image looks down from above."""
+    rows = adjusted.structure
+    seen = np.unique(rows.point[np.isin(rows.image, images)])
+    heights = np.asarray(adjusted.unknowns.points)[seen, 2]
+    flying = np.asarray(adjusted.unknowns.exterior.position)[images, 2].mean() - heights.mean() if len(seen) else 0.0
+    if not flying > 0:
+        return None
+    axis = np.asarray(adjusted.unknowns.exterior.camera_from_object)[images][:, 2, 2]
+    return _Geometry(float(np.ptp(heights) / flying), float(np.degrees(np.arccos(np.clip(axis, -1.0, 1.0))).max()))
+
+
+def _stations(adjusted: Adjustment, images: np.ndarray, axes: tuple[int, ...]) -> bool:
+    """Whether a station, not free to shift with its strip or mount, holds an image on one of `axes`."""
+    block, priors = adjusted.block, adjusted.priors
+    loose = {name for name, bias in priors.strips.items() if bias.shift is FREE}
+    swung = {name for name, mount in priors.mounts.items() if mount.lever_arm is FREE}
+    rows = np.isin(block.stations.who, images) & np.isin(block.stations.axis, axes)
+    held = np.unique(block.stations.who[rows]).tolist()
+    return any(block.image_strip[i] not in loose and block.image_mount[i] not in swung for i in held)
+
+
+def _strongest(c: Correlations, rows: slice, parameters: tuple[str, ...]) -> float:
+    columns = [k for k, name in enumerate(c.parameters) if name in parameters]
+    return float(c.max_abs[rows][:, columns].max(initial=0.0)) if len(c.images) else 0.0
+
+
+def _pairs(c: Correlations, rows: slice, parameters: tuple[str, ...]) -> frozenset[tuple[str, str]]:
+    return frozenset((e, p) for e in c.eop_names[rows] for p in c.parameters if p in parameters)

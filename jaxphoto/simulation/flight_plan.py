@@ -1,0 +1,119 @@
+"""The flight as planned: straight strips over level ground, their exposures, and the ground they cover.
+
+Headings are in degrees clockwise from north, lengths in metres, object frame east-north-up (docs/conventions.md).
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxphoto.camera import Sensor
+from jaxphoto.errors import BlockError
+from jaxphoto.georeferencing.mount import ImageX
+
+
+class Footprint(NamedTuple):
+    """The ground that a vertical image covers, along and across the flight (m)."""
+
+    along: float
+    across: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Strip:
+    """A straight run of `images` exposures, `base_m` apart, flown towards `heading_deg` at a constant height.
+
+    The middle of the run lies `along_m` ahead and `across_m` to the right of the origin, as seen by one who flies it.
+    `height_m` is above the mean terrain, `footprint` is that of an exposure there.
+    """
+
+    name: str
+    camera: str
+    heading_deg: float
+    images: int
+    base_m: float
+    height_m: float
+    footprint: Footprint
+    along_m: float = 0.0
+    across_m: float = 0.0
+
+    @property
+    def axes(self) -> Float[np.ndarray, "2 2"]:
+        """Unit vectors (east, north): ahead, and to the right."""
+        heading = np.deg2rad(self.heading_deg)
+        return np.array([[np.sin(heading), np.cos(heading)], [np.cos(heading), -np.sin(heading)]])
+
+    @property
+    def along(self) -> Float[np.ndarray, "images"]:
+        """How far ahead of the middle of the strip each exposure is (m)."""
+        return (np.arange(self.images) - (self.images - 1) / 2) * self.base_m
+
+    @property
+    def middle(self) -> Float[np.ndarray, "2"]:
+        """Of the run, (east, north) in m."""
+        return np.array([self.along_m, self.across_m]) @ self.axes
+
+    @property
+    def exposures(self) -> Float[np.ndarray, "images 2"]:
+        """(east, north) of the exposures, in m."""
+        return self.middle + self.along[:, None] * self.axes[0]
+
+
+@dataclasses.dataclass(frozen=True)
+class FlightPlan:
+    """Strips in the order of their flight, at a ground speed."""
+
+    strips: tuple[Strip, ...]
+    speed_m_per_s: float = 60.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Swaths:
+    """The ground between the first and last exposure of each strip, over a part of its width.
+
+    `across` is that part; `ends` is the part of half a footprint that is added beyond the first and last exposure.
+    """
+
+    strips: tuple[Strip, ...]
+    across: float = 0.95
+    ends: float = 0.0
+
+    def half(self, strip: Strip) -> Float[np.ndarray, "2"]:
+        """Half the length and half the width (m) of one swath."""
+        length = strip.along[-1] + self.ends * strip.footprint.along / 2
+        return np.array([length, self.across * strip.footprint.across / 2])
+
+    def contain(self, xy: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, "n"]:
+        """Whether places (east, north) lie in any of the swaths."""
+        inside = np.zeros(len(xy), bool)
+        for strip in self.strips:
+            inside |= np.all(np.abs((xy - strip.middle) @ strip.axes.T) <= self.half(strip), axis=1)
+        return inside
+
+    def extent(self, axes: Float[np.ndarray, "2 2"]) -> Float[np.ndarray, "2 2"]:
+        """Least and greatest coordinate of all swaths, (least or greatest, axis) in m along the unit vectors `axes`."""
+        signs = np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]])
+        corners = np.vstack([s.middle + signs * self.half(s) @ s.axes for s in self.strips]) @ axes.T
+        return np.stack([corners.min(axis=0), corners.max(axis=0)])
+
+    def draw(self, rng: np.random.Generator, n: int) -> Float[np.ndarray, "n 2"]:
+        """Places (east, north) of uniform density over the union of the swaths. Raises BlockError if that is empty."""
+        if not any(np.all(self.half(strip) > 0) for strip in self.strips):
+            raise BlockError(
+                "strips of one image each leave no ground between their first and last exposure; "
+                "let the points lie beyond the ends too, or add images"
+            )
+        low, high = self.extent(np.eye(2))
+        found = np.zeros((0, 2))
+        while len(found) < n:
+            xy = rng.uniform(low, high, (4 * n, 2))
+            found = np.vstack([found, xy[self.contain(xy)]])
+        return found[:n]
+
+
+def footprint(sensor: Sensor, c_mm: float, height_m: float, image_x: ImageX) -> Footprint:
+    """The ground that a vertical image covers from `height_m`: format times height over principal distance."""
+    sides = np.array([sensor.width_mm, sensor.height_mm]) * height_m / c_mm
+    return Footprint(*map(float, sides if image_x in ("forward", "back") else sides[::-1]))

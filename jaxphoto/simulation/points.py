@@ -1,0 +1,117 @@
+"""Tie points and targets: where they lie, what they are called, which role they play."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxphoto.errors import BlockError
+from jaxphoto.simulation.flight import Flight
+from jaxphoto.simulation.flight_plan import Strip, Swaths
+from jaxphoto.simulation.recipe import Choice, Recipe, Role, Targets
+from jaxphoto.simulation.streams import stream
+from jaxphoto.simulation.terrain import Terrain
+from jaxphoto.simulation.visibility import Rays, photograph
+
+# Batches of places to try before a rule that finds too few points is given up.
+_TRIES = 20
+
+
+class Scene(NamedTuple):
+    """The points, (points, 3) in m, and their rays without noise."""
+
+    ids: tuple[str, ...]
+    xyz: Float[np.ndarray, "points 3"]
+    roles: tuple[Role, ...]
+    is_target: Bool[np.ndarray, "points"]
+    rays: Rays
+
+
+def scatter(recipe: Recipe, flight: Flight, terrain: Terrain, seed: int) -> Scene:
+    """Ties and targets of the recipe. Raises BlockError where images do not see them often enough."""
+    swaths = Swaths(recipe.plan.strips, recipe.points.across, recipe.points.ends)
+    rng = stream(seed, "ties")
+    ids = [f"{k + 1}" for k in range(recipe.points.ties)]
+    xyz = [_uniform(recipe, flight, terrain, swaths, recipe.points.ties, rng)]
+    roles: list[Role] = ["tie"] * len(ids)
+    counts: dict[str, int] = {}
+    for number, group in enumerate(recipe.targets):
+        rng = stream(seed, f"targets {number}")
+        given = _given(group, terrain, swaths, rng)
+        _check_seen(recipe, flight, given)
+        places = np.vstack([given, _uniform(recipe, flight, terrain, swaths, group.count, rng)])
+        begin = counts.get(group.prefix, 0)
+        counts[group.prefix] = begin + len(places)
+        ids += [f"{group.prefix}{begin + k + 1}" for k in range(len(places))]
+        xyz.append(places)
+        roles += _roles(group, places, recipe.plan.strips)
+    points = np.vstack(xyz)
+    is_target = np.arange(len(points)) >= recipe.points.ties
+    return Scene(tuple(ids), points, tuple(roles), is_target, _rays(recipe, flight, points))
+
+
+def _rays(recipe: Recipe, flight: Flight, xyz: np.ndarray) -> Rays:
+    cameras = {name: camera.truth for name, camera in recipe.cameras.items()}
+    return photograph(cameras, recipe.sensors, flight.cameras, flight.exterior, xyz, recipe.points.margin_mm)
+
+
+def _uniform(
+    recipe: Recipe, flight: Flight, terrain: Terrain, swaths: Swaths, n: int, rng: np.random.Generator
+) -> np.ndarray:
+    found = np.zeros((0, 3))
+    for _ in range(_TRIES):
+        if len(found) >= n:
+            break
+        places = terrain.place(swaths.draw(rng, n), rng)
+        often = _rays(recipe, flight, places).per_point(n) >= recipe.points.min_images
+        found = np.vstack([found, places[often]])
+    if len(found) < n:
+        raise BlockError(
+            f"only {len(found)} of {n} points are seen in {recipe.points.min_images} images, of {_TRIES * n} tried; "
+            "raise the overlaps or the number of images, or ask less of the points"
+        )
+    return found[:n]
+
+
+def _given(group: Targets, terrain: Terrain, swaths: Swaths, rng: np.random.Generator) -> np.ndarray:
+    axes = swaths.strips[0].axes
+    low, high = swaths.extent(axes)
+    parts = np.array(group.at, float).reshape(-1, 2)
+    relative = ((low + high) / 2 + parts * (high - low) / 2) @ axes
+    flat = np.array([place[:2] for place in group.at_m], float).reshape(-1, 2)
+    given = terrain.place(np.vstack([relative, flat]), rng)
+    for k, place in enumerate(group.at_m, start=len(relative)):
+        given[k, 2:] = place[2:] or given[k, 2:]
+    return given
+
+
+def _check_seen(recipe: Recipe, flight: Flight, xyz: np.ndarray) -> None:
+    seen = _rays(recipe, flight, xyz).per_point(len(xyz))
+    for k in np.flatnonzero(seen < recipe.points.min_images):
+        x, y, _ = xyz[k]
+        raise BlockError(
+            f"the target at X {x:.1f} m, Y {y:.1f} m is seen in {seen[k]} image(s), not in {recipe.points.min_images}; "
+            "move it inside the block"
+        )
+
+
+def _roles(group: Targets, xyz: np.ndarray, strips: tuple[Strip, ...]) -> list[Role]:
+    roles = [group.role] * len(xyz)
+    if group.choice is not None:
+        for k in _chosen(group.choice, xyz[:, :2], strips):
+            roles[k] = group.choice.role
+    return roles
+
+
+def _chosen(choice: Choice, xy: np.ndarray, strips: tuple[Strip, ...]) -> list[int]:
+    low, high = Swaths(strips).extent(np.eye(2))
+    xy = xy - (low + high) / 2
+    chosen = list(range(min(choice.first, len(xy))))
+    rankings = [(np.hypot(*xy.T), 1)] if choice.centre else []
+    headings = np.deg2rad(np.unique([round(s.heading_deg % 180, 3) for s in strips]))
+    for ahead in np.column_stack([np.sin(headings), np.cos(headings)]):
+        rankings += [(xy @ ahead, choice.outermost), (-xy @ ahead, choice.outermost)]
+    # One after the other, passing over those already chosen: every rule gets as many as it asks for.
+    for rank, count in rankings:
+        chosen += [int(k) for k in np.argsort(rank, kind="stable") if k not in chosen][:count]
+    return chosen

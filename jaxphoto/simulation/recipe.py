@@ -1,0 +1,161 @@
+"""What a simulation is made from: everything but the seed.
+
+What the block says and what is true are told apart everywhere: `Assumed` for parameters, `Sigmas` twice for noise.
+"""
+
+import dataclasses
+from typing import Generic, Literal, TypeVar
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxphoto.block import Datum
+from jaxphoto.camera import InteriorOrientation, Sensor
+from jaxphoto.georeferencing import Mount, StripBias
+from jaxphoto.simulation.flight_plan import FlightPlan
+from jaxphoto.simulation.terrain import Terrain
+
+Role = Literal["control", "vertical", "check", "tie"]
+"""What a target is: control in X, Y and Z, control in Z only, a check point, or a tie point as good as a target."""
+ROLES: tuple[Role, ...] = ("control", "vertical", "check", "tie")
+Triple = tuple[float, float, float]
+T = TypeVar("T")
+
+
+@dataclasses.dataclass(frozen=True)
+class Assumed(Generic[T]):
+    """Parameters as they are (`truth`), as the block starts with (`start`), and its priors for them."""
+
+    truth: T
+    start: T
+    prior: T
+
+
+@dataclasses.dataclass(frozen=True)
+class Bias:
+    """Shift (m) and drift (m/s) of the GNSS positions of a strip.
+
+    Truth is `truth` plus, for each strip by itself, normal shifts and drifts of `shift_sigma_m` and
+    `drift_sigma_m_per_s`. `model` is the block's start and prior, None where the block knows of no bias.
+    """
+
+    truth: StripBias
+    shift_sigma_m: Triple = (0.0, 0.0, 0.0)
+    drift_sigma_m_per_s: Triple = (0.0, 0.0, 0.0)
+    model: tuple[StripBias, StripBias] | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Jitter:
+    """Standard deviations by which a flight leaves its plan.
+
+    `position_m` per axis X, Y, Z; `angle_deg` of roll and of pitch; `crab_deg` of yaw against the track (the track
+    stays); `rate_deg_per_s` of the rates of turn about right, forward and up.
+    """
+
+    position_m: Triple = (0.0, 0.0, 0.0)
+    angle_deg: float = 0.0
+    crab_deg: float = 0.0
+    rate_deg_per_s: float = 0.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Points:
+    """How many tie points there are, where, and what is measured.
+
+    Points lie in the swaths (`Swaths`: `across`, `ends`) and are seen in `min_images` images at least, with
+    `margin_mm` to the edge of the format. Every image that sees a point measures it, unless `mean_rays` says to how
+    many images a point, on average over all points, rays are thinned out by chance.
+    """
+
+    ties: int
+    min_images: int = 2
+    mean_rays: float | None = None
+    across: float = 0.95
+    ends: float = 0.0
+    margin_mm: float = 0.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Choice:
+    """Targets of a group that play another role: the `outermost` of each arm, the one at the `centre`, the `first`.
+
+    Arms lead from the middle of the block both ways along each direction in which strips are flown. A target is chosen
+    once: the rule that comes to it later takes its next one.
+    """
+
+    role: Role
+    outermost: int = 0
+    centre: bool = False
+    first: int = 0
+
+
+@dataclasses.dataclass(frozen=True)
+class Targets:
+    """Signalised points of one role: `count` of them uniform in the swaths, and those at given places.
+
+    `at_m` gives (X, Y) or (X, Y, Z) in m; `at` gives places as parts of half the block's length and width, along and
+    to the right of the first strip's heading, from the middle of the block.
+    """
+
+    role: Role
+    prefix: str = "T"
+    count: int = 0
+    at_m: tuple[tuple[float, ...], ...] = ()
+    at: tuple[tuple[float, float], ...] = ()
+    choice: Choice | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Sigmas:
+    """Standard deviations of tie points and targets in the images, control, stations, attitudes; None: not observed."""
+
+    image_mm: float
+    target_mm: float
+    control_m: Triple | None = None
+    station_m: Triple | None = None
+    attitude_deg: Triple | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Approximation:
+    """Standard deviations of the approximate values: of orientations, and of all points where they are given."""
+
+    position_m: float = 5.0
+    angle_deg: float = 1.0
+    points_m: float | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Recipe:
+    """A simulation but for its seed.
+
+    `mounts` are by name, "default" or that of a camera; `biases` by name, "default" or that of a strip. `stated` sigmas
+    are those of the block's observations, `noise` those by which these are truly off. `datum_offset_m` is added to all
+    observed stations and is in no model.
+    """
+
+    title: str
+    sensors: dict[str, Sensor]
+    cameras: dict[str, Assumed[InteriorOrientation]]
+    plan: FlightPlan
+    points: Points
+    stated: Sigmas
+    noise: Sigmas
+    targets: tuple[Targets, ...] = ()
+    mounts: dict[str, Assumed[Mount]] = dataclasses.field(default_factory=dict)
+    biases: dict[str, Bias] = dataclasses.field(default_factory=dict)
+    datum_offset_m: Triple = (0.0, 0.0, 0.0)
+    jitter: Jitter = Jitter()
+    terrain: Terrain = dataclasses.field(default_factory=Terrain)
+    start: Approximation = Approximation()
+    datum: Datum = dataclasses.field(default_factory=Datum)
+
+    def mount_of(self, camera: str) -> str:
+        """The name of a camera's mount: its own, "default", or "" without any."""
+        return camera if camera in self.mounts else "default" if "default" in self.mounts else ""
+
+
+def triple(values: Triple) -> Float[np.ndarray, "3"]:
+    """A triple of the recipe as an array."""
+    return np.array(values, float)

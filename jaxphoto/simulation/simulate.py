@@ -1,0 +1,207 @@
+"""A recipe and a seed -> a block with known truth."""
+
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from jaxphoto.block import Attitudes, Block, Distances, ImageRows, Rows, Start
+from jaxphoto.camera import InteriorOrientation
+from jaxphoto.collinearity import ExteriorOrientation
+from jaxphoto.errors import BlockError
+from jaxphoto.georeferencing import Mount, StripBias
+from jaxphoto.simulation.flight import Flight, fly, record, turned
+from jaxphoto.simulation.flight_plan import Swaths
+from jaxphoto.simulation.points import Scene, scatter
+from jaxphoto.simulation.recipe import Assumed, Bias, Recipe, Triple, triple
+from jaxphoto.simulation.streams import stream
+from jaxphoto.simulation.visibility import thinned
+from jaxphoto.unknowns import FIXED, FREE, Unknowns
+
+# Control axes of each role, and the places that the mean height of the ground is taken from.
+_AXES = {"control": (0, 1, 2), "vertical": (2,), "check": (0, 1, 2)}
+_PLACES = 4096
+_NO_BIAS = StripBias(np.zeros(3), np.zeros(3))  # type: ignore[arg-type]
+_NO_MOUNT = Mount(np.zeros(3), np.zeros(3))  # type: ignore[arg-type]
+
+
+class Simulation(NamedTuple):
+    """A block and what is true of it.
+
+    `truth` has the mounts and strips of the recipe, whether the block's model knows of them or not; the shifts of its
+    strips contain `datum_offset_m`. So `remeasure(block, truth, key)` measures the same flight once more, with noise of
+    the stated sigmas.
+    """
+
+    block: Block
+    truth: Unknowns
+    datum_offset_m: Float[np.ndarray, "3"]
+
+
+def simulate(recipe: Recipe, seed: int = 0) -> Simulation:
+    """Fly, place points, measure: the block of `recipe` that `seed` draws, bit for bit the same each time.
+
+    Ground, flight, points and each kind of noise have random streams of their own: a change of a sigma changes neither
+    geometry nor the other noise, and scales its own. Raises BlockError where points or images see too little.
+    """
+    terrain = recipe.terrain.drawn(stream(seed, "terrain"))
+    swaths = Swaths(recipe.plan.strips, recipe.points.across, recipe.points.ends)
+    # The same places for every seed: over ground that stays, the flight stays as high.
+    ground = float(np.mean(terrain.height(swaths.draw(stream(0, "ground"), _PLACES))))
+    flight = fly(recipe, ground, seed)
+    scene = _seen(recipe, flight, scatter(recipe, flight, terrain, seed), seed)
+    biases = _true_biases(recipe, seed)
+    truth = Unknowns(
+        {name: _numbers(camera.truth) for name, camera in recipe.cameras.items()},
+        flight.exterior,
+        scene.xyz,
+        {name: _numbers(mount.truth) for name, mount in recipe.mounts.items()},
+        biases,
+    )
+    stations, attitudes = _georeferencing(recipe, flight, truth, seed)
+    control, check = _control(recipe, scene, seed)
+    start, priors = _start(recipe, flight, scene, control, seed)
+    block = Block(
+        title=recipe.title,
+        images=flight.images,
+        points=scene.ids,
+        sensors=recipe.sensors,
+        image_camera=flight.cameras,
+        image_mount=tuple(recipe.mount_of(camera) for camera in flight.cameras),
+        image_strip=flight.strips,
+        image_time=flight.time,
+        image_points=_image_points(recipe, scene, seed),
+        control=control,
+        fixed=Rows.none(),
+        check=check,
+        stations=stations,
+        attitudes=attitudes,
+        distances=Distances.none(),
+        datum=recipe.datum,
+        start=start,
+        priors=priors,
+        motion=flight.motion if any(map(_runs_late, recipe.mounts.values())) else None,
+    )
+    return Simulation(block, truth, triple(recipe.datum_offset_m))
+
+
+def _seen(recipe: Recipe, flight: Flight, scene: Scene, seed: int) -> Scene:
+    """The scene after thinning. Raises BlockError for an image that cannot be oriented."""
+    points, rays = recipe.points, scene.rays
+    if points.mean_rays is not None:
+        rays = thinned(rays, len(scene.ids), points.min_images, points.mean_rays, stream(seed, "thinning"))
+    per_image = np.bincount(rays.image, minlength=len(flight.images))
+    for k in np.flatnonzero(per_image < 3):
+        raise BlockError(
+            f"image {flight.images[k]} sees {per_image[k]} point(s), but an orientation needs 3; "
+            "ask for more points or rays, or let the swaths reach beyond the ends"
+        )
+    return scene._replace(rays=rays)
+
+
+def _image_points(recipe: Recipe, scene: Scene, seed: int) -> ImageRows:
+    image, point, xy = scene.rays
+    target = scene.is_target[point][:, None]
+    noise = np.where(target, recipe.noise.target_mm, recipe.noise.image_mm)
+    stated = np.where(target, recipe.stated.target_mm, recipe.stated.image_mm)
+    xy = xy + noise * _draw(seed, "noise of image points", xy.shape)
+    return ImageRows(image, point, xy, np.broadcast_to(stated, xy.shape).copy())
+
+
+def _control(recipe: Recipe, scene: Scene, seed: int) -> tuple[Rows, Rows]:
+    """Surveyed coordinates of control and of check points; every point draws, so roles do not move the noise."""
+    surveyed = scene.xyz + _sigma(recipe.noise.control_m) * _draw(seed, "noise of control", scene.xyz.shape)
+    sigma = _sigma(recipe.stated.control_m)
+
+    def rows(*roles: str) -> Rows:
+        pairs = [(k, axis) for k, role in enumerate(scene.roles) if role in roles for axis in _AXES[role]]
+        who, axis = np.array(pairs, int).reshape(-1, 2).T
+        return Rows(who, axis, surveyed[who, axis], sigma[axis])
+
+    return rows("control", "vertical"), rows("check")
+
+
+def _georeferencing(recipe: Recipe, flight: Flight, truth: Unknowns, seed: int) -> tuple[Rows, Attitudes]:
+    mounts = [truth.mounts.get(recipe.mount_of(camera), _NO_MOUNT) for camera in flight.cameras]
+    position, attitude = record(flight, mounts, [truth.strips.get(s, _NO_BIAS) for s in flight.strips])
+    n = len(flight.images)
+    stations, attitudes = Rows.none(), Attitudes.none()
+    if recipe.stated.station_m is not None:
+        position = position + _sigma(recipe.noise.station_m) * _draw(seed, "noise of stations", (n, 3))
+        who, axis = np.indices((n, 3)).reshape(2, -1)
+        stations = Rows(who, axis, position.ravel(), _sigma(recipe.stated.station_m)[axis])
+    if recipe.stated.attitude_deg is not None:
+        noise = np.deg2rad(_sigma(recipe.noise.attitude_deg)) * _draw(seed, "noise of attitudes", (n, 3))
+        sigma = np.deg2rad(_sigma(recipe.stated.attitude_deg))
+        attitudes = Attitudes(np.arange(n), attitude + noise, np.tile(sigma, (n, 1)))
+    return stations, attitudes
+
+
+def _true_biases(recipe: Recipe, seed: int) -> dict[str, StripBias]:
+    """Shift and drift of every strip that has any; the datum offset is part of the shift."""
+    offset, biases = triple(recipe.datum_offset_m), {}
+    for strip in recipe.plan.strips:
+        bias = _bias_of(recipe, strip.name)
+        if bias is None and not offset.any():
+            continue
+        bias = bias or Bias(_NO_BIAS)
+        shift, drift = _draw(seed, f"bias of strip {strip.name}", (2, 3))
+        biases[strip.name] = StripBias(
+            np.asarray(bias.truth.shift) + offset + triple(bias.shift_sigma_m) * shift,
+            np.asarray(bias.truth.drift) + triple(bias.drift_sigma_m_per_s) * drift,
+        )
+    return biases
+
+
+def _start(recipe: Recipe, flight: Flight, scene: Scene, control: Rows, seed: int) -> tuple[Start, Unknowns]:
+    """Where the adjustment starts, and its priors; control stands in for approximate coordinates where it is given."""
+    n, near = len(flight.images), recipe.start
+    off = _draw(seed, "approximate orientation", (2, n, 3))
+    position = np.asarray(flight.exterior.position) + near.position_m * off[0]
+    turn = np.deg2rad(near.angle_deg) * off[1]
+    exterior = ExteriorOrientation(position, turned(flight.exterior, turn))  # type: ignore[arg-type]
+    points = np.full(scene.xyz.shape, np.nan)
+    if near.points_m is not None:
+        points = scene.xyz + near.points_m * _draw(seed, "approximate points", scene.xyz.shape)
+    points[control.who, control.axis] = control.value
+    known = ~np.isnan(points).any(axis=1)
+    points[~known] = 0.0
+    modelled = {s.name: bias.model for s in recipe.plan.strips if (bias := _bias_of(recipe, s.name)) and bias.model}
+    start = Unknowns(
+        {name: _numbers(camera.start) for name, camera in recipe.cameras.items()},
+        exterior,
+        points,
+        {name: _numbers(mount.start) for name, mount in recipe.mounts.items()},
+        {name: _numbers(start) for name, (start, _) in modelled.items()},
+    )
+    priors = Unknowns(
+        {name: camera.prior for name, camera in recipe.cameras.items()},
+        ExteriorOrientation(FREE, FREE),  # type: ignore[arg-type]
+        FREE,  # type: ignore[arg-type]
+        {name: mount.prior for name, mount in recipe.mounts.items()},
+        {name: prior for name, (_, prior) in modelled.items()},
+    )
+    return Start(start, np.ones(n, bool), known), priors
+
+
+def _bias_of(recipe: Recipe, strip: str) -> Bias | None:
+    return recipe.biases.get(strip, recipe.biases.get("default"))
+
+
+def _runs_late(mount: Assumed[Mount]) -> bool:
+    """Whether the time offset matters: then the block needs to know how the sensor moves."""
+    offsets = (mount.truth.time_offset, mount.start.time_offset)
+    return any(float(offset) != 0 for offset in offsets) or mount.prior.time_offset is not FIXED
+
+
+def _draw(seed: int, purpose: str, shape: tuple[int, ...]) -> np.ndarray:
+    return stream(seed, purpose).standard_normal(shape)
+
+
+def _sigma(values: Triple | None) -> np.ndarray:
+    return np.zeros(3) if values is None else triple(values)
+
+
+def _numbers(tree: InteriorOrientation | Mount | StripBias):
+    return jax.tree.map(lambda value: np.asarray(value, float), tree)

@@ -1,0 +1,14 @@
+"""Random streams: one per purpose, all of one seed, so that what one draws does not move another."""
+
+import zlib
+
+import numpy as np
+
+
+def stream(seed: int, purpose: str) -> np.random.Generator:
+    """The generator of `purpose` ("terrain", "noise of stations", ...) under `seed`.
+
+    Streams of different purposes are independent (NumPy's `SeedSequence` with the purpose as spawn key), and a
+    purpose's stream does not depend on which others are used.
+    """
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(zlib.crc32(purpose.encode()),)))

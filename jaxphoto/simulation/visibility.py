@@ -1,0 +1,101 @@
+"""Which image sees which point, and where: no noise, no occlusion."""
+
+import functools
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxphoto.camera import InteriorOrientation, Sensor
+from jaxphoto.collinearity import ExteriorOrientation
+from jaxphoto.simulation.chunks import in_chunks
+
+_CHUNK = 1024
+# Places on the format, along each side, from which is seen how far ideal coordinates reach; 31 x 31 fill a chunk.
+_PLACES = 31
+
+
+class Rays(NamedTuple):
+    """Measured coordinates (mm from the image centre) of points in images, sorted by point, then image."""
+
+    image: Int[np.ndarray, "rays"]
+    point: Int[np.ndarray, "rays"]
+    xy: Float[np.ndarray, "rays 2"]
+
+    def take(self, chosen: np.ndarray) -> "Rays":
+        """The rays of a mask or of indices."""
+        return Rays(self.image[chosen], self.point[chosen], self.xy[chosen])
+
+    def per_point(self, n: int) -> Int[np.ndarray, "points"]:
+        """In how many images each of `n` points is seen."""
+        return np.bincount(self.point, minlength=n)
+
+
+def photograph(
+    cameras: Mapping[str, InteriorOrientation],
+    sensors: Mapping[str, Sensor],
+    image_camera: Sequence[str],
+    exterior: ExteriorOrientation,
+    points: Float[np.ndarray, "points 3"],
+    margin_mm: float = 0.0,
+) -> Rays:
+    """The rays of all points that images see.
+
+    A point is seen where it is in front of the camera (W < 0), where the distortion can be inverted
+    (`InteriorOrientation.valid`), and inside the format by more than `margin_mm`. Coordinates are those of
+    `jaxphoto.collinearity.project`.
+    """
+    position, matrix = np.asarray(exterior.position), np.asarray(exterior.camera_from_object)
+    # (images, points, 3), in the camera frame
+    seen = np.einsum("kij,knj->kni", matrix, points[None] - position[:, None])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        tangents = -seen[..., :2] / seen[..., 2:]
+    found = []
+    for name, interior in cameras.items():
+        sensor = sensors[name]
+        interior = jax.tree.map(np.float64, interior)
+        half = np.array([sensor.width_mm, sensor.height_mm]) / 2
+        mine = np.array([camera == name for camera in image_camera])[:, None] & (seen[..., 2] < 0)
+        ideal = tangents * float(interior.c)
+        image, point = np.nonzero(mine & (np.abs(ideal) <= _reach(interior, half)).all(axis=2))
+        if not len(image):
+            continue
+        xy, valid = in_chunks(functools.partial(_measured, interior), _CHUNK, ideal[image, point])
+        found.append(Rays(image, point, xy).take(valid & (np.abs(xy) < half - margin_mm).all(axis=1)))
+    if not found:
+        return Rays(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)))
+    rays = Rays(*(np.concatenate(part) for part in zip(*found, strict=True)))
+    return rays.take(np.lexsort((rays.image, rays.point)))
+
+
+def _reach(interior: InteriorOrientation, half: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
+    """Bounds of |ideal coordinates| on the format, so that the distortion is not asked about every pair."""
+    grid = np.stack(np.meshgrid(*np.linspace(-half, half, _PLACES).T), axis=-1).reshape(-1, 2)
+    ideal = np.abs(in_chunks(functools.partial(_ideal, interior), _CHUNK, grid))
+    return 1.05 * np.max(ideal, axis=0, initial=0.0, where=np.isfinite(ideal))
+
+
+@jax.jit
+def _ideal(interior: InteriorOrientation, measured):
+    return jax.vmap(interior.ideal_from_measured)(measured)
+
+
+@jax.jit
+def _measured(interior: InteriorOrientation, ideal):
+    each = jax.vmap(lambda xy: (interior.measured_from_ideal(xy), interior.valid(xy)))
+    return each(ideal)
+
+
+def thinned(rays: Rays, n_points: int, min_images: int, mean_rays: float, rng: np.random.Generator) -> Rays:
+    """Rays left out by chance until points have `mean_rays` on average; each keeps `min_images` at least."""
+    surplus = len(rays.point) - round(mean_rays * n_points)
+    if surplus <= 0:
+        return rays
+    order = np.lexsort((rng.random(len(rays.point)), rays.point))
+    begin = np.concatenate([[0], np.cumsum(rays.per_point(n_points))[:-1]])
+    rank = np.empty(len(order), int)
+    rank[order] = np.arange(len(order)) - begin[rays.point[order]]
+    spare = rng.permutation(np.flatnonzero(rank >= min_images))
+    return rays.take(np.setdiff1d(np.arange(len(order)), spare[:surplus]))

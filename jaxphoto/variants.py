@@ -1,0 +1,254 @@
+"""Variants of a block, for experiments: short pure functions, block in and block out, composed by calling.
+
+    vertical_control(strips(block, ["north", "south"]))
+
+The modes of georeferencing of paper 004 are three of them (`MODES`): what differs is which observations there are and
+what is held, never the adjustment (docs/georeferencing.md).
+"""
+
+import dataclasses
+from collections.abc import Callable, Collection, Mapping
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxphoto.arrays import still
+from jaxphoto.block import AXES, Attitudes, Block, Datum, Distances, ImageRows, Rows, direct_exterior, sensor_rows
+from jaxphoto.camera import set_parameter
+from jaxphoto.errors import BlockError
+from jaxphoto.unknowns import FIXED
+
+
+def indirect(block: Block) -> Block:
+    """Neither stations nor attitudes: control alone places the block."""
+    return without_attitudes(without_stations(block))
+
+
+def integrated(block: Block) -> Block:
+    """Stations and attitudes are weighted observations beside the image points: the block as it is."""
+    return block
+
+
+def direct(block: Block) -> Block:
+    """Exterior orientation from stations, attitudes and mounts, and held: no image point moves an image.
+
+    An image without a whole station and attitude keeps its start value. Stations and attitudes are used up: as
+    observations of what they were computed into they would only feign redundancy. Raises BlockError for an image whose
+    orientation neither sensors nor the start give.
+    """
+    rows = sensor_rows(block, block.start.unknowns)
+    known = np.array(block.start.image_known, bool)
+    known[rows.image] = True
+    if not known.all():
+        left = np.flatnonzero(~known)
+        so = "1 image is so" if len(left) == 1 else f"{len(left)} images are so"
+        raise BlockError(
+            f"image {block.images[left[0]]} has neither station and attitude nor an exterior orientation ({so}), which "
+            "direct georeferencing needs: give them, or take another mode"
+        )
+    found = direct_exterior(rows)
+    exterior = jax.tree.map(lambda old, new: jnp.asarray(old).at[rows.image].set(new), _exterior(block), found)
+    start = eqx.tree_at(lambda s: (s.unknowns.exterior, s.image_known), block.start, (exterior, known))
+    held = jax.tree.map(lambda _: FIXED, _exterior(block))
+    return eqx.tree_at(lambda b: (b.start, b.priors.exterior), indirect(block), (start, held))
+
+
+MODES: dict[str, Callable[[Block], Block]] = {"direct": direct, "integrated": integrated, "indirect": indirect}
+"""The modes of georeferencing by the name that block.toml gives them."""
+
+
+def without_stations(block: Block) -> Block:
+    """No GNSS positions. What only they see is held: lever arms, shifts and drifts."""
+    return _hold_unseen(dataclasses.replace(block, stations=Rows.none()))
+
+
+def without_attitudes(block: Block) -> Block:
+    """No observed roll, pitch and yaw. What only they see well is held: the boresight."""
+    return _hold_unseen(dataclasses.replace(block, attitudes=Attitudes.none()))
+
+
+def without_control(block: Block) -> Block:
+    """Control, weighted and fixed, becomes check points."""
+    return control_only(block, ())
+
+
+def control_only(block: Block, points: Collection[str]) -> Block:
+    """Of the control only the `points` named stays; that of all others becomes check points.
+
+    Raises ValueError for a name that has no control.
+    """
+    of = np.array(block.points, object)
+    given = set(of[block.control.who]) | set(of[block.fixed.who])
+    if unknown := [point for point in points if point not in given]:
+        raise ValueError(f"{unknown[0]} is no control point of this block; name some of {', '.join(sorted(given))}")
+    chosen = np.isin(np.arange(len(of)), [k for k, point in enumerate(of) if point in set(points)])
+    stay, held = chosen[block.control.who], chosen[block.fixed.who]
+    return dataclasses.replace(
+        block,
+        control=block.control.take(stay),
+        fixed=block.fixed.take(held),
+        check=Rows.joined(block.check, block.control.take(~stay), block.fixed.take(~held)),
+    )
+
+
+def vertical_control(block: Block) -> Block:
+    """Control in height only: Z of control and check points is control, X and Y are check coordinates.
+
+    A check coordinate without sigma takes that of the control (`all_control`). Fixed heights stay fixed.
+    """
+    control, check, fixed = block.control, block.check, block.fixed
+    upright = check.axis == 2
+    return dataclasses.replace(
+        block,
+        control=Rows.joined(control.take(control.axis == 2), _as_control(check.take(upright), control)),
+        fixed=fixed.take(fixed.axis == 2),
+        check=Rows.joined(check.take(~upright), control.take(control.axis != 2), fixed.take(fixed.axis != 2)),
+    )
+
+
+def all_control(block: Block, sigma: float | Float[np.ndarray, "3"] | None = None) -> Block:
+    """Check points become control, each coordinate with its own sigma or, where it has none (zero), with `sigma`.
+
+    `sigma` in m, one or one an axis; None means that of the block's control on the axis. Raises ValueError where that
+    is none or several.
+    """
+    promoted = _as_control(block.check, block.control, sigma)
+    return dataclasses.replace(block, control=Rows.joined(block.control, promoted), check=Rows.none())
+
+
+def hold_interior(block: Block, camera: str, values: Mapping[str, float]) -> Block:
+    """The interior orientation of `camera` held: at `values` (c_mm, k1 ...), what they do not name at its start."""
+    interior = block.start.unknowns.interior[camera]
+    for name, value in values.items():
+        interior = set_parameter(interior, name, value)
+    held = jax.tree.map(lambda _: FIXED, interior)
+    where = lambda b: (b.start.unknowns.interior[camera], b.priors.interior[camera])  # noqa: E731
+    return eqx.tree_at(where, block, (interior, held))
+
+
+def strips(block: Block, names: Collection[str]) -> Block:
+    """Only the images of the strips `names`, and the points that at least two of them show.
+
+    Cameras, mounts and strips without an image go, observations of what is gone too; ids stay. Raises ValueError for a
+    name that is no strip.
+    """
+    if unknown := [name for name in names if not name or name not in block.image_strip]:
+        known = ", ".join(sorted(set(block.image_strip) - {""}))
+        raise ValueError(f"{unknown[0]!r} is no strip of this block; its strips are {known or 'none'}")
+    image = np.flatnonzero([strip in names for strip in block.image_strip])
+    seen = block.image_points.point[np.isin(block.image_points.image, image)]
+    point = np.flatnonzero(np.bincount(seen, minlength=len(block.points)) >= 2)
+    return _part(block, image, point)
+
+
+def _part(block: Block, image: np.ndarray, point: np.ndarray) -> Block:
+    """The block of some images and points, renumbered."""
+    new_image, new_point = _numbers(image, len(block.images)), _numbers(point, len(block.points))
+    images, points = [block.images[i] for i in image], [block.points[p] for p in point]
+    camera, mount, strip = (
+        tuple(of[i] for i in image) for of in (block.image_camera, block.image_mount, block.image_strip)
+    )
+    rows, attitudes, distances, datum = block.image_points, block.attitudes, block.distances, block.datum
+    seen = np.flatnonzero((new_image[rows.image] >= 0) & (new_point[rows.point] >= 0))
+    turned = np.flatnonzero(new_image[attitudes.image] >= 0)
+    ends = new_point[np.asarray(distances.points, int).reshape(-1, 2)]
+    between = np.flatnonzero((ends >= 0).all(axis=1))
+    if isinstance(datum.over, tuple):
+        datum = Datum(datum.kind, tuple(name for name in datum.over if name in set(points)), datum.scale)
+
+    def used(tree):
+        return dataclasses.replace(
+            tree,
+            interior=_only(tree.interior, camera),
+            mounts=_only(tree.mounts, mount),
+            strips=_only(tree.strips, strip),
+        )
+
+    old = block.start
+    start = dataclasses.replace(
+        used(old.unknowns), exterior=_taken(old.unknowns.exterior, image), points=_taken(old.unknowns.points, point)
+    )
+    return dataclasses.replace(
+        block,
+        images=tuple(images),
+        points=tuple(points),
+        sensors=_only(block.sensors, camera),
+        image_camera=camera,
+        image_mount=mount,
+        image_strip=strip,
+        image_time=_taken(block.image_time, image),
+        image_points=ImageRows(
+            new_image[rows.image[seen]], new_point[rows.point[seen]], *_taken((rows.xy, rows.sigma), seen)
+        ),
+        control=_renumbered(block.control, new_point),
+        fixed=_renumbered(block.fixed, new_point),
+        check=_renumbered(block.check, new_point),
+        stations=_renumbered(block.stations, new_image),
+        attitudes=Attitudes(
+            new_image[attitudes.image[turned]], *_taken((attitudes.roll_pitch_yaw, attitudes.sigma), turned)
+        ),
+        distances=Distances(ends[between], *_taken((distances.value, distances.sigma), between)),
+        datum=datum,
+        start=dataclasses.replace(
+            old, unknowns=start, image_known=old.image_known[image], point_known=old.point_known[point]
+        ),
+        priors=used(block.priors),
+        motion=_taken(block.motion, image),
+    )
+
+
+def _exterior(block: Block):
+    return block.start.unknowns.exterior
+
+
+def _hold_unseen(block: Block) -> Block:
+    """Mounts and strips FIXED where no observation is left that sees them; no motion where nothing moves with it."""
+    positions, turns = len(block.stations.who) > 0, len(block.attitudes.image) > 0
+
+    def unseen(b: Block) -> list:
+        mounts, biases = b.priors.mounts.values(), b.priors.strips.values()
+        held = [] if positions else [m.lever_arm for m in mounts] + [v for s in biases for v in (s.shift, s.drift)]
+        held += [] if turns else [m.boresight for m in mounts]
+        return held + ([] if positions or turns else [m.time_offset for m in mounts])
+
+    block = eqx.tree_at(unseen, block, replace_fn=lambda _: FIXED)
+    return block if positions or turns else dataclasses.replace(block, motion=None)
+
+
+def _as_control(check: Rows, control: Rows, sigma: float | Float[np.ndarray, "3"] | None = None) -> Rows:
+    """Check coordinates as control; those without a sigma take `sigma`, or that of the control on their axis."""
+    own = np.asarray(check.sigma)
+    taken = np.zeros(3)
+    for axis in np.unique(check.axis[own == 0]):
+        of_axis = np.unique(np.asarray(control.sigma)[control.axis == axis])
+        if sigma is None and len(of_axis) != 1:
+            several = len(of_axis) or "none"
+            raise ValueError(
+                f"check coordinates in {AXES[axis]} have no sigma, and the control there has {several} to take; make "
+                "them control by all_control(block, sigma) first"
+            )
+        taken[axis] = of_axis[0] if sigma is None else np.broadcast_to(sigma, 3)[axis]
+    return dataclasses.replace(check, sigma=np.where(own == 0, taken[check.axis], own))
+
+
+def _numbers(kept: np.ndarray, n: int) -> np.ndarray:
+    """The new number of each of `n` things of which some are kept, -1 for the others."""
+    new = np.full(n, -1)
+    new[kept] = np.arange(len(kept))
+    return new
+
+
+def _renumbered(rows: Rows, new: np.ndarray) -> Rows:
+    kept = rows.take(np.flatnonzero(new[rows.who] >= 0))
+    return dataclasses.replace(kept, who=new[kept.who])
+
+
+def _taken(tree, index: np.ndarray):
+    return jax.tree.map(lambda v: still(v)[index], tree)
+
+
+def _only(table: dict, names: Collection[str]) -> dict:
+    return {name: value for name, value in table.items() if name in names}

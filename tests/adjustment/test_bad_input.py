@@ -1,0 +1,130 @@
+"""Unknowns that nothing in the block can see are refused before anything is compiled, by name and with the mend."""
+
+import dataclasses
+
+import equinox as eqx
+import numpy as np
+import pytest
+
+from jaxphoto import FIXED, FREE, DatumError, RankError, Weighted
+from jaxphoto.adjustment import solve
+from jaxphoto.block import Attitudes, Datum, Motion, Rows
+from jaxphoto.georeferencing import Mount, StripBias
+from tests.blocks import simulated
+
+
+def with_mount(**priors):
+    block = simulated("mount").block
+    prior = dataclasses.replace(Mount(FIXED, FIXED, FIXED), **priors)
+    return eqx.tree_at(lambda b: b.priors.mounts["imu"], block, prior, is_leaf=lambda x: isinstance(x, Mount))
+
+
+def with_strips(block=None, **priors):
+    block = simulated("strips").block if block is None else block
+    trees = {name: priors.get(name, StripBias(FIXED, FIXED)) for name in "ab"}
+    return dataclasses.replace(block, priors=dataclasses.replace(block.priors, strips=trees))
+
+
+def without_attitudes(block):
+    return dataclasses.replace(block, attitudes=Attitudes.none())
+
+
+def without_stations(block):
+    return dataclasses.replace(block, stations=Rows.none())
+
+
+def moving(block):
+    n = len(block.images)
+    return dataclasses.replace(block, motion=Motion(np.ones((n, 3)), np.zeros((n, 3))))
+
+
+def lone(what):
+    """Strip c, of the last image alone."""
+    block = simulated("strips").block
+    block = dataclasses.replace(block, image_strip=(*block.image_strip[:-1], "c"))
+    zero = StripBias(np.zeros(3), np.zeros(3))
+    priors = {name: StripBias(FIXED, FIXED) for name in "ab"} | {"c": dataclasses.replace(zero, **what)}
+    strips = block.start.unknowns.strips | {"c": zero}
+    start = dataclasses.replace(block.start.unknowns, strips=strips)
+    block = dataclasses.replace(block, priors=dataclasses.replace(block.priors, strips=priors))
+    return eqx.tree_at(lambda b: b.start.unknowns, block, start, is_leaf=lambda x: x is block.start.unknowns)
+
+
+BOTH_SHIFTS = {name: StripBias(FREE, FIXED) for name in "ab"}
+NO_CONTROL = {"control": Rows.none(), "fixed": Rows.none()}
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "words"),
+    [
+        (lambda: lone({"shift": FREE, "drift": FREE}), RankError, ["strips[c].drift", "one image", "strip c fixed"]),
+        (lambda: lone({"shift": FIXED, "drift": FREE}), RankError, ["strips[c].drift", "one image"]),
+        (
+            lambda: without_stations(with_strips(a=StripBias(FREE, FIXED))),
+            RankError,
+            ["strips[a].shift", "no image with an observed station"],
+        ),
+        (
+            lambda: without_attitudes(with_mount(boresight=FREE)),
+            RankError,
+            ["mounts[imu].boresight", "attitude", "hold the boresight fixed"],
+        ),
+        (
+            lambda: without_stations(with_mount(lever_arm=FREE)),
+            RankError,
+            ["mounts[imu].lever_arm", "station", "hold the lever arm fixed"],
+        ),
+        (
+            lambda: with_mount(time_offset=FREE),
+            RankError,
+            ["mounts[imu].time_offset", "motion", "hold the time offset fixed"],
+        ),
+        (
+            lambda: without_stations(without_attitudes(moving(with_mount(time_offset=FREE)))),
+            RankError,
+            ["mounts[imu].time_offset", "station or attitude"],
+        ),
+        (
+            lambda: dataclasses.replace(with_strips(**BOTH_SHIFTS), **NO_CONTROL),
+            DatumError,
+            ["strips a, b", "no control", "add control points"],
+        ),
+    ],
+    ids=["drift", "drift-alone", "shift", "boresight", "lever-arm", "motion", "time-offset", "shifts"],
+)
+def test_what_cannot_be_seen_is_named_before_anything_is_compiled(make, error, words, monkeypatch):
+    monkeypatch.setattr("jaxphoto.adjustment.adjust.structure_of", None)
+    monkeypatch.setattr("jaxphoto.adjustment.adjust.run_compiled", None)
+    block = make()
+    with pytest.raises(error) as caught:
+        solve(block, block.start.unknowns, block.priors)
+    assert all(word in str(caught.value) for word in words), str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+class _Passed(Exception):
+    pass
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: lone({"shift": FREE, "drift": FIXED}),
+        lambda: lone({"shift": FREE, "drift": Weighted(np.zeros(3), 0.1)}),
+        lambda: without_attitudes(with_mount(lever_arm=FREE)),
+        lambda: without_attitudes(with_mount(boresight=Weighted(np.zeros(3), 0.01))),
+        lambda: moving(with_mount(time_offset=FREE)),
+        lambda: with_strips(**BOTH_SHIFTS),
+        lambda: dataclasses.replace(with_strips(a=StripBias(FREE, FIXED)), **NO_CONTROL),
+        lambda: dataclasses.replace(with_strips(**BOTH_SHIFTS), **NO_CONTROL, datum=Datum("inner")),
+    ],
+    ids=["shift", "weighted-drift", "lever-arm", "weighted-boresight", "time-offset", "control", "one-shift", "inner"],
+)
+def test_what_can_be_seen_or_is_weighted_is_let_through(make, monkeypatch):
+    def stop(*_):
+        raise _Passed
+
+    monkeypatch.setattr("jaxphoto.adjustment.adjust.structure_of", stop)
+    block = make()
+    with pytest.raises(_Passed):
+        solve(block, block.start.unknowns, block.priors)

@@ -1,0 +1,374 @@
+"""Blocks whose stations, attitudes and motion come from a trajectory, or whose motion stands in the tables."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+import pytest
+from pyproj import Transformer
+
+from jaxphoto.block import Frame
+from jaxphoto.errors import BlockError, InputError
+from jaxphoto.io import read_block, write_block
+from jaxphoto.io.block_folder.frame_sections import frame_section
+from jaxphoto.io.trajectory import FIELDS, Records, write_flight_csv, write_sbet
+from jaxphoto.rotation import matrix_from_roll_pitch_yaw, roll_pitch_yaw_from_matrix
+
+START = 350_000.0
+FIX_OFFSET = ("block.toml", "[mounts.default]", '[mounts.default]\ntime_offset = "free"')
+
+
+def motion(t):
+    """Local X, Y, Z (m) and roll, pitch, yaw (degrees) at seconds from the start: a curve to the left, flown east."""
+    t = np.asarray(t)
+    position = np.stack([60 * t, 0.2 * t**2, 1000 + 3 * np.sin(t / 2)], axis=-1)
+    angles = np.stack([2 * np.sin(t), 1 + np.cos(0.7 * t), 90 - 0.4 * t], axis=-1)
+    return position, angles
+
+
+def flight(shift=0.0, sigma=0.02, keep=lambda t: t > -1) -> Records:
+    t = np.arange(-2, 25.0001, 0.05)
+    t = t[keep(t)]
+    position, angles = motion(t)
+    given = np.full((len(t), 3), sigma)
+    return Records("flight.csv", t + START + shift, position, False, angles, given, given / 20)
+
+
+def timed(*seconds) -> tuple[str, str, str]:
+    rows = "".join(f"{i},kodak,one,{float(START + s)!r}\n" for i, s in zip("abc", seconds, strict=True))
+    return ("images.csv", "", "image,camera,strip,time_s\n" + rows)
+
+
+@pytest.fixture
+def fly(write_folder):
+    """Writes the small block with a trajectory for its stations; `text` goes under [trajectory]."""
+
+    def make(records=None, times=(1.01, 3.33, 9.99), text="", *changes):
+        files = [("stations.csv", "", None), ("attitudes.csv", "", None), timed(*times)]
+        toml = ("block.toml", "[sigmas]", f'[trajectory]\nfile = "flight.csv"\n{text}\n[sigmas]')
+        folder = write_folder(*files, toml, *changes)
+        write_flight_csv(records or flight(), folder / "flight.csv")
+        return folder
+
+    return make
+
+
+def test_positions_attitudes_and_motion_are_those_of_the_flight(fly):
+    times = np.array([1.01, 3.33, 9.99])
+    block = read_block(fly())
+    position, angles = motion(times)
+    np.testing.assert_array_equal(block.stations.who, np.repeat([0, 1, 2], 3))
+    np.testing.assert_allclose(np.asarray(block.stations.value).reshape(-1, 3), position, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(np.rad2deg(block.attitudes.roll_pitch_yaw), angles, rtol=0, atol=1e-5)
+    step = 1e-4
+    velocity = (motion(times + step)[0] - motion(times - step)[0]) / (2 * step)
+    np.testing.assert_allclose(block.motion.velocity, velocity, rtol=0, atol=1e-4)
+    before, after = (
+        np.asarray(jax.vmap(matrix_from_roll_pitch_yaw)(jnp.deg2rad(motion(times + s)[1]))) for s in (-step, step)
+    )
+    turn = np.einsum("nji,njk->nik", before, after) / (2 * step)
+    rate = np.stack([turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]], axis=1)
+    np.testing.assert_allclose(block.motion.rate, rate, rtol=0, atol=1e-5)
+    # The interpolation adds nothing worth mentioning to what the file states.
+    np.testing.assert_allclose(block.stations.sigma, 0.02, rtol=1e-3)
+    np.testing.assert_allclose(np.rad2deg(block.attitudes.sigma), 0.001, rtol=1e-2)
+    # Drift is still counted from the mean time of the strip.
+    np.testing.assert_allclose(block.image_time, times - times.mean(), rtol=0, atol=1e-6)
+
+
+def test_coarse_records_cost_accuracy(fly):
+    coarse = flight(keep=lambda t: np.isclose(t % 2, 0) | np.isclose(t % 2, 2))
+    block = read_block(fly(coarse))
+    assert (np.asarray(block.stations.sigma).reshape(-1, 3)[:, 2] > 0.025).any()
+    position = motion(np.array([1.01, 3.33, 9.99]))[0].ravel()
+    assert (np.abs(block.stations.value - position) < 3 * np.asarray(block.stations.sigma)).all()
+
+
+def test_sigmas_are_those_of_block_toml_where_the_file_has_none(fly, write_folder):
+    records = flight()._replace(sigma_m=np.full((len(flight().time), 3), np.nan))
+    np.testing.assert_allclose(read_block(fly(records)).stations.sigma, 0.10, rtol=1e-3)
+
+
+def test_no_sigma_at_all(fly):
+    unknown = np.full((len(flight().time), 3), np.nan)
+    folder = fly(flight()._replace(sigma_deg=unknown), (1, 2, 3), "", ("block.toml", "attitude_deg = 0.01\n", ""))
+    with pytest.raises(InputError, match=r"flight\.csv: .* add attitude_deg under \[sigmas\] in block\.toml"):
+        read_block(folder)
+
+
+def test_an_image_without_a_time_has_no_station(fly):
+    images = ("images.csv", f"b,kodak,one,{START + 3.33!r}", "b,kodak,one,")
+    folder = fly(None, (1.01, 3.33, 9.99), "", ("block.toml", 'drift = "free"', ""))
+    (folder / "images.csv").write_text((folder / "images.csv").read_text().replace(*images[1:]))
+    np.testing.assert_array_equal(read_block(folder).attitudes.image, [0, 2])
+
+
+def test_a_shift_of_the_clock(fly):
+    shifted = read_block(fly(flight(shift=18.0), text="shift_s = 18.0"))
+    np.testing.assert_allclose(shifted.stations.value[:3], motion(1.01)[0], rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("wander", [0.0, 0.3])
+def test_sbet_in_an_epsg_frame(fly, wander):
+    """Roll, pitch and heading refer to the level and true north of the place, wherever the origin is."""
+    records = flight()
+    local = Transformer.from_pipeline(
+        "+proj=pipeline +step +inv +proj=topocentric +ellps=WGS84 +lon_0=-50.2 +lat_0=-25.1 +step +inv +proj=cart "
+        "+ellps=WGS84"
+    )
+    longitude, latitude, height = local.transform(*records.coordinates.T, radians=False)
+    values = np.zeros((len(records.time), len(FIELDS)))
+    columns = dict(zip(FIELDS, range(len(FIELDS)), strict=True))
+    values[:, columns["time"]], values[:, columns["altitude"]] = records.time, height
+    values[:, columns["longitude"]], values[:, columns["latitude"]] = np.deg2rad([longitude, latitude])
+    roll, pitch, yaw = np.deg2rad(records.roll_pitch_yaw_deg).T
+    values[:, columns["roll"]], values[:, columns["pitch"]] = roll, pitch
+    values[:, columns["platform_heading"]], values[:, columns["wander_angle"]] = yaw + wander, wander
+    epsg = 'kind = "epsg"\ncode = 32722\nvertical = "ellipsoidal"\norigin = [-50.2, -25.1, 0.0]'
+    frame = ("block.toml", 'kind = "local"', epsg)
+    points = ("control_points.csv", "", None), ("object_points.csv", "", None)
+    folder = fly(records, (1.01, 3.33, 9.99), "", frame, *points, ("distances.csv", "", None))
+    write_sbet(values, folder / "flight.sbet")
+    (folder / "block.toml").write_text((folder / "block.toml").read_text().replace("flight.csv", "flight.sbet"))
+    block = read_block(folder)
+    position, angles = motion(np.array([1.01, 3.33, 9.99]))
+    np.testing.assert_allclose(np.asarray(block.stations.value).reshape(-1, 3), position, rtol=0, atol=1e-5)
+    level = block.frame.map.local_from_level(position)
+    expected = level @ np.asarray(jax.vmap(matrix_from_roll_pitch_yaw)(jnp.deg2rad(angles)))
+    got = jax.vmap(matrix_from_roll_pitch_yaw)(block.attitudes.roll_pitch_yaw)
+    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("north", ["true", "grid"])
+def test_csv_in_a_map_system(fly, north):
+    frame = Frame("epsg", 32722, None, north, (-51.2, -25.1, 0.0))
+    epsg = "\n".join(f"{k} = {v}" for k, v in frame_section(frame).items() if k not in ("kind", "vertical", "yaw"))
+    epsg = f'kind = "epsg"\nvertical = "ellipsoidal"\nyaw = "{north}"\n{epsg}'
+    records = flight()
+    axes = frame.map.local_from_level if north == "true" else frame.map.local_from_grid
+    bodies = jax.vmap(matrix_from_roll_pitch_yaw)(jnp.deg2rad(records.roll_pitch_yaw_deg))
+    angles = jax.vmap(roll_pitch_yaw_from_matrix)(np.swapaxes(axes(records.coordinates), 1, 2) @ bodies)
+    written = records._replace(
+        coordinates=frame.map.map(records.coordinates), roll_pitch_yaw_deg=np.rad2deg(np.asarray(angles))
+    )
+    points = ("control_points.csv", "", None), ("object_points.csv", "", None), ("distances.csv", "", None)
+    folder = fly(written, (1.01, 3.33, 9.99), "", ("block.toml", 'kind = "local"', epsg), *points)
+    block = read_block(folder)
+    position, expected = motion(np.array([1.01, 3.33, 9.99]))
+    assert block.frame == frame
+    np.testing.assert_allclose(np.asarray(block.stations.value).reshape(-1, 3), position, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(np.rad2deg(block.attitudes.roll_pitch_yaw), expected, rtol=0, atol=1e-5)
+
+
+def test_longitude_and_latitude_need_an_epsg_frame(fly):
+    records = flight()
+    with pytest.raises(InputError, match=r'flight\.csv: .*longitude.*"local".*write kind = "epsg"'):
+        read_block(fly(records._replace(coordinates=records.coordinates / 100, geographic=True)))
+
+
+DAY, WEEK = 86_400, 604_800
+CLOCKS = {
+    "seconds of day": (-4 * DAY, ["seconds of a day", "GPS week", "shift_s = 345600", "18 s more if time_s is UTC"]),
+    "from the first exposure": (-START - 1.01, ["0.000 to 8.980", "first exposure", "time of the first exposure"]),
+    "full GPS time": (2200 * WEEK, ["full GPS", "shift_s = -1330560000"]),
+    "LAS": (2200 * WEEK - 1_000_000_000, ["LAS", "shift_s = -330560000"]),
+    "Unix": (2200 * WEEK + 315_964_800 - 18, ["Unix", f"shift_s = {-(2200 * WEEK + 315_964_800 - 18):d}"]),
+    "leap seconds": (18.0, ["row 4", "image c", "shift_s = -18"]),
+    "another day": (3 * DAY + 5000, ["take a trajectory that covers it"]),
+}
+
+
+@pytest.mark.parametrize("name", CLOCKS)
+def test_clocks_that_are_mixed_up(fly, name):
+    shift, words = CLOCKS[name]
+    with pytest.raises(BlockError) as caught:
+        read_block(fly(times=np.array([1.01, 3.33, 9.99]) + shift))
+    for word in ("images.csv, row ", "image ", "exposed outside flight.csv", *words):
+        assert word in str(caught.value), str(caught.value)
+
+
+def test_a_shift_that_is_there_already_is_counted(fly):
+    with pytest.raises(BlockError, match="write shift_s = 345600 under"):
+        read_block(fly(times=np.array([1.01, 3.33, 9.99]) - 4 * DAY, text="shift_s = -86400.0"))
+
+
+def test_leap_seconds_inside_the_trajectory_are_found_by_approximate_positions(fly):
+    long = np.arange(-2, 60.0001, 0.05)
+    position, angles = motion(long)
+    given = np.full((len(long), 3), 0.02)
+    records = Records("flight.csv", long + START + 18, position, False, angles, given, given / 20)
+    folder = fly(records, (21.01, 23.33, 29.99))
+    at = motion(np.array([21.01, 23.33, 29.99]))[0] + [3.0, -5.0, 2.0]
+    table = pd.read_csv(folder / "images.csv")
+    approximate = dict(zip(("X_m", "Y_m", "Z_m"), at.T, strict=True)) | dict.fromkeys(
+        ("omega_deg", "phi_deg", "kappa_deg"), 0.0
+    )
+    table.assign(**approximate).to_csv(folder / "images.csv", index=False)
+    with pytest.raises(BlockError, match=r"images\.csv: .*flight\.csv.* \+18 s, .*UTC.* shift_s = 18 under"):
+        read_block(folder)
+    toml = folder / "block.toml"
+    toml.write_text(toml.read_text().replace("[sigmas]", "shift_s = 18\n[sigmas]"))
+    np.testing.assert_allclose(read_block(folder).stations.value[:3], motion(21.01)[0], rtol=0, atol=1e-5)
+
+
+def test_an_exposure_in_a_gap(fly):
+    holed = flight(keep=lambda t: (t < 3.01) | (t > 4.02))
+    with pytest.raises(BlockError, match=r"row 3: image b .* 350003\.330 s in a gap of flight\.csv.*max_gap_s"):
+        read_block(fly(holed))
+
+
+def test_a_gap_that_is_allowed(fly):
+    holed = flight(keep=lambda t: (t < 3.01) | (t > 4.02))
+    block = read_block(fly(holed, text="max_gap_s = 2.0"))
+    np.testing.assert_allclose(block.stations.value[3:6], motion(3.33)[0], rtol=0, atol=0.01)
+
+
+def test_stations_beside_a_trajectory(fly):
+    folder = fly()
+    (folder / "stations.csv").write_text("image,X_m,Y_m,Z_m\na,1,2,3\n")
+    with pytest.raises(InputError, match=r"stations\.csv: .* flight\.csv; remove this file, or \[trajectory\]"):
+        read_block(folder)
+
+
+def test_misspelt_key(fly):
+    with pytest.raises(InputError, match=r"\[trajectory\] max_gap: no such key is known; use file, shift_s, max_gap_s"):
+        read_block(fly(text="max_gap = 1.0"))
+
+
+def test_no_file(fly):
+    folder = fly()
+    (folder / "flight.csv").unlink()
+    with pytest.raises(InputError, match=r"there is no file .*flight\.csv; add it"):
+        read_block(folder)
+
+
+def radians(records: Records, yaw) -> Records:
+    angles = np.deg2rad(np.column_stack([records.roll_pitch_yaw_deg[:, :2], np.broadcast_to(yaw, len(records.time))]))
+    return records._replace(roll_pitch_yaw_deg=angles)
+
+
+def test_a_trajectory_in_radians(fly):
+    records = flight()
+    there = records.time < START + 10
+    x = np.where(there, records.coordinates[:, 0], 1200 - records.coordinates[:, 0])
+    records = records._replace(coordinates=np.column_stack([x, records.coordinates[:, 1:]]))
+    with pytest.raises(InputError, match=r"flight\.csv: the yaw .* as radians, .*convert roll, pitch and yaw to deg"):
+        read_block(fly(radians(records, np.where(there, 90.0, 270.0))))
+
+
+# Motion in the tables ---------------------------------------------------------------------------------------
+
+
+def with_motion(folder, velocity=True, rate=True):
+    if velocity:
+        table = pd.read_csv(folder / "stations.csv")
+        table.assign(vX_m_per_s=[60.0, 61.0], vY_m_per_s=[0.5, 0.25], vZ_m_per_s=[-0.1, 0.3]).to_csv(
+            folder / "stations.csv", index=False
+        )
+    if rate:
+        table = pd.read_csv(folder / "attitudes.csv")
+        names = ("right", "forward", "up")
+        columns = {f"rate_{n}_deg_per_s": [k + 0.5, -k] for k, n in enumerate(names)}
+        table.assign(**columns).to_csv(folder / "attitudes.csv", index=False)
+    return folder
+
+
+def test_motion_from_tables_comes_back(write_folder, tmp_path):
+    block = read_block(with_motion(write_folder(FIX_OFFSET)))
+    np.testing.assert_array_equal(block.motion.velocity, [[60, 0.5, -0.1], [61, 0.25, 0.3], [0, 0, 0]])
+    np.testing.assert_allclose(np.rad2deg(block.motion.rate), [[0.5, 1.5, 2.5], [0, -1, -2], [0, 0, 0]])
+    write_block(block, tmp_path / "copy")
+    again = read_block(tmp_path / "copy")
+    np.testing.assert_array_equal(again.motion.velocity, block.motion.velocity)
+    np.testing.assert_allclose(again.motion.rate, block.motion.rate, rtol=1e-15)
+
+
+def test_a_flight_is_written_as_tables(fly, tmp_path):
+    block = read_block(fly(None, (1.01, 3.33, 9.99), "", FIX_OFFSET))
+    write_block(block, tmp_path / "copy")
+    again = read_block(tmp_path / "copy")
+    assert jax.tree.structure(again) == jax.tree.structure(block)
+    for field in ("stations", "attitudes", "motion"):
+        for a, b in zip(*(jax.tree.leaves(getattr(v, field)) for v in (again, block)), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-14, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    "velocity, rate, words",
+    [
+        (False, False, ["[mounts.default]", "image a", "vX_m_per_s", "stations.csv", '"fixed" at zero']),
+        (True, False, ["image a", "rate_right_deg_per_s", "attitudes.csv", "give a [trajectory]"]),
+    ],
+)
+@pytest.mark.parametrize("offset", ['time_offset = "free"', "time_offset_s = 0.01", "time_offset = { sigma_s = 0.01 }"])
+def test_a_time_offset_needs_motion(write_folder, velocity, rate, words, offset):
+    change = (*FIX_OFFSET[:2], f"[mounts.default]\n{offset}")
+    with pytest.raises(BlockError) as caught:
+        read_block(with_motion(write_folder(change), velocity, rate))
+    for word in words:
+        assert word in str(caught.value), str(caught.value)
+
+
+def test_motion_given_in_part(write_folder):
+    folder = with_motion(write_folder())
+    (folder / "stations.csv").write_text((folder / "stations.csv").read_text().replace("61.0", ""))
+    with pytest.raises(InputError, match=r"stations\.csv, row 3: the motion is given in part; fill in vX_m_per_s"):
+        read_block(folder)
+
+
+# Units of attitudes -----------------------------------------------------------------------------------------
+
+
+def strips(write_folder, courses, yaw):
+    """Strips of five images in directions `courses` (degrees), yaw as `yaw(course)` writes it."""
+    images, stations, attitudes, measured = [], [], [], []
+    rng = np.random.default_rng(3)
+    for s, course in enumerate(courses):
+        for k in range(5):
+            name, east, north = f"{s}_{k}", np.sin(np.deg2rad(course)), np.cos(np.deg2rad(course))
+            images.append(f"{name},kodak,s{s},{100 * s + 5 * k}\n")
+            stations.append(f"{name},{60 * k * east + 300 * s},{60 * k * north},1000\n")
+            attitudes.append(f"{name},{0.02 * rng.normal():.4f},{0.02 * rng.normal():.4f},{yaw(course, rng):.4f}\n")
+            measured += [f"{name},p{p},{0.1 * p},0.2,,\n" for p in range(1, 5)]
+    head = "image,point,x_mm,y_mm,sigma_x_mm,sigma_y_mm\n"
+    return write_folder(
+        ("images.csv", "", "image,camera,strip,time_s\n" + "".join(images)),
+        ("stations.csv", "", "image,X_m,Y_m,Z_m\n" + "".join(stations)),
+        ("attitudes.csv", "", "image,roll_deg,pitch_deg,yaw_deg\n" + "".join(attitudes)),
+        ("image_points.csv", "", head + "".join(measured)),
+    )
+
+
+def in_radians(course, rng):
+    return np.deg2rad(course + 8 + rng.normal()) % (2 * np.pi)
+
+
+@pytest.mark.parametrize("courses", [(90, 270), (0, 180, 90), (10, 190, 10)])
+def test_attitudes_in_radians_are_refused(write_folder, courses):
+    with pytest.raises(InputError, match=r"attitudes\.csv: the yaw angles .* radians, not as degrees; convert roll"):
+        read_block(strips(write_folder, courses, in_radians))
+
+
+def test_one_course_is_not_enough_to_refuse(write_folder):
+    with pytest.warns(UserWarning, match="follow the direction of flight as radians"):
+        read_block(strips(write_folder, (90,), in_radians))
+
+
+HONEST = {
+    "aircraft": ((0, 180, 90, 270), lambda course, rng: course + 10 * rng.normal()),
+    "north only": ((0, 0), lambda course, rng: 3 * rng.normal()),
+    "headings that stay north": ((0, 180, 90, 270), lambda course, rng: rng.normal()),
+    "headings of 1.57": ((90, 270), lambda course, rng: 1.57),
+    "backwards": ((90, 270), lambda course, rng: course - 180),
+}
+
+
+@pytest.mark.parametrize("name", HONEST)
+def test_honest_degrees_are_left_alone(write_folder, name):
+    read_block(strips(write_folder, *HONEST[name]))
+
+
+def test_a_flight_without_motion_is_still_a_block(write_folder):
+    assert dataclasses.replace(read_block(write_folder())).motion is None

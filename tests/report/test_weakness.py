@@ -1,0 +1,75 @@
+"""A flat block without stations says in words that c and the principal point are hardly determined."""
+
+import dataclasses
+import functools
+
+import numpy as np
+import pytest
+
+from jaxphoto import Tables, adjust
+from jaxphoto.block import Rows
+from jaxphoto.report import warnings_of
+from tests.blocks import BROWN, CONTROL, Scene, Simulated, aerial, all_stations, bare, free, measured, rows
+
+
+@functools.cache
+def tables(relief: float, stations: bool, names=("c_mm", "xp_mm", "yp_mm")):
+    """The aerial block with its relief (150 m at a height of 1000 m) times `relief`, flown at one height."""
+    scene = aerial()
+    positions = scene.positions * [1, 1, 0] + [0, 0, 1000.0]
+    built, truth = bare(Scene(positions, scene.angles, scene.points * [1, 1, relief]), {"one": BROWN}, ("one",) * 10)
+    observed = all_stations(built) if stations else Rows.none()
+    built = dataclasses.replace(built, control=rows(CONTROL), stations=observed)
+    return Tables(adjust(measured(Simulated(free(built, "one", names), truth)).block))
+
+
+def weak(warnings):
+    return [w for w in warnings if "hardly determined" in w]
+
+
+def test_flat_ground_without_stations_is_put_into_words():
+    found = warnings_of(tables(0.1, False))
+    c, point = weak(found)
+    assert found[:2] == [c, point]
+    assert c.startswith("c of camera one")
+    assert all(cure in c for cure in ("stations (GNSS)", "relief", "second flying height", "oblique", "hold c fixed"))
+    significance = {s.parameter: s for s in tables(0.1, False).significance}
+    rho = tables(0.1, False).correlations["one"].max_abs
+    assert f"sigma {significance['c_mm'].sigma:.3g} mm" in c
+    assert f"up to {rho[2, 0]:.4f}" in c
+    assert rho[2, 0] > 0.99
+    assert "relief 1 %" in c or "relief 2 %" in c
+    assert point.startswith("the principal point of camera one")
+    assert f"sigma of yp_mm {significance['yp_mm'].sigma:.3g} mm" in point
+    assert f"omega and phi up to {rho[3:5, 1:].max():.4f}" in point
+    assert all(cure in point for cure in ("stations (GNSS)", "relief", "oblique", "hold it fixed"))
+    # Said once: no second warning of the same pairs.
+    for pair in ("Z with c_mm", "X with xp_mm", "Y with xp_mm", "X with yp_mm", "Y with yp_mm"):
+        assert not any(pair in w for w in found)
+
+
+def test_stations_cure_it():
+    found = warnings_of(tables(0.1, True))
+    assert not weak(found)
+    sigma = [next(s.sigma for s in tables(0.1, stations).significance if s.parameter == "c_mm") for stations in (0, 1)]
+    assert sigma[0] > 50 * sigma[1]
+
+
+def test_relief_cures_it():
+    assert not weak(warnings_of(tables(2.0, False)))
+
+
+def test_a_held_c_is_not_complained_of():
+    (only,) = weak(warnings_of(tables(0.1, False, ("xp_mm", "yp_mm"))))
+    assert "principal point" in only
+
+
+@pytest.mark.parametrize("axes", [(2,), (0, 1)])
+def test_stations_along_some_axes_cure_what_these_see(axes):
+    """Heights tell c from Z; plane positions tell the principal point from X and Y."""
+    made = tables(0.1, True).adjusted.block
+    keep = np.isin(made.stations.axis, axes)
+    part = dataclasses.replace(made, stations=made.stations.take(keep))
+    found = weak(warnings_of(Tables(adjust(part))))
+    assert len(found) == 1
+    assert ("c of camera" in found[0]) is (axes == (0, 1))
