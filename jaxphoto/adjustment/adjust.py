@@ -1,6 +1,9 @@
 """The adjustment itself: block, start and priors in; unknowns with their normal equations out."""
 
 import dataclasses
+import functools
+import operator
+from collections.abc import Iterable
 
 import equinox as eqx
 import jax
@@ -18,7 +21,7 @@ from jaxphoto.adjustment.optimum import (
     weigh_datum,
     zero_increments,
 )
-from jaxphoto.adjustment.padding import crop_residuals, crop_state, pad_structure, pad_values
+from jaxphoto.adjustment.padding import LEAST, Sizes, crop_residuals, crop_state, pad_structure, pad_values, sizes_of
 from jaxphoto.adjustment.rank import check_priors, check_rank
 from jaxphoto.adjustment.residuals import Residuals, State, Values, residuals_at, state_at
 from jaxphoto.adjustment.result import Adjustment, Factored, Padded
@@ -30,12 +33,16 @@ from jaxphoto.unknowns import Unknowns
 MAX_STEPS = 100
 
 
-def solve(block: Block, start: Unknowns, priors: Unknowns, max_steps: int = MAX_STEPS) -> Adjustment:
+def solve(
+    block: Block, start: Unknowns, priors: Unknowns, max_steps: int = MAX_STEPS, sizes: Sizes = LEAST
+) -> Adjustment:
     """Least-squares adjustment of `block` from `start`, with what `priors` leaves free.
 
     A pure function of the numbers in its arguments: `jax.grad`, `jax.jvp` and `jax.vmap` go through it (by the implicit
     function theorem, exactly), as long as ids and index arrays stay concrete. `start` needs all images and points;
     `jaxphoto.adjust` finds what is missing first.
+
+    `sizes` are sizes to compile for at least (`common_sizes`).
 
     Raises DatumError where the observations leave the datum open and no constraint closes it, RankError where they
     do not see an unknown or cannot tell unknowns apart.
@@ -45,7 +52,7 @@ def solve(block: Block, start: Unknowns, priors: Unknowns, max_steps: int = MAX_
     values = values_of(block, start, priors, structure)
     constraints = close_datum(block, concrete(values, block), structure)
     values = with_datum(values, constraints.eop, constraints.points)
-    wide = pad_structure(structure)
+    wide = pad_structure(structure, sizes)
     numbers = pad_values(values, structure, wide)
     seconds: dict[str, float] = {}
     optimum, state = run_compiled(_optimise, (numbers, wide, max_steps), seconds, "solve")
@@ -74,6 +81,11 @@ def solve(block: Block, start: Unknowns, priors: Unknowns, max_steps: int = MAX_
     if not traced:
         check_rank(adjusted)
     return adjusted
+
+
+def common_sizes(blocks: Iterable[Block]) -> Sizes:
+    """Sizes that all of `blocks` fit into: `solve` with them compiles once for all that differ in numbers only."""
+    return functools.reduce(operator.or_, (sizes_of(structure_of(b, b.priors)) for b in blocks), LEAST)
 
 
 @eqx.filter_jit

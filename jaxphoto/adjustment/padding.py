@@ -6,7 +6,7 @@ results are cropped again. Names stay outside: the padded structure has none.
 """
 
 import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,28 +15,67 @@ import numpy as np
 from jaxphoto.adjustment.residuals import Residuals, State, Values
 from jaxphoto.adjustment.structure import CameraGroup, Structure, chunks_of, rows_by_image
 
-# The least sizes worth a class of their own.
-_IMAGES, _POINTS, _ROWS, _PAIRS, _BLOCKS, _FEW = 8, 64, 256, 1024, 64, 128
+
+class Sizes(NamedTuple):
+    """How large each kind of list is, in a block or as it is compiled for."""
+
+    images: int = 8
+    points: int = 64
+    rows: int = 256
+    pairs: int = 1024
+    blocks: int = 64
+    chunks: int = 64
+    width: int = 8
+    """Rows of the image that has most."""
+    stations: int = 128
+    attitudes: int = 128
+    control: int = 128
+
+    def __or__(self, other: object) -> "Sizes":
+        """What both fit into."""
+        return Sizes(*map(max, self, other)) if isinstance(other, Sizes) else NotImplemented
 
 
-def size_class(n: int, least: int = 8) -> int:
+LEAST = Sizes()
+"""The least sizes worth a class of their own."""
+
+
+def sizes_of(structure: Structure) -> Sizes:
+    """The sizes of a block, with room for the image, the point, the row and the block of images that nothing needs."""
+    s = structure
+    return Sizes(
+        images=s.n_images + 1,
+        points=s.n_points + 1,
+        rows=len(s.image) + 1,
+        pairs=len(s.pair_a),
+        blocks=len(s.block_row) + 1,
+        chunks=len(s.chunk_block),
+        width=s.image_rows.shape[1],
+        stations=len(s.station_image),
+        attitudes=len(s.attitude_image),
+        control=len(s.control_point),
+    )
+
+
+def size_class(n: int) -> int:
     """The next number, from `n` on, that is 8 to 15 times a power of two."""
-    n = max(n, least)
     step = 1 << max(0, n.bit_length() - 4)
     return -(-n // step) * step
 
 
-def pad_structure(structure: Structure) -> Structure:
-    """The same structure in padded sizes; the last image, point and row are the ones nothing depends on."""
+def pad_structure(structure: Structure, sizes: Sizes = LEAST) -> Structure:
+    """The same structure in padded sizes; the last image, point and row are the ones nothing depends on.
+
+    `sizes` are sizes that are wanted at least, such as those of all blocks of a study.
+    """
     s = structure
-    images, points = size_class(s.n_images + 1, _IMAGES), size_class(s.n_points + 1, _POINTS)
-    rows, pairs = size_class(len(s.image) + 1, _ROWS), size_class(len(s.pair_a), _PAIRS)
-    blocks = size_class(len(s.block_row) + 1, _BLOCKS)
-    control = size_class(len(s.control_point), _FEW)
+    images, points, rows, pairs, blocks, n_chunks, width, stations, attitudes, control = map(
+        size_class, sizes_of(s) | LEAST | sizes
+    )
     lists = rows_by_image(s.image, s.point, images, rows)
-    width = size_class(lists["image_rows"].shape[1])
     chunks = chunks_of((s.pair_a, s.pair_b, s.pair_block), rows)
-    n_chunks = size_class(len(chunks["chunk_block"]), _BLOCKS)
+    # A group without rows is left out of the program, so it stays empty.
+    stations, attitudes = stations * (len(s.station_image) > 0), attitudes * (len(s.attitude_image) > 0)
     groups = tuple(_pad_group(g, rows, len(s.image)) for g in s.groups)
     return dataclasses.replace(
         s,
@@ -60,9 +99,9 @@ def pad_structure(structure: Structure) -> Structure:
         column=_pad(s.column, images, len(s.free)),
         mount=_pad(s.mount, images, 0),
         strip=_pad(s.strip, images, 0),
-        station_image=_pad(s.station_image, _few(s.station_image), images - 1),
-        station_axis=_pad(s.station_axis, _few(s.station_axis), 0),
-        attitude_image=_pad(s.attitude_image, _few(s.attitude_image), images - 1),
+        station_image=_pad(s.station_image, stations, images - 1),
+        station_axis=_pad(s.station_axis, stations, 0),
+        attitude_image=_pad(s.attitude_image, attitudes, images - 1),
         control_point=_pad(s.control_point, control, points - 1),
         control_axis=_pad(s.control_axis, control, 0),
         point_class=_pad(s.point_class, points, 0),
@@ -137,11 +176,6 @@ def _still(x: Any) -> Any:
     return x if isinstance(x, jax.core.Tracer) else np.asarray(x)
 
 
-def _few(rows: np.ndarray) -> int:
-    """The size of a group of few rows; a group without rows is left out of the program and stays empty."""
-    return size_class(len(rows), _FEW) if len(rows) else 0
-
-
 def _pad(array: np.ndarray, size: int, fill: float) -> np.ndarray:
     """`array` with its first axis filled up to `size`."""
     more = np.full((size - len(array), *array.shape[1:]), fill, array.dtype)
@@ -161,7 +195,7 @@ def _pad_group(group: CameraGroup, rows: int, n_rows: int) -> CameraGroup:
     if group.rows is None:
         return dataclasses.replace(group, names=names, camera=_pad(group.camera, rows, 0))
     own = np.append(group.rows, np.arange(n_rows, rows)) if group.offset == 0 else group.rows
-    size = size_class(len(own), _ROWS)
+    size = size_class(max(len(own), LEAST.rows))
     return dataclasses.replace(
         group, names=names, camera=_pad(group.camera, size, 0), rows=_pad(own, size, rows - 1).astype(np.int32)
     )

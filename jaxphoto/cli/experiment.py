@@ -23,7 +23,9 @@ def experiment_command(
     name: Annotated[str, typer.Argument(help="Folder of the experiment (000, 003, 004), or all.")],
     out: Annotated[Path, typer.Option(help="Folder for the results, one sub-folder an experiment.")] = Path("results"),
     experiments: Annotated[Path, typer.Option(help="Folder that holds the experiments.")] = Path("experiments"),
-    layouts: Annotated[int | None, typer.Option(min=1, help="Simulated layouts; the experiment's own number if not given.")] = None,
+    layouts: Annotated[
+        int | None, typer.Option(min=1, help="Simulated layouts; the experiment's own number if not given.")
+    ] = None,
 ) -> None:
     """Run experiments; write tables.csv and report.html, ours beside what the paper prints."""
     chosen = find_experiments(experiments, name)
@@ -33,7 +35,7 @@ def experiment_command(
     for folder in chosen:
         experiment = load_experiment(folder)
         with errors.status(folder.name) as status:
-            run = run_experiment(experiment, folder, layouts, lambda text, f=folder: status.update(f"{f.name}: {text}"))
+            run = run_experiment(experiment, folder, layouts, status.update)
         write_run(run, folder, out / folder.name)
         table = compare(run, folder)
         console.print(_judgement(experiment.title, table))

@@ -1,4 +1,4 @@
-"""What an experiment is: one simulated block, variants of it, and the tables that are asked of them. Declarations only."""
+"""What an experiment is: simulated blocks, variants of them, and the tables asked of these. Declarations only."""
 
 import dataclasses
 from collections.abc import Callable, Mapping
@@ -36,8 +36,8 @@ class Variant:
 class Experiment:
     """Variants of simulated blocks and the tables printed of them.
 
-    `layouts` blocks are drawn (seeds 0, 1, ...), every variant of each is adjusted, and every table's cells are the means
-    over them. `published.csv` beside experiment.py holds what a paper prints, if there is one.
+    `layouts` blocks are drawn (seeds 0, 1, ...), every variant of each is adjusted, and every table's cells are the
+    means over them. `published.csv` beside experiment.py holds what a paper prints, if there is one.
     """
 
     title: str

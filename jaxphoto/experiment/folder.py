@@ -19,12 +19,13 @@ def find_experiments(directory: Path, name: str) -> list[Path]:
     known = sorted(path.parent for path in directory.glob(f"*/{FILE}"))
     if not known:
         raise InputError(
-            f"{directory} holds no experiments (folders with {FILE}); go to the folder that has experiments/, or name it "
-            "with --experiments"
+            f"{directory} holds no experiments (folders with {FILE}); go to the folder that has experiments/, or name "
+            "it with --experiments"
         )
     chosen = known if name == "all" else [path for path in known if path.name == name]
     if not chosen:
-        raise InputError(f"there is no experiment {name} in {directory}; choose {', '.join(p.name for p in known)} or all")
+        names = ", ".join(path.name for path in known)
+        raise InputError(f"there is no experiment {name} in {directory}; choose {names} or all")
     return chosen
 
 

@@ -12,7 +12,7 @@ import pandas as pd
 from jaxphoto.block import AXES
 from jaxphoto.experiment.declaration import Cells, Measure, Results
 from jaxphoto.report import Tables
-from jaxphoto.statistics import angle_differences, point_differences
+from jaxphoto.statistics import angle_differences, point_differences, residual_spread
 
 _UNITS = {"k1": "_mm-2", "k2": "_mm-4", "k3": "_mm-6", "p1": "_mm-1", "p2": "_mm-1"}
 _ANGLES = ("omega", "phi", "kappa")
@@ -31,12 +31,9 @@ def iops(rows: Rows) -> Measure:
     def measure(results: Results) -> Cells:
         cells: Cells = {}
         for row, variant in rows.items():
-            table = results[variant].interior
-            for name, value, sigma in table.loc[table["sigma"].notna(), ["parameter", "value", "sigma"]].itertuples(
-                index=False
-            ):
-                column = name + _UNITS.get(name, "")
-                cells[row, column], cells[row, f"sigma_{column}"] = value, sigma
+            for s in results[variant].significance:
+                column = s.parameter + _UNITS.get(s.parameter, "")
+                cells[row, column], cells[row, f"sigma_{column}"] = s.value, s.sigma
         return cells
 
     return measure
@@ -56,7 +53,7 @@ def residuals(rows: Rows, *, image: str = "mm", ground: str = "m") -> Measure:
             adjusted = results[variant].adjusted
             pixel = next(iter(adjusted.block.sensors.values())).pixel_mm
             factors = {"mm": 1 / pixel if image == "px" else 1.0, "m": 1000.0 if ground == "mm" else 1.0}
-            for spread in results[variant].residual_spread.itertuples():
+            for spread in residual_spread(adjusted):
                 if spread.group in named_axes:
                     cells[row, named_axes[spread.group].format(spread.axis)] = spread.rmse * factors[spread.unit]
             cells[row, "sigma0"] = float(adjusted.sigma0) ** 2
@@ -71,10 +68,11 @@ def mean_correlations(rows: Rows, columns: Mapping[str, str]) -> Measure:
     def measure(results: Results) -> Cells:
         cells: Cells = {}
         for row, variant in rows.items():
-            summary = results[variant].correlation_summary
-            for line in summary[summary["exterior"].isin(_ANGLES)].itertuples():
-                if line.interior in columns:
-                    cells[f"{row}/{line.exterior}", columns[line.interior]] = line.mean_abs_rho
+            for camera in results[variant].correlations.values():
+                for i, name in enumerate(camera.eop_names):
+                    for j, parameter in enumerate(camera.parameters):
+                        if name in _ANGLES and parameter in columns:
+                            cells[f"{row}/{name}", columns[parameter]] = float(camera.mean_abs[i, j])
         return cells
 
     return measure
@@ -130,7 +128,8 @@ def principal_point(rows: Rows) -> Measure:
         cells: Cells = {}
         for row, variant in rows.items():
             table = results[variant].interior.set_index("parameter")["value"]
-            cells |= {(row, "xH"): table["xp_mm"], (row, "yH"): table["yp_mm"], (row, "sigma0"): _sigma0_um(results[variant])}
+            cells |= {(row, "xH"): float(table["xp_mm"]), (row, "yH"): float(table["yp_mm"])}
+            cells[row, "sigma0"] = _sigma0_um(results[variant])
         return cells
 
     return measure

@@ -56,8 +56,13 @@ def _table(name: str, cells: pd.DataFrame) -> dict:
         {"name": row, "cells": [_cell(place.get((row, column))) for column in columns]}
         for row in dict.fromkeys(cells["row"])
     ]
-    notes = [f"{', '.join(sorted(set(c['row'] + ' ' + c['column'])))}: {note}" for note, c in cells.groupby("note") if note]
+    notes = [f"{_listed(c)}: {note}" for note, c in cells[cells["note"] != ""].groupby("note", sort=False)]
     return {"name": name, "columns": columns, "rows": rows, "notes": notes}
+
+
+def _listed(cells: pd.DataFrame) -> str:
+    """The columns that a note is about, with their rows where not all of the table have it."""
+    return "; ".join(f"{column} ({', '.join(of['row'])})" for column, of in cells.groupby("column", sort=False))
 
 
 def _cell(cell) -> dict[str, str]:

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from jaxphoto.adjustment import Sizes, common_sizes
+from jaxphoto.block import Block
 from jaxphoto.errors import InputError, JaxphotoError
 from jaxphoto.experiment.declaration import Experiment, Variant
 from jaxphoto.io.block_folder.settings import read_toml
@@ -35,18 +37,31 @@ class Run:
 def run_experiment(
     experiment: Experiment, folder: Path, layouts: int | None = None, progress: Progress = lambda _: None
 ) -> Run:
-    """Run `experiment`, whose recipes lie in `folder`. `progress` is told of every adjustment.
+    """Run `experiment`, whose recipes lie in `folder`. `progress` is told of every step.
 
-    A layout in which a variant cannot be adjusted is left out and told of in `failures`. Raises InputError where no
-    layout is left, and for recipes that cannot be read.
+    A layout in which a variant cannot be made or adjusted is left out and told of in `failures`. Raises InputError
+    where no layout is left, and for recipes that cannot be read.
     """
     recipes = {name: _recipe(variant, folder) for name, variant in experiment.variants.items()}
-    rows, failures, first = [], [], {}
+    failures: list[str] = []
+    blocks: dict[int, dict[str, Block]] = {}
     for layout in range(layouts or experiment.layouts):
+        progress(f"layout {layout}: simulating")
         try:
-            results = _adjusted(experiment, recipes, layout, progress)
-        except JaxphotoError as error:
+            blocks[layout] = _simulated(experiment, recipes, layout)
+        except (JaxphotoError, ValueError) as error:
             failures.append(f"layout {layout}: {error}")
+    sizes = _sizes(list(blocks.values()))
+    rows: list[tuple] = []
+    first: dict[str, Tables] = {}
+    for layout, variants in blocks.items():
+        results = {}
+        try:
+            for name, block in variants.items():
+                progress(f"layout {layout}: adjusting {name}")
+                results[name] = _adjusted(block, sizes[name])
+        except JaxphotoError as error:
+            failures.append(f"layout {layout}, {name}: {error}")
             continue
         first = first or results
         rows += [
@@ -65,21 +80,32 @@ def simulated(experiment: Experiment, folder: Path, variant: str, layout: int = 
     return simulate(_recipe(experiment.variants[variant], folder), layout)
 
 
-def _adjusted(
-    experiment: Experiment, recipes: Mapping[str, Recipe], layout: int, progress: Progress
-) -> dict[str, Tables]:
-    blocks: dict[Any, Simulation] = {}
-    results = {}
+def _simulated(experiment: Experiment, recipes: Mapping[str, Recipe], layout: int) -> dict[str, Block]:
+    """The block of every variant; variants of one recipe are changes of one and the same simulation."""
+    made: dict[tuple[str, str], Block] = {}
+    blocks = {}
     for name, variant in experiment.variants.items():
-        progress(f"layout {layout}, {name}")
         key = (variant.file, repr(variant.recipe))
-        if key not in blocks:
-            blocks[key] = simulate(recipes[name], layout)
-        adjusted = adjust(variant.change(blocks[key].block))
-        if not bool(adjusted.converged):
-            raise InputError(f"{name}: {adjusted.outcome.value}")
-        results[name] = Tables(adjusted)
-    return results
+        if key not in made:
+            made[key] = simulate(recipes[name], layout).block
+        blocks[name] = variant.change(made[key])
+    return blocks
+
+
+def _sizes(layouts: list[dict[str, Block]]) -> dict[str, Sizes]:
+    """By variant, sizes for all layouts and all variants of as many images: they share what is compiled."""
+    of_images: dict[int, list[Block]] = {}
+    for block in (b for variants in layouts for b in variants.values()):
+        of_images.setdefault(len(block.images), []).append(block)
+    sizes = {n: common_sizes(blocks) for n, blocks in of_images.items()}
+    return {name: sizes[len(block.images)] for name, block in layouts[0].items()} if layouts else {}
+
+
+def _adjusted(block: Block, sizes: Sizes) -> Tables:
+    adjusted = adjust(block, sizes=sizes)
+    if not bool(adjusted.converged):
+        raise InputError(adjusted.outcome.value)
+    return Tables(adjusted)
 
 
 def _recipe(variant: Variant, folder: Path) -> Recipe:

@@ -1,18 +1,26 @@
 """The main job: complete the start values of a block and adjust it."""
 
-from jaxphoto.adjustment import MAX_STEPS, Adjustment, solve
+from jaxphoto.adjustment import LEAST, MAX_STEPS, Adjustment, Sizes, solve
 from jaxphoto.block import Block
 from jaxphoto.orientation import approximate
 from jaxphoto.unknowns import Unknowns
 
 
 def adjust(
-    block: Block, start: Unknowns | None = None, priors: Unknowns | None = None, *, max_steps: int = MAX_STEPS
+    block: Block,
+    start: Unknowns | None = None,
+    priors: Unknowns | None = None,
+    *,
+    max_steps: int = MAX_STEPS,
+    sizes: Sizes = LEAST,
 ) -> Adjustment:
     """Self-calibrating bundle adjustment of `block`.
 
     `start` gives every unknown an approximate value; where it is None, those of the block are completed by resection
     and intersection. `priors` says what is FREE, FIXED or Weighted; where it is None, what the block says.
+
+    What is compiled for a block serves all of similar size; a study of many blocks compiles once if it gives `sizes`
+    that all fit into (`common_sizes`).
 
     With `start` given it is a pure function of the numbers in its arguments: `jax.grad` and `jax.vmap` go through it.
 
@@ -22,4 +30,4 @@ def adjust(
     """
     if start is None:
         start = approximate(block)
-    return solve(block, start, block.priors if priors is None else priors, max_steps)
+    return solve(block, start, block.priors if priors is None else priors, max_steps, sizes)
