@@ -1,0 +1,215 @@
+"""Experiments: what is run is what was declared, and what is written is what was run."""
+
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+from typer.testing import CliRunner
+
+import jaxphoto
+from jaxphoto.cli import app
+from jaxphoto.errors import InputError
+from jaxphoto.experiment import compare, find_experiments, load_experiment, run_experiment, simulated, write_run
+from jaxphoto.variants import vertical_control
+
+RECIPE = """
+title = "small"
+[cameras.small]
+width_px = 4500
+height_px = 3000
+pixel_mm = 0.008
+distortion = "brown"
+interior = { c_mm = 34.0 }
+truth = { c_mm = 34.25, xp_mm = 0.06 }
+unknowns = { c_mm = "free", xp_mm = "free" }
+[flight]
+height_m = 1000.0
+forward_overlap_percent = 60.0
+strips = [{ name = "A", heading_deg = 90.0, images = 4 }, { name = "B", heading_deg = 0.0, images = 4 }]
+[terrain]
+kind = "rolling"
+[points]
+ties = 40
+[[targets]]
+role = "control"
+count = 6
+[[targets]]
+role = "check"
+prefix = "C"
+count = 4
+[sigmas]
+image_mm = 0.004
+control_m = 0.03
+station_m = 0.10
+"""
+DECLARED = """
+from jaxphoto.experiment import Experiment, Variant, check_points, iops, tie_point_differences
+from jaxphoto.variants import vertical_control
+
+EXPERIMENT = Experiment(
+    title="small",
+    paper="own",
+    variants={
+        "full": Variant(),
+        "vertical": Variant(vertical_control),
+        "longer": Variant(recipe={"cameras": {"small": {"truth": {"c_mm": 34.75}}}}),
+    },
+    tables={
+        "iops": iops({"1": "full", "2": "longer"}),
+        "check": check_points({"full": "full"}),
+        "ties": tie_point_differences([("full", "vertical")]),
+    },
+    layouts=5,
+)
+"""
+PUBLISHED = """table,row,column,published,unit,tolerance,note
+iops,1,c_mm,34.25,mm,0.1,
+iops,1,xp_mm,9.0,mm,0.1,far off
+iops,1,yp_mm,0.0,mm,,
+iops,all,mean_abs_difference,0,,1e9,
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    place = tmp_path_factory.mktemp("experiments") / "small"
+    place.mkdir()
+    for name, text in (("recipe.toml", RECIPE), ("experiment.py", DECLARED), ("published.csv", PUBLISHED)):
+        (place / name).write_text(text)
+    return place
+
+
+@pytest.fixture(scope="module")
+def run(folder):
+    return run_experiment(load_experiment(folder), folder, layouts=2)
+
+
+def test_cells_are_those_of_each_layout_adjusted_by_itself(folder, run):
+    experiment = load_experiment(folder)
+    for layout in (0, 1):
+        full = simulated(experiment, folder, "full", layout).block
+        c = float(jaxphoto.adjust(full).unknowns.interior["small"].c)
+        points, differences = jaxphoto.point_differences(jaxphoto.adjust(full), jaxphoto.adjust(vertical_control(full)))
+        ties = [k for k, point in enumerate(points) if point[0] not in "TC"]
+        cells = run.cells[run.cells["layout"] == layout].set_index(["table", "row", "column"])["value"]
+        assert cells["iops", "1", "c_mm"] == pytest.approx(c, abs=1e-9)
+        assert cells["ties", "full-vertical", "mean_dX_m"] == pytest.approx(differences[ties, 0].mean(), abs=1e-7)
+        assert cells["check", "full", "n_check_points"] == 4
+    assert not run.failures
+    assert set(run.first) == {"full", "vertical", "longer"}
+
+
+def test_a_variant_replaces_what_it_names_in_the_recipe_and_nothing_else(run):
+    c = run.cells[(run.cells["table"] == "iops") & (run.cells["column"] == "c_mm")].groupby("row")["value"].mean()
+    assert c["1"] == pytest.approx(34.25, abs=0.1)
+    assert c["2"] == pytest.approx(34.75, abs=0.1)
+    x = run.cells[(run.cells["table"] == "iops") & (run.cells["column"] == "xp_mm")].groupby("row")["value"].mean()
+    assert x["2"] == pytest.approx(0.06, abs=0.03)
+
+
+def test_comparison_holds_every_printed_and_every_own_cell_with_its_judgement(folder, run):
+    table = compare(run, folder)
+    expected = "paper table row column published ours unit tolerance within note".split()
+    assert table.columns.tolist()[:10] == expected
+    cell = table.set_index(["table", "row", "column"])
+    values = run.cells.set_index(["table", "row", "column"])["value"]
+    ours = values["iops", "1", "c_mm"].to_numpy()
+    assert cell.loc[("iops", "1", "c_mm"), "ours"] == pytest.approx(ours.mean(), abs=1e-12)
+    assert cell.loc[("iops", "1", "c_mm"), "spread"] == pytest.approx(ours.std(ddof=1), rel=1e-9)
+    assert cell.loc[("iops", "1", "c_mm"), "within"] == "yes"
+    assert cell.loc[("iops", "1", "xp_mm"), ["within", "note"]].tolist() == ["no", "far off"]
+    assert cell.loc[("iops", "1", "yp_mm"), "within"] == ""  # printed, but fixed in ours
+    assert np.isnan(cell.loc[("iops", "1", "yp_mm"), "ours"])
+    assert np.isnan(cell.loc[("iops", "2", "c_mm"), "published"])
+    means = [abs(ours.mean() - 34.25), abs(values["iops", "1", "xp_mm"].mean() - 9.0)]
+    assert cell.loc[("iops", "all", "mean_abs_difference"), "ours"] == pytest.approx(np.mean(means), rel=1e-9)
+    assert (table["paper"] == "own").all()
+    assert not table.duplicated(["table", "row", "column"]).any()
+    assert len(table) == len(values.groupby(level=[0, 1, 2]).size()) + 2
+
+
+def test_a_run_is_written_whole_and_read_back(folder, run, tmp_path):
+    out = tmp_path / "out"
+    write_run(run, folder, out)
+    pd.testing.assert_frame_equal(
+        pd.read_csv(out / "tables.csv", dtype={"row": str}, keep_default_na=False, na_values=[""])[
+            ["ours", "published"]
+        ],
+        compare(run, folder)[["ours", "published"]],
+    )
+    assert len(pd.read_csv(out / "cells.csv")) == len(run.cells)
+    page = (out / "report.html").read_text()
+    assert "far off" in page and "34.25" in page and "data:image/png" in page
+    write_run(run, folder, out)  # an earlier run is replaced
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.tex").write_text("x")
+    with pytest.raises(InputError, match="holds no earlier run"):
+        write_run(run, folder, tmp_path / "mine")
+    assert (tmp_path / "mine" / "thesis.tex").read_text() == "x"
+
+
+def test_layouts_that_cannot_be_made_are_left_out_and_told_of(folder, tmp_path):
+    broken = tmp_path / "broken"
+    broken.mkdir()
+    (broken / "recipe.toml").write_text(RECIPE)
+    text = DECLARED.replace("Variant(vertical_control)", "Variant(sometimes)").replace(
+        "EXPERIMENT =",
+        "import numpy as np\nfrom jaxphoto.errors import BlockError\n\n"
+        "def sometimes(block):\n"
+        f"    if np.asarray(block.image_points.xy)[0, 0] == {first_coordinate(folder)!r}:\n"
+        "        raise BlockError('not this one')\n"
+        "    return vertical_control(block)\n\nEXPERIMENT =",
+    )
+    (broken / "experiment.py").write_text(text)
+    run = run_experiment(load_experiment(broken), broken, layouts=2)
+    assert len(run.failures) == 1 and "layout 1" in run.failures[0] and "not this one" in run.failures[0]
+    assert run.cells["layout"].unique().tolist() == [0]
+    assert "left out" in (write_run(run, broken, tmp_path / "o"), (tmp_path / "o" / "report.html").read_text())[1]
+
+
+def first_coordinate(folder) -> float:
+    block = simulated(load_experiment(folder), folder, "vertical", 1).block
+    return float(np.asarray(block.image_points.xy)[0, 0])
+
+
+@pytest.mark.parametrize(
+    ("files", "message"),
+    [
+        ({}, "holds no experiments"),
+        ({"small/experiment.py": "EXPERIMENT = 3"}, "declares no EXPERIMENT"),
+        ({"small/experiment.py": "import nothing_of_the_kind"}, "cannot be run .ModuleNotFoundError"),
+        ({"small/experiment.py": DECLARED}, "there is no recipe"),
+        ({"small/experiment.py": DECLARED, "small/recipe.toml": RECIPE.replace("ties", "tis")}, "tis: no such key"),
+        ({"other/experiment.py": DECLARED}, "there is no experiment small.*choose other or all"),
+    ],
+)
+def test_what_is_no_experiment_is_refused_with_the_mend(files, message, tmp_path):
+    for name, text in files.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+    with pytest.raises(InputError, match=message):
+        for found in find_experiments(tmp_path, "small"):
+            run_experiment(load_experiment(found), found)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("table,row,column\n", "the column published is missing"),
+        (PUBLISHED + "iops,1,c_mm,34.25,mm,0.1,\n", "c_mm is printed twice"),
+    ],
+)
+def test_published_tables_that_cannot_be_are_refused(text, message, run, tmp_path):
+    (tmp_path / "published.csv").write_text(text)
+    with pytest.raises(InputError, match=message):
+        compare(run, tmp_path)
+
+
+def test_the_command_runs_a_users_own_experiments(folder, tmp_path):
+    arguments = ["experiment", "all", "--experiments", str(folder.parent), "--layouts", "1", "--out", str(tmp_path)]
+    done = CliRunner().invoke(app, arguments)
+    assert done.exit_code == 0, done.output
+    table = pd.read_csv(tmp_path / "small" / "tables.csv")
+    assert table["n_layouts"].max() == 1
+    assert json.dumps(str(tmp_path / "small"))[1:-1] in done.output.replace("\n", "")
