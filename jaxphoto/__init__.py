@@ -18,7 +18,7 @@ if jax.config.values["jax_compilation_cache_dir"] is None:
     jax.config.update("jax_compilation_cache_dir", str(_cache))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 
-from jaxphoto.adjustment import MAX_STEPS, Adjustment, Outcome
+from jaxphoto.adjustment import MAX_STEPS, Adjustment, Outcome, common_sizes
 from jaxphoto.block import Block
 from jaxphoto.camera import (
     AbstractDistortion,
@@ -42,9 +42,11 @@ from jaxphoto.camera import (
 )
 from jaxphoto.collinearity import ExteriorOrientation, image_ray, intersect, project
 from jaxphoto.errors import BlockError, DatumError, InputError, JaxphotoError, RankError
-from jaxphoto.io import convert, read_block, read_source, write_block
+from jaxphoto.georeferencing import Mount, StripBias, Surface, direct_orientation, ground_point
+from jaxphoto.io import convert, read_block, read_recipe, read_source, write_block, write_simulation
 from jaxphoto.procedures import adjust, boresight, georeference
 from jaxphoto.report import Tables
+from jaxphoto.simulation import simulate
 from jaxphoto.statistics import angle_differences, covariance, point_differences
 from jaxphoto.unknowns import FIXED, FREE, Unknowns, Weighted
 
@@ -53,9 +55,10 @@ __version__ = "0.1.0"
 __all__ = [
     "FIXED", "FREE", "MAX_STEPS", "AbstractDistortion", "Adjustment", "AffineBrown", "Balanced", "Block",
     "BlockError", "Brown", "Brown14", "DatumError", "Ebner", "ExteriorOrientation", "Gruen", "InputError",
-    "InteriorOrientation", "JaxphotoError", "Outcome", "PpsRadial", "RadialPolynomial", "RankError", "Sensor",
-    "Smac", "Tables", "Unknowns", "Weighted", "adjust", "angle_differences", "boresight", "conversion_error",
-    "convert", "covariance", "decentring_from_symmetry", "georeference", "image_ray", "intersect",
-    "point_differences", "principal_points", "project", "read_block", "read_source", "rebalance",
-    "rebalance_covariance", "symmetry_from_decentring", "write_block",
+    "InteriorOrientation", "JaxphotoError", "Mount", "Outcome", "PpsRadial", "RadialPolynomial", "RankError",
+    "Sensor", "Smac", "StripBias", "Surface", "Tables", "Unknowns", "Weighted", "adjust", "angle_differences",
+    "boresight", "common_sizes", "conversion_error", "convert", "covariance", "decentring_from_symmetry",
+    "direct_orientation", "georeference", "ground_point", "image_ray", "intersect", "point_differences",
+    "principal_points", "project", "read_block", "read_recipe", "read_source", "rebalance", "rebalance_covariance",
+    "simulate", "symmetry_from_decentring", "write_block", "write_simulation",
 ]  # fmt: skip

@@ -19,7 +19,8 @@ from jaxphoto.arrays import still
 from jaxphoto.block import AXES, Attitudes, Block, Datum, Distances, ImageRows, Rows, direct_exterior, sensor_rows
 from jaxphoto.camera import set_parameter
 from jaxphoto.errors import BlockError
-from jaxphoto.unknowns import FIXED
+from jaxphoto.georeferencing import StripBias
+from jaxphoto.unknowns import FIXED, FREE
 
 
 def indirect(block: Block) -> Block:
@@ -127,6 +128,18 @@ def hold_interior(block: Block, camera: str, values: Mapping[str, float]) -> Blo
     held = jax.tree.map(lambda _: FIXED, interior)
     where = lambda b: (b.start.unknowns.interior[camera], b.priors.interior[camera])  # noqa: E731
     return eqx.tree_at(where, block, (interior, held))
+
+
+def common_shift(block: Block, name: str = "block") -> Block:
+    """All images in one strip, `name`, whose shift is free: a datum offset between stations and control.
+
+    What the block knew of its strips goes.
+    """
+    zero = StripBias(jnp.zeros(3), jnp.zeros(3))
+    known = lambda b: (b.start.unknowns.strips, b.priors.strips)  # noqa: E731
+    priors = StripBias(FREE, FIXED)  # type: ignore[arg-type]
+    joined = dataclasses.replace(block, image_strip=(name,) * len(block.images))
+    return eqx.tree_at(known, joined, ({name: zero}, {name: priors}), is_leaf=lambda x: isinstance(x, dict))
 
 
 def strips(block: Block, names: Collection[str]) -> Block:

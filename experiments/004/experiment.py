@@ -30,14 +30,14 @@ def block_of(row: str, free: bool) -> Variant:
 
 
 variants = {f"{mode}/{row}": block_of(row, mode == "system") for mode in ("independent", "system") for row in ROWS}
-# variants["test field"] = Variant(file="testfield.toml")
+variants["test field"] = Variant(file="testfield.toml")
 
 EXPERIMENT = Experiment(
     title="Paper 004: aerotriangulation with camera stations, independent and system calibration",
     paper="004",
     variants=variants,
     tables={
-        #        "table2_independent_calibration": iops({"60": "test field"}),
+        "table2_independent_calibration": iops({"60": "test field"}),
         "table3_system_calibration_iops": iops({row: f"system/{row}" for row in ROWS}),
         "table4_residuals": residuals(named(v for v in variants if "/" in v), image="px", ground="mm"),
         "table5_checkpoints": check_points(named(v for v in variants if "/" in v)),

@@ -9,7 +9,6 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from jaxphoto.adjustment.compiled import run_compiled
 from jaxphoto.adjustment.datum import close_datum
 from jaxphoto.adjustment.normal import factor_reduced, reduce_normal
 from jaxphoto.adjustment.optimum import (
@@ -28,6 +27,7 @@ from jaxphoto.adjustment.result import Adjustment, Factored, Padded
 from jaxphoto.adjustment.structure import Structure, structure_of
 from jaxphoto.adjustment.values import at_state, unknowns_of, values_of, with_datum
 from jaxphoto.block import Block
+from jaxphoto.compiling import run_compiled
 from jaxphoto.unknowns import Unknowns
 
 MAX_STEPS = 100

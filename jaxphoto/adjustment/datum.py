@@ -5,6 +5,7 @@ changing any image coordinate. Only control, stations, attitudes, distances and 
 together with a free shift or lever arm. What none sees is the datum defect; inner or minimal constraints fill it.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -15,6 +16,7 @@ from jaxtyping import Array, Float
 from jaxphoto.adjustment.residuals import State, Values, georeferencing_residuals
 from jaxphoto.adjustment.structure import Structure
 from jaxphoto.block import Block
+from jaxphoto.compiling import QUICK_TO_COMPILE
 from jaxphoto.errors import DatumError
 from jaxphoto.rotation import small_angles, small_rotation
 
@@ -102,7 +104,7 @@ def similarity(
     return moved, rotation @ turn.T
 
 
-@jax.jit
+@partial(jax.jit, compiler_options=QUICK_TO_COMPILE)
 def _motions_of(position, rotation, points, centre, size):
     zero, seeds = jnp.zeros(7), jnp.eye(7)
 
@@ -148,7 +150,7 @@ def _datum_sensitivity(values: Values, structure: Structure, motions: Motions, c
     return np.concatenate([rows, held * weight]), [structure.labels[j] for j in shared]
 
 
-@jax.jit
+@partial(jax.jit, compiler_options=QUICK_TO_COMPILE)
 def _georeferencing_sensitivity(values: Values, structure: Structure, shared, centre, size):
     def rows(parameters, moved):
         image = lambda x, r: similarity(parameters, x, r, centre, size)  # noqa: E731

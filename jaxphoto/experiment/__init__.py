@@ -1,11 +1,12 @@
 """Experiments: variants of simulated blocks whose tables stand beside what papers print."""
 
-from jaxphoto.experiment.comparison import compare, read_published
+from jaxphoto.experiment.comparison import compare, read_published, side_by_side
 from jaxphoto.experiment.declaration import Cells, Experiment, Measure, Results, Variant
 from jaxphoto.experiment.folder import check_run_target, find_experiments, load_experiment, write_run
 from jaxphoto.experiment.measures import (
     boresight_correlation,
     check_points,
+    effects,
     iops,
     mean_correlations,
     misalignment,
@@ -13,14 +14,17 @@ from jaxphoto.experiment.measures import (
     named,
     orientation_differences,
     principal_point,
+    recovered,
     residuals,
     tie_point_differences,
 )
+from jaxphoto.experiment.plots import comparison_figure
 from jaxphoto.experiment.runner import Run, run_experiment, simulated, summary
 
 __all__ = [
     "Cells", "Experiment", "Measure", "Results", "Run", "Variant", "boresight_correlation", "check_points",
-    "check_run_target", "compare", "find_experiments", "iops", "load_experiment", "mean_correlations", "misalignment",
-    "misalignment_agreement", "named", "orientation_differences", "principal_point", "read_published", "residuals",
-    "run_experiment", "simulated", "summary", "tie_point_differences", "write_run",
+    "check_run_target", "compare", "comparison_figure", "effects", "find_experiments", "iops", "load_experiment",
+    "mean_correlations", "misalignment", "misalignment_agreement", "named", "orientation_differences",
+    "principal_point", "read_published", "recovered", "residuals", "run_experiment", "side_by_side", "simulated",
+    "summary", "tie_point_differences", "write_run",
 ]  # fmt: skip

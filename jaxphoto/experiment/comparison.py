@@ -8,6 +8,8 @@ import pandas as pd
 from jaxphoto.errors import InputError
 from jaxphoto.experiment.runner import Run, summary
 
+MEAN_DIFFERENCE = "mean_abs_difference"
+"""The column whose cell is the mean of |ours - published| over its table."""
 _KEY = ["table", "row", "column"]
 PUBLISHED = [*_KEY, "published", "unit", "tolerance", "note"]
 COLUMNS = [
@@ -48,10 +50,27 @@ def compare(run: Run, folder: Path) -> pd.DataFrame:
     return table[COLUMNS].iloc[np.argsort(places, kind="stable")].reset_index(drop=True)
 
 
+def side_by_side(comparison: pd.DataFrame, table: str) -> pd.DataFrame:
+    """One table of `compare` as it is printed: rows and columns as there, `published` and `ours` beside each other.
+
+    What is neither printed nor ours is left out. Raises ValueError for a table that is none.
+    """
+    cells = comparison[comparison["table"] == table]
+    if cells.empty:
+        known = ", ".join(dict.fromkeys(comparison["table"]))
+        raise ValueError(f"{table!r} is no table of this experiment; its tables are {known}")
+    of = cells.set_index(["row", "column"])
+    columns = pd.MultiIndex.from_product([dict.fromkeys(cells["column"]), ["published", "ours"]])
+    wide = pd.DataFrame(index=pd.Index(list(dict.fromkeys(cells["row"])), name="row"), columns=columns, dtype=float)
+    for row, column in of.index:
+        wide.loc[row, column] = of.loc[(row, column), ["published", "ours"]].to_numpy()
+    return wide.dropna(axis="columns", how="all")
+
+
 def _with_mean_differences(table: pd.DataFrame) -> pd.DataFrame:
-    """Cells `mean_abs_difference` filled in: the mean of |ours - published| over their table."""
+    """Cells of MEAN_DIFFERENCE filled in."""
     table = table.copy()
-    for k in table.index[table["column"] == "mean_abs_difference"]:
+    for k in table.index[table["column"] == MEAN_DIFFERENCE]:
         cells = table[(table["table"] == table.loc[k, "table"]) & (table.index != k)]
         table.loc[k, "ours"] = (cells["ours"] - cells["published"]).abs().mean()
     return table

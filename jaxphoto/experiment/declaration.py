@@ -1,14 +1,34 @@
 """What an experiment is: simulated blocks, variants of them, and the tables asked of these. Declarations only."""
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from jaxphoto.block import Block
 from jaxphoto.report import Tables
+from jaxphoto.simulation import Simulation
 
-Results = Mapping[str, Tables]
-"""The adjusted variants of one layout, by name."""
+
+@dataclasses.dataclass(frozen=True)
+class Results(Mapping[str, Tables]):
+    """The adjusted variants of one layout, by name; `simulations` are the blocks before, with their truth.
+
+    The truth is that of the whole simulation, whatever `Variant.change` took away.
+    """
+
+    adjusted: Mapping[str, Tables]
+    simulations: Mapping[str, Simulation]
+
+    def __getitem__(self, variant: str) -> Tables:
+        return self.adjusted[variant]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.adjusted)
+
+    def __len__(self) -> int:
+        return len(self.adjusted)
+
+
 Cells = dict[tuple[str, str], float]
 """The cells of one table, by row and column."""
 Measure = Callable[[Results], Cells]

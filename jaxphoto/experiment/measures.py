@@ -5,12 +5,14 @@ and may call them otherwise: `{"4": "system 4"}` prints the variant `system 4` i
 """
 
 from collections.abc import Iterable, Mapping
+from types import MappingProxyType
 
 import numpy as np
 import pandas as pd
 
 from jaxphoto.block import AXES
 from jaxphoto.experiment.declaration import Cells, Measure, Results
+from jaxphoto.io.recipe import truth_tables
 from jaxphoto.report import Tables
 from jaxphoto.statistics import angle_differences, point_differences, residual_spread
 
@@ -174,6 +176,43 @@ def boresight_correlation(rows: Rows) -> Measure:
             a, b = names.index("boresight_x_rad"), names.index("yp_mm")
             matrix = np.asarray(covariance.matrix)
             cells[row, "rho(domega,yp)"] = matrix[a, b] / np.sqrt(matrix[a, a] * matrix[b, b])
+        return cells
+
+    return measure
+
+
+def recovered(rows: Rows, truths: Mapping[str, str] = MappingProxyType({})) -> Measure:
+    """Estimated mounts and strips beside their truth, row `row/parameter`; `ratio` is |estimate - truth| / sigma.
+
+    `truths` names the true parameter of the truth's tables where the estimated one has another name there.
+    """
+
+    def measure(results: Results) -> Cells:
+        cells: Cells = {}
+        for row, variant in rows.items():
+            true = truth_tables(results.simulations[variant])["georeferencing"].set_index("parameter")["value"]
+            table = results[variant].georeferencing
+            for parameter, value, sigma in zip(table["parameter"], table["value"], table["sigma"], strict=True):
+                name, truth = f"{row}/{parameter}", float(true[truths.get(parameter, parameter)])
+                cells |= {(name, "truth"): truth, (name, "estimate"): value, (name, "sigma"): sigma}
+                cells[name, "ratio"] = abs(value - truth) / sigma
+        return cells
+
+    return measure
+
+
+def effects(rows: Rows, reference: str) -> Measure:
+    """Estimated interior orientation minus that of the variant `reference`, RMSE at check points, sigma naught."""
+
+    def measure(results: Results) -> Cells:
+        cells: Cells = {}
+        estimates, discrepancies = iops(named([reference, *rows.values()]))(results), check_points(rows)(results)
+        for row, variant in rows.items():
+            for s in results[variant].significance:
+                column = s.parameter + _UNITS.get(s.parameter, "")
+                cells[row, f"change_{column}"] = estimates[variant, column] - estimates[reference, column]
+            cells |= {(row, c): discrepancies[row, c] for c in (f"rmse_d{axis}_m" for axis in AXES)}
+            cells[row, "sigma0"] = float(results[variant].adjusted.sigma0)
         return cells
 
     return measure

@@ -1,81 +1,136 @@
-"""The page of an experiment: each table as printed, ours in the same cells."""
+"""The page of an experiment: what agrees, then each table as printed, ours in the same cells."""
 
 import base64
 import io
 
+import numpy as np
 import pandas as pd
 from jinja2 import Environment
 from matplotlib.figure import Figure
 
+from jaxphoto.experiment.comparison import MEAN_DIFFERENCE
 from jaxphoto.experiment.runner import Run
-from jaxphoto.report import STYLE, layout_figure
+from jaxphoto.experiment.wording import heading, own_decimals, power_of, printed_decimals, table_title
+from jaxphoto.report import STYLE, check_points_figure, layout_figure
 
 _PAGE = """<!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8"><title>{{ title }}</title><style>{{ style }}
-td.no { background: #fbe3e0 } td.yes { background: #e4f3e6 } .ours { font-weight: 600 } .paper { color: #777 }
+body { max-width: 86rem } td, th { white-space: nowrap } th { font-weight: 600 } .tables td, .tables th { line-height: 1.3; padding: .2rem .4rem }
+.no { background: #fbe3e0 } .yes { background: #e4f3e6 } .chip { padding: 0 .5em; border-radius: 3px }
+.ours { font-weight: 600 } .spread, .paper { color: #777 } .spread { font-size: 90% }
+ol.notes { margin: 0 0 1.5rem; font-size: 13px; color: #555 } sup { color: #777; font-size: 75% }
 </style></head><body>
 <h1>{{ title }}</h1>
-<p>Of {{ judged }} printed cells with a tolerance, <b>{{ good }}</b> are within it. In each cell: <span class="ours">ours</span>,
-the mean over {{ layouts }} simulated layouts, &plusmn; the standard deviation from layout to layout;
-<span class="paper">below, what the paper prints</span>. Green and red: within the tolerance or not; no colour: nothing promised.</p>
+<p>{% if judged %}<b>{{ good }} of {{ judged }}</b> printed values for which a tolerance is promised are within it.
+{% else %}Nothing is promised here: no printed value has a tolerance.{% endif %}</p>
+<p>In each cell, above: <span class="ours">ours</span>, the mean over {{ layouts }} simulated
+{{ "layout" if layouts == 1 else "layouts" }}{% if layouts > 1 %}, <span class="spread">± the standard deviation from layout
+to layout</span>{% endif %}. Below: <span class="paper">what is printed (± the tolerance promised)</span>.
+<span class="chip yes">green</span> within the tolerance, <span class="chip no">red</span> not, no colour: nothing promised.
+Small numbers at cells and headings refer to the notes below the table.</p>
 {% for failure in failures %}<p class="warning">left out: {{ failure }}</p>{% endfor %}
+<table><tr><th>table</th><th>within</th><th>of</th></tr>
+{% for table in tables %}<tr><td><a href="#{{ table.name }}">{{ table.title }}</a></td>
+<td>{{ table.good if table.judged else "" }}</td><td>{{ table.judged or "nothing promised" }}</td></tr>
+{% endfor %}</table>
 <h2>Block of the first layout</h2><img alt="block layout" src="{{ layout }}">
-{% for table in tables %}<h2>{{ table.name }}</h2><div class="wide"><table>
-<tr><th></th>{% for c in table.columns %}<th>{{ c }}</th>{% endfor %}</tr>
-{% for row in table.rows %}<tr><td>{{ row.name }}</td>{% for cell in row.cells %}<td class="{{ cell.within }}" title="{{ cell.note }}">
-<span class="ours">{{ cell.ours }}</span><br><span class="paper">{{ cell.published }}</span></td>{% endfor %}</tr>
-{% endfor %}</table></div>
-{% for note in table.notes %}<p class="warning">{{ note }}</p>{% endfor %}
-{% endfor %}</body></html>
+<div class="tables">
+{% for table in tables %}<h2 id="{{ table.name }}">{{ table.title }}</h2>
+{% if table.columns %}<div class="wide"><table>
+<tr><th></th>{% for c in table.columns %}<th>{{ c.heading }}{% for n in c.notes %}<sup>{{ n }}</sup>{% endfor %}</th>{% endfor %}</tr>
+{% for row in table.rows %}<tr><td>{{ row.name }}</td>{% for cell in row.cells %}<td class="{{ cell.within }}">
+{%- if cell.ours %}<span class="ours">{{ cell.ours }}</span><span class="spread">{{ cell.spread }}</span>{% endif %}
+{%- if cell.published or table.printed %}<br><span class="paper">{{ cell.published or "&nbsp;"|safe }}</span>{% endif %}
+{%- if cell.note %}<sup>{{ cell.note }}</sup>{% endif %}</td>{% endfor %}</tr>
+{% endfor %}</table></div>{% endif %}
+{% if table.notes %}<ol class="notes">{% for note in table.notes %}<li>{{ note }}</li>{% endfor %}</ol>{% endif %}
+{% if table.difference %}<p>Mean of |ours - printed| over the table:
+<span class="chip {{ table.difference.within }}">{{ table.difference.words }}</span></p>{% endif %}
+{% endfor %}</div>
+{% if check %}<h2>Check points of the first layout</h2><img alt="discrepancies at check points" src="{{ check }}">{% endif %}
+</body></html>
 """
 
 
 def experiment_page(run: Run, comparison: pd.DataFrame) -> str:
     """The whole page as HTML, pictures inside."""
-    judged = comparison["within"] != ""
+    tables = [_table(str(name), cells) for name, cells in comparison.groupby("table", sort=False)]
+    check = {name: of for name, of in run.first.items() if len(of.check_points)}
     return (
         Environment(autoescape=True)
         .from_string(_PAGE)
         .render(
             title=run.experiment.title,
             style=STYLE,
-            judged=int(judged.sum()),
-            good=int((comparison["within"] == "yes").sum()),
+            judged=sum(table["judged"] for table in tables),
+            good=sum(table["good"] for table in tables),
             layouts=run.cells["layout"].nunique(),
             failures=run.failures,
             layout=_picture(layout_figure(next(iter(run.first.values())))),
-            tables=[_table(str(name), cells) for name, cells in comparison.groupby("table", sort=False)],
+            tables=tables,
+            check=_picture(check_points_figure(check)) if check else "",
         )
     )
 
 
 def _table(name: str, cells: pd.DataFrame) -> dict:
-    columns = list(dict.fromkeys(cells["column"]))
-    place = {(r.row, r.column): r for r in cells.itertuples()}
-    rows = [
-        {"name": row, "cells": [_cell(place.get((row, column))) for column in columns]}
-        for row in dict.fromkeys(cells["row"])
-    ]
-    notes = [f"{_listed(c)}: {note}" for note, c in cells[cells["note"] != ""].groupby("note", sort=False)]
-    return {"name": name, "columns": columns, "rows": rows, "notes": notes}
-
-
-def _listed(cells: pd.DataFrame) -> str:
-    """The columns that a note is about, with their rows where not all of the table have it."""
-    return "; ".join(f"{column} ({', '.join(of['row'])})" for column, of in cells.groupby("column", sort=False))
-
-
-def _cell(cell) -> dict[str, str]:
-    if cell is None:
-        return {"ours": "", "published": "", "within": "", "note": ""}
-    spread = f" ± {cell.spread:.2g}" if pd.notna(cell.spread) else ""
-    tolerance = f" (± {cell.tolerance:.2g})" if pd.notna(cell.tolerance) else ""
+    overall = cells["column"] == MEAN_DIFFERENCE
+    shown = cells[~overall]
+    # A note of a whole column stands at its heading, others at their cells; they are numbered as they come.
+    numbers: dict[str, int] = {}
+    columns: list[dict] = []
+    texts: dict[tuple, dict] = {}
+    for column, of in shown.groupby("column", sort=False):
+        notes = [note for note in of["note"].unique() if note]
+        whole = [note for note in notes if (of["note"] == note).all()]
+        for note in notes:
+            numbers.setdefault(note, len(numbers) + 1)
+        power = power_of(np.concatenate([of["ours"].dropna(), of["published"].dropna()]))
+        unit = next((u for u in of["unit"] if isinstance(u, str)), "")
+        columns.append({"heading": heading(str(column), unit, power), "notes": [numbers[note] for note in whole]})
+        marks = {note: numbers[note] for note in notes if note not in whole}
+        texts |= {(cell["row"], column): text for cell, text in _column(of, power, marks)}
+    empty = {"ours": "", "spread": "", "published": "", "within": "", "note": ""}
+    names = list(dict.fromkeys(shown["column"]))
+    rows = [{"name": r, "cells": [texts.get((r, c), empty) for c in names]} for r in dict.fromkeys(shown["row"])]
     return {
-        "ours": f"{cell.ours:.5g}{spread}" if pd.notna(cell.ours) else "",
-        "published": f"{cell.published:.5g}{tolerance}" if pd.notna(cell.published) else "",
-        "within": cell.within,
-        "note": cell.note,
+        "name": name,
+        "title": table_title(name),
+        "judged": int((cells["within"] != "").sum()),
+        "good": int((cells["within"] == "yes").sum()),
+        "columns": columns,
+        "rows": rows,
+        "printed": bool(shown["published"].notna().any()),
+        "notes": list(numbers),
+        "difference": _difference(cells[overall].iloc[0]) if overall.any() else None,
     }
+
+
+def _column(of: pd.DataFrame, power: int, marks: dict[str, int]) -> list[tuple[pd.Series, dict]]:
+    """Every cell of one column with its texts; the digits are those of the column."""
+    scale = 10.0**-power
+    printed = printed_decimals(of["published"].dropna(), power)
+    size = scale * float(of["ours"].abs().max())
+    found = []
+    for _, cell in of.iterrows():
+        spread = scale * float(cell["spread"]) if pd.notna(cell["spread"]) else 0.0
+        ours, paper = scale * float(cell["ours"]), scale * float(cell["published"])
+        digits = own_decimals(ours, spread, printed, size) if pd.notna(ours) else 0
+        tolerance = f" (± {scale * cell['tolerance']:.2g})" if pd.notna(cell["tolerance"]) else ""
+        text = {
+            "ours": f"{ours:z.{digits}f}" if pd.notna(ours) else "",
+            "spread": f" ± {spread:.{digits}f}" if round(spread, digits) else "",
+            "published": f"{paper:.{printed or 0}f}{tolerance}" if pd.notna(paper) else "",
+            "within": cell["within"],
+            "note": marks.get(cell["note"], ""),
+        }
+        found.append((cell, text))
+    return found
+
+
+def _difference(cell: pd.Series) -> dict[str, str]:
+    promised = f" (at most {cell['tolerance']:g} promised)" if pd.notna(cell["tolerance"]) else ""
+    return {"words": f"{cell['ours']:.3g}{promised}", "within": cell["within"]}
 
 
 def _picture(figure: Figure) -> str:

@@ -11,7 +11,7 @@ import pandas as pd
 from jaxphoto.adjustment import Sizes, common_sizes
 from jaxphoto.block import Block
 from jaxphoto.errors import InputError, JaxphotoError
-from jaxphoto.experiment.declaration import Experiment, Variant
+from jaxphoto.experiment.declaration import Experiment, Results, Variant
 from jaxphoto.io.block_folder.settings import read_toml
 from jaxphoto.io.recipe import recipe_from
 from jaxphoto.procedures import adjust
@@ -44,30 +44,30 @@ def run_experiment(
     """
     recipes = {name: _recipe(variant, folder) for name, variant in experiment.variants.items()}
     failures: list[str] = []
-    blocks: dict[int, dict[str, Block]] = {}
+    simulations: dict[int, dict[str, Simulation]] = {}
     for layout in range(layouts or experiment.layouts):
         progress(f"layout {layout}: simulating")
         try:
-            blocks[layout] = _simulated(experiment, recipes, layout)
+            simulations[layout] = _simulated(experiment, recipes, layout)
         except (JaxphotoError, ValueError) as error:
             failures.append(f"layout {layout}: {error}")
-    sizes = _sizes(list(blocks.values()))
+    sizes = _sizes([{name: s.block for name, s in variants.items()} for variants in simulations.values()])
     rows: list[tuple] = []
     first: dict[str, Tables] = {}
-    for layout, variants in blocks.items():
-        results = {}
+    for layout, variants in simulations.items():
+        adjusted = {}
         try:
-            for name, block in variants.items():
+            for name, simulation in variants.items():
                 progress(f"layout {layout}: adjusting {name}")
-                results[name] = _adjusted(block, sizes[name])
+                adjusted[name] = _adjusted(simulation.block, sizes[name])
         except JaxphotoError as error:
             failures.append(f"layout {layout}, {name}: {error}")
             continue
-        first = first or results
+        first = first or adjusted
         rows += [
             (table, row, column, layout, value)
             for table, measure in experiment.tables.items()
-            for (row, column), value in measure(results).items()
+            for (row, column), value in measure(Results(adjusted, variants)).items()
         ]
     if not first:
         raise InputError(f"{folder}: no layout could be adjusted; the first says: {failures[0]}")
@@ -80,16 +80,16 @@ def simulated(experiment: Experiment, folder: Path, variant: str, layout: int = 
     return simulate(_recipe(experiment.variants[variant], folder), layout)
 
 
-def _simulated(experiment: Experiment, recipes: Mapping[str, Recipe], layout: int) -> dict[str, Block]:
-    """The block of every variant; variants of one recipe are changes of one and the same simulation."""
-    made: dict[tuple[str, str], Block] = {}
-    blocks = {}
+def _simulated(experiment: Experiment, recipes: Mapping[str, Recipe], layout: int) -> dict[str, Simulation]:
+    """Every variant with its block; variants of one recipe are changes of one and the same simulation."""
+    made: dict[tuple[str, str], Simulation] = {}
+    variants = {}
     for name, variant in experiment.variants.items():
         key = (variant.file, repr(variant.recipe))
         if key not in made:
-            made[key] = simulate(recipes[name], layout).block
-        blocks[name] = variant.change(made[key])
-    return blocks
+            made[key] = simulate(recipes[name], layout)
+        variants[name] = made[key]._replace(block=variant.change(made[key].block))
+    return variants
 
 
 def _sizes(layouts: list[dict[str, Block]]) -> dict[str, Sizes]:

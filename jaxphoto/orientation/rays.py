@@ -7,9 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxphoto.camera import InteriorOrientation
-
-# Approximations run once per block, so what counts is compiling: a quarter of the default's time on jax 0.10.2.
-QUICK_TO_COMPILE = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
+from jaxphoto.compiling import QUICK_TO_COMPILE
 
 
 @partial(jax.jit, compiler_options=QUICK_TO_COMPILE)

@@ -17,8 +17,9 @@ from jaxtyping import Float
 
 from jaxphoto.camera import InteriorOrientation
 from jaxphoto.collinearity import ExteriorOrientation, project_ideal
+from jaxphoto.compiling import QUICK_TO_COMPILE
 from jaxphoto.errors import BlockError
-from jaxphoto.orientation.rays import QUICK_TO_COMPILE, ideal_coordinates, padded_length, unit_rays
+from jaxphoto.orientation.rays import ideal_coordinates, padded_length, unit_rays
 from jaxphoto.orientation.three_points import three_point_resections
 from jaxphoto.rotation import small_rotation
 

@@ -21,6 +21,7 @@ from jaxphoto.arrays import Numbers
 from jaxphoto.block import Block, Rows, SensorRows, direct_exterior, sensor_rows
 from jaxphoto.camera import InteriorOrientation, get_parameter, parameter_names
 from jaxphoto.collinearity import ExteriorOrientation
+from jaxphoto.compiling import QUICK_TO_COMPILE
 from jaxphoto.errors import BlockError
 from jaxphoto.georeferencing import Corrections, DirectPartials, direct_partials
 from jaxphoto.georeferencing.intersection import (
@@ -32,7 +33,7 @@ from jaxphoto.georeferencing.intersection import (
     shared_covariance,
 )
 from jaxphoto.orientation import intersect_points
-from jaxphoto.orientation.rays import QUICK_TO_COMPILE, ideal_coordinates, padded_length, turn_to_object, unit_rays
+from jaxphoto.orientation.rays import ideal_coordinates, padded_length, turn_to_object, unit_rays
 from jaxphoto.unknowns import Weighted
 
 # From the point nearest to the rays the first step leaves micrometres, the second nothing.

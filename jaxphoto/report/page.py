@@ -9,7 +9,7 @@ from jinja2 import Environment
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from jaxphoto.report.plots import correlation_figure, layout_figure, residuals_figure
+from jaxphoto.report.plots import check_points_figure, correlation_figure, layout_figure, residuals_figure
 from jaxphoto.report.tables import Tables
 from jaxphoto.statistics import LEAST_CHECKED
 
@@ -34,7 +34,8 @@ Standard deviations are a posteriori (times &sigma;<sub>0</sub>). Correlations r
 <h2>Residuals</h2>{{ spread }}
 {% for figure in residuals %}<img alt="image residuals" src="{{ figure }}">{% endfor %}
 <h3>Largest normalised residuals</h3>{{ largest }}
-{% if check %}<h2>Check points: surveyed minus computed</h2>{{ check_spread }}{{ check }}{% endif %}
+{% if check %}<h2>Check points: surveyed minus computed</h2>{{ check_spread }}
+<img alt="discrepancies at check points" src="{{ check_picture }}">{{ check }}{% endif %}
 <h2>Exterior orientation</h2>{{ exterior }}
 <h2>Correlation of exterior and interior orientation over the images</h2>{{ summary }}
 </body></html>
@@ -74,6 +75,7 @@ def report_page(tables: Tables, warnings: list[str]) -> str:
             spread=_html(tables.residual_spread),
             residuals=[_picture(residuals_figure(tables, c)) for c in a.unknowns.interior],
             largest=_html(largest.drop(columns="size")),
+            check_picture=_picture(check_points_figure({"": tables})) if len(check) else "",
             check=_html(check) if len(check) else "",
             check_spread=_html(_check_spread(check)) if len(check) else "",
             exterior=_html(tables.exterior),

@@ -1,6 +1,9 @@
-"""Pictures of an adjustment: block layout, residuals over the image, correlations. Matplotlib figures."""
+"""Pictures of an adjustment: block layout, residuals, check points, correlations. Matplotlib figures."""
+
+from collections.abc import Mapping
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jaxphoto.report.tables import Tables
@@ -39,16 +42,43 @@ def residuals_figure(tables: Tables, camera: str) -> Figure:
     sensor = a.block.sensors[camera]
     figure = Figure(figsize=(6.4, 5.0), dpi=_DPI, layout="constrained")
     axes = figure.subplots()
-    # The key is a round number near three times the RMS, and six per cent of the format long.
-    rms = max(float(np.sqrt((v**2).mean())), 1e-12) if v.size else 1.0
-    key = float(f"{3 * rms:.0e}")
-    scale = 0.06 * sensor.width_mm / key
-    arrows = axes.quiver(*xy, *v, angles="xy", scale_units="xy", scale=1 / scale, width=0.0015, color="tab:blue")
-    axes.quiverkey(arrows, 0.85, 1.03, key, f"{1000 * key:g} µm", labelpos="E")
+    key = _round_key(v)
+    _vectors(axes, xy, v, key, 0.06 * sensor.width_mm, f"{1000 * key:g} µm", width=0.0015)
     w, h = sensor.width_mm / 2, sensor.height_mm / 2
     axes.plot([-w, w, w, -w, -w], [-h, -h, h, h, -h], color="0.4", lw=0.8)
     axes.set(xlabel="x [mm]", ylabel="y [mm]", title=f"image residuals of camera {camera}")
     axes.set_aspect("equal")
+    return figure
+
+
+def check_points_figure(adjustments: Mapping[str, Tables]) -> Figure:
+    """Discrepancies at check points, surveyed minus computed: in plan on the left, in height (upwards) on the right.
+
+    One line for each of `adjustments`, which are named; all arrows have one scale, so they can be compared.
+    """
+    found = {
+        name: tables.check_points[["dX_m", "dY_m", "dZ_m"]].to_numpy(float).T for name, tables in adjustments.items()
+    }
+    key = _round_key(np.concatenate([d.ravel() for d in found.values()]))
+    extent = np.max([np.ptp(of.adjusted.unknowns.exterior.position, axis=0) for of in adjustments.values()], axis=0)
+    high = 4.2 * float(np.clip(extent[1] / max(extent[0], 1e-9), 0.2, 0.8))
+    figure = Figure(figsize=(9.6, 0.4 + (0.8 + high) * len(found)), dpi=_DPI, layout="constrained")
+    for pair, (name, d) in zip(figure.subplots(len(found), 2, squeeze=False), found.items(), strict=True):
+        a = adjustments[name].adjusted
+        number = {point: k for k, point in enumerate(a.block.points)}
+        at = np.asarray(a.unknowns.points)[[number[p] for p in adjustments[name].check_points["point"]], :2].T
+        stations = np.asarray(a.unknowns.exterior.position)[:, :2].T
+        length = 0.12 * float(np.ptp(np.hstack([stations, at]), axis=1).max())
+        upright = np.stack([np.zeros(d.shape[1]), d[2]])
+        for axes, v, what in zip(pair, (d[:2], upright), ("dX, dY", "dZ"), strict=True):
+            surveyed = np.isfinite(v).all(axis=0)
+            axes.plot(*stations, "+", ms=6, color="0.75")
+            axes.plot(*at[:, surveyed], ".", ms=4, color="tab:green")
+            _vectors(axes, at[:, surveyed], v[:, surveyed], key, length, f"{key:g} m", width=0.003)
+            axes.set(xlabel="X [m]", ylabel="Y [m]")
+            axes.set_title(f"{name}: {what}" if name else what, loc="left", fontsize=10)
+            axes.set_aspect("equal", adjustable="datalim")
+    figure.suptitle("discrepancies at check points, surveyed minus computed", fontsize=11)
     return figure
 
 
@@ -70,3 +100,15 @@ def correlation_figure(tables: Tables, camera: str) -> Figure:
         axes.set_title(title, fontsize=10)
     figure.colorbar(image, ax=[left, right], shrink=0.8)
     return figure
+
+
+def _round_key(v: np.ndarray) -> float:
+    """A round number near three times the RMS of `v`, where it is known."""
+    rms = float(np.sqrt(np.nanmean(v**2))) if np.isfinite(v).any() else 1.0
+    return float(f"{3 * max(rms, 1e-12):.0e}")
+
+
+def _vectors(axes: Axes, at: np.ndarray, v: np.ndarray, key: float, length: float, label: str, *, width: float) -> None:
+    """Arrows `v` at `at` (both 2 x n), with a key: one of size `key`, which is `length` long, and its `label`."""
+    arrows = axes.quiver(*at, *v, angles="xy", scale_units="xy", scale=key / length, width=width, color="tab:blue")
+    axes.quiverkey(arrows, 0.85, 1.03, key, label, labelpos="E")

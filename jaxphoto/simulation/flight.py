@@ -24,6 +24,7 @@ from jaxphoto.rotation import (
     small_rotation,
 )
 from jaxphoto.simulation.chunks import in_chunks
+from jaxphoto.simulation.flight_plan import FlightPlan
 from jaxphoto.simulation.recipe import Recipe, triple
 from jaxphoto.simulation.streams import stream
 
@@ -31,7 +32,10 @@ _CHUNK = 64
 
 
 class Flight(NamedTuple):
-    """One entry per image, in the order of the flight; `time` in seconds from the mean time of the strip."""
+    """One entry per image, in the order of the flight; `time` in seconds from the mean time of the strip.
+
+    Images that belong to no strip have the strip "".
+    """
 
     images: tuple[str, ...]
     cameras: tuple[str, ...]
@@ -41,13 +45,13 @@ class Flight(NamedTuple):
     motion: Motion
 
 
-def fly(recipe: Recipe, mean_height: float, seed: int) -> Flight:
-    """Fly the plan `mean_height` (m) above zero, with the recipe's jitter.
+def fly(recipe: Recipe, plan: FlightPlan, mean_height: float, seed: int) -> Flight:
+    """Fly the recipe's `plan` `mean_height` (m) above zero, with the recipe's jitter.
 
     Every exposure is off its plan by normal deviations. The body's attitude is roll, pitch, yaw = heading + crab; the
     camera follows it through the true mount.
     """
-    strips = recipe.plan.strips
+    strips = plan.strips
     of = np.repeat(np.arange(len(strips)), [s.images for s in strips])
     heading = np.deg2rad([strips[k].heading_deg for k in of])
     cameras = tuple(strips[k].camera for k in of)
@@ -57,7 +61,7 @@ def fly(recipe: Recipe, mean_height: float, seed: int) -> Flight:
     deviation = np.deg2rad([jitter.angle_deg, jitter.angle_deg, jitter.crab_deg])
     attitude = rng.standard_normal((n, 3)) * deviation + np.column_stack([0 * heading, 0 * heading, heading])
     rate = np.deg2rad(jitter.rate_deg_per_s) * rng.standard_normal((n, 3))
-    speed = recipe.plan.speed_m_per_s
+    speed = plan.speed_m_per_s
     velocity = speed * np.column_stack([np.sin(heading), np.cos(heading), 0 * heading])
     mounts = [recipe.mounts[m].truth if (m := recipe.mount_of(c)) else None for c in cameras]
     boresight = np.stack([np.zeros(3) if m is None else np.asarray(m.boresight) for m in mounts])

@@ -68,6 +68,11 @@ class FlightPlan:
     strips: tuple[Strip, ...]
     speed_m_per_s: float = 60.0
 
+    @property
+    def cameras(self) -> set[str]:
+        """Those that are flown."""
+        return {strip.camera for strip in self.strips}
+
 
 @dataclasses.dataclass(frozen=True)
 class Swaths:
@@ -79,6 +84,17 @@ class Swaths:
     strips: tuple[Strip, ...]
     across: float = 0.95
     ends: float = 0.0
+
+    @property
+    def axes(self) -> Float[np.ndarray, "2 2"]:
+        """Unit vectors (east, north): along the first strip's heading, and to its right."""
+        return self.strips[0].axes
+
+    @property
+    def directions(self) -> Float[np.ndarray, "directions 2"]:
+        """Unit vectors (east, north) along which strips are flown, one way or the other."""
+        headings = np.deg2rad(np.unique([round(s.heading_deg % 180, 3) for s in self.strips]))
+        return np.column_stack([np.sin(headings), np.cos(headings)])
 
     def half(self, strip: Strip) -> Float[np.ndarray, "2"]:
         """Half the length and half the width (m) of one swath."""

@@ -6,8 +6,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxphoto.errors import BlockError
+from jaxphoto.simulation.convergent_plan import Field
 from jaxphoto.simulation.flight import Flight
-from jaxphoto.simulation.flight_plan import Strip, Swaths
+from jaxphoto.simulation.flight_plan import Swaths
 from jaxphoto.simulation.recipe import Choice, Recipe, Role, Targets
 from jaxphoto.simulation.streams import stream
 from jaxphoto.simulation.terrain import Terrain
@@ -29,22 +30,21 @@ class Scene(NamedTuple):
 
 def scatter(recipe: Recipe, flight: Flight, terrain: Terrain, seed: int) -> Scene:
     """Ties and targets of the recipe. Raises BlockError where images do not see them often enough."""
-    swaths = Swaths(recipe.plan.strips, recipe.points.across, recipe.points.ends)
     rng = stream(seed, "ties")
     ids = [f"{k + 1}" for k in range(recipe.points.ties)]
-    xyz = [_uniform(recipe, flight, terrain, swaths, recipe.points.ties, rng)]
+    xyz = [_uniform(recipe, flight, terrain, recipe.points.ties, rng)]
     roles: list[Role] = ["tie"] * len(ids)
     counts: dict[str, int] = {}
     for number, group in enumerate(recipe.targets):
         rng = stream(seed, f"targets {number}")
-        given = _given(group, terrain, swaths, rng)
+        given = _given(group, terrain, recipe.ground, rng)
         _check_seen(recipe, flight, given)
-        places = np.vstack([given, _uniform(recipe, flight, terrain, swaths, group.count, rng)])
+        places = np.vstack([given, _uniform(recipe, flight, terrain, group.count, rng)])
         begin = counts.get(group.prefix, 0)
         counts[group.prefix] = begin + len(places)
         ids += [f"{group.prefix}{begin + k + 1}" for k in range(len(places))]
         xyz.append(places)
-        roles += _roles(group, places, recipe.plan.strips)
+        roles += _roles(group, places, recipe.ground)
     points = np.vstack(xyz)
     is_target = np.arange(len(points)) >= recipe.points.ties
     return Scene(tuple(ids), points, tuple(roles), is_target, _rays(recipe, flight, points))
@@ -55,14 +55,12 @@ def _rays(recipe: Recipe, flight: Flight, xyz: np.ndarray) -> Rays:
     return photograph(cameras, recipe.sensors, flight.cameras, flight.exterior, xyz, recipe.points.margin_mm)
 
 
-def _uniform(
-    recipe: Recipe, flight: Flight, terrain: Terrain, swaths: Swaths, n: int, rng: np.random.Generator
-) -> np.ndarray:
+def _uniform(recipe: Recipe, flight: Flight, terrain: Terrain, n: int, rng: np.random.Generator) -> np.ndarray:
     found = np.zeros((0, 3))
     for _ in range(_TRIES):
         if len(found) >= n:
             break
-        places = terrain.place(swaths.draw(rng, n), rng)
+        places = terrain.place(recipe.ground.draw(rng, n), rng)
         often = _rays(recipe, flight, places).per_point(n) >= recipe.points.min_images
         found = np.vstack([found, places[often]])
     if len(found) < n:
@@ -73,9 +71,9 @@ def _uniform(
     return found[:n]
 
 
-def _given(group: Targets, terrain: Terrain, swaths: Swaths, rng: np.random.Generator) -> np.ndarray:
-    axes = swaths.strips[0].axes
-    low, high = swaths.extent(axes)
+def _given(group: Targets, terrain: Terrain, ground: Swaths | Field, rng: np.random.Generator) -> np.ndarray:
+    axes = ground.axes
+    low, high = ground.extent(axes)
     parts = np.array(group.at, float).reshape(-1, 2)
     relative = ((low + high) / 2 + parts * (high - low) / 2) @ axes
     flat = np.array([place[:2] for place in group.at_m], float).reshape(-1, 2)
@@ -95,21 +93,20 @@ def _check_seen(recipe: Recipe, flight: Flight, xyz: np.ndarray) -> None:
         )
 
 
-def _roles(group: Targets, xyz: np.ndarray, strips: tuple[Strip, ...]) -> list[Role]:
+def _roles(group: Targets, xyz: np.ndarray, ground: Swaths | Field) -> list[Role]:
     roles = [group.role] * len(xyz)
     if group.choice is not None:
-        for k in _chosen(group.choice, xyz[:, :2], strips):
+        for k in _chosen(group.choice, xyz[:, :2], ground):
             roles[k] = group.choice.role
     return roles
 
 
-def _chosen(choice: Choice, xy: np.ndarray, strips: tuple[Strip, ...]) -> list[int]:
-    low, high = Swaths(strips).extent(np.eye(2))
+def _chosen(choice: Choice, xy: np.ndarray, ground: Swaths | Field) -> list[int]:
+    low, high = ground.extent(np.eye(2))
     xy = xy - (low + high) / 2
     chosen = list(range(min(choice.first, len(xy))))
     rankings = [(np.hypot(*xy.T), 1)] if choice.centre else []
-    headings = np.deg2rad(np.unique([round(s.heading_deg % 180, 3) for s in strips]))
-    for ahead in np.column_stack([np.sin(headings), np.cos(headings)]):
+    for ahead in ground.directions:
         rankings += [(xy @ ahead, choice.outermost), (-xy @ ahead, choice.outermost)]
     # One after the other, passing over those already chosen: every rule gets as many as it asks for.
     for rank, count in rankings:

@@ -12,7 +12,8 @@ from jaxtyping import Float
 from jaxphoto.block import Datum
 from jaxphoto.camera import InteriorOrientation, Sensor
 from jaxphoto.georeferencing import Mount, StripBias
-from jaxphoto.simulation.flight_plan import FlightPlan
+from jaxphoto.simulation.convergent_plan import ConvergentPlan, Field
+from jaxphoto.simulation.flight_plan import FlightPlan, Swaths
 from jaxphoto.simulation.terrain import Terrain
 
 Role = Literal["control", "vertical", "check", "tie"]
@@ -47,10 +48,11 @@ class Bias:
 
 @dataclasses.dataclass(frozen=True)
 class Jitter:
-    """Standard deviations by which a flight leaves its plan.
+    """Standard deviations by which a flight, or a convergent set, leaves its plan.
 
     `position_m` per axis X, Y, Z; `angle_deg` of roll and of pitch; `crab_deg` of yaw against the track (the track
-    stays); `rate_deg_per_s` of the rates of turn about right, forward and up.
+    stays); `rate_deg_per_s` of the rates of turn about right, forward and up. In a convergent set `angle_deg` is that
+    of the aim, about the camera's x and y axes, and `crab_deg` that of the roll.
     """
 
     position_m: Triple = (0.0, 0.0, 0.0)
@@ -63,9 +65,9 @@ class Jitter:
 class Points:
     """How many tie points there are, where, and what is measured.
 
-    Points lie in the swaths (`Swaths`: `across`, `ends`) and are seen in `min_images` images at least, with
-    `margin_mm` to the edge of the format. Every image that sees a point measures it, unless `mean_rays` says to how
-    many images a point, on average over all points, rays are thinned out by chance.
+    Points lie in the swaths (`Swaths`: `across`, `ends`) or the `Field`, and are seen in `min_images` images at least,
+    with `margin_mm` to the edge of the format. Every image that sees a point measures it, unless `mean_rays` says to
+    how many images a point, on average over all points, rays are thinned out by chance.
     """
 
     ties: int
@@ -80,8 +82,8 @@ class Points:
 class Choice:
     """Targets of a group that play another role: the `outermost` of each arm, the one at the `centre`, the `first`.
 
-    Arms lead from the middle of the block both ways along each direction in which strips are flown. A target is chosen
-    once: the rule that comes to it later takes its next one.
+    Arms lead from the middle of the block both ways along each direction in which strips are flown, or each side of a
+    field. A target is chosen once: the rule that comes to it later takes its next one.
     """
 
     role: Role
@@ -92,10 +94,10 @@ class Choice:
 
 @dataclasses.dataclass(frozen=True)
 class Targets:
-    """Signalised points of one role: `count` of them uniform in the swaths, and those at given places.
+    """Signalised points of one role: `count` of them uniform over the ground, and those at given places.
 
     `at_m` gives (X, Y) or (X, Y, Z) in m; `at` gives places as parts of half the block's length and width, along and
-    to the right of the first strip's heading, from the middle of the block.
+    to the right of the first strip's heading, from the middle of the block; in a field along X and Y.
     """
 
     role: Role
@@ -138,7 +140,7 @@ class Recipe:
     title: str
     sensors: dict[str, Sensor]
     cameras: dict[str, Assumed[InteriorOrientation]]
-    plan: FlightPlan
+    plan: FlightPlan | ConvergentPlan
     points: Points
     stated: Sigmas
     noise: Sigmas
@@ -150,6 +152,13 @@ class Recipe:
     terrain: Terrain = dataclasses.field(default_factory=Terrain)
     start: Approximation = Approximation()
     datum: Datum = dataclasses.field(default_factory=Datum)
+
+    @property
+    def ground(self) -> Swaths | Field:
+        """Where points lie."""
+        if isinstance(self.plan, ConvergentPlan):
+            return self.plan.field
+        return Swaths(self.plan.strips, self.points.across, self.points.ends)
 
     def mount_of(self, camera: str) -> str:
         """The name of a camera's mount: its own, "default", or "" without any."""

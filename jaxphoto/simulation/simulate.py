@@ -11,8 +11,9 @@ from jaxphoto.camera import InteriorOrientation
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import BlockError
 from jaxphoto.georeferencing import Mount, StripBias
+from jaxphoto.simulation.convergent import take_images
+from jaxphoto.simulation.convergent_plan import ConvergentPlan
 from jaxphoto.simulation.flight import Flight, fly, record, turned
-from jaxphoto.simulation.flight_plan import Swaths
 from jaxphoto.simulation.points import Scene, scatter
 from jaxphoto.simulation.recipe import Assumed, Bias, Recipe, Triple, triple
 from jaxphoto.simulation.streams import stream
@@ -40,18 +41,20 @@ class Simulation(NamedTuple):
 
 
 def simulate(recipe: Recipe, seed: int = 0) -> Simulation:
-    """Fly, place points, measure: the block of `recipe` that `seed` draws, bit for bit the same each time.
+    """Fly (or stand), place points, measure: the block of `recipe` that `seed` draws, bit for bit the same each time.
 
     Ground, flight, points and each kind of noise have random streams of their own: a change of a sigma changes neither
     geometry nor the other noise, and scales its own. Raises BlockError where points or images see too little.
     """
     terrain = recipe.terrain.drawn(stream(seed, "terrain"))
-    swaths = Swaths(recipe.plan.strips, recipe.points.across, recipe.points.ends)
     # The same places for every seed: over ground that stays, the flight stays as high.
-    ground = float(np.mean(terrain.height(swaths.draw(stream(0, "ground"), _PLACES))))
-    flight = fly(recipe, ground, seed)
+    height = float(np.mean(terrain.height(recipe.ground.draw(stream(0, "ground"), _PLACES))))
+    if isinstance(recipe.plan, ConvergentPlan):
+        flight = take_images(recipe.plan, recipe.jitter, height, seed)
+    else:
+        flight = fly(recipe, recipe.plan, height, seed)
     scene = _seen(recipe, flight, scatter(recipe, flight, terrain, seed), seed)
-    biases = _true_biases(recipe, seed)
+    biases = _true_biases(recipe, flight, seed)
     truth = Unknowns(
         {name: _numbers(camera.truth) for name, camera in recipe.cameras.items()},
         flight.exterior,
@@ -138,16 +141,16 @@ def _georeferencing(recipe: Recipe, flight: Flight, truth: Unknowns, seed: int) 
     return stations, attitudes
 
 
-def _true_biases(recipe: Recipe, seed: int) -> dict[str, StripBias]:
+def _true_biases(recipe: Recipe, flight: Flight, seed: int) -> dict[str, StripBias]:
     """Shift and drift of every strip that has any; the datum offset is part of the shift."""
     offset, biases = triple(recipe.datum_offset_m), {}
-    for strip in recipe.plan.strips:
-        bias = _bias_of(recipe, strip.name)
+    for strip in dict.fromkeys(flight.strips):
+        bias = _bias_of(recipe, strip)
         if bias is None and not offset.any():
             continue
         bias = bias or Bias(_NO_BIAS)
-        shift, drift = _draw(seed, f"bias of strip {strip.name}", (2, 3))
-        biases[strip.name] = StripBias(
+        shift, drift = _draw(seed, f"bias of strip {strip}", (2, 3))
+        biases[strip] = StripBias(
             np.asarray(bias.truth.shift) + offset + triple(bias.shift_sigma_m) * shift,
             np.asarray(bias.truth.drift) + triple(bias.drift_sigma_m_per_s) * drift,
         )
@@ -167,7 +170,8 @@ def _start(recipe: Recipe, flight: Flight, scene: Scene, control: Rows, seed: in
     points[control.who, control.axis] = control.value
     known = ~np.isnan(points).any(axis=1)
     points[~known] = 0.0
-    modelled = {s.name: bias.model for s in recipe.plan.strips if (bias := _bias_of(recipe, s.name)) and bias.model}
+    strips = dict.fromkeys(flight.strips)
+    modelled = {name: bias.model for name in strips if (bias := _bias_of(recipe, name)) and bias.model}
     start = Unknowns(
         {name: _numbers(camera.start) for name, camera in recipe.cameras.items()},
         exterior,

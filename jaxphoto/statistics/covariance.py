@@ -20,13 +20,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxphoto.adjustment import Adjustment
-from jaxphoto.adjustment.compiled import run_compiled
 from jaxphoto.adjustment.normal import solve_3x3, solve_factored
 from jaxphoto.adjustment.padding import crop_reduced
 from jaxphoto.adjustment.residuals import Increments
 from jaxphoto.adjustment.result import Factored
 from jaxphoto.adjustment.structure import Structure
 from jaxphoto.arrays import Numbers
+from jaxphoto.compiling import run_compiled
 from jaxphoto.rotation import omega_phi_kappa_from_matrix, small_rotation
 
 Rotations = Literal["omega_phi_kappa", "object", "camera"]

@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxphoto.adjustment import Adjustment
-from jaxphoto.adjustment.compiled import run_compiled
 from jaxphoto.adjustment.local import blocks_at
 from jaxphoto.adjustment.normal import solve_factored
 from jaxphoto.adjustment.optimum import zero_increments
@@ -18,6 +17,7 @@ from jaxphoto.adjustment.padding import crop_residuals
 from jaxphoto.adjustment.residuals import Residuals, Values
 from jaxphoto.adjustment.result import Factored
 from jaxphoto.adjustment.structure import Structure
+from jaxphoto.compiling import run_compiled
 from jaxphoto.statistics.covariance import Cofactors, Covariance
 
 LEAST_CHECKED = 0.01

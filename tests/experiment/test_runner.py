@@ -110,7 +110,7 @@ def test_a_variant_replaces_what_it_names_in_the_recipe_and_nothing_else(run):
 
 def test_comparison_holds_every_printed_and_every_own_cell_with_its_judgement(folder, run):
     table = compare(run, folder)
-    expected = "paper table row column published ours unit tolerance within note".split()
+    expected = ["paper", "table", "row", "column", "published", "ours", "unit", "tolerance", "within", "note"]
     assert table.columns.tolist()[:10] == expected
     cell = table.set_index(["table", "row", "column"])
     values = run.cells.set_index(["table", "row", "column"])["value"]

@@ -9,7 +9,7 @@ import pytest
 from jaxphoto.block import Block
 from jaxphoto.errors import BlockError
 from jaxphoto.io import recipe_from
-from jaxphoto.simulation import Choice, Simulation, Swaths, remeasure
+from jaxphoto.simulation import Choice, Simulation, remeasure
 from jaxphoto.simulation.points import _chosen
 from jaxphoto.unknowns import FIXED, FREE
 from tests.blocks import observed
@@ -306,7 +306,7 @@ def test_the_outermost_of_each_arm_and_the_centre():
     xy = simulation.truth.points[40:, :2]
     arms = [np.array([np.sin(a), np.cos(a)]) for a in np.deg2rad([75, 255, 345, 165])]
     # The middle of the block, from where the strips begin and end and how wide they are.
-    low, high = Swaths(recipe_from(changed({})).plan.strips).extent(np.eye(2))
+    low, high = recipe_from(changed({})).ground.extent(np.eye(2))
     chosen = {k for k, role in enumerate(list(roles_of(simulation.block).values())[40:]) if role == "XYZ"}
     assert len(chosen) == 1 + 1 + 4 * 2
     assert {0, int(np.argmin(np.hypot(*(xy - (low + high) / 2).T)))} < chosen
@@ -320,7 +320,7 @@ def test_a_target_at_two_ends_is_chosen_once(seed):
     recipe = recipe_from(changed({"targets": [{"count": 9, "role": "check"}]}))
     choice = Choice("control", outermost=2, centre=True)
     xy = np.random.default_rng(seed).uniform(-500, 500, (9, 2))
-    chosen = _chosen(choice, xy, recipe.plan.strips)
+    chosen = _chosen(choice, xy, recipe.ground)
     assert sorted(chosen) == list(range(9))
 
 

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxphoto.block import Attitudes, Frame, Motion, Rows
+from jaxphoto.compiling import QUICK_TO_COMPILE
 from jaxphoto.errors import BlockError, InputError
 from jaxphoto.georeferencing import Poses, Trajectory, covered, interpolate
 from jaxphoto.georeferencing.trajectory import SHORTEST
@@ -16,7 +17,6 @@ from jaxphoto.io.block_folder.motion import Flight
 from jaxphoto.io.block_folder.settings import Settings
 from jaxphoto.io.trajectory import Records
 from jaxphoto.io.trajectory.time_scales import DAY, LEAP_SECONDS, looks_like, shift_that_fits
-from jaxphoto.orientation.rays import QUICK_TO_COMPILE
 from jaxphoto.rotation import matrix_from_roll_pitch_yaw, quaternion_from_matrix, roll_pitch_yaw_from_matrix
 
 # The spline is given so many records before and after each exposure: what lies further off does not move it.

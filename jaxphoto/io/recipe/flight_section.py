@@ -6,7 +6,7 @@ from typing import NamedTuple
 from jaxphoto.camera import InteriorOrientation, Sensor
 from jaxphoto.georeferencing.mount import ImageX
 from jaxphoto.io.block_folder.section import Section
-from jaxphoto.io.recipe.keys import tables
+from jaxphoto.io.recipe.keys import camera_of, tables
 from jaxphoto.simulation import FlightPlan, Strip, footprint
 
 # Two ways to say each; a strip's own word goes before the flight's.
@@ -57,9 +57,7 @@ def _strips(table: Section, flight: Section, cameras: Mapping[str, Mounted]) -> 
         raise table.error("name", f"a strip cannot be called {name!r}; give it another name")
     if abs(heading) > 360:
         raise table.error("heading_deg", f"{heading:g} is more than a turn; give degrees clockwise from north")
-    camera = table.text("camera", next(iter(cameras)) if len(cameras) == 1 else None)
-    if camera not in cameras:
-        raise table.error("camera", f"there is no table [cameras.{camera}]; use one of {', '.join(cameras)}")
+    camera = camera_of(table, cameras)
     sensor, interior, image_x = cameras[camera]
     c = float(interior.c)
     where, key = _said("height", table, flight)

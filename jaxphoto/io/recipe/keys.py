@@ -1,6 +1,6 @@
 """Kinds of keys that recipes have and block.toml has not."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 from jaxphoto.io.block_folder.section import Section
 from jaxphoto.simulation.recipe import Triple
@@ -13,6 +13,14 @@ def tables(section: Section, key: str) -> list[Section]:
     if not isinstance(values, list) or not all(isinstance(value, dict) for value in values):
         raise section.error(key, f"this is no list of tables; write each as [[{path}]]")
     return [Section(section.file, f"{path}, number {k + 1}", value) for k, value in enumerate(values)]
+
+
+def camera_of(section: Section, cameras: Collection[str]) -> str:
+    """The camera that `section` names, or the only one there is."""
+    camera = section.text("camera", next(iter(cameras)) if len(cameras) == 1 else None)
+    if camera not in cameras:
+        raise section.error("camera", f"there is no table [cameras.{camera}]; use one of {', '.join(cameras)}")
+    return camera
 
 
 def not_negative(section: Section, key: str, default: float | None = None) -> float:
@@ -37,6 +45,16 @@ def flag(section: Section, key: str) -> bool:
     if not isinstance(value, bool):
         raise section.error(key, f"{value!r} is neither true nor false; write one of them")
     return value
+
+
+def one_or_more(section: Section, key: str, default: float | None = None) -> tuple[float, ...]:
+    """A finite number, or a list of some."""
+    value = section.values.get(key)
+    if not isinstance(value, list):
+        return (section.number(key, default),)
+    if not value:
+        raise section.error(key, "the list is empty; give at least one number")
+    return tuple(Section(section.file, section.path, {key: v}).number(key) for v in value)
 
 
 def sigmas(section: Section, key: str, default: Triple | None = None, *, positive: bool = False) -> Triple | None:

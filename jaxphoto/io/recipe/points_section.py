@@ -2,6 +2,8 @@
 
 import dataclasses
 
+import numpy as np
+
 from jaxphoto.errors import InputError
 from jaxphoto.io.block_folder.section import Section
 from jaxphoto.io.recipe.keys import flag, not_negative, places, sigmas, tables, whole
@@ -10,6 +12,8 @@ from jaxphoto.simulation import (
     ROLLING,
     Approximation,
     Choice,
+    ConvergentPlan,
+    FlightPlan,
     Jitter,
     Points,
     RandomWaves,
@@ -21,6 +25,8 @@ from jaxphoto.simulation import (
 from jaxphoto.simulation.recipe import Role
 
 _ZERO = (0.0, 0.0, 0.0)
+# Approximate positions at close range are off by this part of the shortest distance, unless the recipe says otherwise.
+_NEAR = 0.02
 _KINDS = {
     "flat": ("height_m", "roughness_m"),
     "plane": ("height_m", "roughness_m", "slope_east_percent", "slope_north_percent"),
@@ -49,9 +55,9 @@ def read_terrain(section: Section) -> Terrain:
     return dataclasses.replace(ground, waves=tuple(map(_wave, tables(section, "waves"))))
 
 
-def read_points(section: Section) -> Points:
-    """Tie points and what of them is measured."""
-    section.known("ties", "min_images", "mean_rays", "across", "ends", "margin_mm")
+def read_points(section: Section, *, in_swaths: bool) -> Points:
+    """Tie points and what of them is measured; only those `in_swaths` have keys that say how far swaths reach."""
+    section.known("ties", "min_images", "mean_rays", "margin_mm", *(("across", "ends") if in_swaths else ()))
     minimum = section.count("min_images") if "min_images" in section else Points.min_images
     if minimum < 2:
         raise section.error("min_images", "a point in one image has no position; give 2 or more")
@@ -70,7 +76,7 @@ def read_points(section: Section) -> Points:
 
 def read_targets(section: Section) -> Targets:
     """One group of targets."""
-    section.known("role", "prefix", "count", "at_m", "at", "choice")
+    section.known("role", "prefix", "count", "at_m", "at", "grid", "choice")
     prefix = section.text("prefix", Targets.prefix)
     if not prefix or prefix[-1].isdigit() or prefix[0] == "#":
         raise section.error("prefix", f'{prefix!r} does not tell targets apart; use letters, like "T"')
@@ -85,7 +91,7 @@ def read_targets(section: Section) -> Targets:
         prefix=prefix,
         count=whole(section, "count", 0),
         at_m=places(section, "at_m", (2, 3)),
-        at=places(section, "at", (2,)),  # type: ignore[arg-type]
+        at=places(section, "at", (2,)) + _grid(section),  # type: ignore[arg-type]
         choice=choice,
     )
 
@@ -125,11 +131,14 @@ def read_jitter(section: Section) -> Jitter:
     return Jitter(sigmas(section, "position_m") or _ZERO, *numbers)
 
 
-def read_start(section: Section) -> Approximation:
+def read_start(section: Section, plan: FlightPlan | ConvergentPlan) -> Approximation:
     """How far approximate values are off."""
     section.known("position_m", "angle_deg", "points_m")
+    position = Approximation.position_m
+    if isinstance(plan, ConvergentPlan):
+        position = _NEAR * min(station.distance_m for station in plan.stations)
     return Approximation(
-        not_negative(section, "position_m", Approximation.position_m),
+        not_negative(section, "position_m", position),
         not_negative(section, "angle_deg", Approximation.angle_deg),
         not_negative(section, "points_m") if "points_m" in section else None,
     )
@@ -142,6 +151,17 @@ def check_points(top: Section, points: Points, targets: tuple[Targets, ...]) -> 
         raise InputError(
             f"{top.file}, [points] ties: there are {n} points in all; an orientation needs 3, so ask for more"
         )
+
+
+def _grid(section: Section) -> tuple[tuple[float, float], ...]:
+    """The places of `grid = [n, m]`: as many from edge to edge along either side, row by row."""
+    if "grid" not in section:
+        return ()
+    sides = section.values["grid"]
+    if not isinstance(sides, list) or len(sides) != 2 or any(type(n) is not int or n < 2 for n in sides):
+        raise section.error("grid", f"{sides!r} is no grid; give two whole numbers from 2 on, like [7, 5]")
+    x, y = (np.linspace(-1, 1, n).tolist() for n in sides)
+    return tuple((a, b) for b in y for a in x)
 
 
 def _role(section: Section) -> Role:

@@ -18,6 +18,7 @@ from jaxphoto.io.block_folder.camera_section import Camera, read_camera
 from jaxphoto.io.block_folder.mount_sections import read_mounts, read_strips
 from jaxphoto.io.block_folder.section import Section
 from jaxphoto.io.block_folder.settings import read_settings, read_toml
+from jaxphoto.io.recipe.convergent_section import read_convergent
 from jaxphoto.io.recipe.flight_section import Mounted, read_flight
 from jaxphoto.io.recipe.keys import sigmas, tables
 from jaxphoto.io.recipe.points_section import (
@@ -29,11 +30,11 @@ from jaxphoto.io.recipe.points_section import (
     read_targets,
     read_terrain,
 )
-from jaxphoto.simulation import Assumed, Bias, Recipe
+from jaxphoto.simulation import Assumed, Bias, ConvergentPlan, FlightPlan, Recipe
 
 _KEYS = (
-    "title", "cameras", "mounts", "strips", "datum", "truth", "flight", "jitter", "terrain", "points", "targets",
-    "sigmas", "noise", "start",
+    "title", "cameras", "mounts", "strips", "datum", "truth", "flight", "convergent", "jitter", "terrain", "points",
+    "targets", "sigmas", "noise", "start",
 )  # fmt: skip
 _ZERO = (0.0, 0.0, 0.0)
 
@@ -60,14 +61,10 @@ def recipe_from(values: Mapping[str, Any], file: str = "recipe.toml") -> Recipe:
     sensors = {name: camera.sensor for name, camera in settings.cameras.items()}
     mounts = _mounts(top.section("mounts"), settings.mounts, cameras)
     image_x = {n: (mounts.get(n) or mounts.get("default") or _NO_MOUNT).truth.image_x for n in cameras}
-    plan = read_flight(
-        top.section("flight"), {name: Mounted(sensors[name], cameras[name].truth, image_x[name]) for name in cameras}
-    )
-    flown = {strip.camera for strip in plan.strips}
-    for name in cameras:
-        if name not in flown:
-            raise top.section("cameras").error(name, "no strip is flown with this camera; use it or remove it")
-    points, targets = read_points(top.section("points")), tuple(map(read_targets, tables(top, "targets")))
+    plan = _plan(top, {name: Mounted(sensors[name], cameras[name].truth, image_x[name]) for name in cameras})
+    strips = [strip.name for strip in plan.strips] if isinstance(plan, FlightPlan) else []
+    points = read_points(top.section("points"), in_swaths=isinstance(plan, FlightPlan))
+    targets = tuple(map(read_targets, tables(top, "targets")))
     check_points(top, points, targets)
     stated, noise = read_sigmas(top, targets)
     truth = top.section("truth")
@@ -82,16 +79,33 @@ def recipe_from(values: Mapping[str, Any], file: str = "recipe.toml") -> Recipe:
         noise=noise,
         targets=targets,
         mounts=mounts,
-        biases=_biases(top.section("strips"), settings.strips, [strip.name for strip in plan.strips]),
+        biases=_biases(top.section("strips"), settings.strips, strips),
         datum_offset_m=tuple(truth.vector("datum_offset_m").tolist()),
         jitter=read_jitter(top.section("jitter")),
         terrain=read_terrain(top.section("terrain")),
-        start=read_start(top.section("start")),
+        start=read_start(top.section("start"), plan),
         datum=settings.datum,
     )
 
 
 _NO_MOUNT = Assumed(*[Mount(jnp.zeros(3), jnp.zeros(3))] * 3)
+
+
+def _plan(top: Section, cameras: Mapping[str, Mounted]) -> FlightPlan | ConvergentPlan:
+    """The flight or the convergent set; every camera takes part in it."""
+    if ("flight" in top) == ("convergent" in top):
+        raise top.error("", "a recipe has a table [flight] or a table [convergent]; give one of the two")
+    plan: FlightPlan | ConvergentPlan
+    if "flight" in top:
+        plan, images = read_flight(top.section("flight"), cameras), "strip is flown"
+    else:
+        if "strips" in top:
+            raise top.error("strips", "a convergent set has no strips; remove the table")
+        plan, images = read_convergent(top.section("convergent"), list(cameras)), "image is taken"
+    for name in cameras:
+        if name not in plan.cameras:
+            raise top.section("cameras").error(name, f"no {images} with this camera; use it or remove it")
+    return plan
 
 
 def _without_truth(section: Section) -> dict[str, Any]:
