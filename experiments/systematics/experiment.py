@@ -22,7 +22,7 @@ def strips(key: str, truths: Mapping[str, list[float]], parameter: str) -> tuple
     return {"strips": ignored}, {"strips": {strip: table | {parameter: "free"} for strip, table in ignored.items()}}
 
 
-SHIFTS = {"E1": [0.8, -0.6, 1.4], "E2": [-0.7, 0.5, 1.2], "N1": [0.6, 0.9, -1.5], "N2": [-0.9, -0.7, -1.3]}
+SHIFTS = {"E1": [0.8, -0.6, 2.0], "E2": [-0.7, 0.5, 1.8], "N1": [0.6, 0.9, -2.2], "N2": [-0.9, -0.7, -2.4]}
 DRIFTS = {"E1": [0.03, -0.02, 0.03], "E2": [0.02, 0.03, -0.03], "N1": [-0.03, 0.02, 0.03], "N2": [0.03, -0.02, 0.04]}
 OFFSET = {"truth": {"datum_offset_m": [-0.6, 0.5, 0.9]}}
 ERRORS = {

@@ -14,14 +14,16 @@ from jaxphoto.experiment import (
     find_experiments,
     load_experiment,
     run_experiment,
-    write_run,
+    write_runs,
 )
 
 
 @app.command("experiment")
 def experiment_command(
     name: Annotated[str, typer.Argument(help="Folder of the experiment (000, 003, 004), or all.")],
-    out: Annotated[Path, typer.Option(help="Folder for the results, one sub-folder an experiment.")] = Path("results"),
+    out: Annotated[Path, typer.Option(help="Folder for the results; an earlier run in it is replaced.")] = Path(
+        "results"
+    ),
     experiments: Annotated[Path, typer.Option(help="Folder that holds the experiments.")] = Path("experiments"),
     layouts: Annotated[
         int | None, typer.Option(min=1, help="Simulated layouts; the experiment's own number if not given.")
@@ -29,19 +31,19 @@ def experiment_command(
 ) -> None:
     """Run experiments; write tables.csv and report.html, ours beside what the paper prints."""
     chosen = find_experiments(experiments, name)
-    for folder in chosen:
-        check_run_target(out / folder.name)
+    check_run_target(out)
+    declared = {folder: load_experiment(folder) for folder in chosen}
     console, errors = Console(), Console(stderr=True)
-    for folder in chosen:
-        experiment = load_experiment(folder)
+    runs = {}
+    for folder, experiment in declared.items():
         with errors.status(folder.name) as status:
-            run = run_experiment(experiment, folder, layouts, status.update)
-        write_run(run, folder, out / folder.name)
-        table = compare(run, folder)
-        console.print(_judgement(experiment.title, table))
-        for failure in run.failures:
+            runs[folder] = run_experiment(experiment, folder, layouts, status.update)
+        # After each, so that an experiment that fails loses none before it.
+        write_runs(runs, out)
+        console.print(_judgement(experiment.title, compare(runs[folder], folder)))
+        for failure in runs[folder].failures:
             console.print(f"left out: {failure}", highlight=False)
-        console.print(f"results in {out / folder.name} (open report.html)", highlight=False)
+    console.print(f"results in {out} (open report.html)", highlight=False)
 
 
 def _judgement(title: str, table) -> Table:

@@ -3,12 +3,15 @@
 import importlib.util
 import shutil
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
+
+import pandas as pd
 
 from jaxphoto.errors import InputError
 from jaxphoto.experiment.comparison import compare
 from jaxphoto.experiment.declaration import Experiment
-from jaxphoto.experiment.page import experiment_page
+from jaxphoto.experiment.page import experiment_page, index_page
 from jaxphoto.experiment.runner import Run
 
 FILE = "experiment.py"
@@ -46,20 +49,30 @@ def load_experiment(folder: Path) -> Experiment:
     return experiment
 
 
-def write_run(run: Run, folder: Path, out: Path) -> None:
-    """tables.csv, cells.csv (every layout) and report.html in `out`, made whole and then moved into place.
+def write_runs(runs: Mapping[Path, Run], out: Path) -> None:
+    """tables.csv, cells.csv (every layout) and report.html of the `runs` of some experiment folders, in `out`.
 
-    `folder` is the experiment's. Raises InputError where `out` holds something else than an earlier run.
+    Several experiments have a page each, to which report.html leads. All is made whole and then moved into place.
+    Raises InputError where `out` holds something else than an earlier run.
     """
     check_run_target(out)
     out.parent.mkdir(parents=True, exist_ok=True)
+    tables = {folder: compare(run, folder) for folder, run in runs.items()}
+    only = len(runs) == 1
+    pages = {
+        "report.html" if only else f"{folder.name}.html": experiment_page(run, tables[folder])
+        for folder, run in runs.items()
+    }
+    if not only:
+        pages["report.html"] = index_page({f.name: (run.experiment.title, tables[f]) for f, run in runs.items()})
+    cells = [run.cells.assign(experiment=folder.name) for folder, run in runs.items()]
     with tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as place:
         made = Path(place) / "run"
         made.mkdir()
-        table = compare(run, folder)
-        table.to_csv(made / "tables.csv", index=False)
-        run.cells.to_csv(made / "cells.csv", index=False)
-        (made / "report.html").write_text(experiment_page(run, table), encoding="utf-8")
+        pd.concat(tables.values(), ignore_index=True).to_csv(made / "tables.csv", index=False)
+        pd.concat(cells, ignore_index=True).to_csv(made / "cells.csv", index=False)
+        for name, page in pages.items():
+            (made / name).write_text(page, encoding="utf-8")
         if out.exists():
             shutil.move(out, Path(place) / "old")
         made.rename(out)

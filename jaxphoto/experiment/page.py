@@ -2,6 +2,7 @@
 
 import base64
 import io
+from collections.abc import Mapping
 
 import numpy as np
 import pandas as pd
@@ -50,6 +51,29 @@ Small numbers at cells and headings refer to the notes below the table.</p>
 {% if check %}<h2>Check points of the first layout</h2><img alt="discrepancies at check points" src="{{ check }}">{% endif %}
 </body></html>
 """
+
+
+_INDEX = """<!DOCTYPE html>
+<html lang="en"><head><meta charset="utf-8"><title>Experiments</title><style>{{ style }}</style></head><body>
+<h1>Experiments</h1>
+<table><tr><th>experiment</th><th>within</th><th>of the values promised</th></tr>
+{% for row in rows %}<tr><td><a href="{{ row.name }}.html">{{ row.title }}</a></td><td>{{ row.good }}</td><td>{{ row.judged }}</td></tr>
+{% endfor %}</table></body></html>
+"""
+
+
+def index_page(experiments: Mapping[str, tuple[str, pd.DataFrame]]) -> str:
+    """A page that leads to those of several experiments: name -> title and comparison."""
+    rows = [
+        {
+            "name": name,
+            "title": title,
+            "good": int((t["within"] == "yes").sum()),
+            "judged": int((t["within"] != "").sum()),
+        }
+        for name, (title, t) in experiments.items()
+    ]
+    return Environment(autoescape=True).from_string(_INDEX).render(style=STYLE, rows=rows)
 
 
 def experiment_page(run: Run, comparison: pd.DataFrame) -> str:

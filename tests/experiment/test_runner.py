@@ -1,7 +1,5 @@
 """Experiments: what is run is what was declared, and what is written is what was run."""
 
-import json
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -10,7 +8,7 @@ from typer.testing import CliRunner
 import jaxphoto
 from jaxphoto.cli import app
 from jaxphoto.errors import InputError
-from jaxphoto.experiment import compare, find_experiments, load_experiment, run_experiment, simulated, write_run
+from jaxphoto.experiment import compare, find_experiments, load_experiment, run_experiment, simulated, write_runs
 from jaxphoto.variants import vertical_control
 
 RECIPE = """
@@ -131,7 +129,7 @@ def test_comparison_holds_every_printed_and_every_own_cell_with_its_judgement(fo
 
 def test_a_run_is_written_whole_and_read_back(folder, run, tmp_path):
     out = tmp_path / "out"
-    write_run(run, folder, out)
+    write_runs({folder: run}, out)
     pd.testing.assert_frame_equal(
         pd.read_csv(out / "tables.csv", dtype={"row": str}, keep_default_na=False, na_values=[""])[
             ["ours", "published"]
@@ -141,12 +139,25 @@ def test_a_run_is_written_whole_and_read_back(folder, run, tmp_path):
     assert len(pd.read_csv(out / "cells.csv")) == len(run.cells)
     page = (out / "report.html").read_text()
     assert "far off" in page and "34.25" in page and "data:image/png" in page
-    write_run(run, folder, out)  # an earlier run is replaced
+    write_runs({folder: run}, out)  # an earlier run is replaced
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").write_text("x")
     with pytest.raises(InputError, match="holds no earlier run"):
-        write_run(run, folder, tmp_path / "mine")
+        write_runs({folder: run}, tmp_path / "mine")
     assert (tmp_path / "mine" / "thesis.tex").read_text() == "x"
+
+
+def test_several_experiments_share_the_tables_and_have_a_page_each(folder, run, tmp_path):
+    other = tmp_path / "other"
+    other.mkdir()
+    write_runs({folder: run, other: run}, tmp_path / "out")
+    table, cells = (pd.read_csv(tmp_path / "out" / name) for name in ("tables.csv", "cells.csv"))
+    assert len(table) == len(compare(run, folder)) + len(compare(run, other))
+    assert cells["experiment"].value_counts().to_dict() == {"small": len(run.cells), "other": len(run.cells)}
+    index = (tmp_path / "out" / "report.html").read_text()
+    for name in ("small", "other"):
+        assert f'href="{name}.html"' in index
+        assert "data:image/png" in (tmp_path / "out" / f"{name}.html").read_text()
 
 
 def test_layouts_that_cannot_be_made_are_left_out_and_told_of(folder, tmp_path):
@@ -165,7 +176,7 @@ def test_layouts_that_cannot_be_made_are_left_out_and_told_of(folder, tmp_path):
     run = run_experiment(load_experiment(broken), broken, layouts=2)
     assert len(run.failures) == 1 and "layout 1" in run.failures[0] and "not this one" in run.failures[0]
     assert run.cells["layout"].unique().tolist() == [0]
-    assert "left out" in (write_run(run, broken, tmp_path / "o"), (tmp_path / "o" / "report.html").read_text())[1]
+    assert "left out" in (write_runs({broken: run}, tmp_path / "o"), (tmp_path / "o" / "report.html").read_text())[1]
 
 
 def first_coordinate(folder) -> float:
@@ -207,9 +218,18 @@ def test_published_tables_that_cannot_be_are_refused(text, message, run, tmp_pat
 
 
 def test_the_command_runs_a_users_own_experiments(folder, tmp_path):
-    arguments = ["experiment", "all", "--experiments", str(folder.parent), "--layouts", "1", "--out", str(tmp_path)]
+    arguments = [
+        "experiment",
+        "all",
+        "--experiments",
+        str(folder.parent),
+        "--layouts",
+        "1",
+        "--out",
+        str(tmp_path / "out"),
+    ]
     done = CliRunner().invoke(app, arguments)
     assert done.exit_code == 0, done.output
-    table = pd.read_csv(tmp_path / "small" / "tables.csv")
+    table = pd.read_csv(tmp_path / "out" / "tables.csv")
     assert table["n_layouts"].max() == 1
-    assert json.dumps(str(tmp_path / "small"))[1:-1] in done.output.replace("\n", "")
+    assert str(tmp_path / "out") in done.output.replace("\n", "")
