@@ -109,6 +109,11 @@ def map_system(code: int) -> CRS:
     return system
 
 
+def check_heights(code: int, vertical: int) -> None:
+    """Raise InputError where heights of the EPSG system `vertical` cannot be brought to the ellipsoid of `code`."""
+    _to_place(code, vertical)
+
+
 @functools.cache
 def _to_place(code: int, vertical: int | None) -> Transformer:
     """From map coordinates to longitude, latitude and ellipsoidal height of the same datum."""
@@ -121,7 +126,7 @@ def _to_place(code: int, vertical: int | None) -> Transformer:
         heights = CRS.from_epsg(vertical)
     except CRSError:
         raise InputError(
-            f'the EPSG code {vertical} of vertical is unknown; correct it or write "ellipsoidal"'
+            f'the EPSG code {vertical} is unknown; correct it or write "ellipsoidal"'
         ) from None
     if not heights.is_vertical:
         raise InputError(

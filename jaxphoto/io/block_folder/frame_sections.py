@@ -5,7 +5,7 @@ from typing import Any
 from jaxphoto.block import Frame
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import Corrections
-from jaxphoto.georeferencing.map_frame import map_system
+from jaxphoto.georeferencing.map_frame import check_heights, map_system
 from jaxphoto.io.block_folder.section import Section
 
 _KINDS = ("local", "enu", "grid", "epsg")
@@ -34,6 +34,10 @@ def read_frame(section: Section) -> Frame:
                 "of their system (5773 for EGM96)",
             )
         vertical = section.count("vertical")
+        try:
+            check_heights(code, vertical)
+        except InputError as error:
+            raise section.error("vertical", str(error)) from None
     yaw = section.text("yaw", "true")
     if yaw not in ("true", "grid"):
         raise section.error("yaw", f'{yaw!r} is no north; write "true" or "grid"')
