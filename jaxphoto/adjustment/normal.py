@@ -26,6 +26,15 @@ from jaxtyping import Array, Float
 from jaxphoto.adjustment.colouring import Jacobian
 from jaxphoto.adjustment.residuals import Increments, Residuals
 from jaxphoto.adjustment.structure import Structure
+from jaxphoto.adjustment.sums import (
+    image_products,
+    met_by_image,
+    pair_sums,
+    products,
+    shared_point_sums,
+    shared_sums,
+    with_zero_row,
+)
 
 
 class Normal(NamedTuple):
@@ -62,19 +71,19 @@ def sum_normal(jacobian: Jacobian, residuals: Residuals, datum: tuple[Array, Arr
     station_rows = jnp.concatenate([j.station_eop, j.station_shared, r.stations[None]])[:, None]
     attitude_rows = jnp.concatenate([j.attitude_eop, j.attitude_shared, r.attitudes[None]])
     m = (
-        _image_products(image_rows, s)
-        + _products(station_rows, s.station_image, s.n_images)
-        + _products(attitude_rows, s.attitude_image, s.n_images)
+        image_products(image_rows, s)
+        + products(station_rows, s.station_image, s.n_images)
+        + products(attitude_rows, s.attitude_image, s.n_images)
     )
-    us, uss, b_s = _shared_sums(m, s)
+    us, uss, b_s = shared_sums(m, s)
     uss = uss.at[s.weighted, s.weighted].add(j.priors**2)
     b_s = b_s.at[s.weighted].add(j.priors * r.priors)
 
     point_rows = jnp.concatenate([j.image_point, r.image[None]])
-    vp = _products(point_rows, s.point, s.n_points, is_sorted=True)
-    vp = vp + _products(jnp.concatenate([j.control, r.control[None]])[:, None], s.control_point, s.n_points)
+    vp = products(point_rows, s.point, s.n_points, is_sorted=True)
+    vp = vp + products(jnp.concatenate([j.control, r.control[None]])[:, None], s.control_point, s.n_points)
     vp = vp.transpose(1, 2, 0)
-    ws = _shared_point_sums(jnp.einsum("qon,bon->nqb", j.image_shared, j.image_point), s)
+    ws = shared_point_sums(jnp.einsum("qon,bon->nqb", j.image_shared, j.image_point), s)
 
     each = jnp.arange(len(s.distance_points))
     spans = jnp.zeros((len(s.distance_points), 3, s.n_points))
@@ -140,8 +149,8 @@ def reduce_normal(normal: Normal, damping, structure: Structure) -> Reduced:
     y = _whiten(n.w, l[:, s.point])
     ys, yd = _whiten(n.ws, l), _whiten(n.rows_p, l)
 
-    rows = _with_zero_row(y)
-    blocks = -_pair_sums(rows, s)
+    rows = with_zero_row(y)
+    blocks = -pair_sums(rows, s)
     see = jnp.zeros((s.n_images, 6, s.n_images, 6))
     see = see.at[s.block_row, :, s.block_column, :].set(blocks, unique_indices=True)
     each = jnp.arange(s.n_images)
@@ -149,7 +158,7 @@ def reduce_normal(normal: Normal, damping, structure: Structure) -> Reduced:
 
     # What meets an image through its points: shared unknowns and mu.
     across = jnp.concatenate([ys, yd])
-    met = _met(rows, across, s)
+    met = met_by_image(rows, across, s)
     own = jnp.einsum("akp,bkp->ab", across, across)
     q, k, size = s.n_shared, len(yd), 6 * s.n_images
     se = (n.us - met[:, :, :q]).reshape(size, q)
@@ -197,95 +206,6 @@ def solve_3x3(l: Float[Array, "6 points"], b: Float[Array, "3 points"]) -> Float
     x3 = y3 / l33
     x2 = (y2 - l32 * x3) / l22
     return jnp.stack([(y1 - l21 * x2 - l31 * x3) / l11, x2, x3])
-
-
-def _products(rows: Float[Array, "m c n"], owner, n_owners: int, is_sorted: bool = False):
-    """Sum over rows and components of the outer products of `rows`, by owner: (owners, m, m)."""
-    product = jnp.einsum("aon,bon->nab", rows, rows)
-    m = len(rows)
-    sums = jax.ops.segment_sum(product.reshape(-1, m * m), owner, n_owners, indices_are_sorted=is_sorted)
-    return sums.reshape(n_owners, m, m)
-
-
-def _take_rows(table, index):
-    return table.at[index].get(mode="promise_in_bounds")
-
-
-def _with_zero_row(m: Float[Array, "m c n"]) -> Float[Array, "n+1 c*m"]:
-    """Row by row, components before columns, and a row of zeros for padding."""
-    flat = m.transpose(2, 1, 0).reshape(m.shape[2], -1)
-    return jnp.concatenate([flat, jnp.zeros((1, flat.shape[1]))])
-
-
-# So many numbers, at most, are gathered at a time: they stay in the cache of a core, and memory stays small.
-_PIECE = 1 << 20
-
-
-def _piecewise(function, lists, numbers: int):
-    """`function` of each entry of `lists`, as many at a time as the cache holds, `numbers` gathered by each."""
-    size = min(len(jax.tree.leaves(lists)[0]), max(1, _PIECE // max(numbers, 1)))
-    return jax.lax.map(function, lists, batch_size=size)
-
-
-def _image_products(rows: Float[Array, "m c n"], s: Structure) -> Float[Array, "images m m"]:
-    """Sum of the outer products of image rows, by image: one product of matrices each."""
-    table, m = _with_zero_row(rows), len(rows)
-
-    def one(index):
-        own = _take_rows(table, index).reshape(-1, m)
-        return own.T @ own
-
-    return _piecewise(one, s.image_rows, s.image_rows.shape[1] * table.shape[1])
-
-
-def _met(rows, across: Float[Array, "c 3 points"], s: Structure) -> Float[Array, "images 6 c"]:
-    """Sum of Y across' over the points of an image."""
-    c = len(across)
-    if not c:
-        return jnp.zeros((s.n_images, 6, 0))
-    table = across.transpose(2, 1, 0).reshape(-1, 3 * c)
-
-    def one(index):
-        return _take_rows(rows, index[0]).reshape(-1, 6).T @ _take_rows(table, index[1]).reshape(-1, c)
-
-    return _piecewise(one, (s.image_rows, s.image_points), s.image_rows.shape[1] * 3 * (6 + c))
-
-
-def _pair_sums(rows: Float[Array, "n+1 18"], s: Structure) -> Float[Array, "blocks 6 6"]:
-    """Sum over common points of Y_a Y_b', by pair of images: products of chunks of points, then their sum."""
-
-    def one(index):
-        return _take_rows(rows, index[0]).reshape(-1, 6).T @ _take_rows(rows, index[1]).reshape(-1, 6)
-
-    products = _piecewise(one, (s.chunk_a, s.chunk_b), 36 * s.chunk_a.shape[1]).reshape(-1, 36)
-    sums = jax.ops.segment_sum(
-        products, s.chunk_block, len(s.block_row), indices_are_sorted=True, mode="promise_in_bounds"
-    )
-    return sums.reshape(-1, 6, 6)
-
-
-def _shared_sums(m: Float[Array, "images m m"], s: Structure):
-    """Per-image sums by colour, brought to the columns of the shared unknowns (a dummy column is cut off)."""
-    q, n = s.n_colours, s.n_shared
-    each = jnp.arange(s.n_images)
-    us = jnp.zeros((s.n_images, 6, n + 1)).at[each[:, None], :, s.column].add(m[:, :6, 6 : 6 + q].transpose(0, 2, 1))
-    uss = jnp.zeros((n + 1, n + 1)).at[s.column[:, :, None], s.column[:, None, :]].add(m[:, 6 : 6 + q, 6 : 6 + q])
-    b_s = jnp.zeros(n + 1).at[s.column].add(m[:, 6 : 6 + q, -1])
-    return us[:, :, :n], uss[:n, :n], b_s[:n]
-
-
-def _shared_point_sums(product: Float[Array, "rows colours 3"], s: Structure) -> Float[Array, "shared 3 points"]:
-    q, n = s.n_image_colours, s.n_shared
-    if not q:
-        return jnp.zeros((n, 3, s.n_points))
-    if len(s.groups) == 1 and len(s.groups[0].names) == 1:
-        # One camera: a colour means the same unknown in every image, so a sorted sum over points will do.
-        sums = jax.ops.segment_sum(product.reshape(-1, 3 * q), s.point, s.n_points, indices_are_sorted=True)
-        sums = sums.reshape(s.n_points, q, 3).transpose(1, 2, 0)
-        return jnp.concatenate([sums, jnp.zeros((n - q, 3, s.n_points))])
-    columns = s.column[s.image][:, :q]
-    sums = jnp.zeros((n + 1, s.n_points, 3)).at[columns, s.point[:, None]].add(product)
-    return sums[:n].transpose(0, 2, 1)
 
 
 def _cholesky_3x3(v: Float[Array, "3 3 points"]) -> Float[Array, "6 points"]:

@@ -12,8 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxphoto.adjustment.lists import chunks_of, rows_by_image
 from jaxphoto.adjustment.residuals import Residuals, State, Values
-from jaxphoto.adjustment.structure import CameraGroup, Structure, chunks_of, rows_by_image
+from jaxphoto.adjustment.structure import CameraGroup, Structure
 
 
 class Sizes(NamedTuple):

@@ -69,8 +69,10 @@ def _check_mounts(block: Block, priors: Unknowns, with_station: set[int], with_a
 
 
 def _check_strips(block: Block, priors: Unknowns, with_station: set[int]) -> None:
+    times = np.asarray(block.image_time)
     for name, prior in priors.strips.items():
-        n = len(_images_of(name, block.image_strip) & with_station)
+        images = sorted(_images_of(name, block.image_strip) & with_station)
+        n = len(images)
         for what, least in (("shift", 1), ("drift", 2)):
             if getattr(prior, what) is FREE and n < least:
                 found = "one image with an observed station" if n else "no image with an observed station"
@@ -78,6 +80,11 @@ def _check_strips(block: Block, priors: Unknowns, with_station: set[int]) -> Non
                     f"strips[{name}].{what} is free, but the strip has {found}: hold the {what} of strip {name} fixed, "
                     f"or add stations of {least} of its images or more"
                 )
+        if prior.drift is FREE and np.ptp(times[images]) == 0:
+            raise RankError(
+                f"strips[{name}].drift is free, but all images of the strip with an observed station have one time: "
+                f"give the times of their exposures, or hold the drift of strip {name} fixed"
+            )
 
 
 def _check_shifts(block: Block, priors: Unknowns, with_station: set[int]) -> None:

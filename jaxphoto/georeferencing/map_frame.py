@@ -125,9 +125,7 @@ def _to_place(code: int, vertical: int | None) -> Transformer:
     try:
         heights = CRS.from_epsg(vertical)
     except CRSError:
-        raise InputError(
-            f'the EPSG code {vertical} is unknown; correct it or write "ellipsoidal"'
-        ) from None
+        raise InputError(f'the EPSG code {vertical} is unknown; correct it or write "ellipsoidal"') from None
     if not heights.is_vertical:
         raise InputError(
             f"EPSG:{vertical} ({heights.name}) is no system of heights; give the code of one (5773 is EGM96) or "

@@ -43,7 +43,7 @@ def residuals_figure(tables: Tables, camera: str) -> Figure:
     figure = Figure(figsize=(6.4, 5.0), dpi=_DPI, layout="constrained")
     axes = figure.subplots()
     key = _round_key(v)
-    _vectors(axes, xy, v, key, 0.06 * sensor.width_mm, f"{1000 * key:g} µm", width=0.0015)
+    _vectors(axes, xy, v, key, 0.06 * sensor.width_mm, f"{1000 * key:g} µm", width=0.0015, above=0.03)
     w, h = sensor.width_mm / 2, sensor.height_mm / 2
     axes.plot([-w, w, w, -w, -w], [-h, -h, h, h, -h], color="0.4", lw=0.8)
     axes.set(xlabel="x [mm]", ylabel="y [mm]", title=f"image residuals of camera {camera}")
@@ -74,7 +74,7 @@ def check_points_figure(adjustments: Mapping[str, Tables]) -> Figure:
             surveyed = np.isfinite(v).all(axis=0)
             axes.plot(*stations, "+", ms=6, color="0.75")
             axes.plot(*at[:, surveyed], ".", ms=4, color="tab:green")
-            _vectors(axes, at[:, surveyed], v[:, surveyed], key, length, f"{key:g} m", width=0.003)
+            _vectors(axes, at[:, surveyed], v[:, surveyed], key, length, f"{key:g} m", width=0.003, above=0.12 / high)
             axes.set(xlabel="X [m]", ylabel="Y [m]")
             axes.set_title(f"{name}: {what}" if name else what, loc="left", fontsize=10)
             axes.set_aspect("equal", adjustable="datalim")
@@ -108,7 +108,11 @@ def _round_key(v: np.ndarray) -> float:
     return float(f"{3 * max(rms, 1e-12):.0e}")
 
 
-def _vectors(axes: Axes, at: np.ndarray, v: np.ndarray, key: float, length: float, label: str, *, width: float) -> None:
-    """Arrows `v` at `at` (both 2 x n), with a key: one of size `key`, which is `length` long, and its `label`."""
+def _vectors(
+    axes: Axes, at: np.ndarray, v: np.ndarray, key: float, length: float, label: str, *, width: float, above: float
+) -> None:
+    """Arrows `v` at `at` (both 2 x n); in the key, `above` the axes, one of size `key`, `length` long, and its `label`."""
     arrows = axes.quiver(*at, *v, angles="xy", scale_units="xy", scale=key / length, width=width, color="tab:blue")
-    axes.quiverkey(arrows, 0.85, 1.03, key, label, labelpos="E")
+    axes.quiverkey(arrows, 0.85, 1 + above, key, label, labelpos="E")
+    axes.update_datalim((at + v * length / key).T)
+    axes.autoscale_view()

@@ -33,6 +33,10 @@ def without_stations(block):
     return dataclasses.replace(block, stations=Rows.none())
 
 
+def at_one_time(block):
+    return dataclasses.replace(block, image_time=np.full(len(block.images), 5.0))
+
+
 def moving(block):
     n = len(block.images)
     return dataclasses.replace(block, motion=Motion(np.ones((n, 3)), np.zeros((n, 3))))
@@ -59,6 +63,11 @@ NO_CONTROL = {"control": Rows.none(), "fixed": Rows.none()}
     [
         (lambda: lone({"shift": FREE, "drift": FREE}), RankError, ["strips[c].drift", "one image", "strip c fixed"]),
         (lambda: lone({"shift": FIXED, "drift": FREE}), RankError, ["strips[c].drift", "one image"]),
+        (
+            lambda: at_one_time(with_strips(a=StripBias(FREE, FREE))),
+            RankError,
+            ["strips[a].drift", "one time", "give the times"],
+        ),
         (
             lambda: without_stations(with_strips(a=StripBias(FREE, FIXED))),
             RankError,
@@ -90,7 +99,7 @@ NO_CONTROL = {"control": Rows.none(), "fixed": Rows.none()}
             ["strips a, b", "no control", "add control points"],
         ),
     ],
-    ids=["drift", "drift-alone", "shift", "boresight", "lever-arm", "motion", "time-offset", "shifts"],
+    ids=["drift", "drift-alone", "drift-at-once", "shift", "boresight", "lever-arm", "motion", "time-offset", "shifts"],
 )
 def test_what_cannot_be_seen_is_named_before_anything_is_compiled(make, error, words, monkeypatch):
     monkeypatch.setattr("jaxphoto.adjustment.adjust.structure_of", None)

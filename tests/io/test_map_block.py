@@ -134,11 +134,14 @@ REFUSED = {
     "no code": ([("code = 32722\n", "")], ["[frame] code", "missing", "add it"]),
     "feet": ([("32722", "2227")], ["[frame] code", "US survey foot", "convert"]),
     "no vertical": ([('vertical = "ellipsoidal"', "")], ["[frame] vertical", "ellipsoidal", "5773"]),
+    "unknown vertical": ([('"ellipsoidal"', "99999")], ["block.toml, [frame] vertical", "99999 is unknown"]),
+    "no heights": ([('"ellipsoidal"', "4326")], ["block.toml, [frame] vertical", "no system of heights"]),
     "vertical": ([('"ellipsoidal"', '"geoid"')], ["[frame] vertical", "geoid", "give one"]),
     "yaw": ([(EPSG, EPSG + '\nyaw = "map"')], ["[frame] yaw", "'map'", '"grid"']),
     "grid of degrees": ([("32722", "4326"), (EPSG[-13:], EPSG[-13:] + '\nyaw = "grid"')], ["no grid", '"true"']),
     "origin": ([(EPSG, EPSG + "\norigin = [580000, 7220000, 0]")], ["[frame] origin", "degrees"]),
-    "area": ([("32722", "2056")], ["(580002.5, 7220002.0)", "outside the area of EPSG:2056", "correct the code"]),
+    "far origin": ([(EPSG, EPSG + "\norigin = [10, 52, 0]")], ["[frame] origin", "km from the block", "(-50.2"]),
+    "area": ([("32722", "2056")], ["images.csv: the coord", "(580005.0, 7220000.0)", "outside the area of EPSG:2056", "correct"]),
     "curvature": ([("[sigmas]", "[corrections]\ncurvature = true\n[sigmas]")], ["curvature", "Cartesian", "remove"]),
     "sea": ([("[sigmas]", "[corrections]\nrefraction = true\nsea_level_m = 1\n[sigmas]")], ["sea_level_m", "remove"]),
 }  # fmt: skip
@@ -157,6 +160,15 @@ def test_bad_frames_are_refused(write_folder, name):
         read_block(folder)
     for word in words:
         assert word in str(caught.value), str(caught.value)
+
+
+@pytest.mark.parametrize("origin", ["", "\norigin = [-50.0, -25.0, 0.0]"])
+def test_one_table_outside_the_area_is_named(write_folder, origin):
+    folder = to_utm(write_folder(), EPSG + origin)
+    table = pd.read_csv(folder / "stations.csv")
+    table.assign(X_m=table["Y_m"], Y_m=table["X_m"]).to_csv(folder / "stations.csv", index=False)
+    with pytest.raises(InputError, match=r"^stations.csv: the coordinates.* outside the area of EPSG:32722"):
+        read_block(folder)
 
 
 def test_what_a_conversion_needs_is_asked_for(write_folder):

@@ -74,33 +74,44 @@ def origin_of(
 ) -> tuple[float, float, float] | None:
     """A round place amid the coordinates of the tables, or of the trajectory, height zero; None where there are none.
 
-    Raises InputError where they are not in the area of the system.
+    Raises InputError where those of one file are not in the area of the system.
     """
     assert frame.code is not None
     # Places do not depend on the origin, which is not known yet.
     system, names = MapFrame(frame.code, frame.vertical, (0.0, 0.0, 0.0)), coordinate_names(frame)
-    placed = [tables[name] for name in _PLACED if all(column in tables[name] for column in names)]
-    given = [np.stack([table.numbers(column, empty=True) for column in names], axis=1) for table in placed]
-    values = np.concatenate([np.zeros((0, 3)), *given])
-    values = values[~np.isnan(values).any(axis=1)]
-    places = system.place(values)
-    if not len(values) and trajectory is not None:
+    placed = []
+    for table in (tables[name] for name in _PLACED if all(column in tables[name] for column in names)):
+        values = np.stack([table.numbers(column, empty=True) for column in names], axis=1)
+        values = values[~np.isnan(values).any(axis=1)]
+        placed.append((table.file, values, system.place(values)))
+    if trajectory is not None:
         values = trajectory.coordinates
-        places = values if trajectory.geographic else system.place(values)
-    if not len(values):
+        placed.append((trajectory.file, values, values if trajectory.geographic else system.place(values)))
+    for file, values, places in placed:
+        if len(values):
+            _check_area(file, np.median(values, axis=0), np.median(places, axis=0), frame)
+    of_tables = [places for _, _, places in (placed if trajectory is None else placed[:-1]) if len(places)]
+    places = np.concatenate(of_tables or [places for _, _, places in placed] or [np.zeros((0, 3))])
+    if not len(places):
         return None
     longitude, latitude, _ = np.median(places, axis=0)
-    area = map_system(frame.code).area_of_use
-    if area is not None:
-        west, south, east, north = area.bounds
-        outside = west <= east and not west - _BEYOND <= longitude <= east + _BEYOND
-        if outside or not south - _BEYOND <= latitude <= north + _BEYOND or not np.isfinite(longitude):
-            about = ", ".join(f"{value:.1f}" for value in np.median(values, axis=0)[:2])
-            raise InputError(
-                f"the coordinates, about ({about}), lie outside the area of EPSG:{frame.code} ({area.name}); correct "
-                f"the code, or the coordinates ({names[0]} is east, {names[1]} north)"
-            )
     return round(float(longitude), 4), round(float(latitude), 4), 0.0
+
+
+def _check_area(file: str, coordinates: np.ndarray, place: np.ndarray, frame: Frame) -> None:
+    """Raise InputError where the middle of a file's `coordinates`, at `place`, is not in the area of the system."""
+    assert frame.code is not None
+    area, names, (longitude, latitude, _) = map_system(frame.code).area_of_use, coordinate_names(frame), place
+    if area is None:
+        return
+    west, south, east, north = area.bounds
+    outside = west <= east and not west - _BEYOND <= longitude <= east + _BEYOND
+    if outside or not south - _BEYOND <= latitude <= north + _BEYOND or not np.isfinite(longitude):
+        about = ", ".join(f"{value:.1f}" for value in coordinates[:2])
+        raise InputError(
+            f"{file}: the coordinates, about ({about}), lie outside the area of EPSG:{frame.code} ({area.name}); "
+            f"correct the code, or the coordinates ({names[0]} is east, {names[1]} north)"
+        )
 
 
 def _numbers(table: Table, names: dict[str, str]) -> pd.DataFrame:

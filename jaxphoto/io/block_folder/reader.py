@@ -33,6 +33,9 @@ from jaxphoto.io.trajectory import Records, read_records
 from jaxphoto.unknowns import Unknowns, default_priors
 from jaxphoto.variants import MODES
 
+# The vertical so far from the origin of the local frame is tilted by 3 degrees: what is given is not the block's.
+_FAR_M = 3e5
+
 
 @dataclasses.dataclass(frozen=True)
 class BlockTables:
@@ -147,15 +150,25 @@ def assemble(source: BlockTables) -> Block:
 
 def _located(frame: Frame, tables: Mapping[str, Table], source: BlockTables) -> Frame:
     """The frame with an origin: what block.toml gives, else a place amid the block."""
-    if frame.kind != "epsg" or frame.origin is not None:
+    if frame.kind != "epsg":
         return frame
-    origin = origin_of(tables, frame, source.trajectory)
+    amid = origin_of(tables, frame, source.trajectory)
+    origin = amid if frame.origin is None else frame.origin
     if origin is None:
         raise InputError(
             f"{source.file}, [frame]: no coordinate tells where the block lies; add "
             "origin = [longitude, latitude, height] in degrees and metres"
         )
-    return dataclasses.replace(frame, origin=origin)
+    located = dataclasses.replace(frame, origin=origin)
+    if amid is None:
+        return located
+    away = float(np.linalg.norm(located.map.local_from_place(np.array([amid]))))
+    if away > _FAR_M:
+        raise InputError(
+            f"{source.file}, [frame] origin: the place is {away / 1e3:.0f} km from the block, which lies about "
+            f"({amid[0]:.4f}, {amid[1]:.4f}) degrees; correct it or remove the key"
+        )
+    return located
 
 
 def _flight(
