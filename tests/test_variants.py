@@ -17,8 +17,10 @@ from jaxphoto.statistics import check_discrepancies
 from jaxphoto.variants import (
     MODES,
     all_control,
+    common_shift,
     control_only,
     direct,
+    hold_interior,
     indirect,
     integrated,
     strips,
@@ -231,6 +233,19 @@ def test_without_sensors_what_only_they_see_is_held():
     assert measured(neither) == measured(block)
 
 
+def test_an_interior_held_takes_the_values_named_and_keeps_the_others():
+    block = everything()
+    camera, *others = block.start.unknowns.interior
+    held = hold_interior(block, camera, {"c_mm": 33.3, "yp_mm": -0.4})
+    before, after = (b.start.unknowns.interior[camera] for b in (block, held))
+    assert (float(after.c), float(after.y_p)) == (33.3, -0.4)
+    assert jax.tree.leaves(after.distortion) == jax.tree.leaves(before.distortion)
+    assert float(after.x_p) == float(before.x_p)
+    assert all(prior is FIXED for prior in jax.tree.leaves(held.priors.interior[camera]))
+    assert all(eqx.tree_equal(held.priors.interior[name], block.priors.interior[name]) for name in others)
+    assert any(prior is not FIXED for prior in jax.tree.leaves(block.priors.interior[camera]))
+
+
 def test_modes_by_name():
     block = everything()
     assert [MODES[name] for name in ("direct", "integrated", "indirect")] == [direct, integrated, indirect]
@@ -297,6 +312,17 @@ def test_adjustment_with_held_images_is_an_intersection():
     assert len(check.who) == len(blocks.CONTROL) * 3 + len(blocks.CHECK) * 3
     # Noise of 4 um at 1000 m and 35 mm: 0.11 m in a ray.
     assert 0.01 < np.sqrt(np.mean(np.asarray(check.value)[check.axis < 2] ** 2)) < 0.15
+
+
+def test_a_common_shift_takes_the_place_of_the_strips():
+    block = everything()
+    common = common_shift(block)
+    assert (set(common.image_strip), set(common.priors.strips)) == ({"block"}, {"block"})
+    bias = common.priors.strips["block"]
+    assert (bias.shift, bias.drift) == (FREE, FIXED)
+    assert not np.any(jax.tree.leaves(common.start.unknowns.strips))
+    back = dataclasses.replace(common, image_strip=block.image_strip, start=block.start, priors=block.priors)
+    assert eqx.tree_equal(back, block)
 
 
 def fixed(block: Block):

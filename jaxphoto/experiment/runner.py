@@ -126,5 +126,10 @@ def _merged(values: Any, changes: Any) -> Any:
 def summary(cells: pd.DataFrame) -> pd.DataFrame:
     """Mean and standard deviation of every cell over the layouts: table, row, column, ours, spread, n_layouts."""
     groups = cells.groupby(["table", "row", "column"], sort=False)["value"]
-    table = groups.agg(ours="mean", spread=lambda v: np.std(v, ddof=1) if len(v) > 1 else np.nan, n_layouts="size")
+    # About the first layout: what is the same in all comes out as it is, and without any spread.
+    table = groups.agg(
+        ours=lambda v: v.iloc[0] + np.mean(v - v.iloc[0]),
+        spread=lambda v: np.std(v - v.iloc[0], ddof=1) if len(v) > 1 else np.nan,
+        n_layouts="size",
+    )
     return table.reset_index()

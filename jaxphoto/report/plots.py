@@ -111,7 +111,7 @@ def _round_key(v: np.ndarray) -> float:
 def _vectors(
     axes: Axes, at: np.ndarray, v: np.ndarray, key: float, length: float, label: str, *, width: float, above: float
 ) -> None:
-    """Arrows `v` at `at` (both 2 x n); in the key, `above` the axes, one of size `key`, `length` long, and its `label`."""
+    """Arrows `v` at `at` (both 2 x n); in the key, `above` the axes, one of size `key` that is `length` long."""
     arrows = axes.quiver(*at, *v, angles="xy", scale_units="xy", scale=key / length, width=width, color="tab:blue")
     axes.quiverkey(arrows, 0.85, 1 + above, key, label, labelpos="E")
     axes.update_datalim((at + v * length / key).T)

@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxphoto.block import Block, exposures
+from jaxphoto.block import Block, exposures, mountings
 from jaxphoto.collinearity import ExteriorOrientation, project
-from jaxphoto.georeferencing import Mount, StripBias, apparent_point
+from jaxphoto.georeferencing import apparent_point
 from jaxphoto.simulation.flight import recorded
 from jaxphoto.unknowns import Unknowns
 
@@ -58,12 +58,7 @@ def image_coordinates(block: Block, truth: Unknowns) -> Float[Array, "rows 2"]:
 
 def _georeferenced(block: Block, truth: Unknowns) -> tuple[Float[Array, "stations"], Float[Array, "attitudes 3"]]:
     """What GNSS and IMU would observe, without noise."""
-    zero = jnp.zeros(3)
-    mounts = [truth.mounts.get(m, Mount(zero, zero)) for m in block.image_mount]
-    strips = [truth.strips.get(s, StripBias(zero, zero)) for s in block.image_strip]
-    mounts = [Mount(m.lever_arm, m.boresight, m.time_offset) for m in mounts]
-    stack = lambda trees: jax.tree.map(lambda *v: jnp.stack([jnp.asarray(x) for x in v]), *trees)  # noqa: E731
-    mount, strip = stack(mounts), stack(strips)
-    exterior, exposure = jax.tree.map(jnp.asarray, (truth.exterior, exposures(block)))
+    arrays = (truth.exterior, *mountings(block, truth), exposures(block))
+    exterior, mount, strip, exposure = jax.tree.map(jnp.asarray, arrays)
     sensors, angles = jax.vmap(recorded)(exterior.position, exterior.camera_from_object, mount, strip, exposure)
     return sensors[block.stations.who, block.stations.axis], angles[np.asarray(block.attitudes.image)]

@@ -141,7 +141,7 @@ REFUSED = {
     "grid of degrees": ([("32722", "4326"), (EPSG[-13:], EPSG[-13:] + '\nyaw = "grid"')], ["no grid", '"true"']),
     "origin": ([(EPSG, EPSG + "\norigin = [580000, 7220000, 0]")], ["[frame] origin", "degrees"]),
     "far origin": ([(EPSG, EPSG + "\norigin = [10, 52, 0]")], ["[frame] origin", "km from the block", "(-50.2"]),
-    "area": ([("32722", "2056")], ["images.csv: the coord", "(580005.0, 7220000.0)", "outside the area of EPSG:2056", "correct"]),
+    "area": ([("32722", "2056")], ["images.csv: the coord", "(580005.0, 7220000.0)", "area of EPSG:2056"]),
     "curvature": ([("[sigmas]", "[corrections]\ncurvature = true\n[sigmas]")], ["curvature", "Cartesian", "remove"]),
     "sea": ([("[sigmas]", "[corrections]\nrefraction = true\nsea_level_m = 1\n[sigmas]")], ["sea_level_m", "remove"]),
 }  # fmt: skip

@@ -1,16 +1,42 @@
 """Figures draw what the tables hold."""
 
-import dataclasses
-
-import matplotlib.quiver
 import numpy as np
-import pytest
+from matplotlib.quiver import Quiver, QuiverKey
 
-import jaxphoto
-from jaxphoto.block import Rows
+from jaxphoto import Tables
 from jaxphoto.report import check_points_figure
-from tests.blocks import aerial_block
+from tests.blocks import adjusted
 
 
-def test_fails():
-    pass
+def arrows(axes) -> Quiver:
+    (found,) = [child for child in axes.get_children() if isinstance(child, Quiver)]
+    return found
+
+
+def test_check_points_are_drawn_as_they_are_in_one_scale():
+    tables = Tables(adjusted("cross"))
+    figure = check_points_figure({"one": tables, "two": tables})
+    d = tables.check_points[["dX_m", "dY_m", "dZ_m"]].to_numpy()
+    number = [tables.adjusted.block.points.index(p) for p in tables.check_points["point"]]
+    plan, height, *second = figure.axes
+    np.testing.assert_allclose(np.stack([arrows(plan).U, arrows(plan).V], 1), d[:, :2])
+    np.testing.assert_allclose(np.stack([arrows(height).U, arrows(height).V], 1), d[:, 2:] * [0, 1])
+    np.testing.assert_allclose(arrows(plan).XY, np.asarray(tables.adjusted.unknowns.points)[number, :2])
+    assert len(second) == 2
+    assert len({arrows(axes).scale for axes in figure.axes}) == 1
+    (key,) = [child for child in plan.get_children() if isinstance(child, QuiverKey)]
+    assert 2 * np.sqrt((d**2).mean()) < key.U < 4 * np.sqrt((d**2).mean())
+    assert plan.get_title(loc="left").startswith("one")
+    # The tips of the arrows lie inside the axes.
+    figure.draw_without_rendering()
+    tips = arrows(plan).XY + d[:, :2] / arrows(plan).scale
+    assert tips[:, 0].max() < plan.get_xlim()[1] and tips[:, 1].min() > plan.get_ylim()[0]
+
+
+def test_points_checked_in_plan_only_have_no_height():
+    tables = Tables(adjusted("cross"))
+    table = tables.check_points.assign(dZ_m=np.nan)
+    tables.check_points = table
+    plan, height = check_points_figure({"": tables}).axes
+    assert len(arrows(plan).U) == len(table)
+    assert len(arrows(height).U) == 0
