@@ -178,6 +178,16 @@ def test_rotations_of_the_correlations(folder, monkeypatch, capsys, tmp_path):
     assert run(monkeypatch, capsys, "adjust", folder, "--out", out, "--rotations", "gimbal")[0] == 2
 
 
+@pytest.mark.parametrize("command", ["adjust", "boresight", "convert"])
+def test_results_below_a_file_are_refused(folder, monkeypatch, capsys, tmp_path, command):
+    (tmp_path / "notes").write_text("a file")
+    out = tmp_path / "notes" / "out"
+    code, _, error = run(monkeypatch, capsys, command, folder, *([] if command == "convert" else ["--out"]), out)
+    assert code == 2
+    assert error.startswith("jaxphoto: ") and error.count("\n") == 1 and "notes" in error
+    assert [p.name for p in tmp_path.iterdir()] == ["notes"]
+
+
 def test_convert_writes_a_block_that_reads_the_same(folder, monkeypatch, capsys, tmp_path):
     copy = tmp_path / "copy"
     code, screen, _ = run(monkeypatch, capsys, "convert", folder, copy)

@@ -21,6 +21,10 @@ def main() -> None:
     except JaxphotoError as error:
         typer.echo(f"jaxphoto: {error}", err=True)
         sys.exit(2)
+    except OSError as error:
+        where = error.filename if error.filename is not None else "a file"
+        typer.echo(f"jaxphoto: {where}: {error.strerror or error}; name a place that can be read and written", err=True)
+        sys.exit(2)
 
 
 def _show_warning(message, category, filename, lineno, file=None, line=None) -> None:

@@ -28,9 +28,10 @@ _PACKAGES = ("jaxphoto", "jax", "optimistix", "equinox", "lineax", "numpy", "pan
 
 
 def check_target(directory: Path) -> None:
-    """Raise InputError where results must not be written: a file, or a folder that holds something else."""
-    if directory.is_file():
-        raise InputError(f"{directory} is a file: name a folder for the results")
+    """Raise InputError where results must not or cannot be written: a file, below a file, among something else."""
+    for path in (directory, *directory.parents):
+        if path.is_file():
+            raise InputError(f"{path} is a file: name a folder for the results")
     if directory.is_dir() and any(directory.iterdir()) and not (directory / "summary.json").is_file():
         raise InputError(f"{directory} is not empty and holds no earlier results: name a new folder")
 

@@ -18,9 +18,17 @@ def mode(name):
     return "block.toml", "[datum]", f'[georeferencing]\nmode = "{name}"\n[datum]'
 
 
+def read_quietly(folder, name):
+    """Image c has no station: direct georeferencing holds what images.csv says, and says so."""
+    if name != "direct":
+        return read_block(folder)
+    with pytest.warns(UserWarning, match=r"mode = .direct.: 1 image\(s\) have no station and attitude.*exact: c$"):
+        return read_block(folder)
+
+
 @pytest.mark.parametrize("name", MODES)
 def test_the_mode_is_the_variant_and_comes_back(write_folder, tmp_path, name):
-    block = read_block(write_folder(PLACED, mode(name)))
+    block = read_quietly(write_folder(PLACED, mode(name)), name)
     (tmp_path / "block").rename(tmp_path / "first")
     assert_same(block, MODES[name](read_block(write_folder(PLACED))))
     write_block(block, tmp_path / "copy")

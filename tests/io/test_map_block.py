@@ -55,6 +55,16 @@ def test_coordinates_come_into_the_local_frame(write_folder):
     np.testing.assert_allclose(block.control.value[3], block.start.unknowns.points[1, 2], rtol=0, atol=1e-9)
 
 
+def test_heights_are_ellipsoidal_unless_told_and_that_is_said(write_folder, tmp_path):
+    told = read_block(to_utm(write_folder()))
+    (tmp_path / "block").rename(tmp_path / "first")
+    silent = to_utm(write_folder(), EPSG.replace('\nvertical = "ellipsoidal"', ""))
+    with pytest.warns(UserWarning, match=r"block\.toml, \[frame\]: heights are taken as above the ellipsoid.*5773"):
+        assumed = read_block(silent)
+    assert assumed.frame == told.frame
+    np.testing.assert_array_equal(assumed.control.value, told.control.value)
+
+
 @pytest.mark.parametrize("yaw", ["true", "grid"])
 def test_angles_come_into_the_axes_of_the_local_frame(write_folder, yaw):
     block = read_block(to_utm(write_folder(), f'{EPSG}\nyaw = "{yaw}"\norigin = [-50.0, -25.0, 0.0]'))
@@ -133,7 +143,6 @@ REFUSED = {
     "code": ([("32722", "99999")], ["block.toml, [frame] code", "99999 is unknown", "correct"]),
     "no code": ([("code = 32722\n", "")], ["[frame] code", "missing", "add it"]),
     "feet": ([("32722", "2227")], ["[frame] code", "US survey foot", "convert"]),
-    "no vertical": ([('vertical = "ellipsoidal"', "")], ["[frame] vertical", "ellipsoidal", "5773"]),
     "unknown vertical": ([('"ellipsoidal"', "99999")], ["block.toml, [frame] vertical", "99999 is unknown"]),
     "no heights": ([('"ellipsoidal"', "4326")], ["block.toml, [frame] vertical", "no system of heights"]),
     "vertical": ([('"ellipsoidal"', '"geoid"')], ["[frame] vertical", "geoid", "give one"]),

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 import jaxphoto
 from jaxphoto.errors import BlockError, InputError
 from jaxphoto.io import read_block, read_recipe, recipe_from, write_simulation
+from jaxphoto.report import Tables
 from jaxphoto.rotation import matrix_from_omega_phi_kappa
 from jaxphoto.simulation import Field, Simulation, Station, simulate
 from tests.simulation.small import RECIPES, changed
@@ -87,7 +88,7 @@ def test_test_field_of_004():
 def test_calibration_over_the_test_field_is_about_as_good_as_printed():
     sigma = {"c_mm": 0.012, "xp_mm": 0.005, "yp_mm": 0.006, "k1": 1.0635e-6, "k2": 2.3956e-9}
     result = jaxphoto.adjust(simulate(read_recipe(TEST_FIELD), 0).block)
-    found = {s.parameter: s for s in jaxphoto.significance(result)}
+    found = {s.parameter: s for s in Tables(result).significance}
     assert set(found) == set(sigma)
     for name, printed in sigma.items():
         assert found[name].sigma == pytest.approx(printed, rel=0.5)
@@ -188,5 +189,5 @@ def test_a_camera_that_takes_no_image_is_refused():
 
 
 def test_a_field_that_is_not_seen_is_refused():
-    with pytest.raises(BlockError, match="target at X -6.0 m.*seen in 1 image"):
+    with pytest.raises(BlockError, match=r"target at X -6.0 m.*seen in 1 image"):
         made({"convergent.field_m": [12.0, 9.0]})

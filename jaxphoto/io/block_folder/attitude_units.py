@@ -1,7 +1,5 @@
 """Attitudes in radians under columns in degrees, told by the direction of flight."""
 
-import warnings
-
 import numpy as np
 from jaxtyping import Float
 
@@ -13,8 +11,6 @@ from jaxphoto.io.tables import Table
 # Means of the cosine between yaw and course: the crab angle leaves more than the first, and both readings are told
 # apart below the second.
 _ALIKE, _UNLIKE = 0.8, 0.7
-# Courses of one direction have a resultant of 1; below this, strips run in different directions.
-_ONE_WAY = 0.8
 _FEWEST = 4
 
 
@@ -31,8 +27,8 @@ def check_attitude_units(table: Table, stations: Rows, images: Images) -> None:
 def check_yaw(yaw: Float[np.ndarray, "n"], flown: Float[np.ndarray, "n 3"], file: str) -> None:
     """Raise InputError where `yaw` follows the way `flown` when read as radians, and does not when read as degrees.
 
-    Honest degrees are safe: that all of them lie within +-2 pi, follow as radians strips of several directions and yet
-    disagree with them as degrees would be chance. With strips of one direction only it may be, and is a UserWarning.
+    Honest degrees are safe: read as degrees they follow the flight themselves, whatever the wind, because no aircraft
+    flies sideways.
     """
     course = np.arctan2(flown[:, 0], flown[:, 1])
     known = ~np.isnan(course) & ~np.isnan(yaw)
@@ -42,13 +38,10 @@ def check_yaw(yaw: Float[np.ndarray, "n"], flown: Float[np.ndarray, "n 3"], file
     as_radians, as_degrees = np.cos(yaw - course).mean(), np.cos(np.deg2rad(yaw) - course).mean()
     if as_radians < _ALIKE or as_degrees > _UNLIKE:
         return
-    message = (
+    raise InputError(
         f"{file}: the yaw angles lie between {yaw.min():.2f} and {yaw.max():.2f} and follow the direction of flight as "
         "radians, not as degrees; convert roll, pitch and yaw to degrees"
     )
-    if abs(np.exp(1j * course).mean()) < _ONE_WAY:
-        raise InputError(message)
-    warnings.warn(message, UserWarning, stacklevel=3)
 
 
 def _consecutive(images: Images) -> tuple[np.ndarray, np.ndarray]:

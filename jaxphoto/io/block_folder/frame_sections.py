@@ -1,5 +1,6 @@
 """The [frame] and [corrections] tables of block.toml."""
 
+import warnings
 from typing import Any
 
 from jaxphoto.block import Frame
@@ -25,14 +26,15 @@ def read_frame(section: Section) -> Frame:
         system = map_system(code)
     except InputError as error:
         raise section.error("code", str(error)) from None
-    vertical = section.values.get("vertical")
+    vertical = section.values.get("vertical", "ellipsoidal")
+    if "vertical" not in section:
+        warnings.warn(
+            f"{section.file}, [frame]: heights are taken as above the ellipsoid (GNSS); write "
+            'vertical = "ellipsoidal", or the EPSG code of their system (5773 for EGM96) if they are not',
+            UserWarning,
+            stacklevel=2,
+        )
     if vertical != "ellipsoidal":
-        if vertical is None:
-            raise section.error(
-                "vertical",
-                'the key is missing; write "ellipsoidal" if heights are above the ellipsoid (GNSS), else the EPSG code '
-                "of their system (5773 for EGM96)",
-            )
         vertical = section.count("vertical")
         try:
             check_heights(code, vertical)

@@ -12,7 +12,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jaxphoto.block import Block, Frame, Start
+from jaxphoto.block import Block, Frame, Start, sensor_rows
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import Mount
 from jaxphoto.io.block_folder.attitude_units import check_attitude_units
@@ -145,7 +145,24 @@ def assemble(source: BlockTables) -> Block:
         frame=frame,
         corrections=corrections,
     )
-    return MODES[settings.mode](block)
+    posed = MODES[settings.mode](block)
+    if settings.mode == "direct":
+        _warn_of_given_orientations(block, source.file)
+    return posed
+
+
+def _warn_of_given_orientations(block: Block, file: str) -> None:
+    """A UserWarning where direct georeferencing with sensors must hold an orientation that they did not give."""
+    sensed = set(sensor_rows(block, block.start.unknowns).image.tolist())
+    bare = [name for k, name in enumerate(block.images) if k not in sensed]
+    if bare and len(block.stations.who) + len(block.attitudes.image):
+        warnings.warn(
+            f'{file}, [georeferencing] mode = "direct": {len(bare)} image(s) have no station and attitude, so their '
+            f"orientation in images.csv is held as if it were exact: {', '.join(bare[:5])}"
+            + (", ..." if len(bare) > 5 else ""),
+            UserWarning,
+            stacklevel=4,
+        )
 
 
 def _located(frame: Frame, tables: Mapping[str, Table], source: BlockTables) -> Frame:
