@@ -7,7 +7,19 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from jaxphoto import Outcome, RankError, Weighted, adjust, covariance, rebalance, rebalance_covariance
+from jaxphoto import (
+    FIXED,
+    FREE,
+    Mount,
+    Outcome,
+    RankError,
+    Weighted,
+    adjust,
+    covariance,
+    rebalance,
+    rebalance_covariance,
+)
+from jaxphoto.block import Motion
 from jaxphoto.camera import get_parameter, parameter_names
 from jaxphoto.rotation import small_angles
 from jaxphoto.statistics import normalised_residuals, redundancy_numbers
@@ -125,12 +137,18 @@ def test_k0_and_c_are_one_scale():
         assert word in str(caught.value)
 
 
-def test_unknowns_that_nothing_sees_are_named():
-    """Drift along with shift, but every image of the strip taken at one moment."""
+def test_unknowns_that_nothing_tells_apart_are_named():
+    """A time offset at one velocity everywhere is a shift of every strip, and these are free too."""
     block = simulated("strips").block
-    block = dataclasses.replace(block, image_time=0.0 * np.asarray(block.image_time))
-    with pytest.raises(RankError, match=r"strips\[[ab]\]\.drift_[XYZ]_m_per_s"):
+    n, zero = len(block.images), np.zeros(3)
+    block = dataclasses.replace(
+        block, image_mount=("imu",) * n, motion=Motion(np.tile([60.0, 20.0, 0.0], (n, 1)), np.zeros((n, 3)))
+    )
+    mounts = lambda b: (b.start.unknowns.mounts, b.priors.mounts)  # noqa: E731
+    block = eqx.tree_at(mounts, block, ({"imu": Mount(zero, zero)}, {"imu": Mount(FIXED, FIXED, FREE)}))
+    with pytest.raises(RankError, match=r"tell these unknowns apart: .*mounts\[imu\]\.time_offset_s") as caught:
         adjust(block, block.start.unknowns)
+    assert "strips[a].shift_X_m" in str(caught.value)
 
 
 def test_the_step_limit_is_an_outcome():
