@@ -26,6 +26,7 @@ from jaxphoto.camera import (
     Balanced,
     Brown,
     Brown14,
+    BundlerRadial,
     Ebner,
     Gruen,
     InteriorOrientation,
@@ -54,11 +55,11 @@ __version__ = "0.1.0"
 
 __all__ = [
     "FIXED", "FREE", "MAX_STEPS", "AbstractDistortion", "Adjustment", "AffineBrown", "Balanced", "Block",
-    "BlockError", "Brown", "Brown14", "DatumError", "Ebner", "ExteriorOrientation", "Gruen", "InputError",
-    "InteriorOrientation", "JaxphotoError", "Mount", "Outcome", "PpsRadial", "RadialPolynomial", "RankError",
-    "Sensor", "Smac", "StripBias", "Surface", "Tables", "Unknowns", "Weighted", "adjust", "angle_differences",
-    "boresight", "common_sizes", "conversion_error", "convert", "covariance", "decentring_from_symmetry",
-    "direct_orientation", "georeference", "ground_point", "image_ray", "intersect", "point_differences",
-    "principal_points", "project", "read_block", "read_recipe", "read_source", "rebalance", "rebalance_covariance",
-    "simulate", "symmetry_from_decentring", "write_block", "write_simulation",
+    "BlockError", "Brown", "Brown14", "BundlerRadial", "DatumError", "Ebner", "ExteriorOrientation", "Gruen",
+    "InputError", "InteriorOrientation", "JaxphotoError", "Mount", "Outcome", "PpsRadial", "RadialPolynomial",
+    "RankError", "Sensor", "Smac", "StripBias", "Surface", "Tables", "Unknowns", "Weighted", "adjust",
+    "angle_differences", "boresight", "common_sizes", "conversion_error", "convert", "covariance",
+    "decentring_from_symmetry", "direct_orientation", "georeference", "ground_point", "image_ray", "intersect",
+    "point_differences", "principal_points", "project", "read_block", "read_recipe", "read_source", "rebalance",
+    "rebalance_covariance", "simulate", "symmetry_from_decentring", "write_block", "write_simulation",
 ]  # fmt: skip

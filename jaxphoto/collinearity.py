@@ -79,8 +79,8 @@ def image_residual(
     projection = project_ideal(interior.c, exterior, point)
     reduced = xy - interior.principal_point
     if interior.distortion.domain == "measured":
-        return interior.distortion.closed_form(reduced) - projection
-    return reduced - interior.distortion.closed_form(projection)
+        return interior.closed_form(reduced) - projection
+    return reduced - interior.closed_form(projection)
 
 
 def intersect(

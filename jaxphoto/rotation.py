@@ -38,16 +38,15 @@ def matrix_from_omega_phi_kappa(angles: Float[Array, "3"]) -> Float[Array, "3 3"
 def omega_phi_kappa_from_matrix(camera_from_object: Float[Array, "3 3"]) -> Float[Array, "3"]:
     """(omega, phi, kappa) in radians of `camera_from_object`; omega and kappa in (-pi, pi], |phi| <= pi/2.
 
-    At phi = +-pi/2 only omega +- kappa is determined: omega and kappa are then one choice of many.
+    At phi = +-pi/2 only omega +- kappa is determined: omega and kappa are then one choice of many, and belong together.
     """
     m = camera_from_object
-    return jnp.stack(
-        [
-            jnp.arctan2(-m[2, 1], m[2, 2]),
-            jnp.arctan2(m[2, 0], _norm(m[2, 1], m[2, 2])),
-            jnp.arctan2(-m[1, 0], m[0, 0]),
-        ]
-    )
+    omega = jnp.arctan2(-m[2, 1], m[2, 2])
+    # Of M with omega undone: near phi = 90 degrees omega and atan2(-m10, m00) are both rounding, independent of one
+    # another, and would together be another rotation.
+    s, c = jnp.sin(omega), jnp.cos(omega)
+    kappa = jnp.arctan2(c * m[0, 1] + s * m[0, 2], c * m[1, 1] + s * m[1, 2])
+    return jnp.stack([omega, jnp.arctan2(m[2, 0], _norm(m[2, 1], m[2, 2])), kappa])
 
 
 def matrix_from_roll_pitch_yaw(angles: Float[Array, "3"]) -> Float[Array, "3 3"]:

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxphoto.camera import Balanced, Brown, InteriorOrientation
+from jaxphoto.camera import Balanced, Brown, BundlerRadial, InteriorOrientation
 from jaxphoto.collinearity import (
     ExteriorOrientation,
     camera_coordinates,
@@ -16,7 +16,7 @@ from jaxphoto.collinearity import (
     project_ideal,
 )
 from jaxphoto.rotation import matrix_from_omega_phi_kappa, small_rotation
-from tests.camera.models import AICON, KODAK
+from tests.camera.models import AICON, FLICKR, KODAK
 from tests.derivatives import check_derivatives, compiled
 from tests.formulas import camera_from_object, collinearity
 
@@ -24,6 +24,7 @@ bounded = settings(max_examples=50, deadline=None, derandomize=True, database=No
 POSITION = np.array([1000.0, -2000.0, 1500.0])
 BROWN = InteriorOrientation(34.253, 0.065, 0.274, KODAK)
 BALANCED = InteriorOrientation(28.785, 0.017, 0.057, AICON)
+BUNDLER = InteriorOrientation(30.0, 0.03, -0.02, FLICKR)
 
 ideal_of = compiled(project_ideal)
 project_ = compiled(project)
@@ -67,7 +68,7 @@ def test_exterior_orientation_from_angles_and_back():
     np.testing.assert_allclose(compiled(lambda e: e.omega_phi_kappa)(exterior), angles, rtol=0, atol=1e-14)
 
 
-@pytest.mark.parametrize("interior", [BROWN, BALANCED])
+@pytest.mark.parametrize("interior", [BROWN, BALANCED, BUNDLER])
 def test_the_ray_of_a_projection_meets_the_point(interior):
     exterior = exterior_of((0.3, -0.8, 2.0))
     point = seen_point(exterior, (9.0, -5.0), interior.c)
@@ -79,7 +80,7 @@ def test_the_ray_of_a_projection_meets_the_point(interior):
     np.testing.assert_allclose(origin + depth * direction, point, rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("interior", [BROWN, BALANCED])
+@pytest.mark.parametrize("interior", [BROWN, BALANCED, BUNDLER])
 def test_residual_is_observed_minus_computed(interior):
     exterior = exterior_of((0.3, -0.8, 2.0))
     point = seen_point(exterior, (14.0, -9.0), interior.c)
@@ -89,12 +90,25 @@ def test_residual_is_observed_minus_computed(interior):
     residual = image_residual_(interior, exterior, point, xy + error)
     # Ideal and measured domain differ by the slope of the distortion, about 3 % here.
     np.testing.assert_allclose(residual, error, rtol=0.1)
-    if interior is BALANCED:
+    if interior is not BROWN:
         np.testing.assert_allclose(residual, error, rtol=1e-9)
     else:
         slope = compiled(jax.jacfwd(interior.ideal_from_measured))(xy)
         np.testing.assert_allclose(residual, slope @ error, rtol=1e-4)
         assert np.abs(residual / error - 1).max() > 0.01
+
+
+def test_residual_of_bundle_adjustment_in_the_large():
+    # P = R X + t; p = -P / P.z; p' = f r(p) p: the residual is p' - measured there, with y up and -z forwards as here.
+    f, k1, k2, t = 30.0, -0.17, 0.16, np.array([0.3, -1.2, -9.0])
+    rotation = camera_from_object(0.3, -0.8, 2.0)
+    point, measured = np.array([1.0, 2.0, -0.5]), np.array([3.0, -4.0])
+    seen = rotation @ point + t
+    p = -seen[:2] / seen[2]
+    theirs = f * (1 + k1 * (p @ p) + k2 * (p @ p) ** 2) * p - measured
+    interior = InteriorOrientation(f, distortion=BundlerRadial(k1=k1, k2=k2))
+    ours = image_residual_(interior, ExteriorOrientation(-rotation.T @ t, rotation), point, measured)
+    np.testing.assert_allclose(ours, -theirs, rtol=0, atol=1e-13)
 
 
 def rays_to(point, origins):
@@ -141,6 +155,10 @@ def balanced(n):
     return InteriorOrientation(30 + n[0], n[1], n[2], distortion)
 
 
+def bundler(n):
+    return InteriorOrientation(30 + n[0], n[1], n[2], BundlerRadial(k1=0.2 * n[3], k2=0.2 * n[4]))
+
+
 def models_of(camera):
     """Projection, ray and residual with one camera: one compile for the three."""
 
@@ -171,7 +189,7 @@ def cases():
     return numbers, position, theta, angles, point, image
 
 
-@pytest.mark.parametrize("camera", [brown, balanced])
+@pytest.mark.parametrize("camera", [brown, balanced, bundler])
 def test_derivatives_of_projection_ray_and_residual(camera):
     check_derivatives(models_of(camera), *cases())
 

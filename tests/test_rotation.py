@@ -44,6 +44,15 @@ def test_at_phi_90_degrees_the_angles_still_give_the_matrix_back(phi):
     np.testing.assert_allclose(matrix_from_opk(opk_from_matrix(matrix)), matrix, rtol=0, atol=1e-12)
 
 
+@pytest.mark.parametrize("distance", [0.0, 1e-13, 1e-10, 1e-6])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_near_phi_90_degrees_a_matrix_of_any_origin_comes_back(sign, distance):
+    # A product rounds: omega and kappa taken each from elements that should vanish would be two unrelated angles.
+    for turn in random_rotations(np.random.default_rng(20), 5):
+        matrix = turn @ (turn.T @ camera_from_object(2.5, sign * (np.pi / 2 - distance), -0.7))
+        np.testing.assert_allclose(matrix_from_opk(opk_from_matrix(matrix)), matrix, rtol=0, atol=2e-15)
+
+
 @bounded
 @given(angle, tilt, angle)
 def test_roll_pitch_yaw_round_trip_and_independent_product(roll, pitch, yaw):

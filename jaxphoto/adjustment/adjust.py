@@ -10,19 +10,11 @@ import jax
 import numpy as np
 
 from jaxphoto.adjustment.datum import close_datum
-from jaxphoto.adjustment.normal import factor_reduced, reduce_normal
-from jaxphoto.adjustment.optimum import (
-    Optimum,
-    find_optimum,
-    linearise,
-    typical_scale,
-    unit_scale,
-    weigh_datum,
-    zero_increments,
-)
+from jaxphoto.adjustment.normal import At, residuals_at
+from jaxphoto.adjustment.optimum import Optimum, find_optimum, iterate, unit_scale, weigh_datum, zero_increments
 from jaxphoto.adjustment.padding import LEAST, Sizes, crop_residuals, crop_state, pad_structure, pad_values, sizes_of
 from jaxphoto.adjustment.rank import check_priors, check_rank
-from jaxphoto.adjustment.residuals import Residuals, State, Values, residuals_at, state_at
+from jaxphoto.adjustment.residuals import Residuals, State, Values, state_at
 from jaxphoto.adjustment.result import Adjustment, Factored, Padded
 from jaxphoto.adjustment.structure import Structure, structure_of
 from jaxphoto.adjustment.values import at_state, unknowns_of, values_of, with_datum
@@ -52,25 +44,31 @@ def solve(
     values = values_of(block, start, priors, structure)
     constraints = close_datum(block, concrete(values, block), structure)
     values = with_datum(values, constraints.eop, constraints.points)
-    wide = pad_structure(structure, sizes)
-    numbers = pad_values(values, structure, wide)
+    traced = any(isinstance(v, jax.core.Tracer) for v in jax.tree.leaves(values))
+    coupled = len(constraints.eop) + len(structure.distance_points) > 0
+    shards = 1 if traced or coupled else jax.device_count()
+    wide, places = pad_structure(structure, sizes, shards=shards, dense=coupled)
+    numbers = pad_values(values, structure, wide, places)
     seconds: dict[str, float] = {}
-    optimum, state = run_compiled(_optimise, (numbers, wide, max_steps), seconds, "solve")
-    numbers = at_state(numbers, state)
-    # Statistics need the factored normal matrix; a derivative of the unknowns does not, and would pay for it dearly.
-    traced = isinstance(state.position, jax.core.Tracer)
     padded = None
     if traced:
-        residuals = _residuals(numbers, wide)
+        optimum = find_optimum(weigh_datum(numbers, wide), structure=wide, max_steps=max_steps)
+        state = state_at(optimum.increments, unit_scale(wide), numbers, wide)
     else:
-        factored, residuals = run_compiled(_factor, (numbers, wide), seconds, "covariance")
-        padded = Padded(wide, numbers, factored)
-    state = crop_state(state, structure)
+        arguments = (numbers, wide, max_steps, np.array(False))
+        optimum, state, _ = run_compiled(_optimise, arguments, seconds, "solve")
+    numbers = at_state(numbers, state)
+    # Statistics need the factored normal matrix; a derivative of the unknowns does not, and would pay for it dearly.
+    if not traced:
+        _, _, factored = run_compiled(_optimise, (numbers, wide, max_steps, np.array(True)), seconds, "covariance")
+        padded = Padded(wide, numbers, factored, places)
+    residuals = run_compiled(_residuals, (numbers, wide), seconds, "covariance")
+    state = crop_state(state, places)
     adjusted = Adjustment(
         block=block,
         priors=priors,
         unknowns=unknowns_of(state, start, structure),
-        residuals=crop_residuals(residuals, structure),
+        residuals=crop_residuals(residuals, structure, places),
         values=at_state(values, state),
         structure=structure,
         padded=padded,
@@ -89,25 +87,18 @@ def common_sizes(blocks: Iterable[Block]) -> Sizes:
 
 
 @eqx.filter_jit
-def _optimise(values: Values, structure: Structure, max_steps: int) -> tuple[Optimum, State]:
-    values = weigh_datum(values, structure)
-    optimum = find_optimum(values, structure=structure, max_steps=max_steps)
-    return optimum, state_at(optimum.increments, unit_scale(structure), values, structure)
+def _optimise(
+    values: Values, structure: Structure, max_steps: int, only_factor: np.ndarray
+) -> tuple[Optimum, State, Factored]:
+    """The optimum; or, of values that are at theirs, the undamped normal equations, factored."""
+    optimum, system, scale = iterate(weigh_datum(values, structure), structure, max_steps, only_factor)
+    state = state_at(optimum.increments, unit_scale(structure), values, structure)
+    return optimum, state, Factored(system.reduced, system.factor, scale, values.datum_eop.shape[0])
 
 
 @eqx.filter_jit
 def _residuals(values: Values, structure: Structure) -> Residuals:
-    return residuals_at(zero_increments(structure), unit_scale(structure), values, structure)
-
-
-@eqx.filter_jit
-def _factor(values: Values, structure: Structure) -> tuple[Factored, Residuals]:
-    """The undamped normal equations at the optimum, factored; and the residuals there."""
-    weighed = weigh_datum(values, structure)
-    scale = typical_scale(weighed, structure)
-    normal, residuals = linearise(zero_increments(structure), scale, weighed, structure)
-    reduced = reduce_normal(normal, 0.0, structure)
-    return Factored(normal, reduced, factor_reduced(reduced), scale, values.datum_eop.shape[0]), residuals
+    return residuals_at(At(zero_increments(structure), unit_scale(structure), values, structure))
 
 
 def concrete(tree: Values, block: Block) -> Values:

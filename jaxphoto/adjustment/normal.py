@@ -1,4 +1,4 @@
-"""Normal equations with the points eliminated: sums, reduction, solution, inverse.
+"""Normal equations with the points eliminated: solution and products.
 
 In scaled increments, with e the exterior orientations, s the shared unknowns and p the points,
 
@@ -13,202 +13,224 @@ unknowns mu = D x with the block -I, so V stays block-diagonal. With V = L L', Y
     g   = D_e' - Y Yd,   K = I + Yd' Yd               the coupling of mu
     A   = S + g K^-1 g'                               positive definite where the datum is fixed
 
-Once a block: the lists of `Structure`. Once an iterate: the sums (`sum_normal`). Once a damping: `reduce_normal`
-and `factor_reduced`. Once a right-hand side: `solve_factored`.
+W is never kept: `reduced.reduce_normal` sums S tile by tile, and what else needs W is a product with the Jacobian,
+forwards and backwards, by automatic differentiation (`image_products`).
 """
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxphoto.adjustment.colouring import Jacobian
-from jaxphoto.adjustment.residuals import Increments, Residuals
+from jaxphoto.adjustment.band import Band, BandFactor, solve_band
+from jaxphoto.adjustment.residuals import Increments, Residuals, Values, other_residuals, state_at
 from jaxphoto.adjustment.structure import Structure
-from jaxphoto.adjustment.sums import (
-    image_products,
-    met_by_image,
-    pair_sums,
-    products,
-    shared_point_sums,
-    shared_sums,
-    with_zero_row,
-)
+from jaxphoto.adjustment.tiles import Scene, by_point, by_tile, of_images, rows, scene_of, seen_in
+
+AXIS = "tiles"
+"""Mesh axis along which tiles and their points are dealt out to devices."""
 
 
-class Normal(NamedTuple):
-    """The undamped sums; see the module's head. `rows_*` are D; `b` is the whole right-hand side J' r."""
+class At(NamedTuple):
+    """Where equations are linearised: `start + scale * increments`."""
 
-    u: Float[Array, "images 6 6"]
-    us: Float[Array, "images 6 shared"]
-    uss: Float[Array, "shared shared"]
-    v: Float[Array, "3 3 points"]
-    w: Float[Array, "6 3 rows"]
-    ws: Float[Array, "shared 3 points"]
-    b: Increments
-    rows_e: Float[Array, "constraints images 6"]
-    rows_p: Float[Array, "constraints 3 points"]
+    increments: Increments
+    scale: Increments
+    values: Values
+    structure: Structure
+
+    @property
+    def state(self):
+        """The unknowns there."""
+        return state_at(self.increments, self.scale, self.values, self.structure)
 
 
 class Reduced(NamedTuple):
     """The reduced normal matrix and what takes vectors down to it and back to the points."""
 
-    a: Float[Array, "reduced reduced"]
-    """Lower triangle of A (the upper is not filled)."""
+    a: Band
+    """A; its band is one full column block where there are constraints or distances."""
     g: Float[Array, "reduced constraints"]
     k: Float[Array, "constraints constraints"]
     l: Float[Array, "6 points"]  # noqa: E741
     """Cholesky factors of V: l11, l21, l22, l31, l32, l33."""
+    rows_e: Float[Array, "constraints images 6"]
+    rows_p: Float[Array, "constraints 3 points"]
+    """D: distances, then the constraints of the datum."""
 
 
-def sum_normal(jacobian: Jacobian, residuals: Residuals, datum: tuple[Array, Array], structure: Structure) -> Normal:
-    """The sums of N x = b from Jacobian blocks and residuals (so b = J' r); `datum` is D over images and points."""
-    s, j, r = structure, jacobian, residuals
-    q = s.n_colours
-    pad = jnp.zeros((q - s.n_image_colours, 2, len(s.image)))
-    image_rows = jnp.concatenate([j.image_eop, j.image_shared, pad, r.image[None]])
-    station_rows = jnp.concatenate([j.station_eop, j.station_shared, r.stations[None]])[:, None]
-    attitude_rows = jnp.concatenate([j.attitude_eop, j.attitude_shared, r.attitudes[None]])
-    m = (
-        image_products(image_rows, s)
-        + products(station_rows, s.station_image, s.n_images)
-        + products(attitude_rows, s.attitude_image, s.n_images)
+def total(x, s: Structure):
+    """The sum over all devices."""
+    return jax.lax.psum(x, AXIS) if s.tiles is not None and s.tiles.shards > 1 else x
+
+
+def dot(a: Increments, b: Increments, s: Structure) -> Float[Array, ""]:
+    """a'b over all unknowns."""
+    return jnp.vdot(a.eop, b.eop) + jnp.vdot(a.shared, b.shared) + total(jnp.vdot(a.points, b.points), s)
+
+
+def residuals_at(at: At) -> Residuals:
+    """All residuals over their sigmas."""
+    increments, scale, values, s = at
+    state, tiles = at.state, s.tiles
+    assert tiles is not None
+    scene = scene_of(state, s)
+
+    def tile(image, points, xy, sigma):
+        return rows(of_images(scene, image, s), points, seen_in(xy, sigma, image, s), s)
+
+    numbers = (tiles.image, by_tile(state.points, tiles), values.xy, values.sigma_xy)
+    image = jax.vmap(jax.vmap(tile))(*numbers)
+    return other_residuals(increments, scale, values, s)._replace(image=image)
+
+
+def square_sum(at: At) -> Float[Array, ""]:
+    """The sum of all squared residuals, tile by tile."""
+    increments, scale, values, s = at
+    state = at.state
+    scene = scene_of(state, s)
+
+    def tile(numbers):
+        image, points, xy, sigma = numbers
+        r = rows(of_images(scene, image, s), points, seen_in(xy, sigma, image, s), s)
+        return jnp.sum(r * r)
+
+    image = _each_tile(tile, (by_tile(state.points, s.tiles), values.xy, values.sigma_xy), s)
+    return _square_sum(jnp.sum(image), other_residuals(increments, scale, values, s), s)
+
+
+def _square_sum(image: Float[Array, ""], others: Residuals, s: Structure) -> Float[Array, ""]:
+    rest = sum(jnp.sum(v**2) for v in others._replace(image=jnp.zeros(0), control=jnp.zeros(0)))
+    return total(image + jnp.sum(others.control**2), s) + rest
+
+
+def _each_tile(function, numbers, s: Structure):
+    """`function` of (image, *numbers) of every tile, one after the other: what it needs stays in the cache of a core."""
+    joined = jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), (s.tiles.image, *numbers))
+    return jax.lax.map(function, joined)
+
+
+def image_products(at: At, direction: Increments, want: Literal["images", "points", "all"]) -> Increments:
+    """J'J x over the image rows.
+
+    `want` says which part: "images" (with the shared unknowns), "points" or "all"; what is not wanted is zero.
+    """
+    increments, scale, values, s = at
+    tiles = s.tiles
+    assert tiles is not None
+    scene, pull_scene = _scene_and_pull(at)
+    turned = jax.jvp(lambda e, h: scene_of(state_at(increments._replace(eop=e, shared=h), scale, values, s), s),
+                     (increments.eop, increments.shared), (direction.eop, direction.shared))[1]  # fmt: skip
+    points = values.points + increments.points * scale.points
+
+    def tile(numbers):
+        image, point, moved, xy, sigma = numbers
+        seen, place = seen_in(xy, sigma, image, s), of_images(scene, image, s)
+        f = jax.jit(lambda scene, point: rows(scene, point, seen, s))
+        change = jax.jvp(f, (place, point), (of_images(turned, image, s), moved))[1]
+        to_scene, to_point = jax.vjp(f, place, point)[1](change)
+        return (to_scene if want != "points" else None), (to_point if want != "images" else None)
+
+    numbers = (by_tile(v, tiles) for v in (points, direction.points * scale.points))
+    to_scene, to_point = _each_tile(tile, (*numbers, values.xy, values.sigma_xy), s)
+    eop, shared, to_points = jax.tree.map(jnp.zeros_like, increments)
+    if want != "points":
+        eop, shared = pull_scene(total(_by_image(to_scene, scene, s), s))
+    if want != "images":
+        to_points = by_point(to_point.reshape(*tiles.image.shape[:2], *to_point.shape[1:])) * scale.points
+    return Increments(eop, shared, to_points)
+
+
+def gradient(at: At, l: Float[Array, "6 points"], rows_p: Float[Array, "k 3 points"]):  # noqa: E741
+    """b = J'r over all rows, taken down with the points' factors `l`, and the square sum of the residuals.
+
+    Returns b, its reduced part, the part for mu, and r'r. Down goes -J_e' J_p V^-1 b_p with the Jacobian at hand, so
+    one pass over the tiles does it.
+    """
+    increments, scale, values, s = at
+    tiles = s.tiles
+    assert tiles is not None
+    others, pull_others = jax.vjp(lambda y: other_residuals(y, scale, values, s), increments)
+    b_others = pull_others(others)[0]
+    scene, pull_scene = _scene_and_pull(at)
+    points = values.points + increments.points * scale.points
+
+    def tile(numbers):
+        image, point, step, other, factors, xy, sigma = numbers
+        seen, place = seen_in(xy, sigma, image, s), of_images(scene, image, s)
+        f = jax.jit(lambda scene, point: rows(scene, point, seen, s))
+        r, pull = jax.vjp(f, place, point)
+        to_scene, to_point = pull(r)
+        b = to_point * step + other
+        across = jax.jvp(lambda x: f(place, x), (point,), (solve_3x3(factors, b) * step,))[1]
+        return to_scene, pull(across)[0], b, jnp.sum(r * r)
+
+    numbers = (by_tile(v, tiles) for v in (points, scale.points, b_others.points, l))
+    to_scene, down, b, squares = _each_tile(tile, (*numbers, values.xy, values.sigma_xy), s)
+    (e, h), (e_down, h_down) = (pull_scene(total(_by_image(v, scene, s), s)) for v in (to_scene, down))
+    b_p = by_point(b.reshape(*tiles.image.shape[:2], *b.shape[1:]))
+    b = Increments(e + b_others.eop, h + b_others.shared, b_p)
+    right = jnp.concatenate([(b.eop - e_down).T.reshape(-1), b.shared - h_down])
+    return b, right, jnp.einsum("ckp,kp->c", rows_p, solve_3x3(l, b_p)), _square_sum(jnp.sum(squares), others, s)
+
+
+def _scene_and_pull(at: At):
+    """The scene, and what takes its cotangents to increments of images and shared unknowns."""
+    increments, scale, values, s = at
+
+    def scene_at(eop, shared):
+        return scene_of(state_at(increments._replace(eop=eop, shared=shared), scale, values, s), s)
+
+    return jax.vjp(scene_at, increments.eop, increments.shared)
+
+
+def _by_image(parts: Scene, scene: Scene, s: Structure) -> Scene:
+    """Cotangents of tiles, added by image (and over all tiles, for the only camera of a group)."""
+    assert s.tiles is not None
+    image, n = s.tiles.image.reshape(-1), scene.centre.shape[0]
+
+    def of_image(v):
+        return jax.ops.segment_sum(v.reshape(-1, *v.shape[2:]), image, n)
+
+    cameras = tuple(
+        jnp.sum(v, axis=0) if len(g.names) == 1 else of_image(v) for g, v in zip(s.groups, parts.cameras, strict=True)
     )
-    us, uss, b_s = shared_sums(m, s)
-    uss = uss.at[s.weighted, s.weighted].add(j.priors**2)
-    b_s = b_s.at[s.weighted].add(j.priors * r.priors)
-
-    point_rows = jnp.concatenate([j.image_point, r.image[None]])
-    vp = products(point_rows, s.point, s.n_points, is_sorted=True)
-    vp = vp + products(jnp.concatenate([j.control, r.control[None]])[:, None], s.control_point, s.n_points)
-    vp = vp.transpose(1, 2, 0)
-    ws = shared_point_sums(jnp.einsum("qon,bon->nqb", j.image_shared, j.image_point), s)
-
-    each = jnp.arange(len(s.distance_points))
-    spans = jnp.zeros((len(s.distance_points), 3, s.n_points))
-    for end in range(2):
-        spans = spans.at[each, :, s.distance_points[:, end]].add(j.distances[end].T)
-    datum_e = datum[0].transpose(0, 2, 1)
-    rows_e = jnp.concatenate([jnp.zeros((len(each), *datum_e.shape[1:])), datum_e])
-    rows_p = jnp.concatenate([spans, datum[1]])
-    d = jnp.concatenate([r.distances, r.datum])
-    return Normal(
-        u=m[:, :6, :6],
-        us=us,
-        uss=uss,
-        v=vp[:3, :3],
-        w=j.image_eop[:, None, 0] * j.image_point[None, :, 0] + j.image_eop[:, None, 1] * j.image_point[None, :, 1],
-        ws=ws,
-        b=Increments(
-            m[:, :6, -1].T + jnp.einsum("cna,c->an", rows_e, d), b_s, vp[:3, 3] + jnp.einsum("ckp,c->kp", rows_p, d)
-        ),
-        rows_e=rows_e,
-        rows_p=rows_p,
-    )
+    return Scene(of_image(parts.centre), of_image(parts.rotation), cameras)
 
 
-def zero_normal(structure: Structure, n_constraints: int) -> Normal:
-    """No sums at all, in the right shapes."""
-    s, k = structure, len(structure.distance_points) + n_constraints
-    n, q, p = s.n_images, s.n_shared, s.n_points
-    return Normal(
-        u=jnp.zeros((n, 6, 6)),
-        us=jnp.zeros((n, 6, q)),
-        uss=jnp.zeros((q, q)),
-        v=jnp.zeros((3, 3, p)),
-        w=jnp.zeros((6, 3, len(s.image))),
-        ws=jnp.zeros((q, 3, p)),
-        b=Increments(jnp.zeros((6, n)), jnp.zeros(q), jnp.zeros((3, p))),
-        rows_e=jnp.zeros((k, n, 6)),
-        rows_p=jnp.zeros((k, 3, p)),
-    )
-
-
-def multiply_normal(normal: Normal, x: Increments, structure: Structure) -> Increments:
-    """N x, block by block."""
-    n, s = normal, structure
-    mu = jnp.einsum("cna,an->c", n.rows_e, x.eop) + jnp.einsum("ckp,kp->c", n.rows_p, x.points)
-    met = jnp.einsum("akn,kn->na", n.w, x.points[:, s.point])
-    seen = jnp.einsum("akn,an->nk", n.w, x.eop[:, s.image])
-    eop = jnp.einsum("nab,bn->an", n.u, x.eop) + jnp.einsum("naq,q->an", n.us, x.shared)
-    eop += jax.ops.segment_sum(met, s.image, s.n_images).T + jnp.einsum("cna,c->an", n.rows_e, mu)
-    shared = jnp.einsum("naq,an->q", n.us, x.eop) + n.uss @ x.shared + jnp.einsum("qkp,kp->q", n.ws, x.points)
-    points = jnp.einsum("kjp,jp->kp", n.v, x.points) + jnp.einsum("qkp,q->kp", n.ws, x.shared)
-    points += jax.ops.segment_sum(seen, s.point, s.n_points, indices_are_sorted=True).T
-    return Increments(eop, shared, points + jnp.einsum("ckp,c->kp", n.rows_p, mu))
-
-
-def reduce_normal(normal: Normal, damping, structure: Structure) -> Reduced:
-    """Eliminate the points of N + damping I. Unknowns held fixed (zero columns) get a unit diagonal."""
-    n, s = normal, structure
-    v = n.v + (damping + jnp.where(jnp.einsum("iip->ip", n.v) == 0, 1.0, 0.0))[:, None] * jnp.eye(3)[:, :, None]
-    u = n.u + (damping + jnp.where(jnp.einsum("nii->ni", n.u) == 0, 1.0, 0.0))[:, :, None] * jnp.eye(6)
-    uss = n.uss + damping * jnp.eye(s.n_shared)
-    l = _cholesky_3x3(v)  # noqa: E741
-    y = _whiten(n.w, l[:, s.point])
-    ys, yd = _whiten(n.ws, l), _whiten(n.rows_p, l)
-
-    rows = with_zero_row(y)
-    blocks = -pair_sums(rows, s)
-    see = jnp.zeros((s.n_images, 6, s.n_images, 6))
-    see = see.at[s.block_row, :, s.block_column, :].set(blocks, unique_indices=True)
-    each = jnp.arange(s.n_images)
-    see = see.at[each, :, each, :].add(u, unique_indices=True)
-
-    # What meets an image through its points: shared unknowns and mu.
-    across = jnp.concatenate([ys, yd])
-    met = met_by_image(rows, across, s)
-    own = jnp.einsum("akp,bkp->ab", across, across)
-    q, k, size = s.n_shared, len(yd), 6 * s.n_images
-    se = (n.us - met[:, :, :q]).reshape(size, q)
-    a = jnp.block([[see.reshape(size, size), jnp.zeros((size, q))], [se.T, uss - own[:q, :q]]])
-    ge = n.rows_e.transpose(1, 2, 0) - met[:, :, q:]
-    g = jnp.concatenate([ge.reshape(size, k), -own[:q, q:]])
-    kk = jnp.eye(k) + own[q:, q:]
-    if k:
-        a = a + g @ jnp.linalg.solve(kk, g.T)
-    return Reduced(a, g, kk, l)
-
-
-def factor_reduced(reduced: Reduced) -> Float[Array, "reduced reduced"]:
-    """Lower Cholesky factor of A; NaN where A is not positive definite."""
-    return jax.lax.linalg.cholesky(reduced.a, symmetrize_input=False)
-
-
-def solve_factored(
-    normal: Normal, reduced: Reduced, lower: Float[Array, "reduced reduced"], b: Increments, structure: Structure
-) -> Increments:
+def solve_factored(at: At, reduced: Reduced, factor: BandFactor, b: Increments) -> Increments:
     """x of (N + damping I) x = b: down to the reduced unknowns, and back to the points."""
-    n, r, s = normal, reduced, structure
-    z = solve_3x3(r.l, b.points)
-    down = jnp.einsum("akn,kn->na", n.w, z[:, s.point])
-    b_e = b.eop.T - jax.ops.segment_sum(down, s.image, s.n_images)
-    right = jnp.concatenate([b_e.reshape(-1), b.shared - jnp.einsum("qkp,kp->q", n.ws, z)])
-    d = jnp.einsum("ckp,kp->c", n.rows_p, z)
+    z = solve_3x3(reduced.l, b.points)
+    zero = jax.tree.map(jnp.zeros_like, b)
+    down = image_products(at, zero._replace(points=z), "images")
+    right = jnp.concatenate([(b.eop - down.eop).T.reshape(-1), b.shared - down.shared])
+    return solve_reduced(at, reduced, factor, right, jnp.einsum("ckp,kp->c", reduced.rows_p, z), b.points)
+
+
+def solve_reduced(at: At, reduced: Reduced, factor: BandFactor, right, d, b_points) -> Increments:
+    """The same with the right-hand side taken down already: `right` to the reduced unknowns, `d` to mu."""
+    r, n = reduced, at.structure.n_images
     if len(d):
         right = right - r.g @ jnp.linalg.solve(r.k, d)
-    x = jax.scipy.linalg.cho_solve((lower, True), right)
-
-    e, sh = x[: 6 * s.n_images].reshape(s.n_images, 6).T, x[6 * s.n_images :]
-    seen = jnp.einsum("akn,an->nk", n.w, e[:, s.image])
-    b_p = b.points - jax.ops.segment_sum(seen, s.point, s.n_points, indices_are_sorted=True).T
-    b_p = b_p - jnp.einsum("qkp,q->kp", n.ws, sh)
+    x = solve_band(factor, right)
+    e, sh = x[: 6 * n].reshape(n, 6).T, x[6 * n :]
+    across = image_products(at, Increments(e, sh, jnp.zeros_like(b_points)), "points").points
     if len(d):
-        b_p = b_p - jnp.einsum("ckp,c->kp", n.rows_p, jnp.linalg.solve(r.k, r.g.T @ x + d))
-    return Increments(e, sh, solve_3x3(r.l, b_p))
+        across = across + jnp.einsum("ckp,c->kp", r.rows_p, jnp.linalg.solve(r.k, r.g.T @ x + d))
+    return Increments(e, sh, solve_3x3(r.l, b_points - across))
 
 
-def solve_3x3(l: Float[Array, "6 points"], b: Float[Array, "3 points"]) -> Float[Array, "3 points"]:  # noqa: E741
+def solve_3x3(l: Float[Array, "6 *n"], b: Float[Array, "3 *n"]) -> Float[Array, "3 *n"]:  # noqa: E741
     """V^-1 b from the Cholesky factors of V."""
     l11, l21, l22, l31, l32, l33 = l
-    y1, y2, y3 = _whiten(b[None], l)[0]
+    y1, y2, y3 = whiten(b, l)
     x3 = y3 / l33
     x2 = (y2 - l32 * x3) / l22
     return jnp.stack([(y1 - l21 * x2 - l31 * x3) / l11, x2, x3])
 
 
-def _cholesky_3x3(v: Float[Array, "3 3 points"]) -> Float[Array, "6 points"]:
+def cholesky_3x3(v: Float[Array, "3 3 n"]) -> Float[Array, "6 n"]:
     """Closed form: LAPACK on a batch of 3 x 3 matrices is many times slower."""
     l11 = jnp.sqrt(v[0, 0])
     l21, l31 = v[1, 0] / l11, v[2, 0] / l11
@@ -217,9 +239,9 @@ def _cholesky_3x3(v: Float[Array, "3 3 points"]) -> Float[Array, "6 points"]:
     return jnp.stack([l11, l21, l22, l31, l32, jnp.sqrt(v[2, 2] - l31**2 - l32**2)])
 
 
-def _whiten(w: Float[Array, "m 3 n"], l: Float[Array, "6 n"]) -> Float[Array, "m 3 n"]:  # noqa: E741
-    """w L^-T for each of n factors."""
+def whiten(w, l) -> tuple[Array, Array, Array]:  # noqa: E741
+    """L^-1 w, component by component."""
     l11, l21, l22, l31, l32, l33 = l
-    y1 = w[:, 0] / l11
-    y2 = (w[:, 1] - y1 * l21) / l22
-    return jnp.stack([y1, y2, (w[:, 2] - y1 * l31 - y2 * l32) / l33], axis=1)
+    y1 = w[0] / l11
+    y2 = (w[1] - y1 * l21) / l22
+    return y1, y2, (w[2] - y1 * l31 - y2 * l32) / l33

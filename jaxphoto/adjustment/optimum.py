@@ -5,20 +5,25 @@ second derivative (Gauss-Newton part and curvature). H is never formed: conjugat
 preconditioned by the factored normal matrix, from which it differs by the residuals' curvature only.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Int
 
-from jaxphoto.adjustment.local import blocks_at
-from jaxphoto.adjustment.normal import Normal, factor_reduced, reduce_normal, solve_factored, sum_normal
-from jaxphoto.adjustment.residuals import Increments, Residuals, Values, residuals_at
-from jaxphoto.adjustment.solver import BlockDescent, LevenbergMarquardt
+from jaxphoto.adjustment.band import factor_band
+from jaxphoto.adjustment.normal import At, Reduced, residuals_at, solve_factored, square_sum
+from jaxphoto.adjustment.reduced import reduce_normal
+from jaxphoto.adjustment.residuals import Increments, Values
+from jaxphoto.adjustment.shards import EVERYWHERE, along_points, sharded
+from jaxphoto.adjustment.solver import LevenbergMarquardt, System
 from jaxphoto.adjustment.structure import MOUNT_SIZE, STRIP_SIZE, Structure, interior_of
+from jaxphoto.adjustment.tiles import by_tile
 from jaxphoto.collinearity import ExteriorOrientation, image_residual
 
 # The first damping relative to the normal matrix is the square of this: almost Gauss-Newton.
@@ -38,16 +43,6 @@ class Optimum(NamedTuple):
     converged: Bool[Array, ""] | None
 
 
-def linearise(
-    increments: Increments, scale: Increments, values: Values, structure: Structure
-) -> tuple[Normal, Residuals]:
-    """Undamped normal equations and residuals at start + scale * increments."""
-    # Traced once: jit keeps the trace, and everything below uses it again.
-    blocks, residuals = blocks_at(increments, scale, values, structure)
-    datum = (values.datum_eop * scale.eop, values.datum_points * scale.points)
-    return sum_normal(blocks, residuals, datum, structure), residuals
-
-
 def zero_increments(structure: Structure) -> Increments:
     """No change from the start."""
     s = structure
@@ -63,22 +58,49 @@ def unit_scale(structure: Structure) -> Increments:
 @eqx.filter_custom_jvp
 def find_optimum(values: Values, *, structure: Structure, max_steps: int) -> Optimum:
     """Levenberg-Marquardt from the start in `values`. Differentiable in every number of `values`."""
-    zero = zero_increments(structure)
+    return iterate(values, structure, max_steps, np.array(False))[0]
+
+
+def iterate(
+    values: Values, structure: Structure, max_steps: int, only_factor: Bool[Array, ""]
+) -> tuple[Optimum, System, Increments]:
+    """The optimum, and the last system with the scale of its unknowns; or the undamped system at the start.
+
+    The second serves statistics: what was compiled to solve need not be compiled again to factor.
+    """
     scale = jax.tree.map(lambda k: k / _FIRST_DAMPING, typical_scale(values, structure))
-    solver = LevenbergMarquardt(BlockDescent(structure, values, scale), TOLERANCE)
-    fn = jax.jit(lambda y, scale, values: residuals_at(y, scale, values, structure))
+    at_points = along_points(2)
+    system = System(
+        Increments(EVERYWHERE, EVERYWHERE, at_points),
+        Reduced(EVERYWHERE, EVERYWHERE, EVERYWHERE, at_points, EVERYWHERE, along_points(3)),
+        EVERYWHERE,
+        EVERYWHERE,
+    )
+    out = (Optimum(Increments(EVERYWHERE, EVERYWHERE, at_points), EVERYWHERE, EVERYWHERE), system)
+    run = sharded(partial(_iterate, max_steps=max_steps), structure, out)
+    optimum, system = run(values, scale, structure, only_factor)
+    return optimum._replace(increments=jax.tree.map(jnp.multiply, optimum.increments, scale)), system, scale
+
+
+def _iterate(
+    values: Values, scale: Increments, structure: Structure, only_factor: Bool[Array, ""], *, max_steps: int
+) -> tuple[Optimum, System]:
+    """The iteration itself, on what one device holds; increments are scaled."""
+
+    def length(y, args):
+        return jnp.sqrt(square_sum(At(y, *args)))
+
     solution: optx.Solution = optx.least_squares(
-        # The descent differentiates for itself: optimistix is told that there is nothing to linearise.
-        lambda y, args: jax.lax.stop_gradient(fn(y, *args)),
-        solver,
-        zero,
-        args=(scale, values),
+        # The solver differentiates for itself: optimistix is told that there is nothing to linearise.
+        lambda y, args: jax.lax.stop_gradient(length(y, args)),
+        LevenbergMarquardt(structure, values, scale, TOLERANCE, only_factor),
+        jax.tree.map(jnp.zeros_like, scale),
+        args=(scale, values, structure),
         max_steps=max_steps,
         throw=False,
     )
     converged = (solution.result == optx.RESULTS.successful) & jnp.all(jnp.isfinite(solution.value.eop))
-    increments = jax.tree.map(lambda y, k: y * k, solution.value, scale)
-    return Optimum(increments, solution.stats["num_steps"], converged)
+    return Optimum(solution.value, solution.stats["num_steps"], converged), solution.state.system
 
 
 @find_optimum.def_jvp
@@ -88,17 +110,17 @@ def _find_optimum_jvp(primals, tangents, *, structure: Structure, max_steps: int
     unit, at = unit_scale(structure), optimum.increments
 
     def gradient(increments, numbers):
-        residuals, pull = jax.vjp(lambda y: residuals_at(y, unit, numbers, structure), increments)
+        residuals, pull = jax.vjp(lambda y: residuals_at(At(y, unit, numbers, structure)), increments)
         return pull(residuals)[0]
 
     moved, still = eqx.partition(values, jax.tree.map(lambda t: t is not None, direction, is_leaf=lambda t: t is None))
     _, change = jax.jvp(lambda m: gradient(at, eqx.combine(m, still)), (moved,), (direction,))
     scale = typical_scale(values, structure)
-    # The preconditioner belongs to the optimum: `linearise` wants its place in scaled increments.
+    # The preconditioner belongs to the optimum: it wants its place in scaled increments.
     place = jax.tree.map(lambda a, k: jnp.where(k > 0, a / jnp.where(k > 0, k, 1.0), 0.0), at, scale)
-    normal = linearise(place, scale, values, structure)[0]
-    reduced = reduce_normal(normal, 0.0, structure)
-    lower = factor_reduced(reduced)
+    there = At(place, scale, values, structure)
+    reduced, _ = reduce_normal(there, 0.0)
+    factor = factor_band(reduced.a)
 
     right, unravel = ravel_pytree(jax.tree.map(lambda c, k: -c * k, change, scale))
     # One flat vector: the transposed solve wants all of its right-hand side to depend on the direction, or none.
@@ -110,7 +132,7 @@ def _find_optimum_jvp(primals, tangents, *, structure: Structure, max_steps: int
         return flat(jax.tree.map(jnp.multiply, product, scale))
 
     def precondition(b):
-        return flat(solve_factored(normal, reduced, lower, unravel(b), structure))
+        return flat(solve_factored(there, reduced, factor, unravel(b)))
 
     def solve(product, b):
         return jax.scipy.sparse.linalg.cg(product, b, tol=1e-13, maxiter=100, M=precondition)[0]
@@ -144,8 +166,9 @@ def typical_scale(values: Values, structure: Structure) -> Increments:
     """
     s, v = structure, jax.tree.map(jax.lax.stop_gradient, values)
     weight = 1 / v.sigma_xy
-    sigma = jnp.sum(weight > 0) / jnp.sum(weight)
-    corner = jnp.max(jnp.abs(v.xy), axis=1)
+    filled = weight > 0
+    sigma = jnp.sum(filled) / jnp.sum(weight)
+    corner = jnp.max(jnp.where(filled, jnp.abs(v.xy), 0.0), axis=(0, 1, 3, 4))
     vector = jnp.ones(v.shared.shape)
     # A point halfway to the corner and a ray beside it: c moves the one, coefficients the other.
     aim, centre = jnp.array([0.1, 0.1, -1.0]), ExteriorOrientation(jnp.zeros(3), jnp.eye(3))
@@ -160,7 +183,10 @@ def typical_scale(values: Values, structure: Structure) -> Increments:
         stop = group.offset + m * len(group.names)
         vector = vector.at[group.offset : stop].set(jnp.tile(typical, len(group.names)))
     c = v.shared[s.groups[0].offset]
-    depth = jnp.mean(jnp.sqrt(jnp.sum((v.points[:, s.point] - v.position[:, s.image]) ** 2, axis=0)))
+    assert s.tiles is not None
+    apart = by_tile(v.points, s.tiles)[..., None, :] - jnp.moveaxis(v.position[:, s.tiles.image], 0, 2)[..., None]
+    distance = jnp.sqrt(jnp.sum(apart**2, axis=2))
+    depth = jnp.sum(distance * filled[:, :, 0]) / jnp.sum(filled[:, :, 0])
     ground, angle = sigma * depth / c, sigma / c
     eop = jnp.stack([ground, ground, ground, angle, angle, angle])
     seconds = jnp.maximum(jnp.max(jnp.abs(v.time)), 1.0)

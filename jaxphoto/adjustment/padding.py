@@ -1,8 +1,9 @@
-"""Size classes: what is compiled for one block serves every block of similar size.
+"""Layout and size classes: blocks as they are computed with, so that what is compiled serves every block of similar size.
 
-Before it is computed with, a block is padded to the next sizes of a coarse series, at most an eighth larger, with an
-image, a point and rows that nothing depends on: rows of infinite standard deviation, unknowns that are held fixed. The
-results are cropped again. Names stay outside: the padded structure has none.
+Before it is computed with, a block is laid out in tiles (`tiling`) and padded to the next sizes of a coarse series, at
+most an eighth larger, with an image and points that nothing depends on: rows of infinite standard deviation, unknowns
+that are held fixed. The results are cropped again and put back in the block's own order. Names stay outside: the padded
+structure has none.
 """
 
 import dataclasses
@@ -11,26 +12,29 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Int
 
-from jaxphoto.adjustment.lists import chunks_of, rows_by_image
+from jaxphoto.adjustment.band import column_blocks
 from jaxphoto.adjustment.residuals import Residuals, State, Values
-from jaxphoto.adjustment.structure import CameraGroup, Structure
+from jaxphoto.adjustment.structure import CameraGroup, Structure, Tiles
+from jaxphoto.adjustment.tiling import Tiling, order_images, tile_points, tile_shape
 
 
 class Sizes(NamedTuple):
     """How large each kind of list is, in a block or as it is compiled for."""
 
     images: int = 8
-    points: int = 64
-    rows: int = 256
-    pairs: int = 1024
+    bandwidth: int = 8
+    """Largest difference of places of two images that meet."""
+    tiles: int = 8
+    tile_images: int = 4
+    tile_points: int = 8
+    pairs: int = 128
+    """Pairs of images that meet in a tile, in the chunk of tiles that has most."""
     blocks: int = 64
-    chunks: int = 64
-    width: int = 8
-    """Rows of the image that has most."""
+    """Pairs of images that meet anywhere in a chunk, in the chunk that has most."""
     stations: int = 128
     attitudes: int = 128
-    control: int = 128
 
     def __or__(self, other: object) -> "Sizes":
         """What both fit into."""
@@ -41,21 +45,13 @@ LEAST = Sizes()
 """The least sizes worth a class of their own."""
 
 
-def sizes_of(structure: Structure) -> Sizes:
-    """The sizes of a block, with room for the image, the point, the row and the block of images that nothing needs."""
-    s = structure
-    return Sizes(
-        images=s.n_images + 1,
-        points=s.n_points + 1,
-        rows=len(s.image) + 1,
-        pairs=len(s.pair_a),
-        blocks=len(s.block_row) + 1,
-        chunks=len(s.chunk_block),
-        width=s.image_rows.shape[1],
-        stations=len(s.station_image),
-        attitudes=len(s.attitude_image),
-        control=len(s.control_point),
-    )
+class Places(NamedTuple):
+    """Where a block's own images, points and image rows lie in the padded arrays."""
+
+    image: Int[np.ndarray, "images"]
+    point: Int[np.ndarray, "points"]
+    row: Int[np.ndarray, "rows"]
+    """(tile * M + image) * P + point."""
 
 
 def size_class(n: int) -> int:
@@ -64,111 +60,210 @@ def size_class(n: int) -> int:
     return -(-n // step) * step
 
 
-def pad_structure(structure: Structure, sizes: Sizes = LEAST) -> Structure:
-    """The same structure in padded sizes; the last image, point and row are the ones nothing depends on.
+def sizes_of(structure: Structure) -> Sizes:
+    """The sizes of a block, with room for the image and the tile that nothing needs."""
+    return _Layout.of(structure, LEAST, shards=1, dense=False).sizes
 
-    `sizes` are sizes that are wanted at least, such as those of all blocks of a study.
+
+# Tiles are summed in chunks whose products take no more numbers than this.
+_CHUNK = 4_000_000
+
+
+class _Layout(NamedTuple):
+    """Images in order, points in tiles, tiles in chunks."""
+
+    image_place: np.ndarray
+    tiling: Tiling
+    columns: int
+    width: int
+    """Images of a column block."""
+    chunks: int
+    chunk: int
+    lists: tuple[list[np.ndarray], ...]
+    sizes: Sizes
+
+    @classmethod
+    def of(cls, structure: Structure, wanted: Sizes, shards: int, dense: bool) -> "_Layout":
+        s = structure
+        place, bandwidth = order_images(s.image, s.point, s.n_images, s.n_points)
+        image = place[s.image]
+        m, p = tile_shape(image, s.point, s.n_images, s.n_points)
+        m, p = max(m, wanted.tile_images), max(p, wanted.tile_points)
+        tiling = tile_points(image, s.point, s.n_points, m, p)
+        tiles = max(len(tiling.image) + 1, wanted.tiles)
+        images, bandwidth = max(s.n_images + 1, wanted.images), max(bandwidth, wanted.bandwidth)
+        n = size_class(images)
+        columns, width = (1, n) if dense else column_blocks(n, min(n, size_class(bandwidth)))
+        per_shard = -(-tiles // shards)
+        chunks = -(-per_shard * (6 * m) ** 2 // _CHUNK)
+        chunk = size_class(-(-per_shard // chunks))
+        lists = _pair_lists(tiling.image, chunk, width)
+        pairs, blocks = (max((len(v) for v in x), default=0) for x in (lists[0], lists[2]))
+        sizes = Sizes(
+            images, bandwidth, tiles, m, p, pairs, blocks + 1, len(s.station_image), len(s.attitude_image)
+        )
+        return cls(place, tiling, columns, width, shards * chunks, chunk, lists, sizes)
+
+
+def _pair_lists(tile_image: np.ndarray, chunk: int, width: int) -> tuple[list[np.ndarray], ...]:
+    """By chunk: pairs of images of a tile (tile, first, second), their block, and the blocks (see `Tiles`)."""
+    all_pairs, all_blocks, blocks = [], [], []
+    m = tile_image.shape[1]
+    first, second = np.tril_indices(m)
+    for start in range(0, len(tile_image), chunk):
+        own = tile_image[start : start + chunk]
+        a, b = own[:, first], own[:, second]
+        tile, pair = np.nonzero((a >= 0) & (b >= 0))
+        a, b = a[tile, pair].astype(np.int64), b[tile, pair]
+        key = a * (int(own.max(initial=0)) + 1) + b
+        order = np.argsort(key, kind="stable")
+        unique, block = np.unique(key[order], return_inverse=True)
+        row, column = np.divmod(unique, int(own.max(initial=0)) + 1)
+        which = column // width
+        all_pairs.append(np.stack([tile, first[pair], second[pair]], axis=1)[order])
+        all_blocks.append(block)
+        blocks.append(np.stack([which, row - which * width, column % width], axis=1))
+    return all_pairs, all_blocks, blocks
+
+
+def pad_structure(
+    structure: Structure, sizes: Sizes = LEAST, *, shards: int = 1, dense: bool = False
+) -> tuple[Structure, Places]:
+    """The structure in tiles and padded sizes, and where everything went; the last image is the one nothing depends on.
+
+    `sizes` are sizes that are wanted at least, such as those of all blocks of a study; `shards` is the number of
+    devices; `dense` asks for a reduced matrix that is not a band.
     """
-    s = structure
-    images, points, rows, pairs, blocks, n_chunks, width, stations, attitudes, control = map(
-        size_class, sizes_of(s) | LEAST | sizes
-    )
-    lists = rows_by_image(s.image, s.point, images, rows)
-    chunks = chunks_of((s.pair_a, s.pair_b, s.pair_block), rows)
+    s, layout = structure, _Layout.of(structure, sizes, shards, dense)
+    have = layout.sizes | LEAST | sizes
+    m, p = layout.sizes.tile_images, layout.sizes.tile_points
+    n_images, n_chunks = layout.columns * layout.width, layout.chunks
+    pairs, blocks = size_class(have.pairs), size_class(have.blocks)
     # A group without rows is left out of the program, so it stays empty.
-    stations, attitudes = stations * (len(s.station_image) > 0), attitudes * (len(s.attitude_image) > 0)
-    groups = tuple(_pad_group(g, rows, len(s.image)) for g in s.groups)
-    return dataclasses.replace(
+    stations = size_class(have.stations) * (len(s.station_image) > 0)
+    attitudes = size_class(have.attitudes) * (len(s.attitude_image) > 0)
+    tile_image = np.full((n_chunks * layout.chunk, m), n_images - 1, np.int32)
+    own = layout.tiling.image
+    tile_image[: len(own)] = np.where(own >= 0, own, n_images - 1)
+    listed = np.zeros((n_chunks, pairs, 3), np.int32)
+    pair_block = np.full((n_chunks, pairs), blocks - 1, np.int32)
+    # Blocks that are none lie outside the matrix: what is written there is dropped.
+    block = np.tile(np.array([layout.columns, 0, 0], np.int32), (n_chunks, blocks, 1))
+    for k, (pair, which, found) in enumerate(zip(*layout.lists, strict=True)):
+        listed[k, : len(pair)], pair_block[k, : len(pair)], block[k, : len(found)] = pair, which, found
+    # Each elsewhere, so that no two are one.
+    block[:, :, 1] += np.where(block[:, :, 0] == layout.columns, np.arange(blocks), 0)
+    places = Places(layout.image_place, layout.tiling.place.astype(np.int32), layout.tiling.slot)
+    at = places.image
+    n_points = n_chunks * layout.chunk * p
+    padded = dataclasses.replace(
         s,
-        groups=groups,
-        n_images=images,
-        n_points=points,
-        unsort=None if s.unsort is None else _places(np.concatenate([g.rows for g in groups]), rows),
-        image=_pad(s.image, rows, images - 1),
-        point=_pad(s.point, rows, points - 1),
-        pair_a=_pad(s.pair_a, pairs, rows - 1),
-        pair_b=_pad(s.pair_b, pairs, rows - 1),
-        pair_block=_pad(s.pair_block, pairs, blocks - 1),
-        image_rows=_pad(lists["image_rows"].T, width, rows).T,
-        image_points=_pad(lists["image_points"].T, width, points - 1).T,
-        chunk_a=_pad(chunks["chunk_a"], n_chunks, rows),
-        chunk_b=_pad(chunks["chunk_b"], n_chunks, rows),
-        chunk_block=_pad(chunks["chunk_block"], n_chunks, blocks - 1),
-        # Blocks that are none lie, each elsewhere, outside the matrix: what is written there is dropped.
-        block_row=np.append(s.block_row, np.arange(images, images + blocks - len(s.block_row))).astype(np.int32),
-        block_column=_pad(s.block_column, blocks, 0),
-        column=_pad(s.column, images, len(s.free)),
-        mount=_pad(s.mount, images, 0),
-        strip=_pad(s.strip, images, 0),
-        station_image=_pad(s.station_image, stations, images - 1),
+        groups=tuple(_pad_group(g, at, n_images) for g in s.groups),
+        n_images=n_images,
+        n_points=n_points,
+        image=np.zeros(0, np.int32),
+        point=np.zeros(0, np.int32),
+        column=_put(s.column, at, n_images, len(s.free)),
+        mount=_put(s.mount, at, n_images, 0),
+        strip=_put(s.strip, at, n_images, 0),
+        station_image=_pad(at[s.station_image], stations, n_images - 1),
         station_axis=_pad(s.station_axis, stations, 0),
-        attitude_image=_pad(s.attitude_image, attitudes, images - 1),
-        control_point=_pad(s.control_point, control, points - 1),
-        control_axis=_pad(s.control_axis, control, 0),
-        point_class=_pad(s.point_class, points, 0),
-        eop_free=_pad(s.eop_free.T, images, 0.0).T,
-        point_free=_pad(s.point_free.T, points, 0.0).T,
+        attitude_image=_pad(at[s.attitude_image], attitudes, n_images - 1),
+        control_point=np.zeros(0, np.int32),
+        control_axis=np.zeros(0, np.int32),
+        distance_points=places.point[s.distance_points],
+        point_class=_put(s.point_class, places.point, n_points, 0),
+        eop_free=_put(s.eop_free.T, at, n_images, 0.0).T,
+        point_free=_put(s.point_free.T, places.point, n_points, 0.0).T,
         labels=(),
+        tiles=Tiles(
+            image=tile_image.reshape(n_chunks, layout.chunk, m),
+            per_tile=p,
+            pair_tile=listed[..., 0],
+            pair_images=listed[..., 1:],
+            pair_block=pair_block,
+            block=block,
+            columns=layout.columns,
+            shards=shards,
+        ),
     )
+    return padded, places
 
 
-def pad_values(values: Values, structure: Structure, padded: Structure) -> Values:
-    """The numbers of a block in the sizes of its padded structure.
+def pad_values(values: Values, structure: Structure, padded: Structure, places: Places) -> Values:
+    """The numbers of a block in the sizes and the order of its padded structure.
 
-    A row too many is the first row once more, with infinite standard deviation: finite everywhere, and of no weight.
+    Slots that no image row fills have infinite standard deviation: finite everywhere, and of no weight. So do control
+    coordinates that nobody observed.
     """
     v, p = values, padded
-    image, point = structure.image[0], structure.point[0]
-    images, points, rows = p.n_images, p.n_points, len(p.image)
-    stations, attitudes, control = len(p.station_image), len(p.attitude_image), len(p.control_point)
+    assert p.tiles is not None
+    n_images, n_points = p.n_images, p.n_points
+    slots = (*p.tiles.image.shape, p.tiles.per_tile)
+    control = places.point[structure.control_point] + n_points * structure.control_axis
+    stations, attitudes = len(p.station_image), len(p.attitude_image)
+
+    def observed(xy: Any, fill: float) -> Any:
+        rows = _scatter(xy, places.row, int(np.prod(slots)), fill)
+        xp = np if isinstance(rows, np.ndarray) else jnp
+        return xp.moveaxis(rows.reshape(2, *slots), 0, 2)
+
+    def images(x: Any, fill: Any) -> Any:
+        return _scatter(x, places.image, n_images, fill)
+
+    def points(x: Any, fill: Any) -> Any:
+        return _scatter(x, places.point, n_points, fill)
+
     return Values(
-        xy=_last(v.xy, rows, v.xy[:, :1]),
-        sigma_xy=_last(v.sigma_xy, rows, np.inf),
+        xy=observed(v.xy, 0.0),
+        sigma_xy=observed(v.sigma_xy, np.inf),
         stations=_last(v.stations, stations, 0.0),
         sigma_stations=_last(v.sigma_stations, stations, np.inf),
-        time=_last(v.time, images, 0.0),
-        velocity=_last(v.velocity, images, 0.0),
-        rate=_last(v.rate, images, 0.0),
-        nominal=_last(v.nominal, images, np.eye(3)[:, :, None]),
+        time=images(v.time, 0.0),
+        velocity=images(v.velocity, 0.0),
+        rate=images(v.rate, 0.0),
+        nominal=images(v.nominal, np.eye(3)[:, :, None]),
         attitudes=_last(v.attitudes, attitudes, 0.0),
         sigma_attitudes=_last(v.sigma_attitudes, attitudes, np.inf),
-        control=_last(v.control, control, 0.0),
-        sigma_control=_last(v.sigma_control, control, np.inf),
+        control=_scatter(v.control, control, 3 * n_points, 0.0).reshape(3, n_points),
+        sigma_control=_scatter(v.sigma_control, control, 3 * n_points, np.inf).reshape(3, n_points),
         distances=v.distances,
         sigma_distances=v.sigma_distances,
         priors=v.priors,
         sigma_priors=v.sigma_priors,
-        position=_last(v.position, images, v.position[:, image : image + 1]),
-        rotation=_last(v.rotation, images, v.rotation[:, :, image : image + 1]),
+        position=images(v.position, v.position[..., :1]),
+        rotation=images(v.rotation, v.rotation[..., :1]),
         shared=v.shared,
-        points=_last(v.points, points, v.points[:, point : point + 1]),
-        datum_eop=_last(v.datum_eop, images, 0.0),
-        datum_points=_last(v.datum_points, points, 0.0),
+        points=points(v.points, v.points[..., :1]),
+        datum_eop=images(v.datum_eop, 0.0),
+        datum_points=points(v.datum_points, 0.0),
     )
 
 
-def crop_state(state: State, structure: Structure) -> State:
-    """The state in the block's own sizes."""
-    n, m = structure.n_images, structure.n_points
+def crop_state(state: State, places: Places) -> State:
+    """The state in the block's own sizes and order."""
     position, rotation, shared, points = map(_still, state)
-    return State(position[:, :n], rotation[:, :, :n], shared, points[:, :m])
+    return State(position[..., places.image], rotation[..., places.image], shared, points[..., places.point])
 
 
-def crop_residuals(residuals: Residuals, structure: Structure) -> Residuals:
-    """Residuals, or what is shaped like them, in the block's own sizes."""
+def crop_residuals(residuals: Residuals, structure: Structure, places: Places) -> Residuals:
+    """Residuals, or what is shaped like them, in the block's own sizes and order."""
     s, r = structure, Residuals(*map(_still, residuals))
+    chunks, tiles, _, m, p = r.image.shape
+    image = r.image.reshape(chunks * tiles, 2, m * p)
+    tile, slot = np.divmod(places.row, m * p)
     return r._replace(
-        image=r.image[:, : len(s.image)],
+        image=image[tile, :, slot].T,
         stations=r.stations[: len(s.station_image)],
         attitudes=r.attitudes[:, : len(s.attitude_image)],
-        control=r.control[: len(s.control_point)],
+        control=r.control[s.control_axis, places.point[s.control_point]],
     )
 
 
-def crop_reduced(matrix: Any, structure: Structure) -> np.ndarray:
-    """A matrix over the reduced unknowns (6 an image, then the shared ones) in the block's own sizes."""
+def crop_reduced(matrix: Any, structure: Structure, places: Places) -> np.ndarray:
+    """A matrix over the reduced unknowns (6 an image, then the shared ones) in the block's own sizes and order."""
     matrix, q = np.asarray(matrix), structure.n_shared
-    kept = np.r_[0 : 6 * structure.n_images, len(matrix) - q : len(matrix)]
+    kept = np.append((6 * places.image[:, None] + np.arange(6)).ravel(), np.arange(len(matrix) - q, len(matrix)))
     return matrix[np.ix_(kept, kept)]
 
 
@@ -183,27 +278,33 @@ def _pad(array: np.ndarray, size: int, fill: float) -> np.ndarray:
     return np.concatenate([array, more])
 
 
+def _put(array: np.ndarray, at: np.ndarray, size: int, fill: float) -> np.ndarray:
+    """`array`'s rows at their places along the first axis."""
+    result = np.full((size, *array.shape[1:]), fill, array.dtype)
+    result[at] = array
+    return result
+
+
+def _scatter(array: Any, at: np.ndarray, size: int, fill: Any) -> Any:
+    """`array` at its places along the last axis, `fill` elsewhere."""
+    xp = jnp if any(isinstance(x, jax.core.Tracer) for x in (array, fill)) else np
+    result = xp.array(xp.broadcast_to(xp.asarray(fill, float), (*array.shape[:-1], size)))
+    if xp is jnp:
+        return result.at[..., at].set(array, unique_indices=True)
+    result[..., at] = array
+    return result
+
+
 def _last(array: Any, size: int, fill: Any) -> Any:
     """`array` with its last axis filled up to `size`."""
-    xp = jnp if any(isinstance(x, jax.core.Tracer) for x in (array, fill)) else np
-    more = xp.broadcast_to(xp.asarray(fill, float), (*array.shape[:-1], size - array.shape[-1]))
-    return xp.concatenate([array, more], axis=-1)
+    return _scatter(array, np.arange(array.shape[-1]), size, fill)
 
 
-def _pad_group(group: CameraGroup, rows: int, n_rows: int) -> CameraGroup:
-    """A group of cameras without their names; where there are several groups, the first has the rows too many."""
-    names = tuple("" for _ in group.names)
-    if group.rows is None:
-        return dataclasses.replace(group, names=names, camera=_pad(group.camera, rows, 0))
-    own = np.append(group.rows, np.arange(n_rows, rows)) if group.offset == 0 else group.rows
-    size = size_class(max(len(own), LEAST.rows))
+def _pad_group(group: CameraGroup, at: np.ndarray, n_images: int) -> CameraGroup:
+    """A group of cameras without their names; images too many have its first camera."""
     return dataclasses.replace(
-        group, names=names, camera=_pad(group.camera, size, 0), rows=_pad(own, size, rows - 1).astype(np.int32)
+        group,
+        names=tuple("" for _ in group.names),
+        camera=_put(group.camera, at, n_images, 0),
+        member=_put(group.member, at, n_images, group.offset == 0),
     )
-
-
-def _places(sequence: np.ndarray, n: int) -> np.ndarray:
-    """Where each of 0 ... n - 1 stands first in `sequence`."""
-    places = np.zeros(n, np.int32)
-    places[sequence[::-1]] = np.arange(len(sequence))[::-1]
-    return places

@@ -2,8 +2,10 @@
 
 from collections.abc import Iterable
 
+import jax.numpy as jnp
 import numpy as np
 
+from jaxphoto.adjustment.band import dense, pivots
 from jaxphoto.adjustment.padding import crop_reduced
 from jaxphoto.adjustment.result import Adjustment
 from jaxphoto.block import Block
@@ -108,16 +110,14 @@ def check_rank(adjusted: Adjustment) -> None:
     """Raise RankError where the normal matrix at the optimum is singular; the message names the unknowns."""
     if adjusted.padded is None or not bool(adjusted.converged):
         return
-    s = adjusted.structure
-    lower = crop_reduced(adjusted.padded.factored.lower, s)
-    a = crop_reduced(adjusted.padded.factored.reduced.a, s)
-    diagonal = np.diagonal(a)
-    pivots = np.diagonal(lower) ** 2 / np.where(diagonal > 0, diagonal, 1.0)
-    if len(pivots) == 0 or pivots.min() > _DEFECT:
+    s, computed = adjusted.structure, adjusted.padded
+    reduced, factor = computed.factored.reduced.a, computed.factored.factor
+    if float(jnp.nanmin(pivots(reduced, factor))) > _DEFECT and bool(jnp.all(jnp.isfinite(factor.corner))):
         return
-    full = np.tril(a) + np.tril(a, -1).T
+    a = crop_reduced(dense(reduced), s, computed.places)
+    diagonal = np.diagonal(a)
     d = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
-    weakest, vectors = np.linalg.eigh(full * d[:, None] * d[None, :])
+    weakest, vectors = np.linalg.eigh(a * d[:, None] * d[None, :])
     null = np.abs(vectors[:, 0])
     names = [f"exterior[{i}].{n}" for i in adjusted.block.images for n in ("X", "Y", "Z", "rx", "ry", "rz")]
     names += list(s.labels)

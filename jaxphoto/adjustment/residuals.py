@@ -11,13 +11,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxphoto.adjustment.structure import MOUNT_SIZE, STRIP_SIZE, Structure, interior_of
-from jaxphoto.collinearity import ExteriorOrientation, image_residual
+from jaxphoto.adjustment.structure import MOUNT_SIZE, STRIP_SIZE, Structure
 from jaxphoto.georeferencing import (
     Exposure,
     Mount,
     StripBias,
-    apparent_point,
     attitude_residual,
     recorded_attitude,
     sensor_position,
@@ -34,7 +32,10 @@ class Increments(NamedTuple):
 
 
 class Residuals(NamedTuple):
-    """Observed minus computed over sigma, by group. `datum` holds the constraints that observations leave open."""
+    """Observed minus computed over sigma, by group. `datum` holds the constraints that observations leave open.
+
+    Of a padded structure, `image` is (chunks, tiles, 2, m, p), as `Values.xy`, and `control` (3, points).
+    """
 
     image: Float[Array, "2 rows"]
     stations: Float[Array, "stations"]
@@ -57,7 +58,10 @@ GROUPS = {
 
 
 class Values(eqx.Module):
-    """The numbers of an adjustment, batch-last: observations, sigmas, start, and constraint rows of the datum."""
+    """The numbers of an adjustment, batch-last: observations, sigmas, start, and constraint rows of the datum.
+
+    Of a padded structure, `xy` is (chunks, tiles, 2, m, p) and `control` (3, points), each with its sigmas.
+    """
 
     xy: Float[Array, "2 rows"]
     sigma_xy: Float[Array, "2 rows"]
@@ -100,20 +104,13 @@ def state_at(increments: Increments, scale: Increments, values: Values, structur
     return State(
         values.position + eop[:3],
         rotation,
-        values.shared.at[structure.free].add(increments.shared * scale.shared, unique_indices=True),
+        jnp.asarray(values.shared).at[structure.free].add(increments.shared * scale.shared, unique_indices=True),
         values.points + increments.points * scale.points,
     )
 
 
-def residuals_at(increments: Increments, scale: Increments, values: Values, structure: Structure) -> Residuals:
-    """All residuals over their sigmas, at start + scale * increments."""
-    others = other_residuals(increments, scale, values, structure)
-    state = state_at(increments, scale, values, structure)
-    return others._replace(image=image_residuals(state, values, structure) / values.sigma_xy)
-
-
 def other_residuals(increments: Increments, scale: Increments, values: Values, structure: Structure) -> Residuals:
-    """All residuals but those of the image rows, which are left empty."""
+    """All residuals but those of the image rows, which are left empty (for them see `normal.residuals_at`)."""
     state = state_at(increments, scale, values, structure)
     stations, attitudes, control, distances = georeferencing_residuals(state, values, structure)
     datum = jnp.einsum("kci,ci->k", values.datum_eop * scale.eop, increments.eop)
@@ -128,34 +125,6 @@ def other_residuals(increments: Increments, scale: Increments, values: Values, s
         priors,
         datum,
     )
-
-
-def image_residuals(state: State, values: Values, structure: Structure) -> Float[Array, "2 rows"]:
-    """Collinearity residuals in mm, one group of cameras at a time."""
-    parts = []
-    for group in structure.groups:
-        rows = slice(None) if group.rows is None else group.rows
-        n, m = len(group.names), group.treedef.num_leaves
-        table = state.shared[group.offset : group.offset + n * m].reshape(n, m)
-        columns, axis = (list(table[0]), None) if n == 1 else (list(table[group.camera].T), -1)
-
-        def one(parameters, position, rotation, point, xy, group=group):
-            exterior = ExteriorOrientation(position, rotation)
-            aim = apparent_point(position, point, structure.corrections)
-            return image_residual(interior_of(group, parameters), exterior, aim, xy)
-
-        image, point = structure.image[rows], structure.point[rows]
-        parts.append(
-            jax.vmap(one, in_axes=(axis, -1, -1, -1, -1), out_axes=-1)(
-                columns,
-                state.position[:, image],
-                state.rotation[:, :, image],
-                state.points[:, point],
-                values.xy[:, rows],
-            )
-        )
-    joined = jnp.concatenate(parts, axis=1) if len(parts) > 1 else parts[0]
-    return joined if structure.unsort is None else joined[:, structure.unsort]
 
 
 def georeferencing_residuals(state: State, values: Values, structure: Structure) -> tuple[Array, ...]:
@@ -182,7 +151,8 @@ def georeferencing_residuals(state: State, values: Values, structure: Structure)
         stations = jax.vmap(station)(structure.station_image, structure.station_axis, values.stations)
     if len(structure.attitude_image):
         attitudes = jax.vmap(attitude, in_axes=(0, -1), out_axes=-1)(structure.attitude_image, values.attitudes)
-    control = values.control - state.points[structure.control_axis, structure.control_point]
+    padded = structure.tiles is not None
+    control = values.control - state.points[() if padded else (structure.control_axis, structure.control_point)]
     if len(structure.distance_points):
         a, b = structure.distance_points.T
         distances = values.distances - jnp.sqrt(jnp.sum((state.points[:, a] - state.points[:, b]) ** 2, axis=0))

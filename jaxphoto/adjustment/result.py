@@ -6,7 +6,9 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxphoto.adjustment.normal import Normal, Reduced
+from jaxphoto.adjustment.band import BandFactor
+from jaxphoto.adjustment.normal import Reduced
+from jaxphoto.adjustment.padding import Places
 from jaxphoto.adjustment.residuals import GROUPS, Increments, Residuals, Values
 from jaxphoto.adjustment.structure import Structure
 from jaxphoto.arrays import Numbers
@@ -31,20 +33,20 @@ class Outcome(enum.Enum):
 class Factored(eqx.Module):
     """The normal equations at the optimum in scaled increments, undamped, factored: all statistics come from here."""
 
-    normal: Normal
     reduced: Reduced
-    lower: Float[Array, "reduced reduced"]
+    factor: BandFactor
     scale: Increments
     n_constraints: int = eqx.field(static=True)
-    """Constraints of the datum: the last of `normal`'s rows."""
+    """Constraints of the datum: the last of the rows of D."""
 
 
 class Padded(eqx.Module):
-    """The adjustment as it was computed: everything in the sizes of `padding.pad_structure`."""
+    """The adjustment as it was computed: everything in the sizes and order of `padding.pad_structure`."""
 
     structure: Structure
     values: Values
     factored: Factored
+    places: Places
 
 
 class Adjustment(eqx.Module):

@@ -1,11 +1,11 @@
 """The structure of a block's normal equations: who meets whom, made once on the host as index arrays.
 
     unknowns    eop (6 per image: X, Y, Z, small rotation), shared (interior orientation, mounts, strips; only what
-                is not FIXED), points (3 per point)
+                is not FIXED; interior orientations first), points (3 per point)
     colours     each image touches few shared unknowns; unknowns of different cameras, mounts or strips carry the
                 same colour, so one seed differentiates all of them at once
-    pairs       two image rows of one point fill one 6 x 6 block of the reduced normal matrix; the list is sorted
-                by block, so the sum over points is a sorted segment sum
+    tiles       points with the images that see them, see `tiling`; laid out by `padding.pad_structure`, which also
+                puts images and points in the order of the tiles: a padded structure is what is computed with
 
 All arrays are arguments of the compiled functions, never constants in them: a new block of the same shapes
 compiles nothing.
@@ -17,9 +17,9 @@ from collections.abc import Iterable
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
-from jaxphoto.adjustment.lists import check_rows, chunks_of, pairs_of, point_classes, rows_by_image
+from jaxphoto.adjustment.tiling import check_rows
 from jaxphoto.block import Block
 from jaxphoto.camera import InteriorOrientation, parameter_names
 from jaxphoto.georeferencing import Corrections, Mount, StripBias
@@ -32,11 +32,35 @@ class CameraGroup(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
     treedef: jax.tree_util.PyTreeDef = eqx.field(static=True)
     offset: int = eqx.field(static=True)
-    camera: Int[np.ndarray, "rows"]
-    """Camera (within the group) of each of the group's image rows."""
+    camera: Int[np.ndarray, "images"]
+    """Camera (within the group) of each image; 0 where the image's camera is of another group."""
+    member: Bool[np.ndarray, "images"]
+    """Whether the image's camera is of this group."""
     free_leaves: tuple[int, ...] = eqx.field(static=True)
-    rows: Int[np.ndarray, "rows"] | None
-    """The group's image rows, or None where there is one group and they are all rows."""
+
+
+class Tiles(eqx.Module):
+    """The tiles of a padded structure, and the lists that bring their sums to the reduced normal matrix.
+
+    Tiles are cut into equal chunks (leading axis), so that the sums of one chunk are all that is held at a time. Empty
+    slots have the last image, which nothing depends on.
+    """
+
+    image: Int[np.ndarray, "chunks tiles m"]
+    per_tile: int = eqx.field(static=True)
+    """Points of a tile, P."""
+    pair_tile: Int[np.ndarray, "chunks pairs"]
+    """Tile within its chunk of each pair of images of a tile that meet (first image not before second)."""
+    pair_images: Int[np.ndarray, "chunks pairs 2"]
+    """The two within the tile."""
+    pair_block: Int[np.ndarray, "chunks pairs"]
+    """Which of the chunk's blocks the pair adds to; sorted."""
+    block: Int[np.ndarray, "chunks blocks 3"]
+    """Column block of the band, and image row (of two column blocks) and image column in it."""
+    columns: int = eqx.field(static=True)
+    """Column blocks of the reduced matrix, K."""
+    shards: int = eqx.field(static=True)
+    """Devices that the chunks are dealt out to, in equal parts."""
 
 
 class Structure(eqx.Module):
@@ -48,24 +72,14 @@ class Structure(eqx.Module):
     n_images: int = eqx.field(static=True)
     n_points: int = eqx.field(static=True)
     corrections: Corrections = eqx.field(static=True)
+    n_interior: int = eqx.field(static=True)
+    """Shared unknowns that belong to cameras: the first ones."""
     n_image_colours: int = eqx.field(static=True)
     n_colours: int = eqx.field(static=True)
     n_classes: int = eqx.field(static=True)
-    unsort: Int[np.ndarray, "rows"] | None
     image: Int[np.ndarray, "rows"]
+    """Image and point of each image row. Empty in a padded structure, whose rows are the slots of its tiles."""
     point: Int[np.ndarray, "rows"]
-    pair_a: Int[np.ndarray, "pairs"]
-    pair_b: Int[np.ndarray, "pairs"]
-    pair_block: Int[np.ndarray, "pairs"]
-    image_rows: Int[np.ndarray, "images most"]
-    """Image rows of each image, padded with the number of rows."""
-    image_points: Int[np.ndarray, "images most"]
-    """Their points."""
-    chunk_a: Int[np.ndarray, "chunks size"]
-    chunk_b: Int[np.ndarray, "chunks size"]
-    chunk_block: Int[np.ndarray, "chunks"]
-    block_row: Int[np.ndarray, "blocks"]
-    block_column: Int[np.ndarray, "blocks"]
     free: Int[np.ndarray, "shared"]
     """Index, in the vector of all shared parameters, of each shared unknown."""
     column: Int[np.ndarray, "images colours"]
@@ -77,6 +91,8 @@ class Structure(eqx.Module):
     station_axis: Int[np.ndarray, "stations"]
     attitude_image: Int[np.ndarray, "attitudes"]
     control_point: Int[np.ndarray, "control"]
+    """Point and axis of each observed control coordinate. Empty in a padded structure: there every coordinate has a
+    value and a standard deviation."""
     control_axis: Int[np.ndarray, "control"]
     distance_points: Int[np.ndarray, "distances 2"]
     point_class: Int[np.ndarray, "points"]
@@ -86,6 +102,8 @@ class Structure(eqx.Module):
     point_free: Float[np.ndarray, "3 points"]
     labels: tuple[str, ...] = eqx.field(static=True)
     """Parameter path of each shared unknown, such as `interior[kodak].c_mm`."""
+    tiles: Tiles | None
+    """Of a padded structure."""
 
     @property
     def n_shared(self) -> int:
@@ -112,7 +130,9 @@ def structure_of(block: Block, priors: Unknowns) -> Structure:
     check_rows(image, point)
     camera_names = np.array(block.image_camera)
 
-    groups, unsort = _groups(block, camera_names[image])
+    groups = _groups(block, camera_names)
+    if len(np.unique(np.asarray(block.control.who) * 3 + np.asarray(block.control.axis))) < len(block.control.who):
+        raise ValueError("control holds a coordinate of a point twice: keep one row of each")
     entries = _shared_entries(block, priors, groups)
     mount_offset = sum(len(g.names) * g.treedef.num_leaves for g in groups)
     free = np.array([k for k, e in enumerate(entries) if e.prior is not FIXED], dtype=np.int32)
@@ -135,13 +155,12 @@ def structure_of(block: Block, priors: Unknowns) -> Structure:
             for j in of_owner.get(kind + name, ()):
                 column[i, colour[j]] = j
 
-    pairs = pairs_of(image, point)
     point_free = np.ones((3, len(block.points))) * (priors.points is not FIXED)
     point_free[block.fixed.axis, block.fixed.who] = 0.0
     eop_free = np.ones((6, len(block.images)))
     eop_free[:3] *= priors.exterior.position is not FIXED
     eop_free[3:] *= priors.exterior.camera_from_object is not FIXED
-    classes = point_classes(np.asarray(block.distances.points), len(block.points))
+    classes = _point_classes(np.asarray(block.distances.points), len(block.points))
     return Structure(
         groups=groups,
         mount_offset=mount_offset,
@@ -149,19 +168,12 @@ def structure_of(block: Block, priors: Unknowns) -> Structure:
         n_images=len(block.images),
         n_points=len(block.points),
         corrections=block.corrections,
+        n_interior=int((free < mount_offset).sum()),
         n_image_colours=counts[0],
         n_colours=sum(counts),
         n_classes=int(classes.max(initial=0)) + 1,
-        unsort=unsort,
         image=image.astype(np.int32),
         point=point.astype(np.int32),
-        pair_a=pairs[0],
-        pair_b=pairs[1],
-        pair_block=pairs[2],
-        **rows_by_image(image, point, len(block.images), len(image)),
-        **chunks_of(pairs[:3], len(image)),
-        block_row=pairs[3],
-        block_column=pairs[4],
         free=free,
         column=column,
         colour=colour,
@@ -178,6 +190,7 @@ def structure_of(block: Block, priors: Unknowns) -> Structure:
         eop_free=eop_free,
         point_free=point_free,
         labels=tuple(entries[k].label for k in free),
+        tiles=None,
     )
 
 
@@ -199,21 +212,20 @@ def _is_prior(x: object) -> bool:
     return isinstance(x, Weighted)
 
 
-def _groups(block: Block, row_camera: np.ndarray) -> tuple[tuple[CameraGroup, ...], np.ndarray | None]:
+def _groups(block: Block, image_camera: np.ndarray) -> tuple[CameraGroup, ...]:
     by_model: dict[jax.tree_util.PyTreeDef, list[str]] = {}
     for name, interior in block.start.unknowns.interior.items():
         by_model.setdefault(jax.tree.structure(interior), []).append(name)
-    groups, offset, sequence = [], 0, []
+    groups, offset = [], 0
     for treedef, names in by_model.items():
-        place = {name: k for k, name in enumerate(names)}
-        rows = np.flatnonzero(np.isin(row_camera, names)).astype(np.int32)
+        member = np.isin(image_camera, names)
         ordered = np.array(sorted(names))
-        camera = np.array([place[n] for n in ordered], np.int32)[np.searchsorted(ordered, row_camera[rows])]
-        groups.append(CameraGroup(tuple(names), treedef, offset, camera, (), rows if len(by_model) > 1 else None))
+        place = np.array([names.index(n) for n in ordered], np.int32)
+        camera = np.zeros(len(image_camera), np.int32)
+        camera[member] = place[np.searchsorted(ordered, image_camera[member])]
+        groups.append(CameraGroup(tuple(names), treedef, offset, camera, member, ()))
         offset += len(names) * treedef.num_leaves
-        sequence.append(rows)
-    unsort = np.argsort(np.concatenate(sequence)).astype(np.int32) if len(groups) > 1 else None
-    return tuple(groups), unsort
+    return tuple(groups)
 
 
 def _with_free(group: CameraGroup, free: np.ndarray) -> CameraGroup:
@@ -221,6 +233,21 @@ def _with_free(group: CameraGroup, free: np.ndarray) -> CameraGroup:
     m = group.treedef.num_leaves
     own = free[(free >= group.offset) & (free < group.offset + m * len(group.names))] - group.offset
     return dataclasses.replace(group, free_leaves=tuple(sorted({int(k) % m for k in own})))
+
+
+def _point_classes(pairs: np.ndarray, n_points: int) -> np.ndarray:
+    """Greedy colouring: two points joined by a distance lie in different classes."""
+    classes = np.zeros(n_points, np.int32)
+    neighbours: dict[int, set[int]] = {}
+    for a, b in pairs:
+        neighbours.setdefault(int(a), set()).add(int(b))
+        neighbours.setdefault(int(b), set()).add(int(a))
+    done: set[int] = set()
+    for p, around in neighbours.items():
+        taken = {int(classes[q]) for q in around & done}
+        classes[p] = next(k for k in range(len(taken) + 1) if k not in taken)
+        done.add(p)
+    return classes
 
 
 def _shared_entries(block: Block, priors: Unknowns, groups: tuple[CameraGroup, ...]) -> list[_Entry]:

@@ -8,6 +8,7 @@ from jaxphoto.camera.distortion import (
     Balanced,
     Brown,
     Brown14,
+    BundlerRadial,
     Ebner,
     Gruen,
     PpsRadial,
@@ -34,9 +35,9 @@ from jaxphoto.camera.principal_points import (
 from jaxphoto.camera.sensor import Sensor
 
 __all__ = [
-    "DISTORTIONS", "AbstractDistortion", "AffineBrown", "Balanced", "Brown", "Brown14", "ConversionError", "Ebner",
-    "Gruen", "InteriorOrientation", "PpsRadial", "PrincipalPoints", "RadialPolynomial", "Sensor", "Smac",
-    "constant_names", "conversion_error", "decentring_from_symmetry", "get_parameter", "invert", "needed_constants",
-    "parameter_names", "principal_points", "rebalance", "rebalance_covariance", "set_parameter",
+    "DISTORTIONS", "AbstractDistortion", "AffineBrown", "Balanced", "Brown", "Brown14", "BundlerRadial",
+    "ConversionError", "Ebner", "Gruen", "InteriorOrientation", "PpsRadial", "PrincipalPoints", "RadialPolynomial",
+    "Sensor", "Smac", "constant_names", "conversion_error", "decentring_from_symmetry", "get_parameter", "invert",
+    "needed_constants", "parameter_names", "principal_points", "rebalance", "rebalance_covariance", "set_parameter",
     "symmetry_from_decentring",
 ]  # fmt: skip

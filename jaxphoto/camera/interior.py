@@ -1,6 +1,7 @@
 """Interior orientation: principal distance, principal point and a distortion."""
 
 import dataclasses
+from collections.abc import Callable
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,7 +13,8 @@ from jaxphoto.camera.distortion import AbstractDistortion, Brown, invert
 class InteriorOrientation(eqx.Module):
     """Principal distance c > 0, principal point (x_p, y_p) and distortion, all in mm on the image.
 
-    `ideal = distortion.ideal_from_measured(measured - (x_p, y_p))` (docs/conventions.md).
+    `ideal = distortion.ideal_from_measured(measured - (x_p, y_p))`; for a `normalised` distortion both are divided by c
+    (docs/conventions.md).
     """
 
     c: Float[Array, ""] | float
@@ -22,22 +24,30 @@ class InteriorOrientation(eqx.Module):
 
     def ideal_from_measured(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
         """Ideal image coordinate (mm, from the principal point) of a measured one (mm, from the centre)."""
-        return self.distortion.ideal_from_measured(xy - self.principal_point)
+        return self._in_mm(self.distortion.ideal_from_measured, xy - self.principal_point)
 
     def measured_from_ideal(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
         """Measured image coordinate (mm, from the centre) of an ideal one (mm, from the principal point)."""
-        return self.distortion.measured_from_ideal(xy) + self.principal_point
+        return self._in_mm(self.distortion.measured_from_ideal, xy) + self.principal_point
+
+    def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
+        """The distortion's own direction (see its `domain`), of one coordinate in mm from the principal point."""
+        return self._in_mm(self.distortion.closed_form, xy)
 
     def valid(self, xy: Float[Array, "2"]) -> Bool[Array, ""]:
         """Whether the ideal coordinate `xy` lies in the range in which the distortion can be inverted."""
         if self.distortion.domain == "ideal":
             return jnp.array(True)
-        return invert(self.distortion, xy)[1]
+        return invert(self.distortion, xy / self.c if self.distortion.normalised else xy)[1]
 
     @property
     def principal_point(self) -> Float[Array, "2"]:
         """(x_p, y_p) in mm."""
         return jnp.stack([jnp.asarray(self.x_p), jnp.asarray(self.y_p)])
+
+    def _in_mm(self, of_model: Callable, xy: Float[Array, "2"]) -> Float[Array, "2"]:
+        """A map of the distortion, which has a unit of its own, as one of millimetres."""
+        return self.c * of_model(xy / self.c) if self.distortion.normalised else of_model(xy)
 
 
 def parameter_names(interior: InteriorOrientation) -> tuple[str, ...]:

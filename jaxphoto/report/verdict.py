@@ -96,5 +96,5 @@ def _folds(adjusted: Adjustment, name: str, sensor: Sensor) -> bool:
     interior = adjusted.unknowns.interior[name]
     corner = np.array([sensor.width_mm, sensor.height_mm]) / 2
     r = np.linspace(0.0, 1.0, 65)[:, None] * corner
-    out = np.asarray(jax.vmap(interior.distortion.closed_form)(jnp.asarray(r)))
+    out = np.asarray(jax.vmap(interior.closed_form)(jnp.asarray(r)))
     return bool((np.diff(np.linalg.norm(out, axis=1)) <= 0).any())

@@ -1,13 +1,13 @@
 """Cofactors and covariances of all unknowns, from the factor of the reduced normal matrix.
 
-With S~ = [S g; g' -K] the reduced matrix bordered by the few rows that couple points (see adjustment/normal.py) and
-W~ = [W; Ws; D] what a point p meets,
+With S~ = [S g; g' -K] the reduced matrix bordered by the few rows that couple points (see adjustment/normal.py),
+V = L L' and F = [W; Ws; D] L^-T what a point p meets, whitened,
 
-    Q~    = S~^-1                            exterior and interior orientation, mounts, strips
-    Q_pr  = -V^-1 W~' Q~                     points with the former, only where they met
-    Q_pp  = V^-1 - Q_pr W~ V^-1              3 x 3 a point
+    Q~    = S~^-1                                   exterior and interior orientation, mounts, strips
+    Q_pp  = L^-T (I + F' Q~ F) L^-1                 3 x 3 a point
+    j Q j' = z'z + (j_r - F z)' Q~ (j_r - F z)      of an image row with columns j_r and j_p, z = L^-1 j_p'
 
-The full matrix is never inverted. In a free network the part along the open motions, which the constraints of the
+summed tile by tile. The full matrix is never inverted. In a free network the part along the open motions, which the constraints of the
 datum hold, is subtracted: what remains is the covariance under inner (or minimal) constraints.
 """
 
@@ -20,10 +20,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxphoto.adjustment import Adjustment
-from jaxphoto.adjustment.normal import solve_3x3, solve_factored
+from jaxphoto.adjustment.band import invert_band
+from jaxphoto.adjustment.normal import At, solve_factored
+from jaxphoto.adjustment.optimum import weigh_datum
 from jaxphoto.adjustment.padding import crop_reduced
-from jaxphoto.adjustment.residuals import Increments
+from jaxphoto.adjustment.reduced import OtherRows, other_rows, tile_numbers, tile_parts
+from jaxphoto.adjustment.residuals import Increments, Values
 from jaxphoto.adjustment.result import Factored
+from jaxphoto.adjustment.shards import EVERYWHERE, TILES, sharded
 from jaxphoto.adjustment.structure import Structure
 from jaxphoto.arrays import Numbers
 from jaxphoto.compiling import run_compiled
@@ -38,13 +42,11 @@ EOP_NAMES: dict[str, tuple[str, ...]] = {
 
 
 class Cofactors(NamedTuple):
-    """Cofactors in scaled increments: reduced unknowns, points, and points with what they met."""
+    """Cofactors in scaled increments: reduced unknowns, points; and what image rows see of them, j Q j'."""
 
     reduced: Float[Array, "reduced reduced"]
     points: Float[Array, "points 3 3"]
-    point_eop: Float[Array, "rows 3 6"]
-    """Of each image row's point with its image."""
-    point_shared: Float[Array, "points 3 shared"]
+    image_rows: Float[Array, "chunks tiles 2 m p"]
 
 
 class Covariance(eqx.Module):
@@ -92,13 +94,14 @@ def covariance(adjusted: Adjustment, rotations: Rotations = "omega_phi_kappa") -
     if rotations not in EOP_NAMES:
         raise ValueError(f"rotations is one of {', '.join(EOP_NAMES)}, got {rotations!r}")
     padded = adjusted.computed
-    cofactors = run_compiled(_cofactors, (padded.factored, padded.structure), adjusted.seconds, "covariance")
+    given = (padded.values, padded.factored, padded.structure)
+    cofactors = run_compiled(_cofactors, given, adjusted.seconds, "covariance")
     arguments = (cofactors, padded.factored.scale, padded.values.rotation, rotations)
     matrix, points = run_compiled(_physical, arguments, adjusted.seconds, "covariance")
     labels = [f"exterior[{i}].{n}" for i in adjusted.block.images for n in EOP_NAMES[rotations]]
     return Covariance(
-        matrix=crop_reduced(matrix, adjusted.structure),
-        points=np.asarray(points)[: adjusted.structure.n_points],
+        matrix=crop_reduced(matrix, adjusted.structure, padded.places),
+        points=np.asarray(points)[padded.places.point],
         variance_factor=adjusted.sigma0**2,
         cofactors=cofactors,
         labels=(*labels, *adjusted.structure.labels),
@@ -133,45 +136,67 @@ def _physical(q: Cofactors, scale: Increments, rotation: Float[Array, "3 3 image
 
 
 @eqx.filter_jit
-def _cofactors(factored: Factored, structure: Structure) -> Cofactors:
+def _cofactors(values: Values, factored: Factored, s: Structure) -> Cofactors:
     """All cofactors of one factored block; see the module's head."""
-    s, normal, reduced = structure, factored.normal, factored.reduced
-    n, q, k = 6 * s.n_images, s.n_shared, reduced.g.shape[1]
-    inverse = jax.scipy.linalg.cho_solve((factored.lower, True), jnp.eye(n + q))
+    reduced = factored.reduced
+    inverse = invert_band(factored.factor)
     full = inverse
-    if k:
+    if reduced.g.shape[1]:
         kg = jnp.linalg.solve(reduced.k, reduced.g.T)
         low = inverse @ kg.T
         full = jnp.block([[inverse, low], [low.T, kg @ low - jnp.linalg.inv(reduced.k)]])
-
-    # What every point meets besides its images: shared unknowns and constraints.
-    border = jnp.concatenate([normal.ws, normal.rows_p]).transpose(2, 1, 0)
-    w = normal.w.transpose(2, 1, 0)
-    in_images = full[:n, :n].reshape(s.n_images, 6, s.n_images, 6)
-    # Blocks outside the matrix are padding: what is read in their stead meets rows of zeros.
-    blocks = in_images.at[s.block_row, :, s.block_column, :].get(mode="clip")[s.pair_block]
-    own = jnp.where((s.pair_a == s.pair_b)[:, None, None], 0.0, 1.0)
-    met = jax.ops.segment_sum(jnp.einsum("nkc,ncd->nkd", w[s.pair_a], blocks), s.pair_b, len(s.point))
-    met += jax.ops.segment_sum(own * jnp.einsum("nkc,ndc->nkd", w[s.pair_b], blocks), s.pair_a, len(s.point))
-    to_border = full[:n, n:].reshape(s.n_images, 6, -1)
-    met += jnp.einsum("nkb,ndb->nkd", border[s.point], to_border[s.image])
-    met_border = jax.ops.segment_sum(
-        jnp.einsum("nkc,ncb->nkb", w, to_border[s.image]), s.point, s.n_points, indices_are_sorted=True
-    )
-    met_border += jnp.einsum("pkb,bc->pkc", border, full[n:, n:])
-    l = reduced.l  # noqa: E741
-    point_eop = -_solve(l[:, s.point], met)
-    point_border = -_solve(l, met_border)
-    across = jax.ops.segment_sum(jnp.einsum("nkc,njc->nkj", point_eop, w), s.point, s.n_points, indices_are_sorted=True)
-    across += jnp.einsum("pkb,pjb->pkj", point_border, border)
-    eye = jnp.broadcast_to(jnp.eye(3), (s.n_points, 3, 3))
-    points = _solve(l, (eye - across).transpose(0, 2, 1)).transpose(0, 2, 1)
-
-    result = Cofactors(inverse, points, point_eop, point_border[:, :, :q])
-    return _without_open_motions(result, factored, structure)
+    out = (TILES, TILES)
+    points, rows = sharded(_of_points, s, out)(full, weigh_datum(values, s), factored.scale, s)
+    return _without_open_motions(Cofactors(inverse, points, rows), weigh_datum(values, s), factored, s)
 
 
-def _without_open_motions(q: Cofactors, factored: Factored, s: Structure) -> Cofactors:
+def _of_points(full: Float[Array, "n n"], values: Values, scale: Increments, s: Structure):
+    """Cofactors of points, and j Q j' of image rows."""
+    at = At(jax.tree.map(jnp.zeros_like, scale), scale, values, s)
+    rest: OtherRows = other_rows(at)
+    parts_of = tile_parts(at, 0.0, rest.coupled)
+    n, q, i, k = 6 * s.n_images, s.n_image_colours, s.n_interior, len(rest.coupled)
+    shared = jnp.concatenate([n + jnp.arange(i), n + s.n_shared + jnp.arange(k)])
+
+    def tile(numbers):
+        p = parts_of(numbers)
+        image = numbers[0]
+        m, size = len(image), len(p.b[0])
+        index = jnp.concatenate([(6 * image[:, None] + jnp.arange(6)).reshape(-1), shared])
+        own = full[index[:, None], index]
+        f = p.f[:-1]
+        a = own @ f
+        g = jnp.einsum("rkp,rlp->klp", f.reshape(-1, 3, size), a.reshape(-1, 3, size))
+        inner = jnp.eye(3)[:, :, None] + g
+        half = jnp.stack(_unwhiten(inner, p.l))
+        points = jnp.stack(_unwhiten(half.transpose(1, 0, 2), p.l)).transpose(2, 0, 1)
+
+        # A last row and column of zeros serves colours that mean nothing in an image.
+        own, a = jnp.pad(own, (0, 1)), jnp.pad(a, ((0, 1), (0, 0)))
+        column = jnp.asarray(s.column)[image, :q]
+        column = jnp.where(column < i, 6 * m + column, 6 * m + i + k)
+        touched = jnp.concatenate([6 * jnp.arange(m)[:, None] + jnp.arange(6), column], axis=1)
+        j = jnp.concatenate([p.columns.eop, p.columns.shared]).transpose(2, 0, 1, 3)
+        seen = jnp.einsum("mab,mbn->man", own[touched[:, :, None], touched[:, None, :]], j.reshape(m, 6 + q, -1))
+        rows = jnp.sum(j * seen.reshape(j.shape), axis=1).transpose(1, 0, 2)
+        across = jnp.einsum("mcop,mckp->omkp", j, a[touched].reshape(m, 6 + q, 3, size))
+        rows = rows - 2 * jnp.sum(p.z * across, axis=2)
+        rows = rows + jnp.einsum("omkp,klp,omlp->omp", p.z, inner, p.z)
+        return points, rows
+
+    points, rows = jax.lax.map(lambda chunk: jax.lax.map(tile, chunk), tile_numbers(at, rest))
+    return points.reshape(-1, 3, 3), rows
+
+
+def _unwhiten(w, l):  # noqa: E741
+    """L^-T w, component by component."""
+    l11, l21, l22, l31, l32, l33 = l
+    x3 = w[2] / l33
+    x2 = (w[1] - l32 * x3) / l22
+    return (w[0] - l21 * x2 - l31 * x3) / l11, x2, x3
+
+
+def _without_open_motions(q: Cofactors, values: Values, factored: Factored, s: Structure) -> Cofactors:
     """Subtract E E': what the constraints D of the datum, taken as observations, leave along the motions they hold.
 
     E = (N + D'D)^-1 D' spans those motions exactly, because N does not see them; no motion need be known.
@@ -179,21 +204,14 @@ def _without_open_motions(q: Cofactors, factored: Factored, s: Structure) -> Cof
     defect = factored.n_constraints
     if not defect:
         return q
-    normal = factored.normal
+    reduced, scale = factored.reduced, factored.scale
     rows = Increments(
-        normal.rows_e[-defect:].transpose(0, 2, 1), jnp.zeros((defect, s.n_shared)), normal.rows_p[-defect:]
+        reduced.rows_e[-defect:].transpose(0, 2, 1), jnp.zeros((defect, s.n_shared)), reduced.rows_p[-defect:]
     )
-    e = jax.vmap(lambda row: solve_factored(normal, factored.reduced, factored.lower, row, s))(rows)
+    at = At(jax.tree.map(jnp.zeros_like, scale), scale, values, s)
+    e = jax.vmap(lambda row: solve_factored(at, reduced, factored.factor, row))(rows)
     e_eop, e_shared, e_points = e.eop.transpose(2, 1, 0), e.shared.T, e.points.transpose(2, 1, 0)
     e_reduced = jnp.concatenate([e_eop.reshape(-1, defect), e_shared])
-    return Cofactors(
-        q.reduced - e_reduced @ e_reduced.T,
-        q.points - jnp.einsum("pck,pdk->pcd", e_points, e_points),
-        q.point_eop - jnp.einsum("nck,ndk->ncd", e_points[s.point], e_eop[s.image]),
-        q.point_shared - jnp.einsum("pck,qk->pcq", e_points, e_shared),
+    return q._replace(
+        reduced=q.reduced - e_reduced @ e_reduced.T, points=q.points - jnp.einsum("pck,pdk->pcd", e_points, e_points)
     )
-
-
-def _solve(l: Float[Array, "6 n"], b: Float[Array, "n 3 m"]) -> Float[Array, "n 3 m"]:  # noqa: E741
-    """V^-1 b, column by column."""
-    return jax.vmap(solve_3x3, in_axes=(None, 0), out_axes=0)(l, b.transpose(2, 1, 0)).transpose(2, 1, 0)

@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxphoto.adjustment import Adjustment
-from jaxphoto.adjustment.local import blocks_at
-from jaxphoto.adjustment.normal import solve_factored
-from jaxphoto.adjustment.optimum import zero_increments
+from jaxphoto.adjustment.normal import At, solve_factored
+from jaxphoto.adjustment.optimum import weigh_datum
 from jaxphoto.adjustment.padding import crop_residuals
+from jaxphoto.adjustment.reduced import other_rows
 from jaxphoto.adjustment.residuals import Residuals, Values
 from jaxphoto.adjustment.result import Factored
 from jaxphoto.adjustment.structure import Structure
@@ -31,7 +31,7 @@ def redundancy_numbers(adjusted: Adjustment, covariance: Covariance) -> Residual
     padded = adjusted.computed
     arguments = (padded.values, covariance.cofactors, padded.factored, padded.structure)
     numbers = run_compiled(_redundancy, arguments, adjusted.seconds, "covariance")
-    return crop_residuals(numbers, adjusted.structure)
+    return crop_residuals(numbers, adjusted.structure, padded.places)
 
 
 def normalised_residuals(adjusted: Adjustment, redundancy: Residuals) -> Residuals:
@@ -50,55 +50,45 @@ def normalised_residuals(adjusted: Adjustment, redundancy: Residuals) -> Residua
 @eqx.filter_jit
 def _redundancy(values: Values, q: Cofactors, factored: Factored, s: Structure) -> Residuals:
     scale = factored.scale
-    j = blocks_at(zero_increments(s), scale, values, s)[0]
-    n = 6 * s.n_images
+    at = At(jax.tree.map(jnp.zeros_like, scale), scale, weigh_datum(values, s), s)
+    rest = other_rows(at)
+    j, n = rest.blocks, 6 * s.n_images
     # A last row and column of zeros serves colours that mean nothing in an image.
     shared = jnp.pad(q.reduced[n:, n:], (0, 1))
     eop = q.reduced[:n, :n].reshape(s.n_images, 6, s.n_images, 6)
-    each = jnp.arange(s.n_images)
-    own = eop[each, :, each, :]
     across = jnp.pad(q.reduced[:n, n:].reshape(s.n_images, 6, -1), ((0, 0), (0, 0), (0, 1)))
-    in_image = across[each[:, None], :, s.column].transpose(0, 2, 1)
-    by_colour = shared[s.column[:, :, None], s.column[:, None, :]]
 
     def image_part(a, c, image):
         """Of rows (.., n) that touch an image (a) and its shared unknowns (c): diag(J Q J')."""
-        m = len(c)
-        seen = jnp.einsum("aon,nab,bon->on", a, own[image], a) + 2 * jnp.einsum(
-            "aon,naq,qon->on", a, in_image[image][:, :, :m], c
-        )
-        return seen + jnp.einsum("qon,nqr,ron->on", c, by_colour[image][:, :m, :m], c)
+        column = jnp.asarray(s.column)[image]
+        seen = jnp.einsum("aon,nab,bon->on", a, eop[image, :, image, :], a)
+        with_shared = across[image[:, None], :, column].transpose(0, 2, 1)
+        seen += 2 * jnp.einsum("aon,naq,qon->on", a, with_shared, c)
+        by_colour = shared[column[:, :, None], column[:, None, :]]
+        return seen + jnp.einsum("qon,nqr,ron->on", c, by_colour, c)
 
-    a, b, c = j.image_eop, j.image_point, j.image_shared
-    point_shared = jnp.pad(q.point_shared, ((0, 0), (0, 0), (0, 1)))
-    columns = s.column[s.image][:, : len(c)]
-    with_point = point_shared[s.point[:, None], :, columns]
-    image = image_part(a, c, s.image)
-    image += jnp.einsum("bon,nbd,don->on", b, q.points[s.point], b)
-    image += 2 * jnp.einsum("bon,nba,aon->on", b, q.point_eop, a) + 2 * jnp.einsum("bon,nqb,qon->on", b, with_point, c)
-    control = jnp.einsum("bn,nbd,dn->n", j.control, q.points[s.control_point], j.control)
-    priors = j.priors**2 * jnp.diagonal(shared)[s.weighted]
-    stations = image_part(j.station_eop[:, None], j.station_shared[:, None], s.station_image)[0]
+    own_points = jnp.diagonal(q.points, axis1=1, axis2=2).T
+    stations = image_part(j.station_eop[:, None], j.station_shared[:, None], jnp.asarray(s.station_image))[0]
     return Residuals(
-        image=1 - image,
+        image=1 - q.image_rows,
         stations=1 - stations,
-        attitudes=1 - image_part(j.attitude_eop, j.attitude_shared, s.attitude_image),
-        control=1 - control,
-        distances=1 - _distances(j.distances, factored, s),
-        priors=1 - priors,
+        attitudes=1 - image_part(j.attitude_eop, j.attitude_shared, jnp.asarray(s.attitude_image)),
+        control=1 - rest.control**2 * own_points,
+        distances=1 - _distances(j.distances, at, factored),
+        priors=1 - j.priors**2 * jnp.diagonal(shared)[s.weighted],
         datum=jnp.zeros(values.datum_eop.shape[0]),
     )
 
 
-def _distances(ends: jax.Array, factored: Factored, s: Structure) -> jax.Array:
+def _distances(ends: jax.Array, at: At, factored: Factored) -> jax.Array:
     """diag(J Q J') of the distances, by one solve each: they join two points that never met otherwise."""
+    s, zero = at.structure, at.increments
 
     def one(k):
-        points = jnp.zeros((3, s.n_points))
+        points = jnp.zeros_like(zero.points)
         for end in range(2):
             points = points.at[:, s.distance_points[k, end]].add(ends[end, :, k])
-        b = zero_increments(s)._replace(points=points)
-        x = solve_factored(factored.normal, factored.reduced, factored.lower, b, s)
+        x = solve_factored(at, factored.reduced, factored.factor, zero._replace(points=points))
         return jnp.sum(points * x.points)
 
     if not len(s.distance_points):

@@ -10,38 +10,56 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from jaxphoto.adjustment.adjust import concrete
-from jaxphoto.adjustment.colouring import Jacobian
+from jaxphoto.adjustment.band import factor_band
 from jaxphoto.adjustment.datum import close_datum
-from jaxphoto.adjustment.local import blocks_at
-from jaxphoto.adjustment.normal import factor_reduced, multiply_normal, reduce_normal, solve_factored, sum_normal
+from jaxphoto.adjustment.normal import At, gradient, image_products, residuals_at, solve_factored
 from jaxphoto.adjustment.optimum import typical_scale, weigh_datum, zero_increments
-from jaxphoto.adjustment.residuals import Increments, residuals_at
+from jaxphoto.adjustment.padding import crop_residuals, pad_structure, pad_values
+from jaxphoto.adjustment.reduced import OtherRows, other_rows, reduce_normal, tile_numbers, tile_parts
+from jaxphoto.adjustment.residuals import Increments
 from jaxphoto.adjustment.structure import structure_of
+from jaxphoto.adjustment.tiles import Columns
 from jaxphoto.adjustment.values import values_of, with_datum
 from tests.blocks import adjusted
 
 
-def prepared(block):
-    """Structure and values at the start, with the constraints of the datum."""
+def with_constraints(block):
+    """Values and structure at the start, in the block's own order, with the constraints of the datum."""
     structure = structure_of(block, block.priors)
     values = values_of(block, block.start.unknowns, block.priors, structure)
     constraints = close_datum(block, concrete(values, block), structure)
     return with_datum(values, constraints.eop, constraints.points), structure
 
 
+def prepared(block, **layout):
+    """The same, padded, and where everything went."""
+    values, structure = with_constraints(block)
+    coupled = len(values.datum_eop) + len(structure.distance_points) > 0
+    padded, places = pad_structure(structure, dense=coupled, **layout)
+    return pad_values(values, structure, padded, places), padded, places
+
+
 DAMPINGS = (0.0, 0.7)
 
 
 class Dense(NamedTuple):
-    """Dense Jacobian and residuals in scaled increments at an adjustment's result, and the structured code's sums."""
+    """Dense Jacobian and residuals in scaled increments at an adjustment's result, and the structured code's sums.
+
+    Rows and unknowns are in the block's own order.
+    """
 
     jacobian: np.ndarray
     residuals: np.ndarray
-    blocks: Jacobian
+    columns: Columns
+    """Of image rows: eop (6, 2, rows), and so on."""
+    others: OtherRows
     vector: np.ndarray
     products: np.ndarray
-    """The normal matrix times `vector`."""
+    """The image rows' part of the normal matrix times `vector`."""
     gradient: np.ndarray
+    sums: np.ndarray
+    """The same, and the square sum, as the sums of the normal equations have them."""
+    square_sums: np.ndarray
     solutions: np.ndarray
     """x of (N + damping I) x = vector, a row for each of `DAMPINGS`."""
     scale: np.ndarray
@@ -59,7 +77,34 @@ class Dense(NamedTuple):
 def at_optimum(name: str) -> Dense:
     """Of one of the variants of `tests.blocks`."""
     a = adjusted(name)
-    return jax.tree.map(np.asarray, _dense(a.values, a.structure))
+    padded = a.computed
+    whole = jax.tree.map(np.asarray, _dense(padded.values, padded.structure))
+    unknowns, rows = own_order(padded.values, a.structure, padded.structure, padded.places)
+    image = rows[: 2 * len(a.structure.image)].reshape(2, -1)
+    by_row = lambda v: np.stack([w.reshape(-1)[image] for w in np.moveaxis(v, 2, 0)]) if v.shape[2] else np.zeros((0, *image.shape))  # noqa: E731
+    c = whole.columns
+    columns = Columns(
+        c.residual.reshape(-1)[image], *(by_row(np.asarray(v)) for v in (c.eop, c.shared, c.point))
+    )
+    return whole._replace(
+        jacobian=whole.jacobian[np.ix_(rows, unknowns)],
+        residuals=whole.residuals[rows],
+        columns=columns,
+        **{name: getattr(whole, name)[..., unknowns] for name in ("vector", "products", "gradient", "sums", "solutions", "scale")},
+    )
+
+
+def own_order(values, structure, padded, places):
+    """Of the block's own unknowns and residuals, in their order: their places among the padded ones."""
+    zero = zero_increments(padded)
+    flat, back = ravel_pytree(zero)
+    index = back(jnp.arange(len(flat), dtype=float))
+    own = (index.eop[:, places.image], index.shared, index.points[:, places.point])
+    unknowns = np.concatenate([np.ravel(v) for v in own]).astype(int)
+    like = jax.eval_shape(lambda v: residuals_at(At(zero, zero, v, padded)), values)
+    flat, back = ravel_pytree(jax.tree.map(lambda v: np.zeros(v.shape), like))
+    rows = crop_residuals(back(jnp.arange(len(flat), dtype=float)), structure, places)
+    return unknowns, np.concatenate([np.ravel(v) for v in rows]).astype(int)
 
 
 @eqx.filter_jit
@@ -67,79 +112,52 @@ def _dense(values, structure) -> Dense:
     values = weigh_datum(values, structure)
     scale = typical_scale(values, structure)
     zero = zero_increments(structure)
+    at = At(zero, scale, values, structure)
     flat, back = ravel_pytree(zero)
-    fn = jax.jit(lambda y: residuals_at(y, scale, values, structure))
+    fn = jax.jit(lambda y: residuals_at(at._replace(increments=y)))
     residuals, product = jax.linearize(fn, zero)
-    blocks, _ = blocks_at(zero, scale, values, structure)
-    datum = (values.datum_eop * scale.eop, values.datum_points * scale.points)
-    normal = sum_normal(blocks, residuals, datum, structure)
+    rest = other_rows(at)
+    columns = jax.vmap(jax.vmap(lambda n: tile_parts(at, 0.0, rest.coupled)(n).columns))(tile_numbers(at, rest))
+    reduced, right = reduce_normal(at, 0.0)
     flat_scale = ravel_pytree(scale)[0]
     vector = jnp.sin(1.0 + jnp.arange(len(flat))) * (flat_scale > 0)
 
     def solution(damping):
-        reduced = reduce_normal(normal, damping, structure)
-        return ravel_pytree(solve_factored(normal, reduced, factor_reduced(reduced), back(vector), structure))[0]
+        reduced, _ = reduce_normal(at, damping)
+        return ravel_pytree(solve_factored(at, reduced, factor_band(reduced.a), back(vector)))[0]
 
+    b, *_, squares = gradient(at, reduced.l, reduced.rows_p)
     return Dense(
         jacobian=jax.vmap(lambda seed: ravel_pytree(product(back(seed)))[0], out_axes=1)(jnp.eye(len(flat))),
         residuals=ravel_pytree(residuals)[0],
-        blocks=blocks,
+        columns=columns,
+        others=rest,
         vector=vector,
-        products=ravel_pytree(multiply_normal(normal, back(vector), structure))[0],
-        gradient=ravel_pytree(normal.b)[0],
+        products=ravel_pytree(image_products(at, back(vector), "all"))[0],
+        gradient=ravel_pytree(b)[0],
+        sums=ravel_pytree(right.b)[0],
+        square_sums=jnp.stack([squares, right.square_sum]),
         solutions=jax.vmap(solution)(jnp.array(DAMPINGS)),
         scale=flat_scale,
     )
 
 
-def assemble(j, s) -> np.ndarray:
-    """The dense Jacobian that the blocks of the colouring stand for, without the rows of the datum."""
+def assemble(dense: Dense, s) -> np.ndarray:
+    """The dense Jacobian of image rows that the tiles' columns stand for."""
     e, q, n = 6 * s.n_images, s.n_shared, len(s.image)
-    eop = lambda a, image: a * s.n_images + image  # noqa: E731
-    point = lambda a, p: e + q + a * s.n_points + p  # noqa: E731
-    parts = []
-
-    def part(n_rows, *entries):
-        dense = np.zeros((n_rows, e + q + 3 * s.n_points + 1))
-        for rows, columns, values in entries:
-            dense[rows, columns] += values
-        parts.append(dense[:, :-1])
-
-    def shared(colour, image):
-        """The column of a colour in an image; the last, cut off, where it means nothing there."""
-        column = s.column[image, colour]
-        return np.where(column < q, e + column, e + q + 3 * s.n_points)
-
+    result = np.zeros((2 * n, e + q + 3 * s.n_points + 1))
     each = np.arange(n)
-    part(
-        2 * n,
-        *((c * n + each, eop(a, s.image), j.image_eop[a, c]) for a in range(6) for c in range(2)),
-        *((c * n + each, shared(k, s.image), j.image_shared[k, c]) for k in range(s.n_image_colours) for c in range(2)),
-        *((c * n + each, point(a, s.point), j.image_point[a, c]) for a in range(3) for c in range(2)),
-    )
-    each, image = np.arange(len(s.station_image)), s.station_image
-    part(
-        len(each),
-        *((each, eop(a, image), j.station_eop[a]) for a in range(6)),
-        *((each, shared(k, image), j.station_shared[k]) for k in range(s.n_colours)),
-    )
-    n, image = len(s.attitude_image), s.attitude_image
-    each = np.arange(n)
-    part(
-        3 * n,
-        *((c * n + each, eop(a, image), j.attitude_eop[a, c]) for a in range(6) for c in range(3)),
-        *((c * n + each, shared(k, image), j.attitude_shared[k, c]) for k in range(s.n_colours) for c in range(3)),
-    )
-    each = np.arange(len(s.control_point))
-    part(len(each), *((each, point(a, s.control_point), j.control[a]) for a in range(3)))
-    each = np.arange(len(s.distance_points))
-    part(
-        len(each),
-        *((each, point(a, s.distance_points[:, end]), j.distances[end, a]) for end in range(2) for a in range(3)),
-    )
-    each = np.arange(len(s.weighted))
-    part(len(each), (each, e + s.weighted, j.priors))
-    return np.concatenate(parts)
+    for o in range(2):
+        row = o * n + each
+        for a in range(6):
+            result[row, a * s.n_images + s.image] = dense.columns.eop[a, o]
+        for k in range(s.n_image_colours):
+            # The last column, cut off, serves colours that mean nothing in an image.
+            column = s.column[s.image, k]
+            result[row, np.where(column < q, e + column, -1)] = dense.columns.shared[k, o]
+        for a in range(3):
+            result[row, e + q + a * s.n_points + s.point] = dense.columns.point[a, o]
+    return result[:, :-1]
 
 
 def split(vector: np.ndarray, s) -> Increments:

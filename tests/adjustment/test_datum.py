@@ -11,7 +11,7 @@ from jaxphoto import FIXED, FREE, DatumError, adjust
 from jaxphoto.adjustment.datum import MOTIONS
 from jaxphoto.block import Datum, Distances, Rows
 from jaxphoto.georeferencing import StripBias
-from tests.adjustment.dense import prepared
+from tests.adjustment.dense import with_constraints
 from tests.blocks import (
     BROWN,
     adjusted,
@@ -38,7 +38,7 @@ def block_with(**observations):
 def defect_of(block):
     """Defect and motions that the sentence names."""
     with pytest.raises(DatumError) as caught:
-        prepared(block)
+        with_constraints(block)
     text = str(caught.value)
     count = int(re.search(r"defect of (\d)", text)[1])
     return count, {m for m in MOTIONS if re.search(rf"\b{m}\b", text.split(" cannot be")[0])}, text
@@ -101,7 +101,7 @@ def test_stations_on_a_line_leave_a_rotation():
     assert "rotation about X" in named
     # One station beside the line closes it.
     position[2] += [0.0, 30.0, 0.0]
-    prepared(eqx.tree_at(lambda b: b.start.unknowns.exterior.position, block, position))
+    with_constraints(eqx.tree_at(lambda b: b.start.unknowns.exterior.position, block, position))
 
 
 def test_free_shifts_leave_the_position():
@@ -113,8 +113,8 @@ def test_free_shifts_leave_the_position():
     assert (count, named) == (3, SHIFTS)
     assert "strips[a].shift_X_m" in text
     # One shift alone, or one control point, closes it.
-    prepared(measured(type(BARE)(eqx.tree_at(lambda b: b.priors.strips["a"].shift, block, FREE), truth)).block)
-    prepared(measured(type(BARE)(dataclasses.replace(shifted, control=rows((20,))), truth)).block)
+    with_constraints(measured(type(BARE)(eqx.tree_at(lambda b: b.priors.strips["a"].shift, block, FREE), truth)).block)
+    with_constraints(measured(type(BARE)(dataclasses.replace(shifted, control=rows((20,))), truth)).block)
 
 
 @pytest.mark.parametrize(
@@ -129,14 +129,14 @@ def test_free_shifts_leave_the_position():
     ids=["full", "plan-and-height", "fixed", "stations", "attitudes-and-bar"],
 )
 def test_what_closes_the_datum(observations):
-    values, _ = prepared(block_with(**observations))
+    values, _ = with_constraints(block_with(**observations))
     assert values.datum_points.shape[0] == 0
 
 
 @pytest.mark.parametrize("kind", ["inner", "minimal"])
 def test_constraints_fill_the_defect_and_no_more(kind):
     for observations, defect in (({}, 7), ({"distances": BAR}, 6), ({"control": rows((3, 37))}, 1)):
-        values, _ = prepared(dataclasses.replace(block_with(**observations), datum=Datum(kind)))
+        values, _ = with_constraints(dataclasses.replace(block_with(**observations), datum=Datum(kind)))
         assert values.datum_points.shape[0] == defect
 
 
@@ -151,7 +151,7 @@ def test_constraints_fill_the_defect_and_no_more(kind):
 )
 def test_constraints_that_cannot_be(datum, distances, words):
     with pytest.raises(DatumError, match=words):
-        prepared(dataclasses.replace(block_with(distances=distances), datum=datum))
+        with_constraints(dataclasses.replace(block_with(distances=distances), datum=datum))
 
 
 @pytest.mark.parametrize("name", ["inner_images", "inner_some", "minimal"])

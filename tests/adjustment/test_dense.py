@@ -8,8 +8,10 @@ import scipy.optimize
 from jax.flatten_util import ravel_pytree
 
 from jaxphoto import adjust, covariance
+from jaxphoto.adjustment.normal import At, residuals_at
 from jaxphoto.adjustment.optimum import typical_scale, unit_scale, weigh_datum, zero_increments
-from jaxphoto.adjustment.residuals import residuals_at, state_at
+from jaxphoto.adjustment.padding import crop_state
+from jaxphoto.adjustment.residuals import state_at
 from jaxphoto.statistics import redundancy_numbers
 from tests.adjustment.dense import DAMPINGS, assemble, at_optimum, prepared, split
 from tests.blocks import VARIANTS, adjusted, covariance_of, simulated
@@ -19,21 +21,26 @@ FREE_NETWORKS = {"inner": 6, "inner_images": 6, "inner_some": 6, "inner_scale": 
 
 
 @pytest.mark.parametrize("name", VARIANTS)
-def test_colouring_gives_the_jacobian_entry_by_entry(name):
+def test_tiles_give_the_jacobian_of_image_rows_entry_by_entry(name):
     a, dense = adjusted(name), at_optimum(name)
-    blocks, expected = assemble(dense.blocks, a.structure), dense.observed(a.n_constraints)
+    found = assemble(dense, a.structure)
+    expected = dense.jacobian[: len(found)]
     scale = np.abs(expected).max()
     assert scale > 0
-    np.testing.assert_allclose(blocks, expected, rtol=1e-12, atol=1e-13 * scale)
+    np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-13 * scale)
+    np.testing.assert_allclose(dense.columns.residual.ravel(), dense.residuals[: len(found)], rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", VARIANTS)
-def test_sums_are_the_normal_matrix_and_the_gradient(name):
-    dense = at_optimum(name)
-    product = dense.jacobian.T @ (dense.jacobian @ dense.vector)
+def test_sums_are_products_with_the_jacobian(name):
+    dense, n = at_optimum(name), 2 * len(adjusted(name).structure.image)
+    image_rows = dense.jacobian[:n]
+    product = image_rows.T @ (image_rows @ dense.vector)
     np.testing.assert_allclose(dense.products, product, atol=1e-12 * np.abs(product).max())
     terms = np.abs(dense.jacobian).T @ np.abs(dense.residuals)
-    np.testing.assert_allclose(dense.gradient, dense.jacobian.T @ dense.residuals, atol=1e-13 * terms.max())
+    for found in (dense.gradient, dense.sums):
+        np.testing.assert_allclose(found, dense.jacobian.T @ dense.residuals, atol=1e-13 * terms.max())
+    np.testing.assert_allclose(dense.square_sums, (dense.residuals**2).sum(), rtol=1e-12)
 
 
 @pytest.mark.parametrize("damping", DAMPINGS)
@@ -138,7 +145,7 @@ def test_redundancy_numbers(name):
 @pytest.mark.parametrize("name", ["everything", "inner"])
 def test_scipy_finds_the_same_optimum(name):
     """scipy's dense least squares on the same residuals, from the same start."""
-    values, s = prepared(simulated(name).block)
+    values, s, places = prepared(simulated(name).block)
     _, back = ravel_pytree(zero_increments(s))
 
     def setup(values):
@@ -146,7 +153,7 @@ def test_scipy_finds_the_same_optimum(name):
         return values, typical_scale(values, s)
 
     values, scale = jax.jit(setup)(values)
-    of = lambda x: ravel_pytree(residuals_at(back(x), scale, values, s))[0]  # noqa: E731
+    of = lambda x: ravel_pytree(residuals_at(At(back(x), scale, values, s)))[0]  # noqa: E731
     fn = jax.jit(of)
     jac = jax.jit(jax.jacfwd(of))
     free = np.asarray(ravel_pytree(scale)[0]) > 0
@@ -169,14 +176,14 @@ def test_scipy_finds_the_same_optimum(name):
     a = adjusted(name)
     assert abs(2 * found.cost / float(a.square_sum) - 1) < 1e-9
     increments = jax.tree.map(lambda y, k: y * k, back(spread(found.x)), scale)
-    state = jax.jit(lambda x: state_at(x, unit_scale(s), values, s))(increments)
+    state = crop_state(jax.jit(lambda x: state_at(x, unit_scale(s), values, s))(increments), places)
     cov = covariance_of(name)
     sigma = np.sqrt(np.diag(np.asarray(cov.matrix)))
-    exterior = sigma[: 6 * s.n_images].reshape(-1, 6)
+    exterior = sigma[: 6 * a.structure.n_images].reshape(-1, 6)
     position = (np.asarray(state.position).T - np.asarray(a.unknowns.exterior.position)) / exterior[:, :3]
     np.testing.assert_array_less(np.abs(position), 1e-3)
     shared = np.asarray(state.shared)[s.free] - np.asarray(a.values.shared)[s.free]
-    np.testing.assert_array_less(np.abs(shared) / sigma[6 * s.n_images :], 1e-3)
+    np.testing.assert_array_less(np.abs(shared) / sigma[6 * a.structure.n_images :], 1e-3)
     points = np.asarray(state.points).T - np.asarray(a.unknowns.points)
     point_sigma = np.sqrt(np.diagonal(np.asarray(cov.points), axis1=1, axis2=2))
     np.testing.assert_array_less(np.abs(points), 1e-3 * point_sigma + 1e-12)

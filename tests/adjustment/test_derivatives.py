@@ -15,6 +15,12 @@ IMAGE_POINT = 40
 STEPS = np.array([0.1, 0.004, 1e-10, 0.03])
 
 
+@pytest.fixture(scope="module", autouse=True)
+def adjusted_before():
+    """The nominal block is made and adjusted once, outside of what is traced below."""
+    adjusted("cross")
+
+
 def perturbed(p):
     """The cross block with a station's height, an image coordinate, the fixed k3 and a control coordinate moved."""
     block = simulated("cross").block

@@ -27,24 +27,23 @@ def test_a_padded_structure_has_the_sizes_asked_for():
     for name in VARIANTS:
         block = simulated(name).block
         structure = structure_of(block, block.priors)
-        sizes = sizes_of(structure)._replace(rows=700, chunks=333, control=150)
-        s = pad_structure(structure, sizes)
-        assert len(s.image) == len(s.point) == size_class(700)
-        assert len(s.chunk_a) == len(s.chunk_block) == size_class(max(333, len(structure.chunk_block)))
-        assert len(s.control_point) == size_class(max(150, len(structure.control_point)))
+        sizes = sizes_of(structure)._replace(pairs=1000, blocks=333, stations=150)
+        s, places = pad_structure(structure, sizes)
+        assert s.tiles.pair_tile.shape[1] == size_class(1000)
+        assert s.tiles.block.shape[1] == size_class(max(333, sizes.blocks))
+        assert len(s.station_image) == size_class(150) * (len(structure.station_image) > 0)
         assert s.n_images > structure.n_images and s.n_points > structure.n_points
-        # Sorted lists stay sorted, and what is padding refers to padding.
-        for sorted_list in (s.point, s.pair_block, s.chunk_block):
-            assert (np.diff(sorted_list) >= 0).all()
-        assert (s.image[len(structure.image) :] == s.n_images - 1).all()
-        assert s.eop_free[:, structure.n_images :].sum() == 0 == s.point_free[:, structure.n_points :].sum()
+        # What is padding depends on nothing and is held.
+        assert (np.diff(s.tiles.pair_block) >= 0).all()
+        assert s.eop_free.sum() == structure.eop_free.sum() and s.point_free.sum() == structure.point_free.sum()
+        assert s.n_images - 1 not in places.image
 
 
 @pytest.mark.parametrize("name", ["everything", "three_models"])
 def test_larger_sizes_change_no_result(name):
     block = simulated(name).block
     small, sizes = adjusted(name), sizes_of(structure_of(block, block.priors))
-    wide = sizes._replace(images=40, points=200, rows=900, pairs=3000, blocks=500, chunks=500, width=80, control=300)
+    wide = sizes._replace(images=40, tiles=50, tile_images=24, tile_points=16, pairs=3000, blocks=500, stations=300)
     large = adjust(block, small.unknowns, sizes=wide)
     for one, two in zip(small.residuals, large.residuals, strict=True):
         np.testing.assert_allclose(two, one, rtol=0, atol=1e-7)

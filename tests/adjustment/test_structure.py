@@ -1,7 +1,6 @@
 """Who meets whom: the lists behind the structured normal equations, and that no order of rows or ids matters."""
 
 import dataclasses
-import itertools
 
 import equinox as eqx
 import jax
@@ -13,25 +12,6 @@ from jaxphoto.adjustment.structure import structure_of
 from jaxphoto.block import ImageRows, Rows, Start
 from jaxphoto.collinearity import ExteriorOrientation
 from tests.blocks import VARIANTS, adjusted, covariance_of, simulated
-
-
-@pytest.mark.parametrize("name", ["cross", "three_models", "inner"])
-def test_pairs_are_all_pairs_of_rows_of_a_point(name):
-    block = simulated(name).block
-    s = structure_of(block, block.priors)
-    expected = {
-        tuple(sorted(pair))
-        for p in range(s.n_points)
-        for pair in itertools.combinations_with_replacement(np.flatnonzero(s.point == p).tolist(), 2)
-    }
-    assert {tuple(sorted(pair)) for pair in zip(s.pair_a.tolist(), s.pair_b.tolist(), strict=True)} == expected
-    assert len(s.pair_a) == len(expected)
-    # Each pair fills the block of its images in the lower triangle; the list is sorted by block.
-    assert (s.block_row[s.pair_block] == s.image[s.pair_a]).all()
-    assert (s.block_column[s.pair_block] == s.image[s.pair_b]).all()
-    assert (s.block_row >= s.block_column).all()
-    assert (np.diff(s.pair_block) >= 0).all()
-    assert len(set(zip(s.block_row, s.block_column, strict=True))) == len(s.block_row)
 
 
 @pytest.mark.parametrize("name", VARIANTS)

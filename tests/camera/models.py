@@ -7,6 +7,7 @@ from jaxphoto.camera import (
     Balanced,
     Brown,
     Brown14,
+    BundlerRadial,
     Ebner,
     Gruen,
     PpsRadial,
@@ -42,6 +43,7 @@ UNITS = {
         f"a{i}": 1e-3 if i < 3 else 2e-4 if i in (3, 4, 8, 9) else 1e-6 if i in (7, 12, 13) else 2e-5
         for i in range(1, 15)
     },
+    BundlerRadial: {"k1": 1e-4, "k2": 1e-7},  # normalised: as for a c of 1 mm
 }
 MOST = max(map(len, UNITS.values()))
 # Of such a camera: the balance radius, Ebner's and Gruen's grid, the scale of Brown's a13.
@@ -56,6 +58,8 @@ def build(model, numbers):
     return model(**{name: numbers[i] * unit for i, (name, unit) in enumerate(units.items())}, **constants)
 
 
+# The first camera of BAL problem 16-22106 as Ceres leaves it, f = 1486.898 pixels; its points reach 883 and 589 pixels.
+FLICKR = BundlerRadial(k1=-0.175763865, k2=0.166040514)
 KODAK = Brown(k1=-9.1217e-5, k2=1.0435e-7)  # paper 000, table 2, first experiment
 GOPRO = Smac(k1=-3.9445e-2, k2=-1.1881e-3, k3=-1.3126e-4)  # paper 002, table 3, R0 = 0
 GOPRO_XY = np.array([2.325, 1.74])  # its corner

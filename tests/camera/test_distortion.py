@@ -4,9 +4,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxphoto.camera import DISTORTIONS, Balanced, Brown, InteriorOrientation, Sensor, Smac, invert
+from jaxphoto.camera import DISTORTIONS, Balanced, Brown, BundlerRadial, InteriorOrientation, Sensor, Smac, invert
 from jaxphoto.camera.distortion import AffineBrown
-from tests.camera.models import AICON, GOPRO, GOPRO_XY, KODAK, MOST, UNITS, build
+from tests.camera.models import AICON, FLICKR, GOPRO, GOPRO_XY, KODAK, MOST, UNITS, build
 from tests.derivatives import check_derivatives, compiled
 
 bounded = settings(max_examples=40, deadline=None, derandomize=True, database=None)
@@ -84,6 +84,7 @@ def test_sign_of_k1_negative_is_a_barrel():
     assert (ideal(Brown(k1=-1e-4), on_axis(r))[:, 0] > r).all()
     assert (measured(Brown(k1=-1e-4), on_axis(r))[:, 0] < r).all()
     assert (measured(Balanced(a1=-1e-4), on_axis(r))[:, 0] < r).all()
+    assert (measured(BundlerRadial(k1=-1e-4), on_axis(r))[:, 0] < r).all()
     assert (measured(Smac(k1=-1e-4), on_axis(r))[:, 0] < r).all()
     assert (measured(Smac(k1=-1e-4, sign="add"), on_axis(r))[:, 0] > r).all()
 
@@ -133,6 +134,29 @@ def test_balanced_distortion_vanishes_at_r0():
     r = measured(balanced, on_axis([6.0, 13.488, 18.0]))[:, 0] - [6.0, 13.488, 18.0]
     assert abs(r[1]) < 1e-14
     assert r[0] > 1e-3 > 0 > -1e-3 > r[2]
+
+
+@bounded
+@given(*[st.floats(-0.6, 0.6)] * 2, *[st.floats(-0.2, 0.2)] * 2, st.floats(5, 2000))
+def test_bundler_radial_written_out_and_as_balanced(x, y, k1, k2, c):
+    # p' = f r(p) p with r(p) = 1 + k1 |p|^2 + k2 |p|^4, of the coordinate p = (x, y) normalised by c.
+    interior = InteriorOrientation(c, 0.7, -0.4, BundlerRadial(k1=k1, k2=k2))
+    r2 = x * x + y * y
+    expected = c * (1 + k1 * r2 + k2 * r2**2) * np.array([x, y])
+    ideal_mm = c * np.array([x, y])
+    got, own, back, valid = of_interior(interior, ideal_mm)
+    np.testing.assert_allclose(own, expected, rtol=1e-14, atol=1e-13 * c)
+    np.testing.assert_allclose(got - [0.7, -0.4], expected, rtol=1e-14, atol=1e-13 * c)
+    np.testing.assert_allclose(back, ideal_mm, rtol=0, atol=1e-12 * c)
+    assert valid
+    in_mm = Balanced(a1=k1 / c**2, a2=k2 / c**4)
+    np.testing.assert_allclose(closed(in_mm, [ideal_mm])[0], expected, rtol=1e-13, atol=1e-13 * c)
+
+
+@compiled
+def of_interior(interior, xy):
+    measured = interior.measured_from_ideal(xy)
+    return measured, interior.closed_form(xy), interior.ideal_from_measured(measured), interior.valid(xy)
 
 
 def test_sign_of_smac_is_checked():
@@ -185,10 +209,11 @@ def test_inversion_gives_the_coordinate_back(model, numbers):
     np.testing.assert_allclose(found, xy, rtol=0, atol=1e-11)
 
 
-@pytest.mark.parametrize("distortion", [KODAK, GOPRO, AICON])
-def test_inversion_of_real_cameras_to_the_corner(distortion):
-    corner = GOPRO_XY if distortion is GOPRO else np.array([18.0, 12.0])
-    xy = np.linspace(-1, 1, 21)[:, None] * corner
+@pytest.mark.parametrize(
+    ("distortion", "corner"), [(KODAK, [18, 12]), (GOPRO, GOPRO_XY), (AICON, [18, 12]), (FLICKR, [0.594, 0.396])]
+)
+def test_inversion_of_real_cameras_to_the_corner(distortion, corner):
+    xy = np.linspace(-1, 1, 21)[:, None] * np.array(corner)
     found, good = inverted(distortion, closed(distortion, xy))
     assert good.all()
     np.testing.assert_allclose(found, xy, rtol=0, atol=1e-11)
@@ -199,6 +224,7 @@ def test_inversion_of_real_cameras_to_the_corner(distortion):
     [
         (Brown(k1=1e-3), np.sqrt(1 / 3e-3)),  # pincushion: ideal = r - k r^3 turns back
         (Balanced(a1=-1e-3), np.sqrt(1 / 3e-3)),  # barrel in the other direction
+        (BundlerRadial(k1=-0.3), np.sqrt(1 / 0.9)),
         (Smac(k1=-1e-3, sign="add"), np.sqrt(1 / 3e-3)),
         (Brown(k1=-1e-3, k2=4e-6), 17.631),  # barrel first, then folded: 1 + 3e-3 r^2 - 2e-5 r^4 = 0
     ],

@@ -19,6 +19,7 @@ from jaxphoto.unknowns import FIXED, FREE, Weighted
 SMAC = ("block.toml", 'distortion = "brown"', 'distortion = "smac"\nsign = "add"')
 PPS = ("block.toml", '"brown"', '"pps_radial"'), ("block.toml", "k1 = -1e-4", "k1 = -1e-4\npps_x = 0.25\npps_y = -0.5")
 EBNER = ("block.toml", '"brown"', '"ebner"'), ("block.toml", "k1 = -1e-4", "b_mm = 1.5\nb3 = 1e-5")
+BUNDLER = ("block.toml", '"brown"', '"bundler_radial"'), ("block.toml", "k1 = -1e-4", "k1 = -0.125\nk2 = 0.1")
 R0 = ("block.toml", "k1 = -1e-4", "k1 = -1e-4\nr0_mm = 1.5\np3 = 1e-7")
 
 
@@ -38,6 +39,7 @@ def assert_same(got: Block, want: Block) -> None:
         (),
         (SMAC, R0),
         PPS,
+        BUNDLER,
         (*EBNER, ("block.toml", "k1 = { sigma = 2e-5 }", "b3 = { sigma = 2e-6 }")),
         (("block.toml", "{ sigma = 2e-5 }", "{ sigma = 2e-5, value = -3e-4 }"),),
         (("block.toml", '"small"', '"quotation \\" backslash \\\\ tab \\t Ω"'),),

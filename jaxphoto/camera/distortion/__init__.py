@@ -5,6 +5,7 @@ from jaxphoto.camera.distortion.balanced import Balanced
 from jaxphoto.camera.distortion.base import AbstractDistortion, invert
 from jaxphoto.camera.distortion.brown import Brown
 from jaxphoto.camera.distortion.brown14 import Brown14
+from jaxphoto.camera.distortion.bundler_radial import BundlerRadial
 from jaxphoto.camera.distortion.ebner import Ebner
 from jaxphoto.camera.distortion.gruen import Gruen
 from jaxphoto.camera.distortion.pps_radial import PpsRadial
@@ -21,9 +22,10 @@ DISTORTIONS: dict[str, type[AbstractDistortion]] = {
     "ebner": Ebner,
     "gruen": Gruen,
     "brown14": Brown14,
+    "bundler_radial": BundlerRadial,
 }
 
 __all__ = [
-    "DISTORTIONS", "AbstractDistortion", "AffineBrown", "Balanced", "Brown", "Brown14", "Ebner", "Gruen", "PpsRadial",
-    "RadialPolynomial", "Smac", "invert",
+    "DISTORTIONS", "AbstractDistortion", "AffineBrown", "Balanced", "Brown", "Brown14", "BundlerRadial", "Ebner",
+    "Gruen", "PpsRadial", "RadialPolynomial", "Smac", "invert",
 ]  # fmt: skip

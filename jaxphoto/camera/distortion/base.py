@@ -1,8 +1,9 @@
 """What every lens distortion model is: one polynomial map between measured and ideal image coordinates.
 
-Coordinates are in millimetres, reduced to the principal point. A model writes down one direction in closed
-form and says which (`domain`); the other direction is found by `invert`. Which way a distortion runs, and
-with which sign, is thereby part of its type (docs/conventions.md).
+Coordinates are reduced to the principal point and in millimetres, or, for a model that is `normalised`, in units of
+the principal distance. A model writes down one direction in closed form and says which (`domain`); the other
+direction is found by `invert`. Which way a distortion runs, with which sign and in which unit, is thereby part of its
+type (docs/conventions.md); `InteriorOrientation` takes millimetres to any of them.
 """
 
 import abc
@@ -23,7 +24,9 @@ class AbstractDistortion(eqx.Module):
     """A lens distortion; its fields are scalars, its `domain` says where the polynomial lives.
 
     `domain == "measured"`: `closed_form` takes measured to ideal coordinates (the photogrammetric habit).
-    `domain == "ideal"`: it takes ideal to measured ones.
+    `domain == "ideal"`: it takes ideal to measured ones, and residuals are those of measured coordinates.
+    `normalised`: coordinates here are those in mm divided by the principal distance (tangents of the field angle), as
+    in computer vision, so that coefficients have no unit.
     `coefficients` names the fields an adjustment may estimate; other fields are constants of the model. `scales` names
     coefficients that change the scale of the image as the principal distance does: never both can be free.
     """
@@ -31,17 +34,21 @@ class AbstractDistortion(eqx.Module):
     domain: eqx.AbstractClassVar[Literal["measured", "ideal"]]
     coefficients: eqx.AbstractClassVar[tuple[str, ...]]
     scales: ClassVar[tuple[str, ...]] = ()
+    normalised: ClassVar[bool] = False
 
     @abc.abstractmethod
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
-        """The model's own direction, of one reduced coordinate in mm."""
+        """The model's own direction, of one reduced coordinate in the model's unit (mm unless `normalised`)."""
 
     def ideal_from_measured(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
-        """Ideal (distortion-free) from measured coordinate, both reduced to the principal point, in mm."""
+        """Ideal (distortion-free) from measured coordinate, both reduced to the principal point, in the model's unit.
+
+        Where the model is not invertible the value is meaningless: ask `invert` whether it is.
+        """
         return self.closed_form(xy) if self.domain == "measured" else invert(self, xy)[0]
 
     def measured_from_ideal(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
-        """Measured from ideal coordinate, both reduced to the principal point, in mm.
+        """Measured from ideal coordinate, both reduced to the principal point, in the model's unit.
 
         Where the model is not invertible the value is meaningless: ask `invert` whether it is.
         """

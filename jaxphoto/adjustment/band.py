@@ -1,0 +1,298 @@
+"""Cholesky of a block tridiagonal matrix with a dense border: the reduced normal matrix of images in order of flight.
+
+    A = [A11 A21'             S1']     images: k column blocks of m unknowns; only adjacent ones meet,
+        [A21 A22 A32'         S2']     Aij = 0 for |i - j| > 1
+        [    A32 A33 ...      S3']     shared: q unknowns that meet everything (the border S, the corner C)
+        [S1  S2  S3  ...      C  ]
+
+Its factor L (A = L L') has the blocks of A and no others. One column block j after the other, with P the rows of A
+below its diagonal block and W what is left of A when columns 1..j-1 are eliminated:
+
+    Ljj Ljj' = Wjj,   LPj = WPj Ljj'^-1,   WPP -= LPj LPj'                                   10 m^3 / 3 operations
+
+The inverse Z of A obeys Z L = L'^-1, so backwards, from the blocks ZPP of what lies below (Takahashi, Fagan and Chin):
+
+    G = LPj Ljj^-1,   ZPj = -ZPP G,   Zjj = Ljj'^-1 Ljj^-1 + G' ZPP G
+
+needs of Z the blocks of the band and the border alone; columns of the full inverse follow by ZRj = -[ZR,j+1 ZR,q] G.
+The last column block and the shared unknowns are dense together; where k = 1 they are all there is.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+# Inverses of triangles above this size are put together from halves: a product is five times as fast as BLAS' trsm.
+_LEAF = 256
+# What a column block costs beside its operations, counted in operations (measured: about 10 microseconds).
+_OVERHEAD = 2e5
+
+
+class Band(NamedTuple):
+    """A symmetric matrix of images, ordered so that only adjacent column blocks meet, and shared unknowns."""
+
+    columns: Float[Array, "k 2m m"]
+    """Column block j: rows 0..m-1 are A[j, j] (its lower triangle counts), rows m..2m-1 are A[j+1, j]; those of the
+    last column block may be anything."""
+    border: Float[Array, "q n"]
+    """A[shared, images], with n = k m."""
+    corner: Float[Array, "q q"]
+    """A[shared, shared]; its lower triangle counts."""
+
+
+class BandFactor(NamedTuple):
+    """The lower Cholesky factor of a `Band`, stored alike; zero above the diagonal and in the last rows of columns."""
+
+    columns: Float[Array, "k 2m m"]
+    border: Float[Array, "q n"]
+    corner: Float[Array, "q q"]
+
+
+class SelectedInverse(NamedTuple):
+    """Blocks of the inverse inside band and border, stored like a `Band` but with both triangles of its diagonal."""
+
+    columns: Float[Array, "k 2m m"]
+    border: Float[Array, "q n"]
+    corner: Float[Array, "q q"]
+
+
+def factor_band(band: Band) -> BandFactor:
+    """L of A = L L'; NaN from the first column block on that is not positive definite (the last with the shared)."""
+    k, _, m = band.columns.shape
+    border = _split_border(band.border, k)
+    left = (band.columns[0, :m], border[0], band.corner)
+    columns, borders = band.columns[:0], border[:0]
+    if k > 1:
+
+        def eliminate(left, at):
+            diagonal, shared, corner = left
+            below, next_diagonal, next_shared = at
+            lower = _cholesky(diagonal)
+            panel = _solve_right(lower, jnp.concatenate([below, shared]))
+            product = panel @ panel.T
+            left = (next_diagonal - product[:m, :m], next_shared - product[m:, :m], corner - product[m:, m:])
+            return left, (jnp.concatenate([lower, panel[:m]]), panel[m:])
+
+        at = (band.columns[:-1, m:], band.columns[1:, :m], border[1:])
+        left, (columns, borders) = jax.lax.scan(eliminate, left, at)
+
+    end = _cholesky(_with_border(*left))
+    return BandFactor(
+        columns=jnp.concatenate([columns, _last_column(end[:m, :m])]),
+        border=_join_border(jnp.concatenate([borders, end[None, m:, :m]])),
+        corner=end[m:, m:],
+    )
+
+
+def solve_band(factor: BandFactor, right: Float[Array, "unknowns *c"]) -> Float[Array, "unknowns *c"]:
+    """x of A x = b for one right-hand side, or for each column of several; the n + q unknowns are images, then shared.
+
+    L y = b downwards, L' x = y backwards.
+    """
+    columns, border = factor.columns, factor.border
+    k, _, m = columns.shape
+    n = k * m
+    b = right.reshape(len(right), -1)
+    images, shared = b[:n].reshape(k, m, -1), b[n:]
+    left, inner = images[0], border[:, : n - m]
+    # Columns are read in place: as what the scans run over they would be copied, which takes as long as the solution.
+    if k > 1:
+
+        def down(left, at):
+            j, following = at
+            column = jax.lax.dynamic_index_in_dim(columns, j, keepdims=False)
+            y = _solve(column[:m], left)
+            return following - column[m:] @ y, y
+
+        left, y = jax.lax.scan(down, left, (np.arange(k - 1), images[1:]))
+        shared = shared - inner @ y.reshape(n - m, -1)
+
+    end = _end_of(factor)
+    last = _solve_transposed(end, _solve(end, jnp.concatenate([left, shared])))
+    if k == 1:
+        return last.reshape(right.shape)
+
+    def back(after, at):
+        j, y = at
+        column = jax.lax.dynamic_index_in_dim(columns, j, keepdims=False)
+        x = _solve_transposed(column[:m], y - column[m:].T @ after)
+        return x, x
+
+    y = y - (inner.T @ last[m:]).reshape(y.shape)
+    _, x = jax.lax.scan(back, last[:m], (np.arange(k - 1), y), reverse=True)
+    return jnp.concatenate([x.reshape(n - m, -1), last]).reshape(right.shape)
+
+
+def selected_inverse(factor: BandFactor) -> SelectedInverse:
+    """The blocks of A^-1 inside band and border, by Takahashi's recursion (see the module's head)."""
+    return _invert_inside(factor)[0]
+
+
+def invert_band(factor: BandFactor) -> Float[Array, "unknowns unknowns"]:
+    """All of A^-1, symmetric, images first; 2 n^2 m operations beside those of `selected_inverse`."""
+    inside, gains = _invert_inside(factor)
+    k, _, m = inside.columns.shape
+    n = k * m
+    diagonals = inside.columns[:, :m]
+    images = diagonals[0]
+    if k > 1:
+        # Column block j is right from row block j on; what stands above is not used.
+        def fill(after, at):
+            j, gain, diagonal = at
+            column = -jnp.concatenate([after, inside.border.T], axis=1) @ gain.T
+            column = jax.lax.dynamic_update_slice(column, diagonal, (j * m, 0))
+            return column, column
+
+        last = jnp.pad(diagonals[-1], ((n - m, 0), (0, 0)))
+        _, columns = jax.lax.scan(fill, last, (np.arange(k - 1), gains, diagonals[:-1]), reverse=True)
+        columns = jnp.concatenate([columns, last[None]])
+        images = _symmetric(columns.transpose(1, 0, 2).reshape(n, n))
+    return _with_border(images, inside.border, inside.corner)
+
+
+def dense(band: Band) -> Float[Array, "unknowns unknowns"]:
+    """All of A, symmetric: for small blocks and tests."""
+    k, _, m = band.columns.shape
+    each = np.arange(k)
+    images = jnp.zeros((k, m, k, m)).at[each, :, each, :].set(band.columns[:, :m])
+    images = images.at[each[1:], :, each[:-1], :].set(band.columns[:-1, m:])
+    return _with_border(_symmetric(images.reshape(k * m, k * m)), band.border, _symmetric(band.corner))
+
+
+def pivots(band: Band, factor: BandFactor) -> Float[Array, " unknowns"]:
+    """Squared diagonal of L over the diagonal of A (over 1 where that is not positive), images first.
+
+    What is left of an unknown's own information when those before it are eliminated: near zero at a rank defect.
+    """
+    diagonal = _diagonal(band)
+    return _diagonal(factor) ** 2 / jnp.where(diagonal > 0, diagonal, 1.0)
+
+
+def column_blocks(n_images: int, bandwidth: int) -> tuple[int, int]:
+    """Number k of column blocks and images w of each, for images of which none meet further apart than `bandwidth`.
+
+    w >= bandwidth and k w >= n_images. Costs counted are operations of the factorization: n^3 / 3 of a dense one with
+    n = 6 n_images, and m^3 / 3 for each of k column blocks with m = 6 w, 3 m^3 for each but the last (triangular
+    solution m^3, product 2 m^3) and a constant for each. The w of least cost is taken if it halves the cost at least,
+    else the block is one column.
+    """
+
+    def cost(k: int, w: int) -> float:
+        m = 6 * w
+        return k * m**3 / 3 + (k - 1) * 3 * m**3 + k * _OVERHEAD
+
+    n = max(n_images, 1)
+    narrowest = min(max(bandwidth, 1), n)
+    # For each number of column blocks the narrowest; more of them would only be padding.
+    widths = {max(narrowest, -(-n // k)) for k in range(1, -(-n // narrowest) + 1)}
+    choices = [(-(-n // w), w) for w in sorted(widths)]
+    best = min(choices, key=lambda choice: cost(*choice))
+    return best if 2 * cost(*best) <= cost(1, n) else (1, n)
+
+
+def _invert_inside(factor: BandFactor) -> tuple[SelectedInverse, Float[Array, "inner m p"]]:
+    """The selected inverse, and G' of all columns but the last."""
+    k, _, m = factor.columns.shape
+    own = _invert_triangle(_end_of(factor))
+    end = _mean(own @ own.T)
+    border, corner = end[m:, :m], end[m:, m:]
+    columns, borders, gains = _last_column(end[:m, :m]), border[None], factor.columns[:0, :m]
+    if k > 1:
+
+        def invert(after, at):
+            # Written in products A B' only: XLA takes twice as long for A' B.
+            column, shared = at
+            own = _invert_triangle(column[:m])
+            gain = own @ jnp.concatenate([column[m:], shared]).T
+            panel = gain @ after
+            diagonal = jnp.concatenate([own, gain], axis=1) @ jnp.concatenate([own, panel], axis=1).T
+            diagonal, below, shared = _mean(diagonal), -panel[:, :m].T, -panel[:, m:].T
+            return _with_border(diagonal, shared, corner), (gain, jnp.concatenate([diagonal, below]), shared)
+
+        at = (factor.columns[:-1], _split_border(factor.border, k)[:-1])
+        _, (gains, inner, inner_borders) = jax.lax.scan(invert, end, at, reverse=True)
+        columns, borders = jnp.concatenate([inner, columns]), jnp.concatenate([inner_borders, borders])
+    return SelectedInverse(columns, _join_border(borders), corner), gains
+
+
+def _invert_triangle(lower: Float[Array, "m m"]) -> Float[Array, "m m"]:
+    """The transposed inverse of a lower triangle."""
+    m = len(lower)
+    if m <= _LEAF:
+        return _solve_transposed(lower, jnp.eye(m))
+    h = m // 2
+    first, second = _invert_triangle(lower[:h, :h]), _invert_triangle(lower[h:, h:])
+    return jnp.block([[first, -(first @ lower[h:, :h].T) @ second], [jnp.zeros((m - h, h)), second]])
+
+
+@jax.custom_jvp
+def _cholesky(a: Float[Array, "m m"]) -> Float[Array, "m m"]:
+    """Lower Cholesky factor of a lower triangle. JAX's derivative of it alone would read the upper one as well."""
+    return jax.lax.linalg.cholesky(a, symmetrize_input=False)
+
+
+@_cholesky.defjvp
+def _(primals, tangents):
+    (a,), (change,) = primals, tangents
+    return jax.jvp(lambda a: jax.lax.linalg.cholesky(a, symmetrize_input=False), (a,), (_symmetric(change),))
+
+
+# LAPACK stores by columns: the transpose of what JAX stores by rows is no copy.
+def _solve(lower: Float[Array, "m m"], b: Float[Array, "m c"]) -> Float[Array, "m c"]:
+    """L^-1 b."""
+    return jax.lax.linalg.triangular_solve(lower.T, b, left_side=True, lower=False, transpose_a=True)
+
+
+def _solve_transposed(lower: Float[Array, "m m"], b: Float[Array, "m c"]) -> Float[Array, "m c"]:
+    """L'^-1 b."""
+    return jax.lax.linalg.triangular_solve(lower.T, b, left_side=True, lower=False)
+
+
+def _solve_right(lower: Float[Array, "m m"], b: Float[Array, "r m"]) -> Float[Array, "r m"]:
+    """b L'^-1."""
+    return jax.lax.linalg.triangular_solve(lower, b, left_side=False, lower=True, transpose_a=True)
+
+
+def _symmetric(lower: Float[Array, "m m"]) -> Float[Array, "m m"]:
+    """The symmetric matrix of a lower triangle."""
+    return jnp.tril(lower) + jnp.tril(lower, -1).T
+
+
+def _mean(a: Float[Array, "m m"]) -> Float[Array, "m m"]:
+    """Symmetric to the last bit, which a product of floats need not be."""
+    return 0.5 * (a + a.T)
+
+
+def _with_border(
+    images: Float[Array, "n n"], border: Float[Array, "q n"], corner: Float[Array, "q q"]
+) -> Float[Array, "n+q n+q"]:
+    return jnp.block([[images, border.T], [border, corner]])
+
+
+def _diagonal(stored: Band | BandFactor) -> Float[Array, " unknowns"]:
+    m = stored.columns.shape[2]
+    images = jnp.diagonal(stored.columns[:, :m], axis1=1, axis2=2).reshape(-1)
+    return jnp.concatenate([images, jnp.diagonal(stored.corner)])
+
+
+def _end_of(factor: BandFactor) -> Float[Array, "p p"]:
+    """The factor of the last column block and the shared unknowns, which together are dense."""
+    m = factor.columns.shape[2]
+    border = factor.border[:, -m:]
+    return jnp.block([[factor.columns[-1, :m], jnp.zeros_like(border.T)], [border, factor.corner]])
+
+
+def _last_column(diagonal: Float[Array, "m m"]) -> Float[Array, "1 2*m m"]:
+    return jnp.concatenate([diagonal, jnp.zeros_like(diagonal)])[None]
+
+
+def _split_border(border: Float[Array, "q n"], k: int) -> Float[Array, "k q m"]:
+    return border.reshape(len(border), k, border.shape[1] // k).transpose(1, 0, 2)
+
+
+def _join_border(border: Float[Array, "k q m"]) -> Float[Array, "q n"]:
+    k, q, m = border.shape
+    return border.transpose(1, 0, 2).reshape(q, k * m)

@@ -1,0 +1,66 @@
+"""Several devices: tiles and their points are dealt out over a mesh, everything else is on every device.
+
+Each device sums its own tiles; the sums of the reduced normal matrix are added across devices (`normal.total`), and each
+factors the result for itself. So nothing but sums the size of the reduced matrix ever travels.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+from jax.sharding import Mesh
+from jax.sharding import PartitionSpec as P
+
+from jaxphoto.adjustment.normal import AXIS
+from jaxphoto.adjustment.structure import Structure
+
+EVERYWHERE = P()
+TILES = P(AXIS)
+"""Dealt out along the first axis, that of chunks of tiles."""
+
+
+def along_points(ndim: int) -> P:
+    """Dealt out along the last axis, that of points."""
+    return P(*[None] * (ndim - 1), AXIS)
+
+
+_OF_TILES = {"xy", "sigma_xy", "pair_tile", "pair_images", "pair_block", "block"}
+_OF_POINTS = {"points", "control", "sigma_control", "datum_points", "point_free", "point_class", "l", "rows_p"}
+
+
+def mesh_of(shards: int) -> Mesh:
+    """The first `shards` devices, of all processes."""
+    return Mesh(np.array(jax.devices()[:shards]), (AXIS,))
+
+
+def sharded(function: Callable[..., Any], structure: Structure, out: Any) -> Callable[..., Any]:
+    """`function` on what each device holds; itself where there is one device.
+
+    Its arguments are cut by the names of their fields; `out` says how its result is, as a prefix of that tree.
+    """
+    assert structure.tiles is not None
+    if structure.tiles.shards == 1:
+        return function
+
+    def wrapped(*arguments: Any) -> Any:
+        arrays, rest = eqx.partition(arguments, eqx.is_array)
+        run = jax.shard_map(
+            lambda arrays: function(*eqx.combine(arrays, rest)),
+            mesh=mesh_of(structure.tiles.shards),
+            in_specs=(jax.tree_util.tree_map_with_path(_spec, arrays),),
+            out_specs=out,
+            check_vma=False,
+        )
+        return run(arrays)
+
+    return wrapped
+
+
+def _spec(path: tuple[Any, ...], array: Any) -> P:
+    name = getattr(path[-1], "name", "") if path else ""
+    # The images of tiles, not those of the rows of a block.
+    if name in _OF_TILES or (name == "image" and array.ndim >= 3):
+        return TILES
+    return along_points(array.ndim) if name in _OF_POINTS else EVERYWHERE

@@ -1,0 +1,130 @@
+"""Tiles: a few points with all the images that see any of them, so that their sums are products of small dense matrices.
+
+Aerial and close-range blocks alike are locally dense: points that lie together are seen by nearly the same images. A tile
+of P points and M images holds M x P slots, empty where an image does not see a point; what is computed on it needs no
+list of rows, only the M numbers of its images. Images are numbered so that those which meet lie close (reverse
+Cuthill-McKee), which makes the reduced normal matrix a band and lets points in the order of their images fill tiles.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Int
+
+
+class Tiling(NamedTuple):
+    """Where every point and every image row lies."""
+
+    image: Int[np.ndarray, "tiles m"]
+    """Places of a tile's images, ascending; -1 in slots that are empty."""
+    place: Int[np.ndarray, "points"]
+    """Of each point: tile * P + number in the tile."""
+    slot: Int[np.ndarray, "rows"]
+    """Of each image row: (tile * M + image) * P + point."""
+
+
+def check_rows(image: np.ndarray, point: np.ndarray) -> None:
+    """Raise ValueError for image rows that are not sorted by point, or hold a point twice in one image."""
+    if (np.diff(point) < 0).any():
+        raise ValueError(
+            "the rows of image_points must be sorted by point: take them in the order of np.argsort(point)"
+        )
+    key = point.astype(np.int64) * (int(image.max(initial=0)) + 1) + image
+    if len(np.unique(key)) < len(key):
+        raise ValueError("image_points holds a point twice in one image: keep one row of each")
+
+
+# Below this the reduced matrix is dense anyway, and any order will do.
+_FEW_IMAGES = 64
+
+
+def order_images(image: np.ndarray, point: np.ndarray, n_images: int, n_points: int) -> tuple[np.ndarray, int]:
+    """The place of each image, and the largest difference of places of two images that see a point together."""
+    if n_images < _FEW_IMAGES:
+        return np.arange(n_images, dtype=np.int32), n_images
+    # Imported here: it takes a tenth of a second, which small blocks need not wait for.
+    from scipy.sparse import csr_matrix
+    from scipy.sparse.csgraph import reverse_cuthill_mckee
+
+    sees = csr_matrix((np.ones(len(image), np.int32), (point, image)), shape=(n_points, n_images))
+    meet = (sees.T @ sees).tocsr()
+    place = np.empty(n_images, np.int32)
+    place[reverse_cuthill_mckee(meet, symmetric_mode=True)] = np.arange(n_images)
+    one, other = meet.nonzero()
+    return place, int(np.abs(place[one] - place[other]).max(initial=1))
+
+
+def tile_shape(image: np.ndarray, point: np.ndarray, n_images: int, n_points: int) -> tuple[int, int]:
+    """Images and points of a tile that make the sums cheapest, found on a part of the block; see `_cost`."""
+    order, first, images = _in_order(image, point, n_points)
+    part = order[: min(len(order), _PART)]
+    most = max(1, max(map(len, images), default=1))
+    options = {(_round_up(min(m, n_images)), p) for m in (most, 1.25 * most, 1.5 * most, 2 * most) for p in (8, 16, 32)}
+    options = {(m, p) for m, p in options if m >= most}
+    return min(sorted(options), key=lambda mp: _cost(len(_cut(part, images, *mp)), *mp))
+
+
+# Points on which tile shapes are tried.
+_PART = 3000
+
+
+def _round_up(m: float) -> int:
+    """The next multiple of four: blocks of similar size shall share what is compiled."""
+    return 4 * max(1, -(-int(np.ceil(m)) // 4))
+
+
+def _cost(tiles: int, m: int, p: int) -> float:
+    """Microseconds that the sums take: a share by tile, by slot and by multiplication, as measured (docs/solver.md)."""
+    return tiles * (25 + 0.22 * m * p + (6 * m) ** 2 * 3 * p / 1e4)
+
+
+def tile_points(image: np.ndarray, point: np.ndarray, n_points: int, m: int, p: int) -> Tiling:
+    """Tiles of at most `m` images and `p` points; `image` are places, the rows sorted by point.
+
+    Raises ValueError where a point has more than `m` rays.
+    """
+    order, first, images = _in_order(image, point, n_points)
+    if max(map(len, images), default=0) > m:
+        raise ValueError(f"a point is seen by more than the {m} images of a tile")
+    tiles = _cut(order, images, m, p)
+    own = np.full((len(tiles), m), -1, np.int32)
+    place, slot = np.empty(n_points, np.int32), np.empty(len(image), np.int64)
+    for t, (members, start, stop) in enumerate(tiles):
+        own[t, : len(members)] = members
+        place[order[start:stop]] = t * p + np.arange(stop - start)
+    tile = place[point] // p
+    # A row's image within its tile: the tile's images ascend, so numbers tile by tile do.
+    width = int(image.max(initial=0)) + 2
+    key = np.where(own >= 0, own, width - 1) + width * np.arange(len(tiles))[:, None]
+    column = np.searchsorted(key.ravel(), image + width * tile) - m * tile
+    slot = (tile.astype(np.int64) * m + column) * p + place[point] % p
+    return Tiling(own, place, slot)
+
+
+def _in_order(image: np.ndarray, point: np.ndarray, n_points: int) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
+    """Points by their first image, last image and mean image; first rows; each point's images."""
+    first = np.searchsorted(point, np.arange(n_points + 1))
+    rays = np.diff(first)
+    seen = rays > 0
+    low, high, mean = (np.zeros(n_points) for _ in range(3))
+    starts = first[:-1][seen]
+    if len(starts):
+        low[seen] = np.minimum.reduceat(image, starts)
+        high[seen] = np.maximum.reduceat(image, starts)
+        mean[seen] = np.add.reduceat(image.astype(float), starts) / rays[seen]
+    return np.lexsort((mean, high, low)), first, np.split(image, first[1:-1])
+
+
+def _cut(order: np.ndarray, images: list[np.ndarray], m: int, p: int) -> list[tuple[list[int], int, int]]:
+    """Cut points in their order into tiles: (images, first, last + 1)."""
+    tiles, members, start = [], set(), 0
+    for k, j in enumerate(order):
+        own = images[j].tolist()
+        union = members.union(own)
+        if k > start and (len(union) > m or k - start == p):
+            tiles.append((sorted(members), start, k))
+            union, start = set(own), k
+        members = union
+    if len(order):
+        tiles.append((sorted(members), start, len(order)))
+    return tiles

@@ -1,0 +1,30 @@
+"""The radial distortion of Bundler, OpenCV and COLMAP: from ideal to measured, in units of the principal distance."""
+
+from typing import ClassVar, Literal
+
+from jaxtyping import Array, Float
+
+from jaxphoto.camera.distortion.base import AbstractDistortion, radial
+
+
+class BundlerRadial(AbstractDistortion):
+    """Two radial terms of the normalised ideal coordinate p; `measured = c p (1 + k1 |p|^2 + k2 |p|^4)`.
+
+    p = ideal / c = -(U, V) / W. k1 and k2 have no unit; k1 < 0 is a barrel. With coefficients in mm they are those of
+    `Balanced` with R0 = 0, A1 = k1 / c^2 and A2 = k2 / c^4.
+
+    Source: Snavely, Seitz and Szeliski (2006), Photo tourism, the camera of Bundler, and Agarwal and others (2010),
+    Bundle adjustment in the large (BAL). The same numbers are k1 and k2 of OpenCV (fx = fy, all else 0) and of
+    COLMAP's RADIAL; their y runs down and their z forwards, which a radial term does not see.
+    """
+
+    k1: Float[Array, ""] | float = 0.0
+    k2: Float[Array, ""] | float = 0.0
+
+    domain: ClassVar[Literal["measured", "ideal"]] = "ideal"
+    coefficients: ClassVar[tuple[str, ...]] = ("k1", "k2")
+    normalised: ClassVar[bool] = True
+
+    def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
+        """Measured coordinate of an ideal one, both reduced to the principal point and divided by c."""
+        return xy + xy * radial(xy @ xy, self.k1, self.k2)
