@@ -10,20 +10,13 @@ import struct
 from dataclasses import dataclass, fields
 from pathlib import Path
 
-import equinox as eqx
 import numpy as np
 
-from jaxphoto import FREE, Unknowns
-from jaxphoto.block import Attitudes, Block, Datum, Distances, ImageRows, Rows, Start
-from jaxphoto.camera import Brown, InteriorOrientation, Sensor, set_parameter
-from jaxphoto.collinearity import ExteriorOrientation
-from jaxphoto.unknowns import default_priors
-
-NAMES = ("c_mm", "xp_mm", "yp_mm", "k1", "k2")
-SIGN = np.array([1.0, 1.0, 1.0, -1.0, -1.0])
 TRUE_IOP = np.array([34.250, 0.064, 0.273, -9.1e-5, 1.04e-7])
 FRAME = np.array([36.0, 24.0])
 HEIGHT = 1000.0
+# Nothing further away than this (m, along X or Y) is in a frame.
+_REACH = 760.0
 
 
 @dataclass(frozen=True)
@@ -81,20 +74,24 @@ def _parallel(n: int, images: int, across: float, crossing: int, crossing_images
 SIZES = {
     "P31": Size(_cross(7 * 280.0, 263.0), 187, 33, 31),
     "B200": Size(_parallel(8, 22, 420.0, 2, 12, 280.0), 20_000, 40, 200),
+    "B1000": Size(_parallel(24, 40, 420.0, 1, 40, 280.0), 200_000, 100, 1000),
 }
 
 
-def generate(name: str) -> Problem:
-    """The block `name` of `SIZES`, always the same."""
-    size = SIZES[name]
+def parallel_strips(strips: int, images: int, points: int, seed: int = 0) -> Size:
+    """`strips` of `images` each, overlapping by 60 % along and across, without cross strips."""
+    return Size(_parallel(strips, images, 420.0, 0, 0, 280.0), points, min(points, 40), seed)
+
+
+def generate(size: Size) -> Problem:
+    """The block of that size, always the same."""
     rng = np.random.default_rng(size.seed)
-    places, kappa, strip = [], [], []
+    of_strips = []
     for k, (x, y, azimuth, n) in enumerate(size.strips):
         a = np.deg2rad(azimuth)
-        places.append(np.array([x, y]) + size.base * np.arange(n)[:, None] * np.array([np.cos(a), np.sin(a)]))
-        kappa.append(np.full(n, a - np.pi / 2))
-        strip.append(np.full(n, k))
-    places, kappa, strip = np.concatenate(places), np.concatenate(kappa), np.concatenate(strip)
+        line = np.array([x, y]) + size.base * np.arange(n)[:, None] * np.array([np.cos(a), np.sin(a)])
+        of_strips.append((line, np.full(n, a - np.pi / 2), np.full(n, k)))
+    places, kappa, strip = map(np.concatenate, zip(*of_strips, strict=True))
     n = len(places)
     eop = np.column_stack(
         [
@@ -156,18 +153,23 @@ def rotations(angles: np.ndarray) -> np.ndarray:
 def _visible(eop: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Images, points and true coordinates (mm) of every point inside a frame."""
     found = []
+    by_x = np.argsort(points[:, 0])
+    first, stop = (np.searchsorted(points[by_x, 0], eop[:, 3] + side) for side in (-_REACH, _REACH))
     for i, matrix in enumerate(rotations(eop[:, :3])):
-        near = np.flatnonzero(np.max(np.abs(points[:, :2] - eop[i, 3:5]), axis=1) < 760)
+        near = by_x[first[i] : stop[i]]
+        near = near[np.abs(points[near, 1] - eop[i, 4]) < _REACH]
         u = (points[near] - eop[i, 3:]) @ matrix.T
         ideal = -TRUE_IOP[0] * u[:, :2] / u[:, 2:]
         far = np.linalg.norm(ideal, axis=1)
-        radius = np.where(far < 23.5, far, 0.0)
-        for _ in range(30):
+        # Beyond the corners of the frame the polynomial has no inverse.
+        near, ideal, far = near[far < 23.5], ideal[far < 23.5], far[far < 23.5]
+        radius = far
+        for _ in range(10):
             r2 = radius**2
-            error = radius * (1 + TRUE_IOP[3] * r2 + TRUE_IOP[4] * r2**2) - np.where(far < 23.5, far, 0.0)
+            error = radius * (1 + TRUE_IOP[3] * r2 + TRUE_IOP[4] * r2**2) - far
             radius = radius - error / (1 + 3 * TRUE_IOP[3] * r2 + 5 * TRUE_IOP[4] * r2**2)
         xy = ideal * (radius / far)[:, None] + TRUE_IOP[1:3]
-        inside = (far < 23.5) & np.all(np.abs(xy) < FRAME / 2 - 0.4, axis=1)
+        inside = np.all(np.abs(xy) < FRAME / 2 - 0.4, axis=1)
         found.append((np.full(inside.sum(), i), near[inside], xy[inside]))
     image, point, xy = zip(*found, strict=True)
     return np.concatenate(image), np.concatenate(point), np.concatenate(xy)
@@ -192,42 +194,3 @@ def write_bin(problem: Problem, path: Path) -> None:
         file.write(b"JXB1" + struct.pack("<4qd", *counts, p.sigma_img))
         for array in arrays:
             file.write(np.ascontiguousarray(array, "<i4" if array.dtype.kind == "i" else "<f8").tobytes())
-
-
-def block_of(problem: Problem, title: str) -> Block:
-    """The same as a `Block`, start values included."""
-    p = problem
-    n_images, n_points = len(p.init_eop), len(p.init_pts)
-    c, x_p, y_p, k1, k2 = map(float, SIGN * p.init_iop)
-    camera = InteriorOrientation(c, x_p, y_p, Brown(k1=k1, k2=k2))
-    exterior = ExteriorOrientation.from_angles(p.init_eop[:, 3:], p.init_eop[:, :3])
-    start = Unknowns({"cam": camera}, exterior, p.init_pts, {}, {})
-    priors = default_priors(start)
-    interior = priors.interior["cam"]
-    for name in NAMES:
-        interior = set_parameter(interior, name, FREE)
-    return Block(
-        title=title,
-        images=tuple(f"i{k}" for k in range(n_images)),
-        points=tuple(f"p{k}" for k in range(n_points)),
-        sensors={"cam": Sensor(4500, 3000, 0.008)},
-        image_camera=("cam",) * n_images,
-        image_mount=("",) * n_images,
-        image_strip=("",) * n_images,
-        image_time=np.zeros(n_images),
-        image_points=ImageRows(p.obs_img, p.obs_pt, p.obs_xy, np.full(p.obs_xy.shape, p.sigma_img)),
-        control=_rows(p.gcp_pt, p.gcp_obs, p.gcp_sigma),
-        fixed=Rows.none(),
-        check=Rows.none(),
-        stations=_rows(np.arange(n_images), p.sta_obs, p.sta_sigma),
-        attitudes=Attitudes.none(),
-        distances=Distances.none(),
-        datum=Datum(),
-        start=Start(start, np.ones(n_images, bool), np.ones(n_points, bool)),
-        priors=eqx.tree_at(lambda q: q.interior["cam"], priors, interior),
-    )
-
-
-def _rows(who: np.ndarray, values: np.ndarray, sigmas: np.ndarray) -> Rows:
-    n = len(who)
-    return Rows(np.repeat(who, 3), np.tile(np.arange(3), n), np.ravel(values), np.ravel(sigmas))

@@ -1,201 +1,118 @@
 """Ours against the peers on the same block, in one interleaved run. See README.md.
 
-python benchmarks/run.py [--problem P31] [--npz FILE] [--ceres BIN [--bin FILE]] [--rounds 7]
+python benchmarks/run.py [--problem P31 | --npz FILE | --bal FILE] [--ceres BIN] [--ceres-bal BIN] [--rounds 7]
 """
 
 import argparse
-import datetime
-import json
 import os
-import platform
 import shutil
 import statistics
-import subprocess
 import sys
 import tempfile
-import time
 from dataclasses import asdict
 from pathlib import Path
 
+from machine import machine, markdown, run_apart, write_results
+from peers import BY_HAND, CERES, Files, Peers, peers_of
+
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-HERE = Path(__file__).resolve().parent
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--problem", default="P31", choices=("P31", "B200"), help="size of a block of our own")
+    parser.add_argument("--problem", default="P31", choices=("P31", "B200", "B1000"), help="size of a block of our own")
     parser.add_argument("--npz", type=Path, help="a problem of the peers' generator, instead of our own")
-    parser.add_argument("--bin", type=Path, help="the same problem for the C++ peer; written from the npz by default")
-    parser.add_argument("--ceres", type=Path, help="the C++ peer's binary")
+    parser.add_argument("--bal", type=Path, help='a problem file of "Bundle Adjustment in the Large", instead')
+    parser.add_argument("--ceres", type=Path, help="the C++ peers' binary")
+    parser.add_argument("--ceres-bal", type=Path, help="that for BAL files")
     parser.add_argument("--rounds", type=int, default=7)
-    parser.add_argument("--no-scipy", action="store_true", help="leave scipy out")
-    parser.add_argument("--no-start", action="store_true", help="leave the starts of the command line out")
+    parser.add_argument("--cores", type=int, help="all solvers on so many cores; else ours on all, the C++ ones on one")
+    parser.add_argument("--also", nargs="*", default=[], metavar="PEER", help="scipy, pyceres: even if it takes long")
+    parser.add_argument("--without", nargs="*", default=[], metavar="PEER", help="scipy, pyceres: leave it out")
+    parser.add_argument("--start", action="store_true", help="measure starts of the command line, too")
     parser.add_argument("--no-cache", action="store_true", help="compile anew, to measure compiling")
     parser.add_argument("--out", type=Path, help="folder for results.jsonl and results.md")
-    parser.add_argument("--worker", type=Path, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
-    if arguments.worker:
-        _work(arguments.worker)
-        return
     with tempfile.TemporaryDirectory() as folder:
         records = measure(arguments, Path(folder))
-    text = "\n".join(table(records))
-    print(text)
-    if arguments.out:
-        arguments.out.mkdir(parents=True, exist_ok=True)
-        with (arguments.out / "results.jsonl").open("a", encoding="utf-8") as file:
-            file.writelines(json.dumps(record) + "\n" for record in records)
-        with (arguments.out / "results.md").open("a", encoding="utf-8") as file:
-            file.write(text + "\n\n")
+    write_results(arguments.out, "run", records, "\n".join(table(records)))
 
 
 def measure(arguments, folder: Path) -> list[dict]:
     """All records: one head, one a solve and round, one a start of the command line."""
-    import numpy as np
-    from blocks import generate, read_npz, write_bin
-    from peers import run_ceres, run_scipy
+    from ours import Worker
 
-    problem = read_npz(arguments.npz) if arguments.npz else generate(arguments.problem)
-    title = arguments.npz.stem if arguments.npz else f"own {arguments.problem}"
-    npz, flat = folder / "problem.npz", arguments.bin or folder / "problem.bin"
-    np.savez(npz, **asdict(problem))
-    if not arguments.bin:
-        write_bin(problem, flat)
+    file, files, sizes = _problem(arguments, folder)
+    peers: Peers = peers_of(files, arguments)
     head = {
         "kind": "head",
-        "problem": title,
+        **sizes,
+        "rounds": arguments.rounds,
+        "command": _command(arguments),
+        "missing": peers.missing,
+        **machine(),
+    }
+    records = [head]
+    worker = Worker(file, cached=not arguments.no_cache, cores=arguments.cores)
+    solvers = {"ours": worker.solve, **peers.solvers}
+    try:
+        for k in range(arguments.rounds):
+            for solve in solvers.values():
+                load = os.getloadavg()[0]
+                records.append({"kind": "solve", "round": k, "load": load, **solve()})
+            print(f"round {k + 1} of {arguments.rounds}", file=sys.stderr)
+    finally:
+        worker.stop()
+    return records + (starts(file, folder) if arguments.start else [])
+
+
+def _problem(arguments, folder: Path) -> tuple[Path, Files, dict]:
+    """The file that ours reads, those of all peers, and how large the problem is."""
+    if arguments.bal:
+        with arguments.bal.open() as file:
+            images, points, rows = map(int, file.readline().split())
+        size = {"images": images, "points": points, "image_points": rows, "unknowns": 9 * images + 3 * points}
+        return arguments.bal, Files(size["unknowns"], bal=arguments.bal), {"problem": arguments.bal.stem, **size}
+    import numpy as np
+    from blocks import SIZES, generate, read_npz, write_bin
+
+    problem = read_npz(arguments.npz) if arguments.npz else generate(SIZES[arguments.problem])
+    title = arguments.npz.stem if arguments.npz else f"own {arguments.problem}"
+    npz, flat = folder / "problem.npz", folder / "problem.bin"
+    np.savez(npz, **asdict(problem))
+    write_bin(problem, flat)
+    size = {
         "images": len(problem.init_eop),
         "points": len(problem.init_pts),
         "image_points": len(problem.obs_xy),
         "unknowns": problem.n_unknowns,
-        "rounds": arguments.rounds,
-        "command": _command(arguments),
-        **machine(),
     }
-    records, small = [head], len(problem.init_pts) < 5000
-    worker = Worker(npz, cached=not arguments.no_cache)
-    try:
-        for k in range(arguments.rounds):
-            records.append({"kind": "solve", "round": k, "load": os.getloadavg()[0], **worker.solve()})
-            if arguments.ceres:
-                record = run_ceres(arguments.ceres, flat, small, covariance=True)
-                records.append({"kind": "solve", "round": k, "load": os.getloadavg()[0], **record})
-            if not arguments.no_scipy:
-                records.append({"kind": "solve", "round": k, "load": os.getloadavg()[0], **run_scipy(npz)})
-            print(f"round {k + 1} of {arguments.rounds}", file=sys.stderr)
-    finally:
-        worker.stop()
-    if not arguments.no_start:
-        records += starts(npz, title, folder)
-    return records
-
-
-def machine() -> dict:
-    """What may be told of the machine: no names, no places."""
-    model = platform.processor() or platform.machine()
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-        model = next(line.split(":")[1].strip() for line in lines if line.startswith("model name"))
-    except (OSError, StopIteration):
-        pass
-    return {
-        "date": datetime.date.today().isoformat(),
-        "cpu": model,
-        "cores": os.cpu_count(),
-        "load": [round(v, 2) for v in os.getloadavg()],
-        "python": platform.python_version(),
-        "jax": _version("jax"),
-        "jaxphoto": _version("jaxphoto"),
-    }
-
-
-def _version(name: str) -> str:
-    from importlib.metadata import version
-
-    return version(name)
+    return npz, Files(problem.n_unknowns, npz=npz, flat=flat), {"problem": title, **size}
 
 
 def _command(arguments) -> str:
     words = ["python benchmarks/run.py"]
-    words += ["--npz", arguments.npz.name] if arguments.npz else ["--problem", arguments.problem]
+    source = next((n for n in ("bal", "npz") if getattr(arguments, n)), None)
+    words += [f"--{source}", getattr(arguments, source).name] if source else ["--problem", arguments.problem]
     words += ["--ceres ceres_ba"] if arguments.ceres else []
+    words += ["--ceres-bal ceres_bal"] if arguments.ceres_bal else []
+    words += [f"--cores {arguments.cores}"] if arguments.cores else []
+    words += [f"--{n} {' '.join(v)}" for n in ("also", "without") if (v := getattr(arguments, n))]
+    words += [f"--{n.replace('_', '-')}" for n in ("start", "no_cache") if getattr(arguments, n)]
     return " ".join([*words, "--rounds", str(arguments.rounds)])
 
 
-class Worker:
-    """A long-lived process that holds the block and solves it on request."""
-
-    def __init__(self, npz: Path, cached: bool):
-        environment = os.environ | ({} if cached else {"JAX_ENABLE_COMPILATION_CACHE": "false"})
-        command = [sys.executable, __file__, "--worker", str(npz)]
-        self.process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
-        )
-
-    def solve(self) -> dict:
-        """One warm solve."""
-        stdin, stdout = self.process.stdin, self.process.stdout
-        assert stdin is not None
-        assert stdout is not None
-        stdin.write("solve\n")
-        stdin.flush()
-        line = stdout.readline()
-        if not line:
-            raise SystemExit("our worker process failed; its message is above")
-        return json.loads(line)
-
-    def stop(self) -> None:
-        """End the process."""
-        if self.process.stdin:
-            self.process.stdin.close()
-        self.process.wait(timeout=60)
-
-
-def _work(npz: Path) -> None:
-    """The worker: compile and warm up once, then one solve a line."""
-    from blocks import block_of, read_npz
-    from peers import peak_memory
-
-    import jaxphoto
-    from jaxphoto.adjustment import solve
-
-    block = block_of(read_npz(npz), "benchmark")
-
-    def once() -> tuple:
-        began = time.perf_counter()
-        adjusted = solve(block, block.start.unknowns, block.priors)
-        whole = time.perf_counter() - began
-        jaxphoto.covariance(adjusted)
-        return adjusted, whole
-
-    first, _ = once()
-    compiling = first.seconds["compile"]
-    once()
-    for _ in sys.stdin:
-        adjusted, whole = once()
-        record = {
-            "solver": "jaxphoto",
-            "solve_s": adjusted.seconds["solve"],
-            "call_s": whole,
-            "covariance_s": adjusted.seconds["covariance"],
-            "compile_s": compiling,
-            "steps": int(adjusted.steps),
-            "cost": float(adjusted.square_sum) / 2,
-            "memory_mb": peak_memory(),
-        }
-        print(json.dumps(record), flush=True)
-
-
-def starts(npz: Path, title: str, folder: Path) -> list[dict]:
+def starts(file: Path, folder: Path) -> list[dict]:
     """Cold start (nothing compiled), cached start, and the import alone, each in a fresh process."""
-    from blocks import block_of, read_npz
+    import time
+
+    from ours import read_block
 
     from jaxphoto import write_block
 
-    block = folder / "block"
-    write_block(block_of(read_npz(npz), title), block)
-    cache = folder / "cache"
-    environment = os.environ | {"XDG_CACHE_HOME": str(cache), "JAX_COMPILATION_CACHE_DIR": str(cache / "jax")}
+    block, cache = folder / "block", folder / "cache"
+    write_block(read_block(file), block)
+    environment = {"XDG_CACHE_HOME": str(cache), "JAX_COMPILATION_CACHE_DIR": str(cache / "jax")}
     program = "import sys; from jaxphoto.cli import main; sys.argv = ['jaxphoto', *sys.argv[1:]]; main()"
     run = [sys.executable, "-c", program, "adjust", str(block), "--out", str(folder / "out")]
     records = []
@@ -207,11 +124,8 @@ def starts(npz: Path, title: str, folder: Path) -> list[dict]:
     ):
         shutil.rmtree(folder / "out", ignore_errors=True)
         load, began = os.getloadavg()[0], time.perf_counter()
-        done = subprocess.run(command, capture_output=True, text=True, env=environment)
-        seconds = time.perf_counter() - began
-        if done.returncode:
-            raise SystemExit(f"{name} failed: {done.stderr.strip()[-500:]}")
-        records.append({"kind": "start", "what": name, "seconds": seconds, "load": load})
+        run_apart(command, environment=environment)
+        records.append({"kind": "start", "what": name, "seconds": time.perf_counter() - began, "load": load})
     return records
 
 
@@ -221,12 +135,11 @@ def table(records: list[dict]) -> list[str]:
     by_solver: dict[str, list[dict]] = {}
     for r in solves:
         by_solver.setdefault(r["solver"], []).append(r)
-    reference = next((v for k, v in by_solver.items() if k.startswith("Ceres")), None) or next(
-        (v for k, v in by_solver.items() if k != "jaxphoto"), by_solver["jaxphoto"]
-    )
-    best = min(r["cost"] for r in solves)
-    base = statistics.median(r["solve_s"] for r in reference)
     loads = [r["load"] for r in solves]
+    # Ratios are to these two; without them, to the first peer that there is.
+    others = [name for name in by_solver if name != "jaxphoto"]
+    bases = [name for name in others if name.startswith((CERES, BY_HAND))] or others[:1]
+    best = min(r["cost"] for r in solves)
     lines = [
         f"### {head['problem']}: {head['images']} images, {head['points']} points, "
         f"{head['image_points']} image points, {head['unknowns']} unknowns",
@@ -237,28 +150,44 @@ def table(records: list[dict]) -> list[str]:
         "",
         f"`{head['command']}`",
         "",
-        f"| solver | solve ms | ratio to {reference[0]['solver']} | steps | cost above the best (relative) | "
-        "covariance ms | peak memory MB |",
-        "| --- | --- | --- | --- | --- | --- | --- |",
     ]
-    for name, rows in by_solver.items():
-        ratio = statistics.median(r["solve_s"] for r in rows) / base
-        excess = max(r["cost"] for r in rows) / best - 1
-        lines.append(
-            f"| {name} | {_spread(rows, 'solve_s')} | {ratio:.2f} | {rows[0]['steps']} | {excess:.1e} | "
-            f"{_spread(rows, 'covariance_s')} | {max(r['memory_mb'] for r in rows):.0f} |"
-        )
+    names = ["solver", "solve ms", *(f"ratio to {_short(b)}" for b in bases), "steps", "cost above the best (relative)"]
+    names += ["covariance ms", *(f"ratio to {_short(b)}" for b in bases), "peak memory MB"]
+    names += [f"ratio to {_short(b)}" for b in bases[:1]]
+    rows = []
+    for name, own in by_solver.items():
+        cells = [name, _spread(own, "solve_s"), *(_ratio(own, by_solver[b], "solve_s") for b in bases)]
+        cells += [str(own[0]["steps"]), f"{max(r['cost'] for r in own) / best - 1:.1e}"]
+        cells += [_spread(own, "covariance_s"), *(_ratio(own, by_solver[b], "covariance_s") for b in bases)]
+        cells += [f"{max(r['memory_mb'] for r in own):.0f}"]
+        cells += [_ratio(own, by_solver[b], "memory_mb") for b in bases[:1]]
+        rows.append(cells)
+    lines += markdown(names, rows)
     ours = by_solver["jaxphoto"]
     lines += ["", f"Our whole call from Python: {_spread(ours, 'call_s')} ms; compiling: {ours[0]['compile_s']:.1f} s."]
+    lines += [f"{sentence}." for sentence in head["missing"]]
     begun = [r for r in records if r["kind"] == "start"]
     if begun:
-        lines += ["", "| start | seconds | load |", "| --- | --- | --- |"]
-        lines += [f"| {r['what']} | {r['seconds']:.1f} | {r['load']:.1f} |" for r in begun]
+        rows = [[r["what"], f"{r['seconds']:.1f}", f"{r['load']:.1f}"] for r in begun]
+        lines += ["", *markdown(["start", "seconds", "load"], rows)]
     return lines
 
 
+def _short(name: str) -> str:
+    return CERES if name.startswith(CERES) else name
+
+
+def _values(rows: list[dict], key: str) -> list[float]:
+    return [r[key] for r in rows if r.get(key) is not None]
+
+
+def _ratio(rows: list[dict], base: list[dict], key: str) -> str:
+    own, other = _values(rows, key), _values(base, key)
+    return f"{statistics.median(own) / statistics.median(other):.2f}" if own and other else "-"
+
+
 def _spread(rows: list[dict], key: str) -> str:
-    values = [1e3 * r[key] for r in rows if r.get(key) is not None]
+    values = [1e3 * v for v in _values(rows, key)]
     if not values:
         return "-"
     digits = 0 if statistics.median(values) >= 100 else 1

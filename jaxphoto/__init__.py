@@ -4,8 +4,11 @@ Importing it switches JAX to float64 (docs/precision.md) and, unless you chose o
 cache on disk.
 """
 
+import contextlib
+import importlib
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 # SciPy's OpenBLAS, which JAX uses for LAPACK, spins threads that fight XLA's own pool (docs/solver.md).
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -13,6 +16,12 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import jax
 
 jax.config.update("jax_enable_x64", True)
+# One device of JAX a core: large blocks are dealt out to them (docs/scaling.md).
+_chosen = "host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
+if jax.config.values["jax_num_cpu_devices"] <= 0 and not _chosen:
+    # Too late where JAX has begun to compute: then its devices stay what they are.
+    with contextlib.suppress(RuntimeError):
+        jax.config.update("jax_num_cpu_devices", len(os.sched_getaffinity(0)))
 if jax.config.values["jax_compilation_cache_dir"] is None:
     _cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jaxphoto"
     jax.config.update("jax_compilation_cache_dir", str(_cache))
@@ -44,12 +53,14 @@ from jaxphoto.camera import (
 from jaxphoto.collinearity import ExteriorOrientation, image_ray, intersect, project
 from jaxphoto.errors import BlockError, DatumError, InputError, JaxphotoError, RankError
 from jaxphoto.georeferencing import Mount, StripBias, Surface, direct_orientation, ground_point
-from jaxphoto.io import convert, read_block, read_recipe, read_source, write_block, write_simulation
 from jaxphoto.procedures import adjust, boresight, georeference
-from jaxphoto.report import Tables
 from jaxphoto.simulation import simulate
 from jaxphoto.statistics import angle_differences, covariance, point_differences
 from jaxphoto.unknowns import FIXED, FREE, Unknowns, Weighted
+
+if TYPE_CHECKING:
+    from jaxphoto.io import convert, read_block, read_recipe, read_source, write_block, write_simulation
+    from jaxphoto.report import Tables
 
 __version__ = "0.1.0"
 
@@ -63,3 +74,17 @@ __all__ = [
     "point_differences", "principal_points", "project", "read_block", "read_recipe", "read_source", "rebalance",
     "rebalance_covariance", "simulate", "symmetry_from_decentring", "write_block", "write_simulation",
 ]  # fmt: skip
+
+# Files and tables bring pandas and more, a third of a second: they are imported when first asked for.
+_LATER = {
+    "convert": "io", "read_block": "io", "read_recipe": "io", "read_source": "io", "write_block": "io",
+    "write_simulation": "io", "Tables": "report",
+}  # fmt: skip
+
+
+def __getattr__(name: str) -> Any:
+    if name in _LATER.values():
+        return importlib.import_module(f"jaxphoto.{name}")
+    if name in _LATER:
+        return getattr(importlib.import_module(f"jaxphoto.{_LATER[name]}"), name)
+    raise AttributeError(f"module 'jaxphoto' has no attribute {name!r}")

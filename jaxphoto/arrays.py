@@ -1,18 +1,32 @@
 """The arrays of data and results: numpy's or JAX's, whichever the moment asks for."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.experimental import multihost_utils
 
 Numbers = jax.Array | np.ndarray
 """numpy where numbers lie still (reading, results), JAX where they are traced (compiled, differentiated)."""
 
 
-def still(values) -> Numbers:
-    """The same numbers as NumPy's, whose every operation need not be compiled; traced ones as they are."""
-    return values if isinstance(values, jax.core.Tracer) else np.asarray(values)
+def still(values) -> Any:
+    """The same numbers as NumPy's, whose every operation need not be compiled; traced ones as they are.
+
+    What is dealt out to several processes is gathered: each of them has to call this.
+    """
+    if isinstance(values, jax.core.Tracer):
+        return values
+    if isinstance(values, jax.Array) and not (values.is_fully_addressable or values.is_fully_replicated):
+        return np.asarray(multihost_utils.process_allgather(values, tiled=True))
+    return np.asarray(values)
+
+
+def on_device(values) -> jax.Array:
+    """JAX's array of real numbers that are known; `jnp.asarray` compiles a copy for each shape."""
+    return jax.device_put(np.asarray(values, float))
 
 
 def joined(parts: Sequence) -> Numbers:

@@ -5,10 +5,12 @@ what. Every function is of one rotation and is differentiable where the rotation
 """
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-# Body axes (right, forward, up) <-> (forward, right, down), and equally ENU <-> NED: its own inverse.
-_RFU_FRD = jnp.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+# Body axes (right, forward, up) <-> (forward, right, down), and equally ENU <-> NED: its own inverse. NumPy's, because
+# an array of JAX would start a device and compile at import.
+_RFU_FRD = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 
 def rotate(matrix: Float[Array, "3 3"], vector: Float[Array, "3"]) -> Float[Array, "3"]:

@@ -13,13 +13,15 @@ from jaxphoto.adjustment.datum import close_datum
 from jaxphoto.adjustment.normal import At, residuals_at
 from jaxphoto.adjustment.optimum import Optimum, find_optimum, iterate, unit_scale, weigh_datum, zero_increments
 from jaxphoto.adjustment.padding import LEAST, Sizes, crop_residuals, crop_state, pad_structure, pad_values, sizes_of
+from jaxphoto.adjustment.precision import warn_of_lost_digits
 from jaxphoto.adjustment.rank import check_priors, check_rank
 from jaxphoto.adjustment.residuals import Residuals, State, Values, state_at
 from jaxphoto.adjustment.result import Adjustment, Factored, Padded
 from jaxphoto.adjustment.structure import Structure, structure_of
 from jaxphoto.adjustment.values import at_state, unknowns_of, values_of, with_datum
+from jaxphoto.arrays import still
 from jaxphoto.block import Block
-from jaxphoto.compiling import run_compiled
+from jaxphoto.compiling import prepare, run_compiled
 from jaxphoto.unknowns import Unknowns
 
 MAX_STEPS = 100
@@ -40,13 +42,14 @@ def solve(
     do not see an unknown or cannot tell unknowns apart.
     """
     check_priors(block, priors)
+    warn_of_lost_digits(block, start)
     structure = structure_of(block, priors)
     values = values_of(block, start, priors, structure)
     constraints = close_datum(block, concrete(values, block), structure)
     values = with_datum(values, constraints.eop, constraints.points)
     traced = any(isinstance(v, jax.core.Tracer) for v in jax.tree.leaves(values))
     coupled = len(constraints.eop) + len(structure.distance_points) > 0
-    shards = 1 if traced or coupled else jax.device_count()
+    shards = 1 if traced or coupled else _devices_worth_using(len(structure.image))
     wide, places = pad_structure(structure, sizes, shards=shards, dense=coupled)
     numbers = pad_values(values, structure, wide, places)
     seconds: dict[str, float] = {}
@@ -56,7 +59,12 @@ def solve(
         state = state_at(optimum.increments, unit_scale(wide), numbers, wide)
     else:
         arguments = (numbers, wide, max_steps, np.array(False))
+        # The longest first: the other is traced while it compiles.
+        prepare(_optimise, arguments, seconds)
+        prepare(_residuals, (numbers, wide), seconds)
         optimum, state, _ = run_compiled(_optimise, arguments, seconds, "solve")
+        # What comes back from several devices is of another type to a program than what went in.
+        state = State(*map(still, state))
     numbers = at_state(numbers, state)
     # Statistics need the factored normal matrix; a derivative of the unknowns does not, and would pay for it dearly.
     if not traced:
@@ -79,6 +87,14 @@ def solve(
     if not traced:
         check_rank(adjusted)
     return adjusted
+
+
+# Image rows that keep a device busy for longer than adding its sums to those of others takes.
+_ROWS_PER_DEVICE = 20_000
+
+
+def _devices_worth_using(rows: int) -> int:
+    return max(1, min(jax.device_count(), rows // _ROWS_PER_DEVICE))
 
 
 def common_sizes(blocks: Iterable[Block]) -> Sizes:

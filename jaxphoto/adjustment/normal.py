@@ -26,7 +26,7 @@ from jaxtyping import Array, Float
 from jaxphoto.adjustment.band import Band, BandFactor, solve_band
 from jaxphoto.adjustment.residuals import Increments, Residuals, Values, other_residuals, state_at
 from jaxphoto.adjustment.structure import Structure
-from jaxphoto.adjustment.tiles import Scene, by_point, by_tile, of_images, rows, scene_of, seen_in
+from jaxphoto.adjustment.tiles import Scene, by_point, by_tile, each_tile, of_images, rows, scene_of, seen_in
 
 AXIS = "tiles"
 """Mesh axis along which tiles and their points are dealt out to devices."""
@@ -73,8 +73,7 @@ def dot(a: Increments, b: Increments, s: Structure) -> Float[Array, ""]:
 def residuals_at(at: At) -> Residuals:
     """All residuals over their sigmas."""
     increments, scale, values, s = at
-    state, tiles = at.state, s.tiles
-    assert tiles is not None
+    state, tiles = at.state, s.in_tiles
     scene = scene_of(state, s)
 
     def tile(image, points, xy, sigma):
@@ -96,7 +95,7 @@ def square_sum(at: At) -> Float[Array, ""]:
         r = rows(of_images(scene, image, s), points, seen_in(xy, sigma, image, s), s)
         return jnp.sum(r * r)
 
-    image = _each_tile(tile, (by_tile(state.points, s.tiles), values.xy, values.sigma_xy), s)
+    image = _each_tile(tile, (by_tile(state.points, s.in_tiles), values.xy, values.sigma_xy), s)
     return _square_sum(jnp.sum(image), other_residuals(increments, scale, values, s), s)
 
 
@@ -106,9 +105,9 @@ def _square_sum(image: Float[Array, ""], others: Residuals, s: Structure) -> Flo
 
 
 def _each_tile(function, numbers, s: Structure):
-    """`function` of (image, *numbers) of every tile, one after the other: what it needs stays in the cache of a core."""
-    joined = jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), (s.tiles.image, *numbers))
-    return jax.lax.map(function, joined)
+    """`function` of (image, *numbers) of every tile of every chunk."""
+    joined = jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), (s.in_tiles.image, *numbers))
+    return each_tile(function, joined, s.in_tiles)
 
 
 def image_products(at: At, direction: Increments, want: Literal["images", "points", "all"]) -> Increments:
@@ -117,8 +116,7 @@ def image_products(at: At, direction: Increments, want: Literal["images", "point
     `want` says which part: "images" (with the shared unknowns), "points" or "all"; what is not wanted is zero.
     """
     increments, scale, values, s = at
-    tiles = s.tiles
-    assert tiles is not None
+    tiles = s.in_tiles
     scene, pull_scene = _scene_and_pull(at)
     turned = jax.jvp(lambda e, h: scene_of(state_at(increments._replace(eop=e, shared=h), scale, values, s), s),
                      (increments.eop, increments.shared), (direction.eop, direction.shared))[1]  # fmt: skip
@@ -149,8 +147,7 @@ def gradient(at: At, l: Float[Array, "6 points"], rows_p: Float[Array, "k 3 poin
     one pass over the tiles does it.
     """
     increments, scale, values, s = at
-    tiles = s.tiles
-    assert tiles is not None
+    tiles = s.in_tiles
     others, pull_others = jax.vjp(lambda y: other_residuals(y, scale, values, s), increments)
     b_others = pull_others(others)[0]
     scene, pull_scene = _scene_and_pull(at)
@@ -187,8 +184,7 @@ def _scene_and_pull(at: At):
 
 def _by_image(parts: Scene, scene: Scene, s: Structure) -> Scene:
     """Cotangents of tiles, added by image (and over all tiles, for the only camera of a group)."""
-    assert s.tiles is not None
-    image, n = s.tiles.image.reshape(-1), scene.centre.shape[0]
+    image, n = s.in_tiles.image.reshape(-1), scene.centre.shape[0]
 
     def of_image(v):
         return jax.ops.segment_sum(v.reshape(-1, *v.shape[2:]), image, n)

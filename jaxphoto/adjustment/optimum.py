@@ -24,6 +24,7 @@ from jaxphoto.adjustment.shards import EVERYWHERE, along_points, sharded
 from jaxphoto.adjustment.solver import LevenbergMarquardt, System
 from jaxphoto.adjustment.structure import MOUNT_SIZE, STRIP_SIZE, Structure, interior_of
 from jaxphoto.adjustment.tiles import by_tile
+from jaxphoto.arrays import Numbers
 from jaxphoto.collinearity import ExteriorOrientation, image_residual
 
 # The first damping relative to the normal matrix is the square of this: almost Gauss-Newton.
@@ -62,7 +63,7 @@ def find_optimum(values: Values, *, structure: Structure, max_steps: int) -> Opt
 
 
 def iterate(
-    values: Values, structure: Structure, max_steps: int, only_factor: Bool[Array, ""]
+    values: Values, structure: Structure, max_steps: int, only_factor: Bool[Numbers, ""]
 ) -> tuple[Optimum, System, Increments]:
     """The optimum, and the last system with the scale of its unknowns; or the undamped system at the start.
 
@@ -83,7 +84,7 @@ def iterate(
 
 
 def _iterate(
-    values: Values, scale: Increments, structure: Structure, only_factor: Bool[Array, ""], *, max_steps: int
+    values: Values, scale: Increments, structure: Structure, only_factor: Bool[Numbers, ""], *, max_steps: int
 ) -> tuple[Optimum, System]:
     """The iteration itself, on what one device holds; increments are scaled."""
 
@@ -183,8 +184,7 @@ def typical_scale(values: Values, structure: Structure) -> Increments:
         stop = group.offset + m * len(group.names)
         vector = vector.at[group.offset : stop].set(jnp.tile(typical, len(group.names)))
     c = v.shared[s.groups[0].offset]
-    assert s.tiles is not None
-    apart = by_tile(v.points, s.tiles)[..., None, :] - jnp.moveaxis(v.position[:, s.tiles.image], 0, 2)[..., None]
+    apart = by_tile(v.points, s.in_tiles)[..., None, :] - jnp.moveaxis(v.position[:, s.in_tiles.image], 0, 2)[..., None]
     distance = jnp.sqrt(jnp.sum(apart**2, axis=2))
     depth = jnp.sum(distance * filled[:, :, 0]) / jnp.sum(filled[:, :, 0])
     ground, angle = sigma * depth / c, sigma / c

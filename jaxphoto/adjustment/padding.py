@@ -1,4 +1,4 @@
-"""Layout and size classes: blocks as they are computed with, so that what is compiled serves every block of similar size.
+"""Layout and size classes: blocks as they are computed with; what is compiled serves every block of similar size.
 
 Before it is computed with, a block is laid out in tiles (`tiling`) and padded to the next sizes of a coarse series, at
 most an eighth larger, with an image and points that nothing depends on: rows of infinite standard deviation, unknowns
@@ -18,6 +18,7 @@ from jaxphoto.adjustment.band import column_blocks
 from jaxphoto.adjustment.residuals import Residuals, State, Values
 from jaxphoto.adjustment.structure import CameraGroup, Structure, Tiles
 from jaxphoto.adjustment.tiling import Tiling, order_images, tile_points, tile_shape
+from jaxphoto.arrays import still
 
 
 class Sizes(NamedTuple):
@@ -67,6 +68,8 @@ def sizes_of(structure: Structure) -> Sizes:
 
 # Tiles are summed in chunks whose products take no more numbers than this.
 _CHUNK = 4_000_000
+# Slots that are computed with at a time.
+_SLOTS = 400
 
 
 class _Layout(NamedTuple):
@@ -79,6 +82,7 @@ class _Layout(NamedTuple):
     """Images of a column block."""
     chunks: int
     chunk: int
+    at_once: int
     lists: tuple[list[np.ndarray], ...]
     sizes: Sizes
 
@@ -96,13 +100,13 @@ class _Layout(NamedTuple):
         columns, width = (1, n) if dense else column_blocks(n, min(n, size_class(bandwidth)))
         per_shard = -(-tiles // shards)
         chunks = -(-per_shard * (6 * m) ** 2 // _CHUNK)
-        chunk = size_class(-(-per_shard // chunks))
+        times = size_class(-(-per_shard * m * p // (chunks * _SLOTS)))
+        at_once = size_class(-(-per_shard // (chunks * times)))
+        chunk = at_once * times
         lists = _pair_lists(tiling.image, chunk, width)
         pairs, blocks = (max((len(v) for v in x), default=0) for x in (lists[0], lists[2]))
-        sizes = Sizes(
-            images, bandwidth, tiles, m, p, pairs, blocks + 1, len(s.station_image), len(s.attitude_image)
-        )
-        return cls(place, tiling, columns, width, shards * chunks, chunk, lists, sizes)
+        sizes = Sizes(images, bandwidth, tiles, m, p, pairs, blocks + 1, len(s.station_image), len(s.attitude_image))
+        return cls(place, tiling, columns, width, shards * chunks, chunk, at_once, lists, sizes)
 
 
 def _pair_lists(tile_image: np.ndarray, chunk: int, width: int) -> tuple[list[np.ndarray], ...]:
@@ -179,6 +183,7 @@ def pad_structure(
         tiles=Tiles(
             image=tile_image.reshape(n_chunks, layout.chunk, m),
             per_tile=p,
+            at_once=layout.at_once,
             pair_tile=listed[..., 0],
             pair_images=listed[..., 1:],
             pair_block=pair_block,
@@ -197,9 +202,8 @@ def pad_values(values: Values, structure: Structure, padded: Structure, places: 
     coordinates that nobody observed.
     """
     v, p = values, padded
-    assert p.tiles is not None
     n_images, n_points = p.n_images, p.n_points
-    slots = (*p.tiles.image.shape, p.tiles.per_tile)
+    slots = (*p.in_tiles.image.shape, p.in_tiles.per_tile)
     control = places.point[structure.control_point] + n_points * structure.control_axis
     stations, attitudes = len(p.station_image), len(p.attitude_image)
 
@@ -242,13 +246,13 @@ def pad_values(values: Values, structure: Structure, padded: Structure, places: 
 
 def crop_state(state: State, places: Places) -> State:
     """The state in the block's own sizes and order."""
-    position, rotation, shared, points = map(_still, state)
+    position, rotation, shared, points = map(still, state)
     return State(position[..., places.image], rotation[..., places.image], shared, points[..., places.point])
 
 
 def crop_residuals(residuals: Residuals, structure: Structure, places: Places) -> Residuals:
     """Residuals, or what is shaped like them, in the block's own sizes and order."""
-    s, r = structure, Residuals(*map(_still, residuals))
+    s, r = structure, Residuals(*map(still, residuals))
     chunks, tiles, _, m, p = r.image.shape
     image = r.image.reshape(chunks * tiles, 2, m * p)
     tile, slot = np.divmod(places.row, m * p)
@@ -262,14 +266,9 @@ def crop_residuals(residuals: Residuals, structure: Structure, places: Places) -
 
 def crop_reduced(matrix: Any, structure: Structure, places: Places) -> np.ndarray:
     """A matrix over the reduced unknowns (6 an image, then the shared ones) in the block's own sizes and order."""
-    matrix, q = np.asarray(matrix), structure.n_shared
+    matrix, q = still(matrix), structure.n_shared
     kept = np.append((6 * places.image[:, None] + np.arange(6)).ravel(), np.arange(len(matrix) - q, len(matrix)))
     return matrix[np.ix_(kept, kept)]
-
-
-def _still(x: Any) -> Any:
-    """numpy's array where nothing is traced: its slices need no compilation."""
-    return x if isinstance(x, jax.core.Tracer) else np.asarray(x)
 
 
 def _pad(array: np.ndarray, size: int, fill: float) -> np.ndarray:

@@ -16,7 +16,17 @@ from jaxphoto.adjustment.colouring import Jacobian, jacobian_blocks
 from jaxphoto.adjustment.normal import At, Reduced, cholesky_3x3, total, whiten
 from jaxphoto.adjustment.residuals import Increments, Residuals, other_residuals
 from jaxphoto.adjustment.structure import Structure
-from jaxphoto.adjustment.tiles import Columns, by_point, by_tile, columns, of_images, scene_of, seen_in, slopes_of
+from jaxphoto.adjustment.tiles import (
+    Columns,
+    by_point,
+    by_tile,
+    columns,
+    each_tile,
+    of_images,
+    scene_of,
+    seen_in,
+    slopes_of,
+)
 
 
 class Right(NamedTuple):
@@ -59,27 +69,26 @@ class TileParts(NamedTuple):
 
 def reduce_normal(at: At, damping) -> tuple[Reduced, Right]:
     """Eliminate the points of N + damping I. Unknowns held fixed (zero columns) get a unit diagonal."""
-    increments, scale, values, s = at
-    tiles = s.tiles
-    assert tiles is not None
+    s, tiles = at.structure, at.structure.in_tiles
     rest = other_rows(at)
     blocks, others, coupled = rest.blocks, rest.residuals, rest.coupled
     parts_of = tile_parts(at, damping, coupled)
     n, q, c = s.n_images, s.n_image_colours, s.n_interior + len(coupled) + 1
-    n_chunks, chunk, m = tiles.image.shape
+    _, chunk, m = tiles.image.shape
     width = n // tiles.columns
 
     def tile(numbers):
         p = parts_of(numbers)
         j = jnp.concatenate([p.columns.eop, p.columns.shared, p.columns.residual[None]])
         j = j.transpose(2, 0, 1, 3).reshape(m, 7 + q, -1)
-        y, border = p.f[: 6 * m], p.f[6 * m :]
-        own = jnp.concatenate([jnp.einsum("maj,mbj->mab", j, j).reshape(m, -1), (y @ border.T).reshape(m, -1)], axis=1)
-        return y @ y.T, own, border @ border.T, p.l, p.b
+        gram = p.f @ p.f.T
+        across = gram[: 6 * m, 6 * m :].reshape(m, -1)
+        own = jnp.concatenate([jnp.einsum("maj,mbj->mab", j, j).reshape(m, -1), across], axis=1)
+        return gram[: 6 * m, : 6 * m], own, gram[6 * m :, 6 * m :], p.l, p.b
 
     def add_chunk(sums, numbers):
         (pair_tile, pair_images, pair_block, block), of_tiles = numbers
-        grams, own, border, l, b = jax.lax.map(tile, of_tiles)  # noqa: E741
+        grams, own, border, l, b = each_tile(tile, of_tiles, tiles)  # noqa: E741
         grams = grams.reshape(chunk, m, 6, m, 6)[pair_tile, pair_images[:, 0], :, pair_images[:, 1]]
         grams = jax.ops.segment_sum(grams, pair_block, len(block), indices_are_sorted=True)
         band = sums[0].at[block[:, 0], block[:, 1], :, block[:, 2]].add(-grams, unique_indices=True, mode="drop")
@@ -113,9 +122,7 @@ def reduce_normal(at: At, damping) -> tuple[Reduced, Right]:
     gs = jnp.zeros((s.n_shared, k)).at[:i].set(-border[:i, i : i + k])
     g = jnp.concatenate([ge.reshape(6 * n, k), gs])
     kk = jnp.eye(k) + border[i : i + k, i : i + k]
-    a = Band(
-        band.reshape(tiles.columns, 12 * width, 6 * width), us.transpose(2, 0, 1).reshape(s.n_shared, 6 * n), uss
-    )
+    a = Band(band.reshape(tiles.columns, 12 * width, 6 * width), us.transpose(2, 0, 1).reshape(s.n_shared, 6 * n), uss)
     if k:
         a = _with_constraints(a, g, kk)
 
@@ -149,8 +156,7 @@ def other_rows(at: At) -> OtherRows:
 def tile_numbers(at: At, rest: OtherRows):
     """What `tile_parts` wants of each tile, chunks and tiles first."""
     increments, scale, values, s = at
-    tiles = s.tiles
-    assert tiles is not None
+    tiles = s.in_tiles
     points = values.points + increments.points * scale.points
     control = jnp.stack([rest.residuals.control, rest.control])
     of_points = (by_tile(v, tiles) for v in (points, scale.points, control, rest.rows_p))

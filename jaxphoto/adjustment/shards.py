@@ -1,7 +1,7 @@
 """Several devices: tiles and their points are dealt out over a mesh, everything else is on every device.
 
-Each device sums its own tiles; the sums of the reduced normal matrix are added across devices (`normal.total`), and each
-factors the result for itself. So nothing but sums the size of the reduced matrix ever travels.
+Each device sums its own tiles; the sums of the reduced normal matrix are added across devices (`normal.total`), and
+each factors the result for itself. So nothing but sums the size of the reduced matrix ever travels.
 """
 
 from collections.abc import Callable
@@ -16,12 +16,12 @@ from jax.sharding import PartitionSpec as P
 from jaxphoto.adjustment.normal import AXIS
 from jaxphoto.adjustment.structure import Structure
 
-EVERYWHERE = P()
-TILES = P(AXIS)
+EVERYWHERE: Any = P()
+TILES: Any = P(AXIS)
 """Dealt out along the first axis, that of chunks of tiles."""
 
 
-def along_points(ndim: int) -> P:
+def along_points(ndim: int) -> Any:
     """Dealt out along the last axis, that of points."""
     return P(*[None] * (ndim - 1), AXIS)
 
@@ -30,9 +30,23 @@ _OF_TILES = {"xy", "sigma_xy", "pair_tile", "pair_images", "pair_block", "block"
 _OF_POINTS = {"points", "control", "sigma_control", "datum_points", "point_free", "point_class", "l", "rows_p"}
 
 
+def usable(wanted: int) -> int:
+    """The most devices, up to `wanted`, that are equally many of each process; 1 where that would be none.
+
+    With 1, every process computes all of a block by itself.
+    """
+    each = min(wanted // jax.process_count(), *map(len, _devices_by_process()))
+    return max(1, each * jax.process_count())
+
+
 def mesh_of(shards: int) -> Mesh:
-    """The first `shards` devices, of all processes."""
-    return Mesh(np.array(jax.devices()[:shards]), (AXIS,))
+    """`shards` devices, equally many of each process: one without any would have no part in the result."""
+    each = shards // jax.process_count()
+    return Mesh(np.array([device for own in _devices_by_process() for device in own[:each]]), (AXIS,))
+
+
+def _devices_by_process() -> list[list[jax.Device]]:
+    return [[device for device in jax.devices() if device.process_index == k] for k in range(jax.process_count())]
 
 
 def sharded(function: Callable[..., Any], structure: Structure, out: Any) -> Callable[..., Any]:
@@ -40,15 +54,15 @@ def sharded(function: Callable[..., Any], structure: Structure, out: Any) -> Cal
 
     Its arguments are cut by the names of their fields; `out` says how its result is, as a prefix of that tree.
     """
-    assert structure.tiles is not None
-    if structure.tiles.shards == 1:
+    shards = structure.in_tiles.shards
+    if shards == 1:
         return function
 
     def wrapped(*arguments: Any) -> Any:
         arrays, rest = eqx.partition(arguments, eqx.is_array)
         run = jax.shard_map(
             lambda arrays: function(*eqx.combine(arrays, rest)),
-            mesh=mesh_of(structure.tiles.shards),
+            mesh=mesh_of(shards),
             in_specs=(jax.tree_util.tree_map_with_path(_spec, arrays),),
             out_specs=out,
             check_vma=False,

@@ -1,8 +1,8 @@
 """Levenberg-Marquardt for a block, as a solver of optimistix that knows the block's structure.
 
 optimistix runs the iteration. A step sums and factors the normal equations with their points eliminated (`reduced`,
-`band`), or, once steps shrink fast, keeps the factor and only takes the gradient anew: a chord step, which costs a third
-and near the optimum gains nearly as much.
+`band`), or, once steps shrink fast, keeps the factor and only takes the gradient anew: a chord step, which costs a
+third and near the optimum gains nearly as much.
 """
 
 from collections.abc import Callable
@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, Bool, Float, PyTree, Scalar
+from jaxtyping import Array, Bool, PyTree, Scalar
 
-from jaxphoto.adjustment.band import BandFactor, factor_band
+from jaxphoto.adjustment.band import Band, BandFactor, factor_band
 from jaxphoto.adjustment.normal import At, Reduced, dot, gradient, solve_reduced
 from jaxphoto.adjustment.reduced import Right, reduce_normal
 from jaxphoto.adjustment.residuals import Increments, Values
@@ -27,6 +27,22 @@ class System(NamedTuple):
     reduced: Reduced
     factor: BandFactor
     damping: Scalar
+
+
+def zero_system(y: Increments, values: Values, s: Structure) -> System:
+    """A system of the right shapes, to begin with."""
+    n, q, k = 6 * s.n_images, s.n_shared, len(values.distances) + len(values.datum_eop)
+    m, points = n // s.in_tiles.columns, y.points.shape[1]
+    band = (jnp.zeros((s.in_tiles.columns, 2 * m, m)), jnp.zeros((q, n)), jnp.zeros((q, q)))
+    reduced = Reduced(
+        a=Band(*band),
+        g=jnp.zeros((n + q, k)),
+        k=jnp.zeros((k, k)),
+        l=jnp.zeros((6, points)),
+        rows_e=jnp.zeros((k, s.n_images, 6)),
+        rows_p=jnp.zeros((k, 3, points)),
+    )
+    return System(y, reduced, BandFactor(*band), jnp.zeros(()))
 
 
 class Progress(NamedTuple):
@@ -82,9 +98,8 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Increments, Scalar, Any
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> Progress:
         """The first damping; the scaling has made its unit small."""
-        shapes = jax.eval_shape(lambda y: self._factored(y, 1.0)[0], y)
-        empty = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), shapes)
         damping = jnp.where(self.only_factor, 0.0, 1.0)
+        empty = zero_system(y, self.values, self.structure)
         return Progress(damping, jnp.array(jnp.inf), jnp.array(False), empty, jnp.array(False))
 
     def _factored(self, y: Increments, damping) -> tuple[System, Right]:
@@ -112,9 +127,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Increments, Scalar, Any
         settled = (missing <= self.tolerance) & (damped <= seen + self.tolerance**2)
         new_y = jax.tree.map(jnp.add, y, proposal)
         # The last step is short and was computed from an accepted iterate: it needs no proof.
-        square_sum = jax.lax.cond(
-            settled | self.only_factor, lambda: right.square_sum, lambda: fn(new_y, args)[0] ** 2
-        )
+        square_sum = jax.lax.cond(settled | self.only_factor, lambda: right.square_sum, lambda: fn(new_y, args)[0] ** 2)
         reduction, promised = right.square_sum - square_sum, seen + 2 * damped
         accept = settled | (reduction >= _ACCEPT * promised)
         good = reduction >= _GOOD * promised

@@ -49,6 +49,8 @@ class Tiles(eqx.Module):
     image: Int[np.ndarray, "chunks tiles m"]
     per_tile: int = eqx.field(static=True)
     """Points of a tile, P."""
+    at_once: int = eqx.field(static=True)
+    """Tiles that are computed with at a time: few enough for the cache of a core, enough to be worth its while."""
     pair_tile: Int[np.ndarray, "chunks pairs"]
     """Tile within its chunk of each pair of images of a tile that meet (first image not before second)."""
     pair_images: Int[np.ndarray, "chunks pairs 2"]
@@ -104,6 +106,12 @@ class Structure(eqx.Module):
     """Parameter path of each shared unknown, such as `interior[kodak].c_mm`."""
     tiles: Tiles | None
     """Of a padded structure."""
+
+    @property
+    def in_tiles(self) -> Tiles:
+        """The tiles of a padded structure."""
+        assert self.tiles is not None, "not a padded structure"
+        return self.tiles
 
     @property
     def n_shared(self) -> int:

@@ -1,10 +1,12 @@
 """A tile: residuals of its image rows, and their derivatives, in all its slots at once.
 
-A row touches one image, one point and the parameters of one camera. In a tile its image is an axis and its point another,
-so what depends on the image alone is computed once an image, and each column of the Jacobian is one forward derivative of
-`image_residual`, mapped over both axes: nothing is gathered row by row. Arrays end in (m, p): images, points.
+A row touches one image, one point and the parameters of one camera. In a tile its image is an axis and its point
+another, so what depends on the image alone is computed once an image, and each column of the Jacobian is one forward
+derivative of `image_residual`, mapped over both axes: nothing is gathered row by row. Arrays end in (m, p): images,
+points.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -86,9 +88,7 @@ def slopes_of(y: Increments, scale: Increments, values: Values, s: Structure) ->
 def of_images(tree: Any, image: Array, s: Structure) -> Any:
     """The parts of a `Scene` or of `Slopes` that belong to a tile's images."""
     take = lambda a: a.at[image].get(mode="promise_in_bounds")  # noqa: E731
-    cameras = tuple(
-        c if len(g.names) == 1 else take(c) for g, c in zip(s.groups, tree.cameras, strict=True)
-    )
+    cameras = tuple(c if len(g.names) == 1 else take(c) for g, c in zip(s.groups, tree.cameras, strict=True))
     return type(tree)(take(tree.centre), take(tree.rotation), cameras)
 
 
@@ -102,7 +102,8 @@ def rows(scene: Scene, points: Float[Array, "3 p"], seen: Seen, s: Structure) ->
     parts = [_rows_of(g, c, scene, points, seen, s) for g, c in zip(s.groups, scene.cameras, strict=True)]
     if len(parts) == 1:
         return parts[0]
-    return sum(jnp.where(mine[:, None], part, 0.0) for mine, part in zip(seen.member, parts, strict=True))
+    mine = zip(seen.member, parts, strict=True)
+    return sum((jnp.where(own[:, None], part, 0.0) for own, part in mine), jnp.zeros(()))
 
 
 def _rows_of(g: CameraGroup, camera: Array, scene: Scene, points: Array, seen: Seen, s: Structure) -> Array:
@@ -132,7 +133,9 @@ def columns(
         )
 
     # jit keeps the trace: every derivative below uses it again.
-    f = jax.jit(lambda free, centre, rotation, points: rows(Scene(centre, rotation, cameras_with(free)), points, seen, s))
+    f = jax.jit(
+        lambda free, centre, rotation, points: rows(Scene(centre, rotation, cameras_with(free)), points, seen, s)
+    )
 
     def slope(function, x, direction):
         return jax.jvp(function, (x,), (direction,))[1]
@@ -169,3 +172,16 @@ def by_point(array: Float[Array, "chunks tiles *c p"]) -> Float[Array, "*c point
     """The reverse of `by_tile`."""
     joined = jnp.moveaxis(array, (0, 1), (-3, -2))
     return joined.reshape(*joined.shape[:-3], -1)
+
+
+def each_tile(function: Callable, numbers: Any, tiles: Tiles) -> Any:
+    """`function` of every tile's numbers, a few tiles at a time: what that needs stays in the cache of a core."""
+    n = tiles.at_once
+    count = len(jax.tree.leaves(numbers)[0]) // n
+    if count == 1:
+        # As a loop would: what uses the results shall not compute them again.
+        return jax.lax.optimization_barrier(jax.vmap(function)(numbers))
+    if n == 1:
+        return jax.lax.map(function, numbers)
+    some = jax.tree.map(lambda v: v.reshape(count, n, *v.shape[1:]), numbers)
+    return jax.tree.map(lambda v: v.reshape(count * n, *v.shape[2:]), jax.lax.map(jax.vmap(function), some))

@@ -1,8 +1,8 @@
-"""Tiles: a few points with all the images that see any of them, so that their sums are products of small dense matrices.
+"""Tiles: a few points with all the images that see any of them; their sums are products of small dense matrices.
 
-Aerial and close-range blocks alike are locally dense: points that lie together are seen by nearly the same images. A tile
-of P points and M images holds M x P slots, empty where an image does not see a point; what is computed on it needs no
-list of rows, only the M numbers of its images. Images are numbered so that those which meet lie close (reverse
+Aerial and close-range blocks alike are locally dense: points that lie together are seen by nearly the same images. A
+tile of P points and M images holds M x P slots, empty where an image does not see a point; what is computed on it needs
+no list of rows, only the M numbers of its images. Images are numbered so that those which meet lie close (reverse
 Cuthill-McKee), which makes the reduced normal matrix a band and lets points in the order of their images fill tiles.
 """
 
@@ -56,7 +56,7 @@ def order_images(image: np.ndarray, point: np.ndarray, n_images: int, n_points: 
 
 def tile_shape(image: np.ndarray, point: np.ndarray, n_images: int, n_points: int) -> tuple[int, int]:
     """Images and points of a tile that make the sums cheapest, found on a part of the block; see `_cost`."""
-    order, first, images = _in_order(image, point, n_points)
+    order, images = _in_order(image, point, n_points)
     part = order[: min(len(order), _PART)]
     most = max(1, max(map(len, images), default=1))
     options = {(_round_up(min(m, n_images)), p) for m in (most, 1.25 * most, 1.5 * most, 2 * most) for p in (8, 16, 32)}
@@ -83,7 +83,7 @@ def tile_points(image: np.ndarray, point: np.ndarray, n_points: int, m: int, p: 
 
     Raises ValueError where a point has more than `m` rays.
     """
-    order, first, images = _in_order(image, point, n_points)
+    order, images = _in_order(image, point, n_points)
     if max(map(len, images), default=0) > m:
         raise ValueError(f"a point is seen by more than the {m} images of a tile")
     tiles = _cut(order, images, m, p)
@@ -101,8 +101,8 @@ def tile_points(image: np.ndarray, point: np.ndarray, n_points: int, m: int, p: 
     return Tiling(own, place, slot)
 
 
-def _in_order(image: np.ndarray, point: np.ndarray, n_points: int) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
-    """Points by their first image, last image and mean image; first rows; each point's images."""
+def _in_order(image: np.ndarray, point: np.ndarray, n_points: int) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Points by their first image, last image and mean image; each point's images."""
     first = np.searchsorted(point, np.arange(n_points + 1))
     rays = np.diff(first)
     seen = rays > 0
@@ -112,12 +112,13 @@ def _in_order(image: np.ndarray, point: np.ndarray, n_points: int) -> tuple[np.n
         low[seen] = np.minimum.reduceat(image, starts)
         high[seen] = np.maximum.reduceat(image, starts)
         mean[seen] = np.add.reduceat(image.astype(float), starts) / rays[seen]
-    return np.lexsort((mean, high, low)), first, np.split(image, first[1:-1])
+    return np.lexsort((mean, high, low)), np.split(image, first[1:-1])
 
 
 def _cut(order: np.ndarray, images: list[np.ndarray], m: int, p: int) -> list[tuple[list[int], int, int]]:
     """Cut points in their order into tiles: (images, first, last + 1)."""
-    tiles, members, start = [], set(), 0
+    tiles, start = [], 0
+    members: set[int] = set()
     for k, j in enumerate(order):
         own = images[j].tolist()
         union = members.union(own)

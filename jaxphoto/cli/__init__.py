@@ -1,5 +1,6 @@
 """The command line: read, do, write; one sentence and exit code 2 for what a user can mend."""
 
+import gc
 import sys
 import warnings
 
@@ -16,6 +17,8 @@ __all__ = ["app", "main"]
 def main() -> None:
     """Entry point of the command `jaxphoto`."""
     warnings.showwarning = _show_warning
+    # What importing made will stay: the collector need not look through it again and again.
+    gc.freeze()
     try:
         app(standalone_mode=True)
     except JaxphotoError as error:

@@ -1,18 +1,23 @@
 """The page of an experiment: what agrees, then each table as printed, ours in the same cells."""
 
+from __future__ import annotations
+
 import base64
 import io
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
 from jinja2 import Environment
-from matplotlib.figure import Figure
 
 from jaxphoto.experiment.comparison import MEAN_DIFFERENCE
 from jaxphoto.experiment.runner import Run
 from jaxphoto.experiment.wording import heading, own_decimals, power_of, printed_decimals, table_title
 from jaxphoto.report import STYLE, check_points_figure, layout_figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _PAGE = """<!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8"><title>{{ title }}</title><style>{{ style }}

@@ -1,13 +1,19 @@
 """Pictures of an experiment: ours against what is printed. Matplotlib figures."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
 
 from jaxphoto.experiment.comparison import MEAN_DIFFERENCE
 from jaxphoto.experiment.wording import heading, power_of, table_title
+from jaxphoto.report import new_figure
 
-_DPI = 110
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 _ACROSS = 5
 
 
@@ -24,8 +30,7 @@ def comparison_figure(comparison: pd.DataFrame, table: str) -> Figure:
     rows = list(dict.fromkeys(cells["row"]))
     groups = list(cells.groupby("column", sort=False))
     down = -(-len(groups) // _ACROSS)
-    size = (1.6 + 1.8 * min(len(groups), _ACROSS), down * (1.2 + 0.24 * len(rows)))
-    figure = Figure(figsize=size, dpi=_DPI, layout="constrained")
+    figure = new_figure(1.6 + 1.8 * min(len(groups), _ACROSS), down * (1.2 + 0.24 * len(rows)))
     panels = figure.subplots(down, min(len(groups), _ACROSS), squeeze=False, sharey=True).ravel()
     for axes, (column, of) in zip(panels, groups, strict=False):
         power = power_of(np.concatenate([of["published"], of["ours"]]))

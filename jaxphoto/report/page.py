@@ -1,17 +1,22 @@
 """The HTML report: one file that opens offline, judgement first, then tables and pictures."""
 
+from __future__ import annotations
+
 import base64
 import io
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
 from jinja2 import Environment
 from markupsafe import Markup
-from matplotlib.figure import Figure
 
 from jaxphoto.report.plots import check_points_figure, correlation_figure, layout_figure, residuals_figure
 from jaxphoto.report.tables import Tables
 from jaxphoto.statistics import LEAST_CHECKED
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 STYLE = """\
 body { font: 15px/1.45 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: #222 }

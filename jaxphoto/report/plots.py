@@ -1,20 +1,33 @@
 """Pictures of an adjustment: block layout, residuals, check points, correlations. Matplotlib figures."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from jaxphoto.report.tables import Tables
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
 _DPI = 110
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """An empty figure of a size in inches."""
+    # Here, because importing matplotlib takes a third of a second that most uses of jaxphoto need not wait for.
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), dpi=_DPI, layout="constrained")
 
 
 def layout_figure(tables: Tables) -> Figure:
     """Plan of the block: camera stations, object points, control and check points."""
     a = tables.adjusted
-    figure = Figure(figsize=(6.4, 5.6), dpi=_DPI, layout="constrained")
+    figure = new_figure(6.4, 5.6)
     axes = figure.subplots()
     points, stations = np.asarray(a.unknowns.points), np.asarray(a.unknowns.exterior.position)
     control = np.union1d(a.block.control.who, a.block.fixed.who).astype(int)
@@ -40,7 +53,7 @@ def residuals_figure(tables: Tables, camera: str) -> Figure:
     mine = np.array([c == camera for c in a.block.image_camera])[a.structure.image]
     xy, v = np.asarray(a.values.xy)[:, mine], (np.asarray(a.residuals.image) * np.asarray(a.values.sigma_xy))[:, mine]
     sensor = a.block.sensors[camera]
-    figure = Figure(figsize=(6.4, 5.0), dpi=_DPI, layout="constrained")
+    figure = new_figure(6.4, 5.0)
     axes = figure.subplots()
     key = _round_key(v)
     _vectors(axes, xy, v, key, 0.06 * sensor.width_mm, f"{1000 * key:g} µm", width=0.0015, above=0.03)
@@ -62,7 +75,7 @@ def check_points_figure(adjustments: Mapping[str, Tables]) -> Figure:
     key = _round_key(np.concatenate([d.ravel() for d in found.values()]))
     extent = np.max([np.ptp(of.adjusted.unknowns.exterior.position, axis=0) for of in adjustments.values()], axis=0)
     high = 4.2 * float(np.clip(extent[1] / max(extent[0], 1e-9), 0.2, 0.8))
-    figure = Figure(figsize=(9.6, 0.4 + (0.8 + high) * len(found)), dpi=_DPI, layout="constrained")
+    figure = new_figure(9.6, 0.4 + (0.8 + high) * len(found))
     for pair, (name, d) in zip(figure.subplots(len(found), 2, squeeze=False), found.items(), strict=True):
         a = adjustments[name].adjusted
         number = {point: k for k, point in enumerate(a.block.points)}
@@ -85,7 +98,7 @@ def check_points_figure(adjustments: Mapping[str, Tables]) -> Figure:
 def correlation_figure(tables: Tables, camera: str) -> Figure:
     """Heat maps: IOP x IOP, and mean |rho| of EOP x IOP."""
     c = tables.correlations[camera]
-    figure = Figure(figsize=(9.6, 4.4), dpi=_DPI, layout="constrained")
+    figure = new_figure(9.6, 4.4)
     left, right = figure.subplots(1, 2)
     for axes, values, rows, title in (
         (left, c.interior, c.parameters, "correlation of IOP"),

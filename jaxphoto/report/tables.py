@@ -2,6 +2,7 @@
 
 from functools import cached_property
 
+import equinox as eqx
 import jax
 import numpy as np
 import pandas as pd
@@ -10,6 +11,7 @@ from jaxphoto.adjustment import Adjustment
 from jaxphoto.adjustment.residuals import Residuals
 from jaxphoto.block import ATTITUDE_AXES, AXES
 from jaxphoto.camera import constant_names, get_parameter, parameter_names
+from jaxphoto.compiling import call_compiled
 from jaxphoto.rotation import omega_phi_kappa_from_matrix
 from jaxphoto.statistics import (
     Correlations,
@@ -22,12 +24,11 @@ from jaxphoto.statistics import (
     covariance,
     normalised_residuals,
     physical_residuals,
+    prepare_redundancy,
     redundancy_numbers,
     residual_spread,
     significance,
 )
-
-_ANGLES = jax.jit(jax.vmap(omega_phi_kappa_from_matrix))
 
 
 class Tables:
@@ -44,6 +45,8 @@ class Tables:
     @cached_property
     def covariance(self) -> Covariance:
         """Covariance with omega, phi, kappa."""
+        # All tables need both.
+        prepare_redundancy(self.adjusted)
         return covariance(self.adjusted)
 
     @cached_property
@@ -95,7 +98,7 @@ class Tables:
     def exterior(self) -> pd.DataFrame:
         """image, X_m ... kappa_deg and their sigmas."""
         exterior = self.adjusted.unknowns.exterior
-        angles = np.degrees(np.asarray(_ANGLES(exterior.camera_from_object)))
+        angles = np.degrees(np.asarray(call_compiled(_angles, exterior.camera_from_object)))
         sigma = np.asarray(self.covariance.exterior_sigma) * [1, 1, 1, *[180 / np.pi] * 3]
         names = ["X_m", "Y_m", "Z_m", "omega_deg", "phi_deg", "kappa_deg"]
         values = np.hstack([np.asarray(exterior.position), angles, sigma])
@@ -110,7 +113,7 @@ class Tables:
         position = np.asarray(exterior.position)
         camera_from_grid = np.asarray(exterior.camera_from_object) @ system.local_from_grid(position)
         table = self._map_coordinates(position)
-        table[["omega_deg", "phi_deg", "kappa_deg"]] = np.degrees(np.asarray(_ANGLES(camera_from_grid)))
+        table[["omega_deg", "phi_deg", "kappa_deg"]] = np.degrees(np.asarray(call_compiled(_angles, camera_from_grid)))
         table.insert(0, "image", self.adjusted.block.images)
         return table
 
@@ -224,3 +227,8 @@ class Tables:
         """group, axis, n, mean, rmse, max_abs, unit (paper 000, Table 3)."""
         columns = ["group", "axis", "n", "mean", "rmse", "max_abs", "unit"]
         return pd.DataFrame([[getattr(s, c) for c in columns] for s in residual_spread(self.adjusted)], columns=columns)
+
+
+@eqx.filter_jit
+def _angles(camera_from_object):
+    return jax.vmap(omega_phi_kappa_from_matrix)(camera_from_object)

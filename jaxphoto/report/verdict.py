@@ -1,11 +1,12 @@
 """What a person should know first: warnings about an adjustment, most serious first, each with what to do."""
 
+import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.camera import Sensor
+from jaxphoto.compiling import call_compiled
 from jaxphoto.report.tables import Tables
 from jaxphoto.report.weakness import weaknesses
 from jaxphoto.statistics import LEAST_CHECKED, SIGNIFICANT_RATIO, Correlations
@@ -96,5 +97,10 @@ def _folds(adjusted: Adjustment, name: str, sensor: Sensor) -> bool:
     interior = adjusted.unknowns.interior[name]
     corner = np.array([sensor.width_mm, sensor.height_mm]) / 2
     r = np.linspace(0.0, 1.0, 65)[:, None] * corner
-    out = np.asarray(jax.vmap(interior.closed_form)(jnp.asarray(r)))
+    out = np.asarray(call_compiled(_closed_form, interior, r))
     return bool((np.diff(np.linalg.norm(out, axis=1)) <= 0).any())
+
+
+@eqx.filter_jit
+def _closed_form(interior, xy):
+    return jax.vmap(interior.closed_form)(xy)

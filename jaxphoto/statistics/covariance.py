@@ -7,8 +7,8 @@ V = L L' and F = [W; Ws; D] L^-T what a point p meets, whitened,
     Q_pp  = L^-T (I + F' Q~ F) L^-1                 3 x 3 a point
     j Q j' = z'z + (j_r - F z)' Q~ (j_r - F z)      of an image row with columns j_r and j_p, z = L^-1 j_p'
 
-summed tile by tile. The full matrix is never inverted. In a free network the part along the open motions, which the constraints of the
-datum hold, is subtracted: what remains is the covariance under inner (or minimal) constraints.
+summed tile by tile. The full matrix is never inverted. In a free network the part along the open motions, which the
+constraints of the datum hold, is subtracted: what remains is the covariance under inner (or minimal) constraints.
 """
 
 from typing import Literal, NamedTuple
@@ -27,9 +27,10 @@ from jaxphoto.adjustment.padding import crop_reduced
 from jaxphoto.adjustment.reduced import OtherRows, other_rows, tile_numbers, tile_parts
 from jaxphoto.adjustment.residuals import Increments, Values
 from jaxphoto.adjustment.result import Factored
-from jaxphoto.adjustment.shards import EVERYWHERE, TILES, sharded
+from jaxphoto.adjustment.shards import TILES, sharded
 from jaxphoto.adjustment.structure import Structure
-from jaxphoto.arrays import Numbers
+from jaxphoto.adjustment.tiles import each_tile
+from jaxphoto.arrays import Numbers, still
 from jaxphoto.compiling import run_compiled
 from jaxphoto.rotation import omega_phi_kappa_from_matrix, small_rotation
 
@@ -67,22 +68,22 @@ class Covariance(eqx.Module):
     rotations: Rotations = eqx.field(static=True)
 
     @property
-    def exterior_sigma(self) -> Float[Array, "images 6"]:
+    def exterior_sigma(self) -> Float[np.ndarray, "images 6"]:
         """A posteriori standard deviations of X, Y, Z (m) and the rotations (rad), by image."""
-        return self._sigma(jnp.diagonal(self.matrix))[: 6 * self.n_images].reshape(-1, 6)
+        return self._sigma(np.diagonal(self.matrix))[: 6 * self.n_images].reshape(-1, 6)
 
     @property
-    def shared_sigma(self) -> Float[Array, "shared"]:
+    def shared_sigma(self) -> Float[np.ndarray, "shared"]:
         """A posteriori standard deviations of the shared unknowns, in the order of `labels`' end."""
-        return self._sigma(jnp.diagonal(self.matrix))[6 * self.n_images :]
+        return self._sigma(np.diagonal(self.matrix))[6 * self.n_images :]
 
     @property
-    def point_sigma(self) -> Float[Array, "points 3"]:
+    def point_sigma(self) -> Float[np.ndarray, "points 3"]:
         """A posteriori standard deviations of the object points (m)."""
-        return self._sigma(jnp.diagonal(self.points, axis1=1, axis2=2))
+        return self._sigma(np.diagonal(self.points, axis1=1, axis2=2))
 
-    def _sigma(self, variance):
-        return jnp.sqrt(jnp.maximum(variance, 0.0) * self.variance_factor)
+    def _sigma(self, variance: np.ndarray) -> np.ndarray:
+        return np.sqrt(np.maximum(variance, 0.0) * np.asarray(self.variance_factor))
 
 
 def covariance(adjusted: Adjustment, rotations: Rotations = "omega_phi_kappa") -> Covariance:
@@ -101,7 +102,7 @@ def covariance(adjusted: Adjustment, rotations: Rotations = "omega_phi_kappa") -
     labels = [f"exterior[{i}].{n}" for i in adjusted.block.images for n in EOP_NAMES[rotations]]
     return Covariance(
         matrix=crop_reduced(matrix, adjusted.structure, padded.places),
-        points=np.asarray(points)[padded.places.point],
+        points=still(points)[padded.places.point],
         variance_factor=adjusted.sigma0**2,
         cofactors=cofactors,
         labels=(*labels, *adjusted.structure.labels),
@@ -184,7 +185,7 @@ def _of_points(full: Float[Array, "n n"], values: Values, scale: Increments, s: 
         rows = rows + jnp.einsum("omkp,klp,omlp->omp", p.z, inner, p.z)
         return points, rows
 
-    points, rows = jax.lax.map(lambda chunk: jax.lax.map(tile, chunk), tile_numbers(at, rest))
+    points, rows = jax.lax.map(lambda chunk: each_tile(tile, chunk, s.in_tiles), tile_numbers(at, rest))
     return points.reshape(-1, 3, 3), rows
 
 

@@ -17,13 +17,23 @@ from jaxphoto.adjustment.reduced import other_rows
 from jaxphoto.adjustment.residuals import Residuals, Values
 from jaxphoto.adjustment.result import Factored
 from jaxphoto.adjustment.structure import Structure
-from jaxphoto.compiling import run_compiled
+from jaxphoto.compiling import prepare, run_compiled
 from jaxphoto.statistics.covariance import Cofactors, Covariance
 
 LEAST_CHECKED = 0.01
 """Redundancy number below which a normalised residual is mostly rounding and judges nothing."""
 # Below this redundancy number an observation is not checked at all: no normalised residual is given.
 _UNCHECKED = 1e-6
+
+
+def prepare_redundancy(adjusted: Adjustment) -> None:
+    """Have what `redundancy_numbers` needs compiled in the background, beside what `covariance` needs."""
+    padded = adjusted.computed
+    s, n = padded.structure, 6 * padded.structure.n_images + padded.structure.n_shared
+    shapes = ((n, n), (s.n_points, 3, 3), padded.values.xy.shape)
+    # Arrays of the right types that take no memory.
+    cofactors = Cofactors._make(np.broadcast_to(0.0, shape) for shape in shapes)
+    prepare(_redundancy, (padded.values, cofactors, padded.factored, s), adjusted.seconds)
 
 
 def redundancy_numbers(adjusted: Adjustment, covariance: Covariance) -> Residuals:

@@ -6,6 +6,7 @@ from jax.scipy.special import betainc, gammaincc, ndtri
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.camera import get_parameter
+from jaxphoto.compiling import call_compiled
 from jaxphoto.statistics.covariance import Covariance
 
 SIGNIFICANT_RATIO = 10.0
@@ -50,7 +51,8 @@ def student_p(t: float, degrees_of_freedom: int) -> float:
         return 1.0
     if not np.isfinite(t):
         return 0.0
-    return float(betainc(degrees_of_freedom / 2, 0.5, degrees_of_freedom / (degrees_of_freedom + t * t)))
+    a, x = degrees_of_freedom / 2, degrees_of_freedom / (degrees_of_freedom + t * t)
+    return float(call_compiled(_beta, np.array(a), np.array(x)))
 
 
 def chi_square_p(square_sum: float, redundancy: int) -> float:
@@ -61,3 +63,9 @@ def chi_square_p(square_sum: float, redundancy: int) -> float:
 def critical_value(level: float) -> float:
     """What a standard normal value exceeds in size with probability `level`."""
     return float(-ndtri(level / 2))
+
+
+@eqx.filter_jit
+def _beta(a, x):
+    """The regularised incomplete beta function of a and 1/2."""
+    return betainc(a, 0.5, x)

@@ -81,16 +81,19 @@ def at_optimum(name: str) -> Dense:
     whole = jax.tree.map(np.asarray, _dense(padded.values, padded.structure))
     unknowns, rows = own_order(padded.values, a.structure, padded.structure, padded.places)
     image = rows[: 2 * len(a.structure.image)].reshape(2, -1)
-    by_row = lambda v: np.stack([w.reshape(-1)[image] for w in np.moveaxis(v, 2, 0)]) if v.shape[2] else np.zeros((0, *image.shape))  # noqa: E731
+
+    def by_row(v):
+        parts = [part.reshape(-1)[image] for part in np.moveaxis(np.asarray(v), 2, 0)]
+        return np.stack(parts) if parts else np.zeros((0, *image.shape))
+
     c = whole.columns
-    columns = Columns(
-        c.residual.reshape(-1)[image], *(by_row(np.asarray(v)) for v in (c.eop, c.shared, c.point))
-    )
+    columns = Columns(c.residual.reshape(-1)[image], *map(by_row, (c.eop, c.shared, c.point)))
+    names = ("vector", "products", "gradient", "sums", "solutions", "scale")
     return whole._replace(
         jacobian=whole.jacobian[np.ix_(rows, unknowns)],
         residuals=whole.residuals[rows],
         columns=columns,
-        **{name: getattr(whole, name)[..., unknowns] for name in ("vector", "products", "gradient", "sums", "solutions", "scale")},
+        **{name: getattr(whole, name)[..., unknowns] for name in names},
     )
 
 

@@ -5,10 +5,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxphoto import adjust, compiling, covariance
+from jaxphoto import adjust, covariance
 from jaxphoto.adjustment import common_sizes
 from jaxphoto.adjustment.padding import pad_structure, size_class, sizes_of
 from jaxphoto.adjustment.structure import structure_of
+from jaxphoto.compiling import run
 from jaxphoto.statistics import redundancy_numbers
 from jaxphoto.variants import all_control, vertical_control
 from tests.blocks import VARIANTS, adjusted, simulated
@@ -62,7 +63,7 @@ def test_blocks_that_fit_common_sizes_compile_once():
     sizes = common_sizes(blocks)
     start = adjusted("cross").unknowns
     adjust(blocks[0], start, sizes=sizes)
-    before = len(compiling._executables)
+    before = len(run._programs)
     result = adjust(blocks[1], start, sizes=sizes)
-    assert len(compiling._executables) == before
+    assert len(run._programs) == before
     assert bool(result.converged)

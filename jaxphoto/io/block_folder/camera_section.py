@@ -3,9 +3,9 @@
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
+from jaxphoto.arrays import on_device
 from jaxphoto.camera import (
     DISTORTIONS,
     InteriorOrientation,
@@ -103,7 +103,7 @@ def _empty_interior(section: Section) -> InteriorOrientation:
 
 
 def _as_arrays(interior: InteriorOrientation) -> InteriorOrientation:
-    return jax.tree.map(lambda value: jnp.asarray(value, float), interior)
+    return jax.tree.map(on_device, interior)
 
 
 def _read_interior(section: Section, empty: InteriorOrientation, sensor: Sensor) -> InteriorOrientation:
@@ -111,7 +111,7 @@ def _read_interior(section: Section, empty: InteriorOrientation, sensor: Sensor)
     section.known(*names)
     interior = empty
     for name in section:
-        interior = set_parameter(interior, name, jnp.asarray(section.number(name)))
+        interior = set_parameter(interior, name, on_device(section.number(name)))
     c, diagonal = section.number("c_mm"), float(np.hypot(sensor.width_mm, sensor.height_mm))
     if not _SHORTEST * diagonal < c < _LONGEST * diagonal:
         raise section.error(

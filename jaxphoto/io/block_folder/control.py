@@ -3,9 +3,9 @@
 import warnings
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
+from jaxphoto.arrays import on_device
 from jaxphoto.block import AXES, Rows
 from jaxphoto.errors import InputError
 from jaxphoto.io.block_folder.image_points import Points
@@ -104,7 +104,7 @@ def _read_rows(table: Table, point: np.ndarray, settings: Settings) -> tuple[np.
             sigma[i, a] = default_sigma(table, i, SIGMA_XYZ[a], settings, *keys)
     # A check coordinate needs no sigma: it never enters an adjustment.
     sigma = np.nan_to_num(sigma)
-    rows = Rows(point[lines], axes, jnp.asarray(value[lines, axes]), jnp.asarray(sigma[lines, axes]))
+    rows = Rows(point[lines], axes, on_device(value[lines, axes]), on_device(sigma[lines, axes]))
     return role[lines], rows
 
 

@@ -1,8 +1,8 @@
 """stations.csv, attitudes.csv and distances.csv -> what GNSS, an IMU and scale bars observed."""
 
-import jax.numpy as jnp
 import numpy as np
 
+from jaxphoto.arrays import on_device
 from jaxphoto.block import Attitudes, Distances, Rows
 from jaxphoto.io.block_folder.control import default_sigma
 from jaxphoto.io.block_folder.image_points import Points
@@ -24,7 +24,7 @@ def read_stations(table: Table, images: Images, settings: Settings) -> Rows:
     for i, a in zip(lines, axes, strict=True):
         if np.isnan(sigma[i, a]):
             sigma[i, a] = default_sigma(table, i, SIGMA_XYZ[a], settings, "station_m")
-    return Rows(image[lines], axes, jnp.asarray(value[lines, axes]), jnp.asarray(sigma[lines, axes]))
+    return Rows(image[lines], axes, on_device(value[lines, axes]), on_device(sigma[lines, axes]))
 
 
 def read_attitudes(table: Table, images: Images, settings: Settings) -> Attitudes:
@@ -36,7 +36,7 @@ def read_attitudes(table: Table, images: Images, settings: Settings) -> Attitude
     sigma = np.stack([table.sigmas(name) for name in SIGMA_ATTITUDE], axis=1)
     for i, a in np.argwhere(np.isnan(sigma)):
         sigma[i, a] = default_sigma(table, i, SIGMA_ATTITUDE[a], settings, "attitude_deg")
-    return Attitudes(image, jnp.asarray(np.deg2rad(degrees)), jnp.asarray(np.deg2rad(sigma)))
+    return Attitudes(image, on_device(np.deg2rad(degrees)), on_device(np.deg2rad(sigma)))
 
 
 def read_distances(table: Table, points: Points, settings: Settings) -> Distances:
@@ -55,4 +55,4 @@ def read_distances(table: Table, points: Points, settings: Settings) -> Distance
     sigma = table.sigmas("sigma_m")
     for line in np.flatnonzero(np.isnan(sigma)):
         sigma[line] = default_sigma(table, line, "sigma_m", settings, "distance_m")
-    return Distances(ends, jnp.asarray(value), jnp.asarray(sigma))
+    return Distances(ends, on_device(value), on_device(sigma))

@@ -2,10 +2,10 @@
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
+from jaxphoto.arrays import on_device
 from jaxphoto.block import ImageRows
 from jaxphoto.camera import Sensor
 from jaxphoto.errors import BlockError, InputError
@@ -45,7 +45,7 @@ def read_image_points(table: Table, images: Images, settings: Settings) -> Point
     sigma = _sigmas(table, pixel, settings)
     point, ids = pd.factorize(named)
     order = np.lexsort((image, point))
-    rows = ImageRows(image[order], point[order], jnp.asarray(xy[order]), jnp.asarray(sigma[order]))
+    rows = ImageRows(image[order], point[order], on_device(xy[order]), on_device(sigma[order]))
     return Points(table, tuple(ids), rows, order)
 
 

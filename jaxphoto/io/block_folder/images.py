@@ -4,11 +4,11 @@ import warnings
 from typing import NamedTuple
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
 from jaxphoto.collinearity import ExteriorOrientation
+from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import BlockError
 from jaxphoto.io.block_folder.layout import ANGLES, XYZ
 from jaxphoto.io.block_folder.settings import Settings
@@ -106,7 +106,7 @@ def _exterior(table: Table) -> tuple[ExteriorOrientation, np.ndarray]:
         )
     values[~known] = 0.0
     check_angles(table, values[:, 3:], ANGLES)
-    return _from_angles(jnp.asarray(values[:, :3]), jnp.asarray(np.deg2rad(values[:, 3:]))), known
+    return call_compiled(_from_angles, values[:, :3], np.deg2rad(values[:, 3:])), known
 
 
 def check_angles(table: Table, degrees: np.ndarray, columns: tuple[str, ...]) -> None:

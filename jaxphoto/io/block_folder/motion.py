@@ -2,9 +2,9 @@
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
+from jaxphoto.arrays import on_device
 from jaxphoto.block import Attitudes, Motion, Rows
 from jaxphoto.georeferencing import Mount
 from jaxphoto.io.block_folder.images import Images
@@ -29,7 +29,7 @@ def read_motion(stations: Table, attitudes: Table, images: Images) -> tuple[Moti
     rate, rate_known = _columns(attitudes, RATE, images)
     motion = None
     if velocity_known.any() or rate_known.any():
-        motion = Motion(jnp.asarray(velocity), jnp.asarray(np.deg2rad(rate)))
+        motion = Motion(on_device(velocity), on_device(np.deg2rad(rate)))
     return motion, velocity_known, rate_known
 
 

@@ -3,9 +3,9 @@
 from collections.abc import Iterable
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
+from jaxphoto.arrays import on_device
 from jaxphoto.georeferencing import IMAGE_X, Mount, StripBias
 from jaxphoto.io.block_folder.camera_section import status
 from jaxphoto.io.block_folder.section import Section
@@ -29,7 +29,7 @@ def read_mounts(section: Section, cameras: Iterable[str]) -> tuple[dict[str, Mou
                 "image_x", f"{image_x!r} is no direction of the camera's x axis; use {', '.join(IMAGE_X)}"
             )
         offset = table.number("time_offset_s", 0.0)
-        mounts[name] = Mount(jnp.asarray(arm), jnp.asarray(boresight), jnp.asarray(offset), image_x)  # type: ignore[arg-type]
+        mounts[name] = Mount(on_device(arm), on_device(boresight), on_device(offset), image_x)  # type: ignore[arg-type]
         priors[name] = Mount(
             table.prior("lever_arm", arm, "_m"),  # type: ignore[arg-type]
             table.prior("boresight", boresight, "_deg", _DEG),  # type: ignore[arg-type]
@@ -53,7 +53,7 @@ def read_strips(section: Section, strips: Iterable[str]) -> tuple[dict[str, Stri
         table = section.section(key)
         table.known("shift_m", "drift_m_per_s", "shift", "drift")
         shift, drift = table.vector("shift_m"), table.vector("drift_m_per_s")
-        biases[strip] = StripBias(jnp.asarray(shift), jnp.asarray(drift))
+        biases[strip] = StripBias(on_device(shift), on_device(drift))
         priors[strip] = StripBias(
             table.prior("shift", shift, "_m"),  # type: ignore[arg-type]
             table.prior("drift", drift, "_m_per_s"),  # type: ignore[arg-type]

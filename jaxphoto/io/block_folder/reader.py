@@ -9,9 +9,9 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
+from jaxphoto.arrays import on_device
 from jaxphoto.block import Block, Frame, Start, sensor_rows
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import Mount
@@ -112,7 +112,7 @@ def assemble(source: BlockTables) -> Block:
     start = Unknowns(
         {name: camera.interior for name, camera in cameras.items()},
         images.exterior,
-        jnp.asarray(control.start),
+        on_device(control.start),
         _only(mounts, used),
         strips,
     )
@@ -130,7 +130,7 @@ def assemble(source: BlockTables) -> Block:
         image_camera=images.cameras,
         image_mount=image_mount,
         image_strip=images.strips,
-        image_time=jnp.asarray(images.times),
+        image_time=on_device(images.times),
         image_points=points.rows,
         control=control.control,
         fixed=control.fixed,

@@ -2,9 +2,9 @@
 
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
+from jaxphoto.arrays import on_device
 from jaxphoto.errors import InputError
 from jaxphoto.unknowns import FIXED, FREE, Prior, Weighted
 
@@ -90,7 +90,7 @@ class Section:
         if not np.all(sigma > 0):
             raise self.error(key, f'sigma = {status[names["sigma"][0]]} is not positive; give the true one or "fixed"')
         value = self._array(key, status[names["value"][0]], shape) * scale if names["value"] else np.asarray(start)
-        return Weighted(jnp.asarray(value, float), jnp.asarray(sigma, float))
+        return Weighted(on_device(value), on_device(sigma))
 
     def _array(self, key: str, value, shape: tuple[int, ...]) -> np.ndarray:
         values = value if isinstance(value, list) else [value]

@@ -88,7 +88,8 @@ def recipe_from(values: Mapping[str, Any], file: str = "recipe.toml") -> Recipe:
     )
 
 
-_NO_MOUNT = Assumed(*[Mount(jnp.zeros(3), jnp.zeros(3))] * 3)
+# NumPy's arrays: those of JAX would start a device and compile at import.
+_NO_MOUNT = Assumed(*[Mount(np.zeros(3), np.zeros(3))] * 3)  # type: ignore[arg-type]
 
 
 def _plan(top: Section, cameras: Mapping[str, Mounted]) -> FlightPlan | ConvergentPlan:

@@ -1,0 +1,249 @@
+"""How near to the limits of a GPU (or, without one, of the CPU) the adjustment runs. See README.md.
+
+python benchmarks/accelerator.py [--problems P31 B200 B1000] [--draws 64]
+"""
+
+import argparse
+import dataclasses
+import os
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from blocks import SIZES, generate, read_npz
+from machine import machine, markdown, sentence, write_results
+from ours import block_of
+
+import jaxphoto
+from jaxphoto.adjustment import solve
+from jaxphoto.adjustment.band import factor_band
+from jaxphoto.adjustment.normal import At
+from jaxphoto.adjustment.optimum import zero_increments
+from jaxphoto.adjustment.reduced import other_rows, reduce_normal, tile_numbers, tile_parts
+from jaxphoto.adjustment.result import Padded
+from jaxphoto.block import Block
+from jaxphoto.compiling.options import options_here
+
+_ROUNDS = 5
+# Sides of the square matrices, and numbers of a vector, that show the limits: far beyond any cache, a second at most.
+_LIMITS = {"cpu": (2048, 1 << 25), "gpu": (8192, 1 << 28)}
+# Strips are shifted by up to this many metres (standard deviation), as in the Monte Carlo of the peers.
+_SHIFTS = (0.05, 0.10, 0.15, 0.20, 0.25, 0.30)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--problems", nargs="*", default=list(SIZES), choices=list(SIZES))
+    parser.add_argument("--npz", type=Path, help="folder of P31.npz ... of the peers' generator, instead of our own")
+    parser.add_argument("--draws", type=int, default=64, help="adjustments of the Monte Carlo (none for 0)")
+    parser.add_argument("--out", type=Path, help="folder for results.jsonl and results.md")
+    arguments = parser.parse_args()
+    kind, head = jax.default_backend(), machine()
+    device = jax.devices()[0].device_kind
+    if kind == "cpu":
+        print("No GPU is present (or jax is installed without it): this measures the CPU.", file=sys.stderr)
+    limits = _limits(kind)
+    records: list[dict] = [{"kind": "head", "backend": kind, "device": device, **limits, **head}]
+    for name in arguments.problems:
+        problem = read_npz(arguments.npz / f"{name}.npz") if arguments.npz else generate(SIZES[name])
+        records.append(measure(block_of(problem, name)))
+        print(name, file=sys.stderr)
+    if arguments.draws:
+        problem = read_npz(arguments.npz / "P31.npz") if arguments.npz else generate(SIZES["P31"])
+        records.append(monte_carlo(block_of(problem, "P31"), problem.strip, arguments.draws))
+    write_results(arguments.out, "accelerator", records, "\n".join(table(records)))
+
+
+def _best(call: Callable[[], Any], rounds: int = _ROUNDS) -> list[float]:
+    """Seconds of each warm call."""
+    jax.block_until_ready(call())
+    seconds = []
+    for _ in range(rounds):
+        began = time.perf_counter()
+        jax.block_until_ready(call())
+        seconds.append(time.perf_counter() - began)
+    return seconds
+
+
+def _limits(kind: str) -> dict[str, float]:
+    """What the device reaches in this run: operations of a large product, bytes of a large sum a + 3 b."""
+    side, length = _LIMITS["cpu" if kind == "cpu" else "gpu"]
+    a, v = jnp.ones((side, side)), jnp.ones(length)
+    product, triad = jax.jit(jnp.matmul), jax.jit(lambda x, y: x + 3 * y)
+    other = v + 1
+    return {
+        "gflops": 2 * side**3 / min(_best(lambda: product(a, a))) / 1e9,
+        "gbytes": 3 * 8 * length / min(_best(lambda: triad(v, other))) / 1e9,
+    }
+
+
+def measure(block: Block) -> dict:
+    """One block: solve and covariance, and one linearisation with its factorisation against the limits."""
+
+    def once():
+        adjusted = solve(block, block.start.unknowns, block.priors)
+        jaxphoto.covariance(adjusted)
+        return adjusted
+
+    once()
+    adjusted = [once() for _ in range(_ROUNDS)]
+    last = adjusted[-1].computed
+    step, arrays = _step(last)
+    work = _work(last)
+    seconds = statistics.median(_best(lambda: step(*arrays)))
+    return {
+        "kind": "block",
+        "problem": block.title,
+        "images": len(block.images),
+        "image_points": len(block.image_points.xy),
+        "steps": int(adjusted[-1].steps),
+        "solve_s": statistics.median(a.seconds["solve"] for a in adjusted),
+        "covariance_s": statistics.median(a.seconds["covariance"] for a in adjusted),
+        "step_s": seconds,
+        **work,
+    }
+
+
+def _at(padded: Padded) -> At:
+    return At(zero_increments(padded.structure), padded.factored.scale, padded.values, padded.structure)
+
+
+def _step(padded: Padded) -> tuple[Callable[..., Any], list]:
+    """Sums of the reduced normal equations and their factor, compiled as `solve` would compile them."""
+    dynamic, static = eqx.partition(_at(padded), eqx.is_array)
+    leaves, tree = jax.tree.flatten(dynamic)
+
+    def step(*leaves):
+        reduced, right = reduce_normal(eqx.combine(jax.tree.unflatten(tree, leaves), static), 0.0)
+        return factor_band(reduced.a), reduced.l, right
+
+    arrays = [jax.device_put(leaf) for leaf in leaves]
+    return jax.jit(step).lower(*arrays).compile(compiler_options=options_here()), arrays
+
+
+def _work(padded: Padded) -> dict[str, float]:
+    """Operations of one such step, and the bytes that it has to move at least.
+
+    Operations of residuals and derivatives are those that XLA counts (`cost_analysis`) for one tile, times tiles;
+    those of the products of a tile and of the factorisation are counted by hand, as XLA counts loops once. Empty slots
+    count like others. Bytes are those of what is read and written once: measurements, structure, results, and the
+    reduced matrix before it is factored; what stays in caches is not counted.
+    """
+    at, s = _at(padded), padded.structure
+    rest = other_rows(at)
+    parts = tile_parts(at, 0.0, rest.coupled)
+    numbers = jax.tree.map(lambda v: v[0, 0], tile_numbers(at, rest))
+    cost = jax.jit(parts).lower(numbers).compile().cost_analysis() or {}
+    tiles = int(np.prod(s.in_tiles.image.shape[:2]))
+    m, p = s.in_tiles.image.shape[2], s.in_tiles.per_tile
+    f = 6 * m + s.n_interior + len(rest.coupled) + 1
+    products = 2 * 3 * p * f**2 + 2 * 2 * p * m * (7 + s.n_image_colours) ** 2
+    band = padded.factored.reduced.a
+    k, _, width = band.columns.shape
+    n, q = k * width, len(band.corner)
+    factor = k * width**3 / 3 + (k - 1) * 3 * width**3 + 2 * n * q * width + n * q * q
+    # Read: everything that goes in. Written, read and written again: the reduced matrix and its factor.
+    into = sum(np.asarray(leaf).nbytes for leaf in jax.tree.leaves(eqx.filter(at, eqx.is_array)))
+    out = 3 * 8 * sum(v.size for v in band) + 8 * (9 * s.n_points)
+    return {
+        "derivative_gflop": tiles * cost.get("flops", 0.0) / 1e9,
+        "product_gflop": tiles * products / 1e9,
+        "factor_gflop": factor / 1e9,
+        "gbyte": (into + out) / 1e9,
+    }
+
+
+def monte_carlo(block: Block, strip: np.ndarray, draws: int) -> dict:
+    """Adjustments with shifted strips, all at once by `jax.vmap`, from the optimum of the block as it is."""
+    optimum = solve(block, block.start.unknowns, block.priors)
+    rng = np.random.default_rng(0)
+    shift = rng.normal(size=(draws, strip.max() + 1, 3)) * np.resize(_SHIFTS, draws)[:, None, None]
+    stations = np.ravel(block.stations.value) + shift[:, strip].reshape(draws, -1)
+
+    def adjusted(values) -> tuple:
+        shifted = dataclasses.replace(block, stations=dataclasses.replace(block.stations, value=values))
+        found = solve(shifted, optimum.unknowns, block.priors)
+        return found.unknowns.interior["cam"].c, found.steps
+
+    began = time.perf_counter()
+    together = jax.jit(jax.vmap(adjusted)).lower(stations).compile(compiler_options=options_here())
+    compiling = time.perf_counter() - began
+    _, steps = together(stations)
+    seconds = statistics.median(_best(lambda: together(stations), 3))
+    few = stations[: min(draws, 8)]
+    began = time.perf_counter()
+    for values in few:
+        adjusted(values)
+    return {
+        "kind": "monte carlo",
+        "draws": draws,
+        "compile_s": compiling,
+        "per_s": draws / seconds,
+        "loop_per_s": len(few) / (time.perf_counter() - began),
+        "steps": int(np.max(steps)),
+        "seconds": seconds,
+        **_work(optimum.computed),
+    }
+
+
+def table(records: list[dict]) -> list[str]:
+    """The records as Markdown."""
+    head = records[0]
+    lines = [
+        f"### Limits reached: {head['device']} ({head['backend']})",
+        "",
+        sentence(head),
+        *(["No GPU is present: this is the CPU."] if head["backend"] == "cpu" else []),
+        f"Limits measured in the same run: {head['gflops']:.0f} GFLOP/s (product of large matrices, float64), "
+        f"{head['gbytes']:.1f} GB/s (a + 3 b of long vectors).",
+        "",
+        "`python benchmarks/accelerator.py`",
+        "",
+    ]
+    names = ["problem", "solve ms", "steps", "covariance ms", "one linearisation and factor ms"]
+    names += ["Gflop: derivatives, products, factor", "GFLOP/s", "of the limit", "MB", "GB/s", "of the limit"]
+    rows = []
+    for r in records:
+        if r["kind"] == "block":
+            cells = [r["problem"], f"{1e3 * r['solve_s']:.1f}", str(r["steps"]), f"{1e3 * r['covariance_s']:.1f}"]
+            rows.append([*cells, f"{1e3 * r['step_s']:.2f}", *_reached(r, head, r["step_s"], 1)])
+    lines += markdown(names, rows)
+    for r in records:
+        if r["kind"] != "monte carlo":
+            continue
+        # All go on until the last is done; its last step may be one without a linearisation.
+        reached = _reached(r, head, r["seconds"], r["draws"] * r["steps"])
+        lines += [
+            "",
+            f"Monte Carlo, P31 re-adjusted {r['draws']} times with shifted strips: {r['per_s']:.0f} adjustments a "
+            f"second by `jax.vmap` ({r['steps']} steps at most; compiling {r['compile_s']:.0f} s), "
+            f"{r['loop_per_s']:.0f} one after the other from Python. "
+            f"At most {reached[1]} GFLOP/s, {reached[2]} of the limit; {reached[4]} GB/s, {reached[5]}.",
+        ]
+    return lines
+
+
+def _reached(r: dict, head: dict, seconds: float, times: int) -> list[str]:
+    parts = [r[f"{name}_gflop"] for name in ("derivative", "product", "factor")]
+    flops, rate = times * sum(parts) / seconds, times * r["gbyte"] / seconds
+    return [
+        ", ".join(f"{v:.2g}" for v in parts),
+        f"{flops:.1f}",
+        f"{flops / head['gflops']:.0%}",
+        f"{1e3 * r['gbyte']:.1f}",
+        f"{rate:.2f}",
+        f"{rate / head['gbytes']:.1%}",
+    ]
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,76 @@
+"""A text that says what a program is compiled for, the same in every process; or the refusal to give one.
+
+It must never be the same for two programs that differ. So only what is known to be told by it whole is described:
+plain values, arrays by their type, containers, dataclasses, and functions and classes of packages whose content the
+key of `store` holds otherwise, by their names.
+"""
+
+import dataclasses
+import enum
+import types
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+
+# Packages whose sources or versions are part of the key: a name in them says what it means.
+_KNOWN = frozenset({"jaxphoto", "jax", "jaxlib", "equinox", "optimistix", "lineax", "numpy", "builtins"})
+_PLAIN = (type(None), bool, int, float, complex, str, bytes)
+
+
+class Indescribable(Exception):
+    """Something whose meaning a text cannot be trusted to tell; what depends on it stays in its process."""
+
+
+class _Leaf:
+    """Stands for a leaf of a tree of which only the structure is known."""
+
+
+def describe(value: Any) -> str:
+    """The text for arguments, static and not: of arrays their types only. Raises Indescribable."""
+    if type(value) in _PLAIN:
+        return repr(value)
+    if isinstance(value, _Leaf):
+        return "leaf"
+    if eqx.is_array(value):
+        return _array(value)
+    if isinstance(value, enum.Enum):
+        return f"{_name(type(value))}.{value.name}"
+    if isinstance(value, np.dtype):
+        return f"dtype {value.str}"
+    if isinstance(value, type | types.FunctionType):
+        return _name(value)
+    if isinstance(value, jax.tree_util.PyTreeDef):
+        return f"tree {describe(jax.tree.unflatten(value, [_Leaf()] * value.num_leaves))}"
+    return f"{_name(type(value))}({', '.join(map(describe, _content(value)))})"
+
+
+def _content(value: Any) -> list:
+    """What a container or dataclass consists of, in order."""
+    if isinstance(value, tuple) and (type(value) is tuple or hasattr(value, "_fields")):
+        return list(value)
+    if type(value) is list:
+        return value
+    if type(value) is dict:
+        return [part for item in value.items() for part in item]
+    if dataclasses.is_dataclass(value):
+        return [getattr(value, field.name) for field in dataclasses.fields(value)]
+    raise Indescribable(f"{type(value)} is not known to be told by its parts")
+
+
+def _array(value: Any) -> str:
+    """The type of an array: what a compiled program asks of its argument."""
+    told = f"array {np.dtype(value.dtype).name} {value.shape}"
+    if not isinstance(value, jax.Array):
+        return told
+    devices: Any = value.sharding.device_set
+    place = f" {value.sharding} {sorted(device.id for device in devices)}" if value.committed else ""
+    return told + " weak" * value.weak_type + place
+
+
+def _name(value: type | types.FunctionType) -> str:
+    module, name = value.__module__ or "", value.__qualname__
+    if module.split(".")[0] not in _KNOWN or "<" in name:
+        raise Indescribable(f"{module}.{name} may mean something else elsewhere")
+    return f"{module}.{name}"

@@ -1,0 +1,171 @@
+"""Calling what is compiled so that compiling and running are told apart, compiled at most once a process.
+
+Tracing and lowering are Python and take turns; compiling is not, so what is known to be needed soon (`prepare`) is
+compiled on another core meanwhile.
+"""
+
+import contextlib
+import os
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+
+from jaxphoto.compiling import store
+from jaxphoto.compiling.options import options_here
+
+
+class _Slot:
+    """Stands for an array in the tree of a result."""
+
+
+class _Program(NamedTuple):
+    """A compiled function of arrays, and the tree that its results fill: leaves that are `_Slot` are arrays."""
+
+    compiled: jax.stages.Compiled
+    leaves: list
+    structure: jax.tree_util.PyTreeDef
+    loaded: bool
+
+    def __call__(self, arrays: list) -> Any:
+        """The result, ready."""
+        found = iter(jax.block_until_ready(self.compiled(*arrays)))
+        leaves = [next(found) if isinstance(leaf, _Slot) else leaf for leaf in self.leaves]
+        return jax.tree.unflatten(self.structure, leaves)
+
+
+_programs: dict[object, _Program] = {}
+_prepared: dict[object, Future[_Program]] = {}
+_workers = ThreadPoolExecutor(max_workers=os.cpu_count(), thread_name_prefix="jaxphoto-compile")
+
+
+def run_compiled(function: Any, arguments: tuple, seconds: dict[str, float], name: str) -> Any:
+    """Call `function` (made by `eqx.filter_jit`), compiling it first and apart, or loading it from disk (`store`).
+
+    Adds to `seconds["compile"]` what compiling or loading took, and to `seconds[name]` what the call took. Under a
+    transformation of JAX it is a plain call.
+    """
+    if _traced(arguments):
+        return function(*arguments)
+    began = time.perf_counter()
+    key, arrays = _key(function, arguments), jax.tree.leaves(eqx.filter(arguments, eqx.is_array))
+    prepared = _prepared.pop(key, None)
+    if prepared is not None:
+        _programs[key] = prepared.result()
+    elif key not in _programs:
+        _programs[key] = _program_of(function.__wrapped__, arguments)()
+    ready = time.perf_counter()
+    try:
+        result = _programs[key](arrays)
+    except jax.errors.JaxRuntimeError:
+        # Read whole, but not fit to run after all: that shows in the call only.
+        if not _programs[key].loaded:
+            raise
+        _programs[key] = _program_of(function.__wrapped__, arguments, anew=True)()
+        ready = time.perf_counter()
+        result = _programs[key](arrays)
+    seconds["compile"] = seconds.get("compile", 0.0) + ready - began
+    seconds[name] = seconds.get(name, 0.0) + time.perf_counter() - ready
+    return result
+
+
+def call_compiled(function: Any, *arguments: Any) -> Any:
+    """`run_compiled` where nobody asks for times: what a start needs, and would otherwise trace each time."""
+    return run_compiled(function, arguments, {}, "")
+
+
+def prepare(function: Any, arguments: tuple, seconds: dict[str, float]) -> None:
+    """Have `function` compiled in the background for a later `run_compiled` with arguments of these types.
+
+    Adds to `seconds["compile"]` what this caller waits for.
+    """
+    if _traced(arguments):
+        return
+    began = time.perf_counter()
+    key = _key(function, arguments)
+    if key not in _programs and key not in _prepared:
+        _prepared[key] = _workers.submit(_program_of(function.__wrapped__, arguments))
+    seconds["compile"] = seconds.get("compile", 0.0) + time.perf_counter() - began
+
+
+def _traced(arguments: tuple) -> bool:
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(arguments))
+
+
+def _key(function: Any, arguments: tuple) -> object:
+    """What tells programs apart within a process."""
+    dynamic, static = eqx.partition(arguments, eqx.is_array)
+    arrays, structure = jax.tree.flatten(dynamic)
+    types = tuple(map(_type, arrays))
+    return (function, types, structure, tuple(jax.tree.leaves(static)), jax.tree.structure(static))
+
+
+def _type(array: Any) -> tuple:
+    if not isinstance(array, jax.Array):
+        return array.shape, array.dtype, False, None
+    return array.shape, array.dtype, array.weak_type, array.sharding if array.committed else None
+
+
+def _program_of(function: Any, arguments: tuple, anew: bool = False) -> Callable[[], _Program]:
+    """What gives the program: from disk; compiled, and kept for the next process, where it is not or wanted `anew`.
+
+    All that depends on the thread, such as `with jax.enable_x64(False)`, is done before this returns.
+    """
+    options = options_here()
+    key = store.key_of(function, arguments, options)
+    stored = store.load(key) if key and not anew else None
+    if stored is not None:
+        program = _Program(stored.compiled, *jax.tree.flatten(stored.skeleton), loaded=True)
+        return lambda: program
+    lowered, skeleton = _lowered(function, arguments)
+
+    def compiled() -> _Program:
+        with _not_in_cache() if key else contextlib.nullcontext():
+            program = lowered.compile(compiler_options=options)  # type: ignore[arg-type]
+        if key:
+            store.save(key, store.Stored(program, skeleton))
+        return _Program(program, *jax.tree.flatten(skeleton), loaded=False)
+
+    return compiled
+
+
+def _lowered(function: Any, arguments: tuple) -> tuple[jax.stages.Lowered, Any]:
+    """`function` as one from list to list of arrays, which JAX can keep on disk; and the tree that these fill."""
+    dynamic, static = eqx.partition(arguments, eqx.is_array)
+    arrays, structure = jax.tree.flatten(dynamic)
+    skeleton: Any = None
+
+    def flat(*arrays):
+        nonlocal skeleton
+        result = function(*eqx.combine(jax.tree.unflatten(structure, arrays), static))
+        skeleton = jax.tree.map(lambda leaf: _Slot() if eqx.is_array(leaf) else leaf, result)
+        return [leaf for leaf in jax.tree.leaves(result) if eqx.is_array(leaf)]
+
+    # A name of its own: what JAX's cache holds of `function` itself must not be taken for it (`_not_in_cache`).
+    flat.__name__ = f"{function.__name__}_of_arrays"
+    return jax.jit(flat).lower(*arrays), skeleton
+
+
+_THRESHOLD = "jax_persistent_cache_min_compile_time_secs"
+_lock = threading.Lock()
+_kept_out: list[float] = []
+"""The threshold that the user has, once for each compilation under way in `_not_in_cache`."""
+
+
+@contextlib.contextmanager
+def _not_in_cache() -> Iterator[None]:
+    """Keep what is compiled out of JAX's cache: XLA cannot write a program of a CPU once more that comes from there."""
+    with _lock:
+        _kept_out.append(_kept_out[0] if _kept_out else jax.config.values[_THRESHOLD])
+        jax.config.update(_THRESHOLD, float("inf"))
+    try:
+        yield
+    finally:
+        with _lock:
+            before = _kept_out.pop()
+            if not _kept_out:
+                jax.config.update(_THRESHOLD, before)

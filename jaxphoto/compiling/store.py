@@ -1,0 +1,159 @@
+"""Compiled programs on disk, beside JAX's own cache, to be run by a later process without tracing them again.
+
+JAX's cache holds what XLA compiled, but needs the traced and lowered program to find it; these are half of a start.
+A file's name is a hash of all that a program depends on (`key_of`); its content is a hash of itself, then the pickled
+program. Like JAX's cache it holds code that is run: the folder is to be trusted.
+"""
+
+import contextlib
+import functools
+import hashlib
+import os
+import pickle
+import platform
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jaxlib
+import lineax as lx
+import numpy as np
+import optimistix as optx
+from jax.experimental.serialize_executable import deserialize_and_load, serialize
+from jaxlib import lapack
+
+from jaxphoto.compiling.description import Indescribable, describe
+
+# What the folder may hold (bytes): beyond, what was not used for longest goes.
+MOST = 200_000_000
+_PACKAGES = (jax, jaxlib, eqx, optx, lx, np)
+_DIGEST = hashlib.sha256().digest_size
+
+
+class Stored(NamedTuple):
+    """A program whose arguments and results are lists of arrays, and the tree that its results fill."""
+
+    compiled: jax.stages.Compiled
+    skeleton: Any
+
+
+def _digest_of_sources() -> str:
+    digest = hashlib.sha256()
+    package = Path(__file__).parents[1]
+    for path in sorted(package.rglob("*.py")):
+        digest.update(f"{path.relative_to(package)}\n".encode())
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+# Taken while they are imported: an edit after that is not what this process runs.
+_SOURCES = _digest_of_sources()
+
+
+def key_of(function: Any, arguments: tuple, options: dict | None) -> str | None:
+    """The name under which a program is kept; None where nothing is to be kept, or no name would be safe."""
+    if _folder() is None or jax.default_backend() != "cpu" or jax.process_count() > 1:
+        return None
+    try:
+        told = (describe(function), describe(arguments), describe(options), *_surroundings(), *_settings())
+    except Indescribable:
+        return None
+    return hashlib.sha256("\n".join(told).encode()).hexdigest()
+
+
+def load(key: str) -> Stored | None:
+    """The program kept under `key`; None where there is none, or it cannot be read or does not fit."""
+    folder = _folder()
+    if folder is None:
+        return None
+    path = folder / key
+    try:
+        content = path.read_bytes()
+        os.utime(path)
+    except OSError:
+        return None
+    if hashlib.sha256(content[_DIGEST:]).digest() != content[:_DIGEST]:
+        return None
+    # A program finds LAPACK by pointers that JAX sets when it lowers a call of it; here nothing is lowered.
+    lapack.prepare_lapack_call("potrf", np.dtype(float))
+    try:
+        program, n_arguments, n_results, skeleton, ids = pickle.loads(content[_DIGEST:])
+        by_id = {device.id: device for device in jax.devices()}
+        compiled = deserialize_and_load(
+            program,
+            jax.tree.structure(((0,) * n_arguments, {})),
+            jax.tree.structure([0] * n_results),
+            execution_devices=[by_id[k] for k in ids],
+        )
+    except Exception:  # Whatever is wrong with a file, the program can be compiled.
+        return None
+    return Stored(compiled, skeleton)
+
+
+def save(key: str, program: Stored) -> None:
+    """Keep a program, where that is possible: not one that calls back into Python, nor on a full disk."""
+    folder = _folder()
+    if folder is None:
+        return
+    try:
+        serialized, arguments, results = serialize(program.compiled)
+        executable: Any = program.compiled.runtime_executable()
+        ids = [device.id for device in executable.local_devices()]
+        content = pickle.dumps((serialized, arguments.num_leaves, results.num_leaves, program.skeleton, ids))
+    except Exception:  # JAX and pickle say in many ways that something cannot be kept.
+        return
+    with contextlib.suppress(OSError):
+        folder.mkdir(parents=True, exist_ok=True)
+        # Written whole, then named: another process sees all of it or nothing.
+        with tempfile.NamedTemporaryFile(dir=folder, delete=False) as file:
+            file.write(hashlib.sha256(content).digest() + content)
+        Path(file.name).replace(folder / key)
+        _limit(folder)
+
+
+def _limit(folder: Path) -> None:
+    """Delete what was not used for longest until the rest is below `MOST`."""
+    files = sorted(((path, path.stat()) for path in folder.iterdir()), key=lambda f: f[1].st_mtime)
+    size = sum(stat.st_size for _, stat in files)
+    for path, stat in files:
+        if size <= MOST:
+            break
+        path.unlink(missing_ok=True)
+        size -= stat.st_size
+
+
+def _folder() -> Path | None:
+    """Beside JAX's cache; None where that is off or not a local folder."""
+    chosen = jax.config.values["jax_compilation_cache_dir"]
+    if not jax.config.values["jax_enable_compilation_cache"] or not chosen or "://" in chosen:
+        return None
+    return Path(chosen) / "programs"
+
+
+def _settings() -> list[str]:
+    """Everything that JAX, XLA and equinox were told, in this process and around this call; some of it changes code."""
+    kept = ("JAX_", "XLA_", "EQX_")
+    chosen = [f"{name}={value}" for name, value in sorted(os.environ.items()) if name.startswith(kept)]
+    # What is set for a while (`with jax.enable_x64(False)`) is seen as an attribute only, and some options are none.
+    values = {name: getattr(jax.config, name, value) for name, value in jax.config.values.items()}
+    chosen += [f"{name}={value}" for name, value in sorted(values.items())]
+    return [line for line in chosen if "cache" not in line.lower().split("=")[0]]
+
+
+@functools.cache
+def _surroundings() -> tuple[str, ...]:
+    """Sources, versions, Python, the processor and the devices: they stay as they are while a process runs."""
+    versions = [f"{package.__name__} {package.__version__}" for package in _PACKAGES]
+    devices = [f"{device.id} {device.platform} {device.device_kind}" for device in jax.devices()]
+    return (_SOURCES, sys.version, *versions, platform.platform(), _processor(), *devices)
+
+
+def _processor() -> str:
+    """What tells one kind of processor from another: code is made for the instructions of the one at hand."""
+    with contextlib.suppress(OSError):
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        return "\n".join(sorted({line for line in lines if line.startswith(("model", "flags", "Features", "CPU"))}))
+    return platform.processor()

@@ -1,0 +1,89 @@
+"""Every way to compute an adjustment gives the plain one's numbers: banded or dense, in any order, chords or not."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+from jaxphoto import adjust, covariance
+from jaxphoto.adjustment import padding, solver
+from jaxphoto.adjustment.padding import pad_structure
+from jaxphoto.adjustment.structure import structure_of
+from jaxphoto.statistics import redundancy_numbers
+from tests.blocks import BROWN, Scene, adjusted, all_stations, bare, free, measured, rows, simulated
+
+
+@pytest.fixture(scope="module")
+def corridor():
+    """Two opposite strips of 36 images along a valley, the images in no order at all."""
+    rng = np.random.default_rng(11)
+    n = 72
+    along = np.concatenate([np.arange(36), np.arange(36)]) * 250.0
+    positions = np.column_stack([along, np.repeat([-120.0, 120.0], 36), 1000 + rng.normal(0, 15, n)])
+    angles = rng.normal(0, 0.02, (n, 3)) + np.repeat([[0, 0, 0.0], [0, 0, np.pi]], 36, axis=0)
+    points = np.column_stack([rng.uniform(-300, 9100, 420), rng.uniform(-250, 250, 420), rng.uniform(0, 120, 420)])
+    order = rng.permutation(n)
+    block, truth = bare(Scene(positions[order], angles[order], points), {"one": BROWN}, ("one",) * n)
+    block = dataclasses.replace(block, control=rows((3, 100, 200, 300)), stations=all_stations(block))
+    return measured(type(simulated("cross"))(free(block, "one"), truth)).block
+
+
+def everything(block, start):
+    """Unknowns, residuals, covariances and redundancy numbers, flat."""
+    result = adjust(block, start)
+    assert bool(result.converged)
+    cov = covariance(result)
+    numbers = redundancy_numbers(result, cov)
+    sigma = np.sqrt(np.diag(cov.matrix))
+    unknowns = jax.tree.map(np.asarray, result.unknowns)
+    return result, unknowns, cov, sigma, np.concatenate([np.ravel(v) for v in numbers])
+
+
+def assert_same(one, other):
+    """To far below standard deviations."""
+    a, unknowns, cov, sigma, numbers = one
+    b, others, cov2, _, numbers2 = other
+    exterior = sigma[: 6 * len(a.block.images)].reshape(-1, 6)
+    error = (unknowns.exterior.position - others.exterior.position) / exterior[:, :3]
+    assert np.abs(error).max() < 1e-5
+    assert (np.abs(unknowns.points - others.points) < 1e-5 * cov.point_sigma + 1e-12).all()
+    assert float(b.square_sum) == pytest.approx(float(a.square_sum), rel=1e-11)
+    unit = np.outer(sigma, sigma)
+    np.testing.assert_allclose(cov2.matrix / unit, cov.matrix / unit, atol=1e-8)
+    np.testing.assert_allclose(cov2.points, cov.points, rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(numbers2, numbers, atol=1e-7)
+
+
+def test_a_banded_reduced_matrix_gives_what_a_dense_one_gives(corridor, monkeypatch):
+    start = corridor.start.unknowns
+    padded, _ = pad_structure(structure_of(corridor, corridor.priors))
+    assert padded.tiles.columns >= 5
+    banded = everything(corridor, start)
+    monkeypatch.setattr(padding, "column_blocks", lambda n, bandwidth: (1, n))
+    assert_same(banded, everything(corridor, start))
+
+
+@pytest.mark.parametrize("name", ["cross", "three_models"])
+def test_one_small_tile_at_a_time_gives_what_many_together_give(name, monkeypatch):
+    block, start = simulated(name).block, adjusted(name).unknowns
+    together = everything(block, start)
+    monkeypatch.setattr(padding, "_SLOTS", 1)
+    monkeypatch.setattr(padding, "_CHUNK", 100_000)
+    monkeypatch.setattr(padding, "tile_shape", lambda *a: (12, 4))
+    padded, _ = pad_structure(structure_of(block, block.priors))
+    assert padded.tiles.at_once == 1
+    assert len(padded.tiles.image) > 1
+    assert_same(together, everything(block, start))
+
+
+def test_chords_end_where_full_steps_end(monkeypatch):
+    """Compiled apart, and kept nowhere: the constant is part of the program."""
+    block = simulated("cross").block
+    with_chords = everything(block, block.start.unknowns)
+    monkeypatch.setattr(solver, "_CHORD", 0.0)
+    monkeypatch.setattr("jaxphoto.compiling.run._programs", {})
+    monkeypatch.setattr("jaxphoto.compiling.store.key_of", lambda *a: None)
+    without = everything(block, block.start.unknowns)
+    assert_same(with_chords, without)
+    assert int(with_chords[0].steps) >= int(without[0].steps)

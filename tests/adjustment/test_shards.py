@@ -1,0 +1,153 @@
+"""Several devices and several processes: the same optimum and the same statistics as on one device.
+
+Devices and processes are set up before JAX computes, so what is compared runs in processes of its own: `main`.
+"""
+
+import os
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+from unittest import mock
+
+import jax
+import numpy as np
+import pytest
+
+import jaxphoto
+from jaxphoto.adjustment import Adjustment, adjust
+from jaxphoto.adjustment.shards import mesh_of, usable
+from jaxphoto.statistics.reliability import redundancy_numbers
+from tests.blocks import adjusted, simulated
+
+ROOT = Path(__file__).resolve().parents[2]
+# One block for all: what one device makes of it serves each comparison.
+BLOCK = "two_cameras"
+# Compiling takes most of it (seconds); what is much slower hangs.
+PATIENCE = 300
+ADDRESS, PROCESS = "JAXPHOTO_TEST_ADDRESS", "JAXPHOTO_TEST_PROCESS"
+
+
+def numbers_of(result: Adjustment) -> dict[str, np.ndarray]:
+    """Unknowns, their covariances, residuals and redundancy numbers."""
+    cofactors = jaxphoto.covariance(result, "camera")
+    redundancy = redundancy_numbers(result, cofactors)
+    unknowns = result.unknowns
+    found = {
+        "position": unknowns.exterior.position,
+        "rotation": unknowns.exterior.camera_from_object,
+        "points": unknowns.points,
+        "interior": np.array(jax.tree.leaves(unknowns.interior)),
+        "mounts": np.concatenate([np.zeros(0), *map(np.ravel, jax.tree.leaves(unknowns.mounts))]),
+        "square_sum": result.square_sum,
+        "steps": result.steps,
+        "matrix": cofactors.matrix,
+        "point_covariances": cofactors.points,
+    }
+    for name, of in (("residual", result.residuals), ("redundancy", redundancy)):
+        found |= {f"{name}_{group}": values for group, values in of._asdict().items()}
+    return {name: np.asarray(values) for name, values in found.items()}
+
+
+def main(shards: str, folder: str) -> None:
+    """Adjust the block on each of several numbers of devices, after joining other processes if there are any."""
+    process = int(os.environ.get(PROCESS, "0"))
+    if ADDRESS in os.environ:
+        jax.distributed.initialize(os.environ[ADDRESS], num_processes=2, process_id=process, initialization_timeout=60)
+    block = simulated(BLOCK).block
+    for n in map(int, shards.split(",")):
+        # So small a block would be left to one device.
+        with mock.patch.object(adjust, "_devices_worth_using", lambda rows, n=n: usable(n)):
+            result = jaxphoto.adjust(block, block.start.unknowns)
+        assert result.outcome is jaxphoto.Outcome.CONVERGED
+        held = result.computed.structure.in_tiles.shards
+        np.savez(Path(folder) / f"{n}_{process}.npz", shards=held, **numbers_of(result))
+
+
+def run_all(shards: str, folder: Path, devices: int, environments: list[dict[str, str]]) -> None:
+    """`main` in a process of `devices` devices for each of `environments`, to the end; what they say if one fails."""
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={devices}"
+    command = [sys.executable, "-m", "tests.adjustment.test_shards", shards, str(folder)]
+    logs = [folder / f"{k}.log" for k in range(len(environments))]
+    processes = []
+    try:
+        for log, environment in zip(logs, environments, strict=True):
+            with log.open("w") as file:
+                own = os.environ | {"XLA_FLAGS": flags} | environment
+                processes.append(subprocess.Popen(command, cwd=ROOT, env=own, stdout=file, stderr=subprocess.STDOUT))
+        end = time.monotonic() + PATIENCE
+        # Where one fails the others would wait for it.
+        while any(p.poll() is None for p in processes) and not any(p.returncode for p in processes):
+            assert time.monotonic() < end, "\n\n".join(log.read_text() for log in logs)
+            time.sleep(0.1)
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
+    codes = [process.returncode for process in processes]
+    assert not any(codes), f"exit codes {codes}\n" + "\n\n".join(log.read_text() for log in logs)
+
+
+def assert_same(found: dict[str, np.ndarray]) -> None:
+    """The same adjustment as on one device, but for rounding."""
+    wanted = numbers_of(adjusted(BLOCK))
+    assert found.keys() == wanted.keys() | {"shards"}
+    for key, values in wanted.items():
+        size = np.abs(values).max(initial=0.0)
+        np.testing.assert_allclose(found[key], values, rtol=0, atol=1e-10 * size, err_msg=key)
+    sigma = np.sqrt(np.diagonal(wanted["point_covariances"], axis1=1, axis2=2))
+    assert np.abs((found["points"] - wanted["points"]) / sigma).max() < 1e-6
+
+
+@pytest.fixture(scope="module")
+def on_three_devices(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("devices")
+    run_all("2,3", folder, 3, [{}])
+    return folder
+
+
+@pytest.mark.parametrize("shards", [2, 3])
+def test_several_devices_find_the_same(on_three_devices: Path, shards: int) -> None:
+    found = dict(np.load(on_three_devices / f"{shards}_0.npz"))
+    assert found["shards"] == shards
+    assert_same(found)
+
+
+def test_two_processes_find_the_same(tmp_path: Path) -> None:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+    # Of three devices wanted, two can be equally many of each process.
+    run_all("3", tmp_path, 2, [{ADDRESS: address, PROCESS: str(k)} for k in range(2)])
+    for process in range(2):
+        found = dict(np.load(tmp_path / f"3_{process}.npz"))
+        assert found["shards"] == 2
+        assert_same(found)
+
+
+class Device:
+    def __init__(self, process_index: int):
+        self.process_index = process_index
+
+
+@pytest.mark.parametrize(("wanted", "used"), [(0, 1), (1, 1), (2, 2), (3, 2), (4, 4), (7, 4)])
+def test_as_many_devices_of_each_process(monkeypatch: pytest.MonkeyPatch, wanted: int, used: int) -> None:
+    monkeypatch.setattr(jax, "process_count", lambda: 2)
+    monkeypatch.setattr(jax, "devices", lambda: [Device(0)] * 3 + [Device(1)] * 2)
+    assert usable(wanted) == used
+
+
+def test_a_process_alone_takes_its_first_devices() -> None:
+    assert usable(1) == usable(0) == 1
+    assert usable(10_000) == jax.device_count()
+    assert mesh_of(1).devices.tolist() == jax.devices()[:1]
+
+
+def test_large_blocks_are_worth_several_devices() -> None:
+    assert adjust._devices_worth_using(1000) == 1
+    assert adjust._devices_worth_using(10**9) == jax.device_count()
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

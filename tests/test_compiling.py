@@ -1,0 +1,210 @@
+"""Programs kept on disk: a second process runs them without tracing, and nothing it should not."""
+
+import dataclasses
+import functools
+import json
+import os
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.sharding import SingleDeviceSharding
+
+from jaxphoto.camera import Brown, Brown14
+from jaxphoto.collinearity import project
+from jaxphoto.compiling import description, run, run_compiled, store
+from jaxphoto.compiling.description import Indescribable, describe
+from tests.compiled_programs import MATRIX, root
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture
+def kept(tmp_path, monkeypatch):
+    """Programs of the tests are kept, in a folder of their own; none is compiled yet."""
+    monkeypatch.setattr(description, "_KNOWN", description._KNOWN | {"tests"})
+    monkeypatch.setattr(store, "_folder", lambda: tmp_path)
+    monkeypatch.setattr(run, "_programs", {})
+    return tmp_path
+
+
+def in_new_process(*programs: str, **environment: str) -> dict:
+    done = subprocess.run(
+        [sys.executable, "-c", "from tests.compiled_programs import main; main()", *programs],
+        cwd=ROOT, env=os.environ | environment, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def test_a_second_process_loads_and_gives_the_same_numbers(tmp_path):
+    cache = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path), "JAX_NUM_CPU_DEVICES": "2"}
+    names = ("root", "over_devices", "calling_back", "checked")
+    first, second = (in_new_process(*names, **cache) for _ in range(2))
+    assert {name: said["loaded"] for name, said in second.items()} == {
+        "root": True, "over_devices": True, "calling_back": False, "checked": False,
+    }  # fmt: skip
+    assert not any(said["loaded"] for said in first.values())
+    for name in names:
+        assert first[name] | {"loaded": None} == second[name] | {"loaded": None}
+    # Other devices, other programs.
+    assert not in_new_process("root", **cache | {"JAX_NUM_CPU_DEVICES": "1"})["root"]["loaded"]
+
+
+def test_nothing_is_kept_where_the_cache_is_off(tmp_path):
+    cache = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path), "JAX_ENABLE_COMPILATION_CACHE": "false"}
+    assert not in_new_process("root", **cache)["root"]["loaded"]
+    assert not list(tmp_path.iterdir())
+
+
+def calculate(power: int = 2):
+    """The numbers, and whether they came from disk."""
+    run._programs.clear()
+    result = run_compiled(root, (MATRIX, power), {}, "run")
+    (program,) = run._programs.values()
+    return np.asarray(result[0]["root"]), program.loaded
+
+
+def test_a_static_argument_is_part_of_the_key(kept):
+    square, _ = calculate(2)
+    cube, loaded = calculate(3)
+    assert not loaded
+    assert not np.allclose(square, cube)
+    again, loaded = calculate(2)
+    assert loaded
+    np.testing.assert_array_equal(again, square)
+
+
+@pytest.mark.parametrize("damage", ["cut", "changed", "empty", "other", "unfit"])
+def test_a_damaged_file_is_written_anew(kept, damage):
+    right, _ = calculate()
+    (path,) = kept.iterdir()
+    content = path.read_bytes()
+    digest = store._DIGEST
+    unfit = pickle.dumps((b"no program", 1, 2, None, [0]))
+    path.write_bytes(
+        {
+            "cut": content[:-100],
+            "changed": content[: digest + 50] + b"x" + content[digest + 51 :],
+            "empty": b"",
+            "other": b"something else",
+            "unfit": store.hashlib.sha256(unfit).digest() + unfit,
+        }[damage]
+    )
+    again, loaded = calculate()
+    assert not loaded
+    np.testing.assert_array_equal(again, right)
+    assert calculate()[1]
+
+
+def test_a_program_that_fails_when_called_is_compiled_anew(kept, monkeypatch):
+    right, _ = calculate()
+    load = store.load
+
+    def broken(*_):
+        raise jax.errors.JaxRuntimeError("NOT_FOUND: Function kernel not found")
+
+    monkeypatch.setattr(store, "load", lambda key: load(key)._replace(compiled=broken))
+    again, loaded = calculate()
+    assert not loaded
+    np.testing.assert_array_equal(again, right)
+
+
+def test_what_cannot_be_written_is_compiled(kept, monkeypatch):
+    monkeypatch.setattr(store, "_folder", lambda: kept / "file" / "below")
+    (kept / "file").write_text("in the way")
+    assert not calculate()[1]
+    assert not calculate()[1]
+
+
+def test_what_was_not_used_for_longest_goes_first(kept, monkeypatch):
+    calculate(2)
+    (first,) = kept.iterdir()
+    calculate(3)
+    for path in kept.iterdir():
+        os.utime(path, (1, 1) if path == first else (2, 2))
+    assert calculate(2)[1]
+    monkeypatch.setattr(store, "MOST", 2.5 * first.stat().st_size)
+    calculate(4)
+    assert len(list(kept.iterdir())) == 2
+    assert calculate(2)[1]
+    assert calculate(4)[1]
+    assert not calculate(3)[1]
+
+
+def test_the_threshold_of_the_cache_stays(kept):
+    before = jax.config.values[run._THRESHOLD]
+    calculate()
+    assert jax.config.values[run._THRESHOLD] == before
+
+
+def test_prepared_programs_are_used(kept, monkeypatch):
+    seconds: dict[str, float] = {}
+    run.prepare(root, (MATRIX, 5), seconds)
+    monkeypatch.setattr(run, "_program_of", None)
+    result = run_compiled(root, (MATRIX, 5), seconds, "run")
+    np.testing.assert_allclose(result[0]["root"], np.linalg.cholesky(MATRIX) ** 5)
+    assert set(seconds) == {"compile", "run"}
+    assert not run._prepared
+
+
+def test_under_a_transformation_it_is_a_plain_call(kept):
+    gradient = jax.grad(lambda x: run_compiled(root, (x * MATRIX, 2), {}, "run")[0]["root"].sum())(1.0)
+    assert np.isfinite(gradient)
+    assert not run._programs
+
+
+@dataclasses.dataclass
+class Own:
+    """Of a module whose sources are not part of the key."""
+
+    value: float = 0.0
+
+
+def test_what_differs_is_described_differently():
+    one = np.zeros(3)
+    different = [
+        None, 0, False, 0.0, -0.0, "", "0", b"", (), [], {}, (0,), [0], {"a": 0}, {"a": 0.0}, {"b": 0}, ((0,),), (0, 0),
+        float("nan"), float("inf"), one, one.astype(np.float32), one.astype(int), one[:2], one[None], (one, one),
+        jnp.asarray(1.0), jnp.asarray(1.0, jnp.float64), jax.device_put(one, SingleDeviceSharding(jax.devices()[0])),
+        Brown(), Brown(k1=one), Brown14(f=1.0), Brown, Brown14, project,
+        jax.tree.structure((0, 0)), jax.tree.structure([0, 0]),
+        jax.tree.structure(Brown()), eqx.Module, np.dtype(float), np.dtype(int), "None", "0.0", "(0,)",
+    ]  # fmt: skip
+    texts = [describe(value) for value in different]
+    assert len(set(texts)) == len(texts)
+    assert describe(one) == describe(jnp.asarray(one)) == describe(one + 1)
+    assert not any(" at 0x" in text for text in texts)
+
+
+@pytest.mark.parametrize(
+    "value", [Own(), lambda x: x, functools.partial(project), object(), {1, 2}, eqx.filter_jit(project), iter(())]
+)
+def test_what_a_name_does_not_tell_is_not_described(value):
+    with pytest.raises(Indescribable):
+        describe((0, value))
+
+
+def test_settings_are_part_of_the_key(kept, monkeypatch):
+    def key():
+        return store.key_of(root.__wrapped__, (MATRIX, 2), None)
+
+    keys = [key()]
+    with jax.enable_x64(False):
+        keys.append(key())
+    with jax.default_matmul_precision("float32"):
+        keys.append(key())
+    monkeypatch.setenv("XLA_FLAGS", os.environ.get("XLA_FLAGS", "") + " --xla_cpu_enable_fast_math=true")
+    keys.append(key())
+    monkeypatch.setattr(store, "_SOURCES", "other sources")
+    store._surroundings.cache_clear()
+    keys.append(key())
+    monkeypatch.undo()
+    store._surroundings.cache_clear()
+    assert len(set(keys)) == 5
+    assert None not in keys
