@@ -36,10 +36,12 @@ def main() -> None:
         print(json.dumps(_work(arguments.worker)))
         return
     head = machine()
-    lines = ["### Growth", "", sentence(head), "", f"`python benchmarks/growth.py --most {arguments.most}`"]
+    images = " ".join(map(str, arguments.images))
+    command = f"python benchmarks/growth.py --most {arguments.most} --images {images} --widest {arguments.widest}"
+    lines = ["### Growth", "", sentence(head), "", f"`{command}`"]
     records = [{"kind": "head", **head}]
-    for images in arguments.images:
-        own = [_measure(size) for size in _by_points(images, arguments.most)]
+    for held in arguments.images:
+        own = [_measure(size) for size in _by_points(held, arguments.most)]
         records += own
         lines += ["", f"{own[0]['images']} images, more and more points:", "", *_points_table(own)]
     own = [_measure(size) for size in _by_images(arguments.widest)]
@@ -96,9 +98,13 @@ def _work(file: Path) -> dict:
     adjusted = [once() for _ in range(_ROUNDS)]
     peak = memory("VmHWM")
     last = adjusted[-1].computed
-    (program,) = (p for k, p in run._programs.items() if k[0].__name__ == "_optimise")  # type: ignore[index]
-    sizes = program.compiled.memory_analysis()
-    reduced = last.factored.reduced.a
+    (solver,) = (p for k, p in run._programs.items() if k[0].__name__ == "_optimise")  # type: ignore[index]
+    planned = solver.compiled.memory_analysis()
+    program = sum(getattr(planned, f"{name}_size_in_bytes") for name in ("argument", "output", "temp"))
+    # Planned is what one device needs.
+    program *= last.structure.in_tiles.shards
+    # By way of the host: of a block that several devices share, each would repeat what is timed here.
+    reduced = jax.tree.map(lambda v: jnp.asarray(np.asarray(v)), last.factored.reduced.a)
     k, _, m = reduced.columns.shape
     n, q = k * m, len(reduced.corner)
     whole = dense(reduced)
@@ -122,7 +128,7 @@ def _work(file: Path) -> dict:
         "step_s": statistics.median(a.seconds["solve"] / int(a.steps) for a in adjusted),
         "solve_s": statistics.median(a.seconds["solve"] for a in adjusted),
         "slots": int(np.prod(last.structure.in_tiles.image.shape)) * last.structure.in_tiles.per_tile,
-        "program_mb": sum(getattr(sizes, f"{name}_size_in_bytes") for name in ("argument", "output", "temp")) / 1e6,
+        "program_mb": program / 1e6,
         "peak_mb": peak if fresh else None,
         "resident_mb": before,
         "unknowns": n + q,

@@ -17,6 +17,7 @@ from jaxphoto.adjustment.precision import warn_of_lost_digits
 from jaxphoto.adjustment.rank import check_priors, check_rank
 from jaxphoto.adjustment.residuals import Residuals, State, Values, state_at
 from jaxphoto.adjustment.result import Adjustment, Factored, Padded
+from jaxphoto.adjustment.shards import usable
 from jaxphoto.adjustment.structure import Structure, structure_of
 from jaxphoto.adjustment.values import at_state, unknowns_of, values_of, with_datum
 from jaxphoto.arrays import still
@@ -94,7 +95,7 @@ _ROWS_PER_DEVICE = 20_000
 
 
 def _devices_worth_using(rows: int) -> int:
-    return max(1, min(jax.device_count(), rows // _ROWS_PER_DEVICE))
+    return usable(rows // _ROWS_PER_DEVICE)
 
 
 def common_sizes(blocks: Iterable[Block]) -> Sizes:

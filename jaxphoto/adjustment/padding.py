@@ -100,9 +100,8 @@ class _Layout(NamedTuple):
         columns, width = (1, n) if dense else column_blocks(n, min(n, size_class(bandwidth)))
         per_shard = -(-tiles // shards)
         chunks = -(-per_shard * (6 * m) ** 2 // _CHUNK)
-        times = size_class(-(-per_shard * m * p // (chunks * _SLOTS)))
-        at_once = size_class(-(-per_shard // (chunks * times)))
-        chunk = at_once * times
+        at_once = max(1, min(_SLOTS // (m * p), per_shard))
+        chunk = at_once * size_class(-(-per_shard // (chunks * at_once)))
         lists = _pair_lists(tiling.image, chunk, width)
         pairs, blocks = (max((len(v) for v in x), default=0) for x in (lists[0], lists[2]))
         sizes = Sizes(images, bandwidth, tiles, m, p, pairs, blocks + 1, len(s.station_image), len(s.attitude_image))

@@ -13,8 +13,8 @@ def warn_of_lost_digits(block: Block, start: Unknowns) -> None:
     """Warn where JAX computes in 32 bits, and where numbers were given in fewer than 64."""
     if not jax.config.values["jax_enable_x64"]:
         warnings.warn(
-            "JAX computes with 32 bits (jax_enable_x64 was switched off after jaxphoto was imported): an adjustment may "
-            "not converge, and its standard deviations mean little; switch it on for adjusting",
+            "JAX computes with 32 bits (jax_enable_x64 was switched off after jaxphoto was imported): an adjustment "
+            "may not converge, and its standard deviations mean little; switch it on for adjusting",
             stacklevel=4,
         )
     groups = {

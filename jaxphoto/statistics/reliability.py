@@ -29,6 +29,9 @@ _UNCHECKED = 1e-6
 def prepare_redundancy(adjusted: Adjustment) -> None:
     """Have what `redundancy_numbers` needs compiled in the background, beside what `covariance` needs."""
     padded = adjusted.computed
+    if padded.structure.in_tiles.shards > 1:
+        # What comes from several devices is of a type of its own.
+        return
     s, n = padded.structure, 6 * padded.structure.n_images + padded.structure.n_shared
     shapes = ((n, n), (s.n_points, 3, 3), padded.values.xy.shape)
     # Arrays of the right types that take no memory.
