@@ -29,10 +29,12 @@ from jaxphoto.adjustment.band import factor_band
 from jaxphoto.adjustment.normal import At
 from jaxphoto.adjustment.optimum import zero_increments
 from jaxphoto.adjustment.reduced import other_rows, reduce_normal, tile_numbers, tile_parts
+from jaxphoto.adjustment.residuals import Increments, Values
 from jaxphoto.adjustment.result import Padded
 from jaxphoto.adjustment.shards import EVERYWHERE, along_points, sharded
+from jaxphoto.adjustment.structure import Structure
 from jaxphoto.block import Block
-from jaxphoto.compiling.options import options_here
+from jaxphoto.compiling import run_compiled
 
 _ROUNDS = 5
 # Sides of the square matrices, and numbers of a vector, that show the limits: far beyond any cache, a second at most.
@@ -101,9 +103,9 @@ def measure(block: Block) -> dict:
     once()
     adjusted = [once() for _ in range(_ROUNDS)]
     last = adjusted[-1].computed
-    step, arrays = _step(last)
-    work = _work(last)
-    seconds = statistics.median(_seconds(lambda: step(*arrays)))
+    at, work = _at(last), _work(last)
+    # Compiled as `solve` is.
+    steps = _seconds(lambda: run_compiled(_step, (at.values, at.scale, at.structure), {}, ""))
     return {
         "kind": "block",
         "problem": block.title,
@@ -112,7 +114,7 @@ def measure(block: Block) -> dict:
         "steps": int(adjusted[-1].steps),
         "solve_s": statistics.median(a.seconds["solve"] for a in adjusted),
         "covariance_s": statistics.median(a.seconds["covariance"] for a in adjusted),
-        "step_s": seconds,
+        "step_s": statistics.median(steps),
         **work,
     }
 
@@ -123,21 +125,15 @@ def _at(padded: Padded) -> At:
     return At(zero_increments(free.structure), free.factored.scale, free.values, free.structure)
 
 
-def _step(padded: Padded) -> tuple[Callable[..., Any], list]:
-    """Sums of the reduced normal equations and their factor, compiled as `solve` would compile them."""
-    dynamic, static = eqx.partition(_at(padded), eqx.is_array)
-    leaves, tree = jax.tree.flatten(dynamic)
+@eqx.filter_jit
+def _step(values: Values, scale: Increments, structure: Structure):
+    """Sums of the reduced normal equations and their factor."""
 
     def of_device(values, scale, structure):
         reduced, _ = reduce_normal(At(jax.tree.map(jnp.zeros_like, scale), scale, values, structure), 0.0)
         return factor_band(reduced.a), reduced.l
 
-    def step(*leaves):
-        at = eqx.combine(jax.tree.unflatten(tree, leaves), static)
-        out = (EVERYWHERE, along_points(2))
-        return sharded(of_device, at.structure, out)(at.values, at.scale, at.structure)
-
-    return jax.jit(step).lower(*leaves).compile(compiler_options=options_here()), leaves
+    return sharded(of_device, structure, (EVERYWHERE, along_points(2)))(values, scale, structure)
 
 
 def _work(padded: Padded) -> dict[str, float]:
@@ -184,11 +180,13 @@ def monte_carlo(block: Block, strip: np.ndarray, draws: int) -> dict:
         found = solve(shifted, optimum.unknowns, block.priors)
         return found.unknowns.interior["cam"].c, found.steps
 
-    began = time.perf_counter()
-    together = jax.jit(jax.vmap(adjusted)).lower(stations).compile(compiler_options=options_here())
-    compiling = time.perf_counter() - began
-    _, steps = together(stations)
-    seconds = statistics.median(_seconds(lambda: together(stations), 3))
+    @eqx.filter_jit
+    def together(values):
+        return jax.vmap(adjusted)(values)
+
+    first: dict[str, float] = {}
+    _, steps = run_compiled(together, (stations,), first, "")
+    seconds = statistics.median(_seconds(lambda: run_compiled(together, (stations,), {}, ""), 3))
     few = stations[: min(draws, 8)]
     began = time.perf_counter()
     for values in few:
@@ -196,7 +194,7 @@ def monte_carlo(block: Block, strip: np.ndarray, draws: int) -> dict:
     return {
         "kind": "monte carlo",
         "draws": draws,
-        "compile_s": compiling,
+        "compile_s": first["compile"],
         "per_s": draws / seconds,
         "loop_per_s": len(few) / (time.perf_counter() - began),
         "steps": int(np.max(steps)),

@@ -21,7 +21,7 @@ _RAYS = 5.7
 _ROUNDS = 3
 # Points an image, where the number of images grows.
 _POINTS_PER_IMAGE = 30
-_STRIP = 25
+_STRIPS = 5
 
 
 def main() -> None:
@@ -52,7 +52,7 @@ def main() -> None:
 
 def _by_points(images: int, most: int) -> list[Size]:
     """Blocks of P31's or B200's strips, or of parallel ones, with 10^3, 10^4 ... image points."""
-    strips = {31: SIZES["P31"], 200: SIZES["B200"]}.get(images) or parallel_strips(max(images // _STRIP, 1), _STRIP, 0)
+    strips = {31: SIZES["P31"], 200: SIZES["B200"]}.get(images) or parallel_strips(_STRIPS, images // _STRIPS, 0)
     sizes, rows = [], 1000
     while rows <= most:
         # An image with a handful of points would leave its orientation open.
@@ -63,8 +63,10 @@ def _by_points(images: int, most: int) -> list[Size]:
 
 
 def _by_images(most: int) -> list[Size]:
-    """Strips of 25 images, twice as many from one block to the next: a band of the same width, twice as long."""
-    return [parallel_strips(n // _STRIP, _STRIP, _POINTS_PER_IMAGE * n) for n in (50, 100, 200, 400, 800) if n <= most]
+    """Five strips, twice as long from one block to the next: a band of the same width, twice as long."""
+    return [
+        parallel_strips(_STRIPS, n // _STRIPS, _POINTS_PER_IMAGE * n) for n in (50, 100, 200, 400, 800) if n <= most
+    ]
 
 
 def _measure(size: Size) -> dict:

@@ -69,7 +69,7 @@ def test_one_small_tile_at_a_time_gives_what_many_together_give(name, monkeypatc
     block, start = simulated(name).block, adjusted(name).unknowns
     together = everything(block, start)
     monkeypatch.setattr(padding, "_SLOTS", 1)
-    monkeypatch.setattr(padding, "_CHUNK", 100_000)
+    monkeypatch.setattr(padding, "_CHUNK", 20_000)
     monkeypatch.setattr(padding, "tile_shape", lambda *a: (12, 4))
     padded, _ = pad_structure(structure_of(block, block.priors))
     assert padded.tiles.at_once == 1
