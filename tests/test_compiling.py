@@ -31,6 +31,7 @@ def kept(tmp_path, monkeypatch):
     monkeypatch.setattr(description, "_KNOWN", description._KNOWN | {"tests"})
     monkeypatch.setattr(store, "_folder", lambda: tmp_path)
     monkeypatch.setattr(run, "_programs", {})
+    monkeypatch.setattr(run, "_prepared", {})
     return tmp_path
 
 
