@@ -130,8 +130,8 @@ def _step(values: Values, scale: Increments, structure: Structure):
     """Sums of the reduced normal equations and their factor."""
 
     def of_device(values, scale, structure):
-        reduced, _ = reduce_normal(At(jax.tree.map(jnp.zeros_like, scale), scale, values, structure), 0.0)
-        return factor_band(reduced.a), reduced.l
+        a, reduced, _ = reduce_normal(At(jax.tree.map(jnp.zeros_like, scale), scale, values, structure), 0.0)
+        return factor_band(a), reduced.l
 
     return sharded(of_device, structure, (EVERYWHERE, along_points(2)))(values, scale, structure)
 
@@ -153,9 +153,10 @@ def _work(padded: Padded) -> dict[str, float]:
     m, p = s.in_tiles.image.shape[2], s.in_tiles.per_tile
     f = 6 * m + s.n_interior + len(rest.coupled) + 1
     products = 2 * 3 * p * f**2 + 2 * 2 * p * m * (7 + s.n_image_colours) ** 2
-    band = padded.factored.reduced.a
-    k, _, width = band.columns.shape
-    n, q = k * width, len(band.corner)
+    band = padded.factored.factor
+    inner, _, width = band.columns.shape
+    k, q = inner + 1, len(band.end) - width
+    n = k * width
     factor = k * width**3 / 3 + (k - 1) * 3 * width**3 + 2 * n * q * width + n * q * q
     # Read: everything that goes in. Written, read and written again: the reduced matrix and its factor.
     into = sum(np.asarray(leaf).nbytes for leaf in jax.tree.leaves(eqx.filter(at, eqx.is_array)))

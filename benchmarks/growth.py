@@ -87,6 +87,7 @@ def _work(file: Path) -> dict:
 
     from jaxphoto.adjustment import solve
     from jaxphoto.adjustment.band import dense, factor_band
+    from jaxphoto.adjustment.rank import reduced_matrix
     from jaxphoto.compiling import run
 
     block = read_block(file)
@@ -106,9 +107,11 @@ def _work(file: Path) -> dict:
     # Planned is what one device needs.
     program *= last.structure.in_tiles.shards
     # By way of the host: of a block that several devices share, each would repeat what is timed here.
-    reduced = jax.tree.map(lambda v: jnp.asarray(np.asarray(v)), last.factored.reduced.a)
-    k, _, m = reduced.columns.shape
-    n, q = k * m, len(reduced.corner)
+    reduced = reduced_matrix(last.values, last.factored.scale, last.structure)
+    reduced = jax.tree.map(lambda v: jnp.asarray(np.asarray(v)), reduced)
+    inner, _, m = reduced.columns.shape
+    k, q = inner + 1, len(reduced.end) - m
+    n = k * m
     whole = dense(reduced)
 
     def seconds(function, argument) -> float:

@@ -42,7 +42,8 @@ def camera_coordinates(exterior: ExteriorOrientation, point: Float[Array, "3"]) 
 def project_ideal(c, exterior: ExteriorOrientation, point: Float[Array, "3"]) -> Float[Array, "2"]:
     """Ideal image coordinate (mm, from the principal point): x = -c U / W, y = -c V / W."""
     u, v, w = camera_coordinates(exterior, point)
-    return jnp.stack([u, v]) * (-c / w)
+    scale = -c / w
+    return jnp.stack([u * scale, v * scale])
 
 
 def project(
@@ -76,11 +77,15 @@ def image_residual(
     `ideal(measured) - projection` for models in the measured coordinate; `measured - distorted projection` for
     models in the ideal one.
     """
+    # By component to the end: arrays of two that are computed with in between cost an adjustment a tenth of its time.
     projection = project_ideal(interior.c, exterior, point)
-    reduced = xy - interior.principal_point
-    if interior.distortion.domain == "measured":
-        return interior.closed_form(reduced) - projection
-    return reduced - interior.closed_form(projection)
+    reduced = jnp.stack([xy[0] - interior.x_p, xy[1] - interior.y_p])
+    (x, y), (x0, y0) = (
+        (interior.closed_form(reduced), projection)
+        if interior.distortion.domain == "measured"
+        else (reduced, interior.closed_form(projection))
+    )
+    return jnp.stack([x - x0, y - y0])
 
 
 def intersect(

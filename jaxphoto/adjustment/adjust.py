@@ -71,7 +71,7 @@ def solve(
     if not traced:
         _, _, factored = run_compiled(_optimise, (numbers, wide, max_steps, np.array(True)), seconds, "covariance")
         padded = Padded(wide, numbers, factored, places)
-    residuals = run_compiled(_residuals, (numbers, wide), seconds, "covariance")
+    residuals = run_compiled(_residuals, (numbers, wide), seconds, "residuals")
     state = crop_state(state, places)
     adjusted = Adjustment(
         block=block,

@@ -15,7 +15,7 @@ The inverse Z of A obeys Z L = L'^-1, so backwards, from the blocks ZPP of what 
     G = LPj Ljj^-1,   ZPj = -ZPP G,   Zjj = Ljj'^-1 Ljj^-1 + G' ZPP G
 
 needs of Z the blocks of the band and the border alone; columns of the full inverse follow by ZRj = -[ZR,j+1 ZR,q] G.
-The last column block and the shared unknowns are dense together; where k = 1 they are all there is.
+The last column block and the shared unknowns are dense together, the end; where k = 1 they are all there is.
 """
 
 from typing import NamedTuple
@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 # Inverses of triangles above this size are put together from halves: a product is five times as fast as BLAS' trsm.
-_LEAF = 256
+_LEAF = 32
 # What a column block costs beside its operations, counted in operations (measured: about 10 microseconds).
 _OVERHEAD = 2e5
 
@@ -34,57 +34,57 @@ _OVERHEAD = 2e5
 class Band(NamedTuple):
     """A symmetric matrix of images, ordered so that only adjacent column blocks meet, and shared unknowns."""
 
-    columns: Float[Array, "k 2m m"]
-    """Column block j: rows 0..m-1 are A[j, j] (its lower triangle counts), rows m..2m-1 are A[j+1, j]; those of the
-    last column block may be anything."""
-    border: Float[Array, "q n"]
-    """A[shared, images], with n = k m."""
-    corner: Float[Array, "q q"]
-    """A[shared, shared]; its lower triangle counts."""
+    columns: Float[Array, "inner 2m m"]
+    """Column block j, of all but the last: rows 0..m-1 are A[j, j] (its lower triangle counts), rows m..2m-1 are
+    A[j+1, j]."""
+    border: Float[Array, "q inner*m"]
+    """A[shared, images of these blocks]."""
+    end: Float[Array, "m+q m+q"]
+    """The last column block and the shared unknowns; its lower triangle counts."""
 
 
 class BandFactor(NamedTuple):
-    """The lower Cholesky factor of a `Band`, stored alike; zero above the diagonal and in the last rows of columns."""
+    """The lower Cholesky factor of a `Band`, stored alike; zero above the diagonal."""
 
-    columns: Float[Array, "k 2m m"]
-    border: Float[Array, "q n"]
-    corner: Float[Array, "q q"]
+    columns: Float[Array, "inner 2m m"]
+    border: Float[Array, "q inner*m"]
+    end: Float[Array, "m+q m+q"]
 
 
 class SelectedInverse(NamedTuple):
     """Blocks of the inverse inside band and border, stored like a `Band` but with both triangles of its diagonal."""
 
-    columns: Float[Array, "k 2m m"]
-    border: Float[Array, "q n"]
-    corner: Float[Array, "q q"]
+    columns: Float[Array, "inner 2m m"]
+    border: Float[Array, "q inner*m"]
+    end: Float[Array, "m+q m+q"]
 
 
 def factor_band(band: Band) -> BandFactor:
     """L of A = L L'; NaN from the first column block on that is not positive definite (the last with the shared)."""
-    k, _, m = band.columns.shape
-    border = _split_border(band.border, k)
-    left = (band.columns[0, :m], border[0], band.corner)
-    columns, borders = band.columns[:0], border[:0]
-    if k > 1:
+    inner, _, m = band.columns.shape
+    if not inner:
+        return BandFactor(band.columns, band.border, _cholesky(band.end))
+    border = _split_border(band.border, inner)
+    zero = jnp.zeros_like(border[0])
 
-        def eliminate(left, at):
-            diagonal, shared, corner = left
-            below, next_diagonal, next_shared = at
-            lower = _cholesky(diagonal)
-            panel = _solve_right(lower, jnp.concatenate([below, shared]))
-            product = panel @ panel.T
-            left = (next_diagonal - product[:m, :m], next_shared - product[m:, :m], corner - product[m:, m:])
-            return left, (jnp.concatenate([lower, panel[:m]]), panel[m:])
+    def eliminate(left, at):
+        diagonal, shared, corner = left
+        j, next_shared = at
+        column = jax.lax.dynamic_index_in_dim(band.columns, j, keepdims=False)
+        # Behind the inner blocks stands the end.
+        following = jax.lax.dynamic_index_in_dim(band.columns, jnp.minimum(j + 1, inner - 1), keepdims=False)
+        following = jnp.where(j + 1 < inner, following[:m], band.end[:m, :m])
+        lower = _cholesky(diagonal)
+        panel = _solve_right(lower, jnp.concatenate([column[m:], shared]))
+        product = panel @ panel.T
+        left = (following - product[:m, :m], next_shared - product[m:, :m], corner - product[m:, m:])
+        return left, (jnp.concatenate([lower, panel[:m]]), panel[m:])
 
-        at = (band.columns[:-1, m:], band.columns[1:, :m], border[1:])
-        left, (columns, borders) = jax.lax.scan(eliminate, left, at)
-
-    end = _cholesky(_with_border(*left))
-    return BandFactor(
-        columns=jnp.concatenate([columns, _last_column(end[:m, :m])]),
-        border=_join_border(jnp.concatenate([borders, end[None, m:, :m]])),
-        corner=end[m:, m:],
-    )
+    following = jnp.concatenate([border[1:], band.end[None, m:, :m]])
+    left = (band.columns[0, :m], border[0], band.end[m:, m:])
+    (diagonal, shared, corner), (columns, borders) = jax.lax.scan(eliminate, left, (np.arange(inner), following))
+    end = _cholesky(jnp.block([[diagonal, zero.T], [shared, corner]]))
+    return BandFactor(columns, _join_border(borders), end)
 
 
 def solve_band(factor: BandFactor, right: Float[Array, "unknowns *c"]) -> Float[Array, "unknowns *c"]:
@@ -92,28 +92,24 @@ def solve_band(factor: BandFactor, right: Float[Array, "unknowns *c"]) -> Float[
 
     L y = b downwards, L' x = y backwards.
     """
-    columns, border = factor.columns, factor.border
-    k, _, m = columns.shape
-    n = k * m
+    columns, border, end = factor
+    inner, _, m = columns.shape
+    if not inner:
+        return _solve_transposed(end, _solve(end, right.reshape(len(right), -1))).reshape(right.shape)
+    n = (inner + 1) * m
     b = right.reshape(len(right), -1)
-    images, shared = b[:n].reshape(k, m, -1), b[n:]
-    left, inner = images[0], border[:, : n - m]
+    images, shared = b[:n].reshape(inner + 1, m, -1), b[n:]
+
     # Columns are read in place: as what the scans run over they would be copied, which takes as long as the solution.
-    if k > 1:
+    def down(left, at):
+        j, following = at
+        column = jax.lax.dynamic_index_in_dim(columns, j, keepdims=False)
+        y = _solve(column[:m], left)
+        return following - column[m:] @ y, y
 
-        def down(left, at):
-            j, following = at
-            column = jax.lax.dynamic_index_in_dim(columns, j, keepdims=False)
-            y = _solve(column[:m], left)
-            return following - column[m:] @ y, y
-
-        left, y = jax.lax.scan(down, left, (np.arange(k - 1), images[1:]))
-        shared = shared - inner @ y.reshape(n - m, -1)
-
-    end = _end_of(factor)
+    left, y = jax.lax.scan(down, images[0], (np.arange(inner), images[1:]))
+    shared = shared - border @ y.reshape(n - m, -1)
     last = _solve_transposed(end, _solve(end, jnp.concatenate([left, shared])))
-    if k == 1:
-        return last.reshape(right.shape)
 
     def back(after, at):
         j, y = at
@@ -121,8 +117,8 @@ def solve_band(factor: BandFactor, right: Float[Array, "unknowns *c"]) -> Float[
         x = _solve_transposed(column[:m], y - column[m:].T @ after)
         return x, x
 
-    y = y - (inner.T @ last[m:]).reshape(y.shape)
-    _, x = jax.lax.scan(back, last[:m], (np.arange(k - 1), y), reverse=True)
+    y = y - (border.T @ last[m:]).reshape(y.shape)
+    _, x = jax.lax.scan(back, last[:m], (np.arange(inner), y), reverse=True)
     return jnp.concatenate([x.reshape(n - m, -1), last]).reshape(right.shape)
 
 
@@ -134,41 +130,48 @@ def selected_inverse(factor: BandFactor) -> SelectedInverse:
 def invert_band(factor: BandFactor) -> Float[Array, "unknowns unknowns"]:
     """All of A^-1, symmetric, images first; 2 n^2 m operations beside those of `selected_inverse`."""
     inside, gains = _invert_inside(factor)
-    k, _, m = inside.columns.shape
-    n = k * m
-    diagonals = inside.columns[:, :m]
-    images = diagonals[0]
-    if k > 1:
-        # Column block j is right from row block j on; what stands above is not used.
-        def fill(after, at):
-            j, gain, diagonal = at
-            column = -jnp.concatenate([after, inside.border.T], axis=1) @ gain.T
-            column = jax.lax.dynamic_update_slice(column, diagonal, (j * m, 0))
-            return column, column
+    inner, _, m = inside.columns.shape
+    if not inner:
+        return inside.end
+    n = (inner + 1) * m
+    border = jnp.concatenate([inside.border, inside.end[m:, :m]], axis=1)
 
-        last = jnp.pad(diagonals[-1], ((n - m, 0), (0, 0)))
-        _, columns = jax.lax.scan(fill, last, (np.arange(k - 1), gains, diagonals[:-1]), reverse=True)
-        columns = jnp.concatenate([columns, last[None]])
-        images = _symmetric(columns.transpose(1, 0, 2).reshape(n, n))
-    return _with_border(images, inside.border, inside.corner)
+    # Column block j is right from row block j on; what stands above is not used.
+    def fill(after, at):
+        j, gain, diagonal = at
+        column = -jnp.concatenate([after, border.T], axis=1) @ gain.T
+        column = jax.lax.dynamic_update_slice(column, diagonal, (j * m, 0))
+        return column, column
+
+    last = jnp.pad(inside.end[:m, :m], ((n - m, 0), (0, 0)))
+    _, columns = jax.lax.scan(fill, last, (np.arange(inner), gains, inside.columns[:, :m]), reverse=True)
+    images = jnp.concatenate([columns, last[None]]).transpose(1, 0, 2).reshape(n, n)
+    return _with_border(_symmetric(images), border, inside.end[m:, m:])
 
 
 def dense(band: Band) -> Float[Array, "unknowns unknowns"]:
     """All of A, symmetric: for small blocks and tests."""
-    k, _, m = band.columns.shape
-    each = np.arange(k)
-    images = jnp.zeros((k, m, k, m)).at[each, :, each, :].set(band.columns[:, :m])
-    images = images.at[each[1:], :, each[:-1], :].set(band.columns[:-1, m:])
-    return _with_border(_symmetric(images.reshape(k * m, k * m)), band.border, _symmetric(band.corner))
+    inner, _, m = band.columns.shape
+    n, each = (inner + 1) * m, np.arange(inner)
+    images = jnp.zeros((inner + 1, m, inner + 1, m)).at[each, :, each, :].set(band.columns[:, :m])
+    images = images.at[each + 1, :, each, :].set(band.columns[:, m:]).at[inner, :, inner, :].set(band.end[:m, :m])
+    border = jnp.concatenate([band.border, band.end[m:, :m]], axis=1)
+    return _with_border(_symmetric(images.reshape(n, n)), border, _symmetric(band.end[m:, m:]))
 
 
-def pivots(band: Band, factor: BandFactor) -> Float[Array, " unknowns"]:
+def diagonal_of(stored: Band | BandFactor) -> Float[Array, " unknowns"]:
+    """The diagonal, images first."""
+    m = stored.columns.shape[2]
+    images = jnp.diagonal(stored.columns[:, :m], axis1=1, axis2=2).reshape(-1)
+    return jnp.concatenate([images, jnp.diagonal(stored.end)])
+
+
+def pivots(diagonal: Float[Array, " unknowns"], factor: BandFactor) -> Float[Array, " unknowns"]:
     """Squared diagonal of L over the diagonal of A (over 1 where that is not positive), images first.
 
     What is left of an unknown's own information when those before it are eliminated: near zero at a rank defect.
     """
-    diagonal = _diagonal(band)
-    return _diagonal(factor) ** 2 / jnp.where(diagonal > 0, diagonal, 1.0)
+    return diagonal_of(factor) ** 2 / jnp.where(diagonal > 0, diagonal, 1.0)
 
 
 def column_blocks(n_images: int, bandwidth: int) -> tuple[int, int]:
@@ -195,27 +198,26 @@ def column_blocks(n_images: int, bandwidth: int) -> tuple[int, int]:
 
 def _invert_inside(factor: BandFactor) -> tuple[SelectedInverse, Float[Array, "inner m p"]]:
     """The selected inverse, and G' of all columns but the last."""
-    k, _, m = factor.columns.shape
-    own = _invert_triangle(_end_of(factor))
+    inner, _, m = factor.columns.shape
+    own = _invert_triangle(factor.end)
     end = _mean(own @ own.T)
-    border, corner = end[m:, :m], end[m:, m:]
-    columns, borders, gains = _last_column(end[:m, :m]), border[None], factor.columns[:0, :m]
-    if k > 1:
+    if not inner:
+        return SelectedInverse(factor.columns, factor.border, end), jnp.zeros((0, m, len(end)))
+    corner = end[m:, m:]
 
-        def invert(after, at):
-            # Written in products A B' only: XLA takes twice as long for A' B.
-            column, shared = at
-            own = _invert_triangle(column[:m])
-            gain = own @ jnp.concatenate([column[m:], shared]).T
-            panel = gain @ after
-            diagonal = jnp.concatenate([own, gain], axis=1) @ jnp.concatenate([own, panel], axis=1).T
-            diagonal, below, shared = _mean(diagonal), -panel[:, :m].T, -panel[:, m:].T
-            return _with_border(diagonal, shared, corner), (gain, jnp.concatenate([diagonal, below]), shared)
+    def invert(after, at):
+        # Written in products A B' only: XLA takes twice as long for A' B.
+        column, shared = at
+        own = _invert_triangle(column[:m])
+        gain = own @ jnp.concatenate([column[m:], shared]).T
+        panel = gain @ after
+        diagonal = jnp.concatenate([own, gain], axis=1) @ jnp.concatenate([own, panel], axis=1).T
+        diagonal, below, shared = _mean(diagonal), -panel[:, :m].T, -panel[:, m:].T
+        return _with_border(diagonal, shared, corner), (gain, jnp.concatenate([diagonal, below]), shared)
 
-        at = (factor.columns[:-1], _split_border(factor.border, k)[:-1])
-        _, (gains, inner, inner_borders) = jax.lax.scan(invert, end, at, reverse=True)
-        columns, borders = jnp.concatenate([inner, columns]), jnp.concatenate([inner_borders, borders])
-    return SelectedInverse(columns, _join_border(borders), corner), gains
+    at = (factor.columns, _split_border(factor.border, inner))
+    _, (gains, columns, borders) = jax.lax.scan(invert, end, at, reverse=True)
+    return SelectedInverse(columns, _join_border(borders), end), gains
 
 
 def _invert_triangle(lower: Float[Array, "m m"]) -> Float[Array, "m m"]:
@@ -270,23 +272,6 @@ def _with_border(
     images: Float[Array, "n n"], border: Float[Array, "q n"], corner: Float[Array, "q q"]
 ) -> Float[Array, "n+q n+q"]:
     return jnp.block([[images, border.T], [border, corner]])
-
-
-def _diagonal(stored: Band | BandFactor) -> Float[Array, " unknowns"]:
-    m = stored.columns.shape[2]
-    images = jnp.diagonal(stored.columns[:, :m], axis1=1, axis2=2).reshape(-1)
-    return jnp.concatenate([images, jnp.diagonal(stored.corner)])
-
-
-def _end_of(factor: BandFactor) -> Float[Array, "p p"]:
-    """The factor of the last column block and the shared unknowns, which together are dense."""
-    m = factor.columns.shape[2]
-    border = factor.border[:, -m:]
-    return jnp.block([[factor.columns[-1, :m], jnp.zeros_like(border.T)], [border, factor.corner]])
-
-
-def _last_column(diagonal: Float[Array, "m m"]) -> Float[Array, "1 2*m m"]:
-    return jnp.concatenate([diagonal, jnp.zeros_like(diagonal)])[None]
 
 
 def _split_border(border: Float[Array, "q n"], k: int) -> Float[Array, "k q m"]:

@@ -23,10 +23,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxphoto.adjustment.band import Band, BandFactor, solve_band
+from jaxphoto.adjustment.band import BandFactor, solve_band
 from jaxphoto.adjustment.residuals import Increments, Residuals, Values, other_residuals, state_at
 from jaxphoto.adjustment.structure import Structure
-from jaxphoto.adjustment.tiles import Scene, by_point, by_tile, each_tile, of_images, rows, scene_of, seen_in
+from jaxphoto.adjustment.tiles import Pair, Scene, by_point, by_tile, each_tile, of_images, rows, scene_of, seen_in
 
 AXIS = "tiles"
 """Mesh axis along which tiles and their points are dealt out to devices."""
@@ -49,8 +49,8 @@ class At(NamedTuple):
 class Reduced(NamedTuple):
     """The reduced normal matrix and what takes vectors down to it and back to the points."""
 
-    a: Band
-    """A; its band is one full column block where there are constraints or distances."""
+    diagonal: Float[Array, "reduced"]
+    """Of A."""
     g: Float[Array, "reduced constraints"]
     k: Float[Array, "constraints constraints"]
     l: Float[Array, "6 points"]  # noqa: E741
@@ -58,11 +58,18 @@ class Reduced(NamedTuple):
     rows_e: Float[Array, "constraints images 6"]
     rows_p: Float[Array, "constraints 3 points"]
     """D: distances, then the constraints of the datum."""
+    weight: Increments
+    """The diagonal of N, without damping and D'D: what a unit of damping adds."""
 
 
 def total(x, s: Structure):
     """The sum over all devices."""
     return jax.lax.psum(x, AXIS) if s.tiles is not None and s.tiles.shards > 1 else x
+
+
+def norm2(x: Increments, weight: Increments, s: Structure) -> Float[Array, ""]:
+    """x' diag(weight) x over all unknowns."""
+    return dot(x, jax.tree.map(jnp.multiply, weight, x), s)
 
 
 def dot(a: Increments, b: Increments, s: Structure) -> Float[Array, ""]:
@@ -77,7 +84,7 @@ def residuals_at(at: At) -> Residuals:
     scene = scene_of(state, s)
 
     def tile(image, points, xy, sigma):
-        return rows(of_images(scene, image, s), points, seen_in(xy, sigma, image, s), s)
+        return jnp.stack(rows(of_images(scene, image, s), points, seen_in(xy, sigma, image, s), s))
 
     numbers = (tiles.image, by_tile(state.points, tiles), values.xy, values.sigma_xy)
     image = jax.vmap(jax.vmap(tile))(*numbers)
@@ -92,11 +99,15 @@ def square_sum(at: At) -> Float[Array, ""]:
 
     def tile(numbers):
         image, points, xy, sigma = numbers
-        r = rows(of_images(scene, image, s), points, seen_in(xy, sigma, image, s), s)
-        return jnp.sum(r * r)
+        return squares(rows(of_images(scene, image, s), points, seen_in(xy, sigma, image, s), s))
 
     image = _each_tile(tile, (by_tile(state.points, s.in_tiles), values.xy, values.sigma_xy), s)
     return _square_sum(jnp.sum(image), other_residuals(increments, scale, values, s), s)
+
+
+def squares(r: Pair) -> Float[Array, ""]:
+    """The square sum of a tile's rows."""
+    return sum((jnp.sum(v * v) for v in r), jnp.zeros(()))
 
 
 def _square_sum(image: Float[Array, ""], others: Residuals, s: Structure) -> Float[Array, ""]:
@@ -161,15 +172,15 @@ def gradient(at: At, l: Float[Array, "6 points"], rows_p: Float[Array, "k 3 poin
         to_scene, to_point = pull(r)
         b = to_point * step + other
         across = jax.jvp(lambda x: f(place, x), (point,), (solve_3x3(factors, b) * step,))[1]
-        return to_scene, pull(across)[0], b, jnp.sum(r * r)
+        return to_scene, pull(across)[0], b, squares(r)
 
     numbers = (by_tile(v, tiles) for v in (points, scale.points, b_others.points, l))
-    to_scene, down, b, squares = _each_tile(tile, (*numbers, values.xy, values.sigma_xy), s)
+    to_scene, down, b, square = _each_tile(tile, (*numbers, values.xy, values.sigma_xy), s)
     (e, h), (e_down, h_down) = (pull_scene(total(_by_image(v, scene, s), s)) for v in (to_scene, down))
     b_p = by_point(b.reshape(*tiles.image.shape[:2], *b.shape[1:]))
     b = Increments(e + b_others.eop, h + b_others.shared, b_p)
     right = jnp.concatenate([(b.eop - e_down).T.reshape(-1), b.shared - h_down])
-    return b, right, jnp.einsum("ckp,kp->c", rows_p, solve_3x3(l, b_p)), _square_sum(jnp.sum(squares), others, s)
+    return b, right, jnp.einsum("ckp,kp->c", rows_p, solve_3x3(l, b_p)), _square_sum(jnp.sum(square), others, s)
 
 
 def _scene_and_pull(at: At):
@@ -196,7 +207,7 @@ def _by_image(parts: Scene, scene: Scene, s: Structure) -> Scene:
 
 
 def solve_factored(at: At, reduced: Reduced, factor: BandFactor, b: Increments) -> Increments:
-    """x of (N + damping I) x = b: down to the reduced unknowns, and back to the points."""
+    """x of (N + damping diag(N)) x = b: down to the reduced unknowns, and back to the points."""
     z = solve_3x3(reduced.l, b.points)
     zero = jax.tree.map(jnp.zeros_like, b)
     down = image_products(at, zero._replace(points=z), "images")

@@ -27,8 +27,6 @@ from jaxphoto.adjustment.tiles import by_tile
 from jaxphoto.arrays import Numbers
 from jaxphoto.collinearity import ExteriorOrientation, image_residual
 
-# The first damping relative to the normal matrix is the square of this: almost Gauss-Newton.
-_FIRST_DAMPING = 1e-4
 # No unknown misses its optimum by more than this fraction of its standard deviation.
 TOLERANCE = 1e-5
 
@@ -69,15 +67,16 @@ def iterate(
 
     The second serves statistics: what was compiled to solve need not be compiled again to factor.
     """
-    scale = jax.tree.map(lambda k: k / _FIRST_DAMPING, typical_scale(values, structure))
+    scale = typical_scale(values, structure)
     at_points = along_points(2)
+    of_unknowns = Increments(EVERYWHERE, EVERYWHERE, at_points)
     system = System(
-        Increments(EVERYWHERE, EVERYWHERE, at_points),
-        Reduced(EVERYWHERE, EVERYWHERE, EVERYWHERE, at_points, EVERYWHERE, along_points(3)),
+        of_unknowns,
+        Reduced(EVERYWHERE, EVERYWHERE, EVERYWHERE, at_points, EVERYWHERE, along_points(3), of_unknowns),
         EVERYWHERE,
         EVERYWHERE,
     )
-    out = (Optimum(Increments(EVERYWHERE, EVERYWHERE, at_points), EVERYWHERE, EVERYWHERE), system)
+    out = (Optimum(of_unknowns, EVERYWHERE, EVERYWHERE), system)
     run = sharded(partial(_iterate, max_steps=max_steps), structure, out)
     optimum, system = run(values, scale, structure, only_factor)
     return optimum._replace(increments=jax.tree.map(jnp.multiply, optimum.increments, scale)), system, scale
@@ -120,8 +119,8 @@ def _find_optimum_jvp(primals, tangents, *, structure: Structure, max_steps: int
     # The preconditioner belongs to the optimum: it wants its place in scaled increments.
     place = jax.tree.map(lambda a, k: jnp.where(k > 0, a / jnp.where(k > 0, k, 1.0), 0.0), at, scale)
     there = At(place, scale, values, structure)
-    reduced, _ = reduce_normal(there, 0.0)
-    factor = factor_band(reduced.a)
+    a, reduced, _ = reduce_normal(there, 0.0)
+    factor = factor_band(a)
 
     right, unravel = ravel_pytree(jax.tree.map(lambda c, k: -c * k, change, scale))
     # One flat vector: the transposed solve wants all of its right-hand side to depend on the direction, or none.
@@ -162,8 +161,8 @@ def weigh_datum(values: Values, structure: Structure) -> Values:
 def typical_scale(values: Values, structure: Structure) -> Increments:
     """What moves an image point by about its standard deviation; zero for what is held fixed.
 
-    Scaling by these makes columns of the Jacobian alike within a factor of some tens, which is all that the damping and
-    the factorisation need: unknowns run from 1e-7 (k2) to 1e3 m.
+    Scaling by these makes columns of the Jacobian alike within a factor of some tens, which is all that the
+    factorisation needs: unknowns run from 1e-7 (k2) to 1e3 m.
     """
     s, v = structure, jax.tree.map(jax.lax.stop_gradient, values)
     weight = 1 / v.sigma_xy

@@ -1,9 +1,9 @@
 """Layout and size classes: blocks as they are computed with; what is compiled serves every block of similar size.
 
-Before it is computed with, a block is laid out in tiles (`tiling`) and padded to the next sizes of a coarse series, at
-most an eighth larger, with an image and points that nothing depends on: rows of infinite standard deviation, unknowns
-that are held fixed. The results are cropped again and put back in the block's own order. Names stay outside: the padded
-structure has none.
+Before it is computed with, a block is laid out in tiles (`tiling`) and padded with images and points that nothing
+depends on: rows of infinite standard deviation, unknowns that are held fixed. Images and tiles have coarse classes; all
+other lists have sizes that follow from these two, so that they seldom tell blocks apart. The results are cropped again
+and put back in the block's own order. Names stay outside: the padded structure has none.
 """
 
 import dataclasses
@@ -17,25 +17,23 @@ from jaxtyping import Int
 from jaxphoto.adjustment.band import column_blocks
 from jaxphoto.adjustment.residuals import Residuals, State, Values
 from jaxphoto.adjustment.structure import CameraGroup, Structure, Tiles
-from jaxphoto.adjustment.tiling import Tiling, order_images, tile_points, tile_shape
+from jaxphoto.adjustment.tiling import TILES, Tiling, order_images, size_class, tile_points, tile_shape
 from jaxphoto.arrays import still
 
 
 class Sizes(NamedTuple):
     """How large each kind of list is, in a block or as it is compiled for."""
 
-    images: int = 8
-    bandwidth: int = 8
+    images: int = 1
+    bandwidth: int = 1
     """Largest difference of places of two images that meet."""
-    tiles: int = 8
+    tiles: int = 1
     tile_images: int = 4
     tile_points: int = 8
-    pairs: int = 128
-    """Pairs of images that meet in a tile, in the chunk of tiles that has most."""
-    blocks: int = 64
+    blocks: int = 1
     """Pairs of images that meet anywhere in a chunk, in the chunk that has most."""
-    stations: int = 128
-    attitudes: int = 128
+    stations: int = 0
+    attitudes: int = 0
 
     def __or__(self, other: object) -> "Sizes":
         """What both fit into."""
@@ -43,7 +41,7 @@ class Sizes(NamedTuple):
 
 
 LEAST = Sizes()
-"""The least sizes worth a class of their own."""
+"""No more than a block needs by itself."""
 
 
 class Places(NamedTuple):
@@ -55,21 +53,15 @@ class Places(NamedTuple):
     """(tile * M + image) * P + point."""
 
 
-def size_class(n: int) -> int:
-    """The next number, from `n` on, that is 8 to 15 times a power of two."""
-    step = 1 << max(0, n.bit_length() - 4)
-    return -(-n // step) * step
-
-
 def sizes_of(structure: Structure) -> Sizes:
-    """The sizes of a block, with room for the image and the tile that nothing needs."""
+    """The sizes of a block, with room for the image that nothing needs."""
     return _Layout.of(structure, LEAST, shards=1, dense=False).sizes
 
 
 # Tiles are summed in chunks whose products take no more numbers than this.
 _CHUNK = 4_000_000
 # Slots that are computed with at a time.
-_SLOTS = 400
+_SLOTS = 4000
 
 
 class _Layout(NamedTuple):
@@ -94,17 +86,17 @@ class _Layout(NamedTuple):
         m, p = tile_shape(image, s.point, s.n_images, s.n_points)
         m, p = max(m, wanted.tile_images), max(p, wanted.tile_points)
         tiling = tile_points(image, s.point, s.n_points, m, p)
-        tiles = max(len(tiling.image) + 1, wanted.tiles)
+        tiles = max(len(tiling.image), wanted.tiles)
         images, bandwidth = max(s.n_images + 1, wanted.images), max(bandwidth, wanted.bandwidth)
-        n = size_class(images)
-        columns, width = (1, n) if dense else column_blocks(n, min(n, size_class(bandwidth)))
+        n = size_class(images, 16)
+        columns, width = (1, n) if dense else column_blocks(n, min(n, size_class(bandwidth, 8)))
         per_shard = -(-tiles // shards)
         chunks = -(-per_shard * (6 * m) ** 2 // _CHUNK)
-        at_once = max(1, min(_SLOTS // (m * p), per_shard))
-        chunk = at_once * size_class(-(-per_shard // (chunks * at_once)))
+        at_once = max(k for k in range(1, TILES + 1) if TILES % k == 0 and k * m * p <= max(_SLOTS, m * p))
+        chunk = size_class(-(-per_shard // chunks), TILES)
         lists = _pair_lists(tiling.image, chunk, width)
-        pairs, blocks = (max((len(v) for v in x), default=0) for x in (lists[0], lists[2]))
-        sizes = Sizes(images, bandwidth, tiles, m, p, pairs, blocks + 1, len(s.station_image), len(s.attitude_image))
+        blocks = max(map(len, lists[2]), default=0)
+        sizes = Sizes(images, bandwidth, tiles, m, p, blocks + 1, len(s.station_image), len(s.attitude_image))
         return cls(place, tiling, columns, width, shards * chunks, chunk, at_once, lists, sizes)
 
 
@@ -138,13 +130,15 @@ def pad_structure(
     devices; `dense` asks for a reduced matrix that is not a band.
     """
     s, layout = structure, _Layout.of(structure, sizes, shards, dense)
-    have = layout.sizes | LEAST | sizes
+    have = layout.sizes | sizes
     m, p = layout.sizes.tile_images, layout.sizes.tile_points
     n_images, n_chunks = layout.columns * layout.width, layout.chunks
-    pairs, blocks = size_class(have.pairs), size_class(have.blocks)
+    # As many as there can be, or as there often are: padding costs next to nothing here.
+    pairs = layout.chunk * m * (m + 1) // 2
+    blocks = min(size_class(have.blocks, 16 * n_images), pairs + 1)
     # A group without rows is left out of the program, so it stays empty.
-    stations = size_class(have.stations) * (len(s.station_image) > 0)
-    attitudes = size_class(have.attitudes) * (len(s.attitude_image) > 0)
+    stations = size_class(have.stations, 3 * n_images) * (len(s.station_image) > 0)
+    attitudes = size_class(have.attitudes, n_images) * (len(s.attitude_image) > 0)
     tile_image = np.full((n_chunks * layout.chunk, m), n_images - 1, np.int32)
     own = layout.tiling.image
     tile_image[: len(own)] = np.where(own >= 0, own, n_images - 1)

@@ -2,13 +2,22 @@
 
 from collections.abc import Iterable
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxphoto.adjustment.band import dense, pivots
+from jaxphoto.adjustment.band import Band, dense, pivots
+from jaxphoto.adjustment.normal import At
+from jaxphoto.adjustment.optimum import weigh_datum
 from jaxphoto.adjustment.padding import crop_reduced
+from jaxphoto.adjustment.reduced import reduce_normal
+from jaxphoto.adjustment.residuals import Increments, Values
 from jaxphoto.adjustment.result import Adjustment
+from jaxphoto.adjustment.shards import EVERYWHERE, sharded
+from jaxphoto.adjustment.structure import Structure
 from jaxphoto.block import Block
+from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import DatumError, RankError
 from jaxphoto.unknowns import FREE, Unknowns
 
@@ -111,10 +120,12 @@ def check_rank(adjusted: Adjustment) -> None:
     if adjusted.padded is None or not bool(adjusted.converged):
         return
     s, computed = adjusted.structure, adjusted.padded
-    reduced, factor = computed.factored.reduced.a, computed.factored.factor
-    if float(jnp.nanmin(pivots(reduced, factor))) > _DEFECT and bool(jnp.all(jnp.isfinite(factor.corner))):
+    factored = computed.factored
+    left = np.asarray(pivots(factored.reduced.diagonal, factored.factor))
+    if left.min() > _DEFECT:
         return
-    a = crop_reduced(dense(reduced), s, computed.places)
+    band = call_compiled(reduced_matrix, computed.values, factored.scale, computed.structure)
+    a = crop_reduced(dense(band), s, computed.places)
     diagonal = np.diagonal(a)
     d = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
     weakest, vectors = np.linalg.eigh(a * d[:, None] * d[None, :])
@@ -126,3 +137,13 @@ def check_rank(adjusted: Adjustment) -> None:
         f"the observations cannot tell these unknowns apart: {', '.join(worst)}; hold one of them fixed, or give it a "
         f"weight, or add observations that see it (smallest eigenvalue of the scaled normal matrix {weakest[0]:.1e})"
     )
+
+
+@eqx.filter_jit
+def reduced_matrix(values: Values, scale: Increments, s: Structure) -> Band:
+    """The undamped reduced normal matrix itself; the solver keeps its factor, which a defect leaves unfinished."""
+
+    def of_device(values, scale, s):
+        return reduce_normal(At(jax.tree.map(jnp.zeros_like, scale), scale, values, s), 0.0)[0]
+
+    return sharded(of_device, s, EVERYWHERE)(weigh_datum(values, s), scale, s)

@@ -5,13 +5,15 @@ of one matrix F, three columns a point, and F F' holds every sum over the tile's
 symbols.
 """
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from jaxphoto.adjustment.band import Band
+from jaxphoto.adjustment.band import Band, diagonal_of
 from jaxphoto.adjustment.colouring import Jacobian, jacobian_blocks
 from jaxphoto.adjustment.normal import At, Reduced, cholesky_3x3, total, whiten
 from jaxphoto.adjustment.residuals import Increments, Residuals, other_residuals
@@ -23,6 +25,7 @@ from jaxphoto.adjustment.tiles import (
     columns,
     each_tile,
     of_images,
+    once,
     scene_of,
     seen_in,
     slopes_of,
@@ -58,52 +61,57 @@ class OtherRows(NamedTuple):
 class TileParts(NamedTuple):
     """What a tile's statistics and sums are made of."""
 
-    columns: Columns
+    columns: tuple[Columns, Columns]
     f: Float[Array, "6m+border 3p"]
     """F: Y, then interior unknowns, constraints, right-hand side."""
     l: Float[Array, "6 p"]  # noqa: E741
     b: Float[Array, "3 p"]
-    z: Float[Array, "2 m 3 p"]
-    """L^-1 times the columns of the point."""
+    diagonal: Float[Array, "3 p"]
+    """That of V, without damping."""
+    z: tuple[Float[Array, "3 m p"], Float[Array, "3 m p"]]
+    """L^-1 times the columns of the point, for x and y."""
 
 
-def reduce_normal(at: At, damping) -> tuple[Reduced, Right]:
-    """Eliminate the points of N + damping I. Unknowns held fixed (zero columns) get a unit diagonal."""
+def reduce_normal(at: At, damping) -> tuple[Band, Reduced, Right]:
+    """Eliminate the points of N + damping diag(N): A, what goes with it, and the right-hand side.
+
+    Unknowns held fixed (zero columns) get a unit diagonal.
+    """
     s, tiles = at.structure, at.structure.in_tiles
     rest = other_rows(at)
     blocks, others, coupled = rest.blocks, rest.residuals, rest.coupled
     parts_of = tile_parts(at, damping, coupled)
     n, q, c = s.n_images, s.n_image_colours, s.n_interior + len(coupled) + 1
     _, chunk, m = tiles.image.shape
-    width = n // tiles.columns
+    width, inner = n // tiles.columns, tiles.columns - 1
 
     def tile(numbers):
         p = parts_of(numbers)
-        j = jnp.concatenate([p.columns.eop, p.columns.shared, p.columns.residual[None]])
-        j = j.transpose(2, 0, 1, 3).reshape(m, 7 + q, -1)
+        whole = [jnp.concatenate([j.eop, j.shared, j.residual[None]]).transpose(1, 0, 2) for j in p.columns]
+        j = jnp.concatenate(whole, axis=2)
         gram = p.f @ p.f.T
         across = gram[: 6 * m, 6 * m :].reshape(m, -1)
         own = jnp.concatenate([jnp.einsum("maj,mbj->mab", j, j).reshape(m, -1), across], axis=1)
-        return gram[: 6 * m, : 6 * m], own, gram[6 * m :, 6 * m :], p.l, p.b
+        return gram[: 6 * m, : 6 * m], own, gram[6 * m :, 6 * m :], p.l, p.b, p.diagonal
 
     def add_chunk(sums, numbers):
         (pair_tile, pair_images, pair_block, block), of_tiles = numbers
-        grams, own, border, l, b = each_tile(tile, of_tiles, tiles)  # noqa: E741
+        grams, own, border, *of_points = each_tile(tile, of_tiles, tiles)
         grams = grams.reshape(chunk, m, 6, m, 6)[pair_tile, pair_images[:, 0], :, pair_images[:, 1]]
         grams = jax.ops.segment_sum(grams, pair_block, len(block), indices_are_sorted=True)
-        band = sums[0].at[block[:, 0], block[:, 1], :, block[:, 2]].add(-grams, unique_indices=True, mode="drop")
-        own = jax.ops.segment_sum(own.reshape(chunk * m, -1), of_tiles[0].reshape(-1), n)
-        return (band, sums[1] + own, sums[2] + border.sum(0)), (l, b)
+        own = _sum_by(own.reshape(chunk * m, -1), of_tiles[0].reshape(-1), n)
+        band = _subtract_blocks(sums[0], grams, block)
+        return (band, sums[1] + own, sums[2] + border.sum(0)), of_points
 
     zero = (
-        jnp.zeros((tiles.columns, 2 * width, 6, width, 6)),
+        (jnp.zeros((inner, 2 * width, 6, width, 6)), jnp.zeros((width, 6, width, 6))),
         jnp.zeros((n, (7 + q) ** 2 + 6 * c)),
         jnp.zeros((c, c)),
     )
     lists = (tiles.pair_tile, tiles.pair_images, tiles.pair_block, tiles.block)
-    sums, (l, b) = jax.lax.scan(add_chunk, zero, (lists, tile_numbers(at, rest)))  # noqa: E741
-    band, own, border = total(sums, s)
-    l, b_points = by_point(l), by_point(b)  # noqa: E741
+    sums, of_points = jax.lax.scan(add_chunk, zero, (lists, tile_numbers(at, rest)))
+    (columns, last), own, border = total(sums, s)
+    l, b_points, v = map(by_point, of_points)  # noqa: E741
 
     m_images = _with_other_rows(own[:, : (7 + q) ** 2].reshape(n, 7 + q, 7 + q), blocks, others, s)
     met = own[:, (7 + q) ** 2 :].reshape(n, 6, c)
@@ -111,28 +119,51 @@ def reduce_normal(at: At, damping) -> tuple[Reduced, Right]:
     uss = uss.at[s.weighted, s.weighted].add(blocks.priors**2)
     b_s = b_s.at[s.weighted].add(blocks.priors * others.priors)
     u = m_images[:, :6, :6]
-    u = u + (damping + jnp.where(jnp.einsum("nii->ni", u) == 0, 1.0, 0.0))[:, :, None] * jnp.eye(6)
-    each = jnp.arange(n)
-    band = band.at[each // width, each % width, :, each % width].add(u, unique_indices=True)
+    weight = Increments(jnp.einsum("nii->in", u), jnp.diagonal(uss), v)
+    added = damping * weight.eop.T + jnp.where(weight.eop.T == 0, 1.0, 0.0)
+    u = u + added[:, :, None] * jnp.eye(6)
+    each, of_inner = jnp.arange(n), inner * width
+    columns = columns.at[each[:of_inner] // width, each[:of_inner] % width, :, each[:of_inner] % width].add(
+        u[:of_inner], unique_indices=True
+    )
+    last = last.at[each[:width], :, each[:width]].add(u[of_inner:], unique_indices=True)
 
     i, k = s.n_interior, len(coupled)
-    us = us.at[:, :, :i].add(-met[:, :, :i])
-    uss = (uss + damping * jnp.eye(s.n_shared)).at[:i, :i].add(-border[:i, :i])
+    us = us.at[:, :, :i].add(-met[:, :, :i]).transpose(2, 0, 1).reshape(s.n_shared, 6 * n)
+    uss = (uss + damping * jnp.diag(weight.shared)).at[:i, :i].add(-border[:i, :i])
     ge = rest.rows_e.transpose(1, 2, 0) - met[:, :, i : i + k]
     gs = jnp.zeros((s.n_shared, k)).at[:i].set(-border[:i, i : i + k])
     g = jnp.concatenate([ge.reshape(6 * n, k), gs])
     kk = jnp.eye(k) + border[i : i + k, i : i + k]
-    a = Band(band.reshape(tiles.columns, 12 * width, 6 * width), us.transpose(2, 0, 1).reshape(s.n_shared, 6 * n), uss)
+    # Put together by parts that are written whole: `block` would be computed number by number.
+    end = jnp.zeros((6 * width + s.n_shared,) * 2).at[: 6 * width, : 6 * width].set(last.reshape(6 * width, -1))
+    end = end.at[6 * width :, : 6 * width].set(us[:, 6 * of_inner :]).at[6 * width :, 6 * width :].set(uss)
     if k:
-        a = _with_constraints(a, g, kk)
+        # A = S + g K^-1 g' joins all images: the band has one full column block.
+        end = end + g @ jnp.linalg.solve(kk, g.T)
+    a = Band(columns.reshape(inner, 12 * width, 6 * width), us[:, : 6 * of_inner], end)
 
     b_e = m_images[:, :6, -1] + jnp.einsum("cna,c->na", rest.rows_e, coupled)
     right = jnp.concatenate([(b_e - met[:, :, -1]).reshape(-1), b_s.at[:i].add(-border[:i, -1])])
-    reduced = Reduced(a, g, kk, l, rest.rows_e, rest.rows_p)
+    reduced = Reduced(diagonal_of(a), g, kk, l, rest.rows_e, rest.rows_p, weight)
     # Of the residuals' own square, the sums hold the image rows' part.
     squares = jnp.sum(m_images[:, -1, -1]) + total(jnp.sum(others.control**2), s)
     squares += jnp.sum(coupled**2) + jnp.sum(others.priors**2)
-    return reduced, Right(Increments(b_e.T, b_s, b_points), right, border[i : i + k, -1], squares)
+    return a, reduced, Right(Increments(b_e.T, b_s, b_points), right, border[i : i + k, -1], squares)
+
+
+def _subtract_blocks(band: tuple[Array, Array], grams: Float[Array, "blocks 6 6"], block: Array):
+    """Pairs of images, subtracted where they belong: in the inner column blocks, or in the last.
+
+    What lies in neither is dropped.
+    """
+    columns, last = band
+    which, row, column = block.T
+    width, inner = len(last), len(columns)
+    if inner:
+        columns = columns.at[which, row, :, column].add(-grams, mode="drop", unique_indices=True)
+    row = jnp.where(which == inner, row, width)
+    return columns, last.at[row, :, column].add(-grams, mode="drop")
 
 
 def other_rows(at: At) -> OtherRows:
@@ -167,8 +198,7 @@ def tile_parts(at: At, damping, coupled: Float[Array, "constraints"]):
     """A function from one tile's numbers to its `TileParts`."""
     s = at.structure
     scene = scene_of(at.state, s)
-    slopes = slopes_of(at.increments, at.scale, at.values, s)
-    i, q = s.n_interior, s.n_image_colours
+    slopes = once(lambda: slopes_of(at.increments, at.scale, at.values, s), s)
 
     def parts(numbers) -> TileParts:
         image, xy, sigma, points, scale, control, rows_p = numbers
@@ -176,34 +206,59 @@ def tile_parts(at: At, damping, coupled: Float[Array, "constraints"]):
         j = columns(
             of_images(scene, image, s), of_images(slopes, image, s), points, scale, seen_in(xy, sigma, image, s), s
         )
-        # What meets the point in each row: itself, the camera, the residual; summed over rows and brought from colours
-        # to unknowns by one product.
-        whole = jnp.concatenate([j.point, j.shared, j.residual[None]])
-        met = whole[:, None, 0] * j.point[None, :, 0] + whole[:, None, 1] * j.point[None, :, 1]
-        column = jnp.asarray(s.column)[image, :q].T
-        means = jnp.concatenate(
-            [
-                jnp.broadcast_to(jnp.arange(3)[:, None], (3, m)),
-                jnp.where(column < i, column + 3, -1),
-                jnp.full((1, m), 3 + i),
-            ]
-        )
-        pick = (means.reshape(1, -1) == jnp.arange(4 + i)[:, None]).astype(float)
-        met = (pick @ met.transpose(0, 2, 1, 3).reshape(means.size, 3 * p)).reshape(4 + i, 3, p)
-        v, ws, b = met[:3], met[3 : 3 + i], met[3 + i]
+        v, b = _met([c.point for c in j], j), _met([c.residual[None] for c in j], j)[0]
+        ws = _by_interior(j, image, s)
         diagonal = jnp.einsum("iip->ip", v) + control[1] ** 2
-        v = v + (control[1] ** 2 + damping + jnp.where(diagonal == 0, 1.0, 0.0))[:, None] * jnp.eye(3)[:, :, None]
+        added = control[1] ** 2 + damping * diagonal + jnp.where(diagonal == 0, 1.0, 0.0)
+        v = v + added[:, None] * jnp.eye(3)[:, :, None]
         b = b + control[0] * control[1] + jnp.einsum("ckp,c->kp", rows_p, coupled)
-        l = jax.lax.optimization_barrier(cholesky_3x3(v))  # noqa: E741
+        l = once(cholesky_3x3, s, v)  # noqa: E741
         border = jnp.concatenate([ws, rows_p, b[None]])
         border = jnp.stack(whiten(border.transpose(1, 0, 2), l), axis=1)
-        z = jax.lax.optimization_barrier(jnp.stack(whiten(j.point, l), axis=2))
-        y = j.eop[:, 0].transpose(1, 0, 2)[:, :, None] * z[0][:, None]
-        y = y + j.eop[:, 1].transpose(1, 0, 2)[:, :, None] * z[1][:, None]
-        f = jnp.concatenate([y.reshape(6 * m, 3 * p), border.reshape(-1, 3 * p)])
-        return TileParts(j, f, l, b, z)
+        z = once(
+            lambda factors, *points: tuple(jnp.stack(whiten(w, factors)) for w in points), s, l, *(c.point for c in j)
+        )
+        f = jnp.concatenate([once(_whitened_eop, s, j, z).reshape(6 * m, 3 * p), border.reshape(-1, 3 * p)])
+        return TileParts(j, f, l, b, diagonal, z)
 
     return parts
+
+
+def _whitened_eop(j: Iterable[Columns], z: Iterable[Array]) -> Float[Array, "m 6 3 p"]:
+    """Y of a tile."""
+    both = ((c.eop.transpose(1, 0, 2), w.transpose(1, 0, 2)) for c, w in zip(j, z, strict=True))
+    return sum((eop[:, :, None] * w[:, None] for eop, w in both), jnp.zeros(()))
+
+
+def _met(of: Iterable[Float[Array, "a m p"]], j: Iterable[Columns]) -> Float[Array, "a 3 p"]:
+    """Sums over a point's rows, term by term: XLA's products of matrices this small take five times as long."""
+    each = zip(of, j, strict=True)
+    return sum((a[:, None, k] * c.point[:, k] for a, c in each for k in range(a.shape[1])), jnp.zeros(()))
+
+
+def _by_interior(j: tuple[Columns, Columns], image: Array, s: Structure) -> Float[Array, "interior 3 p"]:
+    """Ws of a tile."""
+    i, q = s.n_interior, s.n_image_colours
+    if i == q:
+        # One camera: its colours are its unknowns.
+        return _met([c.shared for c in j], j)
+    met = sum((c.shared[:, :, None] * c.point.transpose(1, 0, 2) for c in j), jnp.zeros(()))
+    column = jnp.asarray(s.column)[image, :q].T.reshape(-1)
+    pick = (column == jnp.arange(i)[:, None]).astype(float)
+    return (pick @ met.reshape(q * len(image), -1)).reshape(i, 3, -1)
+
+
+# XLA compiles the loop over the rows of a scatter as one function where a row is short, and else calls several a row.
+_PIECE = 36
+
+
+def _sum_by(rows: Float[Array, "rows c"], which: Array | np.ndarray, n: int) -> Float[Array, "n c"]:
+    """Sums of rows by a number from 0 to n - 1."""
+    pieces = -(-rows.shape[1] // _PIECE)
+    size = -(-rows.shape[1] // pieces)
+    split = jnp.pad(rows, ((0, 0), (0, pieces * size - rows.shape[1]))).reshape(-1, size)
+    at = (which[:, None] * pieces + jnp.arange(pieces)).reshape(-1)
+    return jax.ops.segment_sum(split, at, n * pieces).reshape(n, -1)[:, : rows.shape[1]]
 
 
 def _with_other_rows(m: Float[Array, "images c c"], blocks: Jacobian, others: Residuals, s: Structure):
@@ -215,7 +270,8 @@ def _with_other_rows(m: Float[Array, "images c c"], blocks: Jacobian, others: Re
     attitudes = jnp.concatenate([blocks.attitude_eop, blocks.attitude_shared, others.attitudes[None]])
     for rows, image in ((stations, s.station_image), (attitudes, s.attitude_image)):
         if len(image):
-            m = m + jax.ops.segment_sum(jnp.einsum("aon,bon->nab", rows, rows), image, s.n_images)
+            squares = once(lambda rows: jnp.einsum("aon,bon->nab", rows, rows), s, rows)
+            m = m + _sum_by(squares.reshape(len(image), -1), image, s.n_images).reshape(m.shape)
     return m
 
 
@@ -227,10 +283,3 @@ def _by_unknown(m: Float[Array, "images c c"], s: Structure):
     uss = jnp.zeros((n + 1, n + 1)).at[s.column[:, :, None], s.column[:, None, :]].add(m[:, 6 : 6 + q, 6 : 6 + q])
     b_s = jnp.zeros(n + 1).at[s.column].add(m[:, 6 : 6 + q, -1])
     return us[:, :, :n], uss[:n, :n], b_s[:n]
-
-
-def _with_constraints(a: Band, g: Float[Array, "reduced constraints"], k) -> Band:
-    """A = S + g K^-1 g': it joins all images, so the band is one full column block."""
-    more = g @ jnp.linalg.solve(k, g.T)
-    n = a.border.shape[1]
-    return Band(a.columns.at[0, :n].add(more[:n, :n]), a.border + more[n:, :n], a.corner + more[n:, n:])

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, PyTree, Scalar
 
-from jaxphoto.adjustment.band import Band, BandFactor, factor_band
-from jaxphoto.adjustment.normal import At, Reduced, dot, gradient, solve_reduced
+from jaxphoto.adjustment.band import BandFactor, factor_band
+from jaxphoto.adjustment.normal import At, Reduced, dot, gradient, norm2, solve_reduced
 from jaxphoto.adjustment.reduced import Right, reduce_normal
 from jaxphoto.adjustment.residuals import Increments, Values
 from jaxphoto.adjustment.structure import Structure
@@ -32,17 +32,18 @@ class System(NamedTuple):
 def zero_system(y: Increments, values: Values, s: Structure) -> System:
     """A system of the right shapes, to begin with."""
     n, q, k = 6 * s.n_images, s.n_shared, len(values.distances) + len(values.datum_eop)
-    m, points = n // s.in_tiles.columns, y.points.shape[1]
-    band = (jnp.zeros((s.in_tiles.columns, 2 * m, m)), jnp.zeros((q, n)), jnp.zeros((q, q)))
+    m, inner, points = n // s.in_tiles.columns, s.in_tiles.columns - 1, y.points.shape[1]
+    factor = BandFactor(jnp.zeros((inner, 2 * m, m)), jnp.zeros((q, inner * m)), jnp.zeros((m + q, m + q)))
     reduced = Reduced(
-        a=Band(*band),
+        diagonal=jnp.zeros(n + q),
         g=jnp.zeros((n + q, k)),
         k=jnp.zeros((k, k)),
         l=jnp.zeros((6, points)),
         rows_e=jnp.zeros((k, s.n_images, 6)),
         rows_p=jnp.zeros((k, 3, points)),
+        weight=jax.tree.map(jnp.zeros_like, y),
     )
-    return System(y, reduced, BandFactor(*band), jnp.zeros(()))
+    return System(y, reduced, factor, jnp.zeros(()))
 
 
 class Progress(NamedTuple):
@@ -57,9 +58,12 @@ class Progress(NamedTuple):
     done: Bool[Array, ""]
 
 
-# Trust region by the ratio of actual to promised reduction: accept above the first, trust more above the second.
-_ACCEPT, _GOOD = 0.01, 0.99
-_LESS_DAMPING, _MORE_DAMPING = 1 / 3.5, 4.0
+# Damping is what is added to the normal matrix, relative to its diagonal. It begins almost as none; where that fails,
+# little more does no better: the first rejected step takes it to the second, each further one multiplies it.
+_FIRST_DAMPING, _DAMPING, _MORE_DAMPING = 1e-8, 1e-4, 10.0
+# A step is accepted above the first ratio of actual to promised reduction. Damping falls with that ratio (Nielsen's
+# rule), at most to this fraction.
+_ACCEPT, _LEAST_FACTOR = 0.001, 0.2
 # Ratio of successive steps that is assumed at least when the missing part is estimated.
 _SLOWEST_SHOWN = 0.1
 # Steps that shrink like this go on with the same factor; a chord step that shrinks less than the second ends it.
@@ -97,14 +101,14 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Increments, Scalar, Any
         return At(y, self.scale, self.values, self.structure)
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> Progress:
-        """The first damping; the scaling has made its unit small."""
-        damping = jnp.where(self.only_factor, 0.0, 1.0)
+        """Almost Gauss-Newton to begin with."""
+        damping = jnp.where(self.only_factor, 0.0, _FIRST_DAMPING)
         empty = zero_system(y, self.values, self.structure)
         return Progress(damping, jnp.array(jnp.inf), jnp.array(False), empty, jnp.array(False))
 
     def _factored(self, y: Increments, damping) -> tuple[System, Right]:
-        reduced, right = reduce_normal(self._at(y), damping)
-        return System(y, reduced, factor_band(reduced.a), jnp.asarray(damping, float)), right
+        a, reduced, right = reduce_normal(self._at(y), damping)
+        return System(y, reduced, factor_band(a), jnp.asarray(damping, float)), right
 
     def _kept(self, y: Increments, system: System) -> tuple[System, Right]:
         """The gradient at `y`, taken down by the system that there is."""
@@ -116,10 +120,14 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Increments, Scalar, Any
             state.chord, lambda: self._kept(y, state.system), lambda: self._factored(y, state.damping)
         )
         place = self._at(system.increments)
-        x = solve_reduced(place, system.reduced, system.factor, right.reduced, right.d, right.b.points)
+        x = jax.lax.cond(
+            self.only_factor,
+            lambda: jax.tree.map(jnp.zeros_like, y),
+            lambda: solve_reduced(place, system.reduced, system.factor, right.reduced, right.d, right.b.points),
+        )
         proposal = jax.tree.map(jnp.negative, x)
-        # (N + damping) d = -b, so d'N d = -d'b - damping d'd, and the linear model promises d'N d / 2 + damping d'd.
-        damped = system.damping * dot(x, x, self.structure)
+        # (N + D) d = -b, so d'N d = -d'b - d'D d, and the linear model promises d'N d / 2 + d'D d.
+        damped = system.damping * norm2(x, system.reduced.weight, self.structure)
         seen = dot(x, right.b, self.structure) - damped
         length = jnp.sqrt(jnp.maximum(seen, 0.0))
         ratio = length / state.length
@@ -130,12 +138,13 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Increments, Scalar, Any
         square_sum = jax.lax.cond(settled | self.only_factor, lambda: right.square_sum, lambda: fn(new_y, args)[0] ** 2)
         reduction, promised = right.square_sum - square_sum, seen + 2 * damped
         accept = settled | (reduction >= _ACCEPT * promised)
-        good = reduction >= _GOOD * promised
         chord_failed = state.chord & ~(accept & (ratio < _CHORD_FAILS))
-        factor = jnp.where(accept, jnp.where(good, _LESS_DAMPING, 1.0), jnp.where(state.chord, 1.0, _MORE_DAMPING))
+        less = state.damping * jnp.maximum(_LEAST_FACTOR, 1 - (2 * reduction / promised - 1) ** 3)
+        more = jnp.maximum(_DAMPING, _MORE_DAMPING * state.damping)
         pick = lambda a, b: jax.tree.map(lambda a, b: jnp.where(accept, a, b), a, b)  # noqa: E731
         progress = Progress(
-            damping=state.damping * factor,
+            # A chord that fails says nothing about the damping: the next step has a factor of its own.
+            damping=jnp.where(state.chord, state.damping, jnp.where(accept, less, more)),
             length=pick(length, state.length),
             chord=accept & ~chord_failed & (state.chord | ((ratio < _CHORD) & jnp.isfinite(state.length))),
             system=system,

@@ -7,6 +7,7 @@ points.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -48,13 +49,17 @@ class Slopes(NamedTuple):
     """(colours, free) where the group is one camera, else (images, colours, free)."""
 
 
-class Columns(NamedTuple):
-    """Weighted residuals of a tile's rows and their derivatives with respect to scaled increments."""
+Pair = tuple[Float[Array, "m p"], Float[Array, "m p"]]
+"""Of a tile's rows, x and y. Joined to one array they would be computed number by number, not as vectors."""
 
-    residual: Float[Array, "2 m p"]
-    eop: Float[Array, "6 2 m p"]
-    shared: Float[Array, "colours 2 m p"]
-    point: Float[Array, "3 2 m p"]
+
+class Columns(NamedTuple):
+    """Weighted residuals of a tile's rows, x or y, and their derivatives with respect to scaled increments."""
+
+    residual: Float[Array, "m p"]
+    eop: Float[Array, "6 m p"]
+    shared: Float[Array, "colours m p"]
+    point: Float[Array, "3 m p"]
 
 
 def scene_of(state: State, s: Structure) -> Scene:
@@ -70,10 +75,10 @@ def scene_of(state: State, s: Structure) -> Scene:
 def slopes_of(y: Increments, scale: Increments, values: Values, s: Structure) -> Slopes:
     """Derivatives of the scene at the increments `y`."""
 
-    def turn(angles, k, start):
-        return jax.jacfwd(lambda d: small_rotation((angles + d) * k) @ start)(jnp.zeros(3))
-
-    rotation = jax.vmap(turn, in_axes=-1, out_axes=0)(y.eop[3:], scale.eop[3:], values.rotation)
+    turned = jax.vmap(jax.jacfwd(small_rotation), in_axes=-1, out_axes=-1)(y.eop[3:] * scale.eop[3:]) * scale.eop[3:]
+    # Term by term: a batch of products of 3 x 3 matrices takes several times as long.
+    rotation = sum((turned[:, j, None] * values.rotation[j, :, None] for j in range(3)), jnp.zeros(()))
+    rotation = rotation.transpose(3, 0, 1, 2)
     own, n = slice(0, s.n_interior), s.n_image_colours
     by_colour = jnp.zeros((len(values.shared), n)).at[s.free[own], s.colour[own]].set(scale.shared[own])
     cameras = []
@@ -97,34 +102,56 @@ def seen_in(xy: Array, sigma: Array, image: Array, s: Structure) -> Seen:
     return Seen(xy, 1 / sigma, tuple(jnp.asarray(g.member)[image] for g in s.groups))
 
 
-def rows(scene: Scene, points: Float[Array, "3 p"], seen: Seen, s: Structure) -> Float[Array, "2 m p"]:
+def rows(scene: Scene, points: Float[Array, "3 p"], seen: Seen, s: Structure) -> Pair:
     """Weighted residuals of a tile: observed minus computed over sigma."""
     parts = [_rows_of(g, c, scene, points, seen, s) for g, c in zip(s.groups, scene.cameras, strict=True)]
     if len(parts) == 1:
         return parts[0]
-    mine = zip(seen.member, parts, strict=True)
-    return sum((jnp.where(own[:, None], part, 0.0) for own, part in mine), jnp.zeros(()))
+    x, y = (
+        sum((jnp.where(own[:, None], v, 0.0) for own, v in zip(seen.member, of_groups, strict=True)), jnp.zeros(()))
+        for of_groups in zip(*parts, strict=True)
+    )
+    return x, y
 
 
-def _rows_of(g: CameraGroup, camera: Array, scene: Scene, points: Array, seen: Seen, s: Structure) -> Array:
+def _rows_of(g: CameraGroup, camera: Array, scene: Scene, points: Array, seen: Seen, s: Structure) -> Pair:
     def one(camera, centre, rotation, point, xy, weight):
         aim = apparent_point(centre, point, s.corrections)
         # An empty slot looks straight ahead: whatever lies there, its numbers stay finite.
         aim = jnp.where(weight[0] > 0, aim, centre - rotation[2])
         exterior = ExteriorOrientation(centre, rotation)
-        return image_residual(interior_of(g, list(camera)), exterior, aim, xy) * weight
+        x, y = image_residual(interior_of(g, list(camera)), exterior, aim, xy)
+        return x * weight[0], y * weight[1]
 
     along_points = jax.vmap(one, (None, None, None, -1, -1, -1), -1)
     whose = None if camera.ndim == 1 else 0
-    return jax.vmap(along_points, (whose, 0, 0, None, 1, 1), 1)(
+    return jax.vmap(along_points, (whose, 0, 0, None, 1, 1))(
         camera, scene.centre, scene.rotation, points, seen.xy, seen.weight
     )
 
 
 def columns(
     scene: Scene, slopes: Slopes, points: Float[Array, "3 p"], scale: Float[Array, "3 p"], seen: Seen, s: Structure
-) -> Columns:
-    """Residuals and Jacobian of a tile."""
+) -> tuple[Columns, Columns]:
+    """Residuals and Jacobian of a tile, x and y."""
+    return once(partial(_columns, s=s), s, scene, slopes, points, scale, seen)
+
+
+def once(function: Callable, s: Structure, *given: Any) -> Any:
+    """`function(*given)`, computed once: XLA on a CPU fuses what is cheap into all that uses it, barriers or not.
+
+    It leaves a branch alone that may not be taken; that this one always is, XLA cannot know.
+    """
+    # jit keeps the trace that the shape takes.
+    function = jax.jit(function)
+    shape = jax.eval_shape(function, *given)
+    nothing = lambda *_: jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), shape)  # noqa: E731
+    return jax.lax.cond(jnp.asarray(s.eop_free)[0, 0] >= 0, function, nothing, *given)
+
+
+def _columns(
+    scene: Scene, slopes: Slopes, points: Float[Array, "3 p"], scale: Float[Array, "3 p"], seen: Seen, s: Structure
+) -> tuple[Columns, Columns]:
     free = tuple(c[..., list(g.free_leaves)] for g, c in zip(s.groups, scene.cameras, strict=True))
 
     def cameras_with(free):
@@ -136,29 +163,24 @@ def columns(
     f = jax.jit(
         lambda free, centre, rotation, points: rows(Scene(centre, rotation, cameras_with(free)), points, seen, s)
     )
-
-    def slope(function, x, direction):
-        return jax.jvp(function, (x,), (direction,))[1]
-
     centre, rotation, unit = scene.centre, scene.rotation, jnp.eye(3)
-    residual = f(free, centre, rotation, points)
-    by_centre = jax.vmap(lambda d: slope(lambda x: f(free, x, rotation, points), centre, d * slopes.centre))(unit)
-    by_rotation = jax.vmap(lambda d: slope(lambda x: f(free, centre, x, points), rotation, d), in_axes=-1)(
-        slopes.rotation
-    )
-    by_point = jax.vmap(lambda d: slope(lambda x: f(free, centre, rotation, x), points, d[:, None] * scale))(unit)
+
+    def slope(function, *x):
+        return jax.vmap(lambda *d: jax.jvp(function, x, d)[1])
+
+    # One loop for all six: joined afterwards, they would be computed number by number.
+    still, turns = jnp.zeros((3, *rotation.shape)), jnp.moveaxis(slopes.rotation, -1, 0)
+    seeds = jnp.concatenate([unit[:, None] * slopes.centre, still[:, :, 0]]), jnp.concatenate([still, turns])
+    by_eop = slope(lambda *x: f(free, *x, points), centre, rotation)(*seeds)
+    by_point = slope(lambda x: f(free, centre, rotation, x), points)(unit[:, :, None] * scale)
+    by_camera = (jnp.zeros((0, *seen.xy.shape[1:])),) * 2
     if s.n_image_colours:
-        axes = tuple(0 if c.ndim == 2 else 1 for c in slopes.cameras)
-        by_camera = jax.vmap(lambda d: slope(lambda x: f(x, centre, rotation, points), free, d), (axes,))(
-            slopes.cameras
+        by_camera = slope(lambda x: f(x, centre, rotation, points), free)(
+            tuple(jnp.moveaxis(c, -2, 0) for c in slopes.cameras)
         )
-    else:
-        by_camera = jnp.zeros((0, *residual.shape))
-    # Fused into what uses them, they would be computed again for every use.
-    residual, by_centre, by_rotation, by_camera, by_point = jax.lax.optimization_barrier(
-        (residual, by_centre, by_rotation, by_camera, by_point)
-    )
-    return Columns(residual, jnp.concatenate([by_centre, by_rotation]), by_camera, by_point)
+    parts = f(free, centre, rotation, points), by_eop, by_camera, by_point
+    x, y = (Columns(*of_one) for of_one in zip(*parts, strict=True))
+    return x, y
 
 
 def by_tile(array: Float[Array, "*c points"], tiles: Tiles) -> Float[Array, "chunks tiles *c p"]:

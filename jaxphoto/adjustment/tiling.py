@@ -54,23 +54,39 @@ def order_images(image: np.ndarray, point: np.ndarray, n_images: int, n_points: 
     return place, int(np.abs(place[one] - place[other]).max(initial=1))
 
 
+# Tiles come in multiples of this many, which a block of some 200 points fills: padding takes milliseconds, compiling
+# seconds.
+TILES = 28
+
+
+def size_class(n: int, step: int) -> int:
+    """The next multiple of `step`; of more than 16 steps the next that is 8 to 16 times a power of two of them."""
+    while n > 16 * step:
+        step *= 2
+    return -(-n // step) * step
+
+
 def tile_shape(image: np.ndarray, point: np.ndarray, n_images: int, n_points: int) -> tuple[int, int]:
-    """Images and points of a tile that make the sums cheapest, found on a part of the block; see `_cost`."""
+    """Images and points of a tile that make the sums cheapest, found on a part of the block; see `_cost`.
+
+    Points are the fewest of 8, 16 and 32 with which `TILES` tiles hold the block, so that small blocks differ in
+    little that they are compiled for.
+    """
     order, images = _in_order(image, point, n_points)
     part = order[: min(len(order), _PART)]
     most = max(1, max(map(len, images), default=1))
-    options = {(_round_up(min(m, n_images)), p) for m in (most, 1.25 * most, 1.5 * most, 2 * most) for p in (8, 16, 32)}
-    options = {(m, p) for m, p in options if m >= most}
-    return min(sorted(options), key=lambda mp: _cost(len(_cut(part, images, *mp)), *mp))
+
+    def option(m: int) -> tuple[float, int, int]:
+        tiles = {p: len(_cut(part, images, m, p)) for p in (8, 16, 32)}
+        p = next((p for p in tiles if tiles[p] <= TILES), 32)
+        return _cost(size_class(tiles[p], TILES), m, p), m, p
+
+    widths = {size_class(int(np.ceil(min(k * most, n_images))), 4) for k in (1, 1.25, 1.5, 2)}
+    return min(map(option, widths))[1:]
 
 
 # Points on which tile shapes are tried.
 _PART = 3000
-
-
-def _round_up(m: float) -> int:
-    """The next multiple of four: blocks of similar size shall share what is compiled."""
-    return 4 * max(1, -(-int(np.ceil(m)) // 4))
 
 
 def _cost(tiles: int, m: int, p: int) -> float:

@@ -47,7 +47,10 @@ class InteriorOrientation(eqx.Module):
 
     def _in_mm(self, of_model: Callable, xy: Float[Array, "2"]) -> Float[Array, "2"]:
         """A map of the distortion, which has a unit of its own, as one of millimetres."""
-        return self.c * of_model(xy / self.c) if self.distortion.normalised else of_model(xy)
+        if not self.distortion.normalised:
+            return of_model(xy)
+        x, y = of_model(jnp.stack([xy[0] / self.c, xy[1] / self.c]))
+        return jnp.stack([self.c * x, self.c * y])
 
 
 def parameter_names(interior: InteriorOrientation) -> tuple[str, ...]:

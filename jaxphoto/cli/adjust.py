@@ -2,6 +2,7 @@
 
 import time
 from pathlib import Path
+from threading import Thread
 from typing import Annotated
 
 import typer
@@ -12,7 +13,7 @@ from jaxphoto.cli.app import app
 from jaxphoto.errors import JaxphotoError
 from jaxphoto.io import read_block
 from jaxphoto.procedures import adjust
-from jaxphoto.report import Tables, check_target, print_adjustment, warnings_of, write_results
+from jaxphoto.report import Tables, check_target, prepare_pictures, print_adjustment, warnings_of, write_results
 from jaxphoto.statistics import EOP_NAMES
 
 
@@ -29,6 +30,7 @@ def adjust_command(
     if rotations not in EOP_NAMES:
         raise JaxphotoError(f"--rotations {rotations}: there are {', '.join(EOP_NAMES)}")
     check_target(out)
+    Thread(target=prepare_pictures, daemon=True).start()
     console, errors = Console(), Console(stderr=True)
     began = time.perf_counter()
     with errors.status("reading the block") as status:

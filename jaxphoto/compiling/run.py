@@ -115,7 +115,7 @@ def _program_of(function: Any, arguments: tuple, anew: bool = False) -> Callable
 
     All that depends on the thread, such as `with jax.enable_x64(False)`, is done before this returns.
     """
-    options = options_here(sum(leaf.nbytes for leaf in jax.tree.leaves(eqx.filter(arguments, eqx.is_array))))
+    options = options_here()
     key = store.key_of(function, arguments, options)
     stored = store.load(key) if key and not anew else None
     if stored is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
@@ -24,11 +25,27 @@ def new_figure(width: float, height: float) -> Figure:
     return Figure(figsize=(width, height), dpi=_DPI, layout="constrained")
 
 
+def prepare_pictures() -> None:
+    """Import and load what draws, which takes half a second: for a thread, while something else computes."""
+    new_figure(1.0, 1.0).savefig(io.BytesIO())
+
+
+def _panels(width: float, height: float, down: int = 1, across: int = 1, *, top: float = 0.5, right: float = 0.25):
+    """A figure and its axes, with margins (inches) for labels as they are here: to find them takes half of drawing."""
+    figure = new_figure(width, height)
+    figure.set_layout_engine("none")
+    left, bottom, between = 0.85, 0.6, 1.0
+    wide = (width - left - right - between * (across - 1)) / across
+    high = (height - top - bottom - between * (down - 1)) / down
+    box = {"left": left / width, "right": 1 - right / width, "bottom": bottom / height, "top": 1 - top / height}
+    spaces = {"wspace": between / wide, "hspace": between / high}
+    return figure, figure.subplots(down, across, squeeze=False, gridspec_kw=box | spaces)
+
+
 def layout_figure(tables: Tables) -> Figure:
     """Plan of the block: camera stations, object points, control and check points."""
     a = tables.adjusted
-    figure = new_figure(6.4, 5.6)
-    axes = figure.subplots()
+    figure, ((axes,),) = _panels(6.4, 5.6)
     points, stations = np.asarray(a.unknowns.points), np.asarray(a.unknowns.exterior.position)
     control = np.union1d(a.block.control.who, a.block.fixed.who).astype(int)
     check = np.unique(a.block.check.who)
@@ -53,8 +70,7 @@ def residuals_figure(tables: Tables, camera: str) -> Figure:
     mine = np.array([c == camera for c in a.block.image_camera])[a.structure.image]
     xy, v = np.asarray(a.values.xy)[:, mine], (np.asarray(a.residuals.image) * np.asarray(a.values.sigma_xy))[:, mine]
     sensor = a.block.sensors[camera]
-    figure = new_figure(6.4, 5.0)
-    axes = figure.subplots()
+    figure, ((axes,),) = _panels(6.4, 5.0)
     key = _round_key(v)
     _vectors(axes, xy, v, key, 0.06 * sensor.width_mm, f"{1000 * key:g} µm", width=0.0015, above=0.03)
     w, h = sensor.width_mm / 2, sensor.height_mm / 2
@@ -75,8 +91,8 @@ def check_points_figure(adjustments: Mapping[str, Tables]) -> Figure:
     key = _round_key(np.concatenate([d.ravel() for d in found.values()]))
     extent = np.max([np.ptp(of.adjusted.unknowns.exterior.position, axis=0) for of in adjustments.values()], axis=0)
     high = 4.2 * float(np.clip(extent[1] / max(extent[0], 1e-9), 0.2, 0.8))
-    figure = new_figure(9.6, 0.4 + (0.8 + high) * len(found))
-    for pair, (name, d) in zip(figure.subplots(len(found), 2, squeeze=False), found.items(), strict=True):
+    figure, rows = _panels(9.6, 0.4 + (0.8 + high) * len(found), len(found), 2, top=0.8)
+    for pair, (name, d) in zip(rows, found.items(), strict=True):
         a = adjustments[name].adjusted
         number = {point: k for k, point in enumerate(a.block.points)}
         at = np.asarray(a.unknowns.points)[[number[p] for p in adjustments[name].check_points["point"]], :2].T
@@ -98,8 +114,7 @@ def check_points_figure(adjustments: Mapping[str, Tables]) -> Figure:
 def correlation_figure(tables: Tables, camera: str) -> Figure:
     """Heat maps: IOP x IOP, and mean |rho| of EOP x IOP."""
     c = tables.correlations[camera]
-    figure = new_figure(9.6, 4.4)
-    left, right = figure.subplots(1, 2)
+    figure, ((left, right),) = _panels(9.6, 4.4, 1, 2, right=1.1)
     for axes, values, rows, title in (
         (left, c.interior, c.parameters, "correlation of IOP"),
         (right, c.mean_abs, c.eop_names, "mean |correlation| of EOP and IOP"),
@@ -111,7 +126,7 @@ def correlation_figure(tables: Tables, camera: str) -> Figure:
             colour = "white" if abs(values[i, j]) > 0.6 else "black"
             axes.text(j, i, f"{values[i, j]:.2f}", ha="center", va="center", fontsize=7, color=colour)
         axes.set_title(title, fontsize=10)
-    figure.colorbar(image, ax=[left, right], shrink=0.8)
+    figure.colorbar(image, cax=figure.add_axes((0.91, 0.2, 0.015, 0.6)))
     return figure
 
 

@@ -17,7 +17,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.adjustment.band import invert_band
@@ -43,11 +43,10 @@ EOP_NAMES: dict[str, tuple[str, ...]] = {
 
 
 class Cofactors(NamedTuple):
-    """Cofactors in scaled increments: reduced unknowns, points; and what image rows see of them, j Q j'."""
+    """Cofactors of reduced unknowns and points, in scaled increments."""
 
     reduced: Float[Array, "reduced reduced"]
     points: Float[Array, "points 3 3"]
-    image_rows: Float[Array, "chunks tiles 2 m p"]
 
 
 class Covariance(eqx.Module):
@@ -95,10 +94,7 @@ def covariance(adjusted: Adjustment, rotations: Rotations = "omega_phi_kappa") -
     if rotations not in EOP_NAMES:
         raise ValueError(f"rotations is one of {', '.join(EOP_NAMES)}, got {rotations!r}")
     padded = adjusted.computed
-    given = (padded.values, padded.factored, padded.structure)
-    cofactors = run_compiled(_cofactors, given, adjusted.seconds, "covariance")
-    arguments = (cofactors, padded.factored.scale, padded.values.rotation, rotations)
-    matrix, points = run_compiled(_physical, arguments, adjusted.seconds, "covariance")
+    cofactors, matrix, points, _ = _run(adjusted, rotations, of_rows=False)
     labels = [f"exterior[{i}].{n}" for i in adjusted.block.images for n in EOP_NAMES[rotations]]
     return Covariance(
         matrix=crop_reduced(matrix, adjusted.structure, padded.places),
@@ -111,7 +107,26 @@ def covariance(adjusted: Adjustment, rotations: Rotations = "omega_phi_kappa") -
     )
 
 
+def image_row_cofactors(adjusted: Adjustment, rotations: Rotations) -> Float[Array, "chunks tiles 2 m p"]:
+    """j Q j' of every image row, by the program that `covariance` has run with these `rotations`."""
+    return _run(adjusted, rotations, of_rows=True)[3]
+
+
+def _run(adjusted: Adjustment, rotations: Rotations, of_rows: bool):
+    padded = adjusted.computed
+    given = (padded.values, padded.factored, padded.structure, rotations, np.array(of_rows))
+    return run_compiled(_covariance, given, adjusted.seconds, "covariance")
+
+
 @eqx.filter_jit
+def _covariance(
+    values: Values, factored: Factored, s: Structure, rotations: Rotations, of_rows: Bool[Numbers, ""]
+) -> tuple[Cofactors, Array, Array, Array]:
+    """Cofactors; the same in units of the unknowns; and j Q j' of image rows, zero where they are not wanted."""
+    q, rows = _cofactors(values, factored, s, of_rows)
+    return q, *_physical(q, factored.scale, values.rotation, rotations), rows
+
+
 def _physical(q: Cofactors, scale: Increments, rotation: Float[Array, "3 3 images"], rotations: Rotations):
     n = rotation.shape[2]
     factors = jnp.concatenate([scale.eop.T.reshape(-1), scale.shared])
@@ -136,8 +151,7 @@ def _physical(q: Cofactors, scale: Increments, rotation: Float[Array, "3 3 image
     return matrix, points
 
 
-@eqx.filter_jit
-def _cofactors(values: Values, factored: Factored, s: Structure) -> Cofactors:
+def _cofactors(values: Values, factored: Factored, s: Structure, of_rows: Bool[Numbers, ""]):
     """All cofactors of one factored block; see the module's head."""
     reduced = factored.reduced
     inverse = invert_band(factored.factor)
@@ -146,12 +160,12 @@ def _cofactors(values: Values, factored: Factored, s: Structure) -> Cofactors:
         kg = jnp.linalg.solve(reduced.k, reduced.g.T)
         low = inverse @ kg.T
         full = jnp.block([[inverse, low], [low.T, kg @ low - jnp.linalg.inv(reduced.k)]])
-    out = (TILES, TILES)
-    points, rows = sharded(_of_points, s, out)(full, weigh_datum(values, s), factored.scale, s)
-    return _without_open_motions(Cofactors(inverse, points, rows), weigh_datum(values, s), factored, s)
+    weighed = weigh_datum(values, s)
+    points, rows = sharded(_of_points, s, (TILES, TILES))(full, weighed, factored.scale, s, of_rows)
+    return _without_open_motions(Cofactors(inverse, points), weighed, factored, s), rows
 
 
-def _of_points(full: Float[Array, "n n"], values: Values, scale: Increments, s: Structure):
+def _of_points(full: Float[Array, "n n"], values: Values, scale: Increments, s: Structure, of_rows: Bool[Numbers, ""]):
     """Cofactors of points, and j Q j' of image rows."""
     at = At(jax.tree.map(jnp.zeros_like, scale), scale, values, s)
     rest: OtherRows = other_rows(at)
@@ -171,22 +185,25 @@ def _of_points(full: Float[Array, "n n"], values: Values, scale: Increments, s: 
         inner = jnp.eye(3)[:, :, None] + g
         half = jnp.stack(_unwhiten(inner, p.l))
         points = jnp.stack(_unwhiten(half.transpose(1, 0, 2), p.l)).transpose(2, 0, 1)
+        nothing = lambda *_: jnp.zeros((2, m, size))  # noqa: E731
+        return points, jax.lax.cond(of_rows, rows, nothing, image, p, own, a, inner)
 
+    def rows(image, p, own, a, inner):
+        m, size = len(image), len(p.b[0])
         # A last row and column of zeros serves colours that mean nothing in an image.
         own, a = jnp.pad(own, (0, 1)), jnp.pad(a, ((0, 1), (0, 0)))
         column = jnp.asarray(s.column)[image, :q]
         column = jnp.where(column < i, 6 * m + column, 6 * m + i + k)
         touched = jnp.concatenate([6 * jnp.arange(m)[:, None] + jnp.arange(6), column], axis=1)
-        j = jnp.concatenate([p.columns.eop, p.columns.shared]).transpose(2, 0, 1, 3)
+        j = jnp.stack([jnp.concatenate([c.eop, c.shared]) for c in p.columns], axis=1).transpose(2, 0, 1, 3)
+        z = jnp.stack(p.z).transpose(0, 2, 1, 3)
         seen = jnp.einsum("mab,mbn->man", own[touched[:, :, None], touched[:, None, :]], j.reshape(m, 6 + q, -1))
-        rows = jnp.sum(j * seen.reshape(j.shape), axis=1).transpose(1, 0, 2)
+        of_images = jnp.sum(j * seen.reshape(j.shape), axis=1).transpose(1, 0, 2)
         across = jnp.einsum("mcop,mckp->omkp", j, a[touched].reshape(m, 6 + q, 3, size))
-        rows = rows - 2 * jnp.sum(p.z * across, axis=2)
-        rows = rows + jnp.einsum("omkp,klp,omlp->omp", p.z, inner, p.z)
-        return points, rows
+        return of_images - 2 * jnp.sum(z * across, axis=2) + jnp.einsum("omkp,klp,omlp->omp", z, inner, z)
 
-    points, rows = jax.lax.map(lambda chunk: each_tile(tile, chunk, s.in_tiles), tile_numbers(at, rest))
-    return points.reshape(-1, 3, 3), rows
+    points, found = jax.lax.map(lambda chunk: each_tile(tile, chunk, s.in_tiles), tile_numbers(at, rest))
+    return points.reshape(-1, 3, 3), found
 
 
 def _unwhiten(w, l):  # noqa: E741

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.adjustment.normal import At, solve_factored
@@ -18,7 +19,7 @@ from jaxphoto.adjustment.residuals import Residuals, Values
 from jaxphoto.adjustment.result import Factored
 from jaxphoto.adjustment.structure import Structure
 from jaxphoto.compiling import prepare, run_compiled
-from jaxphoto.statistics.covariance import Cofactors, Covariance
+from jaxphoto.statistics.covariance import Cofactors, Covariance, image_row_cofactors
 
 LEAST_CHECKED = 0.01
 """Redundancy number below which a normalised residual is mostly rounding and judges nothing."""
@@ -33,16 +34,16 @@ def prepare_redundancy(adjusted: Adjustment) -> None:
         # What comes from several devices is of a type of its own.
         return
     s, n = padded.structure, 6 * padded.structure.n_images + padded.structure.n_shared
-    shapes = ((n, n), (s.n_points, 3, 3), padded.values.xy.shape)
     # Arrays of the right types that take no memory.
-    cofactors = Cofactors._make(np.broadcast_to(0.0, shape) for shape in shapes)
-    prepare(_redundancy, (padded.values, cofactors, padded.factored, s), adjusted.seconds)
+    *cofactors, rows = (np.broadcast_to(0.0, v) for v in ((n, n), (s.n_points, 3, 3), padded.values.xy.shape))
+    prepare(_redundancy, (padded.values, Cofactors._make(cofactors), rows, padded.factored, s), adjusted.seconds)
 
 
 def redundancy_numbers(adjusted: Adjustment, covariance: Covariance) -> Residuals:
     """Redundancy number of every observation, shaped like `adjusted.residuals` (zero for the datum's constraints)."""
     padded = adjusted.computed
-    arguments = (padded.values, covariance.cofactors, padded.factored, padded.structure)
+    rows = image_row_cofactors(adjusted, covariance.rotations)
+    arguments = (padded.values, covariance.cofactors, rows, padded.factored, padded.structure)
     numbers = run_compiled(_redundancy, arguments, adjusted.seconds, "covariance")
     return crop_residuals(numbers, adjusted.structure, padded.places)
 
@@ -61,7 +62,7 @@ def normalised_residuals(adjusted: Adjustment, redundancy: Residuals) -> Residua
 
 
 @eqx.filter_jit
-def _redundancy(values: Values, q: Cofactors, factored: Factored, s: Structure) -> Residuals:
+def _redundancy(values: Values, q: Cofactors, image_rows: Array, factored: Factored, s: Structure) -> Residuals:
     scale = factored.scale
     at = At(jax.tree.map(jnp.zeros_like, scale), scale, weigh_datum(values, s), s)
     rest = other_rows(at)
@@ -83,7 +84,7 @@ def _redundancy(values: Values, q: Cofactors, factored: Factored, s: Structure) 
     own_points = jnp.diagonal(q.points, axis1=1, axis2=2).T
     stations = image_part(j.station_eop[:, None], j.station_shared[:, None], jnp.asarray(s.station_image))[0]
     return Residuals(
-        image=1 - q.image_rows,
+        image=1 - image_rows,
         stations=1 - stations,
         attitudes=1 - image_part(j.attitude_eop, j.attitude_shared, jnp.asarray(s.attitude_image)),
         control=1 - rest.control**2 * own_points,

@@ -61,12 +61,20 @@ class Dense(NamedTuple):
     """The same, and the square sum, as the sums of the normal equations have them."""
     square_sums: np.ndarray
     solutions: np.ndarray
-    """x of (N + damping I) x = vector, a row for each of `DAMPINGS`."""
+    """x of (N + damping W) x = vector, a row for each of `DAMPINGS`; W is `weight`."""
     scale: np.ndarray
 
     @property
     def free(self):
         return self.scale > 0
+
+    @property
+    def weight(self):
+        """The diagonal of N without distances and datum, which couple points."""
+        r = self.others.residuals
+        after = len(self.jacobian) - len(r.datum) - len(r.priors)
+        own = np.delete(np.arange(len(self.jacobian) - len(r.datum)), np.arange(after - len(r.distances), after))
+        return (self.jacobian[own] ** 2).sum(axis=0)
 
     def observed(self, n_datum: int):
         """The Jacobian without the rows of the datum."""
@@ -120,14 +128,15 @@ def _dense(values, structure) -> Dense:
     fn = jax.jit(lambda y: residuals_at(at._replace(increments=y)))
     residuals, product = jax.linearize(fn, zero)
     rest = other_rows(at)
-    columns = jax.vmap(jax.vmap(lambda n: tile_parts(at, 0.0, rest.coupled)(n).columns))(tile_numbers(at, rest))
-    reduced, right = reduce_normal(at, 0.0)
+    both = jax.vmap(jax.vmap(lambda n: tile_parts(at, 0.0, rest.coupled)(n).columns))(tile_numbers(at, rest))
+    columns = jax.tree.map(lambda x, y: jnp.stack([x, y], axis=-3), *both)
+    _, reduced, right = reduce_normal(at, 0.0)
     flat_scale = ravel_pytree(scale)[0]
     vector = jnp.sin(1.0 + jnp.arange(len(flat))) * (flat_scale > 0)
 
     def solution(damping):
-        reduced, _ = reduce_normal(at, damping)
-        return ravel_pytree(solve_factored(at, reduced, factor_band(reduced.a), back(vector)))[0]
+        a, reduced, _ = reduce_normal(at, damping)
+        return ravel_pytree(solve_factored(at, reduced, factor_band(a), back(vector)))[0]
 
     b, *_, squares = gradient(at, reduced.l, reduced.rows_p)
     return Dense(

@@ -15,6 +15,7 @@ from jaxphoto.adjustment.band import (
     BandFactor,
     column_blocks,
     dense,
+    diagonal_of,
     factor_band,
     invert_band,
     pivots,
@@ -48,17 +49,16 @@ def whole(k: int, m: int, q: int, rng: np.random.Generator, padded: int = 0) -> 
 def stored(a: np.ndarray, k: int, m: int, garbage: float = 77.0) -> Band:
     """The matrix as a band, with garbage wherever it may be anything."""
     n = k * m
-    columns = np.full((k, 2 * m, m), garbage)
+    columns = np.full((k - 1, 2 * m, m), garbage)
     upper = np.triu_indices(m, 1)
-    for j in range(k):
+    for j in range(k - 1):
         own = slice(j * m, (j + 1) * m)
         columns[j, :m] = a[own, own]
         columns[j, :m][upper] = garbage
-        if j + 1 < k:
-            columns[j, m:] = a[(j + 1) * m : (j + 2) * m, own]
-    corner = a[n:, n:].copy()
-    corner[np.triu_indices(len(corner), 1)] = garbage
-    return Band(jnp.array(columns), jnp.array(a[n:, :n]), jnp.array(corner))
+        columns[j, m:] = a[(j + 1) * m : (j + 2) * m, own]
+    end = a[n - m :, n - m :].copy()
+    end[np.triu_indices(len(end), 1)] = garbage
+    return Band(jnp.array(columns), jnp.array(a[n:, : n - m]), jnp.array(end))
 
 
 @pytest.mark.parametrize(("k", "m", "q"), SHAPES)
@@ -74,13 +74,12 @@ def test_everything_is_as_dense(k, m, q):
         factor = factor_band(band)
         inverses = selected_inverse(factor), invert_band(factor)
         solutions = solve_band(factor, b), solve_band(factor, several)
-        return factor, dense(band), solutions, inverses, pivots(band, factor)
+        return factor, dense(band), solutions, inverses, pivots(diagonal_of(band), factor)
 
     factor, back, (x, xs), (inside, inverse), left = everything(band, b, several)
     np.testing.assert_array_equal(back, a)
     lower, z = np.linalg.cholesky(a), np.linalg.inv(a)
     assert_stored(factor, lower, k, m)
-    assert not np.any(factor.columns[-1, m:])
     np.testing.assert_allclose(x, z @ b, rtol=0, atol=1e-12)
     np.testing.assert_allclose(xs, z @ several, rtol=0, atol=1e-12)
     np.testing.assert_allclose(inverse, z, rtol=0, atol=1e-13)
@@ -92,13 +91,12 @@ def test_everything_is_as_dense(k, m, q):
 def assert_stored(found, matrix: np.ndarray, k: int, m: int) -> None:
     """Blocks of what is stored are those of the dense matrix; diagonal blocks by both triangles."""
     n, atol = k * m, 1e-12 * np.abs(matrix).max()
-    for j in range(k):
+    for j in range(k - 1):
         own, below = slice(j * m, (j + 1) * m), slice((j + 1) * m, (j + 2) * m)
         np.testing.assert_allclose(found.columns[j, :m], matrix[own, own], rtol=0, atol=atol)
-        if j + 1 < k:
-            np.testing.assert_allclose(found.columns[j, m:], matrix[below, own], rtol=0, atol=atol)
-    np.testing.assert_allclose(found.border, matrix[n:, :n], rtol=0, atol=atol)
-    np.testing.assert_allclose(found.corner, matrix[n:, n:], rtol=0, atol=atol)
+        np.testing.assert_allclose(found.columns[j, m:], matrix[below, own], rtol=0, atol=atol)
+    np.testing.assert_allclose(found.border, matrix[n:, : n - m], rtol=0, atol=atol)
+    np.testing.assert_allclose(found.end, matrix[n - m :, n - m :], rtol=0, atol=atol)
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(-6, 6))
@@ -124,7 +122,7 @@ def test_derivative_is_that_of_differences(k, m, q):
         factor = factor_band(band)
         inside = selected_inverse(factor)
         diagonal = jnp.diagonal(inside.columns[:, :m], axis1=1, axis2=2)
-        return solve_band(factor, b), inside.border, diagonal, invert_band(factor), pivots(band, factor)
+        return solve_band(factor, b), inside.border, diagonal, invert_band(factor), pivots(diagonal_of(band), factor)
 
     _, forward = jax.jit(lambda x, dx: jax.jvp(results, (x,), (dx,)))(stored(a, k, m), stored(change, k, m))
     h = 1e-5
@@ -154,8 +152,8 @@ def test_indefinite_is_not_a_number(at):
     a[at, at] = -1.0
     band = stored(a, 3, 3)
     factor = factored(band)
-    assert np.isnan(factor.corner).any()
-    assert np.isnan(pivots(band, factor)[at:]).any()
+    assert np.isnan(factor.end).any()
+    assert np.isnan(pivots(diagonal_of(band), factor)[at:]).any()
     assert np.isfinite(factor.columns[: min(at // 3, 2)]).all()
     assert np.isnan(solve_band(factor, jnp.ones(11))).all()
 
@@ -167,10 +165,10 @@ def test_pivot_of_a_defect_is_small_and_of_no_information_finite():
     a[:, 4] = a[:, 1]
     a[4, 4] = a[1, 1] * (1 + 1e-9)
     band = stored(a, 2, 3)
-    left = pivots(band, factored(band))
+    left = pivots(diagonal_of(band), factored(band))
     assert left[4] < 1e-8 < np.delete(left, 4).min()
-    nothing = Band(jnp.zeros((1, 6, 3)), jnp.zeros((0, 3)), jnp.zeros((0, 0)))
-    assert np.isfinite(pivots(nothing, BandFactor(*nothing))).all()
+    nothing = Band(jnp.zeros((0, 6, 3)), jnp.zeros((0, 0)), jnp.zeros((3, 3)))
+    assert np.isfinite(pivots(diagonal_of(nothing), BandFactor(*nothing))).all()
 
 
 def test_many_at_once_are_each_by_itself():

@@ -48,7 +48,7 @@ def test_sums_are_products_with_the_jacobian(name):
 def test_elimination_solves_the_dense_normal_equations(name, damping):
     dense = at_optimum(name)
     j = dense.jacobian[:, dense.free]
-    n = j.T @ j + damping * np.eye(j.shape[1])
+    n = j.T @ j + damping * np.diag(dense.weight[dense.free])
     # By Cholesky of the whole matrix; the error is measured in the matrix' own metric.
     expected = scipy.linalg.cho_solve(scipy.linalg.cho_factor(n), dense.vector[dense.free])
     found = dense.solutions[DAMPINGS.index(damping)]

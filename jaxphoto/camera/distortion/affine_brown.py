@@ -31,6 +31,7 @@ class AffineBrown(AbstractDistortion):
 
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
         """Ideal coordinate (mm) of a measured one, both reduced to the principal point."""
-        m = jnp.stack([xy[0] - self.b1 * xy[0] - self.b2 * xy[1], xy[1]])
-        r2 = m[0] * m[0] + m[1] * m[1]
-        return m - m * radial(r2, self.k1, self.k2, self.k3) - decentring(self.p1, self.p2, m)
+        x, y = xy[0] - self.b1 * xy[0] - self.b2 * xy[1], xy[1]
+        dr = radial(x * x + y * y, self.k1, self.k2, self.k3)
+        dx, dy = decentring(self.p1, self.p2, jnp.stack([x, y]))
+        return jnp.stack([x - x * dr - dx, y - y * dr - dy])

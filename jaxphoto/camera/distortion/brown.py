@@ -33,5 +33,6 @@ class Brown(AbstractDistortion):
         """Ideal coordinate (mm) of a measured one, both reduced to the principal point."""
         x, y = xy
         r2 = x * x + y * y
-        affine = jnp.stack([self.b1 * x + self.b2 * y, jnp.zeros_like(y)])
-        return xy - xy * radial(r2, self.k1, self.k2, self.k3) - decentring(self.p1, self.p2, xy) - affine
+        dr = radial(r2, self.k1, self.k2, self.k3)
+        dx, dy = decentring(self.p1, self.p2, xy)
+        return jnp.stack([x - x * dr - dx - (self.b1 * x + self.b2 * y), y - y * dr - dy])

@@ -2,6 +2,7 @@
 
 from typing import ClassVar, Literal
 
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxphoto.camera.distortion.base import AbstractDistortion, radial
@@ -27,4 +28,6 @@ class BundlerRadial(AbstractDistortion):
 
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
         """Measured coordinate of an ideal one, both reduced to the principal point and divided by c."""
-        return xy + xy * radial(xy @ xy, self.k1, self.k2)
+        x, y = xy
+        stretch = 1 + radial(x * x + y * y, self.k1, self.k2)
+        return jnp.stack([x * stretch, y * stretch])

@@ -38,5 +38,6 @@ class PpsRadial(AbstractDistortion):
 
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
         """Ideal coordinate (mm) of a measured one, both reduced to the principal point of autocollimation."""
-        from_pps = xy - self.symmetry_point
-        return xy - from_pps * radial(from_pps @ from_pps, self.k1, self.k2, self.k3)
+        x, y = xy - self.symmetry_point
+        dr = radial(x * x + y * y, self.k1, self.k2, self.k3)
+        return jnp.stack([xy[0] - x * dr, xy[1] - y * dr])

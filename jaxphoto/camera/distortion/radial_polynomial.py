@@ -2,6 +2,7 @@
 
 from typing import ClassVar, Literal
 
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxphoto.camera.distortion.base import AbstractDistortion, radial
@@ -28,4 +29,6 @@ class RadialPolynomial(AbstractDistortion):
 
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
         """Ideal coordinate (mm) of a measured one, both reduced to the principal point."""
-        return xy + xy * radial(xy @ xy, self.k1, self.k2, self.k3)
+        x, y = xy
+        stretch = 1 + radial(x * x + y * y, self.k1, self.k2, self.k3)
+        return jnp.stack([x * stretch, y * stretch])
