@@ -58,12 +58,11 @@ class Progress(NamedTuple):
     done: Bool[Array, ""]
 
 
-# Damping is what is added to the normal matrix, relative to its diagonal. It begins almost as none; where that fails,
-# little more does no better: the first rejected step takes it to the second, each further one multiplies it.
-_FIRST_DAMPING, _DAMPING, _MORE_DAMPING = 1e-8, 1e-4, 10.0
-# A step is accepted above the first ratio of actual to promised reduction. Damping falls with that ratio (Nielsen's
-# rule), at most to this fraction.
-_ACCEPT, _LEAST_FACTOR = 0.001, 0.2
+# The first damping: what is added to the normal matrix, relative to its diagonal.
+_FIRST_DAMPING = 1e-8
+# Trust region by the ratio of actual to promised reduction: accept above the first, trust more above the second.
+_ACCEPT, _GOOD = 0.01, 0.99
+_LESS_DAMPING, _MORE_DAMPING = 1 / 3.5, 4.0
 # Ratio of successive steps that is assumed at least when the missing part is estimated.
 _SLOWEST_SHOWN = 0.1
 # Steps that shrink like this go on with the same factor; a chord step that shrinks less than the second ends it.
@@ -139,12 +138,11 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Increments, Scalar, Any
         reduction, promised = right.square_sum - square_sum, seen + 2 * damped
         accept = settled | (reduction >= _ACCEPT * promised)
         chord_failed = state.chord & ~(accept & (ratio < _CHORD_FAILS))
-        less = state.damping * jnp.maximum(_LEAST_FACTOR, 1 - (2 * reduction / promised - 1) ** 3)
-        more = jnp.maximum(_DAMPING, _MORE_DAMPING * state.damping)
+        good = reduction >= _GOOD * promised
+        factor = jnp.where(accept, jnp.where(good, _LESS_DAMPING, 1.0), jnp.where(state.chord, 1.0, _MORE_DAMPING))
         pick = lambda a, b: jax.tree.map(lambda a, b: jnp.where(accept, a, b), a, b)  # noqa: E731
         progress = Progress(
-            # A chord that fails says nothing about the damping: the next step has a factor of its own.
-            damping=jnp.where(state.chord, state.damping, jnp.where(accept, less, more)),
+            damping=state.damping * factor,
             length=pick(length, state.length),
             chord=accept & ~chord_failed & (state.chord | ((ratio < _CHORD) & jnp.isfinite(state.length))),
             system=system,
