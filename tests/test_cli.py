@@ -1,6 +1,7 @@
 """The command line: files written, exit codes, and one sentence for every mistake."""
 
 import json
+import re
 import subprocess
 import sys
 
@@ -105,8 +106,10 @@ def test_files_say_what_the_adjustment_says(results, folder):
 def test_report_opens_without_a_network(results):
     page = (results[0] / "report.html").read_text()
     assert page.startswith("<!DOCTYPE html>")
-    assert "http" not in page
-    assert page.count("data:image/png;base64,") >= 3
+    # A picture's own letters may spell anything.
+    text, pictures = re.subn(r'"data:image/png;base64,[^"]*"', '""', page)
+    assert "http" not in text
+    assert pictures >= 3
 
 
 def test_results_replace_earlier_results_and_nothing_else(results, folder, monkeypatch, capsys, tmp_path):

@@ -30,11 +30,13 @@ def prepare_pictures() -> None:
     new_figure(1.0, 1.0).savefig(io.BytesIO())
 
 
-def _panels(width: float, height: float, down: int = 1, across: int = 1, *, top: float = 0.5, right: float = 0.25):
+def _panels(
+    width: float, height: float, down: int = 1, across: int = 1, *,
+    left: float = 0.85, right: float = 0.15, bottom: float = 0.5, top: float = 0.4, between: float = 0.95,
+):  # fmt: skip
     """A figure and its axes, with margins (inches) for labels as they are here: to find them takes half of drawing."""
     figure = new_figure(width, height)
     figure.set_layout_engine("none")
-    left, bottom, between = 0.85, 0.6, 1.0
     wide = (width - left - right - between * (across - 1)) / across
     high = (height - top - bottom - between * (down - 1)) / down
     box = {"left": left / width, "right": 1 - right / width, "bottom": bottom / height, "top": 1 - top / height}
@@ -91,7 +93,7 @@ def check_points_figure(adjustments: Mapping[str, Tables]) -> Figure:
     key = _round_key(np.concatenate([d.ravel() for d in found.values()]))
     extent = np.max([np.ptp(of.adjusted.unknowns.exterior.position, axis=0) for of in adjustments.values()], axis=0)
     high = 4.2 * float(np.clip(extent[1] / max(extent[0], 1e-9), 0.2, 0.8))
-    figure, rows = _panels(9.6, 0.4 + (0.8 + high) * len(found), len(found), 2, top=0.8)
+    figure, rows = _panels(9.6, 0.4 + (0.8 + high) * len(found), len(found), 2, top=0.55)
     for pair, (name, d) in zip(rows, found.items(), strict=True):
         a = adjustments[name].adjusted
         number = {point: k for k, point in enumerate(a.block.points)}
@@ -107,14 +109,16 @@ def check_points_figure(adjustments: Mapping[str, Tables]) -> Figure:
             axes.set(xlabel="X [m]", ylabel="Y [m]")
             axes.set_title(f"{name}: {what}" if name else what, loc="left", fontsize=10)
             axes.set_aspect("equal", adjustable="datalim")
-    figure.suptitle("discrepancies at check points, surveyed minus computed", fontsize=11)
+    figure.suptitle(
+        "discrepancies at check points, surveyed minus computed", fontsize=11, y=1 - 0.1 / figure.get_figheight()
+    )
     return figure
 
 
 def correlation_figure(tables: Tables, camera: str) -> Figure:
     """Heat maps: IOP x IOP, and mean |rho| of EOP x IOP."""
     c = tables.correlations[camera]
-    figure, ((left, right),) = _panels(9.6, 4.4, 1, 2, right=1.1)
+    figure, ((left, right),) = _panels(9.6, 4.4, 1, 2, left=0.6, right=1.1, bottom=0.55, top=0.3, between=0.65)
     for axes, values, rows, title in (
         (left, c.interior, c.parameters, "correlation of IOP"),
         (right, c.mean_abs, c.eop_names, "mean |correlation| of EOP and IOP"),
