@@ -165,6 +165,7 @@ def table(records: list[dict]) -> list[str]:
     lines += markdown(names, rows)
     ours = by_solver["jaxphoto"]
     lines += ["", f"Our whole call from Python: {_spread(ours, 'call_s')} ms; compiling: {ours[0]['compile_s']:.1f} s."]
+    lines += [f"Our peak memory with all covariances: {max(r['memory_with_covariance_mb'] for r in ours):.0f} MB."]
     lines += [f"{sentence}." for sentence in head["missing"]]
     begun = [r for r in records if r["kind"] == "start"]
     if begun:

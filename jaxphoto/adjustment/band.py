@@ -133,20 +133,19 @@ def invert_band(factor: BandFactor) -> Float[Array, "unknowns unknowns"]:
     inner, _, m = inside.columns.shape
     if not inner:
         return inside.end
-    n = (inner + 1) * m
+    n, q = (inner + 1) * m, len(inside.border)
     border = jnp.concatenate([inside.border, inside.end[m:, :m]], axis=1)
+    inverse = jnp.zeros((n + q, n + q)).at[n:, : n - m].set(inside.border).at[n - m :, n - m :].set(inside.end)
 
     # Column block j is right from row block j on; what stands above is not used.
-    def fill(after, at):
-        j, gain, diagonal = at
-        column = -jnp.concatenate([after, border.T], axis=1) @ gain.T
-        column = jax.lax.dynamic_update_slice(column, diagonal, (j * m, 0))
-        return column, column
+    def fill(k, inverse):
+        j = inner - 1 - k
+        after = jax.lax.dynamic_slice(inverse, (0, (j + 1) * m), (n, m))
+        column = -jnp.concatenate([after, border.T], axis=1) @ gains[j].T
+        column = jax.lax.dynamic_update_slice(column, inside.columns[j, :m], (j * m, 0))
+        return jax.lax.dynamic_update_slice(inverse, column, (0, j * m))
 
-    last = jnp.pad(inside.end[:m, :m], ((n - m, 0), (0, 0)))
-    _, columns = jax.lax.scan(fill, last, (np.arange(inner), gains, inside.columns[:, :m]), reverse=True)
-    images = jnp.concatenate([columns, last[None]]).transpose(1, 0, 2).reshape(n, n)
-    return _with_border(_symmetric(images), border, inside.end[m:, m:])
+    return _symmetric(jax.lax.fori_loop(0, inner, fill, inverse))
 
 
 def dense(band: Band) -> Float[Array, "unknowns unknowns"]:
@@ -199,8 +198,7 @@ def column_blocks(n_images: int, bandwidth: int) -> tuple[int, int]:
 def _invert_inside(factor: BandFactor) -> tuple[SelectedInverse, Float[Array, "inner m p"]]:
     """The selected inverse, and G' of all columns but the last."""
     inner, _, m = factor.columns.shape
-    own = _invert_triangle(factor.end)
-    end = _mean(own @ own.T)
+    end = _invert_dense(factor.end)
     if not inner:
         return SelectedInverse(factor.columns, factor.border, end), jnp.zeros((0, m, len(end)))
     corner = end[m:, m:]
@@ -220,14 +218,27 @@ def _invert_inside(factor: BandFactor) -> tuple[SelectedInverse, Float[Array, "i
     return SelectedInverse(columns, _join_border(borders), end), gains
 
 
+def _invert_dense(lower: Float[Array, "m m"]) -> Float[Array, "m m"]:
+    """(L L')^-1; where its halves are multiplied apart, zeros of the triangle are not."""
+    first, across, second = _invert_halves(lower)
+    corner = across @ second.T
+    images = _mean(first @ first.T + across @ across.T)
+    return jnp.block([[images, corner], [corner.T, _mean(second @ second.T)]])
+
+
+def _invert_halves(lower: Float[Array, "m m"]) -> tuple[Array, Array, Array]:
+    h = len(lower) // 2
+    first, second = _invert_triangle(lower[:h, :h]), _invert_triangle(lower[h:, h:])
+    return first, -(first @ lower[h:, :h].T) @ second, second
+
+
 def _invert_triangle(lower: Float[Array, "m m"]) -> Float[Array, "m m"]:
     """The transposed inverse of a lower triangle."""
     m = len(lower)
     if m <= _LEAF:
         return _solve_transposed(lower, jnp.eye(m))
-    h = m // 2
-    first, second = _invert_triangle(lower[:h, :h]), _invert_triangle(lower[h:, h:])
-    return jnp.block([[first, -(first @ lower[h:, :h].T) @ second], [jnp.zeros((m - h, h)), second]])
+    first, across, second = _invert_halves(lower)
+    return jnp.block([[first, across], [jnp.zeros((m - len(first), len(first))), second]])
 
 
 @jax.custom_jvp

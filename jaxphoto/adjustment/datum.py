@@ -11,14 +11,15 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxphoto.adjustment.residuals import State, Values, georeferencing_residuals
+from jaxphoto.adjustment.similarity import similarity
 from jaxphoto.adjustment.structure import Structure
 from jaxphoto.block import Block
 from jaxphoto.compiling import QUICK_TO_COMPILE
 from jaxphoto.errors import DatumError
-from jaxphoto.rotation import small_angles, small_rotation
+from jaxphoto.rotation import small_angles
 
 MOTIONS = (
     "shift in X",
@@ -93,15 +94,6 @@ def _plainly_closed(block: Block, values: Values, structure: Structure) -> bool:
             if spread[1] > 1e-6 * spread[0]:
                 return True
     return False
-
-
-def similarity(
-    parameters: Float[Array, "7"], position: Float[Array, "3"], rotation: Float[Array, "3 3"], centre, size
-) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
-    """An image moved by a similarity about `centre`: shifts and scale in units of `size`, rotations in rad."""
-    turn = small_rotation(parameters[3:6])
-    moved = centre + size * parameters[:3] + (1 + parameters[6]) * turn @ (position - centre)
-    return moved, rotation @ turn.T
 
 
 @partial(jax.jit, compiler_options=QUICK_TO_COMPILE)

@@ -17,10 +17,11 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Int
 
 from jaxphoto.adjustment.band import factor_band
-from jaxphoto.adjustment.normal import At, Reduced, residuals_at, solve_factored, square_sum
+from jaxphoto.adjustment.elimination import solve_factored
+from jaxphoto.adjustment.normal import At, Reduced, residuals_at, square_sum
 from jaxphoto.adjustment.reduced import reduce_normal
 from jaxphoto.adjustment.residuals import Increments, Values
-from jaxphoto.adjustment.shards import EVERYWHERE, along_points, sharded
+from jaxphoto.adjustment.shards import EVERYWHERE, TILES, along_points, sharded
 from jaxphoto.adjustment.solver import LevenbergMarquardt, System
 from jaxphoto.adjustment.structure import MOUNT_SIZE, STRIP_SIZE, Structure, interior_of
 from jaxphoto.adjustment.tiles import by_tile
@@ -72,8 +73,7 @@ def iterate(
     of_unknowns = Increments(EVERYWHERE, EVERYWHERE, at_points)
     system = System(
         of_unknowns,
-        Reduced(EVERYWHERE, EVERYWHERE, EVERYWHERE, at_points, EVERYWHERE, along_points(3), of_unknowns),
-        EVERYWHERE,
+        Reduced(EVERYWHERE, EVERYWHERE, EVERYWHERE, TILES, at_points, of_unknowns, EVERYWHERE),
         EVERYWHERE,
     )
     out = (Optimum(of_unknowns, EVERYWHERE, EVERYWHERE), system)
@@ -132,7 +132,7 @@ def _find_optimum_jvp(primals, tangents, *, structure: Structure, max_steps: int
         return flat(jax.tree.map(jnp.multiply, product, scale))
 
     def precondition(b):
-        return flat(solve_factored(there, reduced, factor, unravel(b)))
+        return flat(solve_factored(reduced, factor, unravel(b), there))
 
     def solve(product, b):
         return jax.scipy.sparse.linalg.cg(product, b, tol=1e-13, maxiter=100, M=precondition)[0]

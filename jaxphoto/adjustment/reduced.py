@@ -63,13 +63,11 @@ class TileParts(NamedTuple):
 
     columns: tuple[Columns, Columns]
     f: Float[Array, "6m+border 3p"]
-    """F: Y, then interior unknowns, constraints, right-hand side."""
+    """F, with the right-hand side for its last row."""
     l: Float[Array, "6 p"]  # noqa: E741
     b: Float[Array, "3 p"]
     diagonal: Float[Array, "3 p"]
     """That of V, without damping."""
-    z: tuple[Float[Array, "3 m p"], Float[Array, "3 m p"]]
-    """L^-1 times the columns of the point, for x and y."""
 
 
 def reduce_normal(at: At, damping) -> tuple[Band, Reduced, Right]:
@@ -92,16 +90,17 @@ def reduce_normal(at: At, damping) -> tuple[Band, Reduced, Right]:
         gram = p.f @ p.f.T
         across = gram[: 6 * m, 6 * m :].reshape(m, -1)
         own = jnp.concatenate([jnp.einsum("maj,mbj->mab", j, j).reshape(m, -1), across], axis=1)
-        return gram[: 6 * m, : 6 * m], own, gram[6 * m :, 6 * m :], p.l, p.b, p.diagonal
+        f = p.f if tiles.few else None
+        return gram[: 6 * m, : 6 * m], own, gram[6 * m :, 6 * m :], f, p.l, p.b, p.diagonal
 
     def add_chunk(sums, numbers):
         (pair_tile, pair_images, pair_block, block), of_tiles = numbers
-        grams, own, border, *of_points = each_tile(tile, of_tiles, tiles)
+        grams, own, border, *kept = each_tile(tile, of_tiles, tiles)
         grams = grams.reshape(chunk, m, 6, m, 6)[pair_tile, pair_images[:, 0], :, pair_images[:, 1]]
         grams = jax.ops.segment_sum(grams, pair_block, len(block), indices_are_sorted=True)
         own = _sum_by(own.reshape(chunk * m, -1), of_tiles[0].reshape(-1), n)
         band = _subtract_blocks(sums[0], grams, block)
-        return (band, sums[1] + own, sums[2] + border.sum(0)), of_points
+        return (band, sums[1] + own, sums[2] + border.sum(0)), kept
 
     zero = (
         (jnp.zeros((inner, 2 * width, 6, width, 6)), jnp.zeros((width, 6, width, 6))),
@@ -109,7 +108,7 @@ def reduce_normal(at: At, damping) -> tuple[Band, Reduced, Right]:
         jnp.zeros((c, c)),
     )
     lists = (tiles.pair_tile, tiles.pair_images, tiles.pair_block, tiles.block)
-    sums, of_points = jax.lax.scan(add_chunk, zero, (lists, tile_numbers(at, rest)))
+    sums, (f, *of_points) = jax.lax.scan(add_chunk, zero, (lists, tile_numbers(at, rest)))
     (columns, last), own, border = total(sums, s)
     l, b_points, v = map(by_point, of_points)  # noqa: E741
 
@@ -145,7 +144,7 @@ def reduce_normal(at: At, damping) -> tuple[Band, Reduced, Right]:
 
     b_e = m_images[:, :6, -1] + jnp.einsum("cna,c->na", rest.rows_e, coupled)
     right = jnp.concatenate([(b_e - met[:, :, -1]).reshape(-1), b_s.at[:i].add(-border[:i, -1])])
-    reduced = Reduced(diagonal_of(a), g, kk, l, rest.rows_e, rest.rows_p, weight)
+    reduced = Reduced(diagonal_of(a), g, kk, f, l, weight, jnp.asarray(damping, float))
     # Of the residuals' own square, the sums hold the image rows' part.
     squares = jnp.sum(m_images[:, -1, -1]) + total(jnp.sum(others.control**2), s)
     squares += jnp.sum(coupled**2) + jnp.sum(others.priors**2)
@@ -194,18 +193,28 @@ def tile_numbers(at: At, rest: OtherRows):
     return (tiles.image, values.xy, values.sigma_xy, *of_points)
 
 
-def tile_parts(at: At, damping, coupled: Float[Array, "constraints"]):
-    """A function from one tile's numbers to its `TileParts`."""
+def tile_columns(at: At):
+    """A function from a tile's images, measurements and points to its residuals and Jacobian."""
     s = at.structure
     scene = scene_of(at.state, s)
     slopes = once(lambda: slopes_of(at.increments, at.scale, at.values, s), s)
 
+    def columns_of(numbers) -> tuple[Columns, Columns]:
+        image, xy, sigma, points, scale = numbers
+        seen = seen_in(xy, sigma, image, s)
+        return columns(of_images(scene, image, s), of_images(slopes, image, s), points, scale, seen, s)
+
+    return columns_of
+
+
+def tile_parts(at: At, damping, coupled: Float[Array, "constraints"]):
+    """A function from one tile's numbers to its `TileParts`."""
+    s, columns_of = at.structure, tile_columns(at)
+
     def parts(numbers) -> TileParts:
-        image, xy, sigma, points, scale, control, rows_p = numbers
-        m, p = image.shape[0], points.shape[1]
-        j = columns(
-            of_images(scene, image, s), of_images(slopes, image, s), points, scale, seen_in(xy, sigma, image, s), s
-        )
+        *measured, control, rows_p = numbers
+        j = columns_of(measured)
+        image, (m, p) = measured[0], j[0].residual.shape
         v, b = _met([c.point for c in j], j), _met([c.residual[None] for c in j], j)[0]
         ws = _by_interior(j, image, s)
         diagonal = jnp.einsum("iip->ip", v) + control[1] ** 2
@@ -219,7 +228,7 @@ def tile_parts(at: At, damping, coupled: Float[Array, "constraints"]):
             lambda factors, *points: tuple(jnp.stack(whiten(w, factors)) for w in points), s, l, *(c.point for c in j)
         )
         f = jnp.concatenate([once(_whitened_eop, s, j, z).reshape(6 * m, 3 * p), border.reshape(-1, 3 * p)])
-        return TileParts(j, f, l, b, diagonal, z)
+        return TileParts(j, f, l, b, diagonal)
 
     return parts
 

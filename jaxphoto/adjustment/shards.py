@@ -26,8 +26,8 @@ def along_points(ndim: int) -> Any:
     return P(*[None] * (ndim - 1), AXIS)
 
 
-_OF_TILES = {"xy", "sigma_xy", "pair_tile", "pair_images", "pair_block", "block"}
-_OF_POINTS = {"points", "control", "sigma_control", "datum_points", "point_free", "point_class", "l", "rows_p"}
+_OF_TILES = {"xy", "sigma_xy", "pair_tile", "pair_images", "pair_block", "block", "f"}
+_OF_POINTS = {"points", "control", "sigma_control", "datum_points", "point_free", "point_class", "l"}
 
 
 def usable(wanted: int) -> int:

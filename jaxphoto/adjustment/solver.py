@@ -14,10 +14,13 @@ import optimistix as optx
 from jaxtyping import Array, Bool, PyTree, Scalar
 
 from jaxphoto.adjustment.band import BandFactor, factor_band
-from jaxphoto.adjustment.normal import At, Reduced, dot, gradient, norm2, solve_reduced
+from jaxphoto.adjustment.elimination import gradient, solve_reduced
+from jaxphoto.adjustment.normal import At, Reduced, dot, norm2
 from jaxphoto.adjustment.reduced import Right, reduce_normal
 from jaxphoto.adjustment.residuals import Increments, Values
+from jaxphoto.adjustment.similarity import onto_datum, open_motions
 from jaxphoto.adjustment.structure import Structure
+from jaxphoto.adjustment.values import with_datum
 
 
 class System(NamedTuple):
@@ -26,24 +29,27 @@ class System(NamedTuple):
     increments: Increments
     reduced: Reduced
     factor: BandFactor
-    damping: Scalar
 
 
 def zero_system(y: Increments, values: Values, s: Structure) -> System:
     """A system of the right shapes, to begin with."""
     n, q, k = 6 * s.n_images, s.n_shared, len(values.distances) + len(values.datum_eop)
-    m, inner, points = n // s.in_tiles.columns, s.in_tiles.columns - 1, y.points.shape[1]
-    factor = BandFactor(jnp.zeros((inner, 2 * m, m)), jnp.zeros((q, inner * m)), jnp.zeros((m + q, m + q)))
+    *tiles, m = s.in_tiles.image.shape
+    f = (*tiles, 6 * m + s.n_interior + k + 1, 3 * s.in_tiles.per_tile)
+    size, inner = n // s.in_tiles.columns, s.in_tiles.columns - 1
+    factor = BandFactor(
+        jnp.zeros((inner, 2 * size, size)), jnp.zeros((q, inner * size)), jnp.zeros((size + q, size + q))
+    )
     reduced = Reduced(
         diagonal=jnp.zeros(n + q),
         g=jnp.zeros((n + q, k)),
         k=jnp.zeros((k, k)),
-        l=jnp.zeros((6, points)),
-        rows_e=jnp.zeros((k, s.n_images, 6)),
-        rows_p=jnp.zeros((k, 3, points)),
+        f=jnp.zeros(f) if s.in_tiles.few else None,
+        l=jnp.zeros((6, y.points.shape[1])),
         weight=jax.tree.map(jnp.zeros_like, y),
+        damping=jnp.zeros(()),
     )
-    return System(y, reduced, factor, jnp.zeros(()))
+    return System(y, reduced, factor)
 
 
 class Progress(NamedTuple):
@@ -55,14 +61,19 @@ class Progress(NamedTuple):
     chord: Bool[Array, ""]
     """Whether the next step uses the system as it is."""
     system: System
+    loose: Bool[Array, ""]
+    """Whether damping takes the place of the datum's constraints."""
+    tightened: Bool[Array, ""]
+    """Whether it did before: it does so once."""
     done: Bool[Array, ""]
 
 
-# The first damping: what is added to the normal matrix, relative to its diagonal.
-_FIRST_DAMPING = 1e-8
-# Trust region by the ratio of actual to promised reduction: accept above the first, trust more above the second.
-_ACCEPT, _GOOD = 0.01, 0.99
-_LESS_DAMPING, _MORE_DAMPING = 1 / 3.5, 4.0
+# Damping is what is added to the normal matrix, relative to its diagonal. It begins almost as none; where that fails,
+# little more does no better: the first rejected step takes it to the second, each further one multiplies it.
+_FIRST_DAMPING, _DAMPING, _MORE_DAMPING = 1e-8, 1e-4, 10.0
+# A step is accepted above this ratio of actual to promised reduction. Damping falls with that ratio (Nielsen's rule),
+# at most to this fraction.
+_ACCEPT, _LEAST_FACTOR = 0.001, 0.2
 # Ratio of successive steps that is assumed at least when the missing part is estimated.
 _SLOWEST_SHOWN = 0.1
 # Steps that shrink like this go on with the same factor; a chord step that shrinks less than the second ends it.
@@ -96,37 +107,42 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Increments, Scalar, Any
         self.structure, self.values, self.scale = structure, values, scale
         self.tolerance, self.only_factor = tolerance, only_factor
 
-    def _at(self, y: Increments) -> At:
-        return At(y, self.scale, self.values, self.structure)
+    def _at(self, y: Increments, loose: Bool[Array, ""]) -> At:
+        v = self.values
+        if open_motions(v):
+            v = with_datum(v, jnp.where(loose, 0.0, v.datum_eop), jnp.where(loose, 0.0, v.datum_points))
+        return At(y, self.scale, v, self.structure)
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> Progress:
         """Almost Gauss-Newton to begin with."""
         damping = jnp.where(self.only_factor, 0.0, _FIRST_DAMPING)
         empty = zero_system(y, self.values, self.structure)
-        return Progress(damping, jnp.array(jnp.inf), jnp.array(False), empty, jnp.array(False))
+        no = jnp.array(False)
+        return Progress(damping, jnp.array(jnp.inf), no, empty, loose=no, tightened=no, done=no)
 
-    def _factored(self, y: Increments, damping) -> tuple[System, Right]:
-        a, reduced, right = reduce_normal(self._at(y), damping)
-        return System(y, reduced, factor_band(a), jnp.asarray(damping, float)), right
+    def _factored(self, at: At, damping) -> tuple[System, Right]:
+        a, reduced, right = reduce_normal(at, damping)
+        return System(at.increments, reduced, factor_band(a)), right
 
-    def _kept(self, y: Increments, system: System) -> tuple[System, Right]:
-        """The gradient at `y`, taken down by the system that there is."""
-        return system, Right(*gradient(self._at(y), system.reduced.l, system.reduced.rows_p))
+    def _kept(self, at: At, system: System) -> tuple[System, Right]:
+        """The gradient there, taken down by the system that there is."""
+        return system, Right(*gradient(at, system.reduced, at._replace(increments=system.increments)))
 
     def step(self, fn, y, args, options, state: Progress, tags):
         """Propose a step; take it if it is good, and damp more if not."""
+        at = self._at(y, state.loose)
         system, right = jax.lax.cond(
-            state.chord, lambda: self._kept(y, state.system), lambda: self._factored(y, state.damping)
+            state.chord, lambda: self._kept(at, state.system), lambda: self._factored(at, state.damping)
         )
-        place = self._at(system.increments)
+        place = at._replace(increments=system.increments)
         x = jax.lax.cond(
             self.only_factor,
             lambda: jax.tree.map(jnp.zeros_like, y),
-            lambda: solve_reduced(place, system.reduced, system.factor, right.reduced, right.d, right.b.points),
+            lambda: solve_reduced(system.reduced, system.factor, right.reduced, right.d, right.b.points, place),
         )
         proposal = jax.tree.map(jnp.negative, x)
         # (N + D) d = -b, so d'N d = -d'b - d'D d, and the linear model promises d'N d / 2 + d'D d.
-        damped = system.damping * norm2(x, system.reduced.weight, self.structure)
+        damped = system.reduced.damping * norm2(x, system.reduced.weight, self.structure)
         seen = dot(x, right.b, self.structure) - damped
         length = jnp.sqrt(jnp.maximum(seen, 0.0))
         ratio = length / state.length
@@ -134,21 +150,34 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Increments, Scalar, Any
         settled = (missing <= self.tolerance) & (damped <= seen + self.tolerance**2)
         new_y = jax.tree.map(jnp.add, y, proposal)
         # The last step is short and was computed from an accepted iterate: it needs no proof.
-        square_sum = jax.lax.cond(settled | self.only_factor, lambda: right.square_sum, lambda: fn(new_y, args)[0] ** 2)
+        square_sum = jax.lax.cond(
+            settled | self.only_factor, lambda: right.square_sum, lambda: fn(new_y, at[1:])[0] ** 2
+        )
         reduction, promised = right.square_sum - square_sum, seen + 2 * damped
         accept = settled | (reduction >= _ACCEPT * promised)
         chord_failed = state.chord & ~(accept & (ratio < _CHORD_FAILS))
-        good = reduction >= _GOOD * promised
-        factor = jnp.where(accept, jnp.where(good, _LESS_DAMPING, 1.0), jnp.where(state.chord, 1.0, _MORE_DAMPING))
+        less = state.damping * jnp.maximum(_LEAST_FACTOR, 1 - (2 * reduction / promised - 1) ** 3)
+        more = jnp.maximum(_DAMPING, _MORE_DAMPING * state.damping)
+        # A chord that fails says nothing about the damping: the next step has a factor of its own.
+        damping = jnp.where(state.chord, state.damping, jnp.where(accept, less, more))
         pick = lambda a, b: jax.tree.map(lambda a, b: jnp.where(accept, a, b), a, b)  # noqa: E731
+        next_y, loose, tighten = pick(new_y, y), state.loose, jnp.array(False)
+        if open_motions(self.values):
+            # Held about a start that is far off, the constraints bend the path: it goes on without them, and what it
+            # ends at is brought to them as a whole.
+            tighten = settled & state.loose
+            next_y = jax.lax.cond(tighten, lambda y: onto_datum(self._at(y, jnp.array(False))), lambda y: y, next_y)
+            loose = (state.loose | (~accept & ~state.chord & ~state.tightened)) & ~tighten
         progress = Progress(
-            damping=state.damping * factor,
-            length=pick(length, state.length),
-            chord=accept & ~chord_failed & (state.chord | ((ratio < _CHORD) & jnp.isfinite(state.length))),
+            damping=jnp.where(tighten, _FIRST_DAMPING, damping),
+            length=jnp.where(tighten, jnp.inf, pick(length, state.length)),
+            chord=accept & ~chord_failed & ~tighten & (state.chord | ((ratio < _CHORD) & jnp.isfinite(state.length))),
             system=system,
-            done=settled | self.only_factor,
+            loose=loose,
+            tightened=state.tightened | tighten,
+            done=(settled & ~tighten) | self.only_factor,
         )
-        return pick(new_y, y), progress, None
+        return next_y, progress, None
 
     def terminate(self, fn, y, args, options, state: Progress, tags):
         """After the step that settled it, or the only one."""

@@ -64,6 +64,11 @@ class Tiles(eqx.Module):
     shards: int = eqx.field(static=True)
     """Devices that the chunks are dealt out to, in equal parts."""
 
+    @property
+    def few(self) -> bool:
+        """Whether a device computes with all its tiles at a time: what is made of them is worth keeping."""
+        return self.image.shape[:2] == (1, self.at_once)
+
 
 class Structure(eqx.Module):
     """Index arrays and sizes; see the module's head."""

@@ -9,6 +9,7 @@ import numpy as np
 
 from jaxphoto.adjustment.residuals import State, Values
 from jaxphoto.adjustment.structure import MOUNT_SIZE, STRIP_SIZE, Structure, shared_vector, spread
+from jaxphoto.arrays import Numbers
 from jaxphoto.block import Block, exposures
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.georeferencing import Mount, StripBias
@@ -55,7 +56,7 @@ def _vector(scalars: list):
     return jnp.stack([jnp.asarray(x, float) for x in scalars]) if traced else np.array(scalars, float)
 
 
-def with_datum(values: Values, eop: np.ndarray, points: np.ndarray) -> Values:
+def with_datum(values: Values, eop: Numbers, points: Numbers) -> Values:
     """The same values with constraint rows of the datum."""
     return eqx.tree_at(lambda v: (v.datum_eop, v.datum_points), values, (eop, points))
 

@@ -21,15 +21,16 @@ from jaxtyping import Array, Bool, Float
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.adjustment.band import invert_band
-from jaxphoto.adjustment.normal import At, solve_factored
+from jaxphoto.adjustment.elimination import over_tiles, solve_factored
+from jaxphoto.adjustment.normal import At, Reduced, unwhiten, whiten
 from jaxphoto.adjustment.optimum import weigh_datum
 from jaxphoto.adjustment.padding import crop_reduced
-from jaxphoto.adjustment.reduced import OtherRows, other_rows, tile_numbers, tile_parts
+from jaxphoto.adjustment.reduced import tile_columns
 from jaxphoto.adjustment.residuals import Increments, Values
 from jaxphoto.adjustment.result import Factored
 from jaxphoto.adjustment.shards import TILES, sharded
 from jaxphoto.adjustment.structure import Structure
-from jaxphoto.adjustment.tiles import each_tile
+from jaxphoto.adjustment.tiles import by_tile
 from jaxphoto.arrays import Numbers, still
 from jaxphoto.compiling import run_compiled
 from jaxphoto.rotation import omega_phi_kappa_from_matrix, small_rotation
@@ -161,57 +162,54 @@ def _cofactors(values: Values, factored: Factored, s: Structure, of_rows: Bool[N
         low = inverse @ kg.T
         full = jnp.block([[inverse, low], [low.T, kg @ low - jnp.linalg.inv(reduced.k)]])
     weighed = weigh_datum(values, s)
-    points, rows = sharded(_of_points, s, (TILES, TILES))(full, weighed, factored.scale, s, of_rows)
+    points, rows = sharded(_of_points, s, (TILES, TILES))(full, reduced, weighed, factored.scale, s, of_rows)
     return _without_open_motions(Cofactors(inverse, points), weighed, factored, s), rows
 
 
-def _of_points(full: Float[Array, "n n"], values: Values, scale: Increments, s: Structure, of_rows: Bool[Numbers, ""]):
+def _of_points(
+    full: Float[Array, "n n"],
+    reduced: Reduced,
+    values: Values,
+    scale: Increments,
+    s: Structure,
+    of_rows: Bool[Numbers, ""],
+):
     """Cofactors of points, and j Q j' of image rows."""
     at = At(jax.tree.map(jnp.zeros_like, scale), scale, values, s)
-    rest: OtherRows = other_rows(at)
-    parts_of = tile_parts(at, 0.0, rest.coupled)
-    n, q, i, k = 6 * s.n_images, s.n_image_colours, s.n_interior, len(rest.coupled)
-    shared = jnp.concatenate([n + jnp.arange(i), n + s.n_shared + jnp.arange(k)])
+    columns_of = tile_columns(at)
+    n, q, i, k = 6 * s.n_images, s.n_image_colours, s.n_interior, len(reduced.k)
+    # One more than there are: zeros serve the last row of F, and colours that mean nothing in an image.
+    shared = jnp.concatenate([n + jnp.arange(i), n + s.n_shared + jnp.arange(k + 1)])
 
-    def tile(numbers):
-        p = parts_of(numbers)
-        image = numbers[0]
-        m, size = len(image), len(p.b[0])
+    def tile(f, image, l, *measured):  # noqa: E741
+        size = l.shape[1]
         index = jnp.concatenate([(6 * image[:, None] + jnp.arange(6)).reshape(-1), shared])
-        own = full[index[:, None], index]
-        f = p.f[:-1]
+        own = full.at[index[:, None], index].get(mode="fill", fill_value=0.0)
         a = own @ f
-        g = jnp.einsum("rkp,rlp->klp", f.reshape(-1, 3, size), a.reshape(-1, 3, size))
+        # A product of matrices would want both turned round first.
+        g = jnp.sum(f.reshape(-1, 3, 1, size) * a.reshape(-1, 1, 3, size), axis=0)
         inner = jnp.eye(3)[:, :, None] + g
-        half = jnp.stack(_unwhiten(inner, p.l))
-        points = jnp.stack(_unwhiten(half.transpose(1, 0, 2), p.l)).transpose(2, 0, 1)
-        nothing = lambda *_: jnp.zeros((2, m, size))  # noqa: E731
-        return points, jax.lax.cond(of_rows, rows, nothing, image, p, own, a, inner)
+        half = jnp.stack(unwhiten(inner, l))
+        points = jnp.stack(unwhiten(half.transpose(1, 0, 2), l)).transpose(2, 0, 1)
+        nothing = lambda *_: jnp.zeros((2, len(image), size))  # noqa: E731
+        return points, jax.lax.cond(of_rows, rows, nothing, (image, *measured), l, own, a, inner)
 
-    def rows(image, p, own, a, inner):
-        m, size = len(image), len(p.b[0])
-        # A last row and column of zeros serves colours that mean nothing in an image.
-        own, a = jnp.pad(own, (0, 1)), jnp.pad(a, ((0, 1), (0, 0)))
+    def rows(measured, l, own, a, inner):  # noqa: E741
+        image, both = measured[0], columns_of(measured)
+        m, size = both[0].residual.shape
         column = jnp.asarray(s.column)[image, :q]
         column = jnp.where(column < i, 6 * m + column, 6 * m + i + k)
         touched = jnp.concatenate([6 * jnp.arange(m)[:, None] + jnp.arange(6), column], axis=1)
-        j = jnp.stack([jnp.concatenate([c.eop, c.shared]) for c in p.columns], axis=1).transpose(2, 0, 1, 3)
-        z = jnp.stack(p.z).transpose(0, 2, 1, 3)
+        j = jnp.stack([jnp.concatenate([c.eop, c.shared]) for c in both], axis=1).transpose(2, 0, 1, 3)
+        z = jnp.stack([jnp.stack(whiten(c.point, l)) for c in both]).transpose(0, 2, 1, 3)
         seen = jnp.einsum("mab,mbn->man", own[touched[:, :, None], touched[:, None, :]], j.reshape(m, 6 + q, -1))
         of_images = jnp.sum(j * seen.reshape(j.shape), axis=1).transpose(1, 0, 2)
         across = jnp.einsum("mcop,mckp->omkp", j, a[touched].reshape(m, 6 + q, 3, size))
         return of_images - 2 * jnp.sum(z * across, axis=2) + jnp.einsum("omkp,klp,omlp->omp", z, inner, z)
 
-    points, found = jax.lax.map(lambda chunk: each_tile(tile, chunk, s.in_tiles), tile_numbers(at, rest))
+    l, *places = (by_tile(v, s.in_tiles) for v in (reduced.l, values.points, scale.points))  # noqa: E741
+    points, found = over_tiles(tile, at, reduced, (l, values.xy, values.sigma_xy, *places))
     return points.reshape(-1, 3, 3), found
-
-
-def _unwhiten(w, l):  # noqa: E741
-    """L^-T w, component by component."""
-    l11, l21, l22, l31, l32, l33 = l
-    x3 = w[2] / l33
-    x2 = (w[1] - l32 * x3) / l22
-    return (w[0] - l21 * x2 - l31 * x3) / l11, x2, x3
 
 
 def _without_open_motions(q: Cofactors, values: Values, factored: Factored, s: Structure) -> Cofactors:
@@ -223,11 +221,9 @@ def _without_open_motions(q: Cofactors, values: Values, factored: Factored, s: S
     if not defect:
         return q
     reduced, scale = factored.reduced, factored.scale
-    rows = Increments(
-        reduced.rows_e[-defect:].transpose(0, 2, 1), jnp.zeros((defect, s.n_shared)), reduced.rows_p[-defect:]
-    )
+    rows = Increments(values.datum_eop * scale.eop, jnp.zeros((defect, s.n_shared)), values.datum_points * scale.points)
     at = At(jax.tree.map(jnp.zeros_like, scale), scale, values, s)
-    e = jax.vmap(lambda row: solve_factored(at, reduced, factored.factor, row))(rows)
+    e = jax.vmap(lambda row: solve_factored(reduced, factored.factor, row, at))(rows)
     e_eop, e_shared, e_points = e.eop.transpose(2, 1, 0), e.shared.T, e.points.transpose(2, 1, 0)
     e_reduced = jnp.concatenate([e_eop.reshape(-1, defect), e_shared])
     return q._replace(

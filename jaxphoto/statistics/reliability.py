@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxphoto.adjustment import Adjustment
-from jaxphoto.adjustment.normal import At, solve_factored
+from jaxphoto.adjustment.elimination import solve_factored
+from jaxphoto.adjustment.normal import At
 from jaxphoto.adjustment.optimum import weigh_datum
 from jaxphoto.adjustment.padding import crop_residuals
 from jaxphoto.adjustment.reduced import other_rows
@@ -102,7 +103,7 @@ def _distances(ends: jax.Array, at: At, factored: Factored) -> jax.Array:
         points = jnp.zeros_like(zero.points)
         for end in range(2):
             points = points.at[:, s.distance_points[k, end]].add(ends[end, :, k])
-        x = solve_factored(at, factored.reduced, factored.factor, zero._replace(points=points))
+        x = solve_factored(factored.reduced, factored.factor, zero._replace(points=points), at)
         return jnp.sum(points * x.points)
 
     if not len(s.distance_points):

@@ -12,7 +12,8 @@ from jax.flatten_util import ravel_pytree
 from jaxphoto.adjustment.adjust import concrete
 from jaxphoto.adjustment.band import factor_band
 from jaxphoto.adjustment.datum import close_datum
-from jaxphoto.adjustment.normal import At, gradient, image_products, residuals_at, solve_factored
+from jaxphoto.adjustment.elimination import gradient, solve_factored
+from jaxphoto.adjustment.normal import At, residuals_at
 from jaxphoto.adjustment.optimum import typical_scale, weigh_datum, zero_increments
 from jaxphoto.adjustment.padding import crop_residuals, pad_structure, pad_values
 from jaxphoto.adjustment.reduced import OtherRows, other_rows, reduce_normal, tile_numbers, tile_parts
@@ -54,12 +55,12 @@ class Dense(NamedTuple):
     """Of image rows: eop (6, 2, rows), and so on."""
     others: OtherRows
     vector: np.ndarray
-    products: np.ndarray
-    """The image rows' part of the normal matrix times `vector`."""
     gradient: np.ndarray
     sums: np.ndarray
     """The same, and the square sum, as the sums of the normal equations have them."""
     square_sums: np.ndarray
+    taken_down: np.ndarray
+    """The right-hand side for the reduced unknowns and for mu, of a gradient and of the sums."""
     solutions: np.ndarray
     """x of (N + damping W) x = vector, a row for each of `DAMPINGS`; W is `weight`."""
     scale: np.ndarray
@@ -96,7 +97,7 @@ def at_optimum(name: str) -> Dense:
 
     c = whole.columns
     columns = Columns(c.residual.reshape(-1)[image], *map(by_row, (c.eop, c.shared, c.point)))
-    names = ("vector", "products", "gradient", "sums", "solutions", "scale")
+    names = ("vector", "gradient", "sums", "solutions", "scale")
     return whole._replace(
         jacobian=whole.jacobian[np.ix_(rows, unknowns)],
         residuals=whole.residuals[rows],
@@ -136,19 +137,19 @@ def _dense(values, structure) -> Dense:
 
     def solution(damping):
         a, reduced, _ = reduce_normal(at, damping)
-        return ravel_pytree(solve_factored(at, reduced, factor_band(a), back(vector)))[0]
+        return ravel_pytree(solve_factored(reduced, factor_band(a), back(vector), at))[0]
 
-    b, *_, squares = gradient(at, reduced.l, reduced.rows_p)
+    b, down, d, squares = gradient(at, reduced, at)
     return Dense(
         jacobian=jax.vmap(lambda seed: ravel_pytree(product(back(seed)))[0], out_axes=1)(jnp.eye(len(flat))),
         residuals=ravel_pytree(residuals)[0],
         columns=columns,
         others=rest,
         vector=vector,
-        products=ravel_pytree(image_products(at, back(vector), "all"))[0],
         gradient=ravel_pytree(b)[0],
         sums=ravel_pytree(right.b)[0],
         square_sums=jnp.stack([squares, right.square_sum]),
+        taken_down=jnp.stack([jnp.concatenate([down, d]), jnp.concatenate([right.reduced, right.d])]),
         solutions=jax.vmap(solution)(jnp.array(DAMPINGS)),
         scale=flat_scale,
     )

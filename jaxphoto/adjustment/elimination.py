@@ -1,0 +1,129 @@
+"""Solution of the normal equations: right-hand sides go down to the reduced unknowns, solutions back to the points.
+
+Both ways lead through F, see `normal`. The F of a small block is kept; that of a large one takes longer to fetch from
+memory than to make anew, a few tiles at a time.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from jaxphoto.adjustment.band import BandFactor, solve_band
+from jaxphoto.adjustment.normal import At, Reduced, each_tile_of, squares, total, unwhiten, whiten, with_others
+from jaxphoto.adjustment.reduced import other_rows, tile_numbers, tile_parts
+from jaxphoto.adjustment.residuals import Increments, other_residuals, state_at
+from jaxphoto.adjustment.structure import Structure
+from jaxphoto.adjustment.tiles import (
+    Scene,
+    by_point,
+    by_tile,
+    each_tile,
+    of_images,
+    rows,
+    scene_of,
+    seen_in,
+)
+
+
+def over_tiles(function: Callable, at: At, reduced: Reduced, numbers: tuple) -> Any:
+    """`function(F, images, *numbers)` of every tile, for the F of `reduced`, linearised `at`."""
+    tiles = at.structure.in_tiles
+    if reduced.f is None:
+        rest = other_rows(at)
+        parts_of = tile_parts(at, reduced.damping, rest.coupled)
+        given, f_of = tile_numbers(at, rest), lambda given: parts_of(given).f
+    else:
+        given, f_of = reduced.f, lambda f: f
+
+    def tile(of_tile):
+        image, given, *own = of_tile
+        return function(f_of(given), image, *own)
+
+    return jax.lax.map(lambda chunk: each_tile(tile, chunk, tiles), (tiles.image, given, *numbers))
+
+
+def solve_factored(reduced: Reduced, factor: BandFactor, b: Increments, at: At) -> Increments:
+    """x of (N + damping diag(N)) x = b: down to the reduced unknowns, and back to the points."""
+    return solve_reduced(reduced, factor, *reduce_right(reduced, b, at), b.points, at)
+
+
+def reduce_right(reduced: Reduced, b: Increments, at: At) -> tuple[Array, Array]:
+    """A right-hand side taken down to the reduced unknowns and to mu."""
+    s, i = at.structure, at.structure.n_interior
+    image = s.in_tiles.image
+    z = by_tile(jnp.stack(whiten(b.points, reduced.l)), s.in_tiles)
+    down = over_tiles(lambda f, _, z: f @ z.reshape(-1), at, reduced, (z,))
+    of_images, border = jnp.split(down, [6 * image.shape[2]], axis=2)
+    of_images = jax.ops.segment_sum(of_images.reshape(-1, 6), image.reshape(-1), s.n_images)
+    of_images, border = total((of_images, jnp.sum(border, (0, 1))), s)
+    return jnp.concatenate([(b.eop.T - of_images).reshape(-1), b.shared.at[:i].add(-border[:i])]), border[i:-1]
+
+
+def solve_reduced(reduced: Reduced, factor: BandFactor, right, d, b_points, at: At) -> Increments:
+    """The same with the right-hand side taken down already: `right` to the reduced unknowns, `d` to mu."""
+    r, s, n = reduced, at.structure, at.structure.n_images
+    if len(d):
+        right = right - r.g @ jnp.linalg.solve(r.k, d)
+    x = solve_band(factor, right)
+    mu = jnp.linalg.solve(r.k, r.g.T @ x + d) if len(d) else d
+    eop, shared = x[: 6 * n].reshape(n, 6), x[6 * n :]
+    border = jnp.concatenate([shared[: s.n_interior], mu, jnp.zeros(1)])
+
+    def up(f, image):
+        return (jnp.concatenate([eop[image].reshape(-1), border]) @ f).reshape(3, -1)
+
+    z = jnp.stack(whiten(b_points, r.l)) - by_point(over_tiles(up, at, r, ()))
+    return Increments(eop.T, shared, jnp.stack(unwhiten(z, r.l)))
+
+
+def gradient(at: At, reduced: Reduced, there: At):
+    """b = J'r over all rows, its part for the reduced unknowns and for mu, and the square sum of the residuals.
+
+    What takes it down is `reduced`, linearised `there`.
+    """
+    increments, scale, values, s = at
+    tiles = s.in_tiles
+    others, pull_others = jax.vjp(lambda y: other_residuals(y, scale, values, s), increments)
+    b_others = pull_others(others)[0]
+    scene, pull_scene = _scene_and_pull(at)
+    points = values.points + increments.points * scale.points
+
+    def tile(numbers):
+        image, point, step, other, xy, sigma = numbers
+        seen, place = seen_in(xy, sigma, image, s), of_images(scene, image, s)
+        r, pull = jax.vjp(lambda scene, point: rows(scene, point, seen, s), place, point)
+        to_scene, to_point = pull(r)
+        return to_scene, to_point * step + other, squares(r)
+
+    numbers = (by_tile(v, tiles) for v in (points, scale.points, b_others.points))
+    to_scene, b, square = each_tile_of(tile, (*numbers, values.xy, values.sigma_xy), s)
+    eop, shared = pull_scene(total(_by_image(to_scene, scene, s), s))
+    b_p = by_point(b.reshape(*tiles.image.shape[:2], *b.shape[1:]))
+    b = Increments(eop + b_others.eop, shared + b_others.shared, b_p)
+    return b, *reduce_right(reduced, b, there), with_others(jnp.sum(square), others, s)
+
+
+def _scene_and_pull(at: At):
+    """The scene, and what takes its cotangents to increments of images and shared unknowns."""
+    increments, scale, values, s = at
+
+    def scene_at(eop, shared):
+        return scene_of(state_at(increments._replace(eop=eop, shared=shared), scale, values, s), s)
+
+    return jax.vjp(scene_at, increments.eop, increments.shared)
+
+
+def _by_image(parts: Scene, scene: Scene, s: Structure) -> Scene:
+    """Cotangents of tiles, added by image (and over all tiles, for the only camera of a group)."""
+    image, n = s.in_tiles.image.reshape(-1), scene.centre.shape[0]
+
+    def of_image(v):
+        return jax.ops.segment_sum(v.reshape(-1, *v.shape[2:]), image, n)
+
+    cameras = tuple(
+        jnp.sum(v, axis=0) if len(g.names) == 1 else of_image(v) for g, v in zip(s.groups, parts.cameras, strict=True)
+    )
+    return Scene(of_image(parts.centre), of_image(parts.rotation), cameras)

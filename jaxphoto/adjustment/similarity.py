@@ -1,0 +1,61 @@
+"""Similarities: motions of images and points together that change no image coordinate."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxphoto.adjustment.normal import At
+from jaxphoto.adjustment.residuals import Increments, Values
+from jaxphoto.rotation import small_angles, small_rotation
+
+# Newton's method on so few unknowns doubles the right digits with each of these.
+_NEWTON_STEPS = 8
+
+
+def similarity(
+    parameters: Float[Array, "7"], position: Float[Array, "3"], rotation: Float[Array, "3 3"], centre, size
+) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
+    """An image moved by a similarity about `centre`: shifts and scale in units of `size`, rotations in rad."""
+    turn = small_rotation(parameters[3:6])
+    moved = centre + size * parameters[:3] + (1 + parameters[6]) * turn @ (position - centre)
+    return moved, rotation @ turn.T
+
+
+def open_motions(values: Values) -> int:
+    """How many motions are open, where these are all seven, or all but the scale, which distances give; else 0.
+
+    Those change no residual but the datum's wherever images and points are. Others (a turn about the only control
+    point) depend on the place.
+    """
+    k = len(values.datum_eop)
+    return k if k == 7 or (k == 6 and len(values.distances)) else 0
+
+
+def onto_datum(at: At) -> Increments:
+    """The increments moved by the similarity that meets the datum's constraints, found by Newton's method."""
+    y, scale, values, _ = at
+    k = open_motions(values)
+    centre = values.points.mean(axis=1)
+    size = jnp.sqrt(jnp.mean(jnp.sum((values.points - centre[:, None]) ** 2, axis=0)))
+    safe = jax.tree.map(lambda v: jnp.where(v > 0, v, 1.0), scale)
+
+    def moved(y: Increments, parameters: Float[Array, "k"]) -> Increments:
+        state = At(y, *at[1:]).state
+        parameters = jnp.concatenate([parameters, jnp.zeros(7 - k)])
+        image = lambda x, r: similarity(parameters, x, r, centre, size)  # noqa: E731
+        position, rotation = jax.vmap(image, in_axes=(1, 2), out_axes=(1, 2))(state.position, state.rotation)
+        points = jax.vmap(lambda x: image(x, jnp.eye(3))[0], 1, 1)(state.points)
+        turned = jax.vmap(lambda r, start: small_angles(r @ start.T), 2, 1)(rotation, values.rotation)
+        eop = jnp.concatenate([position - values.position, turned]) / safe.eop
+        return Increments(eop, y.shared, (points - values.points) / safe.points)
+
+    def newton(_, y: Increments) -> Increments:
+        def violation(parameters):
+            x = moved(y, parameters)
+            eop = jnp.einsum("kci,ci->k", values.datum_eop * scale.eop, x.eop)
+            return eop + jnp.einsum("kcp,cp->k", values.datum_points * scale.points, x.points)
+
+        zero = jnp.zeros(k)
+        return moved(y, -jnp.linalg.solve(jax.jacfwd(violation)(zero), violation(zero)))
+
+    return jax.lax.fori_loop(0, _NEWTON_STEPS, newton, y)
