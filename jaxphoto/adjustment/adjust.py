@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import operator
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import equinox as eqx
 import jax
@@ -18,6 +18,7 @@ from jaxphoto.adjustment.rank import check_priors, check_rank
 from jaxphoto.adjustment.residuals import Residuals, State, Values, state_at
 from jaxphoto.adjustment.result import Adjustment, Factored, Padded
 from jaxphoto.adjustment.shards import usable
+from jaxphoto.adjustment.solver import zero_system
 from jaxphoto.adjustment.structure import Structure, structure_of
 from jaxphoto.adjustment.values import at_state, unknowns_of, values_of, with_datum
 from jaxphoto.arrays import still
@@ -29,7 +30,12 @@ MAX_STEPS = 100
 
 
 def solve(
-    block: Block, start: Unknowns, priors: Unknowns, max_steps: int = MAX_STEPS, sizes: Sizes = LEAST
+    block: Block,
+    start: Unknowns,
+    priors: Unknowns,
+    max_steps: int = MAX_STEPS,
+    sizes: Sizes = LEAST,
+    meanwhile: Callable[[Padded, dict[str, float]], None] = lambda padded, seconds: None,
 ) -> Adjustment:
     """Least-squares adjustment of `block` from `start`, with what `priors` leaves free.
 
@@ -37,7 +43,8 @@ def solve(
     function theorem, exactly), as long as ids and index arrays stay concrete. `start` needs all images and points;
     `jaxphoto.adjust` finds what is missing first.
 
-    `sizes` are sizes to compile for at least (`common_sizes`).
+    `sizes` are sizes to compile for at least (`common_sizes`). `meanwhile` is called while the adjustment compiles,
+    with arrays of the types that its result will have, to `prepare` what will be wanted of it, and with its seconds.
 
     Raises DatumError where the observations leave the datum open and no constraint closes it, RankError where they
     do not see an unknown or cannot tell unknowns apart.
@@ -63,6 +70,9 @@ def solve(
         # The longest first: the other is traced while it compiles.
         prepare(_optimise, arguments, seconds)
         prepare(_residuals, (numbers, wide), seconds)
+        if shards == 1:
+            # What comes from several devices is of types of its own.
+            meanwhile(Padded(wide, numbers, _factored_like(numbers, wide), places), seconds)
         optimum, state, _ = run_compiled(_optimise, arguments, seconds, "solve")
         # What comes back from several devices is of another type to a program than what went in.
         state = State(*map(still, state))
@@ -88,6 +98,16 @@ def solve(
     if not traced:
         check_rank(adjusted)
     return adjusted
+
+
+def _factored_like(values: Values, structure: Structure) -> Factored:
+    """Arrays of the right types that take no memory."""
+    zero = zero_increments(structure)
+    system = jax.eval_shape(zero_system, zero, values, structure)
+    reduced, factor, scale = jax.tree.map(
+        lambda v: np.broadcast_to(0.0, v.shape), (system.reduced, system.factor, zero)
+    )
+    return Factored(reduced, factor, scale, values.datum_eop.shape[0])
 
 
 # Image rows that keep a device busy for longer than adding its sums to those of others takes.

@@ -20,7 +20,6 @@ from jaxphoto.adjustment.tiles import (
     Scene,
     by_point,
     by_tile,
-    each_tile,
     of_images,
     rows,
     scene_of,
@@ -30,7 +29,6 @@ from jaxphoto.adjustment.tiles import (
 
 def over_tiles(function: Callable, at: At, reduced: Reduced, numbers: tuple) -> Any:
     """`function(F, images, *numbers)` of every tile, for the F of `reduced`, linearised `at`."""
-    tiles = at.structure.in_tiles
     if reduced.f is None:
         rest = other_rows(at)
         parts_of = tile_parts(at, reduced.damping, rest.coupled)
@@ -42,7 +40,7 @@ def over_tiles(function: Callable, at: At, reduced: Reduced, numbers: tuple) -> 
         image, given, *own = of_tile
         return function(f_of(given), image, *own)
 
-    return jax.lax.map(lambda chunk: each_tile(tile, chunk, tiles), (tiles.image, given, *numbers))
+    return each_tile_of(tile, (given, *numbers), at.structure)
 
 
 def solve_factored(reduced: Reduced, factor: BandFactor, b: Increments, at: At) -> Increments:
@@ -101,8 +99,7 @@ def gradient(at: At, reduced: Reduced, there: At):
     numbers = (by_tile(v, tiles) for v in (points, scale.points, b_others.points))
     to_scene, b, square = each_tile_of(tile, (*numbers, values.xy, values.sigma_xy), s)
     eop, shared = pull_scene(total(_by_image(to_scene, scene, s), s))
-    b_p = by_point(b.reshape(*tiles.image.shape[:2], *b.shape[1:]))
-    b = Increments(eop + b_others.eop, shared + b_others.shared, b_p)
+    b = Increments(eop + b_others.eop, shared + b_others.shared, by_point(b))
     return b, *reduce_right(reduced, b, there), with_others(jnp.sum(square), others, s)
 
 
@@ -121,9 +118,8 @@ def _by_image(parts: Scene, scene: Scene, s: Structure) -> Scene:
     image, n = s.in_tiles.image.reshape(-1), scene.centre.shape[0]
 
     def of_image(v):
-        return jax.ops.segment_sum(v.reshape(-1, *v.shape[2:]), image, n)
+        return jax.ops.segment_sum(v.reshape(-1, *v.shape[3:]), image, n)
 
-    cameras = tuple(
-        jnp.sum(v, axis=0) if len(g.names) == 1 else of_image(v) for g, v in zip(s.groups, parts.cameras, strict=True)
-    )
+    by_group = zip(s.groups, parts.cameras, strict=True)
+    cameras = tuple(jnp.sum(v, axis=(0, 1)) if len(g.names) == 1 else of_image(v) for g, v in by_group)
     return Scene(of_image(parts.centre), of_image(parts.rotation), cameras)

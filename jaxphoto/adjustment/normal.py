@@ -117,9 +117,10 @@ def with_others(image: Float[Array, ""], others: Residuals, s: Structure) -> Flo
 
 
 def each_tile_of(function, numbers, s: Structure):
-    """`function` of (image, *numbers) of every tile of every chunk."""
-    joined = jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), (s.in_tiles.image, *numbers))
-    return each_tile(function, joined, s.in_tiles)
+    """`function` of (image, *numbers) of every tile, chunks and tiles first."""
+    tiles = s.in_tiles
+    given = ((tiles.image, *numbers), tiles.groups)
+    return jax.lax.map(lambda chunk: each_tile(function, chunk[0], chunk[1], tiles), given)
 
 
 def cholesky_3x3(v: Float[Array, "3 3 n"]) -> Float[Array, "6 n"]:

@@ -60,6 +60,8 @@ def sizes_of(structure: Structure) -> Sizes:
 
 # Tiles are summed in chunks whose products take no more numbers than this.
 _CHUNK = 4_000_000
+# Up to so many images, a larger reduced matrix costs less than another program.
+_SMALL = 64
 # Slots that are computed with at a time.
 _SLOTS = 4000
 
@@ -88,7 +90,7 @@ class _Layout(NamedTuple):
         tiling = tile_points(image, s.point, s.n_points, m, p)
         tiles = max(len(tiling.image), wanted.tiles)
         images, bandwidth = max(s.n_images + 1, wanted.images), max(bandwidth, wanted.bandwidth)
-        n = size_class(images, 16)
+        n = size_class(images, 32 if images <= _SMALL else 16)
         columns, width = (1, n) if dense else column_blocks(n, min(n, size_class(bandwidth, 8)))
         per_shard = -(-tiles // shards)
         chunks = -(-per_shard * (6 * m) ** 2 // _CHUNK)
@@ -176,6 +178,7 @@ def pad_structure(
         tiles=Tiles(
             image=tile_image.reshape(n_chunks, layout.chunk, m),
             per_tile=p,
+            groups=-(-np.clip(len(own) - layout.chunk * np.arange(n_chunks), 0, layout.chunk) // layout.at_once),
             at_once=layout.at_once,
             pair_tile=listed[..., 0],
             pair_images=listed[..., 1:],

@@ -94,8 +94,8 @@ def reduce_normal(at: At, damping) -> tuple[Band, Reduced, Right]:
         return gram[: 6 * m, : 6 * m], own, gram[6 * m :, 6 * m :], f, p.l, p.b, p.diagonal
 
     def add_chunk(sums, numbers):
-        (pair_tile, pair_images, pair_block, block), of_tiles = numbers
-        grams, own, border, *kept = each_tile(tile, of_tiles, tiles)
+        (pair_tile, pair_images, pair_block, block), groups, of_tiles = numbers
+        grams, own, border, *kept = each_tile(tile, of_tiles, groups, tiles)
         grams = grams.reshape(chunk, m, 6, m, 6)[pair_tile, pair_images[:, 0], :, pair_images[:, 1]]
         grams = jax.ops.segment_sum(grams, pair_block, len(block), indices_are_sorted=True)
         own = _sum_by(own.reshape(chunk * m, -1), of_tiles[0].reshape(-1), n)
@@ -108,9 +108,11 @@ def reduce_normal(at: At, damping) -> tuple[Band, Reduced, Right]:
         jnp.zeros((c, c)),
     )
     lists = (tiles.pair_tile, tiles.pair_images, tiles.pair_block, tiles.block)
-    sums, (f, *of_points) = jax.lax.scan(add_chunk, zero, (lists, tile_numbers(at, rest)))
+    sums, (f, *of_points) = jax.lax.scan(add_chunk, zero, (lists, tiles.groups, tile_numbers(at, rest)))
     (columns, last), own, border = total(sums, s)
     l, b_points, v = map(by_point, of_points)  # noqa: E741
+    # Tiles that are padding were not computed: their points are each by itself.
+    l = jnp.where(l[0] == 0, jnp.array([1.0, 0, 1, 0, 0, 1])[:, None], l)  # noqa: E741
 
     m_images = _with_other_rows(own[:, : (7 + q) ** 2].reshape(n, 7 + q, 7 + q), blocks, others, s)
     met = own[:, (7 + q) ** 2 :].reshape(n, 6, c)

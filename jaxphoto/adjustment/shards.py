@@ -26,7 +26,7 @@ def along_points(ndim: int) -> Any:
     return P(*[None] * (ndim - 1), AXIS)
 
 
-_OF_TILES = {"xy", "sigma_xy", "pair_tile", "pair_images", "pair_block", "block", "f"}
+_OF_TILES = {"xy", "sigma_xy", "pair_tile", "pair_images", "pair_block", "block", "groups", "f"}
 _OF_POINTS = {"points", "control", "sigma_control", "datum_points", "point_free", "point_class", "l"}
 
 

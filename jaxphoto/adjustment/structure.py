@@ -49,6 +49,8 @@ class Tiles(eqx.Module):
     image: Int[np.ndarray, "chunks tiles m"]
     per_tile: int = eqx.field(static=True)
     """Points of a tile, P."""
+    groups: Int[np.ndarray, "chunks"]
+    """How many groups of `at_once` tiles hold the points of each chunk: the first ones; the others are padding."""
     at_once: int = eqx.field(static=True)
     """Tiles that are computed with at a time: few enough for the cache of a core, enough to be worth its while."""
     pair_tile: Int[np.ndarray, "chunks pairs"]

@@ -196,14 +196,21 @@ def by_point(array: Float[Array, "chunks tiles *c p"]) -> Float[Array, "*c point
     return joined.reshape(*joined.shape[:-3], -1)
 
 
-def each_tile(function: Callable, numbers: Any, tiles: Tiles) -> Any:
-    """`function` of every tile's numbers, a few tiles at a time: what that needs stays in the cache of a core."""
-    n = tiles.at_once
+def each_tile(function: Callable, numbers: Any, groups: Array, tiles: Tiles) -> Any:
+    """`function` of every tile's numbers, a few tiles at a time: what that needs stays in the cache of a core.
+
+    Tiles after the first `groups` of them are padding; their results are zero.
+    """
+    n, some = tiles.at_once, jax.vmap(function)
     count = len(jax.tree.leaves(numbers)[0]) // n
     if count == 1:
-        # As a loop would: what uses the results shall not compute them again.
-        return jax.lax.optimization_barrier(jax.vmap(function)(numbers))
-    if n == 1:
-        return jax.lax.map(function, numbers)
-    some = jax.tree.map(lambda v: v.reshape(count, n, *v.shape[1:]), numbers)
-    return jax.tree.map(lambda v: v.reshape(count * n, *v.shape[2:]), jax.lax.map(jax.vmap(function), some))
+        return some(numbers)
+    split = jax.tree.map(lambda v: jnp.asarray(v).reshape(count, n, *v.shape[1:]), numbers)
+    group = lambda k: some(jax.tree.map(lambda v: jax.lax.dynamic_index_in_dim(v, k, keepdims=False), split))  # noqa: E731
+    zero = jax.tree.map(lambda v: jnp.zeros((count, *v.shape), v.dtype), jax.eval_shape(group, 0))
+
+    def add(k, results):
+        return jax.tree.map(lambda v, new: jax.lax.dynamic_update_index_in_dim(v, new, k, 0), results, group(k))
+
+    results = jax.lax.fori_loop(0, groups, add, zero)
+    return jax.tree.map(lambda v: v.reshape(count * n, *v.shape[2:]), results)

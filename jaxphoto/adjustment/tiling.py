@@ -69,19 +69,20 @@ def size_class(n: int, step: int) -> int:
 def tile_shape(image: np.ndarray, point: np.ndarray, n_images: int, n_points: int) -> tuple[int, int]:
     """Images and points of a tile that make the sums cheapest, found on a part of the block; see `_cost`.
 
-    Points are the fewest of 8, 16 and 32 with which `TILES` tiles hold the block, so that small blocks differ in
-    little that they are compiled for.
+    Shapes are few, so that small blocks differ in little that they are compiled for: images are a multiple of 12, or
+    all; points 8 for fewer than 32 images where `TILES` tiles hold the block, else 32. Padding takes no time.
     """
     order, images = _in_order(image, point, n_points)
     part = order[: min(len(order), _PART)]
     most = max(1, max(map(len, images), default=1))
+    small = n_images < 32 and n_points <= 8 * TILES
 
     def option(m: int) -> tuple[float, int, int]:
-        tiles = {p: len(_cut(part, images, m, p)) for p in (8, 16, 32)}
-        p = next((p for p in tiles if tiles[p] <= TILES), 32)
-        return _cost(size_class(tiles[p], TILES), m, p), m, p
+        p = 8 if small and len(_cut(order, images, m, 8)) <= TILES else 32
+        return _cost(len(_cut(part, images, m, p)), m, p), m, p
 
-    widths = {size_class(int(np.ceil(min(k * most, n_images))), 4) for k in (1, 1.25, 1.5, 2)}
+    all_images = size_class(n_images, 8)
+    widths = {min(size_class(int(np.ceil(k * most)), 12), all_images) for k in (1, 1.25, 1.5, 2)}
     return min(map(option, widths))[1:]
 
 

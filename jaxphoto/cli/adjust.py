@@ -12,7 +12,7 @@ import jaxphoto
 from jaxphoto.cli.app import app
 from jaxphoto.errors import JaxphotoError
 from jaxphoto.io import read_block
-from jaxphoto.procedures import adjust
+from jaxphoto.procedures import adjust_for_tables
 from jaxphoto.report import Tables, check_target, prepare_pictures, print_adjustment, warnings_of, write_results
 from jaxphoto.statistics import EOP_NAMES
 
@@ -40,7 +40,7 @@ def adjust_command(
             f"adjusting {len(read.images)} images, {len(read.points)} points, "
             f"{len(read.image_points.image)} image points"
         )
-        adjusted = adjust(read, max_steps=max_steps)
+        adjusted = adjust_for_tables(read, max_steps)
         status.update("computing statistics")
         tables = Tables(adjusted, rotations)  # type: ignore[arg-type]
         verdict = warnings_of(tables)

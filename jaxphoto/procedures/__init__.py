@@ -1,8 +1,18 @@
 """What a photogrammetrist does with all this, as short scripts over the rooms below."""
 
-from jaxphoto.procedures.adjust import adjust
+from jaxphoto.procedures.adjust import adjust, adjust_for_tables
 from jaxphoto.procedures.boresight import boresight, step_block
 from jaxphoto.procedures.boresight_judgement import Estimate, Step, judge
 from jaxphoto.procedures.georeference import Georeferenced, georeference
 
-__all__ = ["Estimate", "Georeferenced", "Step", "adjust", "boresight", "georeference", "judge", "step_block"]
+__all__ = [
+    "Estimate",
+    "Georeferenced",
+    "Step",
+    "adjust",
+    "adjust_for_tables",
+    "boresight",
+    "georeference",
+    "judge",
+    "step_block",
+]

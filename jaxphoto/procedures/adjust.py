@@ -3,6 +3,7 @@
 from jaxphoto.adjustment import LEAST, MAX_STEPS, Adjustment, Sizes, solve
 from jaxphoto.block import Block
 from jaxphoto.orientation import approximate
+from jaxphoto.statistics import prepare_statistics
 from jaxphoto.unknowns import Unknowns
 
 
@@ -31,3 +32,8 @@ def adjust(
     if start is None:
         start = approximate(block)
     return solve(block, start, block.priors if priors is None else priors, max_steps, sizes)
+
+
+def adjust_for_tables(block: Block, max_steps: int = MAX_STEPS) -> Adjustment:
+    """`adjust`, with what tables and report will want compiled meanwhile."""
+    return solve(block, approximate(block), block.priors, max_steps, meanwhile=prepare_statistics)

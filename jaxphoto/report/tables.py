@@ -24,7 +24,6 @@ from jaxphoto.statistics import (
     covariance,
     normalised_residuals,
     physical_residuals,
-    prepare_redundancy,
     redundancy_numbers,
     residual_spread,
     significance,
@@ -45,8 +44,6 @@ class Tables:
     @cached_property
     def covariance(self) -> Covariance:
         """Covariance with omega, phi, kappa."""
-        # All tables need both.
-        prepare_redundancy(self.adjusted)
         return covariance(self.adjusted)
 
     @cached_property

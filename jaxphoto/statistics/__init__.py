@@ -12,7 +12,7 @@ from jaxphoto.statistics.discrepancy import (
     residual_spread,
     spread_of,
 )
-from jaxphoto.statistics.reliability import LEAST_CHECKED, normalised_residuals, prepare_redundancy, redundancy_numbers
+from jaxphoto.statistics.reliability import LEAST_CHECKED, normalised_residuals, prepare_statistics, redundancy_numbers
 from jaxphoto.statistics.significance import (
     SIGNIFICANT_RATIO,
     Significance,
@@ -25,5 +25,5 @@ __all__ = [
     "EOP_NAMES", "LEAST_CHECKED", "SIGNIFICANT_RATIO", "Correlations", "Covariance", "Rotations", "Significance",
     "Spread", "a_priori_sigmas", "angle_differences", "check_discrepancies", "chi_square_p", "correlation_matrix",
     "correlations", "covariance", "critical_value", "normalised_residuals", "physical_residuals", "point_differences",
-    "prepare_redundancy", "redundancy_numbers", "residual_spread", "significance", "spread_of",
+    "prepare_statistics", "redundancy_numbers", "residual_spread", "significance", "spread_of",
 ]  # fmt: skip

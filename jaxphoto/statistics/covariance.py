@@ -27,12 +27,12 @@ from jaxphoto.adjustment.optimum import weigh_datum
 from jaxphoto.adjustment.padding import crop_reduced
 from jaxphoto.adjustment.reduced import tile_columns
 from jaxphoto.adjustment.residuals import Increments, Values
-from jaxphoto.adjustment.result import Factored
+from jaxphoto.adjustment.result import Factored, Padded
 from jaxphoto.adjustment.shards import TILES, sharded
 from jaxphoto.adjustment.structure import Structure
 from jaxphoto.adjustment.tiles import by_tile
 from jaxphoto.arrays import Numbers, still
-from jaxphoto.compiling import run_compiled
+from jaxphoto.compiling import prepare, run_compiled
 from jaxphoto.rotation import omega_phi_kappa_from_matrix, small_rotation
 
 Rotations = Literal["omega_phi_kappa", "object", "camera"]
@@ -108,15 +108,22 @@ def covariance(adjusted: Adjustment, rotations: Rotations = "omega_phi_kappa") -
     )
 
 
+def prepare_covariance(padded: Padded, seconds: dict[str, float]) -> None:
+    """Have what `covariance` needs compiled in the background."""
+    prepare(_covariance, _given(padded, "omega_phi_kappa", of_rows=False), seconds)
+
+
 def image_row_cofactors(adjusted: Adjustment, rotations: Rotations) -> Float[Array, "chunks tiles 2 m p"]:
     """j Q j' of every image row, by the program that `covariance` has run with these `rotations`."""
     return _run(adjusted, rotations, of_rows=True)[3]
 
 
 def _run(adjusted: Adjustment, rotations: Rotations, of_rows: bool):
-    padded = adjusted.computed
-    given = (padded.values, padded.factored, padded.structure, rotations, np.array(of_rows))
-    return run_compiled(_covariance, given, adjusted.seconds, "covariance")
+    return run_compiled(_covariance, _given(adjusted.computed, rotations, of_rows), adjusted.seconds, "covariance")
+
+
+def _given(padded: Padded, rotations: Rotations, of_rows: bool) -> tuple:
+    return padded.values, padded.factored, padded.structure, rotations, np.array(of_rows)
 
 
 @eqx.filter_jit

@@ -17,10 +17,10 @@ from jaxphoto.adjustment.optimum import weigh_datum
 from jaxphoto.adjustment.padding import crop_residuals
 from jaxphoto.adjustment.reduced import other_rows
 from jaxphoto.adjustment.residuals import Residuals, Values
-from jaxphoto.adjustment.result import Factored
+from jaxphoto.adjustment.result import Factored, Padded
 from jaxphoto.adjustment.structure import Structure
 from jaxphoto.compiling import prepare, run_compiled
-from jaxphoto.statistics.covariance import Cofactors, Covariance, image_row_cofactors
+from jaxphoto.statistics.covariance import Cofactors, Covariance, image_row_cofactors, prepare_covariance
 
 LEAST_CHECKED = 0.01
 """Redundancy number below which a normalised residual is mostly rounding and judges nothing."""
@@ -28,16 +28,12 @@ LEAST_CHECKED = 0.01
 _UNCHECKED = 1e-6
 
 
-def prepare_redundancy(adjusted: Adjustment) -> None:
-    """Have what `redundancy_numbers` needs compiled in the background, beside what `covariance` needs."""
-    padded = adjusted.computed
-    if padded.structure.in_tiles.shards > 1:
-        # What comes from several devices is of a type of its own.
-        return
+def prepare_statistics(padded: Padded, seconds: dict[str, float]) -> None:
+    """Have what `covariance` and `redundancy_numbers` need compiled in the background; see `solve`."""
+    prepare_covariance(padded, seconds)
     s, n = padded.structure, 6 * padded.structure.n_images + padded.structure.n_shared
-    # Arrays of the right types that take no memory.
     *cofactors, rows = (np.broadcast_to(0.0, v) for v in ((n, n), (s.n_points, 3, 3), padded.values.xy.shape))
-    prepare(_redundancy, (padded.values, Cofactors._make(cofactors), rows, padded.factored, s), adjusted.seconds)
+    prepare(_redundancy, (padded.values, Cofactors._make(cofactors), rows, padded.factored, s), seconds)
 
 
 def redundancy_numbers(adjusted: Adjustment, covariance: Covariance) -> Residuals:
