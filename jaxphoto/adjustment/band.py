@@ -65,7 +65,6 @@ def factor_band(band: Band) -> BandFactor:
     if not inner:
         return BandFactor(band.columns, band.border, _cholesky(band.end))
     border = _split_border(band.border, inner)
-    zero = jnp.zeros_like(border[0])
 
     def eliminate(left, at):
         diagonal, shared, corner = left
@@ -83,7 +82,7 @@ def factor_band(band: Band) -> BandFactor:
     following = jnp.concatenate([border[1:], band.end[None, m:, :m]])
     left = (band.columns[0, :m], border[0], band.end[m:, m:])
     (diagonal, shared, corner), (columns, borders) = jax.lax.scan(eliminate, left, (np.arange(inner), following))
-    end = _cholesky(jnp.block([[diagonal, zero.T], [shared, corner]]))
+    end = _cholesky(_with_border(diagonal, shared, corner))
     return BandFactor(columns, _join_border(borders), end)
 
 
@@ -94,10 +93,10 @@ def solve_band(factor: BandFactor, right: Float[Array, "unknowns *c"]) -> Float[
     """
     columns, border, end = factor
     inner, _, m = columns.shape
-    if not inner:
-        return _solve_transposed(end, _solve(end, right.reshape(len(right), -1))).reshape(right.shape)
-    n = (inner + 1) * m
     b = right.reshape(len(right), -1)
+    if not inner:
+        return _solve_transposed(end, _solve(end, b)).reshape(right.shape)
+    n = (inner + 1) * m
     images, shared = b[:n].reshape(inner + 1, m, -1), b[n:]
 
     # Columns are read in place: as what the scans run over they would be copied, which takes as long as the solution.

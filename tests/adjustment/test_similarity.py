@@ -1,0 +1,84 @@
+"""Free networks: brought to their datum as a whole, and found from starts that are far off."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxphoto import adjust
+from jaxphoto.adjustment.normal import At, residuals_at
+from jaxphoto.adjustment.optimum import unit_scale, zero_increments
+from jaxphoto.adjustment.similarity import onto_datum, open_motions
+from jaxphoto.block import Datum, Distances, Rows
+from jaxphoto.rotation import small_rotation
+from tests.adjustment.dense import prepared
+from tests.blocks import BROWN, aerial, bare, measured, simulated
+
+BARE = bare(aerial(), {"one": BROWN}, ("one",) * 10)
+BAR = Distances(np.array([[3, 37]]), np.zeros(1), np.array([0.01]))
+
+
+def free_network(kind: str, distances=None):
+    """The aerial block with image points alone, and perhaps a bar."""
+    own = {"stations": Rows.none(), "datum": Datum(kind), "distances": distances or Distances.none()}
+    return measured(BARE._replace(block=dataclasses.replace(BARE.block, **own))).block
+
+
+@pytest.mark.parametrize("kind", ["inner", "minimal"])
+@pytest.mark.parametrize(("distances", "motions"), [(None, 7), (BAR, 6)])
+def test_a_similarity_meets_the_constraints_and_changes_nothing_else(kind, distances, motions):
+    values, s, _ = prepared(free_network(kind, distances))
+    assert open_motions(values) == motions
+    rng = np.random.default_rng(3)
+    eop, shared, points = zero_increments(s)
+    draw = lambda v, size: jnp.asarray(rng.normal(0, size, v.shape))  # noqa: E731
+    y = eop.at[:3].set(draw(eop[:3], 80.0)).at[3:].set(draw(eop[3:], 0.2)), shared, draw(points, 40.0)
+    at = At(type(zero_increments(s))(*y), unit_scale(s), values, s)
+    before, after = (residuals_at(a) for a in (at, at._replace(increments=onto_datum(at))))
+    assert np.abs(before.datum).min() > 1.0
+    np.testing.assert_allclose(after.datum, 0.0, atol=1e-8)
+    np.testing.assert_allclose(after.image, before.image, rtol=1e-7, atol=1e-7 * np.abs(before.image).max())
+    np.testing.assert_allclose(after.distances, before.distances, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["inner_shift", "everything"])
+def test_motions_that_depend_on_the_place_are_left_to_the_solver(name):
+    values, _, _ = prepared(simulated(name).block)
+    assert open_motions(values) == 0
+
+
+def shape_of(adjusted):
+    """Distances of points from the first, in units of one of them."""
+    points = np.asarray(adjusted.unknowns.points)
+    length = np.linalg.norm(points[1:] - points[0], axis=1)
+    return length / length[0]
+
+
+def test_a_free_network_is_found_from_afar():
+    """Steps are rejected from there: the path goes on without the datum, and its end is brought to it."""
+    block = free_network("inner")
+    near = adjust(block)
+    rng, known = np.random.default_rng(1), near.unknowns
+    turn = np.asarray(jax.vmap(small_rotation)(rng.normal(0, 0.3, (len(block.images), 3))))
+    exterior = dataclasses.replace(
+        known.exterior,
+        position=known.exterior.position + rng.normal(0, 120.0, (len(block.images), 3)),
+        camera_from_object=turn @ known.exterior.camera_from_object,
+    )
+    points = known.points + rng.normal(0, 60.0, known.points.shape)
+    far = adjust(block, eqx.tree_at(lambda u: (u.exterior, u.points), known, (exterior, points)))
+    assert bool(far.converged)
+    # 20 with the constraints held all along, 12 as it is.
+    assert int(far.steps) < 16
+    assert float(far.square_sum) == pytest.approx(float(near.square_sum), rel=1e-9)
+    np.testing.assert_allclose(shape_of(far), shape_of(near), rtol=1e-6)
+    # The inner constraints over the points, about the start: no shift, no turn, no change of scale.
+    moved, arm = far.unknowns.points - points, points - points.mean(axis=0)
+    size = np.abs(moved).max()
+    assert size > 100
+    np.testing.assert_allclose(moved.mean(axis=0) / size, 0.0, atol=1e-9)
+    np.testing.assert_allclose(np.cross(arm, moved).mean(axis=0) / np.abs(arm).max() / size, 0.0, atol=1e-9)
+    np.testing.assert_allclose((arm * moved).mean() / np.abs(arm).max() / size, 0.0, atol=1e-9)
