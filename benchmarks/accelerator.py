@@ -149,7 +149,7 @@ def _work(padded: Padded) -> dict[str, float]:
     parts = tile_parts(at, 0.0, rest.coupled)
     numbers = jax.tree.map(lambda v: v[0, 0], tile_numbers(at, rest))
     cost = jax.jit(parts).lower(numbers).compile().cost_analysis() or {}
-    tiles = int(np.prod(s.in_tiles.image.shape[:2]))
+    tiles = int(np.sum(s.in_tiles.groups)) * s.in_tiles.at_once
     m, p = s.in_tiles.image.shape[2], s.in_tiles.per_tile
     f = 6 * m + s.n_interior + len(rest.coupled) + 1
     products = 2 * 3 * p * f**2 + 2 * 2 * p * m * (7 + s.n_image_colours) ** 2

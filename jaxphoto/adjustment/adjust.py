@@ -70,9 +70,7 @@ def solve(
         # The longest first: the other is traced while it compiles.
         prepare(_optimise, arguments, seconds)
         prepare(_residuals, (numbers, wide), seconds)
-        if shards == 1:
-            # What comes from several devices is of types of its own.
-            meanwhile(Padded(wide, numbers, _factored_like(numbers, wide), places), seconds)
+        meanwhile(Padded(wide, numbers, _factored_like(numbers, wide), places), seconds)
         optimum, state, _ = run_compiled(_optimise, arguments, seconds, "solve")
         # What comes back from several devices is of another type to a program than what went in.
         state = State(*map(still, state))

@@ -61,7 +61,7 @@ def reduce_right(reduced: Reduced, b: Increments, at: At) -> tuple[Array, Array]
 
 
 def solve_reduced(reduced: Reduced, factor: BandFactor, right, d, b_points, at: At) -> Increments:
-    """The same with the right-hand side taken down already: `right` to the reduced unknowns, `d` to mu."""
+    """`solve_factored` with the right-hand side taken down already: `right` to the reduced unknowns, `d` to mu."""
     r, s, n = reduced, at.structure, at.structure.n_images
     if len(d):
         right = right - r.g @ jnp.linalg.solve(r.k, d)

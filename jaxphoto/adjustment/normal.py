@@ -1,4 +1,4 @@
-"""Normal equations with the points eliminated: solution and products.
+"""Normal equations with the points eliminated: symbols, residuals and their square sum, factors of the points.
 
 In scaled increments, with e the exterior orientations, s the shared unknowns and p the points,
 

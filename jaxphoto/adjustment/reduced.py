@@ -59,7 +59,7 @@ class OtherRows(NamedTuple):
 
 
 class TileParts(NamedTuple):
-    """What a tile's statistics and sums are made of."""
+    """What a tile's sums are made of."""
 
     columns: tuple[Columns, Columns]
     f: Float[Array, "6m+border 3p"]

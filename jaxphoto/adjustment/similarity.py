@@ -8,8 +8,8 @@ from jaxphoto.adjustment.normal import At
 from jaxphoto.adjustment.residuals import Increments, Values
 from jaxphoto.rotation import small_angles, small_rotation
 
-# Newton's method on so few unknowns doubles the right digits with each of these.
-_NEWTON_STEPS = 8
+# Newton's method on so few unknowns, begun so near, doubles the right digits with each of these.
+_NEWTON_STEPS = 5
 
 
 def similarity(
@@ -25,19 +25,23 @@ def open_motions(values: Values) -> int:
     """How many motions are open, where these are all seven, or all but the scale, which distances give; else 0.
 
     Those change no residual but the datum's wherever images and points are. Others (a turn about the only control
-    point) depend on the place.
+    point, a shift that a strip's goes along with) depend on the place, or on more than images and points.
     """
-    k = len(values.datum_eop)
-    return k if k == 7 or (k == 6 and len(values.distances)) else 0
+    k, georeferenced = len(values.datum_eop), len(values.stations) + values.attitudes.shape[1]
+    return k if not georeferenced and (k == 7 or (k == 6 and len(values.distances))) else 0
 
 
 def onto_datum(at: At) -> Increments:
-    """The increments moved by the similarity that meets the datum's constraints, found by Newton's method."""
+    """The increments moved by the similarity that meets the datum's constraints.
+
+    Newton's method finds it from the one that brings the points nearest to their start (Umeyama 1991); where it does
+    not, the increments stay as they are.
+    """
     y, scale, values, _ = at
     k = open_motions(values)
     centre = values.points.mean(axis=1)
     size = jnp.sqrt(jnp.mean(jnp.sum((values.points - centre[:, None]) ** 2, axis=0)))
-    safe = jax.tree.map(lambda v: jnp.where(v > 0, v, 1.0), scale)
+    scaled = lambda v, k: jnp.where(k > 0, v / jnp.where(k > 0, k, 1.0), 0.0)  # noqa: E731
 
     def moved(y: Increments, parameters: Float[Array, "k"]) -> Increments:
         state = At(y, *at[1:]).state
@@ -46,8 +50,8 @@ def onto_datum(at: At) -> Increments:
         position, rotation = jax.vmap(image, in_axes=(1, 2), out_axes=(1, 2))(state.position, state.rotation)
         points = jax.vmap(lambda x: image(x, jnp.eye(3))[0], 1, 1)(state.points)
         turned = jax.vmap(lambda r, start: small_angles(r @ start.T), 2, 1)(rotation, values.rotation)
-        eop = jnp.concatenate([position - values.position, turned]) / safe.eop
-        return Increments(eop, y.shared, (points - values.points) / safe.points)
+        eop = scaled(jnp.concatenate([position - values.position, turned]), scale.eop)
+        return Increments(eop, y.shared, scaled(points - values.points, scale.points))
 
     def newton(_, y: Increments) -> Increments:
         def violation(parameters):
@@ -58,4 +62,20 @@ def onto_datum(at: At) -> Increments:
         zero = jnp.zeros(k)
         return moved(y, -jnp.linalg.solve(jax.jacfwd(violation)(zero), violation(zero)))
 
-    return jax.lax.fori_loop(0, _NEWTON_STEPS, newton, y)
+    begin = moved(y, _nearest(at.state.points, values.points, scale.points[0] > 0, centre, size)[:k])
+    found = jax.lax.fori_loop(0, _NEWTON_STEPS, newton, begin)
+    finite = jnp.all(jnp.isfinite(found.eop)) & jnp.all(jnp.isfinite(found.points))
+    return jax.tree.map(lambda new, old: jnp.where(finite, new, old), found, y)
+
+
+def _nearest(points, start, own, centre, size) -> Float[Array, "7"]:
+    """Parameters of the similarity that takes `points` nearest to `start`; only `own` points count."""
+    weight = own / jnp.sum(own)
+    mean, target = points @ weight, start @ weight
+    a, b = points - mean[:, None], start - target[:, None]
+    u, d, vt = jnp.linalg.svd((b * weight) @ a.T)
+    sign = jnp.array([1.0, 1.0, 0.0]) + jnp.array([0.0, 0.0, 1.0]) * jnp.linalg.det(u @ vt)
+    turn = (u * sign) @ vt
+    scale = jnp.sum(d * sign) / jnp.sum(weight * a * a)
+    shift = (target - centre - scale * turn @ (mean - centre)) / size
+    return jnp.concatenate([shift, small_angles(turn), scale[None] - 1])

@@ -2,7 +2,7 @@
 
 optimistix runs the iteration. A step sums and factors the normal equations with their points eliminated (`reduced`,
 `band`), or, once steps shrink fast, keeps the factor and only takes the gradient anew: a chord step, which costs a
-third and near the optimum gains nearly as much.
+third to a half and near the optimum gains nearly as much.
 """
 
 from collections.abc import Callable
@@ -78,6 +78,16 @@ _ACCEPT, _LEAST_FACTOR = 0.001, 0.2
 _SLOWEST_SHOWN = 0.1
 # Steps that shrink like this go on with the same factor; a chord step that shrinks less than the second ends it.
 _CHORD, _CHORD_FAILS = 0.01, 0.3
+
+
+def _next_damping(state: Progress, accept: Bool[Array, ""], gain: Scalar) -> Scalar:
+    """Less after an accepted step, by the ratio of actual to promised reduction; more after a rejected one."""
+    less = state.damping * jnp.maximum(_LEAST_FACTOR, 1 - (2 * gain - 1) ** 3)
+    # Nothing else keeps a loose network's matrix regular.
+    less = jnp.maximum(less, jnp.where(state.loose, _FIRST_DAMPING, 0.0))
+    more = jnp.maximum(_DAMPING, _MORE_DAMPING * state.damping)
+    # A chord that fails says nothing about the damping: the next step has a factor of its own.
+    return jnp.where(state.chord, state.damping, jnp.where(accept, less, more))
 
 
 class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Increments, Scalar, Any, Progress]):
@@ -156,10 +166,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Increments, Scalar, Any
         reduction, promised = right.square_sum - square_sum, seen + 2 * damped
         accept = settled | (reduction >= _ACCEPT * promised)
         chord_failed = state.chord & ~(accept & (ratio < _CHORD_FAILS))
-        less = state.damping * jnp.maximum(_LEAST_FACTOR, 1 - (2 * reduction / promised - 1) ** 3)
-        more = jnp.maximum(_DAMPING, _MORE_DAMPING * state.damping)
-        # A chord that fails says nothing about the damping: the next step has a factor of its own.
-        damping = jnp.where(state.chord, state.damping, jnp.where(accept, less, more))
+        damping = _next_damping(state, accept, reduction / promised)
         pick = lambda a, b: jax.tree.map(lambda a, b: jnp.where(accept, a, b), a, b)  # noqa: E731
         next_y, loose, tighten = pick(new_y, y), state.loose, jnp.array(False)
         if open_motions(self.values):

@@ -199,9 +199,11 @@ def by_point(array: Float[Array, "chunks tiles *c p"]) -> Float[Array, "*c point
 def each_tile(function: Callable, numbers: Any, groups: Array, tiles: Tiles) -> Any:
     """`function` of every tile's numbers, a few tiles at a time: what that needs stays in the cache of a core.
 
-    Tiles after the first `groups` of them are padding; their results are zero.
+    Where there are several groups of `at_once` tiles, those after the first `groups` are padding; their results are
+    zero.
     """
-    n, some = tiles.at_once, jax.vmap(function)
+    # jit keeps the trace that the shape takes.
+    n, some = tiles.at_once, jax.jit(jax.vmap(function))
     count = len(jax.tree.leaves(numbers)[0]) // n
     if count == 1:
         return some(numbers)

@@ -70,7 +70,8 @@ def tile_shape(image: np.ndarray, point: np.ndarray, n_images: int, n_points: in
     """Images and points of a tile that make the sums cheapest, found on a part of the block; see `_cost`.
 
     Shapes are few, so that small blocks differ in little that they are compiled for: images are a multiple of 12, or
-    all; points 8 for fewer than 32 images where `TILES` tiles hold the block, else 32. Padding takes no time.
+    all; points 8 for fewer than 32 images where `TILES` tiles hold the block, else 32. Groups of tiles that are padding
+    take no time.
     """
     order, images = _in_order(image, point, n_points)
     part = order[: min(len(order), _PART)]

@@ -24,6 +24,7 @@ from jaxphoto.statistics import (
     covariance,
     normalised_residuals,
     physical_residuals,
+    prepare_statistics,
     redundancy_numbers,
     residual_spread,
     significance,
@@ -44,6 +45,8 @@ class Tables:
     @cached_property
     def covariance(self) -> Covariance:
         """Covariance with omega, phi, kappa."""
+        # Most tables need redundancy numbers, too.
+        prepare_statistics(self.adjusted.computed, self.adjusted.seconds)
         return covariance(self.adjusted)
 
     @cached_property

@@ -30,6 +30,9 @@ _UNCHECKED = 1e-6
 
 def prepare_statistics(padded: Padded, seconds: dict[str, float]) -> None:
     """Have what `covariance` and `redundancy_numbers` need compiled in the background; see `solve`."""
+    if padded.structure.in_tiles.shards > 1:
+        # What comes from several devices is of types of its own.
+        return
     prepare_covariance(padded, seconds)
     s, n = padded.structure, 6 * padded.structure.n_images + padded.structure.n_shared
     *cofactors, rows = (np.broadcast_to(0.0, v) for v in ((n, n), (s.n_points, 3, 3), padded.values.xy.shape))

@@ -1,6 +1,8 @@
 """The structured adjustment against dense linear algebra, on every kind of block."""
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
@@ -8,10 +10,14 @@ import scipy.optimize
 from jax.flatten_util import ravel_pytree
 
 from jaxphoto import adjust, covariance
+from jaxphoto.adjustment.band import factor_band
+from jaxphoto.adjustment.elimination import gradient, solve_factored
 from jaxphoto.adjustment.normal import At, residuals_at
 from jaxphoto.adjustment.optimum import typical_scale, unit_scale, weigh_datum, zero_increments
-from jaxphoto.adjustment.padding import crop_state
+from jaxphoto.adjustment.padding import crop_state, sizes_of
+from jaxphoto.adjustment.reduced import reduce_normal
 from jaxphoto.adjustment.residuals import state_at
+from jaxphoto.adjustment.structure import structure_of
 from jaxphoto.statistics import redundancy_numbers
 from tests.adjustment.dense import DAMPINGS, assemble, at_optimum, prepared, split
 from tests.blocks import VARIANTS, adjusted, covariance_of, simulated
@@ -53,6 +59,33 @@ def test_elimination_solves_the_dense_normal_equations(name, damping):
     assert (found[~dense.free] == 0).all()
     error = found[dense.free] - expected
     assert np.sqrt(error @ n @ error) < 1e-9 * np.sqrt(expected @ n @ expected)
+
+
+@pytest.mark.parametrize("damping", DAMPINGS)
+@pytest.mark.parametrize("name", ["everything", "inner", "minimal"])
+def test_many_tiles_solve_the_normal_equations(name, damping):
+    """Several groups of tiles, some of them padding: F is made anew. Products are those of the whole Jacobian."""
+    block = simulated(name).block
+    sizes = sizes_of(structure_of(block, block.priors))._replace(tiles=50, tile_images=24, tile_points=16)
+    values, s, _ = prepared(block, sizes=sizes)
+    assert not s.in_tiles.few and s.in_tiles.groups.max() < s.in_tiles.image.shape[1] // s.in_tiles.at_once
+    b, *others = _solved(weigh_datum(values, s), s, damping)
+    for found in others:
+        for one, two in zip(b, found, strict=True):
+            np.testing.assert_allclose(two, one, atol=1e-10 * np.abs(one).max())
+
+
+@eqx.filter_jit
+def _solved(values, s, damping):
+    """J'r by sums and by a gradient, and (N + damping W) x for the x that solves it."""
+    scale = typical_scale(values, s)
+    at = At(zero_increments(s), scale, values, s)
+    a, reduced, right = reduce_normal(at, damping)
+    x = solve_factored(reduced, factor_band(a), right.b, at)
+    _, push = jax.linearize(lambda y: residuals_at(at._replace(increments=y)), at.increments)
+    pull = jax.linear_transpose(push, at.increments)
+    added = jax.tree.map(lambda w, x: damping * w * x, reduced.weight, x)
+    return right.b, gradient(at, reduced, at)[0], jax.tree.map(jnp.add, pull(push(x))[0], added)
 
 
 @pytest.mark.parametrize("name", VARIANTS)

@@ -44,6 +44,16 @@ def test_a_similarity_meets_the_constraints_and_changes_nothing_else(kind, dista
     np.testing.assert_allclose(after.distances, before.distances, atol=1e-6)
 
 
+def test_a_network_turned_and_stretched_far_is_brought_back():
+    """Newton's method alone would not find it from there."""
+    values, s, _ = prepared(free_network("inner"))
+    turn = np.asarray(small_rotation(np.array([1.0, -1.5, 0.8])))
+    points = 3.0 * turn @ np.asarray(values.points) + 5000.0
+    at = At(zero_increments(s)._replace(points=jnp.asarray(points - values.points)), unit_scale(s), values, s)
+    found = onto_datum(at)
+    np.testing.assert_allclose(found.points, 0.0, atol=1e-6)
+
+
 @pytest.mark.parametrize("name", ["inner_shift", "everything"])
 def test_motions_that_depend_on_the_place_are_left_to_the_solver(name):
     values, _, _ = prepared(simulated(name).block)
