@@ -113,8 +113,6 @@ def other_residuals(increments: Increments, scale: Increments, values: Values, s
     """All residuals but those of the image rows, which are left empty (for them see `normal.residuals_at`)."""
     state = state_at(increments, scale, values, structure)
     stations, attitudes, control, distances = georeferencing_residuals(state, values, structure)
-    datum = jnp.einsum("kci,ci->k", values.datum_eop * scale.eop, increments.eop)
-    datum += jnp.einsum("kcp,cp->k", values.datum_points * scale.points, increments.points)
     priors = (values.priors - state.shared[structure.free[structure.weighted]]) / values.sigma_priors
     return Residuals(
         jnp.zeros((2, 0)),
@@ -123,8 +121,14 @@ def other_residuals(increments: Increments, scale: Increments, values: Values, s
         control / values.sigma_control,
         distances / values.sigma_distances,
         priors,
-        datum,
+        datum_residuals(increments, scale, values),
     )
+
+
+def datum_residuals(increments: Increments, scale: Increments, values: Values) -> Float[Array, "constraints"]:
+    """By how much the constraints of the datum are violated."""
+    eop = jnp.einsum("kci,ci->k", values.datum_eop * scale.eop, increments.eop)
+    return eop + jnp.einsum("kcp,cp->k", values.datum_points * scale.points, increments.points)
 
 
 def georeferencing_residuals(state: State, values: Values, structure: Structure) -> tuple[Array, ...]:

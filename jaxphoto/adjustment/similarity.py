@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxphoto.adjustment.normal import At
-from jaxphoto.adjustment.residuals import Increments, Values
+from jaxphoto.adjustment.residuals import Increments, Values, datum_residuals
 from jaxphoto.rotation import small_angles, small_rotation
 
 # Newton's method on so few unknowns, begun so near, doubles the right digits with each of these.
@@ -54,11 +54,7 @@ def onto_datum(at: At) -> Increments:
         return Increments(eop, y.shared, scaled(points - values.points, scale.points))
 
     def newton(_, y: Increments) -> Increments:
-        def violation(parameters):
-            x = moved(y, parameters)
-            eop = jnp.einsum("kci,ci->k", values.datum_eop * scale.eop, x.eop)
-            return eop + jnp.einsum("kcp,cp->k", values.datum_points * scale.points, x.points)
-
+        violation = lambda parameters: datum_residuals(moved(y, parameters), scale, values)  # noqa: E731
         zero = jnp.zeros(k)
         return moved(y, -jnp.linalg.solve(jax.jacfwd(violation)(zero), violation(zero)))
 
