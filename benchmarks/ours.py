@@ -51,7 +51,7 @@ def block_of(problem: Problem, title: str) -> Block:
         sensors={"cam": Sensor(4500, 3000, 0.008)},
         image_camera=("cam",) * n_images,
         image_mount=("",) * n_images,
-        image_strip=("",) * n_images,
+        image_strip=tuple(f"S{k}" for k in p.strip),
         image_time=np.zeros(n_images),
         image_points=ImageRows(p.obs_img, p.obs_pt, p.obs_xy, np.full(p.obs_xy.shape, p.sigma_img)),
         control=_rows(p.gcp_pt, p.gcp_obs, p.gcp_sigma),

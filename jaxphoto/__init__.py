@@ -54,6 +54,7 @@ from jaxphoto.collinearity import ExteriorOrientation, image_ray, intersect, pro
 from jaxphoto.errors import BlockError, DatumError, InputError, JaxphotoError, RankError
 from jaxphoto.georeferencing import Mount, StripBias, Surface, direct_orientation, ground_point
 from jaxphoto.procedures import adjust, boresight, georeference
+from jaxphoto.sensitivity import bias, monte_carlo, noise, readjust
 from jaxphoto.simulation import simulate
 from jaxphoto.statistics import angle_differences, covariance, point_differences
 from jaxphoto.unknowns import FIXED, FREE, Unknowns, Weighted
@@ -69,10 +70,11 @@ __all__ = [
     "BlockError", "Brown", "Brown14", "BundlerRadial", "DatumError", "Ebner", "ExteriorOrientation", "Gruen",
     "InputError", "InteriorOrientation", "JaxphotoError", "Mount", "Outcome", "PpsRadial", "RadialPolynomial",
     "RankError", "Sensor", "Smac", "StripBias", "Surface", "Tables", "Unknowns", "Weighted", "adjust",
-    "angle_differences", "boresight", "common_sizes", "conversion_error", "convert", "covariance",
+    "angle_differences", "bias", "boresight", "common_sizes", "conversion_error", "convert", "covariance",
     "decentring_from_symmetry", "direct_orientation", "georeference", "ground_point", "image_ray", "intersect",
-    "point_differences", "principal_points", "project", "read_block", "read_recipe", "read_source", "rebalance",
-    "rebalance_covariance", "simulate", "symmetry_from_decentring", "write_block", "write_simulation",
+    "monte_carlo", "noise", "point_differences", "principal_points", "project", "read_block", "read_recipe",
+    "read_source", "readjust", "rebalance", "rebalance_covariance", "simulate", "symmetry_from_decentring",
+    "write_block", "write_simulation",
 ]  # fmt: skip
 
 # Files and tables bring pandas and more, a third of a second: they are imported when first asked for.

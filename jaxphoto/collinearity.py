@@ -41,7 +41,11 @@ def camera_coordinates(exterior: ExteriorOrientation, point: Float[Array, "3"]) 
 
 def project_ideal(c, exterior: ExteriorOrientation, point: Float[Array, "3"]) -> Float[Array, "2"]:
     """Ideal image coordinate (mm, from the principal point): x = -c U / W, y = -c V / W."""
-    u, v, w = camera_coordinates(exterior, point)
+    return _ideal(c, camera_coordinates(exterior, point))
+
+
+def _ideal(c, in_camera) -> Float[Array, "2"]:
+    u, v, w = in_camera
     scale = -c / w
     return jnp.stack([u * scale, v * scale])
 
@@ -77,8 +81,15 @@ def image_residual(
     `ideal(measured) - projection` for models in the measured coordinate; `measured - distorted projection` for
     models in the ideal one.
     """
+    return camera_residual(interior, camera_coordinates(exterior, point), xy)
+
+
+def camera_residual(
+    interior: InteriorOrientation, in_camera: Float[Array, "3"] | tuple[Array, Array, Array], xy: Float[Array, "2"]
+) -> Float[Array, "2"]:
+    """`image_residual` of a point in the camera frame (m; see `camera_coordinates`)."""
     # By component to the end: arrays of two that are computed with in between cost an adjustment a tenth of its time.
-    projection = project_ideal(interior.c, exterior, point)
+    projection = _ideal(interior.c, in_camera)
     reduced = jnp.stack([xy[0] - interior.x_p, xy[1] - interior.y_p])
     (x, y), (x0, y0) = (
         (interior.closed_form(reduced), projection)

@@ -16,7 +16,7 @@ from jaxphoto.adjustment.padding import LEAST, Sizes, crop_residuals, crop_state
 from jaxphoto.adjustment.precision import warn_of_lost_digits
 from jaxphoto.adjustment.rank import check_priors, check_rank
 from jaxphoto.adjustment.residuals import Residuals, State, Values, state_at
-from jaxphoto.adjustment.result import Adjustment, Factored, Padded
+from jaxphoto.adjustment.result import Adjustment, Factored, Padded, Unfactored
 from jaxphoto.adjustment.shards import usable
 from jaxphoto.adjustment.solver import zero_system
 from jaxphoto.adjustment.structure import Structure, structure_of
@@ -61,7 +61,6 @@ def solve(
     wide, places = pad_structure(structure, sizes, shards=shards, dense=coupled)
     numbers = pad_values(values, structure, wide, places)
     seconds: dict[str, float] = {}
-    padded = None
     if traced:
         optimum = find_optimum(weigh_datum(numbers, wide), structure=wide, max_steps=max_steps)
         state = state_at(optimum.increments, unit_scale(wide), numbers, wide)
@@ -76,6 +75,7 @@ def solve(
         state = State(*map(still, state))
     numbers = at_state(numbers, state)
     # Statistics need the factored normal matrix; a derivative of the unknowns does not, and would pay for it dearly.
+    padded: Padded | Unfactored = Unfactored(wide, numbers, places)
     if not traced:
         _, _, factored = run_compiled(_optimise, (numbers, wide, max_steps, np.array(True)), seconds, "covariance")
         padded = Padded(wide, numbers, factored, places)
@@ -96,6 +96,18 @@ def solve(
     if not traced:
         check_rank(adjusted)
     return adjusted
+
+
+def on_one_device(adjusted: Adjustment) -> Padded:
+    """What statistics are computed from, on one device; that of a large block is dealt out to several."""
+    padded, s = adjusted.computed, adjusted.structure
+    if padded.structure.in_tiles.shards == 1:
+        return padded
+    wide, places = pad_structure(s)
+    numbers = pad_values(adjusted.values, s, wide, places)
+    arguments = (numbers, wide, MAX_STEPS, np.array(True))
+    _, _, factored = run_compiled(_optimise, arguments, adjusted.seconds, "covariance")
+    return Padded(wide, numbers, factored, places)
 
 
 def _factored_like(values: Values, structure: Structure) -> Factored:

@@ -18,13 +18,14 @@ from jaxphoto.experiment.measures import (
     residuals,
     tie_point_differences,
 )
+from jaxphoto.experiment.monte_carlo import MonteCarlo
 from jaxphoto.experiment.plots import comparison_figure
 from jaxphoto.experiment.runner import Run, run_experiment, simulated, summary
 
 __all__ = [
-    "Cells", "Experiment", "Measure", "Results", "Run", "Variant", "boresight_correlation", "check_points",
-    "check_run_target", "compare", "comparison_figure", "effects", "find_experiments", "iops", "load_experiment",
-    "mean_correlations", "misalignment", "misalignment_agreement", "named", "orientation_differences",
-    "principal_point", "read_published", "recovered", "residuals", "run_experiment", "side_by_side", "simulated",
-    "summary", "tie_point_differences", "write_runs",
+    "Cells", "Experiment", "Measure", "MonteCarlo", "Results", "Run", "Variant", "boresight_correlation",
+    "check_points", "check_run_target", "compare", "comparison_figure", "effects", "find_experiments", "iops",
+    "load_experiment", "mean_correlations", "misalignment", "misalignment_agreement", "named",
+    "orientation_differences", "principal_point", "read_published", "recovered", "residuals", "run_experiment",
+    "side_by_side", "simulated", "summary", "tie_point_differences", "write_runs",
 ]  # fmt: skip

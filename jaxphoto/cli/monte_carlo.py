@@ -1,0 +1,110 @@
+"""`jaxphoto monte-carlo`: a block in, re-adjustments with drawn errors out."""
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from jaxphoto.block import Block
+from jaxphoto.cli.app import app
+from jaxphoto.errors import InputError
+from jaxphoto.experiment import MonteCarlo
+from jaxphoto.io import read_block
+from jaxphoto.procedures import adjust
+from jaxphoto.sensitivity import PER, Bias, Readjustment, bias, check_draws, noise
+
+_KINDS = (*PER, "noise")
+_UNITS = {
+    "station": "m", "control": "m", "lever-arm": "m", "attitude": "deg", "boresight": "deg", "image-points": "mm",
+    "interior": "own",
+}  # fmt: skip
+_KEPT = ("exterior", "points")
+
+
+@app.command("monte-carlo")
+def monte_carlo_command(
+    block: Annotated[Path, typer.Argument(help="Block folder (see docs/block_folder.md).")],
+    out: Annotated[Path, typer.Option(help="Folder for the draws; a run in it with the same settings goes on.")],
+    kind: Annotated[str, typer.Option("--bias", help=f"What is wrong: {', '.join(_KINDS)}.")],
+    per: Annotated[str | None, typer.Option(help="Whose own an error is: block, strip, image, point ...")] = None,
+    sigma_m: Annotated[
+        str | None, typer.Option(help="Standard deviation in m: one number, or three by commas.")
+    ] = None,
+    sigma_deg: Annotated[str | None, typer.Option(help="The same in degrees, for attitude and boresight.")] = None,
+    sigma_mm: Annotated[str | None, typer.Option(help="The same in mm, for image points.")] = None,
+    sigma: Annotated[str | None, typer.Option(help="The same in the units of the interior parameter.")] = None,
+    parameter: Annotated[str, typer.Option(help="The interior parameter (c_mm, k1 ...) for --bias interior.")] = "",
+    on: Annotated[list[str] | None, typer.Option(help="Only these strips, images, points ... (repeatable).")] = None,
+    draws: Annotated[int, typer.Option(help="Number of draws.")] = 1000,
+    seed: Annotated[int, typer.Option(min=0, help="Another seed draws other errors.")] = 0,
+    keep: Annotated[
+        list[str] | None, typer.Option("--with", help="Keep these, too: exterior, points (with check points).")
+    ] = None,
+) -> None:
+    """Re-adjust a block with drawn errors: draws.parquet, summary.csv, summary.json and pictures."""
+    check_draws(draws)
+    kept = tuple(keep or ())
+    if unknown := [name for name in kept if name not in _KEPT]:
+        raise InputError(f"--with {unknown[0]}: there are {', '.join(_KEPT)}")
+    sigmas = _sigma_of(kind, {"m": sigma_m, "deg": sigma_deg, "mm": sigma_mm, "own": sigma})
+    errors = Console(stderr=True)
+    with errors.status("reading the block") as status:
+        read = read_block(block)
+        drawn = _bias_of(read, kind, sigmas, per, on or [], parameter)
+        status.update("adjusting the nominal block")
+        adjusted = adjust(read)
+        status.update("preparing the draws")
+        run = Readjustment(
+            adjusted, drawn.applied, drawn.sigma[None], exterior="exterior" in kept, points="points" in kept
+        )
+    study = MonteCarlo(read, run, drawn, draws, seed, out)
+    columns = (TextColumn("draws"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=errors, transient=True) as progress:
+        task = progress.add_task("", total=draws)
+        study.draw(lambda done: progress.update(task, completed=done))
+    with errors.status(f"writing {out}"):
+        summary, table = study.write()
+    console = Console()
+    console.print(
+        f"{summary['draws']} draws, {summary['converged']} converged, {summary['fallbacks']} by a full adjustment; "
+        f"{summary['draws_per_second']:.0f} draws a second",
+        highlight=False,
+    )
+    shown = Table("quantity", "nominal", "mean", "sd", "predicted sigma", "ratio", title="estimates over the draws")
+    shown_numbers = ["nominal", "mean", "sd", "predicted_sigma", "ratio"]
+    for name, *numbers in table[["quantity", *shown_numbers]].itertuples(index=False):
+        if not str(name).startswith(("bias.", "exterior.", "point.", "check.")):
+            shown.add_row(str(name), *(f"{float(v):.5g}" for v in numbers))
+    console.print(shown)
+    console.print(f"results in {out}", highlight=False)
+
+
+def _sigma_of(kind: str, given: dict[str, str | None]) -> list[float]:
+    """The standard deviation in the units of the adjustment; raises InputError where it is in others."""
+    if kind not in _KINDS:
+        raise InputError(f"--bias {kind}: there are {', '.join(_KINDS)}")
+    option = {"m": "--sigma-m", "deg": "--sigma-deg", "mm": "--sigma-mm", "own": "--sigma"}
+    named = [unit for unit, text in given.items() if text is not None]
+    if kind == "noise":
+        if named:
+            raise InputError(f"--bias noise takes no {option[named[0]]}: errors have the observations' own sigmas")
+        return []
+    wanted = _UNITS[kind]
+    if named != [wanted]:
+        raise InputError(f"a bias of kind {kind} takes {option[wanted]}, and no other sigma")
+    text = str(given[wanted])
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        raise InputError(f"{option[wanted]} {text}: one number, or three with commas between") from None
+    return [np.radians(v) for v in numbers] if wanted == "deg" else numbers
+
+
+def _bias_of(block: Block, kind: str, sigmas: list[float], per: str | None, on: list[str], parameter: str) -> Bias:
+    if kind == "noise":
+        return noise(block)
+    return bias(block, kind, sigmas, per, of=on, parameter=parameter)

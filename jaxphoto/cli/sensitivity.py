@@ -1,0 +1,54 @@
+"""`jaxphoto sensitivity`: a block in, what its estimates hang on out."""
+
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+import jaxphoto
+from jaxphoto.cli.app import app
+from jaxphoto.errors import InputError
+from jaxphoto.io import read_block
+from jaxphoto.procedures import adjust_for_tables
+from jaxphoto.report import check_target
+from jaxphoto.report.sensitivity import SensitivityTables, write_sensitivity
+from jaxphoto.sensitivity.influence import DELTA0
+
+_SHOWN = 12
+
+
+@app.command("sensitivity")
+def sensitivity_command(
+    block: Annotated[Path, typer.Argument(help="Block folder (see docs/block_folder.md).")],
+    out: Annotated[Path, typer.Option(help="Folder for the results; earlier results in it are replaced.")],
+    per: Annotated[str, typer.Option(help="Whose stations have a bias: block, strip, image.")] = "strip",
+    bias_m: Annotated[float, typer.Option(help="Size of the station bias.")] = 0.10,
+    delta0: Annotated[float, typer.Option(help="Non-centrality of the test of normalised residuals.")] = DELTA0,
+    max_steps: Annotated[int, typer.Option(min=1, help="Most iterations.")] = jaxphoto.MAX_STEPS,
+) -> None:
+    """Exact sensitivity of the interior orientation and the check points to stations, and to undetected errors."""
+    if not bias_m:
+        raise InputError("--bias-m 0 is no bias: give its size in metres")
+    check_target(out)
+    console, errors = Console(), Console(stderr=True)
+    began = time.perf_counter()
+    with errors.status("reading the block") as status:
+        read = read_block(block)
+        seconds = {"read": time.perf_counter() - began}
+        status.update(f"adjusting {len(read.images)} images, {len(read.points)} points")
+        adjusted = adjust_for_tables(read, max_steps)
+        status.update("differentiating")
+        tables = SensitivityTables(adjusted, per, bias_m, delta0)  # type: ignore[arg-type]
+        table = tables.bias
+        status.update(f"writing {out}")
+        order = ("compile", "solve", "covariance", "sensitivity")
+        write_sensitivity(tables, out, seconds | {name: adjusted.seconds[name] for name in order})
+    console.print(f"largest changes by a station bias of {bias_m:g} m per {per}: exact, first-order")
+    interior = table[table["estimate"].str.startswith("interior")]
+    largest = interior.loc[interior.groupby("estimate", sort=False)["exact"].apply(lambda v: v.abs().idxmax())]
+    for row in largest.head(_SHOWN).itertuples(index=False):
+        line = f"  {row.estimate}: {row.exact:.4g}, {row.first_order:.4g} (stations of {row.unit} in {row.axis})"
+        console.print(line, highlight=False, markup=False)
+    console.print(f"results in {out}", highlight=False)

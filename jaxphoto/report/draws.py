@@ -1,0 +1,124 @@
+"""A Monte Carlo as tables and pictures: one row a draw, a summary beside the prediction, histograms."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from jaxphoto.adjustment import Adjustment
+from jaxphoto.block import AXES
+from jaxphoto.report.plots import new_figure
+from jaxphoto.sensitivity import Draws
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_EXTERIOR = ("X_m", "Y_m", "Z_m", "omega_rad", "phi_rad", "kappa_rad")
+_QUANTILES = {"q025": 0.025, "q50": 0.5, "q975": 0.975}
+# Histograms of a picture.
+_SHOWN = 12
+
+
+def draws_table(draws: Draws, adjusted: Adjustment, first: int = 0) -> pd.DataFrame:
+    """One row a draw: draw (from `first`), converged, iterations, fallback, bias.*, then what was estimated.
+
+    `<camera>.c_mm` and so on; `mounts.*`, `strips.*`; where they were kept `exterior.<image>.X_m ... kappa_deg` and
+    `point.<id>.X_m`; and `check.<id>.dX_m`, surveyed minus computed, with the points. Angles are in degrees.
+    """
+    block = adjusted.block
+    columns: dict[str, np.ndarray] = {
+        "draw": first + np.arange(len(draws.steps)),
+        "converged": draws.converged,
+        "iterations": draws.steps,
+        "fallback": draws.fallback,
+    }
+    columns |= {f"bias.{name}": v for name, v in draws.recorded.items()}
+    columns |= dict(zip(map(_column, draws.labels), draws.shared.T, strict=True))
+    if draws.exterior is not None:
+        names = [f"exterior.{image}.{name}" for image in block.images for name in _EXTERIOR]
+        columns |= dict(zip(names, draws.exterior.reshape(len(draws.steps), -1).T, strict=True))
+    if draws.points is not None:
+        names = [f"point.{point}.{axis}_m" for point in block.points for axis in AXES]
+        columns |= dict(zip(names, draws.points.reshape(len(draws.steps), -1).T, strict=True))
+        check = block.check
+        for who, axis, value in zip(check.who, check.axis, np.asarray(check.value), strict=True):
+            columns[f"check.{block.points[who]}.d{AXES[axis]}_m"] = value - draws.points[:, who, axis]
+    return pd.DataFrame({name.replace("_rad", "_deg"): _in_degrees(name, v) for name, v in columns.items()})
+
+
+def _in_degrees(name: str, values: np.ndarray) -> np.ndarray:
+    return np.degrees(values) if name.endswith("_rad") else values
+
+
+def _column(label: str) -> str:
+    """`interior[kodak].c_mm` -> `kodak.c_mm`, `strips[E1].shift_X_m` -> `strips.E1.shift_X_m`."""
+    kind, rest = label.split("[", 1)
+    name, parameter = rest.rsplit("].", 1)
+    return f"{name}.{parameter}" if kind == "interior" else f"{kind}.{name}.{parameter}"
+
+
+class Moments(NamedTuple):
+    """Of one column: what its draws are like."""
+
+    mean: float
+    sd: float
+    quantiles: tuple[float, ...]
+
+
+def moments(values: np.ndarray) -> Moments:
+    """Of the draws of one column; not a number where there are too few."""
+    values = np.asarray(values, float)
+    if not len(values):
+        return Moments(np.nan, np.nan, (np.nan,) * len(_QUANTILES))
+    sd = float(values.std(ddof=1)) if len(values) > 1 else np.nan
+    return Moments(float(values.mean()), sd, tuple(np.quantile(values, list(_QUANTILES.values()))))
+
+
+def summary_table(
+    found: Mapping[str, Moments], nominal: Mapping[str, float], predicted: Mapping[str, float]
+) -> pd.DataFrame:
+    """quantity, nominal, mean, sd, quantiles, predicted_sigma, ratio (sd over predicted)."""
+    rows = [(name, nominal.get(name, np.nan), m.mean, m.sd, *m.quantiles) for name, m in found.items()]
+    table = pd.DataFrame(rows, columns=["quantity", "nominal", "mean", "sd", *_QUANTILES])
+    table["predicted_sigma"] = [predicted.get(name, np.nan) for name in found]
+    table["ratio"] = table["sd"] / table["predicted_sigma"]
+    return table
+
+
+def draws_figure(columns: Mapping[str, np.ndarray], summary: pd.DataFrame) -> Figure:
+    """Histograms of some columns, with the nominal value and the predicted normal density."""
+    chosen = list(columns)[:_SHOWN]
+    across = min(3, len(chosen))
+    down = -(-len(chosen) // across)
+    figure = new_figure(3.3 * across, 2.5 * down)
+    of = summary.set_index("quantity")
+    for axes, name in zip(figure.subplots(down, across, squeeze=False).flat, chosen, strict=False):
+        values, row = np.asarray(columns[name], float), of.loc[name]
+        axes.hist(values, bins=min(60, max(5, int(np.sqrt(len(values))))), density=True, color="0.75")
+        axes.axvline(row["nominal"], color="tab:red", lw=1)
+        if row["predicted_sigma"] > 0:
+            at = row["nominal"] + row["predicted_sigma"] * np.linspace(-4, 4, 200)
+            density = np.exp(-0.5 * np.linspace(-4, 4, 200) ** 2) / row["predicted_sigma"] / np.sqrt(2 * np.pi)
+            axes.plot(at, density, color="tab:blue", lw=1)
+        axes.set_title(name, fontsize=9)
+        axes.set_yticks([])
+        axes.tick_params(labelsize=7)
+    for axes in figure.axes[len(chosen) :]:
+        axes.set_axis_off()
+    return figure
+
+
+def effects_figure(effects: pd.DataFrame, summary: pd.DataFrame, quantities: list[str]) -> Figure:
+    """What one sigma of each error does to some quantities, as parts of their predicted standard deviations."""
+    predicted = summary.set_index("quantity")["predicted_sigma"][quantities].to_numpy()
+    parts = effects[quantities].to_numpy() / np.where(predicted > 0, predicted, np.nan)
+    figure = new_figure(1.8 + 0.8 * len(quantities), 1.2 + 0.24 * len(effects))
+    axes = figure.subplots()
+    image = axes.imshow(parts, cmap="RdBu_r", vmin=-1, vmax=1, aspect="auto")
+    axes.set_xticks(range(len(quantities)), quantities, rotation=45, ha="right", fontsize=8)
+    axes.set_yticks(range(len(effects)), list(effects["error"]), fontsize=7)
+    figure.colorbar(image, label="effect of one sigma / predicted sigma")
+    return figure

@@ -1,0 +1,150 @@
+"""Many adjustments of one block by one factor: chord steps from the nominal optimum, with exact gradients.
+
+With N the nominal normal matrix, factored once, and G_i the gradient of draw i,
+
+    y <- y - N^-1 G_i(y)        until what is missing is small
+
+converges to the optimum of draw i itself, because its gradient is exact; how fast, says how far N is from that draw's
+own. A draw whose steps do not shrink is left for a full adjustment.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh
+from jax.sharding import PartitionSpec as P
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxphoto.adjustment.elimination import solve_factored
+from jaxphoto.adjustment.normal import At
+from jaxphoto.adjustment.optimum import weigh_datum
+from jaxphoto.adjustment.residuals import Increments, State
+from jaxphoto.adjustment.result import Factored
+from jaxphoto.sensitivity.many import Common, Varying, image_gradients, other_gradients, states
+
+TOLERANCE = 1e-6
+"""No unknown of a draw misses its optimum by more than this fraction of its standard deviation."""
+# A draw is given up when a step is longer than this part of the one before, or after so many steps.
+_CONTRACTS, _MOST_STEPS = 0.5, 20
+# The part of the first step that is taken to be missing after it.
+_FIRST_RATIO = 0.1
+_AXIS = "draws"
+# What, besides measured image coordinates, moves the residuals of image rows.
+_OF_IMAGE_ROWS = {"xy", "sigma_xy", "position", "rotation", "shared", "points"}
+
+
+class Found(NamedTuple):
+    """The unknowns of each draw (draws last), whether they are the optimum, and after how many steps."""
+
+    state: State
+    settled: Bool[Array, "draws"]
+    steps: Int[Array, "draws"]
+
+
+class _Way(NamedTuple):
+    y: Increments
+    length: Float[Array, "draws"]
+    """Of the last step, sqrt(x' N x): at least |x| / sigma of every unknown."""
+    ratio: Float[Array, "draws"]
+    """Of the last two lengths."""
+    settled: Bool[Array, "draws"]
+    failed: Bool[Array, "draws"]
+    steps: Int[Array, "draws"]
+
+
+@eqx.filter_jit
+def find_optima(varying: Varying, common: Common, factored: Factored, devices: int, first_only: bool) -> Found:
+    """The optimum of every draw, dealt out to `devices`; `first_only`, its first-order approximation."""
+    if devices == 1:
+        return _find(varying, common, factored, first_only)
+    mesh = Mesh(np.array(jax.devices()[:devices]), (_AXIS,))
+    last = lambda v: P(*[None] * (v.ndim - 1), _AXIS)  # noqa: E731
+    arrays, rest = eqx.partition((common, factored), eqx.is_array)
+
+    def of_device(varying, arrays):
+        common, factored = eqx.combine(arrays, rest)
+        return _find(varying, common, factored, first_only)
+
+    run = jax.shard_map(
+        of_device,
+        mesh=mesh,
+        in_specs=(jax.tree.map(last, varying), P()),
+        out_specs=_draws_last(),
+        check_vma=False,
+    )
+    return run(varying, arrays)
+
+
+def _draws_last() -> Any:
+    """`Found`, dealt out along its draws."""
+    each: Any = P(_AXIS)
+    position, rotation, shared, points = (P(*[None] * axes, _AXIS) for axes in (2, 3, 1, 2))
+    state: Any = (position, rotation, shared, points)
+    return Found(State(*state), each, each)
+
+
+def _find(varying: Varying, common: Common, factored: Factored, first_only: bool) -> Found:
+    """`find_optima` of what one device holds."""
+    common = eqx.tree_at(lambda c: c.values, common, weigh_datum(common.values, common.structure))
+    size = next(iter(varying.values())).shape[-1]
+    y = jax.tree.map(lambda v: jnp.zeros((*v.shape, size)), common.scale)
+    of_image_rows = bool(_OF_IMAGE_ROWS & set(varying))
+    none = jnp.zeros(size, bool)
+    way = _Way(y, jnp.full(size, jnp.inf), jnp.zeros(size), none, none, jnp.zeros(size, int))
+    if not of_image_rows:
+        way = _taken(way, _others_alone(y, varying, common), common, factored)
+    elif first_only:
+        way = _taken(way, _all(y, varying, common), common, factored)
+    if not first_only:
+        way = jax.lax.while_loop(
+            lambda way: ~jnp.all(way.settled | way.failed),
+            lambda way: _taken(way, _all(way.y, varying, common), common, factored),
+            way,
+        )
+    return Found(states(way.y, varying, common), way.settled, way.steps)
+
+
+def _taken(way: _Way, b: Increments, common: Common, factored: Factored) -> _Way:
+    """One step, of the draws that are still under way, by their gradients `b`."""
+    x = _solutions(b, common, factored)
+    length = _length(x, b)
+    ratio = jnp.where(jnp.isinf(way.length), _FIRST_RATIO, length / jnp.maximum(way.length, 1e-300))
+    active = ~(way.settled | way.failed)
+    contracts = (ratio <= _CONTRACTS) & (way.steps < _MOST_STEPS)
+    missing = length * jnp.maximum(ratio, way.ratio)
+    # Steps below the tolerance are rounding, which need not shrink.
+    settled = active & ((missing <= TOLERANCE) & contracts | (length <= 0.1 * TOLERANCE))
+    return _Way(
+        y=jax.tree.map(lambda a, d: jnp.where(active, a - d, a), way.y, x),
+        length=length,
+        # What was assumed of the first says nothing about the second.
+        ratio=jnp.where(jnp.isinf(way.length), 0.0, ratio),
+        settled=way.settled | settled,
+        failed=way.failed | (active & ~settled & ~contracts),
+        steps=way.steps + active,
+    )
+
+
+def _all(y: Increments, varying: Varying, common: Common) -> Increments:
+    """The gradient of each draw."""
+    return jax.tree.map(jnp.add, image_gradients(y, varying, common), other_gradients(y, varying, common))
+
+
+def _others_alone(zero: Increments, varying: Varying, common: Common) -> Increments:
+    """The gradient at the nominal optimum of draws whose image rows are the nominal ones: these cancel there."""
+    nominal = other_gradients(jax.tree.map(lambda v: v[..., :1], zero), {}, common)
+    return jax.tree.map(jnp.subtract, other_gradients(zero, varying, common), nominal)
+
+
+def _solutions(b: Increments, common: Common, factored: Factored) -> Increments:
+    at = At(jax.tree.map(jnp.zeros_like, common.scale), common.scale, common.values, common.structure)
+    return jax.vmap(lambda b: solve_factored(factored.reduced, factored.factor, b, at), -1, -1)(b)
+
+
+def _length(x: Increments, b: Increments) -> Float[Array, "draws"]:
+    """sqrt(x' N x), of x = N^-1 b."""
+    along = (jnp.sum(u * v, axis=tuple(range(u.ndim - 1))) for u, v in zip(x, b, strict=True))
+    return jnp.sqrt(jnp.maximum(sum(along, jnp.zeros(())), 0.0))

@@ -1,0 +1,219 @@
+"""The gradients of many adjustments of one block at once.
+
+Adjustments that differ in numbers only are computed side by side: arrays end in the axis of the draws, so that what
+belongs to an image row is read and written in whole stretches. Unlike in the tiles of a single adjustment
+(`adjustment.tiles`) there is no empty slot: image rows are listed, and gather and scatter such stretches.
+
+With u the point of an image row in the camera frame and q half the square of its weighted residuals,
+
+    dq/d(image) = (du/d(image))' dq/du,    dq/d(point) = (du/d(point))' dq/du,    dq/d(camera)
+
+all by automatic differentiation of the model of one row, each kept before it is summed: XLA computes what it fuses anew
+for every result that needs it.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxphoto.adjustment import Adjustment
+from jaxphoto.adjustment.residuals import Increments, State, Values, other_residuals, state_at
+from jaxphoto.adjustment.structure import CameraGroup, Structure, interior_of
+from jaxphoto.adjustment.tiles import once
+from jaxphoto.collinearity import ExteriorOrientation, camera_coordinates, camera_residual
+from jaxphoto.georeferencing import apparent_point
+from jaxphoto.georeferencing.corrections import NO_CORRECTIONS
+from jaxphoto.rotation import rotate
+
+Varying = dict[str, Array]
+"""Fields of `Values` that differ between draws, which are their last axis; `xy` and `sigma_xy` by row of the block."""
+
+
+class RowList(eqx.Module):
+    """Image rows of the cameras of one group: their number in the block, and what they touch in a padded structure."""
+
+    row: Int[np.ndarray, "rows"]
+    image: Int[np.ndarray, "rows"]
+    point: Int[np.ndarray, "rows"]
+    """Sorted."""
+    camera: Int[np.ndarray, "rows"]
+    """Within the group."""
+
+
+class Common(eqx.Module):
+    """What all draws have in common, in padded sizes; image rows (2, rows) by row of the block."""
+
+    values: Values
+    xy: Float[np.ndarray, "2 rows"]
+    sigma_xy: Float[np.ndarray, "2 rows"]
+    scale: Increments
+    structure: Structure
+    lists: tuple[RowList, ...]
+
+
+def common_of(adjusted: Adjustment) -> Common:
+    """The nominal adjustment, from whose optimum all draws begin."""
+    s, padded = adjusted.structure, adjusted.computed
+    lists = []
+    for group in s.groups:
+        own = np.flatnonzero(group.member[s.image])
+        own = own[np.argsort(padded.places.point[s.point[own]], kind="stable")]
+        image = s.image[own]
+        lists.append(RowList(own, padded.places.image[image], padded.places.point[s.point[own]], group.camera[image]))
+    values = adjusted.values
+    return Common(
+        padded.values,
+        np.asarray(values.xy),
+        np.asarray(values.sigma_xy),
+        padded.factored.scale,
+        padded.structure,
+        tuple(lists),
+    )
+
+
+def states(y: Increments, varying: Varying, common: Common) -> State:
+    """The unknowns of every draw at its increments, draws last."""
+
+    def one(y: Increments, varying: Varying) -> State:
+        return state_at(y, common.scale, _values_with(varying, common), common.structure)
+
+    return jax.vmap(one, -1, -1)(y, varying)
+
+
+def other_gradients(y: Increments, varying: Varying, common: Common) -> Increments:
+    """The part of J'r, draws last, that is due to all but the image rows."""
+
+    def one(y: Increments, varying: Varying) -> Increments:
+        values = _values_with(varying, common)
+        r, pull = jax.vjp(lambda y: other_residuals(y, common.scale, values, common.structure), y)
+        return pull(r)[0]
+
+    return jax.vmap(one, -1, -1)(y, varying)
+
+
+def image_gradients(y: Increments, varying: Varying, common: Common) -> Increments:
+    """The part of J'r, draws last, that is due to the image rows."""
+    state, pull = jax.vjp(lambda y: states(y, varying, common), y)
+    xy, sigma = (varying.get(name, getattr(common, name)) for name in ("xy", "sigma_xy"))
+    cotangent = jax.tree.map(jnp.zeros_like, state)
+    for group, rows in zip(common.structure.groups, common.lists, strict=True):
+        seen = jnp.asarray(xy)[:, rows.row], 1 / jnp.asarray(sigma)[:, rows.row]
+        of_group = _group_cotangent(group, rows, state, seen, common.structure)
+        cotangent = jax.tree.map(jnp.add, cotangent, of_group)
+    return pull(cotangent)[0]
+
+
+def _values_with(varying: Varying, common: Common) -> Values:
+    # Those of image rows are not in tiles, and nobody looks for them there.
+    return dataclasses.replace(
+        common.values, **{name: v for name, v in varying.items() if name not in ("xy", "sigma_xy")}
+    )
+
+
+def _each_row(function: Callable, *arrays: Any) -> Any:
+    """`function` of every row (first axis) and draw (last axis)."""
+    return jax.vmap(jax.vmap(function, -1, -1))(*arrays)
+
+
+def _group_cotangent(group: CameraGroup, rows: RowList, state: State, seen: tuple[Array, Array], s: Structure) -> State:
+    """Derivatives of the sum of q over the rows of a group with respect to the state."""
+    n, size = state.position.shape[1:]
+    of_images = jnp.concatenate([state.rotation.reshape(9, n, size), state.position]).transpose(1, 0, 2)
+    of_points = state.points.transpose(1, 0, 2)
+    rotation_of = lambda image: image[:9].reshape(3, 3)  # noqa: E731
+
+    def aim_of(image, point):
+        return apparent_point(image[9:], point, s.corrections)
+
+    def from_place(image, point):
+        return tuple(camera_coordinates(ExteriorOrientation(image[9:], rotation_of(image)), aim_of(image, point)))
+
+    def back_to_aim(image, to_u):
+        """By the place that the ray aims at, in the object frame."""
+        here = lambda aim: tuple(rotate(rotation_of(image), aim))  # noqa: E731
+        return jax.linear_transpose(here, jnp.zeros(3))(to_u)[0]
+
+    def back_to_turn(u, to_u):
+        """By a small rotation t of the image, which adds u x t to u."""
+
+        def turned(t):
+            return u[1] * t[2] - u[2] * t[1], u[2] * t[0] - u[0] * t[2], u[0] * t[1] - u[1] * t[0]
+
+        return jax.linear_transpose(turned, jnp.zeros(3))(to_u)[0]
+
+    def back_to_place(image, point, to_aim):
+        _, pull = jax.vjp(lambda centre, point: apparent_point(centre, point, s.corrections), image[9:], point)
+        return pull(to_aim)
+
+    u = once(lambda i, p: _each_row(from_place, _at(i, rows.image), _at(p, rows.point)), s, of_images, of_points)
+    shared, to_u = _camera_cotangent(group, rows, state.shared, u, seen, s)
+    to_aim = once(lambda i, to_u: _each_row(back_to_aim, _at(i, rows.image), to_u), s, of_images, to_u)
+    turn = jax.ops.segment_sum(_each_row(back_to_turn, u, to_u), rows.image, n)
+    to_centre, to_point = 0.0, to_aim
+    if s.corrections != NO_CORRECTIONS:
+        to_centre, to_point = _each_row(back_to_place, _at(of_images, rows.image), _at(of_points, rows.point), to_aim)
+    centre = jax.ops.segment_sum(to_centre - to_aim, rows.image, n)
+    points = jax.ops.segment_sum(to_point, rows.point, len(of_points), indices_are_sorted=True)
+    # Of all cotangents of a matrix R that changes by -t x R, the one along such changes.
+    rotation = -0.5 * jnp.cross(turn.transpose(1, 0, 2)[:, None], state.rotation, axis=0)
+    return State(centre.transpose(1, 0, 2), rotation, shared, points.transpose(1, 0, 2))
+
+
+def _at(array: Array, index: np.ndarray) -> Array:
+    return array.at[index].get(mode="promise_in_bounds")
+
+
+def _camera_cotangent(
+    group: CameraGroup,
+    rows: RowList,
+    shared: Float[Array, "parameters draws"],
+    u: tuple[Array, ...],
+    seen: tuple[Array, Array],
+    s: Structure,
+) -> tuple[Array, tuple[Array, ...]]:
+    """dq/d(shared), summed over the rows of a group, and dq/du of each."""
+    m, cameras = group.treedef.num_leaves, len(group.names)
+    table = shared[group.offset : group.offset + m * cameras].reshape(cameras, m, -1)
+    # One camera: the same for all rows.
+    leaves = [table[rows.camera, k] if cameras > 1 else table[0, k] for k in range(m)]
+    chosen = [leaves[k] for k in group.free_leaves]
+
+    def residual(chosen, u, leaves, xy):
+        for k, leaf in zip(group.free_leaves, chosen, strict=True):
+            leaves = [*leaves[:k], leaf, *leaves[k + 1 :]]
+        return tuple(camera_residual(interior_of(group, leaves), u, xy))
+
+    def weighed(chosen, u, leaves, xy, weight):
+        return tuple(w * w * r for w, r in zip(weight, residual(chosen, u, leaves, xy), strict=True))
+
+    def back_to_camera(chosen, u, leaves, xy, to_residual):
+        return jax.vjp(lambda chosen: residual(chosen, u, leaves, xy), chosen)[1](to_residual)[0]
+
+    def back_to_u(chosen, u, leaves, xy, to_residual):
+        return jax.vjp(lambda u: residual(chosen, u, leaves, xy), u)[1](to_residual)[0]
+
+    of_camera = 0 if cameras > 1 else None
+    xy_last, weight_last = (-1 if v.ndim == 3 else None for v in seen)
+
+    def each(function: Callable, last_axis: int | None, row_axis: int) -> Callable:
+        of_draws = jax.vmap(function, (-1, -1, -1, xy_last, last_axis), -1)
+        return jax.vmap(of_draws, (of_camera, 0, of_camera, 1, row_axis))
+
+    given = chosen, u, leaves, seen[0]
+    to_residual = once(each(weighed, weight_last, 1), s, *given, seen[1])
+    to_chosen, to_u = (once(each(back, -1, 0), s, *given, to_residual) for back in (back_to_camera, back_to_u))
+    cotangent = jnp.zeros_like(shared)
+    for k, of_rows in zip(group.free_leaves, to_chosen, strict=True):
+        if cameras > 1:
+            summed = jax.ops.segment_sum(of_rows, rows.camera, cameras)
+        else:
+            # Many times faster than a sum along the first axis.
+            summed = jnp.ones((1, len(of_rows))) @ of_rows
+        cotangent = cotangent.at[group.offset + k + m * np.arange(cameras)].set(summed)
+    return cotangent, to_u

@@ -1,0 +1,218 @@
+"""What is drawn in a Monte Carlo: errors of observations and of parameters that the adjustment holds.
+
+A perturbation is any function of a key and a block that returns the block with other numbers in it, alone or with a
+dict of numbers to record:
+
+    def perturb(key, block):
+        rise = 0.1 * jax.random.normal(key)
+        heights = block.stations.value + rise * (block.stations.axis == 2)
+        return eqx.tree_at(lambda b: b.stations.value, block, heights), {"rise_m": rise}
+
+`bias` makes the usual ones.
+"""
+
+from collections.abc import Callable, Collection
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxphoto.block import ATTITUDE_AXES, AXES, Block
+from jaxphoto.camera import InteriorOrientation, get_parameter, parameter_names
+from jaxphoto.errors import InputError
+from jaxphoto.unknowns import FIXED, FREE
+
+Recorded = dict[str, Array]
+Perturbation = Callable[[Any, Block], Block | tuple[Block, Recorded]]
+Distribution = Callable[[Any, tuple[int, ...]], Array]
+"""Numbers of mean 0 and standard deviation 1 from a key and a shape."""
+
+PER = {
+    "station": ("block", "strip", "image"),
+    "attitude": ("block", "strip", "image"),
+    "control": ("block", "point"),
+    "image-points": ("camera", "image", "observation"),
+    "lever-arm": ("mount",),
+    "boresight": ("mount",),
+    "interior": ("camera",),
+}
+"""Kinds of bias, and whose own each may be."""
+_AXES = {"lever-arm": ("right_m", "forward_m", "up_m"), "boresight": ("x_rad", "y_rad", "z_rad")}
+
+
+class Bias(eqx.Module):
+    """Errors added to some numbers of a block: `sigma` times independent draws of `distribution`.
+
+    Called with a key and a block it is a perturbation; `applied` adds given numbers.
+    """
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    """Of the errors drawn, such as `E1.X_m`; angles in rad."""
+    sigma: Float[np.ndarray, "errors"]
+    """In the units of the names."""
+    targets: tuple[tuple[str, ...], ...] = eqx.field(static=True)
+    """Paths, from the block, of the arrays that the errors are added to."""
+    index: tuple[Int[np.ndarray, "..."], ...]
+    """The error that each number of these arrays gets; the number of errors where it gets none."""
+    distribution: Distribution = eqx.field(static=True, default=jax.random.normal)
+    recorded: bool = eqx.field(static=True, default=True)
+    """Whether each error is worth a record of its own."""
+
+    def __call__(self, key, block: Block) -> tuple[Block, Recorded]:
+        """`block` with errors drawn by `key`, and the errors by name."""
+        errors = self.drawn(key)
+        return self.applied(errors, block), dict(zip(self.names, errors, strict=True)) if self.recorded else {}
+
+    def drawn(self, key) -> Float[Array, "errors"]:
+        """The errors that a key draws."""
+        return jnp.asarray(self.sigma) * self.distribution(key, self.sigma.shape)
+
+    def applied(self, errors: Float[Array, "errors"], block: Block) -> Block:
+        """`block` with given errors, in the order of `names`."""
+        added = jnp.append(errors, 0.0)
+        where = lambda b: [_follow(b, path) for path in self.targets]  # noqa: E731
+        old = where(block)
+        new = [v + added[k].reshape(np.shape(v)) for v, k in zip(old, self.index, strict=True)]
+        return eqx.tree_at(where, block, new)
+
+
+def bias(
+    block: Block,
+    kind: str,
+    sigma: float | Collection[float],
+    per: str | None = None,
+    *,
+    of: Collection[str] = (),
+    parameter: str = "",
+    distribution: Distribution = jax.random.normal,
+) -> Bias:
+    """Errors of one kind, independent for each axis and each strip, image, point, mount or camera.
+
+    `kind` is one of `PER`, `per` one of what it lists there (its first if not given). `sigma`: m for stations, control
+    and lever arms; rad for attitudes and boresights; mm for image points; own units for the interior `parameter`
+    (`c_mm`, `k1` ...); one, or one an axis. `of` names those that get errors, all if empty. Lever arms, boresights and
+    interior parameters must be FIXED (the value that is held changes) or Weighted (the value given beforehand changes).
+
+    Raises InputError for a kind, a name or a sigma that cannot be.
+    """
+    if kind not in PER:
+        raise InputError(f"there is no bias of kind {kind!r}; there are {', '.join(PER)}")
+    per = PER[kind][0] if per is None else per
+    if per not in PER[kind]:
+        raise InputError(f"a bias of kind {kind} is drawn per {' or '.join(PER[kind])}, not per {per}")
+    if (parameter != "") != (kind == "interior"):
+        raise InputError("a bias of kind interior, and no other, needs the name of a parameter, such as c_mm")
+    if kind in ("lever-arm", "boresight", "interior"):
+        return _parameters(block, kind, sigma, of, parameter, distribution)
+    axes, (owner, axis), target = _observations(block, kind, per)
+    known = list(dict.fromkeys(owner))
+    if not known:
+        raise InputError(f"the block {block.title!r} has no observation that a bias of kind {kind} could be added to")
+    if known == [""]:
+        raise InputError(f"the images of the block {block.title!r} belong to no {per}: name it in images.csv")
+    chosen = _chosen(of, known, kind, per)
+    first = {name: len(axes) * k for k, name in enumerate(chosen)}
+    index = np.array([first.get(name, -1) for name in owner])
+    index = np.where(index < 0, len(axes) * len(chosen), index + axis)
+    names = tuple(f"{name}.{label}" for name in chosen for label in axes)
+    own = per != "observation"
+    return Bias(names, _sigmas(sigma, axes, len(chosen)), (target,), (index,), distribution, own)
+
+
+def noise(block: Block) -> Bias:
+    """Errors of all observations, each with its own standard deviation: what the covariance of the block is about."""
+    groups = {
+        ("image_points", "xy"): block.image_points.sigma,
+        ("stations", "value"): block.stations.sigma,
+        ("attitudes", "roll_pitch_yaw"): block.attitudes.sigma,
+        ("control", "value"): block.control.sigma,
+        ("distances", "value"): block.distances.sigma,
+    }
+    sigmas = {target: np.ravel(sigma) for target, sigma in groups.items() if np.size(sigma)}
+    starts = np.cumsum([0, *map(len, sigmas.values())])
+    names = tuple(f"{group}.{k}" for (group, _), sigma in sigmas.items() for k in range(len(sigma)))
+    index = tuple(start + np.arange(len(sigma)) for start, sigma in zip(starts, sigmas.values(), strict=False))
+    return Bias(names, np.concatenate(list(sigmas.values())), tuple(sigmas), index, recorded=False)
+
+
+def _observations(block: Block, kind: str, per: str):
+    """The names of the axes; of each number whose it is, and its axis; and where the numbers are."""
+    rows = block.control if kind == "control" else block.stations
+    if kind in ("control", "station"):
+        who, axis, axes = rows.who, rows.axis, tuple(f"{a}_m" for a in AXES)
+        target = ("control" if kind == "control" else "stations", "value")
+    else:
+        attitudes, points = block.attitudes, block.image_points
+        who, axes, target = (
+            (attitudes.image, tuple(f"{a}_rad" for a in ATTITUDE_AXES), ("attitudes", "roll_pitch_yaw"))
+            if kind == "attitude"
+            else (points.image, ("x_mm", "y_mm"), ("image_points", "xy"))
+        )
+        who, axis = np.repeat(who, len(axes)), np.tile(np.arange(len(axes)), len(who))
+    if per == "observation":
+        point = np.repeat(block.image_points.point, 2)
+        return axes, ([f"{block.images[i]}.{block.points[p]}" for i, p in zip(who, point, strict=True)], axis), target
+    names = {"image": block.images, "camera": block.image_camera, "strip": block.image_strip, "point": block.points}
+    return axes, (["block" if per == "block" else names[per][k] for k in who], axis), target
+
+
+def _parameters(block: Block, kind: str, sigma, of: Collection[str], parameter: str, distribution: Distribution):
+    unknowns, priors = block.start.unknowns, block.priors
+    table: Any = unknowns.interior if kind == "interior" else unknowns.mounts
+    of_priors: Any = priors.interior if kind == "interior" else priors.mounts
+    if not table:
+        raise InputError(f"the block {block.title!r} has no mount that a bias of kind {kind} could be added to")
+    chosen = _chosen(of, list(table), kind, PER[kind][0])
+    field = {"lever-arm": "lever_arm", "boresight": "boresight", "interior": parameter}[kind]
+    axes = (parameter,) if kind == "interior" else tuple(f"{field}_{a}" for a in _AXES[kind])
+    targets = []
+    for name in chosen:
+        if kind == "interior" and parameter not in parameter_names(table[name]):
+            known = ", ".join(parameter_names(table[name]))
+            raise InputError(f"camera {name} has no parameter {parameter!r}; it has {known}")
+        prior = _leaf(of_priors[name], field)
+        if prior is FREE:
+            raise InputError(
+                f"{field} of {name} is free, so the adjustment does not take the value that a bias changes"
+            )
+        at = ("start", "unknowns") if prior is FIXED else ("priors",)
+        path = (*at, "interior" if kind == "interior" else "mounts", name, field)
+        targets.append(path if prior is FIXED else (*path, "value"))
+    index = tuple(len(axes) * k + np.arange(len(axes)) for k in range(len(chosen)))
+    names = tuple(f"{name}.{axis}" for name in chosen for axis in axes)
+    return Bias(names, _sigmas(sigma, axes, len(chosen)), tuple(targets), index, distribution)
+
+
+def _follow(tree: Any, path: tuple[str, ...]) -> Any:
+    """The leaf at a path of fields, keys and names of interior parameters."""
+    for step in path:
+        tree = tree[step] if isinstance(tree, dict) else _leaf(tree, step)
+    return tree
+
+
+def _leaf(tree: Any, name: str) -> Any:
+    return get_parameter(tree, name) if isinstance(tree, InteriorOrientation) else getattr(tree, name)
+
+
+def _chosen(of: Collection[str], known: list[str], kind: str, per: str) -> list[str]:
+    if isinstance(of, str):
+        of = (of,)
+    for name in of:
+        if name not in known:
+            some = ", ".join(known[:8]) + (" ..." if len(known) > 8 else "")
+            raise InputError(
+                f"there is no {per} {name!r} that a bias of kind {kind} could be added to; there are {some}"
+            )
+    return [name for name in known if name != "" and (not of or name in of)]
+
+
+def _sigmas(sigma: float | Collection[float], axes: tuple[str, ...], n: int) -> np.ndarray:
+    given = np.atleast_1d(np.asarray(sigma, float))
+    if len(given) not in (1, len(axes)):
+        raise InputError(f"sigma is one number, or one for each of {', '.join(axes)}; got {len(given)}")
+    if not (np.isfinite(given).all() and (given >= 0).all() and given.any()):
+        raise InputError(f"sigma is a standard deviation above zero, got {', '.join(f'{v:g}' for v in given)}")
+    return np.tile(np.broadcast_to(given, len(axes)), n)

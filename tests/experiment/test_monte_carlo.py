@@ -1,0 +1,197 @@
+"""A Monte Carlo on disk: what is promised of its files, and what becomes of a run that is stopped."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from jaxphoto import InputError, bias, cli, covariance
+from jaxphoto.experiment import MonteCarlo
+from jaxphoto.io import write_block
+from jaxphoto.sensitivity import Readjustment, noise
+from tests.blocks import adjusted, simulated
+
+NOMINAL = "strips"
+
+
+def study(directory, draws=1100, seed=1, errors=None) -> MonteCarlo:
+    nominal = adjusted("cross")
+    errors = bias(nominal.block, "station", 0.1, "block") if errors is None else errors
+    run = Readjustment(nominal, errors.applied, errors.sigma[None])
+    return MonteCarlo(nominal.block, run, errors, draws, seed, directory)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A run of several parts that nobody stopped."""
+    directory = tmp_path_factory.mktemp("draws") / "run"
+    done = study(directory)
+    done.draw()
+    return directory, done.write()
+
+
+def test_the_promised_files_and_columns(whole):
+    directory, (summary, table) = whole
+    assert {p.name for p in directory.iterdir()} == {
+        "draws.parquet", "summary.csv", "summary.json", "effects.csv", "interior.png", "effects.png", "run.json",
+    }  # fmt: skip
+    draws = pd.read_parquet(directory / "draws.parquet")
+    assert list(draws["draw"]) == list(range(1100))
+    assert list(draws.columns[:4]) == ["draw", "converged", "iterations", "fallback"]
+    assert {"bias.block.X_m", "bias.block.Y_m", "bias.block.Z_m", "one.c_mm", "one.k1"} <= set(draws.columns)
+    assert draws["converged"].all()
+    assert (summary["draws"], summary["fallbacks"], summary["converged"]) == (1100, 0, 1100)
+    assert set(summary["seconds"]) == {"compile", "draws"}
+    assert json.loads((directory / "summary.json").read_text()) == summary
+    assert summary["draws_per_second"] > 0
+    assert list(table.columns) == [
+        "quantity", "nominal", "mean", "sd", "q025", "q50", "q975", "predicted_sigma", "ratio",
+    ]  # fmt: skip
+    rows = table.set_index("quantity")
+    assert rows.loc["one.c_mm", "sd"] == pytest.approx(draws["one.c_mm"].std(), rel=1e-12)
+    # The standard deviation of a sample of n is off by 1 / sqrt(2 n).
+    assert np.abs(table["ratio"] - 1).max() < 5 / np.sqrt(2 * 1100)
+    effects = pd.read_csv(directory / "effects.csv")
+    assert rows.loc["one.c_mm", "predicted_sigma"] == pytest.approx(np.hypot.reduce(effects["one.c_mm"]), rel=1e-9)
+
+
+class Stop(Exception):
+    """Stands for whatever ends a process."""
+
+
+@pytest.mark.parametrize("at", [1, 1030, 1100])
+def test_a_run_that_was_stopped_goes_on_to_the_same_file(whole, tmp_path, at):
+    def stop(done: int) -> None:
+        if done >= at:
+            raise Stop
+
+    with pytest.raises(Stop):
+        study(tmp_path / "run").draw(stop)
+    assert not (tmp_path / "run" / "draws.parquet").exists()
+    again = study(tmp_path / "run")
+    again.draw()
+    again.write()
+    directory, _ = whole
+    assert (tmp_path / "run" / "draws.parquet").read_bytes() == (directory / "draws.parquet").read_bytes()
+    assert (tmp_path / "run" / "summary.csv").read_bytes() == (directory / "summary.csv").read_bytes()
+    assert not (tmp_path / "run" / "parts").exists()
+
+
+def test_a_run_that_is_done_is_only_read(whole):
+    directory, (summary, _) = whole
+    before = (directory / "summary.json").stat().st_mtime_ns
+    again = study(directory)
+    again.draw()
+    assert again.write()[0] == summary
+    assert (directory / "summary.json").stat().st_mtime_ns == before
+
+
+@pytest.mark.parametrize(("changed", "name"), [({"seed": 2}, "seed"), ({"draws": 5}, "draws")])
+def test_another_run_is_not_overwritten(whole, changed, name):
+    directory, _ = whole
+    before = (directory / "draws.parquet").read_bytes()
+    with pytest.raises(InputError, match=f"other settings .{name}"):
+        study(directory, **changed)
+    assert (directory / "draws.parquet").read_bytes() == before
+
+
+def test_a_folder_of_something_else_is_left_alone(tmp_path):
+    (tmp_path / "thesis.txt").write_text("mine")
+    with pytest.raises(InputError, match="holds no Monte Carlo run"):
+        study(tmp_path)
+    with pytest.raises(InputError, match="is a file"):
+        study(tmp_path / "thesis.txt" / "run")
+    assert [p.name for p in tmp_path.iterdir()] == ["thesis.txt"]
+
+
+def test_noise_is_predicted_by_the_covariance(tmp_path):
+    nominal = adjusted("cross")
+    made = study(tmp_path / "run", draws=4, errors=noise(nominal.block))
+    made.draw()
+    _, table = made.write()
+    of = table.set_index("quantity")["predicted_sigma"]
+    cov = covariance(nominal)
+    expected = np.sqrt(np.diagonal(cov.matrix))[6 * cov.n_images :]
+    found = [of[label.replace("interior[one]", "one")] for label in nominal.structure.labels]
+    assert found == pytest.approx(expected, rel=1e-6)
+
+
+def command(monkeypatch, capsys, *arguments) -> tuple[int, str, str]:
+    monkeypatch.setattr(sys, "argv", ["jaxphoto", *map(str, arguments)])
+    with pytest.raises(SystemExit) as stop:
+        cli.main()
+    captured = capsys.readouterr()
+    return stop.value.code or 0, captured.out, captured.err
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("block") / "block"
+    write_block(simulated(NOMINAL).block, path)
+    return path
+
+
+def test_the_command(folder, monkeypatch, capsys, tmp_path):
+    out = tmp_path / "run"
+    options = ("--bias", "station", "--per", "strip", "--sigma-m", "0.05,0.05,0.1", "--draws", 20, "--seed", 3)
+    code, printed, _ = command(
+        monkeypatch, capsys, "monte-carlo", folder, *options, "--with", "exterior", "--with", "points", "--out", out
+    )
+    assert code == 0
+    assert "20 draws, 20 converged" in printed
+    draws = pd.read_parquet(out / "draws.parquet")
+    block = simulated(NOMINAL).block
+    strips = set(block.image_strip)
+    assert {f"bias.{strip}.{axis}_m" for strip in strips for axis in "XYZ"} <= set(draws.columns)
+    assert f"exterior.{block.images[0]}.kappa_deg" in draws.columns
+    assert f"point.{block.points[0]}.Z_m" in draws.columns
+    shifts = [c for c in draws.columns if c.startswith("strips.")]
+    assert shifts
+
+
+@pytest.mark.parametrize(
+    "options, words",
+    [
+        (("--bias", "station", "--sigma-m", "0.1", "--on", "S9", "--per", "strip"), "no strip 'S9'"),
+        (("--bias", "station", "--sigma-m", "0.1", "--draws", "0"), "1 at least, got 0"),
+        (("--bias", "station", "--sigma-m", "0.1", "--draws", "-5"), "1 at least, got -5"),
+        (("--bias", "station", "--sigma-deg", "0.1"), "takes --sigma-m"),
+        (("--bias", "station"), "takes --sigma-m"),
+        (("--bias", "station", "--sigma-m", "much"), "--sigma-m much"),
+        (("--bias", "station", "--sigma-m", "-1"), "above zero"),
+        (("--bias", "wind", "--sigma-m", "1"), "--bias wind: there are station"),
+        (("--bias", "noise", "--sigma-m", "1"), "takes no --sigma-m"),
+        (("--bias", "station", "--sigma-m", "1", "--with", "all"), "--with all: there are exterior, points"),
+    ],
+)
+def test_a_mistake_is_one_sentence_and_nothing_written(folder, monkeypatch, capsys, tmp_path, options, words):
+    code, _, error = command(monkeypatch, capsys, "monte-carlo", folder, "--out", tmp_path / "run", *options)
+    assert code == 2
+    assert words in error
+    assert "Traceback" not in error
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.slow
+def test_killed_in_the_middle_it_goes_on_to_the_same_file(folder, tmp_path):
+    program = [sys.executable, "-c", "from jaxphoto.cli import main; main()", "monte-carlo", str(folder)]
+    program += ["--bias", "station", "--per", "image", "--sigma-m", "0.1", "--draws", "10000"]
+    subprocess.run([*program, "--out", str(tmp_path / "whole")], check=True, capture_output=True)
+    killed = subprocess.Popen(
+        [*program, "--out", str(tmp_path / "killed")], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    parts = tmp_path / "killed" / "parts"
+    while not list(parts.glob("part-*.parquet")):
+        assert killed.poll() is None
+        time.sleep(0.02)
+    killed.send_signal(signal.SIGKILL)
+    killed.wait()
+    assert not (tmp_path / "killed" / "draws.parquet").exists()
+    subprocess.run([*program, "--out", str(tmp_path / "killed")], check=True, capture_output=True)
+    for name in ("draws.parquet", "summary.csv"):
+        assert (tmp_path / "killed" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
