@@ -54,7 +54,6 @@ from jaxphoto.collinearity import ExteriorOrientation, image_ray, intersect, pro
 from jaxphoto.errors import BlockError, DatumError, InputError, JaxphotoError, RankError
 from jaxphoto.georeferencing import Mount, StripBias, Surface, direct_orientation, ground_point
 from jaxphoto.procedures import adjust, boresight, georeference
-from jaxphoto.sensitivity import bias, monte_carlo, noise, readjust
 from jaxphoto.simulation import simulate
 from jaxphoto.statistics import angle_differences, covariance, point_differences
 from jaxphoto.unknowns import FIXED, FREE, Unknowns, Weighted
@@ -62,6 +61,7 @@ from jaxphoto.unknowns import FIXED, FREE, Unknowns, Weighted
 if TYPE_CHECKING:
     from jaxphoto.io import convert, read_block, read_recipe, read_source, write_block, write_simulation
     from jaxphoto.report import Tables
+    from jaxphoto.sensitivity import bias, monte_carlo, noise, readjust
 
 __version__ = "0.1.0"
 
@@ -77,10 +77,12 @@ __all__ = [
     "write_block", "write_simulation",
 ]  # fmt: skip
 
-# Files and tables bring pandas and more, a third of a second: they are imported when first asked for.
+# Files and tables bring pandas and more, a third of a second, and studies are not for every day: they are imported when
+# first asked for.
 _LATER = {
     "convert": "io", "read_block": "io", "read_recipe": "io", "read_source": "io", "write_block": "io",
-    "write_simulation": "io", "Tables": "report",
+    "write_simulation": "io", "Tables": "report", "bias": "sensitivity", "monte_carlo": "sensitivity",
+    "noise": "sensitivity", "readjust": "sensitivity",
 }  # fmt: skip
 
 

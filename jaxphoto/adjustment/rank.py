@@ -22,7 +22,7 @@ from jaxphoto.errors import DatumError, RankError
 from jaxphoto.unknowns import FREE, Unknowns
 
 # A pivot of the unit-diagonal reduced matrix below this is a rank defect: at float64 it is rounding, not geometry.
-_DEFECT = 1e-13
+DEFECT = 1e-13
 
 
 def check_priors(block: Block, priors: Unknowns) -> None:
@@ -122,7 +122,7 @@ def check_rank(adjusted: Adjustment) -> None:
     s, computed = adjusted.structure, adjusted.padded
     factored = computed.factored
     left = np.asarray(call_compiled(_pivots, factored.reduced.diagonal, factored.factor))
-    if left.min() > _DEFECT:
+    if left.min() > DEFECT:
         return
     band = call_compiled(reduced_matrix, computed.values, factored.scale, computed.structure)
     a = crop_reduced(dense(band), s, computed.places)

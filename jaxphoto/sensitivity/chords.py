@@ -13,16 +13,15 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxphoto.adjustment.elimination import solve_factored
-from jaxphoto.adjustment.normal import At
+from jaxphoto.adjustment.normal import AXIS, At
 from jaxphoto.adjustment.optimum import weigh_datum
 from jaxphoto.adjustment.residuals import Increments, State
 from jaxphoto.adjustment.result import Factored
+from jaxphoto.adjustment.shards import mesh_of
 from jaxphoto.sensitivity.many import Common, Varying, image_gradients, other_gradients, states
 
 TOLERANCE = 1e-6
@@ -31,7 +30,6 @@ TOLERANCE = 1e-6
 _CONTRACTS, _MOST_STEPS = 0.5, 20
 # The part of the first step that is taken to be missing after it.
 _FIRST_RATIO = 0.1
-_AXIS = "draws"
 # What, besides measured image coordinates, moves the residuals of image rows.
 _OF_IMAGE_ROWS = {"xy", "sigma_xy", "position", "rotation", "shared", "points"}
 
@@ -60,8 +58,7 @@ def find_optima(varying: Varying, common: Common, factored: Factored, devices: i
     """The optimum of every draw, dealt out to `devices`; `first_only`, its first-order approximation."""
     if devices == 1:
         return _find(varying, common, factored, first_only)
-    mesh = Mesh(np.array(jax.devices()[:devices]), (_AXIS,))
-    last = lambda v: P(*[None] * (v.ndim - 1), _AXIS)  # noqa: E731
+    last = lambda v: P(*[None] * (v.ndim - 1), AXIS)  # noqa: E731
     arrays, rest = eqx.partition((common, factored), eqx.is_array)
 
     def of_device(varying, arrays):
@@ -70,7 +67,7 @@ def find_optima(varying: Varying, common: Common, factored: Factored, devices: i
 
     run = jax.shard_map(
         of_device,
-        mesh=mesh,
+        mesh=mesh_of(devices),
         in_specs=(jax.tree.map(last, varying), P()),
         out_specs=_draws_last(),
         check_vma=False,
@@ -80,8 +77,8 @@ def find_optima(varying: Varying, common: Common, factored: Factored, devices: i
 
 def _draws_last() -> Any:
     """`Found`, dealt out along its draws."""
-    each: Any = P(_AXIS)
-    position, rotation, shared, points = (P(*[None] * axes, _AXIS) for axes in (2, 3, 1, 2))
+    each: Any = P(AXIS)
+    position, rotation, shared, points = (P(*[None] * axes, AXIS) for axes in (2, 3, 1, 2))
     state: Any = (position, rotation, shared, points)
     return Found(State(*state), each, each)
 

@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxphoto.adjustment import Adjustment, on_one_device, solve
 from jaxphoto.adjustment.padding import crop_state, pad_values
 from jaxphoto.adjustment.residuals import State, Values
+from jaxphoto.adjustment.shards import usable
 from jaxphoto.adjustment.values import values_of, with_datum
 from jaxphoto.arrays import still
 from jaxphoto.block import Block, Start
@@ -31,6 +32,8 @@ from jaxphoto.sensitivity.perturbation import Perturbation, Recorded
 
 # Numbers of image rows and draws that a device computes with at a time (see `batch_size`), and draws that are worth it.
 _ROWS, _MOST_DRAWS = 100_000, 64
+# More than any machine has.
+_MOST_DEVICES = 1024
 
 
 class Draws(eqx.Module):
@@ -129,7 +132,8 @@ class Readjustment:
         self.common = common_of(self.adjusted)
         self.factored, self.places = padded.factored, padded.places
         self.names = self._varying_fields(jax.tree.map(lambda v: v[:1], example))
-        self.devices = len(jax.local_devices())
+        # Of several processes, each draws for itself.
+        self.devices = usable(_MOST_DEVICES) if jax.process_count() == 1 else 1
         self._numbers = jax.jit(jax.vmap(self._numbers_of, out_axes=(-1, 0)))
 
     @property

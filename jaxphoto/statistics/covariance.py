@@ -11,7 +11,7 @@ summed tile by tile. The full matrix is never inverted. In a free network the pa
 constraints of the datum hold, is subtracted: what remains is the covariance under inner (or minimal) constraints.
 """
 
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -58,8 +58,8 @@ class Covariance(eqx.Module):
     for a posteriori values.
     """
 
-    matrix: Float[np.ndarray, "reduced reduced"]
-    points: Float[np.ndarray, "points 3 3"]
+    matrix: Float[Numbers, "reduced reduced"]
+    points: Float[Numbers, "points 3 3"]
     variance_factor: Float[Numbers, ""]
     cofactors: Cofactors
     """In the sizes of `Adjustment.padded`."""
@@ -68,22 +68,25 @@ class Covariance(eqx.Module):
     rotations: Rotations = eqx.field(static=True)
 
     @property
-    def exterior_sigma(self) -> Float[np.ndarray, "images 6"]:
+    def exterior_sigma(self) -> Float[Numbers, "images 6"]:
         """A posteriori standard deviations of X, Y, Z (m) and the rotations (rad), by image."""
-        return self._sigma(np.diagonal(self.matrix))[: 6 * self.n_images].reshape(-1, 6)
+        return self._sigma(self.matrix.diagonal())[: 6 * self.n_images].reshape(-1, 6)
 
     @property
-    def shared_sigma(self) -> Float[np.ndarray, "shared"]:
+    def shared_sigma(self) -> Float[Numbers, "shared"]:
         """A posteriori standard deviations of the shared unknowns, in the order of `labels`' end."""
-        return self._sigma(np.diagonal(self.matrix))[6 * self.n_images :]
+        return self._sigma(self.matrix.diagonal())[6 * self.n_images :]
 
     @property
-    def point_sigma(self) -> Float[np.ndarray, "points 3"]:
+    def point_sigma(self) -> Float[Numbers, "points 3"]:
         """A posteriori standard deviations of the object points (m)."""
-        return self._sigma(np.diagonal(self.points, axis1=1, axis2=2))
+        return self._sigma(self.points.diagonal(axis1=1, axis2=2))
 
-    def _sigma(self, variance: np.ndarray) -> np.ndarray:
-        return np.sqrt(np.maximum(variance, 0.0) * np.asarray(self.variance_factor))
+    def _sigma(self, variance: Numbers) -> Any:
+        xp = jnp if isinstance(variance * self.variance_factor, jax.Array) else np
+        # Double where: the root of what is fixed, zero, has no derivative.
+        free = variance > 0
+        return xp.where(free, xp.sqrt(xp.where(free, variance, 1.0) * self.variance_factor), 0.0)
 
 
 def covariance(adjusted: Adjustment, rotations: Rotations = "omega_phi_kappa") -> Covariance:
@@ -131,24 +134,17 @@ def _covariance(
     values: Values, factored: Factored, s: Structure, rotations: Rotations, of_rows: Bool[Numbers, ""]
 ) -> tuple[Cofactors, Array, Array, Array]:
     """Cofactors; the same in units of the unknowns; and j Q j' of image rows, zero where they are not wanted."""
-    q, rows = _cofactors(values, factored, s, of_rows)
-    return q, *_physical(q, factored.scale, values.rotation, rotations), rows
+    q, rows = cofactors_of(values, factored, s, of_rows)
+    return q, *in_units(q, factored.scale, values.rotation, rotations), rows
 
 
-def _physical(q: Cofactors, scale: Increments, rotation: Float[Array, "3 3 images"], rotations: Rotations):
+def in_units(q: Cofactors, scale: Increments, rotation: Float[Array, "3 3 images"], rotations: Rotations):
+    """Covariances of reduced unknowns and of points (3 x 3 each), in metres, radians and the unknowns' own units."""
     n = rotation.shape[2]
     factors = jnp.concatenate([scale.eop.T.reshape(-1), scale.shared])
     matrix = q.reduced * factors[:, None] * factors[None, :]
 
-    def turn(camera_from_object):
-        if rotations == "camera":
-            return jnp.eye(3)
-        if rotations == "object":
-            return camera_from_object.T
-        angles = lambda theta: omega_phi_kappa_from_matrix(small_rotation(theta) @ camera_from_object)  # noqa: E731
-        return jax.jacfwd(angles)(jnp.zeros(3))
-
-    turns = jax.vmap(turn, in_axes=2)(rotation)
+    turns = turns_of(rotation, rotations)
     blocks = matrix[: 6 * n].reshape(n, 2, 3, -1)
     blocks = jnp.stack([blocks[:, 0], jnp.einsum("nij,njk->nik", turns, blocks[:, 1])], axis=1)
     rows = jnp.concatenate([blocks.reshape(6 * n, -1), matrix[6 * n :]]).T
@@ -159,8 +155,22 @@ def _physical(q: Cofactors, scale: Increments, rotation: Float[Array, "3 3 image
     return matrix, points
 
 
-def _cofactors(values: Values, factored: Factored, s: Structure, of_rows: Bool[Numbers, ""]):
-    """All cofactors of one factored block; see the module's head."""
+def turns_of(rotation: Float[Array, "3 3 images"], rotations: Rotations) -> Float[Array, "images 3 3"]:
+    """What takes an image's small rotation in the camera frame (rad) to the change of its three `rotations` (rad)."""
+
+    def turn(camera_from_object):
+        if rotations == "camera":
+            return jnp.eye(3)
+        if rotations == "object":
+            return camera_from_object.T
+        angles = lambda theta: omega_phi_kappa_from_matrix(small_rotation(theta) @ camera_from_object)  # noqa: E731
+        return jax.jacfwd(angles)(jnp.zeros(3))
+
+    return jax.vmap(turn, in_axes=2)(rotation)
+
+
+def cofactors_of(values: Values, factored: Factored, s: Structure, of_rows: Bool[Numbers, ""]):
+    """All cofactors of one factored block, and j Q j' of its image rows; see the module's head."""
     reduced = factored.reduced
     inverse = invert_band(factored.factor)
     full = inverse

@@ -97,10 +97,11 @@ def test_scatter_under_noise_is_the_covariance():
         ratio = values.std(axis=0, ddof=1)[free] / sigma[free]
         # The standard deviation of a sample of n is off by 1 / sqrt(2 n); five of these for the worst of hundreds.
         assert np.abs(ratio - 1).max() < 5 / np.sqrt(2 * n)
-        assert abs(ratio.mean() - 1) < 0.02
+        # Noise of a measured coordinate is stretched by its distortion, which the weights do not know: two per cent.
+        assert abs(ratio.mean() - 1) < 0.03
 
 
-def test_first_order_is_the_limit_and_large_errors_depart_from_it():
+def test_large_errors_depart_from_first_order_by_their_square():
     nominal = adjusted("cross")
     shift = np.random.default_rng(3).normal(0, 1, (1, 3))
 
@@ -108,17 +109,18 @@ def test_first_order_is_the_limit_and_large_errors_depart_from_it():
         rows = block.stations
         return eqx.tree_at(lambda b: b.stations.value, block, rows.value + errors[rows.axis] * (rows.who % 3 - 1.0))
 
-    departure = {}
+    even = {}
     at = estimates(nominal)[0]
-    for size in (0.05, 0.5):
-        run = Readjustment(nominal, change, size * shift)
-        (exact,) = run.batches(size * shift)
-        first = run.first_order(size * shift)
-        departure[size] = (exact.shared - first.shared)[0]
-        moved = np.abs(first.shared[0] - at).max(initial=0.0)
-        assert 0 < np.abs(departure[size]).max() < moved
-    # The rest of a first-order approximation grows with the square.
-    assert departure[0.5] / departure[0.05] == pytest.approx(np.full(len(at), 100.0), rel=0.3)
+    for size in (0.1, 1.0):
+        to_and_fro = np.concatenate([size * shift, -size * shift])
+        run = Readjustment(nominal, change, to_and_fro)
+        (exact,) = run.batches(to_and_fro)
+        change_of_first = run.first_order(to_and_fro).shared[0] - at
+        odd, even[size] = exact.shared[0] - exact.shared[1], exact.shared.mean(axis=0) - at
+        # First order leaves the residuals' curvature away, which is small.
+        assert odd / 2 == pytest.approx(change_of_first, rel=0.02, abs=0.02 * np.abs(change_of_first).min())
+    # What no first order sees grows with the square.
+    assert even[1.0] / even[0.1] == pytest.approx(np.full(len(at), 100.0), rel=0.1)
 
 
 def test_a_draw_that_does_not_contract_is_adjusted_by_itself():
