@@ -61,6 +61,7 @@ def solve(
     wide, places = pad_structure(structure, sizes, shards=shards, dense=coupled)
     numbers = pad_values(values, structure, wide, places)
     seconds: dict[str, float] = {}
+    padded = None
     if traced:
         optimum = find_optimum(weigh_datum(numbers, wide), structure=wide, max_steps=max_steps)
         state = state_at(optimum.increments, unit_scale(wide), numbers, wide)
@@ -75,7 +76,6 @@ def solve(
         state = State(*map(still, state))
     numbers = at_state(numbers, state)
     # Statistics need the factored normal matrix; a derivative of the unknowns does not, and would pay for it dearly.
-    padded: Padded | Unfactored = Unfactored(wide, numbers, places)
     if not traced:
         _, _, factored = run_compiled(_optimise, (numbers, wide, max_steps, np.array(True)), seconds, "covariance")
         padded = Padded(wide, numbers, factored, places)
@@ -89,6 +89,7 @@ def solve(
         values=at_state(values, state),
         structure=structure,
         padded=padded,
+        unfactored=Unfactored(wide, numbers, places) if padded is None else None,
         steps=optimum.steps,
         converged=optimum.converged,
         seconds=seconds,

@@ -6,13 +6,16 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxphoto.adjustment.band import BandFactor
-from jaxphoto.adjustment.normal import Reduced
+from jaxphoto.adjustment.band import BandFactor, factor_band
+from jaxphoto.adjustment.normal import At, Reduced
+from jaxphoto.adjustment.optimum import typical_scale, weigh_datum, zero_increments
 from jaxphoto.adjustment.padding import Places
+from jaxphoto.adjustment.reduced import reduce_normal
 from jaxphoto.adjustment.residuals import GROUPS, Increments, Residuals, Values
 from jaxphoto.adjustment.structure import Structure
 from jaxphoto.arrays import Numbers
 from jaxphoto.block import Block
+from jaxphoto.compiling import call_compiled
 from jaxphoto.unknowns import Unknowns
 
 
@@ -49,6 +52,34 @@ class Padded(eqx.Module):
     places: Places
 
 
+class Unfactored(eqx.Module):
+    """What `Padded` is made of where that may never be wanted: inside a transformation of JAX."""
+
+    structure: Structure
+    values: Values
+    places: Places
+
+    def padded(self) -> Padded:
+        """With the normal equations, factored."""
+        if self.values.xy.ndim != _DIMENSIONS:
+            raise ValueError(
+                "statistics of many adjustments at once: ask for them inside the function that jax.vmap maps"
+            )
+        factored = call_compiled(_factored, self.values, self.structure)
+        return Padded(self.structure, self.values, factored, self.places)
+
+
+# Of the image coordinates of one adjustment: chunks, tiles, x and y, images, points.
+_DIMENSIONS = 5
+
+
+@eqx.filter_jit
+def _factored(values: Values, structure: Structure) -> Factored:
+    values, scale = weigh_datum(values, structure), typical_scale(values, structure)
+    a, reduced, _ = reduce_normal(At(zero_increments(structure), scale, values, structure), 0.0)
+    return Factored(reduced, factor_band(a), scale, values.datum_eop.shape[0])
+
+
 class Adjustment(eqx.Module):
     """The result of `jaxphoto.adjust`; see `jaxphoto.statistics` for what can be asked of it.
 
@@ -64,17 +95,18 @@ class Adjustment(eqx.Module):
     structure: Structure
     padded: Padded | None
     """None in an adjustment that is being differentiated or mapped over; see `computed`."""
+    unfactored: Unfactored | None
+    """None in any other."""
     steps: Int[Array, ""]
     converged: Array
     seconds: dict[str, float]
 
     @property
     def computed(self) -> Padded:
-        """What statistics are computed from. Raises ValueError inside a transformation of JAX."""
+        """What statistics are computed from; inside a transformation of JAX it is made anew each time."""
         if self.padded is None:
-            raise ValueError(
-                "statistics of an adjustment inside jax.grad, jax.jvp or jax.vmap: adjust outside of it first"
-            )
+            assert self.unfactored is not None
+            return self.unfactored.padded()
         return self.padded
 
     @property

@@ -7,7 +7,15 @@ import warnings
 import typer
 
 # Importing a command registers it.
-from jaxphoto.cli import adjust, boresight, convert, experiment, monte_carlo, simulate  # noqa: F401
+from jaxphoto.cli import (  # noqa: F401
+    adjust,
+    boresight,
+    convert,
+    experiment,
+    monte_carlo,
+    sensitivity,
+    simulate,
+)
 from jaxphoto.cli.app import app
 from jaxphoto.errors import JaxphotoError
 

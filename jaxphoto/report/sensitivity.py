@@ -1,0 +1,195 @@
+"""Sensitivity as tables and a picture: where a station bias ends, what estimates hang on, undetected errors."""
+
+from __future__ import annotations
+
+import time
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pandas as pd
+
+from jaxphoto.adjustment import Adjustment
+from jaxphoto.block import AXES
+from jaxphoto.report.plots import new_figure
+from jaxphoto.report.results import made_whole, versions, write_summary
+from jaxphoto.report.tables import Tables
+from jaxphoto.sensitivity.exact import Sensitivity, sensitivity
+from jaxphoto.sensitivity.influence import DELTA0, Per, external_reliability, station_bias, variance_shares
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+# Interior parameters in the figure.
+_SHOWN = 6
+
+
+class SensitivityTables:
+    """What the sensitivity of an adjustment says of its shared unknowns and its check points.
+
+    Numbers are in the estimate's own unit, which its name ends with; coordinates of points are in metres. `bias_m` is
+    the station bias and `per` whose stations have it: the block's, a strip's, an image's.
+    """
+
+    def __init__(self, adjusted: Adjustment, per: Per = "strip", bias_m: float = 0.10, delta0: float = DELTA0):
+        self.adjusted, self.per, self.bias_m, self.delta0 = adjusted, per, bias_m, delta0
+        self.check = tuple(adjusted.block.points[k] for k in dict.fromkeys(adjusted.block.check.who.tolist()))
+
+    @cached_property
+    def exact(self) -> Sensitivity:
+        """The derivatives."""
+        return sensitivity(self.adjusted, points=self.check)
+
+    @cached_property
+    def first_order(self) -> Sensitivity:
+        """The classical first-order matrix."""
+        return sensitivity(self.adjusted, curvature=False, points=self.check)
+
+    @cached_property
+    def _rows(self) -> slice:
+        """Shared unknowns and check points: all estimates but the exterior orientations."""
+        return slice(6 * len(self.adjusted.block.images), None)
+
+    @cached_property
+    def bias(self) -> pd.DataFrame:
+        """unit, axis, bias_m, estimate, exact, first_order, difference: what a bias of each unit's stations does."""
+        of = [station_bias(self.adjusted, d, self.per, self.bias_m) for d in (self.exact, self.first_order)]
+        exact, first = (b.change[self._rows].transpose(1, 2, 0) for b in of)
+        labels = self.exact.labels[self._rows]
+        index = pd.MultiIndex.from_product([of[0].units, AXES, labels], names=["unit", "axis", "estimate"])
+        table = index.to_frame(index=False)
+        table.insert(2, "bias_m", self.bias_m)
+        table["exact"], table["first_order"] = exact.ravel(), first.ravel()
+        table["difference"] = table["exact"] - table["first_order"]
+        return table
+
+    @cached_property
+    def variance_shares(self) -> pd.DataFrame:
+        """estimate, group, share, and the observation (image, point, axis) that most of it is of, largest_share."""
+        shares = variance_shares(self.adjusted, self.exact)
+        found = []
+        for group, share in shares.groups.items():
+            if not share.size:
+                continue
+            share, rows = share[self._rows], self._observations[group]
+            most = share.argmax(axis=1)
+            table = rows.iloc[most][["image", "point", "axis"]].reset_index(drop=True)
+            table.insert(0, "share", share.sum(axis=1))
+            table.insert(0, "group", group)
+            table.insert(0, "estimate", self.exact.labels[self._rows])
+            table["largest_share"] = share.max(axis=1)
+            found.append(table)
+        return pd.concat(found, ignore_index=True).sort_values("estimate", kind="stable", ignore_index=True)
+
+    @cached_property
+    def external_reliability(self) -> pd.DataFrame:
+        """Of each estimate and group the worst observation: what its minimal detectable error does, undetected.
+
+        estimate, group, image, point, axis, redundancy_number, detectable, unit, effect, effect_over_sigma: `unit` is
+        that of the detectable error, sigma is the estimate's a priori. Observations that nothing checks are left out;
+        the summary counts them.
+        """
+        found = external_reliability(self.adjusted, self.exact, self.delta0)
+        sigma = np.sqrt(variance_shares(self.adjusted, self.exact).variance)[self._rows]
+        tables = []
+        for group, effect in found.effect.items():
+            detectable = found.detectable[group]
+            checked = np.isfinite(detectable)
+            if not checked.any():
+                continue
+            effect, rows = effect[self._rows], self._observations[group]
+            worst = np.where(checked, np.abs(effect), -1.0).argmax(axis=1)
+            table = rows.iloc[worst].reset_index(drop=True).drop(columns=["group", "factor"])
+            table.insert(0, "group", group)
+            table.insert(0, "estimate", self.exact.labels[self._rows])
+            table.insert(6, "detectable", rows["factor"].to_numpy()[worst] * detectable[worst])
+            table["effect"] = effect[np.arange(len(effect)), worst]
+            table["effect_over_sigma"] = table["effect"] / np.where(sigma > 0, sigma, np.nan)
+            tables.append(table)
+        return pd.concat(tables, ignore_index=True).sort_values("estimate", kind="stable", ignore_index=True)
+
+    @cached_property
+    def _observations(self) -> dict[str, pd.DataFrame]:
+        """Whose each column of `Sensitivity.groups` is, with the factor to the unit of tables."""
+        table = Tables(self.adjusted).residuals[["group", "image", "point", "axis", "redundancy_number", "unit"]]
+        table = table.assign(factor=np.where(table["unit"] == "deg", 180 / np.pi, 1.0))
+        return {str(group): rows for group, rows in table.groupby("group")}
+
+    def figure(self) -> Figure:
+        """Interior orientation and check points: the change by a bias of each unit and axis, exact and first-order."""
+        table = self.bias
+        interior = [e for e in dict.fromkeys(table["estimate"]) if e.startswith("interior")][:_SHOWN]
+        panels = {e.split("].")[1] if len(self.adjusted.unknowns.interior) == 1 else e: [e] for e in interior}
+        panels |= {f"check points, {a}, RMS [m]": [f"points[{p}].{a}" for p in self.check] for a in AXES if self.check}
+        columns = 3
+        down = max(1, -(-len(panels) // columns))
+        figure = new_figure(9.6, 0.6 + 2.2 * down)
+        for axes, (title, names) in zip(
+            figure.subplots(down, columns, squeeze=False).flat, panels.items(), strict=False
+        ):
+            chosen = table[table["estimate"].isin(names)]
+            by = chosen.groupby(["unit", "axis"], sort=False)[["exact", "first_order", "difference"]]
+            values = by.sum() if len(names) == 1 else by.agg(_rms)
+            at = np.arange(len(values))
+            for k, (name, colour) in enumerate(
+                (("exact", "tab:blue"), ("first_order", "0.6"), ("difference", "tab:red"))
+            ):
+                axes.bar(at + 0.27 * (k - 1), values[name], 0.27, color=colour, label=name.replace("_", " "))
+            axes.set_xticks(at, [f"{unit} {axis}" for unit, axis in values.index], rotation=90, fontsize=7)
+            axes.axhline(0, color="0.4", lw=0.6)
+            axes.set_title(title, fontsize=10)
+            axes.tick_params(axis="y", labelsize=8)
+        for axes in figure.axes[len(panels) :]:
+            axes.remove()
+        if panels:
+            figure.axes[0].legend(fontsize=7)
+        figure.suptitle(f"change by a station bias of {self.bias_m:g} m per {self.per}", fontsize=11)
+        return figure
+
+
+def _rms(values: pd.Series) -> float:
+    return float(np.sqrt((values**2).mean()))
+
+
+def write_sensitivity(tables: SensitivityTables, directory: Path, seconds: dict[str, float]) -> None:
+    """sensitivity.csv, variance_shares.csv, external_reliability.csv, summary.json, sensitivity.png in `directory`.
+
+    All of it is written before earlier results are replaced. Raises InputError where `directory` holds something that
+    is not an earlier result.
+    """
+    began = time.perf_counter()
+    with made_whole(directory) as work:
+        tables.bias.to_csv(work / "sensitivity.csv", index=False)
+        tables.variance_shares.to_csv(work / "variance_shares.csv", index=False)
+        tables.external_reliability.to_csv(work / "external_reliability.csv", index=False)
+        tables.figure().savefig(work / "sensitivity.png")
+        write_summary(_summary(tables, seconds | {"write": time.perf_counter() - began}), work)
+
+
+def _summary(tables: SensitivityTables, seconds: dict[str, float]) -> dict:
+    adjusted, table = tables.adjusted, tables.bias
+    shares = tables.variance_shares
+    detectable = external_reliability(adjusted, tables.exact, tables.delta0).detectable
+    interior = {}
+    for name in (label for label in tables.exact.labels if label.startswith("interior")):
+        own = table[table["estimate"] == name]
+        worst = own.iloc[int(own["exact"].abs().to_numpy().argmax())]
+        groups = shares[shares["estimate"] == name].set_index("group")["share"]
+        interior[name] = {
+            "largest_change": {key: worst[key] for key in ("unit", "axis", "exact", "first_order", "difference")},
+            "variance_shares": {str(group): float(share) for group, share in groups.items()},
+        }
+    return {
+        "title": adjusted.block.title,
+        "bias_m": tables.bias_m,
+        "per": tables.per,
+        "delta0": tables.delta0,
+        "sigma0": float(adjusted.sigma0),
+        "redundancy": adjusted.redundancy,
+        "check_points": len(tables.check),
+        "unchecked_observations": {name: int((~np.isfinite(v)).sum()) for name, v in detectable.items()},
+        "interior": interior,
+        "seconds": {name: round(value, 6) for name, value in seconds.items()},
+        "versions": versions(),
+    }
