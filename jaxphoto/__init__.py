@@ -61,7 +61,7 @@ from jaxphoto.unknowns import FIXED, FREE, Unknowns, Weighted
 if TYPE_CHECKING:
     from jaxphoto.io import convert, read_block, read_recipe, read_source, write_block, write_simulation
     from jaxphoto.report import Tables
-    from jaxphoto.sensitivity import bias, monte_carlo, noise, readjust
+    from jaxphoto.sensitivity import bias, monte_carlo, readjust
 
 __version__ = "0.1.0"
 
@@ -72,7 +72,7 @@ __all__ = [
     "RankError", "Sensor", "Smac", "StripBias", "Surface", "Tables", "Unknowns", "Weighted", "adjust",
     "angle_differences", "bias", "boresight", "common_sizes", "conversion_error", "convert", "covariance",
     "decentring_from_symmetry", "direct_orientation", "georeference", "ground_point", "image_ray", "intersect",
-    "monte_carlo", "noise", "point_differences", "principal_points", "project", "read_block", "read_recipe",
+    "monte_carlo", "point_differences", "principal_points", "project", "read_block", "read_recipe",
     "read_source", "readjust", "rebalance", "rebalance_covariance", "simulate", "symmetry_from_decentring",
     "write_block", "write_simulation",
 ]  # fmt: skip
@@ -82,7 +82,7 @@ __all__ = [
 _LATER = {
     "convert": "io", "read_block": "io", "read_recipe": "io", "read_source": "io", "write_block": "io",
     "write_simulation": "io", "Tables": "report", "bias": "sensitivity", "monte_carlo": "sensitivity",
-    "noise": "sensitivity", "readjust": "sensitivity",
+    "readjust": "sensitivity",
 }  # fmt: skip
 
 

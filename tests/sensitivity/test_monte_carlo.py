@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxphoto import InputError, adjust, bias, covariance, monte_carlo, noise, readjust
+from jaxphoto import InputError, adjust, bias, covariance, monte_carlo, readjust
 from jaxphoto.adjustment import Adjustment
-from jaxphoto.sensitivity import Readjustment
+from jaxphoto.sensitivity import Readjustment, noise
 from jaxphoto.unknowns import FIXED
 from tests.blocks import adjusted, simulated
 
