@@ -59,7 +59,11 @@ def monte_carlo_command(
         adjusted = adjust(read)
         status.update("preparing the draws")
         run = Readjustment(
-            adjusted, drawn.applied, drawn.sigma[None], exterior="exterior" in kept, points="points" in kept
+            adjusted,
+            drawn.applied,
+            np.tile(drawn.sigma, (draws, 1)),
+            exterior="exterior" in kept,
+            points="points" in kept,
         )
     study = MonteCarlo(read, run, drawn, draws, seed, out)
     columns = (TextColumn("draws"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())

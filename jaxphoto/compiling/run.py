@@ -43,21 +43,21 @@ _prepared: dict[object, Future[_Program]] = {}
 _workers = ThreadPoolExecutor(max_workers=os.cpu_count(), thread_name_prefix="jaxphoto-compile")
 
 
-def run_compiled(function: Any, arguments: tuple, seconds: dict[str, float], name: str) -> Any:
+def run_compiled(function: Any, arguments: tuple, seconds: dict[str, float], name: str, thorough: bool = False) -> Any:
     """Call `function` (made by `eqx.filter_jit`), compiling it first and apart, or loading it from disk (`store`).
 
-    Adds to `seconds["compile"]` what compiling or loading took, and to `seconds[name]` what the call took. Under a
-    transformation of JAX it is a plain call.
+    Adds to `seconds["compile"]` what compiling or loading took, and to `seconds[name]` what the call took. What runs
+    thousands of times is worth `thorough` compiling. Under a transformation of JAX it is a plain call.
     """
     if _traced(arguments):
         return function(*arguments)
     began = time.perf_counter()
-    key, arrays = _key(function, arguments), jax.tree.leaves(eqx.filter(arguments, eqx.is_array))
+    key, arrays = (_key(function, arguments), thorough), jax.tree.leaves(eqx.filter(arguments, eqx.is_array))
     prepared = _prepared.pop(key, None)
     if prepared is not None:
         _programs[key] = prepared.result()
     elif key not in _programs:
-        _programs[key] = _program_of(function.__wrapped__, arguments)()
+        _programs[key] = _program_of(function.__wrapped__, arguments, thorough)()
     ready = time.perf_counter()
     try:
         result = _programs[key](arrays)
@@ -65,7 +65,7 @@ def run_compiled(function: Any, arguments: tuple, seconds: dict[str, float], nam
         # Read whole, but not fit to run after all: that shows in the call only.
         if not _programs[key].loaded:
             raise
-        _programs[key] = _program_of(function.__wrapped__, arguments, anew=True)()
+        _programs[key] = _program_of(function.__wrapped__, arguments, thorough, anew=True)()
         ready = time.perf_counter()
         result = _programs[key](arrays)
     seconds["compile"] = seconds.get("compile", 0.0) + ready - began
@@ -73,9 +73,9 @@ def run_compiled(function: Any, arguments: tuple, seconds: dict[str, float], nam
     return result
 
 
-def call_compiled(function: Any, *arguments: Any) -> Any:
+def call_compiled(function: Any, *arguments: Any, thorough: bool = False) -> Any:
     """`run_compiled` where nobody asks for times: what a start needs, and would otherwise trace each time."""
-    return run_compiled(function, arguments, {}, "")
+    return run_compiled(function, arguments, {}, "", thorough)
 
 
 def prepare(function: Any, arguments: tuple, seconds: dict[str, float]) -> None:
@@ -86,9 +86,9 @@ def prepare(function: Any, arguments: tuple, seconds: dict[str, float]) -> None:
     if _traced(arguments):
         return
     began = time.perf_counter()
-    key = _key(function, arguments)
+    key = _key(function, arguments), False
     if key not in _programs and key not in _prepared:
-        _prepared[key] = _workers.submit(_program_of(function.__wrapped__, arguments))
+        _prepared[key] = _workers.submit(_program_of(function.__wrapped__, arguments, thorough=False))
     seconds["compile"] = seconds.get("compile", 0.0) + time.perf_counter() - began
 
 
@@ -110,12 +110,12 @@ def _type(array: Any) -> tuple:
     return array.shape, array.dtype, array.weak_type, array.sharding if array.committed else None
 
 
-def _program_of(function: Any, arguments: tuple, anew: bool = False) -> Callable[[], _Program]:
+def _program_of(function: Any, arguments: tuple, thorough: bool, anew: bool = False) -> Callable[[], _Program]:
     """What gives the program: from disk; compiled, and kept for the next process, where it is not or wanted `anew`.
 
     All that depends on the thread, such as `with jax.enable_x64(False)`, is done before this returns.
     """
-    options = options_here()
+    options = options_here(thorough)
     key = store.key_of(function, arguments, options)
     stored = store.load(key) if key and not anew else None
     if stored is not None:

@@ -32,6 +32,8 @@ from jaxphoto.sensitivity.perturbation import Perturbation, Recorded
 
 # Numbers of image rows and draws that a device computes with at a time (see `batch_size`), and draws that are worth it.
 _ROWS, _MOST_DRAWS = 100_000, 64
+# Draws that are worth compiling thoroughly.
+_MANY = 500
 # More than any machine has.
 _MOST_DEVICES = 1024
 
@@ -113,7 +115,7 @@ class Drawn(eqx.Module):
 class Readjustment:
     """What is needed to re-adjust a block with other numbers, prepared once; `seconds` says what compiling took.
 
-    `example` is like what `batches` will be given.
+    `example` is like what `batches` will be given, in number, too: many draws are worth better compiled code.
     """
 
     def __init__(
@@ -125,6 +127,7 @@ class Readjustment:
         self.adjusted = dataclasses.replace(adjusted, padded=padded)
         self.change, self.exterior, self.points = change, exterior, points
         self.seconds = {"compile": 0.0}
+        self.many = _count(example) >= _MANY
         start = Start(
             adjusted.unknowns, *(np.ones(len(n), bool) for n in (adjusted.block.images, adjusted.block.points))
         )
@@ -174,7 +177,8 @@ class Readjustment:
         more = self.batch_size - _count(entries)
         entries = jax.tree.map(lambda v: np.concatenate([v, np.repeat(v[-1:], more, axis=0)]), entries)
         varying, recorded = self._numbers(entries)
-        return call_compiled(find_optima, varying, self.common, self.factored, self.devices, first_only), recorded
+        arguments = varying, self.common, self.factored, self.devices, first_only
+        return call_compiled(find_optima, *arguments, thorough=self.many and not first_only), recorded
 
     def _gathered(self, found: Found, recorded: Recorded, n: int) -> Draws:
         """Of a batch, its first `n` draws."""
