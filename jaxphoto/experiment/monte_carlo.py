@@ -44,11 +44,13 @@ class MonteCarlo:
             return
         folder = self.folder
         keys = jax.jit(jax.vmap(lambda k: self.drawn.drawn(jax.random.fold_in(jax.random.key(self.seed), k))))
-        self.run.warm_up(self.drawn.sigma[None])
+        each = np.arange(folder.per_part)
+        self.run.warm_up(np.asarray(keys(each)))
         began = time.perf_counter()
         for part in range(folder.next_part, folder.n_parts):
-            numbers = np.arange(part * folder.per_part, min((part + 1) * folder.per_part, folder.draws))
-            errors, batches, done = np.asarray(keys(numbers)), [], int(numbers[0])
+            # Always as many, so that they are compiled for once.
+            numbers = part * folder.per_part + each
+            errors, batches, done = np.asarray(keys(numbers))[numbers < folder.draws], [], int(numbers[0])
             for batch in self.run.batches(errors):
                 batches.append(batch)
                 done += len(batch.steps)
@@ -56,7 +58,7 @@ class MonteCarlo:
             recorded = dict(zip(self.drawn.names, errors.T, strict=True)) if self.drawn.recorded else {}
             draws = dataclasses.replace(joined_draws(batches), recorded=recorded)
             folder.write_part(part, draws_table(draws, self.run.adjusted, int(numbers[0])))
-            self.computed += len(numbers)
+            self.computed += len(errors)
         folder.join()
         self.seconds = time.perf_counter() - began
 
