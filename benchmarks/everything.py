@@ -35,6 +35,8 @@ def commands(arguments) -> list[list[str]]:
     for name, options in problems.items():
         source = ["--npz", str(arguments.data / f"{name}.npz")] if arguments.data else ["--problem", name]
         runs.append(["run.py", *source, *options, *peer])
+    draws = ["--npz", str(arguments.data / "P31.npz")] if arguments.data else []
+    draws += [*peer, "--growth", "1000" if arguments.quick else "100000"]
     if arguments.bal:
         peer = ["--ceres-bal", str(arguments.ceres_bal)] if arguments.ceres_bal else []
         runs.append(["run.py", "--bal", str(arguments.bal), "--rounds", "2" if arguments.quick else "3", *peer])
@@ -48,6 +50,7 @@ def commands(arguments) -> list[list[str]]:
         *runs,
         ["growth.py", *growth],
         ["compilations.py", "--blocks", blocks],
+        ["monte_carlo.py", *draws],
         ["accelerator.py", *device, *data],
     ]
 
