@@ -122,7 +122,7 @@ class Readjustment:
         self, adjusted: Adjustment, change: Callable, example: Any, *, exterior: bool = False, points: bool = False
     ):
         if not bool(adjusted.converged):
-            raise InputError(f"the nominal adjustment is {adjusted.outcome.value}")
+            raise InputError(f"draws begin at the optimum of the block as it is, which is {adjusted.outcome.value}")
         padded = on_one_device(adjusted)
         self.adjusted = dataclasses.replace(adjusted, padded=padded)
         self.change, self.exterior, self.points = change, exterior, points
@@ -226,6 +226,7 @@ class Readjustment:
 
     def _all_numbers_of(self, entry: Any) -> tuple[dict[str, Any], Recorded]:
         block, recorded = _block_of(self.change(entry, self.nominal))
+        _check_same(block, self.nominal)
         s, v = self.adjusted.structure, self.adjusted.values
         changed = values_of(block, block.start.unknowns, block.priors, s)
         changed = with_datum(changed, v.datum_eop, v.datum_points)
@@ -281,6 +282,19 @@ def _count(entries: Any) -> int:
 
 def _block_of(changed: Block | tuple[Block, Recorded]) -> tuple[Block, Recorded]:
     return changed if isinstance(changed, tuple) else (changed, {})
+
+
+def _check_same(block: Any, nominal: Block) -> None:
+    """Raises InputError where `block` differs from the nominal one in more than numbers."""
+    kind: Any = jax.tree.structure(nominal)
+    same = isinstance(block, Block) and kind == jax.tree.structure(block)
+    if not same or any(
+        np.shape(a) != np.shape(b) for a, b in zip(jax.tree.leaves(block), jax.tree.leaves(nominal), strict=True)
+    ):
+        raise InputError(
+            "a perturbation returns the block that it is given, with other numbers in it, alone or with a dict of "
+            "numbers to record: ids, indices, shapes and what is free stay"
+        )
 
 
 def _with_row(draws: Draws, k: int, row: Draws) -> Draws:

@@ -206,3 +206,10 @@ def test_no_draws_are_refused(draws):
 def test_a_perturbation_that_changes_nothing_is_refused():
     with pytest.raises(InputError, match="changes no number"):
         monte_carlo(adjusted("cross"), lambda key, block: block, 3)
+
+
+def test_a_perturbation_of_more_than_numbers_is_refused():
+    fewer = lambda key, block: eqx.tree_at(lambda b: b.stations, block, block.stations.take(np.arange(3)))  # noqa: E731
+    for perturb in (fewer, lambda key, block: block.stations.value):
+        with pytest.raises(InputError, match="ids, indices, shapes"):
+            monte_carlo(adjusted("cross"), perturb, 3)
