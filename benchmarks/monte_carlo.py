@@ -178,7 +178,7 @@ def _work_on_disk(problem: Problem, draws: int) -> None:
     block = block_of(problem, "draws")
     nominal = solve(block, block.start.unknowns, block.priors)
     errors = bias(block, "station", 0.15, "strip")
-    run = Readjustment(nominal, errors.applied, np.tile(errors.sigma, (draws, 1)))
+    run = Readjustment(nominal, errors.applied, np.broadcast_to(errors.sigma, (draws, len(errors.sigma))))
     with tempfile.TemporaryDirectory() as name:
         study = MonteCarlo(block, run, errors, draws, 0, Path(name) / "run")
         study.draw()

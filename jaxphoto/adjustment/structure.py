@@ -13,9 +13,11 @@ compiles nothing.
 
 import dataclasses
 from collections.abc import Iterable
+from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -300,7 +302,9 @@ def spread(item: Mount | StripBias) -> list[object]:
 def _components(prior: object) -> list[object]:
     if not isinstance(prior, Weighted):
         return [prior] * 3
-    value, sigma = np.broadcast_to(prior.value, 3), np.broadcast_to(prior.sigma, 3)
+    traced = any(isinstance(x, jax.core.Tracer) for x in (prior.value, prior.sigma))
+    xp: Any = jnp if traced else np
+    value, sigma = xp.broadcast_to(prior.value, 3), xp.broadcast_to(prior.sigma, 3)
     return [Weighted(v, s) for v, s in zip(value, sigma, strict=True)]
 
 

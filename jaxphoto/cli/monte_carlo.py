@@ -14,6 +14,7 @@ from jaxphoto.cli.app import app
 from jaxphoto.errors import InputError
 from jaxphoto.experiment import MonteCarlo
 from jaxphoto.io import read_block
+from jaxphoto.io.draws import check_place
 from jaxphoto.procedures import adjust
 from jaxphoto.sensitivity import PER, Bias, Readjustment, bias, check_draws, noise
 
@@ -40,7 +41,7 @@ def monte_carlo_command(
     parameter: Annotated[str, typer.Option(help="The interior parameter (c_mm, k1 ...) for --bias interior.")] = "",
     on: Annotated[list[str] | None, typer.Option(help="Only these strips, images, points ... (repeatable).")] = None,
     draws: Annotated[int, typer.Option(help="Number of draws.")] = 1000,
-    seed: Annotated[int, typer.Option(min=0, help="Another seed draws other errors.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Another seed draws other errors.")] = 0,
     keep: Annotated[
         list[str] | None, typer.Option("--with", help="Keep these, too: exterior, points (with check points).")
     ] = None,
@@ -50,6 +51,9 @@ def monte_carlo_command(
     kept = tuple(keep or ())
     if unknown := [name for name in kept if name not in _KEPT]:
         raise InputError(f"--with {unknown[0]}: there are {', '.join(_KEPT)}")
+    if kind == "noise" and (per is not None or on or parameter):
+        raise InputError("--bias noise is of every observation: it takes no --per, --on or --parameter")
+    check_place(out)
     sigmas = _sigma_of(kind, {"m": sigma_m, "deg": sigma_deg, "mm": sigma_mm, "own": sigma})
     errors = Console(stderr=True)
     with errors.status("reading the block") as status:
@@ -61,7 +65,7 @@ def monte_carlo_command(
         run = Readjustment(
             adjusted,
             drawn.applied,
-            np.tile(drawn.sigma, (draws, 1)),
+            np.broadcast_to(drawn.sigma, (draws, len(drawn.sigma))),
             exterior="exterior" in kept,
             points="points" in kept,
         )

@@ -4,6 +4,7 @@ import time
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import typer
 from rich.console import Console
 
@@ -29,8 +30,8 @@ def sensitivity_command(
     max_steps: Annotated[int, typer.Option(min=1, help="Most iterations.")] = jaxphoto.MAX_STEPS,
 ) -> None:
     """Exact sensitivity of the interior orientation and the check points to stations, and to undetected errors."""
-    if not bias_m:
-        raise InputError("--bias-m 0 is no bias: give its size in metres")
+    if bias_m == 0 or not np.isfinite(bias_m):
+        raise InputError(f"--bias-m {bias_m:g} is no bias: give its size in metres")
     check_target(out)
     console, errors = Console(), Console(stderr=True)
     began = time.perf_counter()

@@ -52,7 +52,7 @@ def run_compiled(function: Any, arguments: tuple, seconds: dict[str, float], nam
     if _traced(arguments):
         return function(*arguments)
     began = time.perf_counter()
-    key, arrays = (_key(function, arguments), thorough), jax.tree.leaves(eqx.filter(arguments, eqx.is_array))
+    key, arrays = _key(function, arguments, thorough), jax.tree.leaves(eqx.filter(arguments, eqx.is_array))
     prepared = _prepared.pop(key, None)
     if prepared is not None:
         _programs[key] = prepared.result()
@@ -86,7 +86,7 @@ def prepare(function: Any, arguments: tuple, seconds: dict[str, float]) -> None:
     if _traced(arguments):
         return
     began = time.perf_counter()
-    key = _key(function, arguments), False
+    key = _key(function, arguments, thorough=False)
     if key not in _programs and key not in _prepared:
         _prepared[key] = _workers.submit(_program_of(function.__wrapped__, arguments, thorough=False))
     seconds["compile"] = seconds.get("compile", 0.0) + time.perf_counter() - began
@@ -96,12 +96,12 @@ def _traced(arguments: tuple) -> bool:
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(arguments))
 
 
-def _key(function: Any, arguments: tuple) -> object:
+def _key(function: Any, arguments: tuple, thorough: bool) -> object:
     """What tells programs apart within a process."""
     dynamic, static = eqx.partition(arguments, eqx.is_array)
     arrays, structure = jax.tree.flatten(dynamic)
     types = tuple(map(_type, arrays))
-    return (function, types, structure, tuple(jax.tree.leaves(static)), jax.tree.structure(static))
+    return (function, types, structure, tuple(jax.tree.leaves(static)), jax.tree.structure(static), thorough)
 
 
 def _type(array: Any) -> tuple:

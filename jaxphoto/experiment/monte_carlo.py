@@ -1,6 +1,7 @@
 """A Monte Carlo on disk: draws streamed to Parquet, continued where they stopped, summed up beside the prediction."""
 
 import dataclasses
+import hashlib
 import json
 import time
 from collections.abc import Callable
@@ -12,12 +13,24 @@ import pandas as pd
 
 from jaxphoto.block import Block
 from jaxphoto.io.draws import DrawsFolder, digest_of, write_whole
-from jaxphoto.report.draws import draws_figure, draws_table, effects_figure, moments, summary_table
-from jaxphoto.report.results import versions, write_summary
+from jaxphoto.report.draws import (
+    Moments,
+    column_of,
+    draws_figure,
+    draws_table,
+    effects_figure,
+    in_degrees,
+    moments,
+    summary_table,
+)
+from jaxphoto.report.results import versions
 from jaxphoto.sensitivity import Bias, Readjustment, joined_draws
 
-# Draws of a part, which a run that is stopped loses at most.
-_PART = 1000
+# Draws of a part, which a run that is stopped loses at most; fewer where they are more numbers than this.
+_PART, _PART_NUMBERS = 1000, 5_000_000
+# Columns of all draws that are read at a time.
+_AT_ONCE = 200
+_OF_DRAWS = ("draw", "converged", "iterations", "fallback")
 # Errors of which the effect of each by itself is worth its time, and errors of a picture.
 _PREDICTED, _PICTURED = 20_000, 60
 
@@ -30,27 +43,32 @@ class MonteCarlo:
 
     def __init__(self, block: Block, run: Readjustment, drawn: Bias, draws: int, seed: int, directory: Path):
         self.title, self.run, self.drawn, self.seed = block.title, run, drawn, seed
+        self.keys = jax.jit(jax.vmap(lambda k: drawn.drawn(jax.random.fold_in(jax.random.key(seed), k))))
+        widest = len(drawn.names) + len(draws_table(run.first_order(np.zeros((1, len(drawn.names)))), run.adjusted).T)
+        parts = min(_PART, _PART_NUMBERS // widest) // run.batch_size
         settings = {
-            "block": digest_of(block), "errors": list(drawn.names), "sigma": drawn.sigma.tolist(), "seed": seed,
-            "exterior": run.exterior, "points": run.points, "batch": run.batch_size, "versions": versions(),
+            "block": digest_of(block), "errors": _told(drawn), "sigma": _sigma_told(drawn), "seed": seed,
+            # What the distribution, which has no name, makes of the seed.
+            "first_draws": _digest(np.asarray(self.keys(np.arange(4)))),
+            "exterior": run.exterior, "points": run.points, "batch": run.batch_size, "devices": run.devices,
+            "thorough": run.many, "versions": versions(),
         }  # fmt: skip
-        per_part = run.batch_size * -(-_PART // run.batch_size)
-        self.folder = DrawsFolder(directory, settings, draws, per_part)
+        self.folder = DrawsFolder(directory, settings, draws, run.batch_size * max(1, parts))
         self.computed, self.seconds = 0, 0.0
 
     def draw(self, progress: Callable[[int], object] = lambda done: None) -> None:
         """Draw what is missing; `progress` is told how many draws there are."""
-        if self.folder.done:
-            return
         folder = self.folder
-        keys = jax.jit(jax.vmap(lambda k: self.drawn.drawn(jax.random.fold_in(jax.random.key(self.seed), k))))
+        if folder.done:
+            folder.tidy()
+            return
         each = np.arange(folder.per_part)
-        self.run.warm_up(np.asarray(keys(each)))
+        self.run.warm_up(np.asarray(self.keys(each)))
         began = time.perf_counter()
         for part in range(folder.next_part, folder.n_parts):
             # Always as many, so that they are compiled for once.
             numbers = part * folder.per_part + each
-            errors, batches, done = np.asarray(keys(numbers))[numbers < folder.draws], [], int(numbers[0])
+            errors, batches, done = np.asarray(self.keys(numbers))[numbers < folder.draws], [], int(numbers[0])
             for batch in self.run.batches(errors):
                 batches.append(batch)
                 done += len(batch.steps)
@@ -60,6 +78,7 @@ class MonteCarlo:
             folder.write_part(part, draws_table(draws, self.run.adjusted, int(numbers[0])))
             self.computed += len(errors)
         folder.join()
+        folder.tidy()
         self.seconds = time.perf_counter() - began
 
     def write(self) -> tuple[dict, pd.DataFrame]:
@@ -72,39 +91,42 @@ class MonteCarlo:
             summary = json.loads((directory / "summary.json").read_text(encoding="utf-8"))
             return summary, pd.read_csv(directory / "summary.csv")
         nominal, effects, predicted = self._prediction()
-        good = folder.column("converged")
-        names = [c for c in folder.columns() if c not in ("draw", "converged", "iterations", "fallback")]
-        predicted |= {f"bias.{name}".replace("_rad", "_deg"): v for name, v in self._sigmas().items()}
-        table = summary_table({c: moments(folder.column(c)[good]) for c in names}, nominal, predicted)
+        told = folder.read(["converged", "fallback"])
+        good = told["converged"]
+        names = [c for c in folder.columns() if c not in _OF_DRAWS]
+        predicted |= {in_degrees(f"bias.{name}"): v for name, v in self._sigmas().items()}
+        found: dict[str, Moments] = {}
+        for first in range(0, len(names), _AT_ONCE):
+            some = folder.read(names[first : first + _AT_ONCE])
+            found |= {name: moments(values[good]) for name, values in some.items()}
+        table = summary_table(found, nominal, predicted)
         write_whole(directory / "summary.csv", lambda path: table.to_csv(path, index=False))
-        pictured = {c: folder.column(c)[good] for c in self._shared_columns()}
-        draws_figure(pictured, table).savefig(directory / "interior.png")
         if len(effects):
             effects.to_csv(directory / "effects.csv", index=False)
-        if 0 < len(effects) <= _PICTURED:
-            effects_figure(effects, table, list(pictured)).savefig(directory / "effects.png")
+        shared = [column_of(label) for label in self.run.adjusted.structure.labels]
+        if shared:
+            pictured = {name: values[good] for name, values in folder.read(shared).items()}
+            draws_figure(pictured, table).savefig(directory / "interior.png")
+        if shared and 0 < len(effects) <= _PICTURED:
+            effects_figure(effects, table, shared).savefig(directory / "effects.png")
         summary = {
             "title": self.title,
             "draws": folder.draws,
             "converged": int(good.sum()),
-            "fallbacks": int(folder.column("fallback").sum()),
+            "fallbacks": int(told["fallback"].sum()),
             "computed_now": self.computed,
             "seconds": {"compile": self.run.seconds["compile"], "draws": self.seconds},
             "draws_per_second": self.computed / self.seconds if self.seconds else 0.0,
             "versions": versions(),
         }
-        write_summary(summary, directory)
+        text = json.dumps(summary, indent=2) + "\n"
+        write_whole(directory / "summary.json", lambda path: path.write_text(text, encoding="utf-8"))
         return summary, table
 
     def _sigmas(self) -> dict[str, float]:
         """By name of the error, angles in degrees."""
         pairs = zip(self.drawn.names, self.drawn.sigma, strict=True)
         return {name: float(np.degrees(v) if name.endswith("_rad") else v) for name, v in pairs}
-
-    def _shared_columns(self) -> list[str]:
-        kept = ("bias.", "exterior.", "point.", "check.")
-        names = self.folder.columns()
-        return [c for c in names if not c.startswith(kept) and c not in ("draw", "converged", "iterations", "fallback")]
 
     def _prediction(self) -> tuple[dict[str, float], pd.DataFrame, dict[str, float]]:
         """The nominal estimates; what one sigma of each error does to each; and the standard deviations of that.
@@ -113,7 +135,7 @@ class MonteCarlo:
         """
         run, names = self.run, self.drawn.names
         nominal = draws_table(run.first_order(np.zeros((1, len(names)))), run.adjusted).iloc[0]
-        quantities = [c for c in nominal.index if c not in ("draw", "converged", "iterations", "fallback")]
+        quantities = [c for c in nominal.index if c not in _OF_DRAWS]
         at = nominal[quantities].to_numpy(float)
         values = dict(zip(quantities, at, strict=True))
         if len(names) > _PREDICTED:
@@ -129,6 +151,26 @@ class MonteCarlo:
                 kept.append(effect)
         effects = pd.concat(kept, ignore_index=True) if kept else pd.DataFrame()
         if len(effects):
-            effects.insert(0, "error", [name.replace("_rad", "_deg") for name in names])
+            effects.insert(0, "error", [in_degrees(name) for name in names])
             effects.insert(1, "sigma", list(self._sigmas().values()))
         return values, effects, dict(zip(quantities, np.sqrt(squares), strict=True))
+
+
+def _told(drawn: Bias) -> str:
+    """What is drawn, in a line: how many errors, of what, and a digest of which gets which."""
+    where = sorted({path[0] if path[0] != "start" else path[2] for path in drawn.targets})
+    digest = _digest(*drawn.index, *(np.frombuffer(".".join(path).encode(), np.uint8) for path in drawn.targets))
+    return f"{len(drawn.names)} of {', '.join(where)}, {digest[:12]}"
+
+
+def _sigma_told(drawn: Bias) -> str:
+    different = np.unique(drawn.sigma)
+    told = ", ".join(f"{v:g}" for v in different[:4]) + (" ..." if len(different) > 4 else "")
+    return f"{told}, {_digest(drawn.sigma)[:12]}"
+
+
+def _digest(*arrays: np.ndarray) -> str:
+    digest = hashlib.sha256()
+    for array in arrays:
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()

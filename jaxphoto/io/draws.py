@@ -21,6 +21,7 @@ from jaxphoto.errors import InputError
 from jaxphoto.unknowns import Prior
 
 _RUN, _PARTS, DRAWS = "run.json", "parts", "draws.parquet"
+_HALF = ".tmp"
 
 
 class DrawsFolder:
@@ -31,18 +32,16 @@ class DrawsFolder:
 
     def __init__(self, directory: Path, settings: dict, draws: int, per_part: int):
         self.directory, self.draws, self.per_part = directory, draws, per_part
-        for path in (directory, *directory.parents):
-            if path.is_file():
-                raise InputError(f"{path} is a file: name a folder for the draws")
+        check_place(directory)
         settings = settings | {"draws": draws, "per_part": per_part}
         run = directory / _RUN
         if run.is_file():
-            self._check(json.loads(run.read_text(encoding="utf-8")), settings)
-        elif directory.is_dir() and any(p.name != _PARTS and not p.name.endswith(".tmp") for p in directory.iterdir()):
-            raise InputError(f"{directory} is not empty and holds no Monte Carlo run: name a new folder")
+            self._check(_settings_in(run), settings)
+        else:
+            directory.mkdir(parents=True, exist_ok=True)
+            write_whole(run, lambda path: path.write_text(json.dumps(settings, indent=2) + "\n", encoding="utf-8"))
         if not self.done:
-            (directory / _PARTS).mkdir(parents=True, exist_ok=True)
-        write_whole(run, lambda path: path.write_text(json.dumps(settings, indent=2) + "\n", encoding="utf-8"))
+            (directory / _PARTS).mkdir(exist_ok=True)
 
     def _check(self, held: dict, settings: dict) -> None:
         wanted = json.loads(json.dumps(settings))
@@ -77,7 +76,7 @@ class DrawsFolder:
         write_whole(self._part(k), lambda path: pq.write_table(_arrow(table), path))
 
     def join(self) -> None:
-        """Bring all parts to one file, part by part, and remove them."""
+        """Bring all parts to one file, part by part."""
         parts = [self._part(k) for k in range(self.n_parts)]
 
         def write(path: Path) -> None:
@@ -86,11 +85,10 @@ class DrawsFolder:
                     writer.write_table(pq.read_table(part))
 
         write_whole(self.directory / DRAWS, write)
-        self.remove_parts()
 
-    def remove_parts(self) -> None:
-        """Remove the parts, which the file of all draws holds."""
-        for path in (self.directory / _PARTS).glob("*"):
+    def tidy(self) -> None:
+        """Remove the parts, which the file of all draws holds, and what was left half-written."""
+        for path in (*(self.directory / _PARTS).glob("*"), *self.directory.glob(f"*{_HALF}")):
             path.unlink()
         if (self.directory / _PARTS).is_dir():
             (self.directory / _PARTS).rmdir()
@@ -99,9 +97,10 @@ class DrawsFolder:
         """Names of the columns of the joined file."""
         return pq.read_schema(self.directory / DRAWS).names
 
-    def column(self, name: str) -> np.ndarray:
-        """One column of the joined file."""
-        return pq.read_table(self.directory / DRAWS, columns=[name]).column(0).to_numpy()
+    def read(self, names: list[str]) -> dict[str, np.ndarray]:
+        """Columns of the joined file."""
+        table = pq.read_table(self.directory / DRAWS, columns=names)
+        return {name: table.column(name).to_numpy() for name in names}
 
     def _part(self, k: int) -> Path:
         return self.directory / _PARTS / f"part-{k:06d}.parquet"
@@ -116,10 +115,33 @@ def digest_of(block: Block) -> str:
     return digest.hexdigest()
 
 
+def check_place(directory: Path) -> None:
+    """Raises InputError where no run can be kept: a file, below a file, among something else."""
+    for path in (directory, *directory.parents):
+        if path.is_file():
+            raise InputError(f"{path} is a file: name a folder for the draws")
+    known = not directory.is_dir() or (directory / _RUN).is_file()
+    if not known and any(not path.name.endswith(_HALF) for path in directory.iterdir()):
+        raise InputError(f"{directory} is not empty and holds no Monte Carlo run: name a new folder")
+
+
+def _settings_in(run: Path) -> dict:
+    try:
+        held = json.loads(run.read_text(encoding="utf-8"))
+    except ValueError:
+        held = None
+    if not isinstance(held, dict):
+        raise InputError(f"{run} holds no settings of a Monte Carlo run: name a new folder")
+    return held
+
+
 def write_whole(path: Path, write: Callable[[Path], object]) -> None:
-    """Write a file beside its place, and move it there when it is whole."""
-    beside = path.with_name(path.name + ".tmp")
+    """Write a file beside its place, and move it there when it is whole and on the disk."""
+    # A name of its own for each process: none moves what another is writing.
+    beside = path.with_name(f"{path.name}.{os.getpid()}{_HALF}")
     write(beside)
+    with beside.open("rb") as file:
+        os.fsync(file.fileno())
     os.replace(beside, path)
 
 

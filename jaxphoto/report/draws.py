@@ -36,7 +36,7 @@ def draws_table(draws: Draws, adjusted: Adjustment, first: int = 0) -> pd.DataFr
         "fallback": draws.fallback,
     }
     columns |= {f"bias.{name}": v for name, v in draws.recorded.items()}
-    columns |= dict(zip(map(_column, draws.labels), draws.shared.T, strict=True))
+    columns |= dict(zip(map(_in_radians, draws.labels), draws.shared.T, strict=True))
     if draws.exterior is not None:
         names = [f"exterior.{image}.{name}" for image in block.images for name in _EXTERIOR]
         columns |= dict(zip(names, draws.exterior.reshape(len(draws.steps), -1).T, strict=True))
@@ -46,15 +46,22 @@ def draws_table(draws: Draws, adjusted: Adjustment, first: int = 0) -> pd.DataFr
         check = block.check
         for who, axis, value in zip(check.who, check.axis, np.asarray(check.value), strict=True):
             columns[f"check.{block.points[who]}.d{AXES[axis]}_m"] = value - draws.points[:, who, axis]
-    return pd.DataFrame({name.replace("_rad", "_deg"): _in_degrees(name, v) for name, v in columns.items()})
+    return pd.DataFrame(
+        {in_degrees(name): np.degrees(v) if name.endswith("_rad") else v for name, v in columns.items()}
+    )
 
 
-def _in_degrees(name: str, values: np.ndarray) -> np.ndarray:
-    return np.degrees(values) if name.endswith("_rad") else values
+def in_degrees(name: str) -> str:
+    """The name of a column whose numbers, if angles, are in degrees."""
+    return name.removesuffix("_rad") + "_deg" if name.endswith("_rad") else name
 
 
-def _column(label: str) -> str:
+def column_of(label: str) -> str:
     """`interior[kodak].c_mm` -> `kodak.c_mm`, `strips[E1].shift_X_m` -> `strips.E1.shift_X_m`."""
+    return in_degrees(_in_radians(label))
+
+
+def _in_radians(label: str) -> str:
     kind, rest = label.split("[", 1)
     name, parameter = rest.rsplit("].", 1)
     return f"{name}.{parameter}" if kind == "interior" else f"{kind}.{name}.{parameter}"
@@ -97,7 +104,10 @@ def draws_figure(columns: Mapping[str, np.ndarray], summary: pd.DataFrame) -> Fi
     of = summary.set_index("quantity")
     for axes, name in zip(figure.subplots(down, across, squeeze=False).flat, chosen, strict=False):
         values, row = np.asarray(columns[name], float), of.loc[name]
-        axes.hist(values, bins=min(60, max(5, int(np.sqrt(len(values))))), density=True, color="0.75")
+        # Where draws differ by rounding only, there is no width to divide into bins.
+        apart = np.ptp(values) > 1e-12 * np.abs(values).max(initial=1e-300) if len(values) else False
+        if apart:
+            axes.hist(values, bins=min(60, max(5, int(np.sqrt(len(values))))), density=True, color="0.75")
         axes.axvline(row["nominal"], color="tab:red", lw=1)
         if row["predicted_sigma"] > 0:
             at = row["nominal"] + row["predicted_sigma"] * np.linspace(-4, 4, 200)

@@ -111,7 +111,8 @@ def _taken(way: _Way, b: Increments, common: Common, factored: Factored) -> _Way
     ratio = jnp.where(jnp.isinf(way.length), _FIRST_RATIO, length / jnp.maximum(way.length, 1e-300))
     active = ~(way.settled | way.failed)
     contracts = (ratio <= _CONTRACTS) & (way.steps < _MOST_STEPS)
-    missing = length * jnp.maximum(ratio, way.ratio)
+    worst = jnp.maximum(ratio, way.ratio)
+    missing = length * worst / jnp.maximum(1 - worst, 1e-3)
     # Steps below the tolerance are rounding, which need not shrink.
     settled = active & ((missing <= TOLERANCE) & contracts | (length <= 0.1 * TOLERANCE))
     return _Way(

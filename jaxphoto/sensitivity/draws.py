@@ -1,8 +1,8 @@
 """Monte Carlo of an adjustment: other numbers in the same block, re-adjusted to convergence, thousands of times.
 
 All draws share the factor of the nominal normal matrix (`chords`); those that do not contract are adjusted by
-themselves and counted. Draws come in batches of a size that follows from the block alone, so a draw is the same
-whatever is drawn before or after it.
+themselves and counted. Draws come in batches of a size that follows from the block and the number of devices, so a draw
+does not depend on those before or after it.
 """
 
 import dataclasses
@@ -29,6 +29,7 @@ from jaxphoto.rotation import omega_phi_kappa_from_matrix
 from jaxphoto.sensitivity.chords import Found, find_optima
 from jaxphoto.sensitivity.many import Varying, common_of
 from jaxphoto.sensitivity.perturbation import Perturbation, Recorded
+from jaxphoto.unknowns import Prior
 
 # Numbers of image rows and draws that a device computes with at a time (see `batch_size`), and draws that are worth it.
 _ROWS, _MOST_DRAWS = 100_000, 64
@@ -288,13 +289,18 @@ def _check_same(block: Any, nominal: Block) -> None:
     """Raises InputError where `block` differs from the nominal one in more than numbers."""
     kind: Any = jax.tree.structure(nominal)
     same = isinstance(block, Block) and kind == jax.tree.structure(block)
-    if not same or any(
-        np.shape(a) != np.shape(b) for a, b in zip(jax.tree.leaves(block), jax.tree.leaves(nominal), strict=True)
-    ):
+    if not same or not all(map(_is_number_or_same, jax.tree.leaves(block), jax.tree.leaves(nominal))):
         raise InputError(
             "a perturbation returns the block that it is given, with other numbers in it, alone or with a dict of "
             "numbers to record: ids, indices, shapes and what is free stay"
         )
+
+
+def _is_number_or_same(new: Any, old: Any) -> bool:
+    """Whether a leaf of a block is as it was, or other numbers of the same shape."""
+    if isinstance(old, Prior) or np.asarray(old).dtype.kind not in "f":
+        return new is old or (not isinstance(new, jax.core.Tracer) and np.array_equal(new, old))
+    return np.shape(new) == np.shape(old)
 
 
 def _with_row(draws: Draws, k: int, row: Draws) -> Draws:

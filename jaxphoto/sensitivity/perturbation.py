@@ -11,7 +11,7 @@ dict of numbers to record:
 `bias` makes the usual ones.
 """
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
 from typing import Any
 
 import equinox as eqx
@@ -23,7 +23,7 @@ from jaxtyping import Array, Float, Int
 from jaxphoto.block import ATTITUDE_AXES, AXES, Block
 from jaxphoto.camera import InteriorOrientation, get_parameter, parameter_names
 from jaxphoto.errors import InputError
-from jaxphoto.unknowns import FIXED, FREE
+from jaxphoto.unknowns import FIXED, FREE, Weighted
 
 Recorded = dict[str, Array]
 Perturbation = Callable[[Any, Block], Block | tuple[Block, Recorded]]
@@ -123,19 +123,48 @@ def bias(
 
 
 def noise(block: Block) -> Bias:
-    """Errors of all observations, each with its own standard deviation: what the covariance of the block is about."""
-    groups = {
+    """Errors of all observations and of all values given beforehand, each with its own standard deviation.
+
+    It is what the covariance of the block is about. Raises InputError for a value given beforehand as one for three
+    axes.
+    """
+    sigmas = {
         ("image_points", "xy"): block.image_points.sigma,
         ("stations", "value"): block.stations.sigma,
         ("attitudes", "roll_pitch_yaw"): block.attitudes.sigma,
         ("control", "value"): block.control.sigma,
         ("distances", "value"): block.distances.sigma,
-    }
-    sigmas = {target: np.ravel(sigma) for target, sigma in groups.items() if np.size(sigma)}
-    starts = np.cumsum([0, *map(len, sigmas.values())])
-    names = tuple(f"{group}.{k}" for (group, _), sigma in sigmas.items() for k in range(len(sigma)))
-    index = tuple(start + np.arange(len(sigma)) for start, sigma in zip(starts, sigmas.values(), strict=False))
-    return Bias(names, np.concatenate(list(sigmas.values())), tuple(sigmas), index, recorded=False)
+    } | {path: np.broadcast_to(prior.sigma, np.shape(prior.value)) for path, prior in _weighted(block)}
+    flat = {target: np.ravel(sigma) for target, sigma in sigmas.items() if np.size(sigma)}
+    starts = np.cumsum([0, *map(len, flat.values())])
+    names = tuple(f"{'.'.join(path)}.{k}" for path, sigma in flat.items() for k in range(len(sigma)))
+    index = tuple(start + np.arange(len(sigma)) for start, sigma in zip(starts, flat.values(), strict=False))
+    return Bias(names, np.concatenate(list(flat.values())), tuple(flat), index, recorded=False)
+
+
+def _weighted(block: Block) -> Iterator[tuple[tuple[str, ...], Weighted]]:
+    """Values given beforehand, with their paths."""
+    priors = block.priors
+    for name, interior in priors.interior.items():
+        for parameter in parameter_names(interior):
+            prior = get_parameter(interior, parameter)
+            if isinstance(prior, Weighted):
+                yield ("priors", "interior", name, parameter, "value"), prior
+    of_mounts = ("lever_arm", "boresight", "time_offset")
+    groups: list[tuple[str, Any, tuple[str, ...]]] = [
+        ("mounts", priors.mounts, of_mounts),
+        ("strips", priors.strips, ("shift", "drift")),
+    ]
+    for group, table, fields in groups:
+        for name, item in table.items():
+            for field in fields:
+                prior = getattr(item, field)
+                if isinstance(prior, Weighted):
+                    if field != "time_offset" and np.shape(prior.value) != (3,):
+                        raise InputError(
+                            f"{field} of {name} is known beforehand by one value for three axes: give it three"
+                        )
+                    yield ("priors", group, name, field, "value"), prior
 
 
 def _observations(block: Block, kind: str, per: str):
@@ -179,6 +208,8 @@ def _parameters(block: Block, kind: str, sigma, of: Collection[str], parameter: 
                 f"{field} of {name} is free, so the adjustment does not take the value that a bias changes"
             )
         at = ("start", "unknowns") if prior is FIXED else ("priors",)
+        if prior is not FIXED and np.shape(prior.value) != (() if kind == "interior" else (3,)):
+            raise InputError(f"{field} of {name} is known beforehand by one value for three axes: give it three")
         path = (*at, "interior" if kind == "interior" else "mounts", name, field)
         targets.append(path if prior is FIXED else (*path, "value"))
     index = tuple(len(axes) * k + np.arange(len(axes)) for k in range(len(chosen)))

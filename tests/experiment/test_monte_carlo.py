@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 
+import jax
 import numpy as np
 import pandas as pd
 import pytest
@@ -101,6 +102,23 @@ def test_another_run_is_not_overwritten(whole, changed, name):
     assert (directory / "draws.parquet").read_bytes() == before
 
 
+def test_other_errors_of_the_same_names_are_another_run(whole):
+    directory, _ = whole
+    of_control = bias(adjusted("cross").block, "control", 0.1, "block")
+    assert of_control.names == bias(adjusted("cross").block, "station", 0.1, "block").names
+    with pytest.raises(InputError, match=r"other settings .errors"):
+        study(directory, errors=of_control)
+    laplace = bias(adjusted("cross").block, "station", 0.1, "block", distribution=jax.random.laplace)
+    with pytest.raises(InputError, match=r"other settings .first_draws"):
+        study(directory, errors=laplace)
+
+
+def test_settings_that_cannot_be_read_are_said_to_be_so(tmp_path):
+    (tmp_path / "run.json").write_text("{")
+    with pytest.raises(InputError, match="holds no settings"):
+        study(tmp_path)
+
+
 def test_a_folder_of_something_else_is_left_alone(tmp_path):
     (tmp_path / "thesis.txt").write_text("mine")
     with pytest.raises(InputError, match="holds no Monte Carlo run"):
@@ -122,6 +140,18 @@ def test_noise_is_predicted_by_the_observations_own_sigmas(tmp_path):
     for label in nominal.structure.labels:
         expected = np.sqrt(variance[derivatives.of(label)])
         assert of[label.replace("interior[one]", "one")] == pytest.approx(expected, rel=2e-3)
+
+
+def test_a_block_that_estimates_no_camera(tmp_path):
+    nominal = adjusted("fixed_interior")
+    wrong = bias(nominal.block, "interior", 0.02, parameter="c_mm")
+    run = Readjustment(nominal, wrong.applied, wrong.sigma[None], points=True)
+    made = MonteCarlo(nominal.block, run, wrong, 3, 0, tmp_path / "run")
+    made.draw()
+    summary, table = made.write()
+    assert summary["converged"] == 3
+    assert (table["quantity"].str.startswith("point.")).any()
+    assert not (tmp_path / "run" / "interior.png").exists()
 
 
 def command(monkeypatch, capsys, *arguments) -> tuple[int, str, str]:
@@ -169,6 +199,7 @@ def test_the_command(folder, monkeypatch, capsys, tmp_path):
         (("--bias", "station", "--sigma-m", "-1"), "above zero"),
         (("--bias", "wind", "--sigma-m", "1"), "--bias wind: there are station"),
         (("--bias", "noise", "--sigma-m", "1"), "takes no --sigma-m"),
+        (("--bias", "noise", "--per", "strip"), "takes no --per"),
         (("--bias", "station", "--sigma-m", "1", "--with", "all"), "--with all: there are exterior, points"),
     ],
 )

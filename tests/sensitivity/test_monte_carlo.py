@@ -11,7 +11,7 @@ import pytest
 from jaxphoto import InputError, adjust, bias, covariance, monte_carlo, readjust
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.sensitivity import Readjustment, noise
-from jaxphoto.unknowns import FIXED
+from jaxphoto.unknowns import FIXED, Weighted
 from tests.blocks import adjusted, simulated
 
 KINDS = ("cross", "three_models", "everything", "inner")
@@ -52,7 +52,7 @@ def test_a_draw_is_the_optimum_of_its_own_block(name):
     for k in range(3):
         block, _ = errors(jax.random.fold_in(jax.random.key(4), k), nominal.block)
         # The same start as the nominal one's: it is what the datum of a free network refers to.
-        full = adjust(block, nominal.block.start.unknowns, nominal.priors)
+        full = adjust(block, nominal.block.start.unknowns, block.priors)
         # Adjustments end within 1e-5 of their own.
         close(draws, k, full, nominal, 2e-5)
 
@@ -85,6 +85,24 @@ def test_a_lever_arm_that_is_held_can_be_drawn():
     )
     assert np.abs(moved).max() > 0.01
     close(draws, 0, adjust(nominal.block, start, held), nominal, 2e-5)
+
+
+def test_a_lever_arm_that_is_known_beforehand_can_be_drawn():
+    nominal = adjusted("everything")
+    (name,) = nominal.block.priors.mounts
+    known = eqx.tree_at(lambda p: p.mounts[name].lever_arm, nominal.priors, Weighted(np.zeros(3), np.full(3, 0.05)))
+    block = dataclasses.replace(nominal.block, priors=known)
+    nominal = adjust(block, nominal.unknowns, known)
+    wrong = bias(block, "lever-arm", 0.1)
+    draws = monte_carlo(nominal, wrong, 1, exterior=True, points=True)
+    moved = jnp.array([draws.recorded[f"{name}.lever_arm_{axis}_m"][0] for axis in ("right", "forward", "up")])
+    changed = wrong.applied(moved, block)
+    assert np.abs(moved).max() > 0.01
+    close(draws, 0, adjust(block, nominal.unknowns, changed.priors), nominal, 2e-5)
+    assert any(target[0] == "priors" for target in noise(block).targets)
+    scalar = eqx.tree_at(lambda p: p.mounts[name].lever_arm, known, Weighted(0.0, 0.05))
+    with pytest.raises(InputError, match="give it three"):
+        bias(dataclasses.replace(block, priors=scalar), "lever-arm", 0.1)
 
 
 def test_scatter_under_noise_is_the_covariance():
@@ -210,6 +228,7 @@ def test_a_perturbation_that_changes_nothing_is_refused():
 
 def test_a_perturbation_of_more_than_numbers_is_refused():
     fewer = lambda key, block: eqx.tree_at(lambda b: b.stations, block, block.stations.take(np.arange(3)))  # noqa: E731
-    for perturb in (fewer, lambda key, block: block.stations.value):
+    held = lambda key, block: eqx.tree_at(lambda b: b.priors.interior["one"].c, block, FIXED)  # noqa: E731
+    for perturb in (fewer, held, lambda key, block: block.stations.value):
         with pytest.raises(InputError, match="ids, indices, shapes"):
             monte_carlo(adjusted("cross"), perturb, 3)

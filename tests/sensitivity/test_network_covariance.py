@@ -13,7 +13,7 @@ import jaxphoto
 from jaxphoto import DatumError, InputError
 from jaxphoto.camera import get_parameter
 from jaxphoto.compiling import call_compiled
-from jaxphoto.sensitivity import network_criteria as criteria
+from jaxphoto.sensitivity.network import criteria
 from jaxphoto.sensitivity.network.block import check_layout, measured_block
 from jaxphoto.sensitivity.network.covariance import design_covariance
 from jaxphoto.sensitivity.network.search import evaluate_designs
