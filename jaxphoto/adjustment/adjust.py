@@ -99,18 +99,6 @@ def solve(
     return adjusted
 
 
-def on_one_device(adjusted: Adjustment) -> Padded:
-    """What statistics are computed from, on one device; that of a large block is dealt out to several."""
-    padded, s = adjusted.computed, adjusted.structure
-    if padded.structure.in_tiles.shards == 1:
-        return padded
-    wide, places = pad_structure(s)
-    numbers = pad_values(adjusted.values, s, wide, places)
-    arguments = (numbers, wide, MAX_STEPS, np.array(True))
-    _, _, factored = run_compiled(_optimise, arguments, adjusted.seconds, "covariance")
-    return Padded(wide, numbers, factored, places)
-
-
 def _factored_like(values: Values, structure: Structure) -> Factored:
     """Arrays of the right types that take no memory."""
     zero = zero_increments(structure)

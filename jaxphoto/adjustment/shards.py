@@ -4,6 +4,7 @@ Each device sums its own tiles; the sums of the reduced normal matrix are added 
 each factors the result for itself. So nothing but sums the size of the reduced matrix ever travels.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -78,3 +79,8 @@ def _spec(path: tuple[Any, ...], array: Any) -> P:
     if name in _OF_TILES or (name == "image" and array.ndim >= 3):
         return TILES
     return along_points(array.ndim) if name in _OF_POINTS else EVERYWHERE
+
+
+def on_one_device(s: Structure) -> Structure:
+    """The same structure for a program that no other device has a part in."""
+    return s if s.in_tiles.shards == 1 else dataclasses.replace(s, tiles=dataclasses.replace(s.in_tiles, shards=1))

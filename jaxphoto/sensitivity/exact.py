@@ -25,13 +25,14 @@ from jaxphoto.adjustment.normal import At, unwhiten, whiten
 from jaxphoto.adjustment.optimum import weigh_datum
 from jaxphoto.adjustment.reduced import other_rows
 from jaxphoto.adjustment.residuals import Increments, Residuals, Values
+from jaxphoto.adjustment.shards import on_one_device
 from jaxphoto.adjustment.structure import Structure, structure_of
 from jaxphoto.arrays import still
 from jaxphoto.block import AXES
 from jaxphoto.compiling import run_compiled
 from jaxphoto.errors import InputError
 from jaxphoto.sensitivity.curvature import attitude_second, mixed_second
-from jaxphoto.sensitivity.hessian import Eliminated, eliminated, image_columns, on_one_device
+from jaxphoto.sensitivity.hessian import Eliminated, eliminated, image_columns
 from jaxphoto.statistics import EOP_NAMES
 from jaxphoto.statistics.covariance import turns_of
 from jaxphoto.unknowns import FREE, uniform_priors

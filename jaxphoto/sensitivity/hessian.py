@@ -15,7 +15,6 @@ and mu = C D x is carried by more unknowns. With S, G, K what is left of H, D an
         [ C G   C K - I ]
 """
 
-import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
@@ -29,6 +28,7 @@ from jaxphoto.adjustment.normal import At, cholesky_3x3, each_tile_of, unwhiten,
 from jaxphoto.adjustment.optimum import weigh_datum
 from jaxphoto.adjustment.reduced import other_rows
 from jaxphoto.adjustment.residuals import Increments, Values
+from jaxphoto.adjustment.shards import on_one_device
 from jaxphoto.adjustment.structure import Structure
 from jaxphoto.adjustment.tiles import (
     by_tile,
@@ -81,11 +81,6 @@ def eliminated(adjusted: Adjustment, curvature: bool) -> Eliminated:
     values, scale = jax.tree.map(still, (computed.values, computed.factored.scale))
     arguments = (values, scale, s, np.array(float(curvature)))
     return run_compiled(_eliminate, arguments, adjusted.seconds, "sensitivity")
-
-
-def on_one_device(s: Structure) -> Structure:
-    """The same structure for a program that no other device has a part in."""
-    return s if s.in_tiles.shards == 1 else dataclasses.replace(s, tiles=dataclasses.replace(s.in_tiles, shards=1))
 
 
 @eqx.filter_jit

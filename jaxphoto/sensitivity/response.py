@@ -15,6 +15,7 @@ from jaxphoto.adjustment.normal import At
 from jaxphoto.adjustment.optimum import weigh_datum
 from jaxphoto.adjustment.padding import crop_state, pad_values
 from jaxphoto.adjustment.residuals import Increments, State, Values, state_at
+from jaxphoto.adjustment.shards import on_one_device
 from jaxphoto.adjustment.structure import Structure
 from jaxphoto.adjustment.values import unknowns_of, values_of, with_datum
 from jaxphoto.arrays import still
@@ -23,7 +24,7 @@ from jaxphoto.compiling import run_compiled
 from jaxphoto.errors import InputError
 from jaxphoto.rotation import omega_phi_kappa_from_matrix
 from jaxphoto.sensitivity.curvature import mixed_second
-from jaxphoto.sensitivity.hessian import Eliminated, eliminated, on_one_device, solve_eliminated
+from jaxphoto.sensitivity.hessian import Eliminated, eliminated, solve_eliminated
 from jaxphoto.unknowns import Unknowns
 
 
