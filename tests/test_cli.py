@@ -10,9 +10,9 @@ import pandas as pd
 import pytest
 
 import jaxphoto
-from jaxphoto import cli
 from jaxphoto.io import write_block
 from tests.blocks import simulated
+from tests.commands import run
 
 FILES = {
     "summary.json",
@@ -36,15 +36,6 @@ COLUMNS = {
     "correlation": ["parameter_a", "parameter_b", "rho"],
     "correlation_summary": ["camera", "exterior", "interior", "mean_abs_rho", "max_abs_rho"],
 }
-
-
-def run(monkeypatch, capsys, *arguments) -> tuple[int, str, str]:
-    """Exit code, standard output and standard error of `jaxphoto ...`, in this process."""
-    monkeypatch.setattr(sys, "argv", ["jaxphoto", *map(str, arguments)])
-    with pytest.raises(SystemExit) as stop:
-        cli.main()
-    captured = capsys.readouterr()
-    return stop.value.code or 0, captured.out, captured.err
 
 
 @pytest.fixture(scope="module")

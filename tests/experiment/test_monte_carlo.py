@@ -11,12 +11,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from jaxphoto import InputError, bias, cli
+from jaxphoto import InputError, bias
 from jaxphoto.experiment import MonteCarlo
 from jaxphoto.io import write_block
 from jaxphoto.sensitivity import Readjustment, noise
 from jaxphoto.sensitivity.exact import sensitivity
 from tests.blocks import adjusted, simulated
+from tests.commands import run
 
 NOMINAL = "strips"
 
@@ -154,14 +155,6 @@ def test_a_block_that_estimates_no_camera(tmp_path):
     assert not (tmp_path / "run" / "interior.png").exists()
 
 
-def command(monkeypatch, capsys, *arguments) -> tuple[int, str, str]:
-    monkeypatch.setattr(sys, "argv", ["jaxphoto", *map(str, arguments)])
-    with pytest.raises(SystemExit) as stop:
-        cli.main()
-    captured = capsys.readouterr()
-    return stop.value.code or 0, captured.out, captured.err
-
-
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     path = tmp_path_factory.mktemp("block") / "block"
@@ -172,7 +165,7 @@ def folder(tmp_path_factory):
 def test_the_command(folder, monkeypatch, capsys, tmp_path):
     out = tmp_path / "run"
     options = ("--bias", "station", "--per", "strip", "--sigma-m", "0.05,0.05,0.1", "--draws", 20, "--seed", 3)
-    code, printed, _ = command(
+    code, printed, _ = run(
         monkeypatch, capsys, "monte-carlo", folder, *options, "--with", "exterior", "--with", "points", "--out", out
     )
     assert code == 0
@@ -204,7 +197,7 @@ def test_the_command(folder, monkeypatch, capsys, tmp_path):
     ],
 )
 def test_a_mistake_is_one_sentence_and_nothing_written(folder, monkeypatch, capsys, tmp_path, options, words):
-    code, _, error = command(monkeypatch, capsys, "monte-carlo", folder, "--out", tmp_path / "run", *options)
+    code, _, error = run(monkeypatch, capsys, "monte-carlo", folder, "--out", tmp_path / "run", *options)
     assert code == 2
     assert words in error
     assert "Traceback" not in error

@@ -1,30 +1,20 @@
 """`jaxphoto simulate`: the folder says what the simulation is, and an adjustment of it finds the truth."""
 
-import sys
-
 import jax
 import numpy as np
 import pandas as pd
 import pytest
 
 import jaxphoto
-from jaxphoto import cli
 from jaxphoto.block import Block
 from jaxphoto.io import read_block, recipe_from, write_simulation
 from jaxphoto.io.block_folder.settings import toml_text
 from jaxphoto.simulation import simulate
+from tests.commands import run
 from tests.simulation.small import RECIPES, changed, made
 
 XYZ = ["X_m", "Y_m", "Z_m"]
 ANGLES = ["omega_deg", "phi_deg", "kappa_deg"]
-
-
-def run(monkeypatch, capsys, *arguments) -> tuple[int, str, str]:
-    monkeypatch.setattr(sys, "argv", ["jaxphoto", *map(str, arguments)])
-    with pytest.raises(SystemExit) as stop:
-        cli.main()
-    captured = capsys.readouterr()
-    return stop.value.code or 0, captured.out, captured.err
 
 
 def assert_same(got: Block, want: Block) -> None:
