@@ -88,6 +88,34 @@ class Distances(eqx.Module):
         return Distances(np.zeros((0, 2), int), np.zeros(0), np.zeros(0))
 
 
+class SurfaceRows(eqx.Module):
+    """Points observed to lie on the surface that a laser scanner measured: on the plane through `foot` (m).
+
+        normal . (X - foot + shift) + turn . boresight = 0
+
+    with standard deviation `sigma` (m), and the shift of the lidar strip and the boresight of `Unknowns.scanner`, where
+    the block has one. `turn` (m) is by how much a unit of boresight has raised `foot` along `normal`
+    (`georeferencing.raised_by_boresight`).
+    """
+
+    point: Int[np.ndarray, "n"]
+    strip: Int[np.ndarray, "n"]
+    """Of `Unknowns.scanner.shifts`, in their order; 0 in a block without a scanner."""
+    foot: Float[Numbers, "n 3"]
+    normal: Float[Numbers, "n 3"]
+    turn: Float[Numbers, "n 3"]
+    sigma: Float[Numbers, "n"]
+
+    @staticmethod
+    def none() -> "SurfaceRows":
+        """No rows."""
+        return SurfaceRows(*(np.zeros(0, int),) * 2, *(np.zeros((0, 3)),) * 3, np.zeros(0))
+
+    def take(self, chosen: np.ndarray) -> "SurfaceRows":
+        """The rows that `chosen` (an index or a mask) names."""
+        return jax.tree.map(lambda v: still(v)[chosen], self)
+
+
 @dataclasses.dataclass(frozen=True)
 class Datum:
     """How position, orientation and scale are fixed where observations leave them open.
@@ -174,6 +202,7 @@ class Block(eqx.Module):
     motion: Motion | None = None
     frame: Frame = eqx.field(static=True, default=Frame())
     corrections: Corrections = eqx.field(static=True, default=Corrections())
+    surfaces: SurfaceRows = eqx.field(default_factory=SurfaceRows.none)
 
 
 class SensorRows(eqx.Module):

@@ -6,7 +6,7 @@ them. "The second experiment without k_2" is one `eqx.tree_at`:
     priors = eqx.tree_at(lambda u: u.interior["kodak"].distortion.k2, priors, FIXED)
 
 For interior orientation the leaves are scalars. `exterior.position`, `exterior.camera_from_object`, `points`, and
-each mount's and strip's vector take one prior for the whole array.
+each mount's, strip's and scanner's vector take one prior for the whole array.
 """
 
 import enum
@@ -18,7 +18,7 @@ from jaxtyping import Float
 from jaxphoto.arrays import Numbers
 from jaxphoto.camera import InteriorOrientation
 from jaxphoto.collinearity import ExteriorOrientation
-from jaxphoto.georeferencing import Mount, StripBias
+from jaxphoto.georeferencing import Mount, Scanner, StripBias
 
 
 class Prior(enum.Enum):
@@ -42,7 +42,7 @@ class Weighted(eqx.Module):
 
 
 class Unknowns(eqx.Module):
-    """All parameters of a block: per camera, per image, per point, per mount and per strip.
+    """All parameters of a block: per camera, per image, per point, per mount and per strip; and of a laser scanner.
 
     `exterior` has a leading axis over the block's images and `points` (m) over its points, in the block's order.
     """
@@ -52,6 +52,7 @@ class Unknowns(eqx.Module):
     points: Float[Numbers, "points 3"]
     mounts: dict[str, Mount]
     strips: dict[str, StripBias]
+    scanner: Scanner | None = None
 
 
 def uniform_priors(unknowns: Unknowns, prior: Prior) -> Unknowns:

@@ -16,7 +16,18 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxphoto.arrays import still
-from jaxphoto.block import AXES, Attitudes, Block, Datum, Distances, ImageRows, Rows, direct_exterior, sensor_rows
+from jaxphoto.block import (
+    AXES,
+    Attitudes,
+    Block,
+    Datum,
+    Distances,
+    ImageRows,
+    Rows,
+    SurfaceRows,
+    direct_exterior,
+    sensor_rows,
+)
 from jaxphoto.camera import set_parameter
 from jaxphoto.errors import BlockError
 from jaxphoto.georeferencing import StripBias
@@ -203,6 +214,7 @@ def _part(block: Block, image: np.ndarray, point: np.ndarray) -> Block:
         attitudes=Attitudes(
             new_image[attitudes.image[turned]], *_taken((attitudes.roll_pitch_yaw, attitudes.sigma), turned)
         ),
+        surfaces=_with_points(block.surfaces, new_point),
         distances=Distances(ends[between], *_taken((distances.value, distances.sigma), between)),
         datum=datum,
         start=dataclasses.replace(
@@ -257,6 +269,11 @@ def _numbers(kept: np.ndarray, n: int) -> np.ndarray:
 def _renumbered(rows: Rows, new: np.ndarray) -> Rows:
     kept = rows.take(np.flatnonzero(new[rows.who] >= 0))
     return dataclasses.replace(kept, who=new[kept.who])
+
+
+def _with_points(surfaces: SurfaceRows, new: np.ndarray) -> SurfaceRows:
+    kept = surfaces.take(np.flatnonzero(new[surfaces.point] >= 0))
+    return dataclasses.replace(kept, point=new[kept.point])
 
 
 def _taken(tree, index: np.ndarray):

@@ -14,10 +14,10 @@ import jax
 import numpy as np
 
 from jaxphoto import FIXED, FREE, Outcome, Unknowns, Weighted, adjust, covariance
-from jaxphoto.block import Attitudes, Block, Datum, Distances, ImageRows, Rows, Start
+from jaxphoto.block import Attitudes, Block, Datum, Distances, ImageRows, Rows, Start, SurfaceRows
 from jaxphoto.camera import Balanced, Brown, InteriorOrientation, Sensor, Smac, set_parameter
 from jaxphoto.collinearity import ExteriorOrientation
-from jaxphoto.georeferencing import Mount, StripBias
+from jaxphoto.georeferencing import Mount, Scanner, StripBias
 from jaxphoto.simulation import remeasure
 from jaxphoto.unknowns import default_priors
 from tests.derivatives import QUICKLY
@@ -174,7 +174,7 @@ def _remeasured(block: Block, truth: Unknowns, key) -> Block:
 def observed(b: Block):
     """The numbers of a block that `remeasure` draws."""
     rows = (b.stations, b.control, b.fixed, b.check, b.distances)
-    return b.image_points.xy, b.attitudes.roll_pitch_yaw, *(r.value for r in rows)
+    return b.image_points.xy, b.attitudes.roll_pitch_yaw, b.surfaces.foot, *(r.value for r in rows)
 
 
 def rough(block: Block, truth: Unknowns, seed: int = 2) -> Unknowns:
@@ -204,6 +204,7 @@ def rough(block: Block, truth: Unknowns, seed: int = 2) -> Unknowns:
         points,
         jax.tree.map(lambda v, p: v if p is FIXED else v + 0.01, truth.mounts, block.priors.mounts),
         jax.tree.map(lambda v, p: v if p is FIXED else 0.0 * v, truth.strips, block.priors.strips),
+        jax.tree.map(lambda v: 0.0 * v, truth.scanner),
     )
 
 
@@ -314,6 +315,26 @@ def _fixed_control() -> Simulated:
     return Simulated(dataclasses.replace(block, control=Rows.none(), fixed=fixed, stations=Rows.none()), truth)
 
 
+def _surfaces() -> Simulated:
+    """Points on the surfaces of two lidar strips for control; boresight and shifts of the scanner unknown."""
+    block, truth = _mount()
+    shifts = {"l1": np.array([0.1, 0.2, -0.3]), "l2": np.array([-0.2, 0.1, 0.2])}
+    scanner = Scanner(np.array([0.002, -0.003, 0.004]), shifts)
+    rng = np.random.default_rng(11)
+    # Some points lie on surfaces of both strips.
+    point = np.concatenate([np.arange(30), np.arange(12, 40)])
+    n = len(point)
+    normal = rng.normal([0, 0, 1.0], 0.5, (n, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    turn = np.cross(rng.normal([0, 0, -1000.0], 200, (n, 3)), normal)
+    surfaces = SurfaceRows(point, np.arange(n) // 30, np.zeros((n, 3)), normal, turn, np.full(n, 0.1))
+    block = dataclasses.replace(block, surfaces=surfaces, control=rows(CONTROL[:1]))
+    of_scanner = lambda b: (b.start.unknowns.scanner, b.priors.scanner)  # noqa: E731
+    prior = Scanner(FREE, {"l1": Weighted(np.zeros(3), np.array([0.3, 0.3, 0.2])), "l2": FREE})
+    block = eqx.tree_at(of_scanner, block, (scanner, prior), is_leaf=lambda x: x is None)
+    return Simulated(block, dataclasses.replace(truth, scanner=scanner))
+
+
 def _close(datum: Datum, bars: bool = True) -> Simulated:
     block, truth = bare(close_range(), {"one": BROWN}, ("one",) * 8)
     ends = np.array([[0, 1], [1, 2], [5, 30]])
@@ -328,6 +349,7 @@ VARIANTS = {
     "mount": _mount,
     "strips": _strips,
     "everything": _everything,
+    "surfaces": _surfaces,
     "fixed_interior": _fixed_interior,
     "fixed_control": _fixed_control,
     "inner": lambda: _close(Datum("inner", "points", False)),

@@ -1,8 +1,9 @@
 """The datum: what position, orientation and scale observations leave open, and the constraints that close it.
 
 The seven parameters of a similarity (3 shifts, 3 rotations, scale) move images and points together without
-changing any image coordinate. Only control, stations, attitudes, distances and fixed unknowns see them, perhaps
-together with a free shift or lever arm. What none sees is the datum defect; inner or minimal constraints fill it.
+changing any image coordinate. Only control, surfaces, stations, attitudes, distances and fixed unknowns see
+them, perhaps together with a free shift or lever arm. What none sees is the datum defect; inner or minimal constraints
+fill it.
 """
 
 from functools import partial
@@ -13,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxphoto.adjustment.residuals import State, Values, georeferencing_residuals
+from jaxphoto.adjustment.residuals import State, Values, georeferencing_residuals, surface_residuals
 from jaxphoto.adjustment.similarity import similarity
 from jaxphoto.adjustment.structure import Structure
 from jaxphoto.block import Block
@@ -122,9 +123,9 @@ def _motions(values: Values) -> tuple[Motions, np.ndarray, float]:
 
 
 def _datum_sensitivity(values: Values, structure: Structure, motions: Motions, centre, size):
-    """d(datum rows / sigma) / d(seven motions, free mount and strip unknowns), and the names of the latter."""
-    shared = [j for j, k in enumerate(structure.free) if k >= structure.mount_offset and j not in structure.weighted]
-    if len(values.stations) + values.attitudes.shape[1] + len(values.distances) == 0:
+    """d(datum rows / sigma) / d(seven motions, free unknowns of scanner, mounts, strips), and names of the latter."""
+    shared = [j for j, k in enumerate(structure.free) if k >= structure.scanner_offset and j not in structure.weighted]
+    if len(values.stations) + values.attitudes.shape[1] + len(values.distances) + len(values.sigma_surfaces) == 0:
         # Control alone: nothing to differentiate, its rows are the motions of its points.
         rows = (
             motions.points[:, structure.control_axis, structure.control_point].T
@@ -150,14 +151,14 @@ def _georeferencing_sensitivity(values: Values, structure: Structure, shared, ce
         points = jax.vmap(lambda x: similarity(parameters, x, jnp.eye(3), centre, size)[0], 1, 1)(values.points)
         vector = values.shared.at[structure.free[shared]].add(moved)
         v = values
-        stations, attitudes, control, distances = georeferencing_residuals(
-            State(position, rotation, vector, points), v, structure
-        )
+        state = State(position, rotation, vector, points)
+        stations, attitudes, control, distances = georeferencing_residuals(state, v, structure)
         return jnp.concatenate(
             [
                 stations / v.sigma_stations,
                 (attitudes / v.sigma_attitudes).ravel(),
                 control / v.sigma_control,
+                surface_residuals(state, v, structure) / v.sigma_surfaces,
                 distances / v.sigma_distances,
             ]
         )
@@ -230,6 +231,7 @@ def _sentence(open_motions: np.ndarray, block: Block, named: list[str]) -> str:
             (len(block.stations.who), "station coordinates"),
             (3 * len(block.attitudes.image), "attitude angles"),
             (len(block.distances.value), "distances"),
+            (len(block.surfaces.point), "points on surfaces"),
         )
         if n
     ]

@@ -50,7 +50,7 @@ def solve_factored(reduced: Reduced, factor: BandFactor, b: Increments, at: At) 
 
 def reduce_right(reduced: Reduced, b: Increments, at: At) -> tuple[Array, Array]:
     """A right-hand side taken down to the reduced unknowns and to mu."""
-    s, i = at.structure, at.structure.n_interior
+    s, i = at.structure, at.structure.n_border
     image = s.in_tiles.image
     z = by_tile(jnp.stack(whiten(b.points, reduced.l)), s.in_tiles)
     down = over_tiles(lambda f, _, z: f @ z.reshape(-1), at, reduced, (z,))
@@ -68,7 +68,7 @@ def solve_reduced(reduced: Reduced, factor: BandFactor, right, d, b_points, at: 
     x = solve_band(factor, right)
     mu = jnp.linalg.solve(r.k, r.g.T @ x + d) if len(d) else d
     eop, shared = x[: 6 * n].reshape(n, 6), x[6 * n :]
-    border = jnp.concatenate([shared[: s.n_interior], mu, jnp.zeros(1)])
+    border = jnp.concatenate([shared[: s.n_border], mu, jnp.zeros(1)])
 
     def up(f, image):
         return (jnp.concatenate([eop[image].reshape(-1), border]) @ f).reshape(3, -1)

@@ -53,8 +53,8 @@ class Reduced(NamedTuple):
     g: Float[Array, "reduced constraints"]
     k: Float[Array, "constraints constraints"]
     f: Float[Array, "chunks tiles f 3p"] | None
-    """F of each tile: 6 rows an image, interior unknowns, constraints (distances, then the datum); the last row, a
-    right-hand side of its time, serves nothing. None where tiles are many: then it is made anew."""
+    """F of each tile: 6 rows an image, unknowns of cameras and scanner, constraints (distances, then the datum); the
+    last row, a right-hand side of its time, serves nothing. None where tiles are many: then it is made anew."""
     l: Float[Array, "6 points"]  # noqa: E741
     """Cholesky factors of V: l11, l21, l22, l31, l32, l33."""
     weight: Increments
@@ -112,8 +112,8 @@ def squares(r: Pair) -> Float[Array, ""]:
 
 def with_others(image: Float[Array, ""], others: Residuals, s: Structure) -> Float[Array, ""]:
     """The sum of all squared residuals, of which `image` is the image rows' part."""
-    rest = sum(jnp.sum(v**2) for v in others._replace(image=jnp.zeros(0), control=jnp.zeros(0)))
-    return total(image + jnp.sum(others.control**2), s) + rest
+    rest = sum(jnp.sum(v**2) for v in others._replace(image=jnp.zeros(0), control=jnp.zeros(0), surfaces=jnp.zeros(0)))
+    return total(image + jnp.sum(others.control**2) + jnp.sum(others.surfaces**2), s) + rest
 
 
 def each_tile_of(function, numbers, s: Structure):

@@ -190,8 +190,10 @@ def typical_scale(values: Values, structure: Structure) -> Increments:
     eop = jnp.stack([ground, ground, ground, angle, angle, angle])
     seconds = jnp.maximum(jnp.max(jnp.abs(v.time)), 1.0)
     speed = jnp.maximum(jnp.max(jnp.abs(v.velocity)), 1.0)
+    scanner = jnp.append(jnp.repeat(angle, 3), jnp.repeat(ground, s.mount_offset - s.scanner_offset))
+    scanner = scanner[: s.mount_offset - s.scanner_offset]
     mount = jnp.tile(jnp.append(eop, ground / speed), (s.strip_offset - s.mount_offset) // MOUNT_SIZE)
     strip = jnp.repeat(jnp.stack([ground, ground / seconds]), 3)
     strip = jnp.tile(strip, (len(vector) - s.strip_offset) // STRIP_SIZE)
-    vector = vector.at[s.mount_offset :].set(jnp.concatenate([mount, strip]))
+    vector = vector.at[s.scanner_offset :].set(jnp.concatenate([scanner, mount, strip]))
     return Increments(eop[:, None] * s.eop_free, vector[s.free], ground * s.point_free)

@@ -170,6 +170,8 @@ def pad_structure(
         attitude_image=_pad(at[s.attitude_image], attitudes, n_images - 1),
         control_point=np.zeros(0, np.int32),
         control_axis=np.zeros(0, np.int32),
+        surface_point=np.zeros(0, np.int32),
+        surface_strip=_surface_strips(s, places, n_points),
         distance_points=places.point[s.distance_points],
         point_class=_put(s.point_class, places.point, n_points, 0),
         eop_free=_put(s.eop_free.T, at, n_images, 0.0).T,
@@ -202,6 +204,7 @@ def pad_values(values: Values, structure: Structure, padded: Structure, places: 
     slots = (*p.in_tiles.image.shape, p.in_tiles.per_tile)
     control = places.point[structure.control_point] + n_points * structure.control_axis
     stations, attitudes = len(p.station_image), len(p.attitude_image)
+    surface, depth = _surface_places(structure, places, n_points), len(p.surface_strip)
 
     def observed(xy: Any, fill: float) -> Any:
         rows = _scatter(xy, places.row, int(np.prod(slots)), fill)
@@ -213,6 +216,10 @@ def pad_values(values: Values, structure: Structure, padded: Structure, places: 
 
     def points(x: Any, fill: Any) -> Any:
         return _scatter(x, places.point, n_points, fill)
+
+    def surfaces(x: Any, fill: float) -> Any:
+        padded = _scatter(x, surface, depth * n_points, fill)
+        return padded.reshape(*x.shape[:-1], depth, n_points)
 
     return Values(
         xy=observed(v.xy, 0.0),
@@ -227,6 +234,10 @@ def pad_values(values: Values, structure: Structure, padded: Structure, places: 
         sigma_attitudes=_last(v.sigma_attitudes, attitudes, np.inf),
         control=_scatter(v.control, control, 3 * n_points, 0.0).reshape(3, n_points),
         sigma_control=_scatter(v.sigma_control, control, 3 * n_points, np.inf).reshape(3, n_points),
+        foot=surfaces(v.foot, 0.0),
+        normal=surfaces(v.normal, 0.0),
+        turn=surfaces(v.turn, 0.0),
+        sigma_surfaces=surfaces(v.sigma_surfaces, np.inf),
         distances=v.distances,
         sigma_distances=v.sigma_distances,
         priors=v.priors,
@@ -257,6 +268,7 @@ def crop_residuals(residuals: Residuals, structure: Structure, places: Places) -
         stations=r.stations[: len(s.station_image)],
         attitudes=r.attitudes[:, : len(s.attitude_image)],
         control=r.control[s.control_axis, places.point[s.control_point]],
+        surfaces=r.surfaces.reshape(-1)[_surface_places(s, places, r.surfaces.shape[1])],
     )
 
 
@@ -265,6 +277,23 @@ def crop_reduced(matrix: Any, structure: Structure, places: Places) -> np.ndarra
     matrix, q = still(matrix), structure.n_shared
     kept = np.append((6 * places.image[:, None] + np.arange(6)).ravel(), np.arange(len(matrix) - q, len(matrix)))
     return matrix[np.ix_(kept, kept)]
+
+
+def _surface_places(s: Structure, places: Places, n_points: int) -> np.ndarray:
+    """Where the rows of surfaces lie in (rows, points): those of a point one below the other."""
+    order = np.argsort(s.surface_point, kind="stable")
+    of_point = s.surface_point[order]
+    below = np.arange(len(order)) - np.searchsorted(of_point, of_point)
+    result = np.zeros(len(order), int)
+    result[order] = below * n_points + places.point[of_point]
+    return result
+
+
+def _surface_strips(s: Structure, places: Places, n_points: int) -> np.ndarray:
+    depth = int(np.bincount(s.surface_point).max(initial=0))
+    result = np.zeros(depth * n_points, np.int32)
+    result[_surface_places(s, places, n_points)] = s.surface_strip
+    return result.reshape(depth, n_points)
 
 
 def _pad(array: np.ndarray, size: int, fill: float) -> np.ndarray:

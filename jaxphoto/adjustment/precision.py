@@ -23,6 +23,7 @@ def warn_of_lost_digits(block: Block, start: Unknowns) -> None:
         "stations": block.stations,
         "attitudes": block.attitudes,
         "distances": block.distances,
+        "surfaces": block.surfaces,
         "start": start,
     }
     found = []

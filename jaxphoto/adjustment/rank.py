@@ -36,6 +36,7 @@ def check_priors(block: Block, priors: Unknowns) -> None:
     _check_mounts(block, priors, with_station, with_attitude)
     _check_strips(block, priors, with_station)
     _check_shifts(block, priors, with_station)
+    _check_scanner(block, priors)
 
 
 def _check_scales(priors: Unknowns) -> None:
@@ -100,7 +101,9 @@ def _check_strips(block: Block, priors: Unknowns, with_station: set[int]) -> Non
 
 def _check_shifts(block: Block, priors: Unknowns, with_station: set[int]) -> None:
     """Stations that may all shift do not hold the block."""
-    if block.datum.kind != "control" or len(block.control.who) + len(block.fixed.who) or not with_station:
+    if block.datum.kind != "control" or not with_station:
+        return
+    if len(block.control.who) + len(block.fixed.who) + len(block.surfaces.point):
         return
     shifted = [name for name, prior in priors.strips.items() if prior.shift is FREE]
     if {block.image_strip[i] for i in with_station} <= set(shifted):
@@ -108,6 +111,22 @@ def _check_shifts(block: Block, priors: Unknowns, with_station: set[int]) -> Non
             f"the shift of every strip is free (strips {', '.join(shifted)}) and the block has no control, so its "
             f"position is open: add control points, or hold the shift of one strip fixed, such as that of {shifted[0]}"
         )
+
+
+def _check_scanner(block: Block, priors: Unknowns) -> None:
+    if priors.scanner is None:
+        return
+    if priors.scanner.boresight is FREE and not np.any(np.asarray(block.surfaces.turn)):
+        raise RankError(
+            "scanner.boresight is free, but no point lies on a laser scanner's surface that the boresight moves: add "
+            "such points, measured from known positions of the scanner, or hold the boresight fixed"
+        )
+    for k, (name, prior) in enumerate(priors.scanner.shifts.items()):
+        if prior is FREE and not np.any(block.surfaces.strip == k):
+            raise RankError(
+                f"scanner[{name}].shift is free, but no point lies on a surface of that lidar strip: hold the shift "
+                "fixed, or leave the strip out"
+            )
 
 
 def _images_of(name: str, names: Iterable[str]) -> set[int]:

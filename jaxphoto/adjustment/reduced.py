@@ -49,6 +49,9 @@ class OtherRows(NamedTuple):
     residuals: Residuals
     control: Float[Array, "3 points"]
     """Derivative of each control residual by its own coordinate."""
+    surfaces: Float[Array, "3 rows points"]
+    """Derivatives of the residuals of surfaces by the coordinates of their points, and by the scanner's unknowns."""
+    surfaces_scanner: Float[Array, "scanner rows points"]
     rows_e: Float[Array, "constraints images 6"]
     rows_p: Float[Array, "constraints 3 points"]
 
@@ -79,7 +82,7 @@ def reduce_normal(at: At, damping) -> tuple[Band, Reduced, Right]:
     rest = other_rows(at)
     blocks, others, coupled = rest.blocks, rest.residuals, rest.coupled
     parts_of = tile_parts(at, damping, coupled)
-    n, q, c = s.n_images, s.n_image_colours, s.n_interior + len(coupled) + 1
+    n, q, c = s.n_images, s.n_image_colours, s.n_border + len(coupled) + 1
     _, chunk, m = tiles.image.shape
     width, inner = n // tiles.columns, tiles.columns - 1
 
@@ -119,6 +122,11 @@ def reduce_normal(at: At, damping) -> tuple[Band, Reduced, Right]:
     us, uss, b_s = _by_unknown(m_images, s)
     uss = uss.at[s.weighted, s.weighted].add(blocks.priors**2)
     b_s = b_s.at[s.weighted].add(blocks.priors * others.priors)
+    if s.n_scanner:
+        by_scanner = rest.surfaces_scanner.reshape(s.n_scanner, -1)
+        own = slice(s.n_interior, s.n_border)
+        uss = uss.at[own, own].add(total(by_scanner @ by_scanner.T, s))
+        b_s = b_s.at[own].add(total(by_scanner @ others.surfaces.reshape(-1), s))
     u = m_images[:, :6, :6]
     weight = Increments(jnp.einsum("nii->in", u), jnp.diagonal(uss), v)
     added = damping * weight.eop.T + jnp.where(weight.eop.T == 0, 1.0, 0.0)
@@ -129,7 +137,7 @@ def reduce_normal(at: At, damping) -> tuple[Band, Reduced, Right]:
     )
     last = last.at[each[:width], :, each[:width]].add(u[of_inner:], unique_indices=True)
 
-    i, k = s.n_interior, len(coupled)
+    i, k = s.n_border, len(coupled)
     us = us.at[:, :, :i].add(-met[:, :, :i]).transpose(2, 0, 1).reshape(s.n_shared, 6 * n)
     uss = (uss + damping * jnp.diag(weight.shared)).at[:i, :i].add(-border[:i, :i])
     ge = rest.rows_e.transpose(1, 2, 0) - met[:, :, i : i + k]
@@ -148,7 +156,7 @@ def reduce_normal(at: At, damping) -> tuple[Band, Reduced, Right]:
     right = jnp.concatenate([(b_e - met[:, :, -1]).reshape(-1), b_s.at[:i].add(-border[:i, -1])])
     reduced = Reduced(diagonal_of(a), g, kk, f, l, weight, jnp.asarray(damping, float))
     # Of the residuals' own square, the sums hold the image rows' part.
-    squares = jnp.sum(m_images[:, -1, -1]) + total(jnp.sum(others.control**2), s)
+    squares = jnp.sum(m_images[:, -1, -1]) + total(jnp.sum(others.control**2) + jnp.sum(others.surfaces**2), s)
     squares += jnp.sum(coupled**2) + jnp.sum(others.priors**2)
     return a, reduced, Right(Increments(b_e.T, b_s, b_points), right, border[i : i + k, -1], squares)
 
@@ -168,13 +176,21 @@ def _subtract_blocks(band: tuple[Array, Array], grams: Float[Array, "blocks 6 6"
 
 
 def other_rows(at: At) -> OtherRows:
-    """Jacobian blocks and residuals of all but the image rows, and the rows that couple points."""
+    """Derivatives and residuals of all but the image rows, and the rows that couple points."""
     increments, scale, values, s = at
     others, product = jax.linearize(lambda y: other_residuals(y, scale, values, s), increments)
     zero = jax.tree.map(jnp.zeros_like, increments)
     blocks = jacobian_blocks(product, zero, s)
     # A control residual touches one coordinate only: one seed gives all of them.
     control = product(zero._replace(points=jnp.ones_like(zero.points))).control
+    surfaces, of_scanner = others.surfaces[None][:0], others.surfaces[None][:0]
+    if others.surfaces.size:
+        # Nor does one of a surface touch another point than its own.
+        along = lambda y: product(y).surfaces  # noqa: E731
+        by_axis = jnp.broadcast_to(jnp.eye(3)[:, :, None], (3, *zero.points.shape))
+        surfaces = jax.vmap(lambda d: along(zero._replace(points=d)))(by_axis)
+        unit = jnp.eye(s.n_shared)[s.n_interior : s.n_border]
+        of_scanner = jax.vmap(lambda d: along(zero._replace(shared=d)))(unit)
     each, n = jnp.arange(len(s.distance_points)), increments.points.shape[1]
     spans = jnp.zeros((len(s.distance_points), 3, n))
     for end in range(2):
@@ -182,7 +198,7 @@ def other_rows(at: At) -> OtherRows:
     datum_e = (values.datum_eop * scale.eop).transpose(0, 2, 1)
     rows_e = jnp.concatenate([jnp.zeros((len(each), *datum_e.shape[1:])), datum_e])
     rows_p = jnp.concatenate([spans, values.datum_points * scale.points])
-    return OtherRows(blocks, others, control, rows_e, rows_p)
+    return OtherRows(blocks, others, control, surfaces, of_scanner, rows_e, rows_p)
 
 
 def tile_numbers(at: At, rest: OtherRows):
@@ -191,7 +207,8 @@ def tile_numbers(at: At, rest: OtherRows):
     tiles = s.in_tiles
     points = values.points + increments.points * scale.points
     control = jnp.stack([rest.residuals.control, rest.control])
-    of_points = (by_tile(v, tiles) for v in (points, scale.points, control, rest.rows_p))
+    surfaces = jnp.concatenate([rest.residuals.surfaces[None], rest.surfaces, rest.surfaces_scanner])
+    of_points = (by_tile(v, tiles) for v in (points, scale.points, control, surfaces, rest.rows_p))
     return (tiles.image, values.xy, values.sigma_xy, *of_points)
 
 
@@ -214,11 +231,15 @@ def tile_parts(at: At, damping, coupled: Float[Array, "constraints"]):
     s, columns_of = at.structure, tile_columns(at)
 
     def parts(numbers) -> TileParts:
-        *measured, control, rows_p = numbers
+        *measured, control, surfaces, rows_p = numbers
         j = columns_of(measured)
         image, (m, p) = measured[0], j[0].residual.shape
         v, b = _met([c.point for c in j], j), _met([c.residual[None] for c in j], j)[0]
         ws = _by_interior(j, image, s)
+        if surfaces.size:
+            by_point = surfaces[1:4]
+            met = jnp.sum(surfaces[:, None] * by_point, axis=2)
+            v, b, ws = v + met[1:4], b + met[0], jnp.concatenate([ws, met[4:]])
         diagonal = jnp.einsum("iip->ip", v) + control[1] ** 2
         added = control[1] ** 2 + damping * diagonal + jnp.where(diagonal == 0, 1.0, 0.0)
         v = v + added[:, None] * jnp.eye(3)[:, :, None]

@@ -34,13 +34,15 @@ class Increments(NamedTuple):
 class Residuals(NamedTuple):
     """Observed minus computed over sigma, by group. `datum` holds the constraints that observations leave open.
 
-    Of a padded structure, `image` is (chunks, tiles, 2, m, p), as `Values.xy`, and `control` (3, points).
+    Of a padded structure, `image` is (chunks, tiles, 2, m, p), as `Values.xy`, `control` (3, points), and `surfaces`
+    (rows, points).
     """
 
     image: Float[Array, "2 rows"]
     stations: Float[Array, "stations"]
     attitudes: Float[Array, "3 attitudes"]
     control: Float[Array, "control"]
+    surfaces: Float[Array, "surfaces"]
     distances: Float[Array, "distances"]
     priors: Float[Array, "weighted"]
     datum: Float[Array, "constraints"]
@@ -51,6 +53,7 @@ GROUPS = {
     "stations": "stations",
     "attitudes": "attitudes",
     "control": "control_points",
+    "surfaces": "surfaces",
     "distances": "distances",
     "priors": "priors",
 }
@@ -75,6 +78,11 @@ class Values(eqx.Module):
     sigma_attitudes: Float[Array, "3 attitudes"]
     control: Float[Array, "control"]
     sigma_control: Float[Array, "control"]
+    foot: Float[Array, "3 surfaces"]
+    """Of the rows of surfaces (`Block.surfaces`); of a padded structure these are (rows, points)."""
+    normal: Float[Array, "3 surfaces"]
+    turn: Float[Array, "3 surfaces"]
+    sigma_surfaces: Float[Array, "surfaces"]
     distances: Float[Array, "distances"]
     sigma_distances: Float[Array, "distances"]
     priors: Float[Array, "weighted"]
@@ -119,10 +127,24 @@ def other_residuals(increments: Increments, scale: Increments, values: Values, s
         stations / values.sigma_stations,
         attitudes / values.sigma_attitudes,
         control / values.sigma_control,
+        surface_residuals(state, values, structure) / values.sigma_surfaces,
         distances / values.sigma_distances,
         priors,
         datum_residuals(increments, scale, values),
     )
+
+
+def surface_residuals(state: State, values: Values, structure: Structure) -> Float[Array, "surfaces"]:
+    """By how much points lie below the laser scanner's surfaces (m), along their normals (`Block.surfaces`)."""
+    v, s = values, structure
+    points = state.points[:, None] if s.tiles is not None else state.points[:, s.surface_point]
+    apart = points - v.foot
+    rise = jnp.zeros(())
+    if s.mount_offset > s.scanner_offset:
+        boresight, *shifts = state.shared[s.scanner_offset : s.mount_offset].reshape(-1, 3)
+        apart = apart + jnp.stack(shifts, axis=1)[:, s.surface_strip] if shifts else apart
+        rise = sum((b * t for b, t in zip(boresight, v.turn, strict=True)), rise)
+    return -(sum((n * a for n, a in zip(v.normal, apart, strict=True)), jnp.zeros(())) + rise)
 
 
 def datum_residuals(increments: Increments, scale: Increments, values: Values) -> Float[Array, "constraints"]:

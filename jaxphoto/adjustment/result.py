@@ -123,19 +123,19 @@ class Adjustment(eqx.Module):
 
     @property
     def n_observations(self) -> dict[str, int]:
-        """Observations by group: image_points, stations, attitudes, control_points, distances, priors."""
+        """Observations by group: image_points, stations, attitudes, control_points, surfaces, distances, priors."""
         return {name: int(np.size(getattr(self.residuals, field))) for field, name in GROUPS.items()}
 
     @property
     def n_unknowns(self) -> dict[str, int]:
-        """Unknowns by group: interior, mounts, strips, exterior, points."""
+        """Unknowns by group: interior, scanner, mounts, strips, exterior, points."""
         s = self.structure
-        interior = int((s.free < s.mount_offset).sum())
         mounts = int(((s.free >= s.mount_offset) & (s.free < s.strip_offset)).sum())
         return {
-            "interior": interior,
+            "interior": s.n_interior,
+            "scanner": s.n_scanner,
             "mounts": mounts,
-            "strips": s.n_shared - interior - mounts,
+            "strips": s.n_shared - s.n_border - mounts,
             "exterior": int(s.eop_free.sum()),
             "points": int(s.point_free.sum()),
         }

@@ -28,7 +28,10 @@ def along_points(ndim: int) -> Any:
 
 
 _OF_TILES = {"xy", "sigma_xy", "pair_tile", "pair_images", "pair_block", "block", "groups", "f"}
-_OF_POINTS = {"points", "control", "sigma_control", "datum_points", "point_free", "point_class", "l"}
+_OF_POINTS = {
+    "points", "control", "sigma_control", "datum_points", "point_free", "point_class", "l", "foot", "normal", "turn",
+    "sigma_surfaces", "surface_strip",
+}  # fmt: skip
 
 
 def usable(wanted: int) -> int:

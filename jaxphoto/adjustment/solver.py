@@ -35,7 +35,7 @@ def zero_system(y: Increments, values: Values, s: Structure) -> System:
     """A system of the right shapes, to begin with."""
     n, q, k = 6 * s.n_images, s.n_shared, len(values.distances) + len(values.datum_eop)
     *tiles, m = s.in_tiles.image.shape
-    f = (*tiles, 6 * m + s.n_interior + k + 1, 3 * s.in_tiles.per_tile)
+    f = (*tiles, 6 * m + s.n_border + k + 1, 3 * s.in_tiles.per_tile)
     size, inner = n // s.in_tiles.columns, s.in_tiles.columns - 1
     factor = BandFactor(
         jnp.zeros((inner, 2 * size, size)), jnp.zeros((q, inner * size)), jnp.zeros((size + q, size + q))

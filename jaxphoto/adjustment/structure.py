@@ -24,7 +24,7 @@ from jaxtyping import Bool, Float, Int
 from jaxphoto.adjustment.tiling import check_rows
 from jaxphoto.block import Block
 from jaxphoto.camera import InteriorOrientation, parameter_names
-from jaxphoto.georeferencing import Corrections, Mount, StripBias
+from jaxphoto.georeferencing import Corrections, Mount, Scanner, StripBias
 from jaxphoto.unknowns import FIXED, Prior, Unknowns, Weighted
 
 
@@ -78,6 +78,8 @@ class Structure(eqx.Module):
     """Index arrays and sizes; see the module's head."""
 
     groups: tuple[CameraGroup, ...]
+    scanner_offset: int = eqx.field(static=True)
+    """The first parameter of the scanner in the vector of all shared parameters: that after the cameras'."""
     mount_offset: int = eqx.field(static=True)
     strip_offset: int = eqx.field(static=True)
     n_images: int = eqx.field(static=True)
@@ -85,6 +87,8 @@ class Structure(eqx.Module):
     corrections: Corrections = eqx.field(static=True)
     n_interior: int = eqx.field(static=True)
     """Shared unknowns that belong to cameras: the first ones."""
+    n_scanner: int = eqx.field(static=True)
+    """Those that belong to the scanner: the next."""
     n_image_colours: int = eqx.field(static=True)
     n_colours: int = eqx.field(static=True)
     n_classes: int = eqx.field(static=True)
@@ -105,6 +109,10 @@ class Structure(eqx.Module):
     """Point and axis of each observed control coordinate. Empty in a padded structure: there every coordinate has a
     value and a standard deviation."""
     control_axis: Int[np.ndarray, "control"]
+    surface_point: Int[np.ndarray, "surfaces"]
+    """Point of each row of a surface. Empty in a padded structure, whose rows are listed by point."""
+    surface_strip: Int[np.ndarray, "surfaces"]
+    """Lidar strip of each row. Of a padded structure (rows, points), rows being the most that a point has."""
     distance_points: Int[np.ndarray, "distances 2"]
     point_class: Int[np.ndarray, "points"]
     weighted: Int[np.ndarray, "weighted"]
@@ -123,17 +131,28 @@ class Structure(eqx.Module):
         return self.tiles
 
     @property
+    def n_border(self) -> int:
+        """Shared unknowns that meet points: those of cameras and scanner."""
+        return self.n_interior + self.n_scanner
+
+    @property
     def n_shared(self) -> int:
         """Number of shared unknowns."""
         return len(self.free)
 
 
 def shared_vector(unknowns: Unknowns, groups: tuple[CameraGroup, ...]) -> list:
-    """All shared parameters as a list of scalars: cameras by group, then mounts, then strips."""
+    """All shared parameters as a list of scalars: cameras by group, then scanner, mounts, strips."""
     cameras = [leaf for g in groups for name in g.names for leaf in jax.tree.leaves(unknowns.interior[name])]
     mounts = [v for m in unknowns.mounts.values() for v in (*m.lever_arm, *m.boresight, m.time_offset)]
     strips = [v for s in unknowns.strips.values() for v in (*s.shift, *s.drift)]
-    return cameras + mounts + strips
+    scanner = [] if unknowns.scanner is None else [v for vector in scanner_vectors(unknowns.scanner) for v in vector]
+    return cameras + scanner + mounts + strips
+
+
+def scanner_vectors(scanner: Scanner) -> list:
+    """Boresight, then the shifts of the lidar strips."""
+    return [scanner.boresight, *scanner.shifts.values()]
 
 
 def interior_of(group: CameraGroup, table) -> InteriorOrientation:
@@ -151,7 +170,9 @@ def structure_of(block: Block, priors: Unknowns) -> Structure:
     if len(np.unique(np.asarray(block.control.who) * 3 + np.asarray(block.control.axis))) < len(block.control.who):
         raise ValueError("control holds a coordinate of a point twice: keep one row of each")
     entries = _shared_entries(block, priors, groups)
-    mount_offset = sum(len(g.names) * g.treedef.num_leaves for g in groups)
+    scanner_offset = sum(len(g.names) * g.treedef.num_leaves for g in groups)
+    lidar = [] if priors.scanner is None else scanner_vectors(priors.scanner)
+    mount_offset = scanner_offset + 3 * len(lidar)
     free = np.array([k for k, e in enumerate(entries) if e.prior is not FIXED], dtype=np.int32)
     ranks: dict[str, int] = {}
     owners, colour = [], np.zeros(len(free), np.int32)
@@ -161,7 +182,10 @@ def structure_of(block: Block, priors: Unknowns) -> Structure:
         owners.append(owner)
     counts = [max((ranks[o] + 1 for o in ranks if o.startswith(kind)), default=0) for kind in ("c:", "m:", "s:")]
     base = {"c": 0, "m": counts[0], "s": counts[0] + counts[1]}
-    colour += np.array([base[o[0]] for o in owners], np.int32) if owners else colour
+    # No image meets the scanner: one colour, the last, is enough for all of it.
+    colour = np.array([sum(counts) if o == _SCANNER else base[o[0]] + c for o, c in zip(owners, colour, strict=True)])
+    colour = colour.astype(np.int32)
+    counts.append(int(_SCANNER in owners))
     groups = tuple(_with_free(g, free) for g in groups)
     column = np.full((len(block.images), sum(counts)), len(free), np.int32)
     of_owner: dict[str, list[int]] = {}
@@ -180,12 +204,14 @@ def structure_of(block: Block, priors: Unknowns) -> Structure:
     classes = _point_classes(np.asarray(block.distances.points), len(block.points))
     return Structure(
         groups=groups,
+        scanner_offset=scanner_offset,
         mount_offset=mount_offset,
         strip_offset=mount_offset + MOUNT_SIZE * len(priors.mounts),
         n_images=len(block.images),
         n_points=len(block.points),
         corrections=block.corrections,
-        n_interior=int((free < mount_offset).sum()),
+        n_interior=int((free < scanner_offset).sum()),
+        n_scanner=owners.count(_SCANNER),
         n_image_colours=counts[0],
         n_colours=sum(counts),
         n_classes=int(classes.max(initial=0)) + 1,
@@ -201,6 +227,8 @@ def structure_of(block: Block, priors: Unknowns) -> Structure:
         attitude_image=np.asarray(block.attitudes.image, np.int32),
         control_point=np.asarray(block.control.who, np.int32),
         control_axis=np.asarray(block.control.axis, np.int32),
+        surface_point=np.asarray(block.surfaces.point, np.int32),
+        surface_strip=np.asarray(block.surfaces.strip, np.int32),
         distance_points=np.asarray(block.distances.points, np.int32).reshape(-1, 2),
         point_class=classes,
         weighted=np.array([j for j, k in enumerate(free) if isinstance(entries[k].prior, Weighted)], np.int32),
@@ -223,6 +251,10 @@ class _Entry(eqx.Module):
     owner: str
     label: str
     prior: object
+
+
+# Who owns the scanner's parameters: there is one scanner.
+_SCANNER = "l:"
 
 
 def _is_prior(x: object) -> bool:
@@ -275,13 +307,23 @@ def _shared_entries(block: Block, priors: Unknowns, groups: tuple[CameraGroup, .
         entries += [
             _Entry(f"c:{name}", f"interior[{name}].{label}", leaf) for label, leaf in zip(labels, leaves, strict=True)
         ]
+    if priors.scanner is not None:
+        vectors: dict[str, tuple[str, ...]] = {"scanner.boresight_{}_rad": ("right", "forward", "up")}
+        vectors |= {f"scanner[{name}].shift_{{}}_m": tuple("XYZ") for name in priors.scanner.shifts}
+        for (label, axes), prior in zip(vectors.items(), scanner_vectors(priors.scanner), strict=True):
+            each = zip(axes, _components(prior), strict=True)
+            entries += [_checked(_Entry(_SCANNER, label.format(axis), prior)) for axis, prior in each]
     for kind, items, names in (("mounts", priors.mounts, _MOUNT), ("strips", priors.strips, _STRIP)):
         for name, item in items.items():
             for label, prior in zip(names, spread(item), strict=True):
-                if not isinstance(prior, Prior | Weighted):
-                    raise ValueError(f"{kind}[{name}].{label}: {prior!r} is no prior; use FREE, FIXED or Weighted")
-                entries.append(_Entry(f"{kind[0]}:{name}", f"{kind}[{name}].{label}", prior))
+                entries.append(_checked(_Entry(f"{kind[0]}:{name}", f"{kind}[{name}].{label}", prior)))
     return entries
+
+
+def _checked(entry: _Entry) -> _Entry:
+    if not isinstance(entry.prior, Prior | Weighted):
+        raise ValueError(f"{entry.label}: {entry.prior!r} is no prior; use FREE, FIXED or Weighted")
+    return entry
 
 
 _MOUNT = (
@@ -292,8 +334,10 @@ _STRIP = (*(f"shift_{axis}_m" for axis in "XYZ"), *(f"drift_{axis}_m_per_s" for 
 MOUNT_SIZE, STRIP_SIZE = len(_MOUNT), len(_STRIP)
 
 
-def spread(item: Mount | StripBias) -> list[object]:
-    """One prior per number of a mount's or strip's tree of priors."""
+def spread(item: Mount | StripBias | Scanner) -> list[object]:
+    """One prior per number of a mount's, strip's or scanner's tree of priors."""
+    if isinstance(item, Scanner):
+        return [p for vector in scanner_vectors(item) for p in _components(vector)]
     if isinstance(item, Mount):
         return [*_components(item.lever_arm), *_components(item.boresight), item.time_offset]
     return [*_components(item.shift), *_components(item.drift)]

@@ -6,6 +6,7 @@ derivative of `image_residual`, mapped over both axes: nothing is gathered row b
 points.
 """
 
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -193,7 +194,7 @@ def by_tile(array: Float[Array, "*c points"], tiles: Tiles) -> Float[Array, "chu
 def by_point(array: Float[Array, "chunks tiles *c p"]) -> Float[Array, "*c points"]:
     """The reverse of `by_tile`."""
     joined = jnp.moveaxis(array, (0, 1), (-3, -2))
-    return joined.reshape(*joined.shape[:-3], -1)
+    return joined.reshape(*joined.shape[:-3], math.prod(joined.shape[-3:]))
 
 
 def each_tile(function: Callable, numbers: Any, groups: Array, tiles: Tiles) -> Any:

@@ -12,7 +12,7 @@ from jaxphoto.adjustment.structure import MOUNT_SIZE, STRIP_SIZE, Structure, sha
 from jaxphoto.arrays import Numbers
 from jaxphoto.block import Block, exposures
 from jaxphoto.collinearity import ExteriorOrientation
-from jaxphoto.georeferencing import Mount, StripBias
+from jaxphoto.georeferencing import Mount, Scanner, StripBias
 from jaxphoto.unknowns import Unknowns, Weighted
 
 
@@ -33,6 +33,10 @@ def values_of(block: Block, start: Unknowns, priors: Unknowns, structure: Struct
         sigma_attitudes=_floats(block.attitudes.sigma).T,
         control=_floats(block.control.value),
         sigma_control=_floats(block.control.sigma),
+        foot=_floats(block.surfaces.foot).T,
+        normal=_floats(block.surfaces.normal).T,
+        turn=_floats(block.surfaces.turn).T,
+        sigma_surfaces=_floats(block.surfaces.sigma),
         distances=_floats(block.distances.value),
         sigma_distances=_floats(block.distances.sigma),
         priors=_vector([w.value for w in weights]),
@@ -80,12 +84,17 @@ def unknowns_of(state: State, like: Unknowns, structure: Structure) -> Unknowns:
     strip = state.shared[structure.strip_offset :].reshape(-1, STRIP_SIZE)
     mounts = [Mount(v[:3], v[3:6], v[6], m.image_x) for v, m in zip(mount, like.mounts.values(), strict=True)]
     strips = [StripBias(v[:3], v[3:]) for v in strip]
+    scanner = like.scanner
+    if scanner is not None:
+        boresight, *shifts = state.shared[structure.scanner_offset : structure.mount_offset].reshape(-1, 3)
+        scanner = Scanner(boresight, dict(zip(scanner.shifts, shifts, strict=True)))
     return Unknowns(
         {name: interior[name] for name in like.interior},
         ExteriorOrientation(state.position.T, state.rotation.transpose(2, 0, 1)),
         state.points.T,
         dict(zip(like.mounts, mounts, strict=True)),
         dict(zip(like.strips, strips, strict=True)),
+        scanner,
     )
 
 
@@ -106,6 +115,7 @@ def _weights(priors: Unknowns, structure: Structure) -> list[Weighted]:
         for name in g.names
         for leaf in jax.tree.leaves(priors.interior[name], is_leaf=is_weighted)
     ]
+    flat += spread(priors.scanner) if priors.scanner is not None else []
     flat += [p for mount in priors.mounts.values() for p in spread(mount)]
     flat += [p for strip in priors.strips.values() for p in spread(strip)]
     return [flat[k] for k in structure.free if is_weighted(flat[k])]

@@ -28,12 +28,14 @@ from jaxphoto.georeferencing.mount import (
     recorded_attitude,
     sensor_position,
 )
+from jaxphoto.georeferencing.scanner import Scanner, corrected_point, raised_by_boresight
 from jaxphoto.georeferencing.trajectory import Poses, Trajectory, covered, interpolate
 
 __all__ = [
-    "IMAGE_X", "NOMINAL", "Corrections", "DirectPartials", "Exposure", "Mount", "Poses", "RayCovariance",
+    "IMAGE_X", "NOMINAL", "Corrections", "DirectPartials", "Exposure", "Mount", "Poses", "RayCovariance", "Scanner",
     "SensorCovariance", "StripBias", "Surface", "Trajectory", "apparent_point", "arm_to_camera", "attitude_residual",
-    "body_from_camera", "covered", "direct_covariance", "direct_orientation", "direct_partials", "exact_offset",
-    "ground_covariance", "ground_point", "interpolate", "level_error", "level_offset", "object_from_body",
-    "recorded_attitude", "refraction_constant", "sensor_position", "worst_level_error",
+    "body_from_camera", "corrected_point", "covered", "direct_covariance", "direct_orientation", "direct_partials",
+    "exact_offset", "ground_covariance", "ground_point", "interpolate", "level_error", "level_offset",
+    "object_from_body", "raised_by_boresight", "recorded_attitude", "refraction_constant", "sensor_position",
+    "worst_level_error",
 ]  # fmt: skip

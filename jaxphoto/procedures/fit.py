@@ -75,6 +75,7 @@ def _blunders(adjusted: Adjustment, w: Residuals, numbers: Residuals) -> tuple[l
         (v, f"control point {points[p]} in {AXES[a]}")
         for v, p, a in zip(size["control"], s.control_point, s.control_axis, strict=True)
     ]
+    large += [(v, f"point {points[p]} on its surface") for v, p in zip(size["surfaces"], s.surface_point, strict=True)]
     large += [
         (v, f"distance {points[a]} to {points[b]}")
         for v, (a, b) in zip(size["distances"], s.distance_points, strict=True)

@@ -84,11 +84,11 @@ class Tables:
 
     @cached_property
     def georeferencing(self) -> pd.DataFrame:
-        """parameter, value, sigma of what was estimated of mounts and strips; units stand in the parameter's name."""
+        """parameter, value, sigma of what was estimated of scanner, mounts and strips; units stand in the names."""
         s = self.adjusted.structure
         rows = []
         for k, label, sigma in zip(s.free, s.labels, np.asarray(self.covariance.shared_sigma), strict=True):
-            if k >= s.mount_offset:
+            if k >= s.scanner_offset:
                 factor = 180 / np.pi if label.endswith("_rad") else 1.0
                 value = float(self.adjusted.values.shared[k])
                 rows.append((label.replace("_rad", "_deg"), factor * value, factor * float(sigma)))
@@ -179,6 +179,7 @@ class Tables:
             ("stations", images[s.station_image], nobody, axes[s.station_axis], 1.0, "m"),
             ("attitudes", images[s.attitude_image], nobody, attitude_axes, 180 / np.pi, "deg"),
             ("control_points", nobody, points[s.control_point], axes[s.control_axis], 1.0, "m"),
+            ("surfaces", nobody, points[s.surface_point], "normal", 1.0, "m"),
             ("distances", nobody, ends, nobody, 1.0, "m"),
             ("priors", nobody, nobody, labels, 1.0, nobody),
         )

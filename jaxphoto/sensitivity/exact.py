@@ -204,6 +204,7 @@ def _derivatives(
         stations=-touching(stations, s.station_image),
         attitudes=-jnp.stack([touching(b, s.attitude_image) for b in attitudes], axis=1),
         control=-of_points * rest.control / values.sigma_control,
+        surfaces=jnp.zeros((len(reduced), *values.sigma_surfaces.shape)),
         distances=-jnp.sum(sum(ends), axis=1) / values.sigma_distances,
         priors=-adjoint.reduced[:, 6 * s.n_images + s.weighted] * j.priors / values.sigma_priors,
         datum=jnp.zeros((len(reduced), 0)),

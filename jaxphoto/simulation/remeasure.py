@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxphoto.block import Block, exposures, mountings
+from jaxphoto.block import Block, SurfaceRows, exposures, mountings
 from jaxphoto.collinearity import ExteriorOrientation, project
 from jaxphoto.georeferencing import apparent_point
 from jaxphoto.simulation.flight import recorded
@@ -16,9 +16,9 @@ from jaxphoto.unknowns import Unknowns
 def remeasure(block: Block, truth: Unknowns, key: PRNGKeyArray) -> Block:
     """`block` with every observation replaced by its true value under `truth` plus normal noise of its sigma.
 
-    Image points, stations, attitudes, control and distances are drawn independently; check and fixed coordinates become
-    true ones; weighted priors stay. Pure and differentiable in `truth`; `vmap` over keys gives many blocks at once.
-    Which unknowns it is called with is what an adjustment of it should recover.
+    Image points, stations, attitudes, control, surfaces and distances are drawn independently; check and fixed
+    coordinates become true ones; weighted priors stay. Pure and differentiable in `truth`; `vmap` over keys gives many
+    blocks at once. Which unknowns it is called with is what an adjustment of it should recover.
     """
     keys = jax.random.split(key, 5)
     draw = lambda k, value, sigma: value + jnp.asarray(sigma) * jax.random.normal(k, value.shape)  # noqa: E731
@@ -28,7 +28,7 @@ def remeasure(block: Block, truth: Unknowns, key: PRNGKeyArray) -> Block:
     length = jnp.sqrt(jnp.sum((points[a] - points[b]) ** 2, axis=1))
     where = lambda x: (  # noqa: E731
         x.image_points.xy, x.stations.value, x.attitudes.roll_pitch_yaw, x.control.value, x.distances.value,
-        x.check.value, x.fixed.value,
+        x.check.value, x.fixed.value, x.surfaces.foot,
     )  # fmt: skip
     new = (
         draw(keys[0], image_coordinates(block, truth), rows.sigma),
@@ -38,8 +38,20 @@ def remeasure(block: Block, truth: Unknowns, key: PRNGKeyArray) -> Block:
         draw(keys[4], length, block.distances.sigma),
         points[block.check.who, block.check.axis],
         points[block.fixed.who, block.fixed.axis],
+        _feet(block.surfaces, truth, jax.random.fold_in(key, 5)),
     )
     return eqx.tree_at(where, block, new)
+
+
+def _feet(surfaces: SurfaceRows, truth: Unknowns, key: PRNGKeyArray) -> Float[Array, "rows 3"]:
+    """Laser points of the surfaces: off by shift and boresight of the scanner, and by noise along the normal."""
+    foot = jnp.asarray(truth.points)[surfaces.point]
+    rise = jnp.asarray(surfaces.sigma) * jax.random.normal(key, surfaces.sigma.shape)
+    if truth.scanner is not None:
+        shifts = jnp.stack([jnp.zeros(3), *truth.scanner.shifts.values()])[1:]
+        foot = foot + shifts[surfaces.strip] if len(shifts) else foot
+        rise = rise + jnp.asarray(surfaces.turn) @ truth.scanner.boresight
+    return foot + rise[:, None] * surfaces.normal
 
 
 def image_coordinates(block: Block, truth: Unknowns) -> Float[Array, "rows 2"]:

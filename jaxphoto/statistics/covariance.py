@@ -3,12 +3,13 @@
 With S~ = [S g; g' -K] the reduced matrix bordered by the few rows that couple points (see adjustment/normal.py),
 V = L L' and F = [W; Ws; D] L^-T what a point p meets, whitened,
 
-    Q~    = S~^-1                                   exterior and interior orientation, mounts, strips
+    Q~    = S~^-1                                   exterior and interior orientation, scanner, mounts, strips
     Q_pp  = L^-T (I + F' Q~ F) L^-1                 3 x 3 a point
     j Q j' = z'z + (j_r - F z)' Q~ (j_r - F z)      of an image row with columns j_r and j_p, z = L^-1 j_p'
 
-summed tile by tile. The full matrix is never inverted. In a free network the part along the open motions, which the
-constraints of the datum hold, is subtracted: what remains is the covariance under inner (or minimal) constraints.
+summed tile by tile, and so of a row of a surface, whose j_r belongs to the scanner. The full matrix is never inverted.
+In a free network the part along the open motions, which the constraints of the datum hold, is subtracted: what remains
+is the covariance under inner (or minimal) constraints.
 """
 
 from typing import Any, Literal, NamedTuple
@@ -25,12 +26,12 @@ from jaxphoto.adjustment.elimination import over_tiles, solve_factored
 from jaxphoto.adjustment.normal import At, Reduced, unwhiten, whiten
 from jaxphoto.adjustment.optimum import weigh_datum
 from jaxphoto.adjustment.padding import crop_reduced
-from jaxphoto.adjustment.reduced import tile_columns
+from jaxphoto.adjustment.reduced import other_rows, tile_columns
 from jaxphoto.adjustment.residuals import Increments, Values
 from jaxphoto.adjustment.result import Factored, Padded
-from jaxphoto.adjustment.shards import TILES, sharded
+from jaxphoto.adjustment.shards import TILES, along_points, sharded
 from jaxphoto.adjustment.structure import Structure
-from jaxphoto.adjustment.tiles import by_tile
+from jaxphoto.adjustment.tiles import by_point, by_tile
 from jaxphoto.arrays import Numbers, still
 from jaxphoto.compiling import prepare, run_compiled
 from jaxphoto.rotation import omega_phi_kappa_from_matrix, small_rotation
@@ -48,6 +49,13 @@ class Cofactors(NamedTuple):
 
     reduced: Float[Array, "reduced reduced"]
     points: Float[Array, "points 3 3"]
+
+
+class RowCofactors(NamedTuple):
+    """j Q j' of rows, in padded sizes."""
+
+    image: Float[Array, "chunks tiles 2 m p"]
+    surfaces: Float[Array, "rows points"]
 
 
 class Covariance(eqx.Module):
@@ -116,8 +124,8 @@ def prepare_covariance(padded: Padded, seconds: dict[str, float]) -> None:
     prepare(_covariance, _given(padded, "omega_phi_kappa", of_rows=False), seconds)
 
 
-def image_row_cofactors(adjusted: Adjustment, rotations: Rotations) -> Float[Array, "chunks tiles 2 m p"]:
-    """j Q j' of every image row, by the program that `covariance` has run with these `rotations`."""
+def row_cofactors(adjusted: Adjustment, rotations: Rotations) -> RowCofactors:
+    """j Q j' of every row of images and surfaces, by the program that `covariance` has run with these `rotations`."""
     return _run(adjusted, rotations, of_rows=True)[3]
 
 
@@ -132,8 +140,8 @@ def _given(padded: Padded, rotations: Rotations, of_rows: bool) -> tuple:
 @eqx.filter_jit
 def _covariance(
     values: Values, factored: Factored, s: Structure, rotations: Rotations, of_rows: Bool[Numbers, ""]
-) -> tuple[Cofactors, Array, Array, Array]:
-    """Cofactors; the same in units of the unknowns; and j Q j' of image rows, zero where they are not wanted."""
+) -> tuple[Cofactors, Array, Array, RowCofactors]:
+    """Cofactors; the same in units of the unknowns; and j Q j' of rows, zero where they are not wanted."""
     q, rows = cofactors_of(values, factored, s, of_rows)
     return q, *in_units(q, factored.scale, values.rotation, rotations), rows
 
@@ -170,7 +178,7 @@ def turns_of(rotation: Float[Array, "3 3 images"], rotations: Rotations) -> Floa
 
 
 def cofactors_of(values: Values, factored: Factored, s: Structure, of_rows: Bool[Numbers, ""]):
-    """All cofactors of one factored block, and j Q j' of its image rows; see the module's head."""
+    """All cofactors of one factored block, and j Q j' of its rows; see the module's head."""
     reduced = factored.reduced
     inverse = invert_band(factored.factor)
     full = inverse
@@ -179,7 +187,8 @@ def cofactors_of(values: Values, factored: Factored, s: Structure, of_rows: Bool
         low = inverse @ kg.T
         full = jnp.block([[inverse, low], [low.T, kg @ low - jnp.linalg.inv(reduced.k)]])
     weighed = weigh_datum(values, s)
-    points, rows = sharded(_of_points, s, (TILES, TILES))(full, reduced, weighed, factored.scale, s, of_rows)
+    out = (TILES, RowCofactors(TILES, along_points(2)))
+    points, rows = sharded(_of_points, s, out)(full, reduced, weighed, factored.scale, s, of_rows)
     return _without_open_motions(Cofactors(inverse, points), weighed, factored, s), rows
 
 
@@ -191,14 +200,18 @@ def _of_points(
     s: Structure,
     of_rows: Bool[Numbers, ""],
 ):
-    """Cofactors of points, and j Q j' of image rows."""
+    """Cofactors of points, and j Q j' of rows."""
     at = At(jax.tree.map(jnp.zeros_like, scale), scale, values, s)
-    columns_of = tile_columns(at)
-    n, q, i, k = 6 * s.n_images, s.n_image_colours, s.n_interior, len(reduced.k)
+    columns_of, depth = tile_columns(at), len(values.sigma_surfaces)
+    surfaces = jnp.zeros((0, *values.sigma_surfaces.shape))
+    if depth:
+        rest = other_rows(at)
+        surfaces = jnp.concatenate([rest.surfaces, rest.surfaces_scanner])
+    n, q, i, k = 6 * s.n_images, s.n_image_colours, s.n_border, len(reduced.k)
     # One more than there are: zeros serve the last row of F, and colours that mean nothing in an image.
     shared = jnp.concatenate([n + jnp.arange(i), n + s.n_shared + jnp.arange(k + 1)])
 
-    def tile(f, image, l, *measured):  # noqa: E741
+    def tile(f, image, l, surfaces, *measured):  # noqa: E741
         size = l.shape[1]
         index = jnp.concatenate([(6 * image[:, None] + jnp.arange(6)).reshape(-1), shared])
         own = full.at[index[:, None], index].get(mode="fill", fill_value=0.0)
@@ -208,10 +221,10 @@ def _of_points(
         inner = jnp.eye(3)[:, :, None] + g
         half = jnp.stack(unwhiten(inner, l))
         points = jnp.stack(unwhiten(half.transpose(1, 0, 2), l)).transpose(2, 0, 1)
-        nothing = lambda *_: jnp.zeros((2, len(image), size))  # noqa: E731
-        return points, jax.lax.cond(of_rows, rows, nothing, (image, *measured), l, own, a, inner)
+        nothing = lambda *_: (jnp.zeros((2, len(image), size)), jnp.zeros((depth, size)))  # noqa: E731
+        return points, *jax.lax.cond(of_rows, rows, nothing, (image, *measured), surfaces, l, own, a, inner)
 
-    def rows(measured, l, own, a, inner):  # noqa: E741
+    def rows(measured, surfaces, l, own, a, inner):  # noqa: E741
         image, both = measured[0], columns_of(measured)
         m, size = both[0].residual.shape
         column = jnp.asarray(s.column)[image, :q]
@@ -222,11 +235,19 @@ def _of_points(
         seen = jnp.einsum("mab,mbn->man", own[touched[:, :, None], touched[:, None, :]], j.reshape(m, 6 + q, -1))
         of_images = jnp.sum(j * seen.reshape(j.shape), axis=1).transpose(1, 0, 2)
         across = jnp.einsum("mcop,mckp->omkp", j, a[touched].reshape(m, 6 + q, 3, size))
-        return of_images - 2 * jnp.sum(z * across, axis=2) + jnp.einsum("omkp,klp,omlp->omp", z, inner, z)
+        found = of_images - 2 * jnp.sum(z * across, axis=2) + jnp.einsum("omkp,klp,omlp->omp", z, inner, z)
+        if not depth:
+            return found, jnp.zeros((0, size))
+        z, j = jnp.stack(whiten(surfaces[:3], l)), surfaces[3:]
+        scanner = slice(6 * m + s.n_interior, 6 * m + s.n_border)
+        across = jnp.einsum("arp,akp->krp", j, a[scanner].reshape(-1, 3, size))
+        of_scanner = jnp.einsum("arp,ab,brp->rp", j, own[scanner, scanner], j)
+        return found, of_scanner - 2 * jnp.sum(z * across, axis=0) + jnp.einsum("krp,klp,lrp->rp", z, inner, z)
 
-    l, *places = (by_tile(v, s.in_tiles) for v in (reduced.l, values.points, scale.points))  # noqa: E741
-    points, found = over_tiles(tile, at, reduced, (l, values.xy, values.sigma_xy, *places))
-    return points.reshape(-1, 3, 3), found
+    of_points = (reduced.l, surfaces, values.points, scale.points)
+    l, surfaces, *places = (by_tile(v, s.in_tiles) for v in of_points)  # noqa: E741
+    points, *found = over_tiles(tile, at, reduced, (l, surfaces, values.xy, values.sigma_xy, *places))
+    return points.reshape(-1, 3, 3), RowCofactors(found[0], by_point(found[1]))
 
 
 def _without_open_motions(q: Cofactors, values: Values, factored: Factored, s: Structure) -> Cofactors:

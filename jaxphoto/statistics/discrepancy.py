@@ -35,7 +35,8 @@ def physical_residuals(adjusted: Adjustment) -> dict[str, Float[np.ndarray, "...
 def a_priori_sigmas(adjusted: Adjustment) -> dict[str, Float[np.ndarray, "..."]]:
     """Standard deviations of the observations as given, by group, in the units of `physical_residuals`."""
     v = adjusted.values
-    sigmas = (v.sigma_xy, v.sigma_stations, v.sigma_attitudes, v.sigma_control, v.sigma_distances, v.sigma_priors)
+    georeferencing = v.sigma_stations, v.sigma_attitudes, v.sigma_control, v.sigma_surfaces
+    sigmas = (v.sigma_xy, *georeferencing, v.sigma_distances, v.sigma_priors)
     return {name: np.asarray(sigma) for name, sigma in zip(GROUPS.values(), sigmas, strict=True)}
 
 
@@ -46,7 +47,7 @@ def residual_spread(adjusted: Adjustment) -> list[Spread]:
     groups += [("stations", a, residuals["stations"][s.station_axis == k], "m") for k, a in enumerate(AXES)]
     groups += [("attitudes", a, residuals["attitudes"][k], "rad") for k, a in enumerate(ATTITUDE_AXES)]
     groups += [("control_points", a, residuals["control_points"][s.control_axis == k], "m") for k, a in enumerate(AXES)]
-    groups += [("distances", "", residuals["distances"], "m")]
+    groups += [(name, "", residuals[name], "m") for name in ("surfaces", "distances")]
     return [spread_of(group, axis, v, unit) for group, axis, v, unit in groups if len(v)]
 
 

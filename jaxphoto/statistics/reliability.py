@@ -8,7 +8,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.adjustment.elimination import solve_factored
@@ -20,7 +19,7 @@ from jaxphoto.adjustment.residuals import Residuals, Values
 from jaxphoto.adjustment.result import Factored, Padded
 from jaxphoto.adjustment.structure import Structure
 from jaxphoto.compiling import prepare, run_compiled
-from jaxphoto.statistics.covariance import Cofactors, Covariance, image_row_cofactors, prepare_covariance
+from jaxphoto.statistics.covariance import Cofactors, Covariance, RowCofactors, prepare_covariance, row_cofactors
 
 LEAST_CHECKED = 0.01
 """Redundancy number below which a normalised residual is mostly rounding and judges nothing."""
@@ -35,14 +34,17 @@ def prepare_statistics(padded: Padded, seconds: dict[str, float]) -> None:
         return
     prepare_covariance(padded, seconds)
     s, n = padded.structure, 6 * padded.structure.n_images + padded.structure.n_shared
-    *cofactors, rows = (np.broadcast_to(0.0, v) for v in ((n, n), (s.n_points, 3, 3), padded.values.xy.shape))
-    prepare(_redundancy, (padded.values, Cofactors._make(cofactors), rows, padded.factored, s), seconds)
+    v = padded.values
+    shapes = (n, n), (s.n_points, 3, 3), v.xy.shape, v.sigma_surfaces.shape
+    *cofactors, image, surfaces = (np.broadcast_to(0.0, shape) for shape in shapes)
+    rows = RowCofactors(image, surfaces)  # type: ignore[arg-type]
+    prepare(_redundancy, (v, Cofactors._make(cofactors), rows, padded.factored, s), seconds)
 
 
 def redundancy_numbers(adjusted: Adjustment, covariance: Covariance) -> Residuals:
     """Redundancy number of every observation, shaped like `adjusted.residuals` (zero for the datum's constraints)."""
     padded = adjusted.computed
-    rows = image_row_cofactors(adjusted, covariance.rotations)
+    rows = row_cofactors(adjusted, covariance.rotations)
     arguments = (padded.values, covariance.cofactors, rows, padded.factored, padded.structure)
     numbers = run_compiled(_redundancy, arguments, adjusted.seconds, "covariance")
     return crop_residuals(numbers, adjusted.structure, padded.places)
@@ -62,7 +64,7 @@ def normalised_residuals(adjusted: Adjustment, redundancy: Residuals) -> Residua
 
 
 @eqx.filter_jit
-def _redundancy(values: Values, q: Cofactors, image_rows: Array, factored: Factored, s: Structure) -> Residuals:
+def _redundancy(values: Values, q: Cofactors, of_rows: RowCofactors, factored: Factored, s: Structure) -> Residuals:
     scale = factored.scale
     at = At(jax.tree.map(jnp.zeros_like, scale), scale, weigh_datum(values, s), s)
     rest = other_rows(at)
@@ -84,10 +86,11 @@ def _redundancy(values: Values, q: Cofactors, image_rows: Array, factored: Facto
     own_points = jnp.diagonal(q.points, axis1=1, axis2=2).T
     stations = image_part(j.station_eop[:, None], j.station_shared[:, None], jnp.asarray(s.station_image))[0]
     return Residuals(
-        image=1 - image_rows,
+        image=1 - of_rows.image,
         stations=1 - stations,
         attitudes=1 - image_part(j.attitude_eop, j.attitude_shared, jnp.asarray(s.attitude_image)),
         control=1 - rest.control**2 * own_points,
+        surfaces=1 - of_rows.surfaces,
         distances=1 - _distances(j.distances, at, factored),
         priors=1 - j.priors**2 * jnp.diagonal(shared)[s.weighted],
         datum=jnp.zeros(values.datum_eop.shape[0]),

@@ -54,6 +54,14 @@ def lone(what):
     return eqx.tree_at(lambda b: b.start.unknowns, block, start, is_leaf=lambda x: x is block.start.unknowns)
 
 
+def without_turns(block):
+    return eqx.tree_at(lambda b: b.surfaces.turn, block, np.zeros((len(block.surfaces.point), 3)))
+
+
+def without_second_strip(block):
+    return dataclasses.replace(block, surfaces=block.surfaces.take(block.surfaces.strip == 0))
+
+
 BOTH_SHIFTS = {name: StripBias(FREE, FIXED) for name in "ab"}
 NO_CONTROL = {"control": Rows.none(), "fixed": Rows.none()}
 
@@ -98,8 +106,30 @@ NO_CONTROL = {"control": Rows.none(), "fixed": Rows.none()}
             DatumError,
             ["strips a, b", "no control", "add control points"],
         ),
+        (
+            lambda: without_turns(simulated("surfaces").block),
+            RankError,
+            ["scanner.boresight", "known positions of the scanner", "hold the boresight fixed"],
+        ),
+        (
+            lambda: without_second_strip(simulated("surfaces").block),
+            RankError,
+            ["scanner[l2].shift", "no point lies on a surface", "hold the shift fixed"],
+        ),
     ],
-    ids=["drift", "drift-alone", "drift-at-once", "shift", "boresight", "lever-arm", "motion", "time-offset", "shifts"],
+    ids=[
+        "drift",
+        "drift-alone",
+        "drift-at-once",
+        "shift",
+        "boresight",
+        "lever-arm",
+        "motion",
+        "time-offset",
+        "shifts",
+        "scanner-boresight",
+        "scanner-shift",
+    ],
 )
 def test_what_cannot_be_seen_is_named_before_anything_is_compiled(make, error, words, monkeypatch):
     monkeypatch.setattr("jaxphoto.adjustment.adjust.structure_of", None)
@@ -126,8 +156,23 @@ class _Passed(Exception):
         lambda: with_strips(**BOTH_SHIFTS),
         lambda: dataclasses.replace(with_strips(a=StripBias(FREE, FIXED)), **NO_CONTROL),
         lambda: dataclasses.replace(with_strips(**BOTH_SHIFTS), **NO_CONTROL, datum=Datum("inner")),
+        lambda: dataclasses.replace(
+            with_strips(**BOTH_SHIFTS), **NO_CONTROL, surfaces=simulated("surfaces").block.surfaces
+        ),
+        lambda: simulated("surfaces").block,
     ],
-    ids=["shift", "weighted-drift", "lever-arm", "weighted-boresight", "time-offset", "control", "one-shift", "inner"],
+    ids=[
+        "shift",
+        "weighted-drift",
+        "lever-arm",
+        "weighted-boresight",
+        "time-offset",
+        "control",
+        "one-shift",
+        "inner",
+        "surfaces",
+        "scanner",
+    ],
 )
 def test_what_can_be_seen_or_is_weighted_is_let_through(make, monkeypatch):
     def stop(*_):

@@ -1,7 +1,5 @@
 """The [trajectory] table of block.toml: stations, attitudes and motion interpolated at the times of images.csv."""
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,8 +14,9 @@ from jaxphoto.io.block_folder.images import Images
 from jaxphoto.io.block_folder.motion import Flight
 from jaxphoto.io.block_folder.settings import Settings
 from jaxphoto.io.trajectory import Records
+from jaxphoto.io.trajectory.in_frame import positions_in, trajectory_in
 from jaxphoto.io.trajectory.time_scales import DAY, LEAP_SECONDS, looks_like, shift_that_fits
-from jaxphoto.rotation import matrix_from_roll_pitch_yaw, quaternion_from_matrix, roll_pitch_yaw_from_matrix
+from jaxphoto.rotation import roll_pitch_yaw_from_matrix
 
 # The spline is given so many records before and after each exposure: what lies further off does not move it.
 _MARGIN = 64
@@ -78,24 +77,6 @@ def _taken(records: Records, chosen: np.ndarray) -> Records:
     return records._replace(**{n: v[chosen] for n, v in records._asdict().items() if isinstance(v, np.ndarray)})
 
 
-def _positions(records: Records, frame: Frame, settings: Settings) -> np.ndarray:
-    """X, Y, Z (m) of the records in the frame of the block."""
-    position = records.coordinates
-    if frame.kind == "epsg":
-        position = frame.map.local_from_place(position) if records.geographic else frame.map.local(position)
-    elif records.geographic:
-        raise InputError(
-            f"{records.file}: the trajectory gives longitude and latitude, which a frame of kind "
-            f'"{frame.kind}" cannot place; write kind = "epsg" under [frame] in {settings.file}, or convert the file'
-        )
-    for k in np.flatnonzero(~np.isfinite(position).all(axis=1))[:1]:
-        raise InputError(
-            f"{records.file}: the coordinates at {records.time[k]:.3f} s lie where EPSG:{frame.code} does not reach; "
-            "correct them or the code"
-        )
-    return position
-
-
 def _in_frame(records: Records, frame: Frame, settings: Settings) -> Trajectory:
     sigmas = []
     for given, key, column in ((records.sigma_m, "station_m", "X_m"), (records.sigma_deg, "attitude_deg", "roll_deg")):
@@ -105,16 +86,7 @@ def _in_frame(records: Records, frame: Frame, settings: Settings) -> Trajectory:
                 f"columns sigma_{column} and so on"
             )
         sigmas.append(np.where(np.isnan(given), settings.sigmas.get(key, 0.0), given))
-    position = _positions(records, frame, settings)
-    turn = np.broadcast_to(np.eye(3), (len(position), 3, 3))
-    if frame.kind == "epsg":
-        true_north = records.geographic or frame.yaw == "true"
-        turn = frame.map.local_from_level(position) if true_north else frame.map.local_from_grid(position)
-    quaternion = _quaternions(turn, np.deg2rad(records.roll_pitch_yaw_deg))
-    return Trajectory(
-        jnp.asarray(records.time), jnp.asarray(position), quaternion, jnp.asarray(sigmas[0]),
-        jnp.asarray(np.deg2rad(sigmas[1])),
-    )  # fmt: skip
+    return trajectory_in(records, frame, sigmas[0], np.deg2rad(sigmas[1]))
 
 
 def _check_covered(
@@ -176,7 +148,7 @@ def _check_leap_seconds(
     def distance(shift: float) -> float:
         """Median distance to the trajectory at shifted times, whose ends stand for what is beyond them."""
         last = np.clip(np.searchsorted(records.time, times[known] + shift), 1, len(records.time) - 1)
-        before, after = (_positions(_taken(records, k), frame, settings) for k in (last - 1, last))
+        before, after = (positions_in(_taken(records, k), frame) for k in (last - 1, last))
         span = records.time[last] - records.time[last - 1]
         part = np.clip((times[known] + shift - records.time[last - 1]) / span, 0.0, 1.0)[:, None]
         return float(np.median(np.linalg.norm((1 - part) * before + part * after - expected, axis=1)))
@@ -193,12 +165,6 @@ def _check_leap_seconds(
             f"{far[best]:.0f} m at {best:+d} s, so one clock is UTC and the other GPS; write "
             f"shift_s = {best + _shift(settings):.15g} under [trajectory]"
         )
-
-
-@partial(jax.jit, compiler_options=QUICK_TO_COMPILE)
-@jax.vmap
-def _quaternions(turn, angles):
-    return quaternion_from_matrix(turn @ matrix_from_roll_pitch_yaw(angles))
 
 
 _angles = jax.jit(jax.vmap(roll_pitch_yaw_from_matrix), compiler_options=QUICK_TO_COMPILE)

@@ -13,6 +13,9 @@ ANGLES = ("omega_deg", "phi_deg", "kappa_deg")
 ATTITUDE = ("roll_deg", "pitch_deg", "yaw_deg")
 SIGMA_ATTITUDE = ("sigma_roll_deg", "sigma_pitch_deg", "sigma_yaw_deg")
 VELOCITY = ("vX_m_per_s", "vY_m_per_s", "vZ_m_per_s")
+FOOT = ("foot_X_m", "foot_Y_m", "foot_Z_m")
+NORMAL = ("normal_X", "normal_Y", "normal_Z")
+TURN = ("turn_right_m", "turn_forward_m", "turn_up_m")
 RATE = ("rate_right_deg_per_s", "rate_forward_deg_per_s", "rate_up_deg_per_s")
 
 
@@ -35,6 +38,7 @@ LAYOUTS = {
     "stations": Layout(False, ("image", *XYZ), (*SIGMA_XYZ, *VELOCITY)),
     "attitudes": Layout(False, ("image", *ATTITUDE), (*SIGMA_ATTITUDE, *RATE)),
     "object_points": Layout(False, ("point", *XYZ)),
+    "surfaces": Layout(False, ("point", *FOOT, *NORMAL, *TURN, "sigma_m"), ("strip",)),
     "distances": Layout(False, ("point_a", "point_b", "distance_m"), ("sigma_m",)),
 }
 

@@ -28,6 +28,7 @@ from jaxphoto.io.block_folder.motion import Flight, check_time_offsets, read_mot
 from jaxphoto.io.block_folder.mount_sections import read_mounts, read_strips
 from jaxphoto.io.block_folder.section import Section
 from jaxphoto.io.block_folder.settings import Settings, read_settings, read_toml
+from jaxphoto.io.block_folder.surfaces import read_surfaces
 from jaxphoto.io.tables import Table, read_csv
 from jaxphoto.io.trajectory import Records, read_records
 from jaxphoto.unknowns import Unknowns, default_priors
@@ -91,7 +92,10 @@ def assemble(source: BlockTables) -> Block:
     images = read_images(tables["images"], settings)
     points = read_image_points(tables["image_points"], images, settings)
     control = read_control(tables["control_points"], tables["object_points"], points, settings)
-    check_rays(points, images, control.held)
+    surfaces = read_surfaces(tables["surfaces"], settings.scanner, points)
+    held = control.held.copy()
+    held[surfaces.rows.point] = True
+    check_rays(points, images, held)
     check_datum_points(settings.datum.over, points, source.file)
 
     cameras = {name: camera for name, camera in settings.cameras.items() if name in images.cameras}
@@ -115,12 +119,14 @@ def assemble(source: BlockTables) -> Block:
         on_device(control.start),
         _only(mounts, used),
         strips,
+        surfaces.scanner,
     )
     priors = dataclasses.replace(
         default_priors(start),
         interior={name: camera.priors for name, camera in cameras.items()},
         mounts=_only(mount_priors, used),
         strips=strip_priors,
+        scanner=surfaces.priors,
     )
     block = Block(
         title=settings.title,
@@ -144,6 +150,7 @@ def assemble(source: BlockTables) -> Block:
         motion=flight.motion,
         frame=frame,
         corrections=corrections,
+        surfaces=surfaces.rows,
     )
     posed = MODES[settings.mode](block)
     if settings.mode == "direct":

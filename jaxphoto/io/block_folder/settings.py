@@ -1,4 +1,4 @@
-"""block.toml: title, frame, corrections, trajectory, cameras, default sigmas, mounts, strips and datum."""
+"""block.toml: title, frame, corrections, trajectory, cameras, default sigmas, mounts, strips, scanner and datum."""
 
 import tomllib
 from pathlib import Path
@@ -23,6 +23,7 @@ _KEYS = (
     "cameras",
     "mounts",
     "strips",
+    "scanner",
     "datum",
     "georeferencing",
 )
@@ -44,6 +45,7 @@ class Settings(NamedTuple):
     cameras: dict[str, Camera]
     mounts: Section
     strips: Section
+    scanner: Section
     datum: Datum
     mode: str
     """Of georeferencing: a name of `variants.MODES`."""
@@ -80,6 +82,7 @@ def read_settings(values: dict[str, Any], file: str = TOML) -> Settings:
         {name: read_camera(cameras.section(name)) for name in cameras},
         top.section("mounts"),
         top.section("strips"),
+        top.section("scanner"),
         _read_datum(top.section("datum")),
         _read_mode(top.section("georeferencing")),
     )

@@ -29,6 +29,7 @@ from jaxphoto.io.block_folder.layout import (
 from jaxphoto.io.block_folder.map_tables import tables_to_map
 from jaxphoto.io.block_folder.mount_sections import mount_section, strip_section
 from jaxphoto.io.block_folder.settings import datum_section, toml_text
+from jaxphoto.io.block_folder.surfaces import scanner_section, surface_table
 from jaxphoto.unknowns import FIXED, FREE
 
 
@@ -102,6 +103,7 @@ def _settings(block: Block) -> dict[str, Any]:
         "cameras": cameras,
         "mounts": {name: mount_section(mount, priors.mounts[name]) for name, mount in start.mounts.items()},
         "strips": {name: strip_section(bias, priors.strips[name]) for name, bias in start.strips.items()},
+        "scanner": scanner_section(start.scanner, priors.scanner),
         "datum": datum_section(block.datum),
         "georeferencing": _mode_section(block),
     }
@@ -148,6 +150,7 @@ def _tables(block: Block) -> dict[str, pd.DataFrame]:
         "stations": _with_motion(_xyz_rows("image", images, block.stations), block, VELOCITY),
         "attitudes": _with_motion(attitudes, block, RATE),
         "object_points": pd.DataFrame({"point": points[block.start.point_known]} | _columns(XYZ, position)),
+        "surfaces": surface_table(block),
         "distances": pd.DataFrame(
             {"point_a": points[ends[:, 0]], "point_b": points[ends[:, 1]]}
             | {"distance_m": np.asarray(distances.value), "sigma_m": np.asarray(distances.sigma)}

@@ -1,0 +1,52 @@
+"""A laser scanner beside the GNSS/IMU: its boresight, and the shifts of its strips.
+
+Functions of one laser point; frames and signs are those of a camera's mount (docs/conventions.md).
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxphoto.rotation import rotate, small_rotation
+
+
+class Scanner(eqx.Module):
+    """What is wrong with a cloud that was georeferenced without it.
+
+    `boresight` is the misalignment, a small rotation about the body's right, forward and up axes (rad); `shifts` holds,
+    for each lidar strip by name, what its points are off the object frame by (m).
+    """
+
+    boresight: Float[Array, "3"]
+    shifts: dict[str, Float[Array, "3"]]
+
+
+def corrected_point(
+    point: Float[Array, "3"],
+    position: Float[Array, "3"],
+    object_from_body: Float[Array, "3 3"],
+    boresight: Float[Array, "3"],
+    shift: Float[Array, "3"],
+) -> Float[Array, "3"]:
+    """A laser point (m) as it is: `position + R small_rotation(boresight) R' (point - position) - shift`.
+
+    `position` and `object_from_body` (R) are those of the scanner when it measured the point, as the trajectory gave
+    them.
+    """
+    in_body = rotate(object_from_body.T, point - position)
+    return position + rotate(object_from_body, rotate(small_rotation(boresight), in_body)) - shift
+
+
+def raised_by_boresight(
+    point: Float[Array, "3"],
+    normal: Float[Array, "3"],
+    position: Float[Array, "3"],
+    object_from_body: Float[Array, "3 3"],
+) -> Float[Array, "3"]:
+    """By how much each component of a boresight not accounted for has raised a laser point along `normal` (m per rad).
+
+    To first order; `position` and `object_from_body` are as in `corrected_point`.
+    """
+    none = jnp.zeros(3)
+    return -jax.grad(lambda b: normal @ corrected_point(point, position, object_from_body, b, none))(none)

@@ -1,0 +1,56 @@
+"""A trajectory's records brought to the object frame of a block."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxphoto.block import Frame
+from jaxphoto.compiling import QUICK_TO_COMPILE
+from jaxphoto.errors import InputError
+from jaxphoto.georeferencing import Trajectory
+from jaxphoto.io.trajectory.records import Records
+from jaxphoto.rotation import matrix_from_roll_pitch_yaw, quaternion_from_matrix
+
+
+def positions_in(records: Records, frame: Frame) -> Float[np.ndarray, "records 3"]:
+    """X, Y, Z (m) of the records in the frame of the block. Raises InputError where they do not go with it."""
+    position = records.coordinates
+    if frame.kind == "epsg":
+        position = frame.map.local_from_place(position) if records.geographic else frame.map.local(position)
+    elif records.geographic:
+        raise InputError(
+            f"{records.file}: the trajectory gives longitude and latitude, which a frame of kind "
+            f'"{frame.kind}" cannot place; write kind = "epsg" under [frame] in block.toml, or convert the file'
+        )
+    for k in np.flatnonzero(~np.isfinite(position).all(axis=1))[:1]:
+        raise InputError(
+            f"{records.file}: the coordinates at {records.time[k]:.3f} s lie where EPSG:{frame.code} does not reach; "
+            "correct them or the code"
+        )
+    return position
+
+
+def trajectory_in(
+    records: Records,
+    frame: Frame,
+    sigma_m: Float[np.ndarray, "records 3"],
+    sigma_rad: Float[np.ndarray, "records 3"],
+) -> Trajectory:
+    """The trajectory in the frame of the block, with the standard deviations given. Raises as `positions_in`."""
+    position = positions_in(records, frame)
+    turn = np.broadcast_to(np.eye(3), (len(position), 3, 3))
+    if frame.kind == "epsg":
+        true_north = records.geographic or frame.yaw == "true"
+        turn = frame.map.local_from_level(position) if true_north else frame.map.local_from_grid(position)
+    quaternion = _quaternions(turn, np.deg2rad(records.roll_pitch_yaw_deg))
+    arrays = (records.time, position, quaternion, sigma_m, sigma_rad)
+    return Trajectory(*map(jnp.asarray, arrays))
+
+
+@partial(jax.jit, compiler_options=QUICK_TO_COMPILE)
+@jax.vmap
+def _quaternions(turn, angles):
+    return quaternion_from_matrix(turn @ matrix_from_roll_pitch_yaw(angles))
