@@ -22,8 +22,9 @@ from jaxphoto.adjustment.normal import At, Reduced, residuals_at, square_sum
 from jaxphoto.adjustment.reduced import reduce_normal
 from jaxphoto.adjustment.residuals import Increments, Values
 from jaxphoto.adjustment.shards import EVERYWHERE, TILES, along_points, sharded
+from jaxphoto.adjustment.shared import MOUNT_SIZE, STRIP_SIZE
 from jaxphoto.adjustment.solver import LevenbergMarquardt, System
-from jaxphoto.adjustment.structure import MOUNT_SIZE, STRIP_SIZE, Structure, interior_of
+from jaxphoto.adjustment.structure import Structure, interior_of
 from jaxphoto.adjustment.tiles import by_tile
 from jaxphoto.arrays import Numbers
 from jaxphoto.collinearity import ExteriorOrientation, image_residual

@@ -11,7 +11,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxphoto.adjustment.structure import MOUNT_SIZE, STRIP_SIZE, Structure
+from jaxphoto.adjustment.shared import MOUNT_SIZE, STRIP_SIZE
+from jaxphoto.adjustment.structure import Structure
 from jaxphoto.georeferencing import (
     Exposure,
     Mount,

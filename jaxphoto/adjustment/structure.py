@@ -13,19 +13,18 @@ compiles nothing.
 
 import dataclasses
 from collections.abc import Iterable
-from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxphoto.adjustment.shared import MOUNT_SIZE, SCANNER, scanner_vectors, shared_entries
 from jaxphoto.adjustment.tiling import check_rows
 from jaxphoto.block import Block
-from jaxphoto.camera import InteriorOrientation, parameter_names
-from jaxphoto.georeferencing import Corrections, Mount, Scanner, StripBias
-from jaxphoto.unknowns import FIXED, Prior, Unknowns, Weighted
+from jaxphoto.camera import InteriorOrientation
+from jaxphoto.georeferencing import Corrections
+from jaxphoto.unknowns import FIXED, Unknowns, Weighted
 
 
 class CameraGroup(eqx.Module):
@@ -141,20 +140,6 @@ class Structure(eqx.Module):
         return len(self.free)
 
 
-def shared_vector(unknowns: Unknowns, groups: tuple[CameraGroup, ...]) -> list:
-    """All shared parameters as a list of scalars: cameras by group, then scanner, mounts, strips."""
-    cameras = [leaf for g in groups for name in g.names for leaf in jax.tree.leaves(unknowns.interior[name])]
-    mounts = [v for m in unknowns.mounts.values() for v in (*m.lever_arm, *m.boresight, m.time_offset)]
-    strips = [v for s in unknowns.strips.values() for v in (*s.shift, *s.drift)]
-    scanner = [] if unknowns.scanner is None else [v for vector in scanner_vectors(unknowns.scanner) for v in vector]
-    return cameras + scanner + mounts + strips
-
-
-def scanner_vectors(scanner: Scanner) -> list:
-    """Boresight, then the shifts of the lidar strips."""
-    return [scanner.boresight, *scanner.shifts.values()]
-
-
 def interior_of(group: CameraGroup, table) -> InteriorOrientation:
     """The group's interior orientations from its table of parameters, one column a parameter."""
     return jax.tree.unflatten(group.treedef, table)
@@ -169,7 +154,7 @@ def structure_of(block: Block, priors: Unknowns) -> Structure:
     groups = _groups(block, camera_names)
     if len(np.unique(np.asarray(block.control.who) * 3 + np.asarray(block.control.axis))) < len(block.control.who):
         raise ValueError("control holds a coordinate of a point twice: keep one row of each")
-    entries = _shared_entries(block, priors, groups)
+    entries = shared_entries(block, priors, groups)
     scanner_offset = sum(len(g.names) * g.treedef.num_leaves for g in groups)
     lidar = [] if priors.scanner is None else scanner_vectors(priors.scanner)
     mount_offset = scanner_offset + 3 * len(lidar)
@@ -183,9 +168,9 @@ def structure_of(block: Block, priors: Unknowns) -> Structure:
     counts = [max((ranks[o] + 1 for o in ranks if o.startswith(kind)), default=0) for kind in ("c:", "m:", "s:")]
     base = {"c": 0, "m": counts[0], "s": counts[0] + counts[1]}
     # No image meets the scanner: one colour, the last, is enough for all of it.
-    colour = np.array([sum(counts) if o == _SCANNER else base[o[0]] + c for o, c in zip(owners, colour, strict=True)])
+    colour = np.array([sum(counts) if o == SCANNER else base[o[0]] + c for o, c in zip(owners, colour, strict=True)])
     colour = colour.astype(np.int32)
-    counts.append(int(_SCANNER in owners))
+    counts.append(int(SCANNER in owners))
     groups = tuple(_with_free(g, free) for g in groups)
     column = np.full((len(block.images), sum(counts)), len(free), np.int32)
     of_owner: dict[str, list[int]] = {}
@@ -211,7 +196,7 @@ def structure_of(block: Block, priors: Unknowns) -> Structure:
         n_points=len(block.points),
         corrections=block.corrections,
         n_interior=int((free < scanner_offset).sum()),
-        n_scanner=owners.count(_SCANNER),
+        n_scanner=owners.count(SCANNER),
         n_image_colours=counts[0],
         n_colours=sum(counts),
         n_classes=int(classes.max(initial=0)) + 1,
@@ -243,22 +228,6 @@ def _index(names: tuple[str, ...], table: Iterable[str]) -> np.ndarray:
     """Place of each name in the table; one past the end where the table lacks it."""
     place = {name: k for k, name in enumerate(table)}
     return np.array([place.get(n, len(place)) for n in names], np.int32)
-
-
-class _Entry(eqx.Module):
-    """One shared parameter: whose it is (`c:kodak`), what it is called, its prior."""
-
-    owner: str
-    label: str
-    prior: object
-
-
-# Who owns the scanner's parameters: there is one scanner.
-_SCANNER = "l:"
-
-
-def _is_prior(x: object) -> bool:
-    return isinstance(x, Weighted)
 
 
 def _groups(block: Block, image_camera: np.ndarray) -> tuple[CameraGroup, ...]:
@@ -297,63 +266,3 @@ def _point_classes(pairs: np.ndarray, n_points: int) -> np.ndarray:
         classes[p] = next(k for k in range(len(taken) + 1) if k not in taken)
         done.add(p)
     return classes
-
-
-def _shared_entries(block: Block, priors: Unknowns, groups: tuple[CameraGroup, ...]) -> list[_Entry]:
-    entries = []
-    for name in (n for g in groups for n in g.names):
-        labels = _leaf_names(block.start.unknowns.interior[name])
-        leaves = jax.tree.leaves(priors.interior[name], is_leaf=_is_prior)
-        entries += [
-            _Entry(f"c:{name}", f"interior[{name}].{label}", leaf) for label, leaf in zip(labels, leaves, strict=True)
-        ]
-    if priors.scanner is not None:
-        vectors: dict[str, tuple[str, ...]] = {"scanner.boresight_{}_rad": ("right", "forward", "up")}
-        vectors |= {f"scanner[{name}].shift_{{}}_m": tuple("XYZ") for name in priors.scanner.shifts}
-        for (label, axes), prior in zip(vectors.items(), scanner_vectors(priors.scanner), strict=True):
-            each = zip(axes, _components(prior), strict=True)
-            entries += [_checked(_Entry(_SCANNER, label.format(axis), prior)) for axis, prior in each]
-    for kind, items, names in (("mounts", priors.mounts, _MOUNT), ("strips", priors.strips, _STRIP)):
-        for name, item in items.items():
-            for label, prior in zip(names, spread(item), strict=True):
-                entries.append(_checked(_Entry(f"{kind[0]}:{name}", f"{kind}[{name}].{label}", prior)))
-    return entries
-
-
-def _checked(entry: _Entry) -> _Entry:
-    if not isinstance(entry.prior, Prior | Weighted):
-        raise ValueError(f"{entry.label}: {entry.prior!r} is no prior; use FREE, FIXED or Weighted")
-    return entry
-
-
-_MOUNT = (
-    *(f"lever_arm_{axis}_m" for axis in ("right", "forward", "up")), *(f"boresight_{axis}_rad" for axis in "xyz"),
-    "time_offset_s",
-)  # fmt: skip
-_STRIP = (*(f"shift_{axis}_m" for axis in "XYZ"), *(f"drift_{axis}_m_per_s" for axis in "XYZ"))
-MOUNT_SIZE, STRIP_SIZE = len(_MOUNT), len(_STRIP)
-
-
-def spread(item: Mount | StripBias | Scanner) -> list[object]:
-    """One prior per number of a mount's, strip's or scanner's tree of priors."""
-    if isinstance(item, Scanner):
-        return [p for vector in scanner_vectors(item) for p in _components(vector)]
-    if isinstance(item, Mount):
-        return [*_components(item.lever_arm), *_components(item.boresight), item.time_offset]
-    return [*_components(item.shift), *_components(item.drift)]
-
-
-def _components(prior: object) -> list[object]:
-    if not isinstance(prior, Weighted):
-        return [prior] * 3
-    traced = any(isinstance(x, jax.core.Tracer) for x in (prior.value, prior.sigma))
-    xp: Any = jnp if traced else np
-    value, sigma = xp.broadcast_to(prior.value, 3), xp.broadcast_to(prior.sigma, 3)
-    return [Weighted(v, s) for v, s in zip(value, sigma, strict=True)]
-
-
-def _leaf_names(interior: InteriorOrientation) -> list[str]:
-    """Parameter names in the order of the tree's leaves; a constant keeps its field's name."""
-    estimable = dict(zip(("c", "x_p", "y_p"), parameter_names(interior), strict=False))
-    paths = jax.tree_util.tree_flatten_with_path(interior)[0]
-    return [estimable.get(path[-1].name, path[-1].name) for path, _ in paths]

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxphoto.adjustment.residuals import State, Values
-from jaxphoto.adjustment.structure import MOUNT_SIZE, STRIP_SIZE, Structure, shared_vector, spread
+from jaxphoto.adjustment.shared import MOUNT_SIZE, STRIP_SIZE, shared_vector, spread
+from jaxphoto.adjustment.structure import Structure
 from jaxphoto.arrays import Numbers
 from jaxphoto.block import Block, exposures
 from jaxphoto.collinearity import ExteriorOrientation

@@ -12,9 +12,11 @@ from jaxphoto.cli import (  # noqa: F401
     boresight,
     convert,
     experiment,
+    lidar,
     monte_carlo,
     sensitivity,
     simulate,
+    surface_model,
 )
 from jaxphoto.cli.app import app
 from jaxphoto.errors import JaxphotoError

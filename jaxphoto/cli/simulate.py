@@ -1,4 +1,4 @@
-"""`jaxphoto simulate`: a recipe in, a block folder with its truth out."""
+"""`jaxphoto simulate`: a recipe in, a block folder with its truth out, and the cloud of a lidar."""
 
 from pathlib import Path
 from typing import Annotated
@@ -7,6 +7,7 @@ import typer
 
 from jaxphoto.cli.app import app
 from jaxphoto.io import read_recipe, write_simulation
+from jaxphoto.io.recipe.scan_files import CLOUD, TRAJECTORY
 from jaxphoto.simulation import simulate
 
 
@@ -19,8 +20,9 @@ def simulate_command(
     """Simulate a block with known truth."""
     simulation = simulate(read_recipe(recipe), seed)
     write_simulation(simulation, out)
-    block = simulation.block
+    block, cloud = simulation.block, simulation.cloud
+    scanned = "" if cloud is None else f", {len(cloud)} laser points in {CLOUD}, their trajectory in {TRAJECTORY}"
     typer.echo(
         f"wrote {out}: {len(block.images)} images, {len(block.points)} points, "
-        f"{len(block.image_points.image)} image points (seed {seed}); the truth is in {out / 'truth'}"
+        f"{len(block.image_points.image)} image points{scanned} (seed {seed}); the truth is in {out / 'truth'}"
     )

@@ -88,7 +88,7 @@ def _simulated(experiment: Experiment, recipes: Mapping[str, Recipe], layout: in
         key = (variant.file, repr(variant.recipe))
         if key not in made:
             made[key] = simulate(recipes[name], layout)
-        variants[name] = made[key]._replace(block=variant.change(made[key].block))
+        variants[name] = dataclasses.replace(made[key], block=variant.change(made[key].block))
     return variants
 
 

@@ -16,7 +16,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxphoto.adjustment.structure import spread
+from jaxphoto.adjustment.shared import spread
 from jaxphoto.arrays import Numbers
 from jaxphoto.block import Block, Rows, SensorRows, direct_exterior, sensor_rows
 from jaxphoto.camera import InteriorOrientation, get_parameter, parameter_names

@@ -1,5 +1,6 @@
 """Blocks and observations with known truth."""
 
+from jaxphoto.simulation.buildings import ROOFS, Building
 from jaxphoto.simulation.convergent_plan import ConvergentPlan, Field, Station
 from jaxphoto.simulation.flight_plan import FlightPlan, Footprint, Strip, Swaths, footprint
 from jaxphoto.simulation.recipe import (
@@ -15,12 +16,16 @@ from jaxphoto.simulation.recipe import (
     Targets,
 )
 from jaxphoto.simulation.remeasure import image_coordinates, remeasure
+from jaxphoto.simulation.scan_plan import ScanPlan
+from jaxphoto.simulation.settlement import Buildings, Settlement, Trees
 from jaxphoto.simulation.simulate import Simulation, simulate
 from jaxphoto.simulation.terrain import ROLLING, RandomWaves, Terrain, Wave
+from jaxphoto.simulation.trees import Tree
 from jaxphoto.simulation.visibility import Rays, photograph
 
 __all__ = [
-    "ROLES", "ROLLING", "Approximation", "Assumed", "Bias", "Choice", "ConvergentPlan", "Field", "FlightPlan",
-    "Footprint", "Jitter", "Points", "RandomWaves", "Rays", "Recipe", "Sigmas", "Simulation", "Station", "Strip",
-    "Swaths", "Targets", "Terrain", "Wave", "footprint", "image_coordinates", "photograph", "remeasure", "simulate",
+    "ROLES", "ROLLING", "ROOFS", "Approximation", "Assumed", "Bias", "Building", "Buildings", "Choice",
+    "ConvergentPlan", "Field", "FlightPlan", "Footprint", "Jitter", "Points", "RandomWaves", "Rays", "Recipe",
+    "ScanPlan", "Settlement", "Sigmas", "Simulation", "Station", "Strip", "Swaths", "Targets", "Terrain", "Tree",
+    "Trees", "Wave", "footprint", "image_coordinates", "photograph", "remeasure", "simulate",
 ]  # fmt: skip

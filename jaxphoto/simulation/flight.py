@@ -28,6 +28,9 @@ from jaxphoto.simulation.flight_plan import FlightPlan
 from jaxphoto.simulation.recipe import Recipe, triple
 from jaxphoto.simulation.streams import stream
 
+NO_BIAS = StripBias(np.zeros(3), np.zeros(3))  # type: ignore[arg-type]
+NO_MOUNT = Mount(np.zeros(3), np.zeros(3))  # type: ignore[arg-type]
+"""Of strips and cameras that have none."""
 _CHUNK = 64
 
 
@@ -45,8 +48,8 @@ class Flight(NamedTuple):
     motion: Motion
 
 
-def fly(recipe: Recipe, plan: FlightPlan, mean_height: float, seed: int) -> Flight:
-    """Fly the recipe's `plan` `mean_height` (m) above zero, with the recipe's jitter.
+def fly(recipe: Recipe, plan: FlightPlan, mean_height: float, seed: int, purpose: str = "flight") -> Flight:
+    """Fly `plan` `mean_height` (m) above zero, with the recipe's jitter, drawn for this `purpose` (`stream`).
 
     Every exposure is off its plan by normal deviations. The body's attitude is roll, pitch, yaw = heading + crab; the
     camera follows it through the true mount.
@@ -56,7 +59,7 @@ def fly(recipe: Recipe, plan: FlightPlan, mean_height: float, seed: int) -> Flig
     heading = np.deg2rad([strips[k].heading_deg for k in of])
     cameras = tuple(strips[k].camera for k in of)
     position = np.vstack([np.column_stack([s.exposures, np.full(s.images, mean_height + s.height_m)]) for s in strips])
-    jitter, rng, n = recipe.jitter, stream(seed, "flight"), len(of)
+    jitter, rng, n = recipe.jitter, stream(seed, purpose), len(of)
     position = position + rng.standard_normal((n, 3)) * triple(jitter.position_m)
     deviation = np.deg2rad([jitter.angle_deg, jitter.angle_deg, jitter.crab_deg])
     attitude = rng.standard_normal((n, 3)) * deviation + np.column_stack([0 * heading, 0 * heading, heading])

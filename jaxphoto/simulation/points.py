@@ -1,5 +1,6 @@
 """Tie points and targets: where they lie, what they are called, which role they play."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +13,7 @@ from jaxphoto.simulation.flight_plan import Swaths
 from jaxphoto.simulation.recipe import Choice, Recipe, Role, Targets
 from jaxphoto.simulation.streams import stream
 from jaxphoto.simulation.terrain import Terrain
-from jaxphoto.simulation.visibility import Rays, photograph
+from jaxphoto.simulation.visibility import Rays, photograph, unhidden
 
 # Batches of places to try before a rule that finds too few points is given up.
 _TRIES = 20
@@ -32,13 +33,18 @@ def scatter(recipe: Recipe, flight: Flight, terrain: Terrain, seed: int) -> Scen
     """Ties and targets of the recipe. Raises BlockError where images do not see them often enough."""
     rng = stream(seed, "ties")
     ids = [f"{k + 1}" for k in range(recipe.points.ties)]
-    xyz = [_uniform(recipe, flight, terrain, recipe.points.ties, rng)]
+    on_roofs = round(recipe.points.on_roofs * len(ids)) if terrain.buildings else 0
+    roofs = stream(seed, "ties on roofs")
+    xyz = [
+        _uniform(recipe, flight, terrain, len(ids) - on_roofs, rng),
+        _seen_often(recipe, flight, terrain, on_roofs, roofs, lambda n: terrain.on_roofs(roofs, n)),
+    ]
     roles: list[Role] = ["tie"] * len(ids)
     counts: dict[str, int] = {}
     for number, group in enumerate(recipe.targets):
         rng = stream(seed, f"targets {number}")
         given = _given(group, terrain, recipe.ground, rng)
-        _check_seen(recipe, flight, given)
+        _check_seen(recipe, flight, terrain, given)
         places = np.vstack([given, _uniform(recipe, flight, terrain, group.count, rng)])
         begin = counts.get(group.prefix, 0)
         counts[group.prefix] = begin + len(places)
@@ -47,22 +53,35 @@ def scatter(recipe: Recipe, flight: Flight, terrain: Terrain, seed: int) -> Scen
         roles += _roles(group, places, recipe.ground)
     points = np.vstack(xyz)
     is_target = np.arange(len(points)) >= recipe.points.ties
-    return Scene(tuple(ids), points, tuple(roles), is_target, _rays(recipe, flight, points))
+    return Scene(tuple(ids), points, tuple(roles), is_target, _rays(recipe, flight, terrain, points))
 
 
-def _rays(recipe: Recipe, flight: Flight, xyz: np.ndarray) -> Rays:
+def _rays(recipe: Recipe, flight: Flight, terrain: Terrain, xyz: np.ndarray) -> Rays:
     cameras = {name: camera.truth for name, camera in recipe.cameras.items()}
-    return photograph(cameras, recipe.sensors, flight.cameras, flight.exterior, xyz, recipe.points.margin_mm)
+    rays = photograph(cameras, recipe.sensors, flight.cameras, flight.exterior, xyz, recipe.points.margin_mm)
+    return unhidden(rays, flight.exterior, xyz, terrain.buildings)
 
 
 def _uniform(recipe: Recipe, flight: Flight, terrain: Terrain, n: int, rng: np.random.Generator) -> np.ndarray:
+    return _seen_often(recipe, flight, terrain, n, rng, lambda n: recipe.ground.draw(rng, n))
+
+
+def _seen_often(
+    recipe: Recipe,
+    flight: Flight,
+    terrain: Terrain,
+    n: int,
+    rng: np.random.Generator,
+    draw: Callable[[int], np.ndarray],
+) -> np.ndarray:
+    """The first `n` of the open places that `draw` gives, on ground or roofs, that enough images see."""
     found = np.zeros((0, 3))
     for _ in range(_TRIES):
         if len(found) >= n:
             break
-        places = terrain.place(recipe.ground.draw(rng, n), rng)
-        often = _rays(recipe, flight, places).per_point(n) >= recipe.points.min_images
-        found = np.vstack([found, places[often]])
+        places = terrain.place(draw(n), rng)
+        often = _rays(recipe, flight, terrain, places).per_point(n) >= recipe.points.min_images
+        found = np.vstack([found, places[often & terrain.open(places[:, :2])]])
     if len(found) < n:
         raise BlockError(
             f"only {len(found)} of {n} points are seen in {recipe.points.min_images} images, of {_TRIES * n} tried; "
@@ -83,8 +102,8 @@ def _given(group: Targets, terrain: Terrain, ground: Swaths | Field, rng: np.ran
     return given
 
 
-def _check_seen(recipe: Recipe, flight: Flight, xyz: np.ndarray) -> None:
-    seen = _rays(recipe, flight, xyz).per_point(len(xyz))
+def _check_seen(recipe: Recipe, flight: Flight, terrain: Terrain, xyz: np.ndarray) -> None:
+    seen = _rays(recipe, flight, terrain, xyz).per_point(len(xyz))
     for k in np.flatnonzero(seen < recipe.points.min_images):
         x, y, _ = xyz[k]
         raise BlockError(

@@ -14,12 +14,13 @@ from jaxphoto.camera import InteriorOrientation, Sensor
 from jaxphoto.georeferencing import Mount, StripBias
 from jaxphoto.simulation.convergent_plan import ConvergentPlan, Field
 from jaxphoto.simulation.flight_plan import FlightPlan, Swaths
+from jaxphoto.simulation.scan_plan import ScanPlan, Triple
+from jaxphoto.simulation.settlement import Settlement
 from jaxphoto.simulation.terrain import Terrain
 
 Role = Literal["control", "vertical", "check", "tie"]
 """What a target is: control in X, Y and Z, control in Z only, a check point, or a tie point as good as a target."""
 ROLES: tuple[Role, ...] = ("control", "vertical", "check", "tie")
-Triple = tuple[float, float, float]
 T = TypeVar("T")
 
 
@@ -67,7 +68,8 @@ class Points:
 
     Points lie in the swaths (`Swaths`: `across`, `ends`) or the `Field`, and are seen in `min_images` images at least,
     with `margin_mm` to the edge of the format. Every image that sees a point measures it, unless `mean_rays` says to
-    how many images a point, on average over all points, rays are thinned out by chance.
+    how many images a point, on average over all points, rays are thinned out by chance. Where there are buildings, the
+    part `on_roofs` of the tie points lies on them, the others on ground and roofs alike; none is near a wall or crown.
     """
 
     ties: int
@@ -76,6 +78,7 @@ class Points:
     across: float = 0.95
     ends: float = 0.0
     margin_mm: float = 0.0
+    on_roofs: float = 0.2
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,13 +113,17 @@ class Targets:
 
 @dataclasses.dataclass(frozen=True)
 class Sigmas:
-    """Standard deviations of tie points and targets in the images, control, stations, attitudes; None: not observed."""
+    """Standard deviations of tie points and targets in the images, control, stations, attitudes, laser points.
+
+    None where these are not observed.
+    """
 
     image_mm: float
     target_mm: float
     control_m: Triple | None = None
     station_m: Triple | None = None
     attitude_deg: Triple | None = None
+    lidar_m: Triple | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -134,7 +141,7 @@ class Recipe:
 
     `mounts` are by name, "default" or that of a camera; `biases` by name, "default" or that of a strip. `stated` sigmas
     are those of the block's observations, `noise` those by which these are truly off. `datum_offset_m` is added to all
-    observed stations and is in no model.
+    observed stations and is in no model. `settlement` is what stands on the terrain; `lidar` scans both, in strips.
     """
 
     title: str
@@ -152,6 +159,8 @@ class Recipe:
     terrain: Terrain = dataclasses.field(default_factory=Terrain)
     start: Approximation = Approximation()
     datum: Datum = dataclasses.field(default_factory=Datum)
+    settlement: Settlement = dataclasses.field(default_factory=Settlement)
+    lidar: ScanPlan | None = None
 
     @property
     def ground(self) -> Swaths | Field:

@@ -1,43 +1,56 @@
 """A recipe and a seed -> a block with known truth."""
 
-from typing import NamedTuple
+from collections.abc import Iterator
+from typing import Any
 
+import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Float
 
 from jaxphoto.block import Attitudes, Block, Distances, ImageRows, Rows, Start
 from jaxphoto.camera import InteriorOrientation
+from jaxphoto.cloud import Cloud
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import BlockError
-from jaxphoto.georeferencing import Mount, StripBias
+from jaxphoto.georeferencing import Mount, StripBias, Trajectory
 from jaxphoto.simulation.convergent import take_images
 from jaxphoto.simulation.convergent_plan import ConvergentPlan
-from jaxphoto.simulation.flight import Flight, fly, record, turned
+from jaxphoto.simulation.flight import NO_BIAS, NO_MOUNT, Flight, fly, record, turned
+from jaxphoto.simulation.platform_path import paths
 from jaxphoto.simulation.points import Scene, scatter
 from jaxphoto.simulation.recipe import Assumed, Bias, Recipe, Triple, triple
+from jaxphoto.simulation.scan import Scan, scan
 from jaxphoto.simulation.streams import stream
+from jaxphoto.simulation.terrain import Terrain
 from jaxphoto.simulation.visibility import thinned
 from jaxphoto.unknowns import FIXED, FREE, Unknowns
 
 # Control axes of each role, and the places that the mean height of the ground is taken from.
 _AXES = {"control": (0, 1, 2), "vertical": (2,), "check": (0, 1, 2)}
 _PLACES = 4096
-_NO_BIAS = StripBias(np.zeros(3), np.zeros(3))  # type: ignore[arg-type]
-_NO_MOUNT = Mount(np.zeros(3), np.zeros(3))  # type: ignore[arg-type]
 
 
-class Simulation(NamedTuple):
-    """A block and what is true of it.
+class Simulation(eqx.Module):
+    """A block and what is true of it; with a lidar also its cloud and trajectory. As a tuple: the first three.
 
-    `truth` has the mounts and strips of the recipe, whether the block's model knows of them or not; the shifts of its
-    strips contain `datum_offset_m`. So `remeasure(block, truth, key)` measures the same flight once more, with noise of
-    the stated sigmas.
+    `truth` has the mounts and strips of the recipe, whether the block's model knows of them or not, and the scanner;
+    the shifts of its strips contain `datum_offset_m`. So `remeasure(block, truth, key)` measures the same flight once
+    more, with noise of the stated sigmas.
     """
 
     block: Block
     truth: Unknowns
     datum_offset_m: Float[np.ndarray, "3"]
+    terrain: Terrain = eqx.field(static=True)
+    """The ground that was drawn, and what stands on it."""
+    cloud: Cloud | None = None
+    """As measured: `corrected_point` with `truth.scanner` brings it to where pulses were reflected, but for noise."""
+    trajectory: Trajectory | None = None
+    """Of the scanner, as GNSS and IMU gave it; its time is that of the cloud."""
+
+    def __iter__(self) -> Iterator[Any]:
+        return iter((self.block, self.truth, self.datum_offset_m))
 
 
 def simulate(recipe: Recipe, seed: int = 0) -> Simulation:
@@ -46,7 +59,7 @@ def simulate(recipe: Recipe, seed: int = 0) -> Simulation:
     Ground, flight, points and each kind of noise have random streams of their own: a change of a sigma changes neither
     geometry nor the other noise, and scales its own. Raises BlockError where points or images see too little.
     """
-    terrain = recipe.terrain.drawn(stream(seed, "terrain"))
+    terrain = recipe.settlement.settled(recipe.terrain.drawn(stream(seed, "terrain")), recipe.ground, seed)
     # The same places for every seed: over ground that stays, the flight stays as high.
     height = float(np.mean(terrain.height(recipe.ground.draw(stream(0, "ground"), _PLACES))))
     if isinstance(recipe.plan, ConvergentPlan):
@@ -55,12 +68,14 @@ def simulate(recipe: Recipe, seed: int = 0) -> Simulation:
         flight = fly(recipe, recipe.plan, height, seed)
     scene = _seen(recipe, flight, scatter(recipe, flight, terrain, seed), seed)
     biases = _true_biases(recipe, flight, seed)
+    cloud, trajectory, scanner = _scanned(recipe, flight, terrain, height, seed)
     truth = Unknowns(
         {name: _numbers(camera.truth) for name, camera in recipe.cameras.items()},
         flight.exterior,
         scene.xyz,
         {name: _numbers(mount.truth) for name, mount in recipe.mounts.items()},
         biases,
+        scanner,
     )
     stations, attitudes = _georeferencing(recipe, flight, truth, seed)
     control, check = _control(recipe, scene, seed)
@@ -86,7 +101,16 @@ def simulate(recipe: Recipe, seed: int = 0) -> Simulation:
         priors=priors,
         motion=flight.motion if any(map(_runs_late, recipe.mounts.values())) else None,
     )
-    return Simulation(block, truth, triple(recipe.datum_offset_m))
+    return Simulation(block, truth, triple(recipe.datum_offset_m), terrain, cloud, trajectory)
+
+
+def _scanned(
+    recipe: Recipe, flight: Flight, terrain: Terrain, height: float, seed: int
+) -> Scan | tuple[None, None, None]:
+    if recipe.lidar is None:
+        return None, None, None
+    flown = paths(recipe, recipe.lidar, flight, height, seed)
+    return scan(recipe.lidar, flown, terrain, _sigma(recipe.noise.lidar_m), seed)
 
 
 def _seen(recipe: Recipe, flight: Flight, scene: Scene, seed: int) -> Scene:
@@ -126,8 +150,8 @@ def _control(recipe: Recipe, scene: Scene, seed: int) -> tuple[Rows, Rows]:
 
 
 def _georeferencing(recipe: Recipe, flight: Flight, truth: Unknowns, seed: int) -> tuple[Rows, Attitudes]:
-    mounts = [truth.mounts.get(recipe.mount_of(camera), _NO_MOUNT) for camera in flight.cameras]
-    position, attitude = record(flight, mounts, [truth.strips.get(s, _NO_BIAS) for s in flight.strips])
+    mounts = [truth.mounts.get(recipe.mount_of(camera), NO_MOUNT) for camera in flight.cameras]
+    position, attitude = record(flight, mounts, [truth.strips.get(s, NO_BIAS) for s in flight.strips])
     n = len(flight.images)
     stations, attitudes = Rows.none(), Attitudes.none()
     if recipe.stated.station_m is not None:
@@ -148,7 +172,7 @@ def _true_biases(recipe: Recipe, flight: Flight, seed: int) -> dict[str, StripBi
         bias = _bias_of(recipe, strip)
         if bias is None and not offset.any():
             continue
-        bias = bias or Bias(_NO_BIAS)
+        bias = bias or Bias(NO_BIAS)
         shift, drift = _draw(seed, f"bias of strip {strip}", (2, 3))
         biases[strip] = StripBias(
             np.asarray(bias.truth.shift) + offset + triple(bias.shift_sigma_m) * shift,

@@ -1,9 +1,15 @@
-"""The ground: level, sloping or wavy, and rough."""
+"""The ground, level, sloping or wavy, and rough; and what stands on it."""
 
 import dataclasses
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+
+from jaxphoto.simulation.buildings import Building, roof_height, wall_distance
+from jaxphoto.simulation.trees import Tree, under_crown
+
+# Points keep so far from walls and crowns (m).
+_CLEARANCE_M = 1.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,8 +45,8 @@ class RandomWaves:
 class Terrain:
     """Z = height + slope . (X, Y) + waves, and at every point by itself a uniform roughness within +- `roughness_m`.
 
-    `slope` is in metres per metre to the east and to the north. `seed` keeps random waves when the simulation's seed
-    changes.
+    `slope` is in metres per metre to the east and to the north. `seed` keeps random waves, and buildings and trees
+    placed by chance, when the simulation's seed changes.
     """
 
     height_m: float = 0.0
@@ -49,6 +55,8 @@ class Terrain:
     roughness_m: float = 0.0
     random: RandomWaves | None = None
     seed: int | None = None
+    buildings: tuple[Building, ...] = ()
+    trees: tuple[Tree, ...] = ()
 
     def drawn(self, rng: np.random.Generator) -> "Terrain":
         """The same ground with its random waves settled."""
@@ -66,10 +74,28 @@ class Terrain:
             z = z + wave.amplitude_m * np.sin(2 * np.pi * distance / wave.length_m + np.deg2rad(wave.phase_deg))
         return z
 
+    def surface(self, xy: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
+        """Z (m) of the smooth ground, or of the roof above it, at (east, north)."""
+        return np.maximum(self.height(xy), roof_height(self.buildings, xy))
+
+    def open(self, xy: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, "n"]:
+        """Whether a place (east, north) is 1 m or more away from walls and crowns, on the ground or on a roof."""
+        near_wall = np.isfinite(wall_distance(self.buildings, xy, _CLEARANCE_M))
+        return ~near_wall & ~under_crown(self.trees, xy, _CLEARANCE_M)
+
     def place(self, xy: Float[np.ndarray, "n 2"], rng: np.random.Generator) -> Float[np.ndarray, "n 3"]:
-        """Points on the rough ground at (east, north), in m."""
+        """Points on the rough ground, or on smooth roofs, at (east, north), in m."""
         rough = rng.uniform(-1, 1, len(xy)) * self.roughness_m
-        return np.column_stack([xy, self.height(xy) + rough])
+        return np.column_stack([xy, np.maximum(self.height(xy) + rough, roof_height(self.buildings, xy))])
+
+    def on_roofs(self, rng: np.random.Generator, n: int) -> Float[np.ndarray, "n 2"]:
+        """Places (east, north) of uniform density over the roofs, 1 m or more from their edges; there is a building."""
+        half = np.maximum(np.stack([b.half for b in self.buildings]) - 1.01 * _CLEARANCE_M, 0)
+        area = half.prod(axis=1)
+        which = rng.choice(len(half), n, p=area / area.sum() if area.any() else None)
+        axes = np.stack([b.axes for b in self.buildings])[which]
+        centre = np.array([b.centre_m for b in self.buildings])[which]
+        return centre + np.einsum("ni,nij->nj", rng.uniform(-1, 1, (n, 2)) * half[which], axes)
 
 
 ROLLING = Terrain(

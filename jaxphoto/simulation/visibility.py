@@ -1,4 +1,4 @@
-"""Which image sees which point, and where: no noise, no occlusion."""
+"""Which image sees which point, and where: no noise; buildings hide points, trees and the ground hide none."""
 
 import functools
 from collections.abc import Mapping, Sequence
@@ -10,11 +10,15 @@ from jaxtyping import Float, Int
 
 from jaxphoto.camera import InteriorOrientation, Sensor
 from jaxphoto.collinearity import ExteriorOrientation
+from jaxphoto.simulation.buildings import Building, entered, solids
 from jaxphoto.simulation.chunks import in_chunks
+from jaxphoto.simulation.nearby import pairs_along
 
 _CHUNK = 1024
 # Places on the format, along each side, from which is seen how far ideal coordinates reach; 31 x 31 fill a chunk.
 _PLACES = 31
+# A point on a roof is not hidden by it: what is entered less than this (m) before a point is what the point is on.
+_ON_IT_M = 1e-3
 
 
 class Rays(NamedTuple):
@@ -86,6 +90,23 @@ def _ideal(interior: InteriorOrientation, measured):
 def _measured(interior: InteriorOrientation, ideal):
     each = jax.vmap(lambda xy: (interior.measured_from_ideal(xy), interior.valid(xy)))
     return each(ideal)
+
+
+def unhidden(
+    rays: Rays, exterior: ExteriorOrientation, points: Float[np.ndarray, "points 3"], buildings: tuple[Building, ...]
+) -> Rays:
+    """The rays that no building stands in the way of."""
+    if not buildings or not len(rays.point):
+        return rays
+    origin, end = np.asarray(exterior.position)[rays.image], points[rays.point]
+    length = np.linalg.norm(end - origin, axis=1)
+    direction = (end - origin) / length[:, None]
+    planes = solids(buildings)
+    which, ray = pairs_along(end, direction, planes.centre, planes.radius, planes.top)
+    met = np.minimum(*entered(planes, which, origin[ray], direction[ray])) < length[ray] - _ON_IT_M
+    hidden = np.zeros(len(length), bool)
+    hidden[ray[met]] = True
+    return rays.take(~hidden)
 
 
 def thinned(rays: Rays, n_points: int, min_images: int, mean_rays: float, rng: np.random.Generator) -> Rays:

@@ -203,10 +203,18 @@ def test_counts():
         "stations": 30,
         "attitudes": 18,
         "control_points": 18,
+        "surfaces": 0,
         "distances": 3,
         "priors": 2 + 3 + 3 + 3,
     }
-    assert a.n_unknowns == {"interior": 4 + 2 + 5, "mounts": 6, "strips": 9, "exterior": 60, "points": 3 * 41 - 2}
+    assert a.n_unknowns == {
+        "interior": 4 + 2 + 5,
+        "scanner": 0,
+        "mounts": 6,
+        "strips": 9,
+        "exterior": 60,
+        "points": 3 * 41 - 2,
+    }
     assert a.redundancy == sum(a.n_observations.values()) - sum(a.n_unknowns.values())
     assert a.n_constraints == 0
 

@@ -31,9 +31,10 @@ _KINDS = {
     "flat": ("height_m", "roughness_m"),
     "plane": ("height_m", "roughness_m", "slope_east_percent", "slope_north_percent"),
     "waves": ("height_m", "roughness_m", "waves"),
-    "random": ("height_m", "roughness_m", "count", "rms_m", "length_m", "seed"),
+    "random": ("height_m", "roughness_m", "count", "rms_m", "length_m"),
     "rolling": (),
 }
+_ON_EVERY = ("buildings", "trees", "seed")
 
 
 def read_terrain(section: Section) -> Terrain:
@@ -41,29 +42,35 @@ def read_terrain(section: Section) -> Terrain:
     kind = section.text("kind", "flat")
     if kind not in _KINDS:
         raise section.error("kind", f"no terrain is called {kind!r}; use {', '.join(_KINDS)}")
-    section.known("kind", *_KINDS[kind])
+    section.known("kind", *_KINDS[kind], *_ON_EVERY)
+    seed = whole(section, "seed", 0) if "seed" in section else None
     if kind == "rolling":
-        return ROLLING
-    ground = Terrain(height_m=section.number("height_m", 0.0), roughness_m=not_negative(section, "roughness_m", 0.0))
+        return dataclasses.replace(ROLLING, seed=seed)
+    height, roughness = section.number("height_m", 0.0), not_negative(section, "roughness_m", 0.0)
+    ground = Terrain(height_m=height, roughness_m=roughness, seed=seed)
     if kind == "plane":
         slope = [section.number(f"slope_{side}_percent", 0.0) / 100 for side in ("east", "north")]
         return dataclasses.replace(ground, slope=(slope[0], slope[1]))
     if kind == "random":
         waves = RandomWaves(section.count("count"), section.positive("rms_m"), section.positive("length_m"))
-        seed = whole(section, "seed", 0) if "seed" in section else None
-        return dataclasses.replace(ground, random=waves, seed=seed)
+        return dataclasses.replace(ground, random=waves)
     return dataclasses.replace(ground, waves=tuple(map(_wave, tables(section, "waves"))))
 
 
 def read_points(section: Section, *, in_swaths: bool) -> Points:
     """Tie points and what of them is measured; only those `in_swaths` have keys that say how far swaths reach."""
-    section.known("ties", "min_images", "mean_rays", "margin_mm", *(("across", "ends") if in_swaths else ()))
+    section.known(
+        "ties", "min_images", "mean_rays", "margin_mm", "on_roofs", *(("across", "ends") if in_swaths else ())
+    )
     minimum = section.count("min_images") if "min_images" in section else Points.min_images
     if minimum < 2:
         raise section.error("min_images", "a point in one image has no position; give 2 or more")
     rays = section.positive("mean_rays") if "mean_rays" in section else None
     if rays is not None and rays < minimum:
         raise section.error("mean_rays", f"{rays:g} is less than min_images = {minimum}; raise it or lower min_images")
+    on_roofs = not_negative(section, "on_roofs", Points.on_roofs)
+    if on_roofs > 1:
+        raise section.error("on_roofs", f"{on_roofs:g} is no part of the tie points; give a number from 0 to 1")
     return Points(
         ties=whole(section, "ties", 0),
         min_images=minimum,
@@ -71,6 +78,7 @@ def read_points(section: Section, *, in_swaths: bool) -> Points:
         across=section.positive("across") if "across" in section else Points.across,
         ends=not_negative(section, "ends", Points.ends),
         margin_mm=not_negative(section, "margin_mm", Points.margin_mm),
+        on_roofs=on_roofs,
     )
 
 
@@ -98,7 +106,7 @@ def read_targets(section: Section) -> Targets:
 
 def read_sigmas(top: Section, targets: tuple[Targets, ...]) -> tuple[Sigmas, Sigmas]:
     """The stated sigmas, and the true ones, which are the same where [noise] does not say otherwise."""
-    keys = ("image_mm", "target_mm", "control_m", "station_m", "attitude_deg")
+    keys = ("image_mm", "target_mm", "control_m", "station_m", "attitude_deg", "lidar_m")
     said, true = top.section("sigmas"), top.section("noise")
     said.known(*keys)
     true.known(*keys)

@@ -21,6 +21,7 @@ from jaxphoto.io.block_folder.settings import read_settings, read_toml
 from jaxphoto.io.recipe.convergent_section import read_convergent
 from jaxphoto.io.recipe.flight_section import Mounted, read_flight
 from jaxphoto.io.recipe.keys import sigmas, tables
+from jaxphoto.io.recipe.lidar_section import read_lidar
 from jaxphoto.io.recipe.points_section import (
     check_points,
     read_jitter,
@@ -30,11 +31,12 @@ from jaxphoto.io.recipe.points_section import (
     read_targets,
     read_terrain,
 )
+from jaxphoto.io.recipe.settlement_section import read_settlement
 from jaxphoto.simulation import Assumed, Bias, ConvergentPlan, FlightPlan, Recipe
 
 _KEYS = (
     "title", "cameras", "mounts", "strips", "datum", "truth", "flight", "convergent", "jitter", "terrain", "points",
-    "targets", "sigmas", "noise", "start",
+    "targets", "sigmas", "noise", "start", "lidar",
 )  # fmt: skip
 _ZERO = (0.0, 0.0, 0.0)
 
@@ -67,6 +69,7 @@ def recipe_from(values: Mapping[str, Any], file: str = "recipe.toml") -> Recipe:
     targets = tuple(map(read_targets, tables(top, "targets")))
     check_points(top, points, targets)
     stated, noise = read_sigmas(top, targets)
+    terrain = read_terrain(top.section("terrain"))
     truth = top.section("truth")
     truth.known("datum_offset_m")
     return Recipe(
@@ -82,9 +85,11 @@ def recipe_from(values: Mapping[str, Any], file: str = "recipe.toml") -> Recipe:
         biases=_biases(top.section("strips"), settings.strips, strips),
         datum_offset_m=tuple(truth.vector("datum_offset_m").tolist()),
         jitter=read_jitter(top.section("jitter")),
-        terrain=read_terrain(top.section("terrain")),
+        terrain=terrain,
         start=read_start(top.section("start"), plan),
         datum=settings.datum,
+        settlement=read_settlement(top.section("terrain")),
+        lidar=read_lidar(top, plan, terrain, stated),
     )
 
 

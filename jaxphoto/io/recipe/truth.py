@@ -1,4 +1,4 @@
-"""A simulation -> its block folder, and beside the block's tables the truth, in the columns of the result tables."""
+"""A simulation -> its block folder; beside the block's tables the truth, in the columns of the result tables."""
 
 import shutil
 import tempfile
@@ -11,16 +11,19 @@ from jaxphoto.block import AXES
 from jaxphoto.camera import constant_names, get_parameter, parameter_names
 from jaxphoto.io.block_folder import write_block
 from jaxphoto.io.block_folder.layout import ANGLES, XYZ
+from jaxphoto.io.recipe.scan_files import CLOUD, TRAJECTORY, scanner_rows, write_scan
 from jaxphoto.simulation import Simulation
 from jaxphoto.simulation.flight import omega_phi_kappa
 
 FOLDER = "truth"
+_SCANNER = "scanner"
 
 
 def write_simulation(simulation: Simulation, folder: str | Path) -> None:
     """Write the block as `write_block` does, with the truth in its sub-folder `truth` (docs/simulation.md).
 
-    The truth is made whole before anything is replaced. Raises what `write_block` raises.
+    Of a lidar there are also `cloud.laz` and `trajectory.csv`. All this is made whole before anything is replaced;
+    cloud and trajectory of an older simulation go. Raises what `write_block` raises.
     """
     folder = Path(folder).absolute()
     folder.parent.mkdir(parents=True, exist_ok=True)
@@ -29,14 +32,25 @@ def write_simulation(simulation: Simulation, folder: str | Path) -> None:
         made.mkdir()
         for name, table in truth_tables(simulation).items():
             table.to_csv(made / f"{name}.csv", index=False)
+        if simulation.cloud is not None and simulation.trajectory is not None:
+            write_scan(simulation.cloud, simulation.trajectory, Path(place))
         write_block(simulation.block, folder)
+        scanned_before = (folder / FOLDER / f"{_SCANNER}.csv").exists()
         if (folder / FOLDER).exists():
             shutil.move(folder / FOLDER, Path(place) / "old")
         made.rename(folder / FOLDER)
+        for name in (CLOUD, TRAJECTORY):
+            if simulation.cloud is not None:
+                (Path(place) / name).replace(folder / name)
+            elif scanned_before:
+                (folder / name).unlink(missing_ok=True)
 
 
 def truth_tables(simulation: Simulation) -> dict[str, pd.DataFrame]:
-    """The truth by name of the result table that it joins: interior, exterior, object_points, georeferencing."""
+    """The truth by name of the result table that it joins: interior, exterior, object_points, georeferencing.
+
+    That of a scanner, which joins georeferencing too, is the table scanner.
+    """
     block, truth = simulation.block, simulation.truth
     interior = [
         (camera, name, float(get_parameter(one, name)))
@@ -44,12 +58,15 @@ def truth_tables(simulation: Simulation) -> dict[str, pd.DataFrame]:
         for name in (*parameter_names(one), *constant_names(type(one.distortion)))
     ]
     angles = np.degrees(omega_phi_kappa(truth.exterior))
-    return {
+    tables = {
         "interior": pd.DataFrame(interior, columns=["camera", "parameter", "value"]),
         "exterior": _table("image", block.images, (*XYZ, *ANGLES), np.hstack([truth.exterior.position, angles])),
         "object_points": _table("point", block.points, XYZ, np.asarray(truth.points)),
         "georeferencing": pd.DataFrame(_georeferencing(simulation), columns=["parameter", "value"]),
     }
+    if truth.scanner is not None:
+        tables[_SCANNER] = pd.DataFrame(scanner_rows(truth.scanner), columns=["parameter", "value"])
+    return tables
 
 
 def _table(id_column: str, ids: tuple[str, ...], names: tuple[str, ...], values: np.ndarray) -> pd.DataFrame:

@@ -50,6 +50,14 @@ def trajectory_in(
     return Trajectory(*map(jnp.asarray, arrays))
 
 
+def with_positions(records: Records, position: Float[np.ndarray, "records 3"], frame: Frame) -> Records:
+    """The same records at other positions (m), given in the frame of the block."""
+    if frame.kind != "epsg":
+        return records._replace(coordinates=position)
+    coordinates = frame.map.map(position)
+    return records._replace(coordinates=frame.map.place(coordinates) if records.geographic else coordinates)
+
+
 @partial(jax.jit, compiler_options=QUICK_TO_COMPILE)
 @jax.vmap
 def _quaternions(turn, angles):

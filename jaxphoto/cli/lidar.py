@@ -1,0 +1,247 @@
+"""`jaxphoto lidar-control` and `jaxphoto simultaneous`: from a block and a cloud, control heights, or both mended."""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from jaxtyping import Float
+from rich.console import Console
+
+from jaxphoto.block import Block
+from jaxphoto.cli.app import app
+from jaxphoto.cli.cloud_options import Classes, CloudEpsg, CloudUnit, ReturnsOption, class_numbers
+from jaxphoto.cloud import Cloud
+from jaxphoto.errors import InputError
+from jaxphoto.georeferencing import Scanner
+from jaxphoto.io import clouds, read_block, write_block
+from jaxphoto.io.tables import is_number
+from jaxphoto.io.trajectory import read_records, write_flight_csv
+from jaxphoto.io.trajectory.in_frame import trajectory_in, with_positions
+from jaxphoto.lidar import HeightSettings
+from jaxphoto.lidar.correction import correct_cloud
+from jaxphoto.orientation import approximate
+from jaxphoto.procedures.lidar import Round, lidar_control, roof_control, simultaneous
+from jaxphoto.procedures.lidar.images_and_cloud import SHIFT_SIGMA, SURFACES
+from jaxphoto.procedures.lidar.rounds import MAX_ROUNDS
+from jaxphoto.procedures.lidar.vertical_control import METHODS, flag_counts
+from jaxphoto.report import check_target
+from jaxphoto.report.lidar import (
+    heights_figure,
+    heights_table,
+    print_moved,
+    print_rounds,
+    rounds_table,
+    write_simultaneous,
+)
+from jaxphoto.unknowns import FIXED, FREE, Weighted
+
+# Beyond the outermost points, in m and as a part of the block: as far as approximate points may be off.
+_MARGIN_M, _MARGIN = 100.0, 0.1
+
+BlockFolder = Annotated[Path, typer.Argument(help="Block folder (see docs/block_folder.md).")]
+CloudFile = Annotated[Path, typer.Argument(help="Cloud: .las, .laz, .csv or .ply (see docs/clouds.md).")]
+SigmaZ = Annotated[float, typer.Option(help="Standard deviation of a laser point's height.")]
+SigmaXY = Annotated[float, typer.Option(help="Standard deviation of a laser point's X, and of its Y.")]
+Systematic = Annotated[float, typer.Option(help="Standard deviation of what all its heights are off by.")]
+Rounds = Annotated[int, typer.Option(min=1, help="Most rounds of looking at the cloud and adjusting.")]
+Method = Annotated[str, typer.Option(help=f"How heights follow from laser points: {', '.join(METHODS)}.")]
+
+
+@app.command("lidar-control")
+def lidar_control_command(
+    block: BlockFolder,
+    cloud: CloudFile,
+    out: Annotated[Path, typer.Option(help="Block folder to write; a block in it is replaced.")],
+    method: Method = "plane",
+    sigma_z_m: SigmaZ = 0.15,
+    sigma_xy_m: SigmaXY = 0.5,
+    sigma_systematic_m: Systematic = 0.0,
+    classes: Classes = None,
+    returns: ReturnsOption = "all",
+    cloud_epsg: CloudEpsg = None,
+    cloud_unit: CloudUnit = None,
+    max_rounds: Rounds = MAX_ROUNDS,
+) -> None:
+    """Give tie points the height of the laser points there as control, and write the block with it."""
+    if method not in METHODS:
+        raise InputError(f"--method {method} is no method: choose one of {', '.join(METHODS)}")
+    settings = _settings(sigma_z_m, sigma_xy_m, sigma_systematic_m)
+    chosen, errors = class_numbers(classes), Console(stderr=True)
+    with errors.status("reading the block") as status:
+        read = read_block(block)
+        status.update("reading the cloud")
+        points = _over_block(read, cloud, chosen, returns, cloud_epsg, cloud_unit)
+        report = _reporter(errors, status.update)
+        found = lidar_control(read, points, method, settings, max_rounds=max_rounds, report=report)  # type: ignore[arg-type]
+        status.update(f"writing {out}")
+        write_block(found.block, out)
+        heights_table(found).to_csv(out / "lidar_heights.csv", index=False)
+        rounds_table(found.rounds).to_csv(out / "lidar_rounds.csv", index=False)
+        heights_figure(found).savefig(out / "lidar_heights.png")
+    console = Console()
+    print_rounds(found.rounds, found.still, console)
+    refused = ", ".join(
+        f"{name.lower()} {n}" for name, n in flag_counts(found.flag[~np.isfinite(found.height)]).items()
+    )
+    console.print(
+        f"wrote {out}: {int(found.used.sum())} of {len(found.points)} tie points have a control height"
+        + (f" (refused: {refused})" if refused else ""),
+        highlight=False,
+        soft_wrap=True,
+    )
+    if not found.still:
+        raise typer.Exit(1)
+
+
+@app.command("roof-control")
+def roof_control_command(
+    block: BlockFolder,
+    cloud: CloudFile,
+    out: Annotated[Path, typer.Option(help="Block folder to write; a block in it is replaced.")],
+    centroids: Annotated[str | None, typer.Option(help="Points at the middle of roof faces, by commas.")] = None,
+    sigma_z_m: SigmaZ = 0.15,
+    sigma_xy_m: SigmaXY = 0.5,
+    classes: Classes = None,
+    returns: ReturnsOption = "all",
+    cloud_epsg: CloudEpsg = None,
+    cloud_unit: CloudUnit = None,
+    max_rounds: Rounds = MAX_ROUNDS,
+) -> None:
+    """Hold tie points on the planes of roof faces, and centroids of roofs in X, Y and Z; write the block with it."""
+    settings, chosen, errors = _settings(sigma_z_m, sigma_xy_m, 0.0), class_numbers(classes), Console(stderr=True)
+    with errors.status("reading the block") as status:
+        read = read_block(block)
+        status.update("reading the cloud")
+        points = _over_block(read, cloud, chosen, returns, cloud_epsg, cloud_unit)
+        named = [name.strip() for name in centroids.split(",")] if centroids else []
+        report = _reporter(errors, status.update)
+        found = roof_control(read, points, settings, centroids=named, max_rounds=max_rounds, report=report)
+        status.update(f"writing {out}")
+        write_block(found.block, out)
+    console = Console()
+    print_rounds(found.rounds, found.still, console)
+    console.print(
+        f"wrote {out}: {len(found.points)} tie points lie on {found.faces} roof faces", highlight=False, soft_wrap=True
+    )
+    if not found.still:
+        raise typer.Exit(1)
+
+
+@app.command("simultaneous")
+def simultaneous_command(
+    block: BlockFolder,
+    cloud: CloudFile,
+    out: Annotated[Path, typer.Option(help="Folder for the results; earlier results in it are replaced.")],
+    trajectory: Annotated[
+        Path | None, typer.Option(help="Trajectory of the scanner (docs/trajectory.md), on the cloud's clock.")
+    ] = None,
+    boresight: Annotated[str, typer.Option(help="Of the scanner: free, fixed, or its sigma in degrees.")] = "free",
+    shift: Annotated[
+        str, typer.Option(help="Of each lidar strip: free, fixed, or its sigma in m.")
+    ] = f"{SHIFT_SIGMA:g}",
+    method: Annotated[str, typer.Option(help=f"How the surface is found: {', '.join(SURFACES)}.")] = "local",
+    sigma_z_m: SigmaZ = 0.15,
+    sigma_xy_m: SigmaXY = 0.5,
+    sigma_systematic_m: Systematic = 0.0,
+    classes: Classes = None,
+    returns: ReturnsOption = "all",
+    cloud_epsg: CloudEpsg = None,
+    cloud_unit: CloudUnit = None,
+    max_rounds: Rounds = MAX_ROUNDS,
+) -> None:
+    """Adjust a block and a cloud together; write the results, the corrected cloud and trajectory.
+
+    --class and --returns choose the points of the surface; the whole cloud is corrected. Exit code 1: written, but it
+    still changed.
+    """
+    if method not in SURFACES:
+        raise InputError(f"--method {method} is no method: choose one of {', '.join(SURFACES)}")
+    settings = _settings(sigma_z_m, sigma_xy_m, sigma_systematic_m)
+    turn = _prior("--boresight", boresight if trajectory is not None else "fixed", np.pi / 180)
+    slide, chosen, errors = _prior("--shift", shift, 1.0), class_numbers(classes), Console(stderr=True)
+    check_target(out)
+    began = time.perf_counter()
+    with errors.status("reading the block") as status:
+        read = read_block(block)
+        records = read_records(trajectory) if trajectory is not None else None
+        path = None
+        if records is not None:
+            unknown = np.zeros((len(records.time), 3))
+            path = trajectory_in(records, read.frame, unknown, unknown)
+        status.update("reading the cloud")
+        said = {"epsg": cloud_epsg, "unit": cloud_unit}
+        whole = surface = clouds.read_cloud(cloud, read.frame, **said)  # type: ignore[arg-type]
+        if chosen is not None or returns != "all":
+            surface = clouds.read_cloud(cloud, read.frame, classes=chosen, returns=returns, **said)  # type: ignore[arg-type]
+        seconds = {"read": time.perf_counter() - began}
+        priors = Scanner(turn, dict.fromkeys(surface.strips or ("cloud",), slide))  # type: ignore[arg-type]
+        result = simultaneous(
+            read,
+            surface,
+            path,
+            priors,
+            method=method,  # type: ignore[arg-type]
+            settings=settings,
+            max_rounds=max_rounds,
+            report=_reporter(errors, status.update),
+        )
+        status.update(f"writing {out}")
+        corrected = result.cloud if surface is whole else correct_cloud(whole, result.scanner, path)
+        like = cloud if cloud.suffix.lower() in (".las", ".laz") else None
+        with write_simultaneous(result, out, seconds) as folder:
+            clouds.write_cloud(corrected, folder / cloud.name, like=like, frame=read.frame, **said)  # type: ignore[arg-type]
+            if records is not None and result.trajectory is not None:
+                moved = with_positions(records, np.asarray(result.trajectory.position), read.frame)
+                write_flight_csv(moved, folder / "trajectory.csv")
+    console = Console()
+    print_rounds(result.rounds, result.still, console)
+    print_moved(result, console)
+    console.print(f"results in {out}", highlight=False)
+    if not result.still:
+        raise typer.Exit(1)
+
+
+def _settings(sigma_z_m: float, sigma_xy_m: float, sigma_systematic_m: float) -> HeightSettings:
+    return HeightSettings(sigma_z_m=sigma_z_m, sigma_xy_m=sigma_xy_m, sigma_systematic_m=sigma_systematic_m)
+
+
+def _prior(option: str, text: str, unit: float):
+    """FREE, FIXED, or weighted at zero. Raises InputError for what is none of these."""
+    if text in ("free", "fixed"):
+        return FREE if text == "free" else FIXED
+    if not is_number(text) or not 0 < float(text) < np.inf:
+        raise InputError(f"{option} {text}: write free, fixed, or a standard deviation")
+    return Weighted(np.zeros(3), np.full(3, float(text) * unit))
+
+
+def _over_block(
+    block: Block, path: Path, classes: list[int] | None, returns: str, epsg: int | None, unit: str | None
+) -> Cloud:
+    """The cloud where points of the block may lie."""
+    said = {"classes": classes, "returns": returns, "epsg": epsg, "unit": unit}
+    return clouds.read_cloud(path, block.frame, within=_ground(block), **said)  # type: ignore[arg-type]
+
+
+def _ground(block: Block) -> Float[np.ndarray, "2 2"]:
+    """Least and greatest X, Y (m) that points of the block may have."""
+    xy = np.asarray(approximate(block).points)[:, :2]
+    low, high = xy.min(axis=0), xy.max(axis=0)
+    margin = _MARGIN_M + _MARGIN * (high - low)
+    return np.stack([low - margin, high + margin])
+
+
+def _reporter(errors: Console, show: Callable[[str], None]) -> Callable[[Round], None]:
+    """Each round on a line of its own, where a person looks."""
+
+    def report(made: Round) -> None:
+        line = f"round {made.number}: {made.observed} observations, RMSE {made.rmse_m:.3f} m"
+        if np.isfinite(made.largest_change):
+            line += f", largest change {made.largest_change:.2g} standard deviations"
+        if errors.is_terminal:
+            errors.print(line, highlight=False)
+        show(f"{line}; looking at the cloud")
+
+    return report

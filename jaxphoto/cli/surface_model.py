@@ -1,0 +1,108 @@
+"""`jaxphoto dsm` and `jaxphoto orthophoto`: a surface model from a cloud, and a photograph laid over it."""
+
+from pathlib import Path
+from typing import Annotated
+
+import jax
+import numpy as np
+import typer
+from rich.console import Console
+
+import jaxphoto
+from jaxphoto.block import Block
+from jaxphoto.cli.app import app
+from jaxphoto.cli.cloud_options import Classes, CloudEpsg, CloudUnit, ReturnsOption, class_numbers
+from jaxphoto.errors import BlockError, InputError
+from jaxphoto.io import clouds, raster, read_block
+from jaxphoto.lidar.orthophoto import orthophoto
+from jaxphoto.lidar.raster import filled, hillshade, surface_model
+from jaxphoto.procedures import adjust
+
+
+@app.command("dsm")
+def dsm_command(
+    cloud: Annotated[Path, typer.Argument(help="Cloud: .las, .laz, .csv or .ply (see docs/clouds.md).")],
+    out: Annotated[Path, typer.Option(help="GeoTIFF to write.")],
+    cell_m: Annotated[float, typer.Option(help="Size of a cell in m.")] = 1.0,
+    classes: Classes = None,
+    returns: ReturnsOption = "all",
+    statistic: Annotated[str, typer.Option(help="Height of a cell: highest, mean, lowest.")] = "highest",
+    fill_m: Annotated[float, typer.Option(min=0.0, help="Close holes whose cells lie within this of heights.")] = 0.0,
+    cloud_epsg: CloudEpsg = None,
+    cloud_unit: CloudUnit = None,
+    shading: Annotated[Path | None, typer.Option("--hillshade", help="PNG of the shaded surface to write.")] = None,
+) -> None:
+    """Make a surface model of a cloud."""
+    chosen = class_numbers(classes)
+    said = {"epsg": cloud_epsg, "unit": cloud_unit}
+    with Console(stderr=True).status("reading the cloud"):
+        system = clouds.cloud_system(cloud, **said)  # type: ignore[arg-type]
+        ends = clouds.extent(cloud, **said)[:, :2]  # type: ignore[arg-type]
+        # One cell more all around: headers are rounded. What stays empty is left out again.
+        ends += np.array([[-cell_m], [cell_m]])
+        parts = clouds.cloud_chunks(cloud, classes=chosen, returns=returns, **said)  # type: ignore[arg-type]
+        surface = surface_model((part.xyz for part in parts), ends, cell_m, statistic)  # type: ignore[arg-type]
+        surface = filled(surface, fill_m)
+        raster.write_dsm(out, surface, system)
+        if shading is not None:
+            raster.write_hillshade(shading, hillshade(surface))
+    rows, columns = surface.heights.shape
+    there = 100 * (1 - np.isnan(surface.heights).mean())
+    low, high = np.nanmin(surface.heights), np.nanmax(surface.heights)
+    typer.echo(
+        f"wrote {out}: {columns} x {rows} cells of {cell_m:g} m, {there:.0f} % with heights, {low:.2f} to "
+        f"{high:.2f} m, in {system.name}"
+    )
+
+
+@app.command("orthophoto")
+def orthophoto_command(
+    block: Annotated[Path, typer.Argument(help="Block folder (see docs/block_folder.md).")],
+    photo: Annotated[Path, typer.Argument(help="The photograph of the image.")],
+    dsm: Annotated[Path, typer.Argument(help="Surface model to lay it over.")],
+    image: Annotated[str, typer.Option(help="Id of the image in the block.")],
+    out: Annotated[Path, typer.Option(help="GeoTIFF to write.")],
+    dsm_epsg: Annotated[int | None, typer.Option(help="EPSG code of the surface model, where it does not say.")] = None,
+    max_steps: Annotated[int, typer.Option(min=1, help="Most iterations.")] = jaxphoto.MAX_STEPS,
+) -> None:
+    """Adjust a block, and lay the photograph of one of its images over a surface model."""
+    with Console(stderr=True).status("reading") as status:
+        read = read_block(block)
+        at = _image(read, image)
+        sensor = read.sensors[read.image_camera[at]]
+        surface, system = raster.read_dsm(dsm, dsm_epsg)
+        way = clouds.Placement(dsm.name, system, read.frame, "--dsm-epsg")
+        pixels = raster.read_photograph(photo, sensor)
+        status.update("adjusting")
+        adjusted = adjust(read, max_steps=max_steps)
+        if not bool(adjusted.converged):
+            raise BlockError(f"{adjusted.outcome.value}: without an adjusted orientation there is no orthophoto")
+        status.update("resampling")
+        exterior = jax.tree.map(lambda v: np.asarray(v)[at], adjusted.unknowns.exterior)
+        picture = orthophoto(
+            surface,
+            pixels,
+            sensor,
+            adjusted.unknowns.interior[read.image_camera[at]],
+            exterior,
+            object_from_map=way.frame_from_metres,
+            map_from_object=way.metres,
+            corrections=read.corrections,
+        )
+        if not picture.seen.any():
+            (west, south), (east, north) = surface.extent
+            x, y, z = way.metres(np.asarray(exterior.position)[None])[0]
+            raise InputError(
+                f"image {image}, from ({x:.1f}, {y:.1f}, {z:.1f}) m, sees nothing of {dsm.name} (X {west:.1f} to "
+                f"{east:.1f}, Y {south:.1f} to {north:.1f} m, Z {np.nanmin(surface.heights):.1f} to "
+                f"{np.nanmax(surface.heights):.1f} m); name the surface model of this area"
+            )
+        raster.write_orthophoto(out, picture, surface, system)
+    typer.echo(f"wrote {out}: image {image} on {100 * picture.seen.mean():.0f} % of the cells of {dsm.name}")
+
+
+def _image(block: Block, name: str) -> int:
+    if name not in block.images:
+        some = ", ".join(block.images[:5]) + (" ..." if len(block.images) > 5 else "")
+        raise InputError(f"--image {name}: the block has no such image; it has {some}")
+    return block.images.index(name)

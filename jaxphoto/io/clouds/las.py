@@ -1,0 +1,154 @@
+"""LAS and LAZ, by laspy with its Rust backend."""
+
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import laspy
+import lazrs
+import numpy as np
+from pyproj import CRS
+from pyproj.exceptions import CRSError
+
+from jaxphoto.cloud import Cloud
+from jaxphoto.errors import InputError
+from jaxphoto.io.clouds.source import CHUNK, Source, StripNumbers
+from jaxphoto.io.clouds.system import System, system_of
+
+# How a damaged file shows, in laspy, its backend and NumPy.
+_DAMAGE = (laspy.errors.LaspyException, lazrs.LazrsError, ValueError, OverflowError, struct.error, EOFError)
+# Bytes of the head of a record before and after the points.
+_RECORD, _RECORD_AFTER = 54, 60
+# Keys of GeoTIFF, and the metres in its codes of lengths.
+_PLANE_UNIT, _HEIGHTS, _HEIGHT_UNIT = 3076, 4096, 4099
+_LENGTHS = {9001: 1.0, 9002: 0.3048, 9003: 1200 / 3937}
+
+
+def open_las(path: Path, given: System | None) -> Source:
+    """A LAS or LAZ file as a source, in the system `given` or, without one, that of the file.
+
+    Points that are marked as withheld are left out, as the format wants.
+
+    Raises InputError where the file is damaged: cut off, with points outside the extent that its header gives, or fewer
+    of them than it promises.
+    """
+    with opened(path) as reader:
+        header = reader.header
+        count, system = header.point_count, given or _system(header, path.name)
+        there = (path.stat().st_size - header.offset_to_point_data) // header.point_format.size
+        if there < count and not header.are_points_compressed:
+            raise _cut_off(path.name, count, there)
+        extent = np.stack([header.mins, header.maxs])
+    if count == 0:
+        raise InputError(f"{path.name} holds no points; name another cloud")
+    return Source(path.name, system, count, extent, lambda: _chunks(path))
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[laspy.LasReader]:
+    """A reader of `path`; whatever shows damage within is an InputError that says so."""
+    try:
+        _check_records(path)
+        with laspy.open(path) as reader:
+            yield reader
+    except InputError:
+        raise
+    except _DAMAGE as error:
+        said = (str(error).strip() or type(error).__name__).splitlines()[0][:80]
+        raise InputError(f"{path.name} is cut off or damaged ({said}); copy it anew from its source") from None
+
+
+def _check_records(path: Path) -> None:
+    """Raise LaspyException where a header counts more records than fit in: laspy would look for all of them."""
+    with path.open("rb") as file:
+        header = file.read(375).ljust(375, b"\0")
+    minor, length, begin, n_records = header[25], *struct.unpack_from("<HII", header, 94)
+    if length + _RECORD * n_records > begin:
+        raise laspy.errors.LaspyException("its header counts more records than it has room for")
+    after, n_after = struct.unpack_from("<QI", header, 235)
+    if minor >= 4 and n_after and after + _RECORD_AFTER * n_after > path.stat().st_size:
+        raise laspy.errors.LaspyException("its header counts more records after the points than there are")
+
+
+def raw_chunks(reader: laspy.LasReader, name: str) -> Iterator[laspy.ScaleAwarePointRecord]:
+    """The points of an open file without those withheld. Raises InputError where there are fewer than promised."""
+    read = 0
+    for points in reader.chunk_iterator(CHUNK):
+        read += len(points)
+        withheld = np.asarray(points.withheld, bool)
+        yield points[~withheld] if withheld.any() else points
+    if read < reader.header.point_count:
+        raise _cut_off(name, reader.header.point_count, read)
+
+
+def _cut_off(name: str, promised: int, there: int) -> InputError:
+    return InputError(
+        f"{name} is cut off: its header promises {promised} points, but there are {there}; copy it anew from its source"
+    )
+
+
+def coordinates(points: laspy.ScaleAwarePointRecord) -> np.ndarray:
+    """X, Y, Z (n, 3) as the file counts them."""
+    counts = np.stack([points.X, points.Y, points.Z], axis=1).astype(float)
+    return counts * np.asarray(points.scales) + np.asarray(points.offsets)
+
+
+def _chunks(path: Path) -> Iterator[Cloud]:
+    strips = StripNumbers()
+    with opened(path) as reader:
+        low, high = np.asarray(reader.header.mins), np.asarray(reader.header.maxs)
+        # Headers are rounded in their own ways.
+        slack = 2 * np.asarray(reader.header.scales) + 1e-6 * (high - low)
+        has_time = "gps_time" in reader.header.point_format.dimension_names
+        for points in raw_chunks(reader, path.name):
+            xyz = coordinates(points)
+            outside = ~((xyz >= low - slack) & (xyz <= high + slack)).all(axis=1)
+            if outside.any():
+                at = ", ".join(f"{value:.2f}" for value in xyz[outside][0])
+                raise InputError(
+                    f"{path.name} is damaged: the point ({at}) lies outside the extent that the header gives; copy the "
+                    "file anew from its source, or have its header mended (lasinfo -repair)"
+                )
+            yield Cloud(
+                xyz,
+                classification=np.array(points.classification, np.uint8),
+                returns=np.stack([points.return_number, points.number_of_returns], axis=1).astype(np.uint8),
+                time=np.array(points.gps_time, float) if has_time else None,
+                strip=strips.of(np.asarray(points.point_source_id)),
+                strips=strips.names,
+            )
+
+
+def _system(header: laspy.LasHeader, name: str) -> System:
+    """What WKT or GeoTIFF keys say; keys that laspy leaves aside tell units and heights."""
+    keys = {
+        key.id: key.value_offset
+        for record in header.vlrs.get_by_id("LASF_Projection")
+        if isinstance(record, laspy.vlrs.known.GeoKeyDirectoryVlr)
+        for key in record.geo_keys
+        if key.tiff_tag_location == 0
+    }
+    try:
+        crs = header.parse_crs()
+    except CRSError:
+        raise InputError(
+            f"{name} names a system of coordinates that PROJ does not know; name it yourself (--cloud-epsg)"
+        ) from None
+    unit = _LENGTHS.get(keys.get(_PLANE_UNIT, 0))
+    system = System() if crs is None else system_of(crs, name)
+    if crs is None and unit is not None:
+        system = System(units=(unit, unit))
+    if system.heights is not None:
+        return system
+    heights, height_unit = None, system.units[1]
+    if keys.get(_HEIGHTS, 0):
+        try:
+            upper = CRS.from_epsg(keys[_HEIGHTS])
+        except CRSError:
+            upper = None
+        if upper is not None and upper.is_vertical:
+            heights, height_unit = keys[_HEIGHTS], upper.axis_info[0].unit_conversion_factor
+    own_unit = height_unit
+    height_unit = _LENGTHS.get(keys.get(_HEIGHT_UNIT, 0), height_unit)
+    return System(system.plane, heights, (system.units[0], height_unit), own_unit)

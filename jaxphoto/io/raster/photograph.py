@@ -1,0 +1,51 @@
+"""Photographs, and the orthophotos that are made of them."""
+
+from pathlib import Path
+
+import numpy as np
+import rasterio
+
+from jaxphoto.camera import Sensor
+from jaxphoto.errors import InputError
+from jaxphoto.io.clouds.source import check_file
+from jaxphoto.io.clouds.system import System
+from jaxphoto.io.raster.opened import opened_raster, quiet
+from jaxphoto.io.raster.surface import layout
+from jaxphoto.io.whole_file import whole_file
+from jaxphoto.lidar.orthophoto import Picture
+from jaxphoto.lidar.raster import Raster
+
+
+def read_photograph(path: str | Path, sensor: Sensor) -> np.ndarray:
+    """The pixels (bands, height, width) of a photograph as the sensor gave them, whatever an EXIF orientation says.
+
+    Raises InputError for a file that is no picture or damaged, and where it has not the size of the sensor.
+    """
+    path = Path(path)
+    check_file(path)
+    with opened_raster(path) as file:
+        if (file.width, file.height) != (sensor.width_px, sensor.height_px):
+            turned = (file.height, file.width) == (sensor.width_px, sensor.height_px)
+            raise InputError(
+                f"{path.name} has {file.width} x {file.height} pixels, but its camera {sensor.width_px} x "
+                f"{sensor.height_px}; name {'the photograph as it was before it was turned' if turned else 'another'}"
+            )
+        return file.read()
+
+
+def write_orthophoto(path: str | Path, picture: Picture, raster: Raster, system: System = System()) -> None:  # noqa: B008
+    """Write an orthophoto as GeoTIFF on the cells of `raster`; a mask in it says which cells the image does not see."""
+    bands = len(picture.pixels)
+    # rasterio has no predictor for floats of all kinds; 2 is that of whole numbers.
+    predictor = 2 if picture.pixels.dtype.kind in "iu" else 3
+    colours = {"photometric": "RGB"} if bands == 3 else {}
+    with (
+        whole_file(Path(path)) as work,
+        quiet(),
+        rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True),
+        rasterio.open(
+            work, "w", **layout(raster, system), dtype=picture.pixels.dtype, count=bands, predictor=predictor, **colours
+        ) as file,
+    ):
+        file.write(picture.pixels)
+        file.write_mask(picture.seen)

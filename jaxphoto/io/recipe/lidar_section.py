@@ -1,0 +1,75 @@
+"""[lidar] of a recipe -> `ScanPlan`."""
+
+import numpy as np
+
+from jaxphoto.io.block_folder.section import Section
+from jaxphoto.io.recipe.keys import sigmas, tables
+from jaxphoto.simulation import ConvergentPlan, FlightPlan, Footprint, ScanPlan, Sigmas, Strip, Terrain
+
+_ZERO = (0.0, 0.0, 0.0)
+# Beyond this a rolling aircraft might look at the horizon.
+_WIDEST_DEG = 60.0
+# From node to node of a flight of its own, about.
+_NODES_S = 5.0
+
+
+def read_lidar(top: Section, plan: FlightPlan | ConvergentPlan, terrain: Terrain, stated: Sigmas) -> ScanPlan | None:
+    """The plan of the scanner, None without [lidar]. Raises InputError for what cannot be scanned."""
+    if "lidar" not in top:
+        if stated.lidar_m is not None:
+            raise top.section("sigmas").error("lidar_m", "there is no table [lidar]; add it, or remove this key")
+        return None
+    section, truth = top.section("lidar"), top.section("lidar").section("truth")
+    section.known("density_per_m2", "scan_angle_deg", "strips", "truth")
+    if isinstance(plan, ConvergentPlan):
+        raise top.error("lidar", "a convergent set is not flown, so it has no lidar strips; remove the table")
+    if terrain.roughness_m:
+        raise top.section("terrain").error(
+            "roughness_m",
+            f"points {terrain.roughness_m:g} m above or below the ground lie on no surface that a lidar could measure; "
+            'use 0, and in place of "rolling" give its waves',
+        )
+    if stated.lidar_m is None:
+        raise top.section("sigmas").error(
+            "lidar_m", "the key is missing, but there is a lidar; add its sigmas, like [0.5, 0.5, 0.15]"
+        )
+    angle = section.positive("scan_angle_deg") if "scan_angle_deg" in section else ScanPlan.scan_angle_deg
+    if angle > _WIDEST_DEG:
+        raise section.error("scan_angle_deg", f"{angle:g} to either side is too wide; give {_WIDEST_DEG:g} or less")
+    strips = _strips(section, plan)
+    truth.known("boresight_deg", "shift_m", "shift_sigma_m")
+    shifts = truth.section("shift_m")
+    shifts.known("default", *(strip.name for strip in strips or plan.strips))
+    return ScanPlan(
+        density_per_m2=section.positive("density_per_m2"),
+        scan_angle_deg=angle,
+        strips=strips,
+        boresight_deg=tuple(truth.vector("boresight_deg").tolist()),
+        shift_m={name: tuple(shifts.vector(name).tolist()) for name in shifts},
+        shift_sigma_m=sigmas(truth, "shift_sigma_m") or _ZERO,
+    )
+
+
+def _strips(section: Section, plan: FlightPlan) -> tuple[Strip, ...]:
+    """Strips of the scanner's own flight, none where it flies with the camera."""
+    strips: list[Strip] = []
+    for table in tables(section, "strips"):
+        table.known("name", "heading_deg", "length_m", "height_m", "along_m", "across_m")
+        name, length = table.text("name"), table.positive("length_m")
+        if name in ("", "default", *(strip.name for strip in strips)):
+            raise table.error("name", f"a strip cannot be called {name!r}; give each its own name")
+        nodes = 1 + max(1, int(np.ceil(length / (_NODES_S * plan.speed_m_per_s))))
+        strips.append(
+            Strip(
+                name=name,
+                camera="",
+                heading_deg=table.number("heading_deg"),
+                images=nodes,
+                base_m=length / (nodes - 1),
+                height_m=table.positive("height_m"),
+                footprint=Footprint(0.0, 0.0),
+                along_m=table.number("along_m", 0.0),
+                across_m=table.number("across_m", 0.0),
+            )
+        )
+    return tuple(strips)

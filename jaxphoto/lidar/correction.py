@@ -1,0 +1,132 @@
+"""A cloud and its trajectory, corrected by what an adjustment has found of the scanner."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxphoto.arrays import Numbers
+from jaxphoto.cloud import Cloud
+from jaxphoto.compiling import call_compiled
+from jaxphoto.errors import BlockError
+from jaxphoto.georeferencing import Scanner, Trajectory, corrected_point, covered, interpolate
+
+# Laser points at once; smaller clouds are padded to a power of two.
+_PORTION = 1 << 20
+# An interval is a gap from this many times the usual interval: one record may be lost.
+_GAP = 2.5
+
+
+class ScannerPoses(eqx.Module):
+    """Where the scanner was when it measured laser points: one entry a point."""
+
+    position: Float[np.ndarray, "n 3"]
+    """Metres, in the object frame."""
+    object_from_body: Float[np.ndarray, "n 3 3"]
+
+
+def scanner_poses(trajectory: Trajectory, time: Float[np.ndarray, "n"]) -> ScannerPoses:
+    """Interpolated at the times of laser points, on the clock of the trajectory (s).
+
+    Raises BlockError for times that the trajectory does not cover.
+    """
+    max_gap = _GAP * float(np.median(np.diff(np.asarray(trajectory.time))))
+    parts = []
+    for first in range(0, len(time), _PORTION):
+        some = np.asarray(time[first : first + _PORTION], float)
+        padded = np.concatenate([some, np.full(_room(len(some)) - len(some), some[0])])
+        position, turn, known = (v[: len(some)] for v in call_compiled(_poses, trajectory, padded, np.array(max_gap)))
+        if not np.all(known):
+            raise _not_covered(trajectory, time, int((~np.asarray(known)).sum()))
+        parts.append((np.asarray(position), np.asarray(turn)))
+    if not parts:
+        return ScannerPoses(np.zeros((0, 3)), np.zeros((0, 3, 3)))
+    return ScannerPoses(*(np.concatenate(v) for v in zip(*parts, strict=True)))
+
+
+def corrected_xyz(
+    xyz: Float[np.ndarray, "n 3"],
+    poses: ScannerPoses | None,
+    boresight: Float[Numbers, "3"],
+    shift: Float[Numbers, "3"],
+) -> Float[np.ndarray, "n 3"]:
+    """`georeferencing.corrected_point` of many points; without poses a boresight has no effect."""
+    shift = np.asarray(shift)
+    if poses is None or not np.any(np.asarray(boresight)):
+        return xyz - shift
+    result = np.empty_like(xyz)
+    for first in range(0, len(xyz), _PORTION):
+        own = slice(first, first + _PORTION)
+        some = xyz[own], poses.position[own], poses.object_from_body[own]
+        n = len(some[0])
+        padded = (np.concatenate([v, np.broadcast_to(v[:1], (_room(n) - n, *v.shape[1:]))]) for v in some)
+        result[own] = call_compiled(_corrected, *padded, np.asarray(boresight), shift)[:n]
+    return result
+
+
+def correct_cloud(cloud: Cloud, scanner: Scanner, trajectory: Trajectory | None) -> Cloud:
+    """The cloud that the scanner would have measured without its boresight and the shifts of its strips.
+
+    A strip that the scanner does not know stays where it is, but for the boresight. Raises as `scanner_poses`.
+    """
+    xyz = np.array(cloud.xyz)
+    turned = trajectory is not None and bool(np.any(np.asarray(scanner.boresight)))
+    for own, shift in _strips(cloud, scanner):
+        poses = scanner_poses(trajectory, cloud.time[own]) if turned and cloud.time is not None else None  # type: ignore[arg-type]
+        xyz[own] = corrected_xyz(cloud.xyz[own], poses, scanner.boresight, shift)
+    return dataclasses.replace(cloud, xyz=xyz)
+
+
+def correct_trajectory(trajectory: Trajectory, cloud: Cloud, scanner: Scanner) -> Trajectory:
+    """The trajectory less the shift of the strip that was flown then; between two strips, of that nearer in time."""
+    if cloud.time is None:
+        return trajectory
+    time = np.asarray(trajectory.time)
+    away, shifts = [], []
+    for own, shift in _strips(cloud, scanner):
+        flown = cloud.time[own]
+        if len(flown):
+            away.append(np.maximum(flown.min() - time, time - flown.max()))
+            shifts.append(np.asarray(shift))
+    nearest = np.argmin(np.maximum(np.stack(away), 0.0), axis=0)
+    return dataclasses.replace(
+        trajectory, position=jnp.asarray(np.asarray(trajectory.position) - np.stack(shifts)[nearest])
+    )
+
+
+def _strips(cloud: Cloud, scanner: Scanner) -> list[tuple[np.ndarray, np.ndarray]]:
+    """The points of each strip of a cloud, and the shift of that strip."""
+    names = cloud.strips or tuple(scanner.shifts)
+    strip = cloud.strip if cloud.strip is not None else np.zeros(len(cloud), int)
+    return [
+        (np.flatnonzero(strip == k), np.asarray(scanner.shifts.get(name, np.zeros(3)))) for k, name in enumerate(names)
+    ]
+
+
+def _not_covered(trajectory: Trajectory, time: np.ndarray, n: int) -> BlockError:
+    known = np.asarray(trajectory.time)
+    return BlockError(
+        f"{n} laser points or more were measured where the trajectory has no records: the points at {time.min():.3f} "
+        f"to {time.max():.3f} s, the trajectory from {known[0]:.3f} to {known[-1]:.3f} s; give the trajectory of this "
+        "flight, with times on the cloud's clock"
+    )
+
+
+def _room(n: int) -> int:
+    return min(1 << max(n - 1, 0).bit_length(), _PORTION)
+
+
+@eqx.filter_jit
+def _poses(
+    trajectory: Trajectory, time: Float[Array, "n"], max_gap: Float[Array, ""]
+) -> tuple[Float[Array, "n 3"], Float[Array, "n 3 3"], Bool[Array, "n"]]:
+    poses = interpolate(trajectory, time, max_gap)  # type: ignore[arg-type]
+    return poses.position, poses.object_from_body, covered(trajectory, time, max_gap)  # type: ignore[arg-type]
+
+
+@eqx.filter_jit
+def _corrected(xyz, position, object_from_body, boresight, shift) -> Float[Array, "n 3"]:
+    return jax.vmap(corrected_point, (0, 0, 0, None, None))(xyz, position, object_from_body, boresight, shift)

@@ -1,0 +1,275 @@
+"""The spatial index of a cloud: its points sorted by the square cell of the ground that they lie over.
+
+Cells are numbered row by row, so those of a window that lie beside each other hold one run of points: a window of
+(2 reach + 1)^2 cells is read as 2 reach + 1 runs. A point outside the grid, and a place outside it, belong to the cell
+of the border that is nearest. That only brings them nearer to each other, so no window misses a point for it, and a
+few points far away cannot make the grid large.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+from scipy.spatial import KDTree
+
+from jaxphoto.arrays import Numbers
+from jaxphoto.cloud import Cloud
+from jaxphoto.errors import InputError
+
+# Points of a cell that is not empty, on average.
+_PER_CELL = 4
+# Points that tell the size of a cell.
+_SAMPLE = 200_000
+# Share of the points beyond each border where a few would otherwise make the grid too large.
+_OUTSIDE = 1e-3
+# Places times candidates that are looked at together.
+_AT_ONCE = 1_000_000
+# Low, medium and high vegetation, the classes of LAS.
+_VEGETATION = (3, 4, 5)
+# Beyond, a search is left to a tree.
+_REACH = 16
+
+
+class Grid(eqx.Module):
+    """Points of a cloud sorted by cells. Arrays are padded, so that clouds of about the same size share programs."""
+
+    xyz: Float[Numbers, "padded 3"]
+    """Points in the order of the cells (m); those too many repeat the last."""
+    order: Int[Numbers, "padded"]
+    """Where each of them is in the cloud; -1 of those too many."""
+    start: Int[Numbers, "offsets"]
+    """Where each cell begins; the last ones are the number of points."""
+    corner: Float[Numbers, "2"]
+    """X, Y (m) of the lower left corner."""
+    cell_m: Float[Numbers, ""]
+    """Side of a cell."""
+    shape: Int[Numbers, "2"]
+    """Rows and columns."""
+    leafy: Bool[Numbers, "padded"]
+    """Whether a point is classified as vegetation (LAS classes 3, 4, 5) or one of several returns of its pulse."""
+    most: int = eqx.field(static=True)
+    """Room for the points of any three cells beside each other."""
+
+    def __len__(self) -> int:
+        return int(self.start[-1])
+
+
+class Nearest(eqx.Module):
+    """The points nearest to places, nearest first; where a cloud has too few, the distance is infinite."""
+
+    index: Int[np.ndarray, "places k"]
+    """Into the sorted points of the grid."""
+    distance: Float[np.ndarray, "places k"]
+    """Horizontal (m)."""
+
+
+def index_cloud(cloud: Cloud | Float[np.ndarray, "n 3"], cell_m: float | None = None) -> Grid:
+    """The index of a cloud, or of bare points (m), in square cells of side `cell_m`.
+
+    By default a cell that is not empty holds some 4 points. There are never more than twice as many cells as points,
+    and a few: where the ground is too large for that, points far from all others count to the border of the grid, and
+    cells are larger.
+
+    Raises InputError for a cloud without points or with coordinates that are no numbers, and for a cell size that is
+    not positive.
+    """
+    xyz = np.asarray(cloud.xyz if isinstance(cloud, Cloud) else cloud, float)
+    if not len(xyz):
+        raise InputError("the cloud has no points, and an index needs one: check the filters it was read with")
+    if not np.isfinite(xyz).all():
+        wrong = int(np.argmin(np.isfinite(xyz).all(axis=1)))
+        raise InputError(
+            f"point {wrong} of the cloud is {xyz[wrong].tolist()}: leave out coordinates that are no numbers"
+        )
+    if cell_m is not None and not (np.isfinite(cell_m) and cell_m > 0):
+        raise InputError(f"cell_m is {cell_m}, and a cell needs a positive side in metres")
+    low, high, cell = _extent(xyz[:, :2], cell_m)
+    shape = np.maximum(np.ceil((high - low)[::-1] / cell), 1).astype(int)
+    place = np.floor((xyz[:, :2] - low) / cell)
+    place = np.clip(place, 0, shape[::-1] - 1).astype(np.int32)
+    of_cell = place[:, 1] * np.int32(shape[1]) + place[:, 0]
+    # Sorting cell and point as one number is stable, and three times as fast as a stable sort.
+    key = of_cell.astype(np.int64) << 32 | np.arange(len(xyz))
+    key.sort()
+    order = (key & 0xFFFFFFFF).astype(np.int32)
+    start = np.zeros(shape.prod() + 1, np.int32)
+    np.cumsum(np.bincount(of_cell, minlength=shape.prod()), out=start[1:])
+    order = np.concatenate([order, np.full(_room(len(xyz)) - len(xyz), -1, np.int32)])
+    known = np.where(order < 0, order[len(xyz) - 1], order)
+    return Grid(
+        xyz=xyz[known],
+        order=order,
+        start=np.concatenate([start, np.full(_room(len(start)) - len(start), len(xyz), np.int32)]),
+        corner=low,
+        cell_m=np.array(cell),
+        shape=shape,
+        leafy=_leafy(cloud)[known] if isinstance(cloud, Cloud) else np.zeros(len(known), bool),
+        most=_room(_fullest(start, shape)),
+    )
+
+
+def around(grid: Grid, xy: Float[Array, "2"], reach: int = 1) -> tuple[Int[Array, "k"], Bool[Array, "k"]]:
+    """The points of the (2 reach + 1)^2 cells around one place (m), and which of these numbers are points at all.
+
+    Numbers are those of the sorted points: `grid.xyz[index]`, and `grid.order[index]` in the cloud. There are always
+    as many of them, `(2 reach + 1) ceil((2 reach + 1) / 3) grid.most`, so that it runs compiled and in a `vmap`. All
+    points nearer than `reach` cells are among them.
+    """
+    rows, columns = grid.shape[0], grid.shape[1]
+    at = jnp.floor((xy - grid.corner) / grid.cell_m)
+    # In floating point until it is inside: a place far away has a number that no integer holds.
+    column = jnp.clip(at[0], 0, columns - 1).astype(int)
+    row = jnp.clip(at[1], 0, rows - 1).astype(int) + jnp.arange(-reach, reach + 1)
+    inside = (row >= 0) & (row < rows)
+    first = jnp.where(inside, row, 0) * columns
+    start = jnp.asarray(grid.start)
+    begin = start[first + jnp.maximum(column - reach, 0)]
+    end = start[first + jnp.minimum(column + reach, columns - 1) + 1]
+    width = -(-(2 * reach + 1) // 3) * grid.most
+    index = begin[:, None] + jnp.arange(width)
+    there = (index < end[:, None]) & inside[:, None]
+    return jnp.where(there, index, 0).ravel(), there.ravel()
+
+
+def nearest(grid: Grid, xy: Float[np.ndarray, "places 2"], k: int) -> Nearest:
+    """The `k` points nearest to places (m) in plan, exactly, nearest first.
+
+    A window is enlarged until the circle through the k-th point lies in it. Places far from all points are looked up
+    in a tree of SciPy.
+    """
+    xy = np.asarray(xy, float).reshape(-1, 2)
+    index, distance = np.zeros((len(xy), k), np.int32), np.full((len(xy), k), np.inf)
+    reach = np.full(len(xy), _first_reach(k))
+    left = np.arange(len(xy))
+    while len(left):
+        far = left[reach[left] > _REACH]
+        if len(far):
+            distance[far], index[far] = _from_tree(grid, xy[far], k)
+        left = left[reach[left] <= _REACH]
+        begin, end, safe = _window(grid, xy[left], reach[left])
+        total = (end - begin).sum(axis=1)
+        by_total = np.argsort(total, kind="stable")
+        for some in _portions(total[by_total]):
+            of = by_total[some]
+            distance[left[of]], index[left[of]] = _nearest_of(grid, xy[left[of]], begin[of], end[of], k)
+        last = distance[left, -1]
+        # Known to hold the k-th: as many cells as the circle through the k-th so far takes.
+        wanted = np.where(np.isfinite(last), np.ceil(last / float(grid.cell_m) + 1e-6), 2 * reach[left])
+        reach[left] = np.minimum(np.maximum(wanted, reach[left] + 1), _REACH + 1)
+        left = left[last > safe]
+    return Nearest(index, distance)
+
+
+def _leafy(cloud: Cloud) -> np.ndarray:
+    leafy = np.zeros(len(cloud), bool)
+    if cloud.classification is not None:
+        leafy |= np.isin(cloud.classification, _VEGETATION)
+    if cloud.returns is not None:
+        leafy |= cloud.returns[:, 1] > 1
+    return leafy
+
+
+def _extent(xy: np.ndarray, cell_m: float | None) -> tuple[np.ndarray, np.ndarray, float]:
+    """Lower left and upper right corner of the grid, and the side of its cells (m)."""
+    low, high = xy.min(axis=0), xy.max(axis=0)
+    some = xy[:: max(1, len(xy) // _SAMPLE)]
+    limit = 2 * len(xy) + 1024
+    cell = cell_m or _cell_side(some, len(xy))
+    if _cells(low, high, cell) > limit:
+        low, high = np.quantile(some, [_OUTSIDE, 1 - _OUTSIDE], axis=0)
+    while _cells(low, high, cell) > limit:
+        cell *= 1.1
+    return low, high, cell
+
+
+def _cells(low: np.ndarray, high: np.ndarray, cell: float) -> float:
+    return float(np.prod(np.maximum(np.ceil((high - low) / cell), 1)))
+
+
+def _cell_side(some: np.ndarray, n: int) -> float:
+    """The side (m) at which the cells that are not empty hold `_PER_CELL` of `n` points, found with some of them."""
+    span = np.ptp(some, axis=0)
+    area = max(float(np.prod(span)), float(span.max()) ** 2 / len(some))
+    if area == 0:
+        return 1.0
+    for _ in range(20):
+        cell = np.sqrt(_PER_CELL * area / len(some))
+        occupied = len(np.unique(np.floor((some - some.min(axis=0)) / cell) @ [1.0, 1.0 + np.ceil(span[0] / cell)]))
+        before, area = area, occupied * cell**2
+        if area > 0.9 * before:
+            break
+    return float(np.sqrt(_PER_CELL * area / n))
+
+
+def _fullest(start: np.ndarray, shape: np.ndarray) -> int:
+    """Points of the three cells beside each other that hold most."""
+    each = np.diff(start).reshape(shape)
+    sums = np.convolve(each.ravel(), [1, 1, 1]) if shape[1] > 2 else each.sum(axis=1)
+    return int(sums.max())
+
+
+def _room(n: int) -> int:
+    """At least `n`, of eight sizes between a power of two and the next."""
+    step = 1 << max(n.bit_length() - 4, 2)
+    return -(-n // step) * step
+
+
+def _first_reach(k: int) -> int:
+    """The window that most often holds `k` points safely."""
+    return max(1, int(np.ceil(np.sqrt(1.5 * k / (_PER_CELL * np.pi)))))
+
+
+def _window(grid: Grid, xy: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The runs of points of the window of each place, and how far (m) it holds all points."""
+    rows, columns = (int(v) for v in grid.shape)
+    place = np.clip((xy - grid.corner) / grid.cell_m, 0, [columns, rows])
+    cell = np.minimum(np.floor(place).astype(int), [columns - 1, rows - 1])
+    widest = int(reach.max(initial=0))
+    step = np.arange(-widest, widest + 1)
+    row = cell[:, 1:] + step
+    inside = (row >= 0) & (row < rows) & (np.abs(step) <= reach[:, None])
+    left, right = cell[:, :1] - reach[:, None], cell[:, :1] + reach[:, None]
+    base = np.where(inside, row, 0) * columns
+    begin = np.where(inside, grid.start[base + np.maximum(left, 0)], 0)
+    end = np.where(inside, grid.start[base + np.minimum(right, columns - 1) + 1], 0)
+    # Beyond the border of the grid there is nothing that was not moved into it.
+    low, high = cell - reach[:, None], cell + reach[:, None] + 1
+    sides = [np.where(low <= 0, np.inf, place - low), np.where(high >= [columns, rows], np.inf, high - place)]
+    return begin, end, np.min(np.concatenate(sides, axis=1), axis=1) * float(grid.cell_m)
+
+
+def _portions(total: np.ndarray) -> list[slice]:
+    """Places one after the other, so many that their tables of candidates are not too large; `total` is ascending."""
+    portions, first = [], 0
+    while first < len(total):
+        many = max(1, int(np.searchsorted((np.arange(first, len(total)) - first + 1) * total[first:], _AT_ONCE)))
+        portions.append(slice(first, first + many))
+        first += many
+    return portions
+
+
+def _nearest_of(grid: Grid, xy: np.ndarray, begin: np.ndarray, end: np.ndarray, k: int):
+    """Distances of the nearest among the points of runs, and these points."""
+    length = end - begin
+    total = length.sum(axis=1)
+    ends = np.cumsum(length.ravel())
+    candidates = np.repeat(begin.ravel() - (ends - length.ravel()), length.ravel()) + np.arange(ends[-1])
+    there = np.arange(max(total.max(), k)) < total[:, None]
+    squared = np.full(there.shape, np.inf)
+    off = grid.xyz[candidates, :2] - np.repeat(xy, total, axis=0)
+    squared[there] = off[:, 0] ** 2 + off[:, 1] ** 2
+    index = np.zeros(there.shape, np.int32)
+    index[there] = candidates
+    if k < there.shape[1]:
+        some = np.argpartition(squared, k - 1, axis=1)[:, :k]
+        squared, index = np.take_along_axis(squared, some, axis=1), np.take_along_axis(index, some, axis=1)
+    by_distance = np.argsort(squared, axis=1)
+    index, squared = (np.take_along_axis(v, by_distance, axis=1) for v in (index, squared))
+    return np.sqrt(squared), index
+
+
+def _from_tree(grid: Grid, xy: np.ndarray, k: int):
+    # Sorted as the points are, a simple tree is as good as a balanced one, and sooner made.
+    tree = KDTree(grid.xyz[: len(grid), :2], balanced_tree=False, compact_nodes=False)
+    distance, index = tree.query(xy, k=np.arange(1, k + 1))
+    return distance, np.where(np.isfinite(distance), index, 0)

@@ -1,0 +1,188 @@
+"""Height at XY from a cloud, with its standard deviation, refused where the cloud does not tell it.
+
+Four ways to weight the heights of points around a place, H = sum w_i Z_i:
+
+- `idw`: w ~ distance^-power over the nearest points (that point alone where one is at the place),
+- `plane`: least squares through the nearest points,
+- `tin`: linear in the triangle of the Delaunay triangulation of the whole cloud (`tin`),
+- `local`: moving least squares, a quadratic with Gaussian weights; a plane where the points do not bear a quadratic.
+
+Where the error comes from: `height_error`. What is written and drawn of it: docs/lidar_heights.md.
+"""
+
+from typing import Literal, get_args
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxphoto.arrays import Numbers
+from jaxphoto.cloud import Cloud
+from jaxphoto.compiling import call_compiled
+from jaxphoto.errors import InputError
+from jaxphoto.lidar.breaklines import lie_on_two_planes
+from jaxphoto.lidar.grid import Grid, index_cloud, nearest
+from jaxphoto.lidar.height_error import LidarNoise
+from jaxphoto.lidar.height_estimate import APART, TIMES, WIDE, Estimate, HeightNumbers, estimate_heights
+from jaxphoto.lidar.height_settings import HeightFlag, HeightSettings
+from jaxphoto.lidar.local_surface import Neighbours
+
+Method = Literal["idw", "plane", "tin", "local"]
+# Places of a call, padded to one of these: few programs.
+_PLACES = (64, 512, 4096)
+# Points among which the triangle over a place is looked for: so many times more, again and again, up to a limit.
+_MORE, _MOST = 4, 384
+# Points that tell the surface, at most, where a cloud is far denser than its horizontal errors.
+_MOST_WIDE = 4 * WIDE
+
+
+class Heights(eqx.Module):
+    """Heights of places (m), and what they rest on; NaN where a height is refused or cannot be told."""
+
+    z: Float[Numbers, "places"]
+    sigma: Float[Numbers, "places"]
+    flag: Int[Numbers, "places"]
+    """Sums of `HeightFlag`."""
+    count: Int[Numbers, "places"]
+    """Points that the height comes from."""
+    density: Float[Numbers, "places"]
+    """Points per m^2 around the place."""
+    roughness: Float[Numbers, "places"]
+    """Standard deviation (m) of the points about the local surface."""
+    gradient: Float[Numbers, "places 2"]
+    """Rise of the local surface by X and Y."""
+
+    def __len__(self) -> int:
+        return len(self.z)
+
+    @property
+    def slope(self) -> Float[Numbers, "places"]:
+        """Rise over run: 1 is 45 degrees."""
+        return np.hypot(*np.asarray(self.gradient).T)
+
+    def flagged(self, flag: HeightFlag) -> Bool[np.ndarray, "places"]:
+        """Places with any flag of `flag`."""
+        return (np.asarray(self.flag) & int(flag)) != 0
+
+
+def heights_at(
+    cloud: Cloud | Grid,
+    xy: Float[np.ndarray, "places 2"],
+    method: Method = "idw",
+    settings: HeightSettings | None = None,
+) -> Heights:
+    """Heights of the cloud at places X, Y (m), by one of four methods, with standard deviations and flags.
+
+    A `Grid` saves indexing the cloud again. Places that `settings.refuse` names are NaN; all places are told apart by
+    `Heights.flag`. The standard deviation is such that 95 % of the errors are within 1.96 sigma.
+
+    Raises InputError for an unknown method, places that are no pairs of numbers, and an empty cloud.
+    """
+    settings = HeightSettings() if settings is None else settings
+    if method not in get_args(Method):
+        raise InputError(f"the method is {method!r}: choose one of {', '.join(get_args(Method))}")
+    xy = np.asarray(xy, float)
+    if xy.ndim != 2 or xy.shape[1] != 2 or not np.isfinite(xy).all():
+        raise InputError("places are rows of X_m and Y_m: give an array of two columns without NaN")
+    grid = cloud if isinstance(cloud, Grid) else index_cloud(cloud)
+    wide = max(WIDE, TIMES * settings.points, _points_of_noise(grid, settings.sigma_xy_m))
+    if settings.radius_m is not None:
+        wide = _points_of_radius(grid, xy, settings.radius_m, wide)
+    found = _estimates(grid, xy, method, settings, wide)
+    return _judged(found, _broken(grid, xy, found, wide), settings)
+
+
+def _points_of_noise(grid: Grid, sigma_xy_m: float) -> int:
+    """How many points lie nearer to a place than horizontal errors matter, on average; a multiple of `WIDE`."""
+    covered = np.count_nonzero(np.diff(grid.start)) * float(grid.cell_m) ** 2
+    many = np.pi * (APART * sigma_xy_m) ** 2 * len(grid) / covered
+    return min(WIDE * int(np.ceil(many / WIDE)), _MOST_WIDE)
+
+
+def _points_of_radius(grid: Grid, xy: np.ndarray, radius_m: float, wide: int) -> int:
+    """How many nearest points hold `TIMES` those of the radius, at every place."""
+    while wide < len(grid):
+        within = (nearest(grid, xy, wide).distance <= radius_m).sum(axis=1).max(initial=0)
+        if TIMES * within <= wide:
+            break
+        wide *= 2
+    return wide
+
+
+def _estimates(grid: Grid, xy: np.ndarray, method: Method, settings: HeightSettings, k: int) -> Estimate:
+    """All places, and again with more points those whose triangle might be another one then."""
+    found = _with_points(grid, xy, method, settings, k)
+    refused = found.hole * HeightFlag.HOLE | ~found.surrounded * HeightFlag.EDGE
+    left = np.flatnonzero(~found.final & (refused & settings.refuse == 0))
+    while len(left) and k < min(_MOST, len(grid)):
+        k *= _MORE
+        again = _with_points(grid, xy[left], method, settings, k)
+        for old, new in zip(found, again, strict=True):
+            old[left] = new
+        left = left[~again.final]
+    if k < len(grid):
+        np.asarray(found.height)[left] = np.nan
+    return found
+
+
+def _with_points(grid: Grid, xy: np.ndarray, method: Method, settings: HeightSettings, k: int) -> Estimate:
+    """Places from their `k` nearest points, in portions of few sizes."""
+    most = max(1, _PLACES[-1] * WIDE // k)
+    noise = LidarNoise(np.array(settings.sigma_z_m), np.array(settings.sigma_xy_m))
+    numbers = HeightNumbers(
+        np.array(settings.points), np.array(settings.power), np.array(settings.radius_m or 0.0), noise
+    )
+    # None at all are one portion as well.
+    parts, sizes = [], [*(size for size in _PLACES if size < most), most]
+    for first in range(0, max(len(xy), 1), most):
+        some = xy[first : first + most]
+        room = next(size for size in sizes if len(some) <= size)
+        padded = np.concatenate([some, np.broadcast_to(grid.xyz[0, :2], (room - len(some), 2))])
+        near, base, leafy = _neighbours(grid, padded, k)
+        part = call_compiled(estimate_heights, near, leafy, numbers, method)
+        part = Estimate(*(np.array(v)[: len(some)] for v in part))
+        parts.append(part._replace(height=part.height + base[: len(some)]))
+    return Estimate(*(np.concatenate(v) for v in zip(*parts, strict=True)))
+
+
+def _neighbours(grid: Grid, xy: np.ndarray, k: int) -> tuple[Neighbours, Numbers, Numbers]:
+    """The nearest points of places, the height of the nearest of all, and which of them are vegetation."""
+    found = nearest(grid, xy, k)
+    points = grid.xyz[found.index]
+    there = np.isfinite(found.distance)
+    base = points[:, 0, 2]
+    near = Neighbours(points[:, :, :2] - xy[:, None], points[:, :, 2] - base[:, None], found.distance, there)
+    return near, base, grid.leafy[found.index] & there
+
+
+def _judged(found: Estimate, broken: np.ndarray, settings: HeightSettings) -> Heights:
+    """Flags put together, and what they refuse taken out."""
+    rough = found.misfit & found.rough & ~broken
+    of_leaves = (found.leafy > 0) & (found.leafy >= settings.leafy_share)
+    flag = found.hole * HeightFlag.HOLE | ~(found.surrounded & np.isfinite(found.height)) * HeightFlag.EDGE
+    flag = flag | (rough | of_leaves) * HeightFlag.VEGETATION | broken * HeightFlag.BREAKLINE
+    flag = flag | found.plane * HeightFlag.PLANE
+    refused = flag & settings.refuse != 0
+    return Heights(
+        z=np.where(refused, np.nan, found.height),
+        sigma=np.where(refused, np.nan, np.hypot(found.sigma, settings.sigma_systematic_m)),
+        flag=flag.astype(np.uint8),
+        count=found.used,
+        density=found.density,
+        roughness=found.roughness,
+        gradient=found.gradient,
+    )
+
+
+def _broken(grid: Grid, xy: np.ndarray, found: Estimate, k: int) -> np.ndarray:
+    """Which places lie where two surfaces meet, of those where one smooth surface does not fit."""
+    broken = np.zeros(len(xy), bool)
+    doubtful = np.flatnonzero(found.misfit)
+    for first in range(0, len(doubtful), _PLACES[1]):
+        some = doubtful[first : first + _PLACES[1]]
+        padded = np.concatenate([some, np.full(_PLACES[1] - len(some), some[0])])
+        near, _, _ = _neighbours(grid, xy[padded], k)
+        there = near.there & (np.arange(k) < found.wide[padded, None])
+        near = near._replace(xy=np.where(there[..., None], near.xy, 0.0), there=there)
+        broken[some] = call_compiled(lie_on_two_planes, near, found.one_surface[padded])[: len(some)]
+    return broken

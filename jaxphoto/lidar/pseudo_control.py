@@ -1,0 +1,316 @@
+"""Pseudo control points: features of an image that take their height from the laser points around them.
+
+For a feature at (x, y) in an image of known orientation (paper 001, equations (1)-(3); docs/pseudo_control.md):
+
+1. down the ray, cell by cell, to the first that has a laser point as high as the ray: the visible surface (`sight`);
+2. the laser points around that place, projected into the image; where they lie on two levels, as at a building, those
+   of the level that the image shows; both again at the height found, until the place stays;
+3. with d_i the distances in the image of the nearest,
+
+       Z = sum w_i Z_i,    w_i = d_i^-p / sum d_j^-p
+
+4. X and Y from the ray at that Z.
+
+Which points are the nearest is a choice and has no derivative; weights and ray have one, by every parameter of interior
+and exterior orientation.
+
+Standard deviation. Let t = d(X, Y)/dZ of the ray, q_i the horizontal offset of a laser point from the ray *at the
+point's own height*, and g the slope of the ground. Seen along the ray, the surface is
+
+    Z = Z_0 + h . q,    h = g / (1 - g . t)
+
+and a laser point is off it by (1 + h . t) e_Z - h . e_XY: over q it is a surface of slope h, measured with errors
+(1 + h . t) sigma_Z and sigma_XY. What weights make of those, and of a slope that they do not reproduce, is
+`height_error`. It is the height of the surface where the ray meets it: how the ray itself is off is not in it.
+"""
+
+from typing import Literal, NamedTuple, get_args
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxphoto.arrays import Numbers, on_device, still
+from jaxphoto.camera import InteriorOrientation
+from jaxphoto.collinearity import ExteriorOrientation, camera_coordinates, image_ray, project, project_ideal
+from jaxphoto.compiling import call_compiled
+from jaxphoto.errors import InputError
+from jaxphoto.georeferencing import Corrections, apparent_point, ground_point
+from jaxphoto.georeferencing.corrections import NO_CORRECTIONS
+from jaxphoto.lidar.grid import Grid, around
+from jaxphoto.lidar.height_error import LidarNoise, excess, height_sigma, noise_variance
+from jaxphoto.lidar.height_settings import HeightFlag, HeightSettings
+from jaxphoto.lidar.local_surface import LocalFit, Neighbours, fit_surface
+from jaxphoto.lidar.sight import Skyline, empty_about, first_met, levels, skyline, surrounded, window_reach
+
+Interpolation = Literal["weighted", "plane"]
+
+# Candidates a point: enough for a slope, and for neighbours left where half of them are hidden.
+_CANDIDATES = 3
+# The first place is half a cell off, and each round leaves slope times run of what is left.
+_ROUNDS = 5
+# Residuals beyond the lidar's noise: met once in 1000 places by chance, and so large that they are no surface's.
+_HARDLY, _ROUGH = 3.09, 3.0
+# Features computed together: what fits into a processor's cache; and where there are few.
+_AT_ONCE, _FEW = 512, 64
+
+
+class PseudoControl(eqx.Module):
+    """Where the rays of features meet a cloud, one a feature; NaN where that is refused or cannot be told."""
+
+    xyz: Float[Numbers, "n 3"]
+    """X, Y, Z (m); X and Y are only as good as the orientation (docs/pseudo_control.md)."""
+    sigma_z: Float[Numbers, "n"]
+    """Standard deviation of Z (m): 95 % of the errors are within 1.96 of it."""
+    flag: Int[Numbers, "n"]
+    """Sums of `HeightFlag`: HOLE where a ray does not meet the cloud, too."""
+    gradient: Float[Numbers, "n 2"]
+    """Rise of the surface by X and Y."""
+    roughness: Float[Numbers, "n"]
+    """Standard deviation (m) of the laser points about the plane through them."""
+
+
+class _Numbers(NamedTuple):
+    """The numbers among the settings."""
+
+    power: Float[Array, ""]
+    sigma_z: Float[Array, ""]
+    sigma_xy: Float[Array, ""]
+    systematic: Float[Array, ""]
+    leafy: Float[Array, ""]
+    refuse: Float[Array, ""]
+
+
+class _Ray(NamedTuple):
+    """The ray of a feature: X, Y = place + run (Z - origin's)."""
+
+    origin: Float[Array, "3"]
+    direction: Float[Array, "3"]
+
+    @property
+    def run(self) -> Float[Array, "2"]:
+        """d(X, Y)/dZ."""
+        return self.direction[:2] / jnp.where(self.direction[2] < 0, self.direction[2], -1.0)
+
+    def at(self, z: Float[Array, "*n"]) -> Float[Array, "*n 2"]:
+        """X and Y (m) at heights."""
+        return self.origin[:2] + self.run * (z - self.origin[2])[..., None]
+
+
+class _Candidates(eqx.Module):
+    """Laser points around a ray, nearest in the image first."""
+
+    index: Int[Array, "m"]
+    seen: Bool[Array, "m"]
+    broken: Bool[Array, ""]
+
+
+def pseudo_control_points(
+    interior: InteriorOrientation,
+    exterior: ExteriorOrientation,
+    xy: Float[Numbers, "n 2"],
+    grid: Grid,
+    settings: HeightSettings | None = None,
+    *,
+    interpolation: Interpolation = "weighted",
+    corrections: Corrections = NO_CORRECTIONS,
+) -> PseudoControl:
+    """The pseudo control points of features measured at `xy` (mm) with one camera, in the cloud of `grid`.
+
+    `exterior` is that of one image, or has a leading axis over the features. `settings.points` are the nearest that are
+    weighted by the paper's d^-`settings.power`; by `interpolation` "plane" three times as many carry a plane in the
+    image, which is better by half where the ground is a plane so far around. One compiled program serves all features.
+
+    `xyz` has derivatives by `interior`, `exterior` and `xy`, exact but where another point becomes one of the nearest;
+    what describes it (`sigma_z` and the rest) has none. Raises InputError for an unknown interpolation, a radius in
+    `settings`, and no feature. Source: paper 001, section 3.1.
+    """
+    settings = HeightSettings() if settings is None else settings
+    if interpolation not in get_args(Interpolation):
+        raise InputError(f"the interpolation is {interpolation!r}: choose one of {', '.join(get_args(Interpolation))}")
+    if settings.radius_m is not None:
+        raise InputError("pseudo control takes the laser points nearest in the image: give points, not radius_m")
+    numbers = (
+        settings.power,
+        settings.sigma_z_m,
+        settings.sigma_xy_m,
+        settings.sigma_systematic_m,
+        settings.leafy_share,
+        settings.refuse,
+    )
+    n = xy.shape[0]
+    if not n:
+        raise InputError("there is no feature to give a height to: give one image coordinate at least")
+    rows = np.arange(_room(n)) % n
+    one = exterior.position.ndim == 1
+    found = call_compiled(
+        _pseudo_control,
+        jax.tree.map(still, interior),
+        jax.tree.map(lambda v: still(v) if one else still(v)[rows], exterior),
+        still(xy)[rows],
+        grid,
+        skyline(grid),
+        _Numbers(*map(on_device, numbers)),
+        settings.points,
+        window_reach(grid, _CANDIDATES * settings.points),
+        interpolation,
+        corrections,
+    )
+    return jax.tree.map(lambda v: v[:n], found)
+
+
+@eqx.filter_jit
+def _pseudo_control(
+    interior: InteriorOrientation,
+    exterior: ExteriorOrientation,
+    xy: Float[Array, "n 2"],
+    grid: Grid,
+    sky: Skyline,
+    numbers: _Numbers,
+    points: int,
+    reach: int,
+    interpolation: Interpolation,
+    corrections: Corrections,
+) -> PseudoControl:
+    one = exterior.position.ndim == 1
+
+    def of_feature(given):
+        image, at = (exterior, given) if one else given
+        held = jax.lax.stop_gradient((interior, image, at))
+        chosen, met = _choose(*held, grid, sky, numbers, points, reach, corrections)
+        return _interpolated(interior, image, at, grid, chosen, met, numbers, points, interpolation, corrections)
+
+    given = xy if one else (exterior, xy)
+    portions = jax.tree.map(lambda v: v.reshape(-1, min(_AT_ONCE, len(v)), *v.shape[1:]), given)
+    found = jax.lax.map(jax.vmap(of_feature), portions)
+    return jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), found)
+
+
+def _choose(
+    interior: InteriorOrientation,
+    exterior: ExteriorOrientation,
+    xy: Float[Array, "2"],
+    grid: Grid,
+    sky: Skyline,
+    numbers: _Numbers,
+    points: int,
+    reach: int,
+    corrections: Corrections,
+) -> tuple[_Candidates, Bool[Array, ""]]:
+    """The candidates of a feature, and whether its ray meets the cloud."""
+    ideal = interior.ideal_from_measured(xy)
+    ray = _Ray(*image_ray(interior, exterior, xy))
+    place, met = first_met(ray.origin, ray.direction, sky, grid)
+
+    def squared_distance(point):
+        aim = apparent_point(exterior.position, point, corrections)
+        off = project_ideal(interior.c, exterior, aim) - ideal
+        return jnp.where(camera_coordinates(exterior, aim)[2] < 0, off @ off, jnp.inf)
+
+    def candidates(place):
+        index, there = around(grid, place, reach)
+        squared = jnp.where(there, jax.vmap(squared_distance)(jnp.asarray(grid.xyz)[index]), jnp.inf)
+        nearness, first = jax.lax.top_k(-squared, min(_CANDIDATES * points, len(squared)))
+        index, there = index[first], jnp.isfinite(nearness)
+        xyz = jnp.asarray(grid.xyz)[index]
+        z = xyz[:, 2]
+        level = levels(xyz[:, :2] - ray.at(z), z, there, ray.run, points, numbers.sigma_z)
+        return _Candidates(index, level.seen, level.broken), z
+
+    def again(_, state):
+        place, found = state
+        new, z = candidates(place)
+        near = new.seen & (jnp.cumsum(new.seen) <= points)
+        mean = jnp.sum(jnp.where(near, z, 0)) / jnp.maximum(near.sum(), 1)
+        # A step that the ray passes on its way may be what the image shows.
+        new = _Candidates(new.index, new.seen, new.broken | found.broken)
+        return jnp.where(near.any(), ray.at(mean), place), new
+
+    some = around(grid, place, reach)[0][: _CANDIDATES * points]
+    none = _Candidates(some, jnp.zeros(len(some), bool), jnp.array(False))
+    return jax.lax.fori_loop(0, _ROUNDS, again, (place, none))[1], met
+
+
+def _interpolated(
+    interior: InteriorOrientation,
+    exterior: ExteriorOrientation,
+    xy: Float[Array, "2"],
+    grid: Grid,
+    chosen: _Candidates,
+    met: Bool[Array, ""],
+    numbers: _Numbers,
+    points: int,
+    interpolation: Interpolation,
+    corrections: Corrections,
+) -> PseudoControl:
+    """The pseudo control point of a feature from its candidates."""
+    xyz = jnp.asarray(grid.xyz)[chosen.index]
+    ray = _Ray(*image_ray(interior, exterior, xy))
+    base = jnp.sum(jnp.where(chosen.seen, xyz[:, 2], 0)) / jnp.maximum(chosen.seen.sum(), 1)
+    q = xyz[:, :2] - ray.at(xyz[:, 2])
+    distance = jax.lax.stop_gradient(jnp.hypot(q[:, 0], q[:, 1]))
+    around_ray = Neighbours(q, xyz[:, 2] - base, distance, chosen.seen)
+    fit = fit_surface(around_ray, 1.0 * chosen.seen, quadratic=False)
+    if interpolation == "plane":
+        weight = fit.rows[0]
+    else:
+        shown = jax.vmap(lambda p: project(interior, exterior, apparent_point(exterior.position, p, corrections)))(xyz)
+        weight = _inverse_distance(jnp.sum((shown - xy) ** 2, axis=1), chosen.seen, points, numbers.power)
+    z = base + weight @ around_ray.z
+    point, ahead = ground_point(interior, exterior, xy, z, corrections)
+
+    lost = ~(met & ahead & chosen.seen.any())
+    described = _described(around_ray, weight, fit, ray, chosen.broken, numbers, points)
+    sigma, flag, gradient, roughness = jax.lax.stop_gradient(described)
+    leafy = jnp.sum(jnp.where(weight != 0, jnp.asarray(grid.leafy)[chosen.index], False)) / jnp.sum(weight != 0)
+    flag |= ((leafy > 0) & (leafy >= numbers.leafy)) * int(HeightFlag.VEGETATION)
+    flag = jnp.where(lost, int(HeightFlag.HOLE), flag)
+    told = lambda value: jnp.where(lost | (flag & numbers.refuse.astype(int) != 0), jnp.nan, value)  # noqa: E731
+    return PseudoControl(told(point), told(sigma), flag, gradient, roughness)
+
+
+def _described(
+    near: Neighbours,
+    weight: Float[Array, "m"],
+    fit: LocalFit,
+    ray: _Ray,
+    broken: Bool[Array, ""],
+    numbers: _Numbers,
+    points: int,
+) -> tuple[Float[Array, ""], Int[Array, ""], Float[Array, "2"], Float[Array, ""]]:
+    """Standard deviation, flags, gradient and roughness."""
+    slope = fit.coefficients[1:3]
+    noise = LidarNoise(jnp.abs(1 + slope @ ray.run) * numbers.sigma_z, numbers.sigma_xy)
+    expected = noise_variance(fit, noise)
+    sigma = jnp.hypot(height_sigma(near, weight, fit, noise), numbers.systematic)
+    rough = (excess(fit, expected, _HARDLY) > 1) & (fit.variance > _ROUGH**2 * expected)
+    hole = (near.there.sum() < points) | empty_about(near.distance, near.there)
+    edge = ~surrounded(near.xy, near.there) | ~fit.interpolates
+    flags = ((hole, HeightFlag.HOLE), (edge, HeightFlag.EDGE), (rough & ~broken, HeightFlag.VEGETATION))
+    flag = sum((which * int(name) for which, name in flags), broken * int(HeightFlag.BREAKLINE))
+    return sigma, flag, slope / (1 + slope @ ray.run), jnp.sqrt(fit.variance)
+
+
+def _inverse_distance(
+    squared: Float[Array, "m"], seen: Bool[Array, "m"], points: int, power: Float[Array, ""]
+) -> Float[Array, "m"]:
+    """d^-p of the nearest points over their sum, from d^2; where a point is met exactly, it alone counts."""
+    known = jax.lax.stop_gradient(jnp.where(seen, squared, jnp.inf))
+    used = seen & (jnp.sum(known < known[:, None], axis=1) < points)
+    least = jnp.where(used.any(), jnp.min(known), 1.0)
+    exact = squared == 0
+    # Double where: neither a distance nor a ratio of zero has a NaN derivative.
+    ratio = jnp.where(exact, 1.0, least / jnp.where(exact, 1.0, squared))
+    some = used & (ratio > 0)
+    weight = jnp.where(some, jnp.where(some, ratio, 1.0) ** (power / 2), 0.0)
+    return weight / jnp.maximum(jnp.sum(weight), 1e-300)
+
+
+def _room(n: int) -> int:
+    """At least `n`: 64, or whole portions of `_AT_ONCE`, of four sizes between a power of two and the next."""
+    if n <= _FEW:
+        return _FEW
+    step = max(_AT_ONCE, 1 << n.bit_length() - 3)
+    return -(-n // step) * step

@@ -1,0 +1,162 @@
+"""What the ray of an image meets in a cloud: the visible surface, and the laser points that show it.
+
+Functions of one ray, to be mapped over many. `q` is the offset (m) of a laser point from the ray in X and Y, at the
+point's own height: where q = 0 the image shows the point in the place of the feature.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+from scipy.ndimage import grey_closing, uniform_filter
+
+from jaxphoto.arrays import Numbers
+from jaxphoto.lidar.grid import Grid
+
+# A gap between heights that makes two levels: in standard deviations of one point, and of the points of either level.
+_GAP_NOISE = 6.0
+_GAP_SPREAD = 3.0
+# Of a half disc the centre of gravity is 0.42 radii from the middle.
+_BALANCED = 0.35
+_EMPTY = 1e-4
+# Cells around a place, where a cloud is that uneven.
+_FARTHEST = 4
+
+
+class Skyline(NamedTuple):
+    """The highest point of every cell of a grid (m), and the heights between which its points lie."""
+
+    tops: Float[np.ndarray, "cells"]
+    """In the order of `Grid.start`, pits narrower than three cells filled; -inf where there is no point."""
+    low: Float[np.ndarray, ""]
+    high: Float[np.ndarray, ""]
+
+
+class Levels(NamedTuple):
+    """Laser points around a ray where the ground, or a roof, is on one level or on two."""
+
+    seen: Bool[Array, "m"]
+    """Those of the level that the image shows in the place of the feature."""
+    broken: Bool[Array, ""]
+    """Whether the feature is so near to where the level changes that it may be on either."""
+
+
+def skyline(grid: Grid) -> Skyline:
+    """The highest points of the cells of `grid`."""
+    rows, columns = (int(v) for v in grid.shape)
+    start, z = np.asarray(grid.start[: rows * columns + 1]), np.asarray(grid.xyz[: len(grid), 2])
+    some = np.flatnonzero(np.diff(start))
+    tops = np.full(len(grid.start), -np.inf)
+    tops[some] = np.maximum.reduceat(z, start[some])
+    inside = tops[: rows * columns].reshape(rows, columns)
+    inside[...] = grey_closing(inside, 3, mode="nearest")
+    return Skyline(tops, z.min(), z.max())
+
+
+def window_reach(grid: Grid, wanted: int) -> int:
+    """How many cells around a place (`around`) hold `wanted` points, at nine in ten of the cells that are not empty."""
+    rows, columns = (int(v) for v in grid.shape)
+    count = np.diff(np.asarray(grid.start[: rows * columns + 1])).reshape(rows, columns)
+    for reach in range(1, _FARTHEST):
+        size = 2 * reach + 1
+        inside = uniform_filter(count.astype(float), size, mode="constant") * size**2
+        if np.mean(inside[count > 0] < wanted - 0.5) < 0.1:
+            return reach
+    return _FARTHEST
+
+
+def first_met(
+    origin: Float[Array, "3"], direction: Float[Array, "3"], sky: Skyline, grid: Grid
+) -> tuple[Float[Array, "2"], Bool[Array, ""]]:
+    """X and Y (m) of the first place, from the camera downwards, where a cell is as high as the ray; and if any is.
+
+    By steps of half a cell in plan, so it is off by so much. A ray that does not go down meets nothing.
+    """
+    down = direction[2] < 0
+    run = direction[:2] / jnp.where(down, direction[2], -1.0)
+    step = 0.5 * grid.cell_m / jnp.maximum(jnp.hypot(run[0], run[1]), 1e-9)
+    step = jnp.minimum(step, 1 + sky.high - sky.low)
+
+    def top(z):
+        column, row = jnp.floor((origin[:2] + run * (z - origin[2]) - grid.corner) / grid.cell_m)
+        inside = (row >= 0) & (column >= 0) & (row < grid.shape[0]) & (column < grid.shape[1])
+        cell = jnp.where(inside, row * grid.shape[1] + column, 0).astype(int)
+        return jnp.where(inside, jnp.asarray(sky.tops)[cell], -jnp.inf)
+
+    high = jnp.minimum(sky.high, origin[2])
+    z = jax.lax.while_loop(lambda z: (z > sky.low) & (top(z) < z), lambda z: z - step, jnp.where(down, high, sky.low))
+    return origin[:2] + run * (z - origin[2]), down & (top(z) >= z)
+
+
+def levels(
+    q: Float[Array, "m 2"],
+    z: Float[Array, "m"],
+    there: Bool[Array, "m"],
+    run: Float[Array, "2"],
+    neighbours: int,
+    sigma_z: Float[Array, ""],
+) -> Levels:
+    """Which of the laser points nearest to a ray, at heights `z` (m), show what the image shows; nearest first.
+
+    The heights are cut at the largest gap between two of them, if it is larger than noise and slope can make it. The
+    upper level hides the lower wherever it lies about the feature. Where neither does, or where the ray is too steep
+    (`run` is d(X, Y)/dZ) for the lower level to appear *behind* the upper, the feature is at the step between them.
+    """
+    # From each point to the next higher one; all with all is sooner compiled than a sort, and they are few.
+    higher = jnp.min(jnp.where(there & (z > z[:, None]), z, jnp.inf), axis=1)
+    gaps = jnp.where(there & jnp.isfinite(higher), higher - z, 0)
+    widest = jnp.argmax(gaps)
+    upper = there & (z > z[widest])
+    lower = there & ~upper
+    spread = jnp.sqrt((_squares(z, upper) + _squares(z, lower)) / jnp.maximum(there.sum(), 1))
+    two = gaps[widest] > jnp.maximum(_GAP_NOISE * sigma_z, _GAP_SPREAD * spread)
+
+    above, below = _around(q, upper, neighbours), _around(q, lower, neighbours)
+    reach = jnp.sqrt(jnp.max(jnp.where(there, jnp.sum(q**2, axis=1), 0)))
+    behind = jnp.hypot(run[0], run[1]) * gaps[widest] > reach
+    on_upper = above.balanced & (behind | (below.nearest > above.reach))
+    on_lower = ~above.balanced & below.balanced & (above.nearest > below.reach)
+    seen = jnp.where(two, jnp.where(above.balanced, upper, lower), there)
+    return Levels(seen, two & ~(on_upper | on_lower))
+
+
+def surrounded(q: Float[Numbers, "m 2"], which: Bool[Numbers, "m"]) -> Bool[Array, ""]:
+    """Whether the points `which` lie on all sides of q = 0: whether each has another less than half a turn on."""
+    x, y = q[:, 0], q[:, 1]
+    to_the_left = which & (x[:, None] * y - y[:, None] * x > 0)
+    return jnp.all(~which | to_the_left.any(axis=1)) & jnp.any(which)
+
+
+def empty_about(distance: Float[Numbers, "m"], which: Bool[Numbers, "m"]) -> Bool[Array, ""]:
+    """Whether no point is near enough: so large an empty circle is met once in ten thousand places of one density.
+
+    The nearest of n points in a circle, as a share of its area, is beyond x with probability (1 - x)^(n-1).
+    """
+    near, far = jnp.min(jnp.where(which, distance, jnp.inf)), jnp.max(jnp.where(which, distance, 0))
+    return (near / jnp.where(far > 0, far, 1)) ** 2 > 1 - _EMPTY ** (1 / jnp.maximum(which.sum() - 1, 1))
+
+
+class _Place(NamedTuple):
+    """How the points of one level lie about the feature."""
+
+    balanced: Bool[Array, ""]
+    nearest: Float[Array, ""]
+    reach: Float[Array, ""]
+
+
+def _around(q: Float[Array, "m 2"], which: Bool[Array, "m"], neighbours: int) -> _Place:
+    distance = jnp.hypot(q[:, 0], q[:, 1])
+    count = which.sum()
+    mean = jnp.sum(jnp.where(which[:, None], q, 0), axis=0) / jnp.maximum(count, 1)
+    farthest = jnp.max(jnp.where(which, distance, 0))
+    balanced = (count >= 3) & (jnp.hypot(mean[0], mean[1]) < _BALANCED * farthest)
+    near = which & (jnp.cumsum(which) <= neighbours)
+    reach = jnp.where(count < neighbours, jnp.inf, jnp.max(jnp.where(near, distance, 0)))
+    return _Place(balanced, jnp.min(jnp.where(which, distance, jnp.inf)), reach)
+
+
+def _squares(z: Float[Array, "m"], which: Bool[Array, "m"]) -> Float[Array, ""]:
+    mean = jnp.sum(jnp.where(which, z, 0)) / jnp.maximum(which.sum(), 1)
+    return jnp.sum(jnp.where(which, (z - mean) ** 2, 0))

@@ -1,0 +1,223 @@
+"""Simultaneous adjustment of images and a cloud (paper 001): the cloud holds the images, the images mend the cloud.
+
+In one step: every tie point is observed to lie on the surface of each lidar strip that shows it, and the boresight of
+the scanner and the shifts of its strips are unknowns beside the orientations. The surface at a point follows from where
+the point is, so that step is made again until nothing changes. Then the trajectory is that of the shifted strips, and
+the cloud is computed anew from it.
+"""
+
+import dataclasses
+from collections.abc import Callable, Collection
+from typing import Any, NamedTuple, get_args
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxphoto.adjustment import Adjustment
+from jaxphoto.block import Block, SurfaceRows
+from jaxphoto.cloud import Cloud
+from jaxphoto.compiling import call_compiled
+from jaxphoto.errors import InputError
+from jaxphoto.georeferencing import Scanner, Trajectory, raised_by_boresight
+from jaxphoto.lidar import HeightSettings, index_cloud, nearest
+from jaxphoto.lidar.correction import (
+    ScannerPoses,
+    correct_cloud,
+    correct_trajectory,
+    corrected_xyz,
+    scanner_poses,
+)
+from jaxphoto.lidar.heights import Method
+from jaxphoto.lidar.tangent_planes import TangentPlanes, tangent_planes
+from jaxphoto.procedures.lidar.rounds import MAX_ROUNDS, Round, Seen, at_result, until_still, with_interior_held
+from jaxphoto.procedures.lidar.vertical_control import nothing_seen, tie_points
+from jaxphoto.statistics import Covariance
+from jaxphoto.unknowns import FIXED, FREE, Weighted
+
+SURFACES = get_args(Method)
+"""Names of the ways to a surface."""
+SHIFT_SIGMA = 0.3
+"""Standard deviation (m) of a lidar strip's shift where nothing else is said of it."""
+# So many laser points of a strip around a tie point are all that its surface can depend on.
+_NEAR = 256
+
+
+class Simultaneous(eqx.Module):
+    """Images and cloud after their simultaneous adjustment, and before."""
+
+    before: Adjustment
+    """The block alone, its interior orientation held."""
+    adjusted: Adjustment
+    cloud: Cloud
+    """Corrected."""
+    trajectory: Trajectory | None
+    """Corrected by the shifts of the strips that were flown along it."""
+    scanner: Scanner
+    points: Int[np.ndarray, "rows"]
+    """Of the block, by observation of a surface."""
+    strip: Int[np.ndarray, "rows"]
+    apart_before: Float[np.ndarray, "rows"]
+    """By how much points lay above the surface of the cloud as it was, before (m); NaN where it was not to be told."""
+    apart: Float[np.ndarray, "rows"]
+    """By how much they lie above that of the corrected cloud; NaN likewise."""
+    moved_cloud: Float[np.ndarray, "3"]
+    """Root mean square move (m) of the laser points along X, Y and Z."""
+    rounds: tuple[Round, ...]
+    still: bool
+    """Whether nothing changed any more at the end."""
+
+
+class _Strip(NamedTuple):
+    """The laser points of one strip near tie points, as measured, and where their scanner was."""
+
+    cloud: Cloud
+    poses: ScannerPoses | None
+
+
+def simultaneous(
+    block: Block,
+    cloud: Cloud,
+    trajectory: Trajectory | None = None,
+    priors: Scanner | None = None,
+    *,
+    method: Method = "local",
+    settings: HeightSettings | None = None,
+    points: Collection[str] | None = None,
+    max_rounds: int = MAX_ROUNDS,
+    report: Callable[[Round], None] = lambda made: None,
+) -> Simultaneous:
+    """Adjust `block` with its tie points on the surface of `cloud`, which is in the block's object frame.
+
+    `priors` are those of the scanner; by default its boresight is FREE where `trajectory` (of the scanner, on the
+    cloud's clock) says from where each point was measured, and FIXED where none is given; shifts are weighted at zero
+    with `SHIFT_SIGMA`. `points` are those that lie on the surface; all tie points if None.
+
+    Raises BlockError where cloud and block, or cloud and trajectory, do not go together; InputError for a boresight to
+    estimate without trajectory or times; and as `jaxphoto.adjust`.
+    """
+    settings = HeightSettings() if settings is None else settings
+    names = cloud.strips or ("cloud",)
+    timed = trajectory is not None and cloud.time is not None
+    if priors is None:
+        shift = Weighted(np.zeros(3), np.full(3, SHIFT_SIGMA))
+        priors = Scanner(FREE if timed else FIXED, dict.fromkeys(names, shift))  # type: ignore[arg-type]
+    if priors.boresight is not FIXED and not timed:
+        raise InputError(
+            "the boresight of the scanner needs its trajectory and the time of each laser point, which say from where "
+            "a point was measured: give them, or hold the boresight fixed"
+        )
+    which = tie_points(block, points)
+    first = with_interior_held(block)
+    strips = _near(cloud, names, np.asarray(first.unknowns.points)[which], trajectory if timed else None)
+    none: Scanner = jax.tree.map(np.asarray, Scanner(jnp.zeros(3), dict.fromkeys(names, jnp.zeros(3))))
+    strip = np.repeat(np.arange(len(names)), len(which))
+
+    def planes(adjusted: Adjustment) -> list[TangentPlanes]:
+        scanner = adjusted.unknowns.scanner or none
+        xy = np.asarray(adjusted.unknowns.points)[which, :2]
+        found = []
+        for of, shift in zip(strips, scanner.shifts.values(), strict=True):
+            corrected = corrected_xyz(of.cloud.xyz, of.poses, scanner.boresight, shift)  # type: ignore[arg-type]
+            grid = index_cloud(dataclasses.replace(of.cloud, xyz=corrected))
+            found.append(tangent_planes(grid, xy, method, settings))
+        return found
+
+    last: dict[str, Any] = {}
+
+    def look(adjusted: Adjustment) -> Seen:
+        last["planes"] = planes(adjusted)
+        foot, normal, sigma, flag = (
+            np.concatenate([getattr(p, name) for p in last["planes"]]) for name in ("foot", "normal", "sigma", "flag")
+        )
+        usable = np.isfinite(foot).all(axis=1)
+        if not usable.any():
+            raise nothing_seen(np.asarray(adjusted.unknowns.points)[which], cloud.xyz, flag)
+        return Seen(np.tile(which, len(names)), foot, normal, sigma, usable)
+
+    def build(adjusted: Adjustment, known: Covariance, seen: Seen, used: np.ndarray) -> Block:
+        scanner = adjusted.unknowns.scanner or none
+        near = np.concatenate([p.nearest for p in last["planes"]])
+        last["turn"] = _turns(seen, strip, near, strips)
+        rows = _surface_rows(seen, used, strip, last["turn"], scanner)
+        unknowns = dataclasses.replace(adjusted.unknowns, scanner=scanner)
+        posed = dataclasses.replace(block, surfaces=rows, priors=dataclasses.replace(block.priors, scanner=priors))
+        return at_result(posed, unknowns)
+
+    def carry(seen: Seen, before: Adjustment, now: Adjustment) -> Seen:
+        old, new = before.unknowns.scanner or none, now.unknowns.scanner or none
+        shift = np.stack([np.asarray(new.shifts[name]) - np.asarray(old.shifts[name]) for name in names])[strip]
+        raised = last["turn"] @ (np.asarray(new.boresight) - np.asarray(old.boresight))
+        return seen._replace(foot=seen.foot - shift - raised[:, None] * seen.normal)
+
+    found = until_still(first, look, build, max_rounds, report, carry)
+    scanner = found.adjusted.unknowns.scanner
+    assert scanner is not None
+    corrected, used = correct_cloud(cloud, scanner, trajectory if timed else None), found.used
+    before, after = look(first), look(found.adjusted)
+    return Simultaneous(
+        first,
+        found.adjusted,
+        corrected,
+        correct_trajectory(trajectory, cloud, scanner) if trajectory is not None else None,
+        scanner,
+        found.seen.point[used],
+        strip[used],
+        before.apart(first)[used],
+        after.apart(found.adjusted)[used],
+        np.sqrt(((corrected.xyz - cloud.xyz) ** 2).mean(axis=0)),
+        found.rounds,
+        found.still,
+    )
+
+
+def _near(
+    cloud: Cloud, names: tuple[str, ...], places: Float[np.ndarray, "n 3"], trajectory: Trajectory | None
+) -> list[_Strip]:
+    """What a surface at some places can depend on, strip by strip."""
+    strips = []
+    for k, name in enumerate(names):
+        whole = cloud if cloud.strip is None else cloud.take(np.flatnonzero(cloud.strip == k))
+        if not len(whole):
+            raise InputError(
+                f"the strip {name} of the cloud has no points: leave it out, or read other classes and returns"
+            )
+        grid = index_cloud(whole.xyz)
+        around = nearest(grid, places[:, :2], min(_NEAR, len(whole))).index
+        own = whole.take(np.unique(np.asarray(grid.order)[around]))
+        poses = scanner_poses(trajectory, own.time) if trajectory is not None and own.time is not None else None
+        strips.append(_Strip(own, poses))
+    return strips
+
+
+def _turns(
+    seen: Seen, strip: Int[np.ndarray, "rows"], near: Int[np.ndarray, "rows"], strips: list[_Strip]
+) -> Float[np.ndarray, "rows 3"]:
+    """`SurfaceRows.turn` of every row, used or not: as many in every round."""
+    turn = np.zeros_like(seen.foot)
+    for k, one in enumerate(strips):
+        own = strip == k
+        if one.poses is not None:
+            laser = near[own]
+            given = seen.foot[own], seen.normal[own], one.poses.position[laser], one.poses.object_from_body[laser]
+            turn[own] = call_compiled(_raised, *given)
+    return turn
+
+
+def _surface_rows(
+    seen: Seen,
+    used: Bool[np.ndarray, "rows"],
+    strip: Int[np.ndarray, "rows"],
+    turn: Float[np.ndarray, "rows 3"],
+    scanner: Scanner,
+) -> SurfaceRows:
+    """The observations, of the cloud as it was measured: linear in shift and boresight about those of `scanner`."""
+    of, turn, foot, normal = strip[used], turn[used], seen.foot[used], seen.normal[used]
+    shift = np.stack([np.asarray(v) for v in scanner.shifts.values()])[of]
+    raised = turn @ np.asarray(scanner.boresight)
+    return SurfaceRows(seen.point[used], of, foot + shift + raised[:, None] * normal, normal, turn, seen.sigma[used])
+
+
+_raised = eqx.filter_jit(jax.vmap(raised_by_boresight))

@@ -1,0 +1,160 @@
+"""Roofs as further control: tie points on the planes of roof faces, and measured centroids as control points.
+
+A roof face is an even plane of many laser points: a tie point on it is held along the plane's normal better than by any
+single height, and normals of roofs look in many directions. The centroid of a roof holds a point in X, Y and Z, where
+somebody has measured it in the images. Both are methods that paper 004 cites. Where no roof is, heights are control as
+in `vertical_control`: they also say first where the points are, well enough to tell one roof from the next.
+"""
+
+import dataclasses
+from collections.abc import Callable, Collection
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import KDTree
+
+from jaxphoto.adjustment import Adjustment
+from jaxphoto.block import Block, Rows, SurfaceRows
+from jaxphoto.cloud import Cloud
+from jaxphoto.errors import BlockError
+from jaxphoto.lidar import HeightSettings
+from jaxphoto.lidar.planes import plane_feet
+from jaxphoto.lidar.roofs import Patch, planar_patches, roof_centroid
+from jaxphoto.procedures.lidar.rounds import MAX_ROUNDS, Round, Seen, at_result, until_still
+from jaxphoto.procedures.lidar.vertical_control import lidar_control, tie_points
+from jaxphoto.statistics import Covariance
+
+BUILDING = 6
+"""The class of roofs in LAS."""
+# Laser points so far from all points asked for (m) belong to no roof of theirs.
+_NEAR = 40.0
+# Laser points that make a roof.
+_LEAST = 20
+
+
+class RoofControl(eqx.Module):
+    """The adjustment with roofs for control; arrays are over the tie points that lie on a roof face."""
+
+    block: Block
+    """With the planes as `surfaces`, heights and centroids as control, starting from the adjusted unknowns."""
+    adjusted: Adjustment
+    points: Int[np.ndarray, "n"]
+    """Of the block."""
+    apart: Float[np.ndarray, "n"]
+    """By how much each lies above its plane (m)."""
+    faces: int
+    """Roof faces that hold a tie point."""
+    rounds: tuple[Round, ...]
+    still: bool
+    """Whether nothing changed any more at the end."""
+
+
+def roof_control(
+    block: Block,
+    cloud: Cloud,
+    settings: HeightSettings | None = None,
+    *,
+    points: Collection[str] | None = None,
+    centroids: Collection[str] = (),
+    max_rounds: int = MAX_ROUNDS,
+    report: Callable[[Round], None] = lambda made: None,
+) -> RoofControl:
+    """Adjust `block` with its tie points (or the `points` named) that lie on a roof face of `cloud` held on its plane.
+
+    The others have control heights (`lidar_control`, by planes). Roofs are laser points of class 6; of a cloud without
+    classes all points are looked at, level ground among them. Points named in `centroids` were measured at the middle
+    of a roof face, and become control in X, Y and Z. The standard deviation of a point on a plane is the plane's there.
+
+    Raises BlockError where no tie point lies on a roof, or a centroid on none; InputError for names that are no points;
+    and as `jaxphoto.adjust`.
+    """
+    settings = HeightSettings() if settings is None else settings
+    which, middles = tie_points(block, points), tie_points(block, centroids) if centroids else np.zeros(0, int)
+    which = np.setdiff1d(which, middles)
+    heights = lidar_control(block, cloud, "plane", settings, points=points, max_rounds=max_rounds, report=report)
+    first = heights.adjusted
+    places = np.asarray(first.unknowns.points)
+    patches = _patches(cloud, places[np.concatenate([which, middles])], settings)
+    margin = 2 * settings.sigma_xy_m
+    centres = _centroid_rows(block, middles, places, patches, cloud)
+    # Those of the block come first.
+    of_heights = heights.block.control.take(np.arange(len(block.control.who), len(heights.block.control.who)))
+    chosen = np.full(len(which), -1)
+
+    def look(adjusted: Adjustment) -> Seen:
+        xyz = np.asarray(adjusted.unknowns.points)[which]
+        chosen[:] = _faces(xyz[:, :2], patches, margin)
+        if not (chosen >= 0).any() and not len(middles):
+            raise BlockError(
+                f"none of {len(which)} tie points lies on one of the cloud's {len(patches)} roof faces: measure "
+                "points on roofs, or take heights for control (lidar_control)"
+            )
+        foot, normal, sigma = np.full((len(which), 3), np.nan), np.full((len(which), 3), np.nan), np.ones(len(which))
+        for k in np.unique(chosen[chosen >= 0]):
+            own = chosen == k
+            foot[own], normal[own], sigma[own] = plane_feet(patches[k].plane, xyz[own])
+        return Seen(which, foot, normal, sigma, chosen >= 0)
+
+    def build(adjusted: Adjustment, known: Covariance, seen: Seen, used: Bool[np.ndarray, "rows"]) -> Block:
+        n, own = int(used.sum()), np.concatenate([which[used], middles])
+        others = of_heights.take(~np.isin(of_heights.who, own))
+        held = dataclasses.replace(block, control=Rows.joined(block.control, centres, others))
+        rows = SurfaceRows(
+            which[used], np.zeros(n, int), seen.foot[used], seen.normal[used], np.zeros((n, 3)), seen.sigma[used]
+        )
+        return at_result(dataclasses.replace(held, surfaces=rows), adjusted.unknowns)
+
+    found = until_still(first, look, build, max_rounds, report)
+    return RoofControl(
+        at_result(found.adjusted.block, found.adjusted.unknowns),
+        found.adjusted,
+        which[found.used],
+        found.seen.apart(found.adjusted)[found.used],
+        len(np.unique(chosen[found.used])),
+        found.rounds,
+        found.still,
+    )
+
+
+def _patches(cloud: Cloud, places: Float[np.ndarray, "n 3"], settings: HeightSettings) -> list[Patch]:
+    """Roof faces near places; `Patch.index` counts the points of `cloud`."""
+    roofs = np.arange(len(cloud)) if cloud.classification is None else np.flatnonzero(cloud.classification == BUILDING)
+    if len(roofs):
+        away, _ = KDTree(places[:, :2]).query(cloud.xyz[roofs, :2], distance_upper_bound=_NEAR)
+        roofs = roofs[np.isfinite(away)]
+    if len(roofs) < _LEAST:
+        raise BlockError(
+            f"within {_NEAR:g} m of the points the cloud has {len(roofs)} laser points of roofs (class {BUILDING}): "
+            "classify the cloud, or take heights for control (lidar_control)"
+        )
+    found = planar_patches(cloud.xyz[roofs], settings.sigma_xy_m, settings.sigma_z_m, _LEAST)
+    return [eqx.tree_at(lambda p: p.index, patch, roofs[patch.index]) for patch in found]
+
+
+def _faces(xy: Float[np.ndarray, "n 2"], patches: list[Patch], margin: float) -> Int[np.ndarray, "n"]:
+    """The patch that each place lies in, `margin` (m) or more from its outline; -1 where it lies in none."""
+    found = np.full(len(xy), -1)
+    for k, patch in reversed(list(enumerate(patches))):
+        corners = patch.outline[:, :2]
+        along = np.roll(corners, -1, axis=0) - corners
+        inward = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.linalg.norm(along, axis=1, keepdims=True)
+        inside = np.einsum("nek,ek->ne", xy[:, None] - corners, inward).min(axis=1)
+        found[inside >= margin] = k
+    return found
+
+
+def _centroid_rows(
+    block: Block, points: Int[np.ndarray, "n"], places: Float[np.ndarray, "all 3"], patches: list[Patch], cloud: Cloud
+) -> Rows:
+    """Control in X, Y and Z of points at the middle of roof faces."""
+    parts = [Rows.none()]
+    for point, face in zip(points, _faces(places[points, :2], patches, 0.0), strict=True):
+        if face < 0:
+            raise BlockError(
+                f"point {block.points[point]} is to be the centroid of a roof, but the cloud has no roof face at X "
+                f"{places[point, 0]:.1f} m, Y {places[point, 1]:.1f} m: leave it out"
+            )
+        centre, covariance = roof_centroid(cloud.xyz[patches[face].index])
+        parts.append(Rows(np.full(3, point), np.arange(3), centre, np.sqrt(np.diagonal(covariance))))
+    return Rows.joined(*parts)

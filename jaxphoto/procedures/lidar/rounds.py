@@ -1,0 +1,189 @@
+"""Adjusting again and again with lidar observations that follow from the result, until nothing changes."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxphoto.adjustment import Adjustment
+from jaxphoto.block import Block, Start
+from jaxphoto.collinearity import ExteriorOrientation
+from jaxphoto.errors import DatumError
+from jaxphoto.procedures.adjust import adjust
+from jaxphoto.statistics import LEAST_CHECKED, Covariance, angle_differences, covariance, redundancy_numbers
+from jaxphoto.unknowns import FIXED, Unknowns
+
+MAX_ROUNDS = 20
+STILL = 0.1
+"""Nothing changes any more where no unknown moves by more than this part of its standard deviation.
+
+Less may never come: with each move some laser point becomes a neighbour, and another ceases to be one.
+"""
+# A point farther from the surface, in standard deviations, is no point of it; it is tried again in the next round.
+_OUTLIER = 4.0
+# After this round, because before it the orientation may be far off; and after that one with a last word.
+_JUDGED, _SETTLED = 2, 5
+# Observations that differ by less, in standard deviations, are the same; after so many rounds nobody looks again.
+_SAME, _LAST_LOOK = 0.5, 8
+
+
+class Round(NamedTuple):
+    """One adjustment, and what it changed."""
+
+    number: int
+    observed: int
+    """Observations of the lidar."""
+    left_out: int
+    """Those that are too far off all others."""
+    moved_m: float
+    """Root mean square move of the object points since the adjustment before."""
+    largest_change: float
+    """Of interior and exterior orientation since then, in standard deviations."""
+    rmse_m: float
+    """Of the distances between the points observed and the surface, after the adjustment."""
+
+
+class Seen(NamedTuple):
+    """What a cloud says of points: one row for each that it may observe, in an order that stays from round to round."""
+
+    point: Int[np.ndarray, "rows"]
+    foot: Float[np.ndarray, "rows 3"]
+    normal: Float[np.ndarray, "rows 3"]
+    sigma: Float[np.ndarray, "rows"]
+    """Of the surface along its normal (m)."""
+    usable: Bool[np.ndarray, "rows"]
+
+    def apart(self, adjusted: Adjustment) -> Float[np.ndarray, "rows"]:
+        """By how much the adjusted points lie above the surface, along its normal (m)."""
+        points = np.asarray(adjusted.unknowns.points)[self.point]
+        return np.einsum("nk,nk->n", self.normal, points - self.foot)
+
+
+class Observed(NamedTuple):
+    """The last of the rounds: its adjustment, what the cloud said, and which of it was used."""
+
+    adjusted: Adjustment
+    covariance: Covariance
+    seen: Seen
+    used: Bool[np.ndarray, "rows"]
+    rounds: tuple[Round, ...]
+    still: bool
+    """Whether nothing changed any more."""
+
+
+Look = Callable[[Adjustment], Seen]
+Carry = Callable[[Seen, Adjustment, Adjustment], Seen]
+Build = Callable[[Adjustment, Covariance, Seen, Bool[np.ndarray, "rows"]], Block]
+
+
+def with_interior_held(block: Block) -> Adjustment:
+    """`block` adjusted with the interior orientation held: where its points lie, as far as it knows by itself.
+
+    Where its datum is open, as that of a strip whose stations lie on a line, exterior orientation is held as it begins,
+    from direct georeferencing: what the cloud adds may close the datum. Raises as `adjust`.
+    """
+    interior = jax.tree.map(lambda _: FIXED, block.start.unknowns.interior)
+    held = dataclasses.replace(block.priors, interior=interior)
+    try:
+        return adjust(block, priors=held)
+    except DatumError:
+        placed = ExteriorOrientation(FIXED, FIXED)  # type: ignore[arg-type]
+        return adjust(block, priors=dataclasses.replace(held, exterior=placed))
+
+
+def until_still(
+    first: Adjustment,
+    look: Look,
+    build: Build,
+    max_rounds: int,
+    report: Callable[[Round], None],
+    carry: Carry = lambda seen, before, now: seen,
+) -> Observed:
+    """`look` at the cloud, `build` a block with what it says, adjust; from `first` on, until nothing changes.
+
+    Each block is adjusted from the unknowns that `build` gives it. Towards the end an observation stays the one it was
+    where the cloud, looked at again, says nearly the same, and then in any case: else a laser point could become a
+    neighbour, cease to be one with the move that this makes, and so on for ever. `carry` brings an earlier observation
+    from the cloud as corrected before to that of now.
+    """
+    adjusted, known, fits = first, covariance(first), np.array(True)
+    before, seen = first, look(first)
+    rounds: list[Round] = []
+    while True:
+        used = seen.usable & fits
+        block = build(adjusted, known, seen, used)
+        new = adjust(block, block.start.unknowns)
+        now = covariance(new)
+        moved = np.asarray(new.unknowns.points) - np.asarray(adjusted.unknowns.points)
+        change = _change(adjusted, new, now)
+        apart = seen.apart(new)[used]
+        rounds.append(
+            Round(
+                len(rounds) + 1,
+                int(used.sum()),
+                int((seen.usable & ~used).sum()),
+                float(np.sqrt((moved**2).sum(axis=1).mean())),
+                change,
+                float(np.sqrt((apart**2).mean())) if len(apart) else np.nan,
+            )
+        )
+        report(rounds[-1])
+        before, adjusted, known = adjusted, new, now
+        still = len(rounds) > _JUDGED and change < STILL
+        if still or len(rounds) >= max_rounds:
+            return Observed(adjusted, known, seen, used, tuple(rounds), still)
+        if len(rounds) >= _JUDGED:
+            # Towards the end what was left out stays so: some observation might come and go for ever.
+            fits = _fit(seen, adjusted, known, used) & (fits if len(rounds) >= _SETTLED else True)
+        if len(rounds) < _SETTLED:
+            seen = look(adjusted)
+            continue
+        seen = carry(seen, before, adjusted)
+        if len(rounds) < _LAST_LOOK:
+            seen = _kept(seen, look(adjusted), adjusted)
+
+
+def at_result(block: Block, unknowns: Unknowns) -> Block:
+    """`block` with an adjustment's unknowns for its start."""
+    known = Start(unknowns, np.ones(len(block.images), bool), np.ones(len(block.points), bool))
+    return dataclasses.replace(block, start=known)
+
+
+def _kept(old: Seen, new: Seen, adjusted: Adjustment) -> Seen:
+    """The old observations where the new ones hardly differ from them."""
+    same = np.abs(old.apart(adjusted) - new.apart(adjusted)) < _SAME * new.sigma
+    chosen = (np.where(same[:, None] if v.ndim > 1 else same, u, v) for u, v in zip(old[1:], new[1:], strict=True))
+    return Seen(new.point, *chosen)
+
+
+def _fit(
+    seen: Seen, adjusted: Adjustment, known: Covariance, used: Bool[np.ndarray, "rows"]
+) -> Bool[np.ndarray, "rows"]:
+    """Which observations the others bear out."""
+    # Those used, by their normalised residuals: the lidar's are the last of their group.
+    numbers, residuals = redundancy_numbers(adjusted, known), adjusted.residuals
+    group = "surfaces" if len(adjusted.block.surfaces.point) else "control"
+    of_used = slice(len(getattr(residuals, group)) - int(used.sum()), None)
+    v, r = (np.asarray(getattr(of, group))[of_used] for of in (residuals, numbers))
+    # The others against where all others put their points.
+    points = np.einsum("ni,nij,nj->n", seen.normal, np.asarray(known.points)[seen.point], seen.normal)
+    w = np.where(seen.usable, np.abs(seen.apart(adjusted)) / np.sqrt(seen.sigma**2 + points), 0.0)
+    w[used] = np.abs(v) / np.sqrt(np.maximum(r, LEAST_CHECKED))
+    return w <= _OUTLIER
+
+
+def _change(old: Adjustment, new: Adjustment, known: Covariance) -> float:
+    """The largest change of a free interior or exterior orientation, in standard deviations."""
+    if old.structure.labels != new.structure.labels:
+        return np.inf
+    sigma = np.sqrt(np.maximum(np.asarray(known.matrix).diagonal(), 0.0))
+    moved = np.asarray(new.unknowns.exterior.position) - np.asarray(old.unknowns.exterior.position)
+    exterior = np.column_stack([moved, angle_differences(new, old)[1]]).ravel()
+    free = new.structure.free
+    shared = np.asarray(new.values.shared)[free] - np.asarray(old.values.shared)[free]
+    known_at_all = sigma > 0
+    change = np.abs(np.concatenate([exterior, shared]))
+    return float(np.max(change[known_at_all] / sigma[known_at_all], initial=0.0))

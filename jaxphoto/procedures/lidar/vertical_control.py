@@ -1,0 +1,170 @@
+"""Vertical control from a cloud: the height of the laser points under each tie point.
+
+A tie point is where the images say, the cloud says how high that is, and with this height the images are adjusted
+again: in turn until nothing changes (paper 001). By `method` "image" the height is that of the pseudo control point of
+paper 001, interpolated in the image; by any other it is `lidar.heights_at`. Control is vertical only: why, says
+docs/pseudo_control.md.
+"""
+
+import dataclasses
+from collections.abc import Callable, Collection
+from typing import Literal, get_args
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxphoto.adjustment import Adjustment
+from jaxphoto.block import Block, Rows
+from jaxphoto.cloud import Cloud
+from jaxphoto.errors import BlockError, InputError
+from jaxphoto.lidar import Grid, HeightFlag, HeightSettings, heights_at, index_cloud
+from jaxphoto.lidar.block_control import pseudo_control_of_block
+from jaxphoto.procedures.lidar.rounds import MAX_ROUNDS, Round, Seen, at_result, until_still, with_interior_held
+from jaxphoto.statistics import Covariance
+
+Method = Literal["idw", "plane", "tin", "local", "image"]
+METHODS = get_args(Method)
+"""Names of the ways to a height."""
+
+
+class LidarControl(eqx.Module):
+    """Vertical control from a cloud, and the adjustment with it; arrays are over the `points` that it may observe."""
+
+    block: Block
+    """With the control, and the adjusted unknowns for its start."""
+    adjusted: Adjustment
+    points: Int[np.ndarray, "points"]
+    """Of the block."""
+    height: Float[np.ndarray, "points"]
+    """Z (m) of the cloud at the point; NaN where it was refused."""
+    sigma: Float[np.ndarray, "points"]
+    """Of the height as control (m): of the cloud's, and of what the point's own place is off by on a slope."""
+    flag: Int[np.ndarray, "points"]
+    """Sums of `lidar.HeightFlag`."""
+    used: Bool[np.ndarray, "points"]
+    """Whether the height is control: neither refused nor far off all others."""
+    rounds: tuple[Round, ...]
+    still: bool
+    """Whether nothing changed any more at the end."""
+
+
+def lidar_control(
+    block: Block,
+    cloud: Cloud | Grid,
+    method: Method = "plane",
+    settings: HeightSettings | None = None,
+    *,
+    points: Collection[str] | None = None,
+    max_rounds: int = MAX_ROUNDS,
+    report: Callable[[Round], None] = lambda made: None,
+) -> LidarControl:
+    """Control heights from a cloud in the block's object frame, for the `points` named or all tie points.
+
+    A tie point is one without control, fixed or check coordinates. The block needs a datum without the cloud: camera
+    stations or control. `report` is called after each round.
+
+    Raises BlockError where the cloud and the points are in different places, or no height can be told; InputError for
+    names that are no points; and as `jaxphoto.adjust`.
+    """
+    settings = HeightSettings() if settings is None else settings
+    grid = cloud if isinstance(cloud, Grid) else index_cloud(cloud)
+    which = tie_points(block, points)
+    heights: dict[str, np.ndarray] = {}
+
+    def look(adjusted: Adjustment) -> Seen:
+        z, sigma, gradient, heights["flag"] = _heights(adjusted, which, grid, method, settings)
+        usable = np.isfinite(z)
+        if not usable.any():
+            raise nothing_seen(np.asarray(adjusted.unknowns.points)[which], np.asarray(grid.xyz), heights["flag"])
+        place = np.asarray(adjusted.unknowns.points)[which]
+        normal = np.column_stack([-gradient, np.ones(len(which))])
+        slant = np.linalg.norm(normal, axis=1)
+        foot = np.column_stack([place[:, :2], z])
+        return Seen(which, foot, normal / slant[:, None], sigma / slant, usable)
+
+    def build(adjusted: Adjustment, known: Covariance, seen: Seen, used: np.ndarray) -> Block:
+        heights["sigma"] = _sigma(known, seen)
+        rows = Rows(which[used], np.full(used.sum(), 2), seen.foot[used, 2], heights["sigma"][used])
+        return dataclasses.replace(at_result(block, adjusted.unknowns), control=Rows.joined(block.control, rows))
+
+    found = until_still(with_interior_held(block), look, build, max_rounds, report)
+    return LidarControl(
+        at_result(found.adjusted.block, found.adjusted.unknowns),
+        found.adjusted,
+        which,
+        found.seen.foot[:, 2],
+        heights["sigma"],
+        heights["flag"],
+        found.used,
+        found.rounds,
+        found.still,
+    )
+
+
+def tie_points(block: Block, names: Collection[str] | None = None) -> Int[np.ndarray, "points"]:
+    """The points named, or all without control, fixed or check coordinates.
+
+    Raises InputError for a name that is no point and for one whose height is control already, BlockError where there is
+    no tie point.
+    """
+    observed = [rows.who for rows in (block.control, block.fixed, block.check)]
+    if names is None:
+        free = np.setdiff1d(np.arange(len(block.points)), np.concatenate(observed).astype(int))
+        if not len(free):
+            raise BlockError(
+                "the block has no tie point that a cloud could give a height: name points that should have one"
+            )
+        return free
+    place = {name: k for k, name in enumerate(block.points)}
+    high = {int(p) for rows in (block.control, block.fixed) for p in np.asarray(rows.who)[rows.axis == 2]}
+    for name in names:
+        if name not in place:
+            raise InputError(f"{name} is no point of the block: name points of image_points.csv")
+        if place[name] in high:
+            raise InputError(
+                f"the height of point {name} is control already: leave it out, or take it out of the control"
+            )
+    return np.array(sorted(place[name] for name in set(names)), int)
+
+
+def nothing_seen(points: np.ndarray, cloud: np.ndarray, flag: np.ndarray) -> BlockError:
+    """Why no point has a height: the cloud lies elsewhere, or all heights were refused."""
+    (low, high), (least, most) = ((v[:, :2].min(axis=0), v[:, :2].max(axis=0)) for v in (points, cloud))
+    if np.any(low > most) or np.any(high < least):
+        block, other = (
+            f"X {a[0]:.0f} to {b[0]:.0f} m, Y {a[1]:.0f} to {b[1]:.0f} m" for a, b in ((low, high), (least, most))
+        )
+        return BlockError(
+            f"the cloud does not cover the block: its points lie at {other}, those of the block at {block}; read the "
+            "cloud for the block's frame (its EPSG code and unit), or take another cloud"
+        )
+    counts = ", ".join(f"{n} {name.lower()}" for name, n in flag_counts(flag).items())
+    return BlockError(
+        f"the cloud tells the height of none of the {len(points)} points ({counts}): take a denser cloud, other "
+        "classes or returns, or another method"
+    )
+
+
+def flag_counts(flag: Int[np.ndarray, "points"]) -> dict[str, int]:
+    """How many heights have each flag that any has."""
+    counts = {f.name or "": int(((flag & int(f)) != 0).sum()) for f in HeightFlag if f}
+    return {name: n for name, n in counts.items() if n}
+
+
+def _heights(adjusted: Adjustment, which: np.ndarray, grid: Grid, method: Method, settings: HeightSettings):
+    """Height, its standard deviation, gradient of the surface and flag, at each of some points."""
+    if method == "image":
+        # In the order of `which`, which is sorted too.
+        pseudo = pseudo_control_of_block(adjusted.block, adjusted.unknowns, grid, which, settings).control
+        return np.asarray(pseudo.xyz)[:, 2], *map(np.asarray, (pseudo.sigma_z, pseudo.gradient, pseudo.flag))
+    found = heights_at(grid, np.asarray(adjusted.unknowns.points)[which, :2], method, settings)
+    return found.z, found.sigma, found.gradient, found.flag
+
+
+def _sigma(known: Covariance, seen: Seen) -> Float[np.ndarray, "points"]:
+    """Of control heights: of the surface, and of the height that the uncertain place of the point means on a slope."""
+    of_place = np.asarray(known.points)[seen.point][:, :2, :2]
+    upright = seen.normal[:, 2]
+    gradient = -seen.normal[:, :2] / upright[:, None]
+    return np.sqrt((seen.sigma / upright) ** 2 + np.einsum("ni,nij,nj->n", gradient, of_place, gradient))

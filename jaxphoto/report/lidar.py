@@ -1,0 +1,210 @@
+"""What a cloud gave a block, as tables and pictures: heights as control, simultaneous adjustment, what moved."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pandas as pd
+from rich.console import Console
+
+from jaxphoto.adjustment import Adjustment
+from jaxphoto.adjustment.structure import structure_of
+from jaxphoto.block import AXES
+from jaxphoto.lidar import HeightFlag
+from jaxphoto.procedures.lidar import LidarControl, Round, Simultaneous
+from jaxphoto.report.plots import new_figure
+from jaxphoto.report.results import made_whole, summary_of, write_results, write_summary
+from jaxphoto.report.tables import Tables
+from jaxphoto.report.verdict import warnings_of
+from jaxphoto.statistics import angle_differences, correlation_matrix
+from jaxphoto.unknowns import FREE, uniform_priors
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_UNITS = {"_mm": "mm", "_m": "m", "_m_per_s": "m/s", "_s": "s"}
+_ORDER = ("compile", "solve", "covariance")
+
+
+def rounds_table(rounds: Sequence[Round]) -> pd.DataFrame:
+    """round, observed, left_out, moved_m, largest_change (in standard deviations), rmse_m."""
+    return pd.DataFrame(rounds, columns=["round", *Round._fields[1:]])
+
+
+def heights_table(control: LidarControl) -> pd.DataFrame:
+    """point, X_m, Y_m, Z_m of the adjusted point, height_m of the cloud, sigma_m, flags, used."""
+    points = np.asarray(control.adjusted.unknowns.points)[control.points]
+    names = np.array(control.block.points, object)[control.points]
+    coordinates = {f"{axis}_m": points[:, k] for k, axis in enumerate(AXES)}
+    flags = [" ".join(f.name.lower() for f in HeightFlag if f and f & int(flag) and f.name) for flag in control.flag]
+    return pd.DataFrame(
+        {"point": names, **coordinates, "height_m": control.height, "sigma_m": control.sigma, "flags": flags}
+        | {"used": control.used}
+    )
+
+
+def surfaces_table(result: Simultaneous) -> pd.DataFrame:
+    """point, strip, X_m, Y_m, Z_m, and by how much it lies above the surface before and after, in m."""
+    block = result.adjusted.block
+    points = np.asarray(result.adjusted.unknowns.points)[result.points]
+    coordinates = {f"{axis}_m": points[:, k] for k, axis in enumerate(AXES)}
+    return pd.DataFrame(
+        {"point": np.array(block.points, object)[result.points]}
+        | {"strip": np.array(tuple(result.scanner.shifts), object)[result.strip], **coordinates}
+        | {"above_before_m": result.apart_before, "above_m": result.apart}
+    )
+
+
+def moved_table(result: Simultaneous) -> pd.DataFrame:
+    """what, before, after, moved, sigma, unit: every parameter of cameras, scanner, mounts and strips that was free.
+
+    Then the root mean square moves of camera stations, rotations, object points and laser points, and the distance of
+    points from the surface. Sigmas are a posteriori.
+    """
+    after, before = result.adjusted, result.before
+    sigma = np.asarray(Tables(after).covariance.shared_sigma)
+    # What the block alone did not know, the scanner, was zero.
+    then, now = _parameters(before), _parameters(after)
+    rows: list[tuple] = []
+    for label, s in zip(after.structure.labels, sigma, strict=True):
+        (factor, unit), old, value = _unit(label), then.get(label, 0.0), now[label]
+        name = label.replace("_rad", "_deg")
+        rows.append((name, factor * old, factor * value, factor * (value - old), factor * float(s), unit))
+
+    def rms(what: str, values: np.ndarray, unit: str) -> None:
+        rows.append((what, np.nan, np.nan, float(np.sqrt(np.nanmean(np.asarray(values) ** 2))), np.nan, unit))
+
+    exterior, points = (
+        np.asarray(getter(after)) - np.asarray(getter(before))
+        for getter in (lambda a: a.unknowns.exterior.position, lambda a: a.unknowns.points)
+    )
+    turned = np.rad2deg(angle_differences(after, before)[1])
+    for k, axis in enumerate(AXES):
+        rms(f"camera stations, {axis}", exterior[:, k], "m")
+    for k, name in enumerate(("omega", "phi", "kappa")):
+        rms(f"images, {name}", turned[:, k], "deg")
+    for k, axis in enumerate(AXES):
+        rms(f"object points, {axis}", points[:, k], "m")
+    for k, axis in enumerate(AXES):
+        rms(f"laser points, {axis}", result.moved_cloud[k : k + 1], "m")
+    both = [float(np.sqrt(np.nanmean(v**2))) for v in (result.apart_before, result.apart)]
+    rows.append(("points above the surface, RMSE", *both, both[1] - both[0], np.nan, "m"))
+    return pd.DataFrame(rows, columns=["what", "before", "after", "moved", "sigma", "unit"])
+
+
+def scanner_correlations(adjusted: Adjustment) -> pd.DataFrame:
+    """parameter_a, parameter_b, rho: boresight and shifts of the scanner with each other and with the cameras."""
+    known = Tables(adjusted).covariance
+    first = 6 * known.n_images
+    rho, labels = correlation_matrix(known)[first:, first:], known.labels[first:]
+    pairs = [
+        (a, b) for a, label in enumerate(labels) if label.startswith("scanner") for b in range(len(labels)) if a != b
+    ]
+    return pd.DataFrame(
+        [(labels[a], labels[b], rho[a, b]) for a, b in pairs], columns=["parameter_a", "parameter_b", "rho"]
+    )
+
+
+def above_figure(result: Simultaneous) -> Figure:
+    """By how much points lie above the cloud's surface, over the ground: before, and after."""
+    figure = new_figure(10.0, 4.6)
+    points = np.asarray(result.adjusted.unknowns.points)[result.points]
+    panels = figure.subplots(1, 2, sharex=True, sharey=True)
+    for axes, values, title in zip(panels, (result.apart_before, result.apart), ("before", "after"), strict=True):
+        limit = float(np.nanpercentile(np.abs(values), 95)) or 1.0
+        shown = axes.scatter(*points[:, :2].T, c=values, cmap="RdBu_r", vmin=-limit, vmax=limit, s=18, edgecolor="0.6")
+        axes.set_title(f"{title}: RMSE {float(np.sqrt(np.nanmean(values**2))):.3f} m")
+        axes.set_aspect("equal")
+        axes.set_xlabel("X (m)")
+        figure.colorbar(shown, ax=axes, label="point above the surface (m)", shrink=0.8)
+    panels[0].set_ylabel("Y (m)")
+    return figure
+
+
+def heights_figure(control: LidarControl) -> Figure:
+    """Where heights are control, and where they were refused; residuals of those that are."""
+    figure = new_figure(10.0, 4.6)
+    points = np.asarray(control.adjusted.unknowns.points)[control.points]
+    left, right = figure.subplots(1, 2, sharex=True, sharey=True)
+    refused = ~np.isfinite(control.height)
+    for chosen, label, colour in (
+        (control.used, "control", "tab:blue"),
+        (~control.used & ~refused, "left out", "tab:red"),
+        (refused, "refused", "0.6"),
+    ):
+        left.scatter(*points[chosen, :2].T, s=14, c=colour, label=f"{label} ({chosen.sum()})")
+    left.legend(loc="best", fontsize="small")
+    left.set_title("heights of the cloud")
+    off = (control.height - points[:, 2])[control.used]
+    limit = float(np.percentile(np.abs(off), 95)) or 1.0
+    shown = right.scatter(*points[control.used, :2].T, c=off, cmap="RdBu_r", vmin=-limit, vmax=limit, s=18)
+    right.set_title(f"cloud - adjusted: RMSE {np.sqrt((off**2).mean()):.3f} m")
+    for axes in (left, right):
+        axes.set_aspect("equal")
+        axes.set_xlabel("X (m)")
+    left.set_ylabel("Y (m)")
+    figure.colorbar(shown, ax=right, label="m", shrink=0.8)
+    return figure
+
+
+@contextmanager
+def write_simultaneous(result: Simultaneous, directory: Path, seconds: dict[str, float]) -> Iterator[Path]:
+    """Tables of rounds, moves, surfaces and correlations, a picture, summary.json, and the adjustment's own folder.
+
+    Yields the folder while it is not yet in its place, for what else belongs there. Raises InputError where `directory`
+    holds something that is not an earlier result.
+    """
+    began = time.perf_counter()
+    with made_whole(directory) as work:
+        tables = Tables(result.adjusted)
+        verdict, times = warnings_of(tables), result.adjusted.seconds
+        write_results(tables, verdict, work / "adjustment", {name: times[name] for name in _ORDER})
+        rounds_table(result.rounds).to_csv(work / "rounds.csv", index=False)
+        moved_table(result).to_csv(work / "moved.csv", index=False)
+        surfaces_table(result).to_csv(work / "surfaces.csv", index=False)
+        scanner_correlations(result.adjusted).to_csv(work / "scanner_correlation.csv", index=False)
+        above_figure(result).savefig(work / "above.png")
+        summary = summary_of(tables, verdict, seconds | {"write": time.perf_counter() - began})
+        write_summary(summary | {"rounds": len(result.rounds), "came_to_rest": result.still}, work)
+        yield work
+
+
+def print_rounds(rounds: Sequence[Round], still: bool, console: Console) -> None:
+    """What the rounds came to, in two sentences."""
+    last = rounds[-1]
+    end = "nothing changes any more" if still else "it still changes: ask for more rounds"
+    console.print(
+        f"{len(rounds)} rounds, {end} (largest change {last.largest_change:.2g} standard deviations); "
+        f"{last.observed} observations of the cloud, {last.left_out} left out",
+        highlight=False,
+        soft_wrap=True,
+    )
+    console.print(f"points lie on the cloud's surface with an RMSE of {last.rmse_m:.3f} m", highlight=False)
+
+
+def print_moved(result: Simultaneous, console: Console) -> None:
+    """What moved and by how much, a line each."""
+    table = moved_table(result)
+    numbers = table[["before", "after", "moved", "sigma"]].to_numpy(float)
+    for what, unit, (before, after, moved, sigma) in zip(table["what"], table["unit"], numbers, strict=True):
+        known = f" from {before:.6g} to {after:.6g}" if np.isfinite(before) else ""
+        spread = f" (sigma {sigma:.2g})" if np.isfinite(sigma) else ""
+        console.print(f"  {what}:{known} by {moved:.4g} {unit}{spread}", highlight=False, markup=False)
+
+
+def _parameters(adjusted: Adjustment) -> dict[str, float]:
+    """All parameters that images share, free or not, by their paths."""
+    labels = structure_of(adjusted.block, uniform_priors(adjusted.unknowns, FREE)).labels
+    return dict(zip(labels, np.asarray(adjusted.values.shared).tolist(), strict=True))
+
+
+def _unit(label: str) -> tuple[float, str]:
+    """From jaxphoto's unit to that shown, and its name."""
+    if label.endswith("_rad"):
+        return 180 / np.pi, "deg"
+    return 1.0, next((unit for end, unit in _UNITS.items() if label.endswith(end)), "")

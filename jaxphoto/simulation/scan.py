@@ -1,0 +1,204 @@
+"""A cloud of laser points as a scanner measures it over ground, buildings and trees, with its trajectory and its truth.
+
+Every pulse goes from the scanner along a ray that turns with the aircraft. It ends at the roof or on the ground,
+whatever it meets first; what meets a wall gives no return, so that buildings throw shadows. On its way it may meet
+leaves.
+"""
+
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from jaxphoto.cloud import Cloud
+from jaxphoto.errors import BlockError
+from jaxphoto.georeferencing import Scanner, Trajectory
+from jaxphoto.rotation import small_rotation
+from jaxphoto.simulation.buildings import entered, solids
+from jaxphoto.simulation.nearby import pairs_along
+from jaxphoto.simulation.platform_path import Path, matrices
+from jaxphoto.simulation.scan_plan import ScanPlan
+from jaxphoto.simulation.streams import stream
+from jaxphoto.simulation.terrain import Terrain
+from jaxphoto.simulation.trees import met_leaves
+
+GROUND, VEGETATION, ROOF = 2, 5, 6
+"""Classes of LAS (ASPRS): ground, high vegetation, building."""
+_RATE_HZ = 100.0
+# Rays meet the ground to this (m) or, where it is too steep for them, not at all.
+_ENOUGH_M = 1e-7
+_ROUNDS = 60
+# Pulses worked on at once: bounds the memory.
+_CHUNK = 500_000
+
+
+class Scan(NamedTuple):
+    """A cloud as measured, the trajectory as GNSS and IMU gave it, and what is wrong with both."""
+
+    cloud: Cloud
+    trajectory: Trajectory
+    scanner: Scanner
+
+
+class _Returns(NamedTuple):
+    """Where pulses were reflected: which, how far along the ray (m), by what (class)."""
+
+    pulse: Int[np.ndarray, "returns"]
+    at: Float[np.ndarray, "returns"]
+    by: UInt8[np.ndarray, "returns"]
+
+
+def scan(
+    plan: ScanPlan,
+    paths: list[Path],
+    terrain: Terrain,
+    noise_m: Float[np.ndarray, "3"],
+    seed: int,
+) -> Scan:
+    """Scan `terrain`, which is drawn and settled, from the path of every strip; strips are called 1, 2 ... in turn.
+
+    The trajectory is off by the shift of each strip, and the rays by the boresight: with these, `corrected_point` of
+    every point is the point that was hit plus normal noise of `noise_m` (X, Y, Z). Raises BlockError where nothing
+    comes back.
+    """
+    shifts = [_shift(plan, path.strip, seed) for path in paths]
+    boresight = np.deg2rad(plan.boresight_deg)
+    body_from_scanner = np.asarray(_small_rotation(boresight))
+    leaves, noise = stream(seed, "laser returns from crowns"), stream(seed, "noise of laser points")
+    parts = []
+    for number, path in enumerate(paths):
+        n = round(plan.density_per_m2 * 2 * plan.half_width * path.height_m * path.length_m)
+        for begin in range(0, n, _CHUNK):
+            pulses = np.arange(begin, min(begin + _CHUNK, n))
+            time, across = _pattern(plan, path, pulses, n)
+            parts.append(
+                _measured(path, time, across, terrain, body_from_scanner, shifts[number], noise_m, leaves, noise)
+            )
+            parts[-1]["strip"] = np.full(len(parts[-1]["time"]), number)
+    if not sum(len(part["time"]) for part in parts):
+        raise BlockError("no laser pulse reaches the ground; raise density_per_m2, or scan longer strips over it")
+    of_points = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    # Numbers, because files of clouds have nothing else.
+    names = tuple(f"{number + 1}" for number in range(len(paths)))
+    truth = Scanner(boresight, dict(zip(names, shifts, strict=True)))  # type: ignore[arg-type]
+    return Scan(Cloud(**of_points, strips=names), _trajectory(paths, shifts), truth)
+
+
+def _shift(plan: ScanPlan, strip: str, seed: int) -> Float[np.ndarray, "3"]:
+    drawn = stream(seed, f"shift of lidar strip {strip}").standard_normal(3)
+    return plan.shift_of(strip) + np.array(plan.shift_sigma_m) * drawn
+
+
+def _pattern(
+    plan: ScanPlan, path: Path, pulses: Int[np.ndarray, "n"], of: int
+) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+    """Time (s) of pulses, and the tangent of their scan angle: lines as far apart on level ground as their pulses are.
+
+    A line runs from left to right, as those of a turning mirror.
+    """
+    per_line = max(1, round(2 * plan.half_width * path.height_m * np.sqrt(plan.density_per_m2)))
+    begin, end = path.node[[0, -1]]
+    time = begin + (pulses + 0.5) / of * (end - begin)
+    return time, plan.half_width * (2 * (pulses % per_line + 0.5) / per_line - 1)
+
+
+def _measured(
+    path: Path,
+    time: Float[np.ndarray, "n"],
+    across: Float[np.ndarray, "n"],
+    terrain: Terrain,
+    body_from_scanner: Float[np.ndarray, "3 3"],
+    shift: Float[np.ndarray, "3"],
+    noise_m: Float[np.ndarray, "3"],
+    leaves: np.random.Generator,
+    noise: np.random.Generator,
+) -> dict[str, np.ndarray]:
+    """The fields of the cloud of some pulses, in the order of time and returns."""
+    origin, quaternion = path.pose(time)
+    object_from_body = matrices(quaternion)
+    # The scanner believes that its axes are those of the body.
+    believed = np.column_stack([across, 0 * across, -np.ones(len(across))])
+    believed /= np.linalg.norm(believed, axis=1, keepdims=True)
+    ray = _rotated(object_from_body, believed @ body_from_scanner.T)
+    returns = _returned(origin, ray, terrain, leaves)
+    order = np.lexsort((returns.at, returns.pulse))
+    pulse, at, by = (a[order] for a in returns)
+    _, first, of_pulse, count = np.unique(pulse, return_index=True, return_inverse=True, return_counts=True)
+    number = np.arange(len(pulse)) - first[of_pulse] + 1
+    # As `corrected_point` has it, resolved for the point of the file; noise is that of the corrected point.
+    hit = ray[pulse] * at[:, None] + noise.standard_normal((len(pulse), 3)) * noise_m
+    body_from_object = object_from_body[pulse].transpose(0, 2, 1)
+    as_believed = _rotated(object_from_body[pulse], _rotated(body_from_object, hit) @ body_from_scanner)
+    return {
+        "xyz": origin[pulse] + shift + as_believed,
+        "classification": by,
+        "returns": np.column_stack([number, count[of_pulse]]).astype(np.uint8),
+        "time": time[pulse],
+    }
+
+
+def _returned(
+    origin: Float[np.ndarray, "n 3"], ray: Float[np.ndarray, "n 3"], terrain: Terrain, rng: np.random.Generator
+) -> _Returns:
+    ground = _ground(origin, ray, terrain)
+    roof = wall = np.full(len(ray), np.inf)
+    if terrain.buildings:
+        roof, wall = _built(origin, ray, ground, terrain)
+    end = np.minimum(np.minimum(ground, roof), wall)
+    seen = np.isfinite(ground)
+    met = met_leaves(terrain.trees, origin, ray, np.where(seen, end, 0.0), rng)
+    last = np.flatnonzero(seen & (wall > end) & ~met.stopped)
+    by_last = np.where(roof[last] <= ground[last], ROOF, GROUND)
+    by = np.concatenate([np.full(len(met.pulse), VEGETATION), by_last]).astype(np.uint8)
+    return _Returns(np.concatenate([met.pulse, last]), np.concatenate([met.at, end[last]]), by)
+
+
+def _ground(origin: np.ndarray, ray: np.ndarray, terrain: Terrain) -> Float[np.ndarray, "n"]:
+    """How far along each ray the ground is: the height at the last place, until it stays; else infinity."""
+    at = np.full(len(ray), np.nan)
+    z = terrain.height(origin[:, :2])
+    left, down = np.arange(len(ray)), -ray[:, 2]
+    for _ in range(_ROUNDS):
+        way = (origin[left, 2] - z) / down[left]
+        now = terrain.height(origin[left, :2] + way[:, None] * ray[left, :2])
+        done = np.abs(now - z) < _ENOUGH_M
+        at[left[done]] = way[done]
+        left, z = left[~done], now[~done]
+        if not len(left):
+            break
+    return np.where(at > 0, at, np.inf)
+
+
+def _built(
+    origin: np.ndarray, ray: np.ndarray, ground: np.ndarray, terrain: Terrain
+) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+    """How far along each ray the first building is entered by its roof, and by a wall."""
+    planes = solids(terrain.buildings)
+    seen = np.flatnonzero(np.isfinite(ground))
+    hit = origin[seen] + ground[seen, None] * ray[seen]
+    which, place = pairs_along(hit, ray[seen], planes.centre, planes.radius, planes.top)
+    pulse = seen[place]
+    by_roof, by_wall = entered(planes, which, origin[pulse], ray[pulse])
+    roof, wall = (np.full(len(ray), np.inf) for _ in range(2))
+    np.minimum.at(roof, pulse, by_roof)
+    np.minimum.at(wall, pulse, by_wall)
+    return roof, wall
+
+
+def _trajectory(paths: list[Path], shifts: list[np.ndarray]) -> Trajectory:
+    """As recorded: `_RATE_HZ` records a second from begin to end of every path, off by the shift of its strip."""
+    ends = [(path.node[0], path.node[-1]) for path in paths]
+    times = [np.linspace(begin, end, int(np.ceil((end - begin) * _RATE_HZ)) + 1) for begin, end in ends]
+    poses = [path.pose(time) for path, time in zip(paths, times, strict=True)]
+    position = np.vstack([x + shift for shift, (x, _) in zip(shifts, poses, strict=True)])
+    exact = np.zeros((len(position), 3))
+    quaternion = np.vstack([q for _, q in poses])
+    return Trajectory(np.concatenate(times), position, quaternion, exact, exact)  # type: ignore[arg-type]
+
+
+def _rotated(matrix: Float[np.ndarray, "n 3 3"], vector: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    return np.einsum("nij,nj->ni", matrix, vector)
+
+
+_small_rotation = jax.jit(small_rotation)

@@ -1,0 +1,38 @@
+"""The laser scanner as planned: which strips, how wide and how dense, and what is wrong with its georeferencing."""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxphoto.simulation.flight_plan import Strip
+
+Triple = tuple[float, float, float]
+_ZERO = (0.0, 0.0, 0.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class ScanPlan:
+    """A scanner that sweeps across the track, line after line, `scan_angle_deg` to either side of the body's nadir.
+
+    `density_per_m2` is that of the pulses of one strip on level ground at the mean height of the terrain. It scans the
+    flight's own strips, or `strips` of a flight of its own. `boresight_deg` (about the body's right, forward and up
+    axes) is the true misalignment; the true shift of a strip is that of `shift_m`, by its name or "default", plus a
+    normal one of `shift_sigma_m`: by so much the trajectory of the strip, and so its points, are off.
+    """
+
+    density_per_m2: float
+    scan_angle_deg: float = 20.0
+    strips: tuple[Strip, ...] = ()
+    boresight_deg: Triple = _ZERO
+    shift_m: dict[str, Triple] = dataclasses.field(default_factory=dict)
+    shift_sigma_m: Triple = _ZERO
+
+    @property
+    def half_width(self) -> float:
+        """Of the swath, as part of the height above ground: the tangent of the scan angle."""
+        return float(np.tan(np.deg2rad(self.scan_angle_deg)))
+
+    def shift_of(self, strip: str) -> Float[np.ndarray, "3"]:
+        """What the plan says of a strip's shift (m), without chance."""
+        return np.array(self.shift_m.get(strip, self.shift_m.get("default", _ZERO)))

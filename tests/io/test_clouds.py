@@ -1,0 +1,633 @@
+"""Clouds: LAS, LAZ, CSV and PLY, their systems and units, filters, and what is said of those that cannot be used."""
+
+import warnings
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pytest
+from pyproj import CRS, Transformer
+
+from jaxphoto import InputError
+from jaxphoto.block import Frame
+from jaxphoto.cloud import Cloud
+from jaxphoto.io import clouds
+from jaxphoto.io.clouds import source as chunked
+
+LOCAL, GRID = Frame("local"), Frame("grid")
+ORIGIN = (-51.0, -25.0, 100.0)
+UTM = Frame("epsg", 32722, None, "true", ORIGIN)
+FT, US_FT = 0.3048, 1200 / 3937
+
+
+def sample(n=1000, seed=2, middle=(500_000.0, 7_234_000.0, 900.0)):
+    """A cloud about `middle`, to the millimetre, so that every format holds it exactly."""
+    rng = np.random.default_rng(seed)
+    xyz = np.round(rng.uniform(-200, 200, (n, 3)), 3) + middle
+    of = rng.integers(1, 4, n)
+    return Cloud(
+        xyz,
+        classification=rng.choice([1, 2, 5, 6], n).astype(np.uint8),
+        returns=np.stack([rng.integers(1, of + 1), of], axis=1).astype(np.uint8),
+        time=rng.uniform(0, 1000, n),
+        strip=rng.integers(0, 3, n),
+        strips=("11", "12", "14"),
+    )
+
+
+def write_las(path, xyz, crs=None, scale=0.001, vlrs=(), **fields):
+    """A LAS or LAZ file by laspy alone, coordinates as they are."""
+    header = laspy.LasHeader(point_format=fields.pop("point_format", 6), version="1.4")
+    header.scales, header.offsets = [scale] * 3, np.floor(xyz.mean(axis=0))
+    if crs is not None:
+        header.add_crs(CRS(crs))
+    header.vlrs.extend(vlrs)
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = xyz.T
+    for name, values in fields.items():
+        setattr(las, name, values)
+    las.write(path)
+    return path
+
+
+def same(a, b, tolerance=1e-9):
+    assert a.strips == b.strips
+    np.testing.assert_allclose(a.xyz, b.xyz, rtol=0, atol=tolerance)
+    for name in ("classification", "returns", "time", "strip"):
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+
+
+@pytest.fixture(autouse=True)
+def small_chunks(monkeypatch):
+    """Chunks that several of make up a file."""
+    for module in ("las", "ply", "table", "writer"):
+        monkeypatch.setattr(f"jaxphoto.io.clouds.{module}.CHUNK", 300)
+    assert chunked.CHUNK > 10_000
+
+
+@pytest.mark.parametrize("name", ["c.las", "c.laz", "c.csv", "c.ply"])
+def test_what_is_written_is_read(tmp_path, name):
+    cloud = sample()
+    clouds.write_cloud(cloud, tmp_path / name)
+    read = clouds.read_cloud(tmp_path / name, LOCAL)
+    same(read, Cloud(read.xyz, cloud.classification, cloud.returns, cloud.time, read.strip, read.strips))
+    np.testing.assert_allclose(read.xyz, cloud.xyz, rtol=0, atol=1e-9)
+    assert [read.strips[k] for k in read.strip] == [cloud.strips[k] for k in cloud.strip]
+    np.testing.assert_allclose(clouds.extent(tmp_path / name), cloud.extent, atol=1e-9)
+    assert [p.name for p in tmp_path.iterdir()] == [name]
+
+
+def test_what_a_file_does_not_tell_is_none(tmp_path):
+    bare = Cloud(sample(50).xyz)
+    for name in ("c.csv", "c.ply"):
+        clouds.write_cloud(bare, tmp_path / name)
+        read = clouds.read_cloud(tmp_path / name)
+        assert (read.classification, read.returns, read.time, read.strip, read.strips) == (None, None, None, None, ())
+    old = write_las(tmp_path / "old.las", bare.xyz, point_format=0)
+    assert clouds.read_cloud(old).time is None
+
+
+@pytest.mark.parametrize("returns", ["all", "first", "last", "only"])
+@pytest.mark.parametrize("classes", [None, [2], [5, 6]])
+def test_filters(tmp_path, returns, classes):
+    cloud = sample()
+    clouds.write_cloud(cloud, tmp_path / "c.laz")
+    west_south, east_north = cloud.xyz[:, :2].min(axis=0) + 50, cloud.xyz[:, :2].max(axis=0) - 80
+    read = clouds.read_cloud(
+        tmp_path / "c.laz", classes=classes, returns=returns, within=np.array([west_south, east_north])
+    )
+    number, of = cloud.returns.T
+    kept = ((cloud.xyz[:, :2] >= west_south) & (cloud.xyz[:, :2] <= east_north)).all(axis=1)
+    kept &= np.isin(cloud.classification, classes or range(256))
+    kept &= {"all": number > 0, "first": number == 1, "last": number == of, "only": of == 1}[returns]
+    assert 0 < kept.sum() < len(cloud)
+    np.testing.assert_allclose(read.xyz, cloud.xyz[kept], atol=1e-9)
+    np.testing.assert_array_equal(read.time, cloud.time[kept])
+    parts = list(clouds.cloud_chunks(tmp_path / "c.laz", classes=classes, returns=returns))
+    assert max(map(len, parts)) <= 300
+
+
+def test_strips_without_points_are_left_out(tmp_path):
+    cloud = sample()
+    classification = np.where(cloud.strip == 1, 2, 1).astype(np.uint8)
+    clouds.write_cloud(Cloud(cloud.xyz, classification, strip=cloud.strip, strips=cloud.strips), tmp_path / "c.las")
+    read = clouds.read_cloud(tmp_path / "c.las", classes=[2])
+    assert read.strips == ("12",) and not read.strip.any() and len(read) == (cloud.strip == 1).sum()
+
+
+def test_withheld_points_are_left_out(tmp_path):
+    cloud = sample(500)
+    withheld = np.arange(500) % 3 == 0
+    path = write_las(tmp_path / "c.las", cloud.xyz, withheld=withheld)
+    np.testing.assert_allclose(clouds.read_cloud(path).xyz, cloud.xyz[~withheld], atol=1e-9)
+    clouds.write_cloud(clouds.read_cloud(path), tmp_path / "d.las", like=path)
+    np.testing.assert_allclose(laspy.read(tmp_path / "d.las").xyz, cloud.xyz[~withheld], atol=1e-9)
+
+
+# Units and systems
+
+
+@pytest.mark.parametrize(
+    ("crs", "plane", "height"),
+    [
+        ("EPSG:32722", 1.0, 1.0),
+        ("EPSG:2994", FT, FT),
+        ("EPSG:2264", US_FT, US_FT),
+        ("EPSG:6557+6360", FT, US_FT),
+        ("EPSG:32610+6360", 1.0, US_FT),
+        ("EPSG:2264+5703", US_FT, 1.0),
+        (None, 1.0, 1.0),
+    ],
+)
+def test_units_are_those_of_the_system(tmp_path, crs, plane, height):
+    xyz = sample(100, middle=(600_000.0, 800_000.0, 400.0)).xyz
+    path = write_las(tmp_path / "c.las", xyz, crs)
+    np.testing.assert_allclose(clouds.read_cloud(path).xyz, xyz * [plane, plane, height], rtol=1e-15, atol=1e-9)
+    # What the user says counts for all.
+    np.testing.assert_allclose(clouds.read_cloud(path, unit="us_ft").xyz, xyz * US_FT, rtol=1e-15, atol=1e-9)
+    if crs is not None:
+        system = clouds.cloud_system(path)
+        assert {axis.unit_name for axis in system.plane.axis_info} == {"metre"}
+        place = Transformer.from_crs(CRS(crs).to_2d(), CRS(crs).geodetic_crs.to_2d(), always_xy=True)
+        here = Transformer.from_crs(system.plane, system.plane.geodetic_crs, always_xy=True)
+        np.testing.assert_allclose(here.transform(*(xyz * plane)[0, :2]), place.transform(*xyz[0, :2]), atol=1e-11)
+
+
+def geo_keys(**keys):
+    """The GeoTIFF directory of these key numbers."""
+    rows = [(1, 1, 0, len(keys)), *((int(k[1:]), 0, 1, v) for k, v in sorted(keys.items()))]
+    return laspy.VLR("LASF_Projection", 34735, "", np.array(rows, "<u2").tobytes())
+
+
+@pytest.mark.parametrize(
+    ("keys", "plane", "height"),
+    [
+        ({"k3072": 2264}, US_FT, US_FT),
+        ({"k3072": 32722, "k4099": 9003}, 1.0, US_FT),
+        ({"k3072": 2994, "k4096": 5703}, FT, 1.0),
+        ({"k3072": 2994, "k4096": 5703, "k4099": 9002}, FT, FT),
+        ({"k3072": 32767, "k3076": 9003}, US_FT, US_FT),
+        ({"k3076": 9002, "k4099": 9001}, FT, 1.0),
+    ],
+)
+def test_units_of_geotiff_keys(tmp_path, keys, plane, height):
+    xyz = sample(100, middle=(600_000.0, 800_000.0, 400.0)).xyz
+    path = write_las(tmp_path / "c.las", xyz, vlrs=[geo_keys(**keys)], point_format=3)
+    np.testing.assert_allclose(clouds.read_cloud(path).xyz, xyz * [plane, plane, height], rtol=1e-15, atol=1e-9)
+
+
+def topocentric(longitude, latitude, height, origin=ORIGIN):
+    """Local east, north, up on GRS 80's WGS 84, by the textbook."""
+    a, f = 6378137.0, 1 / 298.257223563
+    square = f * (2 - f)
+
+    def geocentric(lon, lat, h):
+        lon, lat = np.deg2rad(lon), np.deg2rad(lat)
+        n = a / np.sqrt(1 - square * np.sin(lat) ** 2)
+        return np.stack(
+            [
+                (n + h) * np.cos(lat) * np.cos(lon),
+                (n + h) * np.cos(lat) * np.sin(lon),
+                (n * (1 - square) + h) * np.sin(lat),
+            ]
+        )
+
+    away = (geocentric(longitude, latitude, height).T - geocentric(*origin)).T
+    lon, lat = np.deg2rad(origin[:2])
+    east = [-np.sin(lon), np.cos(lon), 0]
+    north = [-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)]
+    up = [np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)]
+    return (np.array([east, north, up]) @ away).T
+
+
+def test_into_the_frame_of_a_block(tmp_path):
+    """The same places in UTM, in the neighbour zone and in degrees come to the same local points."""
+    cloud = sample()
+    utm = Transformer.from_crs(32722, 4326, always_xy=True)
+    longitude, latitude = utm.transform(*cloud.xyz[:, :2].T)
+    truth = topocentric(longitude, latitude, cloud.xyz[:, 2])
+    path = write_las(tmp_path / "utm.laz", cloud.xyz, "EPSG:32722")
+    read = clouds.read_cloud(path, UTM)
+    np.testing.assert_allclose(read.xyz, truth, rtol=0, atol=1e-6)
+    ends = clouds.extent(path, UTM)
+    assert (ends[0] <= read.extent[0] + 1e-3).all() and (ends[1] >= read.extent[1] - 1e-3).all()
+    assert np.abs(ends - read.extent).max() < 20
+    neighbour = np.stack([*Transformer.from_crs(32722, 32723, always_xy=True).transform(*cloud.xyz[:, :2].T)], axis=1)
+    path = write_las(tmp_path / "other.laz", np.column_stack([neighbour, cloud.xyz[:, 2]]), "EPSG:32723", 1e-4)
+    np.testing.assert_allclose(clouds.read_cloud(path, UTM).xyz, truth, rtol=0, atol=3e-4)
+    degrees = np.column_stack([longitude, latitude, cloud.xyz[:, 2]])
+    clouds.write_cloud(Cloud(degrees), tmp_path / "degrees.csv")
+    np.testing.assert_allclose(
+        clouds.read_cloud(tmp_path / "degrees.csv", UTM, epsg=4326).xyz, truth, rtol=0, atol=1e-6
+    )
+    # A grid is taken as it stands.
+    np.testing.assert_allclose(clouds.read_cloud(tmp_path / "utm.laz", GRID).xyz, cloud.xyz, atol=1e-9)
+    # Heights that count in feet are metres before they are heights.
+    feet = write_las(tmp_path / "feet.las", cloud.xyz / [1, 1, US_FT], "EPSG:32722", 1e-4, vlrs=[])
+    las = laspy.read(feet)
+    las.header.vlrs = laspy.vlrs.vlrlist.VLRList([geo_keys(k3072=32722, k4099=9003)])
+    las.header.global_encoding.wkt = False
+    las.write(feet)
+    np.testing.assert_allclose(clouds.read_cloud(feet, UTM).xyz, truth, rtol=0, atol=1e-4)
+
+
+def test_a_foot_system_comes_to_a_metric_block(tmp_path):
+    frame = Frame("epsg", 2993, None, "true", (-123.0, 44.0, 0.0))
+    metres = sample(middle=(194_000.0, 258_800.0, 130.0)).xyz
+    path = write_las(tmp_path / "ft.laz", metres / FT, "EPSG:2994", 1e-4)
+    np.testing.assert_allclose(clouds.read_cloud(path, frame).xyz, frame.map.local(metres), rtol=0, atol=1e-4)
+
+
+def test_datums_without_a_known_way_are_warned_of(tmp_path):
+    path = write_las(tmp_path / "c.las", sample(middle=(194_000.0, 258_800.0, 130.0)).xyz, "EPSG:2993")
+    with pytest.warns(UserWarning, match="taken to be the same"):
+        clouds.read_cloud(path, Frame("epsg", 26910, None, "true", (-123.0, 44.0, 0.0)))
+
+
+@pytest.mark.parametrize("frame", [None, UTM])
+def test_written_like_another_file(tmp_path, frame):
+    """Coordinates change, and nothing else: units, scale, system and extra dimensions stay."""
+    crs, unit = ("EPSG:2264", US_FT) if frame is None else ("EPSG:32722", 1.0)
+    cloud = sample()
+    xyz = cloud.xyz / unit
+    header = laspy.LasHeader(point_format=7, version="1.4")
+    header.scales, header.offsets = [0.001] * 3, np.floor(xyz.mean(axis=0))
+    header.add_crs(CRS(crs))
+    header.add_extra_dim(laspy.ExtraBytesParams("amplitude", "f4"))
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = xyz.T
+    las.classification, las.gps_time = cloud.classification, cloud.time
+    las["amplitude"] = np.arange(len(cloud), dtype="f4")
+    las.red = np.arange(len(cloud), dtype="u2")
+    las.write(tmp_path / "a.laz")
+    read = clouds.read_cloud(tmp_path / "a.laz", frame)
+    moved = Cloud(read.xyz + np.array([0.5, -0.25, 0.125]), read.classification, read.returns, read.time)
+    clouds.write_cloud(moved, tmp_path / "b.laz", like=tmp_path / "a.laz", frame=frame)
+    new = laspy.read(tmp_path / "b.laz")
+    np.testing.assert_array_equal(new["amplitude"], las["amplitude"])
+    np.testing.assert_array_equal(new.red, las.red)
+    assert new.header.parse_crs() == las.header.parse_crs()
+    np.testing.assert_array_equal(new.header.scales, las.header.scales)
+    np.testing.assert_allclose(clouds.read_cloud(tmp_path / "b.laz", frame).xyz, moved.xyz, atol=0.6e-3 * unit)
+    if frame is None:
+        np.testing.assert_allclose(new.xyz * unit, moved.xyz, atol=0.6e-3 * unit)
+    with pytest.raises(InputError, match=r"500 points.*1000"):
+        clouds.write_cloud(moved.take(np.arange(500)), tmp_path / "c.laz", like=tmp_path / "a.laz", frame=frame)
+    with pytest.raises(InputError, match=r"2000 points.*1000"):
+        clouds.write_cloud(moved.take(np.arange(2000) % 1000), tmp_path / "c.laz", like=tmp_path / "a.laz", frame=frame)
+    assert not (tmp_path / "c.laz").exists()
+
+
+def test_written_in_the_system_of_the_frame(tmp_path):
+    truth = sample()
+    local = Cloud(UTM.map.local(truth.xyz))
+    for name in ("c.laz", "c.csv", "c.ply"):
+        clouds.write_cloud(local, tmp_path / name, frame=UTM)
+        read = clouds.read_cloud(tmp_path / name, epsg=None if name == "c.laz" else 32722)
+        np.testing.assert_allclose(read.xyz, truth.xyz, rtol=0, atol=0.6e-3)
+    assert laspy.read(tmp_path / "c.laz").header.parse_crs().to_epsg() == 32722
+
+
+# Real data
+
+
+def test_real_strip_in_international_feet(data_dir):
+    path = data_dir / "lidar" / "autzen_trim.laz"
+    las = laspy.read(path)
+    read = clouds.read_cloud(path)
+    assert len(read) == 110_000
+    np.testing.assert_allclose(read.xyz, np.stack([las.x, las.y, las.z], axis=1) * FT, rtol=0, atol=1e-9)
+    np.testing.assert_array_equal(read.classification, las.classification)
+    np.testing.assert_array_equal(read.time, las.gps_time)
+    assert read.strips == ("7326",)
+    assert len(clouds.read_cloud(path, classes=[2])) == 26_107
+    frame = Frame("epsg", 26910, None, "true", (-123.07, 44.05, 0.0))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        placed = clouds.read_cloud(path, frame)
+    # Distances are those of the ground: the two projections' scales there differ by parts in ten thousand.
+    a, b = np.random.default_rng(0).integers(0, len(read), (2, 500))
+    ours, file = (np.linalg.norm(c.xyz[a] - c.xyz[b], axis=1) for c in (placed, read))
+    assert np.abs(ours / file - 1)[file > 50].max() < 5e-4
+
+
+def test_real_files_are_the_same_packed_or_not(data_dir):
+    las, laz = (clouds.read_cloud(data_dir / "lidar" / f"simple.{kind}") for kind in ("las", "laz"))
+    same(las, laz)
+    assert len(las) == 1065 and len(las.strips) == 9
+
+
+def test_real_feet_without_a_system_are_recognised(data_dir):
+    path = data_dir / "lidar" / "simple.las"
+    within = np.array([[193_800.0, 258_800.0], [194_700.0, 260_100.0]])
+    with pytest.raises(
+        InputError, match=r"X 635619\.8 to 638982\.6.*X 193800\.0.*--cloud-unit ft or --cloud-unit us_ft"
+    ):
+        clouds.read_cloud(path, LOCAL, within=within)
+    assert len(clouds.read_cloud(path, LOCAL, within=within, unit="ft"))
+
+
+# What cannot be used
+
+
+def complaint(path, frame=None, **options):
+    with pytest.raises(InputError) as said:
+        clouds.read_cloud(path, frame, **options)
+    message = str(said.value)
+    assert "\n" not in message and Path(path).name.split(".")[0] in message
+    return message
+
+
+@pytest.mark.parametrize("kind", ["las", "laz"])
+def test_cut_off_at_any_byte(tmp_path, kind):
+    clouds.write_cloud(sample(2000), tmp_path / f"c.{kind}")
+    whole = (tmp_path / f"c.{kind}").read_bytes()
+    cut = tmp_path / f"cut.{kind}"
+    for length in [1, 3, 4, 50, 104, 226, 300, 374, *np.linspace(380, len(whole) - 1, 25).astype(int)]:
+        cut.write_bytes(whole[:length])
+        assert "cut off" in complaint(cut) or "no points" in complaint(cut)
+    cut.write_bytes(b"")
+    complaint(cut)
+
+
+@pytest.mark.parametrize("kind", ["las", "laz"])
+@pytest.mark.parametrize("promised", [2001, 50_000, 4_000_000_000])
+def test_fewer_points_than_promised(tmp_path, kind, promised):
+    clouds.write_cloud(sample(2000), tmp_path / f"c.{kind}")
+    content = bytearray((tmp_path / f"c.{kind}").read_bytes())
+    content[247:255] = promised.to_bytes(8, "little")
+    (tmp_path / f"c.{kind}").write_bytes(content)
+    message = complaint(tmp_path / f"c.{kind}")
+    assert "cut off" in message or ("memory" in message and kind == "laz" and promised > 1e9)
+
+
+def test_points_outside_the_header_show_damage(tmp_path):
+    path = write_las(tmp_path / "c.las", sample(500).xyz)
+    content = bytearray(path.read_bytes())
+    content[-30 * 100 + 3] ^= 0x40
+    path.write_bytes(content)
+    assert "outside the extent" in complaint(path)
+
+
+def test_damaged_bytes_never_show_a_bare_error(tmp_path):
+    clouds.write_cloud(sample(2000), tmp_path / "c.laz")
+    whole = (tmp_path / "c.laz").read_bytes()
+    rng = np.random.default_rng(7)
+    for _ in range(60):
+        content = bytearray(whole)
+        at = rng.integers(0, len(whole)) if rng.random() < 0.5 else rng.integers(0, 600)
+        content[at] ^= int(rng.integers(1, 256))
+        (tmp_path / "d.laz").write_bytes(content)
+        try:
+            clouds.read_cloud(tmp_path / "d.laz")
+        except InputError as error:
+            assert "\n" not in str(error)
+
+
+def test_files_that_are_none(tmp_path):
+    assert "no file" in complaint(tmp_path / "none.las")
+    assert "folder" in complaint(tmp_path)
+    (tmp_path / "c.xyz").write_text("1 2 3\n")
+    assert ".laz" in complaint(tmp_path / "c.xyz")
+    (tmp_path / "c.las").write_text("no cloud at all " * 50)
+    complaint(tmp_path / "c.las")
+    laspy.LasData(laspy.LasHeader(point_format=6, version="1.4")).write(tmp_path / "empty.las")
+    assert "no points" in complaint(tmp_path / "empty.las")
+    (tmp_path / "empty.csv").write_text("X_m,Y_m,Z_m\n")
+    assert "no points" in complaint(tmp_path / "empty.csv")
+    with pytest.raises(InputError, match="no points"):
+        clouds.extent(tmp_path / "empty.csv")
+
+
+def test_systems_that_do_not_fit(tmp_path):
+    xyz = sample().xyz
+    bare, utm = write_las(tmp_path / "bare.las", xyz), write_las(tmp_path / "utm.las", xyz, "EPSG:32722")
+    degrees = write_las(tmp_path / "deg.las", xyz * 0 + [-51.0, -25.0, 900.0], "EPSG:4326", 1e-7)
+    assert "--cloud-epsg" in complaint(bare, UTM)
+    assert "frame is local" in complaint(utm, LOCAL)
+    assert "degrees" in complaint(degrees)
+    assert "degrees" in complaint(degrees, GRID)
+    assert "99999 is unknown" in complaint(bare, UTM, epsg=99999)
+    assert "no map or geographic system" in complaint(bare, epsg=4978)
+    assert "'yard' is unknown" in complaint_of_unit(bare)
+    assert "does not reach" in complaint(utm, UTM, epsg=4326)
+    assert "does not reach" in complaint(utm, UTM, epsg=4326, within=np.array([[-1e3, -1e3], [1e3, 1e3]]))
+    # EGM96 needs a geoid; where it is on this computer, it lifts the points by metres.
+    egm = write_las(tmp_path / "egm.las", xyz, "EPSG:32722+5773")
+    flat = clouds.read_cloud(egm, UTM, epsg=32722).xyz
+    try:
+        assert np.abs(clouds.read_cloud(egm, UTM).xyz[:, 2] - flat[:, 2]).min() > 1
+    except InputError as error:
+        assert "egm.las: the heights of EPSG:5773" in str(error) and "geoid" in str(error)
+
+
+@pytest.mark.parametrize(("unit", "metres"), [('UNIT["foot",0.3048]', FT), ('UNIT["metre",1]', 1.0)])
+def test_a_named_local_system_tells_its_unit(tmp_path, unit, metres):
+    wkt = f'LOCAL_CS["site",LOCAL_DATUM["site",0],{unit},AXIS["X",EAST],AXIS["Y",NORTH]]'
+    path = write_las(tmp_path / "site.las", sample().xyz, wkt)
+    np.testing.assert_allclose(clouds.read_cloud(path, LOCAL).xyz, sample().xyz * metres, rtol=1e-15, atol=1e-9)
+
+
+def test_a_system_that_proj_does_not_know(tmp_path):
+    path = write_las(tmp_path / "c.las", sample().xyz, vlrs=[laspy.VLR("LASF_Projection", 2112, "", b"nonsense")])
+    assert "PROJ does not know; name it yourself (--cloud-epsg)" in complaint(path)
+    assert len(clouds.read_cloud(path, UTM, epsg=32722)) == 1000
+
+
+def test_records_after_the_points_are_kept(tmp_path):
+    """A system may stand there as well, and is written again."""
+    las = laspy.read(write_las(tmp_path / "c.laz", sample().xyz))
+    las.evlrs = laspy.vlrs.vlrlist.VLRList(
+        [laspy.VLR("LASF_Projection", 2112, "", CRS(2994).to_wkt().encode() + b"\0")]
+    )
+    las.write(tmp_path / "c.laz")
+    read = clouds.read_cloud(tmp_path / "c.laz")
+    np.testing.assert_allclose(read.xyz, sample().xyz * FT, rtol=1e-15, atol=1e-9)
+    clouds.write_cloud(read, tmp_path / "d.laz", like=tmp_path / "c.laz")
+    np.testing.assert_allclose(clouds.read_cloud(tmp_path / "d.laz").xyz, read.xyz, atol=1e-9)
+
+
+@pytest.mark.parametrize("place", [100, 243], ids=["before", "after"])
+def test_more_records_than_there_is_room_for(tmp_path, place):
+    clouds.write_cloud(sample(100), tmp_path / "c.laz")
+    content = bytearray((tmp_path / "c.laz").read_bytes())
+    content[place : place + 4] = (4_000_000_000).to_bytes(4, "little")
+    (tmp_path / "c.laz").write_bytes(content)
+    assert "counts more records" in complaint(tmp_path / "c.laz")
+
+
+def test_coordinates_that_a_scale_cannot_count(tmp_path):
+    path = write_las(tmp_path / "c.las", sample().xyz)
+    far = Cloud(sample().xyz + np.array([1e7, 0, 0]))
+    with pytest.raises(InputError, match=r"c\.las counts in 0\.001"):
+        clouds.write_cloud(far, tmp_path / "d.las", like=path)
+
+
+def complaint_of_unit(path):
+    with pytest.raises(InputError) as said:
+        clouds.read_cloud(path, unit="yard")
+    return str(said.value)
+
+
+@pytest.mark.parametrize("name", ["c.las", "c.csv", "c.ply"])
+def test_beside_the_block(tmp_path, name):
+    cloud = sample(middle=(600_000.0, 800_000.0, 0.0))
+    clouds.write_cloud(Cloud(cloud.xyz), tmp_path / name)
+    away = np.array([[0.0, 0.0], [1000.0, 2000.0]])
+    (x0, y0, _), (x1, y1, _) = cloud.extent
+    message = complaint(tmp_path / name, LOCAL, within=away)
+    assert f"X {x0:.1f} to {x1:.1f}, Y {y0:.1f} to {y1:.1f} m" in message
+    assert "X 0.0 to 1000.0, Y 0.0 to 2000.0 m" in message and "unit" not in message
+    for unit, factor in (("ft", FT), ("us_ft", US_FT)):
+        middle = np.array([600_000.0, 800_000.0]) * factor
+        message = complaint(tmp_path / name, LOCAL, within=np.array([middle - 100, middle + 100]))
+        assert f"--cloud-unit {unit}" in message
+    message = complaint(tmp_path / name, LOCAL, within=cloud.extent[:, :2], unit="ft")
+    assert "--cloud-unit m)" in message or "--cloud-unit m " in message
+
+
+def test_filters_that_leave_nothing_say_what_there_is(tmp_path):
+    cloud = sample()
+    clouds.write_cloud(cloud, tmp_path / "c.laz")
+    message = complaint(tmp_path / "c.laz", classes=[3, 9])
+    counts = np.bincount(cloud.classification)
+    assert "class 3, 9" in message and f"{counts[2]} of class 2" in message and f"{counts[6]} of class 6" in message
+    clouds.write_cloud(cloud.take(cloud.returns[:, 0] > 1), tmp_path / "d.laz")
+    message = complaint(tmp_path / "d.laz", returns="first", classes=[2])
+    n = ((cloud.returns == [2, 3]).all(axis=1)).sum()
+    assert f"{n} of return 2 of 3" in message and "of class 2" in message
+    clouds.write_cloud(Cloud(cloud.xyz), tmp_path / "bare.csv")
+    assert "no classification" in complaint(tmp_path / "bare.csv", classes=[2])
+    assert "no numbers of returns" in complaint(tmp_path / "bare.csv", returns="last")
+    with pytest.raises(InputError, match=r"'every' are unknown"):
+        clouds.read_cloud(tmp_path / "c.laz", returns="every")
+
+
+# Tables and PLY
+
+
+def test_tables_as_spreadsheets_write_them(tmp_path):
+    path = tmp_path / "c.csv"
+    path.write_text(
+        "# survey\n\nstrip;X_m; Y_m;Z_m;note\nnorth;1,5;2,5;3,25;a\n\n# more\nsouth;4,5;5,5;6,5;\n", "utf-8-sig"
+    )
+    read = clouds.read_cloud(path)
+    np.testing.assert_array_equal(read.xyz, [[1.5, 2.5, 3.25], [4.5, 5.5, 6.5]])
+    assert read.strips == ("north", "south") and read.strip.tolist() == [0, 1]
+
+
+@pytest.mark.parametrize(
+    ("row", "says"),
+    [
+        ("1.0,two,3.0,2", "row 404: Y_m is 'two'"),
+        ("1.0,,3.0,2", "row 404: Y_m is empty"),
+        ("1.0,nan,3.0,2", "row 404: Y_m is 'nan'"),
+        ("1.0,2.0,inf,2", "row 404: Z_m is 'inf'"),
+        ("1.0,2.0", "row 404: Z_m is empty"),
+        ("1.0,2.0,3.0,2,5", "row 404: 5 cells"),
+        ("1.0,2.0,3.0,300", "row 404: classification is 300"),
+        ("1.0,2.0,3.0,2.5", "row 404: classification is 2.5"),
+    ],
+)
+def test_a_faulty_row_is_named(tmp_path, row, says):
+    """Beyond the first chunk, after a comment and an empty line."""
+    rows = ["X_m,Y_m,Z_m,classification", "# a comment", "", *["1.0,2.0,3.0,2"] * 400, row, "1.0,2.0,3.0,2"]
+    (tmp_path / "c.csv").write_text("\n".join(rows))
+    assert f"c.csv, {says}" in complaint(tmp_path / "c.csv")
+
+
+def test_tables_that_are_none(tmp_path):
+    path = tmp_path / "c.csv"
+    for text, says in (("", "is empty"), ("X_m,Y_m\n1,2\n", "Z_m is missing"), ("x y z\n1 2 3\n", "X_m is missing")):
+        path.write_text(text)
+        assert says in complaint(path)
+    for rows in (0, 3000):
+        path.write_bytes(b"X_m,Y_m,Z_m\n" + b"1,2,3\n" * rows + b"\xff\xfe,2,3\n")
+        assert "UTF-8" in complaint(path)
+
+
+PLY = """ply
+format {} 1.0
+comment made by hand
+obj_info nothing
+element vertex {}
+property float nx
+property {} x
+property {} y
+property {} z
+property uchar scalar_Classification
+element face 1
+property list uchar int vertex_indices
+end_header
+"""
+
+
+@pytest.mark.parametrize("order", ["ascii", "binary_little_endian", "binary_big_endian"])
+@pytest.mark.parametrize("kind", ["float", "double"])
+def test_ply_of_all_kinds(tmp_path, order, kind):
+    xyz = np.round(sample(700, middle=(100.0, 200.0, 50.0)).xyz, 2)
+    classes = np.arange(700) % 7
+    path = tmp_path / "c.ply"
+    header = PLY.format(order, 700, kind, kind, kind).encode()
+    sign = ">" if "big" in order else "<"
+    if order == "ascii":
+        lines = [f"0.5 {x!r} {y!r} {z!r} {c}" for (x, y, z), c in zip(xyz.tolist(), classes, strict=True)]
+        path.write_bytes(header + "\n".join([*lines, "3 0 1 2", ""]).encode())
+    else:
+        number = sign + ("f4" if kind == "float" else "f8")
+        fields = [("nx", sign + "f4"), ("x", number), ("y", number), ("z", number), ("c", "u1")]
+        records = np.zeros(700, fields)
+        records["x"], records["y"], records["z"] = xyz.T
+        records["c"] = classes
+        path.write_bytes(header + records.tobytes() + b"\x03" + np.array([0, 1, 2], sign + "i4").tobytes())
+    read = clouds.read_cloud(path)
+    tolerance = 0.0 if kind == "double" or order == "ascii" else 1e-5 * 3
+    np.testing.assert_allclose(read.xyz, xyz, rtol=0, atol=tolerance)
+    np.testing.assert_array_equal(read.classification, classes)
+    # Cut off, and with a vertex that is nowhere.
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) * 2 // 3])
+    complaint(path)
+    assert order == "ascii" or "cut off" in complaint(path)
+    xyz[456, 1] = np.nan
+    clouds.write_cloud(Cloud(xyz), path)
+    assert "vertex 457" in complaint(path)
+
+
+def test_ply_in_text_names_the_row(tmp_path):
+    path = tmp_path / "c.ply"
+    header = (
+        "ply\nformat ascii 1.0\nelement vertex 3\nproperty double x\nproperty double y\nproperty double z\nend_header\n"
+    )
+    path.write_text(header + "1 2 3\n4 five 6\n7 8 9\n")
+    assert "row 9" in complaint(path)
+    path.write_text(header + "1 2 3\n4 5 6\n")
+    assert "promises 3 points, but there are 2" in complaint(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("solid\n", "does not begin"),
+        ("ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n", "no vertices with x, y and z"),
+        ("ply\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n", "no format"),
+        ("ply\nformat ascii 1.0\nelement vertex 1\nproperty list uchar int x\n", "row 4"),
+        ("ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float y\nproperty float z\nend_header\n",
+         "no points"),
+        ("ply\nformat ascii 1.0\n", "does not end"),
+        ("ply\nformat ascii 1.0\nelement face 1\nproperty list uchar int v\nelement vertex 1\nproperty float x\n"
+         "property float y\nproperty float z\nend_header\n", "vertices first"),
+    ],
+)  # fmt: skip
+def test_ply_headers_that_are_none(tmp_path, text, says):
+    (tmp_path / "c.ply").write_text(text)
+    assert says in complaint(tmp_path / "c.ply")
+
+
+def test_names_that_no_cloud_has(tmp_path):
+    cloud = sample(10)
+    with pytest.raises(InputError, match=r"\.laz"):
+        clouds.write_cloud(cloud, tmp_path / "c.txt")
+    clouds.write_cloud(cloud, tmp_path / "c.csv")
+    with pytest.raises(InputError, match="both must be"):
+        clouds.write_cloud(cloud, tmp_path / "d.las", like=tmp_path / "c.csv")
