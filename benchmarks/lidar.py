@@ -16,6 +16,7 @@ from machine import forget_peak, machine, markdown, memory, run_here, sentence, 
 _DENSITY = 2.0  # points per square metre
 _METHODS = ("idw", "plane", "tin", "local")
 _NEIGHBOURS = 8
+_FEATURES = 10_000
 
 
 def main() -> None:
@@ -62,6 +63,19 @@ def _heights(method: str, n_points: int, n_places: int) -> dict:
     return _measured(lambda: index_cloud(xyz), lambda grid: heights_at(grid, places, method))  # type: ignore[arg-type]
 
 
+def _pseudo_control(name: str, n_points: int, n_places: int) -> dict:
+    from jaxphoto import Brown, ExteriorOrientation, InteriorOrientation
+    from jaxphoto.lidar import index_cloud, pseudo_control_points
+
+    xyz, _ = cloud_and_places(n_points, 1)
+    camera, middle = InteriorOrientation(34.0, 0.06, 0.27, Brown(k1=-9e-5, k2=1e-7)), np.sqrt(n_points / _DENSITY) / 2
+    image = ExteriorOrientation.from_angles(np.array([middle, middle, 1000.0]), np.array([0.01, -0.02, 0.3]))
+    xy = np.random.default_rng(11).uniform(-11, 11, (_FEATURES, 2))
+    return _measured(
+        lambda: index_cloud(xyz), lambda grid: np.asarray(pseudo_control_points(camera, image, xy, grid).xyz)
+    )
+
+
 def _tree(name: str, n_points: int, n_places: int) -> dict:
     from scipy.spatial import cKDTree
 
@@ -93,6 +107,7 @@ def _measured(index: Callable, heights: Callable) -> dict:
 # What is measured, each in a process of its own.
 _WORK: dict[str, Callable[[str, int, int], dict]] = {
     **dict.fromkeys(_METHODS, _heights),
+    "pseudo control of 10,000 features": _pseudo_control,
     "SciPy's cKDTree, idw without sigma": _tree,
 }
 

@@ -1,9 +1,15 @@
 """Laser points: their index, and what is known of the ground from them."""
 
+from jaxphoto.lidar.block_control import BlockControl, pseudo_control_of_block
 from jaxphoto.lidar.grid import Grid, Nearest, around, index_cloud, nearest
 from jaxphoto.lidar.height_settings import HeightFlag, HeightSettings
 from jaxphoto.lidar.heights import Heights, heights_at
+from jaxphoto.lidar.planes import Plane, fit_plane, plane_distance, plane_feet
+from jaxphoto.lidar.pseudo_control import PseudoControl, pseudo_control_points
+from jaxphoto.lidar.roofs import Patch, planar_patches, ridge_line, roof_centroid
 
 __all__ = [
-    "Grid", "HeightFlag", "HeightSettings", "Heights", "Nearest", "around", "heights_at", "index_cloud", "nearest",
+    "BlockControl", "Grid", "HeightFlag", "HeightSettings", "Heights", "Nearest", "Patch", "Plane", "PseudoControl",
+    "around", "fit_plane", "heights_at", "index_cloud", "nearest", "planar_patches", "plane_distance", "plane_feet",
+    "pseudo_control_of_block", "pseudo_control_points", "ridge_line", "roof_centroid",
 ]  # fmt: skip

@@ -10,7 +10,7 @@ where b is the bias: of weights that do not reproduce a slope or a curve, and of
 averages a curve. It is known with a variance of its own, t^2, and counts as far as it stands out from that: the error
 is taken for normal,
 
-    N(k b, s^2),    k = max(0, 1 - 1.5 t^2 / b^2),    s^2 = |w - k c A|^2 v + k (1 - k) t^2 + roughness
+    N(k b, s^2),    k = max(0, 1 - 2 t^2 / b^2),    s^2 = |w - k c A|^2 v + k (1 - k) t^2 + roughness
 
 where c b is the bias per coefficient. The standard deviation given is that of the normal distribution about zero within
 whose 1.96 sigma lie 95 % of it, just as of the true one.
@@ -71,7 +71,7 @@ def height_sigma(
 
 _ONE_IN_TWENTY = 1.645
 # Variances by which a bias must stand out, to count at all.
-_DOUBT = 1.5
+_DOUBT = 2.0
 
 
 def normal_equivalent(mean: Float[Array, ""], sigma: Float[Array, ""]) -> Float[Array, ""]:

@@ -117,11 +117,11 @@ def _of_house(
 ) -> list[Patch]:
     """The patches of points that hang together; `near` are the neighbours of each, -1 where they are not among them."""
     members: list[np.ndarray] = []
-    free = np.ones(len(xyz), bool)
+    free, scaled = np.ones(len(xyz), bool), xyz / sigma
     seeds = np.random.default_rng(0).permutation(np.flatnonzero(even))
     while len(seeds):
         starts = [found[(found >= 0) & free[found]] for found in near[seeds[:_TRIED]]]
-        grown, _ = _faces(xyz, [_grown(xyz, start, free, graph, sigma) for start in starts], least, sigma)
+        grown, _ = _faces(xyz, [_grown(scaled, start, free, graph) for start in starts], least, sigma)
         if grown:
             found = max(grown, key=len)
             members.append(found)
@@ -168,23 +168,19 @@ def _unevenness(around: np.ndarray, sigma: np.ndarray) -> np.ndarray:
     return np.linalg.eigvalsh(np.swapaxes(scaled, 1, 2) @ scaled)[:, 0] / (around.shape[1] - 3)
 
 
-def _grown(
-    xyz: np.ndarray, seed: np.ndarray, free: np.ndarray, graph: csr_matrix, sigma: np.ndarray
-) -> Int[np.ndarray, "n"]:
-    """The free points that a patch grows to from `seed`; none where that is no plane."""
+def _grown(scaled: np.ndarray, seed: np.ndarray, free: np.ndarray, graph: csr_matrix) -> Int[np.ndarray, "n"]:
+    """The free points that a patch grows to from `seed`; `scaled` are all, in standard deviations of X, Y and Z."""
     patch = seed
     for _ in range(_ROUNDS):
         if len(patch) < 4:
             break
-        try:
-            plane = _plane(xyz[patch], sigma)
-        except InputError:  # on a line
-            return patch[:0]
-        near = np.flatnonzero(free & (np.abs(_scaled_distance(xyz, plane, sigma)) < _CUT))
+        off = scaled - scaled[patch].mean(axis=0)
+        _, axes = np.linalg.eigh(off[patch].T @ off[patch])
+        near = np.flatnonzero(free & (np.abs(off @ axes[:, 0]) < _CUT))
         _, part = connected_components(graph[near][:, near], directed=False)
         largest = np.bincount(part[np.isin(near, patch)], minlength=1)
         new = near[part == np.argmax(largest)] if len(near) else near
-        if len(new) == len(patch) and (new == patch).all():
+        if np.array_equal(new, patch):
             break
         patch = new
     return patch

@@ -72,7 +72,7 @@ def first_met(
 ) -> tuple[Float[Array, "2"], Bool[Array, ""]]:
     """X and Y (m) of the first place, from the camera downwards, where a cell is as high as the ray; and if any is.
 
-    By steps of half a cell in plan, so it is off by so much. A ray that does not go down meets nothing.
+    By steps of half a cell in plan, so it is off by a quarter. A ray that does not go down meets nothing.
     """
     down = direction[2] < 0
     run = direction[:2] / jnp.where(down, direction[2], -1.0)
@@ -87,7 +87,8 @@ def first_met(
 
     high = jnp.minimum(sky.high, origin[2])
     z = jax.lax.while_loop(lambda z: (z > sky.low) & (top(z) < z), lambda z: z - step, jnp.where(down, high, sky.low))
-    return origin[:2] + run * (z - origin[2]), down & (top(z) >= z)
+    # Passed by half a step, on average.
+    return origin[:2] + run * (jnp.minimum(z + step / 2, high) - origin[2]), down & (top(z) >= z)
 
 
 def levels(

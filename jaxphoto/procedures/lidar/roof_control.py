@@ -62,7 +62,7 @@ def roof_control(
 ) -> RoofControl:
     """Adjust `block` with its tie points (or the `points` named) that lie on a roof face of `cloud` held on its plane.
 
-    The others have control heights (`lidar_control`, by planes). Roofs are laser points of class 6; of a cloud without
+    All others have control heights (`lidar_control`, by planes). Roofs are laser points of class 6; of a cloud without
     classes all points are looked at, level ground among them. Points named in `centroids` were measured at the middle
     of a roof face, and become control in X, Y and Z. The standard deviation of a point on a plane is the plane's there.
 
@@ -72,7 +72,7 @@ def roof_control(
     settings = HeightSettings() if settings is None else settings
     which, middles = tie_points(block, points), tie_points(block, centroids) if centroids else np.zeros(0, int)
     which = np.setdiff1d(which, middles)
-    heights = lidar_control(block, cloud, "plane", settings, points=points, max_rounds=max_rounds, report=report)
+    heights = lidar_control(block, cloud, "plane", settings, max_rounds=max_rounds, report=report)
     first = heights.adjusted
     places = np.asarray(first.unknowns.points)
     patches = _patches(cloud, places[np.concatenate([which, middles])], settings)

@@ -24,6 +24,8 @@ Less may never come: with each move some laser point becomes a neighbour, and an
 """
 # A point farther from the surface, in standard deviations, is no point of it; it is tried again in the next round.
 _OUTLIER = 4.0
+# In one round only those are left out that are so near to the largest.
+_LARGEST = 0.5
 # After this round, because before it the orientation may be far off; and after that one with a last word.
 _JUDGED, _SETTLED = 2, 5
 # Observations that differ by less, in standard deviations, are the same; after so many rounds nobody looks again.
@@ -172,7 +174,9 @@ def _fit(
     points = np.einsum("ni,nij,nj->n", seen.normal, np.asarray(known.points)[seen.point], seen.normal)
     w = np.where(seen.usable, np.abs(seen.apart(adjusted)) / np.sqrt(seen.sigma**2 + points), 0.0)
     w[used] = np.abs(v) / np.sqrt(np.maximum(r, LEAST_CHECKED))
-    return w <= _OUTLIER
+    # The largest first: they spoil the others.
+    limit = _OUTLIER * max(1.0, float(adjusted.sigma0))
+    return w <= max(limit, _LARGEST * w.max(initial=0.0))
 
 
 def _change(old: Adjustment, new: Adjustment, known: Covariance) -> float:
