@@ -17,6 +17,7 @@ from jaxphoto.cloud import Cloud
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import Scanner
 from jaxphoto.io import clouds, read_block, write_block
+from jaxphoto.io.block_folder.layout import TOML
 from jaxphoto.io.tables import is_number
 from jaxphoto.io.trajectory import read_records, write_flight_csv
 from jaxphoto.io.trajectory.in_frame import trajectory_in, with_positions
@@ -70,6 +71,7 @@ def lidar_control_command(
         raise InputError(f"--method {method} is no method: choose one of {', '.join(METHODS)}")
     settings = _settings(sigma_z_m, sigma_xy_m, sigma_systematic_m)
     chosen, errors = class_numbers(classes), Console(stderr=True)
+    _check_out(block, out)
     with errors.status("reading the block") as status:
         read = read_block(block)
         status.update("reading the cloud")
@@ -77,10 +79,11 @@ def lidar_control_command(
         report = _reporter(errors, status.update)
         found = lidar_control(read, points, method, settings, max_rounds=max_rounds, report=report)  # type: ignore[arg-type]
         status.update(f"writing {out}")
+        heights, rounds, figure = heights_table(found), rounds_table(found.rounds), heights_figure(found)
         write_block(found.block, out)
-        heights_table(found).to_csv(out / "lidar_heights.csv", index=False)
-        rounds_table(found.rounds).to_csv(out / "lidar_rounds.csv", index=False)
-        heights_figure(found).savefig(out / "lidar_heights.png")
+        heights.to_csv(out / "lidar_heights.csv", index=False)
+        rounds.to_csv(out / "lidar_rounds.csv", index=False)
+        figure.savefig(out / "lidar_heights.png")
     console = Console()
     print_rounds(found.rounds, found.still, console)
     refused = ", ".join(
@@ -112,6 +115,7 @@ def roof_control_command(
 ) -> None:
     """Hold tie points on the planes of roof faces, and centroids of roofs in X, Y and Z; write the block with it."""
     settings, chosen, errors = _settings(sigma_z_m, sigma_xy_m, 0.0), class_numbers(classes), Console(stderr=True)
+    _check_out(block, out)
     with errors.status("reading the block") as status:
         read = read_block(block)
         status.update("reading the cloud")
@@ -138,7 +142,10 @@ def simultaneous_command(
     trajectory: Annotated[
         Path | None, typer.Option(help="Trajectory of the scanner (docs/trajectory.md), on the cloud's clock.")
     ] = None,
-    boresight: Annotated[str, typer.Option(help="Of the scanner: free, fixed, or its sigma in degrees.")] = "free",
+    trajectory_shift_s: Annotated[float, typer.Option(help="Cloud's time + this is the trajectory's.")] = 0.0,
+    boresight: Annotated[
+        str | None, typer.Option(help="Of the scanner: free (with a trajectory), fixed, or its sigma in degrees.")
+    ] = None,
     shift: Annotated[
         str, typer.Option(help="Of each lidar strip: free, fixed, or its sigma in m.")
     ] = f"{SHIFT_SIGMA:g}",
@@ -160,17 +167,22 @@ def simultaneous_command(
     if method not in SURFACES:
         raise InputError(f"--method {method} is no method: choose one of {', '.join(SURFACES)}")
     settings = _settings(sigma_z_m, sigma_xy_m, sigma_systematic_m)
-    turn = _prior("--boresight", boresight if trajectory is not None else "fixed", np.pi / 180)
+    if trajectory is None and boresight not in (None, "fixed"):
+        raise InputError(f"--boresight {boresight} needs --trajectory, which says from where each point was measured")
+    turn = _prior("--boresight", boresight or ("fixed" if trajectory is None else "free"), np.pi / 180)
     slide, chosen, errors = _prior("--shift", shift, 1.0), class_numbers(classes), Console(stderr=True)
     check_target(out)
     began = time.perf_counter()
     with errors.status("reading the block") as status:
         read = read_block(block)
         records = read_records(trajectory) if trajectory is not None else None
+        if records is not None:
+            # On the cloud's clock from here on.
+            records = records._replace(time=records.time - trajectory_shift_s)
         path = None
         if records is not None:
-            unknown = np.zeros((len(records.time), 3))
-            path = trajectory_in(records, read.frame, unknown, unknown)
+            exact = np.zeros((len(records.time), 3))
+            path = trajectory_in(records, read.frame, exact, exact)
         status.update("reading the cloud")
         said = {"epsg": cloud_epsg, "unit": cloud_unit}
         whole = surface = clouds.read_cloud(cloud, read.frame, **said)  # type: ignore[arg-type]
@@ -192,9 +204,11 @@ def simultaneous_command(
         corrected = result.cloud if surface is whole else correct_cloud(whole, result.scanner, path)
         like = cloud if cloud.suffix.lower() in (".las", ".laz") else None
         with write_simultaneous(result, out, seconds) as folder:
-            clouds.write_cloud(corrected, folder / cloud.name, like=like, frame=read.frame, **said)  # type: ignore[arg-type]
+            name = cloud.name if like is not None else f"corrected_{cloud.name}"
+            clouds.write_cloud(corrected, folder / name, like=like, frame=read.frame, **said)  # type: ignore[arg-type]
             if records is not None and result.trajectory is not None:
                 moved = with_positions(records, np.asarray(result.trajectory.position), read.frame)
+                moved = moved._replace(time=moved.time + trajectory_shift_s)
                 write_flight_csv(moved, folder / "trajectory.csv")
     console = Console()
     print_rounds(result.rounds, result.still, console)
@@ -202,6 +216,14 @@ def simultaneous_command(
     console.print(f"results in {out}", highlight=False)
     if not result.still:
         raise typer.Exit(1)
+
+
+def _check_out(block: Path, out: Path) -> None:
+    """Raise InputError where a block must not be written."""
+    if out.resolve() == block.resolve():
+        raise InputError(f"--out {out} is the block itself: name another folder, or the block would lose what it was")
+    if out.is_dir() and any(out.iterdir()) and not (out / TOML).is_file():
+        raise InputError(f"{out} is not empty and holds no block: name a new folder")
 
 
 def _settings(sigma_z_m: float, sigma_xy_m: float, sigma_systematic_m: float) -> HeightSettings:

@@ -47,6 +47,14 @@ def scanner_poses(trajectory: Trajectory, time: Float[np.ndarray, "n"]) -> Scann
     return ScannerPoses(*(np.concatenate(v) for v in zip(*parts, strict=True)))
 
 
+def check_covered(trajectory: Trajectory, time: Float[np.ndarray, "n"]) -> None:
+    """Raise BlockError for laser points at times (s) that the trajectory does not cover, gaps between records aside."""
+    known = np.asarray(trajectory.time)
+    outside = int(((time < known[0]) | (time > known[-1])).sum())
+    if outside:
+        raise _not_covered(trajectory, time, outside)
+
+
 def corrected_xyz(
     xyz: Float[np.ndarray, "n 3"],
     poses: ScannerPoses | None,
@@ -74,9 +82,11 @@ def correct_cloud(cloud: Cloud, scanner: Scanner, trajectory: Trajectory | None)
     """
     xyz = np.array(cloud.xyz)
     turned = trajectory is not None and bool(np.any(np.asarray(scanner.boresight)))
-    for own, shift in _strips(cloud, scanner):
-        poses = scanner_poses(trajectory, cloud.time[own]) if turned and cloud.time is not None else None  # type: ignore[arg-type]
-        xyz[own] = corrected_xyz(cloud.xyz[own], poses, scanner.boresight, shift)
+    for strip, shift in _strips(cloud, scanner):
+        for first in range(0, len(strip), _PORTION):
+            own = strip[first : first + _PORTION]
+            poses = scanner_poses(trajectory, cloud.time[own]) if turned and cloud.time is not None else None  # type: ignore[arg-type]
+            xyz[own] = corrected_xyz(cloud.xyz[own], poses, scanner.boresight, shift)
     return dataclasses.replace(cloud, xyz=xyz)
 
 
@@ -109,9 +119,9 @@ def _strips(cloud: Cloud, scanner: Scanner) -> list[tuple[np.ndarray, np.ndarray
 def _not_covered(trajectory: Trajectory, time: np.ndarray, n: int) -> BlockError:
     known = np.asarray(trajectory.time)
     return BlockError(
-        f"{n} laser points or more were measured where the trajectory has no records: the points at {time.min():.3f} "
+        f"{n} laser points were measured where the trajectory has no records: the points at {time.min():.3f} "
         f"to {time.max():.3f} s, the trajectory from {known[0]:.3f} to {known[-1]:.3f} s; give the trajectory of this "
-        "flight, with times on the cloud's clock"
+        "flight on the cloud's clock (--trajectory-shift-s)"
     )
 
 

@@ -26,6 +26,8 @@ _OUTSIDE = 1e-3
 _AT_ONCE = 1_000_000
 # Low, medium and high vegetation, the classes of LAS.
 _VEGETATION = (3, 4, 5)
+# Ground, buildings, water and bridge decks.
+_SURFACES = (2, 6, 9, 17)
 # Beyond, a search is left to a tree.
 _REACH = 16
 
@@ -165,7 +167,11 @@ def _leafy(cloud: Cloud) -> np.ndarray:
     if cloud.classification is not None:
         leafy |= np.isin(cloud.classification, _VEGETATION)
     if cloud.returns is not None:
-        leafy |= cloud.returns[:, 1] > 1
+        several = cloud.returns[:, 1] > 1
+        if cloud.classification is not None:
+            # Through an open crown the last return is the ground, and its class says so.
+            several &= ~np.isin(cloud.classification, _SURFACES)
+        leafy |= several
     return leafy
 
 

@@ -58,7 +58,7 @@ def surface_model(
     """
     if statistic not in get_args(Statistic):
         raise InputError(f"the statistic {statistic!r} is unknown; choose one of {', '.join(get_args(Statistic))}")
-    if not cell_m > 0:
+    if not (np.isfinite(cell_m) and cell_m > 0):
         raise InputError(f"a cell has a positive size, got {cell_m:g} m; 1 to 2 times the distance of points is usual")
     first, last = np.floor(np.asarray(extent) / cell_m).astype(int)
     columns, rows = (last - first + 1).tolist()

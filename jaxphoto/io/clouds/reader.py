@@ -27,6 +27,8 @@ _OPENERS: dict[str, Callable[[Path, System | None], Source]] = {
     ".csv": open_csv,
     ".ply": open_ply,
 }
+NOISE = (7, 18)
+"""Classes of blunders, low and high, which are read only where they are asked for."""
 _FIELDS = ("xyz", "classification", "returns", "time", "strip")
 _NO_EXTENT = np.array([[np.inf] * 3, [-np.inf] * 3])
 
@@ -44,7 +46,8 @@ def read_cloud(
     """The cloud in a file .las, .laz, .csv or .ply, in the frame of a block.
 
     `frame` is that of the block (`Placement` says how points get there); without it, coordinates are the file's own in
-    metres. `classes` and `returns` choose points; `within` (least and greatest X, Y in m) keeps those over the block.
+    metres. `classes` (all but `NOISE`) and `returns` choose points; `within` (least and greatest X, Y in m) keeps those
+    over the block.
     `epsg` names the file's system in place of what it says itself, `unit` (m, ft, us_ft) what its coordinates count in.
 
     Memory holds the points that are kept and one chunk of the file. Raises InputError where the file is none, damaged
@@ -149,6 +152,8 @@ def _chosen(chunk: Cloud, classes: Collection[int] | None, returns: Returns, nam
         if chunk.classification is None:
             raise InputError(f"{name} has no classification, so no classes can be chosen; leave the filter out")
         chosen &= np.isin(chunk.classification, list(classes))
+    elif chunk.classification is not None:
+        chosen &= ~np.isin(chunk.classification, NOISE)
     if returns != "all":
         if chunk.returns is None:
             raise InputError(f"{name} has no numbers of returns, so none can be chosen; leave the filter out")

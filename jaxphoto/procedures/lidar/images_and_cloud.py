@@ -17,14 +17,16 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxphoto.adjustment import Adjustment
+from jaxphoto.arrays import Numbers
 from jaxphoto.block import Block, SurfaceRows
 from jaxphoto.cloud import Cloud
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import Scanner, Trajectory, raised_by_boresight
-from jaxphoto.lidar import HeightSettings, index_cloud, nearest
+from jaxphoto.lidar import Grid, HeightSettings, index_cloud, nearest
 from jaxphoto.lidar.correction import (
     ScannerPoses,
+    check_covered,
     correct_cloud,
     correct_trajectory,
     corrected_xyz,
@@ -32,7 +34,16 @@ from jaxphoto.lidar.correction import (
 )
 from jaxphoto.lidar.heights import Method
 from jaxphoto.lidar.tangent_planes import TangentPlanes, tangent_planes
-from jaxphoto.procedures.lidar.rounds import MAX_ROUNDS, Round, Seen, at_result, until_still, with_interior_held
+from jaxphoto.procedures.lidar.rounds import (
+    MAX_ROUNDS,
+    Round,
+    Seen,
+    at_result,
+    check_without_surfaces,
+    until_still,
+    with_common_error,
+    with_interior_held,
+)
 from jaxphoto.procedures.lidar.vertical_control import nothing_seen, tie_points
 from jaxphoto.statistics import Covariance
 from jaxphoto.unknowns import FIXED, FREE, Weighted
@@ -41,8 +52,9 @@ SURFACES = get_args(Method)
 """Names of the ways to a surface."""
 SHIFT_SIGMA = 0.3
 """Standard deviation (m) of a lidar strip's shift where nothing else is said of it."""
-# So many laser points of a strip around a tie point are all that its surface can depend on.
-_NEAR = 256
+# So many laser points of a strip around a tie point are all that its surface can depend on; and so many times those
+# that a height is made from.
+_NEAR, _TIMES = 400, 8
 
 
 class Simultaneous(eqx.Module):
@@ -71,10 +83,11 @@ class Simultaneous(eqx.Module):
 
 
 class _Strip(NamedTuple):
-    """The laser points of one strip near tie points, as measured, and where their scanner was."""
+    """The laser points of one strip as measured, and the trajectory that they were measured from."""
 
     cloud: Cloud
-    poses: ScannerPoses | None
+    grid: Grid
+    trajectory: Trajectory | None
 
 
 def simultaneous(
@@ -109,20 +122,23 @@ def simultaneous(
             "the boresight of the scanner needs its trajectory and the time of each laser point, which say from where "
             "a point was measured: give them, or hold the boresight fixed"
         )
+    check_without_surfaces(block)
+    if timed:
+        check_covered(trajectory, cloud.time)  # type: ignore[arg-type]
     which = tie_points(block, points)
     first = with_interior_held(block)
-    strips = _near(cloud, names, np.asarray(first.unknowns.points)[which], trajectory if timed else None)
+    strips = _strips(cloud, names, trajectory if timed else None)
     none: Scanner = jax.tree.map(np.asarray, Scanner(jnp.zeros(3), dict.fromkeys(names, jnp.zeros(3))))
     strip = np.repeat(np.arange(len(names)), len(which))
 
-    def planes(adjusted: Adjustment) -> list[TangentPlanes]:
+    def planes(adjusted: Adjustment) -> list[tuple[TangentPlanes, ScannerPoses | None]]:
         scanner = adjusted.unknowns.scanner or none
         xy = np.asarray(adjusted.unknowns.points)[which, :2]
         found = []
         for of, shift in zip(strips, scanner.shifts.values(), strict=True):
-            corrected = corrected_xyz(of.cloud.xyz, of.poses, scanner.boresight, shift)  # type: ignore[arg-type]
-            grid = index_cloud(dataclasses.replace(of.cloud, xyz=corrected))
-            found.append(tangent_planes(grid, xy, method, settings))
+            near, poses = _near(of, xy, scanner.boresight, shift, settings)
+            planes = tangent_planes(index_cloud(near), xy, method, settings)
+            found.append((planes, None if poses is None else jax.tree.map(lambda v, k=planes.nearest: v[k], poses)))
         return found
 
     last: dict[str, Any] = {}
@@ -130,17 +146,18 @@ def simultaneous(
     def look(adjusted: Adjustment) -> Seen:
         last["planes"] = planes(adjusted)
         foot, normal, sigma, flag = (
-            np.concatenate([getattr(p, name) for p in last["planes"]]) for name in ("foot", "normal", "sigma", "flag")
+            np.concatenate([getattr(p, name) for p, _ in last["planes"]])
+            for name in ("foot", "normal", "sigma", "flag")
         )
         usable = np.isfinite(foot).all(axis=1)
+        sigma = with_common_error(sigma, usable, settings.sigma_systematic_m)
         if not usable.any():
             raise nothing_seen(np.asarray(adjusted.unknowns.points)[which], cloud.xyz, flag)
         return Seen(np.tile(which, len(names)), foot, normal, sigma, usable)
 
     def build(adjusted: Adjustment, known: Covariance, seen: Seen, used: np.ndarray) -> Block:
         scanner = adjusted.unknowns.scanner or none
-        near = np.concatenate([p.nearest for p in last["planes"]])
-        last["turn"] = _turns(seen, strip, near, strips)
+        last["turn"] = _turns(seen, strip, [poses for _, poses in last["planes"]])
         rows = _surface_rows(seen, used, strip, last["turn"], scanner)
         unknowns = dataclasses.replace(adjusted.unknowns, scanner=scanner)
         posed = dataclasses.replace(block, surfaces=rows, priors=dataclasses.replace(block.priors, scanner=priors))
@@ -152,7 +169,7 @@ def simultaneous(
         raised = last["turn"] @ (np.asarray(new.boresight) - np.asarray(old.boresight))
         return seen._replace(foot=seen.foot - shift - raised[:, None] * seen.normal)
 
-    found = until_still(first, look, build, max_rounds, report, carry)
+    found = until_still(first, look, build, max_rounds, report, "surfaces", carry)
     scanner = found.adjusted.unknowns.scanner
     assert scanner is not None
     corrected, used = correct_cloud(cloud, scanner, trajectory if timed else None), found.used
@@ -173,36 +190,49 @@ def simultaneous(
     )
 
 
-def _near(
-    cloud: Cloud, names: tuple[str, ...], places: Float[np.ndarray, "n 3"], trajectory: Trajectory | None
-) -> list[_Strip]:
-    """What a surface at some places can depend on, strip by strip."""
+def _strips(cloud: Cloud, names: tuple[str, ...], trajectory: Trajectory | None) -> list[_Strip]:
+    """The cloud strip by strip."""
     strips = []
     for k, name in enumerate(names):
-        whole = cloud if cloud.strip is None else cloud.take(np.flatnonzero(cloud.strip == k))
-        if not len(whole):
+        own = cloud if cloud.strip is None else cloud.take(np.flatnonzero(cloud.strip == k))
+        if not len(own):
             raise InputError(
-                f"the strip {name} of the cloud has no points: leave it out, or read other classes and returns"
+                f"strip {name} of the cloud has no points: leave it out, or read other classes and returns"
             )
-        grid = index_cloud(whole.xyz)
-        around = nearest(grid, places[:, :2], min(_NEAR, len(whole))).index
-        own = whole.take(np.unique(np.asarray(grid.order)[around]))
-        poses = scanner_poses(trajectory, own.time) if trajectory is not None and own.time is not None else None
-        strips.append(_Strip(own, poses))
+        strips.append(_Strip(own, index_cloud(own.xyz), trajectory))
     return strips
 
 
-def _turns(
-    seen: Seen, strip: Int[np.ndarray, "rows"], near: Int[np.ndarray, "rows"], strips: list[_Strip]
-) -> Float[np.ndarray, "rows 3"]:
+def _near(
+    strip: _Strip,
+    xy: Float[np.ndarray, "n 2"],
+    boresight: Float[Numbers, "3"],
+    shift: Float[Numbers, "3"],
+    settings: HeightSettings,
+) -> tuple[Cloud, ScannerPoses | None]:
+    """The laser points, corrected, that the surface at some places can depend on, and where each was measured from."""
+
+    def corrected(index: Int[np.ndarray, "m"]) -> tuple[Cloud, ScannerPoses | None]:
+        own = strip.cloud.take(index)
+        timed = strip.trajectory is not None and own.time is not None
+        poses = scanner_poses(strip.trajectory, own.time) if timed else None  # type: ignore[arg-type]
+        return dataclasses.replace(own, xyz=corrected_xyz(own.xyz, poses, boresight, shift)), poses
+
+    order = np.asarray(strip.grid.order)
+    # Where the places were in the cloud as measured: as far off as the laser point there.
+    one = order[nearest(strip.grid, xy, 1).index[:, 0]]
+    off = strip.cloud.xyz[one, :2] - corrected(one)[0].xyz[:, :2]
+    enough = min(max(_NEAR, _TIMES * settings.points), len(strip.cloud))
+    return corrected(np.unique(order[nearest(strip.grid, xy + off, enough).index]))
+
+
+def _turns(seen: Seen, strip: Int[np.ndarray, "rows"], poses: list[ScannerPoses | None]) -> Float[np.ndarray, "rows 3"]:
     """`SurfaceRows.turn` of every row, used or not: as many in every round."""
     turn = np.zeros_like(seen.foot)
-    for k, one in enumerate(strips):
+    for k, one in enumerate(poses):
         own = strip == k
-        if one.poses is not None:
-            laser = near[own]
-            given = seen.foot[own], seen.normal[own], one.poses.position[laser], one.poses.object_from_body[laser]
-            turn[own] = call_compiled(_raised, *given)
+        if one is not None:
+            turn[own] = call_compiled(_raised, seen.foot[own], seen.normal[own], one.position, one.object_from_body)
     return turn
 
 

@@ -17,11 +17,18 @@ from scipy.spatial import KDTree
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.block import Block, Rows, SurfaceRows
 from jaxphoto.cloud import Cloud
-from jaxphoto.errors import BlockError
+from jaxphoto.errors import BlockError, InputError
 from jaxphoto.lidar import HeightSettings
 from jaxphoto.lidar.planes import plane_feet
 from jaxphoto.lidar.roofs import Patch, planar_patches, roof_centroid
-from jaxphoto.procedures.lidar.rounds import MAX_ROUNDS, Round, Seen, at_result, until_still
+from jaxphoto.procedures.lidar.rounds import (
+    MAX_ROUNDS,
+    Round,
+    Seen,
+    at_result,
+    check_without_surfaces,
+    until_still,
+)
 from jaxphoto.procedures.lidar.vertical_control import lidar_control, tie_points
 from jaxphoto.statistics import Covariance
 
@@ -31,6 +38,8 @@ BUILDING = 6
 _NEAR = 40.0
 # Laser points that make a roof.
 _LEAST = 20
+# What is farther from a plane (m) is not on it, with heights that are control already.
+_STOREY = 2.0
 
 
 class RoofControl(eqx.Module):
@@ -63,13 +72,15 @@ def roof_control(
     """Adjust `block` with its tie points (or the `points` named) that lie on a roof face of `cloud` held on its plane.
 
     All others have control heights (`lidar_control`, by planes). Roofs are laser points of class 6; of a cloud without
-    classes all points are looked at, level ground among them. Points named in `centroids` were measured at the middle
-    of a roof face, and become control in X, Y and Z. The standard deviation of a point on a plane is the plane's there.
+    classes (or with 0 and 1 only) all points are looked at, level ground among them. Points named in `centroids` were
+    measured at the middle of a roof face, and become control in X, Y and Z. The standard deviation of n points on one
+    plane is sqrt(n) times that of the plane there, which they share.
 
     Raises BlockError where no tie point lies on a roof, or a centroid on none; InputError for names that are no points;
     and as `jaxphoto.adjust`.
     """
     settings = HeightSettings() if settings is None else settings
+    check_without_surfaces(block)
     which, middles = tie_points(block, points), tie_points(block, centroids) if centroids else np.zeros(0, int)
     which = np.setdiff1d(which, middles)
     heights = lidar_control(block, cloud, "plane", settings, max_rounds=max_rounds, report=report)
@@ -93,7 +104,12 @@ def roof_control(
         foot, normal, sigma = np.full((len(which), 3), np.nan), np.full((len(which), 3), np.nan), np.ones(len(which))
         for k in np.unique(chosen[chosen >= 0]):
             own = chosen == k
-            foot[own], normal[own], sigma[own] = plane_feet(patches[k].plane, xyz[own])
+            foot[own], normal[own], of_plane = plane_feet(patches[k].plane, xyz[own])
+            # What a plane is off by is common to its points.
+            sigma[own] = of_plane * np.sqrt(own.sum())
+        # The yard between the wings of a house lies in the outline of its roof, too.
+        off = np.einsum("nk,nk->n", normal, xyz - foot)
+        chosen[~(np.abs(off) < _STOREY)] = -1
         return Seen(which, foot, normal, sigma, chosen >= 0)
 
     def build(adjusted: Adjustment, known: Covariance, seen: Seen, used: Bool[np.ndarray, "rows"]) -> Block:
@@ -105,7 +121,7 @@ def roof_control(
         )
         return at_result(dataclasses.replace(held, surfaces=rows), adjusted.unknowns)
 
-    found = until_still(first, look, build, max_rounds, report)
+    found = until_still(first, look, build, max_rounds, report, "surfaces")
     return RoofControl(
         at_result(found.adjusted.block, found.adjusted.unknowns),
         found.adjusted,
@@ -119,7 +135,8 @@ def roof_control(
 
 def _patches(cloud: Cloud, places: Float[np.ndarray, "n 3"], settings: HeightSettings) -> list[Patch]:
     """Roof faces near places; `Patch.index` counts the points of `cloud`."""
-    roofs = np.arange(len(cloud)) if cloud.classification is None else np.flatnonzero(cloud.classification == BUILDING)
+    told = cloud.classification is not None and bool(np.any(cloud.classification > 1))
+    roofs = np.flatnonzero(cloud.classification == BUILDING) if told else np.arange(len(cloud))
     if len(roofs):
         away, _ = KDTree(places[:, :2]).query(cloud.xyz[roofs, :2], distance_upper_bound=_NEAR)
         roofs = roofs[np.isfinite(away)]
@@ -150,6 +167,8 @@ def _centroid_rows(
     """Control in X, Y and Z of points at the middle of roof faces."""
     parts = [Rows.none()]
     for point, face in zip(points, _faces(places[points, :2], patches, 0.0), strict=True):
+        if point in block.control.who:
+            raise InputError(f"point {block.points[point]} is control already: leave it out of the centroids")
         if face < 0:
             raise BlockError(
                 f"point {block.points[point]} is to be the centroid of a roof, but the cloud has no roof face at X "

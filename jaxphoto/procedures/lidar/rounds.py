@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import numpy as np
@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.block import Block, Start
 from jaxphoto.collinearity import ExteriorOrientation
-from jaxphoto.errors import DatumError
+from jaxphoto.errors import BlockError, DatumError
 from jaxphoto.procedures.adjust import adjust
 from jaxphoto.statistics import LEAST_CHECKED, Covariance, angle_differences, covariance, redundancy_numbers
 from jaxphoto.unknowns import FIXED, Unknowns
@@ -30,6 +30,10 @@ _LARGEST = 0.5
 _JUDGED, _SETTLED = 2, 5
 # Observations that differ by less, in standard deviations, are the same; after so many rounds nobody looks again.
 _SAME, _LAST_LOOK = 0.5, 8
+# Part of the height over the cloud by which points may miss it at first: what a principal distance may be off by.
+_FAR = 0.1
+# Part of the observations that must fit at the end.
+_BORNE_OUT = 0.5
 
 
 class Round(NamedTuple):
@@ -85,15 +89,38 @@ def with_interior_held(block: Block) -> Adjustment:
     """`block` adjusted with the interior orientation held: where its points lie, as far as it knows by itself.
 
     Where its datum is open, as that of a strip whose stations lie on a line, exterior orientation is held as it begins,
-    from direct georeferencing: what the cloud adds may close the datum. Raises as `adjust`.
+    from direct georeferencing: what the cloud adds may close the datum. Raises as `adjust`, and BlockError where it
+    does not converge.
     """
     interior = jax.tree.map(lambda _: FIXED, block.start.unknowns.interior)
     held = dataclasses.replace(block.priors, interior=interior)
     try:
-        return adjust(block, priors=held)
+        found = adjust(block, priors=held)
     except DatumError:
         placed = ExteriorOrientation(FIXED, FIXED)  # type: ignore[arg-type]
-        return adjust(block, priors=dataclasses.replace(held, exterior=placed))
+        found = adjust(block, priors=dataclasses.replace(held, exterior=placed))
+    if not bool(found.converged):
+        raise BlockError(f"the block by itself, its interior orientation held, is {found.outcome.value}")
+    return found
+
+
+def check_without_surfaces(block: Block) -> None:
+    """Raise BlockError for a block with observations that are about to be made."""
+    if len(block.surfaces.point) or block.start.unknowns.scanner is not None:
+        raise BlockError(
+            "the block has points on the surfaces of a laser scanner already: take the block as it was before, without "
+            "surfaces.csv and [scanner]"
+        )
+
+
+def with_common_error(
+    sigma: Float[np.ndarray, "rows"], usable: Bool[np.ndarray, "rows"], common_m: float
+) -> Float[np.ndarray, "rows"]:
+    """Standard deviations whose mean over n rows keeps an error that all have in common: sigma^2 + (n - 1) common^2.
+
+    `sigma` contains the common error once. An adjustment takes its observations for independent, and would average it.
+    """
+    return np.sqrt(sigma**2 + max(int(usable.sum()) - 1, 0) * common_m**2)
 
 
 def until_still(
@@ -102,6 +129,7 @@ def until_still(
     build: Build,
     max_rounds: int,
     report: Callable[[Round], None],
+    group: Literal["control", "surfaces"],
     carry: Carry = lambda seen, before, now: seen,
 ) -> Observed:
     """`look` at the cloud, `build` a block with what it says, adjust; from `first` on, until nothing changes.
@@ -109,10 +137,13 @@ def until_still(
     Each block is adjusted from the unknowns that `build` gives it. Towards the end an observation stays the one it was
     where the cloud, looked at again, says nearly the same, and then in any case: else a laser point could become a
     neighbour, cease to be one with the move that this makes, and so on for ever. `carry` brings an earlier observation
-    from the cloud as corrected before to that of now.
+    from the cloud as corrected before to that of now. The observations are the last rows of their `group`.
+
+    Raises BlockError where the cloud does not lie where the points are.
     """
     adjusted, known, fits = first, covariance(first), np.array(True)
     before, seen = first, look(first)
+    _check_heights(first, seen)
     rounds: list[Round] = []
     while True:
         used = seen.usable & fits
@@ -134,12 +165,13 @@ def until_still(
         )
         report(rounds[-1])
         before, adjusted, known = adjusted, new, now
-        still = len(rounds) > _JUDGED and change < STILL
+        still = len(rounds) > _JUDGED and change < STILL and bool(new.converged)
         if still or len(rounds) >= max_rounds:
+            _check_used(seen, used)
             return Observed(adjusted, known, seen, used, tuple(rounds), still)
         if len(rounds) >= _JUDGED:
             # Towards the end what was left out stays so: some observation might come and go for ever.
-            fits = _fit(seen, adjusted, known, used) & (fits if len(rounds) >= _SETTLED else True)
+            fits = _fit(seen, adjusted, known, used, group) & (fits if len(rounds) >= _SETTLED else True)
         if len(rounds) < _SETTLED:
             seen = look(adjusted)
             continue
@@ -154,6 +186,29 @@ def at_result(block: Block, unknowns: Unknowns) -> Block:
     return dataclasses.replace(block, start=known)
 
 
+def _check_heights(first: Adjustment, seen: Seen) -> None:
+    """Raise BlockError where the cloud is as far from the points as no principal distance explains."""
+    apart = seen.apart(first)[seen.usable]
+    camera = float(np.mean(np.asarray(first.unknowns.exterior.position)[:, 2]))
+    off, height = (float(np.median(v)) for v in (apart, camera - seen.foot[seen.usable, 2]))
+    if abs(off) > _FAR * abs(height):
+        raise BlockError(
+            f"the cloud lies {abs(off):.0f} m {'below' if off > 0 else 'above'} where the block puts its points, with "
+            f"the cameras {height:.0f} m over the cloud: its heights may count in feet or belong to another vertical "
+            "system, or the principal distance that the block begins with is wrong"
+        )
+
+
+def _check_used(seen: Seen, used: Bool[np.ndarray, "rows"]) -> None:
+    """Raise BlockError where the block contradicts what the cloud says of most points."""
+    n, most = int(used.sum()), int(seen.usable.sum())
+    if n < max(1.0, _BORNE_OUT * most):
+        raise BlockError(
+            f"the block bears out only {n} of {most} observations of the cloud: check that cloud and block are in one "
+            "system, that the stated standard deviations are true, and that the block adjusts well without the cloud"
+        )
+
+
 def _kept(old: Seen, new: Seen, adjusted: Adjustment) -> Seen:
     """The old observations where the new ones hardly differ from them."""
     same = np.abs(old.apart(adjusted) - new.apart(adjusted)) < _SAME * new.sigma
@@ -162,12 +217,11 @@ def _kept(old: Seen, new: Seen, adjusted: Adjustment) -> Seen:
 
 
 def _fit(
-    seen: Seen, adjusted: Adjustment, known: Covariance, used: Bool[np.ndarray, "rows"]
+    seen: Seen, adjusted: Adjustment, known: Covariance, used: Bool[np.ndarray, "rows"], group: str
 ) -> Bool[np.ndarray, "rows"]:
     """Which observations the others bear out."""
     # Those used, by their normalised residuals: the lidar's are the last of their group.
     numbers, residuals = redundancy_numbers(adjusted, known), adjusted.residuals
-    group = "surfaces" if len(adjusted.block.surfaces.point) else "control"
     of_used = slice(len(getattr(residuals, group)) - int(used.sum()), None)
     v, r = (np.asarray(getattr(of, group))[of_used] for of in (residuals, numbers))
     # The others against where all others put their points.

@@ -20,7 +20,15 @@ from jaxphoto.cloud import Cloud
 from jaxphoto.errors import BlockError, InputError
 from jaxphoto.lidar import Grid, HeightFlag, HeightSettings, heights_at, index_cloud
 from jaxphoto.lidar.block_control import pseudo_control_of_block
-from jaxphoto.procedures.lidar.rounds import MAX_ROUNDS, Round, Seen, at_result, until_still, with_interior_held
+from jaxphoto.procedures.lidar.rounds import (
+    MAX_ROUNDS,
+    Round,
+    Seen,
+    at_result,
+    until_still,
+    with_common_error,
+    with_interior_held,
+)
 from jaxphoto.statistics import Covariance
 
 Method = Literal["idw", "plane", "tin", "local", "image"]
@@ -81,6 +89,7 @@ def lidar_control(
         normal = np.column_stack([-gradient, np.ones(len(which))])
         slant = np.linalg.norm(normal, axis=1)
         foot = np.column_stack([place[:, :2], z])
+        sigma = with_common_error(sigma, usable, settings.sigma_systematic_m)
         return Seen(which, foot, normal / slant[:, None], sigma / slant, usable)
 
     def build(adjusted: Adjustment, known: Covariance, seen: Seen, used: np.ndarray) -> Block:
@@ -88,7 +97,7 @@ def lidar_control(
         rows = Rows(which[used], np.full(used.sum(), 2), seen.foot[used, 2], heights["sigma"][used])
         return dataclasses.replace(at_result(block, adjusted.unknowns), control=Rows.joined(block.control, rows))
 
-    found = until_still(with_interior_held(block), look, build, max_rounds, report)
+    found = until_still(with_interior_held(block), look, build, max_rounds, report, "control")
     return LidarControl(
         at_result(found.adjusted.block, found.adjusted.unknowns),
         found.adjusted,
