@@ -1,11 +1,8 @@
-"""Second derivatives of half the weighted square sum: with the residuals' curvature, or without.
+"""Second derivatives of half the weighted square sum, of all but image rows: with the residuals' curvature, or without.
 
 Each function takes `curved`: 1 for J'J + sum_r r d2r, 0 for J'J alone (see `hessian`). They are exact, by automatic
 differentiation, and kept by what each row touches: no dense second derivative of a residual is ever made.
 """
-
-from functools import partial
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -16,71 +13,7 @@ from jaxtyping import Array, Float
 from jaxphoto.adjustment.normal import At, residuals_at
 from jaxphoto.adjustment.reduced import other_rows
 from jaxphoto.adjustment.residuals import Increments, Values, other_residuals
-from jaxphoto.adjustment.structure import Structure
-from jaxphoto.adjustment.tiles import Scene, Seen, Slopes, columns, once, rows
 from jaxphoto.arrays import Numbers
-from jaxphoto.rotation import small_rotation
-
-
-def by_slot(
-    scene: Scene,
-    slopes: Slopes,
-    bends: Float[Array, "m 3 3 3 3"],
-    points: Float[Array, "3 p"],
-    step: Float[Array, "3 p"],
-    seen: Seen,
-    curved: Float[Numbers, ""],
-    s: Structure,
-) -> tuple[Float[Array, "a a m p"], Float[Array, "a 2 m p"]]:
-    """H of each slot's row by eop (6), colours and point (3); and B, the same by the measured x and y.
-
-    J'J from the columns of the Jacobian; the curvature from second forward derivatives of the residuals' sum with
-    themselves as weights, along directions in which all slots go at once. The measured coordinates meet the camera's
-    parameters only.
-    """
-    q = s.n_image_colours
-    both = columns(scene, slopes, points, step, seen, s)
-    j = [jnp.concatenate([c.eop, c.shared, c.point]) for c in both]
-    at = {"place": (scene.centre, scene.rotation, points), "cameras": scene.cameras, "measured": seen.xy}
-    directions = once(partial(_directions, s=s), s, scene, slopes, step)
-
-    def residuals(parts):
-        centre, rotation, points = parts["place"]
-        measured = Seen(parts["measured"], seen.weight, seen.member)
-        return rows(Scene(centre, rotation, parts["cameras"]), points, measured, s)
-
-    def weighed(parts):
-        x, y = residuals(parts)
-        return x * both[0].residual + y * both[1].residual
-
-    def second(one, other):
-        """Along every direction of one kind and of the other."""
-
-        def along(a, b):
-            def slope(w):
-                first = w if one == other else at[one]
-                return jax.jvp(lambda z: weighed(at | {other: w} | {one: z}), (first,), (a,))[1]
-
-            return jax.jvp(slope, (at[other],), (b,))[1]
-
-        return jax.vmap(jax.vmap(along, (None, 0)), (0, None))(directions[one], directions[other])
-
-    def turned(rotation):
-        moved = lambda r: weighed(at | {"place": (scene.centre, r, points)})  # noqa: E731
-        return jax.jvp(moved, (scene.rotation,), (rotation,))[1]
-
-    bent = second("place", "place").at[3:6, 3:6].add(jax.vmap(jax.vmap(turned))(bends.transpose(3, 4, 0, 1, 2)))
-    measured = jnp.zeros((q, 2, *both[0].residual.shape))
-    if q:
-        across, own, measured = second("place", "cameras"), second("cameras", "cameras"), second("cameras", "measured")
-        bent = jnp.concatenate([bent, across], axis=1)
-        bent = jnp.concatenate([bent, jnp.concatenate([across.swapaxes(0, 1), own], axis=1)])
-    # Of places, points come last; behind them, so far, the colours.
-    order = np.concatenate([np.arange(6), 9 + np.arange(q), 6 + np.arange(3)])
-    h = sum(c[:, None] * c[None] for c in j) + curved * bent[order[:, None], order]
-    d_xy = jax.vmap(lambda d: jax.jvp(lambda xy: residuals(at | {"measured": xy}), (seen.xy,), (d,))[1])
-    b = sum(c[:, None] * d[None] for c, d in zip(j, d_xy(directions["measured"]), strict=True))
-    return h, b.at[6 : 6 + q].add(curved * measured)
 
 
 def mixed_second(at: At, direction: Values, curved: Float[Numbers, ""]) -> Increments:
@@ -156,28 +89,6 @@ def other_second(at: At, curved: Float[Numbers, ""]) -> Float[Array, "n n"]:
     return jnp.concatenate([jnp.concatenate([h, across.T], 1), jnp.concatenate([across, own], 1)])
 
 
-def bends_of(scale: Increments, values: Values) -> Float[Array, "images 3 3 3 3"]:
-    """Second derivatives of each image's rotation by its scaled small rotation; the last two axes are these."""
-    second = jax.hessian(small_rotation)(jnp.zeros(3))
-    bent = jnp.einsum("ikab,kjn->nijab", second, values.rotation)
-    return bent * (scale.eop[3:, None] * scale.eop[None, 3:]).transpose(2, 0, 1)[:, None, None]
-
-
 def _half_square(r: Array, curved: Float[Numbers, ""]) -> Float[Array, ""]:
     """Half the square sum, with the second derivative J'J + curved r d2r."""
     return jnp.sum(0.5 * r * r - (1 - curved) * jax.lax.stop_gradient(r) * r)
-
-
-def _directions(scene: Scene, slopes: Slopes, step: Array, s: Structure) -> dict[str, Any]:
-    """Changes of places by eop (6) and point (3), of cameras by colours, of what is measured; by the first axis."""
-    q, (m, p) = s.n_image_colours, (len(scene.centre), step.shape[1])
-    unit = jnp.eye(3)
-    centre = jnp.zeros((9, m, 3)).at[:3].set(unit[:, None] * slopes.centre)
-    rotation = jnp.zeros((9, m, 3, 3)).at[3:6].set(jnp.moveaxis(slopes.rotation, -1, 0))
-    points = jnp.zeros((9, 3, p)).at[6:].set(unit[:, :, None] * step)
-    cameras = tuple(
-        jnp.zeros((q, *c.shape)).at[..., np.array(g.free_leaves, int)].set(jnp.moveaxis(d, -2, 0))
-        for g, c, d in zip(s.groups, scene.cameras, slopes.cameras, strict=True)
-    )
-    measured = jnp.broadcast_to(jnp.eye(2)[:, :, None, None], (2, 2, m, p))
-    return {"place": (centre, rotation, points), "cameras": cameras, "measured": measured}

@@ -6,23 +6,27 @@ theorem) an estimate e, a function of the unknowns x, answers a change of v with
     de/dv = -lambda' B,   H lambda = de/dx
 
 with H and B of `hessian`: with the residuals' curvature, the derivative itself; without, the classical first-order
-matrix -N^-1 J'P. One adjoint vector lambda for each estimate serves all observations. `response` answers one direction
-of change of everything in a block, all points included, and takes blocks of any size.
+matrix -N^-1 J'P. One adjoint vector lambda for each estimate serves all observations (`adjoint`), and B is sparse: an
+image row touches its image, camera and point. `response` answers one direction of change of everything in a block, all
+points included, and takes blocks of any size.
 """
 
-from collections.abc import Sequence
-from typing import NamedTuple
+import math
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
+from scipy import sparse
 
 from jaxphoto.adjustment import Adjustment
-from jaxphoto.adjustment.band import Band, factor_band, invert_band
-from jaxphoto.adjustment.normal import At, unwhiten, whiten
+from jaxphoto.adjustment.normal import At
 from jaxphoto.adjustment.optimum import weigh_datum
+from jaxphoto.adjustment.padding import Places, crop_residuals
 from jaxphoto.adjustment.reduced import other_rows
 from jaxphoto.adjustment.residuals import Increments, Residuals, Values
 from jaxphoto.adjustment.shards import on_one_device
@@ -31,16 +35,16 @@ from jaxphoto.arrays import still
 from jaxphoto.block import AXES
 from jaxphoto.compiling import run_compiled
 from jaxphoto.errors import InputError
+from jaxphoto.sensitivity.adjoint import Estimates, adjoint_vectors
 from jaxphoto.sensitivity.curvature import attitude_second, mixed_second
-from jaxphoto.sensitivity.hessian import Eliminated, eliminated, image_columns
+from jaxphoto.sensitivity.hessian import Eliminated, check_optimum, eliminated
+from jaxphoto.sensitivity.image_rows import ImageRows, image_rows
 from jaxphoto.statistics import EOP_NAMES
 from jaxphoto.statistics.covariance import turns_of
 from jaxphoto.unknowns import FREE, uniform_priors
 
-# Numbers that the derivatives by image points may have, empty slots included: 1.6 GB.
+# Numbers that the derivatives by image points may have: 1.6 GB.
 _MOST_NUMBERS = 2e8
-# Points are asked for in multiples of this many, so that what is compiled serves most requests.
-_POINTS = 8
 
 
 class Sensitivity(eqx.Module):
@@ -54,34 +58,38 @@ class Sensitivity(eqx.Module):
     stations: Float[np.ndarray, "estimates stations"]
     attitudes: Float[np.ndarray, "estimates attitudes 3"]
     control_points: Float[np.ndarray, "estimates control"]
+    surfaces: Float[np.ndarray, "estimates surfaces"]
+    """By how far the laser scanner's surfaces lie along their normals (m)."""
     distances: Float[np.ndarray, "estimates distances"]
     priors: Float[np.ndarray, "estimates weighted"]
-    fixed: Float[np.ndarray, "estimates fixed"]
-    """By the parameters and coordinates held fixed, named by `fixed_labels`."""
     labels: tuple[str, ...] = eqx.field(static=True)
     """As those of a `Covariance`; then `points[name].X` and so on for the points asked for."""
-    fixed_labels: tuple[str, ...] = eqx.field(static=True)
     curvature: bool = eqx.field(static=True)
     """Whether the residuals' curvature counts; if not, this is the classical first-order matrix."""
+    by_fixed: Callable[[], tuple[np.ndarray, tuple[str, ...]]] = eqx.field(static=True, repr=False)
+    """What gives `fixed` and `fixed_labels`: they take as long as all else, and are computed when asked for."""
 
     @property
     def groups(self) -> dict[str, Float[np.ndarray, "estimates n"]]:
         """The derivatives by group of observations, each as one matrix: x and y, roll, pitch, yaw of a row in turn."""
-        names = ("image_points", "stations", "attitudes", "control_points", "distances", "priors")
+        names = ("image_points", "stations", "attitudes", "control_points", "surfaces", "distances", "priors")
         return {name: getattr(self, name).reshape(len(self.labels), -1) for name in names}
+
+    @property
+    def fixed(self) -> Float[np.ndarray, "estimates fixed"]:
+        """By the parameters and coordinates held fixed, named by `fixed_labels`."""
+        return self.by_fixed()[0]
+
+    @property
+    def fixed_labels(self) -> tuple[str, ...]:
+        """Parameter paths of all that is held fixed, then `points[name].X` and so on."""
+        return self.by_fixed()[1]
 
     def of(self, label: str) -> int:
         """The row of the estimate `label`. Raises InputError where there is none."""
         if label not in self.labels:
             raise InputError(f"no estimate is called {label}: there are {', '.join(self.labels[-8:])} and others")
         return self.labels.index(label)
-
-
-class Derivatives(NamedTuple):
-    """Rows of `Sensitivity` in the padded order: those of the reduced unknowns, then three for each point."""
-
-    groups: Residuals
-    fixed: Float[Array, "estimates fixed"]
 
 
 def sensitivity(adjusted: Adjustment, *, curvature: bool = True, points: Sequence[str] = ()) -> Sensitivity:
@@ -95,63 +103,36 @@ def sensitivity(adjusted: Adjustment, *, curvature: bool = True, points: Sequenc
     block whose matrix is too large to hold; `response` serves that.
     """
     _check_points(adjusted, points)
-    s, computed = adjusted.structure, adjusted.computed
-    places, padded = computed.places, on_one_device(computed.structure)
-    number = {name: k for k, name in enumerate(adjusted.block.points)}
-    asked = np.array([number[name] for name in points], int)
-    index = np.zeros(-(-len(asked) // _POINTS) * _POINTS, np.int32)
-    index[: len(asked)] = places.point[asked]
-    _check_size(padded, index)
-    held = adjusted.block.fixed
-    fixed = _Fixed(
-        np.setdiff1d(np.arange(len(adjusted.values.shared)), s.free).astype(np.int32),
-        places.point[held.who].astype(np.int32),
-        np.asarray(held.axis, np.int32),
-    )
-    values, scale = jax.tree.map(still, (computed.values, computed.factored.scale))
-    h = eliminated(adjusted, curvature)
-    arguments = (values, scale, h, padded, np.array(float(curvature)), index, fixed)
-    found = run_compiled(_derivatives, arguments, adjusted.seconds, "sensitivity")
+    check_optimum(adjusted)
+    places, values, scale, s = _padded(adjusted)
+    own, estimates = adjusted.structure, 6 * len(places.image) + s.n_shared + 3 * len(points)
+    _check_size(own, estimates)
+    given = values, scale, image_rows(adjusted), s, np.array(float(curvature))
+    found = jax.tree.map(still, run_compiled(_derivatives, given, adjusted.seconds, "sensitivity"))
+    asked = places.point[[adjusted.block.points.index(name) for name in points]] if points else np.zeros(0, int)
+    unknowns = np.append(6 * places.image[:, None] + np.arange(6), 6 * s.n_images + np.arange(s.n_shared))
+    step = np.append(scale.eop.T, scale.shared)[unknowns]
+    of = Estimates(unknowns, step, found.turns[places.image], asked, scale.points.T[asked])
+    adjoint = adjoint_vectors(found.h, of)
 
-    n = 6 * padded.n_images
-    own = (6 * places.image[:, None] + np.arange(6)).ravel()
-    rows = np.concatenate([own, n + np.arange(s.n_shared + 3 * len(asked))])
-    image, groups = places.row, found.groups
-    crop = {name: still(getattr(groups, name))[rows] for name in groups._fields if name != "image"}
-    of_rows = np.take(still(groups.image).reshape(len(groups.image), 2, -1), image, axis=2)[rows]
+    rows = _observations(found, values, own, places, len(unknowns) + len(found.h.c))
+    derivatives = _sparse(list(rows.values()), len(adjoint)) @ adjoint
+    shapes = {name: b.shape[:-1] for name, (b, _) in rows.items()}
+    ends = np.cumsum([math.prod(shape) for shape in shapes.values()])[:-1]
+    parts = zip(shapes.items(), np.split(derivatives, ends), strict=True)
+    # Estimates last in memory: what belongs to an observation is written in one stretch.
+    groups = {name: np.moveaxis(part.reshape(*shape, estimates), -1, 0) for (name, shape), part in parts}
     names = [f"exterior[{i}].{e}" for i in adjusted.block.images for e in EOP_NAMES["omega_phi_kappa"]]
-    labels = (*names, *s.labels, *(f"points[{name}].{axis}" for name in points for axis in AXES))
-    fixed_labels = _fixed_labels(adjusted, fixed)
-    # An estimate that is itself held fixed follows what holds it.
-    same = np.array(labels)[:, None] == np.array(fixed_labels, dtype=str)
-    return Sensitivity(
-        image_points=of_rows.transpose(0, 2, 1),
-        stations=crop["stations"][:, : len(s.station_image)],
-        attitudes=crop["attitudes"].transpose(0, 2, 1)[:, : len(s.attitude_image)],
-        control_points=crop["control"][:, s.control_axis, places.point[s.control_point]],
-        distances=crop["distances"],
-        priors=crop["priors"],
-        fixed=still(found.fixed)[rows] + same,
-        labels=labels,
-        fixed_labels=fixed_labels,
-        curvature=curvature,
-    )
+    labels = (*names, *own.labels, *(f"points[{name}].{axis}" for name in points for axis in AXES))
+    by_fixed = partial(_by_fixed, adjusted, curvature, labels, adjoint, unknowns)
+    return Sensitivity(**groups, labels=labels, curvature=curvature, by_fixed=by_fixed)
 
 
-class _Fixed(NamedTuple):
-    """What is held fixed: shared parameters by their index, then coordinates by point and axis."""
-
-    shared: Int[np.ndarray, "n"]
-    point: Int[np.ndarray, "m"]
-    axis: Int[np.ndarray, "m"]
-
-
-def _fixed_labels(adjusted: Adjustment, fixed: _Fixed) -> tuple[str, ...]:
-    """Parameter paths: of everything shared, if it were free, those of what is not."""
-    block = adjusted.block
-    every = structure_of(block, uniform_priors(adjusted.unknowns, FREE)).labels
-    held = zip(block.fixed.who, block.fixed.axis, strict=True)
-    return (*(every[k] for k in fixed.shared), *(f"points[{block.points[p]}].{AXES[a]}" for p, a in held))
+def _padded(adjusted: Adjustment) -> tuple[Places, Any, Any, Structure]:
+    """What an adjustment was computed with: places, values, scale and structure."""
+    computed = adjusted.computed
+    values, scale = jax.tree.map(still, (computed.values, computed.factored.scale))
+    return computed.places, values, scale, on_one_device(computed.structure)
 
 
 def _check_points(adjusted: Adjustment, points: Sequence[str]) -> None:
@@ -161,135 +142,139 @@ def _check_points(adjusted: Adjustment, points: Sequence[str]) -> None:
         raise InputError(f"the block has no point {missing[0]}, of which the sensitivity is asked for: name one it has")
 
 
-def _check_size(s: Structure, points: np.ndarray) -> None:
-    n = 6 * s.n_images + s.n_shared
-    numbers = 2 * (n + 3 * len(points)) * s.in_tiles.image.size * s.in_tiles.per_tile
+def _check_size(own: Structure, estimates: int) -> None:
+    numbers = 2 * len(own.image) * estimates
     if numbers > _MOST_NUMBERS:
         raise InputError(
-            f"all derivatives of a block of {s.n_images} images would be {numbers:.0e} numbers, "
-            f"{_MOST_NUMBERS:.0e} at most: ask for one change at a time (response), or take a smaller block"
+            f"all derivatives of a block of {own.n_images} images would be {numbers:.0e} numbers, {_MOST_NUMBERS:.0e} "
+            "at most: ask for one change at a time (response), or take a smaller block"
         )
 
 
-class _Adjoint(NamedTuple):
-    """lambda of every estimate, in scaled increments."""
+class _Derivatives(NamedTuple):
+    """Of a padded block: what is eliminated, and -B of all but the image rows."""
 
-    reduced: Float[Array, "estimates n"]
-    points: Float[Array, "tiles 3 estimates p"]
+    h: Eliminated
+    turns: Float[Array, "images 3 3"]
+    stations: Float[Array, "stations 6+colours"]
+    attitudes: Float[Array, "attitudes 3 6+colours"]
+    control: Float[Array, "points 3"]
+    surfaces: Float[Array, "rows points 3+scanner"]
+    distances: Float[Array, "distances 6"]
+    priors: Float[Array, "weighted"]
 
 
 @eqx.filter_jit
-def _derivatives(
-    values: Values, scale: Increments, h: Eliminated, s: Structure, curved: Array, points: Array, fixed: _Fixed
-) -> Derivatives:
+def _derivatives(values: Values, scale: Increments, rows: ImageRows, s: Structure, curved: Array) -> _Derivatives:
     at = At(jax.tree.map(jnp.zeros_like, scale), scale, weigh_datum(values, s), s)
-    adjoint = _adjoint(h, at, points)
     rest = other_rows(at)
     j = rest.blocks
-    # A last column of zeros serves colours that mean nothing in an image.
-    reduced = jnp.pad(adjoint.reduced, ((0, 0), (0, 1)))
-    columns = jnp.concatenate([6 * jnp.arange(s.n_images)[:, None] + jnp.arange(6), 6 * s.n_images + s.column], axis=1)
-    of_points = _by_point(adjoint.points)
-
-    def touching(b, image):
-        """lambda' B of rows that touch an image and its shared unknowns."""
-        return jnp.einsum("ena,an->en", reduced[:, columns[image]], b)
-
-    eop, shared = attitude_second(at, curved)
-    attitudes = jnp.concatenate([eop, shared], axis=1)
     stations = jnp.concatenate([j.station_eop, j.station_shared]) / values.sigma_stations
-    ends = (of_points[:, :, s.distance_points[:, k]] * j.distances[k] for k in range(2))
-    groups = Residuals(
-        image=-_of_image_rows(h, adjoint, s),
-        stations=-touching(stations, s.station_image),
-        attitudes=-jnp.stack([touching(b, s.attitude_image) for b in attitudes], axis=1),
-        control=-of_points * rest.control / values.sigma_control,
-        surfaces=jnp.zeros((len(reduced), *values.sigma_surfaces.shape)),
-        distances=-jnp.sum(sum(ends), axis=1) / values.sigma_distances,
-        priors=-adjoint.reduced[:, 6 * s.n_images + s.weighted] * j.priors / values.sigma_priors,
-        datum=jnp.zeros((len(reduced), 0)),
+    return _Derivatives(
+        eliminated(at, rows, curved),
+        turns_of(values.rotation, "omega_phi_kappa"),
+        -stations.T,
+        -jnp.concatenate(attitude_second(at, curved), axis=1).transpose(2, 0, 1),
+        -(rest.control / values.sigma_control).T,
+        -jnp.moveaxis(jnp.concatenate([rest.surfaces, rest.surfaces_scanner]) / values.sigma_surfaces, 0, -1),
+        -(j.distances / values.sigma_distances).reshape(6, -1).T,
+        -j.priors / values.sigma_priors,
     )
-    return Derivatives(groups, _of_fixed(adjoint.reduced, of_points, at, curved, fixed))
 
 
-def _adjoint(h: Eliminated, at: At, points: Array) -> _Adjoint:
-    """Of the reduced unknowns as they are reported, and of the coordinates of `points`."""
-    scale, s = at.scale, at.structure
-    n_images, n, k = s.n_images, 6 * s.n_images + s.n_shared, len(h.c)
-    inverse = _inverse(h, s)
-    of_reduced = inverse[:, :n].T * jnp.concatenate([scale.eop.T.reshape(-1), scale.shared])[:, None]
-    images = of_reduced[: 6 * n_images].reshape(n_images, 2, 3, n + k)
-    turned = jnp.einsum("nij,njk->nik", turns_of(at.values.rotation, "omega_phi_kappa"), images[:, 1])
-    images = jnp.stack([images[:, 0], turned], axis=1).reshape(6 * n_images, n + k)
-
-    # e of a coordinate is taken down to M, as any right-hand side.
-    tile, slot = points // s.in_tiles.per_tile, points % s.in_tiles.per_tile
-    unit = jnp.eye(3)[:, :, None] * scale.points.T[points].T[:, None]
-    z = jnp.stack(whiten(unit, h.l[tile, :, slot].T))
-    down = jnp.einsum("nfi,ien->nef", h.f[tile, :, :, slot], z)
-    each = jnp.arange(len(points))
-    right = jnp.zeros((len(points), 3, n + k)).at[each[:, None], :, h.touched[tile]].add(-down.transpose(0, 2, 1))
-    right = right.reshape(3 * len(points), n + k)
-    right = jnp.concatenate([right[:, :n], right[:, n:] @ h.c.T], axis=1)
-    reduced = jnp.concatenate([images, of_reduced[6 * n_images :], right @ inverse.T])
-
-    own = jnp.zeros((len(h.f), 3, len(points), 3, s.in_tiles.per_tile))
-    own = own.at[tile, :, each, :, slot].set(z.transpose(2, 0, 1))
-    own = jnp.pad(own.reshape(len(h.f), 3, 3 * len(points), s.in_tiles.per_tile), ((0, 0), (0, 0), (n, 0), (0, 0)))
-
-    def up(tile):
-        f, l, touched, own = tile  # noqa: E741
-        met = (reduced[:, touched] @ f.reshape(len(f), -1)).reshape(len(reduced), 3, -1)
-        return jnp.stack(unwhiten(own - met.transpose(1, 0, 2), l))
-
-    return _Adjoint(reduced[:, :n], jax.lax.map(up, (h.f, h.l, h.touched, own)))
+Rows = tuple[np.ndarray, np.ndarray]
+"""-B of some observations, numbers last, and the unknowns that these belong to."""
 
 
-def _inverse(h: Eliminated, s: Structure) -> Float[Array, "n+k n+k"]:
-    """Of M, which is positive definite where nothing couples points."""
-    if len(h.c):
-        return jnp.linalg.inv(h.m)
-    m, q = 6 * s.n_images, s.n_shared
-    return invert_band(factor_band(Band(jnp.zeros((0, 2 * m, m)), jnp.zeros((q, 0)), h.m)))
+def _observations(found: _Derivatives, values: Values, own: Structure, places: Places, first: int) -> dict[str, Rows]:
+    """-B of all observations, by the names that `Sensitivity` gives them; `first` is where the points begin."""
+    n, q, axes = 6 * own.n_images, own.n_image_colours, np.arange(3)
+    first_of = first + 3 * places.point
+    of_image = np.concatenate([6 * np.arange(own.n_images)[:, None] + np.arange(6), n + own.column], axis=1)
+    of_rows = of_image[own.image]
+    of_rows = np.concatenate([of_rows[:, :6], first_of[own.point][:, None] + axes, of_rows[:, 6 : 6 + q]], axis=1)
+    stations, attitudes, control = len(own.station_image), len(own.attitude_image), own.control_point
+    of_surfaces, of_laser = _surfaces(found, values, own, places, first_of)
+    of_ends = first_of[own.distance_points][:, :, None] + axes
+    rows: dict[str, tuple[Any, np.ndarray]] = {
+        "image_points": (found.h.measured[: len(of_rows)], of_rows[:, None]),
+        "stations": (found.stations[:stations], of_image[own.station_image]),
+        "attitudes": (found.attitudes[:attitudes], of_image[own.attitude_image, None]),
+        "control_points": (
+            found.control[places.point[control], own.control_axis, None],
+            (first_of[control] + own.control_axis)[:, None],
+        ),
+        "surfaces": (of_surfaces, of_laser),
+        "distances": (found.distances, of_ends.reshape(-1, 6)),
+        "priors": (found.priors[:, None], n + own.weighted[:, None]),
+    }
+    return {name: (b, np.broadcast_to(unknowns.astype(np.int32), b.shape)) for name, (b, unknowns) in rows.items()}
 
 
-def _of_image_rows(h: Eliminated, adjoint: _Adjoint, s: Structure) -> Float[Array, "estimates 2 tiles m p"]:
-    """lambda' B of all slots: products of small matrices, tile by tile."""
-    columns = image_columns(s)
-    image = s.in_tiles.image.reshape(len(h.f), -1)
-
-    def tile(numbers):
-        image, points, b = numbers
-        own = adjoint.reduced.at[:, columns[image]].get(mode="fill", fill_value=0.0).transpose(1, 0, 2)
-        a, shape = own.shape[2], b.shape[1:]
-        of_image = own @ b[:a].transpose(2, 0, 1, 3).reshape(shape[1], a, -1)
-        of_image = of_image.reshape(shape[1], -1, 2, shape[2]).transpose(1, 2, 0, 3)
-        return of_image + sum(points[k][:, None, None] * b[a + k] for k in range(3))
-
-    return jax.lax.map(tile, (image, adjoint.points, h.measured)).transpose(1, 2, 0, 3, 4)
+def _surfaces(found: Any, values: Any, own: Structure, places: Places, first_of: Int[np.ndarray, "points"]) -> Rows:
+    """-B of the rows of surfaces: of the coordinates of the point, and of the scanner's unknowns."""
+    scanner = 6 * own.n_images + own.n_interior + np.arange(own.n_scanner)
+    b = found.surfaces.reshape(-1, 3 + own.n_scanner)
+    if len(own.surface_point):
+        names = ("stations", "attitudes", "control", "distances", "priors")
+        shaped: Any = {name: getattr(values, name) for name in names} | {"image": values.xy, "datum": np.zeros(0)}
+        which: Any = np.arange(len(b)).reshape(values.sigma_surfaces.shape)
+        b = b[crop_residuals(Residuals(surfaces=which, **shaped), own, places).surfaces]
+    of_point = first_of[own.surface_point][:, None] + np.arange(3)
+    return b, np.concatenate([of_point, np.broadcast_to(scanner, (len(of_point), own.n_scanner))], axis=1)
 
 
-def _by_point(points: Float[Array, "tiles 3 estimates p"]) -> Float[Array, "estimates 3 points"]:
-    tiles, _, estimates, p = points.shape
-    return points.transpose(2, 1, 0, 3).reshape(estimates, 3, tiles * p)
+def _sparse(rows: Sequence[Rows], unknowns: int) -> sparse.csr_array:
+    """-B, a row each number that is observed."""
+    lengths = np.repeat([b.shape[-1] for b, _ in rows], [math.prod(b.shape[:-1]) for b, _ in rows])
+    data, columns = (np.concatenate([part[k].ravel() for part in rows]) for k in range(2))
+    starts = np.append(0, np.cumsum(lengths)).astype(np.int32)
+    return sparse.csr_array((data, columns, starts), shape=(len(lengths), unknowns))
 
 
-def _of_fixed(
-    reduced: Array, points: Float[Array, "estimates 3 points"], at: At, curved: Array, fixed: _Fixed
-) -> Float[Array, "estimates fixed"]:
-    """-lambda' B of what is held fixed, one after the other: each may touch everything."""
-    shared, coordinates = jnp.zeros_like(at.values.shared), jnp.zeros_like(at.values.points)
+class _Held(NamedTuple):
+    """What is held fixed: shared parameters by their index, then coordinates by point and axis."""
 
-    nothing: Values = jax.tree.map(lambda _: None, at.values)
+    shared: Int[np.ndarray, "n"]
+    point: Int[np.ndarray, "m"]
+    axis: Int[np.ndarray, "m"]
+
+
+def _by_fixed(
+    adjusted: Adjustment, curvature: bool, labels: Sequence[str], adjoint: np.ndarray, unknowns: np.ndarray
+) -> tuple[Float[np.ndarray, "estimates fixed"], tuple[str, ...]]:
+    """-lambda' B of what is held fixed, and its labels: parameter paths of what is not free, then coordinates."""
+    block, fixed = adjusted.block, adjusted.block.fixed
+    places, values, scale, s = _padded(adjusted)
+    shared = np.setdiff1d(np.arange(len(values.shared)), s.free)
+    held = _Held(*(np.asarray(v, np.int32) for v in (shared, places.point[fixed.who], fixed.axis)))
+    given = values, scale, s, np.array(float(curvature)), held
+    b = still(run_compiled(_fixed_rows, given, adjusted.seconds, "sensitivity"))
+    n = 6 * s.n_images + s.n_shared
+    found = b[:, unknowns] @ adjoint[: len(unknowns)] + b[:, n:] @ adjoint[len(adjoint) - 3 * s.n_points :]
+
+    every = structure_of(block, uniform_priors(adjusted.unknowns, FREE)).labels
+    coordinates = (f"points[{block.points[p]}].{AXES[a]}" for p, a in zip(fixed.who, fixed.axis, strict=True))
+    fixed_labels = (*(every[k] for k in shared), *coordinates)
+    # An estimate that is itself held fixed follows what holds it.
+    same = np.array(labels)[:, None] == np.array(fixed_labels, dtype=str)
+    return same - found.T, fixed_labels
+
+
+@eqx.filter_jit
+def _fixed_rows(values: Values, scale: Increments, s: Structure, curved: Array, held: _Held) -> Float[Array, "fixed n"]:
+    """B of what is held fixed, one after the other: each may touch everything, images, shared unknowns and points."""
+    at = At(jax.tree.map(jnp.zeros_like, scale), scale, weigh_datum(values, s), s)
+    shared, coordinates = jnp.zeros_like(values.shared), jnp.zeros_like(values.points)
+    nothing: Values = jax.tree.map(lambda _: None, values)
 
     def column(shared, coordinates):
         of_these = lambda v: (v.shared, v.points)  # noqa: E731
         change = eqx.tree_at(of_these, nothing, (shared, coordinates), is_leaf=lambda v: v is None)
         b = mixed_second(at, change, curved)
-        of_reduced = reduced @ jnp.concatenate([b.eop.T.reshape(-1), b.shared])
-        return -of_reduced - jnp.einsum("ecp,cp->e", points, b.points)
+        return jnp.concatenate([b.eop.T.reshape(-1), b.shared, b.points.T.reshape(-1)])
 
-    by_shared = jax.lax.map(lambda k: column(shared.at[k].set(1.0), coordinates), fixed.shared)
-    of_points = (fixed.axis, fixed.point)
+    by_shared = jax.lax.map(lambda k: column(shared.at[k].set(1.0), coordinates), held.shared)
+    of_points = (held.axis, held.point)
     by_coordinate = jax.lax.map(lambda k: column(shared, coordinates.at[k].set(1.0)), of_points)
-    return jnp.concatenate([by_shared, by_coordinate]).T
+    return jnp.concatenate([by_shared, by_coordinate])

@@ -17,7 +17,6 @@ and mu = C D x is carried by more unknowns. With S, G, K what is left of H, D an
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -25,22 +24,14 @@ from jaxtyping import Array, Float, Int
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.adjustment.normal import At, cholesky_3x3, each_tile_of, unwhiten, whiten
-from jaxphoto.adjustment.optimum import weigh_datum
 from jaxphoto.adjustment.reduced import other_rows
-from jaxphoto.adjustment.residuals import Increments, Values
-from jaxphoto.adjustment.shards import on_one_device
+from jaxphoto.adjustment.residuals import Increments
 from jaxphoto.adjustment.structure import Structure
-from jaxphoto.adjustment.tiles import (
-    by_tile,
-    of_images,
-    scene_of,
-    seen_in,
-    slopes_of,
-)
-from jaxphoto.arrays import Numbers, still
-from jaxphoto.compiling import run_compiled
+from jaxphoto.adjustment.tiles import by_tile
+from jaxphoto.arrays import Numbers
 from jaxphoto.errors import InputError
-from jaxphoto.sensitivity.curvature import bends_of, by_slot, coupling_rows, other_second
+from jaxphoto.sensitivity.curvature import coupling_rows, other_second
+from jaxphoto.sensitivity.image_rows import ImageRows, RowProducts, row_products
 
 # An index that no array has: what is added there is dropped.
 NOWHERE = int(np.iinfo(np.int32).max)
@@ -53,88 +44,88 @@ class Eliminated(NamedTuple):
 
     m: Float[Array, "n+k n+k"]
     c: Float[Array, "k k"]
-    f: Float[Array, "tiles f 3 p"]
+    gain: Float[Array, "tiles p 3 f"]
+    """-V^-1 [W; Ws; D]': what points answer to unknowns of M."""
     l: Float[Array, "tiles 6 p"]  # noqa: E741
+    """Cholesky factors of V."""
     touched: Int[Array, "tiles f"]
-    """Unknowns of M that the rows of F belong to."""
-    measured: Float[Array, "tiles a 2 m p"]
-    """B of each image row by its measured x and y (mm): in eop (6), colours, point (3)."""
+    """The unknowns of M that the columns of the gain belong to."""
+    measured: Float[Array, "rows 2 9+colours"]
+    """-B of each image row by its measured x and y (mm): of eop (6), point (3), colours."""
 
 
-def eliminated(adjusted: Adjustment, curvature: bool) -> Eliminated:
-    """H (or N, without `curvature`) at the optimum that `adjusted` has found.
-
-    Raises InputError where there is no optimum, and where M is too large to hold.
-    """
+def check_optimum(adjusted: Adjustment) -> None:
+    """Raise InputError where there is no optimum, and where M is too large to hold."""
     if not bool(adjusted.converged):
         raise InputError(
             "the adjustment has not converged, and only an optimum has a sensitivity: adjust until it converges"
         )
-    computed = adjusted.computed
-    s = on_one_device(computed.structure)
+    s = adjusted.computed.structure
     unknowns = 6 * s.n_images + s.n_shared
     if unknowns > _MOST_UNKNOWNS:
         raise InputError(
             f"sensitivity inverts a dense matrix of {unknowns} unknowns, {_MOST_UNKNOWNS} at most: take a smaller "
             "block, or one derivative at a time by jax.jvp through adjust"
         )
-    values, scale = jax.tree.map(still, (computed.values, computed.factored.scale))
-    arguments = (values, scale, s, np.array(float(curvature)))
-    return run_compiled(_eliminate, arguments, adjusted.seconds, "sensitivity")
 
 
-@eqx.filter_jit
-def _eliminate(values: Values, scale: Increments, s: Structure, curved: Float[Numbers, ""]) -> Eliminated:
+def eliminated(at: At, rows: ImageRows, curved: Float[Numbers, ""]) -> Eliminated:
     """Of H where `curved` is 1, of N where it is 0, in scaled increments; what is held fixed has a unit diagonal."""
-    values = weigh_datum(values, s)
-    at = At(jax.tree.map(jnp.zeros_like, scale), scale, values, s)
+    values, scale, s = at.values, at.scale, at.structure
     d_e, d_p, c = coupling_rows(at, curved)
-    k, n, q = len(c), 6 * s.n_images + s.n_shared, s.n_image_colours
-    control = other_rows(at).control ** 2
-    scene, slopes = scene_of(at.state, s), slopes_of(at.increments, scale, values, s)
-
-    bends = bends_of(scale, values)
+    k, n = len(c), 6 * s.n_images + s.n_shared
+    rest = other_rows(at)
+    control, surfaces = rest.control**2, jnp.concatenate([rest.surfaces, rest.surfaces_scanner])
+    h = row_products(values, scale, rows, curved, s)
 
     def tile(numbers):
-        image, points, step, control, d_p, xy, sigma = numbers
-        seen = seen_in(xy, sigma, image, s)
-        parts = of_images(scene, image, s), of_images(slopes, image, s), bends[image]
-        h, measured = by_slot(*parts, points, step, seen, curved, s)
-        v = jnp.sum(h[6 + q :, 6 + q :], axis=2)
+        image, slots, control, surfaces, d_p = numbers
+        met = h.by_point.at[:, :, slots].get(mode="promise_in_bounds")
+        v, of_shared = jnp.sum(met[6:9], axis=2), _by_interior(met[9:], image, s)
+        if surfaces.size:
+            # Of the scanner's unknowns, which follow those of cameras: rows of surfaces are linear in all they touch.
+            of_surfaces = jnp.sum(surfaces[:, None] * surfaces[:3], axis=2)
+            v, of_shared = v + of_surfaces[:3], jnp.concatenate([of_shared, of_surfaces[3:]])
         added = control + jnp.where(jnp.einsum("iip->ip", v) + control == 0, 1.0, 0.0)
         l = cholesky_3x3(v + added[:, None] * jnp.eye(3)[:, :, None])  # noqa: E741
-        by_image = h[:6, 6 + q :].transpose(2, 0, 1, 3).reshape(-1, 3, step.shape[1])
-        met = jnp.concatenate([by_image, _by_interior(h[6 : 6 + q, 6 + q :], image, s), d_p])
-        f = jnp.stack(whiten(met.transpose(1, 0, 2), l), axis=1)
+        by_image = met[:6].transpose(2, 0, 1, 3).reshape(-1, 3, slots.shape[1])
+        w = jnp.concatenate([by_image, of_shared, d_p])
+        f = jnp.stack(whiten(w.transpose(1, 0, 2), l), axis=1)
+        gain = -jnp.stack(unwhiten(f.transpose(1, 0, 2), l))
         flat = f.reshape(len(f), -1)
-        return f, l, measured, jnp.sum(h[: 6 + q, : 6 + q], axis=3).transpose(2, 0, 1), flat @ flat.T
+        return gain.transpose(2, 0, 1), l, flat @ flat.T
 
-    of_points = tuple(by_tile(v, s.in_tiles) for v in (values.points, scale.points, control, d_p))
-    *found, own, gram = each_tile_of(tile, (*of_points, values.xy, values.sigma_xy), s)
-    f, l, measured = (v.reshape(-1, *v.shape[2:]) for v in found)  # noqa: E741
+    of_points = (by_tile(v, s.in_tiles) for v in (control, surfaces, d_p))
+    *found, gram = each_tile_of(tile, (rows.of_slot, *of_points), s)
+    gain, l = (v.reshape(-1, *v.shape[2:]) for v in found)  # noqa: E741
+    # Tiles that are padding were not computed: their points are each by itself.
+    l = jnp.where(l[:, :1] == 0, jnp.array([1.0, 0, 1, 0, 0, 1])[:, None], l)  # noqa: E741
 
-    image = jnp.asarray(s.in_tiles.image).reshape(len(f), -1)
-    own = jax.ops.segment_sum(own.reshape(-1, 6 + q, 6 + q), image.reshape(-1), s.n_images)
-    border = jnp.concatenate([6 * s.n_images + jnp.arange(s.n_interior), n + jnp.arange(k)])
-    m = jnp.zeros((n + k, n + k)).at[:n, :n].set(other_second(at, curved) + _by_unknown(own, s))
+    image = jnp.asarray(s.in_tiles.image).reshape(len(l), -1)
+    border = jnp.concatenate([6 * s.n_images + jnp.arange(s.n_border), n + jnp.arange(k)])
+    m = jnp.zeros((n + k, n + k)).at[:n, :n].set(other_second(at, curved) + _by_unknown(h, s))
     m = m.at[n:, :n].set(d_e).at[:n, n:].set(d_e.T) - _products(gram, border, n + k, s)
+    if s.n_scanner:
+        by_scanner, own = rest.surfaces_scanner.reshape(s.n_scanner, -1), border[s.n_interior : s.n_border]
+        m = m.at[own[:, None], own].add(by_scanner @ by_scanner.T)
     fixed = jnp.where(jnp.diagonal(m) == 0, 1.0, 0.0)
     m = m.at[n:].set(c @ m[n:]) + jnp.diag(jnp.where(jnp.arange(n + k) < n, fixed, -1.0))
-    by_eop = (6 * image[:, :, None] + jnp.arange(6)).reshape(len(f), -1)
-    touched = jnp.concatenate([by_eop, jnp.broadcast_to(border, (len(f), len(border)))], axis=1)
-    return Eliminated(m, c, f, l, touched, measured)
+    by_eop = (6 * image[:, :, None] + jnp.arange(6)).reshape(len(l), -1)
+    touched = jnp.concatenate([by_eop, jnp.broadcast_to(border, (len(l), len(border)))], axis=1)
+    return Eliminated(m, c, gain, l, touched, h.measured)
 
 
-def _by_unknown(own: Float[Array, "images 6+q 6+q"], s: Structure) -> Float[Array, "n n"]:
+def _by_unknown(h: RowProducts, s: Structure) -> Float[Array, "n n"]:
     """Sums by image, at the unknowns of the image and of its colours."""
-    each, columns = jnp.arange(s.n_images), image_columns(s)
-    n = 6 * s.n_images + s.n_shared
-    eop = jnp.zeros((s.n_images, 6, s.n_images, 6)).at[each, :, each].set(own[:, :6, :6]).reshape(6 * s.n_images, -1)
-    m = jnp.zeros((n, n)).at[: 6 * s.n_images, : 6 * s.n_images].set(eop)
-    shared = columns[:, 6:]
-    m = m.at[columns[:, :6, None], shared[:, None]].add(own[:, :6, 6:], mode="drop")
-    m = m.at[shared[:, :, None], columns[:, None]].add(own[:, 6:], mode="drop")
-    return m
+    n_eop, columns = 6 * s.n_images, image_columns(s)
+    each, n = jnp.arange(s.n_images), n_eop + s.n_shared
+    eop = 0.5 * (h.eop + h.eop.transpose(0, 2, 1))
+    own = jnp.zeros((s.n_images, 6, s.n_images, 6)).at[each, :, each].set(eop)
+    m = jnp.zeros((n, n)).at[:n_eop, :n_eop].set(own.reshape(n_eop, n_eop))
+    of_eop, of_shared = columns[:, :6], columns[:, 6:]
+    m = m.at[of_shared[:, :, None], of_eop[:, None]].add(h.shared_eop, mode="drop")
+    m = m.at[of_eop[:, :, None], of_shared[:, None]].add(h.shared_eop.transpose(0, 2, 1), mode="drop")
+    return m.at[of_shared[:, :, None], of_shared[:, None]].add(h.shared, mode="drop")
 
 
 def _products(gram: Float[Array, "chunks tiles f f"], border: Array, size: int, s: Structure) -> Array:
@@ -175,14 +166,13 @@ def image_columns(s: Structure) -> Int[Array, "images 6+colours"]:
 def solve_eliminated(h: Eliminated, b: Increments, s: Structure) -> Increments:
     """x of H x = b."""
     n_eop, n = 6 * s.n_images, 6 * s.n_images + s.n_shared
-    l = h.l.transpose(1, 0, 2)  # noqa: E741
-    z = jnp.stack(whiten(b.points.reshape(3, len(h.l), -1), l))
+    of_points = b.points.reshape(3, len(h.l), -1)
     right = jnp.concatenate([b.eop.T.reshape(-1), b.shared, jnp.zeros(len(h.c))])
-    right = right.at[h.touched].add(-jnp.einsum("tfkp,ktp->tf", h.f, z))
+    right = right.at[h.touched].add(jnp.einsum("tpkf,ktp->tf", h.gain, of_points))
     x = jnp.linalg.solve(h.m, jnp.concatenate([right[:n], h.c @ right[n:]]))
-    z = z - jnp.einsum("tfkp,tf->ktp", h.f, x[h.touched])
-    points = jnp.stack(unwhiten(z, l)).reshape(3, -1)
-    return Increments(x[:n_eop].reshape(-1, 6).T, x[n_eop:n], points)
+    l = h.l.transpose(1, 0, 2)  # noqa: E741
+    points = jnp.stack(unwhiten(whiten(of_points, l), l)) + jnp.einsum("tpkf,tf->ktp", h.gain, x[h.touched])
+    return Increments(x[:n_eop].reshape(-1, 6).T, x[n_eop:n], points.reshape(3, -1))
 
 
 def _by_interior(w: Float[Array, "q 3 m p"], image: Array, s: Structure) -> Float[Array, "interior 3 p"]:

@@ -24,7 +24,8 @@ from jaxphoto.compiling import run_compiled
 from jaxphoto.errors import InputError
 from jaxphoto.rotation import omega_phi_kappa_from_matrix
 from jaxphoto.sensitivity.curvature import mixed_second
-from jaxphoto.sensitivity.hessian import Eliminated, eliminated, solve_eliminated
+from jaxphoto.sensitivity.hessian import check_optimum, eliminated, solve_eliminated
+from jaxphoto.sensitivity.image_rows import ImageRows, image_rows
 from jaxphoto.unknowns import Unknowns
 
 
@@ -56,6 +57,7 @@ def response(
     Raises InputError where `block` has other rows, where `adjusted` has not converged, and for a block of more than a
     thousand images; `jax.jvp` through `adjust` serves that.
     """
+    check_optimum(adjusted)
     s, computed = adjusted.structure, adjusted.computed
     moved = values_of(
         block,
@@ -74,8 +76,7 @@ def response(
     padded = on_one_device(computed.structure)
     direction = jax.tree.map(_difference, pad_values(moved, s, padded, computed.places), values)
     scale, curved = jax.tree.map(still, computed.factored.scale), np.array(float(curvature))
-    h = eliminated(adjusted, curvature)
-    arguments = (values, scale, _of_fixed(direction, padded), h, padded, curved)
+    arguments = (values, scale, _of_fixed(direction, padded), image_rows(adjusted), padded, curved)
     state, angles = run_compiled(_response, arguments, adjusted.seconds, "sensitivity")
     change = unknowns_of(crop_state(state, computed.places), adjusted.unknowns, s)
     return Response(change, still(angles)[computed.places.image])
@@ -105,10 +106,10 @@ def _of_fixed(direction: Values, s: Structure) -> Values:
 
 @eqx.filter_jit
 def _response(
-    values: Values, scale: Increments, direction: Values, h: Eliminated, s: Structure, curved: jax.Array
+    values: Values, scale: Increments, direction: Values, rows: ImageRows, s: Structure, curved: jax.Array
 ) -> tuple[State, jax.Array]:
     at = At(jax.tree.map(jnp.zeros_like, scale), scale, weigh_datum(values, s), s)
-    b = jax.tree.map(jnp.negative, mixed_second(at, direction, curved))
+    h, b = eliminated(at, rows, curved), jax.tree.map(jnp.negative, mixed_second(at, direction, curved))
     state = lambda y, v: state_at(y, scale, v, s)  # noqa: E731
     there, change = jax.jvp(state, (at.increments, values), (solve_eliminated(h, b, s), direction))
     angles = jax.vmap(omega_phi_kappa_from_matrix, in_axes=2)

@@ -1,5 +1,6 @@
 """A small flight with a lidar beside its camera, simulated once: known truth for procedures with clouds."""
 
+import copy
 import functools
 
 from jaxphoto.simulation import Simulation
@@ -44,16 +45,16 @@ TRIPLET = SCENE | {
 @functools.cache
 def triplet(seed: int = 4) -> Simulation:
     """Three images of one strip, as in paper 001; their stations lie on a line."""
-    return made(TRIPLET, seed)
+    return made(copy.deepcopy(TRIPLET), seed)
 
 
 @functools.cache
 def scanned(seed: int = 3) -> Simulation:
     """The scanner is as it should be."""
-    return made(SCENE, seed)
+    return made(copy.deepcopy(SCENE), seed)
 
 
 @functools.cache
 def misaligned(seed: int = 3) -> Simulation:
     """The scanner has a boresight, and its strips are shifted."""
-    return made(SCENE | {"lidar.truth": TRUTH}, seed)
+    return made(copy.deepcopy(SCENE) | {"lidar.truth": TRUTH}, seed)

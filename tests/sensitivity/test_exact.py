@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jaxphoto import FIXED, Weighted, adjust, covariance
 from jaxphoto.adjustment.normal import At, residuals_at
 from jaxphoto.adjustment.optimum import weigh_datum
-from jaxphoto.adjustment.structure import shared_vector
+from jaxphoto.adjustment.shared import shared_vector
 from jaxphoto.errors import InputError
 from jaxphoto.sensitivity.exact import sensitivity
 from jaxphoto.sensitivity.response import response
@@ -73,7 +73,7 @@ def off(name: str, found: np.ndarray, expected: np.ndarray) -> float:
     return float(np.abs((found - expected) / sigmas(name)).max() / size)
 
 
-def moved(name: str, where, index, h: float):
+def moved(name: str, where, index, h):
     """The block with one number changed."""
     a = nominal(name)
     values = np.array(where(a.block), float)
@@ -99,6 +99,18 @@ def test_derivatives_by_observations_are_those_of_full_adjustments(group: str) -
     assert off("everything", exact, expected) < 1e-6
     # The classical matrix leaves out the residuals' curvature, which is what makes the difference.
     assert 1e-5 < off("everything", first, expected) < 0.1
+
+
+def test_derivative_by_a_surface_of_the_laser_scanner() -> None:
+    """Of a point that lies on surfaces of two strips, both along the normal of one."""
+    a = nominal("surfaces")
+    row = 35
+    normal = a.block.surfaces.normal[row]
+    where = lambda b: b.surfaces.foot  # noqa: E731
+    expected = difference("surfaces", lambda h: moved("surfaces", where, row, h * normal), 0.05)
+    exact, first = (derivatives("surfaces", c).surfaces[:, row] for c in (True, False))
+    assert off("surfaces", exact, expected) < 1e-6
+    assert 1e-5 < off("surfaces", first, expected) < 0.1
 
 
 def test_derivative_by_a_weighted_prior() -> None:

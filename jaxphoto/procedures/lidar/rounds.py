@@ -1,6 +1,7 @@
 """Adjusting again and again with lidar observations that follow from the result, until nothing changes."""
 
 import dataclasses
+import warnings
 from collections.abc import Callable
 from typing import Literal, NamedTuple
 
@@ -11,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.block import Block, Start
 from jaxphoto.collinearity import ExteriorOrientation
-from jaxphoto.errors import BlockError, DatumError
+from jaxphoto.errors import BlockError, DatumError, RankError
 from jaxphoto.procedures.adjust import adjust
 from jaxphoto.statistics import LEAST_CHECKED, Covariance, angle_differences, covariance, redundancy_numbers
 from jaxphoto.unknowns import FIXED, Unknowns
@@ -33,7 +34,9 @@ _SAME, _LAST_LOOK = 0.5, 8
 # Part of the height over the cloud by which points may miss it at first: what a principal distance may be off by.
 _FAR = 0.1
 # Part of the observations that must fit at the end.
-_BORNE_OUT = 0.5
+_BORNE_OUT = 0.7
+# Part by which a principal distance seldom is off that of the laboratory.
+_UNUSUAL = 0.02
 
 
 class Round(NamedTuple):
@@ -88,17 +91,20 @@ Build = Callable[[Adjustment, Covariance, Seen, Bool[np.ndarray, "rows"]], Block
 def with_interior_held(block: Block) -> Adjustment:
     """`block` adjusted with the interior orientation held: where its points lie, as far as it knows by itself.
 
-    Where its datum is open, as that of a strip whose stations lie on a line, exterior orientation is held as it begins,
-    from direct georeferencing: what the cloud adds may close the datum. Raises as `adjust`, and BlockError where it
-    does not converge.
+    Where its datum is open or nearly so, as that of a strip whose stations lie on a line, exterior orientation is held
+    as it begins, from direct georeferencing: what the cloud adds may close the datum. Raises as `adjust`, and
+    BlockError where it does not converge.
     """
     interior = jax.tree.map(lambda _: FIXED, block.start.unknowns.interior)
     held = dataclasses.replace(block.priors, interior=interior)
     try:
         found = adjust(block, priors=held)
-    except DatumError:
-        placed = ExteriorOrientation(FIXED, FIXED)  # type: ignore[arg-type]
-        found = adjust(block, priors=dataclasses.replace(held, exterior=placed))
+        placed = bool(found.converged)
+    except (DatumError, RankError):
+        placed = False
+    if not placed:
+        exterior = ExteriorOrientation(FIXED, FIXED)  # type: ignore[arg-type]
+        found = adjust(block, priors=dataclasses.replace(held, exterior=exterior))
     if not bool(found.converged):
         raise BlockError(f"the block by itself, its interior orientation held, is {found.outcome.value}")
     return found
@@ -168,6 +174,7 @@ def until_still(
         still = len(rounds) > _JUDGED and change < STILL and bool(new.converged)
         if still or len(rounds) >= max_rounds:
             _check_used(seen, used)
+            _warn_of_scale(first, new)
             return Observed(adjusted, known, seen, used, tuple(rounds), still)
         if len(rounds) >= _JUDGED:
             # Towards the end what was left out stays so: some observation might come and go for ever.
@@ -207,6 +214,19 @@ def _check_used(seen: Seen, used: Bool[np.ndarray, "rows"]) -> None:
             f"the block bears out only {n} of {most} observations of the cloud: check that cloud and block are in one "
             "system, that the stated standard deviations are true, and that the block adjusts well without the cloud"
         )
+
+
+def _warn_of_scale(first: Adjustment, found: Adjustment) -> None:
+    """A UserWarning where the heights want another principal distance than any laboratory would have missed."""
+    for name, interior in found.unknowns.interior.items():
+        before, after = float(first.unknowns.interior[name].c), float(interior.c)
+        if abs(after - before) > _UNUSUAL * abs(before):
+            warnings.warn(
+                f"the principal distance of {name} became {after:.3f} mm from {before:.3f} mm, which is much: heights "
+                "of another vertical system than that of the stations would do this",
+                UserWarning,
+                stacklevel=4,
+            )
 
 
 def _kept(old: Seen, new: Seen, adjusted: Adjustment) -> Seen:

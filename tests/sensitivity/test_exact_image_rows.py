@@ -1,0 +1,60 @@
+"""Second derivatives of listed image rows against dense ones of all residuals, by automatic differentiation."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxphoto import adjust
+from jaxphoto.adjustment.normal import At, residuals_at
+from jaxphoto.adjustment.optimum import weigh_datum
+from jaxphoto.adjustment.residuals import Increments
+from jaxphoto.georeferencing import Corrections
+from jaxphoto.sensitivity import image_rows as listed
+from jaxphoto.sensitivity.hessian import image_columns
+from tests.blocks import adjusted, simulated
+
+
+def corrected():
+    """Two cameras of different models, refraction and curvature of the earth: all that a row may depend on."""
+    block = simulated("everything").block
+    block = dataclasses.replace(block, corrections=Corrections(refraction=True, curvature=True, sea_level_m=-50.0))
+    return adjust(block, adjusted("everything").unknowns, max_steps=2)
+
+
+@pytest.mark.parametrize("curved", [0.0, 1.0])
+@pytest.mark.parametrize("at_once", [8192, 64])
+def test_products_of_rows_are_the_dense_ones(curved: float, at_once: int, monkeypatch) -> None:
+    monkeypatch.setattr(listed, "_AT_ONCE", at_once)
+    a = corrected()
+    computed, own = a.computed, a.structure
+    s, scale = computed.structure, jax.tree.map(jnp.asarray, computed.factored.scale)
+    values, rows = jax.tree.map(jnp.asarray, weigh_datum(computed.values, s)), listed.image_rows(a)
+    found = eqx.filter_jit(listed.row_products)(values, scale, rows, jnp.asarray(curved), s)
+
+    # The row that is looked at, and its image, point and camera.
+    row, zero = 57, jax.tree.map(jnp.zeros_like, scale)
+    tile, slot = np.divmod(computed.places.row[row], s.in_tiles.image.shape[2] * s.in_tiles.per_tile)
+    chunk, tile = np.divmod(tile, s.in_tiles.image.shape[1])
+    m, p = np.divmod(slot, s.in_tiles.per_tile)
+    image, point = computed.places.image[own.image[row]], computed.places.point[own.point[row]]
+    columns = np.asarray(image_columns(s))[image, 6:] - 6 * s.n_images
+    there = columns < s.n_shared
+
+    def half_square(y, xy):
+        """Half the square of the row's residuals, with the second derivative J'J + curved r d2r."""
+        shared = zero.shared.at[columns].add(y[9:], mode="drop")
+        moved = Increments(zero.eop.at[:, image].set(y[:6]), shared, zero.points.at[:, point].set(y[6:9]))
+        v = eqx.tree_at(lambda v: v.xy, values, jnp.asarray(values.xy).at[chunk, tile, :, m, p].set(xy))
+        r = residuals_at(At(moved, scale, v, s)).image[chunk, tile, :, m, p]
+        return jnp.sum(0.5 * r * r - (1 - curved) * jax.lax.stop_gradient(r) * r)
+
+    at = jnp.zeros(9 + len(columns)), jnp.asarray(values.xy)[chunk, tile, :, m, p]
+    (h, b), _ = jax.jit(jax.hessian(half_square, (0, 1)))(*at)
+    kept = np.append(np.full(9, True), there)
+    by_point = np.where(kept[:, None], found.by_point[:, :, row], 0.0)
+    np.testing.assert_allclose(by_point, h[:, 6:9], rtol=0, atol=1e-12 * np.abs(h).max())
+    np.testing.assert_allclose(-found.measured[row].T, b, rtol=0, atol=1e-12 * np.abs(b).max())
