@@ -194,7 +194,9 @@ def print_moved(result: Simultaneous, console: Console) -> None:
     for what, unit, (before, after, moved, sigma) in zip(table["what"], table["unit"], numbers, strict=True):
         known = f" from {before:.6g} to {after:.6g}" if np.isfinite(before) else ""
         spread = f" (sigma {sigma:.2g})" if np.isfinite(sigma) else ""
-        console.print(f"  {what}:{known} by {moved:.4g} {unit}{spread}", highlight=False, markup=False)
+        console.print(
+            f"  {what}:{known} by {moved:.4g} {unit}{spread}".rstrip(), highlight=False, markup=False, soft_wrap=True
+        )
 
 
 def _parameters(adjusted: Adjustment) -> dict[str, float]:

@@ -27,6 +27,8 @@ _NAMES = {
     "strip": ("strip", "point_source_id", "pointsourceid"),
 }
 _LONGEST_HEADER = 1000
+# What a cloud holds as a byte.
+_BYTES = {"classification", "return_number", "number_of_returns"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,6 +65,13 @@ def _chunks(path: Path, vertices: _Vertices) -> Iterator[Cloud]:
             where = f"row {vertices.lines + at + 1}" if vertices.order == "" else f"vertex {at + 1}"
             raise InputError(f"{path.name}, {where}: x, y, z are not three finite numbers; mend or delete it")
         values = {own: np.asarray(table[name]) for own, name in known.items()}
+        for name in _BYTES & set(values):
+            wrong = ~((values[name] >= 0) & (values[name] <= 255))
+            if wrong.any():
+                at = read + int(np.flatnonzero(wrong)[0])
+                raise InputError(
+                    f"{path.name}, vertex {at + 1}: {name} is not a number from 0 to 255; mend or delete it"
+                )
         yield Cloud(
             xyz,
             classification=values["classification"].astype(np.uint8) if "classification" in values else None,
@@ -144,6 +153,8 @@ def _header(path: Path) -> _Vertices:
         begin = file.tell()
     if order not in _ORDERS or count < 0 or not {"x", "y", "z"} <= {name.lower() for name, _ in fields}:
         raise InputError(f"{path.name}: the header has no format, or no vertices with x, y and z; write it anew")
+    if len({name for name, _ in fields}) < len(fields):
+        raise InputError(f"{path.name}: a property of the vertices is named twice; write the cloud anew")
     if before:
         raise InputError(f"{path.name}: other elements stand before the vertices; write the cloud with vertices first")
     return _Vertices(_ORDERS[order], count, tuple(fields), begin, line)

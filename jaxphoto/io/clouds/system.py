@@ -16,6 +16,8 @@ from jaxphoto.georeferencing.map_frame import map_system
 UNITS: Mapping[str, float] = {"m": 1.0, "ft": 0.3048, "us_ft": 1200 / 3937}
 """Metres in a metre, an international foot and a US survey foot, by the name that options give them."""
 _ELLIPSOID = "ellipsoid"
+# Heights of NAVD88, NGVD29 and the sea in feet, and the same in metres.
+_METRIC_HEIGHTS = {6360: 5703, 8228: 5703, 5702: 7968, 8050: 5714}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,10 +65,15 @@ class System:
 
     @property
     def metric(self) -> CRS | None:
-        """The system of its coordinates in metres, with that of the heights where this is known and in metres."""
-        if self.plane is None or not isinstance(self.heights, int) or self.heights_unit != 1:
+        """The system of its coordinates in metres, with that of the heights where it is known and has one in metres."""
+        heights = _METRIC_HEIGHTS.get(self.heights, self.heights)  # type: ignore[arg-type]
+        if (
+            self.plane is None
+            or not isinstance(heights, int)
+            or CRS.from_epsg(heights).axis_info[0].unit_name != "metre"
+        ):
             return self.plane
-        upper = CRS.from_epsg(self.heights)
+        upper = CRS.from_epsg(heights)
         return CompoundCRS(f"{self.plane.name} + {upper.name}", [self.plane, upper])
 
     @property
