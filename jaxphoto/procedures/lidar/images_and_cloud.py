@@ -117,6 +117,13 @@ def simultaneous(
     if priors is None:
         shift = Weighted(np.zeros(3), np.full(3, SHIFT_SIGMA))
         priors = Scanner(FREE if timed else FIXED, dict.fromkeys(names, shift))  # type: ignore[arg-type]
+    if set(priors.shifts) != set(names):
+        raise InputError(
+            f"the scanner's priors are of the strips {', '.join(priors.shifts)}, and the cloud's are {', '.join(names)}: "
+            "give one for each of these"
+        )
+    # In the order of the cloud's strips.
+    priors = Scanner(priors.boresight, {name: priors.shifts[name] for name in names})
     if priors.boresight is not FIXED and not timed:
         raise InputError(
             "the boresight of the scanner needs its trajectory and the time of each laser point, which say from where "
@@ -137,8 +144,8 @@ def simultaneous(
         found = []
         for of, shift in zip(strips, scanner.shifts.values(), strict=True):
             near, poses = _near(of, xy, scanner.boresight, shift, settings)
-            planes = tangent_planes(index_cloud(near), xy, method, settings)
-            found.append((planes, None if poses is None else jax.tree.map(lambda v, k=planes.nearest: v[k], poses)))
+            touching = tangent_planes(index_cloud(near), xy, method, settings)
+            found.append((touching, None if poses is None else jax.tree.map(lambda v, k=touching.nearest: v[k], poses)))
         return found
 
     last: dict[str, Any] = {}
