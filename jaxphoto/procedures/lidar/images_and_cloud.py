@@ -119,8 +119,8 @@ def simultaneous(
         priors = Scanner(FREE if timed else FIXED, dict.fromkeys(names, shift))  # type: ignore[arg-type]
     if set(priors.shifts) != set(names):
         raise InputError(
-            f"the scanner's priors are of the strips {', '.join(priors.shifts)}, and the cloud's are {', '.join(names)}: "
-            "give one for each of these"
+            f"the scanner's priors are of the strips {', '.join(priors.shifts)}, and the cloud's are "
+            f"{', '.join(names)}: give one for each of these"
         )
     # In the order of the cloud's strips.
     priors = Scanner(priors.boresight, {name: priors.shifts[name] for name in names})
