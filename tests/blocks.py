@@ -174,7 +174,7 @@ def _remeasured(block: Block, truth: Unknowns, key) -> Block:
 def observed(b: Block):
     """The numbers of a block that `remeasure` draws."""
     rows = (b.stations, b.control, b.fixed, b.check, b.distances)
-    return b.image_points.xy, b.attitudes.roll_pitch_yaw, b.surfaces.foot, *(r.value for r in rows)
+    return b.image_points.xy, b.attitudes.roll_pitch_yaw, *(r.value for r in rows), b.surfaces.foot
 
 
 def rough(block: Block, truth: Unknowns, seed: int = 2) -> Unknowns:
