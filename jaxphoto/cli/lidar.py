@@ -175,12 +175,11 @@ def simultaneous_command(
     began = time.perf_counter()
     with errors.status("reading the block") as status:
         read = read_block(block)
-        records = read_records(trajectory) if trajectory is not None else None
-        if records is not None:
+        records = path = None
+        if trajectory is not None:
+            records = read_records(trajectory)
             # On the cloud's clock from here on.
             records = records._replace(time=records.time - trajectory_shift_s)
-        path = None
-        if records is not None:
             exact = np.zeros((len(records.time), 3))
             path = trajectory_in(records, read.frame, exact, exact)
         status.update("reading the cloud")

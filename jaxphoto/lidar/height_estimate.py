@@ -10,14 +10,13 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxphoto.arrays import Numbers
 from jaxphoto.lidar.height_error import LidarNoise, excess, height_sigma, noise_variance
 from jaxphoto.lidar.local_surface import LocalFit, Neighbours, fit_surface
+from jaxphoto.lidar.sight import empty_about
 from jaxphoto.lidar.tin import delaunay_triangle
 
 # Points around a place that tell slope, curvature and roughness: at least so many, and so many times those used.
 WIDE, TIMES = 24, 3
 # And all points nearer than so many horizontal standard deviations, as far as they are given.
 APART = 4.75
-# So large an empty circle about a place is met once in ten thousand places, if points are anywhere alike.
-_EMPTY = 1e-4
 # Quantiles of the normal distribution: 1 in 20, and 1 in 1000.
 _SELDOM, _HARDLY = 1.645, 3.09
 # Residuals in units of the lidar's noise that are no surface's.
@@ -118,8 +117,7 @@ def _estimate(near: Neighbours, leafy: Bool[Array, "points"], numbers: HeightNum
         roughness=jnp.sqrt(fit.variance),
         gradient=fit.coefficients[1:3],
         leafy=jnp.sum(leafy & used) / jnp.maximum(jnp.sum(used), 1),
-        # The nearest of n points in a circle, as a share of its area, is beyond x with probability (1 - x)^(n-1).
-        hole=(near.distance[0] / reach) ** 2 > 1 - _EMPTY ** (1 / jnp.maximum(n_there - 1, 1)),
+        hole=empty_about(near.distance, around),
         surrounded=_surrounded(near.xy, around) & fit.interpolates & interpolates,
         plane=take_flat & (method == "local"),
         misfit=misfit(fit, _HARDLY),

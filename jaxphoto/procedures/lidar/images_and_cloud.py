@@ -180,7 +180,7 @@ def simultaneous(
     scanner = found.adjusted.unknowns.scanner
     assert scanner is not None
     corrected, used = correct_cloud(cloud, scanner, trajectory if timed else None), found.used
-    before, after = look(first), look(found.adjusted)
+    after = look(found.adjusted)
     return Simultaneous(
         first,
         found.adjusted,
@@ -189,7 +189,7 @@ def simultaneous(
         scanner,
         found.seen.point[used],
         strip[used],
-        before.apart(first)[used],
+        found.before.apart(first)[used],
         after.apart(found.adjusted)[used],
         np.sqrt(((corrected.xyz - cloud.xyz) ** 2).mean(axis=0)),
         found.rounds,

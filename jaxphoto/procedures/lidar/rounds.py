@@ -74,6 +74,8 @@ class Seen(NamedTuple):
 class Observed(NamedTuple):
     """The last of the rounds: its adjustment, what the cloud said, and which of it was used."""
 
+    before: Seen
+    """What the cloud said at first."""
     adjusted: Adjustment
     covariance: Covariance
     seen: Seen
@@ -148,7 +150,8 @@ def until_still(
     Raises BlockError where the cloud does not lie where the points are.
     """
     adjusted, known, fits = first, covariance(first), np.array(True)
-    before, seen = first, look(first)
+    before, at_first = first, look(first)
+    seen = at_first
     _check_heights(first, seen)
     rounds: list[Round] = []
     while True:
@@ -175,7 +178,7 @@ def until_still(
         if still or len(rounds) >= max_rounds:
             _check_used(seen, used)
             _warn_of_scale(first, new)
-            return Observed(adjusted, known, seen, used, tuple(rounds), still)
+            return Observed(at_first, adjusted, known, seen, used, tuple(rounds), still)
         if len(rounds) >= _JUDGED:
             # Towards the end what was left out stays so: some observation might come and go for ever.
             fits = _fit(seen, adjusted, known, used, group) & (fits if len(rounds) >= _SETTLED else True)
