@@ -1,8 +1,10 @@
 """Fixtures for all tests."""
 
+import gc
 import os
 from pathlib import Path
 
+import jax
 import pytest
 
 # What costs here is compiling: these halve it and more, and change results by rounding only (measured on jax 0.10.2).
@@ -19,3 +21,13 @@ def data_dir() -> Path:
             f"no real measurements in {folder}: set JAXPHOTO_DATA to the folder that holds sxb, camcal and aicon"
         )
     return folder
+
+
+@pytest.fixture(scope="module", autouse=True)
+def programs_let_go():
+    """Let JAX's compiled programs go in time: each takes mappings of memory, and a process has 65,530 of them."""
+    yield
+    mappings = Path("/proc/self/maps")
+    if mappings.exists() and mappings.read_bytes().count(b"\n") > 15_000:
+        jax.clear_caches()
+        gc.collect()

@@ -144,6 +144,13 @@ def test_the_threshold_of_the_cache_stays(kept):
     assert jax.config.values[run._THRESHOLD] == before
 
 
+def test_what_was_not_used_for_longest_is_let_go(kept, monkeypatch):
+    monkeypatch.setattr(run, "MOST", 2)
+    for power in (2, 3, 2, 4):
+        run_compiled(root, (MATRIX, power), {}, "run")
+    assert [key[3] for key in run._programs] == [(2,), (4,)]
+
+
 def test_prepared_programs_are_used(kept, monkeypatch):
     seconds: dict[str, float] = {}
     run.prepare(root, (MATRIX, 5), seconds)

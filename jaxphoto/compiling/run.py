@@ -38,6 +38,9 @@ class _Program(NamedTuple):
         return jax.tree.unflatten(self.structure, leaves)
 
 
+# What a process keeps: beyond, what was not used for longest goes. A program takes some hundred mappings of memory,
+# and Linux gives a process 65,530; the one that finds none left crashes.
+MOST = 100
 _programs: dict[object, _Program] = {}
 _prepared: dict[object, Future[_Program]] = {}
 _workers = ThreadPoolExecutor(max_workers=os.cpu_count(), thread_name_prefix="jaxphoto-compile")
@@ -53,21 +56,23 @@ def run_compiled(function: Any, arguments: tuple, seconds: dict[str, float], nam
         return function(*arguments)
     began = time.perf_counter()
     key, arrays = _key(function, arguments, thorough), jax.tree.leaves(eqx.filter(arguments, eqx.is_array))
-    prepared = _prepared.pop(key, None)
+    prepared, program = _prepared.pop(key, None), _programs.pop(key, None)
     if prepared is not None:
-        _programs[key] = prepared.result()
-    elif key not in _programs:
-        _programs[key] = _program_of(function.__wrapped__, arguments, thorough)()
+        program = prepared.result()
+    elif program is None:
+        program = _program_of(function.__wrapped__, arguments, thorough)()
+    _keep(key, program)
     ready = time.perf_counter()
     try:
-        result = _programs[key](arrays)
+        result = program(arrays)
     except jax.errors.JaxRuntimeError:
         # Read whole, but not fit to run after all: that shows in the call only.
-        if not _programs[key].loaded:
+        if not program.loaded:
             raise
-        _programs[key] = _program_of(function.__wrapped__, arguments, thorough, anew=True)()
+        program = _program_of(function.__wrapped__, arguments, thorough, anew=True)()
+        _keep(key, program)
         ready = time.perf_counter()
-        result = _programs[key](arrays)
+        result = program(arrays)
     seconds["compile"] = seconds.get("compile", 0.0) + ready - began
     seconds[name] = seconds.get(name, 0.0) + time.perf_counter() - ready
     return result
@@ -90,6 +95,14 @@ def prepare(function: Any, arguments: tuple, seconds: dict[str, float]) -> None:
     if key not in _programs and key not in _prepared:
         _prepared[key] = _workers.submit(_program_of(function.__wrapped__, arguments, thorough=False))
     seconds["compile"] = seconds.get("compile", 0.0) + time.perf_counter() - began
+
+
+def _keep(key: object, program: _Program) -> None:
+    """Keep `program` as the one used last; the one that was not used for longest goes where there are too many."""
+    _programs.pop(key, None)
+    _programs[key] = program
+    while len(_programs) > MOST:
+        del _programs[next(iter(_programs))]
 
 
 def _traced(arguments: tuple) -> bool:

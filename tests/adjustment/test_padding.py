@@ -88,7 +88,7 @@ def test_blocks_that_fit_common_sizes_compile_once():
     sizes = common_sizes(blocks)
     start = adjusted("cross").unknowns
     adjust(blocks[0], start, sizes=sizes)
-    before = len(run._programs)
+    before = set(run._programs)
     result = adjust(blocks[1], start, sizes=sizes)
-    assert len(run._programs) == before
+    assert set(run._programs) == before
     assert bool(result.converged)
