@@ -4,11 +4,26 @@ import gc
 import os
 from pathlib import Path
 
-import jax
 import pytest
 
 # What costs here is compiling: these halve it and more, and change results by rounding only (measured on jax 0.10.2).
 os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false")
+# What one process compiles serves the others and the next run: the smallest programs too, of which there are thousands.
+os.environ.setdefault(
+    "JAX_COMPILATION_CACHE_DIR",
+    str(Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jaxphoto" / "tests"),
+)
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+
+import jax
+
+from jaxphoto.compiling import run, store
+
+# The suite's programs are hundreds, of 2 MB: with a user's room each would be gone before another process needs it.
+store.MOST = 2_000_000_000
+# Of the 65,530 mappings of memory that Linux gives a process. A large program takes some three hundred, a module of
+# tests up to ten thousand.
+_MOST_MAPPINGS = 30_000
 
 
 @pytest.fixture(scope="session")
@@ -25,9 +40,10 @@ def data_dir() -> Path:
 
 @pytest.fixture(scope="module", autouse=True)
 def programs_let_go():
-    """Let JAX's compiled programs go in time: each takes mappings of memory, and a process has 65,530 of them."""
+    """Let JAX's compiled programs go before a process runs out of mappings of memory; most are on disk."""
     yield
     mappings = Path("/proc/self/maps")
-    if mappings.exists() and mappings.read_bytes().count(b"\n") > 15_000:
+    if mappings.exists() and mappings.read_bytes().count(b"\n") > _MOST_MAPPINGS:
+        run._programs.clear()
         jax.clear_caches()
         gc.collect()

@@ -38,8 +38,8 @@ class _Program(NamedTuple):
         return jax.tree.unflatten(self.structure, leaves)
 
 
-# What a process keeps: beyond, what was not used for longest goes. A program takes some hundred mappings of memory,
-# and Linux gives a process 65,530; the one that finds none left crashes.
+# What a process keeps: beyond, what was not used for longest goes. A large program takes three hundred mappings of
+# memory, and Linux gives a process 65,530; the one that finds none left crashes.
 MOST = 100
 _programs: dict[object, _Program] = {}
 _prepared: dict[object, Future[_Program]] = {}

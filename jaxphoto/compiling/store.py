@@ -28,7 +28,7 @@ from jaxlib import lapack
 from jaxphoto.compiling.description import Indescribable, describe
 
 # What the folder may hold (bytes): beyond, what was not used for longest goes.
-MOST = 200_000_000
+MOST = 1_000_000_000
 _PACKAGES = (jax, jaxlib, eqx, optx, lx, np)
 _DIGEST = hashlib.sha256().digest_size
 

@@ -131,14 +131,16 @@ def _dense(values, structure) -> Dense:
     rest = other_rows(at)
     both = jax.vmap(jax.vmap(lambda n: tile_parts(at, 0.0, rest.coupled)(n).columns))(tile_numbers(at, rest))
     columns = jax.tree.map(lambda x, y: jnp.stack([x, y], axis=-3), *both)
-    _, reduced, right = reduce_normal(at, 0.0)
     flat_scale = ravel_pytree(scale)[0]
     vector = jnp.sin(1.0 + jnp.arange(len(flat))) * (flat_scale > 0)
 
-    def solution(damping):
-        a, reduced, _ = reduce_normal(at, damping)
-        return ravel_pytree(solve_factored(reduced, factor_band(a), back(vector), at))[0]
+    def solved(damping):
+        a, reduced, right = reduce_normal(at, damping)
+        return ravel_pytree(solve_factored(reduced, factor_band(a), back(vector), at))[0], reduced, right
 
+    # One damping after the other: half of what is compiled here is the normal equations.
+    solutions, *undamped = jax.lax.map(solved, jnp.array(DAMPINGS))
+    reduced, right = jax.tree.map(lambda v: v[DAMPINGS.index(0.0)], undamped)
     b, down, d, squares = gradient(at, reduced, at)
     return Dense(
         jacobian=jax.vmap(lambda seed: ravel_pytree(product(back(seed)))[0], out_axes=1)(jnp.eye(len(flat))),
@@ -150,7 +152,7 @@ def _dense(values, structure) -> Dense:
         sums=ravel_pytree(right.b)[0],
         square_sums=jnp.stack([squares, right.square_sum]),
         taken_down=jnp.stack([jnp.concatenate([down, d]), jnp.concatenate([right.reduced, right.d])]),
-        solutions=jax.vmap(solution)(jnp.array(DAMPINGS)),
+        solutions=solutions,
         scale=flat_scale,
     )
 

@@ -64,9 +64,8 @@ def test_a_banded_reduced_matrix_gives_what_a_dense_one_gives(corridor, monkeypa
     assert_same(banded, everything(corridor, start))
 
 
-@pytest.mark.parametrize("name", ["cross", "three_models"])
-def test_one_small_tile_at_a_time_gives_what_many_together_give(name, monkeypatch):
-    block, start = simulated(name).block, adjusted(name).unknowns
+def test_one_small_tile_at_a_time_gives_what_many_together_give(monkeypatch):
+    block, start = simulated("three_models").block, adjusted("three_models").unknowns
     together = everything(block, start)
     monkeypatch.setattr(padding, "_SLOTS", 1)
     monkeypatch.setattr(padding, "_CHUNK", 20_000)

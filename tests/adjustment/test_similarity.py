@@ -72,7 +72,7 @@ def test_a_free_network_is_found_from_afar():
     block = free_network("inner")
     near = adjust(block)
     rng, known = np.random.default_rng(1), near.unknowns
-    turn = np.asarray(jax.vmap(small_rotation)(rng.normal(0, 0.3, (len(block.images), 3))))
+    turn = np.asarray(jax.jit(jax.vmap(small_rotation))(rng.normal(0, 0.3, (len(block.images), 3))))
     exterior = dataclasses.replace(
         known.exterior,
         position=known.exterior.position + rng.normal(0, 120.0, (len(block.images), 3)),

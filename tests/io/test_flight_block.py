@@ -3,7 +3,6 @@
 import dataclasses
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
@@ -15,9 +14,12 @@ from jaxphoto.io import read_block, write_block
 from jaxphoto.io.block_folder.frame_sections import frame_section
 from jaxphoto.io.trajectory import FIELDS, Records, write_flight_csv, write_sbet
 from jaxphoto.rotation import matrix_from_roll_pitch_yaw, roll_pitch_yaw_from_matrix
+from tests.derivatives import compiled
 
 START = 350_000.0
 FIX_OFFSET = ("block.toml", "[mounts.default]", '[mounts.default]\ntime_offset = "free"')
+
+matrices = compiled(jax.vmap(matrix_from_roll_pitch_yaw))
 
 
 def motion(t):
@@ -65,9 +67,7 @@ def test_positions_attitudes_and_motion_are_those_of_the_flight(fly):
     step = 1e-4
     velocity = (motion(times + step)[0] - motion(times - step)[0]) / (2 * step)
     np.testing.assert_allclose(block.motion.velocity, velocity, rtol=0, atol=1e-4)
-    before, after = (
-        np.asarray(jax.vmap(matrix_from_roll_pitch_yaw)(jnp.deg2rad(motion(times + s)[1]))) for s in (-step, step)
-    )
+    before, after = (matrices(np.deg2rad(motion(times + s)[1])) for s in (-step, step))
     turn = np.einsum("nji,njk->nik", before, after) / (2 * step)
     rate = np.stack([turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]], axis=1)
     np.testing.assert_allclose(block.motion.rate, rate, rtol=0, atol=1e-5)
@@ -136,8 +136,8 @@ def test_sbet_in_an_epsg_frame(fly, wander):
     position, angles = motion(np.array([1.01, 3.33, 9.99]))
     np.testing.assert_allclose(np.asarray(block.stations.value).reshape(-1, 3), position, rtol=0, atol=1e-5)
     level = block.frame.map.local_from_level(position)
-    expected = level @ np.asarray(jax.vmap(matrix_from_roll_pitch_yaw)(jnp.deg2rad(angles)))
-    got = jax.vmap(matrix_from_roll_pitch_yaw)(block.attitudes.roll_pitch_yaw)
+    expected = level @ matrices(np.deg2rad(angles))
+    got = matrices(block.attitudes.roll_pitch_yaw)
     np.testing.assert_allclose(got, expected, rtol=0, atol=1e-7)
 
 
@@ -148,11 +148,9 @@ def test_csv_in_a_map_system(fly, north):
     epsg = f'kind = "epsg"\nvertical = "ellipsoidal"\nyaw = "{north}"\n{epsg}'
     records = flight()
     axes = frame.map.local_from_level if north == "true" else frame.map.local_from_grid
-    bodies = jax.vmap(matrix_from_roll_pitch_yaw)(jnp.deg2rad(records.roll_pitch_yaw_deg))
-    angles = jax.vmap(roll_pitch_yaw_from_matrix)(np.swapaxes(axes(records.coordinates), 1, 2) @ bodies)
-    written = records._replace(
-        coordinates=frame.map.map(records.coordinates), roll_pitch_yaw_deg=np.rad2deg(np.asarray(angles))
-    )
+    bodies = matrices(np.deg2rad(records.roll_pitch_yaw_deg))
+    angles = compiled(jax.vmap(roll_pitch_yaw_from_matrix))(np.swapaxes(axes(records.coordinates), 1, 2) @ bodies)
+    written = records._replace(coordinates=frame.map.map(records.coordinates), roll_pitch_yaw_deg=np.rad2deg(angles))
     points = ("control_points.csv", "", None), ("object_points.csv", "", None), ("distances.csv", "", None)
     folder = fly(written, (1.01, 3.33, 9.99), "", ("block.toml", 'kind = "local"', epsg), *points)
     block = read_block(folder)

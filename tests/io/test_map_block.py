@@ -273,7 +273,9 @@ def test_an_adjustment_does_not_depend_on_the_system_of_the_files(tmp_path):
     assert np.abs(exterior[["E_m", "N_m", "H_m"]].to_numpy() - start[["X_m", "Y_m", "Z_m"]].to_numpy()).max() < 10
     local = np.asarray(in_utm.unknowns.exterior.position)
     np.testing.assert_allclose(exterior[["E_m", "N_m", "H_m"]], frame.map.map(local), rtol=0, atol=1e-6)
-    got = jax.vmap(matrix_from_omega_phi_kappa)(np.deg2rad(exterior[["omega_deg", "phi_deg", "kappa_deg"]].to_numpy()))
+    got = jax.jit(jax.vmap(matrix_from_omega_phi_kappa))(
+        np.deg2rad(exterior[["omega_deg", "phi_deg", "kappa_deg"]].to_numpy())
+    )
     camera = np.asarray(in_utm.unknowns.exterior.camera_from_object) @ frame.map.local_from_grid(local)
     np.testing.assert_allclose(got, camera, rtol=0, atol=1e-12)
     points = pd.read_csv(tmp_path / "results" / "object_points_map.csv")

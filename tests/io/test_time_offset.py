@@ -54,7 +54,7 @@ def test_a_time_offset_is_estimated_with_its_standard_deviation(tmp_path):
     times = np.r_[0:41:9.5, 100:141:9.5]
     at, attitude = pose(times)
     at, attitude = at + rng.normal(0, 0.03, at.shape), attitude + rng.normal(0, 0.003, at.shape)
-    body = np.asarray(jax.vmap(matrix_from_roll_pitch_yaw)(np.deg2rad(attitude)))
+    body = np.asarray(jax.jit(jax.vmap(matrix_from_roll_pitch_yaw))(np.deg2rad(attitude)))
     camera = np.swapaxes(body @ NOMINAL["forward"], 1, 2)
     points = np.column_stack([rng.uniform(-200, 1400, 60), rng.uniform(-200, 500, 60), rng.uniform(0, 120, 60)])
 

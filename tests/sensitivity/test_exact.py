@@ -145,9 +145,9 @@ def test_derivatives_by_what_is_fixed(label: str) -> None:
 
 
 def test_derivative_by_a_fixed_lever_arm() -> None:
-    priors = eqx.tree_at(lambda p: p.mounts["imu"].lever_arm, simulated("mount").block.priors, FIXED)
-    block = simulated("mount").block
-    a = adjust(block, adjusted("mount").unknowns, priors)
+    block, truth = simulated("mount")
+    priors = eqx.tree_at(lambda p: p.mounts["imu"].lever_arm, block.priors, FIXED)
+    a = adjust(block, truth, priors)
     found = sensitivity(a, curvature=True)
     column = found.fixed_labels.index("mounts[imu].lever_arm_forward_m")
     row = found.of("interior[one].yp_mm")

@@ -296,7 +296,7 @@ def test_what_is_written_is_what_was_scanned(tmp_path):
     np.testing.assert_array_equal(records.coordinates, simulation.trajectory.position)
     some = slice(0, None, 500)
     angles = np.deg2rad(records.roll_pitch_yaw_deg[some])
-    body = jax.vmap(matrix_from_quaternion)(jax.numpy.asarray(simulation.trajectory.quaternion[some]))
+    body = jax.jit(jax.vmap(matrix_from_quaternion))(jax.numpy.asarray(simulation.trajectory.quaternion[some]))
     np.testing.assert_allclose(np.stack([_body(*a) for a in angles]), body, rtol=0, atol=1e-12)
     truth = pd.read_csv(folder / "truth" / "scanner.csv").set_index("parameter")["value"]
     scanner = simulation.truth.scanner
