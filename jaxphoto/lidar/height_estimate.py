@@ -9,8 +9,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxphoto.arrays import Numbers
 from jaxphoto.lidar.height_error import LidarNoise, excess, height_sigma, noise_variance
+from jaxphoto.lidar.inverse_distance import inverse_distance_weights
 from jaxphoto.lidar.local_surface import LocalFit, Neighbours, fit_surface
-from jaxphoto.lidar.sight import empty_about
+from jaxphoto.lidar.sight import empty_about, surrounded
 from jaxphoto.lidar.tin import delaunay_triangle
 
 # Points around a place that tell slope, curvature and roughness: at least so many, and so many times those used.
@@ -93,7 +94,8 @@ def _estimate(near: Neighbours, leafy: Bool[Array, "points"], numbers: HeightNum
     fit = jax.tree.map(lambda a, b: jnp.where(take_flat, a, b), flat, curved)
     final = interpolates = jnp.array(True)
     if method == "idw":
-        weight = _inverse_distance(near.distance, used, numbers.power)
+        weight = inverse_distance_weights(near.distance**2, used, numbers.power)
+        weight = jnp.where(jnp.any(used), weight, jnp.nan)
     elif method == "plane":
         plane = fit_surface(near, used.astype(float), quadratic=False)
         weight, interpolates = jnp.where(plane.determined, plane.rows[0], jnp.nan), plane.interpolates
@@ -118,7 +120,7 @@ def _estimate(near: Neighbours, leafy: Bool[Array, "points"], numbers: HeightNum
         gradient=fit.coefficients[1:3],
         leafy=jnp.sum(leafy & used) / jnp.maximum(jnp.sum(used), 1),
         hole=empty_about(near.distance, around),
-        surrounded=_surrounded(near.xy, around) & fit.interpolates & interpolates,
+        surrounded=surrounded(near.xy, around) & fit.interpolates & interpolates,
         plane=take_flat & (method == "local"),
         misfit=misfit(fit, _HARDLY),
         rough=fit.variance > _ROUGH**2 * expected,
@@ -126,21 +128,3 @@ def _estimate(near: Neighbours, leafy: Bool[Array, "points"], numbers: HeightNum
         one_surface=curved.variance,
         final=final,
     )
-
-
-def _inverse_distance(
-    distance: Float[Numbers, "points"], used: Bool[Numbers, "points"], power: Float[Numbers, ""]
-) -> Float[Numbers, "points"]:
-    """Weights d^-p, their sum 1; those at the place itself alone where there are any."""
-    at_place = used & (distance == 0)
-    relative = jnp.where(distance > 0, distance, 1.0) / jnp.max(jnp.where(used, distance, 0.0))
-    weight = jnp.where(jnp.any(at_place), 1.0 * at_place, jnp.where(used, relative**-power, 0.0))
-    return weight / jnp.sum(weight)
-
-
-def _surrounded(xy: Float[Numbers, "points 2"], there: Bool[Numbers, "points"]) -> Bool[Array, ""]:
-    """Whether the place lies in the hull of the points: between no two of their directions is half a turn."""
-    direction = jnp.sort(jnp.where(there, jnp.arctan2(xy[:, 1], xy[:, 0]), jnp.inf))
-    n = jnp.sum(there)
-    following = jnp.roll(direction, -1).at[n - 1].set(direction[0] + 2 * jnp.pi)
-    return jnp.max(jnp.where(jnp.arange(len(xy)) < n, following - direction, 0.0)) < jnp.pi

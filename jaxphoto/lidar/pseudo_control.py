@@ -42,6 +42,7 @@ from jaxphoto.georeferencing.corrections import NO_CORRECTIONS
 from jaxphoto.lidar.grid import Grid, around
 from jaxphoto.lidar.height_error import LidarNoise, excess, height_sigma, noise_variance
 from jaxphoto.lidar.height_settings import HeightFlag, HeightSettings
+from jaxphoto.lidar.inverse_distance import inverse_distance_weights
 from jaxphoto.lidar.local_surface import LocalFit, Neighbours, fit_surface
 from jaxphoto.lidar.sight import Skyline, empty_about, first_met, levels, skyline, surrounded, window_reach
 
@@ -257,7 +258,10 @@ def _interpolated(
         weight = fit.rows[0]
     else:
         shown = jax.vmap(lambda p: project(interior, exterior, apparent_point(exterior.position, p, corrections)))(xyz)
-        weight = _inverse_distance(jnp.sum((shown - xy) ** 2, axis=1), chosen.seen, points, numbers.power)
+        squared = jnp.sum((shown - xy) ** 2, axis=1)
+        known = jax.lax.stop_gradient(jnp.where(chosen.seen, squared, jnp.inf))
+        nearest = chosen.seen & (jnp.sum(known < known[:, None], axis=1) < points)
+        weight = inverse_distance_weights(squared, nearest, numbers.power)
     z = base + weight @ around_ray.z
     point, ahead = ground_point(interior, exterior, xy, z, corrections)
 
@@ -291,21 +295,6 @@ def _described(
     flags = ((hole, HeightFlag.HOLE), (edge, HeightFlag.EDGE), (rough & ~broken, HeightFlag.VEGETATION))
     flag = sum((which * int(name) for which, name in flags), broken * int(HeightFlag.BREAKLINE))
     return sigma, flag, slope / (1 + slope @ ray.run), jnp.sqrt(fit.variance)
-
-
-def _inverse_distance(
-    squared: Float[Array, "m"], seen: Bool[Array, "m"], points: int, power: Float[Array, ""]
-) -> Float[Array, "m"]:
-    """d^-p of the nearest points over their sum, from d^2; where a point is met exactly, it alone counts."""
-    known = jax.lax.stop_gradient(jnp.where(seen, squared, jnp.inf))
-    used = seen & (jnp.sum(known < known[:, None], axis=1) < points)
-    least = jnp.where(used.any(), jnp.min(known), 1.0)
-    exact = squared == 0
-    # Double where: neither a distance nor a ratio of zero has a NaN derivative.
-    ratio = jnp.where(exact, 1.0, least / jnp.where(exact, 1.0, squared))
-    some = used & (ratio > 0)
-    weight = jnp.where(some, jnp.where(some, ratio, 1.0) ** (power / 2), 0.0)
-    return weight / jnp.maximum(jnp.sum(weight), 1e-300)
 
 
 def _room(n: int) -> int:

@@ -124,8 +124,12 @@ def levels(
 
 
 def surrounded(q: Float[Numbers, "m 2"], which: Bool[Numbers, "m"]) -> Bool[Array, ""]:
-    """Whether the points `which` lie on all sides of q = 0: whether each has another less than half a turn on."""
+    """Whether the points `which` lie on all sides of q = 0: whether each has another less than half a turn on.
+
+    A point at q = 0 itself lies on no side.
+    """
     x, y = q[:, 0], q[:, 1]
+    which = which & ((x != 0) | (y != 0))
     to_the_left = which & (x[:, None] * y - y[:, None] * x > 0)
     return jnp.all(~which | to_the_left.any(axis=1)) & jnp.any(which)
 

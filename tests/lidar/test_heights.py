@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.optimize import brentq
-from scipy.spatial import cKDTree
+from scipy.spatial import ConvexHull, cKDTree
 from scipy.stats import norm
 
 from jaxphoto import InputError
@@ -13,6 +13,7 @@ from jaxphoto.cloud import Cloud
 from jaxphoto.lidar import HeightFlag, HeightSettings, heights_at, index_cloud
 from jaxphoto.lidar.height_error import normal_equivalent
 from jaxphoto.lidar.height_settings import REFUSED
+from jaxphoto.lidar.sight import surrounded
 from tests.lidar.clouds import SURFACES, gable, ground, places_over, read_autzen
 
 METHODS = ("idw", "plane", "tin", "local")
@@ -59,6 +60,32 @@ def test_heights_at_points_themselves_are_theirs() -> None:
     inner = xyz[(np.abs(xyz[:, :2] - 20) < 12).all(axis=1)]
     for method in ("idw", "tin"):
         np.testing.assert_allclose(heights_at(Cloud(xyz), inner[:, :2], method, ALL).z, inner[:, 2], atol=1e-9)
+
+
+def test_a_place_is_surrounded_where_its_neighbours_hull_holds_it() -> None:
+    """Against the hull's own equations; a laser point exactly at the place lies on no side and changes nothing."""
+    rng = np.random.default_rng(8)
+    told = []
+    for _ in range(60):
+        q = rng.normal(rng.normal(0, 0.7, 2), 1.0, (7, 2))
+        inside = bool((ConvexHull(q).equations[:, 2] < 0).all())
+        used, with_own = np.ones(7, bool), np.vstack([q, np.zeros((1, 2))])
+        assert bool(surrounded(q, used)) == bool(surrounded(with_own, np.ones(8, bool))) == inside
+        # Those that do not count are of no account.
+        assert bool(surrounded(np.vstack([q, -q]), np.append(used, ~used))) == inside
+        told.append(inside)
+    assert 10 < sum(told) < 50
+    on_the_rim = np.array([[1.0, 2.0], [-2.0, -4.0], [3.0, 1.0], [0.0, 0.0]])
+    assert not surrounded(on_the_rim, np.ones(4, bool))
+    assert not surrounded(np.zeros((1, 2)), np.ones(1, bool))
+
+
+def test_a_height_at_a_laser_point_is_told() -> None:
+    """By every method: at a point inside the cloud there is no edge."""
+    xyz = ground(lambda x, y: 0.3 * x, 1.0, 0.05, 0.02, 40.0)
+    inner = xyz[(np.abs(xyz[:, :2] - 20) < 12).all(axis=1)]
+    for method in METHODS:
+        assert not heights_at(Cloud(xyz), inner[:, :2], method, EXACT).flagged(HeightFlag.EDGE).mean() > 0.01
 
 
 def test_radius_takes_all_points_within() -> None:

@@ -15,12 +15,16 @@ from jaxphoto.errors import InputError
 from jaxphoto.lidar.grid import index_cloud
 from jaxphoto.lidar.height_settings import HeightFlag, HeightSettings
 from jaxphoto.lidar.pseudo_control import pseudo_control_points
+from tests.derivatives import compiled
 
 POINTS = 32400
 HEIGHT = 1000.0
 CAMERA = InteriorOrientation(34.0, 0.06, 0.27, Brown(k1=-9e-5))
 NOISE = (0.5, 0.15)
 SLOPE = np.tan(np.pi / 6)
+
+projected = compiled(jax.vmap(project, (None, None, 0)))
+ideal = compiled(CAMERA.ideal_from_measured)
 
 
 def image(tilt_deg: float) -> ExteriorOrientation:
@@ -30,7 +34,7 @@ def image(tilt_deg: float) -> ExteriorOrientation:
 
 
 def measured(exterior, points):
-    return np.array(jax.vmap(lambda point: project(CAMERA, exterior, point))(points))
+    return np.array(projected(CAMERA, exterior, points))
 
 
 def scanned(surface, density, rng, noise=NOISE):
@@ -85,7 +89,7 @@ def direct(exterior, xy, cloud, n, power):
         near = np.argsort(distance)[:n]
         weight = np.maximum(distance[near], 1e-12) ** -power
         z = weight @ cloud[near, 2] / weight.sum()
-        ray = m.T @ [*np.asarray(CAMERA.ideal_from_measured(at)), -CAMERA.c]
+        ray = m.T @ [*ideal(at), -CAMERA.c]
         result.append(position + ray * (z - position[2]) / ray[2])
     return np.array(result)
 

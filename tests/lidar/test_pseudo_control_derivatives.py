@@ -31,10 +31,10 @@ def test_derivatives_are_those_of_differences(interpolation):
         return pseudo_control_points(interior, taken, xy + theta[10:], grid, settings, interpolation=interpolation).xyz
 
     differences = np.stack([(points(theta + d) - points(theta - d)) / (2 * d.sum()) for d in np.diag(step)], axis=-1)
-    exact = np.asarray(jax.jacfwd(points)(theta))
+    exact = np.asarray(jax.jit(jax.jacfwd(points))(theta))
     wrong = np.abs(exact - differences).max(axis=1) > 1e-4 * np.abs(differences).max(axis=(0, 1))
     assert wrong.any(axis=1).sum() <= 1
     assert np.abs(differences[:, 2]).max(axis=0).min() > 0
     if interpolation == "weighted":
-        backward = jax.grad(lambda theta: points(theta)[:, 2].mean())(theta)
+        backward = jax.jit(jax.grad(lambda theta: points(theta)[:, 2].mean()))(theta)
         np.testing.assert_allclose(backward, exact[:, 2].mean(axis=0), rtol=1e-9, atol=1e-12)
