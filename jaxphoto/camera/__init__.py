@@ -5,17 +5,20 @@ from jaxphoto.camera.distortion import (
     DISTORTIONS,
     AbstractDistortion,
     AffineBrown,
+    Agisoft,
     Balanced,
     Brown,
     Brown14,
     BundlerRadial,
     Ebner,
     Gruen,
+    OpenCv,
     PpsRadial,
     RadialPolynomial,
     Smac,
     invert,
 )
+from jaxphoto.camera.equivalence import exact, with_sign
 from jaxphoto.camera.interior import (
     InteriorOrientation,
     constant_names,
@@ -35,9 +38,9 @@ from jaxphoto.camera.principal_points import (
 from jaxphoto.camera.sensor import Sensor
 
 __all__ = [
-    "DISTORTIONS", "AbstractDistortion", "AffineBrown", "Balanced", "Brown", "Brown14", "BundlerRadial",
-    "ConversionError", "Ebner", "Gruen", "InteriorOrientation", "PpsRadial", "PrincipalPoints", "RadialPolynomial",
-    "Sensor", "Smac", "constant_names", "conversion_error", "decentring_from_symmetry", "get_parameter", "invert",
-    "needed_constants", "parameter_names", "principal_points", "rebalance", "rebalance_covariance", "set_parameter",
-    "symmetry_from_decentring",
+    "DISTORTIONS", "AbstractDistortion", "AffineBrown", "Agisoft", "Balanced", "Brown", "Brown14", "BundlerRadial",
+    "ConversionError", "Ebner", "Gruen", "InteriorOrientation", "OpenCv", "PpsRadial", "PrincipalPoints",
+    "RadialPolynomial", "Sensor", "Smac", "constant_names", "conversion_error", "decentring_from_symmetry", "exact",
+    "get_parameter", "invert", "needed_constants", "parameter_names", "principal_points", "rebalance",
+    "rebalance_covariance", "set_parameter", "symmetry_from_decentring", "with_sign",
 ]  # fmt: skip

@@ -1,9 +1,11 @@
 """Files -> `Block` and back: the block folder, and other programs' formats converted to it."""
 
 from jaxphoto.io.block_folder import read_block, write_block
+from jaxphoto.io.cameras import read_camera_file, write_camera_file
 from jaxphoto.io.convert import FORMATS, convert, read_source
 from jaxphoto.io.recipe import read_recipe, recipe_from, write_simulation
 
 __all__ = [
-    "FORMATS", "convert", "read_block", "read_recipe", "read_source", "recipe_from", "write_block", "write_simulation",
+    "FORMATS", "convert", "read_block", "read_camera_file", "read_recipe", "read_source", "recipe_from",
+    "write_block", "write_camera_file", "write_simulation",
 ]  # fmt: skip

@@ -9,6 +9,8 @@ from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 
+from jaxphoto.adjustment import Adjustment
+from jaxphoto.camera import DISTORTIONS, Smac
 from jaxphoto.errors import InputError
 from jaxphoto.report.page import report_page
 from jaxphoto.report.tables import Tables
@@ -91,11 +93,28 @@ def summary_of(tables: Tables, warnings: list[str], seconds: dict[str, float]) -
         "n_constraints": adjusted.n_constraints,
         "n_unknowns": {"total": sum(unknowns.values()), **unknowns},
         "iterations": int(adjusted.steps),
+        "cameras": _cameras(adjusted),
         "georeferencing": {p: {"value": v, "sigma": s} for p, v, s in tables.georeferencing.itertuples(index=False)},
         "seconds": {name: round(value, 6) for name, value in seconds.items()},
         "warnings": warnings,
         "versions": versions(),
     }
+
+
+def _cameras(adjusted: Adjustment) -> dict:
+    """Sensor and distortion model of every camera, by which interior.csv can be read."""
+    told = {}
+    for name, interior in adjusted.unknowns.interior.items():
+        distortion, sensor = interior.distortion, adjusted.block.sensors[name]
+        told[name] = {
+            "width_px": sensor.width_px,
+            "height_px": sensor.height_px,
+            "pixel_mm": sensor.pixel_mm,
+            "distortion": next(key for key, kind in DISTORTIONS.items() if kind is type(distortion)),
+        }
+        if isinstance(distortion, Smac):
+            told[name]["sign"] = distortion.sign
+    return told
 
 
 def versions() -> dict[str, str]:

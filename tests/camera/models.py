@@ -4,12 +4,14 @@ import numpy as np
 
 from jaxphoto.camera import (
     AffineBrown,
+    Agisoft,
     Balanced,
     Brown,
     Brown14,
     BundlerRadial,
     Ebner,
     Gruen,
+    OpenCv,
     PpsRadial,
     RadialPolynomial,
     Smac,
@@ -44,6 +46,8 @@ UNITS = {
         for i in range(1, 15)
     },
     BundlerRadial: {"k1": 1e-4, "k2": 1e-7},  # normalised: as for a c of 1 mm
+    OpenCv: {**_RADIAL, "k4": 1e-5, "k5": 1e-8, "k6": 1e-11, "p1": 1e-5, "p2": 1e-5, "b1": 1e-3, "b2": 1e-3},
+    Agisoft: {**_RADIAL, "k4": 1e-13, "p1": 1e-5, "p2": 1e-5, "p3": 1e-3, "p4": 1e-6, "b1": 1e-3, "b2": 1e-3},
 }
 MOST = max(map(len, UNITS.values()))
 # Of such a camera: the balance radius, Ebner's and Gruen's grid, the scale of Brown's a13.

@@ -1,6 +1,7 @@
 """Lens distortion: one final class per model over one abstract base, found by the name a file gives it."""
 
 from jaxphoto.camera.distortion.affine_brown import AffineBrown
+from jaxphoto.camera.distortion.agisoft import Agisoft
 from jaxphoto.camera.distortion.balanced import Balanced
 from jaxphoto.camera.distortion.base import AbstractDistortion, invert
 from jaxphoto.camera.distortion.brown import Brown
@@ -8,6 +9,7 @@ from jaxphoto.camera.distortion.brown14 import Brown14
 from jaxphoto.camera.distortion.bundler_radial import BundlerRadial
 from jaxphoto.camera.distortion.ebner import Ebner
 from jaxphoto.camera.distortion.gruen import Gruen
+from jaxphoto.camera.distortion.open_cv import OpenCv
 from jaxphoto.camera.distortion.pps_radial import PpsRadial
 from jaxphoto.camera.distortion.radial_polynomial import RadialPolynomial
 from jaxphoto.camera.distortion.smac import Smac
@@ -23,9 +25,11 @@ DISTORTIONS: dict[str, type[AbstractDistortion]] = {
     "gruen": Gruen,
     "brown14": Brown14,
     "bundler_radial": BundlerRadial,
+    "opencv": OpenCv,
+    "agisoft": Agisoft,
 }
 
 __all__ = [
-    "DISTORTIONS", "AbstractDistortion", "AffineBrown", "Balanced", "Brown", "Brown14", "BundlerRadial", "Ebner",
-    "Gruen", "PpsRadial", "RadialPolynomial", "Smac", "invert",
+    "DISTORTIONS", "AbstractDistortion", "AffineBrown", "Agisoft", "Balanced", "Brown", "Brown14", "BundlerRadial",
+    "Ebner", "Gruen", "OpenCv", "PpsRadial", "RadialPolynomial", "Smac", "invert",
 ]  # fmt: skip

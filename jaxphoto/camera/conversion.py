@@ -1,0 +1,224 @@
+"""The same camera with another distortion model: exactly where the models allow it (`exact`), otherwise fitted."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.optimize import least_squares
+
+from jaxphoto.camera.distortion import (
+    AbstractDistortion,
+    AffineBrown,
+    Agisoft,
+    Balanced,
+    Brown,
+    OpenCv,
+    Smac,
+    invert,
+)
+from jaxphoto.camera.equivalence import exact
+from jaxphoto.camera.interior import (
+    InteriorOrientation,
+    constant_names,
+    get_parameter,
+    needed_constants,
+    parameter_names,
+    set_parameter,
+)
+from jaxphoto.camera.sensor import Sensor
+from jaxphoto.compiling import call_compiled
+
+# Image points along each side of the format, corners included, at which cameras are compared.
+_SIDE = 25
+# A fit without the terms that are rarely needed is taken where it misses by no more than this.
+_GOOD_PX = 0.01
+# What a model has beyond the terms that most cameras need; scales (K0) stand beside c and are never fitted.
+_RARE: dict[type[AbstractDistortion], tuple[str, ...]] = {
+    OpenCv: ("k4", "k5", "k6", "b1", "b2"),
+    Agisoft: ("k4", "p3", "p4", "b1", "b2"),
+    Brown: ("b1", "b2"),
+    AffineBrown: ("b1", "b2"),
+    Balanced: ("c1", "c2"),
+    Smac: ("k4", "p3", "p4"),
+}
+
+# Where a fit ends: rational models lie in a flat valley, in which only the coefficients change any more.
+_UNTIL = {"ftol": 1e-10, "xtol": 1e-13, "gtol": 1e-13, "max_nfev": 300}
+
+
+def usual_coefficients(distortion: type[AbstractDistortion]) -> tuple[str, ...]:
+    """The coefficients of a model that most cameras need: without affinity, rational and highest terms, and scales."""
+    rare = (*_RARE.get(distortion, ()), *distortion.scales)
+    return tuple(name for name in distortion.coefficients if name not in rare)
+
+
+class Conversion(NamedTuple):
+    """A camera written with another model, and by how much its image points are displaced for the same rays (px)."""
+
+    interior: InteriorOrientation
+    rms_px: float
+    """Over the format, of the length of the displacement; 0 where the conversion is exact."""
+    max_px: float
+    covered: float
+    """The part of the format that was compared; below 1 where the given camera says nothing of its corners."""
+
+
+def converted(
+    interior: InteriorOrientation, target: type[AbstractDistortion], sensor: Sensor, held: tuple[str, ...] = ()
+) -> Conversion:
+    """`exact` where it exists, otherwise `fitted`; `held` names coefficients of `target` that must be 0.
+
+    Raises what `fitted` raises.
+    """
+    same = exact(interior, target)
+    if same is not None and all(float(get_parameter(same, name)) == 0 for name in held):
+        return Conversion(same, 0.0, 0.0, 1.0)
+    return fitted(interior, target, sensor, held)
+
+
+def fitted(
+    interior: InteriorOrientation, target: type[AbstractDistortion], sensor: Sensor, held: tuple[str, ...] = ()
+) -> Conversion:
+    """The camera with the model `target` whose rays are nearest to those of `interior`, by least squares in the image.
+
+    c, x_p, y_p and the coefficients of `target` but `held` are fitted to 25 x 25 evenly spaced image points of the
+    format, all of one weight; the camera is not turned. Rare terms (affinity, rational and highest ones) are taken only
+    where others leave more than 0.01 px. R0 of SMAC and of the balanced model is 0.
+
+    Raises ValueError where `interior` says nothing of more than half of the format, or the fitted model folds in it.
+    """
+    points, rays, covered = _sampled(interior, sensor)
+    scales = (*held, *target.scales)
+    rare = tuple(n for n in target.coefficients if n not in (*usual_coefficients(target), *scales))
+    found = _fit(_plain(interior, target, sensor), sensor, points, rays, (*scales, *rare))
+    if rare and not found.max_px <= _GOOD_PX:
+        fuller = _fit(found.interior, sensor, points, rays, scales)
+        # A fold makes max_px NaN: any other is better.
+        found = fuller if not found.rms_px <= fuller.rms_px else found
+    if not np.isfinite(found.max_px):
+        raise ValueError(
+            f"{target.__name__} cannot follow this camera to the edge of its format: the fitted model folds there; "
+            "choose a model with more terms"
+        )
+    return found._replace(covered=covered)
+
+
+def _sampled(interior: InteriorOrientation, sensor: Sensor) -> tuple[np.ndarray, np.ndarray, float]:
+    """Image points (mm) of the format that the camera maps, their ideal coordinates over c, and their part of all."""
+    x, y = (np.linspace(-0.5, 0.5, _SIDE) * side for side in (sensor.width_mm, sensor.height_mm))
+    points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    rays, good = (np.asarray(v) for v in call_compiled(_rays, _arrays(interior), points))
+    if good.mean() < 0.5:
+        raise ValueError(
+            f"the distortion of this camera folds within {1 - good.mean():.0%} of its format: check its coefficients, "
+            "their unit and the size of the image"
+        )
+    return points[good], rays[good], float(good.mean())
+
+
+@eqx.filter_jit
+def _rays(interior: InteriorOrientation, points):
+    """Ideal coordinates over c of image points, and whether the model is invertible there."""
+    d, c = interior.distortion, interior.c
+
+    def of_one(xy):
+        ideal, reduced = interior.ideal_from_measured(xy) / c, xy - interior.principal_point
+        if d.domain == "ideal":
+            good = invert(d, reduced / c if d.normalised else reduced)[1]
+        else:
+            # The inverse of an inverse: only within the monotone range does it lead back.
+            back, monotone = invert(d, c * ideal)
+            good = monotone & (jnp.max(jnp.abs(back - reduced)) < 1e-6 * c)
+        return ideal, good & jnp.all(jnp.isfinite(ideal))
+
+    return jax.vmap(of_one)(points)
+
+
+def _fit(
+    first: InteriorOrientation, sensor: Sensor, points: np.ndarray, rays: np.ndarray, held: tuple[str, ...]
+) -> Conversion:
+    """All parameters of `first` but `held` fitted, from its values."""
+    names = parameter_names(first)
+    free = np.array([name not in held for name in names])
+    begin = np.array([float(get_parameter(first, name)) for name in names])
+    data = (_arrays(first), np.array(sensor.pixel_mm), _padded(points), _padded(rays))
+
+    # All parameters go in, held ones too: one program serves a model.
+    def whole(values):
+        full = begin.copy()
+        full[free] = values
+        return full
+
+    def residuals(values):
+        return np.asarray(call_compiled(_displacements, whole(values), *data)).ravel()
+
+    def jacobian(values):
+        return np.asarray(call_compiled(_jacobian, whole(values), *data)).reshape(-1, len(names))[:, free]
+
+    solved = least_squares(residuals, begin[free], jacobian, method="lm", x_scale="jac", **_UNTIL)
+    interior = _with(first, whole(solved.x))
+    moved = np.asarray(call_compiled(_moved, _arrays(interior), *data[1:]))[: len(points)]
+    return Conversion(interior, float(np.sqrt(np.mean(moved**2))), float(np.max(moved)), 1.0)
+
+
+def _padded(values: np.ndarray) -> np.ndarray:
+    """NaN in place of the points of a format that were left out: one program serves all."""
+    return np.concatenate([values, np.full((_SIDE**2 - len(values), 2), np.nan)])
+
+
+@eqx.filter_jit
+def _displacements(values, first: InteriorOrientation, pixel_mm, points, rays):
+    """By how much the image points of the given rays lie elsewhere (px), to first order for measured-domain models."""
+    interior = _with(first, values)
+
+    def of_one(xy, ray):
+        here = jnp.all(jnp.isfinite(xy))
+        xy, ray = jnp.where(here, xy, 0.0), jnp.where(here, ray, 0.0)
+        if interior.distortion.domain == "ideal":
+            apart = interior.measured_from_ideal(interior.c * ray) - xy
+        else:
+            # Ideal coordinates over c; the model's own derivative takes their difference to the image.
+            ideal = lambda m: interior.ideal_from_measured(m) / interior.c  # noqa: E731
+            j = jax.lax.stop_gradient(jax.jacfwd(ideal)(xy))
+            apart = jnp.linalg.solve(j, ray - ideal(xy))
+        return jnp.where(here, apart / pixel_mm, 0.0)
+
+    return jax.vmap(of_one)(points, rays)
+
+
+@eqx.filter_jit
+def _jacobian(values, *rest):
+    return jax.jacfwd(lambda v: _displacements(v, *rest))(values)
+
+
+@eqx.filter_jit
+def _moved(interior: InteriorOrientation, pixel_mm, points, rays):
+    """Lengths of the displacements (px), exactly; NaN where the model folds."""
+
+    def of_one(xy, ray):
+        ideal = interior.c * ray
+        apart = interior.measured_from_ideal(ideal) - xy
+        return jnp.where(interior.valid(ideal), jnp.linalg.norm(apart) / pixel_mm, jnp.nan)
+
+    return jax.vmap(of_one)(points, rays)
+
+
+def _plain(interior: InteriorOrientation, target: type[AbstractDistortion], sensor: Sensor) -> InteriorOrientation:
+    """The camera without distortion, as a `target` whose lengths (grid, scale of Brown 14) suit the format."""
+    lengths = {"f": float(interior.c), "b": sensor.width_mm / 3}
+    constants = {field: jnp.asarray(lengths[field]) for field in needed_constants(target).values()}
+    zero = {name: jnp.zeros(()) for name in target.coefficients}
+    others = {f: jnp.zeros(()) for f in constant_names(target).values() if f not in constants}
+    return InteriorOrientation(interior.c, interior.x_p, interior.y_p, target(**zero, **constants, **others))
+
+
+def _with(interior: InteriorOrientation, values) -> InteriorOrientation:
+    for name, value in zip(parameter_names(interior), values, strict=True):
+        interior = set_parameter(interior, name, value)
+    return interior
+
+
+def _arrays(interior: InteriorOrientation) -> InteriorOrientation:
+    return jax.tree.map(lambda v: np.asarray(v, float), interior)

@@ -1,0 +1,46 @@
+"""Agisoft's frame camera: polynomial from ideal to measured, normalised, with affinity and skew."""
+
+from typing import ClassVar, Literal
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxphoto.camera.distortion.base import AbstractDistortion, decentring, radial
+from jaxphoto.camera.distortion.open_cv import affine_up
+
+
+class Agisoft(AbstractDistortion):
+    """K1-K4, P1-P4 of Metashape and PhotoScan and their affinity; `measured = c (u + b1 u + b2 v, v)`.
+
+        u = x q + t (P1 (r^2 + 2 x^2) + 2 P2 x y),   v = y q + t (2 P1 x y + P2 (r^2 + 2 y^2))
+        q = 1 + K1 r^2 + K2 r^4 + K3 r^6 + K4 r^8,   t = 1 + P3 r^2 + P4 r^4
+
+    (x, y) is the ideal coordinate divided by c, and in these formulas y runs *down*, as in Agisoft's; the coordinates
+    that `closed_form` takes and gives have y up, as everywhere here. c is its f; all coefficients are its own numbers,
+    without unit, but for b1 = B1 / f and b2 = B2 / f, as its B1 and B2 are in pixels. P3 and P4 are of PhotoScan
+    1.2 to 1.4; Metashape has none.
+    Source: Agisoft PhotoScan and Metashape, user manual, appendix "Camera models".
+    """
+
+    k1: Float[Array, ""] | float = 0.0
+    k2: Float[Array, ""] | float = 0.0
+    k3: Float[Array, ""] | float = 0.0
+    k4: Float[Array, ""] | float = 0.0
+    p1: Float[Array, ""] | float = 0.0
+    p2: Float[Array, ""] | float = 0.0
+    p3: Float[Array, ""] | float = 0.0
+    p4: Float[Array, ""] | float = 0.0
+    b1: Float[Array, ""] | float = 0.0
+    b2: Float[Array, ""] | float = 0.0
+
+    domain: ClassVar[Literal["measured", "ideal"]] = "ideal"
+    coefficients: ClassVar[tuple[str, ...]] = ("k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4", "b1", "b2")
+    normalised: ClassVar[bool] = True
+
+    def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
+        """Measured coordinate of an ideal one, both reduced to the principal point and divided by c, y up."""
+        down = xy * jnp.array([1.0, -1.0])
+        r2 = down[0] * down[0] + down[1] * down[1]
+        q = 1 + radial(r2, self.k1, self.k2, self.k3, self.k4)
+        tangential = (1 + radial(r2, self.p3, self.p4)) * decentring(self.p1, self.p2, down)
+        return affine_up(down * q + tangential, self.b1, self.b2)

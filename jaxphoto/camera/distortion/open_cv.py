@@ -1,0 +1,53 @@
+"""OpenCV's rational lens model with unequal focal lengths and skew: from ideal to measured, normalised."""
+
+from typing import ClassVar, Literal
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxphoto.camera.distortion.base import AbstractDistortion, decentring, radial
+
+
+class OpenCv(AbstractDistortion):
+    """k1-k6, p1, p2 of OpenCV and the affinity of its camera matrix; `measured = c (u + b1 u + b2 v, v)`.
+
+        u = x q + 2 p1 x y + p2 (r^2 + 2 x^2),   v = y q + p1 (r^2 + 2 y^2) + 2 p2 x y
+        q = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)
+
+    (x, y) is the ideal coordinate divided by c, and in these formulas y runs *down*, as in OpenCV; the coordinates that
+    `closed_form` takes and gives have y up, as everywhere here. All coefficients are therefore OpenCV's own numbers,
+    without unit: its p1 and p2 are P2 (with the other sign) and P1 of the decentring of `Brown`. c is f_y, with
+    b1 = f_x / f_y - 1 and b2 = skew / f_y; OpenCV itself has no skew.
+
+    Not all can be estimated together from every block: k4 to k6 do nearly what k1 to k3 do.
+    Source: OpenCV, calib3d, "Detailed description"; COLMAP's FULL_OPENCV is the same, and its SIMPLE_PINHOLE, PINHOLE,
+    SIMPLE_RADIAL, RADIAL and OPENCV are parts of it.
+    """
+
+    k1: Float[Array, ""] | float = 0.0
+    k2: Float[Array, ""] | float = 0.0
+    k3: Float[Array, ""] | float = 0.0
+    k4: Float[Array, ""] | float = 0.0
+    k5: Float[Array, ""] | float = 0.0
+    k6: Float[Array, ""] | float = 0.0
+    p1: Float[Array, ""] | float = 0.0
+    p2: Float[Array, ""] | float = 0.0
+    b1: Float[Array, ""] | float = 0.0
+    b2: Float[Array, ""] | float = 0.0
+
+    domain: ClassVar[Literal["measured", "ideal"]] = "ideal"
+    coefficients: ClassVar[tuple[str, ...]] = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "b1", "b2")
+    normalised: ClassVar[bool] = True
+
+    def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
+        """Measured coordinate of an ideal one, both reduced to the principal point and divided by c, y up."""
+        down = xy * jnp.array([1.0, -1.0])
+        r2 = down[0] * down[0] + down[1] * down[1]
+        q = (1 + radial(r2, self.k1, self.k2, self.k3)) / (1 + radial(r2, self.k4, self.k5, self.k6))
+        return affine_up(down * q + decentring(self.p2, self.p1, down), self.b1, self.b2)
+
+
+def affine_up(down: Float[Array, "2"], b1, b2) -> Float[Array, "2"]:
+    """(u + b1 u + b2 v, v) of a coordinate (u, v) whose v runs down, given with y up."""
+    u, v = down
+    return jnp.stack([u + b1 * u + b2 * v, -v])

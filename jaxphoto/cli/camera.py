@@ -1,0 +1,57 @@
+"""`jaxphoto camera`: a camera file in, one of another program out."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from jaxphoto.camera import DISTORTIONS, get_parameter, parameter_names
+from jaxphoto.cli.app import app
+from jaxphoto.errors import InputError
+from jaxphoto.io.cameras import CAMERA_FORMATS, read_camera_file, write_camera_file
+
+
+@app.command("camera")
+def camera_command(
+    source: Annotated[Path, typer.Argument(help="Camera file, folder of results, block or COLMAP model.")],
+    out: Annotated[Path, typer.Argument(help="Camera file to write.")],
+    out_format: Annotated[
+        str | None,
+        typer.Option("--format", help=f"Of OUT: {', '.join(CAMERA_FORMATS)}; told by its name when not given."),
+    ] = None,
+    camera: Annotated[str | None, typer.Option(help="Which camera, where IN holds several.")] = None,
+    pixel_mm: Annotated[float | None, typer.Option(help="Size of a pixel, where IN does not give it.")] = None,
+    width_px: Annotated[int | None, typer.Option(min=1, help="Width, where IN does not give it.")] = None,
+    height_px: Annotated[int | None, typer.Option(min=1, help="Height, where IN does not give it.")] = None,
+    block: Annotated[Path | None, typer.Option(help="Block of which IN is the result.")] = None,
+    distortion: Annotated[
+        str | None, typer.Option(help=f"Model in a block.toml: {', '.join(DISTORTIONS)}; that of IN when not given.")
+    ] = None,
+) -> None:
+    """Convert a camera file: exactly where the models allow it, otherwise fitted, the residual stated in pixels."""
+    if distortion is not None and distortion not in DISTORTIONS:
+        raise InputError(f"--distortion {distortion}: there are {', '.join(DISTORTIONS)}")
+    if (width_px is None) != (height_px is None):
+        raise InputError("--width-px and --height-px belong together; give both or none")
+    size = None if width_px is None or height_px is None else (width_px, height_px)
+    read = read_camera_file(source, camera=camera, pixel_mm=pixel_mm, size_px=size, block=block)
+    kind = DISTORTIONS[distortion] if distortion is not None else None
+    done = write_camera_file(out, read.sensor, read.interior, out_format, name=read.name, distortion=kind)
+    console = Console(highlight=False, soft_wrap=True)
+    console.print(
+        f"{read.name}: {type(read.interior.distortion).__name__} -> {type(done.interior.distortion).__name__}"
+    )
+    if read.note:
+        console.print(f"note: {read.note}")
+    for name in parameter_names(done.interior):
+        value = float(get_parameter(done.interior, name))
+        if value != 0 or name == "c_mm":
+            console.print(f"  {name} = {value:.9g}")
+    if done.max_px == 0:
+        console.print("the conversion is exact")
+    else:
+        console.print(f"fitted over the format: rms {done.rms_px:.3g} px, largest {done.max_px:.3g} px")
+    if done.covered < 1:
+        console.print(f"the given distortion folds in {1 - done.covered:.1%} of the format, which was left out")
+    console.print(f"wrote {out}")

@@ -1,0 +1,118 @@
+"""What a camera file says: one camera, its sensor and interior orientation, and how sure it is of them."""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from jaxphoto.arrays import on_device
+from jaxphoto.camera import InteriorOrientation, Sensor
+from jaxphoto.errors import InputError
+
+ASSUMED_PIXEL_MM = 0.001
+"""The pixel where neither file nor user gives one: c in micrometres then is the focal length in pixels."""
+
+
+class CameraFile(NamedTuple):
+    """A camera as a file gives it.
+
+    `covariance` is that of `parameter_names(interior)` (a posteriori, with zero rows for what was held), None where the
+    file has none. `note` says what was assumed, and what else the file tells; empty where there is nothing to say.
+    """
+
+    name: str
+    sensor: Sensor
+    interior: InteriorOrientation
+    covariance: Float[np.ndarray, "n n"] | None = None
+    note: str = ""
+
+
+class Source(NamedTuple):
+    """A file to read, and what the user adds to it."""
+
+    path: Path
+    camera: str | None = None
+    """Which camera, where the file holds several."""
+    pixel_mm: float | None = None
+    size_px: tuple[int, int] | None = None
+    """Width and height, where the file does not give them."""
+    block: Path | None = None
+    """The block folder or block.toml that says of which model the parameters of interior.csv are."""
+
+    def error(self, message: str) -> InputError:
+        """An error about this file."""
+        return InputError(f"{self.path}: {message}")
+
+    def text(self) -> str:
+        """The whole file. Raises InputError where it is not text."""
+        try:
+            return self.path.read_text(encoding="utf-8-sig")
+        except UnicodeDecodeError:
+            raise self.error("the file is no text; give a camera file") from None
+
+    def number(self, name: str, text: Any) -> float:
+        """A finite number of the file."""
+        try:
+            value = float(text)
+        except (TypeError, ValueError):
+            value = np.nan
+        if not np.isfinite(value):
+            raise self.error(f"{name} is {text!r}, not a finite number; write it like 12.34")
+        return value
+
+    def chosen(self, names: list[str]) -> str:
+        """The one camera among `names` that is meant."""
+        known = ", ".join(names)
+        if not names:
+            raise self.error("there is no camera in it; give a file with one")
+        if self.camera is None:
+            if len(names) > 1:
+                raise self.error(f"it holds {len(names)} cameras; name one of {known}")
+            return names[0]
+        if self.camera not in names:
+            raise self.error(f"there is no camera {self.camera!r} in it; name one of {known}")
+        return self.camera
+
+    def sensor(self, width: float, height: float, pixel_mm: float | None = None) -> tuple[Sensor, str]:
+        """The sensor in the file's own format, and what was assumed of it; the user's pixel goes before `pixel_mm`."""
+        if self.size_px is not None and self.size_px != (width, height):
+            given = "{} x {}".format(*self.size_px)
+            raise self.error(f"its images have {width:g} x {height:g} pixels, not {given}; leave the size out")
+        if not (width > 0 and height > 0 and width == int(width) and height == int(height)):
+            raise self.error(f"an image of {width:g} x {height:g} pixels cannot be; give whole positive numbers")
+        pixel = self.pixel_mm if self.pixel_mm is not None else pixel_mm
+        if pixel is not None and not pixel > 0:
+            raise self.error(f"a pixel of {pixel:g} mm cannot be; give its size in millimetres")
+        assumed = f"the size of a pixel is not known; {ASSUMED_PIXEL_MM} mm was assumed, and c_mm scales with it"
+        note = assumed if pixel is None else ""
+        return Sensor(int(width), int(height), ASSUMED_PIXEL_MM if pixel is None else float(pixel)), note
+
+
+def in_pixels(
+    source: Source, sensor: Sensor, fx: float, fy: float, centre: tuple[float, float], distortion: type, **coefficients
+) -> InteriorOrientation:
+    """A camera of computer vision: focal lengths and principal point in pixels (of conventions.md) -> millimetres.
+
+    c is fy, fx / fy - 1 is the affinity `b1` where they differ. Raises InputError for focal lengths that cannot be.
+    """
+    if not (fx > 0 and fy > 0):
+        raise source.error(f"focal lengths of {fx:g} and {fy:g} pixels cannot be; give positive ones")
+    if fx != fy:
+        coefficients["b1"] = fx / fy - 1
+    x_p, y_p = sensor.mm_from_px(np.array([centre]))[0]
+    interior = InteriorOrientation(fy * sensor.pixel_mm, x_p, y_p, distortion(**coefficients))
+    return jax.tree.map(on_device, interior)
+
+
+def from_centre_px(interior: InteriorOrientation, sensor: Sensor) -> tuple[float, float, float, float]:
+    """fx, fy and the principal point in pixels of conventions.md: the inverse of `in_pixels`."""
+    fy = float(interior.c) / sensor.pixel_mm
+    column, row = sensor.px_from_mm(np.array([[float(interior.x_p), float(interior.y_p)]]))[0]
+    return fy * (1 + float(getattr(interior.distortion, "b1", 0.0))), fy, float(column), float(row)
+
+
+def joined_notes(*notes: str) -> str:
+    """Several notes as one."""
+    return "; ".join(note for note in notes if note)
