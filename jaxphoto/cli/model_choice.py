@@ -1,0 +1,45 @@
+"""`jaxphoto models`: a block in, a comparison of distortion models out."""
+
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from jaxphoto.cli.app import app
+from jaxphoto.io import read_block
+from jaxphoto.procedures.model_choice import FOLDS, model_choice
+from jaxphoto.report import check_target
+from jaxphoto.report.model_choice import print_model_choice, write_model_choice
+
+_MODELS = "brown:none,brown:k1,brown:k1+k2,brown:k1+k2+k3,brown,brown:all"
+
+
+@app.command("models")
+def models_command(
+    block: Annotated[Path, typer.Argument(help="Block folder (see docs/block_folder.md).")],
+    out: Annotated[Path, typer.Option(help="Folder for the results; earlier results in it are replaced.")],
+    models: Annotated[
+        str, typer.Option(help="Comma-separated: brown (usual coefficients), brown:all, brown:none, brown:k1+k2, smac.")
+    ] = _MODELS,
+    folds: Annotated[int, typer.Option(min=0, help="Parts of the cross-validation; 0 for none.")] = FOLDS,
+    seed: Annotated[int, typer.Option(min=0, help="Of the draw of what is left out.")] = 0,
+) -> None:
+    """Compare distortion models by cross-validation, information criteria and significance."""
+    check_target(out)
+    console, errors = Console(), Console(stderr=True)
+    began = time.perf_counter()
+    with errors.status("reading the block") as status:
+        read = read_block(block)
+        seconds = {"read": time.perf_counter() - began}
+        named = [name for name in models.split(",") if name.strip()]
+        status.update(f"adjusting {len(named)} models of {len(read.images)} images, {len(read.points)} points")
+        choice = model_choice(read, named, k=folds, seed=seed)
+        seconds["adjust"] = time.perf_counter() - began - seconds["read"]
+        status.update(f"writing {out}")
+        write_model_choice(choice, read.title, out, seconds)
+    print_model_choice(choice, console)
+    console.print(f"results in {out} (open report.html)", highlight=False)
+    if not choice.by_bic:
+        raise typer.Exit(1)

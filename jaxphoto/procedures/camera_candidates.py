@@ -1,0 +1,101 @@
+"""Candidates for the distortion of a block: a model of which some coefficients are estimated, others held at 0."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from jaxphoto.arrays import on_device
+from jaxphoto.block import Block
+from jaxphoto.camera import (
+    DISTORTIONS,
+    AbstractDistortion,
+    InteriorOrientation,
+    Sensor,
+    exact,
+    get_parameter,
+    needed_constants,
+    set_parameter,
+)
+from jaxphoto.camera.conversion import fitted, usual_coefficients
+from jaxphoto.errors import InputError
+from jaxphoto.unknowns import FIXED, FREE, Unknowns, Weighted
+
+
+class Candidate(NamedTuple):
+    """A distortion model of which only `free` is estimated; its other coefficients are held at 0."""
+
+    name: str
+    distortion: type[AbstractDistortion]
+    free: tuple[str, ...]
+
+    def within(self, other: "Candidate") -> bool:
+        """Whether `other` is this candidate with more coefficients."""
+        return self.distortion is other.distortion and set(self.free) < set(other.free)
+
+
+def candidate_of(text: str) -> Candidate:
+    """`brown` (its usual coefficients), `brown:all`, `brown:none` or `brown:k1+k2`.
+
+    Raises InputError for a model or coefficient that there is not.
+    """
+    model, _, listed = text.strip().partition(":")
+    if model not in DISTORTIONS:
+        raise InputError(f"no distortion model is called {model!r}; choose among {', '.join(DISTORTIONS)}")
+    kind = DISTORTIONS[model]
+    estimable = tuple(name for name in kind.coefficients if name not in kind.scales)
+    if listed in ("", "all"):
+        return Candidate(text.strip(), kind, estimable if listed else usual_coefficients(kind))
+    names = () if listed == "none" else tuple(name.strip() for name in listed.split("+"))
+    for name in names:
+        if name not in estimable:
+            raise InputError(f"{text}: {model} has no coefficient {name!r} to estimate; it has {', '.join(estimable)}")
+    return Candidate(text.strip(), kind, tuple(name for name in estimable if name in names))
+
+
+def with_candidate(block: Block, candidate: Candidate, known: Unknowns | None) -> Block:
+    """The block with the candidate for all cameras, from `known` orientations and points if there are any.
+
+    c, x_p and y_p stay what the block says of them, and so does a coefficient that it weights; the other coefficients
+    of the candidate are free. They start from the block's distortion, converted where its model is another.
+    """
+    interior, priors = {}, {}
+    for name, given in block.start.unknowns.interior.items():
+        interior[name] = _start(given, candidate, block.sensors[name])
+        priors[name] = _priors(given, block.priors.interior[name], interior[name], candidate)
+    block = eqx.tree_at(lambda b: (b.start.unknowns.interior, b.priors.interior), block, (interior, priors))
+    if known is None:
+        return block
+    places = lambda b: (b.start.unknowns.exterior, b.start.unknowns.points)  # noqa: E731
+    block = eqx.tree_at(places, block, (known.exterior, known.points))
+    everything = (np.ones(len(block.images), bool), np.ones(len(block.points), bool))
+    return eqx.tree_at(lambda b: (b.start.image_known, b.start.point_known), block, everything)
+
+
+def _start(given: InteriorOrientation, candidate: Candidate, sensor: Sensor) -> InteriorOrientation:
+    kind = candidate.distortion
+    held = tuple(name for name in kind.coefficients if name not in candidate.free)
+    try:
+        same = exact(given, kind)
+        # A fit must know what is held: the rational terms of a full one mean nothing without each other.
+        interior = same if same is not None else fitted(given, kind, sensor, held).interior
+    except ValueError:
+        # What does not follow the given distortion starts without any.
+        lengths = {"f": float(given.c), "b": sensor.width_mm / 3}
+        constants = {field: lengths[field] for field in needed_constants(kind).values()}
+        interior = InteriorOrientation(given.c, given.x_p, given.y_p, kind(**constants))
+    for name in held:
+        interior = set_parameter(interior, name, 0.0)
+    return jax.tree.map(on_device, interior)
+
+
+def _priors(given, given_priors, interior: InteriorOrientation, candidate: Candidate):
+    priors = jax.tree.map(lambda _: FIXED, interior)
+    for name in ("c_mm", "xp_mm", "yp_mm"):
+        priors = set_parameter(priors, name, get_parameter(given_priors, name))
+    same = type(given.distortion) is candidate.distortion
+    for name in candidate.free:
+        stated = get_parameter(given_priors, name) if same else FREE
+        priors = set_parameter(priors, name, stated if isinstance(stated, Weighted) else FREE)
+    return priors

@@ -1,0 +1,95 @@
+"""k-fold cross-validation of an adjustment: image points left out, and predicted from all others.
+
+Image measurements are left out point by point, so that every point keeps at least two rays: the block without them is
+adjusted, and what it predicts of them with its cameras, orientations and points is compared with what was measured.
+"""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxphoto.adjustment import Sizes, common_sizes
+from jaxphoto.arrays import still
+from jaxphoto.block import Block, ImageRows
+from jaxphoto.collinearity import ExteriorOrientation, image_residual
+from jaxphoto.compiling import call_compiled
+from jaxphoto.errors import BlockError
+from jaxphoto.georeferencing import apparent_point
+from jaxphoto.unknowns import Unknowns
+
+_LEAST_RAYS = 2
+
+
+def folds(block: Block, k: int, seed: int = 0) -> Int[np.ndarray, "rows"]:
+    """In which fold (0 ... k - 1) each image row is left out; -1 for those that never are.
+
+    Rows of a point go to the folds in turn and at random, no more to each than leave the point two rays. Raises
+    BlockError where no point was measured in three images.
+    """
+    point = np.asarray(block.image_points.point)
+    rng = np.random.default_rng(seed)
+    order = rng.permutation(len(point))
+    order = order[np.argsort(point[order], kind="stable")]
+    rays = np.bincount(point, minlength=len(block.points))
+    first = np.concatenate([[0], np.cumsum(rays)[:-1]])
+    place = np.arange(len(order)) - first[point[order]]
+    turn = rng.integers(0, k, len(block.points))
+    fold = np.full(len(point), -1)
+    # The place // k-th of its fold: the point keeps the others.
+    allowed = place // k < rays[point[order]] - _LEAST_RAYS
+    fold[order] = np.where(allowed, (place + turn[point[order]]) % k, -1)
+    if not (fold >= 0).any():
+        raise BlockError(
+            "no point was measured in three images: there is nothing to leave out, so measure more of them"
+        )
+    return fold
+
+
+def without_rows(block: Block, left_out: Bool[np.ndarray, "rows"]) -> Block:
+    """The block without some of its image points."""
+    kept, p = ~left_out, block.image_points
+    rows = ImageRows(p.image[kept], p.point[kept], still(p.xy)[kept], still(p.sigma)[kept])
+    return dataclasses.replace(block, image_points=rows)
+
+
+def fold_blocks(block: Block, fold: Int[np.ndarray, "rows"]) -> tuple[list[Block], Sizes]:
+    """The block without each of the folds, and sizes that these and the block itself fit into."""
+    parts = [without_rows(block, fold == k) for k in range(fold.max() + 1)]
+    return parts, common_sizes([block, *parts])
+
+
+def measured_discrepancies(block: Block, unknowns: Unknowns) -> Float[np.ndarray, "rows 2"]:
+    """Measured minus predicted image coordinate (mm) of every image row, whatever the direction of the distortion.
+
+    Models in the measured coordinate have residuals of ideal ones, which are stretched by distortion and scaled with c:
+    they are taken back by the model's derivative, so that all models are compared by the same numbers.
+    """
+    p = block.image_points
+    found = np.zeros((len(p.image), 2))
+    camera = np.array(block.image_camera, object)[p.image]
+    positions, matrices = (still(v) for v in (unknowns.exterior.position, unknowns.exterior.camera_from_object))
+    for name, interior in unknowns.interior.items():
+        own = np.flatnonzero(camera == name)
+        if len(own):
+            image, point = p.image[own], p.point[own]
+            exterior = ExteriorOrientation(positions[image], matrices[image])
+            numbers = jax.tree.map(lambda v: np.asarray(v, float), interior)
+            rows = (exterior, still(unknowns.points)[point], still(p.xy)[own])
+            found[own] = call_compiled(_discrepancies, numbers, *rows, block.corrections)
+    return found
+
+
+@eqx.filter_jit
+def _discrepancies(interior, exterior, points, xy, corrections):
+    def of_one(exterior, point, xy):
+        aim = apparent_point(exterior.position, point, corrections)
+        residual = image_residual(interior, exterior, aim, xy)
+        if interior.distortion.domain == "ideal":
+            return residual
+        return jnp.linalg.solve(jax.jacfwd(interior.ideal_from_measured)(xy), residual)
+
+    return jax.vmap(of_one)(exterior, points, xy)

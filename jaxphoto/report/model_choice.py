@@ -1,0 +1,197 @@
+"""The choice of a distortion model as tables, a picture, a page and words in the terminal."""
+
+from __future__ import annotations
+
+import math
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pandas as pd
+from jinja2 import Environment
+from markupsafe import Markup
+from rich.console import Console
+from rich.table import Table
+
+from jaxphoto.procedures.model_choice import ModelChoice
+from jaxphoto.report.page import STYLE
+from jaxphoto.report.plots import new_figure
+from jaxphoto.report.results import made_whole, versions, write_summary
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_PAGE = """<!DOCTYPE html>
+<html lang="en"><head><meta charset="utf-8"><title>{{ title }}</title><style>{{ style }}</style></head><body>
+<h1>{{ title }}</h1>
+{% for sentence in verdict %}<p><b>{{ sentence }}</b></p>{% endfor %}
+<h2>Models</h2>{{ models }}
+<img alt="models" src="models.png">
+<h2>Estimated parameters of every model</h2>{{ parameters }}
+</body></html>
+"""
+# The page shows these of `choice_table`, with that many digits; the terminal a few of them.
+_SHOWN = {
+    "model": None, "parameters": "{:d}", "sigma0": "{:.3f}", "rms_px": "{:.4f}", "cv_rms_px": "{:.4f}",
+    "cv_excess_se": "{:.1f}", "delta_aicc": "{:.1f}", "delta_bic": "{:.1f}", "smaller": None, "f": "{:.2f}",
+    "f_p": "{:.2g}", "weakest": None, "weakest_ratio": "{:.1f}",
+}  # fmt: skip
+
+_IN_TERMINAL = ("model", "parameters", "rms_px", "cv_rms_px", "cv_excess_se", "delta_bic", "f_p")
+# Differences of BIC below this say nothing (Kass and Raftery 1995).
+_ALIKE = 2.0
+
+
+def choice_table(choice: ModelChoice) -> pd.DataFrame:
+    """One row a candidate; `delta_` are differences from the smallest, empty cells what there is not.
+
+    model, distortion, coefficients, parameters, observations, redundancy, v'Pv, sigma0, rms_px, cv_rms_px,
+    cv_excess_se, aic, aicc, bic, delta_aic, delta_aicc, delta_bic, smaller, f, f_p, weakest, weakest_ratio, weakest_p,
+    problem: as `jaxphoto.procedures.model_choice` says.
+    """
+    rows = []
+    for j in choice.judged:
+        weakest = j.weakest
+        rows.append(
+            {
+                "model": j.candidate.name,
+                "distortion": j.candidate.distortion.__name__,
+                "coefficients": " ".join(j.candidate.free),
+                "parameters": j.n_parameters,
+                "observations": j.n_effective,
+                "redundancy": j.redundancy,
+                "square_sum": j.square_sum,
+                "sigma0": j.sigma0,
+                "rms_px": j.rms_px,
+                "cv_rms_px": j.cv_rms_px,
+                "cv_excess_se": j.cv_excess,
+                "aic": j.aic,
+                "aicc": j.aicc,
+                "bic": j.bic,
+                "smaller": j.smaller,
+                "f": j.f,
+                "f_p": j.f_p,
+                "weakest": weakest.parameter if weakest else "",
+                "weakest_ratio": weakest.ratio if weakest else np.nan,
+                "weakest_p": weakest.p_value if weakest else np.nan,
+                "problem": j.problem,
+            }
+        )
+    table = pd.DataFrame(rows)
+    place = table.columns.tolist().index("bic") + 1
+    for k, name in enumerate(("aic", "aicc", "bic")):
+        table.insert(place + k, f"delta_{name}", table[name] - table[name].min())
+    return table
+
+
+def parameter_table(choice: ModelChoice) -> pd.DataFrame:
+    """model, camera, parameter, value, sigma (a posteriori), ratio, p_value of every estimated interior parameter."""
+    rows = [
+        (j.candidate.name, s.camera, s.parameter, s.value, s.sigma, s.ratio, s.p_value)
+        for j in choice.judged
+        for s in j.parameters
+    ]
+    return pd.DataFrame(rows, columns=["model", "camera", "parameter", "value", "sigma", "ratio", "p_value"])
+
+
+def choice_verdict(choice: ModelChoice) -> list[str]:
+    """The choice in sentences."""
+    if not choice.by_bic:
+        return ["no model could be adjusted; see the column problem"]
+    best = min(j.bic for j in choice.judged if math.isfinite(j.bic))
+    alike = [j.candidate.name for j in choice.judged if j.bic <= best + _ALIKE and j.candidate.name != choice.by_bic]
+    said = [f"BIC prefers {choice.by_bic}" + f", and hardly less {', '.join(alike)}" * bool(alike)]
+    if choice.by_prediction:
+        said.append(
+            f"of {choice.n_left_out} image points left out, {choice.by_prediction} is the smallest model that predicts "
+            "within one standard error of the best"
+        )
+    said += [f"{j.candidate.name} could not be judged: {j.problem}" for j in choice.judged if j.problem]
+    return said
+
+
+def choice_figure(choice: ModelChoice) -> Figure:
+    """BIC above the smallest, and the RMS of adjusted and of left-out image points, model by model."""
+    judged = [j for j in choice.judged if math.isfinite(j.bic)]
+    names = [f"{j.candidate.name} ({j.n_parameters})" for j in judged]
+    at = np.arange(len(judged))
+    figure = new_figure(9.0, 1.2 + 0.36 * max(len(judged), 3))
+    left, right = figure.subplots(1, 2, sharey=True)
+    bic = np.array([j.bic for j in judged])
+    left.barh(
+        at,
+        bic - bic.min(initial=np.inf),
+        color=["tab:blue" if j.candidate.name == choice.by_bic else "0.7" for j in judged],
+    )
+    left.set_yticks(at, names, fontsize=8)
+    left.invert_yaxis()
+    left.set_xscale("symlog", linthresh=10)
+    left.set_xlabel("BIC above the smallest", fontsize=9)
+    right.plot([j.rms_px for j in judged], at, "o", color="0.5", label="adjusted")
+    right.plot([j.cv_rms_px for j in judged], at, "D", color="tab:red", label="left out")
+    right.set_xlabel("RMS of image points [px]", fontsize=9)
+    right.legend(fontsize=8)
+    right.grid(axis="x", lw=0.3)
+    figure.suptitle("distortion models (estimated interior parameters)", fontsize=11)
+    return figure
+
+
+def write_model_choice(choice: ModelChoice, title: str, directory: Path, seconds: dict[str, float]) -> None:
+    """models.csv, parameters.csv, models.png, report.html and summary.json, in `directory` only when all is written.
+
+    Raises InputError where `directory` holds something that is not an earlier result.
+    """
+    began = time.perf_counter()
+    table, parameters, verdict = choice_table(choice), parameter_table(choice), choice_verdict(choice)
+    with made_whole(directory) as work:
+        table.to_csv(work / "models.csv", index=False)
+        parameters.to_csv(work / "parameters.csv", index=False)
+        choice_figure(choice).savefig(work / "models.png")
+        page = Environment(autoescape=True).from_string(_PAGE)
+        html = page.render(
+            style=STYLE,
+            title=f"{title or 'block'}: models",
+            verdict=verdict,
+            models=_html(_shown(table)),
+            parameters=_html(parameters),
+        )
+        (work / "report.html").write_text(html, encoding="utf-8")
+        summary = {
+            "title": title,
+            "verdict": verdict,
+            "by_bic": choice.by_bic,
+            "by_prediction": choice.by_prediction,
+            "n_left_out": choice.n_left_out,
+            "models": table["model"].tolist(),
+            "seconds": {k: round(v, 6) for k, v in (seconds | {"write": time.perf_counter() - began}).items()},
+            "versions": versions(),
+        }
+        write_summary(summary, work)
+
+
+def print_model_choice(choice: ModelChoice, console: Console) -> None:
+    """Print the choice, then the table."""
+    for sentence in choice_verdict(choice):
+        console.print(sentence, highlight=False, markup=False)
+    shown = _shown(choice_table(choice))
+    shown = shown[[name for name in _IN_TERMINAL if name in shown]]
+    table = Table(*map(str, shown.columns))
+    for row in shown.itertuples(index=False):
+        table.add_row(*row)
+    console.print(table)
+
+
+def _shown(table: pd.DataFrame) -> pd.DataFrame:
+    """The columns for people, as text; those of which no model has a number are left out."""
+    columns = {}
+    for name, form in _SHOWN.items():
+        cells = [str(v) if form is None else "" if pd.isna(v) else form.format(v) for v in table[name]]
+        if any(cells):
+            columns[name] = cells
+    return pd.DataFrame(columns)
+
+
+def _html(table: pd.DataFrame) -> Markup:
+    page = table.to_html(index=False, border=0, na_rep="", float_format="{:.6g}".format)
+    return Markup(f'<div class="wide">{page}</div>')
