@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from jaxphoto.block import Block
 from jaxphoto.errors import InputError
-from jaxphoto.io import aicon, bal, dbat, photomodeler
+from jaxphoto.io import aicon, bal, colmap, dbat, photomodeler
 from jaxphoto.io.block_folder import BlockTables, assemble, write_block
 from jaxphoto.io.block_folder.layout import TOML
 from jaxphoto.io.block_folder.reader import read_folder
@@ -25,6 +25,7 @@ FORMATS = {
     "photomodeler": Format(photomodeler.recognises, photomodeler.read_photomodeler),
     "aicon": Format(aicon.recognises, aicon.read_aicon),
     "bal": Format(bal.recognises, bal.read_bal),
+    "colmap": Format(colmap.recognises, colmap.read_colmap_model),
 }
 
 

@@ -1,14 +1,11 @@
-"""Features of photographs: interest points of one, and the same points in several, found by OpenCV."""
+"""Features of one photograph, found by OpenCV: corners that spread evenly, and SIFT features that can be matched."""
 
-import itertools
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int
-from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import connected_components
+from jaxtyping import Float, Int, UInt8
 
 from jaxphoto.camera import Sensor
 from jaxphoto.errors import InputError
@@ -19,11 +16,13 @@ _WEAKEST = 0.01
 _HALF_WINDOW = 5
 _BORDER_PX = 8
 _CELLS = 16
-# Lowe's: how much nearer the best match must be than the second best.
-_RATIO = 0.8
-# Off the epipolar line at most.
-_EPIPOLAR_PX = 2.0
-_LEAST_MATCHES = 16
+# Half of what OpenCV asks: walls and streets have little contrast, and the strongest are taken first anyway.
+_CONTRAST = 0.02
+# A SIFT descriptor has this length before it is rounded; its parts are then below 256 but for odd ones.
+_LENGTH = 512
+# Of a feature whose blob is a point, and what each pixel of its width adds.
+_SIGMA_PX = 0.07
+_SIGMA_OF_WIDTH = 0.025
 
 
 class Features(NamedTuple):
@@ -35,13 +34,17 @@ class Features(NamedTuple):
     """Smaller eigenvalue of the gradients around it (Shi and Tomasi, 1994), over that of the strongest."""
 
 
-class TieFeatures(NamedTuple):
-    """Points seen in several photographs, one row for each measurement, sorted by point."""
+class SiftFeatures(NamedTuple):
+    """Places of a photograph that can be known again in another one."""
 
-    photograph: Int[np.ndarray, "rows"]
-    """Index of the photograph, in the order given."""
-    point: Int[np.ndarray, "rows"]
-    xy_mm: Float[np.ndarray, "rows 2"]
+    xy_mm: Float[np.ndarray, "n 2"]
+    """Measured image coordinates, from the image centre, x right, y up (docs/conventions.md)."""
+    sigma_mm: Float[np.ndarray, "n"]
+    """Standard deviation of either coordinate where views of a plane differ little; see `sift_features`."""
+    feature: Int[np.ndarray, "m"]
+    """Which of the n places a descriptor is of: one with several prevailing directions has several descriptors."""
+    descriptors: UInt8[np.ndarray, "m 128"]
+    """What the surroundings look like: the square roots of SIFT's histogram, of length 512 (RootSIFT)."""
 
 
 def interest_points(photograph: Path, sensor: Sensor, count: int) -> Features:
@@ -71,45 +74,47 @@ def interest_points(photograph: Path, sensor: Sensor, count: int) -> Features:
     fine = fine.reshape(-1, 2).astype(float)
     # One that ran away is another's corner.
     stayed = np.abs(fine - corners).max(axis=1) <= _HALF_WINDOW
-    return Features(_mm(fine[stayed], sensor), (strength[stayed] / quality.max()).astype(float))
+    # OpenCV counts from the centre of the upper left pixel, which is at (0.5, 0.5) (docs/conventions.md).
+    return Features(sensor.mm_from_px(fine[stayed] + 0.5), (strength[stayed] / quality.max()).astype(float))
 
 
-def tie_features(photographs: list[Path], sensor: Sensor, count: int = 5000, least_photographs: int = 2) -> TieFeatures:
-    """Points that overlapping photographs of one camera show in common: pairs, triplets and more.
+def sift_features(photograph: Path, sensor: Sensor, count: int = 5000, longest_px: int = 3200) -> SiftFeatures:
+    """Up to `count` SIFT features of a photograph, those of most contrast, to a part of a pixel.
 
-    SIFT features (up to `count` a photograph) of each two photographs are matched both ways by Lowe's ratio test, those
-    off the epipolar lines of the fundamental matrix (RANSAC) are left out, and what matches hangs together is a point.
-    One that would lie at two places of a photograph is left out, and so is one in fewer than `least_photographs`.
-    Raises InputError as `interest_points`, and where no two photographs have enough in common.
+    A photograph whose longer side is above `longest_px` is made smaller first, as its features else need gigabytes of
+    memory. The standard deviation of a blob s pixels wide (the scale of SIFT) is
+
+        sigma = sqrt(0.07^2 + (0.025 s)^2) pixels,
+
+    found from views of textures under known projective maps (tests/io/test_matching.py). Where the views differ more,
+    all are larger alike: `match_photographs` says how much.
+    Raises InputError as `interest_points`.
+    Sources: Lowe (2004), Distinctive image features from scale-invariant keypoints; Arandjelovic and Zisserman (2012),
+    Three things everyone should know to improve object retrieval.
     """
+    picture = _read(photograph, sensor)
+    shrunk = min(1.0, longest_px / max(picture.shape))
+    if shrunk < 1:
+        size = (round(sensor.width_px * shrunk), round(sensor.height_px * shrunk))
+        picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
     # Without the last argument all features are a quarter of a pixel off, to the right and down.
-    sift = cv2.SIFT_create(count, enable_precise_upscale=True)  # type: ignore[attr-defined]
-    places, descriptors = [], []
-    for path in photographs:
-        keys, described = sift.detectAndCompute(_read(path, sensor), None)
-        if described is None or len(keys) < 2:
-            raise InputError(f"{path}: no interest point was found; the picture is blank or out of focus")
-        places.append(np.array([key.pt for key in keys]))
-        descriptors.append(described)
-    number = np.array([len(p) for p in places])
-    first = np.cumsum(number) - number
-    matches = [np.zeros((0, 2), int)]
-    for one, other in itertools.combinations(range(len(photographs)), 2):
-        pairs = _matched(places[one], places[other], descriptors[one], descriptors[other])
-        matches.append(pairs + first[[one, other]])
-    match = np.concatenate(matches)
-    graph = csr_matrix((np.ones(len(match)), match.T), (number.sum(),) * 2)
-    _, feature = connected_components(graph, directed=False)
-    photograph = np.repeat(np.arange(len(photographs)), number)
-    rows = _common(feature, photograph, least_photographs)
-    if not len(rows):
-        raise InputError(
-            f"the {len(photographs)} photographs have no point in common; give such as overlap, in the same size"
-        )
-    _, point = np.unique(feature[rows], return_inverse=True)
-    xy_mm = _mm(np.concatenate(places)[rows], sensor)
-    order = np.lexsort((photograph[rows], point))
-    return TieFeatures(photograph[rows][order], point[order], xy_mm[order])
+    sift = cv2.SIFT_create(  # type: ignore[attr-defined]
+        count, contrastThreshold=_CONTRAST, enable_precise_upscale=True
+    )
+    keys, described = sift.detectAndCompute(picture, None)
+    if described is None or len(keys) < 2:
+        raise InputError(f"{photograph}: no interest point was found; the picture is blank or out of focus")
+    places, feature = np.unique([(*key.pt, key.size) for key in keys], axis=0, return_inverse=True)
+    scale = np.array([sensor.width_px, sensor.height_px]) / picture.shape[::-1]
+    # OpenCV gives the diameter, two widths.
+    sigma_px = np.hypot(_SIGMA_PX, _SIGMA_OF_WIDTH * places[:, 2] / 2) * scale.mean()
+    roots = np.sqrt(described / np.maximum(described.sum(axis=1, keepdims=True), 1e-9))
+    return SiftFeatures(
+        sensor.mm_from_px((places[:, :2] + 0.5) * scale),
+        sigma_px * sensor.pixel_mm,
+        feature.reshape(-1),
+        np.minimum(np.round(_LENGTH * roots), 255).astype(np.uint8),
+    )
 
 
 def _read(photograph: Path, sensor: Sensor) -> np.ndarray:
@@ -128,11 +133,6 @@ def _read(photograph: Path, sensor: Sensor) -> np.ndarray:
     return picture
 
 
-def _mm(pixels: np.ndarray, sensor: Sensor) -> Float[np.ndarray, "n 2"]:
-    """OpenCV counts from the centre of the upper left pixel, which is at (0.5, 0.5) (docs/conventions.md)."""
-    return sensor.mm_from_px(pixels + 0.5)
-
-
 def _spread(corners: np.ndarray, strength: np.ndarray, sensor: Sensor, count: int) -> Int[np.ndarray, "n"]:
     """Of each cell of a grid the strongest, then the second of each, until there are enough."""
     across = max(1, min(_CELLS, int(np.sqrt(count / 2))))
@@ -142,29 +142,3 @@ def _spread(corners: np.ndarray, strength: np.ndarray, sensor: Sensor, count: in
     begins = np.flatnonzero(np.diff(cell[order], prepend=-1))
     rank = np.arange(len(order)) - np.repeat(begins, np.diff(np.append(begins, len(order))))
     return order[np.lexsort((-strength[order], rank))][:count]
-
-
-def _matched(one: np.ndarray, other: np.ndarray, described: Any, others: Any) -> Int[np.ndarray, "pairs 2"]:
-    """Features of two photographs that are each other's best and lie on each other's epipolar lines."""
-    ways = []
-    for a, b in ((described, others), (others, described)):
-        best = [pair for pair in cv2.BFMatcher(cv2.NORM_L2).knnMatch(a, b, k=2) if len(pair) == 2]
-        ways.append({m.queryIdx: m.trainIdx for m, second in best if m.distance < _RATIO * second.distance})
-    pairs = np.array([(a, b) for a, b in ways[0].items() if ways[1].get(b) == a]).reshape(-1, 2)
-    if len(pairs) < _LEAST_MATCHES:
-        return pairs[:0]
-    cv2.setRNGSeed(0)
-    _, good = cv2.findFundamentalMat(one[pairs[:, 0]], other[pairs[:, 1]], cv2.FM_RANSAC, _EPIPOLAR_PX, 0.999)
-    if good is None or good.sum() < _LEAST_MATCHES:
-        return pairs[:0]
-    return pairs[good.ravel() > 0]
-
-
-def _common(feature: np.ndarray, photograph: np.ndarray, least: int) -> Int[np.ndarray, "rows"]:
-    """Features of points that are in `least` photographs at least and once in each."""
-    _, point, times = np.unique(feature, return_inverse=True, return_counts=True)
-    pairs = np.stack([point, photograph])
-    _, where, often = np.unique(pairs, axis=1, return_index=True, return_counts=True)
-    twice = np.zeros(len(times), bool)
-    twice[point[where[often > 1]]] = True
-    return np.flatnonzero((times[point] >= least) & ~twice[point])

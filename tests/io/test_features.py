@@ -6,7 +6,7 @@ import pytest
 
 from jaxphoto.camera import Sensor
 from jaxphoto.errors import InputError
-from jaxphoto.io.features import interest_points, tie_features
+from jaxphoto.io.features import interest_points, sift_features
 
 SENSOR = Sensor(640, 480, 0.006)
 FINE = 8
@@ -59,37 +59,6 @@ def test_points_spread_over_the_format_although_texture_does_not(tmp_path):
     assert np.abs(xy).max(axis=0) == pytest.approx([SENSOR.width_mm / 2, SENSOR.height_mm / 2], rel=0.1)
 
 
-def test_the_same_points_in_three_photographs(tmp_path):
-    """Views of a plane under known projective maps: every row must be where its map puts the point."""
-    ground = texture(np.random.default_rng(2))
-    maps, photographs = [], []
-    for k in range(3):
-        a = np.deg2rad(4.0 * k)
-        turned = np.array(
-            [[np.cos(a), -np.sin(a), -60 - 45.3 * k], [np.sin(a), np.cos(a), -90 + 3.7 * k], [2e-5 * k, 0, 1]]
-        )
-        view = cv2.warpPerspective(ground, turned, (640, 480), flags=cv2.INTER_CUBIC)
-        path = tmp_path / f"{k}.png"
-        cv2.imwrite(str(path), view)
-        maps.append(turned)
-        photographs.append(path)
-    found = tie_features(photographs, SENSOR, least_photographs=3)
-    counts = np.bincount(found.point)
-    assert len(counts) > 60 and (counts == 3).all()
-    pixels = SENSOR.px_from_mm(found.xy_mm) - 0.5
-    on_ground = np.zeros((len(pixels), 2))
-    for k, turned in enumerate(maps):
-        rows = found.photograph == k
-        homogeneous = np.column_stack([pixels[rows], np.ones(rows.sum())]) @ np.linalg.inv(turned).T
-        on_ground[rows] = homogeneous[:, :2] / homogeneous[:, 2:]
-    off = on_ground.reshape(-1, 3, 2) - on_ground.reshape(-1, 3, 2).mean(axis=1, keepdims=True)
-    assert np.median(np.linalg.norm(off, axis=2)) < 0.3
-    assert np.mean(np.linalg.norm(off, axis=2).max(axis=1) > 1.5) < 0.05
-    again = tie_features(photographs, SENSOR, least_photographs=3)
-    np.testing.assert_array_equal(again.xy_mm, found.xy_mm)
-    assert (np.bincount(tie_features(photographs, SENSOR).point) >= 2).all()
-
-
 def test_features_of_blobs_have_no_offset(tmp_path):
     """Bright spots at known places: SIFT as OpenCV has it by default would be off by a quarter of a pixel."""
     rng = np.random.default_rng(3)
@@ -100,18 +69,37 @@ def test_features_of_blobs_have_no_offset(tmp_path):
     picture = np.full((480, 640), 60.0)
     for (x, y), s in zip(places, width, strict=True):
         picture += 150 * np.exp(-((column - x) ** 2 + (row - y) ** 2) / (2 * s**2))
-    for k in range(2):
-        cv2.imwrite(
-            str(tmp_path / f"{k}.png"), np.clip(picture + rng.normal(size=picture.shape), 0, 255).astype(np.uint8)
-        )
-    found = tie_features([tmp_path / "0.png", tmp_path / "1.png"], SENSOR)
+    cv2.imwrite(str(tmp_path / "blobs.png"), np.clip(picture + rng.normal(size=picture.shape), 0, 255).astype(np.uint8))
+    found = sift_features(tmp_path / "blobs.png", SENSOR)
     pixels = SENSOR.px_from_mm(found.xy_mm)
     off = pixels[:, None] - places
     nearest = np.argmin(np.sum(off**2, axis=2), axis=1)
     off = off[np.arange(len(off)), nearest]
-    off = off[np.linalg.norm(off, axis=1) < 1]
-    assert len(off) > 40
-    assert np.abs(off.mean(axis=0)).max() < 0.05
+    close = np.linalg.norm(off, axis=1) < 1
+    # Some stand so close that they are one blob.
+    assert len(np.unique(nearest[close])) > 0.85 * len(places)
+    assert np.abs(off[close].mean(axis=0)).max() < 0.05
+    # A wide spot is told less well.
+    assert np.corrcoef(width[nearest[close]], found.sigma_mm[close])[0, 1] > 0.8
+
+
+def test_each_place_of_a_large_photograph_is_one_feature(tmp_path):
+    """Made smaller before it is searched, its features lie where those of the whole lie, and are told less well."""
+    cv2.imwrite(str(tmp_path / "p.png"), texture(np.random.default_rng(5))[:480, :640])
+    whole = sift_features(tmp_path / "p.png", SENSOR, count=800)
+    small = sift_features(tmp_path / "p.png", SENSOR, count=800, longest_px=427)
+    for found in (whole, small):
+        assert len(np.unique(found.xy_mm, axis=0)) == len(found.xy_mm)
+        assert set(found.feature) == set(range(len(found.xy_mm)))
+        norm = np.linalg.norm(found.descriptors.astype(float), axis=1)
+        assert np.abs(norm - 512).max() < 40
+    off = whole.xy_mm[:, None] - small.xy_mm
+    nearest = np.argmin(np.sum(off**2, axis=2), axis=1)
+    off = off[np.arange(len(off)), nearest] / SENSOR.pixel_mm
+    close = np.linalg.norm(off, axis=1) < 0.75
+    assert close.sum() > 150
+    assert np.abs(off[close].mean(axis=0)).max() < 0.05
+    assert np.median(small.sigma_mm) > 1.2 * np.median(whole.sigma_mm)
 
 
 def test_what_cannot_be_measured_is_told_in_a_sentence(tmp_path):
@@ -125,8 +113,5 @@ def test_what_cannot_be_measured_is_told_in_a_sentence(tmp_path):
         interest_points(tmp_path / "blank.png", SENSOR, 10)
     with pytest.raises(InputError, match="the picture has 640 x 480 pixels, the camera 320 x 240"):
         interest_points(tmp_path / "blank.png", Sensor(320, 240, 0.006), 10)
-    rng = np.random.default_rng(4)
-    for name in ("one", "other"):
-        cv2.imwrite(str(tmp_path / f"{name}.png"), texture(rng)[:480, :640])
-    with pytest.raises(InputError, match="have no point in common"):
-        tie_features([tmp_path / "one.png", tmp_path / "other.png"], SENSOR)
+    with pytest.raises(InputError, match="no interest point was found"):
+        sift_features(tmp_path / "blank.png", SENSOR)

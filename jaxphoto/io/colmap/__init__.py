@@ -1,0 +1,6 @@
+"""Models of COLMAP: cameras, images and points, as text or binary -> the tables of a block folder."""
+
+from jaxphoto.io.colmap.model import recognises
+from jaxphoto.io.colmap.tables import read_colmap_model
+
+__all__ = ["read_colmap_model", "recognises"]

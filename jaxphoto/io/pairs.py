@@ -1,0 +1,51 @@
+"""Which photographs to compare: each with each, with its neighbours in the row, or with those taken nearby."""
+
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+
+from jaxphoto.errors import InputError
+from jaxphoto.io.photographs import Photograph
+
+_EARTH_M = 6_371_000.0
+
+
+def photograph_pairs(photographs: Sequence[Photograph], choice: str = "exhaustive") -> list[tuple[int, int]]:
+    """The pairs (first < second) of indices of photographs that `choice` names.
+
+    `exhaustive`: all; for many photographs they are too many. `sequence:K`: each with the K that follow it in the order
+    given. `position:K`: each with the K nearest by the GPS positions of EXIF, heights left out.
+
+    Raises InputError for another choice, and for `position` where a photograph has no position.
+    """
+    name, _, number = choice.partition(":")
+    if name == "exhaustive" and not number:
+        return list(itertools.combinations(range(len(photographs)), 2))
+    if name not in ("sequence", "position") or not number.isdecimal() or int(number) < 1:
+        raise InputError(
+            f"the choice of pairs is {choice!r}; give exhaustive, sequence:K or position:K with a whole number K, for "
+            "example sequence:10"
+        )
+    if name == "sequence":
+        n = len(photographs)
+        return [(k, other) for k in range(n) for other in range(k + 1, min(n, k + 1 + int(number)))]
+    without = [p.path.name for p in photographs if p.gps is None]
+    if without:
+        raise InputError(
+            f"{len(without)} photograph(s) have no GPS position in their EXIF ({', '.join(without[:5])}); choose the "
+            "pairs by sequence:K or exhaustive"
+        )
+    places = np.deg2rad([(p.gps.longitude_deg, p.gps.latitude_deg) for p in photographs if p.gps])
+    longitude, latitude = places.reshape(-1, 2).T
+    level = np.stack([np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)])
+    return nearest_pairs(_EARTH_M * level.T, int(number))
+
+
+def nearest_pairs(positions_m: Float[np.ndarray, "n axes"], count: int) -> list[tuple[int, int]]:
+    """The pairs (first < second) in which one is among the `count` nearest of the other."""
+    n = len(positions_m)
+    _, near = cKDTree(positions_m).query(positions_m, k=range(1, min(count + 1, n) + 1))
+    return sorted({(min(k, j), max(k, j)) for k in range(n) for j in near[k].tolist() if j != k})

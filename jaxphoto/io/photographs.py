@@ -1,0 +1,262 @@
+"""Photographs: what their files say about the camera, and the interior orientation to start from.
+
+Only sizes and EXIF are read here; the picture itself is what `jaxphoto.io.features` reads. A picture is taken as it
+lies in the file, which is as the sensor saw it: the EXIF orientation flag turns nothing.
+"""
+
+import math
+import warnings
+from collections.abc import Callable, Hashable, Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from PIL import ExifTags, Image, UnidentifiedImageError
+
+from jaxphoto.camera import InteriorOrientation, Sensor
+from jaxphoto.errors import InputError
+
+_DIAGONAL_35_MM = math.hypot(36, 24)
+# Of the longer side: the start of many programs where nothing is known, a field of 45 degrees.
+_USUAL_C = 1.2
+# Of a pixel whose size is not known; c in pixels is what matters then.
+_NOMINAL_PIXEL_MM = 0.005
+_UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+_TAG = ExifTags.Base
+
+
+class Gps(NamedTuple):
+    """A position that the camera's own receiver gave, metres off at best."""
+
+    latitude_deg: float
+    longitude_deg: float
+    altitude_m: float | None
+
+
+class Photograph(NamedTuple):
+    """What the file of a photograph says; None where its EXIF does not."""
+
+    name: str
+    """Of the file, without its ending: the id of the image."""
+    path: Path
+    width_px: int
+    height_px: int
+    make: str | None = None
+    model: str | None = None
+    focal_length_mm: float | None = None
+    focal_length_35mm_mm: float | None = None
+    """Of the lens that gives the same field on film of 36 mm x 24 mm."""
+    sensor_width_mm: float | None = None
+    """From the focal plane resolution and the size that EXIF notes, which a file made smaller may keep."""
+    orientation: int = 1
+    """The flag by which viewers turn the picture, 1 to 8; 1 where there is none."""
+    date: datetime | None = None
+    gps: Gps | None = None
+
+
+class CameraStart(NamedTuple):
+    """The camera that photographs were taken with, as far as it is known before a calibration."""
+
+    sensor: Sensor
+    interior: InteriorOrientation
+    origin: str
+    """A sentence that says where pixel size and principal distance come from."""
+
+
+def photographs(paths: Sequence[str | Path]) -> list[Photograph]:
+    """The photographs in the files `paths`, in this order.
+
+    Raises InputError for a file that is missing or no picture, and for two whose names differ in the folder or the
+    ending only.
+    """
+    read: dict[str, Photograph] = {}
+    for path in map(Path, paths):
+        photograph = _photograph(path)
+        other = read.setdefault(path.stem, photograph)
+        if other is not photograph:
+            raise InputError(
+                f"{other.path} and {path} would both be the image {path.stem!r}; give each photograph once, and "
+                "rename one of two that are different"
+            )
+    return list(read.values())
+
+
+def sensor_and_interior(
+    photographs: Sequence[Photograph], pixel_mm: float | None = None, c_mm: float | None = None
+) -> CameraStart:
+    """The camera of `photographs`, all taken with one: what is given counts, then what EXIF says.
+
+    The pixel size is that of the focal plane resolution, or follows from the focal length f and that of the same field
+    on film, f35: the diagonal of the sensor is 43.27 mm f / f35. The principal distance is f; with a pixel size that is
+    given it follows from f35 first, which no change of the picture's size alters. Where EXIF says neither it starts at
+    1.2 times the longer side. The distortion starts at zero.
+
+    Raises InputError for no photographs, for such as differ in size, orientation flag, camera or focal length, and for
+    a c_mm of pixels whose size nobody says.
+    """
+    if not photographs:
+        raise InputError("no photograph is given; name the files of those that one camera took")
+    for what, given in (("pixel_mm", pixel_mm), ("c_mm", c_mm)):
+        if given is not None and not (math.isfinite(given) and given > 0):
+            raise InputError(f"{what} is {given:g}; give a positive number of millimetres")
+    _check_one_camera(photographs, c_mm)
+    first = next((p for p in photographs if p.focal_length_35mm_mm or p.focal_length_mm), photographs[0])
+    longer = max(first.width_px, first.height_px)
+    pixel, pixel_origin = _pixel(first, pixel_mm)
+    if pixel is None and c_mm is not None:
+        raise InputError(
+            f"c_mm is given, but neither a pixel size nor EXIF that tells it ({first.path}); give pixel_mm as well"
+        )
+    if pixel is None:
+        pixel = _NOMINAL_PIXEL_MM
+    if c_mm is not None:
+        c, c_origin = c_mm, "c as given"
+    elif pixel_mm is None and first.focal_length_mm and pixel_origin:
+        c, c_origin = first.focal_length_mm, "c is the focal length of EXIF"
+    elif first.focal_length_35mm_mm:
+        c = first.focal_length_35mm_mm / _DIAGONAL_35_MM * math.hypot(first.width_px, first.height_px) * pixel
+        c_origin = f"c from {first.focal_length_35mm_mm:g} mm on film of 36 mm x 24 mm (EXIF)"
+    elif pixel_mm is not None and first.focal_length_mm:
+        c, c_origin = first.focal_length_mm, "c is the focal length of EXIF"
+    else:
+        c = _USUAL_C * longer * pixel
+        c_origin = f"c a guess, {_USUAL_C:g} times the longer side: EXIF does not tell it"
+    pixel_origin = pixel_origin or "pixel size nominal: EXIF does not tell it, and only c in pixels matters"
+    sensor = Sensor(first.width_px, first.height_px, pixel)
+    sentence = f"c = {c:.6g} mm ({c / pixel:.5g} pixels of {pixel:.4g} mm): {c_origin}; {pixel_origin}."
+    return CameraStart(sensor, InteriorOrientation(c), sentence)
+
+
+def _pixel(photograph: Photograph, given_mm: float | None) -> tuple[float | None, str]:
+    """The size of a pixel and where it comes from; None where nothing says it."""
+    if given_mm is not None:
+        return given_mm, "pixel size as given"
+    if photograph.sensor_width_mm:
+        return photograph.sensor_width_mm / photograph.width_px, "pixel size from the focal plane resolution (EXIF)"
+    if photograph.focal_length_mm and photograph.focal_length_35mm_mm:
+        diagonal_mm = _DIAGONAL_35_MM * photograph.focal_length_mm / photograph.focal_length_35mm_mm
+        pixel = diagonal_mm / math.hypot(photograph.width_px, photograph.height_px)
+        return pixel, (
+            f"pixel size from the focal lengths {photograph.focal_length_mm:g} mm and, on film, "
+            f"{photograph.focal_length_35mm_mm:g} mm (EXIF)"
+        )
+    return None, ""
+
+
+def _check_one_camera(photographs: Sequence[Photograph], c_mm: float | None) -> None:
+    checks: list[tuple[str, Callable[[Photograph], Hashable], str]] = [
+        ("sizes", lambda p: f"{p.width_px} x {p.height_px} px", "give those of one camera as they were taken"),
+        (
+            "orientation flags",
+            lambda p: p.orientation,
+            "pictures are read as they lie in the file: give all as the sensor saw them, with one and the same flag",
+        ),
+        ("cameras", lambda p: " ".join(filter(None, (p.make, p.model))) or None, "give the photographs of one camera"),
+    ]
+    if c_mm is None:
+        checks.append(
+            ("focal lengths", lambda p: p.focal_length_mm and f"{p.focal_length_mm:.4g} mm", "give those of one zoom")
+        )
+    for what, of, mend in checks:
+        groups: dict[Any, list[Photograph]] = {}
+        for p in photographs:
+            if of(p) is not None:
+                groups.setdefault(of(p), []).append(p)
+        if len(groups) > 1:
+            listed = "; ".join(f"{value}: {_some(group)}" for value, group in groups.items())
+            raise InputError(f"the photographs of one camera have different {what} ({listed}); {mend}")
+
+
+def _some(group: list[Photograph]) -> str:
+    names = ", ".join(p.path.name for p in group[:3])
+    return names if len(group) <= 3 else f"{names} and {len(group) - 3} more"
+
+
+def _photograph(path: Path) -> Photograph:
+    if path.is_dir():
+        raise InputError(f"{path} is a folder; name its photographs, for example {path}/*.jpg")
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such photograph; correct the name")
+    # Pillow takes more than 179 million pixels for an attack. Aerial cameras have more, and no pixel is read here.
+    limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            with Image.open(path) as picture:
+                return Photograph(path.stem, path, *picture.size, **_exif(picture))
+    except (UnidentifiedImageError, OSError, SyntaxError) as error:
+        raise InputError(f"{path}: this is no picture that can be read; give a TIFF, PNG or JPEG") from error
+    finally:
+        Image.MAX_IMAGE_PIXELS = limit
+
+
+def _exif(picture: Image.Image) -> dict[str, Any]:
+    """The fields of `Photograph` after the first four, from EXIF that may be absent or damaged."""
+    try:
+        top = picture.getexif()
+        taken, gps = top.get_ifd(ExifTags.IFD.Exif), top.get_ifd(ExifTags.IFD.GPSInfo)
+    except (OSError, SyntaxError, ValueError, TypeError, KeyError, EOFError):
+        return {}
+    flag = top.get(_TAG.Orientation, 1)
+    return {
+        "make": _words(top.get(_TAG.Make)),
+        "model": _words(top.get(_TAG.Model)),
+        "focal_length_mm": _positive(taken.get(_TAG.FocalLength)),
+        "focal_length_35mm_mm": _positive(taken.get(_TAG.FocalLengthIn35mmFilm)),
+        "sensor_width_mm": _sensor_width(taken, *picture.size),
+        "orientation": flag if flag in range(1, 9) else 1,
+        "date": _date(taken.get(_TAG.DateTimeOriginal) or top.get(_TAG.DateTime)),
+        "gps": _gps(gps),
+    }
+
+
+def _sensor_width(taken: dict, width_px: int, height_px: int) -> float | None:
+    """In mm along x: the width that EXIF notes over the focal plane resolution; None for a picture cut since."""
+    resolution = _positive(taken.get(_TAG.FocalPlaneXResolution))
+    unit = _UNIT_MM.get(taken.get(_TAG.FocalPlaneResolutionUnit, 2))
+    if resolution is None or unit is None:
+        return None
+    width = _positive(taken.get(_TAG.ExifImageWidth)) or width_px
+    height = _positive(taken.get(_TAG.ExifImageHeight)) or height_px
+    cut = abs(width * height_px / (height * width_px) - 1) > 0.01
+    return None if cut else width / resolution * unit
+
+
+def _positive(value: Any) -> float | None:
+    try:
+        number = float(value)
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    return number if math.isfinite(number) and number > 0 else None
+
+
+def _words(value: Any) -> str | None:
+    words = value.replace("\0", "").strip() if isinstance(value, str) else ""
+    return words or None
+
+
+def _date(value: Any) -> datetime | None:
+    try:
+        return datetime.strptime(value.replace("\0", "").strip(), "%Y:%m:%d %H:%M:%S")
+    except (AttributeError, ValueError):
+        return None
+
+
+def _gps(tags: dict) -> Gps | None:
+    try:
+        latitude, longitude = (_degrees(tags[k]) * _sign(tags.get(k - 1)) for k in (2, 4))
+        altitude = float(tags[6]) * (-1 if tags.get(5) in (1, b"\x01") else 1) if 6 in tags else None
+    except (KeyError, TypeError, ValueError, ZeroDivisionError):
+        return None
+    known = math.isfinite(latitude) and math.isfinite(longitude) and (abs(latitude) <= 90 and abs(longitude) <= 180)
+    if not known:
+        return None
+    return Gps(latitude, longitude, altitude if altitude is not None and math.isfinite(altitude) else None)
+
+
+def _degrees(parts: Any) -> float:
+    return sum(float(part) / 60**k for k, part in enumerate(parts))
+
+
+def _sign(reference: Any) -> int:
+    return -1 if str(reference).strip("\0 ").upper()[:1] in ("S", "W") else 1

@@ -1,0 +1,118 @@
+"""Matches of features between photographs, and the points they hang together to.
+
+A point is a connected component of the graph whose nodes are the features and whose edges are the matches. A single
+false match joins two points into one that shows twice in some photographs. Dropping all of such a component would lose
+the long tracks first, which have most matches and are worth most; `tracks` grows the components match by match
+instead, those first that other matches confirm, and leaves out a match that would show a photograph twice.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Int
+
+
+class PairMatches(NamedTuple):
+    """Features that two photographs have in common."""
+
+    first: int
+    """Index of a photograph."""
+    second: int
+    """Index of another one, greater than `first`."""
+    features: Int[np.ndarray, "n 2"]
+    """Index of the feature in the first and in the second photograph; each occurs once at most in its column."""
+
+
+class Tracks(NamedTuple):
+    """Points that photographs show in common: one row a measurement, sorted by point, then by photograph."""
+
+    image: Int[np.ndarray, "rows"]
+    feature: Int[np.ndarray, "rows"]
+    point: Int[np.ndarray, "rows"]
+    n_conflicting: int
+    """Matches left out because with them a point would have shown twice in a photograph."""
+
+
+def tracks(n_features: list[int], pairs: list[PairMatches]) -> Tracks:
+    """The points that `pairs` make of features, each point once at most in a photograph.
+
+    `n_features` says how many features every photograph has. The matches join features in the order of their support:
+    the number of third features that both of the two are matched to. Ties keep the order given. A match whose
+    two components hold one photograph in common, in two features, is left out and counted. Points are numbered in the
+    order of their first feature.
+
+    Raises ValueError for a match of a photograph or feature that is not there.
+    """
+    number = np.asarray(n_features, int)
+    first = np.concatenate([[0], np.cumsum(number)])
+    edges = _edges(first, pairs)
+    support = _support(edges, int(first[-1]))
+    photograph = np.repeat(np.arange(len(number)), number).tolist()
+    edges = edges[np.argsort(-support, kind="stable")]
+    parent = list(range(int(first[-1])))
+    shown: dict[int, set[int]] = {}
+    n_conflicting = 0
+    for a, b in edges.tolist():
+        a, b = _root(parent, a), _root(parent, b)
+        if a == b:
+            continue
+        of_a, of_b = shown.get(a, {photograph[a]}), shown.get(b, {photograph[b]})
+        if not of_a.isdisjoint(of_b):
+            n_conflicting += 1
+            continue
+        if len(of_a) < len(of_b):
+            a, b, of_a, of_b = b, a, of_b, of_a
+        parent[b] = a
+        shown[a] = of_a | of_b
+        shown.pop(b, None)
+    rows = np.unique(edges)
+    roots = np.array([_root(parent, k) for k in rows.tolist()], int)
+    _, begins, point, times = np.unique(roots, return_index=True, return_inverse=True, return_counts=True)
+    # A feature whose every match was left out makes no point.
+    kept = times[point] >= 2
+    rows, point = rows[kept], begins[point][kept]
+    image = np.searchsorted(first, rows, side="right") - 1
+    order = np.lexsort((image, point))
+    return Tracks(
+        image[order], (rows - first[image])[order], np.unique(point, return_inverse=True)[1][order], n_conflicting
+    )
+
+
+def connected_images(n_images: int, pairs: list[PairMatches]) -> list[Int[np.ndarray, "images"]]:
+    """The groups of images that matches join, the largest first; an image that matches no other one is a group."""
+    parent = list(range(n_images))
+    for pair in pairs:
+        if len(pair.features):
+            parent[_root(parent, pair.second)] = _root(parent, pair.first)
+    group = np.array([_root(parent, k) for k in range(n_images)], int)
+    return sorted((np.flatnonzero(group == k) for k in np.unique(group)), key=lambda images: -len(images))
+
+
+def _edges(first: np.ndarray, pairs: list[PairMatches]) -> Int[np.ndarray, "edges 2"]:
+    """The matches of all pairs as features counted through all photographs."""
+    edges = [np.zeros((0, 2), int)]
+    for one, other, features in pairs:
+        if not 0 <= one < other < len(first) - 1:
+            raise ValueError(f"a pair of {len(first) - 1} photographs has first < second, got {one} and {other}")
+        number = first[[one + 1, other + 1]] - first[[one, other]]
+        if (features < 0).any() or (features >= number).any():
+            raise ValueError(f"the pair {one}, {other} matches features that are not there; they have {number}")
+        edges.append(np.asarray(features, int) + first[[one, other]])
+    return np.concatenate(edges)
+
+
+def _support(edges: np.ndarray, n: int) -> Int[np.ndarray, "edges"]:
+    """How many third features both ends of each match are matched to: the triangles of the graph over it."""
+    partners: list[set[int]] = [set() for _ in range(n)]
+    for a, b in edges.tolist():
+        partners[a].add(b)
+        partners[b].add(a)
+    return np.array([len(partners[a] & partners[b]) for a, b in edges.tolist()], int)
+
+
+def _root(parent: list[int], k: int) -> int:
+    """The representative of the component of `k`; the way to it is halved."""
+    while parent[k] != k:
+        parent[k] = parent[parent[k]]
+        k = parent[k]
+    return k

@@ -1,0 +1,219 @@
+"""COLMAP models: the same block from text and binary, by COLMAP's own equations; what is refused; pycolmap's."""
+
+import struct
+
+import jax
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from jaxphoto.camera import get_parameter, parameter_names
+from jaxphoto.collinearity import project
+from jaxphoto.errors import InputError
+from jaxphoto.io import convert, read_block, read_source
+from jaxphoto.unknowns import FREE
+
+RNG = np.random.default_rng(27)
+# fx, fy, cx, cy, k1, k2, p1, p2.
+PARAMS = [801.5, 803.25, 325.5, 239.0, -0.12, 0.03, 1e-3, -2e-3]
+ROTATIONS = Rotation.from_rotvec([[0.0, 0, 0], [0.1, -0.3, 1.5], [3.0, 0.2, 0.1]])
+TRANSLATIONS = np.array([[0.1, 0.2, 8.0], [-0.3, 0.0, 9.0], [0.2, -0.1, 7.0]])
+POINTS = RNG.uniform(-1.5, 1.5, (6, 3))
+RATIONAL = {f"k{k}" for k in range(1, 7)}
+IDS = np.array([3, 7, 8, 20, 21, 40])
+NAMES = ["b.jpg", "a.jpg", "c.jpg"]
+
+
+def computed(image):
+    """COLMAP's camera OPENCV, from the world to pixels."""
+    fx, fy, cx, cy, k1, k2, p1, p2 = PARAMS
+    x, y, z = (ROTATIONS[image].apply(POINTS) + TRANSLATIONS[image]).T
+    u, v = x / z, y / z
+    r2 = u * u + v * v
+    q = 1 + k1 * r2 + k2 * r2 * r2
+    du = u * q + 2 * p1 * u * v + p2 * (r2 + 2 * u * u)
+    dv = v * q + 2 * p2 * u * v + p1 * (r2 + 2 * v * v)
+    return np.column_stack([fx * du + cx, fy * dv + cy])
+
+
+def features(image):
+    """Features and the points they are of; one of no point first."""
+    xy = np.concatenate([[[5.0, 6.0]], computed(image)])
+    return xy, np.concatenate([[-1], IDS])
+
+
+def quaternion(image):
+    x, y, z, w = ROTATIONS[image].as_quat()
+    return [w, x, y, z]
+
+
+def write_text(folder, change=lambda name, lines: lines):
+    files = {
+        "cameras": ["# a comment", "5 OPENCV 640 480 " + " ".join(map(repr, PARAMS))],
+        "images": ["# IMAGE_ID, QW, ...", "#   POINTS2D[] as (X, Y, POINT3D_ID)"],
+        "points3D": ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]"],
+    }
+    for k, name in enumerate(NAMES):
+        pose = " ".join(repr(float(v)) for v in [*quaternion(k), *TRANSLATIONS[k]])
+        xy, ids = features(k)
+        rows = " ".join(f"{x!r} {y!r} {i}" for (x, y), i in zip(xy.tolist(), ids, strict=True))
+        files["images"] += [f"{k + 1} {pose} 5 {name}", rows]
+    for j, (i, xyz) in enumerate(zip(IDS, POINTS.tolist(), strict=True), 1):
+        files["points3D"].append(f"{i} {' '.join(map(repr, xyz))} 1 2 3 0.5 1 {j} 2 {j} 3 {j}")
+    folder.mkdir(exist_ok=True)
+    for name, lines in files.items():
+        (folder / f"{name}.txt").write_text("\n".join(change(name, lines)) + "\n")
+    return folder
+
+
+def write_binary(folder):
+    folder.mkdir(exist_ok=True)
+    (folder / "cameras.bin").write_bytes(struct.pack("<QIiQQ8d", 1, 5, 4, 640, 480, *PARAMS))
+    data = struct.pack("<Q", 3)
+    for k, name in enumerate(NAMES):
+        data += struct.pack("<I7dI", k + 1, *quaternion(k), *TRANSLATIONS[k], 5) + name.encode() + b"\0"
+        xy, ids = features(k)
+        data += struct.pack("<Q", len(ids))
+        data += b"".join(struct.pack("<ddQ", *p, int(i) % 2**64) for p, i in zip(xy, ids, strict=True))
+    (folder / "images.bin").write_bytes(data)
+    data = struct.pack("<Q", len(IDS))
+    for j, (i, xyz) in enumerate(zip(IDS, POINTS, strict=True), 1):
+        data += struct.pack("<Q3d3BdQ6I", i, *xyz, 1, 2, 3, 0.5, 3, 1, j, 2, j, 3, j)
+    (folder / "points3D.bin").write_bytes(data)
+    return folder
+
+
+def misfits_mm(block):
+    """Measured minus projected of the start values."""
+    rows, start = block.image_points, block.start.unknowns
+    camera = start.interior[block.image_camera[0]]
+    at = jax.tree.map(lambda leaf: leaf[rows.image], start.exterior)
+    projected = jax.jit(jax.vmap(lambda e, p: project(camera, e, p)))(at, start.points[rows.point])
+    return np.asarray(rows.xy - projected)
+
+
+@pytest.mark.parametrize("write", [write_text, write_binary])
+def test_a_model_is_read_as_colmap_means_it(tmp_path, write):
+    block = read_source(write(tmp_path / "model"))
+    assert block.images == ("a", "b", "c")
+    assert set(block.points) == {str(i) for i in IDS}
+    assert len(block.image_points.point) == 18
+    # c is 0.8 mm, a pixel 0.001 mm.
+    assert np.abs(misfits_mm(block)).max() < 1e-12
+    assert block.start.image_known.all() and block.start.point_known.all()
+    centres = -np.einsum("nji,nj->ni", ROTATIONS.as_matrix(), TRANSLATIONS)
+    np.testing.assert_allclose(block.start.unknowns.exterior.position, centres[[1, 0, 2]], atol=1e-12)
+    (priors,) = block.priors.interior.values()
+    free = {name for name in parameter_names(priors) if get_parameter(priors, name) is FREE}
+    assert free == {"c_mm", "xp_mm", "yp_mm", "k1", "k2", "p1", "p2", "b1"}
+    assert block.datum.kind == "inner"
+
+
+def test_it_becomes_a_block_folder(tmp_path):
+    block = convert(write_text(tmp_path / "model"), tmp_path / "block")
+    again = read_block(tmp_path / "block")
+    assert again.images == block.images
+    np.testing.assert_allclose(again.image_points.xy, block.image_points.xy, atol=1e-12)
+    assert np.abs(misfits_mm(again)).max() < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("model", "params", "free"),
+    [
+        ("SIMPLE_PINHOLE", "800 320 240", set()),
+        ("PINHOLE", "800 801 320 240", {"b1"}),
+        ("SIMPLE_RADIAL", "800 320 240 0.1", {"k1"}),
+        ("RADIAL", "800 320 240 0.1 0.01", {"k1", "k2"}),
+        ("FULL_OPENCV", "800 801 320 240 .1 .01 .001 .002 .3 .4 .5 .6", {*RATIONAL, "p1", "p2", "b1"}),
+    ],
+)  # fmt: skip
+def test_cameras_are_free_in_what_their_model_has(tmp_path, model, params, free):
+    def change(name, lines):
+        return [f"5 {model} 640 480 {params}"] if name == "cameras" else lines
+
+    block = read_source(write_text(tmp_path / "model", change), "colmap")
+    (priors,), (interior,) = block.priors.interior.values(), block.start.unknowns.interior.values()
+    names = {name for name in parameter_names(priors) if get_parameter(priors, name) is FREE}
+    assert names == free | {"c_mm", "xp_mm", "yp_mm"}
+    if model == "FULL_OPENCV":
+        values = [float(get_parameter(interior, n)) for n in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")]
+        assert values == [0.1, 0.01, 0.001, 0.002, 0.3, 0.4, 0.5, 0.6]
+    if "b1" in free:
+        assert float(interior.distortion.b1) == pytest.approx(800 / 801 - 1)
+
+
+def test_what_a_model_has_twice_is_used_once(tmp_path):
+    """Point 41 is point 40 again by the same features; image c shows point 3 in two features; point 50 is seen once."""
+
+    def change(name, lines):
+        if name == "points3D":
+            return [*lines, "41 0 0 0 1 2 3 0.5", "50 0 0 0 1 2 3 0.5"]
+        if name == "images":
+            for k in range(3):
+                x, y, _ = lines[3 + 2 * k].split()[-3:]
+                lines[3 + 2 * k] += f" {x} {y} 41"
+            lines[7] += " 9.0 9.0 3 11.0 11.0 50"
+        return lines
+
+    folder = write_text(tmp_path / "model", change)
+    with pytest.warns(UserWarning, match=r"4 measurement\(s\) that are there twice are not used, nor are 1 point"):
+        block = read_source(folder)
+    assert set(block.points) == {str(i) for i in IDS}
+    assert len(block.image_points.point) == 18
+    # Which of two features of one point is right is not known: one of them is kept.
+    assert np.sum(np.abs(misfits_mm(block)).max(axis=1) > 1e-12) <= 1
+
+
+def spoil(file, row, text):
+    def change(name, lines):
+        if name == file:
+            lines[row] = text
+        return lines
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (spoil("cameras", 1, "5 OPENCV_FISHEYE 640 480 1 1 1 1 0 0 0 0"), "the model OPENCV_FISHEYE is not known"),
+        (spoil("cameras", 1, "5 OPENCV 640 480 800 800"), "row 2: 2 parameters, OPENCV has 8"),
+        (spoil("cameras", 1, "5 OPENCV"), "row 2: 2 cells instead of CAMERA_ID MODEL"),
+        (spoil("cameras", 1, "6 SIMPLE_PINHOLE 640 480 800 320 240"), "image a.jpg is of camera 5, which is missing"),
+        (spoil("images", 2, "1 1 0 0"), "row 3: 4 cells instead of IMAGE_ID"),
+        (spoil("images", 2, "1 1 0 0 x 0 0 0 5 b.jpg"), "row 3: there is a cell that is no finite number"),
+        (spoil("images", 3, "1.0 2.0"), "row 4: 2 cells are not X Y POINT3D_ID"),
+        (spoil("images", 3, "1.0 2.0 99"), "points3D has not, for example 99"),
+        (spoil("points3D", 1, "3 0 0"), "row 2: 3 cells instead of POINT3D_ID"),
+        (lambda name, lines: lines[:2] if name == "images" else lines, "no image of the model is oriented"),
+    ],
+)  # fmt: skip
+def test_what_is_no_model_is_told_in_a_sentence(tmp_path, change, message):
+    with pytest.raises(InputError, match=message):
+        read_source(write_text(tmp_path / "model", change), "colmap")
+
+
+@pytest.mark.parametrize("file", ["cameras", "images", "points3D"])
+def test_a_binary_file_that_ends_early(tmp_path, file):
+    path = write_binary(tmp_path / "model") / f"{file}.bin"
+    path.write_bytes(path.read_bytes()[:-5])
+    with pytest.raises(InputError, match=f"{file}.bin: the file ends early"):
+        read_source(tmp_path / "model")
+
+
+def test_a_folder_without_a_file_of_the_model(tmp_path):
+    folder = write_text(tmp_path / "model")
+    (folder / "points3D.txt").unlink()
+    with pytest.raises(InputError, match="has not cameras, images, points3D"):
+        read_source(folder, "colmap")
+
+
+def test_pycolmap_writes_what_is_read(tmp_path):
+    pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is not installed")
+    model = pycolmap.Reconstruction(str(write_text(tmp_path / "model")))
+    binary = tmp_path / "binary"
+    binary.mkdir()
+    model.write(str(binary))
+    block = read_source(binary)
+    assert block.images == ("a", "b", "c")
+    assert np.abs(misfits_mm(block)).max() < 1e-12
