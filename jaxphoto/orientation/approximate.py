@@ -21,6 +21,7 @@ from jaxphoto.orientation.rays import ideal_coordinates, turn_to_object, unit_ra
 from jaxphoto.orientation.resection import resect_ideal
 from jaxphoto.unknowns import Unknowns
 
+_RESECTED = 4  # known points
 _ANGLES = np.deg2rad([1.0, 0.02])  # between rays that make a point: wanted, and just bearable
 _MEND = "give their X_m, Y_m, Z_m, omega_deg, phi_deg, kappa_deg in images.csv, or measure more control points in them"
 
@@ -43,6 +44,14 @@ def approximate(block: Block) -> Unknowns:
     places = lambda u: (u.exterior.position, u.exterior.camera_from_object, u.points)  # noqa: E731
     found = (jnp.asarray(state.positions), jnp.asarray(state.matrices), jnp.asarray(state.points))
     return eqx.tree_at(places, block.start.unknowns, found)
+
+
+def has_beginning(block: Block) -> bool:
+    """Whether any image is known, sensed by GNSS and IMU, or sees four known points: where `approximate` can begin."""
+    if np.any(block.start.image_known) or len(sensor_rows(block, block.start.unknowns).image):
+        return True
+    known = np.asarray(block.start.point_known)[block.image_points.point]
+    return bool(np.bincount(np.asarray(block.image_points.image)[known], minlength=1).max() >= _RESECTED)
 
 
 class _State:
@@ -128,7 +137,7 @@ class _State:
         count = np.bincount(self.image[useful], minlength=len(self.image_known))
         progress = False
         for i in np.argsort(-count, kind="stable"):
-            if count[i] < max(4, count.max() / 2) and (progress or count[i] < 4):
+            if count[i] < max(_RESECTED, count.max() / 2) and (progress or count[i] < _RESECTED):
                 break
             rows = self.rows_of_image[self.first_row[i] : self.first_row[i + 1]]
             rows = rows[useful[rows]]
@@ -146,7 +155,7 @@ class _State:
     def _images_left(self) -> BlockError:
         left = np.flatnonzero(~self.image_known)
         seen = np.bincount(self.image[self.point_known[self.point]], minlength=len(self.image_known))
-        if self.refused is not None and seen[left].max() >= 4:
+        if self.refused is not None and seen[left].max() >= _RESECTED:
             return self.refused
         return BlockError(
             f"{len(left)} of {len(self.image_known)} images have no approximate orientation and see fewer than 4 known "

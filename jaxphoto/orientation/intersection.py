@@ -1,7 +1,22 @@
 """Forward intersection of all points of a block at once: 3 x 3 normal equations summed over rows, in NumPy."""
 
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
+
+_STEPS = 5
+
+
+class IntersectedPoints(NamedTuple):
+    """Points from the rays of images without errors; NaN where they are not determined."""
+
+    points: Float[np.ndarray, "points 3"]
+    """In m."""
+    covariance: Float[np.ndarray, "points 3 3"]
+    """A priori, m^2."""
+    determined: Bool[np.ndarray, " points"]
+    """Whether rays meet at an angle, in front of the cameras."""
 
 
 def intersect_points(
@@ -44,3 +59,46 @@ def intersect_points(
     determined[some] = True
     result[some] = centre + np.linalg.solve(normal[some], right[some][..., None])[..., 0]
     return result, determined
+
+
+def intersect_with_covariance(
+    positions: Float[np.ndarray, "images 3"],
+    camera_from_object: Float[np.ndarray, "images 3 3"],
+    image: Int[np.ndarray, " rows"],
+    rays: Float[np.ndarray, "rows 3"],
+    point: Int[np.ndarray, " rows"],
+    n_points: int,
+    sigma_rad: float,
+    min_angle: float = np.deg2rad(0.02),
+) -> IntersectedPoints:
+    """The points with the least squared errors of image coordinates, and their covariances.
+
+        sum J' (u - u(X)) = 0,   u = (x, y) / -z,   Q = sigma_rad^2 (sum J' J)^-1,   J = du / dX
+
+    `rays` are unit directions in the camera frame of the `image` of each row, `point` is the point it belongs to;
+    `sigma_rad` is the standard deviation of image coordinates as a fraction of c. Starts from `intersect_points`, with
+    its `min_angle` (rad). A point behind one of its cameras is not determined either.
+    """
+    directions = np.einsum("nij,ni->nj", camera_from_object[image], rays)
+    found, determined = intersect_points(positions[image], directions, point, n_points, min_angle=min_angle)
+    covariance = np.full((n_points, 3, 3), np.nan)
+    use = determined[point]
+    image, point, turn = image[use], point[use], camera_from_object[image[use]]
+    measured = rays[use, :2] / -rays[use, 2:]
+    some = np.flatnonzero(determined)
+    with np.errstate(all="ignore"):  # rays that only just meet may send a point to infinity, and it is then behind
+        for _ in range(_STEPS):
+            x, y, z = np.einsum("nij,nj->in", turn, found[point] - positions[image])
+            slope = (turn[:, :2] + np.stack([x, y], axis=1)[:, :, None] / -z[:, None, None] * turn[:, 2:]) / -z[
+                :, None, None
+            ]
+            residual = measured - np.stack([x, y], axis=1) / -z[:, None]
+            normal, right = np.zeros((n_points, 3, 3)), np.zeros((n_points, 3))
+            np.add.at(normal, point, np.swapaxes(slope, 1, 2) @ slope)
+            np.add.at(right, point, np.einsum("nki,nk->ni", slope, residual))
+            found[some] += np.linalg.solve(normal[some], right[some][..., None])[..., 0]
+    covariance[some] = sigma_rad**2 * np.linalg.inv(normal[some])
+    depth = np.einsum("ni,ni->n", turn[:, 2], found[point] - positions[image])
+    behind = np.bincount(point[~(depth < 0)], minlength=n_points) > 0
+    found[behind], covariance[behind] = np.nan, np.nan
+    return IntersectedPoints(found, covariance, determined & ~behind)
