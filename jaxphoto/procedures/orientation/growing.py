@@ -1,0 +1,248 @@
+"""A network that grows image by image: from two images of the best triplet, the most compatible image next.
+
+1. The two images of the start, its base the unit of length; the points that their rays meet in.
+2. Of the images that see nearly most of the points met so far, the one whose pairs agree best on its rotation is
+   oriented by two steps (`two_steps`) and then by its points; where that fails it is resected from its points alone.
+3. Points are met anew; each time the network has grown by two fifths, everything is adjusted.
+"""
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Int
+
+from jaxphoto.block import Block
+from jaxphoto.errors import BlockError
+from jaxphoto.orientation.averaging import best_triplet
+from jaxphoto.orientation.resection import resect_ideal
+from jaxphoto.orientation.resection_steps import refined as refined_by_points
+from jaxphoto.procedures.orientation.network import (
+    Network,
+    empty_network,
+    meet,
+    misfits,
+    normalised_misfits,
+    robust_scale,
+    sight_of,
+)
+from jaxphoto.procedures.orientation.pairs import Pair, Report
+from jaxphoto.procedures.orientation.refine import Calibration, early, refined
+from jaxphoto.procedures.orientation.two_steps import Placed, two_steps
+
+# Rays at less than this do not make a point; where images see too few points, less will do.
+ANGLES = (np.deg2rad(1.5), np.deg2rad(0.4))
+# Of the points that an image sees, the part that fits at least.
+_FITTING = 0.4
+# Rays that miss by more are left out: in robust standard deviations of those that are not, and in a priori ones.
+_LIMIT, _LEAST_LIMIT = 5.0, 4.0
+_GROWN = 1.4
+# Images that tell of their camera: before, points are as wrong as it is, though rays of two images meet in them well.
+_TELLING = 3
+_NEARLY_MOST = 0.6
+# Part of the largest misfit at which a ray counts half when an image is oriented by its points.
+_DOUBTFUL = 0.3
+# Starts that are tried where one orients less than this part of the images.
+_STARTS, _ENOUGH = 4, 0.6
+
+
+class Grown(NamedTuple):
+    """A network that no image can be added to."""
+
+    network: Network
+    order: tuple[int, ...]
+    """The images as they were added."""
+    refused: dict[int, str]
+    """Images that are not oriented, and why."""
+    angle: float
+    """The least angle (rad) at which rays make a point."""
+
+
+def grown(
+    block: Block,
+    pairs: Sequence[Pair],
+    calibration: Calibration,
+    least: int,
+    most: float,
+    report: Report = lambda text: None,
+) -> Grown:
+    """The largest network that grows from one of the best starts; each of its images sees `least` points or more.
+
+    Rays that miss their points by more than `most` standard deviations are never used.
+
+    Raises BlockError where no two images begin it.
+    """
+    best: Grown | None = None
+    for start in _starts(pairs):
+        found = _grow(_Growth(block, pairs, calibration, least, most, report), start)
+        if best is None or len(found.order) > len(best.order):
+            best = found
+        if len(best.order) >= _ENOUGH * len(block.images):
+            break
+    if best is None or len(best.order) < 2:
+        raise BlockError(
+            "no two images see enough points at a wide enough angle to begin with: take photographs from more "
+            "different places that overlap by more than half"
+        )
+    return best
+
+
+def _starts(pairs: Sequence[Pair]) -> Iterator[tuple[int, ...]]:
+    """Images to begin with: the best triplet, its pair with the widest rays first; then the best pairs."""
+    left = list(pairs)
+    for _ in range(_STARTS):
+        if not left:
+            return
+        triplet = best_triplet(left)
+        among = [p for p in left if triplet is None or {p.first, p.second} <= set(triplet)]
+        pair = max(among, key=_worth)
+        yield (pair.first, pair.second, *(k for k in triplet or () if k not in (pair.first, pair.second)))
+        left.remove(pair)
+
+
+def _worth(pair: Pair) -> float:
+    return pair.n * min(pair.angle, np.deg2rad(15.0))
+
+
+class _Growth:
+    """What one start has come to. A working table of one call, not a value: it is filled in place."""
+
+    def __init__(
+        self,
+        block: Block,
+        pairs: Sequence[Pair],
+        calibration: Calibration,
+        least: int,
+        most: float,
+        report: Report,
+    ) -> None:
+        self.block, self.pairs, self.calibration, self.report = block, pairs, calibration, report
+        self.least, self.most = least, most
+        self.network = empty_network(block)
+        self.sight = sight_of(block, self.network.interior)
+        self.order: list[int] = []
+        self.refused: dict[int, str] = {}
+        self.adjusted = 0
+        self.angle = ANGLES[0]
+        self.limit = most
+
+    def meet(self) -> None:
+        """Points anew, with the limit that follows from those before."""
+        self.network = meet(self.sight, self.network, self.limit, self.angle)
+        if self.adjusted >= _TELLING:
+            scale = robust_scale(normalised_misfits(self.sight, self.network))
+            self.limit = min(max(_LEAST_LIMIT, _LIMIT * scale), self.most)
+
+    def add(self, image: int, position: np.ndarray, matrix: np.ndarray) -> bool:
+        """Orient `image`; False, and nothing changed, where it then sees too few points."""
+        before = self.network
+        self.network = before.with_image(image, position, matrix)
+        self.meet()
+        if len(self.order) >= 1 and self.network.used[self.sight.of_image(image)].sum() < self.least:
+            self.network = before
+            return False
+        self.order.append(image)
+        self.refused.pop(image, None)
+        return True
+
+    def adjust(self) -> None:
+        """All that is oriented, and points by what it gives."""
+        self.report(f"adjusting {len(self.order)} images")
+        estimated = early(self.calibration) if len(self.order) >= _TELLING else {}
+        self.network, _ = refined(self.block, self.network, self.calibration, estimated)
+        self.sight = sight_of(self.block, self.network.interior)
+        self.adjusted = len(self.order)
+        self.meet()
+        # Once more with the limit that follows from the camera as it is known now.
+        self.meet()
+
+    def seen(self) -> Int[np.ndarray, " images"]:
+        """How many points that are met each image sees."""
+        rows = self.network.met(self.sight)[self.sight.point]
+        return np.bincount(self.sight.image[rows], minlength=len(self.block.images))
+
+    def known(self, image: int) -> Int[np.ndarray, " n"]:
+        """The rows of `image` whose points are met."""
+        rows = self.sight.of_image(image)
+        return rows[self.network.met(self.sight)[self.sight.point[rows]]]
+
+
+def _grow(growth: "_Growth", start: tuple[int, ...]) -> Grown:
+    first, second = start[:2]
+    pair = next(p for p in growth.pairs if {p.first, p.second} == {first, second})
+    _, matrix, base = pair.of(first)
+    growth.add(first, np.zeros(3), np.eye(3))
+    if not growth.add(second, base, matrix):
+        return Grown(growth.network, (), {}, growth.angle)
+    for image in start[2:]:
+        _orient_next(growth, [image])
+    n = len(growth.block.images)
+    while len(growth.order) < n:
+        count = growth.seen()
+        waiting = [i for i in range(n) if not growth.network.oriented[i] and i not in growth.refused]
+        ready = [i for i in waiting if count[i] >= growth.least]
+        if not ready:
+            if not _try_again(growth):
+                break
+            continue
+        most = max(count[i] for i in ready)
+        _orient_next(growth, [i for i in ready if count[i] >= _NEARLY_MOST * most])
+        if len(growth.order) >= max(_TELLING, _GROWN * growth.adjusted):
+            growth.adjust()
+    if growth.adjusted < len(growth.order):
+        growth.adjust()
+    count = growth.seen()
+    for i in np.flatnonzero(~growth.network.oriented).tolist():
+        growth.refused.setdefault(i, f"it sees {count[i]} points of the others, and {growth.least} are needed")
+    return Grown(growth.network, tuple(growth.order), growth.refused, growth.angle)
+
+
+def _try_again(growth: _Growth) -> bool:
+    """After an adjustment, or with narrower rays, images may be oriented that were not; False where all was tried."""
+    if growth.adjusted < len(growth.order):
+        growth.adjust()
+    elif growth.angle != ANGLES[1]:
+        growth.angle = ANGLES[1]
+        growth.meet()
+    else:
+        return False
+    growth.refused.clear()
+    return True
+
+
+def _orient_next(growth: _Growth, images: Sequence[int]) -> None:
+    """Orient the one of `images` whose pairs agree best on its rotation, or refuse it."""
+    placed = {i: two_steps(i, growth.pairs, growth.network, growth.sight) for i in images}
+    image = min(images, key=lambda i: np.inf if placed[i] is None else placed[i].spread)  # type: ignore[union-attr]
+    rows, of_pairs = growth.known(image), placed[image]
+    if len(rows) < growth.least:
+        growth.refused[image] = f"it sees {len(rows)} points of the others, and {growth.least} are needed"
+        return
+    growth.report(f"orienting image {len(growth.order) + 1}: {growth.block.images[image]}")
+    fitting = 0.0
+    for position, matrix in _by_points(growth, image, rows, of_pairs):
+        trial = growth.network.with_image(image, position, matrix)
+        fitting = float(np.mean(misfits(growth.sight, trial, rows) <= growth.most))
+        if fitting >= _FITTING and growth.add(image, position, matrix):
+            return
+    growth.refused[image] = f"only {fitting:.0%} of the {len(rows)} points it shares with others fit one orientation"
+
+
+def _by_points(
+    growth: _Growth, image: int, rows: Int[np.ndarray, " n"], placed: Placed | None
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """The orientation of `image` by the points of its `rows`, from where its pairs place it, then from nothing."""
+    sight, points = growth.sight, growth.network.points[growth.sight.point[rows]]
+    c, ideal = float(sight.c_mm[rows[0]]), sight.ideal[rows]
+    if placed is not None:
+        origin = points.mean(axis=0)
+        start = (placed.position - origin)[None], placed.camera_from_object[None]
+        # Rays off by more count less and less.
+        limit = _DOUBTFUL * growth.most * float(np.median(sight.sigma[rows]))
+        settled = refined_by_points(c, ideal, points - origin, *start, limit)
+        yield settled.positions[0] + origin, settled.matrices[0]
+    try:
+        found = resect_ideal(c, ideal, points, growth.block.images[image])
+    except BlockError:
+        return
+    yield np.asarray(found.position), np.asarray(found.camera_from_object)

@@ -1,0 +1,180 @@
+"""The self-calibrating adjustment of what is oriented so far, as a free network.
+
+All adjustments of one network, small or large, run one compiled program: they have one set of unknowns and are padded
+to one size. What is not to be estimated yet gets a weight that holds it.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool
+
+from jaxphoto.adjustment import Adjustment, Sizes, common_sizes, solve
+from jaxphoto.block import Attitudes, Block, Datum, Distances, Frame, ImageRows, Rows, Start, SurfaceRows
+from jaxphoto.camera import InteriorOrientation, get_parameter, parameter_names, set_parameter
+from jaxphoto.collinearity import ExteriorOrientation
+from jaxphoto.georeferencing import Corrections
+from jaxphoto.procedures.orientation.network import Network
+from jaxphoto.unknowns import FIXED, FREE, Unknowns, Weighted, default_priors
+
+_STEPS = 40
+# By what part of the radius a parameter moves the corner of the format: one that is held, and what lenses have. The
+# latter is observed about the start: images that say little of a lens would else let a wrong principal distance and
+# distortions of many tens of pixels make up for one another.
+_HELD, _LENS = 1e-7, 0.03
+# A principal distance may be off by any amount, and by so much a step; and what little else a few images can tell.
+_C_STEP, _C_OPEN, _EARLY = 0.1, 0.3, ("c_mm", "k1", "k2")
+Names = dict[str, tuple[str, ...]]
+
+
+class Calibration(NamedTuple):
+    """What is estimated of the interior orientation while a network grows."""
+
+    names: Names
+    """Parameters by camera: those that the block does not hold."""
+    unit: dict[str, dict[str, float]]
+    """By camera and parameter: the change that moves the corner of the format by its whole radius."""
+    start: dict[str, dict[str, float]]
+    """By camera and parameter."""
+    sizes: Sizes
+    """Of the whole block, which all its parts are padded to."""
+
+
+def calibration_of(block: Block) -> Calibration:
+    """What a free network of the images of `block` estimates: all that its priors do not hold fixed."""
+    names, unit, begin = {}, {}, {}
+    for camera, priors in block.priors.interior.items():
+        names[camera] = tuple(n for n in parameter_names(priors) if get_parameter(priors, n) is not FIXED)
+        sensor, interior = block.sensors[camera], block.start.unknowns.interior[camera]
+        corner = np.array([sensor.width_mm, sensor.height_mm]) / 2
+        unit[camera] = {n: float(np.linalg.norm(corner)) / _at_corner(interior, n, corner) for n in names[camera]}
+        begin[camera] = {n: float(np.asarray(get_parameter(interior, n))) for n in names[camera]}
+    calibration = Calibration(names, unit, begin, Sizes())
+    return calibration._replace(sizes=common_sizes([_with_priors(bare(block), calibration, names)]))
+
+
+def _at_corner(interior: InteriorOrientation, name: str, corner: np.ndarray) -> float:
+    """By how many mm a unit of a parameter moves the image at the corner of the format."""
+    if name == "c_mm":
+        return float(np.linalg.norm(corner) / np.asarray(interior.c))
+    if name in ("xp_mm", "yp_mm"):
+        return 1.0
+    value, step = float(np.asarray(get_parameter(interior, name))), 1e-12
+    at = jnp.asarray(corner)
+    both = [np.asarray(set_parameter(interior, name, value + s).closed_form(at)) for s in (step, -step)]
+    return float(np.linalg.norm(both[0] - both[1])) / (2 * step)
+
+
+def early(calibration: Calibration) -> Names:
+    """What few images can tell of a camera."""
+    return {camera: tuple(n for n in names if n in _EARLY) for camera, names in calibration.names.items()}
+
+
+def refined(
+    block: Block, network: Network, calibration: Calibration, estimated: Names, final: bool = False
+) -> tuple[Network, Adjustment]:
+    """The network after an adjustment of its oriented images and of the points that they meet in.
+
+    `estimated` parameters of the cameras are observed at their start as loosely as lenses differ, principal distances
+    as they are now, and with `final` so loosely that it hardly counts; the rest of `calibration` is held.
+    """
+    images = np.flatnonzero(network.oriented)
+    points = np.unique(np.asarray(block.image_points.point)[network.used])
+    part = part_of(block, network, images, points, network.used)
+    part = _with_priors(part, calibration, estimated, _C_OPEN if final else _C_STEP)
+    adjusted = solve(part, part.start.unknowns, part.priors, _STEPS, calibration.sizes)
+    if not bool(adjusted.converged) and not np.isfinite(float(adjusted.square_sum)):
+        return network, adjusted
+    exterior = adjusted.unknowns.exterior
+    positions, matrices, at = network.positions.copy(), network.camera_from_object.copy(), network.points.copy()
+    positions[images], matrices[images] = exterior.position, exterior.camera_from_object
+    at[points] = adjusted.unknowns.points
+    interior = network.interior | adjusted.unknowns.interior
+    found = network._replace(interior=interior, positions=positions, camera_from_object=matrices, points=at)
+    return found, adjusted
+
+
+def _with_priors(block: Block, calibration: Calibration, estimated: Names, c_part: float = _C_STEP) -> Block:
+    interiors = {}
+    for camera, start in block.start.unknowns.interior.items():
+        priors = block.priors.interior[camera]
+        for name in calibration.names[camera]:
+            is_c = name == "c_mm"
+            value = float(get_parameter(start, name)) if is_c else calibration.start[camera][name]
+            part = (c_part if is_c else _LENS) if name in estimated.get(camera, ()) else _HELD
+            weight = Weighted(np.asarray(value), np.asarray(part * calibration.unit[camera][name]))
+            priors = set_parameter(priors, name, weight)
+        interiors[camera] = priors
+    return dataclasses.replace(block, priors=dataclasses.replace(block.priors, interior=interiors))
+
+
+def part_of(
+    block: Block, network: Network, images: np.ndarray, points: np.ndarray, rows: Bool[np.ndarray, " rows"]
+) -> Block:
+    """`images` and `points` of `block` with the image rows `rows`, oriented as in `network`, as a free network."""
+    free, measured = bare(block), block.image_points
+    image, point = (_numbers(kept, n) for kept, n in ((images, len(block.images)), (points, len(block.points))))
+    cameras = tuple(block.image_camera[i] for i in images)
+    exterior = ExteriorOrientation(network.positions[images], network.camera_from_object[images])  # type: ignore[arg-type]
+    interior = {name: network.interior[name] for name in network.interior if name in cameras}
+    unknowns = Unknowns(interior, exterior, network.points[points], {}, {})
+    priors = default_priors(unknowns)
+    own = {name: block.priors.interior[name] for name in interior}
+    return dataclasses.replace(
+        free,
+        images=tuple(block.images[i] for i in images),
+        points=tuple(block.points[p] for p in points),
+        sensors={name: block.sensors[name] for name in interior},
+        image_camera=cameras,
+        image_mount=("",) * len(images),
+        image_strip=("",) * len(images),
+        image_time=np.zeros(len(images)),
+        image_points=ImageRows(
+            image[np.asarray(measured.image)[rows]],
+            point[np.asarray(measured.point)[rows]],
+            np.asarray(measured.xy)[rows],
+            np.asarray(measured.sigma)[rows],
+        ),
+        start=Start(unknowns, np.ones(len(images), bool), np.ones(len(points), bool)),
+        priors=dataclasses.replace(priors, interior=own),
+    )
+
+
+def _numbers(kept: np.ndarray, n: int) -> np.ndarray:
+    new = np.full(n, -1)
+    new[kept] = np.arange(len(kept))
+    return new
+
+
+def bare(block: Block) -> Block:
+    """`block` with its image rows only, and its datum free: no control, no sensor, no mount, no strip."""
+    n = len(block.images)
+    unknowns = dataclasses.replace(block.start.unknowns, mounts={}, strips={}, scanner=None)
+    return dataclasses.replace(
+        block,
+        image_mount=("",) * n,
+        image_strip=("",) * n,
+        image_time=np.zeros(n),
+        control=Rows.none(),
+        fixed=Rows.none(),
+        check=Rows.none(),
+        stations=Rows.none(),
+        attitudes=Attitudes.none(),
+        distances=Distances.none(),
+        datum=Datum("inner", "points"),
+        start=dataclasses.replace(block.start, unknowns=unknowns),
+        priors=dataclasses.replace(block.priors, mounts={}, strips={}, scanner=None),
+        motion=None,
+        frame=Frame(),
+        corrections=Corrections(),
+        surfaces=SurfaceRows.none(),
+    )
+
+
+def freed(priors: InteriorOrientation, names: tuple[str, ...]) -> InteriorOrientation:
+    """Priors of a camera of which `names` are FREE and everything else is FIXED."""
+    for name in parameter_names(priors):
+        priors = set_parameter(priors, name, FREE if name in names else FIXED)
+    return priors

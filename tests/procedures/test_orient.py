@@ -1,0 +1,126 @@
+"""Photographs oriented to one another from their matches alone, false ones among them; truth is known."""
+
+import numpy as np
+import pytest
+
+from jaxphoto.camera import InteriorOrientation, get_parameter
+from jaxphoto.errors import BlockError
+from jaxphoto.orientation.matches import PairMatches
+from jaxphoto.procedures.orientation import orient
+from jaxphoto.procedures.orientation.finish import _shared_covariance
+from jaxphoto.procedures.orientation.onto_known import similarity_between
+from tests.procedures.orientable import PIXEL, SENSOR, convergent, photographed
+
+FALSE = 0.3
+TRUTH = {"c_mm": 8.0, "xp_mm": 0.04, "yp_mm": -0.03, "k1": 1.5e-3, "k2": -2e-5}
+
+
+def oriented_from(photographs):
+    sigmas = [np.full(len(xy), 0.3 * PIXEL) for xy in photographs.features]
+    start = InteriorOrientation(8.6)
+    return orient(photographs.names, SENSOR, start, photographs.features, photographs.matches, sigmas)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return convergent(n_images=7, n_points=220)
+
+
+@pytest.fixture(scope="module")
+def clean(scene):
+    return oriented_from(photographed(scene))
+
+
+@pytest.fixture(scope="module")
+def spoilt(scene):
+    return oriented_from(photographed(scene, false=FALSE))
+
+
+def parameters(oriented):
+    """Estimates and a posteriori sigmas of the interior orientation that is free."""
+    labels = [label.split("].")[1] for label in oriented.adjusted.structure.labels]
+    sigmas = dict(zip(labels, np.sqrt(np.diagonal(_shared_covariance(oriented.adjusted))), strict=True))
+    interior = oriented.block.start.unknowns.interior["camera"]
+    return {n: (float(get_parameter(interior, n)), sigmas[n]) for n in oriented.report.estimated}
+
+
+def stations_in(scene, oriented):
+    """The stations of a network in the frame of the truth."""
+    order = [int(name[1:]) for name in oriented.block.images]
+    there = np.asarray(oriented.block.start.unknowns.exterior.position)
+    s = similarity_between(there, scene.positions[order])
+    turned = np.asarray(oriented.block.start.unknowns.exterior.camera_from_object) @ s.turn.T
+    return order, s.shift + s.scale * there @ s.turn.T, turned
+
+
+@pytest.mark.parametrize("which", ["clean", "spoilt"])
+def test_camera_and_images_are_those_of_the_truth(which, scene, request):
+    oriented = request.getfixturevalue(which)
+    assert oriented.block.images == tuple(f"p{k:02d}" for k in range(7))
+    assert bool(oriented.adjusted.converged)
+    assert 0.9 < oriented.report.sigma0 < 1.1
+    # Of 0.3 px in each of two axes, less what the unknowns take up.
+    assert 0.3 < oriented.report.mean_px < 0.4
+    found = parameters(oriented)
+    assert set(found) >= {"c_mm", "k1"}
+    for name, (value, sigma) in found.items():
+        assert abs(value - TRUTH.get(name, 0.0)) < 3.5 * sigma, (name, value, sigma)
+    order, stations, matrices = stations_in(scene, oriented)
+    # 0.3 px of 1,600 at a distance of 8 m is 1.5 mm; stations are some parts of that to some times that.
+    assert np.linalg.norm(stations - scene.positions[order], axis=1).max() < 0.006
+    np.testing.assert_allclose(matrices, scene.matrices[order], rtol=0, atol=1e-3)
+
+
+def test_false_matches_change_nothing_beyond_three_sigma(clean, spoilt, scene):
+    a, b = parameters(clean), parameters(spoilt)
+    assert set(a) == set(b)
+    for name in a:
+        assert abs(a[name][0] - b[name][0]) < 3 * a[name][1], name
+    _, one, _ = stations_in(scene, clean)
+    order, other, _ = stations_in(scene, spoilt)
+    error = np.sqrt(np.mean(np.sum((one - scene.positions[order]) ** 2, axis=1)))
+    assert np.linalg.norm(one - other, axis=1).max() < 3 * error
+
+
+def test_false_matches_are_found_and_counted(scene, clean, spoilt):
+    photographs = photographed(scene, false=FALSE)
+    ends = [
+        [photographs.point_of[image][feature] for image, feature in zip(m[:2], m.features.T, strict=True)]
+        for m in photographs.matches
+    ]
+    # Clutter is no point, and so never the same one.
+    n_false = sum(int(((one != other) | (one < 0)).sum()) for one, other in ends)
+    n = sum(len(one) for one, _ in ends)
+    assert abs(n_false / n - FALSE) < 0.01
+    report = spoilt.report
+    assert report.n_matches == n
+    # A false match is on its epipolar line by chance in few cases; of the true ones hardly any goes.
+    assert 0.9 * n_false < report.gross_errors.off_epipolar < 1.02 * n_false + 5
+    assert clean.report.gross_errors.off_epipolar < 0.01 * n
+    rows = spoilt.block.image_points
+    assert report.n_image_points == len(rows.image)
+    assert len(rows.image) > 0.97 * len(clean.block.image_points.image)
+
+
+def test_block_holds_what_was_oriented(clean):
+    block = clean.block
+    assert block.start.image_known.all()
+    assert block.start.point_known.all()
+    assert block.datum.kind == "inner"
+    assert np.bincount(block.image_points.point).min() >= 2
+    assert sorted(clean.report.order) == sorted(block.images)
+
+
+def test_two_groups_that_nothing_connects_are_both_named(scene):
+    p = photographed(scene)
+    matches = [m for m in p.matches if (m.first < 3) == (m.second < 3) and m.second in (1, 2, 4)]
+    sigmas = [np.full(len(xy), 0.3 * PIXEL) for xy in p.features]
+    with pytest.raises(BlockError, match=r"2 groups .*\(p00, p01, p02; p03, p04\)"):
+        orient(p.names, SENSOR, InteriorOrientation(8.0), p.features, matches, sigmas)
+
+
+def test_too_few_matches(scene):
+    p = photographed(scene)
+    matches = [PairMatches(0, 1, p.matches[0].features[:6])]
+    with pytest.raises(BlockError, match="images p00 and p01 have 6 matches, and 15 are needed"):
+        orient(p.names, SENSOR, InteriorOrientation(8.0), p.features, matches)

@@ -1,0 +1,167 @@
+"""Parts of an orientation by themselves: meeting points, two steps, what a camera needs, the frame of known points."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from jaxphoto.block import Rows
+from jaxphoto.camera import InteriorOrientation
+from jaxphoto.errors import BlockError
+from jaxphoto.orientation.matches import tracks
+from jaxphoto.procedures.orientation.finish import _eliminate
+from jaxphoto.procedures.orientation.network import Fate, empty_network, meet, misfits, sight_of
+from jaxphoto.procedures.orientation.onto_known import onto_known, similarity_between
+from jaxphoto.procedures.orientation.pairs import Pair
+from jaxphoto.procedures.orientation.photographs import _block_of
+from jaxphoto.procedures.orientation.two_steps import two_steps
+from tests.formulas import camera_from_object
+from tests.procedures.orientable import PIXEL, SENSOR, Camera, Scene, convergent, photographed
+
+PLAIN = Camera(8.0, 0.0, 0.0, 0.0, 0.0)
+
+
+def network_of(scene, noise_px=0.0):
+    """A network at the truth, of exact images, its points not met yet; its block, its rays, and true points of rows."""
+    p = photographed(scene, PLAIN, noise_px, clutter=0, found=1.0)
+    sigmas = [np.full(len(xy), 0.3 * PIXEL) for xy in p.features]
+    found = tracks([len(xy) for xy in p.features], p.matches)
+    block = _block_of("scene", p.names, SENSOR, InteriorOrientation(8.0), p.features, sigmas, found)
+    true = np.array([p.point_of[i][f] for i, f in zip(found.image, found.feature, strict=True)])
+    network = empty_network(block)._replace(
+        positions=scene.positions.copy(),
+        camera_from_object=scene.matrices.copy(),
+        oriented=np.ones(len(p.names), bool),
+    )
+    return block, network, sight_of(block, network.interior), true
+
+
+def pair_of(scene, i, j, n=100):
+    """The true relative orientation of two images."""
+    base = scene.matrices[i] @ (scene.positions[j] - scene.positions[i])
+    rotation = scene.matrices[j] @ scene.matrices[i].T
+    return Pair(i, j, rotation, base / np.linalg.norm(base), n, 0.3)
+
+
+def test_points_meet_where_they_are():
+    scene = convergent(5, 60)
+    _, network, sight, true = network_of(scene)
+    met = meet(sight, network, 4.0, np.deg2rad(1.5))
+    assert met.used.all()
+    np.testing.assert_allclose(met.points[sight.point], scene.points[true], rtol=0, atol=1e-9)
+    assert misfits(sight, met, np.arange(len(true))).max() < 1e-6
+
+
+def test_wrong_rays_are_left_out_and_others_stay():
+    scene = convergent(6, 60)
+    block, network, _, true = network_of(scene)
+    rows = block.image_points
+    often = np.flatnonzero(np.bincount(rows.point) >= 4)[::3]
+    wrong = np.array([np.flatnonzero(rows.point == p)[1] for p in often])
+    xy = np.array(rows.xy)
+    xy[wrong] += [30 * PIXEL, -20 * PIXEL]
+    block = dataclasses.replace(block, image_points=dataclasses.replace(rows, xy=xy))
+    sight = sight_of(block, network.interior)
+    met = meet(sight, network, 4.0, np.deg2rad(1.5))
+    np.testing.assert_array_equal(np.flatnonzero(met.fate == Fate.BEYOND), np.sort(wrong))
+    np.testing.assert_allclose(met.points[sight.point], scene.points[true], rtol=0, atol=1e-9)
+
+
+def test_narrow_rays_and_lone_ones_make_no_point():
+    scene = convergent(5, 40)
+    near = scene.positions[0] + [0.02, 0.0, 0.0]
+    two = Scene(np.stack([scene.positions[0], near]), scene.matrices[[0, 0]], scene.points)
+    _, network, sight, _ = network_of(two)
+    assert (meet(sight, network, 4.0, np.deg2rad(1.5)).fate == Fate.SMALL_ANGLE).all()
+    assert meet(sight, network, 4.0, np.deg2rad(0.01)).used.all()
+    alone = meet(sight, network.without_image(1), 4.0, np.deg2rad(0.01))
+    assert set(alone.fate) == {Fate.TOO_FEW, Fate.UNORIENTED}
+
+
+@pytest.mark.parametrize("turned", [False, True], ids=["from", "to"])
+def test_two_steps_give_rotation_and_position(turned):
+    scene = convergent(5, 40)
+    _, network, sight, _ = network_of(scene)
+    network = network.without_image(4)
+    ends = [(4, i) if turned else (i, 4) for i in range(3)]
+    placed = two_steps(4, [pair_of(scene, *e) for e in ends], network, sight)
+    np.testing.assert_allclose(placed.position, scene.positions[4], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(placed.camera_from_object, scene.matrices[4], rtol=0, atol=1e-9)
+
+
+def test_a_false_pair_does_not_spoil_two_steps():
+    scene = convergent(5, 40)
+    _, network, sight, _ = network_of(scene)
+    pairs = [pair_of(scene, i, 4) for i in range(3)]
+    false = pair_of(scene, 3, 4)._replace(second_from_first=np.asarray(camera_from_object(0.4, 0.2, 1.0)))
+    placed = two_steps(4, [false, *pairs], network.without_image(4), sight)
+    np.testing.assert_allclose(placed.position, scene.positions[4], rtol=0, atol=1e-9)
+
+
+def test_on_a_line_the_points_give_the_scale():
+    rng = np.random.default_rng(3)
+    positions = np.array([[0.0, 0, 0], [0, 1, 0], [0, 2.3, 0]])
+    matrices = np.stack([camera_from_object(np.pi / 2, 0.0, 0.02 * k) for k in range(3)])
+    points = rng.uniform([-4, 6, -3], [4, 14, 3], (80, 3))
+    scene = Scene(positions, matrices, points)
+    _, network, sight, _ = network_of(scene)
+    network = meet(sight, network.without_image(2), 4.0, np.deg2rad(0.5))
+    placed = two_steps(2, [pair_of(scene, 0, 2), pair_of(scene, 1, 2)], network, sight)
+    np.testing.assert_allclose(placed.position, positions[2], rtol=0, atol=1e-6)
+
+
+def test_without_a_pair_there_are_no_two_steps():
+    scene = convergent(4, 40)
+    _, network, sight, _ = network_of(scene)
+    assert two_steps(3, [pair_of(scene, 0, 1)], network.without_image(3), sight) is None
+
+
+def test_held_parameters_change_the_others_as_a_new_adjustment_would():
+    rng = np.random.default_rng(0)
+    a = rng.normal(size=(60, 4)) @ (np.eye(4) + 0.5 * rng.normal(size=(4, 4)))
+    truth = np.array([3.0, 2.0, 0.0, 0.0])
+    y = a @ truth + 0.1 * rng.normal(size=60)
+    covariance = 0.01 * np.linalg.inv(a.T @ a)
+    left, why = _eliminate(("k1", "k2", "p1", "p2"), np.linalg.lstsq(a, y)[0], covariance, np.full(4, 1e3))
+    # The same by adjusting anew, the least significant one held each time.
+    kept = [0, 1, 2, 3]
+    while True:
+        part = a[:, kept]
+        x, q = np.linalg.lstsq(part, y)[0], 0.01 * np.linalg.inv(part.T @ part)
+        ratio = np.abs(x) / np.sqrt(np.diagonal(q))
+        if ratio.min() >= 3:
+            break
+        kept.pop(int(np.argmin(ratio)))
+    assert left == tuple(np.array(["k1", "k2", "p1", "p2"])[kept])
+    assert set(why) == {"k1", "k2", "p1", "p2"} - set(left)
+    assert {"k1", "k2"} <= set(left)
+
+
+def test_similarity_by_any_turn_and_its_defects():
+    rng = np.random.default_rng(1)
+    there = rng.normal(size=(6, 3))
+    for kappa in (0.3, np.pi, -3.0):
+        turn = np.asarray(camera_from_object(0.1, -0.2, kappa))
+        found = similarity_between(there, [1000.0, -50, 7] + 12.5 * there @ turn.T)
+        np.testing.assert_allclose(found.turn, turn, rtol=0, atol=1e-12)
+        assert found.scale == pytest.approx(12.5, rel=1e-12)
+    line = np.outer(np.arange(5.0), [1, 2, 3])
+    assert similarity_between(line, 3 * line + 1) is None
+    assert similarity_between(there[:2], there[:2]) is None
+
+
+def test_a_network_comes_to_known_points_or_says_why_not():
+    scene = convergent(4, 40)
+    block, network, sight, true = network_of(scene)
+    network = meet(sight, network, 4.0, np.deg2rad(1.5))
+    assert onto_known(block, network) is network
+    where = np.zeros((len(block.points), 3))
+    where[sight.point] = scene.points[true]
+    there = 5 + 2 * where @ np.asarray(camera_from_object(0.5, 0.4, 3.1)).T
+    stations = 5 + 2 * scene.positions @ np.asarray(camera_from_object(0.5, 0.4, 3.1)).T
+    rows = Rows(np.repeat(np.arange(4), 3), np.tile(np.arange(3), 4), stations.ravel(), np.full(12, 0.1))
+    found = onto_known(dataclasses.replace(block, stations=rows), network)
+    np.testing.assert_allclose(found.points, there, rtol=0, atol=1e-9)
+    few = Rows(rows.who[:6], rows.axis[:6], rows.value[:6], rows.sigma[:6])
+    with pytest.raises(BlockError, match="the 2 known points and stations that they see are fewer than three"):
+        onto_known(dataclasses.replace(block, stations=few), network)
