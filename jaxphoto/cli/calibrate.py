@@ -1,0 +1,78 @@
+"""`jaxphoto calibrate`: photographs of a board in, the calibrated camera out."""
+
+import time
+from functools import partial
+from pathlib import Path
+from threading import Thread
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+import jaxphoto
+from jaxphoto.camera import DISTORTIONS
+from jaxphoto.cli.app import app
+from jaxphoto.errors import InputError
+from jaxphoto.io import write_block
+from jaxphoto.io.photographs import photographs, sensor_and_interior
+from jaxphoto.io.targets import SYNTAX, find_targets, read_board, read_grey
+from jaxphoto.procedures.calibration import calibrate, distortion_model, free_parameters
+from jaxphoto.report import check_target, prepare_pictures, print_adjustment, warnings_of
+from jaxphoto.report.calibration import print_calibration, write_calibration
+
+
+@app.command("calibrate")
+def calibrate_command(
+    images: Annotated[list[Path], typer.Argument(help="Photographs of the board, all by one camera at one focus.")],
+    board: Annotated[str, typer.Option(help=f"The board: {', '.join(SYNTAX.values())}.")],
+    out: Annotated[Path, typer.Option(help="Folder for the results; earlier results in it are replaced.")],
+    model: Annotated[str, typer.Option(help=f"Distortion: {', '.join(DISTORTIONS)}.")] = "smac",
+    r0_mm: Annotated[float, typer.Option(help="Balance radius R0 of SMAC.")] = 0.0,
+    free: Annotated[
+        str | None, typer.Option(help="What is estimated, by commas: c,xp,yp,k1,... (default: usual).")
+    ] = None,
+    pixel_mm: Annotated[float | None, typer.Option(help="Size of a pixel (default: from EXIF).")] = None,
+    c_mm: Annotated[float | None, typer.Option(help="Principal distance to start from (default: from EXIF).")] = None,
+    board_sigma_mm: Annotated[
+        float | None, typer.Option(help="Standard deviation of the board's coordinates (default: they are fixed).")
+    ] = None,
+    max_steps: Annotated[int, typer.Option(min=1, help="Most iterations of an adjustment.")] = jaxphoto.MAX_STEPS,
+) -> None:
+    """Calibrate a camera with photographs of a board. Exit code 1: written, but not converged."""
+    if board_sigma_mm is not None and not board_sigma_mm > 0:
+        raise InputError(f"--board-sigma-mm {board_sigma_mm:g} is not positive; leave it out for a board that is exact")
+    check_target(out)
+    pattern, taken = read_board(board), photographs(images)
+    start = sensor_and_interior(taken, pixel_mm, c_mm)
+    wanted = None if free is None else [name.strip() for name in free.split(",") if name.strip()]
+    free_parameters(model, distortion_model(model, start.sensor, r0_mm), wanted)
+    Thread(target=prepare_pictures, daemon=True).start()
+    console, errors = Console(), Console(stderr=True)
+    began = time.perf_counter()
+    with errors.status("looking for the board") as status:
+        targets = find_targets(taken, pattern, lambda image: status.update(f"looking for the board in {image}"))
+        seconds = {"read": time.perf_counter() - began}
+        status.update(f"calibrating with {len(targets.detections)} photographs")
+        done = calibrate(
+            pattern.board,
+            targets.detections,
+            start.sensor,
+            start.interior,
+            model=model,
+            r0_mm=r0_mm,
+            free=wanted,
+            board_sigma_m=None if board_sigma_mm is None else board_sigma_mm / 1000,
+            max_steps=max_steps,
+        )
+        done = done._replace(left_out=targets.left_out | done.left_out)
+        status.update(f"writing {out}")
+        pictures = {photograph.name: partial(read_grey, photograph.path) for photograph in taken}
+        tables = write_calibration(
+            done, out, seconds, pictures, lambda folder: write_block(done.adjusted.block, folder / "block")
+        )
+    console.print(start.origin, highlight=False)
+    print_adjustment(tables, warnings_of(tables), console)
+    print_calibration(done, console)
+    console.print(f"results in {out} (open report.html and photographs.html)", highlight=False)
+    if not bool(done.adjusted.converged):
+        raise typer.Exit(1)

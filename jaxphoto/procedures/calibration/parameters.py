@@ -1,0 +1,64 @@
+"""Which model of the lens a calibration estimates, and which of its parameters."""
+
+from collections.abc import Sequence
+
+from jaxphoto.camera import (
+    DISTORTIONS,
+    AbstractDistortion,
+    InteriorOrientation,
+    Sensor,
+    Smac,
+    needed_constants,
+    parameter_names,
+)
+from jaxphoto.errors import InputError
+
+_CENTRAL = ("c_mm", "xp_mm", "yp_mm")
+# What a board shows well; the rest of a model's coefficients stay at zero unless they are asked for.
+_USUAL = {
+    "brown": ("k1", "k2", "k3", "p1", "p2"),
+    "smac": ("k1", "k2", "k3", "p1", "p2"),
+    "balanced": ("a1", "a2", "a3", "b1", "b2"),
+}
+# Gruen's terms up to the third degree: with all 44, neighbouring targets would be fitted one by one.
+_DEGREE = 3
+
+
+def distortion_model(name: str, sensor: Sensor, r0_mm: float = 0.0) -> AbstractDistortion:
+    """The model called `name` in block.toml, without distortion, with constants that fit the sensor.
+
+    Half the longer side for the spacing b of Ebner's and Gruen's points, the longer side for Brown14's F. Raises
+    InputError for an unknown name, and for an R0 of another model than SMAC or one beyond the format.
+    """
+    if name not in DISTORTIONS:
+        raise InputError(f"no distortion model is called {name!r}; choose one of {', '.join(DISTORTIONS)}")
+    kind, longer = DISTORTIONS[name], max(sensor.width_mm, sensor.height_mm)
+    if kind is Smac:
+        if not 0 <= r0_mm <= longer:
+            raise InputError(f"R0 = {r0_mm:g} mm does not lie on an image of {longer:.4g} mm; give 0 to {longer:.4g}")
+        return Smac(r0=r0_mm)
+    if r0_mm:
+        raise InputError(f"R0 belongs to the model smac; leave it out with {name}, or choose smac")
+    return kind(**{field: longer / 2 if field == "b" else longer for field in needed_constants(kind).values()})
+
+
+def free_parameters(name: str, distortion: AbstractDistortion, wanted: Sequence[str] | None = None) -> tuple[str, ...]:
+    """The parameters to estimate, in the order of the model: `wanted` (c, xp, yp stand for c_mm, ...), or the usual.
+
+    The usual are c, the principal point, and the coefficients that a board tells: for SMAC and Brown K1-K3, P1, P2; for
+    Gruen those up to the third degree; for others all. Raises InputError for names that the model has not, and for a
+    scale coefficient beside c.
+    """
+    names = parameter_names(InteriorOrientation(1.0, distortion=distortion))
+    if wanted is None:
+        usual = _USUAL.get(name, distortion.coefficients)
+        if name == "gruen":
+            usual = tuple(c for c in usual if int(c[1]) + int(c[2]) - 2 <= _DEGREE)
+        return tuple(n for n in names if n in (*_CENTRAL, *usual))
+    asked = [f"{n}_mm" if n in ("c", "xp", "yp") else n for n in wanted]
+    for parameter in asked:
+        if parameter not in names:
+            raise InputError(f"the model {name} has no parameter {parameter!r}; it has {', '.join(names)}")
+    if both := [scale for scale in distortion.scales if scale in asked and "c_mm" in asked]:
+        raise InputError(f"{both[0]} changes the scale as c does: leave {both[0]} or c out of what is free")
+    return tuple(n for n in names if n in asked)

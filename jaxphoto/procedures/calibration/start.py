@@ -1,0 +1,181 @@
+"""Where a calibration starts when nothing is known of the camera: distortion from straightness, c from perspective.
+
+1. Radial distortion, `ideal = measured (1 - k1 r^2 - k2 r^4)` about the image centre: that with which the photographs
+   of a flat board are best what a pinhole makes of a plane, a homography each (lines are straight). The errors are
+   those in the plane of the board, so that a smaller image is no better one.
+2. The principal distance from the homographies (Zhang, 2000): the images of the board's axes are at right angles and of
+   one length, `h1' W h2 = 0`, `h1' W h1 = h2' W h2` with W = diag(1, 1, c^2), by least squares over all photographs.
+3. The coefficients of any distortion model that come nearest to this radial distortion over the format.
+"""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from scipy.optimize import minimize
+
+from jaxphoto.camera import AbstractDistortion, Brown, InteriorOrientation, Sensor, get_parameter, set_parameter
+from jaxphoto.compiling import call_compiled
+from jaxphoto.orientation.rays import ideal_coordinates
+from jaxphoto.procedures.calibration.block import TargetRows
+from jaxphoto.procedures.calibration.board import Board
+from jaxphoto.procedures.calibration.reprojection import projections
+from jaxphoto.procedures.calibration.resections import resected
+
+# Points along each side of the format at which two distortions are compared, and Gauss-Newton steps.
+_SIDE, _STEPS = 15, 8
+# Principal distances, over the diagonal of the format, that a photograph of a board can have.
+_SHORTEST, _LONGEST = 0.15, 15.0
+# Of the typical mean square error of a homography: beyond, a view is no plane seen by this camera.
+_MISFIT = 25.0
+# Mean square errors of homographies, over the size of the board: of none that fits, and of measurements without noise.
+_FOLDED, _EXACT = 1e6, 1e-16
+# Of h1 and h2, what a view must be tilted by to tell c: below, all views are taken as square on.
+_TILT = 1e-3
+
+
+def rough_interior(
+    board: Board, rows: TargetRows, sensor: Sensor, known: InteriorOrientation | None = None
+) -> InteriorOrientation:
+    """Where the calibration starts: from a flat board, else from what is `known`, else from resections with several c.
+
+    Of a board that is not flat, and of views square on, nothing is told by homographies: then c is that of `known`, or
+    the one of a few between half and three times the longer side with which resections leave least.
+    """
+    plane = board.plane
+    if plane is not None:
+        middle, axes = plane
+        flat = (board.xyz_m - middle) @ axes[:, :2]
+        own = [rows.image == k for k in range(len(rows.images))]
+        rough, told = flat_start([(flat[rows.point[k]], rows.xy_mm[k]) for k in own], sensor)
+        if told or known is None:
+            return rough
+        return eqx.tree_at(lambda i: i.c, rough, float(known.c))
+    if known is not None:
+        return known
+    longer = max(sensor.width_mm, sensor.height_mm)
+    choices = [InteriorOrientation(c * longer) for c in np.geomspace(0.5, 3.0, 7)]
+    return min(choices, key=lambda interior: _resection_error(board, rows, interior))
+
+
+def _resection_error(board: Board, rows: TargetRows, interior: InteriorOrientation) -> float:
+    """Median error (mm) of the resections of all photographs with an interior orientation."""
+    exterior, why = resected(board, rows, interior)
+    rows = rows.take(np.array([rows.images[k] not in why for k in rows.image], bool))
+    if not len(rows.image):
+        return np.inf
+    place = np.asarray(exterior.position)[rows.image], np.asarray(exterior.camera_from_object)[rows.image]
+    error = rows.xy_mm - projections(interior, *place, board.xyz_m[rows.point])
+    return float(np.median(np.linalg.norm(error, axis=1)))
+
+
+def flat_start(
+    views: Sequence[tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]], sensor: Sensor
+) -> tuple[InteriorOrientation, bool]:
+    """c, K1 and K2 (`Brown`) from views of flat boards: coordinates in the board (m) and measured ones (mm).
+
+    The second value is False where no view is tilted enough to tell c, which is then 1.2 times the longer side.
+    """
+    half = np.hypot(sensor.width_mm, sensor.height_mm) / 2
+    # The mean of logarithms: a view of something else adds a constant and no more.
+    bend = lambda k: float(np.mean(np.log(_bends(views, k, half))))  # noqa: E731
+    lens = minimize(bend, np.zeros(2), method="Nelder-Mead", options={"maxiter": 120}).x
+    bends = _bends(views, lens, half)
+    straight = [view for view, error in zip(views, bends, strict=True) if error <= _MISFIT * np.median(bends)]
+    homographies = [_homography(board, _straight(xy, lens, half)) for board, xy in straight]
+    rows, right = [], []
+    for h in homographies:
+        a, b = h[:, 0], h[:, 1]
+        size = np.linalg.norm(a[:2]) * np.linalg.norm(b[:2])
+        rows += [a[2] * b[2] / size, (a[2] ** 2 - b[2] ** 2) / size]
+        right += [-(a[:2] @ b[:2]) / size, -(a[:2] @ a[:2] - b[:2] @ b[:2]) / size]
+    slope, wanted = np.array(rows), np.array(right)
+    square = slope @ wanted / max(slope @ slope, 1e-300)
+    c = np.sqrt(square) * half if square > 0 else np.nan
+    told = bool(np.max(np.abs(slope)) > _TILT and 2 * _SHORTEST * half < c < 2 * _LONGEST * half)
+    if not told:
+        c = 1.2 * max(sensor.width_mm, sensor.height_mm)
+    k1, k2 = lens / half ** np.array([2, 4])
+    return InteriorOrientation(c, distortion=Brown(k1=k1, k2=k2)), told
+
+
+def nearest_distortion(
+    known: InteriorOrientation, model: AbstractDistortion, free: Sequence[str], sensor: Sensor
+) -> InteriorOrientation:
+    """`known` with the distortion `model`, whose coefficients among `free` come nearest to that of `known`.
+
+    Over 15 x 15 points of the format, by least squares of the residuals that an adjustment would have.
+    """
+    x, y = (np.linspace(-0.48, 0.48, _SIDE) * side for side in (sensor.width_mm, sensor.height_mm))
+    measured = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    ideal = ideal_coordinates(known, measured)
+    given, wanted = (measured - np.asarray(known.principal_point), ideal)
+    if model.domain == "ideal":
+        given, wanted = wanted, given
+    interior = jax.tree.map(lambda v: np.asarray(v, float), InteriorOrientation(known.c, known.x_p, known.y_p, model))
+    names = tuple(name for name in free if name in model.coefficients)
+    for _ in range(_STEPS if names else 0):
+        value, slope = call_compiled(_closed_form, interior, given, names)
+        slope = np.asarray(slope).reshape(-1, len(names))
+        length = np.maximum(np.linalg.norm(slope, axis=0), 1e-300)
+        step = np.linalg.lstsq(slope / length, (wanted - np.asarray(value)).ravel(), rcond=1e-10)[0] / length
+        for name, change in zip(names, step, strict=True):
+            interior = set_parameter(interior, name, np.asarray(get_parameter(interior, name) + change))
+    return interior
+
+
+@eqx.filter_jit
+def _closed_form(interior: InteriorOrientation, xy: Float[np.ndarray, "n 2"], names: tuple[str, ...]):
+    """What the distortion makes of `xy`, (n, 2), and the derivatives by the coefficients `names`, (n, 2, names)."""
+
+    def value(parameters):
+        tree = interior
+        for name, parameter in zip(names, parameters, strict=True):
+            tree = set_parameter(tree, name, parameter)
+        return jax.vmap(tree.closed_form)(jnp.asarray(xy))
+
+    start = jnp.stack([get_parameter(interior, name) for name in names])
+    return value(start), jax.jacfwd(value)(start)
+
+
+def _straight(xy, lens, half):
+    """Ideal coordinates over half the diagonal."""
+    reduced = xy / half
+    r2 = np.sum(reduced**2, axis=1, keepdims=True)
+    return reduced * (1 - lens[0] * r2 - lens[1] * r2**2)
+
+
+def _bends(views, lens, half) -> Float[np.ndarray, "views"]:
+    """Mean square error of the best homography of each view, in the board and over its size."""
+    r = np.linspace(0, 1, 20)
+    if np.any(1 - 3 * lens[0] * r**2 - 5 * lens[1] * r**4 <= 0.05):
+        return np.full(len(views), _FOLDED)  # the lens would fold the image inside the format
+    errors = []
+    for board, xy in views:
+        image = _straight(xy, lens, half)
+        back = np.linalg.pinv(_homography(board, image)) @ np.column_stack([image, np.ones(len(xy))]).T
+        error = (back[:2] / back[2]).T - board
+        square = np.mean(np.sum(error**2, axis=1)) / np.mean(np.sum((board - board.mean(0)) ** 2, axis=1))
+        errors.append(square if np.isfinite(square) else _FOLDED)
+    return np.maximum(errors, _EXACT)
+
+
+def _homography(board, image) -> Float[np.ndarray, "3 3"]:
+    """image ~ H board, by least squares in coordinates of one size (the direct linear transformation)."""
+    (a, to_a), (b, to_b) = _conditioned(board), _conditioned(image)
+    one, zero = np.ones((len(a), 1)), np.zeros((len(a), 3))
+    point = np.hstack([a, one])
+    rows = np.vstack([np.hstack([point, zero, -b[:, :1] * point]), np.hstack([zero, point, -b[:, 1:] * point])])
+    h = np.linalg.svd(rows)[2][-1].reshape(3, 3)
+    return np.linalg.solve(to_b, h @ to_a)
+
+
+def _conditioned(xy):
+    """The same points about their middle and of size 1, and the matrix that makes them so."""
+    middle = xy.mean(axis=0)
+    size = max(float(np.sqrt(np.mean(np.sum((xy - middle) ** 2, axis=1)))), 1e-300)
+    matrix = np.array([[1 / size, 0, -middle[0] / size], [0, 1 / size, -middle[1] / size], [0, 0, 1]])
+    return (xy - middle) / size, matrix

@@ -1,0 +1,153 @@
+"""The results of a calibration with targets: those of its adjustment, and what became of every photograph."""
+
+import json
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from jinja2 import Environment
+from markupsafe import Markup
+from matplotlib.figure import Figure
+from rich.console import Console
+
+from jaxphoto.procedures.calibration import Calibration, rms_px
+from jaxphoto.report.page import STYLE
+from jaxphoto.report.plots import new_figure
+from jaxphoto.report.results import made_whole, write_results, write_summary
+from jaxphoto.report.tables import Tables
+from jaxphoto.report.verdict import warnings_of
+
+PICTURES = "photographs"
+_PAGE = """<!DOCTYPE html>
+<html lang="en"><head><meta charset="utf-8"><title>{{ title }}</title><style>{{ style }}</style></head><body>
+<h1>{{ title }}: photographs</h1>
+{{ table }}
+{% for name in pictures %}<h2>{{ name }}</h2><img alt="targets and residuals" src="photographs/{{ name }}.png">
+{% endfor %}</body></html>
+"""
+_WIDTH_INCHES = 6.4
+# Of the width of the picture: how long the arrow of a typical residual is drawn.
+_ARROW = 0.03
+_SHOWN = 4
+
+
+def photographs_table(calibration: Calibration) -> pd.DataFrame:
+    """image, used, n_points, rms_px, max_px, reason: every photograph, those left out last."""
+    rows, residuals = calibration.measured, calibration.residuals_px
+    lines: list[tuple] = []
+    for k, name in enumerate(rows.images):
+        own = residuals[rows.image == k]
+        lines.append((name, True, len(own), rms_px(own), float(np.linalg.norm(own, axis=1).max()), ""))
+    lines += [(name, False, 0, np.nan, np.nan, reason) for name, reason in calibration.left_out.items()]
+    return pd.DataFrame(lines, columns=["image", "used", "n_points", "rms_px", "max_px", "reason"])
+
+
+def targets_figure(calibration: Calibration, image: str, picture: np.ndarray | None = None) -> Figure:
+    """The targets of one photograph, over its grey values where they are given, with residual vectors, enlarged."""
+    rows, sensor = calibration.measured, calibration.sensor
+    own = rows.image == rows.images.index(image)
+    place, v = sensor.px_from_mm(rows.xy_mm[own]), calibration.residuals_px[own]
+    typical = max(rms_px(calibration.residuals_px), 1e-12)
+    scale = _ARROW * sensor.width_px / typical
+    figure = new_figure(_WIDTH_INCHES, _WIDTH_INCHES * sensor.height_px / sensor.width_px + 0.6)
+    axes = figure.subplots()
+    if picture is not None:
+        step = max(1, sensor.width_px // 1000)
+        extent = (0, sensor.width_px, sensor.height_px, 0)
+        axes.imshow(picture[::step, ::step], cmap="gray", extent=extent, vmin=0, vmax=255)
+    axes.plot(*place.T, "+", ms=5, color="tab:cyan")
+    axes.quiver(
+        *place.T, *(scale * v).T, color="tab:red", angles="xy", scale_units="xy", scale=1, width=0.003, headwidth=4
+    )
+    axes.set(xlim=(0, sensor.width_px), ylim=(sensor.height_px, 0), xlabel="column [px]", ylabel="row [px]")
+    axes.set_title(f"{image}: RMS {rms_px(v):.3f} px, residuals {scale:.0f} times enlarged", fontsize=10)
+    axes.set_aspect("equal")
+    return figure
+
+
+def findings(calibration: Calibration) -> list[str]:
+    """What a person should know of the photographs, in sentences."""
+    found = []
+    if calibration.left_out:
+        some = [f"{name} ({reason})" for name, reason in list(calibration.left_out.items())[:_SHOWN]]
+        more = ", ..." if len(calibration.left_out) > _SHOWN else ""
+        found.append(f"{len(calibration.left_out)} photographs are not used: {', '.join(some)}{more}")
+    if calibration.removed:
+        some = [f"{point} in {image}" for image, point in calibration.removed[:_SHOWN]]
+        more = ", ..." if len(calibration.removed) > _SHOWN else ""
+        found.append(f"{len(calibration.removed)} image points were blunders and are not used: {', '.join(some)}{more}")
+    measured = float(np.median(calibration.measured.sigma_mm)) / calibration.sensor.pixel_mm
+    if calibration.added_sigma_px > measured:
+        found.append(
+            f"the targets are measured to {measured:.3f} px, but fit to {calibration.added_sigma_px:.3f} px only: "
+            "look at the residuals of the photographs for an uneven board, a rolling shutter or a model too simple"
+        )
+    return found
+
+
+def write_calibration(
+    calibration: Calibration,
+    directory: Path,
+    seconds: dict[str, float],
+    pictures: Mapping[str, Callable[[], np.ndarray]],
+    beside: Callable[[Path], None] = lambda folder: None,
+) -> Tables:
+    """Write what `jaxphoto adjust` writes, and photographs.csv, photographs.html and a picture of each photograph.
+
+    summary.json gains rms_px, n_images_used, n_image_points, added_sigma_px, left_out and removed. `pictures` read the
+    grey values of photographs by their names; `beside` may write more into the folder while it is made. Raises
+    InputError where `directory` holds something that is not an earlier result.
+    """
+    began = time.perf_counter()
+    tables = Tables(calibration.adjusted)
+    verdict = findings(calibration) + warnings_of(tables)
+    times = calibration.adjusted.seconds
+    with made_whole(directory) as work:
+        write_results(tables, verdict, work, seconds | {k: times[k] for k in ("compile", "solve", "covariance")})
+        photographs = photographs_table(calibration)
+        photographs.to_csv(work / "photographs.csv", index=False)
+        (work / PICTURES).mkdir()
+        for name in calibration.measured.images:
+            picture = pictures[name]() if name in pictures else None
+            targets_figure(calibration, name, picture).savefig(work / PICTURES / f"{name}.png")
+        shown = photographs.to_html(index=False, border=0, na_rep="", float_format="{:.3f}".format)
+        page = Environment(autoescape=True).from_string(_PAGE)
+        (work / "photographs.html").write_text(
+            page.render(
+                title=calibration.adjusted.block.title,
+                style=STYLE,
+                table=Markup(shown),
+                pictures=calibration.measured.images,
+            ),
+            encoding="utf-8",
+        )
+        beside(work)
+        summary = json.loads((work / "summary.json").read_text(encoding="utf-8"))
+        summary["seconds"]["write"] = round(time.perf_counter() - began, 6)
+        write_summary(summary | calibration_summary(calibration), work)
+    return tables
+
+
+def calibration_summary(calibration: Calibration) -> dict:
+    """What summary.json says beyond the adjustment."""
+    return {
+        "rms_px": calibration.rms_px,
+        "n_images_used": len(calibration.measured.images),
+        "n_image_points": len(calibration.residuals_px),
+        "added_sigma_px": calibration.added_sigma_px,
+        "left_out": calibration.left_out,
+        "removed": [f"{point} in {image}" for image, point in calibration.removed],
+    }
+
+
+def print_calibration(calibration: Calibration, console: Console) -> None:
+    """Print what became of the photographs."""
+    console.print(
+        f"{len(calibration.measured.images)} photographs used, {len(calibration.residuals_px)} image points, RMS "
+        f"{calibration.rms_px:.3f} px",
+        highlight=False,
+    )
+    for finding in findings(calibration):
+        console.print(f"  - {finding}", highlight=False, markup=False)

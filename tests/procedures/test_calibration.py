@@ -1,0 +1,210 @@
+"""Calibration with a board: the truth of a simulated camera, the start, gross errors, circles, and a real camera."""
+
+import cv2
+import jax
+import numpy as np
+import pytest
+
+from jaxphoto import Brown, ExteriorOrientation, InputError, InteriorOrientation, Outcome, Sensor, Smac, Tables
+from jaxphoto.camera import get_parameter, rebalance
+from jaxphoto.io.photographs import photographs, sensor_and_interior
+from jaxphoto.io.targets import find_targets, read_board
+from jaxphoto.procedures.calibration import (
+    Board,
+    Detection,
+    calibrate,
+    distortion_model,
+    eccentricity,
+    free_parameters,
+)
+from jaxphoto.procedures.calibration.outliers import added_sigma
+from jaxphoto.procedures.calibration.reprojection import projections
+from jaxphoto.procedures.calibration.start import flat_start, nearest_distortion
+
+SENSOR = Sensor(1280, 960, 0.0054)
+WIDE = InteriorOrientation(3.1, 0.04, -0.03, Smac(k1=-0.028, k2=-0.0009, k3=-5e-5, p1=2e-4, p2=-3e-4))
+SIGMA_PX = 0.05
+# Beyond, the distortion of the simulation is not invertible.
+_WITHIN = 0.48
+
+
+def flat_board(diameter_m: float = 0.0) -> Board:
+    row, column = np.divmod(np.arange(9 * 7), 9)
+    xyz = np.stack([0.03 * column, -0.03 * row, 0.0 * row], axis=1)
+    ids = tuple(f"r{r}c{c}" for r, c in zip(row, column, strict=True))
+    return Board("board", ids, xyz, np.full(len(ids), diameter_m))
+
+
+def views(board: Board, n: int) -> list[ExteriorOrientation]:
+    """Cameras half a radian and more off the normal, on all sides, turned about their axes."""
+    rng = np.random.default_rng(1)
+    found = []
+    for k in range(n):
+        target = board.xyz_m.mean(axis=0) + np.array([*rng.uniform(-0.06, 0.06, 2), 0])
+        slant, around = rng.uniform(0.3, 0.7), 2.4 * k
+        away = np.array([np.sin(slant) * np.cos(around), np.sin(slant) * np.sin(around), np.cos(slant)])
+        x = np.cross([0.0, 1.0, 0.0], away)
+        x /= np.linalg.norm(x)
+        c, s = np.cos(0.8 * k), np.sin(0.8 * k)
+        turn = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+        matrix = turn @ np.stack([x, np.cross(away, x), away])
+        found.append(ExteriorOrientation(target + rng.uniform(0.16, 0.24) * away, matrix))  # type: ignore[arg-type]
+    return found
+
+
+def seen(board, exteriors, noise_px, seed=0, interior=WIDE) -> list[Detection]:
+    rng = np.random.default_rng(seed)
+    detections = []
+    for k, exterior in enumerate(exteriors):
+        n = len(board.points)
+        place = np.tile(exterior.position, (n, 1)), np.tile(exterior.camera_from_object, (n, 1, 1))
+        px = SENSOR.px_from_mm(projections(interior, *place, board.xyz_m))
+        px += noise_px * rng.standard_normal(px.shape)
+        half = np.array([SENSOR.width_px, SENSOR.height_px]) / 2
+        point = np.flatnonzero((np.abs(px - half) < 2 * _WITHIN * half).all(axis=1))
+        detections.append(Detection(f"i{k}", point, px[point], np.full((len(point), 2), noise_px)))
+    return detections
+
+
+@pytest.fixture(scope="module")
+def simulated():
+    board = flat_board()
+    detections = seen(board, views(board, 12), SIGMA_PX)
+    # Two blunders, one image of something else, one with hardly a target.
+    spoilt = detections[3].column_row.copy()
+    spoilt[[5, 20]] += [[4.0, -3.0], [-2.0, 6.0]]
+    detections[3] = detections[3]._replace(column_row=spoilt)
+    rng = np.random.default_rng(9)
+    other = rng.uniform(50, 900, (40, 2))
+    detections.append(Detection("other", np.arange(40), other, np.full((40, 2), SIGMA_PX)))
+    detections.append(detections[0].take(np.arange(4))._replace(image="few"))
+    return calibrate(board, detections, SENSOR)
+
+
+def test_recovers_the_camera_within_its_standard_deviations(simulated):
+    assert simulated.adjusted.outcome is Outcome.CONVERGED
+    tables = Tables(simulated.adjusted).interior.set_index("parameter")
+    for name in free_parameters("smac", Smac()):
+        value, sigma = tables.loc[name, ["value", "sigma"]]
+        assert abs(value - float(get_parameter(WIDE, name))) < 3 * sigma, name
+    # sigma naught is 1 where nothing but the noise of the measurement is left.
+    assert float(simulated.adjusted.sigma0) == pytest.approx(1.0, abs=0.08)
+    assert simulated.added_sigma_px < 0.5 * SIGMA_PX
+    assert simulated.rms_px == pytest.approx(np.sqrt(2) * SIGMA_PX, rel=0.1)
+    rays = _rays(simulated.interior), _rays(WIDE)
+    assert np.abs(rays[0] - rays[1]).max() < 3e-3
+
+
+def test_gross_errors_are_found_and_named(simulated):
+    assert set(simulated.left_out) == {"other", "few"}
+    wrong = {point for image, point in simulated.removed if image == "i3"}
+    third = seen(flat_board(), views(flat_board(), 12), SIGMA_PX)[3]
+    assert {flat_board().points[third.point[k]] for k in (5, 20)} <= wrong
+    assert len(simulated.removed) <= 4
+
+
+def _rays(interior) -> np.ndarray:
+    """Ideal coordinates over c, at points of the format."""
+    side = [np.linspace(-0.45, 0.45, 11) * s for s in (SENSOR.width_mm, SENSOR.height_mm)]
+    grid = np.stack(np.meshgrid(*side), axis=-1).reshape(-1, 2)
+    return np.asarray(jax.vmap(interior.ideal_from_measured)(grid)) / float(interior.c)
+
+
+def test_any_balance_radius_gives_the_same_bundle(simulated):
+    board = flat_board()
+    again = calibrate(board, seen(board, views(board, 12), 8 * SIGMA_PX), SENSOR)
+    balanced = calibrate(board, seen(board, views(board, 12), 8 * SIGMA_PX), SENSOR, r0_mm=2.5)
+    assert float(balanced.interior.distortion.r0) == 2.5
+    assert np.abs(_rays(again.interior) - _rays(balanced.interior)).max() < 1e-9
+    assert np.abs(_rays(rebalance(again.interior, 2.5)) - _rays(balanced.interior)).max() < 1e-9
+    assert balanced.rms_px == pytest.approx(again.rms_px, rel=1e-9)
+
+
+def test_start_needs_nothing_but_tilted_views():
+    board = flat_board()
+    pairs = [(board.xyz_m[d.point, :2], SENSOR.mm_from_px(d.column_row)) for d in seen(board, views(board, 6), 0.2)]
+    start, told = flat_start(pairs, SENSOR)
+    assert told
+    assert float(start.c) == pytest.approx(float(WIDE.c), rel=0.05)
+    # From straight above nothing tells c from the height.
+    above = ExteriorOrientation(np.array([0.12, -0.09, 0.2]), np.eye(3))  # type: ignore[arg-type]
+    level = [(board.xyz_m[d.point, :2], SENSOR.mm_from_px(d.column_row)) for d in seen(board, [above] * 3, 0.0)]
+    assert not flat_start(level, SENSOR)[1]
+
+
+@pytest.mark.parametrize("name", ["smac", "balanced", "bundler_radial"])
+def test_another_model_begins_where_the_rays_are_nearest(name):
+    known = InteriorOrientation(3.1, distortion=Brown(k1=-0.02, k2=-0.001))
+    model = distortion_model(name, SENSOR)
+    begun = nearest_distortion(known, model, free_parameters(name, model), SENSOR)
+    off = np.abs(_rays(begun) - _rays(known)).max()
+    assert off < {"smac": 1e-9, "balanced": 0.02, "bundler_radial": 0.06}[name]
+
+
+def test_eccentricity_is_that_of_the_ellipse_in_closed_form():
+    """Without distortion: the centre of the conic H^-T diag(1, 1, -1) H^-1 minus the image of the centre."""
+    board = flat_board()
+    lens = InteriorOrientation(3.1, 0.02, 0.01)
+    for exterior in views(board, 4):
+        centre, radius = np.array([0.1, -0.05, 0.0]), 0.012
+        matrix, position = np.asarray(exterior.camera_from_object), np.asarray(exterior.position)
+        k = np.array([[-3.1, 0, 0.02], [0, -3.1, 0.01], [0, 0, 1]])
+        h = k @ np.column_stack([radius * matrix[:, :2], matrix @ (centre - position)])
+        conic = np.linalg.inv(h).T @ np.diag([1.0, 1.0, -1.0]) @ np.linalg.inv(h)
+        ellipse = np.linalg.solve(conic[:2, :2], -conic[:2, 2])
+        image = h[:, 2] / h[2, 2]
+        found = eccentricity(lens, exterior, centre, np.eye(3)[:, :2], radius)
+        np.testing.assert_allclose(np.asarray(found), ellipse - image[:2], atol=1e-12)
+        assert np.linalg.norm(ellipse - image[:2]) > 1e-3 * SENSOR.pixel_mm
+
+
+def test_added_sigma_makes_the_square_sum_the_redundancy():
+    rng = np.random.default_rng(0)
+    sigma = rng.uniform(0.01, 0.2, (4000, 2))
+    residuals = np.hypot(sigma, 0.3) * rng.standard_normal(sigma.shape)
+    assert added_sigma(residuals, sigma, sigma.size) == pytest.approx(0.3, rel=0.03)
+    assert added_sigma(0.5 * sigma, sigma, sigma.size) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"model": "fisheye"}, ["fisheye", "brown"]),
+        ({"model": "brown", "r0_mm": 2.0}, ["R0", "smac"]),
+        ({"r0_mm": 50.0}, ["R0 = 50 mm"]),
+        ({"free": ["c", "k9"]}, ["k9", "c_mm"]),
+        ({"free": ["c", "k0"]}, ["k0", "scale"]),
+        ({}, ["2 of 2 photographs", "3"]),
+    ],
+)
+def test_bad_input_is_one_sentence(arguments, words):
+    board = flat_board()
+    with pytest.raises(InputError) as error:
+        calibrate(board, seen(board, views(board, 2), 0.1), SENSOR, **arguments)
+    for word in words:
+        assert word in str(error.value)
+
+
+def test_gopro_fits_better_than_opencv_on_the_same_corners(data_dir):
+    """SMAC with K1-K3, P1, P2 against OpenCV's k1-k3, p1, p2 with one focal length: c and xp, yp in both."""
+    folder = data_dir / "gopro_chessboard" / "calibration_wide"
+    if not folder.is_dir():
+        pytest.skip(f"no photographs in {folder}")
+    taken = photographs(sorted(folder.glob("*.jpg")))
+    pattern = read_board("chessboard:8x6:square_mm=30")
+    targets = find_targets(taken, pattern)
+    start = sensor_and_interior(taken)
+    done = calibrate(pattern.board, targets.detections, start.sensor, start.interior)
+    assert done.adjusted.outcome is Outcome.CONVERGED
+    rows = done.measured
+    assert len(rows.images) >= 34
+    plane, image = [], []
+    for k in range(len(rows.images)):
+        own = rows.image == k
+        plane.append((pattern.board.xyz_m[rows.point[own]] * [1, -1, 1]).astype(np.float32))
+        image.append((start.sensor.px_from_mm(rows.xy_mm[own]) - 0.5).astype(np.float32))
+    size = start.sensor.width_px, start.sensor.height_px
+    guess = np.array([[600.0, 0, size[0] / 2], [0, 600.0, size[1] / 2], [0, 0, 1]])
+    flags = cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_USE_INTRINSIC_GUESS
+    theirs = cv2.calibrateCamera(plane, image, size, guess, None, flags=flags)[0]
+    assert done.rms_px <= theirs
