@@ -1,0 +1,183 @@
+"""A stability analysis as a table, a map of the offsets over the image, a page, and a screen of text."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import pandas as pd
+from jinja2 import Environment
+from markupsafe import Markup
+from rich.console import Console
+from rich.table import Table
+
+from jaxphoto.camera import InteriorOrientation, Sensor
+from jaxphoto.report.page import STYLE
+from jaxphoto.report.plots import new_figure
+from jaxphoto.report.results import made_whole, versions, write_summary
+from jaxphoto.stability import Analysis, Method
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_PAGE = """<!DOCTYPE html>
+<html lang="en"><head><meta charset="utf-8"><title>Stability</title><style>{{ style }}</style></head><body>
+<h1>Stability of interior orientation</h1>
+<p class="{{ 'good' if similar else 'bad' }}"><b>{{ verdict }}</b></p>
+{% for line in about %}<p>{{ line }}</p>{% endfor %}
+{{ table }}
+<img alt="offsets of the two bundles over the image" src="{{ picture }}">
+</body></html>
+"""
+
+
+class Compared(NamedTuple):
+    """Which of the two sets is meant, for tables and pictures."""
+
+    name: str
+    interior: InteriorOrientation
+    known: bool
+    """Whether its covariance is known."""
+
+    def __str__(self) -> str:
+        model, how = type(self.interior.distortion).__name__, "with" if self.known else "WITHOUT"
+        return f"{self.name}: {model}, c = {float(self.interior.c):.6g} mm, {how} covariance"
+
+
+def stability_table(analyses: Mapping[Method, Analysis], pixel_mm: float, noise_mm: float) -> pd.DataFrame:
+    """One row a method: method, unknowns, rmse_offset_mm, rmse_offset_px, rmse_measured_mm, largest_mm, similar, ...
+
+    The uncertainty follows (sigma_mm to unexplained_mm, see `OffsetUncertainty`), empty where no covariance is known,
+    then the alignment: rotations in degrees, positions as parts of the object's distance.
+    """
+    rows = []
+    for method, one in analyses.items():
+        v = one.offsets
+        alignment = np.full(6, np.nan)
+        alignment[: len(v.alignment)] = v.alignment
+        row = {
+            "method": method,
+            "unknowns": len(v.alignment),
+            "rmse_offset_mm": float(v.rmse_mm),
+            "rmse_offset_px": float(v.rmse_mm) / pixel_mm,
+            "rmse_measured_mm": float(v.rmse_measured_mm),
+            "largest_mm": float(np.linalg.norm(v.offsets, axis=1).max()),
+            "similar": one.similar(noise_mm),
+        }
+        row |= one.uncertainty._asdict() if one.uncertainty is not None else {}
+        row |= dict(zip(("rx_deg", "ry_deg", "rz_deg"), np.rad2deg(alignment[:3]), strict=True))
+        row |= dict(zip(("X_of_distance", "Y_of_distance", "Z_of_distance"), alignment[3:], strict=True))
+        rows.append(row | {"converged": bool(v.converged)})
+    return pd.DataFrame(rows)
+
+
+def offsets_table(analysis: Analysis) -> pd.DataFrame:
+    """x_mm, y_mm of the grid, dx_mm, dy_mm on the virtual image plane, and in the image as it is measured."""
+    v = analysis.offsets
+    columns = ["x_mm", "y_mm", "dx_mm", "dy_mm", "dx_measured_mm", "dy_measured_mm"]
+    return pd.DataFrame(np.hstack([v.points, v.offsets, v.measured]), columns=columns)
+
+
+def offsets_figure(analysis: Analysis, sensor: Sensor) -> Figure:
+    """The map of RMSE_offset: size of the offsets as colour, the offsets as arrows, over the format."""
+    points, v = np.asarray(analysis.offsets.points), 1e3 * np.asarray(analysis.offsets.offsets)
+    size = np.linalg.norm(v, axis=1)
+    figure = new_figure(7.2, 5.4)
+    axes = figure.subplots()
+    if size.max() > 0:
+        shown = axes.tricontourf(points[:, 0], points[:, 1], size, levels=12, cmap="viridis")
+        figure.colorbar(shown, ax=axes, label="offset of corresponding rays [um]", shrink=0.85)
+    arrows = axes.quiver(*points.T, *v.T, angles="xy", color="white", width=0.002)
+    key = float(f"{max(size.mean(), 1e-12):.0e}")
+    axes.quiverkey(arrows, 0.9, 1.03, key, f"{key:g} um", labelpos="E", color="0.2")
+    w, h = sensor.width_mm / 2, sensor.height_mm / 2
+    axes.plot([-w, w, w, -w, -w], [-h, -h, h, h, -h], color="0.4", lw=0.8)
+    rmse = 1e3 * float(analysis.offsets.rmse_mm)
+    axes.set_title(f"{analysis.method}: RMSE_offset {rmse:.3g} um", loc="left")
+    axes.set(xlabel="x [mm]", ylabel="y [mm]", aspect="equal")
+    return figure
+
+
+def print_stability(
+    analyses: Mapping[Method, Analysis], sets: tuple[Compared, Compared], pixel_mm: float, noise_mm: float,
+    method: Method, console: Console,
+) -> None:  # fmt: skip
+    """Both sets, a line for each method in micrometres, and the verdict by `method`."""
+    for compared in sets:
+        console.print(str(compared), highlight=False, soft_wrap=True)
+    console.print(_missing(sets), highlight=False, soft_wrap=True)
+    table = Table(title=f"stability [um]; noise {1e3 * noise_mm:.4g} um = {noise_mm / pixel_mm:.4g} px")
+    for name in ("method", "RMSE_offset", "px", "as measured", "largest", "sigma", "95 %", "one camera", "p"):
+        table.add_column(name, justify="left" if name == "method" else "right", no_wrap=True)
+    for name, one in analyses.items():
+        v, known = one.offsets, one.uncertainty
+        sizes = (v.rmse_mm, v.rmse_measured_mm, np.linalg.norm(v.offsets, axis=1).max())
+        rmse, measured, largest = (f"{1e3 * float(s):.4g}" for s in sizes)
+        spread = ("", "", "", "")
+        if known is not None:
+            between = f"{1e3 * known.low_mm:.3g}-{1e3 * known.high_mm:.3g}"
+            of_one = f"{1e3 * known.expected_of_one_mm:.3g}"
+            spread = (f"{1e3 * known.sigma_mm:.3g}", between, of_one, f"{known.p_value:.2g}")
+        table.add_row(name, rmse, f"{float(v.rmse_mm) / pixel_mm:.4g}", measured, largest, *spread)
+    console.print(table)
+    chosen = analyses[method]
+    colour = "green" if chosen.similar(noise_mm) else "red"
+    verdict = chosen.verdict(noise_mm)
+    console.print(f"[{colour}]{method}: {verdict}[/{colour}]", highlight=False, soft_wrap=True)
+
+
+def write_stability(
+    analyses: Mapping[Method, Analysis], sets: tuple[Compared, Compared], sensor: Sensor, noise_mm: float,
+    method: Method, directory: Path,
+) -> None:  # fmt: skip
+    """stability.csv, and of `method` offsets.csv and offsets.png; report.html and summary.json of it all.
+
+    Raises InputError where `directory` holds something that is not an earlier result.
+    """
+    table = stability_table(analyses, sensor.pixel_mm, noise_mm)
+    chosen = analyses[method]
+    verdict = f"{method}: {chosen.verdict(noise_mm)}"
+    figure = io.BytesIO()
+    offsets_figure(chosen, sensor).savefig(figure, format="png")
+    with made_whole(directory) as work:
+        table.to_csv(work / "stability.csv", index=False)
+        offsets_table(chosen).to_csv(work / "offsets.csv", index=False)
+        (work / "offsets.png").write_bytes(figure.getvalue())
+        page = (
+            Environment(autoescape=True)
+            .from_string(_PAGE)
+            .render(
+                style=STYLE,
+                similar=chosen.similar(noise_mm),
+                verdict=verdict,
+                about=[str(sets[0]), str(sets[1]), _missing(sets)],
+                table=Markup(table.to_html(index=False, border=0, na_rep="", float_format="{:.4g}".format)),
+                picture="data:image/png;base64," + base64.b64encode(figure.getvalue()).decode(),
+            )
+        )
+        (work / "report.html").write_text(page, encoding="utf-8")
+        summary = {
+            "verdict": verdict,
+            "method": method,
+            "similar": chosen.similar(noise_mm),
+            "noise_mm": noise_mm,
+            "rmse_offset_mm": {name: float(one.offsets.rmse_mm) for name, one in analyses.items()},
+            "n_points": len(chosen.offsets.points),
+            "covariance": {"A": sets[0].known, "B": sets[1].known},
+            "versions": versions(),
+        }
+        write_summary(summary, work)
+
+
+def _missing(sets: tuple[Compared, Compared]) -> str:
+    """What the uncertainty is made of."""
+    without = [one.name for one in sets if not one.known]
+    if len(without) == 2:
+        return "Neither set has a covariance: no uncertainty is given."
+    if without:
+        return f"{without[0]} has no covariance and is taken as exact: the uncertainty is that of the other set alone."
+    return "Uncertainty by the covariances of both sets, which are taken to be of different images."
