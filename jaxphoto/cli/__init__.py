@@ -10,12 +10,17 @@ import typer
 from jaxphoto.cli import (  # noqa: F401
     adjust,
     boresight,
+    calibrate,
+    camera,
     convert,
     experiment,
     lidar,
+    model_choice,
     monte_carlo,
+    orient,
     sensitivity,
     simulate,
+    stability,
     surface_model,
 )
 from jaxphoto.cli.app import app
