@@ -79,7 +79,8 @@ def image_residual(
     """Observed minus computed image coordinate, in mm, in the domain where the distortion has a closed form.
 
     `ideal(measured) - projection` for models in the measured coordinate; `measured - distorted projection` for
-    models in the ideal one.
+    models in the ideal one. Where `interior.residuals` is "measured", the first is taken back into the measured image
+    by the derivative of the distortion at the measured coordinate.
     """
     return camera_residual(interior, camera_coordinates(exterior, point), xy)
 
@@ -96,7 +97,11 @@ def camera_residual(
         if interior.distortion.domain == "measured"
         else (reduced, interior.closed_form(projection))
     )
-    return jnp.stack([x - x0, y - y0])
+    if interior.distortion.domain == "ideal" or interior.residuals == "model":
+        return jnp.stack([x - x0, y - y0])
+    (a, b), (c, d) = jax.jacfwd(interior.closed_form)(reduced)
+    determinant = a * d - b * c
+    return jnp.stack([d * (x - x0) - b * (y - y0), a * (y - y0) - c * (x - x0)]) / determinant
 
 
 def intersect(

@@ -1,10 +1,12 @@
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxphoto.camera import Balanced, Brown, BundlerRadial, InteriorOrientation
+from jaxphoto.camera import Balanced, Brown, BundlerRadial, InteriorOrientation, Smac, rebalance
 from jaxphoto.collinearity import (
     ExteriorOrientation,
     camera_coordinates,
@@ -24,6 +26,7 @@ bounded = settings(max_examples=50, deadline=None, derandomize=True, database=No
 POSITION = np.array([1000.0, -2000.0, 1500.0])
 BROWN = InteriorOrientation(34.253, 0.065, 0.274, KODAK)
 BALANCED = InteriorOrientation(28.785, 0.017, 0.057, AICON)
+GOPRO = InteriorOrientation(2.6989, -0.0736, 0.0878, Smac(k1=-3.9445e-2, k2=-1.1881e-3, k3=-1.3126e-4, p1=1e-4))
 BUNDLER = InteriorOrientation(30.0, 0.03, -0.02, FLICKR)
 
 ideal_of = compiled(project_ideal)
@@ -96,6 +99,23 @@ def test_residual_is_observed_minus_computed(interior):
         slope = compiled(jax.jacfwd(interior.ideal_from_measured))(xy)
         np.testing.assert_allclose(residual, slope @ error, rtol=1e-4)
         assert np.abs(residual / error - 1).max() > 0.01
+
+
+@pytest.mark.parametrize("r0_mm", [0.0, 3.0])
+def test_a_residual_of_the_measured_image_is_free_of_the_balance_radius(r0_mm):
+    """In the model's image, which is stretched to the double in the corner, it is neither the error nor the same."""
+    exterior = exterior_of((0.1, -0.05, 0.3))
+    point = seen_point(exterior, (2.9, 1.8), GOPRO.c)
+    error = np.array([3e-6, -5e-6])
+    xy = project_(GOPRO, exterior, point) + error
+    own = rebalance(GOPRO, r0_mm)
+    in_model = image_residual_(own, exterior, point, xy)
+    assert np.abs(in_model / error - 1).max() > 0.1
+    measured = dataclasses.replace(GOPRO, residuals="measured")
+    found = image_residual_(rebalance(measured, r0_mm), exterior, point, xy)
+    # Beyond the first order: the bend of the lens over the error.
+    np.testing.assert_allclose(found, error, rtol=0, atol=1e-5 * np.abs(error).max())
+    np.testing.assert_allclose(found, image_residual_(measured, exterior, point, xy), rtol=0, atol=1e-14)
 
 
 def test_residual_of_bundle_adjustment_in_the_large():

@@ -34,7 +34,7 @@ def rebalance(interior: InteriorOrientation, r0_mm: float) -> InteriorOrientatio
         k0=jnp.zeros_like(factor), k1=k1, k2=k2, k3=k3, k4=k4, p1=d.p1 * factor, p2=d.p2 * factor,
         p3=d.p3, p4=d.p4, r0=jnp.asarray(r0_mm, float), sign=d.sign,
     )  # fmt: skip
-    return InteriorOrientation(interior.c * factor, interior.x_p, interior.y_p, smac)
+    return InteriorOrientation(interior.c * factor, interior.x_p, interior.y_p, smac, interior.residuals)
 
 
 def rebalance_covariance(

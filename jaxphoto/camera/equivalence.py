@@ -51,7 +51,7 @@ def exact(interior: InteriorOrientation, target: type[AbstractDistortion]) -> In
         term = _TERMS[target][name]
         own[term.field] = value * term.sign / c**term.power
     distortion = target(**{name: jnp.asarray(value) for name, value in own.items()})
-    return InteriorOrientation(jnp.asarray(c), interior.x_p, interior.y_p, distortion)
+    return InteriorOrientation(jnp.asarray(c), interior.x_p, interior.y_p, distortion, interior.residuals)
 
 
 def with_sign(interior: InteriorOrientation, sign: Literal["subtract", "add"]) -> InteriorOrientation:
@@ -66,7 +66,7 @@ def with_sign(interior: InteriorOrientation, sign: Literal["subtract", "add"]) -
         return interior
     turned = {name: -jnp.asarray(getattr(d, name)) for name in ("k0", "k1", "k2", "k3", "k4", "p1", "p2")}
     smac = Smac(**turned, p3=d.p3, p4=d.p4, r0=d.r0, sign=sign)
-    return InteriorOrientation(interior.c, interior.x_p, interior.y_p, smac)
+    return InteriorOrientation(interior.c, interior.x_p, interior.y_p, smac, interior.residuals)
 
 
 class _Term(NamedTuple):

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
+from typing import Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -15,12 +16,16 @@ class InteriorOrientation(eqx.Module):
 
     `ideal = distortion.ideal_from_measured(measured - (x_p, y_p))`; for a `normalised` distortion both are divided by c
     (docs/conventions.md).
+
+    `residuals` says in which image an adjustment measures its residuals: that of the model, where the distortion has a
+    closed form, or always the measured one, whose noise it is. They differ where a wide-angle lens stretches the image.
     """
 
     c: Float[Array, ""] | float
     x_p: Float[Array, ""] | float = 0.0
     y_p: Float[Array, ""] | float = 0.0
     distortion: AbstractDistortion = dataclasses.field(default_factory=Brown)
+    residuals: Literal["model", "measured"] = eqx.field(static=True, default="model")
 
     def ideal_from_measured(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
         """Ideal image coordinate (mm, from the principal point) of a measured one (mm, from the centre)."""

@@ -1,5 +1,6 @@
 """Candidates for the distortion of a block: a model of which some coefficients are estimated, others held at 0."""
 
+import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
@@ -85,6 +86,7 @@ def _start(given: InteriorOrientation, candidate: Candidate, sensor: Sensor) -> 
         lengths = {"f": float(given.c), "b": sensor.width_mm / 3}
         constants = {field: lengths[field] for field in needed_constants(kind).values()}
         interior = InteriorOrientation(given.c, given.x_p, given.y_p, kind(**constants))
+    interior = dataclasses.replace(interior, residuals=given.residuals)
     for name in held:
         interior = set_parameter(interior, name, 0.0)
     return jax.tree.map(on_device, interior)

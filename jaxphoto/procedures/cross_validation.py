@@ -88,7 +88,7 @@ def _discrepancies(interior, exterior, points, xy, corrections):
     def of_one(exterior, point, xy):
         aim = apparent_point(exterior.position, point, corrections)
         residual = image_residual(interior, exterior, aim, xy)
-        if interior.distortion.domain == "ideal":
+        if interior.distortion.domain == "ideal" or interior.residuals == "measured":
             return residual
         return jnp.linalg.solve(jax.jacfwd(interior.ideal_from_measured)(xy), residual)
 

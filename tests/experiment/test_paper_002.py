@@ -128,7 +128,6 @@ def test_every_promise_is_kept_over_all_twins(all_twins):
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(reason="residuals on the ideal plane bias so strong a distortion (README.md of the experiment)")
 @pytest.mark.parametrize("dataset", ["indoor", "uav"])
 def test_the_feature_twins_find_their_truth(all_twins, dataset):
     experiment, run = all_twins

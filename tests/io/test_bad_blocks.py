@@ -117,6 +117,7 @@ CASES = {
     "zero weight": ([(T, "sigma = 2e-5", "sigma = 0.0")], ["block.toml", "unknowns] k1", '"fixed"']),
     "weight without sigma": ([(T, "sigma = 2e-5", "value = 2e-5")], ["block.toml", "unknowns] k1", "sigma"]),
     "sign of brown": ([(T, '"brown"', '"brown"\nsign = "add"')], ["block.toml", "sign", "remove"]),
+    "residuals of nothing": ([(T, '"brown"', '"brown"\nresiduals = "x"')], ["block.toml", "residuals", '"measured"']),
     "sign of smac": ([(T, '"brown"', '"smac"\nsign = "plus"')], ["block.toml", "sign", '"subtract"']),
     "no grid of Ebner": ([(T, '"brown"', '"ebner"')], ["block.toml", "[cameras.kodak.interior] b_mm", "add it"]),
     "grid of Gruen": (

@@ -59,8 +59,11 @@ def test_round_trip(write_folder, tmp_path, changes):
 
 
 def test_round_trip_of_smac_keeps_what_is_static(write_folder, tmp_path):
-    write_block(read_block(write_folder(SMAC, R0)), tmp_path / "copy")
-    distortion = read_block(tmp_path / "copy").start.unknowns.interior["kodak"].distortion
+    measured = ("block.toml", 'distortion = "smac"', 'residuals = "measured"\ndistortion = "smac"')
+    write_block(read_block(write_folder(SMAC, R0, measured)), tmp_path / "copy")
+    interior = read_block(tmp_path / "copy").start.unknowns.interior["kodak"]
+    assert interior.residuals == "measured"
+    distortion = interior.distortion
     assert isinstance(distortion, Smac)
     assert (distortion.sign, float(distortion.r0), float(distortion.p3)) == ("add", 1.5, 1e-7)
 

@@ -1,5 +1,6 @@
 """One [cameras.X] table of block.toml: sensor, starting interior orientation and what of it is free."""
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import jax
@@ -37,7 +38,7 @@ class Camera(NamedTuple):
 
 def read_camera(section: Section) -> Camera:
     """The camera that a [cameras.X] table describes. Raises InputError for what cannot be one."""
-    section.known("width_px", "height_px", "pixel_mm", "distortion", "sign", "interior", "unknowns")
+    section.known("width_px", "height_px", "pixel_mm", "distortion", "sign", "residuals", "interior", "unknowns")
     sensor = Sensor(section.count("width_px"), section.count("height_px"), section.positive("pixel_mm"))
     if not _PIXEL_MM[0] <= sensor.pixel_mm <= _PIXEL_MM[1]:
         raise section.error("pixel_mm", f"a pixel of {sensor.pixel_mm:g} mm cannot be; give its size in millimetres")
@@ -64,6 +65,8 @@ def camera_section(camera: Camera) -> dict[str, Any]:
     }
     if isinstance(distortion, Smac):
         written["sign"] = distortion.sign
+    if interior.residuals != "model":
+        written["residuals"] = interior.residuals
     names = parameter_names(interior)
     constants = {name: getattr(distortion, field) for name, field in constant_names(type(distortion)).items()}
     written["interior"] = {name: float(get_parameter(interior, name)) for name in names}
@@ -85,6 +88,13 @@ def status(prior: Any, start, scale: float = 1.0) -> str | dict[str, Any]:
 
 
 def _empty_interior(section: Section) -> InteriorOrientation:
+    residuals = section.text("residuals", "model")
+    if residuals not in ("model", "measured"):
+        raise section.error("residuals", f'{residuals!r} is neither "model" nor "measured"; choose one of them')
+    return dataclasses.replace(_empty_model(section), residuals=residuals)  # type: ignore[arg-type]
+
+
+def _empty_model(section: Section) -> InteriorOrientation:
     model = section.text("distortion")
     if model not in DISTORTIONS:
         known = ", ".join(DISTORTIONS)

@@ -6,7 +6,7 @@
    measurement and what board and model add to it (`outliers.added_sigma`); centres of circles are corrected for their
    eccentricity; and back to 2, until nothing changes.
 
-Residuals are those of the measured image, whatever the direction of the distortion (`measured_domain`).
+Residuals are those of the measured image, whatever the direction of the distortion.
 """
 
 import dataclasses
@@ -27,7 +27,6 @@ from jaxphoto.procedures.adjust import adjust
 from jaxphoto.procedures.calibration.block import CAMERA, TargetRows, calibration_block
 from jaxphoto.procedures.calibration.board import Board, Detection
 from jaxphoto.procedures.calibration.eccentricity import eccentricities
-from jaxphoto.procedures.calibration.measured_domain import in_measured_image, own_domain
 from jaxphoto.procedures.calibration.outliers import added_sigma, blunders, misfits
 from jaxphoto.procedures.calibration.parameters import distortion_model, free_parameters
 from jaxphoto.procedures.calibration.reprojection import reprojection_residuals, rms_px
@@ -114,15 +113,16 @@ def calibrate(
     interior = nearest_distortion(rough, distortion_model(model, sensor), names, sensor)
     if isinstance(distortion, Smac) and r0_mm:
         interior = rebalance(interior, r0_mm)
+    interior = dataclasses.replace(interior, residuals="measured")
 
     added: float | None = None
     correction, removed = np.zeros_like(rows.xy_mm), []
     for round_ in range(_ROUNDS):
         sigma = np.hypot(rows.sigma_mm, (_FIRST_SIGMA_PX if added is None else added) * sensor.pixel_mm)
         weighed = rows._replace(xy_mm=rows.xy_mm - correction, sigma_mm=sigma)
-        block = calibration_block(board, weighed, sensor, in_measured_image(interior), exterior, names, board_sigma_m)
+        block = calibration_block(board, weighed, sensor, interior, exterior, names, board_sigma_m)
         adjusted = _adjusted(block, max_steps)
-        interior, exterior = own_domain(adjusted.unknowns.interior[CAMERA]), _still(adjusted.unknowns.exterior)
+        interior, exterior = adjusted.unknowns.interior[CAMERA], _still(adjusted.unknowns.exterior)
         residuals = reprojection_residuals(adjusted)
         before, correction = correction, _eccentricities(board, rows, interior, exterior)
         misfit = misfits(residuals, rows.image, len(rows.images))
@@ -143,7 +143,7 @@ def calibrate(
         rows, correction = rows.take(good), correction[good]
         _check_enough(rows, len(detections))
     return Calibration(
-        adjusted=_in_own_domain(adjusted),
+        adjusted=adjusted,
         board=board,
         measured=rows,
         residuals_px=residuals,
@@ -174,14 +174,6 @@ def _adjusted(block: Block, max_steps: int) -> Adjustment:
     first = adjust(block, priors=eqx.tree_at(lambda p: p.interior[CAMERA], block.priors, interior), max_steps=max_steps)
     start = dataclasses.replace(block.start, unknowns=first.unknowns)
     return adjust(dataclasses.replace(block, start=start), max_steps=max_steps)
-
-
-def _in_own_domain(adjusted: Adjustment) -> Adjustment:
-    """The same adjustment, with unknowns and block as one writes them: the camera with its distortion as it is."""
-    interiors = lambda a: [  # noqa: E731
-        tree.interior[CAMERA] for tree in (a.unknowns, a.priors, a.block.priors, a.block.start.unknowns)
-    ]
-    return eqx.tree_at(interiors, adjusted, [own_domain(interior) for interior in interiors(adjusted)])
 
 
 def _still(exterior: ExteriorOrientation) -> ExteriorOrientation:

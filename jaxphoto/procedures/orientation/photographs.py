@@ -182,6 +182,7 @@ def _block_of(title, names, sensor, interior, features, sigmas_mm, found: Tracks
     n, n_points = len(names), int(found.point.max(initial=-1)) + 1
     for name in parameter_names(interior):
         interior = set_parameter(interior, name, np.asarray(get_parameter(interior, name), float))
+    interior = dataclasses.replace(interior, residuals="measured")
     exterior = ExteriorOrientation(np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1)))  # type: ignore[arg-type]
     unknowns = Unknowns({CAMERA: interior}, exterior, np.zeros((n_points, 3)), {}, {})
     priors = default_priors(unknowns)
