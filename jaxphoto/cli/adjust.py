@@ -29,7 +29,7 @@ def adjust_command(
     """Adjust a block and write tables, statistics and a report. Exit code 1: written, but not converged."""
     if rotations not in EOP_NAMES:
         raise JaxphotoError(f"--rotations {rotations}: there are {', '.join(EOP_NAMES)}")
-    check_target(out)
+    check_target(out, block)
     Thread(target=prepare_pictures, daemon=True).start()
     console, errors = Console(), Console(stderr=True)
     began = time.perf_counter()

@@ -24,7 +24,7 @@ def boresight_command(
     max_steps: Annotated[int, typer.Option(min=1, help="Most iterations of each adjustment.")] = jaxphoto.MAX_STEPS,
 ) -> None:
     """Boresight misalignment in four steps. Exit code 1: written, but a step is not passed or not converged."""
-    check_target(out)
+    check_target(out, block)
     console, errors = Console(), Console(stderr=True)
     began = time.perf_counter()
     with errors.status("reading the block") as status:

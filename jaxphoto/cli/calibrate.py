@@ -41,7 +41,7 @@ def calibrate_command(
     """Calibrate a camera with photographs of a board. Exit code 1: written, but not converged."""
     if board_sigma_mm is not None and not board_sigma_mm > 0:
         raise InputError(f"--board-sigma-mm {board_sigma_mm:g} is not positive; leave it out for a board that is exact")
-    check_target(out)
+    check_target(out, *images)
     pattern, taken = read_board(board), photographs(images)
     start = sensor_and_interior(taken, pixel_mm, c_mm)
     wanted = None if free is None else [name.strip() for name in free.split(",") if name.strip()]

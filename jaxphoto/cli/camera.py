@@ -30,6 +30,8 @@ def camera_command(
     ] = None,
 ) -> None:
     """Convert a camera file: exactly where the models allow it, otherwise fitted, the residual stated in pixels."""
+    if out.exists():
+        raise InputError(f"{out} exists already: name a new file")
     if distortion is not None and distortion not in DISTORTIONS:
         raise InputError(f"--distortion {distortion}: there are {', '.join(DISTORTIONS)}")
     if (width_px is None) != (height_px is None):

@@ -171,7 +171,7 @@ def simultaneous_command(
         raise InputError(f"--boresight {boresight} needs --trajectory, which says from where each point was measured")
     turn = _prior("--boresight", boresight or ("fixed" if trajectory is None else "free"), np.pi / 180)
     slide, chosen, errors = _prior("--shift", shift, 1.0), class_numbers(classes), Console(stderr=True)
-    check_target(out)
+    check_target(out, block, cloud)
     began = time.perf_counter()
     with errors.status("reading the block") as status:
         read = read_block(block)

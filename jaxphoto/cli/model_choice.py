@@ -27,7 +27,7 @@ def models_command(
     seed: Annotated[int, typer.Option(min=0, help="Of the draw of what is left out.")] = 0,
 ) -> None:
     """Compare distortion models by cross-validation, information criteria and significance."""
-    check_target(out)
+    check_target(out, block)
     console, errors = Console(), Console(stderr=True)
     began = time.perf_counter()
     with errors.status("reading the block") as status:

@@ -36,7 +36,7 @@ def orient_command(
 
     Given a block folder, find the approximate orientation that its images.csv lacks.
     """
-    _check_out(out)
+    _check_out(out, images)
     console, errors = Console(), Console(stderr=True)
     if len(images) == 1 and (images[0] / TOML).is_file():
         with errors.status("reading the block") as status:
@@ -85,8 +85,10 @@ def orient_command(
     console.print(f"wrote {out}: adjust it with jaxphoto adjust {out} --out DIR", highlight=False, soft_wrap=True)
 
 
-def _check_out(out: Path) -> None:
+def _check_out(out: Path, images: list[Path]) -> None:
     """Raise InputError where no block can be written: before minutes are spent."""
+    if out.resolve() in [image.resolve() for image in images]:
+        raise InputError(f"--out {out} is the input itself, which would be lost: name another folder")
     if out.is_file():
         raise InputError(f"{out} is a file; give the name of a folder")
     if out.is_dir() and any(out.iterdir()) and not (out / TOML).is_file():

@@ -32,7 +32,7 @@ def sensitivity_command(
     """Exact sensitivity of the interior orientation and the check points to stations, and to undetected errors."""
     if bias_m == 0 or not np.isfinite(bias_m):
         raise InputError(f"--bias-m {bias_m:g} is no bias: give its size in metres")
-    check_target(out)
+    check_target(out, block)
     console, errors = Console(), Console(stderr=True)
     began = time.perf_counter()
     with errors.status("reading the block") as status:

@@ -44,7 +44,7 @@ def stability_command(
         raise InputError(f"--relief {relief:g}: give a part of the object's distance, from 0 to less than 1")
     columns, rows = _grid(grid)
     if out is not None:
-        check_target(out)
+        check_target(out, first, second)
     both = [read_camera_file(path, camera=camera, pixel_mm=pixel_mm, block=block) for path in (first, second)]
     a, b = both
     _check_one_sensor(a, b, first, second)

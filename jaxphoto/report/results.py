@@ -29,8 +29,16 @@ _MAP_TABLES = ("exterior_map", "object_points_map")
 _PACKAGES = ("jaxphoto", "jax", "optimistix", "equinox", "lineax", "numpy", "pandas")
 
 
-def check_target(directory: Path) -> None:
-    """Raise InputError where results must not or cannot be written: a file, below a file, among something else."""
+def check_target(directory: Path, *inputs: Path) -> None:
+    """Raise InputError where results must not or cannot be written: a file, below a file, among something else.
+
+    Nor in place of one of the `inputs`, or of a folder that holds it: they would be gone.
+    """
+    for given in inputs:
+        if directory.resolve() in (given.resolve(), *given.resolve().parents):
+            raise InputError(
+                f"--out {directory} is or holds the input {given}, which would be lost: name another folder"
+            )
     for path in (directory, *directory.parents):
         if path.is_file():
             raise InputError(f"{path} is a file: name a folder for the results")
@@ -110,7 +118,9 @@ def _cameras(adjusted: Adjustment) -> dict:
             "width_px": sensor.width_px,
             "height_px": sensor.height_px,
             "pixel_mm": sensor.pixel_mm,
-            "distortion": next(key for key, kind in DISTORTIONS.items() if kind is type(distortion)),
+            "distortion": next(
+                (key for key, kind in DISTORTIONS.items() if kind is type(distortion)), type(distortion).__name__
+            ),
         }
         if isinstance(distortion, Smac):
             told[name]["sign"] = distortion.sign

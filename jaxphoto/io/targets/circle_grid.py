@@ -19,6 +19,8 @@ class CircleGrid(Pattern):
     """
 
     def __init__(self, columns: int, rows: int, spacing_m: float, diameter_m: float) -> None:
+        if rows < 3:
+            raise ValueError("an asymmetric grid has 3 rows at least")
         if diameter_m >= np.sqrt(2) * spacing_m:
             raise ValueError("circles so large touch each other: the diameter is less than 1.41 times the spacing")
         self.columns, self.rows, self.radius_m = columns, rows, diameter_m / 2

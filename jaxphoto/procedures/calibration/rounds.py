@@ -20,7 +20,7 @@ from jaxtyping import Float
 
 from jaxphoto.adjustment import MAX_STEPS, Adjustment
 from jaxphoto.block import Block
-from jaxphoto.camera import InteriorOrientation, Sensor, Smac, rebalance, set_parameter
+from jaxphoto.camera import InteriorOrientation, Sensor, Smac, get_parameter, rebalance, set_parameter
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import InputError
 from jaxphoto.procedures.adjust import adjust
@@ -103,13 +103,18 @@ def calibrate(
     distortion = distortion_model(model, sensor, r0_mm)
     names = free_parameters(model, distortion, free)
     left_out = {d.image: f"{len(d.point)} targets found" for d in detections if len(d.point) < _LEAST_POINTS}
-    rows = TargetRows.of([d for d in detections if d.image not in left_out], sensor)
-    _check_enough(rows, len(detections))
+    used = [d for d in detections if d.image not in left_out]
+    _check_enough(len(used), len(detections))
+    rows = TargetRows.of(used, sensor)
     rough = rough_interior(board, rows, sensor, start)
+    if start is not None:
+        # What is not estimated stays what was given.
+        for name in {"c_mm", "xp_mm", "yp_mm"}.difference(names):
+            rough = set_parameter(rough, name, float(get_parameter(start, name)))
     exterior, why = resected(board, rows, rough)
     left_out |= why
     rows = rows.take(np.array([rows.images[k] not in why for k in rows.image], bool))
-    _check_enough(rows, len(detections))
+    _check_enough(len(rows.images), len(detections))
     interior = nearest_distortion(rough, distortion_model(model, sensor), names, sensor)
     if isinstance(distortion, Smac) and r0_mm:
         interior = rebalance(interior, r0_mm)
@@ -141,7 +146,7 @@ def calibrate(
         stay = np.unique(rows.image[good])
         exterior = jax.tree.map(lambda v: v[stay], exterior)  # noqa: B023
         rows, correction = rows.take(good), correction[good]
-        _check_enough(rows, len(detections))
+        _check_enough(len(rows.images), len(detections))
     return Calibration(
         adjusted=adjusted,
         board=board,
@@ -154,10 +159,10 @@ def calibrate(
     )
 
 
-def _check_enough(rows: TargetRows, given: int) -> None:
-    if len(rows.images) < LEAST_IMAGES:
+def _check_enough(images: int, given: int) -> None:
+    if images < LEAST_IMAGES:
         raise InputError(
-            f"{len(rows.images)} of {given} photographs show enough of the board, and a calibration needs "
+            f"{images} of {given} photographs show enough of the board, and a calibration needs "
             f"{LEAST_IMAGES}: take more of them, with the board tilted and turned"
         )
 

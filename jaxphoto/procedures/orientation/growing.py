@@ -73,8 +73,8 @@ def grown(
     Raises BlockError where no two images begin it.
     """
     best: Grown | None = None
-    for start in _starts(pairs):
-        found = _grow(_Growth(block, pairs, calibration, least, most, report), start)
+    for pair, third in _starts(pairs):
+        found = _grow(_Growth(block, pairs, calibration, least, most, report), pair, third)
         if best is None or len(found.order) > len(best.order):
             best = found
         if len(best.order) >= _ENOUGH * len(block.images):
@@ -87,8 +87,11 @@ def grown(
     return best
 
 
-def _starts(pairs: Sequence[Pair]) -> Iterator[tuple[int, ...]]:
-    """Images to begin with: the best triplet, its pair with the widest rays first; then the best pairs."""
+def _starts(pairs: Sequence[Pair]) -> Iterator[tuple[Pair, tuple[int, ...]]]:
+    """The pair to begin with and an image to go on with: the best triplet, its pair with the widest rays first.
+
+    Of two orientations that a pair may have, each is a start of its own.
+    """
     left = list(pairs)
     for _ in range(_STARTS):
         if not left:
@@ -96,8 +99,8 @@ def _starts(pairs: Sequence[Pair]) -> Iterator[tuple[int, ...]]:
         triplet = best_triplet(left)
         among = [p for p in left if triplet is None or {p.first, p.second} <= set(triplet)]
         pair = max(among, key=_worth)
-        yield (pair.first, pair.second, *(k for k in triplet or () if k not in (pair.first, pair.second)))
-        left.remove(pair)
+        yield pair, tuple(k for k in triplet or () if k not in (pair.first, pair.second))
+        left = [other for other in left if other is not pair]
 
 
 def _worth(pair: Pair) -> float:
@@ -167,14 +170,13 @@ class _Growth:
         return rows[self.network.met(self.sight)[self.sight.point[rows]]]
 
 
-def _grow(growth: "_Growth", start: tuple[int, ...]) -> Grown:
-    first, second = start[:2]
-    pair = next(p for p in growth.pairs if {p.first, p.second} == {first, second})
+def _grow(growth: "_Growth", pair: Pair, third: tuple[int, ...]) -> Grown:
+    first, second = pair.first, pair.second
     _, matrix, base = pair.of(first)
     growth.add(first, np.zeros(3), np.eye(3))
     if not growth.add(second, base, matrix):
         return Grown(growth.network, (), {}, growth.angle)
-    for image in start[2:]:
+    for image in third:
         _orient_next(growth, [image])
     n = len(growth.block.images)
     while len(growth.order) < n:
