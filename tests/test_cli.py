@@ -10,7 +10,9 @@ import pandas as pd
 import pytest
 
 import jaxphoto
+from jaxphoto.errors import InputError
 from jaxphoto.io import write_block
+from jaxphoto.report import check_target
 from tests.blocks import simulated
 from tests.commands import run
 
@@ -203,3 +205,13 @@ def _replace(path, old: str, new: str) -> None:
     text = path.read_text()
     assert old in text
     path.write_text(text.replace(old, new))
+
+
+def test_results_never_take_the_place_of_what_they_are_made_of(tmp_path):
+    results = tmp_path / "results"
+    (results / "block").mkdir(parents=True)
+    (results / "summary.json").write_text("{}")
+    for given in (results, results / "block", results / "interior.csv"):
+        with pytest.raises(InputError, match="would be lost"):
+            check_target(results, tmp_path / "another", given)
+    check_target(results, tmp_path / "block")

@@ -438,12 +438,13 @@ def test_command_converts_and_says_how_well(tmp_path, monkeypatch, capsys):
     assert "the conversion is exact" in said
     both = [read_camera_file(tmp_path / name, pixel_mm=0.0048) for name in ("calib.yml", "lens.xml")]
     np.testing.assert_allclose(*map(columns_rows, both), rtol=0, atol=1e-9)
-    for more, message in (
-        (["--width-px", "100"], "--width-px and --height-px belong together"),
-        (["--distortion", "none"], "--distortion none: there are brown"),
-        (["--format", "none"], "name one of opencv"),
+    for out, more, message in (
+        ("lens.xml", [], "exists already"),
+        ("new.xml", ["--width-px", "100"], "--width-px and --height-px belong together"),
+        ("new.xml", ["--distortion", "none"], "--distortion none: there are brown"),
+        ("new.xml", ["--format", "none"], "name one of opencv"),
     ):
-        monkeypatch.setattr("sys.argv", ["jaxphoto", *arguments, *more])
+        monkeypatch.setattr("sys.argv", ["jaxphoto", *arguments[:2], str(tmp_path / out), *arguments[3:], *more])
         with pytest.raises(SystemExit) as stopped:
             main()
         assert stopped.value.code == 2

@@ -113,6 +113,7 @@ def test_an_arrangement_that_turns_into_itself_is_refused(tmp_path):
         ("chessboard:8x6:square_mm=nan", ["square_mm is 'nan'"]),
         ("chessboard:8x6:size=3", ["'size=3'", "square_mm=..."]),
         ("circles:4x11:spacing_mm=20:diameter_mm=40", ["touch"]),
+        ("circles:4x2:spacing_mm=20:diameter_mm=15", ["3 rows"]),
         ("charuco:7x5:square_mm=30:marker_mm=40:dictionary=4X4_50", ["not smaller"]),
         ("charuco:7x5:square_mm=30:marker_mm=20:dictionary=9X9", ["9X9", "4X4_50"]),
         ("aruco:9x9:marker_mm=30:gap_mm=5:dictionary=4X4_50", ["81 markers"]),

@@ -120,6 +120,15 @@ def test_any_balance_radius_gives_the_same_bundle(simulated):
     assert balanced.rms_px == pytest.approx(again.rms_px, rel=1e-9)
 
 
+def test_too_few_targets_in_every_photograph_are_said():
+    few = [
+        d._replace(point=d.point[:5], column_row=d.column_row[:5], sigma_px=d.sigma_px[:5])
+        for d in seen(flat_board(), views(flat_board(), 3), 0.0)
+    ]
+    with pytest.raises(InputError, match="0 of 3 photographs show enough of the board"):
+        calibrate(flat_board(), few, SENSOR)
+
+
 def test_start_needs_nothing_but_tilted_views():
     board = flat_board()
     pairs = [(board.xyz_m[d.point, :2], SENSOR.mm_from_px(d.column_row)) for d in seen(board, views(board, 6), 0.2)]
