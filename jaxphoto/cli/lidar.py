@@ -17,7 +17,7 @@ from jaxphoto.cloud import Cloud
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import Scanner
 from jaxphoto.io import clouds, read_block, write_block
-from jaxphoto.io.block_folder.layout import TOML
+from jaxphoto.io.block_folder import check_block_target
 from jaxphoto.io.tables import is_number
 from jaxphoto.io.trajectory import read_records, write_flight_csv
 from jaxphoto.io.trajectory.in_frame import trajectory_in, with_positions
@@ -71,7 +71,7 @@ def lidar_control_command(
         raise InputError(f"--method {method} is no method: choose one of {', '.join(METHODS)}")
     settings = _settings(sigma_z_m, sigma_xy_m, sigma_systematic_m)
     chosen, errors = class_numbers(classes), Console(stderr=True)
-    _check_out(block, out)
+    check_block_target(out, block)
     with errors.status("reading the block") as status:
         read = read_block(block)
         status.update("reading the cloud")
@@ -115,7 +115,7 @@ def roof_control_command(
 ) -> None:
     """Hold tie points on the planes of roof faces, and centroids of roofs in X, Y and Z; write the block with it."""
     settings, chosen, errors = _settings(sigma_z_m, sigma_xy_m, 0.0), class_numbers(classes), Console(stderr=True)
-    _check_out(block, out)
+    check_block_target(out, block)
     with errors.status("reading the block") as status:
         read = read_block(block)
         status.update("reading the cloud")
@@ -215,14 +215,6 @@ def simultaneous_command(
     console.print(f"results in {out}", highlight=False)
     if not result.still:
         raise typer.Exit(1)
-
-
-def _check_out(block: Path, out: Path) -> None:
-    """Raise InputError where a block must not be written."""
-    if out.resolve() == block.resolve():
-        raise InputError(f"--out {out} is the block itself: name another folder, or the block would lose what it was")
-    if out.is_dir() and any(out.iterdir()) and not (out / TOML).is_file():
-        raise InputError(f"{out} is not empty and holds no block: name a new folder")
 
 
 def _settings(sigma_z_m: float, sigma_xy_m: float, sigma_systematic_m: float) -> HeightSettings:

@@ -11,6 +11,7 @@ from jaxphoto.camera import DISTORTIONS, AbstractDistortion, InteriorOrientation
 from jaxphoto.cli.app import app
 from jaxphoto.errors import InputError
 from jaxphoto.io import read_block, write_block
+from jaxphoto.io.block_folder import check_block_target
 from jaxphoto.io.block_folder.layout import TOML
 from jaxphoto.io.matching import match_photographs
 from jaxphoto.io.pairs import photograph_pairs
@@ -36,7 +37,7 @@ def orient_command(
 
     Given a block folder, find the approximate orientation that its images.csv lacks.
     """
-    _check_out(out, images)
+    check_block_target(out, *images)
     console, errors = Console(), Console(stderr=True)
     if len(images) == 1 and (images[0] / TOML).is_file():
         with errors.status("reading the block") as status:
@@ -83,16 +84,6 @@ def orient_command(
     )
     print_orientation(found.report, console)
     console.print(f"wrote {out}: adjust it with jaxphoto adjust {out} --out DIR", highlight=False, soft_wrap=True)
-
-
-def _check_out(out: Path, images: list[Path]) -> None:
-    """Raise InputError where no block can be written: before minutes are spent."""
-    if out.resolve() in [image.resolve() for image in images]:
-        raise InputError(f"--out {out} is the input itself, which would be lost: name another folder")
-    if out.is_file():
-        raise InputError(f"{out} is a file; give the name of a folder")
-    if out.is_dir() and any(out.iterdir()) and not (out / TOML).is_file():
-        raise InputError(f"{out} is not empty and holds no block; empty it or give another folder")
 
 
 def _distortion(model: str, r0_mm: float) -> AbstractDistortion:

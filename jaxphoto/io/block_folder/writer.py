@@ -33,6 +33,16 @@ from jaxphoto.io.block_folder.surfaces import scanner_section, surface_table
 from jaxphoto.unknowns import FIXED, FREE
 
 
+def check_block_target(folder: Path, *inputs: Path) -> None:
+    """Raise InputError where no block can be written: a file, among something else, in place of one of the `inputs`."""
+    if folder.resolve() in [given.resolve() for given in inputs]:
+        raise InputError(f"--out {folder} is the input itself, which would be lost: name another folder")
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder} is a file; give the name of a folder")
+    if folder.is_dir() and any(folder.iterdir()) and not (folder / TOML).is_file():
+        raise InputError(f"{folder} is not empty and holds no block; empty it or give another folder")
+
+
 def write_block(block: Block, folder: str | Path) -> None:
     """Write `block` as a folder that `read_block` reads as the same block; numbers come back exactly.
 
@@ -43,10 +53,7 @@ def write_block(block: Block, folder: str | Path) -> None:
     Raises InputError where `folder` holds anything else, BlockError for priors that block.toml cannot express.
     """
     folder = Path(folder).absolute()
-    if folder.exists() and not folder.is_dir():
-        raise InputError(f"{folder} is a file; give the name of a folder")
-    if folder.is_dir() and any(folder.iterdir()) and not (folder / TOML).is_file():
-        raise InputError(f"{folder} is not empty and holds no block; empty it or give another folder")
+    check_block_target(folder)
     settings, tables = _settings(block), _tables(block)
     if block.frame.kind == "epsg":
         tables = tables_to_map(tables, block.frame)

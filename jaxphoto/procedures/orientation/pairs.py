@@ -33,8 +33,6 @@ class Pair(NamedTuple):
     """Matches that agree."""
     angle: float
     """Median angle (rad) at which their rays meet."""
-    ambiguous: bool = False
-    """Whether another orientation fits as well."""
 
     def of(self, image: int) -> tuple[int, Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
         """The other image, what takes `image`'s camera frame to the other's, and the direction to it in the former."""
@@ -91,7 +89,7 @@ def relate(
         for r in found:
             n = int(r.agrees.sum())
             ends = (match.first, match.second)
-            pairs.append(Pair(*ends, r.camera_2_from_camera_1, r.base, n, r.parallactic_angle, len(found) > 1))
+            pairs.append(Pair(*ends, r.camera_2_from_camera_1, r.base, n, r.parallactic_angle))
     return Related(tuple(pairs), tuple(kept), off, weak, refused)
 
 
