@@ -51,6 +51,7 @@ def commands(arguments) -> list[list[str]]:
         ["growth.py", *growth],
         ["compilations.py", "--blocks", blocks],
         ["monte_carlo.py", *draws],
+        ["twins.py", "--twins", *(["target"] if arguments.quick else ["target", "indoor", "uav"])],
         ["lidar.py", *(["--points", "1000000"] if arguments.quick else [])],
         ["accelerator.py", *device, *data],
     ]

@@ -1,6 +1,7 @@
 """`jaxphoto calibrate`: rendered photographs in, a folder of results out; bad input in one sentence."""
 
 import json
+import shutil
 
 import cv2
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 
 import jaxphoto
 from jaxphoto.io.targets import read_board, rendered
+from jaxphoto.procedures.calibration import rounds
 from tests.commands import run
 from tests.io.test_targets import LENS, SENSOR, view
 
@@ -44,12 +46,50 @@ def test_calibrates_and_writes_everything(folder, monkeypatch, capsys, tmp_path)
     photographs = pd.read_csv(out / "photographs.csv")
     assert len(photographs) == IMAGES + 1
     assert photographs["used"].sum() == IMAGES
-    assert {path.name for path in (out / "photographs").iterdir()} == {f"p{k}.png" for k in range(IMAGES)}
+    pictures = {path.name for path in (out / "photographs").iterdir()}
+    assert pictures == {"wall.png"} | {f"p{k}.png" for k in range(IMAGES)}
+    assert "photographs/wall.png" in (out / "photographs.html").read_text()
+    assert summary["settled"] is True
+    assert "pixel size as given" in summary["start"]
+    assert not any("pixel size" in warning for warning in summary["warnings"])
     assert "photographs/p0.png" in (out / "photographs.html").read_text()
     assert (out / "report.html").is_file()
     block = jaxphoto.read_block(out / "block")
     assert block.images == tuple(f"p{k}" for k in range(IMAGES))
     assert float(block.start.unknowns.interior["camera"].distortion.r0) == 0.0
+
+
+def test_two_calibrations_are_compared(folder, monkeypatch, capsys, tmp_path):
+    """The same photographs under names with brackets and dollars, with another R0, and no size of a pixel given."""
+    named = [tmp_path / f"[x]{k}$a$ #1 [bold].png" for k in range(IMAGES)]
+    for k, path in enumerate(named):
+        shutil.copy(folder / f"p{k}.png", path)
+    shutil.copy(folder / "wall.png", tmp_path / "[red]wall.png")
+    outs = tmp_path / "[a]", tmp_path / "b"
+    for out, r0 in zip(outs, (0, 2), strict=True):
+        arguments = (*named, tmp_path / "[red]wall.png", "--board", BOARD, "--r0-mm", r0, "--out", out)
+        code, screen, error = run(monkeypatch, capsys, "calibrate", *arguments)
+        assert code == 0, error
+        assert "[red]wall" in screen
+    summary = json.loads((outs[0] / "summary.json").read_text())
+    assert "pixel size nominal" in summary["start"]
+    assert "pixel size nominal" in (outs[0] / "report.html").read_text()
+    assert "%5Bx%5D0" in (outs[0] / "photographs.html").read_text()
+    code, screen, error = run(monkeypatch, capsys, "stability", *outs, "--out", tmp_path / "stability")
+    assert code == 0, error
+    rows = pd.read_csv(tmp_path / "stability" / "stability.csv").set_index("method")
+    assert (rows["rmse_offset_mm"] < 1e-8).all()
+    assert (rows["p_value"] > 0.99).all()
+
+
+def test_rounds_that_do_not_settle_end_with_exit_code_1(folder, monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr(rounds, "_ROUNDS", 1)
+    arguments = (*sorted(folder.glob("p*.png")), "--board", BOARD, "--out", tmp_path / "out", "--pixel-mm", 0.008)
+    code, screen, _ = run(monkeypatch, capsys, "calibrate", *arguments)
+    assert code == 1
+    assert "did not come to rest" in " ".join(screen.split())
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["settled"] is False
+    assert "did not come to rest" in (tmp_path / "out" / "report.html").read_text()
 
 
 @pytest.mark.parametrize(

@@ -13,10 +13,13 @@ import pytest
 import jaxphoto
 from jaxphoto.camera.distortion import DISTORTIONS
 from jaxphoto.io.block_folder.settings import read_settings
+from tests.marks import slow_but
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "examples"
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), *EXAMPLES.glob("*.md")])
+# Whole procedures on blocks of their own size, for each of which there are tests.
+LONG = ("boresight", "correlation_studies", "experiments", "monte_carlo", "network_design", "sensitivity")
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +79,9 @@ def _python(page: Path) -> list[str]:
     return re.findall(r"^```python\n(.*?)^```", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
 
 
-@pytest.mark.parametrize("page", [p for p in PAGES if _python(p)], ids=lambda p: p.name)
+@pytest.mark.parametrize(
+    "page", slow_but(lambda p: p.stem not in LONG, [p for p in PAGES if _python(p)]), ids=lambda p: p.name
+)
 def test_python_on_pages_runs(page: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
     names: dict[str, object] = {}

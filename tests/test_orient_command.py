@@ -11,6 +11,7 @@ from jaxphoto.cli import orient as command
 from jaxphoto.io import read_block
 from jaxphoto.io.matching import MatchedPhotographs
 from jaxphoto.io.photographs import CameraStart
+from jaxphoto.procedures.orientation import finish, photographs
 from tests.commands import run
 from tests.procedures.orientable import PIXEL, SENSOR, convergent, photographed
 
@@ -24,7 +25,7 @@ def taken(tmp_path, monkeypatch):
         Image.new("L", (SENSOR.width_px, SENSOR.height_px)).save(path)
     sigmas = [np.full(len(xy), 0.3 * PIXEL) for xy in scene.features]
     counts = np.array([(m.first, m.second, len(m.features) + 2, len(m.features)) for m in scene.matches])
-    matched = MatchedPhotographs(scene.features, sigmas, 1.0, scene.matches, counts)
+    matched = MatchedPhotographs(scene.features, sigmas, 1.0, scene.matches, counts, {})
     monkeypatch.setattr(command, "match_photographs", lambda *arguments, **options: matched)
     start = CameraStart(SENSOR, InteriorOrientation(8.6), "c as given.")
     monkeypatch.setattr(command, "sensor_and_interior", lambda *arguments: start)
@@ -44,14 +45,21 @@ def test_photographs_become_a_block(taken, tmp_path, monkeypatch, capsys):
     summary = json.loads((out / "orientation.json").read_text())
     assert summary["n_images"] == len(summary["order"]) == 7
     assert summary["gross_errors"]["off_epipolar"] > 100
+    assert summary["settled"] and summary["converged"]
+    # Simulated rays err independently.
+    assert 1 <= summary["alike"] < 1.2
+    assert summary["matching"] == {"n_gross": 2 * summary["n_pairs"], "sigma_factor": 1.0}
     assert {p.name for p in out.glob("*.png")} == {"orientation_network.png", "orientation_residuals.png"}
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--model", "pinhole"], "--model pinhole: there are brown"),
-        (["--model", "ebner"], "has constants of its own"),
+        (["--model", "pinhole"], "no distortion model is called 'pinhole'; choose one of brown"),
+        (["--model", "brown", "--r0-mm", "3"], "R0 belongs to the model smac"),
+        (["--r0-mm", "nan"], "R0 belongs to the model smac"),
+        (["--model", "smac", "--r0-mm", "-1"], "R0 = -1 mm does not lie on an image"),
+        (["--model", "smac", "--r0-mm", "nan"], "R0 = nan mm does not lie on an image"),
         (["--pairs", "nearest"], "the choice of pairs is 'nearest'"),
     ],
 )
@@ -68,6 +76,56 @@ def test_a_folder_with_something_else_is_left_alone(taken, tmp_path, monkeypatch
     code, _, wrong = run(monkeypatch, capsys, "orient", *taken, "--out", tmp_path / "full")
     assert code == 2
     assert "is not empty and holds no block" in wrong
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        (["--c-mm", "8"], "--c-mm"),
+        (["--pixel-mm", "0.005", "--pairs", "exhaustive"], "--pairs, --pixel-mm"),
+        (["--model", "brown", "--r0-mm", "0"], "--model, --r0-mm"),
+    ],
+)
+def test_options_for_photographs_mean_nothing_for_a_block(options, named, tmp_path, monkeypatch, capsys):
+    code, _, wrong = run(monkeypatch, capsys, "orient", "examples/cross_block", "--out", tmp_path / "block", *options)
+    assert code == 2
+    assert f"leave out {named}, or change block.toml" in wrong
+    assert wrong.count("\n") == 1
+
+
+def test_rounds_that_do_not_settle_are_said(taken, tmp_path, monkeypatch, capsys):
+    # Not even a round that changes nothing ends them.
+    monkeypatch.setattr(finish, "_STILL", -1.0)
+    monkeypatch.setattr(finish, "_FEW", -1)
+    monkeypatch.setattr(photographs, "LAST_ROUNDS", 2)
+    out = tmp_path / "block"
+    code, said, wrong = run(monkeypatch, capsys, "orient", *taken, "--out", out)
+    assert code == 1, wrong
+    assert "warning: after" in said and "still went and came back" in said
+    summary = json.loads((out / "orientation.json").read_text())
+    assert not summary["settled"] and not summary["converged"]
+    assert read_block(out).images
+
+
+def test_photographs_that_show_nothing_are_named(taken, tmp_path, monkeypatch, capsys):
+    """One that is blank is left out with its reason; its name is printed as it is, brackets and all."""
+    blank = tmp_path / "wall[red].png"
+    Image.new("L", (SENSOR.width_px, SENSOR.height_px)).save(blank)
+    matched = command.match_photographs()
+    more = matched._replace(
+        xy_mm=[*matched.xy_mm, np.zeros((0, 2))],
+        sigma_mm=[*matched.sigma_mm, np.zeros(0)],
+        left_out={"wall[red]": "it shows no features: it is blank or out of focus"},
+    )
+    monkeypatch.setattr(command, "match_photographs", lambda *arguments, **options: more)
+    out = tmp_path / "block[1]"
+    code, said, wrong = run(monkeypatch, capsys, "orient", *taken, blank, "--out", out)
+    assert code == 0, wrong
+    assert "7 of 8 images oriented" in said
+    assert "image wall[red] is not oriented: it shows no features: it is blank or out of focus" in said
+    assert f"wrote {out}" in said
+    summary = json.loads((out / "orientation.json").read_text())
+    assert list(summary["unoriented"]) == ["wall[red]"]
 
 
 def test_a_block_that_has_a_beginning_is_handed_back(tmp_path, monkeypatch, capsys):

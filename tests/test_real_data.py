@@ -97,6 +97,7 @@ def test_sxb_control_and_check_points(sxb):
         assert abs(-value - report.check_difference[adjusted.block.points[who]][axis]) <= 0.5e-3 + 1e-9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("stations", "file", "sigma0", "redundancy"),
     [
@@ -257,6 +258,7 @@ def check_aicon_correlations(adjusted, cov, report, tolerance, but=frozenset()):
     assert {image for image, too_much in zip(c.images, off, strict=True) if too_much} == but
 
 
+@pytest.mark.slow
 def test_aicon(aicon, aicon_report):
     adjusted, cov = aicon
     check_aicon_summary(adjusted, aicon_report)
@@ -269,6 +271,7 @@ def test_aicon(aicon, aicon_report):
     check_aicon_correlations(adjusted, cov, aicon_report, 2e-3, but={"48", "54"})
 
 
+@pytest.mark.slow
 def test_aicon_with_its_own_weights(aicon_weights, aicon_report):
     """Interior and exterior orientation: every printed digit of values, standard deviations and correlations."""
     adjusted, cov = aicon_weights
@@ -288,6 +291,7 @@ def test_aicon_with_its_own_weights(aicon_weights, aicon_report):
     np.testing.assert_allclose(2 * sigma[:, 3:], [p[1] for p in order], atol=0.51e-6)
 
 
+@pytest.mark.slow
 def test_aicon_object_points(aicon_weights, aicon_report):
     """Coordinates and standard deviations under inner constraints, as printed (1e-4 mm)."""
     adjusted, cov = aicon_weights
@@ -301,6 +305,7 @@ def test_aicon_object_points(aicon_weights, aicon_report):
     np.testing.assert_allclose(1000 * np.asarray(adjusted.unknowns.points)[which], values[:, :3], atol=0.6e-4)
 
 
+@pytest.mark.slow
 def test_aicon_residuals_redundancy_numbers_and_tests(aicon_weights, aicon_report):
     """Of all 9,972 image points, as printed (1e-6 mm, 2 digits, 2 digits)."""
     adjusted, cov = aicon_weights

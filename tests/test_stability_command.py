@@ -6,7 +6,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from jaxphoto.cli import stability  # noqa: F401  (registers the command)
+from jaxphoto.camera import InteriorOrientation, Sensor, Smac
+from jaxphoto.io.cameras import write_camera_file
 from tests.commands import run
 
 TARGET_1 = {"c_mm": 2.6989, "xp_mm": -7.3634e-02, "yp_mm": 8.7821e-02, "k1": -3.9445e-02, "k2": -1.1881e-03}
@@ -14,25 +15,29 @@ TARGET_1 |= {"k3": -1.3126e-04}
 TARGET_2 = {"c_mm": 2.6987, "xp_mm": -7.7553e-02, "yp_mm": 8.4873e-02, "k1": -3.9280e-02, "k2": -1.2408e-03}
 TARGET_2 |= {"k3": -1.2604e-04}
 SIGMAS = {"c_mm": 2.2e-3, "xp_mm": 1.4e-3, "yp_mm": 1.4e-3, "k1": 3.1e-4, "k2": 9.5e-5, "k3": 9.4e-6}
-SMAC = ("c_mm", "xp_mm", "yp_mm", "k0", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4", "r0_mm")
+PARAMETERS = ("c_mm", "xp_mm", "yp_mm", "k0", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4", "r0_mm")
 SENSOR = {"width_px": 3000, "height_px": 2250, "pixel_mm": 0.00155}
+
+
+def written_set(folder, camera, values):
+    """Results with a covariance, of a camera with SMAC."""
+    folder.mkdir()
+    rows = [(camera, p, values.get(p, 0.0), SIGMAS.get(p, np.nan), True) for p in PARAMETERS]
+    columns = ["camera", "parameter", "value", "sigma", "significant"]
+    pd.DataFrame(rows, columns=columns).to_csv(folder / "interior.csv", index=False)
+    free = list(SIGMAS)
+    rho = [(f"interior[{camera}].{a}", f"interior[{camera}].{b}", 0.0) for a in free for b in free if a != b]
+    pd.DataFrame(rho, columns=["parameter_a", "parameter_b", "rho"]).to_csv(folder / "correlation.csv", index=False)
+    told = {"distortion": "smac", "sign": "subtract", **SENSOR}
+    (folder / "summary.json").write_text(json.dumps({"cameras": {camera: told}}))
+    return folder
 
 
 @pytest.fixture
 def sets(tmp_path):
     """Two folders of results with covariances, and the first set as a block.toml without."""
     for name, values in (("one", TARGET_1), ("two", TARGET_2)):
-        folder = tmp_path / name
-        folder.mkdir()
-        rows = [("gopro", p, values.get(p, 0.0), SIGMAS.get(p, np.nan), True) for p in SMAC]
-        pd.DataFrame(rows, columns=["camera", "parameter", "value", "sigma", "significant"]).to_csv(
-            folder / "interior.csv", index=False
-        )
-        free = list(SIGMAS)
-        rho = [(f"interior[gopro].{a}", f"interior[gopro].{b}", 0.0) for a in free for b in free if a != b]
-        pd.DataFrame(rho, columns=["parameter_a", "parameter_b", "rho"]).to_csv(folder / "correlation.csv", index=False)
-        told = {"distortion": "smac", "sign": "subtract", **SENSOR}
-        (folder / "summary.json").write_text(json.dumps({"cameras": {"gopro": told}}))
+        written_set(tmp_path / name, "gopro", values)
     lines = [f"{k} = {v}" for k, v in SENSOR.items()]
     values = [f"{k} = {v!r}" for k, v in TARGET_1.items()]
     bare = tmp_path / "bare.toml"
@@ -100,3 +105,49 @@ def test_cameras_of_different_sensors_are_refused(sets, monkeypatch, capsys):
     code, _, error = run(monkeypatch, capsys, "stability", sets / "one", other)
     assert code == 2
     assert "give the true one by --pixel-mm" in error
+
+
+@pytest.fixture(scope="module")
+def kinds(tmp_path_factory):
+    """One camera without distortion, which every model holds exactly, in every kind of file."""
+    folder = tmp_path_factory.mktemp("kinds")
+    sensor = Sensor(**SENSOR)
+    interior = InteriorOrientation(2.7, -0.07, 0.08, Smac())
+    files = {"opencv": "a.yml", "colmap": "cameras.txt", "agisoft": "a.xml", "smac": "a.txt", "block": "block.toml"}
+    found = {}
+    for kind, name in files.items():
+        (folder / kind).mkdir()
+        found[kind] = folder / kind / name
+        write_camera_file(found[kind], sensor, interior, kind, name="1")
+    results = written_set(folder / "results", "1", {"c_mm": 2.7, "xp_mm": -0.07, "yp_mm": 0.08})
+    found |= {"model folder": folder / "colmap", "block folder": folder / "block"}
+    return found | {"results": results, "interior.csv": results / "interior.csv"}
+
+
+# Every kind on one side, with as few pairs of models as that needs: each pair is compiled.
+PAIRS = (
+    ("results", "results"), ("results", "interior.csv"), ("block", "results"), ("results", "block folder"),
+    ("opencv", "results"), ("colmap", "interior.csv"), ("model folder", "block"), ("agisoft", "results"),
+    ("smac", "results"),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(("first", "second"), PAIRS)
+def test_every_kind_of_file_is_compared(kinds, monkeypatch, capsys, first, second):
+    monkeypatch.setenv("COLUMNS", "160")
+    pair = kinds[first], kinds[second]
+    code, text, error = run(monkeypatch, capsys, "stability", *pair, "--pixel-mm", SENSOR["pixel_mm"])
+    assert code == 0, error
+    rmse = [float(line.split("│")[2]) for line in text.splitlines() if line.startswith("│")]
+    assert len(rmse) == 3 and max(rmse) < 1e-8
+    known = "results" in (first, second) or "interior.csv" in (first, second)
+    assert "similar" in text and ("nothing says that it has changed" in text) == known
+
+
+def test_a_camera_may_have_another_name_in_b(sets, monkeypatch, capsys):
+    other = sets / "other.toml"
+    other.write_text((sets / "bare.toml").read_text().replace("cameras.gopro", "cameras.hero"))
+    arguments = ("stability", sets / "one", other, "--camera", "gopro")
+    code, _, error = run(monkeypatch, capsys, *arguments)
+    assert (code, "there is no camera 'gopro' in it; name one of hero" in error) == (2, True)
+    assert run(monkeypatch, capsys, *arguments, "--camera-b", "hero")[0] == 0

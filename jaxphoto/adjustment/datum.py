@@ -15,12 +15,11 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxphoto.adjustment.residuals import State, Values, georeferencing_residuals, surface_residuals
-from jaxphoto.adjustment.similarity import similarity
+from jaxphoto.adjustment.similarity import motions, similarity
 from jaxphoto.adjustment.structure import Structure
 from jaxphoto.block import Block
 from jaxphoto.compiling import QUICK_TO_COMPILE
 from jaxphoto.errors import DatumError
-from jaxphoto.rotation import small_angles
 
 MOTIONS = (
     "shift in X",
@@ -97,21 +96,7 @@ def _plainly_closed(block: Block, values: Values, structure: Structure) -> bool:
     return False
 
 
-@partial(jax.jit, compiler_options=QUICK_TO_COMPILE)
-def _motions_of(position, rotation, points, centre, size):
-    zero, seeds = jnp.zeros(7), jnp.eye(7)
-
-    def image(p, position, rotation):
-        moved, turned = similarity(p, position, rotation, centre, size)
-        return jnp.concatenate([moved, small_angles(turned @ rotation.T)])
-
-    def derivative(fn):
-        return jax.vmap(lambda seed: jax.jvp(fn, (zero,), (seed,))[1])(seeds)
-
-    eop = jax.vmap(lambda x, r: derivative(lambda p: image(p, x, r)), in_axes=(1, 2), out_axes=2)(position, rotation)
-    still = jnp.eye(3)
-    moved = lambda x: derivative(lambda p: similarity(p, x, still, centre, size)[0])  # noqa: E731
-    return eop, jax.vmap(moved, in_axes=1, out_axes=2)(points)
+_motions_of = jax.jit(motions, compiler_options=QUICK_TO_COMPILE)
 
 
 def _motions(values: Values) -> tuple[Motions, np.ndarray, float]:

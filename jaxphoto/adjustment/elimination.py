@@ -1,10 +1,12 @@
 """Solution of the normal equations: right-hand sides go down to the reduced unknowns, solutions back to the points.
 
 Both ways lead through F, see `normal`. The F of a small block is kept; that of a large one takes longer to fetch from
-memory than to make anew, a few tiles at a time.
+memory than to make anew, a few tiles at a time. That pays for many right-hand sides at once. One is taken down and up
+by two derivatives of the image rows each, in a direction and back: W z = J_e' (J_p z), W' x = J_p' (J_e x).
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -44,15 +46,19 @@ def over_tiles(function: Callable, at: At, reduced: Reduced, numbers: tuple) -> 
 
 
 def solve_factored(reduced: Reduced, factor: BandFactor, b: Increments, at: At) -> Increments:
-    """x of (N + damping diag(N)) x = b: down to the reduced unknowns, and back to the points."""
-    return solve_reduced(reduced, factor, *reduce_right(reduced, b, at), b.points, at)
+    """x of (N + damping diag(N)) x = b, one of many: down to the reduced unknowns, and back to the points."""
+    return solve_reduced(reduced, factor, *reduce_right(reduced, b, at, many=True), b.points, at, many=True)
 
 
-def reduce_right(reduced: Reduced, b: Increments, at: At) -> tuple[Array, Array]:
-    """A right-hand side taken down to the reduced unknowns and to mu."""
+def reduce_right(reduced: Reduced, b: Increments, at: At, many: bool = False) -> tuple[Array, Array]:
+    """A right-hand side, or one of `many` under `jax.vmap`, taken down to the reduced unknowns and to mu."""
     s, i = at.structure, at.structure.n_border
-    image = s.in_tiles.image
-    z = by_tile(jnp.stack(whiten(b.points, reduced.l)), s.in_tiles)
+    z = jnp.stack(whiten(b.points, reduced.l))
+    if reduced.f is None and not many:
+        of_points, d = _down_by_rows(jnp.stack(unwhiten(z, reduced.l)), at)
+        eop, shared = b.eop - of_points.eop, b.shared - of_points.shared
+        return jnp.concatenate([eop.T.reshape(-1), shared]), d
+    image, z = s.in_tiles.image, by_tile(z, s.in_tiles)
     down = over_tiles(lambda f, _, z: f @ z.reshape(-1), at, reduced, (z,))
     of_images, border = jnp.split(down, [6 * image.shape[2]], axis=2)
     of_images = jax.ops.segment_sum(of_images.reshape(-1, 6), image.reshape(-1), s.n_images)
@@ -60,14 +66,17 @@ def reduce_right(reduced: Reduced, b: Increments, at: At) -> tuple[Array, Array]
     return jnp.concatenate([(b.eop.T - of_images).reshape(-1), b.shared.at[:i].add(-border[:i])]), border[i:-1]
 
 
-def solve_reduced(reduced: Reduced, factor: BandFactor, right, d, b_points, at: At) -> Increments:
-    """`solve_factored` with the right-hand side taken down already: `right` to the reduced unknowns, `d` to mu."""
+def solve_reduced(reduced: Reduced, factor: BandFactor, right, d, b_points, at: At, many: bool = False) -> Increments:
+    """x of a right-hand side taken down already: `right` to the reduced unknowns, `d` to mu."""
     r, s, n = reduced, at.structure, at.structure.n_images
     if len(d):
         right = right - r.g @ jnp.linalg.solve(r.k, d)
     x = solve_band(factor, right)
     mu = jnp.linalg.solve(r.k, r.g.T @ x + d) if len(d) else d
     eop, shared = x[: 6 * n].reshape(n, 6), x[6 * n :]
+    if r.f is None and not many:
+        b_points = b_points - _up_by_rows(eop.T, shared, mu, at)
+        return Increments(eop.T, shared, jnp.stack(unwhiten(whiten(b_points, r.l), r.l)))
     border = jnp.concatenate([shared[: s.n_border], mu, jnp.zeros(1)])
 
     def up(f, image):
@@ -75,6 +84,48 @@ def solve_reduced(reduced: Reduced, factor: BandFactor, right, d, b_points, at: 
 
     z = jnp.stack(whiten(b_points, r.l)) - by_point(over_tiles(up, at, r, ()))
     return Increments(eop.T, shared, jnp.stack(unwhiten(z, r.l)))
+
+
+def _down_by_rows(step: Array, at: At) -> tuple[Increments, Array]:
+    """What increments of the points add to the right-hand sides of images, shared unknowns and mu."""
+    _, scale, values, s = at
+    rest = other_rows(at)
+    scene, pull_scene = _scene_and_pull(at)
+
+    def tile(numbers):
+        image, point, step, xy, sigma = numbers
+        seen, place = seen_in(xy, sigma, image, s), of_images(scene, image, s)
+        moved = jax.jvp(lambda point: rows(place, point, seen, s), (point,), (step,))[1]
+        return jax.vjp(lambda scene: rows(scene, point, seen, s), place)[1](moved)[0]
+
+    numbers = (by_tile(at.state.points, s.in_tiles), by_tile(step * scale.points, s.in_tiles))
+    to_scene = each_tile_of(tile, (*numbers, values.xy, values.sigma_xy), s)
+    eop, shared = pull_scene(total(_by_image(to_scene, scene, s), s))
+    if s.n_scanner:
+        along = jnp.sum(rest.surfaces * step[:, None], axis=0)
+        of_scanner = total(jnp.einsum("arp,rp->a", rest.surfaces_scanner, along), s)
+        shared = shared.at[s.n_interior : s.n_border].add(of_scanner)
+    return Increments(eop, shared, step), total(jnp.einsum("kcp,cp->k", rest.rows_p, step), s)
+
+
+def _up_by_rows(eop: Array, shared: Array, mu: Array, at: At) -> Array:
+    """What increments of images and shared unknowns, and mu, add to the right-hand sides of the points."""
+    increments, scale, values, s = at
+    rest = other_rows(at)
+    scene, moved = jax.jvp(partial(_scene_at, at), (increments.eop, increments.shared), (eop, shared))
+
+    def tile(numbers):
+        image, point, xy, sigma = numbers
+        seen, place = seen_in(xy, sigma, image, s), of_images(scene, image, s)
+        moves = jax.jvp(lambda scene: rows(scene, point, seen, s), (place,), (of_images(moved, image, s),))[1]
+        return jax.vjp(lambda point: rows(place, point, seen, s), point)[1](moves)[0]
+
+    numbers = (by_tile(at.state.points, s.in_tiles), values.xy, values.sigma_xy)
+    result = by_point(each_tile_of(tile, numbers, s)) * scale.points + jnp.einsum("kcp,k->cp", rest.rows_p, mu)
+    if s.n_scanner:
+        along = jnp.einsum("arp,a->rp", rest.surfaces_scanner, shared[s.n_interior : s.n_border])
+        result = result + jnp.sum(rest.surfaces * along, axis=1)
+    return result
 
 
 def gradient(at: At, reduced: Reduced, there: At):
@@ -105,12 +156,12 @@ def gradient(at: At, reduced: Reduced, there: At):
 
 def _scene_and_pull(at: At):
     """The scene, and what takes its cotangents to increments of images and shared unknowns."""
+    return jax.vjp(partial(_scene_at, at), at.increments.eop, at.increments.shared)
+
+
+def _scene_at(at: At, eop: Array, shared: Array) -> Scene:
     increments, scale, values, s = at
-
-    def scene_at(eop, shared):
-        return scene_of(state_at(increments._replace(eop=eop, shared=shared), scale, values, s), s)
-
-    return jax.vjp(scene_at, increments.eop, increments.shared)
+    return scene_of(state_at(increments._replace(eop=eop, shared=shared), scale, values, s), s)
 
 
 def _by_image(parts: Scene, scene: Scene, s: Structure) -> Scene:

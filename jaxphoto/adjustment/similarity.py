@@ -21,6 +21,29 @@ def similarity(
     return moved, rotation @ turn.T
 
 
+def motions(
+    position: Float[Array, "3 images"],
+    rotation: Float[Array, "3 3 images"],
+    points: Float[Array, "3 points"],
+    centre,
+    size,
+) -> tuple[Float[Array, "7 6 images"], Float[Array, "7 3 points"]]:
+    """Derivatives of images (position, small rotation) and points by the parameters of `similarity`, at none."""
+    zero, seeds = jnp.zeros(7), jnp.eye(7)
+
+    def image(p, position, rotation):
+        moved, turned = similarity(p, position, rotation, centre, size)
+        return jnp.concatenate([moved, small_angles(turned @ rotation.T)])
+
+    def derivative(fn):
+        return jax.vmap(lambda seed: jax.jvp(fn, (zero,), (seed,))[1])(seeds)
+
+    eop = jax.vmap(lambda x, r: derivative(lambda p: image(p, x, r)), in_axes=(1, 2), out_axes=2)(position, rotation)
+    still = jnp.eye(3)
+    moved = lambda x: derivative(lambda p: similarity(p, x, still, centre, size)[0])  # noqa: E731
+    return eop, jax.vmap(moved, in_axes=1, out_axes=2)(points)
+
+
 def open_motions(values: Values) -> int:
     """How many motions are open, where these are all seven, or all but the scale, which distances give; else 0.
 
@@ -39,9 +62,7 @@ def onto_datum(at: At) -> Increments:
     """
     y, scale, values, _ = at
     k = open_motions(values)
-    centre = values.points.mean(axis=1)
-    size = jnp.sqrt(jnp.mean(jnp.sum((values.points - centre[:, None]) ** 2, axis=0)))
-    scaled = lambda v, k: jnp.where(k > 0, v / jnp.where(k > 0, k, 1.0), 0.0)  # noqa: E731
+    centre, size = _extent(values)
 
     def moved(y: Increments, parameters: Float[Array, "k"]) -> Increments:
         state = At(y, *at[1:]).state
@@ -50,8 +71,8 @@ def onto_datum(at: At) -> Increments:
         position, rotation = jax.vmap(image, in_axes=(1, 2), out_axes=(1, 2))(state.position, state.rotation)
         points = jax.vmap(lambda x: image(x, jnp.eye(3))[0], 1, 1)(state.points)
         turned = jax.vmap(lambda r, start: small_angles(r @ start.T), 2, 1)(rotation, values.rotation)
-        eop = scaled(jnp.concatenate([position - values.position, turned]), scale.eop)
-        return Increments(eop, y.shared, scaled(points - values.points, scale.points))
+        eop = _scaled(jnp.concatenate([position - values.position, turned]), scale.eop)
+        return Increments(eop, y.shared, _scaled(points - values.points, scale.points))
 
     def newton(_, y: Increments) -> Increments:
         violation = lambda parameters: datum_residuals(moved(y, parameters), scale, values)  # noqa: E731
@@ -62,6 +83,24 @@ def onto_datum(at: At) -> Increments:
     found = jax.lax.fori_loop(0, _NEWTON_STEPS, newton, begin)
     finite = jnp.all(jnp.isfinite(found.eop)) & jnp.all(jnp.isfinite(found.points))
     return jax.tree.map(lambda new, old: jnp.where(finite, new, old), found, y)
+
+
+def along_motions(values: Values, scale: Increments) -> Increments:
+    """Scaled increments along each of the `open_motions` (leading axis), which nothing but the datum sees."""
+    k, shared = open_motions(values), scale.shared
+    eop, points = motions(values.position, values.rotation, values.points, *_extent(values))
+    return Increments(_scaled(eop[:k], scale.eop), jnp.zeros((k, *shared.shape)), _scaled(points[:k], scale.points))
+
+
+def _extent(values: Values) -> tuple[Float[Array, "3"], Float[Array, ""]]:
+    """Centre and size (m) of the points."""
+    centre = values.points.mean(axis=1)
+    return centre, jnp.sqrt(jnp.mean(jnp.sum((values.points - centre[:, None]) ** 2, axis=0)))
+
+
+def _scaled(v, scale):
+    """Increments of what is free, zero for what is held."""
+    return jnp.where(scale > 0, v / jnp.where(scale > 0, scale, 1.0), 0.0)
 
 
 def _nearest(points, start, own, centre, size) -> Float[Array, "7"]:

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxphoto.adjustment.residuals import Increments, State, Values
 from jaxphoto.adjustment.structure import CameraGroup, Structure, Tiles, interior_of
-from jaxphoto.collinearity import ExteriorOrientation, image_residual
+from jaxphoto.collinearity import ExteriorOrientation, camera_coordinates, camera_residual
 from jaxphoto.georeferencing import apparent_point
 from jaxphoto.rotation import small_rotation
 
@@ -52,6 +52,10 @@ class Slopes(NamedTuple):
 
 Pair = tuple[Float[Array, "m p"], Float[Array, "m p"]]
 """Of a tile's rows, x and y. Joined to one array they would be computed number by number, not as vectors."""
+
+
+Triple = tuple[Float[Array, "m p"], Float[Array, "m p"], Float[Array, "m p"]]
+"""The three coordinates of a tile's points in its cameras' frames."""
 
 
 class Columns(NamedTuple):
@@ -105,7 +109,31 @@ def seen_in(xy: Array, sigma: Array, image: Array, s: Structure) -> Seen:
 
 def rows(scene: Scene, points: Float[Array, "3 p"], seen: Seen, s: Structure) -> Pair:
     """Weighted residuals of a tile: observed minus computed over sigma."""
-    parts = [_rows_of(g, c, scene, points, seen, s) for g, c in zip(s.groups, scene.cameras, strict=True)]
+    return _residuals(
+        [_leaves_of(c) for c in scene.cameras], _in_cameras(scene.centre, scene.rotation, points, seen, s), seen, s
+    )
+
+
+def _in_cameras(centre: Array, rotation: Array, points: Array, seen: Seen, s: Structure) -> Triple:
+    """Points in the frames of a tile's cameras."""
+
+    def one(centre, rotation, point, weight):
+        aim = apparent_point(centre, point, s.corrections)
+        # An empty slot looks straight ahead: whatever lies there, its numbers stay finite.
+        aim = jnp.where(weight > 0, aim, centre - rotation[2])
+        u, v, w = camera_coordinates(ExteriorOrientation(centre, rotation), aim)
+        return u, v, w
+
+    along_points = jax.vmap(one, (None, None, -1, -1), -1)
+    return jax.vmap(along_points, (0, 0, None, 0))(centre, rotation, points, seen.weight[0])
+
+
+def _leaves_of(camera: Array) -> list[Array]:
+    return list(jnp.moveaxis(camera, -1, 0))
+
+
+def _residuals(cameras: list[list[Array]], in_camera: Triple, seen: Seen, s: Structure) -> Pair:
+    parts = [_residuals_of(g, c, in_camera, seen) for g, c in zip(s.groups, cameras, strict=True)]
     if len(parts) == 1:
         return parts[0]
     x, y = (
@@ -115,20 +143,14 @@ def rows(scene: Scene, points: Float[Array, "3 p"], seen: Seen, s: Structure) ->
     return x, y
 
 
-def _rows_of(g: CameraGroup, camera: Array, scene: Scene, points: Array, seen: Seen, s: Structure) -> Pair:
-    def one(camera, centre, rotation, point, xy, weight):
-        aim = apparent_point(centre, point, s.corrections)
-        # An empty slot looks straight ahead: whatever lies there, its numbers stay finite.
-        aim = jnp.where(weight[0] > 0, aim, centre - rotation[2])
-        exterior = ExteriorOrientation(centre, rotation)
-        x, y = image_residual(interior_of(g, list(camera)), exterior, aim, xy)
+def _residuals_of(g: CameraGroup, camera: list[Array], in_camera: Triple, seen: Seen) -> Pair:
+    def one(camera, in_camera, xy, weight):
+        x, y = camera_residual(interior_of(g, camera), in_camera, xy)
         return x * weight[0], y * weight[1]
 
-    along_points = jax.vmap(one, (None, None, None, -1, -1, -1), -1)
-    whose = None if camera.ndim == 1 else 0
-    return jax.vmap(along_points, (whose, 0, 0, None, 1, 1))(
-        camera, scene.centre, scene.rotation, points, seen.xy, seen.weight
-    )
+    along_points = jax.vmap(one, (None, -1, -1, -1), -1)
+    whose = None if camera[0].ndim == 0 else 0
+    return jax.vmap(along_points, (whose, 0, 1, 1))(camera, in_camera, seen.xy, seen.weight)
 
 
 def columns(
@@ -153,35 +175,53 @@ def once(function: Callable, s: Structure, *given: Any) -> Any:
 def _columns(
     scene: Scene, slopes: Slopes, points: Float[Array, "3 p"], scale: Float[Array, "3 p"], seen: Seen, s: Structure
 ) -> tuple[Columns, Columns]:
-    free = tuple(c[..., list(g.free_leaves)] for g, c in zip(s.groups, scene.cameras, strict=True))
-
-    def cameras_with(free):
-        return tuple(
-            c.at[..., list(g.free_leaves)].set(f) for g, c, f in zip(s.groups, scene.cameras, free, strict=True)
-        )
-
-    # jit keeps the trace: every derivative below uses it again.
-    f = jax.jit(
-        lambda free, centre, rotation, points: rows(Scene(centre, rotation, cameras_with(free)), points, seen, s)
-    )
+    """By the chain rule: through the points in the cameras' frames, three numbers a slot."""
     centre, rotation, unit = scene.centre, scene.rotation, jnp.eye(3)
-
-    def slope(function, *x):
-        return jax.vmap(lambda *d: jax.jvp(function, x, d)[1])
-
     # One loop for all six: joined afterwards, they would be computed number by number.
     still, turns = jnp.zeros((3, *rotation.shape)), jnp.moveaxis(slopes.rotation, -1, 0)
     seeds = jnp.concatenate([unit[:, None] * slopes.centre, still[:, :, 0]]), jnp.concatenate([still, turns])
-    by_eop = slope(lambda *x: f(free, *x, points), centre, rotation)(*seeds)
-    by_point = slope(lambda x: f(free, centre, rotation, x), points)(unit[:, :, None] * scale)
-    by_camera = (jnp.zeros((0, *seen.xy.shape[1:])),) * 2
-    if s.n_image_colours:
-        by_camera = slope(lambda x: f(x, centre, rotation, points), free)(
-            tuple(jnp.moveaxis(c, -2, 0) for c in slopes.cameras)
+    # jit keeps the trace: every derivative below uses it again.
+    place = jax.jit(partial(_in_cameras, seen=seen, s=s))
+    by_eop = _slope(lambda *x: place(*x, points), centre, rotation)(*seeds)
+    by_point = _slope(lambda x: place(centre, rotation, x), points)(unit[:, :, None] * scale)
+    residual, by_place, by_camera = once(
+        partial(_camera_columns, s=s), s, scene.cameras, slopes.cameras, place(centre, rotation, points), seen
+    )
+
+    def of_one(k: int) -> Columns:
+        eop, point = (
+            sum((b[k] * v for b, v in zip(by_place, moved, strict=True)), jnp.zeros(())) for moved in (by_eop, by_point)
         )
-    parts = f(free, centre, rotation, points), by_eop, by_camera, by_point
-    x, y = (Columns(*of_one) for of_one in zip(*parts, strict=True))
-    return x, y
+        return Columns(residual[k], eop, by_camera[k], point)
+
+    return of_one(0), of_one(1)
+
+
+def _camera_columns(cameras: tuple[Array, ...], slopes: tuple[Array, ...], in_camera: Triple, seen: Seen, s: Structure):
+    """Residuals, and their derivatives by the point in the camera's frame and by the cameras' unknowns."""
+    leaves = [_leaves_of(c) for c in cameras]
+    # Only what is free: derivatives of the rest would be computed, though they are zero.
+    free = [[own[k] for k in g.free_leaves] for g, own in zip(s.groups, leaves, strict=True)]
+
+    def with_free(free):
+        new = [dict(zip(g.free_leaves, f, strict=True)) for g, f in zip(s.groups, free, strict=True)]
+        return [[of_group.get(k, v) for k, v in enumerate(own)] for of_group, own in zip(new, leaves, strict=True)]
+
+    f = jax.jit(lambda free, in_camera: _residuals(with_free(free), in_camera, seen, s))
+
+    def along(k: int) -> Pair:
+        move = lambda x: f(free, (*in_camera[:k], x, *in_camera[k + 1 :]))  # noqa: E731
+        return jax.jvp(move, (in_camera[k],), (jnp.ones_like(in_camera[k]),))[1]
+
+    by_camera = (jnp.zeros((0, *in_camera[0].shape)),) * 2
+    if s.n_image_colours:
+        by_camera = _slope(lambda x: f(x, in_camera), free)([_leaves_of(jnp.moveaxis(c, -2, 0)) for c in slopes])
+    return f(free, in_camera), tuple(map(along, range(3))), by_camera
+
+
+def _slope(function: Callable, *x: Any) -> Callable:
+    """Directions, along a leading axis, to derivatives of `function` at `x`."""
+    return jax.vmap(lambda *d: jax.jvp(function, x, d)[1])
 
 
 def by_tile(array: Float[Array, "*c points"], tiles: Tiles) -> Float[Array, "chunks tiles *c p"]:

@@ -73,22 +73,29 @@ def tile_shape(image: np.ndarray, point: np.ndarray, n_images: int, n_points: in
     all; points 8 for fewer than 32 images where `TILES` tiles hold the block, else 32. Groups of tiles that are padding
     take no time.
     """
-    order, images = _in_order(image, point, n_points)
-    part = order[: min(len(order), _PART)]
+    orders, images = _orders(image, point, n_points)
+    parts = [_part_of(order) for order in orders]
     most = max(1, max(map(len, images), default=1))
     small = n_images < 32 and n_points <= 8 * TILES
 
     def option(m: int) -> tuple[float, int, int]:
-        p = 8 if small and len(_cut(order, images, m, 8)) <= TILES else 32
-        return _cost(len(_cut(part, images, m, p)), m, p), m, p
+        p = 8 if small and len(_best_cut(orders, images, m, 8)[1]) <= TILES else 32
+        return _cost(len(_best_cut(parts, images, m, p)[1]), m, p), m, p
 
     all_images = size_class(n_images, 8)
     widths = {min(size_class(int(np.ceil(k * most)), 12), all_images) for k in (1, 1.25, 1.5, 2)}
     return min(map(option, widths))[1:]
 
 
-# Points on which tile shapes are tried.
-_PART = 3000
+# Points on which tile shapes are tried: so many runs of so many.
+_RUNS, _RUN = 6, 500
+
+
+def _part_of(order: np.ndarray) -> np.ndarray:
+    if len(order) <= _RUNS * _RUN:
+        return order
+    starts = np.linspace(0, len(order) - _RUN, _RUNS).astype(int)
+    return order[(starts[:, None] + np.arange(_RUN)).ravel()]
 
 
 def _cost(tiles: int, m: int, p: int) -> float:
@@ -101,10 +108,10 @@ def tile_points(image: np.ndarray, point: np.ndarray, n_points: int, m: int, p: 
 
     Raises ValueError where a point has more than `m` rays.
     """
-    order, images = _in_order(image, point, n_points)
+    orders, images = _orders(image, point, n_points)
     if max(map(len, images), default=0) > m:
         raise ValueError(f"a point is seen by more than the {m} images of a tile")
-    tiles = _cut(order, images, m, p)
+    order, tiles = _best_cut(orders, images, m, p)
     own = np.full((len(tiles), m), -1, np.int32)
     place, slot = np.empty(n_points, np.int32), np.empty(len(image), np.int64)
     for t, (members, start, stop) in enumerate(tiles):
@@ -119,8 +126,12 @@ def tile_points(image: np.ndarray, point: np.ndarray, n_points: int, m: int, p: 
     return Tiling(own, place, slot)
 
 
-def _in_order(image: np.ndarray, point: np.ndarray, n_points: int) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Points by their first image, last image and mean image; each point's images."""
+def _orders(image: np.ndarray, point: np.ndarray, n_points: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Two orders of the points, and each point's images.
+
+    By first image, last image and mean image; and by first image, second image, and so on, which is better where
+    there are many more points than sets of images that see one.
+    """
     first = np.searchsorted(point, np.arange(n_points + 1))
     rays = np.diff(first)
     seen = rays > 0
@@ -130,7 +141,15 @@ def _in_order(image: np.ndarray, point: np.ndarray, n_points: int) -> tuple[np.n
         low[seen] = np.minimum.reduceat(image, starts)
         high[seen] = np.maximum.reduceat(image, starts)
         mean[seen] = np.add.reduceat(image.astype(float), starts) / rays[seen]
-    return np.lexsort((mean, high, low)), np.split(image, first[1:-1])
+    each = np.full((max(1, int(rays.max(initial=0))), n_points), np.iinfo(np.int32).max)
+    each[np.arange(len(image)) - first[point], point] = image
+    each.sort(axis=0)
+    return [np.lexsort((mean, high, low)), np.lexsort(each[::-1])], np.split(image, first[1:-1])
+
+
+def _best_cut(orders: list[np.ndarray], images: list[np.ndarray], m: int, p: int):
+    """The order that makes fewest tiles, and these."""
+    return min(((order, _cut(order, images, m, p)) for order in orders), key=lambda cut: len(cut[1]))
 
 
 def _cut(order: np.ndarray, images: list[np.ndarray], m: int, p: int) -> list[tuple[list[int], int, int]]:

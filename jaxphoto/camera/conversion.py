@@ -8,17 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import least_squares
 
-from jaxphoto.camera.distortion import (
-    AbstractDistortion,
-    AffineBrown,
-    Agisoft,
-    Balanced,
-    Brown,
-    OpenCv,
-    Smac,
-    invert,
-)
-from jaxphoto.camera.equivalence import exact
+from jaxphoto.camera.distortion import AbstractDistortion, invert
+from jaxphoto.camera.equivalence import exact, usual_coefficients
 from jaxphoto.camera.interior import (
     InteriorOrientation,
     constant_names,
@@ -34,24 +25,8 @@ from jaxphoto.compiling import call_compiled
 _SIDE = 25
 # A fit without the terms that are rarely needed is taken where it misses by no more than this.
 _GOOD_PX = 0.01
-# What a model has beyond the terms that most cameras need; scales (K0) stand beside c and are never fitted.
-_RARE: dict[type[AbstractDistortion], tuple[str, ...]] = {
-    OpenCv: ("k4", "k5", "k6", "b1", "b2"),
-    Agisoft: ("k4", "p3", "p4", "b1", "b2"),
-    Brown: ("b1", "b2"),
-    AffineBrown: ("b1", "b2"),
-    Balanced: ("c1", "c2"),
-    Smac: ("k4", "p3", "p4"),
-}
-
 # Where a fit ends: rational models lie in a flat valley, in which only the coefficients change any more.
 _UNTIL = {"ftol": 1e-10, "xtol": 1e-13, "gtol": 1e-13, "max_nfev": 300}
-
-
-def usual_coefficients(distortion: type[AbstractDistortion]) -> tuple[str, ...]:
-    """The coefficients of a model that most cameras need: without affinity, rational and highest terms, and scales."""
-    rare = (*_RARE.get(distortion, ()), *distortion.scales)
-    return tuple(name for name in distortion.coefficients if name not in rare)
 
 
 class Conversion(NamedTuple):

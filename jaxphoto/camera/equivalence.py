@@ -1,4 +1,4 @@
-"""Distortion models that are the same polynomial in other names, signs, units or scale: exact conversions.
+"""Distortion models that are the same polynomial in other names, signs, units or scale: exact conversions, usual terms.
 
 Most models are one of two polynomials, D being Brown's decentring and (x, y) with y up:
 
@@ -54,6 +54,12 @@ def exact(interior: InteriorOrientation, target: type[AbstractDistortion]) -> In
     return InteriorOrientation(jnp.asarray(c), interior.x_p, interior.y_p, distortion, interior.residuals)
 
 
+def usual_coefficients(distortion: type[AbstractDistortion]) -> tuple[str, ...]:
+    """The coefficients of a model that most cameras need: without affinity, rational and highest terms, and scales."""
+    rare = (*_RARE.get(distortion, ()), *distortion.scales)
+    return tuple(name for name in distortion.coefficients if name not in rare)
+
+
 def with_sign(interior: InteriorOrientation, sign: Literal["subtract", "add"]) -> InteriorOrientation:
     """The same camera with a SMAC that is subtracted, as in paper 002, or added, as in reports of the USGS.
 
@@ -106,6 +112,16 @@ _TERMS: dict[type[AbstractDistortion], dict[str, _Term]] = {
     },
 }
 """The models that are one of the two polynomials of this module: its terms as their coefficients."""
+
+# What a model has beyond the terms that most cameras need; scales (K0) stand beside c and are never fitted.
+_RARE: dict[type[AbstractDistortion], tuple[str, ...]] = {
+    OpenCv: ("k4", "k5", "k6", "b1", "b2"),
+    Agisoft: ("k4", "p3", "p4", "b1", "b2"),
+    Brown: ("b1", "b2"),
+    AffineBrown: ("b1", "b2"),
+    Balanced: ("c1", "c2"),
+    Smac: ("k4", "p3", "p4"),
+}
 
 _AFFINITY_ADDED = (Brown, Balanced)
 """Models whose affinity acts on the coordinate that the other terms see; in the others it acts before or after them."""

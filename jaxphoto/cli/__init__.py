@@ -1,28 +1,10 @@
 """The command line: read, do, write; one sentence and exit code 2 for what a user can mend."""
 
-import gc
 import sys
 import warnings
 
 import typer
 
-# Importing a command registers it.
-from jaxphoto.cli import (  # noqa: F401
-    adjust,
-    boresight,
-    calibrate,
-    camera,
-    convert,
-    experiment,
-    lidar,
-    model_choice,
-    monte_carlo,
-    orient,
-    sensitivity,
-    simulate,
-    stability,
-    surface_model,
-)
 from jaxphoto.cli.app import app
 from jaxphoto.errors import JaxphotoError
 
@@ -32,8 +14,6 @@ __all__ = ["app", "main"]
 def main() -> None:
     """Entry point of the command `jaxphoto`."""
     warnings.showwarning = _show_warning
-    # What importing made will stay: the collector need not look through it again and again.
-    gc.freeze()
     try:
         app(standalone_mode=True)
     except JaxphotoError as error:

@@ -8,14 +8,16 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 
 import jaxphoto
 from jaxphoto.camera import DISTORTIONS
 from jaxphoto.cli.app import app
 from jaxphoto.errors import InputError
 from jaxphoto.io import write_block
+from jaxphoto.io.grey_values import read_grey
 from jaxphoto.io.photographs import photographs, sensor_and_interior
-from jaxphoto.io.targets import SYNTAX, find_targets, read_board, read_grey
+from jaxphoto.io.targets import SYNTAX, find_targets, read_board
 from jaxphoto.procedures.calibration import calibrate, distortion_model, free_parameters
 from jaxphoto.report import check_target, prepare_pictures, print_adjustment, warnings_of
 from jaxphoto.report.calibration import print_calibration, write_calibration
@@ -38,7 +40,7 @@ def calibrate_command(
     ] = None,
     max_steps: Annotated[int, typer.Option(min=1, help="Most iterations of an adjustment.")] = jaxphoto.MAX_STEPS,
 ) -> None:
-    """Calibrate a camera with photographs of a board. Exit code 1: written, but not converged."""
+    """Calibrate a camera with photographs of a board. Exit code 1: written, but not converged or not settled."""
     if board_sigma_mm is not None and not board_sigma_mm > 0:
         raise InputError(f"--board-sigma-mm {board_sigma_mm:g} is not positive; leave it out for a board that is exact")
     check_target(out, *images)
@@ -50,7 +52,7 @@ def calibrate_command(
     console, errors = Console(), Console(stderr=True)
     began = time.perf_counter()
     with errors.status("looking for the board") as status:
-        targets = find_targets(taken, pattern, lambda image: status.update(f"looking for the board in {image}"))
+        targets = find_targets(taken, pattern, lambda image: status.update(escape(f"looking for the board in {image}")))
         seconds = {"read": time.perf_counter() - began}
         status.update(f"calibrating with {len(targets.detections)} photographs")
         done = calibrate(
@@ -65,14 +67,22 @@ def calibrate_command(
             max_steps=max_steps,
         )
         done = done._replace(left_out=targets.left_out | done.left_out)
-        status.update(f"writing {out}")
+        status.update(escape(f"writing {out}"))
         pictures = {photograph.name: partial(read_grey, photograph.path) for photograph in taken}
         tables = write_calibration(
-            done, out, seconds, pictures, lambda folder: write_block(done.adjusted.block, folder / "block")
+            done,
+            out,
+            seconds,
+            pictures,
+            lambda folder: write_block(done.adjusted.block, folder / "block"),
+            detections=targets.detections,
+            start=start.origin,
+            # A size that nobody gave is the unit of every length in the report.
+            notes=() if pixel_mm is not None else (start.origin,),
         )
-    console.print(start.origin, highlight=False)
+    console.print(start.origin, highlight=False, markup=False)
     print_adjustment(tables, warnings_of(tables), console)
     print_calibration(done, console)
-    console.print(f"results in {out} (open report.html and photographs.html)", highlight=False)
-    if not bool(done.adjusted.converged):
+    console.print(f"results in {out} (open report.html and photographs.html)", highlight=False, markup=False)
+    if not done.converged:
         raise typer.Exit(1)

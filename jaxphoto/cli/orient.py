@@ -1,23 +1,26 @@
 """`jaxphoto orient`: photographs, or a block without approximate values, to an oriented block."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 import typer
 from rich.console import Console
+from rich.markup import escape
 
-from jaxphoto.camera import DISTORTIONS, AbstractDistortion, InteriorOrientation, constant_names
+from jaxphoto.camera import DISTORTIONS, InteriorOrientation
 from jaxphoto.cli.app import app
 from jaxphoto.errors import InputError
 from jaxphoto.io import read_block, write_block
 from jaxphoto.io.block_folder import check_block_target
 from jaxphoto.io.block_folder.layout import TOML
-from jaxphoto.io.matching import match_photographs
+from jaxphoto.io.matching import MatchedPhotographs, match_photographs
 from jaxphoto.io.pairs import photograph_pairs
 from jaxphoto.io.photographs import photographs, sensor_and_interior
 from jaxphoto.orientation.approximate import has_beginning
-from jaxphoto.procedures.orientation import orient, orient_block
+from jaxphoto.procedures.calibration import distortion_model
+from jaxphoto.procedures.orientation import Oriented, orient, orient_block
 from jaxphoto.report.orientation import print_orientation, write_orientation
 
 
@@ -26,42 +29,41 @@ def orient_command(
     images: Annotated[list[Path], typer.Argument(help="Photographs of one camera; or one block folder.")],
     out: Annotated[Path, typer.Option(help="Block folder to write; a block in it is replaced.")],
     pairs: Annotated[
-        str, typer.Option(help="Photographs to compare: exhaustive, sequence:K, position:K.")
-    ] = "exhaustive",
+        str | None,
+        typer.Option(help="Photographs to compare: exhaustive, sequence:K, position:K (default: exhaustive)."),
+    ] = None,
     c_mm: Annotated[float | None, typer.Option(help="Where the principal distance starts; else from EXIF.")] = None,
     pixel_mm: Annotated[float | None, typer.Option(help="Size of a pixel; else from EXIF.")] = None,
-    model: Annotated[str, typer.Option(help="Distortion: brown, smac, ...")] = "brown",
-    r0_mm: Annotated[float, typer.Option(help="Of smac and pps_radial: the radius of no radial distortion.")] = 0.0,
+    model: Annotated[str | None, typer.Option(help=f"Distortion: {', '.join(DISTORTIONS)} (default: brown).")] = None,
+    r0_mm: Annotated[
+        float | None, typer.Option(help="Balance radius R0 of smac (default: 0), where radial distortion is none.")
+    ] = None,
 ) -> None:
     """Orient photographs to one another from their features alone, for `jaxphoto adjust` to calibrate the camera.
 
-    Given a block folder, find the approximate orientation that its images.csv lacks.
+    Given a block folder, find the approximate orientation that its images.csv lacks. Exit code 1: written, but not
+    converged.
     """
     check_block_target(out, *images)
     console, errors = Console(), Console(stderr=True)
     if len(images) == 1 and (images[0] / TOML).is_file():
+        _refuse_options(images[0], pairs=pairs, c_mm=c_mm, pixel_mm=pixel_mm, model=model, r0_mm=r0_mm)
         with errors.status("reading the block") as status:
-            block = read_block(images[0])
-            if has_beginning(block):
-                raise InputError(
-                    f"{images[0]} needs no orientation: images are known, or see four known points; adjust it as it is"
-                )
-            with_start = orient_block(block, status.update)
-            write_block(with_start, out)
-        known = int(np.sum(with_start.start.image_known))
-        console.print(f"{known} of {len(block.images)} images oriented; wrote {out}", highlight=False, soft_wrap=True)
+            n_known, n = _orient_folder(images[0], out, lambda said: status.update(escape(said)))
+        console.print(f"{n_known} of {n} images oriented; wrote {escape(str(out))}", highlight=False, soft_wrap=True)
         return
-    distortion = _distortion(model, r0_mm)
     with errors.status("reading the photographs") as status:
         read = photographs(images)
         camera = sensor_and_interior(read, pixel_mm, c_mm)
-        console.print(camera.origin, highlight=False, soft_wrap=True)
+        distortion = distortion_model(model or "brown", camera.sensor, r0_mm or 0.0)
+        compared = photograph_pairs(read, pairs or "exhaustive")
+        console.print(camera.origin, highlight=False, markup=False, soft_wrap=True)
         start = camera.interior
         matched = match_photographs(
             read,
             camera.sensor,
             start,
-            photograph_pairs(read, pairs),
+            compared,
             progress=lambda done, of: status.update(f"features and matches: {done} of {of}"),
         )
         found = orient(
@@ -72,27 +74,47 @@ def orient_command(
             matched.pairs,
             matched.sigma_mm,
             title=f"{len(read)} photographs",
-            report=status.update,
+            report=lambda said: status.update(escape(said)),
         )
-        status.update(f"writing {out}")
+        found = _with_reasons(found, matched)
+        status.update(f"writing {escape(str(out))}")
         write_block(found.block, out)
-        write_orientation(found, out)
+        write_orientation(found, out, n_gross=matched.n_gross, sigma_factor=matched.sigma_factor)
     console.print(
-        f"{matched.n_gross} matches by looks left out before: off the epipolar line, or of pairs with too few",
+        f"{matched.n_gross} matches by looks left out before: off the epipolar line, or of pairs with too few; the "
+        f"others scatter {matched.sigma_factor:.2g} times as much as in views of a plane",
         highlight=False,
         soft_wrap=True,
     )
     print_orientation(found.report, console)
-    console.print(f"wrote {out}: adjust it with jaxphoto adjust {out} --out DIR", highlight=False, soft_wrap=True)
+    said = f"wrote {out}: adjust it with jaxphoto adjust {out} --out DIR"
+    console.print(said, highlight=False, markup=False, soft_wrap=True)
+    if not found.report.converged:
+        raise typer.Exit(1)
 
 
-def _distortion(model: str, r0_mm: float) -> AbstractDistortion:
-    if model not in DISTORTIONS:
-        raise InputError(f"--model {model}: there are {', '.join(DISTORTIONS)}")
-    constants = constant_names(DISTORTIONS[model])
-    if set(constants) - {"r0_mm"}:
+def _refuse_options(folder: Path, **options: object) -> None:
+    given = [f"--{name.replace('_', '-')}" for name, value in options.items() if value is not None]
+    if given:
         raise InputError(
-            f"--model {model} has constants of its own ({', '.join(constants)}); orient with brown, then change "
-            "block.toml"
+            f"{folder} is a block folder, whose own image points and cameras count: leave out {', '.join(given)}, or "
+            "change block.toml"
         )
-    return DISTORTIONS[model](**dict.fromkeys(constants.values(), r0_mm))
+
+
+def _orient_folder(folder: Path, out: Path, report: Callable[[str], None]) -> tuple[int, int]:
+    """How many images of the block in `folder` are oriented in that written to `out`, and how many there are."""
+    block = read_block(folder)
+    if has_beginning(block):
+        raise InputError(
+            f"{folder} needs no orientation: images are known, or see four known points; adjust it as it is"
+        )
+    with_start = orient_block(block, report)
+    write_block(with_start, out)
+    return int(np.sum(with_start.start.image_known)), len(block.images)
+
+
+def _with_reasons(found: Oriented, matched: MatchedPhotographs) -> Oriented:
+    """`found`, whose report says why photographs are not oriented that never matched another one."""
+    why = {name: matched.left_out.get(name, reason) for name, reason in found.report.unoriented.items()}
+    return found._replace(report=found.report._replace(unoriented=why))

@@ -29,6 +29,7 @@ def stability_command(
         float, typer.Option(help="Of spr: relief of the object points, as a part of their distance.")
     ] = 0.0,
     camera: Annotated[str | None, typer.Option(help="Which camera, where a file holds several.")] = None,
+    camera_b: Annotated[str | None, typer.Option(help="Which camera of B, where it is called otherwise there.")] = None,
     pixel_mm: Annotated[float | None, typer.Option(help="Size of a pixel, where files do not say it.")] = None,
     block: Annotated[
         Path | None, typer.Option(help="Block of which interior.csv is, where results do not say the model.")
@@ -45,8 +46,11 @@ def stability_command(
     columns, rows = _grid(grid)
     if out is not None:
         check_target(out, first, second)
-    both = [read_camera_file(path, camera=camera, pixel_mm=pixel_mm, block=block) for path in (first, second)]
-    a, b = both
+    names = (camera, camera_b if camera_b is not None else camera)
+    both = a, b = [
+        read_camera_file(path, camera=name, pixel_mm=pixel_mm, block=block)
+        for path, name in zip((first, second), names, strict=True)
+    ]
     _check_one_sensor(a, b, first, second)
     points = image_grid(a.sensor, columns, rows, _extent(extent))
     found = analyse(a.interior, b.interior, points, (a.covariance, b.covariance), relief)

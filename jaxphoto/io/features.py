@@ -9,6 +9,7 @@ from jaxtyping import Float, Int, UInt8
 
 from jaxphoto.camera import Sensor
 from jaxphoto.errors import InputError
+from jaxphoto.io.grey_values import read_grey
 
 # Of a corner's strength over that of the strongest, as OpenCV counts it.
 _WEAKEST = 0.01
@@ -87,8 +88,9 @@ def sift_features(photograph: Path, sensor: Sensor, count: int = 5000, longest_p
         sigma = sqrt(0.07^2 + (0.025 s)^2) pixels,
 
     found from views of textures under known projective maps (tests/io/test_matching.py). Where the views differ more,
-    all are larger alike: `match_photographs` says how much.
-    Raises InputError as `interest_points`.
+    all are larger alike: `match_photographs` says how much. A photograph that is blank or out of focus has none.
+
+    Raises InputError for a file that is no picture, and for one of another size than the sensor's.
     Sources: Lowe (2004), Distinctive image features from scale-invariant keypoints; Arandjelovic and Zisserman (2012),
     Three things everyone should know to improve object retrieval.
     """
@@ -102,8 +104,8 @@ def sift_features(photograph: Path, sensor: Sensor, count: int = 5000, longest_p
         count, contrastThreshold=_CONTRAST, enable_precise_upscale=True
     )
     keys, described = sift.detectAndCompute(picture, None)
-    if described is None or len(keys) < 2:
-        raise InputError(f"{photograph}: no interest point was found; the picture is blank or out of focus")
+    if described is None:
+        return SiftFeatures(np.zeros((0, 2)), np.zeros(0), np.zeros(0, int), np.zeros((0, 128), np.uint8))
     places, feature = np.unique([(*key.pt, key.size) for key in keys], axis=0, return_inverse=True)
     scale = np.array([sensor.width_px, sensor.height_px]) / picture.shape[::-1]
     # OpenCV gives the diameter, two widths.
@@ -118,12 +120,8 @@ def sift_features(photograph: Path, sensor: Sensor, count: int = 5000, longest_p
 
 
 def _read(photograph: Path, sensor: Sensor) -> np.ndarray:
-    """The grey values of a photograph, turned as its sensor is: no note of the camera about it counts."""
-    if not Path(photograph).is_file():
-        raise InputError(f"{photograph}: there is no such photograph")
-    picture = cv2.imread(str(photograph), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
-    if picture is None:
-        raise InputError(f"{photograph}: this is no picture that OpenCV can read; give a TIFF, PNG or JPEG")
+    """The grey values of a photograph of the sensor's size."""
+    picture = read_grey(photograph)
     height, width = picture.shape
     if (width, height) != (sensor.width_px, sensor.height_px):
         raise InputError(

@@ -8,7 +8,6 @@ matrix.
 
 import itertools
 import os
-import warnings
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -37,6 +36,8 @@ _TRIALS = 10_000
 # Scatter is measured where nine tenths lie, 1.645 standard deviations of a normal distribution: the median would be
 # blind to the long tails that features have, the square sum to nothing but the false matches left.
 _MOST, _MOST_SIGMA = 0.9, 1.6449
+_BLANK = "it shows no features: it is blank or out of focus"
+_ALONE = f"it has {_LEAST_MATCHES} points in common with no other photograph it was compared with"
 # Rows of a table of all products that the cache of a processor holds.
 _ROWS = 256
 
@@ -54,6 +55,8 @@ class MatchedPhotographs(NamedTuple):
     """Of those that have enough in common."""
     counts: Int[np.ndarray, "compared 4"]
     """For all pairs compared: first, second, matches by looks, those of them kept (0 where they are too few)."""
+    left_out: dict[str, str]
+    """Photographs by name that match no other one, and why."""
 
     @property
     def n_gross(self) -> int:
@@ -84,13 +87,16 @@ def match_photographs(
     `interior` is what is known of the camera; only its distortion and principal point count. `progress` is called with
     the numbers of steps done and of all: a step is a photograph read or a pair compared.
 
+    A photograph that shows no features, or matches no other one, is `left_out` by name.
+
     Raises InputError as `sift_features`, where no two photographs match, and where they fall into groups that nothing
-    joins. A UserWarning names photographs that match no other one.
+    joins.
     """
     paths = [p.path for p in photographs]
     matched = _matched(paths, sensor, interior, pairs, count, progress or (lambda done, of: None))
-    _check_connected([path.name for path in paths], matched.pairs)
-    return matched
+    blank = [len(xy) == 0 for xy in matched.xy_mm]
+    alone = _alone([path.name for path in paths], blank, matched.pairs)
+    return matched._replace(left_out={photographs[k].name: _BLANK if blank[k] else _ALONE for k in alone})
 
 
 def tie_features(paths: list[Path], sensor: Sensor, count: int = 5000, least_photographs: int = 2) -> TieFeatures:
@@ -161,6 +167,7 @@ def _matched(
         factor,
         found,
         np.array(counts, int).reshape(-1, 4),
+        {},
     )
 
 
@@ -237,13 +244,18 @@ def _over_sigma(matrix: np.ndarray, one: np.ndarray, other: np.ndarray, *sigmas:
     return (in_other * other).sum(axis=1) / np.sqrt(variance)
 
 
-def _check_connected(names: list[str], pairs: list[PairMatches]) -> None:
+def _alone(names: list[str], blank: list[bool], pairs: list[PairMatches]) -> list[int]:
+    """Photographs that match no other one; InputError unless all others hang together."""
     groups = connected_images(len(names), pairs)
     joined = [group for group in groups if len(group) > 1]
+    if len(names) < 2:
+        raise InputError("an orientation needs two photographs that overlap, or more; give them all")
     if not joined:
+        empty = [name for name, nothing in zip(names, blank, strict=True) if nothing]
+        beside = f"; {_listed(empty)} show no features: blank or out of focus" if empty else ""
         raise InputError(
-            f"no two of the {len(names)} photographs ({_listed(names)}) have {_LEAST_MATCHES} points in common; give "
-            "photographs that overlap by half at least, in sharp focus, or compare more pairs"
+            f"no two of the {len(names)} photographs ({_listed(names)}) have {_LEAST_MATCHES} points in "
+            f"common{beside}; give photographs that overlap by half at least, in sharp focus, or compare more pairs"
         )
     if len(joined) > 1:
         each = "; ".join(_listed([names[k] for k in group]) for group in joined)
@@ -251,9 +263,7 @@ def _check_connected(names: list[str], pairs: list[PairMatches]) -> None:
             f"the photographs fall into {len(joined)} groups without matches between them ({each}); add photographs "
             "that see both, compare more pairs, or take each group by itself"
         )
-    alone = [names[group[0]] for group in groups if len(group) == 1]
-    if alone:
-        warnings.warn(f"{len(alone)} photograph(s) match no other one: {_listed(alone)}", UserWarning, stacklevel=3)
+    return [int(group[0]) for group in groups if len(group) == 1]
 
 
 def _listed(names: list[str]) -> str:

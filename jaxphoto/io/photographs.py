@@ -5,9 +5,9 @@ lies in the file, which is as the sensor saw it: the EXIF orientation flag turns
 """
 
 import math
+import struct
 import warnings
 from collections.abc import Callable, Hashable, Sequence
-from datetime import datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,12 +17,16 @@ from jaxphoto.camera import InteriorOrientation, Sensor
 from jaxphoto.errors import InputError
 
 _DIAGONAL_35_MM = math.hypot(36, 24)
+# What lenses there are for it: fields of 154 to half a degree. Some cameras note 1 or 65535 where they do not know.
+_FILM_MM = (5.0, 5000.0)
 # Of the longer side: the start of many programs where nothing is known, a field of 45 degrees.
 _USUAL_C = 1.2
 # Of a pixel whose size is not known; c in pixels is what matters then.
 _NOMINAL_PIXEL_MM = 0.005
 _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _TAG = ExifTags.Base
+# What Pillow raises on bytes that are not what they should be.
+_DAMAGED = (OSError, SyntaxError, ValueError, TypeError, KeyError, IndexError, EOFError, struct.error)
 
 
 class Gps(NamedTuple):
@@ -50,7 +54,6 @@ class Photograph(NamedTuple):
     """From the focal plane resolution and the size that EXIF notes, which a file made smaller may keep."""
     orientation: int = 1
     """The flag by which viewers turn the picture, 1 to 8; 1 where there is none."""
-    date: datetime | None = None
     gps: Gps | None = None
 
 
@@ -145,11 +148,17 @@ def _pixel(photograph: Photograph, given_mm: float | None) -> tuple[float | None
 
 def _check_one_camera(photographs: Sequence[Photograph], c_mm: float | None) -> None:
     checks: list[tuple[str, Callable[[Photograph], Hashable], str]] = [
-        ("sizes", lambda p: f"{p.width_px} x {p.height_px} px", "give those of one camera as they were taken"),
+        (
+            "sizes",
+            lambda p: f"{p.width_px} x {p.height_px} px",
+            "give those of one camera as they were taken: turn back what was turned, leave out what was cut or made "
+            "smaller",
+        ),
         (
             "orientation flags",
             lambda p: p.orientation,
-            "pictures are read as they lie in the file: give all as the sensor saw them, with one and the same flag",
+            "pictures are read as they lie in the file, and a program may have turned some: where all are as the "
+            "sensor saw them, set one flag (exiftool -n -Orientation=1 FILES), else leave the odd ones out",
         ),
         ("cameras", lambda p: " ".join(filter(None, (p.make, p.model))) or None, "give the photographs of one camera"),
     ]
@@ -184,7 +193,7 @@ def _photograph(path: Path) -> Photograph:
             warnings.simplefilter("ignore")
             with Image.open(path) as picture:
                 return Photograph(path.stem, path, *picture.size, **_exif(picture))
-    except (UnidentifiedImageError, OSError, SyntaxError) as error:
+    except (UnidentifiedImageError, *_DAMAGED) as error:
         raise InputError(f"{path}: this is no picture that can be read; give a TIFF, PNG or JPEG") from error
     finally:
         Image.MAX_IMAGE_PIXELS = limit
@@ -195,17 +204,16 @@ def _exif(picture: Image.Image) -> dict[str, Any]:
     try:
         top = picture.getexif()
         taken, gps = top.get_ifd(ExifTags.IFD.Exif), top.get_ifd(ExifTags.IFD.GPSInfo)
-    except (OSError, SyntaxError, ValueError, TypeError, KeyError, EOFError):
+    except _DAMAGED:
         return {}
-    flag = top.get(_TAG.Orientation, 1)
+    flag, film = top.get(_TAG.Orientation, 1), _positive(taken.get(_TAG.FocalLengthIn35mmFilm))
     return {
         "make": _words(top.get(_TAG.Make)),
         "model": _words(top.get(_TAG.Model)),
         "focal_length_mm": _positive(taken.get(_TAG.FocalLength)),
-        "focal_length_35mm_mm": _positive(taken.get(_TAG.FocalLengthIn35mmFilm)),
+        "focal_length_35mm_mm": film if film is not None and _FILM_MM[0] <= film <= _FILM_MM[1] else None,
         "sensor_width_mm": _sensor_width(taken, *picture.size),
         "orientation": flag if flag in range(1, 9) else 1,
-        "date": _date(taken.get(_TAG.DateTimeOriginal) or top.get(_TAG.DateTime)),
         "gps": _gps(gps),
     }
 
@@ -233,13 +241,6 @@ def _positive(value: Any) -> float | None:
 def _words(value: Any) -> str | None:
     words = value.replace("\0", "").strip() if isinstance(value, str) else ""
     return words or None
-
-
-def _date(value: Any) -> datetime | None:
-    try:
-        return datetime.strptime(value.replace("\0", "").strip(), "%Y:%m:%d %H:%M:%S")
-    except (AttributeError, ValueError):
-        return None
 
 
 def _gps(tags: dict) -> Gps | None:

@@ -14,7 +14,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jaxphoto.block import Block, Rows, direct_exterior, sensor_rows
+from jaxphoto.block import Block, Rows, Start, direct_exterior, sensor_rows
 from jaxphoto.errors import BlockError
 from jaxphoto.orientation.intersection import intersect_points
 from jaxphoto.orientation.rays import ideal_coordinates, turn_to_object, unit_rays
@@ -36,22 +36,22 @@ def approximate(block: Block) -> Unknowns:
     point do not meet at an angle, and where a point lies behind a camera that measured it.
     """
     state = _State(block)
-    if not (state.image_known.all() and state.point_known.all()):
-        state.complete()
+    state.complete()
+    state.check()
     _check_in_front(block, state.positions, state.matrices, state.points)
-    if block.start.image_known.all() and block.start.point_known.all():
-        return block.start.unknowns
-    places = lambda u: (u.exterior.position, u.exterior.camera_from_object, u.points)  # noqa: E731
-    found = (jnp.asarray(state.positions), jnp.asarray(state.matrices), jnp.asarray(state.points))
-    return eqx.tree_at(places, block.start.unknowns, found)
+    return state.start().unknowns
+
+
+def completed(block: Block) -> Start:
+    """As much of `approximate` as what is known allows: images and points beyond its reach stay unknown."""
+    state = _State(block)
+    state.complete()
+    return state.start()
 
 
 def has_beginning(block: Block) -> bool:
-    """Whether any image is known, sensed by GNSS and IMU, or sees four known points: where `approximate` can begin."""
-    if np.any(block.start.image_known) or len(sensor_rows(block, block.start.unknowns).image):
-        return True
-    known = np.asarray(block.start.point_known)[block.image_points.point]
-    return bool(np.bincount(np.asarray(block.image_points.image)[known], minlength=1).max() >= _RESECTED)
+    """Whether `approximate` reaches every image from what is known."""
+    return bool(completed(block).image_known.all())
 
 
 class _State:
@@ -71,6 +71,8 @@ class _State:
         self.resected = False
 
     def complete(self) -> None:
+        if self.image_known.all() and self.point_known.all():
+            return
         self._orient_directly()
         self._image_space()
         for min_angle in _ANGLES:
@@ -78,13 +80,22 @@ class _State:
                 self._intersect(~self.point_known, min_angle)
                 if not self._resect_best():
                     break
-        if not self.image_known.all():
-            raise self._images_left()
         if self.resected:
             # Once more with all rays: the points met first were met by few.
             self._intersect(~self.point_given, _ANGLES[-1])
+
+    def check(self) -> None:
+        if not self.image_known.all():
+            raise self._images_left()
         if not self.point_known.all():
             raise self._points_left()
+
+    def start(self) -> Start:
+        if self.block.start.image_known.all() and self.block.start.point_known.all():
+            return self.block.start
+        places = lambda u: (u.exterior.position, u.exterior.camera_from_object, u.points)  # noqa: E731
+        found = (jnp.asarray(self.positions), jnp.asarray(self.matrices), jnp.asarray(self.points))
+        return Start(eqx.tree_at(places, self.block.start.unknowns, found), self.image_known, self.point_known)
 
     def _orient_directly(self) -> None:
         """Step 1: X = GNSS - R l - shift - drift t, and the attitude through the boresight."""

@@ -17,6 +17,7 @@ from jaxphoto.orientation.quaternions import cross_matrices, turned
 from jaxphoto.orientation.rays import ray_noise
 
 _STEPS = 50
+_DAMPING = 1e-2  # first, of the diagonal: with less, few points of a flat scene leap over the nearest orientation
 # Within a few sigmas of the epipole the condition is all noise, and the first order says nothing of that: there the
 # epipole would be drawn to the point. Its variance of second order counts so many times.
 _EPIPOLE = 50.0
@@ -45,21 +46,22 @@ class RayPairs(NamedTuple):
         return RayPairs(*(part[which] for part in self))
 
 
-class RelativeFit(NamedTuple):
-    """A relative orientation found by least squares."""
+class RelativeFits(NamedTuple):
+    """Relative orientations found by least squares."""
 
-    rotation: Float[np.ndarray, "3 3"]
-    base: Float[np.ndarray, "3"]
-    normal: Float[np.ndarray, "5 5"]
-    """Normal matrix (rad^-2) of the small rotation in camera 2 and the shift of the base in its tangent plane."""
+    rotations: Float[np.ndarray, "m 3 3"]
+    bases: Float[np.ndarray, "m 3"]
+    normals: Float[np.ndarray, "m 5 5"]
+    """Normal matrices (rad^-2) of the small rotation in camera 2 and the shift of the base in its tangent plane."""
 
 
-def tangent_plane(base: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 2"]:
+def tangent_plane(base: Float[np.ndarray, "*m 3"]) -> Float[np.ndarray, "*m 3 2"]:
     """Two unit vectors, as columns, across a unit vector and each other: the axes of small shifts of a base."""
     across = cross_matrices(base)
-    first = across[:, np.argmin(np.abs(base))]
-    first = first / np.linalg.norm(first)
-    return np.stack([first, across @ first], axis=1)
+    least = np.argmin(np.abs(base), axis=-1)[..., None, None]
+    first = np.take_along_axis(across, least, axis=-1)
+    first = first / np.linalg.norm(first, axis=-2, keepdims=True)
+    return np.concatenate([first, across @ first], axis=-1)
 
 
 def essential(rotation: Float[np.ndarray, "*n 3 3"], base: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
@@ -92,50 +94,80 @@ def behind(
 
 
 def fitted(
-    rotation: Float[np.ndarray, "3 3"], base: Float[np.ndarray, "3"], pairs: RayPairs, tolerance: float = 0.0
-) -> RelativeFit:
-    """Least squares in the five unknowns from an approximate orientation, by Levenberg-Marquardt steps.
+    rotations: Float[np.ndarray, "m 3 3"],
+    bases: Float[np.ndarray, "m 3"],
+    pairs: RayPairs,
+    counts: Bool[np.ndarray, "m n"],
+    tolerance: float = 0.0,
+) -> RelativeFits:
+    """Least squares in the five unknowns from approximate orientations, each of the points that `counts` says.
 
-    They end where a step is less than `tolerance` standard deviations, and at the latest where it is rounding.
+    By Levenberg-Marquardt steps, of all at once. They end where a step is less than `tolerance` standard deviations,
+    and at the latest where it is rounding.
     """
-    value, slope = linearised(rotation, base, pairs)
-    damping = 1e-6
+    state = _state(rotations, bases, pairs, counts)
+    damping, under_way = np.full(len(rotations), _DAMPING), np.ones(len(rotations), bool)
     for _ in range(_STEPS):
-        normal = slope.T @ slope
-        scaled = normal + damping * np.diag(np.diag(normal) + 1e-12 * np.trace(normal))
-        step = -np.linalg.solve(scaled, slope.T @ value)
-        trial_rotation, trial_base = turned(rotation, step[:3]), base + tangent_plane(base) @ step[3:]
-        trial_base /= np.linalg.norm(trial_base)
-        trial, trial_slope = linearised(trial_rotation, trial_base, pairs)
-        size, better = np.max(np.abs(step)), trial @ trial <= value @ value
-        if better:
-            rotation, base, value, slope, damping = trial_rotation, trial_base, trial, trial_slope, 0.1 * damping
-        else:
-            damping = max(10 * damping, 1e-9)
+        diagonal = np.einsum("mkk->mk", state.normals)
+        scaled = damping[:, None] * (diagonal + 1e-12 * diagonal.sum(axis=1, keepdims=True) + 1e-300)
+        step = -np.linalg.solve(state.normals + scaled[:, :, None] * np.eye(5), state.right[..., None])[..., 0]
+        trial = _state(*moved(state.rotations, state.bases, step), pairs, counts)
+        better = under_way & (trial.costs <= state.costs)
+        gain = np.einsum("mi,mij,mj->m", step, state.normals, step)
+        state = _State(
+            *(np.where(better.reshape(-1, *[1] * (a.ndim - 1)), a, b) for a, b in zip(trial, state, strict=True))
+        )
+        damping = np.where(better, 0.1 * damping, np.maximum(10 * damping, 1e-9))
         # A small step that does not help: what is left is rounding.
-        if size < (1e-12 if better else 1e-8) or (better and step @ normal @ step < tolerance**2):
+        size = np.max(np.abs(step), axis=1)
+        under_way &= ~((size < np.where(better, 1e-12, 1e-8)) | (better & (gain < tolerance**2)))
+        if not under_way.any():
             break
-    return RelativeFit(rotation, base, slope.T @ slope)
+    return RelativeFits(state.rotations, state.bases, state.normals)
+
+
+def moved(
+    rotations: Float[np.ndarray, "m 3 3"], bases: Float[np.ndarray, "m 3"], step: Float[np.ndarray, "m 5"]
+) -> tuple[Float[np.ndarray, "m 3 3"], Float[np.ndarray, "m 3"]]:
+    """Orientations moved by a small rotation in camera 2 and a shift of the base in its tangent plane (rad)."""
+    there = bases + (tangent_plane(bases) @ step[:, 3:, None])[..., 0]
+    return turned(rotations, step[:, :3]), there / np.linalg.norm(there, axis=1, keepdims=True)
+
+
+class _State(NamedTuple):
+    rotations: Float[np.ndarray, "m 3 3"]
+    bases: Float[np.ndarray, "m 3"]
+    costs: Float[np.ndarray, " m"]
+    normals: Float[np.ndarray, "m 5 5"]
+    right: Float[np.ndarray, "m 5"]
+
+
+def _state(rotations, bases, pairs: RayPairs, counts) -> _State:
+    """Orientations with their squared misclosures, normal matrices and right sides."""
+    value, slope = linearised(rotations, bases, pairs)
+    value, slope = value * counts, slope * counts[..., None]
+    across = np.swapaxes(slope, 1, 2)
+    return _State(rotations, bases, np.sum(value**2, axis=1), across @ slope, (across @ value[..., None])[..., 0])
 
 
 def linearised(
-    rotation: Float[np.ndarray, "3 3"], base: Float[np.ndarray, "3"], pairs: RayPairs
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 5"]]:
+    rotations: Float[np.ndarray, "m 3 3"], bases: Float[np.ndarray, "m 3"], pairs: RayPairs
+) -> tuple[Float[np.ndarray, "m n"], Float[np.ndarray, "m n 5"]]:
     """Misclosures in units of sigma and their derivatives by the five unknowns, those of the sigmas included."""
-    x_1, x_2, in_1 = pairs.rays_1, pairs.rays_2, pairs.rays_2 @ rotation
-    matrix = essential(rotation, base)
-    by_1, by_2 = x_2 @ matrix, x_1 @ matrix.T
+    x_1, x_2, in_1 = pairs.rays_1, pairs.rays_2, pairs.rays_2 @ rotations
+    matrices = essential(rotations, bases)
+    by_1, by_2 = x_2 @ matrices, x_1 @ np.swapaxes(matrices, 1, 2)
     noise_1, noise_2 = _along(by_1, pairs.noise_1), _along(by_2, pairs.noise_2)
-    variance = np.sum(noise_1**2, axis=1) + np.sum(noise_2**2, axis=1) + pairs.floor
+    variance = np.sum(noise_1**2, axis=-1) + np.sum(noise_2**2, axis=-1) + pairs.floor
     sigma = np.sqrt(np.maximum(variance, 1e-300))
-    value = np.sum(x_2 * by_2, axis=1) / sigma
+    value = np.sum(x_2 * by_2, axis=-1) / sigma
     # d sigma = (of_1' d by_1 + of_2' d by_2) / sigma
-    of_1, of_2 = (pairs.noise_1 @ noise_1[:, :, None])[:, :, 0], (pairs.noise_2 @ noise_2[:, :, None])[:, :, 0]
-    share = (value / sigma)[:, None]
-    of_1, of_2 = share * of_1, share * of_2
-    turn = _cross(x_2, by_2 - of_1 @ matrix.T) - _cross(of_2, by_2)
-    shift = _cross(x_1, in_1 - of_2 @ rotation) - _cross(of_1, in_1)
-    return value, np.column_stack([turn, shift @ tangent_plane(base)]) / sigma[:, None]
+    share = (value / sigma)[..., None]
+    of_1 = share * (pairs.noise_1 @ noise_1[..., None])[..., 0]
+    of_2 = share * (pairs.noise_2 @ noise_2[..., None])[..., 0]
+    turn = _cross(x_2, by_2 - of_1 @ np.swapaxes(matrices, 1, 2)) - _cross(of_2, by_2)
+    shift = _cross(x_1, in_1 - of_2 @ rotations) - _cross(of_1, in_1)
+    return value, np.concatenate([turn, shift @ tangent_plane(bases)], axis=-1) / sigma[..., None]
 
 
 def error_directions(
@@ -152,12 +184,12 @@ def error_directions(
 
 
 def _along(by, noise):
-    return (by[:, None, :] @ noise)[:, 0]
+    return (by[..., None, :] @ noise)[..., 0, :]
 
 
 def _cross(a, b):
     """Products of the rows of two tables: numpy.cross takes five times as long."""
-    result = np.empty(a.shape)
+    result = np.empty(np.broadcast_shapes(a.shape, b.shape))
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        result[:, i] = a[:, j] * b[:, k] - a[:, k] * b[:, j]
+        result[..., i] = a[..., j] * b[..., k] - a[..., k] * b[..., j]
     return result

@@ -38,12 +38,13 @@ _LINEAR = [_LEFT.index(e) for e in ((1, 0, 0), (0, 1, 0), (0, 0, 1), (0, 0, 0))]
 
 
 def five_point_essentials(
-    rays_1: Float[np.ndarray, "fives 5 3"], rays_2: Float[np.ndarray, "fives 5 3"]
+    rays_1: Float[np.ndarray, "fives 5 3"], rays_2: Float[np.ndarray, "fives 5 3"], imaginary: float = 1e-9
 ) -> Float[np.ndarray, "solutions 3 3"]:
     """Every real essential matrix E, `x_2' E x_1 = 0`, of every five pairs of rays; of norm sqrt 2.
 
     Fives whose conditions depend on one another, such as points on a line, are left out. With measuring errors a pair
-    of real solutions may turn complex: no five is sure to have one.
+    of real solutions may turn complex: no five is sure to have one. For where there is no other five, an `imaginary`
+    part of so much of the size is passed over, and the matrix is only nearly an essential one.
     """
     conditions = np.einsum("fni,fnj->fnij", rays_2, rays_1).reshape(-1, 5, 9)
     _, size, vectors = np.linalg.svd(conditions)
@@ -60,7 +61,7 @@ def five_point_essentials(
             times_x[:, row, monomial - 10] = 1.0
     times_x = times_x[np.isfinite(times_x).all(axis=(1, 2))]
     values, vectors = np.linalg.eig(times_x)
-    five, which = np.nonzero(np.abs(values.imag) <= 1e-9 * np.abs(values))
+    five, which = np.nonzero(np.abs(values.imag) <= imaginary * np.abs(values))
     weights = vectors[five, :, which].real[:, _LINEAR]
     essentials = np.einsum("sk,skij->sij", weights, basis[five])
     return essentials * (np.sqrt(2) / np.linalg.norm(essentials, axis=(1, 2), keepdims=True))

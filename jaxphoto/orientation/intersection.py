@@ -6,6 +6,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 _STEPS = 5
+_OPEN = (
+    0.2  # a standard deviation, of the distance, beyond which errors along the rays are on one side more than the other
+)
 
 
 class IntersectedPoints(NamedTuple):
@@ -16,7 +19,7 @@ class IntersectedPoints(NamedTuple):
     covariance: Float[np.ndarray, "points 3 3"]
     """A priori, m^2."""
     determined: Bool[np.ndarray, " points"]
-    """Whether rays meet at an angle, in front of the cameras."""
+    """Whether rays meet at an angle that their errors leave certain, in front of the cameras."""
 
 
 def intersect_points(
@@ -77,8 +80,12 @@ def intersect_with_covariance(
 
     `rays` are unit directions in the camera frame of the `image` of each row, `point` is the point it belongs to;
     `sigma_rad` is the standard deviation of image coordinates as a fraction of c. Starts from `intersect_points`, with
-    its `min_angle` (rad). A point behind one of its cameras is not determined either.
+    its `min_angle` (rad). A point behind one of its cameras is not determined either, nor one with a standard deviation
+    of more than a fifth of its distance: the errors of so weak an intersection are no longer symmetrical. Raises
+    ValueError where `sigma_rad` is not positive.
     """
+    if not sigma_rad > 0:
+        raise ValueError(f"the standard deviation of image coordinates is positive, but sigma_rad is {sigma_rad}")
     directions = np.einsum("nij,ni->nj", camera_from_object[image], rays)
     found, determined = intersect_points(positions[image], directions, point, n_points, min_angle=min_angle)
     covariance = np.full((n_points, 3, 3), np.nan)
@@ -96,9 +103,27 @@ def intersect_with_covariance(
             normal, right = np.zeros((n_points, 3, 3)), np.zeros((n_points, 3))
             np.add.at(normal, point, np.swapaxes(slope, 1, 2) @ slope)
             np.add.at(right, point, np.einsum("nki,nk->ni", slope, residual))
-            found[some] += np.linalg.solve(normal[some], right[some][..., None])[..., 0]
-    covariance[some] = sigma_rad**2 * np.linalg.inv(normal[some])
-    depth = np.einsum("ni,ni->n", turn[:, 2], found[point] - positions[image])
-    behind = np.bincount(point[~(depth < 0)], minlength=n_points) > 0
-    found[behind], covariance[behind] = np.nan, np.nan
-    return IntersectedPoints(found, covariance, determined & ~behind)
+            covariance[some] = sigma_rad**2 * _inverses(normal[some])
+            step = (covariance[some] @ right[some][..., None])[..., 0] / sigma_rad**2
+            found[some] += step
+        offsets = found[point] - positions[image]
+        depth = np.einsum("ni,ni->n", turn[:, 2], offsets)
+        distance = np.full(n_points, np.inf)
+        np.minimum.at(distance, point, np.linalg.norm(offsets, axis=1))
+        spread = np.sqrt(np.trace(covariance, axis1=1, axis2=2))
+        # What the last step still moved by more than it may be wrong by has not arrived.
+        good = spread < _OPEN * distance
+        good[some] &= np.linalg.norm(step, axis=1) < spread[some]
+    good &= np.bincount(point[~(depth < 0)], minlength=n_points) == 0
+    found[~good], covariance[~good] = np.nan, np.nan
+    return IntersectedPoints(found, covariance, determined & good)
+
+
+def _inverses(normal: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 3 3"]:
+    """NaN where a matrix is singular or no number."""
+    result = np.full_like(normal, np.nan)
+    regular = np.isfinite(normal).all(axis=(1, 2))
+    values = np.linalg.eigvalsh(normal[regular])
+    regular[regular] = values[:, 0] > 1e-15 * values[:, 2]
+    result[regular] = np.linalg.inv(normal[regular])
+    return result

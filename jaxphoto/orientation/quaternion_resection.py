@@ -14,7 +14,6 @@ It uses all points alike and needs no minimal solution: for targets and surveyed
 Source: Mazaheri and Habib (2015), "Quaternion-based solutions for the single photo resection problem", PE&RS 81(3).
 """
 
-from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -25,17 +24,27 @@ from jaxphoto.errors import BlockError
 from jaxphoto.orientation.quaternions import best_rotations, turned
 from jaxphoto.orientation.rays import ideal_coordinates, unit_rays
 from jaxphoto.orientation.resection import checked_points
-from jaxphoto.orientation.resection_steps import NO_LIMIT, STARTS, RefinedResections, refined, reprojection_errors
+from jaxphoto.orientation.resection_steps import (
+    NO_LIMIT,
+    STARTS,
+    RefinedResections,
+    both,
+    moved,
+    refined,
+    reprojection_errors,
+)
+from jaxphoto.orientation.resection_tests import check_determined, check_linear, check_unique
 
 _TURNS = 50
-_POINTS = 30  # at most that are paired
+_SETTLED = 1e-3  # change of the rotations after which no more turns are taken
+_POINTS = 60  # at most that are paired
 _INCLINED = np.deg2rad(40.0)
 _FEW = 8  # so many points may be far from a plane: cameras turned by quarters about its normal, too
 _APART = 0.05  # chord of rotations that lead to different results
-# A standard deviation, as a fraction of the distance or in rad, beyond which an orientation is no start for anything.
+_ASIDE = np.array([-0.3, -0.03, 0.03, 0.3])  # of the distance and in rad together
+# A standard deviation, of the distance or in rad, beyond which an orientation is no start for anything.
 _OPEN = 0.1
 _HOPELESS = 0.05  # root mean square residual as a fraction of c
-_AS_GOOD = 9.0  # squared residuals by which another orientation may be worse: three standard deviations
 
 
 class Resection(NamedTuple):
@@ -52,6 +61,19 @@ class Resection(NamedTuple):
     """Measured minus computed ideal image coordinates, mm."""
     iterations: int
     """Turns of the quaternion solution, at most 50."""
+    settled: bool
+    """Whether they ended because the rotation no longer changed (by 1e-3), rather than at the fiftieth."""
+    steps: int
+    """Gauss-Newton steps after them, at most 40."""
+
+
+class _Turned(NamedTuple):
+    """Orientations that the quaternion solution ends with, how many turns it took, and whether it settled."""
+
+    positions: Float[np.ndarray, "starts 3"]
+    matrices: Float[np.ndarray, "starts 3 3"]
+    turns: int
+    settled: bool
 
 
 def resect_by_quaternions(
@@ -66,18 +88,20 @@ def resect_by_quaternions(
     `xy_mm` are measured coordinates from the image centre with the standard deviation `sigma_mm`, `points` (m) the
     known points in the same order, without errors; `image` the name for messages.
 
-    Raises BlockError where there are fewer than four distinct points (three leave up to four solutions), they lie on a
-    line, the orientation is left open because the projection centre lies with the points on a dangerous curve or
-    cylinder, two orientations fit equally well (small flat figures seen from afar), or none fits.
+    Raises BlockError where there are fewer than four distinct points (three leave up to four solutions), a coordinate
+    is no number, the points lie on a line or in a plane with the projection centre, the orientation is left open by
+    more than 0.1 of the distance or 0.1 rad or by more than a covariance can tell, because the projection centre lies
+    with the points on a dangerous curve or cylinder, two orientations fit equally well (small flat figures seen from
+    afar), or none fits. ValueError where `sigma_mm` is not positive or there are not as many points as coordinates.
     """
     c, ideal = float(interior.c), ideal_coordinates(interior, np.asarray(xy_mm, float))
+    if not sigma_mm > 0:
+        raise ValueError(f"the standard deviation of image coordinates is positive, but sigma_mm is {sigma_mm}")
     local, origin = checked_points(ideal, points, image)
-    positions, matrices, turns = _starts(c, ideal, local)
-    found = refined(c, ideal, local, positions, matrices, NO_LIMIT)
-    best = int(np.argmin(found.costs))
-    position, matrix = _mirrored(found.positions[best], found.matrices[best], local)
-    other = refined(c, ideal, local, position, matrix, NO_LIMIT)
-    found = RefinedResections(*(np.concatenate(both) for both in zip(found, other, strict=True)))
+    start = _starts(c, ideal, local)
+    found = refined(c, ideal, local, start.positions, start.matrices, NO_LIMIT)
+    positions, matrices = _alike(c, ideal, local, found)
+    found = both(found, refined(c, ideal, local, positions, matrices, NO_LIMIT))
     best = int(np.argmin(found.costs))
     cost, redundancy = float(found.costs[best]), 2 * len(local) - 6
     if not cost < 2 * len(local) * _HOPELESS**2:
@@ -88,8 +112,9 @@ def resect_by_quaternions(
     sigma = sigma_mm / c
     sigma0 = float(np.sqrt(cost / redundancy)) / sigma
     noise = sigma * max(1.0, sigma0)
-    _check_determined(found.normals[best], noise, image)
-    _check_unique(found, best, noise, image)
+    check_determined(found, best, noise, image, _OPEN)
+    check_unique(found, best, noise, image)
+    check_linear(c, ideal, local, found, best, noise, image)
     scale = np.repeat([found.distances[best], 1.0], 3)
     position, matrix = found.positions[best], found.matrices[best]
     in_camera = (local - position) @ matrix.T
@@ -99,31 +124,22 @@ def resect_by_quaternions(
         sigma**2 * scale[:, None] * np.linalg.inv(found.normals[best]) * scale,
         sigma0,
         ideal + c * in_camera[:, :2] / in_camera[:, 2:],
-        turns,
+        start.turns,
+        start.settled,
+        found.steps,
     )
 
 
-def _starts(c, ideal, points):
-    """Positions and matrices, up to `STARTS`, from the quaternion solution, best first; and the turns it took."""
-    rays = unit_rays(c, ideal)
-    some = np.unique(np.linspace(0, len(points) - 1, min(len(points), _POINTS)).astype(int))
-    j, k = some[np.array(list(combinations(range(len(some)), 2)))].T
-    normals, sides = np.cross(rays[j], rays[k]), points[k] - points[j]
-    sides = sides / np.sqrt(np.mean(np.sum(sides**2, axis=1)))
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    useful = length[:, 0] > 1e-9
-    normals, sides = (normals / np.maximum(length, 1e-300))[useful], sides[useful]
-    matrices, turns = _from_plane(ideal, points), 0
-    for _ in range(_TURNS):
-        across = normals @ matrices  # M' n
-        along = np.einsum("ni,sni->sn", sides, across)[..., None] * sides
-        targets = np.sum(sides**2, axis=1)[:, None] * across - along
-        new = best_rotations(np.einsum("ni,snj->sij", normals, targets))
+def _starts(c, ideal, points) -> _Turned:
+    """Up to `STARTS` orientations from the quaternion solution, best first."""
+    matrices = _from_plane(ideal, points)
+    product = _condition(unit_rays(c, ideal), points)
+    turns, change = 0, np.inf
+    while turns < _TURNS and change > _SETTLED:
+        new = best_rotations((matrices.reshape(-1, 9) @ product).reshape(-1, 3, 3))
         change, matrices, turns = np.max(np.abs(new - matrices)), new, turns + 1
-        if change < 1e-12:
-            break
     # The rays turned round, from the points: sum (I - d d') (S - X) = 0.
-    directions = rays @ matrices
+    directions = unit_rays(c, ideal) @ matrices
     across = np.eye(3) - directions[..., :, None] * directions[..., None, :]
     right = np.einsum("snij,nj->si", across, points)
     positions = np.linalg.solve(across.sum(axis=1), right[..., None])[..., 0]
@@ -132,7 +148,22 @@ def _starts(c, ideal, points):
     for k in np.argsort(errors, kind="stable"):
         if all(np.linalg.norm(matrices[k] - matrices[i]) > _APART for i in chosen):
             chosen.append(int(k))
-    return positions[chosen[:STARTS]], matrices[chosen[:STARTS]], turns
+    return _Turned(positions[chosen[:STARTS]], matrices[chosen[:STARTS]], turns, bool(change <= _SETTLED))
+
+
+def _condition(rays, points) -> Float[np.ndarray, "9 9"]:
+    """What takes M, row by row, to the sum of n (|V|^2 M' n - V V' M' n)', of which the next M is the best rotation."""
+    some = np.unique(np.linspace(0, len(points) - 1, min(len(points), _POINTS)).astype(int))
+    j, k = some[np.stack(np.triu_indices(len(some), 1))]
+    normals, sides = np.cross(rays[j], rays[k]), points[k] - points[j]
+    sides = sides / np.sqrt(np.mean(np.sum(sides**2, axis=1)))
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    useful = length[:, 0] > 1e-9
+    normals, sides = (normals / np.maximum(length, 1e-300))[useful], sides[useful]
+    twice = (normals[:, :, None] * normals[:, None]).reshape(-1, 9)
+    across = np.sum(sides**2, axis=1)[:, None, None] * np.eye(3) - sides[:, :, None] * sides[:, None]
+    result = (twice.T @ across.reshape(-1, 9)).reshape(3, 3, 3, 3)  # (row, row, column, column)
+    return result.transpose(0, 2, 1, 3).reshape(9, 9)
 
 
 def _from_plane(ideal, points) -> Float[np.ndarray, "starts 3 3"]:
@@ -154,34 +185,23 @@ def _from_plane(ideal, points) -> Float[np.ndarray, "starts 3 3"]:
     return np.array(starts)
 
 
-def _mirrored(position, matrix, points):
-    """Where a distant flat figure looks alike from: half a turn about its normal, and another about the sight line."""
+def _alike(c, ideal, points, found: RefinedResections):
+    """Where else the points may look as they do from the best place: positions and matrices.
+
+    To both sides along the direction that is least determined, which leads over a dangerous cylinder to the orientation
+    beyond it. And of a distant flat figure half a turn about its normal, and another about the sight line.
+    """
+    best = int(np.argmin(found.costs))
+    position, matrix, distance = found.positions[best], found.matrices[best], found.distances[best : best + 1]
+    weakest = np.linalg.eigh(found.normals[best])[1][:, 0]
+    steps = np.outer(_ASIDE, weakest)
+    positions, matrices = moved(position[None], matrix[None], distance, steps)
     normal = np.linalg.svd(points, full_matrices=False)[2][2]
     sight = -position / np.linalg.norm(position)
     half_turn = lambda axis: 2 * np.outer(axis, axis) - np.eye(3)  # noqa: E731
-    other = matrix @ half_turn(sight) @ half_turn(normal)
-    return (other.T @ (matrix @ position))[None], other[None]
-
-
-def _check_determined(normal, sigma: float, image: str) -> None:
-    values = np.linalg.eigvalsh(normal)
-    weakest = sigma / np.sqrt(values[0]) if values[0] > 1e-13 * values[-1] else np.inf
-    if not weakest < _OPEN:
-        raise BlockError(
-            f"the known points of image {image} leave its orientation open, as points close to a line do, or points "
-            "on a dangerous cylinder or curve through the projection centre: measure known points elsewhere in it"
-        )
-
-
-def _check_unique(found: RefinedResections, best: int, sigma: float, image: str) -> None:
-    near = found.costs - found.costs[best] < _AS_GOOD * sigma**2
-    apart = np.linalg.norm(found.matrices - found.matrices[best], axis=(1, 2))
-    # Of the same minimum: closer than its own standard deviations allow it to be told apart.
-    same = np.sqrt(np.max(np.diagonal(np.linalg.inv(found.normals[best]))[3:])) * sigma
-    if np.any(near & (apart > np.maximum(5 * same, 1e-6))):
-        turn = np.rad2deg(2 * np.arcsin(min(float(np.max(apart[near])) / np.sqrt(8), 1.0)))
-        raise BlockError(
-            f"two orientations of image {image}, turned by {turn:.1f} deg, fit its known points equally well, as few "
-            "points and flat figures seen from afar do: measure points off the plane or over more of the "
-            "image, or give omega_deg, phi_deg, kappa_deg in images.csv"
-        )
+    mirrored = matrix @ half_turn(sight) @ half_turn(normal)
+    beyond = mirrored.T @ (matrix @ position)
+    error = reprojection_errors(c, ideal, points, beyond[None], mirrored[None])
+    if np.sqrt(np.mean(error**2)) < _HOPELESS * c:
+        positions, matrices = np.concatenate([positions, beyond[None]]), np.concatenate([matrices, mirrored[None]])
+    return positions, matrices

@@ -23,10 +23,10 @@ def cross_matrices(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 
     return result
 
 
-def turned(matrix: Float[np.ndarray, "3 3"], theta: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+def turned(matrix: Float[np.ndarray, "*n 3 3"], theta: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
     """`small_rotation(theta) @ matrix` of `jaxphoto.rotation`: turned by `theta` (rad) on the camera's side."""
-    half = 0.5 * np.linalg.norm(theta)
-    quaternion = np.concatenate([[np.cos(half)], -0.5 * np.sinc(half / np.pi) * theta])
+    half = 0.5 * np.linalg.norm(theta, axis=-1, keepdims=True)
+    quaternion = np.concatenate([np.cos(half), -0.5 * np.sinc(half / np.pi) * theta], axis=-1)
     return matrices_from_quaternions(quaternion) @ matrix
 
 

@@ -4,6 +4,8 @@ The fives are always the same ones for as many points, so a result can be had ag
 orientation costs each judge its squared misclosure, a gross error no more than the limit.
 """
 
+from itertools import combinations
+
 import numpy as np
 from jaxtyping import Float
 
@@ -11,43 +13,73 @@ from jaxphoto.errors import BlockError
 from jaxphoto.orientation.coplanarity import RayPairs, behind, essential, misclosures
 from jaxphoto.orientation.essential import linear_essential, orientations
 from jaxphoto.orientation.five_point import five_point_essentials
+from jaxphoto.orientation.homography import homographies, homography_orientations, transfer_errors
 
 _FIVES = 60  # at a time
 _BATCHES = 40  # at most: three in four false matches still leave two fives of true ones
 _GOOD_FIVES = 12.0  # to be expected: one alone may be a poor one, of points close together
 _JUDGES = 300
 _LIMIT = 6.0  # standard deviations; wider than a blunder, because five points leave errors of their own
+_FEW, _NEARLY = 8, 0.1  # of so few points, essential matrices with imaginary parts are starts, too
+_FOURS = 20  # of the fives, of which four points make a homography
+_OFF_PLANE = 8.0  # the same of points and a homography, which four have more errors of
+_PLANE, _LEAST_PLANE = 0.2, 6  # part and number of the points that make a plane at least
 _BEST = 16  # essential matrices that are looked at for the points in front
-_STARTS = 6
+_STARTS, _STARTS_OF_FEW = 8, 40
 _APART = np.deg2rad(3.0)  # starts closer to one another than this in rotation and base lead to the same result
 
 
-def candidates(pairs: RayPairs) -> list[tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]]:
-    """Rotations `camera_2_from_camera_1` and bases (unit vectors) worth adjusting, best first; none may be found."""
+def candidates(pairs: RayPairs) -> tuple[Float[np.ndarray, "starts 3 3"], Float[np.ndarray, "starts 3"]]:
+    """Rotations `camera_2_from_camera_1` and bases (unit vectors) worth adjusting; none may be found."""
     n = len(pairs.rays_1)
     rng = np.random.default_rng(0)
     judges = pairs if n <= _JUDGES else pairs.take(np.sort(rng.choice(n, _JUDGES, replace=False)))
     best, costs = np.zeros((0, 3, 3)), np.zeros(0)
+    plane, least = np.zeros((0, 3, 3)), np.inf
     for batch in range(1, _BATCHES + 1):
         fives = _fives(rng, n)
-        found = five_point_essentials(pairs.rays_1[fives], pairs.rays_2[fives])
-        best, costs = _kept(np.concatenate([best, found]), np.concatenate([costs, _costs(found, judges)]))
+        found = five_point_essentials(pairs.rays_1[fives], pairs.rays_2[fives], 1e-9 if n > _FEW else _NEARLY)
+        best, costs = np.concatenate([best, found]), np.concatenate([costs, _costs(found, judges)])
+        order = np.argsort(costs, kind="stable")[: _BEST if n > _FEW else None]
+        best, costs = best[order], costs[order]
+        flat = homographies(pairs.rays_1[fives[:_FOURS, :4]], pairs.rays_2[fives[:_FOURS, :4]])
+        misfits = np.minimum(transfer_errors(flat, judges) ** 2, _OFF_PLANE**2).sum(axis=1)
+        if np.min(misfits) < least:
+            plane, least = flat[np.argmin(misfits)][None], float(np.min(misfits))
         if len(costs):
             share = np.mean(np.abs(misclosures(best[:1], judges)) < _LIMIT)
-            if batch * _FIVES * share**5 > _GOOD_FIVES:
+            if n <= _FEW or batch * _FIVES * share**5 > _GOOD_FIVES:
                 break
     if not len(costs):
-        return []
+        return best, np.zeros((0, 3))
     best = np.concatenate([best, _linear(best[:1], pairs)])
     rotations, bases = (part.reshape(-1, *part.shape[2:]) for part in orientations(best))
+    both = _of_plane(plane, pairs)
+    if both:
+        rotations = np.concatenate([[rotation for rotation, _ in both], rotations])
+        bases = np.concatenate([[base for _, base in both], bases])
     # A point behind a camera costs as much as a gross error.
     squares = np.minimum(misclosures(essential(rotations, bases), judges) ** 2, _LIMIT**2)
     costs = np.where(behind(rotations, bases, judges, _LIMIT), _LIMIT**2, squares).sum(axis=1)
-    return _distinct(rotations, bases, np.argsort(costs, kind="stable"))
+    # Both orientations of a plane are worth a look, whatever they cost before they are adjusted.
+    order = np.concatenate([np.arange(len(both)), len(both) + np.argsort(costs[len(both) :], kind="stable")])
+    return _distinct(rotations, bases, order, _STARTS if n > _FEW else _STARTS_OF_FEW)
+
+
+def _of_plane(plane, pairs: RayPairs):
+    """The orientations of the homography of the points that agree with it; none where these are few."""
+    for _ in range(3):
+        agrees = transfer_errors(plane, pairs)[0] < _OFF_PLANE
+        if agrees.sum() < max(_LEAST_PLANE, _PLANE * len(agrees)):
+            return []
+        plane = homographies(pairs.rays_1[agrees][None], pairs.rays_2[agrees][None])
+    return homography_orientations(plane[0], pairs.rays_1[agrees])
 
 
 def _fives(rng: np.random.Generator, n: int):
-    """Indices (fives, 5) of different points."""
+    """Indices (fives, 5) of different points: all, of a few points."""
+    if n <= _FEW:
+        return np.array(list(combinations(range(n), 5)))
     if n < 50:
         return np.argsort(rng.random((_FIVES, n)), axis=1)[:, :5]
     drawn = np.sort(rng.integers(n, size=(2 * _FIVES, 5)), axis=1)
@@ -56,11 +88,6 @@ def _fives(rng: np.random.Generator, n: int):
 
 def _costs(essentials, judges: RayPairs):
     return np.minimum(misclosures(essentials, judges) ** 2, _LIMIT**2).sum(axis=1)
-
-
-def _kept(essentials, costs):
-    order = np.argsort(costs, kind="stable")[:_BEST]
-    return essentials[order], costs[order]
 
 
 def _linear(best, pairs: RayPairs):
@@ -72,18 +99,14 @@ def _linear(best, pairs: RayPairs):
         return np.zeros((0, 3, 3))
 
 
-def _distinct(rotations, bases, order):
-    """The first of every group of like orientations, `_STARTS` at most."""
+def _distinct(rotations, bases, order, most: int):
+    """The first of every group of like orientations, so many at most."""
+    turned = 0.5 * (rotations.reshape(-1, 9) @ rotations.reshape(-1, 9).T - 1)
+    far = np.minimum(turned, bases @ bases.T) < np.cos(_APART)
     chosen: list[int] = []
     for k in order:
-        if all(_angle(rotations[k], bases[k], rotations[i], bases[i]) > _APART for i in chosen):
+        if far[k, chosen].all():
             chosen.append(k)
-        if len(chosen) == _STARTS:
+        if len(chosen) == most:
             break
-    return [(rotations[k], bases[k]) for k in chosen]
-
-
-def _angle(rotation, base, other_rotation, other_base) -> float:
-    """The larger of the angles (rad) between two rotations and two bases."""
-    turn = np.arccos(np.clip(0.5 * (np.sum(rotation * other_rotation) - 1), -1, 1))
-    return max(turn, np.arccos(np.clip(base @ other_base, -1, 1)))
+    return rotations[chosen], bases[chosen]

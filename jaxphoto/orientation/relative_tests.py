@@ -4,8 +4,10 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxphoto.errors import BlockError
-from jaxphoto.orientation.coplanarity import RayPairs, misclosures
+from jaxphoto.orientation.bending import bends, typical_errors
+from jaxphoto.orientation.coplanarity import RayPairs, essential, misclosures, moved
 from jaxphoto.orientation.quaternions import best_rotations
+from jaxphoto.orientation.relative_steps import RelativeOrientation
 
 _OPEN = 0.1  # rad: a standard deviation beyond which an orientation is no start for anything
 _SAME_PLACE = 3.0  # parallaxes below so many times their noise are none
@@ -13,22 +15,48 @@ _QUANTILE = 0.8  # of the points; their parallax counts, so that a few near ones
 _FALSE_ALARM = np.log(1e-2)
 
 
-def check_determined(normal: Float[np.ndarray, "5 5"], images: str) -> None:
-    """Raises BlockError where the normal matrix (rad^-2) leaves a direction of the five unknowns open."""
-    values = np.linalg.eigvalsh(normal)
-    sigma = 1 / np.sqrt(values[0]) if values[0] > 1e-13 * values[-1] else np.inf
-    if not sigma < _OPEN:
-        known = f"to {np.rad2deg(sigma):.0f} deg only" if sigma < 3 else "not at all"
-        raise BlockError(
-            f"the common points of {images} determine their relative orientation {known}, as points on a line, close "
-            "together or on a critical surface do: measure points that spread over both images, near and far"
-        )
+def check_determined(one: RelativeOrientation, images: str) -> None:
+    """Raises BlockError where a direction of the five unknowns is open."""
+    if not _sigma(one) < _OPEN:
+        raise _open(one, images)
+
+
+def check_described(one: RelativeOrientation, images: str) -> None:
+    """Raises BlockError where the covariance does not tell the errors."""
+    if not one.described:
+        raise _open(one, images)
+
+
+def is_described(one: RelativeOrientation, pairs: RayPairs) -> bool:
+    """Whether errors are as the covariance says (see `bending`); of `pairs`, all points, those that agree count."""
+    pairs = pairs.take(one.agrees)
+    noise = max(1.0, np.nan_to_num(one.sigma0))
+    steps = typical_errors(np.linalg.inv(one.covariance), noise)
+    places = moved(one.camera_2_from_camera_1[None], one.base[None], steps)
+    costs = np.sum(misclosures(essential(*places), pairs) ** 2, axis=1)
+    least = np.sum(misclosures(essential(one.camera_2_from_camera_1, one.base)[None], pairs) ** 2)
+    return not bends(costs - least, 5, noise)
+
+
+def _sigma(one: RelativeOrientation) -> float:
+    """Of the direction that is told worst (rad)."""
+    return float(np.sqrt(np.linalg.eigvalsh(one.covariance)[-1])) if np.isfinite(one.covariance).all() else np.inf
+
+
+def _open(one: RelativeOrientation, images: str) -> BlockError:
+    sigma = _sigma(one)
+    known = f"to {np.rad2deg(sigma):.2g} deg only" if sigma < 3 else "not at all"
+    return BlockError(
+        f"the common points of {images} determine their relative orientation {known}, as few points, points on a "
+        "line, close together or on a critical surface do: measure points that spread over both images, near and "
+        "far"
+    )
 
 
 def check_not_a_line(pairs: RayPairs, images: str) -> None:
     """Raises BlockError where the rays of an image lie in one plane, but for noise: its points are on a line."""
     for rays, noise in ((pairs.rays_1, pairs.noise_1), (pairs.rays_2, pairs.noise_2)):
-        across = np.sqrt(np.linalg.eigvalsh(rays.T @ rays)[0] / len(rays))
+        across = np.linalg.svd(rays, compute_uv=False)[2] / np.sqrt(len(rays))
         if across < _SAME_PLACE * np.sqrt(0.5 * np.mean(np.sum(noise**2, axis=(1, 2)))):
             raise BlockError(
                 f"the common points of {images} lie on a line, which leaves their relative orientation open: measure "
@@ -57,7 +85,7 @@ def check_parallax(pairs: RayPairs, sigma0: float, images: str) -> None:
         )
 
 
-def check_not_chance(essential: Float[np.ndarray, "3 3"], pairs: RayPairs, agrees: int, limit: float, images: str):
+def check_not_chance(matrix: Float[np.ndarray, "3 3"], pairs: RayPairs, agrees: int, limit: float, images: str):
     """Raises BlockError where as many points would agree with the best of all orientations if all were false.
 
     The share of false matches that agree is that of wrong partners, each point with those of others. Of the n points,
@@ -69,8 +97,11 @@ def check_not_chance(essential: Float[np.ndarray, "3 3"], pairs: RayPairs, agree
         return
     shifts = np.unique(np.linspace(1, n - 1, min(10, n - 1)).astype(int))
     false = [pairs._replace(rays_2=np.roll(pairs.rays_2, s, 0), noise_2=np.roll(pairs.noise_2, s, 0)) for s in shifts]
-    hits = np.concatenate([np.abs(misclosures(essential[None], wrong)[0]) < limit for wrong in false])
-    chance = np.clip((hits.sum() + 1) / (len(hits) + 2), 1e-6, 0.999)
+    value = np.concatenate([np.abs(misclosures(matrix[None], wrong)[0]) for wrong in false])
+    hits = np.sum(value < limit)
+    # Of few points no wrong partner may agree: then half of the median misclosure counts as evenly spread.
+    chance = (hits + 1) / (len(value) + 2) if hits else min(0.5, 0.5 * limit / np.median(value))
+    chance = np.clip(chance, 1e-6, 0.999)
     share = min((agrees - 5) / (n - 5), 1 - 1e-12)
     # Chernoff's bound of the binomial tail, and the logarithm of the number of fives.
     tail = 0.0

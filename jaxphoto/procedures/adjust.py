@@ -1,12 +1,23 @@
 """The main job: complete the start values of a block and adjust it."""
 
+import dataclasses
+
+import numpy as np
+
 from jaxphoto.adjustment import LEAST, MAX_STEPS, Adjustment, Sizes, solve
-from jaxphoto.block import Block
+from jaxphoto.block import Block, sensor_rows
+from jaxphoto.errors import BlockError
 from jaxphoto.orientation import approximate
-from jaxphoto.orientation.approximate import has_beginning
+from jaxphoto.orientation.approximate import completed
 from jaxphoto.procedures.orientation import orient_block
+from jaxphoto.procedures.orientation.network import empty_network, misfits, sight_of
 from jaxphoto.statistics import prepare_statistics
 from jaxphoto.unknowns import Unknowns
+
+# Images that a message names.
+_NAMED = 8
+# Rays that miss by more (rad) are off by more than lenses distort.
+_NEAR = 0.02
 
 
 def adjust(
@@ -20,8 +31,9 @@ def adjust(
     """Self-calibrating bundle adjustment of `block`.
 
     `start` gives every unknown an approximate value; where it is None, those of the block are completed by resection
-    and intersection, and where no image is known or sees four known points, found from image points alone
-    (docs/orient.md). `priors` says what is FREE, FIXED or Weighted; where it is None, what the block says.
+    and intersection, and where these do not reach all images, found from image points alone and brought to the frame
+    of what is known (docs/orient.md). `priors` says what is FREE, FIXED or Weighted; where it is None, what the block
+    says.
 
     What is compiled for a block serves all of similar size; a study of many blocks compiles once if it gives `sizes`
     that all fit into (`common_sizes`).
@@ -43,5 +55,42 @@ def adjust_for_tables(block: Block, max_steps: int = MAX_STEPS) -> Adjustment:
 
 
 def start_of(block: Block) -> Unknowns:
-    """All approximate values of `block`: `approximate`, after its images are oriented to one another if need be."""
-    return approximate(block if has_beginning(block) else orient_block(block))
+    """All approximate values of `block`: `approximate`, after its images are oriented to one another if need be.
+
+    Need is where resection and intersection do not reach all images, or where rays then miss their points by far, as
+    from a few images known roughly.
+
+    Raises BlockError where this fails as well, naming the images that are left.
+    """
+    reached = dataclasses.replace(block, start=completed(block))
+    known, given = np.asarray(reached.start.image_known), np.array(block.start.image_known)
+    given[sensor_rows(block, block.start.unknowns).image] = True
+    if given.all() or (known.all() and _fits(reached)):
+        return approximate(reached)
+    try:
+        return approximate(orient_block(block))
+    except BlockError as error:
+        if known.all():
+            return approximate(reached)
+        if not known.any():
+            raise
+        left = [name for name, is_known in zip(block.images, known, strict=True) if not is_known]
+        raise BlockError(
+            f"{len(left)} of {len(known)} images ({', '.join(left[:_NAMED])}{', ...' if len(left) > _NAMED else ''}) "
+            "have no approximate orientation and see too few known points for a resection; by their common points, "
+            f"too, they cannot be oriented: {error}"
+        ) from error
+
+
+def _fits(block: Block) -> bool:
+    """Whether nine in ten rays to known points pass near them, and none of these lies behind its image."""
+    start = block.start.unknowns
+    sight = sight_of(block, start.interior)
+    network = empty_network(block)._replace(
+        positions=np.asarray(start.exterior.position),
+        camera_from_object=np.asarray(start.exterior.camera_from_object),
+        points=np.asarray(start.points),
+    )
+    rows = np.flatnonzero(np.asarray(block.start.point_known)[sight.point])
+    off = misfits(sight, network, rows) * sight.sigma[rows]
+    return bool(np.isfinite(off).all() and np.quantile(off, 0.9) < _NEAR)

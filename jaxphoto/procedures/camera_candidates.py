@@ -19,7 +19,8 @@ from jaxphoto.camera import (
     needed_constants,
     set_parameter,
 )
-from jaxphoto.camera.conversion import fitted, usual_coefficients
+from jaxphoto.camera.conversion import fitted
+from jaxphoto.camera.equivalence import usual_coefficients
 from jaxphoto.errors import InputError
 from jaxphoto.unknowns import FIXED, FREE, Unknowns, Weighted
 
@@ -58,13 +59,15 @@ def candidate_of(text: str) -> Candidate:
 def with_candidate(block: Block, candidate: Candidate, known: Unknowns | None) -> Block:
     """The block with the candidate for all cameras, from `known` orientations and points if there are any.
 
-    c, x_p and y_p stay what the block says of them, and so does a coefficient that it weights; the other coefficients
-    of the candidate are free. They start from the block's distortion, converted where its model is another.
+    c, x_p and y_p stay what the block says of them: a weighted value is carried over where the conversion to another
+    model moves them, as SMAC's c does with R0. The coefficients of the candidate are free, weighted ones too: those who
+    have them would else explain an observation more than those who do not. They start from the block's distortion,
+    converted where its model is another. Residuals are of measured coordinates, for every model.
     """
     interior, priors = {}, {}
     for name, given in block.start.unknowns.interior.items():
         interior[name] = _start(given, candidate, block.sensors[name])
-        priors[name] = _priors(given, block.priors.interior[name], interior[name], candidate)
+        priors[name] = _priors(given, block.priors.interior[name], interior[name], candidate.free)
     block = eqx.tree_at(lambda b: (b.start.unknowns.interior, b.priors.interior), block, (interior, priors))
     if known is None:
         return block
@@ -86,18 +89,23 @@ def _start(given: InteriorOrientation, candidate: Candidate, sensor: Sensor) -> 
         lengths = {"f": float(given.c), "b": sensor.width_mm / 3}
         constants = {field: lengths[field] for field in needed_constants(kind).values()}
         interior = InteriorOrientation(given.c, given.x_p, given.y_p, kind(**constants))
-    interior = dataclasses.replace(interior, residuals=given.residuals)
+    interior = dataclasses.replace(interior, residuals="measured")
     for name in held:
         interior = set_parameter(interior, name, 0.0)
     return jax.tree.map(on_device, interior)
 
 
-def _priors(given, given_priors, interior: InteriorOrientation, candidate: Candidate):
-    priors = jax.tree.map(lambda _: FIXED, interior)
-    for name in ("c_mm", "xp_mm", "yp_mm"):
-        priors = set_parameter(priors, name, get_parameter(given_priors, name))
-    same = type(given.distortion) is candidate.distortion
-    for name in candidate.free:
-        stated = get_parameter(given_priors, name) if same else FREE
-        priors = set_parameter(priors, name, stated if isinstance(stated, Weighted) else FREE)
-    return priors
+def _priors(given: InteriorOrientation, priors, interior: InteriorOrientation, free: tuple[str, ...]):
+    """Those of the candidate, whose camera `interior` was made of the `given` one."""
+    own = jax.tree.map(lambda _: FIXED, interior)
+    scale = float(interior.c) / float(given.c)
+    for name, factor in (("c_mm", scale), ("xp_mm", 1.0), ("yp_mm", 1.0)):
+        prior = get_parameter(priors, name)
+        if isinstance(prior, Weighted):
+            # As far from the start as it was, in the unit that c now has.
+            start, before = (float(get_parameter(camera, name)) for camera in (interior, given))
+            prior = Weighted(start + factor * (float(prior.value) - before), factor * float(prior.sigma))
+        own = set_parameter(own, name, prior)
+    for name in free:
+        own = set_parameter(own, name, FREE)
+    return own

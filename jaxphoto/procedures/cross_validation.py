@@ -8,7 +8,6 @@ import dataclasses
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -65,8 +64,7 @@ def fold_blocks(block: Block, fold: Int[np.ndarray, "rows"]) -> tuple[list[Block
 def measured_discrepancies(block: Block, unknowns: Unknowns) -> Float[np.ndarray, "rows 2"]:
     """Measured minus predicted image coordinate (mm) of every image row, whatever the direction of the distortion.
 
-    Models in the measured coordinate have residuals of ideal ones, which are stretched by distortion and scaled with c:
-    they are taken back by the model's derivative, so that all models are compared by the same numbers.
+    It is the residual "measured" of `InteriorOrientation`, by which all models are compared by the same numbers.
     """
     p = block.image_points
     found = np.zeros((len(p.image), 2))
@@ -77,7 +75,7 @@ def measured_discrepancies(block: Block, unknowns: Unknowns) -> Float[np.ndarray
         if len(own):
             image, point = p.image[own], p.point[own]
             exterior = ExteriorOrientation(positions[image], matrices[image])
-            numbers = jax.tree.map(lambda v: np.asarray(v, float), interior)
+            numbers = jax.tree.map(lambda v: np.asarray(v, float), dataclasses.replace(interior, residuals="measured"))
             rows = (exterior, still(unknowns.points)[point], still(p.xy)[own])
             found[own] = call_compiled(_discrepancies, numbers, *rows, block.corrections)
     return found
@@ -87,9 +85,6 @@ def measured_discrepancies(block: Block, unknowns: Unknowns) -> Float[np.ndarray
 def _discrepancies(interior, exterior, points, xy, corrections):
     def of_one(exterior, point, xy):
         aim = apparent_point(exterior.position, point, corrections)
-        residual = image_residual(interior, exterior, aim, xy)
-        if interior.distortion.domain == "ideal" or interior.residuals == "measured":
-            return residual
-        return jnp.linalg.solve(jax.jacfwd(interior.ideal_from_measured)(xy), residual)
+        return image_residual(interior, exterior, aim, xy)
 
     return jax.vmap(of_one)(exterior, points, xy)

@@ -1,7 +1,7 @@
 """Which distortion model does one block need: cross-validation, information criteria and significance of several.
 
-Every candidate is adjusted to all observations, and to the block without each of k folds (`cross_validation`). All are
-compared by the same numbers, residuals of *measured* image coordinates. Orientations and points are estimated anew with
+Every candidate is adjusted to all observations, and to the block without each of k folds (`cross_validation`); each by
+the same residuals, those of *measured* image coordinates. Orientations and points are estimated anew with
 every candidate and grow with the block: they are not what is chosen. What is left for the camera are
 
     N = observations + constraints - unknowns other than interior ones = redundancy + p
@@ -23,7 +23,6 @@ from jaxtyping import Float
 from scipy.special import fdtrc
 
 from jaxphoto.adjustment import Adjustment, Sizes
-from jaxphoto.arrays import still
 from jaxphoto.block import Block
 from jaxphoto.errors import BlockError, DatumError, InputError, RankError
 from jaxphoto.procedures.adjust import adjust
@@ -90,8 +89,8 @@ class ModelChoice(NamedTuple):
 def model_choice(block: Block, models: Iterable[str | Candidate], *, k: int = FOLDS, seed: int = 0) -> ModelChoice:
     """Compare candidates (`candidate_of`) for all cameras of `block`; `k` = 0 leaves cross-validation out.
 
-    c, x_p and y_p are what the block says of them, and so is a weighted coefficient; other coefficients of a candidate
-    are free. What cannot be adjusted is judged unfit, with the reason.
+    c, x_p and y_p are what the block says of them (`with_candidate`), the coefficients of a candidate are free. What
+    cannot be adjusted is judged unfit, with the reason.
 
     Raises InputError for unknown or repeated candidates or fewer than two folds, BlockError where nothing can be left
     out.
@@ -113,7 +112,7 @@ def model_choice(block: Block, models: Iterable[str | Candidate], *, k: int = FO
             adjusted = adjust(own, None if known is None else own.start.unknowns, sizes=sizes)
             found = _judge(candidate, adjusted)
             squares.append(_predicted(own, adjusted, fold, sizes) if k else None)
-            known = adjusted.unknowns if known is None else known
+            known = adjusted.unknowns if known is None and bool(adjusted.converged) else known
         except (BlockError, DatumError, RankError) as error:
             found = Judged(candidate, str(error))
             squares.append(None)
@@ -125,9 +124,7 @@ def _judge(candidate: Candidate, adjusted: Adjustment) -> Judged:
     if not bool(adjusted.converged):
         return Judged(candidate, adjusted.outcome.value)
     block = adjusted.block
-    apart = measured_discrepancies(block, adjusted.unknowns)
-    others = sum(float((np.asarray(v) ** 2).sum()) for v in adjusted.residuals[1:-1])
-    s = float(((apart / still(block.image_points.sigma)) ** 2).sum()) + others
+    apart, s = measured_discrepancies(block, adjusted.unknowns), float(adjusted.square_sum)
     p, r = adjusted.n_unknowns["interior"], adjusted.redundancy
     n = r + p
     fit = n * np.log(s / n) if r > 0 else _NAN

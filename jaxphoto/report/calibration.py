@@ -2,8 +2,9 @@
 
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from textwrap import wrap
 
 import numpy as np
 import pandas as pd
@@ -12,7 +13,8 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 from rich.console import Console
 
-from jaxphoto.procedures.calibration import Calibration, rms_px
+from jaxphoto.camera import Sensor
+from jaxphoto.procedures.calibration import Calibration, Detection, rms_px
 from jaxphoto.report.page import STYLE
 from jaxphoto.report.plots import new_figure
 from jaxphoto.report.results import made_whole, write_results, write_summary
@@ -24,13 +26,16 @@ _PAGE = """<!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8"><title>{{ title }}</title><style>{{ style }}</style></head><body>
 <h1>{{ title }}: photographs</h1>
 {{ table }}
-{% for name in pictures %}<h2>{{ name }}</h2><img alt="targets and residuals" src="photographs/{{ name }}.png">
+{% for name in pictures %}<h2>{{ name }}</h2>
+<img alt="targets and residuals" src="photographs/{{ name|urlencode }}.png">
 {% endfor %}</body></html>
 """
 _WIDTH_INCHES = 6.4
 # Of the width of the picture: how long the arrow of a typical residual is drawn.
 _ARROW = 0.03
 _SHOWN = 4
+# Characters of a line of a title.
+_LINE = 80
 
 
 def photographs_table(calibration: Calibration) -> pd.DataFrame:
@@ -51,25 +56,52 @@ def targets_figure(calibration: Calibration, image: str, picture: np.ndarray | N
     place, v = sensor.px_from_mm(rows.xy_mm[own]), calibration.residuals_px[own]
     typical = max(rms_px(calibration.residuals_px), 1e-12)
     scale = _ARROW * sensor.width_px / typical
+    figure = _photograph_figure(
+        sensor, picture, f"{image}: RMS {rms_px(v):.3f} px, residuals {scale:.0f} times enlarged"
+    )
+    (axes,) = figure.axes
+    axes.plot(*place.T, "+", ms=5, color="tab:cyan")
+    axes.quiver(
+        *place.T, *(scale * v).T, color="tab:red", angles="xy", scale_units="xy", scale=1, width=0.003, headwidth=4
+    )
+    return figure
+
+
+def left_out_figure(
+    calibration: Calibration, image: str, picture: np.ndarray | None = None, found: Detection | None = None
+) -> Figure:
+    """A photograph that is not used, with the reason and the targets that were `found` in it nevertheless."""
+    place = np.zeros((0, 2)) if found is None else found.column_row
+    title = f"{image}: not used, {calibration.left_out[image]}"
+    figure = _photograph_figure(calibration.sensor, picture, title)
+    (axes,) = figure.axes
+    axes.plot(*place.T, "x", ms=5, color="tab:orange")
+    return figure
+
+
+def _photograph_figure(sensor: Sensor, picture: np.ndarray | None, title: str) -> Figure:
+    """The format in pixels, grey values in it where they are given."""
     figure = new_figure(_WIDTH_INCHES, _WIDTH_INCHES * sensor.height_px / sensor.width_px + 0.6)
     axes = figure.subplots()
     if picture is not None:
         step = max(1, sensor.width_px // 1000)
         extent = (0, sensor.width_px, sensor.height_px, 0)
         axes.imshow(picture[::step, ::step], cmap="gray", extent=extent, vmin=0, vmax=255)
-    axes.plot(*place.T, "+", ms=5, color="tab:cyan")
-    axes.quiver(
-        *place.T, *(scale * v).T, color="tab:red", angles="xy", scale_units="xy", scale=1, width=0.003, headwidth=4
-    )
     axes.set(xlim=(0, sensor.width_px), ylim=(sensor.height_px, 0), xlabel="column [px]", ylabel="row [px]")
-    axes.set_title(f"{image}: RMS {rms_px(v):.3f} px, residuals {scale:.0f} times enlarged", fontsize=10)
+    # A dollar sign in the name of a file begins no formula.
+    axes.set_title("\n".join(wrap(title, _LINE)), fontsize=10, parse_math=False)
     axes.set_aspect("equal")
     return figure
 
 
 def findings(calibration: Calibration) -> list[str]:
-    """What a person should know of the photographs, in sentences."""
+    """What a person should know of the rounds and the photographs, in sentences."""
     found = []
+    if not calibration.settled:
+        found.append(
+            "the rounds of adjusting and taking out blunders did not come to rest, and the results are those of the "
+            "last one: look at the photographs with the largest residuals, and leave them out"
+        )
     if calibration.left_out:
         some = [f"{name} ({reason})" for name, reason in list(calibration.left_out.items())[:_SHOWN]]
         more = ", ..." if len(calibration.left_out) > _SHOWN else ""
@@ -82,7 +114,8 @@ def findings(calibration: Calibration) -> list[str]:
     if calibration.added_sigma_px > measured:
         found.append(
             f"the targets are measured to {measured:.3f} px, but fit to {calibration.added_sigma_px:.3f} px only: "
-            "look at the residuals of the photographs for an uneven board, a rolling shutter or a model too simple"
+            "look at the residuals of the photographs for a board that is not flat (--board-sigma-mm lets the "
+            "adjustment find its shape), a rolling shutter or a model too simple"
         )
     return found
 
@@ -93,40 +126,53 @@ def write_calibration(
     seconds: dict[str, float],
     pictures: Mapping[str, Callable[[], np.ndarray]],
     beside: Callable[[Path], None] = lambda folder: None,
+    *,
+    detections: Sequence[Detection] = (),
+    start: str = "",
+    notes: Sequence[str] = (),
 ) -> Tables:
     """Write what `jaxphoto adjust` writes, and photographs.csv, photographs.html and a picture of each photograph.
 
-    summary.json gains rms_px, n_images_used, n_image_points, added_sigma_px, left_out and removed. `pictures` read the
-    grey values of photographs by their names; `beside` may write more into the folder while it is made. Raises
-    InputError where `directory` holds something that is not an earlier result.
+    summary.json gains rms_px, n_images_used, n_image_points, added_sigma_px, settled, left_out, removed and `start`, a
+    sentence that says where the camera began. `pictures` read the grey values of photographs by their names, also of
+    those left out, of which `detections` say what was found in them; `notes` are sentences that report.html begins
+    with; `beside` may write more into the folder while it is made. Raises InputError where `directory` holds something
+    that is not an earlier result.
     """
     began = time.perf_counter()
     tables = Tables(calibration.adjusted)
-    verdict = findings(calibration) + warnings_of(tables)
+    verdict = [*notes, *findings(calibration), *warnings_of(tables)]
     times = calibration.adjusted.seconds
     with made_whole(directory) as work:
         write_results(tables, verdict, work, seconds | {k: times[k] for k in ("compile", "solve", "covariance")})
         photographs = photographs_table(calibration)
         photographs.to_csv(work / "photographs.csv", index=False)
         (work / PICTURES).mkdir()
-        for name in calibration.measured.images:
+        found = {detection.image: detection for detection in detections}
+        shown = [name for name in photographs["image"] if name in calibration.measured.images or name in pictures]
+        for name in shown:
             picture = pictures[name]() if name in pictures else None
-            targets_figure(calibration, name, picture).savefig(work / PICTURES / f"{name}.png")
-        shown = photographs.to_html(index=False, border=0, na_rep="", float_format="{:.3f}".format)
+            figure = (
+                left_out_figure(calibration, name, picture, found.get(name))
+                if name in calibration.left_out
+                else targets_figure(calibration, name, picture)
+            )
+            figure.savefig(work / PICTURES / f"{name}.png")
+        table = photographs.to_html(index=False, border=0, na_rep="", float_format="{:.3f}".format)
         page = Environment(autoescape=True).from_string(_PAGE)
         (work / "photographs.html").write_text(
             page.render(
                 title=calibration.adjusted.block.title,
                 style=STYLE,
-                table=Markup(shown),
-                pictures=calibration.measured.images,
+                table=Markup(table),
+                pictures=shown,
             ),
             encoding="utf-8",
         )
         beside(work)
         summary = json.loads((work / "summary.json").read_text(encoding="utf-8"))
         summary["seconds"]["write"] = round(time.perf_counter() - began, 6)
-        write_summary(summary | calibration_summary(calibration), work)
+        write_summary(summary | calibration_summary(calibration) | {"start": start}, work)
     return tables
 
 
@@ -137,6 +183,7 @@ def calibration_summary(calibration: Calibration) -> dict:
         "n_images_used": len(calibration.measured.images),
         "n_image_points": len(calibration.residuals_px),
         "added_sigma_px": calibration.added_sigma_px,
+        "settled": calibration.settled,
         "left_out": calibration.left_out,
         "removed": [f"{point} in {image}" for image, point in calibration.removed],
     }

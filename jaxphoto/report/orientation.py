@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,6 +17,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _SHOWN = 6
+# What chance alone may do to the standard deviations of a few hundred rays.
+_ALIKE = 1.2
 
 
 def orientation_sentences(report: OrientationReport) -> list[str]:
@@ -36,9 +39,25 @@ def orientation_sentences(report: OrientationReport) -> list[str]:
         f"{report.limit_px:.2g} px, {left.small_angle} whose rays meet at too small an angle, {left.too_few} of points "
         "with too few rays left",
         f"residuals: {report.mean_px:.2f} px on average, sigma0 {report.sigma0:.2f}",
+        *_doubts(report),
         f"free of the camera: {', '.join(report.estimated) or 'nothing'}",
     ]
+    if report.alike > _ALIKE:
+        said.append(
+            f"neighbouring rays of an image err alike: standard deviations of the camera are {report.alike:.2g} times "
+            "what an adjustment says, which takes them for independent"
+        )
     return said + list(report.held)
+
+
+def _doubts(report: OrientationReport) -> Iterator[str]:
+    if not report.settled:
+        yield (
+            f"warning: after {report.rounds} rounds image points still went and came back; what is left is no settled "
+            "choice: false matches or a model of the lens that does not fit (--model) may be why"
+        )
+    elif not report.converged:
+        yield "warning: the last adjustment did not converge; adjust the block with more iterations (--max-steps)"
 
 
 def print_orientation(report: OrientationReport, console: Console) -> None:
@@ -109,10 +128,13 @@ def image_residuals_figure(oriented: Oriented) -> Figure:
     return figure
 
 
-def write_orientation(oriented: Oriented, folder: Path) -> None:
-    """orientation.json, orientation_network.png and orientation_residuals.png, beside the block in `folder`."""
+def write_orientation(oriented: Oriented, folder: Path, **matching: float) -> None:
+    """orientation.json, orientation_network.png and orientation_residuals.png, beside the block in `folder`.
+
+    `matching` are numbers of what came before (matches left out, how features scatter), under that name in the first.
+    """
     report = oriented.report
-    summary = report._asdict() | {"gross_errors": report.gross_errors._asdict()}
+    summary = report._asdict() | {"gross_errors": report.gross_errors._asdict(), "matching": matching}
     (folder / "orientation.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
     network_figure(oriented).savefig(folder / "orientation_network.png")
     image_residuals_figure(oriented).savefig(folder / "orientation_residuals.png")

@@ -30,6 +30,7 @@ from jaxphoto.adjustment.reduced import other_rows, tile_columns
 from jaxphoto.adjustment.residuals import Increments, Values
 from jaxphoto.adjustment.result import Factored, Padded
 from jaxphoto.adjustment.shards import TILES, along_points, sharded
+from jaxphoto.adjustment.similarity import along_motions, open_motions
 from jaxphoto.adjustment.structure import Structure
 from jaxphoto.adjustment.tiles import by_point, by_tile
 from jaxphoto.arrays import Numbers, still
@@ -253,15 +254,21 @@ def _of_points(
 def _without_open_motions(q: Cofactors, values: Values, factored: Factored, s: Structure) -> Cofactors:
     """Subtract E E': what the constraints D of the datum, taken as observations, leave along the motions they hold.
 
-    E = (N + D'D)^-1 D' spans those motions exactly, because N does not see them; no motion need be known.
+    E = (N + D'D)^-1 D' spans those motions exactly, because N does not see them; where all are open, they are known.
     """
     defect = factored.n_constraints
     if not defect:
         return q
     reduced, scale = factored.reduced, factored.scale
     rows = Increments(values.datum_eop * scale.eop, jnp.zeros((defect, s.n_shared)), values.datum_points * scale.points)
-    at = At(jax.tree.map(jnp.zeros_like, scale), scale, values, s)
-    e = jax.vmap(lambda row: solve_factored(reduced, factored.factor, row, at))(rows)
+    if open_motions(values):
+        # The motions are known: E = M (D M)^-1.
+        m = along_motions(values, scale)
+        met = jnp.einsum("kci,jci->kj", rows.eop, m.eop) + jnp.einsum("kcp,jcp->kj", rows.points, m.points)
+        e = jax.tree.map(lambda v: jnp.tensordot(jnp.linalg.inv(met), v, (0, 0)), m)
+    else:
+        at = At(jax.tree.map(jnp.zeros_like, scale), scale, values, s)
+        e = jax.vmap(lambda row: solve_factored(reduced, factored.factor, row, at))(rows)
     e_eop, e_shared, e_points = e.eop.transpose(2, 1, 0), e.shared.T, e.points.transpose(2, 1, 0)
     e_reduced = jnp.concatenate([e_eop.reshape(-1, defect), e_shared])
     return q._replace(

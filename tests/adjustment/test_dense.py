@@ -2,7 +2,6 @@
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
@@ -11,7 +10,7 @@ from jax.flatten_util import ravel_pytree
 
 from jaxphoto import adjust, covariance
 from jaxphoto.adjustment.band import factor_band
-from jaxphoto.adjustment.elimination import gradient, solve_factored
+from jaxphoto.adjustment.elimination import gradient, solve_factored, solve_reduced
 from jaxphoto.adjustment.normal import At, residuals_at
 from jaxphoto.adjustment.optimum import typical_scale, unit_scale, weigh_datum, zero_increments
 from jaxphoto.adjustment.padding import crop_state, sizes_of
@@ -21,9 +20,12 @@ from jaxphoto.adjustment.structure import structure_of
 from jaxphoto.statistics import redundancy_numbers
 from tests.adjustment.dense import DAMPINGS, assemble, at_optimum, prepared, split
 from tests.blocks import VARIANTS, adjusted, covariance_of, simulated
+from tests.marks import slow_but
 
-# Each costs a minute of compiling: what one camera, two, and a mount without more would show, the others do.
-KINDS = [name for name in VARIANTS if name not in ("cross", "two_cameras", "mount")]
+# Each shape of block is compiled for itself: what one camera, two, and a mount without more would show, the others
+# do. The other kinds (surfaces of a lidar, fixed control, free shifts, ...) are slow only by what compiling takes.
+QUICK = ("everything", "inner", "inner_images", "inner_some", "minimal")
+KINDS = slow_but(QUICK, [name for name in VARIANTS if name not in ("cross", "two_cameras", "mount")])
 # The defect of each.
 FREE_NETWORKS = {"inner": 6, "inner_images": 6, "inner_some": 6, "inner_scale": 7, "inner_shift": 3, "minimal": 6}
 
@@ -64,14 +66,18 @@ def test_elimination_solves_the_dense_normal_equations(name, damping):
 
 
 @pytest.mark.parametrize("damping", DAMPINGS)
-@pytest.mark.parametrize("name", ["everything", "inner", "minimal"])
+@pytest.mark.parametrize("name", slow_but(("inner",), ("everything", "surfaces", "inner", "minimal")))
 def test_many_tiles_solve_the_normal_equations(name, damping):
-    """Several groups of tiles, some of them padding: F is made anew. Products are those of the whole Jacobian."""
+    """Several groups of tiles, some of them padding: F is made anew, or the rows are gone through for one solution.
+
+    Products are those of the whole Jacobian.
+    """
     block = simulated(name).block
     sizes = sizes_of(structure_of(block, block.priors))._replace(tiles=50, tile_images=24, tile_points=16)
     values, s, _ = prepared(block, sizes=sizes)
     assert not s.in_tiles.few and s.in_tiles.groups.max() < s.in_tiles.image.shape[1] // s.in_tiles.at_once
-    b, *others = _solved(weigh_datum(values, s), s, damping)
+    # An array, so that one program serves all of them.
+    b, *others = _solved(weigh_datum(values, s), s, np.asarray(damping))
     for found in others:
         for one, two in zip(b, found, strict=True):
             np.testing.assert_allclose(two, one, atol=1e-10 * np.abs(one).max())
@@ -79,15 +85,21 @@ def test_many_tiles_solve_the_normal_equations(name, damping):
 
 @eqx.filter_jit
 def _solved(values, s, damping):
-    """J'r by sums and by a gradient, and (N + damping W) x for the x that solves it."""
+    """J'r by sums and by a gradient, and (N + damping W) x for the x that solves it, by F and row by row."""
     scale = typical_scale(values, s)
     at = At(zero_increments(s), scale, values, s)
     a, reduced, right = reduce_normal(at, damping)
-    x = solve_factored(reduced, factor_band(a), right.b, at)
+    factor = factor_band(a)
     _, push = jax.linearize(lambda y: residuals_at(at._replace(increments=y)), at.increments)
     pull = jax.linear_transpose(push, at.increments)
-    added = jax.tree.map(lambda w, x: damping * w * x, reduced.weight, x)
-    return right.b, gradient(at, reduced, at)[0], jax.tree.map(jnp.add, pull(push(x))[0], added)
+
+    def multiplied(x):
+        return jax.tree.map(lambda nx, w, x: nx + damping * w * x, pull(push(x))[0], reduced.weight, x)
+
+    b, *down = gradient(at, reduced, at)
+    by_f = solve_factored(reduced, factor, right.b, at)
+    by_rows = solve_reduced(reduced, factor, *down[:2], b.points, at)
+    return right.b, b, multiplied(by_f), multiplied(by_rows)
 
 
 @pytest.mark.parametrize("name", KINDS)
@@ -131,7 +143,7 @@ def test_covariance(name):
         np.testing.assert_allclose(points[p], block, atol=1e-7 * max(np.trace(block), 1e-30))
 
 
-@pytest.mark.parametrize("name", FREE_NETWORKS)
+@pytest.mark.parametrize("name", slow_but(QUICK, FREE_NETWORKS))
 def test_covariance_of_a_free_network_does_not_move_along_its_datum(name):
     """Constraints C x = 0 hold exactly, so C Q = 0; over all points, inner constraints give the least trace."""
     q, at = dense_covariance(name)
@@ -142,8 +154,8 @@ def test_covariance_of_a_free_network_does_not_move_along_its_datum(name):
 
 
 def test_inner_constraints_over_all_points_have_the_least_trace():
-    trace = {name: float(np.trace(np.asarray(covariance_of(name).points).sum(0))) for name in FREE_NETWORKS}
-    assert all(trace[name] > 1.001 * trace["inner"] for name in ("inner_images", "inner_some", "minimal"))
+    trace = lambda name: float(np.trace(np.asarray(covariance_of(name).points).sum(0)))  # noqa: E731
+    assert all(trace(name) > 1.001 * trace("inner") for name in ("inner_images", "inner_some", "minimal"))
 
 
 def test_inner_constraints_over_all_points_are_the_pseudo_inverse():
@@ -175,7 +187,7 @@ def test_redundancy_numbers(name):
     assert (found < 1 + 1e-9).all()
 
 
-@pytest.mark.parametrize("name", ["everything", "inner"])
+@pytest.mark.parametrize("name", slow_but(("inner",), ("everything", "inner")))
 def test_scipy_finds_the_same_optimum(name):
     """scipy's dense least squares on the same residuals, from the same start."""
     values, s, places = prepared(simulated(name).block)

@@ -70,6 +70,7 @@ def differences():
     return np.stack(columns, axis=1)
 
 
+@pytest.mark.slow
 def test_forward(differences):
     """Along a direction in which all four parameters count alike."""
     found = np.asarray(jax.jit(lambda p, d: jax.jvp(result, (p,), (d,))[1])(jnp.zeros(4), STEPS))
@@ -93,6 +94,7 @@ def test_many_adjustments_at_once():
     assert np.abs(apart[0] - apart[1]).max() > 1e-4
 
 
+@pytest.mark.slow
 def test_a_fixed_control_coordinate_moves_what_hangs_on_it():
     block, start = simulated("fixed_control").block, adjusted("fixed_control").unknowns
 
@@ -111,6 +113,7 @@ def test_a_fixed_control_coordinate_moves_what_hangs_on_it():
     assert abs(slope) > 1e-3
 
 
+@pytest.mark.slow
 def test_derivatives_do_not_depend_on_the_start():
     """From rough start values as from the optimum, although everything is linearised somewhere."""
     block, near = simulated("cross").block, adjusted("cross").unknowns

@@ -55,6 +55,7 @@ def assert_same(one, other):
     np.testing.assert_allclose(numbers2, numbers, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_a_banded_reduced_matrix_gives_what_a_dense_one_gives(corridor, monkeypatch):
     start = corridor.start.unknowns
     padded, _ = pad_structure(structure_of(corridor, corridor.priors))
@@ -64,6 +65,7 @@ def test_a_banded_reduced_matrix_gives_what_a_dense_one_gives(corridor, monkeypa
     assert_same(banded, everything(corridor, start))
 
 
+@pytest.mark.slow
 def test_one_small_tile_at_a_time_gives_what_many_together_give(monkeypatch):
     block, start = simulated("three_models").block, adjusted("three_models").unknowns
     together = everything(block, start)
@@ -76,6 +78,7 @@ def test_one_small_tile_at_a_time_gives_what_many_together_give(monkeypatch):
     assert_same(together, everything(block, start))
 
 
+@pytest.mark.slow
 def test_chords_end_where_full_steps_end(monkeypatch):
     """Compiled apart, and kept nowhere: the constant is part of the program."""
     block = simulated("cross").block

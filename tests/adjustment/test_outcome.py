@@ -36,6 +36,7 @@ from tests.blocks import (
     simulated,
     with_priors,
 )
+from tests.marks import slow_but
 
 
 def true_value(truth, label):
@@ -50,7 +51,13 @@ def true_value(truth, label):
     return float(vector[list(axes).index(axis)])
 
 
-@pytest.mark.parametrize("name", ["cross", "two_cameras", "three_models", "mount", "strips", "everything"])
+@pytest.mark.parametrize(
+    "name",
+    slow_but(
+        ("cross", "two_cameras", "everything"),
+        ("cross", "two_cameras", "three_models", "mount", "strips", "everything"),
+    ),
+)
 def test_truth_is_recovered(name):
     """Interior orientation, lever arm, boresight, shift, drift, exterior orientation, points: within sigmas."""
     a, truth = adjusted(name), simulated(name).truth
@@ -137,6 +144,7 @@ def test_k0_and_c_are_one_scale():
         assert word in str(caught.value)
 
 
+@pytest.mark.slow
 def test_unknowns_that_nothing_tells_apart_are_named():
     """A time offset at one velocity everywhere is a shift of every strip, and these are free too."""
     block = simulated("strips").block

@@ -114,6 +114,7 @@ def test_several_devices_find_the_same(on_three_devices: Path, shards: int) -> N
     assert_same(found)
 
 
+@pytest.mark.slow
 def test_two_processes_find_the_same(tmp_path: Path) -> None:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))

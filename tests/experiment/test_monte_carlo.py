@@ -18,6 +18,7 @@ from jaxphoto.sensitivity import Readjustment, noise
 from jaxphoto.sensitivity.exact import sensitivity
 from tests.blocks import adjusted, simulated
 from tests.commands import run
+from tests.marks import slow_but
 
 NOMINAL = "strips"
 
@@ -67,7 +68,7 @@ class Stop(Exception):
     """Stands for whatever ends a process."""
 
 
-@pytest.mark.parametrize("at", [1, 1030, 1100])
+@pytest.mark.parametrize("at", slow_but((1030,), (1, 1030, 1100)))
 def test_a_run_that_was_stopped_goes_on_to_the_same_file(whole, tmp_path, at):
     def stop(done: int) -> None:
         if done >= at:
@@ -129,6 +130,7 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["thesis.txt"]
 
 
+@pytest.mark.slow
 def test_noise_is_predicted_by_the_observations_own_sigmas(tmp_path):
     nominal = adjusted("cross")
     made = study(tmp_path / "run", draws=4, errors=noise(nominal.block))
@@ -143,6 +145,7 @@ def test_noise_is_predicted_by_the_observations_own_sigmas(tmp_path):
         assert of[label.replace("interior[one]", "one")] == pytest.approx(expected, rel=2e-3)
 
 
+@pytest.mark.slow
 def test_a_block_that_estimates_no_camera(tmp_path):
     nominal = adjusted("fixed_interior")
     wrong = bias(nominal.block, "interior", 0.02, parameter="c_mm")

@@ -91,6 +91,7 @@ def off_in_sigmas(tables, simulation):
     return np.array(off), {s.parameter: s.sigma for s in tables.significance}
 
 
+@pytest.mark.slow
 def test_the_target_twin_finds_its_truth_with_sigmas_like_those_printed(paper):
     simulation = simulated(load_experiment(FOLDER), FOLDER, "target1")
     assert (len(simulation.block.images), len(simulation.block.points)) == (18, 35)

@@ -159,6 +159,31 @@ def test_agisoft_file_projects_as_its_manual_says(tmp_path):
     assert isinstance(camera.interior.distortion, Agisoft)
 
 
+@pytest.mark.parametrize("p", [(0.0, 0.0), (0.0011, -0.0007)])
+def test_an_older_agisoft_file_projects_as_the_manual_of_lens_says(tmp_path, p):
+    """fx, fy and skew, the principal point from the upper left corner, p1 and p2 as OpenCV has them."""
+    numbers = {"fx": 3270.5, "fy": 3268.3, "cx": 1971.4, "cy": 1529.5, "skew": -4.25, "k1": -0.118, "k2": 0.0936}
+    numbers |= {"width": 4032, "height": 3024, "p1": p[0], "p2": p[1]}
+    elements = "".join(f"<{key}>{value}</{key}>" for key, value in numbers.items())
+    camera = read_camera_file(written(tmp_path, f"<calibration>{elements}</calibration>", "old.xml"))
+    u, v = distorted(POINTS[:, 0] / POINTS[:, 2], POINTS[:, 1] / POINTS[:, 2], (-0.118, 0.0936), *p)
+    expected = np.column_stack([1971.4 + u * 3270.5 + v * -4.25, 1529.5 + v * 3268.3])
+    np.testing.assert_allclose(columns_rows(camera), expected, rtol=0, atol=1e-9)
+    assert ("p1 and p2 were taken in OpenCV's order" in camera.note) == (p[0] != 0)
+
+
+@pytest.mark.parametrize("count", [4, 5, 8, 12, 14])
+def test_opencv_files_have_as_many_coefficients_as_opencv_may_give(tmp_path, count):
+    given = [-0.21, 0.11, 1.1e-3, -2.3e-3, 0.02, 0.03, -0.01, 0.004][:count] + [0.0] * (count - 8)
+    text = OPENCV.split("distortion_coefficients")[0] + (
+        f"distortion_coefficients: !!opencv-matrix\n   rows: 1\n   cols: {count}\n   dt: d\n   data: {given}\n"
+    )
+    camera = read_camera_file(written(tmp_path, text, "a.yml"))
+    matrix = np.array([[912.25, 0, 655.5], [0, 910.75, 471.25], [0, 0, 1]])
+    expected = cv2.projectPoints(POINTS, np.zeros(3), np.zeros(3), matrix, np.array(given))[0][:, 0]
+    np.testing.assert_allclose(columns_rows(camera), expected + 0.5, rtol=0, atol=1e-9)
+
+
 @pytest.mark.parametrize("number", range(1, 7))
 def test_colmap_cameras_project_as_colmap(tmp_path, number):
     camera = read_camera_file(written(tmp_path, COLMAP, "cameras.txt"), camera=str(number))
@@ -281,10 +306,10 @@ nadir,k1,9e-05,1e-07,True
 )
 CORRELATION = """parameter_a,parameter_b,rho
 interior[nadir].c_mm,interior[nadir].xp_mm,0.25
-interior[nadir].c_mm,interior[nadir].k1,-0.75
+interior[nadir].c_mm,interior[nadir].k1,0.75
 interior[nadir].xp_mm,interior[nadir].c_mm,0.25
 interior[nadir].xp_mm,interior[nadir].k1,0.5
-interior[nadir].k1,interior[nadir].c_mm,-0.75
+interior[nadir].k1,interior[nadir].c_mm,0.75
 interior[nadir].k1,interior[nadir].xp_mm,0.5
 exterior[1].X_m,interior[nadir].k1,0.9
 """
@@ -307,7 +332,7 @@ def test_results_give_the_camera_and_its_covariance(tmp_path):
     assert camera.sensor == SENSOR
     expected = np.zeros((12, 12))
     free, sigma = [0, 1, 4], np.array([2e-3, 1e-3, 1e-7])
-    expected[np.ix_(free, free)] = [[1, 0.25, -0.75], [0.25, 1, 0.5], [-0.75, 0.5, 1]] * np.outer(sigma, sigma)
+    expected[np.ix_(free, free)] = [[1, 0.25, 0.75], [0.25, 1, 0.5], [0.75, 0.5, 1]] * np.outer(sigma, sigma)
     np.testing.assert_allclose(camera.covariance, expected, rtol=1e-15)
     # Without the block, where the results say themselves what camera they are of.
     told = {"width_px": 4500, "height_px": 3000, "pixel_mm": 0.008, "distortion": "smac", "sign": "add"}
@@ -351,7 +376,8 @@ def test_a_block_may_get_another_model(tmp_path):
         (AGISOFT.replace("frame", "fisheye"), "a.xml", "projection 'fisheye' is not known"),
         (AGISOFT.replace("<f>3268.30117351641</f>", ""), "a.xml", "<f> is missing"),
         (AGISOFT.replace("<width>4032</width>", ""), "a.xml", "<width> or <height> is missing"),
-        (AGISOFT.replace("f>", "fx>"), "a.xml", "fx, fy and skew are of old versions"),
+        (AGISOFT.replace("<f>", "<fx>").replace("</f>", "</fx>"), "a.xml", "<fy> is missing; add it"),
+        (AGISOFT.replace("<f>", "<g>").replace("</f>", "</g>"), "a.xml", "<f> is missing; add it"),
         (AGISOFT.replace("-0.0123", "-0,0123"), "a.xml", "k3 is '-0,0123', not a finite number"),
         (COLMAP, "cameras.txt", "it holds 6 cameras; name one of 1, 2, 3, 4, 5, 6"),
         (
@@ -365,9 +391,16 @@ def test_a_block_may_get_another_model(tmp_path):
             "camera 1 has 4 parameters, RADIAL has 5: f, cx, cy, k1, k2",
         ),
         ("1 PINHOLE 100 100.5 80 80 50 50\n", "cameras.txt", "100 x 100.5 pixels cannot be"),
+        (SMAC.replace("0.1558 × 10-6", "0.1558 × 10-"), "a.txt", "P2 is '0.1558e', not a finite number"),
+        (SMAC.replace("0.5690 x 10-26", ""), "a.txt", "K4 cannot be found in this SMAC report"),
+        (SMAC_TORN[: SMAC_TORN.index("-0.3015")], "a.txt", "P1, P2, P3, P4 cannot be found in this SMAC report"),
         (SMAC.replace("xp =", ""), "a.txt", "xp cannot be found in this SMAC report"),
         (SMAC.replace("153.358 mm", ""), "a.txt", "the Calibrated Focal Length in mm cannot be found"),
         (INTERIOR, "interior.csv", "nor a block says of which model camera nadir is; give the block"),
+        (COLMAP.replace("2 PINHOLE", "1 PINHOLE"), "cameras.txt", "camera 1 stands there twice"),
+        ("# Camera list\n", "cameras.txt", "there is no camera in it"),
+        (OPENCV + "fisheye_model: 1\n", "a.yml", "it is of OpenCV's fish-eye model, which is not known here"),
+        (OPENCV.replace("   cols: 1\n", ""), "a.yml", "distortion_coefficients is no matrix with rows, cols"),
         ("hello", "a.txt", "no camera file that is known"),
         ("", "a.txt", "the file is empty"),
     ],
@@ -443,6 +476,7 @@ def test_command_converts_and_says_how_well(tmp_path, monkeypatch, capsys):
         ("new.xml", ["--width-px", "100"], "--width-px and --height-px belong together"),
         ("new.xml", ["--distortion", "none"], "--distortion none: there are brown"),
         ("new.xml", ["--format", "none"], "name one of opencv"),
+        ("new.xml", ["--distortion", "brown"], "the format agisoft has the distortion Agisoft, not Brown; leave"),
     ):
         monkeypatch.setattr("sys.argv", ["jaxphoto", *arguments[:2], str(tmp_path / out), *arguments[3:], *more])
         with pytest.raises(SystemExit) as stopped:

@@ -1,7 +1,10 @@
-"""COLMAP models: the same block from text and binary, by COLMAP's own equations; what is refused; pycolmap's."""
+"""COLMAP models: the same block from text and binary, by COLMAP's own equations, and back; what is refused."""
 
+import dataclasses
+import operator
 import struct
 
+import equinox as eqx
 import jax
 import numpy as np
 import pytest
@@ -10,8 +13,13 @@ from scipy.spatial.transform import Rotation
 from jaxphoto.camera import get_parameter, parameter_names
 from jaxphoto.collinearity import project
 from jaxphoto.errors import InputError
+from jaxphoto.georeferencing import Corrections
 from jaxphoto.io import convert, read_block, read_source
+from jaxphoto.io.cameras import read_camera_file
+from jaxphoto.io.colmap import write_colmap_model
 from jaxphoto.unknowns import FREE
+from tests.blocks import simulated
+from tests.commands import run
 
 RNG = np.random.default_rng(27)
 # fx, fy, cx, cy, k1, k2, p1, p2.
@@ -22,6 +30,8 @@ POINTS = RNG.uniform(-1.5, 1.5, (6, 3))
 RATIONAL = {f"k{k}" for k in range(1, 7)}
 IDS = np.array([3, 7, 8, 20, 21, 40])
 NAMES = ["b.jpg", "a.jpg", "c.jpg"]
+# Models that are no part of OpenCV's, by their numbers in a binary file.
+NUMBERS = {"OPENCV_FISHEYE": 5, "FOV": 7, "SIMPLE_RADIAL_FISHEYE": 8, "RADIAL_FISHEYE": 9, "THIN_PRISM_FISHEYE": 10}
 
 
 def computed(image):
@@ -176,9 +186,9 @@ def spoil(file, row, text):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (spoil("cameras", 1, "5 OPENCV_FISHEYE 640 480 1 1 1 1 0 0 0 0"), "the model OPENCV_FISHEYE is not known"),
-        (spoil("cameras", 1, "5 OPENCV 640 480 800 800"), "row 2: 2 parameters, OPENCV has 8"),
-        (spoil("cameras", 1, "5 OPENCV"), "row 2: 2 cells instead of CAMERA_ID MODEL"),
+        (spoil("cameras", 1, "5 OPENCV_FISHEYE 640 480 1 1 1 1 0 0 0 0"), "OPENCV_FISHEYE of camera 5 is not known"),
+        (spoil("cameras", 1, "5 OPENCV 640 480 800 800"), "camera 5 has 2 parameters, OPENCV has 8: fx"),
+        (spoil("cameras", 1, "5 OPENCV"), "camera 5 has 2 cells; write CAMERA_ID MODEL"),
         (spoil("cameras", 1, "6 SIMPLE_PINHOLE 640 480 800 320 240"), "image a.jpg is of camera 5, which is missing"),
         (spoil("images", 2, "1 1 0 0"), "row 3: 4 cells instead of IMAGE_ID"),
         (spoil("images", 2, "1 1 0 0 x 0 0 0 5 b.jpg"), "row 3: there is a cell that is no finite number"),
@@ -217,3 +227,145 @@ def test_pycolmap_writes_what_is_read(tmp_path):
     block = read_source(binary)
     assert block.images == ("a", "b", "c")
     assert np.abs(misfits_mm(block)).max() < 1e-12
+
+
+# Written ----------------------------------------------------------------------------------------------------
+
+
+def same_block(a, b):
+    """Image points (px), orientations and points of both, whatever the sizes of their pixels."""
+    assert a.images == b.images and len(a.points) == len(b.points)
+    px = [x.sensors[x.image_camera[0]].px_from_mm(x.image_points.xy) for x in (a, b)]
+    np.testing.assert_allclose(*px, rtol=0, atol=1e-9)
+    for where in ("exterior.position", "exterior.camera_from_object", "points"):
+        values = [operator.attrgetter(where)(x.start.unknowns) for x in (a, b)]
+        np.testing.assert_allclose(*values, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("write", [write_text, write_binary])
+def test_a_model_that_is_written_is_the_model_that_was_read(tmp_path, write):
+    block = read_source(write(tmp_path / "model"))
+    conversions = write_colmap_model(block, tmp_path / "again")
+    assert [c.max_px for c in conversions.values()] == [0.0]
+    again = read_source(tmp_path / "again")
+    same_block(again, block)
+    assert again.points == block.points
+    same = [x.start.unknowns.interior["5"] for x in (again, block)]
+    values = [[float(get_parameter(i, n)) for n in parameter_names(i)] for i in same]
+    np.testing.assert_allclose(*values, rtol=1e-13, atol=1e-16)
+    assert "5 OPENCV 640 480 801.5" in (tmp_path / "again" / "cameras.txt").read_text()
+    # Written anew in its own place.
+    write_colmap_model(again, tmp_path / "again")
+    same_block(read_source(tmp_path / "again"), block)
+
+
+def test_a_block_of_another_distortion_keeps_its_bundles(tmp_path):
+    """Brown's camera is fitted, and told so; points without approximate values are intersected first."""
+    made, truth = simulated("cross")
+    known = eqx.tree_at(lambda b: b.start.unknowns, made, truth)
+    places = lambda b: (b.start.unknowns.points, b.start.point_known)  # noqa: E731
+    bare = eqx.tree_at(places, known, (np.zeros_like(truth.points), np.zeros(len(made.points), bool)))
+    pixel = made.sensors["one"].pixel_mm
+    for name, block, unknowns in (("given", bare, truth), ("found", bare, None)):
+        (conversion,) = write_colmap_model(block, tmp_path / name, unknowns).values()
+        assert 0 < conversion.rms_px <= conversion.max_px < 0.05
+        again = read_source(tmp_path / name)
+        assert again.images == made.images
+        assert {int(point) for point in again.points} == set(range(1, len(made.points) + 1))
+        number = np.array([int(point) for point in again.points])[again.image_points.point]
+        theirs = misfits_mm(again)[np.lexsort((number, again.image_points.image))]
+        ours = misfits_mm(known)[np.lexsort((known.image_points.point, known.image_points.image))]
+        theirs *= pixel / again.sensors[again.image_camera[0]].pixel_mm
+        if unknowns is not None:
+            np.testing.assert_allclose(theirs, ours, atol=1.5 * pixel * conversion.max_px)
+        # With noise of half a pixel, intersected points fit no worse than the true ones.
+        assert np.sqrt(np.mean(theirs**2)) < 1.1 * np.sqrt(np.mean(ours**2))
+
+
+def test_pycolmap_reads_what_is_written(tmp_path):
+    pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is not installed")
+    write_colmap_model(read_source(write_text(tmp_path / "model")), tmp_path / "again")
+    first, again = (pycolmap.Reconstruction(str(tmp_path / name)) for name in ("model", "again"))
+    assert again.num_images() == 3 and again.num_points3D() == 6
+    assert again.compute_num_observations() == 18
+    assert again.compute_mean_reprojection_error() < 1e-9
+    for image in again.images.values():
+        (other,) = (i for i in first.images.values() if i.name.removesuffix(".jpg") == image.name)
+        pose = [i.cam_from_world().matrix() for i in (image, other)]
+        np.testing.assert_allclose(*pose, atol=1e-12)
+
+
+def test_where_no_model_can_be_written(tmp_path):
+    block = read_source(write_text(tmp_path / "model"))
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "thesis.txt").write_text("years of work")
+    with pytest.raises(InputError, match=r"other holds something else than cameras, images, points3D as \.txt"):
+        write_colmap_model(block, tmp_path / "other")
+    with pytest.raises(InputError, match="is a file; give the name of a folder"):
+        write_colmap_model(block, tmp_path / "other" / "thesis.txt")
+    terms = lambda b: (b.start.unknowns.interior["5"].distortion.k1, b.start.unknowns.interior["5"].distortion.b2)  # noqa: E731
+    folding = eqx.tree_at(terms, block, (np.array(-9.0), np.array(0.1)))
+    with pytest.raises(InputError, match="camera 5 cannot be written for COLMAP: the distortion of this camera folds"):
+        write_colmap_model(folding, tmp_path / "new")
+    assert not (tmp_path / "new").exists()
+    curved = dataclasses.replace(block, corrections=Corrections(curvature=True))
+    with pytest.warns(UserWarning, match="COLMAP knows no refraction or earth curvature"):
+        write_colmap_model(curved, tmp_path / "curved")
+
+
+def test_the_command_converts_there_and_back(tmp_path, monkeypatch, capsys):
+    model = write_text(tmp_path / "model")
+    assert run(monkeypatch, capsys, "convert", model, tmp_path / "block")[0] == 0
+    code, said, _ = run(monkeypatch, capsys, "convert", tmp_path / "block", tmp_path / "back", "--to", "colmap")
+    assert code == 0
+    assert "camera 5: exact" in said
+    same_block(read_source(tmp_path / "back"), read_source(model))
+    for out, to, message in (
+        (tmp_path / "block", "colmap", "is the input itself, which would be lost"),
+        (tmp_path / "new", "colmop", "--to colmop: there are block, colmap"),
+    ):
+        code, _, error = run(monkeypatch, capsys, "convert", tmp_path / "block", out, "--to", to)
+        assert (code, message in error) == (2, True)
+
+
+@pytest.mark.parametrize("name", ["frame.0001", "left/a b.JPG", "d.dng"])
+def test_only_endings_of_photographs_are_taken_off(tmp_path, name):
+    def change(file, lines):
+        return [line.replace("a.jpg", name) for line in lines] if file == "images" else lines
+
+    folder = write_text(tmp_path / "model", change)
+    assert name.removesuffix(".JPG").removesuffix(".dng") in read_source(folder).images
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (spoil("images", 2, "1 0 0 0 0 0 0 0 5 b.jpg"), "the quaternion of image b.jpg is zero, which is no rotation"),
+        (spoil("cameras", 0, "5 PINHOLE 640 480 800 800 320 240"), "camera 5 stands there twice"),
+        (spoil("cameras", 0, "x PINHOLE 640 480 800 800 320 240"), "row 1 begins with 'x', which is no id"),
+        (spoil("images", 4, "3 1 0 0 0 0 0 0 5 b.jpg"), "image b.jpg is there twice"),
+        (spoil("points3D", 0, "3 0 0 0"), "point 3 is there twice"),
+        (spoil("points3D", 0, "3.5 0 0 0"), "row 1: an id is a whole number"),
+        (spoil("points3D", 0, "99999999999999999999999 0 0 0"), "row 1: an id is a whole number"),
+    ],
+)  # fmt: skip
+def test_what_contradicts_itself_is_told_in_a_sentence(tmp_path, change, message):
+    with pytest.raises(InputError, match=message):
+        read_source(write_text(tmp_path / "model", change), "colmap")
+
+
+@pytest.mark.parametrize("model", [*NUMBERS, "DIVISION"])
+def test_models_that_are_not_opencv_s_are_refused_by_name(tmp_path, model):
+    change = spoil("cameras", 1, f"5 {model} 640 480 800 800 320 240 0 0 0 0 0 0 0 0")
+    with pytest.raises(InputError, match=f"the model {model} of camera 5 is not known here; use one of SIMPLE_PINHOLE"):
+        read_source(write_text(tmp_path / "model", change), "colmap")
+    path = write_binary(tmp_path / "binary") / "cameras.bin"
+    path.write_bytes(struct.pack("<QIiQQ8d", 1, 5, NUMBERS.get(model, 13), 640, 480, *PARAMS))
+    with pytest.raises(InputError, match=f"the model {model if model in NUMBERS else 'number 13'} of camera 5"):
+        read_camera_file(tmp_path / "binary")
+
+
+def test_a_binary_camera_file_is_a_camera_file(tmp_path):
+    both = [read_camera_file(write(tmp_path / write.__name__)) for write in (write_text, write_binary)]
+    assert both[0].interior.c == both[1].interior.c
+    assert both[1].name == "5"

@@ -113,5 +113,12 @@ def test_what_cannot_be_measured_is_told_in_a_sentence(tmp_path):
         interest_points(tmp_path / "blank.png", SENSOR, 10)
     with pytest.raises(InputError, match="the picture has 640 x 480 pixels, the camera 320 x 240"):
         interest_points(tmp_path / "blank.png", Sensor(320, 240, 0.006), 10)
-    with pytest.raises(InputError, match="no interest point was found"):
-        sift_features(tmp_path / "blank.png", SENSOR)
+    with pytest.raises(InputError, match="the picture has 640 x 480 pixels, the camera 320 x 240"):
+        sift_features(tmp_path / "blank.png", Sensor(320, 240, 0.006))
+
+
+def test_a_blank_photograph_has_no_features(tmp_path):
+    cv2.imwrite(str(tmp_path / "blank.png"), np.full((480, 640), 90, np.uint8))
+    found = sift_features(tmp_path / "blank.png", SENSOR)
+    assert [len(part) for part in found] == [0, 0, 0, 0]
+    assert found.descriptors.shape == (0, 128)

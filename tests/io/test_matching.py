@@ -211,11 +211,31 @@ def test_photographs_that_do_not_hang_together(taken, elsewhere):
         match_photographs(apart, camera.sensor, camera.interior, [(0, 1)], count=800)
     with pytest.raises(InputError, match="the 2 photographs have no point in common"):
         tie_features([p.path for p in apart], camera.sensor, count=800)
-    odd = photographs([*near, elsewhere[0]])
-    with pytest.warns(UserWarning, match=r"1 photograph\(s\) match no other one: far0.png"):
-        found = match_photographs(odd, camera.sensor, camera.interior, photograph_pairs(odd), count=800)
-    assert [pair[:2] for pair in found.pairs] == [(0, 1)]
-    assert found.counts[1:, 3].tolist() == [0, 0]
+
+
+def test_photographs_that_match_no_other_one_are_left_out_by_name(taken, elsewhere, tmp_path):
+    images, camera, _, _ = taken
+    cv2.imwrite(str(tmp_path / "blank.png"), np.full((480, 640), 90, np.uint8))
+    odd = photographs([images[0].path, tmp_path / "blank.png", images[1].path, elsewhere[0]])
+    found = match_photographs(odd, camera.sensor, camera.interior, photograph_pairs(odd), count=800)
+    assert [pair[:2] for pair in found.pairs] == [(0, 2)]
+    assert found.counts[:, 3].astype(bool).tolist() == [False, True, False, False, False, False]
+    assert len(found.xy_mm[1]) == len(found.sigma_mm[1]) == 0
+    assert found.left_out == {
+        "blank": "it shows no features: it is blank or out of focus",
+        "far0": "it has 15 points in common with no other photograph it was compared with",
+    }
+
+
+def test_too_few_photographs_with_features(taken, tmp_path):
+    images, camera, _, _ = taken
+    for k in range(2):
+        cv2.imwrite(str(tmp_path / f"blank{k}.png"), np.full((480, 640), 90, np.uint8))
+    one = photographs([tmp_path / "blank0.png", images[0].path, tmp_path / "blank1.png"])
+    with pytest.raises(InputError, match=r"in common; blank0.png, blank1.png show no features: blank or out of focus"):
+        match_photographs(one, camera.sensor, camera.interior, photograph_pairs(one), count=800)
+    with pytest.raises(InputError, match="an orientation needs two photographs that overlap"):
+        match_photographs(images[:1], camera.sensor, camera.interior, [], count=800)
 
 
 def test_a_camera_with_distortion_is_matched_by_its_ideal_coordinates(taken, tmp_path):

@@ -1,6 +1,5 @@
 """Photographs: what EXIF says of the camera, where the start comes from, and what is refused."""
 
-from datetime import datetime
 from fractions import Fraction
 
 import numpy as np
@@ -31,7 +30,7 @@ def test_what_exif_says(tmp_path):
     path = write(
         tmp_path / "a.jpg",
         top={BASE.Make: "Canon\0", BASE.Model: "EOS 5D ", BASE.Orientation: 6},
-        taken={BASE.FocalLength: 24.0, BASE.FocalLengthIn35mmFilm: 24, BASE.DateTimeOriginal: "2016:11:14 05:02:45"},
+        taken={BASE.FocalLength: 24.0, BASE.FocalLengthIn35mmFilm: 24},
         gps={1: "S", 2: (ratio(33.0), ratio(30.0), ratio(36.0)), 3: "E", 4: (ratio(13.5), ratio(0.0), ratio(0.0)),
              5: b"\x01", 6: ratio(2.5)},
     )  # fmt: skip
@@ -39,14 +38,13 @@ def test_what_exif_says(tmp_path):
     assert found[:4] == ("a", path, 640, 480)
     assert (found.make, found.model, found.orientation) == ("Canon", "EOS 5D", 6)
     assert (found.focal_length_mm, found.focal_length_35mm_mm) == (24.0, 24.0)
-    assert found.date == datetime(2016, 11, 14, 5, 2, 45)
     assert found.gps == pytest.approx((-33.51, 13.5, -2.5))
 
 
 def test_without_exif_nothing_is_known(tmp_path):
     Image.new("RGB", (64, 48)).save(tmp_path / "a.png")
     (found,) = photographs([str(tmp_path / "a.png")])
-    assert found[2:] == (64, 48, None, None, None, None, None, 1, None, None)
+    assert found[2:] == (64, 48, None, None, None, None, None, 1, None)
 
 
 def test_damaged_exif_says_nothing(tmp_path):
@@ -56,12 +54,36 @@ def test_damaged_exif_says_nothing(tmp_path):
         taken={
             BASE.FocalLength: TiffImagePlugin.IFDRational(3, 0),
             BASE.FocalLengthIn35mmFilm: 0,
-            BASE.DateTimeOriginal: "0000:00:00 00:00:00",
         },
         gps={1: "N", 2: (ratio(133.0), ratio(0.0), ratio(0.0)), 3: "E", 4: (ratio(3.0), ratio(0.0), ratio(0.0))},
     )
     (found,) = photographs([path])
-    assert found[4:] == (None, None, None, None, None, 1, None, None)
+    assert found[4:] == (None, None, None, None, None, 1, None)
+
+
+def test_exif_that_is_cut_off_is_no_traceback(tmp_path):
+    """What is left of it counts, or nothing; the size is known in any case."""
+    usual = {"top": {BASE.Make: "Canon"}, "taken": {BASE.FocalLength: 24.0, BASE.FocalLengthIn35mmFilm: 35}}
+    gps = {1: "S", 2: (ratio(33.0), ratio(30.0), ratio(36.0)), 3: "E", 4: (ratio(3.0), ratio(0.0), ratio(0.0))}
+    with Image.open(write(tmp_path / "a.jpg", **usual, gps=gps)) as picture:
+        whole = picture.info["exif"]
+    known = set()
+    for n in range(len(whole)):
+        for kind in ("jpg", "png"):
+            Image.new("L", (64, 48)).save(tmp_path / f"cut.{kind}", exif=whole[:n])
+            (found,) = photographs([tmp_path / f"cut.{kind}"])
+            assert found[2:4] == (64, 48)
+            known.add(found.focal_length_mm)
+    assert known == {None, 24.0}
+
+
+def test_c_of_film_is_by_the_diagonal_whatever_the_format(tmp_path):
+    """CIPA's definition: 35 mm on film is 2 atan(43.27 / 70) across the diagonal, of a picture of 4:3 or 16:9 too."""
+    for width, height in ((640, 480), (960, 540), (600, 600)):
+        path = write(tmp_path / f"{width}.jpg", (width, height), taken=PHONE)
+        camera = sensor_and_interior(photographs([path]))
+        across = 2 * np.arctan(np.hypot(width, height) * camera.sensor.pixel_mm / 2 / camera.interior.c)
+        assert across == pytest.approx(2 * np.arctan(np.hypot(36, 24) / 70), rel=1e-9)
 
 
 # That of 36 mm x 24 mm, over the 800 pixels of the diagonal of 640 x 480.
@@ -92,6 +114,7 @@ FULL_FRAME = {BASE.FocalLength: 50.0, BASE.FocalPlaneXResolution: 4000 / 36 * 10
         ({BASE.FocalLength: 8.0}, {"pixel_mm": 0.01}, 8.0, 0.01, "c is the focal length.*pixel size as given"),
         ({BASE.FocalLength: 8.0, BASE.FocalLengthIn35mmFilm: 35}, {"c_mm": 7.5}, 7.5, DIAGONAL * 8 / 35, "c as given"),
         ({}, {}, 768 * 0.005, 0.005, "a guess, 1.2 times the longer side.*pixel size nominal"),
+        ({BASE.FocalLengthIn35mmFilm: 65535}, {}, 768 * 0.005, 0.005, "a guess, 1.2 times the longer side"),
         ({}, {"pixel_mm": 0.002}, 1.536, 0.002, "a guess.*pixel size as given"),
         ({}, {"pixel_mm": 0.002, "c_mm": 1.5}, 1.5, 0.002, "c as given; pixel size as given"),
     ],

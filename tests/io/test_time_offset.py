@@ -2,6 +2,7 @@
 
 import jax
 import numpy as np
+import pytest
 
 import jaxphoto.report
 from jaxphoto.georeferencing import NOMINAL
@@ -41,6 +42,7 @@ def pose(t):
     return position, angles
 
 
+@pytest.mark.slow
 def test_a_time_offset_is_estimated_with_its_standard_deviation(tmp_path):
     rng = np.random.default_rng(12)
     records = np.r_[np.arange(-5, 45, 0.05), np.arange(95, 145, 0.05)]

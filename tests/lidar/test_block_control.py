@@ -51,6 +51,7 @@ def in_turn(block, start, grid, rounds):
     return results
 
 
+@pytest.mark.slow
 def test_orientation_and_control_in_turn_converge(flown):
     block, truth, grid = flown
     start = block.start.unknowns

@@ -9,9 +9,10 @@ from jaxphoto.camera import Brown
 from jaxphoto.lidar.height_settings import HeightFlag, HeightSettings
 from jaxphoto.lidar.pseudo_control import pseudo_control_points
 from tests.lidar.test_pseudo_control import anywhere, image, indexed, measured, scanned, slope
+from tests.marks import slow_but
 
 
-@pytest.mark.parametrize("interpolation", ["weighted", "plane"])
+@pytest.mark.parametrize("interpolation", slow_but(("plane",), ("weighted", "plane")))
 def test_derivatives_are_those_of_differences(interpolation):
     rng = np.random.default_rng(3)
     grid = indexed(scanned(slope(20, 100), 2, rng))

@@ -6,10 +6,10 @@ from scipy.stats import kstest
 
 from jaxphoto.errors import BlockError
 from jaxphoto.orientation import relative_orientation, relative_orientations
-from jaxphoto.orientation.coplanarity import RayPairs, essential, fitted, linearised, misclosures, tangent_plane
+from jaxphoto.orientation.coplanarity import RayPairs, essential, fitted, linearised, misclosures, moved, tangent_plane
 from jaxphoto.orientation.essential import linear_essential, orientations
 from jaxphoto.orientation.five_point import five_point_essentials
-from jaxphoto.orientation.quaternions import turned
+from jaxphoto.orientation.homography import homographies, homography_orientations, transfer_errors
 from tests.formulas import turns
 from tests.orientation.image_pairs import normalised, pair_scene, rays_of, rotation_error
 
@@ -69,35 +69,29 @@ def test_linear_solution_says_where_it_is_open():
 def test_derivatives_equal_differences():
     scene = pair_scene(30, 2, sigma=SIGMA)
     pairs = RayPairs.of(scene.rays_1, scene.rays_2, SIGMA)
-    value, slope = linearised(scene.rotation, scene.base, pairs)
+    (value,), (slope,) = linearised(scene.rotation[None], scene.base[None], pairs)
     np.testing.assert_allclose(value, misclosures(essential(scene.rotation, scene.base)[None], pairs)[0], atol=1e-9)
 
-    def moved(k, h):
-        step = np.zeros(5)
-        step[k] = h
-        base = scene.base + tangent_plane(scene.base) @ step[3:]
-        return linearised(turned(scene.rotation, step[:3]), base / np.linalg.norm(base), pairs)[0]
+    def there(k, h):
+        step = np.zeros((1, 5))
+        step[0, k] = h
+        return linearised(*moved(scene.rotation[None], scene.base[None], step), pairs)[0][0]
 
     for k in range(5):
-        np.testing.assert_allclose(slope[:, k], (moved(k, 1e-6) - moved(k, -1e-6)) / 2e-6, rtol=1e-6, atol=1e-4)
+        np.testing.assert_allclose(slope[:, k], (there(k, 1e-6) - there(k, -1e-6)) / 2e-6, rtol=1e-6, atol=1e-4)
 
 
 def test_least_squares_is_the_least():
     scene = pair_scene(30, 4, sigma=SIGMA)
     pairs = RayPairs.of(scene.rays_1, scene.rays_2, SIGMA)
-    found = fitted(scene.rotation, scene.base, pairs)
-    value, slope = linearised(found.rotation, found.base, pairs)
-    gradient = slope.T @ value / np.sqrt(np.diagonal(found.normal))
+    found = fitted(scene.rotation[None], scene.base[None], pairs, np.ones((1, 30), bool))
+    (value,), (slope,) = linearised(found.rotations, found.bases, pairs)
+    gradient = slope.T @ value / np.sqrt(np.diagonal(found.normals[0]))
     np.testing.assert_allclose(gradient, 0, atol=1e-5)
-    assert value @ value < np.sum(linearised(scene.rotation, scene.base, pairs)[0] ** 2)
+    assert value @ value < np.sum(linearised(scene.rotation[None], scene.base[None], pairs)[0] ** 2)
 
 
-CASES = [(0, False, 30, 300), (0.3, False, 60, 100), (0, True, 40, 60)]
-
-
-@pytest.mark.parametrize(
-    ("false", "flat", "n", "count"), [*CASES, pytest.param(0, False, 40, 1000, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize(("false", "flat", "n", "count"), [(0.3, False, 60, 120), (0.3, True, 60, 60)])
 def test_errors_are_those_that_the_covariance_says(false, flat, n, count):
     squares, variance_factors = [], []
     for seed in range(count):
@@ -107,10 +101,8 @@ def test_errors_are_those_that_the_covariance_says(false, flat, n, count):
         squares.append(min(normalised(error_of(found, scene), found.covariance) for found in all_that_fit))
         variance_factors.append(all_that_fit[0].sigma0 ** 2)
     assert kstest(squares, "chi2", (5,)).pvalue > 1e-3
-    # Now and then a false match within 3.3 sigma of its epipolar line takes part, and nobody can know;
-    # of a flat scene the other orientation may fit better by chance, and the true one not be among the starts.
-    assert np.mean(np.array(squares) > 25) <= (0.03 if false or flat else 0.0)
-    assert false or flat or abs(np.mean(squares) - 5) < 4 * np.sqrt(10 / count)
+    # Now and then a false match within 3.3 sigma of its epipolar line takes part, and nobody can know.
+    assert np.mean(np.array(squares) > 25) <= 0.015
     assert abs(np.mean(variance_factors) - 1) < 0.05
 
 
@@ -147,6 +139,66 @@ def test_few_points():
         relative_orientation(scene.rays_1, scene.rays_2, SIGMA)
 
 
+@pytest.mark.parametrize("n", [5, 6, 7, 8])
+def test_all_orientations_of_exact_minimal_points(n):
+    for seed in range(10):
+        scene = pair_scene(n, seed)
+        found = relative_orientations(scene.rays_1, scene.rays_2, 1e-7, robust=False)
+        apart = [np.abs(f.camera_2_from_camera_1 - scene.rotation).max() for f in found]
+        assert min(apart) < 1e-8
+        assert n == 5 or len(found) <= 2
+
+
+def test_points_on_a_critical_surface():
+    """Where x_2' F x_1 = 0 holds for another essential matrix F, too: a quadric through both projection centres."""
+    told = 0
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        scene = pair_scene(5, seed, base=[1, 0.2, 0.1])
+        other = essential(turns(0.3 * rng.normal(size=3))[0] @ scene.rotation, scene.base[[1, 2, 0]])
+        directions = np.column_stack([rng.uniform(-0.6, 0.6, (4000, 2)), -np.ones(4000)])
+        in_2 = directions @ scene.rotation.T
+        base_2 = scene.rotation @ scene.base
+        depth = (directions @ other.T @ base_2) / np.einsum("ni,ij,nj->n", in_2, other, directions)
+        seen_2 = depth[:, None] * in_2 - base_2
+        good = (depth > 2) & (depth < 15) & (seen_2[:, 2] < -0.5) & (np.abs(seen_2[:, :2]).max(1) < -1.5 * seen_2[:, 2])
+        points, seen_2 = (directions * depth[:, None])[good][:40], seen_2[good][:40]
+        if len(points) < 40:
+            continue
+        noisy = (rays_of(p[:, :2] / -p[:, 2:] + SIGMA * rng.normal(size=(40, 2))) for p in (points, seen_2))
+        told += 1
+        try:
+            found = relative_orientations(*noisy, SIGMA)
+        except BlockError as reason:
+            assert "determine their relative orientation" in str(reason)
+            continue
+        assert min(normalised(error_of(f, scene), f.covariance) for f in found) < 30
+    assert told >= 3
+
+
+def test_rays_that_are_no_numbers_or_in_no_order():
+    scene = pair_scene(20, 0)
+    spoilt = scene.rays_2.copy()
+    spoilt[3] = np.nan
+    with pytest.raises(BlockError, match="1 of the 20 rays of the two images are no numbers"):
+        relative_orientation(scene.rays_1, spoilt, SIGMA)
+    with pytest.raises(ValueError, match="there are 20 and 19"):
+        relative_orientation(scene.rays_1, scene.rays_2[:19], SIGMA)
+    with pytest.raises(ValueError, match="sigma_rad is 0"):
+        relative_orientation(scene.rays_1, scene.rays_2, 0.0)
+
+
+def test_covariance_that_does_not_tell_the_errors():
+    # A small flat figure from afar, with a short base: what is known of the orientation lies on a curve.
+    refused = 0
+    for seed in range(6):
+        scene = pair_scene(15, seed, 10 * SIGMA, flat=True, base=[1, 0, 0], length=1.0)
+        with pytest.raises(BlockError, match=r"determine their relative orientation|one place|fit their|as many would"):
+            relative_orientation(scene.rays_1, scene.rays_2, 10 * SIGMA)
+        refused += 1
+    assert refused == 6
+
+
 def test_images_from_one_place():
     scene = pair_scene(100, 0, SIGMA, length=0.0)
     with pytest.raises(BlockError, match="images a and b were taken from one place"):
@@ -175,13 +227,31 @@ def test_matches_that_are_all_false():
             relative_orientation(rays_of(xy[0]), rays_of(xy[1]), SIGMA)
 
 
+def test_homography_of_a_plane_and_its_two_orientations():
+    for seed in range(20):
+        scene = pair_scene(20, seed, flat=True)
+        (matrix,) = homographies(scene.rays_1[None, :4], scene.rays_2[None, :4])
+        pairs = RayPairs.of(scene.rays_1, scene.rays_2, 1e-6)
+        assert np.max(transfer_errors(matrix[None], pairs)) < 1e-3
+        found = homography_orientations(matrix, scene.rays_1)
+        apart = [np.abs(r - scene.rotation).max() + np.abs(b - scene.base).max() for r, b in found]
+        assert np.sort(apart)[0] < 1e-6 < 0.01 < np.sort(apart)[1]
+        # Both meet the coplanarity condition of every point of the plane.
+        for rotation, base in found:
+            matrix = essential(rotation, base)
+            np.testing.assert_allclose(np.einsum("ni,ij,nj->n", scene.rays_2, matrix, scene.rays_1), 0, atol=1e-6)
+    turned = homographies(scene.rays_1[None], scene.rays_1[None] @ scene.rotation.T)[0]
+    np.testing.assert_allclose(turned, scene.rotation, atol=1e-7)
+    assert homography_orientations(turned, scene.rays_1) == []
+
+
 def test_both_orientations_of_a_flat_scene_are_told():
     told = 0
     for seed in range(40):
         scene = pair_scene(60, seed, SIGMA, flat=True)
         found = relative_orientations(scene.rays_1, scene.rays_2, SIGMA)
-        apart = [np.linalg.norm(rotation_error(f.camera_2_from_camera_1, scene.rotation)) for f in found]
-        assert min(apart) < 0.05, "the truth is not among them"
+        apart = [normalised(error_of(f, scene), f.covariance) for f in found]
+        assert min(apart) < 40, "the truth is not among them"
         if len(found) > 1:
             told += 1
             with pytest.raises(BlockError, match="fit their 60 common points equally well"):

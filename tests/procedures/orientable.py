@@ -6,6 +6,8 @@ import numpy as np
 
 from jaxphoto.camera import Sensor
 from jaxphoto.orientation.matches import PairMatches
+from jaxphoto.procedures.orientation.onto_known import similarity_between
+from jaxphoto.statistics import covariance
 from tests.formulas import camera_from_object
 
 PIXEL = 0.005
@@ -72,20 +74,36 @@ def convergent(n_images=10, n_points=400, seed=0):
     return Scene(positions, matrices, points)
 
 
-def aerial(strips=2, per_strip=6, n_points=600, seed=0):
-    """Strips flown there and back over hilly ground, 70 % overlap along and across."""
+def aerial(
+    strips=2,
+    per_strip=5,
+    forward=0.6,
+    across=0.3,
+    relief=15.0,
+    crab_deg=5.0,
+    tilt=0.02,
+    c=8.0,
+    height=100.0,
+    per_image=250,
+    seed=0,
+):
+    """Strips flown there and back `height` m over rolling ground, with overlaps, crab, and c (mm) of the lens."""
     rng = np.random.default_rng(seed)
+    width, depth = SENSOR.width_mm * height / c, SENSOR.height_mm * height / c
+    base, apart = (1 - forward) * width, (1 - across) * depth
     positions, matrices = [], []
     for s in range(strips):
         for k in range(per_strip):
-            x = 30.0 * (k if s % 2 == 0 else per_strip - 1 - k)
-            positions.append([x, 40.0 * s, 100.0])
-            kappa = np.pi * (s % 2)
-            matrices.append(camera_from_object(*(0.03 * rng.normal(size=2)), kappa + 0.03 * rng.normal()))
-    positions = np.array(positions) + rng.normal(size=(len(positions), 3))
-    low, high = [-50, -40], [30.0 * per_strip + 20, 40.0 * strips]
-    points = np.column_stack([rng.uniform(low, high, (n_points, 2)), 25 * rng.random(n_points)])
-    return Scene(positions, np.stack(matrices), points)
+            back = s % 2
+            positions.append([base * (per_strip - 1 - k if back else k), apart * s, height])
+            kappa = np.pi * back + np.deg2rad(crab_deg) * (1 - 2 * back) + tilt * rng.normal()
+            matrices.append(camera_from_object(*(tilt * rng.normal(size=2)), kappa))
+    positions = np.array(positions) + 0.01 * height * rng.normal(size=(len(positions), 3))
+    low, high = np.array([-width, -depth]) / 2, [base * (per_strip - 1) + width / 2, apart * (strips - 1) + depth / 2]
+    n = round(per_image * np.prod(high - low) / (width * depth))
+    x, y = rng.uniform(low, high, (n, 2)).T
+    rolling = 0.35 * np.sin(2 * x / width) * np.cos(2.5 * y / width) + 0.15 * rng.uniform(-1, 1, n)
+    return Scene(positions, np.stack(matrices), np.column_stack([x, y, relief * rolling]))
 
 
 TRUE = Camera()
@@ -125,3 +143,42 @@ def photographed(scene, camera=TRUE, noise_px=0.3, false=0.0, seed=1, clutter=60
             matches.append(PairMatches(i, j, pairs[rng.permutation(len(pairs))] if not false else pairs))
     names = tuple(f"p{k:02d}" for k in range(len(features)))
     return Photographs(names, features, matches, scene, camera, point_of)
+
+
+def placed(oriented, scene):
+    """Stations and matrices of a network after the similarity that brings its stations nearest to the true ones."""
+    order = [int(name[1:]) for name in oriented.block.images]
+    exterior = oriented.adjusted.unknowns.exterior
+    there = np.asarray(exterior.position)
+    s = similarity_between(there, scene.positions[order])
+    return order, s, s.of(there), np.asarray(exterior.camera_from_object) @ s.turn.T
+
+
+def errors_over_sigmas(oriented, scene):
+    """Errors (images, 6) of stations and rotations after `placed`, over their standard deviations in that datum.
+
+    A network has errors e in its own datum. What the similarity leaves of them is S e, S = I - G (G_s' G_s)^-1 G_s',
+    with the seven motions G, of which G_s are the rows of stations; so their covariance is S C S' in any datum.
+    """
+    order, s, stations, matrices = placed(oriented, scene)
+    n, true = len(order), scene.matrices[order]
+    found = covariance(oriented.adjusted, "camera")
+    turned = np.einsum("nij,nkj->nik", matrices, true)
+    # A small rotation theta takes M to (I - [theta]x) M.
+    rotations = 0.5 * np.stack([turned[:, i, j] - turned[:, j, i] for i, j in ((1, 2), (2, 0), (0, 1))], axis=1)
+    errors = np.hstack([stations - scene.positions[order], rotations])
+    datum = np.zeros((n, 6, 6))
+    datum[:, :3, :3], datum[:, 3:, 3:] = s.scale * s.turn, np.eye(3)
+    x = scene.positions[order] - scene.positions[order].mean(axis=0)
+    motions = np.zeros((n, 6, 7))
+    motions[:, :3, :3], motions[:, :3, 6] = np.eye(3), x
+    motions[:, :3, 3:6] = np.cross(np.eye(3)[None], x[:, None]).transpose(0, 2, 1)
+    motions[:, 3:, 3:6] = true
+    flat = motions.reshape(6 * n, 7)
+    of_station = np.tile(np.arange(6) < 3, n)
+    fit = flat @ np.linalg.pinv(flat[of_station])
+    left = np.eye(6 * n)
+    left[:, of_station] -= fit
+    apply = np.einsum("anj,njk->ank", left.reshape(6 * n, n, 6), datum).reshape(6 * n, 6 * n)
+    matrix = apply @ np.asarray(found.matrix)[: 6 * n, : 6 * n] @ apply.T * float(found.variance_factor)
+    return errors / np.sqrt(np.diagonal(matrix)).reshape(n, 6)

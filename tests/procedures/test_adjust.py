@@ -6,9 +6,10 @@ from jaxphoto.compiling import run
 from jaxphoto.procedures import adjust_for_tables
 from jaxphoto.report import Tables
 from tests.blocks import simulated
+from tests.marks import slow_but
 
 
-@pytest.mark.parametrize("name", ["cross", "inner", "mount"])
+@pytest.mark.parametrize("name", slow_but(("cross",), ("cross", "inner", "mount")))
 def test_what_is_compiled_meanwhile_serves_the_tables(name, monkeypatch):
     monkeypatch.setattr(run, "_programs", {})
     monkeypatch.setattr(run, "_prepared", {})

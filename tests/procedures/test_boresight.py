@@ -147,6 +147,7 @@ def test_a_major_shift_stops_at_the_second_step():
     assert "trajectory" in said(found[1])
 
 
+@pytest.mark.slow
 def test_a_moderate_shift_is_carried():
     """Free in step 3, held at its value in step 4; nothing else of the strips is kept."""
     shift = 0.4

@@ -103,6 +103,7 @@ def test_observations_are_linear_about_the_result():
     assert np.mean(off < 0.01) > 0.9 and off.max() < 0.1
 
 
+@pytest.mark.slow
 def test_without_a_trajectory_only_shifts_are_found():
     flight = misaligned()
     found = simultaneous(flight.block, flight.cloud, settings=SETTINGS, max_rounds=2)

@@ -44,6 +44,7 @@ def test_lidar_control(folder, tmp_path, monkeypatch, capsys):
     assert code == 0
 
 
+@pytest.mark.slow
 def test_simultaneous(folder, tmp_path, monkeypatch, capsys):
     out, cloud = tmp_path / "both", folder / "cloud.laz"
     given = ("--trajectory", folder / "trajectory.csv", "--shift", "2", *SIGMAS)

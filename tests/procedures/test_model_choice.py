@@ -2,12 +2,13 @@ import csv
 import json
 
 import equinox as eqx
+import jax
 import numpy as np
 import pytest
 
 from jaxphoto import FIXED, FREE, Weighted, adjust
 from jaxphoto.block import ImageRows
-from jaxphoto.camera import Brown, OpenCv, Smac, get_parameter
+from jaxphoto.camera import Brown, OpenCv, Smac, exact, get_parameter, rebalance, set_parameter
 from jaxphoto.errors import BlockError, InputError
 from jaxphoto.io import write_block
 from jaxphoto.procedures.camera_candidates import candidate_of, with_candidate
@@ -190,8 +191,10 @@ def test_a_candidate_starts_from_the_distortion_of_the_block(block):
     interior, priors = same.start.unknowns.interior["one"], same.priors.interior["one"]
     assert isinstance(interior.distortion, Brown)
     assert [float(get_parameter(interior, n)) for n in ("k1", "k2", "p1")] == [-9e-5, 0.0, 0.0]
-    assert isinstance(priors.c, Weighted) and isinstance(priors.distortion.k1, Weighted)
-    assert (priors.distortion.p1, priors.distortion.k2) == (FREE, FIXED)
+    assert (priors.c.value, priors.c.sigma) == (35.0, 0.01)
+    # A weighted coefficient would be an observation that others do not have.
+    assert (priors.distortion.k1, priors.distortion.p1, priors.distortion.k2) == (FREE, FREE, FIXED)
+    assert interior.residuals == "measured"
     smac = with_candidate(block, candidate_of("smac:k1+k2"), None).start.unknowns.interior["one"].distortion
     assert isinstance(smac, Smac)
     assert (float(smac.k1), float(smac.k2)) == (-9e-5, 1.0e-7)
@@ -199,6 +202,24 @@ def test_a_candidate_starts_from_the_distortion_of_the_block(block):
     assert isinstance(with_others.start.unknowns.interior["one"].distortion, OpenCv)
     # The best k1 alone: that of Brown's k1 would be -0.11, and his k2 takes half of it back in the corners.
     assert float(with_others.start.unknowns.interior["one"].distortion.k1) < -0.03
+
+
+def test_a_weighted_principal_distance_is_the_same_in_every_model(block, perfect):
+    """SMAC's c at R0 = 9 mm is 0.7 % below Brown's: 26 of the standard deviations that it is known with."""
+    noisy = drawn(block, perfect, 3)
+    balanced = rebalance(exact(noisy.start.unknowns.interior["one"], Smac), 9.0)
+    free = jax.tree.map(lambda _: FIXED, balanced)
+    for name in ("k1", "k2", "xp_mm", "yp_mm"):
+        free = set_parameter(free, name, FREE)
+    weighted = set_parameter(free, "c_mm", Weighted(float(balanced.c) + 0.004, 0.01))
+    places = lambda b: (b.start.unknowns.interior["one"], b.priors.interior["one"])  # noqa: E731
+    own = eqx.tree_at(places, noisy, (balanced, weighted))
+    as_brown = with_candidate(own, candidate_of("brown:k1+k2"), None)
+    prior, c = as_brown.priors.interior["one"].c, float(as_brown.start.unknowns.interior["one"].c)
+    # c of R0 = 0 is c / (1 + sum of k R0^(2 i)): the bundle of the weighted value is the same.
+    scale = 1 / (1 + float(balanced.distortion.k1) * 9.0**2 + float(balanced.distortion.k2) * 9.0**4)
+    assert abs(c - scale * float(balanced.c)) < 1e-12 < 0.2 < abs(c - float(balanced.c))
+    np.testing.assert_allclose((prior.value, prior.sigma), (scale * (float(balanced.c) + 0.004), scale * 0.01))
 
 
 def test_wrong_use_is_refused(block):

@@ -8,8 +8,17 @@ from jaxphoto.errors import BlockError
 from jaxphoto.orientation.matches import PairMatches
 from jaxphoto.procedures.orientation import orient
 from jaxphoto.procedures.orientation.finish import _shared_covariance
-from jaxphoto.procedures.orientation.onto_known import similarity_between
-from tests.procedures.orientable import PIXEL, SENSOR, convergent, photographed
+from tests.procedures.orientable import (
+    PIXEL,
+    SENSOR,
+    Camera,
+    Scene,
+    convergent,
+    errors_over_sigmas,
+    looking,
+    photographed,
+    placed,
+)
 
 FALSE = 0.3
 TRUTH = {"c_mm": 8.0, "xp_mm": 0.04, "yp_mm": -0.03, "k1": 1.5e-3, "k2": -2e-5}
@@ -44,15 +53,6 @@ def parameters(oriented):
     return {n: (float(get_parameter(interior, n)), sigmas[n]) for n in oriented.report.estimated}
 
 
-def stations_in(scene, oriented):
-    """The stations of a network in the frame of the truth."""
-    order = [int(name[1:]) for name in oriented.block.images]
-    there = np.asarray(oriented.block.start.unknowns.exterior.position)
-    s = similarity_between(there, scene.positions[order])
-    turned = np.asarray(oriented.block.start.unknowns.exterior.camera_from_object) @ s.turn.T
-    return order, s.shift + s.scale * there @ s.turn.T, turned
-
-
 @pytest.mark.parametrize("which", ["clean", "spoilt"])
 def test_camera_and_images_are_those_of_the_truth(which, scene, request):
     oriented = request.getfixturevalue(which)
@@ -65,10 +65,13 @@ def test_camera_and_images_are_those_of_the_truth(which, scene, request):
     assert set(found) >= {"c_mm", "k1"}
     for name, (value, sigma) in found.items():
         assert abs(value - TRUTH.get(name, 0.0)) < 3.5 * sigma, (name, value, sigma)
-    order, stations, matrices = stations_in(scene, oriented)
+    order, _, stations, matrices = placed(oriented, scene)
     # 0.3 px of 1,600 at a distance of 8 m is 1.5 mm; stations are some parts of that to some times that.
     assert np.linalg.norm(stations - scene.positions[order], axis=1).max() < 0.006
     np.testing.assert_allclose(matrices, scene.matrices[order], rtol=0, atol=1e-3)
+    ratios = errors_over_sigmas(oriented, scene)
+    assert np.abs(ratios).max() < 3.5
+    assert np.sqrt(np.mean(ratios**2)) < 1.5
 
 
 def test_false_matches_change_nothing_beyond_three_sigma(clean, spoilt, scene):
@@ -76,10 +79,26 @@ def test_false_matches_change_nothing_beyond_three_sigma(clean, spoilt, scene):
     assert set(a) == set(b)
     for name in a:
         assert abs(a[name][0] - b[name][0]) < 3 * a[name][1], name
-    _, one, _ = stations_in(scene, clean)
-    order, other, _ = stations_in(scene, spoilt)
-    error = np.sqrt(np.mean(np.sum((one - scene.positions[order]) ** 2, axis=1)))
-    assert np.linalg.norm(one - other, axis=1).max() < 3 * error
+    # The same rays but for a few, so that their errors are nearly the same.
+    assert np.abs(in_order(clean, scene) - in_order(spoilt, scene)).max() < 1.0
+
+
+def in_order(oriented, scene):
+    """Errors over sigmas of stations and rotations, by image."""
+    assert len(oriented.block.images) == len(scene.positions)
+    return errors_over_sigmas(oriented, scene)[np.argsort(oriented.block.images)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(1, 5))
+def test_false_matches_change_nothing_in_other_scenes(seed):
+    scene = convergent(7, 220, seed=seed)
+    one, other = (oriented_from(photographed(scene, false=f, seed=seed + 1)) for f in (0.0, FALSE))
+    one, other = in_order(one, scene), in_order(other, scene)
+    assert np.abs(one - other).max() < 3.0
+    for ratios in (one, other):
+        assert np.abs(ratios).max() < 4.0
+        assert np.sqrt(np.mean(ratios**2)) < 1.6
 
 
 def test_false_matches_are_found_and_counted(scene, clean, spoilt):
@@ -124,3 +143,43 @@ def test_too_few_matches(scene):
     matches = [PairMatches(0, 1, p.matches[0].features[:6])]
     with pytest.raises(BlockError, match="images p00 and p01 have 6 matches, and 15 are needed"):
         orient(p.names, SENSOR, InteriorOrientation(8.0), p.features, matches)
+
+
+def test_a_photograph_of_something_else_and_one_twice_from_a_place(scene):
+    """The former is named; the latter are both oriented by their pairs with the others."""
+    twice = Scene(*(v[[0, 1, 2, 3, 4, 2]] for v in scene[:2]), scene.points)
+    p = photographed(twice)
+    rng = np.random.default_rng(0)
+    half = np.array([SENSOR.width_mm, SENSOR.height_mm]) / 2
+    features = [*p.features, rng.uniform(-half, half, (250, 2))]
+    false = [
+        PairMatches(i, 6, np.column_stack([rng.permutation(len(p.features[i]))[:40], rng.permutation(250)[:40]]))
+        for i in range(6)
+    ]
+    sigmas = [np.full(len(xy), 0.3 * PIXEL) for xy in features]
+    names = (*p.names, "elsewhere")
+    found = orient(names, SENSOR, InteriorOrientation(8.6), features, [*p.matches, *false], sigmas)
+    assert sorted(found.block.images) == list(p.names)
+    assert found.report.unoriented == {"elsewhere": "no other image has a relative orientation to it"}
+    ratios = errors_over_sigmas(found, twice)
+    assert np.abs(ratios).max() < 3.5
+
+
+@pytest.mark.parametrize("false", [0.0, FALSE])
+def test_images_from_one_place_are_recognised(false):
+    rng = np.random.default_rng(3)
+    centre, angles = np.array([0.0, 0.0, 1.0]), np.deg2rad(np.arange(0, 120, 20))
+    matrices = np.stack([looking(centre, centre + np.array([np.cos(a), np.sin(a), 0.1]), 0.0) for a in angles])
+    points = rng.normal(size=(600, 3))
+    points *= (10 * rng.uniform(0.5, 3, 600) / np.linalg.norm(points, axis=1))[:, None]
+    p = photographed(Scene(np.tile(centre, (6, 1)), matrices, points), Camera(8.0, 0.0, 0.0, 0.0, 0.0), false=false)
+    with pytest.raises(BlockError, match=r"no two of the 6 images .*were taken from one place"):
+        orient(p.names, SENSOR, InteriorOrientation(8.0), p.features, p.matches)
+
+
+def test_groups_that_one_image_connects_by_three_points_are_named(scene):
+    p = photographed(scene)
+    matches = [m for m in p.matches if max(m.first, m.second) <= 3 or min(m.first, m.second) >= 3]
+    few = [m._replace(features=m.features[:3]) if m.first == 3 else m for m in matches]
+    with pytest.raises(BlockError, match=r"2 groups .*\(p00, p01, p02, p03; p04, p05, p06\)"):
+        orient(p.names, SENSOR, InteriorOrientation(8.0), p.features, few)

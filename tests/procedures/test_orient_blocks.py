@@ -5,16 +5,18 @@ import dataclasses
 import numpy as np
 import pytest
 
-from jaxphoto.block import Rows, Start
+from jaxphoto.block import ImageRows, Rows, Start
 from jaxphoto.camera import InteriorOrientation
+from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import BlockError
-from jaxphoto.orientation.approximate import has_beginning
+from jaxphoto.orientation.approximate import completed, has_beginning
 from jaxphoto.orientation.matches import tracks
-from jaxphoto.procedures.adjust import start_of
+from jaxphoto.procedures.adjust import adjust, start_of
 from jaxphoto.procedures.orientation import orient_block
 from jaxphoto.procedures.orientation.photographs import _block_of
 from jaxphoto.procedures.orientation.refine import freed
-from tests.procedures.orientable import PIXEL, SENSOR, Camera, convergent, photographed
+from tests.formulas import camera_from_object
+from tests.procedures.orientable import PIXEL, SENSOR, Camera, aerial, convergent, photographed
 
 PLAIN = Camera(8.0, 0.0, 0.0, 0.0, 0.0)
 
@@ -88,8 +90,111 @@ def test_what_can_be_resected_needs_no_orientation(scene):
     assert not has_beginning(block)
     assert not has_beginning(with_control(block, true, scene, np.array([0, 20, 45])))
     assert has_beginning(with_control(block, true, scene, np.arange(20)))
-    known = dataclasses.replace(block.start, image_known=np.arange(5) == 2)
-    assert has_beginning(dataclasses.replace(block, start=known))
+    assert not has_beginning(with_known_images(block, scene, [2]))
+    assert has_beginning(with_known_images(block, scene, [1, 2]))
+
+
+@pytest.fixture(scope="module")
+def flown():
+    """Ten images of two strips, and four control points that no two images see all."""
+    scene = aerial(per_image=120, crab_deg=0.0)
+    block, true = unknown_block(scene)
+    corners = scene.points[true][:, :2] @ np.array([[1.0, 1.0, -1.0, -1.0], [1.0, -1.0, 1.0, -1.0]])
+    return scene, block, true, np.unique(np.argmax(corners, axis=0))
+
+
+def with_known_images(block, scene, which, off_m=0.0, off_rad=0.0):
+    """The images `which` known, wrongly by so much."""
+    rng = np.random.default_rng(0)
+    known = np.isin(np.arange(len(block.images)), which)
+    positions = scene.positions + off_m * rng.normal(size=scene.positions.shape)
+    turned = np.stack([camera_from_object(*a) for a in off_rad * rng.normal(size=(len(known), 3))])
+    exterior = ExteriorOrientation(
+        np.where(known[:, None], positions, 0.0), np.where(known[:, None, None], turned @ scene.matrices, np.eye(3))
+    )
+    unknowns = dataclasses.replace(block.start.unknowns, exterior=exterior)
+    return dataclasses.replace(block, start=Start(unknowns, known, block.start.point_known))
+
+
+def with_stations(block, scene, which):
+    """Stations observed by GNSS to 5 cm, no angles."""
+    noise = 0.05 * np.random.default_rng(1).normal(size=(len(which), 3))
+    n = len(which)
+    rows = Rows(
+        np.repeat(which, 3),
+        np.tile(np.arange(3), n),
+        (scene.positions[which] + noise).ravel(),
+        np.full(3 * n, 0.05),
+    )
+    return dataclasses.replace(block, stations=rows)
+
+
+def largest_errors(start, scene):
+    """Of stations (m) and rotations (rad)."""
+    exterior = start.exterior
+    turned = np.einsum("nij,nkj->nik", exterior.camera_from_object, scene.matrices)
+    angle = 2 * np.arcsin(np.linalg.norm(turned - np.eye(3), axis=(1, 2)) / np.sqrt(8))
+    return np.linalg.norm(exterior.position - scene.positions, axis=1).max(), angle.max()
+
+
+@pytest.mark.parametrize(
+    ("images", "control", "stations"),
+    [
+        (range(10), False, ()),
+        (range(0, 10, 2), False, ()),
+        ((0, 1), False, ()),
+        ((0, 9), False, ()),
+        ((3,), True, ()),
+        ((), True, ()),
+        ((), False, range(10)),
+        ((), False, (0, 4, 5)),
+        ((4,), False, (0, 1, 2)),
+    ],
+    ids=["all", "half", "two", "ends", "one, control", "control", "GNSS", "GNSS of three", "one, GNSS on a line"],
+)
+def test_whatever_is_known_gives_a_start(flown, images, control, stations):
+    scene, block, true, corners = flown
+    block = with_control(block, true, scene, corners) if control else block
+    block = with_stations(block, scene, np.array(stations, int)) if len(stations) else block
+    block = with_known_images(block, scene, np.array(images, int), 0.05, 5e-4)
+    start = start_of(block)
+    metres, radians = largest_errors(start, scene)
+    # From 100 m, 0.3 px is 2 cm; over a strip of five images this sums up to some decimetres.
+    assert metres < 2.0, metres
+    assert radians < 0.02, radians
+    given = np.array(images, int)
+    exterior, known = start.exterior, block.start.unknowns.exterior
+    np.testing.assert_array_equal(np.asarray(exterior.position)[given], np.asarray(known.position)[given])
+    apart = np.linalg.norm(start.points - scene.points[true], axis=1)
+    assert np.median(apart) < 1.0
+
+
+def test_few_images_known_roughly_lead_to_the_same_adjustment(flown):
+    scene, block, true, corners = flown
+    block = with_control(block, true, scene, corners)
+    # 3 m and 3.4 degrees: resections from points that these intersect would lead others astray.
+    rough = with_known_images(block, scene, [0, 1], 3.0, 0.06)
+    assert largest_errors(completed(rough).unknowns, scene)[0] > 20.0
+    assert largest_errors(start_of(rough), scene)[0] < 8.0
+    adjusted = adjust(rough)
+    assert bool(adjusted.converged)
+    assert 0.9 < float(adjusted.sigma0) < 1.1
+    best = adjust(with_known_images(block, scene, np.arange(10)))
+    np.testing.assert_allclose(adjusted.unknowns.exterior.position, best.unknowns.exterior.position, rtol=0, atol=1e-5)
+    assert largest_errors(adjusted.unknowns, scene)[0] < 1.0
+
+
+def test_images_beyond_reach_are_named(flown):
+    scene, block, _, _ = flown
+    rows = block.image_points
+    # Points of one strip only: the other has no tie to it.
+    first = np.isin(np.arange(len(block.points)), rows.point[rows.image < 5])
+    second = np.isin(np.arange(len(block.points)), rows.point[rows.image >= 5])
+    block = with_known_images(block, scene, [0, 1])
+    kept = ~(first & second)[rows.point]
+    cut = ImageRows(*(np.asarray(v)[kept] for v in (rows.image, rows.point, rows.xy, rows.sigma)))
+    with pytest.raises(BlockError, match=r"5 of 10 images \(p05, p06, p07, p08, p09\) have no approximate .*2 groups"):
+        start_of(dataclasses.replace(block, image_points=cut))
 
 
 def test_images_that_see_nothing_in_common_are_refused(scene):

@@ -5,11 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from jaxphoto.block import Rows
+from jaxphoto.block import Distances, Rows, Start
 from jaxphoto.camera import InteriorOrientation
+from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import BlockError
 from jaxphoto.orientation.matches import tracks
 from jaxphoto.procedures.orientation.finish import _eliminate
+from jaxphoto.procedures.orientation.growing import _starts, _worth
 from jaxphoto.procedures.orientation.network import Fate, empty_network, meet, misfits, sight_of
 from jaxphoto.procedures.orientation.onto_known import onto_known, similarity_between
 from jaxphoto.procedures.orientation.pairs import Pair
@@ -98,6 +100,28 @@ def test_a_false_pair_does_not_spoil_two_steps():
     np.testing.assert_allclose(placed.position, scene.positions[4], rtol=0, atol=1e-9)
 
 
+def test_of_two_orientations_of_a_pair_one_counts():
+    """The other, from the same place, would have the lines meet there."""
+    scene = convergent(5, 60)
+    _, network, sight, _ = network_of(scene)
+    network = meet(sight, network.without_image(4), 4.0, np.deg2rad(0.5))
+    true = pair_of(scene, 0, 4)
+    turn = np.asarray(camera_from_object(0.03, -0.02, 0.01))
+    other = true._replace(second_from_first=turn @ true.second_from_first, base=np.asarray(turn) @ true.base)
+    for pairs in ([true, other], [other, true, pair_of(scene, 1, 4)]):
+        placed = two_steps(4, pairs, network, sight)
+        np.testing.assert_allclose(placed.position, scene.positions[4], rtol=0, atol=0.05)
+    np.testing.assert_allclose(placed.camera_from_object, scene.matrices[4], rtol=0, atol=0.03)
+
+
+def test_it_begins_with_the_orientation_that_the_triplet_bears_out():
+    scene = convergent(4, 40)
+    pairs = [pair_of(scene, i, j, 100) for i in range(4) for j in range(i + 1, 4)]
+    wrong = pairs[0]._replace(second_from_first=np.asarray(camera_from_object(0.3, 0.2, 0.1)), n=150)
+    assert _worth(wrong) == max(map(_worth, [wrong, *pairs]))
+    assert next(_starts([wrong, *pairs]))[0] is not wrong
+
+
 def test_on_a_line_the_points_give_the_scale():
     rng = np.random.default_rng(3)
     positions = np.array([[0.0, 0, 0], [0, 1, 0], [0, 2.3, 0]])
@@ -119,22 +143,26 @@ def test_without_a_pair_there_are_no_two_steps():
 def test_held_parameters_change_the_others_as_a_new_adjustment_would():
     rng = np.random.default_rng(0)
     a = rng.normal(size=(60, 4)) @ (np.eye(4) + 0.5 * rng.normal(size=(4, 4)))
-    truth = np.array([3.0, 2.0, 0.0, 0.0])
+    a[:, 3] = a[:, 2] + 0.02 * rng.normal(size=60)  # two that are hardly told apart
+    truth = np.array([3.0, 0.0, 0.0, 0.01])
     y = a @ truth + 0.1 * rng.normal(size=60)
     covariance = 0.01 * np.linalg.inv(a.T @ a)
-    left, why = _eliminate(("k1", "k2", "p1", "p2"), np.linalg.lstsq(a, y)[0], covariance, np.full(4, 1e3))
-    # The same by adjusting anew, the least significant one held each time.
+    unit = np.array([3.0, 3.0, 3.0, 3.0])
+    left, why = _eliminate(("k1", "k2", "p1", "p2"), np.linalg.lstsq(a, y)[0], covariance, unit)
+    # The same by adjusting anew, the one most open held each time.
     kept = [0, 1, 2, 3]
     while True:
         part = a[:, kept]
-        x, q = np.linalg.lstsq(part, y)[0], 0.01 * np.linalg.inv(part.T @ part)
-        ratio = np.abs(x) / np.sqrt(np.diagonal(q))
-        if ratio.min() >= 3:
+        x, sigma = np.linalg.lstsq(part, y)[0], 0.1 * np.sqrt(np.diagonal(np.linalg.inv(part.T @ part)))
+        open_ = (sigma > 0.3) | ((sigma > 0.06) & (np.abs(x) < 3 * sigma))
+        if not open_.any():
             break
-        kept.pop(int(np.argmin(ratio)))
+        kept.pop(int(np.argmax(np.where(open_, sigma, 0))))
     assert left == tuple(np.array(["k1", "k2", "p1", "p2"])[kept])
-    assert set(why) == {"k1", "k2", "p1", "p2"} - set(left)
+    # One of the two is held, though both were open; what is told stays free, significant or not.
+    assert len(left) == 3
     assert {"k1", "k2"} <= set(left)
+    assert set(why) == {"k1", "k2", "p1", "p2"} - set(left)
 
 
 def test_similarity_by_any_turn_and_its_defects():
@@ -150,18 +178,70 @@ def test_similarity_by_any_turn_and_its_defects():
     assert similarity_between(there[:2], there[:2]) is None
 
 
-def test_a_network_comes_to_known_points_or_says_why_not():
-    scene = convergent(4, 40)
+@pytest.fixture(scope="module")
+def elsewhere():
+    """A network of six images, its block, and truth in a frame that is turned, moved and twice as large."""
+    scene = convergent(6, 60)
     block, network, sight, true = network_of(scene)
     network = meet(sight, network, 4.0, np.deg2rad(1.5))
-    assert onto_known(block, network) is network
+    turn = np.asarray(camera_from_object(0.5, 0.4, 3.1))
     where = np.zeros((len(block.points), 3))
     where[sight.point] = scene.points[true]
-    there = 5 + 2 * where @ np.asarray(camera_from_object(0.5, 0.4, 3.1)).T
-    stations = 5 + 2 * scene.positions @ np.asarray(camera_from_object(0.5, 0.4, 3.1)).T
-    rows = Rows(np.repeat(np.arange(4), 3), np.tile(np.arange(3), 4), stations.ravel(), np.full(12, 0.1))
-    found = onto_known(dataclasses.replace(block, stations=rows), network)
-    np.testing.assert_allclose(found.points, there, rtol=0, atol=1e-9)
-    few = Rows(rows.who[:6], rows.axis[:6], rows.value[:6], rows.sigma[:6])
+    there = Scene(5 + 2 * scene.positions @ turn.T, scene.matrices @ turn.T, 5 + 2 * where @ turn.T)
+    return block, network, there
+
+
+def stations_of(there, images):
+    """Stations of `images` as rows of a block."""
+    n = len(images)
+    return Rows(np.repeat(images, 3), np.tile(np.arange(3), n), there.positions[images].ravel(), np.full(3 * n, 0.1))
+
+
+def known_start(block, there, images=(), points=()):
+    """A start that knows `images` and `points`."""
+    pick = lambda n, which: np.isin(np.arange(n), which)  # noqa: E731
+    image, point = pick(len(block.images), images), pick(len(block.points), points)
+    exterior = ExteriorOrientation(
+        np.where(image[:, None], there.positions, 0.0),
+        np.where(image[:, None, None], there.matrices, np.eye(3)),
+    )
+    unknowns = dataclasses.replace(
+        block.start.unknowns, exterior=exterior, points=np.where(point[:, None], there.points, 0.0)
+    )
+    return Start(unknowns, image, point)
+
+
+def test_a_network_comes_to_known_stations_or_says_why_not(elsewhere):
+    block, network, there = elsewhere
+    np.testing.assert_array_equal(onto_known(block, network, block.start).points, network.points)
+    found = onto_known(dataclasses.replace(block, stations=stations_of(there, np.arange(4))), network, block.start)
+    np.testing.assert_allclose(found.points, there.points, rtol=0, atol=1e-9)
+    few = dataclasses.replace(block, stations=stations_of(there, np.arange(2)))
     with pytest.raises(BlockError, match="the 2 known points and stations that they see are fewer than three"):
-        onto_known(dataclasses.replace(block, stations=few), network)
+        onto_known(few, network, block.start)
+
+
+@pytest.mark.parametrize(
+    ("images", "points"),
+    [([0, 1, 2, 3], []), ([1, 4], []), ([2], [5, 6]), ([3], [7])],
+    ids=["four images", "two images", "one image and two points", "one image and one point"],
+)
+def test_known_images_give_the_frame(elsewhere, images, points):
+    block, network, there = elsewhere
+    start = known_start(block, there, images, points)
+    found = onto_known(dataclasses.replace(block, start=start), network, start)
+    np.testing.assert_allclose(found.positions, there.positions, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(found.camera_from_object, there.matrices, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(found.points, there.points, rtol=0, atol=1e-9)
+
+
+def test_a_scale_bar_gives_the_scale(elsewhere):
+    block, network, there = elsewhere
+    bar = np.array([[3, 17]])
+    length = np.linalg.norm(there.points[3] - there.points[17])
+    block = dataclasses.replace(block, distances=Distances(bar, np.array([length]), np.array([0.01])))
+    start = known_start(block, there, [2])
+    found = onto_known(dataclasses.replace(block, start=start), network, start)
+    np.testing.assert_allclose(found.points, there.points, rtol=0, atol=1e-9)
+    free = onto_known(block, network, block.start)
+    assert np.linalg.norm(free.points[3] - free.points[17]) == pytest.approx(length, rel=1e-12)

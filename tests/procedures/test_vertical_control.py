@@ -11,6 +11,7 @@ from jaxphoto.block import Rows
 from jaxphoto.cloud import Cloud
 from jaxphoto.lidar import HeightFlag, HeightSettings
 from jaxphoto.procedures.lidar import LidarControl, lidar_control
+from tests.marks import slow_but
 from tests.procedures.lidar import scanned, triplet
 
 SETTINGS = HeightSettings(sigma_z_m=0.1, sigma_xy_m=0.3)
@@ -29,7 +30,7 @@ def errors(control: LidarControl) -> np.ndarray:
     return (np.asarray(a.values.shared)[a.structure.free] - true) / np.asarray(known.shared_sigma)
 
 
-@pytest.mark.parametrize("method", ["plane", "local", "image"])
+@pytest.mark.parametrize("method", slow_but(("plane",), ("plane", "local", "image")))
 def test_heights_alone_calibrate_the_camera(method):
     control = controlled(method)
     assert control.still and bool(control.adjusted.converged)
@@ -83,6 +84,7 @@ def test_only_points_named():
     assert [scanned().block.points[p] for p in control.points] == list(names)
 
 
+@pytest.mark.slow
 def test_a_triplet_is_calibrated_by_pseudo_control():
     """Paper 001: three images of a strip, 30 features, four laser points each; stations on a line leave roll open."""
     flight, settings = triplet(), HeightSettings(points=4, sigma_z_m=0.1, sigma_xy_m=0.3)

@@ -59,6 +59,7 @@ def test_relief_cures_it():
     assert not weak(warnings_of(tables(2.0, False)))
 
 
+@pytest.mark.slow
 def test_a_held_c_is_not_complained_of():
     (only,) = weak(warnings_of(tables(0.1, False, ("xp_mm", "yp_mm"))))
     assert "principal point" in only

@@ -101,6 +101,7 @@ def test_derivatives_by_observations_are_those_of_full_adjustments(group: str) -
     assert 1e-5 < off("everything", first, expected) < 0.1
 
 
+@pytest.mark.slow
 def test_derivative_by_a_surface_of_the_laser_scanner() -> None:
     """Of a point that lies on surfaces of two strips, both along the normal of one."""
     a = nominal("surfaces")
@@ -144,6 +145,7 @@ def test_derivatives_by_what_is_fixed(label: str) -> None:
     assert off("everything", found.fixed[:, found.fixed_labels.index(label)], expected) < 1e-6
 
 
+@pytest.mark.slow
 def test_derivative_by_a_fixed_lever_arm() -> None:
     block, truth = simulated("mount")
     priors = eqx.tree_at(lambda p: p.mounts["imu"].lever_arm, block.priors, FIXED)
@@ -196,6 +198,7 @@ class _Exterior:
         self.position, self.omega_phi_kappa = change.unknowns.exterior.position, change.omega_phi_kappa
 
 
+@pytest.mark.slow
 def test_first_order_matrix_is_the_dense_one() -> None:
     """-N^-1 J' dr of the distances of a free network, from the dense Jacobian of all residuals."""
     a = nominal("inner")

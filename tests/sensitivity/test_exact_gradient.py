@@ -27,6 +27,7 @@ def with_station(height, unknowns):
     return adjust(eqx.tree_at(lambda b: b.stations.value, block, block.stations.value + move), unknowns)
 
 
+@pytest.mark.slow
 def test_gradient_of_statistics_in_jit_and_vmap() -> None:
     start = adjusted("cross").unknowns
     heights = np.array([0.0, 0.2])

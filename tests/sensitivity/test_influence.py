@@ -75,6 +75,7 @@ def test_variance_is_that_of_the_covariance_where_residuals_are_measurements() -
     assert set(shares.by_group) == set(derivatives("cross").groups)
 
 
+@pytest.mark.slow
 def test_shares_without_distortion_are_those_of_the_covariance() -> None:
     """Where residuals are the measured coordinates themselves, A diag(sigma^2) A' is the covariance exactly."""
     block = simulated("fixed_interior").block

@@ -13,8 +13,9 @@ from jaxphoto.adjustment import Adjustment
 from jaxphoto.sensitivity import Readjustment, noise
 from jaxphoto.unknowns import FIXED, Weighted
 from tests.blocks import adjusted, simulated
+from tests.marks import slow_but
 
-KINDS = ("cross", "everything", "inner")
+KINDS = slow_but(("cross",), ("cross", "everything", "inner"))
 
 
 def sigmas(nominal: Adjustment) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -57,6 +58,7 @@ def test_a_draw_is_the_optimum_of_its_own_block(name):
         close(draws, k, full, nominal, 2e-5)
 
 
+@pytest.mark.slow
 def test_what_is_held_can_be_drawn():
     nominal = adjusted("fixed_interior")
     wrong = bias(nominal.block, "interior", 0.02, parameter="c_mm")
@@ -72,6 +74,7 @@ def test_what_is_held_can_be_drawn():
         close(draws, k, adjust(nominal.block, start, nominal.priors), nominal, 2e-5)
 
 
+@pytest.mark.slow
 def test_a_lever_arm_that_is_held_can_be_drawn():
     block, truth = simulated("mount")
     (name,) = block.priors.mounts
@@ -87,6 +90,7 @@ def test_a_lever_arm_that_is_held_can_be_drawn():
     close(draws, 0, adjust(nominal.block, start, held), nominal, 2e-5)
 
 
+@pytest.mark.slow
 def test_a_lever_arm_that_is_known_beforehand_can_be_drawn():
     nominal = adjusted("everything")
     (name,) = nominal.block.priors.mounts

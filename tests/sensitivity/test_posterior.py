@@ -55,6 +55,7 @@ def test_laplace_is_the_a_priori_covariance(of_cross):
     assert of_cross.optimum[3] == pytest.approx(float(unknowns.exterior.omega_phi_kappa[7, 2]), abs=1e-12)
 
 
+@pytest.mark.slow
 def test_free_network_is_sampled_on_the_plane_of_its_constraints():
     a = adjusted("inner")
     names = ("interior[one].c_mm", "exterior[i2].X", "points[p4].Z")

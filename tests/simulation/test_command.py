@@ -91,6 +91,7 @@ def test_mistakes_end_with_one_sentence_and_nothing_written(tmp_path, monkeypatc
     assert {p.name for p in tmp_path.iterdir()} == {"bad.toml", "full"}
 
 
+@pytest.mark.slow
 def test_an_adjustment_of_a_simulated_block_finds_the_truth(tmp_path):
     """Ties, control, stations and attitudes with noise; camera, boresight and the shifts of two strips are found."""
     free = dict.fromkeys(("c_mm", "xp_mm", "yp_mm", "k1", "k2"), "free")

@@ -85,7 +85,7 @@ def test_check_points_do_not_take_part():
 
 
 def test_point_differences_are_first_minus_second_of_the_common():
-    one, other = adjusted("cross"), adjusted("strips")
+    one, other = adjusted("cross"), adjusted("fixed_interior")
     fewer = eqx.tree_at(lambda x: x.unknowns.points, other, np.asarray(other.unknowns.points)[2:])
     fewer = dataclasses.replace(fewer, block=dataclasses.replace(other.block, points=other.block.points[2:]))
     names, difference = point_differences(one, fewer)

@@ -1,7 +1,10 @@
 """Agisoft's calibration XML: f, cx, cy, b1, b2 in pixels and k1-k4, p1-p4 of Metashape and PhotoScan.
 
 cx and cy run from the image centre, y down. Exported cameras (<document>) hold the same per sensor, with the size of a
-pixel. Files with fx, fy and skew are older; which of p1 and p2 is which depended on the version then.
+pixel. Files with fx, fy and skew are of PhotoScan before 1.2 and of Agisoft Lens: cx and cy run from the upper left
+corner, f = fy, b1 = fx - fy, b2 = skew, and p1 and p2 are in OpenCV's order.
+Source: Agisoft Metashape User Manual, Appendix D "Camera models"; Agisoft Lens User Manual 0.4; Agisoft's forum, topic
+6437.
 """
 
 import xml.etree.ElementTree as ElementTree
@@ -11,10 +14,11 @@ import jax
 
 from jaxphoto.arrays import on_device
 from jaxphoto.camera import Agisoft, InteriorOrientation, Sensor
-from jaxphoto.io.cameras.camera_file import CameraFile, Source
+from jaxphoto.io.cameras.camera_file import CameraFile, Source, joined_notes
 
 _SCALED = ("b1", "b2")
 _COEFFICIENTS = tuple(name for name in Agisoft.coefficients if name not in _SCALED)
+_KNOWN = ("f", "fx", "fy", "cx", "cy", "skew", *Agisoft.coefficients)
 
 
 def recognises(path: Path, text: str) -> bool:
@@ -25,7 +29,8 @@ def recognises(path: Path, text: str) -> bool:
 def read_agisoft(source: Source) -> CameraFile:
     """The frame camera of a calibration file, or one sensor of exported cameras.
 
-    Raises InputError for a file that is cut off, other projections than "frame", missing or old elements.
+    Raises InputError for a file that is cut off, other projections than "frame", missing elements, and what is no
+    number.
     """
     try:
         root = ElementTree.fromstring(source.text())
@@ -37,18 +42,14 @@ def read_agisoft(source: Source) -> CameraFile:
     kind = calibration.findtext("projection") or calibration.get("type") or "frame"
     if kind.strip() != "frame":
         raise source.error(f'the projection {kind.strip()!r} is not known here; only "frame" is')
-    if calibration.find("f") is None and calibration.find("fx") is not None:
-        raise source.error("fx, fy and skew are of old versions, which differ in p1 and p2; export it from Metashape")
     pixel_mm = source.number("pixel_width", pixel) if pixel is not None else None
     sensor, assumed = source.sensor(*_size(source, calibration), pixel_mm)
-    f = source.number("f", _needed(source, calibration, "f"))
-    if not f > 0:
-        raise source.error(f"f is {f:g} pixels; a focal length is positive")
-    value = lambda key: source.number(key, calibration.findtext(key, "0"))  # noqa: E731
-    coefficients = {k: value(k) for k in _COEFFICIENTS} | {k: value(k) / f for k in _SCALED}
-    x_p, y_p = value("cx") * sensor.pixel_mm, -value("cy") * sensor.pixel_mm
-    interior = InteriorOrientation(f * sensor.pixel_mm, x_p, y_p, Agisoft(**coefficients))
-    return CameraFile(name, sensor, jax.tree.map(on_device, interior), None, assumed)
+    values, note = _values(source, calibration, sensor)
+    f = values.pop("f")
+    x_p, y_p = values.pop("cx") * sensor.pixel_mm, -values.pop("cy") * sensor.pixel_mm
+    distortion = Agisoft(**{k: v / f if k in _SCALED else v for k, v in values.items()})
+    interior = InteriorOrientation(f * sensor.pixel_mm, x_p, y_p, distortion)
+    return CameraFile(name, sensor, jax.tree.map(on_device, interior), None, joined_notes(note, assumed))
 
 
 def write_agisoft(path: Path, name: str, sensor: Sensor, interior: InteriorOrientation) -> None:
@@ -82,6 +83,28 @@ def _sensors(root: ElementTree.Element) -> dict[str, tuple[ElementTree.Element, 
     return found
 
 
+def _values(source: Source, calibration: ElementTree.Element, sensor: Sensor) -> tuple[dict[str, float], str]:
+    """f, cx, cy, b1, b2 and coefficients as Metashape has them, and what was assumed of an older file."""
+    older = calibration.find("f") is None and calibration.find("fx") is not None
+    for key in ("fx", "fy") if older else ("f",):
+        if calibration.findtext(key) is None:
+            raise source.error(f"<{key}> is missing; add it")
+    given = {child.tag: source.number(child.tag, child.text) for child in calibration if child.tag in _KNOWN}
+    for key in ("f", "fx", "fy"):
+        if key in given and not given[key] > 0:
+            raise source.error(f"{key} is {given[key]:g} pixels; a focal length is positive")
+    values = {key: given.get(key, 0.0) for key in ("f", "cx", "cy", *Agisoft.coefficients)}
+    if not older:
+        return values, ""
+    values |= {"f": given["fy"], "b1": given["fx"] - given["fy"], "b2": given.get("skew", 0.0)}
+    values |= {
+        key: given[key] - side / 2 for key, side in (("cx", sensor.width_px), ("cy", sensor.height_px)) if key in given
+    }
+    values |= {"p1": values["p2"], "p2": values["p1"]}
+    tangential = values["p1"] != 0 or values["p2"] != 0
+    return values, "fx and fy are of an old version; its p1 and p2 were taken in OpenCV's order" * tangential
+
+
 def _size(source: Source, calibration: ElementTree.Element) -> tuple[float, float]:
     resolution = calibration.find("resolution")
     given = [calibration.findtext(side) if resolution is None else resolution.get(side) for side in ("width", "height")]
@@ -90,10 +113,3 @@ def _size(source: Source, calibration: ElementTree.Element) -> tuple[float, floa
     if None in given:
         raise source.error("<width> or <height> is missing; add both")
     return source.number("width", given[0]), source.number("height", given[1])
-
-
-def _needed(source: Source, calibration: ElementTree.Element, key: str) -> str:
-    text = calibration.findtext(key)
-    if text is None:
-        raise source.error(f"<{key}> is missing; add it")
-    return text

@@ -83,7 +83,7 @@ class Source(NamedTuple):
         if not (width > 0 and height > 0 and width == int(width) and height == int(height)):
             raise self.error(f"an image of {width:g} x {height:g} pixels cannot be; give whole positive numbers")
         pixel = self.pixel_mm if self.pixel_mm is not None else pixel_mm
-        if pixel is not None and not pixel > 0:
+        if pixel is not None and not 0 < pixel < np.inf:
             raise self.error(f"a pixel of {pixel:g} mm cannot be; give its size in millimetres")
         assumed = f"the size of a pixel is not known; {ASSUMED_PIXEL_MM} mm was assumed, and c_mm scales with it"
         note = assumed if pixel is None else ""

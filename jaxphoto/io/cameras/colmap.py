@@ -1,11 +1,14 @@
-"""Cameras of COLMAP's cameras.txt: `CAMERA_ID MODEL WIDTH HEIGHT PARAMS...` a line.
+"""Cameras of COLMAP: `CAMERA_ID MODEL WIDTH HEIGHT PARAMS...`, a line of cameras.txt or a record of cameras.bin.
 
 COLMAP's centre of the upper left pixel is (0.5, 0.5), as ours. All its models without fish-eye are parts of OpenCV's.
+Source: the documentation of COLMAP, "Camera models" and "Output format".
 """
 
 from pathlib import Path
+from typing import NamedTuple
 
 from jaxphoto.camera import InteriorOrientation, OpenCv, Sensor
+from jaxphoto.io.cameras.binary_file import BinaryFile
 from jaxphoto.io.cameras.camera_file import CameraFile, Source, from_centre_px, in_pixels
 from jaxphoto.io.tables import is_number
 
@@ -20,54 +23,136 @@ MODELS = {
 }
 """The models that are known, simplest first, and the order of their parameters."""
 
+TEXT, BINARY = "cameras.txt", "cameras.bin"
+_COLUMNS = "CAMERA_ID MODEL WIDTH HEIGHT PARAMS"
+# By the number that a binary file has for it; those that are not known here for the message.
+_NUMBERS = (
+    "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV",
+    "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE",
+)  # fmt: skip
+
+
+class ColmapCamera(NamedTuple):
+    """A camera as COLMAP has it: name of its model, format in pixels, and parameters in the order of `MODELS`."""
+
+    model: str
+    width_px: int
+    height_px: int
+    values: tuple[float, ...]
+
+    @property
+    def named(self) -> dict[str, float]:
+        """The parameters by their names."""
+        return dict(zip(MODELS[self.model], self.values, strict=True))
+
 
 def recognises(path: Path, text: str) -> bool:
-    """Whether the first line that is no comment begins with an id and the name of a model."""
-    first = next((line.split() for line in _lines(text)), [])
-    return len(first) > 4 and first[1].isupper() and all(map(is_number, first[2:]))
+    """Whether the file is called so, or the first line that is no comment begins with an id and the name of a model."""
+    first = next((line.split() for _, line in _lines(text)), [])
+    return path.name in (TEXT, BINARY) or (len(first) > 4 and first[1].isupper() and all(map(is_number, first[2:])))
 
 
 def read_colmap(source: Source) -> CameraFile:
-    """One camera of the file. Raises InputError for lines that are no camera and for models that are not known here."""
-    lines = {}
-    for line in _lines(source.text()):
-        cells = line.split()
-        lines[cells[0]] = cells
-    name = source.chosen(list(lines))
-    cells = lines[name]
-    if len(cells) < 4:
-        raise source.error(f"camera {name} has {len(cells)} cells; write CAMERA_ID MODEL WIDTH HEIGHT PARAMS")
-    model = cells[1]
-    if model not in MODELS:
-        raise source.error(f"the model {model} of camera {name} is not known here; use one of {', '.join(MODELS)}")
-    names = MODELS[model]
-    if len(cells) != 4 + len(names):
-        raise source.error(
-            f"camera {name} has {len(cells) - 4} parameters, {model} has {len(names)}: {', '.join(names)}"
-        )
-    values = {key: source.number(f"{key} of camera {name}", cell) for key, cell in zip(names, cells[4:], strict=True)}
-    sensor, assumed = source.sensor(*(source.number(f"the size of camera {name}", cell) for cell in cells[2:4]))
-    fx, fy = (values.pop("f"),) * 2 if "f" in values else (values.pop("fx"), values.pop("fy"))
-    centre = values.pop("cx"), values.pop("cy")
-    interior = in_pixels(source, sensor, fx, fy, centre, OpenCv, **values)
+    """One camera of the file, which only has to be sound in itself. Raises what `read_cameras` raises."""
+    if source.path.suffix == ".bin":
+        cameras = read_cameras(source)
+        name = source.chosen([str(identifier) for identifier in cameras])
+        camera = cameras[int(name)]
+    else:
+        lines = _by_id(source)
+        name = source.chosen([str(identifier) for identifier in lines])
+        camera = _camera(source, name, lines[int(name)])
+    sensor, interior, assumed = sensor_and_interior(source, camera)
     return CameraFile(name, sensor, interior, None, assumed)
 
 
-def write_colmap(path: Path, name: str, sensor: Sensor, interior: InteriorOrientation) -> None:
-    """Write a camera with the distortion `OpenCv` and b2 = 0, as the simplest model that holds it."""
+def read_cameras(source: Source) -> dict[int, ColmapCamera]:
+    """All cameras of cameras.txt or cameras.bin by their ids.
+
+    Raises InputError for what is no camera, for ids that are there twice and for models that are not known here.
+    """
+    if source.path.suffix != ".bin":
+        return {key: _camera(source, str(key), cells) for key, cells in _by_id(source).items()}
+    cameras = {}
+    file = BinaryFile(source.path)
+    for _ in range(file.count(24)):
+        identifier, number, width, height = file.take("IiQQ")
+        model = _NUMBERS[number] if 0 <= number < len(_NUMBERS) else f"number {number}"
+        _check_known(source, model, str(identifier))
+        cameras[identifier] = ColmapCamera(model, width, height, file.numbers(len(MODELS[model])))
+    return cameras
+
+
+def sensor_and_interior(source: Source, camera: ColmapCamera) -> tuple[Sensor, InteriorOrientation, str]:
+    """Sensor, interior orientation with the distortion `OpenCv`, and what was assumed. Raises what `in_pixels` does."""
+    sensor, assumed = source.sensor(camera.width_px, camera.height_px)
+    values = camera.named
+    fx, fy = (values.pop("f"),) * 2 if "f" in values else (values.pop("fx"), values.pop("fy"))
+    centre = values.pop("cx"), values.pop("cy")
+    return sensor, in_pixels(source, sensor, fx, fy, centre, OpenCv, **values), assumed
+
+
+def colmap_camera(sensor: Sensor, interior: InteriorOrientation) -> ColmapCamera:
+    """A camera with the distortion `OpenCv` and b2 = 0 as the simplest model that holds it."""
     fx, fy, column, row = from_centre_px(interior, sensor)
     d = interior.distortion
-    values = {"fx": fx, "fy": fy, "cx": column, "cy": row}
-    values |= {k: float(getattr(d, k)) for k in OpenCv.coefficients if k not in ("b1", "b2")}
-    needed = {key for key, value in values.items() if value != 0 and key not in ("fx", "fy", "cx", "cy")}
-    needed |= {"fx"} if fx != fy else set()
+    values = {"fx": fx, "fy": fy, "f": fy, "cx": column, "cy": row}
+    coefficients = {k: float(getattr(d, k)) for k in OpenCv.coefficients if k not in ("b1", "b2")}
+    needed = {key for key, value in coefficients.items() if value != 0} | ({"fx"} if fx != fy else set())
     model = next(m for m, names in MODELS.items() if needed <= set(names))
-    cells = [repr(values["fy" if key == "f" else key]) for key in MODELS[model]]
-    identifier = name if name.isdigit() else "1"
-    head = "# Camera list with one line of data per camera:\n#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n"
-    line = " ".join([identifier, model, str(sensor.width_px), str(sensor.height_px), *cells])
-    path.write_text(head + line + "\n", encoding="utf-8")
+    of_model = tuple((values | coefficients)[key] for key in MODELS[model])
+    return ColmapCamera(model, sensor.width_px, sensor.height_px, of_model)
 
 
-def _lines(text: str) -> list[str]:
-    return [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+def cameras_text(cameras: dict[int, ColmapCamera]) -> str:
+    """The content of cameras.txt; numbers come back exactly."""
+    lines = ["# Camera list with one line of data per camera:", "#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
+    for identifier, c in cameras.items():
+        lines.append(" ".join([f"{identifier} {c.model} {c.width_px} {c.height_px}", *map(repr, c.values)]))
+    return "\n".join(lines) + "\n"
+
+
+def write_colmap(path: Path, name: str, sensor: Sensor, interior: InteriorOrientation) -> None:
+    """Write a camera with the distortion `OpenCv` and b2 = 0 as cameras.txt; a `name` that is a number is its id."""
+    identifier = int(name) if name.isascii() and name.isdigit() else 1
+    path.write_text(cameras_text({identifier: colmap_camera(sensor, interior)}), encoding="utf-8")
+
+
+def _by_id(source: Source) -> dict[int, list[str]]:
+    """The cells of every camera's line, by its id."""
+    found: dict[int, list[str]] = {}
+    for row, line in _lines(source.text()):
+        cells = line.split()
+        if not (cells[0].isascii() and cells[0].isdigit()):
+            raise source.error(f"row {row} begins with {cells[0]!r}, which is no id; write {_COLUMNS}")
+        identifier = int(cells[0])
+        if identifier in found:
+            raise source.error(f"camera {identifier} stands there twice; keep one of the two lines")
+        found[identifier] = cells
+    return found
+
+
+def _camera(source: Source, name: str, cells: list[str]) -> ColmapCamera:
+    if len(cells) < 4:
+        raise source.error(f"camera {name} has {len(cells)} cells; write {_COLUMNS}")
+    model = cells[1]
+    _check_known(source, model, name)
+    names = MODELS[model]
+    if len(cells) != 4 + len(names):
+        given = len(cells) - 4
+        raise source.error(f"camera {name} has {given} parameters, {model} has {len(names)}: {', '.join(names)}")
+    width, height = (source.number(f"the size of camera {name}", cell) for cell in cells[2:4])
+    source.sensor(width, height)
+    values = (source.number(f"{key} of camera {name}", cell) for key, cell in zip(names, cells[4:], strict=True))
+    return ColmapCamera(model, int(width), int(height), tuple(values))
+
+
+def _check_known(source: Source, model: str, name: str) -> None:
+    if model not in MODELS:
+        raise source.error(f"the model {model} of camera {name} is not known here; use one of {', '.join(MODELS)}")
+
+
+def _lines(text: str) -> list[tuple[int, str]]:
+    """Rows and text of the lines that are neither empty nor comments."""
+    numbered = enumerate(text.splitlines(), start=1)
+    return [(row, line) for row, line in numbered if line.strip() and not line.lstrip().startswith("#")]

@@ -86,8 +86,11 @@ def _size(source: Source, storage: cv2.FileStorage) -> tuple[float, float]:
     return size[0], size[1]  # type: ignore[return-value]
 
 
-def _number(storage: cv2.FileStorage, key: str) -> float | None:
-    node = storage.getNode(key)
+def _number(parent: cv2.FileStorage | cv2.FileNode, key: str) -> float | None:
+    return _value(parent.getNode(key))
+
+
+def _value(node: cv2.FileNode) -> float | None:
     return float(node.real()) if not node.empty() and (node.isReal() or node.isInt()) else None
 
 
@@ -95,10 +98,13 @@ def _matrix(source: Source, storage: cv2.FileStorage, key: str) -> np.ndarray:
     node = storage.getNode(key)
     if node.empty():
         raise source.error(f"{key} is missing; add it, as OpenCV's calibration writes it")
-    try:
-        matrix = node.mat()
-    except cv2.error:
-        matrix = None
-    if matrix is None or not np.isfinite(matrix).all():
-        raise source.error(f"{key} is no matrix of finite numbers; write it with cv2.FileStorage")
-    return np.asarray(matrix, float)
+    # Its parts one by one: FileNode.mat() ends the whole process where one of them is missing.
+    rows, columns = (_number(node, side) if node.isMap() else None for side in ("rows", "cols"))
+    data = node.getNode("data") if node.isMap() else node
+    values = [_value(data.at(k)) for k in range(data.size())] if data.isSeq() else []
+    if rows is None or columns is None or None in values or not rows * columns == len(values) > 0:
+        raise source.error(f"{key} is no matrix with rows, cols and as many numbers in data; write it anew with OpenCV")
+    matrix = np.array(values, float).reshape(-1, max(int(columns), 1))
+    if not np.isfinite(matrix).all():
+        raise source.error(f"{key} is no matrix of finite numbers; calibrate again")
+    return matrix

@@ -26,7 +26,7 @@ _FORMATS = {
     "opencv": _Format(open_cv.recognises, open_cv.read_open_cv),
 }
 # In a folder, what its camera file is called.
-_IN_FOLDER = (results.INTERIOR, TOML, "cameras.txt")
+_IN_FOLDER = (results.INTERIOR, TOML, colmap.TEXT, colmap.BINARY)
 
 
 def read_camera_file(
@@ -55,7 +55,7 @@ def read_camera_file(
     if not path.is_file():
         raise InputError(f"there is no file {path}; correct the name")
     source = Source(path, camera, pixel_mm, size_px, Path(block) if block is not None else None)
-    text = source.text()
+    text = "" if path.name == colmap.BINARY else source.text()
     for known in _FORMATS.values():
         if known.recognises(path, text):
             return known.read(source)

@@ -27,6 +27,7 @@ from jaxphoto.unknowns import FIXED
 INTERIOR = "interior.csv"
 _COLUMNS = ("camera", "parameter", "value")
 _CORRELATION = ("parameter_a", "parameter_b", "rho")
+_ROUNDING = 1e-5
 
 
 def read_block_camera(source: Source) -> CameraFile:
@@ -54,17 +55,29 @@ def read_results(source: Source) -> CameraFile:
     name = source.chosen(list(dict.fromkeys(of.tolist())))
     sensor, empty = _described(source, name)
     own = table.take(of == name)
-    values = dict(zip(own.ids("parameter").tolist(), own.numbers("value").tolist(), strict=True))
-    sigmas = dict(zip(values, own.numbers("sigma", empty=True).tolist(), strict=True))
+    parameters = own.ids("parameter").tolist()
+    for number, parameter in enumerate(parameters):
+        if parameter in parameters[:number]:
+            raise own.bad(number, f"{parameter} of camera {name} stands there twice; keep one of the two rows")
+    values = dict(zip(parameters, own.numbers("value").tolist(), strict=True))
+    given = np.nan_to_num(own.numbers("sigma", empty=True))
+    for line in np.flatnonzero(given < 0):
+        raise own.bad(line, f"sigma is {given[line]:g}; leave it empty for what was held fixed")
+    sigmas = dict(zip(parameters, given.tolist(), strict=True))
     names = parameter_names(empty)
     constants = constant_names(type(empty.distortion))
     if missing := [n for n in (*names, *constants) if n not in values]:
         model = type(empty.distortion).__name__
         raise source.error(f"camera {name} has no {', '.join(missing)}, which {model} needs; give the block it is of")
+    if not values["c_mm"] > 0:
+        raise source.error(f"c_mm of camera {name} is {values['c_mm']:g}; a principal distance is positive")
+    for constant in constants:
+        if not (values[constant] > 0 or (constant == "r0_mm" and values[constant] == 0)):
+            raise source.error(f"{constant} of camera {name} is {values[constant]:g}; give it as a positive length")
     interior = empty
     for parameter in (*names, *constants):
         interior = set_parameter(interior, parameter, on_device(values[parameter]))
-    sigma = np.nan_to_num(np.array([sigmas[n] for n in names]))
+    sigma = np.array([sigmas[n] for n in names])
     return CameraFile(name, sensor, interior, _covariance(source, name, names, sigma))
 
 
@@ -74,14 +87,27 @@ def _covariance(source: Source, camera: str, names: tuple[str, ...], sigma: np.n
     free = [n for n, s in zip(names, sigma, strict=True) if s > 0]
     if not free or not path.is_file():
         return None
-    table: pd.DataFrame = pd.read_csv(path, usecols=list(_CORRELATION))
+    try:
+        table: pd.DataFrame = pd.read_csv(path, usecols=list(_CORRELATION), low_memory=False)
+    except ValueError:
+        needed = ", ".join(_CORRELATION)
+        raise source.error(f"{path.name} beside it is no table of {needed}; adjust again or remove it") from None
     labels = {f"interior[{camera}].{n}": k for k, n in enumerate(names) if n in free}
     rows = table[table.parameter_a.isin(labels) & table.parameter_b.isin(labels)]
-    if len(rows) != len(free) * (len(free) - 1):
+    rho = np.full((len(names), len(names)), np.nan)
+    a, b = (rows[column].map(labels).to_numpy(int) for column in _CORRELATION[:2])
+    rho[a, b] = pd.to_numeric(rows.rho, errors="coerce")
+    own = np.ix_(*2 * [[names.index(n) for n in free]])
+    np.fill_diagonal(rho, 1.0)
+    if len(rows) != len(free) * (len(free) - 1) or not _is_correlation(rho[own]):
         raise source.error(f"{path.name} beside it is not of the same adjustment; adjust again or remove it")
-    rho = np.eye(len(names))
-    rho[rows.parameter_a.map(labels), rows.parameter_b.map(labels)] = rows.rho
-    return sigma[:, None] * rho * sigma
+    return sigma[:, None] * np.nan_to_num(rho) * sigma
+
+
+def _is_correlation(rho: np.ndarray) -> bool:
+    """Whether every pair is there, both ways alike, and the matrix could be one of correlations, but for rounding."""
+    alike = np.isfinite(rho).all() and np.abs(rho - rho.T).max() < _ROUNDING
+    return bool(alike and np.linalg.eigvalsh(rho).min() > -_ROUNDING)
 
 
 def _described(source: Source, camera: str) -> tuple[Sensor, InteriorOrientation]:
@@ -97,10 +123,10 @@ def _described(source: Source, camera: str) -> tuple[Sensor, InteriorOrientation
         told = json.loads(path.read_text(encoding="utf-8"))["cameras"][camera]
         kind = DISTORTIONS[told["distortion"]]
         sensor = Sensor(told["width_px"], told["height_px"], told["pixel_mm"])
-        sign = {"sign": told["sign"]} if kind is Smac else {}
+        constants = dict.fromkeys(constant_names(kind).values(), 1.0)
+        distortion = kind(**constants, **({"sign": told["sign"]} if kind is Smac else {}))
     except (OSError, ValueError, KeyError, TypeError):
         raise source.error(
             f"neither summary.json beside it nor a block says of which model camera {camera} is; give the block"
         ) from None
-    constants = dict.fromkeys(constant_names(kind).values(), 1.0)
-    return sensor, InteriorOrientation(1.0, 0.0, 0.0, kind(**constants, **sign))
+    return sensor, InteriorOrientation(1.0, 0.0, 0.0, distortion)

@@ -20,7 +20,9 @@ _NEEDED = ("K0", "K1", "K2", "xp", "yp")
 _FILM_MM, _FILM_PIXEL_MM = 228.6, 0.01
 # Powers as reports print them (0.2616 x 10-4), or as computers do (0.2616E-04); minus signs of either kind.
 _NUMBER = r"[-+−]?\s?(?:\d+\.?\d*|\.\d+)(?:[eEdD][-+−]?\d+|\s*[x×*]\s*10\s*(?:\^|\*\*)?\s*[-+−]\s?\d+)?"
-_TOKEN = re.compile(rf"(?P<name>\b(?:K[0-4]|P[1-4]|[xy]p)\b)|(?P<equals>=)|(?P<number>{_NUMBER})")
+# A power of ten that is cut off stays with its number, which is none without it.
+_CUT = r"(?:\s*[x×*]\s*10(?!\d))?"
+_TOKEN = re.compile(rf"(?P<name>\b(?:K[0-4]|P[1-4]|[xy]p)\b)|(?P<equals>=)|(?P<number>{_NUMBER}{_CUT})")
 _FOCAL = re.compile(rf"calibrated\s+focal\s+length.*?({_NUMBER})\s*mm", re.IGNORECASE | re.DOTALL)
 _POINT = re.compile(rf"[xy]p\s*=\s*{_NUMBER}\s*mm")
 _FORMAT = re.compile(rf"image format:\s*(\d+)\s*x\s*(\d+)\s*pixels of\s*({_NUMBER})\s*mm", re.IGNORECASE)
@@ -36,8 +38,8 @@ def read_smac_report(source: Source) -> CameraFile:
     text = source.text()
     # Where its own number is torn away, that of the principal point is not to be taken for it.
     focal = _FOCAL.search(_POINT.sub(" ", text))
-    values = _values(source, text)
-    missing = [name for name in _NEEDED if name not in values]
+    values, named = _values(source, text)
+    missing = [name for name in _PARAMETERS if name in named.union(_NEEDED) and name not in values]
     if focal is None:
         missing.insert(0, "the Calibrated Focal Length in mm")
     if focal is None or missing:
@@ -79,8 +81,11 @@ def write_smac_report(path: Path, name: str, sensor: Sensor, interior: InteriorO
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def _values(source: Source, text: str) -> dict[str, float]:
-    """NAME = VALUE, and columns of which the text of a PDF gives first all names, then all signs, then all values."""
+def _values(source: Source, text: str) -> tuple[dict[str, float], set[str]]:
+    """NAME = VALUE, and columns of which the text of a PDF gives first all names, then all signs, then all values.
+
+    With all names that there are, of which some may have lost their values.
+    """
     tokens = [(m.lastgroup, m.group()) for m in _TOKEN.finditer(text)]
     values: dict[str, float] = {}
     waiting: list[str] = []
@@ -100,13 +105,12 @@ def _values(source: Source, text: str) -> dict[str, float]:
             values.setdefault(name, _number(source, name, token))
             signs -= 1
         k += 1
-    return values
+    return values, {token for kind, token in tokens if kind == "name"}
 
 
 def _number(source: Source, name: str, text: str) -> float:
-    text = re.sub(r"\s", "", text).replace("−", "-")
-    mantissa, _, power = re.sub(r"[x×*]10(\^|\*\*)?", "e", text).replace("D", "e").replace("d", "e").partition("e")
-    return source.number(name, f"{mantissa}e{power}" if power else mantissa)
+    plain = re.sub(r"\s", "", text).replace("−", "-")
+    return source.number(name, re.sub(r"[x×*]10(\^|\*\*)?|[dD]", "e", plain))
 
 
 def _sensor(source: Source, text: str) -> tuple[Sensor, str]:

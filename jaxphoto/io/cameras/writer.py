@@ -49,7 +49,8 @@ def write_camera_file(
     `format` None: cameras.txt is COLMAP's, else the suffix tells. The distortion is converted exactly where its terms
     allow it, else fitted over the format (`camera.conversion`). `distortion` chooses the model in a block.toml.
 
-    Raises InputError for unknown formats and for cameras that the format cannot hold.
+    Raises InputError for unknown formats, for a `distortion` that is not the format's and for cameras that the format
+    cannot hold.
     """
     path = Path(path)
     if format is None:
@@ -58,6 +59,11 @@ def write_camera_file(
     if format not in _FORMATS:
         raise InputError(f"{path}: the name does not tell the format; name one of {', '.join(_FORMATS)}")
     known = _FORMATS[format]
+    if distortion not in (None, known.distortion) and known.distortion is not None:
+        raise InputError(
+            f"{path}: the format {format} has the distortion {known.distortion.__name__}, not {distortion.__name__}; "
+            "leave the distortion out, or write a .toml"
+        )
     target = known.distortion or distortion or type(interior.distortion)
     try:
         conversion = converted(interior, target, sensor, known.lacks)

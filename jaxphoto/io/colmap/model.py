@@ -4,7 +4,6 @@ Frames and rigs, which newer models have beside them, repeat the poses of the im
 Source: the documentation of COLMAP, "Output format".
 """
 
-import struct
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -13,25 +12,13 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxphoto.errors import InputError
-from jaxphoto.io.cameras.colmap import MODELS
+from jaxphoto.io.cameras.binary_file import BinaryFile
+from jaxphoto.io.cameras.camera_file import Source
+from jaxphoto.io.cameras.colmap import ColmapCamera, read_cameras
 
-_FILES = ("cameras", "images", "points3D")
-# By the number that a binary file has for it; those that are not known here for the message.
-_MODEL_NUMBERS = (
-    "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV",
-    "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE",
-)  # fmt: skip
+FILES = ("cameras", "images", "points3D")
 # What a binary file has for a feature that is of no point.
 _NO_POINT = 2**64 - 1
-
-
-class ColmapCamera(NamedTuple):
-    """A camera: the name of its model, its format in pixels and its parameters in the order of `MODELS`."""
-
-    model: str
-    width_px: int
-    height_px: int
-    values: tuple[float, ...]
 
 
 class ColmapImage(NamedTuple):
@@ -59,31 +46,43 @@ class ColmapModel(NamedTuple):
 
 def recognises(source: Path) -> bool:
     """Whether `source` is a folder with the three files of a model, all text or all binary."""
-    return any(all((source / (name + suffix)).is_file() for name in _FILES) for suffix in (".txt", ".bin"))
+    return any(all((source / (name + suffix)).is_file() for name in FILES) for suffix in (".txt", ".bin"))
 
 
 def read_model(folder: Path) -> ColmapModel:
     """The model in `folder`, from the text where it has both kinds. Raises InputError for what cannot be read."""
     if not recognises(folder):
         raise InputError(
-            f"{folder} has not {', '.join(_FILES)}, all .txt or all .bin; give the folder of a COLMAP model"
+            f"{folder} has not {', '.join(FILES)}, all .txt or all .bin; give the folder of a COLMAP model"
         )
-    if all((folder / f"{name}.txt").is_file() for name in _FILES):
-        cameras, images, points = (_Text(folder / f"{name}.txt") for name in _FILES)
-        return _sorted(ColmapModel(folder, _text_cameras(cameras), _text_images(images), *_text_points(points)))
-    cameras_bin, images_bin, points_bin = (_Binary(folder / f"{name}.bin") for name in _FILES)
-    parts = _binary_cameras(cameras_bin), _binary_images(images_bin), *_binary_points(points_bin)
-    return _sorted(ColmapModel(folder, *parts))
+    if all((folder / f"{name}.txt").is_file() for name in FILES):
+        images, points = (_Text(folder / f"{name}.txt") for name in FILES[1:])
+        model = ColmapModel(
+            folder, read_cameras(Source(folder / "cameras.txt")), _text_images(images), *_text_points(points)
+        )
+    else:
+        images_bin, points_bin = (BinaryFile(folder / f"{name}.bin") for name in FILES[1:])
+        cameras = read_cameras(Source(folder / "cameras.bin"))
+        model = ColmapModel(folder, cameras, _binary_images(images_bin), *_binary_points(points_bin))
+    return _sound(model._replace(images=sorted(model.images, key=lambda image: image.name)))
 
 
-def _sorted(model: ColmapModel) -> ColmapModel:
-    return model._replace(images=sorted(model.images, key=lambda image: image.name))
-
-
-def _check_known(place: str, model: str) -> None:
-    """Raise InputError for the model of a camera that is not known here, as those of fish-eye lenses."""
-    if model not in MODELS:
-        raise InputError(f"{place}: the model {model} is not known here; let COLMAP use one of {', '.join(MODELS)}")
+def _sound(model: ColmapModel) -> ColmapModel:
+    """The model itself. Raises InputError for what does not fit together."""
+    for image in model.images:
+        if image.camera not in model.cameras:
+            missing = f"{model.folder}: image {image.name} is of camera {image.camera}, which is missing; add it"
+            raise InputError(missing)
+        if not np.linalg.norm(image.quaternion) > 0:
+            raise InputError(
+                f"{model.folder}: the quaternion of image {image.name} is zero, which is no rotation; let COLMAP write "
+                "the model again"
+            )
+    for what, ids in (("image", [i.name for i in model.images]), ("point", model.point_ids.tolist())):
+        values, times = np.unique(np.array(ids), return_counts=True)
+        if (times > 1).any():
+            raise InputError(f"{model.folder}: {what} {values[times > 1][0]} is there twice; keep one of them")
+    return model
 
 
 class _Text:
@@ -91,72 +90,58 @@ class _Text:
 
     def __init__(self, path: Path):
         self.path = path
-        try:
-            lines = path.read_text(encoding="utf-8").splitlines()
-        except UnicodeDecodeError:
-            raise InputError(f"{path}: the file is no text; give a model as COLMAP writes it") from None
+        lines = Source(path).text().split("\n")
         self.lines = iter([(row, line) for row, line in enumerate(lines, 1) if not line.lstrip().startswith("#")])
         self.row = 0
 
-    def __iter__(self) -> Iterator[list[str]]:
-        """The cells of the lines that are not empty."""
+    def __iter__(self) -> Iterator[str]:
+        """The lines that are not empty."""
         for row, line in self.lines:
             self.row = row
             if line.strip():
-                yield line.split()
+                yield line
 
     def next_line(self) -> list[str]:
         """The cells of the line that follows, none where it is empty or the file ends."""
         self.row, line = next(self.lines, (self.row + 1, ""))
         return line.split()
 
-    def numbers(self, cells: list[str], whole: bool = False) -> np.ndarray:
+    def numbers(self, cells: list[str]) -> np.ndarray:
         try:
             values = np.array(cells, float)
         except ValueError:
             values = np.array([np.nan])
         if not np.isfinite(values).all():
             raise self.error("there is a cell that is no finite number")
-        if not whole:
-            return values
-        if (values != np.floor(values)).any():
-            raise self.error("an id is a whole number")
-        return values.astype(int)
+        return values
+
+    def ids(self, cells: list[str]) -> np.ndarray:
+        try:
+            return np.array(cells, object).astype(np.int64)
+        except (ValueError, OverflowError):
+            raise self.error("an id is a whole number") from None
 
     def error(self, message: str) -> InputError:
         return InputError(f"{self.path}, row {self.row}: {message}; correct the file or let COLMAP write it again")
 
 
-def _text_cameras(file: _Text) -> dict[int, ColmapCamera]:
-    cameras = {}
-    for cells in file:
-        if len(cells) < 4:
-            raise file.error(f"{len(cells)} cells instead of CAMERA_ID MODEL WIDTH HEIGHT PARAMS")
-        _check_known(f"{file.path}, row {file.row}", cells[1])
-        identifier, width, height = file.numbers([cells[0], *cells[2:4]], whole=True).tolist()
-        values = file.numbers(cells[4:])
-        if len(values) != len(MODELS[cells[1]]):
-            raise file.error(f"{len(values)} parameters, {cells[1]} has {len(MODELS[cells[1]])}")
-        cameras[identifier] = ColmapCamera(cells[1], width, height, tuple(values.tolist()))
-    return cameras
-
-
 def _text_images(file: _Text) -> list[ColmapImage]:
     images = []
-    for cells in file:
+    for line in file:
+        cells = line.split(maxsplit=9)
         if len(cells) < 10:
             raise file.error(f"{len(cells)} cells instead of IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME")
         pose = file.numbers(cells[1:8]).tolist()
-        camera = int(file.numbers(cells[8:9], whole=True)[0])
+        camera = int(file.ids(cells[8:9])[0])
         features = file.next_line()
         if len(features) % 3:
             raise file.error(f"{len(features)} cells are not X Y POINT3D_ID of some features")
         measured = file.numbers(features).reshape(-1, 3)
-        ids = file.numbers(features[2::3], whole=True)
+        ids = file.ids(features[2::3])
         of_point = ids >= 0
         images.append(
             ColmapImage(
-                " ".join(cells[9:]), camera, tuple(pose[:4]), tuple(pose[4:]), measured[of_point, :2], ids[of_point]
+                cells[9].strip(), camera, tuple(pose[:4]), tuple(pose[4:]), measured[of_point, :2], ids[of_point]
             )
         )
     return images
@@ -164,79 +149,36 @@ def _text_images(file: _Text) -> list[ColmapImage]:
 
 def _text_points(file: _Text) -> tuple[np.ndarray, np.ndarray]:
     ids, xyz = [], []
-    for cells in file:
+    for line in file:
+        cells = line.split(maxsplit=4)
         if len(cells) < 4:
             raise file.error(f"{len(cells)} cells instead of POINT3D_ID X Y Z and more")
-        ids.append(cells[0])
-        xyz.append(cells[1:4])
-    return file.numbers(ids, whole=True), file.numbers([cell for row in xyz for cell in row]).reshape(-1, 3)
+        ids.append(file.ids(cells[:1])[0])
+        xyz.append(file.numbers(cells[1:4]))
+    return np.array(ids, np.int64), np.array(xyz, float).reshape(-1, 3)
 
 
-class _Binary:
-    """The bytes of a file, little-endian, read one after the other."""
-
-    def __init__(self, path: Path):
-        self.path, self.data, self.at = path, path.read_bytes(), 0
-
-    def take(self, layout: str) -> tuple:
-        """The values of a `struct` layout."""
-        try:
-            values = struct.unpack_from("<" + layout, self.data, self.at)
-        except struct.error:
-            raise self.short() from None
-        self.at += struct.calcsize("<" + layout)
-        return values
-
-    def text(self) -> str:
-        """What comes before the next zero."""
-        end = self.data.find(b"\0", self.at)
-        if end < 0:
-            raise self.short()
-        text = self.data[self.at : end].decode("utf-8", "replace")
-        self.at = end + 1
-        return text
-
-    def rows(self, dtype: list[tuple[str, str]], count: int) -> np.ndarray:
-        """`count` records."""
-        kind = np.dtype(dtype)
-        if self.at + count * kind.itemsize > len(self.data):
-            raise self.short()
-        values = np.frombuffer(self.data, kind, count, self.at)
-        self.at += count * kind.itemsize
-        return values
-
-    def short(self) -> InputError:
-        return InputError(f"{self.path}: the file ends early; copy it again or let COLMAP write it again")
-
-
-def _binary_cameras(file: _Binary) -> dict[int, ColmapCamera]:
-    cameras = {}
-    for _ in range(file.take("Q")[0]):
-        identifier, number, width, height = file.take("IiQQ")
-        model = _MODEL_NUMBERS[number] if 0 <= number < len(_MODEL_NUMBERS) else f"number {number}"
-        _check_known(f"{file.path}, camera {identifier}", model)
-        cameras[identifier] = ColmapCamera(model, width, height, file.take(f"{len(MODELS[model])}d"))
-    return cameras
-
-
-def _binary_images(file: _Binary) -> list[ColmapImage]:
+def _binary_images(file: BinaryFile) -> list[ColmapImage]:
     images = []
-    for _ in range(file.take("Q")[0]):
-        _, *pose, camera = file.take("I7dI")
+    for _ in range(file.count(73)):
+        file.take("I")
+        pose, camera = file.numbers(7), file.take("I")[0]
         name = file.text()
-        features = file.rows([("x", "<f8"), ("y", "<f8"), ("point", "<u8")], file.take("Q")[0])
+        features = file.rows([("x", "<f8"), ("y", "<f8"), ("point", "<u8")])
         features = features[features["point"] != _NO_POINT]
         xy = np.stack([features["x"], features["y"]], axis=1)
-        images.append(
-            ColmapImage(name, camera, tuple(pose[:4]), tuple(pose[4:]), xy, features["point"].astype(np.int64))
-        )
+        if not np.isfinite(xy).all():
+            raise file.error(f"image {name} has a coordinate that is not finite")
+        images.append(ColmapImage(name, camera, pose[:4], pose[4:], xy, features["point"].astype(np.int64)))  # type: ignore[arg-type]
     return images
 
 
-def _binary_points(file: _Binary) -> tuple[np.ndarray, np.ndarray]:
-    count = file.take("Q")[0]
+def _binary_points(file: BinaryFile) -> tuple[np.ndarray, np.ndarray]:
+    count = file.count(51)
     ids, xyz = np.zeros(count, np.int64), np.zeros((count, 3))
     for k in range(count):
-        ids[k], *xyz[k], _, length = file.take("Q3d3xdQ")
-        file.rows([("image", "<u4"), ("feature", "<u4")], length)
+        identifier = file.take("Q")[0]
+        ids[k], xyz[k] = np.uint64(identifier).astype(np.int64), file.numbers(3)
+        file.take("3xd")
+        file.rows([("image", "<u4"), ("feature", "<u4")])
     return ids, xyz

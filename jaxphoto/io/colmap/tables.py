@@ -9,20 +9,26 @@ import warnings
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+import jax
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from jaxphoto.camera import set_parameter
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import InputError
 from jaxphoto.io.block_folder import BlockTables
+from jaxphoto.io.block_folder.camera_section import Camera, camera_section
 from jaxphoto.io.block_folder.layout import ANGLES, XYZ
-from jaxphoto.io.cameras.camera_file import ASSUMED_PIXEL_MM
-from jaxphoto.io.cameras.colmap import MODELS
-from jaxphoto.io.colmap.model import ColmapCamera, ColmapImage, ColmapModel, read_model
+from jaxphoto.io.cameras.camera_file import Source
+from jaxphoto.io.cameras.colmap import TEXT, ColmapCamera, sensor_and_interior
+from jaxphoto.io.colmap.model import ColmapImage, ColmapModel, read_model
 from jaxphoto.io.tables import Table
+from jaxphoto.unknowns import FIXED, FREE
 
-_CAMERA_TURN = np.array([[1.0], [-1.0], [-1.0]])
+CAMERA_TURN = np.array([[1.0], [-1.0], [-1.0]])
+"""Rows by which a rotation into COLMAP's camera frame becomes one into ours, and back."""
 _PLACES = ("f", "fx", "fy", "cx", "cy")
+_PHOTOGRAPHS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".jp2", ".ppm", ".pgm", ".dng")
 
 
 def read_colmap_model(folder: Path) -> BlockTables:
@@ -41,9 +47,6 @@ def read_colmap_model(folder: Path) -> BlockTables:
     if not model.images:
         raise InputError(f"{folder}: no image of the model is oriented; give one that has images")
     names = np.array(_image_names(model.images), object)
-    for of in model.images:
-        if of.camera not in model.cameras:
-            raise InputError(f"{folder}: image {of.name} is of camera {of.camera}, which is missing; add it")
     image, point, xy = _measurements(model)
     centres, angles = _orientations(model.images)
     used = sorted({of.camera for of in model.images})
@@ -59,7 +62,7 @@ def read_colmap_model(folder: Path) -> BlockTables:
     settings = {
         "title": name,
         "sigmas": {"image_px": 1.0},
-        "cameras": {str(number): _camera(model.cameras[number]) for number in used},
+        "cameras": {str(number): _camera(folder, model.cameras[number]) for number in used},
         "datum": {"kind": "inner", "over": "points"},
     }
     return BlockTables(
@@ -68,8 +71,9 @@ def read_colmap_model(folder: Path) -> BlockTables:
 
 
 def _image_names(images: list[ColmapImage]) -> list[str]:
-    """Names of the files without their endings, with them where two would be the same."""
-    short = [str(PurePosixPath(image.name).with_suffix("")) for image in images]
+    """Names of the files without the endings of photographs, with them where two would be the same."""
+    paths = [PurePosixPath(image.name) for image in images]
+    short = [str(path.with_suffix("")) if path.suffix.lower() in _PHOTOGRAPHS else str(path) for path in paths]
     return short if len(set(short)) == len(short) else [image.name for image in images]
 
 
@@ -109,25 +113,18 @@ def _orientations(images: list[ColmapImage]) -> tuple[np.ndarray, np.ndarray]:
     quaternions = np.array([i.quaternion for i in images])
     rotation = Rotation.from_quat(quaternions[:, [1, 2, 3, 0]]).as_matrix()
     centres = -np.einsum("nji,nj->ni", rotation, np.array([i.translation for i in images]))
-    return centres, np.asarray(ExteriorOrientation(centres, _CAMERA_TURN * rotation).omega_phi_kappa)
+    return centres, np.asarray(ExteriorOrientation(centres, CAMERA_TURN * rotation).omega_phi_kappa)
 
 
-def _camera(camera: ColmapCamera) -> dict[str, Any]:
-    """The table [cameras.X]: c is fy, and fx / fy - 1 the affinity b1."""
-    values = dict(zip(MODELS[camera.model], camera.values, strict=True))
-    fx, fy = (values["f"],) * 2 if "f" in values else (values["fx"], values["fy"])
-    free = ["c_mm", "xp_mm", "yp_mm", *(k for k in values if k not in _PLACES), *(["b1"] if "fx" in values else [])]
-    interior = {
-        "c_mm": fy * ASSUMED_PIXEL_MM,
-        "xp_mm": (values["cx"] - camera.width_px / 2) * ASSUMED_PIXEL_MM,
-        "yp_mm": -(values["cy"] - camera.height_px / 2) * ASSUMED_PIXEL_MM,
-        **{k: v for k, v in values.items() if k not in _PLACES},
-        "b1": fx / fy - 1,
-    }
-    return {
-        "width_px": camera.width_px, "height_px": camera.height_px, "pixel_mm": ASSUMED_PIXEL_MM,
-        "distortion": "opencv", "interior": interior, "unknowns": dict.fromkeys(free, "free"),
-    }  # fmt: skip
+def _camera(folder: Path, camera: ColmapCamera) -> dict[str, Any]:
+    """The table [cameras.X]."""
+    sensor, interior, _ = sensor_and_interior(Source(folder / TEXT), camera)
+    free = ["c_mm", "xp_mm", "yp_mm", *(k for k in camera.named if k not in _PLACES)]
+    free += ["b1"] if "fx" in camera.named else []
+    priors = jax.tree.map(lambda _: FIXED, interior)
+    for name in free:
+        priors = set_parameter(priors, name, FREE)
+    return camera_section(Camera(sensor, interior, priors))
 
 
 def _text(ids: np.ndarray) -> np.ndarray:

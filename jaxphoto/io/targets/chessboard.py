@@ -1,5 +1,7 @@
 """Chessboards: the inner corners of one, found by OpenCV and placed by least squares."""
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 from jaxtyping import Float
@@ -38,12 +40,17 @@ class Chessboard(Pattern):
         inside = (column >= 0) & (row >= 0) & (column <= self.columns) & (row <= self.rows)
         return np.where(inside, (column + row) % 2, 1.0)
 
-    def hint(self, picture: np.ndarray) -> str | None:
-        """The count with which the board is found, where it is that of squares and not of corners."""
-        for columns, rows in ((self.columns - 1, self.rows - 1), (self.columns + 1, self.rows + 1)):
-            if min(columns, rows) >= 3 and cv2.findChessboardCorners(picture, (columns, rows), None, _FLAGS)[0]:
-                return f"{columns}x{rows} corners are found: count the inner corners, where four squares meet"
-        return None
+    def hint(self, pictures: Sequence[np.ndarray]) -> str | None:
+        """The largest count of corners that is found in the pictures, where there is one."""
+        counts = []
+        for picture in pictures:
+            flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
+            seen, _, kinds = cv2.findChessboardCornersSBWithMeta(picture, (3, 3), flags)
+            counts += [sorted(kinds.shape[:2])] if seen else []
+        if not counts:
+            return None
+        fewer, more = max(counts, key=np.prod)
+        return f"{more}x{fewer} corners are found: count the inner corners, where four squares meet"
 
 
 def grid_points(columns: int, rows: int, apart_m: float) -> tuple[tuple[str, ...], Float[np.ndarray, "n 3"]]:

@@ -2,11 +2,15 @@
 
 A circle of known size and its image give the affine map between board and picture there, but for a rotation; the
 direction to one neighbour gives that, and the other neighbours say whether it is right. The guesses that most agree
-with become homographies over all targets; the one with most targets wins, unless another labelling does as well: then
-the arrangement is the same when it is turned, and no picture can tell how it is seen.
+with become homographies over all targets. Of those with most targets the one that fits best wins, unless another
+labelling does as well: then the arrangement is the same when it is turned, and no picture can tell how it is seen.
+
+Which side of its plane a field is seen from its coordinates do not say (a floor, a ceiling, a wall), so that both are
+tried; of an arrangement that is its own mirror image the side is that of Z, unless the plane stands upright.
 """
 
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -24,8 +28,10 @@ _NEIGHBOURS = 8
 # Of the distance between neighbours: what a guess, and what a homography of a distorted picture, may be off.
 _OFF, _NEAR = 0.25, 0.3
 _GUESSES = 40
-# Of the number of targets that agree with the best labelling: from here on another one is as good.
-_AS_GOOD = 0.8
+# Another labelling is as good from this part of the number of targets on, and up to this multiple of the misfit.
+_AS_GOOD, _AS_NEAR = 0.8, 2.0
+# Z of the normal of a plane that stands upright.
+_UPRIGHT = 0.1
 
 
 class CircularTargets(Pattern):
@@ -48,19 +54,22 @@ class CircularTargets(Pattern):
         self.board = Board(path.stem, ids, xyz, diameter / 1000)
         plane = self.board.plane
         if plane is None:
-            raise InputError(f"{path.name}: the targets lie in no plane, and only those of a flat board are told apart")
+            raise InputError(
+                f"{path.name}: the targets lie in no plane (to 1 % of their extent), and only those of one are told "
+                "apart; give those of one wall"
+            )
         middle, axes = plane
         self._flat = (xyz - middle) @ axes[:, :2]
+        self._upright = bool(abs(axes[2, 2]) < _UPRIGHT)
 
     def find(self, picture: np.ndarray) -> Found | None:
         """The targets that are seen; None where their arrangement is not found, or found in several ways."""
         blobs = elliptic_blobs(picture)
         for dark in (True, False):
-            own = np.flatnonzero(blobs.dark == dark)
-            pairs = identified(self._flat, self.board.diameter_m / 2, Blobs(*(v[own] for v in blobs)))
+            own = blobs.take(blobs.dark == dark)
+            pairs = identified(self._flat, self.board.diameter_m / 2, own, self._upright)
             if pairs is not None:
-                chosen = Blobs(*(v[own[pairs[:, 1]]] for v in blobs))
-                return Found(pairs[:, 0], fit_discs(picture, chosen))
+                return Found(pairs[:, 0], fit_discs(picture, own.take(pairs[:, 1])))
         return None
 
     def reflectance(self, xy_m: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
@@ -68,25 +77,47 @@ class CircularTargets(Pattern):
         return disc_reflectance(self.board, xy_m)
 
 
+class _Labelling(NamedTuple):
+    """(target, blob) pairs, the RMS (px) by which a homography misses them, and the side of the plane, 1 or -1."""
+
+    pairs: Int[np.ndarray, "pairs 2"]
+    misfit: float
+    side: int
+
+    def agrees(self, other: "_Labelling") -> bool:
+        """Whether most of these pairs are the other's, too."""
+        label = dict(other.pairs[:, ::-1].tolist())
+        same = sum(label.get(blob) == target for target, blob in self.pairs.tolist())
+        return self.side == other.side and same >= 0.5 * len(self.pairs)
+
+
 def identified(
-    flat: Float[np.ndarray, "targets 2"], radius: Float[np.ndarray, "targets"], blobs: Blobs
+    flat: Float[np.ndarray, "targets 2"], radius: Float[np.ndarray, "targets"], blobs: Blobs, upright: bool = False
 ) -> Int[np.ndarray, "pairs 2"] | None:
-    """(target, blob) of those that are each other's, from places in the plane of the board (Y up); None if not told."""
+    """(target, blob) of those that are each other's, from places in the plane of the field; None if not told.
+
+    Y is up where the field is seen from its front. Of an `upright` field nobody knows which side that is.
+    """
     if len(blobs.column_row) < _LEAST:
         return None
-    found: list[np.ndarray] = []
-    for guess in _guesses(flat * (1, -1), radius, blobs):
-        pairs = _grown(flat, guess, blobs)
-        if pairs is not None:
-            found.append(pairs)
-    if not found:
+    found: list[_Labelling] = []
+    for side in (1, -1):
+        seen = flat * (side, 1)
+        grown = (_grown(seen, guess, blobs) for guess in _guesses(seen * (1, -1), radius, blobs))
+        found += [_Labelling(*g, side) for g in grown if g is not None]
+    best = _best(found)
+    if best is None and not upright:
+        best = _best([one for one in found if one.side == 1])
+    return None if best is None else best.pairs
+
+
+def _best(found: list[_Labelling]) -> _Labelling | None:
+    """The labelling that fits best among those of most targets; None where another one is as good."""
+    most = max((len(one.pairs) for one in found), default=0)
+    able = [one for one in found if len(one.pairs) >= _AS_GOOD * most]
+    best = min(able, key=lambda one: one.misfit, default=None)
+    if best is None or any(one.misfit < _AS_NEAR * best.misfit and not one.agrees(best) for one in able):
         return None
-    best = max(found, key=len)
-    label = dict(best[:, ::-1].tolist())
-    for other in found:
-        same = sum(label.get(blob) == target for target, blob in other.tolist())
-        if len(other) >= _AS_GOOD * len(best) and same < 0.5 * len(other):
-            return None
     return best
 
 
@@ -121,8 +152,8 @@ def _guesses(down, radius, blobs) -> list[np.ndarray]:
     return sorted(guesses, key=len, reverse=True)[:_GUESSES]
 
 
-def _grown(flat, pairs, blobs) -> np.ndarray | None:
-    """All pairs that a homography from a few leads to; None where it leads nowhere."""
+def _grown(flat, pairs, blobs) -> tuple[np.ndarray, float] | None:
+    """All pairs that a homography from a few leads to, and by how much it misses them; None where it leads nowhere."""
     spacing = np.linalg.norm(flat[_nearest(flat)[:, 0]] - flat, axis=1)
     for _ in range(4):
         if len(np.unique(pairs[:, 1])) < len(pairs) or len(pairs) < 4:
@@ -137,4 +168,11 @@ def _grown(flat, pairs, blobs) -> np.ndarray | None:
         good = distance.min(axis=1) < _NEAR * np.linalg.norm(other - seen, axis=1)
         good &= distance.argmin(axis=0)[blob] == np.arange(len(flat))
         pairs = np.column_stack([np.flatnonzero(good), blob[good]])
-    return pairs if len(pairs) >= _LEAST else None
+    if len(pairs) < _LEAST:
+        return None
+    # Of a homography of these pairs, not of those that led to them.
+    h, _ = cv2.findHomography(flat[pairs[:, 0]], blobs.column_row[pairs[:, 1]])
+    if h is None:
+        return None
+    off = cv2.perspectiveTransform(flat[pairs[:, 0]][None], h)[0] - blobs.column_row[pairs[:, 1]]
+    return pairs, float(np.sqrt(np.mean(np.sum(off**2, axis=1))))

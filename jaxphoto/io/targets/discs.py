@@ -14,7 +14,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxphoto.io.targets.corners import Places, linearised
 from jaxphoto.io.targets.patches import Patches, fit_patches
@@ -35,8 +35,12 @@ class Blobs(NamedTuple):
     column_row: Float[np.ndarray, "n 2"]
     shape: Float[np.ndarray, "n 2 2"]
     """Q of the ellipse d' Q d = 1."""
-    dark: np.ndarray
+    dark: Bool[np.ndarray, "n"]
     """Whether it is darker than what is around it."""
+
+    def take(self, chosen: np.ndarray) -> "Blobs":
+        """The spots that `chosen` (an index or a mask) names."""
+        return Blobs(self.column_row[chosen], self.shape[chosen], self.dark[chosen])
 
 
 def elliptic_blobs(picture: np.ndarray) -> Blobs:
@@ -49,16 +53,16 @@ def elliptic_blobs(picture: np.ndarray) -> Blobs:
         for above in (7, -7):
             mask = cv2.adaptiveThreshold(smooth, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY, window, above)
             kept += _components(mask)
-    centres: list[np.ndarray] = []
-    shapes: list[np.ndarray] = []
-    darks: list[bool] = []
-    for centre, shape, _ in sorted(kept, key=lambda blob: blob[2]):
-        inside = [(centre - c) @ q @ (centre - c) < 0.25 for c, q in zip(centres, shapes, strict=True)]
-        if not any(inside):
-            centres.append(centre)
-            shapes.append(shape)
-            darks.append(_is_dark(smooth, centre, shape))
-    return Blobs(np.reshape(centres, (-1, 2)), np.reshape(shapes, (-1, 2, 2)), np.array(darks, bool))
+    kept.sort(key=lambda blob: blob[2])
+    centres, shapes = np.zeros((len(kept), 2)), np.zeros((len(kept), 2, 2))
+    n = 0
+    for centre, shape, _ in kept:
+        d = centre - centres[:n]
+        if not (np.einsum("ni,nij,nj->n", d, shapes[:n], d) < 0.25).any():
+            centres[n], shapes[n] = centre, shape
+            n += 1
+    darks = [_is_dark(smooth, centre, shape) for centre, shape in zip(centres[:n], shapes[:n], strict=True)]
+    return Blobs(centres[:n], shapes[:n], np.array(darks, bool))
 
 
 def _is_dark(picture: np.ndarray, centre: np.ndarray, shape: np.ndarray) -> bool:

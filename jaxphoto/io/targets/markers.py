@@ -73,12 +73,14 @@ class CharucoBoard(Pattern):
         self.board = Board("ChArUco", ids, xyz + np.array([square_m, -square_m, 0.0]), np.zeros(len(ids)))
 
     def find(self, picture: np.ndarray) -> Found | None:
-        """The inner corners between markers that are seen; None where there are fewer than four."""
+        """The inner corners between markers that are seen; None where there are no four, or all lie in one row."""
         corners, ids, *_ = cv2.aruco.CharucoDetector(self._drawn).detectBoard(picture)
         if ids is None or len(ids) < 4:
             return None
         near, point = np.asarray(corners, float).reshape(-1, 2), np.asarray(ids).ravel()
         plane = self.board.xyz_m[point, :2]
+        if np.ptp(plane, axis=0).min() == 0:
+            return None  # which way the other edges run, and where the camera is, a row does not tell
         homography, _ = cv2.findHomography(plane, near)
         if homography is None:
             return None

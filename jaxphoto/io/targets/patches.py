@@ -54,37 +54,36 @@ def fit_patches(
     of the model for parameters (patches, parameters) and pixels (patches, pixels, 2).
     """
     (n, unknowns), (pixels, grey, used) = start.shape, patches
-    room = (padded_length(n), -(-pixels.shape[1] // _PIXELS) * _PIXELS)
-    place = np.zeros((*room, 2))
-    place[:n, : pixels.shape[1]] = pixels
+    width = -(-pixels.shape[1] // _PIXELS) * _PIXELS
 
-    def system(parameters):
-        padded = np.ones((room[0], unknowns))
-        padded[:n] = parameters
-        value, slope = (np.asarray(v)[:n, : pixels.shape[1]] for v in call_compiled(linearised, padded, place))
-        residual = np.where(used, grey - value, 0.0)
-        slope = np.where(used[:, :, None], slope, 0.0)
+    def system(parameters, which):
+        padded, place = np.ones((padded_length(len(which)), unknowns)), np.zeros((padded_length(len(which)), width, 2))
+        padded[: len(which)], place[: len(which), : pixels.shape[1]] = parameters, pixels[which]
+        values = call_compiled(linearised, padded, place)
+        value, slope = (np.asarray(v)[: len(which), : pixels.shape[1]] for v in values)
+        residual = np.where(used[which], grey[which] - value, 0.0)
+        slope = np.where(used[which, :, None], slope, 0.0)
         across = slope.transpose(0, 2, 1)
         return np.sum(residual**2, axis=1), across @ slope, (across @ residual[:, :, None])[:, :, 0]
 
     parameters, damping = start.astype(float), np.full(n, 1e-3)
-    state = system(parameters)
+    state = system(parameters, np.arange(n))
     still = np.zeros(n, bool)
     for _ in range(_STEPS):
-        square_sum, normal, right = state
-        diagonal = np.einsum("pkk->pk", normal)
-        damped = normal + (damping[:, None] * diagonal + 1e-12)[:, :, None] * np.eye(unknowns)
-        step = np.linalg.solve(damped, right[:, :, None])[:, :, 0]
-        trial = system(parameters + step)
-        better = trial[0] <= square_sum
-        parameters = np.where(better[:, None], parameters + step, parameters)
-        state = tuple(
-            np.where(better.reshape(-1, *[1] * (a.ndim - 1)), a, b) for a, b in zip(trial, state, strict=True)
-        )
-        damping = np.clip(damping * np.where(better, 0.3, 10.0), _LEAST_DAMPING, 1e9)
-        still |= np.max(np.abs(step[:, :2]), axis=1) < _STILL
-        if still.all():
+        which = np.flatnonzero(~still)
+        if not len(which):
             break
+        square_sum, normal, right = (part[which] for part in state)
+        diagonal = np.einsum("pkk->pk", normal)
+        damped = normal + (damping[which, None] * diagonal + 1e-12)[:, :, None] * np.eye(unknowns)
+        step = np.linalg.solve(damped, right[:, :, None])[:, :, 0]
+        trial = system(parameters[which] + step, which)
+        better = trial[0] <= square_sum
+        parameters[which[better]] += step[better]
+        for part, new in zip(state, trial, strict=True):
+            part[which[better]] = new[better]
+        damping[which] = np.clip(damping[which] * np.where(better, 0.3, 10.0), _LEAST_DAMPING, 1e9)
+        still[which] = np.max(np.abs(step[:, :2]), axis=1) < _STILL
     square_sum, normal, _ = state
     noise = np.sqrt(square_sum / np.maximum(used.sum(axis=1) - unknowns, 1))
     # What the picture no longer sees at all, such as a blur far below a pixel's own, stays where it is.

@@ -1,6 +1,7 @@
 """What every kind of calibration board is: targets with known coordinates, and a way to find them in a picture."""
 
 import abc
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -31,6 +32,6 @@ class Pattern(abc.ABC):
     def reflectance(self, xy_m: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
         """What is printed at places of the board (m, in the frame of `board`): 0 black, 1 white."""
 
-    def hint(self, picture: np.ndarray) -> str | None:
-        """What other board the picture seems to show, where that can be said."""
+    def hint(self, pictures: Sequence[np.ndarray]) -> str | None:
+        """What other board pictures without this one seem to show, where that can be said."""
         return None

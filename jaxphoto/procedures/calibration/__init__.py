@@ -4,10 +4,11 @@ from jaxphoto.procedures.calibration.block import CAMERA, TargetRows, calibratio
 from jaxphoto.procedures.calibration.board import Board, Detection
 from jaxphoto.procedures.calibration.eccentricity import eccentricity
 from jaxphoto.procedures.calibration.parameters import distortion_model, free_parameters
+from jaxphoto.procedures.calibration.precision import interior_covariance
 from jaxphoto.procedures.calibration.reprojection import reprojection_residuals, rms_px
 from jaxphoto.procedures.calibration.rounds import Calibration, calibrate
 
 __all__ = [
     "CAMERA", "Board", "Calibration", "Detection", "TargetRows", "calibrate", "calibration_block",
-    "distortion_model", "eccentricity", "free_parameters", "reprojection_residuals", "rms_px",
+    "distortion_model", "eccentricity", "free_parameters", "interior_covariance", "reprojection_residuals", "rms_px",
 ]  # fmt: skip

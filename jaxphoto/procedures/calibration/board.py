@@ -5,8 +5,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-# Of the largest side of a board: what its points may be off a plane and still count as flat.
-_FLAT = 1e-6
+# Of its largest extent: what the points of a board may be off a plane and still count as flat. Surveyed targets on a
+# wall are never exact; beyond a hundredth, views are no homographies and circles face elsewhere.
+_FLAT = 1e-2
 
 
 class Board(NamedTuple):
@@ -21,7 +22,10 @@ class Board(NamedTuple):
 
     @property
     def plane(self) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]] | None:
-        """The middle of a flat board and axes (columns; the third is the normal, with Z > 0), or None."""
+        """The middle of a flat board and axes (columns; right-handed, the third is the normal), or None.
+
+        The normal is either of the two; of a board that does not stand upright that with Z > 0.
+        """
         middle = self.xyz_m.mean(axis=0)
         _, size, axes = np.linalg.svd(self.xyz_m - middle, full_matrices=False)
         if size[2] > _FLAT * size[0]:

@@ -4,7 +4,7 @@
 2. Self-calibrating adjustment; the points of the board are fixed, or weighted.
 3. Photographs that do not fit and blunders among the image points go; image points get the standard deviation of their
    measurement and what board and model add to it (`outliers.added_sigma`); centres of circles are corrected for their
-   eccentricity; and back to 2, until nothing changes.
+   eccentricity; and back to 2, until nothing changes (`Calibration.settled`), twenty times at most.
 
 Residuals are those of the measured image, whatever the direction of the distortion.
 """
@@ -62,6 +62,13 @@ class Calibration(NamedTuple):
     """Photographs that were not used, each with the reason."""
     removed: tuple[tuple[str, str], ...]
     """(image, point) of image points that were blunders."""
+    settled: bool
+    """False where the last round still changed something: image points that were used, sigmas, centres of circles."""
+
+    @property
+    def converged(self) -> bool:
+        """Whether the last adjustment converged and the rounds came to rest."""
+        return bool(self.adjusted.converged) and self.settled
 
     @property
     def sensor(self) -> Sensor:
@@ -135,7 +142,8 @@ def calibrate(
         redundancy = adjusted.redundancy - 2 * int((~good).sum())
         last, added = added, added_sigma(residuals[good], rows.sigma_mm[good] / sensor.pixel_mm, redundancy)
         turned = np.max(np.abs(correction - before), initial=0.0) < _STILL_PX * sensor.pixel_mm
-        if round_ == _ROUNDS - 1 or (good.all() and turned and last is not None and abs(added - last) < _STILL_PX):
+        settled = bool(good.all() and turned) and last is not None and abs(added - last) < _STILL_PX
+        if settled or round_ == _ROUNDS - 1:
             break
         left_out |= {rows.images[k]: "it does not fit the others" for k in np.flatnonzero(misfit)}
         few = np.bincount(rows.image[good], minlength=len(rows.images)) < _LEAST_POINTS
@@ -156,6 +164,7 @@ def calibrate(
         added_sigma_px=last or 0.0,
         left_out=left_out,
         removed=tuple(removed),
+        settled=settled,
     )
 
 

@@ -35,6 +35,8 @@ _MISFIT = 25.0
 _FOLDED, _EXACT = 1e6, 1e-16
 # Of h1 and h2, what a view must be tilted by to tell c: below, all views are taken as square on.
 _TILT = 1e-3
+# Of the largest singular value: below, points determine no homography, as those of one row and a single one beside it.
+_DETERMINED = 1e-3
 
 
 def rough_interior(
@@ -77,9 +79,13 @@ def flat_start(
 ) -> tuple[InteriorOrientation, bool]:
     """c, K1 and K2 (`Brown`) from views of flat boards: coordinates in the board (m) and measured ones (mm).
 
-    The second value is False where no view is tilted enough to tell c, which is then 1.2 times the longer side.
+    Views whose points lie on a line, or all but one of them, say nothing and are not looked at. The second value is
+    False where no view is tilted enough to tell c, which is then 1.2 times the longer side.
     """
     half = np.hypot(sensor.width_mm, sensor.height_mm) / 2
+    views = [view for view in views if _determines(view[0])]
+    if not views:
+        return InteriorOrientation(1.2 * max(sensor.width_mm, sensor.height_mm)), False
     # The mean of logarithms: a view of something else adds a constant and no more.
     bend = lambda k: float(np.mean(np.log(_bends(views, k, half))))  # noqa: E731
     lens = minimize(bend, np.zeros(2), method="Nelder-Mead", options={"maxiter": 120}).x
@@ -166,11 +172,22 @@ def _bends(views, lens, half) -> Float[np.ndarray, "views"]:
 def _homography(board, image) -> Float[np.ndarray, "3 3"]:
     """image ~ H board, by least squares in coordinates of one size (the direct linear transformation)."""
     (a, to_a), (b, to_b) = _conditioned(board), _conditioned(image)
-    one, zero = np.ones((len(a), 1)), np.zeros((len(a), 3))
-    point = np.hstack([a, one])
-    rows = np.vstack([np.hstack([point, zero, -b[:, :1] * point]), np.hstack([zero, point, -b[:, 1:] * point])])
-    h = np.linalg.svd(rows)[2][-1].reshape(3, 3)
+    h = np.linalg.svd(_linear(a, b))[2][-1].reshape(3, 3)
     return np.linalg.solve(to_b, h @ to_a)
+
+
+def _determines(board) -> bool:
+    """Whether points of a plane determine a homography: then only one takes them to themselves."""
+    same, _ = _conditioned(board)
+    size = np.linalg.svd(_linear(same, same), compute_uv=False)
+    return bool(len(size) > 7 and size[7] > _DETERMINED * size[0])
+
+
+def _linear(board, image) -> Float[np.ndarray, "rows 9"]:
+    """The equations of the direct linear transformation: these times the nine elements of H are zero."""
+    one, zero = np.ones((len(board), 1)), np.zeros((len(board), 3))
+    point = np.hstack([board, one])
+    return np.vstack([np.hstack([point, zero, -image[:, :1] * point]), np.hstack([zero, point, -image[:, 1:] * point])])
 
 
 def _conditioned(xy):

@@ -1,4 +1,4 @@
-"""A block of which nothing is known but what was measured in its images: oriented as photographs are.
+"""A block of which too little is known but what was measured in its images: oriented as photographs are.
 
 Its points say which measurements belong together, so there is nothing to match. Gross errors stay in the block; they
 are only kept from spoiling its start.
@@ -11,6 +11,7 @@ import equinox as eqx
 import numpy as np
 
 from jaxphoto.block import Block, Start
+from jaxphoto.orientation.approximate import completed
 from jaxphoto.orientation.matches import PairMatches
 from jaxphoto.procedures.orientation.growing import grown
 from jaxphoto.procedures.orientation.network import Sight, sight_of
@@ -25,9 +26,9 @@ _LEAST_MATCHES, _LEAST_POINTS = 8, 6
 def orient_block(block: Block, report: Report = lambda text: None) -> Block:
     """`block` with a start for its images and points, found from its image points alone.
 
-    The frame is that of its known points and camera stations, where three or more not on a line are seen; where none
-    is, it is a frame of its own. Interior orientation that is not fixed starts where the images want it. Images
-    and points that cannot be oriented stay unknown.
+    The frame is that of its known points and camera stations, where three or more not on a line are seen, else that of
+    its known images; where nothing is known, it is a frame of its own. Interior orientation that is not fixed starts
+    where the images want it. What was known stays as it is; images and points that cannot be oriented stay unknown.
 
     Raises BlockError where no two images begin a network, for groups of images that nothing connects, and where known
     points and stations are too few for the frame.
@@ -42,16 +43,20 @@ def orient_block(block: Block, report: Report = lambda text: None) -> Block:
     related = relate(block.images, rays, loose, list(_common_points(sight, len(rays))), _LEAST_MATCHES, report)
     check_connected(block.images, related)
     most = MOST * loose / sigma
-    found = onto_known(block, grown(block, related.pairs, calibration, _LEAST_POINTS, most, report).network)
+    network = grown(block, related.pairs, calibration, _LEAST_POINTS, most, report).network
+    found = onto_known(block, network, completed(block))
 
     start = block.start.unknowns
-    met = np.isfinite(found.points).all(axis=1) & found.met(sight)
-    point_known = np.asarray(block.start.point_known) | met
-    points = np.where((met & ~np.asarray(block.start.point_known))[:, None], found.points, np.asarray(start.points))
+    image_known, point_known = np.asarray(block.start.image_known), np.asarray(block.start.point_known)
+    met = np.isfinite(found.points).all(axis=1) & found.met(sight) & ~point_known
+    oriented = found.oriented & ~image_known
+    given = (start.exterior.position, start.exterior.camera_from_object, start.points)
+    new = (found.positions, found.camera_from_object, found.points)
+    is_new = (oriented[:, None], oriented[:, None, None], met[:, None])
     places = lambda u: (u.exterior.position, u.exterior.camera_from_object, u.points)  # noqa: E731
-    unknowns = eqx.tree_at(places, start, (found.positions, found.camera_from_object, points))
+    unknowns = eqx.tree_at(places, start, tuple(np.where(*v) for v in zip(is_new, new, given, strict=True)))
     unknowns = dataclasses.replace(unknowns, interior=found.interior)
-    return dataclasses.replace(block, start=Start(unknowns, found.oriented, point_known))
+    return dataclasses.replace(block, start=Start(unknowns, image_known | oriented, point_known | met))
 
 
 def _common_points(sight: Sight, n_images: int) -> Iterator[PairMatches]:

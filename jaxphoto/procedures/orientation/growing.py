@@ -90,7 +90,7 @@ def grown(
 def _starts(pairs: Sequence[Pair]) -> Iterator[tuple[Pair, tuple[int, ...]]]:
     """The pair to begin with and an image to go on with: the best triplet, its pair with the widest rays first.
 
-    Of two orientations that a pair may have, each is a start of its own.
+    Of two orientations that a pair may have, each that the triplet bears out is a start of its own.
     """
     left = list(pairs)
     for _ in range(_STARTS):
@@ -98,9 +98,15 @@ def _starts(pairs: Sequence[Pair]) -> Iterator[tuple[Pair, tuple[int, ...]]]:
             return
         triplet = best_triplet(left)
         among = [p for p in left if triplet is None or {p.first, p.second} <= set(triplet)]
-        pair = max(among, key=_worth)
+        pair = max((p for p in among if triplet is None or _borne_out(p, among)), key=_worth)
         yield pair, tuple(k for k in triplet or () if k not in (pair.first, pair.second))
         left = [other for other in left if other is not pair]
+
+
+def _borne_out(pair: Pair, among: Sequence[Pair]) -> bool:
+    """Whether the other two pairs of a triplet close with this orientation of `pair`."""
+    ends = {pair.first, pair.second}
+    return best_triplet([pair, *(other for other in among if {other.first, other.second} != ends)]) is not None
 
 
 def _worth(pair: Pair) -> float:
@@ -194,8 +200,10 @@ def _grow(growth: "_Growth", pair: Pair, third: tuple[int, ...]) -> Grown:
     if growth.adjusted < len(growth.order):
         growth.adjust()
     count = growth.seen()
+    paired = {image for pair in growth.pairs for image in (pair.first, pair.second)}
     for i in np.flatnonzero(~growth.network.oriented).tolist():
-        growth.refused.setdefault(i, f"it sees {count[i]} points of the others, and {growth.least} are needed")
+        few = f"it sees {count[i]} points of the others, and {growth.least} are needed"
+        growth.refused.setdefault(i, few if i in paired else "no other image has a relative orientation to it")
     return Grown(growth.network, tuple(growth.order), growth.refused, growth.angle)
 
 

@@ -48,10 +48,6 @@ class Related(NamedTuple):
     """Two entries for a pair with two orientations that fit equally well, as points of a flat scene leave them."""
     matches: tuple[PairMatches, ...]
     """Those that agree with the relative orientation of their pair."""
-    off_epipolar: int
-    """Matches off the epipolar line."""
-    weak: int
-    """Matches of pairs that have too few, or whose relative orientation is open."""
     refused: dict[tuple[int, int], str]
     """Pairs without a relative orientation, and why."""
 
@@ -72,7 +68,6 @@ def relate(
     pairs: list[Pair] = []
     kept: list[PairMatches] = []
     refused: dict[tuple[int, int], str] = {}
-    off = weak = 0
     for k, match in enumerate(matches):
         if k % 10 == 0:
             report(f"relative orientation of pair {k + 1} of {len(matches)}")
@@ -81,16 +76,14 @@ def relate(
         found = _orientations(rays[match.first][one], rays[match.second][other], sigma_rad, least, both)
         if isinstance(found, str):
             refused[match.first, match.second] = found
-            weak += len(one)
             continue
         agrees = found[0].agrees
-        off += len(one) - int(agrees.sum())
         kept.append(match._replace(features=match.features[agrees]))
         for r in found:
             n = int(r.agrees.sum())
             ends = (match.first, match.second)
             pairs.append(Pair(*ends, r.camera_2_from_camera_1, r.base, n, r.parallactic_angle))
-    return Related(tuple(pairs), tuple(kept), off, weak, refused)
+    return Related(tuple(pairs), tuple(kept), refused)
 
 
 def _orientations(rays_1, rays_2, sigma_rad: float, least: int, images: str) -> list[RelativeOrientation] | str:

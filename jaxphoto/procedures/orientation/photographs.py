@@ -4,7 +4,7 @@
 2. What is left hangs together to points; a network grows over them (`growing`).
 3. With the camera as the network knows it now, and all images oriented, every match is tested again: lens distortion
    has made true ones look false, in the corners of the format above all. Points anew, adjustments in rounds.
-4. Parameters of the camera that the images cannot tell, or that it does not need, are held, and the rounds run again.
+4. Parameters of the camera that the images cannot tell are held, and the rounds run again.
 """
 
 import dataclasses
@@ -17,10 +17,11 @@ from jaxtyping import Float
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.block import Attitudes, Block, Datum, Distances, ImageRows, Rows, Start
 from jaxphoto.camera import InteriorOrientation, Sensor, get_parameter, parameter_names, set_parameter
+from jaxphoto.camera.equivalence import usual_coefficients
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.orientation.matches import PairMatches, Tracks, tracks
 from jaxphoto.orientation.rays import ideal_coordinates, unit_rays
-from jaxphoto.procedures.orientation.finish import finished, told, with_held
+from jaxphoto.procedures.orientation.finish import LAST_ROUNDS, finished, told, with_held
 from jaxphoto.procedures.orientation.growing import grown
 from jaxphoto.procedures.orientation.network import Fate, Network, empty_network, meet, sight_of
 from jaxphoto.procedures.orientation.pairs import LENS_PX, MOST, Report, check_connected, relate
@@ -38,8 +39,6 @@ LEAST_POINTS = 10
 """That an oriented photograph sees."""
 # Matches off the epipolar line are beyond so many a priori standard deviations once the camera is known.
 _EPIPOLAR = 4.0
-# Affinity and shear of the sensor, and the like, are not looked for.
-_USUAL = ("k1", "k2", "k3", "p1", "p2")
 
 
 class GrossErrors(NamedTuple):
@@ -74,6 +73,10 @@ class OrientationReport(NamedTuple):
     n_points: int
     n_image_points: int
     rounds: int
+    settled: bool
+    """Whether the last of them changed hardly any image point."""
+    converged: bool
+    """Whether the last adjustment did, and the rounds settled."""
     limit_px: float
     """Rays that missed their points by more were left out."""
     mean_px: float
@@ -83,6 +86,8 @@ class OrientationReport(NamedTuple):
     """Parameters of the interior orientation that are free in the block."""
     held: tuple[str, ...]
     """Why others are not, a sentence each."""
+    alike: float
+    """By what the standard deviations of the camera are larger than if neighbouring rays erred independently."""
 
 
 class Oriented(NamedTuple):
@@ -141,9 +146,10 @@ def orient(
     )
     network = meet(sight_of(block, network.interior), network, first.limit, start.angle)
     free = finished(block, network, calibration, calibration.names, start.angle, LEAST_POINTS, report)
-    estimated, held = told(block, free.adjusted, calibration)
+    camera = told(block, free.adjusted, calibration)
+    estimated = camera.names
     network = with_held(block, free.network, calibration, estimated)
-    last = finished(block, network, calibration, estimated, start.angle, LEAST_POINTS, report)
+    last = finished(block, network, calibration, estimated, start.angle, LEAST_POINTS, report, LAST_ROUNDS)
 
     network = last.network
     refused = start.refused | first.lost | free.lost | last.lost
@@ -165,11 +171,14 @@ def orient(
             n_points=len(made.points),
             n_image_points=len(made.image_points.image),
             rounds=first.rounds + free.rounds + last.rounds,
+            settled=last.settled,
+            converged=last.settled and bool(last.adjusted.converged),
             limit_px=last.limit * sigma / sensor.pixel_mm,
             mean_px=float(np.mean(np.hypot(*residual.T))) / sensor.pixel_mm,
             sigma0=float(last.adjusted.sigma0),
             estimated=estimated[CAMERA],
-            held=tuple(held),
+            held=tuple(camera.held),
+            alike=camera.alike,
         ),
     )
 
@@ -213,10 +222,8 @@ def _block_of(title, names, sensor, interior, features, sigmas_mm, found: Tracks
 
 
 def _candidates(interior: InteriorOrientation) -> tuple[str, ...]:
-    """Parameters that the images are asked for: c, principal point and the usual of the model, else all it has."""
-    model = interior.distortion
-    usual = tuple(n for n in model.coefficients if n in _USUAL)
-    return ("c_mm", "xp_mm", "yp_mm", *(usual or (n for n in model.coefficients if n not in model.scales)))
+    """Parameters that the images are asked for: c, principal point and the usual of the model."""
+    return ("c_mm", "xp_mm", "yp_mm", *usual_coefficients(type(interior.distortion)))
 
 
 def _oriented_block(block: Block, network: Network, estimated: tuple[str, ...]) -> Block:

@@ -33,13 +33,14 @@ class Placed(NamedTuple):
 
 def two_steps(image: int, pairs: Sequence[Pair], network: Network, sight: Sight) -> Placed | None:
     """The orientation of `image` by its pairs with oriented images; None where its position stays open."""
-    rotations, origins, directions, weights = [], [], [], []
+    others, rotations, origins, directions, weights = [], [], [], [], []
     for pair in pairs:
         if image not in (pair.first, pair.second):
             continue
         other = pair.second if image == pair.first else pair.first
         if network.oriented[other]:
             _, image_from_other, direction = pair.of(other)
+            others.append(other)
             rotations.append(image_from_other @ network.camera_from_object[other])
             directions.append(network.camera_from_object[other].T @ direction)
             origins.append(network.positions[other])
@@ -47,9 +48,13 @@ def two_steps(image: int, pairs: Sequence[Pair], network: Network, sight: Sight)
     if not rotations:
         return None
     rotation, origin, direction, weight = (np.array(v) for v in (rotations, origins, directions, weights))
-    # Those that agree with one of them, by most matches.
-    near = np.einsum("aij,bij->ab", rotation, rotation) > 1 + 2 * np.cos(_FALSE)
-    best = near[np.argmax(near @ weight)]
+    # Those that agree with the one most agree with; of two orientations of a pair, the one that agrees better.
+    alike = np.einsum("aij,bij->ab", rotation, rotation)
+    near = alike > 1 + 2 * np.cos(_FALSE)
+    chosen = int(np.argmax((near * alike) @ weight))
+    by_likeness = np.argsort(-alike[chosen], kind="stable")
+    best = by_likeness[np.unique(np.array(others)[by_likeness], return_index=True)[1]]
+    best = best[near[chosen][best]]
     matrix, spread = average_rotation(rotation[best], weight[best])
     position = _position(image, matrix, origin[best], direction[best], weight[best], network, sight)
     return None if position is None else Placed(position, matrix, spread / np.sqrt(weight[best].sum()))

@@ -1,0 +1,67 @@
+"""29 real photographs of a walk along a street, oriented from their features alone; COLMAP's poses beside ours."""
+
+import numpy as np
+import pytest
+
+from jaxphoto.io.matching import match_photographs
+from jaxphoto.io.pairs import photograph_pairs
+from jaxphoto.io.photographs import photographs, sensor_and_interior
+from jaxphoto.procedures.orientation import orient
+from jaxphoto.procedures.orientation.onto_known import similarity_between
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def folder(data_dir):
+    images = data_dir / "lund" / "images"
+    if not images.is_dir():
+        pytest.skip(f"no photographs in {images}")
+    return images
+
+
+@pytest.fixture(scope="module")
+def oriented(folder):
+    taken = photographs(sorted(folder.glob("*.jpg")))
+    camera = sensor_and_interior(taken)
+    matched = match_photographs(taken, camera.sensor, camera.interior, photograph_pairs(taken))
+    names = [p.name for p in taken]
+    return orient(names, camera.sensor, camera.interior, matched.xy_mm, matched.pairs, matched.sigma_mm)
+
+
+def test_the_street_is_oriented(oriented):
+    report = oriented.report
+    assert report.n_images == 29
+    assert len(report.order) >= 25
+    assert report.mean_px <= 1
+    assert report.settled and report.converged
+    # EXIF says 1,035 pixels; a walk straight ahead tells little of it.
+    c_px = float(oriented.block.start.unknowns.interior["camera"].c) / oriented.block.sensors["camera"].pixel_mm
+    assert 600 < c_px < 1300
+
+
+def test_positions_are_those_of_colmap(oriented, folder, tmp_path):
+    """To a hundredth of the path's length, after a similarity: each of the images that both have oriented."""
+    pycolmap = pytest.importorskip("pycolmap", reason="pycolmap, the independent check, is not installed")
+    pycolmap.logging.minloglevel = 2
+    database = tmp_path / "colmap.db"
+    one = pycolmap.CameraMode.SINGLE
+    pycolmap.extract_features(database, folder, camera_mode=one, device=pycolmap.Device.cpu)
+    pycolmap.match_exhaustive(database, device=pycolmap.Device.cpu)
+    options = pycolmap.IncrementalPipelineOptions(random_seed=0)
+    # As it comes, COLMAP finds no two images to begin with: all look along the line they stand on.
+    options.mapper.init_max_forward_motion = 1.0
+    options.mapper.init_min_tri_angle = 4.0
+    options.triangulation.ignore_two_view_tracks = False
+    models = pycolmap.incremental_mapping(database, folder, tmp_path, options)
+    best = max(models.values(), key=lambda m: m.num_reg_images())
+    theirs = {i.name.removesuffix(".jpg"): i.projection_center() for i in best.images.values() if i.has_pose}
+    ours = dict(zip(oriented.block.images, oriented.block.start.unknowns.exterior.position, strict=True))
+    both = sorted(set(ours) & set(theirs))
+    assert len(both) >= 20
+    there, here = (np.array([positions[name] for name in both]) for positions in (ours, theirs))
+    s = similarity_between(there, here)
+    off = np.linalg.norm(s.shift + s.scale * there @ s.turn.T - here, axis=1)
+    path = np.linalg.norm(np.diff(here, axis=0), axis=1).sum()
+    print(f"{len(both)} images, {100 * off.mean() / path:.2f} % on average, {100 * off.max() / path:.2f} % at most")
+    assert off.max() < 0.01 * path

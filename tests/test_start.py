@@ -1,0 +1,47 @@
+"""The start of the command line: the list of commands is whole, and a command brings only what it needs."""
+
+import importlib
+import inspect
+import subprocess
+import sys
+
+from jaxphoto.cli.app import COMMANDS, app
+
+
+def after(*arguments):
+    """Modules that `jaxphoto ...` has imported in a process of its own, and what it printed."""
+    program = (
+        "import sys\nfrom jaxphoto.cli import main\n"
+        "try:\n    main()\nexcept SystemExit:\n    print('MODULES', *sys.modules)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program, *arguments], capture_output=True, text=True, check=True)
+    said, _, modules = done.stdout.partition("MODULES")
+    return set(modules.split()), said
+
+
+def test_help_lists_every_command_and_imports_none():
+    modules, said = after("--help")
+    for name, command in COMMANDS.items():
+        assert name in said
+        assert command.sentence.split()[0] in said
+        assert f"jaxphoto.cli.{command.module}" not in modules
+    assert not {"cv2", "pandas", "laspy", "rasterio", "matplotlib.figure"} & modules
+
+
+def test_a_command_is_imported_when_it_is_called():
+    modules, said = after("simulate", "--help")
+    assert "Simulate a block with known truth." in said
+    assert "jaxphoto.cli.simulate" in modules
+    assert not {"jaxphoto.cli.calibrate", "jaxphoto.cli.lidar", "jaxphoto.cli.adjust"} & modules
+
+
+def test_the_list_is_of_the_commands_that_there_are():
+    """Every module registers what the list says of it, under that name, and nothing else is registered."""
+    for command in COMMANDS.values():
+        importlib.import_module(f"jaxphoto.cli.{command.module}")
+    own = [known for known in app.registered_commands if known.callback.__module__ != "jaxphoto.cli.app"]
+    registered = {known.name: known.callback for known in own}
+    assert set(registered) == set(COMMANDS)
+    for name, command in COMMANDS.items():
+        assert registered[name].__module__ == f"jaxphoto.cli.{command.module}"
+        assert inspect.getdoc(registered[name]).startswith(command.sentence.rstrip(".")), name
