@@ -1,6 +1,7 @@
 """One screen of text: outcome, sigma naught, warnings first, then the interior orientation."""
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from jaxphoto.report.tables import Tables
@@ -15,7 +16,7 @@ def print_adjustment(tables: Tables, warnings: list[str], console: Console) -> N
     adjusted = tables.adjusted
     colour = "green" if bool(adjusted.converged) else "red"
     n, u = sum(adjusted.n_observations.values()), sum(adjusted.n_unknowns.values())
-    console.print(f"[bold]{adjusted.block.title}[/bold]" if adjusted.block.title else "[bold]block[/bold]")
+    console.print(f"[bold]{escape(adjusted.block.title)}[/bold]" if adjusted.block.title else "[bold]block[/bold]")
     console.print(f"[{colour}]{adjusted.outcome.value}[/{colour}] ({int(adjusted.steps)} iterations)")
     console.print(
         f"sigma0 [bold]{float(adjusted.sigma0):.6g}[/bold]   redundancy {adjusted.redundancy} = {n} observations"
@@ -23,7 +24,7 @@ def print_adjustment(tables: Tables, warnings: list[str], console: Console) -> N
         + f" - {u} unknowns"
     )
     for warning in warnings[:_WARNINGS]:
-        console.print(f"[yellow]![/yellow] {warning}", highlight=False)
+        console.print(f"[yellow]![/yellow] {escape(warning)}", highlight=False)
     if len(warnings) > _WARNINGS:
         console.print(f"[yellow]![/yellow] and {len(warnings) - _WARNINGS} more in report.html")
     if tables.significance:

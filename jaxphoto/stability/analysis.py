@@ -38,7 +38,8 @@ class Analysis(NamedTuple):
             text += f", but calibrations repeated would give {1e3 * known.low_mm:.3g} to {1e3 * known.high_mm:.3g} um"
         one = f"Two calibrations of one camera would differ by {1e3 * known.expected_of_one_mm:.3g} um"
         if known.p_value < SIGNIFICANT_P:
-            return f"{text}. {one}, and by as much as this with p = {known.p_value:.2g}: the camera has changed."
+            changed = "the camera has changed, or many points of a set share errors"
+            return f"{text}. {one}, and by as much as this with p = {known.p_value:.2g}: {changed}."
         return f"{text}. {one}, and by as much as this with p = {known.p_value:.2g}: nothing says that it has changed."
 
 

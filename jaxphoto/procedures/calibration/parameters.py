@@ -11,15 +11,10 @@ from jaxphoto.camera import (
     needed_constants,
     parameter_names,
 )
+from jaxphoto.camera.equivalence import usual_coefficients
 from jaxphoto.errors import InputError
 
 _CENTRAL = ("c_mm", "xp_mm", "yp_mm")
-# What a board shows well; the rest of a model's coefficients stay at zero unless they are asked for.
-_USUAL = {
-    "brown": ("k1", "k2", "k3", "p1", "p2"),
-    "smac": ("k1", "k2", "k3", "p1", "p2"),
-    "balanced": ("a1", "a2", "a3", "b1", "b2"),
-}
 # Gruen's terms up to the third degree: with all 44, neighbouring targets would be fitted one by one.
 _DEGREE = 3
 
@@ -46,12 +41,12 @@ def free_parameters(name: str, distortion: AbstractDistortion, wanted: Sequence[
     """The parameters to estimate, in the order of the model: `wanted` (c, xp, yp stand for c_mm, ...), or the usual.
 
     The usual are c, the principal point, and the coefficients that a board tells: for SMAC and Brown K1-K3, P1, P2; for
-    Gruen those up to the third degree; for others all. Raises InputError for names that the model has not, and for a
-    scale coefficient beside c.
+    Gruen those up to the third degree; affinity, rational and highest terms only where they are wanted. Raises
+    InputError for names that the model has not, and for a scale coefficient beside c.
     """
     names = parameter_names(InteriorOrientation(1.0, distortion=distortion))
     if wanted is None:
-        usual = _USUAL.get(name, distortion.coefficients)
+        usual = usual_coefficients(type(distortion))
         if name == "gruen":
             usual = tuple(c for c in usual if int(c[1]) + int(c[2]) - 2 <= _DEGREE)
         return tuple(n for n in names if n in (*_CENTRAL, *usual))
