@@ -126,6 +126,10 @@ def tile_points(image: np.ndarray, point: np.ndarray, n_points: int, m: int, p: 
     return Tiling(own, place, slot)
 
 
+# Images of a point that the second order looks at.
+_SORTED_BY = 16
+
+
 def _orders(image: np.ndarray, point: np.ndarray, n_points: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Two orders of the points, and each point's images.
 
@@ -141,9 +145,10 @@ def _orders(image: np.ndarray, point: np.ndarray, n_points: int) -> tuple[list[n
         low[seen] = np.minimum.reduceat(image, starts)
         high[seen] = np.maximum.reduceat(image, starts)
         mean[seen] = np.add.reduceat(image.astype(float), starts) / rays[seen]
-    each = np.full((max(1, int(rays.max(initial=0))), n_points), np.iinfo(np.int32).max)
-    each[np.arange(len(image)) - first[point], point] = image
-    each.sort(axis=0)
+    rank = np.arange(len(image)) - first[point]
+    near = rank < _SORTED_BY
+    each = np.full((_SORTED_BY, n_points), np.iinfo(np.int32).max, np.int32)
+    each[rank[near], point[near]] = image[np.lexsort((image, point))][near]
     return [np.lexsort((mean, high, low)), np.lexsort(each[::-1])], np.split(image, first[1:-1])
 
 

@@ -22,6 +22,7 @@ from jaxphoto.camera.distortion import (
     Balanced,
     Brown,
     BundlerRadial,
+    Gruen,
     OpenCv,
     PpsRadial,
     RadialPolynomial,
@@ -121,6 +122,8 @@ _RARE: dict[type[AbstractDistortion], tuple[str, ...]] = {
     AffineBrown: ("b1", "b2"),
     Balanced: ("c1", "c2"),
     Smac: ("k4", "p3", "p4"),
+    # Up to the third degree: with all 44, neighbouring targets would be fitted one by one.
+    Gruen: tuple(name for name in Gruen.coefficients if int(name[1]) + int(name[2]) - 2 > 3),
 }
 
 _AFFINITY_ADDED = (Brown, Balanced)

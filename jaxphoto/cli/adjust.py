@@ -49,6 +49,6 @@ def adjust_command(
         order = ("read", "compile", "solve", "covariance")
         write_results(tables, verdict, out, {name: times[name] for name in order})
     print_adjustment(tables, verdict, console)
-    console.print(f"results in {out} (open report.html)", highlight=False)
+    console.print(f"results in {out} (open report.html)", highlight=False, markup=False)
     if not bool(adjusted.converged):
         raise typer.Exit(1)

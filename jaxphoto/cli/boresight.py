@@ -35,6 +35,6 @@ def boresight_command(
         status.update(f"writing {out}")
         write_boresight(steps, out, seconds)
     print_boresight(steps, console)
-    console.print(f"results in {out} (open report.html)", highlight=False)
+    console.print(f"results in {out} (open report.html)", highlight=False, markup=False)
     if not all(step.go_on for step in steps):
         raise typer.Exit(1)

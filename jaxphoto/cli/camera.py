@@ -40,7 +40,7 @@ def camera_command(
     read = read_camera_file(source, camera=camera, pixel_mm=pixel_mm, size_px=size, block=block)
     kind = DISTORTIONS[distortion] if distortion is not None else None
     done = write_camera_file(out, read.sensor, read.interior, out_format, name=read.name, distortion=kind)
-    console = Console(highlight=False, soft_wrap=True)
+    console = Console(highlight=False, markup=False, soft_wrap=True)
     console.print(
         f"{read.name}: {type(read.interior.distortion).__name__} -> {type(done.interior.distortion).__name__}"
     )

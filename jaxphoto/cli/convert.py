@@ -7,7 +7,7 @@ import typer
 
 from jaxphoto.cli.app import app
 from jaxphoto.errors import InputError
-from jaxphoto.io import read_source, write_block
+from jaxphoto.io import convert, read_source
 from jaxphoto.io.block_folder import check_block_target
 from jaxphoto.io.colmap import check_model_target, write_colmap_model
 
@@ -28,7 +28,7 @@ def convert_command(
         raise InputError(f"--to {to}: there are {', '.join(_TARGETS)}")
     if to == "block":
         check_block_target(out)
-        write_block(read_source(source, source_format), out)
+        convert(source, out, source_format)
     else:
         check_model_target(out, source)
         for name, conversion in write_colmap_model(read_source(source, source_format), out).items():

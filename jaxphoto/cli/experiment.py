@@ -42,8 +42,8 @@ def experiment_command(
         write_runs(runs, out)
         console.print(_judgement(experiment.title, compare(runs[folder], folder)))
         for failure in runs[folder].failures:
-            console.print(f"left out: {failure}", highlight=False)
-    console.print(f"results in {out} (open report.html)", highlight=False)
+            console.print(f"left out: {failure}", highlight=False, markup=False)
+    console.print(f"results in {out} (open report.html)", highlight=False, markup=False)
 
 
 def _judgement(title: str, table) -> Table:

@@ -212,7 +212,7 @@ def simultaneous_command(
     console = Console()
     print_rounds(result.rounds, result.still, console)
     print_moved(result, console)
-    console.print(f"results in {out}", highlight=False)
+    console.print(f"results in {out}", highlight=False, markup=False)
     if not result.still:
         raise typer.Exit(1)
 

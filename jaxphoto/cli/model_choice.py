@@ -40,6 +40,6 @@ def models_command(
         status.update(f"writing {out}")
         write_model_choice(choice, read.title, out, seconds)
     print_model_choice(choice, console)
-    console.print(f"results in {out} (open report.html)", highlight=False)
+    console.print(f"results in {out} (open report.html)", highlight=False, markup=False)
     if not choice.by_bic:
         raise typer.Exit(1)

@@ -6,6 +6,7 @@ from typing import Annotated
 import numpy as np
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
@@ -74,7 +75,7 @@ def monte_carlo_command(
     with Progress(*columns, console=errors, transient=True) as progress:
         task = progress.add_task("", total=draws)
         study.draw(lambda done: progress.update(task, completed=done))
-    with errors.status(f"writing {out}"):
+    with errors.status(escape(f"writing {out}")):
         summary, table = study.write()
     console = Console()
     console.print(
@@ -88,7 +89,7 @@ def monte_carlo_command(
         if not str(name).startswith(("bias.", "exterior.", "point.", "check.")):
             shown.add_row(str(name), *(f"{float(v):.5g}" for v in numbers))
     console.print(shown)
-    console.print(f"results in {out}", highlight=False)
+    console.print(f"results in {out}", highlight=False, markup=False)
 
 
 def _sigma_of(kind: str, given: dict[str, str | None]) -> list[float]:

@@ -18,7 +18,7 @@ from jaxphoto.io.block_folder.layout import TOML
 from jaxphoto.io.matching import MatchedPhotographs, match_photographs
 from jaxphoto.io.pairs import photograph_pairs
 from jaxphoto.io.photographs import photographs, sensor_and_interior
-from jaxphoto.orientation.approximate import has_beginning
+from jaxphoto.procedures.adjust import needs_orientation
 from jaxphoto.procedures.calibration import distortion_model
 from jaxphoto.procedures.orientation import Oriented, orient, orient_block
 from jaxphoto.report.orientation import print_orientation, write_orientation
@@ -105,9 +105,9 @@ def _refuse_options(folder: Path, **options: object) -> None:
 def _orient_folder(folder: Path, out: Path, report: Callable[[str], None]) -> tuple[int, int]:
     """How many images of the block in `folder` are oriented in that written to `out`, and how many there are."""
     block = read_block(folder)
-    if has_beginning(block):
+    if not needs_orientation(block):
         raise InputError(
-            f"{folder} needs no orientation: images are known, or see four known points; adjust it as it is"
+            f"{folder} needs no orientation: from what is known, resection reaches all its images; adjust it as it is"
         )
     with_start = orient_block(block, report)
     write_block(with_start, out)

@@ -52,4 +52,4 @@ def sensitivity_command(
     for row in largest.head(_SHOWN).itertuples(index=False):
         line = f"  {row.estimate}: {row.exact:.4g}, {row.first_order:.4g} (stations of {row.unit} in {row.axis})"
         console.print(line, highlight=False, markup=False)
-    console.print(f"results in {out}", highlight=False)
+    console.print(f"results in {out}", highlight=False, markup=False)

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 
 from jaxphoto.cli.app import app
 from jaxphoto.errors import InputError
@@ -62,11 +63,11 @@ def stability_command(
     )
     for letter, file in zip("AB", both, strict=True):
         if file.note:
-            console.print(f"[yellow]![/yellow] {letter}: {file.note}", highlight=False, soft_wrap=True)
+            console.print(f"[yellow]![/yellow] {letter}: {escape(file.note)}", highlight=False, soft_wrap=True)
     print_stability(found, (one, other), a.sensor.pixel_mm, noise_mm, chosen, console)
     if out is not None:
         write_stability(found, (one, other), a.sensor, noise_mm, chosen, out)
-        console.print(f"results in {out} (open report.html)", highlight=False)
+        console.print(f"results in {out} (open report.html)", highlight=False, markup=False)
 
 
 def _grid(text: str) -> tuple[int, int]:

@@ -49,11 +49,6 @@ def completed(block: Block) -> Start:
     return state.start()
 
 
-def has_beginning(block: Block) -> bool:
-    """Whether `approximate` reaches every image from what is known."""
-    return bool(completed(block).image_known.all())
-
-
 class _State:
     """What is known so far. A working table of one call, not a value: it is filled in place."""
 

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxphoto.orientation.coplanarity import RayPairs
+from jaxphoto.orientation.quaternions import cross_matrices
 
 _TURNED = 1e-3  # a difference of squared singular values below which the homography is a rotation
 _SAME = 1e-12
@@ -26,10 +27,7 @@ def homographies(rays_1: Float[np.ndarray, "sets n 3"], rays_2: Float[np.ndarray
 
     Of three points on a line, or of fewer than four different ones, it is one of many.
     """
-    first = np.zeros((*rays_2.shape, 3))  # [x_2]x
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        first[..., j, i], first[..., i, j] = rays_2[..., k], -rays_2[..., k]
-    rows = (first[..., :, None] * rays_1[..., None, None, :]).reshape(len(rays_1), -1, 9)
+    rows = (cross_matrices(rays_2)[..., :, None] * rays_1[..., None, None, :]).reshape(len(rays_1), -1, 9)
     found = np.linalg.eigh(np.swapaxes(rows, 1, 2) @ rows)[1][:, :, 0].reshape(-1, 3, 3)
     middle = np.linalg.svd(found, compute_uv=False)[:, 1]
     sign = np.sign(np.einsum("sni,sij,snj->s", rays_2, found, rays_1))

@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxphoto.adjustment import LEAST, MAX_STEPS, Adjustment, Sizes, solve
 from jaxphoto.block import Block, sensor_rows
-from jaxphoto.errors import BlockError
+from jaxphoto.errors import BlockError, DatumError, RankError
 from jaxphoto.orientation import approximate
 from jaxphoto.orientation.approximate import completed
 from jaxphoto.procedures.orientation import orient_block
@@ -14,8 +14,6 @@ from jaxphoto.procedures.orientation.network import empty_network, misfits, sigh
 from jaxphoto.statistics import prepare_statistics
 from jaxphoto.unknowns import Unknowns
 
-# Images that a message names.
-_NAMED = 8
 # Rays that miss by more (rad) are off by more than lenses distort.
 _NEAR = 0.02
 
@@ -57,29 +55,37 @@ def adjust_for_tables(block: Block, max_steps: int = MAX_STEPS) -> Adjustment:
 def start_of(block: Block) -> Unknowns:
     """All approximate values of `block`: `approximate`, after its images are oriented to one another if need be.
 
-    Need is where resection and intersection do not reach all images, or where rays then miss their points by far, as
-    from a few images known roughly.
-
-    Raises BlockError where this fails as well, naming the images that are left.
+    Raises BlockError where neither reaches all images, naming those that are left, and where points are not met.
     """
-    reached = dataclasses.replace(block, start=completed(block))
-    known, given = np.asarray(reached.start.image_known), np.array(block.start.image_known)
-    given[sensor_rows(block, block.start.unknowns).image] = True
-    if given.all() or (known.all() and _fits(reached)):
+    reached, enough = _reached(block)
+    if enough:
         return approximate(reached)
     try:
-        return approximate(orient_block(block))
-    except BlockError as error:
-        if known.all():
-            return approximate(reached)
-        if not known.any():
+        oriented = orient_block(block)
+    except (BlockError, DatumError, RankError) as error:
+        if not reached.start.image_known.any():
             raise
-        left = [name for name, is_known in zip(block.images, known, strict=True) if not is_known]
-        raise BlockError(
-            f"{len(left)} of {len(known)} images ({', '.join(left[:_NAMED])}{', ...' if len(left) > _NAMED else ''}) "
-            "have no approximate orientation and see too few known points for a resection; by their common points, "
-            f"too, they cannot be oriented: {error}"
-        ) from error
+        try:
+            return approximate(reached)
+        except BlockError as why:
+            raise BlockError(f"{why}; by their common points, too, they cannot be oriented: {error}") from error
+    return approximate(oriented)
+
+
+def needs_orientation(block: Block) -> bool:
+    """Whether resection and intersection from what is known do not reach all images of `block`.
+
+    Or reach them so badly, as from a few images known roughly, that rays miss their points by far.
+    """
+    return not _reached(block)[1]
+
+
+def _reached(block: Block) -> tuple[Block, bool]:
+    """`block` with what resection and intersection find, and whether that will do."""
+    reached = dataclasses.replace(block, start=completed(block))
+    given = np.array(block.start.image_known)
+    given[sensor_rows(block, block.start.unknowns).image] = True
+    return reached, bool(given.all() or (np.all(reached.start.image_known) and _fits(reached)))
 
 
 def _fits(block: Block) -> bool:

@@ -9,9 +9,9 @@ from jaxphoto.block import ImageRows, Rows, Start
 from jaxphoto.camera import InteriorOrientation
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import BlockError
-from jaxphoto.orientation.approximate import completed, has_beginning
+from jaxphoto.orientation.approximate import completed
 from jaxphoto.orientation.matches import tracks
-from jaxphoto.procedures.adjust import adjust, start_of
+from jaxphoto.procedures.adjust import adjust, needs_orientation, start_of
 from jaxphoto.procedures.orientation import orient_block
 from jaxphoto.procedures.orientation.photographs import _block_of
 from jaxphoto.procedures.orientation.refine import freed
@@ -87,11 +87,11 @@ def test_an_adjustment_begins_with_it(scene):
 
 def test_what_can_be_resected_needs_no_orientation(scene):
     block, true = unknown_block(scene)
-    assert not has_beginning(block)
-    assert not has_beginning(with_control(block, true, scene, np.array([0, 20, 45])))
-    assert has_beginning(with_control(block, true, scene, np.arange(20)))
-    assert not has_beginning(with_known_images(block, scene, [2]))
-    assert has_beginning(with_known_images(block, scene, [1, 2]))
+    assert needs_orientation(block)
+    assert needs_orientation(with_control(block, true, scene, np.array([0, 20, 45])))
+    assert not needs_orientation(with_control(block, true, scene, np.arange(20)))
+    assert needs_orientation(with_known_images(block, scene, [2]))
+    assert not needs_orientation(with_known_images(block, scene, [1, 2]))
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxphoto.block import Distances, Rows, Start
-from jaxphoto.camera import InteriorOrientation
+from jaxphoto.camera import InteriorOrientation, Smac
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import BlockError
 from jaxphoto.orientation.matches import tracks
@@ -16,6 +16,7 @@ from jaxphoto.procedures.orientation.network import Fate, empty_network, meet, m
 from jaxphoto.procedures.orientation.onto_known import onto_known, similarity_between
 from jaxphoto.procedures.orientation.pairs import Pair
 from jaxphoto.procedures.orientation.photographs import _block_of
+from jaxphoto.procedures.orientation.refine import _at_corner
 from jaxphoto.procedures.orientation.two_steps import two_steps
 from tests.formulas import camera_from_object
 from tests.procedures.orientable import PIXEL, SENSOR, Camera, Scene, convergent, photographed
@@ -43,6 +44,13 @@ def pair_of(scene, i, j, n=100):
     base = scene.matrices[i] @ (scene.positions[j] - scene.positions[i])
     rotation = scene.matrices[j] @ scene.matrices[i].T
     return Pair(i, j, rotation, base / np.linalg.norm(base), n, 0.3)
+
+
+@pytest.mark.parametrize("r0_mm", [0.0, 4.9, 5.0, 5.1])
+def test_radial_terms_move_the_image_whatever_the_balance_radius(r0_mm):
+    """The corner is at 5 mm: k1 moves it, or what lies within, by a good part of 125 mm."""
+    moved = _at_corner(InteriorOrientation(8.0, distortion=Smac(r0=r0_mm)), "k1", np.array([4.0, 3.0]))
+    assert 40 < moved < 130
 
 
 def test_points_meet_where_they_are():

@@ -79,6 +79,8 @@ def read_cameras(source: Source) -> dict[int, ColmapCamera]:
         identifier, number, width, height = file.take("IiQQ")
         model = _NUMBERS[number] if 0 <= number < len(_NUMBERS) else f"number {number}"
         _check_known(source, model, str(identifier))
+        if identifier in cameras:
+            raise source.error(f"camera {identifier} stands there twice; keep one of the two")
         cameras[identifier] = ColmapCamera(model, width, height, file.numbers(len(MODELS[model])))
     return cameras
 

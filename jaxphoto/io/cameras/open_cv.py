@@ -102,7 +102,7 @@ def _matrix(source: Source, storage: cv2.FileStorage, key: str) -> np.ndarray:
     rows, columns = (_number(node, side) if node.isMap() else None for side in ("rows", "cols"))
     data = node.getNode("data") if node.isMap() else node
     values = [_value(data.at(k)) for k in range(data.size())] if data.isSeq() else []
-    if rows is None or columns is None or None in values or not rows * columns == len(values) > 0:
+    if not rows or not columns or rows % 1 or columns % 1 or None in values or not rows * columns == len(values) > 0:
         raise source.error(f"{key} is no matrix with rows, cols and as many numbers in data; write it anew with OpenCV")
     matrix = np.array(values, float).reshape(-1, max(int(columns), 1))
     if not np.isfinite(matrix).all():

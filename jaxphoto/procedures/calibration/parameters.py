@@ -15,8 +15,6 @@ from jaxphoto.camera.equivalence import usual_coefficients
 from jaxphoto.errors import InputError
 
 _CENTRAL = ("c_mm", "xp_mm", "yp_mm")
-# Gruen's terms up to the third degree: with all 44, neighbouring targets would be fitted one by one.
-_DEGREE = 3
 
 
 def distortion_model(name: str, sensor: Sensor, r0_mm: float = 0.0) -> AbstractDistortion:
@@ -47,8 +45,6 @@ def free_parameters(name: str, distortion: AbstractDistortion, wanted: Sequence[
     names = parameter_names(InteriorOrientation(1.0, distortion=distortion))
     if wanted is None:
         usual = usual_coefficients(type(distortion))
-        if name == "gruen":
-            usual = tuple(c for c in usual if int(c[1]) + int(c[2]) - 2 <= _DEGREE)
         return tuple(n for n in names if n in (*_CENTRAL, *usual))
     asked = [f"{n}_mm" if n in ("c", "xp", "yp") else n for n in wanted]
     for parameter in asked:

@@ -7,6 +7,7 @@ to one size. What is not to be estimated yet gets a weight that holds it.
 import dataclasses
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool
@@ -56,15 +57,18 @@ def calibration_of(block: Block) -> Calibration:
 
 
 def _at_corner(interior: InteriorOrientation, name: str, corner: np.ndarray) -> float:
-    """By how many mm a unit of a parameter moves the image at the corner of the format."""
+    """By how many mm a unit of a parameter moves the image at the corner of the format, or nearer where that is more.
+
+    A balance radius may lie at the corner, which radial terms then leave where it is.
+    """
     if name == "c_mm":
         return float(np.linalg.norm(corner) / np.asarray(interior.c))
     if name in ("xp_mm", "yp_mm"):
         return 1.0
     value, step = float(np.asarray(get_parameter(interior, name))), 1e-12
-    at = jnp.asarray(corner)
-    both = [np.asarray(set_parameter(interior, name, value + s).closed_form(at)) for s in (step, -step)]
-    return float(np.linalg.norm(both[0] - both[1])) / (2 * step)
+    at = jnp.asarray(corner) * jnp.linspace(0.25, 1.0, 4)[:, None]
+    both = [np.asarray(jax.vmap(set_parameter(interior, name, value + s).closed_form)(at)) for s in (step, -step)]
+    return float(np.linalg.norm(both[0] - both[1], axis=1).max()) / (2 * step)
 
 
 def early(calibration: Calibration) -> Names:
