@@ -68,7 +68,7 @@ def start_of(block: Block) -> Unknowns:
         try:
             return approximate(reached)
         except BlockError as why:
-            raise BlockError(f"{why}; by their common points, too, they cannot be oriented: {error}") from error
+            raise BlockError(f"{why}; nor can they be oriented by their common points: {error}") from error
     return approximate(oriented)
 
 
