@@ -148,8 +148,10 @@ def orient(
     free = finished(block, network, calibration, calibration.names, start.angle, LEAST_POINTS, report)
     camera = told(block, free.adjusted, calibration)
     estimated = camera.names
-    network = with_held(block, free.network, calibration, estimated)
-    last = finished(block, network, calibration, estimated, start.angle, LEAST_POINTS, report, LAST_ROUNDS)
+    last = free
+    if camera.held or not free.settled:
+        network = with_held(block, free.network, calibration, estimated)
+        last = finished(block, network, calibration, estimated, start.angle, LEAST_POINTS, report, LAST_ROUNDS)
 
     network = last.network
     refused = start.refused | first.lost | free.lost | last.lost
@@ -170,7 +172,7 @@ def orient(
             ),
             n_points=len(made.points),
             n_image_points=len(made.image_points.image),
-            rounds=first.rounds + free.rounds + last.rounds,
+            rounds=first.rounds + free.rounds + (0 if last is free else last.rounds),
             settled=last.settled,
             converged=last.settled and bool(last.adjusted.converged),
             limit_px=last.limit * sigma / sensor.pixel_mm,
