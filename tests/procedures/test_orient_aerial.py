@@ -53,16 +53,17 @@ def test_flat_ground_and_vertical_images_leave_c_open():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("flight", "lens"),
+    ("flight", "lens", "false"),
     [
-        ({"strips": 3, "per_strip": 4, "c": 20.0}, Camera(20.0, 0.04, -0.03, 1e-4, -1e-6)),
-        ({"strips": 2, "per_strip": 5, "c": 20.0, "relief": 0.0}, Camera(20.0, 0.04, -0.03, 1e-4, -1e-6)),
-        ({"strips": 3, "per_strip": 4, "c": 5.0, "crab_deg": 10.0}, Camera(5.0, 0.04, -0.03, 1e-3, -1e-5)),
-        ({"strips": 4, "per_strip": 5, "forward": 0.8, "across": 0.6}, LENS),
-        ({"strips": 2, "per_strip": 5, "relief": 0.0}, CHEAP),
+        ({"strips": 3, "per_strip": 4, "c": 20.0}, Camera(20.0, 0.04, -0.03, 1e-4, -1e-6), 0.3),
+        # No false ones: along epipolar lines they look like relief, and tell a c that flat ground leaves open.
+        ({"strips": 2, "per_strip": 5, "c": 20.0, "relief": 0.0}, Camera(20.0, 0.04, -0.03, 1e-4, -1e-6), 0.0),
+        ({"strips": 3, "per_strip": 4, "c": 5.0, "crab_deg": 10.0}, Camera(5.0, 0.04, -0.03, 1e-3, -1e-5), 0.3),
+        ({"strips": 4, "per_strip": 5, "forward": 0.8, "across": 0.6}, LENS, 0.3),
+        ({"strips": 2, "per_strip": 5, "relief": 0.0}, CHEAP, 0.3),
     ],
     ids=["narrow", "narrow and flat", "wide", "dense", "flat, cheap lens"],
 )
-def test_other_flights(flight, lens):
+def test_other_flights(flight, lens, false):
     scene = aerial(**flight)
-    check(oriented_from(scene, lens, InteriorOrientation(1.03 * lens.c), 0.4, 0.3), scene)
+    check(oriented_from(scene, lens, InteriorOrientation(1.03 * lens.c), 0.4, false), scene)
