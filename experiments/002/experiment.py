@@ -42,12 +42,8 @@ def printed(dataset: str, r0_mm: int) -> InteriorOrientation:
 
 def covariance(tables: Tables, r0_mm: int) -> np.ndarray:
     """A posteriori covariance of the twin's IOP in the order of their names, written with another R0."""
-    (interior,) = tables.adjusted.unknowns.interior.values()
-    known, names = tables.covariance, parameter_names(interior)
-    first = 6 * known.n_images
-    places = [names.index(label.rsplit("].", 1)[1]) for label in known.labels[first:]]
-    full = np.zeros((len(names), len(names)))
-    full[np.ix_(places, places)] = known.matrix[first:, first:] * float(known.variance_factor)
+    ((camera, interior),) = tables.adjusted.unknowns.interior.items()
+    full = tables.covariance.of_interior(camera, parameter_names(interior))
     return np.asarray(rebalance_covariance(interior, float(r0_mm), full))
 
 

@@ -55,9 +55,8 @@ def reduce_right(reduced: Reduced, b: Increments, at: At, many: bool = False) ->
     s, i = at.structure, at.structure.n_border
     z = jnp.stack(whiten(b.points, reduced.l))
     if reduced.f is None and not many:
-        of_points, d = _down_by_rows(jnp.stack(unwhiten(z, reduced.l)), at)
-        eop, shared = b.eop - of_points.eop, b.shared - of_points.shared
-        return jnp.concatenate([eop.T.reshape(-1), shared]), d
+        eop, shared, d = _down_by_rows(jnp.stack(unwhiten(z, reduced.l)), at)
+        return jnp.concatenate([(b.eop - eop).T.reshape(-1), b.shared - shared]), d
     image, z = s.in_tiles.image, by_tile(z, s.in_tiles)
     down = over_tiles(lambda f, _, z: f @ z.reshape(-1), at, reduced, (z,))
     of_images, border = jnp.split(down, [6 * image.shape[2]], axis=2)
@@ -86,7 +85,7 @@ def solve_reduced(reduced: Reduced, factor: BandFactor, right, d, b_points, at: 
     return Increments(eop.T, shared, jnp.stack(unwhiten(z, r.l)))
 
 
-def _down_by_rows(step: Array, at: At) -> tuple[Increments, Array]:
+def _down_by_rows(step: Array, at: At) -> tuple[Array, Array, Array]:
     """What increments of the points add to the right-hand sides of images, shared unknowns and mu."""
     _, scale, values, s = at
     rest = other_rows(at)
@@ -105,7 +104,7 @@ def _down_by_rows(step: Array, at: At) -> tuple[Increments, Array]:
         along = jnp.sum(rest.surfaces * step[:, None], axis=0)
         of_scanner = total(jnp.einsum("arp,rp->a", rest.surfaces_scanner, along), s)
         shared = shared.at[s.n_interior : s.n_border].add(of_scanner)
-    return Increments(eop, shared, step), total(jnp.einsum("kcp,cp->k", rest.rows_p, step), s)
+    return eop, shared, total(jnp.einsum("kcp,cp->k", rest.rows_p, step), s)
 
 
 def _up_by_rows(eop: Array, shared: Array, mu: Array, at: At) -> Array:

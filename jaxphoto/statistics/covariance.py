@@ -12,6 +12,7 @@ In a free network the part along the open motions, which the constraints of the 
 is the covariance under inner (or minimal) constraints.
 """
 
+from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
@@ -90,6 +91,18 @@ class Covariance(eqx.Module):
     def point_sigma(self) -> Float[Numbers, "points 3"]:
         """A posteriori standard deviations of the object points (m)."""
         return self._sigma(self.points.diagonal(axis1=1, axis2=2))
+
+    def of_interior(self, camera: str, parameters: Sequence[str]) -> Float[np.ndarray, "parameters parameters"]:
+        """A posteriori covariance of a camera's interior orientation in the order of `parameters`; zero where held."""
+        first, own = 6 * self.n_images, f"interior[{camera}]."
+        place = {
+            label.removeprefix(own): first + k for k, label in enumerate(self.labels[first:]) if label.startswith(own)
+        }
+        which = [k for k, name in enumerate(parameters) if name in place]
+        where = [place[parameters[k]] for k in which]
+        found = np.zeros((len(parameters), len(parameters)))
+        found[np.ix_(which, which)] = np.asarray(self.matrix)[np.ix_(where, where)] * float(self.variance_factor)
+        return found
 
     def _sigma(self, variance: Numbers) -> Any:
         xp = jnp if isinstance(variance * self.variance_factor, jax.Array) else np

@@ -15,12 +15,4 @@ def interior_covariance(adjusted: Adjustment) -> Float[np.ndarray, "parameters p
     Rows and columns of what was held are zero. It takes the image points as independent of each other: what a board
     that is not flat does to many of them alike is not in it.
     """
-    known, names = covariance(adjusted), parameter_names(adjusted.unknowns.interior[CAMERA])
-    shared = known.labels[6 * known.n_images :]
-    own = f"interior[{CAMERA}]."
-    place = [k for k, label in enumerate(shared) if label.startswith(own)]
-    which = [names.index(shared[k].removeprefix(own)) for k in place]
-    matrix = np.asarray(known.matrix)[6 * known.n_images :, 6 * known.n_images :] * float(known.variance_factor)
-    found = np.zeros((len(names), len(names)))
-    found[np.ix_(which, which)] = matrix[np.ix_(place, place)]
-    return found
+    return covariance(adjusted).of_interior(CAMERA, parameter_names(adjusted.unknowns.interior[CAMERA]))
