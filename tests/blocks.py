@@ -18,6 +18,7 @@ from jaxphoto.block import Attitudes, Block, Datum, Distances, ImageRows, Rows, 
 from jaxphoto.camera import Balanced, Brown, InteriorOrientation, Sensor, Smac, set_parameter
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.georeferencing import Mount, Scanner, StripBias
+from jaxphoto.rotation import small_rotation
 from jaxphoto.simulation import remeasure
 from jaxphoto.unknowns import default_priors
 from tests.derivatives import QUICKLY
@@ -340,6 +341,27 @@ def _close(datum: Datum, bars: bool = True) -> Simulated:
     ends = np.array([[0, 1], [1, 2], [5, 30]])
     distances = Distances(ends, np.zeros(3), np.full(3, 1e-4)) if bars else Distances.none()
     return Simulated(free(dataclasses.replace(block, distances=distances, datum=datum), "one"), truth)
+
+
+def free_network(kind: str = "inner", distances: Distances | None = None) -> Block:
+    """The aerial block with image points alone, and perhaps distances."""
+    block, truth = bare(aerial(), {"one": BROWN}, ("one",) * 10)
+    own = {"datum": Datum(kind), "distances": distances or Distances.none()}
+    return measured(Simulated(dataclasses.replace(block, **own), truth)).block
+
+
+def from_afar(block: Block, known: Unknowns) -> Block:
+    """The block with a start so far off from what is `known` that steps are rejected from there."""
+    rng, n = np.random.default_rng(1), len(block.images)
+    turn = np.asarray(jax.jit(jax.vmap(small_rotation))(rng.normal(0, 0.3, (n, 3))))
+    exterior = dataclasses.replace(
+        known.exterior,
+        position=known.exterior.position + rng.normal(0, 120.0, (n, 3)),
+        camera_from_object=turn @ known.exterior.camera_from_object,
+    )
+    points = known.points + rng.normal(0, 60.0, known.points.shape)
+    start = eqx.tree_at(lambda u: (u.exterior, u.points), known, (exterior, points))
+    return eqx.tree_at(lambda b: b.start.unknowns, block, start)
 
 
 VARIANTS = {

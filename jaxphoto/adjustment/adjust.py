@@ -17,7 +17,8 @@ from jaxphoto.adjustment.precision import warn_of_lost_digits
 from jaxphoto.adjustment.rank import check_priors, check_rank
 from jaxphoto.adjustment.residuals import Residuals, State, Values, state_at
 from jaxphoto.adjustment.result import Adjustment, Factored, Padded, Unfactored
-from jaxphoto.adjustment.shards import usable
+from jaxphoto.adjustment.shards import gathered, on_one_device, usable
+from jaxphoto.adjustment.similarity import open_motions
 from jaxphoto.adjustment.solver import zero_system
 from jaxphoto.adjustment.structure import Structure, structure_of
 from jaxphoto.adjustment.values import at_state, unknowns_of, values_of, with_datum
@@ -56,9 +57,11 @@ def solve(
     constraints = close_datum(block, concrete(values, block), structure)
     values = with_datum(values, constraints.eop, constraints.points)
     traced = any(isinstance(v, jax.core.Tracer) for v in jax.tree.leaves(values))
-    coupled = len(constraints.eop) + len(structure.distance_points) > 0
-    shards = 1 if traced or coupled else _devices_worth_using(len(structure.image))
-    wide, places = pad_structure(structure, sizes, shards=shards, dense=coupled)
+    constrained, distances = len(constraints.eop) > 0, len(structure.distance_points) > 0
+    # A distance may join points of two devices; of constraints, statistics have only the open motions in closed form.
+    alone = traced or distances or (constrained and not open_motions(values))
+    shards = 1 if alone else _devices_worth_using(len(structure.image))
+    wide, places = pad_structure(structure, sizes, shards=shards, dense=constrained or distances)
     numbers = pad_values(values, structure, wide, places)
     seconds: dict[str, float] = {}
     padded = None
@@ -78,7 +81,7 @@ def solve(
     # Statistics need the factored normal matrix; a derivative of the unknowns does not, and would pay for it dearly.
     if not traced:
         _, _, factored = run_compiled(_optimise, (numbers, wide, max_steps, np.array(True)), seconds, "covariance")
-        padded = Padded(wide, numbers, factored, places)
+        padded = Padded(wide, numbers, gathered(factored), places)
     residuals = run_compiled(_residuals, (numbers, wide), seconds, "residuals")
     state = crop_state(state, places)
     adjusted = Adjustment(
@@ -134,7 +137,8 @@ def _optimise(
 
 @eqx.filter_jit
 def _residuals(values: Values, structure: Structure) -> Residuals:
-    return residuals_at(At(zero_increments(structure), unit_scale(structure), values, structure))
+    s = on_one_device(structure)
+    return residuals_at(At(zero_increments(s), unit_scale(s), values, s))
 
 
 def concrete(tree: Values, block: Block) -> Values:

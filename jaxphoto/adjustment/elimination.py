@@ -14,10 +14,10 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxphoto.adjustment.band import BandFactor, solve_band
-from jaxphoto.adjustment.normal import At, Reduced, each_tile_of, squares, total, unwhiten, whiten, with_others
+from jaxphoto.adjustment.normal import At, Reduced, each_tile_of, squares, unwhiten, whiten, with_others
 from jaxphoto.adjustment.reduced import other_rows, tile_numbers, tile_parts
-from jaxphoto.adjustment.residuals import Increments, other_residuals, state_at
-from jaxphoto.adjustment.structure import Structure
+from jaxphoto.adjustment.residuals import Increments, Residuals, other_residuals, state_at
+from jaxphoto.adjustment.structure import Structure, total
 from jaxphoto.adjustment.tiles import (
     Scene,
     by_point,
@@ -134,8 +134,7 @@ def gradient(at: At, reduced: Reduced, there: At):
     """
     increments, scale, values, s = at
     tiles = s.in_tiles
-    others, pull_others = jax.vjp(lambda y: other_residuals(y, scale, values, s), increments)
-    b_others = pull_others(others)[0]
+    others, b_others = _others_and_gradient(at)
     scene, pull_scene = _scene_and_pull(at)
     points = values.points + increments.points * scale.points
 
@@ -151,6 +150,23 @@ def gradient(at: At, reduced: Reduced, there: At):
     eop, shared = pull_scene(total(_by_image(to_scene, scene, s), s))
     b = Increments(eop + b_others.eop, shared + b_others.shared, by_point(b))
     return b, *reduce_right(reduced, b, there), with_others(jnp.sum(square), others, s)
+
+
+def _others_and_gradient(at: At) -> tuple[Residuals, Increments]:
+    """All but the image rows, and their part of b."""
+    increments, scale, values, s = at
+    others, pull = jax.vjp(lambda y: other_residuals(y, scale, values, s), increments)
+    nothing = jax.tree.map(jnp.zeros_like, others)
+    b = pull(others._replace(surfaces=nothing.surfaces, datum=nothing.datum))[0]
+    if others.surfaces.size:
+        # These alone are dealt out with their points and meet shared unknowns, which are on every device.
+        of_surfaces = pull(nothing._replace(surfaces=others.surfaces))[0]
+        of_surfaces = of_surfaces._replace(shared=total(of_surfaces.shared, s))
+        b = jax.tree.map(jnp.add, b, of_surfaces)
+    # The constraints of the datum go over all points.
+    eop = jnp.einsum("kci,k->ci", values.datum_eop * scale.eop, others.datum)
+    points = jnp.einsum("kcp,k->cp", values.datum_points * scale.points, others.datum)
+    return others, b._replace(eop=b.eop + eop, points=b.points + points)
 
 
 def _scene_and_pull(at: At):

@@ -24,11 +24,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Scalar
 
 from jaxphoto.adjustment.residuals import Increments, Residuals, Values, other_residuals, state_at
-from jaxphoto.adjustment.structure import Structure
+from jaxphoto.adjustment.structure import Structure, total
 from jaxphoto.adjustment.tiles import Pair, by_tile, each_tile, of_images, rows, scene_of, seen_in
-
-AXIS = "tiles"
-"""Mesh axis along which tiles and their points are dealt out to devices."""
 
 
 class At(NamedTuple):
@@ -60,11 +57,6 @@ class Reduced(NamedTuple):
     weight: Increments
     """The diagonal of N, without damping and D'D: what a unit of damping adds."""
     damping: Scalar
-
-
-def total(x, s: Structure):
-    """The sum over all devices."""
-    return jax.lax.psum(x, AXIS) if s.tiles is not None and s.tiles.shards > 1 else x
 
 
 def norm2(x: Increments, weight: Increments, s: Structure) -> Float[Array, ""]:

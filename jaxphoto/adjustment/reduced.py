@@ -15,9 +15,9 @@ from jaxtyping import Array, Float
 
 from jaxphoto.adjustment.band import Band, diagonal_of
 from jaxphoto.adjustment.colouring import Jacobian, jacobian_blocks
-from jaxphoto.adjustment.normal import At, Reduced, cholesky_3x3, total, whiten
+from jaxphoto.adjustment.normal import At, Reduced, cholesky_3x3, whiten
 from jaxphoto.adjustment.residuals import Increments, Residuals, other_residuals
-from jaxphoto.adjustment.structure import Structure
+from jaxphoto.adjustment.structure import Structure, total
 from jaxphoto.adjustment.tiles import (
     Columns,
     by_point,

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxphoto.adjustment.shared import MOUNT_SIZE, STRIP_SIZE
-from jaxphoto.adjustment.structure import Structure
+from jaxphoto.adjustment.structure import Structure, total
 from jaxphoto.georeferencing import (
     Exposure,
     Mount,
@@ -131,7 +131,7 @@ def other_residuals(increments: Increments, scale: Increments, values: Values, s
         surface_residuals(state, values, structure) / values.sigma_surfaces,
         distances / values.sigma_distances,
         priors,
-        datum_residuals(increments, scale, values),
+        datum_residuals(increments, scale, values, structure),
     )
 
 
@@ -148,10 +148,13 @@ def surface_residuals(state: State, values: Values, structure: Structure) -> Flo
     return -(sum((n * a for n, a in zip(v.normal, apart, strict=True)), jnp.zeros(())) + rise)
 
 
-def datum_residuals(increments: Increments, scale: Increments, values: Values) -> Float[Array, "constraints"]:
+def datum_residuals(
+    increments: Increments, scale: Increments, values: Values, structure: Structure
+) -> Float[Array, "constraints"]:
     """By how much the constraints of the datum are violated."""
     eop = jnp.einsum("kci,ci->k", values.datum_eop * scale.eop, increments.eop)
-    return eop + jnp.einsum("kcp,cp->k", values.datum_points * scale.points, increments.points)
+    points = jnp.einsum("kcp,cp->k", values.datum_points * scale.points, increments.points)
+    return eop + total(points, structure)
 
 
 def georeferencing_residuals(state: State, values: Values, structure: Structure) -> tuple[Array, ...]:

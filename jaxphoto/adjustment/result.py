@@ -3,6 +3,7 @@
 import enum
 
 import equinox as eqx
+import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
 
@@ -12,8 +13,9 @@ from jaxphoto.adjustment.optimum import typical_scale, weigh_datum, zero_increme
 from jaxphoto.adjustment.padding import Places
 from jaxphoto.adjustment.reduced import reduce_normal
 from jaxphoto.adjustment.residuals import GROUPS, Increments, Residuals, Values
+from jaxphoto.adjustment.shards import on_one_device
 from jaxphoto.adjustment.structure import Structure
-from jaxphoto.arrays import Numbers
+from jaxphoto.arrays import Numbers, still
 from jaxphoto.block import Block
 from jaxphoto.compiling import call_compiled
 from jaxphoto.unknowns import Unknowns
@@ -50,6 +52,12 @@ class Padded(eqx.Module):
     values: Values
     factored: Factored
     places: Places
+
+    @property
+    def on_one_device(self) -> "Padded":
+        """The same for programs that no other device has a part in."""
+        values, factored = jax.tree.map(still, (self.values, self.factored))
+        return Padded(on_one_device(self.structure), values, factored, self.places)
 
 
 class Unfactored(eqx.Module):

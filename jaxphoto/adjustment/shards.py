@@ -14,8 +14,8 @@ import numpy as np
 from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
 
-from jaxphoto.adjustment.normal import AXIS
-from jaxphoto.adjustment.structure import Structure
+from jaxphoto.adjustment.structure import AXIS, Structure
+from jaxphoto.arrays import still
 
 EVERYWHERE: Any = P()
 TILES: Any = P(AXIS)
@@ -82,6 +82,11 @@ def _spec(path: tuple[Any, ...], array: Any) -> P:
     if name in _OF_TILES or (name == "image" and array.ndim >= 3):
         return TILES
     return along_points(array.ndim) if name in _OF_POINTS else EVERYWHERE
+
+
+def gathered(tree: Any) -> Any:
+    """What a program gave on several devices, as the next one expects it; what several processes hold stays there."""
+    return tree if jax.process_count() > 1 else jax.tree.map(still, tree)
 
 
 def on_one_device(s: Structure) -> Structure:

@@ -6,6 +6,7 @@ from jaxtyping import Array, Float
 
 from jaxphoto.adjustment.normal import At
 from jaxphoto.adjustment.residuals import Increments, Values, datum_residuals
+from jaxphoto.adjustment.structure import Structure, total
 from jaxphoto.rotation import small_angles, small_rotation
 
 # Newton's method on so few unknowns, begun so near, doubles the right digits with each of these.
@@ -60,9 +61,9 @@ def onto_datum(at: At) -> Increments:
     Newton's method finds it from the one that brings the points nearest to their start (Umeyama 1991); where it does
     not, the increments stay as they are.
     """
-    y, scale, values, _ = at
+    y, scale, values, s = at
     k = open_motions(values)
-    centre, size = _extent(values)
+    centre, size = _extent(values, s)
 
     def moved(y: Increments, parameters: Float[Array, "k"]) -> Increments:
         state = At(y, *at[1:]).state
@@ -75,27 +76,28 @@ def onto_datum(at: At) -> Increments:
         return Increments(eop, y.shared, _scaled(points - values.points, scale.points))
 
     def newton(_, y: Increments) -> Increments:
-        violation = lambda parameters: datum_residuals(moved(y, parameters), scale, values)  # noqa: E731
+        violation = lambda parameters: datum_residuals(moved(y, parameters), scale, values, s)  # noqa: E731
         zero = jnp.zeros(k)
         return moved(y, -jnp.linalg.solve(jax.jacfwd(violation)(zero), violation(zero)))
 
-    begin = moved(y, _nearest(at.state.points, values.points, scale.points[0] > 0, centre, size)[:k])
+    begin = moved(y, _nearest(at.state.points, values.points, scale.points[0] > 0, centre, size, s)[:k])
     found = jax.lax.fori_loop(0, _NEWTON_STEPS, newton, begin)
-    finite = jnp.all(jnp.isfinite(found.eop)) & jnp.all(jnp.isfinite(found.points))
+    finite = jnp.all(jnp.isfinite(found.eop)) & (total(jnp.sum(~jnp.isfinite(found.points)), s) == 0)
     return jax.tree.map(lambda new, old: jnp.where(finite, new, old), found, y)
 
 
-def along_motions(values: Values, scale: Increments) -> Increments:
+def along_motions(values: Values, scale: Increments, s: Structure) -> Increments:
     """Scaled increments along each of the `open_motions` (leading axis), which nothing but the datum sees."""
     k, shared = open_motions(values), scale.shared
-    eop, points = motions(values.position, values.rotation, values.points, *_extent(values))
+    eop, points = motions(values.position, values.rotation, values.points, *_extent(values, s))
     return Increments(_scaled(eop[:k], scale.eop), jnp.zeros((k, *shared.shape)), _scaled(points[:k], scale.points))
 
 
-def _extent(values: Values) -> tuple[Float[Array, "3"], Float[Array, ""]]:
+def _extent(values: Values, s: Structure) -> tuple[Float[Array, "3"], Float[Array, ""]]:
     """Centre and size (m) of the points."""
-    centre = values.points.mean(axis=1)
-    return centre, jnp.sqrt(jnp.mean(jnp.sum((values.points - centre[:, None]) ** 2, axis=0)))
+    mean = lambda v: total(jnp.sum(v, axis=-1), s) / s.n_points  # noqa: E731
+    centre = mean(values.points)
+    return centre, jnp.sqrt(mean(jnp.sum((values.points - centre[:, None]) ** 2, axis=0)))
 
 
 def _scaled(v, scale):
@@ -103,14 +105,14 @@ def _scaled(v, scale):
     return jnp.where(scale > 0, v / jnp.where(scale > 0, scale, 1.0), 0.0)
 
 
-def _nearest(points, start, own, centre, size) -> Float[Array, "7"]:
+def _nearest(points, start, own, centre, size, s: Structure) -> Float[Array, "7"]:
     """Parameters of the similarity that takes `points` nearest to `start`; only `own` points count."""
-    weight = own / jnp.sum(own)
-    mean, target = points @ weight, start @ weight
+    weight = own / total(jnp.sum(own), s)
+    mean, target = total((points @ weight, start @ weight), s)
     a, b = points - mean[:, None], start - target[:, None]
-    u, d, vt = jnp.linalg.svd((b * weight) @ a.T)
+    u, d, vt = jnp.linalg.svd(total((b * weight) @ a.T, s))
     sign = jnp.array([1.0, 1.0, 0.0]) + jnp.array([0.0, 0.0, 1.0]) * jnp.linalg.det(u @ vt)
     turn = (u * sign) @ vt
-    scale = jnp.sum(d * sign) / jnp.sum(weight * a * a)
+    scale = jnp.sum(d * sign) / total(jnp.sum(weight * a * a), s)
     shift = (target - centre - scale * turn @ (mean - centre)) / size
     return jnp.concatenate([shift, small_angles(turn), scale[None] - 1])

@@ -26,6 +26,9 @@ from jaxphoto.camera import InteriorOrientation
 from jaxphoto.georeferencing import Corrections
 from jaxphoto.unknowns import FIXED, Unknowns, Weighted
 
+AXIS = "tiles"
+"""Mesh axis along which tiles and their points are dealt out to devices."""
+
 
 class CameraGroup(eqx.Module):
     """Cameras of one model: their parameters are rows of one table, so one `vmap` serves them all."""
@@ -138,6 +141,11 @@ class Structure(eqx.Module):
     def n_shared(self) -> int:
         """Number of shared unknowns."""
         return len(self.free)
+
+
+def total(x, s: Structure):
+    """The sum over all devices."""
+    return jax.lax.psum(x, AXIS) if s.tiles is not None and s.tiles.shards > 1 else x
 
 
 def interior_of(group: CameraGroup, table) -> InteriorOrientation:

@@ -6,6 +6,7 @@ no list of rows, only the M numbers of its images. Images are numbered so that t
 Cuthill-McKee), which makes the reduced normal matrix a band and lets points in the order of their images fill tiles.
 """
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -130,7 +131,7 @@ def tile_points(image: np.ndarray, point: np.ndarray, n_points: int, m: int, p: 
 _SORTED_BY = 16
 
 
-def _orders(image: np.ndarray, point: np.ndarray, n_points: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
+def _orders(image: np.ndarray, point: np.ndarray, n_points: int) -> tuple[list[np.ndarray], list[list[int]]]:
     """Two orders of the points, and each point's images.
 
     By first image, last image and mean image; and by first image, second image, and so on, which is better where
@@ -149,20 +150,21 @@ def _orders(image: np.ndarray, point: np.ndarray, n_points: int) -> tuple[list[n
     near = rank < _SORTED_BY
     each = np.full((_SORTED_BY, n_points), np.iinfo(np.int32).max, np.int32)
     each[rank[near], point[near]] = image[np.lexsort((image, point))][near]
-    return [np.lexsort((mean, high, low)), np.lexsort(each[::-1])], np.split(image, first[1:-1])
+    places = image.tolist()
+    return [np.lexsort((mean, high, low)), np.lexsort(each[::-1])], [places[a:b] for a, b in pairwise(first.tolist())]
 
 
-def _best_cut(orders: list[np.ndarray], images: list[np.ndarray], m: int, p: int):
+def _best_cut(orders: list[np.ndarray], images: list[list[int]], m: int, p: int):
     """The order that makes fewest tiles, and these."""
     return min(((order, _cut(order, images, m, p)) for order in orders), key=lambda cut: len(cut[1]))
 
 
-def _cut(order: np.ndarray, images: list[np.ndarray], m: int, p: int) -> list[tuple[list[int], int, int]]:
+def _cut(order: np.ndarray, images: list[list[int]], m: int, p: int) -> list[tuple[list[int], int, int]]:
     """Cut points in their order into tiles: (images, first, last + 1)."""
     tiles, start = [], 0
     members: set[int] = set()
-    for k, j in enumerate(order):
-        own = images[j].tolist()
+    for k, j in enumerate(order.tolist()):
+        own = images[j]
         union = members.union(own)
         if k > start and (len(union) > m or k - start == p):
             tiles.append((sorted(members), start, k))

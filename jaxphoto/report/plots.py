@@ -66,18 +66,26 @@ def layout_figure(tables: Tables) -> Figure:
     return figure
 
 
+# More arrows than the first hide one another and take seconds to draw; among them are the largest ones.
+_ARROWS, _LARGEST = 4000, 100
+
+
 def residuals_figure(tables: Tables, camera: str) -> Figure:
-    """Residual vectors of one camera's image points over its format, all images together."""
+    """Residual vectors of one camera's image points over its format, all images together; of many, a part."""
     a = tables.adjusted
     mine = np.array([c == camera for c in a.block.image_camera])[a.structure.image]
     xy, v = np.asarray(a.values.xy)[:, mine], (np.asarray(a.residuals.image) * np.asarray(a.values.sigma_xy))[:, mine]
     sensor = a.block.sensors[camera]
     figure, ((axes,),) = _panels(6.4, 5.0)
-    key = _round_key(v)
+    key, title = _round_key(v), f"image residuals of camera {camera}"
+    if (n := v.shape[1]) > _ARROWS:
+        one_in = -(-n // _ARROWS)
+        shown = np.union1d(np.arange(0, n, one_in), np.argsort(np.hypot(*v))[-_LARGEST:])
+        xy, v, title = xy[:, shown], v[:, shown], f"{title}: 1 in {one_in}, and the largest {_LARGEST}"
     _vectors(axes, xy, v, key, 0.06 * sensor.width_mm, f"{1000 * key:g} µm", width=0.0015, above=0.03)
     w, h = sensor.width_mm / 2, sensor.height_mm / 2
     axes.plot([-w, w, w, -w, -w], [-h, -h, h, h, -h], color="0.4", lw=0.8)
-    axes.set(xlabel="x [mm]", ylabel="y [mm]", title=f"image residuals of camera {camera}")
+    axes.set(xlabel="x [mm]", ylabel="y [mm]", title=title)
     axes.set_aspect("equal")
     return figure
 

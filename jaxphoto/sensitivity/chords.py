@@ -17,11 +17,12 @@ from jax.sharding import PartitionSpec as P
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxphoto.adjustment.elimination import solve_factored
-from jaxphoto.adjustment.normal import AXIS, At
+from jaxphoto.adjustment.normal import At
 from jaxphoto.adjustment.optimum import weigh_datum
 from jaxphoto.adjustment.residuals import Increments, State
 from jaxphoto.adjustment.result import Factored
 from jaxphoto.adjustment.shards import mesh_of
+from jaxphoto.adjustment.structure import AXIS
 from jaxphoto.sensitivity.many import Common, Varying, image_gradients, other_gradients, states
 
 TOLERANCE = 1e-6

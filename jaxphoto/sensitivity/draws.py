@@ -19,8 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxphoto.adjustment import Adjustment, solve
 from jaxphoto.adjustment.padding import crop_state, pad_values
 from jaxphoto.adjustment.residuals import State, Values
-from jaxphoto.adjustment.result import Padded
-from jaxphoto.adjustment.shards import on_one_device, usable
+from jaxphoto.adjustment.shards import usable
 from jaxphoto.adjustment.values import values_of, with_datum
 from jaxphoto.arrays import still
 from jaxphoto.block import Block, Start
@@ -125,9 +124,7 @@ class Readjustment:
     ):
         if not bool(adjusted.converged):
             raise InputError(f"draws begin at the optimum of the block as it is, which is {adjusted.outcome.value}")
-        own = adjusted.computed
-        values, factored = jax.tree.map(still, (own.values, own.factored))
-        padded = Padded(on_one_device(own.structure), values, factored, own.places)
+        padded = adjusted.computed.on_one_device
         self.adjusted = dataclasses.replace(adjusted, padded=padded)
         self.change, self.exterior, self.points = change, exterior, points
         self.seconds = {"compile": 0.0}

@@ -146,12 +146,7 @@ def posterior(
             raise InputError(f"{name} is {least} at least, got {number}: ask for more")
     if not bool(adjusted.converged):
         raise InputError(f"there is no optimum to sample about; {adjusted.outcome.value}")
-    padded = adjusted.computed
-    if padded.structure.in_tiles.shards > 1:
-        raise InputError(
-            "the block was adjusted on several devices, but the posterior is sampled on one: set XLA_FLAGS="
-            "--xla_force_host_platform_device_count=1 before Python starts, and adjust again"
-        )
+    padded = adjusted.computed.on_one_device
     chosen = _places(adjusted, parameters)
     free = np.flatnonzero(_flat(jax.tree.map(np.asarray, padded.factored.scale), np))
     given = padded.values, padded.factored, padded.structure, chosen

@@ -30,7 +30,7 @@ from jaxphoto.adjustment.padding import crop_reduced
 from jaxphoto.adjustment.reduced import other_rows, tile_columns
 from jaxphoto.adjustment.residuals import Increments, Values
 from jaxphoto.adjustment.result import Factored, Padded
-from jaxphoto.adjustment.shards import TILES, along_points, sharded
+from jaxphoto.adjustment.shards import TILES, along_points, gathered, on_one_device, sharded
 from jaxphoto.adjustment.similarity import along_motions, open_motions
 from jaxphoto.adjustment.structure import Structure
 from jaxphoto.adjustment.tiles import by_point, by_tile
@@ -144,7 +144,8 @@ def row_cofactors(adjusted: Adjustment, rotations: Rotations) -> RowCofactors:
 
 
 def _run(adjusted: Adjustment, rotations: Rotations, of_rows: bool):
-    return run_compiled(_covariance, _given(adjusted.computed, rotations, of_rows), adjusted.seconds, "covariance")
+    given = _given(adjusted.computed, rotations, of_rows)
+    return gathered(run_compiled(_covariance, given, adjusted.seconds, "covariance"))
 
 
 def _given(padded: Padded, rotations: Rotations, of_rows: bool) -> tuple:
@@ -276,7 +277,7 @@ def _without_open_motions(q: Cofactors, values: Values, factored: Factored, s: S
     rows = Increments(values.datum_eop * scale.eop, jnp.zeros((defect, s.n_shared)), values.datum_points * scale.points)
     if open_motions(values):
         # The motions are known: E = M (D M)^-1.
-        m = along_motions(values, scale)
+        m = along_motions(values, scale, on_one_device(s))
         met = jnp.einsum("kci,jci->kj", rows.eop, m.eop) + jnp.einsum("kcp,jcp->kj", rows.points, m.points)
         e = jax.tree.map(lambda v: jnp.tensordot(jnp.linalg.inv(met), v, (0, 0)), m)
     else:

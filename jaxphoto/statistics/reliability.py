@@ -17,6 +17,7 @@ from jaxphoto.adjustment.padding import crop_residuals
 from jaxphoto.adjustment.reduced import other_rows
 from jaxphoto.adjustment.residuals import Residuals, Values
 from jaxphoto.adjustment.result import Factored, Padded
+from jaxphoto.adjustment.shards import on_one_device
 from jaxphoto.adjustment.structure import Structure
 from jaxphoto.compiling import prepare, run_compiled
 from jaxphoto.statistics.covariance import Cofactors, Covariance, RowCofactors, prepare_covariance, row_cofactors
@@ -29,8 +30,8 @@ _UNCHECKED = 1e-6
 
 def prepare_statistics(padded: Padded, seconds: dict[str, float]) -> None:
     """Have what `covariance` and `redundancy_numbers` need compiled in the background; see `solve`."""
-    if padded.structure.in_tiles.shards > 1:
-        # What comes from several devices is of types of its own.
+    if jax.process_count() > 1:
+        # What comes from several processes is of types of its own.
         return
     prepare_covariance(padded, seconds)
     s, n = padded.structure, 6 * padded.structure.n_images + padded.structure.n_shared
@@ -65,7 +66,7 @@ def normalised_residuals(adjusted: Adjustment, redundancy: Residuals) -> Residua
 
 @eqx.filter_jit
 def _redundancy(values: Values, q: Cofactors, of_rows: RowCofactors, factored: Factored, s: Structure) -> Residuals:
-    scale = factored.scale
+    scale, s = factored.scale, on_one_device(s)
     at = At(jax.tree.map(jnp.zeros_like, scale), scale, weigh_datum(values, s), s)
     rest = other_rows(at)
     j, n = rest.blocks, 6 * s.n_images

@@ -3,6 +3,7 @@
 Devices and processes are set up before JAX computes, so what is compared runs in processes of its own: `main`.
 """
 
+import functools
 import os
 import socket
 import subprocess
@@ -19,11 +20,16 @@ import jaxphoto
 from jaxphoto.adjustment import Adjustment, adjust
 from jaxphoto.adjustment.shards import mesh_of, usable
 from jaxphoto.statistics.reliability import redundancy_numbers
-from tests.blocks import adjusted, simulated
+from tests.blocks import free_network, from_afar, simulated
 
 ROOT = Path(__file__).resolve().parents[2]
-# One block for all: what one device makes of it serves each comparison.
-BLOCK = "two_cameras"
+BLOCKS = {
+    "two_cameras": lambda: simulated("two_cameras").block,
+    # Surfaces meet shared unknowns.
+    "surfaces": lambda: simulated("surfaces").block,
+    # The constraints of the datum go over all points, and what it ends at is brought to them as a whole.
+    "afar": lambda: from_afar(network := free_network(), network.start.unknowns),
+}
 # Compiling takes most of it (seconds); what is much slower hangs.
 PATIENCE = 300
 ADDRESS, PROCESS = "JAXPHOTO_TEST_ADDRESS", "JAXPHOTO_TEST_PROCESS"
@@ -50,25 +56,31 @@ def numbers_of(result: Adjustment) -> dict[str, np.ndarray]:
     return {name: np.asarray(values) for name, values in found.items()}
 
 
-def main(shards: str, folder: str) -> None:
-    """Adjust the block on each of several numbers of devices, after joining other processes if there are any."""
+@functools.cache
+def on_one_device(name: str) -> dict[str, np.ndarray]:
+    block = BLOCKS[name]()
+    return numbers_of(jaxphoto.adjust(block, block.start.unknowns))
+
+
+def main(cases: str, folder: str) -> None:
+    """Adjust blocks on numbers of devices (name:number,...), after joining other processes if there are any."""
     process = int(os.environ.get(PROCESS, "0"))
     if ADDRESS in os.environ:
         jax.distributed.initialize(os.environ[ADDRESS], num_processes=2, process_id=process, initialization_timeout=60)
-    block = simulated(BLOCK).block
-    for n in map(int, shards.split(",")):
+    for name, n in (case.split(":") for case in cases.split(",")):
+        block = BLOCKS[name]()
         # So small a block would be left to one device.
-        with mock.patch.object(adjust, "_devices_worth_using", lambda rows, n=n: usable(n)):
+        with mock.patch.object(adjust, "_devices_worth_using", lambda rows, n=n: usable(int(n))):
             result = jaxphoto.adjust(block, block.start.unknowns)
         assert result.outcome is jaxphoto.Outcome.CONVERGED
         held = result.computed.structure.in_tiles.shards
-        np.savez(Path(folder) / f"{n}_{process}.npz", shards=held, **numbers_of(result))
+        np.savez(Path(folder) / f"{name}_{n}_{process}.npz", shards=held, **numbers_of(result))
 
 
-def run_all(shards: str, folder: Path, devices: int, environments: list[dict[str, str]]) -> None:
+def run_all(cases: str, folder: Path, devices: int, environments: list[dict[str, str]]) -> None:
     """`main` in a process of `devices` devices for each of `environments`, to the end; what they say if one fails."""
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={devices}"
-    command = [sys.executable, "-m", "tests.adjustment.test_shards", shards, str(folder)]
+    command = [sys.executable, "-m", "tests.adjustment.test_shards", cases, str(folder)]
     logs = [folder / f"{k}.log" for k in range(len(environments))]
     processes = []
     try:
@@ -89,9 +101,9 @@ def run_all(shards: str, folder: Path, devices: int, environments: list[dict[str
     assert not any(codes), f"exit codes {codes}\n" + "\n\n".join(log.read_text() for log in logs)
 
 
-def assert_same(found: dict[str, np.ndarray]) -> None:
+def assert_same(found: dict[str, np.ndarray], name: str) -> None:
     """The same adjustment as on one device, but for rounding."""
-    wanted = numbers_of(adjusted(BLOCK))
+    wanted = on_one_device(name)
     assert found.keys() == wanted.keys() | {"shards"}
     for key, values in wanted.items():
         size = np.abs(values).max(initial=0.0)
@@ -103,15 +115,18 @@ def assert_same(found: dict[str, np.ndarray]) -> None:
 @pytest.fixture(scope="module")
 def on_three_devices(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("devices")
-    run_all("2,3", folder, 3, [{}])
+    run_all(",".join(f"{name}:{shards}" for name, shards in CASES), folder, 3, [{}])
     return folder
 
 
-@pytest.mark.parametrize("shards", [2, 3])
-def test_several_devices_find_the_same(on_three_devices: Path, shards: int) -> None:
-    found = dict(np.load(on_three_devices / f"{shards}_0.npz"))
+CASES = [("two_cameras", 2), ("two_cameras", 3), ("surfaces", 2), ("afar", 3)]
+
+
+@pytest.mark.parametrize(("name", "shards"), CASES)
+def test_several_devices_find_the_same(on_three_devices: Path, name: str, shards: int) -> None:
+    found = dict(np.load(on_three_devices / f"{name}_{shards}_0.npz"))
     assert found["shards"] == shards
-    assert_same(found)
+    assert_same(found, name)
 
 
 @pytest.mark.slow
@@ -120,11 +135,11 @@ def test_two_processes_find_the_same(tmp_path: Path) -> None:
         free.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{free.getsockname()[1]}"
     # Of three devices wanted, two can be equally many of each process.
-    run_all("3", tmp_path, 2, [{ADDRESS: address, PROCESS: str(k)} for k in range(2)])
+    run_all("two_cameras:3", tmp_path, 2, [{ADDRESS: address, PROCESS: str(k)} for k in range(2)])
     for process in range(2):
-        found = dict(np.load(tmp_path / f"3_{process}.npz"))
+        found = dict(np.load(tmp_path / f"two_cameras_3_{process}.npz"))
         assert found["shards"] == 2
-        assert_same(found)
+        assert_same(found, "two_cameras")
 
 
 class Device:

@@ -1,9 +1,5 @@
 """Free networks: brought to their datum as a whole, and found from starts that are far off."""
 
-import dataclasses
-
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -12,19 +8,12 @@ from jaxphoto import adjust
 from jaxphoto.adjustment.normal import At, residuals_at
 from jaxphoto.adjustment.optimum import unit_scale, zero_increments
 from jaxphoto.adjustment.similarity import onto_datum, open_motions
-from jaxphoto.block import Datum, Distances, Rows
+from jaxphoto.block import Distances
 from jaxphoto.rotation import small_rotation
 from tests.adjustment.dense import prepared
-from tests.blocks import BROWN, aerial, bare, measured, simulated
+from tests.blocks import free_network, from_afar, simulated
 
-BARE = bare(aerial(), {"one": BROWN}, ("one",) * 10)
 BAR = Distances(np.array([[3, 37]]), np.zeros(1), np.array([0.01]))
-
-
-def free_network(kind: str, distances=None):
-    """The aerial block with image points alone, and perhaps a bar."""
-    own = {"stations": Rows.none(), "datum": Datum(kind), "distances": distances or Distances.none()}
-    return measured(BARE._replace(block=dataclasses.replace(BARE.block, **own))).block
 
 
 @pytest.mark.parametrize("kind", ["inner", "minimal"])
@@ -71,15 +60,9 @@ def test_a_free_network_is_found_from_afar():
     """Steps are rejected from there: the path goes on without the datum, and its end is brought to it."""
     block = free_network("inner")
     near = adjust(block)
-    rng, known = np.random.default_rng(1), near.unknowns
-    turn = np.asarray(jax.jit(jax.vmap(small_rotation))(rng.normal(0, 0.3, (len(block.images), 3))))
-    exterior = dataclasses.replace(
-        known.exterior,
-        position=known.exterior.position + rng.normal(0, 120.0, (len(block.images), 3)),
-        camera_from_object=turn @ known.exterior.camera_from_object,
-    )
-    points = known.points + rng.normal(0, 60.0, known.points.shape)
-    far = adjust(block, eqx.tree_at(lambda u: (u.exterior, u.points), known, (exterior, points)))
+    afar = from_afar(block, near.unknowns)
+    points = afar.start.unknowns.points
+    far = adjust(afar, afar.start.unknowns)
     assert bool(far.converged)
     # 20 with the constraints held all along, 12 as it is.
     assert int(far.steps) < 16

@@ -4,7 +4,7 @@ import numpy as np
 from matplotlib.quiver import Quiver, QuiverKey
 
 from jaxphoto import Tables
-from jaxphoto.report import check_points_figure
+from jaxphoto.report import check_points_figure, plots
 from tests.blocks import adjusted
 
 
@@ -40,3 +40,18 @@ def test_points_checked_in_plan_only_have_no_height():
     plan, height = check_points_figure({"": tables}).axes
     assert len(arrows(plan).U) == len(table)
     assert len(arrows(height).U) == 0
+
+
+def test_of_many_residuals_a_part_is_drawn_and_the_largest(monkeypatch):
+    tables = Tables(adjusted("cross"))
+    (whole,) = plots.residuals_figure(tables, "one").axes
+    n = len(tables.adjusted.block.image_points.xy)
+    assert len(arrows(whole).U) == n and "1 in" not in whole.get_title()
+    monkeypatch.setattr(plots, "_ARROWS", n // 4)
+    monkeypatch.setattr(plots, "_LARGEST", 3)
+    (part,) = plots.residuals_figure(tables, "one").axes
+    assert n // 5 <= len(arrows(part).U) <= n // 4 + 3
+    assert "1 in 5" in part.get_title() or "1 in 4" in part.get_title()
+    size = lambda axes: np.sort(np.hypot(arrows(axes).U, arrows(axes).V))  # noqa: E731
+    np.testing.assert_allclose(size(part)[-3:], size(whole)[-3:])
+    assert arrows(part).scale == arrows(whole).scale
