@@ -84,5 +84,5 @@ def test_poses_are_those_of_colmap(oriented, folder, tmp_path):
         f"turned by {np.degrees(alike.magnitude()):.2f} degrees together, {angle.max():.2f} at most besides"
     )
     assert off.max() < 0.01 * path
-    # COLMAP's c is a tenth shorter: an image whose points lie on one side, 200 pixels away, makes up for it by 1.4 degrees.
+    # Their c is a tenth shorter: an image with its points 200 pixels to one side makes up for that by 1.4 degrees.
     assert np.median(angle) < 0.7 and angle.max() < 3
