@@ -78,10 +78,11 @@ def _correlated(camera: str, c: Correlations, explained: frozenset[tuple[str, st
 
 def _large_residuals(tables: Tables) -> list[str]:
     residuals = tables.residuals
-    checked = residuals[(residuals["group"] == "image_points") & (residuals["redundancy_number"] > LEAST_CHECKED)]
+    checked = (residuals["group"] == "image_points") & (residuals["redundancy_number"] > LEAST_CHECKED)
+    found = residuals[checked & (residuals["w"].abs() > LARGE_W)]
     # A point in an image is one blunder, whichever of its coordinates shows it.
-    size = checked["w"].abs().groupby([checked["point"], checked["image"]], sort=False).max()
-    large = size[size > LARGE_W].sort_values(ascending=False)
+    size = found["w"].abs().groupby([found["point"], found["image"]], sort=False).max()
+    large = size.sort_values(ascending=False)
     if not len(large):
         return []
     shown = large.head(_SHOWN)
