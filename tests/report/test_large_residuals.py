@@ -1,0 +1,29 @@
+"""A blunder is named once, whichever of its coordinates shows it."""
+
+import dataclasses
+
+import numpy as np
+
+from jaxphoto import Tables, adjust
+from jaxphoto.report import warnings_of
+from tests.blocks import adjusted, simulated
+
+
+def large(warnings):
+    return [w for w in warnings if "look for blunders" in w]
+
+
+def test_blunders_are_named_the_largest_first():
+    assert not large(warnings_of(Tables(adjusted("cross"))))
+    block = simulated("cross").block
+    rows, xy = block.image_points, np.array(block.image_points.xy)
+    of_point = np.bincount(rows.point)
+    # In points of many rays, else their other rays look as bad.
+    first, second = (int(np.flatnonzero(rows.point == p)[2]) for p in np.argsort(-of_point, kind="stable")[:2])
+    xy[first] += 0.08
+    xy[second] -= [0.0, 0.05]
+    spoilt = dataclasses.replace(block, image_points=dataclasses.replace(rows, xy=xy))
+    (found,) = large(warnings_of(Tables(adjust(spoilt))))
+    names = [f"point {block.points[rows.point[k]]} in image {block.images[rows.image[k]]}" for k in (first, second)]
+    assert found.startswith("2 image points have residuals over 4")
+    assert 0 < found.index(names[0]) < found.index(names[1])
