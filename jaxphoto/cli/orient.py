@@ -42,7 +42,7 @@ def orient_command(
     """Orient photographs to one another from their features alone, for `jaxphoto adjust` to calibrate the camera.
 
     Given a block folder, find the approximate orientation that its images.csv lacks. Exit code 1: written, but not
-    converged.
+    converged or not settled.
     """
     check_block_target(out, *images)
     console, errors = Console(), Console(stderr=True)

@@ -34,6 +34,8 @@ _WIDTH_INCHES = 6.4
 # Of the width of the picture: how long the arrow of a typical residual is drawn.
 _ARROW = 0.03
 _SHOWN = 4
+# What adds so many times the measurement's standard deviation deserves a look.
+_MISFIT = 2.0
 # Characters of a line of a title.
 _LINE = 80
 
@@ -105,17 +107,20 @@ def findings(calibration: Calibration) -> list[str]:
     if calibration.left_out:
         some = [f"{name} ({reason})" for name, reason in list(calibration.left_out.items())[:_SHOWN]]
         more = ", ..." if len(calibration.left_out) > _SHOWN else ""
-        found.append(f"{len(calibration.left_out)} photographs are not used: {', '.join(some)}{more}")
+        n = len(calibration.left_out)
+        found.append(f"{n} photograph{'s are' if n > 1 else ' is'} not used: {', '.join(some)}{more}")
     if calibration.removed:
         some = [f"{point} in {image}" for image, point in calibration.removed[:_SHOWN]]
         more = ", ..." if len(calibration.removed) > _SHOWN else ""
-        found.append(f"{len(calibration.removed)} image points were blunders and are not used: {', '.join(some)}{more}")
+        n = len(calibration.removed)
+        count = "1 image point is" if n == 1 else f"{n} image points are"
+        found.append(f"{count} off by over five times what is usual here and not used: {', '.join(some)}{more}")
     measured = float(np.median(calibration.measured.sigma_mm)) / calibration.sensor.pixel_mm
-    if calibration.added_sigma_px > measured:
+    if calibration.added_sigma_px > _MISFIT * measured:
         found.append(
-            f"the targets are measured to {measured:.3f} px, but fit to {calibration.added_sigma_px:.3f} px only: "
-            "look at the residuals of the photographs for a board that is not flat (--board-sigma-mm lets the "
-            "adjustment find its shape), a rolling shutter or a model too simple"
+            f"the targets are measured to {measured:.3f} px, but fit to {calibration.added_sigma_px:.3f} px only, "
+            "an axis: look at the residuals of the photographs for a board that is not flat (--board-sigma-mm lets "
+            "the adjustment find its shape), a rolling shutter or a model too simple"
         )
     return found
 

@@ -5,6 +5,7 @@ import jax
 import numpy as np
 
 from jaxphoto.adjustment import Adjustment
+from jaxphoto.block import Block
 from jaxphoto.camera import Sensor
 from jaxphoto.compiling import call_compiled
 from jaxphoto.report.tables import Tables
@@ -25,7 +26,7 @@ def warnings_of(tables: Tables) -> list[str]:
     for camera, c in tables.correlations.items():
         weak = weaknesses(tables, camera, c)
         found += [w.sentence for w in weak]
-        found += _correlated(camera, c, frozenset().union(*(w.explains for w in weak)))
+        found += _correlated(camera, c, frozenset().union(*(w.explains for w in weak)), _all_known(adjusted.block))
     found += [
         f"{s.parameter} of camera {s.camera} is not significant: |value| is {s.ratio:.1f} sigma (asked: "
         f"{SIGNIFICANT_RATIO:.0f}; t-test p = {s.p_value:.2g}); consider holding it fixed"
@@ -42,9 +43,22 @@ def warnings_of(tables: Tables) -> list[str]:
     return found
 
 
-def _correlated(camera: str, c: Correlations, explained: frozenset[tuple[str, str]]) -> list[str]:
-    """High correlations, but for the pairs of exterior and interior orientation that are `explained` already."""
+def _all_known(block: Block) -> bool:
+    """Whether all points are known beforehand: a field of targets."""
+    return len(np.union1d(block.control.who, block.fixed.who)) == len(block.points)
+
+
+def _correlated(camera: str, c: Correlations, explained: frozenset[tuple[str, str]], field: bool) -> list[str]:
+    """High correlations, but for the pairs of exterior and interior orientation that are `explained` already.
+
+    What cures them depends on whether all images show a `field` of known targets.
+    """
     found = []
+    cure = "add cross strips, control or height differences"
+    usual = "usual without camera stations or attitudes, their effects on the ground cancel"
+    if field:
+        cure = "add photographs turned by 90 degrees about the line of sight, and tilted ones"
+        usual = "usual where targets alone orient an image, their effects on it cancel"
     pairs = [
         (abs(c.interior[i, j]), c.interior[i, j], a, c.parameters[j])
         for i, a in enumerate(c.parameters)
@@ -63,16 +77,13 @@ def _correlated(camera: str, c: Correlations, explained: frozenset[tuple[str, st
         image = c.images[int(np.abs(c.exterior[:, i, j]).argmax())]
         found.append(
             f"high correlation of {c.eop_names[i]} with {c.parameters[j]} of camera {camera}: up to {worst[i, j]:.3f} "
-            f"(image {image}); add cross strips, control or height differences"
+            f"(image {image}); {cure}"
         )
     own = np.abs(c.within_image).max(axis=0)
     strong = [(own[i, j], i, j) for i in range(6) for j in range(i) if own[i, j] > HIGH_OWN_CORRELATION]
     if strong:
         names = ", ".join(f"{c.eop_names[j]} and {c.eop_names[i]} (up to {r:.3f})" for r, i, j in sorted(strong)[::-1])
-        found.append(
-            f"exterior orientation of single images is highly correlated: {names}; usual without camera stations or "
-            "attitudes, their effects on the ground cancel"
-        )
+        found.append(f"exterior orientation of single images is highly correlated: {names}; {usual}")
     return found
 
 

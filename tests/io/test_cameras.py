@@ -184,6 +184,17 @@ def test_opencv_files_have_as_many_coefficients_as_opencv_may_give(tmp_path, cou
     np.testing.assert_allclose(columns_rows(camera), expected + 0.5, rtol=0, atol=1e-9)
 
 
+def test_opencv_5_writes_a_list_as_one_of_n_dimensions(tmp_path):
+    text = OPENCV.split("distortion_coefficients")[0]
+    given = "dt: d\n   data: [ -0.21, 0.11, 1.1e-3, -2.3e-3, 0.02 ]\n"
+    new, old = (
+        read_camera_file(written(tmp_path, f"{text}distortion_coefficients: !!{kind}\n   {sizes}\n   {given}", "a.yml"))
+        for kind, sizes in (("opencv-nd-matrix", "sizes: [ 5 ]"), ("opencv-matrix", "rows: 5\n   cols: 1"))
+    )
+    assert jax.tree.all(jax.tree.map(np.array_equal, new.interior, old.interior))
+    assert float(new.interior.distortion.k3) == 0.02
+
+
 @pytest.mark.parametrize("number", range(1, 7))
 def test_colmap_cameras_project_as_colmap(tmp_path, number):
     camera = read_camera_file(written(tmp_path, COLMAP, "cameras.txt"), camera=str(number))

@@ -15,6 +15,7 @@ from jaxphoto.procedures.calibration import (
     free_parameters,
     rounds,
 )
+from jaxphoto.procedures.calibration.eccentricity import eccentricities
 from jaxphoto.procedures.calibration.outliers import added_sigma
 from jaxphoto.procedures.calibration.reprojection import projections
 from jaxphoto.procedures.calibration.start import flat_start, nearest_distortion
@@ -192,6 +193,26 @@ def test_another_model_begins_where_the_rays_are_nearest(name):
     begun = nearest_distortion(known, model, free_parameters(name, model), SENSOR)
     off = np.abs(_rays(begun) - _rays(known)).max()
     assert off < {"smac": 1e-9, "balanced": 0.02, "bundler_radial": 0.06}[name]
+
+
+def test_circles_of_two_sizes_are_no_blunders():
+    """Their centres are off by several times the noise before they are corrected for, each size by another amount."""
+    board = flat_board()
+    board = board._replace(diameter_m=np.where(np.arange(len(board.points)) % 10, 0.016, 0.004))
+    detections, noise = [], 0.004
+    for exterior, d in zip(views(board, 8), seen(board, views(board, 8), noise), strict=True):
+        n = len(d.point)
+        place = np.tile(exterior.position, (n, 1)), np.tile(exterior.camera_from_object, (n, 1, 1))
+        radius = board.diameter_m[d.point] / 2
+        off = eccentricities(WIDE, *place, board.xyz_m[d.point], np.eye(3)[:, :2], radius) / SENSOR.pixel_mm
+        assert np.abs(off).max() > 20 * noise
+        detections.append(d._replace(column_row=d.column_row + off * (1, -1)))
+    done = calibrate(board, detections, SENSOR)
+    assert done.settled and not done.removed and not done.left_out
+    assert done.added_sigma_px < noise
+    tables = Tables(done.adjusted)
+    off = [(s.value - float(get_parameter(WIDE, s.parameter))) / s.sigma for s in tables.significance]
+    assert np.abs(off).max() < 3.5
 
 
 def test_eccentricity_is_that_of_the_ellipse_in_closed_form():

@@ -8,8 +8,8 @@ import pytest
 
 from jaxphoto import Tables, adjust
 from jaxphoto.block import Rows
-from jaxphoto.report import warnings_of
-from tests.blocks import BROWN, CONTROL, Scene, Simulated, aerial, all_stations, bare, free, measured, rows
+from jaxphoto.report import verdict, warnings_of
+from tests.blocks import BROWN, CONTROL, Scene, Simulated, adjusted, aerial, all_stations, bare, free, measured, rows
 
 
 @functools.cache
@@ -21,6 +21,18 @@ def tables(relief: float, stations: bool, names=("c_mm", "xp_mm", "yp_mm")):
     observed = all_stations(built) if stations else Rows.none()
     built = dataclasses.replace(built, control=rows(CONTROL), stations=observed)
     return Tables(adjust(measured(Simulated(free(built, "one", names), truth)).block))
+
+
+def test_a_field_of_known_targets_has_cures_of_its_own(monkeypatch):
+    monkeypatch.setattr(verdict, "HIGH_CORRELATION", 0.5)
+    monkeypatch.setattr(verdict, "HIGH_OWN_CORRELATION", 0.5)
+    free_network = adjusted("inner_scale")
+    control = rows(range(len(free_network.block.points)), sigma=0.001)
+    control = dataclasses.replace(control, value=np.asarray(free_network.unknowns.points)[control.who, control.axis])
+    field = dataclasses.replace(free_network.block, control=control)
+    of_network, of_field = ("; ".join(warnings_of(Tables(a))) for a in (free_network, adjust(field)))
+    assert "add cross strips" in of_network and "targets alone" not in of_network
+    assert "turned by 90 degrees" in of_field and "targets alone" in of_field and "add cross strips" not in of_field
 
 
 def weak(warnings):

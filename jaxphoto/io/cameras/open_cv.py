@@ -94,6 +94,10 @@ def _value(node: cv2.FileNode) -> float | None:
     return float(node.real()) if not node.empty() and (node.isReal() or node.isInt()) else None
 
 
+def _values(node: cv2.FileNode) -> list[float | None]:
+    return [_value(node.at(k)) for k in range(node.size())] if node.isSeq() else []
+
+
 def _matrix(source: Source, storage: cv2.FileStorage, key: str) -> np.ndarray:
     node = storage.getNode(key)
     if node.empty():
@@ -101,7 +105,10 @@ def _matrix(source: Source, storage: cv2.FileStorage, key: str) -> np.ndarray:
     # Its parts one by one: FileNode.mat() ends the whole process where one of them is missing.
     rows, columns = (_number(node, side) if node.isMap() else None for side in ("rows", "cols"))
     data = node.getNode("data") if node.isMap() else node
-    values = [_value(data.at(k)) for k in range(data.size())] if data.isSeq() else []
+    values = _values(data)
+    if rows is None and node.isMap() and len(sizes := _values(node.getNode("sizes"))) == 1:
+        # A list of one dimension, as OpenCV 5 writes it.
+        rows, columns = 1.0, sizes[0]
     if not rows or not columns or rows % 1 or columns % 1 or None in values or not rows * columns == len(values) > 0:
         raise source.error(f"{key} is no matrix with rows, cols and as many numbers in data; write it anew with OpenCV")
     matrix = np.array(values, float).reshape(-1, max(int(columns), 1))

@@ -74,8 +74,9 @@ def _distances(ellipse: Float[Array, "5"], b: Float[Array, "points 2"]) -> Float
     """Distances of points from an ellipse (column, row and the three of L) to first order."""
     x, y = b[:, 0] - ellipse[0], b[:, 1] - ellipse[1]
     u, v = ellipse[2] * x + ellipse[3] * y, ellipse[4] * y
-    rho = jnp.hypot(u, v)
-    return rho * (rho - 1) / jnp.hypot(ellipse[2] * u, ellipse[3] * u + ellipse[4] * v)
+    # XLA without optimisation differentiates jnp.hypot wrongly (jax 0.10.2).
+    rho = jnp.sqrt(u**2 + v**2)
+    return rho * (rho - 1) / jnp.sqrt((ellipse[2] * u) ** 2 + (ellipse[3] * u + ellipse[4] * v) ** 2)
 
 
 def eccentricities(

@@ -137,12 +137,14 @@ def calibrate(
         interior, exterior = adjusted.unknowns.interior[CAMERA], _still(adjusted.unknowns.exterior)
         residuals = reprojection_residuals(adjusted)
         before, correction = correction, _eccentricities(board, rows, interior, exterior)
+        turned = float(np.max(np.linalg.norm(correction - before, axis=1), initial=0.0)) / sensor.pixel_mm
         misfit = misfits(residuals, rows.image, len(rows.images))
-        good = ~misfit[rows.image] & ~blunders(residuals, sigma / sensor.pixel_mm, rows.image, len(rows.images))
+        large = blunders(residuals, sigma / sensor.pixel_mm, rows.image, len(rows.images))
+        # What the correction of circles has still to change is no blunder.
+        good = ~misfit[rows.image] & ~(large & (np.linalg.norm(residuals, axis=1) > turned))
         redundancy = adjusted.redundancy - 2 * int((~good).sum())
         last, added = added, added_sigma(residuals[good], rows.sigma_mm[good] / sensor.pixel_mm, redundancy)
-        turned = np.max(np.abs(correction - before), initial=0.0) < _STILL_PX * sensor.pixel_mm
-        settled = bool(good.all() and turned) and last is not None and abs(added - last) < _STILL_PX
+        settled = bool(good.all()) and turned < _STILL_PX and last is not None and abs(added - last) < _STILL_PX
         if settled or round_ == _ROUNDS - 1:
             break
         left_out |= {rows.images[k]: "it does not fit the others" for k in np.flatnonzero(misfit)}
