@@ -36,8 +36,8 @@ def orientation_sentences(report: OrientationReport) -> list[str]:
         f"left out of {report.n_matches} matches: {left.off_epipolar} off the epipolar line, {left.conflicting} by "
         f"which a point would show twice in an image, {left.unoriented} of images that are not oriented",
         f"left out of the image points they made: {left.beyond} that miss their point by more than "
-        f"{report.limit_px:.2g} px, {left.small_angle} whose rays meet at too small an angle, {left.too_few} of points "
-        "with too few rays left",
+        f"{report.limit_px:.2g} px, {left.small_angle} whose rays meet at too small an angle, {left.unsupported} of "
+        f"two rays that meet where nothing near them in the images is, {left.too_few} of points with too few rays left",
         f"residuals: {report.mean_px:.2f} px on average, sigma0 {report.sigma0:.2f}",
         *_doubts(report),
         f"free of the camera: {', '.join(report.estimated) or 'nothing'}",
@@ -47,7 +47,7 @@ def orientation_sentences(report: OrientationReport) -> list[str]:
             f"neighbouring rays of an image err alike: standard deviations of the camera are {report.alike:.2g} times "
             "what an adjustment says, which takes them for independent"
         )
-    return said + list(report.held)
+    return said + list(report.observed)
 
 
 def _doubts(report: OrientationReport) -> Iterator[str]:

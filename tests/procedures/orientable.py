@@ -109,16 +109,23 @@ def aerial(
 TRUE = Camera()
 
 
+def projected(scene, camera, image, points):
+    """Where `points` are in an image of `scene`, and whether they are on it."""
+    half = np.array([SENSOR.width_mm, SENSOR.height_mm]) / 2
+    u, v, w = scene.matrices[image] @ (points - scene.positions[image]).T
+    ideal = -camera.c * np.column_stack([u, v]) / w[:, None]
+    xy = camera.measured(ideal)
+    return xy, (w < 0) & (np.abs(xy) < half).all(axis=1) & (np.linalg.norm(ideal, axis=1) < 1.3 * 5.0)
+
+
 def photographed(scene, camera=TRUE, noise_px=0.3, false=0.0, seed=1, clutter=60, found=0.8):
     """Features of the points of `scene`, in disorder and among others, and matches of which the part `false` is."""
     rng = np.random.default_rng(seed)
     features, point_of = [], []
     half = np.array([SENSOR.width_mm, SENSOR.height_mm]) / 2
-    for position, matrix in zip(scene.positions, scene.matrices, strict=True):
-        u, v, w = matrix @ (scene.points - position).T
-        ideal = -camera.c * np.column_stack([u, v]) / w[:, None]
-        xy = camera.measured(ideal)
-        seen = np.flatnonzero((w < 0) & (np.abs(xy) < half).all(axis=1) & (np.linalg.norm(ideal, axis=1) < 1.3 * 5.0))
+    for image in range(len(scene.positions)):
+        xy, visible = projected(scene, camera, image, scene.points)
+        seen = np.flatnonzero(visible)
         xy = np.concatenate([xy[seen], rng.uniform(-half, half, (clutter, 2))])
         xy[: len(seen)] += noise_px * PIXEL * rng.normal(size=(len(seen), 2))
         order = rng.permutation(len(xy))
@@ -145,6 +152,25 @@ def photographed(scene, camera=TRUE, noise_px=0.3, false=0.0, seed=1, clutter=60
     return Photographs(names, features, matches, scene, camera, point_of)
 
 
+def with_epipolar_matches(photographs, per_pair, noise_px=0.3, seed=7):
+    """The same and `per_pair` false matches of each pair along epipolar lines, at 0.6 to 1.6 of the true distance."""
+    scene, camera, rng = photographs.scene, photographs.camera, np.random.default_rng(seed)
+    features, point_of = ([*of_image] for of_image in (photographs.features, photographs.point_of))
+    matches = []
+    for match in photographs.matches:
+        i, j = match.first, match.second
+        away = rng.permutation(scene.points) - scene.positions[i]
+        where = scene.positions[i] + away * np.exp(rng.uniform(-0.5, 0.5, (len(away), 1)))
+        (one, on_one), (other, on_other) = (projected(scene, camera, k, where) for k in (i, j))
+        rows = np.flatnonzero(on_one & on_other)[:per_pair]
+        more = np.column_stack([len(features[k]) + np.arange(len(rows)) for k in (i, j)])
+        for k, xy in ((i, one[rows]), (j, other[rows])):
+            features[k] = np.concatenate([features[k], xy + noise_px * PIXEL * rng.normal(size=xy.shape)])
+            point_of[k] = np.append(point_of[k], np.full(len(rows), -1))
+        matches.append(match._replace(features=np.concatenate([match.features, more])))
+    return photographs._replace(features=features, matches=matches, point_of=point_of)
+
+
 def placed(oriented, scene):
     """Stations and matrices of a network after the similarity that brings its stations nearest to the true ones."""
     order = [int(name[1:]) for name in oriented.block.images]
@@ -155,7 +181,13 @@ def placed(oriented, scene):
 
 
 def errors_over_sigmas(oriented, scene):
-    """Errors (images, 6) of stations and rotations after `placed`, over their standard deviations in that datum.
+    """Errors (images, 6) of stations and rotations after `placed`, over their standard deviations in that datum."""
+    errors, matrix = errors_with_covariance(oriented, scene)
+    return (errors / np.sqrt(np.diagonal(matrix))).reshape(-1, 6)
+
+
+def errors_with_covariance(oriented, scene, camera=None):
+    """Errors of stations and rotations after `placed`, by image, and of c and principal point if the true one is given.
 
     A network has errors e in its own datum. What the similarity leaves of them is S e, S = I - G (G_s' G_s)^-1 G_s',
     with the seven motions G, of which G_s are the rows of stations; so their covariance is S C S' in any datum.
@@ -166,7 +198,7 @@ def errors_over_sigmas(oriented, scene):
     turned = np.einsum("nij,nkj->nik", matrices, true)
     # A small rotation theta takes M to (I - [theta]x) M.
     rotations = 0.5 * np.stack([turned[:, i, j] - turned[:, j, i] for i, j in ((1, 2), (2, 0), (0, 1))], axis=1)
-    errors = np.hstack([stations - scene.positions[order], rotations])
+    errors = np.hstack([stations - scene.positions[order], rotations]).ravel()
     datum = np.zeros((n, 6, 6))
     datum[:, :3, :3], datum[:, 3:, 3:] = s.scale * s.turn, np.eye(3)
     x = scene.positions[order] - scene.positions[order].mean(axis=0)
@@ -180,5 +212,11 @@ def errors_over_sigmas(oriented, scene):
     left = np.eye(6 * n)
     left[:, of_station] -= fit
     apply = np.einsum("anj,njk->ank", left.reshape(6 * n, n, 6), datum).reshape(6 * n, 6 * n)
-    matrix = apply @ np.asarray(found.matrix)[: 6 * n, : 6 * n] @ apply.T * float(found.variance_factor)
-    return errors / np.sqrt(np.diagonal(matrix)).reshape(n, 6)
+    shown = list(range(6 * n))
+    if camera is not None:
+        interior = oriented.adjusted.unknowns.interior["camera"]
+        errors = np.append(errors, np.array([interior.c, interior.x_p, interior.y_p]) - camera[:3])
+        shown += [found.labels.index(f"interior[camera].{name}") for name in ("c_mm", "xp_mm", "yp_mm")]
+        apply = np.block([[apply, np.zeros((6 * n, 3))], [np.zeros((3, 6 * n)), np.eye(3)]])
+    matrix = apply @ np.asarray(found.matrix)[np.ix_(shown, shown)] @ apply.T * float(found.variance_factor)
+    return errors, matrix

@@ -48,7 +48,8 @@ def spoilt(scene):
 def parameters(oriented):
     """Estimates and a posteriori sigmas of the interior orientation that is free."""
     labels = [label.split("].")[1] for label in oriented.adjusted.structure.labels]
-    sigmas = dict(zip(labels, np.sqrt(np.diagonal(_shared_covariance(oriented.adjusted))), strict=True))
+    sigmas = np.sqrt(np.diagonal(_shared_covariance(oriented.adjusted))) * float(oriented.adjusted.sigma0)
+    sigmas = dict(zip(labels, sigmas, strict=True))
     interior = oriented.block.start.unknowns.interior["camera"]
     return {n: (float(get_parameter(interior, n)), sigmas[n]) for n in oriented.report.estimated}
 

@@ -10,7 +10,8 @@ from jaxphoto.camera import InteriorOrientation, Smac
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import BlockError
 from jaxphoto.orientation.matches import tracks
-from jaxphoto.procedures.orientation.finish import _eliminate
+from jaxphoto.procedures.orientation.depths import supported
+from jaxphoto.procedures.orientation.finish import _open
 from jaxphoto.procedures.orientation.growing import _starts, _worth
 from jaxphoto.procedures.orientation.network import Fate, empty_network, meet, misfits, sight_of
 from jaxphoto.procedures.orientation.onto_known import onto_known, similarity_between
@@ -19,14 +20,26 @@ from jaxphoto.procedures.orientation.photographs import _block_of
 from jaxphoto.procedures.orientation.refine import _at_corner
 from jaxphoto.procedures.orientation.two_steps import two_steps
 from tests.formulas import camera_from_object
-from tests.procedures.orientable import PIXEL, SENSOR, Camera, Scene, convergent, photographed
+from tests.procedures.orientable import (
+    PIXEL,
+    SENSOR,
+    Camera,
+    Scene,
+    aerial,
+    convergent,
+    photographed,
+    with_epipolar_matches,
+)
 
 PLAIN = Camera(8.0, 0.0, 0.0, 0.0, 0.0)
 
 
-def network_of(scene, noise_px=0.0):
-    """A network at the truth, of exact images, its points not met yet; its block, its rays, and true points of rows."""
-    p = photographed(scene, PLAIN, noise_px, clutter=0, found=1.0)
+def network_of(scene, noise_px=0.0, false=0):
+    """A network at the truth, of exact images, its points not met yet; its block, its rays, and true points of rows.
+
+    `false` matches of each pair lie along epipolar lines; their points are -1.
+    """
+    p = with_epipolar_matches(photographed(scene, PLAIN, noise_px, clutter=0, found=1.0), false, noise_px)
     sigmas = [np.full(len(xy), 0.3 * PIXEL) for xy in p.features]
     found = tracks([len(xy) for xy in p.features], p.matches)
     block = _block_of("scene", p.names, SENSOR, InteriorOrientation(8.0), p.features, sigmas, found)
@@ -86,6 +99,36 @@ def test_narrow_rays_and_lone_ones_make_no_point():
     assert meet(sight, network, 4.0, np.deg2rad(0.01)).used.all()
     alone = meet(sight, network.without_image(1), 4.0, np.deg2rad(0.01))
     assert set(alone.fate) == {Fate.TOO_FEW, Fate.UNORIENTED}
+
+
+def stepped(scene, height=15.0):
+    """The scene with blocks of houses, 12 m wide, of up to so many metres."""
+    x, y = np.floor(scene.points[:, :2] / 12).astype(int).T
+    houses = height * np.random.default_rng(0).random((200, 200))[x % 200, y % 200] * ((x + y) % 2)
+    return scene._replace(points=scene.points + np.column_stack([0 * houses, 0 * houses, houses]))
+
+
+DEPTHS = {
+    "flat": aerial(relief=0.0),
+    "hills": aerial(relief=40.0),
+    "houses": stepped(aerial()),
+    "a heap": convergent(6, 300),
+}
+
+
+@pytest.mark.parametrize("which", DEPTHS)
+def test_points_of_two_rays_go_where_nothing_else_is(which):
+    """Hardly a true one, whatever the relief; false ones the more, the less the depths of neighbours differ."""
+    _, network, sight, true = network_of(DEPTHS[which], 0.3, false=4)
+    met = meet(sight, network, 4.0, np.deg2rad(1.5))
+    left = supported(sight, met)
+    gone = met.used & ~left.used
+    two = met.used & (np.bincount(sight.point[met.used], minlength=len(met.points))[sight.point] == 2)
+    assert not (gone & ~two).any()
+    assert (left.fate[gone] == Fate.UNSUPPORTED).all()
+    false, right = two & (true < 0), two & (true >= 0)
+    assert gone[right].mean() < 0.02
+    assert gone[false].mean() > {"flat": 0.9, "hills": 0.15, "houses": 0.15, "a heap": -1}[which]
 
 
 @pytest.mark.parametrize("turned", [False, True], ids=["from", "to"])
@@ -148,29 +191,27 @@ def test_without_a_pair_there_are_no_two_steps():
     assert two_steps(3, [pair_of(scene, 0, 1)], network.without_image(3), sight) is None
 
 
-def test_held_parameters_change_the_others_as_a_new_adjustment_would():
+def test_observed_parameters_change_the_others_as_a_new_adjustment_would():
     rng = np.random.default_rng(0)
     a = rng.normal(size=(60, 4)) @ (np.eye(4) + 0.5 * rng.normal(size=(4, 4)))
     a[:, 3] = a[:, 2] + 0.02 * rng.normal(size=60)  # two that are hardly told apart
-    truth = np.array([3.0, 0.0, 0.0, 0.01])
-    y = a @ truth + 0.1 * rng.normal(size=60)
-    covariance = 0.01 * np.linalg.inv(a.T @ a)
-    unit = np.array([3.0, 3.0, 3.0, 3.0])
-    left, why = _eliminate(("k1", "k2", "p1", "p2"), np.linalg.lstsq(a, y)[0], covariance, unit)
-    # The same by adjusting anew, the one most open held each time.
-    kept = [0, 1, 2, 3]
+    a[:, 1] *= 0.05  # one that is hardly told
+    names, observed, hardly = ("k1", "k2", "p1", "p2"), np.full(4, 0.1), np.full(4, 1.0)
+    found = _open(names, a.T @ a / 0.1**2, observed, hardly)
+    # The same by adjusting anew, the one told least observed each time.
+    known: dict[int, float] = {}
     while True:
-        part = a[:, kept]
-        x, sigma = np.linalg.lstsq(part, y)[0], 0.1 * np.sqrt(np.diagonal(np.linalg.inv(part.T @ part)))
-        open_ = (sigma > 0.3) | ((sigma > 0.06) & (np.abs(x) < 3 * sigma))
-        if not open_.any():
+        prior = np.array([observed[k] if k in known else hardly[k] for k in range(4)])
+        sigma = np.linalg.norm(np.linalg.pinv(np.vstack([a / 0.1, np.diag(1 / prior)])), axis=1)
+        left = [k for k in range(4) if k not in known]
+        worst = max(left, key=lambda k: sigma[k])
+        if sigma[worst] <= 0.05:
             break
-        kept.pop(int(np.argmax(np.where(open_, sigma, 0))))
-    assert left == tuple(np.array(["k1", "k2", "p1", "p2"])[kept])
-    # One of the two is held, though both were open; what is told stays free, significant or not.
-    assert len(left) == 3
-    assert {"k1", "k2"} <= set(left)
-    assert set(why) == {"k1", "k2", "p1", "p2"} - set(left)
+        known[worst] = sigma[worst]
+    assert list(found) == [names[k] for k in known]
+    np.testing.assert_allclose(list(found.values()), list(known.values()), rtol=1e-9)
+    # One of the two observed does not tell the other; what is told stays free.
+    assert set(found) == {"k2", "p1", "p2"}
 
 
 def test_similarity_by_any_turn_and_its_defects():

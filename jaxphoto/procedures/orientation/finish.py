@@ -1,9 +1,9 @@
 """The end of an orientation: all parameters estimated, gross errors left out in rounds, and what the camera needs.
 
-Which parameters of the interior orientation the images can tell follows from one adjustment of all of them. Those are
-held, one after the other, that would move the corner of the format by an unknown amount; each time the rest is what it
-would be with that one held (a conditional normal distribution). What the images tell stays free even where it hardly
-differs from its start: held two of its standard deviations from the truth, it would bend a strip by many of theirs.
+Which parameters of the interior orientation the images can tell follows from one adjustment of all of them, freed of
+what was known beforehand. One after the other, those that would leave the corner of the format open are observed where
+they start; each time the rest is what it would be with that one observed. What the images tell stays free even where it
+hardly differs from its start: drawn to it, it would bend a strip by more than its own uncertainty does.
 
 Rays beside one another in an image err alike where the lens, a rolling shutter or the features do what no model says.
 Standard deviations that take them for independent are too small by the root of the design effect (Kish),
@@ -22,11 +22,11 @@ from jaxtyping import Float
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.adjustment.band import invert_band
 from jaxphoto.block import Block
-from jaxphoto.camera import get_parameter, set_parameter
 from jaxphoto.compiling import call_compiled
+from jaxphoto.procedures.orientation.depths import supported
 from jaxphoto.procedures.orientation.network import Network, meet, normalised_misfits, robust_scale, sight_of
 from jaxphoto.procedures.orientation.pairs import Report
-from jaxphoto.procedures.orientation.refine import Calibration, Names, refined
+from jaxphoto.procedures.orientation.refine import Asked, Calibration, Names, hardly_known, observation, refined
 
 # Gross errors are beyond so many robust standard deviations, and never within the second, in a priori ones.
 _LIMIT, _LEAST_LIMIT = 4.0, 1.0
@@ -34,11 +34,8 @@ _LIMIT, _LEAST_LIMIT = 4.0, 1.0
 # they need not come to that.
 _STILL, _FEW = 1e-3, 2
 ROUNDS, LAST_ROUNDS = 6, 20
-# The images tell a parameter that leaves the corner of the format open by less than the first part of the radius, or
-# is so many standard deviations from its start; none that leaves it open by more than the second. A principal distance
-# is told up to the second: what is known of one beforehand is often no better.
-_COUNTS = 3.0
-_TOLD, _LOST = 0.02, 0.1
+# The images tell a parameter that they know by so much better than anybody beforehand.
+_TOLD = 0.5
 # Cells along the longer side of an image.
 _CELLS = 8
 
@@ -61,13 +58,13 @@ def finished(
     block: Block,
     network: Network,
     calibration: Calibration,
-    names: Names,
+    estimated: Asked,
     angle: float,
     least: int,
     report: Report = lambda text: None,
     rounds: int = ROUNDS,
 ) -> Finished:
-    """`network` adjusted, `names` estimated, in turn with its points met anew until hardly any image point changes.
+    """`network` adjusted in turn with its points met anew until hardly any image point changes.
 
     Rays make a point at `angle` (rad) or more; an image that sees fewer than `least` points goes. After `rounds` it
     ends in any case; `settled` says whether it had to.
@@ -76,21 +73,21 @@ def finished(
     settled = False
     for number in range(1, rounds + 1):
         report(f"adjusting {int(network.oriented.sum())} images, round {number}")
-        network, adjusted = refined(block, network, calibration, names, final=True)
+        network, adjusted = refined(block, network, calibration, estimated)
         sight, before = sight_of(block, network.interior), network.fate
         limit = max(_LEAST_LIMIT, _LIMIT * robust_scale(normalised_misfits(sight, network)))
-        network = meet(sight, network, limit, angle)
+        network = supported(sight, meet(sight, network, limit, angle))
         seen = np.bincount(sight.image[network.used], minlength=len(network.oriented))
         few = np.flatnonzero(network.oriented & (seen < least))
         for image in few.tolist():
             lost[image] = f"only {seen[image]} of its points fit, and {least} are needed"
             network = network.without_image(image)
         if len(few):
-            network = meet(sight, network, limit, angle)
+            network = supported(sight, meet(sight, network, limit, angle))
         elif np.sum(before != network.fate) <= max(_FEW, _STILL * len(before)):
             settled = True
             break
-    network, adjusted = refined(block, network, calibration, names, final=True)
+    network, adjusted = refined(block, network, calibration, estimated)
     return Finished(network, adjusted, limit, number, settled, lost)
 
 
@@ -98,27 +95,35 @@ class Told(NamedTuple):
     """The parameters of cameras that images tell."""
 
     names: Names
-    held: list[str]
-    """Why others are held, a sentence each."""
+    open: list[str]
+    """Why others are observed, a sentence each."""
     alike: float
     """By what their standard deviations are larger than they were if all rays erred independently."""
 
 
-def told(block: Block, adjusted: Adjustment, calibration: Calibration) -> Told:
-    """The parameters of `calibration` that the images of `block` tell."""
+def told(adjusted: Adjustment, calibration: Calibration) -> Told:
+    """The parameters of `calibration` that images tell; in `adjusted` all of them were observed."""
     alike = erring_alike(adjusted.block, np.asarray(adjusted.residuals.image))
-    matrix, labels = _shared_covariance(adjusted) * alike**2, adjusted.structure.labels
+    matrix, labels = _shared_covariance(adjusted), adjusted.structure.labels
     kept: Names = {}
-    held: list[str] = []
+    said: list[str] = []
     for camera, names in calibration.names.items():
         place = [labels.index(f"interior[{camera}].{name}") for name in names]
-        now, then = (u.interior[camera] for u in (adjusted.unknowns, block.start.unknowns))
-        moved = np.array([float(get_parameter(now, n)) - float(get_parameter(then, n)) for n in names])
-        unit = np.array([calibration.unit[camera][n] for n in names])
-        left, why = _eliminate(names, moved, matrix[np.ix_(place, place)], unit)
-        kept[camera] = left
-        held += [f"{name} of camera {camera} is held: {reason}" for name, reason in why.items()]
-    return Told(kept, held, alike)
+        known = [observation(calibration, camera, name) for name in names]
+        sigma = np.array([float(prior.sigma) for prior in known])
+        hardly = np.array([hardly_known(calibration, camera, name) for name in names])
+        # What the images say by themselves.
+        images = np.linalg.inv(matrix[np.ix_(place, place)]) - np.diag(sigma**-2.0)
+        left_open = _open(names, images / (float(adjusted.sigma0) * alike) ** 2, sigma, hardly)
+        kept[camera] = tuple(name for name in names if name not in left_open)
+        said += [
+            f"{name} of camera {camera} is observed where it starts, {float(prior.value):.6g} +- "
+            f"{float(prior.sigma):.2g}: the images leave the corner of the format open by "
+            f"{left_open[name] / calibration.unit[camera][name]:.1%} of its radius"
+            for name, prior in zip(names, known, strict=True)
+            if name in left_open
+        ]
+    return Told(kept, said, alike)
 
 
 def erring_alike(block: Block, residuals: Float[np.ndarray, "2 rows"]) -> float:
@@ -133,45 +138,30 @@ def erring_alike(block: Block, residuals: Float[np.ndarray, "2 rows"]) -> float:
 
 
 def _shared_covariance(adjusted: Adjustment) -> np.ndarray:
-    """A posteriori covariance of the unknowns that images share; no datum changes it, so its constraints stay in."""
+    """A priori covariance of the unknowns that images share; no datum changes it, so its constraints stay in."""
     factored, n = adjusted.computed.factored, adjusted.structure.n_shared
     scale = np.asarray(factored.scale.shared)
     inverse = np.asarray(call_compiled(_inverse, factored.factor))[-n:, -n:]
-    return inverse * np.outer(scale, scale) * float(adjusted.sigma0) ** 2
+    return inverse * np.outer(scale, scale)
 
 
 # All of statistics.covariance, points and all, would take several times longer to compile.
 _inverse = eqx.filter_jit(invert_band)
 
 
-def _eliminate(names: tuple[str, ...], moved: np.ndarray, matrix: np.ndarray, unit: np.ndarray):
-    """Names that are left, and by name why the others are not.
+def _open(names: tuple[str, ...], normal: np.ndarray, observed: np.ndarray, hardly: np.ndarray) -> dict[str, float]:
+    """Parameters that the images do not tell, and their standard deviations by the images.
 
-    `moved` are the values from their starts, `matrix` is their covariance.
+    `normal` are the normal equations of the images. What they do not tell joins them, the least told first, with the
+    standard deviations `observed`; the rest with `hardly`, which keep them regular.
     """
-    left, why = list(range(len(names))), {}
-    while left:
-        sigma = np.sqrt(np.diagonal(matrix))
-        at_corner, ratio = sigma / unit[left], np.abs(moved) / sigma
-        told_by = np.array([_LOST if names[k] == "c_mm" else _TOLD for k in left])
-        open_ = (at_corner > _LOST) | ((at_corner > told_by) & (ratio < _COUNTS))
-        if not open_.any():
-            break
-        out = int(np.argmax(np.where(open_, at_corner, 0.0)))
-        why[names[left[out]]] = f"the images leave the corner of the format open by {at_corner[out]:.1%} of its radius"
-        rest = [k for k in range(len(left)) if k != out]
-        gain = matrix[rest, out] / matrix[out, out]
-        moved = moved[rest] - gain * moved[out]
-        matrix = matrix[np.ix_(rest, rest)] - np.outer(gain, matrix[out, rest])
-        left.pop(out)
-    return tuple(names[k] for k in left), why
-
-
-def with_held(block: Block, network: Network, calibration: Calibration, names: Names) -> Network:
-    """`network` with the parameters of `calibration` that are not in `names` as the block starts them."""
-    interiors = dict(network.interior)
-    for camera, all_names in calibration.names.items():
-        for name in set(all_names) - set(names[camera]):
-            value = get_parameter(block.start.unknowns.interior[camera], name)
-            interiors[camera] = set_parameter(interiors[camera], name, np.asarray(value, float))
-    return network._replace(interior=interiors)
+    found = np.zeros(len(names), bool)
+    said: dict[str, float] = {}
+    while True:
+        weight = np.where(found, observed, hardly) ** -2.0
+        sigma = np.sqrt(np.diagonal(np.linalg.inv(normal + np.diag(weight))))
+        part = np.where(found, 0.0, sigma / observed)
+        out = int(np.argmax(part))
+        if not part[out] > _TOLD:
+            return said
+        found[out], said[names[out]] = True, float(sigma[out])

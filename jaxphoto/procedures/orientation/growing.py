@@ -27,7 +27,7 @@ from jaxphoto.procedures.orientation.network import (
     sight_of,
 )
 from jaxphoto.procedures.orientation.pairs import Pair, Report
-from jaxphoto.procedures.orientation.refine import Calibration, early, refined
+from jaxphoto.procedures.orientation.refine import Asked, Calibration, early, refined
 from jaxphoto.procedures.orientation.two_steps import Placed, two_steps
 
 # Rays at less than this do not make a point; where images see too few points, less will do.
@@ -157,8 +157,8 @@ class _Growth:
     def adjust(self) -> None:
         """All that is oriented, and points by what it gives."""
         self.report(f"adjusting {len(self.order)} images")
-        estimated = early(self.calibration) if len(self.order) >= _TELLING else {}
-        self.network, _ = refined(self.block, self.network, self.calibration, estimated)
+        estimated = early(self.calibration) if len(self.order) >= _TELLING else Asked({}, {})
+        self.network, _ = refined(self.block, self.network, self.calibration, estimated, growing=True)
         self.sight = sight_of(self.block, self.network.interior)
         self.adjusted = len(self.order)
         self.meet()

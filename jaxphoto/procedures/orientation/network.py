@@ -31,6 +31,8 @@ class Fate(enum.IntEnum):
     """Fewer than two rays of its point are left."""
     UNORIENTED = 4
     """Its image is not oriented."""
+    UNSUPPORTED = 5
+    """Its point has two rays, at a depth where nothing near it in the images is."""
 
 
 class Sight(NamedTuple):

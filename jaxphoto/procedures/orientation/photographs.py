@@ -4,7 +4,7 @@
 2. What is left hangs together to points; a network grows over them (`growing`).
 3. With the camera as the network knows it now, and all images oriented, every match is tested again: lens distortion
    has made true ones look false, in the corners of the format above all. Points anew, adjustments in rounds.
-4. Parameters of the camera that the images cannot tell are held, and the rounds run again.
+4. Parameters of the camera that the images cannot tell are observed where they start, and the rounds run again.
 """
 
 import dataclasses
@@ -21,11 +21,20 @@ from jaxphoto.camera.equivalence import usual_coefficients
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.orientation.matches import PairMatches, Tracks, tracks
 from jaxphoto.orientation.rays import ideal_coordinates, unit_rays
-from jaxphoto.procedures.orientation.finish import LAST_ROUNDS, finished, told, with_held
+from jaxphoto.procedures.orientation.finish import LAST_ROUNDS, finished, told
 from jaxphoto.procedures.orientation.growing import grown
 from jaxphoto.procedures.orientation.network import Fate, Network, empty_network, meet, sight_of
 from jaxphoto.procedures.orientation.pairs import LENS_PX, MOST, Report, check_connected, relate
-from jaxphoto.procedures.orientation.refine import calibration_of, early, freed, part_of
+from jaxphoto.procedures.orientation.refine import (
+    Asked,
+    Calibration,
+    asked,
+    calibration_of,
+    early,
+    freed,
+    observation,
+    part_of,
+)
 from jaxphoto.procedures.orientation.second_look import second_look
 from jaxphoto.unknowns import Unknowns, default_priors
 
@@ -56,6 +65,8 @@ class GrossErrors(NamedTuple):
     """Image points whose rays meet at too small an angle."""
     too_few: int
     """Image points left alone by those that went."""
+    unsupported: int
+    """Image points of two rays that meet where nothing near them in the images is."""
 
 
 class OrientationReport(NamedTuple):
@@ -84,8 +95,8 @@ class OrientationReport(NamedTuple):
     sigma0: float
     estimated: tuple[str, ...]
     """Parameters of the interior orientation that are free in the block."""
-    held: tuple[str, ...]
-    """Why others are not, a sentence each."""
+    observed: tuple[str, ...]
+    """Why others are observed where they start, a sentence each."""
     alike: float
     """By what the standard deviations of the camera are larger than if neighbouring rays erred independently."""
 
@@ -145,17 +156,15 @@ def orient(
         oriented=first.network.oriented,
     )
     network = meet(sight_of(block, network.interior), network, first.limit, start.angle)
-    free = finished(block, network, calibration, calibration.names, start.angle, LEAST_POINTS, report)
-    camera = told(block, free.adjusted, calibration)
-    estimated = camera.names
-    last = free
-    if camera.held or not free.settled:
-        network = with_held(block, free.network, calibration, estimated)
-        last = finished(block, network, calibration, estimated, start.angle, LEAST_POINTS, report, LAST_ROUNDS)
+    observed = asked(calibration, {CAMERA: ()})
+    second = finished(block, network, calibration, observed, start.angle, LEAST_POINTS, report)
+    camera = told(second.adjusted, calibration)
+    estimated = asked(calibration, camera.names)
+    last = finished(block, second.network, calibration, estimated, start.angle, LEAST_POINTS, report, LAST_ROUNDS)
 
     network = last.network
-    refused = start.refused | first.lost | free.lost | last.lost
-    made = _oriented_block(block, network, estimated[CAMERA])
+    refused = start.refused | first.lost | second.lost | last.lost
+    made = _oriented_block(block, network, calibration, estimated)
     residual = np.asarray(last.adjusted.residuals.image).T * np.asarray(made.image_points.sigma)
     fate = np.bincount(network.fate, minlength=len(Fate))
     return Oriented(
@@ -172,20 +181,20 @@ def orient(
             ),
             n_points=len(made.points),
             n_image_points=len(made.image_points.image),
-            rounds=first.rounds + free.rounds + (0 if last is free else last.rounds),
+            rounds=first.rounds + second.rounds + last.rounds,
             settled=last.settled,
             converged=last.settled and bool(last.adjusted.converged),
             limit_px=last.limit * sigma / sensor.pixel_mm,
             mean_px=float(np.mean(np.hypot(*residual.T))) / sensor.pixel_mm,
             sigma0=float(last.adjusted.sigma0),
-            estimated=estimated[CAMERA],
-            held=tuple(camera.held),
+            estimated=camera.names[CAMERA],
+            observed=tuple(camera.open),
             alike=camera.alike,
         ),
     )
 
 
-_COUNTED = (Fate.BEYOND, Fate.SMALL_ANGLE, Fate.TOO_FEW)
+_COUNTED = (Fate.BEYOND, Fate.SMALL_ANGLE, Fate.TOO_FEW, Fate.UNSUPPORTED)
 
 
 def _block_of(title, names, sensor, interior, features, sigmas_mm, found: Tracks) -> Block:
@@ -228,9 +237,11 @@ def _candidates(interior: InteriorOrientation) -> tuple[str, ...]:
     return ("c_mm", "xp_mm", "yp_mm", *usual_coefficients(type(interior.distortion)))
 
 
-def _oriented_block(block: Block, network: Network, estimated: tuple[str, ...]) -> Block:
+def _oriented_block(block: Block, network: Network, calibration: Calibration, estimated: Asked) -> Block:
     images = np.flatnonzero(network.oriented)
     points = np.unique(block.image_points.point[network.used])
     made = part_of(block, network, images, points, network.used)
-    free = freed(made.priors.interior[CAMERA], estimated)
-    return dataclasses.replace(made, priors=dataclasses.replace(made.priors, interior={CAMERA: free}))
+    priors = freed(made.priors.interior[CAMERA], estimated.free[CAMERA])
+    for name in estimated.observed[CAMERA]:
+        priors = set_parameter(priors, name, observation(calibration, CAMERA, name))
+    return dataclasses.replace(made, priors=dataclasses.replace(made.priors, interior={CAMERA: priors}))

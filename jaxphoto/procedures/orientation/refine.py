@@ -20,14 +20,26 @@ from jaxphoto.georeferencing import Corrections
 from jaxphoto.procedures.orientation.network import Network
 from jaxphoto.unknowns import FIXED, FREE, Unknowns, Weighted, default_priors
 
-_STEPS = 40
+# Over flat ground a principal distance that is hardly told creeps.
+_STEPS = 200
 # By what part of the radius a parameter moves the corner of the format: one that is held, and what lenses have. The
 # latter is observed about the start: images that say little of a lens would else let a wrong principal distance and
 # distortions of many tens of pixels make up for one another.
 _HELD, _LENS = 1e-7, 0.03
-# A principal distance may be off by any amount, and by so much a step; and what little else a few images can tell.
-_C_STEP, _C_OPEN, _EARLY = 0.1, 0.3, ("c_mm", "k1", "k2")
+# The same of a principal distance, which a start says to so much, and which moves by so much a step while a network
+# grows; and what hardly counts.
+_C, _FREE = 0.1, 0.3
+_EARLY = ("c_mm", "k1", "k2")
 Names = dict[str, tuple[str, ...]]
+
+
+class Asked(NamedTuple):
+    """The parameters that an adjustment estimates; the others of a calibration are held."""
+
+    free: Names
+    """By camera: of which nothing is known."""
+    observed: Names
+    """By camera: observed where they start, with the standard deviation of `observation`."""
 
 
 class Calibration(NamedTuple):
@@ -53,7 +65,7 @@ def calibration_of(block: Block) -> Calibration:
         unit[camera] = {n: float(np.linalg.norm(corner)) / _at_corner(interior, n, corner) for n in names[camera]}
         begin[camera] = {n: float(np.asarray(get_parameter(interior, n))) for n in names[camera]}
     calibration = Calibration(names, unit, begin, Sizes())
-    return calibration._replace(sizes=common_sizes([_with_priors(bare(block), calibration, names)]))
+    return calibration._replace(sizes=common_sizes([_with_priors(bare(block), calibration, Asked(names, {}))]))
 
 
 def _at_corner(interior: InteriorOrientation, name: str, corner: np.ndarray) -> float:
@@ -71,23 +83,40 @@ def _at_corner(interior: InteriorOrientation, name: str, corner: np.ndarray) -> 
     return float(np.linalg.norm(both[0] - both[1], axis=1).max()) / (2 * step)
 
 
-def early(calibration: Calibration) -> Names:
+def observation(calibration: Calibration, camera: str, name: str) -> Weighted:
+    """What is known of a parameter beforehand: its start, as closely as lenses are alike and as c is known."""
+    sigma = (_C if name == "c_mm" else _LENS) * calibration.unit[camera][name]
+    return Weighted(np.asarray(calibration.start[camera][name]), np.asarray(sigma))
+
+
+def hardly_known(calibration: Calibration, camera: str, name: str) -> float:
+    """A standard deviation that hardly counts, for a parameter that is free."""
+    return _FREE * calibration.unit[camera][name]
+
+
+def asked(calibration: Calibration, free: Names) -> Asked:
+    """All parameters of `calibration`: those in `free`, and the others observed."""
+    rest = {camera: tuple(n for n in names if n not in free[camera]) for camera, names in calibration.names.items()}
+    return Asked(free, rest)
+
+
+def early(calibration: Calibration) -> Asked:
     """What few images can tell of a camera."""
-    return {camera: tuple(n for n in names if n in _EARLY) for camera, names in calibration.names.items()}
+    return Asked({}, {camera: tuple(n for n in names if n in _EARLY) for camera, names in calibration.names.items()})
 
 
 def refined(
-    block: Block, network: Network, calibration: Calibration, estimated: Names, final: bool = False
+    block: Block, network: Network, calibration: Calibration, estimated: Asked, growing: bool = False
 ) -> tuple[Network, Adjustment]:
     """The network after an adjustment of its oriented images and of the points that they meet in.
 
-    `estimated` parameters of the cameras are observed at their start as loosely as lenses differ, principal distances
-    as they are now, and with `final` so loosely that it hardly counts; the rest of `calibration` is held.
+    What is free is observed where it is now, so loosely that it hardly counts. While a network is `growing`, c is
+    observed where it is now, too: it may be off by any amount, and moves so much a step.
     """
     images = np.flatnonzero(network.oriented)
     points = np.unique(np.asarray(block.image_points.point)[network.used])
     part = part_of(block, network, images, points, network.used)
-    part = _with_priors(part, calibration, estimated, _C_OPEN if final else _C_STEP)
+    part = _with_priors(part, calibration, estimated, growing)
     adjusted = solve(part, part.start.unknowns, part.priors, _STEPS, calibration.sizes)
     if not bool(adjusted.converged) and not np.isfinite(float(adjusted.square_sum)):
         return network, adjusted
@@ -100,16 +129,21 @@ def refined(
     return found, adjusted
 
 
-def _with_priors(block: Block, calibration: Calibration, estimated: Names, c_part: float = _C_STEP) -> Block:
+def _with_priors(block: Block, calibration: Calibration, estimated: Asked, growing: bool = False) -> Block:
     interiors = {}
     for camera, start in block.start.unknowns.interior.items():
         priors = block.priors.interior[camera]
         for name in calibration.names[camera]:
-            is_c = name == "c_mm"
-            value = float(get_parameter(start, name)) if is_c else calibration.start[camera][name]
-            part = (c_part if is_c else _LENS) if name in estimated.get(camera, ()) else _HELD
-            weight = Weighted(np.asarray(value), np.asarray(part * calibration.unit[camera][name]))
-            priors = set_parameter(priors, name, weight)
+            prior, now = observation(calibration, camera, name), np.asarray(get_parameter(start, name), float)
+            if name in estimated.free.get(camera, ()):
+                prior = Weighted(now, np.asarray(hardly_known(calibration, camera, name)))
+            elif name not in estimated.observed.get(camera, ()):
+                # A principal distance stays where it has come to, the others are held at their start.
+                held = np.asarray(_HELD * calibration.unit[camera][name])
+                prior = Weighted(now if name == "c_mm" else prior.value, held)
+            elif growing and name == "c_mm":
+                prior = Weighted(now, prior.sigma)
+            priors = set_parameter(priors, name, prior)
         interiors[camera] = priors
     return dataclasses.replace(block, priors=dataclasses.replace(block.priors, interior=interiors))
 
