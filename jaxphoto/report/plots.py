@@ -85,7 +85,8 @@ def residuals_figure(tables: Tables, camera: str) -> Figure:
     _vectors(axes, xy, v, key, 0.06 * sensor.width_mm, f"{1000 * key:g} µm", width=0.0015, above=0.03)
     w, h = sensor.width_mm / 2, sensor.height_mm / 2
     axes.plot([-w, w, w, -w, -w], [-h, -h, h, h, -h], color="0.4", lw=0.8)
-    axes.set(xlabel="x [mm]", ylabel="y [mm]", title=title)
+    axes.set(xlabel="x [mm]", ylabel="y [mm]")
+    axes.set_title(title, loc="left", fontsize=10)
     axes.set_aspect("equal")
     return figure
 

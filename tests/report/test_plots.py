@@ -46,12 +46,12 @@ def test_of_many_residuals_a_part_is_drawn_and_the_largest(monkeypatch):
     tables = Tables(adjusted("cross"))
     (whole,) = plots.residuals_figure(tables, "one").axes
     n = len(tables.adjusted.block.image_points.xy)
-    assert len(arrows(whole).U) == n and "1 in" not in whole.get_title()
+    assert len(arrows(whole).U) == n and "1 in" not in whole.get_title(loc="left")
     monkeypatch.setattr(plots, "_ARROWS", n // 4)
     monkeypatch.setattr(plots, "_LARGEST", 3)
     (part,) = plots.residuals_figure(tables, "one").axes
     assert n // 5 <= len(arrows(part).U) <= n // 4 + 3
-    assert "1 in 5" in part.get_title() or "1 in 4" in part.get_title()
+    assert "1 in 5" in part.get_title(loc="left") or "1 in 4" in part.get_title(loc="left")
     size = lambda axes: np.sort(np.hypot(arrows(axes).U, arrows(axes).V))  # noqa: E731
     np.testing.assert_allclose(size(part)[-3:], size(whole)[-3:])
     assert arrows(part).scale == arrows(whole).scale
