@@ -106,28 +106,38 @@ def print_stability(
     analyses: Mapping[Method, Analysis], sets: tuple[Compared, Compared], pixel_mm: float, noise_mm: float,
     method: Method, console: Console,
 ) -> None:  # fmt: skip
-    """Both sets, a line for each method in micrometres, and the verdict by `method`."""
+    """Both sets, a column for each method in micrometres, and the verdict by `method`."""
     for compared in sets:
         console.print(str(compared), highlight=False, soft_wrap=True)
     console.print(_missing(sets), highlight=False, soft_wrap=True)
-    table = Table(title=f"stability [um]; noise {1e3 * noise_mm:.4g} um = {noise_mm / pixel_mm:.4g} px")
-    for name in ("method", "RMSE_offset", "px", "as measured", "largest", "sigma", "95 %", "one camera", "p"):
-        table.add_column(name, justify="left" if name == "method" else "right", no_wrap=True)
-    for name, one in analyses.items():
-        v, known = one.offsets, one.uncertainty
-        sizes = (v.rmse_mm, v.rmse_measured_mm, np.linalg.norm(v.offsets, axis=1).max())
-        rmse, measured, largest = (f"{1e3 * float(s):.4g}" for s in sizes)
-        spread = ("", "", "", "")
-        if known is not None:
-            between = f"{1e3 * known.low_mm:.3g}-{1e3 * known.high_mm:.3g}"
-            of_one = f"{1e3 * known.expected_of_one_mm:.3g}"
-            spread = (f"{1e3 * known.sigma_mm:.3g}", between, of_one, f"{known.p_value:.2g}")
-        table.add_row(name, rmse, f"{float(v.rmse_mm) / pixel_mm:.4g}", measured, largest, *spread)
+    table = Table(title=f"stability (um); noise {1e3 * noise_mm:.4g} um = {noise_mm / pixel_mm:.4g} px")
+    table.add_column("", no_wrap=True)
+    for name in analyses:
+        table.add_column(name, justify="right", no_wrap=True)
+    shown = [_shown(one, pixel_mm) for one in analyses.values()]
+    # A method a column: with a row each, a screen of 80 characters would cut the numbers off.
+    for measure in shown[0]:
+        table.add_row(measure, *(of_method[measure] for of_method in shown))
     console.print(table)
     chosen = analyses[method]
     colour = "green" if chosen.similar(noise_mm) else "red"
     verdict = chosen.verdict(noise_mm)
     console.print(f"[{colour}]{method}: {verdict}[/{colour}]", highlight=False, soft_wrap=True)
+
+
+def _shown(one: Analysis, pixel_mm: float) -> dict[str, str]:
+    """The numbers of a method in micrometres; those that need a covariance are empty without."""
+    v, known = one.offsets, one.uncertainty
+    sizes = (v.rmse_mm, v.rmse_measured_mm, np.linalg.norm(v.offsets, axis=1).max())
+    rmse, measured, largest = (f"{1e3 * float(s):.4g}" for s in sizes)
+    found = {"RMSE_offset": rmse, "in pixels": f"{float(v.rmse_mm) / pixel_mm:.4g}", "as measured": measured}
+    found |= {"largest": largest, "sigma": "", "95 %": "", "of one camera": "", "p": ""}
+    if known is not None:
+        found["sigma"] = f"{1e3 * known.sigma_mm:.3g}"
+        found["95 %"] = f"{1e3 * known.low_mm:.3g}-{1e3 * known.high_mm:.3g}"
+        found["of one camera"] = f"{1e3 * known.expected_of_one_mm:.3g}"
+        found["p"] = f"{known.p_value:.2g}"
+    return found
 
 
 def write_stability(
