@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -114,7 +114,7 @@ def print_stability(
     table.add_column("", no_wrap=True)
     for name in analyses:
         table.add_column(name, justify="right", no_wrap=True)
-    shown = [_shown(one, pixel_mm) for one in analyses.values()]
+    shown = [_shown(row) for row in stability_table(analyses, pixel_mm, noise_mm).to_dict("records")]
     # A method a column: with a row each, a screen of 80 characters would cut the numbers off.
     for measure in shown[0]:
         table.add_row(measure, *(of_method[measure] for of_method in shown))
@@ -125,19 +125,23 @@ def print_stability(
     console.print(f"[{colour}]{method}: {verdict}[/{colour}]", highlight=False, soft_wrap=True)
 
 
-def _shown(one: Analysis, pixel_mm: float) -> dict[str, str]:
-    """The numbers of a method in micrometres; those that need a covariance are empty without."""
-    v, known = one.offsets, one.uncertainty
-    sizes = (v.rmse_mm, v.rmse_measured_mm, np.linalg.norm(v.offsets, axis=1).max())
-    rmse, measured, largest = (f"{1e3 * float(s):.4g}" for s in sizes)
-    found = {"RMSE_offset": rmse, "in pixels": f"{float(v.rmse_mm) / pixel_mm:.4g}", "as measured": measured}
-    found |= {"largest": largest, "sigma": "", "95 %": "", "of one camera": "", "p": ""}
-    if known is not None:
-        found["sigma"] = f"{1e3 * known.sigma_mm:.3g}"
-        found["95 %"] = f"{1e3 * known.low_mm:.3g}-{1e3 * known.high_mm:.3g}"
-        found["of one camera"] = f"{1e3 * known.expected_of_one_mm:.3g}"
-        found["p"] = f"{known.p_value:.2g}"
-    return found
+def _shown(row: Mapping[Hashable, Any]) -> dict[str, str]:
+    """A row of `stability_table` in micrometres; what needs a covariance is empty without."""
+    um = lambda name, digits: f"{1e3 * row[name]:.{digits}g}"  # noqa: E731
+    found = {
+        "RMSE_offset": um("rmse_offset_mm", 4),
+        "in pixels": f"{row['rmse_offset_px']:.4g}",
+        "as measured": um("rmse_measured_mm", 4),
+        "largest": um("largest_mm", 4),
+    }
+    if "sigma_mm" not in row:
+        return found | dict.fromkeys(("sigma", "95 %", "of one camera", "p"), "")
+    return found | {
+        "sigma": um("sigma_mm", 3),
+        "95 %": f"{um('low_mm', 3)}-{um('high_mm', 3)}",
+        "of one camera": um("expected_of_one_mm", 3),
+        "p": f"{row['p_value']:.2g}",
+    }
 
 
 def write_stability(

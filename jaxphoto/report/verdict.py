@@ -92,8 +92,8 @@ def _large_residuals(tables: Tables) -> list[str]:
     checked = (residuals["group"] == "image_points") & (residuals["redundancy_number"] > LEAST_CHECKED)
     found = residuals[checked & (residuals["w"].abs() > LARGE_W)]
     # A point in an image is one blunder, whichever of its coordinates shows it.
-    size = found["w"].abs().groupby([found["point"], found["image"]], sort=False).max()
-    large = size.sort_values(ascending=False)
+    by_image_point = found["w"].abs().groupby([found["point"], found["image"]], sort=False)
+    large = by_image_point.max().sort_values(ascending=False)
     if not len(large):
         return []
     shown = large.head(_SHOWN)

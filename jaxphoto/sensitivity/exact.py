@@ -29,7 +29,6 @@ from jaxphoto.adjustment.optimum import weigh_datum
 from jaxphoto.adjustment.padding import Places, crop_residuals
 from jaxphoto.adjustment.reduced import other_rows
 from jaxphoto.adjustment.residuals import Increments, Residuals, Values
-from jaxphoto.adjustment.shards import on_one_device
 from jaxphoto.adjustment.structure import Structure, structure_of
 from jaxphoto.arrays import still
 from jaxphoto.block import AXES
@@ -130,9 +129,8 @@ def sensitivity(adjusted: Adjustment, *, curvature: bool = True, points: Sequenc
 
 def _padded(adjusted: Adjustment) -> tuple[Places, Any, Any, Structure]:
     """What an adjustment was computed with: places, values, scale and structure."""
-    computed = adjusted.computed
-    values, scale = jax.tree.map(still, (computed.values, computed.factored.scale))
-    return computed.places, values, scale, on_one_device(computed.structure)
+    computed = adjusted.computed.on_one_device
+    return computed.places, computed.values, computed.factored.scale, computed.structure
 
 
 def _check_points(adjusted: Adjustment, points: Sequence[str]) -> None:

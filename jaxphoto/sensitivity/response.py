@@ -15,7 +15,6 @@ from jaxphoto.adjustment.normal import At
 from jaxphoto.adjustment.optimum import weigh_datum
 from jaxphoto.adjustment.padding import crop_state, pad_values
 from jaxphoto.adjustment.residuals import Increments, State, Values, state_at
-from jaxphoto.adjustment.shards import on_one_device
 from jaxphoto.adjustment.structure import Structure
 from jaxphoto.adjustment.values import unknowns_of, values_of, with_datum
 from jaxphoto.arrays import still
@@ -58,7 +57,7 @@ def response(
     thousand images; `jax.jvp` through `adjust` serves that.
     """
     check_optimum(adjusted)
-    s, computed = adjusted.structure, adjusted.computed
+    s, computed = adjusted.structure, adjusted.computed.on_one_device
     moved = values_of(
         block,
         adjusted.unknowns if start is None else start,
@@ -72,10 +71,9 @@ def response(
             "response compares numbers row by row, but the block has other rows than the adjusted one: "
             "change its values, or adjust it anew"
         )
-    values = jax.tree.map(still, computed.values)
-    padded = on_one_device(computed.structure)
+    values, padded = computed.values, computed.structure
     direction = jax.tree.map(_difference, pad_values(moved, s, padded, computed.places), values)
-    scale, curved = jax.tree.map(still, computed.factored.scale), np.array(float(curvature))
+    scale, curved = computed.factored.scale, np.array(float(curvature))
     arguments = (values, scale, _of_fixed(direction, padded), image_rows(adjusted), padded, curved)
     state, angles = run_compiled(_response, arguments, adjusted.seconds, "sensitivity")
     change = unknowns_of(crop_state(state, computed.places), adjusted.unknowns, s)
