@@ -28,7 +28,8 @@ from jaxphoto.adjustment import solve
 from jaxphoto.adjustment.band import factor_band
 from jaxphoto.adjustment.normal import At
 from jaxphoto.adjustment.optimum import zero_increments
-from jaxphoto.adjustment.reduced import other_rows, reduce_normal, tile_numbers, tile_parts
+from jaxphoto.adjustment.other_rows import other_rows
+from jaxphoto.adjustment.reduced import reduce_normal, tile_numbers, tile_parts
 from jaxphoto.adjustment.residuals import Increments, Values
 from jaxphoto.adjustment.result import Padded
 from jaxphoto.adjustment.shards import EVERYWHERE, along_points, sharded

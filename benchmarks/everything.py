@@ -18,6 +18,7 @@ def main() -> None:
     parser.add_argument("--ceres", type=Path, help="the C++ peers' binary")
     parser.add_argument("--bal", type=Path, help='a problem file of "Bundle Adjustment in the Large"')
     parser.add_argument("--ceres-bal", type=Path, help="the C++ peer's binary for it")
+    parser.add_argument("--field", type=Path, help="folder that holds mrcal_board; mrcal is the system's")
     parser.add_argument("--quick", action="store_true", help="a few minutes: small blocks, few rounds")
     arguments = parser.parse_args()
     for command in commands(arguments):
@@ -46,12 +47,14 @@ def commands(arguments) -> list[list[str]]:
     else:
         growth, blocks, device = ["--most", "1000000"], "20", []
     data = ["--npz", str(arguments.data)] if arguments.data else []
+    fields = [["test_field.py", "--data", str(arguments.field)]] if arguments.field else []
     return [
         *runs,
         ["growth.py", *growth],
         ["compilations.py", "--blocks", blocks],
         ["monte_carlo.py", *draws],
         ["twins.py", "--twins", *(["target"] if arguments.quick else ["target", "indoor", "uav"])],
+        *fields,
         ["lidar.py", *(["--points", "1000000"] if arguments.quick else [])],
         ["accelerator.py", *device, *data],
     ]

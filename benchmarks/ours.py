@@ -18,9 +18,10 @@ from machine import memory, pinned
 import jaxphoto
 from jaxphoto import FREE, Unknowns, read_source
 from jaxphoto.adjustment import solve
-from jaxphoto.block import Attitudes, Block, Datum, Distances, ImageRows, Rows, Start
+from jaxphoto.block import Block, Datum, Start
 from jaxphoto.camera import Brown, InteriorOrientation, Sensor, set_parameter
 from jaxphoto.collinearity import ExteriorOrientation
+from jaxphoto.observations import Attitudes, ControlRows, Distances, ImageRows, StationRows
 from jaxphoto.unknowns import default_priors
 
 NAMES = ("c_mm", "xp_mm", "yp_mm", "k1", "k2")
@@ -55,9 +56,9 @@ def block_of(problem: Problem, title: str) -> Block:
         image_time=np.zeros(n_images),
         image_points=ImageRows(p.obs_img, p.obs_pt, p.obs_xy, np.full(p.obs_xy.shape, p.sigma_img)),
         control=_rows(p.gcp_pt, p.gcp_obs, p.gcp_sigma),
-        fixed=Rows.none(),
-        check=Rows.none(),
-        stations=_rows(np.arange(n_images), p.sta_obs, p.sta_sigma),
+        fixed=ControlRows.none(),
+        check=ControlRows.none(),
+        stations=_rows(np.arange(n_images), p.sta_obs, p.sta_sigma, StationRows),
         attitudes=Attitudes.none(),
         distances=Distances.none(),
         datum=Datum(),
@@ -66,9 +67,9 @@ def block_of(problem: Problem, title: str) -> Block:
     )
 
 
-def _rows(who: np.ndarray, values: np.ndarray, sigmas: np.ndarray) -> Rows:
+def _rows(who: np.ndarray, values: np.ndarray, sigmas: np.ndarray, kind=ControlRows):
     n = len(who)
-    return Rows(np.repeat(who, 3), np.tile(np.arange(3), n), np.ravel(values), np.ravel(sigmas))
+    return kind(np.repeat(who, 3), np.tile(np.arange(3), n), np.ravel(values), np.ravel(sigmas))
 
 
 class Worker:

@@ -163,7 +163,7 @@ def _images_of(exterior: ExteriorOrientation, places: jax.Array) -> tuple[jax.Ar
 
     def of_point(one, place):
         # Far outside the format the distortion cannot be inverted, and behind the camera there is no image.
-        seen = TRUTH.valid(project_ideal(TRUTH.c, one, place)) & (camera_coordinates(one, place)[2] < 0)
+        seen = TRUTH.valid(project_ideal(TRUTH, one, place)) & (camera_coordinates(one, place)[2] < 0)
         return project(TRUTH, one, place), seen
 
     return jax.vmap(jax.vmap(of_point, in_axes=(None, 0)), in_axes=(0, None))(exterior, places)

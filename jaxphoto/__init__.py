@@ -7,6 +7,7 @@ cache on disk.
 import contextlib
 import importlib
 import os
+import pkgutil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,28 +22,21 @@ _chosen = "host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
 if jax.config.values["jax_num_cpu_devices"] <= 0 and not _chosen:
     # Too late where JAX has begun to compute: then its devices stay what they are.
     with contextlib.suppress(RuntimeError):
-        jax.config.update("jax_num_cpu_devices", len(os.sched_getaffinity(0)))
+        # Those that this process may use, where the system says it (macOS and Windows do not).
+        _cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        jax.config.update("jax_num_cpu_devices", _cores)
 if jax.config.values["jax_compilation_cache_dir"] is None:
     _cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jaxphoto"
     jax.config.update("jax_compilation_cache_dir", str(_cache))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 
 from jaxphoto.adjustment import MAX_STEPS, Adjustment, Outcome, common_sizes
-from jaxphoto.block import Block
+from jaxphoto.block import Block, Datum, Frame, Start
 from jaxphoto.camera import (
     AbstractDistortion,
-    AffineBrown,
-    Balanced,
-    Brown,
-    Brown14,
-    BundlerRadial,
-    Ebner,
-    Gruen,
+    AbstractProjection,
     InteriorOrientation,
-    PpsRadial,
-    RadialPolynomial,
     Sensor,
-    Smac,
     conversion_error,
     decentring_from_symmetry,
     principal_points,
@@ -50,45 +44,81 @@ from jaxphoto.camera import (
     rebalance_covariance,
     symmetry_from_decentring,
 )
+from jaxphoto.camera.distortion import *  # noqa: F403 - all that are declared are public
+from jaxphoto.camera.distortion import DISTORTIONS
+from jaxphoto.camera.projection import *  # noqa: F403
+from jaxphoto.camera.projection import PROJECTIONS
 from jaxphoto.collinearity import ExteriorOrientation, image_ray, intersect, project
 from jaxphoto.errors import BlockError, DatumError, InputError, JaxphotoError, RankError
-from jaxphoto.georeferencing import Mount, StripBias, Surface, direct_orientation, ground_point
+from jaxphoto.georeferencing import Corrections, Exposure, Mount, StripBias, Surface, direct_orientation, ground_point
+from jaxphoto.observations import (
+    AbstractObservations,
+    Attitudes,
+    ControlRows,
+    Distances,
+    ImageRows,
+    KnownParameters,
+    StationRows,
+    SurfaceRows,
+    correlated,
+    touching,
+)
+from jaxphoto.parameters import AbstractParameters
 from jaxphoto.procedures import adjust, boresight, georeference
 from jaxphoto.simulation import simulate
-from jaxphoto.statistics import angle_differences, covariance, point_differences
-from jaxphoto.unknowns import FIXED, FREE, Unknowns, Weighted
+from jaxphoto.statistics import angle_differences, covariance, point_differences, significance
+from jaxphoto.unknowns import FIXED, FREE, Unknowns, Weighted, default_priors
 
 if TYPE_CHECKING:
     from jaxphoto.io import convert, read_block, read_recipe, read_source, write_block, write_simulation
+    from jaxphoto.procedures.calibration import calibrate
+    from jaxphoto.procedures.lidar import simultaneous
+    from jaxphoto.procedures.orientation import orient
     from jaxphoto.report import Tables
     from jaxphoto.sensitivity import bias, monte_carlo, readjust
 
 __version__ = "0.1.0"
 
 __all__ = [
-    "FIXED", "FREE", "MAX_STEPS", "AbstractDistortion", "Adjustment", "AffineBrown", "Balanced", "Block",
-    "BlockError", "Brown", "Brown14", "BundlerRadial", "DatumError", "Ebner", "ExteriorOrientation", "Gruen",
-    "InputError", "InteriorOrientation", "JaxphotoError", "Mount", "Outcome", "PpsRadial", "RadialPolynomial",
-    "RankError", "Sensor", "Smac", "StripBias", "Surface", "Tables", "Unknowns", "Weighted", "adjust",
-    "angle_differences", "bias", "boresight", "common_sizes", "conversion_error", "convert", "covariance",
-    "decentring_from_symmetry", "direct_orientation", "georeference", "ground_point", "image_ray", "intersect",
-    "monte_carlo", "point_differences", "principal_points", "project", "read_block", "read_recipe",
-    "read_source", "readjust", "rebalance", "rebalance_covariance", "simulate", "symmetry_from_decentring",
-    "write_block", "write_simulation",
+    *(model.__name__ for model in (*DISTORTIONS.values(), *PROJECTIONS.values())),
+    "FIXED", "FREE", "MAX_STEPS", "AbstractDistortion", "AbstractObservations", "AbstractParameters",
+    "AbstractProjection", "Adjustment", "Attitudes", "Block", "BlockError", "ControlRows", "Corrections", "Datum",
+    "DatumError", "Distances", "Exposure", "ExteriorOrientation", "Frame", "ImageRows", "InputError",
+    "InteriorOrientation", "JaxphotoError", "KnownParameters", "Mount", "Outcome", "RankError", "Sensor", "Start",
+    "StationRows", "StripBias", "Surface", "SurfaceRows", "Tables", "Unknowns", "Weighted", "adjust",
+    "angle_differences", "bias", "boresight", "calibrate", "common_sizes", "conversion_error", "convert",
+    "correlated", "covariance", "decentring_from_symmetry", "default_priors", "direct_orientation", "georeference",
+    "ground_point", "image_ray", "intersect", "monte_carlo", "orient", "point_differences", "principal_points",
+    "project", "read_block", "read_recipe", "read_source", "readjust", "rebalance", "rebalance_covariance",
+    "significance", "simulate", "simultaneous", "symmetry_from_decentring", "touching", "write_block",
+    "write_simulation",
 ]  # fmt: skip
 
 # Files and tables bring pandas and more, a third of a second, and studies are not for every day: they are imported when
-# first asked for.
+# first asked for, as is every room. The names of each room, as imported above for whoever reads types.
 _LATER = {
-    "convert": "io", "read_block": "io", "read_recipe": "io", "read_source": "io", "write_block": "io",
-    "write_simulation": "io", "Tables": "report", "bias": "sensitivity", "monte_carlo": "sensitivity",
-    "readjust": "sensitivity",
-}  # fmt: skip
+    "io": ("convert", "read_block", "read_recipe", "read_source", "write_block", "write_simulation"),
+    "procedures.calibration": ("calibrate",),
+    "procedures.lidar": ("simultaneous",),
+    "procedures.orientation": ("orient",),
+    "report": ("Tables",),
+    "sensitivity": ("bias", "monte_carlo", "readjust"),
+}
 
 
 def __getattr__(name: str) -> Any:
-    if name in _LATER.values():
+    for room, names in _LATER.items():
+        if name in names:
+            return getattr(importlib.import_module(f"jaxphoto.{room}"), name)
+    if name in _rooms():
         return importlib.import_module(f"jaxphoto.{name}")
-    if name in _LATER:
-        return getattr(importlib.import_module(f"jaxphoto.{_LATER[name]}"), name)
     raise AttributeError(f"module 'jaxphoto' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    """The names of the package and its rooms: what tab completion offers."""
+    return sorted({*__all__, *_rooms(), "__version__"})
+
+
+def _rooms() -> set[str]:
+    return {module.name for module in pkgutil.iter_modules(__path__)}  # noqa: F405

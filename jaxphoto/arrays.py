@@ -1,5 +1,6 @@
 """The arrays of data and results: numpy's or JAX's, whichever the moment asks for."""
 
+import typing
 from collections.abc import Sequence
 from typing import Any
 
@@ -34,3 +35,22 @@ def joined(parts: Sequence) -> Numbers:
     parts = [still(part) for part in parts]
     traced = any(isinstance(part, jax.core.Tracer) for part in parts)
     return jnp.concatenate(parts) if traced else np.concatenate(parts)
+
+
+def vector_of(scalars: Sequence) -> Any:
+    """One float64 array of scalars, NumPy's unless one is being traced."""
+    traced = any(isinstance(x, jax.core.Tracer) for x in scalars)
+    return jnp.stack([jnp.asarray(x, float) for x in scalars]) if traced else np.array(scalars, float)
+
+
+def annotated(hint: Any) -> tuple[list[str], bool] | None:
+    """The axes that an annotation names, and whether it is of whole numbers: ["n", "2"] of `Int[np.ndarray, "n 2"]`.
+
+    None where it says nothing of an array.
+    """
+    kind = next((a for a in (*typing.get_args(hint), hint) if hasattr(a, "dim_str")), None)
+    if kind is None:
+        return None
+    # Axes of many objects, as in "3 *images", are none of the object's own.
+    axes = [axis for axis in kind.dim_str.split() if not axis.startswith("*")]
+    return axes, not any("float" in name for name in kind.dtypes)

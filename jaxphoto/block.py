@@ -1,11 +1,11 @@
 """The block: observations as rows, and who observed what.
 
-A row of `Rows` is (who, axis, value, sigma). "Vertical control" is then rows with axis 2: there is no NaN and no
+Observations are rows (`jaxphoto.observations`): "vertical control" is rows with axis 2, so there is no NaN and no
 infinite sigma, and the redundancy is a count. Units are metres, radians and millimetres on the image.
 """
 
-import dataclasses
-from typing import Literal
+import functools
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -14,164 +14,24 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxphoto.arrays import Numbers, joined, still
+from jaxphoto.block_from_arrays import block_fields
+from jaxphoto.block_parts import Datum, Frame, Motion, Start
 from jaxphoto.camera import Sensor
 from jaxphoto.collinearity import ExteriorOrientation
+from jaxphoto.errors import BlockError
 from jaxphoto.georeferencing import NOMINAL, Corrections, Exposure, Mount, StripBias, direct_orientation
-from jaxphoto.georeferencing.map_frame import MapFrame
+from jaxphoto.observations import (
+    AbstractObservations,
+    Attitudes,
+    ControlRows,
+    Distances,
+    ImageRows,
+    KnownParameters,
+    StationRows,
+    SurfaceRows,
+)
+from jaxphoto.short_repr import block_repr
 from jaxphoto.unknowns import Unknowns
-
-AXES = ("X", "Y", "Z")
-ATTITUDE_AXES = ("roll", "pitch", "yaw")
-
-
-class ImageRows(eqx.Module):
-    """Measured image coordinates (mm, from the image centre) of `point` in `image`, sorted by point."""
-
-    image: Int[np.ndarray, "n"]
-    point: Int[np.ndarray, "n"]
-    xy: Float[Numbers, "n 2"]
-    sigma: Float[Numbers, "n 2"]
-
-
-class Rows(eqx.Module):
-    """One scalar each: `who` (index of a point or an image), `axis` (0, 1, 2), `value` and `sigma`."""
-
-    who: Int[np.ndarray, "n"]
-    axis: Int[np.ndarray, "n"]
-    value: Float[Numbers, "n"]
-    sigma: Float[Numbers, "n"]
-
-    @staticmethod
-    def none() -> "Rows":
-        """No rows."""
-        return Rows(np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros(0))
-
-    @staticmethod
-    def joined(*parts: "Rows") -> "Rows":
-        """The rows of all `parts`, in this order."""
-        who, axis, value, sigma = (joined(field) for field in zip(*(p.fields for p in parts), strict=True))
-        return Rows(who, axis, value, sigma)  # type: ignore[arg-type]
-
-    def take(self, chosen: np.ndarray) -> "Rows":
-        """The rows that `chosen` (an index or a mask) names."""
-        return Rows(self.who[chosen], self.axis[chosen], still(self.value)[chosen], still(self.sigma)[chosen])
-
-    @property
-    def fields(self) -> tuple:
-        """who, axis, value, sigma."""
-        return self.who, self.axis, self.value, self.sigma
-
-
-class Attitudes(eqx.Module):
-    """Observed roll, pitch, yaw (rad, all three) of `image` with their sigmas (rad)."""
-
-    image: Int[np.ndarray, "n"]
-    roll_pitch_yaw: Float[Numbers, "n 3"]
-    sigma: Float[Numbers, "n 3"]
-
-    @staticmethod
-    def none() -> "Attitudes":
-        """No rows."""
-        return Attitudes(np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 3)))
-
-
-class Distances(eqx.Module):
-    """Scale bars: the distance (m) between two points."""
-
-    points: Int[np.ndarray, "n 2"]
-    value: Float[Numbers, "n"]
-    sigma: Float[Numbers, "n"]
-
-    @staticmethod
-    def none() -> "Distances":
-        """No rows."""
-        return Distances(np.zeros((0, 2), int), np.zeros(0), np.zeros(0))
-
-
-class SurfaceRows(eqx.Module):
-    """Points observed to lie on the surface that a laser scanner measured: on the plane through `foot` (m).
-
-        normal . (X - foot + shift) + turn . boresight = 0
-
-    with standard deviation `sigma` (m), and the shift of the lidar strip and the boresight of `Unknowns.scanner`, where
-    the block has one. `turn` (m) is by how much a unit of boresight has raised `foot` along `normal`
-    (`georeferencing.raised_by_boresight`).
-    """
-
-    point: Int[np.ndarray, "n"]
-    strip: Int[np.ndarray, "n"]
-    """Of `Unknowns.scanner.shifts`, in their order; 0 in a block without a scanner."""
-    foot: Float[Numbers, "n 3"]
-    normal: Float[Numbers, "n 3"]
-    turn: Float[Numbers, "n 3"]
-    sigma: Float[Numbers, "n"]
-
-    @staticmethod
-    def none() -> "SurfaceRows":
-        """No rows."""
-        return SurfaceRows(*(np.zeros(0, int),) * 2, *(np.zeros((0, 3)),) * 3, np.zeros(0))
-
-    def take(self, chosen: np.ndarray) -> "SurfaceRows":
-        """The rows that `chosen` (an index or a mask) names."""
-        return jax.tree.map(lambda v: still(v)[chosen], self)
-
-
-@dataclasses.dataclass(frozen=True)
-class Datum:
-    """How position, orientation and scale are fixed where observations leave them open.
-
-    `control`: they must not be open. `minimal`: just enough coordinates of points held at their start values.
-    `inner`: inner constraints over all points, all images or the points named (`over`); `scale` None means
-    "constrain the scale if it is open".
-    """
-
-    kind: Literal["control", "minimal", "inner"] = "control"
-    over: Literal["points", "images"] | tuple[str, ...] = "points"
-    scale: bool | None = None
-
-
-class Motion(eqx.Module):
-    """How the GNSS/IMU moves at each exposure, for a time offset to act on (`georeferencing.Exposure`)."""
-
-    velocity: Float[Numbers, "images 3"]
-    """In the object frame, m/s."""
-    rate: Float[Numbers, "images 3"]
-    """About the body's right, forward and up axes, rad/s."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Frame:
-    """The object frame of a block, and how to come back to the frame of its files.
-
-    `local`, `enu`: Cartesian, as the files give it. `grid`: map-grid coordinates taken as they stand, which is no
-    Cartesian frame. `epsg`: files in the EPSG system `code`, with heights of the EPSG system `vertical` (None: above
-    the ellipsoid) and yaw from true or grid north, were brought to the local east-north-up frame whose origin is
-    (longitude, latitude in degrees, ellipsoidal height in m).
-    """
-
-    kind: Literal["local", "enu", "grid", "epsg"] = "local"
-    code: int | None = None
-    vertical: int | None = None
-    yaw: Literal["true", "grid"] = "true"
-    origin: tuple[float, float, float] | None = None
-
-    @property
-    def map(self) -> MapFrame:
-        """To and from the map coordinates of the files; of kind `epsg` only."""
-        if self.code is None or self.origin is None:
-            raise ValueError(f"only a frame of kind epsg with an origin has map coordinates, this is {self}")
-        return MapFrame(self.code, self.vertical, self.origin)
-
-
-class Start(eqx.Module):
-    """Approximate unknowns, and which images and points they are truly known for.
-
-    The arrays of unknown images and points hold zeros (identity rotations) until approximations are found.
-    """
-
-    unknowns: Unknowns
-    image_known: np.ndarray
-    point_known: np.ndarray
 
 
 class Block(eqx.Module):
@@ -190,10 +50,10 @@ class Block(eqx.Module):
     image_strip: tuple[str, ...] = eqx.field(static=True)
     image_time: Float[Numbers, "images"]
     image_points: ImageRows
-    control: Rows
-    fixed: Rows
-    check: Rows
-    stations: Rows
+    control: ControlRows
+    fixed: ControlRows
+    check: ControlRows
+    stations: StationRows
     attitudes: Attitudes
     distances: Distances
     datum: Datum = eqx.field(static=True)
@@ -203,6 +63,57 @@ class Block(eqx.Module):
     frame: Frame = eqx.field(static=True, default=Frame())
     corrections: Corrections = eqx.field(static=True, default=Corrections())
     surfaces: SurfaceRows = eqx.field(default_factory=SurfaceRows.none)
+    more: tuple[AbstractObservations | KnownParameters, ...] = ()
+    """Observations of further kinds, and parameters known beforehand together."""
+    flight_time: Float[Numbers, "images"] | None = None
+    """Seconds from the middle of the flight; `image_time` is from those of the strips. None: they are the same."""
+    partitions: dict[str, tuple[str, ...]] = eqx.field(static=True, default_factory=dict)
+    """Owners of parameters that are neither cameras nor mounts nor strips: by partition, the part that each image is in
+    ("" for none), such as intervals of time."""
+
+    def __check_init__(self) -> None:
+        for field, kind in (
+            ("stations", StationRows),
+            *((name, ControlRows) for name in ("control", "fixed", "check")),
+        ):
+            given = getattr(self, field)
+            if isinstance(given, AbstractObservations) and not isinstance(given, kind):
+                raise BlockError(f"Block.{field} takes {kind.__name__}, got {type(given).__name__}")
+
+    @property
+    def observations(self) -> tuple[AbstractObservations, ...]:
+        """All that an adjustment observes besides image points, by kind."""
+        further = (rows for rows in self.more if isinstance(rows, AbstractObservations))
+        return (self.stations, self.attitudes, self.control, self.surfaces, self.distances, *further)
+
+    def owners(self, owner: str) -> tuple[str, ...]:
+        """Of each image, the owner of parameters that belong to its `owner`, such as "camera"; "" where it has none.
+
+        Raises BlockError for a partition that the block does not have.
+        """
+        known = {
+            "image": self.images,
+            "camera": self.image_camera,
+            "mount": self.image_mount,
+            "strip": self.image_strip,
+            "block": ("",) * len(self.images),
+            # A laser scanner belongs to the block, but to none of its images.
+            "lidar": ("none",) * len(self.images),
+        } | self.partitions
+        if owner not in known:
+            raise BlockError(
+                f"parameters belong to the {owner} of an image, but the block has no such partition; give "
+                f'Block.partitions {{"{owner}": (...)}}, or one of {", ".join(known)}'
+            )
+        return known[owner]
+
+    __repr__ = block_repr
+
+    @staticmethod
+    @functools.wraps(block_fields)
+    def of(*args: Any, **kwargs: Any) -> "Block":
+        """The block of arrays and tables: see `block_fields`."""
+        return Block(**block_fields(*args, **kwargs))
 
 
 class SensorRows(eqx.Module):
@@ -276,4 +187,5 @@ def exposures(block: Block) -> Exposure:
     motion = block.motion if block.motion is not None else Motion(none, none)
     mounts = block.start.unknowns.mounts
     nominal = np.stack([mounts[name].nominal if name in mounts else NOMINAL["forward"] for name in block.image_mount])
-    return Exposure(block.image_time, motion.velocity, motion.rate, nominal)  # type: ignore[arg-type]
+    flight_time = block.image_time if block.flight_time is None else block.flight_time
+    return Exposure(block.image_time, motion.velocity, motion.rate, nominal, flight_time)  # type: ignore[arg-type]

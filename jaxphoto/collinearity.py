@@ -1,5 +1,8 @@
 """Collinearity: from an object point to its image, from an image to its ray, from rays to a point.
 
+What a direction in the camera's frame becomes in the image is the camera's own matter (`camera.projection`): the
+perspective plane, or a fisheye's, whose rays may come from behind the image plane.
+
 Each function is of one image and one point (intersection: of one point and its rays); map over rows with
 `jax.vmap`. Frames, signs and units: docs/conventions.md. Source of the equations: paper 001, equation (1).
 """
@@ -7,10 +10,11 @@ Each function is of one image and one point (intersection: of one point and its 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxphoto.camera import InteriorOrientation
 from jaxphoto.rotation import matrix_from_omega_phi_kappa, omega_phi_kappa_from_matrix, rotate
+from jaxphoto.single import single
 
 
 class ExteriorOrientation(eqx.Module):
@@ -34,20 +38,32 @@ class ExteriorOrientation(eqx.Module):
         return jnp.vectorize(omega_phi_kappa_from_matrix, signature="(i,j)->(i)")(self.camera_from_object)
 
 
+def _single(exterior: ExteriorOrientation) -> ExteriorOrientation:
+    """The orientation of one image, of arrays; see `jaxphoto.single`."""
+    return ExteriorOrientation(
+        single("exterior.position", exterior.position, 3),
+        single("exterior.camera_from_object", exterior.camera_from_object, 3, 3),
+    )
+
+
 def camera_coordinates(exterior: ExteriorOrientation, point: Float[Array, "3"]) -> Float[Array, "3"]:
     """Object point (m) in the camera frame: x right, y up, z out of the camera's back; z < 0 is in front."""
     return rotate(exterior.camera_from_object, point - exterior.position)
 
 
-def project_ideal(c, exterior: ExteriorOrientation, point: Float[Array, "3"]) -> Float[Array, "2"]:
-    """Ideal image coordinate (mm, from the principal point): x = -c U / W, y = -c V / W."""
-    return _ideal(c, camera_coordinates(exterior, point))
+def project_ideal(
+    interior: InteriorOrientation, exterior: ExteriorOrientation, point: Float[Array, "3"]
+) -> Float[Array, "2"]:
+    """Ideal image coordinate (mm, from the principal point); of the perspective plane x = -c U / W, y = -c V / W."""
+    u, v, w = camera_coordinates(exterior, point)
+    return interior.ideal_from_direction(u, v, w)
 
 
-def _ideal(c, in_camera) -> Float[Array, "2"]:
-    u, v, w = in_camera
-    scale = -c / w
-    return jnp.stack([u * scale, v * scale])
+def in_field(interior: InteriorOrientation, exterior: ExteriorOrientation, point: Float[Array, "3"]) -> Bool[Array, ""]:
+    """Whether a point (m) has an image, of whatever format: its direction has (for a perspective camera it lies in
+    front), and there the distortion does not fold."""
+    u, v, w = camera_coordinates(exterior, point)
+    return interior.projection.sees(u, v, w) & interior.invertible(interior.ideal_from_direction(u, v, w))
 
 
 def project(
@@ -55,18 +71,18 @@ def project(
 ) -> Float[Array, "2"]:
     """Measured image coordinate (mm, from the image centre) of an object point (m).
 
-    Where the ideal coordinate lies outside the distortion's monotone range (`InteriorOrientation.valid`), or the
-    point behind the camera (`camera_coordinates`), the value is meaningless.
+    Where the point is not `in_field`, the value is meaningless.
     """
-    return interior.measured_from_ideal(project_ideal(interior.c, exterior, point))
+    return interior.measured_from_ideal(project_ideal(interior, _single(exterior), single("point", point, 3)))
 
 
 def image_ray(
     interior: InteriorOrientation, exterior: ExteriorOrientation, xy: Float[Array, "2"]
 ) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
     """Origin (m) and unit direction, in the object frame, of the ray of a measured image coordinate (mm)."""
-    x, y = interior.ideal_from_measured(xy)
-    direction = rotate(exterior.camera_from_object.T, jnp.stack([x, y, -jnp.asarray(interior.c, x.dtype)]))
+    exterior = _single(exterior)
+    in_camera = interior.direction_from_ideal(interior.ideal_from_measured(xy))
+    direction = rotate(exterior.camera_from_object.T, jnp.stack(in_camera))
     return exterior.position, direction / jnp.sqrt(jnp.sum(direction**2))
 
 
@@ -90,7 +106,8 @@ def camera_residual(
 ) -> Float[Array, "2"]:
     """`image_residual` of a point in the camera frame (m; see `camera_coordinates`)."""
     # By component to the end: arrays of two that are computed with in between cost an adjustment a tenth of its time.
-    projection = _ideal(interior.c, in_camera)
+    u, v, w = in_camera
+    projection = interior.ideal_from_direction(u, v, w)
     reduced = jnp.stack([xy[0] - interior.x_p, xy[1] - interior.y_p])
     (x, y), (x0, y0) = (
         (interior.closed_form(reduced), projection)
@@ -113,7 +130,8 @@ def intersect(
 
     `directions` are unit vectors; rays of weight zero do not count. Parallel rays give no point: NaN or far away.
     """
-    w = jnp.ones(len(origins)) if weights is None else weights
+    origins, directions = single("origins", origins, None, 3), single("directions", directions, len(origins), 3)
+    w = jnp.ones(len(origins)) if weights is None else single("weights", weights, len(origins))
     across = w[:, None, None] * (jnp.eye(3) - directions[:, :, None] * directions[:, None, :])
     # Solved about the first origin, so that large coordinates lose no digits.
     b = jnp.einsum("nij,nj->i", across, origins - origins[0])

@@ -115,7 +115,7 @@ def quaternion_from_matrix(matrix: Float[Array, "3 3"]) -> Float[Array, "4"]:
 
 
 def small_rotation(theta: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """`exp(-[theta]x)`: the rotation that takes V to `V - theta x V` to first order (docs/models.md).
+    """`exp(-[theta]x)`, theta in rad: the rotation that takes V to `V - theta x V` to first order (docs/models.md).
 
     Exact for any angle, smooth at zero. It is how the adjustment updates every rotation, on the camera's
     side: `camera_from_object = small_rotation(theta) @ start`, so phi = 90 degrees is no singularity.
@@ -133,7 +133,7 @@ def small_rotation(theta: Float[Array, "3"]) -> Float[Array, "3 3"]:
 
 
 def small_angles(matrix: Float[Array, "3 3"]) -> Float[Array, "3"]:
-    """The rotation vector theta of `small_rotation(theta) = matrix`; |theta| below half a turn."""
+    """The rotation vector theta (rad) of `small_rotation(theta) = matrix`; |theta| below half a turn."""
     m = matrix
     s = 0.5 * jnp.stack([m[1, 2] - m[2, 1], m[2, 0] - m[0, 2], m[0, 1] - m[1, 0]])
     cosine = 0.5 * (m[0, 0] + m[1, 1] + m[2, 2] - 1)

@@ -5,20 +5,27 @@ them. "The second experiment without k_2" is one `eqx.tree_at`:
 
     priors = eqx.tree_at(lambda u: u.interior["kodak"].distortion.k2, priors, FIXED)
 
-For interior orientation the leaves are scalars. `exterior.position`, `exterior.camera_from_object`, `points`, and
-each mount's, strip's and scanner's vector take one prior for the whole array.
+For interior orientation the leaves are scalars. `exterior.position`, `exterior.camera_from_object`, `points`, and each
+vector of declared parameters (mounts, strips, scanner, `more`) take one prior for the whole array.
 """
 
 import enum
+from typing import Any
 
 import equinox as eqx
 import jax
+import numpy as np
 from jaxtyping import Float
 
 from jaxphoto.arrays import Numbers
-from jaxphoto.camera import InteriorOrientation
+from jaxphoto.camera import InteriorOrientation, PrincipalDistanceRate
 from jaxphoto.collinearity import ExteriorOrientation
-from jaxphoto.georeferencing import Mount, Scanner, StripBias
+from jaxphoto.errors import InputError
+from jaxphoto.georeferencing import FlightBias, Mount, Scanner, StripBias
+from jaxphoto.parameters import AbstractParameters
+
+UNKNOWNS: tuple[type[AbstractParameters], ...] = (Scanner, Mount, StripBias, FlightBias, PrincipalDistanceRate)
+"""The classes of declared parameters that a block folder may hold; one of your own is given to `read_block`."""
 
 
 class Prior(enum.Enum):
@@ -35,16 +42,30 @@ FREE, FIXED = Prior.FREE, Prior.FIXED
 
 
 class Weighted(eqx.Module):
-    """An unknown observed beforehand as `value` with standard deviation `sigma` (its own units, arrays allowed)."""
+    """An unknown observed beforehand as `value` with standard deviation `sigma` (its own units, arrays allowed).
+
+    A vector may have a full `covariance` matrix instead: (3, 3), or of positions and points (n, 3, 3), one for each.
+    The value of `exterior.camera_from_object` is rotation matrices, its sigma of small rotations in the camera frame
+    (rad). What goes over several parameters at once is `observations.KnownParameters`.
+    """
 
     value: Float[Numbers, "..."] | float
     sigma: Float[Numbers, "..."] | float
+    covariance: Float[Numbers, "..."] | None
+
+    def __init__(self, value, sigma=None, *, covariance=None):
+        if (sigma is None) == (covariance is None):
+            raise ValueError("Weighted takes a value and either its sigma or its covariance")
+        self.value, self.covariance = value, covariance
+        self.sigma = sigma if covariance is None else np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
 
 
 class Unknowns(eqx.Module):
     """All parameters of a block: per camera, per image, per point, per mount and per strip; and of a laser scanner.
 
-    `exterior` has a leading axis over the block's images and `points` (m) over its points, in the block's order.
+    `exterior` has a leading axis over the block's images and `points` (m) over its points, in the block's order. `more`
+    holds further declared parameters (`jaxphoto.parameters`) by kind and owner: `{"c_rates": {"kodak": rate}}`. The
+    owner of what belongs to the whole block is "".
     """
 
     interior: dict[str, InteriorOrientation]
@@ -53,6 +74,33 @@ class Unknowns(eqx.Module):
     mounts: dict[str, Mount]
     strips: dict[str, StripBias]
     scanner: Scanner | None = None
+    more: dict[str, dict[str, AbstractParameters]] = eqx.field(default_factory=dict)
+
+    @property
+    def tables(self) -> dict[str, dict[str, Any]]:
+        """All declared parameters (or their priors), by kind and owner."""
+        scanner: dict[str, dict[str, Any]] = {} if self.scanner is None else {"scanner": {"": self.scanner}}
+        return scanner | {"mounts": self.mounts, "strips": self.strips} | self.more
+
+    def with_tables(self, tables: dict[str, dict[str, Any]]) -> "Unknowns":
+        """The same with other declared parameters, of all kinds."""
+        own = dict(tables)
+        scanner, mounts, strips = own.pop("scanner", {"": None})[""], own.pop("mounts"), own.pop("strips")
+        return Unknowns(self.interior, self.exterior, self.points, mounts, strips, scanner, own)
+
+
+def is_prior(tree: Any) -> bool:
+    """Whether a node of a tree of priors is a leaf."""
+    return isinstance(tree, Prior | Weighted)
+
+
+def check_prior(label: str, prior: Any) -> None:
+    """Raises InputError, which names the parameter, where `prior` is none."""
+    if not is_prior(prior):
+        given = " ".join(repr(prior).split())
+        raise InputError(
+            f"{label}: {given:.80} is no prior; use FREE, FIXED (at the start value) or Weighted(value, sigma)"
+        )
 
 
 def uniform_priors(unknowns: Unknowns, prior: Prior) -> Unknowns:

@@ -16,21 +16,12 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxphoto.arrays import still
-from jaxphoto.block import (
-    AXES,
-    Attitudes,
-    Block,
-    Datum,
-    Distances,
-    ImageRows,
-    Rows,
-    SurfaceRows,
-    direct_exterior,
-    sensor_rows,
-)
+from jaxphoto.block import Block, Datum, direct_exterior, sensor_rows
 from jaxphoto.camera import set_parameter
 from jaxphoto.errors import BlockError
 from jaxphoto.georeferencing import StripBias
+from jaxphoto.observations import AXES, AbstractObservations, Attitudes, ControlRows, StationRows
+from jaxphoto.parameters import AbstractParameters, dynamic_fields
 from jaxphoto.unknowns import FIXED, FREE
 
 
@@ -74,7 +65,7 @@ MODES: dict[str, Callable[[Block], Block]] = {"direct": direct, "integrated": in
 
 def without_stations(block: Block) -> Block:
     """No GNSS positions. What only they see is held: lever arms, shifts and drifts."""
-    return _hold_unseen(dataclasses.replace(block, stations=Rows.none()))
+    return _hold_unseen(dataclasses.replace(block, stations=StationRows.none()))
 
 
 def without_attitudes(block: Block) -> Block:
@@ -102,7 +93,7 @@ def control_only(block: Block, points: Collection[str]) -> Block:
         block,
         control=block.control.take(stay),
         fixed=block.fixed.take(held),
-        check=Rows.joined(block.check, block.control.take(~stay), block.fixed.take(~held)),
+        check=ControlRows.joined(block.check, block.control.take(~stay), block.fixed.take(~held)),
     )
 
 
@@ -115,9 +106,9 @@ def vertical_control(block: Block) -> Block:
     upright = check.axis == 2
     return dataclasses.replace(
         block,
-        control=Rows.joined(control.take(control.axis == 2), _as_control(check.take(upright), control)),
+        control=ControlRows.joined(control.take(control.axis == 2), _as_control(check.take(upright), control)),
         fixed=fixed.take(fixed.axis == 2),
-        check=Rows.joined(check.take(~upright), control.take(control.axis != 2), fixed.take(fixed.axis != 2)),
+        check=ControlRows.joined(check.take(~upright), control.take(control.axis != 2), fixed.take(fixed.axis != 2)),
     )
 
 
@@ -128,7 +119,7 @@ def all_control(block: Block, sigma: float | Float[np.ndarray, "3"] | None = Non
     is none or several.
     """
     promoted = _as_control(block.check, block.control, sigma)
-    return dataclasses.replace(block, control=Rows.joined(block.control, promoted), check=Rows.none())
+    return dataclasses.replace(block, control=ControlRows.joined(block.control, promoted), check=ControlRows.none())
 
 
 def hold_interior(block: Block, camera: str, values: Mapping[str, float]) -> Block:
@@ -175,13 +166,13 @@ def _part(block: Block, image: np.ndarray, point: np.ndarray) -> Block:
     camera, mount, strip = (
         tuple(of[i] for i in image) for of in (block.image_camera, block.image_mount, block.image_strip)
     )
-    rows, attitudes, distances, datum = block.image_points, block.attitudes, block.distances, block.datum
-    seen = np.flatnonzero((new_image[rows.image] >= 0) & (new_point[rows.point] >= 0))
-    turned = np.flatnonzero(new_image[attitudes.image] >= 0)
-    ends = new_point[np.asarray(distances.points, int).reshape(-1, 2)]
-    between = np.flatnonzero((ends >= 0).all(axis=1))
+    datum = block.datum
+    kept = lambda rows: rows.renumbered(image=new_image, point=new_point)  # noqa: E731
     if isinstance(datum.over, tuple):
         datum = Datum(datum.kind, tuple(name for name in datum.over if name in set(points)), datum.scale)
+
+    def owners(table):
+        return {name for own in table.values() for name in np.array(block.owners(own.owner), object)[image]}
 
     def used(tree):
         return dataclasses.replace(
@@ -189,6 +180,7 @@ def _part(block: Block, image: np.ndarray, point: np.ndarray) -> Block:
             interior=_only(tree.interior, camera),
             mounts=_only(tree.mounts, mount),
             strips=_only(tree.strips, strip),
+            more={kind: _only(table, owners(table)) for kind, table in tree.more.items()},
         )
 
     old = block.start
@@ -204,18 +196,17 @@ def _part(block: Block, image: np.ndarray, point: np.ndarray) -> Block:
         image_mount=mount,
         image_strip=strip,
         image_time=_taken(block.image_time, image),
-        image_points=ImageRows(
-            new_image[rows.image[seen]], new_point[rows.point[seen]], *_taken((rows.xy, rows.sigma), seen)
-        ),
-        control=_renumbered(block.control, new_point),
-        fixed=_renumbered(block.fixed, new_point),
-        check=_renumbered(block.check, new_point),
-        stations=_renumbered(block.stations, new_image),
-        attitudes=Attitudes(
-            new_image[attitudes.image[turned]], *_taken((attitudes.roll_pitch_yaw, attitudes.sigma), turned)
-        ),
-        surfaces=_with_points(block.surfaces, new_point),
-        distances=Distances(ends[between], *_taken((distances.value, distances.sigma), between)),
+        flight_time=_taken(block.flight_time, image),
+        image_points=kept(block.image_points),
+        control=kept(block.control),
+        fixed=kept(block.fixed),
+        check=kept(block.check),
+        stations=kept(block.stations),
+        attitudes=kept(block.attitudes),
+        surfaces=kept(block.surfaces),
+        distances=kept(block.distances),
+        more=tuple(kept(rows) if isinstance(rows, AbstractObservations) else rows for rows in block.more),
+        partitions={name: tuple(of[i] for i in image) for name, of in block.partitions.items()},
         datum=datum,
         start=dataclasses.replace(
             old, unknowns=start, image_known=old.image_known[image], point_known=old.point_known[point]
@@ -237,13 +228,18 @@ def _hold_unseen(block: Block) -> Block:
         mounts, biases = b.priors.mounts.values(), b.priors.strips.values()
         held = [] if positions else [m.lever_arm for m in mounts] + [v for s in biases for v in (s.shift, s.drift)]
         held += [] if turns else [m.boresight for m in mounts]
+        declared = [own for table in b.priors.more.values() for own in table.values() if not positions]
+        moving = [own for own in declared if type(own).station is not AbstractParameters.station]
+        held += [getattr(own, name) for own in moving for name in dynamic_fields(type(own))]
         return held + ([] if positions or turns else [m.time_offset for m in mounts])
 
     block = eqx.tree_at(unseen, block, replace_fn=lambda _: FIXED)
     return block if positions or turns else dataclasses.replace(block, motion=None)
 
 
-def _as_control(check: Rows, control: Rows, sigma: float | Float[np.ndarray, "3"] | None = None) -> Rows:
+def _as_control(
+    check: ControlRows, control: ControlRows, sigma: float | Float[np.ndarray, "3"] | None = None
+) -> ControlRows:
     """Check coordinates as control; those without a sigma take `sigma`, or that of the control on their axis."""
     own = np.asarray(check.sigma)
     taken = np.zeros(3)
@@ -264,16 +260,6 @@ def _numbers(kept: np.ndarray, n: int) -> np.ndarray:
     new = np.full(n, -1)
     new[kept] = np.arange(len(kept))
     return new
-
-
-def _renumbered(rows: Rows, new: np.ndarray) -> Rows:
-    kept = rows.take(np.flatnonzero(new[rows.who] >= 0))
-    return dataclasses.replace(kept, who=new[kept.who])
-
-
-def _with_points(surfaces: SurfaceRows, new: np.ndarray) -> SurfaceRows:
-    kept = surfaces.take(np.flatnonzero(new[surfaces.point] >= 0))
-    return dataclasses.replace(kept, point=new[kept.point])
 
 
 def _taken(tree, index: np.ndarray):

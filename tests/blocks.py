@@ -14,10 +14,11 @@ import jax
 import numpy as np
 
 from jaxphoto import FIXED, FREE, Outcome, Unknowns, Weighted, adjust, covariance
-from jaxphoto.block import Attitudes, Block, Datum, Distances, ImageRows, Rows, Start, SurfaceRows
+from jaxphoto.block import Block, Datum, Start
 from jaxphoto.camera import Balanced, Brown, InteriorOrientation, Sensor, Smac, set_parameter
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.georeferencing import Mount, Scanner, StripBias
+from jaxphoto.observations import Attitudes, ControlRows, Distances, ImageRows, StationRows, SurfaceRows
 from jaxphoto.rotation import small_rotation
 from jaxphoto.simulation import remeasure
 from jaxphoto.unknowns import default_priors
@@ -119,10 +120,10 @@ def bare(scene: Scene, cameras: dict[str, InteriorOrientation], of_image, mounts
         image_strip=("a",) * half + ("b",) * (n_images - half) if strips else ("",) * n_images,
         image_time=time if strips else np.zeros(n_images),
         image_points=ImageRows(image, point, np.zeros((n, 2)), np.full((n, 2), 0.004)),
-        control=Rows.none(),
-        fixed=Rows.none(),
-        check=Rows.none(),
-        stations=Rows.none(),
+        control=ControlRows.none(),
+        fixed=ControlRows.none(),
+        check=ControlRows.none(),
+        stations=StationRows.none(),
         attitudes=Attitudes.none(),
         distances=Distances.none(),
         datum=Datum(),
@@ -132,14 +133,14 @@ def bare(scene: Scene, cameras: dict[str, InteriorOrientation], of_image, mounts
     return Simulated(block, truth)
 
 
-def rows(who, axes=(0, 1, 2), sigma=0.03) -> Rows:
+def rows(who, axes=(0, 1, 2), sigma=0.03, kind=ControlRows):
     """Every axis of `axes` of `who`; values are for `measured` to fill."""
     who, axis = (v.ravel() for v in np.meshgrid(np.asarray(who, int), axes, indexing="ij"))
-    return Rows(who, axis, np.zeros(len(who)), np.full(len(who), sigma))
+    return kind(who, axis, np.zeros(len(who)), np.full(len(who), sigma))
 
 
-def all_stations(block: Block, sigma=0.10) -> Rows:
-    return rows(range(len(block.images)), sigma=sigma)
+def all_stations(block: Block, sigma=0.10) -> StationRows:
+    return rows(range(len(block.images)), sigma=sigma, kind=StationRows)
 
 
 def all_attitudes(block: Block, sigma=1e-4) -> Attitudes:
@@ -267,7 +268,7 @@ def _inner_shift() -> Simulated:
     block, truth = _strips()
     priors = {name: StripBias(FREE, FIXED) for name in truth.strips}
     block = eqx.tree_at(lambda b: b.priors.strips, block, priors)
-    return Simulated(dataclasses.replace(block, control=Rows.none(), datum=Datum("inner")), truth)
+    return Simulated(dataclasses.replace(block, control=ControlRows.none(), datum=Datum("inner")), truth)
 
 
 def _everything() -> Simulated:
@@ -287,7 +288,7 @@ def _everything() -> Simulated:
     block = dataclasses.replace(
         block,
         attitudes=jax.tree.map(lambda v: v[1:7], all_attitudes(block)),
-        control=Rows.joined(rows(CONTROL), rows((5, 21, 33), (2,))),
+        control=ControlRows.joined(rows(CONTROL), rows((5, 21, 33), (2,))),
         fixed=rows((17,), (0, 1), 0.0),
         distances=Distances(ends, np.zeros(3), np.array([0.02, 0.03, 0.01])),
     )
@@ -312,8 +313,10 @@ def _fixed_interior() -> Simulated:
 def _fixed_control() -> Simulated:
     """Control without error, among it a point that is fixed in height only; no stations."""
     block, truth = _cross()
-    fixed = Rows.joined(rows(CONTROL, sigma=0.0), rows((21,), (2,), 0.0))
-    return Simulated(dataclasses.replace(block, control=Rows.none(), fixed=fixed, stations=Rows.none()), truth)
+    fixed = ControlRows.joined(rows(CONTROL, sigma=0.0), rows((21,), (2,), 0.0))
+    return Simulated(
+        dataclasses.replace(block, control=ControlRows.none(), fixed=fixed, stations=StationRows.none()), truth
+    )
 
 
 def _surfaces() -> Simulated:
@@ -383,10 +386,43 @@ VARIANTS = {
 }
 
 
+def _field(n_images: int = 60) -> Simulated:
+    """A test field: points without error, each seen by nearly all images."""
+    rng = np.random.default_rng(13)
+    grid = np.stack(np.meshgrid(np.linspace(-300, 300, 5), np.linspace(-250, 250, 4)), axis=-1).reshape(-1, 2)
+    points = np.column_stack([grid + rng.normal(0, 20, grid.shape), rng.uniform(0, 150, len(grid))])
+    positions = np.column_stack([rng.normal(0, 60, (n_images, 2)), rng.normal(1000, 30, n_images)])
+    angles = rng.normal(0, 0.05, (n_images, 3)) + np.linspace(0, 6, n_images)[:, None] * [0, 0, 1]
+    block, truth = bare(Scene(positions, angles, points), {"one": BROWN}, ("one",) * n_images)
+    block = dataclasses.replace(block, fixed=rows(np.arange(len(block.points)), sigma=0.0))
+    return Simulated(free(block, "one"), truth)
+
+
+def _field_and_ground() -> Simulated:
+    """Points without error that nearly all images see, and others that few see; distances between both kinds."""
+    block, truth = _field(26)
+    fixed, n = np.arange(0, len(block.points), 2), len(block.points)
+    image, point, xy, sigma = (getattr(block.image_points, k) for k in ("image", "point", "xy", "sigma"))
+    few = (point % 2 == 0) | ((image + point) % 6 == 0)
+    ends = np.array([[0, 3], [5, 7]])
+    block = dataclasses.replace(
+        block,
+        image_points=ImageRows(image[few], point[few], xy[few], sigma[few]),
+        fixed=ControlRows.joined(rows(fixed, sigma=0.0), rows((n - 1,), (2,), 0.0)),
+        control=rows((1, 9)),
+        distances=Distances(ends, np.zeros(2), np.array([0.02, 0.03])),
+    )
+    return Simulated(block, truth)
+
+
+# Blocks of which fixed points lie at several places of the padded arrays.
+FIELDS = {"field": _field, "field_and_ground": _field_and_ground}
+
+
 @functools.cache
 def simulated(name: str) -> Simulated:
-    """One of `VARIANTS` with noisy observations."""
-    return measured(VARIANTS[name]())
+    """One of `VARIANTS` or `FIELDS` with noisy observations."""
+    return measured((VARIANTS | FIELDS)[name]())
 
 
 @functools.cache

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+# As `jaxphoto` does where it is imported first; here NumPy's OpenBLAS is loaded before, by JAX.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # What costs here is compiling: these halve it and more, and change results by rounding only (measured on jax 0.10.2).
 os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false")
 # What one process compiles serves the others and the next run: the smallest programs too, of which there are thousands.
@@ -17,13 +19,20 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 
 import jax
 
-from jaxphoto.compiling import run, store
+from tests.checked_types import check_types
+from tests.marks import QUICK
+
+check_types()
+
+from jaxphoto.compiling import run, store  # noqa: E402
 
 # The suite's programs are hundreds, of 2 MB: with a user's room each would be gone before another process needs it.
 store.MOST = 2_000_000_000
 # Of the 65,530 mappings of memory that Linux gives a process. A large program takes some three hundred, a module of
 # tests up to ten thousand.
 _MOST_MAPPINGS = 30_000
+# Bytes in memory, of pages of 4 kB: two processes and what they start must fit into 16 GB.
+_MOST_MEMORY = 4_000_000_000
 
 
 @pytest.fixture(scope="session")
@@ -38,12 +47,32 @@ def data_dir() -> Path:
     return folder
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark what `-m quick` runs, before pytest chooses by marks."""
+    chosen = {f"tests/{test}" for tests in QUICK.values() for test in tests}
+    for item in items:
+        # A module, a function or one case of it.
+        names = item.nodeid.split("::")[0], item.nodeid.split("[")[0], item.nodeid
+        if not item.get_closest_marker("slow") and not chosen.isdisjoint(names):
+            item.add_marker(pytest.mark.quick)
+
+
+def pytest_collection_finish() -> None:
+    """Look for garbage seldom, and not in what is there to stay: it took a quarter of the time that tracing takes."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(100_000, 10, 10)
+
+
 @pytest.fixture(scope="module", autouse=True)
 def programs_let_go():
-    """Let JAX's compiled programs go before a process runs out of mappings of memory; most are on disk."""
+    """Let JAX's compiled programs go before a process runs out of memory or of mappings; most are on disk."""
     yield
-    mappings = Path("/proc/self/maps")
-    if mappings.exists() and mappings.read_bytes().count(b"\n") > _MOST_MAPPINGS:
+    mappings, memory = Path("/proc/self/maps"), Path("/proc/self/statm")
+    if mappings.exists() and (
+        mappings.read_bytes().count(b"\n") > _MOST_MAPPINGS or int(memory.read_text().split()[1]) * 4096 > _MOST_MEMORY
+    ):
         run._programs.clear()
         jax.clear_caches()
         gc.collect()

@@ -10,3 +10,57 @@ def slow_but(quick: Callable[[Any], bool] | Iterable, cases: Iterable) -> list:
     """`cases`, those that are not `quick` marked slow: what one case shows the others show again."""
     chosen = quick if callable(quick) else set(quick).__contains__
     return [case if chosen(case) else pytest.param(case, marks=pytest.mark.slow) for case in cases]
+
+
+# `-m quick`: of every room of the package tests that compile little, and one adjustment that the others share.
+QUICK = {
+    "adjustment": (
+        "adjustment/test_bad_input.py",
+        "adjustment/test_tiling.py",
+        "adjustment/test_outcome.py::test_truth_is_recovered[cross]",
+    ),
+    "arrays": ("lidar/test_grid.py",),
+    "block": ("io/test_bad_blocks.py",),
+    "block_from_arrays": ("test_block_from_arrays.py",),
+    "block_parts": ("io/test_bad_blocks.py",),
+    "camera": ("camera/test_additional_parameters.py", "camera/test_balance.py", "camera/test_principal_points.py"),
+    "cli": ("test_cli.py::test_version_and_help", "test_cli.py::test_bad_input_is_one_sentence_and_nothing_written"),
+    "cloud": ("lidar/test_roofs.py",),
+    "columns": ("test_block_from_arrays.py",),
+    "collinearity": ("georeferencing/test_direct.py",),
+    "compiling": (
+        "test_compiling.py::test_a_damaged_file_is_written_anew",
+        "test_compiling.py::test_what_differs_is_described_differently",
+    ),
+    "errors": ("io/test_cameras.py",),
+    "experiment": ("experiment/test_docs.py", "experiment/test_page.py"),
+    "georeferencing": ("georeferencing/test_corrections.py", "georeferencing/test_map_frame.py"),
+    "image_measurement": ("image_measurement/test_features.py",),
+    "io": ("io/test_bal.py", "io/test_colmap.py", "io/test_read_block.py", "io/test_write_block.py"),
+    "lidar": ("lidar/test_planes.py",),
+    "observations": ("adjustment/test_structure.py",),
+    "parameters": ("adjustment/test_structure.py",),
+    "orientation": (
+        "orientation/test_averaging.py",
+        "orientation/test_intersection.py",
+        "orientation/test_resection.py",
+    ),
+    "procedures": ("procedures/test_orient_parts.py",),
+    "report": ("report/test_large_residuals.py", "report/test_plots.py"),
+    "rotation": ("georeferencing/test_lever_arm.py",),
+    "sensitivity": (
+        "sensitivity/test_network_search.py::test_a_budget_without_stations_and_control_leaves_no_datum",
+        "sensitivity/test_network_search.py::test_what_cannot_be_searched_is_said_in_a_sentence",
+        "sensitivity/test_network_search.py::test_grid_and_random_designs_fill_the_region",
+    ),
+    "short_repr": ("test_front_door.py",),
+    "single": ("test_front_door.py",),
+    "simulation": ("simulation/test_flight_plan.py", "simulation/test_recipes.py", "simulation/test_terrain.py"),
+    "stability": ("test_stability.py::test_equal_weights_give_the_chi_square_distribution_far_into_its_tails",),
+    "statistics": (
+        "statistics/test_covariance.py::test_kinds_of_rotation_are_one_covariance",
+        "statistics/test_significance.py",
+    ),
+    "unknowns": ("io/test_surfaces.py",),
+    "variants": ("test_variants.py::test_control_only_keeps_the_points_named",),
+}

@@ -2,16 +2,22 @@
 
 import ast
 import inspect
+import re
 import shutil
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import jaxphoto
+from jaxphoto.camera import DISTORTIONS, PROJECTIONS
+from tests.marks import QUICK
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "jaxphoto"
-TABLES_AND_FILES = ("io", "report", "experiment", "cli")
+TABLES_AND_FILES = ("io", "image_measurement", "report", "experiment", "cli")
+# To be emptied: image rows of a block, and the same in the order of the tiles (sensitivity).
+CLASSES_THAT_STAND_TWICE: set[str] = set()
 
 
 def imported(path: Path) -> set[str]:
@@ -30,6 +36,26 @@ def test_each_floor_imports_only_floors_below():
     done = subprocess.run([command, "--no-cache"], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "1 kept, 0 broken" in done.stdout
+
+
+def test_the_table_of_floors_is_the_contract():
+    """CONTRIBUTING lists every floor of the contract with its rooms, highest first."""
+    contract = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"][0]["layers"]
+    floors = [{room.strip(" ()") for room in layer.split("|")} for layer in contract]
+    rows = re.findall(r"^\| (\d+) \| (.+?) \|$", (ROOT / "CONTRIBUTING.md").read_text(), re.MULTILINE)
+    assert [int(number) for number, _ in rows] == list(range(len(floors)))[::-1]
+    assert [set(re.findall(r"`(\w+)`", rooms)) for _, rooms in rows] == floors
+    assert set().union(*floors) | {"__init__"} == {p.stem for p in PACKAGE.iterdir() if p.name != "__pycache__"}
+
+
+def test_a_class_name_stands_once():
+    """A name that two rooms use for two things is a riddle in every import."""
+    places: dict[str, list[str]] = {}
+    for path in PACKAGE.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ClassDef):
+                places.setdefault(node.name, []).append(str(path.relative_to(PACKAGE)))
+    assert {name for name, files in places.items() if len(files) > 1} == CLASSES_THAT_STAND_TWICE, places
 
 
 def test_modules_can_be_read_at_one_sitting():
@@ -62,8 +88,28 @@ def test_importing_brings_neither_tables_nor_pictures():
 
 
 def test_public_names_exist_and_are_documented():
-    assert len(jaxphoto.__all__) < 60
+    assert len(set(jaxphoto.__all__)) == len(jaxphoto.__all__)
     for name in jaxphoto.__all__:
         thing = getattr(jaxphoto, name)
+        # What others made is imported from them, and a module is no public name beside what is in it.
+        assert not inspect.ismodule(thing), name
+        assert not callable(thing) or thing.__module__.split(".")[0] == "jaxphoto", name
         if inspect.isclass(thing) or inspect.isfunction(thing):
             assert inspect.getdoc(thing), name
+
+
+def test_the_quick_tests_are_of_every_room_and_there():
+    rooms = {p.stem for p in PACKAGE.iterdir() if p.suffix == ".py" or (p / "__init__.py").exists()}
+    assert set(QUICK) == rooms - {"__init__"}
+    for test in (test for tests in QUICK.values() for test in tests):
+        path, _, name = test.partition("::")
+        assert f"def {name.split('[')[0] or 'test_'}" in (ROOT / "tests" / path).read_text(encoding="utf-8"), test
+
+
+def test_what_is_declared_is_public():
+    models = {*DISTORTIONS.values(), *PROJECTIONS.values()}
+    assert {model.__name__ for model in models} <= set(jaxphoto.__all__)
+    assert all(getattr(jaxphoto, model.__name__) is model for model in models)
+    for folder, known in (("distortion", DISTORTIONS), ("projection", PROJECTIONS)):
+        files = {path.stem for path in (PACKAGE / "camera" / folder).glob("*.py")} - {"__init__", "base"}
+        assert {model.__module__.split(".")[-1] for model in known.values()} == files

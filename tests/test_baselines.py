@@ -13,9 +13,10 @@ import pytest
 
 from jaxphoto import FREE, Unknowns, adjust, covariance, read_block, write_block
 from jaxphoto.adjustment import Outcome
-from jaxphoto.block import Attitudes, Block, Datum, Distances, ImageRows, Rows, Start
+from jaxphoto.block import Block, Datum, Start
 from jaxphoto.camera import Brown, InteriorOrientation, Sensor, set_parameter
 from jaxphoto.collinearity import ExteriorOrientation
+from jaxphoto.observations import Attitudes, ControlRows, Distances, ImageRows, StationRows
 from jaxphoto.statistics import redundancy_numbers
 from jaxphoto.unknowns import default_priors
 
@@ -32,9 +33,9 @@ def baselines(data_dir):
     return folder
 
 
-def xyz_rows(who, values, sigmas):
+def xyz_rows(who, values, sigmas, kind=ControlRows):
     n = len(who)
-    return Rows(np.repeat(who, 3), np.tile(np.arange(3), n), np.ravel(values), np.ravel(sigmas))
+    return kind(np.repeat(who, 3), np.tile(np.arange(3), n), np.ravel(values), np.ravel(sigmas))
 
 
 def block_of(npz: Path) -> Block:
@@ -66,9 +67,9 @@ def block_of(npz: Path) -> Block:
             d["obs_img"][order], d["obs_pt"][order], d["obs_xy"][order], np.full(d["obs_xy"].shape, d["sigma_img"])
         ),
         control=xyz_rows(d["gcp_pt"], d["gcp_obs"], d["gcp_sigma"]),
-        fixed=Rows.none(),
-        check=Rows.none(),
-        stations=xyz_rows(np.arange(n_images), d["sta_obs"], d["sta_sigma"]),
+        fixed=ControlRows.none(),
+        check=ControlRows.none(),
+        stations=xyz_rows(np.arange(n_images), d["sta_obs"], d["sta_sigma"], StationRows),
         attitudes=Attitudes.none(),
         distances=Distances.none(),
         datum=Datum(),
@@ -153,7 +154,7 @@ def test_redundancy_numbers(solved):
     n = 2 * len(solved.problem.ii)
     order = np.lexsort((solved.problem.ii, solved.problem.jj))
     np.testing.assert_allclose(np.asarray(ours.image).T, dense[:n].reshape(-1, 2)[order], atol=1e-9)
-    np.testing.assert_allclose(np.concatenate([ours.control, ours.stations]), dense[n:], atol=1e-9)
+    np.testing.assert_allclose(np.concatenate([ours["control_points"], ours["stations"]]), dense[n:], atol=1e-9)
 
 
 def test_by_way_of_a_block_folder(solved, tmp_path):

@@ -52,14 +52,14 @@ def test_projection_equals_the_equations_written_out(omega, phi, kappa, x, y):
     exterior = exterior_of(angles)
     point = seen_point(exterior, (x, y), 34.0)
     np.testing.assert_allclose(collinearity(34.0, angles, POSITION, point), [x, y], rtol=0, atol=1e-9)
-    np.testing.assert_allclose(ideal_of(34.0, exterior, point), [x, y], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(ideal_of(InteriorOrientation(34.0), exterior, point), [x, y], rtol=0, atol=1e-9)
 
 
 def test_axes_of_a_vertical_photograph():
     # No rotation: x is east, y north, the camera looks down; scale c / H.
-    exterior = exterior_of((0, 0, 0), (0, 0, 1000.0))
-    np.testing.assert_allclose(ideal_of(35.0, exterior, [100.0, 0, 0]), [3.5, 0], rtol=0, atol=1e-15)
-    np.testing.assert_allclose(ideal_of(35.0, exterior, [0, 100.0, 0]), [0, 3.5], rtol=0, atol=1e-15)
+    plain, exterior = InteriorOrientation(35.0), exterior_of((0, 0, 0), (0, 0, 1000.0))
+    np.testing.assert_allclose(ideal_of(plain, exterior, [100.0, 0, 0]), [3.5, 0], rtol=0, atol=1e-15)
+    np.testing.assert_allclose(ideal_of(plain, exterior, [0, 100.0, 0]), [0, 3.5], rtol=0, atol=1e-15)
     assert compiled(camera_coordinates)(exterior, [0, 0, 0])[2] == -1000.0
 
 

@@ -180,7 +180,7 @@ def test_what_differs_is_described_differently():
         None, 0, False, 0.0, -0.0, "", "0", b"", (), [], {}, (0,), [0], {"a": 0}, {"a": 0.0}, {"b": 0}, ((0,),), (0, 0),
         float("nan"), float("inf"), one, one.astype(np.float32), one.astype(int), one[:2], one[None], (one, one),
         jnp.asarray(1.0), jnp.asarray(1.0, jnp.float64), jax.device_put(one, SingleDeviceSharding(jax.devices()[0])),
-        Brown(), Brown(k1=one), Brown14(f=1.0), Brown, Brown14, project,
+        Brown(), Brown(k1=jnp.asarray(0.5)), Brown14(f=1.0), Brown, Brown14, project,
         jax.tree.structure((0, 0)), jax.tree.structure([0, 0]),
         jax.tree.structure(Brown()), eqx.Module, np.dtype(float), np.dtype(int), "None", "0.0", "(0,)",
     ]  # fmt: skip

@@ -12,6 +12,7 @@ import pytest
 
 import jaxphoto
 from jaxphoto.camera.distortion import DISTORTIONS
+from jaxphoto.cli import app
 from jaxphoto.io.block_folder.settings import read_settings
 from tests.marks import slow_but
 
@@ -79,12 +80,17 @@ def _python(page: Path) -> list[str]:
     return re.findall(r"^```python\n(.*?)^```", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
 
 
+# What a page writes is written in a folder of its own: tests/docs/test_extending_files.py.
 @pytest.mark.parametrize(
-    "page", slow_but(lambda p: p.stem not in LONG, [p for p in PAGES if _python(p)]), ids=lambda p: p.name
+    "page",
+    slow_but(lambda p: p.stem not in LONG, [p for p in PAGES if _python(p) and p.stem != "extending_files"]),
+    ids=lambda p: p.name,
 )
 def test_python_on_pages_runs(page: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
-    names: dict[str, object] = {}
+    # A page's own command is gone afterwards; its classes are those of the page, run it who will.
+    monkeypatch.setattr(app, "registered_commands", list(app.registered_commands))
+    names: dict[str, object] = {"__name__": page.stem}
     try:
         for number, text in enumerate(_python(page)):
             exec(compile(text, f"{page.name}, block {number + 1}", "exec"), names)
@@ -101,7 +107,8 @@ def test_links_lead_somewhere(page: Path) -> None:
 def test_block_folder_page_shows_a_readable_block_toml() -> None:
     text = re.search(r"^```toml\n(.*?)^```", (ROOT / "docs/block_folder.md").read_text(encoding="utf-8"), re.M | re.S)
     assert text is not None
-    assert list(read_settings(tomllib.loads(text[1])).cameras) == ["kodak"]
+    keys = ["distance_m"]
+    assert list(read_settings(tomllib.loads(text[1]), sigma_keys=keys).cameras) == ["kodak"]
 
 
 def test_pages_name_every_distortion_and_coefficient() -> None:

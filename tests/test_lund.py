@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jaxphoto.io.matching import match_photographs
-from jaxphoto.io.pairs import photograph_pairs
+from jaxphoto.image_measurement.matching import match_photographs
+from jaxphoto.image_measurement.photograph_pairs import photograph_pairs
 from jaxphoto.io.photographs import photographs, sensor_and_interior
 from jaxphoto.procedures.orientation import orient
 from jaxphoto.procedures.orientation.onto_known import similarity_between

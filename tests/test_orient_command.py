@@ -8,10 +8,10 @@ from PIL import Image
 
 from jaxphoto.camera import InteriorOrientation
 from jaxphoto.cli import orient as command
+from jaxphoto.image_measurement.matching import MatchedPhotographs
 from jaxphoto.io import read_block
-from jaxphoto.io.matching import MatchedPhotographs
 from jaxphoto.io.photographs import CameraStart
-from jaxphoto.procedures.orientation import finish, photographs
+from jaxphoto.procedures.orientation import finish, orient_photographs
 from tests.commands import run
 from tests.procedures.orientable import PIXEL, SENSOR, convergent, photographed
 
@@ -97,7 +97,7 @@ def test_rounds_that_do_not_settle_are_said(taken, tmp_path, monkeypatch, capsys
     # Not even a round that changes nothing ends them.
     monkeypatch.setattr(finish, "_STILL", -1.0)
     monkeypatch.setattr(finish, "_FEW", -1)
-    monkeypatch.setattr(photographs, "LAST_ROUNDS", 2)
+    monkeypatch.setattr(orient_photographs, "LAST_ROUNDS", 2)
     out = tmp_path / "block"
     code, said, wrong = run(monkeypatch, capsys, "orient", *taken, "--out", out)
     assert code == 1, wrong

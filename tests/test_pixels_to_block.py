@@ -15,7 +15,7 @@ from jaxphoto.procedures.orientation.onto_known import similarity_between
 from jaxphoto.rotation import omega_phi_kappa_from_matrix
 from tests.commands import run
 from tests.formulas import camera_from_object
-from tests.io.ground import C_MM, GROUND_M, SENSOR, texture
+from tests.image_measurement.ground import C_MM, GROUND_M, SENSOR, texture
 
 pytestmark = pytest.mark.slow
 

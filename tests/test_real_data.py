@@ -317,5 +317,5 @@ def test_aicon_residuals_redundancy_numbers_and_tests(aicon_weights, aicon_repor
     np.testing.assert_allclose(-observed_minus_computed, values[:, 2:4], atol=0.51e-6)
     np.testing.assert_allclose(np.asarray(redundancy.image).T[which], values[:, 6:8], atol=0.00501)
     np.testing.assert_allclose(np.abs(w.image).T[which], values[:, 8:10], atol=0.00501)
-    total = sum(float(np.sum(r)) for r in redundancy)
+    total = sum(float(np.sum(r)) for r in redundancy.named.values())
     assert abs(total - 18804) < 1e-6 * 18804

@@ -2,6 +2,7 @@
 
 import importlib
 import inspect
+import os
 import subprocess
 import sys
 
@@ -45,3 +46,14 @@ def test_the_list_is_of_the_commands_that_there_are():
     for name, command in COMMANDS.items():
         assert registered[name].__module__ == f"jaxphoto.cli.{command.module}"
         assert inspect.getdoc(registered[name]).startswith(command.sentence.rstrip(".")), name
+
+
+def test_importing_needs_no_list_of_cores():
+    """Not every system says which cores a process may use (macOS and Windows do not)."""
+    program = (
+        "import os\nos.__dict__.pop('sched_getaffinity', None)\nimport jax, jaxphoto\n"
+        "print(jax.device_count() == os.cpu_count())"
+    )
+    clean = {k: v for k, v in os.environ.items() if k != "XLA_FLAGS"}
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, env=clean)
+    assert done.stdout.strip() == "True", done.stderr

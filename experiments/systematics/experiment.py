@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 from typing import Any
 
-from jaxphoto.block import AXES
 from jaxphoto.experiment import Experiment, Variant, effects, recovered
+from jaxphoto.observations import AXES
 from jaxphoto.variants import common_shift
 
 Recipe = Mapping[str, Any]

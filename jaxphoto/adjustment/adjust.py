@@ -1,6 +1,5 @@
 """The adjustment itself: block, start and priors in; unknowns with their normal equations out."""
 
-import dataclasses
 import functools
 import operator
 from collections.abc import Callable, Iterable
@@ -8,11 +7,13 @@ from collections.abc import Callable, Iterable
 import equinox as eqx
 import jax
 import numpy as np
+from jaxtyping import Bool
 
 from jaxphoto.adjustment.datum import close_datum
+from jaxphoto.adjustment.layout import LEAST, Sizes, sizes_of
 from jaxphoto.adjustment.normal import At, residuals_at
 from jaxphoto.adjustment.optimum import Optimum, find_optimum, iterate, unit_scale, weigh_datum, zero_increments
-from jaxphoto.adjustment.padding import LEAST, Sizes, crop_residuals, crop_state, pad_structure, pad_values, sizes_of
+from jaxphoto.adjustment.padding import crop_residuals, crop_state, pad_structure, pad_values
 from jaxphoto.adjustment.precision import warn_of_lost_digits
 from jaxphoto.adjustment.rank import check_priors, check_rank
 from jaxphoto.adjustment.residuals import Residuals, State, Values, state_at
@@ -20,9 +21,9 @@ from jaxphoto.adjustment.result import Adjustment, Factored, Padded, Unfactored
 from jaxphoto.adjustment.shards import gathered, on_one_device, usable
 from jaxphoto.adjustment.similarity import open_motions
 from jaxphoto.adjustment.solver import zero_system
-from jaxphoto.adjustment.structure import Structure, structure_of
+from jaxphoto.adjustment.structure import Structure, observed_in, structure_of
 from jaxphoto.adjustment.values import at_state, unknowns_of, values_of, with_datum
-from jaxphoto.arrays import still
+from jaxphoto.arrays import Numbers, still
 from jaxphoto.block import Block
 from jaxphoto.compiling import prepare, run_compiled
 from jaxphoto.unknowns import Unknowns
@@ -52,16 +53,17 @@ def solve(
     """
     check_priors(block, priors)
     warn_of_lost_digits(block, start)
-    structure = structure_of(block, priors)
-    values = values_of(block, start, priors, structure)
+    observed = observed_in(block, priors)
+    structure = structure_of(block, priors, observed)
+    values = values_of(block, start, priors, structure, observed)
     constraints = close_datum(block, concrete(values, block), structure)
     values = with_datum(values, constraints.eop, constraints.points)
     traced = any(isinstance(v, jax.core.Tracer) for v in jax.tree.leaves(values))
-    constrained, distances = len(constraints.eop) > 0, len(structure.distance_points) > 0
-    # A distance may join points of two devices; of constraints, statistics have only the open motions in closed form.
-    alone = traced or distances or (constrained and not open_motions(values))
+    constrained, coupled = len(constraints.eop) > 0, bool(structure.coupled)
+    # Such rows may join points of two devices; of constraints, statistics have only the open motions in closed form.
+    alone = traced or coupled or (constrained and not open_motions(values, structure))
     shards = 1 if alone else _devices_worth_using(len(structure.image))
-    wide, places = pad_structure(structure, sizes, shards=shards, dense=constrained or distances)
+    wide, places = pad_structure(structure, sizes, shards=shards, dense=constrained or coupled)
     numbers = pad_values(values, structure, wide, places)
     seconds: dict[str, float] = {}
     padded = None
@@ -127,7 +129,7 @@ def common_sizes(blocks: Iterable[Block]) -> Sizes:
 
 @eqx.filter_jit
 def _optimise(
-    values: Values, structure: Structure, max_steps: int, only_factor: np.ndarray
+    values: Values, structure: Structure, max_steps: int, only_factor: Bool[Numbers, ""]
 ) -> tuple[Optimum, State, Factored]:
     """The optimum; or, of values that are at theirs, the undamped normal equations, factored."""
     optimum, system, scale = iterate(weigh_datum(values, structure), structure, max_steps, only_factor)
@@ -147,9 +149,11 @@ def concrete(tree: Values, block: Block) -> Values:
     place = {"position": known.exterior.position, "points": known.points}
     still = {k: np.asarray(v, float).T for k, v in place.items() if not isinstance(v, jax.core.Tracer)}
 
-    def number(name: str, v):
+    def number(path, v):
         if not isinstance(v, jax.core.Tracer):
             return np.asarray(v)
-        return still.get(name, np.zeros(v.shape))
+        # Standard deviations that are being traced weigh as one.
+        filler = np.ones if getattr(path[-1], "name", "") in ("sigma", "sigma_xy", "whitener") else np.zeros
+        return still.get(path[0].name, filler(v.shape))
 
-    return Values(**{f.name: number(f.name, getattr(tree, f.name)) for f in dataclasses.fields(tree)})
+    return jax.tree_util.tree_map_with_path(number, tree)

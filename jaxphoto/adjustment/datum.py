@@ -1,25 +1,29 @@
 """The datum: what position, orientation and scale observations leave open, and the constraints that close it.
 
 The seven parameters of a similarity (3 shifts, 3 rotations, scale) move images and points together without
-changing any image coordinate. Only control, surfaces, stations, attitudes, distances and fixed unknowns see
-them, perhaps together with a free shift or lever arm. What none sees is the datum defect; inner or minimal constraints
-fill it.
+changing any image coordinate. Only other observations (control, stations, distances ...) and fixed unknowns see them,
+perhaps together with a free shift or lever arm. What none sees is the datum defect; inner or minimal constraints fill
+it.
 """
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxphoto.adjustment.residuals import State, Values, georeferencing_residuals, surface_residuals
+from jaxphoto.adjustment.groups import Group
+from jaxphoto.adjustment.residuals import Increments, State, Values
+from jaxphoto.adjustment.rows import group_residuals, rows_of
 from jaxphoto.adjustment.similarity import motions, similarity
 from jaxphoto.adjustment.structure import Structure
+from jaxphoto.adjustment.values import at_state
 from jaxphoto.block import Block
 from jaxphoto.compiling import QUICK_TO_COMPILE
 from jaxphoto.errors import DatumError
+from jaxphoto.observations import PRIORS, ControlRows
 
 MOTIONS = (
     "shift in X",
@@ -50,7 +54,7 @@ def close_datum(block: Block, values: Values, structure: Structure) -> Motions:
     if _plainly_closed(block, values, structure):
         return Motions(np.zeros((0, 6, structure.n_images)), np.zeros((0, 3, structure.n_points)))
     motions, centre, size = _motions(values)
-    sensitivity, named = _datum_sensitivity(values, structure, motions, centre, size)
+    sensitivity, named = _datum_sensitivity(block, values, structure, motions, centre, size)
     open_motions = _null_motions(sensitivity)
     null = _combine(motions, open_motions)
     kind, over = block.datum.kind, block.datum.over
@@ -81,12 +85,12 @@ def close_datum(block: Block, values: Values, structure: Structure) -> Motions:
 def _plainly_closed(block: Block, values: Values, structure: Structure) -> bool:
     """Three full control points (or stations without free mounts and strips) that do not lie on a line will do."""
     seen = np.zeros((3, structure.n_points))
-    seen[structure.control_axis, structure.control_point] = 1
+    seen[block.control.axis, block.control.who] = 1
     seen[structure.point_free == 0] = 1
     sets = [np.asarray(values.points)[:, seen.all(0)]]
-    if not any(k >= structure.mount_offset for k in structure.free):
+    if not (structure.free >= structure.n_cameras).any():
         stations = np.zeros((3, structure.n_images))
-        stations[structure.station_axis, structure.station_image] = 1
+        stations[block.stations.axis, block.stations.who] = 1
         sets.append(np.asarray(values.position)[:, stations.all(0)])
     for places in sets:
         if places.shape[1] >= 3:
@@ -107,46 +111,50 @@ def _motions(values: Values) -> tuple[Motions, np.ndarray, float]:
     return Motions(np.asarray(eop), np.asarray(pts)), centre, size
 
 
-def _datum_sensitivity(values: Values, structure: Structure, motions: Motions, centre, size):
-    """d(datum rows / sigma) / d(seven motions, free unknowns of scanner, mounts, strips), and names of the latter."""
-    shared = [j for j, k in enumerate(structure.free) if k >= structure.scanner_offset and j not in structure.weighted]
-    if len(values.stations) + values.attitudes.shape[1] + len(values.distances) + len(values.sigma_surfaces) == 0:
+def _datum_sensitivity(block: Block, values: Values, structure: Structure, motions: Motions, centre, size):
+    """d(datum rows / sigma) / d(seven motions, declared unknowns), and names of those of these that are free."""
+    s = structure
+    own = [j for j, k in enumerate(s.free) if k >= s.n_cameras]
+    weighted = {int(j) for g in s.observed if g.name.startswith(PRIORS) for j in g.column.ravel()}
+    placed = {g.name for g in s.observed if len(g.image) or len(g.point)}
+    if placed <= {ControlRows.group}:
         # Control alone: nothing to differentiate, its rows are the motions of its points.
-        rows = (
-            motions.points[:, structure.control_axis, structure.control_point].T
-            / np.asarray(values.sigma_control)[:, None]
-        )
+        control = block.control
+        rows = motions.points[:, control.axis, control.who].T / _control_sigma(values, s)[:, None]
     else:
-        rows = np.asarray(_georeferencing_sensitivity(values, structure, np.array(shared, int), centre, size))
-    fixed_p = np.argwhere(structure.point_free.T == 0)
-    fixed_e = np.argwhere(structure.eop_free.T == 0)
+        rows = np.asarray(_row_sensitivity(values, s, np.array(own, int), centre, size))
+    fixed_p = np.argwhere(s.point_free.T == 0)
+    fixed_e = np.argwhere(s.eop_free.T == 0)
     held = np.concatenate(
         [motions.points[:, fixed_p[:, 1], fixed_p[:, 0]].T, motions.eop[:, fixed_e[:, 1], fixed_e[:, 0]].T]
     )
     held = np.concatenate([held, np.zeros((len(held), rows.shape[1] - 7))], axis=1)
-    weight = 1 / np.asarray(values.sigma_control).min(initial=0.01)
-    return np.concatenate([rows, held * weight]), [structure.labels[j] for j in shared]
+    weight = 1 / _control_sigma(values, s).min(initial=0.01)
+    return np.concatenate([rows, held * weight]), [s.labels[j] for j in own if j not in weighted]
+
+
+def _control_sigma(values: Values, s: Structure) -> np.ndarray:
+    """Standard deviations of the control (m)."""
+    groups = zip(s.observed, values.groups, strict=True)
+    return np.concatenate(
+        [np.zeros(0), *(np.asarray(rows_of(g, n).sigmas) for g, n in groups if g.name == ControlRows.group)]
+    )
 
 
 @partial(jax.jit, compiler_options=QUICK_TO_COMPILE)
-def _georeferencing_sensitivity(values: Values, structure: Structure, shared, centre, size):
+def _row_sensitivity(values: Values, structure: Structure, shared, centre, size):
     def rows(parameters, moved):
-        image = lambda x, r: similarity(parameters, x, r, centre, size)  # noqa: E731
-        position, rotation = jax.vmap(image, in_axes=(1, 2), out_axes=(1, 2))(values.position, values.rotation)
-        points = jax.vmap(lambda x: similarity(parameters, x, jnp.eye(3), centre, size)[0], 1, 1)(values.points)
-        vector = values.shared.at[structure.free[shared]].add(moved)
         v = values
-        state = State(position, rotation, vector, points)
-        stations, attitudes, control, distances = georeferencing_residuals(state, v, structure)
-        return jnp.concatenate(
-            [
-                stations / v.sigma_stations,
-                (attitudes / v.sigma_attitudes).ravel(),
-                control / v.sigma_control,
-                surface_residuals(state, v, structure) / v.sigma_surfaces,
-                distances / v.sigma_distances,
-            ]
+        image = lambda x, r: similarity(parameters, x, r, centre, size)  # noqa: E731
+        position, rotation = jax.vmap(image, in_axes=(1, 2), out_axes=(1, 2))(v.position, v.rotation)
+        points = jax.vmap(lambda x: similarity(parameters, x, jnp.eye(3), centre, size)[0], 1, 1)(v.points)
+        vector = jnp.asarray(v.shared).at[structure.free[shared]].add(moved)
+        there = at_state(v, State(position, rotation, vector, points))
+        zero = Increments(
+            jnp.zeros((6, structure.n_images)), jnp.zeros(structure.n_shared), jnp.zeros((3, structure.n_points))
         )
+        groups: list[tuple[Group, Any]] = list(zip(structure.observed, v.groups, strict=True))
+        return jnp.concatenate([group_residuals(g, n, zero, zero, there, structure).ravel() for g, n in groups])
 
     by_motion, by_shared = jax.jacfwd(rows, argnums=(0, 1))(jnp.zeros(7), jnp.zeros(len(shared)))
     return jnp.concatenate([by_motion, by_shared], axis=1)
@@ -209,17 +217,14 @@ def _minimal(null: Motions, structure: Structure) -> Motions:
 def _sentence(open_motions: np.ndarray, block: Block, named: list[str]) -> str:
     shares = np.sqrt((open_motions**2).sum(0))
     names = [m for m, share in zip(MOTIONS, shares, strict=True) if share > 0.05]
-    observed = [
-        f"{n} {what[:-1] if n == 1 else what}"
-        for n, what in (
-            (len(block.control.who) + len(block.fixed.who), "control coordinates"),
-            (len(block.stations.who), "station coordinates"),
-            (3 * len(block.attitudes.image), "attitude angles"),
-            (len(block.distances.value), "distances"),
-            (len(block.surfaces.point), "points on surfaces"),
-        )
-        if n
-    ]
+    counts = {rows.group: int(np.size(rows.observation)) for rows in block.observations if len(rows)}
+    if n := counts.pop(ControlRows.group, 0) + len(block.fixed.who):
+        counts[ControlRows.group] = n
+    what = {"control_points": "control coordinates", "stations": "station coordinates", "attitudes": "attitude angles"}
+    what |= {"surfaces": "points on surfaces"}
+    order = ["control_points", *(name for name in counts if name != "control_points")]
+    named_counts = [(counts[name], what.get(name, name.replace("_", " "))) for name in order if name in counts]
+    observed = [f"{n} {noun[:-1] if n == 1 else noun}" for n, noun in named_counts]
     mends = 'add control points or camera stations, or set [datum] kind = "inner" (or "minimal") in block.toml'
     if named:
         mends = "add control points, or fix " + ", ".join(named[:3]) + (" ..." if len(named) > 3 else "")

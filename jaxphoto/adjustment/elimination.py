@@ -5,6 +5,7 @@ memory than to make anew, a few tiles at a time. That pays for many right-hand s
 by two derivatives of the image rows each, in a direction and back: W z = J_e' (J_p z), W' x = J_p' (J_e x).
 """
 
+import dataclasses
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -14,12 +15,16 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxphoto.adjustment.band import BandFactor, solve_band
-from jaxphoto.adjustment.normal import At, Reduced, each_tile_of, squares, unwhiten, whiten, with_others
-from jaxphoto.adjustment.reduced import other_rows, tile_numbers, tile_parts
-from jaxphoto.adjustment.residuals import Increments, Residuals, other_residuals, state_at
+from jaxphoto.adjustment.groups import AtPoints
+from jaxphoto.adjustment.normal import At, Reduced, each_tile_of, other_squares, squares, unwhiten, whiten
+from jaxphoto.adjustment.other_rows import other_rows
+from jaxphoto.adjustment.reduced import tile_numbers, tile_parts
+from jaxphoto.adjustment.residuals import Increments, Residuals, state_at
+from jaxphoto.adjustment.rows import other_residuals
 from jaxphoto.adjustment.structure import Structure, total
 from jaxphoto.adjustment.tiles import (
     Scene,
+    by_image,
     by_point,
     by_tile,
     of_images,
@@ -53,6 +58,8 @@ def solve_factored(reduced: Reduced, factor: BandFactor, b: Increments, at: At) 
 def reduce_right(reduced: Reduced, b: Increments, at: At, many: bool = False) -> tuple[Array, Array]:
     """A right-hand side, or one of `many` under `jax.vmap`, taken down to the reduced unknowns and to mu."""
     s, i = at.structure, at.structure.n_border
+    if not s.in_tiles.free_points:
+        return jnp.concatenate([b.eop.T.reshape(-1), b.shared]), jnp.zeros(len(reduced.k))
     z = jnp.stack(whiten(b.points, reduced.l))
     if reduced.f is None and not many:
         eop, shared, d = _down_by_rows(jnp.stack(unwhiten(z, reduced.l)), at)
@@ -73,6 +80,8 @@ def solve_reduced(reduced: Reduced, factor: BandFactor, right, d, b_points, at: 
     x = solve_band(factor, right)
     mu = jnp.linalg.solve(r.k, r.g.T @ x + d) if len(d) else d
     eop, shared = x[: 6 * n].reshape(n, 6), x[6 * n :]
+    if not s.in_tiles.free_points:
+        return Increments(eop.T, shared, jnp.zeros_like(b_points))
     if r.f is None and not many:
         b_points = b_points - _up_by_rows(eop.T, shared, mu, at)
         return Increments(eop.T, shared, jnp.stack(unwhiten(whiten(b_points, r.l), r.l)))
@@ -100,10 +109,8 @@ def _down_by_rows(step: Array, at: At) -> tuple[Array, Array, Array]:
     numbers = (by_tile(at.state.points, s.in_tiles), by_tile(step * scale.points, s.in_tiles))
     to_scene = each_tile_of(tile, (*numbers, values.xy, values.sigma_xy), s)
     eop, shared = pull_scene(total(_by_image(to_scene, scene, s), s))
-    if s.n_scanner:
-        along = jnp.sum(rest.surfaces * step[:, None], axis=0)
-        of_scanner = total(jnp.einsum("arp,rp->a", rest.surfaces_scanner, along), s)
-        shared = shared.at[s.n_interior : s.n_border].add(of_scanner)
+    if len(rest.w):
+        shared = shared.at[s.n_interior : s.n_border].add(total(jnp.einsum("lap,ap->l", rest.w, step), s))
     return eop, shared, total(jnp.einsum("kcp,cp->k", rest.rows_p, step), s)
 
 
@@ -121,9 +128,8 @@ def _up_by_rows(eop: Array, shared: Array, mu: Array, at: At) -> Array:
 
     numbers = (by_tile(at.state.points, s.in_tiles), values.xy, values.sigma_xy)
     result = by_point(each_tile_of(tile, numbers, s)) * scale.points + jnp.einsum("kcp,k->cp", rest.rows_p, mu)
-    if s.n_scanner:
-        along = jnp.einsum("arp,a->rp", rest.surfaces_scanner, shared[s.n_interior : s.n_border])
-        result = result + jnp.sum(rest.surfaces * along, axis=1)
+    if len(rest.w):
+        result = result + jnp.einsum("lap,l->ap", rest.w, shared[s.n_interior : s.n_border])
     return result
 
 
@@ -149,20 +155,25 @@ def gradient(at: At, reduced: Reduced, there: At):
     to_scene, b, square = each_tile_of(tile, (*numbers, values.xy, values.sigma_xy), s)
     eop, shared = pull_scene(total(_by_image(to_scene, scene, s), s))
     b = Increments(eop + b_others.eop, shared + b_others.shared, by_point(b))
-    return b, *reduce_right(reduced, b, there), with_others(jnp.sum(square), others, s)
+    return b, *reduce_right(reduced, b, there), total(jnp.sum(square), s) + other_squares(others, s)
 
 
 def _others_and_gradient(at: At) -> tuple[Residuals, Increments]:
     """All but the image rows, and their part of b."""
     increments, scale, values, s = at
     others, pull = jax.vjp(lambda y: other_residuals(y, scale, values, s), increments)
-    nothing = jax.tree.map(jnp.zeros_like, others)
-    b = pull(others._replace(surfaces=nothing.surfaces, datum=nothing.datum))[0]
-    if others.surfaces.size:
+    nothing = dataclasses.replace(others, datum=jnp.zeros_like(others.datum))
+
+    def of(at_points: bool) -> Increments:
+        chosen = (isinstance(g.rows, AtPoints) == at_points for g in s.observed)
+        pairs = zip(chosen, others.others, strict=True)
+        return pull(dataclasses.replace(nothing, others=tuple(v if own else jnp.zeros_like(v) for own, v in pairs)))[0]
+
+    b = of(at_points=False)
+    if any(isinstance(g.rows, AtPoints) for g in s.observed):
         # These alone are dealt out with their points and meet shared unknowns, which are on every device.
-        of_surfaces = pull(nothing._replace(surfaces=others.surfaces))[0]
-        of_surfaces = of_surfaces._replace(shared=total(of_surfaces.shared, s))
-        b = jax.tree.map(jnp.add, b, of_surfaces)
+        at_points = of(at_points=True)
+        b = jax.tree.map(jnp.add, b, at_points._replace(shared=total(at_points.shared, s)))
     # The constraints of the datum go over all points.
     eop = jnp.einsum("kci,k->ci", values.datum_eop * scale.eop, others.datum)
     points = jnp.einsum("kcp,k->cp", values.datum_points * scale.points, others.datum)
@@ -176,7 +187,7 @@ def _scene_and_pull(at: At):
 
 def _scene_at(at: At, eop: Array, shared: Array) -> Scene:
     increments, scale, values, s = at
-    return scene_of(state_at(increments._replace(eop=eop, shared=shared), scale, values, s), s)
+    return scene_of(state_at(increments._replace(eop=eop, shared=shared), scale, values, s), values, s)
 
 
 def _by_image(parts: Scene, scene: Scene, s: Structure) -> Scene:
@@ -187,5 +198,5 @@ def _by_image(parts: Scene, scene: Scene, s: Structure) -> Scene:
         return jax.ops.segment_sum(v.reshape(-1, *v.shape[3:]), image, n)
 
     by_group = zip(s.groups, parts.cameras, strict=True)
-    cameras = tuple(jnp.sum(v, axis=(0, 1)) if len(g.names) == 1 else of_image(v) for g, v in by_group)
+    cameras = tuple(jnp.sum(v, axis=(0, 1)) if not by_image(g, s) else of_image(v) for g, v in by_group)
     return Scene(of_image(parts.centre), of_image(parts.rotation), cameras)

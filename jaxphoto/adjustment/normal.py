@@ -6,24 +6,29 @@ In scaled increments, with e the exterior orientations, s the shared unknowns an
     N = [ Us'  Uss  Ws'] [s] = [b_s]        V block-diagonal (3 x 3 a point), W 6 x 3 a (image, point) that met
         [ W'   Ws   V  ] [p]   [b_p]
 
-Few rows couple many points: distances and the constraints of the datum, D. Their part D'D of N is carried by extra
-unknowns mu = D x with the block -I, so V stays block-diagonal. With V = L L', Y = W L^-T, Ys = L^-1 Ws, Yd = L^-1 D':
+Few rows couple points, D: distances, all that touches two points or a point and an image (`groups`), and the
+constraints of the datum. Their part D'D of N is carried by extra unknowns mu = D x with the block -I, so V stays
+block-diagonal. With V = L L', Y = W L^-T, Ys = L^-1 Ws, Yd = L^-1 D_p', and D_r the part of D for images and shared
+unknowns:
 
     S   = [U Us; Us' Uss] - [Y; Ys'] [Y; Ys']'        the reduced normal matrix
-    g   = D_e' - Y Yd,   K = I + Yd' Yd               the coupling of mu
+    g   = D_r' - [Y; Ys'] Yd,   K = I + Yd' Yd        the coupling of mu
     A   = S + g K^-1 g'                               positive definite where the datum is fixed
 
 Tile by tile, `reduced.reduce_normal` makes F = [Y; Ys'; Yd'] and sums S from it; `elimination` takes vectors down to
 the reduced unknowns, and back to the points, by products with F.
 """
 
+import dataclasses
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Scalar
 
-from jaxphoto.adjustment.residuals import Increments, Residuals, Values, other_residuals, state_at
+from jaxphoto.adjustment.groups import AtPoints
+from jaxphoto.adjustment.residuals import Increments, Residuals, Values, state_at
+from jaxphoto.adjustment.rows import other_residuals
 from jaxphoto.adjustment.structure import Structure, total
 from jaxphoto.adjustment.tiles import Pair, by_tile, each_tile, of_images, rows, scene_of, seen_in
 
@@ -50,7 +55,7 @@ class Reduced(NamedTuple):
     g: Float[Array, "reduced constraints"]
     k: Float[Array, "constraints constraints"]
     f: Float[Array, "chunks tiles f 3p"] | None
-    """F of each tile: 6 rows an image, unknowns of cameras and scanner, constraints (distances, then the datum); the
+    """F of each tile: 6 rows an image, unknowns that points meet, constraints (coupled rows, then the datum); the
     last row, a right-hand side of its time, serves nothing. None where tiles are many: then it is made anew."""
     l: Float[Array, "6 points"]  # noqa: E741
     """Cholesky factors of V: l11, l21, l22, l31, l32, l33."""
@@ -73,28 +78,28 @@ def residuals_at(at: At) -> Residuals:
     """All residuals over their sigmas."""
     increments, scale, values, s = at
     state, tiles = at.state, s.in_tiles
-    scene = scene_of(state, s)
+    scene = scene_of(state, values, s)
 
     def tile(image, points, xy, sigma):
         return jnp.stack(rows(of_images(scene, image, s), points, seen_in(xy, sigma, image, s), s))
 
     numbers = (tiles.image, by_tile(state.points, tiles), values.xy, values.sigma_xy)
     image = jax.vmap(jax.vmap(tile))(*numbers)
-    return other_residuals(increments, scale, values, s)._replace(image=image)
+    return dataclasses.replace(other_residuals(increments, scale, values, s), image=image)
 
 
 def square_sum(at: At) -> Float[Array, ""]:
     """The sum of all squared residuals, tile by tile."""
     increments, scale, values, s = at
     state = at.state
-    scene = scene_of(state, s)
+    scene = scene_of(state, values, s)
 
     def tile(numbers):
         image, points, xy, sigma = numbers
         return squares(rows(of_images(scene, image, s), points, seen_in(xy, sigma, image, s), s))
 
     image = each_tile_of(tile, (by_tile(state.points, s.in_tiles), values.xy, values.sigma_xy), s)
-    return with_others(jnp.sum(image), other_residuals(increments, scale, values, s), s)
+    return total(jnp.sum(image), s) + other_squares(other_residuals(increments, scale, values, s), s)
 
 
 def squares(r: Pair) -> Float[Array, ""]:
@@ -102,10 +107,15 @@ def squares(r: Pair) -> Float[Array, ""]:
     return sum((jnp.sum(v * v) for v in r), jnp.zeros(()))
 
 
-def with_others(image: Float[Array, ""], others: Residuals, s: Structure) -> Float[Array, ""]:
-    """The sum of all squared residuals, of which `image` is the image rows' part."""
-    rest = sum(jnp.sum(v**2) for v in others._replace(image=jnp.zeros(0), control=jnp.zeros(0), surfaces=jnp.zeros(0)))
-    return total(image + jnp.sum(others.control**2) + jnp.sum(others.surfaces**2), s) + rest
+def other_squares(others: Residuals, s: Structure) -> Float[Array, ""]:
+    """The square sum of all but the image rows."""
+    dealt_out, everywhere = jnp.zeros(()), jnp.sum(others.datum**2)
+    for group, v in zip(s.observed, others.others, strict=True):
+        if isinstance(group.rows, AtPoints):
+            dealt_out += jnp.sum(v**2)
+        else:
+            everywhere += jnp.sum(v**2)
+    return total(dealt_out, s) + everywhere
 
 
 def each_tile_of(function, numbers, s: Structure):

@@ -22,7 +22,6 @@ from jaxphoto.adjustment.normal import At, Reduced, residuals_at, square_sum
 from jaxphoto.adjustment.reduced import reduce_normal
 from jaxphoto.adjustment.residuals import Increments, Values
 from jaxphoto.adjustment.shards import EVERYWHERE, TILES, along_points, sharded
-from jaxphoto.adjustment.shared import MOUNT_SIZE, STRIP_SIZE
 from jaxphoto.adjustment.solver import LevenbergMarquardt, System
 from jaxphoto.adjustment.structure import Structure, interior_of
 from jaxphoto.adjustment.tiles import by_tile
@@ -189,12 +188,16 @@ def typical_scale(values: Values, structure: Structure) -> Increments:
     depth = jnp.sum(distance * filled[:, :, 0]) / jnp.sum(filled[:, :, 0])
     ground, angle = sigma * depth / c, sigma / c
     eop = jnp.stack([ground, ground, ground, angle, angle, angle])
+    # By the unit that ends a declared parameter's name.
+    by_unit = {
+        "m": ground,
+        "rad": angle,
+        "mm": sigma,
+        "s": ground / jnp.maximum(jnp.max(jnp.abs(v.velocity)), 1.0),
+    }
     seconds = jnp.maximum(jnp.max(jnp.abs(v.time)), 1.0)
-    speed = jnp.maximum(jnp.max(jnp.abs(v.velocity)), 1.0)
-    scanner = jnp.append(jnp.repeat(angle, 3), jnp.repeat(ground, s.mount_offset - s.scanner_offset))
-    scanner = scanner[: s.mount_offset - s.scanner_offset]
-    mount = jnp.tile(jnp.append(eop, ground / speed), (s.strip_offset - s.mount_offset) // MOUNT_SIZE)
-    strip = jnp.repeat(jnp.stack([ground, ground / seconds]), 3)
-    strip = jnp.tile(strip, (len(vector) - s.strip_offset) // STRIP_SIZE)
-    vector = vector.at[s.scanner_offset :].set(jnp.concatenate([scanner, mount, strip]))
+    by_unit |= {f"{unit}_per_s": by_unit[unit] / seconds for unit in ("m", "rad", "mm")}
+    if s.tables:
+        declared = [by_unit.get(unit, jnp.ones(())) for t in s.tables for _ in t.owners for unit in t.units]
+        vector = vector.at[s.n_cameras :].set(jnp.stack(declared))
     return Increments(eop[:, None] * s.eop_free, vector[s.free], ground * s.point_free)

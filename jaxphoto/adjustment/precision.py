@@ -17,15 +17,7 @@ def warn_of_lost_digits(block: Block, start: Unknowns) -> None:
             "may not converge, and its standard deviations mean little; switch it on for adjusting",
             stacklevel=4,
         )
-    groups = {
-        "image_points": block.image_points,
-        "control": block.control,
-        "stations": block.stations,
-        "attitudes": block.attitudes,
-        "distances": block.distances,
-        "surfaces": block.surfaces,
-        "start": start,
-    }
+    groups = {"image_points": block.image_points, **{rows.group: rows for rows in block.observations}, "start": start}
     found = []
     for name, group in groups.items():
         for path, leaf in jax.tree_util.tree_leaves_with_path(group):

@@ -10,13 +10,12 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from jaxphoto.adjustment.band import Band, diagonal_of
-from jaxphoto.adjustment.colouring import Jacobian, jacobian_blocks
-from jaxphoto.adjustment.normal import At, Reduced, cholesky_3x3, whiten
-from jaxphoto.adjustment.residuals import Increments, Residuals, other_residuals
+from jaxphoto.adjustment.normal import At, Reduced, cholesky_3x3, other_squares, whiten
+from jaxphoto.adjustment.other_rows import OtherRows, Sums, add_blocks, add_other_rows, other_rows, sum_by
+from jaxphoto.adjustment.residuals import Increments
 from jaxphoto.adjustment.structure import Structure, total
 from jaxphoto.adjustment.tiles import (
     Columns,
@@ -42,25 +41,6 @@ class Right(NamedTuple):
     """r'r, all residuals."""
 
 
-class OtherRows(NamedTuple):
-    """All but the image rows."""
-
-    blocks: Jacobian
-    residuals: Residuals
-    control: Float[Array, "3 points"]
-    """Derivative of each control residual by its own coordinate."""
-    surfaces: Float[Array, "3 rows points"]
-    """Derivatives of the residuals of surfaces by the coordinates of their points, and by the scanner's unknowns."""
-    surfaces_scanner: Float[Array, "scanner rows points"]
-    rows_e: Float[Array, "constraints images 6"]
-    rows_p: Float[Array, "constraints 3 points"]
-
-    @property
-    def coupled(self) -> Float[Array, "constraints"]:
-        """Residuals of the rows that couple points."""
-        return jnp.concatenate([self.residuals.distances, self.residuals.datum])
-
-
 class TileParts(NamedTuple):
     """What a tile's sums are made of."""
 
@@ -80,7 +60,7 @@ def reduce_normal(at: At, damping) -> tuple[Band, Reduced, Right]:
     """
     s, tiles = at.structure, at.structure.in_tiles
     rest = other_rows(at)
-    blocks, others, coupled = rest.blocks, rest.residuals, rest.coupled
+    coupled = rest.coupled
     parts_of = tile_parts(at, damping, coupled)
     n, q, c = s.n_images, s.n_image_colours, s.n_border + len(coupled) + 1
     _, chunk, m = tiles.image.shape
@@ -91,18 +71,21 @@ def reduce_normal(at: At, damping) -> tuple[Band, Reduced, Right]:
         whole = [jnp.concatenate([j.eop, j.shared, j.residual[None]]).transpose(1, 0, 2) for j in p.columns]
         j = jnp.concatenate(whole, axis=2)
         gram = p.f @ p.f.T
+        of_images = gram[: 6 * m, : 6 * m] if tiles.free_points else gram[:0, :0]
         across = gram[: 6 * m, 6 * m :].reshape(m, -1)
         own = jnp.concatenate([jnp.einsum("maj,mbj->mab", j, j).reshape(m, -1), across], axis=1)
         f = p.f if tiles.few else None
-        return gram[: 6 * m, : 6 * m], own, gram[6 * m :, 6 * m :], f, p.l, p.b, p.diagonal
+        return of_images, own, gram[6 * m :, 6 * m :], f, p.l, p.b, p.diagonal
 
     def add_chunk(sums, numbers):
         (pair_tile, pair_images, pair_block, block), groups, of_tiles = numbers
         grams, own, border, *kept = each_tile(tile, of_tiles, groups, tiles)
+        own = sum_by(own.reshape(chunk * m, -1), of_tiles[0].reshape(-1), n)
+        if not tiles.free_points:
+            return (sums[0], sums[1] + own, sums[2]), kept
         grams = grams.reshape(chunk, m, 6, m, 6)[pair_tile, pair_images[:, 0], :, pair_images[:, 1]]
         grams = jax.ops.segment_sum(grams, pair_block, len(block), indices_are_sorted=True)
-        own = _sum_by(own.reshape(chunk * m, -1), of_tiles[0].reshape(-1), n)
-        band = _subtract_blocks(sums[0], grams, block)
+        band = add_blocks(sums[0], -grams, block, distinct=True)
         return (band, sums[1] + own, sums[2] + border.sum(0)), kept
 
     zero = (
@@ -117,17 +100,11 @@ def reduce_normal(at: At, damping) -> tuple[Band, Reduced, Right]:
     # Tiles that are padding were not computed: their points are each by itself.
     l = jnp.where(l[0] == 0, jnp.array([1.0, 0, 1, 0, 0, 1])[:, None], l)  # noqa: E741
 
-    m_images = _with_other_rows(own[:, : (7 + q) ** 2].reshape(n, 7 + q, 7 + q), blocks, others, s)
+    m_images = own[:, : (7 + q) ** 2].reshape(n, 7 + q, 7 + q)
     met = own[:, (7 + q) ** 2 :].reshape(n, 6, c)
     us, uss, b_s = _by_unknown(m_images, s)
-    uss = uss.at[s.weighted, s.weighted].add(blocks.priors**2)
-    b_s = b_s.at[s.weighted].add(blocks.priors * others.priors)
-    if s.n_scanner:
-        by_scanner = rest.surfaces_scanner.reshape(s.n_scanner, -1)
-        own = slice(s.n_interior, s.n_border)
-        uss = uss.at[own, own].add(total(by_scanner @ by_scanner.T, s))
-        b_s = b_s.at[own].add(total(by_scanner @ others.surfaces.reshape(-1), s))
-    u = m_images[:, :6, :6]
+    images = Sums((columns, last), m_images[:, :6, :6], us, uss, b_s, m_images[:, :6, -1])
+    (columns, last), u, us, uss, b_s, b_e = add_other_rows(images, rest, s)
     weight = Increments(jnp.einsum("nii->in", u), jnp.diagonal(uss), v)
     added = damping * weight.eop.T + jnp.where(weight.eop.T == 0, 1.0, 0.0)
     u = u + added[:, :, None] * jnp.eye(6)
@@ -141,7 +118,7 @@ def reduce_normal(at: At, damping) -> tuple[Band, Reduced, Right]:
     us = us.at[:, :, :i].add(-met[:, :, :i]).transpose(2, 0, 1).reshape(s.n_shared, 6 * n)
     uss = (uss + damping * jnp.diag(weight.shared)).at[:i, :i].add(-border[:i, :i])
     ge = rest.rows_e.transpose(1, 2, 0) - met[:, :, i : i + k]
-    gs = jnp.zeros((s.n_shared, k)).at[:i].set(-border[:i, i : i + k])
+    gs = rest.rows_s.T.at[:i].add(-border[:i, i : i + k])
     g = jnp.concatenate([ge.reshape(6 * n, k), gs])
     kk = jnp.eye(k) + border[i : i + k, i : i + k]
     # Put together by parts that are written whole: `block` would be computed number by number.
@@ -152,53 +129,12 @@ def reduce_normal(at: At, damping) -> tuple[Band, Reduced, Right]:
         end = end + g @ jnp.linalg.solve(kk, g.T)
     a = Band(columns.reshape(inner, 12 * width, 6 * width), us[:, : 6 * of_inner], end)
 
-    b_e = m_images[:, :6, -1] + jnp.einsum("cna,c->na", rest.rows_e, coupled)
+    b_e, b_s = b_e + jnp.einsum("cna,c->na", rest.rows_e, coupled), b_s + rest.rows_s.T @ coupled
     right = jnp.concatenate([(b_e - met[:, :, -1]).reshape(-1), b_s.at[:i].add(-border[:i, -1])])
     reduced = Reduced(diagonal_of(a), g, kk, f, l, weight, jnp.asarray(damping, float))
     # Of the residuals' own square, the sums hold the image rows' part.
-    squares = jnp.sum(m_images[:, -1, -1]) + total(jnp.sum(others.control**2) + jnp.sum(others.surfaces**2), s)
-    squares += jnp.sum(coupled**2) + jnp.sum(others.priors**2)
+    squares = jnp.sum(m_images[:, -1, -1]) + other_squares(rest.residuals, s)
     return a, reduced, Right(Increments(b_e.T, b_s, b_points), right, border[i : i + k, -1], squares)
-
-
-def _subtract_blocks(band: tuple[Array, Array], grams: Float[Array, "blocks 6 6"], block: Array):
-    """Pairs of images, subtracted where they belong: in the inner column blocks, or in the last.
-
-    What lies in neither is dropped.
-    """
-    columns, last = band
-    which, row, column = block.T
-    width, inner = len(last), len(columns)
-    if inner:
-        columns = columns.at[which, row, :, column].add(-grams, mode="drop", unique_indices=True)
-    row = jnp.where(which == inner, row, width)
-    return columns, last.at[row, :, column].add(-grams, mode="drop")
-
-
-def other_rows(at: At) -> OtherRows:
-    """Derivatives and residuals of all but the image rows, and the rows that couple points."""
-    increments, scale, values, s = at
-    others, product = jax.linearize(lambda y: other_residuals(y, scale, values, s), increments)
-    zero = jax.tree.map(jnp.zeros_like, increments)
-    blocks = jacobian_blocks(product, zero, s)
-    # A control residual touches one coordinate only: one seed gives all of them.
-    control = product(zero._replace(points=jnp.ones_like(zero.points))).control
-    surfaces, of_scanner = others.surfaces[None][:0], others.surfaces[None][:0]
-    if others.surfaces.size:
-        # Nor does one of a surface touch another point than its own.
-        along = lambda y: product(y).surfaces  # noqa: E731
-        by_axis = jnp.broadcast_to(jnp.eye(3)[:, :, None], (3, *zero.points.shape))
-        surfaces = jax.vmap(lambda d: along(zero._replace(points=d)))(by_axis)
-        unit = jnp.eye(s.n_shared)[s.n_interior : s.n_border]
-        of_scanner = jax.vmap(lambda d: along(zero._replace(shared=d)))(unit)
-    each, n = jnp.arange(len(s.distance_points)), increments.points.shape[1]
-    spans = jnp.zeros((len(s.distance_points), 3, n))
-    for end in range(2):
-        spans = spans.at[each, :, s.distance_points[:, end]].add(blocks.distances[end].T)
-    datum_e = (values.datum_eop * scale.eop).transpose(0, 2, 1)
-    rows_e = jnp.concatenate([jnp.zeros((len(each), *datum_e.shape[1:])), datum_e])
-    rows_p = jnp.concatenate([spans, values.datum_points * scale.points])
-    return OtherRows(blocks, others, control, surfaces, of_scanner, rows_e, rows_p)
 
 
 def tile_numbers(at: At, rest: OtherRows):
@@ -206,16 +142,14 @@ def tile_numbers(at: At, rest: OtherRows):
     increments, scale, values, s = at
     tiles = s.in_tiles
     points = values.points + increments.points * scale.points
-    control = jnp.stack([rest.residuals.control, rest.control])
-    surfaces = jnp.concatenate([rest.residuals.surfaces[None], rest.surfaces, rest.surfaces_scanner])
-    of_points = (by_tile(v, tiles) for v in (points, scale.points, control, surfaces, rest.rows_p))
+    of_points = (by_tile(v, tiles) for v in (points, scale.points, rest.v, rest.b, rest.w, rest.rows_p))
     return (tiles.image, values.xy, values.sigma_xy, *of_points)
 
 
 def tile_columns(at: At):
     """A function from a tile's images, measurements and points to its residuals and Jacobian."""
     s = at.structure
-    scene = scene_of(at.state, s)
+    scene = scene_of(at.state, at.values, s)
     slopes = once(lambda: slopes_of(at.increments, at.scale, at.values, s), s)
 
     def columns_of(numbers) -> tuple[Columns, Columns]:
@@ -231,19 +165,20 @@ def tile_parts(at: At, damping, coupled: Float[Array, "constraints"]):
     s, columns_of = at.structure, tile_columns(at)
 
     def parts(numbers) -> TileParts:
-        *measured, control, surfaces, rows_p = numbers
+        *measured, own_v, own_b, own_w, rows_p = numbers
         j = columns_of(measured)
         image, (m, p) = measured[0], j[0].residual.shape
+        if not s.in_tiles.free_points:
+            f = jnp.zeros((6 * m + s.n_border + len(coupled) + 1, 0))
+            unit, nothing = jnp.array([1.0, 0, 1, 0, 0, 1])[:, None], jnp.zeros((3, p))
+            return TileParts(j, f, jnp.broadcast_to(unit, (6, p)), nothing, nothing)
         v, b = _met([c.point for c in j], j), _met([c.residual[None] for c in j], j)[0]
-        ws = _by_interior(j, image, s)
-        if surfaces.size:
-            by_point = surfaces[1:4]
-            met = jnp.sum(surfaces[:, None] * by_point, axis=2)
-            v, b, ws = v + met[1:4], b + met[0], jnp.concatenate([ws, met[4:]])
-        diagonal = jnp.einsum("iip->ip", v) + control[1] ** 2
-        added = control[1] ** 2 + damping * diagonal + jnp.where(diagonal == 0, 1.0, 0.0)
+        ws = jnp.concatenate([_by_interior(j, image, s), own_w])
+        v, b = v + own_v, b + own_b
+        diagonal = jnp.einsum("iip->ip", v)
+        added = damping * diagonal + jnp.where(diagonal == 0, 1.0, 0.0)
         v = v + added[:, None] * jnp.eye(3)[:, :, None]
-        b = b + control[0] * control[1] + jnp.einsum("ckp,c->kp", rows_p, coupled)
+        b = b + jnp.einsum("ckp,c->kp", rows_p, coupled)
         l = once(cholesky_3x3, s, v)  # noqa: E741
         border = jnp.concatenate([ws, rows_p, b[None]])
         border = jnp.stack(whiten(border.transpose(1, 0, 2), l), axis=1)
@@ -280,38 +215,11 @@ def _by_interior(j: tuple[Columns, Columns], image: Array, s: Structure) -> Floa
     return (pick @ met.reshape(q * len(image), -1)).reshape(i, 3, -1)
 
 
-# XLA compiles the loop over the rows of a scatter as one function where a row is short, and else calls several a row.
-_PIECE = 36
-
-
-def _sum_by(rows: Float[Array, "rows c"], which: Array | np.ndarray, n: int) -> Float[Array, "n c"]:
-    """Sums of rows by a number from 0 to n - 1."""
-    pieces = -(-rows.shape[1] // _PIECE)
-    size = -(-rows.shape[1] // pieces)
-    split = jnp.pad(rows, ((0, 0), (0, pieces * size - rows.shape[1]))).reshape(-1, size)
-    at = (which[:, None] * pieces + jnp.arange(pieces)).reshape(-1)
-    return jax.ops.segment_sum(split, at, n * pieces).reshape(n, -1)[:, : rows.shape[1]]
-
-
-def _with_other_rows(m: Float[Array, "images c c"], blocks: Jacobian, others: Residuals, s: Structure):
-    """Sums by image, over all colours: those of image rows, and those of stations and attitudes."""
-    q = s.n_image_colours
-    kept = jnp.append(jnp.arange(6 + q), 6 + s.n_colours)
-    m = jnp.zeros((s.n_images, 7 + s.n_colours, 7 + s.n_colours)).at[:, kept[:, None], kept].set(m)
-    stations = jnp.concatenate([blocks.station_eop, blocks.station_shared, others.stations[None]])[:, None]
-    attitudes = jnp.concatenate([blocks.attitude_eop, blocks.attitude_shared, others.attitudes[None]])
-    for rows, image in ((stations, s.station_image), (attitudes, s.attitude_image)):
-        if len(image):
-            squares = once(lambda rows: jnp.einsum("aon,bon->nab", rows, rows), s, rows)
-            m = m + _sum_by(squares.reshape(len(image), -1), image, s.n_images).reshape(m.shape)
-    return m
-
-
 def _by_unknown(m: Float[Array, "images c c"], s: Structure):
-    """Per-image sums by colour, brought to the columns of the shared unknowns (a dummy column is cut off)."""
-    q, n = s.n_colours, s.n_shared
-    each = jnp.arange(s.n_images)
-    us = jnp.zeros((s.n_images, 6, n + 1)).at[each[:, None], :, s.column].add(m[:, :6, 6 : 6 + q].transpose(0, 2, 1))
-    uss = jnp.zeros((n + 1, n + 1)).at[s.column[:, :, None], s.column[:, None, :]].add(m[:, 6 : 6 + q, 6 : 6 + q])
-    b_s = jnp.zeros(n + 1).at[s.column].add(m[:, 6 : 6 + q, -1])
-    return us[:, :, :n], uss[:n, :n], b_s[:n]
+    """Per-image sums by colour, brought to the columns of the shared unknowns; the last column is a dummy."""
+    q, n = s.n_image_colours, s.n_shared
+    each, column = jnp.arange(s.n_images), jnp.asarray(s.column)[:, : s.n_image_colours]
+    us = jnp.zeros((s.n_images, 6, n + 1)).at[each[:, None], :, column].add(m[:, :6, 6 : 6 + q].transpose(0, 2, 1))
+    uss = jnp.zeros((n + 1, n + 1)).at[column[:, :, None], column[:, None, :]].add(m[:, 6 : 6 + q, 6 : 6 + q])
+    b_s = jnp.zeros(n + 1).at[column].add(m[:, 6 : 6 + q, -1])
+    return us, uss, b_s

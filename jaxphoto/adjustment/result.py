@@ -8,16 +8,18 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxphoto.adjustment.band import BandFactor, factor_band
+from jaxphoto.adjustment.layout import Places
 from jaxphoto.adjustment.normal import At, Reduced
 from jaxphoto.adjustment.optimum import typical_scale, weigh_datum, zero_increments
-from jaxphoto.adjustment.padding import Places
 from jaxphoto.adjustment.reduced import reduce_normal
-from jaxphoto.adjustment.residuals import GROUPS, Increments, Residuals, Values
+from jaxphoto.adjustment.residuals import Increments, Residuals, Values
 from jaxphoto.adjustment.shards import on_one_device
 from jaxphoto.adjustment.structure import Structure
 from jaxphoto.arrays import Numbers, still
 from jaxphoto.block import Block
 from jaxphoto.compiling import call_compiled
+from jaxphoto.observations import PRIORS
+from jaxphoto.short_repr import adjustment_repr
 from jaxphoto.unknowns import Unknowns
 
 
@@ -109,6 +111,8 @@ class Adjustment(eqx.Module):
     converged: Array
     seconds: dict[str, float]
 
+    __repr__ = adjustment_repr
+
     @property
     def computed(self) -> Padded:
         """What statistics are computed from; inside a transformation of JAX it is made anew each time."""
@@ -118,9 +122,9 @@ class Adjustment(eqx.Module):
         return self.padded
 
     @property
-    def square_sum(self) -> Float[Numbers, ""]:
+    def square_sum(self) -> Float[Numbers, ""] | float:
         """v'Pv: the weighted square sum of all observations' residuals."""
-        return sum(((v**2).sum() for v in self.residuals[:-1]), np.zeros(()))
+        return sum(((v**2).sum() for v in self.residuals.named.values()), np.zeros(()))
 
     @property
     def outcome(self) -> Outcome:
@@ -131,19 +135,22 @@ class Adjustment(eqx.Module):
 
     @property
     def n_observations(self) -> dict[str, int]:
-        """Observations by group: image_points, stations, attitudes, control_points, surfaces, distances, priors."""
-        return {name: int(np.size(getattr(self.residuals, field))) for field, name in GROUPS.items()}
+        """Observations by group: image_points, those of `Block.observations`, priors; 0 where there are none."""
+        groups = (self.block.image_points, *self.block.observations)
+        none = {rows.group: 0 for rows in groups} | {PRIORS: 0}
+        return none | {name: int(np.size(v)) for name, v in self.residuals.named.items()}
 
     @property
     def n_unknowns(self) -> dict[str, int]:
-        """Unknowns by group: interior, scanner, mounts, strips, exterior, points."""
+        """Unknowns by kind: interior, scanner, mounts, strips and further declared ones, exterior, points."""
         s = self.structure
-        mounts = int(((s.free >= s.mount_offset) & (s.free < s.strip_offset)).sum())
+        declared = {"scanner": 0} | dict.fromkeys(self.unknowns.tables, 0)
+        for t in s.tables:
+            stop = t.offset + t.size * len(t.owners)
+            declared[t.kind] = int(((s.free >= t.offset) & (s.free < stop)).sum())
         return {
-            "interior": s.n_interior,
-            "scanner": s.n_scanner,
-            "mounts": mounts,
-            "strips": s.n_shared - s.n_border - mounts,
+            "interior": int((s.free < s.n_cameras).sum()),
+            **declared,
             "exterior": int(s.eop_free.sum()),
             "points": int(s.point_free.sum()),
         }
@@ -159,7 +166,7 @@ class Adjustment(eqx.Module):
         return sum(self.n_observations.values()) + self.n_constraints - sum(self.n_unknowns.values())
 
     @property
-    def sigma0(self) -> Float[Numbers, ""]:
+    def sigma0(self) -> Float[Numbers, ""] | float:
         """Square root of the a posteriori variance factor; 1 where there is no redundancy."""
         redundancy = self.redundancy
         return (self.square_sum / redundancy) ** 0.5 if redundancy > 0 else self.square_sum * 0 + 1.0

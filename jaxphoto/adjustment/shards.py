@@ -28,10 +28,7 @@ def along_points(ndim: int) -> Any:
 
 
 _OF_TILES = {"xy", "sigma_xy", "pair_tile", "pair_images", "pair_block", "block", "groups", "f"}
-_OF_POINTS = {
-    "points", "control", "sigma_control", "datum_points", "point_free", "point_class", "l", "foot", "normal", "turn",
-    "sigma_surfaces", "surface_strip",
-}  # fmt: skip
+_OF_POINTS = {"points", "datum_points", "point_free", "l"}
 
 
 def usable(wanted: int) -> int:
@@ -49,7 +46,7 @@ def mesh_of(shards: int) -> Mesh:
     return Mesh(np.array([device for own in _devices_by_process() for device in own[:each]]), (AXIS,))
 
 
-def _devices_by_process() -> list[list[jax.Device]]:
+def _devices_by_process() -> list[list[Any]]:
     return [[device for device in jax.devices() if device.process_index == k] for k in range(jax.process_count())]
 
 
@@ -77,7 +74,12 @@ def sharded(function: Callable[..., Any], structure: Structure, out: Any) -> Cal
 
 
 def _spec(path: tuple[Any, ...], array: Any) -> P:
-    name = getattr(path[-1], "name", "") if path else ""
+    names = [getattr(step, "name", "") for step in path]
+    name = names[-1] if names else ""
+    if "at_points" in names:
+        return along_points(array.ndim)
+    if "listed" in names:
+        return EVERYWHERE
     # The images of tiles, not those of the rows of a block.
     if name in _OF_TILES or (name == "image" and array.ndim >= 3):
         return TILES

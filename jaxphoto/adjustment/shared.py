@@ -1,104 +1,174 @@
-"""The parameters that images share, cameras, scanner, mounts and strips: their order, names and priors."""
+"""The parameters that images share, those of cameras and all declared ones: their order, names and priors."""
 
-from collections.abc import Iterable
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Int
 
+from jaxphoto.arrays import Numbers
 from jaxphoto.block import Block
 from jaxphoto.camera import InteriorOrientation, parameter_names
-from jaxphoto.georeferencing import Mount, Scanner, StripBias
-from jaxphoto.unknowns import Prior, Unknowns, Weighted
-
-SCANNER = "l:"
-"""Who owns the parameters of the scanner: there is one scanner."""
+from jaxphoto.errors import InputError
+from jaxphoto.parameters import dynamic_fields, filled, form_of, leaves_in_order, numbers_of, size_of, unit_of
+from jaxphoto.unknowns import Unknowns, Weighted, check_prior
 
 
-class _Cameras(Protocol):
-    """Cameras of one model."""
+class ParameterTable(eqx.Module):
+    """Declared parameters of one kind: a row of numbers for each owner, one after the other."""
 
-    names: tuple[str, ...]
+    kind: str = eqx.field(static=True)
+    owners: tuple[str, ...] = eqx.field(static=True)
+    form: Any = eqx.field(static=True)
+    """What `parameters.filled` makes parameters of."""
+    offset: int = eqx.field(static=True)
+    """Place of the first number in the vector of all shared parameters."""
+    size: int = eqx.field(static=True)
+    bends: bool = eqx.field(static=True)
+    """Whether it changes the interior orientation of its images."""
+    units: tuple[str, ...] = eqx.field(static=True)
+    """Of each number, what its name ends in; "" where that is no unit."""
+    of_images: bool = eqx.field(static=True)
+    """Whether any image has such parameters."""
+    of_image: Int[np.ndarray, "images"]
+    """The owner of each image; their number where it has none."""
+
+    def numbers_at(self, owner: np.ndarray, nowhere: int) -> Int[np.ndarray, "size n"]:
+        """Places of the numbers of owners; `nowhere` where there is none."""
+        own = self.offset + self.size * owner + np.arange(self.size)[:, None]
+        return np.where(owner < len(self.owners), own, nowhere)
+
+    def all_owners(self, shared: Array) -> Any:
+        """The parameters of all owners and, last, of none (zeros), along the last axis."""
+        numbers = shared[self.offset : self.offset + self.size * len(self.owners)].reshape(-1, self.size)
+        return filled(self.form, jnp.concatenate([numbers, jnp.zeros((1, self.size))]).T)
 
 
 class Entry(NamedTuple):
     """One shared parameter."""
 
     owner: str
-    """Whose it is: `c:kodak`, `m:` a mount, `s:` a strip, or `SCANNER`."""
+    """Whose it is, of all kinds: such as `c:kodak`, `mounts:` a mount, `strips:` a strip."""
     label: str
     prior: object
 
 
-def shared_vector(unknowns: Unknowns, groups: Iterable[_Cameras]) -> list:
-    """All shared parameters as a list of scalars: cameras by group, then scanner, mounts, strips."""
-    cameras = [leaf for g in groups for name in g.names for leaf in jax.tree.leaves(unknowns.interior[name])]
-    mounts = [v for m in unknowns.mounts.values() for v in (*m.lever_arm, *m.boresight, m.time_offset)]
-    strips = [v for s in unknowns.strips.values() for v in (*s.shift, *s.drift)]
-    scanner = [] if unknowns.scanner is None else [v for vector in scanner_vectors(unknowns.scanner) for v in vector]
-    return cameras + scanner + mounts + strips
+class Together(NamedTuple):
+    """Parameters known beforehand with a full covariance matrix, by their places in the vector of all parameters."""
+
+    parameters: np.ndarray
+    value: Any
+    covariance: Any
 
 
-def scanner_vectors(scanner: Scanner) -> list:
-    """Boresight, then the shifts of the lidar strips."""
-    return [scanner.boresight, *scanner.shifts.values()]
+def tables_of(block: Block, unknowns: Unknowns, offset: int) -> tuple[ParameterTable, ...]:
+    """The declared parameters of a block in their order: what bends cameras, what points meet, then all else."""
+    met = {kind for rows in block.observations if "image" not in dict(rows.indices()) for kind in rows.also}
+    given = [(kind, owners) for kind, owners in unknowns.tables.items() if owners]
+
+    def rank(item: tuple[str, dict]) -> int:
+        kind, owners = item
+        return 0 if next(iter(owners.values())).bends else 1 if kind in met or kind == "scanner" else 2
+
+    tables = []
+    for kind, owners in sorted(given, key=rank):
+        first = next(iter(owners.values()))
+        form = form_of(first)
+        place = {name: k for k, name in enumerate(owners)}
+        of_image = np.array([place.get(name, len(place)) for name in block.owners(first.owner)], np.int32)
+        units = tuple(unit_of(label) for label in first.labels(""))
+        some = bool((of_image < len(place)).any())
+        tables.append(
+            ParameterTable(kind, tuple(owners), form, offset, size_of(form), bool(first.bends), units, some, of_image)
+        )
+        offset += tables[-1].size * len(owners)
+    return tuple(tables)
 
 
-def shared_entries(block: Block, priors: Unknowns, groups: Iterable[_Cameras]) -> list[Entry]:
-    """All shared parameters in the order of `shared_vector`.
+def shared_vector(unknowns: Unknowns, cameras: Iterable[str], tables: Sequence[ParameterTable]) -> list:
+    """All shared parameters as a list of scalars: cameras, then declared ones."""
+    of_cameras = [leaf for name in cameras for leaf in jax.tree.leaves(unknowns.interior[name])]
+    known = unknowns.tables
+    return of_cameras + [v for t in tables for name in t.owners for v in numbers_of(known[t.kind][name])]
 
-    Raises ValueError for a prior that is none.
+
+def unknowns_from(shared: Numbers, like: Unknowns, tables: Sequence[ParameterTable]) -> Unknowns:
+    """`like` with the declared parameters of the vector of all shared ones."""
+    found: dict[str, dict[str, Any]] = {kind: {} for kind in like.tables}
+    for t in tables:
+        for k, name in enumerate(t.owners):
+            own = shared[t.offset + k * t.size : t.offset + (k + 1) * t.size]
+            found[t.kind][name] = filled(form_of(like.tables[t.kind][name]), own)
+    return like.with_tables({kind: {name: found[kind][name] for name in of} for kind, of in like.tables.items()})
+
+
+def shared_entries(
+    block: Block, priors: Unknowns, cameras: Iterable[str], tables: Sequence[ParameterTable]
+) -> tuple[list[Entry], list[Together]]:
+    """All shared parameters in the order of `shared_vector`, and those that are known together.
+
+    Raises InputError for a prior that is none, and for a tree of priors that lacks something.
     """
-    entries = []
-    for name in (n for g in groups for n in g.names):
-        labels = _leaf_names(block.start.unknowns.interior[name])
-        leaves = jax.tree.leaves(priors.interior[name], is_leaf=lambda x: isinstance(x, Weighted))
-        entries += [
-            Entry(f"c:{name}", f"interior[{name}].{label}", leaf) for label, leaf in zip(labels, leaves, strict=True)
-        ]
-    if priors.scanner is not None:
-        vectors: dict[str, tuple[str, ...]] = {"scanner.boresight_{}_rad": ("right", "forward", "up")}
-        vectors |= {f"scanner[{name}].shift_{{}}_m": tuple("XYZ") for name in priors.scanner.shifts}
-        for (label, axes), prior in zip(vectors.items(), scanner_vectors(priors.scanner), strict=True):
-            each = zip(axes, _components(prior), strict=True)
-            entries += [_checked(Entry(SCANNER, label.format(axis), prior)) for axis, prior in each]
-    for kind, items, names in (("mounts", priors.mounts, _MOUNT), ("strips", priors.strips, _STRIP)):
-        for name, item in items.items():
-            for label, prior in zip(names, spread(item), strict=True):
-                entries.append(_checked(Entry(f"{kind[0]}:{name}", f"{kind}[{name}].{label}", prior)))
-    return entries
+    entries: list[Entry] = []
+    together: list[Together] = []
+    for name in cameras:
+        interior = block.start.unknowns.interior[name]
+        treedef: Any = jax.tree.structure(interior)
+        labels, leaves = _leaf_names(interior), treedef.flatten_up_to(priors.interior[name])
+        for label, prior in zip(labels, leaves, strict=True):
+            entries.append(_checked(Entry(f"c:{name}", f"interior[{name}].{label}", prior)))
+    for t in tables:
+        for name in t.owners:
+            known: Any = block.start.unknowns.tables[t.kind][name]
+            given: Any = priors.tables.get(t.kind, {}).get(name)
+            if type(given) is not type(known):
+                found = "lack" if given is None else f"have {type(given).__name__} for"
+                raise InputError(
+                    f"the priors {found} {t.kind}[{name}], which the start values have: "
+                    f"give a {type(known).__name__} of priors"
+                )
+            labels = iter(known.labels(name))
+            for prior, value in zip(_leaves(given, known), leaves_in_order(known), strict=True):
+                own = [next(labels) for _ in range(np.size(value))]
+                if isinstance(prior, Weighted) and prior.covariance is not None:
+                    together.append(Together(len(entries) + np.arange(len(own)), prior.value, prior.covariance))
+                entries += [
+                    _checked(Entry(f"{t.kind}:{name}", label, each))
+                    for label, each in zip(own, _components(prior, len(own)), strict=True)
+                ]
+    return entries, together
+
+
+def scalar_priors(priors: Any, like: Any) -> list:
+    """The prior of each number of the declared parameters `like`."""
+    pairs = zip(_leaves(priors, like), leaves_in_order(like), strict=True)
+    return [each for prior, value in pairs for each in _components(prior, np.size(value))]
+
+
+def _leaves(priors: Any, like: Any) -> list:
+    """The priors of parameters, one for each field (each entry of a dict) of `like`."""
+    found = []
+    for name in dynamic_fields(type(like)):
+        prior, value = getattr(priors, name), getattr(like, name)
+        found += [prior[key] for key in value] if isinstance(value, dict) else [prior]
+    return found
 
 
 def _checked(entry: Entry) -> Entry:
-    if not isinstance(entry.prior, Prior | Weighted):
-        raise ValueError(f"{entry.label}: {entry.prior!r} is no prior; use FREE, FIXED or Weighted")
+    check_prior(entry.label, entry.prior)
     return entry
 
 
-_MOUNT = (
-    *(f"lever_arm_{axis}_m" for axis in ("right", "forward", "up")), *(f"boresight_{axis}_rad" for axis in "xyz"),
-    "time_offset_s",
-)  # fmt: skip
-_STRIP = (*(f"shift_{axis}_m" for axis in "XYZ"), *(f"drift_{axis}_m_per_s" for axis in "XYZ"))
-MOUNT_SIZE, STRIP_SIZE = len(_MOUNT), len(_STRIP)
-
-
-def spread(item: Mount | StripBias | Scanner) -> list[object]:
-    """One prior per number of a mount's, strip's or scanner's tree of priors."""
-    if isinstance(item, Scanner):
-        return [p for vector in scanner_vectors(item) for p in _components(vector)]
-    if isinstance(item, Mount):
-        return [*_components(item.lever_arm), *_components(item.boresight), item.time_offset]
-    return [*_components(item.shift), *_components(item.drift)]
-
-
-def _components(prior: object) -> list[object]:
+def _components(prior: object, n: int) -> list[object]:
+    """One prior for each of `n` numbers."""
     if not isinstance(prior, Weighted):
-        return [prior] * 3
+        return [prior] * n
     traced = any(isinstance(x, jax.core.Tracer) for x in (prior.value, prior.sigma))
     xp: Any = jnp if traced else np
-    value, sigma = xp.broadcast_to(prior.value, 3), xp.broadcast_to(prior.sigma, 3)
+    value, sigma = xp.broadcast_to(prior.value, n), xp.broadcast_to(prior.sigma, n)
     return [Weighted(v, s) for v, s in zip(value, sigma, strict=True)]
 
 

@@ -45,14 +45,16 @@ def motions(
     return eop, jax.vmap(moved, in_axes=1, out_axes=2)(points)
 
 
-def open_motions(values: Values) -> int:
+def open_motions(values: Values, s: Structure) -> int:
     """How many motions are open, where these are all seven, or all but the scale, which distances give; else 0.
 
     Those change no residual but the datum's wherever images and points are. Others (a turn about the only control
     point, a shift that a strip's goes along with) depend on the place, or on more than images and points.
     """
-    k, georeferenced = len(values.datum_eop), len(values.stations) + values.attitudes.shape[1]
-    return k if not georeferenced and (k == 7 or (k == 6 and len(values.distances))) else 0
+    k = len(values.datum_eop)
+    rigid = all(g.rigid for g in s.observed)
+    lengths = any(g.rigid and g.layout != "reduced" for g in s.observed)
+    return k if rigid and (k == 7 or (k == 6 and lengths)) else 0
 
 
 def onto_datum(at: At) -> Increments:
@@ -62,7 +64,7 @@ def onto_datum(at: At) -> Increments:
     not, the increments stay as they are.
     """
     y, scale, values, s = at
-    k = open_motions(values)
+    k = open_motions(values, s)
     centre, size = _extent(values, s)
 
     def moved(y: Increments, parameters: Float[Array, "k"]) -> Increments:
@@ -88,7 +90,7 @@ def onto_datum(at: At) -> Increments:
 
 def along_motions(values: Values, scale: Increments, s: Structure) -> Increments:
     """Scaled increments along each of the `open_motions` (leading axis), which nothing but the datum sees."""
-    k, shared = open_motions(values), scale.shared
+    k, shared = open_motions(values, s), scale.shared
     eop, points = motions(values.position, values.rotation, values.points, *_extent(values, s))
     return Increments(_scaled(eop[:k], scale.eop), jnp.zeros((k, *shared.shape)), _scaled(points[:k], scale.points))
 

@@ -33,9 +33,9 @@ class System(NamedTuple):
 
 def zero_system(y: Increments, values: Values, s: Structure) -> System:
     """A system of the right shapes, to begin with."""
-    n, q, k = 6 * s.n_images, s.n_shared, len(values.distances) + len(values.datum_eop)
+    n, q, k = 6 * s.n_images, s.n_shared, s.n_coupled + len(values.datum_eop)
     *tiles, m = s.in_tiles.image.shape
-    f = (*tiles, 6 * m + s.n_border + k + 1, 3 * s.in_tiles.per_tile)
+    f = (*tiles, 6 * m + s.n_border + k + 1, s.in_tiles.eliminated)
     size, inner = n // s.in_tiles.columns, s.in_tiles.columns - 1
     factor = BandFactor(
         jnp.zeros((inner, 2 * size, size)), jnp.zeros((q, inner * size)), jnp.zeros((size + q, size + q))
@@ -119,7 +119,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Increments, Scalar, Any
 
     def _at(self, y: Increments, loose: Bool[Array, ""]) -> At:
         v = self.values
-        if open_motions(v):
+        if open_motions(v, self.structure):
             v = with_datum(v, jnp.where(loose, 0.0, v.datum_eop), jnp.where(loose, 0.0, v.datum_points))
         return At(y, self.scale, v, self.structure)
 
@@ -169,7 +169,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Increments, Scalar, Any
         damping = _next_damping(state, accept, reduction / promised)
         pick = lambda a, b: jax.tree.map(lambda a, b: jnp.where(accept, a, b), a, b)  # noqa: E731
         next_y, loose, tighten = pick(new_y, y), state.loose, jnp.array(False)
-        if open_motions(self.values):
+        if open_motions(self.values, self.structure):
             # Held about a start that is far off, the constraints bend the path: it goes on without them, and what it
             # ends at is brought to them as a whole.
             tighten = settled & state.loose

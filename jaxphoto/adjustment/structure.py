@@ -4,6 +4,7 @@
                 is not FIXED; interior orientations first), points (3 per point)
     colours     each image touches few shared unknowns; unknowns of different cameras, mounts or strips carry the
                 same colour, so one seed differentiates all of them at once
+    groups      all observations but image rows, see `groups`
     tiles       points with the images that see them, see `tiling`; laid out by `padding.pad_structure`, which also
                 puts images and points in the order of the tiles: a padded structure is what is computed with
 
@@ -12,19 +13,22 @@ compiles nothing.
 """
 
 import dataclasses
-from collections.abc import Iterable
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxphoto.adjustment.shared import MOUNT_SIZE, SCANNER, scanner_vectors, shared_entries
+from jaxphoto.adjustment.groups import Group, group_of, observations_of, weighted_parameters
+from jaxphoto.adjustment.shared import Entry, ParameterTable, shared_entries, tables_of
 from jaxphoto.adjustment.tiling import check_rows
 from jaxphoto.block import Block
 from jaxphoto.camera import InteriorOrientation
+from jaxphoto.errors import BlockError
 from jaxphoto.georeferencing import Corrections
-from jaxphoto.unknowns import FIXED, Unknowns, Weighted
+from jaxphoto.observations import PRIORS, AbstractObservations
+from jaxphoto.unknowns import FIXED, Unknowns
 
 AXIS = "tiles"
 """Mesh axis along which tiles and their points are dealt out to devices."""
@@ -53,6 +57,8 @@ class Tiles(eqx.Module):
     image: Int[np.ndarray, "chunks tiles m"]
     per_tile: int = eqx.field(static=True)
     """Points of a tile, P."""
+    free_points: bool = eqx.field(static=True)
+    """Whether any point has a free coordinate; else nothing is eliminated, and F has no columns."""
     groups: Int[np.ndarray, "chunks"]
     """How many groups of `at_once` tiles hold the points of each chunk: the first ones; the others are padding."""
     at_once: int = eqx.field(static=True)
@@ -73,52 +79,39 @@ class Tiles(eqx.Module):
     @property
     def few(self) -> bool:
         """Whether a device computes with all its tiles at a time: what is made of them is worth keeping."""
-        return self.image.shape[:2] == (1, self.at_once)
+        return self.image.shape[:2] == (1, self.at_once) or not self.free_points
+
+    @property
+    def eliminated(self) -> int:
+        """Columns of F: coordinates of a tile that are eliminated."""
+        return 3 * self.per_tile if self.free_points else 0
 
 
 class Structure(eqx.Module):
     """Index arrays and sizes; see the module's head."""
 
     groups: tuple[CameraGroup, ...]
-    scanner_offset: int = eqx.field(static=True)
-    """The first parameter of the scanner in the vector of all shared parameters: that after the cameras'."""
-    mount_offset: int = eqx.field(static=True)
-    strip_offset: int = eqx.field(static=True)
+    tables: tuple[ParameterTable, ...]
+    """Declared parameters, in their order after those of the cameras."""
     n_images: int = eqx.field(static=True)
     n_points: int = eqx.field(static=True)
     corrections: Corrections = eqx.field(static=True)
     n_interior: int = eqx.field(static=True)
-    """Shared unknowns that belong to cameras: the first ones."""
-    n_scanner: int = eqx.field(static=True)
-    """Those that belong to the scanner: the next."""
+    """Shared unknowns that image rows touch, those of cameras and what bends them: the first ones."""
+    n_border: int = eqx.field(static=True)
+    """These, and others that points meet: the next."""
     n_image_colours: int = eqx.field(static=True)
-    n_colours: int = eqx.field(static=True)
-    n_classes: int = eqx.field(static=True)
     image: Int[np.ndarray, "rows"]
     """Image and point of each image row. Empty in a padded structure, whose rows are the slots of its tiles."""
     point: Int[np.ndarray, "rows"]
     free: Int[np.ndarray, "shared"]
     """Index, in the vector of all shared parameters, of each shared unknown."""
     column: Int[np.ndarray, "images colours"]
-    """Shared unknown that a colour means for an image; the number of shared unknowns where it means none."""
+    """Shared unknown that a colour means for an image; the number of shared unknowns where it means none. Colours of
+    image rows come first."""
     colour: Int[np.ndarray, "shared"]
-    mount: Int[np.ndarray, "images"]
-    strip: Int[np.ndarray, "images"]
-    station_image: Int[np.ndarray, "stations"]
-    station_axis: Int[np.ndarray, "stations"]
-    attitude_image: Int[np.ndarray, "attitudes"]
-    control_point: Int[np.ndarray, "control"]
-    """Point and axis of each observed control coordinate. Empty in a padded structure: there every coordinate has a
-    value and a standard deviation."""
-    control_axis: Int[np.ndarray, "control"]
-    surface_point: Int[np.ndarray, "surfaces"]
-    """Point of each row of a surface. Empty in a padded structure, whose rows are listed by point."""
-    surface_strip: Int[np.ndarray, "surfaces"]
-    """Lidar strip of each row. Of a padded structure (rows, points), rows being the most that a point has."""
-    distance_points: Int[np.ndarray, "distances 2"]
-    point_class: Int[np.ndarray, "points"]
-    weighted: Int[np.ndarray, "weighted"]
-    """Shared unknown of each weighted prior."""
+    observed: tuple[Group, ...]
+    """All observations but image rows, and what is known beforehand."""
     eop_free: Float[np.ndarray, "6 images"]
     point_free: Float[np.ndarray, "3 points"]
     labels: tuple[str, ...] = eqx.field(static=True)
@@ -133,14 +126,29 @@ class Structure(eqx.Module):
         return self.tiles
 
     @property
-    def n_border(self) -> int:
-        """Shared unknowns that meet points: those of cameras and scanner."""
-        return self.n_interior + self.n_scanner
-
-    @property
     def n_shared(self) -> int:
         """Number of shared unknowns."""
         return len(self.free)
+
+    @property
+    def n_cameras(self) -> int:
+        """Number of parameters of all cameras: the first ones of the vector of all shared parameters."""
+        return _n_parameters(self.groups)
+
+    @property
+    def coupled(self) -> tuple[Group, ...]:
+        """The groups whose rows couple points."""
+        return tuple(g for g in self.observed if g.layout == "coupled")
+
+    @property
+    def n_coupled(self) -> int:
+        """How many numbers these observe."""
+        return sum(g.components * g.n_rows for g in self.coupled)
+
+    @property
+    def bends(self) -> bool:
+        """Whether the interior orientation differs between images of a camera."""
+        return any(t.bends for t in self.tables)
 
 
 def total(x, s: Structure):
@@ -153,78 +161,76 @@ def interior_of(group: CameraGroup, table) -> InteriorOrientation:
     return jax.tree.unflatten(group.treedef, table)
 
 
-def structure_of(block: Block, priors: Unknowns) -> Structure:
-    """Everything about the adjustment of `block` that does not depend on a measured value."""
+class ObservedRows(NamedTuple):
+    """What an adjustment observes besides image points, and the order of the shared parameters."""
+
+    cameras: tuple[CameraGroup, ...]
+    tables: tuple[ParameterTable, ...]
+    entries: list[Entry]
+    named: list[tuple[str, AbstractObservations]]
+    """Rows by the name of their group."""
+
+    @property
+    def camera_names(self) -> list[str]:
+        """All cameras, model by model."""
+        return [name for g in self.cameras for name in g.names]
+
+
+def observed_in(block: Block, priors: Unknowns) -> ObservedRows:
+    """The observations of `block` and of `priors`, and the shared parameters.
+
+    Raises InputError or BlockError for priors and rows that are none.
+    """
+    cameras = _groups(block, np.array(block.image_camera))
+    tables = tables_of(block, block.start.unknowns, _n_parameters(cameras))
+    entries, together = shared_entries(block, priors, [name for g in cameras for name in g.names], tables)
+    named = observations_of(block, priors, together, [e.label for e in entries])
+    weighted = weighted_parameters([e.prior for e in entries], together)
+    return ObservedRows(cameras, tables, entries, named + [(PRIORS, weighted)] * (len(weighted) > 0))
+
+
+def structure_of(block: Block, priors: Unknowns, observed: ObservedRows | None = None) -> Structure:
+    """Everything about the adjustment of `block` that does not depend on a measured value.
+
+    `observed` is `observed_in(block, priors)`, where it is known already.
+    """
     image, point = np.asarray(block.image_points.image), np.asarray(block.image_points.point)
     check_rows(image, point)
-    camera_names = np.array(block.image_camera)
-
-    groups = _groups(block, camera_names)
     if len(np.unique(np.asarray(block.control.who) * 3 + np.asarray(block.control.axis))) < len(block.control.who):
         raise ValueError("control holds a coordinate of a point twice: keep one row of each")
-    entries = shared_entries(block, priors, groups)
-    scanner_offset = sum(len(g.names) * g.treedef.num_leaves for g in groups)
-    lidar = [] if priors.scanner is None else scanner_vectors(priors.scanner)
-    mount_offset = scanner_offset + 3 * len(lidar)
+    given = observed_in(block, priors) if observed is None else observed
+    tables, entries = given.tables, given.entries
     free = np.array([k for k, e in enumerate(entries) if e.prior is not FIXED], dtype=np.int32)
-    ranks: dict[str, int] = {}
-    owners, colour = [], np.zeros(len(free), np.int32)
-    for j, k in enumerate(free):
-        owner = entries[k].owner
-        colour[j] = ranks[owner] = ranks.get(owner, -1) + 1
-        owners.append(owner)
-    counts = [max((ranks[o] + 1 for o in ranks if o.startswith(kind)), default=0) for kind in ("c:", "m:", "s:")]
-    base = {"c": 0, "m": counts[0], "s": counts[0] + counts[1]}
-    # No image meets the scanner: one colour, the last, is enough for all of it.
-    colour = np.array([sum(counts) if o == SCANNER else base[o[0]] + c for o, c in zip(owners, colour, strict=True)])
-    colour = colour.astype(np.int32)
-    counts.append(int(SCANNER in owners))
-    groups = tuple(_with_free(g, free) for g in groups)
-    column = np.full((len(block.images), sum(counts)), len(free), np.int32)
-    of_owner: dict[str, list[int]] = {}
-    for j, o in enumerate(owners):
-        of_owner.setdefault(o, []).append(j)
-    for names, kind in ((block.image_camera, "c:"), (block.image_mount, "m:"), (block.image_strip, "s:")):
-        for i, name in enumerate(names):
-            for j in of_owner.get(kind + name, ()):
-                column[i, colour[j]] = j
+    unknown_of = np.full(len(entries) + 1, len(free), np.int32)
+    unknown_of[free] = np.arange(len(free))
+    colour, column, n_image_colours = _colours(block, given, free)
+    bent = sum(t.size * len(t.owners) for t in tables if t.bends)
+    n_interior = int((free < _n_parameters(given.cameras) + bent).sum())
+    cameras = _places_of_cameras(given.cameras)
+    groups = tuple(group_of(name, rows, tables, cameras, unknown_of, len(free)) for name, rows in given.named)
+    met = [int(g.column.max(initial=-1)) + 1 for g in groups if g.layout == "point"]
 
     point_free = np.ones((3, len(block.points))) * (priors.points is not FIXED)
     point_free[block.fixed.axis, block.fixed.who] = 0.0
+    _check_coupled(block, groups, point, point_free)
     eop_free = np.ones((6, len(block.images)))
     eop_free[:3] *= priors.exterior.position is not FIXED
     eop_free[3:] *= priors.exterior.camera_from_object is not FIXED
-    classes = _point_classes(np.asarray(block.distances.points), len(block.points))
     return Structure(
-        groups=groups,
-        scanner_offset=scanner_offset,
-        mount_offset=mount_offset,
-        strip_offset=mount_offset + MOUNT_SIZE * len(priors.mounts),
+        groups=tuple(_with_free(g, free, tables) for g in given.cameras),
+        tables=tables,
         n_images=len(block.images),
         n_points=len(block.points),
         corrections=block.corrections,
-        n_interior=int((free < scanner_offset).sum()),
-        n_scanner=owners.count(SCANNER),
-        n_image_colours=counts[0],
-        n_colours=sum(counts),
-        n_classes=int(classes.max(initial=0)) + 1,
+        n_interior=n_interior,
+        n_border=max([n_interior, *met]),
+        n_image_colours=n_image_colours,
         image=image.astype(np.int32),
         point=point.astype(np.int32),
         free=free,
         column=column,
         colour=colour,
-        mount=_index(block.image_mount, priors.mounts),
-        strip=_index(block.image_strip, priors.strips),
-        station_image=np.asarray(block.stations.who, np.int32),
-        station_axis=np.asarray(block.stations.axis, np.int32),
-        attitude_image=np.asarray(block.attitudes.image, np.int32),
-        control_point=np.asarray(block.control.who, np.int32),
-        control_axis=np.asarray(block.control.axis, np.int32),
-        surface_point=np.asarray(block.surfaces.point, np.int32),
-        surface_strip=np.asarray(block.surfaces.strip, np.int32),
-        distance_points=np.asarray(block.distances.points, np.int32).reshape(-1, 2),
-        point_class=classes,
-        weighted=np.array([j for j, k in enumerate(free) if isinstance(entries[k].prior, Weighted)], np.int32),
+        observed=groups,
         eop_free=eop_free,
         point_free=point_free,
         labels=tuple(entries[k].label for k in free),
@@ -232,10 +238,68 @@ def structure_of(block: Block, priors: Unknowns) -> Structure:
     )
 
 
-def _index(names: tuple[str, ...], table: Iterable[str]) -> np.ndarray:
-    """Place of each name in the table; one past the end where the table lacks it."""
-    place = {name: k for k, name in enumerate(table)}
-    return np.array([place.get(n, len(place)) for n in names], np.int32)
+def _check_coupled(block: Block, groups: tuple[Group, ...], point: np.ndarray, point_free: np.ndarray) -> None:
+    """Raise BlockError for a point that only rows that couple points meet: nothing of its own could eliminate it."""
+    own = (point_free == 0).all(axis=0)
+    own[point] = True
+    for g in groups:
+        if g.layout == "point":
+            own[g.point] = True
+    for g in groups:
+        if g.layout == "coupled" and not own[g.point].all():
+            name = block.points[int(g.point[~own[g.point]][0])]
+            raise BlockError(
+                f"point {name} is met by {g.name} alone: measure it in an image, or give it control, or leave it out"
+            )
+
+
+def _n_parameters(cameras: tuple[CameraGroup, ...]) -> int:
+    """Of all cameras."""
+    return sum(len(g.names) * g.treedef.num_leaves for g in cameras)
+
+
+def _colours(block: Block, given: ObservedRows, free: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
+    """Colour of each shared unknown, what each means for an image, and how many of them image rows touch.
+
+    An owner's unknowns have different colours; unknowns of two owners of a kind share theirs.
+    """
+    owners = [given.entries[k].owner for k in free]
+    rank, seen = np.zeros(len(free), np.int32), dict.fromkeys(owners, -1)
+    for j, o in enumerate(owners):
+        rank[j] = seen[o] = seen[o] + 1
+    kinds = {"c": block.image_camera} | {
+        t.kind: tuple(t.owners[k] if k < len(t.owners) else None for k in t.of_image) for t in given.tables
+    }
+    base, count = {}, 0
+    n_image_colours = 0
+    bends = {t.kind for t in given.tables if t.bends}
+    for kind, names in kinds.items():
+        base[kind] = count
+        if not any(name is not None for name in names):
+            # No image meets the scanner.
+            continue
+        count += max((seen[o] + 1 for o in seen if o.split(":")[0] == kind), default=0)
+        if kind == "c" or kind in bends:
+            n_image_colours = count
+    colour = np.array([base[o.split(":")[0]] + r for o, r in zip(owners, rank, strict=True)], np.int32)
+    column = np.full((len(block.images), count), len(free), np.int32)
+    of_owner: dict[str, list[int]] = {}
+    for j, o in enumerate(owners):
+        of_owner.setdefault(o, []).append(j)
+    for kind, names in kinds.items():
+        for i, name in enumerate(names):
+            for j in of_owner.get(f"{kind}:{name}", ()):
+                column[i, colour[j]] = j
+    return colour, column, n_image_colours
+
+
+def _places_of_cameras(cameras: tuple[CameraGroup, ...]) -> np.ndarray | None:
+    """Places of the parameters of each image's camera (parameters, images); None where models differ."""
+    if len(cameras) != 1:
+        return None
+    (g,) = cameras
+    m = g.treedef.num_leaves
+    return g.offset + m * g.camera + np.arange(m)[:, None]
 
 
 def _groups(block: Block, image_camera: np.ndarray) -> tuple[CameraGroup, ...]:
@@ -254,23 +318,16 @@ def _groups(block: Block, image_camera: np.ndarray) -> tuple[CameraGroup, ...]:
     return tuple(groups)
 
 
-def _with_free(group: CameraGroup, free: np.ndarray) -> CameraGroup:
-    """The group with its list of parameters that are free in any of its cameras."""
+def _with_free(group: CameraGroup, free: np.ndarray, tables: tuple[ParameterTable, ...]) -> CameraGroup:
+    """The group with its list of parameters that are free, or bent, in any of its cameras."""
     m = group.treedef.num_leaves
     own = free[(free >= group.offset) & (free < group.offset + m * len(group.names))] - group.offset
-    return dataclasses.replace(group, free_leaves=tuple(sorted({int(k) % m for k in own})))
-
-
-def _point_classes(pairs: np.ndarray, n_points: int) -> np.ndarray:
-    """Greedy colouring: two points joined by a distance lie in different classes."""
-    classes = np.zeros(n_points, np.int32)
-    neighbours: dict[int, set[int]] = {}
-    for a, b in pairs:
-        neighbours.setdefault(int(a), set()).add(int(b))
-        neighbours.setdefault(int(b), set()).add(int(a))
-    done: set[int] = set()
-    for p, around in neighbours.items():
-        taken = {int(classes[q]) for q in around & done}
-        classes[p] = next(k for k in range(len(taken) + 1) if k not in taken)
-        done.add(p)
-    return classes
+    moved = {int(k) % m for k in own}
+    fields = [
+        path[-1].name
+        for path, _ in jax.tree_util.tree_flatten_with_path(jax.tree.unflatten(group.treedef, range(m)))[0]
+    ]
+    for t in tables:
+        if t.bends:
+            moved |= {fields.index(name) for name in t.form[0].bends if name in fields}
+    return dataclasses.replace(group, free_leaves=tuple(sorted(moved)))

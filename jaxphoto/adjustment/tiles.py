@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float
 from jaxphoto.adjustment.residuals import Increments, State, Values
 from jaxphoto.adjustment.structure import CameraGroup, Structure, Tiles, interior_of
 from jaxphoto.collinearity import ExteriorOrientation, camera_coordinates, camera_residual
-from jaxphoto.georeferencing import apparent_point
+from jaxphoto.georeferencing import Exposure, apparent_point
 from jaxphoto.rotation import small_rotation
 
 
@@ -28,7 +28,7 @@ class Scene(NamedTuple):
     centre: Float[Array, "images 3"]
     rotation: Float[Array, "images 3 3"]
     cameras: tuple[Array, ...]
-    """Of each group of cameras, its parameters: (m) where the group is one camera, else (images, m)."""
+    """Of each group of cameras, its parameters: (m) where it is one camera that nothing bends, else (images, m)."""
 
 
 class Seen(NamedTuple):
@@ -47,7 +47,7 @@ class Slopes(NamedTuple):
     rotation: Float[Array, "images 3 3 3"]
     """The last axis is the increment's."""
     cameras: tuple[Array, ...]
-    """(colours, free) where the group is one camera, else (images, colours, free)."""
+    """(colours, free) where parameters are (m), else (images, colours, free)."""
 
 
 Pair = tuple[Float[Array, "m p"], Float[Array, "m p"]]
@@ -67,14 +67,38 @@ class Columns(NamedTuple):
     point: Float[Array, "3 m p"]
 
 
-def scene_of(state: State, s: Structure) -> Scene:
+def scene_of(state: State, values: Values, s: Structure) -> Scene:
     """The state, image by image."""
+    return Scene(state.position.T, state.rotation.transpose(2, 0, 1), _cameras_at(jnp.asarray(state.shared), values, s))
+
+
+def _cameras_at(shared: Array, values: Values, s: Structure) -> tuple[Array, ...]:
+    """The parameters of the cameras (see `Scene`), bent by what is declared to bend them."""
     cameras = []
     for g in s.groups:
         m = g.treedef.num_leaves
-        table = state.shared[g.offset : g.offset + m * len(g.names)].reshape(-1, m)
-        cameras.append(table[0] if len(g.names) == 1 else table[g.camera])
-    return Scene(state.position.T, state.rotation.transpose(2, 0, 1), tuple(cameras))
+        table = shared[g.offset : g.offset + m * len(g.names)].reshape(-1, m)
+        cameras.append(_bent(g, table[g.camera], shared, values, s) if by_image(g, s) else table[0])
+    return tuple(cameras)
+
+
+def _bent(g: CameraGroup, cameras: Float[Array, "images m"], shared: Array, v: Values, s: Structure) -> Array:
+    if not s.bends:
+        return cameras
+    bending = [(jax.tree.map(lambda p, t=t: p[..., t.of_image], t.all_owners(shared))) for t in s.tables if t.bends]
+
+    def one(camera: Array, parameters: list, *exposure: Array) -> Array:
+        interior = interior_of(g, list(camera))
+        for own in parameters:
+            interior = own.interior(interior, Exposure(*exposure))
+        return jnp.stack([jnp.asarray(leaf, float) for leaf in jax.tree.leaves(interior)])
+
+    return jax.vmap(one, (0, -1, *[-1] * 5))(cameras, bending, v.time, v.velocity, v.rate, v.nominal, v.flight_time)
+
+
+def by_image(g: CameraGroup, s: Structure) -> bool:
+    """Whether the parameters of a group of cameras are listed by image."""
+    return s.bends or len(g.names) > 1
 
 
 def slopes_of(y: Increments, scale: Increments, values: Values, s: Structure) -> Slopes:
@@ -87,18 +111,24 @@ def slopes_of(y: Increments, scale: Increments, values: Values, s: Structure) ->
     own, n = slice(0, s.n_interior), s.n_image_colours
     by_colour = jnp.zeros((len(values.shared), n)).at[s.free[own], s.colour[own]].set(scale.shared[own])
     cameras = []
-    for g in s.groups:
-        m = g.treedef.num_leaves
-        table = by_colour[g.offset : g.offset + m * len(g.names)].reshape(len(g.names), m, n)
-        table = table[:, list(g.free_leaves)].transpose(0, 2, 1)
-        cameras.append(table[0] if len(g.names) == 1 else table[g.camera])
+    if s.bends:
+        shared = jnp.asarray(values.shared).at[s.free].add(y.shared * scale.shared, unique_indices=True)
+        # A product for each colour: an image has one owner of each kind, so nothing of another's comes in.
+        along = jax.vmap(lambda d: jax.jvp(lambda p: _cameras_at(p, values, s), (shared,), (d,))[1], -1, 1)(by_colour)
+        cameras = [c[..., list(g.free_leaves)] for g, c in zip(s.groups, along, strict=True)]
+    else:
+        for g in s.groups:
+            m = g.treedef.num_leaves
+            table = by_colour[g.offset : g.offset + m * len(g.names)].reshape(len(g.names), m, n)
+            table = table[:, list(g.free_leaves)].transpose(0, 2, 1)
+            cameras.append(table[0] if len(g.names) == 1 else table[g.camera])
     return Slopes(scale.eop[:3].T, rotation, tuple(cameras))
 
 
 def of_images(tree: Any, image: Array, s: Structure) -> Any:
     """The parts of a `Scene` or of `Slopes` that belong to a tile's images."""
     take = lambda a: a.at[image].get(mode="promise_in_bounds")  # noqa: E731
-    cameras = tuple(c if len(g.names) == 1 else take(c) for g, c in zip(s.groups, tree.cameras, strict=True))
+    cameras = tuple(take(c) if by_image(g, s) else c for g, c in zip(s.groups, tree.cameras, strict=True))
     return type(tree)(take(tree.centre), take(tree.rotation), cameras)
 
 
@@ -183,7 +213,7 @@ def _columns(
     # jit keeps the trace: every derivative below uses it again.
     place = jax.jit(partial(_in_cameras, seen=seen, s=s))
     by_eop = _slope(lambda *x: place(*x, points), centre, rotation)(*seeds)
-    by_point = _slope(lambda x: place(centre, rotation, x), points)(unit[:, :, None] * scale)
+    by_point = _by_point(lambda x: place(centre, rotation, x), points, scale, s)
     residual, by_place, by_camera = once(
         partial(_camera_columns, s=s), s, scene.cameras, slopes.cameras, place(centre, rotation, points), seen
     )
@@ -195,6 +225,13 @@ def _columns(
         return Columns(residual[k], eop, by_camera[k], point)
 
     return of_one(0), of_one(1)
+
+
+def _by_point(place: Callable, points: Float[Array, "3 p"], scale: Float[Array, "3 p"], s: Structure):
+    """Derivatives of the places in the cameras' frames by the points' coordinates; none where all are fixed."""
+    if not s.in_tiles.free_points:
+        return tuple(jnp.zeros((3, *v.shape)) for v in jax.eval_shape(place, points))
+    return _slope(place, points)(jnp.eye(3)[:, :, None] * scale)
 
 
 def _camera_columns(cameras: tuple[Array, ...], slopes: tuple[Array, ...], in_camera: Triple, seen: Seen, s: Structure):

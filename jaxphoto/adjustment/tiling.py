@@ -41,8 +41,8 @@ _FEW_IMAGES = 64
 
 def order_images(image: np.ndarray, point: np.ndarray, n_images: int, n_points: int) -> tuple[np.ndarray, int]:
     """The place of each image, and the largest difference of places of two images that see a point together."""
-    if n_images < _FEW_IMAGES:
-        return np.arange(n_images, dtype=np.int32), n_images
+    if n_images < _FEW_IMAGES or not len(image):
+        return np.arange(n_images, dtype=np.int32), n_images if len(image) else 1
     # Imported here: it takes a tenth of a second, which small blocks need not wait for.
     from scipy.sparse import csr_matrix
     from scipy.sparse.csgraph import reverse_cuthill_mckee
@@ -86,6 +86,30 @@ def tile_shape(image: np.ndarray, point: np.ndarray, n_images: int, n_points: in
     all_images = size_class(n_images, 8)
     widths = {min(size_class(int(np.ceil(k * most)), 12), all_images) for k in (1, 1.25, 1.5, 2)}
     return min(map(option, widths))[1:]
+
+
+# Points of a tile, all of them fixed, and images of one that are tried.
+_FIELD, _WIDTHS = 128, (12, 4)
+# Slots whose computation takes as long as what a tile takes besides.
+_TILE = 40
+
+
+def field_shape(image: np.ndarray, point: np.ndarray, n_images: int, n_points: int) -> tuple[int, int]:
+    """Images and points of a tile where all points are fixed (`split_points`): a field is cut into few equal parts.
+
+    Where images see few of the points in common, tiles of few images have fewer empty slots.
+    """
+    parts = -(-max(n_points, 1) // _FIELD)
+    p = size_class(-(-n_points // parts), 8)
+    fixed = np.ones(n_points, bool)
+
+    def cost(m: int) -> int:
+        copy, point_of = split_points(image, point, fixed, m)
+        order = np.argsort(copy, kind="stable")
+        tiles = len(_best_cut(*_orders(image[order], copy[order], len(point_of)), m, p)[1])
+        return tiles * (m * p + _TILE)
+
+    return min((min(m, size_class(n_images, 4)) for m in _WIDTHS), key=cost), p
 
 
 # Points on which tile shapes are tried: so many runs of so many.
@@ -173,3 +197,17 @@ def _cut(order: np.ndarray, images: list[list[int]], m: int, p: int) -> list[tup
     if len(order):
         tiles.append((sorted(members), start, len(order)))
     return tiles
+
+
+def split_points(
+    image: np.ndarray, point: np.ndarray, fixed: np.ndarray, m: int
+) -> tuple[Int[np.ndarray, "rows"], Int[np.ndarray, "copies"]]:
+    """A copy of each `fixed` point for every `m` images in a row that see it: the copy of each row, the point of each.
+
+    Copies are in the order of their points; a point that no image sees has one as well.
+    """
+    groups = int(image.max(initial=0)) // m + 1
+    key = point.astype(np.int64) * groups + np.where(fixed[point], image // m, 0)
+    unseen = np.setdiff1d(np.arange(len(fixed)), point) * groups
+    copies = np.union1d(key, unseen)
+    return np.searchsorted(copies, key), copies // groups

@@ -1,32 +1,19 @@
-"""What the camera does to light: sensor, interior orientation, distortion."""
+"""What the camera does to light: sensor, interior orientation, projection, distortion."""
 
 from jaxphoto.camera.balance import rebalance, rebalance_covariance
-from jaxphoto.camera.distortion import (
-    DISTORTIONS,
-    AbstractDistortion,
-    AffineBrown,
-    Agisoft,
-    Balanced,
-    Brown,
-    Brown14,
-    BundlerRadial,
-    Ebner,
-    Gruen,
-    OpenCv,
-    PpsRadial,
-    RadialPolynomial,
-    Smac,
-    invert,
-)
+from jaxphoto.camera.distortion import *  # noqa: F403 - what is declared there is public here
+from jaxphoto.camera.distortion import DISTORTIONS, AbstractDistortion, invert
 from jaxphoto.camera.equivalence import exact, with_sign
 from jaxphoto.camera.interior import (
     InteriorOrientation,
     constant_names,
+    empty_camera,
     get_parameter,
-    needed_constants,
+    model_keys,
     parameter_names,
     set_parameter,
 )
+from jaxphoto.camera.principal_distance_rate import PrincipalDistanceRate
 from jaxphoto.camera.principal_points import (
     ConversionError,
     PrincipalPoints,
@@ -35,12 +22,15 @@ from jaxphoto.camera.principal_points import (
     principal_points,
     symmetry_from_decentring,
 )
+from jaxphoto.camera.projection import *  # noqa: F403
+from jaxphoto.camera.projection import PROJECTIONS, AbstractProjection
 from jaxphoto.camera.sensor import Sensor
 
 __all__ = [
-    "DISTORTIONS", "AbstractDistortion", "AffineBrown", "Agisoft", "Balanced", "Brown", "Brown14", "BundlerRadial",
-    "ConversionError", "Ebner", "Gruen", "InteriorOrientation", "OpenCv", "PpsRadial", "PrincipalPoints",
-    "RadialPolynomial", "Sensor", "Smac", "constant_names", "conversion_error", "decentring_from_symmetry", "exact",
-    "get_parameter", "invert", "needed_constants", "parameter_names", "principal_points", "rebalance",
-    "rebalance_covariance", "set_parameter", "symmetry_from_decentring", "with_sign",
+    *(model.__name__ for model in (*DISTORTIONS.values(), *PROJECTIONS.values())), "DISTORTIONS", "PROJECTIONS",
+    "AbstractDistortion", "AbstractProjection", "ConversionError", "InteriorOrientation",
+    "PrincipalDistanceRate", "PrincipalPoints", "Sensor",
+    "constant_names", "conversion_error", "decentring_from_symmetry", "empty_camera", "exact", "get_parameter",
+    "invert", "model_keys", "parameter_names", "principal_points", "rebalance", "rebalance_covariance",
+    "set_parameter", "symmetry_from_decentring", "with_sign",
 ]  # fmt: skip

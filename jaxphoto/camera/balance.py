@@ -1,5 +1,7 @@
 """SMAC at another balance radius R0: the exact map, its inverse, and what it does to a covariance."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -9,7 +11,7 @@ from jaxphoto.camera.distortion import Smac
 from jaxphoto.camera.interior import InteriorOrientation, get_parameter, parameter_names, set_parameter
 
 
-def rebalance(interior: InteriorOrientation, r0_mm: float) -> InteriorOrientation:
+def rebalance(interior: InteriorOrientation, r0_mm: Float[Array, ""] | float) -> InteriorOrientation:
     """The same bundle of rays written with the balance radius `r0_mm` and K0 = 0.
 
     With `s = 1 -+ (K0 - sum Ki R0^2i)` (upper sign: subtracted), c, Ki, P1 and P2 divide by s to reach R0 = 0, and
@@ -34,11 +36,11 @@ def rebalance(interior: InteriorOrientation, r0_mm: float) -> InteriorOrientatio
         k0=jnp.zeros_like(factor), k1=k1, k2=k2, k3=k3, k4=k4, p1=d.p1 * factor, p2=d.p2 * factor,
         p3=d.p3, p4=d.p4, r0=jnp.asarray(r0_mm, float), sign=d.sign,
     )  # fmt: skip
-    return InteriorOrientation(interior.c * factor, interior.x_p, interior.y_p, smac, interior.residuals)
+    return dataclasses.replace(interior, c=interior.c * factor, distortion=smac)
 
 
 def rebalance_covariance(
-    interior: InteriorOrientation, r0_mm: float, covariance: Float[Array, "n n"]
+    interior: InteriorOrientation, r0_mm: Float[Array, ""] | float, covariance: Float[Array, "n n"]
 ) -> Float[Array, "n n"]:
     """Covariance of `rebalance(interior, r0_mm)`: J Q J' with J the exact derivative of the map.
 

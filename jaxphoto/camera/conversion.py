@@ -9,15 +9,9 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from jaxphoto.camera.distortion import AbstractDistortion, invert
-from jaxphoto.camera.equivalence import exact, usual_coefficients
-from jaxphoto.camera.interior import (
-    InteriorOrientation,
-    constant_names,
-    get_parameter,
-    needed_constants,
-    parameter_names,
-    set_parameter,
-)
+from jaxphoto.camera.equivalence import exact
+from jaxphoto.camera.interior import InteriorOrientation, get_parameter, parameter_names, set_parameter
+from jaxphoto.camera.projection import AbstractProjection
 from jaxphoto.camera.sensor import Sensor
 from jaxphoto.compiling import call_compiled
 
@@ -41,33 +35,50 @@ class Conversion(NamedTuple):
 
 
 def converted(
-    interior: InteriorOrientation, target: type[AbstractDistortion], sensor: Sensor, held: tuple[str, ...] = ()
+    interior: InteriorOrientation,
+    target: type[AbstractDistortion],
+    sensor: Sensor,
+    held: tuple[str, ...] = (),
+    projection: AbstractProjection | None = None,
 ) -> Conversion:
     """`exact` where it exists, otherwise `fitted`; `held` names coefficients of `target` that must be 0.
 
-    Raises what `fitted` raises.
+    `projection` is that of the result, the camera's own where it is None. Raises what `fitted` raises.
     """
-    same = exact(interior, target)
+    own = projection is None or eqx.tree_equal(projection, interior.projection) is True
+    same = exact(interior, target) if own else None
     if same is not None and all(float(get_parameter(same, name)) == 0 for name in held):
         return Conversion(same, 0.0, 0.0, 1.0)
-    return fitted(interior, target, sensor, held)
+    return fitted(interior, target, sensor, held, projection)
 
 
 def fitted(
-    interior: InteriorOrientation, target: type[AbstractDistortion], sensor: Sensor, held: tuple[str, ...] = ()
+    interior: InteriorOrientation,
+    target: type[AbstractDistortion],
+    sensor: Sensor,
+    held: tuple[str, ...] = (),
+    projection: AbstractProjection | None = None,
 ) -> Conversion:
     """The camera with the model `target` whose rays are nearest to those of `interior`, by least squares in the image.
 
     c, x_p, y_p and the coefficients of `target` but `held` are fitted to 25 x 25 evenly spaced image points of the
     format, all of one weight; the camera is not turned. Rare terms (affinity, rational and highest ones) are taken only
-    where others leave more than 0.01 px. R0 of SMAC and of the balanced model is 0.
+    where others leave more than 0.01 px. R0 of SMAC and of the balanced model is 0. `projection` is that of the result,
+    the camera's own where it is None.
 
-    Raises ValueError where `interior` says nothing of more than half of the format, or the fitted model folds in it.
+    Raises ValueError where `interior` says nothing of more than half of the format, where it sees directions there that
+    `projection` does not, or the fitted model folds in it.
     """
     points, rays, covered = _sampled(interior, sensor)
     scales = (*held, *target.scales)
-    rare = tuple(n for n in target.coefficients if n not in (*usual_coefficients(target), *scales))
-    found = _fit(_plain(interior, target, sensor), sensor, points, rays, (*scales, *rare))
+    rare = tuple(n for n in target.coefficients if n not in (*target.usual(), *scales))
+    first = _plain(interior, target, sensor, interior.projection if projection is None else projection)
+    if not np.all(np.asarray(first.projection.sees(*rays.T))):
+        raise ValueError(
+            f"this camera sees directions within its format that the projection {first.projection.name} does not: "
+            f"choose one that does, such as equidistant"
+        )
+    found = _fit(first, sensor, points, rays, (*scales, *rare))
     if rare and not found.max_px <= _GOOD_PX:
         fuller = _fit(found.interior, sensor, points, rays, scales)
         # A fold makes max_px NaN: any other is better.
@@ -81,7 +92,7 @@ def fitted(
 
 
 def _sampled(interior: InteriorOrientation, sensor: Sensor) -> tuple[np.ndarray, np.ndarray, float]:
-    """Image points (mm) of the format that the camera maps, their ideal coordinates over c, and their part of all."""
+    """Image points (mm) of the format that the camera maps, their directions, and their part of all."""
     x, y = (np.linspace(-0.5, 0.5, _SIDE) * side for side in (sensor.width_mm, sensor.height_mm))
     points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     rays, good = (np.asarray(v) for v in call_compiled(_rays, _arrays(interior), points))
@@ -95,18 +106,20 @@ def _sampled(interior: InteriorOrientation, sensor: Sensor) -> tuple[np.ndarray,
 
 @eqx.filter_jit
 def _rays(interior: InteriorOrientation, points):
-    """Ideal coordinates over c of image points, and whether the model is invertible there."""
+    """Directions, over c, of image points, and whether the model is invertible there."""
     d, c = interior.distortion, interior.c
 
     def of_one(xy):
-        ideal, reduced = interior.ideal_from_measured(xy) / c, xy - interior.principal_point
+        ideal, reduced = interior.ideal_from_measured(xy), xy - interior.principal_point
+        unit = c if d.normalised else 1.0
         if d.domain == "ideal":
-            good = invert(d, reduced / c if d.normalised else reduced)[1]
+            good = invert(d, reduced / unit)[1]
         else:
             # The inverse of an inverse: only within the monotone range does it lead back.
-            back, monotone = invert(d, c * ideal)
-            good = monotone & (jnp.max(jnp.abs(back - reduced)) < 1e-6 * c)
-        return ideal, good & jnp.all(jnp.isfinite(ideal))
+            back, monotone = invert(d, ideal / unit)
+            good = monotone & (jnp.max(jnp.abs(unit * back - reduced)) < 1e-6 * c)
+        ray = jnp.stack(interior.direction_from_ideal(ideal)) / c
+        return ray, good & jnp.all(jnp.isfinite(ray))
 
     return jax.vmap(of_one)(points)
 
@@ -140,7 +153,7 @@ def _fit(
 
 def _padded(values: np.ndarray) -> np.ndarray:
     """NaN in place of the points of a format that were left out: one program serves all."""
-    return np.concatenate([values, np.full((_SIDE**2 - len(values), 2), np.nan)])
+    return np.concatenate([values, np.full((_SIDE**2 - len(values), values.shape[1]), np.nan)])
 
 
 @eqx.filter_jit
@@ -150,14 +163,15 @@ def _displacements(values, first: InteriorOrientation, pixel_mm, points, rays):
 
     def of_one(xy, ray):
         here = jnp.all(jnp.isfinite(xy))
-        xy, ray = jnp.where(here, xy, 0.0), jnp.where(here, ray, 0.0)
+        xy, ray = jnp.where(here, xy, 0.0), jnp.where(here, ray, jnp.array([0.0, 0.0, -1.0]))
+        aimed = interior.ideal_from_direction(*ray)
         if interior.distortion.domain == "ideal":
-            apart = interior.measured_from_ideal(interior.c * ray) - xy
+            apart = interior.measured_from_ideal(aimed) - xy
         else:
             # Ideal coordinates over c; the model's own derivative takes their difference to the image.
             ideal = lambda m: interior.ideal_from_measured(m) / interior.c  # noqa: E731
             j = jax.lax.stop_gradient(jax.jacfwd(ideal)(xy))
-            apart = jnp.linalg.solve(j, ray - ideal(xy))
+            apart = jnp.linalg.solve(j, aimed / interior.c - ideal(xy))
         return jnp.where(here, apart / pixel_mm, 0.0)
 
     return jax.vmap(of_one)(points, rays)
@@ -173,20 +187,20 @@ def _moved(interior: InteriorOrientation, pixel_mm, points, rays):
     """Lengths of the displacements (px), exactly; NaN where the model folds."""
 
     def of_one(xy, ray):
-        ideal = interior.c * ray
+        ideal = interior.ideal_from_direction(*ray)
         apart = interior.measured_from_ideal(ideal) - xy
         return jnp.where(interior.valid(ideal), jnp.linalg.norm(apart) / pixel_mm, jnp.nan)
 
     return jax.vmap(of_one)(points, rays)
 
 
-def _plain(interior: InteriorOrientation, target: type[AbstractDistortion], sensor: Sensor) -> InteriorOrientation:
-    """The camera without distortion, as a `target` whose lengths (grid, scale of Brown 14) suit the format."""
-    lengths = {"f": float(interior.c), "b": sensor.width_mm / 3}
-    constants = {field: jnp.asarray(lengths[field]) for field in needed_constants(target).values()}
-    zero = {name: jnp.zeros(()) for name in target.coefficients}
-    others = {f: jnp.zeros(()) for f in constant_names(target).values() if f not in constants}
-    return InteriorOrientation(interior.c, interior.x_p, interior.y_p, target(**zero, **constants, **others))
+def _plain(
+    interior: InteriorOrientation, target: type[AbstractDistortion], sensor: Sensor, projection: AbstractProjection
+) -> InteriorOrientation:
+    """The camera without distortion, as a `target`, and whether or not its own projection is another."""
+    plain = target.plain(sensor)
+    camera = InteriorOrientation(interior.c, interior.x_p, interior.y_p, plain, projection=projection)
+    return jax.tree.map(lambda v: jnp.asarray(v, float), camera)
 
 
 def _with(interior: InteriorOrientation, values) -> InteriorOrientation:

@@ -1,19 +1,27 @@
-"""Interior orientation: principal distance, principal point and a distortion."""
+"""Interior orientation: principal distance, principal point, projection and a distortion."""
 
 import dataclasses
-from collections.abc import Callable
-from typing import Literal
+from collections.abc import Callable, Mapping
+from typing import Any, Literal, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxphoto.camera.declared import Declared
 from jaxphoto.camera.distortion import AbstractDistortion, Brown, invert
+from jaxphoto.camera.projection import AbstractProjection, Perspective
+from jaxphoto.errors import InputError
+from jaxphoto.single import single
+
+Part = TypeVar("Part", bound=Declared)
 
 
 class InteriorOrientation(eqx.Module):
-    """Principal distance c > 0, principal point (x_p, y_p) and distortion, all in mm on the image.
+    """Principal distance c > 0, principal point (x_p, y_p) and distortion, all in mm on the image, and the projection.
 
+    `projection` takes a direction in the camera's frame to the ideal image and back; the perspective plane where none
+    is named.
     `ideal = distortion.ideal_from_measured(measured - (x_p, y_p))`; for a `normalised` distortion both are divided by c
     (docs/conventions.md).
 
@@ -26,14 +34,22 @@ class InteriorOrientation(eqx.Module):
     y_p: Float[Array, ""] | float = 0.0
     distortion: AbstractDistortion = dataclasses.field(default_factory=Brown)
     residuals: Literal["model", "measured"] = eqx.field(static=True, default="model")
+    projection: AbstractProjection = dataclasses.field(default_factory=Perspective)
+
+    def __check_init__(self) -> None:
+        if both := set(self.projection.coefficients) & set(self.distortion.coefficients):
+            raise InputError(
+                f"{', '.join(sorted(both))} would be a coefficient of the projection {self.projection.name} and of the "
+                f"distortion {self.distortion.name}: rename it in one of them"
+            )
 
     def ideal_from_measured(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
         """Ideal image coordinate (mm, from the principal point) of a measured one (mm, from the centre)."""
-        return self._in_mm(self.distortion.ideal_from_measured, xy - self.principal_point)
+        return self._in_mm(self.distortion.ideal_from_measured, single("xy", xy, 2) - self.principal_point)
 
     def measured_from_ideal(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
         """Measured image coordinate (mm, from the centre) of an ideal one (mm, from the principal point)."""
-        return self._in_mm(self.distortion.measured_from_ideal, xy) + self.principal_point
+        return self._in_mm(self.distortion.measured_from_ideal, single("xy", xy, 2)) + self.principal_point
 
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
         """The distortion's own direction (see its `domain`), of one coordinate in mm from the principal point."""
@@ -44,6 +60,23 @@ class InteriorOrientation(eqx.Module):
         if self.distortion.domain == "ideal":
             return jnp.array(True)
         return invert(self.distortion, xy / self.c if self.distortion.normalised else xy)[1]
+
+    def invertible(self, xy: Float[Array, "2"]) -> Bool[Array, ""]:
+        """`valid`, and the same where the distortion is one of the ideal coordinate: far outside, that folds, too."""
+        if self.distortion.domain == "measured":
+            return self.valid(xy)
+        there = xy / self.c if self.distortion.normalised else xy
+        back, sure = invert(self.distortion, self.distortion.closed_form(there))
+        return sure & (jnp.abs(back - there).max() < 1e-9 * (1 + jnp.abs(there).max()))
+
+    def direction_from_ideal(self, xy: Float[Array, "2"]) -> tuple[Array, Array, Array]:
+        """The direction (u, v, w) in the camera's frame, of any length, of an ideal coordinate (mm)."""
+        u, v, w = self.projection.direction_from_ideal(jnp.asarray(self.c, xy.dtype), xy[0], xy[1])
+        return u, v, w
+
+    def ideal_from_direction(self, u: Array, v: Array, w: Array) -> Float[Array, "2"]:
+        """Ideal image coordinate (mm, from the principal point) of a direction, or point, in the camera's frame."""
+        return jnp.stack(self.projection.ideal_from_direction(self.c, u, v, w))
 
     @property
     def principal_point(self) -> Float[Array, "2"]:
@@ -63,16 +96,50 @@ def parameter_names(interior: InteriorOrientation) -> tuple[str, ...]:
 
     These are the names of `block.toml` and of every table (docs/block_folder.md).
     """
-    return ("c_mm", "xp_mm", "yp_mm", *interior.distortion.coefficients)
+    return (*_FIELDS, *interior.distortion.coefficients, *interior.projection.coefficients)
+
+
+def constant_names(interior: InteriorOrientation) -> tuple[str, ...]:
+    """The constants of its models, by their names in files (`r0_mm`)."""
+    return (*interior.distortion.constants, *interior.projection.constants)
+
+
+def model_keys(interior: InteriorOrientation) -> dict[str, str]:
+    """The keys by which files tell the models of a camera: distortion, projection (a perspective one goes without
+    saying), and what is chosen of each."""
+    keys = {"distortion": interior.distortion.name}
+    if type(interior.projection) is not Perspective:
+        keys["projection"] = interior.projection.name
+    return keys | {
+        key: getattr(part, key) for part in (interior.distortion, interior.projection) for key in part.choices
+    }
+
+
+def empty_camera(told: Mapping[str, Any], constant: float = 1.0) -> InteriorOrientation:
+    """A camera of the models that `model_keys` told, zeros for numbers, every constant being `constant`.
+
+    Raises InputError for models that are not known, KeyError where no distortion is told.
+    """
+    distortion = _empty(AbstractDistortion.called(told["distortion"]), told, constant)
+    projection = _empty(AbstractProjection.called(told.get("projection", Perspective.name)), told, constant)
+    return InteriorOrientation(1.0, 0.0, 0.0, distortion, projection=projection)
+
+
+def _empty(kind: type[Part], told: Mapping[str, Any], constant: float) -> Part:
+    chosen = {key: told[key] for key in kind.choices if key in told}
+    return kind(**dict.fromkeys(kind.constants.values(), constant), **chosen)
 
 
 def get_parameter(interior: InteriorOrientation, name: str):
-    """The value (or, in a tree of priors, the prior) that `name` of `parameter_names` stands for."""
+    """The value (or, in a tree of priors, the prior) that `name` of `parameter_names` stands for; constants, too.
+
+    Raises InputError for a name that the camera has not.
+    """
     return getattr(*_place(interior, name))
 
 
 def set_parameter(interior: InteriorOrientation, name: str, value) -> InteriorOrientation:
-    """A copy of `interior` in which the parameter `name` is `value`."""
+    """A copy of `interior` in which the parameter `name` is `value`. Raises InputError for a name that it has not."""
 
     def where(tree):
         return getattr(*_place(tree, name))
@@ -81,22 +148,17 @@ def set_parameter(interior: InteriorOrientation, name: str, value) -> InteriorOr
 
 
 _FIELDS = {"c_mm": "c", "xp_mm": "x_p", "yp_mm": "y_p"}
-_CONSTANTS = {"r0_mm": "r0", "b_mm": "b", "f_mm": "f"}
-
-
-def constant_names(distortion: type[AbstractDistortion]) -> dict[str, str]:
-    """The constants of a model: name in a file -> field (`r0_mm` -> `r0`)."""
-    fields = {f.name for f in dataclasses.fields(distortion)}
-    return {name: field for name, field in _CONSTANTS.items() if field in fields}
-
-
-def needed_constants(distortion: type[AbstractDistortion]) -> dict[str, str]:
-    """Those of `constant_names` that have no default: positive lengths without which the model says nothing."""
-    needed = {f.name for f in dataclasses.fields(distortion) if f.default is dataclasses.MISSING}
-    return {name: field for name, field in constant_names(distortion).items() if field in needed}
 
 
 def _place(interior: InteriorOrientation, name: str) -> tuple[object, str]:
     if name in _FIELDS:
         return interior, _FIELDS[name]
-    return interior.distortion, _CONSTANTS.get(name, name)
+    for part in (interior.distortion, interior.projection):
+        if name in part.coefficients:
+            return part, name
+        if name in part.constants:
+            return part, part.constants[name]
+    known = ", ".join((*parameter_names(interior), *constant_names(interior)))
+    raise InputError(
+        f"a camera with the distortion {interior.distortion.name} has no parameter {name!r}; it has {known}"
+    )

@@ -10,6 +10,7 @@ S^2 are not of that form. A conversion drops them, and `conversion_error` says h
 docs/models.md; the two points in paper 003, section 2.4.
 """
 
+import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
@@ -109,9 +110,9 @@ def conversion_error(
 
     def displacement(unknowns):
         theta, interior = unknowns[:3], camera(unknowns[3:])
-        ideal = jax.vmap(interior.ideal_from_measured)(points)
-        rays = jnp.column_stack([ideal, jnp.full(len(points), -interior.c)]) @ small_rotation(theta).T
-        return (-before.c * rays[:, :2] / rays[:, 2:] - wanted).ravel()
+        rays = jax.vmap(lambda xy: jnp.stack(interior.direction_from_ideal(interior.ideal_from_measured(xy))))(points)
+        turned = rays @ small_rotation(theta).T
+        return (jax.vmap(before.ideal_from_direction)(*turned.T) - wanted).ravel()
 
     def improved(_, unknowns):
         jacobian = jax.jacfwd(displacement)(unknowns)
@@ -140,4 +141,4 @@ def _checked(interior: InteriorOrientation, kind):
 
 
 def _with_distortion(interior: InteriorOrientation, distortion) -> InteriorOrientation:
-    return InteriorOrientation(interior.c, interior.x_p, interior.y_p, distortion)
+    return dataclasses.replace(interior, distortion=distortion)

@@ -4,6 +4,8 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from jaxphoto.arrays import Numbers
+
 
 class Sensor(eqx.Module):
     """A frame sensor of `width_px` x `height_px` square pixels of `pixel_mm` millimetres."""
@@ -29,7 +31,7 @@ class Sensor(eqx.Module):
         """Format along y, in millimetres."""
         return self.height_px * self.pixel_mm
 
-    def mm_from_px(self, column_row: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+    def mm_from_px(self, column_row: Float[Numbers, "n 2"]) -> Float[np.ndarray, "n 2"]:
         """Millimetres, origin at the image centre, x right, y up, from (column, row) in pixels.
 
         The centre of the upper-left pixel is (0.5, 0.5) (docs/conventions.md).
@@ -37,7 +39,7 @@ class Sensor(eqx.Module):
         centre = np.array([self.width_px, self.height_px]) / 2
         return (np.asarray(column_row) - centre) * np.array([self.pixel_mm, -self.pixel_mm])
 
-    def px_from_mm(self, xy_mm: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+    def px_from_mm(self, xy_mm: Float[Numbers, "n 2"]) -> Float[np.ndarray, "n 2"]:
         """(column, row) in pixels from millimetres: the inverse of `mm_from_px`."""
         centre = np.array([self.width_px, self.height_px]) / 2
         return np.asarray(xy_mm) / np.array([self.pixel_mm, -self.pixel_mm]) + centre

@@ -14,10 +14,10 @@ import jaxphoto
 from jaxphoto.camera import DISTORTIONS
 from jaxphoto.cli.app import app
 from jaxphoto.errors import InputError
+from jaxphoto.image_measurement.grey_values import read_grey
+from jaxphoto.image_measurement.targets import SYNTAX, find_targets, read_board
 from jaxphoto.io import write_block
-from jaxphoto.io.grey_values import read_grey
 from jaxphoto.io.photographs import photographs, sensor_and_interior
-from jaxphoto.io.targets import SYNTAX, find_targets, read_board
 from jaxphoto.procedures.calibration import calibrate, distortion_model, free_parameters
 from jaxphoto.report import check_target, prepare_pictures, print_adjustment, warnings_of
 from jaxphoto.report.calibration import print_calibration, write_calibration

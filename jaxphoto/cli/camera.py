@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from jaxphoto.camera import DISTORTIONS, get_parameter, parameter_names
+from jaxphoto.camera import DISTORTIONS, AbstractDistortion, get_parameter, parameter_names
 from jaxphoto.cli.app import app
 from jaxphoto.errors import InputError
 from jaxphoto.io.cameras import CAMERA_FORMATS, read_camera_file, write_camera_file
@@ -32,13 +32,14 @@ def camera_command(
     """Convert a camera file: exactly where the models allow it, otherwise fitted, the residual stated in pixels."""
     if out.exists():
         raise InputError(f"{out} exists already: name a new file")
-    if distortion is not None and distortion not in DISTORTIONS:
-        raise InputError(f"--distortion {distortion}: there are {', '.join(DISTORTIONS)}")
+    known = AbstractDistortion.known()
+    if distortion is not None and distortion not in known:
+        raise InputError(f"--distortion {distortion}: there are {', '.join(known)}")
     if (width_px is None) != (height_px is None):
         raise InputError("--width-px and --height-px belong together; give both or none")
     size = None if width_px is None or height_px is None else (width_px, height_px)
     read = read_camera_file(source, camera=camera, pixel_mm=pixel_mm, size_px=size, block=block)
-    kind = DISTORTIONS[distortion] if distortion is not None else None
+    kind = known[distortion] if distortion is not None else None
     done = write_camera_file(out, read.sensor, read.interior, out_format, name=read.name, distortion=kind)
     console = Console(highlight=False, markup=False, soft_wrap=True)
     console.print(

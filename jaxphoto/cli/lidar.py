@@ -18,7 +18,7 @@ from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import Scanner
 from jaxphoto.io import clouds, read_block, write_block
 from jaxphoto.io.block_folder import check_block_target
-from jaxphoto.io.tables import is_number
+from jaxphoto.io.text_tables import is_number
 from jaxphoto.io.trajectory import read_records, write_flight_csv
 from jaxphoto.io.trajectory.in_frame import trajectory_in, with_positions
 from jaxphoto.lidar import HeightSettings
@@ -26,7 +26,7 @@ from jaxphoto.lidar.correction import correct_cloud
 from jaxphoto.orientation import approximate
 from jaxphoto.procedures.lidar import Round, lidar_control, roof_control, simultaneous
 from jaxphoto.procedures.lidar.images_and_cloud import SHIFT_SIGMA, SURFACES
-from jaxphoto.procedures.lidar.rounds import MAX_ROUNDS
+from jaxphoto.procedures.lidar.until_still import MAX_ROUNDS
 from jaxphoto.procedures.lidar.vertical_control import METHODS, flag_counts
 from jaxphoto.report import check_target
 from jaxphoto.report.lidar import (

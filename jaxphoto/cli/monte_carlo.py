@@ -15,7 +15,7 @@ from jaxphoto.cli.app import app
 from jaxphoto.errors import InputError
 from jaxphoto.experiment import MonteCarlo
 from jaxphoto.io import read_block
-from jaxphoto.io.draws import check_place
+from jaxphoto.io.draws_folder import check_place
 from jaxphoto.procedures import adjust
 from jaxphoto.sensitivity import PER, Bias, Readjustment, bias, check_draws, noise
 

@@ -12,11 +12,11 @@ from rich.markup import escape
 from jaxphoto.camera import DISTORTIONS, InteriorOrientation
 from jaxphoto.cli.app import app
 from jaxphoto.errors import InputError
+from jaxphoto.image_measurement.matching import MatchedPhotographs, match_photographs
+from jaxphoto.image_measurement.photograph_pairs import photograph_pairs
 from jaxphoto.io import read_block, write_block
 from jaxphoto.io.block_folder import check_block_target
-from jaxphoto.io.block_folder.layout import TOML
-from jaxphoto.io.matching import MatchedPhotographs, match_photographs
-from jaxphoto.io.pairs import photograph_pairs
+from jaxphoto.io.block_folder.table_layout import TOML
 from jaxphoto.io.photographs import photographs, sensor_and_interior
 from jaxphoto.procedures.adjust import needs_orientation
 from jaxphoto.procedures.calibration import distortion_model

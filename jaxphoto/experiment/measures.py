@@ -10,9 +10,9 @@ from types import MappingProxyType
 import numpy as np
 import pandas as pd
 
-from jaxphoto.block import AXES
 from jaxphoto.experiment.declaration import Cells, Measure, Results
 from jaxphoto.io.recipe import truth_tables
+from jaxphoto.observations import AXES
 from jaxphoto.report import Tables
 from jaxphoto.statistics import angle_differences, point_differences, residual_spread
 

@@ -5,6 +5,7 @@ import hashlib
 import json
 import time
 from collections.abc import Callable
+from functools import cached_property
 from pathlib import Path
 
 import jax
@@ -12,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from jaxphoto.block import Block
-from jaxphoto.io.draws import DrawsFolder, digest_of, write_whole
+from jaxphoto.io.draws_folder import DrawsFolder, digest_of, write_whole
 from jaxphoto.report.draws import (
     Moments,
     column_of,
@@ -26,8 +27,12 @@ from jaxphoto.report.draws import (
 from jaxphoto.report.results import versions
 from jaxphoto.sensitivity import Bias, Readjustment, joined_draws
 
-# Draws of a part, which a run that is stopped loses at most; fewer where they are more numbers than this.
-_PART, _PART_NUMBERS = 1000, 5_000_000
+# Draws of a part, which a run that is stopped loses at most; fewer where they are more numbers than this, or more image
+# rows, which take some seconds.
+_PART, _PART_NUMBERS, _PART_ROWS = 1000, 5_000_000, 12_000_000
+# A run sums up what it has when there are so many draws, and so many seconds, or so many times as long as summing up
+# takes, have gone into drawing since it did so last.
+_FIRST_DRAWS, _SECONDS, _TIMES = 100, 10.0, 20
 # Columns of all draws that are read at a time.
 _AT_ONCE = 200
 _OF_DRAWS = ("draw", "converged", "iterations", "fallback")
@@ -45,7 +50,8 @@ class MonteCarlo:
         self.title, self.run, self.drawn, self.seed = block.title, run, drawn, seed
         self.keys = jax.jit(jax.vmap(lambda k: drawn.drawn(jax.random.fold_in(jax.random.key(seed), k))))
         widest = len(drawn.names) + len(draws_table(run.first_order(np.zeros((1, len(drawn.names)))), run.adjusted).T)
-        parts = min(_PART, _PART_NUMBERS // widest) // run.batch_size
+        rows = len(run.adjusted.structure.image)
+        parts = min(_PART, _PART_NUMBERS // widest, _PART_ROWS // rows) // run.batch_size
         settings = {
             "block": digest_of(block), "errors": _told(drawn), "sigma": _sigma_told(drawn), "seed": seed,
             # What the distribution, which has no name, makes of the seed.
@@ -64,37 +70,58 @@ class MonteCarlo:
             return
         each = np.arange(folder.per_part)
         self.run.warm_up(np.asarray(self.keys(each)))
-        began = time.perf_counter()
+        since, pause = 0.0, _SECONDS
         for part in range(folder.next_part, folder.n_parts):
-            # Always as many, so that they are compiled for once.
-            numbers = part * folder.per_part + each
-            errors, batches, done = np.asarray(self.keys(numbers))[numbers < folder.draws], [], int(numbers[0])
-            for batch in self.run.batches(errors):
-                batches.append(batch)
-                done += len(batch.steps)
-                progress(done)
-            recorded = dict(zip(self.drawn.names, errors.T, strict=True)) if self.drawn.recorded else {}
-            draws = dataclasses.replace(joined_draws(batches), recorded=recorded)
-            folder.write_part(part, draws_table(draws, self.run.adjusted, int(numbers[0])))
-            self.computed += len(errors)
+            began = time.perf_counter()
+            self._draw_part(part, part * folder.per_part + each, progress)
+            took = time.perf_counter() - began
+            self.seconds, since = self.seconds + took, since + took
+            done = (part + 1) * folder.per_part
+            if since >= pause and _FIRST_DRAWS <= done < folder.draws:
+                began = time.perf_counter()
+                self._sum_up(self._columns_of_few)
+                since, pause = 0.0, max(_SECONDS, _TIMES * (time.perf_counter() - began))
         folder.join()
         folder.tidy()
-        self.seconds = time.perf_counter() - began
+
+    def _draw_part(self, part: int, numbers: np.ndarray, progress: Callable[[int], object]) -> None:
+        """Draw those of `numbers` that are asked for; these are always as many, so that they are compiled for once."""
+        errors, batches, done = np.asarray(self.keys(numbers))[numbers < self.folder.draws], [], int(numbers[0])
+        for batch in self.run.batches(errors):
+            batches.append(batch)
+            done += len(batch.steps)
+            progress(done)
+        recorded = dict(zip(self.drawn.names, errors.T, strict=True)) if self.drawn.recorded else {}
+        draws = dataclasses.replace(joined_draws(batches), recorded=recorded)
+        self.folder.write_part(part, draws_table(draws, self.run.adjusted, int(numbers[0])))
+        self.computed += len(errors)
 
     def write(self) -> tuple[dict, pd.DataFrame]:
         """Write summary.csv, effects.csv, pictures and, last, summary.json; gives the summary and its table.
 
         Where all that was written before and nothing was drawn since, it is only read.
         """
-        directory, folder = self.folder.directory, self.folder
+        directory = self.folder.directory
         if self.computed == 0 and (directory / "summary.json").is_file():
             summary = json.loads((directory / "summary.json").read_text(encoding="utf-8"))
-            return summary, pd.read_csv(directory / "summary.csv")
-        nominal, effects, predicted = self._prediction()
+            # Not what was summed up on the way.
+            if summary["draws"] == self.folder.draws:
+                return summary, pd.read_csv(directory / "summary.csv")
+        return self._sum_up([c for c in self.folder.columns() if c not in _OF_DRAWS])
+
+    @property
+    def _columns_of_few(self) -> list[str]:
+        """Errors and shared parameters: what is summed up on the way, when every column would take too long."""
+        errors = [in_degrees(f"bias.{name}") for name in self.drawn.names] if self.drawn.recorded else []
+        return errors + [column_of(label) for label in self.run.adjusted.structure.labels]
+
+    def _sum_up(self, names: list[str]) -> tuple[dict, pd.DataFrame]:
+        """Write what `write` does of these columns of the draws there are."""
+        directory, folder = self.folder.directory, self.folder
+        nominal, effects, predicted = self._prediction
         told = folder.read(["converged", "fallback"])
         good = told["converged"]
-        names = [c for c in folder.columns() if c not in _OF_DRAWS]
-        predicted |= {in_degrees(f"bias.{name}"): v for name, v in self._sigmas().items()}
+        predicted = predicted | {in_degrees(f"bias.{name}"): v for name, v in self._sigmas().items()}
         found: dict[str, Moments] = {}
         for first in range(0, len(names), _AT_ONCE):
             some = folder.read(names[first : first + _AT_ONCE])
@@ -111,7 +138,8 @@ class MonteCarlo:
             effects_figure(effects, table, shared).savefig(directory / "effects.png")
         summary = {
             "title": self.title,
-            "draws": folder.draws,
+            "draws": len(good),
+            "draws_asked_for": folder.draws,
             "converged": int(good.sum()),
             "fallbacks": int(told["fallback"].sum()),
             "computed_now": self.computed,
@@ -128,6 +156,7 @@ class MonteCarlo:
         pairs = zip(self.drawn.names, self.drawn.sigma, strict=True)
         return {name: float(np.degrees(v) if name.endswith("_rad") else v) for name, v in pairs}
 
+    @cached_property
     def _prediction(self) -> tuple[dict[str, float], pd.DataFrame, dict[str, float]]:
         """The nominal estimates; what one sigma of each error does to each; and the standard deviations of that.
 

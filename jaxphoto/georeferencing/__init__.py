@@ -8,6 +8,7 @@ from jaxphoto.georeferencing.direct import (
     direct_orientation,
     direct_partials,
 )
+from jaxphoto.georeferencing.flight_bias import FlightBias
 from jaxphoto.georeferencing.ground import RayCovariance, Surface, ground_covariance, ground_point
 from jaxphoto.georeferencing.lever_arm import (
     arm_to_camera,
@@ -32,10 +33,10 @@ from jaxphoto.georeferencing.scanner import Scanner, corrected_point, raised_by_
 from jaxphoto.georeferencing.trajectory import Poses, Trajectory, covered, interpolate
 
 __all__ = [
-    "IMAGE_X", "NOMINAL", "Corrections", "DirectPartials", "Exposure", "Mount", "Poses", "RayCovariance", "Scanner",
-    "SensorCovariance", "StripBias", "Surface", "Trajectory", "apparent_point", "arm_to_camera", "attitude_residual",
-    "body_from_camera", "corrected_point", "covered", "direct_covariance", "direct_orientation", "direct_partials",
-    "exact_offset", "ground_covariance", "ground_point", "interpolate", "level_error", "level_offset",
-    "object_from_body", "raised_by_boresight", "recorded_attitude", "refraction_constant", "sensor_position",
-    "worst_level_error",
+    "IMAGE_X", "NOMINAL", "Corrections", "DirectPartials", "Exposure", "FlightBias", "Mount", "Poses",
+    "RayCovariance", "Scanner", "SensorCovariance", "StripBias", "Surface", "Trajectory", "apparent_point",
+    "arm_to_camera", "attitude_residual", "body_from_camera", "corrected_point", "covered", "direct_covariance",
+    "direct_orientation", "direct_partials", "exact_offset", "ground_covariance", "ground_point", "interpolate",
+    "level_error", "level_offset", "object_from_body", "raised_by_boresight", "recorded_attitude",
+    "refraction_constant", "sensor_position", "worst_level_error",
 ]  # fmt: skip

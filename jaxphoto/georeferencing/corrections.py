@@ -1,7 +1,7 @@
 """Atmospheric refraction and earth curvature as displacements of the object point, for any tilt of the camera.
 
-For a vertical image both are exactly the textbook's radial image displacements (docs/models.md). They are models that a
-block switches on; curvature belongs to map-grid coordinates alone.
+For a vertical image both are, to first order, the textbook's radial image displacements (docs/frames.md). They are
+models that a block switches on; curvature belongs to map-grid coordinates alone.
 """
 
 import dataclasses
@@ -25,9 +25,9 @@ NO_CORRECTIONS = Corrections()
 
 
 def apparent_point(
-    position: Float[Array, "3"], point: Float[Array, "3"], corrections: Corrections
-) -> Float[Array, "3"]:
-    """Where a straight ray from the projection centre aims to meet the image of `point` (m).
+    position: Float[Array, "3 *many"], point: Float[Array, "3 *many"], corrections: Corrections
+) -> Float[Array, "3 *many"]:
+    """Where a straight ray from the projection centre aims to meet the image of `point` (m); of many with a last axis.
 
     Curvature lowers the point by d^2 / 2R, with d its horizontal distance. Refraction turns the ray outward by
     K tan(a), a its angle off the nadir: the point moves by K d (1 + tan(a)^2).
@@ -45,7 +45,9 @@ def apparent_point(
     return position + jnp.stack([east, north, up])
 
 
-def refraction_constant(camera_height: Float[Array, ""], point_height: Float[Array, ""]) -> Float[Array, ""]:
+def refraction_constant(
+    camera_height: Float[Array, "*many"], point_height: Float[Array, "*many"]
+) -> Float[Array, "*many"]:
     """K (rad) of the standard atmosphere for heights above the sea in m: the image moves outward by K r (1 + r^2/c^2).
 
     K = 0.00241 [Z0 / (Z0^2 - 6 Z0 + 250) - Z^2 / (Z0 (Z^2 - 6 Z + 250))]     heights in km

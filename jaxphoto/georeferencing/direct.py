@@ -11,8 +11,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxphoto.collinearity import ExteriorOrientation
-from jaxphoto.georeferencing.mount import Exposure, Mount, StripBias, body_from_camera, sensor_position
+from jaxphoto.georeferencing.mount import Exposure, Mount, StripBias, body_from_camera, nominal_mount, sensor_position
 from jaxphoto.rotation import matrix_from_roll_pitch_yaw, small_angles, small_rotation
+from jaxphoto.single import single
 
 
 class SensorCovariance(eqx.Module):
@@ -38,8 +39,9 @@ def direct_orientation(
     X = GNSS - R l - shift - drift (t - t0) + v tau, the attitude turned on by rate tau and then through the boresight
     (papers 000 and 004, equation (1)).
     """
+    station, roll_pitch_yaw = single("station", station, 3), single("roll_pitch_yaw", roll_pitch_yaw, 3)
     turned = matrix_from_roll_pitch_yaw(roll_pitch_yaw) @ small_rotation(exposure.rate * mount.time_offset).T
-    camera_from_object = (turned @ body_from_camera(mount.boresight, exposure.nominal)).T
+    camera_from_object = (turned @ body_from_camera(mount.boresight, nominal_mount(mount, exposure))).T
     origin = sensor_position(jnp.zeros(3), camera_from_object, mount, bias, exposure)
     return ExteriorOrientation(station - origin, camera_from_object)
 
@@ -64,7 +66,8 @@ def direct_partials(
     at = direct_orientation(station, roll_pitch_yaw, mount, bias, exposure)
 
     def moved(d_station, d_attitude, d_mount):
-        m = Mount(mount.lever_arm + d_mount[:3], mount.boresight + d_mount[3:6], mount.time_offset + d_mount[6])
+        changed = mount.lever_arm + d_mount[:3], mount.boresight + d_mount[3:6], mount.time_offset + d_mount[6]
+        m = Mount(*changed, mount.image_x)
         new = direct_orientation(station + d_station, roll_pitch_yaw + d_attitude, m, bias, exposure)
         return jnp.concatenate([new.position, small_angles(new.camera_from_object @ at.camera_from_object.T)])
 

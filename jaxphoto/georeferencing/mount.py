@@ -6,10 +6,14 @@ Functions of one image. Frames and signs: docs/conventions.md; source: paper 000
 from typing import Literal
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxphoto.arrays import Numbers
+from jaxphoto.errors import InputError
+from jaxphoto.parameters import AbstractParameters
 from jaxphoto.rotation import rotate, small_angles, small_rotation
 
 ImageX = Literal["forward", "left", "back", "right"]
@@ -24,7 +28,7 @@ NOMINAL: dict[str, np.ndarray] = {
 IMAGE_X = tuple(NOMINAL)
 
 
-class Mount(eqx.Module):
+class Mount(AbstractParameters):
     """How a camera sits beside the GNSS/IMU, and how its clock runs.
 
     `lever_arm` from the projection centre to the GNSS/IMU reference (m: right, forward, up), `boresight` as a small
@@ -32,9 +36,17 @@ class Mount(eqx.Module):
     nominal mount: where the camera's x axis points.
     """
 
-    lever_arm: Float[Array, "3"]
-    boresight: Float[Array, "3"]
-    time_offset: Float[Array, ""] | float = 0.0
+    kind = "mounts"
+    owner = "mount"
+    names = {  # noqa: RUF012
+        "lever_arm": tuple(f"lever_arm_{axis}_m" for axis in ("right", "forward", "up")),
+        "boresight": tuple(f"boresight_{axis}_rad" for axis in "xyz"),
+        "time_offset": ("time_offset_s",),
+    }
+
+    lever_arm: Float[Array, "3 *images"]
+    boresight: Float[Array, "3 *images"]
+    time_offset: Float[Array, "*images"] | float = 0.0
     image_x: ImageX = eqx.field(static=True, default="forward")
 
     def __check_init__(self) -> None:
@@ -47,34 +59,65 @@ class Mount(eqx.Module):
         return NOMINAL[self.image_x]
 
 
-class StripBias(eqx.Module):
+class StripBias(AbstractParameters):
     """Shift (m) and drift (m/s), per axis, of the GNSS positions of one strip."""
 
-    shift: Float[Array, "3"]
-    drift: Float[Array, "3"]
+    kind = "strips"
+    owner = "strip"
+    names = {  # noqa: RUF012
+        "shift": tuple(f"shift_{axis}_m" for axis in "XYZ"),
+        "drift": tuple(f"drift_{axis}_m_per_s" for axis in "XYZ"),
+    }
+
+    shift: Float[Array, "3 *images"]
+    drift: Float[Array, "3 *images"]
 
 
 class Exposure(eqx.Module):
-    """What is known of an exposure besides its observations; of many with a leading axis.
+    """What is known of an exposure besides its observations; of many with a leading (in an adjustment: last) axis.
 
     `time` from the strip's reference time (s), `velocity` of the GNSS/IMU in the object frame (m/s), `rate` of turn
-    about the body's right, forward and up axes (rad/s), `nominal` mount of the camera (`Mount.nominal`). Velocity and
-    rate are what a time offset acts on.
+    about the body's right, forward and up axes (rad/s). Velocity and rate are what a time offset acts on. `nominal` is
+    needed only where mounts of several kinds are stacked (`Mount.image_x` is one for all): the `Mount.nominal` of each.
+    `flight_time` is that from the middle of the flight (s), for what changes from strip to strip; None: as `time`.
     """
 
-    time: Float[Array, "*images"]
-    velocity: Float[Array, "*images 3"]
-    rate: Float[Array, "*images 3"]
-    nominal: Float[Array, "*images 3 3"]
+    time: Float[Array, "*images"] | float
+    velocity: Float[Array, "*images 3"] | Float[Array, "3 *images"]
+    rate: Float[Array, "*images 3"] | Float[Array, "3 *images"]
+    nominal: Float[Array, "*images 3 3"] | Float[Array, "3 3 *images"] | None = None
+    flight_time: Float[Array, "*images"] | float | None = None
+
+    @property
+    def in_flight(self) -> Float[Array, "*images"] | float:
+        """Time from the middle of the flight (s)."""
+        return self.time if self.flight_time is None else self.flight_time
 
 
-def body_from_camera(boresight: Float[Array, "3"], nominal: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
+def nominal_mount(mount: Mount, exposure: Exposure) -> Float[Numbers, "3 3"]:
+    """`body_from_camera` without misalignment: what the exposure says, else the mount.
+
+    Raises InputError (under `jit` an error of Equinox) where a mount that is not "forward" and the exposure differ.
+    """
+    if exposure.nominal is None or mount.image_x == "forward":
+        return mount.nominal if exposure.nominal is None else exposure.nominal
+    differ = jnp.any(jnp.asarray(exposure.nominal) != mount.nominal)
+    message = (
+        f"the mount says image_x = {mount.image_x!r}, which is not the nominal mount of the exposure; leave "
+        "Exposure.nominal out, or give it Mount.nominal"
+    )
+    if not isinstance(differ, jax.core.Tracer) and differ:
+        raise InputError(message)
+    return eqx.error_if(jnp.asarray(exposure.nominal), differ, message)
+
+
+def body_from_camera(boresight: Float[Array, "3"], nominal: Float[Numbers, "3 3"]) -> Float[Array, "3 3"]:
     """Nominal mount times the misalignment (small rotation in the camera frame, rad)."""
-    return nominal @ small_rotation(boresight)
+    return jnp.matmul(nominal, small_rotation(boresight))
 
 
 def object_from_body(
-    camera_from_object: Float[Array, "3 3"], boresight: Float[Array, "3"], nominal: Float[Array, "3 3"]
+    camera_from_object: Float[Array, "3 3"], boresight: Float[Array, "3"], nominal: Float[Numbers, "3 3"]
 ) -> Float[Array, "3 3"]:
     """Attitude of the body from the orientation of the camera and the boresight misalignment."""
     return camera_from_object.T @ body_from_camera(boresight, nominal).T
@@ -91,13 +134,13 @@ def sensor_position(
 
     tau is the mount's time offset. Source: paper 000, equation (1).
     """
-    arm = rotate(object_from_body(camera_from_object, mount.boresight, exposure.nominal), mount.lever_arm)
+    arm = rotate(object_from_body(camera_from_object, mount.boresight, nominal_mount(mount, exposure)), mount.lever_arm)
     return position + arm + bias.shift + bias.drift * exposure.time - exposure.velocity * mount.time_offset
 
 
 def recorded_attitude(camera_from_object: Float[Array, "3 3"], mount: Mount, exposure: Exposure) -> Float[Array, "3 3"]:
     """`object_from_body` at the recorded time: an offset tau before the exposure, with `rate * tau` still to turn."""
-    body = object_from_body(camera_from_object, mount.boresight, exposure.nominal)
+    body = object_from_body(camera_from_object, mount.boresight, nominal_mount(mount, exposure))
     return body @ small_rotation(exposure.rate * mount.time_offset)
 
 

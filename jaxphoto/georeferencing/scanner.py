@@ -3,23 +3,32 @@
 Functions of one laser point; frames and signs are those of a camera's mount (docs/conventions.md).
 """
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxphoto.parameters import AbstractParameters
 from jaxphoto.rotation import rotate, small_rotation
 
 
-class Scanner(eqx.Module):
+class Scanner(AbstractParameters):
     """What is wrong with a cloud that was georeferenced without it.
 
     `boresight` is the misalignment, a small rotation about the body's right, forward and up axes (rad); `shifts` holds,
     for each lidar strip by name, what its points are off the object frame by (m).
     """
 
+    kind = "scanner"
+    owner = "lidar"
+    names = {"boresight": tuple(f"boresight_{axis}_rad" for axis in ("right", "forward", "up"))}  # noqa: RUF012
+
     boresight: Float[Array, "3"]
     shifts: dict[str, Float[Array, "3"]]
+
+    def labels(self, owner: str) -> tuple[str, ...]:
+        """Boresight, then the shifts of the lidar strips, each by its name."""
+        shifts = (f"{self.kind}[{name}].shift_{axis}_m" for name in self.shifts for axis in "XYZ")
+        return (*(f"{self.kind}.{name}" for name in self.names["boresight"]), *shifts)
 
 
 def corrected_point(

@@ -56,7 +56,7 @@ class Poses(NamedTuple):
     """The same of roll, pitch, yaw (rad)."""
 
 
-def interpolate(trajectory: Trajectory, times: Float[Array, "times"], max_gap: float) -> Poses:
+def interpolate(trajectory: Trajectory, times: Float[Array, "times"], max_gap: Float[Array, ""] | float) -> Poses:
     """Position, attitude and motion at `times` (s), differentiable with respect to them.
 
     No spline runs across an interval longer than `max_gap` (s): what is returned for times there, and for times before
@@ -84,14 +84,16 @@ def interpolate(trajectory: Trajectory, times: Float[Array, "times"], max_gap: f
     return Poses(at[:, :3], dot[:, :3], matrix, rate, sigma[:, :3], sigma[:, 3:])
 
 
-def covered(trajectory: Trajectory, times: Float[Array, "times"], max_gap: float) -> Bool[Array, "times"]:
+def covered(
+    trajectory: Trajectory, times: Float[Array, "times"], max_gap: Float[Array, ""] | float
+) -> Bool[Array, "times"]:
     """Whether each time lies within the trajectory and in no gap of it."""
     inside = (times >= trajectory.time[0]) & (times <= trajectory.time[-1])
     joined = _joined(trajectory, max_gap)
     return inside & joined[_interval(jnp.asarray(trajectory.time), joined, times)]
 
 
-def _joined(trajectory: Trajectory, max_gap: float) -> Bool[Array, "records-1"]:
+def _joined(trajectory: Trajectory, max_gap: Float[Array, ""] | float) -> Bool[Array, "intervals"]:
     """Which intervals between records are no gap."""
     return jnp.diff(trajectory.time) <= max_gap
 
@@ -103,7 +105,7 @@ def _continuous(quaternion: Float[Array, "n 4"]) -> Float[Array, "n 4"]:
     return quaternion * jnp.concatenate([jnp.ones(1), sign])[:, None]
 
 
-def _interval(nodes: Float[Array, "n"], joined: Bool[Array, "n-1"], times: Float[Array, "m"]) -> Int[Array, "m"]:
+def _interval(nodes: Float[Array, "n"], joined: Bool[Array, "intervals"], times: Float[Array, "m"]) -> Int[Array, "m"]:
     """The interval that each time is in; that before a record where a gap begins, for the time of this record."""
     i = jnp.clip(jnp.searchsorted(nodes, times, side="right") - 1, 0, len(nodes) - 2)
     return jnp.where((times == nodes[i]) & ~joined[i], jnp.maximum(i - 1, 0), i)

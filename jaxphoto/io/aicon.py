@@ -12,8 +12,8 @@ import numpy as np
 
 from jaxphoto.errors import InputError
 from jaxphoto.io.block_folder import BlockTables
-from jaxphoto.io.block_folder.layout import ANGLES, XYZ
-from jaxphoto.io.tables import Table, content_lines, read_columns
+from jaxphoto.io.block_folder.table_layout import ANGLES, XYZ
+from jaxphoto.io.text_tables import Table, content_lines, read_columns
 
 _MM = 0.001
 # What the program gives every image coordinate; columns 5 and 6 of the .phc file are results.

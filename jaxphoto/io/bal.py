@@ -20,8 +20,8 @@ import numpy as np
 
 from jaxphoto.errors import InputError
 from jaxphoto.io.block_folder import BlockTables
-from jaxphoto.io.block_folder.layout import ANGLES, XYZ
-from jaxphoto.io.tables import Table, content_lines, is_number
+from jaxphoto.io.block_folder.table_layout import ANGLES, XYZ
+from jaxphoto.io.text_tables import Table, content_lines, is_number
 from jaxphoto.rotation import omega_phi_kappa_from_matrix, small_rotation
 
 _PIXEL_MM = 0.001

@@ -8,8 +8,8 @@ from jaxphoto.block import Block
 from jaxphoto.errors import InputError
 from jaxphoto.io import aicon, bal, colmap, dbat, photomodeler
 from jaxphoto.io.block_folder import BlockTables, assemble, write_block
-from jaxphoto.io.block_folder.layout import TOML
-from jaxphoto.io.block_folder.reader import read_folder
+from jaxphoto.io.block_folder.block_reader import read_folder
+from jaxphoto.io.block_folder.table_layout import TOML
 
 
 class Format(NamedTuple):

@@ -11,9 +11,9 @@ import numpy as np
 
 from jaxphoto.errors import InputError
 from jaxphoto.io.block_folder import BlockTables
-from jaxphoto.io.block_folder.layout import SIGMA_XYZ, XYZ
+from jaxphoto.io.block_folder.table_layout import SIGMA_XYZ, XYZ
 from jaxphoto.io.dbat import CAMERA, control_table
-from jaxphoto.io.tables import Table, content_lines, is_number, read_columns
+from jaxphoto.io.text_tables import Table, content_lines, is_number, read_columns
 
 CONTROL, STATIONS = "ctrlpts-weighted.txt", "fake-camera-positions.txt"
 # The export's own standard deviations mark the kind of point (1 manual, 0 automatic); DBAT takes 1 pixel for all.

@@ -11,13 +11,14 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxphoto.arrays import still
-from jaxphoto.block import Block, Rows
+from jaxphoto.block import Block
 from jaxphoto.collinearity import ExteriorOrientation, image_ray
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import BlockError
 from jaxphoto.lidar.grid import Grid
 from jaxphoto.lidar.height_settings import HeightSettings
 from jaxphoto.lidar.pseudo_control import Interpolation, PseudoControl, pseudo_control_points
+from jaxphoto.observations import ControlRows
 from jaxphoto.unknowns import Unknowns
 
 
@@ -30,11 +31,11 @@ class BlockControl(eqx.Module):
     """The image that each was taken from."""
     control: PseudoControl
 
-    def rows(self) -> Rows:
+    def rows(self) -> ControlRows:
         """Vertical control: Z of the points that have one, with its standard deviation."""
         good = np.flatnonzero(np.isfinite(self.control.sigma_z))
         z, sigma = self.control.xyz[good, 2], self.control.sigma_z[good]
-        return Rows(self.point[good], np.full(len(good), 2), z, sigma)
+        return ControlRows(self.point[good], np.full(len(good), 2), z, sigma)
 
 
 def pseudo_control_of_block(

@@ -36,7 +36,7 @@ class HeightNumbers(NamedTuple):
     noise: LidarNoise
 
 
-class Estimate(NamedTuple):
+class HeightEstimate(NamedTuple):
     """What one place comes to."""
 
     height: Float[Numbers, ""]
@@ -67,12 +67,12 @@ class Estimate(NamedTuple):
 @eqx.filter_jit
 def estimate_heights(
     near: Neighbours, leafy: Bool[Array, "places points"], numbers: HeightNumbers, method: str
-) -> Estimate:
+) -> HeightEstimate:
     """Every place by `method`; arrays of `near` have a leading axis over the places."""
     return jax.vmap(lambda n, of: _estimate(n, of, numbers, method))(near, leafy)
 
 
-def _estimate(near: Neighbours, leafy: Bool[Array, "points"], numbers: HeightNumbers, method: str) -> Estimate:
+def _estimate(near: Neighbours, leafy: Bool[Array, "points"], numbers: HeightNumbers, method: str) -> HeightEstimate:
     in_radius = near.there & (near.distance <= numbers.radius)
     n_used = jnp.where(numbers.radius > 0, jnp.sum(in_radius), numbers.points)
     n_around = jnp.maximum(WIDE, TIMES * n_used)
@@ -111,7 +111,7 @@ def _estimate(near: Neighbours, leafy: Bool[Array, "points"], numbers: HeightNum
         weight = jnp.where(take_flat, flat.rows[0], curved.rows[0])
     reach, n_there = jnp.max(jnp.where(around, near.distance, 0.0)), jnp.sum(around)
     expected = noise_variance(fit, numbers.noise)
-    return Estimate(
+    return HeightEstimate(
         height=jnp.sum(weight * jnp.where(near.there, near.z, 0.0)),
         sigma=height_sigma(near, weight, fit, numbers.noise),
         used=jnp.sum(used),

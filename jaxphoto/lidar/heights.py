@@ -14,7 +14,7 @@ from typing import Literal, get_args
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Integer
 
 from jaxphoto.arrays import Numbers
 from jaxphoto.cloud import Cloud
@@ -23,7 +23,7 @@ from jaxphoto.errors import InputError
 from jaxphoto.lidar.breaklines import lie_on_two_planes
 from jaxphoto.lidar.grid import Grid, index_cloud, nearest
 from jaxphoto.lidar.height_error import LidarNoise
-from jaxphoto.lidar.height_estimate import APART, TIMES, WIDE, Estimate, HeightNumbers, estimate_heights
+from jaxphoto.lidar.height_estimate import APART, TIMES, WIDE, HeightEstimate, HeightNumbers, estimate_heights
 from jaxphoto.lidar.height_settings import HeightFlag, HeightSettings
 from jaxphoto.lidar.local_surface import Neighbours
 
@@ -41,7 +41,7 @@ class Heights(eqx.Module):
 
     z: Float[Numbers, "places"]
     sigma: Float[Numbers, "places"]
-    flag: Int[Numbers, "places"]
+    flag: Integer[Numbers, "places"]
     """Sums of `HeightFlag`."""
     count: Int[Numbers, "places"]
     """Points that the height comes from."""
@@ -109,7 +109,7 @@ def _points_of_radius(grid: Grid, xy: np.ndarray, radius_m: float, wide: int) ->
     return wide
 
 
-def _estimates(grid: Grid, xy: np.ndarray, method: Method, settings: HeightSettings, k: int) -> Estimate:
+def _estimates(grid: Grid, xy: np.ndarray, method: Method, settings: HeightSettings, k: int) -> HeightEstimate:
     """All places, and again with more points those whose triangle might be another one then."""
     found = _with_points(grid, xy, method, settings, k)
     refused = found.hole * HeightFlag.HOLE | ~found.surrounded * HeightFlag.EDGE
@@ -125,7 +125,7 @@ def _estimates(grid: Grid, xy: np.ndarray, method: Method, settings: HeightSetti
     return found
 
 
-def _with_points(grid: Grid, xy: np.ndarray, method: Method, settings: HeightSettings, k: int) -> Estimate:
+def _with_points(grid: Grid, xy: np.ndarray, method: Method, settings: HeightSettings, k: int) -> HeightEstimate:
     """Places from their `k` nearest points, in portions of few sizes."""
     most = max(1, _PLACES[-1] * WIDE // k)
     noise = LidarNoise(np.array(settings.sigma_z_m), np.array(settings.sigma_xy_m))
@@ -140,9 +140,9 @@ def _with_points(grid: Grid, xy: np.ndarray, method: Method, settings: HeightSet
         padded = np.concatenate([some, np.broadcast_to(grid.xyz[0, :2], (room - len(some), 2))])
         near, base, leafy = _neighbours(grid, padded, k)
         part = call_compiled(estimate_heights, near, leafy, numbers, method)
-        part = Estimate(*(np.array(v)[: len(some)] for v in part))
+        part = HeightEstimate(*(np.array(v)[: len(some)] for v in part))
         parts.append(part._replace(height=part.height + base[: len(some)]))
-    return Estimate(*(np.concatenate(v) for v in zip(*parts, strict=True)))
+    return HeightEstimate(*(np.concatenate(v) for v in zip(*parts, strict=True)))
 
 
 def _neighbours(grid: Grid, xy: np.ndarray, k: int) -> tuple[Neighbours, Numbers, Numbers]:
@@ -155,7 +155,7 @@ def _neighbours(grid: Grid, xy: np.ndarray, k: int) -> tuple[Neighbours, Numbers
     return near, base, grid.leafy[found.index] & there
 
 
-def _judged(found: Estimate, broken: np.ndarray, settings: HeightSettings) -> Heights:
+def _judged(found: HeightEstimate, broken: np.ndarray, settings: HeightSettings) -> Heights:
     """Flags put together, and what they refuse taken out."""
     rough = found.misfit & found.rough & ~broken
     of_leaves = (found.leafy > 0) & (found.leafy >= settings.leafy_share)
@@ -174,7 +174,7 @@ def _judged(found: Estimate, broken: np.ndarray, settings: HeightSettings) -> He
     )
 
 
-def _broken(grid: Grid, xy: np.ndarray, found: Estimate, k: int) -> np.ndarray:
+def _broken(grid: Grid, xy: np.ndarray, found: HeightEstimate, k: int) -> np.ndarray:
     """Which places lie where two surfaces meet, of those where one smooth surface does not fit."""
     broken = np.zeros(len(xy), bool)
     doubtful = np.flatnonzero(found.misfit)

@@ -10,7 +10,7 @@ from jaxphoto.arrays import Numbers
 def inverse_distance_weights(
     squared: Float[Numbers, "m"], used: Bool[Numbers, "m"], power: Float[Numbers, ""]
 ) -> Float[Array, "m"]:
-    """w = d^-p over their sum, from the squares d^2 (m^2) of the distances; of the points `used`, zero of all others.
+    """w = d^-p over their sum, from the squares d^2 of distances in any unit; of the points `used`, zero of all others.
 
     Points at the place itself (d = 0) alone count where there are any; differentiable there too. All are zero where no
     point is used.

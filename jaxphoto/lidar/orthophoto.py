@@ -4,13 +4,12 @@ from collections.abc import Callable
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 from scipy import ndimage
 
-from jaxphoto.camera import InteriorOrientation, Sensor, invert
-from jaxphoto.collinearity import ExteriorOrientation, camera_coordinates, project, project_ideal
+from jaxphoto.camera import InteriorOrientation, Sensor
+from jaxphoto.collinearity import ExteriorOrientation, in_field, project
 from jaxphoto.compiling import call_compiled
 from jaxphoto.georeferencing.corrections import NO_CORRECTIONS, Corrections, apparent_point
 from jaxphoto.lidar.raster import Raster
@@ -151,17 +150,6 @@ def _imaged(
 def _each_imaged(interior, exterior, points: Float[Array, "n 3"], corrections: Corrections):
     def one(point):
         aim = apparent_point(exterior.position, point, corrections)
-        ideal, xy = project_ideal(interior.c, exterior, aim), project(interior, exterior, aim)
-        return xy, (camera_coordinates(exterior, aim)[2] < 0) & _unfolded(interior, ideal)
+        return project(interior, exterior, aim), in_field(interior, exterior, aim)
 
     return jax.vmap(one)(points)
-
-
-def _unfolded(interior: InteriorOrientation, ideal: Float[Array, "2"]) -> Bool[Array, ""]:
-    """`InteriorOrientation.valid`, and the same for distortions of the ideal coordinate: far outside these fold too."""
-    distortion = interior.distortion
-    if distortion.domain == "measured":
-        return interior.valid(ideal)
-    there = ideal / interior.c if distortion.normalised else ideal
-    back, sure = invert(distortion, distortion.closed_form(there))
-    return sure & (jnp.abs(back - there).max() < 1e-9 * (1 + jnp.abs(there).max()))

@@ -95,7 +95,7 @@ def point_sigma(sigma_xy_m: float, sigma_z_m: float) -> Float[np.ndarray, "3"]:
 def plane_distance(
     plane: Plane, points: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
-    """Distance (m) of `points` above the plane, along its normal, and its standard deviation by that of the plane."""
+    """Distance (m) of `points` (m) above the plane, along its normal, and its sigma (m) by that of the plane."""
     off = points - plane.centroid
     by = np.column_stack([off, -np.ones(len(off))])
     return off @ plane.normal, np.sqrt(np.einsum("ni,ij,nj->n", by, plane.covariance, by))

@@ -30,16 +30,17 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Integer
 
 from jaxphoto.arrays import Numbers, on_device, still
 from jaxphoto.camera import InteriorOrientation
+from jaxphoto.cloud import Cloud
 from jaxphoto.collinearity import ExteriorOrientation, camera_coordinates, image_ray, project, project_ideal
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import Corrections, apparent_point, ground_point
 from jaxphoto.georeferencing.corrections import NO_CORRECTIONS
-from jaxphoto.lidar.grid import Grid, around
+from jaxphoto.lidar.grid import Grid, around, index_cloud
 from jaxphoto.lidar.height_error import LidarNoise, excess, height_sigma, noise_variance
 from jaxphoto.lidar.height_settings import HeightFlag, HeightSettings
 from jaxphoto.lidar.inverse_distance import inverse_distance_weights
@@ -61,15 +62,15 @@ _AT_ONCE, _FEW = 512, 64
 class PseudoControl(eqx.Module):
     """Where the rays of features meet a cloud, one a feature; NaN where that is refused or cannot be told."""
 
-    xyz: Float[Numbers, "n 3"]
+    xyz: Float[Numbers, "*n 3"]
     """X, Y, Z (m); X and Y are only as good as the orientation (docs/pseudo_control.md)."""
-    sigma_z: Float[Numbers, "n"]
+    sigma_z: Float[Numbers, "*n"]
     """Standard deviation of Z (m): 95 % of the errors are within 1.96 of it."""
-    flag: Int[Numbers, "n"]
+    flag: Integer[Numbers, "*n"]
     """Sums of `HeightFlag`: HOLE where a ray does not meet the cloud, too."""
-    gradient: Float[Numbers, "n 2"]
+    gradient: Float[Numbers, "*n 2"]
     """Rise of the surface by X and Y."""
-    roughness: Float[Numbers, "n"]
+    roughness: Float[Numbers, "*n"]
     """Standard deviation (m) of the laser points about the plane through them."""
 
 
@@ -112,17 +113,18 @@ def pseudo_control_points(
     interior: InteriorOrientation,
     exterior: ExteriorOrientation,
     xy: Float[Numbers, "n 2"],
-    grid: Grid,
+    cloud: Cloud | Grid,
     settings: HeightSettings | None = None,
     *,
     interpolation: Interpolation = "weighted",
     corrections: Corrections = NO_CORRECTIONS,
 ) -> PseudoControl:
-    """The pseudo control points of features measured at `xy` (mm) with one camera, in the cloud of `grid`.
+    """The pseudo control points of features measured at `xy` (mm) with one camera, in a cloud.
 
-    `exterior` is that of one image, or has a leading axis over the features. `settings.points` are the nearest that are
-    weighted by the paper's d^-`settings.power`; by `interpolation` "plane" three times as many carry a plane in the
-    image, which is better by half where the ground is a plane so far around. One compiled program serves all features.
+    A `Grid` saves indexing the cloud again. `exterior` is that of one image, or has a leading axis over the features.
+    `settings.points` are the nearest that are weighted by the paper's d^-`settings.power`; by `interpolation` "plane"
+    three times as many carry a plane in the image, which is better by half where the ground is a plane so far around.
+    One compiled program serves all features.
 
     `xyz` has derivatives by `interior`, `exterior` and `xy`, exact but where another point becomes one of the nearest;
     what describes it (`sigma_z` and the rest) has none. Raises InputError for an unknown interpolation, a radius in
@@ -141,7 +143,7 @@ def pseudo_control_points(
         settings.leafy_share,
         settings.refuse,
     )
-    n = xy.shape[0]
+    grid, n = cloud if isinstance(cloud, Grid) else index_cloud(cloud), len(xy)
     if not n:
         raise InputError("there is no feature to give a height to: give one image coordinate at least")
     rows = np.arange(_room(n)) % n
@@ -207,8 +209,8 @@ def _choose(
 
     def squared_distance(point):
         aim = apparent_point(exterior.position, point, corrections)
-        off = project_ideal(interior.c, exterior, aim) - ideal
-        return jnp.where(camera_coordinates(exterior, aim)[2] < 0, off @ off, jnp.inf)
+        off = project_ideal(interior, exterior, aim) - ideal
+        return jnp.where(interior.projection.sees(*camera_coordinates(exterior, aim)), off @ off, jnp.inf)
 
     def candidates(place):
         index, there = around(grid, place, reach)

@@ -4,7 +4,7 @@ Cells are counted from the north-west corner: row 0 lies in the north, column 0 
 """
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Literal, get_args
 
 import equinox as eqx
@@ -43,8 +43,8 @@ class Raster(eqx.Module):
 
 
 def surface_model(
-    parts: Iterable[Float[np.ndarray, "n 3"]],
-    extent: Float[np.ndarray, "2 2"],
+    parts: Iterable[Float[np.ndarray, "_ 3"]],
+    extent: Float[np.ndarray, "2 2"] | Sequence,
     cell_m: float,
     statistic: Statistic = "highest",
 ) -> Raster:

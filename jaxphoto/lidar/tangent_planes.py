@@ -2,7 +2,7 @@
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Integer
 
 from jaxphoto.lidar.grid import Grid, nearest
 from jaxphoto.lidar.height_settings import HeightSettings
@@ -18,7 +18,7 @@ class TangentPlanes(eqx.Module):
     """Unit vectors, upwards."""
     sigma: Float[np.ndarray, "places"]
     """Standard deviation of the surface along the normal (m)."""
-    flag: Int[np.ndarray, "places"]
+    flag: Integer[np.ndarray, "places"]
     """Sums of `HeightFlag`."""
     nearest: Int[np.ndarray, "places"]
     """The laser point nearest to the place, in the order of the cloud."""

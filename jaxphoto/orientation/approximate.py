@@ -14,10 +14,11 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jaxphoto.block import Block, Rows, Start, direct_exterior, sensor_rows
+from jaxphoto.block import Block, Start, direct_exterior, sensor_rows
 from jaxphoto.errors import BlockError
-from jaxphoto.orientation.intersection import intersect_points
-from jaxphoto.orientation.rays import ideal_coordinates, turn_to_object, unit_rays
+from jaxphoto.observations import ControlRows
+from jaxphoto.orientation.block_intersection import intersect_points
+from jaxphoto.orientation.rays import camera_rays, ideal_coordinates, turn_to_object
 from jaxphoto.orientation.resection import resect_ideal
 from jaxphoto.unknowns import Unknowns
 
@@ -35,7 +36,7 @@ def approximate(block: Block) -> Unknowns:
     Raises BlockError, naming the first few and the mend, where images never see four known points, where the rays of a
     point do not meet at an angle, and where a point lies behind a camera that measured it.
     """
-    state = _State(block)
+    state = _SoFar(block)
     state.complete()
     state.check()
     _check_in_front(block, state.positions, state.matrices, state.points)
@@ -44,12 +45,12 @@ def approximate(block: Block) -> Unknowns:
 
 def completed(block: Block) -> Start:
     """As much of `approximate` as what is known allows: images and points beyond its reach stay unknown."""
-    state = _State(block)
+    state = _SoFar(block)
     state.complete()
     return state.start()
 
 
-class _State:
+class _SoFar:
     """What is known so far. A working table of one call, not a value: it is filled in place."""
 
     def __init__(self, block: Block) -> None:
@@ -110,12 +111,12 @@ class _State:
         names = sorted(set(self.block.image_camera))
         camera = np.array([names.index(c) for c in self.block.image_camera], int)[self.image]
         self.c = np.array([float(interior[name].c) for name in names])[camera]
-        self.ideal = np.zeros_like(xy)
+        self.ideal, self.rays = np.zeros_like(xy), np.zeros((len(xy), 3))
         for k, name in enumerate(names):
             rows = camera == k
             if rows.any():
                 self.ideal[rows] = ideal_coordinates(interior[name], xy[rows])
-        self.rays = unit_rays(self.c, self.ideal)
+                self.rays[rows] = camera_rays(interior[name], xy[rows])
         self.rows_of_image = np.argsort(self.image, kind="stable")
         self.first_row = np.searchsorted(self.image[self.rows_of_image], np.arange(len(self.image_known) + 1))
 
@@ -139,7 +140,8 @@ class _State:
 
     def _resect_best(self) -> bool:
         """Step 3, of the images with at least half as many known points as the best; False where none could be."""
-        useful = self.point_known[self.point] & ~self.image_known[self.image]
+        # A fisheye is resected by those of its rays that meet the perspective plane.
+        useful = self.point_known[self.point] & ~self.image_known[self.image] & np.isfinite(self.ideal).all(axis=1)
         count = np.bincount(self.image[useful], minlength=len(self.image_known))
         progress = False
         for i in np.argsort(-count, kind="stable"):
@@ -184,7 +186,7 @@ class _State:
         )
 
 
-def _rows_of(rows: Rows, wanted):
+def _rows_of(rows: ControlRows, wanted):
     """(who, axis, value) of the rows of the points `wanted`."""
     who = np.asarray(rows.who, int)
     use = wanted[who]
@@ -193,8 +195,15 @@ def _rows_of(rows: Rows, wanted):
 
 def _check_in_front(block: Block, positions, matrices, points) -> None:
     image, point = np.asarray(block.image_points.image), np.asarray(block.image_points.point)
-    depth = np.einsum("ni,ni->n", matrices[:, 2].take(image, 0), points.take(point, 0) - positions.take(image, 0))
-    bad = np.flatnonzero(~(depth < 0))
+    to_point = points.take(point, 0) - positions.take(image, 0)
+    in_front = np.einsum("ni,ni->n", matrices[:, 2].take(image, 0), to_point) < 0
+    for name, interior in block.start.unknowns.interior.items():
+        if interior.projection.widest_deg > 90:
+            # What such a camera sees may lie behind its image plane, but not opposite to where it was measured.
+            mine = np.array([camera == name for camera in block.image_camera])[image]
+            rays = camera_rays(interior, np.asarray(block.image_points.xy, float)[mine])
+            in_front[mine] = np.einsum("ni,ni->n", turn_to_object(matrices, image[mine], rays), to_point[mine]) > 0
+    bad = np.flatnonzero(~in_front)
     if len(bad):
         first = bad[0]
         raise BlockError(

@@ -10,7 +10,7 @@ captured images by low-cost mobile mapping systems", ISPRS Archives XL-1. What m
 from collections import defaultdict
 from collections.abc import Sequence
 from itertools import product
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -23,6 +23,7 @@ _SPREAD = np.deg2rad(10.0)  # bases at more than this span a triangle
 _WIDE = np.deg2rad(5.0)  # rays at less than this count in proportion
 
 
+@runtime_checkable
 class OrientedPair(Protocol):
     """What the choice of a triplet asks of a pair."""
 

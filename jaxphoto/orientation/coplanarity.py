@@ -114,7 +114,7 @@ def fitted(
         trial = _state(*moved(state.rotations, state.bases, step), pairs, counts)
         better = under_way & (trial.costs <= state.costs)
         gain = np.einsum("mi,mij,mj->m", step, state.normals, step)
-        state = _State(
+        state = _RelativeState(
             *(np.where(better.reshape(-1, *[1] * (a.ndim - 1)), a, b) for a, b in zip(trial, state, strict=True))
         )
         damping = np.where(better, 0.1 * damping, np.maximum(10 * damping, 1e-9))
@@ -127,14 +127,14 @@ def fitted(
 
 
 def moved(
-    rotations: Float[np.ndarray, "m 3 3"], bases: Float[np.ndarray, "m 3"], step: Float[np.ndarray, "m 5"]
-) -> tuple[Float[np.ndarray, "m 3 3"], Float[np.ndarray, "m 3"]]:
+    rotations: Float[np.ndarray, "#m 3 3"], bases: Float[np.ndarray, "#m 3"], step: Float[np.ndarray, "#m 5"]
+) -> tuple[Float[np.ndarray, "#m 3 3"], Float[np.ndarray, "#m 3"]]:
     """Orientations moved by a small rotation in camera 2 and a shift of the base in its tangent plane (rad)."""
     there = bases + (tangent_plane(bases) @ step[:, 3:, None])[..., 0]
     return turned(rotations, step[:, :3]), there / np.linalg.norm(there, axis=1, keepdims=True)
 
 
-class _State(NamedTuple):
+class _RelativeState(NamedTuple):
     rotations: Float[np.ndarray, "m 3 3"]
     bases: Float[np.ndarray, "m 3"]
     costs: Float[np.ndarray, " m"]
@@ -142,12 +142,14 @@ class _State(NamedTuple):
     right: Float[np.ndarray, "m 5"]
 
 
-def _state(rotations, bases, pairs: RayPairs, counts) -> _State:
+def _state(rotations, bases, pairs: RayPairs, counts) -> _RelativeState:
     """Orientations with their squared misclosures, normal matrices and right sides."""
     value, slope = linearised(rotations, bases, pairs)
     value, slope = value * counts, slope * counts[..., None]
     across = np.swapaxes(slope, 1, 2)
-    return _State(rotations, bases, np.sum(value**2, axis=1), across @ slope, (across @ value[..., None])[..., 0])
+    return _RelativeState(
+        rotations, bases, np.sum(value**2, axis=1), across @ slope, (across @ value[..., None])[..., 0]
+    )
 
 
 def linearised(

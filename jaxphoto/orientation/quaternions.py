@@ -23,7 +23,7 @@ def cross_matrices(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 
     return result
 
 
-def turned(matrix: Float[np.ndarray, "*n 3 3"], theta: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
+def turned(matrix: Float[np.ndarray, "*#n 3 3"], theta: Float[np.ndarray, "*#n 3"]) -> Float[np.ndarray, "*#n 3 3"]:
     """`small_rotation(theta) @ matrix` of `jaxphoto.rotation`: turned by `theta` (rad) on the camera's side."""
     half = 0.5 * np.linalg.norm(theta, axis=-1, keepdims=True)
     quaternion = np.concatenate([np.cos(half), -0.5 * np.sinc(half / np.pi) * theta], axis=-1)

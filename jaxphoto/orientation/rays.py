@@ -1,28 +1,51 @@
-"""Ideal image coordinates of many rows at once, and the rays they are in object space."""
+"""Rays of many image coordinates at once, and where they meet the perspective plane."""
 
 from functools import partial
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxphoto.camera import InteriorOrientation
+from jaxphoto.camera import InteriorOrientation, Perspective
 from jaxphoto.compiling import QUICK_TO_COMPILE
+
+# Cosine of the angle from the axis beyond which a ray of a fisheye is not taken to the perspective plane: 80 degrees,
+# where a pixel there is 30 times as large as in the middle.
+_FLATTEST = 0.17
 
 
 @partial(jax.jit, compiler_options=QUICK_TO_COMPILE)
-def _ideal(interior: InteriorOrientation, xy):
-    return jax.vmap(interior.ideal_from_measured)(xy)
+def _directions(interior: InteriorOrientation, xy):
+    return jax.vmap(lambda one: jnp.stack(interior.direction_from_ideal(interior.ideal_from_measured(one))))(xy)
 
 
 def ideal_coordinates(interior: InteriorOrientation, xy_mm: Float[np.ndarray, "rows 2"]) -> Float[np.ndarray, "rows 2"]:
-    """Ideal image coordinates (mm, from the principal point) of the measured rows of one camera."""
+    """Ideal coordinates (mm, from the principal point) on the perspective plane of the measured rows of one camera.
+
+    NaN for a ray of another projection that is farther than 80 degrees from the axis.
+    """
+    directions = _of_rows(interior, xy_mm)
+    # In this order the ideal coordinates of a perspective camera stay what they are.
+    ideal = directions[:, :2] * (-float(interior.c) / directions[:, 2:])
+    if type(interior.projection) is not Perspective:
+        ideal[~(-directions[:, 2] > _FLATTEST * np.linalg.norm(directions, axis=1))] = np.nan
+    return ideal
+
+
+def camera_rays(interior: InteriorOrientation, xy_mm: Float[np.ndarray, "rows 2"]) -> Float[np.ndarray, "rows 3"]:
+    """Unit directions in the camera frame of the measured rows of one camera, of whatever projection."""
+    directions = _of_rows(interior, xy_mm)
+    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def _of_rows(interior: InteriorOrientation, xy_mm: Float[np.ndarray, "rows 2"]) -> Float[np.ndarray, "rows 3"]:
     n = len(xy_mm)
     padded = np.zeros((padded_length(n), 2))
     padded[:n] = xy_mm
     # Numbers as arrays: a float in the tree would be compiled in, and every camera compiled anew.
     numbers = jax.tree.map(partial(np.asarray, dtype=float), interior)
-    return np.asarray(_ideal(numbers, padded))[:n]
+    return np.asarray(_directions(numbers, padded))[:n]
 
 
 def padded_length(n: int) -> int:

@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from jaxphoto.errors import BlockError
 from jaxphoto.orientation.coplanarity import RayPairs, behind, essential, misclosures
-from jaxphoto.orientation.essential import linear_essential, orientations
+from jaxphoto.orientation.essential_matrix import linear_essential, orientations
 from jaxphoto.orientation.five_point import five_point_essentials
 from jaxphoto.orientation.homography import homographies, homography_orientations, transfer_errors
 

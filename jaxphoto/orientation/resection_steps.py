@@ -42,7 +42,7 @@ class RefinedResections(NamedTuple):
     """How many there were, of all starts alike."""
 
 
-class _State(NamedTuple):
+class _ResectionState(NamedTuple):
     positions: Float[np.ndarray, "starts 3"]
     matrices: Float[np.ndarray, "starts 3 3"]
     costs: Float[np.ndarray, " starts"]
@@ -72,7 +72,7 @@ def refined(c_mm: float, ideal, points, positions, matrices, limit: float) -> Re
         trial = _state(observed, points, limit, distances, *moved(state.positions, state.matrices, distances, step))
         better = (trial.costs < state.costs) & ~settled
         much = state.costs - trial.costs > _GAIN * state.costs + _NOTHING * len(points)
-        state = _State(*(_chosen(better, a, b) for a, b in zip(trial, state, strict=True)))
+        state = _ResectionState(*(_chosen(better, a, b) for a, b in zip(trial, state, strict=True)))
         damping *= np.where(better, 0.1, 10.0)
         # A small step that does not help: what is left is rounding.
         settled |= np.max(np.abs(step), axis=1) < np.where(much, _DONE, _ROUNDING)
@@ -94,11 +94,11 @@ def both(one: RefinedResections, other: RefinedResections) -> RefinedResections:
 
 
 def moved(
-    positions: Float[np.ndarray, "starts 3"],
-    matrices: Float[np.ndarray, "starts 3 3"],
-    distances: Float[np.ndarray, " starts"],
-    step: Float[np.ndarray, "starts 6"],
-) -> tuple[Float[np.ndarray, "starts 3"], Float[np.ndarray, "starts 3 3"]]:
+    positions: Float[np.ndarray, "#starts 3"],
+    matrices: Float[np.ndarray, "#starts 3 3"],
+    distances: Float[np.ndarray, "#starts"],
+    step: Float[np.ndarray, "#starts 6"],
+) -> tuple[Float[np.ndarray, "#starts 3"], Float[np.ndarray, "#starts 3 3"]]:
     """Orientations moved by steps: shift as a fraction of the distance, small rotation in the camera frame (rad)."""
     return positions + distances[:, None] * step[:, :3], turned(matrices, step[:, 3:])
 
@@ -133,7 +133,7 @@ def _chosen(better, new, old):
     return np.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old)
 
 
-def _state(observed, points, limit, distances, positions, matrices) -> _State:
+def _state(observed, points, limit, distances, positions, matrices) -> _ResectionState:
     """Orientations with their robust costs, normal matrices and right sides."""
     starts, n = len(positions), len(points)
     u, slope, in_front = linearised(points, positions, matrices, distances)
@@ -145,4 +145,4 @@ def _state(observed, points, limit, distances, positions, matrices) -> _State:
     rows = slope.reshape(starts, 2 * n, 6)
     weighted = np.swapaxes((slope / (1 + size)[..., None, None]).reshape(starts, 2 * n, 6), 1, 2)
     right = (weighted @ residual.reshape(starts, 2 * n, 1))[..., 0]
-    return _State(positions, matrices, cost, np.nan_to_num(weighted @ rows), np.nan_to_num(right))
+    return _ResectionState(positions, matrices, cost, np.nan_to_num(weighted @ rows), np.nan_to_num(right))

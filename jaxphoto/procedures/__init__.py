@@ -2,11 +2,11 @@
 
 from jaxphoto.procedures.adjust import adjust, adjust_for_tables
 from jaxphoto.procedures.boresight import boresight, step_block
-from jaxphoto.procedures.boresight_judgement import Estimate, Step, judge
+from jaxphoto.procedures.boresight_judgement import BoresightEstimate, Step, judge
 from jaxphoto.procedures.georeference import Georeferenced, georeference
 
 __all__ = [
-    "Estimate",
+    "BoresightEstimate",
     "Georeferenced",
     "Step",
     "adjust",

@@ -1,12 +1,14 @@
 """The main job: complete the start values of a block and adjust it."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 
 from jaxphoto.adjustment import LEAST, MAX_STEPS, Adjustment, Sizes, solve
 from jaxphoto.block import Block, sensor_rows
 from jaxphoto.errors import BlockError, DatumError, RankError
+from jaxphoto.observations import AbstractObservations, KnownParameters
 from jaxphoto.orientation import approximate
 from jaxphoto.orientation.approximate import completed
 from jaxphoto.procedures.orientation import orient_block
@@ -23,6 +25,7 @@ def adjust(
     start: Unknowns | None = None,
     priors: Unknowns | None = None,
     *,
+    more: Sequence[AbstractObservations | KnownParameters] = (),
     max_steps: int = MAX_STEPS,
     sizes: Sizes = LEAST,
 ) -> Adjustment:
@@ -31,7 +34,8 @@ def adjust(
     `start` gives every unknown an approximate value; where it is None, those of the block are completed by resection
     and intersection, and where these do not reach all images, found from image points alone and brought to the frame
     of what is known (docs/orient.md). `priors` says what is FREE, FIXED or Weighted; where it is None, what the block
-    says.
+    says. `more` are observations of any kind, those of your own among them (docs/extending.md), and parameters known
+    beforehand together: they are added to `block.more`, so that the block of the result has them.
 
     What is compiled for a block serves all of similar size; a study of many blocks compiles once if it gives `sizes`
     that all fit into (`common_sizes`).
@@ -42,6 +46,8 @@ def adjust(
     open, RankError where the observations cannot tell unknowns apart. A solve that does not converge is no error: see
     `Adjustment.outcome`.
     """
+    if more:
+        block = dataclasses.replace(block, more=(*block.more, *more))
     if start is None:
         start = start_of(block)
     return solve(block, start, block.priors if priors is None else priors, max_steps, sizes)

@@ -9,7 +9,7 @@ import equinox as eqx
 import numpy as np
 
 from jaxphoto.adjustment import Adjustment
-from jaxphoto.block import AXES
+from jaxphoto.observations import AXES
 from jaxphoto.procedures.fit import LEVEL, fit
 from jaxphoto.statistics import (
     Covariance,
@@ -39,7 +39,7 @@ _ANGLES = {"x": "d-omega", "y": "d-phi", "z": "d-kappa"}
 _UNITS = {"_m_per_s": "m/s", "_mm": "mm", "_deg": "deg", "_m": "m", "_s": "s"}
 
 
-class Estimate(NamedTuple):
+class BoresightEstimate(NamedTuple):
     """One number that a step gives, in `unit` (angles in degrees); sigma is a posteriori."""
 
     parameter: str
@@ -59,7 +59,7 @@ class Step(eqx.Module):
     number: int = eqx.field(static=True)
     adjusted: Adjustment
     covariance: Covariance
-    estimates: tuple[Estimate, ...] = eqx.field(static=True)
+    estimates: tuple[BoresightEstimate, ...] = eqx.field(static=True)
     findings: tuple[str, ...] = eqx.field(static=True)
     go_on: bool = eqx.field(static=True)
     biases: Biases = eqx.field(static=True, default=())
@@ -120,11 +120,11 @@ def _known(adjusted: Adjustment, cov: Covariance) -> _Known:
     return _Known(dict(zip(labels, values, strict=True)), dict(zip(labels, sigmas, strict=True)))
 
 
-def _estimate(label: str, value: float, sigma: float) -> Estimate:
+def _estimate(label: str, value: float, sigma: float) -> BoresightEstimate:
     factor = 180 / np.pi if label.endswith("_rad") else 1.0
     name = label.replace("_rad", "_deg")
     unit = next((unit for end, unit in _UNITS.items() if name.endswith(end)), "")
-    return Estimate(name, factor * value, factor * sigma, unit)
+    return BoresightEstimate(name, factor * value, factor * sigma, unit)
 
 
 def _shifts(adjusted: Adjustment, cov: Covariance, known: _Known) -> tuple[list[str], Biases, bool]:
@@ -144,7 +144,7 @@ def _shifts(adjusted: Adjustment, cov: Covariance, known: _Known) -> tuple[list[
         rows.append((abs(v) * size, abs(v) / s, f"{text} the stations' sigma)"))
     clear = sorted((r for r in rows if r[1] > SIGNIFICANT), reverse=True) or [max(rows, key=lambda r: r[1])]
     listed = "; ".join(r[2] for r in clear[:_SHOWN]) + (f" and {len(clear) - _SHOWN} more" if clear[_SHOWN:] else "")
-    major = clear[0][0] > MAJOR
+    major = bool(clear[0][0] > MAJOR)
     judged = "major shift or drift" if major else "significant shift or drift, not major, which the next steps keep"
     return [f"{judged}: {listed}", *note], keep, major
 
@@ -248,7 +248,7 @@ def _strongest(cov: Covariance, first, second) -> tuple[float, str, str]:
 
 def _differences(
     adjusted: Adjustment, cov: Covariance, known: _Known, last: Step | None, biases: Biases
-) -> tuple[list[Estimate], str, bool]:
+) -> tuple[list[BoresightEstimate], str, bool]:
     """Step 4 minus step 3 of every boresight angle.
 
     Step 3 has all observations of step 4, so the difference has the variance Q4 - Q3. Where step 4 holds shifts that

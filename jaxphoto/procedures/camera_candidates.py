@@ -9,18 +9,8 @@ import numpy as np
 
 from jaxphoto.arrays import on_device
 from jaxphoto.block import Block
-from jaxphoto.camera import (
-    DISTORTIONS,
-    AbstractDistortion,
-    InteriorOrientation,
-    Sensor,
-    exact,
-    get_parameter,
-    needed_constants,
-    set_parameter,
-)
+from jaxphoto.camera import AbstractDistortion, InteriorOrientation, Sensor, exact, get_parameter, set_parameter
 from jaxphoto.camera.conversion import fitted
-from jaxphoto.camera.equivalence import usual_coefficients
 from jaxphoto.errors import InputError
 from jaxphoto.unknowns import FIXED, FREE, Unknowns, Weighted
 
@@ -43,12 +33,10 @@ def candidate_of(text: str) -> Candidate:
     Raises InputError for a model or coefficient that there is not.
     """
     model, _, listed = text.strip().partition(":")
-    if model not in DISTORTIONS:
-        raise InputError(f"no distortion model is called {model!r}; choose among {', '.join(DISTORTIONS)}")
-    kind = DISTORTIONS[model]
+    kind = AbstractDistortion.called(model)
     estimable = tuple(name for name in kind.coefficients if name not in kind.scales)
     if listed in ("", "all"):
-        return Candidate(text.strip(), kind, estimable if listed else usual_coefficients(kind))
+        return Candidate(text.strip(), kind, estimable if listed else kind.usual())
     names = () if listed == "none" else tuple(name.strip() for name in listed.split("+"))
     for name in names:
         if name not in estimable:
@@ -86,9 +74,7 @@ def _start(given: InteriorOrientation, candidate: Candidate, sensor: Sensor) -> 
         interior = same if same is not None else fitted(given, kind, sensor, held).interior
     except ValueError:
         # What does not follow the given distortion starts without any.
-        lengths = {"f": float(given.c), "b": sensor.width_mm / 3}
-        constants = {field: lengths[field] for field in needed_constants(kind).values()}
-        interior = InteriorOrientation(given.c, given.x_p, given.y_p, kind(**constants))
+        interior = dataclasses.replace(given, distortion=kind.plain(sensor))
     interior = dataclasses.replace(interior, residuals="measured")
     for name in held:
         interior = set_parameter(interior, name, 0.0)

@@ -13,11 +13,12 @@ from jaxtyping import Bool, Float, Int
 
 from jaxphoto.adjustment import Sizes, common_sizes
 from jaxphoto.arrays import still
-from jaxphoto.block import Block, ImageRows
+from jaxphoto.block import Block
 from jaxphoto.collinearity import ExteriorOrientation, image_residual
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import BlockError
 from jaxphoto.georeferencing import apparent_point
+from jaxphoto.observations import ImageRows
 from jaxphoto.unknowns import Unknowns
 
 _LEAST_RAYS = 2

@@ -3,14 +3,15 @@
 import numpy as np
 
 from jaxphoto.adjustment import Adjustment
-from jaxphoto.adjustment.residuals import GROUPS, Residuals
-from jaxphoto.block import ATTITUDE_AXES, AXES
+from jaxphoto.adjustment.residuals import Residuals
 from jaxphoto.statistics import (
     LEAST_CHECKED,
     Covariance,
+    Redundancy,
     chi_square_p,
     critical_value,
     normalised_residuals,
+    observation_groups,
     redundancy_numbers,
     residual_spread,
 )
@@ -50,34 +51,20 @@ def fit(adjusted: Adjustment, cov: Covariance) -> tuple[list[str], bool]:
     return [found, sentence, *(on_control if control else [])], not (large or blunders)
 
 
-def _blunders(adjusted: Adjustment, w: Residuals, numbers: Residuals) -> tuple[list[tuple[float, str]], float, int]:
+def _blunders(adjusted: Adjustment, w: Residuals, numbers: Redundancy) -> tuple[list[tuple[float, str]], float, int]:
     """Observations whose |w| no correct observation reaches, largest first; that limit, and how many were tested."""
-    size = {f: np.where(getattr(numbers, f) > LEAST_CHECKED, np.abs(getattr(w, f)), 0.0) for f in GROUPS}
+    size = {name: np.where(numbers[name] > LEAST_CHECKED, np.abs(v), 0.0) for name, v in w.named.items()}
     n = sum(int((v > 0).sum()) for v in size.values())
     limit = critical_value(LEVEL / max(n, 1))
-    s, block = adjusted.structure, adjusted.block
-    images, points = block.images, block.points
-    # A point in an image is one blunder, whichever of its coordinates shows it.
-    large = [
-        (v, f"point {points[p]} in image {images[i]}")
-        for v, i, p in zip(size["image"].max(axis=0), s.image, s.point, strict=True)
-    ]
-    large += [
-        (v, f"station of image {images[i]} in {AXES[a]}")
-        for v, i, a in zip(size["stations"], s.station_image, s.station_axis, strict=True)
-    ]
-    large += [
-        (v, f"{name} of image {images[i]}")
-        for name, row in zip(ATTITUDE_AXES, size["attitudes"], strict=True)
-        for v, i in zip(row, s.attitude_image, strict=True)
-    ]
-    large += [
-        (v, f"control point {points[p]} in {AXES[a]}")
-        for v, p, a in zip(size["control"], s.control_point, s.control_axis, strict=True)
-    ]
-    large += [(v, f"point {points[p]} on its surface") for v, p in zip(size["surfaces"], s.surface_point, strict=True)]
-    large += [
-        (v, f"distance {points[a]} to {points[b]}")
-        for v, (a, b) in zip(size["distances"], s.distance_points, strict=True)
-    ]
-    return sorted(((float(v), name) for v, name in large if v > limit), reverse=True), limit, n
+    block = adjusted.block
+    found: dict[str, float] = {}
+    for name, rows in observation_groups(adjusted).items():
+        if not rows.unit:
+            # What is known of parameters beforehand is no observation.
+            continue
+        words = np.broadcast_to(rows.words(block.images, block.points), size[name].shape)
+        large = size[name] > limit
+        for v, word in zip(size[name][large].tolist(), words[large].tolist(), strict=True):
+            # What has one name is one blunder, whichever of its coordinates shows it.
+            found[word] = max(v, found.get(word, 0.0))
+    return sorted(((v, word) for word, v in found.items()), reverse=True), limit, n

@@ -16,15 +16,15 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxphoto.adjustment.shared import spread
+from jaxphoto.adjustment.shared import scalar_priors
 from jaxphoto.arrays import Numbers
-from jaxphoto.block import Block, Rows, SensorRows, direct_exterior, sensor_rows
+from jaxphoto.block import Block, SensorRows, direct_exterior, sensor_rows
 from jaxphoto.camera import InteriorOrientation, get_parameter, parameter_names
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.compiling import QUICK_TO_COMPILE
 from jaxphoto.errors import BlockError
 from jaxphoto.georeferencing import Corrections, DirectPartials, direct_partials
-from jaxphoto.georeferencing.intersection import (
+from jaxphoto.georeferencing.intersection_covariance import (
     RayPartials,
     intersection_gain,
     intersection_step,
@@ -32,8 +32,9 @@ from jaxphoto.georeferencing.intersection import (
     ray_partials,
     shared_covariance,
 )
+from jaxphoto.observations import ControlRows
 from jaxphoto.orientation import intersect_points
-from jaxphoto.orientation.rays import ideal_coordinates, padded_length, turn_to_object, unit_rays
+from jaxphoto.orientation.rays import camera_rays, padded_length, turn_to_object
 from jaxphoto.unknowns import Weighted
 
 # From the point nearest to the rays the first step leaves micrometres, the second nothing.
@@ -54,7 +55,7 @@ class Georeferenced(eqx.Module):
     """Of `points`, m."""
     covariance: Float[np.ndarray, "points 3 3"]
     """Of `positions` (m^2), errors that images share by a mount or a camera included."""
-    discrepancies: Rows
+    discrepancies: ControlRows
     """Surveyed minus computed (m) at control, fixed and check points, with the survey's sigmas; `who`: of `points`."""
 
     @property
@@ -85,7 +86,8 @@ def georeference(block: Block) -> Georeferenced:
     by = jax.tree.map(np.asarray, _direct_partials(sensors))
     own = _propagated(by.station, sensors.station_sigma) + _propagated(by.attitude, sensors.attitude_sigma)
     mount_of = np.array(block.image_mount, object)[sensors.image]
-    mount_sigma = {name: _sigmas(spread(prior)) for name, prior in block.priors.mounts.items()}
+    mounts = block.start.unknowns.mounts
+    mount_sigma = {name: _sigmas(scalar_priors(prior, mounts[name])) for name, prior in block.priors.mounts.items()}
     of_image = np.stack([mount_sigma.get(name, np.zeros(by.mount.shape[2])) for name in mount_of])
 
     rays, positions, shown = _intersected(block, sensors.image, exterior)
@@ -102,7 +104,7 @@ def georeference(block: Block) -> Georeferenced:
         sigma = _sigmas([get_parameter(interior, parameter) for parameter in parameter_names(interior)])
         covariance += _shared_covariance(rays.gain[rows], by_interior, np.diag(sigma**2), point[rows], n)
 
-    surveyed = Rows.joined(block.control, block.fixed, block.check)
+    surveyed = ControlRows.joined(block.control, block.fixed, block.check)
     place = np.full(len(block.points), -1)
     place[shown] = np.arange(n)
     known = surveyed.take(place[surveyed.who] >= 0)
@@ -114,7 +116,7 @@ def georeference(block: Block) -> Georeferenced:
         exterior_covariance=own + _propagated(by.mount, of_image),
         positions=positions,
         covariance=np.asarray(covariance),
-        discrepancies=Rows(who, known.axis, np.asarray(known.value) - positions[who, known.axis], known.sigma),
+        discrepancies=ControlRows(who, known.axis, np.asarray(known.value) - positions[who, known.axis], known.sigma),
     )
 
 
@@ -147,7 +149,7 @@ def _intersected(
     interior = block.start.unknowns.interior
     for name, of in interior.items():
         mine = camera == name
-        rays = unit_rays(float(of.c), ideal_coordinates(of, xy[mine]))
+        rays = camera_rays(of, xy[mine])
         directions[mine] = turn_to_object(matrix, image[mine], rays)
     found, good = intersect_points(position[image], directions, point, len(block.points))
     behind = np.einsum("ni,ni->n", directions, found[point] - position[image]) <= 0

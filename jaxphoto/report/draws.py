@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from jaxphoto.adjustment import Adjustment
-from jaxphoto.block import AXES
+from jaxphoto.observations import AXES
 from jaxphoto.report.plots import new_figure
 from jaxphoto.sensitivity import Draws
 
@@ -25,8 +25,9 @@ _SHOWN = 12
 def draws_table(draws: Draws, adjusted: Adjustment, first: int = 0) -> pd.DataFrame:
     """One row a draw: draw (from `first`), converged, iterations, fallback, bias.*, then what was estimated.
 
-    `<camera>.c_mm` and so on; `mounts.*`, `strips.*`; where they were kept `exterior.<image>.X_m ... kappa_deg` and
-    `point.<id>.X_m`; and `check.<id>.dX_m`, surveyed minus computed, with the points. Angles are in degrees.
+    `<camera>.c_mm` and so on; `scanner.*`, `mounts.*`, `strips.*`; where they were kept `exterior.<image>.X_m ...
+    kappa_deg` and `point.<id>.X_m`; and `check.<id>.dX_m`, surveyed minus computed, with the points. Angles are in
+    degrees.
     """
     block = adjusted.block
     columns: dict[str, np.ndarray] = {
@@ -57,11 +58,16 @@ def in_degrees(name: str) -> str:
 
 
 def column_of(label: str) -> str:
-    """`interior[kodak].c_mm` -> `kodak.c_mm`, `strips[E1].shift_X_m` -> `strips.E1.shift_X_m`."""
+    """`interior[kodak].c_mm` -> `kodak.c_mm`, `strips[E1].shift_X_m` -> `strips.E1.shift_X_m`.
+
+    What belongs to nobody by name, such as `scanner.boresight_right_rad`, keeps its label.
+    """
     return in_degrees(_in_radians(label))
 
 
 def _in_radians(label: str) -> str:
+    if "[" not in label:
+        return label
     kind, rest = label.split("[", 1)
     name, parameter = rest.rsplit("].", 1)
     return f"{name}.{parameter}" if kind == "interior" else f"{kind}.{name}.{parameter}"

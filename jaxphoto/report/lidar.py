@@ -14,8 +14,8 @@ from rich.console import Console
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.adjustment.structure import structure_of
-from jaxphoto.block import AXES
 from jaxphoto.lidar import HeightFlag
+from jaxphoto.observations import AXES
 from jaxphoto.procedures.lidar import LidarControl, Round, Simultaneous
 from jaxphoto.report.plots import new_figure
 from jaxphoto.report.results import made_whole, summary_of, write_results, write_summary

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from rich.console import Console
 
-from jaxphoto.procedures.orientation.photographs import CAMERA, OrientationReport, Oriented
+from jaxphoto.procedures.orientation.orient_photographs import CAMERA, OrientationReport, Oriented
 from jaxphoto.report.plots import new_figure
 
 if TYPE_CHECKING:

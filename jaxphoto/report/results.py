@@ -10,7 +10,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from jaxphoto.adjustment import Adjustment
-from jaxphoto.camera import DISTORTIONS, Smac
+from jaxphoto.camera import model_keys
 from jaxphoto.errors import InputError
 from jaxphoto.report.page import report_page
 from jaxphoto.report.tables import Tables
@@ -110,20 +110,12 @@ def summary_of(tables: Tables, warnings: list[str], seconds: dict[str, float]) -
 
 
 def _cameras(adjusted: Adjustment) -> dict:
-    """Sensor and distortion model of every camera, by which interior.csv can be read."""
+    """Sensor and models of every camera, by which interior.csv can be read."""
     told = {}
     for name, interior in adjusted.unknowns.interior.items():
-        distortion, sensor = interior.distortion, adjusted.block.sensors[name]
-        told[name] = {
-            "width_px": sensor.width_px,
-            "height_px": sensor.height_px,
-            "pixel_mm": sensor.pixel_mm,
-            "distortion": next(
-                (key for key, kind in DISTORTIONS.items() if kind is type(distortion)), type(distortion).__name__
-            ),
-        }
-        if isinstance(distortion, Smac):
-            told[name]["sign"] = distortion.sign
+        sensor = adjusted.block.sensors[name]
+        size = {"width_px": sensor.width_px, "height_px": sensor.height_px, "pixel_mm": sensor.pixel_mm}
+        told[name] = size | model_keys(interior)
     return told
 
 

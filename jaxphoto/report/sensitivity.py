@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from jaxphoto.adjustment import Adjustment
-from jaxphoto.block import AXES
+from jaxphoto.observations import AXES
 from jaxphoto.report.plots import new_figure
 from jaxphoto.report.results import made_whole, versions, write_summary
 from jaxphoto.report.tables import Tables

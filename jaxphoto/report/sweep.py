@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import pandas as pd
 
-from jaxphoto.block import AXES
 from jaxphoto.errors import InputError
+from jaxphoto.observations import AXES
 from jaxphoto.report.plots import new_figure
 from jaxphoto.sensitivity.sweep import Sweep
 

@@ -9,13 +9,14 @@ import pandas as pd
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.adjustment.residuals import Residuals
-from jaxphoto.block import ATTITUDE_AXES, AXES
 from jaxphoto.camera import constant_names, get_parameter, parameter_names
 from jaxphoto.compiling import call_compiled
+from jaxphoto.observations import AXES
 from jaxphoto.rotation import omega_phi_kappa_from_matrix
 from jaxphoto.statistics import (
     Correlations,
     Covariance,
+    Redundancy,
     Rotations,
     Significance,
     a_priori_sigmas,
@@ -23,6 +24,7 @@ from jaxphoto.statistics import (
     correlations,
     covariance,
     normalised_residuals,
+    observation_groups,
     physical_residuals,
     prepare_statistics,
     redundancy_numbers,
@@ -50,7 +52,7 @@ class Tables:
         return covariance(self.adjusted)
 
     @cached_property
-    def redundancy(self) -> Residuals:
+    def redundancy(self) -> Redundancy:
         """Redundancy number of every observation."""
         return redundancy_numbers(self.adjusted, self.covariance)
 
@@ -76,7 +78,7 @@ class Tables:
         tested = {(s.camera, s.parameter): s for s in self.significance}
         rows = []
         for camera, interior in self.adjusted.unknowns.interior.items():
-            for name in (*parameter_names(interior), *constant_names(type(interior.distortion))):
+            for name in (*parameter_names(interior), *constant_names(interior)):
                 test = tested.get((camera, name))
                 known = (test.sigma, test.significant) if test else (np.nan, None)
                 rows.append((camera, name, float(get_parameter(interior, name)), *known))
@@ -88,7 +90,7 @@ class Tables:
         s = self.adjusted.structure
         rows = []
         for k, label, sigma in zip(s.free, s.labels, np.asarray(self.covariance.shared_sigma), strict=True):
-            if k >= s.scanner_offset:
+            if k >= s.n_cameras:
                 factor = 180 / np.pi if label.endswith("_rad") else 1.0
                 value = float(self.adjusted.values.shared[k])
                 rows.append((label.replace("_rad", "_deg"), factor * value, factor * float(sigma)))
@@ -146,43 +148,30 @@ class Tables:
         `sigma` is a priori; `w` is the residual over its own standard deviation, sigma0 sigma sqrt(redundancy_number).
         """
         residual, sigma = physical_residuals(self.adjusted), a_priori_sigmas(self.adjusted)
+        block, s = self.adjusted.block, self.adjusted.structure
+        labels = np.full(len(self.adjusted.values.shared), "", object)
+        labels[s.free] = s.labels
         frames = []
-        for (group, image, point, axis, factor, unit), r, w in zip(
-            self._groups(), self.redundancy[:-1], self.w[:-1], strict=True
-        ):
+        for group, rows in observation_groups(self.adjusted).items():
+            v = residual[group]
             # Rows run along the last axis; the components of a row stand together.
-            flat = lambda v, shape=r.shape: np.broadcast_to(np.asarray(v), shape).T.ravel()  # noqa: E731
+            flat = lambda x, shape=v.shape: np.broadcast_to(np.asarray(x), shape).T.ravel()  # noqa: E731
+            axis, parameter = flat(rows.axis_names()), flat(rows.names_of("parameter", labels))
+            factor, unit = (180 / np.pi, "deg") if rows.unit == "rad" else (1.0, rows.unit)
             columns = {
                 "group": group,
-                "image": flat(image),
-                "point": flat(point),
-                "axis": flat(axis),
-                "residual": factor * flat(residual[group]),
+                "image": flat(rows.names_of("image", block.images)),
+                "point": flat(rows.names_of("point", block.points)),
+                "axis": np.where(axis == "", parameter, axis),
+                "residual": factor * flat(v),
                 "sigma": factor * flat(sigma[group]),
                 "unit": unit,
-                "redundancy_number": flat(r),
-                "w": flat(w),
+                "redundancy_number": flat(self.redundancy[group]),
+                "w": flat(self.w[group]),
             }
-            if r.size:
+            if v.size:
                 frames.append(pd.DataFrame(columns))
         return pd.concat(frames, ignore_index=True)
-
-    def _groups(self) -> tuple[tuple, ...]:
-        """Group, image, point, axis, factor to the unit and unit, in the order of `Residuals`."""
-        block, s = self.adjusted.block, self.adjusted.structure
-        images, points, axes, nobody = np.array(block.images), np.array(block.points), np.array(AXES), ""
-        ends = np.array([f"{points[a]}-{points[b]}" for a, b in s.distance_points], dtype=object)
-        labels = np.array([s.labels[j] for j in s.weighted], dtype=object)
-        attitude_axes = np.array(ATTITUDE_AXES)[:, None]
-        return (
-            ("image_points", images[s.image], points[s.point], np.array([["x"], ["y"]]), 1.0, "mm"),
-            ("stations", images[s.station_image], nobody, axes[s.station_axis], 1.0, "m"),
-            ("attitudes", images[s.attitude_image], nobody, attitude_axes, 180 / np.pi, "deg"),
-            ("control_points", nobody, points[s.control_point], axes[s.control_axis], 1.0, "m"),
-            ("surfaces", nobody, points[s.surface_point], "normal", 1.0, "m"),
-            ("distances", nobody, ends, nobody, 1.0, "m"),
-            ("priors", nobody, nobody, labels, 1.0, nobody),
-        )
 
     @cached_property
     def check_points(self) -> pd.DataFrame:

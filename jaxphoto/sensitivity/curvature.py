@@ -4,16 +4,29 @@ Each function takes `curved`: 1 for J'J + sum_r r d2r, 0 for J'J alone (see `hes
 differentiation, and kept by what each row touches: no dense second derivative of a residual is ever made.
 """
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from jaxphoto.adjustment.groups import AtPoints, Group
 from jaxphoto.adjustment.normal import At, residuals_at
-from jaxphoto.adjustment.reduced import other_rows
-from jaxphoto.adjustment.residuals import Increments, Values, other_residuals
+from jaxphoto.adjustment.residuals import Increments, Values
+from jaxphoto.adjustment.rows import Given, Local, each_row, gathered_rows, reduced_places, row_function
+from jaxphoto.adjustment.structure import Structure
 from jaxphoto.arrays import Numbers
+
+
+class RowSecond(NamedTuple):
+    """Second derivatives of half the square of each row of a group, rows last, by what the row touches: the increments
+    of its images, its shared unknowns and the increments of its points, in this order (z)."""
+
+    h: Float[Array, "z z rows"]
+    b: Float[Array, "z o rows"]
+    """By z and by the numbers observed."""
 
 
 def mixed_second(at: At, direction: Values, curved: Float[Numbers, ""]) -> Increments:
@@ -29,66 +42,98 @@ def mixed_second(at: At, direction: Values, curved: Float[Numbers, ""]) -> Incre
     return jax.jvp(gradient, (eqx.filter(at.values, there),), (direction,))[1]
 
 
-def attitude_second(at: At, curved: Float[Numbers, ""]) -> tuple[Float[Array, "3 6 n"], Float[Array, "3 colours n"]]:
-    """B of each attitude by its observed roll, pitch, yaw (rad): in eop, and in colours."""
+def row_second(group: Group, numbers: eqx.Module, at: At, curved: Float[Numbers, ""]) -> RowSecond:
+    """H and B of all rows of a group, each by itself."""
+    function = row_function(group, at.structure)
 
-    def of(observed):
-        rest = other_rows(at._replace(values=eqx.tree_at(lambda v: v.attitudes, at.values, observed)))
-        return (rest.blocks.attitude_eop, rest.blocks.attitude_shared), rest.residuals.attitudes
+    def one(z: Local, given: Given) -> RowSecond:
+        flat, unravel = ravel_pytree(z)
+        observed = given.row.observation
 
-    def by(seed):
-        primals, ((eop, shared), dr) = jax.jvp(of, (at.values.attitudes,), (seed,))
-        (j_eop, j_shared), r = primals
-        return jnp.sum(j_eop * dr + curved * eop * r, axis=1), jnp.sum(j_shared * dr + curved * shared * r, axis=1)
+        def half_square(flat: Array, observed: Array) -> Float[Array, ""]:
+            r = function(unravel(flat), given._replace(row=given.row.with_observation(observed)))
+            # Its second derivative is J'J + curved r d2r.
+            return jnp.sum(0.5 * r * r - (1 - curved) * jax.lax.stop_gradient(r) * r)
 
-    return jax.vmap(by)(jnp.broadcast_to(jnp.eye(3)[:, :, None], (3, *at.values.attitudes.shape)))
+        slope = jax.grad(half_square)
+        h, b = jax.jacfwd(slope, (0, 1))(flat, observed)
+        return RowSecond(h, b.reshape(len(flat), -1))
+
+    given = gathered_rows(group, numbers, at.increments, at.scale, at.values)
+    return each_row(one, group, *given)
 
 
-def coupling_rows(at: At, curved: Float[Numbers, ""]) -> tuple[Array, Array, Array]:
-    """D, by the reduced unknowns (k, n) and by the points (k, 3, points), and its weight C."""
+def rows_second(at: At, curved: Float[Numbers, ""]) -> tuple[RowSecond, ...]:
+    """`row_second` of all groups."""
+    s = at.structure
+    return tuple(row_second(g, numbers, at, curved) for g, numbers in zip(s.observed, at.values.groups, strict=True))
+
+
+class AtPointsSecond(NamedTuple):
+    """Sums over the rows that lie at points (see `other_rows.OtherRows`)."""
+
+    v: Float[Array, "3 3 points"]
+    w: Float[Array, "others 3 points"]
+
+
+def points_second(second: tuple[RowSecond, ...], at: At) -> AtPointsSecond:
+    """H of rows at points, by these, and by these and shared unknowns."""
+    s, n = at.structure, at.increments.points.shape[1]
+    v, w = jnp.zeros((3, 3, n)), jnp.zeros((s.n_border - s.n_interior, 3, n))
+    for g, own in zip(s.observed, second, strict=True):
+        if isinstance(g.rows, AtPoints):
+            k, h = len(g.place), jnp.sum(own.h, axis=2)
+            v = v + h[k:, k:]
+            w = w.at[jnp.asarray(g.column)[:, 0] - s.n_interior].add(h[:k, k:], mode="drop")
+    return AtPointsSecond(v, w)
+
+
+def coupling_rows(second: tuple[RowSecond, ...], at: At) -> tuple[Array, Array, Array]:
+    """D, by the reduced unknowns (k, n) and by the points (k, 3, points), and its weight C.
+
+    Of a row that couples points, D is what it touches, one after the other, and C its H.
+    """
     values, scale, s = at.values, at.scale, at.structure
-    ends = s.distance_points
-    count, fixed = len(ends), values.datum_eop.shape[0]
-
-    def second(apart, observed, sigma):
-        return jax.hessian(lambda d: _half_square((observed - jnp.sqrt(jnp.sum(d**2))) / sigma, curved))(apart)
-
-    weight = jnp.eye(3 * count + fixed)
-    spans = jnp.zeros((count, 3, 3, s.n_points))
-    if count:
-        apart = values.points[:, ends[:, 0]] - values.points[:, ends[:, 1]]
-        blocks = jax.vmap(second)(apart.T, values.distances, values.sigma_distances)
-        weight = weight.at[: 3 * count, : 3 * count].set(jax.scipy.linalg.block_diag(*blocks))
-        each, axis = np.arange(count)[:, None], np.arange(3)
-        for end, sign in ((0, 1.0), (1, -1.0)):
-            at_end = ends[:, end, None]
-            spans = spans.at[each, axis, axis, at_end].set(sign * scale.points[axis, at_end])
-    d_p = jnp.concatenate([spans.reshape(-1, 3, s.n_points), values.datum_points * scale.points])
+    n, n_points, fixed = 6 * s.n_images + s.n_shared, scale.points.shape[1], values.datum_eop.shape[0]
+    d_e: list[Array] = []
+    d_p: list[Array] = []
+    blocks: list[Array] = []
+    for g, own in zip(s.observed, second, strict=True):
+        if g.layout == "coupled":
+            places = reduced_places(g, s.n_images).T
+            reduced, z = places.shape[1], len(own.h)
+            each = jnp.arange(g.n_rows)[:, None]
+            e = jnp.zeros((g.n_rows, z, n)).at[each, jnp.arange(reduced), places].set(1.0, mode="drop")
+            p = jnp.zeros((g.n_rows, z, 3, n_points))
+            for k, point in enumerate(g.point):
+                axis = jnp.arange(3)
+                p = p.at[each, reduced + 3 * k + axis, axis, jnp.asarray(point)[:, None]].set(1.0)
+            d_e, d_p = [*d_e, e.reshape(-1, n)], [*d_p, p.reshape(-1, 3, n_points)]
+            blocks += list(jnp.moveaxis(own.h, 2, 0))
     datum = (values.datum_eop * scale.eop).transpose(0, 2, 1).reshape(fixed, 6 * s.n_images)
-    d_e = jnp.zeros((3 * count + fixed, 6 * s.n_images + s.n_shared)).at[3 * count :, : 6 * s.n_images].set(datum)
-    return d_e, d_p, weight
+    d_e.append(jnp.concatenate([datum, jnp.zeros((fixed, s.n_shared))], axis=1))
+    d_p.append(values.datum_points * scale.points)
+    return jnp.concatenate(d_e), jnp.concatenate(d_p), _block_diagonal([*blocks, jnp.eye(fixed)])
 
 
-def other_second(at: At, curved: Float[Numbers, ""]) -> Float[Array, "n n"]:
-    """H of stations, attitudes and priors in the reduced unknowns: an image touches itself and any shared unknown."""
-    zero, s = at.increments, at.structure
-    n, each = 6 * s.n_images, jnp.arange(s.n_images)
-
-    def half_square(eop, shared):
-        r = other_residuals(Increments(eop, shared, zero.points), at.scale, at.values, s)
-        return sum((_half_square(v, curved) for v in (r.stations, r.attitudes, r.priors)), jnp.zeros(()))
-
-    def product(eop, shared):
-        return jax.jvp(jax.grad(half_square, (0, 1)), (zero.eop, zero.shared), (eop, shared))[1]
-
-    seeds = jnp.broadcast_to(jnp.eye(6)[:, :, None], (6, 6, s.n_images))
-    by_eop = jax.vmap(lambda seed: product(seed, zero.shared)[0])(seeds)
-    h = jnp.zeros((s.n_images, 6, s.n_images, 6)).at[each, :, each].set(by_eop.transpose(2, 0, 1)).reshape(n, n)
-    across, own = jax.vmap(lambda seed: product(zero.eop, seed))(jnp.eye(s.n_shared))
-    across = across.transpose(0, 2, 1).reshape(s.n_shared, n)
-    return jnp.concatenate([jnp.concatenate([h, across.T], 1), jnp.concatenate([across, own], 1)])
+def _block_diagonal(blocks: list[Array]) -> Array:
+    size = sum(len(b) for b in blocks)
+    result, first = jnp.zeros((size, size)), 0
+    for b in blocks:
+        result = result.at[first : first + len(b), first : first + len(b)].set(b)
+        first += len(b)
+    return result
 
 
-def _half_square(r: Array, curved: Float[Numbers, ""]) -> Float[Array, ""]:
-    """Half the square sum, with the second derivative J'J + curved r d2r."""
-    return jnp.sum(0.5 * r * r - (1 - curved) * jax.lax.stop_gradient(r) * r)
+def other_second(second: tuple[RowSecond, ...], s: Structure) -> Float[Array, "n n"]:
+    """H of all rows but image rows in the reduced unknowns, without those that couple points."""
+    n = 6 * s.n_images + s.n_shared
+    h = jnp.zeros((n, n))
+    for g, own in zip(s.observed, second, strict=True):
+        if isinstance(g.rows, AtPoints):
+            k, place = len(g.place), 6 * s.n_images + jnp.asarray(g.column)[:, 0]
+            h = h.at[place[:, None], place].add(jnp.sum(own.h[:k, :k], axis=(2, 3)), mode="drop")
+        elif g.layout == "reduced":
+            place = reduced_places(g, s.n_images).T
+            h = h.at[place[:, :, None], place[:, None]].add(jnp.moveaxis(own.h, 2, 0), mode="drop")
+    return h

@@ -91,7 +91,7 @@ def prepare_design(block: Block, truth: Unknowns | None, sizes: Sizes, n_check: 
     values = values_of(block, approximate(block), block.priors, structure)
     constraints = close_datum(block, concrete(values, block), structure)
     values = with_datum(values, constraints.eop, constraints.points)
-    coupled = len(constraints.eop) + len(structure.distance_points) > 0
+    coupled = len(constraints.eop) > 0 or bool(structure.coupled)
     wide, places = pad_structure(structure, sizes, dense=coupled)
     who = np.unique(block.check.who)
     check = Check(np.zeros(n_check, np.int32), np.zeros(n_check), np.full((n_check, 3), np.nan))
@@ -99,8 +99,7 @@ def prepare_design(block: Block, truth: Unknowns | None, sizes: Sizes, n_check: 
     if truth is not None:
         check.truth[: len(who)] = np.asarray(truth.points)[who]
     s = structure
-    observed = 2 * len(s.image) + len(s.station_image) + 3 * len(s.attitude_image) + len(s.control_point)
-    observed += len(s.distance_points) + len(s.weighted) + len(constraints.eop)
+    observed = 2 * len(s.image) + sum(g.components * g.n_rows for g in s.observed) + len(constraints.eop)
     unknown = s.n_shared + s.eop_free.sum() + s.point_free.sum()
     return Prepared(pad_values(values, structure, wide, places), wide, check, s.labels, int(observed - unknown))
 

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxphoto.adjustment import Adjustment, solve
 from jaxphoto.adjustment.padding import crop_state, pad_values
-from jaxphoto.adjustment.residuals import State, Values
+from jaxphoto.adjustment.residuals import State
 from jaxphoto.adjustment.shards import usable
 from jaxphoto.adjustment.values import values_of, with_datum
 from jaxphoto.arrays import still
@@ -27,12 +27,17 @@ from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import InputError, JaxphotoError
 from jaxphoto.rotation import omega_phi_kappa_from_matrix
 from jaxphoto.sensitivity.chords import Found, find_optima
-from jaxphoto.sensitivity.many import Varying, common_of
+from jaxphoto.sensitivity.many import Varying, common_of, path_name
 from jaxphoto.sensitivity.perturbation import Perturbation, Recorded
 from jaxphoto.unknowns import Prior
 
-# Numbers of image rows and draws that a device computes with at a time (see `batch_size`), and draws that are worth it.
-_ROWS, _MOST_DRAWS = 100_000, 64
+# Draws that a device computes side by side. Vectors end in them: 32 are enough for that, and for what is made anew for
+# all of them (see `adjustment.elimination`); more, up to 64, pay where image rows x draws stay below this number, fewer
+# only where unknowns x draws would be more than this, of which memory holds several.
+_FEW, _MOST, _LEAST = 32, 64, 8
+_ROWS, _UNKNOWNS = 100_000, 8_000_000
+# Image rows x draws that are computed with at a time: what that needs stays in the cache of a core.
+_AT_ONCE = 16_384
 # Draws that are worth compiling thoroughly.
 _MANY = 500
 # More than any machine has.
@@ -133,18 +138,22 @@ class Readjustment:
             adjusted.unknowns, *(np.ones(len(n), bool) for n in (adjusted.block.images, adjusted.block.points))
         )
         self.nominal = dataclasses.replace(adjusted.block, start=start, priors=adjusted.priors)
-        self.common = common_of(self.adjusted)
         self.factored, self.places = padded.factored, padded.places
-        self.names = self._varying_fields(jax.tree.map(lambda v: v[:1], example))
         # Of several processes, each draws for itself.
         self.devices = usable(_MOST_DEVICES) if jax.process_count() == 1 else 1
+        self.common = common_of(self.adjusted, _AT_ONCE // self._draws_of_device)
+        self.names = self._varying_fields(jax.tree.map(lambda v: v[:1], example))
         self._numbers = jax.jit(jax.vmap(self._numbers_of, out_axes=(-1, 0)))
 
     @property
     def batch_size(self) -> int:
         """Draws that are computed side by side."""
-        rows = len(self.adjusted.structure.image)
-        return self.devices * int(np.clip(_ROWS // rows, 1, _MOST_DRAWS))
+        return self.devices * self._draws_of_device
+
+    @property
+    def _draws_of_device(self) -> int:
+        rows, unknowns = len(self.adjusted.structure.image), sum(self.adjusted.n_unknowns.values())
+        return int(max(_LEAST, min(np.clip(_ROWS // rows, _FEW, _MOST), _UNKNOWNS // unknowns)))
 
     def warm_up(self, given: Any) -> None:
         """Have everything compiled that `batches` needs."""
@@ -233,7 +242,7 @@ class Readjustment:
         changed = with_datum(changed, v.datum_eop, v.datum_points)
         wide, nominal = self.common.structure, self.common.values
         padded = pad_values(changed, s, wide, self.places)
-        numbers = {f.name: getattr(padded, f.name) for f in dataclasses.fields(Values)}
+        numbers = {path_name(path): v for path, v in jax.tree_util.tree_leaves_with_path(padded)}
         # What is free begins at the optimum, wherever the block says that it starts.
         held = {
             "position": wide.eop_free[:3] == 0,
@@ -247,7 +256,7 @@ class Readjustment:
         return numbers | {"xy": changed.xy, "sigma_xy": changed.sigma_xy}, recorded
 
     def _varying_fields(self, entries: Any) -> tuple[str, ...]:
-        """The fields of `Values` that differ between draws."""
+        """The leaves of `Values` that differ between draws."""
         varying: list[str] = []
 
         def look(entry):

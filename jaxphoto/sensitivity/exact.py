@@ -11,6 +11,7 @@ image row touches its image, camera and point. `response` answers one direction 
 points included, and takes blocks of any size.
 """
 
+import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -24,20 +25,21 @@ from jaxtyping import Array, Float, Int
 from scipy import sparse
 
 from jaxphoto.adjustment import Adjustment
+from jaxphoto.adjustment.layout import Places
 from jaxphoto.adjustment.normal import At
 from jaxphoto.adjustment.optimum import weigh_datum
-from jaxphoto.adjustment.padding import Places, crop_residuals
-from jaxphoto.adjustment.reduced import other_rows
-from jaxphoto.adjustment.residuals import Increments, Residuals, Values
+from jaxphoto.adjustment.padded_groups import crop_rows
+from jaxphoto.adjustment.residuals import IMAGE_POINTS, Increments, Values
+from jaxphoto.adjustment.rows import reduced_places
 from jaxphoto.adjustment.structure import Structure, structure_of
 from jaxphoto.arrays import still
-from jaxphoto.block import AXES
 from jaxphoto.compiling import run_compiled
 from jaxphoto.errors import InputError
+from jaxphoto.observations import AXES
 from jaxphoto.sensitivity.adjoint import Estimates, adjoint_vectors
-from jaxphoto.sensitivity.curvature import attitude_second, mixed_second
+from jaxphoto.sensitivity.curvature import mixed_second, rows_second
 from jaxphoto.sensitivity.hessian import Eliminated, check_optimum, eliminated
-from jaxphoto.sensitivity.image_rows import ImageRows, image_rows
+from jaxphoto.sensitivity.image_rows import ListedRows, image_rows
 from jaxphoto.statistics import EOP_NAMES
 from jaxphoto.statistics.covariance import turns_of
 from jaxphoto.unknowns import FREE, uniform_priors
@@ -47,20 +49,15 @@ _MOST_NUMBERS = 2e8
 
 
 class Sensitivity(eqx.Module):
-    """Derivatives of the estimates named by `labels`, one row each, by group of observations in the block's order.
+    """Derivatives of the estimates named by `labels`, one row each, by observations in the block's order.
 
-    Units are those of the estimate (m, rad, mm, the coefficient's own) over those of the observation (mm on the image,
-    m, rad). Derivatives of and by what is held fixed are zero in the rows and in the groups of observations.
+    `named` has them by group, as the residuals of an adjustment: (estimates, rows), or (estimates, rows, axes). Units
+    are those of the estimate (m, rad, mm, the coefficient's own) over those of the observation (mm on the image, m,
+    rad). Of surfaces it is by how far they lie along their normals (m). Derivatives of and by what is held fixed are
+    zero in the rows and in the groups of observations.
     """
 
-    image_points: Float[np.ndarray, "estimates rows 2"]
-    stations: Float[np.ndarray, "estimates stations"]
-    attitudes: Float[np.ndarray, "estimates attitudes 3"]
-    control_points: Float[np.ndarray, "estimates control"]
-    surfaces: Float[np.ndarray, "estimates surfaces"]
-    """By how far the laser scanner's surfaces lie along their normals (m)."""
-    distances: Float[np.ndarray, "estimates distances"]
-    priors: Float[np.ndarray, "estimates weighted"]
+    named: dict[str, Float[np.ndarray, "estimates ..."]]
     labels: tuple[str, ...] = eqx.field(static=True)
     """As those of a `Covariance`; then `points[name].X` and so on for the points asked for."""
     curvature: bool = eqx.field(static=True)
@@ -68,11 +65,13 @@ class Sensitivity(eqx.Module):
     by_fixed: Callable[[], tuple[np.ndarray, tuple[str, ...]]] = eqx.field(static=True, repr=False)
     """What gives `fixed` and `fixed_labels`: they take as long as all else, and are computed when asked for."""
 
+    def __getitem__(self, name: str) -> Float[np.ndarray, "estimates ..."]:
+        return self.named[name]
+
     @property
     def groups(self) -> dict[str, Float[np.ndarray, "estimates n"]]:
-        """The derivatives by group of observations, each as one matrix: x and y, roll, pitch, yaw of a row in turn."""
-        names = ("image_points", "stations", "attitudes", "control_points", "surfaces", "distances", "priors")
-        return {name: getattr(self, name).reshape(len(self.labels), -1) for name in names}
+        """The derivatives by group of observations, each as one matrix: the numbers of a row in turn."""
+        return {name: v.reshape(len(self.labels), -1) for name, v in self.named.items()}
 
     @property
     def fixed(self) -> Float[np.ndarray, "estimates fixed"]:
@@ -114,7 +113,7 @@ def sensitivity(adjusted: Adjustment, *, curvature: bool = True, points: Sequenc
     of = Estimates(unknowns, step, found.turns[places.image], asked, scale.points.T[asked])
     adjoint = adjoint_vectors(found.h, of)
 
-    rows = _observations(found, values, own, places, len(unknowns) + len(found.h.c))
+    rows = _observations(found, own, places, len(unknowns) + len(found.h.c))
     derivatives = _sparse(list(rows.values()), len(adjoint)) @ adjoint
     shapes = {name: b.shape[:-1] for name, (b, _) in rows.items()}
     ends = np.cumsum([math.prod(shape) for shape in shapes.values()])[:-1]
@@ -124,7 +123,7 @@ def sensitivity(adjusted: Adjustment, *, curvature: bool = True, points: Sequenc
     names = [f"exterior[{i}].{e}" for i in adjusted.block.images for e in EOP_NAMES["omega_phi_kappa"]]
     labels = (*names, *own.labels, *(f"points[{name}].{axis}" for name in points for axis in AXES))
     by_fixed = partial(_by_fixed, adjusted, curvature, labels, adjoint, unknowns)
-    return Sensitivity(**groups, labels=labels, curvature=curvature, by_fixed=by_fixed)
+    return Sensitivity(groups, labels=labels, curvature=curvature, by_fixed=by_fixed)
 
 
 def _padded(adjusted: Adjustment) -> tuple[Places, Any, Any, Structure]:
@@ -150,76 +149,43 @@ def _check_size(own: Structure, estimates: int) -> None:
 
 
 class _Derivatives(NamedTuple):
-    """Of a padded block: what is eliminated, and -B of all but the image rows."""
+    """Of a padded block: what is eliminated, and B of all but the image rows (z, observed, ...)."""
 
     h: Eliminated
     turns: Float[Array, "images 3 3"]
-    stations: Float[Array, "stations 6+colours"]
-    attitudes: Float[Array, "attitudes 3 6+colours"]
-    control: Float[Array, "points 3"]
-    surfaces: Float[Array, "rows points 3+scanner"]
-    distances: Float[Array, "distances 6"]
-    priors: Float[Array, "weighted"]
+    others: tuple[Float[Array, "z o ..."], ...]
 
 
 @eqx.filter_jit
-def _derivatives(values: Values, scale: Increments, rows: ImageRows, s: Structure, curved: Array) -> _Derivatives:
+def _derivatives(values: Values, scale: Increments, rows: ListedRows, s: Structure, curved: Array) -> _Derivatives:
     at = At(jax.tree.map(jnp.zeros_like, scale), scale, weigh_datum(values, s), s)
-    rest = other_rows(at)
-    j = rest.blocks
-    stations = jnp.concatenate([j.station_eop, j.station_shared]) / values.sigma_stations
-    return _Derivatives(
-        eliminated(at, rows, curved),
-        turns_of(values.rotation, "omega_phi_kappa"),
-        -stations.T,
-        -jnp.concatenate(attitude_second(at, curved), axis=1).transpose(2, 0, 1),
-        -(rest.control / values.sigma_control).T,
-        -jnp.moveaxis(jnp.concatenate([rest.surfaces, rest.surfaces_scanner]) / values.sigma_surfaces, 0, -1),
-        -(j.distances / values.sigma_distances).reshape(6, -1).T,
-        -j.priors / values.sigma_priors,
-    )
+    others = tuple(second.b for second in rows_second(at, curved))
+    return _Derivatives(eliminated(at, rows, curved), turns_of(values.rotation, "omega_phi_kappa"), others)
 
 
 Rows = tuple[np.ndarray, np.ndarray]
 """-B of some observations, numbers last, and the unknowns that these belong to."""
 
 
-def _observations(found: _Derivatives, values: Values, own: Structure, places: Places, first: int) -> dict[str, Rows]:
-    """-B of all observations, by the names that `Sensitivity` gives them; `first` is where the points begin."""
+def _observations(found: _Derivatives, own: Structure, places: Places, first: int) -> dict[str, Rows]:
+    """-B of all observations, by the names of their groups; `first` is where the points begin."""
     n, q, axes = 6 * own.n_images, own.n_image_colours, np.arange(3)
     first_of = first + 3 * places.point
-    of_image = np.concatenate([6 * np.arange(own.n_images)[:, None] + np.arange(6), n + own.column], axis=1)
+    of_image = np.concatenate([6 * np.arange(own.n_images)[:, None] + np.arange(6), n + own.column[:, :q]], axis=1)
     of_rows = of_image[own.image]
-    of_rows = np.concatenate([of_rows[:, :6], first_of[own.point][:, None] + axes, of_rows[:, 6 : 6 + q]], axis=1)
-    stations, attitudes, control = len(own.station_image), len(own.attitude_image), own.control_point
-    of_surfaces, of_laser = _surfaces(found, values, own, places, first_of)
-    of_ends = first_of[own.distance_points][:, :, None] + axes
+    of_rows = np.concatenate([of_rows[:, :6], first_of[own.point][:, None] + axes, of_rows[:, 6:]], axis=1)
     rows: dict[str, tuple[Any, np.ndarray]] = {
-        "image_points": (found.h.measured[: len(of_rows)], of_rows[:, None]),
-        "stations": (found.stations[:stations], of_image[own.station_image]),
-        "attitudes": (found.attitudes[:attitudes], of_image[own.attitude_image, None]),
-        "control_points": (
-            found.control[places.point[control], own.control_axis, None],
-            (first_of[control] + own.control_axis)[:, None],
-        ),
-        "surfaces": (of_surfaces, of_laser),
-        "distances": (found.distances, of_ends.reshape(-1, 6)),
-        "priors": (found.priors[:, None], n + own.weighted[:, None]),
+        IMAGE_POINTS: (found.h.measured[: len(of_rows)], of_rows[:, None]),
     }
+    for g, b in zip(own.observed, found.others, strict=True):
+        z, o = b.shape[:2]
+        # (z o, rows), then rows first and z last.
+        flat = crop_rows(dataclasses.replace(g, scalar=False), np.reshape(b, (z * o, *b.shape[2:])), places)
+        flat = -np.moveaxis(flat.reshape(z, o, -1), 0, -1).swapaxes(0, 1)
+        of_points = (first_of[g.point][:, None] + axes[:, None]).reshape(-1, g.n_rows)
+        touched = np.concatenate([np.asarray(reduced_places(g, own.n_images)), of_points]).T
+        rows[g.name] = (flat[:, 0], touched) if g.scalar else (flat, touched[:, None])
     return {name: (b, np.broadcast_to(unknowns.astype(np.int32), b.shape)) for name, (b, unknowns) in rows.items()}
-
-
-def _surfaces(found: Any, values: Any, own: Structure, places: Places, first_of: Int[np.ndarray, "points"]) -> Rows:
-    """-B of the rows of surfaces: of the coordinates of the point, and of the scanner's unknowns."""
-    scanner = 6 * own.n_images + own.n_interior + np.arange(own.n_scanner)
-    b = found.surfaces.reshape(-1, 3 + own.n_scanner)
-    if len(own.surface_point):
-        names = ("stations", "attitudes", "control", "distances", "priors")
-        shaped: Any = {name: getattr(values, name) for name in names} | {"image": values.xy, "datum": np.zeros(0)}
-        which: Any = np.arange(len(b)).reshape(values.sigma_surfaces.shape)
-        b = b[crop_residuals(Residuals(surfaces=which, **shaped), own, places).surfaces]
-    of_point = first_of[own.surface_point][:, None] + np.arange(3)
-    return b, np.concatenate([of_point, np.broadcast_to(scanner, (len(of_point), own.n_scanner))], axis=1)
 
 
 def _sparse(rows: Sequence[Rows], unknowns: int) -> sparse.csr_array:
@@ -231,11 +197,13 @@ def _sparse(rows: Sequence[Rows], unknowns: int) -> sparse.csr_array:
 
 
 class _Held(NamedTuple):
-    """What is held fixed: shared parameters by their index, then coordinates by point and axis."""
+    """What is held fixed: shared parameters by their index, then coordinates by point of the block and axis."""
 
     shared: Int[np.ndarray, "n"]
     point: Int[np.ndarray, "m"]
     axis: Int[np.ndarray, "m"]
+    point_at: Int[np.ndarray, "points"]
+    """That of `Places`: a fixed point may lie at several places."""
 
 
 def _by_fixed(
@@ -245,7 +213,7 @@ def _by_fixed(
     block, fixed = adjusted.block, adjusted.block.fixed
     places, values, scale, s = _padded(adjusted)
     shared = np.setdiff1d(np.arange(len(values.shared)), s.free)
-    held = _Held(*(np.asarray(v, np.int32) for v in (shared, places.point[fixed.who], fixed.axis)))
+    held = _Held(*(np.asarray(v, np.int32) for v in (shared, fixed.who, fixed.axis, places.point_at)))
     given = values, scale, s, np.array(float(curvature)), held
     b = still(run_compiled(_fixed_rows, given, adjusted.seconds, "sensitivity"))
     n = 6 * s.n_images + s.n_shared
@@ -273,6 +241,6 @@ def _fixed_rows(values: Values, scale: Increments, s: Structure, curved: Array, 
         return jnp.concatenate([b.eop.T.reshape(-1), b.shared, b.points.T.reshape(-1)])
 
     by_shared = jax.lax.map(lambda k: column(shared.at[k].set(1.0), coordinates), held.shared)
-    of_points = (held.axis, held.point)
-    by_coordinate = jax.lax.map(lambda k: column(shared, coordinates.at[k].set(1.0)), of_points)
+    moved = lambda axis, point: coordinates.at[axis].set(held.point_at == point)  # noqa: E731
+    by_coordinate = jax.lax.map(lambda k: column(shared, moved(*k)), (held.axis, held.point))
     return jnp.concatenate([by_shared, by_coordinate])

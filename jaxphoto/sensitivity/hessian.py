@@ -7,9 +7,9 @@ With r the weighted residuals, y the increments and v any number that r depends 
 
 and the optimum answers dv with dy = -H^-1 B dv. Without the terms that carry r, this is the classical first-order
 matrix -N^-1 J' dr/dv. Every image row touches one image, one point and one camera, so H has the blocks of the normal
-matrix (see adjustment/normal.py) and its points are eliminated alike, by V = L L' and F = [W; Ws; D] L^-T. Distances
-and the datum couple points: their rows D (three components of each distance, then the constraints) have the weight C,
-and mu = C D x is carried by more unknowns. With S, G, K what is left of H, D and 0 without the points,
+matrix (see adjustment/normal.py) and its points are eliminated alike, by V = L L' and F = [W; Ws; D] L^-T. Some rows,
+and the datum, couple points: D (what such a row touches, then the constraints) has the weight C, and mu = C D x is
+carried by more unknowns. With S, G, K what is left of H, D and 0 without the points,
 
     M = [ S     G'      ]
         [ C G   C K - I ]
@@ -24,14 +24,13 @@ from jaxtyping import Array, Float, Int
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.adjustment.normal import At, cholesky_3x3, each_tile_of, unwhiten, whiten
-from jaxphoto.adjustment.reduced import other_rows
 from jaxphoto.adjustment.residuals import Increments
 from jaxphoto.adjustment.structure import Structure
 from jaxphoto.adjustment.tiles import by_tile
 from jaxphoto.arrays import Numbers
 from jaxphoto.errors import InputError
-from jaxphoto.sensitivity.curvature import coupling_rows, other_second
-from jaxphoto.sensitivity.image_rows import ImageRows, RowProducts, row_products
+from jaxphoto.sensitivity.curvature import coupling_rows, other_second, points_second, rows_second
+from jaxphoto.sensitivity.image_rows import ListedRows, RowProducts, row_products
 
 # An index that no array has: what is added there is dropped.
 NOWHERE = int(np.iinfo(np.int32).max)
@@ -42,7 +41,7 @@ _MOST_UNKNOWNS = 6000
 class Eliminated(NamedTuple):
     """M, and what takes vectors down to it and back to the points; tiles of all chunks are joined."""
 
-    m: Float[Array, "n+k n+k"]
+    m: Float[Array, "n_and_k n_and_k"]
     c: Float[Array, "k k"]
     gain: Float[Array, "tiles p 3 f"]
     """-V^-1 [W; Ws; D]': what points answer to unknowns of M."""
@@ -50,7 +49,7 @@ class Eliminated(NamedTuple):
     """Cholesky factors of V."""
     touched: Int[Array, "tiles f"]
     """The unknowns of M that the columns of the gain belong to."""
-    measured: Float[Array, "rows 2 9+colours"]
+    measured: Float[Array, "rows 2 touched"]
     """-B of each image row by its measured x and y (mm): of eop (6), point (3), colours."""
 
 
@@ -69,24 +68,22 @@ def check_optimum(adjusted: Adjustment) -> None:
         )
 
 
-def eliminated(at: At, rows: ImageRows, curved: Float[Numbers, ""]) -> Eliminated:
+def eliminated(at: At, rows: ListedRows, curved: Float[Numbers, ""]) -> Eliminated:
     """Of H where `curved` is 1, of N where it is 0, in scaled increments; what is held fixed has a unit diagonal."""
     values, scale, s = at.values, at.scale, at.structure
-    d_e, d_p, c = coupling_rows(at, curved)
+    second = rows_second(at, curved)
+    d_e, d_p, c = coupling_rows(second, at)
     k, n = len(c), 6 * s.n_images + s.n_shared
-    rest = other_rows(at)
-    control, surfaces = rest.control**2, jnp.concatenate([rest.surfaces, rest.surfaces_scanner])
+    at_points = points_second(second, at)
     h = row_products(values, scale, rows, curved, s)
 
     def tile(numbers):
-        image, slots, control, surfaces, d_p = numbers
+        image, slots, own_v, own_w, d_p = numbers
         met = h.by_point.at[:, :, slots].get(mode="promise_in_bounds")
-        v, of_shared = jnp.sum(met[6:9], axis=2), _by_interior(met[9:], image, s)
-        if surfaces.size:
-            # Of the scanner's unknowns, which follow those of cameras: rows of surfaces are linear in all they touch.
-            of_surfaces = jnp.sum(surfaces[:, None] * surfaces[:3], axis=2)
-            v, of_shared = v + of_surfaces[:3], jnp.concatenate([of_shared, of_surfaces[3:]])
-        added = control + jnp.where(jnp.einsum("iip->ip", v) + control == 0, 1.0, 0.0)
+        v = jnp.sum(met[6:9], axis=2) + own_v
+        # Of shared unknowns that points meet besides those of cameras, which they follow.
+        of_shared = jnp.concatenate([_by_interior(met[9:], image, s), own_w])
+        added = jnp.where(jnp.einsum("iip->ip", v) == 0, 1.0, 0.0)
         l = cholesky_3x3(v + added[:, None] * jnp.eye(3)[:, :, None])  # noqa: E741
         by_image = met[:6].transpose(2, 0, 1, 3).reshape(-1, 3, slots.shape[1])
         w = jnp.concatenate([by_image, of_shared, d_p])
@@ -95,7 +92,7 @@ def eliminated(at: At, rows: ImageRows, curved: Float[Numbers, ""]) -> Eliminate
         flat = f.reshape(len(f), -1)
         return gain.transpose(2, 0, 1), l, flat @ flat.T
 
-    of_points = (by_tile(v, s.in_tiles) for v in (control, surfaces, d_p))
+    of_points = (by_tile(v, s.in_tiles) for v in (*at_points, d_p))
     *found, gram = each_tile_of(tile, (rows.of_slot, *of_points), s)
     gain, l = (v.reshape(-1, *v.shape[2:]) for v in found)  # noqa: E741
     # Tiles that are padding were not computed: their points are each by itself.
@@ -103,11 +100,8 @@ def eliminated(at: At, rows: ImageRows, curved: Float[Numbers, ""]) -> Eliminate
 
     image = jnp.asarray(s.in_tiles.image).reshape(len(l), -1)
     border = jnp.concatenate([6 * s.n_images + jnp.arange(s.n_border), n + jnp.arange(k)])
-    m = jnp.zeros((n + k, n + k)).at[:n, :n].set(other_second(at, curved) + _by_unknown(h, s))
+    m = jnp.zeros((n + k, n + k)).at[:n, :n].set(other_second(second, s) + _by_unknown(h, s))
     m = m.at[n:, :n].set(d_e).at[:n, n:].set(d_e.T) - _products(gram, border, n + k, s)
-    if s.n_scanner:
-        by_scanner, own = rest.surfaces_scanner.reshape(s.n_scanner, -1), border[s.n_interior : s.n_border]
-        m = m.at[own[:, None], own].add(by_scanner @ by_scanner.T)
     fixed = jnp.where(jnp.diagonal(m) == 0, 1.0, 0.0)
     m = m.at[n:].set(c @ m[n:]) + jnp.diag(jnp.where(jnp.arange(n + k) < n, fixed, -1.0))
     by_eop = (6 * image[:, :, None] + jnp.arange(6)).reshape(len(l), -1)
@@ -156,7 +150,7 @@ def _products(gram: Float[Array, "chunks tiles f f"], border: Array, size: int, 
     return result.at[border[:, None], border].set(gram[:, :, 6 * m :, 6 * m :].sum((0, 1)))
 
 
-def image_columns(s: Structure) -> Int[Array, "images 6+colours"]:
+def image_columns(s: Structure) -> Int[Array, "images e_and_colours"]:
     """Reduced unknowns of each image: exterior orientation, then those of its camera's colours."""
     column = jnp.asarray(s.column)[:, : s.n_image_colours]
     shared = jnp.where(column < s.n_shared, 6 * s.n_images + column, NOWHERE)

@@ -27,7 +27,7 @@ from jaxtyping import Array, Float, Int
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.adjustment.residuals import Increments, Values, state_at
 from jaxphoto.adjustment.structure import CameraGroup, Structure, interior_of
-from jaxphoto.adjustment.tiles import once, scene_of, slopes_of
+from jaxphoto.adjustment.tiles import by_image, once, scene_of, slopes_of
 from jaxphoto.arrays import Numbers, still
 from jaxphoto.collinearity import camera_residual
 from jaxphoto.georeferencing import Corrections, apparent_point
@@ -40,7 +40,7 @@ Scalars = tuple[Array, ...]
 _AT_ONCE = 8192
 
 
-class ImageRows(NamedTuple):
+class ListedRows(NamedTuple):
     """Image rows in the block's order, then at least one of no weight; what they touch in a padded structure."""
 
     image: Int[Numbers, "rows"]
@@ -59,13 +59,13 @@ class RowProducts(NamedTuple):
     """Sums by image; symmetric when the transpose is added and half of it taken."""
     shared_eop: Float[Array, "images colours 6"]
     shared: Float[Array, "images colours colours"]
-    by_point: Float[Array, "9+colours 3 rows"]
+    by_point: Float[Array, "touched 3 rows"]
     """Of each row's eop (6), point (3) and colours with its point."""
-    measured: Float[Array, "rows 2 9+colours"]
+    measured: Float[Array, "rows 2 touched"]
     """-B of each row's eop (6), point (3) and colours."""
 
 
-def image_rows(adjusted: Adjustment) -> ImageRows:
+def image_rows(adjusted: Adjustment) -> ListedRows:
     """The image rows of an adjustment."""
     s, computed = adjusted.structure, adjusted.computed
     places, tiles = computed.places, computed.structure.in_tiles
@@ -80,7 +80,7 @@ def image_rows(adjusted: Adjustment) -> ImageRows:
     of_slot = np.full((*tiles.image.shape, tiles.per_tile), size - 1, np.int32)
     of_slot.reshape(-1)[places.row] = np.arange(n)
     image, point = places.image[s.image].astype(np.int32), places.point[s.point].astype(np.int32)
-    return ImageRows(pad(image), pad(point), pad(still(adjusted.values.xy)), weight, of_slot)
+    return ListedRows(pad(image), pad(point), pad(still(adjusted.values.xy)), weight, of_slot)
 
 
 def _size(rows: int) -> int:
@@ -90,7 +90,7 @@ def _size(rows: int) -> int:
 
 
 def row_products(
-    values: Values, scale: Increments, rows: ImageRows, curved: Float[Numbers, ""], s: Structure
+    values: Values, scale: Increments, rows: ListedRows, curved: Float[Numbers, ""], s: Structure
 ) -> RowProducts:
     """H and B of all rows at the values, in scaled increments; without the terms that carry r where `curved` is 0."""
     count = -(-len(rows.image) // _AT_ONCE)
@@ -101,7 +101,7 @@ def row_products(
 
     def of_some(some: tuple[Array, Array, Array, Array]) -> RowProducts:
         image, point, xy, weight = some
-        return _of_some(values, scale, ImageRows(image, point, xy, weight, rows.of_slot), curved, s)
+        return _of_some(values, scale, ListedRows(image, point, xy, weight, rows.of_slot), curved, s)
 
     found = jax.lax.map(of_some, split)
     by_point = jnp.moveaxis(found.by_point, 0, 2)
@@ -115,18 +115,18 @@ def row_products(
 
 
 def _of_some(
-    values: Values, scale: Increments, rows: ImageRows, curved: Float[Numbers, ""], s: Structure
+    values: Values, scale: Increments, rows: ListedRows, curved: Float[Numbers, ""], s: Structure
 ) -> RowProducts:
     image, point = rows.image, rows.point
     q, zero = s.n_image_colours, jax.tree.map(jnp.zeros_like, scale)
-    scene, slopes = scene_of(state_at(zero, scale, values, s), s), slopes_of(zero, scale, values, s)
+    scene, slopes = scene_of(state_at(zero, scale, values, s), values, s), slopes_of(zero, scale, values, s)
     ends = jnp.concatenate([_at(values.position, image), _at(values.points, point)])
     rotation, of_image, of_point = _at(values.rotation, image), _at(scale.eop, image), _at(scale.points, point)
     u, by_place = once(partial(_places, s.corrections), s, rotation, ends, of_image, of_point)
 
     g, to_u = jnp.zeros(()), (jnp.zeros(()),) * 3
     for group, camera, slope in zip(s.groups, scene.cameras, slopes.cameras, strict=True):
-        if len(group.names) > 1:
+        if by_image(group, s):
             camera, slope = camera[image].T, jnp.moveaxis(slope[image], 0, -1)
         weight = tuple(jnp.where(jnp.asarray(group.member)[image], rows.weight, 0.0))
         of_group = once(partial(_by_camera, group), s, camera, slope, u, tuple(rows.xy), weight, curved)
@@ -218,7 +218,7 @@ def _by_camera(
     xy: Scalars,
     weight: Scalars,
     curved: Float[Numbers, ""],
-) -> tuple[Float[Array, "3+colours 5+colours rows"], Scalars]:
+) -> tuple[Float[Array, "u_and_colours directions rows"], Scalars]:
     """G of every row, (u, t) by (u, t, m), and J_u' r."""
     q = len(slope)
     z = (*u, *(jnp.zeros_like(u[0]),) * q, *xy)
@@ -228,7 +228,13 @@ def _by_camera(
         leaves = list(camera)
         for k, leaf in enumerate(group.free_leaves):
             leaves[leaf] = leaves[leaf] + _dot(z[3 : 3 + q], slope[:, k])
-        r = camera_residual(interior_of(group, leaves), (z[0], z[1], z[2]), jnp.stack(z[3 + q :]))
+        # Row by row: what is written for one image point need not know of many.
+        of_one = jax.vmap(
+            lambda own, u, xy: camera_residual(interior_of(group, own), u, xy),
+            ([0 if jnp.ndim(leaf) else None for leaf in leaves], 0, -1),
+            -1,
+        )
+        r = of_one(leaves, z[:3], jnp.stack(z[3 + q :]))
         return tuple(w * v for w, v in zip(weight, r, strict=True))
 
     r, j = residual(z), jax.vmap(lambda seed: jax.jvp(residual, (z,), (seed,))[1])(seeds)

@@ -12,8 +12,9 @@ from jaxtyping import Float
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.errors import InputError
+from jaxphoto.observations import AbstractObservations, Correlated, StationRows
 from jaxphoto.sensitivity.exact import Sensitivity
-from jaxphoto.statistics import a_priori_sigmas, covariance, redundancy_numbers
+from jaxphoto.statistics import covariance, error_precision, observation_groups, redundancy_numbers
 
 Per = Literal["block", "strip", "image"]
 DELTA0 = 4.13
@@ -81,17 +82,25 @@ def station_bias(
     place = {unit: k for k, unit in enumerate(units)}
     unit = np.array([place.get(name, len(units)) for name in of_row])
     change = np.zeros((len(units) + 1, 3, len(derivatives.labels)))
-    np.add.at(change, (unit, rows.axis), bias_m * derivatives.stations.T)
+    np.add.at(change, (unit, rows.axis), bias_m * derivatives[StationRows.group].T)
     return StationBias(change[:-1].transpose(2, 0, 1), units, bias_m)
 
 
 def variance_shares(adjusted: Adjustment, derivatives: Sensitivity) -> VarianceShares:
     """Which observations an estimate hangs on: the share A_k^2 sigma_k^2 of each in the estimate's variance."""
-    sigmas = _sigmas(adjusted)
-    parts = {name: (a * sigmas[name]) ** 2 for name, a in derivatives.groups.items()}
+    rows = observation_groups(adjusted)
+    parts = {name: _shares(a, rows[name]) for name, a in derivatives.groups.items()}
     variance = np.sum([part.sum(axis=1) for part in parts.values()], axis=0)
     known = np.where(variance > 0, variance, 1.0)[:, None]
     return VarianceShares({name: part / known for name, part in parts.items()}, variance)
+
+
+def _shares(a: Float[np.ndarray, "estimates n"], rows: AbstractObservations) -> Float[np.ndarray, "estimates n"]:
+    """What each observation adds to A C A', whose sum over the observations it is."""
+    if isinstance(rows, Correlated):
+        by_set = a.reshape(len(a), len(rows), -1)
+        return (by_set * np.einsum("esn,snm->esm", by_set, np.asarray(rows.covariance))).reshape(a.shape)
+    return (a * np.ravel(rows.sigmas)) ** 2
 
 
 def external_reliability(adjusted: Adjustment, derivatives: Sensitivity, delta0: float = DELTA0) -> ExternalReliability:
@@ -107,20 +116,14 @@ def external_reliability(adjusted: Adjustment, derivatives: Sensitivity, delta0:
     if not delta0 > 0:
         raise InputError(f"delta0 is the shift that a test detects, a positive number, not {delta0}")
     numbers = redundancy_numbers(adjusted, covariance(adjusted))
-    by_name = dict(zip(derivatives.groups, numbers, strict=False))
     detectable, effect = {}, {}
-    for name, sigma in _sigmas(adjusted).items():
-        r = _in_rows(np.asarray(by_name[name]))
-        checked = r > _UNCHECKED
-        detectable[name] = np.where(checked, delta0 * sigma / np.sqrt(np.where(checked, r, 1.0)), np.inf)
+    for name, variance in error_precision(adjusted, numbers).items():
+        checked = _in_rows(np.asarray(numbers[name])) > _UNCHECKED
+        known = np.where(checked, _in_rows(variance), 1.0)
+        detectable[name] = np.where(checked, delta0 / np.sqrt(known), np.inf)
         a = derivatives.groups[name]
         effect[name] = np.multiply(a, detectable[name], out=np.zeros_like(a), where=a != 0)
     return ExternalReliability(detectable, effect, delta0)
-
-
-def _sigmas(adjusted: Adjustment) -> dict[str, Float[np.ndarray, "n"]]:
-    """A priori standard deviations in the order of the columns of `Sensitivity.groups`."""
-    return {name: _in_rows(sigma) for name, sigma in a_priori_sigmas(adjusted).items()}
 
 
 def _in_rows(values: np.ndarray) -> Float[np.ndarray, "n"]:

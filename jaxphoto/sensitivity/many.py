@@ -2,7 +2,8 @@
 
 Adjustments that differ in numbers only are computed side by side: arrays end in the axis of the draws, so that what
 belongs to an image row is read and written in whole stretches. Unlike in the tiles of a single adjustment
-(`adjustment.tiles`) there is no empty slot: image rows are listed, and gather and scatter such stretches.
+(`adjustment.tiles`) there is no empty slot: image rows are listed, and gather and scatter such stretches, a chunk of
+rows at a time, whose numbers stay in the cache of a core.
 
 With u the point of an image row in the camera frame and q half the square of its weighted residuals,
 
@@ -12,9 +13,8 @@ all by automatic differentiation of the model of one row, each kept before it is
 for every result that needs it.
 """
 
-import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -23,27 +23,35 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxphoto.adjustment import Adjustment
-from jaxphoto.adjustment.residuals import Increments, State, Values, other_residuals, state_at
+from jaxphoto.adjustment.residuals import Increments, State, Values, state_at
+from jaxphoto.adjustment.rows import other_residuals
 from jaxphoto.adjustment.structure import CameraGroup, Structure, interior_of
 from jaxphoto.adjustment.tiles import once
+from jaxphoto.arrays import Numbers
 from jaxphoto.collinearity import ExteriorOrientation, camera_coordinates, camera_residual
 from jaxphoto.georeferencing import apparent_point
 from jaxphoto.georeferencing.corrections import NO_CORRECTIONS
 from jaxphoto.rotation import rotate
 
 Varying = dict[str, Array]
-"""Fields of `Values` that differ between draws, which are their last axis; `xy` and `sigma_xy` by row of the block."""
+"""Leaves of `Values`, by `path_name`, that differ between draws, which are their last axis; `xy` and `sigma_xy` by row
+of the block."""
 
 
 class RowList(eqx.Module):
-    """Image rows of the cameras of one group: their number in the block, and what they touch in a padded structure."""
+    """Image rows of the cameras of one group, in chunks: their number in the block, and what they touch.
 
-    row: Int[np.ndarray, "rows"]
-    image: Int[np.ndarray, "rows"]
-    point: Int[np.ndarray, "rows"]
-    """Sorted."""
-    camera: Int[np.ndarray, "rows"]
+    Images and points are those of a padded structure, points ascending. The last chunk repeats its last row, without
+    weight.
+    """
+
+    row: Int[np.ndarray, "chunks rows"]
+    image: Int[np.ndarray, "chunks rows"]
+    point: Int[np.ndarray, "chunks rows"]
+    camera: Int[np.ndarray, "chunks rows"]
     """Within the group."""
+    counts: Float[np.ndarray, "chunks rows"]
+    """1, and 0 where a row is a repetition."""
 
 
 class Common(eqx.Module):
@@ -57,15 +65,20 @@ class Common(eqx.Module):
     lists: tuple[RowList, ...]
 
 
-def common_of(adjusted: Adjustment) -> Common:
-    """The nominal adjustment, from whose optimum all draws begin."""
+def common_of(adjusted: Adjustment, at_once: int) -> Common:
+    """The nominal adjustment, from whose optimum all draws begin; `at_once` image rows are computed with at a time."""
     s, padded = adjusted.structure, adjusted.computed
     lists = []
     for group in s.groups:
         own = np.flatnonzero(group.member[s.image])
         own = own[np.argsort(padded.places.point[s.point[own]], kind="stable")]
-        image = s.image[own]
-        lists.append(RowList(own, padded.places.image[image], padded.places.point[s.point[own]], group.camera[image]))
+        chunks = -(-len(own) // at_once)
+        size = -(-len(own) // max(chunks, 1))
+        place = np.arange(chunks * size).reshape(chunks, size)
+        row = own[np.minimum(place, len(own) - 1)]
+        image = s.image[row]
+        of_group = padded.places.image[image], padded.places.point[s.point[row]], group.camera[image]
+        lists.append(RowList(row, *of_group, (place < len(own)).astype(float)))
     values = adjusted.values
     return Common(
         padded.values,
@@ -100,20 +113,26 @@ def other_gradients(y: Increments, varying: Varying, common: Common) -> Incremen
 def image_gradients(y: Increments, varying: Varying, common: Common) -> Increments:
     """The part of J'r, draws last, that is due to the image rows."""
     state, pull = jax.vjp(lambda y: states(y, varying, common), y)
-    xy, sigma = (varying.get(name, getattr(common, name)) for name in ("xy", "sigma_xy"))
+    xy, sigma = (jnp.asarray(varying.get(name, getattr(common, name))) for name in ("xy", "sigma_xy"))
     cotangent = jax.tree.map(jnp.zeros_like, state)
     for group, rows in zip(common.structure.groups, common.lists, strict=True):
-        seen = jnp.asarray(xy)[:, rows.row], 1 / jnp.asarray(sigma)[:, rows.row]
-        of_group = _group_cotangent(group, rows, state, seen, common.structure)
+        of_group = _group_cotangent(group, rows, state, (xy, sigma), common.structure)
         cotangent = jax.tree.map(jnp.add, cotangent, of_group)
     return pull(cotangent)[0]
 
 
 def _values_with(varying: Varying, common: Common) -> Values:
-    # Those of image rows are not in tiles, and nobody looks for them there.
-    return dataclasses.replace(
-        common.values, **{name: v for name, v in varying.items() if name not in ("xy", "sigma_xy")}
-    )
+    def of_draw(path: Any, nominal: Any) -> Any:
+        name = path_name(path)
+        # Those of image rows are not in tiles, and nobody looks for them there.
+        return nominal if name in ("xy", "sigma_xy") else varying.get(name, nominal)
+
+    return jax.tree_util.tree_map_with_path(of_draw, common.values)
+
+
+def path_name(path: Any) -> str:
+    """What `Varying` calls a leaf of `Values`, such as `shared` and `groups[0].listed.value`."""
+    return jax.tree_util.keystr(path)[1:]
 
 
 def _each_row(function: Callable, *arrays: Any) -> Any:
@@ -121,11 +140,43 @@ def _each_row(function: Callable, *arrays: Any) -> Any:
     return jax.vmap(jax.vmap(function, -1, -1))(*arrays)
 
 
+class _Sums(NamedTuple):
+    """What the image rows of a group add up to: derivatives of the sum of q, draws last."""
+
+    centre: Float[Array, "images 3 draws"]
+    turn: Float[Array, "images 3 draws"]
+    shared: Float[Array, "parameters draws"]
+    points: Float[Array, "points 3 draws"]
+
+
 def _group_cotangent(group: CameraGroup, rows: RowList, state: State, seen: tuple[Array, Array], s: Structure) -> State:
     """Derivatives of the sum of q over the rows of a group with respect to the state."""
     n, size = state.position.shape[1:]
     of_images = jnp.concatenate([state.rotation.reshape(9, n, size), state.position]).transpose(1, 0, 2)
     of_points = state.points.transpose(1, 0, 2)
+    nothing = jnp.zeros((n, 3, size))
+    zero = _Sums(nothing, nothing, jnp.zeros_like(state.shared), jnp.zeros_like(of_points))
+
+    def add(sums: _Sums, rows: RowList) -> tuple[_Sums, None]:
+        return _with_chunk(sums, group, rows, of_images, of_points, state.shared, seen, s), None
+
+    sums, _ = jax.lax.scan(add, zero, rows)
+    # Of all cotangents of a matrix R that changes by -t x R, the one along such changes.
+    rotation = -0.5 * jnp.cross(sums.turn.transpose(1, 0, 2)[:, None], state.rotation, axis=0)
+    return State(sums.centre.transpose(1, 0, 2), rotation, sums.shared, sums.points.transpose(1, 0, 2))
+
+
+def _with_chunk(
+    sums: _Sums,
+    group: CameraGroup,
+    rows: RowList,
+    of_images: Float[Array, "images 12 draws"],
+    of_points: Float[Array, "points 3 draws"],
+    shared: Float[Array, "parameters draws"],
+    seen: tuple[Array, Array],
+    s: Structure,
+) -> _Sums:
+    """The sums with one chunk of rows added."""
     rotation_of = lambda image: image[:9].reshape(3, 3)  # noqa: E731
 
     def aim_of(image, point):
@@ -152,17 +203,19 @@ def _group_cotangent(group: CameraGroup, rows: RowList, state: State, seen: tupl
         return pull(to_aim)
 
     u = once(lambda i, p: _each_row(from_place, _at(i, rows.image), _at(p, rows.point)), s, of_images, of_points)
-    shared, to_u = _camera_cotangent(group, rows, state.shared, u, seen, s)
+    xy, sigma = (v[:, rows.row] for v in seen)
+    weight = jnp.expand_dims(rows.counts, range(1, sigma.ndim - 1)) / sigma
+    to_chosen, to_u = _camera_cotangent(group, rows, shared, u, (xy, weight), s)
     to_aim = once(lambda i, to_u: _each_row(back_to_aim, _at(i, rows.image), to_u), s, of_images, to_u)
-    turn = jax.ops.segment_sum(_each_row(back_to_turn, u, to_u), rows.image, n)
     to_centre, to_point = 0.0, to_aim
     if s.corrections != NO_CORRECTIONS:
         to_centre, to_point = _each_row(back_to_place, _at(of_images, rows.image), _at(of_points, rows.point), to_aim)
-    centre = jax.ops.segment_sum(to_centre - to_aim, rows.image, n)
-    points = jax.ops.segment_sum(to_point, rows.point, len(of_points), indices_are_sorted=True)
-    # Of all cotangents of a matrix R that changes by -t x R, the one along such changes.
-    rotation = -0.5 * jnp.cross(turn.transpose(1, 0, 2)[:, None], state.rotation, axis=0)
-    return State(centre.transpose(1, 0, 2), rotation, shared, points.transpose(1, 0, 2))
+    return _Sums(
+        sums.centre.at[rows.image].add(to_centre - to_aim),
+        sums.turn.at[rows.image].add(_each_row(back_to_turn, u, to_u)),
+        sums.shared + to_chosen,
+        sums.points.at[rows.point].add(to_point, indices_are_sorted=True),
+    )
 
 
 def _units(of: tuple[Array, ...]) -> list[tuple[Array, ...]]:
@@ -174,7 +227,7 @@ def _dot(a: Sequence[Array], b: Sequence[Array]) -> Array:
     return sum((x * y for x, y in zip(a, b, strict=True)), jnp.zeros(()))
 
 
-def _at(array: Array, index: np.ndarray) -> Array:
+def _at(array: Array, index: Numbers) -> Array:
     return array.at[index].get(mode="promise_in_bounds")
 
 

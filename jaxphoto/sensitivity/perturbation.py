@@ -11,8 +11,9 @@ dict of numbers to record:
 `bias` makes the usual ones.
 """
 
+import dataclasses
 from collections.abc import Callable, Collection, Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -20,10 +21,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxphoto.block import ATTITUDE_AXES, AXES, Block
+from jaxphoto.block import Block
 from jaxphoto.camera import InteriorOrientation, get_parameter, parameter_names
 from jaxphoto.errors import InputError
-from jaxphoto.unknowns import FIXED, FREE, Weighted
+from jaxphoto.observations import ATTITUDE_AXES, AXES, Correlated, KnownParameters
+from jaxphoto.rotation import small_rotation
+from jaxphoto.unknowns import FIXED, FREE, Weighted, is_prior
 
 Recorded = dict[str, Array]
 Perturbation = Callable[[Any, Block], Block | tuple[Block, Recorded]]
@@ -53,13 +56,15 @@ class Bias(eqx.Module):
     """Of the errors drawn, such as `E1.X_m`; angles in rad."""
     sigma: Float[np.ndarray, "errors"]
     """In the units of the names."""
-    targets: tuple[tuple[str, ...], ...] = eqx.field(static=True)
+    targets: tuple[tuple[Any, ...], ...] = eqx.field(static=True)
     """Paths, from the block, of the arrays that the errors are added to."""
     index: tuple[Int[np.ndarray, "..."], ...]
     """The error that each number of these arrays gets; the number of errors where it gets none."""
     distribution: Distribution = eqx.field(static=True, default=jax.random.normal)
     recorded: bool = eqx.field(static=True, default=True)
     """Whether each error is worth a record of its own."""
+    mixed: tuple[Float[np.ndarray, "sets n n"] | None, ...] = ()
+    """Of arrays whose errors are correlated, what makes them of errors drawn: L of the covariance L L' of each set."""
 
     def __call__(self, key, block: Block) -> tuple[Block, Recorded]:
         """`block` with errors drawn by `key`, and the errors by name."""
@@ -74,9 +79,20 @@ class Bias(eqx.Module):
         """`block` with given errors, in the order of `names`."""
         added = jnp.append(errors, 0.0)
         where = lambda b: [_follow(b, path) for path in self.targets]  # noqa: E731
-        old = where(block)
-        new = [v + added[k].reshape(np.shape(v)) for v, k in zip(old, self.index, strict=True)]
+        mixed = self.mixed or (None,) * len(self.targets)
+        new = [
+            _with_errors(v, added[k] if factor is None else jnp.einsum("nij,nj->ni", factor, added[k]))
+            for v, k, factor in zip(where(block), self.index, mixed, strict=True)
+        ]
         return eqx.tree_at(where, block, new)
+
+
+def _with_errors(values: Any, errors: Array) -> Array:
+    """Numbers with errors added; rotation matrices turned by them, small rotations."""
+    if errors.size == np.size(values):
+        return jnp.asarray(values) + errors.reshape(np.shape(values))
+    turn = jax.vmap(small_rotation)(errors.reshape(-1, 3))
+    return (turn @ jnp.asarray(values).reshape(-1, 3, 3)).reshape(np.shape(values))
 
 
 def bias(
@@ -122,49 +138,77 @@ def bias(
     return Bias(names, _sigmas(sigma, axes, len(chosen)), (target,), (index,), distribution, own)
 
 
+class _Noisy(NamedTuple):
+    """Where observed numbers are, their standard deviations, and what mixes errors of unit size if correlated."""
+
+    path: tuple[Any, ...]
+    sigma: np.ndarray
+    mixed: np.ndarray | None = None
+
+
 def noise(block: Block) -> Bias:
     """Errors of all observations and of all values given beforehand, each with its own standard deviation.
 
-    It is what the covariance of the block is about. Raises InputError for a value given beforehand as one for three
-    axes.
+    It is what the covariance of the block is about. Raises InputError for a value given beforehand as one for several
+    numbers.
     """
-    sigmas = {
-        ("image_points", "xy"): block.image_points.sigma,
-        ("stations", "value"): block.stations.sigma,
-        ("attitudes", "roll_pitch_yaw"): block.attitudes.sigma,
-        ("control", "value"): block.control.sigma,
-        ("distances", "value"): block.distances.sigma,
-    } | {path: np.broadcast_to(prior.sigma, np.shape(prior.value)) for path, prior in _weighted(block)}
-    flat = {target: np.ravel(sigma) for target, sigma in sigmas.items() if np.size(sigma)}
-    starts = np.cumsum([0, *map(len, flat.values())])
-    names = tuple(f"{'.'.join(path)}.{k}" for path, sigma in flat.items() for k in range(len(sigma)))
-    index = tuple(start + np.arange(len(sigma)) for start, sigma in zip(starts, flat.values(), strict=False))
-    return Bias(names, np.concatenate(list(flat.values())), tuple(flat), index, recorded=False)
+    parts = [part for part in (*_observed(block), *_weighted(block)) if np.size(part.sigma)]
+    starts = np.cumsum([0, *(np.size(part.sigma) for part in parts)])
+    names = tuple(f"{'.'.join(map(str, part.path))}.{k}" for part in parts for k in range(np.size(part.sigma)))
+    index = tuple(
+        start + np.arange(np.size(part.sigma)).reshape(np.shape(part.sigma))
+        for start, part in zip(starts, parts, strict=False)
+    )
+    sigma = np.concatenate([np.ravel(part.sigma) for part in parts])
+    mixed = tuple(part.mixed for part in parts)
+    return Bias(names, sigma, tuple(part.path for part in parts), index, recorded=False, mixed=mixed)
 
 
-def _weighted(block: Block) -> Iterator[tuple[tuple[str, ...], Weighted]]:
-    """Values given beforehand, with their paths."""
-    priors = block.priors
-    for name, interior in priors.interior.items():
-        for parameter in parameter_names(interior):
-            prior = get_parameter(interior, parameter)
-            if isinstance(prior, Weighted):
-                yield ("priors", "interior", name, parameter, "value"), prior
-    of_mounts = ("lever_arm", "boresight", "time_offset")
-    groups: list[tuple[str, Any, tuple[str, ...]]] = [
-        ("mounts", priors.mounts, of_mounts),
-        ("strips", priors.strips, ("shift", "drift")),
-    ]
-    for group, table, fields in groups:
-        for name, item in table.items():
-            for field in fields:
-                prior = getattr(item, field)
-                if isinstance(prior, Weighted):
-                    if field != "time_offset" and np.shape(prior.value) != (3,):
-                        raise InputError(
-                            f"{field} of {name} is known beforehand by one value for three axes: give it three"
-                        )
-                    yield ("priors", group, name, field, "value"), prior
+def _observed(block: Block) -> Iterator[_Noisy]:
+    """All observations, wherever the block holds them."""
+    own = (block.image_points, *block.observations)
+    places: list[tuple[tuple[Any, ...], Any]] = [((f.name,), getattr(block, f.name)) for f in dataclasses.fields(block)]
+    places += [(("more", k), rows) for k, rows in enumerate(block.more)]
+    for path, rows in places:
+        if isinstance(rows, KnownParameters):
+            yield _correlated((*path, "value"), rows.covariance[None])
+        elif isinstance(rows, Correlated):
+            yield _correlated((*path, "rows", rows.rows.observed), rows.covariance)
+        elif any(rows is other for other in own):
+            yield _Noisy((*path, rows.observed), np.asarray(rows.sigmas))
+
+
+def _correlated(path: tuple[Any, ...], covariance: Any) -> _Noisy:
+    factor = np.linalg.cholesky(np.asarray(covariance))
+    return _Noisy(path, np.ones(factor.shape[:2]), factor)
+
+
+def _weighted(block: Block) -> Iterator[_Noisy]:
+    """Values given beforehand."""
+    paths = jax.tree_util.tree_leaves_with_path(block.priors, is_leaf=is_prior)
+    known = block.start.unknowns
+    for keys, prior in paths:
+        if isinstance(prior, Weighted):
+            path = tuple(getattr(key, "name", getattr(key, "key", None)) for key in keys)
+            value = _follow(known, path)
+            if np.shape(prior.value) != np.shape(value):
+                raise InputError(
+                    f"{_label(path)} is known beforehand by one value for {np.size(value)} numbers: give each its own"
+                )
+            rotations = path[-1] == "camera_from_object"
+            shape = (*np.shape(value)[:-1],) if rotations else np.shape(value)
+            if prior.covariance is None:
+                yield _Noisy(("priors", *path, "value"), np.broadcast_to(prior.sigma, shape))
+            else:
+                sets = (int(np.prod(shape[:-1], dtype=int)), 3, 3)
+                yield _correlated(("priors", *path, "value"), np.broadcast_to(prior.covariance, sets))
+
+
+def _label(path: tuple[Any, ...]) -> str:
+    """Such as "shift of a" and "exterior.position"."""
+    return (
+        f"{path[-1]} of {path[-2]}" if path[0] in ("mounts", "strips", "scanner", "more") else ".".join(map(str, path))
+    )
 
 
 def _observations(block: Block, kind: str, per: str):
@@ -217,15 +261,17 @@ def _parameters(block: Block, kind: str, sigma, of: Collection[str], parameter: 
     return Bias(names, _sigmas(sigma, axes, len(chosen)), tuple(targets), index, distribution)
 
 
-def _follow(tree: Any, path: tuple[str, ...]) -> Any:
-    """The leaf at a path of fields, keys and names of interior parameters."""
+def _follow(tree: Any, path: tuple[Any, ...]) -> Any:
+    """The leaf at a path of fields, keys, numbers and names of interior parameters."""
     for step in path:
-        tree = tree[step] if isinstance(tree, dict) else _leaf(tree, step)
+        tree = tree[step] if isinstance(tree, dict | tuple) else _leaf(tree, step)
     return tree
 
 
 def _leaf(tree: Any, name: str) -> Any:
-    return get_parameter(tree, name) if isinstance(tree, InteriorOrientation) else getattr(tree, name)
+    """A field, or a parameter of a camera by its name."""
+    named = isinstance(tree, InteriorOrientation) and not hasattr(tree, name)
+    return get_parameter(tree, name) if named else getattr(tree, name)
 
 
 def _chosen(of: Collection[str], known: list[str], kind: str, per: str) -> list[str]:

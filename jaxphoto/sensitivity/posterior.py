@@ -38,9 +38,9 @@ from jaxphoto.adjustment.residuals import Increments, Values, state_at
 from jaxphoto.adjustment.result import Factored
 from jaxphoto.adjustment.structure import Structure, structure_of
 from jaxphoto.arrays import still
-from jaxphoto.block import AXES
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import InputError
+from jaxphoto.observations import AXES
 from jaxphoto.rotation import omega_phi_kappa_from_matrix
 from jaxphoto.statistics import EOP_NAMES
 from jaxphoto.unknowns import FREE, uniform_priors

@@ -24,7 +24,7 @@ from jaxphoto.errors import InputError
 from jaxphoto.rotation import omega_phi_kappa_from_matrix
 from jaxphoto.sensitivity.curvature import mixed_second
 from jaxphoto.sensitivity.hessian import check_optimum, eliminated, solve_eliminated
-from jaxphoto.sensitivity.image_rows import ImageRows, image_rows
+from jaxphoto.sensitivity.image_rows import ListedRows, image_rows
 from jaxphoto.unknowns import Unknowns
 
 
@@ -104,7 +104,7 @@ def _of_fixed(direction: Values, s: Structure) -> Values:
 
 @eqx.filter_jit
 def _response(
-    values: Values, scale: Increments, direction: Values, rows: ImageRows, s: Structure, curved: jax.Array
+    values: Values, scale: Increments, direction: Values, rows: ListedRows, s: Structure, curved: jax.Array
 ) -> tuple[State, jax.Array]:
     at = At(jax.tree.map(jnp.zeros_like, scale), scale, weigh_datum(values, s), s)
     h, b = eliminated(at, rows, curved), jax.tree.map(jnp.negative, mixed_second(at, direction, curved))

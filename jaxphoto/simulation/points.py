@@ -10,7 +10,7 @@ from jaxphoto.errors import BlockError
 from jaxphoto.simulation.convergent_plan import Field
 from jaxphoto.simulation.flight import Flight
 from jaxphoto.simulation.flight_plan import Swaths
-from jaxphoto.simulation.recipe import Choice, Recipe, Role, Targets
+from jaxphoto.simulation.recipe import Choice, Recipe, Role, TargetPlan
 from jaxphoto.simulation.streams import stream
 from jaxphoto.simulation.terrain import Terrain
 from jaxphoto.simulation.visibility import Rays, photograph, unhidden
@@ -19,7 +19,7 @@ from jaxphoto.simulation.visibility import Rays, photograph, unhidden
 _TRIES = 20
 
 
-class Scene(NamedTuple):
+class TruePoints(NamedTuple):
     """The points, (points, 3) in m, and their rays without noise."""
 
     ids: tuple[str, ...]
@@ -29,7 +29,7 @@ class Scene(NamedTuple):
     rays: Rays
 
 
-def scatter(recipe: Recipe, flight: Flight, terrain: Terrain, seed: int) -> Scene:
+def scatter(recipe: Recipe, flight: Flight, terrain: Terrain, seed: int) -> TruePoints:
     """Ties and targets of the recipe. Raises BlockError where images do not see them often enough."""
     rng = stream(seed, "ties")
     ids = [f"{k + 1}" for k in range(recipe.points.ties)]
@@ -53,7 +53,7 @@ def scatter(recipe: Recipe, flight: Flight, terrain: Terrain, seed: int) -> Scen
         roles += _roles(group, places, recipe.ground)
     points = np.vstack(xyz)
     is_target = np.arange(len(points)) >= recipe.points.ties
-    return Scene(tuple(ids), points, tuple(roles), is_target, _rays(recipe, flight, terrain, points))
+    return TruePoints(tuple(ids), points, tuple(roles), is_target, _rays(recipe, flight, terrain, points))
 
 
 def _rays(recipe: Recipe, flight: Flight, terrain: Terrain, xyz: np.ndarray) -> Rays:
@@ -90,7 +90,7 @@ def _seen_often(
     return found[:n]
 
 
-def _given(group: Targets, terrain: Terrain, ground: Swaths | Field, rng: np.random.Generator) -> np.ndarray:
+def _given(group: TargetPlan, terrain: Terrain, ground: Swaths | Field, rng: np.random.Generator) -> np.ndarray:
     axes = ground.axes
     low, high = ground.extent(axes)
     parts = np.array(group.at, float).reshape(-1, 2)
@@ -112,7 +112,7 @@ def _check_seen(recipe: Recipe, flight: Flight, terrain: Terrain, xyz: np.ndarra
         )
 
 
-def _roles(group: Targets, xyz: np.ndarray, ground: Swaths | Field) -> list[Role]:
+def _roles(group: TargetPlan, xyz: np.ndarray, ground: Swaths | Field) -> list[Role]:
     roles = [group.role] * len(xyz)
     if group.choice is not None:
         for k in _chosen(group.choice, xyz[:, :2], ground):

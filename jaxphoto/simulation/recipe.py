@@ -34,7 +34,7 @@ class Assumed(Generic[T]):
 
 
 @dataclasses.dataclass(frozen=True)
-class Bias:
+class SimulatedBias:
     """Shift (m) and drift (m/s) of the GNSS positions of a strip.
 
     Truth is `truth` plus, for each strip by itself, normal shifts and drifts of `shift_sigma_m` and
@@ -63,7 +63,7 @@ class Jitter:
 
 
 @dataclasses.dataclass(frozen=True)
-class Points:
+class PointPlan:
     """How many tie points there are, where, and what is measured.
 
     Points lie in the swaths (`Swaths`: `across`, `ends`) or the `Field`, and are seen in `min_images` images at least,
@@ -96,7 +96,7 @@ class Choice:
 
 
 @dataclasses.dataclass(frozen=True)
-class Targets:
+class TargetPlan:
     """Signalised points of one role: `count` of them uniform over the ground, and those at given places.
 
     `at_m` gives (X, Y) or (X, Y, Z) in m; `at` gives places as parts of half the block's length and width, along and
@@ -148,12 +148,12 @@ class Recipe:
     sensors: dict[str, Sensor]
     cameras: dict[str, Assumed[InteriorOrientation]]
     plan: FlightPlan | ConvergentPlan
-    points: Points
+    points: PointPlan
     stated: Sigmas
     noise: Sigmas
-    targets: tuple[Targets, ...] = ()
+    targets: tuple[TargetPlan, ...] = ()
     mounts: dict[str, Assumed[Mount]] = dataclasses.field(default_factory=dict)
-    biases: dict[str, Bias] = dataclasses.field(default_factory=dict)
+    biases: dict[str, SimulatedBias] = dataclasses.field(default_factory=dict)
     datum_offset_m: Triple = (0.0, 0.0, 0.0)
     jitter: Jitter = Jitter()
     terrain: Terrain = dataclasses.field(default_factory=Terrain)

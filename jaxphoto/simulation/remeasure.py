@@ -6,9 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxphoto.block import Block, SurfaceRows, exposures, mountings
+from jaxphoto.block import Block, exposures, mountings
 from jaxphoto.collinearity import ExteriorOrientation, project
 from jaxphoto.georeferencing import apparent_point
+from jaxphoto.observations import SurfaceRows
 from jaxphoto.simulation.flight import recorded
 from jaxphoto.unknowns import Unknowns
 

@@ -8,18 +8,19 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxphoto.block import Attitudes, Block, Distances, ImageRows, Rows, Start
+from jaxphoto.block import Block, Start
 from jaxphoto.camera import InteriorOrientation
 from jaxphoto.cloud import Cloud
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import BlockError
 from jaxphoto.georeferencing import Mount, StripBias, Trajectory
+from jaxphoto.observations import Attitudes, ControlRows, Distances, ImageRows, StationRows
 from jaxphoto.simulation.convergent import take_images
 from jaxphoto.simulation.convergent_plan import ConvergentPlan
 from jaxphoto.simulation.flight import NO_BIAS, NO_MOUNT, Flight, fly, record, turned
 from jaxphoto.simulation.platform_path import paths
-from jaxphoto.simulation.points import Scene, scatter
-from jaxphoto.simulation.recipe import Assumed, Bias, Recipe, Triple, triple
+from jaxphoto.simulation.points import TruePoints, scatter
+from jaxphoto.simulation.recipe import Assumed, Recipe, SimulatedBias, Triple, triple
 from jaxphoto.simulation.scan import Scan, scan
 from jaxphoto.simulation.streams import stream
 from jaxphoto.simulation.terrain import Terrain
@@ -91,7 +92,7 @@ def simulate(recipe: Recipe, seed: int = 0) -> Simulation:
         image_time=flight.time,
         image_points=_image_points(recipe, scene, seed),
         control=control,
-        fixed=Rows.none(),
+        fixed=ControlRows.none(),
         check=check,
         stations=stations,
         attitudes=attitudes,
@@ -113,7 +114,7 @@ def _scanned(
     return scan(recipe.lidar, flown, terrain, _sigma(recipe.noise.lidar_m), seed)
 
 
-def _seen(recipe: Recipe, flight: Flight, scene: Scene, seed: int) -> Scene:
+def _seen(recipe: Recipe, flight: Flight, scene: TruePoints, seed: int) -> TruePoints:
     """The scene after thinning. Raises BlockError for an image that cannot be oriented."""
     points, rays = recipe.points, scene.rays
     if points.mean_rays is not None:
@@ -127,7 +128,7 @@ def _seen(recipe: Recipe, flight: Flight, scene: Scene, seed: int) -> Scene:
     return scene._replace(rays=rays)
 
 
-def _image_points(recipe: Recipe, scene: Scene, seed: int) -> ImageRows:
+def _image_points(recipe: Recipe, scene: TruePoints, seed: int) -> ImageRows:
     image, point, xy = scene.rays
     target = scene.is_target[point][:, None]
     noise = np.where(target, recipe.noise.target_mm, recipe.noise.image_mm)
@@ -136,28 +137,28 @@ def _image_points(recipe: Recipe, scene: Scene, seed: int) -> ImageRows:
     return ImageRows(image, point, xy, np.broadcast_to(stated, xy.shape).copy())
 
 
-def _control(recipe: Recipe, scene: Scene, seed: int) -> tuple[Rows, Rows]:
+def _control(recipe: Recipe, scene: TruePoints, seed: int) -> tuple[ControlRows, ControlRows]:
     """Surveyed coordinates of control and of check points; every point draws, so roles do not move the noise."""
     surveyed = scene.xyz + _sigma(recipe.noise.control_m) * _draw(seed, "noise of control", scene.xyz.shape)
     sigma = _sigma(recipe.stated.control_m)
 
-    def rows(*roles: str) -> Rows:
+    def rows(*roles: str) -> ControlRows:
         pairs = [(k, axis) for k, role in enumerate(scene.roles) if role in roles for axis in _AXES[role]]
         who, axis = np.array(pairs, int).reshape(-1, 2).T
-        return Rows(who, axis, surveyed[who, axis], sigma[axis])
+        return ControlRows(who, axis, surveyed[who, axis], sigma[axis])
 
     return rows("control", "vertical"), rows("check")
 
 
-def _georeferencing(recipe: Recipe, flight: Flight, truth: Unknowns, seed: int) -> tuple[Rows, Attitudes]:
+def _georeferencing(recipe: Recipe, flight: Flight, truth: Unknowns, seed: int) -> tuple[StationRows, Attitudes]:
     mounts = [truth.mounts.get(recipe.mount_of(camera), NO_MOUNT) for camera in flight.cameras]
     position, attitude = record(flight, mounts, [truth.strips.get(s, NO_BIAS) for s in flight.strips])
     n = len(flight.images)
-    stations, attitudes = Rows.none(), Attitudes.none()
+    stations, attitudes = StationRows.none(), Attitudes.none()
     if recipe.stated.station_m is not None:
         position = position + _sigma(recipe.noise.station_m) * _draw(seed, "noise of stations", (n, 3))
         who, axis = np.indices((n, 3)).reshape(2, -1)
-        stations = Rows(who, axis, position.ravel(), _sigma(recipe.stated.station_m)[axis])
+        stations = StationRows(who, axis, position.ravel(), _sigma(recipe.stated.station_m)[axis])
     if recipe.stated.attitude_deg is not None:
         noise = np.deg2rad(_sigma(recipe.noise.attitude_deg)) * _draw(seed, "noise of attitudes", (n, 3))
         sigma = np.deg2rad(_sigma(recipe.stated.attitude_deg))
@@ -172,7 +173,7 @@ def _true_biases(recipe: Recipe, flight: Flight, seed: int) -> dict[str, StripBi
         bias = _bias_of(recipe, strip)
         if bias is None and not offset.any():
             continue
-        bias = bias or Bias(NO_BIAS)
+        bias = bias or SimulatedBias(NO_BIAS)
         shift, drift = _draw(seed, f"bias of strip {strip}", (2, 3))
         biases[strip] = StripBias(
             np.asarray(bias.truth.shift) + offset + triple(bias.shift_sigma_m) * shift,
@@ -181,7 +182,9 @@ def _true_biases(recipe: Recipe, flight: Flight, seed: int) -> dict[str, StripBi
     return biases
 
 
-def _start(recipe: Recipe, flight: Flight, scene: Scene, control: Rows, seed: int) -> tuple[Start, Unknowns]:
+def _start(
+    recipe: Recipe, flight: Flight, scene: TruePoints, control: ControlRows, seed: int
+) -> tuple[Start, Unknowns]:
     """Where the adjustment starts, and its priors; control stands in for approximate coordinates where it is given."""
     n, near = len(flight.images), recipe.start
     off = _draw(seed, "approximate orientation", (2, n, 3))
@@ -213,7 +216,7 @@ def _start(recipe: Recipe, flight: Flight, scene: Scene, control: Rows, seed: in
     return Start(start, np.ones(n, bool), known), priors
 
 
-def _bias_of(recipe: Recipe, strip: str) -> Bias | None:
+def _bias_of(recipe: Recipe, strip: str) -> SimulatedBias | None:
     return recipe.biases.get(strip, recipe.biases.get("default"))
 
 

@@ -47,27 +47,28 @@ def photograph(
 ) -> Rays:
     """The rays of all points that images see.
 
-    A point is seen where it is in front of the camera (W < 0), where the distortion can be inverted
-    (`InteriorOrientation.valid`), and inside the format by more than `margin_mm`. Coordinates are those of
-    `jaxphoto.collinearity.project`.
+    A point is seen where its direction has an image (`AbstractProjection.sees`; in front of a perspective camera),
+    where the distortion can be inverted (`InteriorOrientation.invertible`), and inside the format by more than
+    `margin_mm`. Coordinates are those of `jaxphoto.collinearity.project`.
     """
     position, matrix = np.asarray(exterior.position), np.asarray(exterior.camera_from_object)
     # (images, points, 3), in the camera frame
     seen = np.einsum("kij,knj->kni", matrix, points[None] - position[:, None])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        tangents = -seen[..., :2] / seen[..., 2:]
     found = []
     for name, interior in cameras.items():
         sensor = sensors[name]
         interior = jax.tree.map(np.float64, interior)
         half = np.array([sensor.width_mm, sensor.height_mm]) / 2
-        mine = np.array([camera == name for camera in image_camera])[:, None] & (seen[..., 2] < 0)
-        ideal = tangents * float(interior.c)
+        own = np.flatnonzero([camera == name for camera in image_camera])
+        direction = np.moveaxis(seen[own], -1, 0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ideal = np.stack(interior.projection.ideal_from_direction(float(interior.c), *direction), axis=-1)
+        mine = np.asarray(interior.projection.sees(*direction))
         image, point = np.nonzero(mine & (np.abs(ideal) <= _reach(interior, half)).all(axis=2))
         if not len(image):
             continue
         xy, valid = in_chunks(functools.partial(_measured, interior), _CHUNK, ideal[image, point])
-        found.append(Rays(image, point, xy).take(valid & (np.abs(xy) < half - margin_mm).all(axis=1)))
+        found.append(Rays(own[image], point, xy).take(valid & (np.abs(xy) < half - margin_mm).all(axis=1)))
     if not found:
         return Rays(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)))
     rays = Rays(*(np.concatenate(part) for part in zip(*found, strict=True)))
@@ -88,7 +89,7 @@ def _ideal(interior: InteriorOrientation, measured):
 
 @jax.jit
 def _measured(interior: InteriorOrientation, ideal):
-    each = jax.vmap(lambda xy: (interior.measured_from_ideal(xy), interior.valid(xy)))
+    each = jax.vmap(lambda xy: (interior.measured_from_ideal(xy), interior.invertible(xy)))
     return each(ideal)
 
 

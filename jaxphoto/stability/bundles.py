@@ -29,10 +29,16 @@ def image_grid(
 def image_rays(interior: InteriorOrientation, points: Float[Numbers, "points 2"]) -> Float[Array, "points 3"]:
     """The bundle of rays: (x', y', -c) in mm, in the camera frame, of measured image points (mm from the centre).
 
-    x' = ideal(x) is the distortion-free coordinate from the principal point, on the virtual image plane at distance c.
+    x' is the distortion-free coordinate from the principal point, on the virtual image plane at distance c, whatever
+    the projection: that of rays within 90 degrees of the axis.
     """
-    ideal = jax.vmap(interior.ideal_from_measured)(jnp.asarray(points, float))
-    return jnp.column_stack([ideal, jnp.full(len(ideal), -interior.c)])
+
+    def ray(xy):
+        u, v, w = interior.direction_from_ideal(interior.ideal_from_measured(xy))
+        longer = -interior.c / w
+        return jnp.stack([u * longer, v * longer, -jnp.asarray(interior.c, float)])
+
+    return jax.vmap(ray)(jnp.asarray(points, float))
 
 
 def parameter_vector(interior: InteriorOrientation) -> Float[Array, "parameters"]:

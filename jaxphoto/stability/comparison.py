@@ -87,8 +87,8 @@ def check_rays(interior: InteriorOrientation, points: Float[Numbers, "points 2"]
     if not good.all():
         reach = np.hypot(*np.asarray(points)[~good].T).min()
         raise InputError(
-            f"{name}: its distortion means nothing at {(~good).sum()} of {len(good)} points of the grid, the nearest "
-            f"{reach:.3g} mm from the image centre; compare over a smaller extent"
+            f"{name}: its distortion means nothing at {(~good).sum()} of {len(good)} points of the grid, or they look "
+            f"behind the camera, the nearest {reach:.3g} mm from the image centre; compare over a smaller extent"
         )
 
 
@@ -107,9 +107,13 @@ def _compared(first, second, points, method, depth) -> BundleOffsets:
 
 @eqx.filter_jit
 def _regular(interior, points):
-    """Whether the map from measured to ideal coordinates keeps its orientation at each point."""
+    """Whether the map from measured to ideal coordinates keeps its orientation at the points, and they look ahead."""
 
     def one(xy):
+        _, _, w = interior.direction_from_ideal(interior.ideal_from_measured(xy))
+        return unfolded(xy) & (w < 0)
+
+    def unfolded(xy):
         if interior.distortion.domain == "ideal":
             reduced = xy - interior.principal_point
             return invert(interior.distortion, reduced / interior.c if interior.distortion.normalised else reduced)[1]

@@ -7,7 +7,7 @@ V = L L' and F = [W; Ws; D] L^-T what a point p meets, whitened,
     Q_pp  = L^-T (I + F' Q~ F) L^-1                 3 x 3 a point
     j Q j' = z'z + (j_r - F z)' Q~ (j_r - F z)      of an image row with columns j_r and j_p, z = L^-1 j_p'
 
-summed tile by tile, and so of a row of a surface, whose j_r belongs to the scanner. The full matrix is never inverted.
+summed tile by tile, and so of other rows by point that touch shared unknowns, too. The full matrix is never inverted.
 In a free network the part along the open motions, which the constraints of the datum hold, is subtracted: what remains
 is the covariance under inner (or minimal) constraints.
 """
@@ -24,10 +24,12 @@ from jaxtyping import Array, Bool, Float
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.adjustment.band import invert_band
 from jaxphoto.adjustment.elimination import over_tiles, solve_factored
+from jaxphoto.adjustment.groups import AtPoints, Group
 from jaxphoto.adjustment.normal import At, Reduced, unwhiten, whiten
 from jaxphoto.adjustment.optimum import weigh_datum
+from jaxphoto.adjustment.other_rows import OtherRows, other_rows
 from jaxphoto.adjustment.padding import crop_reduced
-from jaxphoto.adjustment.reduced import other_rows, tile_columns
+from jaxphoto.adjustment.reduced import tile_columns
 from jaxphoto.adjustment.residuals import Increments, Values
 from jaxphoto.adjustment.result import Factored, Padded
 from jaxphoto.adjustment.shards import TILES, along_points, gathered, on_one_device, sharded
@@ -54,10 +56,17 @@ class Cofactors(NamedTuple):
 
 
 class RowCofactors(NamedTuple):
-    """j Q j' of rows, in padded sizes."""
+    """j Q j' of rows, in padded sizes: of the numbers of a row with one another."""
 
     image: Float[Array, "chunks tiles 2 m p"]
-    surfaces: Float[Array, "rows points"]
+    """Of x and of y alone."""
+    at_points: tuple[Float[Array, "c c rows points"], ...]
+    """Of the groups of `with_shared`."""
+
+
+def with_shared(s: Structure) -> tuple[Group, ...]:
+    """The groups of rows by point that touch shared unknowns, too."""
+    return tuple(g for g in s.observed if isinstance(g.rows, AtPoints) and g.place)
 
 
 class Covariance(eqx.Module):
@@ -70,7 +79,7 @@ class Covariance(eqx.Module):
 
     matrix: Float[Numbers, "reduced reduced"]
     points: Float[Numbers, "points 3 3"]
-    variance_factor: Float[Numbers, ""]
+    variance_factor: Float[Numbers, ""] | float
     cofactors: Cofactors
     """In the sizes of `Adjustment.padded`."""
     labels: tuple[str, ...] = eqx.field(static=True)
@@ -139,7 +148,7 @@ def prepare_covariance(padded: Padded, seconds: dict[str, float]) -> None:
 
 
 def row_cofactors(adjusted: Adjustment, rotations: Rotations) -> RowCofactors:
-    """j Q j' of every row of images and surfaces, by the program that `covariance` has run with these `rotations`."""
+    """j Q j' of rows that are computed with their tiles, by the program that `covariance` has run with `rotations`."""
     return _run(adjusted, rotations, of_rows=True)[3]
 
 
@@ -202,7 +211,7 @@ def cofactors_of(values: Values, factored: Factored, s: Structure, of_rows: Bool
         low = inverse @ kg.T
         full = jnp.block([[inverse, low], [low.T, kg @ low - jnp.linalg.inv(reduced.k)]])
     weighed = weigh_datum(values, s)
-    out = (TILES, RowCofactors(TILES, along_points(2)))
+    out = (TILES, RowCofactors(TILES, (along_points(4),) * len(with_shared(s))))
     points, rows = sharded(_of_points, s, out)(full, reduced, weighed, factored.scale, s, of_rows)
     return _without_open_motions(Cofactors(inverse, points), weighed, factored, s), rows
 
@@ -217,17 +226,16 @@ def _of_points(
 ):
     """Cofactors of points, and j Q j' of rows."""
     at = At(jax.tree.map(jnp.zeros_like, scale), scale, values, s)
-    columns_of, depth = tile_columns(at), len(values.sigma_surfaces)
-    surfaces = jnp.zeros((0, *values.sigma_surfaces.shape))
-    if depth:
-        rest = other_rows(at)
-        surfaces = jnp.concatenate([rest.surfaces, rest.surfaces_scanner])
+    columns_of, groups = tile_columns(at), with_shared(s)
+    by_rows = _by_rows(other_rows(at), s) if groups else ()
     n, q, i, k = 6 * s.n_images, s.n_image_colours, s.n_border, len(reduced.k)
     # One more than there are: zeros serve the last row of F, and colours that mean nothing in an image.
     shared = jnp.concatenate([n + jnp.arange(i), n + s.n_shared + jnp.arange(k + 1)])
 
-    def tile(f, image, l, surfaces, *measured):  # noqa: E741
+    def tile(f, image, l, by_rows, *measured):  # noqa: E741
         size = l.shape[1]
+        if not s.in_tiles.free_points:
+            f = jnp.zeros((len(f), 3 * size))
         index = jnp.concatenate([(6 * image[:, None] + jnp.arange(6)).reshape(-1), shared])
         own = full.at[index[:, None], index].get(mode="fill", fill_value=0.0)
         a = own @ f
@@ -236,10 +244,11 @@ def _of_points(
         inner = jnp.eye(3)[:, :, None] + g
         half = jnp.stack(unwhiten(inner, l))
         points = jnp.stack(unwhiten(half.transpose(1, 0, 2), l)).transpose(2, 0, 1)
-        nothing = lambda *_: (jnp.zeros((2, len(image), size)), jnp.zeros((depth, size)))  # noqa: E731
-        return points, *jax.lax.cond(of_rows, rows, nothing, (image, *measured), surfaces, l, own, a, inner)
+        none = tuple(jnp.zeros((len(j), len(j), *j.shape[2:])) for j in by_rows)
+        nothing = lambda *_: (jnp.zeros((2, len(image), size)), none)  # noqa: E731
+        return points, *jax.lax.cond(of_rows, rows, nothing, (image, *measured), by_rows, l, own, a, inner)
 
-    def rows(measured, surfaces, l, own, a, inner):  # noqa: E741
+    def rows(measured, by_rows, l, own, a, inner):  # noqa: E741
         image, both = measured[0], columns_of(measured)
         m, size = both[0].residual.shape
         column = jnp.asarray(s.column)[image, :q]
@@ -251,18 +260,29 @@ def _of_points(
         of_images = jnp.sum(j * seen.reshape(j.shape), axis=1).transpose(1, 0, 2)
         across = jnp.einsum("mcop,mckp->omkp", j, a[touched].reshape(m, 6 + q, 3, size))
         found = of_images - 2 * jnp.sum(z * across, axis=2) + jnp.einsum("omkp,klp,omlp->omp", z, inner, z)
-        if not depth:
-            return found, jnp.zeros((0, size))
-        z, j = jnp.stack(whiten(surfaces[:3], l)), surfaces[3:]
-        scanner = slice(6 * m + s.n_interior, 6 * m + s.n_border)
-        across = jnp.einsum("arp,akp->krp", j, a[scanner].reshape(-1, 3, size))
-        of_scanner = jnp.einsum("arp,ab,brp->rp", j, own[scanner, scanner], j)
-        return found, of_scanner - 2 * jnp.sum(z * across, axis=0) + jnp.einsum("krp,klp,lrp->rp", z, inner, z)
+        first = 6 * m
+        return found, tuple(of_group(g, j, l, own, a, inner, first) for g, j in zip(groups, by_rows, strict=True))
 
-    of_points = (reduced.l, surfaces, values.points, scale.points)
-    l, surfaces, *places = (by_tile(v, s.in_tiles) for v in of_points)  # noqa: E741
-    points, *found = over_tiles(tile, at, reduced, (l, surfaces, values.xy, values.sigma_xy, *places))
-    return points.reshape(-1, 3, 3), RowCofactors(found[0], by_point(found[1]))
+    def of_group(g, j, l, own, a, inner, first):  # noqa: E741
+        z, j = jnp.stack(whiten(j[:, :3].swapaxes(0, 1), l)), j[:, 3:]
+        met = first + jnp.asarray(g.column)[:, 0]
+        across = jnp.einsum("clrp,lkp->ckrp", j, a[met].reshape(len(met), 3, -1))
+        shared = jnp.einsum("clrp,lm,dmrp->cdrp", j, own[met[:, None], met], j)
+        both = jnp.einsum("kcrp,dkrp->cdrp", z, across)
+        return shared - both - both.swapaxes(0, 1) + jnp.einsum("kcrp,klp,ldrp->cdrp", z, inner, z)
+
+    of_points = (reduced.l, by_rows, values.points, scale.points)
+    l, by_rows, *places = jax.tree.map(lambda v: by_tile(v, s.in_tiles), of_points)  # noqa: E741
+    points, *found = over_tiles(tile, at, reduced, (l, by_rows, values.xy, values.sigma_xy, *places))
+    return points.reshape(-1, 3, 3), RowCofactors(found[0], tuple(by_point(v) for v in found[1]))
+
+
+def _by_rows(rest: OtherRows, s: Structure) -> tuple[Float[Array, "c touched rows points"], ...]:
+    """Derivatives of the groups of `with_shared` by their points and by shared unknowns."""
+    pairs = zip(s.observed, rest.jacobians, strict=True)
+    chosen = ((g, j) for g, j in pairs if isinstance(g.rows, AtPoints) and g.place)
+    shared = lambda g, j: jnp.broadcast_to(j.shared, (g.components, len(g.place), *j.shared.shape[2:]))  # noqa: E731
+    return tuple(jnp.concatenate([j.points[:, 0], shared(g, j)], axis=1) for g, j in chosen)
 
 
 def _without_open_motions(q: Cofactors, values: Values, factored: Factored, s: Structure) -> Cofactors:
@@ -275,7 +295,7 @@ def _without_open_motions(q: Cofactors, values: Values, factored: Factored, s: S
         return q
     reduced, scale = factored.reduced, factored.scale
     rows = Increments(values.datum_eop * scale.eop, jnp.zeros((defect, s.n_shared)), values.datum_points * scale.points)
-    if open_motions(values):
+    if open_motions(values, s):
         # The motions are known: E = M (D M)^-1.
         m = along_motions(values, scale, on_one_device(s))
         met = jnp.einsum("kci,jci->kj", rows.eop, m.eop) + jnp.einsum("kcp,jcp->kj", rows.points, m.points)

@@ -9,8 +9,9 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxphoto.adjustment import Adjustment
-from jaxphoto.adjustment.residuals import GROUPS
-from jaxphoto.block import ATTITUDE_AXES, AXES, Rows
+from jaxphoto.adjustment.residuals import IMAGE_POINTS
+from jaxphoto.adjustment.rows import rows_of
+from jaxphoto.observations import AXES, AbstractObservations, ControlRows
 from jaxphoto.rotation import omega_phi_kappa_from_matrix
 
 
@@ -26,36 +27,44 @@ class Spread(eqx.Module):
     unit: str
 
 
+def observation_groups(adjusted: Adjustment) -> dict[str, AbstractObservations]:
+    """The rows of every group of `adjusted.residuals`, image points first, with the numbers they were adjusted with."""
+    s, block = adjusted.structure, adjusted.block
+    groups = zip(s.observed, adjusted.values.groups, strict=True)
+    first_last = lambda v: np.moveaxis(np.asarray(v), -1, 0)  # noqa: E731
+    others = {g.name: jax.tree.map(first_last, rows_of(g, numbers)) for g, numbers in groups}
+    return {IMAGE_POINTS: block.image_points, **others}
+
+
 def physical_residuals(adjusted: Adjustment) -> dict[str, Float[np.ndarray, "..."]]:
     """Observed minus computed by group, in mm (image), m and rad; shaped like `adjusted.residuals`."""
-    sigmas = a_priori_sigmas(adjusted)
-    return {name: np.asarray(getattr(adjusted.residuals, field)) * sigmas[name] for field, name in GROUPS.items()}
+    rows = observation_groups(adjusted)
+    return {name: rows[name].physical(v) for name, v in adjusted.residuals.named.items()}
 
 
 def a_priori_sigmas(adjusted: Adjustment) -> dict[str, Float[np.ndarray, "..."]]:
     """Standard deviations of the observations as given, by group, in the units of `physical_residuals`."""
-    v = adjusted.values
-    georeferencing = v.sigma_stations, v.sigma_attitudes, v.sigma_control, v.sigma_surfaces
-    sigmas = (v.sigma_xy, *georeferencing, v.sigma_distances, v.sigma_priors)
-    return {name: np.asarray(sigma) for name, sigma in zip(GROUPS.values(), sigmas, strict=True)}
+    return {name: np.asarray(rows.sigmas).T for name, rows in observation_groups(adjusted).items()}
 
 
 def residual_spread(adjusted: Adjustment) -> list[Spread]:
     """RMSE of the residuals per group and axis (paper 000, Table 3); RMSE divides by n."""
-    residuals, s = physical_residuals(adjusted), adjusted.structure
-    groups = [("image_points", a, residuals["image_points"][k], "mm") for k, a in enumerate("xy")]
-    groups += [("stations", a, residuals["stations"][s.station_axis == k], "m") for k, a in enumerate(AXES)]
-    groups += [("attitudes", a, residuals["attitudes"][k], "rad") for k, a in enumerate(ATTITUDE_AXES)]
-    groups += [("control_points", a, residuals["control_points"][s.control_axis == k], "m") for k, a in enumerate(AXES)]
-    groups += [(name, "", residuals[name], "m") for name in ("surfaces", "distances")]
-    return [spread_of(group, axis, v, unit) for group, axis, v, unit in groups if len(v)]
+    found = []
+    groups = observation_groups(adjusted)
+    for group, v in physical_residuals(adjusted).items():
+        rows = groups[group]
+        if v.size and rows.unit:
+            axis = np.broadcast_to(rows.axis_names(), v.shape)
+            names = [a for a in dict.fromkeys((*AXES, *rows.axes, *axis.ravel())) if (axis == a).any()]
+            found += [spread_of(group, "" if len(names) == 1 else a, v[axis == a], rows.unit) for a in names]
+    return found
 
 
-def check_discrepancies(adjusted: Adjustment) -> Rows:
+def check_discrepancies(adjusted: Adjustment) -> ControlRows:
     """Surveyed minus computed coordinates (m) of the check points, with the survey's sigmas (paper 000, Table 5)."""
     check = adjusted.block.check
     points = np.asarray(adjusted.unknowns.points)
-    return Rows(check.who, check.axis, np.asarray(check.value) - points[check.who, check.axis], check.sigma)
+    return ControlRows(check.who, check.axis, np.asarray(check.value) - points[check.who, check.axis], check.sigma)
 
 
 def point_differences(first: Adjustment, second: Adjustment) -> tuple[tuple[str, ...], Float[np.ndarray, "n 3"]]:

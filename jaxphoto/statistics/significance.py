@@ -14,7 +14,10 @@ SIGNIFICANT_RATIO = 10.0
 
 
 class Significance(eqx.Module):
-    """One estimated interior parameter: value, a posteriori sigma, |value| / sigma, and two-sided p of value = 0."""
+    """One estimated interior parameter: value, a posteriori sigma, |value| / sigma, and two-sided p of value = 0.
+
+    Value and sigma are in the parameter's unit: mm for c_mm, xp_mm and yp_mm, else that of the distortion's docstring.
+    """
 
     camera: str
     parameter: str

@@ -15,8 +15,9 @@ from jaxphoto.adjustment.datum import close_datum
 from jaxphoto.adjustment.elimination import gradient, solve_factored
 from jaxphoto.adjustment.normal import At, residuals_at
 from jaxphoto.adjustment.optimum import typical_scale, weigh_datum, zero_increments
+from jaxphoto.adjustment.other_rows import OtherRows, other_rows
 from jaxphoto.adjustment.padding import crop_residuals, pad_structure, pad_values
-from jaxphoto.adjustment.reduced import OtherRows, other_rows, reduce_normal, tile_numbers, tile_parts
+from jaxphoto.adjustment.reduced import reduce_normal, tile_numbers, tile_parts
 from jaxphoto.adjustment.residuals import Increments
 from jaxphoto.adjustment.structure import structure_of
 from jaxphoto.adjustment.tiles import Columns
@@ -35,7 +36,7 @@ def with_constraints(block):
 def prepared(block, **layout):
     """The same, padded, and where everything went."""
     values, structure = with_constraints(block)
-    coupled = len(values.datum_eop) + len(structure.distance_points) > 0
+    coupled = len(values.datum_eop) > 0 or bool(structure.coupled)
     padded, places = pad_structure(structure, dense=coupled, **layout)
     return pad_values(values, structure, padded, places), padded, places
 
@@ -61,6 +62,8 @@ class Dense(NamedTuple):
     square_sums: np.ndarray
     taken_down: np.ndarray
     """The right-hand side for the reduced unknowns and for mu, of a gradient and of the sums."""
+    couples: np.ndarray
+    """Whether a row couples points."""
     solutions: np.ndarray
     """x of (N + damping W) x = vector, a row for each of `DAMPINGS`; W is `weight`."""
     scale: np.ndarray
@@ -72,10 +75,7 @@ class Dense(NamedTuple):
     @property
     def weight(self):
         """The diagonal of N without distances and datum, which couple points."""
-        r = self.others.residuals
-        after = len(self.jacobian) - len(r.datum) - len(r.priors)
-        own = np.delete(np.arange(len(self.jacobian) - len(r.datum)), np.arange(after - len(r.distances), after))
-        return (self.jacobian[own] ** 2).sum(axis=0)
+        return (self.jacobian[~self.couples] ** 2).sum(axis=0)
 
     def observed(self, n_datum: int):
         """The Jacobian without the rows of the datum."""
@@ -85,7 +85,11 @@ class Dense(NamedTuple):
 @functools.cache
 def at_optimum(name: str) -> Dense:
     """Of one of the variants of `tests.blocks`."""
-    a = adjusted(name)
+    return dense_of(adjusted(name))
+
+
+def dense_of(a) -> Dense:
+    """Of any adjustment."""
     padded = a.computed
     whole = jax.tree.map(np.asarray, _dense(padded.values, padded.structure))
     unknowns, rows = own_order(padded.values, a.structure, padded.structure, padded.places)
@@ -102,8 +106,21 @@ def at_optimum(name: str) -> Dense:
         jacobian=whole.jacobian[np.ix_(rows, unknowns)],
         residuals=whole.residuals[rows],
         columns=columns,
+        couples=couples(a),
         **{name: getattr(whole, name)[..., unknowns] for name in names},
     )
+
+
+def couples(a) -> np.ndarray:
+    """Of each residual of an adjustment, whether it couples points: distances do, and constraints of the datum."""
+    named, coupled = a.residuals.named, {g.name for g in a.structure.coupled} | {"datum"}
+    sizes = {name: np.size(v) for name, v in named.items()} | {"datum": len(a.residuals.datum)}
+    return np.concatenate([np.full(n, name in coupled) for name, n in sizes.items()])
+
+
+def in_order(residuals) -> np.ndarray:
+    """All residuals as one list: image points, the other groups, the datum."""
+    return np.concatenate([np.ravel(v) for v in (*residuals.named.values(), residuals.datum)])
 
 
 def own_order(values, structure, padded, places):
@@ -116,7 +133,7 @@ def own_order(values, structure, padded, places):
     like = jax.eval_shape(lambda v: residuals_at(At(zero, zero, v, padded)), values)
     flat, back = ravel_pytree(jax.tree.map(lambda v: np.zeros(v.shape), like))
     rows = crop_residuals(back(jnp.arange(len(flat), dtype=float)), structure, places)
-    return unknowns, np.concatenate([np.ravel(v) for v in rows]).astype(int)
+    return unknowns, in_order(rows).astype(int)
 
 
 @eqx.filter_jit
@@ -152,6 +169,7 @@ def _dense(values, structure) -> Dense:
         sums=ravel_pytree(right.b)[0],
         square_sums=jnp.stack([squares, right.square_sum]),
         taken_down=jnp.stack([jnp.concatenate([down, d]), jnp.concatenate([right.reduced, right.d])]),
+        couples=jnp.zeros(0, bool),
         solutions=solutions,
         scale=flat_scale,
     )

@@ -8,8 +8,9 @@ import pytest
 
 from jaxphoto import FIXED, FREE, DatumError, RankError, Weighted
 from jaxphoto.adjustment import solve
-from jaxphoto.block import Attitudes, Datum, Motion, Rows
+from jaxphoto.block import Datum, Motion
 from jaxphoto.georeferencing import Mount, StripBias
+from jaxphoto.observations import Attitudes, ControlRows, StationRows
 from tests.blocks import simulated
 
 
@@ -30,7 +31,7 @@ def without_attitudes(block):
 
 
 def without_stations(block):
-    return dataclasses.replace(block, stations=Rows.none())
+    return dataclasses.replace(block, stations=StationRows.none())
 
 
 def at_one_time(block):
@@ -63,7 +64,7 @@ def without_second_strip(block):
 
 
 BOTH_SHIFTS = {name: StripBias(FREE, FIXED) for name in "ab"}
-NO_CONTROL = {"control": Rows.none(), "fixed": Rows.none()}
+NO_CONTROL = {"control": ControlRows.none(), "fixed": ControlRows.none()}
 
 
 @pytest.mark.parametrize(

@@ -9,8 +9,9 @@ import pytest
 
 from jaxphoto import FIXED, FREE, DatumError, adjust
 from jaxphoto.adjustment.datum import MOTIONS
-from jaxphoto.block import Datum, Distances, Rows
+from jaxphoto.block import Datum
 from jaxphoto.georeferencing import StripBias
+from jaxphoto.observations import ControlRows, Distances, StationRows
 from tests.adjustment.dense import with_constraints
 from tests.blocks import (
     BROWN,
@@ -31,7 +32,7 @@ BARE = bare(aerial(), {"one": BROWN}, ("one",) * 10)
 
 def block_with(**observations):
     """The aerial block with only these observations beside image points, at its true values."""
-    observations.setdefault("stations", Rows.none())
+    observations.setdefault("stations", StationRows.none())
     return measured(BARE._replace(block=dataclasses.replace(BARE.block, **observations))).block
 
 
@@ -92,7 +93,7 @@ def test_control_in_height_only():
 
 
 def test_stations_on_a_line_leave_a_rotation():
-    block = block_with(stations=rows(range(5), sigma=0.1))
+    block = block_with(stations=rows(range(5), sigma=0.1, kind=StationRows))
     position = np.array(block.start.unknowns.exterior.position)
     position[:5] = np.linspace([-400.0, 0.0, 1000.0], [400.0, 0.0, 1000.0], 5)
     block = eqx.tree_at(lambda b: b.start.unknowns.exterior.position, block, position)
@@ -121,9 +122,9 @@ def test_free_shifts_leave_the_position():
     "observations",
     [
         {"control": rows((3, 4, 37))},
-        {"control": Rows.joined(rows((3, 4), (0, 1)), rows((3, 20, 36), (2,)))},
+        {"control": ControlRows.joined(rows((3, 4), (0, 1)), rows((3, 20, 36), (2,)))},
         {"fixed": rows((3, 4, 37), sigma=0.0)},
-        {"stations": rows(range(10), sigma=0.1)},
+        {"stations": rows(range(10), sigma=0.1, kind=StationRows)},
         {"attitudes": all_attitudes(BARE.block), "control": rows((20,)), "distances": BAR},
     ],
     ids=["full", "plan-and-height", "fixed", "stations", "attitudes-and-bar"],
@@ -160,7 +161,7 @@ def test_what_can_be_estimated_does_not_depend_on_the_datum(name):
     assert float(one.sigma0) == pytest.approx(float(other.sigma0), rel=1e-9)
     assert one.redundancy == other.redundancy == 414
     np.testing.assert_allclose(other.residuals.image, one.residuals.image, atol=1e-4)
-    np.testing.assert_allclose(other.residuals.distances, one.residuals.distances, atol=1e-4)
+    np.testing.assert_allclose(other.residuals["distances"], one.residuals["distances"], atol=1e-4)
     sigma = np.asarray(covariance_of("inner").shared_sigma)
     np.testing.assert_allclose(covariance_of(name).shared_sigma, sigma, rtol=1e-6)
     free_of = lambda a: np.asarray(a.values.shared)[a.structure.free]  # noqa: E731

@@ -11,21 +11,23 @@ from jax.flatten_util import ravel_pytree
 from jaxphoto import adjust, covariance
 from jaxphoto.adjustment.band import factor_band
 from jaxphoto.adjustment.elimination import gradient, solve_factored, solve_reduced
+from jaxphoto.adjustment.layout import sizes_of
 from jaxphoto.adjustment.normal import At, residuals_at
 from jaxphoto.adjustment.optimum import typical_scale, unit_scale, weigh_datum, zero_increments
-from jaxphoto.adjustment.padding import crop_state, sizes_of
+from jaxphoto.adjustment.padding import crop_state
 from jaxphoto.adjustment.reduced import reduce_normal
 from jaxphoto.adjustment.residuals import state_at
 from jaxphoto.adjustment.structure import structure_of
 from jaxphoto.statistics import redundancy_numbers
 from tests.adjustment.dense import DAMPINGS, assemble, at_optimum, prepared, split
-from tests.blocks import VARIANTS, adjusted, covariance_of, simulated
+from tests.blocks import FIELDS, VARIANTS, adjusted, covariance_of, simulated
 from tests.marks import slow_but
 
 # Each shape of block is compiled for itself: what one camera, two, and a mount without more would show, the others
 # do. The other kinds (surfaces of a lidar, fixed control, free shifts, ...) are slow only by what compiling takes.
 QUICK = ("everything", "inner", "inner_images", "inner_some", "minimal")
 KINDS = slow_but(QUICK, [name for name in VARIANTS if name not in ("cross", "two_cameras", "mount")])
+KINDS += slow_but(("field",), FIELDS)
 # The defect of each.
 FREE_NETWORKS = {"inner": 6, "inner_images": 6, "inner_some": 6, "inner_scale": 7, "inner_shift": 3, "minimal": 6}
 
@@ -181,7 +183,7 @@ def test_redundancy_numbers(name):
     observed = at.observed(adjusted(name).n_constraints)
     expected = 1 - ((observed @ q) * observed).sum(1)
     numbers = redundancy_numbers(adjusted(name), covariance_of(name))
-    found = np.concatenate([np.ravel(v) for v in numbers[:-1]])
+    found = np.concatenate([np.ravel(v) for v in numbers.named.values()])
     np.testing.assert_allclose(found, expected, atol=1e-6)
     assert abs(found.sum() - adjusted(name).redundancy) < 1e-4
     assert (found > -1e-6).all()

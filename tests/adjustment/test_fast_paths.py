@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jaxphoto import adjust, covariance
-from jaxphoto.adjustment import padding, solver
+from jaxphoto.adjustment import layout, solver
 from jaxphoto.adjustment.padding import pad_structure
 from jaxphoto.adjustment.structure import structure_of
 from jaxphoto.statistics import redundancy_numbers
@@ -37,7 +37,7 @@ def everything(block, start):
     numbers = redundancy_numbers(result, cov)
     sigma = np.sqrt(np.diag(cov.matrix))
     unknowns = jax.tree.map(np.asarray, result.unknowns)
-    return result, unknowns, cov, sigma, np.concatenate([np.ravel(v) for v in numbers])
+    return result, unknowns, cov, sigma, np.concatenate([np.ravel(v) for v in numbers.named.values()])
 
 
 def assert_same(one, other):
@@ -61,7 +61,7 @@ def test_a_banded_reduced_matrix_gives_what_a_dense_one_gives(corridor, monkeypa
     padded, _ = pad_structure(structure_of(corridor, corridor.priors))
     assert padded.tiles.columns >= 5
     banded = everything(corridor, start)
-    monkeypatch.setattr(padding, "column_blocks", lambda n, bandwidth: (1, n))
+    monkeypatch.setattr(layout, "column_blocks", lambda n, bandwidth: (1, n))
     assert_same(banded, everything(corridor, start))
 
 
@@ -69,9 +69,9 @@ def test_a_banded_reduced_matrix_gives_what_a_dense_one_gives(corridor, monkeypa
 def test_one_small_tile_at_a_time_gives_what_many_together_give(monkeypatch):
     block, start = simulated("three_models").block, adjusted("three_models").unknowns
     together = everything(block, start)
-    monkeypatch.setattr(padding, "_SLOTS", 1)
-    monkeypatch.setattr(padding, "_CHUNK", 20_000)
-    monkeypatch.setattr(padding, "tile_shape", lambda *a: (12, 4))
+    monkeypatch.setattr(layout, "_SLOTS", 1)
+    monkeypatch.setattr(layout, "_CHUNK", 20_000)
+    monkeypatch.setattr(layout, "tile_shape", lambda *a: (12, 4))
     padded, _ = pad_structure(structure_of(block, block.priors))
     assert padded.tiles.at_once == 1
     assert len(padded.tiles.image) > 1

@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 
 from jaxphoto import adjust, covariance
 from jaxphoto.adjustment import common_sizes
-from jaxphoto.adjustment.padding import pad_structure, sizes_of
+from jaxphoto.adjustment.layout import sizes_of
+from jaxphoto.adjustment.padding import pad_structure
 from jaxphoto.adjustment.structure import structure_of
 from jaxphoto.adjustment.tiling import TILES, size_class
 from jaxphoto.block import Block
@@ -51,11 +52,10 @@ def test_a_padded_structure_has_the_sizes_asked_for():
     for name in VARIANTS:
         block = simulated(name).block
         structure = structure_of(block, block.priors)
-        sizes = sizes_of(structure)._replace(blocks=333, stations=150)
+        sizes = sizes_of(structure)._replace(blocks=333, rows=(("stations", 150),))
         s, places = pad_structure(structure, sizes)
         assert s.tiles.block.shape[1] >= 333
-        if len(structure.station_image):
-            assert len(s.station_image) >= 150
+        assert all(g.n_rows >= 150 for g in s.observed if g.name == "stations")
         assert s.tiles.image.shape[1] % TILES == 0
         assert s.n_images > structure.n_images
         # What is padding depends on nothing and is held.
@@ -67,16 +67,16 @@ def test_a_padded_structure_has_the_sizes_asked_for():
 def test_larger_sizes_change_no_result():
     block = simulated("everything").block
     small, sizes = adjusted("everything"), sizes_of(structure_of(block, block.priors))
-    wide = sizes._replace(images=40, tiles=50, tile_images=24, tile_points=16, blocks=500, stations=300)
+    wide = sizes._replace(images=40, tiles=50, tile_images=24, tile_points=16, blocks=500, rows=(("stations", 300),))
     large = adjust(block, small.unknowns, sizes=wide)
-    for one, two in zip(small.residuals, large.residuals, strict=True):
+    for one, two in zip(small.residuals.named.values(), large.residuals.named.values(), strict=True):
         np.testing.assert_allclose(two, one, rtol=0, atol=1e-7)
     a, b = covariance(small), covariance(large)
     scale = np.sqrt(np.abs(np.diag(a.matrix)))
     scale = np.where(scale > 0, scale, 1.0)
     np.testing.assert_allclose(b.matrix / np.outer(scale, scale), a.matrix / np.outer(scale, scale), rtol=0, atol=1e-8)
     np.testing.assert_allclose(b.points, a.points, rtol=1e-7, atol=1e-14)
-    for one, two in zip(redundancy_numbers(small, a), redundancy_numbers(large, b), strict=True):
+    for one, two in zip(*(redundancy_numbers(*of).named.values() for of in ((small, a), (large, b))), strict=True):
         np.testing.assert_allclose(two, one, rtol=0, atol=1e-8)
 
 

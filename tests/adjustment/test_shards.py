@@ -52,7 +52,7 @@ def numbers_of(result: Adjustment) -> dict[str, np.ndarray]:
         "point_covariances": cofactors.points,
     }
     for name, of in (("residual", result.residuals), ("redundancy", redundancy)):
-        found |= {f"{name}_{group}": values for group, values in of._asdict().items()}
+        found |= {f"{name}_{group}": values for group, values in of.named.items()}
     return {name: np.asarray(values) for name, values in found.items()}
 
 

@@ -9,8 +9,10 @@ import pytest
 
 from jaxphoto import adjust
 from jaxphoto.adjustment.structure import structure_of
-from jaxphoto.block import ImageRows, Rows, Start
+from jaxphoto.block import Start
 from jaxphoto.collinearity import ExteriorOrientation
+from jaxphoto.errors import BlockError
+from jaxphoto.observations import ControlRows, Distances, ImageRows
 from tests.blocks import VARIANTS, adjusted, covariance_of, simulated
 
 
@@ -18,7 +20,7 @@ from tests.blocks import VARIANTS, adjusted, covariance_of, simulated
 def test_unknowns_of_one_image_never_share_a_colour(name):
     block = simulated(name).block
     s = structure_of(block, block.priors)
-    assert s.column.shape == (s.n_images, s.n_colours)
+    assert len(s.column) == s.n_images and s.n_image_colours <= s.column.shape[1]
     for i, columns in enumerate(s.column):
         meant = columns[columns < s.n_shared]
         assert len(set(meant.tolist())) == len(meant)
@@ -32,12 +34,25 @@ def test_unknowns_of_one_image_never_share_a_colour(name):
     assert len(set(s.labels)) == len(s.labels)
 
 
-def test_points_joined_by_a_distance_lie_in_different_classes():
-    block = simulated("inner").block
-    s = structure_of(block, block.priors)
-    a, b = s.distance_points.T
-    assert (s.point_class[a] != s.point_class[b]).all()
-    assert s.n_classes == 2
+def test_what_rows_touch_says_how_they_are_eliminated():
+    """Nobody declares it: one point, images and what they share, or several points."""
+    layouts = {g.name: g.layout for name in ("everything", "surfaces") for g in structure_of_variant(name).observed}
+    assert layouts == {
+        "stations": "reduced",
+        "attitudes": "reduced",
+        "priors": "reduced",
+        "control_points": "point",
+        "surfaces": "point",
+        "distances": "coupled",
+    }
+    s = structure_of_variant("everything")
+    (distances,) = s.coupled
+    np.testing.assert_array_equal(distances.point, simulated("everything").block.distances.points.T)
+
+
+def structure_of_variant(name):
+    block = simulated(name).block
+    return structure_of(block, block.priors)
 
 
 def permuted(block, images, points, seed):
@@ -47,9 +62,9 @@ def permuted(block, images, points, seed):
     rows = block.image_points
     order = rng.permutation(len(rows.point))
     order = order[np.argsort(new_point[rows.point[order]], kind="stable")]
-    who = lambda r, place: Rows(place[r.who], r.axis, r.value, r.sigma)  # noqa: E731
+    who = lambda r, place: type(r)(place[r.who], r.axis, r.value, r.sigma)  # noqa: E731
     shuffled = rng.permutation(len(block.control.who))
-    control = Rows(
+    control = ControlRows(
         *(
             np.asarray(v)[shuffled]
             for v in (block.control.who, block.control.axis, block.control.value, block.control.sigma)
@@ -125,3 +140,14 @@ def test_rows_that_cannot_be_are_refused():
     twice = jax.tree.map(lambda v: np.concatenate([v[:1], v]), block.image_points)
     with pytest.raises(ValueError, match="twice"):
         structure_of(eqx.tree_at(lambda b: b.image_points, block, twice), block.priors)
+
+
+def test_a_point_that_only_a_distance_meets_is_refused():
+    block = simulated("inner").block
+    lonely = dataclasses.replace(
+        block,
+        points=(*block.points, "far"),
+        distances=Distances(np.array([[0, len(block.points)]]), np.ones(1), np.ones(1)),
+    )
+    with pytest.raises(BlockError, match="point far is met by distances alone"):
+        structure_of(lonely, block.priors)

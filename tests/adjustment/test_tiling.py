@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from jaxphoto.adjustment.padding import pad_structure
 from jaxphoto.adjustment.structure import structure_of
 from jaxphoto.adjustment.tiling import order_images, tile_points, tile_shape
-from tests.blocks import VARIANTS, simulated
+from tests.blocks import FIELDS, VARIANTS, simulated
 
 
 @st.composite
@@ -57,11 +57,15 @@ def test_a_point_with_more_rays_than_a_tile_has_images_is_refused():
 
 
 @pytest.mark.parametrize("shards", [1, 2])
-@pytest.mark.parametrize("name", VARIANTS)
+@pytest.mark.parametrize("name", (*VARIANTS, *FIELDS))
 def test_lists_of_pairs_are_all_pairs_of_images_that_share_a_tile(name, shards):
+    """Of a tile's images those that see a free point in it."""
     block = simulated(name).block
     structure = structure_of(block, block.priors)
-    s, _ = pad_structure(structure, shards=shards)
+    s, places = pad_structure(structure, shards=shards)
+    slots = np.zeros((*s.tiles.image.shape, s.tiles.per_tile), bool)
+    slots.reshape(-1)[places.row] = structure.point_free.any(axis=0)[structure.point]
+    of_free = slots.any(axis=-1)
     tiles, nobody = s.tiles, s.n_images - 1
     assert len(tiles.image) % shards == 0
     width = s.n_images // tiles.columns
@@ -83,7 +87,7 @@ def test_lists_of_pairs_are_all_pairs_of_images_that_share_a_tile(name, shards):
             for t, own in enumerate(tiles.image[k])
             for a in range(len(own))
             for b in range(a + 1)
-            if own[a] != nobody and own[b] != nobody
+            if own[a] != nobody and own[b] != nobody and of_free[k, t, a] and of_free[k, t, b]
         }
         assert found == expected
         where = [tuple(v) for v in tiles.block[k]]

@@ -12,10 +12,10 @@ from jaxphoto.camera import (
     Ebner,
     Gruen,
     OpenCv,
+    OpenCvFisheye,
     PpsRadial,
     RadialPolynomial,
     Smac,
-    constant_names,
 )
 
 # Per model: the coefficients in units of the size they have on a sensor of 36 mm x 24 mm.
@@ -48,6 +48,7 @@ UNITS = {
     BundlerRadial: {"k1": 1e-4, "k2": 1e-7},  # normalised: as for a c of 1 mm
     OpenCv: {**_RADIAL, "k4": 1e-5, "k5": 1e-8, "k6": 1e-11, "p1": 1e-5, "p2": 1e-5, "b1": 1e-3, "b2": 1e-3},
     Agisoft: {**_RADIAL, "k4": 1e-13, "p1": 1e-5, "p2": 1e-5, "p3": 1e-3, "p4": 1e-6, "b1": 1e-3, "b2": 1e-3},
+    OpenCvFisheye: {**_RADIAL, "k4": 1e-13, **dict.fromkeys(("p1", "p2", "s1", "s2"), 1e-5), "b1": 1e-3, "b2": 1e-3},
 }
 MOST = max(map(len, UNITS.values()))
 # Of such a camera: the balance radius, Ebner's and Gruen's grid, the scale of Brown's a13.
@@ -58,7 +59,7 @@ def build(model, numbers):
     """A model from its coefficients as multiples of `UNITS`, in the model's order, and `CONSTANTS`."""
     units = UNITS[model]
     assert tuple(units) == model.coefficients, "UNITS and the model disagree"
-    constants = {field: CONSTANTS[field] for field in constant_names(model).values()}
+    constants = {field: CONSTANTS[field] for field in model.constants.values()}
     return model(**{name: numbers[i] * unit for i, (name, unit) in enumerate(units.items())}, **constants)
 
 

@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from jaxphoto.camera import Brown14, Ebner, Gruen, RadialPolynomial, constant_names
+from jaxphoto.camera import Brown14, Ebner, Gruen, RadialPolynomial
 from tests.camera.models import UNITS, build
 from tests.derivatives import compiled
 
@@ -18,7 +18,7 @@ def ideal(distortion, xy):
 
 def columns(model, b, xy):
     """What each coefficient of one does to the image at `xy`: (2 n, coefficients), all x before all y."""
-    constants = dict.fromkeys(constant_names(model).values(), b)
+    constants = dict.fromkeys(model.constants.values(), b)
     deltas = [xy - ideal(model(**constants, **{name: 1.0}), xy) for name in model.coefficients]
     return np.column_stack([delta.T.ravel() for delta in deltas])
 
@@ -106,7 +106,7 @@ def test_radial_polynomial_of_odd_degree_is_added():
 
 @pytest.mark.parametrize("model", [Ebner, Gruen, Brown14])
 def test_constants_must_be_given_and_positive(model):
-    (name,) = constant_names(model).values()
+    (name,) = model.constants.values()
     with pytest.raises(TypeError, match=f"'{name}'"):
         model()
     for wrong in (0.0, -3.0, np.nan):

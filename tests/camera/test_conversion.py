@@ -14,6 +14,7 @@ from jaxphoto.camera import (
     Ebner,
     InteriorOrientation,
     OpenCv,
+    OpenCvFisheye,
     PpsRadial,
     RadialPolynomial,
     Sensor,
@@ -58,6 +59,7 @@ FULL = {
     BundlerRadial: BundlerRadial(**NORMALISED),
     OpenCv: OpenCv(**NORMALISED, k3=0.01, k4=0.02, k5=0.03, k6=0.01, p1=1e-3, p2=-2e-3, b1=1e-3, b2=5e-4),
     Agisoft: Agisoft(**NORMALISED, k3=0.01, k4=0.02, p1=1e-3, p2=-2e-3, p3=0.1, p4=0.2, b1=1e-3, b2=5e-4),
+    OpenCvFisheye: OpenCvFisheye(**NORMALISED, k3=0.01, k4=0.02, p1=1e-3, p2=-2e-3, s1=1e-3, s2=2e-3, b1=1e-3, b2=5e-4),
 }
 USUAL = {
     Brown: Brown(**MEASURED, **P),
@@ -67,18 +69,21 @@ USUAL = {
     Balanced: Balanced(a1=-1e-4, a2=1e-7, a3=-1e-11, b1=1e-5, b2=-1e-5, r0=13.0),
     OpenCv: OpenCv(**NORMALISED, k3=0.01, p1=1e-3, p2=-2e-3),
     Agisoft: Agisoft(**NORMALISED, k3=0.01, p1=1e-3, p2=-2e-3),
+    OpenCvFisheye: OpenCvFisheye(**NORMALISED, k3=0.01, p1=1e-3, p2=-2e-3),
 }
 # Which others of its direction hold it exactly.
 FULL_TO = {Brown: (), AffineBrown: (), Smac: (), RadialPolynomial: (Brown, AffineBrown, Smac, PpsRadial), PpsRadial: ()}
-FULL_TO |= {Balanced: (), BundlerRadial: (Balanced, OpenCv, Agisoft), OpenCv: (), Agisoft: ()}
+FULL_TO |= {Balanced: (), BundlerRadial: (Balanced, OpenCv, Agisoft, OpenCvFisheye), OpenCv: (), Agisoft: ()}
+FULL_TO[OpenCvFisheye] = ()
 USUAL_TO = {
     Brown: (AffineBrown, Smac),
     AffineBrown: (Brown, Smac),
     Smac: (Brown, AffineBrown),
     PpsRadial: (Brown, AffineBrown, Smac, RadialPolynomial),
-    Balanced: (OpenCv, Agisoft),
-    OpenCv: (Balanced, Agisoft),
-    Agisoft: (Balanced, OpenCv),
+    Balanced: (OpenCv, Agisoft, OpenCvFisheye),
+    OpenCv: (Balanced, Agisoft, OpenCvFisheye),
+    Agisoft: (Balanced, OpenCv, OpenCvFisheye),
+    OpenCvFisheye: (Balanced, OpenCv, Agisoft),
 }
 
 

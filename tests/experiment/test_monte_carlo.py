@@ -86,6 +86,43 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_file(whole, tmp_path, at):
     assert not (tmp_path / "run" / "parts").exists()
 
 
+def test_what_there_is_is_summed_up_while_a_run_lasts(whole, tmp_path, monkeypatch):
+    def stop(done: int) -> None:
+        if done >= 1030:
+            raise Stop
+
+    monkeypatch.setattr("jaxphoto.experiment.monte_carlo._SECONDS", 0.0)
+    with pytest.raises(Stop):
+        study(tmp_path / "run").draw(stop)
+    directory, (_, table) = whole
+    so_far = json.loads((tmp_path / "run" / "summary.json").read_text())
+    kept = len(pd.read_parquet(tmp_path / "run" / "parts"))
+    assert so_far["draws"] == so_far["converged"] == kept >= 100
+    assert so_far["draws_asked_for"] == 1100
+    first = pd.read_parquet(directory / "draws.parquet")[:kept]
+    found = pd.read_csv(tmp_path / "run" / "summary.csv").set_index("quantity")
+    assert list(found.index) == list(table["quantity"])
+    assert found.loc["one.c_mm", "sd"] == pytest.approx(first["one.c_mm"].std(), rel=1e-12)
+    assert (tmp_path / "run" / "interior.png").exists()
+    # Stopped again where all is drawn and nothing summed up yet: what was on the way is not taken for all.
+    study(tmp_path / "run").draw()
+    assert study(tmp_path / "run").write()[0]["draws"] == 1100
+    assert (tmp_path / "run" / "summary.csv").read_bytes() == (directory / "summary.csv").read_bytes()
+
+
+def test_of_a_large_block_every_batch_is_kept(tmp_path, monkeypatch):
+    monkeypatch.setattr("jaxphoto.experiment.monte_carlo._PART_ROWS", 1)
+    made = study(tmp_path / "run", draws=200)
+
+    def stop(done: int) -> None:
+        if done > made.run.batch_size:
+            raise Stop
+
+    with pytest.raises(Stop):
+        made.draw(stop)
+    assert len(pd.read_parquet(tmp_path / "run" / "parts")) == made.run.batch_size
+
+
 def test_a_run_that_is_done_is_only_read(whole):
     directory, (summary, _) = whole
     before = (directory / "summary.json").stat().st_mtime_ns
@@ -156,6 +193,20 @@ def test_a_block_that_estimates_no_camera(tmp_path):
     assert summary["converged"] == 3
     assert (table["quantity"].str.startswith("point.")).any()
     assert not (tmp_path / "run" / "interior.png").exists()
+
+
+def test_a_block_that_estimates_a_scanner(tmp_path):
+    nominal = adjusted("surfaces")
+    wrong = bias(nominal.block, "station", 0.1, "block")
+    made = MonteCarlo(nominal.block, Readjustment(nominal, wrong.applied, wrong.sigma[None]), wrong, 3, 0, tmp_path)
+    made.draw()
+    _, table = made.write()
+    scanner = nominal.unknowns.scanner
+    of = table.set_index("quantity")["nominal"]
+    turn = [of[f"scanner.boresight_{axis}_deg"] for axis in ("right", "forward", "up")]
+    assert np.radians(turn) == pytest.approx(np.asarray(scanner.boresight), rel=1e-9)
+    for strip, shift in scanner.shifts.items():
+        assert [of[f"scanner.{strip}.shift_{axis}_m"] for axis in "XYZ"] == pytest.approx(np.asarray(shift), rel=1e-9)
 
 
 @pytest.fixture(scope="module")

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from jaxphoto.camera import InteriorOrientation
 from jaxphoto.collinearity import ExteriorOrientation, project_ideal
 from jaxphoto.georeferencing import Corrections, apparent_point, refraction_constant
 from jaxphoto.rotation import matrix_from_omega_phi_kappa
@@ -30,8 +31,8 @@ def imaged(corrections, angles):
     def both(offset):
         exterior = ExteriorOrientation(POSITION, matrix_from_omega_phi_kappa(angles))
         point = POSITION + offset
-        aim = apparent_point(POSITION, point, corrections)
-        return project_ideal(C, exterior, aim), project_ideal(C, exterior, point)
+        aim, plain = apparent_point(POSITION, point, corrections), InteriorOrientation(C)
+        return project_ideal(plain, exterior, aim), project_ideal(plain, exterior, point)
 
     return both
 

@@ -1,8 +1,10 @@
 """Direct georeferencing against independent NumPy code, and its covariance against the scatter of many draws."""
 
+import jax
 import numpy as np
 import pytest
 
+from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import (
     Exposure,
     Mount,
@@ -74,6 +76,35 @@ def test_covariance_is_the_scatter_of_many_draws(known):
     sensors = SensorCovariance(np.diag(STATION_SIGMA**2), np.diag(ATTITUDE_SIGMA**2), given)
     predicted = covariance(STATION, ATTITUDE, Mount(ARM, BORESIGHT, 0.0), NONE, STILL, sensors)
     formulas.assert_scatter(np.hstack([position - centre, theta]), predicted)
+
+
+SIDEWAYS = {"forward": 0.0, "left": 90.0, "back": 180.0, "right": -90.0}
+
+
+@pytest.mark.parametrize("image_x", SIDEWAYS)
+def test_the_camera_sits_as_its_mount_says(image_x):
+    """Turned about the vertical in a level aircraft heading east, the camera's x axis is that of the mount."""
+    mount = Mount(ARM, LEVEL, 0.0, image_x)
+    found = direct_orientation(STATION, np.array([0.0, 0.0, np.pi / 2]), mount, NONE, Exposure(0.0, LEVEL, LEVEL))
+    turn = np.deg2rad(SIDEWAYS[image_x])
+    x_axis = np.array([np.cos(turn), np.sin(turn), 0.0])
+    np.testing.assert_allclose(found.camera_from_object[0], x_axis, rtol=0, atol=1e-15)
+    # The lever arm is one of the aircraft, however the camera is turned: right is south, forward east.
+    np.testing.assert_allclose(STATION - found.position, [ARM[1], -ARM[0], ARM[2]], rtol=0, atol=1e-12)
+    given = np.diag([0.02, 0.03, 0.01, 1e-3, 2e-3, 3e-3, 0.0]) ** 2
+    sensors = SensorCovariance(np.zeros((3, 3)), np.zeros((3, 3)), given)
+    seen = direct_covariance(STATION, ATTITUDE, mount, NONE, Exposure(0.0, LEVEL, LEVEL), sensors)
+    told = Exposure(0.0, LEVEL, LEVEL, mount.nominal)
+    same = direct_covariance(STATION, ATTITUDE, Mount(ARM, LEVEL, 0.0), NONE, told, sensors)
+    np.testing.assert_allclose(seen, same, rtol=0, atol=1e-15)
+
+
+def test_a_mount_and_an_exposure_that_differ_are_refused():
+    left = Mount(ARM, BORESIGHT, 0.0, "left")
+    with pytest.raises(InputError, match=r"image_x = 'left', which is not the nominal mount of the exposure"):
+        direct_orientation(STATION, ATTITUDE, left, NONE, MOVING)
+    with pytest.raises(RuntimeError, match="not the nominal mount"):
+        jax.block_until_ready(orientation(STATION, ATTITUDE, left, NONE, MOVING))
 
 
 def found(station, attitude, arm, boresight, offset, shift, drift, time, velocity, rate):

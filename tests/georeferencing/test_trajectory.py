@@ -18,11 +18,18 @@ from jaxphoto.rotation import (
 from tests.derivatives import QUICKLY, check_derivatives
 
 ANY_GAP = 1e9
-at_times = jax.jit(interpolate, compiler_options=QUICKLY)
+# Where numbers do not matter there are as many records and times, so that what is compiled for one serves all.
+RECORDS, TIMES = 201, 400
+_at_times = jax.jit(interpolate, compiler_options=QUICKLY)
 _quaternions = jax.jit(lambda a: jax.vmap(quaternion_from_matrix)(jax.vmap(matrix_from_roll_pitch_yaw)(a)))
 _matrices = jax.jit(jax.vmap(matrix_from_roll_pitch_yaw))
 _angles = jax.jit(jax.vmap(roll_pitch_yaw_from_matrix))
 _difference = jax.jit(jax.vmap(lambda a, b: small_angles(a.T @ b)))
+
+
+def at_times(trajectory, times, max_gap):
+    got = _at_times(trajectory, np.resize(times, TIMES), max_gap)
+    return jax.tree.map(lambda leaf: leaf[: len(times)], got)
 
 
 def recorded(motion, times, sigma=0.0) -> Trajectory:
@@ -60,8 +67,8 @@ def turbulence(seed: int):
 
 def misses(motion, spacing):
     """True errors and stated sigmas (times, 6) of 201 records at 400 random times, 25 records from the ends."""
-    times = np.arange(201) * spacing + 350_000.25
-    at = np.random.default_rng(3).uniform(times[25], times[-26], 400)
+    times = np.arange(RECORDS) * spacing + 350_000.25
+    at = np.random.default_rng(3).uniform(times[25], times[-26], TIMES)
     shifted = lambda t: motion(t - 350_000.25)  # noqa: E731
     got = at_times(recorded(shifted, times), at, ANY_GAP)
     position, angles = shifted(at)
@@ -71,7 +78,7 @@ def misses(motion, spacing):
 
 
 def test_at_the_records_it_is_the_records():
-    times = np.cumsum(np.random.default_rng(1).uniform(0.5, 1.5, 30))
+    times = np.cumsum(np.random.default_rng(1).uniform(0.5, 1.5, RECORDS))
     trajectory = recorded(turn, times, sigma=0.04)
     got = at_times(trajectory, times, ANY_GAP)
     np.testing.assert_allclose(got.position, trajectory.position, rtol=0, atol=1e-10)
@@ -129,7 +136,7 @@ def test_sigma_is_larger_where_the_flight_is_rougher():
 
 
 def test_velocity_and_rate_are_those_of_the_motion():
-    times, at, tau = np.arange(0, 30.0, 0.05), np.linspace(3, 27, 40), 1e-4
+    times, at, tau = 0.05 * np.arange(RECORDS), np.linspace(1, 9, 40), 1e-4
     got = at_times(recorded(turn, times), at, ANY_GAP)
     velocity = (turn(at + tau)[0] - turn(at - tau)[0]) / (2 * tau)
     np.testing.assert_allclose(got.velocity, velocity, rtol=0, atol=2e-4)
@@ -142,7 +149,7 @@ def test_velocity_and_rate_are_those_of_the_motion():
 
 def test_rate_has_the_signs_of_the_angles():
     """Nose up is about right, right wing down about forward, and a turn to the right is negative about up."""
-    times = np.arange(0, 5.0, 0.1)
+    times = 0.1 * np.arange(RECORDS)
     got = at_times(
         recorded(lambda t: (np.zeros((len(t), 3)), np.outer(t, [0.02, 0.03, 0.05])), times), np.zeros(1), ANY_GAP
     )
@@ -162,7 +169,7 @@ def test_no_spline_runs_across_a_gap():
 
 
 def test_angles_of_half_a_turn_and_signs_of_quaternions_do_not_matter():
-    times, at = np.arange(0, 12.0, 0.4), np.linspace(0.1, 11.0, 30)
+    times, at = 0.4 * np.arange(RECORDS), np.linspace(0.1, 11.0, 30)
     trajectory = recorded(turn, times)
     flipped = trajectory.quaternion * np.where(np.arange(len(times)) % 3, 1, -1)[:, None]
     other = Trajectory(times, trajectory.position, flipped, trajectory.sigma_position, trajectory.sigma_attitude)

@@ -31,7 +31,7 @@ RATIONAL = {f"k{k}" for k in range(1, 7)}
 IDS = np.array([3, 7, 8, 20, 21, 40])
 NAMES = ["b.jpg", "a.jpg", "c.jpg"]
 # Models that are no part of OpenCV's, by their numbers in a binary file.
-NUMBERS = {"OPENCV_FISHEYE": 5, "FOV": 7, "SIMPLE_RADIAL_FISHEYE": 8, "RADIAL_FISHEYE": 9, "THIN_PRISM_FISHEYE": 10}
+NUMBERS = {"FOV": 7, "RAD_TAN_THIN_PRISM_FISHEYE": 11}
 
 
 def computed(image):
@@ -186,7 +186,7 @@ def spoil(file, row, text):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (spoil("cameras", 1, "5 OPENCV_FISHEYE 640 480 1 1 1 1 0 0 0 0"), "OPENCV_FISHEYE of camera 5 is not known"),
+        (spoil("cameras", 1, "5 FOV 640 480 1 1 1 1 0 0 0 0"), "FOV of camera 5 is not known"),
         (spoil("cameras", 1, "5 OPENCV 640 480 800 800"), "camera 5 has 2 parameters, OPENCV has 8: fx"),
         (spoil("cameras", 1, "5 OPENCV"), "camera 5 has 2 cells; write CAMERA_ID MODEL"),
         (spoil("cameras", 1, "6 SIMPLE_PINHOLE 640 480 800 320 240"), "image a.jpg is of camera 5, which is missing"),

@@ -17,6 +17,7 @@ from jaxphoto.cloud import Cloud
 from jaxphoto.io import clouds, raster, write_block
 from jaxphoto.lidar.orthophoto import Picture
 from jaxphoto.lidar.raster import Raster, filled, hillshade, surface_model
+from tests.checked_types import unchecked
 from tests.commands import run
 from tests.lidar.photographs import rendered
 from tests.simulation.small import made
@@ -39,7 +40,7 @@ def surface(seed=1, shape=(300, 410), west=194_000.0, north=258_900.0):
 @pytest.mark.parametrize("code", [None, 32610, 2993])
 def test_what_is_written_is_read_by_rasterio(tmp_path, code):
     model = surface()
-    system = clouds.System() if code is None else clouds.System(CRS.from_epsg(code))
+    system = clouds.CoordinateSystem() if code is None else clouds.CoordinateSystem(CRS.from_epsg(code))
     path = tmp_path / "out" / "dsm.tif"
     raster.write_dsm(path, model, system)
     with rasterio.open(path) as file:
@@ -58,7 +59,7 @@ def test_what_is_written_is_read_by_rasterio(tmp_path, code):
 
 
 def test_systems_of_heights_come_back(tmp_path):
-    raster.write_dsm(tmp_path / "dsm.tif", surface(), clouds.System(CRS.from_epsg(32610), 5703))
+    raster.write_dsm(tmp_path / "dsm.tif", surface(), clouds.CoordinateSystem(CRS.from_epsg(32610), 5703))
     _, system = raster.read_dsm(tmp_path / "dsm.tif")
     assert (system.plane.to_epsg(), system.heights) == (32610, 5703)
 
@@ -169,7 +170,9 @@ def test_orthophotos_carry_a_mask(tmp_path, kind, bands):
     rng = np.random.default_rng(0)
     seen = rng.random((70, 90)) < 0.7
     pixels = np.where(seen, rng.integers(0, 200, (bands, 70, 90)), 0).astype(kind)
-    raster.write_orthophoto(tmp_path / "o.tif", Picture(pixels, seen), model, clouds.System(CRS.from_epsg(32722)))
+    raster.write_orthophoto(
+        tmp_path / "o.tif", Picture(pixels, seen), model, clouds.CoordinateSystem(CRS.from_epsg(32722))
+    )
     with rasterio.open(tmp_path / "o.tif") as file:
         np.testing.assert_array_equal(file.read(), pixels)
         np.testing.assert_array_equal(file.dataset_mask() > 0, seen)
@@ -271,7 +274,7 @@ def test_what_the_command_cannot_do(tmp_path, monkeypatch, capsys, changes, says
     write_block(block, tmp_path / "block")
     photographed(tmp_path, block.images[0], lambda x, y: 0 * x)
     away = 1e5 if changes.get("dsm") == "away" else 0.0
-    system = clouds.System(CRS.from_epsg(32722)) if changes.get("dsm") == "utm" else clouds.System()
+    system = clouds.CoordinateSystem(CRS.from_epsg(32722)) if changes.get("dsm") == "utm" else clouds.CoordinateSystem()
     raster.write_dsm(tmp_path / "dsm.tif", Raster(np.zeros((50, 50)), away - 400, 400.0, 16.0), system)
     photo = {"dsm": "dsm.tif", "none": "none.tif"}.get(changes.get("photo"), "photo.tif")
     arguments = (tmp_path / "block", tmp_path / photo, tmp_path / "dsm.tif", "--out", tmp_path / "ortho.tif")
@@ -296,6 +299,7 @@ def test_what_the_command_cannot_do(tmp_path, monkeypatch, capsys, changes, says
 )
 def test_what_dsm_cannot_do(tmp_path, monkeypatch, capsys, arguments, says):
     clouds.write_cloud(Cloud(np.arange(30.0).reshape(10, 3), np.ones(10, np.uint8)), tmp_path / "c.las")
-    code, _, errors = run(monkeypatch, capsys, "dsm", tmp_path / "c.las", "--out", tmp_path / "d.tif", *arguments)
+    with unchecked():
+        code, _, errors = run(monkeypatch, capsys, "dsm", tmp_path / "c.las", "--out", tmp_path / "d.tif", *arguments)
     assert code == 2 and says in errors and errors.count("\n") == 1
     assert not (tmp_path / "d.tif").exists()

@@ -10,10 +10,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from jaxphoto.block import Block, Rows
+from jaxphoto.block import Block
 from jaxphoto.camera import Smac
 from jaxphoto.errors import BlockError, InputError
 from jaxphoto.io import read_block, write_block
+from jaxphoto.observations import ControlRows
 from jaxphoto.unknowns import FIXED, FREE, Weighted
 
 SMAC = ("block.toml", 'distortion = "brown"', 'distortion = "smac"\nsign = "add"')
@@ -83,7 +84,7 @@ def test_numbers_and_ids_come_back_exactly(write_folder, tmp_path_factory, value
         write_folder().rename(source)
     block = read_block(source)
     points = tuple(name if point == "p3" else point for point in block.points)
-    fixed = Rows(block.fixed.who, block.fixed.axis, jnp.asarray(values), block.fixed.sigma)
+    fixed = ControlRows(block.fixed.who, block.fixed.axis, jnp.asarray(values), block.fixed.sigma)
     control = dataclasses.replace(block.control, sigma=jnp.full(4, sigma))
     block = dataclasses.replace(
         block, points=points, fixed=fixed, control=control, datum=dataclasses.replace(block.datum, over=(name,))

@@ -15,6 +15,7 @@ from jaxphoto.errors import InputError
 from jaxphoto.lidar.grid import index_cloud
 from jaxphoto.lidar.height_settings import HeightFlag, HeightSettings
 from jaxphoto.lidar.pseudo_control import pseudo_control_points
+from tests.checked_types import unchecked
 from tests.derivatives import compiled
 
 POINTS = 32400
@@ -218,7 +219,7 @@ def test_no_program_is_compiled_for_another_camera_image_or_cloud_of_like_size()
 
 def test_wrong_use_is_told_in_a_sentence():
     grid = indexed(scanned(slope(0, 0), 1, np.random.default_rng(7)))
-    with pytest.raises(InputError, match="choose one of weighted, plane"):
+    with pytest.raises(InputError, match="choose one of weighted, plane"), unchecked():
         pseudo_control_points(CAMERA, image(0), np.zeros((1, 2)), grid, interpolation="spline")  # type: ignore[arg-type]
     with pytest.raises(InputError, match="give one image coordinate at least"):
         pseudo_control_points(CAMERA, image(0), np.zeros((0, 2)), grid)

@@ -5,10 +5,11 @@ import dataclasses
 import equinox as eqx
 import numpy as np
 
-from jaxphoto.block import Attitudes, Block, Datum, Distances, ImageRows, Rows, Start
+from jaxphoto.block import Block, Datum, Start
 from jaxphoto.camera import Brown, InteriorOrientation, Sensor
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.georeferencing import Mount, StripBias
+from jaxphoto.observations import Attitudes, ControlRows, Distances, ImageRows, StationRows
 from jaxphoto.unknowns import FIXED, Unknowns, uniform_priors
 from tests.formulas import camera_from_object
 
@@ -81,10 +82,10 @@ def block_of(image, point, xy, n_images, n_points):
         image_strip=("default",) * n_images,
         image_time=np.zeros(n_images),
         image_points=ImageRows(image, point, xy, np.full_like(xy, 0.004)),
-        control=Rows.none(),
-        fixed=Rows.none(),
-        check=Rows.none(),
-        stations=Rows.none(),
+        control=ControlRows.none(),
+        fixed=ControlRows.none(),
+        check=ControlRows.none(),
+        stations=StationRows.none(),
         attitudes=Attitudes.none(),
         distances=Distances.none(),
         datum=Datum(),
@@ -108,6 +109,6 @@ def with_known(block, truth, images=(), points=()):
 
 
 def coordinate_rows(values, who, axes=(0, 1, 2)):
-    """Rows of every axis of `axes` of `who`, with the values of the table `values`."""
+    """ControlRows of every axis of `axes` of `who`, with the values of the table `values`."""
     who, axis = (grid.ravel() for grid in np.meshgrid(np.asarray(who, int), axes, indexing="ij"))
-    return Rows(who, axis, values[who, axis], np.full(len(who), 0.03))
+    return ControlRows(who, axis, values[who, axis], np.full(len(who), 0.03))

@@ -4,10 +4,11 @@ import equinox as eqx
 import numpy as np
 import pytest
 
-from jaxphoto.block import Attitudes, ImageRows, Motion
+from jaxphoto.block import Motion
 from jaxphoto.camera import Brown, InteriorOrientation
 from jaxphoto.errors import BlockError
 from jaxphoto.georeferencing import Exposure, Mount, StripBias, recorded_attitude, sensor_position
+from jaxphoto.observations import Attitudes, ImageRows
 from jaxphoto.orientation import approximate
 from jaxphoto.orientation.resection import resect_ideal
 from jaxphoto.rotation import roll_pitch_yaw_from_matrix

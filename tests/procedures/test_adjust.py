@@ -15,7 +15,7 @@ def test_what_is_compiled_meanwhile_serves_the_tables(name, monkeypatch):
     monkeypatch.setattr(run, "_prepared", {})
     adjusted = adjust_for_tables(simulated(name).block)
     ahead = {key[0].__name__ for key in run._prepared}
-    assert {"_covariance", "_redundancy"} <= ahead
+    assert {"_covariance", "_row_variances"} <= ahead
     tables = Tables(adjusted)
     tables.covariance, tables.redundancy  # noqa: B018
     assert not run._prepared

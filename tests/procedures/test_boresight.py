@@ -11,9 +11,9 @@ import pandas as pd
 import pytest
 
 from jaxphoto import FIXED, FREE, BlockError, boresight, cli
-from jaxphoto.block import Attitudes, Rows
 from jaxphoto.georeferencing import Mount, StripBias
 from jaxphoto.io import write_block
+from jaxphoto.observations import Attitudes, ControlRows, StationRows
 from jaxphoto.procedures import step_block
 from tests.blocks import BORESIGHT, BROWN, CONTROL, Simulated, aerial, all_attitudes, all_stations, bare, measured, rows
 from tests.blocks import free as free_interior
@@ -222,8 +222,8 @@ def lone_control():
 @pytest.mark.parametrize(
     ("spoil", "words"),
     [
-        (lambda: dataclasses.replace(block(), control=Rows.none()), ["step 1", "control_points.csv"]),
-        (lambda: dataclasses.replace(block(), stations=Rows.none()), ["step 2", "stations.csv"]),
+        (lambda: dataclasses.replace(block(), control=ControlRows.none()), ["step 1", "control_points.csv"]),
+        (lambda: dataclasses.replace(block(), stations=StationRows.none()), ["step 2", "stations.csv"]),
         (lambda: dataclasses.replace(block(), attitudes=Attitudes.none()), ["step 3", "attitudes.csv"]),
         (lambda: dataclasses.replace(block(), image_strip=("",) * 10), ["step 2", "column strip", "images.csv"]),
         (lambda: dataclasses.replace(block(), image_strip=("a",) * 10), ["strip a", "opposite direction"]),

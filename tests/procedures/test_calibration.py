@@ -20,6 +20,7 @@ from jaxphoto.procedures.calibration.outliers import added_sigma
 from jaxphoto.procedures.calibration.reprojection import projections
 from jaxphoto.procedures.calibration.start import flat_start, nearest_distortion
 from jaxphoto.report.calibration import findings
+from tests.derivatives import compiled
 
 SENSOR = Sensor(1280, 960, 0.0054)
 WIDE = InteriorOrientation(3.1, 0.04, -0.03, Smac(k1=-0.028, k2=-0.0009, k3=-5e-5, p1=2e-4, p2=-3e-4))
@@ -106,11 +107,14 @@ def test_gross_errors_are_found_and_named(simulated):
     assert len(simulated.removed) <= 4
 
 
+_ideal = compiled(lambda interior, xy: jax.vmap(interior.ideal_from_measured)(xy))
+
+
 def _rays(interior) -> np.ndarray:
     """Ideal coordinates over c, at points of the format."""
     side = [np.linspace(-0.45, 0.45, 11) * s for s in (SENSOR.width_mm, SENSOR.height_mm)]
     grid = np.stack(np.meshgrid(*side), axis=-1).reshape(-1, 2)
-    return np.asarray(jax.vmap(interior.ideal_from_measured)(grid)) / float(interior.c)
+    return _ideal(jax.tree.map(np.float64, interior), grid) / float(interior.c)
 
 
 def test_any_balance_radius_gives_the_same_bundle(simulated):
@@ -218,17 +222,17 @@ def test_circles_of_two_sizes_are_no_blunders():
 def test_eccentricity_is_that_of_the_ellipse_in_closed_form():
     """Without distortion: the centre of the conic H^-T diag(1, 1, -1) H^-1 minus the image of the centre."""
     board = flat_board()
-    lens = InteriorOrientation(3.1, 0.02, 0.01)
+    lens, centre, radius = InteriorOrientation(3.1, 0.02, 0.01), np.array([0.1, -0.05, 0.0]), 0.012
+    of_view = compiled(lambda exterior: eccentricity(lens, exterior, centre, np.eye(3)[:, :2], radius))
     for exterior in views(board, 4):
-        centre, radius = np.array([0.1, -0.05, 0.0]), 0.012
         matrix, position = np.asarray(exterior.camera_from_object), np.asarray(exterior.position)
         k = np.array([[-3.1, 0, 0.02], [0, -3.1, 0.01], [0, 0, 1]])
         h = k @ np.column_stack([radius * matrix[:, :2], matrix @ (centre - position)])
         conic = np.linalg.inv(h).T @ np.diag([1.0, 1.0, -1.0]) @ np.linalg.inv(h)
         ellipse = np.linalg.solve(conic[:2, :2], -conic[:2, 2])
         image = h[:, 2] / h[2, 2]
-        found = eccentricity(lens, exterior, centre, np.eye(3)[:, :2], radius)
-        np.testing.assert_allclose(np.asarray(found), ellipse - image[:2], atol=1e-12)
+        found = of_view(exterior)
+        np.testing.assert_allclose(found, ellipse - image[:2], atol=1e-12)
         assert np.linalg.norm(ellipse - image[:2]) > 1e-3 * SENSOR.pixel_mm
 
 

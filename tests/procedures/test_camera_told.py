@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from jaxphoto.block import ImageRows
 from jaxphoto.camera import InteriorOrientation, Sensor
 from jaxphoto.io import read_block
+from jaxphoto.observations import ImageRows
 from jaxphoto.procedures.adjust import adjust
 from jaxphoto.procedures.orientation import orient
 from jaxphoto.procedures.orientation.finish import erring_alike

@@ -12,6 +12,7 @@ from jaxphoto.georeferencing import Scanner
 from jaxphoto.lidar import HeightSettings
 from jaxphoto.lidar.correction import correct_cloud, correct_trajectory
 from jaxphoto.procedures.lidar import Simultaneous, simultaneous
+from jaxphoto.statistics import physical_residuals
 from tests.procedures.lidar import misaligned
 
 SETTINGS = HeightSettings(sigma_z_m=0.1, sigma_xy_m=0.3)
@@ -96,7 +97,7 @@ def test_cloud_and_trajectory_are_corrected_alike():
 def test_observations_are_linear_about_the_result():
     """What the block says of the surface at the result is what the corrected cloud says."""
     a = both().adjusted
-    residuals, told = np.asarray(a.residuals.surfaces) * np.asarray(a.values.sigma_surfaces), np.isfinite(both().apart)
+    residuals, told = physical_residuals(a)["surfaces"], np.isfinite(both().apart)
     assert told.mean() > 0.95
     off = np.abs(residuals + both().apart)[told]
     # Some laser point may have become a neighbour, or ceased to be one, since the last look.

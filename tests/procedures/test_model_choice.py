@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from jaxphoto import FIXED, FREE, Weighted, adjust
-from jaxphoto.block import ImageRows
 from jaxphoto.camera import Brown, OpenCv, Smac, exact, get_parameter, rebalance, set_parameter
 from jaxphoto.errors import BlockError, InputError
 from jaxphoto.io import write_block
+from jaxphoto.observations import ImageRows
 from jaxphoto.procedures.camera_candidates import candidate_of, with_candidate
 from jaxphoto.procedures.cross_validation import folds, measured_discrepancies, without_rows
 from jaxphoto.procedures.model_choice import model_choice
@@ -177,7 +177,7 @@ def test_candidates_by_name():
     assert not candidate_of("brown").within(candidate_of("brown"))
     assert not candidate_of("smac:k1").within(candidate_of("brown"))
     for name, message in (
-        ("braun", "no distortion model is called 'braun'; choose among brown"),
+        ("braun", "no distortion model is called 'braun'; choose one of brown"),
         ("brown:k9", "brown has no coefficient 'k9' to estimate; it has k1"),
         ("smac:k0", "smac has no coefficient 'k0' to estimate"),
     ):

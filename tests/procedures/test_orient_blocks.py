@@ -5,15 +5,16 @@ import dataclasses
 import numpy as np
 import pytest
 
-from jaxphoto.block import ImageRows, Rows, Start
+from jaxphoto.block import Start
 from jaxphoto.camera import InteriorOrientation
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import BlockError
+from jaxphoto.observations import ControlRows, ImageRows, StationRows
 from jaxphoto.orientation.approximate import completed
 from jaxphoto.orientation.matches import tracks
 from jaxphoto.procedures.adjust import adjust, needs_orientation, start_of
 from jaxphoto.procedures.orientation import orient_block
-from jaxphoto.procedures.orientation.photographs import _block_of
+from jaxphoto.procedures.orientation.orient_photographs import _block_of
 from jaxphoto.procedures.orientation.refine import freed
 from tests.formulas import camera_from_object
 from tests.procedures.orientable import PIXEL, SENSOR, Camera, aerial, convergent, photographed
@@ -42,7 +43,7 @@ def with_control(block, true, scene, which):
     known = np.zeros(len(points), bool)
     known[which] = True
     unknowns = dataclasses.replace(block.start.unknowns, points=points)
-    rows = Rows(
+    rows = ControlRows(
         np.repeat(which, 3), np.tile(np.arange(3), len(which)), points[which].ravel(), np.full(3 * len(which), 0.01)
     )
     return dataclasses.replace(block, control=rows, start=Start(unknowns, block.start.image_known, known))
@@ -120,7 +121,7 @@ def with_stations(block, scene, which):
     """Stations observed by GNSS to 5 cm, no angles."""
     noise = 0.05 * np.random.default_rng(1).normal(size=(len(which), 3))
     n = len(which)
-    rows = Rows(
+    rows = StationRows(
         np.repeat(which, 3),
         np.tile(np.arange(3), n),
         (scene.positions[which] + noise).ravel(),

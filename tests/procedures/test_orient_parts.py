@@ -5,19 +5,20 @@ import dataclasses
 import numpy as np
 import pytest
 
-from jaxphoto.block import Distances, Rows, Start
+from jaxphoto.block import Start
 from jaxphoto.camera import InteriorOrientation, Smac
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import BlockError
+from jaxphoto.observations import Distances, StationRows
 from jaxphoto.orientation.matches import tracks
 from jaxphoto.procedures.orientation.depths import supported
 from jaxphoto.procedures.orientation.finish import _open
 from jaxphoto.procedures.orientation.growing import _starts, _worth
 from jaxphoto.procedures.orientation.network import Fate, empty_network, meet, misfits, sight_of
 from jaxphoto.procedures.orientation.onto_known import onto_known, similarity_between
-from jaxphoto.procedures.orientation.pairs import Pair
-from jaxphoto.procedures.orientation.photographs import _block_of
+from jaxphoto.procedures.orientation.orient_photographs import _block_of
 from jaxphoto.procedures.orientation.refine import _at_corner
+from jaxphoto.procedures.orientation.related_pairs import Pair
 from jaxphoto.procedures.orientation.two_steps import two_steps
 from tests.formulas import camera_from_object
 from tests.procedures.orientable import (
@@ -243,7 +244,9 @@ def elsewhere():
 def stations_of(there, images):
     """Stations of `images` as rows of a block."""
     n = len(images)
-    return Rows(np.repeat(images, 3), np.tile(np.arange(3), n), there.positions[images].ravel(), np.full(3 * n, 0.1))
+    return StationRows(
+        np.repeat(images, 3), np.tile(np.arange(3), n), there.positions[images].ravel(), np.full(3 * n, 0.1)
+    )
 
 
 def known_start(block, there, images=(), points=()):

@@ -16,7 +16,7 @@ from jaxphoto.adjustment.shared import shared_vector
 from jaxphoto.errors import InputError
 from jaxphoto.sensitivity.exact import sensitivity
 from jaxphoto.sensitivity.response import response
-from tests.adjustment.dense import own_order
+from tests.adjustment.dense import couples, own_order
 from tests.blocks import adjusted, simulated
 
 POINTS = ("p1", "p17")
@@ -38,7 +38,9 @@ def estimates(name: str, unknowns) -> np.ndarray:
     """What `Sensitivity` has a row of each, in this order."""
     a = nominal(name)
     exterior = np.hstack([unknowns.exterior.position, np.asarray(unknowns.exterior.omega_phi_kappa)])
-    shared = np.array(shared_vector(unknowns, a.structure.groups), float)[a.structure.free]
+    shared = np.array(
+        shared_vector(unknowns, [n for g in a.structure.groups for n in g.names], a.structure.tables), float
+    )[a.structure.free]
     at = [a.block.points.index(p) for p in POINTS]
     return np.concatenate([exterior.ravel(), shared, np.asarray(unknowns.points)[at].ravel()])
 
@@ -95,7 +97,7 @@ def test_derivatives_by_observations_are_those_of_full_adjustments(group: str) -
     where, index, step = OBSERVATIONS[group]
     expected = difference("everything", lambda h: moved("everything", where, index, h), step)
     at = (slice(None), *np.atleast_1d(index))
-    exact, first = (getattr(derivatives("everything", c), group)[at] for c in (True, False))
+    exact, first = (derivatives("everything", c)[group][at] for c in (True, False))
     assert off("everything", exact, expected) < 1e-6
     # The classical matrix leaves out the residuals' curvature, which is what makes the difference.
     assert 1e-5 < off("everything", first, expected) < 0.1
@@ -109,14 +111,15 @@ def test_derivative_by_a_surface_of_the_laser_scanner() -> None:
     normal = a.block.surfaces.normal[row]
     where = lambda b: b.surfaces.foot  # noqa: E731
     expected = difference("surfaces", lambda h: moved("surfaces", where, row, h * normal), 0.05)
-    exact, first = (derivatives("surfaces", c).surfaces[:, row] for c in (True, False))
+    exact, first = (derivatives("surfaces", c)["surfaces"][:, row] for c in (True, False))
     assert off("surfaces", exact, expected) < 1e-6
     assert 1e-5 < off("surfaces", first, expected) < 0.1
 
 
 def test_derivative_by_a_weighted_prior() -> None:
     a = nominal("everything")
-    weighted = [a.structure.labels[k] for k in a.structure.weighted]
+    (priors,) = (g for g in a.structure.observed if g.name == "priors")
+    weighted = [a.structure.labels[k] for k in priors.column[0]]
     lever_arm = weighted.index("mounts[imu].lever_arm_up_m")
 
     def changed(h):
@@ -125,7 +128,7 @@ def test_derivative_by_a_weighted_prior() -> None:
         return a.block, a.unknowns, eqx.tree_at(lambda p: p.mounts["imu"].lever_arm, a.priors, prior)
 
     expected = difference("everything", changed, 0.05)
-    assert off("everything", derivatives("everything").priors[:, lever_arm], expected) < 1e-6
+    assert off("everything", derivatives("everything")["priors"][:, lever_arm], expected) < 1e-6
 
 
 @pytest.mark.parametrize("label", ["interior[two].k2", "interior[one].b1", "points[p17].Y"])
@@ -174,7 +177,7 @@ def test_free_network(group: str) -> None:
     step = 0.002 if group == "image_points" else 1e-4
     expected = difference("inner", lambda h: moved("inner", where, index, h), step)
     at = (slice(None), *np.atleast_1d(index))
-    assert off("inner", getattr(derivatives("inner"), group)[at], expected) < 1e-6
+    assert off("inner", derivatives("inner")[group][at], expected) < 1e-6
 
 
 @pytest.mark.parametrize("curvature", [True, False])
@@ -187,7 +190,7 @@ def test_response_is_the_sum_of_derivatives(curvature: bool) -> None:
     block = eqx.tree_at(where, a.block, (a.block.stations.value + heights, a.block.image_points.xy + xy))
     change = response(a, block, curvature=curvature)
     angles = eqx.tree_at(lambda u: u.exterior, change.unknowns, _Exterior(change))
-    expected = found.stations @ heights + np.einsum("ero,ro->e", found.image_points, xy)
+    expected = found["stations"] @ heights + np.einsum("ero,ro->e", found["image_points"], xy)
     assert off("everything", estimates("everything", angles), expected) < 1e-9
 
 
@@ -208,12 +211,12 @@ def test_first_order_matrix_is_the_dense_one() -> None:
     at = lambda y: ravel_pytree(residuals_at(At(back(y), scale, values, s)))[0]  # noqa: E731
     unknowns, rows = own_order(values, a.structure, s, a.computed.places)
     j = np.asarray(jax.jit(jax.jacfwd(at))(flat))[np.ix_(rows, unknowns)]
-    datum, priors = len(a.residuals.datum), len(a.residuals.priors)
-    distances = j[len(j) - datum - priors - len(a.residuals.distances) : len(j) - datum - priors]
-    change = -np.linalg.solve(j.T @ j, distances.T) / np.asarray(a.values.sigma_distances)
+    coupled = j[couples(a)]
+    distances = coupled[: len(coupled) - len(a.residuals.datum)]
+    change = -np.linalg.solve(j.T @ j, distances.T) / np.asarray(a.block.distances.sigma)
     change *= ravel_pytree(scale)[0][unknowns][:, None]
     images, shared = len(a.block.images), a.structure.n_shared
-    found = derivatives("inner", False).distances
+    found = derivatives("inner", False)["distances"]
     positions = found[: 6 * images].reshape(images, 6, -1)[:, :3].swapaxes(0, 1).reshape(3 * images, -1)
     of_shared = slice(6 * images, 6 * images + shared)
     for mine, dense in ((positions, change[: 3 * images]), (found[of_shared], change[of_shared])):

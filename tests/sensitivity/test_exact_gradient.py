@@ -17,7 +17,7 @@ def scalar(result):
     """Of unknowns, residuals, sigma naught and standard deviations; each part counts."""
     cov = covariance(result)
     sigmas = 100 * cov.shared_sigma[0] + 10 * cov.exterior_sigma[2, 4] + cov.point_sigma[3, 2]
-    return result.sigma0 + result.residuals.control[3] + result.unknowns.interior["one"].c + sigmas
+    return result.sigma0 + result.residuals["control_points"][3] + result.unknowns.interior["one"].c + sigmas
 
 
 def with_station(height, unknowns):

@@ -1,6 +1,7 @@
 """Second derivatives of listed image rows against dense ones of all residuals, by automatic differentiation."""
 
 import dataclasses
+import functools
 
 import equinox as eqx
 import jax
@@ -17,7 +18,11 @@ from jaxphoto.sensitivity import image_rows as listed
 from jaxphoto.sensitivity.hessian import image_columns
 from tests.blocks import adjusted, simulated
 
+# The row that is looked at.
+ROW = 57
 
+
+@functools.cache
 def corrected():
     """Two cameras of different models, refraction and curvature of the earth: all that a row may depend on."""
     block = simulated("everything").block
@@ -25,26 +30,23 @@ def corrected():
     return adjust(block, adjusted("everything").unknowns, max_steps=2)
 
 
-@pytest.mark.parametrize("curved", [0.0, 1.0])
-@pytest.mark.parametrize("at_once", [8192, 64])
-def test_products_of_rows_are_the_dense_ones(curved: float, at_once: int, monkeypatch) -> None:
-    monkeypatch.setattr(listed, "_AT_ONCE", at_once)
+@functools.cache
+def dense_products():
+    """Second derivatives of all residuals by the unknowns of `ROW` and by what it measures, as functions of `curved`.
+
+    Compiled once, beside them: which of the columns of shared unknowns there are.
+    """
     a = corrected()
     computed, own = a.computed, a.structure
     s, scale = computed.structure, jax.tree.map(jnp.asarray, computed.factored.scale)
-    values, rows = jax.tree.map(jnp.asarray, weigh_datum(computed.values, s)), listed.image_rows(a)
-    found = eqx.filter_jit(listed.row_products)(values, scale, rows, jnp.asarray(curved), s)
-
-    # The row that is looked at, and its image, point and camera.
-    row, zero = 57, jax.tree.map(jnp.zeros_like, scale)
-    tile, slot = np.divmod(computed.places.row[row], s.in_tiles.image.shape[2] * s.in_tiles.per_tile)
+    values, zero = jax.tree.map(jnp.asarray, weigh_datum(computed.values, s)), jax.tree.map(jnp.zeros_like, scale)
+    tile, slot = np.divmod(computed.places.row[ROW], s.in_tiles.image.shape[2] * s.in_tiles.per_tile)
     chunk, tile = np.divmod(tile, s.in_tiles.image.shape[1])
     m, p = np.divmod(slot, s.in_tiles.per_tile)
-    image, point = computed.places.image[own.image[row]], computed.places.point[own.point[row]]
+    image, point = computed.places.image[own.image[ROW]], computed.places.point[own.point[ROW]]
     columns = np.asarray(image_columns(s))[image, 6:] - 6 * s.n_images
-    there = columns < s.n_shared
 
-    def half_square(y, xy):
+    def half_square(y, xy, curved):
         """Half the square of the row's residuals, with the second derivative J'J + curved r d2r."""
         shared = zero.shared.at[columns].add(y[9:], mode="drop")
         moved = Increments(zero.eop.at[:, image].set(y[:6]), shared, zero.points.at[:, point].set(y[6:9]))
@@ -53,8 +55,22 @@ def test_products_of_rows_are_the_dense_ones(curved: float, at_once: int, monkey
         return jnp.sum(0.5 * r * r - (1 - curved) * jax.lax.stop_gradient(r) * r)
 
     at = jnp.zeros(9 + len(columns)), jnp.asarray(values.xy)[chunk, tile, :, m, p]
-    (h, b), _ = jax.jit(jax.hessian(half_square, (0, 1)))(*at)
+    return functools.partial(jax.jit(jax.hessian(half_square, (0, 1))), *at), columns < s.n_shared
+
+
+@pytest.mark.parametrize("curved", [0.0, 1.0])
+@pytest.mark.parametrize("at_once", [8192, 64])
+def test_products_of_rows_are_the_dense_ones(curved: float, at_once: int, monkeypatch) -> None:
+    monkeypatch.setattr(listed, "_AT_ONCE", at_once)
+    a = corrected()
+    computed = a.computed
+    s, scale = computed.structure, jax.tree.map(jnp.asarray, computed.factored.scale)
+    values, rows = jax.tree.map(jnp.asarray, weigh_datum(computed.values, s)), listed.image_rows(a)
+    found = eqx.filter_jit(listed.row_products)(values, scale, rows, jnp.asarray(curved), s)
+
+    products, there = dense_products()
+    (h, b), _ = products(jnp.asarray(curved))
     kept = np.append(np.full(9, True), there)
-    by_point = np.where(kept[:, None], found.by_point[:, :, row], 0.0)
+    by_point = np.where(kept[:, None], found.by_point[:, :, ROW], 0.0)
     np.testing.assert_allclose(by_point, h[:, 6:9], rtol=0, atol=1e-12 * np.abs(h).max())
-    np.testing.assert_allclose(-found.measured[row].T, b, rtol=0, atol=1e-12 * np.abs(b).max())
+    np.testing.assert_allclose(-found.measured[ROW].T, b, rtol=0, atol=1e-12 * np.abs(b).max())

@@ -12,9 +12,9 @@ import pytest
 from typer.testing import CliRunner
 
 from jaxphoto import adjust, covariance, read_block
-from jaxphoto.block import Rows
 from jaxphoto.cli import app
 from jaxphoto.errors import InputError
+from jaxphoto.observations import StationRows
 from jaxphoto.report.sensitivity import SensitivityTables
 from jaxphoto.sensitivity.exact import sensitivity
 from jaxphoto.sensitivity.influence import Per, external_reliability, station_bias, variance_shares
@@ -93,7 +93,7 @@ def test_external_reliability_is_an_undetected_error_adjusted_in() -> None:
     a = adjusted("cross")
     found = external_reliability(a, derivatives("cross", False))
     control = 4
-    r = np.asarray(redundancy_numbers(a, covariance(a)).control)[control]
+    r = np.asarray(redundancy_numbers(a, covariance(a))["control_points"])[control]
     error = found.detectable["control_points"][control]
     assert error == pytest.approx(4.13 * 0.03 / np.sqrt(r), rel=1e-9)
     value = np.array(a.block.control.value)
@@ -105,7 +105,7 @@ def test_external_reliability_is_an_undetected_error_adjusted_in() -> None:
     assert all((d > 0).all() for d in found.detectable.values())
     assert not any(np.isnan(e).any() for e in found.effect.values())
     # The test that is meant finds it: the normalised residual moves by delta0.
-    change = (np.asarray(again.residuals.control) - np.asarray(a.residuals.control))[control] / np.sqrt(r)
+    change = (again.residuals["control_points"] - a.residuals["control_points"])[control] / np.sqrt(r)
     assert change == pytest.approx(4.13, rel=0.02)
 
 
@@ -125,7 +125,7 @@ def test_mistakes_get_a_sentence(call, sentence: str) -> None:
 
 def test_bias_of_a_block_without_stations() -> None:
     a = adjusted("cross")
-    a = dataclasses.replace(a, block=dataclasses.replace(a.block, stations=Rows.none()))
+    a = dataclasses.replace(a, block=dataclasses.replace(a.block, stations=StationRows.none()))
     with pytest.raises(InputError, match="no observed stations"):
         station_bias(a, derivatives("cross"))
 

@@ -11,6 +11,7 @@ import pytest
 from jaxphoto import InputError, adjust, bias, covariance, monte_carlo, readjust
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.sensitivity import Readjustment, noise
+from jaxphoto.sensitivity.many import common_of, image_gradients
 from jaxphoto.unknowns import FIXED, Weighted
 from tests.blocks import adjusted, simulated
 from tests.marks import slow_but
@@ -172,6 +173,19 @@ def test_draws_do_not_depend_on_how_many_there_are():
     assert all(np.array_equal(values, many.recorded[name][:2]) for name, values in few.recorded.items())
     other = monte_carlo(nominal, errors, 2, seed=8)
     assert not np.array_equal(few.shared, other.shared)
+
+
+@pytest.mark.parametrize("name", ["everything", "three_models"])
+@pytest.mark.parametrize("measured", [True, False])
+def test_rows_that_come_in_chunks_add_up_to_the_same(name, measured):
+    nominal, rng = adjusted(name), np.random.default_rng(5)
+    near = jax.tree.map(lambda v: rng.normal(0, 0.3, (*v.shape, 3)), nominal.computed.factored.scale)
+    xy = np.asarray(nominal.values.xy)
+    varying = {"xy": xy[..., None] + rng.normal(0, 0.01, (*xy.shape, 3))} if measured else {}
+    whole, chunks = (image_gradients(near, varying, common_of(nominal, at_once)) for at_once in (100_000, 7))
+    for one, other in zip(whole, chunks, strict=True):
+        assert np.abs(one).max() > 1
+        assert np.asarray(other) == pytest.approx(np.asarray(one), rel=1e-11, abs=1e-12 * np.abs(one).max())
 
 
 def test_a_function_of_ones_own_records_what_it_drew():

@@ -10,7 +10,7 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 import jaxphoto
-from jaxphoto import DatumError, InputError
+from jaxphoto import BlockError, DatumError, Equidistant, InputError
 from jaxphoto.camera import get_parameter
 from jaxphoto.compiling import call_compiled
 from jaxphoto.sensitivity.network import criteria
@@ -145,4 +145,7 @@ def test_what_a_layout_cannot_be_is_said_in_a_sentence(layout):
     nothing = dataclasses.replace(layout, station_weight=0.0, attitude_weight=0.0)
     with pytest.raises(DatumError, match="rotation about X"):
         check_layout(nothing)
+    fisheye = dataclasses.replace(layout.interior, projection=Equidistant())
+    with pytest.raises(BlockError, match="this one is equidistant"):
+        check_layout(dataclasses.replace(layout, interior=fisheye))
     check_layout(layout)

@@ -69,7 +69,7 @@ def test_every_model_is_imaged_as_project_does(name):
 
 
 def _imaged(interior, exterior, point):
-    return project(interior, exterior, point), interior.valid(project_ideal(interior.c, exterior, point))
+    return project(interior, exterior, point), interior.valid(project_ideal(interior, exterior, point))
 
 
 def _frame(x: float, y: float) -> np.ndarray:

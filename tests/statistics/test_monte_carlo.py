@@ -56,7 +56,7 @@ def _expected(nominal) -> np.ndarray:
     interior = nominal.unknowns.interior["one"]
     stretch = jax.jit(jax.vmap(jax.jacfwd(interior.ideal_from_measured)))(np.asarray(nominal.values.xy).T)
     image = np.asarray(r.image) * np.einsum("nij,nij->in", stretch, stretch)
-    return np.concatenate([image.ravel(), r.stations, r.control])
+    return np.concatenate([image.ravel(), r["stations"], r["control_points"]])
 
 
 def _errors(adjusted, truth, nominal) -> np.ndarray:

@@ -112,9 +112,9 @@ def test_normalised_residuals():
     a = adjusted("everything")
     numbers = redundancy_numbers(a, covariance_of("everything"))
     w = normalised_residuals(a, numbers)
-    for v, r, found in zip(a.residuals[:-1], numbers[:-1], w[:-1], strict=True):
+    for v, r, found in zip(*(of.named.values() for of in (a.residuals, numbers, w)), strict=True):
         np.testing.assert_allclose(found, np.asarray(v) / (float(a.sigma0) * np.sqrt(np.asarray(r))), rtol=1e-9)
-    everything = np.concatenate([np.ravel(x) for x in w[:-1]])
+    everything = np.concatenate([np.ravel(x) for x in w.named.values()])
     # Standard normal but for their correlation.
     assert 0.9 < np.std(everything) < 1.1
     assert np.abs(everything).max() < 4.5
@@ -123,6 +123,7 @@ def test_normalised_residuals():
 def test_observations_that_nothing_checks_have_no_normalised_residual():
     a = adjusted("inner")
     numbers = redundancy_numbers(a, covariance_of("inner"))
-    unchecked = numbers._replace(distances=np.zeros(3))
-    assert np.isnan(normalised_residuals(a, unchecked).distances).all()
-    assert np.isfinite(normalised_residuals(a, numbers).distances).all()
+    (place,) = (k for k, name in enumerate(numbers.numbers.names) if name == "distances")
+    unchecked = eqx.tree_at(lambda r: r.numbers.others[place], numbers, np.zeros(3))
+    assert np.isnan(normalised_residuals(a, unchecked)["distances"]).all()
+    assert np.isfinite(normalised_residuals(a, numbers)["distances"]).all()

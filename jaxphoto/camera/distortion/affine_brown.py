@@ -1,11 +1,12 @@
 """Brown's distortion after an affinity of the image axes, in the measured coordinate, subtracted."""
 
+from collections.abc import Mapping
 from typing import ClassVar, Literal
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxphoto.camera.distortion.base import AbstractDistortion, decentring, radial
+from jaxphoto.camera.distortion.base import AbstractDistortion, Term, decentring, radial, same_terms
 
 
 class AffineBrown(AbstractDistortion):
@@ -26,8 +27,11 @@ class AffineBrown(AbstractDistortion):
     b1: Float[Array, ""] | float = 0.0
     b2: Float[Array, ""] | float = 0.0
 
+    name: ClassVar[str] = "affine_brown"
     domain: ClassVar[Literal["measured", "ideal"]] = "measured"
     coefficients: ClassVar[tuple[str, ...]] = ("k1", "k2", "k3", "p1", "p2", "b1", "b2")
+    rare: ClassVar[tuple[str, ...]] = ("b1", "b2")
+    terms: ClassVar[Mapping[str, Term] | None] = same_terms(*coefficients)
 
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
         """Ideal coordinate (mm) of a measured one, both reduced to the principal point."""

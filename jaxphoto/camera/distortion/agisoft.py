@@ -1,11 +1,11 @@
 """Agisoft's frame camera: polynomial from ideal to measured, normalised, with affinity and skew."""
 
+from collections.abc import Mapping
 from typing import ClassVar, Literal
 
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxphoto.camera.distortion.base import AbstractDistortion, decentring, radial
+from jaxphoto.camera.distortion.base import AbstractDistortion, Term, decentring, radial, same_terms
 from jaxphoto.camera.distortion.open_cv import affine_up
 
 
@@ -33,14 +33,21 @@ class Agisoft(AbstractDistortion):
     b1: Float[Array, ""] | float = 0.0
     b2: Float[Array, ""] | float = 0.0
 
+    name: ClassVar[str] = "agisoft"
     domain: ClassVar[Literal["measured", "ideal"]] = "ideal"
     coefficients: ClassVar[tuple[str, ...]] = ("k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4", "b1", "b2")
+    rare: ClassVar[tuple[str, ...]] = ("k4", "p3", "p4", "b1", "b2")
+    # y runs down: what is odd in y changes its sign.
+    terms: ClassVar[Mapping[str, Term] | None] = {
+        **same_terms("k1", "k2", "k3", "k4", "p1", "p3", "p4", "b1"),
+        **{"p2": Term("p2", -1.0), "b2": Term("b2", -1.0)},
+    }
     normalised: ClassVar[bool] = True
 
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
         """Measured coordinate of an ideal one, both reduced to the principal point and divided by c, y up."""
-        down = xy * jnp.array([1.0, -1.0])
-        r2 = down[0] * down[0] + down[1] * down[1]
+        x, y = xy[0], -xy[1]
+        r2 = x * x + y * y
         q = 1 + radial(r2, self.k1, self.k2, self.k3, self.k4)
-        tangential = (1 + radial(r2, self.p3, self.p4)) * decentring(self.p1, self.p2, down)
-        return affine_up(down * q + tangential, self.b1, self.b2)
+        t, (dx, dy) = 1 + radial(r2, self.p3, self.p4), decentring(self.p1, self.p2, (x, y))
+        return affine_up(x * q + t * dx, y * q + t * dy, self.b1, self.b2)

@@ -1,11 +1,12 @@
 """The balanced radial model of close-range metrology, in the ideal coordinate, added."""
 
+from collections.abc import Mapping
 from typing import ClassVar, Literal
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxphoto.camera.distortion.base import AbstractDistortion, decentring
+from jaxphoto.camera.distortion.base import AbstractDistortion, Term, decentring
 
 
 class Balanced(AbstractDistortion):
@@ -28,8 +29,17 @@ class Balanced(AbstractDistortion):
     c2: Float[Array, ""] | float = 0.0
     r0: Float[Array, ""] | float = 0.0
 
+    name: ClassVar[str] = "balanced"
     domain: ClassVar[Literal["measured", "ideal"]] = "ideal"
     coefficients: ClassVar[tuple[str, ...]] = ("a1", "a2", "a3", "b1", "b2", "c1", "c2")
+    constants: ClassVar[Mapping[str, str]] = {"r0_mm": "r0"}
+    rare: ClassVar[tuple[str, ...]] = ("c1", "c2")
+    terms: ClassVar[Mapping[str, Term] | None] = {
+        **{f"k{i}": Term(f"a{i}", 1.0, 2 * i) for i in (1, 2, 3)},
+        **{f"p{i}": Term(f"b{i}", 1.0, 1) for i in (1, 2)},
+        **{f"b{i}": Term(f"c{i}") for i in (1, 2)},
+    }
+    affinity_added: ClassVar[bool] = True
 
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
         """Measured coordinate (mm) of an ideal one, both reduced to the principal point."""

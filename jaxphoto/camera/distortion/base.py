@@ -7,12 +7,16 @@ type (docs/conventions.md); `InteriorOrientation` takes millimetres to any of th
 """
 
 import abc
-from typing import ClassVar, Literal
+from collections.abc import Mapping
+from typing import ClassVar, Literal, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
+
+from jaxphoto.camera.declared import Declared
+from jaxphoto.camera.sensor import Sensor
 
 # Newton's steps at most; a model inside its monotone range needs 4 to 8.
 _STEPS = 50
@@ -20,21 +24,53 @@ _STEPS = 50
 _PROBES = 64
 
 
-class AbstractDistortion(eqx.Module):
+class Term(NamedTuple):
+    """A coefficient of a model: the common term (`AbstractDistortion.terms`) is `sign * coefficient * c^power`."""
+
+    field: str
+    sign: float = 1.0
+    power: int = 0
+
+
+def same_terms(*names: str) -> dict[str, Term]:
+    """Terms that are coefficients of the same name, sign and unit."""
+    return {name: Term(name) for name in names}
+
+
+class AbstractDistortion(Declared):
     """A lens distortion; its fields are scalars, its `domain` says where the polynomial lives.
 
     `domain == "measured"`: `closed_form` takes measured to ideal coordinates (the photogrammetric habit).
     `domain == "ideal"`: it takes ideal to measured ones, and residuals are those of measured coordinates.
     `normalised`: coordinates here are those in mm divided by the principal distance (tangents of the field angle), as
     in computer vision, so that coefficients have no unit.
-    `coefficients` names the fields an adjustment may estimate; other fields are constants of the model. `scales` names
-    coefficients that change the scale of the image as the principal distance does: never both can be free.
+
+    What a model is called and made of is declared here and nowhere else (docs/extending.md): `name`,
+    `coefficients`, `constants` and `choices` as in `Declared`; `rare` names coefficients that most cameras do without
+    (affinity, rational and highest terms); `scales` those that change the scale of the image as the principal distance
+    does: never both can be free.
+
+    `terms` makes exact conversions possible (`camera.equivalence`): which coefficients are the terms of one of its two
+    polynomials; None where the model is neither. `affinity_added` says that its affinity acts on the coordinate that
+    its other terms see; in other models it acts before or after them.
     """
 
     domain: eqx.AbstractClassVar[Literal["measured", "ideal"]]
-    coefficients: eqx.AbstractClassVar[tuple[str, ...]]
+    rare: ClassVar[tuple[str, ...]] = ()
     scales: ClassVar[tuple[str, ...]] = ()
     normalised: ClassVar[bool] = False
+    terms: ClassVar[Mapping[str, Term] | None] = None
+    affinity_added: ClassVar[bool] = False
+
+    @classmethod
+    def plain(cls, sensor: Sensor) -> "AbstractDistortion":
+        """The model without distortion, for a camera with that sensor: lengths that it needs are chosen here."""
+        return cls()
+
+    @classmethod
+    def usual(cls) -> tuple[str, ...]:
+        """The coefficients that most cameras need: all but `rare` and `scales`."""
+        return tuple(name for name in cls.coefficients if name not in (*cls.rare, *cls.scales))
 
     @abc.abstractmethod
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
@@ -111,7 +147,7 @@ def radial(r2: Float[Array, ""], *k) -> Float[Array, ""]:
     return total
 
 
-def decentring(p1, p2, xy: Float[Array, "2"]) -> Float[Array, "2"]:
+def decentring(p1, p2, xy: Float[Array, "2"] | tuple[Array, Array]) -> Float[Array, "2"]:
     """Decentring distortion P1 (r^2 + 2 x^2) + 2 P2 x y, 2 P1 x y + P2 (r^2 + 2 y^2)."""
     x, y = xy
     r2 = x * x + y * y

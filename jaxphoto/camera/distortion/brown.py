@@ -1,11 +1,12 @@
 """Brown's distortion with affinity and shear, in the measured coordinate, subtracted."""
 
+from collections.abc import Mapping
 from typing import ClassVar, Literal
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxphoto.camera.distortion.base import AbstractDistortion, decentring, radial
+from jaxphoto.camera.distortion.base import AbstractDistortion, Term, decentring, radial, same_terms
 
 
 class Brown(AbstractDistortion):
@@ -15,7 +16,8 @@ class Brown(AbstractDistortion):
         delta_y = y (K1 r^2 + K2 r^4 + K3 r^6) + 2 P1 x y + P2 (r^2 + 2 y^2)
 
     Units: K1 mm^-2, K2 mm^-4, K3 mm^-6, P1 and P2 mm^-1, b1 and b2 none. K1 < 0 is a barrel.
-    Source: Brown (1971), Fraser (1997); the sense of papers 000, 002 and 004.
+    Source: Brown (1971); the sense of papers 000, 002 and 004. Fraser (1997) adds the correction that is subtracted
+    here: with his coefficients, change every sign.
     """
 
     k1: Float[Array, ""] | float = 0.0
@@ -26,8 +28,12 @@ class Brown(AbstractDistortion):
     b1: Float[Array, ""] | float = 0.0
     b2: Float[Array, ""] | float = 0.0
 
+    name: ClassVar[str] = "brown"
     domain: ClassVar[Literal["measured", "ideal"]] = "measured"
     coefficients: ClassVar[tuple[str, ...]] = ("k1", "k2", "k3", "p1", "p2", "b1", "b2")
+    rare: ClassVar[tuple[str, ...]] = ("b1", "b2")
+    terms: ClassVar[Mapping[str, Term] | None] = same_terms(*coefficients)
+    affinity_added: ClassVar[bool] = True
 
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
         """Ideal coordinate (mm) of a measured one, both reduced to the principal point."""

@@ -1,11 +1,13 @@
 """Brown's fourteen additional parameters for aerial cameras, in the measured coordinate, subtracted."""
 
+from collections.abc import Mapping
 from typing import ClassVar, Literal
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxphoto.camera.distortion.base import AbstractDistortion, check_positive
+from jaxphoto.camera.sensor import Sensor
 
 
 class Brown14(AbstractDistortion):
@@ -40,8 +42,15 @@ class Brown14(AbstractDistortion):
     a13: Float[Array, ""] | float = 0.0
     a14: Float[Array, ""] | float = 0.0
 
+    name: ClassVar[str] = "brown14"
     domain: ClassVar[Literal["measured", "ideal"]] = "measured"
     coefficients: ClassVar[tuple[str, ...]] = tuple(f"a{i}" for i in range(1, 15))
+    constants: ClassVar[Mapping[str, str]] = {"f_mm": "f"}
+
+    @classmethod
+    def plain(cls, sensor: Sensor) -> "Brown14":
+        """All coefficients 0, F being the longer side, which is of the size of most principal distances."""
+        return cls(f=max(sensor.width_mm, sensor.height_mm))
 
     def __check_init__(self) -> None:
         check_positive(self, "f", "the scale of a13")

@@ -1,11 +1,12 @@
 """The radial distortion of Bundler, OpenCV and COLMAP: from ideal to measured, in units of the principal distance."""
 
+from collections.abc import Mapping
 from typing import ClassVar, Literal
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxphoto.camera.distortion.base import AbstractDistortion, radial
+from jaxphoto.camera.distortion.base import AbstractDistortion, Term, radial, same_terms
 
 
 class BundlerRadial(AbstractDistortion):
@@ -22,8 +23,10 @@ class BundlerRadial(AbstractDistortion):
     k1: Float[Array, ""] | float = 0.0
     k2: Float[Array, ""] | float = 0.0
 
+    name: ClassVar[str] = "bundler_radial"
     domain: ClassVar[Literal["measured", "ideal"]] = "ideal"
     coefficients: ClassVar[tuple[str, ...]] = ("k1", "k2")
+    terms: ClassVar[Mapping[str, Term] | None] = same_terms(*coefficients)
     normalised: ClassVar[bool] = True
 
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:

@@ -1,11 +1,13 @@
 """Ebner's twelve additional parameters, in the measured coordinate, subtracted."""
 
+from collections.abc import Mapping
 from typing import ClassVar, Literal
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxphoto.camera.distortion.base import AbstractDistortion, check_positive
+from jaxphoto.camera.sensor import Sensor
 
 
 class Ebner(AbstractDistortion):
@@ -39,8 +41,15 @@ class Ebner(AbstractDistortion):
     b11: Float[Array, ""] | float = 0.0
     b12: Float[Array, ""] | float = 0.0
 
+    name: ClassVar[str] = "ebner"
     domain: ClassVar[Literal["measured", "ideal"]] = "measured"
     coefficients: ClassVar[tuple[str, ...]] = tuple(f"b{i}" for i in range(1, 13))
+    constants: ClassVar[Mapping[str, str]] = {"b_mm": "b"}
+
+    @classmethod
+    def plain(cls, sensor: Sensor) -> "Ebner":
+        """All coefficients 0, on points that reach the ends of the longer side."""
+        return cls(b=max(sensor.width_mm, sensor.height_mm) / 2)
 
     def __check_init__(self) -> None:
         check_positive(self, "b", "the spacing of its points")

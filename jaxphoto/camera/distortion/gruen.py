@@ -1,11 +1,13 @@
 """Gruen's forty-four additional parameters, in the measured coordinate, subtracted."""
 
+from collections.abc import Mapping
 from typing import ClassVar, Literal
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxphoto.camera.distortion.base import AbstractDistortion, check_positive
+from jaxphoto.camera.sensor import Sensor
 
 
 class Gruen(AbstractDistortion):
@@ -76,6 +78,7 @@ class Gruen(AbstractDistortion):
     b54: Float[Array, ""] | float = 0.0
     b55: Float[Array, ""] | float = 0.0
 
+    name: ClassVar[str] = "gruen"
     domain: ClassVar[Literal["measured", "ideal"]] = "measured"
     # fmt: off
     coefficients: ClassVar[tuple[str, ...]] = (
@@ -91,6 +94,14 @@ class Gruen(AbstractDistortion):
         "b51", "b52", "b53", "b54", "b55",
     )
     # fmt: on
+    constants: ClassVar[Mapping[str, str]] = {"b_mm": "b"}
+    # Beyond the third degree: with all 44, neighbouring targets would be fitted one by one.
+    rare: ClassVar[tuple[str, ...]] = tuple(n for n in coefficients if int(n[1]) + int(n[2]) - 2 > 3)
+
+    @classmethod
+    def plain(cls, sensor: Sensor) -> "Gruen":
+        """All coefficients 0, on points that reach the ends of the longer side."""
+        return cls(b=max(sensor.width_mm, sensor.height_mm) / 2)
 
     def __check_init__(self) -> None:
         check_positive(self, "b", "twice the spacing of its points")

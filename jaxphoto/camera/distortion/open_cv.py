@@ -1,11 +1,12 @@
 """OpenCV's rational lens model with unequal focal lengths and skew: from ideal to measured, normalised."""
 
+from collections.abc import Mapping
 from typing import ClassVar, Literal
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxphoto.camera.distortion.base import AbstractDistortion, decentring, radial
+from jaxphoto.camera.distortion.base import AbstractDistortion, Term, decentring, radial, same_terms
 
 
 class OpenCv(AbstractDistortion):
@@ -35,19 +36,27 @@ class OpenCv(AbstractDistortion):
     b1: Float[Array, ""] | float = 0.0
     b2: Float[Array, ""] | float = 0.0
 
+    name: ClassVar[str] = "opencv"
     domain: ClassVar[Literal["measured", "ideal"]] = "ideal"
     coefficients: ClassVar[tuple[str, ...]] = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "b1", "b2")
+    rare: ClassVar[tuple[str, ...]] = ("k4", "k5", "k6", "b1", "b2")
+    # y runs down: what is odd in y changes its sign.
+    terms: ClassVar[Mapping[str, Term] | None] = {
+        **same_terms("k1", "k2", "k3"),
+        **{f"q{i}": Term(f"k{i + 3}") for i in (1, 2, 3)},
+        **{"p1": Term("p2"), "p2": Term("p1", -1.0), "b1": Term("b1"), "b2": Term("b2", -1.0)},
+    }
     normalised: ClassVar[bool] = True
 
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
         """Measured coordinate of an ideal one, both reduced to the principal point and divided by c, y up."""
-        down = xy * jnp.array([1.0, -1.0])
-        r2 = down[0] * down[0] + down[1] * down[1]
+        x, y = xy[0], -xy[1]
+        r2 = x * x + y * y
         q = (1 + radial(r2, self.k1, self.k2, self.k3)) / (1 + radial(r2, self.k4, self.k5, self.k6))
-        return affine_up(down * q + decentring(self.p2, self.p1, down), self.b1, self.b2)
+        dx, dy = decentring(self.p2, self.p1, (x, y))
+        return affine_up(x * q + dx, y * q + dy, self.b1, self.b2)
 
 
-def affine_up(down: Float[Array, "2"], b1, b2) -> Float[Array, "2"]:
+def affine_up(u: Float[Array, ""], v: Float[Array, ""], b1, b2) -> Float[Array, "2"]:
     """(u + b1 u + b2 v, v) of a coordinate (u, v) whose v runs down, given with y up."""
-    u, v = down
     return jnp.stack([u + b1 * u + b2 * v, -v])

@@ -1,11 +1,12 @@
 """Radial distortion about a principal point of symmetry that is not the principal point, subtracted."""
 
+from collections.abc import Mapping
 from typing import ClassVar, Literal
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxphoto.camera.distortion.base import AbstractDistortion, radial
+from jaxphoto.camera.distortion.base import AbstractDistortion, Term, radial, same_terms
 
 
 class PpsRadial(AbstractDistortion):
@@ -28,8 +29,10 @@ class PpsRadial(AbstractDistortion):
     pps_x: Float[Array, ""] | float = 0.0
     pps_y: Float[Array, ""] | float = 0.0
 
+    name: ClassVar[str] = "pps_radial"
     domain: ClassVar[Literal["measured", "ideal"]] = "measured"
     coefficients: ClassVar[tuple[str, ...]] = ("k1", "k2", "k3", "pps_x", "pps_y")
+    terms: ClassVar[Mapping[str, Term] | None] = same_terms("k1", "k2", "k3")
 
     @property
     def symmetry_point(self) -> Float[Array, "2"]:
@@ -38,6 +41,6 @@ class PpsRadial(AbstractDistortion):
 
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
         """Ideal coordinate (mm) of a measured one, both reduced to the principal point of autocollimation."""
-        x, y = xy - self.symmetry_point
+        x, y = xy[0] - self.pps_x, xy[1] - self.pps_y
         dr = radial(x * x + y * y, self.k1, self.k2, self.k3)
         return jnp.stack([xy[0] - x * dr, xy[1] - y * dr])

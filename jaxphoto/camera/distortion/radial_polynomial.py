@@ -1,11 +1,12 @@
 """The radial polynomial of odd degree, in the measured coordinate, added."""
 
+from collections.abc import Mapping
 from typing import ClassVar, Literal
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxphoto.camera.distortion.base import AbstractDistortion, radial
+from jaxphoto.camera.distortion.base import AbstractDistortion, Term, radial
 
 
 class RadialPolynomial(AbstractDistortion):
@@ -24,8 +25,10 @@ class RadialPolynomial(AbstractDistortion):
     k2: Float[Array, ""] | float = 0.0
     k3: Float[Array, ""] | float = 0.0
 
+    name: ClassVar[str] = "radial"
     domain: ClassVar[Literal["measured", "ideal"]] = "measured"
     coefficients: ClassVar[tuple[str, ...]] = ("k1", "k2", "k3")
+    terms: ClassVar[Mapping[str, Term] | None] = {name: Term(name, -1.0) for name in ("k1", "k2", "k3")}
 
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
         """Ideal coordinate (mm) of a measured one, both reduced to the principal point."""

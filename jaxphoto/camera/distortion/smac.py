@@ -1,11 +1,12 @@
 """SMAC, the USGS Simultaneous Multi-frame Analytical Calibration model, in the measured coordinate."""
 
+from collections.abc import Mapping
 from typing import ClassVar, Literal
 
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from jaxphoto.camera.distortion.base import AbstractDistortion, decentring
+from jaxphoto.camera.distortion.base import AbstractDistortion, Term, decentring, same_terms
 
 
 class Smac(AbstractDistortion):
@@ -31,9 +32,14 @@ class Smac(AbstractDistortion):
     r0: Float[Array, ""] | float = 0.0
     sign: Literal["subtract", "add"] = eqx.field(static=True, default="subtract")
 
+    name: ClassVar[str] = "smac"
     domain: ClassVar[Literal["measured", "ideal"]] = "measured"
     scales: ClassVar[tuple[str, ...]] = ("k0",)
     coefficients: ClassVar[tuple[str, ...]] = ("k0", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
+    constants: ClassVar[Mapping[str, str]] = {"r0_mm": "r0"}
+    choices: ClassVar[Mapping[str, tuple[str, ...]]] = {"sign": ("subtract", "add")}
+    rare: ClassVar[tuple[str, ...]] = ("k4", "p3", "p4")
+    terms: ClassVar[Mapping[str, Term] | None] = same_terms("k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
 
     def __check_init__(self) -> None:
         if self.sign not in ("subtract", "add"):

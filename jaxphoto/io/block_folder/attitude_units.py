@@ -3,10 +3,10 @@
 import numpy as np
 from jaxtyping import Float
 
-from jaxphoto.block import Rows
 from jaxphoto.errors import InputError
 from jaxphoto.io.block_folder.images import Images
-from jaxphoto.io.tables import Table
+from jaxphoto.io.text_tables import Table
+from jaxphoto.observations import StationRows
 
 # Means of the cosine between yaw and course: the crab angle leaves more than the first, and both readings are told
 # apart below the second.
@@ -14,7 +14,7 @@ _ALIKE, _UNLIKE = 0.8, 0.7
 _FEWEST = 4
 
 
-def check_attitude_units(table: Table, stations: Rows, images: Images) -> None:
+def check_attitude_units(table: Table, stations: StationRows, images: Images) -> None:
     """`check_yaw` of the attitudes as attitudes.csv gives them, against the flight from image to image of a strip."""
     yaw = np.full(len(images.ids), np.nan)
     yaw[images.find(table)] = table.numbers("yaw_deg")

@@ -1,31 +1,37 @@
 """One [cameras.X] table of block.toml: sensor, starting interior orientation and what of it is free."""
 
 import dataclasses
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import numpy as np
 
 from jaxphoto.arrays import on_device
 from jaxphoto.camera import (
-    DISTORTIONS,
+    AbstractDistortion,
+    AbstractProjection,
     InteriorOrientation,
+    Perspective,
     Sensor,
-    Smac,
     constant_names,
     get_parameter,
-    needed_constants,
+    model_keys,
     parameter_names,
     set_parameter,
 )
-from jaxphoto.errors import BlockError
+from jaxphoto.camera.declared import Declared
+from jaxphoto.errors import BlockError, InputError
 from jaxphoto.io.block_folder.section import Section
 from jaxphoto.unknowns import FIXED, Prior, Weighted
 
+_KEYS = ("width_px", "height_px", "pixel_mm", "distortion", "projection", "residuals")
 # A principal distance beyond these multiples of the format's diagonal is in another unit than millimetres.
 _LONGEST, _SHORTEST = 20.0, 0.05
 # Pixels of known sensors are 0.5 to 50 micrometres.
 _PIXEL_MM = (2e-4, 0.1)
+
+Part = TypeVar("Part", bound=Declared)
 
 
 class Camera(NamedTuple):
@@ -38,11 +44,13 @@ class Camera(NamedTuple):
 
 def read_camera(section: Section) -> Camera:
     """The camera that a [cameras.X] table describes. Raises InputError for what cannot be one."""
-    section.known("width_px", "height_px", "pixel_mm", "distortion", "sign", "residuals", "interior", "unknowns")
+    distortion = _kind(section, "distortion", AbstractDistortion.called)
+    projection = _kind(section, "projection", AbstractProjection.called, Perspective.name)
+    section.known(*_KEYS, *distortion.choices, *projection.choices, "interior", "unknowns")
     sensor = Sensor(section.count("width_px"), section.count("height_px"), section.positive("pixel_mm"))
     if not _PIXEL_MM[0] <= sensor.pixel_mm <= _PIXEL_MM[1]:
         raise section.error("pixel_mm", f"a pixel of {sensor.pixel_mm:g} mm cannot be; give its size in millimetres")
-    empty = _empty_interior(section)
+    empty = _empty_interior(section, distortion, projection)
     interior = _read_interior(section.section("interior"), empty, sensor)
     status = section.section("unknowns")
     status.known(*parameter_names(interior))
@@ -55,22 +63,12 @@ def read_camera(section: Section) -> Camera:
 def camera_section(camera: Camera) -> dict[str, Any]:
     """The [cameras.X] table that `read_camera` reads as `camera`."""
     sensor, interior, priors = camera
-    distortion = interior.distortion
-    name = next(key for key, kind in DISTORTIONS.items() if kind is type(distortion))
-    written: dict[str, Any] = {
-        "width_px": sensor.width_px,
-        "height_px": sensor.height_px,
-        "pixel_mm": sensor.pixel_mm,
-        "distortion": name,
-    }
-    if isinstance(distortion, Smac):
-        written["sign"] = distortion.sign
+    written: dict[str, Any] = {"width_px": sensor.width_px, "height_px": sensor.height_px, "pixel_mm": sensor.pixel_mm}
+    written |= model_keys(interior)
     if interior.residuals != "model":
         written["residuals"] = interior.residuals
     names = parameter_names(interior)
-    constants = {name: getattr(distortion, field) for name, field in constant_names(type(distortion)).items()}
-    written["interior"] = {name: float(get_parameter(interior, name)) for name in names}
-    written["interior"] |= {name: float(value) for name, value in constants.items()}
+    written["interior"] = {n: float(get_parameter(interior, n)) for n in (*names, *constant_names(interior))}
     written["unknowns"] = {name: status(get_parameter(priors, name), get_parameter(interior, name)) for name in names}
     return written
 
@@ -81,44 +79,50 @@ def status(prior: Any, start, scale: float = 1.0) -> str | dict[str, Any]:
         return prior.value
     if not isinstance(prior, Weighted):
         raise BlockError(f"{prior!r} is no prior; use FREE, FIXED or Weighted(value, sigma)")
-    written: dict[str, Any] = {"sigma": (np.asarray(prior.sigma) / scale).tolist()}
+    if prior.covariance is None:
+        written: dict[str, Any] = {"sigma": (np.asarray(prior.sigma) / scale).tolist()}
+    else:
+        written = {"covariance": (np.asarray(prior.covariance) / scale**2).tolist()}
     if not np.array_equal(np.asarray(prior.value), np.asarray(start)):
         written["value"] = (np.asarray(prior.value) / scale).tolist()
     return written
 
 
-def _empty_interior(section: Section) -> InteriorOrientation:
-    residuals = section.text("residuals", "model")
-    if residuals not in ("model", "measured"):
-        raise section.error("residuals", f'{residuals!r} is neither "model" nor "measured"; choose one of them')
-    return dataclasses.replace(_empty_model(section), residuals=residuals)  # type: ignore[arg-type]
+def _kind(section: Section, key: str, called: Callable[[str], type[Part]], usual: str | None = None) -> type[Part]:
+    name = section.text(key, usual)
+    try:
+        return called(name)
+    except InputError as error:
+        raise section.error(key, str(error)) from None
 
 
-def _empty_model(section: Section) -> InteriorOrientation:
-    model = section.text("distortion")
-    if model not in DISTORTIONS:
-        known = ", ".join(DISTORTIONS)
-        raise section.error("distortion", f"no distortion model is called {model!r}; choose one of {known}")
-    kind = DISTORTIONS[model]
-    if kind is not Smac:
-        if "sign" in section:
-            raise section.error("sign", f"the model {model} has its sign by definition; remove the key")
-        values = section.section("interior")
-        constants = {field: values.positive(name) for name, field in needed_constants(kind).items()}
-        return _as_arrays(InteriorOrientation(0.0, 0.0, 0.0, kind(**constants)))
-    sign = section.text("sign", "subtract")
-    if sign not in ("subtract", "add"):
-        raise section.error("sign", f'{sign!r} is neither "subtract" nor "add"; choose one of them')
-    return _as_arrays(InteriorOrientation(0.0, 0.0, 0.0, Smac(sign=sign)))  # type: ignore[arg-type]
+def _empty_interior(
+    section: Section, distortion: type[AbstractDistortion], projection: type[AbstractProjection]
+) -> InteriorOrientation:
+    residuals = _one_of(section, "residuals", ("model", "measured"), "model")
+    parts = _empty(section, distortion), _empty(section, projection)
+    empty = InteriorOrientation(0.0, 0.0, 0.0, parts[0], residuals, parts[1])  # type: ignore[arg-type]
+    return jax.tree.map(on_device, empty)
 
 
-def _as_arrays(interior: InteriorOrientation) -> InteriorOrientation:
-    return jax.tree.map(on_device, interior)
+def _empty(section: Section, kind: type[Part]) -> Part:
+    """A model with zeros for numbers, but for the constants that it needs."""
+    values = section.section("interior")
+    usual: dict[str, Any] = {f.name: f.default for f in dataclasses.fields(kind)}
+    chosen = {key: _one_of(section, key, words, usual[key]) for key, words in kind.choices.items()}
+    return kind(**{field: values.positive(name) for name, field in kind.needed().items()}, **chosen)
+
+
+def _one_of(section: Section, key: str, words: tuple[str, ...], usual: str) -> str:
+    word = section.text(key, usual)
+    if word not in words:
+        known = " nor ".join(f'"{w}"' for w in words)
+        raise section.error(key, f"{word!r} is neither {known}; choose one of them")
+    return word
 
 
 def _read_interior(section: Section, empty: InteriorOrientation, sensor: Sensor) -> InteriorOrientation:
-    names = (*parameter_names(empty), *constant_names(type(empty.distortion)))
-    section.known(*names)
+    section.known(*parameter_names(empty), *constant_names(empty))
     interior = empty
     for name in section:
         interior = set_parameter(interior, name, on_device(section.number(name)))

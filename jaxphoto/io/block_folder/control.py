@@ -6,13 +6,13 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxphoto.arrays import on_device
-from jaxphoto.block import AXES, Rows
 from jaxphoto.errors import InputError
-from jaxphoto.io.block_folder.image_points import Points
+from jaxphoto.io.block_folder.image_points import ObservedPoints
 from jaxphoto.io.block_folder.images import refuse_duplicates
-from jaxphoto.io.block_folder.layout import SIGMA_XYZ, XYZ
 from jaxphoto.io.block_folder.settings import Settings
-from jaxphoto.io.tables import Line, Table
+from jaxphoto.io.block_folder.table_layout import SIGMA_XYZ, XYZ
+from jaxphoto.io.text_tables import Line, Table
+from jaxphoto.observations import AXES, ControlRows
 
 ROLES = ("control", "fixed", "check")
 
@@ -20,15 +20,15 @@ ROLES = ("control", "fixed", "check")
 class Control(NamedTuple):
     """Object coordinates by role, starting coordinates (points, 3) and for which points all three are known."""
 
-    control: Rows
-    fixed: Rows
-    check: Rows
+    control: ControlRows
+    fixed: ControlRows
+    check: ControlRows
     start: np.ndarray
     known: np.ndarray
     held: np.ndarray
 
 
-def read_control(table: Table, approximations: Table, points: Points, settings: Settings) -> Control:
+def read_control(table: Table, approximations: Table, points: ObservedPoints, settings: Settings) -> Control:
     """Control of each role; a point that no image shows is dropped with a UserWarning.
 
     Starting coordinates are those of control and fixed points, axis by axis, then those of object_points.csv.
@@ -66,7 +66,7 @@ def default_sigma(table: Table, line: Line, column: str, settings: Settings, *ke
     )
 
 
-def _find(table: Table, points: Points) -> np.ndarray:
+def _find(table: Table, points: ObservedPoints) -> np.ndarray:
     """The index of each line's point, -1 (and a warning) where no image shows it."""
     named = table.ids("point")
     index = points.find(named)
@@ -81,7 +81,7 @@ def _find(table: Table, points: Points) -> np.ndarray:
     return index
 
 
-def _read_rows(table: Table, point: np.ndarray, settings: Settings) -> tuple[np.ndarray, Rows]:
+def _read_rows(table: Table, point: np.ndarray, settings: Settings) -> tuple[np.ndarray, ControlRows]:
     """The role of each row and the rows, one per given coordinate."""
     role = np.where(table.text("role") == "", "control", table.text("role"))
     for line in np.flatnonzero(~np.isin(role, ROLES)):
@@ -104,11 +104,11 @@ def _read_rows(table: Table, point: np.ndarray, settings: Settings) -> tuple[np.
             sigma[i, a] = default_sigma(table, i, SIGMA_XYZ[a], settings, *keys)
     # A check coordinate needs no sigma: it never enters an adjustment.
     sigma = np.nan_to_num(sigma)
-    rows = Rows(point[lines], axes, on_device(value[lines, axes]), on_device(sigma[lines, axes]))
+    rows = ControlRows(point[lines], axes, on_device(value[lines, axes]), on_device(sigma[lines, axes]))
     return role[lines], rows
 
 
-def check_datum_points(over: object, points: Points, file: str) -> None:
+def check_datum_points(over: object, points: ObservedPoints, file: str) -> None:
     """Raise InputError for a datum over points that no image shows."""
     if isinstance(over, tuple):
         for name, index in zip(over, points.find(np.array(over, object)), strict=True):

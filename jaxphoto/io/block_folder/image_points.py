@@ -6,18 +6,18 @@ import numpy as np
 import pandas as pd
 
 from jaxphoto.arrays import on_device
-from jaxphoto.block import ImageRows
 from jaxphoto.camera import Sensor
 from jaxphoto.errors import BlockError, InputError
 from jaxphoto.io.block_folder.images import Images, refuse_duplicates
 from jaxphoto.io.block_folder.settings import Settings
-from jaxphoto.io.tables import Table
+from jaxphoto.io.text_tables import Table
+from jaxphoto.observations import ImageRows
 
 # How far outside the format, in parts of its half, a measurement may lie: beyond, it is in another unit.
 _OUTSIDE = 1.5
 
 
-class Points(NamedTuple):
+class ObservedPoints(NamedTuple):
     """The observed points and their rows; `lines` is the line of the table each row comes from."""
 
     table: Table
@@ -30,7 +30,7 @@ class Points(NamedTuple):
         return pd.Index(self.ids).get_indexer(pd.Index(ids))
 
 
-def read_image_points(table: Table, images: Images, settings: Settings) -> Points:
+def read_image_points(table: Table, images: Images, settings: Settings) -> ObservedPoints:
     """The measurements, sorted by point and image. Raises InputError and BlockError (see `tests/io`)."""
     if not len(table):
         raise BlockError(f"{table.file}: there are no image points; list what was measured in the images")
@@ -46,10 +46,10 @@ def read_image_points(table: Table, images: Images, settings: Settings) -> Point
     point, ids = pd.factorize(named)
     order = np.lexsort((image, point))
     rows = ImageRows(image[order], point[order], on_device(xy[order]), on_device(sigma[order]))
-    return Points(table, tuple(ids), rows, order)
+    return ObservedPoints(table, tuple(ids), rows, order)
 
 
-def check_rays(points: Points, images: Images, held: np.ndarray) -> None:
+def check_rays(points: ObservedPoints, images: Images, held: np.ndarray) -> None:
     """Raise BlockError for an image with fewer than 3 points, or a point of one ray that no control holds.
 
     `held` (points,) is true where a control coordinate or a fixed one is known.

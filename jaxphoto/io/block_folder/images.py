@@ -10,9 +10,9 @@ import pandas as pd
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import BlockError
-from jaxphoto.io.block_folder.layout import ANGLES, XYZ
 from jaxphoto.io.block_folder.settings import Settings
-from jaxphoto.io.tables import Table
+from jaxphoto.io.block_folder.table_layout import ANGLES, XYZ
+from jaxphoto.io.text_tables import Table
 from jaxphoto.unknowns import FIXED
 
 _from_angles = eqx.filter_jit(ExteriorOrientation.from_angles)
@@ -26,6 +26,9 @@ class Images(NamedTuple):
     cameras: tuple[str, ...]
     strips: tuple[str, ...]
     times: np.ndarray
+    """Seconds from the mean of the image's strip."""
+    flight_times: np.ndarray
+    """Seconds from the mean of all images."""
     time_known: np.ndarray
     exterior: ExteriorOrientation
     known: np.ndarray
@@ -39,6 +42,11 @@ class Images(NamedTuple):
                 line, f"image {named[line]} is not in {self.table.file}; add it there or delete this row"
             )
         return index
+
+    @property
+    def strips_are_the_flight(self) -> bool:
+        """Whether the times of all strips have one mean, to a nanosecond: one strip, or a file that centred them."""
+        return bool(np.allclose(self.flight_times, self.times, rtol=0.0, atol=1e-9))
 
 
 def read_images(table: Table, settings: Settings) -> Images:
@@ -61,7 +69,15 @@ def read_images(table: Table, settings: Settings) -> Images:
     times = table.numbers("time_s", empty=True)
     exterior, oriented = _exterior(table)
     return Images(
-        table, tuple(ids), tuple(cameras), tuple(strips), _centred(times, strips), ~np.isnan(times), exterior, oriented
+        table,
+        tuple(ids),
+        tuple(cameras),
+        tuple(strips),
+        _centred(times, strips),
+        _centred(times, np.zeros(len(times))),
+        ~np.isnan(times),
+        exterior,
+        oriented,
     )
 
 

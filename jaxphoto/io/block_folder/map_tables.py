@@ -17,8 +17,8 @@ from jaxphoto.block import Frame
 from jaxphoto.errors import BlockError, InputError
 from jaxphoto.georeferencing.map_frame import MapFrame, map_system
 from jaxphoto.io.block_folder.images import check_angles
-from jaxphoto.io.block_folder.layout import ANGLES, ATTITUDE, VELOCITY, XYZ, coordinate_names
-from jaxphoto.io.tables import Table
+from jaxphoto.io.block_folder.table_layout import ANGLES, ATTITUDE, VELOCITY, XYZ, coordinate_names
+from jaxphoto.io.text_tables import Table
 from jaxphoto.io.trajectory import Records
 from jaxphoto.rotation import (
     matrix_from_omega_phi_kappa,

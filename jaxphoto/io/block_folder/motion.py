@@ -5,18 +5,19 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxphoto.arrays import on_device
-from jaxphoto.block import Attitudes, Motion, Rows
+from jaxphoto.block import Motion
 from jaxphoto.georeferencing import Mount
 from jaxphoto.io.block_folder.images import Images
-from jaxphoto.io.block_folder.layout import RATE, VELOCITY
-from jaxphoto.io.tables import Table
+from jaxphoto.io.block_folder.table_layout import RATE, VELOCITY
+from jaxphoto.io.text_tables import Table
+from jaxphoto.observations import Attitudes, StationRows
 from jaxphoto.unknowns import FIXED
 
 
-class Flight(NamedTuple):
+class ObservedFlight(NamedTuple):
     """What is observed of stations, attitudes and motion, and of which images velocity and rate are known."""
 
-    stations: Rows
+    stations: StationRows
     attitudes: Attitudes
     motion: Motion | None
     velocity_known: np.ndarray
@@ -34,7 +35,7 @@ def read_motion(stations: Table, attitudes: Table, images: Images) -> tuple[Moti
 
 
 def check_time_offsets(
-    flight: Flight,
+    flight: ObservedFlight,
     image_mount: tuple[str, ...],
     mounts: dict[str, Mount],
     priors: dict[str, Mount],

@@ -46,6 +46,13 @@ class Section:
             raise self.error(key, f'{value!r} is not text; put it in quotation marks, like "{value}"')
         return value
 
+    def texts(self, key: str) -> tuple[str, ...]:
+        """A list of pieces of text; none where the key is absent."""
+        value = self.values.get(key, [])
+        if not isinstance(value, list) or not all(isinstance(v, str) for v in value):
+            raise self.error(key, f'{value!r} is not a list of text; write it like ["a", "b"]')
+        return tuple(value)
+
     def number(self, key: str, default: float | None = None) -> float:
         """A finite number."""
         value = self._needed(key) if default is None else self.values.get(key, default)
@@ -65,15 +72,18 @@ class Section:
             raise self.error(key, f"{value!r} is not a positive whole number; give one")
         return value
 
-    def vector(self, key: str) -> np.ndarray:
-        """Three finite numbers, zeros where the key is absent."""
-        value = self.values.get(key, [0.0, 0.0, 0.0])
-        if not isinstance(value, list) or len(value) != 3:
-            raise self.error(key, f"{value!r} is not a list of three numbers; write it like [0.0, 0.0, 0.0]")
+    def vector(self, key: str, size: int = 3) -> np.ndarray:
+        """Finite numbers, zeros where the key is absent."""
+        value = self.values.get(key, [0.0] * size)
+        if not isinstance(value, list) or len(value) != size:
+            many = "three" if size == 3 else size
+            raise self.error(key, f"{value!r} is not a list of {many} numbers; write it like {[0.0] * size}")
         return np.array([self._finite(key, v) for v in value])
 
     def prior(self, key: str, start, unit: str = "", scale: float = 1.0) -> Prior | Weighted:
         """`"free"`, `"fixed"` (also where absent) or `{ sigma = ... }`, weighted at `start` unless `value` is given.
+
+        A vector may have `covariance`, the rows of a matrix, in place of `sigma`.
 
         `start` is in jaxphoto's unit, which is the file's times `scale`; `unit` may end the two names (sigma_deg).
         """
@@ -82,15 +92,30 @@ class Section:
             return FREE
         if status == "fixed":
             return FIXED
-        names = {name: [n for n in (name, name + unit) if isinstance(status, dict) and n in status] for name in _KEYS}
-        if not isinstance(status, dict) or not names["sigma"] or set(status) - {n for ns in names.values() for n in ns}:
-            raise self.error(key, f'{status!r} is no status; write "free", "fixed" or {{ sigma{unit} = ... }}')
         shape = np.shape(start)
+        names = {name: [n for n in (name, name + unit) if isinstance(status, dict) and n in status] for name in _KEYS}
+        names["covariance"] = ["covariance"] if isinstance(status, dict) and "covariance" in status and shape else []
+        known = {n for ns in names.values() for n in ns}
+        if not isinstance(status, dict) or bool(names["sigma"]) == bool(names["covariance"]) or set(status) - known:
+            raise self.error(key, f'{status!r} is no status; write "free", "fixed" or {{ sigma{unit} = ... }}')
+        value = self._array(key, status[names["value"][0]], shape) * scale if names["value"] else np.asarray(start)
+        if names["covariance"]:
+            return Weighted(on_device(value), covariance=on_device(self._covariance(key, status, *shape) * scale**2))
         sigma = self._array(key, status[names["sigma"][0]], shape) * scale
         if not np.all(sigma > 0):
             raise self.error(key, f'sigma = {status[names["sigma"][0]]} is not positive; give the true one or "fixed"')
-        value = self._array(key, status[names["value"][0]], shape) * scale if names["value"] else np.asarray(start)
         return Weighted(on_device(value), on_device(sigma))
+
+    def _covariance(self, key: str, status: dict[str, Any], size: int) -> np.ndarray:
+        rows = status["covariance"]
+        if not isinstance(rows, list) or [np.shape(row) for row in rows] != [(size,)] * size:
+            raise self.error(
+                key, f"the covariance is no matrix of {size} x {size}; write {size} lists of {size} numbers"
+            )
+        matrix = np.array([[self._finite(key, v) for v in row] for row in rows])
+        if not np.array_equal(matrix, matrix.T) or not np.all(np.linalg.eigvalsh(matrix) > 0):
+            raise self.error(key, "the covariance is not symmetric and positive definite; correct it, or give sigma")
+        return matrix
 
     def _array(self, key: str, value, shape: tuple[int, ...]) -> np.ndarray:
         values = value if isinstance(value, list) else [value]

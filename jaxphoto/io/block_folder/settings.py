@@ -1,6 +1,7 @@
 """block.toml: title, frame, corrections, trajectory, cameras, default sigmas, mounts, strips, scanner and datum."""
 
 import tomllib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,8 +11,8 @@ from jaxphoto.block import Datum, Frame
 from jaxphoto.errors import InputError
 from jaxphoto.io.block_folder.camera_section import Camera, read_camera
 from jaxphoto.io.block_folder.frame_sections import read_frame
-from jaxphoto.io.block_folder.layout import TOML
 from jaxphoto.io.block_folder.section import Section
+from jaxphoto.io.block_folder.table_layout import LAYOUTS, PLACE, TOML
 from jaxphoto.variants import MODES
 
 _KEYS = (
@@ -26,10 +27,12 @@ _KEYS = (
     "scanner",
     "datum",
     "georeferencing",
+    "observations",
+    "unknowns",
+    "partitions",
 )
 _SIGMAS = (
     "image_mm", "image_px", "control_m", "control_X_m", "control_Y_m", "control_Z_m", "station_m", "attitude_deg",
-    "distance_m",
 )  # fmt: skip
 
 
@@ -49,6 +52,11 @@ class Settings(NamedTuple):
     datum: Datum
     mode: str
     """Of georeferencing: a name of `variants.MODES`."""
+    observations: tuple[str, ...]
+    """Tables of classes that are not jaxphoto's own."""
+    unknowns: Section
+    partitions: tuple[str, ...]
+    """Columns of images.csv that say whose further unknowns are."""
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -61,12 +69,12 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise InputError(f"{path.name}: {error}; correct the TOML there") from None
 
 
-def read_settings(values: dict[str, Any], file: str = TOML) -> Settings:
-    """The settings in the content of block.toml; `file` is what messages call it."""
+def read_settings(values: dict[str, Any], file: str = TOML, sigma_keys: Sequence[str] = ()) -> Settings:
+    """The settings in the content of block.toml; `file` is what messages call it, `sigma_keys` of further tables."""
     top = Section(file, "", values)
     top.known(*_KEYS)
     sigmas = top.section("sigmas")
-    sigmas.known(*_SIGMAS)
+    sigmas.known(*_SIGMAS, *sigma_keys)
     cameras = top.section("cameras")
     if not cameras.values:
         raise top.error("", "there is no camera; add a table [cameras.NAME] with its format and interior orientation")
@@ -85,7 +93,19 @@ def read_settings(values: dict[str, Any], file: str = TOML) -> Settings:
         top.section("scanner"),
         _read_datum(top.section("datum")),
         _read_mode(top.section("georeferencing")),
+        top.texts("observations"),
+        top.section("unknowns"),
+        read_partitions(top),
     )
+
+
+def read_partitions(top: Section) -> tuple[str, ...]:
+    """The names of columns of images.csv. Raises InputError for those that have another meaning."""
+    names, images = top.texts("partitions"), LAYOUTS["images"]
+    for name in names:
+        if name in (*images.columns, *images.optional, *PLACE, "mount", "block", "lidar") or names.count(name) > 1:
+            raise top.error("partitions", f"{name} has a meaning already; give the partition another name")
+    return names
 
 
 def datum_section(datum: Datum) -> dict[str, Any]:
@@ -146,7 +166,7 @@ def _table_lines(path: str, values: dict[str, Any]) -> list[str]:
 
 def _is_table(value: Any) -> bool:
     # A weighted status is the one table that stands on a line of its key.
-    return isinstance(value, dict) and "sigma" not in value
+    return isinstance(value, dict) and not {"sigma", "covariance"} & set(value)
 
 
 def _key(key: str) -> str:

@@ -6,13 +6,14 @@ import numpy as np
 import pandas as pd
 
 from jaxphoto.arrays import on_device
-from jaxphoto.block import Block, SurfaceRows
+from jaxphoto.block import Block
 from jaxphoto.georeferencing import Scanner
 from jaxphoto.io.block_folder.camera_section import status
-from jaxphoto.io.block_folder.image_points import Points
-from jaxphoto.io.block_folder.layout import FOOT, NORMAL, TURN
+from jaxphoto.io.block_folder.image_points import ObservedPoints
 from jaxphoto.io.block_folder.section import Section
-from jaxphoto.io.tables import Table
+from jaxphoto.io.block_folder.table_layout import FOOT, NORMAL, TURN
+from jaxphoto.io.text_tables import Table
+from jaxphoto.observations import SurfaceRows
 
 _DEG = np.pi / 180
 # By how much the length of a normal may miss 1: more than rounding of a few written digits.
@@ -27,7 +28,7 @@ class Surfaces(NamedTuple):
     priors: Scanner | None
 
 
-def read_surfaces(table: Table, section: Section, points: Points) -> Surfaces:
+def read_surfaces(table: Table, section: Section, points: ObservedPoints) -> Surfaces:
     """All of it in the object frame, whatever the frame of other files."""
     section.known("boresight_deg", "boresight", "shifts")
     shifts = section.section("shifts")

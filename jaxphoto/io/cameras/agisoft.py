@@ -14,7 +14,7 @@ import jax
 
 from jaxphoto.arrays import on_device
 from jaxphoto.camera import Agisoft, InteriorOrientation, Sensor
-from jaxphoto.io.cameras.camera_file import CameraFile, Source, joined_notes
+from jaxphoto.io.cameras.camera_file import CameraFile, CameraSource, joined_notes
 
 _SCALED = ("b1", "b2")
 _COEFFICIENTS = tuple(name for name in Agisoft.coefficients if name not in _SCALED)
@@ -26,7 +26,7 @@ def recognises(path: Path, text: str) -> bool:
     return "<calibration" in text and "<opencv_storage" not in text
 
 
-def read_agisoft(source: Source) -> CameraFile:
+def read_agisoft(source: CameraSource) -> CameraFile:
     """The frame camera of a calibration file, or one sensor of exported cameras.
 
     Raises InputError for a file that is cut off, other projections than "frame", missing elements, and what is no
@@ -83,7 +83,7 @@ def _sensors(root: ElementTree.Element) -> dict[str, tuple[ElementTree.Element, 
     return found
 
 
-def _values(source: Source, calibration: ElementTree.Element, sensor: Sensor) -> tuple[dict[str, float], str]:
+def _values(source: CameraSource, calibration: ElementTree.Element, sensor: Sensor) -> tuple[dict[str, float], str]:
     """f, cx, cy, b1, b2 and coefficients as Metashape has them, and what was assumed of an older file."""
     older = calibration.find("f") is None and calibration.find("fx") is not None
     for key in ("fx", "fy") if older else ("f",):
@@ -105,7 +105,7 @@ def _values(source: Source, calibration: ElementTree.Element, sensor: Sensor) ->
     return values, "fx and fy are of an old version; its p1 and p2 were taken in OpenCV's order" * tangential
 
 
-def _size(source: Source, calibration: ElementTree.Element) -> tuple[float, float]:
+def _size(source: CameraSource, calibration: ElementTree.Element) -> tuple[float, float]:
     resolution = calibration.find("resolution")
     given = [calibration.findtext(side) if resolution is None else resolution.get(side) for side in ("width", "height")]
     if None in given and source.size_px is not None:

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxphoto.arrays import on_device
-from jaxphoto.camera import InteriorOrientation, Sensor
+from jaxphoto.camera import AbstractDistortion, AbstractProjection, InteriorOrientation, Sensor
 from jaxphoto.errors import InputError
 
 ASSUMED_PIXEL_MM = 0.001
@@ -29,7 +29,7 @@ class CameraFile(NamedTuple):
     note: str = ""
 
 
-class Source(NamedTuple):
+class CameraSource(NamedTuple):
     """A file to read, and what the user adds to it."""
 
     path: Path
@@ -90,8 +90,23 @@ class Source(NamedTuple):
         return Sensor(int(width), int(height), ASSUMED_PIXEL_MM if pixel is None else float(pixel)), note
 
 
+class CameraModel(NamedTuple):
+    """What the cameras of a format are here: a distortion, those of its coefficients that the format lacks, and a
+    projection."""
+
+    distortion: type[AbstractDistortion]
+    lacks: tuple[str, ...]
+    projection: AbstractProjection
+
+
 def in_pixels(
-    source: Source, sensor: Sensor, fx: float, fy: float, centre: tuple[float, float], distortion: type, **coefficients
+    source: CameraSource,
+    sensor: Sensor,
+    fx: float,
+    fy: float,
+    centre: tuple[float, float],
+    model: CameraModel,
+    **coefficients,
 ) -> InteriorOrientation:
     """A camera of computer vision: focal lengths and principal point in pixels (of conventions.md) -> millimetres.
 
@@ -102,7 +117,8 @@ def in_pixels(
     if fx != fy:
         coefficients["b1"] = fx / fy - 1
     x_p, y_p = sensor.mm_from_px(np.array([centre]))[0]
-    interior = InteriorOrientation(fy * sensor.pixel_mm, x_p, y_p, distortion(**coefficients))
+    distortion = model.distortion(**coefficients)
+    interior = InteriorOrientation(fy * sensor.pixel_mm, x_p, y_p, distortion, projection=model.projection)
     return jax.tree.map(on_device, interior)
 
 

@@ -1,19 +1,20 @@
 """Cameras of COLMAP: `CAMERA_ID MODEL WIDTH HEIGHT PARAMS...`, a line of cameras.txt or a record of cameras.bin.
 
-COLMAP's centre of the upper left pixel is (0.5, 0.5), as ours. All its models without fish-eye are parts of OpenCV's.
-Source: the documentation of COLMAP, "Camera models" and "Output format".
+COLMAP's centre of the upper left pixel is (0.5, 0.5), as ours. All its models without fisheye are parts of
+`OpenCv`, those with it of `OpenCvFisheye` on the equidistant projection.
+Source: the documentation of COLMAP, "Camera models" and "Output format", and its src/colmap/sensor/models.h.
 """
 
 from pathlib import Path
 from typing import NamedTuple
 
-from jaxphoto.camera import InteriorOrientation, OpenCv, Sensor
+from jaxphoto.camera import Equidistant, InteriorOrientation, OpenCv, OpenCvFisheye, Perspective, Sensor
 from jaxphoto.io.cameras.binary_file import BinaryFile
-from jaxphoto.io.cameras.camera_file import CameraFile, Source, from_centre_px, in_pixels
-from jaxphoto.io.tables import is_number
+from jaxphoto.io.cameras.camera_file import CameraFile, CameraModel, CameraSource, from_centre_px, in_pixels
+from jaxphoto.io.text_tables import is_number
 
-# fx alone stands for both focal lengths.
-MODELS = {
+# f alone stands for both focal lengths.
+_PLANES = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
     "PINHOLE": ("fx", "fy", "cx", "cy"),
     "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
@@ -21,7 +22,17 @@ MODELS = {
     "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
     "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
 }
+_FISHEYES = {
+    "SIMPLE_RADIAL_FISHEYE": ("f", "cx", "cy", "k1"),
+    "RADIAL_FISHEYE": ("f", "cx", "cy", "k1", "k2"),
+    "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
+    "THIN_PRISM_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "s1", "s2"),
+}
+MODELS = _PLANES | _FISHEYES
 """The models that are known, simplest first, and the order of their parameters."""
+PLANE = CameraModel(OpenCv, ("b2",), Perspective())
+FISHEYE = CameraModel(OpenCvFisheye, ("b2",), Equidistant())
+"""What they are here."""
 
 TEXT, BINARY = "cameras.txt", "cameras.bin"
 _COLUMNS = "CAMERA_ID MODEL WIDTH HEIGHT PARAMS"
@@ -52,7 +63,7 @@ def recognises(path: Path, text: str) -> bool:
     return path.name in (TEXT, BINARY) or (len(first) > 4 and first[1].isupper() and all(map(is_number, first[2:])))
 
 
-def read_colmap(source: Source) -> CameraFile:
+def read_colmap(source: CameraSource) -> CameraFile:
     """One camera of the file, which only has to be sound in itself. Raises what `read_cameras` raises."""
     if source.path.suffix == ".bin":
         cameras = read_cameras(source)
@@ -66,7 +77,7 @@ def read_colmap(source: Source) -> CameraFile:
     return CameraFile(name, sensor, interior, None, assumed)
 
 
-def read_cameras(source: Source) -> dict[int, ColmapCamera]:
+def read_cameras(source: CameraSource) -> dict[int, ColmapCamera]:
     """All cameras of cameras.txt or cameras.bin by their ids.
 
     Raises InputError for what is no camera, for ids that are there twice and for models that are not known here.
@@ -85,23 +96,25 @@ def read_cameras(source: Source) -> dict[int, ColmapCamera]:
     return cameras
 
 
-def sensor_and_interior(source: Source, camera: ColmapCamera) -> tuple[Sensor, InteriorOrientation, str]:
-    """Sensor, interior orientation with the distortion `OpenCv`, and what was assumed. Raises what `in_pixels` does."""
+def sensor_and_interior(source: CameraSource, camera: ColmapCamera) -> tuple[Sensor, InteriorOrientation, str]:
+    """Sensor, interior orientation as `PLANE` or `FISHEYE`, and what was assumed. Raises what `in_pixels` does."""
     sensor, assumed = source.sensor(camera.width_px, camera.height_px)
     values = camera.named
     fx, fy = (values.pop("f"),) * 2 if "f" in values else (values.pop("fx"), values.pop("fy"))
     centre = values.pop("cx"), values.pop("cy")
-    return sensor, in_pixels(source, sensor, fx, fy, centre, OpenCv, **values), assumed
+    model = FISHEYE if camera.model in _FISHEYES else PLANE
+    return sensor, in_pixels(source, sensor, fx, fy, centre, model, **values), assumed
 
 
 def colmap_camera(sensor: Sensor, interior: InteriorOrientation) -> ColmapCamera:
-    """A camera with the distortion `OpenCv` and b2 = 0 as the simplest model that holds it."""
+    """A camera that is a `PLANE` or `FISHEYE` as the simplest model that holds it."""
     fx, fy, column, row = from_centre_px(interior, sensor)
     d = interior.distortion
     values = {"fx": fx, "fy": fy, "f": fy, "cx": column, "cy": row}
-    coefficients = {k: float(getattr(d, k)) for k in OpenCv.coefficients if k not in ("b1", "b2")}
+    coefficients = {k: float(getattr(d, k)) for k in d.coefficients if k not in ("b1", "b2")}
     needed = {key for key, value in coefficients.items() if value != 0} | ({"fx"} if fx != fy else set())
-    model = next(m for m, names in MODELS.items() if needed <= set(names))
+    models = _FISHEYES if isinstance(d, OpenCvFisheye) else _PLANES
+    model = next(m for m, names in models.items() if needed <= set(names))
     of_model = tuple((values | coefficients)[key] for key in MODELS[model])
     return ColmapCamera(model, sensor.width_px, sensor.height_px, of_model)
 
@@ -115,12 +128,12 @@ def cameras_text(cameras: dict[int, ColmapCamera]) -> str:
 
 
 def write_colmap(path: Path, name: str, sensor: Sensor, interior: InteriorOrientation) -> None:
-    """Write a camera with the distortion `OpenCv` and b2 = 0 as cameras.txt; a `name` that is a number is its id."""
+    """Write a camera that is a `PLANE` or `FISHEYE` as cameras.txt; a `name` that is a number is its id."""
     identifier = int(name) if name.isascii() and name.isdigit() else 1
     path.write_text(cameras_text({identifier: colmap_camera(sensor, interior)}), encoding="utf-8")
 
 
-def _by_id(source: Source) -> dict[int, list[str]]:
+def _by_id(source: CameraSource) -> dict[int, list[str]]:
     """The cells of every camera's line, by its id."""
     found: dict[int, list[str]] = {}
     for row, line in _lines(source.text()):
@@ -134,7 +147,7 @@ def _by_id(source: Source) -> dict[int, list[str]]:
     return found
 
 
-def _camera(source: Source, name: str, cells: list[str]) -> ColmapCamera:
+def _camera(source: CameraSource, name: str, cells: list[str]) -> ColmapCamera:
     if len(cells) < 4:
         raise source.error(f"camera {name} has {len(cells)} cells; write {_COLUMNS}")
     model = cells[1]
@@ -149,7 +162,7 @@ def _camera(source: Source, name: str, cells: list[str]) -> ColmapCamera:
     return ColmapCamera(model, int(width), int(height), tuple(values))
 
 
-def _check_known(source: Source, model: str, name: str) -> None:
+def _check_known(source: CameraSource, model: str, name: str) -> None:
     if model not in MODELS:
         raise source.error(f"the model {model} of camera {name} is not known here; use one of {', '.join(MODELS)}")
 

@@ -1,6 +1,7 @@
 """Camera files of OpenCV: YAML, XML or JSON of cv2.FileStorage, as its calibration sample writes them.
 
-OpenCV's centre of the upper left pixel is (0, 0), ours (0.5, 0.5). It ignores what stands at the place of a skew.
+OpenCV's centre of the upper left pixel is (0, 0), ours (0.5, 0.5). It ignores what stands at the place of a skew. Files
+of cv2.fisheye say `fisheye_model: 1` and have four coefficients.
 """
 
 from pathlib import Path
@@ -8,11 +9,22 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from jaxphoto.camera import InteriorOrientation, OpenCv, Sensor
-from jaxphoto.io.cameras.camera_file import CameraFile, Source, from_centre_px, in_pixels, joined_notes
+from jaxphoto.camera import Equidistant, InteriorOrientation, OpenCv, OpenCvFisheye, Perspective, Sensor
+from jaxphoto.io.cameras.camera_file import (
+    CameraFile,
+    CameraModel,
+    CameraSource,
+    from_centre_px,
+    in_pixels,
+    joined_notes,
+)
 
 _ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _COUNTS = (4, 5, 8, 12, 14)
+_FISHEYE_ORDER = ("k1", "k2", "k3", "k4")
+PLANE = CameraModel(OpenCv, ("b2",), Perspective())
+FISHEYE = CameraModel(OpenCvFisheye, ("p1", "p2", "s1", "s2", "b2"), Equidistant())
+"""What its cameras are here."""
 
 
 def recognises(path: Path, text: str) -> bool:
@@ -21,10 +33,10 @@ def recognises(path: Path, text: str) -> bool:
     return start.startswith("%YAML") or "<opencv_storage" in start[:500] or "camera_matrix" in text
 
 
-def read_open_cv(source: Source) -> CameraFile:
+def read_open_cv(source: CameraSource) -> CameraFile:
     """camera_matrix, distortion_coefficients, image_width, image_height and avg_reprojection_error of a file.
 
-    Raises InputError for a file that is cut off, for missing keys, fish-eye cameras and terms of thin prisms or tilt.
+    Raises InputError for a file that is cut off, for missing keys, and terms of thin prisms or tilt.
     """
     text = source.text()
     if not text.lstrip().startswith(("%YAML", "<?xml", "{")):
@@ -43,26 +55,30 @@ def read_open_cv(source: Source) -> CameraFile:
 
 
 def write_open_cv(path: Path, name: str, sensor: Sensor, interior: InteriorOrientation) -> None:
-    """Write a camera with the distortion `OpenCv` and b2 = 0; the suffix of `path` says in which of the three ways."""
+    """Write a camera that is a `PLANE` or `FISHEYE`; the suffix of `path` says in which of the three ways."""
     fx, fy, column, row = from_centre_px(interior, sensor)
     d = interior.distortion
-    values = [float(getattr(d, k)) for k in _ORDER]
+    fisheye = isinstance(d, OpenCvFisheye)
+    values = [float(getattr(d, k)) for k in (_FISHEYE_ORDER if fisheye else _ORDER)]
     coefficients = np.array(values if any(values[5:]) else values[:5])
     storage = cv2.FileStorage(str(path), cv2.FileStorage_WRITE)
     storage.write("image_width", sensor.width_px)
     storage.write("image_height", sensor.height_px)
+    if fisheye:
+        storage.write("fisheye_model", 1)
     storage.write("camera_matrix", np.array([[fx, 0.0, column - 0.5], [0.0, fy, row - 0.5], [0.0, 0.0, 1.0]]))
     storage.write("distortion_coefficients", coefficients[:, None])
     storage.release()
 
 
-def _camera(source: Source, storage: cv2.FileStorage) -> CameraFile:
-    if _number(storage, "fisheye_model") not in (None, 0.0):
-        raise source.error("it is of OpenCV's fish-eye model, which is not known here; calibrate with the standard one")
+def _camera(source: CameraSource, storage: cv2.FileStorage) -> CameraFile:
+    fisheye = _number(storage, "fisheye_model") not in (None, 0.0)
     matrix = _matrix(source, storage, "camera_matrix")
     if matrix.shape != (3, 3):
         raise source.error(f"camera_matrix is {' x '.join(map(str, matrix.shape))}; it has to be 3 x 3")
     coefficients = _matrix(source, storage, "distortion_coefficients").ravel()
+    if fisheye and len(coefficients) != len(_FISHEYE_ORDER):
+        raise source.error(f"there are {len(coefficients)} distortion_coefficients; OpenCV's fisheye model has 4")
     if len(coefficients) not in _COUNTS:
         counts = ", ".join(map(str, _COUNTS))
         raise source.error(f"there are {len(coefficients)} distortion_coefficients; OpenCV has one of {counts}")
@@ -70,14 +86,15 @@ def _camera(source: Source, storage: cv2.FileStorage) -> CameraFile:
         raise source.error("its terms of a thin prism or a tilted sensor are not known here; calibrate without them")
     sensor, assumed = source.sensor(*_size(source, storage))
     (fx, _, cx), (_, fy, cy), _ = matrix.tolist()
-    named = dict(zip(_ORDER, coefficients.tolist(), strict=False))
-    interior = in_pixels(source, sensor, fx, fy, (cx + 0.5, cy + 0.5), OpenCv, **named)
+    named = dict(zip(_FISHEYE_ORDER if fisheye else _ORDER, coefficients.tolist(), strict=False))
+    model = FISHEYE if fisheye else PLANE
+    interior = in_pixels(source, sensor, fx, fy, (cx + 0.5, cy + 0.5), model, **named)
     rms = _number(storage, "avg_reprojection_error")
     quality = f"avg_reprojection_error {rms:.4g} px" if rms is not None else ""
     return CameraFile(source.path.stem, sensor, interior, None, joined_notes(quality, assumed))
 
 
-def _size(source: Source, storage: cv2.FileStorage) -> tuple[float, float]:
+def _size(source: CameraSource, storage: cv2.FileStorage) -> tuple[float, float]:
     size = [_number(storage, key) for key in ("image_width", "image_height")]
     if None in size:
         if source.size_px is None:
@@ -98,7 +115,7 @@ def _values(node: cv2.FileNode) -> list[float | None]:
     return [_value(node.at(k)) for k in range(node.size())] if node.isSeq() else []
 
 
-def _matrix(source: Source, storage: cv2.FileStorage, key: str) -> np.ndarray:
+def _matrix(source: CameraSource, storage: cv2.FileStorage, key: str) -> np.ndarray:
     node = storage.getNode(key)
     if node.empty():
         raise source.error(f"{key} is missing; add it, as OpenCV's calibration writes it")

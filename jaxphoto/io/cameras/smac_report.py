@@ -12,7 +12,7 @@ import jax
 
 from jaxphoto.arrays import on_device
 from jaxphoto.camera import InteriorOrientation, Sensor, Smac, rebalance, with_sign
-from jaxphoto.io.cameras.camera_file import CameraFile, Source, joined_notes
+from jaxphoto.io.cameras.camera_file import CameraFile, CameraSource, joined_notes
 
 _PARAMETERS = ("K0", "K1", "K2", "K3", "K4", "P1", "P2", "P3", "P4", "xp", "yp")
 _NEEDED = ("K0", "K1", "K2", "xp", "yp")
@@ -33,7 +33,7 @@ def recognises(path: Path, text: str) -> bool:
     return re.search(r"calibrated\s+focal\s+length", text, re.IGNORECASE) is not None and "K1" in text
 
 
-def read_smac_report(source: Source) -> CameraFile:
+def read_smac_report(source: CameraSource) -> CameraFile:
     """The camera of a report. Raises InputError naming what is missing."""
     text = source.text()
     # Where its own number is torn away, that of the principal point is not to be taken for it.
@@ -81,7 +81,7 @@ def write_smac_report(path: Path, name: str, sensor: Sensor, interior: InteriorO
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def _values(source: Source, text: str) -> tuple[dict[str, float], set[str]]:
+def _values(source: CameraSource, text: str) -> tuple[dict[str, float], set[str]]:
     """NAME = VALUE, and columns of which the text of a PDF gives first all names, then all signs, then all values.
 
     With all names that there are, of which some may have lost their values.
@@ -108,12 +108,12 @@ def _values(source: Source, text: str) -> tuple[dict[str, float], set[str]]:
     return values, {token for kind, token in tokens if kind == "name"}
 
 
-def _number(source: Source, name: str, text: str) -> float:
+def _number(source: CameraSource, name: str, text: str) -> float:
     plain = re.sub(r"\s", "", text).replace("−", "-")
     return source.number(name, re.sub(r"[x×*]10(\^|\*\*)?|[dD]", "e", plain))
 
 
-def _sensor(source: Source, text: str) -> tuple[Sensor, str]:
+def _sensor(source: CameraSource, text: str) -> tuple[Sensor, str]:
     written = _FORMAT.search(text)
     if written is not None:
         width, height, pixel = written.groups()

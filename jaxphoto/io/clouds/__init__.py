@@ -4,19 +4,26 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from jaxphoto.io.clouds.cloud_reader import Returns, cloud_chunks, cloud_system, extent, read_cloud
+    from jaxphoto.io.clouds.cloud_writer import write_cloud
+    from jaxphoto.io.clouds.coordinate_system import CoordinateSystem, frame_system
     from jaxphoto.io.clouds.placement import Placement
-    from jaxphoto.io.clouds.reader import Returns, cloud_chunks, cloud_system, extent, read_cloud
-    from jaxphoto.io.clouds.system import System, frame_system
-    from jaxphoto.io.clouds.writer import write_cloud
 
 _MODULES = {
-    "Placement": "placement", "Returns": "reader", "System": "system", "cloud_chunks": "reader",
-    "cloud_system": "reader", "extent": "reader", "frame_system": "system", "read_cloud": "reader",
-    "write_cloud": "writer",
+    "CoordinateSystem": "coordinate_system", "Placement": "placement", "Returns": "cloud_reader",
+    "cloud_chunks": "cloud_reader", "cloud_system": "cloud_reader", "extent": "cloud_reader",
+    "frame_system": "coordinate_system", "read_cloud": "cloud_reader", "write_cloud": "cloud_writer",
 }  # fmt: skip
 
 __all__ = [
-    "Placement", "Returns", "System", "cloud_chunks", "cloud_system", "extent", "frame_system", "read_cloud",
+    "CoordinateSystem",
+    "Placement",
+    "Returns",
+    "cloud_chunks",
+    "cloud_system",
+    "extent",
+    "frame_system",
+    "read_cloud",
     "write_cloud",
 ]  # fmt: skip
 

@@ -13,8 +13,8 @@ from pyproj.exceptions import CRSError
 
 from jaxphoto.cloud import Cloud
 from jaxphoto.errors import InputError
-from jaxphoto.io.clouds.source import CHUNK, Source, StripNumbers
-from jaxphoto.io.clouds.system import System, system_of
+from jaxphoto.io.clouds.cloud_source import CHUNK, CloudSource, StripNumbers
+from jaxphoto.io.clouds.coordinate_system import CoordinateSystem, system_of
 
 # How a damaged file shows, in laspy, its backend and NumPy.
 _DAMAGE = (laspy.errors.LaspyException, lazrs.LazrsError, ValueError, OverflowError, struct.error, EOFError)
@@ -25,7 +25,7 @@ _PLANE_UNIT, _HEIGHTS, _HEIGHT_UNIT = 3076, 4096, 4099
 _LENGTHS = {9001: 1.0, 9002: 0.3048, 9003: 1200 / 3937}
 
 
-def open_las(path: Path, given: System | None) -> Source:
+def open_las(path: Path, given: CoordinateSystem | None) -> CloudSource:
     """A LAS or LAZ file as a source, in the system `given` or, without one, that of the file.
 
     Points that are marked as withheld are left out, as the format wants.
@@ -42,7 +42,7 @@ def open_las(path: Path, given: System | None) -> Source:
         extent = np.stack([header.mins, header.maxs])
     if count == 0:
         raise InputError(f"{path.name} holds no points; name another cloud")
-    return Source(path.name, system, count, extent, lambda: _chunks(path))
+    return CloudSource(path.name, system, count, extent, lambda: _chunks(path))
 
 
 @contextmanager
@@ -120,7 +120,7 @@ def _chunks(path: Path) -> Iterator[Cloud]:
             )
 
 
-def _system(header: laspy.LasHeader, name: str) -> System:
+def _system(header: laspy.LasHeader, name: str) -> CoordinateSystem:
     """What WKT or GeoTIFF keys say; keys that laspy leaves aside tell units and heights."""
     keys = {
         key.id: key.value_offset
@@ -136,9 +136,9 @@ def _system(header: laspy.LasHeader, name: str) -> System:
             f"{name} names a system of coordinates that PROJ does not know; name it yourself (--cloud-epsg)"
         ) from None
     unit = _LENGTHS.get(keys.get(_PLANE_UNIT, 0))
-    system = System() if crs is None else system_of(crs, name)
+    system = CoordinateSystem() if crs is None else system_of(crs, name)
     if crs is None and unit is not None:
-        system = System(units=(unit, unit))
+        system = CoordinateSystem(units=(unit, unit))
     if system.heights is not None:
         return system
     heights, height_unit = None, system.units[1]
@@ -151,4 +151,4 @@ def _system(header: laspy.LasHeader, name: str) -> System:
             heights, height_unit = keys[_HEIGHTS], upper.axis_info[0].unit_conversion_factor
     own_unit = height_unit
     height_unit = _LENGTHS.get(keys.get(_HEIGHT_UNIT, 0), height_unit)
-    return System(system.plane, heights, (system.units[0], height_unit), own_unit)
+    return CoordinateSystem(system.plane, heights, (system.units[0], height_unit), own_unit)

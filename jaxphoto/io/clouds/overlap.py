@@ -1,16 +1,16 @@
 """Whether a cloud and a block lie over each other, and what to say where they do not."""
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Real
 
 from jaxphoto.errors import InputError
+from jaxphoto.io.clouds.coordinate_system import UNITS
 from jaxphoto.io.clouds.placement import Placement
-from jaxphoto.io.clouds.system import UNITS
 
 _SAID = {"m": "metres", "ft": "international feet", "us_ft": "US survey feet"}
 
 
-def check_overlap(placement: Placement, extent: Float[np.ndarray, "2 3"], within: Float[np.ndarray, "2 2"]) -> None:
+def check_overlap(placement: Placement, extent: Float[np.ndarray, "2 3"], within: Real[np.ndarray, "2 2"]) -> None:
     """Raise InputError where a cloud of `extent` (as its file counts) lies nowhere `within` X, Y (m) of the block.
 
     The sentence gives both extents. Where they would overlap if the cloud counted in another unit, it says so.

@@ -11,7 +11,7 @@ from pyproj.transformer import TransformerGroup
 from jaxphoto.block import Frame
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing.map_frame import MapFrame, Place, map_system
-from jaxphoto.io.clouds.system import System
+from jaxphoto.io.clouds.coordinate_system import CoordinateSystem
 
 # Half the side (degrees) of the area in which a way between two systems has to serve.
 _ABOUT = 0.1
@@ -27,7 +27,7 @@ class Placement:
     Raises InputError where the file's system and the frame cannot meet; `option` is what names the file's system.
     """
 
-    def __init__(self, name: str, system: System, frame: Frame | None, option: str = "--cloud-epsg"):
+    def __init__(self, name: str, system: CoordinateSystem, frame: Frame | None, option: str = "--cloud-epsg"):
         self.name, self.system, self.option = name, system, option
         _check_kinds(name, system, frame, option)
         self._map: MapFrame | None = None
@@ -88,7 +88,7 @@ class Placement:
         return placed
 
 
-def _check_kinds(name: str, system: System, frame: Frame | None, option: str) -> None:
+def _check_kinds(name: str, system: CoordinateSystem, frame: Frame | None, option: str) -> None:
     kind = "local" if frame is None else frame.kind
     if frame is None:
         if system.geographic:

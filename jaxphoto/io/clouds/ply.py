@@ -9,8 +9,8 @@ import pandas as pd
 
 from jaxphoto.cloud import Cloud
 from jaxphoto.errors import InputError
-from jaxphoto.io.clouds.source import CHUNK, Source, StripNumbers
-from jaxphoto.io.clouds.system import System
+from jaxphoto.io.clouds.cloud_source import CHUNK, CloudSource, StripNumbers
+from jaxphoto.io.clouds.coordinate_system import CoordinateSystem
 
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
@@ -42,7 +42,7 @@ class _Vertices:
     lines: int
 
 
-def open_ply(path: Path, given: System | None) -> Source:
+def open_ply(path: Path, given: CoordinateSystem | None) -> CloudSource:
     """A PLY file as a source, in the system `given`; elements other than vertices are left out.
 
     Raises InputError for a damaged header, vertices without x, y, z or with lists, and a file that is cut off.
@@ -50,7 +50,7 @@ def open_ply(path: Path, given: System | None) -> Source:
     vertices = _header(path)
     if vertices.count == 0:
         raise InputError(f"{path.name} holds no points; name another cloud")
-    return Source(path.name, given or System(), vertices.count, None, lambda: _chunks(path, vertices))
+    return CloudSource(path.name, given or CoordinateSystem(), vertices.count, None, lambda: _chunks(path, vertices))
 
 
 def _chunks(path: Path, vertices: _Vertices) -> Iterator[Cloud]:

@@ -11,9 +11,9 @@ import pandas as pd
 
 from jaxphoto.cloud import Cloud
 from jaxphoto.errors import InputError
-from jaxphoto.io.clouds.source import CHUNK, Source, StripNumbers
-from jaxphoto.io.clouds.system import System
-from jaxphoto.io.tables import is_number
+from jaxphoto.io.clouds.cloud_source import CHUNK, CloudSource, StripNumbers
+from jaxphoto.io.clouds.coordinate_system import CoordinateSystem
+from jaxphoto.io.text_tables import is_number
 
 XYZ = ("X_m", "Y_m", "Z_m")
 RETURNS = ("return_number", "number_of_returns")
@@ -21,7 +21,7 @@ _BYTES = ("classification", *RETURNS)
 COLUMNS = (*XYZ, *_BYTES, "time_s", "strip")
 
 
-def open_csv(path: Path, given: System | None) -> Source:
+def open_csv(path: Path, given: CoordinateSystem | None) -> CloudSource:
     """A CSV as a source, in the system `given`; columns that are not in `COLUMNS` are left out.
 
     Separators are commas, or semicolons, then with decimal commas or points; lines that start with # are comments.
@@ -32,11 +32,11 @@ def open_csv(path: Path, given: System | None) -> Source:
         if name not in layout.header:
             found = ", ".join(layout.header)
             raise InputError(f"{path.name}: the column {name} is missing (found {found}); add it, in metres")
-    return Source(path.name, given or System(), None, None, lambda: _chunks(path, layout))
+    return CloudSource(path.name, given or CoordinateSystem(), None, None, lambda: _chunks(path, layout))
 
 
 @dataclasses.dataclass(frozen=True)
-class _Layout:
+class _Dialect:
     """How a table is written: its columns, and what separates cells and begins decimals."""
 
     header: list[str]
@@ -44,7 +44,7 @@ class _Layout:
     decimal: str
 
 
-def _chunks(path: Path, layout: _Layout) -> Iterator[Cloud]:
+def _chunks(path: Path, layout: _Dialect) -> Iterator[Cloud]:
     numbers = [name for name in layout.header if name in COLUMNS and name != "strip"]
     kinds: dict[str, type] = {name: float if name in numbers else str for name in layout.header}
     strips = StripNumbers()
@@ -86,7 +86,7 @@ def _chunks(path: Path, layout: _Layout) -> Iterator[Cloud]:
         raise _fault(path, layout, numbers) from None
 
 
-def _fault(path: Path, layout: _Layout, numbers: list[str]) -> InputError:
+def _fault(path: Path, layout: _Dialect, numbers: list[str]) -> InputError:
     """The error about the first row in which something is wrong."""
     rows = _rows(path, layout.separator)
     next(rows)
@@ -111,7 +111,7 @@ def _surplus(path: Path, row: int, cells: list[str], header: list[str]) -> Input
     )
 
 
-def _layout(path: Path) -> _Layout:
+def _layout(path: Path) -> _Dialect:
     """What the header and the first line of numbers tell."""
     lines = [(row, cells[0]) for row, cells in itertools.islice(_rows(path, "\n"), 2)]
     if not lines:
@@ -121,7 +121,7 @@ def _layout(path: Path) -> _Layout:
     for cells in first:
         if len(cells) > len(header):
             raise _surplus(path, lines[1][0], cells, header)
-    return _Layout(header, separator, "," if separator == ";" and "," in "".join(*first) else ".")
+    return _Dialect(header, separator, "," if separator == ";" and "," in "".join(*first) else ".")
 
 
 def _rows(path: Path, separator: str) -> Iterator[tuple[int, list[str]]]:

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 
 from jaxphoto.errors import InputError
 from jaxphoto.io.cameras.binary_file import BinaryFile
-from jaxphoto.io.cameras.camera_file import Source
+from jaxphoto.io.cameras.camera_file import CameraSource
 from jaxphoto.io.cameras.colmap import ColmapCamera, read_cameras
 
 FILES = ("cameras", "images", "points3D")
@@ -58,11 +58,11 @@ def read_model(folder: Path) -> ColmapModel:
     if all((folder / f"{name}.txt").is_file() for name in FILES):
         images, points = (_Text(folder / f"{name}.txt") for name in FILES[1:])
         model = ColmapModel(
-            folder, read_cameras(Source(folder / "cameras.txt")), _text_images(images), *_text_points(points)
+            folder, read_cameras(CameraSource(folder / "cameras.txt")), _text_images(images), *_text_points(points)
         )
     else:
         images_bin, points_bin = (BinaryFile(folder / f"{name}.bin") for name in FILES[1:])
-        cameras = read_cameras(Source(folder / "cameras.bin"))
+        cameras = read_cameras(CameraSource(folder / "cameras.bin"))
         model = ColmapModel(folder, cameras, _binary_images(images_bin), *_binary_points(points_bin))
     return _sound(model._replace(images=sorted(model.images, key=lambda image: image.name)))
 
@@ -90,7 +90,7 @@ class _Text:
 
     def __init__(self, path: Path):
         self.path = path
-        lines = Source(path).text().split("\n")
+        lines = CameraSource(path).text().split("\n")
         self.lines = iter([(row, line) for row, line in enumerate(lines, 1) if not line.lstrip().startswith("#")])
         self.row = 0
 

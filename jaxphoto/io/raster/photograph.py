@@ -7,8 +7,8 @@ import rasterio
 
 from jaxphoto.camera import Sensor
 from jaxphoto.errors import InputError
-from jaxphoto.io.clouds.source import check_file
-from jaxphoto.io.clouds.system import System
+from jaxphoto.io.clouds.cloud_source import check_file
+from jaxphoto.io.clouds.coordinate_system import CoordinateSystem
 from jaxphoto.io.raster.opened import opened_raster, quiet
 from jaxphoto.io.raster.surface import layout
 from jaxphoto.io.whole_file import whole_file
@@ -33,7 +33,12 @@ def read_photograph(path: str | Path, sensor: Sensor) -> np.ndarray:
         return file.read()
 
 
-def write_orthophoto(path: str | Path, picture: Picture, raster: Raster, system: System = System()) -> None:  # noqa: B008
+def write_orthophoto(
+    path: str | Path,
+    picture: Picture,
+    raster: Raster,
+    system: CoordinateSystem = CoordinateSystem(),  # noqa: B008
+) -> None:
     """Write an orthophoto as GeoTIFF on the cells of `raster`; a mask in it says which cells the image does not see."""
     bands = len(picture.pixels)
     # rasterio has no predictor for floats of all kinds; 2 is that of whole numbers.

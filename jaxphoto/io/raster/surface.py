@@ -8,8 +8,8 @@ from jaxtyping import Float
 from pyproj import CRS
 
 from jaxphoto.errors import InputError
-from jaxphoto.io.clouds.source import check_file
-from jaxphoto.io.clouds.system import System, epsg_system, system_of
+from jaxphoto.io.clouds.cloud_source import check_file
+from jaxphoto.io.clouds.coordinate_system import CoordinateSystem, epsg_system, system_of
 from jaxphoto.io.raster.opened import opened_raster, quiet
 from jaxphoto.io.whole_file import whole_file
 from jaxphoto.lidar.raster import Raster
@@ -18,7 +18,7 @@ _NODATA = -9999.0
 _TILE = 256
 
 
-def write_dsm(path: str | Path, raster: Raster, system: System = System()) -> None:  # noqa: B008
+def write_dsm(path: str | Path, raster: Raster, system: CoordinateSystem = CoordinateSystem()) -> None:  # noqa: B008
     """Write a surface model as GeoTIFF: float32 heights (m), tiled, compressed without loss; whole or not at all.
 
     `system` is that of its coordinates; a local frame writes none. Cells without height are nodata (-9999).
@@ -34,7 +34,7 @@ def write_dsm(path: str | Path, raster: Raster, system: System = System()) -> No
         f.set_band_description(1, "height")
 
 
-def layout(raster: Raster, system: System) -> dict:
+def layout(raster: Raster, system: CoordinateSystem) -> dict:
     """What every GeoTIFF on the cells of `raster` has in common, as rasterio wants it."""
     rows, columns = raster.heights.shape
     return {
@@ -51,7 +51,7 @@ def layout(raster: Raster, system: System) -> dict:
     }
 
 
-def read_dsm(path: str | Path, epsg: int | None = None) -> tuple[Raster, System]:
+def read_dsm(path: str | Path, epsg: int | None = None) -> tuple[Raster, CoordinateSystem]:
     """The surface model in the first band of a raster, in metres, and the system of its coordinates.
 
     `epsg` names the system in place of what the file says. Raises InputError for a file that is no raster or damaged,
@@ -65,7 +65,7 @@ def read_dsm(path: str | Path, epsg: int | None = None) -> tuple[Raster, System]
     if epsg is not None:
         system = epsg_system(epsg, path.name)
     else:
-        system = system_of(CRS.from_wkt(crs.to_wkt()), path.name) if crs else System()
+        system = system_of(CRS.from_wkt(crs.to_wkt()), path.name) if crs else CoordinateSystem()
     if place.is_identity:
         raise InputError(f"{path.name} does not say where its cells lie; write it with its georeferencing")
     if place.b or place.d or place.a <= 0 or place.e >= 0:

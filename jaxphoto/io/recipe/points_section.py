@@ -15,10 +15,10 @@ from jaxphoto.simulation import (
     ConvergentPlan,
     FlightPlan,
     Jitter,
-    Points,
+    PointPlan,
     RandomWaves,
     Sigmas,
-    Targets,
+    TargetPlan,
     Terrain,
     Wave,
 )
@@ -57,35 +57,35 @@ def read_terrain(section: Section) -> Terrain:
     return dataclasses.replace(ground, waves=tuple(map(_wave, tables(section, "waves"))))
 
 
-def read_points(section: Section, *, in_swaths: bool) -> Points:
+def read_points(section: Section, *, in_swaths: bool) -> PointPlan:
     """Tie points and what of them is measured; only those `in_swaths` have keys that say how far swaths reach."""
     section.known(
         "ties", "min_images", "mean_rays", "margin_mm", "on_roofs", *(("across", "ends") if in_swaths else ())
     )
-    minimum = section.count("min_images") if "min_images" in section else Points.min_images
+    minimum = section.count("min_images") if "min_images" in section else PointPlan.min_images
     if minimum < 2:
         raise section.error("min_images", "a point in one image has no position; give 2 or more")
     rays = section.positive("mean_rays") if "mean_rays" in section else None
     if rays is not None and rays < minimum:
         raise section.error("mean_rays", f"{rays:g} is less than min_images = {minimum}; raise it or lower min_images")
-    on_roofs = not_negative(section, "on_roofs", Points.on_roofs)
+    on_roofs = not_negative(section, "on_roofs", PointPlan.on_roofs)
     if on_roofs > 1:
         raise section.error("on_roofs", f"{on_roofs:g} is no part of the tie points; give a number from 0 to 1")
-    return Points(
+    return PointPlan(
         ties=whole(section, "ties", 0),
         min_images=minimum,
         mean_rays=rays,
-        across=section.positive("across") if "across" in section else Points.across,
-        ends=not_negative(section, "ends", Points.ends),
-        margin_mm=not_negative(section, "margin_mm", Points.margin_mm),
+        across=section.positive("across") if "across" in section else PointPlan.across,
+        ends=not_negative(section, "ends", PointPlan.ends),
+        margin_mm=not_negative(section, "margin_mm", PointPlan.margin_mm),
         on_roofs=on_roofs,
     )
 
 
-def read_targets(section: Section) -> Targets:
+def read_targets(section: Section) -> TargetPlan:
     """One group of targets."""
     section.known("role", "prefix", "count", "at_m", "at", "grid", "choice")
-    prefix = section.text("prefix", Targets.prefix)
+    prefix = section.text("prefix", TargetPlan.prefix)
     if not prefix or prefix[-1].isdigit() or prefix[0] == "#":
         raise section.error("prefix", f'{prefix!r} does not tell targets apart; use letters, like "T"')
     choice = None
@@ -94,7 +94,7 @@ def read_targets(section: Section) -> Targets:
         table.known("role", "outermost", "centre", "first")
         outermost, first = whole(table, "outermost", 0), whole(table, "first", 0)
         choice = Choice(_role(table), outermost, flag(table, "centre"), first)
-    return Targets(
+    return TargetPlan(
         role=_role(section),
         prefix=prefix,
         count=whole(section, "count", 0),
@@ -104,7 +104,7 @@ def read_targets(section: Section) -> Targets:
     )
 
 
-def read_sigmas(top: Section, targets: tuple[Targets, ...]) -> tuple[Sigmas, Sigmas]:
+def read_sigmas(top: Section, targets: tuple[TargetPlan, ...]) -> tuple[Sigmas, Sigmas]:
     """The stated sigmas, and the true ones, which are the same where [noise] does not say otherwise."""
     keys = ("image_mm", "target_mm", "control_m", "station_m", "attitude_deg", "lidar_m")
     said, true = top.section("sigmas"), top.section("noise")
@@ -152,7 +152,7 @@ def read_start(section: Section, plan: FlightPlan | ConvergentPlan) -> Approxima
     )
 
 
-def check_points(top: Section, points: Points, targets: tuple[Targets, ...]) -> None:
+def check_points(top: Section, points: PointPlan, targets: tuple[TargetPlan, ...]) -> None:
     """Raise InputError where there is nothing to measure."""
     n = points.ties + sum(t.count + len(t.at) + len(t.at_m) for t in targets)
     if n < 3:

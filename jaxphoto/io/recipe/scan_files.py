@@ -5,11 +5,11 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from jaxphoto.block import AXES
 from jaxphoto.cloud import Cloud
 from jaxphoto.georeferencing import Scanner, Trajectory
 from jaxphoto.io import clouds
 from jaxphoto.io.trajectory import Records, write_flight_csv
+from jaxphoto.observations import AXES
 from jaxphoto.rotation import matrix_from_quaternion, roll_pitch_yaw_from_matrix
 from jaxphoto.simulation.chunks import in_chunks
 

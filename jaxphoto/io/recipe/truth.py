@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from jaxphoto.block import AXES
 from jaxphoto.camera import constant_names, get_parameter, parameter_names
 from jaxphoto.io.block_folder import write_block
-from jaxphoto.io.block_folder.layout import ANGLES, XYZ
+from jaxphoto.io.block_folder.table_layout import ANGLES, XYZ
 from jaxphoto.io.recipe.scan_files import CLOUD, TRAJECTORY, scanner_rows, write_scan
+from jaxphoto.observations import AXES
 from jaxphoto.simulation import Simulation
 from jaxphoto.simulation.flight import omega_phi_kappa
 
@@ -55,7 +55,7 @@ def truth_tables(simulation: Simulation) -> dict[str, pd.DataFrame]:
     interior = [
         (camera, name, float(get_parameter(one, name)))
         for camera, one in truth.interior.items()
-        for name in (*parameter_names(one), *constant_names(type(one.distortion)))
+        for name in (*parameter_names(one), *constant_names(one))
     ]
     angles = np.degrees(omega_phi_kappa(truth.exterior))
     tables = {

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 
 from jaxphoto.errors import InputError
-from jaxphoto.io.tables import read_csv
+from jaxphoto.io.text_tables import read_csv
 from jaxphoto.io.trajectory.records import Records, check_records
 
 _MAP = ("X_m", "Y_m", "Z_m")

@@ -10,7 +10,7 @@ from jaxphoto.camera import InteriorOrientation
 from jaxphoto.collinearity import ExteriorOrientation, project
 from jaxphoto.compiling import call_compiled
 from jaxphoto.orientation.rays import padded_length
-from jaxphoto.procedures.calibration.block import CAMERA
+from jaxphoto.procedures.calibration.calibration_block import CAMERA
 
 
 def reprojection_residuals(adjusted: Adjustment) -> Float[np.ndarray, "rows 2"]:

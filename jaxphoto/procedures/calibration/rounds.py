@@ -24,8 +24,8 @@ from jaxphoto.camera import InteriorOrientation, Sensor, Smac, get_parameter, re
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import InputError
 from jaxphoto.procedures.adjust import adjust
-from jaxphoto.procedures.calibration.block import CAMERA, TargetRows, calibration_block
 from jaxphoto.procedures.calibration.board import Board, Detection
+from jaxphoto.procedures.calibration.calibration_block import CAMERA, TargetRows, calibration_block
 from jaxphoto.procedures.calibration.eccentricity import eccentricities
 from jaxphoto.procedures.calibration.outliers import added_sigma, blunders, misfits
 from jaxphoto.procedures.calibration.parameters import distortion_model, free_parameters

@@ -14,14 +14,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 from scipy.optimize import minimize
 
 from jaxphoto.camera import AbstractDistortion, Brown, InteriorOrientation, Sensor, get_parameter, set_parameter
 from jaxphoto.compiling import call_compiled
 from jaxphoto.orientation.rays import ideal_coordinates
-from jaxphoto.procedures.calibration.block import TargetRows
 from jaxphoto.procedures.calibration.board import Board
+from jaxphoto.procedures.calibration.calibration_block import TargetRows
 from jaxphoto.procedures.calibration.reprojection import projections
 from jaxphoto.procedures.calibration.resections import resected
 
@@ -134,7 +134,7 @@ def nearest_distortion(
 
 
 @eqx.filter_jit
-def _closed_form(interior: InteriorOrientation, xy: Float[np.ndarray, "n 2"], names: tuple[str, ...]):
+def _closed_form(interior: InteriorOrientation, xy: Float[Array, "n 2"], names: tuple[str, ...]):
     """What the distortion makes of `xy`, (n, 2), and the derivatives by the coefficients `names`, (n, 2, names)."""
 
     def value(parameters):

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.arrays import Numbers
-from jaxphoto.block import Block, SurfaceRows
+from jaxphoto.block import Block
 from jaxphoto.cloud import Cloud
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import InputError
@@ -34,10 +34,11 @@ from jaxphoto.lidar.correction import (
 )
 from jaxphoto.lidar.heights import Method
 from jaxphoto.lidar.tangent_planes import TangentPlanes, tangent_planes
-from jaxphoto.procedures.lidar.rounds import (
+from jaxphoto.observations import SurfaceRows
+from jaxphoto.procedures.lidar.until_still import (
     MAX_ROUNDS,
     Round,
-    Seen,
+    SeenByCloud,
     at_result,
     check_without_surfaces,
     until_still,
@@ -150,7 +151,7 @@ def simultaneous(
 
     last: dict[str, Any] = {}
 
-    def look(adjusted: Adjustment) -> Seen:
+    def look(adjusted: Adjustment) -> SeenByCloud:
         last["planes"] = planes(adjusted)
         foot, normal, sigma, flag = (
             np.concatenate([getattr(p, name) for p, _ in last["planes"]])
@@ -160,9 +161,9 @@ def simultaneous(
         sigma = with_common_error(sigma, usable, settings.sigma_systematic_m)
         if not usable.any():
             raise nothing_seen(np.asarray(adjusted.unknowns.points)[which], cloud.xyz, flag)
-        return Seen(np.tile(which, len(names)), foot, normal, sigma, usable)
+        return SeenByCloud(np.tile(which, len(names)), foot, normal, sigma, usable)
 
-    def build(adjusted: Adjustment, known: Covariance, seen: Seen, used: np.ndarray) -> Block:
+    def build(adjusted: Adjustment, known: Covariance, seen: SeenByCloud, used: np.ndarray) -> Block:
         scanner = adjusted.unknowns.scanner or none
         last["turn"] = _turns(seen, strip, [poses for _, poses in last["planes"]])
         rows = _surface_rows(seen, used, strip, last["turn"], scanner)
@@ -170,7 +171,7 @@ def simultaneous(
         posed = dataclasses.replace(block, surfaces=rows, priors=dataclasses.replace(block.priors, scanner=priors))
         return at_result(posed, unknowns)
 
-    def carry(seen: Seen, before: Adjustment, now: Adjustment) -> Seen:
+    def carry(seen: SeenByCloud, before: Adjustment, now: Adjustment) -> SeenByCloud:
         old, new = before.unknowns.scanner or none, now.unknowns.scanner or none
         shift = np.stack([np.asarray(new.shifts[name]) - np.asarray(old.shifts[name]) for name in names])[strip]
         raised = last["turn"] @ (np.asarray(new.boresight) - np.asarray(old.boresight))
@@ -233,7 +234,9 @@ def _near(
     return corrected(np.unique(order[nearest(strip.grid, xy + off, enough).index]))
 
 
-def _turns(seen: Seen, strip: Int[np.ndarray, "rows"], poses: list[ScannerPoses | None]) -> Float[np.ndarray, "rows 3"]:
+def _turns(
+    seen: SeenByCloud, strip: Int[np.ndarray, "rows"], poses: list[ScannerPoses | None]
+) -> Float[np.ndarray, "rows 3"]:
     """`SurfaceRows.turn` of every row, used or not: as many in every round."""
     turn = np.zeros_like(seen.foot)
     for k, one in enumerate(poses):
@@ -244,7 +247,7 @@ def _turns(seen: Seen, strip: Int[np.ndarray, "rows"], poses: list[ScannerPoses 
 
 
 def _surface_rows(
-    seen: Seen,
+    seen: SeenByCloud,
     used: Bool[np.ndarray, "rows"],
     strip: Int[np.ndarray, "rows"],
     turn: Float[np.ndarray, "rows 3"],

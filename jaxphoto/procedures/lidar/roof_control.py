@@ -15,16 +15,17 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
 from jaxphoto.adjustment import Adjustment
-from jaxphoto.block import Block, Rows, SurfaceRows
+from jaxphoto.block import Block
 from jaxphoto.cloud import Cloud
 from jaxphoto.errors import BlockError, InputError
 from jaxphoto.lidar import HeightSettings
 from jaxphoto.lidar.planes import plane_feet
 from jaxphoto.lidar.roofs import Patch, planar_patches, roof_centroid
-from jaxphoto.procedures.lidar.rounds import (
+from jaxphoto.observations import ControlRows, SurfaceRows
+from jaxphoto.procedures.lidar.until_still import (
     MAX_ROUNDS,
     Round,
-    Seen,
+    SeenByCloud,
     at_result,
     check_without_surfaces,
     until_still,
@@ -93,7 +94,7 @@ def roof_control(
     of_heights = heights.block.control.take(np.arange(len(block.control.who), len(heights.block.control.who)))
     chosen = np.full(len(which), -1)
 
-    def look(adjusted: Adjustment) -> Seen:
+    def look(adjusted: Adjustment) -> SeenByCloud:
         xyz = np.asarray(adjusted.unknowns.points)[which]
         chosen[:] = _faces(xyz[:, :2], patches, margin)
         if not (chosen >= 0).any() and not len(middles):
@@ -110,12 +111,12 @@ def roof_control(
         # The yard between the wings of a house lies in the outline of its roof, too.
         off = np.einsum("nk,nk->n", normal, xyz - foot)
         chosen[~(np.abs(off) < _STOREY)] = -1
-        return Seen(which, foot, normal, sigma, chosen >= 0)
+        return SeenByCloud(which, foot, normal, sigma, chosen >= 0)
 
-    def build(adjusted: Adjustment, known: Covariance, seen: Seen, used: Bool[np.ndarray, "rows"]) -> Block:
+    def build(adjusted: Adjustment, known: Covariance, seen: SeenByCloud, used: Bool[np.ndarray, "rows"]) -> Block:
         n, own = int(used.sum()), np.concatenate([which[used], middles])
         others = of_heights.take(~np.isin(of_heights.who, own))
-        held = dataclasses.replace(block, control=Rows.joined(block.control, centres, others))
+        held = dataclasses.replace(block, control=ControlRows.joined(block.control, centres, others))
         rows = SurfaceRows(
             which[used], np.zeros(n, int), seen.foot[used], seen.normal[used], np.zeros((n, 3)), seen.sigma[used]
         )
@@ -163,9 +164,9 @@ def _faces(xy: Float[np.ndarray, "n 2"], patches: list[Patch], margin: float) ->
 
 def _centroid_rows(
     block: Block, points: Int[np.ndarray, "n"], places: Float[np.ndarray, "all 3"], patches: list[Patch], cloud: Cloud
-) -> Rows:
+) -> ControlRows:
     """Control in X, Y and Z of points at the middle of roof faces."""
-    parts = [Rows.none()]
+    parts = [ControlRows.none()]
     for point, face in zip(points, _faces(places[points, :2], patches, 0.0), strict=True):
         if point in block.control.who:
             raise InputError(f"point {block.points[point]} is control already: leave it out of the centroids")
@@ -175,5 +176,5 @@ def _centroid_rows(
                 f"{places[point, 0]:.1f} m, Y {places[point, 1]:.1f} m: leave it out"
             )
         centre, covariance = roof_centroid(cloud.xyz[patches[face].index])
-        parts.append(Rows(np.full(3, point), np.arange(3), centre, np.sqrt(np.diagonal(covariance))))
-    return Rows.joined(*parts)
+        parts.append(ControlRows(np.full(3, point), np.arange(3), centre, np.sqrt(np.diagonal(covariance))))
+    return ControlRows.joined(*parts)

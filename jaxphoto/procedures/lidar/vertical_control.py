@@ -12,18 +12,19 @@ from typing import Literal, get_args
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Integer
 
 from jaxphoto.adjustment import Adjustment
-from jaxphoto.block import Block, Rows
+from jaxphoto.block import Block
 from jaxphoto.cloud import Cloud
 from jaxphoto.errors import BlockError, InputError
 from jaxphoto.lidar import Grid, HeightFlag, HeightSettings, heights_at, index_cloud
 from jaxphoto.lidar.block_control import pseudo_control_of_block
-from jaxphoto.procedures.lidar.rounds import (
+from jaxphoto.observations import ControlRows
+from jaxphoto.procedures.lidar.until_still import (
     MAX_ROUNDS,
     Round,
-    Seen,
+    SeenByCloud,
     at_result,
     until_still,
     with_common_error,
@@ -48,7 +49,7 @@ class LidarControl(eqx.Module):
     """Z (m) of the cloud at the point; NaN where it was refused."""
     sigma: Float[np.ndarray, "points"]
     """Of the height as control (m): of the cloud's, and of what the point's own place is off by on a slope."""
-    flag: Int[np.ndarray, "points"]
+    flag: Integer[np.ndarray, "points"]
     """Sums of `lidar.HeightFlag`."""
     used: Bool[np.ndarray, "points"]
     """Whether the height is control: neither refused nor far off all others."""
@@ -80,7 +81,7 @@ def lidar_control(
     which = tie_points(block, points)
     heights: dict[str, np.ndarray] = {}
 
-    def look(adjusted: Adjustment) -> Seen:
+    def look(adjusted: Adjustment) -> SeenByCloud:
         z, sigma, gradient, heights["flag"] = _heights(adjusted, which, grid, method, settings)
         usable = np.isfinite(z)
         if not usable.any():
@@ -90,14 +91,14 @@ def lidar_control(
         slant = np.linalg.norm(normal, axis=1)
         foot = np.column_stack([place[:, :2], z])
         sigma = with_common_error(sigma, usable, settings.sigma_systematic_m)
-        return Seen(which, foot, normal / slant[:, None], sigma / slant, usable)
+        return SeenByCloud(which, foot, normal / slant[:, None], sigma / slant, usable)
 
-    def build(adjusted: Adjustment, known: Covariance, seen: Seen, used: np.ndarray) -> Block:
+    def build(adjusted: Adjustment, known: Covariance, seen: SeenByCloud, used: np.ndarray) -> Block:
         heights["sigma"] = _sigma(known, seen)
-        rows = Rows(which[used], np.full(used.sum(), 2), seen.foot[used, 2], heights["sigma"][used])
-        return dataclasses.replace(at_result(block, adjusted.unknowns), control=Rows.joined(block.control, rows))
+        rows = ControlRows(which[used], np.full(used.sum(), 2), seen.foot[used, 2], heights["sigma"][used])
+        return dataclasses.replace(at_result(block, adjusted.unknowns), control=ControlRows.joined(block.control, rows))
 
-    found = until_still(with_interior_held(block), look, build, max_rounds, report, "control")
+    found = until_still(with_interior_held(block), look, build, max_rounds, report, "control_points")
     return LidarControl(
         at_result(found.adjusted.block, found.adjusted.unknowns),
         found.adjusted,
@@ -155,7 +156,7 @@ def nothing_seen(points: np.ndarray, cloud: np.ndarray, flag: np.ndarray) -> Blo
     )
 
 
-def flag_counts(flag: Int[np.ndarray, "points"]) -> dict[str, int]:
+def flag_counts(flag: Integer[np.ndarray, "points"]) -> dict[str, int]:
     """How many heights have each flag that any has."""
     counts = {f.name or "": int(((flag & int(f)) != 0).sum()) for f in HeightFlag if f}
     return {name: n for name, n in counts.items() if n}
@@ -171,7 +172,7 @@ def _heights(adjusted: Adjustment, which: np.ndarray, grid: Grid, method: Method
     return found.z, found.sigma, found.gradient, found.flag
 
 
-def _sigma(known: Covariance, seen: Seen) -> Float[np.ndarray, "points"]:
+def _sigma(known: Covariance, seen: SeenByCloud) -> Float[np.ndarray, "points"]:
     """Of control heights: of the surface, and of the height that the uncertain place of the point means on a slope."""
     of_place = np.asarray(known.points)[seen.point][:, :2, :2]
     upright = seen.normal[:, 2]

@@ -1,6 +1,6 @@
 """Images oriented to one another from their common points alone: photographs, or a block without approximate values."""
 
 from jaxphoto.procedures.orientation.blocks import orient_block
-from jaxphoto.procedures.orientation.photographs import GrossErrors, OrientationReport, Oriented, orient
+from jaxphoto.procedures.orientation.orient_photographs import GrossErrors, OrientationReport, Oriented, orient
 
 __all__ = ["GrossErrors", "OrientationReport", "Oriented", "orient", "orient_block"]

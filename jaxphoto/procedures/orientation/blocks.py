@@ -11,13 +11,15 @@ import equinox as eqx
 import numpy as np
 
 from jaxphoto.block import Block, Start
+from jaxphoto.camera import Perspective
+from jaxphoto.errors import BlockError
 from jaxphoto.orientation.approximate import completed
 from jaxphoto.orientation.matches import PairMatches
 from jaxphoto.procedures.orientation.growing import grown
 from jaxphoto.procedures.orientation.network import Sight, sight_of
 from jaxphoto.procedures.orientation.onto_known import onto_known
-from jaxphoto.procedures.orientation.pairs import LENS_PX, MOST, Report, check_connected, relate
 from jaxphoto.procedures.orientation.refine import calibration_of
+from jaxphoto.procedures.orientation.related_pairs import LENS_PX, MOST, Report, check_connected, relate
 
 # Points measured by hand are few, and mostly right.
 _LEAST_MATCHES, _LEAST_POINTS = 8, 6
@@ -30,9 +32,10 @@ def orient_block(block: Block, report: Report = lambda text: None) -> Block:
     its known images; where nothing is known, it is a frame of its own. Interior orientation that is not fixed starts
     where the images want it. What was known stays as it is; images and points that cannot be oriented stay unknown.
 
-    Raises BlockError where no two images begin a network, for groups of images that nothing connects, and where known
-    points and stations are too few for the frame.
+    Raises BlockError for cameras that are not perspective, where no two images begin a network, for groups of images
+    that nothing connects, and where known points and stations are too few for the frame.
     """
+    _check_perspective(block)
     sight = sight_of(block, block.start.unknowns.interior)
     calibration = calibration_of(block)
     pixel = float(np.median([s.pixel_mm / float(block.start.unknowns.interior[n].c) for n, s in block.sensors.items()]))
@@ -57,6 +60,16 @@ def orient_block(block: Block, report: Report = lambda text: None) -> Block:
     unknowns = eqx.tree_at(places, start, tuple(np.where(*v) for v in zip(is_new, new, given, strict=True)))
     unknowns = dataclasses.replace(unknowns, interior=found.interior)
     return dataclasses.replace(block, start=Start(unknowns, image_known | oriented, point_known | met))
+
+
+def _check_perspective(block: Block) -> None:
+    for name, interior in block.start.unknowns.interior.items():
+        if type(interior.projection) is not Perspective:
+            raise BlockError(
+                f"camera {name} has the projection {interior.projection.name}, and images are oriented from nothing "
+                "but their points for perspective cameras only: give approximate values in images.csv, stations and "
+                "attitudes, or four known points in each image"
+            )
 
 
 def _common_points(sight: Sight, n_images: int) -> Iterator[PairMatches]:

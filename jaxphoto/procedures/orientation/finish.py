@@ -25,8 +25,8 @@ from jaxphoto.block import Block
 from jaxphoto.compiling import call_compiled
 from jaxphoto.procedures.orientation.depths import supported
 from jaxphoto.procedures.orientation.network import Network, meet, normalised_misfits, robust_scale, sight_of
-from jaxphoto.procedures.orientation.pairs import Report
-from jaxphoto.procedures.orientation.refine import Asked, Calibration, Names, hardly_known, observation, refined
+from jaxphoto.procedures.orientation.refine import Asked, Names, SelfCalibration, hardly_known, observation, refined
+from jaxphoto.procedures.orientation.related_pairs import Report
 
 # Gross errors are beyond so many robust standard deviations, and never within the second, in a priori ones.
 _LIMIT, _LEAST_LIMIT = 4.0, 1.0
@@ -57,7 +57,7 @@ class Finished(NamedTuple):
 def finished(
     block: Block,
     network: Network,
-    calibration: Calibration,
+    calibration: SelfCalibration,
     estimated: Asked,
     angle: float,
     least: int,
@@ -101,7 +101,7 @@ class Told(NamedTuple):
     """By what their standard deviations are larger than they were if all rays erred independently."""
 
 
-def told(adjusted: Adjustment, calibration: Calibration) -> Told:
+def told(adjusted: Adjustment, calibration: SelfCalibration) -> Told:
     """The parameters of `calibration` that images tell; in `adjusted` all of them were observed."""
     alike = erring_alike(adjusted.block, np.asarray(adjusted.residuals.image))
     matrix, labels = _shared_covariance(adjusted), adjusted.structure.labels

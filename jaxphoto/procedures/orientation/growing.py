@@ -26,8 +26,8 @@ from jaxphoto.procedures.orientation.network import (
     robust_scale,
     sight_of,
 )
-from jaxphoto.procedures.orientation.pairs import Pair, Report
-from jaxphoto.procedures.orientation.refine import Asked, Calibration, early, refined
+from jaxphoto.procedures.orientation.refine import Asked, SelfCalibration, early, refined
+from jaxphoto.procedures.orientation.related_pairs import Pair, Report
 from jaxphoto.procedures.orientation.two_steps import Placed, two_steps
 
 # Rays at less than this do not make a point; where images see too few points, less will do.
@@ -61,7 +61,7 @@ class Grown(NamedTuple):
 def grown(
     block: Block,
     pairs: Sequence[Pair],
-    calibration: Calibration,
+    calibration: SelfCalibration,
     least: int,
     most: float,
     report: Report = lambda text: None,
@@ -120,7 +120,7 @@ class _Growth:
         self,
         block: Block,
         pairs: Sequence[Pair],
-        calibration: Calibration,
+        calibration: SelfCalibration,
         least: int,
         most: float,
         report: Report,

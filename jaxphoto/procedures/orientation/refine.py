@@ -13,10 +13,11 @@ import numpy as np
 from jaxtyping import Bool
 
 from jaxphoto.adjustment import Adjustment, Sizes, common_sizes, solve
-from jaxphoto.block import Attitudes, Block, Datum, Distances, Frame, ImageRows, Rows, Start, SurfaceRows
+from jaxphoto.block import Block, Datum, Frame, Start
 from jaxphoto.camera import InteriorOrientation, get_parameter, parameter_names, set_parameter
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.georeferencing import Corrections
+from jaxphoto.observations import Attitudes, ControlRows, Distances, ImageRows, StationRows, SurfaceRows
 from jaxphoto.procedures.orientation.network import Network
 from jaxphoto.unknowns import FIXED, FREE, Unknowns, Weighted, default_priors
 
@@ -42,7 +43,7 @@ class Asked(NamedTuple):
     """By camera: observed where they start, with the standard deviation of `observation`."""
 
 
-class Calibration(NamedTuple):
+class SelfCalibration(NamedTuple):
     """What is estimated of the interior orientation while a network grows."""
 
     names: Names
@@ -55,7 +56,7 @@ class Calibration(NamedTuple):
     """Of the whole block, which all its parts are padded to."""
 
 
-def calibration_of(block: Block) -> Calibration:
+def calibration_of(block: Block) -> SelfCalibration:
     """What a free network of the images of `block` estimates: all that its priors do not hold fixed."""
     names, unit, begin = {}, {}, {}
     for camera, priors in block.priors.interior.items():
@@ -64,7 +65,7 @@ def calibration_of(block: Block) -> Calibration:
         corner = np.array([sensor.width_mm, sensor.height_mm]) / 2
         unit[camera] = {n: float(np.linalg.norm(corner)) / _at_corner(interior, n, corner) for n in names[camera]}
         begin[camera] = {n: float(np.asarray(get_parameter(interior, n))) for n in names[camera]}
-    calibration = Calibration(names, unit, begin, Sizes())
+    calibration = SelfCalibration(names, unit, begin, Sizes())
     return calibration._replace(sizes=common_sizes([_with_priors(bare(block), calibration, Asked(names, {}))]))
 
 
@@ -83,30 +84,30 @@ def _at_corner(interior: InteriorOrientation, name: str, corner: np.ndarray) -> 
     return float(np.linalg.norm(both[0] - both[1], axis=1).max()) / (2 * step)
 
 
-def observation(calibration: Calibration, camera: str, name: str) -> Weighted:
+def observation(calibration: SelfCalibration, camera: str, name: str) -> Weighted:
     """What is known of a parameter beforehand: its start, as closely as lenses are alike and as c is known."""
     sigma = (_C if name == "c_mm" else _LENS) * calibration.unit[camera][name]
     return Weighted(np.asarray(calibration.start[camera][name]), np.asarray(sigma))
 
 
-def hardly_known(calibration: Calibration, camera: str, name: str) -> float:
+def hardly_known(calibration: SelfCalibration, camera: str, name: str) -> float:
     """A standard deviation that hardly counts, for a parameter that is free."""
     return _FREE * calibration.unit[camera][name]
 
 
-def asked(calibration: Calibration, free: Names) -> Asked:
+def asked(calibration: SelfCalibration, free: Names) -> Asked:
     """All parameters of `calibration`: those in `free`, and the others observed."""
     rest = {camera: tuple(n for n in names if n not in free[camera]) for camera, names in calibration.names.items()}
     return Asked(free, rest)
 
 
-def early(calibration: Calibration) -> Asked:
+def early(calibration: SelfCalibration) -> Asked:
     """What few images can tell of a camera."""
     return Asked({}, {camera: tuple(n for n in names if n in _EARLY) for camera, names in calibration.names.items()})
 
 
 def refined(
-    block: Block, network: Network, calibration: Calibration, estimated: Asked, growing: bool = False
+    block: Block, network: Network, calibration: SelfCalibration, estimated: Asked, growing: bool = False
 ) -> tuple[Network, Adjustment]:
     """The network after an adjustment of its oriented images and of the points that they meet in.
 
@@ -129,7 +130,7 @@ def refined(
     return found, adjusted
 
 
-def _with_priors(block: Block, calibration: Calibration, estimated: Asked, growing: bool = False) -> Block:
+def _with_priors(block: Block, calibration: SelfCalibration, estimated: Asked, growing: bool = False) -> Block:
     interiors = {}
     for camera, start in block.start.unknowns.interior.items():
         priors = block.priors.interior[camera]
@@ -195,10 +196,10 @@ def bare(block: Block) -> Block:
         image_mount=("",) * n,
         image_strip=("",) * n,
         image_time=np.zeros(n),
-        control=Rows.none(),
-        fixed=Rows.none(),
-        check=Rows.none(),
-        stations=Rows.none(),
+        control=ControlRows.none(),
+        fixed=ControlRows.none(),
+        check=ControlRows.none(),
+        stations=StationRows.none(),
         attitudes=Attitudes.none(),
         distances=Distances.none(),
         datum=Datum("inner", "points"),

@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from jaxphoto.orientation.averaging import average_rotation, intersect_directions
 from jaxphoto.procedures.orientation.network import Network, Sight
-from jaxphoto.procedures.orientation.pairs import Pair
+from jaxphoto.procedures.orientation.related_pairs import Pair
 
 # A pair whose rotation is so far from the average of the others (rad) is a false one.
 _FALSE = np.deg2rad(5.0)

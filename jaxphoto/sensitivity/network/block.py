@@ -16,11 +16,12 @@ from jaxphoto.adjustment.datum import close_datum
 from jaxphoto.adjustment.structure import structure_of
 from jaxphoto.adjustment.values import values_of
 from jaxphoto.arrays import still
-from jaxphoto.block import Attitudes, Block, Datum, Distances, ImageRows, Rows, Start
-from jaxphoto.camera import set_parameter
+from jaxphoto.block import Block, Datum, Start
+from jaxphoto.camera import Perspective, set_parameter
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import BlockError
 from jaxphoto.georeferencing import NOMINAL, Mount, body_from_camera
+from jaxphoto.observations import Attitudes, ControlRows, Distances, ImageRows, StationRows
 from jaxphoto.rotation import roll_pitch_yaw_from_matrix
 from jaxphoto.sensitivity.network.layout import Layout
 from jaxphoto.simulation import photograph
@@ -81,10 +82,10 @@ def measured_block(layout: Layout) -> Measured:
         image_strip=("",) * n,
         image_time=np.zeros(n),
         image_points=ImageRows(rays.image, number[rays.point], rays.xy, sigma),
-        control=_rows(control[point], np.asarray(truth.points)),
-        fixed=Rows.none(),
-        check=Rows.none(),
-        stations=_rows(station, np.asarray(layout.exterior.position)),
+        control=ControlRows(*_rows(control[point], np.asarray(truth.points))),
+        fixed=ControlRows.none(),
+        check=ControlRows.none(),
+        stations=StationRows(*_rows(station, np.asarray(layout.exterior.position))),
         attitudes=Attitudes(turned, angles[turned], 1 / np.sqrt(attitude[turned])),
         distances=Distances.none(),
         datum=Datum(),
@@ -96,19 +97,24 @@ def measured_block(layout: Layout) -> Measured:
 
 def check_layout(layout: Layout) -> None:
     """Raise DatumError where `layout` leaves position, orientation or scale open, BlockError where an image
-    sees too few points.
+    sees too few points, or where the camera is a fisheye, whose images are not planned.
 
     It is the check of `jaxphoto.adjust`, and says what is open.
     """
+    if not isinstance(layout.interior.projection, Perspective):
+        raise BlockError(
+            f"layouts are planned for perspective cameras, and this one is {layout.interior.projection.name}: adjust "
+            "blocks of it instead (designs, monte_carlo)"
+        )
     block, truth, _ = measured_block(layout)
     structure = structure_of(block, block.priors)
     close_datum(block, concrete(values_of(block, truth, block.priors, structure), block), structure)
 
 
-def _rows(weight: np.ndarray, value: np.ndarray) -> Rows:
+def _rows(weight: np.ndarray, value: np.ndarray) -> tuple[np.ndarray, ...]:
     """One row for every coordinate that has a weight."""
     who, axis = np.nonzero(weight > 0)
-    return Rows(who, axis, np.asarray(value)[who, axis], 1 / np.sqrt(weight[who, axis]))
+    return who, axis, np.asarray(value)[who, axis], 1 / np.sqrt(weight[who, axis])
 
 
 @eqx.filter_jit

@@ -1,0 +1,269 @@
+"""Groups of observations besides image points: what each row touches, as index arrays made once on the host.
+
+What the rows of a group touch decides how they are eliminated; nobody declares it:
+
+    reduced     no point: rows add to the reduced normal matrix, where images and shared unknowns meet
+    point       one point, and otherwise unknowns that are the same for all rows: they add to the point's own block
+                (`Tiles`), before it is eliminated
+    coupled     all else, such as two points, or a point and an image: few rows, that extra unknowns carry (`normal`)
+"""
+
+from collections.abc import Sequence
+from typing import Any, Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Int
+
+from jaxphoto.adjustment.shared import ParameterTable, Together
+from jaxphoto.arrays import vector_of
+from jaxphoto.block import Block
+from jaxphoto.errors import BlockError
+from jaxphoto.observations import (
+    PRIORS,
+    AbstractObservations,
+    KnownParameters,
+    ParameterRows,
+    PointRows,
+    PositionRows,
+    RotationRows,
+    correlated,
+)
+from jaxphoto.unknowns import Unknowns, Weighted, check_prior
+
+RowLayout = Literal["reduced", "point", "coupled"]
+
+
+class Argument(NamedTuple):
+    """What the residual of one row is given."""
+
+    what: str
+    """"image", "point", "parameter", or a kind of declared parameters."""
+    shape: tuple[int, ...]
+    """() for one, (m,) for a stack of m."""
+
+
+class Listed(eqx.Module):
+    """Rows along the last axis."""
+
+    listed: AbstractObservations
+
+
+class AtPoints(eqx.Module):
+    """Rows by point: arrays end in (rows, points), rows being the most that a point has."""
+
+    at_points: AbstractObservations
+
+
+class Group(eqx.Module):
+    """A group of observations: index arrays of its rows and of what they touch, rows last."""
+
+    name: str = eqx.field(static=True)
+    layout: RowLayout = eqx.field(static=True)
+    scalar: bool = eqx.field(static=True)
+    """Whether a row is one number; its residuals then have no axis for it in the results."""
+    components: int = eqx.field(static=True)
+    arguments: tuple[Argument, ...] = eqx.field(static=True)
+    through_camera: bool = eqx.field(static=True)
+    rigid: bool = eqx.field(static=True)
+    rows: Listed | AtPoints
+    """Indices only; the numbers are in `Values.groups`."""
+    image: Int[np.ndarray, "k rows"]
+    """The images that a row touches."""
+    point: Int[np.ndarray, "j rows"]
+    parameter: Int[np.ndarray, "p _"]
+    """Places of the parameters that a row touches in the vector of all shared ones; its length where there is none.
+    First those of each image, table by table, then those of the other arguments. (p, rows); of rows by point (p, 1)."""
+    place: tuple[int, ...] = eqx.field(static=True)
+    """Which of these are unknowns in any row."""
+    column: Int[np.ndarray, "l _"]
+    """The shared unknowns that they are; the number of these where a row has none."""
+    pair: Int[np.ndarray, "pairs rows 4"]
+    """Of a padded structure: where two images of a row meet in the band (see `Tiles.block`), and whether transposed."""
+
+    @property
+    def own(self) -> AbstractObservations:
+        """The rows, wherever they lie."""
+        return self.rows.at_points if isinstance(self.rows, AtPoints) else self.rows.listed
+
+    @property
+    def depth(self) -> int:
+        """Of rows at points, the most that a point has."""
+        return int(np.bincount(self.point[0]).max(initial=0))
+
+    @property
+    def n_rows(self) -> int:
+        """Number of rows, those by point with the empty ones."""
+        return int(np.shape(jax.tree.leaves(self.own)[0])[-1])
+
+
+def observations_of(
+    block: Block, priors: Unknowns, together: Sequence[Together], labels: Sequence[str]
+) -> list[tuple[str, AbstractObservations]]:
+    """All groups of a block that have rows, with their names: what it observes, then what is known beforehand.
+
+    Scalar priors of shared parameters are not among them (`weighted_parameters`). Raises BlockError for rows that
+    refer to nothing.
+    """
+    named: list[tuple[str, AbstractObservations]] = []
+    for rows in (*block.observations, *_priors_of_places(block, priors)):
+        if len(rows):
+            _check(rows, block)
+            taken = sum(name.split("#")[0] == rows.group for name, _ in named)
+            named.append((rows.group if not taken else f"{rows.group}#{taken + 1}", rows))
+    known = [k for k in block.more if isinstance(k, KnownParameters)]
+    place = {label: k for k, label in enumerate(labels)}
+    for k in known:
+        if missing := [label for label in k.labels if label not in place]:
+            raise BlockError(f"{missing[0]} is no parameter of this block, which has {', '.join(list(place)[:4])} ...")
+    sets = [Together(np.array([place[x] for x in k.labels]), k.value, k.covariance) for k in known]
+    for n, (parameters, value, covariance) in enumerate([*together, *sets]):
+        size = len(parameters)
+        rows = ParameterRows(parameters, _spread(value, (size,)), np.ones(size))
+        covariance = _spread(covariance, (size, size))
+        named.append((f"{PRIORS}_together" + f"#{n + 1}" * (n > 0), correlated(rows, [range(size)], covariance[None])))
+    return named
+
+
+def weighted_parameters(priors: Sequence[object], together: Sequence[Together]) -> ParameterRows:
+    """The scalar priors of shared parameters, in their order."""
+    joint = {int(k) for t in together for k in t.parameters}
+    own = {k: prior for k, prior in enumerate(priors) if isinstance(prior, Weighted) and k not in joint}
+    value = vector_of([prior.value for prior in own.values()])
+    sigma = vector_of([prior.sigma for prior in own.values()])
+    return ParameterRows(np.array(list(own), int), value, sigma)
+
+
+def _spread(v: Any, shape: tuple[int, ...]) -> Any:
+    return (jax.numpy if isinstance(v, jax.core.Tracer) else np).broadcast_to(v, shape)
+
+
+def _priors_of_places(block: Block, priors: Unknowns) -> list[AbstractObservations]:
+    """Weighted exterior orientations and points. Raises InputError for a prior that is none."""
+    found: list[AbstractObservations] = []
+    exterior, n, m = priors.exterior, len(block.images), len(block.points)
+    for label, prior, kind, count, shape in (
+        ("exterior.position", exterior.position, PositionRows, n, (3,)),
+        ("exterior.camera_from_object", exterior.camera_from_object, RotationRows, n, (3, 3)),
+        ("points", priors.points, PointRows, m, (3,)),
+    ):
+        check_prior(label, prior)
+        if not isinstance(prior, Weighted):
+            continue
+        value, sigma = _spread(prior.value, (count, *shape)), _spread(prior.sigma, (count, 3))
+        extra = (np.zeros((count, 3)),) if kind is RotationRows else ()
+        rows = kind(np.arange(count), value, sigma, *extra)
+        if prior.covariance is None:
+            found.append(rows)
+        else:
+            found.append(correlated(rows, np.arange(count)[:, None], _spread(prior.covariance, (count, 3, 3))))
+    return found
+
+
+def _check(rows: AbstractObservations, block: Block) -> None:
+    for what, index in rows.indices():
+        size = {"image": len(block.images), "point": len(block.points)}.get(what)
+        index = np.asarray(index)
+        if index.dtype.kind not in "iu":
+            raise BlockError(f"{rows.group}: what a row touches is given by numbers of {what}s, not by {index.dtype}")
+        if size is None:
+            continue
+        bad = np.flatnonzero(((index < 0) | (index >= size)).reshape(len(index), -1).any(axis=1))
+        if len(bad):
+            raise BlockError(f"{rows.group}, row {bad[0]}: there is no {what} {index[bad[0]]} among {size}")
+
+
+def group_of(
+    name: str,
+    rows: AbstractObservations,
+    tables: Sequence[ParameterTable],
+    cameras: Int[np.ndarray, "p images"] | None,
+    unknown_of: Int[np.ndarray, "parameters_and_none"],
+    n_shared: int,
+) -> Group:
+    """The index arrays of a group: `cameras` are the places of the interior orientation of each image, `unknown_of`
+    gives the shared unknown of each parameter, `n_shared` for none."""
+    n, nowhere = len(rows), len(unknown_of) - 1
+    by_kind = {t.kind: t for t in tables}
+    images, points, of_images, of_others, arguments = [], [], [], [], []
+    own = image_tables(tables)
+    for what, index in rows.indices():
+        argument = Argument(what, index.shape[1:])
+        arguments.append(argument)
+        for one in np.asarray(index, np.int32).reshape(n, -1).T:
+            if what == "image":
+                images.append(one)
+                of_images += [t.numbers_at(t.of_image[one], nowhere) for t in own]
+                if rows.through_camera:
+                    of_images.append(_cameras(rows, cameras)[:, one])
+            elif what == "point":
+                points.append(one)
+            elif what == "parameter":
+                of_others.append(one[None])
+            elif what in by_kind:
+                of_others.append(by_kind[what].numbers_at(one, nowhere))
+            else:
+                raise BlockError(f"{rows.group}: the rows touch {what}, of which the block has none")
+    for kind in rows.also:
+        arguments.append(Argument(kind, ()))
+        if kind in by_kind:
+            of_others.append(np.repeat(by_kind[kind].numbers_at(np.zeros(1, int), nowhere), n, axis=1))
+    parameter = np.concatenate([np.zeros((0, n), np.int32), *of_images, *of_others]).astype(np.int32)
+    column = unknown_of[parameter]
+    place = np.flatnonzero((column < n_shared).any(axis=1))
+    column = column[place].astype(np.int32)
+    alike = n > 0 and (parameter == parameter[:, :1]).all()
+    layout: RowLayout = "reduced" if not points else "point" if len(points) == 1 and not images and alike else "coupled"
+    return Group(
+        name=name,
+        layout=layout,
+        scalar=len(rows.axes) == 1,
+        components=len(rows.axes),
+        arguments=tuple(arguments),
+        through_camera=rows.through_camera,
+        rigid=rows.rigid or not (images or points),
+        rows=Listed(indices_of(rows)),
+        image=_stack(images, n),
+        point=_stack(points, n),
+        parameter=parameter,
+        place=tuple(int(k) for k in place),
+        column=column,
+        pair=np.zeros((0, n, 4), np.int32),
+    )
+
+
+def _cameras(rows: AbstractObservations, cameras: np.ndarray | None) -> np.ndarray:
+    if cameras is None:
+        raise BlockError(f"{rows.group} go through the camera: that works where all cameras have one distortion model")
+    return cameras
+
+
+def _stack(parts: list[np.ndarray], n: int) -> np.ndarray:
+    return np.stack(parts) if parts else np.zeros((0, n), np.int32)
+
+
+def image_tables(tables: Sequence[ParameterTable]) -> list[ParameterTable]:
+    """Those whose parameters a row gets with its images."""
+    return [t for t in tables if t.of_images and not t.bends]
+
+
+def indices_of(rows: AbstractObservations) -> AbstractObservations:
+    """The rows without their numbers, rows last."""
+    whole = eqx.filter(rows, lambda v: not _is_number(v))
+    return jax.tree.map(lambda v: np.moveaxis(np.asarray(v), 0, -1), whole)
+
+
+def numbers_in(rows: AbstractObservations) -> AbstractObservations:
+    """The numbers of the rows without their indices, rows last; float64."""
+    whole = eqx.filter(rows, _is_number)
+
+    def last(v: Any) -> Any:
+        traced = isinstance(v, jax.core.Tracer)
+        return jax.numpy.moveaxis(v, 0, -1) if traced else np.moveaxis(np.asarray(v, float), 0, -1)
+
+    return jax.tree.map(last, whole)
+
+
+def _is_number(v: Any) -> bool:
+    return np.dtype(getattr(v, "dtype", float)).kind == "f"

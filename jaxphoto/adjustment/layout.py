@@ -1,0 +1,191 @@
+"""The layout of a block: images in order, points in tiles, tiles in chunks, and how large each list is.
+
+A point without a free coordinate is not eliminated, so nothing makes it unique: where all images of a test field see
+the same points, each of them lies once in the tile of every few images. Images that meet in such points only do not
+meet in the reduced normal matrix; where no point is free it is an arrow: images by themselves, and what they share.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Int
+
+from jaxphoto.adjustment.band import column_blocks
+from jaxphoto.adjustment.structure import Structure
+from jaxphoto.adjustment.tiling import (
+    TILES,
+    Tiling,
+    field_shape,
+    order_images,
+    size_class,
+    split_points,
+    tile_points,
+    tile_shape,
+)
+
+
+class Sizes(NamedTuple):
+    """How large each kind of list is, in a block or as it is compiled for."""
+
+    images: int = 1
+    bandwidth: int = 1
+    """Largest difference of places of two images that meet in a free point."""
+    tiles: int = 1
+    tile_images: int = 4
+    tile_points: int = 8
+    blocks: int = 1
+    """Pairs of images that meet anywhere in a chunk, in the chunk that has most."""
+    rows: tuple[tuple[str, int], ...] = ()
+    """Of each group of observations; of rows at points, the most that a point has."""
+
+    def __or__(self, other: object) -> "Sizes":
+        """What both fit into."""
+        if not isinstance(other, Sizes):
+            return NotImplemented
+        most = [dict(self.rows), dict(other.rows)]
+        rows = tuple((name, max(of.get(name, 0) for of in most)) for name in most[0] | most[1])
+        images, bandwidth, tiles, m, p, blocks = map(max, self[:-1], other[:-1])
+        return Sizes(images, bandwidth, tiles, m, p, blocks, rows)
+
+
+LEAST = Sizes()
+"""No more than a block needs by itself."""
+
+
+class Places(NamedTuple):
+    """Where a block's own images, points and image rows lie in the padded arrays."""
+
+    image: Int[np.ndarray, "images"]
+    point: Int[np.ndarray, "points"]
+    """Of a fixed point that lies at several places, the first: what is observed of it but in images is there."""
+    row: Int[np.ndarray, "rows"]
+    """(tile * M + image) * P + point."""
+    point_at: Int[np.ndarray, "padded"]
+    """The block's point at every place of the padded arrays, -1 at those that are padding."""
+
+
+def sizes_of(structure: Structure) -> Sizes:
+    """The sizes of a block, with room for the image that nothing needs."""
+    return TileLayout.of(structure, LEAST, shards=1, dense=False).sizes
+
+
+# Tiles are summed in chunks whose products take no more numbers than this.
+_CHUNK = 4_000_000
+# Up to so many images, a larger reduced matrix costs less than another program.
+_SMALL = 64
+# Slots that are computed with at a time.
+_SLOTS = 4000
+
+
+class TileLayout(NamedTuple):
+    """Images in order, points in tiles, tiles in chunks."""
+
+    image_place: np.ndarray
+    tiling: Tiling
+    point_of: Int[np.ndarray, "copies"]
+    """The point that each of the tiling's points is."""
+    free_points: bool
+    """Whether any point has a free coordinate."""
+    columns: int
+    width: int
+    """Images of a column block."""
+    chunks: int
+    chunk: int
+    at_once: int
+    lists: tuple[list[np.ndarray], ...]
+    sizes: Sizes
+
+    @classmethod
+    def of(cls, structure: Structure, wanted: Sizes, shards: int, dense: bool) -> "TileLayout":
+        """Of a block on its own; `wanted` are sizes that it is to have at least."""
+        s = structure
+        free = np.any(s.point_free > 0, axis=0)
+        own = free[s.point]
+        place, bandwidth = order_images(*_meetings(s, own))
+        tiling, point_of, (m, p) = _tiles(place[s.image], s.point, free, s.n_images, wanted)
+        tiles = max(len(tiling.image), wanted.tiles)
+        images, bandwidth = max(s.n_images + 1, wanted.images), max(bandwidth, wanted.bandwidth)
+        n = size_class(images, 32 if images <= _SMALL else 16)
+        columns, width = (1, n) if dense else column_blocks(n, min(n, size_class(bandwidth, 8)))
+        per_shard = -(-tiles // shards)
+        chunks = -(-per_shard * (6 * m) ** 2 // _CHUNK)
+        at_once = max(k for k in range(1, TILES + 1) if TILES % k == 0 and k * m * p <= max(_SLOTS, m * p))
+        chunk = size_class(-(-per_shard // chunks), TILES)
+        lists = _pair_lists(_images_of_free_points(tiling, own, p), chunk, width)
+        blocks = max(map(len, lists[2]), default=0)
+        rows = tuple((g.name, g.depth if g.layout == "point" else g.n_rows) for g in s.observed)
+        sizes = Sizes(images, bandwidth, tiles, m, p, blocks + 1, rows)
+        return cls(
+            place, tiling, point_of, bool(free.any()), columns, width, shards * chunks, chunk, at_once, lists, sizes
+        )
+
+    @property
+    def pairs(self) -> int:
+        """As many pairs of images as there can be in the tiles of a chunk."""
+        m = self.sizes.tile_images
+        return self.chunk * m * (m + 1) // 2 if self.free_points else 0
+
+
+def _meetings(s: Structure, own: Bool[np.ndarray, "rows"]) -> tuple[np.ndarray, np.ndarray, int, int]:
+    """Which images meet in which free points (`own` rows); those that an observation joins, in a point of their own."""
+    image, point, n = [s.image[own]], [s.point[own]], s.n_points
+    for g in s.observed:
+        if g.layout == "reduced" and len(g.image) > 1:
+            image.append(g.image.T.ravel())
+            point.append(n + np.repeat(np.arange(g.n_rows), len(g.image)))
+            n += g.n_rows
+    return np.concatenate(image), np.concatenate(point), s.n_images, n
+
+
+def _tiles(
+    image: Int[np.ndarray, "rows"], point: Int[np.ndarray, "rows"], free: Bool[np.ndarray, "points"], n: int, wanted
+) -> tuple[Tiling, np.ndarray, tuple[int, int]]:
+    """The tiles, the point that each of their points is, and their shape; `image` are places."""
+    own, n_points = free[point], len(free)
+    rays = np.bincount(point, minlength=n_points)
+    # Of a point that is free all images are in one tile; fixed ones are split where they would want a wider one.
+    split = rays[~free].max(initial=0) > rays[free].max(initial=0)
+    if not free.any():
+        m, p = field_shape(image, point, n, n_points)
+    elif split:
+        kept = np.cumsum(free) - 1
+        m, p = tile_shape(image[own], kept[point[own]], n, int(free.sum()))
+    else:
+        m, p = tile_shape(image, point, n, n_points)
+    m, p = max(m, wanted.tile_images), max(p, wanted.tile_points)
+    if not split:
+        return tile_points(image, point, n_points, m, p), np.arange(n_points), (m, p)
+    copy, point_of = split_points(image, point, ~free, m)
+    order = np.argsort(copy, kind="stable")
+    tiling = tile_points(image[order], copy[order], len(point_of), m, p)
+    slot = np.empty_like(tiling.slot)
+    slot[order] = tiling.slot
+    return tiling._replace(slot=slot), point_of, (m, p)
+
+
+def _images_of_free_points(tiling: Tiling, own: Bool[np.ndarray, "rows"], p: int) -> Int[np.ndarray, "tiles m"]:
+    """The images of each tile that see a free point in it, -1 in place of the others; `own` says which rows do."""
+    seen = np.zeros(tiling.image.shape, bool)
+    seen.reshape(-1)[tiling.slot[own] // p] = True
+    return np.where(seen, tiling.image, -1)
+
+
+def _pair_lists(tile_image: np.ndarray, chunk: int, width: int) -> tuple[list[np.ndarray], ...]:
+    """By chunk: pairs of images of a tile (tile, first, second), their block, and the blocks (see `Tiles`)."""
+    all_pairs, all_blocks, blocks = [], [], []
+    m = tile_image.shape[1]
+    first, second = np.tril_indices(m)
+    for start in range(0, len(tile_image), chunk):
+        own = tile_image[start : start + chunk]
+        a, b = own[:, first], own[:, second]
+        tile, pair = np.nonzero((a >= 0) & (b >= 0))
+        a, b = a[tile, pair].astype(np.int64), b[tile, pair]
+        key = a * (int(own.max(initial=0)) + 1) + b
+        order = np.argsort(key, kind="stable")
+        unique, block = np.unique(key[order], return_inverse=True)
+        row, column = np.divmod(unique, int(own.max(initial=0)) + 1)
+        which = column // width
+        all_pairs.append(np.stack([tile, first[pair], second[pair]], axis=1)[order])
+        all_blocks.append(block)
+        blocks.append(np.stack([which, row - which * width, column % width], axis=1))
+    return all_pairs, all_blocks, blocks

@@ -1,0 +1,186 @@
+"""What all rows but image rows add to the normal equations, group by group (see `groups` for the three layouts)."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxphoto.adjustment.groups import AtPoints, Group
+from jaxphoto.adjustment.normal import At
+from jaxphoto.adjustment.residuals import Residuals, datum_residuals
+from jaxphoto.adjustment.rows import RowJacobian, row_jacobian
+from jaxphoto.adjustment.structure import Structure, total
+from jaxphoto.adjustment.tiles import once
+
+
+class OtherRows(NamedTuple):
+    """Derivatives and residuals of all but the image rows."""
+
+    jacobians: tuple[RowJacobian, ...]
+    residuals: Residuals
+    v: Float[Array, "3 3 points"]
+    """Sums over the rows that lie at points: of J_p' J_p,"""
+    b: Float[Array, "3 points"]
+    """of J_p' r,"""
+    w: Float[Array, "others 3 points"]
+    """and of J_s' J_p, s being the unknowns that points meet besides those of cameras (`Structure.n_border`)."""
+    rows_e: Float[Array, "constraints images 6"]
+    """Rows that couple points, by what they touch: observations, then the constraints of the datum."""
+    rows_s: Float[Array, "constraints shared"]
+    rows_p: Float[Array, "constraints 3 points"]
+    coupled: Float[Array, "constraints"]
+    """Their residuals."""
+
+
+class Sums(NamedTuple):
+    """Sums of the normal equations of images and shared unknowns (see `normal`), before points are eliminated.
+
+    Shared unknowns have a column more than there are: what means none adds to it.
+    """
+
+    band: tuple[Float[Array, "inner 2w 6 w 6"], Float[Array, "w 6 w 6"]]
+    """Pairs of images, by column block; images with themselves are in `u`."""
+    u: Float[Array, "images 6 6"]
+    us: Float[Array, "images 6 shared+1"]
+    uss: Float[Array, "shared+1 shared+1"]
+    b_s: Float[Array, "shared+1"]
+    b_e: Float[Array, "images 6"]
+
+
+def other_rows(at: At) -> OtherRows:
+    """Derivatives and residuals at `at`, and their sums by point."""
+    increments, scale, values, s = at
+    n, q = increments.points.shape[1], s.n_border - s.n_interior
+    jacobians = tuple(
+        row_jacobian(g, numbers, increments, scale, values, s)
+        for g, numbers in zip(s.observed, values.groups, strict=True)
+    )
+    v, b, w = jnp.zeros((3, 3, n)), jnp.zeros((3, n)), jnp.zeros((q, 3, n))
+    coupling: list[tuple[Array, Array, Array]] = []
+    coupled = []
+    for g, j in zip(s.observed, jacobians, strict=True):
+        if isinstance(g.rows, AtPoints):
+            # Term by term and rows with rows of a point: few, and every one of them as long as there are points.
+            flat = j.points.reshape(-1, 3, *j.points.shape[3:])
+            flat = jnp.moveaxis(flat, 2, 1).reshape(-1, 3, n)
+            r = j.residual.reshape(-1, n)
+            v, b = v + jnp.einsum("rap,rbp->abp", flat, flat), b + jnp.einsum("rap,rp->ap", flat, r)
+            if len(g.place):
+                shared = jnp.moveaxis(j.shared, 1, 2).reshape(-1, len(g.place), n)
+                met = jnp.einsum("rlp,rap->lap", shared, flat)
+                w = w.at[jnp.asarray(g.column)[:, 0] - s.n_interior].add(met, mode="drop")
+        elif g.layout == "coupled":
+            coupling.append(_coupled(g, j, s, n))
+            coupled.append(j.residual.reshape(-1))
+    k = len(values.datum_eop)
+    residuals = Residuals(
+        jnp.zeros((2, 0)),
+        tuple(j.residual for j in jacobians),
+        datum_residuals(increments, scale, values, s),
+        tuple(g.name for g in s.observed),
+    )
+    datum = (
+        (values.datum_eop * scale.eop).transpose(0, 2, 1),
+        jnp.zeros((k, s.n_shared)),
+        values.datum_points * scale.points,
+    )
+    e, of_s, p = (jnp.concatenate(of) for of in zip(*coupling, datum, strict=True))
+    return OtherRows(jacobians, residuals, v, b, w, e, of_s, p, jnp.concatenate([*coupled, residuals.datum]))
+
+
+def _coupled(g: Group, j: RowJacobian, s: Structure, n_points: int) -> tuple[Array, Array, Array]:
+    """The rows of a group in full, by images, shared unknowns and points."""
+    c, each = g.components, jnp.arange(g.n_rows)
+    e = jnp.zeros((c, g.n_rows, s.n_images, 6))
+    for k, image in enumerate(g.image):
+        e = e.at[:, each, image].add(j.eop[:, k].transpose(0, 2, 1))
+    of_s = jnp.zeros((c, g.n_rows, s.n_shared + 1))
+    for k, column in enumerate(g.column):
+        of_s = of_s.at[:, each, column].add(j.shared[:, k])
+    p = jnp.zeros((c, g.n_rows, 3, n_points))
+    for k, point in enumerate(g.point):
+        p = p.at[:, each, :, point].add(j.points[:, k].transpose(2, 0, 1))
+    flat = lambda v: v.reshape(-1, *v.shape[2:])  # noqa: E731
+    return flat(e), flat(of_s)[:, :-1], flat(p)
+
+
+def add_other_rows(sums: Sums, rest: OtherRows, s: Structure) -> Sums:
+    """The sums with those of all rows that meet images and shared unknowns."""
+    for g, j in zip(s.observed, rest.jacobians, strict=True):
+        if isinstance(g.rows, AtPoints):
+            if len(g.place):
+                sums = _add_shared(sums, g, j, s)
+        elif g.layout == "reduced":
+            sums = _add_reduced(sums, g, j, s)
+    return sums._replace(us=sums.us[:, :, :-1], uss=sums.uss[:-1, :-1], b_s=sums.b_s[:-1])
+
+
+def _add_shared(sums: Sums, g: Group, j: RowJacobian, s: Structure) -> Sums:
+    """Of rows at points, which are dealt out with these, what they add to the shared unknowns."""
+    flat = jnp.moveaxis(j.shared, 1, 0).reshape(len(g.place), -1)
+    column = jnp.asarray(g.column)[:, 0]
+    own, b = total((flat @ flat.T, flat @ j.residual.reshape(-1)), s)
+    return sums._replace(uss=sums.uss.at[column[:, None], column].add(own), b_s=sums.b_s.at[column].add(b))
+
+
+def _add_reduced(sums: Sums, g: Group, j: RowJacobian, s: Structure) -> Sums:
+    band, u, us, uss, b_s, b_e = sums
+    pair = 0
+    for a, image in enumerate(g.image):
+        own = j.eop[:, a]
+        square = once(lambda own, r: _products(own, jnp.concatenate([own, r[:, None]], 1)), s, own, j.residual)
+        by_image = sum_by(square.reshape(-1, 42), image, s.n_images).reshape(-1, 6, 7)
+        u, b_e = u + by_image[:, :, :6], b_e + by_image[:, :, 6]
+        for other in range(a):
+            across = _products(own, j.eop[:, other])
+            which, row, column, turned = jnp.asarray(g.pair[pair]).T
+            pair += 1
+            same = (jnp.asarray(g.image[other]) == image)[:, None, None]
+            # A row that touches an image twice: both halves of the product belong to the image itself.
+            both = jnp.where(same, across + across.transpose(0, 2, 1), 0.0)
+            u = u + sum_by(both.reshape(-1, 36), image, s.n_images).reshape(-1, 6, 6)
+            across = jnp.where(turned[:, None, None] > 0, across.transpose(0, 2, 1), across)
+            band = add_blocks(band, jnp.where(same, 0.0, across), jnp.stack([which, row, column], 1))
+        if len(g.place):
+            met = _products(own, j.shared)
+            us = us.at[jnp.asarray(image)[:, None], :, jnp.asarray(g.column).T].add(met.transpose(0, 2, 1))
+    if len(g.place):
+        column = jnp.asarray(g.column).T
+        uss = uss.at[column[:, :, None], column[:, None]].add(_products(j.shared, j.shared))
+        b_s = b_s.at[column].add(jnp.einsum("cln,cn->nl", j.shared, j.residual))
+    return Sums(band, u, us, uss, b_s, b_e)
+
+
+def _products(a: Float[Array, "c a rows"], b: Float[Array, "c b rows"]) -> Float[Array, "rows a b"]:
+    return jnp.einsum("can,cbn->nab", a, b)
+
+
+def add_blocks(
+    band: tuple[Array, Array], blocks: Float[Array, "blocks 6 6"], place: Array, distinct: bool = False
+) -> tuple[Array, Array]:
+    """Pairs of images, added where they belong: in the inner column blocks, or in the last (see `Tiles.block`).
+
+    What lies in neither is dropped. `distinct` says that no two blocks belong in one place, which is quicker.
+    """
+    columns, last = band
+    which, row, column = place.T
+    width, inner = len(last), len(columns)
+    if inner:
+        columns = columns.at[which, row, :, column].add(blocks, mode="drop", unique_indices=distinct)
+    row = jnp.where(which == inner, row, width)
+    return columns, last.at[row, :, column].add(blocks, mode="drop")
+
+
+# XLA compiles the loop over the rows of a scatter as one function where a row is short, and else calls several a row.
+_PIECE = 36
+
+
+def sum_by(rows: Float[Array, "rows c"], which: Array | np.ndarray | Any, n: int) -> Float[Array, "n c"]:
+    """Sums of rows by a number from 0 to n - 1."""
+    pieces = -(-rows.shape[1] // _PIECE)
+    size = -(-rows.shape[1] // pieces)
+    split = jnp.pad(rows, ((0, 0), (0, pieces * size - rows.shape[1]))).reshape(-1, size)
+    at = (which[:, None] * pieces + jnp.arange(pieces)).reshape(-1)
+    return jax.ops.segment_sum(split, at, n * pieces).reshape(n, -1)[:, : rows.shape[1]]

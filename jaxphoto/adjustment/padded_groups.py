@@ -1,0 +1,137 @@
+"""Groups of observations in padded sizes: rows listed, or by point; and back.
+
+Padding repeats the first row without weight: whatever is computed of it stays finite, and adds nothing.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Int
+
+from jaxphoto.adjustment.groups import AtPoints, Group, Listed
+from jaxphoto.adjustment.layout import Places
+from jaxphoto.adjustment.residuals import Values
+from jaxphoto.adjustment.rows import rows_of
+from jaxphoto.adjustment.structure import Structure
+from jaxphoto.adjustment.tiling import size_class
+from jaxphoto.arrays import still
+
+
+def pad_groups(
+    s: Structure, places: Places, n_images: int, n_points: int, width: int, rows: Mapping[str, int]
+) -> tuple[Group, ...]:
+    """The groups of a structure in padded sizes: `rows` are wanted at least, `width` is images of a column block."""
+    return tuple(_pad_group(g, places, n_images, n_points, width, rows.get(g.name, 0)) for g in s.observed)
+
+
+def _pad_group(g: Group, places: Places, n_images: int, n_points: int, width: int, wanted: int) -> Group:
+    if g.layout == "point":
+        index = _by_point(g, places, n_points, max(g.depth, wanted))
+        return dataclasses.replace(
+            g,
+            rows=AtPoints(jax.tree.map(lambda v: v[..., index], g.own)),
+            image=np.zeros((0, 0), np.int32),
+            point=np.zeros((1, 0), np.int32),
+            parameter=g.parameter[:, :1],
+            column=g.column[:, :1],
+            pair=np.zeros((0, 0, 4), np.int32),
+        )
+    image = places.image[g.image].astype(np.int32)
+    padded = dataclasses.replace(g, image=image, point=places.point[g.point], pair=_pairs(image, width))
+    if g.layout == "coupled":
+        return padded
+    # Such lists have no classes of their own: as long as they often are in a block of so many images.
+    more = size_class(max(g.n_rows, wanted), (3 if g.scalar else 1) * n_images) - g.n_rows
+    filled = lambda v: np.concatenate([v, np.repeat(v[..., :1], more, axis=-1)], axis=-1)  # noqa: E731
+    last = lambda v: np.moveaxis(filled(np.moveaxis(v, 1, -1)), -1, 1)  # noqa: E731
+    return dataclasses.replace(
+        padded,
+        rows=Listed(jax.tree.map(filled, g.own)),
+        image=filled(padded.image),
+        point=filled(padded.point),
+        parameter=filled(g.parameter),
+        column=filled(g.column),
+        pair=last(padded.pair),
+    )
+
+
+def _pairs(image: Int[np.ndarray, "k rows"], width: int) -> Int[np.ndarray, "pairs rows 4"]:
+    """Where two images of a row meet: column block, row and column in it, and whether the second lies behind."""
+    found = []
+    for a in range(len(image)):
+        for b in range(a):
+            row, column = np.maximum(image[a], image[b]), np.minimum(image[a], image[b])
+            which = column // width
+            found.append(np.stack([which, row - which * width, column % width, image[a] < image[b]], axis=1))
+    return np.array(found, np.int32).reshape(-1, image.shape[1], 4)
+
+
+def _by_point(g: Group, places: Places, n_points: int, depth: int) -> Int[np.ndarray, "rows points"]:
+    """The row in every place by point; the first where there is none."""
+    index = np.zeros(depth * n_points, int)
+    index[_row_places(g, places, n_points)] = np.arange(g.n_rows)
+    return index.reshape(depth, n_points)
+
+
+def _row_places(g: Group, places: Places, n_points: int) -> Int[np.ndarray, "rows"]:
+    """Where the rows of a group by point lie in (rows, points): those of a point one below the other."""
+    order = np.argsort(g.point[0], kind="stable")
+    of_point = g.point[0][order]
+    below = np.arange(len(order)) - np.searchsorted(of_point, of_point)
+    result = np.zeros(len(order), int)
+    result[order] = below * n_points + places.point[of_point]
+    return result
+
+
+def pad_rows(v: Values, s: Structure, padded: Structure, places: Places) -> tuple[Listed | AtPoints, ...]:
+    """The numbers of all rows in the sizes and the order of the padded structure."""
+    groups = zip(s.observed, padded.observed, v.groups, strict=True)
+    return tuple(_pad_numbers(g, wide, numbers, places) for g, wide, numbers in groups)
+
+
+def _pad_numbers(g: Group, wide: Group, numbers: Any, places: Places) -> Listed | AtPoints:
+    own = numbers.listed
+    if isinstance(wide.rows, AtPoints):
+        shape = np.shape(jax.tree.leaves(wide.own)[0])[-2:]
+        at = _row_places(g, places, shape[1])
+    else:
+        shape, at = (wide.n_rows,), np.arange(g.n_rows)
+    # The first row again, without weight.
+    idle = rows_of(g, Listed(jax.tree.map(lambda x: x[..., 0], own))).without_weight()
+    size = int(np.prod(shape))
+
+    def spread(x: Any, fill: Any) -> Any:
+        return scatter(x, at, size, still(fill)[..., None]).reshape(*x.shape[:-1], *shape)
+
+    fills = jax.tree.map(lambda x, y: None if x is None else y, own, idle, is_leaf=lambda x: x is None)
+    laid = jax.tree.map(spread, own, fills)
+    return AtPoints(laid) if isinstance(wide.rows, AtPoints) else Listed(laid)
+
+
+def crop_rows(g: Group, v: np.ndarray, places: Places) -> np.ndarray:
+    """Numbers of padded rows, (components, ...), in the block's own order: (rows) where a row is one number."""
+    if v.ndim == 3:
+        v = v.reshape(len(v), -1)[:, _row_places(g, places, v.shape[2])]
+    v = v[:, : g.n_rows]
+    return v[0] if g.scalar else v
+
+
+def put(array: np.ndarray, at: np.ndarray, size: int, fill: float) -> np.ndarray:
+    """`array`'s rows at their places along the first axis."""
+    result = np.full((size, *array.shape[1:]), fill, array.dtype)
+    result[at] = array
+    return result
+
+
+def scatter(array: Any, at: np.ndarray, size: int, fill: Any) -> Any:
+    """`array` at its places along the last axis, `fill` elsewhere."""
+    xp = jnp if any(isinstance(x, jax.core.Tracer) for x in (array, fill)) else np
+    result = xp.array(xp.broadcast_to(xp.asarray(fill, float), (*array.shape[:-1], size)))
+    if xp is jnp:
+        return result.at[..., at].set(array, unique_indices=True)
+    result[..., at] = array
+    return result

@@ -1,0 +1,195 @@
+"""Rows of the groups of observations: residuals, and their derivatives by what each row touches.
+
+A row is a function of a few numbers: the increments z of its images (6 each), its shared unknowns and its points (3
+each). All rows of a group are computed side by side, and every derivative is one of that function, by automatic
+differentiation; no dense Jacobian is ever made. Rows are the last axis throughout; of rows by point, rows and points.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxphoto.adjustment.groups import AtPoints, Group, image_tables
+from jaxphoto.adjustment.residuals import Increments, Residuals, Values, datum_residuals
+from jaxphoto.adjustment.structure import Structure, interior_of
+from jaxphoto.georeferencing import Exposure
+from jaxphoto.observations import AbstractObservations, ImageState
+from jaxphoto.parameters import filled
+from jaxphoto.rotation import small_rotation
+
+
+class Local(NamedTuple):
+    """Increments of what one row touches, or derivatives by them."""
+
+    eop: Float[Array, "k 6"]
+    shared: Float[Array, "l"]
+    points: Float[Array, "j 3"]
+
+
+class Given(NamedTuple):
+    """Everything else that a row is computed from; of many rows with rows last."""
+
+    row: AbstractObservations
+    scale: Local
+    position: Float[Array, "k 3"]
+    rotation: Float[Array, "k 3 3"]
+    exposure: tuple[Array, ...]
+    """The numbers of an `Exposure`, with a leading axis over the k images."""
+    parameters: Float[Array, "p"]
+    points: Float[Array, "j 3"]
+
+
+# Which axis of a row by point runs over the points, and which over the rows of one.
+_OVER_POINTS = Local(None, None, -1), Given(-1, Local(None, None, -1), None, None, None, None, -1)  # type: ignore[arg-type]
+_OVER_ROWS = Local(None, None, None), Given(-1, Local(None, None, None), None, None, None, None, None)  # type: ignore[arg-type]
+
+
+def each_row(function: Callable[[Local, Given], Any], group: Group, z: Local, given: Given) -> Any:
+    """`function` of every row, rows last."""
+    if isinstance(group.rows, AtPoints):
+        return jax.vmap(jax.vmap(function, _OVER_ROWS, -1), _OVER_POINTS, -1)(z, given)
+    return jax.vmap(function, -1, -1)(z, given)
+
+
+def rows_of(group: Group, numbers: Any) -> AbstractObservations:
+    """The rows with their indices and numbers."""
+    own = numbers.at_points if isinstance(numbers, AtPoints) else numbers.listed
+    return eqx.combine(group.own, own)
+
+
+def gathered_rows(group: Group, numbers: Any, y: Increments, scale: Increments, v: Values) -> tuple[Local, Given]:
+    """What every row of a group touches at the increments `y`."""
+    at_points = isinstance(group.rows, AtPoints)
+
+    def of_images(a: Array) -> Array:
+        if at_points:
+            return jnp.zeros((0, *jnp.shape(a)[:-1]))
+        return jnp.moveaxis(jnp.asarray(a)[..., group.image], -2, 0)
+
+    def of_points(a: Array) -> Array:
+        return a[None] if at_points else jnp.moveaxis(jnp.asarray(a)[..., group.point], -2, 0)
+
+    def of_shared(a: Array, index: Any) -> Array:
+        found = jnp.append(a, 0.0)[index]
+        # Rows by point touch the same parameters all.
+        return found[:, 0] if at_points else found
+
+    # An image's exterior orientation may be held fixed, which a scale of zero says.
+    z = Local(of_images(y.eop), of_shared(y.shared, group.column), of_points(y.points))
+    steps = Local(of_images(scale.eop), of_shared(scale.shared, group.column), of_points(scale.points))
+    exposure = tuple(of_images(a) for a in (v.time, v.velocity, v.rate, v.nominal, v.flight_time))
+    parameters = of_shared(v.shared, group.parameter)
+    row = rows_of(group, numbers)
+    return z, Given(row, steps, of_images(v.position), of_images(v.rotation), exposure, parameters, of_points(v.points))
+
+
+def row_function(group: Group, s: Structure) -> Callable[[Local, Given], Float[Array, "c"]]:
+    """Observed minus computed over sigma of one row."""
+    tables = image_tables(s.tables)
+    forms = {t.kind: (t.form, t.size) for t in s.tables}
+
+    def residual(z: Local, given: Given) -> Float[Array, "c"]:
+        parameters = given.parameters
+        if group.place:
+            # A copy for each number would be made of an array: these are few.
+            parameters = parameters.at[jnp.array(group.place)].add(z.shared * given.scale.shared)
+        position = given.position + z.eop[:, :3] * given.scale.eop[:, :3]
+        points = given.points + z.points * given.scale.points
+        first = image = point = 0
+        touched: list[Any] = []
+
+        def take(size: int) -> Array:
+            nonlocal first
+            first += size
+            return parameters[first - size : first]
+
+        def state(k: int) -> ImageState:
+            turn = small_rotation(z.eop[k, 3:] * given.scale.eop[k, 3:])
+            own = {t.kind: filled(t.form, take(t.size)) for t in tables}
+            camera = None
+            if group.through_camera:
+                (only,) = s.groups
+                camera = interior_of(only, list(take(only.treedef.num_leaves)))
+            exposure = Exposure(*(a[k] for a in given.exposure))
+            return ImageState(position[k], turn @ given.rotation[k], exposure, own, camera)
+
+        # Images take their parameters first, in the order in which `groups.group_of` lists them.
+        states = [state(k) for k in range(len(group.image))]
+        for what, shape in group.arguments:
+            count = math.prod(shape)
+            if what == "image":
+                own, image = states[image : image + count], image + count
+                touched.append(_stacked(own, shape))
+            elif what == "point":
+                touched.append(points[point : point + count].reshape(*shape, 3))
+                point += count
+            elif what == "parameter":
+                touched.append(take(count).reshape(shape))
+            elif what in forms:
+                form, size = forms[what]
+                touched.append(_stacked([filled(form, take(size)) for _ in range(count)], shape))
+            else:
+                touched.append(None)
+        return jnp.ravel(given.row.whitened(given.row.residual(*touched)))
+
+    return residual
+
+
+def _stacked(parts: list[Any], shape: tuple[int, ...]) -> Any:
+    """One of `parts`, or all of them with leading axes `shape`."""
+    if not shape:
+        return parts[0]
+    return jax.tree.map(lambda *v: jnp.stack(v).reshape(*shape, *jnp.shape(v[0])), *parts)
+
+
+class RowJacobian(NamedTuple):
+    """Residuals of a group and their derivatives by scaled increments of what a row touches, rows last."""
+
+    residual: Float[Array, "c *rows"]
+    eop: Float[Array, "c k 6 *rows"]
+    shared: Float[Array, "c l *rows"]
+    points: Float[Array, "c j 3 *rows"]
+
+
+def group_residuals(
+    group: Group, numbers: Any, y: Increments, scale: Increments, v: Values, s: Structure
+) -> Float[Array, "c *rows"]:
+    """Residuals of a group over their sigmas."""
+    return each_row(row_function(group, s), group, *gathered_rows(group, numbers, y, scale, v))
+
+
+def row_jacobian(group: Group, numbers: Any, y: Increments, scale: Increments, v: Values, s: Structure) -> RowJacobian:
+    """Residuals of a group, and the derivatives of each row."""
+    function = row_function(group, s)
+
+    def one(z: Local, given: Given) -> tuple[Float[Array, "c"], Local]:
+        # The residuals come along.
+        slopes, residual = jax.jacfwd(lambda z: (function(z, given),) * 2, has_aux=True)(z)
+        return residual, slopes
+
+    residual, slopes = each_row(one, group, *gathered_rows(group, numbers, y, scale, v))
+    return RowJacobian(residual, slopes.eop, slopes.shared, slopes.points)
+
+
+def reduced_places(g: Group, n_images: int) -> Int[Array, "z rows"]:
+    """Of images and shared unknowns that the rows of a group touch, the places among the reduced unknowns.
+
+    What means none lies behind the last.
+    """
+    images = 6 * jnp.asarray(g.image)[:, None] + jnp.arange(6)[:, None]
+    return jnp.concatenate([images.reshape(-1, images.shape[-1]), 6 * n_images + jnp.asarray(g.column)])
+
+
+def other_residuals(increments: Increments, scale: Increments, values: Values, structure: Structure) -> Residuals:
+    """All residuals but those of the image rows, which are left empty (for them see `normal.residuals_at`)."""
+    others = tuple(
+        group_residuals(g, numbers, increments, scale, values, structure)
+        for g, numbers in zip(structure.observed, values.groups, strict=True)
+    )
+    datum = datum_residuals(increments, scale, values, structure)
+    return Residuals(jnp.zeros((2, 0)), others, datum, tuple(g.name for g in structure.observed))

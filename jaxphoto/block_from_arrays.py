@@ -1,0 +1,187 @@
+"""A block from arrays or tables in memory: only what it has is given, by the column names of a block folder.
+
+    block = Block.of(
+        {"image": ["a", "b"], "point": ["1", "1"], "x_mm": [0.1, -4.2], "y_mm": [2.0, 2.1]},
+        {"kodak": (Sensor(4500, 3000, 0.008), InteriorOrientation(35.0))},
+        sigma_mm=0.004,
+    )
+
+A table is a mapping of columns, as a pandas frame is one. Units are in the names (docs/block_folder.md).
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxphoto.arrays import on_device
+from jaxphoto.block_parts import Datum, Start
+from jaxphoto.camera import InteriorOrientation, Sensor, parameter_names, set_parameter
+from jaxphoto.collinearity import ExteriorOrientation
+from jaxphoto.columns import CheckedColumns, TableLike
+from jaxphoto.errors import BlockError, InputError
+from jaxphoto.georeferencing import Mount, StripBias
+from jaxphoto.observations import Attitudes, ControlRows, Distances, ImageRows, StationRows
+from jaxphoto.unknowns import FREE, Unknowns, default_priors
+
+_XYZ, _SIGMA_XYZ = ("X_m", "Y_m", "Z_m"), ("sigma_X_m", "sigma_Y_m", "sigma_Z_m")
+_ANGLES, _ATTITUDE = ("omega_deg", "phi_deg", "kappa_deg"), ("roll_deg", "pitch_deg", "yaw_deg")
+_SIGMA_ATTITUDE = ("sigma_roll_deg", "sigma_pitch_deg", "sigma_yaw_deg")
+_ROLES = ("control", "fixed", "check")
+
+
+def block_fields(
+    image_points: TableLike,
+    cameras: Mapping[str, tuple[Sensor, InteriorOrientation]],
+    *,
+    sigma_mm: float | None = None,
+    images: TableLike | None = None,
+    control: TableLike | None = None,
+    stations: TableLike | None = None,
+    attitudes: TableLike | None = None,
+    distances: TableLike | None = None,
+    points: TableLike | None = None,
+    mounts: Mapping[str, Mount] | None = None,
+    free: Sequence[str] = (),
+    datum: Datum | None = None,
+    title: str = "block",
+) -> dict[str, Any]:
+    """The block (its fields) of `image_points` (image, point, x_mm, y_mm) and `cameras`, and whatever else is known.
+
+    `sigma_mm` serves image points without the columns sigma_x_mm, sigma_y_mm. `images` (image) says in which order
+    they stand, and gives `camera`, needed where there are several, `strip`, `time_s` and a start: X_m to Z_m and
+    omega_deg to kappa_deg. `control` (point, X_m to Z_m, NaN where not known; sigma_X_m to sigma_Z_m; role control,
+    fixed or check), `stations` (image, X_m to Z_m and their sigmas), `attitudes` (image, roll_deg to yaw_deg,
+    sigma_roll_deg to sigma_yaw_deg) and `distances` (point_a, point_b, distance_m, sigma_m) are observed; sigma_m or
+    sigma_deg stands for all three. `points` (point, X_m to Z_m) are approximate values, `mounts` by camera, `free` the
+    parameters that every camera estimates. What has no approximate value is for `adjust` to find. `datum` is minimal
+    where nothing but images and distances is given.
+
+    Raises InputError for a column, name or number that is missing or wrong, BlockError for what makes no block.
+    """
+    if not cameras:
+        raise InputError('cameras: there is none; give {"name": (Sensor(...), InteriorOrientation(...))}')
+    seen = CheckedColumns("image_points", image_points)
+    listed = CheckedColumns("images", {"image": list(dict.fromkeys(seen.ids("image")))} if images is None else images)
+    listed.refuse_twice("image")
+    names, of_camera = tuple(listed.ids("image")), _cameras(listed, tuple(cameras))
+    ids, rows = _image_rows(seen, names, sigma_mm)
+
+    given = CheckedColumns("control", control, "point", *_XYZ)
+    of_point = given.index("point", ids, "point {name} is measured in no image; measure it or leave it out")
+    role = np.array(given.ids("role") if "role" in given else ["control"] * given.n, object)
+    given.find(list(role), _ROLES, "the role {name!r} is unknown; write control, fixed or check")
+    coordinates, entry = _scalars(given, of_point, role == "control")
+    by_role = {r: coordinates.take(role[entry] == r) for r in _ROLES}
+    flown, turned = (
+        CheckedColumns("stations", stations, "image", *_XYZ),
+        CheckedColumns("attitudes", attitudes, "image", *_ATTITUDE),
+    )
+    for table in (flown, turned):
+        table.refuse_twice("image")
+    of_station, of_attitude = (t.index("image", names, "there is no image {name}") for t in (flown, turned))
+    bars = CheckedColumns("distances", distances, "point_a", "point_b", "distance_m")
+    ends = [bars.index(end, ids, "point {name} is measured in no image") for end in ("point_a", "point_b")]
+
+    start, known = _start(ids, CheckedColumns("points", points, "point", *_XYZ), by_role["control"], by_role["fixed"])
+    placed = set(_XYZ + _ANGLES) <= set(listed.columns)
+    position, angles = (listed.numbers(*c) if placed else np.zeros((len(names), 3)) for c in (_XYZ, _ANGLES))
+    strips = tuple(listed.ids("strip")) if "strip" in listed else ("",) * len(names)
+    used, zero = dict(mounts or {}), jnp.zeros(3)
+    unknowns = Unknowns(
+        {name: interior for name, (_, interior) in cameras.items()},
+        ExteriorOrientation.from_angles(on_device(position), on_device(np.deg2rad(angles))),
+        on_device(start),
+        used,
+        {strip: StripBias(zero, zero) for strip in dict.fromkeys(strips) if strip},
+    )
+    return {
+        "title": title,
+        "images": names,
+        "points": ids,
+        "sensors": {name: sensor for name, (sensor, _) in cameras.items()},
+        "image_camera": of_camera,
+        "image_mount": tuple(camera if camera in used else "" for camera in of_camera),
+        "image_strip": strips,
+        "image_time": on_device(listed.numbers("time_s")[:, 0] if "time_s" in listed else np.zeros(len(names))),
+        "image_points": rows,
+        "control": by_role["control"],
+        "fixed": by_role["fixed"],
+        "check": by_role["check"],
+        "stations": _scalars(flown, of_station, kind=StationRows)[0],
+        "attitudes": Attitudes(
+            of_attitude,
+            on_device(np.deg2rad(turned.numbers(*_ATTITUDE))),
+            on_device(np.deg2rad(turned.sigmas(_SIGMA_ATTITUDE, "sigma_deg"))),
+        ),
+        "distances": Distances(
+            np.stack(ends, axis=1),
+            on_device(bars.numbers("distance_m")[:, 0]),
+            on_device(bars.sigmas(("sigma_m",), "sigma_m")[:, 0]),
+        ),
+        "datum": datum or Datum("control" if given.n or flown.n else "minimal"),
+        "start": Start(unknowns, np.full(len(names), placed), known),
+        "priors": _priors(unknowns, free),
+    }
+
+
+def _cameras(images: CheckedColumns, cameras: tuple[str, ...]) -> tuple[str, ...]:
+    """The camera of every image."""
+    if "camera" not in images:
+        if len(cameras) > 1:
+            raise InputError(f"images: add the column camera, as there are {len(cameras)} ({', '.join(cameras)})")
+        return cameras * images.n
+    images.index("camera", cameras, f"there is no camera {{name}} ({', '.join(cameras)})")
+    return tuple(images.ids("camera"))
+
+
+def _image_rows(
+    seen: CheckedColumns, images: tuple[str, ...], sigma_mm: float | None
+) -> tuple[tuple[str, ...], ImageRows]:
+    """The points in the order in which they are met, and their measurements sorted by point and image."""
+    if not seen.n:
+        raise BlockError("image_points: there are none; give what was measured in the images")
+    image, ids = seen.index("image", images, "image {name} is not listed under images"), seen.ids("point")
+    points = tuple(dict.fromkeys(ids))
+    point = seen.index("point", points, "")
+    xy, sigma = seen.numbers("x_mm", "y_mm"), seen.sigmas(("sigma_x_mm", "sigma_y_mm"), "sigma_mm", sigma_mm)
+    order = np.lexsort((image, point))
+    for k in np.flatnonzero((np.diff(image[order]) == 0) & (np.diff(point[order]) == 0)):
+        again = max(order[k], order[k + 1])
+        raise seen.wrong(again, f"point {ids[again]} is measured twice in image {images[image[again]]}")
+    return points, ImageRows(image[order], point[order], on_device(xy[order]), on_device(sigma[order]))
+
+
+def _priors(unknowns: Unknowns, free: Sequence[str]) -> Unknowns:
+    """Exterior orientation and points free, and of every camera the parameters `free`."""
+    priors = default_priors(unknowns)
+    for camera, interior in unknowns.interior.items():
+        for name in free:
+            if name not in parameter_names(interior):
+                there = ", ".join(parameter_names(interior))
+                raise InputError(f"free: camera {camera} has no parameter {name!r}; it has {there}")
+            priors.interior[camera] = set_parameter(priors.interior[camera], name, FREE)
+    return priors
+
+
+def _scalars(
+    table: CheckedColumns, who: np.ndarray, observed: np.ndarray | None = None, kind: Any = ControlRows
+) -> tuple[Any, np.ndarray]:
+    """One row for each coordinate given, and the entry that it is of; those not `observed` need no sigma."""
+    value = table.numbers(*_XYZ, empty=True)
+    there = ~np.isnan(value)
+    needed = there if observed is None else there & observed[:, None]
+    sigma = table.sigmas(_SIGMA_XYZ, "sigma_m", needed=needed)
+    entry, axis = np.nonzero(there)
+    return kind(who[entry], axis, on_device(value[there]), on_device(sigma[there])), entry
+
+
+def _start(ids: tuple[str, ...], near: CheckedColumns, *held: ControlRows) -> tuple[np.ndarray, np.ndarray]:
+    """Approximate coordinates of all points, those of control first, and for which points all three are known."""
+    start = np.full((len(ids), 3), np.nan)
+    start[near.index("point", ids, "point {name} is measured in no image")] = near.numbers(*_XYZ)
+    for rows in held:
+        start[rows.who, rows.axis] = rows.value
+    known = ~np.isnan(start).any(axis=1)
+    return np.where(known[:, None], start, 0.0), known

@@ -1,0 +1,102 @@
+"""Columns of a table in memory, checked: what is missing or wrong is named by table, column and entry."""
+
+from collections.abc import Iterator, Sequence
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxphoto.errors import InputError
+
+
+@runtime_checkable
+class TableLike(Protocol):
+    """Columns by name: a dictionary of arrays, a pandas frame."""
+
+    def __getitem__(self, column: str, /) -> Any: ...
+
+    def __iter__(self) -> Iterator[str]: ...
+
+
+class CheckedColumns:
+    """The columns of a table that is called `name` in messages."""
+
+    def __init__(self, name: str, columns: TableLike | None, *bare: str) -> None:
+        """None is a table without entries that has the columns `bare`."""
+        self.name = name
+        given: TableLike = dict.fromkeys(bare, ()) if columns is None else columns
+        self.columns = {str(key): np.asarray(given[key]) for key in given}
+        lengths = {key: len(np.atleast_1d(column)) for key, column in self.columns.items()}
+        if len(set(lengths.values())) > 1:
+            listed = ", ".join(f"{key} {n}" for key, n in lengths.items())
+            raise InputError(f"{name}: the columns differ in length ({listed}); give each entry a value in all")
+        self.n = next(iter(lengths.values()), 0)
+
+    def __contains__(self, column: str) -> bool:
+        return column in self.columns
+
+    def wrong(self, entry: int | np.integer, message: str) -> InputError:
+        """An error about an entry, counted from 0 as arrays are."""
+        return InputError(f"{self.name}, entry {entry}: {message}")
+
+    def ids(self, column: str) -> list[str]:
+        """Names, numbers as they are written."""
+        return [str(v) for v in self._column(column).tolist()]
+
+    def numbers(self, *columns: str, empty: bool = False) -> Float[np.ndarray, "n k"]:
+        """Finite numbers, one column each; NaN is allowed where `empty`."""
+        try:
+            values = np.stack([np.asarray(self._column(c), float).reshape(self.n) for c in columns], axis=1)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"{self.name}: {', '.join(columns)} must be one number an entry ({error})") from None
+        for entry, k in np.argwhere(~np.isfinite(values)):
+            if not (empty and np.isnan(values[entry, k])):
+                raise self.wrong(entry, f"{columns[k]} is {values[entry, k]}; give a number")
+        return values
+
+    def sigmas(
+        self, columns: Sequence[str], of_all: str, default: float | None = None, needed: np.ndarray | None = None
+    ) -> Float[np.ndarray, "n k"]:
+        """Positive standard deviations: a column each, else the one column or the number that stands for all.
+
+        Where `needed` (n, k) is false there need be none: then it is zero.
+        """
+        needed = np.ones((self.n, len(columns)), bool) if needed is None else needed
+        if set(columns) <= set(self.columns):
+            values = self.numbers(*columns, empty=True)
+        elif of_all in self or default is not None:
+            one = self.numbers(of_all, empty=True) if of_all in self else np.full((self.n, 1), float(default or 0))
+            values = np.repeat(one, len(columns), axis=1)
+        elif needed.any():
+            raise InputError(f"{self.name}: there is no standard deviation; give {' and '.join(columns)}, or {of_all}")
+        else:
+            values = np.zeros(needed.shape)
+        for entry, k in np.argwhere(needed & ~(values > 0)):
+            raise self.wrong(entry, f"the standard deviation {columns[k]} is {values[entry, k]}; it must be positive")
+        return np.where(needed, values, 0.0)
+
+    def index(self, column: str, known: Sequence[str], message: str) -> Int[np.ndarray, "n"]:
+        """The place of each name of a column among those `known`; see `find`."""
+        return self.find(self.ids(column), known, message)
+
+    def find(self, names: Sequence[str], known: Sequence[str], message: str) -> Int[np.ndarray, "n"]:
+        """The place of each of `names` among those `known`. Raises InputError, by `message` of {name}, for another."""
+        places = {name: k for k, name in enumerate(known)}
+        for entry, name in enumerate(names):
+            if name not in places:
+                raise self.wrong(entry, message.format(name=name))
+        return np.array([places[name] for name in names], int)
+
+    def refuse_twice(self, column: str) -> None:
+        """Raise InputError where a name stands twice in a column."""
+        met: set[str] = set()
+        for entry, name in enumerate(self.ids(column)):
+            if name in met:
+                raise self.wrong(entry, f"{column} {name} is given twice")
+            met.add(name)
+
+    def _column(self, column: str) -> np.ndarray:
+        if column not in self.columns:
+            there = ", ".join(self.columns) or "none"
+            raise InputError(f"{self.name}: the column {column} is missing; there are {there}")
+        return self.columns[column]

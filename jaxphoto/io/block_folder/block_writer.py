@@ -1,0 +1,215 @@
+"""`Block` -> a block folder, made whole beside its place and then moved there."""
+
+import csv
+import math
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import numpy as np
+import pandas as pd
+
+from jaxphoto.block import Block
+from jaxphoto.errors import BlockError, InputError
+from jaxphoto.io.block_folder.camera_section import Camera, camera_section
+from jaxphoto.io.block_folder.declared_unknowns import unknown_sections
+from jaxphoto.io.block_folder.frame_sections import corrections_section, frame_section
+from jaxphoto.io.block_folder.joint import JOINT
+from jaxphoto.io.block_folder.map_tables import tables_to_map
+from jaxphoto.io.block_folder.mount_sections import mount_section, strip_section
+from jaxphoto.io.block_folder.section import Section
+from jaxphoto.io.block_folder.settings import datum_section, read_toml, toml_text
+from jaxphoto.io.block_folder.surfaces import scanner_section, surface_table
+from jaxphoto.io.block_folder.table_layout import (
+    ANGLES,
+    ATTITUDE,
+    LAYOUTS,
+    RATE,
+    SIGMA_ATTITUDE,
+    SIGMA_XYZ,
+    TOML,
+    VELOCITY,
+    XYZ,
+)
+from jaxphoto.io.block_folder.tables import declared_tables, kinds_of, layouts
+from jaxphoto.observations import OBSERVATIONS, AbstractCoordinates
+from jaxphoto.unknowns import FIXED, FREE
+
+
+def check_block_target(folder: Path, *inputs: Path) -> None:
+    """Raise InputError where no block can be written: a file, among something else, in place of one of the `inputs`."""
+    if folder.resolve() in [given.resolve() for given in inputs]:
+        raise InputError(f"--out {folder} is the input itself, which would be lost: name another folder")
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder} is a file; give the name of a folder")
+    if folder.is_dir() and any(folder.iterdir()) and not (folder / TOML).is_file():
+        raise InputError(f"{folder} is not empty and holds no block; empty it or give another folder")
+
+
+def write_block(block: Block, folder: str | Path) -> None:
+    """Write `block` as a folder that `read_block` reads as the same block; numbers come back exactly.
+
+    Angles are written in degrees and come back to rounding, as do coordinates of a frame of kind epsg, which are
+    written in its system (1e-6 m). Velocities are written for images with a station, rates for those with an attitude.
+    A block folder of that name is replaced.
+
+    Raises InputError where `folder` holds anything else, BlockError for priors that block.toml cannot express.
+    """
+    folder = Path(folder).absolute()
+    check_block_target(folder)
+    settings, tables = _settings(block), _tables(block) | declared_tables(block)
+    if block.frame.kind == "epsg":
+        tables = tables_to_map(tables, block.frame)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    made = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+    try:
+        (made / TOML).write_text(toml_text(settings), encoding="utf-8")
+        for name, frame in tables.items():
+            if len(frame) or (name in LAYOUTS and LAYOUTS[name].needed):
+                # A first id that starts with # is quoted, or its line would be a comment.
+                comment = frame.iloc[:, 0].astype(str).str.startswith("#").any()
+                quoting: Literal[0, 2] = csv.QUOTE_NONNUMERIC if comment else csv.QUOTE_MINIMAL
+                frame.to_csv(made / f"{name}.csv", index=False, quoting=quoting)
+        made.chmod(0o755)
+        _replace(folder, made, {TOML, *(f"{name}.csv" for name in layouts((*OBSERVATIONS, *kinds_of(block))))})
+    finally:
+        shutil.rmtree(made, ignore_errors=True)
+
+
+def _replace(folder: Path, made: Path, written: set[str]) -> None:
+    """Put `made` in the place of `folder`; whatever the old folder holds besides what is `written` moves along."""
+    if not folder.exists():
+        made.rename(folder)
+        return
+    own = _own_tables(folder / TOML) if (folder / TOML).is_file() else []
+    written = written | {f"{start}{name}.csv" for name in own for start in ("", JOINT)}
+    for path in folder.iterdir():
+        if path.name not in written:
+            _copy(path, made / path.name)
+    old = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+    folder.rename(old / "block")
+    made.rename(folder)
+    shutil.rmtree(old)
+
+
+def _copy(path: Path, to: Path) -> None:
+    if path.is_dir():
+        shutil.copytree(path, to, symlinks=True)
+    else:
+        shutil.copy2(path, to, follow_symlinks=False)
+
+
+def _settings(block: Block) -> dict[str, Any]:
+    start, priors = block.start.unknowns, block.priors
+    if any(p is not FREE for p in jax.tree.leaves(priors.points)):
+        raise BlockError("block.toml can only say FREE of object points; reset their priors")
+    cameras = {
+        name: camera_section(Camera(block.sensors[name], start.interior[name], priors.interior[name]))
+        for name in start.interior
+    }
+    own = [kind.group for kind in kinds_of(block) if kind not in OBSERVATIONS]
+    return {
+        "title": block.title,
+        **({"observations": own} if own else {}),
+        **({"partitions": list(block.partitions)} if block.partitions else {}),
+        "frame": frame_section(block.frame),
+        "corrections": corrections_section(block.corrections, block.frame),
+        "cameras": cameras,
+        "mounts": {name: mount_section(mount, priors.mounts[name]) for name, mount in start.mounts.items()},
+        "strips": {name: strip_section(bias, priors.strips[name]) for name, bias in start.strips.items()},
+        "scanner": scanner_section(start.scanner, priors.scanner),
+        "unknowns": unknown_sections(block),
+        "datum": datum_section(block.datum),
+        "georeferencing": _mode_section(block),
+    }
+
+
+def _own_tables(path: Path) -> list[str]:
+    """The tables of an older block that only a class of somebody's own reads."""
+    try:
+        return list(Section(TOML, "", read_toml(path)).texts("observations"))
+    except InputError:
+        return []
+
+
+def _mode_section(block: Block) -> dict[str, str]:
+    """Nothing, or that the exterior orientation is held; what it was computed from must be gone (`variants.direct`)."""
+    priors = set(jax.tree.leaves(block.priors.exterior))
+    if priors == {FREE}:
+        return {}
+    sensors = len(block.stations.who) or len(block.attitudes.image)
+    if priors == {FIXED} and block.start.image_known.all() and not sensors:
+        return {"mode": "direct"}
+    raise BlockError(
+        "block.toml can say of exterior orientation that all of it is FREE, or FIXED at known values and no station or "
+        "attitude observed; reset its priors, or hold it by jaxphoto.variants.direct"
+    )
+
+
+def _tables(block: Block) -> dict[str, pd.DataFrame]:
+    images, points = np.array(block.images, object), np.array(block.points, object)
+    rows = block.image_points
+    xy, sigma = np.asarray(rows.xy), np.asarray(rows.sigma)
+    position = np.asarray(block.start.unknowns.points)[block.start.point_known]
+    attitudes = pd.DataFrame(
+        {"image": images[block.attitudes.image]}
+        | _columns(ATTITUDE, np.rad2deg(block.attitudes.roll_pitch_yaw))
+        | _columns(SIGMA_ATTITUDE, np.rad2deg(block.attitudes.sigma))
+    )
+    return {
+        "images": _images(block),
+        "image_points": pd.DataFrame(
+            {"image": images[rows.image], "point": points[rows.point]}
+            | {"x_mm": xy[:, 0], "y_mm": xy[:, 1], "sigma_x_mm": sigma[:, 0], "sigma_y_mm": sigma[:, 1]}
+        ),
+        "control_points": pd.concat(
+            [
+                _xyz_rows("point", points, given).assign(role=role)
+                for role, given in (("control", block.control), ("fixed", block.fixed), ("check", block.check))
+            ],
+            ignore_index=True,
+        ),
+        "stations": _with_motion(_xyz_rows("image", images, block.stations), block, VELOCITY),
+        "attitudes": _with_motion(attitudes, block, RATE),
+        "object_points": pd.DataFrame({"point": points[block.start.point_known]} | _columns(XYZ, position)),
+        "surfaces": surface_table(block),
+    }
+
+
+def _images(block: Block) -> pd.DataFrame:
+    exterior, known = block.start.unknowns.exterior, block.start.image_known
+    columns: dict[str, Any] = {"image": block.images, "camera": block.image_camera}
+    if any(block.image_strip):
+        columns["strip"] = block.image_strip
+    columns |= block.partitions
+    times = np.asarray(block.image_time if block.flight_time is None else block.flight_time)
+    if times.any() or block.start.unknowns.strips:
+        columns["time_s"] = times
+    if known.any():
+        values = np.hstack([np.asarray(exterior.position), np.rad2deg(exterior.omega_phi_kappa)])
+        values = np.where(known[:, None], values, math.nan)
+        columns |= _columns((*XYZ, *ANGLES), values)
+    return pd.DataFrame(columns)
+
+
+def _with_motion(table: pd.DataFrame, block: Block, columns: tuple[str, ...]) -> pd.DataFrame:
+    if block.motion is None:
+        return table
+    values = block.motion.velocity if columns == VELOCITY else np.rad2deg(block.motion.rate)
+    place = pd.Index(block.images).get_indexer(pd.Index(table["image"]))
+    return table.assign(**_columns(columns, np.asarray(values)[place]))
+
+
+def _xyz_rows(id_column: str, ids: np.ndarray, rows: AbstractCoordinates) -> pd.DataFrame:
+    """One line per point or image; coordinates that are not observed, and sigmas of zero, are left empty."""
+    line, who = pd.factorize(np.asarray(rows.who))
+    table = np.full((len(who), 6), math.nan)
+    table[line, rows.axis] = rows.value
+    table[line, np.asarray(rows.axis) + 3] = np.where(np.asarray(rows.sigma) > 0, rows.sigma, math.nan)
+    return pd.DataFrame({id_column: ids[who]} | _columns((*XYZ, *SIGMA_XYZ), table))
+
+
+def _columns(names: tuple[str, ...], values: np.ndarray) -> dict[str, np.ndarray]:
+    return {name: np.asarray(values)[:, j] for j, name in enumerate(names)}

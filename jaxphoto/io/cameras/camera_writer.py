@@ -1,0 +1,83 @@
+"""An interior orientation -> a camera file of another program, converted exactly where that can be."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from jaxphoto.camera import AbstractDistortion, Agisoft, InteriorOrientation, Perspective, Sensor, Smac
+from jaxphoto.camera.conversion import Conversion, converted
+from jaxphoto.errors import InputError
+from jaxphoto.io.cameras import colmap, open_cv
+from jaxphoto.io.cameras.agisoft import write_agisoft
+from jaxphoto.io.cameras.camera_file import CameraModel
+from jaxphoto.io.cameras.colmap import write_colmap
+from jaxphoto.io.cameras.open_cv import write_open_cv
+from jaxphoto.io.cameras.own_cameras import write_block_camera
+from jaxphoto.io.cameras.smac_report import write_smac_report
+from jaxphoto.io.whole_file import whole_file
+
+
+class _WriteFormat(NamedTuple):
+    """How a format is written, what its perspective cameras and its fisheyes are (None: any, and those of perspective
+    cameras), and how its files are called."""
+
+    write: Callable[[Path, str, Sensor, InteriorOrientation], None]
+    plane: CameraModel | None
+    fisheye: CameraModel | None
+    suffixes: tuple[str, ...]
+
+    def model_of(self, interior: InteriorOrientation) -> CameraModel | None:
+        """What a camera is written as."""
+        return self.plane if type(interior.projection) is Perspective else self.fisheye or self.plane
+
+
+_FORMATS = {
+    "opencv": _WriteFormat(write_open_cv, open_cv.PLANE, open_cv.FISHEYE, (".yml", ".yaml", ".json")),
+    "colmap": _WriteFormat(write_colmap, colmap.PLANE, colmap.FISHEYE, ()),
+    "agisoft": _WriteFormat(write_agisoft, CameraModel(Agisoft, ("p3", "p4"), Perspective()), None, (".xml",)),
+    "smac": _WriteFormat(write_smac_report, CameraModel(Smac, (), Perspective()), None, (".txt", ".rpt")),
+    "block": _WriteFormat(write_block_camera, None, None, (".toml",)),
+}
+CAMERA_FORMATS = tuple(_FORMATS)
+"""The formats that `write_camera_file` knows."""
+
+
+def write_camera_file(
+    path: str | Path,
+    sensor: Sensor,
+    interior: InteriorOrientation,
+    format: str | None = None,
+    *,
+    name: str = "camera",
+    distortion: type[AbstractDistortion] | None = None,
+) -> Conversion:
+    """Write a camera in one of `CAMERA_FORMATS`, and say by how much the file's camera differs from `interior`.
+
+    `format` None: cameras.txt is COLMAP's, else the suffix tells. The distortion is converted exactly where its terms
+    allow it, else fitted over the format (`camera.conversion`). `distortion` chooses the model in a block.toml.
+
+    Raises InputError for unknown formats, for a `distortion` that is not the format's and for cameras that the format
+    cannot hold.
+    """
+    path = Path(path)
+    if format is None:
+        by_suffix = [key for key, known in _FORMATS.items() if path.suffix.lower() in known.suffixes]
+        format = "colmap" if path.name == "cameras.txt" else by_suffix[0] if by_suffix else ""
+    if format not in _FORMATS:
+        raise InputError(f"{path}: the name does not tell the format; name one of {', '.join(_FORMATS)}")
+    known = _FORMATS[format]
+    model = known.model_of(interior)
+    if model is None:
+        model = CameraModel(distortion or type(interior.distortion), (), interior.projection)
+    if distortion not in (None, model.distortion):
+        raise InputError(
+            f"{path}: the format {format} has the distortion {model.distortion.__name__}, not {distortion.__name__}; "
+            "leave the distortion out, or write a .toml"
+        )
+    try:
+        conversion = converted(interior, model.distortion, sensor, model.lacks, model.projection)
+    except ValueError as error:
+        raise InputError(f"{path} cannot be written: {error}") from None
+    with whole_file(path) as work:
+        known.write(work, name, sensor, conversion.interior)
+    return conversion

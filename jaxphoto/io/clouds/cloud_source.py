@@ -1,0 +1,56 @@
+"""What a reader of one format gives: a cloud file that is open, before its coordinates are placed and filtered."""
+
+import dataclasses
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxphoto.cloud import Cloud
+from jaxphoto.errors import InputError
+from jaxphoto.io.clouds.coordinate_system import CoordinateSystem
+
+CHUNK = 500_000
+"""Points that are read, placed and filtered together."""
+
+
+@dataclasses.dataclass(frozen=True)
+class CloudSource:
+    """A cloud file. `chunks` gives its points with the file's own coordinates, at most `CHUNK` at a time.
+
+    `system` is what the file says of its coordinates. `most` is how many points there are at most, `extent` their least
+    and greatest coordinates, both None where only reading tells. A chunk's `strips` are those met up to it.
+    """
+
+    name: str
+    system: CoordinateSystem
+    most: int | None
+    extent: Float[np.ndarray, "2 3"] | None
+    chunks: Callable[[], Iterator[Cloud]]
+
+
+class StripNumbers:
+    """Numbers strips in the order in which they are met."""
+
+    def __init__(self) -> None:
+        self._index: dict[str, int] = {}
+
+    def of(self, ids: np.ndarray) -> np.ndarray:
+        """The index in `names` of each of the strips `ids`."""
+        known, place = np.unique(ids, return_inverse=True)
+        numbers = [self._index.setdefault(str(name), len(self._index)) for name in known]
+        return np.array(numbers, np.int32)[place]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The strips met so far."""
+        return tuple(self._index)
+
+
+def check_file(path: Path) -> None:
+    """Raise InputError where there is no file at `path`."""
+    if path.is_dir():
+        raise InputError(f"{path} is a folder; name a file")
+    if not path.exists():
+        raise InputError(f"there is no file {path}; correct the name")

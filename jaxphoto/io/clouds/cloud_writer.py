@@ -1,0 +1,176 @@
+"""Writing clouds: LAS, LAZ, CSV and PLY, whole or not at all."""
+
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pandas as pd
+from pyproj import CRS
+
+from jaxphoto.block import Frame
+from jaxphoto.cloud import Cloud
+from jaxphoto.errors import InputError
+from jaxphoto.io.clouds.cloud_reader import open_source
+from jaxphoto.io.clouds.cloud_source import CHUNK, check_file
+from jaxphoto.io.clouds.las import opened, raw_chunks
+from jaxphoto.io.clouds.placement import Placement
+from jaxphoto.io.clouds.table import RETURNS, XYZ
+from jaxphoto.io.whole_file import whole_file
+
+# A millimetre holds what a scanner measures, and leaves 4,000 km of room.
+_SCALE_M, _SCALE_DEG = 1e-3, 1e-8
+_LAS = (".las", ".laz")
+
+
+def write_cloud(
+    cloud: Cloud,
+    path: str | Path,
+    *,
+    like: str | Path | None = None,
+    frame: Frame | None = None,
+    epsg: int | None = None,
+    unit: str | None = None,
+) -> None:
+    """Write `cloud`, which is in `frame`, to a file .las, .laz, .csv or .ply; nothing is left half-written.
+
+    With `like`, the LAS or LAZ file that it was read from whole (`epsg` and `unit` as they were then): that file with
+    other coordinates, in its own system, units and scale, and all else that it says of every point. Without, in the
+    system of `frame` where that is of kind epsg, or as it stands, in metres; LAS 1.4 to the millimetre, CSV and PLY in
+    double precision.
+
+    Raises InputError where `like` has another number of points, and for names that are no cloud's.
+    """
+    path = Path(path)
+    kind = path.suffix.lower()
+    if kind not in (*_LAS, ".csv", ".ply"):
+        raise InputError(f"{path.name} is no cloud that is known by its name; name a file .las, .laz, .csv or .ply")
+    if like is not None:
+        check_file(Path(like))
+        if kind not in _LAS or Path(like).suffix.lower() not in _LAS:
+            raise InputError(f"{path.name} cannot be written like {Path(like).name}: both must be .las or .laz")
+        source = open_source(like, epsg, unit)
+        placement = Placement(source.name, source.system, frame)
+        with whole_file(path) as work:
+            _write_like(cloud, work, Path(like), placement)
+        return
+    in_map = frame is not None and frame.kind == "epsg"
+    with whole_file(path) as work:
+        if kind in _LAS:
+            _write_las(cloud, work, frame if in_map else None)
+        elif kind == ".csv":
+            _write_csv(cloud, work, frame if in_map else None)
+        else:
+            _write_ply(cloud, work, frame if in_map else None)
+
+
+def _parts(cloud: Cloud, frame: Frame | None):
+    """The cloud in parts, with coordinates in the system of `frame`."""
+    for begin in range(0, len(cloud), CHUNK):
+        part = cloud.take(np.arange(begin, min(begin + CHUNK, len(cloud))))
+        yield part, part.xyz if frame is None else frame.map.map(part.xyz)
+
+
+def _write_like(cloud: Cloud, path: Path, like: Path, placement: Placement) -> None:
+    with opened(like) as reader:
+        header = reader.header
+        with laspy.open(path, "w", header=header) as writer:
+            done = 0
+            for points in raw_chunks(reader, like.name):
+                xyz = placement.file(cloud.xyz[done : done + len(points)])
+                if len(xyz) < len(points):
+                    break
+                _check_room(xyz, header, like.name)
+                points.x, points.y, points.z = xyz.T
+                writer.write_points(points)
+                done += len(points)
+            else:
+                if header.evlrs:
+                    writer.write_evlrs(header.evlrs)
+                if done == len(cloud):
+                    return
+    raise InputError(
+        f"{path.name} cannot be written like {like.name}: the cloud has {len(cloud)} points, that file "
+        f"{header.point_count}; read the file whole, without filters"
+    )
+
+
+def _write_las(cloud: Cloud, path: Path, frame: Frame | None) -> None:
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    ends = np.concatenate([xyz[[0]] for _, xyz in _parts(cloud, frame)])
+    geographic = frame is not None and frame.map.geographic
+    header.scales = np.array([*[_SCALE_DEG if geographic else _SCALE_M] * 2, _SCALE_M])
+    header.offsets = np.floor(ends.mean(axis=0))
+    if frame is not None:
+        header.add_crs(CRS(f"EPSG:{frame.code}" + (f"+{frame.vertical}" if frame.vertical else "")))
+    with laspy.open(path, "w", header=header) as writer:
+        for part, xyz in _parts(cloud, frame):
+            _check_room(xyz, header, path.name)
+            points = laspy.ScaleAwarePointRecord.zeros(len(part), header=header)
+            points.x, points.y, points.z = xyz.T
+            if part.classification is not None:
+                points.classification = part.classification
+            if part.returns is not None:
+                points.return_number, points.number_of_returns = part.returns.T
+            if part.time is not None:
+                points.gps_time = part.time
+            if part.strip is not None:
+                points.point_source_id = _source_ids(part)
+            writer.write_points(points)
+
+
+def _check_room(xyz: np.ndarray, header: laspy.LasHeader, name: str) -> None:
+    """Raise InputError where coordinates cannot be counted in the scale of a file."""
+    counts = np.abs((xyz - header.offsets) / header.scales)
+    if not (counts < 2**31 - 1).all():
+        raise InputError(
+            f"{name} counts in {header.scales[0]:g} from its offset, too finely for coordinates up to "
+            f"{np.abs(xyz).max():g}; write the cloud as .csv or .ply"
+        )
+
+
+def _source_ids(cloud: Cloud) -> np.ndarray:
+    """Point source IDs: the strips' own where they are such numbers, else their index from 1."""
+    numbers = [int(name) if name.isdigit() and int(name) < 1 << 16 else -1 for name in cloud.strips]
+    ids = np.arange(1, len(numbers) + 1) if min(numbers) < 0 else np.array(numbers)
+    assert cloud.strip is not None
+    return ids[cloud.strip].astype(np.uint16)
+
+
+def _columns(cloud: Cloud) -> dict[str, np.ndarray]:
+    """What is known of every point besides its coordinates, by the names of CSV and PLY."""
+    columns = {}
+    if cloud.classification is not None:
+        columns["classification"] = cloud.classification
+    if cloud.returns is not None:
+        columns |= dict(zip(RETURNS, cloud.returns.T, strict=True))
+    if cloud.time is not None:
+        columns["time_s"] = cloud.time
+    return columns
+
+
+def _write_csv(cloud: Cloud, path: Path, frame: Frame | None) -> None:
+    with path.open("w", encoding="utf-8", newline="") as file:
+        for k, (part, xyz) in enumerate(_parts(cloud, frame)):
+            table = pd.DataFrame(dict(zip(XYZ, xyz.T, strict=True)) | _columns(part))
+            if part.strip is not None:
+                table["strip"] = np.array(part.strips, object)[part.strip]
+            table.to_csv(file, index=False, header=k == 0)
+
+
+def _write_ply(cloud: Cloud, path: Path, frame: Frame | None) -> None:
+    fields = [(axis, "<f8") for axis in "xyz"] + [(name, v.dtype.str) for name, v in _columns(cloud).items()]
+    if cloud.strip is not None:
+        fields.append(("point_source_id", "<u2"))
+    named = {"<f8": "double", "|u1": "uchar", "<u2": "ushort"}
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(cloud)}"]
+    header += [f"property {named[kind]} {name}" for name, kind in fields]
+    with path.open("wb") as file:
+        file.write("\n".join([*header, "end_header", ""]).encode("ascii"))
+        for part, xyz in _parts(cloud, frame):
+            records = np.empty(len(part), fields)
+            records["x"], records["y"], records["z"] = xyz.T
+            for name, values in _columns(part).items():
+                records[name] = values
+            if part.strip is not None:
+                records["point_source_id"] = _source_ids(part)
+            records.tofile(file)

@@ -1,0 +1,162 @@
+"""A DBAT script and the text files it names -> the tables of a block folder."""
+
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+
+from jaxphoto.errors import InputError
+from jaxphoto.io.block_folder import BlockTables
+from jaxphoto.io.block_folder.table_layout import SIGMA_XYZ, XYZ
+from jaxphoto.io.dbat.script import Script, open_script
+from jaxphoto.io.dbat.script_camera import camera_settings
+from jaxphoto.io.text_tables import Table, concatenate, read_columns
+
+CAMERA = "camera"
+_METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+_INPUT = ("c", "ctrl_pts", "check_pts", "images", "image_pts", "cameras")
+
+
+def recognises(source: Path) -> bool:
+    """Whether `source` is a DBAT script, or a folder that holds exactly one."""
+    return len(_scripts(source)) == 1
+
+
+def read_dbat(source: Path) -> BlockTables:
+    """The block of a DBAT script. Raises InputError for what it asks that this reader cannot do."""
+    scripts = _scripts(source)
+    if len(scripts) != 1:
+        raise InputError(f"{source} holds {len(scripts)} DBAT scripts; name the one XML file to read")
+    path = scripts[0]
+    script = open_script(path)
+    for element in script.input:
+        if element.tag not in _INPUT:
+            raise script.error(f"<{element.tag}> in <input> cannot be read; remove it, or convert the project by hand")
+    images = _images(script)
+    camera = camera_settings(script)
+    tables = {
+        "images": Table(
+            images.file,
+            {"image": images.text("name"), "camera": np.full(len(images), CAMERA, object)},
+            images.files,
+            images.rows,
+        ),
+        "image_points": _image_points(script, images, camera["pixel_mm"]),
+    }
+    control = [_control(script, "ctrl_pts", ""), _control(script, "check_pts", "check")]
+    if given := [table for table in control if table is not None]:
+        tables["control_points"] = concatenate(given)
+    return BlockTables({"title": script.text("meta/name", path.stem), "cameras": {CAMERA: camera}}, tables, path.name)
+
+
+def _scripts(source: Path) -> list[Path]:
+    paths = sorted(source.glob("*.xml")) if source.is_dir() else [source] if source.suffix == ".xml" else []
+    return [path for path in paths if path.is_file() and b"dbat_script_version" in path.read_bytes()[:2000]]
+
+
+def _read(script: Script, element: ET.Element) -> Table:
+    """The file of a <file> element, its columns named by the attribute `format`."""
+    return read_columns(script.file(element), [name.strip() for name in element.get("format", "").split(",")])
+
+
+def _images(script: Script) -> Table:
+    """Columns id and name: the file's stem, or the id where stems are not unique."""
+    elements = script.find("input/images").findall("file")
+    if not elements:
+        raise script.error("<images> names no file; add <file format='id,path'>")
+    table = concatenate([_read(script, element) for element in elements])
+    _need(script, "images", table, "id", "path")
+    stems = [Path(path.replace("\\", "/")).stem for path in table.text("path")]
+    names = table.ids("id") if len(set(stems)) < len(stems) else np.array(stems, object)
+    return Table(table.file, {"id": table.ids("id"), "name": names}, table.files, table.rows)
+
+
+def _image_points(script: Script, images: Table, pixel_mm: float) -> Table:
+    names = dict(zip(images.text("id"), images.text("name"), strict=True))
+    parts = []
+    for element in script.find("input/image_pts").findall("file"):
+        table = _read(script, element)
+        _need(script, "image_pts", table, "id", "im", "x", "y")
+        for line, image in enumerate(table.ids("im")):
+            if image not in names:
+                raise table.bad(line, f"image {image} is not in {images.file}; add it there or delete this row")
+        columns = {
+            "image": np.array([names[image] for image in table.text("im")], object),
+            "point": table.ids("id"),
+            "column_px": table.numbers("x") - 0.5,
+            "row_px": table.numbers("y") - 0.5,
+        }
+        for axis in "xy":
+            columns[f"sigma_{axis}_mm"] = _image_sigma(script, element, table, axis) * pixel_mm
+        parts.append(Table(table.file, columns, table.files, table.rows))
+    if not parts:
+        raise script.error("<image_pts> names no file; add <file format='id,im,x,y' sxy='1'>")
+    return concatenate(parts)
+
+
+def _image_sigma(script: Script, element: ET.Element, table: Table, axis: str) -> np.ndarray:
+    """Pixels: the attribute overrides the columns."""
+    for name in ("sxy", f"s{axis}"):
+        if name in element.attrib:
+            try:
+                return np.full(len(table), float(element.attrib[name]))
+            except ValueError:
+                raise script.error(f"{name} = {element.attrib[name]!r} is not a number; give it in pixels") from None
+    for name in ("sxy", f"s{axis}"):
+        if name in table:
+            return table.sigmas(name)
+    raise script.error(f"the points of {table.file} have no standard deviation; add sxy='...' (pixels) to their <file>")
+
+
+def _control(script: Script, tag: str, role: str) -> Table | None:
+    """Control (role "control" with standard deviations, "fixed" without) or check points, in metres."""
+    section = script.input.find(tag)
+    if section is None:
+        return None
+    metres = script.text("meta/project_unit", "m")
+    if metres not in _METRES:
+        raise script.error(f"the project_unit {metres!r} is unknown; use one of {', '.join(_METRES)}")
+    elements = section.findall("file")
+    if not elements:
+        raise script.error(f"<{tag}> names no file; add <file format='id,label,x,y,z,sx,sy,sz'>")
+    table = concatenate([control_table(_read(script, e), role, _METRES[metres]) for e in elements])
+    for element in section.findall("filter"):
+        wanted = [part.strip() for part in element.get("id", "").split(",")]
+        action = (element.text or "").strip()
+        if action not in ("keep", "remove") or wanted == [""]:
+            raise script.error(
+                f"a <filter> of <{tag}> is not understood; write <filter id='1,2'>keep or remove</filter>"
+            )
+        chosen = np.isin(table.text("point").astype(str), wanted)
+        table = table.take(chosen if action == "keep" else ~chosen)
+    return table
+
+
+def control_table(table: Table, role: str, metres: float) -> Table:
+    """A DBAT control file as control_points.csv; `role` "" is control, or fixed where no row has a sigma."""
+    sigmas = {axis: _first(table, f"s{axis}", "sxy" if axis != "z" else "sz", "sxyz") for axis in "xyz"}
+    columns: dict[str, np.ndarray] = {"point": table.ids("id")}
+    columns |= {name: table.numbers(axis) * metres for name, axis in zip(XYZ, "xyz", strict=True)}
+    zero = np.ones(len(table), bool)
+    for name, sigma in zip(SIGMA_XYZ, sigmas.values(), strict=True):
+        values = np.zeros(len(table)) if sigma is None else table.numbers(sigma)
+        zero &= values == 0
+        columns[name] = values * metres
+    # DBAT's standard deviation zero means that the point is held.
+    columns["role"] = (
+        np.where(zero, "fixed", "control").astype(object) if not role else np.full(len(table), role, object)
+    )
+    for name in SIGMA_XYZ:
+        cells = columns[name]
+        columns[name] = np.array(["" if z else repr(float(s)) for s, z in zip(cells, zero, strict=True)], object)
+    return Table(table.file, columns, table.files, table.rows)
+
+
+def _first(table: Table, *names: str) -> str | None:
+    return next((name for name in names if name in table), None)
+
+
+def _need(script: Script, tag: str, table: Table, *columns: str) -> None:
+    for name in columns:
+        if name not in table:
+            raise script.error(f"the format of <{tag}> has no {name}; add it ({', '.join(columns)} are needed)")

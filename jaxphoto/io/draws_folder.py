@@ -1,0 +1,155 @@
+"""Draws on disk: Parquet parts while a Monte Carlo runs, one file when it is done.
+
+A part is written whole or not at all, so a run that was stopped at any moment goes on after its last part, and gives
+the same file as one that was not.
+"""
+
+import hashlib
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import jax
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from jaxphoto.block import Block
+from jaxphoto.errors import InputError
+from jaxphoto.unknowns import Prior
+
+_RUN, _PARTS, DRAWS = "run.json", "parts", "draws.parquet"
+_HALF = ".tmp"
+
+
+class DrawsFolder:
+    """The folder of one run: its settings, its parts, and the file of all draws.
+
+    `settings` are all that the draws depend on. Raises InputError where the folder holds another run or something else.
+    """
+
+    def __init__(self, directory: Path, settings: dict, draws: int, per_part: int):
+        self.directory, self.draws, self.per_part = directory, draws, per_part
+        check_place(directory)
+        settings = settings | {"draws": draws, "per_part": per_part}
+        run = directory / _RUN
+        if run.is_file():
+            self._check(_settings_in(run), settings)
+        else:
+            directory.mkdir(parents=True, exist_ok=True)
+            write_whole(run, lambda path: path.write_text(json.dumps(settings, indent=2) + "\n", encoding="utf-8"))
+        if not self.done:
+            (directory / _PARTS).mkdir(exist_ok=True)
+
+    def _check(self, held: dict, settings: dict) -> None:
+        wanted = json.loads(json.dumps(settings))
+        different = [name for name in {**held, **wanted} if held.get(name) != wanted.get(name)]
+        if different:
+            name = different[0]
+            raise InputError(
+                f"{self.directory} holds a run with other settings ({name} {held.get(name)}, now {wanted.get(name)}): "
+                "name a new folder, or give the settings of that run to go on with it"
+            )
+
+    @property
+    def done(self) -> bool:
+        """Whether all draws are in one file."""
+        return (self.directory / DRAWS).is_file()
+
+    @property
+    def next_part(self) -> int:
+        """The first part that is not there; parts are written in order."""
+        k = 0
+        while self._part(k).is_file():
+            k += 1
+        return k
+
+    @property
+    def n_parts(self) -> int:
+        """Parts of the whole run."""
+        return -(-self.draws // self.per_part)
+
+    def write_part(self, k: int, table: pd.DataFrame) -> None:
+        """Keep the draws of part `k`."""
+        write_whole(self._part(k), lambda path: pq.write_table(_arrow(table), path))
+
+    def join(self) -> None:
+        """Bring all parts to one file, part by part."""
+        parts = [self._part(k) for k in range(self.n_parts)]
+
+        def write(path: Path) -> None:
+            with pq.ParquetWriter(path, pq.read_schema(parts[0])) as writer:
+                for part in parts:
+                    writer.write_table(pq.read_table(part))
+
+        write_whole(self.directory / DRAWS, write)
+
+    def tidy(self) -> None:
+        """Remove the parts, which the file of all draws holds, and what was left half-written."""
+        for path in (*(self.directory / _PARTS).glob("*"), *self.directory.glob(f"*{_HALF}")):
+            path.unlink()
+        if (self.directory / _PARTS).is_dir():
+            (self.directory / _PARTS).rmdir()
+
+    def columns(self) -> list[str]:
+        """Names of the columns of the draws there are."""
+        return pq.read_schema(self._files[0]).names
+
+    def read(self, names: list[str]) -> dict[str, np.ndarray]:
+        """Columns of the draws there are."""
+        table = pa.concat_tables(pq.read_table(file, columns=names) for file in self._files)
+        return {name: table.column(name).to_numpy() for name in names}
+
+    @property
+    def _files(self) -> list[Path]:
+        """The file of all draws, or the parts there are."""
+        return [self.directory / DRAWS] if self.done else [self._part(k) for k in range(self.next_part)]
+
+    def _part(self, k: int) -> Path:
+        return self.directory / _PARTS / f"part-{k:06d}.parquet"
+
+
+def digest_of(block: Block) -> str:
+    """A hash of everything that a block says."""
+    arrays, structure = jax.tree.flatten(block)
+    digest = hashlib.sha256(repr(structure).encode())
+    for array in arrays:
+        digest.update(repr(array).encode() if isinstance(array, Prior) else np.asarray(array).tobytes())
+    return digest.hexdigest()
+
+
+def check_place(directory: Path) -> None:
+    """Raises InputError where no run can be kept: a file, below a file, among something else."""
+    for path in (directory, *directory.parents):
+        if path.is_file():
+            raise InputError(f"{path} is a file: name a folder for the draws")
+    known = not directory.is_dir() or (directory / _RUN).is_file()
+    if not known and any(not path.name.endswith(_HALF) for path in directory.iterdir()):
+        raise InputError(f"{directory} is not empty and holds no Monte Carlo run: name a new folder")
+
+
+def _settings_in(run: Path) -> dict:
+    try:
+        held = json.loads(run.read_text(encoding="utf-8"))
+    except ValueError:
+        held = None
+    if not isinstance(held, dict):
+        raise InputError(f"{run} holds no settings of a Monte Carlo run: name a new folder")
+    return held
+
+
+def write_whole(path: Path, write: Callable[[Path], object]) -> None:
+    """Write a file beside its place, and move it there when it is whole and on the disk."""
+    # A name of its own for each process: none moves what another is writing.
+    beside = path.with_name(f"{path.name}.{os.getpid()}{_HALF}")
+    write(beside)
+    with beside.open("rb") as file:
+        os.fsync(file.fileno())
+    os.replace(beside, path)
+
+
+def _arrow(table: pd.DataFrame) -> pa.Table:
+    # Without pandas' own description, which tells of versions.
+    return pa.Table.from_pandas(table, preserve_index=False).replace_schema_metadata(None)

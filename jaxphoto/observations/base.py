@@ -1,0 +1,197 @@
+"""What declares an observation: rows, what one row touches, and the residual of one row.
+
+A file that adds an observation holds one final subclass of `AbstractObservations`. Derivatives, elimination, padding,
+redundancy numbers, noise, sensitivities, datum, tables and files follow from what it declares.
+
+    class HeightDifferences(AbstractObservations):
+        group = "height_differences"
+        unit = "m"
+        start: Int[np.ndarray, "n"] = touching("point")
+        end: Int[np.ndarray, "n"] = touching("point")
+        value: Float[Numbers, "n"]
+        sigma: Float[Numbers, "n"]
+
+        def residual(self, start, end):
+            return self.value - (end[2] - start[2])
+
+Its file is height_differences.csv with the columns start, end, value_m and sigma_m (`observations.columns`).
+
+Inside `residual` the module is *one* row: `self.value` is a number. It is given what the fields marked `touching` point
+at, in their order (a field of several numbers a row gives a stack with a leading axis), then what `also` names. A point
+is its three coordinates (m), an image an `ImageState`; any kind of declared unknowns (`jaxphoto.parameters`) gives
+parameters of that kind.
+"""
+
+import abc
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
+from types import MappingProxyType
+from typing import Any, ClassVar, Self, dataclass_transform
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxphoto.arrays import Numbers, joined, still
+from jaxphoto.georeferencing import Exposure, Mount, StripBias
+from jaxphoto.observations.columns import row_fields
+
+AXES = ("X", "Y", "Z")
+
+
+def touching(what: str) -> Any:
+    """A field of indices: of "image", "point", or a kind of declared unknowns such as "strips"."""
+    return eqx.field(metadata={"touches": what})
+
+
+class ImageState(eqx.Module):
+    """What is known of one image while its rows are computed."""
+
+    position: Float[Array, "3"]
+    """Projection centre (m)."""
+    camera_from_object: Float[Array, "3 3"]
+    exposure: Exposure
+    parameters: dict[str, Any]
+    """Declared unknowns of the image, by kind; zeros where the image has none of a kind that others have."""
+    interior: Any = None
+    """Interior orientation, for rows whose class says `through_camera`."""
+
+    @property
+    def mount(self) -> Mount:
+        """Lever arm, boresight and time offset of its camera."""
+        return self.parameters.get("mounts") or Mount(jnp.zeros(3), jnp.zeros(3))
+
+    @property
+    def strip(self) -> StripBias:
+        """Shift and drift of its strip."""
+        return self.parameters.get("strips") or StripBias(jnp.zeros(3), jnp.zeros(3))
+
+
+@dataclass_transform(field_specifiers=(touching, eqx.field))
+class AbstractObservations(eqx.Module):
+    """Rows of one kind, one along the first axis of every field; they need `sigma`, in the unit of the residual."""
+
+    group: eqx.AbstractClassVar[str]
+    """What tables, files and results call them."""
+    unit: eqx.AbstractClassVar[str]
+    """m, mm, rad, s ...; tables show rad in degrees."""
+    axes: ClassVar[tuple[str, ...]] = ("",)
+    """Names of the numbers of a row."""
+    also: ClassVar[tuple[str, ...]] = ()
+    """Kinds of unknowns of the whole block that a row touches besides; None where the block has none."""
+    observed: ClassVar[str] = "value"
+    """The field that was observed: what noise is added to, and derivatives are taken by."""
+    rigid: ClassVar[bool] = False
+    """Whether no row notices that everything is shifted and turned together."""
+    through_camera: ClassVar[bool] = False
+    """Whether a row touches the interior orientation of its image."""
+    columns: ClassVar[Mapping[str, str | tuple[str, ...]]] = MappingProxyType({})
+    """Columns in files, by field, that are not called as `observations.columns` says."""
+    once: ClassVar[bool] = False
+    """Whether files may list what a row touches, in whatever order, only once."""
+
+    @abc.abstractmethod
+    def residual(self, *touched: Any) -> Float[Numbers, "..."]:
+        """Observed minus computed of one row, in the unit."""
+
+    def whitened(self, residual: Float[Numbers, "..."]) -> Float[Numbers, "..."]:
+        """The residual of one row over its standard deviation."""
+        return residual / self.sigma  # type: ignore[attr-defined]
+
+    def without_weight(self) -> Self:
+        """The same rows, which count for nothing: what padding is made of."""
+        return eqx.tree_at(lambda rows: rows.sigma, self, np.full(np.shape(self.sigmas), np.inf))
+
+    def indices(self) -> list[tuple[str, Int[Numbers, "..."]]]:
+        """What the rows touch, and which: (n,), or more axes where a row touches several."""
+        return [
+            (f.metadata["touches"], getattr(self, f.name)) for f in dataclasses.fields(self) if "touches" in f.metadata
+        ]
+
+    @property
+    def observation(self) -> Numbers:
+        """The numbers that were observed: (n,), or (n, axes)."""
+        return getattr(self, self.observed)
+
+    def with_observation(self, value: Numbers) -> Self:
+        """The same rows with other numbers observed."""
+        return eqx.tree_at(lambda rows: getattr(rows, self.observed), self, value)
+
+    def physical(self, whitened: Float[Numbers, "..."]) -> Float[np.ndarray, "..."]:
+        """Residuals over their standard deviations, (n,) or (axes, n), brought back to the unit."""
+        return np.asarray(whitened) * np.asarray(self.sigmas).T
+
+    @classmethod
+    def none(cls) -> Self:
+        """No rows."""
+        return cls(**{f.name: np.zeros((0, *f.shape), int if f.whole else float) for f in row_fields(cls)})
+
+    def flaws(self) -> Iterator[tuple[int, str]]:
+        """Rows that cannot be, by number, and what is wrong and the mend; who reads them says where they stand."""
+        return iter(())
+
+    @property
+    def sigmas(self) -> Any:
+        """Standard deviations of the observed numbers (n,) or (n, axes)."""
+        return self.sigma  # type: ignore[attr-defined]
+
+    def __len__(self) -> int:
+        return len(getattr(self, dataclasses.fields(self)[0].name))
+
+    @classmethod
+    def joined(cls, *parts: Self) -> Self:
+        """The rows of all `parts`, in this order."""
+        return cls(**{f.name: joined([getattr(p, f.name) for p in parts]) for f in dataclasses.fields(cls)})
+
+    def take(self, chosen: np.ndarray) -> Self:
+        """The rows that `chosen` (an index or a mask) names."""
+        return jax.tree.map(lambda v: still(v)[chosen], self)
+
+    def renumbered(self, **new: np.ndarray) -> Self:
+        """The rows whose images and points are kept: `new` gives, by what is touched, the new number of each or -1."""
+        touched = {f.name: f.metadata["touches"] for f in dataclasses.fields(self) if "touches" in f.metadata}
+        fields = {name: new[what] for name, what in touched.items() if what in new}
+        kept = np.ones(len(self), bool)
+        for name, number in fields.items():
+            kept &= (number[getattr(self, name)] >= 0).all(axis=tuple(range(1, np.ndim(getattr(self, name)))))
+        some = self.take(np.flatnonzero(kept))
+        return dataclasses.replace(some, **{name: number[getattr(some, name)] for name, number in fields.items()})
+
+    def axis_names(self) -> np.ndarray:
+        """The name of the axis of each observed number: (n,), or (axes, 1) where a row has several."""
+        return np.array(self.axes)[:, None] if len(self.axes) > 1 else np.full(len(self), self.axes[0], object)
+
+    def names_of(self, what: str, names: Sequence[str] | np.ndarray) -> np.ndarray:
+        """Of each row (n,), or number (axes, n), the names of the images or points that it touches, hyphens between."""
+        table, parts = np.array([*names, ""], object), []
+        for touched, index in self.indices():
+            if touched == what:
+                parts += [table[np.asarray(index, int)[(slice(None), *at)]] for at in np.ndindex(*np.shape(index)[1:])]
+        return np.array(["-".join(of) for of in zip(*parts, strict=True)] if parts else [""] * len(self), object)
+
+    def words(self, images: Sequence[str], points: Sequence[str]) -> np.ndarray:
+        """What a sentence calls each observed number, shaped like the residuals: "station of image 12 in Z"."""
+        whose = [
+            " ".join(part for part in ("image " + i if i else "", "point " + p if p else "") if part)
+            for i, p in zip(self.names_of("image", images), self.names_of("point", points), strict=True)
+        ]
+        thing = self.group.replace("_", " ").removesuffix("s")
+        axis = self.axis_names()
+        shape = np.broadcast_shapes(axis.shape, (len(self),))
+        both = zip(*(v.ravel() for v in np.broadcast_arrays(np.array(whose, object), axis)), strict=True)
+        return np.array([f"{thing} of {who}" + (f" in {a}" if a else "") for who, a in both], object).reshape(shape)
+
+
+class AbstractCoordinates(AbstractObservations):
+    """Single coordinates (m): `who` (index of a point or an image), `axis` (0, 1, 2), `value` and `sigma`."""
+
+    who: eqx.AbstractVar[np.ndarray]
+    axis: eqx.AbstractVar[np.ndarray]
+    value: eqx.AbstractVar[Numbers]
+    sigma: eqx.AbstractVar[Numbers]
+
+    def axis_names(self) -> np.ndarray:
+        """X, Y or Z of each row."""
+        return np.array(AXES, object)[self.axis]

@@ -1,0 +1,32 @@
+"""Control: surveyed coordinates of object points."""
+
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxphoto.arrays import Numbers
+from jaxphoto.observations.base import AXES, AbstractCoordinates, touching
+
+
+class ControlRows(AbstractCoordinates):
+    """Surveyed coordinates of point `who`: `axis` (0, 1, 2), `value` and `sigma` (m).
+
+    "Vertical control" is rows with axis 2. Check coordinates, and those held fixed, have such rows, too.
+    """
+
+    group = "control_points"
+    unit = "m"
+    columns = {"who": "point"}  # noqa: RUF012
+
+    who: Int[np.ndarray, "n"] = touching("point")
+    axis: Int[np.ndarray, "n"]
+    value: Float[Numbers, "n"]
+    sigma: Float[Numbers, "n"]
+
+    def residual(self, point: Float[Array, "3"]) -> Float[Numbers, ""]:
+        """Surveyed minus computed (m)."""
+        return self.value - point[self.axis]
+
+    def words(self, images, points) -> np.ndarray:
+        """Such as "control point T11 in Z"."""
+        rows = zip(self.who, self.axis, strict=True)
+        return np.array([f"control point {points[p]} in {AXES[a]}" for p, a in rows], object)

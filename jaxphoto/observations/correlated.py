@@ -1,0 +1,137 @@
+"""Correlated observations: rows that a full covariance matrix joins by small sets.
+
+The three axes of a station from GNSS processing, a point from another adjustment, stations of a strip with exponential
+correlation in time: a set of m rows of any kind has the covariance matrix C = L L'. Its residuals are multiplied by
+L^-1, once, so the solver meets nothing but rows of unit weight.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxphoto.arrays import Numbers, still
+from jaxphoto.observations.base import AbstractObservations
+
+
+class Correlated(AbstractObservations):
+    """Sets of rows: fields of `rows` have the leading axes (sets, m); made by `correlated`.
+
+    `covariance` (sets, m k, m k) goes over the rows of a set, and over the k numbers of each.
+    """
+
+    rows: AbstractObservations
+    covariance: Float[Numbers, "sets n n"]
+    whitener: Float[Numbers, "sets n n"]
+    """L^-1."""
+    group: str = eqx.field(static=True)  # type: ignore[misc]
+    unit: str = eqx.field(static=True)  # type: ignore[misc]
+    axes: tuple[str, ...] = eqx.field(static=True)  # type: ignore[misc]
+    also: tuple[str, ...] = eqx.field(static=True)  # type: ignore[misc]
+    rigid: bool = eqx.field(static=True)  # type: ignore[misc]
+    through_camera: bool = eqx.field(static=True)  # type: ignore[misc]
+
+    def residual(self, *touched: Any) -> Float[Numbers, "n"]:
+        """The residuals of the rows of one set, one after the other."""
+        n = len(self.rows.indices())
+        each = jax.vmap(lambda row, *own: row.residual(*own, *touched[n:]))(self.rows, *touched[:n])
+        return each.reshape(-1)
+
+    def whitened(self, residual: Float[Numbers, "n"]) -> Float[Numbers, "n"]:
+        """L^-1 times the residuals."""
+        return self.whitener @ residual
+
+    def without_weight(self) -> "Correlated":
+        """The same sets, which count for nothing."""
+        return eqx.tree_at(lambda sets: sets.whitener, self, np.zeros(np.shape(self.whitener)))
+
+    def indices(self) -> list[tuple[str, Int[Numbers, "..."]]]:
+        """What the rows of a set touch, along the axes after the first."""
+        return self.rows.indices()
+
+    @property
+    def observation(self) -> Numbers:
+        """(sets, n)."""
+        return self.rows.observation.reshape(len(self), -1)
+
+    def with_observation(self, value: Numbers) -> "Correlated":
+        """The same sets with other numbers observed."""
+        inner = self.rows.with_observation(value.reshape(self.rows.observation.shape))
+        return eqx.tree_at(lambda sets: sets.rows, self, inner)
+
+    @property
+    def sigmas(self) -> Numbers:
+        """(sets, n)."""
+        return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
+
+    def physical(self, whitened: Float[Numbers, "n sets"]) -> Float[np.ndarray, "n sets"]:
+        """L times the whitened residuals."""
+        return np.linalg.solve(np.asarray(self.whitener), np.asarray(whitened).T[..., None])[..., 0].T
+
+    def __len__(self) -> int:
+        return len(self.covariance)
+
+    def axis_names(self) -> np.ndarray:
+        """(n, sets)."""
+        return self._by_set(self.flat.axis_names())
+
+    def names_of(self, what: str, names: Sequence[str] | np.ndarray) -> np.ndarray:
+        """(n, sets)."""
+        return self._by_set(self.flat.names_of(what, names))
+
+    def words(self, images: Sequence[str], points: Sequence[str]) -> np.ndarray:
+        """(n, sets)."""
+        return self._by_set(self.flat.words(images, points))
+
+    @property
+    def flat(self) -> AbstractObservations:
+        """All rows, one set after the other."""
+        return jax.tree.map(lambda v: np.asarray(v).reshape(-1, *np.shape(v)[2:]), self.rows)
+
+    def _by_set(self, names: np.ndarray) -> np.ndarray:
+        n = int(np.prod(np.shape(self.covariance)[:2]))
+        k = len(self.rows.axes)
+        return np.broadcast_to(names, (k, n // k)).T.reshape(len(self), -1).T
+
+
+def correlated(
+    rows: AbstractObservations, sets: Sequence[Sequence[int]] | np.ndarray, covariance: Float[np.ndarray, "sets n n"]
+) -> Correlated:
+    """`rows` in sets of equal length (lists of row numbers), each with its covariance matrix (m2, rad2 ...).
+
+    The covariance of a set goes over its rows in their order, and over the numbers of each row. The standard deviations
+    that `rows` have do not count. Raises ValueError for matrices that are none.
+    """
+    index, covariance = np.asarray(sets, int), np.asarray(covariance, float)
+    n = index.shape[1] * len(rows.axes) if index.ndim == 2 else 0
+    if index.ndim != 2 or covariance.shape != (len(index), n, n):
+        raise ValueError(
+            f"sets are lists of equally many rows, each with a covariance matrix of all their numbers: {len(index)} "
+            f"sets need {(len(index), n, n)}, got {covariance.shape}"
+        )
+    try:
+        whitener = np.linalg.inv(np.linalg.cholesky(covariance))
+    except np.linalg.LinAlgError:
+        raise ValueError("a covariance matrix is not positive definite: a combination has no uncertainty") from None
+    return Correlated(
+        rows=jax.tree.map(lambda v: still(v)[index], rows),
+        covariance=covariance,
+        whitener=whitener,
+        group=f"correlated_{rows.group}",
+        unit=rows.unit,
+        axes=rows.axes * index.shape[1],
+        also=rows.also,
+        rigid=rows.rigid,
+        through_camera=rows.through_camera,
+    )
+
+
+def exponential_covariance(
+    time: Float[np.ndarray, "n"], sigma: Float[np.ndarray, "n"] | float, correlation_time: float
+) -> Float[np.ndarray, "n n"]:
+    """sigma_i sigma_j exp(-|t_i - t_j| / T): a first-order Gauss-Markov process at `time` (s), T in s."""
+    time, sigma = np.asarray(time, float), np.broadcast_to(np.asarray(sigma, float), np.shape(time))
+    return sigma[:, None] * sigma * np.exp(-np.abs(time[:, None] - time) / correlation_time)

@@ -1,0 +1,39 @@
+"""Scale bars: distances between two points."""
+
+from collections.abc import Iterator
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxphoto.arrays import Numbers
+from jaxphoto.observations.base import AbstractObservations, touching
+
+
+class Distances(AbstractObservations):
+    """Scale bars: the distance (m) between two points."""
+
+    group = "distances"
+    unit = "m"
+    rigid = True
+    columns = {"points": ("point_a", "point_b"), "value": "distance_m"}  # noqa: RUF012
+    once = True
+
+    points: Int[np.ndarray, "n 2"] = touching("point")
+    value: Float[Numbers, "n"]
+    sigma: Float[Numbers, "n"]
+
+    def residual(self, ends: Float[Array, "2 3"]) -> Float[Numbers, ""]:
+        """Observed minus computed (m)."""
+        return self.value - jnp.sqrt(jnp.sum((ends[0] - ends[1]) ** 2))
+
+    def words(self, images, points) -> np.ndarray:
+        """Such as "distance A to B"."""
+        return np.array([f"distance {points[a]} to {points[b]}" for a, b in self.points], object)
+
+    def flaws(self) -> Iterator[tuple[int, str]]:
+        """Between a point and itself, or not positive."""
+        for row in np.flatnonzero(self.points[:, 0] == self.points[:, 1]):
+            yield int(row), "the distance runs from a point to itself; correct point_a or point_b"
+        for row in np.flatnonzero(np.asarray(self.value) <= 0):
+            yield int(row), f"distance_m is {self.value[row]:g}; a distance is positive, so give its true value"

@@ -1,0 +1,35 @@
+"""Image points: the observations that an adjustment is made of, and its fast path (`adjustment.tiles`)."""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxphoto.arrays import Numbers
+from jaxphoto.collinearity import ExteriorOrientation, image_residual
+from jaxphoto.observations.base import AbstractObservations, ImageState, touching
+
+
+class ImageRows(AbstractObservations):
+    """Measured image coordinates (mm, from the image centre) of `point` in `image`, sorted by point."""
+
+    group = "image_points"
+    unit = "mm"
+    axes = ("x", "y")
+    observed = "xy"
+    through_camera = True
+    columns = {"xy": ("x_mm", "y_mm")}  # noqa: RUF012
+
+    image: Int[np.ndarray, "n"] = touching("image")
+    point: Int[np.ndarray, "n"] = touching("point")
+    xy: Float[Numbers, "n 2"]
+    sigma: Float[Numbers, "n 2"]
+
+    def residual(self, image: ImageState, point: Float[Array, "3"]) -> Float[Numbers, "2"]:
+        """Observed minus computed (mm), without refraction and curvature; see `collinearity.image_residual`."""
+        exterior = ExteriorOrientation(image.position, image.camera_from_object)
+        return image_residual(image.interior, exterior, point, jnp.asarray(self.xy))
+
+    def words(self, images, points) -> np.ndarray:
+        """Such as "point 7 in image 12", for both coordinates: a point in an image is one blunder."""
+        names = [f"point {points[p]} in image {images[i]}" for i, p in zip(self.image, self.point, strict=True)]
+        return np.broadcast_to(np.array(names, object), (2, len(names)))

@@ -1,0 +1,102 @@
+"""What is known of unknowns beforehand, as observations of them."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxphoto.arrays import Numbers
+from jaxphoto.observations.base import AXES, AbstractObservations, ImageState, touching
+from jaxphoto.rotation import small_angles
+
+PRIORS = "priors"
+
+
+class ParameterRows(AbstractObservations):
+    """Parameters that were known beforehand as `value` with `sigma`, in their own units."""
+
+    group = PRIORS
+    unit = ""
+
+    parameter: Int[np.ndarray, "n"] = touching("parameter")
+    value: Float[Numbers, "n"]
+    sigma: Float[Numbers, "n"]
+
+    def residual(self, parameter: Float[Array, ""]) -> Float[Numbers, ""]:
+        """Known beforehand minus estimated."""
+        return self.value - parameter
+
+
+class PositionRows(AbstractObservations):
+    """Projection centres (m) of `image` that were known beforehand."""
+
+    group = "prior_positions"
+    unit = "m"
+    axes = AXES
+
+    image: Int[np.ndarray, "n"] = touching("image")
+    value: Float[Numbers, "n 3"]
+    sigma: Float[Numbers, "n 3"]
+
+    def residual(self, image: ImageState) -> Float[Numbers, "3"]:
+        """Known beforehand minus estimated (m)."""
+        return self.value - image.position
+
+
+class RotationRows(AbstractObservations):
+    """Rotations `camera_from_object` of `image` known beforehand; sigma is of a small rotation in its frame (rad)."""
+
+    group = "prior_rotations"
+    unit = "rad"
+    axes = ("rx", "ry", "rz")
+    observed = "turn"
+    columns = {"value": tuple(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)), "turn": ()}  # noqa: RUF012
+
+    image: Int[np.ndarray, "n"] = touching("image")
+    value: Float[Numbers, "n 3 3"]
+    sigma: Float[Numbers, "n 3"]
+    turn: Float[Numbers, "n 3"]
+    """What was observed besides `value`: zero, unless somebody adds an error to it."""
+
+    def residual(self, image: ImageState) -> Float[Numbers, "3"]:
+        """Known beforehand minus estimated, a small rotation in the camera frame (rad)."""
+        return self.turn + small_angles(jnp.asarray(self.value) @ image.camera_from_object.T)
+
+
+class PointRows(AbstractObservations):
+    """Object points (m) known beforehand."""
+
+    group = "prior_points"
+    unit = "m"
+    axes = AXES
+
+    point: Int[np.ndarray, "n"] = touching("point")
+    value: Float[Numbers, "n 3"]
+    sigma: Float[Numbers, "n 3"]
+
+    def residual(self, point: Float[Array, "3"]) -> Float[Numbers, "3"]:
+        """Known beforehand minus estimated (m)."""
+        return self.value - point
+
+
+class KnownParameters(eqx.Module):
+    """Parameters known beforehand together: a calibration of last year, with its correlations.
+
+    `labels` are paths such as `interior[kodak].c_mm` and `strips[a].shift_Z_m` (of every table that shows parameters),
+    `value` and `covariance` in their own units. For `adjust(block, more=...)`; the parameters are FREE in `priors`.
+    """
+
+    labels: tuple[str, ...] = eqx.field(static=True)
+    value: Float[Numbers, "n"]
+    covariance: Float[Numbers, "n n"]
+
+    def __init__(self, labels: Sequence[str], value: Float[Numbers, "n"], covariance: Float[Numbers, "n n"]):
+        self.labels, self.value, self.covariance = tuple(labels), value, covariance
+        n = len(self.labels)
+        if np.shape(value) != (n,) or np.shape(covariance) != (n, n):
+            raise ValueError(
+                f"{n} labels need {n} values and a covariance matrix of {n} x {n}, got {np.shape(value)} and "
+                f"{np.shape(covariance)}"
+            )

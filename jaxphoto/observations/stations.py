@@ -1,0 +1,36 @@
+"""Camera stations: what GNSS observed at the exposures."""
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxphoto.arrays import Numbers
+from jaxphoto.georeferencing import sensor_position
+from jaxphoto.observations.base import AXES, AbstractCoordinates, ImageState, touching
+
+
+class StationRows(AbstractCoordinates):
+    """Coordinates of the GNSS/IMU at the exposure of image `who`: `axis` (0, 1, 2), `value` and `sigma` (m)."""
+
+    group = "stations"
+    unit = "m"
+    columns = {"who": "image"}  # noqa: RUF012
+
+    who: Int[np.ndarray, "n"] = touching("image")
+    axis: Int[np.ndarray, "n"]
+    value: Float[Numbers, "n"]
+    sigma: Float[Numbers, "n"]
+
+    def residual(self, image: ImageState) -> Float[Numbers, ""]:
+        """Observed minus computed (m); see `georeferencing.sensor_position`."""
+        if not image.parameters:
+            # Neither mounts nor strips: a station is the projection centre itself.
+            return self.value - image.position[self.axis]
+        at = sensor_position(image.position, image.camera_from_object, image.mount, image.strip, image.exposure)
+        for own in image.parameters.values():
+            at = own.station(at, image.exposure)
+        return self.value - at[self.axis]
+
+    def words(self, images, points) -> np.ndarray:
+        """Such as "station of image 12 in Z"."""
+        rows = zip(self.who, self.axis, strict=True)
+        return np.array([f"station of image {images[i]} in {AXES[a]}" for i, a in rows], object)

@@ -1,0 +1,59 @@
+"""Surfaces: points observed to lie on what a laser scanner measured."""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxphoto.arrays import Numbers
+from jaxphoto.georeferencing import Scanner
+from jaxphoto.observations.base import AbstractObservations, touching
+
+
+class SurfaceRows(AbstractObservations):
+    """Points observed to lie on the surface that a laser scanner measured: on the plane through `foot` (m).
+
+        normal . (X - foot + shift) + turn . boresight = rise
+
+    with standard deviation `sigma` (m), and the shift of the lidar strip and the boresight of `Unknowns.scanner`, where
+    the block has one. `turn` (m) is by how much a unit of boresight has raised `foot` along `normal`
+    (`georeferencing.raised_by_boresight`). `rise` is what was observed: zero, unless somebody adds an error to it.
+    """
+
+    group = "surfaces"
+    unit = "m"
+    axes = ("normal",)
+    also = ("scanner",)
+    observed = "rise"
+    columns = {  # noqa: RUF012
+        "foot": ("foot_X_m", "foot_Y_m", "foot_Z_m"),
+        "normal": ("normal_X", "normal_Y", "normal_Z"),
+        "turn": ("turn_right_m", "turn_forward_m", "turn_up_m"),
+        "rise": (),
+    }
+
+    point: Int[np.ndarray, "n"] = touching("point")
+    strip: Int[np.ndarray, "n"]
+    """Of `Unknowns.scanner.shifts`, in their order; 0 in a block without a scanner."""
+    foot: Float[Numbers, "n 3"]
+    normal: Float[Numbers, "n 3"]
+    turn: Float[Numbers, "n 3"]
+    sigma: Float[Numbers, "n"]
+    rise: Float[Numbers, "n"]
+
+    def __init__(self, point, strip, foot, normal, turn, sigma, rise=None):
+        self.point, self.strip = np.asarray(point), strip
+        self.foot, self.normal, self.turn, self.sigma = foot, normal, turn, sigma
+        self.rise = np.zeros(np.shape(sigma)) if rise is None else rise
+
+    def residual(self, point: Float[Array, "3"], scanner: Scanner | None) -> Float[Numbers, ""]:
+        """By how much the point lies below the surface (m), along its normal."""
+        apart, rise = point - self.foot, jnp.zeros(())
+        if scanner is not None:
+            shifts = list(scanner.shifts.values())
+            apart = apart + jnp.stack(shifts)[self.strip] if shifts else apart
+            rise = jnp.sum(scanner.boresight * self.turn)
+        return self.rise - (jnp.sum(self.normal * apart) + rise)
+
+    def words(self, images, points) -> np.ndarray:
+        """Such as "point 12 on its surface"."""
+        return np.array([f"point {points[p]} on its surface" for p in self.point], object)

@@ -1,0 +1,35 @@
+"""The door of functions of one image and one point: lists become arrays, and a forgotten `jax.vmap` is named.
+
+Under `jit` this is of the tracing alone.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxphoto.errors import InputError
+
+
+def single(name: str, values: Any, *shape: int | None) -> Float[Array, "..."]:
+    """`values` as an array of `shape`, in which None is any number.
+
+    Raises InputError for another shape, and for what is no array of numbers.
+    """
+    if not isinstance(values, jax.Array | np.ndarray):
+        try:
+            values = jnp.asarray(values, float)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"{name} must be an array of numbers of shape {_written(shape)} ({error})") from None
+    if values.ndim == len(shape) and all(n in (None, m) for n, m in zip(shape, values.shape, strict=True)):
+        return values
+    many = values.ndim == len(shape) + 1 and all(n in (None, m) for n, m in zip(shape, values.shape[1:], strict=True))
+    mend = "map the function over many with jax.vmap" if many else "give an array of that shape"
+    raise InputError(f"{name} has shape {_written(values.shape)} where {_written(shape)} is one: {mend}")
+
+
+def _written(shape: tuple[int | None, ...]) -> str:
+    sizes = ["n" if n is None else str(n) for n in shape]
+    return f"({', '.join(sizes)}{',' if len(sizes) == 1 else ''})"

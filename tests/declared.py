@@ -1,0 +1,229 @@
+"""One block in which everything that can be declared is observed and estimated: jaxphoto's own kinds and a user's.
+
+One block, because what costs is compiling: all tests of `test_declared` ask the same adjustment.
+"""
+
+import dataclasses
+import functools
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxphoto import AbstractObservations, AbstractParameters, KnownParameters, Outcome, adjust, correlated, touching
+from jaxphoto.adjustment.adjust import _residuals
+from jaxphoto.adjustment.padding import crop_residuals, pad_structure, pad_values
+from jaxphoto.adjustment.structure import structure_of
+from jaxphoto.adjustment.values import values_of
+from jaxphoto.arrays import Numbers
+from jaxphoto.block import Block, Motion
+from jaxphoto.compiling import run_compiled
+from jaxphoto.georeferencing import Mount
+from jaxphoto.observations import AXES, Distances, ImageState, StationRows, exponential_covariance
+from jaxphoto.rotation import small_rotation
+from jaxphoto.unknowns import FIXED, FREE, Unknowns, Weighted
+from tests.blocks import VARIANTS, Simulated, free, measured, rows, with_priors
+from tests.levelling import HeightDifferences
+
+
+class Baselines(AbstractObservations):
+    """Relative positions of two exposures (m)."""
+
+    group = "baselines"
+    unit = "m"
+    axes = AXES
+
+    start: Int[np.ndarray, "n"] = touching("image")
+    end: Int[np.ndarray, "n"] = touching("image")
+    value: Float[Numbers, "n 3"]
+    sigma: Float[Numbers, "n 3"]
+
+    def residual(self, start: ImageState, end: ImageState) -> Float[Array, "3"]:
+        return self.value - (end.position - start.position)
+
+
+class RateOfC(AbstractParameters):
+    """The principal distance of a camera grows as it warms up."""
+
+    kind = "c_rates"
+    owner = "camera"
+    names = {"rate": ("rate_mm_per_s",)}  # noqa: RUF012
+    bends = ("c",)
+
+    rate: float
+
+    def interior(self, interior, exposure):
+        return dataclasses.replace(interior, c=interior.c + self.rate * exposure.time)
+
+
+class Heights(AbstractParameters):
+    """GNSS heights of a strip are too large by this."""
+
+    kind = "heights"
+    owner = "strip"
+    names = {"offset": ("offset_m",)}  # noqa: RUF012
+
+    offset: float
+
+    def station(self, position, exposure):
+        return position.at[2].add(self.offset)
+
+
+class Clocks(AbstractParameters):
+    """The receiver's clock is slow by this, in each session."""
+
+    kind = "clocks"
+    owner = "session"
+    names = {"offset": ("offset_s",)}  # noqa: RUF012
+
+    offset: float
+
+    def station(self, position, exposure):
+        return position + exposure.velocity * self.offset
+
+
+class CommonShift(AbstractParameters):
+    """All stations are shifted in plan."""
+
+    kind = "shifts"
+    owner = "block"
+    names = {"shift": ("X_m", "Y_m")}  # noqa: RUF012
+
+    shift: Float[Array, "2"]
+
+    def station(self, position, exposure):
+        return position.at[:2].add(self.shift)
+
+
+OWN = {
+    "c_rates": {"one": RateOfC(np.float64(0.012))},
+    "heights": {"a": Heights(np.float64(0.35)), "b": Heights(np.float64(-0.25))},
+    "clocks": {"early": Clocks(np.float64(0.006)), "late": Clocks(np.float64(-0.004))},
+    "shifts": {"": CommonShift(np.array([0.3, -0.2]))},
+}
+"""Truth of the unknowns of a user's own, one of each kind of owner."""
+KNOWN = ("interior[one].c_mm", "interior[one].k1")
+
+
+def own_priors(prior_of) -> dict:
+    """Priors of all of `OWN`: `prior_of` a true value."""
+    return jax.tree.map(prior_of, OWN)
+
+
+def residuals_of(block: Block, unknowns: Unknowns):
+    """Residuals over their standard deviations at `unknowns`, and the structure."""
+    s = structure_of(block, block.priors)
+    wide, places = pad_structure(s, dense=bool(s.coupled))
+    values = pad_values(values_of(block, unknowns, block.priors, s), s, wide, places)
+    return crop_residuals(run_compiled(_residuals, (values, wide), {}, "residuals"), s, places), s
+
+
+def changed(block: Block, change) -> Block:
+    """The block with `change(rows, k)` in place of all observations; k is the place of their group, -1 for images."""
+    where = lambda b: (b.stations, b.attitudes, b.control, b.surfaces, b.distances)  # noqa: E731
+    given = [change(block.image_points, -1)]
+    for k, of in enumerate(block.observations):
+        given.append(change(of, k))
+    more = iter(given[6:])
+    block = eqx.tree_at(lambda b: (b.image_points, *where(b)), block, tuple(given[:6]))
+    return dataclasses.replace(
+        block, more=tuple(next(more) if isinstance(m, AbstractObservations) else m for m in block.more)
+    )
+
+
+def _observed(block: Block, truth: Unknowns, seed: int) -> Block:
+    """Every observation computed from the truth by its own residual, with noise of its own covariance."""
+
+    def exact(of, k):
+        v = found.image if k < 0 else found.others[k]
+        return of.with_observation(np.asarray(of.observation) - of.physical(v).T)
+
+    def noisy(of, k):
+        return of.with_observation(np.asarray(of.observation) + of.physical(rng.normal(size=np.shape(of.sigmas)).T).T)
+
+    # Residuals are those of ideal coordinates: what they say of measured ones is right to a few per cent.
+    for _ in range(6):
+        found, _ = residuals_of(block, truth)
+        block = changed(block, exact)
+    assert max(np.abs(v).max() for v in (found.image, *found.others[: len(block.observations)])) < 1e-5
+    rng = np.random.default_rng(seed)
+    return changed(block, noisy)
+
+
+def _weighted(rng, truth, sigma) -> Weighted:
+    sigma = np.broadcast_to(sigma, np.shape(truth))
+    return Weighted(truth + sigma * rng.normal(size=np.shape(truth)), np.array(sigma))
+
+
+def _further(n_images: int) -> tuple:
+    """Observations of all further kinds; values are for `_observed` to fill."""
+    rng = np.random.default_rng(4)
+    factor = rng.normal(0, 0.02, (n_images, 3, 3)) + 0.05 * np.eye(3)
+    gnss = rows(range(n_images), sigma=1.0, kind=StationRows)
+    heights = rows(range(n_images), (2,), sigma=1.0, kind=StationRows)
+    times = np.array([np.linspace(-6, 6, 5), np.linspace(-7, 7, 5)])
+    in_time = np.stack([exponential_covariance(t, 0.08, 5.0) for t in times])
+    start, end = np.array([0, 3, 8, 20, 30]), np.array([7, 9, 25, 33, 5])
+    first = np.array([0, 2, 5, 4])
+    return (
+        HeightDifferences(start, end, np.zeros(5), np.array([0.005, 0.01, 0.02, 0.01, 0.005])),
+        Baselines(first, np.array([1, 3, 9, 6]), np.zeros((4, 3)), np.full((4, 3), 0.03) * [1, 1, 2]),
+        correlated(gnss, np.arange(3 * n_images).reshape(-1, 3), factor @ factor.transpose(0, 2, 1)),
+        correlated(heights, np.arange(n_images).reshape(2, -1), in_time),
+    )
+
+
+@functools.cache
+def simulated(seed: int = 1) -> Simulated:
+    """The block, noisy, with a rough start, and its truth."""
+    block, truth = VARIANTS["surfaces"]()
+    n, rng = len(block.images), np.random.default_rng(seed + 100)
+    ends = np.array([[3, 17], [17, 40], [5, 35]])
+    block = dataclasses.replace(
+        block,
+        control=rows((3, 4, 20, 36, 37)),
+        distances=Distances(ends, np.zeros(3), np.array([0.02, 0.03, 0.01])),
+        image_strip=("a",) * 5 + ("b",) * 5,
+        image_time=np.concatenate([np.linspace(-6, 6, 5), np.linspace(-7, 7, 5)]),
+        motion=Motion(np.repeat([[60.0, 12, 0], [-8, 55.0, 0]], 5, axis=0), np.zeros((n, 3))),
+        partitions={"session": ("early",) * 4 + ("late",) * 5 + ("",)},
+    )
+    block, _ = measured(Simulated(free(block, "one"), truth))
+    truth = dataclasses.replace(truth, more=OWN)
+    start = dataclasses.replace(block.start.unknowns, more=jax.tree.map(np.zeros_like, OWN))
+    camera = truth.interior["one"]
+    block = with_priors(block, "one", k2=_weighted(rng, np.float64(camera.distortion.k2), 3e-9))
+    turns = rng.normal(0, 2e-3, (n, 3))
+    priors = dataclasses.replace(
+        block.priors,
+        more=own_priors(lambda _: FREE),
+        exterior=dataclasses.replace(
+            block.priors.exterior,
+            position=_weighted(rng, truth.exterior.position, [0.1, 0.1, 0.2]),
+            camera_from_object=Weighted(
+                np.asarray(jax.vmap(small_rotation)(turns)) @ truth.exterior.camera_from_object, np.full((n, 3), 2e-3)
+            ),
+        ),
+        points=_weighted(rng, truth.points, 1.0),
+        mounts={"imu": Mount(_weighted(rng, truth.mounts["imu"].lever_arm, 0.05), FREE, FIXED)},
+    )
+    sigma = np.array([0.01, 2e-6])
+    covariance = np.outer(sigma, sigma) * [[1, -0.7], [-0.7, 1]]
+    known = np.array([camera.c, camera.distortion.k1]) + np.linalg.cholesky(covariance) @ rng.normal(size=2)
+    unfinished = dataclasses.replace(
+        block,
+        start=dataclasses.replace(block.start, unknowns=start),
+        priors=priors,
+        more=(*_further(n), KnownParameters(KNOWN, known, covariance)),
+    )
+    return Simulated(_observed(unfinished, truth, seed), truth)
+
+
+@functools.cache
+def adjusted():
+    """The adjustment of `simulated`, the further observations given as from a notebook."""
+    block = simulated().block
+    result = adjust(dataclasses.replace(block, more=()), block.start.unknowns, more=block.more)
+    assert result.outcome is Outcome.CONVERGED
+    return result

@@ -1,0 +1,22 @@
+"""A user's observations of two points."""
+
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxphoto import AbstractObservations, touching
+from jaxphoto.arrays import Numbers
+
+
+class HeightDifferences(AbstractObservations):
+    """Levelled: how much higher `end` lies than `start` (m)."""
+
+    group = "height_differences"
+    unit = "m"
+
+    start: Int[np.ndarray, "n"] = touching("point")
+    end: Int[np.ndarray, "n"] = touching("point")
+    value: Float[Numbers, "n"]
+    sigma: Float[Numbers, "n"]
+
+    def residual(self, start: Float[Array, "3"], end: Float[Array, "3"]) -> Float[Array, ""]:
+        return self.value - (end[2] - start[2])

@@ -1,0 +1,448 @@
+"""Whatever is declared as an observation or an unknown holds what the adjustment, statistics and tables promise.
+
+All cases ask one adjustment (`tests.declared`), in which everything that can be declared is observed and estimated.
+"""
+
+import dataclasses
+import functools
+
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+import scipy.linalg
+from jax.flatten_util import ravel_pytree
+
+import jaxphoto.observations
+from jaxphoto import FIXED, FREE, AbstractObservations, JaxphotoError, Tables, Weighted, adjust, covariance, monte_carlo
+from jaxphoto.adjustment.layout import sizes_of
+from jaxphoto.adjustment.normal import At, residuals_at
+from jaxphoto.adjustment.optimum import typical_scale, weigh_datum, zero_increments
+from jaxphoto.adjustment.structure import structure_of
+from jaxphoto.observations import Correlated, KnownParameters
+from jaxphoto.parameters import numbers_of
+from jaxphoto.report.results import write_results
+from jaxphoto.sensitivity import noise, sensitivity
+from jaxphoto.sensitivity.designs import prepare_design
+from jaxphoto.statistics import observation_groups, redundancy_numbers
+from tests.adjustment.dense import dense_of, own_order
+from tests.declared import OWN, adjusted, own_priors, residuals_of, simulated
+
+# Every class that a file or a notebook gives rows of, by the groups of the block that show it.
+SHOWN = {
+    "ImageRows": ("image_points",),
+    "StationRows": ("stations",),
+    "Attitudes": ("attitudes",),
+    "ControlRows": ("control_points",),
+    "SurfaceRows": ("surfaces",),
+    "Distances": ("distances",),
+    "HeightDifferences": ("height_differences",),
+    "Baselines": ("baselines",),
+    "Correlated": ("correlated_stations", "correlated_stations#2", "priors_together"),
+    "PositionRows": ("prior_positions",),
+    "RotationRows": ("prior_rotations",),
+    "PointRows": ("prior_points",),
+    "ParameterRows": ("priors",),
+}
+GROUPS = tuple(name for names in SHOWN.values() for name in names)
+each_group = pytest.mark.parametrize("group", GROUPS)
+
+
+def concrete(cls: type) -> set[type]:
+    """The classes below, without those that declare nothing themselves."""
+    below = {c for one in cls.__subclasses__() for c in {one, *concrete(one)}}
+    return {c for c in below if not c.__name__.startswith("Abstract")}
+
+
+def test_no_class_of_observations_is_forgotten():
+    declared = {c.__name__ for c in concrete(AbstractObservations) if c.__module__.startswith("jaxphoto.")}
+    declared |= {"HeightDifferences", "Baselines"}
+    assert set(SHOWN) == declared
+    assert {c for c in declared if hasattr(jaxphoto.observations, c)} == declared - {"HeightDifferences", "Baselines"}
+    assert set(adjusted().residuals.named) == set(GROUPS)
+
+
+@functools.cache
+def dense():
+    return dense_of(adjusted())
+
+
+@functools.cache
+def rows_of_groups() -> dict[str, slice]:
+    """Where the residuals of each group stand among all."""
+    ends = np.cumsum([0, *(np.size(v) for v in adjusted().residuals.named.values())])
+    return {name: slice(*ends[k : k + 2]) for k, name in enumerate(adjusted().residuals.named)}
+
+
+@functools.cache
+def differences() -> tuple[np.ndarray, np.ndarray]:
+    """What all residuals answer to eight random directions: by the Jacobian, and by central differences."""
+    a = adjusted()
+    padded = a.computed
+    s = padded.structure
+
+    def answered(values, direction):
+        values = weigh_datum(values, s)
+        scale = typical_scale(values, s)
+        _, back = ravel_pytree(zero_increments(s))
+
+        def at(h):
+            return ravel_pytree(residuals_at(At(back(h * direction), scale, values, s)))[0]
+
+        return (at(-2 * _STEP) - 8 * at(-_STEP) + 8 * at(_STEP) - at(2 * _STEP)) / (12 * _STEP)
+
+    unknowns, rows = own_order(padded.values, a.structure, s, padded.places)
+    rng, n = np.random.default_rng(3), np.size(ravel_pytree(zero_increments(s))[0])
+    directions = np.zeros((8, n))
+    directions[:, unknowns] = rng.normal(size=(8, len(unknowns)))
+    found = np.array(jax.jit(lambda v, d: jax.lax.map(lambda one: answered(v, one), d))(padded.values, directions))
+    return dense().jacobian @ directions[:, unknowns].T, found[:, rows].T
+
+
+# Of increments that are typical of an unknown: fourth-order differences are then right to eight digits and more.
+_STEP = 1e-3
+
+
+@each_group
+def test_derivatives_of_the_rows_are_central_differences(group):
+    found, expected = (v[rows_of_groups()[group]] for v in differences())
+    scale = np.abs(expected).max()
+    assert scale > 1e-3, "nothing depends on anything: the check would pass for any derivative"
+    np.testing.assert_allclose(found, expected, atol=1e-7 * scale)
+
+
+@each_group
+def test_every_row_weighs_in_the_normal_equations(group):
+    """The sums of the structured code, group by group: without a group the dense sums are others."""
+    d = dense()
+    own = rows_of_groups()[group]
+    terms = np.abs(d.jacobian).T @ np.abs(d.residuals)
+    np.testing.assert_allclose(d.sums, d.jacobian.T @ d.residuals, atol=1e-12 * terms.max())
+    part = d.jacobian[own].T @ d.residuals[own]
+    assert np.abs(part).max() > 1e-9 * terms.max()
+
+
+def test_elimination_solves_the_dense_normal_equations():
+    d = dense()
+    j = d.jacobian[:, d.free]
+    n = j.T @ j
+    expected = scipy.linalg.cho_solve(scipy.linalg.cho_factor(n), d.vector[d.free])
+    error = d.solutions[0][d.free] - expected
+    assert np.sqrt(error @ n @ error) < 1e-9 * np.sqrt(expected @ n @ expected)
+
+
+@functools.cache
+def redundancy():
+    return redundancy_numbers(adjusted(), covariance_of())
+
+
+@functools.cache
+def covariance_of():
+    return covariance(adjusted())
+
+
+@functools.cache
+def dense_cofactors() -> np.ndarray:
+    """Of the residuals over their standard deviations, or times L^-1: I - J N^-1 J'."""
+    j = dense().jacobian[:, dense().free]
+    return np.eye(len(j)) - j @ np.linalg.solve(j.T @ j, j.T)
+
+
+@each_group
+def test_redundancy_numbers_are_those_of_the_dense_matrix(group):
+    found, own = redundancy().named[group], rows_of_groups()[group]
+    expected, rows = dense_cofactors()[own, own], observation_groups(adjusted())[group]
+    if isinstance(rows, Correlated):
+        # Of observations themselves: the diagonal of Q_vv P = L (I - J N^-1 J') L^-1.
+        factor = np.linalg.cholesky(np.asarray(rows.covariance))
+        sets, n = factor.shape[:2]
+        expected = expected.reshape(n, sets, n, sets)
+        whole = [factor[k] @ expected[:, k, :, k] @ np.linalg.inv(factor[k]) for k in range(sets)]
+        expected = np.stack([np.diagonal(one) for one in whole], axis=1)
+    else:
+        expected = np.diagonal(expected)
+        assert (found > -1e-6).all()
+        assert (found < 1 + 1e-9).all()
+    np.testing.assert_allclose(np.ravel(found), np.ravel(expected), atol=1e-6)
+
+
+def test_redundancy_numbers_sum_to_the_redundancy():
+    total = sum(float(np.sum(v)) for v in redundancy().named.values())
+    assert abs(total - adjusted().redundancy) < 1e-5
+
+
+def test_larger_sizes_change_nothing():
+    a = adjusted()
+    sizes = sizes_of(a.structure)
+    more = tuple((name, 2 * n + 3) for name, n in sizes.rows)
+    wide = sizes._replace(images=40, tiles=20, tile_images=16, tile_points=16, rows=more)
+    again = adjust(a.block, a.block.start.unknowns, sizes=wide)
+    for name, v in a.residuals.named.items():
+        np.testing.assert_allclose(again.residuals[name], v, atol=1e-6, err_msg=name)
+    sigma = np.asarray(covariance_of().shared_sigma)
+    of_shared = lambda x: np.asarray(x.values.shared)[a.structure.free]  # noqa: E731
+    np.testing.assert_array_less(np.abs(of_shared(again) - of_shared(a)) / sigma, 1e-6)
+    np.testing.assert_allclose(again.unknowns.points, a.unknowns.points, atol=1e-6)
+
+
+@functools.cache
+def whitened_by_noise() -> dict[str, np.ndarray]:
+    """By group, the derivatives of the residuals by errors of unit size, all that `noise` knows."""
+    a = adjusted()
+    errors, nominal = noise(a.block), residuals_of(a.block, a.unknowns)[0]
+    step = 1e-3
+    rng = np.random.default_rng(8)
+    draws = []
+    for z in rng.choice([-1.0, 1.0], (24, len(errors.sigma))):
+        moved = errors.applied(step * z * errors.sigma, a.block)
+        moved = jax.tree.map(lambda v: np.asarray(v) if eqx.is_array(v) else v, moved)
+        found = residuals_of(moved, a.unknowns)[0]
+        draws.append({k: np.ravel((v - nominal[k]) / step) for k, v in found.named.items()})
+    return {k: np.stack([d[k] for d in draws]) for k in draws[0]}
+
+
+@each_group
+def test_noise_moves_every_number_by_its_own_standard_deviation(group):
+    """Errors of +1 and -1 standard deviations: what is not correlated moves by as much, what is by unit variance."""
+    moved = whitened_by_noise()[group]
+    assert (np.abs(moved).max(0) > 0.1).all(), "a number has no noise"
+    if group.startswith(("correlated", "priors_together")):
+        np.testing.assert_allclose((moved**2).sum(1), moved.shape[1], rtol=1e-6)
+    else:
+        np.testing.assert_allclose(np.abs(moved), 1.0, atol=_BENT.get(group, 1e-3))
+
+
+# By how much what is observed differs from what the residual is of: ideal coordinates, small rotations of an aircraft
+# that is tilted (errors of two angles meet in one axis), small rotations from what is off by 2 mrad.
+_BENT = {"image_points": 0.1, "attitudes": 0.15, "prior_rotations": 0.01}
+
+
+def test_noise_knows_each_number_once():
+    assert len(noise(adjusted().block).sigma) == sum(np.size(v) for v in adjusted().residuals.named.values())
+
+
+N_DRAWS = 300
+
+
+@functools.cache
+def draws():
+    return monte_carlo(adjusted(), noise(adjusted().block), N_DRAWS, seed=2)
+
+
+def test_scatter_of_re_adjustments_is_the_covariance():
+    """Of cameras, scanner, mounts and a user's own alike: within four times the sampling error, alone and together."""
+    found, cov = draws(), covariance_of()
+    assert found.converged.all()
+    at = np.array([found.labels.index(label) for label in adjusted().structure.labels])
+    n = len(at)
+    expected = np.asarray(cov.matrix)[-n:, -n:]
+    off = found.shared[:, at] - np.asarray(adjusted().values.shared)[adjusted().structure.free]
+    ratio = off.std(0) / np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(ratio, 1.0, atol=4 / np.sqrt(2 * N_DRAWS))
+    unit = np.linalg.solve(np.linalg.cholesky(expected), off.T)
+    assert abs((unit**2).sum() / (n * N_DRAWS) - 1) < 4 * np.sqrt(2 / (n * N_DRAWS))
+
+
+@functools.cache
+def from_optimum():
+    """The adjustment from its own optimum."""
+    return adjust(adjusted().block, adjusted().unknowns)
+
+
+@functools.cache
+def derivatives():
+    return sensitivity(from_optimum())
+
+
+# The second number of a group, which is enough of it to move.
+_PLACES = {
+    "stations": ("stations", "value"), "attitudes": ("attitudes", "roll_pitch_yaw"),
+    "control_points": ("control", "value"), "surfaces": ("surfaces", "rise"), "distances": ("distances", "value"),
+    "height_differences": 0, "baselines": 1,
+    "correlated_stations": 2, "correlated_stations#2": 3, "image_points": ("image_points", "xy"),
+}  # fmt: skip
+
+
+def with_one_changed(group: str, h: float):
+    """The adjusted block with the second number of a group changed by h."""
+    block = from_optimum().block
+    place = _PLACES[group]
+    where = (lambda b: b.more[place]) if isinstance(place, int) else (lambda b: getattr(b, place[0]))
+    rows = where(block)
+    value = np.array(rows.observation, float)
+    value.reshape(-1)[1] += h
+    return eqx.tree_at(where, block, jax.tree.map(np.asarray, rows.with_observation(value)))
+
+
+@pytest.mark.parametrize("group", _PLACES)
+def test_exact_sensitivity_is_the_difference_of_re_adjustments(group):
+    a = from_optimum()
+    rows = observation_groups(a)[group]
+    step = float(np.ravel(np.asarray(rows.sigmas))[1])
+
+    def estimates(h):
+        unknowns = a.unknowns
+        # Once more, so that nothing of the iteration is left.
+        for _ in range(2):
+            found = adjust(with_one_changed(group, h), unknowns)
+            unknowns = found.unknowns
+        return np.asarray(found.values.shared)[a.structure.free]
+
+    expected = (estimates(step) - estimates(-step)) / (2 * step)
+    d = derivatives()
+    shared = [d.of(label) for label in a.structure.labels]
+    found = d.groups[group][shared, 1]
+    sigma = np.asarray(covariance(a).shared_sigma)
+    size = np.abs(expected / sigma).max()
+    assert size * step > 1e-7, "nothing depends on it"
+    np.testing.assert_allclose(found / sigma / size, expected / sigma / size, atol=2e-4)
+
+
+def test_a_design_has_the_redundancy_of_the_adjustment():
+    block, truth = simulated()
+    known = dataclasses.replace(
+        block.start, image_known=np.ones(len(block.images), bool), point_known=np.ones(len(block.points), bool)
+    )
+    block = dataclasses.replace(block, start=known)
+    design = prepare_design(block, truth, sizes_of(structure_of(block, block.priors)), len(block.points))
+    assert design.redundancy == adjusted().redundancy
+    assert design.labels == adjusted().structure.labels
+
+
+@functools.cache
+def table():
+    return Tables(adjusted()).residuals
+
+
+@each_group
+def test_the_table_of_residuals_names_each_number(group):
+    own = table()[table()["group"] == group]
+    assert len(own) == np.size(adjusted().residuals[group])
+    names = own[["image", "point", "axis"]]
+    # Two numbers that are called the same could not be told apart. Points may lie on surfaces of two strips.
+    assert not names.duplicated().any() or group == "surfaces"
+    assert (names != "").any(axis=1).all()
+    rows = observation_groups(adjusted())[group]
+    assert set(own["unit"]) == {"deg" if rows.unit == "rad" else rows.unit}
+    sentences = np.ravel(rows.words(adjusted().block.images, adjusted().block.points))
+    assert all(sentences)
+    assert np.isfinite(own[["residual", "sigma", "redundancy_number", "w"]].to_numpy(float)).all()
+
+
+def test_results_and_report_are_written(tmp_path):
+    write_results(Tables(adjusted()), [], tmp_path / "out", {})
+    page = (tmp_path / "out/report.html").read_text(encoding="utf-8")
+    for name in ("height differences", "baselines"):
+        assert name in page.replace("_", " "), name
+    summary = page + (tmp_path / "out/summary.json").read_text(encoding="utf-8")
+    for label in TRUE:
+        assert label in summary, label
+
+
+# Unknowns of a user's own ------------------------------------------------------------------------------------
+
+
+TRUE = {
+    label: value
+    for owners in OWN.values()
+    for name, own in owners.items()
+    for label, value in zip(own.labels(name), numbers_of(own), strict=True)
+}
+
+
+def numbers_of_own(more) -> np.ndarray:
+    return np.array([v for kind, owners in OWN.items() for name in owners for v in numbers_of(more[kind][name])])
+
+
+@pytest.mark.parametrize("label", TRUE)
+def test_truth_of_an_own_unknown_is_recovered(label):
+    found = Tables(adjusted()).georeferencing.set_index("parameter").loc[label]
+    assert abs(TRUE[label]) > 3 * found.sigma, "nothing is known of it"
+    assert abs(found.value - TRUE[label]) < 3 * found.sigma
+
+
+def with_own(prior_of):
+    block = simulated().block
+    return dataclasses.replace(block, priors=dataclasses.replace(block.priors, more=own_priors(prior_of)))
+
+
+@functools.cache
+def by_prior(kind: str):
+    """Own unknowns held at half their truth, or known beforehand as that, hardly or well."""
+    half = jax.tree.map(lambda v: 0.5 * v, OWN)
+    start = dataclasses.replace(simulated().block.start.unknowns, more=half)
+    of = {
+        "fixed": lambda v: FIXED,
+        "hardly": lambda v: Weighted(0.5 * v, 1e4 * np.ones(np.shape(v))),
+        "well": lambda v: Weighted(0.5 * v, 1e-9 * np.ones(np.shape(v))),
+    }
+    return adjust(with_own(of[kind]), start)
+
+
+def off(a, b) -> float:
+    """The largest difference of two adjustments' own unknowns and camera, in standard deviations of the free ones."""
+    free = adjusted()
+    sigma = np.asarray(covariance_of().shared_sigma)
+    v = [np.asarray(x.values.shared)[free.structure.free] for x in (a, b)]
+    return float(np.max(np.abs(v[0] - v[1]) / sigma))
+
+
+def test_a_weak_prior_of_an_own_unknown_is_none():
+    assert off(by_prior("hardly"), adjusted()) < 1e-3
+
+
+def test_an_own_unknown_held_fixed_stays_as_it_starts_and_a_strong_prior_does_the_same():
+    held = by_prior("fixed")
+    np.testing.assert_array_equal(numbers_of_own(held.unknowns.more), 0.5 * numbers_of_own(OWN))
+    assert off(by_prior("well"), held) < 1e-4
+    assert off(held, adjusted()) > 1, "what is held has an effect"
+    numbers = held.n_unknowns
+    assert {numbers[kind] for kind in OWN} == {0}
+
+
+def test_a_covariance_of_a_vector_is_what_known_parameters_say_and_both_pull():
+    """Known beforehand with a correlation near one, the shift moves along it."""
+    known = np.array([0.5, -0.1])
+    matrix = np.array([[1.0, 0.999], [0.999, 1.0]]) * 0.02**2
+    free = simulated().block
+    shifts = {"": dataclasses.replace(free.priors.more["shifts"][""], shift=Weighted(known, covariance=matrix))}
+    priors = dataclasses.replace(free.priors, more={**free.priors.more, "shifts": shifts})
+    one = adjust(dataclasses.replace(free, priors=priors), free.start.unknowns)
+    two = adjust(free, free.start.unknowns, more=(KnownParameters(("shifts.X_m", "shifts.Y_m"), known, matrix),))
+    assert off(one, two) < 1e-6
+    assert off(one, adjusted()) > 1
+    moved = np.asarray(one.unknowns.more["shifts"][""].shift) - known
+    assert abs(moved[0] - moved[1]) < 0.1 * np.abs(moved).max() + 4e-3
+
+
+# Priors that are none ----------------------------------------------------------------------------------------
+
+PLACES = {
+    "exterior.position": lambda p: p.exterior.position,
+    "exterior.camera_from_object": lambda p: p.exterior.camera_from_object,
+    "points": lambda p: p.points,
+    "interior[one].k3": lambda p: p.interior["one"].distortion.k3,
+    "c_rates[one].rate_mm_per_s": lambda p: p.more["c_rates"]["one"].rate,
+    "clocks[early].offset_s": lambda p: p.more["clocks"]["early"].offset,
+    "shifts.X_m": lambda p: p.more["shifts"][""].shift,
+    "mounts[imu].boresight_x_rad": lambda p: p.mounts["imu"].boresight,
+}
+
+
+@pytest.mark.parametrize("garbage", [0.0, "free", None, np.zeros(3), np.zeros((3, 3))], ids=str)
+@pytest.mark.parametrize("label", PLACES)
+def test_what_is_no_prior_is_refused_by_name(label, garbage):
+    block = simulated().block
+    priors = eqx.tree_at(PLACES[label], block.priors, garbage, is_leaf=lambda v: isinstance(v, Weighted))
+    with pytest.raises(JaxphotoError) as refused:
+        adjust(block, block.start.unknowns, priors)
+    assert str(refused.value).startswith(f"{label}: "), str(refused.value)
+    assert "FREE, FIXED" in str(refused.value) and "\n" not in str(refused.value)
+
+
+def test_a_table_of_priors_that_is_none_is_refused_by_name():
+    block = simulated().block
+    for garbage in (0.0, FREE, None):
+        more = {**block.priors.more, "clocks": {"early": garbage, "late": block.priors.more["clocks"]["late"]}}
+        with pytest.raises(JaxphotoError, match=r"^[^\n]*clocks\[early\][^\n]*$"):
+            adjust(block, block.start.unknowns, dataclasses.replace(block.priors, more=more))
