@@ -24,16 +24,13 @@ from machine import machine, markdown, sentence, write_results
 from ours import block_of
 
 import jaxphoto
-from jaxphoto.adjustment import solve
-from jaxphoto.adjustment.band import factor_band
-from jaxphoto.adjustment.normal import At
-from jaxphoto.adjustment.optimum import zero_increments
-from jaxphoto.adjustment.other_rows import other_rows
-from jaxphoto.adjustment.reduced import reduce_normal, tile_numbers, tile_parts
-from jaxphoto.adjustment.residuals import Increments, Values
-from jaxphoto.adjustment.result import Padded
-from jaxphoto.adjustment.shards import EVERYWHERE, along_points, sharded
-from jaxphoto.adjustment.structure import Structure
+from jaxphoto.adjustment import At, NormalEquations, TiledStructure, TiledValues, solve
+from jaxphoto.adjustment.layout.sharding import EVERYWHERE, along_points, sharded
+from jaxphoto.adjustment.model.residuals import Increments
+from jaxphoto.adjustment.solver.band import factor_band
+from jaxphoto.adjustment.solver.non_image_rows import non_image_rows
+from jaxphoto.adjustment.solver.optimum import zero_increments
+from jaxphoto.adjustment.solver.reduced import reduce_normal, tile_numbers, tile_parts
 from jaxphoto.block import Block
 from jaxphoto.compiling import run_compiled
 
@@ -103,7 +100,7 @@ def measure(block: Block) -> dict:
 
     once()
     adjusted = [once() for _ in range(_ROUNDS)]
-    last = adjusted[-1].computed
+    last = adjusted[-1].equations
     at, work = _at(last), _work(last)
     # Compiled as `solve` is.
     steps = _seconds(lambda: run_compiled(_step, (at.values, at.scale, at.structure), {}, ""))
@@ -120,14 +117,14 @@ def measure(block: Block) -> dict:
     }
 
 
-def _at(padded: Padded) -> At:
+def _at(equations: NormalEquations) -> At:
     """Where the block was linearised last; arrays by way of the host, so that no device holds them for itself."""
-    free = jax.tree.map(lambda v: jnp.asarray(np.asarray(v)) if eqx.is_array(v) else v, padded)
+    free = jax.tree.map(lambda v: jnp.asarray(np.asarray(v)) if eqx.is_array(v) else v, equations)
     return At(zero_increments(free.structure), free.factored.scale, free.values, free.structure)
 
 
 @eqx.filter_jit
-def _step(values: Values, scale: Increments, structure: Structure):
+def _step(values: TiledValues, scale: Increments, structure: TiledStructure):
     """Sums of the reduced normal equations and their factor."""
 
     def of_device(values, scale, structure):
@@ -137,7 +134,7 @@ def _step(values: Values, scale: Increments, structure: Structure):
     return sharded(of_device, structure, (EVERYWHERE, along_points(2)))(values, scale, structure)
 
 
-def _work(padded: Padded) -> dict[str, float]:
+def _work(equations: NormalEquations) -> dict[str, float]:
     """Operations of one such step, and the bytes that it has to move at least.
 
     Operations of residuals and derivatives are those that XLA counts (`cost_analysis`) for one tile, times tiles;
@@ -145,16 +142,16 @@ def _work(padded: Padded) -> dict[str, float]:
     count like others. Bytes are those of what is read and written once: measurements, structure, results, and the
     reduced matrix before it is factored; what stays in caches is not counted.
     """
-    at, s = _at(padded), padded.structure
-    rest = other_rows(at)
+    at, s = _at(equations), equations.structure
+    rest = non_image_rows(at)
     parts = tile_parts(at, 0.0, rest.coupled)
     numbers = jax.tree.map(lambda v: v[0, 0], tile_numbers(at, rest))
     cost = jax.jit(parts).lower(numbers).compile().cost_analysis() or {}
-    tiles = int(np.sum(s.in_tiles.groups)) * s.in_tiles.at_once
-    m, p = s.in_tiles.image.shape[2], s.in_tiles.per_tile
+    tiles = int(np.sum(s.tiles.groups)) * s.tiles.at_once
+    m, p = s.tiles.image.shape[2], s.tiles.per_tile
     f = 6 * m + s.n_interior + len(rest.coupled) + 1
     products = 2 * 3 * p * f**2 + 2 * 2 * p * m * (7 + s.n_image_colours) ** 2
-    band = padded.factored.factor
+    band = equations.factored.factor
     inner, _, width = band.columns.shape
     k, q = inner + 1, len(band.end) - width
     n = k * width
@@ -201,7 +198,7 @@ def monte_carlo(block: Block, strip: np.ndarray, draws: int) -> dict:
         "loop_per_s": len(few) / (time.perf_counter() - began),
         "steps": int(np.max(steps)),
         "seconds": seconds,
-        **_work(optimum.computed),
+        **_work(optimum.equations),
     }
 
 

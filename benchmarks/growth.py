@@ -86,8 +86,8 @@ def _work(file: Path) -> dict:
     from ours import read_block
 
     from jaxphoto.adjustment import solve
-    from jaxphoto.adjustment.band import dense, factor_band
     from jaxphoto.adjustment.rank import reduced_matrix
+    from jaxphoto.adjustment.solver.band import dense, factor_band
     from jaxphoto.compiling import run
 
     block = read_block(file)
@@ -100,14 +100,14 @@ def _work(file: Path) -> dict:
     fresh = forget_peak()
     adjusted = [once() for _ in range(_ROUNDS)]
     peak = memory("VmHWM")
-    last = adjusted[-1].computed
-    (solver,) = (p for k, p in run._programs.items() if k[0].__name__ == "_optimise")  # type: ignore[index]
+    last = adjusted[-1].equations
+    (solver,) = (p for k, p in run._programs.items() if k[0].__name__ == "optimise")  # type: ignore[index]
     planned = solver.compiled.memory_analysis()
     program = sum(getattr(planned, f"{name}_size_in_bytes") for name in ("argument", "output", "temp"))
     # Planned is what one device needs.
-    program *= last.structure.in_tiles.shards
+    program *= last.structure.tiles.shards
     # By way of the host: of a block that several devices share, each would repeat what is timed here.
-    reduced = reduced_matrix(last.values, last.factored.scale, last.structure)
+    reduced = reduced_matrix(last)
     reduced = jax.tree.map(lambda v: jnp.asarray(np.asarray(v)), reduced)
     inner, _, m = reduced.columns.shape
     k, q = inner + 1, len(reduced.end) - m
@@ -132,7 +132,7 @@ def _work(file: Path) -> dict:
         "steps": int(adjusted[-1].steps),
         "step_s": statistics.median(a.seconds["solve"] / int(a.steps) for a in adjusted),
         "solve_s": statistics.median(a.seconds["solve"] for a in adjusted),
-        "slots": int(np.prod(last.structure.in_tiles.image.shape)) * last.structure.in_tiles.per_tile,
+        "slots": int(np.prod(last.structure.tiles.image.shape)) * last.structure.tiles.per_tile,
         "program_mb": program / 1e6,
         "peak_mb": peak if fresh else None,
         "resident_mb": before,

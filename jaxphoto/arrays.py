@@ -25,6 +25,11 @@ def still(values) -> Any:
     return np.asarray(values)
 
 
+def gathered(tree: Any) -> Any:
+    """What a program gave on several devices, as the next one expects it; what several processes hold stays there."""
+    return tree if jax.process_count() > 1 else jax.tree.map(still, tree)
+
+
 def on_device(values) -> jax.Array:
     """JAX's array of real numbers that are known; `jnp.asarray` compiles a copy for each shape."""
     return jax.device_put(np.asarray(values, float))

@@ -13,9 +13,9 @@ from jaxtyping import Array, Float, Int
 
 from jaxphoto import AbstractObservations, AbstractParameters, KnownParameters, Outcome, adjust, correlated, touching
 from jaxphoto.adjustment.adjust import _residuals
-from jaxphoto.adjustment.padding import crop_residuals, pad_structure, pad_values
-from jaxphoto.adjustment.structure import structure_of
-from jaxphoto.adjustment.values import values_of
+from jaxphoto.adjustment.layout.padding import pad_structure
+from jaxphoto.adjustment.model.structure import structure_of
+from jaxphoto.adjustment.model.values import values_of
 from jaxphoto.arrays import Numbers
 from jaxphoto.block import Block, Motion
 from jaxphoto.compiling import run_compiled
@@ -114,9 +114,9 @@ def own_priors(prior_of) -> dict:
 def residuals_of(block: Block, unknowns: Unknowns):
     """Residuals over their standard deviations at `unknowns`, and the structure."""
     s = structure_of(block, block.priors)
-    wide, places = pad_structure(s, dense=bool(s.coupled))
-    values = pad_values(values_of(block, unknowns, block.priors, s), s, wide, places)
-    return crop_residuals(run_compiled(_residuals, (values, wide), {}, "residuals"), s, places), s
+    tiled = pad_structure(s, dense=bool(s.coupled))
+    values = tiled.pad(values_of(block, unknowns, block.priors, s))
+    return tiled.crop_residuals(run_compiled(_residuals, (values, tiled.structure), {}, "residuals")), s
 
 
 def changed(block: Block, change) -> Block:

@@ -15,17 +15,17 @@ from jax.flatten_util import ravel_pytree
 
 import jaxphoto.observations
 from jaxphoto import FIXED, FREE, AbstractObservations, JaxphotoError, Tables, Weighted, adjust, covariance, monte_carlo
-from jaxphoto.adjustment.layout import sizes_of
-from jaxphoto.adjustment.normal import At, residuals_at
-from jaxphoto.adjustment.optimum import typical_scale, weigh_datum, zero_increments
-from jaxphoto.adjustment.structure import structure_of
+from jaxphoto.adjustment import At
+from jaxphoto.adjustment.layout.tile_layout import sizes_of
+from jaxphoto.adjustment.model.structure import structure_of
+from jaxphoto.adjustment.solver.optimum import typical_scale, weigh_datum, zero_increments
 from jaxphoto.observations import Correlated, KnownParameters
 from jaxphoto.parameters import numbers_of
 from jaxphoto.report.results import write_results
 from jaxphoto.sensitivity import noise, sensitivity
 from jaxphoto.sensitivity.designs import prepare_design
 from jaxphoto.statistics import observation_groups, redundancy_numbers
-from tests.adjustment.dense import dense_of, own_order
+from tests.adjustment.dense import dense_of, in_one_list, own_order
 from tests.declared import OWN, adjusted, own_priors, residuals_of, simulated
 
 # Every class that a file or a notebook gives rows of, by the groups of the block that show it.
@@ -78,8 +78,8 @@ def rows_of_groups() -> dict[str, slice]:
 def differences() -> tuple[np.ndarray, np.ndarray]:
     """What all residuals answer to eight random directions: by the Jacobian, and by central differences."""
     a = adjusted()
-    padded = a.computed
-    s = padded.structure
+    equations = a.equations
+    s = equations.structure
 
     def answered(values, direction):
         values = weigh_datum(values, s)
@@ -87,15 +87,15 @@ def differences() -> tuple[np.ndarray, np.ndarray]:
         _, back = ravel_pytree(zero_increments(s))
 
         def at(h):
-            return ravel_pytree(residuals_at(At(back(h * direction), scale, values, s)))[0]
+            return in_one_list(At(back(h * direction), scale, values, s).residuals())
 
         return (at(-2 * _STEP) - 8 * at(-_STEP) + 8 * at(_STEP) - at(2 * _STEP)) / (12 * _STEP)
 
-    unknowns, rows = own_order(padded.values, a.structure, s, padded.places)
+    unknowns, rows = own_order(equations.values, a.tiled)
     rng, n = np.random.default_rng(3), np.size(ravel_pytree(zero_increments(s))[0])
     directions = np.zeros((8, n))
     directions[:, unknowns] = rng.normal(size=(8, len(unknowns)))
-    found = np.array(jax.jit(lambda v, d: jax.lax.map(lambda one: answered(v, one), d))(padded.values, directions))
+    found = np.array(jax.jit(lambda v, d: jax.lax.map(lambda one: answered(v, one), d))(equations.values, directions))
     return dense().jacobian @ directions[:, unknowns].T, found[:, rows].T
 
 

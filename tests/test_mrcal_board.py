@@ -9,10 +9,8 @@ import pandas as pd
 import pytest
 
 from jaxphoto import Outcome, adjust, covariance
-from jaxphoto.adjustment.band import dense
-from jaxphoto.adjustment.optimum import typical_scale
-from jaxphoto.adjustment.padding import crop_reduced
-from jaxphoto.adjustment.rank import reduced_matrix
+from jaxphoto.adjustment import NormalEquations
+from jaxphoto.adjustment.normal_equations import factor_normal
 from jaxphoto.camera import Brown, InteriorOrientation, OpenCv, Sensor, get_parameter, set_parameter
 from jaxphoto.procedures.calibration import CAMERA, Board, Detection, TargetRows, calibration_block
 from jaxphoto.procedures.calibration.resections import resected
@@ -111,13 +109,14 @@ def test_cofactors_of_the_camera_are_mrcals(calibrated, reference):
     start = calibrated.unknowns
     for name, value in zip(FREE, theirs, strict=True):
         start = eqx.tree_at(lambda u: u.interior[CAMERA], start, set_parameter(start.interior[CAMERA], name, value))
-    values, s, places = prepared(eqx.tree_at(lambda b: b.start.unknowns, calibrated.block, start))
-    scale = eqx.filter_jit(typical_scale)(values, s)
-    matrix = crop_reduced(dense(reduced_matrix(values, scale, s)), calibrated.structure, places)
+    values, s, _ = prepared(eqx.tree_at(lambda b: b.start.unknowns, calibrated.block, start))
+    equations = NormalEquations(values, s, eqx.filter_jit(factor_normal)(values, s))
     labels = [label.removeprefix(f"interior[{CAMERA}].") for label in calibrated.structure.labels]
     which = [labels.index(name) for name in FREE]
-    unit = np.asarray(scale.shared)[which]
-    own = np.linalg.inv(matrix)[-len(labels) :, -len(labels) :][np.ix_(which, which)] * np.outer(unit, unit)
+    unit = np.asarray(equations.scale.shared)[which]
+    own = np.asarray(equations.inverse_of_images())[-len(labels) :, -len(labels) :][np.ix_(which, which)] * np.outer(
+        unit, unit
+    )
     to_pixels = slope(calibrated, theirs)
     assert off(to_pixels @ own @ to_pixels.T, expected) < 1e-6
 
@@ -127,8 +126,7 @@ def test_cofactors_of_the_camera_are_mrcals(calibrated, reference):
 
 
 def test_a_board_is_laid_out_as_an_arrow_of_tiles_of_few_images(calibrated):
-    s = calibrated.padded.structure
-    tiles = s.in_tiles
+    tiles = calibrated.tiled.structure.tiles
     # Nothing is eliminated, no two images meet, and most slots hold a corner.
     assert not tiles.free_points
     assert tiles.pair_tile.size == 0
@@ -136,4 +134,4 @@ def test_a_board_is_laid_out_as_an_arrow_of_tiles_of_few_images(calibrated):
     assert (
         len(calibrated.structure.image) > 0.8 * tiles.image[:, : tiles.groups[0] * tiles.at_once].size * tiles.per_tile
     )
-    assert jax.tree.leaves(calibrated.padded.factored.reduced.f)[0].size == 0
+    assert jax.tree.leaves(calibrated.factored.reduced.f)[0].size == 0

@@ -1,7 +1,17 @@
-"""Least-squares adjustment of a block: residuals, coloured Jacobians, normal equations, datum, solution, result."""
+"""Least-squares adjustment of a block.
 
-from jaxphoto.adjustment.adjust import MAX_STEPS, common_sizes, solve
-from jaxphoto.adjustment.layout import LEAST, Sizes
+What is adjusted lies in `model`; how it lies in memory, in `layout`; how it is solved, in `solver`. Whoever needs more
+of the last two than a result asks `NormalEquations`.
+"""
+
+from jaxphoto.adjustment.adjust import MAX_STEPS, LaidOut, common_sizes, lay_out, solve
+from jaxphoto.adjustment.layout.padding import TiledBlock
+from jaxphoto.adjustment.layout.tile_layout import LEAST, Sizes
+from jaxphoto.adjustment.layout.tiled import TiledStructure, TiledValues
+from jaxphoto.adjustment.normal_equations import At, Cofactors, NormalEquations, RowCofactors, optimise
 from jaxphoto.adjustment.result import Adjustment, Outcome
 
-__all__ = ["LEAST", "MAX_STEPS", "Adjustment", "Outcome", "Sizes", "common_sizes", "solve"]
+__all__ = [
+    "LEAST", "MAX_STEPS", "Adjustment", "At", "Cofactors", "LaidOut", "NormalEquations", "Outcome", "RowCofactors",
+    "Sizes", "TiledBlock", "TiledStructure", "TiledValues", "common_sizes", "lay_out", "optimise", "solve",
+]  # fmt: skip

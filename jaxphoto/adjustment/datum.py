@@ -14,12 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxphoto.adjustment.groups import Group
-from jaxphoto.adjustment.residuals import Increments, State, Values
-from jaxphoto.adjustment.rows import group_residuals, rows_of
-from jaxphoto.adjustment.similarity import motions, similarity
-from jaxphoto.adjustment.structure import Structure
-from jaxphoto.adjustment.values import at_state
+from jaxphoto.adjustment.model.observed_groups import ObservedGroup
+from jaxphoto.adjustment.model.residuals import Increments, UnknownArrays, Values
+from jaxphoto.adjustment.model.row_functions import group_residuals, rows_of
+from jaxphoto.adjustment.model.structure import Structure
+from jaxphoto.adjustment.model.values import at_state
+from jaxphoto.adjustment.solver.similarity import motions, similarity
 from jaxphoto.block import Block
 from jaxphoto.compiling import QUICK_TO_COMPILE
 from jaxphoto.errors import DatumError
@@ -38,21 +38,22 @@ MOTIONS = (
 _OPEN = 1e-9
 
 
-class Motions(NamedTuple):
+class DatumRows(NamedTuple):
     """How each increment moves under the seven motions (about the centroid, shifts in units of the block's size)."""
 
     eop: Float[np.ndarray, "7 6 images"]
     points: Float[np.ndarray, "7 3 points"]
 
 
-def close_datum(block: Block, values: Values, structure: Structure) -> Motions:
+def close_datum(block: Block, values: Values, structure: Structure) -> DatumRows:
     """The constraints that close what the observations leave open (leading axis: the defect).
 
     Raises DatumError where the block's datum is open and its kind "control", or where the constraints asked for cannot
     close it.
     """
+    values = _concrete(values, block)
     if _plainly_closed(block, values, structure):
-        return Motions(np.zeros((0, 6, structure.n_images)), np.zeros((0, 3, structure.n_points)))
+        return DatumRows(np.zeros((0, 6, structure.n_images)), np.zeros((0, 3, structure.n_points)))
     motions, centre, size = _motions(values)
     sensitivity, named = _datum_sensitivity(block, values, structure, motions, centre, size)
     open_motions = _null_motions(sensitivity)
@@ -82,6 +83,22 @@ def close_datum(block: Block, values: Values, structure: Structure) -> Motions:
     return _orthonormal(constraints)
 
 
+def _concrete(values: Values, block: Block) -> Values:
+    """The same values with numbers for what is being traced: the datum depends on where things are, roughly."""
+    known = block.start.unknowns
+    place = {"position": known.exterior.position, "points": known.points}
+    still = {k: np.asarray(v, float).T for k, v in place.items() if not isinstance(v, jax.core.Tracer)}
+
+    def number(path, v):
+        if not isinstance(v, jax.core.Tracer):
+            return np.asarray(v)
+        # Standard deviations that are being traced weigh as one.
+        filler = np.ones if getattr(path[-1], "name", "") in ("sigma", "sigma_xy", "whitener") else np.zeros
+        return still.get(path[0].name, filler(v.shape))
+
+    return jax.tree_util.tree_map_with_path(number, values)
+
+
 def _plainly_closed(block: Block, values: Values, structure: Structure) -> bool:
     """Three full control points (or stations without free mounts and strips) that do not lie on a line will do."""
     seen = np.zeros((3, structure.n_points))
@@ -103,15 +120,15 @@ def _plainly_closed(block: Block, values: Values, structure: Structure) -> bool:
 _motions_of = jax.jit(motions, compiler_options=QUICK_TO_COMPILE)
 
 
-def _motions(values: Values) -> tuple[Motions, np.ndarray, float]:
+def _motions(values: Values) -> tuple[DatumRows, np.ndarray, float]:
     points = np.asarray(values.points)
     centre = points.mean(axis=1)
     size = float(np.sqrt(((points - centre[:, None]) ** 2).sum(0).mean())) or 1.0
     eop, pts = _motions_of(values.position, values.rotation, values.points, centre, size)
-    return Motions(np.asarray(eop), np.asarray(pts)), centre, size
+    return DatumRows(np.asarray(eop), np.asarray(pts)), centre, size
 
 
-def _datum_sensitivity(block: Block, values: Values, structure: Structure, motions: Motions, centre, size):
+def _datum_sensitivity(block: Block, values: Values, structure: Structure, motions: DatumRows, centre, size):
     """d(datum rows / sigma) / d(seven motions, declared unknowns), and names of those of these that are free."""
     s = structure
     own = [j for j, k in enumerate(s.free) if k >= s.n_cameras]
@@ -149,11 +166,11 @@ def _row_sensitivity(values: Values, structure: Structure, shared, centre, size)
         position, rotation = jax.vmap(image, in_axes=(1, 2), out_axes=(1, 2))(v.position, v.rotation)
         points = jax.vmap(lambda x: similarity(parameters, x, jnp.eye(3), centre, size)[0], 1, 1)(v.points)
         vector = jnp.asarray(v.shared).at[structure.free[shared]].add(moved)
-        there = at_state(v, State(position, rotation, vector, points))
+        there = at_state(v, UnknownArrays(position, rotation, vector, points))
         zero = Increments(
             jnp.zeros((6, structure.n_images)), jnp.zeros(structure.n_shared), jnp.zeros((3, structure.n_points))
         )
-        groups: list[tuple[Group, Any]] = list(zip(structure.observed, v.groups, strict=True))
+        groups: list[tuple[ObservedGroup, Any]] = list(zip(structure.observed, v.groups, strict=True))
         return jnp.concatenate([group_residuals(g, n, zero, zero, there, structure).ravel() for g, n in groups])
 
     by_motion, by_shared = jax.jacfwd(rows, argnums=(0, 1))(jnp.zeros(7), jnp.zeros(len(shared)))
@@ -175,31 +192,31 @@ def _null_motions(sensitivity: np.ndarray) -> np.ndarray:
     return basis[s2 > 1e-9]
 
 
-def _combine(motions: Motions, combinations: np.ndarray) -> Motions:
-    return Motions(
+def _combine(motions: DatumRows, combinations: np.ndarray) -> DatumRows:
+    return DatumRows(
         np.einsum("km,mci->kci", combinations, motions.eop), np.einsum("km,mcp->kcp", combinations, motions.points)
     )
 
 
-def _inner(null: Motions, block: Block, over) -> Motions:
+def _inner(null: DatumRows, block: Block, over) -> DatumRows:
     """Inner constraints: the open motions themselves, restricted to the positions or points they are taken over."""
     if over == "images":
         eop = null.eop.copy()
         eop[:, 3:] = 0.0
-        return Motions(eop, np.zeros_like(null.points))
+        return DatumRows(eop, np.zeros_like(null.points))
     chosen = np.ones(len(block.points)) if over == "points" else np.isin(block.points, over).astype(float)
-    return Motions(np.zeros_like(null.eop), null.points * chosen)
+    return DatumRows(np.zeros_like(null.eop), null.points * chosen)
 
 
-def _orthonormal(rows: Motions) -> Motions:
+def _orthonormal(rows: DatumRows) -> DatumRows:
     k = len(rows.eop)
     flat = np.concatenate([rows.eop.reshape(k, -1), rows.points.reshape(k, -1)], axis=1)
     q = np.linalg.qr(flat.T)[0].T
     split = rows.eop[0].size if k else 0
-    return Motions(q[:, :split].reshape(rows.eop.shape), q[:, split:].reshape(rows.points.shape))
+    return DatumRows(q[:, :split].reshape(rows.eop.shape), q[:, split:].reshape(rows.points.shape))
 
 
-def _minimal(null: Motions, structure: Structure) -> Motions:
+def _minimal(null: DatumRows, structure: Structure) -> DatumRows:
     """As few point coordinates as the defect asks for, chosen by pivoting so that they fix it best."""
     k = len(null.points)
     flat = null.points.transpose(0, 2, 1).reshape(k, -1) * structure.point_free.T.reshape(-1)
@@ -211,7 +228,7 @@ def _minimal(null: Motions, structure: Structure) -> Motions:
         direction = left[:, best] / max(np.sqrt((left[:, best] ** 2).sum()), 1e-300)
         left -= np.outer(direction, direction @ left)
     points = rows.reshape(k, structure.n_points, 3).transpose(0, 2, 1)
-    return Motions(np.zeros_like(null.eop), points)
+    return DatumRows(np.zeros_like(null.eop), points)
 
 
 def _sentence(open_motions: np.ndarray, block: Block, named: list[str]) -> str:

@@ -3,19 +3,14 @@
 from collections.abc import Iterable
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from jaxphoto.adjustment.band import Band, dense, pivots
-from jaxphoto.adjustment.normal import At
-from jaxphoto.adjustment.optimum import weigh_datum
-from jaxphoto.adjustment.padding import crop_reduced
-from jaxphoto.adjustment.reduced import reduce_normal
-from jaxphoto.adjustment.residuals import Increments, Values
+from jaxphoto.adjustment.layout.sharding import EVERYWHERE, sharded
+from jaxphoto.adjustment.normal_equations import NormalEquations
 from jaxphoto.adjustment.result import Adjustment
-from jaxphoto.adjustment.shards import EVERYWHERE, sharded
-from jaxphoto.adjustment.structure import Structure
+from jaxphoto.adjustment.solver.band import Band, dense, pivots
+from jaxphoto.adjustment.solver.normal import At
+from jaxphoto.adjustment.solver.reduced import reduce_normal
 from jaxphoto.block import Block
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import DatumError, RankError
@@ -136,15 +131,15 @@ def _images_of(name: str, names: Iterable[str]) -> set[int]:
 
 def check_rank(adjusted: Adjustment) -> None:
     """Raise RankError where the normal matrix at the optimum is singular; the message names the unknowns."""
-    if adjusted.padded is None or not bool(adjusted.converged):
+    if adjusted.factored is None or not bool(adjusted.converged):
         return
-    s, computed = adjusted.structure, adjusted.padded
-    factored = computed.factored
+    s, equations = adjusted.structure, adjusted.equations
+    factored = equations.factored
     left = np.asarray(call_compiled(_pivots, factored.reduced.diagonal, factored.factor))
     if left.min() > DEFECT:
         return
-    band = call_compiled(reduced_matrix, computed.values, factored.scale, computed.structure)
-    a = crop_reduced(dense(band), s, computed.places)
+    band = call_compiled(reduced_matrix, equations)
+    a = adjusted.tiled.crop_reduced(dense(band))
     diagonal = np.diagonal(a)
     d = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
     weakest, vectors = np.linalg.eigh(a * d[:, None] * d[None, :])
@@ -163,10 +158,10 @@ _pivots = eqx.filter_jit(pivots)
 
 
 @eqx.filter_jit
-def reduced_matrix(values: Values, scale: Increments, s: Structure) -> Band:
+def reduced_matrix(equations: NormalEquations) -> Band:
     """The undamped reduced normal matrix itself; the solver keeps its factor, which a defect leaves unfinished."""
 
-    def of_device(values, scale, s):
-        return reduce_normal(At(jax.tree.map(jnp.zeros_like, scale), scale, values, s), 0.0)[0]
+    def of_device(at: At) -> Band:
+        return reduce_normal(at, 0.0)[0]
 
-    return sharded(of_device, s, EVERYWHERE)(weigh_datum(values, s), scale, s)
+    return sharded(of_device, equations.structure, EVERYWHERE)(equations.at)

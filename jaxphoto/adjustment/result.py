@@ -1,21 +1,18 @@
-"""What an adjustment gives: unknowns, residuals, sigma naught, redundancy, the factored normal matrix, an outcome."""
+"""What an adjustment gives: unknowns, residuals, sigma naught, redundancy, the normal equations, an outcome."""
 
 import enum
 
 import equinox as eqx
-import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxphoto.adjustment.band import BandFactor, factor_band
-from jaxphoto.adjustment.layout import Places
-from jaxphoto.adjustment.normal import At, Reduced
-from jaxphoto.adjustment.optimum import typical_scale, weigh_datum, zero_increments
-from jaxphoto.adjustment.reduced import reduce_normal
-from jaxphoto.adjustment.residuals import Increments, Residuals, Values
-from jaxphoto.adjustment.shards import on_one_device
-from jaxphoto.adjustment.structure import Structure
-from jaxphoto.arrays import Numbers, still
+from jaxphoto.adjustment.layout.padding import TiledBlock
+from jaxphoto.adjustment.layout.tiled import TiledValues
+from jaxphoto.adjustment.model.residuals import Residuals, Values
+from jaxphoto.adjustment.model.structure import Structure, observed_in
+from jaxphoto.adjustment.normal_equations import NormalEquations, factor_normal
+from jaxphoto.adjustment.solver.elimination import FactoredNormal
+from jaxphoto.arrays import Numbers
 from jaxphoto.block import Block
 from jaxphoto.compiling import call_compiled
 from jaxphoto.observations import PRIORS
@@ -37,57 +34,9 @@ class Outcome(enum.Enum):
     )
 
 
-class Factored(eqx.Module):
-    """The normal equations at the optimum in scaled increments, undamped, factored: all statistics come from here."""
-
-    reduced: Reduced
-    factor: BandFactor
-    scale: Increments
-    n_constraints: int = eqx.field(static=True)
-    """Constraints of the datum: the last of the rows of D."""
-
-
-class Padded(eqx.Module):
-    """The adjustment as it was computed: everything in the sizes and order of `padding.pad_structure`."""
-
-    structure: Structure
-    values: Values
-    factored: Factored
-    places: Places
-
-    @property
-    def on_one_device(self) -> "Padded":
-        """The same for programs that no other device has a part in."""
-        values, factored = jax.tree.map(still, (self.values, self.factored))
-        return Padded(on_one_device(self.structure), values, factored, self.places)
-
-
-class Unfactored(eqx.Module):
-    """What `Padded` is made of where that may never be wanted: inside a transformation of JAX."""
-
-    structure: Structure
-    values: Values
-    places: Places
-
-    def padded(self) -> Padded:
-        """With the normal equations, factored."""
-        if self.values.xy.ndim != _DIMENSIONS:
-            raise ValueError(
-                "statistics of many adjustments at once: ask for them inside the function that jax.vmap maps"
-            )
-        factored = call_compiled(_factored, self.values, self.structure)
-        return Padded(self.structure, self.values, factored, self.places)
-
-
 # Of the image coordinates of one adjustment: chunks, tiles, x and y, images, points.
 _DIMENSIONS = 5
-
-
-@eqx.filter_jit
-def _factored(values: Values, structure: Structure) -> Factored:
-    values, scale = weigh_datum(values, structure), typical_scale(values, structure)
-    a, reduced, _ = reduce_normal(At(zero_increments(structure), scale, values, structure), 0.0)
-    return Factored(reduced, factor_band(a), scale, values.datum_eop.shape[0])
+_factored = eqx.filter_jit(factor_normal)
 
 
 class Adjustment(eqx.Module):
@@ -102,11 +51,10 @@ class Adjustment(eqx.Module):
     unknowns: Unknowns
     residuals: Residuals
     values: Values
-    structure: Structure
-    padded: Padded | None
-    """None in an adjustment that is being differentiated or mapped over; see `computed`."""
-    unfactored: Unfactored | None
-    """None in any other."""
+    tiled: TiledBlock
+    tiled_values: TiledValues
+    factored: FactoredNormal | None
+    """None in an adjustment that is being differentiated or mapped over; see `equations`."""
     steps: Int[Array, ""]
     converged: Array
     seconds: dict[str, float]
@@ -114,12 +62,26 @@ class Adjustment(eqx.Module):
     __repr__ = adjustment_repr
 
     @property
-    def computed(self) -> Padded:
-        """What statistics are computed from; inside a transformation of JAX it is made anew each time."""
-        if self.padded is None:
-            assert self.unfactored is not None
-            return self.unfactored.padded()
-        return self.padded
+    def structure(self) -> Structure:
+        """Index arrays and sizes of the block as given."""
+        return self.tiled.own
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Paths of all shared parameters, free or not, in the order of `values.shared`."""
+        return tuple(e.label for e in observed_in(self.block, self.priors).entries)
+
+    @property
+    def equations(self) -> NormalEquations:
+        """What statistics are computed from; inside a transformation of JAX they are factored anew each time."""
+        s, v = self.tiled.structure, self.tiled_values
+        if self.factored is not None:
+            return NormalEquations(v, s, self.factored)
+        if v.xy.ndim != _DIMENSIONS:
+            raise ValueError(
+                "statistics of many adjustments at once: ask for them inside the function that jax.vmap maps"
+            )
+        return NormalEquations(v, s, call_compiled(_factored, v, s))
 
     @property
     def square_sum(self) -> Float[Numbers, ""] | float:

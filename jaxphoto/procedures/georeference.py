@@ -16,7 +16,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxphoto.adjustment.shared import scalar_priors
+from jaxphoto.adjustment.model.parameter_tables import scalar_priors
 from jaxphoto.arrays import Numbers
 from jaxphoto.block import Block, SensorRows, direct_exterior, sensor_rows
 from jaxphoto.camera import InteriorOrientation, get_parameter, parameter_names

@@ -13,7 +13,6 @@ import pandas as pd
 from rich.console import Console
 
 from jaxphoto.adjustment import Adjustment
-from jaxphoto.adjustment.structure import structure_of
 from jaxphoto.lidar import HeightFlag
 from jaxphoto.observations import AXES
 from jaxphoto.procedures.lidar import LidarControl, Round, Simultaneous
@@ -22,7 +21,6 @@ from jaxphoto.report.results import made_whole, summary_of, write_results, write
 from jaxphoto.report.tables import Tables
 from jaxphoto.report.verdict import warnings_of
 from jaxphoto.statistics import angle_differences, correlation_matrix
-from jaxphoto.unknowns import FREE, uniform_priors
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -201,8 +199,7 @@ def print_moved(result: Simultaneous, console: Console) -> None:
 
 def _parameters(adjusted: Adjustment) -> dict[str, float]:
     """All parameters that images share, free or not, by their paths."""
-    labels = structure_of(adjusted.block, uniform_priors(adjusted.unknowns, FREE)).labels
-    return dict(zip(labels, np.asarray(adjusted.values.shared).tolist(), strict=True))
+    return dict(zip(adjusted.parameters, np.asarray(adjusted.values.shared).tolist(), strict=True))
 
 
 def _unit(label: str) -> tuple[float, str]:

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from jaxphoto.adjustment import Adjustment
-from jaxphoto.adjustment.residuals import Residuals
+from jaxphoto.adjustment.model.residuals import Residuals
 from jaxphoto.camera import constant_names, get_parameter, parameter_names
 from jaxphoto.compiling import call_compiled
 from jaxphoto.observations import AXES
@@ -48,7 +48,7 @@ class Tables:
     def covariance(self) -> Covariance:
         """Covariance with omega, phi, kappa."""
         # Most tables need redundancy numbers, too.
-        prepare_statistics(self.adjusted.computed, self.adjusted.seconds)
+        prepare_statistics(self.adjusted.equations, self.adjusted.seconds)
         return covariance(self.adjusted)
 
     @cached_property

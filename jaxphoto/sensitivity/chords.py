@@ -8,6 +8,7 @@ converges to the optimum of draw i itself, because its gradient is exact; how fa
 own. A draw whose steps do not shrink is left for a full adjustment.
 """
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -16,13 +17,8 @@ import jax.numpy as jnp
 from jax.sharding import PartitionSpec as P
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxphoto.adjustment.elimination import solve_factored
-from jaxphoto.adjustment.normal import At
-from jaxphoto.adjustment.optimum import weigh_datum
-from jaxphoto.adjustment.residuals import Increments, State
-from jaxphoto.adjustment.result import Factored
-from jaxphoto.adjustment.shards import mesh_of
-from jaxphoto.adjustment.structure import AXIS
+from jaxphoto.adjustment.model.residuals import Increments, UnknownArrays
+from jaxphoto.devices import AXIS, mesh_of
 from jaxphoto.sensitivity.many import Common, Varying, image_gradients, other_gradients, states
 
 TOLERANCE = 1e-6
@@ -38,7 +34,7 @@ _OF_IMAGE_ROWS = {"xy", "sigma_xy", "position", "rotation", "shared", "points"}
 class Found(NamedTuple):
     """The unknowns of each draw (draws last), whether they are the optimum, and after how many steps."""
 
-    state: State
+    state: UnknownArrays
     settled: Bool[Array, "draws"]
     steps: Int[Array, "draws"]
 
@@ -55,16 +51,15 @@ class _Way(NamedTuple):
 
 
 @eqx.filter_jit
-def find_optima(varying: Varying, common: Common, factored: Factored, devices: int, first_only: bool) -> Found:
+def find_optima(varying: Varying, common: Common, devices: int, first_only: bool) -> Found:
     """The optimum of every draw, dealt out to `devices`; `first_only`, its first-order approximation."""
     if devices == 1:
-        return _find(varying, common, factored, first_only)
+        return _find(varying, common, first_only)
     last = lambda v: P(*[None] * (v.ndim - 1), AXIS)  # noqa: E731
-    arrays, rest = eqx.partition((common, factored), eqx.is_array)
+    arrays, rest = eqx.partition(common, eqx.is_array)
 
     def of_device(varying, arrays):
-        common, factored = eqx.combine(arrays, rest)
-        return _find(varying, common, factored, first_only)
+        return _find(varying, eqx.combine(arrays, rest), first_only)
 
     run = jax.shard_map(
         of_device,
@@ -81,33 +76,33 @@ def _draws_last() -> Any:
     each: Any = P(AXIS)
     position, rotation, shared, points = (P(*[None] * axes, AXIS) for axes in (2, 3, 1, 2))
     state: Any = (position, rotation, shared, points)
-    return Found(State(*state), each, each)
+    return Found(UnknownArrays(*state), each, each)
 
 
-def _find(varying: Varying, common: Common, factored: Factored, first_only: bool) -> Found:
+def _find(varying: Varying, common: Common, first_only: bool) -> Found:
     """`find_optima` of what one device holds."""
-    common = eqx.tree_at(lambda c: c.values, common, weigh_datum(common.values, common.structure))
+    common = dataclasses.replace(common, equations=common.equations.weighed)
     size = next(iter(varying.values())).shape[-1]
     y = jax.tree.map(lambda v: jnp.zeros((*v.shape, size)), common.scale)
     of_image_rows = bool(_OF_IMAGE_ROWS & set(varying))
     none = jnp.zeros(size, bool)
     way = _Way(y, jnp.full(size, jnp.inf), jnp.zeros(size), none, none, jnp.zeros(size, int))
     if not of_image_rows:
-        way = _taken(way, _others_alone(y, varying, common), common, factored)
+        way = _taken(way, _others_alone(y, varying, common), common)
     elif first_only:
-        way = _taken(way, _all(y, varying, common), common, factored)
+        way = _taken(way, _all(y, varying, common), common)
     if not first_only:
         way = jax.lax.while_loop(
             lambda way: ~jnp.all(way.settled | way.failed),
-            lambda way: _taken(way, _all(way.y, varying, common), common, factored),
+            lambda way: _taken(way, _all(way.y, varying, common), common),
             way,
         )
     return Found(states(way.y, varying, common), way.settled, way.steps)
 
 
-def _taken(way: _Way, b: Increments, common: Common, factored: Factored) -> _Way:
+def _taken(way: _Way, b: Increments, common: Common) -> _Way:
     """One step, of the draws that are still under way, by their gradients `b`."""
-    x = _solutions(b, common, factored)
+    x = _solutions(b, common)
     length = _length(x, b)
     ratio = jnp.where(jnp.isinf(way.length), _FIRST_RATIO, length / jnp.maximum(way.length, 1e-300))
     active = ~(way.settled | way.failed)
@@ -138,9 +133,8 @@ def _others_alone(zero: Increments, varying: Varying, common: Common) -> Increme
     return jax.tree.map(jnp.subtract, other_gradients(zero, varying, common), nominal)
 
 
-def _solutions(b: Increments, common: Common, factored: Factored) -> Increments:
-    at = At(jax.tree.map(jnp.zeros_like, common.scale), common.scale, common.values, common.structure)
-    return jax.vmap(lambda b: solve_factored(factored.reduced, factored.factor, b, at), -1, -1)(b)
+def _solutions(b: Increments, common: Common) -> Increments:
+    return jax.vmap(common.equations.solve, -1, -1)(b)
 
 
 def _length(x: Increments, b: Increments) -> Float[Array, "draws"]:

@@ -12,11 +12,17 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from jaxphoto.adjustment.groups import AtPoints, Group
-from jaxphoto.adjustment.normal import At, residuals_at
-from jaxphoto.adjustment.residuals import Increments, Values
-from jaxphoto.adjustment.rows import Given, Local, each_row, gathered_rows, reduced_places, row_function
-from jaxphoto.adjustment.structure import Structure
+from jaxphoto.adjustment import At, TiledStructure, TiledValues
+from jaxphoto.adjustment.model.observed_groups import ObservedGroup, RowsAtPoints
+from jaxphoto.adjustment.model.residuals import Increments
+from jaxphoto.adjustment.model.row_functions import (
+    RowInputs,
+    Touched,
+    each_row,
+    gathered_rows,
+    reduced_places,
+    row_function,
+)
 from jaxphoto.arrays import Numbers
 
 
@@ -29,12 +35,12 @@ class RowSecond(NamedTuple):
     """By z and by the numbers observed."""
 
 
-def mixed_second(at: At, direction: Values, curved: Float[Numbers, ""]) -> Increments:
+def mixed_second(at: At, direction: TiledValues, curved: Float[Numbers, ""]) -> Increments:
     """B dv over all rows, for a direction of change of the numbers; leaves that are None do not change."""
 
     def gradient(moved):
         values = eqx.combine(moved, at.values)
-        residuals, pull = jax.vjp(lambda y: residuals_at(At(y, at.scale, values, at.structure)), at.increments)
+        residuals, pull = jax.vjp(lambda y: At(y, at.scale, values, at.structure).residuals(), at.increments)
         counted = jax.tree.map(lambda r: r - (1 - curved) * jax.lax.stop_gradient(r), residuals)
         return pull(counted)[0]
 
@@ -42,11 +48,11 @@ def mixed_second(at: At, direction: Values, curved: Float[Numbers, ""]) -> Incre
     return jax.jvp(gradient, (eqx.filter(at.values, there),), (direction,))[1]
 
 
-def row_second(group: Group, numbers: eqx.Module, at: At, curved: Float[Numbers, ""]) -> RowSecond:
+def row_second(group: ObservedGroup, numbers: eqx.Module, at: At, curved: Float[Numbers, ""]) -> RowSecond:
     """H and B of all rows of a group, each by itself."""
     function = row_function(group, at.structure)
 
-    def one(z: Local, given: Given) -> RowSecond:
+    def one(z: Touched, given: RowInputs) -> RowSecond:
         flat, unravel = ravel_pytree(z)
         observed = given.row.observation
 
@@ -70,7 +76,7 @@ def rows_second(at: At, curved: Float[Numbers, ""]) -> tuple[RowSecond, ...]:
 
 
 class AtPointsSecond(NamedTuple):
-    """Sums over the rows that lie at points (see `other_rows.OtherRows`)."""
+    """Sums over the rows that lie at points (see `NonImageRows`)."""
 
     v: Float[Array, "3 3 points"]
     w: Float[Array, "others 3 points"]
@@ -81,7 +87,7 @@ def points_second(second: tuple[RowSecond, ...], at: At) -> AtPointsSecond:
     s, n = at.structure, at.increments.points.shape[1]
     v, w = jnp.zeros((3, 3, n)), jnp.zeros((s.n_border - s.n_interior, 3, n))
     for g, own in zip(s.observed, second, strict=True):
-        if isinstance(g.rows, AtPoints):
+        if isinstance(g.rows, RowsAtPoints):
             k, h = len(g.place), jnp.sum(own.h, axis=2)
             v = v + h[k:, k:]
             w = w.at[jnp.asarray(g.column)[:, 0] - s.n_interior].add(h[:k, k:], mode="drop")
@@ -125,12 +131,12 @@ def _block_diagonal(blocks: list[Array]) -> Array:
     return result
 
 
-def other_second(second: tuple[RowSecond, ...], s: Structure) -> Float[Array, "n n"]:
+def other_second(second: tuple[RowSecond, ...], s: TiledStructure) -> Float[Array, "n n"]:
     """H of all rows but image rows in the reduced unknowns, without those that couple points."""
     n = 6 * s.n_images + s.n_shared
     h = jnp.zeros((n, n))
     for g, own in zip(s.observed, second, strict=True):
-        if isinstance(g.rows, AtPoints):
+        if isinstance(g.rows, RowsAtPoints):
             k, place = len(g.place), 6 * s.n_images + jnp.asarray(g.column)[:, 0]
             h = h.at[place[:, None], place].add(jnp.sum(own.h[:k, :k], axis=(2, 3)), mode="drop")
         elif g.layout == "reduced":

@@ -5,32 +5,24 @@ study asks for: no block's normal matrix outlives its turn.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import PartitionSpec as P
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxphoto.adjustment import Sizes
-from jaxphoto.adjustment.adjust import concrete
-from jaxphoto.adjustment.band import pivots
-from jaxphoto.adjustment.datum import close_datum
-from jaxphoto.adjustment.normal import At, square_sum
-from jaxphoto.adjustment.optimum import iterate, unit_scale, weigh_datum, zero_increments
-from jaxphoto.adjustment.padding import pad_structure, pad_values
-from jaxphoto.adjustment.rank import check_priors
-from jaxphoto.adjustment.residuals import State, Values, state_at
-from jaxphoto.adjustment.result import Factored
-from jaxphoto.adjustment.shards import TILES, mesh_of, usable
-from jaxphoto.adjustment.structure import Structure, structure_of
-from jaxphoto.adjustment.values import at_state, values_of, with_datum
+from jaxphoto.adjustment import NormalEquations, Sizes, TiledStructure, TiledValues, lay_out, optimise
+from jaxphoto.adjustment.model.residuals import UnknownArrays
+from jaxphoto.adjustment.model.values import at_state
 from jaxphoto.arrays import Numbers
 from jaxphoto.block import Block
 from jaxphoto.compiling import run_compiled
+from jaxphoto.devices import AXIS, mesh_of, usable
 from jaxphoto.orientation import approximate
-from jaxphoto.statistics.covariance import Rotations, cofactors_of, in_units
+from jaxphoto.statistics.covariance import Rotations, in_units
 from jaxphoto.unknowns import Unknowns
 
 # Designs that one call of the program holds in memory, at least one a device.
@@ -51,8 +43,8 @@ class Check(NamedTuple):
 class Prepared(NamedTuple):
     """One design as it is computed with, and what is known of it beforehand."""
 
-    values: Values
-    structure: Structure
+    values: TiledValues
+    structure: TiledStructure
     check: Check
     labels: tuple[str, ...]
     """Of the shared unknowns, in their order."""
@@ -86,22 +78,16 @@ def prepare_design(block: Block, truth: Unknowns | None, sizes: Sizes, n_check: 
     `sizes` and `n_check`, the length of the list of check points, are those of all designs. Raises what
     `jaxphoto.adjust` raises before it computes: BlockError, DatumError, RankError.
     """
-    check_priors(block, block.priors)
-    structure = structure_of(block, block.priors)
-    values = values_of(block, approximate(block), block.priors, structure)
-    constraints = close_datum(block, concrete(values, block), structure)
-    values = with_datum(values, constraints.eop, constraints.points)
-    coupled = len(constraints.eop) > 0 or bool(structure.coupled)
-    wide, places = pad_structure(structure, sizes, dense=coupled)
+    laid = lay_out(block, approximate(block), block.priors, sizes, alone=True)
+    s, constraints = laid.tiled.own, len(laid.values.datum_eop)
     who = np.unique(block.check.who)
     check = Check(np.zeros(n_check, np.int32), np.zeros(n_check), np.full((n_check, 3), np.nan))
-    check.point[: len(who)], check.weight[: len(who)] = places.point[who], 1.0
+    check.point[: len(who)], check.weight[: len(who)] = laid.tiled.places.point[who], 1.0
     if truth is not None:
         check.truth[: len(who)] = np.asarray(truth.points)[who]
-    s = structure
-    observed = 2 * len(s.image) + sum(g.components * g.n_rows for g in s.observed) + len(constraints.eop)
+    observed = 2 * len(s.image) + sum(g.components * g.n_rows for g in s.observed) + constraints
     unknown = s.n_shared + s.eop_free.sum() + s.point_free.sum()
-    return Prepared(pad_values(values, structure, wide, places), wide, check, s.labels, int(observed - unknown))
+    return Prepared(laid.numbers, laid.tiled.structure, check, s.labels, int(observed - unknown))
 
 
 def alike(designs: Sequence[Prepared]) -> list[list[int]]:
@@ -135,7 +121,13 @@ def find(designs: Sequence[Prepared], rotations: Rotations, max_steps: int, seco
 
 @eqx.filter_jit
 def _find(
-    values: Values, s: Structure, check: Check, wanted: Array, devices: int, rotations: Rotations, max_steps: int
+    values: TiledValues,
+    s: TiledStructure,
+    check: Check,
+    wanted: Array,
+    devices: int,
+    rotations: Rotations,
+    max_steps: int,
 ) -> Findings:
     arrays, rest = eqx.partition((values, s, check), eqx.is_array)
 
@@ -152,28 +144,25 @@ def _find(
 
     if devices == 1:
         return of_each(arrays, wanted)
-    run = jax.shard_map(of_each, mesh=mesh_of(devices), in_specs=TILES, out_specs=TILES, check_vma=False)
+    of_designs: Any = P(AXIS)
+    run = jax.shard_map(of_each, mesh=mesh_of(devices), in_specs=of_designs, out_specs=of_designs, check_vma=False)
     return run(arrays, wanted)
 
 
-def _findings(values: Values, s: Structure, check: Check, rotations: Rotations, max_steps: int) -> Findings:
+def _findings(values: TiledValues, s: TiledStructure, check: Check, rotations: Rotations, max_steps: int) -> Findings:
     """Adjustment, factor at the optimum, covariance, and what is kept of them."""
 
-    def solved(start: State, only_factor):
-        given = at_state(values, start)
-        optimum, system, scale = iterate(weigh_datum(given, s), s, max_steps, only_factor)
-        kept = (optimum.converged, optimum.steps, system.reduced, system.factor, scale)
-        return state_at(optimum.increments, unit_scale(s), given, s), kept
+    def solved(start: UnknownArrays, only_factor):
+        found = optimise(at_state(values, start), s, max_steps, only_factor)
+        return found.state, found
 
     # To the optimum, and there once more for the undamped factor: a loop, so that it is one piece of code.
-    start = State(values.position, values.rotation, values.shared, values.points)
-    state, kept = jax.lax.scan(solved, start, np.array([False, True]))
-    converged, steps = kept[0][0], kept[1][0]
-    reduced, factor, scale = jax.tree.map(lambda v: v[1], kept[2:])
-    there, zero = at_state(values, state), zero_increments(s)
-    factored = Factored(reduced, factor, scale, values.datum_eop.shape[0])
-    cofactors, _ = cofactors_of(there, factored, s, np.array(False))
-    covariance, points = in_units(cofactors, scale, there.rotation, rotations)
+    start = UnknownArrays(values.position, values.rotation, values.shared, values.points)
+    state, found = jax.lax.scan(solved, start, np.array([False, True]))
+    there, factored = at_state(values, state), jax.tree.map(lambda v: v[1], found.factored)
+    equations = NormalEquations(there, s, factored)
+    cofactors, _ = equations.cofactors(np.array(False))
+    covariance, points = in_units(cofactors, equations.scale, there.rotation, rotations)
 
     n = 6 * s.n_images
     variance = jnp.maximum(jnp.diagonal(covariance), 0.0)
@@ -185,10 +174,10 @@ def _findings(values: Values, s: Structure, check: Check, rotations: Rotations, 
     is_check, n_check = check.weight[:, None] > 0, jnp.sum(check.weight)
     off = check.truth - there.points[:, check.point].T
     return Findings(
-        converged=converged,
-        least_pivot=jnp.min(pivots(reduced.diagonal, factor)),
-        steps=steps,
-        square_sum=square_sum(At(zero, unit_scale(s), there, s)),
+        converged=found.converged[0],
+        least_pivot=equations.least_pivot(),
+        steps=found.steps[0],
+        square_sum=equations.at.square_sum(),
         covariance=covariance[n:, n:],
         exterior_variance=own @ variance[:n].reshape(-1, 6) / jnp.sum(own),
         mean_abs=jnp.sum(rho, axis=0) / jnp.sum(touches, axis=0),

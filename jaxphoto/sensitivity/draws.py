@@ -17,13 +17,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxphoto.adjustment import Adjustment, solve
-from jaxphoto.adjustment.padding import crop_state, pad_values
-from jaxphoto.adjustment.residuals import State
-from jaxphoto.adjustment.shards import usable
-from jaxphoto.adjustment.values import values_of, with_datum
+from jaxphoto.adjustment.model.residuals import UnknownArrays
+from jaxphoto.adjustment.model.values import values_of, with_datum
 from jaxphoto.arrays import still
 from jaxphoto.block import Block, Start
 from jaxphoto.compiling import call_compiled
+from jaxphoto.devices import usable
 from jaxphoto.errors import InputError, JaxphotoError
 from jaxphoto.rotation import omega_phi_kappa_from_matrix
 from jaxphoto.sensitivity.chords import Found, find_optima
@@ -129,8 +128,11 @@ class Readjustment:
     ):
         if not bool(adjusted.converged):
             raise InputError(f"draws begin at the optimum of the block as it is, which is {adjusted.outcome.value}")
-        padded = adjusted.computed.on_one_device
-        self.adjusted = dataclasses.replace(adjusted, padded=padded)
+        equations = adjusted.equations.on_one_device
+        tiled = dataclasses.replace(adjusted.tiled, structure=equations.structure)
+        self.adjusted = dataclasses.replace(
+            adjusted, tiled=tiled, tiled_values=equations.values, factored=equations.factored
+        )
         self.change, self.exterior, self.points = change, exterior, points
         self.seconds = {"compile": 0.0}
         self.many = _count(example) >= _MANY
@@ -138,7 +140,6 @@ class Readjustment:
             adjusted.unknowns, *(np.ones(len(n), bool) for n in (adjusted.block.images, adjusted.block.points))
         )
         self.nominal = dataclasses.replace(adjusted.block, start=start, priors=adjusted.priors)
-        self.factored, self.places = padded.factored, padded.places
         # Of several processes, each draws for itself.
         self.devices = usable(_MOST_DEVICES) if jax.process_count() == 1 else 1
         self.common = common_of(self.adjusted, _AT_ONCE // self._draws_of_device)
@@ -187,17 +188,17 @@ class Readjustment:
         more = self.batch_size - _count(entries)
         entries = jax.tree.map(lambda v: np.concatenate([v, np.repeat(v[-1:], more, axis=0)]), entries)
         varying, recorded = self._numbers(entries)
-        arguments = varying, self.common, self.factored, self.devices, first_only
+        arguments = varying, self.common, self.devices, first_only
         return call_compiled(find_optima, *arguments, thorough=self.many and not first_only), recorded
 
     def _gathered(self, found: Found, recorded: Recorded, n: int) -> Draws:
         """Of a batch, its first `n` draws."""
-        state = crop_state(State(*(_draws_first(v)[:n] for v in found.state)), self.places)
+        state = self.adjusted.tiled.crop_state(UnknownArrays(*(_draws_first(v)[:n] for v in found.state)))
         labels, kept = self.adjusted.structure.labels, {name: np.asarray(v)[:n] for name, v in recorded.items()}
         steps, settled = np.asarray(found.steps)[:n], np.asarray(found.settled)[:n]
         return Draws(kept, *self._estimates(state), settled, steps, np.zeros(n, bool), labels)
 
-    def _estimates(self, state: State) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
+    def _estimates(self, state: UnknownArrays) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
         """`shared`, `exterior` and `points` of `Draws`."""
         shared = still(state.shared)[:, self.adjusted.structure.free]
         points = _by_object(state.points) if self.points else None
@@ -218,11 +219,11 @@ class Readjustment:
             v, converged, steps = solved.values, bool(solved.converged), int(solved.steps)
         except JaxphotoError:
             v, converged, steps = jax.tree.map(lambda x: np.full_like(x, np.nan), self.adjusted.values), False, 0
-        state = State(*(still(x)[None] for x in (v.position, v.rotation, v.shared, v.points)))
+        state = UnknownArrays(*(still(x)[None] for x in (v.position, v.rotation, v.shared, v.points)))
         found, taken, alone = np.array([converged]), np.array([steps]), np.array([True])
         return Draws({}, *self._estimates(state), found, taken, alone, ())
 
-    def _exterior(self, state: State) -> Float[np.ndarray, "draws images 6"]:
+    def _exterior(self, state: UnknownArrays) -> Float[np.ndarray, "draws images 6"]:
         """X, Y, Z, omega, phi, kappa; angles run on from the nominal ones, without a jump at 180 degrees."""
         angles = np.asarray(call_compiled(_angles, _by_object(state.rotation)))
         nominal = np.asarray(call_compiled(_angles, np.asarray(self.adjusted.values.rotation).transpose(2, 0, 1)[None]))
@@ -241,7 +242,7 @@ class Readjustment:
         changed = values_of(block, block.start.unknowns, block.priors, s)
         changed = with_datum(changed, v.datum_eop, v.datum_points)
         wide, nominal = self.common.structure, self.common.values
-        padded = pad_values(changed, s, wide, self.places)
+        padded = self.adjusted.tiled.pad(changed)
         numbers = {path_name(path): v for path, v in jax.tree_util.tree_leaves_with_path(padded)}
         # What is free begins at the optimum, wherever the block says that it starts.
         held = {

@@ -24,14 +24,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy import sparse
 
-from jaxphoto.adjustment import Adjustment
-from jaxphoto.adjustment.layout import Places
-from jaxphoto.adjustment.normal import At
-from jaxphoto.adjustment.optimum import weigh_datum
-from jaxphoto.adjustment.padded_groups import crop_rows
-from jaxphoto.adjustment.residuals import IMAGE_POINTS, Increments, Values
-from jaxphoto.adjustment.rows import reduced_places
-from jaxphoto.adjustment.structure import Structure, structure_of
+from jaxphoto.adjustment import Adjustment, NormalEquations, TiledBlock
+from jaxphoto.adjustment.model.residuals import IMAGE_POINTS
+from jaxphoto.adjustment.model.row_functions import reduced_places
+from jaxphoto.adjustment.model.structure import Structure
 from jaxphoto.arrays import still
 from jaxphoto.compiling import run_compiled
 from jaxphoto.errors import InputError
@@ -42,7 +38,6 @@ from jaxphoto.sensitivity.hessian import Eliminated, check_optimum, eliminated
 from jaxphoto.sensitivity.image_rows import ListedRows, image_rows
 from jaxphoto.statistics import EOP_NAMES
 from jaxphoto.statistics.covariance import turns_of
-from jaxphoto.unknowns import FREE, uniform_priors
 
 # Numbers that the derivatives by image points may have: 1.6 GB.
 _MOST_NUMBERS = 2e8
@@ -102,18 +97,19 @@ def sensitivity(adjusted: Adjustment, *, curvature: bool = True, points: Sequenc
     """
     _check_points(adjusted, points)
     check_optimum(adjusted)
-    places, values, scale, s = _padded(adjusted)
+    equations = adjusted.equations.on_one_device
+    tiled, places, scale, s = adjusted.tiled, adjusted.tiled.places, equations.scale, equations.structure
     own, estimates = adjusted.structure, 6 * len(places.image) + s.n_shared + 3 * len(points)
     _check_size(own, estimates)
-    given = values, scale, image_rows(adjusted), s, np.array(float(curvature))
+    given = equations, image_rows(adjusted), np.array(float(curvature))
     found = jax.tree.map(still, run_compiled(_derivatives, given, adjusted.seconds, "sensitivity"))
     asked = places.point[[adjusted.block.points.index(name) for name in points]] if points else np.zeros(0, int)
     unknowns = np.append(6 * places.image[:, None] + np.arange(6), 6 * s.n_images + np.arange(s.n_shared))
     step = np.append(scale.eop.T, scale.shared)[unknowns]
-    of = Estimates(unknowns, step, found.turns[places.image], asked, scale.points.T[asked])
+    of = Estimates(unknowns, step, found.turns[places.image], asked, still(scale.points).T[asked])
     adjoint = adjoint_vectors(found.h, of)
 
-    rows = _observations(found, own, places, len(unknowns) + len(found.h.c))
+    rows = _observations(found, tiled, len(unknowns) + len(found.h.c))
     derivatives = _sparse(list(rows.values()), len(adjoint)) @ adjoint
     shapes = {name: b.shape[:-1] for name, (b, _) in rows.items()}
     ends = np.cumsum([math.prod(shape) for shape in shapes.values()])[:-1]
@@ -124,12 +120,6 @@ def sensitivity(adjusted: Adjustment, *, curvature: bool = True, points: Sequenc
     labels = (*names, *own.labels, *(f"points[{name}].{axis}" for name in points for axis in AXES))
     by_fixed = partial(_by_fixed, adjusted, curvature, labels, adjoint, unknowns)
     return Sensitivity(groups, labels=labels, curvature=curvature, by_fixed=by_fixed)
-
-
-def _padded(adjusted: Adjustment) -> tuple[Places, Any, Any, Structure]:
-    """What an adjustment was computed with: places, values, scale and structure."""
-    computed = adjusted.computed.on_one_device
-    return computed.places, computed.values, computed.factored.scale, computed.structure
 
 
 def _check_points(adjusted: Adjustment, points: Sequence[str]) -> None:
@@ -157,18 +147,19 @@ class _Derivatives(NamedTuple):
 
 
 @eqx.filter_jit
-def _derivatives(values: Values, scale: Increments, rows: ListedRows, s: Structure, curved: Array) -> _Derivatives:
-    at = At(jax.tree.map(jnp.zeros_like, scale), scale, weigh_datum(values, s), s)
+def _derivatives(equations: NormalEquations, rows: ListedRows, curved: Array) -> _Derivatives:
+    at = equations.at
     others = tuple(second.b for second in rows_second(at, curved))
-    return _Derivatives(eliminated(at, rows, curved), turns_of(values.rotation, "omega_phi_kappa"), others)
+    return _Derivatives(eliminated(at, rows, curved), turns_of(at.values.rotation, "omega_phi_kappa"), others)
 
 
 Rows = tuple[np.ndarray, np.ndarray]
 """-B of some observations, numbers last, and the unknowns that these belong to."""
 
 
-def _observations(found: _Derivatives, own: Structure, places: Places, first: int) -> dict[str, Rows]:
+def _observations(found: _Derivatives, tiled: TiledBlock, first: int) -> dict[str, Rows]:
     """-B of all observations, by the names of their groups; `first` is where the points begin."""
+    own, places = tiled.own, tiled.places
     n, q, axes = 6 * own.n_images, own.n_image_colours, np.arange(3)
     first_of = first + 3 * places.point
     of_image = np.concatenate([6 * np.arange(own.n_images)[:, None] + np.arange(6), n + own.column[:, :q]], axis=1)
@@ -180,7 +171,7 @@ def _observations(found: _Derivatives, own: Structure, places: Places, first: in
     for g, b in zip(own.observed, found.others, strict=True):
         z, o = b.shape[:2]
         # (z o, rows), then rows first and z last.
-        flat = crop_rows(dataclasses.replace(g, scalar=False), np.reshape(b, (z * o, *b.shape[2:])), places)
+        flat = tiled.crop_rows(dataclasses.replace(g, scalar=False), np.reshape(b, (z * o, *b.shape[2:])))
         flat = -np.moveaxis(flat.reshape(z, o, -1), 0, -1).swapaxes(0, 1)
         of_points = (first_of[g.point][:, None] + axes[:, None]).reshape(-1, g.n_rows)
         touched = np.concatenate([np.asarray(reduced_places(g, own.n_images)), of_points]).T
@@ -211,28 +202,28 @@ def _by_fixed(
 ) -> tuple[Float[np.ndarray, "estimates fixed"], tuple[str, ...]]:
     """-lambda' B of what is held fixed, and its labels: parameter paths of what is not free, then coordinates."""
     block, fixed = adjusted.block, adjusted.block.fixed
-    places, values, scale, s = _padded(adjusted)
+    equations = adjusted.equations.on_one_device
+    s, places, values = equations.structure, adjusted.tiled.places, equations.values
     shared = np.setdiff1d(np.arange(len(values.shared)), s.free)
     held = _Held(*(np.asarray(v, np.int32) for v in (shared, fixed.who, fixed.axis, places.point_at)))
-    given = values, scale, s, np.array(float(curvature)), held
+    given = equations, np.array(float(curvature)), held
     b = still(run_compiled(_fixed_rows, given, adjusted.seconds, "sensitivity"))
     n = 6 * s.n_images + s.n_shared
     found = b[:, unknowns] @ adjoint[: len(unknowns)] + b[:, n:] @ adjoint[len(adjoint) - 3 * s.n_points :]
 
-    every = structure_of(block, uniform_priors(adjusted.unknowns, FREE)).labels
     coordinates = (f"points[{block.points[p]}].{AXES[a]}" for p, a in zip(fixed.who, fixed.axis, strict=True))
-    fixed_labels = (*(every[k] for k in shared), *coordinates)
+    fixed_labels = (*(adjusted.parameters[k] for k in shared), *coordinates)
     # An estimate that is itself held fixed follows what holds it.
     same = np.array(labels)[:, None] == np.array(fixed_labels, dtype=str)
     return same - found.T, fixed_labels
 
 
 @eqx.filter_jit
-def _fixed_rows(values: Values, scale: Increments, s: Structure, curved: Array, held: _Held) -> Float[Array, "fixed n"]:
+def _fixed_rows(equations: NormalEquations, curved: Array, held: _Held) -> Float[Array, "fixed n"]:
     """B of what is held fixed, one after the other: each may touch everything, images, shared unknowns and points."""
-    at = At(jax.tree.map(jnp.zeros_like, scale), scale, weigh_datum(values, s), s)
+    at, values = equations.at, equations.values
     shared, coordinates = jnp.zeros_like(values.shared), jnp.zeros_like(values.points)
-    nothing: Values = jax.tree.map(lambda _: None, values)
+    nothing: Any = jax.tree.map(lambda _: None, values)
 
     def column(shared, coordinates):
         of_these = lambda v: (v.shared, v.points)  # noqa: E731

@@ -7,9 +7,9 @@ With r the weighted residuals, y the increments and v any number that r depends 
 
 and the optimum answers dv with dy = -H^-1 B dv. Without the terms that carry r, this is the classical first-order
 matrix -N^-1 J' dr/dv. Every image row touches one image, one point and one camera, so H has the blocks of the normal
-matrix (see adjustment/normal.py) and its points are eliminated alike, by V = L L' and F = [W; Ws; D] L^-T. Some rows,
-and the datum, couple points: D (what such a row touches, then the constraints) has the weight C, and mu = C D x is
-carried by more unknowns. With S, G, K what is left of H, D and 0 without the points,
+matrix (see adjustment/solver/normal.py) and its points are eliminated alike, by V = L L' and F = [W; Ws; D] L^-T. Some
+rows, and the datum, couple points: D (what such a row touches, then the constraints) has the weight C, and mu = C D x
+is carried by more unknowns. With S, G, K what is left of H, D and 0 without the points,
 
     M = [ S     G'      ]
         [ C G   C K - I ]
@@ -22,15 +22,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxphoto.adjustment import Adjustment
-from jaxphoto.adjustment.normal import At, cholesky_3x3, each_tile_of, unwhiten, whiten
-from jaxphoto.adjustment.residuals import Increments
-from jaxphoto.adjustment.structure import Structure
-from jaxphoto.adjustment.tiles import by_tile
+from jaxphoto.adjustment import Adjustment, At, TiledStructure
+from jaxphoto.adjustment.model.residuals import Increments
 from jaxphoto.arrays import Numbers
 from jaxphoto.errors import InputError
 from jaxphoto.sensitivity.curvature import coupling_rows, other_second, points_second, rows_second
 from jaxphoto.sensitivity.image_rows import ListedRows, RowProducts, row_products
+from jaxphoto.small_matrices import cholesky_3x3, unwhiten, whiten
 
 # An index that no array has: what is added there is dropped.
 NOWHERE = int(np.iinfo(np.int32).max)
@@ -59,7 +57,7 @@ def check_optimum(adjusted: Adjustment) -> None:
         raise InputError(
             "the adjustment has not converged, and only an optimum has a sensitivity: adjust until it converges"
         )
-    s = adjusted.computed.structure
+    s = adjusted.tiled.structure
     unknowns = 6 * s.n_images + s.n_shared
     if unknowns > _MOST_UNKNOWNS:
         raise InputError(
@@ -92,13 +90,13 @@ def eliminated(at: At, rows: ListedRows, curved: Float[Numbers, ""]) -> Eliminat
         flat = f.reshape(len(f), -1)
         return gain.transpose(2, 0, 1), l, flat @ flat.T
 
-    of_points = (by_tile(v, s.in_tiles) for v in (*at_points, d_p))
-    *found, gram = each_tile_of(tile, (rows.of_slot, *of_points), s)
+    of_points = (s.by_tile(v) for v in (*at_points, d_p))
+    *found, gram = s.each_tile(tile, (rows.of_slot, *of_points))
     gain, l = (v.reshape(-1, *v.shape[2:]) for v in found)  # noqa: E741
     # Tiles that are padding were not computed: their points are each by itself.
     l = jnp.where(l[:, :1] == 0, jnp.array([1.0, 0, 1, 0, 0, 1])[:, None], l)  # noqa: E741
 
-    image = jnp.asarray(s.in_tiles.image).reshape(len(l), -1)
+    image = jnp.asarray(s.tiles.image).reshape(len(l), -1)
     border = jnp.concatenate([6 * s.n_images + jnp.arange(s.n_border), n + jnp.arange(k)])
     m = jnp.zeros((n + k, n + k)).at[:n, :n].set(other_second(second, s) + _by_unknown(h, s))
     m = m.at[n:, :n].set(d_e).at[:n, n:].set(d_e.T) - _products(gram, border, n + k, s)
@@ -109,7 +107,7 @@ def eliminated(at: At, rows: ListedRows, curved: Float[Numbers, ""]) -> Eliminat
     return Eliminated(m, c, gain, l, touched, h.measured)
 
 
-def _by_unknown(h: RowProducts, s: Structure) -> Float[Array, "n n"]:
+def _by_unknown(h: RowProducts, s: TiledStructure) -> Float[Array, "n n"]:
     """Sums by image, at the unknowns of the image and of its colours."""
     n_eop, columns = 6 * s.n_images, image_columns(s)
     each, n = jnp.arange(s.n_images), n_eop + s.n_shared
@@ -122,9 +120,9 @@ def _by_unknown(h: RowProducts, s: Structure) -> Float[Array, "n n"]:
     return m.at[of_shared[:, :, None], of_shared[:, None]].add(h.shared, mode="drop")
 
 
-def _products(gram: Float[Array, "chunks tiles f f"], border: Array, size: int, s: Structure) -> Array:
+def _products(gram: Float[Array, "chunks tiles f f"], border: Array, size: int, s: TiledStructure) -> Array:
     """F F' of all tiles at their unknowns: pairs of images by the lists of `Tiles`, the border by image."""
-    tiles, n = s.in_tiles, s.n_images
+    tiles, n = s.tiles, s.n_images
     m, width = tiles.image.shape[2], n // tiles.columns
 
     def blocks(numbers):
@@ -150,14 +148,14 @@ def _products(gram: Float[Array, "chunks tiles f f"], border: Array, size: int, 
     return result.at[border[:, None], border].set(gram[:, :, 6 * m :, 6 * m :].sum((0, 1)))
 
 
-def image_columns(s: Structure) -> Int[Array, "images e_and_colours"]:
+def image_columns(s: TiledStructure) -> Int[Array, "images e_and_colours"]:
     """Reduced unknowns of each image: exterior orientation, then those of its camera's colours."""
     column = jnp.asarray(s.column)[:, : s.n_image_colours]
     shared = jnp.where(column < s.n_shared, 6 * s.n_images + column, NOWHERE)
     return jnp.concatenate([6 * jnp.arange(s.n_images)[:, None] + jnp.arange(6), shared], axis=1)
 
 
-def solve_eliminated(h: Eliminated, b: Increments, s: Structure) -> Increments:
+def solve_eliminated(h: Eliminated, b: Increments, s: TiledStructure) -> Increments:
     """x of H x = b."""
     n_eop, n = 6 * s.n_images, 6 * s.n_images + s.n_shared
     of_points = b.points.reshape(3, len(h.l), -1)
@@ -169,7 +167,7 @@ def solve_eliminated(h: Eliminated, b: Increments, s: Structure) -> Increments:
     return Increments(x[:n_eop].reshape(-1, 6).T, x[n_eop:n], points.reshape(3, -1))
 
 
-def _by_interior(w: Float[Array, "q 3 m p"], image: Array, s: Structure) -> Float[Array, "interior 3 p"]:
+def _by_interior(w: Float[Array, "q 3 m p"], image: Array, s: TiledStructure) -> Float[Array, "interior 3 p"]:
     """Ws of a tile: what its colours mean, added up over its images."""
     if not s.n_interior:
         return jnp.zeros((0, 3, w.shape[3]))

@@ -24,12 +24,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxphoto.adjustment import Adjustment
-from jaxphoto.adjustment.residuals import Increments, Values, state_at
-from jaxphoto.adjustment.structure import CameraGroup, Structure, interior_of
-from jaxphoto.adjustment.tiles import by_image, once, scene_of, slopes_of
+from jaxphoto.adjustment import Adjustment, TiledStructure, TiledValues
+from jaxphoto.adjustment.model.residuals import Increments, state_at
+from jaxphoto.adjustment.model.scene import by_image, scene_of, slopes_of
+from jaxphoto.adjustment.model.structure import CameraGroup, interior_of
 from jaxphoto.arrays import Numbers, still
 from jaxphoto.collinearity import camera_residual
+from jaxphoto.compiling import once
 from jaxphoto.georeferencing import Corrections, apparent_point
 from jaxphoto.georeferencing.corrections import NO_CORRECTIONS
 
@@ -67,8 +68,7 @@ class RowProducts(NamedTuple):
 
 def image_rows(adjusted: Adjustment) -> ListedRows:
     """The image rows of an adjustment."""
-    s, computed = adjusted.structure, adjusted.computed
-    places, tiles = computed.places, computed.structure.in_tiles
+    s, places, tiles = adjusted.structure, adjusted.tiled.places, adjusted.tiled.structure.tiles
     n, size = len(s.image), _size(len(s.image) + 1)
 
     def pad(values: np.ndarray) -> np.ndarray:
@@ -90,7 +90,7 @@ def _size(rows: int) -> int:
 
 
 def row_products(
-    values: Values, scale: Increments, rows: ListedRows, curved: Float[Numbers, ""], s: Structure
+    values: TiledValues, scale: Increments, rows: ListedRows, curved: Float[Numbers, ""], s: TiledStructure
 ) -> RowProducts:
     """H and B of all rows at the values, in scaled increments; without the terms that carry r where `curved` is 0."""
     count = -(-len(rows.image) // _AT_ONCE)
@@ -115,24 +115,24 @@ def row_products(
 
 
 def _of_some(
-    values: Values, scale: Increments, rows: ListedRows, curved: Float[Numbers, ""], s: Structure
+    values: TiledValues, scale: Increments, rows: ListedRows, curved: Float[Numbers, ""], s: TiledStructure
 ) -> RowProducts:
     image, point = rows.image, rows.point
     q, zero = s.n_image_colours, jax.tree.map(jnp.zeros_like, scale)
     scene, slopes = scene_of(state_at(zero, scale, values, s), values, s), slopes_of(zero, scale, values, s)
     ends = jnp.concatenate([_at(values.position, image), _at(values.points, point)])
     rotation, of_image, of_point = _at(values.rotation, image), _at(scale.eop, image), _at(scale.points, point)
-    u, by_place = once(partial(_places, s.corrections), s, rotation, ends, of_image, of_point)
+    u, by_place = once(partial(_places, s.corrections), s.eop_free, rotation, ends, of_image, of_point)
 
     g, to_u = jnp.zeros(()), (jnp.zeros(()),) * 3
     for group, camera, slope in zip(s.groups, scene.cameras, slopes.cameras, strict=True):
         if by_image(group, s):
             camera, slope = camera[image].T, jnp.moveaxis(slope[image], 0, -1)
         weight = tuple(jnp.where(jnp.asarray(group.member)[image], rows.weight, 0.0))
-        of_group = once(partial(_by_camera, group), s, camera, slope, u, tuple(rows.xy), weight, curved)
+        of_group = once(partial(_by_camera, group), s.eop_free, camera, slope, u, tuple(rows.xy), weight, curved)
         g, to_u = g + of_group[0], tuple(a + b for a, b in zip(to_u, of_group[1], strict=True))
 
-    across = once(lambda g, by_place: sum(g[k, :, None] * d for k, d in enumerate(by_place)), s, g, by_place)
+    across = once(lambda g, by_place: sum(g[k, :, None] * d for k, d in enumerate(by_place)), s.eop_free, g, by_place)
     turned = curved * of_image[3:, None] * jnp.stack(_cross(to_u, by_place))
     eop = sum((d[:6, None] * across[k, None, :6] for k, d in enumerate(by_place)), jnp.zeros(()))
     by_point = sum((d[:, None] * across[k, None, 6:] for k, d in enumerate(by_place)), jnp.zeros(()))

@@ -2,7 +2,7 @@
 
 Adjustments that differ in numbers only are computed side by side: arrays end in the axis of the draws, so that what
 belongs to an image row is read and written in whole stretches. Unlike in the tiles of a single adjustment
-(`adjustment.tiles`) there is no empty slot: image rows are listed, and gather and scatter such stretches, a chunk of
+(`adjustment.layout`) there is no empty slot: image rows are listed, and gather and scatter such stretches, a chunk of
 rows at a time, whose numbers stay in the cache of a core.
 
 With u the point of an image row in the camera frame and q half the square of its weighted residuals,
@@ -22,13 +22,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxphoto.adjustment import Adjustment
-from jaxphoto.adjustment.residuals import Increments, State, Values, state_at
-from jaxphoto.adjustment.rows import other_residuals
-from jaxphoto.adjustment.structure import CameraGroup, Structure, interior_of
-from jaxphoto.adjustment.tiles import once
+from jaxphoto.adjustment import Adjustment, NormalEquations, TiledStructure, TiledValues
+from jaxphoto.adjustment.model.residuals import Increments, UnknownArrays, state_at
+from jaxphoto.adjustment.model.row_functions import non_image_residuals
+from jaxphoto.adjustment.model.structure import CameraGroup, interior_of
 from jaxphoto.arrays import Numbers
 from jaxphoto.collinearity import ExteriorOrientation, camera_coordinates, camera_residual
+from jaxphoto.compiling import once
 from jaxphoto.georeferencing import apparent_point
 from jaxphoto.georeferencing.corrections import NO_CORRECTIONS
 from jaxphoto.rotation import rotate
@@ -57,43 +57,49 @@ class RowList(eqx.Module):
 class Common(eqx.Module):
     """What all draws have in common, in padded sizes; image rows (2, rows) by row of the block."""
 
-    values: Values
+    equations: NormalEquations
     xy: Float[np.ndarray, "2 rows"]
     sigma_xy: Float[np.ndarray, "2 rows"]
-    scale: Increments
-    structure: Structure
     lists: tuple[RowList, ...]
+
+    @property
+    def values(self) -> TiledValues:
+        """The nominal numbers."""
+        return self.equations.values
+
+    @property
+    def scale(self) -> Increments:
+        """Of increments."""
+        return self.equations.scale
+
+    @property
+    def structure(self) -> TiledStructure:
+        """That of the nominal adjustment."""
+        return self.equations.structure
 
 
 def common_of(adjusted: Adjustment, at_once: int) -> Common:
     """The nominal adjustment, from whose optimum all draws begin; `at_once` image rows are computed with at a time."""
-    s, padded = adjusted.structure, adjusted.computed
+    s, places = adjusted.structure, adjusted.tiled.places
     lists = []
     for group in s.groups:
         own = np.flatnonzero(group.member[s.image])
-        own = own[np.argsort(padded.places.point[s.point[own]], kind="stable")]
+        own = own[np.argsort(places.point[s.point[own]], kind="stable")]
         chunks = -(-len(own) // at_once)
         size = -(-len(own) // max(chunks, 1))
         place = np.arange(chunks * size).reshape(chunks, size)
         row = own[np.minimum(place, len(own) - 1)]
         image = s.image[row]
-        of_group = padded.places.image[image], padded.places.point[s.point[row]], group.camera[image]
+        of_group = places.image[image], places.point[s.point[row]], group.camera[image]
         lists.append(RowList(row, *of_group, (place < len(own)).astype(float)))
     values = adjusted.values
-    return Common(
-        padded.values,
-        np.asarray(values.xy),
-        np.asarray(values.sigma_xy),
-        padded.factored.scale,
-        padded.structure,
-        tuple(lists),
-    )
+    return Common(adjusted.equations, np.asarray(values.xy), np.asarray(values.sigma_xy), tuple(lists))
 
 
-def states(y: Increments, varying: Varying, common: Common) -> State:
+def states(y: Increments, varying: Varying, common: Common) -> UnknownArrays:
     """The unknowns of every draw at its increments, draws last."""
 
-    def one(y: Increments, varying: Varying) -> State:
+    def one(y: Increments, varying: Varying) -> UnknownArrays:
         return state_at(y, common.scale, _values_with(varying, common), common.structure)
 
     return jax.vmap(one, -1, -1)(y, varying)
@@ -104,7 +110,7 @@ def other_gradients(y: Increments, varying: Varying, common: Common) -> Incremen
 
     def one(y: Increments, varying: Varying) -> Increments:
         values = _values_with(varying, common)
-        r, pull = jax.vjp(lambda y: other_residuals(y, common.scale, values, common.structure), y)
+        r, pull = jax.vjp(lambda y: non_image_residuals(y, common.scale, values, common.structure), y)
         return pull(r)[0]
 
     return jax.vmap(one, -1, -1)(y, varying)
@@ -121,7 +127,7 @@ def image_gradients(y: Increments, varying: Varying, common: Common) -> Incremen
     return pull(cotangent)[0]
 
 
-def _values_with(varying: Varying, common: Common) -> Values:
+def _values_with(varying: Varying, common: Common) -> TiledValues:
     def of_draw(path: Any, nominal: Any) -> Any:
         name = path_name(path)
         # Those of image rows are not in tiles, and nobody looks for them there.
@@ -149,7 +155,9 @@ class _Sums(NamedTuple):
     points: Float[Array, "points 3 draws"]
 
 
-def _group_cotangent(group: CameraGroup, rows: RowList, state: State, seen: tuple[Array, Array], s: Structure) -> State:
+def _group_cotangent(
+    group: CameraGroup, rows: RowList, state: UnknownArrays, seen: tuple[Array, Array], s: TiledStructure
+) -> UnknownArrays:
     """Derivatives of the sum of q over the rows of a group with respect to the state."""
     n, size = state.position.shape[1:]
     of_images = jnp.concatenate([state.rotation.reshape(9, n, size), state.position]).transpose(1, 0, 2)
@@ -163,7 +171,7 @@ def _group_cotangent(group: CameraGroup, rows: RowList, state: State, seen: tupl
     sums, _ = jax.lax.scan(add, zero, rows)
     # Of all cotangents of a matrix R that changes by -t x R, the one along such changes.
     rotation = -0.5 * jnp.cross(sums.turn.transpose(1, 0, 2)[:, None], state.rotation, axis=0)
-    return State(sums.centre.transpose(1, 0, 2), rotation, sums.shared, sums.points.transpose(1, 0, 2))
+    return UnknownArrays(sums.centre.transpose(1, 0, 2), rotation, sums.shared, sums.points.transpose(1, 0, 2))
 
 
 def _with_chunk(
@@ -174,7 +182,7 @@ def _with_chunk(
     of_points: Float[Array, "points 3 draws"],
     shared: Float[Array, "parameters draws"],
     seen: tuple[Array, Array],
-    s: Structure,
+    s: TiledStructure,
 ) -> _Sums:
     """The sums with one chunk of rows added."""
     rotation_of = lambda image: image[:9].reshape(3, 3)  # noqa: E731
@@ -202,11 +210,13 @@ def _with_chunk(
         _, pull = jax.vjp(lambda centre, point: apparent_point(centre, point, s.corrections), image[9:], point)
         return pull(to_aim)
 
-    u = once(lambda i, p: _each_row(from_place, _at(i, rows.image), _at(p, rows.point)), s, of_images, of_points)
+    u = once(
+        lambda i, p: _each_row(from_place, _at(i, rows.image), _at(p, rows.point)), s.eop_free, of_images, of_points
+    )
     xy, sigma = (v[:, rows.row] for v in seen)
     weight = jnp.expand_dims(rows.counts, range(1, sigma.ndim - 1)) / sigma
     to_chosen, to_u = _camera_cotangent(group, rows, shared, u, (xy, weight), s)
-    to_aim = once(lambda i, to_u: _each_row(back_to_aim, _at(i, rows.image), to_u), s, of_images, to_u)
+    to_aim = once(lambda i, to_u: _each_row(back_to_aim, _at(i, rows.image), to_u), s.eop_free, of_images, to_u)
     to_centre, to_point = 0.0, to_aim
     if s.corrections != NO_CORRECTIONS:
         to_centre, to_point = _each_row(back_to_place, _at(of_images, rows.image), _at(of_points, rows.point), to_aim)
@@ -237,7 +247,7 @@ def _camera_cotangent(
     shared: Float[Array, "parameters draws"],
     u: tuple[Array, ...],
     seen: tuple[Array, Array],
-    s: Structure,
+    s: TiledStructure,
 ) -> tuple[Array, tuple[Array, ...]]:
     """dq/d(shared), summed over the rows of a group, and dq/du of each."""
     m, cameras = group.treedef.num_leaves, len(group.names)
@@ -273,8 +283,8 @@ def _camera_cotangent(
         return jax.vmap(of_draws, (of_camera, 0, of_camera, 1, row_axis))
 
     given = chosen, u, leaves, seen[0]
-    to_residual = once(each(weighed, weight_last, 1), s, *given, seen[1])
-    to_chosen, to_u = (once(each(by, -1, 0), s, *given, to_residual) for by in (back_to_camera, back_to_u))
+    to_residual = once(each(weighed, weight_last, 1), s.eop_free, *given, seen[1])
+    to_chosen, to_u = (once(each(by, -1, 0), s.eop_free, *given, to_residual) for by in (back_to_camera, back_to_u))
     cotangent = jnp.zeros_like(shared)
     for k, of_rows in zip(group.free_leaves, to_chosen, strict=True):
         if cameras > 1:

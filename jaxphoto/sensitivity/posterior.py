@@ -7,7 +7,7 @@ Least squares reports the optimum and the inverse of the normal matrix: the Lapl
 It is the posterior itself where residuals are linear in the unknowns; where c, flying height and heights of points go
 along a curved valley, it is not. Here the whole posterior is sampled by the No-U-Turn sampler, in coordinates z in
 which the Laplace approximation is a standard normal distribution. With V = L L' of the points, A = M M' of the
-reduced unknowns and F as in adjustment/normal.py,
+reduced unknowns and F as in adjustment/solver/normal.py,
 
     x_r = M'^-1 z_r,   x_p = L'^-1 (z_p - F' x_r)
 
@@ -29,21 +29,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Scalar
 
-from jaxphoto.adjustment import Adjustment
-from jaxphoto.adjustment.band import Band, BandFactor, dense, solve_band
-from jaxphoto.adjustment.elimination import gradient, reduce_right, solve_factored, solve_reduced
-from jaxphoto.adjustment.normal import At, Reduced, whiten
-from jaxphoto.adjustment.optimum import weigh_datum, zero_increments
-from jaxphoto.adjustment.residuals import Increments, Values, state_at
-from jaxphoto.adjustment.result import Factored
-from jaxphoto.adjustment.structure import Structure, structure_of
+from jaxphoto.adjustment import Adjustment, At, NormalEquations
+from jaxphoto.adjustment.model.residuals import Increments, state_at
 from jaxphoto.arrays import still
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import InputError
 from jaxphoto.observations import AXES
 from jaxphoto.rotation import omega_phi_kappa_from_matrix
+from jaxphoto.small_matrices import whiten
 from jaxphoto.statistics import EOP_NAMES
-from jaxphoto.unknowns import FREE, uniform_priors
 
 try:
     import blackjax
@@ -146,10 +140,10 @@ def posterior(
             raise InputError(f"{name} is {least} at least, got {number}: ask for more")
     if not bool(adjusted.converged):
         raise InputError(f"there is no optimum to sample about; {adjusted.outcome.value}")
-    padded = adjusted.computed.on_one_device
+    equations = adjusted.equations.on_one_device
     chosen = _places(adjusted, parameters)
-    free = np.flatnonzero(_flat(jax.tree.map(np.asarray, padded.factored.scale), np))
-    given = padded.values, padded.factored, padded.structure, chosen
+    free = np.flatnonzero(_flat(jax.tree.map(np.asarray, equations.scale), np))
+    given = equations, chosen
     optimum, laplace = map(still, call_compiled(_laplace, *given))
     samples, divergences, gradients = map(
         still, call_compiled(_sample, *given, free, np.array(seed), chains, draws, warmup)
@@ -169,8 +163,8 @@ def posterior(
 
 def _places(adjusted: Adjustment, parameters: Sequence[str]) -> Int[np.ndarray, " parameters"]:
     """Where `parameters` lie among all numbers of the padded state (`_numbers`)."""
-    block, s, padded = adjusted.block, adjusted.structure, adjusted.computed
-    n, q, image, point = padded.structure.n_images, s.n_shared, padded.places.image, padded.places.point
+    block, s, tiled = adjusted.block, adjusted.structure, adjusted.tiled
+    n, q, image, point = tiled.structure.n_images, s.n_shared, tiled.places.image, tiled.places.point
     names = EOP_NAMES["omega_phi_kappa"]
     exterior = {
         f"exterior[{block.images[i]}].{names[k]}": 6 * image[i] + k
@@ -178,7 +172,7 @@ def _places(adjusted: Adjustment, parameters: Sequence[str]) -> Int[np.ndarray, 
     }
     shared = {label: 6 * n + j for j, label in enumerate(s.labels)}
     points = {
-        f"points[{block.points[p]}].{AXES[k]}": 6 * n + q + k * padded.structure.n_points + point[p]
+        f"points[{block.points[p]}].{AXES[k]}": 6 * n + q + k * tiled.structure.n_points + point[p]
         for k, p in zip(*np.nonzero(s.point_free), strict=True)
     }
     places = exterior | shared | points
@@ -192,10 +186,10 @@ def _places(adjusted: Adjustment, parameters: Sequence[str]) -> Int[np.ndarray, 
 
 def _sentence(wrong: str, known: list[str], adjusted: Adjustment) -> str:
     """What is the matter with a parameter that is not among the unknowns."""
-    block, unknowns = adjusted.block, adjusted.unknowns
+    block = adjusted.block
     every = [
         *(f"exterior[{i}].{name}" for i in block.images for name in EOP_NAMES["omega_phi_kappa"]),
-        *structure_of(block, uniform_priors(unknowns, FREE)).labels,
+        *adjusted.parameters,
         *(f"points[{p}].{axis}" for p in block.points for axis in AXES),
     ]
     if wrong in every:
@@ -207,10 +201,7 @@ def _sentence(wrong: str, known: list[str], adjusted: Adjustment) -> str:
 class _White(NamedTuple):
     """Coordinates z of the unknowns that are free; see the module's head."""
 
-    there: At
-    """The optimum."""
-    reduced: Reduced
-    factor: BandFactor
+    equations: NormalEquations
     triangle: Float[Array, "reduced reduced"]
     """M of A = M M'."""
     free: Int[Array, "free"]
@@ -219,23 +210,20 @@ class _White(NamedTuple):
     """Orthonormal rows that span the constraints of the datum in z."""
 
     @classmethod
-    def at_optimum(cls, values: Values, factored: Factored, s: Structure, free: Int[Array, "free"]) -> "_White":
+    def at_optimum(cls, equations: NormalEquations, free: Int[Array, "free"]) -> "_White":
         """The coordinates."""
-        values, scale, f = weigh_datum(values, s), factored.scale, factored.factor
-        triangle = jnp.tril(dense(Band(*f)))
-        there = At(zero_increments(s), scale, values, s)
-        white = cls(there, factored.reduced, f, triangle, free, jnp.zeros((0, len(free))))
-        rows = jax.vmap(white.whitened)(_constraints(there, factored.n_constraints))
+        white = cls(equations.weighed, equations.triangle(), free, jnp.zeros((0, len(free))))
+        rows = jax.vmap(white.whitened)(equations.constraints())
         return white._replace(held=jnp.linalg.qr(rows.T)[0].T)
 
     def increments(self, z: Float[Array, "free"]) -> Increments:
         """x of z."""
-        r, (l11, l21, l22, l31, l32, l33) = len(self.triangle), self.reduced.l
+        reduced = self.equations.factored.reduced
+        r, (l11, l21, l22, l31, l32, l33) = len(self.triangle), reduced.l
         full = jnp.zeros(r + 3 * len(l11)).at[self.free].set(self.without_open(z))
         p1, p2, p3 = full[r:].reshape(3, -1)
         points = jnp.stack([l11 * p1, l21 * p1 + l22 * p2, l31 * p1 + l32 * p2 + l33 * p3])
-        right, nothing = self.triangle @ full[:r], jnp.zeros(len(self.reduced.k))
-        return solve_reduced(self.reduced, self.factor, right, nothing, points, self.there)
+        return self.equations.expand(self.triangle @ full[:r], jnp.zeros(len(reduced.k)), points)
 
     def without_open(self, z: Float[Array, "free"]) -> Float[Array, "free"]:
         """z on the plane that the constraints of the datum hold."""
@@ -243,19 +231,20 @@ class _White(NamedTuple):
 
     def whitened(self, row: Increments) -> Float[Array, "free"]:
         """The derivative by z of what has the derivative `row` by x."""
-        return self._whitened(row, *reduce_right(self.reduced, row, self.there))
+        return self._whitened(row, *self.equations.reduce(row))
 
     def _whitened(self, row: Increments, right: Array, d: Array) -> Float[Array, "free"]:
+        reduced = self.equations.factored.reduced
         if len(d):
-            right = right - self.reduced.g @ jnp.linalg.solve(self.reduced.k, d)
-        half = self.triangle.T @ solve_band(self.factor, right)
-        points = jnp.stack(whiten(row.points, self.reduced.l))
+            right = right - reduced.g @ jnp.linalg.solve(reduced.k, d)
+        half = self.triangle.T @ self.equations.solve_images(right)
+        points = jnp.stack(whiten(row.points, reduced.l))
         return self.without_open(jnp.concatenate([half, points.reshape(-1)])[self.free])
 
     def slope(self, z: Float[Array, "free"]) -> tuple[Scalar, Float[Array, "free"]]:
         """Half the sum of squares and its derivative; of what the constraints hold, that of a standard normal."""
-        there, held = self.there, self.held @ z
-        b, right, d, square = gradient(there._replace(increments=self.increments(z)), self.reduced, there)
+        held = self.held @ z
+        b, right, d, square = self.equations.gradient(self.increments(z))
         return 0.5 * (square + held @ held), self._whitened(b, right, d) + self.held.T @ held
 
     def log_density(self, z: Float[Array, "free"]) -> Scalar:
@@ -264,12 +253,6 @@ class _White(NamedTuple):
         half, slope = self.slope(at)
         # Its derivative comes with it: what differentiates this sees a plane.
         return -half - slope @ (z - at)
-
-
-def _constraints(there: At, n: int) -> Increments:
-    """Derivatives of the `n` constraints of the datum, one after the other."""
-    _, scale, values, s = there
-    return Increments(values.datum_eop * scale.eop, jnp.zeros((n, s.n_shared)), values.datum_points * scale.points)
 
 
 def _flat(x: Increments, xp) -> Array:
@@ -291,27 +274,26 @@ def _numbers(x: Increments, there: At) -> Float[Array, "numbers"]:
 
 @eqx.filter_jit
 def _laplace(
-    values: Values, factored: Factored, s: Structure, chosen: Int[Array, " parameters"]
+    equations: NormalEquations, chosen: Int[Array, " parameters"]
 ) -> tuple[Float[Array, " parameters"], Float[Array, "parameters parameters"]]:
     """The chosen parameters at the optimum, and their covariance."""
-    there = At(zero_increments(s), factored.scale, weigh_datum(values, s), s)
-
+    there = equations.at
     parameters = lambda x: _numbers(x, there)[chosen]  # noqa: E731
-    rows = jax.jacrev(parameters)(zero_increments(s))
-    solved = jax.vmap(lambda row: solve_factored(factored.reduced, factored.factor, row, there))(rows)
+    rows = jax.jacrev(parameters)(there.increments)
+    solved = jax.vmap(equations.solve)(rows)
     flat = jax.vmap(partial(_flat, xp=jnp))
-    # Of the open motions the constraints leave nothing (see statistics/covariance.py).
-    along = flat(solved) @ flat(_constraints(there, factored.n_constraints)).T
-    return parameters(zero_increments(s)), flat(rows) @ flat(solved).T - along @ along.T
+    # Of the open motions the constraints leave nothing (see adjustment/solver/inverse.py).
+    along = flat(solved) @ flat(equations.constraints()).T
+    return parameters(there.increments), flat(rows) @ flat(solved).T - along @ along.T
 
 
 @eqx.filter_jit
 def _sample(
-    values: Values, factored: Factored, s: Structure, chosen: Int[Array, " parameters"], free: Int[Array, " free"],
-    seed: Int[Array, ""], chains: int, draws: int, warmup: int,
+    equations: NormalEquations, chosen: Int[Array, " parameters"], free: Int[Array, " free"], seed: Int[Array, ""],
+    chains: int, draws: int, warmup: int,
 ) -> tuple[Float[Array, "chains draws parameters"], Int[Array, " chains"], Int[Array, " chains"]]:  # fmt: skip
     """Samples of the chosen parameters; divergent draws and gradients of each chain."""
-    white = _White.at_optimum(values, factored, s, free)
+    white, there = _White.at_optimum(equations, free), equations.at
     metric, transition = jnp.ones(len(free)), blackjax.nuts.build_kernel()
     begin, update, final = blackjax.adaptation.step_size.dual_averaging_adaptation(_ACCEPTANCE)
 
@@ -330,7 +312,7 @@ def _sample(
         def draw(state, key):
             state, info = transition(key, state, white.log_density, step, metric)
             x = white.increments(state.position)
-            return state, (_numbers(x, white.there)[chosen], info.is_divergent, info.num_integration_steps)
+            return state, (_numbers(x, there)[chosen], info.is_divergent, info.num_integration_steps)
 
         _, (samples, divergent, steps) = jax.lax.scan(draw, state, jax.random.split(of_draws, draws))
         return samples, jnp.sum(divergent), jnp.sum(steps)

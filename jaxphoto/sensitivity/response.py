@@ -10,13 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxphoto.adjustment import Adjustment
-from jaxphoto.adjustment.normal import At
-from jaxphoto.adjustment.optimum import weigh_datum
-from jaxphoto.adjustment.padding import crop_state, pad_values
-from jaxphoto.adjustment.residuals import Increments, State, Values, state_at
-from jaxphoto.adjustment.structure import Structure
-from jaxphoto.adjustment.values import unknowns_of, values_of, with_datum
+from jaxphoto.adjustment import Adjustment, NormalEquations, TiledStructure, TiledValues
+from jaxphoto.adjustment.model.residuals import UnknownArrays, state_at
+from jaxphoto.adjustment.model.values import unknowns_of, values_of, with_datum
 from jaxphoto.arrays import still
 from jaxphoto.block import Block
 from jaxphoto.compiling import run_compiled
@@ -57,7 +53,7 @@ def response(
     thousand images; `jax.jvp` through `adjust` serves that.
     """
     check_optimum(adjusted)
-    s, computed = adjusted.structure, adjusted.computed.on_one_device
+    s, equations = adjusted.structure, adjusted.equations.on_one_device
     moved = values_of(
         block,
         adjusted.unknowns if start is None else start,
@@ -71,13 +67,12 @@ def response(
             "response compares numbers row by row, but the block has other rows than the adjusted one: "
             "change its values, or adjust it anew"
         )
-    values, padded = computed.values, computed.structure
-    direction = jax.tree.map(_difference, pad_values(moved, s, padded, computed.places), values)
-    scale, curved = computed.factored.scale, np.array(float(curvature))
-    arguments = (values, scale, _of_fixed(direction, padded), image_rows(adjusted), padded, curved)
+    direction = jax.tree.map(_difference, adjusted.tiled.pad(moved), equations.values)
+    moves = _of_fixed(direction, equations.structure)
+    arguments = (equations, moves, image_rows(adjusted), np.array(float(curvature)))
     state, angles = run_compiled(_response, arguments, adjusted.seconds, "sensitivity")
-    change = unknowns_of(crop_state(state, computed.places), adjusted.unknowns, s)
-    return Response(change, still(angles)[computed.places.image])
+    change = unknowns_of(adjusted.tiled.crop_state(state), adjusted.unknowns, s)
+    return Response(change, still(angles)[adjusted.tiled.places.image])
 
 
 def _difference(moved: np.ndarray, before: np.ndarray) -> np.ndarray:
@@ -86,7 +81,7 @@ def _difference(moved: np.ndarray, before: np.ndarray) -> np.ndarray:
     return np.where(both, np.where(both, moved, 0.0) - np.where(both, before, 0.0), 0.0)
 
 
-def _of_fixed(direction: Values, s: Structure) -> Values:
+def _of_fixed(direction: TiledValues, s: TiledStructure) -> TiledValues:
     """The same without what is free: where it starts does not matter."""
     shared = np.array(direction.shared)
     shared[s.free] = 0.0
@@ -104,11 +99,11 @@ def _of_fixed(direction: Values, s: Structure) -> Values:
 
 @eqx.filter_jit
 def _response(
-    values: Values, scale: Increments, direction: Values, rows: ListedRows, s: Structure, curved: jax.Array
-) -> tuple[State, jax.Array]:
-    at = At(jax.tree.map(jnp.zeros_like, scale), scale, weigh_datum(values, s), s)
+    equations: NormalEquations, direction: TiledValues, rows: ListedRows, curved: jax.Array
+) -> tuple[UnknownArrays, jax.Array]:
+    at, s = equations.at, equations.structure
     h, b = eliminated(at, rows, curved), jax.tree.map(jnp.negative, mixed_second(at, direction, curved))
-    state = lambda y, v: state_at(y, scale, v, s)  # noqa: E731
-    there, change = jax.jvp(state, (at.increments, values), (solve_eliminated(h, b, s), direction))
+    state = lambda y, v: state_at(y, at.scale, v, s)  # noqa: E731
+    there, change = jax.jvp(state, (at.increments, equations.values), (solve_eliminated(h, b, s), direction))
     angles = jax.vmap(omega_phi_kappa_from_matrix, in_axes=2)
     return change, jax.jvp(angles, (there.rotation,), (change.rotation,))[1]

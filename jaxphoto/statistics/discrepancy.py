@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxphoto.adjustment import Adjustment
-from jaxphoto.adjustment.residuals import IMAGE_POINTS
-from jaxphoto.adjustment.rows import rows_of
+from jaxphoto.adjustment.model.residuals import IMAGE_POINTS
+from jaxphoto.adjustment.model.row_functions import rows_of
 from jaxphoto.observations import AXES, AbstractObservations, ControlRows
 from jaxphoto.rotation import omega_phi_kappa_from_matrix
 

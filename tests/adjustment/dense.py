@@ -9,19 +9,19 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from jaxphoto.adjustment.adjust import concrete
-from jaxphoto.adjustment.band import factor_band
+from jaxphoto.adjustment import At
 from jaxphoto.adjustment.datum import close_datum
-from jaxphoto.adjustment.elimination import gradient, solve_factored
-from jaxphoto.adjustment.normal import At, residuals_at
-from jaxphoto.adjustment.optimum import typical_scale, weigh_datum, zero_increments
-from jaxphoto.adjustment.other_rows import OtherRows, other_rows
-from jaxphoto.adjustment.padding import crop_residuals, pad_structure, pad_values
-from jaxphoto.adjustment.reduced import reduce_normal, tile_numbers, tile_parts
-from jaxphoto.adjustment.residuals import Increments
-from jaxphoto.adjustment.structure import structure_of
-from jaxphoto.adjustment.tiles import Columns
-from jaxphoto.adjustment.values import values_of, with_datum
+from jaxphoto.adjustment.layout.padding import pad_structure
+from jaxphoto.adjustment.layout.tiled import TiledResiduals
+from jaxphoto.adjustment.model.residuals import Increments
+from jaxphoto.adjustment.model.structure import structure_of
+from jaxphoto.adjustment.model.values import values_of, with_datum
+from jaxphoto.adjustment.solver.band import factor_band
+from jaxphoto.adjustment.solver.elimination import gradient, solve_factored
+from jaxphoto.adjustment.solver.non_image_rows import NonImageRows, non_image_rows
+from jaxphoto.adjustment.solver.optimum import typical_scale, weigh_datum, zero_increments
+from jaxphoto.adjustment.solver.reduced import reduce_normal, tile_numbers, tile_parts
+from jaxphoto.adjustment.solver.tile_rows import TileJacobian
 from tests.blocks import adjusted
 
 
@@ -29,16 +29,16 @@ def with_constraints(block):
     """Values and structure at the start, in the block's own order, with the constraints of the datum."""
     structure = structure_of(block, block.priors)
     values = values_of(block, block.start.unknowns, block.priors, structure)
-    constraints = close_datum(block, concrete(values, block), structure)
+    constraints = close_datum(block, values, structure)
     return with_datum(values, constraints.eop, constraints.points), structure
 
 
 def prepared(block, **layout):
-    """The same, padded, and where everything went."""
+    """The same in tiles, and where everything went."""
     values, structure = with_constraints(block)
     coupled = len(values.datum_eop) > 0 or bool(structure.coupled)
-    padded, places = pad_structure(structure, dense=coupled, **layout)
-    return pad_values(values, structure, padded, places), padded, places
+    tiled = pad_structure(structure, dense=coupled, **layout)
+    return tiled.pad(values), tiled.structure, tiled
 
 
 DAMPINGS = (0.0, 0.7)
@@ -52,9 +52,9 @@ class Dense(NamedTuple):
 
     jacobian: np.ndarray
     residuals: np.ndarray
-    columns: Columns
+    columns: TileJacobian
     """Of image rows: eop (6, 2, rows), and so on."""
-    others: OtherRows
+    others: NonImageRows
     vector: np.ndarray
     gradient: np.ndarray
     sums: np.ndarray
@@ -90,9 +90,9 @@ def at_optimum(name: str) -> Dense:
 
 def dense_of(a) -> Dense:
     """Of any adjustment."""
-    padded = a.computed
-    whole = jax.tree.map(np.asarray, _dense(padded.values, padded.structure))
-    unknowns, rows = own_order(padded.values, a.structure, padded.structure, padded.places)
+    equations = a.equations
+    whole = jax.tree.map(np.asarray, _dense(equations.values, equations.structure))
+    unknowns, rows = own_order(equations.values, a.tiled)
     image = rows[: 2 * len(a.structure.image)].reshape(2, -1)
 
     def by_row(v):
@@ -100,7 +100,7 @@ def dense_of(a) -> Dense:
         return np.stack(parts) if parts else np.zeros((0, *image.shape))
 
     c = whole.columns
-    columns = Columns(c.residual.reshape(-1)[image], *map(by_row, (c.eop, c.shared, c.point)))
+    columns = TileJacobian(c.residual.reshape(-1)[image], *map(by_row, (c.eop, c.shared, c.point)))
     names = ("vector", "gradient", "sums", "solutions", "scale")
     return whole._replace(
         jacobian=whole.jacobian[np.ix_(rows, unknowns)],
@@ -123,16 +123,24 @@ def in_order(residuals) -> np.ndarray:
     return np.concatenate([np.ravel(v) for v in (*residuals.named.values(), residuals.datum)])
 
 
-def own_order(values, structure, padded, places):
-    """Of the block's own unknowns and residuals, in their order: their places among the padded ones."""
+def in_one_list(residuals):
+    """Residuals in tiles as one list: image points, the other groups, the datum."""
+    return jnp.concatenate([jnp.ravel(v) for v in (residuals.image, *residuals.others, residuals.datum)])
+
+
+def own_order(values, tiled):
+    """Of the block's own unknowns and residuals, in their order: their places among those in tiles."""
+    padded, places = tiled.structure, tiled.places
     zero = zero_increments(padded)
     flat, back = ravel_pytree(zero)
     index = back(jnp.arange(len(flat), dtype=float))
     own = (index.eop[:, places.image], index.shared, index.points[:, places.point])
     unknowns = np.concatenate([np.ravel(v) for v in own]).astype(int)
-    like = jax.eval_shape(lambda v: residuals_at(At(zero, zero, v, padded)), values)
-    flat, back = ravel_pytree(jax.tree.map(lambda v: np.zeros(v.shape), like))
-    rows = crop_residuals(back(jnp.arange(len(flat), dtype=float)), structure, places)
+    like = jax.eval_shape(lambda v: At(zero, zero, v, padded).residuals(), values)
+    leaves = (like.image, *like.others, like.datum)
+    flat, back = ravel_pytree([np.zeros(v.shape) for v in leaves])
+    image, *others, datum = back(jnp.arange(len(flat), dtype=float))
+    rows = tiled.crop_residuals(TiledResiduals(tuple(others), datum, like.names, image))
     return unknowns, in_order(rows).astype(int)
 
 
@@ -143,9 +151,9 @@ def _dense(values, structure) -> Dense:
     zero = zero_increments(structure)
     at = At(zero, scale, values, structure)
     flat, back = ravel_pytree(zero)
-    fn = jax.jit(lambda y: residuals_at(at._replace(increments=y)))
+    fn = jax.jit(lambda y: at._replace(increments=y).residuals())
     residuals, product = jax.linearize(fn, zero)
-    rest = other_rows(at)
+    rest = non_image_rows(at)
     both = jax.vmap(jax.vmap(lambda n: tile_parts(at, 0.0, rest.coupled)(n).columns))(tile_numbers(at, rest))
     columns = jax.tree.map(lambda x, y: jnp.stack([x, y], axis=-3), *both)
     flat_scale = ravel_pytree(scale)[0]
@@ -160,8 +168,8 @@ def _dense(values, structure) -> Dense:
     reduced, right = jax.tree.map(lambda v: v[DAMPINGS.index(0.0)], undamped)
     b, down, d, squares = gradient(at, reduced, at)
     return Dense(
-        jacobian=jax.vmap(lambda seed: ravel_pytree(product(back(seed)))[0], out_axes=1)(jnp.eye(len(flat))),
-        residuals=ravel_pytree(residuals)[0],
+        jacobian=jax.vmap(lambda seed: in_one_list(product(back(seed))), out_axes=1)(jnp.eye(len(flat))),
+        residuals=in_one_list(residuals),
         columns=columns,
         others=rest,
         vector=vector,

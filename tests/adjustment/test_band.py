@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from jax.sharding import Mesh, PartitionSpec
 
-from jaxphoto.adjustment.band import (
+from jaxphoto.adjustment.layout.tile_layout import column_blocks
+from jaxphoto.adjustment.solver.band import (
     Band,
     BandFactor,
-    column_blocks,
     dense,
     diagonal_of,
     factor_band,

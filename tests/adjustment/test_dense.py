@@ -9,17 +9,16 @@ import scipy.optimize
 from jax.flatten_util import ravel_pytree
 
 from jaxphoto import adjust, covariance
-from jaxphoto.adjustment.band import factor_band
-from jaxphoto.adjustment.elimination import gradient, solve_factored, solve_reduced
-from jaxphoto.adjustment.layout import sizes_of
-from jaxphoto.adjustment.normal import At, residuals_at
-from jaxphoto.adjustment.optimum import typical_scale, unit_scale, weigh_datum, zero_increments
-from jaxphoto.adjustment.padding import crop_state
-from jaxphoto.adjustment.reduced import reduce_normal
-from jaxphoto.adjustment.residuals import state_at
-from jaxphoto.adjustment.structure import structure_of
+from jaxphoto.adjustment import At
+from jaxphoto.adjustment.layout.tile_layout import sizes_of
+from jaxphoto.adjustment.model.residuals import state_at
+from jaxphoto.adjustment.model.structure import structure_of
+from jaxphoto.adjustment.solver.band import factor_band
+from jaxphoto.adjustment.solver.elimination import gradient, solve_factored, solve_reduced
+from jaxphoto.adjustment.solver.optimum import typical_scale, unit_scale, weigh_datum, zero_increments
+from jaxphoto.adjustment.solver.reduced import reduce_normal
 from jaxphoto.statistics import redundancy_numbers
-from tests.adjustment.dense import DAMPINGS, assemble, at_optimum, prepared, split
+from tests.adjustment.dense import DAMPINGS, assemble, at_optimum, in_one_list, prepared, split
 from tests.blocks import FIELDS, VARIANTS, adjusted, covariance_of, simulated
 from tests.marks import slow_but
 
@@ -77,7 +76,7 @@ def test_many_tiles_solve_the_normal_equations(name, damping):
     block = simulated(name).block
     sizes = sizes_of(structure_of(block, block.priors))._replace(tiles=50, tile_images=24, tile_points=16)
     values, s, _ = prepared(block, sizes=sizes)
-    assert not s.in_tiles.few and s.in_tiles.groups.max() < s.in_tiles.image.shape[1] // s.in_tiles.at_once
+    assert not s.tiles.few and s.tiles.groups.max() < s.tiles.image.shape[1] // s.tiles.at_once
     # An array, so that one program serves all of them.
     b, *others = _solved(weigh_datum(values, s), s, np.asarray(damping))
     for found in others:
@@ -92,7 +91,7 @@ def _solved(values, s, damping):
     at = At(zero_increments(s), scale, values, s)
     a, reduced, right = reduce_normal(at, damping)
     factor = factor_band(a)
-    _, push = jax.linearize(lambda y: residuals_at(at._replace(increments=y)), at.increments)
+    _, push = jax.linearize(lambda y: at._replace(increments=y).residuals(), at.increments)
     pull = jax.linear_transpose(push, at.increments)
 
     def multiplied(x):
@@ -193,7 +192,7 @@ def test_redundancy_numbers(name):
 @pytest.mark.parametrize("name", slow_but(("inner",), ("everything", "inner")))
 def test_scipy_finds_the_same_optimum(name):
     """scipy's dense least squares on the same residuals, from the same start."""
-    values, s, places = prepared(simulated(name).block)
+    values, s, tiled = prepared(simulated(name).block)
     _, back = ravel_pytree(zero_increments(s))
 
     def setup(values):
@@ -201,7 +200,7 @@ def test_scipy_finds_the_same_optimum(name):
         return values, typical_scale(values, s)
 
     values, scale = jax.jit(setup)(values)
-    of = lambda x: ravel_pytree(residuals_at(At(back(x), scale, values, s)))[0]  # noqa: E731
+    of = lambda x: in_one_list(At(back(x), scale, values, s).residuals())  # noqa: E731
     fn = jax.jit(of)
     jac = jax.jit(jax.jacfwd(of))
     free = np.asarray(ravel_pytree(scale)[0]) > 0
@@ -224,7 +223,7 @@ def test_scipy_finds_the_same_optimum(name):
     a = adjusted(name)
     assert abs(2 * found.cost / float(a.square_sum) - 1) < 1e-9
     increments = jax.tree.map(lambda y, k: y * k, back(spread(found.x)), scale)
-    state = crop_state(jax.jit(lambda x: state_at(x, unit_scale(s), values, s))(increments), places)
+    state = tiled.crop_state(jax.jit(lambda x: state_at(x, unit_scale(s), values, s))(increments))
     cov = covariance_of(name)
     sigma = np.sqrt(np.diag(np.asarray(cov.matrix)))
     exterior = sigma[: 6 * a.structure.n_images].reshape(-1, 6)

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from jaxphoto import adjust, covariance
-from jaxphoto.adjustment import layout, solver
-from jaxphoto.adjustment.padding import pad_structure
-from jaxphoto.adjustment.structure import structure_of
+from jaxphoto.adjustment.layout import tile_layout
+from jaxphoto.adjustment.layout.padding import pad_structure
+from jaxphoto.adjustment.model.structure import structure_of
+from jaxphoto.adjustment.solver import levenberg_marquardt
 from jaxphoto.statistics import redundancy_numbers
 from tests.blocks import BROWN, Scene, adjusted, all_stations, bare, free, measured, rows, simulated
 
@@ -58,10 +59,10 @@ def assert_same(one, other):
 @pytest.mark.slow
 def test_a_banded_reduced_matrix_gives_what_a_dense_one_gives(corridor, monkeypatch):
     start = corridor.start.unknowns
-    padded, _ = pad_structure(structure_of(corridor, corridor.priors))
+    padded = pad_structure(structure_of(corridor, corridor.priors)).structure
     assert padded.tiles.columns >= 5
     banded = everything(corridor, start)
-    monkeypatch.setattr(layout, "column_blocks", lambda n, bandwidth: (1, n))
+    monkeypatch.setattr(tile_layout, "column_blocks", lambda n, bandwidth: (1, n))
     assert_same(banded, everything(corridor, start))
 
 
@@ -69,10 +70,10 @@ def test_a_banded_reduced_matrix_gives_what_a_dense_one_gives(corridor, monkeypa
 def test_one_small_tile_at_a_time_gives_what_many_together_give(monkeypatch):
     block, start = simulated("three_models").block, adjusted("three_models").unknowns
     together = everything(block, start)
-    monkeypatch.setattr(layout, "_SLOTS", 1)
-    monkeypatch.setattr(layout, "_CHUNK", 20_000)
-    monkeypatch.setattr(layout, "tile_shape", lambda *a: (12, 4))
-    padded, _ = pad_structure(structure_of(block, block.priors))
+    monkeypatch.setattr(tile_layout, "_SLOTS", 1)
+    monkeypatch.setattr(tile_layout, "_CHUNK", 20_000)
+    monkeypatch.setattr(tile_layout, "tile_shape", lambda *a: (12, 4))
+    padded = pad_structure(structure_of(block, block.priors)).structure
     assert padded.tiles.at_once == 1
     assert len(padded.tiles.image) > 1
     assert_same(together, everything(block, start))
@@ -83,7 +84,7 @@ def test_chords_end_where_full_steps_end(monkeypatch):
     """Compiled apart, and kept nowhere: the constant is part of the program."""
     block = simulated("cross").block
     with_chords = everything(block, block.start.unknowns)
-    monkeypatch.setattr(solver, "_CHORD", 0.0)
+    monkeypatch.setattr(levenberg_marquardt, "_CHORD", 0.0)
     monkeypatch.setattr("jaxphoto.compiling.run._programs", {})
     monkeypatch.setattr("jaxphoto.compiling.store.key_of", lambda *a: None)
     without = everything(block, block.start.unknowns)

@@ -5,10 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from jaxphoto.adjustment.layout import LEAST, sizes_of
-from jaxphoto.adjustment.padding import pad_structure, pad_values
-from jaxphoto.adjustment.structure import structure_of
-from jaxphoto.adjustment.values import values_of
+from jaxphoto.adjustment import LEAST
+from jaxphoto.adjustment.layout.padding import pad_structure
+from jaxphoto.adjustment.layout.tile_layout import sizes_of
+from jaxphoto.adjustment.model.structure import structure_of
+from jaxphoto.adjustment.model.values import values_of
 from jaxphoto.sensitivity import response, sensitivity
 from tests.blocks import FIELDS, adjusted, simulated
 
@@ -17,15 +18,15 @@ def laid_out(name, **options):
     block = simulated(name).block
     structure = structure_of(block, block.priors)
     values = values_of(block, block.start.unknowns, block.priors, structure)
-    s, places = pad_structure(structure, **options)
-    return structure, values, s, places, pad_values(values, structure, s, places)
+    tiled = pad_structure(structure, **options)
+    return structure, values, tiled.structure, tiled.places, tiled.pad(values)
 
 
 @pytest.mark.parametrize("shards", [1, 2])
 @pytest.mark.parametrize("name", FIELDS)
 def test_every_row_lies_in_its_image_and_at_its_point(name, shards):
     structure, values, s, places, padded = laid_out(name, shards=shards)
-    tiles, p = s.in_tiles, s.in_tiles.per_tile
+    tiles, p = s.tiles, s.tiles.per_tile
     tile, slot = np.divmod(places.row, tiles.image.shape[2] * p)
     assert (tiles.image.reshape(-1, tiles.image.shape[2])[tile, slot // p] == places.image[structure.image]).all()
     at = tile * p + slot % p
@@ -43,7 +44,7 @@ def test_points_that_are_free_lie_at_one_place_and_fixed_ones_at_several(name):
     assert (often[free] == 1).all()
     assert (often[~free] > 1).any()
     assert (places.point_at[places.point] == np.arange(structure.n_points)).all()
-    assert s.in_tiles.free_points == free.any()
+    assert s.tiles.free_points == free.any()
     assert s.point_free.sum() == structure.point_free.sum()
 
 
@@ -56,7 +57,7 @@ def test_a_field_asks_for_tiles_no_wider_than_its_free_points_do():
 
 def test_images_that_meet_in_fixed_points_only_do_not_meet():
     structure, _, s, places, _ = laid_out("field")
-    assert s.in_tiles.pair_tile.size == 0
+    assert s.tiles.pair_tile.size == 0
     assert sizes_of(structure).bandwidth == LEAST.bandwidth
     assert sorted(places.image.tolist()) == list(range(structure.n_images))
 

@@ -7,10 +7,10 @@ from hypothesis import strategies as st
 
 from jaxphoto import adjust, covariance
 from jaxphoto.adjustment import common_sizes
-from jaxphoto.adjustment.layout import sizes_of
-from jaxphoto.adjustment.padding import pad_structure
-from jaxphoto.adjustment.structure import structure_of
-from jaxphoto.adjustment.tiling import TILES, size_class
+from jaxphoto.adjustment.layout.padding import pad_structure
+from jaxphoto.adjustment.layout.tile_layout import sizes_of
+from jaxphoto.adjustment.layout.tiling import TILE_STEP, size_class
+from jaxphoto.adjustment.model.structure import structure_of
 from jaxphoto.block import Block
 from jaxphoto.compiling import run
 from jaxphoto.statistics import redundancy_numbers
@@ -42,7 +42,7 @@ def test_blocks_of_similar_size_share_what_is_compiled():
     kinds = set()
     for k, change in enumerate(np.linspace(-0.25, 0.25, 6)):
         block = strips(round(11 * (1 + change / 2)), round(150 * (1 + change)), seed=k)
-        padded, _ = pad_structure(structure_of(block, block.priors))
+        padded = pad_structure(structure_of(block, block.priors)).structure
         leaves, tree = jax.tree.flatten(padded)
         kinds.add((tuple(map(np.shape, leaves)), tree))
     assert len(kinds) == 1
@@ -53,10 +53,11 @@ def test_a_padded_structure_has_the_sizes_asked_for():
         block = simulated(name).block
         structure = structure_of(block, block.priors)
         sizes = sizes_of(structure)._replace(blocks=333, rows=(("stations", 150),))
-        s, places = pad_structure(structure, sizes)
+        tiled = pad_structure(structure, sizes)
+        s, places = tiled.structure, tiled.places
         assert s.tiles.block.shape[1] >= 333
         assert all(g.n_rows >= 150 for g in s.observed if g.name == "stations")
-        assert s.tiles.image.shape[1] % TILES == 0
+        assert s.tiles.image.shape[1] % TILE_STEP == 0
         assert s.n_images > structure.n_images
         # What is padding depends on nothing and is held.
         assert (np.diff(s.tiles.pair_block) >= 0).all()

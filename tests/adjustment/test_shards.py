@@ -18,7 +18,7 @@ import pytest
 
 import jaxphoto
 from jaxphoto.adjustment import Adjustment, adjust
-from jaxphoto.adjustment.shards import mesh_of, usable
+from jaxphoto.devices import mesh_of, usable
 from jaxphoto.statistics.reliability import redundancy_numbers
 from tests.blocks import free_network, from_afar, simulated
 
@@ -73,7 +73,7 @@ def main(cases: str, folder: str) -> None:
         with mock.patch.object(adjust, "_devices_worth_using", lambda rows, n=n: usable(int(n))):
             result = jaxphoto.adjust(block, block.start.unknowns)
         assert result.outcome is jaxphoto.Outcome.CONVERGED
-        held = result.computed.structure.in_tiles.shards
+        held = result.equations.structure.tiles.shards
         np.savez(Path(folder) / f"{name}_{n}_{process}.npz", shards=held, **numbers_of(result))
 
 

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from jaxphoto import adjust
-from jaxphoto.adjustment.normal import At, residuals_at
-from jaxphoto.adjustment.optimum import unit_scale, zero_increments
-from jaxphoto.adjustment.similarity import onto_datum, open_motions
+from jaxphoto.adjustment import At
+from jaxphoto.adjustment.solver.optimum import unit_scale, zero_increments
+from jaxphoto.adjustment.solver.similarity import onto_datum, open_motions
 from jaxphoto.observations import Distances
 from jaxphoto.rotation import small_rotation
 from tests.adjustment.dense import prepared
@@ -26,7 +26,7 @@ def test_a_similarity_meets_the_constraints_and_changes_nothing_else(kind, dista
     draw = lambda v, size: jnp.asarray(rng.normal(0, size, v.shape))  # noqa: E731
     y = eop.at[:3].set(draw(eop[:3], 80.0)).at[3:].set(draw(eop[3:], 0.2)), shared, draw(points, 40.0)
     at = At(type(zero_increments(s))(*y), unit_scale(s), values, s)
-    before, after = (residuals_at(a) for a in (at, at._replace(increments=onto_datum(at))))
+    before, after = (a.residuals() for a in (at, at._replace(increments=onto_datum(at))))
     assert np.abs(before.datum).min() > 1.0
     np.testing.assert_allclose(after.datum, 0.0, atol=1e-8)
     np.testing.assert_allclose(after.image, before.image, rtol=1e-7, atol=1e-7 * np.abs(before.image).max())

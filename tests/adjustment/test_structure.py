@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxphoto import adjust
-from jaxphoto.adjustment.structure import structure_of
+from jaxphoto.adjustment.model.structure import structure_of
 from jaxphoto.block import Start
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import BlockError

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxphoto.adjustment.padding import pad_structure
-from jaxphoto.adjustment.structure import structure_of
-from jaxphoto.adjustment.tiling import order_images, tile_points, tile_shape
+from jaxphoto.adjustment.layout.padding import pad_structure
+from jaxphoto.adjustment.layout.tiling import order_images, tile_points, tile_shape
+from jaxphoto.adjustment.model.structure import structure_of
 from tests.blocks import FIELDS, VARIANTS, simulated
 
 
@@ -62,7 +62,8 @@ def test_lists_of_pairs_are_all_pairs_of_images_that_share_a_tile(name, shards):
     """Of a tile's images those that see a free point in it."""
     block = simulated(name).block
     structure = structure_of(block, block.priors)
-    s, places = pad_structure(structure, shards=shards)
+    tiled = pad_structure(structure, shards=shards)
+    s, places = tiled.structure, tiled.places
     slots = np.zeros((*s.tiles.image.shape, s.tiles.per_tile), bool)
     slots.reshape(-1)[places.row] = structure.point_free.any(axis=0)[structure.point]
     of_free = slots.any(axis=-1)

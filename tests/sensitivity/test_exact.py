@@ -10,13 +10,12 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 from jaxphoto import FIXED, Weighted, adjust, covariance
-from jaxphoto.adjustment.normal import At, residuals_at
-from jaxphoto.adjustment.optimum import weigh_datum
-from jaxphoto.adjustment.shared import shared_vector
+from jaxphoto.adjustment import At
+from jaxphoto.adjustment.model.parameter_tables import shared_vector
 from jaxphoto.errors import InputError
 from jaxphoto.sensitivity.exact import sensitivity
 from jaxphoto.sensitivity.response import response
-from tests.adjustment.dense import couples, own_order
+from tests.adjustment.dense import couples, in_one_list, own_order
 from tests.blocks import adjusted, simulated
 
 POINTS = ("p1", "p17")
@@ -205,11 +204,10 @@ class _Exterior:
 def test_first_order_matrix_is_the_dense_one() -> None:
     """-N^-1 J' dr of the distances of a free network, from the dense Jacobian of all residuals."""
     a = nominal("inner")
-    s, scale = a.computed.structure, a.computed.factored.scale
-    values = weigh_datum(a.computed.values, s)
+    s, scale, values = a.equations.structure, a.equations.scale, a.equations.weighed.values
     flat, back = ravel_pytree(jax.tree.map(np.zeros_like, scale))
-    at = lambda y: ravel_pytree(residuals_at(At(back(y), scale, values, s)))[0]  # noqa: E731
-    unknowns, rows = own_order(values, a.structure, s, a.computed.places)
+    at = lambda y: in_one_list(At(back(y), scale, values, s).residuals())  # noqa: E731
+    unknowns, rows = own_order(values, a.tiled)
     j = np.asarray(jax.jit(jax.jacfwd(at))(flat))[np.ix_(rows, unknowns)]
     coupled = j[couples(a)]
     distances = coupled[: len(coupled) - len(a.residuals.datum)]

@@ -1,5 +1,7 @@
 """`jax.grad` through an adjustment and its statistics, inside `jit` and `vmap`."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -7,7 +9,6 @@ import numpy as np
 import pytest
 
 from jaxphoto import adjust, covariance
-from jaxphoto.adjustment.result import Unfactored
 from tests.blocks import adjusted
 
 STATION = 14
@@ -49,7 +50,7 @@ def test_gradient_of_statistics_in_jit_and_vmap() -> None:
 
 
 def test_statistics_of_a_batch_are_asked_for_inside() -> None:
-    computed = adjusted("cross").computed
-    values = jax.tree.map(lambda v: np.stack([v, v]), computed.values)
+    nominal = adjusted("cross")
+    values = jax.tree.map(lambda v: np.stack([v, v]), nominal.tiled_values)
     with pytest.raises(ValueError, match="inside the function that jax"):
-        Unfactored(computed.structure, values, computed.places).padded()
+        _ = dataclasses.replace(nominal, tiled_values=values, factored=None).equations

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from jaxphoto import adjust
-from jaxphoto.adjustment.normal import At, residuals_at
-from jaxphoto.adjustment.optimum import weigh_datum
-from jaxphoto.adjustment.residuals import Increments
+from jaxphoto.adjustment import At
+from jaxphoto.adjustment.model.residuals import Increments
 from jaxphoto.georeferencing import Corrections
 from jaxphoto.sensitivity import image_rows as listed
 from jaxphoto.sensitivity.hessian import image_columns
@@ -37,13 +36,13 @@ def dense_products():
     Compiled once, beside them: which of the columns of shared unknowns there are.
     """
     a = corrected()
-    computed, own = a.computed, a.structure
-    s, scale = computed.structure, jax.tree.map(jnp.asarray, computed.factored.scale)
-    values, zero = jax.tree.map(jnp.asarray, weigh_datum(computed.values, s)), jax.tree.map(jnp.zeros_like, scale)
-    tile, slot = np.divmod(computed.places.row[ROW], s.in_tiles.image.shape[2] * s.in_tiles.per_tile)
-    chunk, tile = np.divmod(tile, s.in_tiles.image.shape[1])
-    m, p = np.divmod(slot, s.in_tiles.per_tile)
-    image, point = computed.places.image[own.image[ROW]], computed.places.point[own.point[ROW]]
+    own, places, equations = a.structure, a.tiled.places, a.equations
+    s, scale = equations.structure, jax.tree.map(jnp.asarray, equations.scale)
+    values, zero = jax.tree.map(jnp.asarray, equations.weighed.values), jax.tree.map(jnp.zeros_like, scale)
+    tile, slot = np.divmod(places.row[ROW], s.tiles.image.shape[2] * s.tiles.per_tile)
+    chunk, tile = np.divmod(tile, s.tiles.image.shape[1])
+    m, p = np.divmod(slot, s.tiles.per_tile)
+    image, point = places.image[own.image[ROW]], places.point[own.point[ROW]]
     columns = np.asarray(image_columns(s))[image, 6:] - 6 * s.n_images
 
     def half_square(y, xy, curved):
@@ -51,7 +50,7 @@ def dense_products():
         shared = zero.shared.at[columns].add(y[9:], mode="drop")
         moved = Increments(zero.eop.at[:, image].set(y[:6]), shared, zero.points.at[:, point].set(y[6:9]))
         v = eqx.tree_at(lambda v: v.xy, values, jnp.asarray(values.xy).at[chunk, tile, :, m, p].set(xy))
-        r = residuals_at(At(moved, scale, v, s)).image[chunk, tile, :, m, p]
+        r = At(moved, scale, v, s).residuals().image[chunk, tile, :, m, p]
         return jnp.sum(0.5 * r * r - (1 - curved) * jax.lax.stop_gradient(r) * r)
 
     at = jnp.zeros(9 + len(columns)), jnp.asarray(values.xy)[chunk, tile, :, m, p]
@@ -63,9 +62,8 @@ def dense_products():
 def test_products_of_rows_are_the_dense_ones(curved: float, at_once: int, monkeypatch) -> None:
     monkeypatch.setattr(listed, "_AT_ONCE", at_once)
     a = corrected()
-    computed = a.computed
-    s, scale = computed.structure, jax.tree.map(jnp.asarray, computed.factored.scale)
-    values, rows = jax.tree.map(jnp.asarray, weigh_datum(computed.values, s)), listed.image_rows(a)
+    s, scale = a.equations.structure, jax.tree.map(jnp.asarray, a.equations.scale)
+    values, rows = jax.tree.map(jnp.asarray, a.equations.weighed.values), listed.image_rows(a)
     found = eqx.filter_jit(listed.row_products)(values, scale, rows, jnp.asarray(curved), s)
 
     products, there = dense_products()

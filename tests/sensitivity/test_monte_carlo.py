@@ -179,7 +179,7 @@ def test_draws_do_not_depend_on_how_many_there_are():
 @pytest.mark.parametrize("measured", [True, False])
 def test_rows_that_come_in_chunks_add_up_to_the_same(name, measured):
     nominal, rng = adjusted(name), np.random.default_rng(5)
-    near = jax.tree.map(lambda v: rng.normal(0, 0.3, (*v.shape, 3)), nominal.computed.factored.scale)
+    near = jax.tree.map(lambda v: rng.normal(0, 0.3, (*v.shape, 3)), nominal.equations.scale)
     xy = np.asarray(nominal.values.xy)
     varying = {"xy": xy[..., None] + rng.normal(0, 0.01, (*xy.shape, 3))} if measured else {}
     whole, chunks = (image_gradients(near, varying, common_of(nominal, at_once)) for at_once in (100_000, 7))

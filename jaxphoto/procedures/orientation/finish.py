@@ -17,10 +17,9 @@ from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
-from jaxphoto.adjustment import Adjustment
-from jaxphoto.adjustment.band import invert_band
+from jaxphoto.adjustment import Adjustment, NormalEquations
 from jaxphoto.block import Block
 from jaxphoto.compiling import call_compiled
 from jaxphoto.procedures.orientation.depths import supported
@@ -139,14 +138,16 @@ def erring_alike(block: Block, residuals: Float[np.ndarray, "2 rows"]) -> float:
 
 def _shared_covariance(adjusted: Adjustment) -> np.ndarray:
     """A priori covariance of the unknowns that images share; no datum changes it, so its constraints stay in."""
-    factored, n = adjusted.computed.factored, adjusted.structure.n_shared
-    scale = np.asarray(factored.scale.shared)
-    inverse = np.asarray(call_compiled(_inverse, factored.factor))[-n:, -n:]
+    equations, n = adjusted.equations, adjusted.structure.n_shared
+    scale = np.asarray(equations.scale.shared)
+    inverse = np.asarray(call_compiled(_inverse, equations))[-n:, -n:]
     return inverse * np.outer(scale, scale)
 
 
-# All of statistics.covariance, points and all, would take several times longer to compile.
-_inverse = eqx.filter_jit(invert_band)
+@eqx.filter_jit
+def _inverse(equations: NormalEquations) -> Float[Array, "reduced reduced"]:
+    # All of statistics.covariance, points and all, would take several times longer to compile.
+    return equations.inverse_of_images()
 
 
 def _open(names: tuple[str, ...], normal: np.ndarray, observed: np.ndarray, hardly: np.ndarray) -> dict[str, float]:

@@ -11,10 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxphoto.adjustment.adjust import concrete
 from jaxphoto.adjustment.datum import close_datum
-from jaxphoto.adjustment.structure import structure_of
-from jaxphoto.adjustment.values import values_of
+from jaxphoto.adjustment.model.structure import structure_of
+from jaxphoto.adjustment.model.values import values_of
 from jaxphoto.arrays import still
 from jaxphoto.block import Block, Datum, Start
 from jaxphoto.camera import Perspective, set_parameter
@@ -108,7 +107,7 @@ def check_layout(layout: Layout) -> None:
         )
     block, truth, _ = measured_block(layout)
     structure = structure_of(block, block.priors)
-    close_datum(block, concrete(values_of(block, truth, block.priors, structure), block), structure)
+    close_datum(block, values_of(block, truth, block.priors, structure), structure)
 
 
 def _rows(weight: np.ndarray, value: np.ndarray) -> tuple[np.ndarray, ...]:

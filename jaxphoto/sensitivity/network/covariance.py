@@ -1,6 +1,6 @@
 """The covariance of a network that is only planned, differentiable in every number of its layout.
 
-No residual is needed: the normal matrix is that of the layout itself, in the notation of adjustment/normal.py,
+No residual is needed: the normal matrix is that of the layout itself, in the notation of adjustment/solver/normal.py,
 
     S = U - sum_p Y_p Y_p',    Y_p = W_p L_p^-T,    V_p = L_p L_p'
     Q = S^-1,    Q_pp = L_p^-T (I + Y_p' Q Y_p) L_p^-1
@@ -20,7 +20,6 @@ import numpy as np
 from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Float
 
-from jaxphoto.adjustment.normal import cholesky_3x3, unwhiten, whiten
 from jaxphoto.arrays import still
 from jaxphoto.camera import InteriorOrientation, get_parameter, set_parameter
 from jaxphoto.collinearity import ExteriorOrientation, camera_coordinates, image_residual, project
@@ -28,6 +27,7 @@ from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import InputError
 from jaxphoto.rotation import omega_phi_kappa_from_matrix, rotate, small_rotation
 from jaxphoto.sensitivity.network.layout import Layout
+from jaxphoto.small_matrices import cholesky_3x3, unwhiten, whiten
 from jaxphoto.statistics import EOP_NAMES
 
 # Every point is known beforehand with this part of the best point's weight (a million times its sigma): one that fewer

@@ -5,7 +5,7 @@ What the rows of a group touch decides how they are eliminated; nobody declares 
     reduced     no point: rows add to the reduced normal matrix, where images and shared unknowns meet
     point       one point, and otherwise unknowns that are the same for all rows: they add to the point's own block
                 (`Tiles`), before it is eliminated
-    coupled     all else, such as two points, or a point and an image: few rows, that extra unknowns carry (`normal`)
+    coupled     all else, such as two points, or a point and an image: few rows, that extra unknowns carry (`solver.normal`)
 """
 
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ import jax
 import numpy as np
 from jaxtyping import Int
 
-from jaxphoto.adjustment.shared import ParameterTable, Together
+from jaxphoto.adjustment.model.parameter_tables import JointPrior, ParameterTable
 from jaxphoto.arrays import vector_of
 from jaxphoto.block import Block
 from jaxphoto.errors import BlockError
@@ -44,19 +44,19 @@ class Argument(NamedTuple):
     """() for one, (m,) for a stack of m."""
 
 
-class Listed(eqx.Module):
+class RowsInList(eqx.Module):
     """Rows along the last axis."""
 
     listed: AbstractObservations
 
 
-class AtPoints(eqx.Module):
+class RowsAtPoints(eqx.Module):
     """Rows by point: arrays end in (rows, points), rows being the most that a point has."""
 
     at_points: AbstractObservations
 
 
-class Group(eqx.Module):
+class ObservedGroup(eqx.Module):
     """A group of observations: index arrays of its rows and of what they touch, rows last."""
 
     name: str = eqx.field(static=True)
@@ -67,7 +67,7 @@ class Group(eqx.Module):
     arguments: tuple[Argument, ...] = eqx.field(static=True)
     through_camera: bool = eqx.field(static=True)
     rigid: bool = eqx.field(static=True)
-    rows: Listed | AtPoints
+    rows: RowsInList | RowsAtPoints
     """Indices only; the numbers are in `Values.groups`."""
     image: Int[np.ndarray, "k rows"]
     """The images that a row touches."""
@@ -85,7 +85,7 @@ class Group(eqx.Module):
     @property
     def own(self) -> AbstractObservations:
         """The rows, wherever they lie."""
-        return self.rows.at_points if isinstance(self.rows, AtPoints) else self.rows.listed
+        return self.rows.at_points if isinstance(self.rows, RowsAtPoints) else self.rows.listed
 
     @property
     def depth(self) -> int:
@@ -99,7 +99,7 @@ class Group(eqx.Module):
 
 
 def observations_of(
-    block: Block, priors: Unknowns, together: Sequence[Together], labels: Sequence[str]
+    block: Block, priors: Unknowns, together: Sequence[JointPrior], labels: Sequence[str]
 ) -> list[tuple[str, AbstractObservations]]:
     """All groups of a block that have rows, with their names: what it observes, then what is known beforehand.
 
@@ -117,7 +117,7 @@ def observations_of(
     for k in known:
         if missing := [label for label in k.labels if label not in place]:
             raise BlockError(f"{missing[0]} is no parameter of this block, which has {', '.join(list(place)[:4])} ...")
-    sets = [Together(np.array([place[x] for x in k.labels]), k.value, k.covariance) for k in known]
+    sets = [JointPrior(np.array([place[x] for x in k.labels]), k.value, k.covariance) for k in known]
     for n, (parameters, value, covariance) in enumerate([*together, *sets]):
         size = len(parameters)
         rows = ParameterRows(parameters, _spread(value, (size,)), np.ones(size))
@@ -126,7 +126,7 @@ def observations_of(
     return named
 
 
-def weighted_parameters(priors: Sequence[object], together: Sequence[Together]) -> ParameterRows:
+def weighted_parameters(priors: Sequence[object], together: Sequence[JointPrior]) -> ParameterRows:
     """The scalar priors of shared parameters, in their order."""
     joint = {int(k) for t in together for k in t.parameters}
     own = {k: prior for k, prior in enumerate(priors) if isinstance(prior, Weighted) and k not in joint}
@@ -181,7 +181,7 @@ def group_of(
     cameras: Int[np.ndarray, "p images"] | None,
     unknown_of: Int[np.ndarray, "parameters_and_none"],
     n_shared: int,
-) -> Group:
+) -> ObservedGroup:
     """The index arrays of a group: `cameras` are the places of the interior orientation of each image, `unknown_of`
     gives the shared unknown of each parameter, `n_shared` for none."""
     n, nowhere = len(rows), len(unknown_of) - 1
@@ -215,7 +215,7 @@ def group_of(
     column = column[place].astype(np.int32)
     alike = n > 0 and (parameter == parameter[:, :1]).all()
     layout: RowLayout = "reduced" if not points else "point" if len(points) == 1 and not images and alike else "coupled"
-    return Group(
+    return ObservedGroup(
         name=name,
         layout=layout,
         scalar=len(rows.axes) == 1,
@@ -223,7 +223,7 @@ def group_of(
         arguments=tuple(arguments),
         through_camera=rows.through_camera,
         rigid=rows.rigid or not (images or points),
-        rows=Listed(indices_of(rows)),
+        rows=RowsInList(indices_of(rows)),
         image=_stack(images, n),
         point=_stack(points, n),
         parameter=parameter,

@@ -2,7 +2,7 @@
 
 Increments are scaled and small: `unknown = start (+) scale * increment`, rotations by a small rotation in the
 camera frame. Arrays are batch-last (components first, rows last), which XLA vectorises best on a CPU. Image rows are
-computed in their tiles (`tiles`), all others row by row (`rows`).
+computed in their tiles (`solver.tile_rows`), all others row by row (`row_functions`).
 """
 
 from typing import NamedTuple
@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxphoto.adjustment.groups import AtPoints, Listed
-from jaxphoto.adjustment.structure import Structure, total
+from jaxphoto.adjustment.model.observed_groups import RowsAtPoints, RowsInList
+from jaxphoto.adjustment.model.structure import AbstractStructure, total
 from jaxphoto.arrays import Numbers
 from jaxphoto.rotation import small_rotation
 
@@ -29,19 +29,24 @@ class Increments(NamedTuple):
     points: Float[Array, "3 points"]
 
 
-class Residuals(eqx.Module):
-    """Observed minus computed over sigma, by group; `datum` holds the constraints that observations leave open.
+class NonImageResiduals(eqx.Module):
+    """Observed minus computed over sigma of all but image rows, by group; `datum` holds the constraints that
+    observations leave open.
 
-    While they are computed, in padded sizes, `image` is (chunks, tiles, 2, m, p), as `Values.xy`, and all others are
-    (components, rows), or (components, rows, points) where rows lie at points. Of a result, `image` is (2, rows), and a
-    group whose rows are single numbers has (rows).
+    While they are computed, in padded sizes, they are (components, rows), or (components, rows, points) where rows lie
+    at points. Of a result, a group whose rows are single numbers has (rows).
     """
 
-    image: Float[Numbers, "..."]
     others: tuple[Float[Numbers, "..."], ...]
     datum: Float[Numbers, "constraints"]
     names: tuple[str, ...] = eqx.field(static=True)
     """Of the groups of `others`."""
+
+
+class Residuals(NonImageResiduals):
+    """Observed minus computed over sigma, by group, in the block's own order."""
+
+    image: Float[Numbers, "2 rows"]
 
     @property
     def named(self) -> dict[str, Float[Numbers, "..."]]:
@@ -52,15 +57,10 @@ class Residuals(eqx.Module):
         return self.named[name]
 
 
-class Values(eqx.Module):
-    """The numbers of an adjustment, batch-last: observations, sigmas, start, and constraint rows of the datum.
+class AbstractValues(eqx.Module):
+    """The numbers of an adjustment, batch-last: observations, sigmas, start, and constraint rows of the datum."""
 
-    `xy` and its sigmas are (2, rows), of a padded structure (chunks, tiles, 2, m, p).
-    """
-
-    xy: Float[Array, "..."]
-    sigma_xy: Float[Array, "..."]
-    groups: tuple[Listed | AtPoints, ...]
+    groups: tuple[RowsInList | RowsAtPoints, ...]
     """The numbers of the rows of `Structure.observed`; their indices are there."""
     time: Float[Array, "images"]
     velocity: Float[Array, "3 images"]
@@ -75,7 +75,14 @@ class Values(eqx.Module):
     datum_points: Float[Array, "constraints 3 points"]
 
 
-class State(NamedTuple):
+class Values(AbstractValues):
+    """Those of a block as given."""
+
+    xy: Float[Array, "2 rows"]
+    sigma_xy: Float[Array, "2 rows"]
+
+
+class UnknownArrays(NamedTuple):
     """The unknowns themselves, batch-last."""
 
     position: Float[Array, "3 images"]
@@ -84,12 +91,14 @@ class State(NamedTuple):
     points: Float[Array, "3 points"]
 
 
-def state_at(increments: Increments, scale: Increments, values: Values, structure: Structure) -> State:
+def state_at(
+    increments: Increments, scale: Increments, values: AbstractValues, structure: AbstractStructure
+) -> UnknownArrays:
     """Start values moved by scaled increments; what is fixed does not move."""
     eop = increments.eop * scale.eop
     turn = jax.vmap(small_rotation, in_axes=-1, out_axes=-1)(eop[3:])
     rotation = jnp.stack([jnp.stack([jnp.sum(turn[i] * values.rotation[:, j], 0) for j in range(3)]) for i in range(3)])
-    return State(
+    return UnknownArrays(
         values.position + eop[:3],
         rotation,
         jnp.asarray(values.shared).at[structure.free].add(increments.shared * scale.shared, unique_indices=True),
@@ -98,7 +107,7 @@ def state_at(increments: Increments, scale: Increments, values: Values, structur
 
 
 def datum_residuals(
-    increments: Increments, scale: Increments, values: Values, structure: Structure
+    increments: Increments, scale: Increments, values: AbstractValues, structure: AbstractStructure
 ) -> Float[Array, "constraints"]:
     """By how much the constraints of the datum are violated."""
     eop = jnp.einsum("kci,ci->k", values.datum_eop * scale.eop, increments.eop)

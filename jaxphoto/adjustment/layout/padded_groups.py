@@ -12,28 +12,31 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
 
-from jaxphoto.adjustment.groups import AtPoints, Group, Listed
-from jaxphoto.adjustment.layout import Places
-from jaxphoto.adjustment.residuals import Values
-from jaxphoto.adjustment.rows import rows_of
-from jaxphoto.adjustment.structure import Structure
-from jaxphoto.adjustment.tiling import size_class
+from jaxphoto.adjustment.layout.tile_layout import Places
+from jaxphoto.adjustment.layout.tiled import TiledStructure
+from jaxphoto.adjustment.layout.tiling import size_class
+from jaxphoto.adjustment.model.observed_groups import ObservedGroup, RowsAtPoints, RowsInList
+from jaxphoto.adjustment.model.residuals import Values
+from jaxphoto.adjustment.model.row_functions import rows_of
+from jaxphoto.adjustment.model.structure import Structure
 from jaxphoto.arrays import still
 
 
 def pad_groups(
     s: Structure, places: Places, n_images: int, n_points: int, width: int, rows: Mapping[str, int]
-) -> tuple[Group, ...]:
+) -> tuple[ObservedGroup, ...]:
     """The groups of a structure in padded sizes: `rows` are wanted at least, `width` is images of a column block."""
     return tuple(_pad_group(g, places, n_images, n_points, width, rows.get(g.name, 0)) for g in s.observed)
 
 
-def _pad_group(g: Group, places: Places, n_images: int, n_points: int, width: int, wanted: int) -> Group:
+def _pad_group(
+    g: ObservedGroup, places: Places, n_images: int, n_points: int, width: int, wanted: int
+) -> ObservedGroup:
     if g.layout == "point":
         index = _by_point(g, places, n_points, max(g.depth, wanted))
         return dataclasses.replace(
             g,
-            rows=AtPoints(jax.tree.map(lambda v: v[..., index], g.own)),
+            rows=RowsAtPoints(jax.tree.map(lambda v: v[..., index], g.own)),
             image=np.zeros((0, 0), np.int32),
             point=np.zeros((1, 0), np.int32),
             parameter=g.parameter[:, :1],
@@ -50,7 +53,7 @@ def _pad_group(g: Group, places: Places, n_images: int, n_points: int, width: in
     last = lambda v: np.moveaxis(filled(np.moveaxis(v, 1, -1)), -1, 1)  # noqa: E731
     return dataclasses.replace(
         padded,
-        rows=Listed(jax.tree.map(filled, g.own)),
+        rows=RowsInList(jax.tree.map(filled, g.own)),
         image=filled(padded.image),
         point=filled(padded.point),
         parameter=filled(g.parameter),
@@ -70,14 +73,14 @@ def _pairs(image: Int[np.ndarray, "k rows"], width: int) -> Int[np.ndarray, "pai
     return np.array(found, np.int32).reshape(-1, image.shape[1], 4)
 
 
-def _by_point(g: Group, places: Places, n_points: int, depth: int) -> Int[np.ndarray, "rows points"]:
+def _by_point(g: ObservedGroup, places: Places, n_points: int, depth: int) -> Int[np.ndarray, "rows points"]:
     """The row in every place by point; the first where there is none."""
     index = np.zeros(depth * n_points, int)
     index[_row_places(g, places, n_points)] = np.arange(g.n_rows)
     return index.reshape(depth, n_points)
 
 
-def _row_places(g: Group, places: Places, n_points: int) -> Int[np.ndarray, "rows"]:
+def _row_places(g: ObservedGroup, places: Places, n_points: int) -> Int[np.ndarray, "rows"]:
     """Where the rows of a group by point lie in (rows, points): those of a point one below the other."""
     order = np.argsort(g.point[0], kind="stable")
     of_point = g.point[0][order]
@@ -87,21 +90,21 @@ def _row_places(g: Group, places: Places, n_points: int) -> Int[np.ndarray, "row
     return result
 
 
-def pad_rows(v: Values, s: Structure, padded: Structure, places: Places) -> tuple[Listed | AtPoints, ...]:
+def pad_rows(v: Values, s: Structure, padded: TiledStructure, places: Places) -> tuple[RowsInList | RowsAtPoints, ...]:
     """The numbers of all rows in the sizes and the order of the padded structure."""
     groups = zip(s.observed, padded.observed, v.groups, strict=True)
     return tuple(_pad_numbers(g, wide, numbers, places) for g, wide, numbers in groups)
 
 
-def _pad_numbers(g: Group, wide: Group, numbers: Any, places: Places) -> Listed | AtPoints:
+def _pad_numbers(g: ObservedGroup, wide: ObservedGroup, numbers: Any, places: Places) -> RowsInList | RowsAtPoints:
     own = numbers.listed
-    if isinstance(wide.rows, AtPoints):
+    if isinstance(wide.rows, RowsAtPoints):
         shape = np.shape(jax.tree.leaves(wide.own)[0])[-2:]
         at = _row_places(g, places, shape[1])
     else:
         shape, at = (wide.n_rows,), np.arange(g.n_rows)
     # The first row again, without weight.
-    idle = rows_of(g, Listed(jax.tree.map(lambda x: x[..., 0], own))).without_weight()
+    idle = rows_of(g, RowsInList(jax.tree.map(lambda x: x[..., 0], own))).without_weight()
     size = int(np.prod(shape))
 
     def spread(x: Any, fill: Any) -> Any:
@@ -109,10 +112,10 @@ def _pad_numbers(g: Group, wide: Group, numbers: Any, places: Places) -> Listed 
 
     fills = jax.tree.map(lambda x, y: None if x is None else y, own, idle, is_leaf=lambda x: x is None)
     laid = jax.tree.map(spread, own, fills)
-    return AtPoints(laid) if isinstance(wide.rows, AtPoints) else Listed(laid)
+    return RowsAtPoints(laid) if isinstance(wide.rows, RowsAtPoints) else RowsInList(laid)
 
 
-def crop_rows(g: Group, v: np.ndarray, places: Places) -> np.ndarray:
+def crop_rows(g: ObservedGroup, v: np.ndarray, places: Places) -> np.ndarray:
     """Numbers of padded rows, (components, ...), in the block's own order: (rows) where a row is one number."""
     if v.ndim == 3:
         v = v.reshape(len(v), -1)[:, _row_places(g, places, v.shape[2])]

@@ -27,8 +27,6 @@ from jaxtyping import Array, Float
 
 # Inverses of triangles above this size are put together from halves: a product is five times as fast as BLAS' trsm.
 _LEAF = 32
-# What a column block costs beside its operations, counted in operations (measured: about 10 microseconds).
-_OVERHEAD = 2e5
 
 
 class Band(NamedTuple):
@@ -170,28 +168,6 @@ def pivots(diagonal: Float[Array, " unknowns"], factor: BandFactor) -> Float[Arr
     What is left of an unknown's own information when those before it are eliminated: near zero at a rank defect.
     """
     return diagonal_of(factor) ** 2 / jnp.where(diagonal > 0, diagonal, 1.0)
-
-
-def column_blocks(n_images: int, bandwidth: int) -> tuple[int, int]:
-    """Number k of column blocks and images w of each, for images of which none meet further apart than `bandwidth`.
-
-    w >= bandwidth and k w >= n_images. Costs counted are operations of the factorization: n^3 / 3 of a dense one with
-    n = 6 n_images, and m^3 / 3 for each of k column blocks with m = 6 w, 3 m^3 for each but the last (triangular
-    solution m^3, product 2 m^3) and a constant for each. The w of least cost is taken if it halves the cost at least,
-    else the block is one column.
-    """
-
-    def cost(k: int, w: int) -> float:
-        m = 6 * w
-        return k * m**3 / 3 + (k - 1) * 3 * m**3 + k * _OVERHEAD
-
-    n = max(n_images, 1)
-    narrowest = min(max(bandwidth, 1), n)
-    # For each number of column blocks the narrowest; more of them would only be padding.
-    widths = {max(narrowest, -(-n // k)) for k in range(1, -(-n // narrowest) + 1)}
-    choices = [(-(-n // w), w) for w in sorted(widths)]
-    best = min(choices, key=lambda choice: cost(*choice))
-    return best if 2 * cost(*best) <= cost(1, n) else (1, n)
 
 
 def _invert_inside(factor: BandFactor) -> tuple[SelectedInverse, Float[Array, "inner m p"]]:

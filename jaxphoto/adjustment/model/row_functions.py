@@ -14,16 +14,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxphoto.adjustment.groups import AtPoints, Group, image_tables
-from jaxphoto.adjustment.residuals import Increments, Residuals, Values, datum_residuals
-from jaxphoto.adjustment.structure import Structure, interior_of
+from jaxphoto.adjustment.model.observed_groups import ObservedGroup, RowsAtPoints, image_tables
+from jaxphoto.adjustment.model.residuals import AbstractValues, Increments, NonImageResiduals, datum_residuals
+from jaxphoto.adjustment.model.structure import AbstractStructure, interior_of
 from jaxphoto.georeferencing import Exposure
 from jaxphoto.observations import AbstractObservations, ImageState
 from jaxphoto.parameters import filled
 from jaxphoto.rotation import small_rotation
 
 
-class Local(NamedTuple):
+class Touched(NamedTuple):
     """Increments of what one row touches, or derivatives by them."""
 
     eop: Float[Array, "k 6"]
@@ -31,11 +31,11 @@ class Local(NamedTuple):
     points: Float[Array, "j 3"]
 
 
-class Given(NamedTuple):
+class RowInputs(NamedTuple):
     """Everything else that a row is computed from; of many rows with rows last."""
 
     row: AbstractObservations
-    scale: Local
+    scale: Touched
     position: Float[Array, "k 3"]
     rotation: Float[Array, "k 3 3"]
     exposure: tuple[Array, ...]
@@ -45,26 +45,28 @@ class Given(NamedTuple):
 
 
 # Which axis of a row by point runs over the points, and which over the rows of one.
-_OVER_POINTS = Local(None, None, -1), Given(-1, Local(None, None, -1), None, None, None, None, -1)  # type: ignore[arg-type]
-_OVER_ROWS = Local(None, None, None), Given(-1, Local(None, None, None), None, None, None, None, None)  # type: ignore[arg-type]
+_OVER_POINTS = Touched(None, None, -1), RowInputs(-1, Touched(None, None, -1), None, None, None, None, -1)  # type: ignore[arg-type]
+_OVER_ROWS = Touched(None, None, None), RowInputs(-1, Touched(None, None, None), None, None, None, None, None)  # type: ignore[arg-type]
 
 
-def each_row(function: Callable[[Local, Given], Any], group: Group, z: Local, given: Given) -> Any:
+def each_row(function: Callable[[Touched, RowInputs], Any], group: ObservedGroup, z: Touched, given: RowInputs) -> Any:
     """`function` of every row, rows last."""
-    if isinstance(group.rows, AtPoints):
+    if isinstance(group.rows, RowsAtPoints):
         return jax.vmap(jax.vmap(function, _OVER_ROWS, -1), _OVER_POINTS, -1)(z, given)
     return jax.vmap(function, -1, -1)(z, given)
 
 
-def rows_of(group: Group, numbers: Any) -> AbstractObservations:
+def rows_of(group: ObservedGroup, numbers: Any) -> AbstractObservations:
     """The rows with their indices and numbers."""
-    own = numbers.at_points if isinstance(numbers, AtPoints) else numbers.listed
+    own = numbers.at_points if isinstance(numbers, RowsAtPoints) else numbers.listed
     return eqx.combine(group.own, own)
 
 
-def gathered_rows(group: Group, numbers: Any, y: Increments, scale: Increments, v: Values) -> tuple[Local, Given]:
+def gathered_rows(
+    group: ObservedGroup, numbers: Any, y: Increments, scale: Increments, v: AbstractValues
+) -> tuple[Touched, RowInputs]:
     """What every row of a group touches at the increments `y`."""
-    at_points = isinstance(group.rows, AtPoints)
+    at_points = isinstance(group.rows, RowsAtPoints)
 
     def of_images(a: Array) -> Array:
         if at_points:
@@ -80,20 +82,22 @@ def gathered_rows(group: Group, numbers: Any, y: Increments, scale: Increments, 
         return found[:, 0] if at_points else found
 
     # An image's exterior orientation may be held fixed, which a scale of zero says.
-    z = Local(of_images(y.eop), of_shared(y.shared, group.column), of_points(y.points))
-    steps = Local(of_images(scale.eop), of_shared(scale.shared, group.column), of_points(scale.points))
+    z = Touched(of_images(y.eop), of_shared(y.shared, group.column), of_points(y.points))
+    steps = Touched(of_images(scale.eop), of_shared(scale.shared, group.column), of_points(scale.points))
     exposure = tuple(of_images(a) for a in (v.time, v.velocity, v.rate, v.nominal, v.flight_time))
     parameters = of_shared(v.shared, group.parameter)
     row = rows_of(group, numbers)
-    return z, Given(row, steps, of_images(v.position), of_images(v.rotation), exposure, parameters, of_points(v.points))
+    return z, RowInputs(
+        row, steps, of_images(v.position), of_images(v.rotation), exposure, parameters, of_points(v.points)
+    )
 
 
-def row_function(group: Group, s: Structure) -> Callable[[Local, Given], Float[Array, "c"]]:
+def row_function(group: ObservedGroup, s: AbstractStructure) -> Callable[[Touched, RowInputs], Float[Array, "c"]]:
     """Observed minus computed over sigma of one row."""
     tables = image_tables(s.tables)
     forms = {t.kind: (t.form, t.size) for t in s.tables}
 
-    def residual(z: Local, given: Given) -> Float[Array, "c"]:
+    def residual(z: Touched, given: RowInputs) -> Float[Array, "c"]:
         parameters = given.parameters
         if group.place:
             # A copy for each number would be made of an array: these are few.
@@ -157,17 +161,19 @@ class RowJacobian(NamedTuple):
 
 
 def group_residuals(
-    group: Group, numbers: Any, y: Increments, scale: Increments, v: Values, s: Structure
+    group: ObservedGroup, numbers: Any, y: Increments, scale: Increments, v: AbstractValues, s: AbstractStructure
 ) -> Float[Array, "c *rows"]:
     """Residuals of a group over their sigmas."""
     return each_row(row_function(group, s), group, *gathered_rows(group, numbers, y, scale, v))
 
 
-def row_jacobian(group: Group, numbers: Any, y: Increments, scale: Increments, v: Values, s: Structure) -> RowJacobian:
+def row_jacobian(
+    group: ObservedGroup, numbers: Any, y: Increments, scale: Increments, v: AbstractValues, s: AbstractStructure
+) -> RowJacobian:
     """Residuals of a group, and the derivatives of each row."""
     function = row_function(group, s)
 
-    def one(z: Local, given: Given) -> tuple[Float[Array, "c"], Local]:
+    def one(z: Touched, given: RowInputs) -> tuple[Float[Array, "c"], Touched]:
         # The residuals come along.
         slopes, residual = jax.jacfwd(lambda z: (function(z, given),) * 2, has_aux=True)(z)
         return residual, slopes
@@ -176,7 +182,7 @@ def row_jacobian(group: Group, numbers: Any, y: Increments, scale: Increments, v
     return RowJacobian(residual, slopes.eop, slopes.shared, slopes.points)
 
 
-def reduced_places(g: Group, n_images: int) -> Int[Array, "z rows"]:
+def reduced_places(g: ObservedGroup, n_images: int) -> Int[Array, "z rows"]:
     """Of images and shared unknowns that the rows of a group touch, the places among the reduced unknowns.
 
     What means none lies behind the last.
@@ -185,11 +191,13 @@ def reduced_places(g: Group, n_images: int) -> Int[Array, "z rows"]:
     return jnp.concatenate([images.reshape(-1, images.shape[-1]), 6 * n_images + jnp.asarray(g.column)])
 
 
-def other_residuals(increments: Increments, scale: Increments, values: Values, structure: Structure) -> Residuals:
-    """All residuals but those of the image rows, which are left empty (for them see `normal.residuals_at`)."""
+def non_image_residuals(
+    increments: Increments, scale: Increments, values: AbstractValues, structure: AbstractStructure
+) -> NonImageResiduals:
+    """All residuals but those of the image rows."""
     others = tuple(
         group_residuals(g, numbers, increments, scale, values, structure)
         for g, numbers in zip(structure.observed, values.groups, strict=True)
     )
     datum = datum_residuals(increments, scale, values, structure)
-    return Residuals(jnp.zeros((2, 0)), others, datum, tuple(g.name for g in structure.observed))
+    return NonImageResiduals(others, datum, tuple(g.name for g in structure.observed))

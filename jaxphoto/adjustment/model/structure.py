@@ -4,14 +4,15 @@
                 is not FIXED; interior orientations first), points (3 per point)
     colours     each image touches few shared unknowns; unknowns of different cameras, mounts or strips carry the
                 same colour, so one seed differentiates all of them at once
-    groups      all observations but image rows, see `groups`
-    tiles       points with the images that see them, see `tiling`; laid out by `padding.pad_structure`, which also
-                puts images and points in the order of the tiles: a padded structure is what is computed with
+    groups      all observations but image rows, see `observed_groups`
+    tiles       points with the images that see them: a `layout.TiledStructure` is what is computed with, its images
+                and points in the order of the tiles
 
 All arrays are arguments of the compiled functions, never constants in them: a new block of the same shapes
 compiles nothing.
 """
 
+import abc
 import dataclasses
 from typing import NamedTuple
 
@@ -20,18 +21,21 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxphoto.adjustment.groups import Group, group_of, observations_of, weighted_parameters
-from jaxphoto.adjustment.shared import Entry, ParameterTable, shared_entries, tables_of
-from jaxphoto.adjustment.tiling import check_rows
+from jaxphoto.adjustment.model.observed_groups import (
+    ObservedGroup,
+    RowsAtPoints,
+    group_of,
+    observations_of,
+    weighted_parameters,
+)
+from jaxphoto.adjustment.model.parameter_tables import ParameterTable, SharedParameter, shared_entries, tables_of
 from jaxphoto.block import Block
 from jaxphoto.camera import InteriorOrientation
+from jaxphoto.devices import AXIS
 from jaxphoto.errors import BlockError
 from jaxphoto.georeferencing import Corrections
 from jaxphoto.observations import PRIORS, AbstractObservations
 from jaxphoto.unknowns import FIXED, Unknowns
-
-AXIS = "tiles"
-"""Mesh axis along which tiles and their points are dealt out to devices."""
 
 
 class CameraGroup(eqx.Module):
@@ -47,48 +51,8 @@ class CameraGroup(eqx.Module):
     free_leaves: tuple[int, ...] = eqx.field(static=True)
 
 
-class Tiles(eqx.Module):
-    """The tiles of a padded structure, and the lists that bring their sums to the reduced normal matrix.
-
-    Tiles are cut into equal chunks (leading axis), so that the sums of one chunk are all that is held at a time. Empty
-    slots have the last image, which nothing depends on.
-    """
-
-    image: Int[np.ndarray, "chunks tiles m"]
-    per_tile: int = eqx.field(static=True)
-    """Points of a tile, P."""
-    free_points: bool = eqx.field(static=True)
-    """Whether any point has a free coordinate; else nothing is eliminated, and F has no columns."""
-    groups: Int[np.ndarray, "chunks"]
-    """How many groups of `at_once` tiles hold the points of each chunk: the first ones; the others are padding."""
-    at_once: int = eqx.field(static=True)
-    """Tiles that are computed with at a time: few enough for the cache of a core, enough to be worth its while."""
-    pair_tile: Int[np.ndarray, "chunks pairs"]
-    """Tile within its chunk of each pair of images of a tile that meet (first image not before second)."""
-    pair_images: Int[np.ndarray, "chunks pairs 2"]
-    """The two within the tile."""
-    pair_block: Int[np.ndarray, "chunks pairs"]
-    """Which of the chunk's blocks the pair adds to; sorted."""
-    block: Int[np.ndarray, "chunks blocks 3"]
-    """Column block of the band, and image row (of two column blocks) and image column in it."""
-    columns: int = eqx.field(static=True)
-    """Column blocks of the reduced matrix, K."""
-    shards: int = eqx.field(static=True)
-    """Devices that the chunks are dealt out to, in equal parts."""
-
-    @property
-    def few(self) -> bool:
-        """Whether a device computes with all its tiles at a time: what is made of them is worth keeping."""
-        return self.image.shape[:2] == (1, self.at_once) or not self.free_points
-
-    @property
-    def eliminated(self) -> int:
-        """Columns of F: coordinates of a tile that are eliminated."""
-        return 3 * self.per_tile if self.free_points else 0
-
-
-class Structure(eqx.Module):
-    """Index arrays and sizes; see the module's head."""
+class AbstractStructure(eqx.Module):
+    """Index arrays and sizes that a block has as given and in tiles."""
 
     groups: tuple[CameraGroup, ...]
     tables: tuple[ParameterTable, ...]
@@ -101,29 +65,21 @@ class Structure(eqx.Module):
     n_border: int = eqx.field(static=True)
     """These, and others that points meet: the next."""
     n_image_colours: int = eqx.field(static=True)
-    image: Int[np.ndarray, "rows"]
-    """Image and point of each image row. Empty in a padded structure, whose rows are the slots of its tiles."""
-    point: Int[np.ndarray, "rows"]
     free: Int[np.ndarray, "shared"]
     """Index, in the vector of all shared parameters, of each shared unknown."""
     column: Int[np.ndarray, "images colours"]
     """Shared unknown that a colour means for an image; the number of shared unknowns where it means none. Colours of
     image rows come first."""
     colour: Int[np.ndarray, "shared"]
-    observed: tuple[Group, ...]
+    observed: tuple[ObservedGroup, ...]
     """All observations but image rows, and what is known beforehand."""
     eop_free: Float[np.ndarray, "6 images"]
     point_free: Float[np.ndarray, "3 points"]
-    labels: tuple[str, ...] = eqx.field(static=True)
-    """Parameter path of each shared unknown, such as `interior[kodak].c_mm`."""
-    tiles: Tiles | None
-    """Of a padded structure."""
 
     @property
-    def in_tiles(self) -> Tiles:
-        """The tiles of a padded structure."""
-        assert self.tiles is not None, "not a padded structure"
-        return self.tiles
+    @abc.abstractmethod
+    def shards(self) -> int:
+        """Devices that points are dealt out to, in equal parts."""
 
     @property
     def n_shared(self) -> int:
@@ -136,9 +92,14 @@ class Structure(eqx.Module):
         return _n_parameters(self.groups)
 
     @property
-    def coupled(self) -> tuple[Group, ...]:
+    def coupled(self) -> tuple[ObservedGroup, ...]:
         """The groups whose rows couple points."""
         return tuple(g for g in self.observed if g.layout == "coupled")
+
+    @property
+    def with_shared(self) -> tuple[ObservedGroup, ...]:
+        """The groups of rows by point that touch shared unknowns, too."""
+        return tuple(g for g in self.observed if isinstance(g.rows, RowsAtPoints) and g.place)
 
     @property
     def n_coupled(self) -> int:
@@ -151,9 +112,24 @@ class Structure(eqx.Module):
         return any(t.bends for t in self.tables)
 
 
-def total(x, s: Structure):
+class Structure(AbstractStructure):
+    """Of a block as given; see the module's head."""
+
+    image: Int[np.ndarray, "rows"]
+    """Image and point of each image row."""
+    point: Int[np.ndarray, "rows"]
+    labels: tuple[str, ...] = eqx.field(static=True)
+    """Parameter path of each shared unknown, such as `interior[kodak].c_mm`."""
+
+    @property
+    def shards(self) -> int:
+        """One device: nothing is dealt out yet."""
+        return 1
+
+
+def total(x, s: AbstractStructure):
     """The sum over all devices."""
-    return jax.lax.psum(x, AXIS) if s.tiles is not None and s.tiles.shards > 1 else x
+    return jax.lax.psum(x, AXIS) if s.shards > 1 else x
 
 
 def interior_of(group: CameraGroup, table) -> InteriorOrientation:
@@ -166,7 +142,7 @@ class ObservedRows(NamedTuple):
 
     cameras: tuple[CameraGroup, ...]
     tables: tuple[ParameterTable, ...]
-    entries: list[Entry]
+    entries: list[SharedParameter]
     named: list[tuple[str, AbstractObservations]]
     """Rows by the name of their group."""
 
@@ -195,7 +171,7 @@ def structure_of(block: Block, priors: Unknowns, observed: ObservedRows | None =
     `observed` is `observed_in(block, priors)`, where it is known already.
     """
     image, point = np.asarray(block.image_points.image), np.asarray(block.image_points.point)
-    check_rows(image, point)
+    _check_rows(image, point)
     if len(np.unique(np.asarray(block.control.who) * 3 + np.asarray(block.control.axis))) < len(block.control.who):
         raise ValueError("control holds a coordinate of a point twice: keep one row of each")
     given = observed_in(block, priors) if observed is None else observed
@@ -234,11 +210,21 @@ def structure_of(block: Block, priors: Unknowns, observed: ObservedRows | None =
         eop_free=eop_free,
         point_free=point_free,
         labels=tuple(entries[k].label for k in free),
-        tiles=None,
     )
 
 
-def _check_coupled(block: Block, groups: tuple[Group, ...], point: np.ndarray, point_free: np.ndarray) -> None:
+def _check_rows(image: np.ndarray, point: np.ndarray) -> None:
+    """Raise ValueError for image rows that are not sorted by point, or hold a point twice in one image."""
+    if (np.diff(point) < 0).any():
+        raise ValueError(
+            "the rows of image_points must be sorted by point: take them in the order of np.argsort(point)"
+        )
+    key = point.astype(np.int64) * (int(image.max(initial=0)) + 1) + image
+    if len(np.unique(key)) < len(key):
+        raise ValueError("image_points holds a point twice in one image: keep one row of each")
+
+
+def _check_coupled(block: Block, groups: tuple[ObservedGroup, ...], point: np.ndarray, point_free: np.ndarray) -> None:
     """Raise BlockError for a point that only rows that couple points meet: nothing of its own could eliminate it."""
     own = (point_free == 0).all(axis=0)
     own[point] = True

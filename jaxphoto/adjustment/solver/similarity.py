@@ -4,9 +4,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxphoto.adjustment.normal import At
-from jaxphoto.adjustment.residuals import Increments, Values, datum_residuals
-from jaxphoto.adjustment.structure import Structure, total
+from jaxphoto.adjustment.layout.tiled import TiledStructure, TiledValues
+from jaxphoto.adjustment.model.residuals import AbstractValues, Increments, datum_residuals
+from jaxphoto.adjustment.model.structure import AbstractStructure, total
+from jaxphoto.adjustment.solver.normal import At
 from jaxphoto.rotation import small_angles, small_rotation
 
 # Newton's method on so few unknowns, begun so near, doubles the right digits with each of these.
@@ -45,7 +46,7 @@ def motions(
     return eop, jax.vmap(moved, in_axes=1, out_axes=2)(points)
 
 
-def open_motions(values: Values, s: Structure) -> int:
+def open_motions(values: AbstractValues, s: AbstractStructure) -> int:
     """How many motions are open, where these are all seven, or all but the scale, which distances give; else 0.
 
     Those change no residual but the datum's wherever images and points are. Others (a turn about the only control
@@ -88,14 +89,14 @@ def onto_datum(at: At) -> Increments:
     return jax.tree.map(lambda new, old: jnp.where(finite, new, old), found, y)
 
 
-def along_motions(values: Values, scale: Increments, s: Structure) -> Increments:
+def along_motions(values: TiledValues, scale: Increments, s: TiledStructure) -> Increments:
     """Scaled increments along each of the `open_motions` (leading axis), which nothing but the datum sees."""
     k, shared = open_motions(values, s), scale.shared
     eop, points = motions(values.position, values.rotation, values.points, *_extent(values, s))
     return Increments(_scaled(eop[:k], scale.eop), jnp.zeros((k, *shared.shape)), _scaled(points[:k], scale.points))
 
 
-def _extent(values: Values, s: Structure) -> tuple[Float[Array, "3"], Float[Array, ""]]:
+def _extent(values: TiledValues, s: TiledStructure) -> tuple[Float[Array, "3"], Float[Array, ""]]:
     """Centre and size (m) of the points."""
     mean = lambda v: total(jnp.sum(v, axis=-1), s) / s.n_points  # noqa: E731
     centre = mean(values.points)
@@ -107,7 +108,7 @@ def _scaled(v, scale):
     return jnp.where(scale > 0, v / jnp.where(scale > 0, scale, 1.0), 0.0)
 
 
-def _nearest(points, start, own, centre, size, s: Structure) -> Float[Array, "7"]:
+def _nearest(points, start, own, centre, size, s: TiledStructure) -> Float[Array, "7"]:
     """Parameters of the similarity that takes `points` nearest to `start`; only `own` points count."""
     weight = own / total(jnp.sum(own), s)
     mean, target = total((points @ weight, start @ weight), s)

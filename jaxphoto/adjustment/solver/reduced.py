@@ -12,26 +12,26 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxphoto.adjustment.band import Band, diagonal_of
-from jaxphoto.adjustment.normal import At, Reduced, cholesky_3x3, other_squares, whiten
-from jaxphoto.adjustment.other_rows import OtherRows, Sums, add_blocks, add_other_rows, other_rows, sum_by
-from jaxphoto.adjustment.residuals import Increments
-from jaxphoto.adjustment.structure import Structure, total
-from jaxphoto.adjustment.tiles import (
-    Columns,
-    by_point,
-    by_tile,
-    columns,
-    each_tile,
-    of_images,
-    once,
-    scene_of,
-    seen_in,
-    slopes_of,
+from jaxphoto.adjustment.layout.tiled import TiledStructure
+from jaxphoto.adjustment.model.residuals import Increments
+from jaxphoto.adjustment.model.scene import of_images, scene_of, slopes_of
+from jaxphoto.adjustment.model.structure import total
+from jaxphoto.adjustment.solver.band import Band, diagonal_of
+from jaxphoto.adjustment.solver.non_image_rows import (
+    NonImageRows,
+    NormalSums,
+    add_blocks,
+    add_non_image_rows,
+    non_image_rows,
+    sum_by,
 )
+from jaxphoto.adjustment.solver.normal import At, Reduced, other_squares
+from jaxphoto.adjustment.solver.tile_rows import TileJacobian, seen_in, tile_jacobian
+from jaxphoto.compiling import once
+from jaxphoto.small_matrices import cholesky_3x3, whiten
 
 
-class Right(NamedTuple):
+class RightSide(NamedTuple):
     """A right-hand side: whole (b = J'r), and taken down to the reduced unknowns and to mu."""
 
     b: Increments
@@ -44,7 +44,7 @@ class Right(NamedTuple):
 class TileParts(NamedTuple):
     """What a tile's sums are made of."""
 
-    columns: tuple[Columns, Columns]
+    columns: tuple[TileJacobian, TileJacobian]
     f: Float[Array, "6m+border 3p"]
     """F, with the right-hand side for its last row."""
     l: Float[Array, "6 p"]  # noqa: E741
@@ -53,13 +53,13 @@ class TileParts(NamedTuple):
     """That of V, without damping."""
 
 
-def reduce_normal(at: At, damping) -> tuple[Band, Reduced, Right]:
+def reduce_normal(at: At, damping) -> tuple[Band, Reduced, RightSide]:
     """Eliminate the points of N + damping diag(N): A, what goes with it, and the right-hand side.
 
     Unknowns held fixed (zero columns) get a unit diagonal.
     """
-    s, tiles = at.structure, at.structure.in_tiles
-    rest = other_rows(at)
+    s, tiles = at.structure, at.structure.tiles
+    rest = non_image_rows(at)
     coupled = rest.coupled
     parts_of = tile_parts(at, damping, coupled)
     n, q, c = s.n_images, s.n_image_colours, s.n_border + len(coupled) + 1
@@ -79,7 +79,7 @@ def reduce_normal(at: At, damping) -> tuple[Band, Reduced, Right]:
 
     def add_chunk(sums, numbers):
         (pair_tile, pair_images, pair_block, block), groups, of_tiles = numbers
-        grams, own, border, *kept = each_tile(tile, of_tiles, groups, tiles)
+        grams, own, border, *kept = tiles.each_of_chunk(tile, of_tiles, groups)
         own = sum_by(own.reshape(chunk * m, -1), of_tiles[0].reshape(-1), n)
         if not tiles.free_points:
             return (sums[0], sums[1] + own, sums[2]), kept
@@ -96,15 +96,15 @@ def reduce_normal(at: At, damping) -> tuple[Band, Reduced, Right]:
     lists = (tiles.pair_tile, tiles.pair_images, tiles.pair_block, tiles.block)
     sums, (f, *of_points) = jax.lax.scan(add_chunk, zero, (lists, tiles.groups, tile_numbers(at, rest)))
     (columns, last), own, border = total(sums, s)
-    l, b_points, v = map(by_point, of_points)  # noqa: E741
+    l, b_points, v = map(s.by_point, of_points)  # noqa: E741
     # Tiles that are padding were not computed: their points are each by itself.
     l = jnp.where(l[0] == 0, jnp.array([1.0, 0, 1, 0, 0, 1])[:, None], l)  # noqa: E741
 
     m_images = own[:, : (7 + q) ** 2].reshape(n, 7 + q, 7 + q)
     met = own[:, (7 + q) ** 2 :].reshape(n, 6, c)
     us, uss, b_s = _by_unknown(m_images, s)
-    images = Sums((columns, last), m_images[:, :6, :6], us, uss, b_s, m_images[:, :6, -1])
-    (columns, last), u, us, uss, b_s, b_e = add_other_rows(images, rest, s)
+    images = NormalSums((columns, last), m_images[:, :6, :6], us, uss, b_s, m_images[:, :6, -1])
+    (columns, last), u, us, uss, b_s, b_e = add_non_image_rows(images, rest, s)
     weight = Increments(jnp.einsum("nii->in", u), jnp.diagonal(uss), v)
     added = damping * weight.eop.T + jnp.where(weight.eop.T == 0, 1.0, 0.0)
     u = u + added[:, :, None] * jnp.eye(6)
@@ -134,15 +134,15 @@ def reduce_normal(at: At, damping) -> tuple[Band, Reduced, Right]:
     reduced = Reduced(diagonal_of(a), g, kk, f, l, weight, jnp.asarray(damping, float))
     # Of the residuals' own square, the sums hold the image rows' part.
     squares = jnp.sum(m_images[:, -1, -1]) + other_squares(rest.residuals, s)
-    return a, reduced, Right(Increments(b_e.T, b_s, b_points), right, border[i : i + k, -1], squares)
+    return a, reduced, RightSide(Increments(b_e.T, b_s, b_points), right, border[i : i + k, -1], squares)
 
 
-def tile_numbers(at: At, rest: OtherRows):
+def tile_numbers(at: At, rest: NonImageRows):
     """What `tile_parts` wants of each tile, chunks and tiles first."""
     increments, scale, values, s = at
-    tiles = s.in_tiles
+    tiles = s.tiles
     points = values.points + increments.points * scale.points
-    of_points = (by_tile(v, tiles) for v in (points, scale.points, rest.v, rest.b, rest.w, rest.rows_p))
+    of_points = (s.by_tile(v) for v in (points, scale.points, rest.v, rest.b, rest.w, rest.rows_p))
     return (tiles.image, values.xy, values.sigma_xy, *of_points)
 
 
@@ -150,12 +150,12 @@ def tile_columns(at: At):
     """A function from a tile's images, measurements and points to its residuals and Jacobian."""
     s = at.structure
     scene = scene_of(at.state, at.values, s)
-    slopes = once(lambda: slopes_of(at.increments, at.scale, at.values, s), s)
+    slopes = once(lambda: slopes_of(at.increments, at.scale, at.values, s), s.eop_free)
 
-    def columns_of(numbers) -> tuple[Columns, Columns]:
+    def columns_of(numbers) -> tuple[TileJacobian, TileJacobian]:
         image, xy, sigma, points, scale = numbers
         seen = seen_in(xy, sigma, image, s)
-        return columns(of_images(scene, image, s), of_images(slopes, image, s), points, scale, seen, s)
+        return tile_jacobian(of_images(scene, image, s), of_images(slopes, image, s), points, scale, seen, s)
 
     return columns_of
 
@@ -168,7 +168,7 @@ def tile_parts(at: At, damping, coupled: Float[Array, "constraints"]):
         *measured, own_v, own_b, own_w, rows_p = numbers
         j = columns_of(measured)
         image, (m, p) = measured[0], j[0].residual.shape
-        if not s.in_tiles.free_points:
+        if not s.tiles.free_points:
             f = jnp.zeros((6 * m + s.n_border + len(coupled) + 1, 0))
             unit, nothing = jnp.array([1.0, 0, 1, 0, 0, 1])[:, None], jnp.zeros((3, p))
             return TileParts(j, f, jnp.broadcast_to(unit, (6, p)), nothing, nothing)
@@ -179,31 +179,34 @@ def tile_parts(at: At, damping, coupled: Float[Array, "constraints"]):
         added = damping * diagonal + jnp.where(diagonal == 0, 1.0, 0.0)
         v = v + added[:, None] * jnp.eye(3)[:, :, None]
         b = b + jnp.einsum("ckp,c->kp", rows_p, coupled)
-        l = once(cholesky_3x3, s, v)  # noqa: E741
+        l = once(cholesky_3x3, s.eop_free, v)  # noqa: E741
         border = jnp.concatenate([ws, rows_p, b[None]])
         border = jnp.stack(whiten(border.transpose(1, 0, 2), l), axis=1)
         z = once(
-            lambda factors, *points: tuple(jnp.stack(whiten(w, factors)) for w in points), s, l, *(c.point for c in j)
+            lambda factors, *points: tuple(jnp.stack(whiten(w, factors)) for w in points),
+            s.eop_free,
+            l,
+            *(c.point for c in j),
         )
-        f = jnp.concatenate([once(_whitened_eop, s, j, z).reshape(6 * m, 3 * p), border.reshape(-1, 3 * p)])
+        f = jnp.concatenate([once(_whitened_eop, s.eop_free, j, z).reshape(6 * m, 3 * p), border.reshape(-1, 3 * p)])
         return TileParts(j, f, l, b, diagonal)
 
     return parts
 
 
-def _whitened_eop(j: Iterable[Columns], z: Iterable[Array]) -> Float[Array, "m 6 3 p"]:
+def _whitened_eop(j: Iterable[TileJacobian], z: Iterable[Array]) -> Float[Array, "m 6 3 p"]:
     """Y of a tile."""
     both = ((c.eop.transpose(1, 0, 2), w.transpose(1, 0, 2)) for c, w in zip(j, z, strict=True))
     return sum((eop[:, :, None] * w[:, None] for eop, w in both), jnp.zeros(()))
 
 
-def _met(of: Iterable[Float[Array, "a m p"]], j: Iterable[Columns]) -> Float[Array, "a 3 p"]:
+def _met(of: Iterable[Float[Array, "a m p"]], j: Iterable[TileJacobian]) -> Float[Array, "a 3 p"]:
     """Sums over a point's rows, term by term: XLA's products of matrices this small take five times as long."""
     each = zip(of, j, strict=True)
     return sum((a[:, None, k] * c.point[:, k] for a, c in each for k in range(a.shape[1])), jnp.zeros(()))
 
 
-def _by_interior(j: tuple[Columns, Columns], image: Array, s: Structure) -> Float[Array, "interior 3 p"]:
+def _by_interior(j: tuple[TileJacobian, TileJacobian], image: Array, s: TiledStructure) -> Float[Array, "interior 3 p"]:
     """Ws of a tile."""
     i, q = s.n_interior, s.n_image_colours
     if i == q:
@@ -215,7 +218,7 @@ def _by_interior(j: tuple[Columns, Columns], image: Array, s: Structure) -> Floa
     return (pick @ met.reshape(q * len(image), -1)).reshape(i, 3, -1)
 
 
-def _by_unknown(m: Float[Array, "images c c"], s: Structure):
+def _by_unknown(m: Float[Array, "images c c"], s: TiledStructure):
     """Per-image sums by colour, brought to the columns of the shared unknowns; the last column is a dummy."""
     q, n = s.n_image_colours, s.n_shared
     each, column = jnp.arange(s.n_images), jnp.asarray(s.column)[:, : s.n_image_colours]

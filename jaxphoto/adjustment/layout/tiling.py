@@ -24,17 +24,6 @@ class Tiling(NamedTuple):
     """Of each image row: (tile * M + image) * P + point."""
 
 
-def check_rows(image: np.ndarray, point: np.ndarray) -> None:
-    """Raise ValueError for image rows that are not sorted by point, or hold a point twice in one image."""
-    if (np.diff(point) < 0).any():
-        raise ValueError(
-            "the rows of image_points must be sorted by point: take them in the order of np.argsort(point)"
-        )
-    key = point.astype(np.int64) * (int(image.max(initial=0)) + 1) + image
-    if len(np.unique(key)) < len(key):
-        raise ValueError("image_points holds a point twice in one image: keep one row of each")
-
-
 # Below this the reduced matrix is dense anyway, and any order will do.
 _FEW_IMAGES = 64
 
@@ -57,7 +46,7 @@ def order_images(image: np.ndarray, point: np.ndarray, n_images: int, n_points: 
 
 # Tiles come in multiples of this many, which a block of some 200 points fills: padding takes milliseconds, compiling
 # seconds.
-TILES = 28
+TILE_STEP = 28
 
 
 def size_class(n: int, step: int) -> int:
@@ -71,16 +60,16 @@ def tile_shape(image: np.ndarray, point: np.ndarray, n_images: int, n_points: in
     """Images and points of a tile that make the sums cheapest, found on a part of the block; see `_cost`.
 
     Shapes are few, so that small blocks differ in little that they are compiled for: images are a multiple of 12, or
-    all; points 8 for fewer than 32 images where `TILES` tiles hold the block, else 32. Groups of tiles that are padding
-    take no time.
+    all; points 8 for fewer than 32 images where `TILE_STEP` tiles hold the block, else 32. Groups of tiles that are
+    padding take no time.
     """
     orders, images = _orders(image, point, n_points)
     parts = [_part_of(order) for order in orders]
     most = max(1, max(map(len, images), default=1))
-    small = n_images < 32 and n_points <= 8 * TILES
+    small = n_images < 32 and n_points <= 8 * TILE_STEP
 
     def option(m: int) -> tuple[float, int, int]:
-        p = 8 if small and len(_best_cut(orders, images, m, 8)[1]) <= TILES else 32
+        p = 8 if small and len(_best_cut(orders, images, m, 8)[1]) <= TILE_STEP else 32
         return _cost(len(_best_cut(parts, images, m, p)[1]), m, p), m, p
 
     all_images = size_class(n_images, 8)

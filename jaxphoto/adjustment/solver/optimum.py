@@ -16,15 +16,15 @@ import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Int
 
-from jaxphoto.adjustment.band import factor_band
-from jaxphoto.adjustment.elimination import solve_factored
-from jaxphoto.adjustment.normal import At, Reduced, residuals_at, square_sum
-from jaxphoto.adjustment.reduced import reduce_normal
-from jaxphoto.adjustment.residuals import Increments, Values
-from jaxphoto.adjustment.shards import EVERYWHERE, TILES, along_points, sharded
-from jaxphoto.adjustment.solver import LevenbergMarquardt, System
-from jaxphoto.adjustment.structure import Structure, interior_of
-from jaxphoto.adjustment.tiles import by_tile
+from jaxphoto.adjustment.layout.sharding import EVERYWHERE, TILES, along_points, sharded
+from jaxphoto.adjustment.layout.tiled import TiledStructure, TiledValues
+from jaxphoto.adjustment.model.residuals import Increments
+from jaxphoto.adjustment.model.structure import interior_of
+from jaxphoto.adjustment.solver.band import factor_band
+from jaxphoto.adjustment.solver.elimination import solve_factored
+from jaxphoto.adjustment.solver.levenberg_marquardt import FactoredSystem, LevenbergMarquardt
+from jaxphoto.adjustment.solver.normal import At, Reduced
+from jaxphoto.adjustment.solver.reduced import reduce_normal
 from jaxphoto.arrays import Numbers
 from jaxphoto.collinearity import ExteriorOrientation, image_residual
 
@@ -43,27 +43,27 @@ class Optimum(NamedTuple):
     converged: Bool[Array, ""] | None
 
 
-def zero_increments(structure: Structure) -> Increments:
+def zero_increments(structure: TiledStructure) -> Increments:
     """No change from the start."""
     s = structure
     return Increments(jnp.zeros((6, s.n_images)), jnp.zeros(s.n_shared), jnp.zeros((3, s.n_points)))
 
 
-def unit_scale(structure: Structure) -> Increments:
+def unit_scale(structure: TiledStructure) -> Increments:
     """Increments in metres, radians and the parameters' own units; zero for what is held fixed."""
     s = structure
     return Increments(jnp.asarray(s.eop_free), jnp.ones(s.n_shared), jnp.asarray(s.point_free))
 
 
 @eqx.filter_custom_jvp
-def find_optimum(values: Values, *, structure: Structure, max_steps: int) -> Optimum:
+def find_optimum(values: TiledValues, *, structure: TiledStructure, max_steps: int) -> Optimum:
     """Levenberg-Marquardt from the start in `values`. Differentiable in every number of `values`."""
     return iterate(values, structure, max_steps, np.array(False))[0]
 
 
 def iterate(
-    values: Values, structure: Structure, max_steps: int, only_factor: Bool[Numbers, ""]
-) -> tuple[Optimum, System, Increments]:
+    values: TiledValues, structure: TiledStructure, max_steps: int, only_factor: Bool[Numbers, ""]
+) -> tuple[Optimum, FactoredSystem, Increments]:
     """The optimum, and the last system with the scale of its unknowns; or the undamped system at the start.
 
     The second serves statistics: what was compiled to solve need not be compiled again to factor.
@@ -71,7 +71,7 @@ def iterate(
     scale = typical_scale(values, structure)
     at_points = along_points(2)
     of_unknowns = Increments(EVERYWHERE, EVERYWHERE, at_points)
-    system = System(
+    system = FactoredSystem(
         of_unknowns,
         Reduced(EVERYWHERE, EVERYWHERE, EVERYWHERE, TILES, at_points, of_unknowns, EVERYWHERE),
         EVERYWHERE,
@@ -83,12 +83,12 @@ def iterate(
 
 
 def _iterate(
-    values: Values, scale: Increments, structure: Structure, only_factor: Bool[Numbers, ""], *, max_steps: int
-) -> tuple[Optimum, System]:
+    values: TiledValues, scale: Increments, structure: TiledStructure, only_factor: Bool[Numbers, ""], *, max_steps: int
+) -> tuple[Optimum, FactoredSystem]:
     """The iteration itself, on what one device holds; increments are scaled."""
 
     def length(y, args):
-        return jnp.sqrt(square_sum(At(y, *args)))
+        return jnp.sqrt(At(y, *args).square_sum())
 
     solution: optx.Solution = optx.least_squares(
         # The solver differentiates for itself: optimistix is told that there is nothing to linearise.
@@ -104,13 +104,13 @@ def _iterate(
 
 
 @find_optimum.def_jvp
-def _find_optimum_jvp(primals, tangents, *, structure: Structure, max_steps: int):
+def _find_optimum_jvp(primals, tangents, *, structure: TiledStructure, max_steps: int):
     (values,), (direction,) = primals, tangents
     optimum = find_optimum(values, structure=structure, max_steps=max_steps)
     unit, at = unit_scale(structure), optimum.increments
 
     def gradient(increments, numbers):
-        residuals, pull = jax.vjp(lambda y: residuals_at(At(y, unit, numbers, structure)), increments)
+        residuals, pull = jax.vjp(lambda y: At(y, unit, numbers, structure).residuals(), increments)
         return pull(residuals)[0]
 
     moved, still = eqx.partition(values, jax.tree.map(lambda t: t is not None, direction, is_leaf=lambda t: t is None))
@@ -142,7 +142,7 @@ def _find_optimum_jvp(primals, tangents, *, structure: Structure, max_steps: int
     return optimum, Optimum(increments, None, None)
 
 
-def weigh_datum(values: Values, structure: Structure) -> Values:
+def weigh_datum(values: TiledValues, structure: TiledStructure) -> TiledValues:
     """The same constraints of the datum, each of unit length in scaled increments.
 
     Their weight does not change the optimum (no observation speaks against them); this one keeps N well-conditioned.
@@ -158,7 +158,7 @@ def weigh_datum(values: Values, structure: Structure) -> Values:
     return eqx.tree_at(where, values, (values.datum_eop * weight, values.datum_points * weight))
 
 
-def typical_scale(values: Values, structure: Structure) -> Increments:
+def typical_scale(values: TiledValues, structure: TiledStructure) -> Increments:
     """What moves an image point by about its standard deviation; zero for what is held fixed.
 
     Scaling by these makes columns of the Jacobian alike within a factor of some tens, which is all that the
@@ -183,7 +183,7 @@ def typical_scale(values: Values, structure: Structure) -> Increments:
         stop = group.offset + m * len(group.names)
         vector = vector.at[group.offset : stop].set(jnp.tile(typical, len(group.names)))
     c = v.shared[s.groups[0].offset]
-    apart = by_tile(v.points, s.in_tiles)[..., None, :] - jnp.moveaxis(v.position[:, s.in_tiles.image], 0, 2)[..., None]
+    apart = s.by_tile(v.points)[..., None, :] - jnp.moveaxis(v.position[:, s.tiles.image], 0, 2)[..., None]
     distance = jnp.sqrt(jnp.sum(apart**2, axis=2))
     depth = jnp.sum(distance * filled[:, :, 0]) / jnp.sum(filled[:, :, 0])
     ground, angle = sigma * depth / c, sigma / c

@@ -1,4 +1,4 @@
-"""What all rows but image rows add to the normal equations, group by group (see `groups` for the three layouts)."""
+"""What all rows but image rows add to the normal equations, group by group (`model.observed_groups` has the three layouts)."""
 
 from typing import Any, NamedTuple
 
@@ -7,19 +7,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxphoto.adjustment.groups import AtPoints, Group
-from jaxphoto.adjustment.normal import At
-from jaxphoto.adjustment.residuals import Residuals, datum_residuals
-from jaxphoto.adjustment.rows import RowJacobian, row_jacobian
-from jaxphoto.adjustment.structure import Structure, total
-from jaxphoto.adjustment.tiles import once
+from jaxphoto.adjustment.layout.tiled import TiledStructure
+from jaxphoto.adjustment.model.observed_groups import ObservedGroup, RowsAtPoints
+from jaxphoto.adjustment.model.residuals import NonImageResiduals, datum_residuals
+from jaxphoto.adjustment.model.row_functions import RowJacobian, row_jacobian
+from jaxphoto.adjustment.model.structure import total
+from jaxphoto.adjustment.solver.normal import At
+from jaxphoto.compiling import once
 
 
-class OtherRows(NamedTuple):
+class NonImageRows(NamedTuple):
     """Derivatives and residuals of all but the image rows."""
 
     jacobians: tuple[RowJacobian, ...]
-    residuals: Residuals
+    residuals: NonImageResiduals
     v: Float[Array, "3 3 points"]
     """Sums over the rows that lie at points: of J_p' J_p,"""
     b: Float[Array, "3 points"]
@@ -34,7 +35,7 @@ class OtherRows(NamedTuple):
     """Their residuals."""
 
 
-class Sums(NamedTuple):
+class NormalSums(NamedTuple):
     """Sums of the normal equations of images and shared unknowns (see `normal`), before points are eliminated.
 
     Shared unknowns have a column more than there are: what means none adds to it.
@@ -49,7 +50,7 @@ class Sums(NamedTuple):
     b_e: Float[Array, "images 6"]
 
 
-def other_rows(at: At) -> OtherRows:
+def non_image_rows(at: At) -> NonImageRows:
     """Derivatives and residuals at `at`, and their sums by point."""
     increments, scale, values, s = at
     n, q = increments.points.shape[1], s.n_border - s.n_interior
@@ -61,7 +62,7 @@ def other_rows(at: At) -> OtherRows:
     coupling: list[tuple[Array, Array, Array]] = []
     coupled = []
     for g, j in zip(s.observed, jacobians, strict=True):
-        if isinstance(g.rows, AtPoints):
+        if isinstance(g.rows, RowsAtPoints):
             # Term by term and rows with rows of a point: few, and every one of them as long as there are points.
             flat = j.points.reshape(-1, 3, *j.points.shape[3:])
             flat = jnp.moveaxis(flat, 2, 1).reshape(-1, 3, n)
@@ -75,8 +76,7 @@ def other_rows(at: At) -> OtherRows:
             coupling.append(_coupled(g, j, s, n))
             coupled.append(j.residual.reshape(-1))
     k = len(values.datum_eop)
-    residuals = Residuals(
-        jnp.zeros((2, 0)),
+    residuals = NonImageResiduals(
         tuple(j.residual for j in jacobians),
         datum_residuals(increments, scale, values, s),
         tuple(g.name for g in s.observed),
@@ -87,10 +87,10 @@ def other_rows(at: At) -> OtherRows:
         values.datum_points * scale.points,
     )
     e, of_s, p = (jnp.concatenate(of) for of in zip(*coupling, datum, strict=True))
-    return OtherRows(jacobians, residuals, v, b, w, e, of_s, p, jnp.concatenate([*coupled, residuals.datum]))
+    return NonImageRows(jacobians, residuals, v, b, w, e, of_s, p, jnp.concatenate([*coupled, residuals.datum]))
 
 
-def _coupled(g: Group, j: RowJacobian, s: Structure, n_points: int) -> tuple[Array, Array, Array]:
+def _coupled(g: ObservedGroup, j: RowJacobian, s: TiledStructure, n_points: int) -> tuple[Array, Array, Array]:
     """The rows of a group in full, by images, shared unknowns and points."""
     c, each = g.components, jnp.arange(g.n_rows)
     e = jnp.zeros((c, g.n_rows, s.n_images, 6))
@@ -106,10 +106,10 @@ def _coupled(g: Group, j: RowJacobian, s: Structure, n_points: int) -> tuple[Arr
     return flat(e), flat(of_s)[:, :-1], flat(p)
 
 
-def add_other_rows(sums: Sums, rest: OtherRows, s: Structure) -> Sums:
+def add_non_image_rows(sums: NormalSums, rest: NonImageRows, s: TiledStructure) -> NormalSums:
     """The sums with those of all rows that meet images and shared unknowns."""
     for g, j in zip(s.observed, rest.jacobians, strict=True):
-        if isinstance(g.rows, AtPoints):
+        if isinstance(g.rows, RowsAtPoints):
             if len(g.place):
                 sums = _add_shared(sums, g, j, s)
         elif g.layout == "reduced":
@@ -117,7 +117,7 @@ def add_other_rows(sums: Sums, rest: OtherRows, s: Structure) -> Sums:
     return sums._replace(us=sums.us[:, :, :-1], uss=sums.uss[:-1, :-1], b_s=sums.b_s[:-1])
 
 
-def _add_shared(sums: Sums, g: Group, j: RowJacobian, s: Structure) -> Sums:
+def _add_shared(sums: NormalSums, g: ObservedGroup, j: RowJacobian, s: TiledStructure) -> NormalSums:
     """Of rows at points, which are dealt out with these, what they add to the shared unknowns."""
     flat = jnp.moveaxis(j.shared, 1, 0).reshape(len(g.place), -1)
     column = jnp.asarray(g.column)[:, 0]
@@ -125,12 +125,12 @@ def _add_shared(sums: Sums, g: Group, j: RowJacobian, s: Structure) -> Sums:
     return sums._replace(uss=sums.uss.at[column[:, None], column].add(own), b_s=sums.b_s.at[column].add(b))
 
 
-def _add_reduced(sums: Sums, g: Group, j: RowJacobian, s: Structure) -> Sums:
+def _add_reduced(sums: NormalSums, g: ObservedGroup, j: RowJacobian, s: TiledStructure) -> NormalSums:
     band, u, us, uss, b_s, b_e = sums
     pair = 0
     for a, image in enumerate(g.image):
         own = j.eop[:, a]
-        square = once(lambda own, r: _products(own, jnp.concatenate([own, r[:, None]], 1)), s, own, j.residual)
+        square = once(lambda own, r: _products(own, jnp.concatenate([own, r[:, None]], 1)), s.eop_free, own, j.residual)
         by_image = sum_by(square.reshape(-1, 42), image, s.n_images).reshape(-1, 6, 7)
         u, b_e = u + by_image[:, :, :6], b_e + by_image[:, :, 6]
         for other in range(a):
@@ -150,7 +150,7 @@ def _add_reduced(sums: Sums, g: Group, j: RowJacobian, s: Structure) -> Sums:
         column = jnp.asarray(g.column).T
         uss = uss.at[column[:, :, None], column[:, None]].add(_products(j.shared, j.shared))
         b_s = b_s.at[column].add(jnp.einsum("cln,cn->nl", j.shared, j.residual))
-    return Sums(band, u, us, uss, b_s, b_e)
+    return NormalSums(band, u, us, uss, b_s, b_e)
 
 
 def _products(a: Float[Array, "c a rows"], b: Float[Array, "c b rows"]) -> Float[Array, "rows a b"]:

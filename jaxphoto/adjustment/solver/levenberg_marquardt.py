@@ -13,17 +13,17 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, PyTree, Scalar
 
-from jaxphoto.adjustment.band import BandFactor, factor_band
-from jaxphoto.adjustment.elimination import gradient, solve_reduced
-from jaxphoto.adjustment.normal import At, Reduced, dot, norm2
-from jaxphoto.adjustment.reduced import Right, reduce_normal
-from jaxphoto.adjustment.residuals import Increments, Values
-from jaxphoto.adjustment.similarity import onto_datum, open_motions
-from jaxphoto.adjustment.structure import Structure
-from jaxphoto.adjustment.values import with_datum
+from jaxphoto.adjustment.layout.tiled import TiledStructure, TiledValues
+from jaxphoto.adjustment.model.residuals import Increments
+from jaxphoto.adjustment.model.values import with_datum
+from jaxphoto.adjustment.solver.band import BandFactor, factor_band
+from jaxphoto.adjustment.solver.elimination import gradient, solve_reduced
+from jaxphoto.adjustment.solver.normal import At, Reduced, dot, norm2
+from jaxphoto.adjustment.solver.reduced import RightSide, reduce_normal
+from jaxphoto.adjustment.solver.similarity import onto_datum, open_motions
 
 
-class System(NamedTuple):
+class FactoredSystem(NamedTuple):
     """Normal equations summed and factored at some increments."""
 
     increments: Increments
@@ -31,12 +31,12 @@ class System(NamedTuple):
     factor: BandFactor
 
 
-def zero_system(y: Increments, values: Values, s: Structure) -> System:
+def zero_system(y: Increments, values: TiledValues, s: TiledStructure) -> FactoredSystem:
     """A system of the right shapes, to begin with."""
     n, q, k = 6 * s.n_images, s.n_shared, s.n_coupled + len(values.datum_eop)
-    *tiles, m = s.in_tiles.image.shape
-    f = (*tiles, 6 * m + s.n_border + k + 1, s.in_tiles.eliminated)
-    size, inner = n // s.in_tiles.columns, s.in_tiles.columns - 1
+    *tiles, m = s.tiles.image.shape
+    f = (*tiles, 6 * m + s.n_border + k + 1, s.tiles.eliminated)
+    size, inner = n // s.tiles.columns, s.tiles.columns - 1
     factor = BandFactor(
         jnp.zeros((inner, 2 * size, size)), jnp.zeros((q, inner * size)), jnp.zeros((size + q, size + q))
     )
@@ -44,15 +44,15 @@ def zero_system(y: Increments, values: Values, s: Structure) -> System:
         diagonal=jnp.zeros(n + q),
         g=jnp.zeros((n + q, k)),
         k=jnp.zeros((k, k)),
-        f=jnp.zeros(f) if s.in_tiles.few else None,
+        f=jnp.zeros(f) if s.tiles.few else None,
         l=jnp.zeros((6, y.points.shape[1])),
         weight=jax.tree.map(jnp.zeros_like, y),
         damping=jnp.zeros(()),
     )
-    return System(y, reduced, factor)
+    return FactoredSystem(y, reduced, factor)
 
 
-class Progress(NamedTuple):
+class SolverState(NamedTuple):
     """The solver's state between two steps."""
 
     damping: Scalar
@@ -60,7 +60,7 @@ class Progress(NamedTuple):
     """Of the last accepted step, in the metric of the normal matrix."""
     chord: Bool[Array, ""]
     """Whether the next step uses the system as it is."""
-    system: System
+    system: FactoredSystem
     loose: Bool[Array, ""]
     """Whether damping takes the place of the datum's constraints."""
     tightened: Bool[Array, ""]
@@ -80,7 +80,7 @@ _SLOWEST_SHOWN = 0.1
 _CHORD, _CHORD_FAILS = 0.01, 0.3
 
 
-def _next_damping(state: Progress, accept: Bool[Array, ""], gain: Scalar) -> Scalar:
+def _next_damping(state: SolverState, accept: Bool[Array, ""], gain: Scalar) -> Scalar:
     """Less after an accepted step, by the ratio of actual to promised reduction; more after a rejected one."""
     less = state.damping * jnp.maximum(_LEAST_FACTOR, 1 - (2 * gain - 1) ** 3)
     # Nothing else keeps a loose network's matrix regular.
@@ -90,7 +90,7 @@ def _next_damping(state: Progress, accept: Bool[Array, ""], gain: Scalar) -> Sca
     return jnp.where(state.chord, state.damping, jnp.where(accept, less, more))
 
 
-class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Increments, Scalar, Any, Progress]):
+class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Increments, Scalar, Any, SolverState]):
     """Levenberg-Marquardt, stopped by what is still missing to the optimum in standard deviations.
 
     The function it minimises returns the length of the residual vector; derivatives are the solver's own business.
@@ -104,14 +104,16 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Increments, Scalar, Any
     rtol: float
     atol: float
     norm: Callable[[PyTree], Scalar]
-    structure: Structure
-    values: Values
+    structure: TiledStructure
+    values: TiledValues
     scale: Increments
     tolerance: float
     only_factor: Bool[Array, ""]
     """One undamped step, for the sake of its system: what has a program to solve needs none to factor."""
 
-    def __init__(self, structure: Structure, values: Values, scale: Increments, tolerance: float, only_factor):
+    def __init__(
+        self, structure: TiledStructure, values: TiledValues, scale: Increments, tolerance: float, only_factor
+    ):
         # optimistix' own test of convergence is not used: `step` decides.
         self.rtol, self.atol, self.norm = 0.0, 0.0, optx.max_norm
         self.structure, self.values, self.scale = structure, values, scale
@@ -123,22 +125,22 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Increments, Scalar, Any
             v = with_datum(v, jnp.where(loose, 0.0, v.datum_eop), jnp.where(loose, 0.0, v.datum_points))
         return At(y, self.scale, v, self.structure)
 
-    def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> Progress:
+    def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> SolverState:
         """Almost Gauss-Newton to begin with."""
         damping = jnp.where(self.only_factor, 0.0, _FIRST_DAMPING)
         empty = zero_system(y, self.values, self.structure)
         no = jnp.array(False)
-        return Progress(damping, jnp.array(jnp.inf), no, empty, loose=no, tightened=no, done=no)
+        return SolverState(damping, jnp.array(jnp.inf), no, empty, loose=no, tightened=no, done=no)
 
-    def _factored(self, at: At, damping) -> tuple[System, Right]:
+    def _factored(self, at: At, damping) -> tuple[FactoredSystem, RightSide]:
         a, reduced, right = reduce_normal(at, damping)
-        return System(at.increments, reduced, factor_band(a)), right
+        return FactoredSystem(at.increments, reduced, factor_band(a)), right
 
-    def _kept(self, at: At, system: System) -> tuple[System, Right]:
+    def _kept(self, at: At, system: FactoredSystem) -> tuple[FactoredSystem, RightSide]:
         """The gradient there, taken down by the system that there is."""
-        return system, Right(*gradient(at, system.reduced, at._replace(increments=system.increments)))
+        return system, RightSide(*gradient(at, system.reduced, at._replace(increments=system.increments)))
 
-    def step(self, fn, y, args, options, state: Progress, tags):
+    def step(self, fn, y, args, options, state: SolverState, tags):
         """Propose a step; take it if it is good, and damp more if not."""
         at = self._at(y, state.loose)
         system, right = jax.lax.cond(
@@ -175,7 +177,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Increments, Scalar, Any
             tighten = settled & state.loose
             next_y = jax.lax.cond(tighten, lambda y: onto_datum(self._at(y, jnp.array(False))), lambda y: y, next_y)
             loose = (state.loose | (~accept & ~state.chord & ~state.tightened)) & ~tighten
-        progress = Progress(
+        progress = SolverState(
             damping=jnp.where(tighten, _FIRST_DAMPING, damping),
             length=jnp.where(tighten, jnp.inf, pick(length, state.length)),
             chord=accept & ~chord_failed & ~tighten & (state.chord | ((ratio < _CHORD) & jnp.isfinite(state.length))),
@@ -186,7 +188,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Increments, Scalar, Any
         )
         return next_y, progress, None
 
-    def terminate(self, fn, y, args, options, state: Progress, tags):
+    def terminate(self, fn, y, args, options, state: SolverState, tags):
         """After the step that settled it, or the only one."""
         return state.done, optx.RESULTS.successful
 

@@ -47,7 +47,7 @@ class ParameterTable(eqx.Module):
         return filled(self.form, jnp.concatenate([numbers, jnp.zeros((1, self.size))]).T)
 
 
-class Entry(NamedTuple):
+class SharedParameter(NamedTuple):
     """One shared parameter."""
 
     owner: str
@@ -56,7 +56,7 @@ class Entry(NamedTuple):
     prior: object
 
 
-class Together(NamedTuple):
+class JointPrior(NamedTuple):
     """Parameters known beforehand with a full covariance matrix, by their places in the vector of all parameters."""
 
     parameters: np.ndarray
@@ -107,19 +107,19 @@ def unknowns_from(shared: Numbers, like: Unknowns, tables: Sequence[ParameterTab
 
 def shared_entries(
     block: Block, priors: Unknowns, cameras: Iterable[str], tables: Sequence[ParameterTable]
-) -> tuple[list[Entry], list[Together]]:
+) -> tuple[list[SharedParameter], list[JointPrior]]:
     """All shared parameters in the order of `shared_vector`, and those that are known together.
 
     Raises InputError for a prior that is none, and for a tree of priors that lacks something.
     """
-    entries: list[Entry] = []
-    together: list[Together] = []
+    entries: list[SharedParameter] = []
+    together: list[JointPrior] = []
     for name in cameras:
         interior = block.start.unknowns.interior[name]
         treedef: Any = jax.tree.structure(interior)
         labels, leaves = _leaf_names(interior), treedef.flatten_up_to(priors.interior[name])
         for label, prior in zip(labels, leaves, strict=True):
-            entries.append(_checked(Entry(f"c:{name}", f"interior[{name}].{label}", prior)))
+            entries.append(_checked(SharedParameter(f"c:{name}", f"interior[{name}].{label}", prior)))
     for t in tables:
         for name in t.owners:
             known: Any = block.start.unknowns.tables[t.kind][name]
@@ -134,9 +134,9 @@ def shared_entries(
             for prior, value in zip(_leaves(given, known), leaves_in_order(known), strict=True):
                 own = [next(labels) for _ in range(np.size(value))]
                 if isinstance(prior, Weighted) and prior.covariance is not None:
-                    together.append(Together(len(entries) + np.arange(len(own)), prior.value, prior.covariance))
+                    together.append(JointPrior(len(entries) + np.arange(len(own)), prior.value, prior.covariance))
                 entries += [
-                    _checked(Entry(f"{t.kind}:{name}", label, each))
+                    _checked(SharedParameter(f"{t.kind}:{name}", label, each))
                     for label, each in zip(own, _components(prior, len(own)), strict=True)
                 ]
     return entries, together
@@ -157,7 +157,7 @@ def _leaves(priors: Any, like: Any) -> list:
     return found
 
 
-def _checked(entry: Entry) -> Entry:
+def _checked(entry: SharedParameter) -> SharedParameter:
     check_prior(entry.label, entry.prior)
     return entry
 

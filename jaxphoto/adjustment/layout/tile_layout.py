@@ -10,10 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Int
 
-from jaxphoto.adjustment.band import column_blocks
-from jaxphoto.adjustment.structure import Structure
-from jaxphoto.adjustment.tiling import (
-    TILES,
+from jaxphoto.adjustment.layout.tiling import (
+    TILE_STEP,
     Tiling,
     field_shape,
     order_images,
@@ -22,6 +20,7 @@ from jaxphoto.adjustment.tiling import (
     tile_points,
     tile_shape,
 )
+from jaxphoto.adjustment.model.structure import Structure
 
 
 class Sizes(NamedTuple):
@@ -73,6 +72,8 @@ def sizes_of(structure: Structure) -> Sizes:
 _CHUNK = 4_000_000
 # Up to so many images, a larger reduced matrix costs less than another program.
 _SMALL = 64
+# What a column block costs beside its operations, counted in operations (measured: about 10 microseconds).
+_OVERHEAD = 2e5
 # Slots that are computed with at a time.
 _SLOTS = 4000
 
@@ -109,8 +110,8 @@ class TileLayout(NamedTuple):
         columns, width = (1, n) if dense else column_blocks(n, min(n, size_class(bandwidth, 8)))
         per_shard = -(-tiles // shards)
         chunks = -(-per_shard * (6 * m) ** 2 // _CHUNK)
-        at_once = max(k for k in range(1, TILES + 1) if TILES % k == 0 and k * m * p <= max(_SLOTS, m * p))
-        chunk = size_class(-(-per_shard // chunks), TILES)
+        at_once = max(k for k in range(1, TILE_STEP + 1) if TILE_STEP % k == 0 and k * m * p <= max(_SLOTS, m * p))
+        chunk = size_class(-(-per_shard // chunks), TILE_STEP)
         lists = _pair_lists(_images_of_free_points(tiling, own, p), chunk, width)
         blocks = max(map(len, lists[2]), default=0)
         rows = tuple((g.name, g.depth if g.layout == "point" else g.n_rows) for g in s.observed)
@@ -124,6 +125,28 @@ class TileLayout(NamedTuple):
         """As many pairs of images as there can be in the tiles of a chunk."""
         m = self.sizes.tile_images
         return self.chunk * m * (m + 1) // 2 if self.free_points else 0
+
+
+def column_blocks(n_images: int, bandwidth: int) -> tuple[int, int]:
+    """Number k of column blocks and images w of each, for images of which none meet further apart than `bandwidth`.
+
+    w >= bandwidth and k w >= n_images. Costs counted are operations of the factorization: n^3 / 3 of a dense one with
+    n = 6 n_images, and m^3 / 3 for each of k column blocks with m = 6 w, 3 m^3 for each but the last (triangular
+    solution m^3, product 2 m^3) and a constant for each. The w of least cost is taken if it halves the cost at least,
+    else the block is one column.
+    """
+
+    def cost(k: int, w: int) -> float:
+        m = 6 * w
+        return k * m**3 / 3 + (k - 1) * 3 * m**3 + k * _OVERHEAD
+
+    n = max(n_images, 1)
+    narrowest = min(max(bandwidth, 1), n)
+    # For each number of column blocks the narrowest; more of them would only be padding.
+    widths = {max(narrowest, -(-n // k)) for k in range(1, -(-n // narrowest) + 1)}
+    choices = [(-(-n // w), w) for w in sorted(widths)]
+    best = min(choices, key=lambda choice: cost(*choice))
+    return best if 2 * cost(*best) <= cost(1, n) else (1, n)
 
 
 def _meetings(s: Structure, own: Bool[np.ndarray, "rows"]) -> tuple[np.ndarray, np.ndarray, int, int]:

@@ -10,34 +10,39 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxphoto.adjustment.band import BandFactor, solve_band
-from jaxphoto.adjustment.groups import AtPoints
-from jaxphoto.adjustment.normal import At, Reduced, each_tile_of, other_squares, squares, unwhiten, whiten
-from jaxphoto.adjustment.other_rows import other_rows
-from jaxphoto.adjustment.reduced import tile_numbers, tile_parts
-from jaxphoto.adjustment.residuals import Increments, Residuals, state_at
-from jaxphoto.adjustment.rows import other_residuals
-from jaxphoto.adjustment.structure import Structure, total
-from jaxphoto.adjustment.tiles import (
-    Scene,
-    by_image,
-    by_point,
-    by_tile,
-    of_images,
-    rows,
-    scene_of,
-    seen_in,
-)
+from jaxphoto.adjustment.layout.tiled import TiledStructure
+from jaxphoto.adjustment.model.observed_groups import RowsAtPoints
+from jaxphoto.adjustment.model.residuals import Increments, NonImageResiduals, state_at
+from jaxphoto.adjustment.model.row_functions import non_image_residuals
+from jaxphoto.adjustment.model.scene import Scene, by_image, of_images, scene_of
+from jaxphoto.adjustment.model.structure import total
+from jaxphoto.adjustment.solver.band import BandFactor, solve_band
+from jaxphoto.adjustment.solver.non_image_rows import non_image_rows
+from jaxphoto.adjustment.solver.normal import At, Reduced, other_squares, squares
+from jaxphoto.adjustment.solver.reduced import tile_numbers, tile_parts
+from jaxphoto.adjustment.solver.tile_rows import seen_in, tile_residuals
+from jaxphoto.small_matrices import unwhiten, whiten
+
+
+class FactoredNormal(eqx.Module):
+    """The normal equations at an optimum in scaled increments, undamped, factored."""
+
+    reduced: Reduced
+    factor: BandFactor
+    scale: Increments
+    n_constraints: int = eqx.field(static=True)
+    """Constraints of the datum: the last of the rows of D."""
 
 
 def over_tiles(function: Callable, at: At, reduced: Reduced, numbers: tuple) -> Any:
     """`function(F, images, *numbers)` of every tile, for the F of `reduced`, linearised `at`."""
     if reduced.f is None:
-        rest = other_rows(at)
+        rest = non_image_rows(at)
         parts_of = tile_parts(at, reduced.damping, rest.coupled)
         given, f_of = tile_numbers(at, rest), lambda given: parts_of(given).f
     else:
@@ -47,7 +52,7 @@ def over_tiles(function: Callable, at: At, reduced: Reduced, numbers: tuple) -> 
         image, given, *own = of_tile
         return function(f_of(given), image, *own)
 
-    return each_tile_of(tile, (given, *numbers), at.structure)
+    return at.structure.each_tile(tile, (given, *numbers))
 
 
 def solve_factored(reduced: Reduced, factor: BandFactor, b: Increments, at: At) -> Increments:
@@ -58,13 +63,13 @@ def solve_factored(reduced: Reduced, factor: BandFactor, b: Increments, at: At) 
 def reduce_right(reduced: Reduced, b: Increments, at: At, many: bool = False) -> tuple[Array, Array]:
     """A right-hand side, or one of `many` under `jax.vmap`, taken down to the reduced unknowns and to mu."""
     s, i = at.structure, at.structure.n_border
-    if not s.in_tiles.free_points:
+    if not s.tiles.free_points:
         return jnp.concatenate([b.eop.T.reshape(-1), b.shared]), jnp.zeros(len(reduced.k))
     z = jnp.stack(whiten(b.points, reduced.l))
     if reduced.f is None and not many:
         eop, shared, d = _down_by_rows(jnp.stack(unwhiten(z, reduced.l)), at)
         return jnp.concatenate([(b.eop - eop).T.reshape(-1), b.shared - shared]), d
-    image, z = s.in_tiles.image, by_tile(z, s.in_tiles)
+    image, z = s.tiles.image, s.by_tile(z)
     down = over_tiles(lambda f, _, z: f @ z.reshape(-1), at, reduced, (z,))
     of_images, border = jnp.split(down, [6 * image.shape[2]], axis=2)
     of_images = jax.ops.segment_sum(of_images.reshape(-1, 6), image.reshape(-1), s.n_images)
@@ -80,7 +85,7 @@ def solve_reduced(reduced: Reduced, factor: BandFactor, right, d, b_points, at: 
     x = solve_band(factor, right)
     mu = jnp.linalg.solve(r.k, r.g.T @ x + d) if len(d) else d
     eop, shared = x[: 6 * n].reshape(n, 6), x[6 * n :]
-    if not s.in_tiles.free_points:
+    if not s.tiles.free_points:
         return Increments(eop.T, shared, jnp.zeros_like(b_points))
     if r.f is None and not many:
         b_points = b_points - _up_by_rows(eop.T, shared, mu, at)
@@ -90,24 +95,24 @@ def solve_reduced(reduced: Reduced, factor: BandFactor, right, d, b_points, at: 
     def up(f, image):
         return (jnp.concatenate([eop[image].reshape(-1), border]) @ f).reshape(3, -1)
 
-    z = jnp.stack(whiten(b_points, r.l)) - by_point(over_tiles(up, at, r, ()))
+    z = jnp.stack(whiten(b_points, r.l)) - s.by_point(over_tiles(up, at, r, ()))
     return Increments(eop.T, shared, jnp.stack(unwhiten(z, r.l)))
 
 
 def _down_by_rows(step: Array, at: At) -> tuple[Array, Array, Array]:
     """What increments of the points add to the right-hand sides of images, shared unknowns and mu."""
     _, scale, values, s = at
-    rest = other_rows(at)
+    rest = non_image_rows(at)
     scene, pull_scene = _scene_and_pull(at)
 
     def tile(numbers):
         image, point, step, xy, sigma = numbers
         seen, place = seen_in(xy, sigma, image, s), of_images(scene, image, s)
-        moved = jax.jvp(lambda point: rows(place, point, seen, s), (point,), (step,))[1]
-        return jax.vjp(lambda scene: rows(scene, point, seen, s), place)[1](moved)[0]
+        moved = jax.jvp(lambda point: tile_residuals(place, point, seen, s), (point,), (step,))[1]
+        return jax.vjp(lambda scene: tile_residuals(scene, point, seen, s), place)[1](moved)[0]
 
-    numbers = (by_tile(at.state.points, s.in_tiles), by_tile(step * scale.points, s.in_tiles))
-    to_scene = each_tile_of(tile, (*numbers, values.xy, values.sigma_xy), s)
+    numbers = (s.by_tile(at.state.points), s.by_tile(step * scale.points))
+    to_scene = s.each_tile(tile, (*numbers, values.xy, values.sigma_xy))
     eop, shared = pull_scene(total(_by_image(to_scene, scene, s), s))
     if len(rest.w):
         shared = shared.at[s.n_interior : s.n_border].add(total(jnp.einsum("lap,ap->l", rest.w, step), s))
@@ -117,17 +122,17 @@ def _down_by_rows(step: Array, at: At) -> tuple[Array, Array, Array]:
 def _up_by_rows(eop: Array, shared: Array, mu: Array, at: At) -> Array:
     """What increments of images and shared unknowns, and mu, add to the right-hand sides of the points."""
     increments, scale, values, s = at
-    rest = other_rows(at)
+    rest = non_image_rows(at)
     scene, moved = jax.jvp(partial(_scene_at, at), (increments.eop, increments.shared), (eop, shared))
 
     def tile(numbers):
         image, point, xy, sigma = numbers
         seen, place = seen_in(xy, sigma, image, s), of_images(scene, image, s)
-        moves = jax.jvp(lambda scene: rows(scene, point, seen, s), (place,), (of_images(moved, image, s),))[1]
-        return jax.vjp(lambda point: rows(place, point, seen, s), point)[1](moves)[0]
+        moves = jax.jvp(lambda scene: tile_residuals(scene, point, seen, s), (place,), (of_images(moved, image, s),))[1]
+        return jax.vjp(lambda point: tile_residuals(place, point, seen, s), point)[1](moves)[0]
 
-    numbers = (by_tile(at.state.points, s.in_tiles), values.xy, values.sigma_xy)
-    result = by_point(each_tile_of(tile, numbers, s)) * scale.points + jnp.einsum("kcp,k->cp", rest.rows_p, mu)
+    numbers = (s.by_tile(at.state.points), values.xy, values.sigma_xy)
+    result = s.by_point(s.each_tile(tile, numbers)) * scale.points + jnp.einsum("kcp,k->cp", rest.rows_p, mu)
     if len(rest.w):
         result = result + jnp.einsum("lap,l->ap", rest.w, shared[s.n_interior : s.n_border])
     return result
@@ -139,7 +144,6 @@ def gradient(at: At, reduced: Reduced, there: At):
     What takes it down is `reduced`, linearised `there`.
     """
     increments, scale, values, s = at
-    tiles = s.in_tiles
     others, b_others = _others_and_gradient(at)
     scene, pull_scene = _scene_and_pull(at)
     points = values.points + increments.points * scale.points
@@ -147,30 +151,30 @@ def gradient(at: At, reduced: Reduced, there: At):
     def tile(numbers):
         image, point, step, other, xy, sigma = numbers
         seen, place = seen_in(xy, sigma, image, s), of_images(scene, image, s)
-        r, pull = jax.vjp(lambda scene, point: rows(scene, point, seen, s), place, point)
+        r, pull = jax.vjp(lambda scene, point: tile_residuals(scene, point, seen, s), place, point)
         to_scene, to_point = pull(r)
         return to_scene, to_point * step + other, squares(r)
 
-    numbers = (by_tile(v, tiles) for v in (points, scale.points, b_others.points))
-    to_scene, b, square = each_tile_of(tile, (*numbers, values.xy, values.sigma_xy), s)
+    numbers = (s.by_tile(v) for v in (points, scale.points, b_others.points))
+    to_scene, b, square = s.each_tile(tile, (*numbers, values.xy, values.sigma_xy))
     eop, shared = pull_scene(total(_by_image(to_scene, scene, s), s))
-    b = Increments(eop + b_others.eop, shared + b_others.shared, by_point(b))
+    b = Increments(eop + b_others.eop, shared + b_others.shared, s.by_point(b))
     return b, *reduce_right(reduced, b, there), total(jnp.sum(square), s) + other_squares(others, s)
 
 
-def _others_and_gradient(at: At) -> tuple[Residuals, Increments]:
+def _others_and_gradient(at: At) -> tuple[NonImageResiduals, Increments]:
     """All but the image rows, and their part of b."""
     increments, scale, values, s = at
-    others, pull = jax.vjp(lambda y: other_residuals(y, scale, values, s), increments)
+    others, pull = jax.vjp(lambda y: non_image_residuals(y, scale, values, s), increments)
     nothing = dataclasses.replace(others, datum=jnp.zeros_like(others.datum))
 
     def of(at_points: bool) -> Increments:
-        chosen = (isinstance(g.rows, AtPoints) == at_points for g in s.observed)
+        chosen = (isinstance(g.rows, RowsAtPoints) == at_points for g in s.observed)
         pairs = zip(chosen, others.others, strict=True)
         return pull(dataclasses.replace(nothing, others=tuple(v if own else jnp.zeros_like(v) for own, v in pairs)))[0]
 
     b = of(at_points=False)
-    if any(isinstance(g.rows, AtPoints) for g in s.observed):
+    if any(isinstance(g.rows, RowsAtPoints) for g in s.observed):
         # These alone are dealt out with their points and meet shared unknowns, which are on every device.
         at_points = of(at_points=True)
         b = jax.tree.map(jnp.add, b, at_points._replace(shared=total(at_points.shared, s)))
@@ -190,9 +194,9 @@ def _scene_at(at: At, eop: Array, shared: Array) -> Scene:
     return scene_of(state_at(increments._replace(eop=eop, shared=shared), scale, values, s), values, s)
 
 
-def _by_image(parts: Scene, scene: Scene, s: Structure) -> Scene:
+def _by_image(parts: Scene, scene: Scene, s: TiledStructure) -> Scene:
     """Cotangents of tiles, added by image (and over all tiles, for the only camera of a group)."""
-    image, n = s.in_tiles.image.reshape(-1), scene.centre.shape[0]
+    image, n = s.tiles.image.reshape(-1), scene.centre.shape[0]
 
     def of_image(v):
         return jax.ops.segment_sum(v.reshape(-1, *v.shape[3:]), image, n)

@@ -1,4 +1,4 @@
-"""TileLayout and size classes: blocks as they are computed with; what is compiled serves every block of similar size.
+"""Sizes come in classes: blocks as they are computed with; what is compiled serves every block of similar size.
 
 Before it is computed with, a block is laid out in tiles (`tiling`) and padded with images and points that nothing
 depends on: rows of infinite standard deviation, unknowns that are held fixed. Images and tiles have coarse classes; all
@@ -9,21 +9,64 @@ and put back in the block's own order. Names stay outside: the padded structure 
 import dataclasses
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jaxphoto.adjustment.layout import LEAST, Places, Sizes, TileLayout
-from jaxphoto.adjustment.padded_groups import crop_rows, pad_groups, pad_rows, put, scatter
-from jaxphoto.adjustment.residuals import Residuals, State, Values
-from jaxphoto.adjustment.structure import CameraGroup, Structure, Tiles
-from jaxphoto.adjustment.tiling import size_class
+from jaxphoto.adjustment.layout.padded_groups import crop_rows, pad_groups, pad_rows, put, scatter
+from jaxphoto.adjustment.layout.tile_layout import LEAST, Places, Sizes, TileLayout
+from jaxphoto.adjustment.layout.tiled import TiledResiduals, TiledStructure, TiledValues, Tiles
+from jaxphoto.adjustment.layout.tiling import size_class
+from jaxphoto.adjustment.model.observed_groups import ObservedGroup
+from jaxphoto.adjustment.model.residuals import Residuals, UnknownArrays, Values
+from jaxphoto.adjustment.model.structure import CameraGroup, Structure
 from jaxphoto.arrays import still
 
 
-def pad_structure(
-    structure: Structure, sizes: Sizes = LEAST, *, shards: int = 1, dense: bool = False
-) -> tuple[Structure, Places]:
-    """The structure in tiles and padded sizes, and where everything went; the last image is the one nothing depends on.
+class TiledBlock(eqx.Module):
+    """A block as given and in tiles, and the way from one to the other."""
+
+    own: Structure
+    structure: TiledStructure
+    places: Places
+
+    def pad(self, values: Values) -> TiledValues:
+        """Numbers of the block in its tiles."""
+        return pad_values(values, self.own, self.structure, self.places)
+
+    def crop_state(self, state: UnknownArrays) -> UnknownArrays:
+        """The state in the block's own sizes and order."""
+        position, rotation, shared, points = map(still, state)
+        p = self.places
+        return UnknownArrays(position[..., p.image], rotation[..., p.image], shared, points[..., p.point])
+
+    def crop_residuals(self, residuals: TiledResiduals) -> Residuals:
+        """Residuals in the block's own sizes and order."""
+        groups = zip(self.own.observed, residuals.others, strict=True)
+        others = tuple(self.crop_rows(g, still(v)) for g, v in groups)
+        return Residuals(others, still(residuals.datum), residuals.names, self.crop_image(residuals.image))
+
+    def crop_rows(self, group: ObservedGroup, numbers: np.ndarray) -> np.ndarray:
+        """Numbers of padded rows, (components, ...), in the block's own order: (rows) where a row is one number."""
+        return crop_rows(group, numbers, self.places)
+
+    def crop_image(self, image: Any) -> np.ndarray:
+        """Numbers of the slots of tiles (chunks, tiles, 2, m, p) by image row of the block (2, rows)."""
+        image = still(image)
+        chunks, tiles, _, m, p = image.shape
+        tile, slot = np.divmod(self.places.row, m * p)
+        return image.reshape(chunks * tiles, 2, m * p)[tile, :, slot].T
+
+    def crop_reduced(self, matrix: Any) -> np.ndarray:
+        """A matrix over the reduced unknowns (6 an image, then the shared ones) in the block's own sizes and order."""
+        matrix, q = still(matrix), self.own.n_shared
+        of_images = (6 * self.places.image[:, None] + np.arange(6)).ravel()
+        kept = np.append(of_images, np.arange(len(matrix) - q, len(matrix)))
+        return matrix[np.ix_(kept, kept)]
+
+
+def pad_structure(structure: Structure, sizes: Sizes = LEAST, *, shards: int = 1, dense: bool = False) -> TiledBlock:
+    """The block in tiles and padded sizes; the last image is the one nothing depends on.
 
     `sizes` are sizes that are wanted at least, such as those of all blocks of a study; `shards` is the number of
     devices; `dense` asks for a reduced matrix that is not a band.
@@ -51,13 +94,15 @@ def pad_structure(
     _, first = np.unique(layout.point_of, return_index=True)
     places = Places(layout.image_place, layout.tiling.place[first].astype(np.int32), layout.tiling.slot, point_at)
     at = places.image
-    padded = dataclasses.replace(
-        s,
+    same = {
+        name: getattr(s, name)
+        for name in ("corrections", "n_interior", "n_border", "n_image_colours", "free", "colour")
+    }
+    padded = TiledStructure(
+        **{name: getattr(s, name) for name in same},
         groups=tuple(_pad_group(g, at, n_images) for g in s.groups),
         n_images=n_images,
         n_points=n_points,
-        image=np.zeros(0, np.int32),
-        point=np.zeros(0, np.int32),
         column=put(s.column, at, n_images, len(s.free)),
         tables=tuple(
             dataclasses.replace(t, owners=("",) * len(t.owners), of_image=put(t.of_image, at, n_images, len(t.owners)))
@@ -66,7 +111,6 @@ def pad_structure(
         observed=pad_groups(s, places, n_images, n_points, layout.width, dict(have.rows)),
         eop_free=put(s.eop_free.T, at, n_images, 0.0).T,
         point_free=put(s.point_free.T, places.point, n_points, 0.0).T,
-        labels=(),
         tiles=Tiles(
             image=tile_image.reshape(n_chunks, layout.chunk, m),
             per_tile=p,
@@ -81,17 +125,17 @@ def pad_structure(
             shards=shards,
         ),
     )
-    return padded, places
+    return TiledBlock(s, padded, places)
 
 
-def pad_values(values: Values, structure: Structure, padded: Structure, places: Places) -> Values:
+def pad_values(values: Values, structure: Structure, padded: TiledStructure, places: Places) -> TiledValues:
     """The numbers of a block in the sizes and the order of its padded structure.
 
     Slots that no image row fills have infinite standard deviation: finite everywhere, and of no weight.
     """
     v, p = values, padded
     n_images, n_points = p.n_images, p.n_points
-    slots = (*p.in_tiles.image.shape, p.in_tiles.per_tile)
+    slots = (*p.tiles.image.shape, p.tiles.per_tile)
 
     def observed(xy: Any, fill: float) -> Any:
         rows = scatter(xy, places.row, int(np.prod(slots)), fill)
@@ -108,7 +152,7 @@ def pad_values(values: Values, structure: Structure, padded: Structure, places: 
         # Padding looks like the first point: -1 would be the last.
         return x[..., np.maximum(places.point_at, 0)]
 
-    return Values(
+    return TiledValues(
         xy=observed(v.xy, 0.0),
         sigma_xy=observed(v.sigma_xy, np.inf),
         groups=pad_rows(v, structure, p, places),
@@ -124,33 +168,6 @@ def pad_values(values: Values, structure: Structure, padded: Structure, places: 
         datum_eop=images(v.datum_eop, 0.0),
         datum_points=points(v.datum_points, 0.0),
     )
-
-
-def crop_state(state: State, places: Places) -> State:
-    """The state in the block's own sizes and order."""
-    position, rotation, shared, points = map(still, state)
-    return State(position[..., places.image], rotation[..., places.image], shared, points[..., places.point])
-
-
-def crop_residuals(residuals: Residuals, structure: Structure, places: Places) -> Residuals:
-    """Residuals, or what is shaped like them, in the block's own sizes and order."""
-    others = tuple(crop_rows(g, still(v), places) for g, v in zip(structure.observed, residuals.others, strict=True))
-    return Residuals(crop_image(residuals.image, places), others, still(residuals.datum), residuals.names)
-
-
-def crop_image(image: Any, places: Places) -> np.ndarray:
-    """Numbers of the slots of tiles (chunks, tiles, 2, m, p) by image row of the block (2, rows)."""
-    image = still(image)
-    chunks, tiles, _, m, p = image.shape
-    tile, slot = np.divmod(places.row, m * p)
-    return image.reshape(chunks * tiles, 2, m * p)[tile, :, slot].T
-
-
-def crop_reduced(matrix: Any, structure: Structure, places: Places) -> np.ndarray:
-    """A matrix over the reduced unknowns (6 an image, then the shared ones) in the block's own sizes and order."""
-    matrix, q = still(matrix), structure.n_shared
-    kept = np.append((6 * places.image[:, None] + np.arange(6)).ravel(), np.arange(len(matrix) - q, len(matrix)))
-    return matrix[np.ix_(kept, kept)]
 
 
 def _pad_group(group: CameraGroup, at: np.ndarray, n_images: int) -> CameraGroup:

@@ -1,25 +1,27 @@
 """From a block, a start and priors to the batch-last numbers that the adjustment computes with, and back."""
 
 import dataclasses
-from typing import Any
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxphoto.adjustment.groups import Listed, numbers_in
-from jaxphoto.adjustment.residuals import State, Values
-from jaxphoto.adjustment.shared import shared_vector, unknowns_from
-from jaxphoto.adjustment.structure import ObservedRows, Structure, observed_in
+from jaxphoto.adjustment.model.observed_groups import RowsInList, numbers_in
+from jaxphoto.adjustment.model.parameter_tables import shared_vector, unknowns_from
+from jaxphoto.adjustment.model.residuals import AbstractValues, UnknownArrays, Values
+from jaxphoto.adjustment.model.structure import AbstractStructure, ObservedRows, observed_in
 from jaxphoto.arrays import Numbers, vector_of
 from jaxphoto.block import Block, exposures
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.unknowns import Unknowns
 
+SomeValues = TypeVar("SomeValues", bound=AbstractValues)
+
 
 def values_of(
-    block: Block, start: Unknowns, priors: Unknowns, structure: Structure, observed: ObservedRows | None = None
+    block: Block, start: Unknowns, priors: Unknowns, structure: AbstractStructure, observed: ObservedRows | None = None
 ) -> Values:
     """Observations and start values as arrays; numbers only, so derivatives with respect to each exist.
 
@@ -30,7 +32,7 @@ def values_of(
     return Values(
         xy=_floats(rows.xy).T,
         sigma_xy=_floats(rows.sigma).T,
-        groups=tuple(Listed(numbers_in(rows)) for _, rows in given.named),
+        groups=tuple(RowsInList(numbers_in(rows)) for _, rows in given.named),
         time=_floats(known.time),
         velocity=_floats(known.velocity).T,
         rate=_floats(known.rate).T,
@@ -50,20 +52,20 @@ def _floats(x: Any) -> Any:
     return x if isinstance(x, jax.core.Tracer) else np.asarray(x, float)
 
 
-def with_datum(values: Values, eop: Numbers, points: Numbers) -> Values:
+def with_datum(values: SomeValues, eop: Numbers, points: Numbers) -> SomeValues:
     """The same values with constraint rows of the datum."""
     return eqx.tree_at(lambda v: (v.datum_eop, v.datum_points), values, (eop, points))
 
 
-def at_state(values: Values, state: State) -> Values:
+def at_state(values: SomeValues, state: UnknownArrays) -> SomeValues:
     """The same values with the state as the new start, so that increments are zero there."""
     where = lambda v: (v.position, v.rotation, v.shared, v.points)  # noqa: E731
     return eqx.tree_at(where, values, tuple(state))
 
 
-def unknowns_of(state: State, like: Unknowns, structure: Structure) -> Unknowns:
+def unknowns_of(state: UnknownArrays, like: Unknowns, structure: AbstractStructure) -> Unknowns:
     """The state as the tree a user knows."""
-    state = State(*map(_floats, state))
+    state = UnknownArrays(*map(_floats, state))
     interior = {}
     for group in structure.groups:
         m = group.treedef.num_leaves

@@ -1,0 +1,1 @@
+"""How a block lies in memory: points in tiles with the images that see them, padded sizes, several devices."""

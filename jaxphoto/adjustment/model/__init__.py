@@ -1,0 +1,1 @@
+"""What is adjusted: unknowns, observations by group, the residual of a row, and how they are numbered."""

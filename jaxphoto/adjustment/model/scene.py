@@ -1,0 +1,98 @@
+"""What image rows depend on besides their points, image by image, and its derivatives by the unknowns."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxphoto.adjustment.model.residuals import AbstractValues, Increments, UnknownArrays
+from jaxphoto.adjustment.model.structure import AbstractStructure, CameraGroup, interior_of
+from jaxphoto.georeferencing import Exposure
+from jaxphoto.rotation import small_rotation
+
+
+class Scene(NamedTuple):
+    """What image rows depend on besides their points, image by image."""
+
+    centre: Float[Array, "images 3"]
+    rotation: Float[Array, "images 3 3"]
+    cameras: tuple[Array, ...]
+    """Of each group of cameras, its parameters: (m) where it is one camera that nothing bends, else (images, m)."""
+
+
+class SceneDerivatives(NamedTuple):
+    """Derivatives of a `Scene` with respect to scaled increments."""
+
+    centre: Float[Array, "images 3"]
+    rotation: Float[Array, "images 3 3 3"]
+    """The last axis is the increment's."""
+    cameras: tuple[Array, ...]
+    """(colours, free) where parameters are (m), else (images, colours, free)."""
+
+
+def scene_of(state: UnknownArrays, values: AbstractValues, s: AbstractStructure) -> Scene:
+    """The state, image by image."""
+    return Scene(state.position.T, state.rotation.transpose(2, 0, 1), _cameras_at(jnp.asarray(state.shared), values, s))
+
+
+def _cameras_at(shared: Array, values: AbstractValues, s: AbstractStructure) -> tuple[Array, ...]:
+    """The parameters of the cameras (see `Scene`), bent by what is declared to bend them."""
+    cameras = []
+    for g in s.groups:
+        m = g.treedef.num_leaves
+        table = shared[g.offset : g.offset + m * len(g.names)].reshape(-1, m)
+        cameras.append(_bent(g, table[g.camera], shared, values, s) if by_image(g, s) else table[0])
+    return tuple(cameras)
+
+
+def _bent(
+    g: CameraGroup, cameras: Float[Array, "images m"], shared: Array, v: AbstractValues, s: AbstractStructure
+) -> Array:
+    if not s.bends:
+        return cameras
+    bending = [(jax.tree.map(lambda p, t=t: p[..., t.of_image], t.all_owners(shared))) for t in s.tables if t.bends]
+
+    def one(camera: Array, parameters: list, *exposure: Array) -> Array:
+        interior = interior_of(g, list(camera))
+        for own in parameters:
+            interior = own.interior(interior, Exposure(*exposure))
+        return jnp.stack([jnp.asarray(leaf, float) for leaf in jax.tree.leaves(interior)])
+
+    return jax.vmap(one, (0, -1, *[-1] * 5))(cameras, bending, v.time, v.velocity, v.rate, v.nominal, v.flight_time)
+
+
+def by_image(g: CameraGroup, s: AbstractStructure) -> bool:
+    """Whether the parameters of a group of cameras are listed by image."""
+    return s.bends or len(g.names) > 1
+
+
+def slopes_of(y: Increments, scale: Increments, values: AbstractValues, s: AbstractStructure) -> SceneDerivatives:
+    """Derivatives of the scene at the increments `y`."""
+
+    turned = jax.vmap(jax.jacfwd(small_rotation), in_axes=-1, out_axes=-1)(y.eop[3:] * scale.eop[3:]) * scale.eop[3:]
+    # Term by term: a batch of products of 3 x 3 matrices takes several times as long.
+    rotation = sum((turned[:, j, None] * values.rotation[j, :, None] for j in range(3)), jnp.zeros(()))
+    rotation = rotation.transpose(3, 0, 1, 2)
+    own, n = slice(0, s.n_interior), s.n_image_colours
+    by_colour = jnp.zeros((len(values.shared), n)).at[s.free[own], s.colour[own]].set(scale.shared[own])
+    cameras = []
+    if s.bends:
+        shared = jnp.asarray(values.shared).at[s.free].add(y.shared * scale.shared, unique_indices=True)
+        # A product for each colour: an image has one owner of each kind, so nothing of another's comes in.
+        along = jax.vmap(lambda d: jax.jvp(lambda p: _cameras_at(p, values, s), (shared,), (d,))[1], -1, 1)(by_colour)
+        cameras = [c[..., list(g.free_leaves)] for g, c in zip(s.groups, along, strict=True)]
+    else:
+        for g in s.groups:
+            m = g.treedef.num_leaves
+            table = by_colour[g.offset : g.offset + m * len(g.names)].reshape(len(g.names), m, n)
+            table = table[:, list(g.free_leaves)].transpose(0, 2, 1)
+            cameras.append(table[0] if len(g.names) == 1 else table[g.camera])
+    return SceneDerivatives(scale.eop[:3].T, rotation, tuple(cameras))
+
+
+def of_images(tree: Any, image: Array, s: AbstractStructure) -> Any:
+    """The parts of a `Scene` or of `SceneDerivatives` that belong to a tile's images."""
+    take = lambda a: a.at[image].get(mode="promise_in_bounds")  # noqa: E731
+    cameras = tuple(take(c) if by_image(g, s) else c for g, c in zip(s.groups, tree.cameras, strict=True))
+    return type(tree)(take(tree.centre), take(tree.rotation), cameras)

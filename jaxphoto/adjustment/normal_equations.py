@@ -1,0 +1,126 @@
+"""The normal equations of a block at its optimum: the one door from statistics and sensitivity to the solver.
+
+Everything here is traced, in scaled increments and in the order of the tiles; `Adjustment.tiled` brings it back to the
+order of the block.
+"""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxphoto.adjustment.layout.tiled import TiledStructure, TiledValues
+from jaxphoto.adjustment.model.residuals import Increments, UnknownArrays, state_at
+from jaxphoto.adjustment.solver.band import Band, dense, factor_band, invert_band, pivots, solve_band
+from jaxphoto.adjustment.solver.elimination import FactoredNormal, gradient, reduce_right, solve_factored, solve_reduced
+from jaxphoto.adjustment.solver.inverse import Cofactors, RowCofactors, cofactors_of, row_variances
+from jaxphoto.adjustment.solver.normal import At
+from jaxphoto.adjustment.solver.optimum import iterate, typical_scale, unit_scale, weigh_datum, zero_increments
+from jaxphoto.adjustment.solver.reduced import reduce_normal
+from jaxphoto.arrays import Numbers, still
+
+
+class NormalEquations(eqx.Module):
+    """N x = b at the optimum, undamped and factored."""
+
+    values: TiledValues
+    """Their start is the optimum."""
+    structure: TiledStructure
+    factored: FactoredNormal
+
+    @property
+    def scale(self) -> Increments:
+        """Of increments; zero for what is held fixed."""
+        return self.factored.scale
+
+    @property
+    def at(self) -> At:
+        """Where the equations are linearised: at no increments, with the constraints of the datum weighed."""
+        s = self.structure
+        return At(jax.tree.map(jnp.zeros_like, self.scale), self.scale, weigh_datum(self.values, s), s)
+
+    @property
+    def weighed(self) -> "NormalEquations":
+        """The same with the constraints of the datum as `at` has them."""
+        return dataclasses.replace(self, values=self.at.values)
+
+    @property
+    def on_one_device(self) -> "NormalEquations":
+        """The same for programs that no other device has a part in."""
+        values, factored = jax.tree.map(still, (self.values, self.factored))
+        return NormalEquations(values, self.structure.on_one_device, factored)
+
+    def solve(self, b: Increments) -> Increments:
+        """x of N x = b; of many by `jax.vmap`."""
+        return solve_factored(self.factored.reduced, self.factored.factor, b, self.at)
+
+    def cofactors(self, of_rows: Bool[Numbers, ""]) -> tuple[Cofactors, RowCofactors]:
+        """The inverse of N for images, shared unknowns and each point, and of rows in tiles, if these are wanted."""
+        return cofactors_of(self.at, self.factored, of_rows)
+
+    def row_variances(self, q: Cofactors, of_rows: RowCofactors) -> tuple[Array, tuple[Array, ...]]:
+        """J Q J' of image rows, and of the numbers of each other row with one another (c, c, ...)."""
+        return row_variances(self.at, q, of_rows, self.factored)
+
+    def reduce(self, b: Increments) -> tuple[Float[Array, "reduced"], Float[Array, "constraints"]]:
+        """A right-hand side taken down to the reduced unknowns, and to those that couple points."""
+        return reduce_right(self.factored.reduced, b, self.at)
+
+    def expand(
+        self, right: Float[Array, "reduced"], d: Float[Array, "constraints"], b_points: Float[Array, "3 points"]
+    ) -> Increments:
+        """x of a right-hand side that `reduce` has taken down."""
+        return solve_reduced(self.factored.reduced, self.factored.factor, right, d, b_points, self.at)
+
+    def solve_images(self, right: Float[Array, "reduced *c"]) -> Float[Array, "reduced *c"]:
+        """A^-1 right, of the reduced unknowns alone."""
+        return solve_band(self.factored.factor, right)
+
+    def triangle(self) -> Float[Array, "reduced reduced"]:
+        """M of the reduced normal matrix A = M M'."""
+        return jnp.tril(dense(Band(*self.factored.factor)))
+
+    def inverse_of_images(self) -> Float[Array, "reduced reduced"]:
+        """A^-1."""
+        return invert_band(self.factored.factor)
+
+    def least_pivot(self) -> Float[Array, ""]:
+        """What is left of the weakest unknown when those before it are eliminated: 1 unharmed, 0 at a rank defect."""
+        return jnp.min(pivots(self.factored.reduced.diagonal, self.factored.factor))
+
+    def gradient(self, increments: Increments) -> tuple[Increments, Array, Array, Float[Array, ""]]:
+        """b = J'r at other increments, the same as `reduce` takes it down, and the square sum r'r there."""
+        return gradient(self.at._replace(increments=increments), self.factored.reduced, self.at)
+
+    def constraints(self) -> Increments:
+        """Derivatives of the constraints of the datum, along a leading axis."""
+        return self.at.constraints()
+
+
+def factor_normal(values: TiledValues, structure: TiledStructure) -> FactoredNormal:
+    """The normal equations of values that are at their optimum."""
+    values, scale = weigh_datum(values, structure), typical_scale(values, structure)
+    a, reduced, _ = reduce_normal(At(zero_increments(structure), scale, values, structure), 0.0)
+    return FactoredNormal(reduced, factor_band(a), scale, values.datum_eop.shape[0])
+
+
+class Optimised(eqx.Module):
+    """Where an iteration ended, and the normal equations that it had last."""
+
+    state: UnknownArrays
+    steps: Int[Array, ""]
+    converged: Bool[Array, ""]
+    factored: FactoredNormal
+
+
+def optimise(
+    values: TiledValues, structure: TiledStructure, max_steps: int, only_factor: Bool[Numbers, ""]
+) -> Optimised:
+    """The optimum; or, of values that are at theirs, the undamped normal equations, factored."""
+    optimum, system, scale = iterate(weigh_datum(values, structure), structure, max_steps, only_factor)
+    state = state_at(optimum.increments, unit_scale(structure), values, structure)
+    factored = FactoredNormal(system.reduced, system.factor, scale, values.datum_eop.shape[0])
+    assert optimum.steps is not None and optimum.converged is not None, "only of a tangent is this unknown"
+    return Optimised(state, optimum.steps, optimum.converged, factored)

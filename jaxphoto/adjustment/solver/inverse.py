@@ -1,0 +1,204 @@
+"""The inverse of the normal matrix as far as anybody asks for it: cofactors of unknowns and of rows.
+
+With S~ = [S g; g' -K] the reduced matrix bordered by the few rows that couple points (see `normal`), V = L L' and
+F = [W; Ws; D] L^-T what a point p meets, whitened,
+
+    Q~    = S~^-1                                   exterior and interior orientation, scanner, mounts, strips
+    Q_pp  = L^-T (I + F' Q~ F) L^-1                 3 x 3 a point
+    j Q j' = z'z + (j_r - F z)' Q~ (j_r - F z)      of an image row with columns j_r and j_p, z = L^-1 j_p'
+
+summed tile by tile, and so of other rows by point that touch shared unknowns, too. The full matrix is never inverted.
+In a free network the part along the open motions, which the constraints of the datum hold, is subtracted: what remains
+is the covariance under inner (or minimal) constraints.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxphoto.adjustment.layout.sharding import TILES, along_points, sharded
+from jaxphoto.adjustment.layout.tiled import TiledStructure
+from jaxphoto.adjustment.model.observed_groups import ObservedGroup, RowsAtPoints
+from jaxphoto.adjustment.model.residuals import Increments
+from jaxphoto.adjustment.model.row_functions import RowJacobian, reduced_places
+from jaxphoto.adjustment.solver.band import invert_band
+from jaxphoto.adjustment.solver.elimination import FactoredNormal, over_tiles, solve_factored
+from jaxphoto.adjustment.solver.non_image_rows import NonImageRows, non_image_rows
+from jaxphoto.adjustment.solver.normal import At, Reduced, dot
+from jaxphoto.adjustment.solver.reduced import tile_columns
+from jaxphoto.adjustment.solver.similarity import along_motions, open_motions
+from jaxphoto.arrays import Numbers
+from jaxphoto.small_matrices import unwhiten, whiten
+
+
+class Cofactors(NamedTuple):
+    """Cofactors of reduced unknowns and points, in scaled increments."""
+
+    reduced: Float[Array, "reduced reduced"]
+    points: Float[Array, "points 3 3"]
+
+
+class RowCofactors(NamedTuple):
+    """j Q j' of rows, in padded sizes: of the numbers of a row with one another."""
+
+    image: Float[Array, "chunks tiles 2 m p"]
+    """Of x and of y alone."""
+    at_points: tuple[Float[Array, "c c rows points"], ...]
+    """Of the groups of `AbstractStructure.with_shared`."""
+
+
+def cofactors_of(at: At, factored: FactoredNormal, of_rows: Bool[Numbers, ""]) -> tuple[Cofactors, RowCofactors]:
+    """All cofactors of one factored block, and j Q j' of its rows; see the module's head."""
+    s = at.structure
+    reduced = factored.reduced
+    inverse = invert_band(factored.factor)
+    full = inverse
+    if reduced.g.shape[1]:
+        kg = jnp.linalg.solve(reduced.k, reduced.g.T)
+        low = inverse @ kg.T
+        full = jnp.block([[inverse, low], [low.T, kg @ low - jnp.linalg.inv(reduced.k)]])
+    out = (TILES, RowCofactors(TILES, (along_points(4),) * len(s.with_shared)))
+    points, rows = sharded(_of_points, s, out)(full, reduced, at, of_rows)
+    return _without_open_motions(Cofactors(inverse, points), at, factored), rows
+
+
+def _of_points(
+    full: Float[Array, "n n"], reduced: Reduced, at: At, of_rows: Bool[Numbers, ""]
+) -> tuple[Float[Array, "points 3 3"], RowCofactors]:
+    """Cofactors of points, and j Q j' of rows."""
+    _, scale, values, s = at
+    columns_of, groups = tile_columns(at), s.with_shared
+    by_rows = _by_rows(non_image_rows(at), s) if groups else ()
+    n, q, i, k = 6 * s.n_images, s.n_image_colours, s.n_border, len(reduced.k)
+    # One more than there are: zeros serve the last row of F, and colours that mean nothing in an image.
+    shared = jnp.concatenate([n + jnp.arange(i), n + s.n_shared + jnp.arange(k + 1)])
+
+    def tile(f, image, l, by_rows, *measured):  # noqa: E741
+        size = l.shape[1]
+        if not s.tiles.free_points:
+            f = jnp.zeros((len(f), 3 * size))
+        index = jnp.concatenate([(6 * image[:, None] + jnp.arange(6)).reshape(-1), shared])
+        own = full.at[index[:, None], index].get(mode="fill", fill_value=0.0)
+        a = own @ f
+        # A product of matrices would want both turned round first.
+        g = jnp.sum(f.reshape(-1, 3, 1, size) * a.reshape(-1, 1, 3, size), axis=0)
+        inner = jnp.eye(3)[:, :, None] + g
+        half = jnp.stack(unwhiten(inner, l))
+        points = jnp.stack(unwhiten(half.transpose(1, 0, 2), l)).transpose(2, 0, 1)
+        none = tuple(jnp.zeros((len(j), len(j), *j.shape[2:])) for j in by_rows)
+        nothing = lambda *_: (jnp.zeros((2, len(image), size)), none)  # noqa: E731
+        return points, *jax.lax.cond(of_rows, rows, nothing, (image, *measured), by_rows, l, own, a, inner)
+
+    def rows(measured, by_rows, l, own, a, inner):  # noqa: E741
+        image, both = measured[0], columns_of(measured)
+        m, size = both[0].residual.shape
+        column = jnp.asarray(s.column)[image, :q]
+        column = jnp.where(column < i, 6 * m + column, 6 * m + i + k)
+        touched = jnp.concatenate([6 * jnp.arange(m)[:, None] + jnp.arange(6), column], axis=1)
+        j = jnp.stack([jnp.concatenate([c.eop, c.shared]) for c in both], axis=1).transpose(2, 0, 1, 3)
+        z = jnp.stack([jnp.stack(whiten(c.point, l)) for c in both]).transpose(0, 2, 1, 3)
+        seen = jnp.einsum("mab,mbn->man", own[touched[:, :, None], touched[:, None, :]], j.reshape(m, 6 + q, -1))
+        of_images = jnp.sum(j * seen.reshape(j.shape), axis=1).transpose(1, 0, 2)
+        across = jnp.einsum("mcop,mckp->omkp", j, a[touched].reshape(m, 6 + q, 3, size))
+        found = of_images - 2 * jnp.sum(z * across, axis=2) + jnp.einsum("omkp,klp,omlp->omp", z, inner, z)
+        first = 6 * m
+        return found, tuple(of_group(g, j, l, own, a, inner, first) for g, j in zip(groups, by_rows, strict=True))
+
+    def of_group(g, j, l, own, a, inner, first):  # noqa: E741
+        z, j = jnp.stack(whiten(j[:, :3].swapaxes(0, 1), l)), j[:, 3:]
+        met = first + jnp.asarray(g.column)[:, 0]
+        across = jnp.einsum("clrp,lkp->ckrp", j, a[met].reshape(len(met), 3, -1))
+        shared = jnp.einsum("clrp,lm,dmrp->cdrp", j, own[met[:, None], met], j)
+        both = jnp.einsum("kcrp,dkrp->cdrp", z, across)
+        return shared - both - both.swapaxes(0, 1) + jnp.einsum("kcrp,klp,ldrp->cdrp", z, inner, z)
+
+    of_points = (reduced.l, by_rows, values.points, scale.points)
+    l, by_rows, *places = jax.tree.map(s.by_tile, of_points)  # noqa: E741
+    points, *found = over_tiles(tile, at, reduced, (l, by_rows, values.xy, values.sigma_xy, *places))
+    return points.reshape(-1, 3, 3), RowCofactors(found[0], tuple(s.by_point(v) for v in found[1]))
+
+
+def _by_rows(rest: NonImageRows, s: TiledStructure) -> tuple[Float[Array, "c touched rows points"], ...]:
+    """Derivatives of the groups of `AbstractStructure.with_shared` by their points and by shared unknowns."""
+    pairs = zip(s.observed, rest.jacobians, strict=True)
+    chosen = ((g, j) for g, j in pairs if isinstance(g.rows, RowsAtPoints) and g.place)
+    shared = lambda g, j: jnp.broadcast_to(j.shared, (g.components, len(g.place), *j.shared.shape[2:]))  # noqa: E731
+    return tuple(jnp.concatenate([j.points[:, 0], shared(g, j)], axis=1) for g, j in chosen)
+
+
+def _without_open_motions(q: Cofactors, at: At, factored: FactoredNormal) -> Cofactors:
+    """Subtract E E': what the constraints D of the datum, taken as observations, leave along the motions they hold.
+
+    E = (N + D'D)^-1 D' spans those motions exactly, because N does not see them; where all are open, they are known.
+    """
+    defect = factored.n_constraints
+    if not defect:
+        return q
+    _, scale, values, s = at
+    rows = at.constraints()
+    if open_motions(values, s):
+        # The motions are known: E = M (D M)^-1.
+        m = along_motions(values, scale, s.on_one_device)
+        met = jnp.einsum("kci,jci->kj", rows.eop, m.eop) + jnp.einsum("kcp,jcp->kj", rows.points, m.points)
+        e = jax.tree.map(lambda v: jnp.tensordot(jnp.linalg.inv(met), v, (0, 0)), m)
+    else:
+        e = jax.vmap(lambda row: solve_factored(factored.reduced, factored.factor, row, at))(rows)
+    e_eop, e_shared, e_points = e.eop.transpose(2, 1, 0), e.shared.T, e.points.transpose(2, 1, 0)
+    e_reduced = jnp.concatenate([e_eop.reshape(-1, defect), e_shared])
+    return q._replace(
+        reduced=q.reduced - e_reduced @ e_reduced.T, points=q.points - jnp.einsum("pck,pdk->pcd", e_points, e_points)
+    )
+
+
+def row_variances(
+    at: At, q: Cofactors, of_rows: RowCofactors, factored: FactoredNormal
+) -> tuple[Array, tuple[Array, ...]]:
+    """J Q J' of image rows, and of the numbers of each other row with one another (c, c, ...)."""
+    at = at._replace(structure=at.structure.on_one_device)
+    s = at.structure
+    rest = non_image_rows(at)
+    at_points, found = iter(of_rows.at_points), []
+    for g, j in zip(s.observed, rest.jacobians, strict=True):
+        if isinstance(g.rows, RowsAtPoints):
+            own = jnp.einsum("carp,pab,dbrp->cdrp", j.points[:, 0], q.points, j.points[:, 0])
+            found.append(next(at_points) if g.place else own)
+        elif g.layout == "reduced":
+            found.append(_of_reduced(g, j, q.reduced, s))
+        else:
+            found.append(_of_coupled(g, j, at, factored))
+    return of_rows.image, tuple(found)
+
+
+def _of_reduced(g: ObservedGroup, j: RowJacobian, q: Array, s: TiledStructure) -> Float[Array, "c c rows"]:
+    touched = reduced_places(g, s.n_images).T
+    own = jnp.concatenate([j.eop.reshape(g.components, -1, g.n_rows), j.shared], axis=1)
+    # What means no unknown lies behind the last.
+    met = q.at[touched[:, :, None], touched[:, None]].get(mode="fill", fill_value=0.0)
+    seen = jnp.einsum("nab,dbn->dan", met, own)
+    return jnp.einsum("can,dan->cdn", own, seen)
+
+
+def _of_coupled(g: ObservedGroup, j: RowJacobian, at: At, factored: FactoredNormal) -> Float[Array, "c c rows"]:
+    """By one solve for each number: they join what never met otherwise."""
+    s, zero = at.structure, at.increments
+
+    def whole(k, c) -> Increments:
+        y = zero
+        for n, image in enumerate(g.image):
+            y = y._replace(eop=y.eop.at[:, jnp.asarray(image)[k]].add(j.eop[c, n, :, k]))
+        for n, column in enumerate(g.column):
+            y = y._replace(shared=y.shared.at[jnp.asarray(column)[k]].add(j.shared[c, n, k], mode="drop"))
+        for n, point in enumerate(g.point):
+            y = y._replace(points=y.points.at[:, jnp.asarray(point)[k]].add(j.points[c, n, :, k]))
+        return y
+
+    def one(at_number):
+        k, c = at_number
+        x = solve_factored(factored.reduced, factored.factor, whole(k, c), at)
+        return jnp.stack([dot(whole(k, d), x, s) for d in range(g.components)])
+
+    each = jnp.meshgrid(jnp.arange(g.n_rows), jnp.arange(g.components), indexing="ij")
+    found = jax.lax.map(one, tuple(v.reshape(-1) for v in each))
+    return found.reshape(g.n_rows, g.components, g.components).transpose(1, 2, 0)

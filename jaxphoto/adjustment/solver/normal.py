@@ -1,0 +1,124 @@
+"""Normal equations with the points eliminated: symbols, residuals and their square sum, factors of the points.
+
+In scaled increments, with e the exterior orientations, s the shared unknowns and p the points,
+
+        [ U    Us   W  ] [e]   [b_e]
+    N = [ Us'  Uss  Ws'] [s] = [b_s]        V block-diagonal (3 x 3 a point), W 6 x 3 a (image, point) that met
+        [ W'   Ws   V  ] [p]   [b_p]
+
+Few rows couple points, D: distances, all that touches two points or a point and an image (`model.observed_groups`), and the
+constraints of the datum. Their part D'D of N is carried by extra unknowns mu = D x with the block -I, so V stays
+block-diagonal. With V = L L', Y = W L^-T, Ys = L^-1 Ws, Yd = L^-1 D_p', and D_r the part of D for images and shared
+unknowns:
+
+    S   = [U Us; Us' Uss] - [Y; Ys'] [Y; Ys']'        the reduced normal matrix
+    g   = D_r' - [Y; Ys'] Yd,   K = I + Yd' Yd        the coupling of mu
+    A   = S + g K^-1 g'                               positive definite where the datum is fixed
+
+Tile by tile, `reduced.reduce_normal` makes F = [Y; Ys'; Yd'] and sums S from it; `elimination` takes vectors down to
+the reduced unknowns, and back to the points, by products with F.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Scalar
+
+from jaxphoto.adjustment.layout.tiled import TiledResiduals, TiledStructure, TiledValues
+from jaxphoto.adjustment.model.observed_groups import RowsAtPoints
+from jaxphoto.adjustment.model.residuals import Increments, NonImageResiduals, UnknownArrays, state_at
+from jaxphoto.adjustment.model.row_functions import non_image_residuals
+from jaxphoto.adjustment.model.scene import of_images, scene_of
+from jaxphoto.adjustment.model.structure import total
+from jaxphoto.adjustment.solver.tile_rows import Pair, seen_in, tile_residuals
+
+
+class At(NamedTuple):
+    """Where equations are linearised: `start + scale * increments`."""
+
+    increments: Increments
+    scale: Increments
+    values: TiledValues
+    structure: TiledStructure
+
+    @property
+    def state(self) -> UnknownArrays:
+        """The unknowns there."""
+        return state_at(self.increments, self.scale, self.values, self.structure)
+
+    def constraints(self) -> Increments:
+        """Derivatives of the constraints of the datum, along a leading axis."""
+        _, scale, values, s = self
+        none = jnp.zeros((len(values.datum_eop), s.n_shared))
+        return Increments(values.datum_eop * scale.eop, none, values.datum_points * scale.points)
+
+    def residuals(self) -> TiledResiduals:
+        """All residuals over their sigmas."""
+        increments, scale, values, s = self
+        state, tiles = self.state, s.tiles
+        scene = scene_of(state, values, s)
+
+        def tile(image, points, xy, sigma):
+            return jnp.stack(tile_residuals(of_images(scene, image, s), points, seen_in(xy, sigma, image, s), s))
+
+        numbers = (tiles.image, s.by_tile(state.points), values.xy, values.sigma_xy)
+        image = jax.vmap(jax.vmap(tile))(*numbers)
+        others = non_image_residuals(increments, scale, values, s)
+        return TiledResiduals(others.others, others.datum, others.names, image)
+
+    def square_sum(self) -> Float[Array, ""]:
+        """The sum of all squared residuals, tile by tile."""
+        increments, scale, values, s = self
+        state = self.state
+        scene = scene_of(state, values, s)
+
+        def tile(numbers):
+            image, points, xy, sigma = numbers
+            return squares(tile_residuals(of_images(scene, image, s), points, seen_in(xy, sigma, image, s), s))
+
+        image = s.each_tile(tile, (s.by_tile(state.points), values.xy, values.sigma_xy))
+        return total(jnp.sum(image), s) + other_squares(non_image_residuals(increments, scale, values, s), s)
+
+
+class Reduced(NamedTuple):
+    """The reduced normal matrix and what takes vectors down to it and back to the points."""
+
+    diagonal: Float[Array, "reduced"]
+    """Of A."""
+    g: Float[Array, "reduced constraints"]
+    k: Float[Array, "constraints constraints"]
+    f: Float[Array, "chunks tiles f 3p"] | None
+    """F of each tile: 6 rows an image, unknowns that points meet, constraints (coupled rows, then the datum); the
+    last row, a right-hand side of its time, serves nothing. None where tiles are many: then it is made anew."""
+    l: Float[Array, "6 points"]  # noqa: E741
+    """Cholesky factors of V: l11, l21, l22, l31, l32, l33."""
+    weight: Increments
+    """The diagonal of N, without damping and D'D: what a unit of damping adds."""
+    damping: Scalar
+
+
+def norm2(x: Increments, weight: Increments, s: TiledStructure) -> Float[Array, ""]:
+    """x' diag(weight) x over all unknowns."""
+    return dot(x, jax.tree.map(jnp.multiply, weight, x), s)
+
+
+def dot(a: Increments, b: Increments, s: TiledStructure) -> Float[Array, ""]:
+    """a'b over all unknowns."""
+    return jnp.vdot(a.eop, b.eop) + jnp.vdot(a.shared, b.shared) + total(jnp.vdot(a.points, b.points), s)
+
+
+def squares(r: Pair) -> Float[Array, ""]:
+    """The square sum of a tile's rows."""
+    return sum((jnp.sum(v * v) for v in r), jnp.zeros(()))
+
+
+def other_squares(others: NonImageResiduals, s: TiledStructure) -> Float[Array, ""]:
+    """The square sum of all but the image rows."""
+    dealt_out, everywhere = jnp.zeros(()), jnp.sum(others.datum**2)
+    for group, v in zip(s.observed, others.others, strict=True):
+        if isinstance(group.rows, RowsAtPoints):
+            dealt_out += jnp.sum(v**2)
+        else:
+            everywhere += jnp.sum(v**2)
+    return total(dealt_out, s) + everywhere

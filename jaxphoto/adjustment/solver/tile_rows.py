@@ -1,0 +1,177 @@
+"""A tile: residuals of its image rows, and their derivatives, in all its slots at once.
+
+A row touches one image, one point and the parameters of one camera. In a tile its image is an axis and its point
+another, so what depends on the image alone is computed once an image, and each column of the Jacobian is one forward
+derivative of `image_residual`, mapped over both axes: nothing is gathered row by row. Arrays end in (m, p): images,
+points.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxphoto.adjustment.layout.tiled import TiledStructure
+from jaxphoto.adjustment.model.scene import Scene, SceneDerivatives
+from jaxphoto.adjustment.model.structure import CameraGroup, interior_of
+from jaxphoto.collinearity import ExteriorOrientation, camera_coordinates, camera_residual
+from jaxphoto.compiling import once
+from jaxphoto.georeferencing import apparent_point
+
+
+class TileMeasurements(NamedTuple):
+    """What was measured in a tile, with weights 1 / sigma; zero in empty slots."""
+
+    xy: Float[Array, "2 m p"]
+    weight: Float[Array, "2 m p"]
+    member: tuple[Bool[Array, "m"], ...]
+    """By group of cameras: whether the image's camera belongs to it."""
+
+
+Pair = tuple[Float[Array, "m p"], Float[Array, "m p"]]
+"""Of a tile's rows, x and y. Joined to one array they would be computed number by number, not as vectors."""
+
+
+Triple = tuple[Float[Array, "m p"], Float[Array, "m p"], Float[Array, "m p"]]
+"""The three coordinates of a tile's points in its cameras' frames."""
+
+
+class TileJacobian(NamedTuple):
+    """Weighted residuals of a tile's rows, x or y, and their derivatives with respect to scaled increments."""
+
+    residual: Float[Array, "m p"]
+    eop: Float[Array, "6 m p"]
+    shared: Float[Array, "colours m p"]
+    point: Float[Array, "3 m p"]
+
+
+def seen_in(xy: Array, sigma: Array, image: Array, s: TiledStructure) -> TileMeasurements:
+    """What a tile's rows measured."""
+    return TileMeasurements(xy, 1 / sigma, tuple(jnp.asarray(g.member)[image] for g in s.groups))
+
+
+def tile_residuals(scene: Scene, points: Float[Array, "3 p"], seen: TileMeasurements, s: TiledStructure) -> Pair:
+    """Weighted residuals of a tile: observed minus computed over sigma."""
+    return _residuals(
+        [_leaves_of(c) for c in scene.cameras], _in_cameras(scene.centre, scene.rotation, points, seen, s), seen, s
+    )
+
+
+def _in_cameras(centre: Array, rotation: Array, points: Array, seen: TileMeasurements, s: TiledStructure) -> Triple:
+    """Points in the frames of a tile's cameras."""
+
+    def one(centre, rotation, point, weight):
+        aim = apparent_point(centre, point, s.corrections)
+        # An empty slot looks straight ahead: whatever lies there, its numbers stay finite.
+        aim = jnp.where(weight > 0, aim, centre - rotation[2])
+        u, v, w = camera_coordinates(ExteriorOrientation(centre, rotation), aim)
+        return u, v, w
+
+    along_points = jax.vmap(one, (None, None, -1, -1), -1)
+    return jax.vmap(along_points, (0, 0, None, 0))(centre, rotation, points, seen.weight[0])
+
+
+def _leaves_of(camera: Array) -> list[Array]:
+    return list(jnp.moveaxis(camera, -1, 0))
+
+
+def _residuals(cameras: list[list[Array]], in_camera: Triple, seen: TileMeasurements, s: TiledStructure) -> Pair:
+    parts = [_residuals_of(g, c, in_camera, seen) for g, c in zip(s.groups, cameras, strict=True)]
+    if len(parts) == 1:
+        return parts[0]
+    x, y = (
+        sum((jnp.where(own[:, None], v, 0.0) for own, v in zip(seen.member, of_groups, strict=True)), jnp.zeros(()))
+        for of_groups in zip(*parts, strict=True)
+    )
+    return x, y
+
+
+def _residuals_of(g: CameraGroup, camera: list[Array], in_camera: Triple, seen: TileMeasurements) -> Pair:
+    def one(camera, in_camera, xy, weight):
+        x, y = camera_residual(interior_of(g, camera), in_camera, xy)
+        return x * weight[0], y * weight[1]
+
+    along_points = jax.vmap(one, (None, -1, -1, -1), -1)
+    whose = None if camera[0].ndim == 0 else 0
+    return jax.vmap(along_points, (whose, 0, 1, 1))(camera, in_camera, seen.xy, seen.weight)
+
+
+def tile_jacobian(
+    scene: Scene,
+    slopes: SceneDerivatives,
+    points: Float[Array, "3 p"],
+    scale: Float[Array, "3 p"],
+    seen: TileMeasurements,
+    s: TiledStructure,
+) -> tuple[TileJacobian, TileJacobian]:
+    """Residuals and Jacobian of a tile, x and y."""
+    return once(partial(_tile_jacobian, s=s), s.eop_free, scene, slopes, points, scale, seen)
+
+
+def _tile_jacobian(
+    scene: Scene,
+    slopes: SceneDerivatives,
+    points: Float[Array, "3 p"],
+    scale: Float[Array, "3 p"],
+    seen: TileMeasurements,
+    s: TiledStructure,
+) -> tuple[TileJacobian, TileJacobian]:
+    """By the chain rule: through the points in the cameras' frames, three numbers a slot."""
+    centre, rotation, unit = scene.centre, scene.rotation, jnp.eye(3)
+    # One loop for all six: joined afterwards, they would be computed number by number.
+    still, turns = jnp.zeros((3, *rotation.shape)), jnp.moveaxis(slopes.rotation, -1, 0)
+    seeds = jnp.concatenate([unit[:, None] * slopes.centre, still[:, :, 0]]), jnp.concatenate([still, turns])
+    # jit keeps the trace: every derivative below uses it again.
+    place = jax.jit(partial(_in_cameras, seen=seen, s=s))
+    by_eop = _slope(lambda *x: place(*x, points), centre, rotation)(*seeds)
+    by_point = _by_point(lambda x: place(centre, rotation, x), points, scale, s)
+    residual, by_place, by_camera = once(
+        partial(_camera_columns, s=s), s.eop_free, scene.cameras, slopes.cameras, place(centre, rotation, points), seen
+    )
+
+    def of_one(k: int) -> TileJacobian:
+        eop, point = (
+            sum((b[k] * v for b, v in zip(by_place, moved, strict=True)), jnp.zeros(())) for moved in (by_eop, by_point)
+        )
+        return TileJacobian(residual[k], eop, by_camera[k], point)
+
+    return of_one(0), of_one(1)
+
+
+def _by_point(place: Callable, points: Float[Array, "3 p"], scale: Float[Array, "3 p"], s: TiledStructure):
+    """Derivatives of the places in the cameras' frames by the points' coordinates; none where all are fixed."""
+    if not s.tiles.free_points:
+        return tuple(jnp.zeros((3, *v.shape)) for v in jax.eval_shape(place, points))
+    return _slope(place, points)(jnp.eye(3)[:, :, None] * scale)
+
+
+def _camera_columns(
+    cameras: tuple[Array, ...], slopes: tuple[Array, ...], in_camera: Triple, seen: TileMeasurements, s: TiledStructure
+):
+    """Residuals, and their derivatives by the point in the camera's frame and by the cameras' unknowns."""
+    leaves = [_leaves_of(c) for c in cameras]
+    # Only what is free: derivatives of the rest would be computed, though they are zero.
+    free = [[own[k] for k in g.free_leaves] for g, own in zip(s.groups, leaves, strict=True)]
+
+    def with_free(free):
+        new = [dict(zip(g.free_leaves, f, strict=True)) for g, f in zip(s.groups, free, strict=True)]
+        return [[of_group.get(k, v) for k, v in enumerate(own)] for of_group, own in zip(new, leaves, strict=True)]
+
+    f = jax.jit(lambda free, in_camera: _residuals(with_free(free), in_camera, seen, s))
+
+    def along(k: int) -> Pair:
+        move = lambda x: f(free, (*in_camera[:k], x, *in_camera[k + 1 :]))  # noqa: E731
+        return jax.jvp(move, (in_camera[k],), (jnp.ones_like(in_camera[k]),))[1]
+
+    by_camera = (jnp.zeros((0, *in_camera[0].shape)),) * 2
+    if s.n_image_colours:
+        by_camera = _slope(lambda x: f(x, in_camera), free)([_leaves_of(jnp.moveaxis(c, -2, 0)) for c in slopes])
+    return f(free, in_camera), tuple(map(along, range(3))), by_camera
+
+
+def _slope(function: Callable, *x: Any) -> Callable:
+    """Directions, along a leading axis, to derivatives of `function` at `x`."""
+    return jax.vmap(lambda *d: jax.jvp(function, x, d)[1])
