@@ -63,10 +63,10 @@ def solve(
         state = state_at(found.increments, unit_scale(structure), numbers, structure)
     else:
         arguments = (numbers, structure, max_steps, np.array(False))
-        # The longest first: the other is traced while it compiles.
-        prepare(_optimise, arguments, seconds)
-        prepare(_residuals, (numbers, structure), seconds)
-        meanwhile(NormalEquations(numbers, structure, _factored_like(numbers, structure)), seconds)
+        # The longest first: the others are traced while it compiles.
+        if prepare(_optimise, arguments, seconds):
+            prepare(_residuals, (numbers, structure), seconds)
+            meanwhile(NormalEquations(numbers, structure, _factored_like(numbers, structure)), seconds)
         found = run_compiled(_optimise, arguments, seconds, "solve")
         # What comes back from several devices is of another type to a program than what went in.
         state = UnknownArrays(*map(still, found.state))

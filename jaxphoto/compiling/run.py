@@ -52,10 +52,11 @@ def run_compiled(function: Any, arguments: tuple, seconds: dict[str, float], nam
     Adds to `seconds["compile"]` what compiling or loading took, and to `seconds[name]` what the call took. What runs
     thousands of times is worth `thorough` compiling. Under a transformation of JAX it is a plain call.
     """
-    if _traced(arguments):
-        return function(*arguments)
     began = time.perf_counter()
-    key, arrays = _key(function, arguments, thorough), jax.tree.leaves(eqx.filter(arguments, eqx.is_array))
+    found = _key_and_arrays(function, arguments, thorough)
+    if found is None:
+        return function(*arguments)
+    key, arrays = found
     prepared, program = _prepared.pop(key, None), _programs.pop(key, None)
     if prepared is not None:
         program = prepared.result()
@@ -83,18 +84,21 @@ def call_compiled(function: Any, *arguments: Any, thorough: bool = False) -> Any
     return run_compiled(function, arguments, {}, "", thorough)
 
 
-def prepare(function: Any, arguments: tuple, seconds: dict[str, float]) -> None:
+def prepare(function: Any, arguments: tuple, seconds: dict[str, float]) -> bool:
     """Have `function` compiled in the background for a later `run_compiled` with arguments of these types.
 
-    Adds to `seconds["compile"]` what this caller waits for.
+    Adds to `seconds["compile"]` what this caller waits for. Returns whether anything is left to compile.
     """
-    if _traced(arguments):
-        return
     began = time.perf_counter()
-    key = _key(function, arguments, thorough=False)
-    if key not in _programs and key not in _prepared:
+    found = _key_and_arrays(function, arguments, thorough=False)
+    if found is None:
+        return False
+    key, _ = found
+    new = key not in _programs
+    if new and key not in _prepared:
         _prepared[key] = _workers.submit(_program_of(function.__wrapped__, arguments, thorough=False))
     seconds["compile"] = seconds.get("compile", 0.0) + time.perf_counter() - began
+    return new
 
 
 def _keep(key: object, program: _Program) -> None:
@@ -105,16 +109,17 @@ def _keep(key: object, program: _Program) -> None:
         del _programs[next(iter(_programs))]
 
 
-def _traced(arguments: tuple) -> bool:
-    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(arguments))
+def _key_and_arrays(function: Any, arguments: tuple, thorough: bool) -> tuple[object, list] | None:
+    """What tells programs apart within a process, and the arrays that one is called with; None where any is traced.
 
-
-def _key(function: Any, arguments: tuple, thorough: bool) -> object:
-    """What tells programs apart within a process."""
-    dynamic, static = eqx.partition(arguments, eqx.is_array)
-    arrays, structure = jax.tree.flatten(dynamic)
-    types = tuple(map(_type, arrays))
-    return (function, types, structure, tuple(jax.tree.leaves(static)), jax.tree.structure(static), thorough)
+    Taking arguments apart costs more than all else that is done here, so it is done once.
+    """
+    leaves, structure = jax.tree.flatten(arguments)
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+        return None
+    arrays = [leaf for leaf in leaves if eqx.is_array(leaf)]
+    others = tuple(None if eqx.is_array(leaf) else leaf for leaf in leaves)
+    return (function, structure, tuple(map(_type, arrays)), others, thorough), arrays
 
 
 def _type(array: Any) -> tuple:

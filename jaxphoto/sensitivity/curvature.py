@@ -4,7 +4,7 @@ Each function takes `curved`: 1 for J'J + sum_r r d2r, 0 for J'J alone (see `hes
 differentiation, and kept by what each row touches: no dense second derivative of a residual is ever made.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -48,7 +48,7 @@ def mixed_second(at: At, direction: TiledValues, curved: Float[Numbers, ""]) -> 
     return jax.jvp(gradient, (eqx.filter(at.values, there),), (direction,))[1]
 
 
-def row_second(group: ObservedGroup, numbers: eqx.Module, at: At, curved: Float[Numbers, ""]) -> RowSecond:
+def row_second(group: ObservedGroup, numbers: Any, at: At, curved: Float[Numbers, ""]) -> RowSecond:
     """H and B of all rows of a group, each by itself."""
     function = row_function(group, at.structure)
 

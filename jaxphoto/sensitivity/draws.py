@@ -129,7 +129,7 @@ class Readjustment:
         if not bool(adjusted.converged):
             raise InputError(f"draws begin at the optimum of the block as it is, which is {adjusted.outcome.value}")
         equations = adjusted.equations.on_one_device
-        tiled = dataclasses.replace(adjusted.tiled, structure=equations.structure)
+        tiled = adjusted.tiled._replace(structure=equations.structure)
         self.adjusted = dataclasses.replace(
             adjusted, tiled=tiled, tiled_values=equations.values, factored=equations.factored
         )

@@ -7,9 +7,8 @@ and put back in the block's own order. Names stay outside: the padded structure 
 """
 
 import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
@@ -23,7 +22,7 @@ from jaxphoto.adjustment.model.structure import CameraGroup, Structure
 from jaxphoto.arrays import still
 
 
-class TiledBlock(eqx.Module):
+class TiledBlock(NamedTuple):
     """A block as given and in tiles, and the way from one to the other."""
 
     own: Structure

@@ -1,7 +1,8 @@
 """Several devices: tiles and their points are dealt out over a mesh, everything else is on every device.
 
-Each device sums its own tiles; the sums of the reduced normal matrix are added across devices (`model.structure.total`), and
-each factors the result for itself. So nothing but sums the size of the reduced matrix ever travels.
+Each device sums its own tiles; the sums of the reduced normal matrix are added across devices
+(`model.structure.total`), and each factors the result for itself. So nothing but sums the size of the reduced matrix
+ever travels.
 """
 
 from collections.abc import Callable

@@ -5,7 +5,8 @@ What the rows of a group touch decides how they are eliminated; nobody declares 
     reduced     no point: rows add to the reduced normal matrix, where images and shared unknowns meet
     point       one point, and otherwise unknowns that are the same for all rows: they add to the point's own block
                 (`Tiles`), before it is eliminated
-    coupled     all else, such as two points, or a point and an image: few rows, that extra unknowns carry (`solver.normal`)
+    coupled     all else, such as two points, or a point and an image: few rows, that extra unknowns carry
+                (`solver.normal`)
 """
 
 from collections.abc import Sequence
@@ -44,13 +45,13 @@ class Argument(NamedTuple):
     """() for one, (m,) for a stack of m."""
 
 
-class RowsInList(eqx.Module):
+class RowsInList(NamedTuple):
     """Rows along the last axis."""
 
     listed: AbstractObservations
 
 
-class RowsAtPoints(eqx.Module):
+class RowsAtPoints(NamedTuple):
     """Rows by point: arrays end in (rows, points), rows being the most that a point has."""
 
     at_points: AbstractObservations

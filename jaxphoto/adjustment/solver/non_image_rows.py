@@ -1,4 +1,4 @@
-"""What all rows but image rows add to the normal equations, group by group (`model.observed_groups` has the three layouts)."""
+"""What all rows but image rows add to the normal equations, group by group; see `model.observed_groups`."""
 
 from typing import Any, NamedTuple
 
