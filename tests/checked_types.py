@@ -2,6 +2,8 @@
 
 import contextlib
 import functools
+import types
+import typing
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -12,12 +14,11 @@ import numpy as np
 import optimistix  # noqa: F401
 from beartype import BeartypeConf, beartype
 
-# The rooms that are checked. To be added: adjustment, statistics and sensitivity, whose arrays have other shapes while
-# they are dealt out or mapped over; procedures and experiment.
+# The rooms that are checked: all that compute.
 CHECKED = (
-    "arrays", "block_from_arrays", "camera", "cloud", "collinearity", "columns", "georeferencing",
-    "image_measurement", "io", "lidar", "observations", "orientation", "parameters", "report", "rotation",
-    "simulation", "stability", "unknowns",
+    "adjustment", "arrays", "block_from_arrays", "camera", "cloud", "collinearity", "columns", "experiment",
+    "georeferencing", "image_measurement", "io", "lidar", "observations", "orientation", "parameters", "procedures",
+    "report", "rotation", "sensitivity", "simulation", "small_matrices", "stability", "statistics", "unknowns",
 )  # fmt: skip
 
 
@@ -35,9 +36,8 @@ def checked(function: Callable) -> Callable:
         # Beartype knows `Self` only of classes that it was given whole.
         if "typing.Self" in str(hint):
             function.__annotations__[name] = Any
-        # What lies still for a user is traced where JAX maps or differentiates the whole.
-        elif hint is np.ndarray:
-            function.__annotations__[name] = np.ndarray | jax.Array
+        else:
+            function.__annotations__[name] = _widened(hint)
     strict = beartype(conf=BeartypeConf(is_pep484_tower=True))(function)
     if function.__name__ != "__init__":
         return strict
@@ -49,6 +49,20 @@ def checked(function: Callable) -> Callable:
         return (function if priors else strict)(*arguments, **fields)
 
     return of_numbers_or_priors
+
+
+def _widened(hint: Any) -> Any:
+    """The hint with JAX's arrays beside NumPy's: what lies still for a user is traced where JAX maps over the whole."""
+    if hint is np.ndarray:
+        return np.ndarray | jax.Array
+    if isinstance(hint, type) and issubclass(hint, jaxtyping.AbstractArray) and hint.array_type is np.ndarray:
+        return hint.dtype[np.ndarray | jax.Array, hint.dim_str]
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (types.UnionType, typing.Union):
+        return typing.Union[tuple(map(_widened, arguments))]  # noqa: UP007
+    if origin in (tuple, list, dict):
+        return origin[tuple(map(_widened, arguments))]
+    return hint
 
 
 @contextlib.contextmanager

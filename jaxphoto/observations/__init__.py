@@ -1,39 +1,54 @@
-"""Observations: one file each declares its rows, what a row touches, and the residual of one row."""
+"""Observations: one file each declares its rows, what a row touches, and the residual of one row.
 
-from jaxphoto.observations.attitudes import ATTITUDE_AXES, Attitudes
-from jaxphoto.observations.base import AXES, AbstractCoordinates, AbstractObservations, ImageState, touching
-from jaxphoto.observations.columns import Column, columns_of, sigma_key
-from jaxphoto.observations.control import ControlRows
-from jaxphoto.observations.correlated import Correlated, correlated, exponential_covariance
-from jaxphoto.observations.distances import Distances
-from jaxphoto.observations.image_points import ImageRows
-from jaxphoto.observations.priors import (
-    PRIORS,
-    KnownParameters,
-    ParameterRows,
-    PointRows,
-    PositionRows,
-    RotationRows,
-)
-from jaxphoto.observations.stations import StationRows
-from jaxphoto.observations.surfaces import SurfaceRows
+A new kind is one file here and its line below.
+"""
 
-OBSERVATIONS: tuple[type[AbstractObservations], ...] = (
-    ImageRows,
-    StationRows,
-    Attitudes,
-    ControlRows,
-    SurfaceRows,
-    Distances,
-    PositionRows,
-    RotationRows,
-    PointRows,
-)
+import dataclasses
+from typing import TYPE_CHECKING
+
+from jaxphoto.observations.base import AXES as AXES
+from jaxphoto.observations.base import AbstractCoordinates as AbstractCoordinates
+from jaxphoto.observations.base import AbstractObservations as AbstractObservations
+from jaxphoto.observations.base import ImageState as ImageState
+from jaxphoto.observations.base import touching as touching
+
+# In the order of tables and files.
+# ruff: isort: off
+from jaxphoto.observations.image_points import ImageRows as ImageRows
+from jaxphoto.observations.stations import StationRows as StationRows
+from jaxphoto.observations.attitudes import ATTITUDE_AXES as ATTITUDE_AXES, Attitudes as Attitudes
+from jaxphoto.observations.control import ControlRows as ControlRows
+from jaxphoto.observations.surfaces import SurfaceRows as SurfaceRows
+from jaxphoto.observations.distances import Distances as Distances
+from jaxphoto.observations.priors import PositionRows as PositionRows
+from jaxphoto.observations.priors import RotationRows as RotationRows, PointRows as PointRows
+
+# ruff: isort: on
+from jaxphoto.observations.columns import Column as Column
+from jaxphoto.observations.columns import columns_of as columns_of
+from jaxphoto.observations.columns import sigma_key as sigma_key
+from jaxphoto.observations.correlated import Correlated as Correlated
+from jaxphoto.observations.correlated import correlated as correlated
+from jaxphoto.observations.correlated import exponential_covariance as exponential_covariance
+from jaxphoto.observations.priors import PRIORS as PRIORS
+from jaxphoto.observations.priors import KnownParameters as KnownParameters
+from jaxphoto.observations.priors import ParameterRows as ParameterRows
+
+
+def _has_a_table(kind: object) -> bool:
+    """Whether it is a class of rows that files can say: with a name, and of what files have names for."""
+    if not (isinstance(kind, type) and issubclass(kind, AbstractObservations) and kind.__dict__.get("group")):
+        return False
+    return all(f.metadata.get("touches") != "parameter" for f in dataclasses.fields(kind))
+
+
+OBSERVATIONS: tuple[type[AbstractObservations], ...] = tuple(filter(_has_a_table, list(globals().values())))
 """The classes whose tables a block folder may hold; a class of your own is given to `read_block`."""
 
-__all__ = [
-    "ATTITUDE_AXES", "AXES", "OBSERVATIONS", "PRIORS", "AbstractCoordinates", "AbstractObservations", "Attitudes",
-    "Column", "ControlRows", "Correlated", "Distances", "ImageRows", "ImageState", "KnownParameters", "ParameterRows",
-    "PointRows", "PositionRows", "RotationRows", "StationRows", "SurfaceRows", "columns_of", "correlated",
-    "exponential_covariance", "sigma_key", "touching",
-]  # fmt: skip
+if not TYPE_CHECKING:
+    # Checkers of types would take a list that is computed for an empty one; the aliases above tell them the same.
+    __all__ = sorted(
+        name
+        for name, what in globals().items()
+        if name[0] != "_" and (isinstance(what, str | tuple) or getattr(what, "__module__", "").startswith(__name__))
+    )

@@ -3,6 +3,7 @@
 Devices and processes are set up before JAX computes, so what is compared runs in processes of its own: `main`.
 """
 
+import dataclasses
 import functools
 import os
 import socket
@@ -18,9 +19,13 @@ import pytest
 
 import jaxphoto
 from jaxphoto.adjustment import Adjustment, adjust
+from jaxphoto.block import Block
 from jaxphoto.devices import mesh_of, usable
+from jaxphoto.observations import Distances
 from jaxphoto.statistics.reliability import redundancy_numbers
+from tests import declared
 from tests.blocks import free_network, from_afar, simulated
+from tests.levelling import HeightDifferences
 
 ROOT = Path(__file__).resolve().parents[2]
 BLOCKS = {
@@ -29,10 +34,17 @@ BLOCKS = {
     "surfaces": lambda: simulated("surfaces").block,
     # The constraints of the datum go over all points, and what it ends at is brought to them as a whole.
     "afar": lambda: from_afar(network := free_network(), network.start.unknowns),
+    "declared": lambda: _without_coupled(declared.simulated().block),
 }
 # Compiling takes most of it (seconds); what is much slower hangs.
 PATIENCE = 300
 ADDRESS, PROCESS = "JAXPHOTO_TEST_ADDRESS", "JAXPHOTO_TEST_PROCESS"
+
+
+def _without_coupled(block: Block) -> Block:
+    """All that is declared but rows that couple points: a block with these stays on one device."""
+    more = tuple(rows for rows in block.more if not isinstance(rows, HeightDifferences))
+    return dataclasses.replace(block, distances=Distances.none(), more=more)
 
 
 def numbers_of(result: Adjustment) -> dict[str, np.ndarray]:
@@ -120,6 +132,14 @@ def on_three_devices(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 CASES = [("two_cameras", 2), ("two_cameras", 3), ("surfaces", 2), ("afar", 3)]
+
+
+@pytest.mark.slow
+def test_everything_declared_is_dealt_out(tmp_path: Path) -> None:
+    run_all("declared:2", tmp_path, 2, [{}])
+    found = dict(np.load(tmp_path / "declared_2_0.npz"))
+    assert found["shards"] == 2
+    assert_same(found, "declared")
 
 
 @pytest.mark.parametrize(("name", "shards"), CASES)

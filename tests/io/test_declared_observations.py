@@ -286,6 +286,7 @@ def test_groups_of_one_class_share_a_table(block, tmp_path):
     [
         (("1,2,1,", "1,7,1,"), r"covariance\.csv, row 3: a and b count the numbers of set 1, 1 to 2; correct 7, 1"),
         (("1,2,2,", "2,2,2,"), r"covariance\.csv, row 4: set 2 is not in correlated_height_differences\.csv"),
+        (("1,2,2,4.0", "1,1,2,0.5\n1,2,2,4.0"), r"row 4: the covariance of 1 and 2 of set 1 stands there with two"),
         (("1,2,2,4.0", "1,2,2,0.5"), r"the covariance matrix of set 1 is not positive definite; give a variance"),
     ],
 )

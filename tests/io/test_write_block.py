@@ -138,6 +138,25 @@ def test_priors_that_cannot_be_written_are_refused(write_folder, tmp_path, prior
     assert [path.name for path in tmp_path.iterdir()] == ["block"]
 
 
+def test_a_mount_that_is_no_cameras_cannot_be_written(write_folder, tmp_path):
+    block = read_block(write_folder())
+    (mount,) = block.start.unknowns.mounts.values()
+    start = dataclasses.replace(block.start.unknowns, mounts={"imu": mount})
+    priors = dataclasses.replace(block.priors, mounts={"imu": next(iter(block.priors.mounts.values()))})
+    renamed = dataclasses.replace(
+        block,
+        start=dataclasses.replace(block.start, unknowns=start),
+        priors=priors,
+        image_mount=("imu",) * len(block.images),
+    )
+    with pytest.raises(BlockError, match=r"has mount imu; name a mount \w+ or default"):
+        write_block(renamed, tmp_path / "copy")
+    some = dataclasses.replace(block, image_mount=("", *block.image_mount[1:]))
+    with pytest.raises(BlockError, match="has none; name a mount"):
+        write_block(some, tmp_path / "copy")
+    assert [path.name for path in tmp_path.iterdir()] == ["block"]
+
+
 def test_a_failed_write_leaves_nothing(write_folder, tmp_path, monkeypatch):
     block = read_block(write_folder())
 

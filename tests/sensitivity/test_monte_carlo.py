@@ -14,6 +14,7 @@ from jaxphoto.sensitivity import Readjustment, noise
 from jaxphoto.sensitivity.many import common_of, image_gradients
 from jaxphoto.unknowns import FIXED, Weighted
 from tests.blocks import adjusted, simulated
+from tests.checked_types import unchecked
 from tests.marks import slow_but
 
 KINDS = slow_but(("cross",), ("cross", "everything", "inner"))
@@ -248,5 +249,5 @@ def test_a_perturbation_of_more_than_numbers_is_refused():
     fewer = lambda key, block: eqx.tree_at(lambda b: b.stations, block, block.stations.take(np.arange(3)))  # noqa: E731
     held = lambda key, block: eqx.tree_at(lambda b: b.priors.interior["one"].c, block, FIXED)  # noqa: E731
     for perturb in (fewer, held, lambda key, block: block.stations.value):
-        with pytest.raises(InputError, match="ids, indices, shapes"):
+        with pytest.raises(InputError, match="ids, indices, shapes"), unchecked():
             monte_carlo(adjusted("cross"), perturb, 3)

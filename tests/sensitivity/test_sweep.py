@@ -267,7 +267,7 @@ def test_mistakes_are_told_in_one_sentence(designs, swept):
         sweep([base._replace(block=blind)])
     with pytest.raises(InputError, match=r"design 1 .* has a truth of 3 points, but its block has \d+"):
         sweep([base._replace(truth=eqx.tree_at(lambda t: t.points, base.truth, np.zeros((3, 3))))])
-    with pytest.raises(ValueError, match="rotations is one of"):
+    with pytest.raises(ValueError, match="rotations is one of"), unchecked():
         sweep([base], "euler")  # type: ignore[arg-type]
     renamed = dataclasses.replace(swept, parameters=tuple({"value": k} for k in range(len(swept))))
     with pytest.raises(InputError, match="called value, like a column"):

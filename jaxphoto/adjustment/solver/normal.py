@@ -7,9 +7,9 @@ In scaled increments, with e the exterior orientations, s the shared unknowns an
         [ W'   Ws   V  ] [p]   [b_p]
 
 Few rows couple points, D: distances, all that touches two points or a point and an image (`model.observed_groups`),
-and the constraints of the datum. Their part D'D of N is carried by extra unknowns mu = D x with the block -I, so V stays
-block-diagonal. With V = L L', Y = W L^-T, Ys = L^-1 Ws, Yd = L^-1 D_p', and D_r the part of D for images and shared
-unknowns:
+and the constraints of the datum. Their part D'D of N is carried by extra unknowns mu = D x with the block -I, so V
+stays block-diagonal. With V = L L', Y = W L^-T, Ys = L^-1 Ws, Yd = L^-1 D_p', and D_r the part of D for images and
+shared unknowns:
 
     S   = [U Us; Us' Uss] - [Y; Ys'] [Y; Ys']'        the reduced normal matrix
     g   = D_r' - [Y; Ys'] Yd,   K = I + Yd' Yd        the coupling of mu

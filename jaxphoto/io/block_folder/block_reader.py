@@ -24,7 +24,7 @@ from jaxphoto.io.block_folder.image_points import check_rays, read_image_points
 from jaxphoto.io.block_folder.images import Images, check_times, read_images
 from jaxphoto.io.block_folder.map_tables import origin_of, tables_to_local
 from jaxphoto.io.block_folder.motion import ObservedFlight, check_time_offsets, read_motion
-from jaxphoto.io.block_folder.mount_sections import read_mounts, read_strips
+from jaxphoto.io.block_folder.mount_sections import mounts_of, read_mounts, read_strips
 from jaxphoto.io.block_folder.observed import Ids, Kind, known_kinds, own_tables
 from jaxphoto.io.block_folder.section import Section
 from jaxphoto.io.block_folder.settings import Settings, read_partitions, read_settings, read_toml
@@ -132,7 +132,7 @@ def assemble(source: BlockTables) -> Block:
         message = f"{source.file}: no image is taken by camera {', '.join(unused)}, which is not used"
         warnings.warn(message, UserWarning, stacklevel=3)
     mounts, mount_priors = read_mounts(settings.mounts, settings.cameras)
-    mount_of = {name: name if name in mounts else "default" if "default" in mounts else "" for name in cameras}
+    mount_of = mounts_of(cameras, mounts)
     used = {mount for mount in mount_of.values() if mount}
     strips, strip_priors = read_strips(settings.strips, _distinct(images.strips))
     check_times(images, strips, strip_priors)

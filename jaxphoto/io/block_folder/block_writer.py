@@ -18,7 +18,7 @@ from jaxphoto.io.block_folder.declared_unknowns import unknown_sections
 from jaxphoto.io.block_folder.frame_sections import corrections_section, frame_section
 from jaxphoto.io.block_folder.joint import JOINT
 from jaxphoto.io.block_folder.map_tables import tables_to_map
-from jaxphoto.io.block_folder.mount_sections import mount_section, strip_section
+from jaxphoto.io.block_folder.mount_sections import mount_section, mounts_of, strip_section
 from jaxphoto.io.block_folder.section import Section
 from jaxphoto.io.block_folder.settings import datum_section, read_toml, toml_text
 from jaxphoto.io.block_folder.surfaces import scanner_section, surface_table
@@ -109,6 +109,14 @@ def _settings(block: Block) -> dict[str, Any]:
         name: camera_section(Camera(block.sensors[name], start.interior[name], priors.interior[name]))
         for name in start.interior
     }
+    mount_of = mounts_of(start.interior, start.mounts)
+    for image, camera, mount in zip(block.images, block.image_camera, block.image_mount, strict=True):
+        if mount != mount_of[camera]:
+            raise BlockError(
+                f"block.toml says of a camera, by the name of its mount, how all its images are mounted: image {image} "
+                f"of camera {camera} has {f'mount {mount}' if mount else 'none'}; name a mount {camera} or default, "
+                "and give a camera that was mounted in two ways two names"
+            )
     own = [kind.group for kind in kinds_of(block) if kind not in OBSERVATIONS]
     return {
         "title": block.title,

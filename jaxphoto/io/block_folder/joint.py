@@ -103,12 +103,17 @@ def _sets(table: Table, matrices: Table, unit: str, scale: float, k: int) -> Ite
     for name in dict.fromkeys(named):
         lines, entries = np.flatnonzero(named == name), np.flatnonzero(owner == name)
         n = k * len(lines)
-        matrix = np.zeros((n, n))
+        matrix = np.full((n, n), np.nan)
         for line in entries:
             a, b = places[line]
             if not (a in range(1, n + 1) and b in range(1, n + 1)):
                 raise matrices.bad(line, f"a and b count the numbers of set {name}, 1 to {n}; correct {a:g}, {b:g}")
-            matrix[int(a) - 1, int(b) - 1] = matrix[int(b) - 1, int(a) - 1] = value[line]
+            row, column = int(a) - 1, int(b) - 1
+            if np.isfinite(matrix[row, column]) and matrix[row, column] != value[line]:
+                said = f"the covariance of {a:g} and {b:g} of set {name} stands there with two values; keep one"
+                raise matrices.bad(line, said)
+            matrix[row, column] = matrix[column, row] = value[line]
+        matrix = np.nan_to_num(matrix)
         if not np.all(np.linalg.eigvalsh(matrix) > 0):
             raise InputError(
                 f"{matrices.file}: the covariance matrix of set {name} is not positive definite; give a variance "

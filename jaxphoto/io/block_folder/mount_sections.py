@@ -1,6 +1,6 @@
 """The [mounts.X] and [strips.X] tables of block.toml: lever arm, boresight, shift and drift."""
 
-from collections.abc import Iterable
+from collections.abc import Container, Iterable
 from typing import Any
 
 import numpy as np
@@ -37,6 +37,11 @@ def read_mounts(section: Section, cameras: Iterable[str]) -> tuple[dict[str, Mou
             image_x,  # type: ignore[arg-type]
         )
     return mounts, priors
+
+
+def mounts_of(cameras: Iterable[str], mounts: Container[str]) -> dict[str, str]:
+    """The mount of each camera: the one that has its name, else "default", else none ("")."""
+    return {name: name if name in mounts else "default" if "default" in mounts else "" for name in cameras}
 
 
 def read_strips(section: Section, strips: Iterable[str]) -> tuple[dict[str, StripBias], dict[str, StripBias]]:
