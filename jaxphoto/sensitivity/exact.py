@@ -64,7 +64,7 @@ class Sensitivity(eqx.Module):
         return self.named[name]
 
     @property
-    def groups(self) -> dict[str, Float[np.ndarray, "estimates n"]]:
+    def groups(self) -> dict[str, Float[np.ndarray, "estimates _"]]:
         """The derivatives by group of observations, each as one matrix: the numbers of a row in turn."""
         return {name: v.reshape(len(self.labels), -1) for name, v in self.named.items()}
 

@@ -38,7 +38,7 @@ class VarianceShares(eqx.Module):
     priori variance A diag(sigma^2) A' of the estimate, in its unit squared.
     """
 
-    groups: dict[str, Float[np.ndarray, "estimates n"]]
+    groups: dict[str, Float[np.ndarray, "estimates _"]]
     variance: Float[np.ndarray, "estimates"]
 
     @property
@@ -54,8 +54,8 @@ class ExternalReliability(eqx.Module):
     observation: no error there would be found.
     """
 
-    detectable: dict[str, Float[np.ndarray, "n"]]
-    effect: dict[str, Float[np.ndarray, "estimates n"]]
+    detectable: dict[str, Float[np.ndarray, "_"]]
+    effect: dict[str, Float[np.ndarray, "estimates _"]]
     delta0: float = eqx.field(static=True)
 
 

@@ -63,8 +63,8 @@ class Bias(eqx.Module):
     distribution: Distribution = eqx.field(static=True, default=jax.random.normal)
     recorded: bool = eqx.field(static=True, default=True)
     """Whether each error is worth a record of its own."""
-    mixed: tuple[Float[np.ndarray, "sets n n"] | None, ...] = ()
-    """Of arrays whose errors are correlated, what makes them of errors drawn: L of the covariance L L' of each set."""
+    mixed: tuple[Float[np.ndarray, "_ _ _"] | None, ...] = ()
+    """Of arrays whose errors are correlated, L (sets, n, n) of the covariances L L': it makes them of errors drawn."""
 
     def __call__(self, key, block: Block) -> tuple[Block, Recorded]:
         """`block` with errors drawn by `key`, and the errors by name."""

@@ -50,8 +50,8 @@ class Redundancy(eqx.Module):
     """Redundancy numbers, shaped like `Adjustment.residuals`; they sum to the redundancy."""
 
     numbers: Residuals
-    blocks: dict[str, Float[np.ndarray, "rows c c"]]
-    """I - J Q J' of the whitened numbers of each row, for groups whose rows are correlated within themselves."""
+    blocks: dict[str, Float[np.ndarray, "_ _ _"]]
+    """I - J Q J' (rows, c, c) of the whitened numbers of each row, where rows are correlated within themselves."""
 
     @property
     def image(self) -> Float[Numbers, "2 rows"]:

@@ -20,6 +20,7 @@ from jaxphoto.sensitivity.exact import sensitivity
 from jaxphoto.sensitivity.influence import Per, external_reliability, station_bias, variance_shares
 from jaxphoto.statistics import redundancy_numbers
 from tests.blocks import adjusted, simulated
+from tests.checked_types import unchecked
 from tests.test_examples import EXAMPLES
 
 
@@ -119,7 +120,7 @@ def test_external_reliability_is_an_undetected_error_adjusted_in() -> None:
     ],
 )
 def test_mistakes_get_a_sentence(call, sentence: str) -> None:
-    with pytest.raises(InputError, match=sentence):
+    with pytest.raises(InputError, match=sentence), unchecked():
         call(adjusted("cross"), derivatives("cross"))
 
 

@@ -18,6 +18,7 @@ from jaxphoto.report.sweep import sweep_figure, sweep_table
 from jaxphoto.sensitivity import designs as side_by_side
 from jaxphoto.sensitivity.sweep import Design, Sweep, sweep
 from jaxphoto.statistics import correlations
+from tests.checked_types import unchecked
 from tests.simulation.small import SMALL, made
 
 ARM = {"lever_arm_m": [0.1, -0.25, 0.8], "lever_arm": {"sigma_m": 0.01}}

@@ -75,7 +75,7 @@ def _resection_error(board: Board, rows: TargetRows, interior: InteriorOrientati
 
 
 def flat_start(
-    views: Sequence[tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]], sensor: Sensor
+    views: Sequence[tuple[Float[np.ndarray, "_ 2"], Float[np.ndarray, "_ 2"]]], sensor: Sensor
 ) -> tuple[InteriorOrientation, bool]:
     """c, K1 and K2 (`Brown`) from views of flat boards: coordinates in the board (m) and measured ones (mm).
 

@@ -113,9 +113,9 @@ def orient(
     names: Sequence[str],
     sensor: Sensor,
     interior: InteriorOrientation,
-    features: Sequence[Float[np.ndarray, "features 2"]],
+    features: Sequence[Float[np.ndarray, "_ 2"]],
     matches: Sequence[PairMatches],
-    sigmas_mm: Sequence[Float[np.ndarray, " features"]] | None = None,
+    sigmas_mm: Sequence[Float[np.ndarray, "_"]] | None = None,
     title: str = "photographs",
     report: Report = lambda text: None,
 ) -> Oriented:

@@ -54,7 +54,7 @@ class Related(NamedTuple):
 
 def relate(
     names: Sequence[str],
-    rays: Sequence[Float[np.ndarray, "features 3"]],
+    rays: Sequence[Float[np.ndarray, "_ 3"]],
     sigma_rad: float,
     matches: Sequence[PairMatches],
     least: int,

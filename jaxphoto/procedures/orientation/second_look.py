@@ -26,7 +26,7 @@ class SecondLook(NamedTuple):
 def second_look(
     network: Network,
     interior: InteriorOrientation,
-    features: Sequence[Float[np.ndarray, "features 2"]],
+    features: Sequence[Float[np.ndarray, "_ 2"]],
     matches: Sequence[PairMatches],
     sigma_mm: float,
     limit: float,
