@@ -24,12 +24,11 @@ from machine import machine, markdown, sentence, write_results
 from ours import block_of
 
 import jaxphoto
-from jaxphoto.adjustment import At, NormalEquations, TiledStructure, TiledValues, solve
+from jaxphoto.adjustment import Linearised, NormalEquations, TiledStructure, TiledValues, solve
 from jaxphoto.adjustment.layout.sharding import EVERYWHERE, along_points, sharded
-from jaxphoto.adjustment.model.residuals import Increments
+from jaxphoto.adjustment.model.numbers import Increments, zero_increments
 from jaxphoto.adjustment.solver.band import factor_band
 from jaxphoto.adjustment.solver.non_image_rows import non_image_rows
-from jaxphoto.adjustment.solver.optimum import zero_increments
 from jaxphoto.adjustment.solver.reduced import reduce_normal, tile_numbers, tile_parts
 from jaxphoto.block import Block
 from jaxphoto.compiling import run_compiled
@@ -117,10 +116,10 @@ def measure(block: Block) -> dict:
     }
 
 
-def _at(equations: NormalEquations) -> At:
+def _at(equations: NormalEquations) -> Linearised:
     """Where the block was linearised last; arrays by way of the host, so that no device holds them for itself."""
     free = jax.tree.map(lambda v: jnp.asarray(np.asarray(v)) if eqx.is_array(v) else v, equations)
-    return At(zero_increments(free.structure), free.factored.scale, free.values, free.structure)
+    return Linearised(zero_increments(free.structure), free.factored.scale, free.values, free.structure)
 
 
 @eqx.filter_jit
@@ -128,7 +127,7 @@ def _step(values: TiledValues, scale: Increments, structure: TiledStructure):
     """Sums of the reduced normal equations and their factor."""
 
     def of_device(values, scale, structure):
-        a, reduced, _ = reduce_normal(At(jax.tree.map(jnp.zeros_like, scale), scale, values, structure), 0.0)
+        a, reduced, _ = reduce_normal(Linearised(jax.tree.map(jnp.zeros_like, scale), scale, values, structure), 0.0)
         return factor_band(a), reduced.l
 
     return sharded(of_device, structure, (EVERYWHERE, along_points(2)))(values, scale, structure)
@@ -147,7 +146,7 @@ def _work(equations: NormalEquations) -> dict[str, float]:
     parts = tile_parts(at, 0.0, rest.coupled)
     numbers = jax.tree.map(lambda v: v[0, 0], tile_numbers(at, rest))
     cost = jax.jit(parts).lower(numbers).compile().cost_analysis() or {}
-    tiles = int(np.sum(s.tiles.groups)) * s.tiles.at_once
+    tiles = int(np.sum(s.tiles.batches)) * s.tiles.at_once
     m, p = s.tiles.image.shape[2], s.tiles.per_tile
     f = 6 * m + s.n_interior + len(rest.coupled) + 1
     products = 2 * 3 * p * f**2 + 2 * 2 * p * m * (7 + s.n_image_colours) ** 2

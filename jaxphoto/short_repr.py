@@ -27,7 +27,7 @@ def block_repr(block: Any) -> str:
 def adjustment_repr(adjusted: Any) -> str:
     """`Adjustment of 'title': converged ...`, then steps, sigma naught and redundancy, in two lines."""
     of = f"Adjustment of {adjusted.block.title!r}"
-    # A traced number has no value, and several have no common one; `padded` is None inside a transformation of JAX.
+    # A traced number has no value, and several have no common one; `factored` is None inside a transformation of JAX.
     if adjusted.factored is None or np.ndim(adjusted.converged) != 0:
         return f"{of} inside a transformation of JAX or of several blocks at once: its numbers are arrays"
     observations, unknowns = (sum(n.values()) for n in (adjusted.n_observations, adjusted.n_unknowns))

@@ -14,8 +14,8 @@ from jaxtyping import Array, Float, Int
 from jaxphoto import AbstractObservations, AbstractParameters, KnownParameters, Outcome, adjust, correlated, touching
 from jaxphoto.adjustment.adjust import _residuals
 from jaxphoto.adjustment.layout.padding import pad_structure
+from jaxphoto.adjustment.model.block_values import values_of
 from jaxphoto.adjustment.model.structure import structure_of
-from jaxphoto.adjustment.model.values import values_of
 from jaxphoto.arrays import Numbers
 from jaxphoto.block import Block, Motion
 from jaxphoto.compiling import run_compiled

@@ -32,6 +32,7 @@ QUICK = {
         "test_compiling.py::test_a_damaged_file_is_written_anew",
         "test_compiling.py::test_what_differs_is_described_differently",
     ),
+    "devices": ("adjustment/test_shards.py::test_as_many_devices_of_each_process",),
     "errors": ("io/test_cameras.py",),
     "experiment": ("experiment/test_docs.py", "experiment/test_page.py"),
     "georeferencing": ("georeferencing/test_corrections.py", "georeferencing/test_map_frame.py"),
@@ -56,6 +57,7 @@ QUICK = {
     "short_repr": ("test_front_door.py",),
     "single": ("test_front_door.py",),
     "simulation": ("simulation/test_flight_plan.py", "simulation/test_recipes.py", "simulation/test_terrain.py"),
+    "small_matrices": ("adjustment/test_outcome.py::test_truth_is_recovered[cross]",),
     "stability": ("test_stability.py::test_equal_weights_give_the_chi_square_distribution_far_into_its_tails",),
     "statistics": (
         "statistics/test_covariance.py::test_kinds_of_rotation_are_one_covariance",

@@ -15,10 +15,11 @@ from jax.flatten_util import ravel_pytree
 
 import jaxphoto.observations
 from jaxphoto import FIXED, FREE, AbstractObservations, JaxphotoError, Tables, Weighted, adjust, covariance, monte_carlo
-from jaxphoto.adjustment import At
+from jaxphoto.adjustment import Linearised
 from jaxphoto.adjustment.layout.tile_layout import sizes_of
+from jaxphoto.adjustment.model.numbers import zero_increments
 from jaxphoto.adjustment.model.structure import structure_of
-from jaxphoto.adjustment.solver.optimum import typical_scale, weigh_datum, zero_increments
+from jaxphoto.adjustment.solver.optimum import typical_scale, weigh_datum
 from jaxphoto.observations import Correlated, KnownParameters
 from jaxphoto.parameters import numbers_of
 from jaxphoto.report.results import write_results
@@ -87,7 +88,7 @@ def differences() -> tuple[np.ndarray, np.ndarray]:
         _, back = ravel_pytree(zero_increments(s))
 
         def at(h):
-            return in_one_list(At(back(h * direction), scale, values, s).residuals())
+            return in_one_list(Linearised(back(h * direction), scale, values, s).residuals())
 
         return (at(-2 * _STEP) - 8 * at(-_STEP) + 8 * at(_STEP) - at(2 * _STEP)) / (12 * _STEP)
 

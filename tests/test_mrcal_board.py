@@ -114,7 +114,7 @@ def test_cofactors_of_the_camera_are_mrcals(calibrated, reference):
     labels = [label.removeprefix(f"interior[{CAMERA}].") for label in calibrated.structure.labels]
     which = [labels.index(name) for name in FREE]
     unit = np.asarray(equations.scale.shared)[which]
-    own = np.asarray(equations.inverse_of_images())[-len(labels) :, -len(labels) :][np.ix_(which, which)] * np.outer(
+    own = np.asarray(equations.inverse_of_reduced())[-len(labels) :, -len(labels) :][np.ix_(which, which)] * np.outer(
         unit, unit
     )
     to_pixels = slope(calibrated, theirs)
@@ -132,6 +132,6 @@ def test_a_board_is_laid_out_as_an_arrow_of_tiles_of_few_images(calibrated):
     assert tiles.pair_tile.size == 0
     assert tiles.columns > 10
     assert (
-        len(calibrated.structure.image) > 0.8 * tiles.image[:, : tiles.groups[0] * tiles.at_once].size * tiles.per_tile
+        len(calibrated.structure.image) > 0.8 * tiles.image[:, : tiles.batches[0] * tiles.at_once].size * tiles.per_tile
     )
     assert jax.tree.leaves(calibrated.factored.reduced.f)[0].size == 0

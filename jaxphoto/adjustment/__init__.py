@@ -8,10 +8,25 @@ from jaxphoto.adjustment.adjust import MAX_STEPS, LaidOut, common_sizes, lay_out
 from jaxphoto.adjustment.layout.padding import TiledBlock
 from jaxphoto.adjustment.layout.tile_layout import LEAST, Sizes
 from jaxphoto.adjustment.layout.tiled import TiledStructure, TiledValues
-from jaxphoto.adjustment.normal_equations import At, Cofactors, NormalEquations, RowCofactors, optimise
+from jaxphoto.adjustment.normal_equations import Cofactors, Linearised, NormalEquations, RowCofactors, optimise
 from jaxphoto.adjustment.result import Adjustment, Outcome
 
 __all__ = [
-    "LEAST", "MAX_STEPS", "Adjustment", "At", "Cofactors", "LaidOut", "NormalEquations", "Outcome", "RowCofactors",
-    "Sizes", "TiledBlock", "TiledStructure", "TiledValues", "common_sizes", "lay_out", "optimise", "solve",
+    "LEAST",
+    "MAX_STEPS",
+    "Adjustment",
+    "Cofactors",
+    "LaidOut",
+    "Linearised",
+    "NormalEquations",
+    "Outcome",
+    "RowCofactors",
+    "Sizes",
+    "TiledBlock",
+    "TiledStructure",
+    "TiledValues",
+    "common_sizes",
+    "lay_out",
+    "optimise",
+    "solve",
 ]  # fmt: skip

@@ -13,18 +13,18 @@ from jaxphoto.adjustment.datum import close_datum
 from jaxphoto.adjustment.layout.padding import TiledBlock, pad_structure
 from jaxphoto.adjustment.layout.tile_layout import LEAST, Sizes, sizes_of
 from jaxphoto.adjustment.layout.tiled import TiledResiduals, TiledStructure, TiledValues
-from jaxphoto.adjustment.model.residuals import UnknownArrays, Values, state_at
+from jaxphoto.adjustment.lost_digits import warn_of_lost_digits
+from jaxphoto.adjustment.model.block_values import unknowns_of, values_of, with_datum, with_start
+from jaxphoto.adjustment.model.numbers import UnknownArrays, Values, state_at, zero_increments
 from jaxphoto.adjustment.model.structure import observed_in, structure_of
-from jaxphoto.adjustment.model.values import at_state, unknowns_of, values_of, with_datum
 from jaxphoto.adjustment.normal_equations import NormalEquations, optimise
-from jaxphoto.adjustment.precision import warn_of_lost_digits
 from jaxphoto.adjustment.rank import check_priors, check_rank
 from jaxphoto.adjustment.result import Adjustment
 from jaxphoto.adjustment.solver.elimination import FactoredNormal
 from jaxphoto.adjustment.solver.levenberg_marquardt import zero_system
-from jaxphoto.adjustment.solver.normal import At
-from jaxphoto.adjustment.solver.optimum import find_optimum, unit_scale, weigh_datum, zero_increments
-from jaxphoto.adjustment.solver.similarity import open_motions
+from jaxphoto.adjustment.solver.normal import Linearised
+from jaxphoto.adjustment.solver.optimum import find_optimum, unit_scale, weigh_datum
+from jaxphoto.adjustment.solver.similarity import n_open_motions
 from jaxphoto.arrays import gathered, still
 from jaxphoto.block import Block
 from jaxphoto.compiling import prepare, run_compiled
@@ -55,7 +55,7 @@ def solve(
     do not see an unknown or cannot tell unknowns apart.
     """
     laid = lay_out(block, start, priors, sizes)
-    tiled, numbers, structure = laid.tiled, laid.numbers, laid.tiled.structure
+    tiled, numbers, structure = laid.tiled, laid.tiled_values, laid.tiled.structure
     seconds: dict[str, float] = {}
     factored = None
     if laid.traced:
@@ -70,7 +70,7 @@ def solve(
         found = run_compiled(_optimise, arguments, seconds, "solve")
         # What comes back from several devices is of another type to a program than what went in.
         state = UnknownArrays(*map(still, found.state))
-    numbers = at_state(numbers, state)
+    numbers = with_start(numbers, state)
     # Statistics need the factored normal matrix; a derivative of the unknowns does not, and would pay for it dearly.
     if not laid.traced:
         again = run_compiled(_optimise, (numbers, structure, max_steps, np.array(True)), seconds, "covariance")
@@ -82,7 +82,7 @@ def solve(
         priors=priors,
         unknowns=unknowns_of(state, start, tiled.own),
         residuals=tiled.crop_residuals(residuals),
-        values=at_state(laid.values, state),
+        values=with_start(laid.values, state),
         tiled=tiled,
         tiled_values=numbers,
         factored=factored,
@@ -100,12 +100,12 @@ class LaidOut(NamedTuple):
 
     tiled: TiledBlock
     values: Values
-    numbers: TiledValues
+    tiled_values: TiledValues
 
     @property
     def traced(self) -> bool:
         """Whether any number is traced by a transformation of JAX."""
-        return any(isinstance(v, jax.core.Tracer) for v in jax.tree.leaves(self.values))
+        return _traced(self.values)
 
 
 def lay_out(block: Block, start: Unknowns, priors: Unknowns, sizes: Sizes = LEAST, alone: bool = False) -> LaidOut:
@@ -121,9 +121,8 @@ def lay_out(block: Block, start: Unknowns, priors: Unknowns, sizes: Sizes = LEAS
     constraints = close_datum(block, values, structure)
     values = with_datum(values, constraints.eop, constraints.points)
     constrained, coupled = len(constraints.eop) > 0, bool(structure.coupled)
-    traced = any(isinstance(v, jax.core.Tracer) for v in jax.tree.leaves(values))
     # Such rows may join points of two devices; of constraints, statistics have only the open motions in closed form.
-    alone = alone or traced or coupled or (constrained and not open_motions(values, structure))
+    alone = alone or _traced(values) or coupled or (constrained and not n_open_motions(values, structure))
     shards = 1 if alone else _devices_worth_using(len(structure.image))
     tiled = pad_structure(structure, sizes, shards=shards, dense=constrained or coupled)
     return LaidOut(tiled, values, tiled.pad(values))
@@ -136,7 +135,11 @@ def _factored_like(values: TiledValues, structure: TiledStructure) -> FactoredNo
     reduced, factor, scale = jax.tree.map(
         lambda v: np.broadcast_to(0.0, v.shape), (system.reduced, system.factor, zero)
     )
-    return FactoredNormal(reduced, factor, scale, values.datum_eop.shape[0])
+    return FactoredNormal(reduced, factor, scale)
+
+
+def _traced(values: Values) -> bool:
+    return any(isinstance(v, jax.core.Tracer) for v in jax.tree.leaves(values))
 
 
 # Image rows that keep a device busy for longer than adding its sums to those of others takes.
@@ -158,4 +161,4 @@ _optimise = eqx.filter_jit(optimise)
 @eqx.filter_jit
 def _residuals(values: TiledValues, structure: TiledStructure) -> TiledResiduals:
     s = structure.on_one_device
-    return At(zero_increments(s), unit_scale(s), values, s).residuals()
+    return Linearised(zero_increments(s), unit_scale(s), values, s).residuals()

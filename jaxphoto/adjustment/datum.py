@@ -14,11 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from jaxphoto.adjustment.model.block_values import with_start
+from jaxphoto.adjustment.model.numbers import UnknownArrays, Values, zero_increments
 from jaxphoto.adjustment.model.observed_groups import ObservedGroup
-from jaxphoto.adjustment.model.residuals import Increments, UnknownArrays, Values
 from jaxphoto.adjustment.model.row_functions import group_residuals, rows_of
 from jaxphoto.adjustment.model.structure import Structure
-from jaxphoto.adjustment.model.values import at_state
 from jaxphoto.adjustment.solver.similarity import motions, similarity
 from jaxphoto.block import Block
 from jaxphoto.compiling import QUICK_TO_COMPILE
@@ -56,15 +56,15 @@ def close_datum(block: Block, values: Values, structure: Structure) -> DatumRows
         return DatumRows(np.zeros((0, 6, structure.n_images)), np.zeros((0, 3, structure.n_points)))
     motions, centre, size = _motions(values)
     sensitivity, named = _datum_sensitivity(block, values, structure, motions, centre, size)
-    open_motions = _null_motions(sensitivity)
-    null = _combine(motions, open_motions)
+    null_motions = _null_motions(sensitivity)
+    null = _combine(motions, null_motions)
     kind, over = block.datum.kind, block.datum.over
     if kind == "control":
-        if len(open_motions):
-            raise DatumError(_sentence(open_motions, block, named))
+        if len(null_motions):
+            raise DatumError(_sentence(null_motions, block, named))
         return null
     if block.datum.scale is not None:
-        scale_open = bool(len(open_motions)) and bool(np.abs(open_motions[:, 6]).max() > 1e-6)
+        scale_open = bool(len(null_motions)) and bool(np.abs(null_motions[:, 6]).max() > 1e-6)
         if scale_open != block.datum.scale:
             raise DatumError(
                 "[datum] scale = false, but nothing in the block gives it a scale: add a distance, stations or "
@@ -76,7 +76,7 @@ def close_datum(block: Block, values: Values, structure: Structure) -> DatumRows
     product = np.einsum("kci,jci->kj", constraints.eop, null.eop) + np.einsum(
         "kcp,jcp->kj", constraints.points, null.points
     )
-    if len(open_motions) and np.linalg.svd(product, compute_uv=False)[-1] < 1e-9 * np.abs(product).max():
+    if len(null_motions) and np.linalg.svd(product, compute_uv=False)[-1] < 1e-9 * np.abs(product).max():
         raise DatumError(
             f'[datum] over = "{over}" cannot fix the datum (they lie on a line or in a point): take all points'
         )
@@ -166,10 +166,8 @@ def _row_sensitivity(values: Values, structure: Structure, shared, centre, size)
         position, rotation = jax.vmap(image, in_axes=(1, 2), out_axes=(1, 2))(v.position, v.rotation)
         points = jax.vmap(lambda x: similarity(parameters, x, jnp.eye(3), centre, size)[0], 1, 1)(v.points)
         vector = jnp.asarray(v.shared).at[structure.free[shared]].add(moved)
-        there = at_state(v, UnknownArrays(position, rotation, vector, points))
-        zero = Increments(
-            jnp.zeros((6, structure.n_images)), jnp.zeros(structure.n_shared), jnp.zeros((3, structure.n_points))
-        )
+        there = with_start(v, UnknownArrays(position, rotation, vector, points))
+        zero = zero_increments(structure)
         groups: list[tuple[ObservedGroup, Any]] = list(zip(structure.observed, v.groups, strict=True))
         return jnp.concatenate([group_residuals(g, n, zero, zero, there, structure).ravel() for g, n in groups])
 
@@ -231,8 +229,8 @@ def _minimal(null: DatumRows, structure: Structure) -> DatumRows:
     return DatumRows(np.zeros_like(null.eop), points)
 
 
-def _sentence(open_motions: np.ndarray, block: Block, named: list[str]) -> str:
-    shares = np.sqrt((open_motions**2).sum(0))
+def _sentence(null_motions: np.ndarray, block: Block, named: list[str]) -> str:
+    shares = np.sqrt((null_motions**2).sum(0))
     names = [m for m, share in zip(MOTIONS, shares, strict=True) if share > 0.05]
     counts = {rows.group: int(np.size(rows.observation)) for rows in block.observations if len(rows)}
     if n := counts.pop(ControlRows.group, 0) + len(block.fixed.who):
@@ -246,6 +244,6 @@ def _sentence(open_motions: np.ndarray, block: Block, named: list[str]) -> str:
     if named:
         mends = "add control points, or fix " + ", ".join(named[:3]) + (" ..." if len(named) > 3 else "")
     return (
-        f"the datum of the block has a defect of {len(open_motions)}: {', '.join(names)} cannot be determined from "
+        f"the datum of the block has a defect of {len(null_motions)}: {', '.join(names)} cannot be determined from "
         f"{' and '.join(observed) if observed else 'image coordinates alone'}; {mends}"
     )

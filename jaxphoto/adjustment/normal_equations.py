@@ -1,7 +1,6 @@
 """The normal equations of a block at its optimum: the one door from statistics and sensitivity to the solver.
 
-Everything here is traced, in scaled increments and in the order of the tiles; `Adjustment.tiled` brings it back to the
-order of the block.
+All is in scaled increments and in the order of the tiles; `Adjustment.tiled` brings it back to the order of the block.
 """
 
 import dataclasses
@@ -12,12 +11,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxphoto.adjustment.layout.tiled import TiledStructure, TiledValues
-from jaxphoto.adjustment.model.residuals import Increments, UnknownArrays, state_at
+from jaxphoto.adjustment.model.numbers import Increments, UnknownArrays, state_at, zero_increments
 from jaxphoto.adjustment.solver.band import Band, dense, factor_band, invert_band, pivots, solve_band
 from jaxphoto.adjustment.solver.elimination import FactoredNormal, gradient, reduce_right, solve_factored, solve_reduced
 from jaxphoto.adjustment.solver.inverse import Cofactors, RowCofactors, cofactors_of, row_variances
-from jaxphoto.adjustment.solver.normal import At
-from jaxphoto.adjustment.solver.optimum import iterate, typical_scale, unit_scale, weigh_datum, zero_increments
+from jaxphoto.adjustment.solver.normal import Linearised
+from jaxphoto.adjustment.solver.optimum import iterate, typical_scale, unit_scale, weigh_datum
 from jaxphoto.adjustment.solver.reduced import reduce_normal
 from jaxphoto.arrays import Numbers, still
 
@@ -36,10 +35,10 @@ class NormalEquations(eqx.Module):
         return self.factored.scale
 
     @property
-    def at(self) -> At:
+    def at(self) -> Linearised:
         """Where the equations are linearised: at no increments, with the constraints of the datum weighed."""
         s = self.structure
-        return At(jax.tree.map(jnp.zeros_like, self.scale), self.scale, weigh_datum(self.values, s), s)
+        return Linearised(jax.tree.map(jnp.zeros_like, self.scale), self.scale, weigh_datum(self.values, s), s)
 
     @property
     def weighed(self) -> "NormalEquations":
@@ -74,15 +73,15 @@ class NormalEquations(eqx.Module):
         """x of a right-hand side that `reduce` has taken down."""
         return solve_reduced(self.factored.reduced, self.factored.factor, right, d, b_points, self.at)
 
-    def solve_images(self, right: Float[Array, "reduced *c"]) -> Float[Array, "reduced *c"]:
+    def solve_reduced_matrix(self, right: Float[Array, "reduced *c"]) -> Float[Array, "reduced *c"]:
         """A^-1 right, of the reduced unknowns alone."""
         return solve_band(self.factored.factor, right)
 
-    def triangle(self) -> Float[Array, "reduced reduced"]:
+    def cholesky_factor(self) -> Float[Array, "reduced reduced"]:
         """M of the reduced normal matrix A = M M'."""
         return jnp.tril(dense(Band(*self.factored.factor)))
 
-    def inverse_of_images(self) -> Float[Array, "reduced reduced"]:
+    def inverse_of_reduced(self) -> Float[Array, "reduced reduced"]:
         """A^-1."""
         return invert_band(self.factored.factor)
 
@@ -102,8 +101,8 @@ class NormalEquations(eqx.Module):
 def factor_normal(values: TiledValues, structure: TiledStructure) -> FactoredNormal:
     """The normal equations of values that are at their optimum."""
     values, scale = weigh_datum(values, structure), typical_scale(values, structure)
-    a, reduced, _ = reduce_normal(At(zero_increments(structure), scale, values, structure), 0.0)
-    return FactoredNormal(reduced, factor_band(a), scale, values.datum_eop.shape[0])
+    a, reduced, _ = reduce_normal(Linearised(zero_increments(structure), scale, values, structure), 0.0)
+    return FactoredNormal(reduced, factor_band(a), scale)
 
 
 class Optimised(eqx.Module):
@@ -121,6 +120,6 @@ def optimise(
     """The optimum; or, of values that are at theirs, the undamped normal equations, factored."""
     optimum, system, scale = iterate(weigh_datum(values, structure), structure, max_steps, only_factor)
     state = state_at(optimum.increments, unit_scale(structure), values, structure)
-    factored = FactoredNormal(system.reduced, system.factor, scale, values.datum_eop.shape[0])
+    factored = FactoredNormal(system.reduced, system.factor, scale)
     assert optimum.steps is not None and optimum.converged is not None, "only of a tangent is this unknown"
     return Optimised(state, optimum.steps, optimum.converged, factored)

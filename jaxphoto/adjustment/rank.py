@@ -9,7 +9,7 @@ from jaxphoto.adjustment.layout.sharding import EVERYWHERE, sharded
 from jaxphoto.adjustment.normal_equations import NormalEquations
 from jaxphoto.adjustment.result import Adjustment
 from jaxphoto.adjustment.solver.band import Band, dense, pivots
-from jaxphoto.adjustment.solver.normal import At
+from jaxphoto.adjustment.solver.normal import Linearised
 from jaxphoto.adjustment.solver.reduced import reduce_normal
 from jaxphoto.block import Block
 from jaxphoto.compiling import call_compiled
@@ -161,7 +161,7 @@ _pivots = eqx.filter_jit(pivots)
 def reduced_matrix(equations: NormalEquations) -> Band:
     """The undamped reduced normal matrix itself; the solver keeps its factor, which a defect leaves unfinished."""
 
-    def of_device(at: At) -> Band:
+    def of_device(at: Linearised) -> Band:
         return reduce_normal(at, 0.0)[0]
 
     return sharded(of_device, equations.structure, EVERYWHERE)(equations.at)

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxphoto.adjustment.layout.padding import TiledBlock
 from jaxphoto.adjustment.layout.tiled import TiledValues
-from jaxphoto.adjustment.model.residuals import Residuals, Values
+from jaxphoto.adjustment.model.numbers import Residuals, Values
 from jaxphoto.adjustment.model.structure import Structure, observed_in
 from jaxphoto.adjustment.normal_equations import NormalEquations, factor_normal
 from jaxphoto.adjustment.solver.elimination import FactoredNormal

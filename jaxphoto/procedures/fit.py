@@ -3,7 +3,7 @@
 import numpy as np
 
 from jaxphoto.adjustment import Adjustment
-from jaxphoto.adjustment.model.residuals import Residuals
+from jaxphoto.adjustment.model.numbers import Residuals
 from jaxphoto.statistics import (
     LEAST_CHECKED,
     Covariance,

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from jaxphoto.adjustment import Adjustment
-from jaxphoto.adjustment.model.residuals import Residuals
+from jaxphoto.adjustment.model.numbers import Residuals
 from jaxphoto.camera import constant_names, get_parameter, parameter_names
 from jaxphoto.compiling import call_compiled
 from jaxphoto.observations import AXES

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jax.sharding import PartitionSpec as P
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxphoto.adjustment.model.residuals import Increments, UnknownArrays
+from jaxphoto.adjustment.model.numbers import Increments, UnknownArrays
 from jaxphoto.devices import AXIS, mesh_of
 from jaxphoto.sensitivity.many import Common, Varying, image_gradients, other_gradients, states
 

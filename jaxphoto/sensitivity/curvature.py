@@ -12,9 +12,9 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from jaxphoto.adjustment import At, TiledStructure, TiledValues
+from jaxphoto.adjustment import Linearised, TiledStructure, TiledValues
+from jaxphoto.adjustment.model.numbers import Increments
 from jaxphoto.adjustment.model.observed_groups import ObservedGroup, RowsAtPoints
-from jaxphoto.adjustment.model.residuals import Increments
 from jaxphoto.adjustment.model.row_functions import (
     RowInputs,
     Touched,
@@ -35,12 +35,12 @@ class RowSecond(NamedTuple):
     """By z and by the numbers observed."""
 
 
-def mixed_second(at: At, direction: TiledValues, curved: Float[Numbers, ""]) -> Increments:
+def mixed_second(at: Linearised, direction: TiledValues, curved: Float[Numbers, ""]) -> Increments:
     """B dv over all rows, for a direction of change of the numbers; leaves that are None do not change."""
 
     def gradient(moved):
         values = eqx.combine(moved, at.values)
-        residuals, pull = jax.vjp(lambda y: At(y, at.scale, values, at.structure).residuals(), at.increments)
+        residuals, pull = jax.vjp(lambda y: Linearised(y, at.scale, values, at.structure).residuals(), at.increments)
         counted = jax.tree.map(lambda r: r - (1 - curved) * jax.lax.stop_gradient(r), residuals)
         return pull(counted)[0]
 
@@ -48,7 +48,7 @@ def mixed_second(at: At, direction: TiledValues, curved: Float[Numbers, ""]) -> 
     return jax.jvp(gradient, (eqx.filter(at.values, there),), (direction,))[1]
 
 
-def row_second(group: ObservedGroup, numbers: Any, at: At, curved: Float[Numbers, ""]) -> RowSecond:
+def row_second(group: ObservedGroup, numbers: Any, at: Linearised, curved: Float[Numbers, ""]) -> RowSecond:
     """H and B of all rows of a group, each by itself."""
     function = row_function(group, at.structure)
 
@@ -69,7 +69,7 @@ def row_second(group: ObservedGroup, numbers: Any, at: At, curved: Float[Numbers
     return each_row(one, group, *given)
 
 
-def rows_second(at: At, curved: Float[Numbers, ""]) -> tuple[RowSecond, ...]:
+def rows_second(at: Linearised, curved: Float[Numbers, ""]) -> tuple[RowSecond, ...]:
     """`row_second` of all groups."""
     s = at.structure
     return tuple(row_second(g, numbers, at, curved) for g, numbers in zip(s.observed, at.values.groups, strict=True))
@@ -82,7 +82,7 @@ class AtPointsSecond(NamedTuple):
     w: Float[Array, "others 3 points"]
 
 
-def points_second(second: tuple[RowSecond, ...], at: At) -> AtPointsSecond:
+def points_second(second: tuple[RowSecond, ...], at: Linearised) -> AtPointsSecond:
     """H of rows at points, by these, and by these and shared unknowns."""
     s, n = at.structure, at.increments.points.shape[1]
     v, w = jnp.zeros((3, 3, n)), jnp.zeros((s.n_border - s.n_interior, 3, n))
@@ -94,7 +94,7 @@ def points_second(second: tuple[RowSecond, ...], at: At) -> AtPointsSecond:
     return AtPointsSecond(v, w)
 
 
-def coupling_rows(second: tuple[RowSecond, ...], at: At) -> tuple[Array, Array, Array]:
+def coupling_rows(second: tuple[RowSecond, ...], at: Linearised) -> tuple[Array, Array, Array]:
     """D, by the reduced unknowns (k, n) and by the points (k, 3, points), and its weight C.
 
     Of a row that couples points, D is what it touches, one after the other, and C its H.
@@ -105,7 +105,7 @@ def coupling_rows(second: tuple[RowSecond, ...], at: At) -> tuple[Array, Array, 
     d_p: list[Array] = []
     blocks: list[Array] = []
     for g, own in zip(s.observed, second, strict=True):
-        if g.layout == "coupled":
+        if g.elimination == "coupled":
             places = reduced_places(g, s.n_images).T
             reduced, z = places.shape[1], len(own.h)
             each = jnp.arange(g.n_rows)[:, None]
@@ -116,9 +116,9 @@ def coupling_rows(second: tuple[RowSecond, ...], at: At) -> tuple[Array, Array, 
                 p = p.at[each, reduced + 3 * k + axis, axis, jnp.asarray(point)[:, None]].set(1.0)
             d_e, d_p = [*d_e, e.reshape(-1, n)], [*d_p, p.reshape(-1, 3, n_points)]
             blocks += list(jnp.moveaxis(own.h, 2, 0))
-    datum = (values.datum_eop * scale.eop).transpose(0, 2, 1).reshape(fixed, 6 * s.n_images)
-    d_e.append(jnp.concatenate([datum, jnp.zeros((fixed, s.n_shared))], axis=1))
-    d_p.append(values.datum_points * scale.points)
+    datum = at.constraints()
+    d_e.append(jnp.concatenate([datum.eop.transpose(0, 2, 1).reshape(fixed, 6 * s.n_images), datum.shared], axis=1))
+    d_p.append(datum.points)
     return jnp.concatenate(d_e), jnp.concatenate(d_p), _block_diagonal([*blocks, jnp.eye(fixed)])
 
 
@@ -139,7 +139,7 @@ def other_second(second: tuple[RowSecond, ...], s: TiledStructure) -> Float[Arra
         if isinstance(g.rows, RowsAtPoints):
             k, place = len(g.place), 6 * s.n_images + jnp.asarray(g.column)[:, 0]
             h = h.at[place[:, None], place].add(jnp.sum(own.h[:k, :k], axis=(2, 3)), mode="drop")
-        elif g.layout == "reduced":
+        elif g.elimination == "reduced":
             place = reduced_places(g, s.n_images).T
             h = h.at[place[:, :, None], place[:, None]].add(jnp.moveaxis(own.h, 2, 0), mode="drop")
     return h

@@ -15,8 +15,8 @@ from jax.sharding import PartitionSpec as P
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxphoto.adjustment import NormalEquations, Sizes, TiledStructure, TiledValues, lay_out, optimise
-from jaxphoto.adjustment.model.residuals import UnknownArrays
-from jaxphoto.adjustment.model.values import at_state
+from jaxphoto.adjustment.model.block_values import with_start
+from jaxphoto.adjustment.model.numbers import UnknownArrays
 from jaxphoto.arrays import Numbers
 from jaxphoto.block import Block
 from jaxphoto.compiling import run_compiled
@@ -87,7 +87,7 @@ def prepare_design(block: Block, truth: Unknowns | None, sizes: Sizes, n_check: 
         check.truth[: len(who)] = np.asarray(truth.points)[who]
     observed = 2 * len(s.image) + sum(g.components * g.n_rows for g in s.observed) + constraints
     unknown = s.n_shared + s.eop_free.sum() + s.point_free.sum()
-    return Prepared(laid.numbers, laid.tiled.structure, check, s.labels, int(observed - unknown))
+    return Prepared(laid.tiled_values, laid.tiled.structure, check, s.labels, int(observed - unknown))
 
 
 def alike(designs: Sequence[Prepared]) -> list[list[int]]:
@@ -153,13 +153,13 @@ def _findings(values: TiledValues, s: TiledStructure, check: Check, rotations: R
     """Adjustment, factor at the optimum, covariance, and what is kept of them."""
 
     def solved(start: UnknownArrays, only_factor):
-        found = optimise(at_state(values, start), s, max_steps, only_factor)
+        found = optimise(with_start(values, start), s, max_steps, only_factor)
         return found.state, found
 
     # To the optimum, and there once more for the undamped factor: a loop, so that it is one piece of code.
     start = UnknownArrays(values.position, values.rotation, values.shared, values.points)
     state, found = jax.lax.scan(solved, start, np.array([False, True]))
-    there, factored = at_state(values, state), jax.tree.map(lambda v: v[1], found.factored)
+    there, factored = with_start(values, state), jax.tree.map(lambda v: v[1], found.factored)
     equations = NormalEquations(there, s, factored)
     cofactors, _ = equations.cofactors(np.array(False))
     covariance, points = in_units(cofactors, equations.scale, there.rotation, rotations)

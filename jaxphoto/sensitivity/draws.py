@@ -17,8 +17,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxphoto.adjustment import Adjustment, solve
-from jaxphoto.adjustment.model.residuals import UnknownArrays
-from jaxphoto.adjustment.model.values import values_of, with_datum
+from jaxphoto.adjustment.model.block_values import values_of, with_datum
+from jaxphoto.adjustment.model.numbers import UnknownArrays
 from jaxphoto.arrays import still
 from jaxphoto.block import Block, Start
 from jaxphoto.compiling import call_compiled
@@ -31,8 +31,8 @@ from jaxphoto.sensitivity.perturbation import Perturbation, Recorded
 from jaxphoto.unknowns import Prior
 
 # Draws that a device computes side by side. Vectors end in them: 32 are enough for that, and for what is made anew for
-# all of them (see `adjustment.elimination`); more, up to 64, pay where image rows x draws stay below this number, fewer
-# only where unknowns x draws would be more than this, of which memory holds several.
+# all of them (see `adjustment.solver.elimination`); more, up to 64, pay where image rows x draws stay below this
+# number, fewer only where unknowns x draws would be more than this, of which memory holds several.
 _FEW, _MOST, _LEAST = 32, 64, 8
 _ROWS, _UNKNOWNS = 100_000, 8_000_000
 # Image rows x draws that are computed with at a time: what that needs stays in the cache of a core.

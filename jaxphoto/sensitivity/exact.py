@@ -25,7 +25,7 @@ from jaxtyping import Array, Float, Int
 from scipy import sparse
 
 from jaxphoto.adjustment import Adjustment, NormalEquations, TiledBlock
-from jaxphoto.adjustment.model.residuals import IMAGE_POINTS
+from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
 from jaxphoto.adjustment.model.row_functions import reduced_places
 from jaxphoto.adjustment.model.structure import Structure
 from jaxphoto.arrays import still

@@ -7,9 +7,9 @@ With r the weighted residuals, y the increments and v any number that r depends 
 
 and the optimum answers dv with dy = -H^-1 B dv. Without the terms that carry r, this is the classical first-order
 matrix -N^-1 J' dr/dv. Every image row touches one image, one point and one camera, so H has the blocks of the normal
-matrix (see adjustment/solver/normal.py) and its points are eliminated alike, by V = L L' and F = [W; Ws; D] L^-T. Some
-rows, and the datum, couple points: D (what such a row touches, then the constraints) has the weight C, and mu = C D x
-is carried by more unknowns. With S, G, K what is left of H, D and 0 without the points,
+matrix (see adjustment/solver/normal.py) and its points are eliminated alike, by V = L L' and F = [W; Ws'; D_p] L^-T.
+Some rows, and the datum, couple points: D (what such a row touches, then the constraints) has the weight C, and
+mu = C D x is carried by more unknowns. With S, G, K what is left of H, D and 0 without the points,
 
     M = [ S     G'      ]
         [ C G   C K - I ]
@@ -22,8 +22,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxphoto.adjustment import Adjustment, At, TiledStructure
-from jaxphoto.adjustment.model.residuals import Increments
+from jaxphoto.adjustment import Adjustment, Linearised, TiledStructure
+from jaxphoto.adjustment.model.numbers import Increments
 from jaxphoto.arrays import Numbers
 from jaxphoto.errors import InputError
 from jaxphoto.sensitivity.curvature import coupling_rows, other_second, points_second, rows_second
@@ -66,7 +66,7 @@ def check_optimum(adjusted: Adjustment) -> None:
         )
 
 
-def eliminated(at: At, rows: ListedRows, curved: Float[Numbers, ""]) -> Eliminated:
+def eliminated(at: Linearised, rows: ListedRows, curved: Float[Numbers, ""]) -> Eliminated:
     """Of H where `curved` is 1, of N where it is 0, in scaled increments; what is held fixed has a unit diagonal."""
     values, scale, s = at.values, at.scale, at.structure
     second = rows_second(at, curved)

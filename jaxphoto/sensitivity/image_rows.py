@@ -25,8 +25,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxphoto.adjustment import Adjustment, TiledStructure, TiledValues
-from jaxphoto.adjustment.model.residuals import Increments, state_at
-from jaxphoto.adjustment.model.scene import by_image, scene_of, slopes_of
+from jaxphoto.adjustment.model.image_orientations import by_image, orientation_derivatives, orientations_of
+from jaxphoto.adjustment.model.numbers import Increments, state_at
 from jaxphoto.adjustment.model.structure import CameraGroup, interior_of
 from jaxphoto.arrays import Numbers, still
 from jaxphoto.collinearity import camera_residual
@@ -119,7 +119,10 @@ def _of_some(
 ) -> RowProducts:
     image, point = rows.image, rows.point
     q, zero = s.n_image_colours, jax.tree.map(jnp.zeros_like, scale)
-    scene, slopes = scene_of(state_at(zero, scale, values, s), values, s), slopes_of(zero, scale, values, s)
+    scene, slopes = (
+        orientations_of(state_at(zero, scale, values, s), values, s),
+        orientation_derivatives(zero, scale, values, s),
+    )
     ends = jnp.concatenate([_at(values.position, image), _at(values.points, point)])
     rotation, of_image, of_point = _at(values.rotation, image), _at(scale.eop, image), _at(scale.points, point)
     u, by_place = once(partial(_places, s.corrections), s.eop_free, rotation, ends, of_image, of_point)

@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxphoto.adjustment import Adjustment, NormalEquations, TiledStructure, TiledValues
-from jaxphoto.adjustment.model.residuals import Increments, UnknownArrays, state_at
+from jaxphoto.adjustment.model.numbers import Increments, UnknownArrays, state_at
 from jaxphoto.adjustment.model.row_functions import non_image_residuals
 from jaxphoto.adjustment.model.structure import CameraGroup, interior_of
 from jaxphoto.arrays import Numbers

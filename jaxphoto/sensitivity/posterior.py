@@ -29,8 +29,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Scalar
 
-from jaxphoto.adjustment import Adjustment, At, NormalEquations
-from jaxphoto.adjustment.model.residuals import Increments, state_at
+from jaxphoto.adjustment import Adjustment, Linearised, NormalEquations
+from jaxphoto.adjustment.model.numbers import Increments, state_at
 from jaxphoto.arrays import still
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import InputError
@@ -212,7 +212,7 @@ class _White(NamedTuple):
     @classmethod
     def at_optimum(cls, equations: NormalEquations, free: Int[Array, "free"]) -> "_White":
         """The coordinates."""
-        white = cls(equations.weighed, equations.triangle(), free, jnp.zeros((0, len(free))))
+        white = cls(equations.weighed, equations.cholesky_factor(), free, jnp.zeros((0, len(free))))
         rows = jax.vmap(white.whitened)(equations.constraints())
         return white._replace(held=jnp.linalg.qr(rows.T)[0].T)
 
@@ -237,7 +237,7 @@ class _White(NamedTuple):
         reduced = self.equations.factored.reduced
         if len(d):
             right = right - reduced.g @ jnp.linalg.solve(reduced.k, d)
-        half = self.triangle.T @ self.equations.solve_images(right)
+        half = self.triangle.T @ self.equations.solve_reduced_matrix(right)
         points = jnp.stack(whiten(row.points, reduced.l))
         return self.without_open(jnp.concatenate([half, points.reshape(-1)])[self.free])
 
@@ -260,7 +260,7 @@ def _flat(x: Increments, xp) -> Array:
     return xp.concatenate([x.eop.T.reshape(-1), x.shared, x.points.reshape(-1)])
 
 
-def _numbers(x: Increments, there: At) -> Float[Array, "numbers"]:
+def _numbers(x: Increments, there: Linearised) -> Float[Array, "numbers"]:
     """All unknowns in their own units: X, Y, Z, omega, phi, kappa of the images, the shared ones, the points."""
     _, scale, values, s = there
     angles = jax.vmap(omega_phi_kappa_from_matrix, in_axes=2)

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxphoto.adjustment import Adjustment, NormalEquations, TiledStructure, TiledValues
-from jaxphoto.adjustment.model.residuals import UnknownArrays, state_at
-from jaxphoto.adjustment.model.values import unknowns_of, values_of, with_datum
+from jaxphoto.adjustment.model.block_values import unknowns_of, values_of, with_datum
+from jaxphoto.adjustment.model.numbers import UnknownArrays, state_at
 from jaxphoto.arrays import still
 from jaxphoto.block import Block
 from jaxphoto.compiling import run_compiled

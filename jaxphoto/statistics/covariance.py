@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxphoto.adjustment import Adjustment, Cofactors, NormalEquations, RowCofactors
-from jaxphoto.adjustment.model.residuals import Increments
+from jaxphoto.adjustment.model.numbers import Increments
 from jaxphoto.arrays import Numbers, gathered, still
 from jaxphoto.compiling import prepare, run_compiled
 from jaxphoto.rotation import omega_phi_kappa_from_matrix, small_rotation

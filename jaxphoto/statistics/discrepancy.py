@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxphoto.adjustment import Adjustment
-from jaxphoto.adjustment.model.residuals import IMAGE_POINTS
+from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
 from jaxphoto.adjustment.model.row_functions import rows_of
 from jaxphoto.observations import AXES, AbstractObservations, ControlRows
 from jaxphoto.rotation import omega_phi_kappa_from_matrix

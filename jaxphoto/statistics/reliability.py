@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxphoto.adjustment import Adjustment, NormalEquations
-from jaxphoto.adjustment.model.residuals import Residuals
+from jaxphoto.adjustment.model.numbers import Residuals
 from jaxphoto.arrays import Numbers, still
 from jaxphoto.compiling import prepare, run_compiled
 from jaxphoto.observations import Correlated

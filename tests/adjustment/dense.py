@@ -9,17 +9,17 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from jaxphoto.adjustment import At
+from jaxphoto.adjustment import Linearised
 from jaxphoto.adjustment.datum import close_datum
 from jaxphoto.adjustment.layout.padding import pad_structure
 from jaxphoto.adjustment.layout.tiled import TiledResiduals
-from jaxphoto.adjustment.model.residuals import Increments
+from jaxphoto.adjustment.model.block_values import values_of, with_datum
+from jaxphoto.adjustment.model.numbers import Increments, zero_increments
 from jaxphoto.adjustment.model.structure import structure_of
-from jaxphoto.adjustment.model.values import values_of, with_datum
 from jaxphoto.adjustment.solver.band import factor_band
 from jaxphoto.adjustment.solver.elimination import gradient, solve_factored
 from jaxphoto.adjustment.solver.non_image_rows import NonImageRows, non_image_rows
-from jaxphoto.adjustment.solver.optimum import typical_scale, weigh_datum, zero_increments
+from jaxphoto.adjustment.solver.optimum import typical_scale, weigh_datum
 from jaxphoto.adjustment.solver.reduced import reduce_normal, tile_numbers, tile_parts
 from jaxphoto.adjustment.solver.tile_rows import TileJacobian
 from tests.blocks import adjusted
@@ -136,7 +136,7 @@ def own_order(values, tiled):
     index = back(jnp.arange(len(flat), dtype=float))
     own = (index.eop[:, places.image], index.shared, index.points[:, places.point])
     unknowns = np.concatenate([np.ravel(v) for v in own]).astype(int)
-    like = jax.eval_shape(lambda v: At(zero, zero, v, padded).residuals(), values)
+    like = jax.eval_shape(lambda v: Linearised(zero, zero, v, padded).residuals(), values)
     leaves = (like.image, *like.others, like.datum)
     flat, back = ravel_pytree([np.zeros(v.shape) for v in leaves])
     image, *others, datum = back(jnp.arange(len(flat), dtype=float))
@@ -149,7 +149,7 @@ def _dense(values, structure) -> Dense:
     values = weigh_datum(values, structure)
     scale = typical_scale(values, structure)
     zero = zero_increments(structure)
-    at = At(zero, scale, values, structure)
+    at = Linearised(zero, scale, values, structure)
     flat, back = ravel_pytree(zero)
     fn = jax.jit(lambda y: at._replace(increments=y).residuals())
     residuals, product = jax.linearize(fn, zero)

@@ -9,13 +9,13 @@ import scipy.optimize
 from jax.flatten_util import ravel_pytree
 
 from jaxphoto import adjust, covariance
-from jaxphoto.adjustment import At
+from jaxphoto.adjustment import Linearised
 from jaxphoto.adjustment.layout.tile_layout import sizes_of
-from jaxphoto.adjustment.model.residuals import state_at
+from jaxphoto.adjustment.model.numbers import state_at, zero_increments
 from jaxphoto.adjustment.model.structure import structure_of
 from jaxphoto.adjustment.solver.band import factor_band
 from jaxphoto.adjustment.solver.elimination import gradient, solve_factored, solve_reduced
-from jaxphoto.adjustment.solver.optimum import typical_scale, unit_scale, weigh_datum, zero_increments
+from jaxphoto.adjustment.solver.optimum import typical_scale, unit_scale, weigh_datum
 from jaxphoto.adjustment.solver.reduced import reduce_normal
 from jaxphoto.statistics import redundancy_numbers
 from tests.adjustment.dense import DAMPINGS, assemble, at_optimum, in_one_list, prepared, split
@@ -76,7 +76,7 @@ def test_many_tiles_solve_the_normal_equations(name, damping):
     block = simulated(name).block
     sizes = sizes_of(structure_of(block, block.priors))._replace(tiles=50, tile_images=24, tile_points=16)
     values, s, _ = prepared(block, sizes=sizes)
-    assert not s.tiles.few and s.tiles.groups.max() < s.tiles.image.shape[1] // s.tiles.at_once
+    assert not s.tiles.few and s.tiles.batches.max() < s.tiles.image.shape[1] // s.tiles.at_once
     # An array, so that one program serves all of them.
     b, *others = _solved(weigh_datum(values, s), s, np.asarray(damping))
     for found in others:
@@ -88,7 +88,7 @@ def test_many_tiles_solve_the_normal_equations(name, damping):
 def _solved(values, s, damping):
     """J'r by sums and by a gradient, and (N + damping W) x for the x that solves it, by F and row by row."""
     scale = typical_scale(values, s)
-    at = At(zero_increments(s), scale, values, s)
+    at = Linearised(zero_increments(s), scale, values, s)
     a, reduced, right = reduce_normal(at, damping)
     factor = factor_band(a)
     _, push = jax.linearize(lambda y: at._replace(increments=y).residuals(), at.increments)
@@ -200,7 +200,7 @@ def test_scipy_finds_the_same_optimum(name):
         return values, typical_scale(values, s)
 
     values, scale = jax.jit(setup)(values)
-    of = lambda x: in_one_list(At(back(x), scale, values, s).residuals())  # noqa: E731
+    of = lambda x: in_one_list(Linearised(back(x), scale, values, s).residuals())  # noqa: E731
     fn = jax.jit(of)
     jac = jax.jit(jax.jacfwd(of))
     free = np.asarray(ravel_pytree(scale)[0]) > 0

@@ -8,8 +8,8 @@ import pytest
 from jaxphoto.adjustment import LEAST
 from jaxphoto.adjustment.layout.padding import pad_structure
 from jaxphoto.adjustment.layout.tile_layout import sizes_of
+from jaxphoto.adjustment.model.block_values import values_of
 from jaxphoto.adjustment.model.structure import structure_of
-from jaxphoto.adjustment.model.values import values_of
 from jaxphoto.sensitivity import response, sensitivity
 from tests.blocks import FIELDS, adjusted, simulated
 

@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 
 from jaxphoto import adjust
-from jaxphoto.adjustment import At
-from jaxphoto.adjustment.solver.optimum import unit_scale, zero_increments
-from jaxphoto.adjustment.solver.similarity import onto_datum, open_motions
+from jaxphoto.adjustment import Linearised
+from jaxphoto.adjustment.model.numbers import zero_increments
+from jaxphoto.adjustment.solver.optimum import unit_scale
+from jaxphoto.adjustment.solver.similarity import n_open_motions, onto_datum
 from jaxphoto.observations import Distances
 from jaxphoto.rotation import small_rotation
 from tests.adjustment.dense import prepared
@@ -20,12 +21,12 @@ BAR = Distances(np.array([[3, 37]]), np.zeros(1), np.array([0.01]))
 @pytest.mark.parametrize(("distances", "motions"), [(None, 7), (BAR, 6)])
 def test_a_similarity_meets_the_constraints_and_changes_nothing_else(kind, distances, motions):
     values, s, _ = prepared(free_network(kind, distances))
-    assert open_motions(values, s) == motions
+    assert n_open_motions(values, s) == motions
     rng = np.random.default_rng(3)
     eop, shared, points = zero_increments(s)
     draw = lambda v, size: jnp.asarray(rng.normal(0, size, v.shape))  # noqa: E731
     y = eop.at[:3].set(draw(eop[:3], 80.0)).at[3:].set(draw(eop[3:], 0.2)), shared, draw(points, 40.0)
-    at = At(type(zero_increments(s))(*y), unit_scale(s), values, s)
+    at = Linearised(type(zero_increments(s))(*y), unit_scale(s), values, s)
     before, after = (a.residuals() for a in (at, at._replace(increments=onto_datum(at))))
     assert np.abs(before.datum).min() > 1.0
     np.testing.assert_allclose(after.datum, 0.0, atol=1e-8)
@@ -39,7 +40,7 @@ def test_a_network_turned_and_stretched_far_is_brought_back():
     values, s, _ = prepared(free_network("inner"))
     turn = np.asarray(small_rotation(np.array([1.0, -1.5, 0.8])))
     points = 3.0 * turn @ np.asarray(values.points) + 5000.0
-    at = At(zero_increments(s)._replace(points=jnp.asarray(points - values.points)), unit_scale(s), values, s)
+    at = Linearised(zero_increments(s)._replace(points=jnp.asarray(points - values.points)), unit_scale(s), values, s)
     found = onto_datum(at)
     np.testing.assert_allclose(found.points, 0.0, atol=1e-6)
 
@@ -47,7 +48,7 @@ def test_a_network_turned_and_stretched_far_is_brought_back():
 @pytest.mark.parametrize("name", ["inner_shift", "everything"])
 def test_motions_that_depend_on_the_place_are_left_to_the_solver(name):
     values, s, _ = prepared(simulated(name).block)
-    assert open_motions(values, s) == 0
+    assert n_open_motions(values, s) == 0
 
 
 def shape_of(adjusted):

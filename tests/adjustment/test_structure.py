@@ -36,7 +36,9 @@ def test_unknowns_of_one_image_never_share_a_colour(name):
 
 def test_what_rows_touch_says_how_they_are_eliminated():
     """Nobody declares it: one point, images and what they share, or several points."""
-    layouts = {g.name: g.layout for name in ("everything", "surfaces") for g in structure_of_variant(name).observed}
+    layouts = {
+        g.name: g.elimination for name in ("everything", "surfaces") for g in structure_of_variant(name).observed
+    }
     assert layouts == {
         "stations": "reduced",
         "attitudes": "reduced",

@@ -10,7 +10,7 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 from jaxphoto import FIXED, Weighted, adjust, covariance
-from jaxphoto.adjustment import At
+from jaxphoto.adjustment import Linearised
 from jaxphoto.adjustment.model.parameter_tables import shared_vector
 from jaxphoto.errors import InputError
 from jaxphoto.sensitivity.exact import sensitivity
@@ -206,7 +206,7 @@ def test_first_order_matrix_is_the_dense_one() -> None:
     a = nominal("inner")
     s, scale, values = a.equations.structure, a.equations.scale, a.equations.weighed.values
     flat, back = ravel_pytree(jax.tree.map(np.zeros_like, scale))
-    at = lambda y: in_one_list(At(back(y), scale, values, s).residuals())  # noqa: E731
+    at = lambda y: in_one_list(Linearised(back(y), scale, values, s).residuals())  # noqa: E731
     unknowns, rows = own_order(values, a.tiled)
     j = np.asarray(jax.jit(jax.jacfwd(at))(flat))[np.ix_(rows, unknowns)]
     coupled = j[couples(a)]

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from jaxphoto import adjust
-from jaxphoto.adjustment import At
-from jaxphoto.adjustment.model.residuals import Increments
+from jaxphoto.adjustment import Linearised
+from jaxphoto.adjustment.model.numbers import Increments
 from jaxphoto.georeferencing import Corrections
 from jaxphoto.sensitivity import image_rows as listed
 from jaxphoto.sensitivity.hessian import image_columns
@@ -50,7 +50,7 @@ def dense_products():
         shared = zero.shared.at[columns].add(y[9:], mode="drop")
         moved = Increments(zero.eop.at[:, image].set(y[:6]), shared, zero.points.at[:, point].set(y[6:9]))
         v = eqx.tree_at(lambda v: v.xy, values, jnp.asarray(values.xy).at[chunk, tile, :, m, p].set(xy))
-        r = At(moved, scale, v, s).residuals().image[chunk, tile, :, m, p]
+        r = Linearised(moved, scale, v, s).residuals().image[chunk, tile, :, m, p]
         return jnp.sum(0.5 * r * r - (1 - curved) * jax.lax.stop_gradient(r) * r)
 
     at = jnp.zeros(9 + len(columns)), jnp.asarray(values.xy)[chunk, tile, :, m, p]

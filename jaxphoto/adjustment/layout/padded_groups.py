@@ -15,8 +15,8 @@ from jaxtyping import Int
 from jaxphoto.adjustment.layout.tile_layout import Places
 from jaxphoto.adjustment.layout.tiled import TiledStructure
 from jaxphoto.adjustment.layout.tiling import size_class
+from jaxphoto.adjustment.model.numbers import Values
 from jaxphoto.adjustment.model.observed_groups import ObservedGroup, RowsAtPoints, RowsInList
-from jaxphoto.adjustment.model.residuals import Values
 from jaxphoto.adjustment.model.row_functions import rows_of
 from jaxphoto.adjustment.model.structure import Structure
 from jaxphoto.arrays import still
@@ -32,7 +32,7 @@ def pad_groups(
 def _pad_group(
     g: ObservedGroup, places: Places, n_images: int, n_points: int, width: int, wanted: int
 ) -> ObservedGroup:
-    if g.layout == "point":
+    if g.elimination == "point":
         index = _by_point(g, places, n_points, max(g.depth, wanted))
         return dataclasses.replace(
             g,
@@ -45,7 +45,7 @@ def _pad_group(
         )
     image = places.image[g.image].astype(np.int32)
     padded = dataclasses.replace(g, image=image, point=places.point[g.point], pair=_pairs(image, width))
-    if g.layout == "coupled":
+    if g.elimination == "coupled":
         return padded
     # Such lists have no classes of their own: as long as they often are in a block of so many images.
     more = size_class(max(g.n_rows, wanted), (3 if g.scalar else 1) * n_images) - g.n_rows

@@ -3,7 +3,7 @@
 Before it is computed with, a block is laid out in tiles (`tiling`) and padded with images and points that nothing
 depends on: rows of infinite standard deviation, unknowns that are held fixed. Images and tiles have coarse classes; all
 other lists have sizes that follow from these two, so that they seldom tell blocks apart. The results are cropped again
-and put back in the block's own order. Names stay outside: the padded structure has none.
+and put back in the block's own order. Ids stay outside: no program depends on them.
 """
 
 import dataclasses
@@ -16,8 +16,8 @@ from jaxphoto.adjustment.layout.padded_groups import crop_rows, pad_groups, pad_
 from jaxphoto.adjustment.layout.tile_layout import LEAST, Places, Sizes, TileLayout
 from jaxphoto.adjustment.layout.tiled import TiledResiduals, TiledStructure, TiledValues, Tiles
 from jaxphoto.adjustment.layout.tiling import size_class
+from jaxphoto.adjustment.model.numbers import Residuals, UnknownArrays, Values
 from jaxphoto.adjustment.model.observed_groups import ObservedGroup
-from jaxphoto.adjustment.model.residuals import Residuals, UnknownArrays, Values
 from jaxphoto.adjustment.model.structure import CameraGroup, Structure
 from jaxphoto.arrays import still
 
@@ -93,12 +93,13 @@ def pad_structure(structure: Structure, sizes: Sizes = LEAST, *, shards: int = 1
     _, first = np.unique(layout.point_of, return_index=True)
     places = Places(layout.image_place, layout.tiling.place[first].astype(np.int32), layout.tiling.slot, point_at)
     at = places.image
-    same = {
-        name: getattr(s, name)
-        for name in ("corrections", "n_interior", "n_border", "n_image_colours", "free", "colour")
-    }
     padded = TiledStructure(
-        **{name: getattr(s, name) for name in same},
+        corrections=s.corrections,
+        n_interior=s.n_interior,
+        n_border=s.n_border,
+        n_image_colours=s.n_image_colours,
+        free=s.free,
+        colour=s.colour,
         groups=tuple(_pad_group(g, at, n_images) for g in s.groups),
         n_images=n_images,
         n_points=n_points,
@@ -114,7 +115,7 @@ def pad_structure(structure: Structure, sizes: Sizes = LEAST, *, shards: int = 1
             image=tile_image.reshape(n_chunks, layout.chunk, m),
             per_tile=p,
             free_points=layout.free_points,
-            groups=-(-np.clip(len(own) - layout.chunk * np.arange(n_chunks), 0, layout.chunk) // layout.at_once),
+            batches=-(-np.clip(len(own) - layout.chunk * np.arange(n_chunks), 0, layout.chunk) // layout.at_once),
             at_once=layout.at_once,
             pair_tile=listed[..., 0],
             pair_images=listed[..., 1:],

@@ -25,7 +25,7 @@ def along_points(ndim: int) -> Any:
     return P(*[None] * (ndim - 1), AXIS)
 
 
-_OF_TILES = {"xy", "sigma_xy", "pair_tile", "pair_images", "pair_block", "block", "groups", "f"}
+_OF_TILES = {"xy", "sigma_xy", "pair_tile", "pair_images", "pair_block", "block", "batches", "f"}
 _OF_POINTS = {"points", "datum_points", "point_free", "l"}
 
 

@@ -114,7 +114,7 @@ class TileLayout(NamedTuple):
         chunk = size_class(-(-per_shard // chunks), TILE_STEP)
         lists = _pair_lists(_images_of_free_points(tiling, own, p), chunk, width)
         blocks = max(map(len, lists[2]), default=0)
-        rows = tuple((g.name, g.depth if g.layout == "point" else g.n_rows) for g in s.observed)
+        rows = tuple((g.name, g.depth if g.elimination == "point" else g.n_rows) for g in s.observed)
         sizes = Sizes(images, bandwidth, tiles, m, p, blocks + 1, rows)
         return cls(
             place, tiling, point_of, bool(free.any()), columns, width, shards * chunks, chunk, at_once, lists, sizes
@@ -153,7 +153,7 @@ def _meetings(s: Structure, own: Bool[np.ndarray, "rows"]) -> tuple[np.ndarray, 
     """Which images meet in which free points (`own` rows); those that an observation joins, in a point of their own."""
     image, point, n = [s.image[own]], [s.point[own]], s.n_points
     for g in s.observed:
-        if g.layout == "reduced" and len(g.image) > 1:
+        if g.elimination == "reduced" and len(g.image) > 1:
             image.append(g.image.T.ravel())
             point.append(n + np.repeat(np.arange(g.n_rows), len(g.image)))
             n += g.n_rows

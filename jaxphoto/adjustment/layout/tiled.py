@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxphoto.adjustment.model.residuals import AbstractValues, NonImageResiduals
+from jaxphoto.adjustment.model.numbers import AbstractValues, NonImageResiduals
 from jaxphoto.adjustment.model.structure import AbstractStructure
 from jaxphoto.arrays import Numbers
 
@@ -28,8 +28,8 @@ class Tiles(eqx.Module):
     """Points of a tile, P."""
     free_points: bool = eqx.field(static=True)
     """Whether any point has a free coordinate; else nothing is eliminated, and F has no columns."""
-    groups: Int[np.ndarray, "chunks"]
-    """How many groups of `at_once` tiles hold the points of each chunk: the first ones; the others are padding."""
+    batches: Int[np.ndarray, "chunks"]
+    """How many batches of `at_once` tiles hold the points of each chunk: the first ones; the others are padding."""
     at_once: int = eqx.field(static=True)
     """Tiles that are computed with at a time: few enough for the cache of a core, enough to be worth its while."""
     pair_tile: Int[np.ndarray, "chunks pairs"]
@@ -55,11 +55,11 @@ class Tiles(eqx.Module):
         """Columns of F: coordinates of a tile that are eliminated."""
         return 3 * self.per_tile if self.free_points else 0
 
-    def each_of_chunk(self, function: Callable, numbers: Any, groups: Array) -> Any:
+    def each_of_chunk(self, function: Callable, numbers: Any, batches: Array) -> Any:
         """`function` of the numbers of every tile of a chunk, a few tiles at a time: what that needs stays in the cache
         of a core.
 
-        Where there are several groups of `at_once` tiles, those after the first `groups` are padding; their results
+        Where there are several batches of `at_once` tiles, those after the first `batches` are padding; their results
         are zero.
         """
         # jit keeps the trace that the shape takes.
@@ -74,7 +74,7 @@ class Tiles(eqx.Module):
         def add(k, results):
             return jax.tree.map(lambda v, new: jax.lax.dynamic_update_index_in_dim(v, new, k, 0), results, group(k))
 
-        results = jax.lax.fori_loop(0, groups, add, zero)
+        results = jax.lax.fori_loop(0, batches, add, zero)
         return jax.tree.map(lambda v: v.reshape(count * n, *v.shape[2:]), results)
 
 
@@ -101,7 +101,7 @@ class TiledStructure(AbstractStructure):
 
     def each_tile(self, function: Callable, numbers: tuple) -> Any:
         """`function` of (images, *numbers) of every tile, chunks and tiles first."""
-        given = ((self.tiles.image, *numbers), self.tiles.groups)
+        given = ((self.tiles.image, *numbers), self.tiles.batches)
         return jax.lax.map(lambda chunk: self.tiles.each_of_chunk(function, *chunk), given)
 
     @property

@@ -4,7 +4,7 @@ What the rows of a group touch decides how they are eliminated; nobody declares 
 
     reduced     no point: rows add to the reduced normal matrix, where images and shared unknowns meet
     point       one point, and otherwise unknowns that are the same for all rows: they add to the point's own block
-                (`Tiles`), before it is eliminated
+                before it is eliminated
     coupled     all else, such as two points, or a point and an image: few rows, that extra unknowns carry
                 (`solver.normal`)
 """
@@ -33,7 +33,7 @@ from jaxphoto.observations import (
 )
 from jaxphoto.unknowns import Unknowns, Weighted, check_prior
 
-RowLayout = Literal["reduced", "point", "coupled"]
+RowElimination = Literal["reduced", "point", "coupled"]
 
 
 class Argument(NamedTuple):
@@ -61,7 +61,7 @@ class ObservedGroup(eqx.Module):
     """A group of observations: index arrays of its rows and of what they touch, rows last."""
 
     name: str = eqx.field(static=True)
-    layout: RowLayout = eqx.field(static=True)
+    elimination: RowElimination = eqx.field(static=True)
     scalar: bool = eqx.field(static=True)
     """Whether a row is one number; its residuals then have no axis for it in the results."""
     components: int = eqx.field(static=True)
@@ -215,10 +215,12 @@ def group_of(
     place = np.flatnonzero((column < n_shared).any(axis=1))
     column = column[place].astype(np.int32)
     alike = n > 0 and (parameter == parameter[:, :1]).all()
-    layout: RowLayout = "reduced" if not points else "point" if len(points) == 1 and not images and alike else "coupled"
+    elimination: RowElimination = (
+        "reduced" if not points else "point" if len(points) == 1 and not images and alike else "coupled"
+    )
     return ObservedGroup(
         name=name,
-        layout=layout,
+        elimination=elimination,
         scalar=len(rows.axes) == 1,
         components=len(rows.axes),
         arguments=tuple(arguments),

@@ -14,8 +14,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jaxphoto.adjustment.model.numbers import AbstractValues, Increments, NonImageResiduals, datum_residuals
 from jaxphoto.adjustment.model.observed_groups import ObservedGroup, RowsAtPoints, image_tables
-from jaxphoto.adjustment.model.residuals import AbstractValues, Increments, NonImageResiduals, datum_residuals
 from jaxphoto.adjustment.model.structure import AbstractStructure, interior_of
 from jaxphoto.georeferencing import Exposure
 from jaxphoto.observations import AbstractObservations, ImageState
@@ -84,7 +84,7 @@ def gathered_rows(
     # An image's exterior orientation may be held fixed, which a scale of zero says.
     z = Touched(of_images(y.eop), of_shared(y.shared, group.column), of_points(y.points))
     steps = Touched(of_images(scale.eop), of_shared(scale.shared, group.column), of_points(scale.points))
-    exposure = tuple(of_images(a) for a in (v.time, v.velocity, v.rate, v.nominal, v.flight_time))
+    exposure = tuple(map(of_images, v.exposures))
     parameters = of_shared(v.shared, group.parameter)
     row = rows_of(group, numbers)
     return z, RowInputs(
@@ -122,7 +122,7 @@ def row_function(group: ObservedGroup, s: AbstractStructure) -> Callable[[Touche
             exposure = Exposure(*(a[k] for a in given.exposure))
             return ImageState(position[k], turn @ given.rotation[k], exposure, own, camera)
 
-        # Images take their parameters first, in the order in which `groups.group_of` lists them.
+        # Images take their parameters first, in the order in which `observed_groups.group_of` lists them.
         states = [state(k) for k in range(len(group.image))]
         for what, shape in group.arguments:
             count = math.prod(shape)

@@ -5,8 +5,8 @@
     colours     each image touches few shared unknowns; unknowns of different cameras, mounts or strips carry the
                 same colour, so one seed differentiates all of them at once
     groups      all observations but image rows, see `observed_groups`
-    tiles       points with the images that see them: a `layout.TiledStructure` is what is computed with, its images
-                and points in the order of the tiles
+    tiles       points with the images that see them: a `layout.tiled.TiledStructure` is what is computed with, its
+                images and points in the order of the tiles
 
 All arrays are arguments of the compiled functions, never constants in them: a new block of the same shapes
 compiles nothing.
@@ -94,7 +94,7 @@ class AbstractStructure(eqx.Module):
     @property
     def coupled(self) -> tuple[ObservedGroup, ...]:
         """The groups whose rows couple points."""
-        return tuple(g for g in self.observed if g.layout == "coupled")
+        return tuple(g for g in self.observed if g.elimination == "coupled")
 
     @property
     def with_shared(self) -> tuple[ObservedGroup, ...]:
@@ -184,7 +184,7 @@ def structure_of(block: Block, priors: Unknowns, observed: ObservedRows | None =
     n_interior = int((free < _n_parameters(given.cameras) + bent).sum())
     cameras = _places_of_cameras(given.cameras)
     groups = tuple(group_of(name, rows, tables, cameras, unknown_of, len(free)) for name, rows in given.named)
-    met = [int(g.column.max(initial=-1)) + 1 for g in groups if g.layout == "point"]
+    met = [int(g.column.max(initial=-1)) + 1 for g in groups if g.elimination == "point"]
 
     point_free = np.ones((3, len(block.points))) * (priors.points is not FIXED)
     point_free[block.fixed.axis, block.fixed.who] = 0.0
@@ -229,10 +229,10 @@ def _check_coupled(block: Block, groups: tuple[ObservedGroup, ...], point: np.nd
     own = (point_free == 0).all(axis=0)
     own[point] = True
     for g in groups:
-        if g.layout == "point":
+        if g.elimination == "point":
             own[g.point] = True
     for g in groups:
-        if g.layout == "coupled" and not own[g.point].all():
+        if g.elimination == "coupled" and not own[g.point].all():
             name = block.points[int(g.point[~own[g.point]][0])]
             raise BlockError(
                 f"point {name} is met by {g.name} alone: measure it in an image, or give it control, or leave it out"

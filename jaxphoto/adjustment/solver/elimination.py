@@ -16,14 +16,14 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxphoto.adjustment.layout.tiled import TiledStructure
+from jaxphoto.adjustment.model.image_orientations import ImageOrientations, by_image, of_images, orientations_of
+from jaxphoto.adjustment.model.numbers import Increments, NonImageResiduals, state_at
 from jaxphoto.adjustment.model.observed_groups import RowsAtPoints
-from jaxphoto.adjustment.model.residuals import Increments, NonImageResiduals, state_at
 from jaxphoto.adjustment.model.row_functions import non_image_residuals
-from jaxphoto.adjustment.model.scene import Scene, by_image, of_images, scene_of
 from jaxphoto.adjustment.model.structure import total
 from jaxphoto.adjustment.solver.band import BandFactor, solve_band
 from jaxphoto.adjustment.solver.non_image_rows import non_image_rows
-from jaxphoto.adjustment.solver.normal import At, Reduced, other_squares, squares
+from jaxphoto.adjustment.solver.normal import Linearised, Reduced, other_squares, squares
 from jaxphoto.adjustment.solver.reduced import tile_numbers, tile_parts
 from jaxphoto.adjustment.solver.tile_rows import seen_in, tile_residuals
 from jaxphoto.small_matrices import unwhiten, whiten
@@ -35,11 +35,9 @@ class FactoredNormal(eqx.Module):
     reduced: Reduced
     factor: BandFactor
     scale: Increments
-    n_constraints: int = eqx.field(static=True)
-    """Constraints of the datum: the last of the rows of D."""
 
 
-def over_tiles(function: Callable, at: At, reduced: Reduced, numbers: tuple) -> Any:
+def over_tiles(function: Callable, at: Linearised, reduced: Reduced, numbers: tuple) -> Any:
     """`function(F, images, *numbers)` of every tile, for the F of `reduced`, linearised `at`."""
     if reduced.f is None:
         rest = non_image_rows(at)
@@ -55,12 +53,12 @@ def over_tiles(function: Callable, at: At, reduced: Reduced, numbers: tuple) -> 
     return at.structure.each_tile(tile, (given, *numbers))
 
 
-def solve_factored(reduced: Reduced, factor: BandFactor, b: Increments, at: At) -> Increments:
+def solve_factored(reduced: Reduced, factor: BandFactor, b: Increments, at: Linearised) -> Increments:
     """x of (N + damping diag(N)) x = b, one of many: down to the reduced unknowns, and back to the points."""
     return solve_reduced(reduced, factor, *reduce_right(reduced, b, at, many=True), b.points, at, many=True)
 
 
-def reduce_right(reduced: Reduced, b: Increments, at: At, many: bool = False) -> tuple[Array, Array]:
+def reduce_right(reduced: Reduced, b: Increments, at: Linearised, many: bool = False) -> tuple[Array, Array]:
     """A right-hand side, or one of `many` under `jax.vmap`, taken down to the reduced unknowns and to mu."""
     s, i = at.structure, at.structure.n_border
     if not s.tiles.free_points:
@@ -77,7 +75,9 @@ def reduce_right(reduced: Reduced, b: Increments, at: At, many: bool = False) ->
     return jnp.concatenate([(b.eop.T - of_images).reshape(-1), b.shared.at[:i].add(-border[:i])]), border[i:-1]
 
 
-def solve_reduced(reduced: Reduced, factor: BandFactor, right, d, b_points, at: At, many: bool = False) -> Increments:
+def solve_reduced(
+    reduced: Reduced, factor: BandFactor, right, d, b_points, at: Linearised, many: bool = False
+) -> Increments:
     """x of a right-hand side taken down already: `right` to the reduced unknowns, `d` to mu."""
     r, s, n = reduced, at.structure, at.structure.n_images
     if len(d):
@@ -99,7 +99,7 @@ def solve_reduced(reduced: Reduced, factor: BandFactor, right, d, b_points, at: 
     return Increments(eop.T, shared, jnp.stack(unwhiten(z, r.l)))
 
 
-def _down_by_rows(step: Array, at: At) -> tuple[Array, Array, Array]:
+def _down_by_rows(step: Array, at: Linearised) -> tuple[Array, Array, Array]:
     """What increments of the points add to the right-hand sides of images, shared unknowns and mu."""
     _, scale, values, s = at
     rest = non_image_rows(at)
@@ -119,7 +119,7 @@ def _down_by_rows(step: Array, at: At) -> tuple[Array, Array, Array]:
     return eop, shared, total(jnp.einsum("kcp,cp->k", rest.rows_p, step), s)
 
 
-def _up_by_rows(eop: Array, shared: Array, mu: Array, at: At) -> Array:
+def _up_by_rows(eop: Array, shared: Array, mu: Array, at: Linearised) -> Array:
     """What increments of images and shared unknowns, and mu, add to the right-hand sides of the points."""
     increments, scale, values, s = at
     rest = non_image_rows(at)
@@ -138,7 +138,7 @@ def _up_by_rows(eop: Array, shared: Array, mu: Array, at: At) -> Array:
     return result
 
 
-def gradient(at: At, reduced: Reduced, there: At):
+def gradient(at: Linearised, reduced: Reduced, there: Linearised):
     """b = J'r over all rows, its part for the reduced unknowns and for mu, and the square sum of the residuals.
 
     What takes it down is `reduced`, linearised `there`.
@@ -162,7 +162,7 @@ def gradient(at: At, reduced: Reduced, there: At):
     return b, *reduce_right(reduced, b, there), total(jnp.sum(square), s) + other_squares(others, s)
 
 
-def _others_and_gradient(at: At) -> tuple[NonImageResiduals, Increments]:
+def _others_and_gradient(at: Linearised) -> tuple[NonImageResiduals, Increments]:
     """All but the image rows, and their part of b."""
     increments, scale, values, s = at
     others, pull = jax.vjp(lambda y: non_image_residuals(y, scale, values, s), increments)
@@ -184,17 +184,17 @@ def _others_and_gradient(at: At) -> tuple[NonImageResiduals, Increments]:
     return others, b._replace(eop=b.eop + eop, points=b.points + points)
 
 
-def _scene_and_pull(at: At):
+def _scene_and_pull(at: Linearised):
     """The scene, and what takes its cotangents to increments of images and shared unknowns."""
     return jax.vjp(partial(_scene_at, at), at.increments.eop, at.increments.shared)
 
 
-def _scene_at(at: At, eop: Array, shared: Array) -> Scene:
+def _scene_at(at: Linearised, eop: Array, shared: Array) -> ImageOrientations:
     increments, scale, values, s = at
-    return scene_of(state_at(increments._replace(eop=eop, shared=shared), scale, values, s), values, s)
+    return orientations_of(state_at(increments._replace(eop=eop, shared=shared), scale, values, s), values, s)
 
 
-def _by_image(parts: Scene, scene: Scene, s: TiledStructure) -> Scene:
+def _by_image(parts: ImageOrientations, scene: ImageOrientations, s: TiledStructure) -> ImageOrientations:
     """Cotangents of tiles, added by image (and over all tiles, for the only camera of a group)."""
     image, n = s.tiles.image.reshape(-1), scene.centre.shape[0]
 
@@ -203,4 +203,4 @@ def _by_image(parts: Scene, scene: Scene, s: TiledStructure) -> Scene:
 
     by_group = zip(s.groups, parts.cameras, strict=True)
     cameras = tuple(jnp.sum(v, axis=(0, 1)) if not by_image(g, s) else of_image(v) for g, v in by_group)
-    return Scene(of_image(parts.centre), of_image(parts.rotation), cameras)
+    return ImageOrientations(of_image(parts.centre), of_image(parts.rotation), cameras)

@@ -1,7 +1,7 @@
 """The inverse of the normal matrix as far as anybody asks for it: cofactors of unknowns and of rows.
 
 With S~ = [S g; g' -K] the reduced matrix bordered by the few rows that couple points (see `normal`), V = L L' and
-F = [W; Ws; D] L^-T what a point p meets, whitened,
+F = [W; Ws'; D_p] L^-T what a point p meets, whitened,
 
     Q~    = S~^-1                                   exterior and interior orientation, scanner, mounts, strips
     Q_pp  = L^-T (I + F' Q~ F) L^-1                 3 x 3 a point
@@ -20,15 +20,15 @@ from jaxtyping import Array, Bool, Float
 
 from jaxphoto.adjustment.layout.sharding import TILES, along_points, sharded
 from jaxphoto.adjustment.layout.tiled import TiledStructure
+from jaxphoto.adjustment.model.numbers import Increments
 from jaxphoto.adjustment.model.observed_groups import ObservedGroup, RowsAtPoints
-from jaxphoto.adjustment.model.residuals import Increments
 from jaxphoto.adjustment.model.row_functions import RowJacobian, reduced_places
 from jaxphoto.adjustment.solver.band import invert_band
 from jaxphoto.adjustment.solver.elimination import FactoredNormal, over_tiles, solve_factored
 from jaxphoto.adjustment.solver.non_image_rows import NonImageRows, non_image_rows
-from jaxphoto.adjustment.solver.normal import At, Reduced, dot
+from jaxphoto.adjustment.solver.normal import Linearised, Reduced, dot
 from jaxphoto.adjustment.solver.reduced import tile_columns
-from jaxphoto.adjustment.solver.similarity import along_motions, open_motions
+from jaxphoto.adjustment.solver.similarity import along_motions, n_open_motions
 from jaxphoto.arrays import Numbers
 from jaxphoto.small_matrices import unwhiten, whiten
 
@@ -49,7 +49,9 @@ class RowCofactors(NamedTuple):
     """Of the groups of `AbstractStructure.with_shared`."""
 
 
-def cofactors_of(at: At, factored: FactoredNormal, of_rows: Bool[Numbers, ""]) -> tuple[Cofactors, RowCofactors]:
+def cofactors_of(
+    at: Linearised, factored: FactoredNormal, of_rows: Bool[Numbers, ""]
+) -> tuple[Cofactors, RowCofactors]:
     """All cofactors of one factored block, and j Q j' of its rows; see the module's head."""
     s = at.structure
     reduced = factored.reduced
@@ -65,7 +67,7 @@ def cofactors_of(at: At, factored: FactoredNormal, of_rows: Bool[Numbers, ""]) -
 
 
 def _of_points(
-    full: Float[Array, "n n"], reduced: Reduced, at: At, of_rows: Bool[Numbers, ""]
+    full: Float[Array, "n n"], reduced: Reduced, at: Linearised, of_rows: Bool[Numbers, ""]
 ) -> tuple[Float[Array, "points 3 3"], RowCofactors]:
     """Cofactors of points, and j Q j' of rows."""
     _, scale, values, s = at
@@ -128,17 +130,17 @@ def _by_rows(rest: NonImageRows, s: TiledStructure) -> tuple[Float[Array, "c tou
     return tuple(jnp.concatenate([j.points[:, 0], shared(g, j)], axis=1) for g, j in chosen)
 
 
-def _without_open_motions(q: Cofactors, at: At, factored: FactoredNormal) -> Cofactors:
+def _without_open_motions(q: Cofactors, at: Linearised, factored: FactoredNormal) -> Cofactors:
     """Subtract E E': what the constraints D of the datum, taken as observations, leave along the motions they hold.
 
     E = (N + D'D)^-1 D' spans those motions exactly, because N does not see them; where all are open, they are known.
     """
-    defect = factored.n_constraints
+    defect = len(at.values.datum_eop)
     if not defect:
         return q
     _, scale, values, s = at
     rows = at.constraints()
-    if open_motions(values, s):
+    if n_open_motions(values, s):
         # The motions are known: E = M (D M)^-1.
         m = along_motions(values, scale, s.on_one_device)
         met = jnp.einsum("kci,jci->kj", rows.eop, m.eop) + jnp.einsum("kcp,jcp->kj", rows.points, m.points)
@@ -153,7 +155,7 @@ def _without_open_motions(q: Cofactors, at: At, factored: FactoredNormal) -> Cof
 
 
 def row_variances(
-    at: At, q: Cofactors, of_rows: RowCofactors, factored: FactoredNormal
+    at: Linearised, q: Cofactors, of_rows: RowCofactors, factored: FactoredNormal
 ) -> tuple[Array, tuple[Array, ...]]:
     """J Q J' of image rows, and of the numbers of each other row with one another (c, c, ...)."""
     at = at._replace(structure=at.structure.on_one_device)
@@ -164,7 +166,7 @@ def row_variances(
         if isinstance(g.rows, RowsAtPoints):
             own = jnp.einsum("carp,pab,dbrp->cdrp", j.points[:, 0], q.points, j.points[:, 0])
             found.append(next(at_points) if g.place else own)
-        elif g.layout == "reduced":
+        elif g.elimination == "reduced":
             found.append(_of_reduced(g, j, q.reduced, s))
         else:
             found.append(_of_coupled(g, j, at, factored))
@@ -180,7 +182,7 @@ def _of_reduced(g: ObservedGroup, j: RowJacobian, q: Array, s: TiledStructure) -
     return jnp.einsum("can,dan->cdn", own, seen)
 
 
-def _of_coupled(g: ObservedGroup, j: RowJacobian, at: At, factored: FactoredNormal) -> Float[Array, "c c rows"]:
+def _of_coupled(g: ObservedGroup, j: RowJacobian, at: Linearised, factored: FactoredNormal) -> Float[Array, "c c rows"]:
     """By one solve for each number: they join what never met otherwise."""
     s, zero = at.structure, at.increments
 

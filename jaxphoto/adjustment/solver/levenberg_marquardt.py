@@ -14,13 +14,13 @@ import optimistix as optx
 from jaxtyping import Array, Bool, PyTree, Scalar
 
 from jaxphoto.adjustment.layout.tiled import TiledStructure, TiledValues
-from jaxphoto.adjustment.model.residuals import Increments
-from jaxphoto.adjustment.model.values import with_datum
+from jaxphoto.adjustment.model.block_values import with_datum
+from jaxphoto.adjustment.model.numbers import Increments
 from jaxphoto.adjustment.solver.band import BandFactor, factor_band
 from jaxphoto.adjustment.solver.elimination import gradient, solve_reduced
-from jaxphoto.adjustment.solver.normal import At, Reduced, dot, norm2
+from jaxphoto.adjustment.solver.normal import Linearised, Reduced, dot, norm2
 from jaxphoto.adjustment.solver.reduced import RightSide, reduce_normal
-from jaxphoto.adjustment.solver.similarity import onto_datum, open_motions
+from jaxphoto.adjustment.solver.similarity import n_open_motions, onto_datum
 
 
 class FactoredSystem(NamedTuple):
@@ -119,11 +119,11 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Increments, Scalar, Any
         self.structure, self.values, self.scale = structure, values, scale
         self.tolerance, self.only_factor = tolerance, only_factor
 
-    def _at(self, y: Increments, loose: Bool[Array, ""]) -> At:
+    def _at(self, y: Increments, loose: Bool[Array, ""]) -> Linearised:
         v = self.values
-        if open_motions(v, self.structure):
+        if n_open_motions(v, self.structure):
             v = with_datum(v, jnp.where(loose, 0.0, v.datum_eop), jnp.where(loose, 0.0, v.datum_points))
-        return At(y, self.scale, v, self.structure)
+        return Linearised(y, self.scale, v, self.structure)
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> SolverState:
         """Almost Gauss-Newton to begin with."""
@@ -132,11 +132,11 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Increments, Scalar, Any
         no = jnp.array(False)
         return SolverState(damping, jnp.array(jnp.inf), no, empty, loose=no, tightened=no, done=no)
 
-    def _factored(self, at: At, damping) -> tuple[FactoredSystem, RightSide]:
+    def _factored(self, at: Linearised, damping) -> tuple[FactoredSystem, RightSide]:
         a, reduced, right = reduce_normal(at, damping)
         return FactoredSystem(at.increments, reduced, factor_band(a)), right
 
-    def _kept(self, at: At, system: FactoredSystem) -> tuple[FactoredSystem, RightSide]:
+    def _kept(self, at: Linearised, system: FactoredSystem) -> tuple[FactoredSystem, RightSide]:
         """The gradient there, taken down by the system that there is."""
         return system, RightSide(*gradient(at, system.reduced, at._replace(increments=system.increments)))
 
@@ -171,7 +171,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Increments, Scalar, Any
         damping = _next_damping(state, accept, reduction / promised)
         pick = lambda a, b: jax.tree.map(lambda a, b: jnp.where(accept, a, b), a, b)  # noqa: E731
         next_y, loose, tighten = pick(new_y, y), state.loose, jnp.array(False)
-        if open_motions(self.values, self.structure):
+        if n_open_motions(self.values, self.structure):
             # Held about a start that is far off, the constraints bend the path: it goes on without them, and what it
             # ends at is brought to them as a whole.
             tighten = settled & state.loose

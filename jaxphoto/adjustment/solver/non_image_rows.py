@@ -8,11 +8,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxphoto.adjustment.layout.tiled import TiledStructure
+from jaxphoto.adjustment.model.numbers import NonImageResiduals, datum_residuals
 from jaxphoto.adjustment.model.observed_groups import ObservedGroup, RowsAtPoints
-from jaxphoto.adjustment.model.residuals import NonImageResiduals, datum_residuals
 from jaxphoto.adjustment.model.row_functions import RowJacobian, row_jacobian
 from jaxphoto.adjustment.model.structure import total
-from jaxphoto.adjustment.solver.normal import At
+from jaxphoto.adjustment.solver.normal import Linearised
 from jaxphoto.compiling import once
 
 
@@ -50,7 +50,7 @@ class NormalSums(NamedTuple):
     b_e: Float[Array, "images 6"]
 
 
-def non_image_rows(at: At) -> NonImageRows:
+def non_image_rows(at: Linearised) -> NonImageRows:
     """Derivatives and residuals at `at`, and their sums by point."""
     increments, scale, values, s = at
     n, q = increments.points.shape[1], s.n_border - s.n_interior
@@ -72,19 +72,19 @@ def non_image_rows(at: At) -> NonImageRows:
                 shared = jnp.moveaxis(j.shared, 1, 2).reshape(-1, len(g.place), n)
                 met = jnp.einsum("rlp,rap->lap", shared, flat)
                 w = w.at[jnp.asarray(g.column)[:, 0] - s.n_interior].add(met, mode="drop")
-        elif g.layout == "coupled":
+        elif g.elimination == "coupled":
             coupling.append(_coupled(g, j, s, n))
             coupled.append(j.residual.reshape(-1))
-    k = len(values.datum_eop)
+    constraints = at.constraints()
     residuals = NonImageResiduals(
         tuple(j.residual for j in jacobians),
         datum_residuals(increments, scale, values, s),
         tuple(g.name for g in s.observed),
     )
     datum = (
-        (values.datum_eop * scale.eop).transpose(0, 2, 1),
-        jnp.zeros((k, s.n_shared)),
-        values.datum_points * scale.points,
+        constraints.eop.transpose(0, 2, 1),
+        constraints.shared,
+        constraints.points,
     )
     e, of_s, p = (jnp.concatenate(of) for of in zip(*coupling, datum, strict=True))
     return NonImageRows(jacobians, residuals, v, b, w, e, of_s, p, jnp.concatenate([*coupled, residuals.datum]))
@@ -112,7 +112,7 @@ def add_non_image_rows(sums: NormalSums, rest: NonImageRows, s: TiledStructure) 
         if isinstance(g.rows, RowsAtPoints):
             if len(g.place):
                 sums = _add_shared(sums, g, j, s)
-        elif g.layout == "reduced":
+        elif g.elimination == "reduced":
             sums = _add_reduced(sums, g, j, s)
     return sums._replace(us=sums.us[:, :, :-1], uss=sums.uss[:-1, :-1], b_s=sums.b_s[:-1])
 

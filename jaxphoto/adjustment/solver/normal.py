@@ -26,15 +26,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Scalar
 
 from jaxphoto.adjustment.layout.tiled import TiledResiduals, TiledStructure, TiledValues
+from jaxphoto.adjustment.model.image_orientations import of_images, orientations_of
+from jaxphoto.adjustment.model.numbers import Increments, NonImageResiduals, UnknownArrays, state_at
 from jaxphoto.adjustment.model.observed_groups import RowsAtPoints
-from jaxphoto.adjustment.model.residuals import Increments, NonImageResiduals, UnknownArrays, state_at
 from jaxphoto.adjustment.model.row_functions import non_image_residuals
-from jaxphoto.adjustment.model.scene import of_images, scene_of
 from jaxphoto.adjustment.model.structure import total
 from jaxphoto.adjustment.solver.tile_rows import Pair, seen_in, tile_residuals
 
 
-class At(NamedTuple):
+class Linearised(NamedTuple):
     """Where equations are linearised: `start + scale * increments`."""
 
     increments: Increments
@@ -57,7 +57,7 @@ class At(NamedTuple):
         """All residuals over their sigmas."""
         increments, scale, values, s = self
         state, tiles = self.state, s.tiles
-        scene = scene_of(state, values, s)
+        scene = orientations_of(state, values, s)
 
         def tile(image, points, xy, sigma):
             return jnp.stack(tile_residuals(of_images(scene, image, s), points, seen_in(xy, sigma, image, s), s))
@@ -71,7 +71,7 @@ class At(NamedTuple):
         """The sum of all squared residuals, tile by tile."""
         increments, scale, values, s = self
         state = self.state
-        scene = scene_of(state, values, s)
+        scene = orientations_of(state, values, s)
 
         def tile(numbers):
             image, points, xy, sigma = numbers

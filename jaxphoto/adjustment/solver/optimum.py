@@ -18,12 +18,12 @@ from jaxtyping import Array, Bool, Int
 
 from jaxphoto.adjustment.layout.sharding import EVERYWHERE, TILES, along_points, sharded
 from jaxphoto.adjustment.layout.tiled import TiledStructure, TiledValues
-from jaxphoto.adjustment.model.residuals import Increments
+from jaxphoto.adjustment.model.numbers import Increments
 from jaxphoto.adjustment.model.structure import interior_of
 from jaxphoto.adjustment.solver.band import factor_band
 from jaxphoto.adjustment.solver.elimination import solve_factored
 from jaxphoto.adjustment.solver.levenberg_marquardt import FactoredSystem, LevenbergMarquardt
-from jaxphoto.adjustment.solver.normal import At, Reduced
+from jaxphoto.adjustment.solver.normal import Linearised, Reduced
 from jaxphoto.adjustment.solver.reduced import reduce_normal
 from jaxphoto.arrays import Numbers
 from jaxphoto.collinearity import ExteriorOrientation, image_residual
@@ -41,12 +41,6 @@ class Optimum(NamedTuple):
     increments: Increments
     steps: Int[Array, ""] | None
     converged: Bool[Array, ""] | None
-
-
-def zero_increments(structure: TiledStructure) -> Increments:
-    """No change from the start."""
-    s = structure
-    return Increments(jnp.zeros((6, s.n_images)), jnp.zeros(s.n_shared), jnp.zeros((3, s.n_points)))
 
 
 def unit_scale(structure: TiledStructure) -> Increments:
@@ -88,7 +82,7 @@ def _iterate(
     """The iteration itself, on what one device holds; increments are scaled."""
 
     def length(y, args):
-        return jnp.sqrt(At(y, *args).square_sum())
+        return jnp.sqrt(Linearised(y, *args).square_sum())
 
     solution: optx.Solution = optx.least_squares(
         # The solver differentiates for itself: optimistix is told that there is nothing to linearise.
@@ -110,7 +104,7 @@ def _find_optimum_jvp(primals, tangents, *, structure: TiledStructure, max_steps
     unit, at = unit_scale(structure), optimum.increments
 
     def gradient(increments, numbers):
-        residuals, pull = jax.vjp(lambda y: At(y, unit, numbers, structure).residuals(), increments)
+        residuals, pull = jax.vjp(lambda y: Linearised(y, unit, numbers, structure).residuals(), increments)
         return pull(residuals)[0]
 
     moved, still = eqx.partition(values, jax.tree.map(lambda t: t is not None, direction, is_leaf=lambda t: t is None))
@@ -118,7 +112,7 @@ def _find_optimum_jvp(primals, tangents, *, structure: TiledStructure, max_steps
     scale = typical_scale(values, structure)
     # The preconditioner belongs to the optimum: it wants its place in scaled increments.
     place = jax.tree.map(lambda a, k: jnp.where(k > 0, a / jnp.where(k > 0, k, 1.0), 0.0), at, scale)
-    there = At(place, scale, values, structure)
+    there = Linearised(place, scale, values, structure)
     a, reduced, _ = reduce_normal(there, 0.0)
     factor = factor_band(a)
 

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxphoto.adjustment.layout.tiled import TiledStructure
-from jaxphoto.adjustment.model.residuals import Increments
-from jaxphoto.adjustment.model.scene import of_images, scene_of, slopes_of
+from jaxphoto.adjustment.model.image_orientations import of_images, orientation_derivatives, orientations_of
+from jaxphoto.adjustment.model.numbers import Increments
 from jaxphoto.adjustment.model.structure import total
 from jaxphoto.adjustment.solver.band import Band, diagonal_of
 from jaxphoto.adjustment.solver.non_image_rows import (
@@ -25,7 +25,7 @@ from jaxphoto.adjustment.solver.non_image_rows import (
     non_image_rows,
     sum_by,
 )
-from jaxphoto.adjustment.solver.normal import At, Reduced, other_squares
+from jaxphoto.adjustment.solver.normal import Linearised, Reduced, other_squares
 from jaxphoto.adjustment.solver.tile_rows import TileJacobian, seen_in, tile_jacobian
 from jaxphoto.compiling import once
 from jaxphoto.small_matrices import cholesky_3x3, whiten
@@ -53,7 +53,7 @@ class TileParts(NamedTuple):
     """That of V, without damping."""
 
 
-def reduce_normal(at: At, damping) -> tuple[Band, Reduced, RightSide]:
+def reduce_normal(at: Linearised, damping) -> tuple[Band, Reduced, RightSide]:
     """Eliminate the points of N + damping diag(N): A, what goes with it, and the right-hand side.
 
     Unknowns held fixed (zero columns) get a unit diagonal.
@@ -78,8 +78,8 @@ def reduce_normal(at: At, damping) -> tuple[Band, Reduced, RightSide]:
         return of_images, own, gram[6 * m :, 6 * m :], f, p.l, p.b, p.diagonal
 
     def add_chunk(sums, numbers):
-        (pair_tile, pair_images, pair_block, block), groups, of_tiles = numbers
-        grams, own, border, *kept = tiles.each_of_chunk(tile, of_tiles, groups)
+        (pair_tile, pair_images, pair_block, block), batches, of_tiles = numbers
+        grams, own, border, *kept = tiles.each_of_chunk(tile, of_tiles, batches)
         own = sum_by(own.reshape(chunk * m, -1), of_tiles[0].reshape(-1), n)
         if not tiles.free_points:
             return (sums[0], sums[1] + own, sums[2]), kept
@@ -94,7 +94,7 @@ def reduce_normal(at: At, damping) -> tuple[Band, Reduced, RightSide]:
         jnp.zeros((c, c)),
     )
     lists = (tiles.pair_tile, tiles.pair_images, tiles.pair_block, tiles.block)
-    sums, (f, *of_points) = jax.lax.scan(add_chunk, zero, (lists, tiles.groups, tile_numbers(at, rest)))
+    sums, (f, *of_points) = jax.lax.scan(add_chunk, zero, (lists, tiles.batches, tile_numbers(at, rest)))
     (columns, last), own, border = total(sums, s)
     l, b_points, v = map(s.by_point, of_points)  # noqa: E741
     # Tiles that are padding were not computed: their points are each by itself.
@@ -137,7 +137,7 @@ def reduce_normal(at: At, damping) -> tuple[Band, Reduced, RightSide]:
     return a, reduced, RightSide(Increments(b_e.T, b_s, b_points), right, border[i : i + k, -1], squares)
 
 
-def tile_numbers(at: At, rest: NonImageRows):
+def tile_numbers(at: Linearised, rest: NonImageRows):
     """What `tile_parts` wants of each tile, chunks and tiles first."""
     increments, scale, values, s = at
     tiles = s.tiles
@@ -146,11 +146,11 @@ def tile_numbers(at: At, rest: NonImageRows):
     return (tiles.image, values.xy, values.sigma_xy, *of_points)
 
 
-def tile_columns(at: At):
+def tile_columns(at: Linearised):
     """A function from a tile's images, measurements and points to its residuals and Jacobian."""
     s = at.structure
-    scene = scene_of(at.state, at.values, s)
-    slopes = once(lambda: slopes_of(at.increments, at.scale, at.values, s), s.eop_free)
+    scene = orientations_of(at.state, at.values, s)
+    slopes = once(lambda: orientation_derivatives(at.increments, at.scale, at.values, s), s.eop_free)
 
     def columns_of(numbers) -> tuple[TileJacobian, TileJacobian]:
         image, xy, sigma, points, scale = numbers
@@ -160,7 +160,7 @@ def tile_columns(at: At):
     return columns_of
 
 
-def tile_parts(at: At, damping, coupled: Float[Array, "constraints"]):
+def tile_parts(at: Linearised, damping, coupled: Float[Array, "constraints"]):
     """A function from one tile's numbers to its `TileParts`."""
     s, columns_of = at.structure, tile_columns(at)
 

@@ -5,9 +5,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxphoto.adjustment.layout.tiled import TiledStructure, TiledValues
-from jaxphoto.adjustment.model.residuals import AbstractValues, Increments, datum_residuals
+from jaxphoto.adjustment.model.numbers import AbstractValues, Increments, datum_residuals
 from jaxphoto.adjustment.model.structure import AbstractStructure, total
-from jaxphoto.adjustment.solver.normal import At
+from jaxphoto.adjustment.solver.normal import Linearised
 from jaxphoto.rotation import small_angles, small_rotation
 
 # Newton's method on so few unknowns, begun so near, doubles the right digits with each of these.
@@ -46,7 +46,7 @@ def motions(
     return eop, jax.vmap(moved, in_axes=1, out_axes=2)(points)
 
 
-def open_motions(values: AbstractValues, s: AbstractStructure) -> int:
+def n_open_motions(values: AbstractValues, s: AbstractStructure) -> int:
     """How many motions are open, where these are all seven, or all but the scale, which distances give; else 0.
 
     Those change no residual but the datum's wherever images and points are. Others (a turn about the only control
@@ -54,22 +54,22 @@ def open_motions(values: AbstractValues, s: AbstractStructure) -> int:
     """
     k = len(values.datum_eop)
     rigid = all(g.rigid for g in s.observed)
-    lengths = any(g.rigid and g.layout != "reduced" for g in s.observed)
+    lengths = any(g.rigid and g.elimination != "reduced" for g in s.observed)
     return k if rigid and (k == 7 or (k == 6 and lengths)) else 0
 
 
-def onto_datum(at: At) -> Increments:
+def onto_datum(at: Linearised) -> Increments:
     """The increments moved by the similarity that meets the datum's constraints.
 
     Newton's method finds it from the one that brings the points nearest to their start (Umeyama 1991); where it does
     not, the increments stay as they are.
     """
     y, scale, values, s = at
-    k = open_motions(values, s)
+    k = n_open_motions(values, s)
     centre, size = _extent(values, s)
 
     def moved(y: Increments, parameters: Float[Array, "k"]) -> Increments:
-        state = At(y, *at[1:]).state
+        state = Linearised(y, *at[1:]).state
         parameters = jnp.concatenate([parameters, jnp.zeros(7 - k)])
         image = lambda x, r: similarity(parameters, x, r, centre, size)  # noqa: E731
         position, rotation = jax.vmap(image, in_axes=(1, 2), out_axes=(1, 2))(state.position, state.rotation)
@@ -90,8 +90,8 @@ def onto_datum(at: At) -> Increments:
 
 
 def along_motions(values: TiledValues, scale: Increments, s: TiledStructure) -> Increments:
-    """Scaled increments along each of the `open_motions` (leading axis), which nothing but the datum sees."""
-    k, shared = open_motions(values, s), scale.shared
+    """Scaled increments along each of the `n_open_motions` (leading axis), which nothing but the datum sees."""
+    k, shared = n_open_motions(values, s), scale.shared
     eop, points = motions(values.position, values.rotation, values.points, *_extent(values, s))
     return Increments(_scaled(eop[:k], scale.eop), jnp.zeros((k, *shared.shape)), _scaled(points[:k], scale.points))
 

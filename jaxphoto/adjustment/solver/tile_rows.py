@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxphoto.adjustment.layout.tiled import TiledStructure
-from jaxphoto.adjustment.model.scene import Scene, SceneDerivatives
+from jaxphoto.adjustment.model.image_orientations import ImageOrientations, OrientationDerivatives
 from jaxphoto.adjustment.model.structure import CameraGroup, interior_of
 from jaxphoto.collinearity import ExteriorOrientation, camera_coordinates, camera_residual
 from jaxphoto.compiling import once
@@ -53,7 +53,9 @@ def seen_in(xy: Array, sigma: Array, image: Array, s: TiledStructure) -> TileMea
     return TileMeasurements(xy, 1 / sigma, tuple(jnp.asarray(g.member)[image] for g in s.groups))
 
 
-def tile_residuals(scene: Scene, points: Float[Array, "3 p"], seen: TileMeasurements, s: TiledStructure) -> Pair:
+def tile_residuals(
+    scene: ImageOrientations, points: Float[Array, "3 p"], seen: TileMeasurements, s: TiledStructure
+) -> Pair:
     """Weighted residuals of a tile: observed minus computed over sigma."""
     return _residuals(
         [_leaves_of(c) for c in scene.cameras], _in_cameras(scene.centre, scene.rotation, points, seen, s), seen, s
@@ -100,8 +102,8 @@ def _residuals_of(g: CameraGroup, camera: list[Array], in_camera: Triple, seen: 
 
 
 def tile_jacobian(
-    scene: Scene,
-    slopes: SceneDerivatives,
+    scene: ImageOrientations,
+    slopes: OrientationDerivatives,
     points: Float[Array, "3 p"],
     scale: Float[Array, "3 p"],
     seen: TileMeasurements,
@@ -112,8 +114,8 @@ def tile_jacobian(
 
 
 def _tile_jacobian(
-    scene: Scene,
-    slopes: SceneDerivatives,
+    scene: ImageOrientations,
+    slopes: OrientationDerivatives,
     points: Float[Array, "3 p"],
     scale: Float[Array, "3 p"],
     seen: TileMeasurements,

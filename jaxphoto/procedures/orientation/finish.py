@@ -147,7 +147,7 @@ def _shared_covariance(adjusted: Adjustment) -> np.ndarray:
 @eqx.filter_jit
 def _inverse(equations: NormalEquations) -> Float[Array, "reduced reduced"]:
     # All of statistics.covariance, points and all, would take several times longer to compile.
-    return equations.inverse_of_images()
+    return equations.inverse_of_reduced()
 
 
 def _open(names: tuple[str, ...], normal: np.ndarray, observed: np.ndarray, hardly: np.ndarray) -> dict[str, float]:

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxphoto.adjustment.datum import close_datum
+from jaxphoto.adjustment.model.block_values import values_of
 from jaxphoto.adjustment.model.structure import structure_of
-from jaxphoto.adjustment.model.values import values_of
 from jaxphoto.arrays import still
 from jaxphoto.block import Block, Datum, Start
 from jaxphoto.camera import Perspective, set_parameter

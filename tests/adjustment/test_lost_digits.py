@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxphoto import adjust
-from jaxphoto.adjustment.precision import warn_of_lost_digits
+from jaxphoto.adjustment.lost_digits import warn_of_lost_digits
 from tests.blocks import adjusted, simulated
 
 

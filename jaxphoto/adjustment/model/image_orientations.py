@@ -6,13 +6,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxphoto.adjustment.model.residuals import AbstractValues, Increments, UnknownArrays
+from jaxphoto.adjustment.model.numbers import AbstractValues, Increments, UnknownArrays
 from jaxphoto.adjustment.model.structure import AbstractStructure, CameraGroup, interior_of
 from jaxphoto.georeferencing import Exposure
 from jaxphoto.rotation import small_rotation
 
 
-class Scene(NamedTuple):
+class ImageOrientations(NamedTuple):
     """What image rows depend on besides their points, image by image."""
 
     centre: Float[Array, "images 3"]
@@ -21,8 +21,8 @@ class Scene(NamedTuple):
     """Of each group of cameras, its parameters: (m) where it is one camera that nothing bends, else (images, m)."""
 
 
-class SceneDerivatives(NamedTuple):
-    """Derivatives of a `Scene` with respect to scaled increments."""
+class OrientationDerivatives(NamedTuple):
+    """Derivatives of a `ImageOrientations` with respect to scaled increments."""
 
     centre: Float[Array, "images 3"]
     rotation: Float[Array, "images 3 3 3"]
@@ -31,13 +31,15 @@ class SceneDerivatives(NamedTuple):
     """(colours, free) where parameters are (m), else (images, colours, free)."""
 
 
-def scene_of(state: UnknownArrays, values: AbstractValues, s: AbstractStructure) -> Scene:
+def orientations_of(state: UnknownArrays, values: AbstractValues, s: AbstractStructure) -> ImageOrientations:
     """The state, image by image."""
-    return Scene(state.position.T, state.rotation.transpose(2, 0, 1), _cameras_at(jnp.asarray(state.shared), values, s))
+    return ImageOrientations(
+        state.position.T, state.rotation.transpose(2, 0, 1), _cameras_at(jnp.asarray(state.shared), values, s)
+    )
 
 
 def _cameras_at(shared: Array, values: AbstractValues, s: AbstractStructure) -> tuple[Array, ...]:
-    """The parameters of the cameras (see `Scene`), bent by what is declared to bend them."""
+    """The parameters of the cameras (see `ImageOrientations`), bent by what is declared to bend them."""
     cameras = []
     for g in s.groups:
         m = g.treedef.num_leaves
@@ -59,7 +61,7 @@ def _bent(
             interior = own.interior(interior, Exposure(*exposure))
         return jnp.stack([jnp.asarray(leaf, float) for leaf in jax.tree.leaves(interior)])
 
-    return jax.vmap(one, (0, -1, *[-1] * 5))(cameras, bending, v.time, v.velocity, v.rate, v.nominal, v.flight_time)
+    return jax.vmap(one, (0, -1, *[-1] * 5))(cameras, bending, *v.exposures)
 
 
 def by_image(g: CameraGroup, s: AbstractStructure) -> bool:
@@ -67,7 +69,9 @@ def by_image(g: CameraGroup, s: AbstractStructure) -> bool:
     return s.bends or len(g.names) > 1
 
 
-def slopes_of(y: Increments, scale: Increments, values: AbstractValues, s: AbstractStructure) -> SceneDerivatives:
+def orientation_derivatives(
+    y: Increments, scale: Increments, values: AbstractValues, s: AbstractStructure
+) -> OrientationDerivatives:
     """Derivatives of the scene at the increments `y`."""
 
     turned = jax.vmap(jax.jacfwd(small_rotation), in_axes=-1, out_axes=-1)(y.eop[3:] * scale.eop[3:]) * scale.eop[3:]
@@ -88,11 +92,11 @@ def slopes_of(y: Increments, scale: Increments, values: AbstractValues, s: Abstr
             table = by_colour[g.offset : g.offset + m * len(g.names)].reshape(len(g.names), m, n)
             table = table[:, list(g.free_leaves)].transpose(0, 2, 1)
             cameras.append(table[0] if len(g.names) == 1 else table[g.camera])
-    return SceneDerivatives(scale.eop[:3].T, rotation, tuple(cameras))
+    return OrientationDerivatives(scale.eop[:3].T, rotation, tuple(cameras))
 
 
 def of_images(tree: Any, image: Array, s: AbstractStructure) -> Any:
-    """The parts of a `Scene` or of `SceneDerivatives` that belong to a tile's images."""
+    """The parts of a `ImageOrientations` or of `OrientationDerivatives` that belong to a tile's images."""
     take = lambda a: a.at[image].get(mode="promise_in_bounds")  # noqa: E731
     cameras = tuple(take(c) if by_image(g, s) else c for g, c in zip(s.groups, tree.cameras, strict=True))
     return type(tree)(take(tree.centre), take(tree.rotation), cameras)

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxphoto.adjustment.model.numbers import AbstractValues, UnknownArrays, Values
 from jaxphoto.adjustment.model.observed_groups import RowsInList, numbers_in
 from jaxphoto.adjustment.model.parameter_tables import shared_vector, unknowns_from
-from jaxphoto.adjustment.model.residuals import AbstractValues, UnknownArrays, Values
 from jaxphoto.adjustment.model.structure import AbstractStructure, ObservedRows, observed_in
 from jaxphoto.arrays import Numbers, vector_of
 from jaxphoto.block import Block, exposures
@@ -57,7 +57,7 @@ def with_datum(values: SomeValues, eop: Numbers, points: Numbers) -> SomeValues:
     return eqx.tree_at(lambda v: (v.datum_eop, v.datum_points), values, (eop, points))
 
 
-def at_state(values: SomeValues, state: UnknownArrays) -> SomeValues:
+def with_start(values: SomeValues, state: UnknownArrays) -> SomeValues:
     """The same values with the state as the new start, so that increments are zero there."""
     where = lambda v: (v.position, v.rotation, v.shared, v.points)  # noqa: E731
     return eqx.tree_at(where, values, tuple(state))

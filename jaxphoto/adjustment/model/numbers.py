@@ -1,4 +1,4 @@
-"""Residuals of a block: every observation, divided by its standard deviation, as a function of increments.
+"""The numbers of an adjustment: observations and start, increments, the unknowns that these lead to, residuals.
 
 Increments are scaled and small: `unknown = start (+) scale * increment`, rotations by a small rotation in the
 camera frame. Arrays are batch-last (components first, rows last), which XLA vectorises best on a CPU. Image rows are
@@ -74,6 +74,11 @@ class AbstractValues(eqx.Module):
     datum_eop: Float[Array, "constraints 6 images"]
     datum_points: Float[Array, "constraints 3 points"]
 
+    @property
+    def exposures(self) -> tuple[Float[Array, "... images"], ...]:
+        """What an `Exposure` of each image holds."""
+        return self.time, self.velocity, self.rate, self.nominal, self.flight_time
+
 
 class Values(AbstractValues):
     """Those of a block as given."""
@@ -89,6 +94,12 @@ class UnknownArrays(NamedTuple):
     rotation: Float[Array, "3 3 images"]
     shared: Float[Array, "parameters"]
     points: Float[Array, "3 points"]
+
+
+def zero_increments(structure: AbstractStructure) -> Increments:
+    """No change from the start."""
+    s = structure
+    return Increments(jnp.zeros((6, s.n_images)), jnp.zeros(s.n_shared), jnp.zeros((3, s.n_points)))
 
 
 def state_at(
