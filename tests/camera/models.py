@@ -1,8 +1,11 @@
 """Distortion models with numbers of real cameras, and with every coefficient at work."""
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxphoto.camera import (
+    DISTORTIONS,
     AffineBrown,
     Agisoft,
     Balanced,
@@ -11,6 +14,7 @@ from jaxphoto.camera import (
     BundlerRadial,
     Ebner,
     Gruen,
+    InteriorOrientation,
     OpenCv,
     OpenCvFisheye,
     PpsRadial,
@@ -50,9 +54,27 @@ UNITS = {
     Agisoft: {**_RADIAL, "k4": 1e-13, "p1": 1e-5, "p2": 1e-5, "p3": 1e-3, "p4": 1e-6, "b1": 1e-3, "b2": 1e-3},
     OpenCvFisheye: {**_RADIAL, "k4": 1e-13, **dict.fromkeys(("p1", "p2", "s1", "s2"), 1e-5), "b1": 1e-3, "b2": 1e-3},
 }
-MOST = max(map(len, UNITS.values()))
 # Of such a camera: the balance radius, Ebner's and Gruen's grid, the scale of Brown's a13.
 CONSTANTS = {"r0": 8.0, "b": 12.0, "f": 35.0}
+
+
+def _units(model):
+    """Of a model that is not listed above: what moves a point 15 mm from the centre by 0.03 mm."""
+    constants = {field: CONSTANTS[field] for field in model.constants.values()}
+
+    def moved(values):
+        coefficients = dict(zip(model.coefficients, values, strict=True))
+        camera = InteriorOrientation(1.0, distortion=model(**coefficients, **constants))
+        return camera.ideal_from_measured(jnp.array([12.0, 9.0]))
+
+    by_coefficient = np.abs(jax.jacfwd(moved)(jnp.zeros(len(model.coefficients)))).max(axis=0)
+    # Some only scale others, and move nothing by themselves.
+    units = np.where(by_coefficient > 0, 0.03 / np.where(by_coefficient > 0, by_coefficient, 1.0), 1.0)
+    return dict(zip(model.coefficients, units, strict=True))
+
+
+UNITS |= {model: _units(model) for model in DISTORTIONS.values() if model not in UNITS}
+MOST = max(map(len, UNITS.values()))
 
 
 def build(model, numbers):
