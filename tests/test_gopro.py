@@ -86,6 +86,7 @@ def test_any_balance_radius_gives_the_same_bundle(seen, calibrated):
     assert float(zero.adjusted.sigma0) == pytest.approx(float(three.adjusted.sigma0), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_any_balance_radius_gives_the_same_board(calibrated):
     """The same where the points of the board are estimated, too."""
     zero, three = (calibrated(board_sigma_m=1e-3, r0_mm=r0) for r0 in (0.0, 3.0))

@@ -16,6 +16,9 @@ from tests.formulas import turns
 from tests.orientation.image_pairs import normalised, rotation_error
 from tests.orientation.random_scenes import SIGMA_RAD, random_pair
 
+# A study of a thousand cases: minutes.
+pytestmark = pytest.mark.slow
+
 N = 1000
 
 

@@ -16,6 +16,9 @@ from tests.formulas import camera_from_object, collinearity, random_rotations
 from tests.orientation.image_pairs import normalised, rotation_error
 from tests.orientation.random_scenes import SIGMA_MM, image_scene
 
+# A study of a thousand cases: minutes.
+pytestmark = pytest.mark.slow
+
 N = 1000
 
 

@@ -45,6 +45,7 @@ def check(oriented, scene):
     assert np.sqrt(np.mean(ratios**2)) < 1.6
 
 
+@pytest.mark.slow
 def test_rolling_ground_and_a_lens_that_nothing_is_known_of():
     scene = aerial(per_strip=4, seed=1)
     oriented = oriented_from(scene, CHEAP, InteriorOrientation(8.24), 0.3, 0.3)

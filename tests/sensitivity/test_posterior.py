@@ -115,6 +115,7 @@ def integrated(case: TwoHeights) -> tuple[np.ndarray, ...]:
     return tuple(np.array(moments).T)
 
 
+@pytest.mark.slow
 def test_curved_posterior_is_the_density_summed_over_a_grid():
     case = two_heights()
     p, again = (posterior(case.adjusted, PARAMETERS, draws=400, warmup=150, seed=1) for _ in range(2))
