@@ -148,7 +148,7 @@ def test_what_was_not_used_for_longest_is_let_go(kept, monkeypatch):
     monkeypatch.setattr(run, "MOST", 2)
     for power in (2, 3, 2, 4):
         run_compiled(root, (MATRIX, power), {}, "run")
-    assert [key[3] for key in run._programs] == [(2,), (4,)]
+    assert [key[3] for key in run._programs] == [(None, 2), (None, 4)]
 
 
 def test_prepared_programs_are_used(kept, monkeypatch):
