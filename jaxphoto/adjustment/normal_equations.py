@@ -28,6 +28,8 @@ class NormalEquations(eqx.Module):
     """Their start is the optimum."""
     structure: TiledStructure
     factored: FactoredNormal
+    is_weighed: bool = eqx.field(static=True, default=False)
+    """Whether the constraints of the datum are as `at` wants them: what runs many times weighs them once, before."""
 
     @property
     def scale(self) -> Increments:
@@ -38,18 +40,19 @@ class NormalEquations(eqx.Module):
     def at(self) -> Linearised:
         """Where the equations are linearised: at no increments, with the constraints of the datum weighed."""
         s = self.structure
-        return Linearised(jax.tree.map(jnp.zeros_like, self.scale), self.scale, weigh_datum(self.values, s), s)
+        values = self.values if self.is_weighed else weigh_datum(self.values, s)
+        return Linearised(jax.tree.map(jnp.zeros_like, self.scale), self.scale, values, s)
 
     @property
     def weighed(self) -> "NormalEquations":
         """The same with the constraints of the datum as `at` has them."""
-        return dataclasses.replace(self, values=self.at.values)
+        return dataclasses.replace(self, values=self.at.values, is_weighed=True)
 
     @property
     def on_one_device(self) -> "NormalEquations":
         """The same for programs that no other device has a part in."""
         values, factored = jax.tree.map(still, (self.values, self.factored))
-        return NormalEquations(values, self.structure.on_one_device, factored)
+        return dataclasses.replace(self, values=values, structure=self.structure.on_one_device, factored=factored)
 
     def solve(self, b: Increments) -> Increments:
         """x of N x = b; of many by `jax.vmap`."""

@@ -204,6 +204,7 @@ def _by_fixed(
     block, fixed = adjusted.block, adjusted.block.fixed
     equations = adjusted.equations.on_one_device
     s, places, values = equations.structure, adjusted.tiled.places, equations.values
+    every = adjusted.parameters
     shared = np.setdiff1d(np.arange(len(values.shared)), s.free)
     held = _Held(*(np.asarray(v, np.int32) for v in (shared, fixed.who, fixed.axis, places.point_at)))
     given = equations, np.array(float(curvature)), held
@@ -212,7 +213,7 @@ def _by_fixed(
     found = b[:, unknowns] @ adjoint[: len(unknowns)] + b[:, n:] @ adjoint[len(adjoint) - 3 * s.n_points :]
 
     coordinates = (f"points[{block.points[p]}].{AXES[a]}" for p, a in zip(fixed.who, fixed.axis, strict=True))
-    fixed_labels = (*(adjusted.parameters[k] for k in shared), *coordinates)
+    fixed_labels = (*(every[k] for k in shared), *coordinates)
     # An estimate that is itself held fixed follows what holds it.
     same = np.array(labels)[:, None] == np.array(fixed_labels, dtype=str)
     return same - found.T, fixed_labels

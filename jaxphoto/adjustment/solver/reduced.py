@@ -6,6 +6,7 @@ symbols.
 """
 
 from collections.abc import Iterable
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -155,7 +156,8 @@ def tile_columns(at: Linearised):
     def columns_of(numbers) -> tuple[TileJacobian, TileJacobian]:
         image, xy, sigma, points, scale = numbers
         seen = seen_in(xy, sigma, image, s)
-        return tile_jacobian(of_images(scene, image, s), of_images(slopes, image, s), points, scale, seen, s)
+        own = of_images(scene, image, s), of_images(slopes, image, s)
+        return once(partial(tile_jacobian, s=s), s.eop_free, *own, points, scale, seen)
 
     return columns_of
 

@@ -109,19 +109,9 @@ def tile_jacobian(
     seen: TileMeasurements,
     s: TiledStructure,
 ) -> tuple[TileJacobian, TileJacobian]:
-    """Residuals and Jacobian of a tile, x and y."""
-    return once(partial(_tile_jacobian, s=s), s.eop_free, scene, slopes, points, scale, seen)
-
-
-def _tile_jacobian(
-    scene: ImageOrientations,
-    slopes: OrientationDerivatives,
-    points: Float[Array, "3 p"],
-    scale: Float[Array, "3 p"],
-    seen: TileMeasurements,
-    s: TiledStructure,
-) -> tuple[TileJacobian, TileJacobian]:
-    """By the chain rule: through the points in the cameras' frames, three numbers a slot."""
+    """Residuals and Jacobian of a tile, x and y, by the chain rule: through the points in the cameras' frames, three
+    numbers a slot.
+    """
     centre, rotation, unit = scene.centre, scene.rotation, jnp.eye(3)
     # One loop for all six: joined afterwards, they would be computed number by number.
     still, turns = jnp.zeros((3, *rotation.shape)), jnp.moveaxis(slopes.rotation, -1, 0)
