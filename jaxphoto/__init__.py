@@ -64,7 +64,7 @@ from jaxphoto.observations import (
     touching,
 )
 from jaxphoto.parameters import AbstractParameters
-from jaxphoto.procedures import adjust, boresight, georeference
+from jaxphoto.procedures import adjust, boresight, georeference, snoop
 from jaxphoto.simulation import simulate
 from jaxphoto.statistics import angle_differences, covariance, point_differences, significance
 from jaxphoto.unknowns import FIXED, FREE, Unknowns, Weighted, default_priors
@@ -90,7 +90,7 @@ __all__ = [
     "correlated", "covariance", "decentring_from_symmetry", "default_priors", "direct_orientation", "georeference",
     "ground_point", "image_ray", "intersect", "monte_carlo", "orient", "point_differences", "principal_points",
     "project", "read_block", "read_recipe", "read_source", "readjust", "rebalance", "rebalance_covariance",
-    "significance", "simulate", "simultaneous", "symmetry_from_decentring", "touching", "write_block",
+    "significance", "simulate", "simultaneous", "snoop", "symmetry_from_decentring", "touching", "write_block",
     "write_simulation",
 ]  # fmt: skip
 

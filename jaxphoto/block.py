@@ -4,7 +4,9 @@ Observations are rows (`jaxphoto.observations`): "vertical control" is rows with
 infinite sigma, and the redundancy is a count. Units are metres, radians and millimetres on the image.
 """
 
+import dataclasses
 import functools
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import equinox as eqx
@@ -86,6 +88,18 @@ class Block(eqx.Module):
         further = (rows for rows in self.more if isinstance(rows, AbstractObservations))
         return (self.stations, self.attitudes, self.control, self.surfaces, self.distances, *further)
 
+    @property
+    def named_observations(self) -> dict[str, AbstractObservations]:
+        """Image points and all other rows, by the names that results have for them; kinds without rows are left out."""
+        return {self.image_points.group: self.image_points, **named_rows(self.observations)}
+
+    def with_observations(self, rows: Mapping[str, AbstractObservations]) -> "Block":
+        """The same with other rows in place of some of `named_observations`."""
+        new = {id(old): rows[name] for name, old in self.named_observations.items() if name in rows}
+        fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        changed: dict[str, Any] = {name: new[id(value)] for name, value in fields.items() if id(value) in new}
+        return dataclasses.replace(self, **changed, more=tuple(new.get(id(value), value) for value in self.more))
+
     def owners(self, owner: str) -> tuple[str, ...]:
         """Of each image, the owner of parameters that belong to its `owner`, such as "camera"; "" where it has none.
 
@@ -114,6 +128,16 @@ class Block(eqx.Module):
     def of(*args: Any, **kwargs: Any) -> "Block":
         """The block of arrays and tables: see `block_fields`."""
         return Block(**block_fields(*args, **kwargs))
+
+
+def named_rows(groups: Iterable[AbstractObservations]) -> dict[str, AbstractObservations]:
+    """Groups that have rows by their names, with a number where several have the same."""
+    named: dict[str, AbstractObservations] = {}
+    for rows in groups:
+        if len(rows):
+            taken = sum(name.split("#")[0] == rows.group for name in named)
+            named[rows.group if not taken else f"{rows.group}#{taken + 1}"] = rows
+    return named
 
 
 class SensorRows(eqx.Module):

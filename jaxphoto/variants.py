@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
 from jaxphoto.arrays import still
 from jaxphoto.block import Block, Datum, direct_exterior, sensor_rows
@@ -157,6 +157,24 @@ def strips(block: Block, names: Collection[str]) -> Block:
     seen = block.image_points.point[np.isin(block.image_points.image, image)]
     point = np.flatnonzero(np.bincount(seen, minlength=len(block.points)) >= 2)
     return _part(block, image, point)
+
+
+def without_observations(
+    block: Block, left_out: Mapping[str, Bool[np.ndarray, "_"]]
+) -> tuple[Block, Int[np.ndarray, "_"]]:
+    """The block without some of its observations, by group (`Block.named_observations`), and the points that stay.
+
+    Points that are left with fewer observations than coordinates, such as one ray, go with what was observed of them.
+    """
+    kept = block.with_observations({name: block.named_observations[name].take(~out) for name, out in left_out.items()})
+    numbers = np.zeros(len(block.points), int)
+    for rows in kept.named_observations.values():
+        for what, index in rows.indices():
+            if what == "point":
+                np.add.at(numbers, still(index).ravel(), np.repeat(len(rows.axes), np.size(index)))
+    np.add.at(numbers, kept.fixed.who, 1)
+    point = np.flatnonzero(numbers >= 3)
+    return (kept, point) if len(point) == len(numbers) else (_part(kept, np.arange(len(block.images)), point), point)
 
 
 def _part(block: Block, image: np.ndarray, point: np.ndarray) -> Block:

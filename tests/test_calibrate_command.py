@@ -51,7 +51,7 @@ def test_calibrates_and_writes_everything(folder, monkeypatch, capsys, tmp_path)
     assert "photographs/wall.png" in (out / "photographs.html").read_text()
     assert summary["settled"] is True
     assert "pixel size as given" in summary["start"]
-    assert not any("pixel size" in warning for warning in summary["warnings"])
+    assert not any("pixel size" in finding["text"] for finding in summary["findings"])
     assert "photographs/p0.png" in (out / "photographs.html").read_text()
     assert (out / "report.html").is_file()
     block = jaxphoto.read_block(out / "block")

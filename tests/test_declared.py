@@ -22,7 +22,7 @@ from jaxphoto.adjustment.model.structure import structure_of
 from jaxphoto.adjustment.solver.optimum import typical_scale, weigh_datum
 from jaxphoto.observations import Correlated, KnownParameters
 from jaxphoto.parameters import numbers_of
-from jaxphoto.report.results import write_results
+from jaxphoto.report import Verdict, write_results
 from jaxphoto.sensitivity import noise, sensitivity
 from jaxphoto.sensitivity.designs import prepare_design
 from jaxphoto.statistics import observation_groups, redundancy_numbers
@@ -331,7 +331,7 @@ def test_the_table_of_residuals_names_each_number(group):
 
 
 def test_results_and_report_are_written(tmp_path):
-    write_results(Tables(adjusted()), [], tmp_path / "out", {})
+    write_results(Tables(adjusted()), Verdict(()), tmp_path / "out", {})
     page = (tmp_path / "out/report.html").read_text(encoding="utf-8")
     for name in ("height differences", "baselines"):
         assert name in page.replace("_", " "), name

@@ -4,10 +4,10 @@ What is adjusted lies in `model`; how it lies in memory, in `layout`; how it is 
 of the last two than a result asks `NormalEquations`.
 """
 
-from jaxphoto.adjustment.adjust import MAX_STEPS, LaidOut, common_sizes, lay_out, solve
+from jaxphoto.adjustment.adjust import MAX_STEPS, LaidOut, common_sizes, lay_out, linearise, solve
 from jaxphoto.adjustment.layout.padding import TiledBlock
 from jaxphoto.adjustment.layout.tile_layout import LEAST, Sizes
-from jaxphoto.adjustment.layout.tiled import TiledStructure, TiledValues
+from jaxphoto.adjustment.layout.tiled import TiledResiduals, TiledStructure, TiledValues
 from jaxphoto.adjustment.normal_equations import Cofactors, Linearised, NormalEquations, RowCofactors, optimise
 from jaxphoto.adjustment.result import Adjustment, Outcome
 
@@ -23,10 +23,12 @@ __all__ = [
     "RowCofactors",
     "Sizes",
     "TiledBlock",
+    "TiledResiduals",
     "TiledStructure",
     "TiledValues",
     "common_sizes",
     "lay_out",
+    "linearise",
     "optimise",
     "solve",
 ]  # fmt: skip

@@ -1,5 +1,6 @@
 """The adjustment itself: block, start and priors in; unknowns with their normal equations out."""
 
+import dataclasses
 import functools
 import operator
 from collections.abc import Callable, Iterable
@@ -55,9 +56,8 @@ def solve(
     do not see an unknown or cannot tell unknowns apart.
     """
     laid = lay_out(block, start, priors, sizes)
-    tiled, numbers, structure = laid.tiled, laid.tiled_values, laid.tiled.structure
+    numbers, structure = laid.tiled_values, laid.tiled.structure
     seconds: dict[str, float] = {}
-    factored = None
     if laid.traced:
         found = find_optimum(weigh_datum(numbers, structure), structure=structure, max_steps=max_steps)
         state = state_at(found.increments, unit_scale(structure), numbers, structure)
@@ -70,14 +70,41 @@ def solve(
         found = run_compiled(_optimise, arguments, seconds, "solve")
         # What comes back from several devices is of another type to a program than what went in.
         state = UnknownArrays(*map(still, found.state))
-    numbers = with_start(numbers, state)
+    adjusted = _at(state, laid, block, start, priors, max_steps, seconds)
+    adjusted = dataclasses.replace(adjusted, steps=found.steps, converged=found.converged)
+    if laid.traced:
+        return adjusted
+    if adjusted.astray.any():
+        return dataclasses.replace(adjusted, converged=np.array(False))
+    check_rank(adjusted)
+    return adjusted
+
+
+def linearise(
+    block: Block, unknowns: Unknowns, priors: Unknowns, max_steps: int = MAX_STEPS, sizes: Sizes = LEAST
+) -> Adjustment:
+    """`block` where the unknowns are, not at its optimum: residuals and normal equations there, by `solve`'s programs.
+
+    What an adjustment of some of the observations says of all of them. Raises what `solve` raises before it computes.
+    """
+    laid = lay_out(block, unknowns, priors, sizes)
+    v = laid.tiled_values
+    return _at(UnknownArrays(v.position, v.rotation, v.shared, v.points), laid, block, unknowns, priors, max_steps, {})
+
+
+def _at(
+    state: UnknownArrays, laid: "LaidOut", block: Block, start: Unknowns, priors: Unknowns, max_steps: int, seconds
+) -> Adjustment:
+    """All that an adjustment tells with the unknowns as they are in `state`."""
+    tiled, numbers = laid.tiled, with_start(laid.tiled_values, state)
+    structure, factored = tiled.structure, None
     # Statistics need the factored normal matrix; a derivative of the unknowns does not, and would pay for it dearly.
     if not laid.traced:
         again = run_compiled(_optimise, (numbers, structure, max_steps, np.array(True)), seconds, "covariance")
         factored = gathered(again.factored)
     residuals = run_compiled(_residuals, (numbers, structure), seconds, "residuals")
     state = tiled.crop_state(state)
-    adjusted = Adjustment(
+    return Adjustment(
         block=block,
         priors=priors,
         unknowns=unknowns_of(state, start, tiled.own),
@@ -86,13 +113,10 @@ def solve(
         tiled=tiled,
         tiled_values=numbers,
         factored=factored,
-        steps=found.steps,
-        converged=found.converged,
+        steps=np.array(0),
+        converged=np.array(False),
         seconds=seconds,
     )
-    if not laid.traced:
-        check_rank(adjusted)
-    return adjusted
 
 
 class LaidOut(NamedTuple):

@@ -4,7 +4,7 @@ import enum
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxphoto.adjustment.layout.padding import TiledBlock
 from jaxphoto.adjustment.layout.tiled import TiledValues
@@ -12,7 +12,7 @@ from jaxphoto.adjustment.model.numbers import Residuals, Values
 from jaxphoto.adjustment.model.structure import Structure, observed_in
 from jaxphoto.adjustment.normal_equations import NormalEquations, factor_normal
 from jaxphoto.adjustment.solver.elimination import FactoredNormal
-from jaxphoto.arrays import Numbers
+from jaxphoto.arrays import Numbers, still
 from jaxphoto.block import Block
 from jaxphoto.compiling import call_compiled
 from jaxphoto.observations import PRIORS
@@ -28,12 +28,18 @@ class Outcome(enum.Enum):
         "not converged: the step limit was reached; check the approximate values, look for blunders among the largest "
         "residuals, or hold weakly determined unknowns fixed"
     )
+    ASTRAY = (
+        "not converged: object points went so far away that their rays are parallel; look for blunders in what was "
+        "measured of them, leave them out, or give better approximate values"
+    )
     DIVERGED = (
         "not converged: the numbers became infinite; check units, approximate values, and whether points lie behind "
         "their cameras"
     )
 
 
+# Times the median distance of a point: float64 resolves the directions of a base no longer than a few nanoradians.
+_FARTHEST = 1e7
 # Of the image coordinates of one adjustment: chunks, tiles, x and y, images, points.
 _DIMENSIONS = 5
 _factored = eqx.filter_jit(factor_normal)
@@ -55,8 +61,8 @@ class Adjustment(eqx.Module):
     tiled_values: TiledValues
     factored: FactoredNormal | None
     """None in an adjustment that is being differentiated or mapped over; see `equations`."""
-    steps: Int[Array, ""]
-    converged: Array
+    steps: Int[Numbers, ""]
+    converged: Bool[Numbers, ""]
     seconds: dict[str, float]
 
     __repr__ = adjustment_repr
@@ -93,7 +99,21 @@ class Adjustment(eqx.Module):
         """Converged or not, and why; a member of `Outcome`."""
         if bool(self.converged):
             return Outcome.CONVERGED
-        return Outcome.STEPS if np.isfinite(float(self.square_sum)) else Outcome.DIVERGED
+        if not np.isfinite(float(self.square_sum)):
+            return Outcome.DIVERGED
+        return Outcome.ASTRAY if self.astray.any() else Outcome.STEPS
+
+    @property
+    def astray(self) -> Bool[np.ndarray, "points"]:
+        """Which points lie so far from an image of theirs, beside the others, that no difference of directions is left.
+
+        Their standard deviations are larger still, so that by them any such place is as good as the optimum.
+        """
+        s, u = self.structure, self.unknowns
+        distance = np.linalg.norm(still(u.points)[s.point] - still(u.exterior.position)[s.image], axis=1)
+        far = np.zeros(len(self.block.points), bool)
+        far[s.point[~(distance < _FARTHEST * np.median(distance))]] = True
+        return far
 
     @property
     def n_observations(self) -> dict[str, int]:

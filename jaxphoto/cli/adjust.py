@@ -11,9 +11,21 @@ from rich.console import Console
 import jaxphoto
 from jaxphoto.cli.app import app
 from jaxphoto.errors import JaxphotoError
-from jaxphoto.io import read_block
+from jaxphoto.io import read_block, write_block
 from jaxphoto.procedures import adjust_for_tables
-from jaxphoto.report import Tables, check_target, prepare_pictures, print_adjustment, warnings_of, write_results
+from jaxphoto.report import (
+    Level,
+    Tables,
+    Verdict,
+    check_target,
+    left_out_table,
+    made_whole,
+    prepare_pictures,
+    print_adjustment,
+    snooped_findings,
+    verdict_of,
+    write_results,
+)
 from jaxphoto.statistics import EOP_NAMES
 
 
@@ -24,9 +36,15 @@ def adjust_command(
     rotations: Annotated[
         str, typer.Option(help=f"Rotations the correlations mean: {', '.join(EOP_NAMES)}.")
     ] = "omega_phi_kappa",
+    snoop: Annotated[
+        bool,
+        typer.Option(
+            "--snoop", help="Leave out what contradicts the other observations, and write what went and the block left."
+        ),
+    ] = False,
     max_steps: Annotated[int, typer.Option(min=1, help="Most iterations.")] = jaxphoto.MAX_STEPS,
 ) -> None:
-    """Adjust a block and write tables, statistics and a report. Exit code 1: written, but not converged."""
+    """Adjust a block and write tables, statistics and a report. Exit code 1: written, but the verdict is red."""
     if rotations not in EOP_NAMES:
         raise JaxphotoError(f"--rotations {rotations}: there are {', '.join(EOP_NAMES)}")
     check_target(out, block)
@@ -40,15 +58,24 @@ def adjust_command(
             f"adjusting {len(read.images)} images, {len(read.points)} points, "
             f"{len(read.image_points.image)} image points"
         )
-        adjusted = adjust_for_tables(read, max_steps)
+        snooped = None
+        if snoop:
+            snooped = jaxphoto.snoop(read, max_steps=max_steps, report=status.update)
+        adjusted = snooped.adjusted if snooped else adjust_for_tables(read, max_steps)
         status.update("computing statistics")
         tables = Tables(adjusted, rotations)  # type: ignore[arg-type]
-        verdict = warnings_of(tables)
+        verdict = verdict_of(tables)
+        if snooped:
+            verdict = Verdict.of([*snooped_findings(snooped), *verdict.findings])
         status.update(f"writing {out}")
         times = adjusted.seconds | seconds
         order = ("read", "compile", "solve", "covariance")
-        write_results(tables, verdict, out, {name: times[name] for name in order})
+        with made_whole(out) as work:
+            write_results(tables, verdict, work, {name: times[name] for name in order})
+            if snooped:
+                left_out_table(snooped, read).to_csv(work / "left_out.csv", index=False)
+                write_block(adjusted.block, work / "block")
     print_adjustment(tables, verdict, console)
     console.print(f"results in {out} (open report.html)", highlight=False, markup=False)
-    if not bool(adjusted.converged):
+    if verdict.level == Level.ALARM:
         raise typer.Exit(1)

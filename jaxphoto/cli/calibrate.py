@@ -19,7 +19,7 @@ from jaxphoto.image_measurement.targets import SYNTAX, find_targets, read_board
 from jaxphoto.io import write_block
 from jaxphoto.io.photographs import photographs, sensor_and_interior
 from jaxphoto.procedures.calibration import calibrate, distortion_model, free_parameters
-from jaxphoto.report import check_target, prepare_pictures, print_adjustment, warnings_of
+from jaxphoto.report import check_target, prepare_pictures, print_adjustment, verdict_of
 from jaxphoto.report.calibration import print_calibration, write_calibration
 
 
@@ -81,7 +81,7 @@ def calibrate_command(
             notes=() if pixel_mm is not None else (start.origin,),
         )
     console.print(start.origin, highlight=False, markup=False)
-    print_adjustment(tables, warnings_of(tables), console)
+    print_adjustment(tables, verdict_of(tables), console)
     print_calibration(done, console)
     console.print(f"results in {out} (open report.html and photographs.html)", highlight=False, markup=False)
     if not done.converged:

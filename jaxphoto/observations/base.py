@@ -104,6 +104,11 @@ class AbstractObservations(eqx.Module):
         """The same rows, which count for nothing: what padding is made of."""
         return eqx.tree_at(lambda rows: rows.sigma, self, np.full(np.shape(self.sigmas), np.inf))
 
+    def scaled(self, factor: Float[Numbers, "n"]) -> Self:
+        """The same rows with standard deviations `factor` times as large, one a row."""
+        sigma = still(self.sigmas)
+        return eqx.tree_at(lambda rows: rows.sigma, self, (sigma.T * factor).T)
+
     def indices(self) -> list[tuple[str, Int[Numbers, "..."]]]:
         """What the rows touch, and which: (n,), or more axes where a row touches several."""
         return [

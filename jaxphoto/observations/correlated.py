@@ -62,6 +62,12 @@ class Correlated(AbstractObservations):
         inner = self.rows.with_observation(value.reshape(self.rows.observation.shape))
         return eqx.tree_at(lambda sets: sets.rows, self, inner)
 
+    def scaled(self, factor: Float[Numbers, "sets"]) -> "Correlated":
+        """The same sets with standard deviations `factor` times as large, one factor a set."""
+        f = np.asarray(factor)[:, None, None]
+        where = lambda sets: (sets.covariance, sets.whitener)  # noqa: E731
+        return eqx.tree_at(where, self, (still(self.covariance) * f**2, still(self.whitener) / f))
+
     @property
     def sigmas(self) -> Numbers:
         """(sets, n)."""

@@ -13,6 +13,7 @@ from functools import partial
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool
 
 from jaxphoto.block import Block, Start, direct_exterior, sensor_rows
 from jaxphoto.errors import BlockError
@@ -24,6 +25,8 @@ from jaxphoto.unknowns import Unknowns
 
 _RESECTED = 4  # known points
 _ANGLES = np.deg2rad([1.0, 0.02])  # between rays that make a point: wanted, and just bearable
+# Part of the points that may be where no camera could see them: blunders. Of more, the frame is wrong.
+_BLUNDERS = 0.05
 _MEND = "give their X_m, Y_m, Z_m, omega_deg, phi_deg, kappa_deg in images.csv, or measure more control points in them"
 
 
@@ -79,12 +82,36 @@ class _SoFar:
         if self.resected:
             # Once more with all rays: the points met first were met by few.
             self._intersect(~self.point_given, _ANGLES[-1])
+        self._bring_in_front()
 
     def check(self) -> None:
         if not self.image_known.all():
             raise self._images_left()
         if not self.point_known.all():
             raise self._points_left()
+
+    def _bring_in_front(self) -> None:
+        """Points found behind a camera that measured them, as blunders make it: to where their rays are as deep as
+        others. Adjusted there, their residuals tell which ray is wrong.
+        """
+        known = self.image_known[self.image] & self.point_known[self.point]
+        seen = _in_front(self.block, self.positions, self.matrices, self.points)
+        bad = np.unique(self.point[known & ~seen])
+        bad = bad[~self.point_given[bad]]
+        if not len(bad) or len(bad) > max(1, _BLUNDERS * len(self.points)):
+            return
+        wrong = known & np.isin(self.point, bad)
+        depth = np.linalg.norm(self.points[self.point] - self.positions[self.image], axis=1)
+        usual = np.full(len(self.positions), np.median(depth[known & seen]))
+        for i in np.unique(self.image[wrong]):
+            if (own := known & ~wrong & (self.image == i)).any():
+                usual[i] = np.median(depth[own])
+        image, point = self.image[wrong], self.point[wrong]
+        along = turn_to_object(self.matrices, image, self.rays[wrong])
+        along /= np.linalg.norm(along, axis=1, keepdims=True)
+        ends = self.positions[image] + usual[image, None] * along
+        for p in bad:
+            self.points[p] = ends[point == p].mean(axis=0)
 
     def start(self) -> Start:
         if self.block.start.image_known.all() and self.block.start.point_known.all():
@@ -195,6 +222,19 @@ def _rows_of(rows: ControlRows, wanted):
 
 def _check_in_front(block: Block, positions, matrices, points) -> None:
     image, point = np.asarray(block.image_points.image), np.asarray(block.image_points.point)
+    bad = np.flatnonzero(~_in_front(block, positions, matrices, points))
+    if len(bad):
+        first = bad[0]
+        raise BlockError(
+            f"point {block.points[point[first]]} lies behind image {block.images[image[first]]}, which measured it "
+            f"({len(bad)} of {len(image)} image points are so): check the approximate angles and their units, the "
+            "position of the image, and that the point's coordinates are in the same frame"
+        )
+
+
+def _in_front(block: Block, positions, matrices, points) -> Bool[np.ndarray, "rows"]:
+    """Whether each image row's point lies where its camera could see it."""
+    image, point = np.asarray(block.image_points.image), np.asarray(block.image_points.point)
     to_point = points.take(point, 0) - positions.take(image, 0)
     in_front = np.einsum("ni,ni->n", matrices[:, 2].take(image, 0), to_point) < 0
     for name, interior in block.start.unknowns.interior.items():
@@ -203,14 +243,7 @@ def _check_in_front(block: Block, positions, matrices, points) -> None:
             mine = np.array([camera == name for camera in block.image_camera])[image]
             rays = camera_rays(interior, np.asarray(block.image_points.xy, float)[mine])
             in_front[mine] = np.einsum("ni,ni->n", turn_to_object(matrices, image[mine], rays), to_point[mine]) > 0
-    bad = np.flatnonzero(~in_front)
-    if len(bad):
-        first = bad[0]
-        raise BlockError(
-            f"point {block.points[point[first]]} lies behind image {block.images[image[first]]}, which measured it "
-            f"({len(bad)} of {len(image)} image points are so): check the approximate angles and their units, the "
-            "position of the image, and that the point's coordinates are in the same frame"
-        )
+    return in_front
 
 
 def _few(names, indices) -> str:

@@ -4,15 +4,19 @@ from jaxphoto.procedures.adjust import adjust, adjust_for_tables
 from jaxphoto.procedures.boresight import boresight, step_block
 from jaxphoto.procedures.boresight_judgement import BoresightEstimate, Step, judge
 from jaxphoto.procedures.georeference import Georeferenced, georeference
+from jaxphoto.procedures.snooping import Exchanged, Snooped, snoop
 
 __all__ = [
     "BoresightEstimate",
+    "Exchanged",
     "Georeferenced",
+    "Snooped",
     "Step",
     "adjust",
     "adjust_for_tables",
     "boresight",
     "georeference",
     "judge",
+    "snoop",
     "step_block",
 ]

@@ -10,8 +10,9 @@ import numpy as np
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.observations import AXES
-from jaxphoto.procedures.fit import LEVEL, fit
+from jaxphoto.procedures.fit import fit
 from jaxphoto.statistics import (
+    LEVEL,
     Covariance,
     check_discrepancies,
     chi_square_p,

@@ -12,7 +12,7 @@ from jaxphoto.procedures import Step
 from jaxphoto.report.page import STYLE
 from jaxphoto.report.results import made_whole, versions, write_results, write_summary
 from jaxphoto.report.tables import Tables
-from jaxphoto.report.verdict import warnings_of
+from jaxphoto.report.verdict import verdict_of
 
 _PAGE = """<!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8"><title>{{ title }}</title><style>{{ style }}</style></head><body>
@@ -84,7 +84,7 @@ def write_boresight(steps: tuple[Step, ...], directory: Path, seconds: dict[str,
     with made_whole(directory) as work:
         for step in steps:
             tables = Tables(step.adjusted)
-            verdict, times = warnings_of(tables), step.adjusted.seconds
+            verdict, times = verdict_of(tables), step.adjusted.seconds
             order = ("compile", "solve", "covariance")
             write_results(tables, verdict, work / f"step_{step.number}", {name: times[name] for name in order})
         steps_table(steps).to_csv(work / "steps.csv", index=False)

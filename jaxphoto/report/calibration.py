@@ -15,11 +15,12 @@ from rich.console import Console
 
 from jaxphoto.camera import Sensor
 from jaxphoto.procedures.calibration import Calibration, Detection, rms_px
+from jaxphoto.report.findings import Finding, Level, Verdict
 from jaxphoto.report.page import STYLE
 from jaxphoto.report.plots import new_figure
 from jaxphoto.report.results import made_whole, write_results, write_summary
 from jaxphoto.report.tables import Tables
-from jaxphoto.report.verdict import warnings_of
+from jaxphoto.report.verdict import verdict_of
 
 PICTURES = "photographs"
 _PAGE = """<!DOCTYPE html>
@@ -146,7 +147,8 @@ def write_calibration(
     """
     began = time.perf_counter()
     tables = Tables(calibration.adjusted)
-    verdict = [*notes, *findings(calibration), *warnings_of(tables)]
+    said = [Finding(Level.INFORMATION, text) for text in (*notes, *findings(calibration))]
+    verdict = Verdict.of([*said, *verdict_of(tables).findings])
     times = calibration.adjusted.seconds
     with made_whole(directory) as work:
         write_results(tables, verdict, work, seconds | {k: times[k] for k in ("compile", "solve", "covariance")})

@@ -19,7 +19,7 @@ from jaxphoto.procedures.lidar import LidarControl, Round, Simultaneous
 from jaxphoto.report.plots import new_figure
 from jaxphoto.report.results import made_whole, summary_of, write_results, write_summary
 from jaxphoto.report.tables import Tables
-from jaxphoto.report.verdict import warnings_of
+from jaxphoto.report.verdict import verdict_of
 from jaxphoto.statistics import angle_differences, correlation_matrix
 
 if TYPE_CHECKING:
@@ -160,7 +160,7 @@ def write_simultaneous(result: Simultaneous, directory: Path, seconds: dict[str,
     began = time.perf_counter()
     with made_whole(directory) as work:
         tables = Tables(result.adjusted)
-        verdict, times = warnings_of(tables), result.adjusted.seconds
+        verdict, times = verdict_of(tables), result.adjusted.seconds
         write_results(tables, verdict, work / "adjustment", {name: times[name] for name in _ORDER})
         rounds_table(result.rounds).to_csv(work / "rounds.csv", index=False)
         moved_table(result).to_csv(work / "moved.csv", index=False)

@@ -11,6 +11,7 @@ import pandas as pd
 from jinja2 import Environment
 from markupsafe import Markup
 
+from jaxphoto.report.findings import Verdict
 from jaxphoto.report.plots import check_points_figure, correlation_figure, layout_figure, residuals_figure
 from jaxphoto.report.tables import Tables
 from jaxphoto.statistics import LEAST_CHECKED
@@ -23,15 +24,21 @@ body { font: 15px/1.45 system-ui, sans-serif; max-width: 62rem; margin: 2rem aut
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; margin: .5rem 0 1.5rem; font-size: 13px }
 th, td { padding: .2rem .7rem; border-bottom: 1px solid #ddd; text-align: right } th { background: #f4f4f4 }
 th:first-child, td:first-child { text-align: left } img { max-width: 100% } .wide { overflow-x: auto }
-.good { color: #176b2c } .bad { color: #a11 } .warning { border-left: 4px solid #d90; padding-left: .6rem; margin: .4rem 0 }
+.good { color: #176b2c } .bad { color: #a11 }
+.verdict { font-size: 17px; padding: .4rem .8rem; border-radius: 4px }
+.verdict.green { background: #e2f2e5; color: #124d20 } .verdict.amber { background: #fdf0d5; color: #6b4700 }
+.verdict.red { background: #fbe0e0; color: #7d0d0d }
+.alarm, .warning, .information { border-left: 4px solid #89a; padding-left: .6rem; margin: .4rem 0 }
+.alarm { border-color: #a11 } .warning { border-color: #d90 }
 """
 _PAGE = """<!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8"><title>{{ title }}</title><style>{{ style }}</style></head><body>
 <h1>{{ title }}</h1>
-<p class="{{ 'good' if converged else 'bad' }}"><b>{{ outcome }}</b> ({{ steps }} iterations)</p>
+<p class="verdict {{ verdict.colour }}"><b>{{ verdict.headline }}</b></p>
+{% for f in verdict.findings %}<p class="{{ f.level.name.lower() }}">{{ f.text }}</p>{% endfor %}
+<p>{{ outcome }} ({{ steps }} iterations)</p>
 <p>&sigma;<sub>0</sub> = <b>{{ sigma0 }}</b>, redundancy {{ redundancy }}: {{ counts }}.
 Standard deviations are a posteriori (times &sigma;<sub>0</sub>). Correlations refer to the rotations {{ rotations }}.</p>
-{% for w in warnings %}<p class="warning">{{ w }}</p>{% else %}<p>No warnings.</p>{% endfor %}
 <h2>Interior orientation</h2>{{ interior }}
 {% for figure in correlation %}<img alt="correlations" src="{{ figure }}">{% endfor %}
 {% if georeferencing %}<h2>Mounts and strips</h2>{{ georeferencing }}{% endif %}
@@ -48,7 +55,7 @@ Standard deviations are a posteriori (times &sigma;<sub>0</sub>). Correlations r
 _LARGEST = 20
 
 
-def report_page(tables: Tables, warnings: list[str]) -> str:
+def report_page(tables: Tables, verdict: Verdict) -> str:
     """The whole report as HTML, pictures inside."""
     a = tables.adjusted
     counts = [f"{n} observations of {group.replace('_', ' ')}" for group, n in a.n_observations.items() if n]
@@ -65,14 +72,13 @@ def report_page(tables: Tables, warnings: list[str]) -> str:
         .render(
             style=STYLE,
             title=a.block.title or "jaxphoto adjustment",
-            converged=bool(a.converged),
             outcome=a.outcome.value,
             steps=int(a.steps),
             sigma0=f"{float(a.sigma0):.6g}",
             redundancy=a.redundancy,
             counts=", ".join(counts) + f"; {sum(a.n_unknowns.values())} unknowns",
             rotations=tables.rotations.replace("_", ", "),
-            warnings=warnings,
+            verdict=verdict,
             interior=_html(interior.replace({True: "yes", False: "no", None: ""})),
             correlation=[_picture(correlation_figure(tables, c)) for c in used],
             georeferencing=_html(tables.georeferencing) if len(tables.georeferencing) else "",

@@ -12,6 +12,7 @@ from pathlib import Path
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.camera import model_keys
 from jaxphoto.errors import InputError
+from jaxphoto.report.findings import Verdict
 from jaxphoto.report.page import report_page
 from jaxphoto.report.tables import Tables
 
@@ -46,7 +47,7 @@ def check_target(directory: Path, *inputs: Path) -> None:
         raise InputError(f"{directory} is not empty and holds no earlier results: name a new folder")
 
 
-def write_results(tables: Tables, warnings: list[str], directory: Path, seconds: dict[str, float]) -> None:
+def write_results(tables: Tables, verdict: Verdict, directory: Path, seconds: dict[str, float]) -> None:
     """Write the files of docs/block_folder.md into `directory`, replacing earlier results only when all is written.
 
     `seconds` (read, compile, solve, covariance) goes into summary.json with the time of writing. Raises InputError
@@ -57,8 +58,8 @@ def write_results(tables: Tables, warnings: list[str], directory: Path, seconds:
         in_map = tables.adjusted.block.frame.kind == "epsg"
         for name in (*_TABLES, *(_MAP_TABLES if in_map else ())):
             getattr(tables, name).to_csv(work / f"{name}.csv", index=False)
-        (work / "report.html").write_text(report_page(tables, warnings), encoding="utf-8")
-        summary = summary_of(tables, warnings, seconds | {"write": time.perf_counter() - began})
+        (work / "report.html").write_text(report_page(tables, verdict), encoding="utf-8")
+        summary = summary_of(tables, verdict, seconds | {"write": time.perf_counter() - began})
         write_summary(summary, work)
 
 
@@ -87,12 +88,14 @@ def write_summary(summary: dict, directory: Path) -> None:
     (directory / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
 
 
-def summary_of(tables: Tables, warnings: list[str], seconds: dict[str, float]) -> dict:
+def summary_of(tables: Tables, verdict: Verdict, seconds: dict[str, float]) -> dict:
     """What summary.json says."""
     adjusted = tables.adjusted
     observations, unknowns = adjusted.n_observations, adjusted.n_unknowns
     return {
         "title": adjusted.block.title,
+        "verdict": verdict.colour,
+        "findings": [{"level": f.level.name.lower(), "text": f.text} for f in verdict.findings],
         "converged": bool(adjusted.converged),
         "outcome": adjusted.outcome.value,
         "sigma0": float(adjusted.sigma0),
@@ -104,7 +107,6 @@ def summary_of(tables: Tables, warnings: list[str], seconds: dict[str, float]) -
         "cameras": _cameras(adjusted),
         "georeferencing": {p: {"value": v, "sigma": s} for p, v, s in tables.georeferencing.itertuples(index=False)},
         "seconds": {name: round(value, 6) for name, value in seconds.items()},
-        "warnings": warnings,
         "versions": versions(),
     }
 

@@ -14,15 +14,18 @@ from jaxphoto.compiling import call_compiled
 from jaxphoto.observations import AXES
 from jaxphoto.rotation import omega_phi_kappa_from_matrix
 from jaxphoto.statistics import (
+    BlunderTest,
     Correlations,
     Covariance,
     Redundancy,
     Rotations,
     Significance,
     a_priori_sigmas,
+    blunder_test,
     check_discrepancies,
     correlations,
     covariance,
+    detectable_errors,
     normalised_residuals,
     observation_groups,
     physical_residuals,
@@ -31,6 +34,11 @@ from jaxphoto.statistics import (
     residual_spread,
     significance,
 )
+
+
+def in_file_unit(unit: str) -> tuple[float, str]:
+    """What numbers are multiplied by to be shown, and the name of the unit they are shown in: degrees for rad."""
+    return (180 / np.pi, "deg") if unit == "rad" else (1.0, unit)
 
 
 class Tables:
@@ -60,6 +68,11 @@ class Tables:
     def w(self) -> Residuals:
         """Normalised residual of every observation."""
         return normalised_residuals(self.adjusted, self.redundancy)
+
+    @cached_property
+    def blunders(self) -> BlunderTest:
+        """Every normalised residual against the critical value of all together."""
+        return blunder_test(self.adjusted, self.redundancy)
 
     @cached_property
     def correlations(self) -> dict[str, Correlations]:
@@ -143,10 +156,12 @@ class Tables:
 
     @cached_property
     def residuals(self) -> pd.DataFrame:
-        """One row an observation: group, image, point, axis, residual, sigma, unit, redundancy_number, w.
+        """One row an observation: group, image, point, axis, residual, sigma, unit, redundancy_number, w, detectable.
 
-        `sigma` is a priori; `w` is the residual over its own standard deviation, sigma0 sigma sqrt(redundancy_number).
+        `sigma` is a priori; `w` is the residual over its own standard deviation, sigma0 sigma sqrt(redundancy_number);
+        `detectable` is the least error in it alone that the test of w finds with a probability of 80 %.
         """
+        detectable = detectable_errors(self.adjusted, self.redundancy)
         residual, sigma = physical_residuals(self.adjusted), a_priori_sigmas(self.adjusted)
         block, s = self.adjusted.block, self.adjusted.structure
         labels = np.full(len(self.adjusted.values.shared), "", object)
@@ -157,7 +172,7 @@ class Tables:
             # Rows run along the last axis; the components of a row stand together.
             flat = lambda x, shape=v.shape: np.broadcast_to(np.asarray(x), shape).T.ravel()  # noqa: E731
             axis, parameter = flat(rows.axis_names()), flat(rows.names_of("parameter", labels))
-            factor, unit = (180 / np.pi, "deg") if rows.unit == "rad" else (1.0, rows.unit)
+            factor, unit = in_file_unit(rows.unit)
             columns = {
                 "group": group,
                 "image": flat(rows.names_of("image", block.images)),
@@ -168,6 +183,7 @@ class Tables:
                 "unit": unit,
                 "redundancy_number": flat(self.redundancy[group]),
                 "w": flat(self.w[group]),
+                "detectable": factor * flat(detectable[group]),
             }
             if v.size:
                 frames.append(pd.DataFrame(columns))

@@ -4,29 +4,34 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from jaxphoto.report.findings import Level, Verdict
 from jaxphoto.report.tables import Tables
 from jaxphoto.statistics import residual_spread
 
-_WARNINGS = 12
+_FINDINGS = 12
+_COLOURS = {Level.INFORMATION: "green", Level.WARNING: "yellow", Level.ALARM: "red"}
+_MARKS = {Level.INFORMATION: "-", Level.WARNING: "!", Level.ALARM: "!!"}
 _PARAMETERS = 18
 
 
-def print_adjustment(tables: Tables, warnings: list[str], console: Console) -> None:
-    """Print the outcome of an adjustment, what to worry about, and the interior orientation with its sigmas."""
+def print_adjustment(tables: Tables, verdict: Verdict, console: Console) -> None:
+    """Print the verdict on an adjustment with its reasons, and the interior orientation with its sigmas."""
     adjusted = tables.adjusted
-    colour = "green" if bool(adjusted.converged) else "red"
     n, u = sum(adjusted.n_observations.values()), sum(adjusted.n_unknowns.values())
     console.print(f"[bold]{escape(adjusted.block.title)}[/bold]" if adjusted.block.title else "[bold]block[/bold]")
-    console.print(f"[{colour}]{adjusted.outcome.value}[/{colour}] ({int(adjusted.steps)} iterations)")
+    colour = _COLOURS[verdict.level]
+    console.print(f"[bold {colour}]{verdict.headline}[/bold {colour}]", highlight=False)
+    for finding in verdict.findings[:_FINDINGS]:
+        mark = _COLOURS[finding.level]
+        console.print(f"[{mark}]{_MARKS[finding.level]}[/{mark}] {escape(finding.text)}", highlight=False)
+    if len(verdict.findings) > _FINDINGS:
+        console.print(f"and {len(verdict.findings) - _FINDINGS} more in report.html")
+    console.print(f"{adjusted.outcome.value} ({int(adjusted.steps)} iterations)", highlight=False)
     console.print(
         f"sigma0 [bold]{float(adjusted.sigma0):.6g}[/bold]   redundancy {adjusted.redundancy} = {n} observations"
         + (f" + {adjusted.n_constraints} constraints" if adjusted.n_constraints else "")
         + f" - {u} unknowns"
     )
-    for warning in warnings[:_WARNINGS]:
-        console.print(f"[yellow]![/yellow] {escape(warning)}", highlight=False)
-    if len(warnings) > _WARNINGS:
-        console.print(f"[yellow]![/yellow] and {len(warnings) - _WARNINGS} more in report.html")
     if tables.significance:
         table = Table(
             "camera", "parameter", "value", "sigma", "|value| / sigma", "p", title="interior orientation (a posteriori)"

@@ -1,46 +1,160 @@
-"""What a person should know first: warnings about an adjustment, most serious first, each with what to do."""
+"""What a person should know first: findings about an adjustment, the worst first, each with what to do.
+
+Red, amber or green follows from tests, not from convergence: of sigma naught as a whole and by group, of every
+normalised residual (`statistics.blunder_test`), of what the geometry leaves open.
+"""
+
+from collections.abc import Iterator
 
 import equinox as eqx
 import jax
 import numpy as np
 
 from jaxphoto.adjustment import Adjustment
+from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
 from jaxphoto.block import Block
 from jaxphoto.camera import Sensor
 from jaxphoto.compiling import call_compiled
-from jaxphoto.report.tables import Tables
+from jaxphoto.report.findings import Finding, Level, Verdict
+from jaxphoto.report.tables import Tables, in_file_unit
 from jaxphoto.report.weakness import weaknesses
-from jaxphoto.statistics import LEAST_CHECKED, SIGNIFICANT_RATIO, Correlations
+from jaxphoto.statistics import LEVEL, Correlations, Significance, global_test, group_factors, if_zero, worst_checked
 
 HIGH_CORRELATION = 0.9
 HIGH_OWN_CORRELATION = 0.95
-LARGE_W = 4.0
-_SHOWN = 4
+NOTHING_FITS = 3.0
+"""A rejected sigma naught above this is no question of weights: something is wrong."""
+_SHOWN = 3
 
 
-def warnings_of(tables: Tables) -> list[str]:
-    """Non-convergence, weaknesses, high correlations, insignificant IOP, large residuals, range of the distortion."""
-    adjusted, found = tables.adjusted, []
+def verdict_of(tables: Tables) -> Verdict:
+    """Convergence, sigma naught, blunders, weaknesses, high correlations, what may be zero, what no test finds."""
+    return Verdict.of(_findings(tables))
+
+
+def _findings(tables: Tables) -> Iterator[Finding]:
+    adjusted = tables.adjusted
     if not bool(adjusted.converged):
-        found.append(adjusted.outcome.value)
+        yield Finding(Level.ALARM, adjusted.outcome.value)
+        if names := [adjusted.block.points[p] for p in np.flatnonzero(adjusted.astray)]:
+            yield Finding(Level.ALARM, f"gone astray: point {_few(names)}")
+        # Nothing that is said of an optimum holds elsewhere.
+        return
+    yield from _global_test(tables)
+    yield from _blunders(tables)
     for camera, c in tables.correlations.items():
         weak = weaknesses(tables, camera, c)
-        found += [w.sentence for w in weak]
-        found += _correlated(camera, c, frozenset().union(*(w.explains for w in weak)), _all_known(adjusted.block))
-    found += [
-        f"{s.parameter} of camera {s.camera} is not significant: |value| is {s.ratio:.1f} sigma (asked: "
-        f"{SIGNIFICANT_RATIO:.0f}; t-test p = {s.p_value:.2g}); consider holding it fixed"
-        for s in tables.significance
-        if not s.significant
-    ]
-    found += _large_residuals(tables)
-    found += [
-        f"camera {name}: its distortion folds inside the format; image points beyond the fold mean nothing, use fewer "
-        "coefficients or more points in the corners"
-        for name, sensor in adjusted.block.sensors.items()
-        if _folds(adjusted, name, sensor)
-    ]
-    return found
+        yield from (Finding(Level.WARNING, w.sentence) for w in weak)
+        yield from _correlated(camera, c, frozenset().union(*(w.explains for w in weak)), _all_known(adjusted.block))
+    yield from (_not_significant(tables, s) for s in tables.significance if not s.significant)
+    for name, sensor in adjusted.block.sensors.items():
+        if _folds(adjusted, name, sensor):
+            yield Finding(
+                Level.WARNING,
+                f"camera {name}: its distortion folds inside the format; image points beyond the fold mean nothing, "
+                "use fewer coefficients or more points in the corners",
+            )
+    yield from _unchecked(tables)
+
+
+def _few(names: list[str]) -> str:
+    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+    return ", ".join(names[:_SHOWN]) + more
+
+
+def _global_test(tables: Tables) -> Iterator[Finding]:
+    """Sigma naught against 1, and which groups of observations it comes from."""
+    whole = global_test(tables.adjusted)
+    if whole.redundancy <= 0:
+        yield Finding(
+            Level.WARNING,
+            "the redundancy is 0: nothing checks anything, and standard deviations rest on those that were given; "
+            "add observations",
+        )
+        return
+    if whole.p_value >= LEVEL:
+        return
+    factors = [f for f in group_factors(tables.adjusted, tables.redundancy) if f.p_value < LEVEL]
+    groups = ", ".join(f"{f.group.replace('_', ' ')} {f.sigma:.2f}" for f in factors)
+    of_groups = f"; by group of observations: {groups}" if groups else ""
+    said = f"sigma naught {whole.sigma:.3g}, expected 1 (p = {whole.p_value:.1g})"
+    if whole.factor < 1:
+        yield Finding(
+            Level.WARNING,
+            f"{said}: residuals are smaller than the standard deviations that were given{of_groups}; those are too "
+            "large, and where they are not all so by the same factor, the weights are wrong: correct them",
+        )
+    elif whole.sigma <= NOTHING_FITS:
+        yield Finding(
+            Level.WARNING,
+            f"{said}: residuals are larger than the standard deviations that were given{of_groups}; these are "
+            "too small, or there are blunders, or the camera model lacks something",
+        )
+    else:
+        yield Finding(
+            Level.ALARM,
+            f"{said}: the observations contradict one another or the model{of_groups}; look at approximate values, "
+            "units, point ids and the largest residuals",
+        )
+
+
+def _blunders(tables: Tables) -> Iterator[Finding]:
+    """The likeliest culprit first: of several, all but the first may be innocent."""
+    suspects = tables.blunders.suspects
+    for s in suspects[:_SHOWN]:
+        factor, unit = in_file_unit(s.unit)
+        yield Finding(
+            Level.ALARM,
+            f"{s.words} contradicts the other observations: if it alone is wrong, by {factor * s.error:+.3g} +- "
+            f"{factor * s.sigma:.2g} {unit} (w {s.w:.1f}, critical {tables.blunders.limit:.1f})",
+        )
+    if len(suspects) > _SHOWN:
+        yield Finding(
+            Level.ALARM,
+            f"{len(suspects)} of {tables.blunders.n} observations are beyond the critical value; a blunder spoils what "
+            "is beside it: jaxphoto adjust --snoop finds those that must go",
+        )
+
+
+def _not_significant(tables: Tables, s: Significance) -> Finding:
+    """What holding a parameter at zero would change, for whoever wants fewer of them."""
+    adjusted = tables.adjusted
+    change = if_zero(adjusted, tables.covariance, s)
+    sensor = adjusted.block.sensors[s.camera]
+    others = {name: abs(v) for name, v in change.in_sigmas.items() if name != s.parameter}
+    most = max(others, key=lambda name: others[name], default="")
+    moved = f"{most} by {others[most]:.1f} of its sigma and " if most else ""
+    pixels = f"{change.corner_mm / sensor.pixel_mm:.2g} px" if sensor.pixel_mm else f"{change.corner_mm:.2g} mm"
+    return Finding(
+        Level.INFORMATION,
+        f"{s.parameter} of camera {s.camera} may be zero (p = {s.p_value:.2g}); held there, it would move {moved}the "
+        f"corner of the image by {pixels}",
+    )
+
+
+def _unchecked(tables: Tables) -> Iterator[Finding]:
+    """What no test could find: points of two rays, and how large an error of each further group may stay hidden."""
+    adjusted = tables.adjusted
+    rays = np.bincount(adjusted.structure.point, minlength=len(adjusted.block.points))
+    if twice := int((rays == 2).sum()):
+        yield Finding(
+            Level.INFORMATION,
+            f"{twice} of {len(rays)} points are in two images only: an error along the plane of their rays shows "
+            "nowhere",
+        )
+    for hidden in worst_checked(adjusted, tables.redundancy):
+        if hidden.group != IMAGE_POINTS and hidden.detectable > _HIDDEN * hidden.sigma:
+            factor, unit = in_file_unit(hidden.unit)
+            size = f"of {factor * hidden.detectable:.2g} {unit}" if np.isfinite(hidden.detectable) else "of any size"
+            yield Finding(
+                Level.INFORMATION,
+                f"{hidden.words}: an error {size} would be found with a probability of 80 % only, a smaller one less "
+                f"often (its sigma is {factor * hidden.sigma:.2g} {unit})",
+            )
+
+
+# An observation whose detectable error is more than this times its sigma is checked by hardly anything (r < 0.17).
+_HIDDEN = 10.0
 
 
 def _all_known(block: Block) -> bool:
@@ -48,12 +162,11 @@ def _all_known(block: Block) -> bool:
     return len(np.union1d(block.control.who, block.fixed.who)) == len(block.points)
 
 
-def _correlated(camera: str, c: Correlations, explained: frozenset[tuple[str, str]], field: bool) -> list[str]:
+def _correlated(camera: str, c: Correlations, explained: frozenset[tuple[str, str]], field: bool) -> Iterator[Finding]:
     """High correlations, but for the pairs of exterior and interior orientation that are `explained` already.
 
     What cures them depends on whether all images show a `field` of known targets.
     """
-    found = []
     cure = "add cross strips, control or height differences"
     usual = "usual without camera stations or attitudes, their effects on the ground cancel"
     if field:
@@ -65,43 +178,33 @@ def _correlated(camera: str, c: Correlations, explained: frozenset[tuple[str, st
         for j in range(i)
         if abs(c.interior[i, j]) > HIGH_CORRELATION
     ]
-    for _, rho, a, b in sorted(pairs, reverse=True)[:_SHOWN]:
-        found.append(
-            f"high correlation of {a} and {b} of camera {camera}: {rho:+.3f}; a combination of them is better known"
+    if pairs:
+        names = _few([f"{a} and {b} {rho:+.3f}" for _, rho, a, b in sorted(pairs, reverse=True)])
+        yield Finding(
+            Level.INFORMATION,
+            f"high correlation within the interior orientation of camera {camera}: {names}; a change of one makes good "
+            "for the other, and only together they mean much",
         )
     if len(c.images) == 0:
-        return found
+        return
     told = [[(e, p) in explained for p in c.parameters] for e in c.eop_names]
     worst = np.where(np.reshape(told, c.max_abs.shape), 0.0, c.max_abs)
-    for i, j in sorted(np.argwhere(worst > HIGH_CORRELATION).tolist(), key=lambda k: -worst[k[0], k[1]])[:_SHOWN]:
-        image = c.images[int(np.abs(c.exterior[:, i, j]).argmax())]
-        found.append(
-            f"high correlation of {c.eop_names[i]} with {c.parameters[j]} of camera {camera}: up to {worst[i, j]:.3f} "
-            f"(image {image}); {cure}"
+    high = sorted(np.argwhere(worst > HIGH_CORRELATION).tolist(), key=lambda k: -worst[k[0], k[1]])
+    if high:
+        images = [c.images[int(np.abs(c.exterior[:, i, j]).argmax())] for i, j in high]
+        where = zip(high, images, strict=True)
+        names = _few([f"{c.eop_names[i]} with {c.parameters[j]} {worst[i, j]:.3f} (image {k})" for (i, j), k in where])
+        yield Finding(
+            Level.WARNING,
+            f"high correlation of exterior with interior orientation of camera {camera}: {names}; {cure}",
         )
     own = np.abs(c.within_image).max(axis=0)
     strong = [(own[i, j], i, j) for i in range(6) for j in range(i) if own[i, j] > HIGH_OWN_CORRELATION]
     if strong:
-        names = ", ".join(f"{c.eop_names[j]} and {c.eop_names[i]} (up to {r:.3f})" for r, i, j in sorted(strong)[::-1])
-        found.append(f"exterior orientation of single images is highly correlated: {names}; {usual}")
-    return found
-
-
-def _large_residuals(tables: Tables) -> list[str]:
-    residuals = tables.residuals
-    checked = (residuals["group"] == "image_points") & (residuals["redundancy_number"] > LEAST_CHECKED)
-    found = residuals[checked & (residuals["w"].abs() > LARGE_W)]
-    # A point in an image is one blunder, whichever of its coordinates shows it.
-    by_image_point = found["w"].abs().groupby([found["point"], found["image"]], sort=False)
-    large = by_image_point.max().sort_values(ascending=False)
-    if not len(large):
-        return []
-    shown = large.head(_SHOWN)
-    names = ", ".join(
-        f"point {where[0]} in image {where[1]} ({w:.1f})" for where, w in zip(shown.index.tolist(), shown, strict=True)
-    )
-    count = "1 image point has a residual" if len(large) == 1 else f"{len(large)} image points have residuals"
-    return [f"{count} over {LARGE_W:.0f} of its own standard deviations: {names}; look for blunders"]
+        names = _few([f"{c.eop_names[j]} and {c.eop_names[i]} (up to {r:.3f})" for r, i, j in sorted(strong)[::-1]])
+        yield Finding(
+            Level.INFORMATION, f"exterior orientation of single images is highly correlated: {names}; {usual}"
+        )
 
 
 def _folds(adjusted: Adjustment, name: str, sensor: Sensor) -> bool:

@@ -14,13 +14,9 @@ from jaxphoto.adjustment import Adjustment
 from jaxphoto.errors import InputError
 from jaxphoto.observations import AbstractObservations, Correlated, StationRows
 from jaxphoto.sensitivity.exact import Sensitivity
-from jaxphoto.statistics import covariance, error_precision, observation_groups, redundancy_numbers
+from jaxphoto.statistics import DELTA0, covariance, detectable_errors, observation_groups, redundancy_numbers
 
 Per = Literal["block", "strip", "image"]
-DELTA0 = 4.13
-"""Shift of a normalised residual that a test of level 0.1 % finds with a power of 80 %."""
-# Below this redundancy number nothing checks an observation.
-_UNCHECKED = 1e-6
 
 
 class StationBias(eqx.Module):
@@ -117,10 +113,8 @@ def external_reliability(adjusted: Adjustment, derivatives: Sensitivity, delta0:
         raise InputError(f"delta0 is the shift that a test detects, a positive number, not {delta0}")
     numbers = redundancy_numbers(adjusted, covariance(adjusted))
     detectable, effect = {}, {}
-    for name, variance in error_precision(adjusted, numbers).items():
-        checked = _in_rows(np.asarray(numbers[name])) > _UNCHECKED
-        known = np.where(checked, _in_rows(variance), 1.0)
-        detectable[name] = np.where(checked, delta0 / np.sqrt(known), np.inf)
+    for name, errors in detectable_errors(adjusted, numbers, delta0).items():
+        detectable[name] = _in_rows(errors)
         a = derivatives.groups[name]
         effect[name] = np.multiply(a, detectable[name], out=np.zeros_like(a), where=a != 0)
     return ExternalReliability(detectable, effect, delta0)

@@ -1,5 +1,16 @@
 """What an adjustment is worth: covariance, correlation, reliability, significance, discrepancies."""
 
+from jaxphoto.statistics.blunder_test import (
+    DELTA0,
+    LEVEL,
+    BlunderTest,
+    Hidden,
+    Suspect,
+    blunder_test,
+    critical_w,
+    detectable_errors,
+    worst_checked,
+)
 from jaxphoto.statistics.correlation import Correlations, correlation_matrix, correlations
 from jaxphoto.statistics.covariance import EOP_NAMES, Covariance, Rotations, covariance
 from jaxphoto.statistics.discrepancy import (
@@ -13,6 +24,7 @@ from jaxphoto.statistics.discrepancy import (
     residual_spread,
     spread_of,
 )
+from jaxphoto.statistics.global_test import VarianceFactor, global_test, group_factors
 from jaxphoto.statistics.reliability import (
     LEAST_CHECKED,
     Redundancy,
@@ -22,17 +34,20 @@ from jaxphoto.statistics.reliability import (
     redundancy_numbers,
 )
 from jaxphoto.statistics.significance import (
-    SIGNIFICANT_RATIO,
+    SIGNIFICANCE_LEVEL,
+    IfZero,
     Significance,
     chi_square_p,
-    critical_value,
+    if_zero,
     significance,
 )
 
 __all__ = [
-    "EOP_NAMES", "LEAST_CHECKED", "SIGNIFICANT_RATIO", "Correlations", "Covariance", "Redundancy", "Rotations",
-    "Significance", "Spread", "a_priori_sigmas", "angle_differences", "check_discrepancies", "chi_square_p",
-    "correlation_matrix", "correlations", "covariance", "critical_value", "error_precision", "normalised_residuals",
-    "observation_groups", "physical_residuals", "point_differences", "prepare_statistics", "redundancy_numbers",
-    "residual_spread", "significance", "spread_of",
+    "DELTA0", "EOP_NAMES", "LEAST_CHECKED", "LEVEL", "SIGNIFICANCE_LEVEL", "BlunderTest", "Correlations", "Covariance",
+    "Hidden", "IfZero", "Redundancy", "Rotations", "Significance", "Spread", "Suspect", "VarianceFactor",
+    "a_priori_sigmas", "angle_differences", "blunder_test", "check_discrepancies", "chi_square_p",
+    "correlation_matrix", "correlations", "covariance", "critical_w", "detectable_errors", "error_precision",
+    "global_test", "group_factors", "if_zero", "normalised_residuals", "observation_groups", "physical_residuals",
+    "point_differences", "prepare_statistics", "redundancy_numbers", "residual_spread", "significance", "spread_of",
+    "worst_checked",
 ]  # fmt: skip

@@ -69,9 +69,9 @@ class Covariance(eqx.Module):
 
     def _sigma(self, variance: Numbers) -> Any:
         xp = jnp if isinstance(variance * self.variance_factor, jax.Array) else np
-        # Double where: the root of what is fixed, zero, has no derivative.
-        free = variance > 0
-        return xp.where(free, xp.sqrt(xp.where(free, variance, 1.0) * self.variance_factor), 0.0)
+        # Double where: the root of what is fixed, zero, has no derivative. What is no number stays none.
+        fixed = variance == 0
+        return xp.where(fixed, 0.0, xp.sqrt(xp.where(fixed, 1.0, variance) * self.variance_factor))
 
 
 def covariance(adjusted: Adjustment, rotations: Rotations = "omega_phi_kappa") -> Covariance:

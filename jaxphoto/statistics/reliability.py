@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxphoto.adjustment import Adjustment, NormalEquations
-from jaxphoto.adjustment.model.numbers import Residuals
+from jaxphoto.adjustment.model.numbers import IMAGE_POINTS, Residuals
 from jaxphoto.arrays import Numbers, still
 from jaxphoto.compiling import prepare, run_compiled
 from jaxphoto.observations import Correlated
@@ -27,8 +27,8 @@ from jaxphoto.statistics.discrepancy import observation_groups
 
 LEAST_CHECKED = 0.01
 """Redundancy number below which a normalised residual is mostly rounding and judges nothing."""
-# Below this redundancy number an observation is not checked at all: no normalised residual is given.
-_UNCHECKED = 1e-6
+UNCHECKED = 1e-6
+"""Redundancy number below which an observation is not checked at all: it has no normalised residual."""
 
 
 def prepare_statistics(equations: NormalEquations, seconds: dict[str, float]) -> None:
@@ -40,7 +40,8 @@ def prepare_statistics(equations: NormalEquations, seconds: dict[str, float]) ->
     s, v = equations.structure, equations.values
     n = 6 * s.n_images + s.n_shared
     at_points = ((g.components, g.components, *np.shape(jax.tree.leaves(g.own)[0])[-2:]) for g in s.with_shared)
-    shapes = (n, n), (s.n_points, 3, 3), v.xy.shape, *at_points
+    chunks, tiles, _, *slots = v.xy.shape
+    shapes = (n, n), (s.n_points, 3, 3), (chunks, tiles, 3, *slots), *at_points
     reduced, points, image, *others = (np.broadcast_to(0.0, shape) for shape in shapes)
     cofactors, rows = (reduced, points), RowCofactors(image, tuple(others))  # type: ignore[arg-type]
     prepare(_row_variances, (equations, Cofactors._make(cofactors), rows), seconds)
@@ -51,7 +52,7 @@ class Redundancy(eqx.Module):
 
     numbers: Residuals
     blocks: dict[str, Float[np.ndarray, "_ _ _"]]
-    """I - J Q J' (rows, c, c) of the whitened numbers of each row, where rows are correlated within themselves."""
+    """I - J Q J' (rows, c, c) of the whitened numbers of each row, by group."""
 
     @property
     def image(self) -> Float[Numbers, "2 rows"]:
@@ -83,13 +84,15 @@ def redundancy_numbers(adjusted: Adjustment, covariance: Covariance) -> Redundan
         seen = adjusted.tiled.crop_rows(dataclasses.replace(g, scalar=False), flat)
         block = np.eye(c) - seen.reshape(c, c, -1).transpose(2, 0, 1)
         numbers = np.diagonal(block, axis1=1, axis2=2).T
+        blocks[g.name] = block
         if isinstance(rows, Correlated):
-            blocks[g.name], w = block, np.asarray(rows.whitener)
+            w = np.asarray(rows.whitener)
             numbers = np.einsum("nij,njk,nki->in", np.linalg.inv(w), block, w)
         found.append(numbers[0] if g.scalar else numbers)
     whole = dataclasses.replace(adjusted.residuals, others=tuple(found), datum=np.zeros(adjusted.n_constraints))
-    image = adjusted.tiled.crop_image(1 - still(image))
-    return Redundancy(dataclasses.replace(whole, image=image), blocks)
+    x, y, both = adjusted.tiled.crop_image(image)
+    blocks = {IMAGE_POINTS: np.eye(2) - np.array([[x, both], [both, y]]).transpose(2, 0, 1), **blocks}
+    return Redundancy(dataclasses.replace(whole, image=1 - np.stack([x, y])), blocks)
 
 
 def normalised_residuals(adjusted: Adjustment, redundancy: Redundancy) -> Residuals:
@@ -107,7 +110,7 @@ def normalised_residuals(adjusted: Adjustment, redundancy: Redundancy) -> Residu
             weighed = weighed.reshape(v.shape)
         else:
             weighed = v / np.asarray(rows.sigmas).T
-        checked = r > _UNCHECKED
+        checked = r > UNCHECKED
         return np.where(checked, weighed / (sigma0 * np.sqrt(np.where(checked, precision[name], 1.0))), np.nan)
 
     groups, residuals = observation_groups(adjusted), adjusted.residuals.named

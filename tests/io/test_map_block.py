@@ -13,7 +13,7 @@ from jaxphoto.errors import BlockError, InputError
 from jaxphoto.georeferencing import Corrections
 from jaxphoto.io import read_block, write_block
 from jaxphoto.observations import PointRows, StationRows, correlated
-from jaxphoto.report import Tables, write_results
+from jaxphoto.report import Tables, Verdict, write_results
 from jaxphoto.rotation import matrix_from_omega_phi_kappa, matrix_from_roll_pitch_yaw
 from tests.blocks import adjusted, simulated
 
@@ -266,7 +266,7 @@ def test_an_adjustment_does_not_depend_on_the_system_of_the_files(tmp_path):
     np.testing.assert_allclose(in_utm.unknowns.exterior.position, expected.exterior.position, rtol=0, atol=1e-5)
     np.testing.assert_allclose(in_utm.unknowns.points, expected.points, rtol=0, atol=1e-5)
 
-    write_results(Tables(in_utm), [], tmp_path / "results", {})
+    write_results(Tables(in_utm), Verdict(()), tmp_path / "results", {})
     exterior = pd.read_csv(tmp_path / "results" / "exterior_map.csv")
     assert list(exterior) == ["image", "E_m", "N_m", "H_m", "omega_deg", "phi_deg", "kappa_deg"]
     start = pd.read_csv(tmp_path / "utm" / "images.csv")

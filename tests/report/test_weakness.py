@@ -8,7 +8,7 @@ import pytest
 
 from jaxphoto import Tables, adjust
 from jaxphoto.observations import StationRows
-from jaxphoto.report import verdict, warnings_of
+from jaxphoto.report import verdict, verdict_of
 from tests.blocks import BROWN, CONTROL, Scene, Simulated, adjusted, aerial, all_stations, bare, free, measured, rows
 
 
@@ -30,7 +30,7 @@ def test_a_field_of_known_targets_has_cures_of_its_own(monkeypatch):
     control = rows(range(len(free_network.block.points)), sigma=0.001)
     control = dataclasses.replace(control, value=np.asarray(free_network.unknowns.points)[control.who, control.axis])
     field = dataclasses.replace(free_network.block, control=control)
-    of_network, of_field = ("; ".join(warnings_of(Tables(a))) for a in (free_network, adjust(field)))
+    of_network, of_field = ("; ".join(verdict_of(Tables(a)).texts) for a in (free_network, adjust(field)))
     assert "add cross strips" in of_network and "targets alone" not in of_network
     assert "turned by 90 degrees" in of_field and "targets alone" in of_field and "add cross strips" not in of_field
 
@@ -40,7 +40,7 @@ def weak(warnings):
 
 
 def test_flat_ground_without_stations_is_put_into_words():
-    found = warnings_of(tables(0.1, False))
+    found = verdict_of(tables(0.1, False)).texts
     c, point = weak(found)
     assert found[:2] == [c, point]
     assert c.startswith("c of camera one")
@@ -61,19 +61,19 @@ def test_flat_ground_without_stations_is_put_into_words():
 
 
 def test_stations_cure_it():
-    found = warnings_of(tables(0.1, True))
+    found = verdict_of(tables(0.1, True)).texts
     assert not weak(found)
     sigma = [next(s.sigma for s in tables(0.1, stations).significance if s.parameter == "c_mm") for stations in (0, 1)]
     assert sigma[0] > 50 * sigma[1]
 
 
 def test_relief_cures_it():
-    assert not weak(warnings_of(tables(2.0, False)))
+    assert not weak(verdict_of(tables(2.0, False)).texts)
 
 
 @pytest.mark.slow
 def test_a_held_c_is_not_complained_of():
-    (only,) = weak(warnings_of(tables(0.1, False, ("xp_mm", "yp_mm"))))
+    (only,) = weak(verdict_of(tables(0.1, False, ("xp_mm", "yp_mm"))).texts)
     assert "principal point" in only
 
 
@@ -83,6 +83,6 @@ def test_stations_along_some_axes_cure_what_these_see(axes):
     made = tables(0.1, True).adjusted.block
     keep = np.isin(made.stations.axis, axes)
     part = dataclasses.replace(made, stations=made.stations.take(keep))
-    found = weak(warnings_of(Tables(adjust(part))))
+    found = weak(verdict_of(Tables(adjust(part))).texts)
     assert len(found) == 1
     assert ("c of camera" in found[0]) is (axes == (0, 1))

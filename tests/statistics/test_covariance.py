@@ -8,7 +8,7 @@ from scipy import stats
 from jaxphoto import covariance
 from jaxphoto.camera import get_parameter
 from jaxphoto.rotation import omega_phi_kappa_from_matrix, small_rotation
-from jaxphoto.statistics import EOP_NAMES, SIGNIFICANT_RATIO, correlation_matrix, correlations, significance
+from jaxphoto.statistics import EOP_NAMES, correlation_matrix, correlations, significance
 from jaxphoto.statistics.significance import student_p
 from tests.blocks import adjusted, covariance_of
 from tests.checked_types import unchecked
@@ -117,8 +117,9 @@ def test_significance():
         value = float(get_parameter(a.unknowns.interior[t.camera], t.parameter))
         assert (t.value, t.sigma) == (value, sigma)
         assert t.ratio == pytest.approx(abs(value) / sigma)
-        assert t.significant == (abs(value) >= SIGNIFICANT_RATIO * sigma)
-        assert t.p_value == pytest.approx(2 * stats.t.sf(abs(value) / sigma, a.redundancy), rel=1e-9, abs=1e-300)
+        p = 2 * stats.t.sf(abs(value) / sigma, a.redundancy)
+        assert t.p_value == pytest.approx(p, rel=1e-9, abs=1e-300)
+        assert t.significant == (p < 0.05)
     assert {t.significant for t in tests} == {True, False}
 
 

@@ -30,7 +30,7 @@ def test_significance_is_the_ratio_to_the_a_posteriori_sigma():
     values = [interior.c, interior.x_p, interior.y_p, interior.distortion.k1, interior.distortion.k2]
     for test, value, s in zip(tests.values(), values, sigma, strict=True):
         assert test.ratio == pytest.approx(abs(float(value)) / s, rel=1e-12)
-        assert test.significant == (abs(float(value)) >= 10 * s)
+        assert test.significant == (abs(float(value)) >= stats.t.ppf(0.975, result.redundancy) * s)
 
 
 def test_correlations_are_scaled_covariances_of_the_named_unknowns():

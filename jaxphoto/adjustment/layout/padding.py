@@ -50,11 +50,11 @@ class TiledBlock(NamedTuple):
         return crop_rows(group, numbers, self.places)
 
     def crop_image(self, image: Any) -> np.ndarray:
-        """Numbers of the slots of tiles (chunks, tiles, 2, m, p) by image row of the block (2, rows)."""
+        """Numbers of the slots of tiles (chunks, tiles, k, m, p) by image row of the block (k, rows)."""
         image = still(image)
-        chunks, tiles, _, m, p = image.shape
+        chunks, tiles, k, m, p = image.shape
         tile, slot = np.divmod(self.places.row, m * p)
-        return image.reshape(chunks * tiles, 2, m * p)[tile, :, slot].T
+        return image.reshape(chunks * tiles, k, m * p)[tile, :, slot].T
 
     def crop_reduced(self, matrix: Any) -> np.ndarray:
         """A matrix over the reduced unknowns (6 an image, then the shared ones) in the block's own sizes and order."""

@@ -19,7 +19,7 @@ from jaxtyping import Int
 
 from jaxphoto.adjustment.model.parameter_tables import JointPrior, ParameterTable
 from jaxphoto.arrays import vector_of
-from jaxphoto.block import Block
+from jaxphoto.block import Block, named_rows
 from jaxphoto.errors import BlockError
 from jaxphoto.observations import (
     PRIORS,
@@ -107,12 +107,9 @@ def observations_of(
     Scalar priors of shared parameters are not among them (`weighted_parameters`). Raises BlockError for rows that
     refer to nothing.
     """
-    named: list[tuple[str, AbstractObservations]] = []
-    for rows in (*block.observations, *_priors_of_places(block, priors)):
-        if len(rows):
-            _check(rows, block)
-            taken = sum(name.split("#")[0] == rows.group for name, _ in named)
-            named.append((rows.group if not taken else f"{rows.group}#{taken + 1}", rows))
+    named = list(named_rows([*block.observations, *_priors_of_places(block, priors)]).items())
+    for _, rows in named:
+        _check(rows, block)
     known = [k for k in block.more if isinstance(k, KnownParameters)]
     place = {label: k for k, label in enumerate(labels)}
     for k in known:

@@ -43,8 +43,8 @@ class Cofactors(NamedTuple):
 class RowCofactors(NamedTuple):
     """j Q j' of rows, in padded sizes: of the numbers of a row with one another."""
 
-    image: Float[Array, "chunks tiles 2 m p"]
-    """Of x and of y alone."""
+    image: Float[Array, "chunks tiles 3 m p"]
+    """Of x, of y, and of both with one another."""
     at_points: tuple[Float[Array, "c c rows points"], ...]
     """Of the groups of `AbstractStructure.with_shared`."""
 
@@ -90,7 +90,7 @@ def _of_points(
         half = jnp.stack(unwhiten(inner, l))
         points = jnp.stack(unwhiten(half.transpose(1, 0, 2), l)).transpose(2, 0, 1)
         none = tuple(jnp.zeros((len(j), len(j), *j.shape[2:])) for j in by_rows)
-        nothing = lambda *_: (jnp.zeros((2, len(image), size)), none)  # noqa: E731
+        nothing = lambda *_: (jnp.zeros((3, len(image), size)), none)  # noqa: E731
         return points, *jax.lax.cond(of_rows, rows, nothing, (image, *measured), by_rows, l, own, a, inner)
 
     def rows(measured, by_rows, l, own, a, inner):  # noqa: E741
@@ -102,9 +102,13 @@ def _of_points(
         j = jnp.stack([jnp.concatenate([c.eop, c.shared]) for c in both], axis=1).transpose(2, 0, 1, 3)
         z = jnp.stack([jnp.stack(whiten(c.point, l)) for c in both]).transpose(0, 2, 1, 3)
         seen = jnp.einsum("mab,mbn->man", own[touched[:, :, None], touched[:, None, :]], j.reshape(m, 6 + q, -1))
-        of_images = jnp.sum(j * seen.reshape(j.shape), axis=1).transpose(1, 0, 2)
-        across = jnp.einsum("mcop,mckp->omkp", j, a[touched].reshape(m, 6 + q, 3, size))
-        found = of_images - 2 * jnp.sum(z * across, axis=2) + jnp.einsum("omkp,klp,omlp->omp", z, inner, z)
+        seen, across = seen.reshape(j.shape), jnp.einsum("mcop,mckp->omkp", j, a[touched].reshape(m, 6 + q, 3, size))
+
+        def of_both(o: int, k: int) -> Float[Array, "m p"]:
+            met = jnp.sum(z[o] * across[k] + z[k] * across[o], axis=1)
+            return jnp.sum(j[:, :, o] * seen[:, :, k], axis=1) - met + jnp.einsum("mkp,klp,mlp->mp", z[o], inner, z[k])
+
+        found = jnp.stack([of_both(0, 0), of_both(1, 1), of_both(0, 1)])
         first = 6 * m
         return found, tuple(of_group(g, j, l, own, a, inner, first) for g, j in zip(groups, by_rows, strict=True))
 

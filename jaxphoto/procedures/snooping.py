@@ -1,0 +1,294 @@
+"""Blunders found and left out: a robust start, then tests until nothing changes.
+
+1. The block is adjusted with weights that fall with the residual (Huber), again and again: many blunders hide one
+   another from the test of a single one, but hardly move such an estimate.
+2. What contradicts it is left out, and the block adjusted without it. Then, in turns: each observation left out is
+   predicted by the others and put back where the prediction agrees; of those that are in, the worst of each point is
+   left out where it contradicts the others (Baarda's data snooping). Until nothing changes.
+3. Two image points of one image that each lie where the other should be have changed names, and get them back.
+
+Sources: Baarda (1968), A testing procedure for use in geodetic networks; Huber (1981), Robust statistics.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.special import gammainccinv
+
+from jaxphoto.adjustment import MAX_STEPS, Adjustment, Outcome, Sizes, common_sizes, linearise, solve
+from jaxphoto.arrays import still
+from jaxphoto.block import Block
+from jaxphoto.errors import BlockError
+from jaxphoto.procedures.adjust import start_of
+from jaxphoto.procedures.cross_validation import measured_discrepancies
+from jaxphoto.statistics import LEAST_CHECKED, LEVEL, Suspect, covariance, redundancy_numbers
+from jaxphoto.unknowns import Unknowns
+from jaxphoto.variants import without_observations
+
+Masks = dict[str, Bool[np.ndarray, "_"]]
+"""By group of observations: which rows."""
+Blocks = dict[str, Float[np.ndarray, "_ _ _"]]
+"""By group of observations: (rows, numbers of a row, numbers of a row)."""
+# Huber's constant: residuals of so many standard deviations count whole (95 % efficient where all are normal).
+_HUBER = 1.345
+_ROBUST_STEPS, _ROUNDS = 10, 20
+# A weight that changes by less, in a robust step, no longer changes what is suspected.
+_STILL = 0.02
+# Median size of a standard normal number; of fewer numbers than these it says too little of a group by itself.
+_MEDIAN, _ENOUGH = 0.6745, 30
+# Two image points may have each other's name where one lies as near to the prediction of the other, beside how far
+# apart they are.
+_NEAR = 0.2
+# A blunder inflates the residuals around it: in one turn nothing goes that is less than this part of the worst.
+_BESIDE_THE_WORST = 0.5
+
+
+class Exchanged(NamedTuple):
+    """Two image points of an image that had each other's name."""
+
+    image: str
+    points: tuple[str, str]
+
+
+class Snooped(NamedTuple):
+    """A block without its blunders, adjusted; what was left out, the worst first; what was put right.
+
+    `left_out` are rows of the block as given: the others contradict them by `error` +- `sigma`.
+    """
+
+    adjusted: Adjustment
+    left_out: tuple[Suspect, ...]
+    exchanged: tuple[Exchanged, ...]
+    points: tuple[str, ...]
+    """Those that went because too little was left of them."""
+
+
+def snoop(
+    block: Block,
+    start: Unknowns | None = None,
+    *,
+    max_steps: int = MAX_STEPS,
+    report: Callable[[str], object] = lambda text: None,
+) -> Snooped:
+    """Adjust `block` without the observations that contradict the others.
+
+    All observations are tested, image points, control, stations and every further kind, but not priors. A row goes as a
+    whole: both coordinates of an image point, one coordinate of a control point. Raises what `adjust` raises.
+    """
+    sizes = common_sizes([block])
+    at, r, flown = _robust(block, start_of(block) if start is None else start, max_steps, sizes, report)
+    scale = _scales(at, r)
+    worst = _worst(block, {name: size / scale[name] for name, size in _sizes(at, r).items()}, 1.0)
+    left = {name: flown[name] | worst[name] for name in worst}
+    tried: list[Masks] = []
+    exchanged: list[Exchanged] = []
+    while True:
+        report(f"adjusting without {sum(int(m.sum()) for m in left.values())} observations")
+        kept, point = without_observations(block, left)
+        adjusted = solve(kept, _some_points(at.unknowns, point), kept.priors, max_steps, sizes)
+        at = linearise(block, _all_points(adjusted.unknowns, at.unknowns, point), block.priors, max_steps, sizes)
+        pairs = _exchanged(at, left, float(adjusted.sigma0))
+        if pairs:
+            block, left = _exchange(block, left, pairs)
+            exchanged += [_named(block, pair) for pair in pairs]
+            continue
+        found = _tested(adjusted, at, left, point)
+        if len(tried) == _ROUNDS or any(_same(found, old) for old in (left, *tried)):
+            break
+        tried.append(left)
+        left = found
+    gone = np.setdiff1d(np.arange(len(block.points)), point)
+    told = _told(at, left, _stays(block, point), _redundancy(at), float(adjusted.sigma0))
+    return Snooped(adjusted, told, tuple(exchanged), tuple(block.points[p] for p in gone))
+
+
+def _robust(
+    block: Block, start: Unknowns, max_steps: int, sizes: Sizes, report: Callable[[str], object]
+) -> tuple[Adjustment, Blocks, Masks]:
+    """The block where weights that fall with the residual have led, linearised; the redundancy numbers there; and the
+    image points of points that flew away.
+    """
+    rows, unknowns = block.named_observations, start
+    weight = {name: np.ones(len(own)) for name, own in rows.items()}
+    left = {name: np.zeros(len(own), bool) for name, own in rows.items()}
+    at: Adjustment | None = None
+    r: Blocks = {}
+    for step in range(_ROBUST_STEPS + 1):
+        report(f"robust step {step}" if step else "adjusting all observations")
+        weighed = block.with_observations({name: own.scaled(weight[name] ** -0.5) for name, own in rows.items()})
+        kept, point = without_observations(weighed, left)
+        found = solve(kept, _some_points(unknowns, point), kept.priors, max_steps, sizes)
+        if found.astray.any():
+            # Blunders that leave their point no place: without it, from where the last step began.
+            flown = np.isin(block.image_points.point, point[found.astray])
+            left[block.image_points.group] |= flown
+            continue
+        unknowns = _all_points(found.unknowns, unknowns, point)
+        at = linearise(block, unknowns, block.priors, max_steps, sizes)
+        r = r or _redundancy(at)
+        scale = _scales(at, r)
+        new = {name: 1 / np.maximum(_largest(at, name, r) / (_HUBER * scale[name]), 1.0) for name in rows}
+        if max(float(np.abs(new[name] - weight[name]).max(initial=0.0)) for name in rows) < _STILL:
+            break
+        weight = new
+    if at is None:
+        raise BlockError(f"too many object points fly away: {Outcome.ASTRAY.value}")
+    return at, r, left
+
+
+def _redundancy(adjusted: Adjustment) -> Blocks:
+    """Of each row, what its own residuals show of a change of its whitened numbers."""
+    blocks = redundancy_numbers(adjusted, covariance(adjusted)).blocks
+    return {name: blocks[name] for name in adjusted.block.named_observations}
+
+
+def _sizes(at: Adjustment, r: Blocks, predicted: bool = False) -> dict[str, Float[np.ndarray, "_"]]:
+    """Of each row, sqrt(v' R^-1 v) over the root of its chi-square quantile: above 1 it is a blunder.
+
+    Or sqrt(v' R v), of rows that were left out and are `predicted` by the others. Only directions that the others check
+    count: a point of two rays is checked across the plane of these, and not along it.
+    """
+    axes = {name: np.linalg.eigh(own) for name, own in r.items()}
+    checked = {name: values > LEAST_CHECKED for name, (values, _) in axes.items()}
+    n = sum(int(own.any(axis=1).sum()) for own in checked.values())
+    found = {}
+    for name, (values, vectors) in axes.items():
+        along = np.einsum("nij,in->nj", vectors, np.atleast_2d(at.residuals[name])) ** 2
+        known = np.where(checked[name], values, 1.0)
+        squares = np.sum(np.where(checked[name], along * known if predicted else along / known, 0.0), axis=1)
+        freedom = np.maximum(checked[name].sum(axis=1), 1)
+        found[name] = np.sqrt(squares / (2 * gammainccinv(freedom / 2, LEVEL / max(n, 1))))
+    return found
+
+
+def _scales(at: Adjustment, r: Blocks) -> dict[str, float]:
+    """By group, a standard deviation of whitened residuals that blunders hardly move."""
+    found = {}
+    for name, own in r.items():
+        diagonal = np.diagonal(own, axis1=1, axis2=2).T
+        checked = diagonal > LEAST_CHECKED
+        if int(checked.sum()) >= _ENOUGH:
+            size = np.abs(np.atleast_2d(at.residuals[name]))[checked] / np.sqrt(diagonal[checked])
+            found[name] = float(np.median(size)) / _MEDIAN
+    usual = found.get(at.block.image_points.group, 1.0)
+    return {name: found.get(name, usual) for name in r}
+
+
+def _tested(adjusted: Adjustment, at: Adjustment, left: Masks, point: np.ndarray) -> Masks:
+    """What is to be left out next: `adjusted` is without `left`, `at` the whole block linearised there."""
+    sigma0, stays = float(adjusted.sigma0), _stays(at.block, point)
+    wrong = {name: size > sigma0 for name, size in _sizes(at, _redundancy(at), predicted=True).items()}
+    found = {name: out & (wrong[name] | ~stays[name]) for name, out in left.items()}
+    sizes = {}
+    for name, size in _sizes(adjusted, _redundancy(adjusted)).items():
+        sizes[name] = np.zeros(len(left[name]))
+        sizes[name][~left[name] & stays[name]] = size / sigma0
+    least = max(1.0, _BESIDE_THE_WORST * max(float(size.max(initial=0.0)) for size in sizes.values()))
+    return {name: found[name] | new for name, new in _worst(at.block, sizes, least).items()}
+
+
+def _largest(at: Adjustment, name: str, r: Blocks) -> Float[np.ndarray, "_"]:
+    """Of each row, the largest |v| / sqrt(r); tiny where hardly anything checks it."""
+    own = np.diagonal(r[name], axis1=1, axis2=2).T
+    checked = own > LEAST_CHECKED
+    size = np.abs(np.atleast_2d(at.residuals[name])) / np.sqrt(np.where(checked, own, 1.0))
+    return np.where(checked, size, 0.0).max(axis=0, initial=0.0)
+
+
+def _worst(block: Block, sizes: dict[str, np.ndarray], limit: float) -> Masks:
+    """Of the rows whose size is above `limit`, the largest of each point; of those that touch none, of each image."""
+    groups = block.named_observations
+    worst: dict[object, tuple[float, str, int]] = {}
+    for name, rows in groups.items():
+        for row in np.flatnonzero(sizes[name] > limit).tolist():
+            touched = {what: np.ravel(index[row])[0] for what, index in reversed(rows.indices())}
+            what = "point" if "point" in touched else next(iter(touched), "")
+            place, size = (what, touched.get(what)), float(sizes[name][row])
+            worst[place] = max(worst.get(place, (0.0, "", 0)), (size, name, row))
+    found = {name: np.zeros(len(rows), bool) for name, rows in groups.items()}
+    for _, name, row in worst.values():
+        found[name][row] = True
+    return found
+
+
+def _stays(block: Block, point: np.ndarray) -> Masks:
+    """Which rows touch no point that is gone."""
+    found = {}
+    for name, rows in block.named_observations.items():
+        found[name] = np.ones(len(rows), bool)
+        for what, index in rows.indices():
+            if what == "point":
+                found[name] &= np.isin(index, point).reshape(len(rows), -1).all(axis=1)
+    return found
+
+
+def _same(one: Masks, other: Masks) -> bool:
+    return all(np.array_equal(one[name], other[name]) for name in one)
+
+
+def _some_points(unknowns: Unknowns, point: np.ndarray) -> Unknowns:
+    return dataclasses.replace(unknowns, points=still(unknowns.points)[point])
+
+
+def _all_points(unknowns: Unknowns, before: Unknowns, point: np.ndarray) -> Unknowns:
+    """The unknowns with all points: those that are gone, where they were."""
+    points = np.array(before.points)
+    points[point] = still(unknowns.points)
+    return dataclasses.replace(unknowns, points=points)
+
+
+def _exchanged(at: Adjustment, left: Masks, sigma0: float) -> list[tuple[int, int]]:
+    """Rows of image points left out, two of an image, that fit each other's prediction."""
+    p, r = at.block.image_points, _redundancy(at)[at.block.image_points.group]
+    # Both coordinates of two points are tested; as all others, against all others.
+    limit = sigma0 * float(np.sqrt(2 * gammainccinv(1.0, LEVEL / len(p))))
+    measured, missed = still(p.xy), measured_discrepancies(at.block, at.unknowns)
+    predicted = measured - missed
+    found: list[tuple[int, int]] = []
+    for a, b in combinations(np.flatnonzero(left[p.group]).tolist(), 2):
+        apart = np.abs(measured[a] - measured[b]).max()
+        near = np.abs(measured[[a, b]] - predicted[[b, a]]).max() < _NEAR * apart
+        if p.image[a] == p.image[b] and near and not {a, b} & {k for pair in found for k in pair}:
+            # So far from where it was predicted, a difference is no measure: once more with the names exchanged.
+            block, _ = _exchange(at.block, left, [(a, b)])
+            off = measured_discrepancies(block, at.unknowns)[[a, b]] / still(p.sigma)[[a, b]]
+            if np.all(np.einsum("ni,nij,nj->n", off, r[[a, b]], off) < limit**2):
+                found.append((a, b))
+    return found
+
+
+def _exchange(block: Block, left: Masks, pairs: list[tuple[int, int]]) -> tuple[Block, Masks]:
+    """The block with the image points of `pairs` exchanged, and no longer left out."""
+    p, group = block.image_points, block.image_points.group
+    order, out = np.arange(len(p)), left[group].copy()
+    for a, b in pairs:
+        order[[a, b]] = b, a
+        out[[a, b]] = False
+    rows = dataclasses.replace(p, xy=still(p.xy)[order], sigma=still(p.sigma)[order])
+    return block.with_observations({group: rows}), left | {group: out}
+
+
+def _named(block: Block, pair: tuple[int, int]) -> Exchanged:
+    p = block.image_points
+    one, other = (block.points[p.point[k]] for k in pair)
+    return Exchanged(block.images[p.image[pair[0]]], (one, other))
+
+
+def _told(at: Adjustment, left: Masks, stays: Masks, r: Blocks, sigma0: float) -> tuple[Suspect, ...]:
+    """The rows left out of points that stay, with the number of each that contradicts most."""
+    block, found = at.block, []
+    for name, rows in block.named_observations.items():
+        v = np.atleast_2d(at.residuals[name])
+        own = np.sqrt(np.diagonal(r[name], axis1=1, axis2=2).T)
+        error, sigma = np.atleast_2d(rows.physical(v)), np.atleast_2d(np.asarray(rows.sigmas).T)
+        words = np.broadcast_to(rows.words(block.images, block.points), np.shape(v))
+        for row in np.flatnonzero(left[name] & stays[name]).tolist():
+            k = int(np.abs(v[:, row] * own[:, row]).argmax())
+            known = sigma0 * float(sigma[k, row] / own[k, row])
+            off = float(error[k, row])
+            found.append(Suspect(name, row, str(words[k, row]), off / known, off, known, rows.unit))
+    return tuple(sorted(found, key=lambda out: -abs(out.w)))

@@ -1,0 +1,62 @@
+"""What is said of an adjustment, by how much it matters: alarm, warning, information."""
+
+import enum
+from collections.abc import Iterable
+from typing import NamedTuple
+
+
+class Level(enum.IntEnum):
+    """How much a finding matters; the worst gives the verdict its colour."""
+
+    INFORMATION = 0
+    """To be known; nothing need be done."""
+    WARNING = 1
+    """Results hold with a reservation."""
+    ALARM = 2
+    """Results are not to be used before this is mended."""
+
+
+COLOURS = {Level.INFORMATION: "green", Level.WARNING: "amber", Level.ALARM: "red"}
+
+
+class Finding(NamedTuple):
+    """One sentence, with its mend."""
+
+    level: Level
+    text: str
+
+
+class Verdict(NamedTuple):
+    """All findings, the worst first; within a level in the order in which they were found."""
+
+    findings: tuple[Finding, ...]
+
+    @classmethod
+    def of(cls, findings: Iterable[Finding]) -> "Verdict":
+        """The findings in order."""
+        return cls(tuple(sorted(findings, key=lambda f: -f.level)))
+
+    @property
+    def level(self) -> Level:
+        """The worst of all."""
+        return max((f.level for f in self.findings), default=Level.INFORMATION)
+
+    @property
+    def colour(self) -> str:
+        """green, amber or red."""
+        return COLOURS[self.level]
+
+    @property
+    def headline(self) -> str:
+        """The verdict in one line."""
+        n = sum(f.level == self.level for f in self.findings)
+        if self.level == Level.ALARM:
+            return f"red: not to be used before {'this is' if n == 1 else f'these {n} are'} mended"
+        if self.level == Level.WARNING:
+            return f"amber: {'one reservation' if n == 1 else f'{n} reservations'}"
+        return "green: the observations agree with one another and with their standard deviations"
+
+    @property
+    def texts(self) -> list[str]:
+        """The sentences alone."""
+        return [f.text for f in self.findings]

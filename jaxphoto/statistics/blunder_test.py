@@ -1,0 +1,125 @@
+"""Which observation contradicts the others: the normalised residual of every one against what no correct one reaches.
+
+An error e in observation i alone is estimated by (P v)_i / (P Q_vv P)_ii with the standard deviation
+sigma0 / sqrt((P Q_vv P)_ii), and w_i is their ratio. Where sigma naught is estimated from the same residuals, w follows
+the tau distribution; of n of them the largest is compared with its quantile of level alpha / n (Bonferroni).
+
+Sources: Baarda (1968), A testing procedure for use in geodetic networks; Pope (1976), The statistics of residuals and
+the detection of outliers, NOAA Technical Report NOS 65 NGS 1.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+from scipy.special import stdtrit
+
+from jaxphoto.adjustment import Adjustment
+from jaxphoto.arrays import still
+from jaxphoto.statistics.discrepancy import observation_groups
+from jaxphoto.statistics.reliability import LEAST_CHECKED, UNCHECKED, Redundancy, error_precision, normalised_residuals
+
+LEVEL = 1e-3
+"""Error probability of a test of the whole adjustment: of sigma naught, and of all normalised residuals together."""
+DELTA0 = 4.13
+"""Shift of a normalised residual that a test of level 0.1 % finds with a power of 80 % (Baarda)."""
+
+
+class Suspect(eqx.Module):
+    """An observation that contradicts the others, and by how much it is off if it alone is."""
+
+    group: str
+    row: int
+    """Of its group in the block."""
+    words: str
+    """What a sentence calls it."""
+    w: float
+    error: float
+    sigma: float
+    """Of `error`, a posteriori; both in `unit`."""
+    unit: str
+
+
+class BlunderTest(eqx.Module):
+    """The `suspects`, rows with a number beyond `limit`, the worst first; `n` normalised residuals were tested."""
+
+    suspects: tuple[Suspect, ...]
+    limit: float
+    n: int
+
+
+def blunder_test(adjusted: Adjustment, redundancy: Redundancy, level: float = LEVEL) -> BlunderTest:
+    """All observations of `adjusted` against the critical value of |w| for all of them together.
+
+    What is known of parameters beforehand is no observation; what hardly anything checks is not tested.
+    """
+    w, precision = normalised_residuals(adjusted, redundancy), error_precision(adjusted, redundancy)
+    sigma0 = float(adjusted.sigma0)
+    groups = {name: rows for name, rows in observation_groups(adjusted).items() if rows.unit}
+    sizes = {name: np.where(still(redundancy[name]) > LEAST_CHECKED, np.abs(w[name]), 0.0) for name in groups}
+    n = sum(int((v > 0).sum()) for v in sizes.values())
+    limit, block, found = critical_w(n, adjusted.redundancy, level), adjusted.block, []
+    for name, rows in groups.items():
+        size = np.atleast_2d(sizes[name])
+        bad = np.flatnonzero(size.max(axis=0, initial=0.0) > limit)
+        if not len(bad):
+            continue
+        # The largest number of a row speaks for it: a point in an image is one blunder, whichever coordinate shows it.
+        worst = size[:, bad].argmax(axis=0)
+        words = np.broadcast_to(rows.words(block.images, block.points), np.shape(w[name]))
+        of_worst = (np.atleast_2d(v)[worst, bad] for v in (words, w[name], precision[name]))
+        for row, word, value, p in zip(bad.tolist(), *of_worst, strict=True):
+            sigma = sigma0 / float(p) ** 0.5
+            found.append(Suspect(name, row, str(word), float(value), float(value) * sigma, sigma, rows.unit))
+    return BlunderTest(tuple(sorted(found, key=lambda s: -abs(s.w))), limit, n)
+
+
+def critical_w(n: int, redundancy: int, level: float = LEVEL) -> float:
+    """What the largest of `n` normalised residuals exceeds with probability `level` at most (Pope's tau).
+
+    With nu the redundancy and t the quantile of Student's distribution of nu - 1 degrees of freedom,
+    tau = t sqrt(nu) / sqrt(nu - 1 + t^2); infinite below a redundancy of 2, where all |w| are 1.
+    """
+    if redundancy < 2 or n == 0:
+        return float("inf")
+    t = float(-stdtrit(redundancy - 1, level / (2 * n)))
+    return t * redundancy**0.5 / (redundancy - 1 + t * t) ** 0.5
+
+
+def detectable_errors(
+    adjusted: Adjustment, redundancy: Redundancy, delta0: float = DELTA0
+) -> dict[str, Float[np.ndarray, "..."]]:
+    """By group, the least error that the test of one normalised residual finds with its power: delta0 / sqrt(P Q_vv P).
+
+    In the unit of each observation; infinite where nothing checks it.
+    """
+    found = {}
+    for name, p in error_precision(adjusted, redundancy).items():
+        checked = still(redundancy[name]) > UNCHECKED
+        found[name] = np.where(checked, delta0 / np.sqrt(np.where(checked, p, 1.0)), np.inf)
+    return found
+
+
+class Hidden(NamedTuple):
+    """The observation of a group whose errors are found worst: `detectable` is infinite where none ever is."""
+
+    group: str
+    words: str
+    detectable: float
+    sigma: float
+    """A priori; both in `unit`."""
+    unit: str
+
+
+def worst_checked(adjusted: Adjustment, redundancy: Redundancy) -> list[Hidden]:
+    """Of each group of observations, that of the largest detectable error beside its standard deviation."""
+    found, block = [], adjusted.block
+    detectable = detectable_errors(adjusted, redundancy)
+    for name, rows in observation_groups(adjusted).items():
+        if rows.unit and len(rows):
+            size, sigma = np.atleast_2d(detectable[name]), np.atleast_2d(still(rows.sigmas).T)
+            words = np.broadcast_to(rows.words(block.images, block.points), size.shape)
+            k = np.unravel_index(np.argmax(size / sigma), size.shape)
+            found.append(Hidden(name, str(words[k]), float(size[k]), float(sigma[k]), rows.unit))
+    return found
