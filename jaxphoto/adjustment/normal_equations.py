@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxphoto.adjustment.layout.tiled import TiledResiduals, TiledStructure, TiledValues
+from jaxphoto.adjustment.layout.tiled import TiledStructure, TiledValues
 from jaxphoto.adjustment.model.numbers import Increments, UnknownArrays, state_at, zero_increments
 from jaxphoto.adjustment.solver.band import Band, dense, factor_band, invert_band, pivots, solve_band
 from jaxphoto.adjustment.solver.elimination import FactoredNormal, gradient, reduce_right, solve_factored, solve_reduced
@@ -91,16 +91,6 @@ class NormalEquations(eqx.Module):
     def least_pivot(self) -> Float[Array, ""]:
         """What is left of the weakest unknown when those before it are eliminated: 1 unharmed, 0 at a rank defect."""
         return jnp.min(pivots(self.factored.reduced.diagonal, self.factored.factor))
-
-    def left_over(self, change: TiledResiduals) -> TiledResiduals:
-        """What residuals show of a change of the observations, both over their sigmas: (I - J N^-1 J') change."""
-        at = self.at
-        function = lambda y: at._replace(increments=y).residuals()  # noqa: E731
-        _, pull = jax.vjp(function, at.increments)
-        # Constraints of the datum observe nothing.
-        step = self.solve(pull(dataclasses.replace(change, datum=jnp.zeros_like(change.datum)))[0])
-        absorbed = jax.jvp(function, (at.increments,), (step,))[1]
-        return jax.tree.map(jnp.subtract, change, absorbed)
 
     def gradient(self, increments: Increments) -> tuple[Increments, Array, Array, Float[Array, ""]]:
         """b = J'r at other increments, the same as `reduce` takes it down, and the square sum r'r there."""

@@ -1,0 +1,103 @@
+"""Blunders are found, named and left out; what is sound stays; exchanged names are put right."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from jaxphoto import adjust, snoop
+from tests.blocks import simulated
+
+
+@pytest.fixture(scope="module")
+def block():
+    return simulated("cross").block
+
+
+def with_xy(block, change):
+    """`block` with image coordinates changed in place by `change`."""
+    xy = np.array(block.image_points.xy)
+    change(xy)
+    return block.with_observations({"image_points": dataclasses.replace(block.image_points, xy=xy)})
+
+
+def of_many_rays(block, n):
+    """Rows of points with the most rays, one of a point."""
+    p = block.image_points
+    points = np.argsort(-np.bincount(p.point), kind="stable")[:n]
+    return [int(np.flatnonzero(p.point == point)[k % 3]) for k, point in enumerate(points)]
+
+
+def test_nothing_goes_where_nothing_is_wrong(block):
+    found, whole = snoop(block), adjust(block)
+    assert not (found.left_out or found.points or found.exchanged)
+    np.testing.assert_allclose(found.adjusted.unknowns.points, whole.unknowns.points, atol=1e-6)
+    assert float(found.adjusted.sigma0) == pytest.approx(float(whole.sigma0), rel=1e-6)
+
+
+def test_blunders_of_every_kind_go_and_nothing_else(block):
+    wrong = of_many_rays(block, 6)
+
+    def spoil(xy):
+        for k, row in enumerate(wrong):
+            xy[row] += (
+                np.asarray(block.image_points.sigma)[row] * [30, -200, 12, 1000, 60, 300][k] * np.array([0.8, 0.6])
+            )
+
+    spoilt, station, control = with_xy(block, spoil), block.stations, block.control
+    value, surveyed = np.array(station.value), np.array(control.value)
+    value[4] += 5.0
+    heights = np.flatnonzero(control.axis == 0)
+    surveyed[heights[0]] -= 3.0
+    spoilt = spoilt.with_observations(
+        {
+            "stations": dataclasses.replace(station, value=value),
+            "control_points": dataclasses.replace(control, value=surveyed),
+        }
+    )
+    found = snoop(spoilt)
+    assert {(s.group, s.row) for s in found.left_out} == {
+        *(("image_points", row) for row in wrong),
+        ("stations", 4),
+        ("control_points", int(heights[0])),
+    }
+    assert not found.points
+    by_row = {(s.group, s.row): s for s in found.left_out}
+    assert abs(by_row["stations", 4].error - 5.0) < 5 * by_row["stations", 4].sigma
+    assert abs(by_row["control_points", int(heights[0])].error + 3.0) < 5 * by_row["control_points", heights[0]].sigma
+    clean = adjust(block)
+    assert abs(float(found.adjusted.sigma0) / float(clean.sigma0) - 1) < 0.1
+
+
+def test_exchanged_names_are_put_right(block):
+    p = block.image_points
+    first = of_many_rays(block, 1)[0]
+    rays = np.bincount(p.point)[p.point]
+    far = np.abs(np.asarray(p.xy) - np.asarray(p.xy)[first]).max(axis=1)
+    second = int(np.argmax(np.where((p.image == p.image[first]) & (rays >= 4), far, 0.0)))
+
+    def exchange(xy):
+        xy[[first, second]] = xy[[second, first]]
+
+    found = snoop(with_xy(block, exchange))
+    ((image, points),) = found.exchanged
+    assert image == block.images[p.image[first]]
+    assert set(points) == {block.points[p.point[first]], block.points[p.point[second]]}
+    assert not found.left_out
+    np.testing.assert_allclose(found.adjusted.unknowns.points, adjust(block).unknowns.points, atol=1e-5)
+
+
+def test_a_point_of_two_contradicting_rays_goes_as_a_whole(block):
+    p = block.image_points
+    rays = np.bincount(p.point, minlength=len(block.points))
+    point = int(np.flatnonzero(rays == rays.min())[0])
+    rows = np.flatnonzero(p.point == point)
+
+    def spoil(xy):
+        xy[rows[0]] += [0.4, 0.5]
+        xy[rows[1:]] -= [0.3, 0.5]
+
+    found = snoop(with_xy(block, spoil))
+    left = {s.row for s in found.left_out if s.group == "image_points"}
+    assert block.points[point] in found.points or left <= set(rows.tolist())
+    assert abs(float(found.adjusted.sigma0) / float(adjust(block).sigma0) - 1) < 0.1
