@@ -1,0 +1,326 @@
+"""Files spoilt at random, seeded, for the readers: each is read as it stands or refused in one sentence.
+
+`READERS` lists what is read. A new reader is one entry there; `tests/io/test_mutations.py` then spoils its files a few
+hundred times, and `benchmarks/mutations.py` as often as it is asked to, each reader in a process of its own.
+"""
+
+import functools
+import re
+import tempfile
+import time
+import traceback
+import warnings
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxphoto.errors import JaxphotoError
+from jaxphoto.io import read_block, read_recipe
+from jaxphoto.io.cameras import read_camera_file
+from jaxphoto.io.trajectory import Records, read_records, write_flight_csv, write_sbet
+from tests.io import test_cameras as cameras
+from tests.io.conftest import FILES
+
+Files = dict[str, bytes]
+SLOWEST_S = 10.0
+"""A file of any content is read or refused in this time."""
+MOST_MB = 1000.0
+"""And with so much memory beyond what was used before."""
+# A sentence about one place; what it quotes is cut.
+_LONGEST = 1500
+# No control characters: they would be commands to a terminal.
+_CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f]")
+_EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
+
+NUMBERS = (
+    "1e999", "-1e999", "nan", "NaN", "inf", "-inf", "0", "-0.0", "-1", "1e308", "1e-320", "1e30", "9" * 30, "9" * 400,
+    "9" * 5000, "0." + "3" * 400, "1_000", "1,5", "0x1F", "1e", "--1", "\u0661\u0662", "1e5000000", "2147483648",
+    "18446744073709551616", "true", "\u22121.5", "1.2.3", "",
+)  # fmt: skip
+"""What stands in place of a number."""
+TEXTS = (
+    "", " ", "#", "\0", "\x1b[31m", "\x1b]0;title\x07", "\u202e", "\ufeff", "\ud7ff", "[/red]", "[bold]", "$\\frac{1$",
+    "=cmd|' /C calc'!A0", "../../etc/passwd", "/dev/zero", "/dev/null", "<script>", "&amp;", '"', "'", '""', "\\", "{",
+    "}", "[", "]", "%s", "{0}", "default", "x" * 200_000, '"' + "y" * 200_000 + '"', "[" * 3000, "{a=" * 3000,
+    "a." * 3000, "," * 20_000, ";" * 20_000, " " * 200_000, "\t", "\r", "\n", "<a>" * 3000, "(" * 3000, "-" * 3000,
+)  # fmt: skip
+"""What stands in place of a word, or between two."""
+_NUMBER = re.compile(rb"[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?")
+_WORD = re.compile(rb"[^\s,;=\[\]{}<>\"']+")
+
+
+class Reader(NamedTuple):
+    """A reader and sound files for it."""
+
+    files: Callable[[], Files]
+    """The sound files by their names, below one folder."""
+    read: Callable[[Path], object]
+    """Reads from that folder."""
+    spoilt: tuple[str, ...] = ()
+    """The files that are spoilt; all where none are named."""
+
+
+class Finding(NamedTuple):
+    """What a reader did that it must not do."""
+
+    reader: str
+    seed: int
+    what: str
+    detail: str
+
+
+def text(**files: str) -> Callable[[], Files]:
+    """Files of text by name; `__` in a name stands for a point."""
+    return lambda: {name.replace("__", "."): content.encode() for name, content in files.items()}
+
+
+def written_by(write: Callable[[Path], object]) -> Callable[[], Files]:
+    """The files that `write` leaves in the folder that it is given."""
+
+    def files() -> Files:
+        with tempfile.TemporaryDirectory() as folder:
+            write(Path(folder))
+            paths = sorted(path for path in Path(folder).rglob("*") if path.is_file())
+            return {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths}
+
+    return files
+
+
+def _flight() -> Records:
+    t = np.arange(50) * 0.5
+    position = np.stack([5 * t - 50, 0.1 * t**2, 100 + np.sin(t)], axis=1)
+    angles = np.stack([np.sin(t), np.cos(t), 90 - t], axis=1)
+    given = np.full((len(t), 3), 0.02)
+    return Records("flight.csv", t, position, False, angles, given, given)
+
+
+def _sbet(folder: Path) -> None:
+    values = np.zeros((12, 17))
+    values[:, 0], values[:, 1], values[:, 2], values[:, 3] = np.arange(12), 0.8, 0.1, 500.0
+    write_sbet(values, folder / "flight.sbet")
+
+
+def _flown_block(folder: Path) -> None:
+    for name, content in FILES.items():
+        if name not in ("stations.csv", "attitudes.csv"):
+            (folder / name).write_text(content, encoding="utf-8")
+    toml = FILES["block.toml"].replace("[sigmas]", '[trajectory]\nfile = "flight.csv"\nmax_gap_s = 2.0\n\n[sigmas]')
+    (folder / "block.toml").write_text(toml, encoding="utf-8")
+    write_flight_csv(_flight(), folder / "flight.csv")
+
+
+def _map_block(folder: Path) -> None:
+    for name, content in FILES.items():
+        (folder / name).write_text(content, encoding="utf-8")
+    toml = FILES["block.toml"].replace('kind = "local"', 'kind = "epsg"\ncode = 32722\nvertical = "ellipsoidal"')
+    (folder / "block.toml").write_text(toml, encoding="utf-8")
+    for name in ("images.csv", "control_points.csv", "stations.csv", "object_points.csv"):
+        header, *rows = FILES[name].splitlines()
+        at = header.split(",").index("X_m")
+        moved = [row.split(",") for row in rows]
+        for cells in moved:
+            for axis, offset in ((at, 580_000.0), (at + 1, 7_220_000.0)):
+                cells[axis] = repr(float(cells[axis]) + offset) if cells[axis] else ""
+        (folder / name).write_text("\n".join([header, *map(",".join, moved)]) + "\n", encoding="utf-8")
+
+
+def _camera(name: str, **options) -> Callable[[Path], object]:
+    return lambda folder: read_camera_file(folder / name, **options)
+
+
+SUMMARY = (
+    '{"cameras": {"nadir": {"width_px": 4500, "height_px": 3000, "pixel_mm": 0.008, "distortion": "smac", '
+    '"sign": "add"}}}'
+)
+READERS: dict[str, Reader] = {
+    "block": Reader(lambda: {name: content.encode() for name, content in FILES.items()}, read_block),
+    "block-map": Reader(written_by(_map_block), read_block),
+    "block-flight": Reader(written_by(_flown_block), read_block),
+    "trajectory-csv": Reader(
+        written_by(lambda folder: write_flight_csv(_flight(), folder / "flight.csv")),
+        lambda folder: read_records(folder / "flight.csv"),
+    ),
+    "trajectory-sbet": Reader(written_by(_sbet), lambda folder: read_records(folder / "flight.sbet")),
+    "recipe": Reader(
+        lambda: {"recipe.toml": (_EXAMPLES / "recipe.toml").read_bytes()},
+        lambda folder: read_recipe(folder / "recipe.toml"),
+    ),
+    "camera-opencv": Reader(text(a__yml=cameras.OPENCV), _camera("a.yml")),
+    "camera-agisoft": Reader(text(a__xml=cameras.AGISOFT), _camera("a.xml")),
+    "camera-colmap": Reader(text(cameras__txt=cameras.COLMAP), _camera("cameras.txt", camera="5")),
+    "camera-smac": Reader(text(a__txt=cameras.SMAC), _camera("a.txt")),
+    "camera-smac-torn": Reader(text(a__txt=cameras.SMAC_TORN), _camera("a.txt")),
+    "camera-toml": Reader(text(a__toml=cameras.TOML), _camera("a.toml")),
+    "camera-results": Reader(
+        text(interior__csv=cameras.INTERIOR, correlation__csv=cameras.CORRELATION, summary__json=SUMMARY), _camera("")
+    ),
+}
+"""The readers by name."""
+
+
+@functools.cache
+def sound(reader: str) -> Files:
+    """The sound files of a reader."""
+    return READERS[reader].files()
+
+
+def spoilt(reader: str, seed: int) -> Files:
+    """The files of a reader, one of them spoilt."""
+    rng = np.random.default_rng((zlib.crc32(reader.encode()), seed))
+    files = dict(sound(reader))
+    name = str(rng.choice(sorted(READERS[reader].spoilt or files)))
+    content = files[name]
+    for _ in range(1 + rng.integers(3)):
+        content = _WAYS[rng.integers(len(_WAYS))](content, rng)
+    return files | {name: content}
+
+
+def tried(reader: str, seed: int, folder: Path) -> list[Finding]:
+    """Spoil the files of a reader, read them, and say what it did that it must not do."""
+    for name, content in spoilt(reader, seed).items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
+    found: list[tuple[str, str]] = []
+    said: list[str] = []
+    began, before = time.perf_counter(), peak_mb(anew=True)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            READERS[reader].read(folder)
+        except JaxphotoError as error:
+            said.append(str(error))
+        except Exception:
+            found.append(("traceback", traceback.format_exc(limit=-4)))
+    seconds, more = time.perf_counter() - began, peak_mb() - before
+    said += [str(w.message) for w in caught if issubclass(w.category, UserWarning)]
+    found += [
+        ("warning", f"{w.filename}:{w.lineno}: {w.message}") for w in caught if issubclass(w.category, RuntimeWarning)
+    ]
+    found += [("message", message[:300]) for message in said if len(message) > _LONGEST or _CONTROL.search(message)]
+    if seconds > SLOWEST_S:
+        found.append(("slow", f"{seconds:.1f} s"))
+    if more > MOST_MB:
+        found.append(("memory", f"{more:.0f} MB"))
+    return [Finding(reader, seed, *what) for what in found]
+
+
+def peak_mb(*, anew: bool = False) -> float:
+    """The most memory (MB) that this process has had resident, `anew` from now on; 0 where that is not told."""
+    try:
+        if anew:
+            Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+        lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
+        return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM")) / 1024
+    except OSError:
+        return 0.0
+
+
+# Ways to spoil -----------------------------------------------------------------------------------------------
+
+
+def _span(content: bytes, rng: np.random.Generator, longest: int = 200) -> tuple[int, int]:
+    """Begin and end of a piece."""
+    begin = int(rng.integers(len(content) + 1))
+    return begin, min(len(content), begin + int(rng.integers(1, longest)))
+
+
+def _byte(content: bytes, rng: np.random.Generator) -> bytes:
+    begin, _ = _span(content, rng)
+    return content[:begin] + bytes([rng.integers(256)]) + content[begin + 1 :]
+
+
+def _bit(content: bytes, rng: np.random.Generator) -> bytes:
+    if not content:
+        return content
+    at = int(rng.integers(len(content)))
+    return content[:at] + bytes([content[at] ^ (1 << int(rng.integers(8)))]) + content[at + 1 :]
+
+
+def _deleted(content: bytes, rng: np.random.Generator) -> bytes:
+    begin, end = _span(content, rng)
+    return content[:begin] + content[end:]
+
+
+def _repeated(content: bytes, rng: np.random.Generator) -> bytes:
+    begin, end = _span(content, rng)
+    return content[:begin] + content[begin:end] * int(rng.choice([2, 3, 500])) + content[end:]
+
+
+def _cut(content: bytes, rng: np.random.Generator) -> bytes:
+    return content[: rng.integers(len(content) + 1)]
+
+
+def _moved(content: bytes, rng: np.random.Generator) -> bytes:
+    begin, end = _span(content, rng)
+    rest = content[:begin] + content[end:]
+    at = int(rng.integers(len(rest) + 1))
+    return rest[:at] + content[begin:end] + rest[at:]
+
+
+def _lines(content: bytes, rng: np.random.Generator) -> bytes:
+    """Two lines change places, or one stands there more often, or not at all."""
+    lines = content.split(b"\n")
+    i, j = rng.integers(len(lines), size=2)
+    kind = rng.integers(4)
+    if kind == 0:
+        lines[i], lines[j] = lines[j], lines[i]
+    elif kind == 1:
+        lines.insert(j, lines[i])
+    elif kind == 2:
+        lines[i : i + 1] = [lines[i]] * 2000
+    else:
+        del lines[i]
+    return b"\n".join(lines)
+
+
+def _replaced(content: bytes, rng: np.random.Generator, pattern: re.Pattern, others: tuple[str, ...]) -> bytes:
+    found = list(pattern.finditer(content))
+    if not found:
+        return content
+    match, other = found[rng.integers(len(found))], others[rng.integers(len(others))]
+    return content[: match.start()] + other.encode() + content[match.end() :]
+
+
+def _number(content: bytes, rng: np.random.Generator) -> bytes:
+    return _replaced(content, rng, _NUMBER, NUMBERS)
+
+
+def _word(content: bytes, rng: np.random.Generator) -> bytes:
+    return _replaced(content, rng, _WORD, TEXTS)
+
+
+def _inserted(content: bytes, rng: np.random.Generator) -> bytes:
+    begin, _ = _span(content, rng)
+    return content[:begin] + TEXTS[rng.integers(len(TEXTS))].encode() + content[begin:]
+
+
+def _exchanged(content: bytes, rng: np.random.Generator) -> bytes:
+    """A word in place of another of the same file."""
+    words = sorted(set(_WORD.findall(content[:100_000])))
+    return (
+        _replaced(content, rng, _WORD, (words[rng.integers(len(words))].decode("utf-8", "replace"),))
+        if words
+        else content
+    )
+
+
+def _binary_number(content: bytes, rng: np.random.Generator) -> bytes:
+    """Eight bytes, or four, that are an extreme number."""
+    kind, values = [
+        ("<f8", [np.nan, np.inf, -np.inf, 1e308, -1e300, 5e-324, 0.0, -1.0]),
+        ("<i8", [-1, 0, 2**63 - 1, -(2**63), 2**32, 10**9]),
+        ("<i4", [-1, 0, 2**31 - 1, -(2**31), 10**9]),
+    ][rng.integers(3)]
+    new = np.array([values[rng.integers(len(values))]], kind).tobytes()
+    at = int(rng.integers(len(content) + 1)) // len(new) * len(new)
+    return content[:at] + new + content[at + len(new) :]
+
+
+_WAYS = (
+    _byte, _bit, _deleted, _repeated, _cut, _moved, _lines, _number, _number, _number, _word, _word, _inserted,
+    _exchanged, _binary_number,
+)  # fmt: skip
