@@ -4,9 +4,35 @@ Every message says what was found, where (file, row, id or unknown), and what to
 not an error: it is an outcome of the result (see `jaxphoto.adjustment.result.Outcome`).
 """
 
+import re
+import reprlib
+
+# Of a message: what is longer is left out in the middle, because the place stands first and the mend last.
+_BEGINNING, _END = 900, 500
+# Of one word (a path may be as long), and of a value that is quoted.
+_WORD = re.compile(r"\S{400,}")
+_QUOTED = 100
+
+
+def shown(text: str) -> str:
+    """`text` as it may stand in one line of a terminal: what cannot be printed is escaped, and what is long is cut.
+
+    Names and cells of files are in messages; their control characters would be commands to the terminal.
+    """
+    text = "".join(c if c.isprintable() else repr(c)[1:-1] for c in _short(text))
+    return _WORD.sub(lambda word: f"{word[0][:200]}...{word[0][-50:]}", text)
+
+
+def quoted(value: object) -> str:
+    """`repr(value)`, short whatever the value: for messages."""
+    return _SHORT.repr(value)
+
 
 class JaxphotoError(ValueError):
     """Anything a user can mend; the command line prints it as one sentence and ends with exit code 2."""
+
+    def __init__(self, message: str = ""):
+        super().__init__(shown(message))
 
 
 class InputError(JaxphotoError):
@@ -23,3 +49,12 @@ class DatumError(JaxphotoError):
 
 class RankError(JaxphotoError):
     """Unknowns that the observations cannot tell apart, although the datum is determined."""
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= _BEGINNING + _END else f"{text[:_BEGINNING]} ... {text[-_END:]}"
+
+
+_SHORT = reprlib.Repr()
+_SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = _QUOTED
+_SHORT.maxlist = _SHORT.maxtuple = _SHORT.maxdict = 8

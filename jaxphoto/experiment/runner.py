@@ -12,8 +12,8 @@ from jaxphoto.adjustment import Sizes, common_sizes
 from jaxphoto.block import Block
 from jaxphoto.errors import InputError, JaxphotoError
 from jaxphoto.experiment.declaration import Experiment, Results, Variant
-from jaxphoto.io.block_folder.settings import read_toml
 from jaxphoto.io.recipe import recipe_from
+from jaxphoto.io.toml import read_toml
 from jaxphoto.procedures import adjust
 from jaxphoto.report import Tables
 from jaxphoto.simulation import Recipe, Simulation, simulate

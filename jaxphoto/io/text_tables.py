@@ -3,20 +3,30 @@
 A row is counted as a spreadsheet counts it: header, comments and empty lines included, from 1.
 """
 
+import collections
 import csv
 import dataclasses
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
-from jaxphoto.errors import BlockError, InputError
+from jaxphoto.errors import BlockError, InputError, quoted, shown
+from jaxphoto.io.names import LONGEST, harm_in, harmless
+from jaxphoto.io.whole_text import LARGE, read_text
 
 # The index of a line in its table, from Python or from numpy.
 Line = int | np.integer
 # The columns in which a comma is not a decimal comma.
 _TEXT = frozenset({"image", "camera", "strip", "point", "role"})
+LARGEST = 1e30
+"""No length, angle, time or coefficient is larger; the square of it is a number yet."""
+# What fits into 64 bits.
+_DIGITS = 18
+# Of a table: the widest one here has some twenty columns.
+_MOST_COLUMNS, _LONGEST_LINE = 1_000, 100_000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,9 +76,18 @@ class Table:
 
     def ids(self, column: str) -> np.ndarray:
         """A column of ids, none of them empty."""
-        values = self.text(column)
+        values = self.names(column)
         for line in np.flatnonzero(values == ""):
             raise self.bad(line, f"the {column} is empty; give its id or delete the row")
+        return values
+
+    def names(self, column: str) -> np.ndarray:
+        """A column of ids, some of which may be empty; none does harm where results show it (`jaxphoto.io.names`)."""
+        values = self.text(column)
+        if not harmless(pd.unique(values).tolist()):
+            for line, name in enumerate(values):
+                if harm := harm_in(name):
+                    raise self.bad(line, f"the {column} {quoted(name)} {harm}")
         return values
 
     def numbers(self, column: str, *, empty: bool = False) -> np.ndarray:
@@ -81,6 +100,8 @@ class Table:
         else:
             for line in np.flatnonzero(~np.isfinite(cells)):
                 raise self.bad(line, f"{column} is {cells[line]}; give a finite number")
+        for line in np.flatnonzero(np.abs(cells) > LARGEST):
+            raise self.bad(line, f"{column} is {cells[line]:g}, larger than any number can be here; correct it")
         if not empty:
             for line in np.flatnonzero(np.isnan(cells)):
                 raise self.bad(line, f"{column} is empty; give a number or delete the row")
@@ -106,10 +127,11 @@ class Table:
         except ValueError:
             bad = np.array([cell != "" and not is_number(cell) for cell in cells], bool)
         for line in np.flatnonzero(bad):
-            raise self.bad(line, f"{column} is {cells[line]!r}, not a number; write it like 12.34")
+            raise self.bad(line, f"{column} is {quoted(cells[line])}, not a number; write it like 12.34")
         for line in np.flatnonzero(filled & ~np.isfinite(values)):
             raise self.bad(
-                line, f"{column} is {cells[line]!r}; give a finite number, or leave the cell empty if it is unknown"
+                line,
+                f"{column} is {quoted(cells[line])}; give a finite number, or leave the cell empty if it is unknown",
             )
         return values
 
@@ -133,90 +155,110 @@ def read_csv(path: Path, needed: Sequence[str], optional: Sequence[str] = (), te
     and any line ends are accepted. Columns in neither list are left out, with a UserWarning. A comma in the columns
     `text` is not a decimal comma.
 
-    Raises InputError where the file, a needed column or a cell is missing or too many.
+    Raises InputError where the file, a needed column or a cell is missing, too many or too long.
     """
     lines, rows = content_lines(path)
     if not lines:
         raise InputError(f"{path.name}: the file is empty; give it a header with the columns {', '.join(needed)}")
     separator = ";" if ";" in lines[0] else ","
-    header, *records = _records(path, lines, rows, separator)
-    header = [name.strip() for name in header]
-    for name in header:
-        if name and header.count(name) > 1:
+    records = _records(path, lines, rows, separator)
+    header = [name.strip() for name in next(records)]
+    for name, count in collections.Counter(header).items():
+        if name and count > 1:
             raise InputError(f"{path.name}, row {rows[0]}: the column {name} stands there twice; keep one of them")
     for name in needed:
         if name not in header:
             found = ", ".join(filter(None, header))
             raise InputError(f"{path.name}, row {rows[0]}: the column {name} is missing (found {found}); add it")
-    unknown = [name for name in header if name and name not in needed and name not in optional]
-    if unknown:
+    known = {name: j for j, name in enumerate(header) if name in needed or name in optional}
+    if unknown := [name for name in header if name and name not in known]:
         message = f"{path.name}: columns that jaxphoto does not know are not used: {', '.join(unknown)}"
-        warnings.warn(message, UserWarning, stacklevel=2)
+        warnings.warn(shown(message), UserWarning, stacklevel=2)
+    # Only what is used is kept of a row.
+    kept = [[record[j].strip() for j in known.values()] for record in records]
     columns = {}
-    for j, name in enumerate(header):
-        if name in needed or name in optional:
-            cells = [record[j].strip() for record in records]
-            if separator == ";" and name not in _TEXT and name not in text:
-                cells = [cell.replace(",", ".") for cell in cells]
-            columns[name] = _objects(cells)
-    return Table.of(path.name, columns, np.array(rows[1:], int))
+    for k, name in enumerate(known):
+        cells = [record[k] for record in kept]
+        if separator == ";" and name not in _TEXT and name not in text:
+            cells = [cell.replace(",", ".") for cell in cells]
+        columns[name] = _objects(cells)
+    return _of_short_cells(Table.of(path.name, columns, np.array(rows[1:], int)))
 
 
 def read_columns(path: Path, columns: Sequence[str], separator: str | None = ",") -> Table:
     """A file without a header whose columns are named by the caller; `separator` None means blanks."""
     lines, rows = content_lines(path)
-    records = [[cell.strip() for cell in line.split(separator)] for line in lines]
-    for record, row in zip(records, rows, strict=True):
+    records = []
+    for line, row in zip(lines, rows, strict=True):
+        record = [cell.strip() for cell in line.split(separator)]
         if len(record) != len(columns):
             raise InputError(
                 f"{path.name}, row {row}: {len(record)} cells instead of {len(columns)} ({', '.join(columns)}); "
                 "complete the row or correct the format"
             )
+        records.append(record)
     cells = {name: _objects([record[j] for record in records]) for j, name in enumerate(columns)}
-    return Table.of(path.name, cells, np.array(rows, int))
+    return _of_short_cells(Table.of(path.name, cells, np.array(rows, int)))
 
 
 def content_lines(path: Path) -> tuple[list[str], list[int]]:
     """The lines of a text file that are neither empty nor comments, and their row numbers."""
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise InputError(f"there is no file {path}; add it, or correct the name") from None
-    except OSError as error:
-        raise InputError(f"{path.name} cannot be read ({error.strerror}); check that it is a readable file") from None
-    except UnicodeDecodeError as error:
-        row = error.object[: error.start].count(b"\n") + 1
-        raise InputError(f"{path.name}, row {row}: the text is not UTF-8; save the file as UTF-8") from None
     # Not splitlines(): that also ends lines at form feeds and other characters an editor does not count.
-    numbered = enumerate(text.split("\n"), start=1)
+    numbered = enumerate(read_text(path, LARGE).split("\n"), start=1)
     kept = [(line, row) for row, line in numbered if line.strip() and not line.lstrip().startswith("#")]
     return [line for line, _ in kept], [row for _, row in kept]
 
 
-def _records(path: Path, lines: list[str], rows: list[int], separator: str) -> list[list[str]]:
-    try:
-        records = list(csv.reader(lines, delimiter=separator, skipinitialspace=True, strict=True))
-    except csv.Error:
-        records = []
-    if len(records) != len(lines):
-        row = next((row for line, row in zip(lines, rows, strict=True) if line.count('"') % 2), rows[0])
-        raise InputError(f"{path.name}, row {row}: the quotation marks do not pair; close or remove them in that row")
-    width = len(records[0])
-    for record, row in zip(records, rows, strict=True):
+def _records(path: Path, lines: list[str], rows: list[int], separator: str) -> Iterator[list[str]]:
+    """The cells of one line after the other, as many as the first has."""
+    width = 0
+    for line, row in zip(lines, rows, strict=True):
+        if len(line) > _LONGEST_LINE:
+            raise InputError(
+                f"{path.name}, row {row}: the row has {len(line)} characters, and one of a table has at most "
+                f"{_LONGEST_LINE}; correct it"
+            )
+        try:
+            (record,) = csv.reader([line], delimiter=separator, skipinitialspace=True, strict=True)
+        except csv.Error:
+            raise InputError(
+                f"{path.name}, row {row}: the quotation marks do not pair; close or remove them in that row"
+            ) from None
+        width = width or len(record)
+        if width > _MOST_COLUMNS:
+            raise InputError(
+                f"{path.name}, row {row}: the header has {width} columns, and a table has at most {_MOST_COLUMNS}; "
+                "correct it"
+            )
         if len(record) > width:
             raise InputError(
                 f"{path.name}, row {row}: {len(record)} cells, but the header has {width}; remove the surplus ones"
                 + (" (decimal commas need semicolons between the columns)" if separator == "," else "")
             )
         # Some spreadsheets leave out empty cells at the end of a row.
-        record.extend([""] * (width - len(record)))
-    return records
+        yield record + [""] * (width - len(record))
+
+
+def _of_short_cells(table: Table) -> Table:
+    """The table. Raises InputError for a cell that is longer than any id or number: arrays of text would explode."""
+    for column, cells in table.columns.items():
+        if max(map(len, cells), default=0) > LONGEST:
+            line, cell = next((k, cell) for k, cell in enumerate(cells) if len(cell) > LONGEST)
+            raise table.bad(
+                line, f"{column} is {quoted(cell)} of {len(cell)} characters, the most are {LONGEST}; correct it"
+            )
+    return table
 
 
 def _objects(cells: list[str]) -> np.ndarray:
     values = np.empty(len(cells), object)
     values[:] = cells
     return values
+
+
+def natural(cell: str) -> int | None:
+    """The whole number, zero or more, that a cell is; None where it is none, or has more digits than any count."""
+    return int(cell) if cell.isascii() and cell.isdigit() and len(cell) <= _DIGITS else None
 
 
 def is_number(cell: str) -> bool:

@@ -76,3 +76,8 @@ class ConvergentPlan:
     def cameras(self) -> set[str]:
         """Those that take an image."""
         return {station.camera for station in self.stations}
+
+    @property
+    def n_images(self) -> int:
+        """Each station is one."""
+        return len(self.stations)

@@ -13,6 +13,9 @@ from jaxphoto.camera import Sensor
 from jaxphoto.errors import BlockError
 from jaxphoto.georeferencing.mount import ImageX
 
+# So often 4 n places are drawn for n: enough where strips are a thousandth of the ground between them.
+_TRIES = 1_000
+
 
 class Footprint(NamedTuple):
     """The ground that a vertical image covers, along and across the flight (m)."""
@@ -73,6 +76,11 @@ class FlightPlan:
         """Those that are flown."""
         return {strip.camera for strip in self.strips}
 
+    @property
+    def n_images(self) -> int:
+        """In all strips."""
+        return sum(strip.images for strip in self.strips)
+
 
 @dataclasses.dataclass(frozen=True)
 class Swaths:
@@ -123,10 +131,12 @@ class Swaths:
             )
         low, high = self.extent(np.eye(2))
         found = np.zeros((0, 2))
-        while len(found) < n:
+        for _ in range(_TRIES):
+            if len(found) >= n:
+                return found[:n]
             xy = rng.uniform(low, high, (4 * n, 2))
             found = np.vstack([found, xy[self.contain(xy)]])
-        return found[:n]
+        raise BlockError("the strips lie so far apart that places are hardly ever in one; bring them together")
 
 
 def footprint(sensor: Sensor, c_mm: float, height_m: float, image_x: ImageX) -> Footprint:

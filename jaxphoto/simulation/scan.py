@@ -31,6 +31,8 @@ _ENOUGH_M = 1e-7
 _ROUNDS = 60
 # Pulses worked on at once: bounds the memory.
 _CHUNK = 500_000
+# What a computer can hold of a cloud, and of a trajectory.
+_PULSES, _RECORDS = 1e8, 2e7
 
 
 class Scan(NamedTuple):
@@ -67,8 +69,18 @@ def scan(
     body_from_scanner = np.asarray(_small_rotation(boresight))
     leaves, noise = stream(seed, "laser returns from crowns"), stream(seed, "noise of laser points")
     parts = []
+    pulses_of = [plan.density_per_m2 * 2 * plan.half_width * path.height_m * path.length_m for path in paths]
+    if not sum(pulses_of) <= _PULSES:
+        raise BlockError(
+            f"the scanner would send {sum(pulses_of):.3g} pulses, the most are {_PULSES:g}; lower density_per_m2"
+        )
+    seconds = sum(path.node[-1] - path.node[0] for path in paths)
+    if not seconds * _RATE_HZ <= _RECORDS:
+        raise BlockError(
+            f"the scanner would fly for {seconds / 3600:.3g} hours; give shorter strips, or a higher speed"
+        )
     for number, path in enumerate(paths):
-        n = round(plan.density_per_m2 * 2 * plan.half_width * path.height_m * path.length_m)
+        n = round(pulses_of[number])
         for begin in range(0, n, _CHUNK):
             pulses = np.arange(begin, min(begin + _CHUNK, n))
             time, across = _pattern(plan, path, pulses, n)

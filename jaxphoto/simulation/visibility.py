@@ -15,6 +15,8 @@ from jaxphoto.simulation.chunks import in_chunks
 from jaxphoto.simulation.nearby import pairs_along
 
 _CHUNK = 1024
+# Images times points worked on at once: bounds the memory.
+_PAIRS = 2_000_000
 # Places on the format, along each side, from which is seen how far ideal coordinates reach; 31 x 31 fill a chunk.
 _PLACES = 31
 # A point on a roof is not hidden by it: what is entered less than this (m) before a point is what the point is on.
@@ -51,6 +53,24 @@ def photograph(
     where the distortion can be inverted (`InteriorOrientation.invertible`), and inside the format by more than
     `margin_mm`. Coordinates are those of `jaxphoto.collinearity.project`.
     """
+    at_once = max(1, _PAIRS // max(len(image_camera), 1))
+    begins = range(0, max(len(points), 1), at_once)
+    parts = [_photograph(cameras, sensors, image_camera, exterior, points[k : k + at_once], margin_mm) for k in begins]
+    point = [part.point + begin for part, begin in zip(parts, begins, strict=True)]
+    return Rays(
+        np.concatenate([part.image for part in parts]), np.concatenate(point), np.concatenate([p.xy for p in parts])
+    )
+
+
+def _photograph(
+    cameras: Mapping[str, InteriorOrientation],
+    sensors: Mapping[str, Sensor],
+    image_camera: Sequence[str],
+    exterior: ExteriorOrientation,
+    points: Float[np.ndarray, "points 3"],
+    margin_mm: float,
+) -> Rays:
+    """As `photograph`, all points at once."""
     position, matrix = np.asarray(exterior.position), np.asarray(exterior.camera_from_object)
     # (images, points, 3), in the camera frame
     seen = np.einsum("kij,knj->kni", matrix, points[None] - position[:, None])

@@ -27,12 +27,13 @@ from jaxphoto.io.block_folder.motion import ObservedFlight, check_time_offsets, 
 from jaxphoto.io.block_folder.mount_sections import mounts_of, read_mounts, read_strips
 from jaxphoto.io.block_folder.observed import Ids, Kind, known_kinds, own_tables
 from jaxphoto.io.block_folder.section import Section
-from jaxphoto.io.block_folder.settings import Settings, read_partitions, read_settings, read_toml
+from jaxphoto.io.block_folder.settings import Settings, read_partitions, read_settings
 from jaxphoto.io.block_folder.surfaces import read_surfaces
 from jaxphoto.io.block_folder.table_layout import LAYOUTS, TOML, TableLayout, layout_in
 from jaxphoto.io.block_folder.tables import layouts, read_declared
 from jaxphoto.io.block_folder.trajectory_section import read_flight
 from jaxphoto.io.text_tables import Table, read_csv
+from jaxphoto.io.toml import read_toml
 from jaxphoto.io.trajectory import Records, read_records
 from jaxphoto.observations import AbstractObservations, Distances, sigma_key
 from jaxphoto.parameters import AbstractParameters
@@ -208,7 +209,7 @@ def _partitions(images: Images, settings: Settings) -> dict[str, tuple[str, ...]
             raise InputError(
                 f"{images.table.file}: the column {name} is missing, which is one of the partitions; add it"
             )
-        found[name] = tuple(images.table.text(name))
+        found[name] = tuple(images.table.names(name))
         for line in [k for k, part in enumerate(found[name]) if part == "default"][:1]:
             raise images.table.bad(line, f"the {name} default means every {name} in [unknowns]; give it another name")
     return found

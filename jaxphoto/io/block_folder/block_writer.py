@@ -20,7 +20,7 @@ from jaxphoto.io.block_folder.joint import JOINT
 from jaxphoto.io.block_folder.map_tables import tables_to_map
 from jaxphoto.io.block_folder.mount_sections import mount_section, mounts_of, strip_section
 from jaxphoto.io.block_folder.section import Section
-from jaxphoto.io.block_folder.settings import datum_section, read_toml, toml_text
+from jaxphoto.io.block_folder.settings import datum_section, toml_text
 from jaxphoto.io.block_folder.surfaces import scanner_section, surface_table
 from jaxphoto.io.block_folder.table_layout import (
     ANGLES,
@@ -34,6 +34,7 @@ from jaxphoto.io.block_folder.table_layout import (
     XYZ,
 )
 from jaxphoto.io.block_folder.tables import declared_tables, kinds_of, layouts
+from jaxphoto.io.toml import read_toml
 from jaxphoto.observations import OBSERVATIONS, AbstractCoordinates
 from jaxphoto.unknowns import FIXED, FREE
 

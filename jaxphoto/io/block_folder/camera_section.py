@@ -21,7 +21,7 @@ from jaxphoto.camera import (
     set_parameter,
 )
 from jaxphoto.camera.declared import Declared
-from jaxphoto.errors import BlockError, InputError
+from jaxphoto.errors import BlockError, InputError, quoted
 from jaxphoto.io.block_folder.section import Section
 from jaxphoto.unknowns import FIXED, Prior, Weighted
 
@@ -117,7 +117,7 @@ def _one_of(section: Section, key: str, words: tuple[str, ...], usual: str) -> s
     word = section.text(key, usual)
     if word not in words:
         known = " nor ".join(f'"{w}"' for w in words)
-        raise section.error(key, f"{word!r} is neither {known}; choose one of them")
+        raise section.error(key, f"{quoted(word)} is neither {known}; choose one of them")
     return word
 
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxphoto.arrays import on_device
-from jaxphoto.errors import InputError
+from jaxphoto.errors import InputError, quoted
 from jaxphoto.io.block_folder.image_points import ObservedPoints
 from jaxphoto.io.block_folder.images import refuse_duplicates
 from jaxphoto.io.block_folder.settings import Settings
@@ -85,7 +85,7 @@ def _read_rows(table: Table, point: np.ndarray, settings: Settings) -> tuple[np.
     """The role of each row and the rows, one per given coordinate."""
     role = np.where(table.text("role") == "", "control", table.text("role"))
     for line in np.flatnonzero(~np.isin(role, ROLES)):
-        raise table.bad(line, f"the role {role[line]!r} is unknown; write control, fixed or check")
+        raise table.bad(line, f"the role {quoted(role[line])} is unknown; write control, fixed or check")
     value = np.stack([table.numbers(name, empty=True) for name in XYZ], axis=1)
     sigma = np.stack([table.sigmas(name) for name in SIGMA_XYZ], axis=1)
     for line in np.flatnonzero(np.isnan(value).all(axis=1)):

@@ -4,7 +4,7 @@ import warnings
 from typing import Any
 
 from jaxphoto.block import Frame
-from jaxphoto.errors import InputError
+from jaxphoto.errors import InputError, quoted
 from jaxphoto.georeferencing import Corrections
 from jaxphoto.georeferencing.map_frame import check_heights, map_system
 from jaxphoto.io.block_folder.section import Section
@@ -16,7 +16,7 @@ def read_frame(section: Section) -> Frame:
     """The frame that a [frame] table describes; of kind epsg without an origin where the table gives none."""
     kind = section.text("kind", "local")
     if kind not in _KINDS:
-        raise section.error("kind", f'{kind!r} is no frame; write "local", "enu", "grid" or "epsg"')
+        raise section.error("kind", f'{quoted(kind)} is no frame; write "local", "enu", "grid" or "epsg"')
     if kind != "epsg":
         section.known("kind")
         return Frame(kind)  # type: ignore[arg-type]
@@ -42,7 +42,7 @@ def read_frame(section: Section) -> Frame:
             raise section.error("vertical", str(error)) from None
     yaw = section.text("yaw", "true")
     if yaw not in ("true", "grid"):
-        raise section.error("yaw", f'{yaw!r} is no north; write "true" or "grid"')
+        raise section.error("yaw", f'{quoted(yaw)} is no north; write "true" or "grid"')
     origin = None
     if "origin" in section:
         longitude, latitude, height = section.vector("origin")
@@ -101,5 +101,5 @@ def corrections_section(corrections: Corrections, frame: Frame) -> dict[str, Any
 def _switch(section: Section, key: str) -> bool:
     value = section.values.get(key, False)
     if not isinstance(value, bool):
-        raise section.error(key, f"{value!r} is neither true nor false; write one of them")
+        raise section.error(key, f"{quoted(value)} is neither true nor false; write one of them")
     return value

@@ -63,7 +63,7 @@ def read_images(table: Table, settings: Settings) -> Images:
                 number,
                 f"camera {camera} has no table [cameras.{camera}] in {settings.file}; add it or use one of {known}",
             )
-    strips = table.text("strip")
+    strips = table.names("strip")
     for i in np.flatnonzero(strips == "default"):
         raise table.bad(i, f"the strip name default means every strip in {settings.file}; give it another name")
     times = table.numbers("time_s", empty=True)

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from jaxphoto.arrays import on_device
+from jaxphoto.errors import quoted
 from jaxphoto.georeferencing import IMAGE_X, Mount, StripBias
 from jaxphoto.io.block_folder.camera_section import status
 from jaxphoto.io.block_folder.section import Section
@@ -26,7 +27,7 @@ def read_mounts(section: Section, cameras: Iterable[str]) -> tuple[dict[str, Mou
         image_x = table.text("image_x", "forward")
         if image_x not in IMAGE_X:
             raise table.error(
-                "image_x", f"{image_x!r} is no direction of the camera's x axis; use {', '.join(IMAGE_X)}"
+                "image_x", f"{quoted(image_x)} is no direction of the camera's x axis; use {', '.join(IMAGE_X)}"
             )
         offset = table.number("time_offset_s", 0.0)
         mounts[name] = Mount(on_device(arm), on_device(boresight), on_device(offset), image_x)  # type: ignore[arg-type]

@@ -1,12 +1,18 @@
 """A table of block.toml that knows its own name, so that every message can say where the mistake is."""
 
+import math
 from typing import Any
 
 import numpy as np
 
 from jaxphoto.arrays import on_device
-from jaxphoto.errors import InputError
+from jaxphoto.errors import InputError, quoted
+from jaxphoto.io.names import harm_in
+from jaxphoto.io.text_tables import LARGEST
 from jaxphoto.unknowns import FIXED, FREE, Prior, Weighted
+
+MOST = 10**9
+"""Of anything that is counted. Numbers of things that are made have limits of their own."""
 
 
 class Section:
@@ -36,21 +42,28 @@ class Section:
         """The table under `key`, empty where there is none."""
         values = self.values.get(key, {})
         if not isinstance(values, dict):
-            raise self.error(key, f"{values!r} is not a table; write it as [{self._below(key)}]")
+            raise self.error(key, f"{quoted(values)} is not a table; write it as [{self._below(key)}]")
         return Section(self.file, self._below(key), values)
 
     def text(self, key: str, default: str | None = None) -> str:
         """A piece of text."""
         value = self._needed(key) if default is None else self.values.get(key, default)
         if not isinstance(value, str):
-            raise self.error(key, f'{value!r} is not text; put it in quotation marks, like "{value}"')
+            raise self.error(key, f'{quoted(value)} is not text; put it in quotation marks, like "..."')
+        return value
+
+    def name(self, key: str) -> str:
+        """A piece of text that results show as the name of something."""
+        value = self.text(key)
+        if harm := harm_in(value):
+            raise self.error(key, f"the name {quoted(value)} {harm}")
         return value
 
     def texts(self, key: str) -> tuple[str, ...]:
         """A list of pieces of text; none where the key is absent."""
         value = self.values.get(key, [])
         if not isinstance(value, list) or not all(isinstance(v, str) for v in value):
-            raise self.error(key, f'{value!r} is not a list of text; write it like ["a", "b"]')
+            raise self.error(key, f'{quoted(value)} is not a list of text; write it like ["a", "b"]')
         return tuple(value)
 
     def number(self, key: str, default: float | None = None) -> float:
@@ -65,11 +78,13 @@ class Section:
             raise self.error(key, f"{value:g} is not positive; give the true value")
         return value
 
-    def count(self, key: str) -> int:
-        """A whole number above zero."""
+    def count(self, key: str, most: int = MOST) -> int:
+        """A whole number above zero, and not above `most`."""
         value = self._needed(key)
         if isinstance(value, bool) or not isinstance(value, int) or value <= 0:
-            raise self.error(key, f"{value!r} is not a positive whole number; give one")
+            raise self.error(key, f"{quoted(value)} is not a positive whole number; give one")
+        if value > most:
+            raise self.error(key, f"{quoted(value)} is too large, the most are {most}; give the true number")
         return value
 
     def vector(self, key: str, size: int = 3) -> np.ndarray:
@@ -77,7 +92,7 @@ class Section:
         value = self.values.get(key, [0.0] * size)
         if not isinstance(value, list) or len(value) != size:
             many = "three" if size == 3 else size
-            raise self.error(key, f"{value!r} is not a list of {many} numbers; write it like {[0.0] * size}")
+            raise self.error(key, f"{quoted(value)} is not a list of {many} numbers; write it like {[0.0] * size}")
         return np.array([self._finite(key, v) for v in value])
 
     def prior(self, key: str, start, unit: str = "", scale: float = 1.0) -> Prior | Weighted:
@@ -97,7 +112,7 @@ class Section:
         names["covariance"] = ["covariance"] if isinstance(status, dict) and "covariance" in status and shape else []
         known = {n for ns in names.values() for n in ns}
         if not isinstance(status, dict) or bool(names["sigma"]) == bool(names["covariance"]) or set(status) - known:
-            raise self.error(key, f'{status!r} is no status; write "free", "fixed" or {{ sigma{unit} = ... }}')
+            raise self.error(key, f'{quoted(status)} is no status; write "free", "fixed" or {{ sigma{unit} = ... }}')
         value = self._array(key, status[names["value"][0]], shape) * scale if names["value"] else np.asarray(start)
         if names["covariance"]:
             return Weighted(on_device(value), covariance=on_device(self._covariance(key, status, *shape) * scale**2))
@@ -108,7 +123,8 @@ class Section:
 
     def _covariance(self, key: str, status: dict[str, Any], size: int) -> np.ndarray:
         rows = status["covariance"]
-        if not isinstance(rows, list) or [np.shape(row) for row in rows] != [(size,)] * size:
+        lengths = [len(row) if isinstance(row, list) else 0 for row in rows] if isinstance(rows, list) else []
+        if lengths != [size] * size:
             raise self.error(
                 key, f"the covariance is no matrix of {size} x {size}; write {size} lists of {size} numbers"
             )
@@ -121,12 +137,16 @@ class Section:
         values = value if isinstance(value, list) else [value]
         numbers = np.array([self._finite(key, v) for v in values])
         if len(numbers) not in (1, *shape):
-            raise self.error(key, f"{value!r} has {len(numbers)} numbers; give one, or one per axis")
+            raise self.error(key, f"{quoted(value)} has {len(numbers)} numbers; give one, or one per axis")
         return np.broadcast_to(numbers, shape).copy() if shape else numbers.reshape(())
 
     def _finite(self, key: str, value) -> float:
-        if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
-            raise self.error(key, f"{value!r} is not a finite number; write it like 12.34, without quotation marks")
+        if isinstance(value, bool) or not isinstance(value, int | float) or not _is_finite(value):
+            raise self.error(
+                key, f"{quoted(value)} is not a finite number; write it like 12.34, without quotation marks"
+            )
+        if abs(value) > LARGEST:
+            raise self.error(key, f"{value:g} is larger than any number can be here; give the true one")
         return float(value)
 
     def _needed(self, key: str):
@@ -139,3 +159,11 @@ class Section:
 
 
 _KEYS = ("sigma", "value")
+
+
+def _is_finite(value: int | float) -> bool:
+    try:
+        return math.isfinite(value)
+    except OverflowError:
+        # A whole number beyond the floats.
+        return False

@@ -1,14 +1,12 @@
 """block.toml: title, frame, corrections, trajectory, cameras, default sigmas, mounts, strips, scanner and datum."""
 
-import tomllib
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxphoto.block import Datum, Frame
-from jaxphoto.errors import InputError
+from jaxphoto.errors import quoted
 from jaxphoto.io.block_folder.camera_section import Camera, read_camera
 from jaxphoto.io.block_folder.frame_sections import read_frame
 from jaxphoto.io.block_folder.section import Section
@@ -57,16 +55,6 @@ class Settings(NamedTuple):
     unknowns: Section
     partitions: tuple[str, ...]
     """Columns of images.csv that say whose further unknowns are."""
-
-
-def read_toml(path: Path) -> dict[str, Any]:
-    """A TOML file as it stands. Raises InputError with the line of a syntax error."""
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except UnicodeDecodeError:
-        raise InputError(f"{path.name}: the text is not UTF-8; save the file as UTF-8") from None
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path.name}: {error}; correct the TOML there") from None
 
 
 def read_settings(values: dict[str, Any], file: str = TOML, sigma_keys: Sequence[str] = ()) -> Settings:
@@ -127,7 +115,7 @@ def _read_datum(section: Section) -> Datum:
     section.known("kind", "over", "scale")
     kind = section.text("kind", "control")
     if kind not in ("control", "minimal", "inner"):
-        raise section.error("kind", f'{kind!r} is no datum; write "control", "minimal" or "inner"')
+        raise section.error("kind", f'{quoted(kind)} is no datum; write "control", "minimal" or "inner"')
     if kind != "inner":
         for key in ("over", "scale"):
             if key in section:
@@ -136,13 +124,15 @@ def _read_datum(section: Section) -> Datum:
     over = section.values.get("over", "points")
     if isinstance(over, list):
         if not over or not all(isinstance(point, str) for point in over):
-            raise section.error("over", f'{over!r} is no list of point ids; write them as text, like ["1", "2", "3"]')
+            raise section.error(
+                "over", f'{quoted(over)} is no list of point ids; write them as text, like ["1", "2", "3"]'
+            )
         over = tuple(over)
     elif over not in ("points", "images"):
-        raise section.error("over", f'{over!r} is unknown; write "points", "images" or a list of point ids')
+        raise section.error("over", f'{quoted(over)} is unknown; write "points", "images" or a list of point ids')
     scale = section.values.get("scale")
     if scale is not None and not isinstance(scale, bool):
-        raise section.error("scale", f"{scale!r} is neither true nor false; write one of them")
+        raise section.error("scale", f"{quoted(scale)} is neither true nor false; write one of them")
     return Datum("inner", over, scale)
 
 
@@ -150,7 +140,7 @@ def _read_mode(section: Section) -> str:
     section.known("mode")
     mode = section.text("mode", "integrated")
     if mode not in MODES:
-        raise section.error("mode", f"{mode!r} is no mode; write {', '.join(MODES)}")
+        raise section.error("mode", f"{quoted(mode)} is no mode; write {', '.join(MODES)}")
     return mode
 
 

@@ -7,6 +7,7 @@ import pandas as pd
 
 from jaxphoto.arrays import on_device
 from jaxphoto.block import Block
+from jaxphoto.errors import quoted
 from jaxphoto.georeferencing import Scanner
 from jaxphoto.io.block_folder.camera_section import status
 from jaxphoto.io.block_folder.image_points import ObservedPoints
@@ -45,7 +46,7 @@ def read_surfaces(table: Table, section: Section, points: ObservedPoints) -> Sur
     named, names = table.text("strip"), tuple(shifts)
     for line in np.flatnonzero([bool(names) and name not in names for name in named]):
         raise table.misfit(
-            line, f"strip {named[line]!r} has no table; add [scanner.shifts.{named[line]}] to {section.file}"
+            line, f"strip {quoted(named[line])} has no table; add [scanner.shifts.{named[line]}] to {section.file}"
         )
     strip = np.array([names.index(name) if names else 0 for name in named], int)
     rows = SurfaceRows(point, strip, *map(on_device, (foot, normal, turn, sigma)))

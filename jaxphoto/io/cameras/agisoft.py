@@ -14,6 +14,7 @@ import jax
 
 from jaxphoto.arrays import on_device
 from jaxphoto.camera import Agisoft, InteriorOrientation, Sensor
+from jaxphoto.errors import quoted
 from jaxphoto.io.cameras.camera_file import CameraFile, CameraSource, joined_notes
 
 _SCALED = ("b1", "b2")
@@ -41,7 +42,7 @@ def read_agisoft(source: CameraSource) -> CameraFile:
     calibration, pixel = found[name]
     kind = calibration.findtext("projection") or calibration.get("type") or "frame"
     if kind.strip() != "frame":
-        raise source.error(f'the projection {kind.strip()!r} is not known here; only "frame" is')
+        raise source.error(f'the projection {quoted(kind.strip())} is not known here; only "frame" is')
     pixel_mm = source.number("pixel_width", pixel) if pixel is not None else None
     sensor, assumed = source.sensor(*_size(source, calibration), pixel_mm)
     values, note = _values(source, calibration, sensor)

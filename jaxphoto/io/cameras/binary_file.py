@@ -6,13 +6,17 @@ from pathlib import Path
 import numpy as np
 
 from jaxphoto.errors import InputError
+from jaxphoto.io.whole_text import read_whole
+
+# Of points of some ten thousand images.
+_MOST = 8_000_000_000
 
 
 class BinaryFile:
     """The bytes of a file and how far they are read."""
 
     def __init__(self, path: Path):
-        self.path, self.data, self.at = path, path.read_bytes(), 0
+        self.path, self.data, self.at = path, read_whole(path, _MOST), 0
 
     def take(self, layout: str) -> tuple:
         """The values of a `struct` layout."""

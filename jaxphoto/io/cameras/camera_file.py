@@ -9,10 +9,17 @@ from jaxtyping import Float
 
 from jaxphoto.arrays import on_device
 from jaxphoto.camera import AbstractDistortion, AbstractProjection, InteriorOrientation, Sensor
-from jaxphoto.errors import InputError
+from jaxphoto.errors import InputError, quoted
+from jaxphoto.io.names import harm_in
+from jaxphoto.io.text_tables import LARGEST
+from jaxphoto.io.whole_text import SMALL, read_whole
 
 ASSUMED_PIXEL_MM = 0.001
 """The pixel where neither file nor user gives one: c in micrometres then is the focal length in pixels."""
+
+
+# Pixels along a side: a mosaic of the largest scanners.
+_WIDEST = 1e7
 
 
 class CameraFile(NamedTuple):
@@ -46,9 +53,10 @@ class CameraSource(NamedTuple):
         return InputError(f"{self.path}: {message}")
 
     def text(self) -> str:
-        """The whole file. Raises InputError where it is not text."""
+        """The whole file. Raises InputError where it is not text, and what `read_whole` raises."""
+        content = read_whole(self.path, SMALL)
         try:
-            return self.path.read_text(encoding="utf-8-sig")
+            return content.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
         except UnicodeDecodeError:
             raise self.error("the file is no text; give a camera file") from None
 
@@ -56,10 +64,10 @@ class CameraSource(NamedTuple):
         """A finite number of the file."""
         try:
             value = float(text)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             value = np.nan
-        if not np.isfinite(value):
-            raise self.error(f"{name} is {text!r}, not a finite number; write it like 12.34")
+        if not abs(value) <= LARGEST:
+            raise self.error(f"{name} is {quoted(text)}, not a finite number; write it like 12.34")
         return value
 
     def chosen(self, names: list[str]) -> str:
@@ -67,12 +75,15 @@ class CameraSource(NamedTuple):
         known = ", ".join(names)
         if not names:
             raise self.error("there is no camera in it; give a file with one")
+        for name in names:
+            if harm := harm_in(name):
+                raise self.error(f"the camera {quoted(name)} {harm}")
         if self.camera is None:
             if len(names) > 1:
                 raise self.error(f"it holds {len(names)} cameras; name one of {known}")
             return names[0]
         if self.camera not in names:
-            raise self.error(f"there is no camera {self.camera!r} in it; name one of {known}")
+            raise self.error(f"there is no camera {quoted(self.camera)} in it; name one of {known}")
         return self.camera
 
     def sensor(self, width: float, height: float, pixel_mm: float | None = None) -> tuple[Sensor, str]:
@@ -80,8 +91,10 @@ class CameraSource(NamedTuple):
         if self.size_px is not None and self.size_px != (width, height):
             given = "{} x {}".format(*self.size_px)
             raise self.error(f"its images have {width:g} x {height:g} pixels, not {given}; leave the size out")
-        if not (width > 0 and height > 0 and width == int(width) and height == int(height)):
-            raise self.error(f"an image of {width:g} x {height:g} pixels cannot be; give whole positive numbers")
+        if not (0 < width <= _WIDEST and 0 < height <= _WIDEST and width == int(width) and height == int(height)):
+            raise self.error(
+                f"an image of {width:g} x {height:g} pixels cannot be; give whole positive numbers up to {_WIDEST:g}"
+            )
         pixel = self.pixel_mm if self.pixel_mm is not None else pixel_mm
         if pixel is not None and not 0 < pixel < np.inf:
             raise self.error(f"a pixel of {pixel:g} mm cannot be; give its size in millimetres")

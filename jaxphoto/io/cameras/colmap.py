@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 from jaxphoto.camera import Equidistant, InteriorOrientation, OpenCv, OpenCvFisheye, Perspective, Sensor
+from jaxphoto.errors import quoted
 from jaxphoto.io.cameras.binary_file import BinaryFile
 from jaxphoto.io.cameras.camera_file import CameraFile, CameraModel, CameraSource, from_centre_px, in_pixels
-from jaxphoto.io.text_tables import is_number
+from jaxphoto.io.text_tables import is_number, natural
 
 # f alone stands for both focal lengths.
 _PLANES = {
@@ -138,9 +139,9 @@ def _by_id(source: CameraSource) -> dict[int, list[str]]:
     found: dict[int, list[str]] = {}
     for row, line in _lines(source.text()):
         cells = line.split()
-        if not (cells[0].isascii() and cells[0].isdigit()):
-            raise source.error(f"row {row} begins with {cells[0]!r}, which is no id; write {_COLUMNS}")
-        identifier = int(cells[0])
+        identifier = natural(cells[0])
+        if identifier is None:
+            raise source.error(f"row {row} begins with {quoted(cells[0])}, which is no id; write {_COLUMNS}")
         if identifier in found:
             raise source.error(f"camera {identifier} stands there twice; keep one of the two lines")
         found[identifier] = cells

@@ -4,6 +4,7 @@ OpenCV's centre of the upper left pixel is (0, 0), ours (0.5, 0.5). It ignores w
 of cv2.fisheye say `fisheye_model: 1` and have four coefficients.
 """
 
+import re
 from pathlib import Path
 
 import cv2
@@ -22,6 +23,9 @@ from jaxphoto.io.cameras.camera_file import (
 _ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _COUNTS = (4, 5, 8, 12, 14)
 _FISHEYE_ORDER = ("k1", "k2", "k3", "k4")
+# Its parser came to the end of the stack at some 20,000 levels (OpenCV 5.0); files have five.
+_NESTING = re.compile(r"[\[{]|<(?![/?!])|[\]}]|</|/>")
+_DEEPEST, _SIGNS = 100, 1_000
 PLANE = CameraModel(OpenCv, ("b2",), Perspective())
 FISHEYE = CameraModel(OpenCvFisheye, ("p1", "p2", "s1", "s2", "b2"), Equidistant())
 """What its cameras are here."""
@@ -39,6 +43,8 @@ def read_open_cv(source: CameraSource) -> CameraFile:
     Raises InputError for a file that is cut off, for missing keys, and terms of thin prisms or tilt.
     """
     text = source.text()
+    if _is_deep(text):
+        raise source.error("lists or keys are nested more deeply than in any file of OpenCV; write it anew")
     if not text.lstrip().startswith(("%YAML", "<?xml", "{")):
         text = "%YAML:1.0\n---\n" + text.lstrip().removeprefix("---")
     storage = cv2.FileStorage()
@@ -50,6 +56,9 @@ def read_open_cv(source: CameraSource) -> CameraFile:
         raise source.error("OpenCV cannot read it; it is cut off or was changed, so write it anew")
     try:
         return _camera(source, storage)
+    except cv2.error:
+        # Such as a list where names and values are expected.
+        raise source.error("OpenCV finds no camera in it; write it anew") from None
     finally:
         storage.release()
 
@@ -69,6 +78,21 @@ def write_open_cv(path: Path, name: str, sensor: Sensor, interior: InteriorOrien
     storage.write("camera_matrix", np.array([[fx, 0.0, column - 0.5], [0.0, fy, row - 0.5], [0.0, 0.0, 1.0]]))
     storage.write("distortion_coefficients", coefficients[:, None])
     storage.release()
+
+
+def _is_deep(text: str) -> bool:
+    """Whether OpenCV's parser might end the process: it calls itself for everything that is in something else."""
+    depth = 0
+    for sign in _NESTING.finditer(text):
+        depth = max(depth + (1 if sign[0] in ("[", "{", "<") else -1), 0)
+        if depth > _DEEPEST:
+            return True
+    # A list within a list begins by a dash, a name within a name by a colon, or both are told by how far a line begins
+    # from the left.
+    return any(
+        line.count("-") + line.count(":") > _SIGNS or len(line) - len(line.lstrip()) > _SIGNS
+        for line in text.split("\n")
+    )
 
 
 def _camera(source: CameraSource, storage: cv2.FileStorage) -> CameraFile:

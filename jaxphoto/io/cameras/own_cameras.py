@@ -1,6 +1,5 @@
 """Cameras of jaxphoto itself: interior.csv of a folder of results, with its covariance, and those of a block.toml."""
 
-import json
 from pathlib import Path
 
 import jax
@@ -9,12 +8,14 @@ import pandas as pd
 
 from jaxphoto.arrays import on_device
 from jaxphoto.camera import InteriorOrientation, Sensor, constant_names, empty_camera, parameter_names, set_parameter
-from jaxphoto.errors import JaxphotoError
 from jaxphoto.io.block_folder.camera_section import Camera, camera_section
-from jaxphoto.io.block_folder.settings import read_settings, read_toml, toml_text
+from jaxphoto.io.block_folder.section import Section
+from jaxphoto.io.block_folder.settings import read_settings, toml_text
 from jaxphoto.io.block_folder.table_layout import TOML
 from jaxphoto.io.cameras.camera_file import CameraFile, CameraSource
+from jaxphoto.io.json_file import read_json
 from jaxphoto.io.text_tables import read_csv
+from jaxphoto.io.toml import read_toml
 from jaxphoto.unknowns import FIXED
 
 INTERIOR = "interior.csv"
@@ -113,10 +114,10 @@ def _described(source: CameraSource, camera: str) -> tuple[Sensor, InteriorOrien
         return cameras[camera].sensor, cameras[camera].interior
     path = source.path.with_name("summary.json")
     try:
-        told = json.loads(path.read_text(encoding="utf-8"))["cameras"][camera]
-        sensor = Sensor(told["width_px"], told["height_px"], told["pixel_mm"])
-        return sensor, empty_camera(told)
-    except (JaxphotoError, OSError, ValueError, KeyError, TypeError):
+        told = Section(path.name, "", read_json(path)).section("cameras").section(camera)
+        sensor = Sensor(told.count("width_px"), told.count("height_px"), told.positive("pixel_mm"))
+        return sensor, empty_camera(told.values)
+    except (ValueError, KeyError, TypeError):
         raise source.error(
             f"neither summary.json beside it nor a block says of which model camera {camera} is; give the block"
         ) from None

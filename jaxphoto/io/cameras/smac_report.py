@@ -5,6 +5,7 @@ A report says nothing of pixels: where the user does not either, the format of a
 report OSL/2985.
 """
 
+import collections
 import re
 from pathlib import Path
 
@@ -19,27 +20,33 @@ _NEEDED = ("K0", "K1", "K2", "xp", "yp")
 # 9 x 9 inches.
 _FILM_MM, _FILM_PIXEL_MM = 228.6, 0.01
 # Powers as reports print them (0.2616 x 10-4), or as computers do (0.2616E-04); minus signs of either kind.
-_NUMBER = r"[-+−]?\s?(?:\d+\.?\d*|\.\d+)(?:[eEdD][-+−]?\d+|\s*[x×*]\s*10\s*(?:\^|\*\*)?\s*[-+−]\s?\d+)?"
+# A number is not looked for within one: a thousand digits would be tried from each of them.
+_NUMBER = (
+    r"(?:[-+−]\s?|(?<![\d.]))(?:\d+(?:\.\d*)?|\.\d+)(?:[eEdD][-+−]?\d+|\s*[x×*]\s*10\s*(?:\^|\*\*)?\s*[-+−]\s?\d+)?"
+)
 # A power of ten that is cut off stays with its number, which is none without it.
 _CUT = r"(?:\s*[x×*]\s*10(?!\d))?"
 _TOKEN = re.compile(rf"(?P<name>\b(?:K[0-4]|P[1-4]|[xy]p)\b)|(?P<equals>=)|(?P<number>{_NUMBER}{_CUT})")
-_FOCAL = re.compile(rf"calibrated\s+focal\s+length.*?({_NUMBER})\s*mm", re.IGNORECASE | re.DOTALL)
+_FOCAL = re.compile(r"calibrated\s+focal\s+length", re.IGNORECASE)
+_IN_MM = re.compile(rf"({_NUMBER})\s*mm", re.IGNORECASE)
 _POINT = re.compile(rf"[xy]p\s*=\s*{_NUMBER}\s*mm")
 _FORMAT = re.compile(rf"image format:\s*(\d+)\s*x\s*(\d+)\s*pixels of\s*({_NUMBER})\s*mm", re.IGNORECASE)
 
 
 def recognises(path: Path, text: str) -> bool:
     """Whether `text` names SMAC's focal length and parameters."""
-    return re.search(r"calibrated\s+focal\s+length", text, re.IGNORECASE) is not None and "K1" in text
+    return _FOCAL.search(text) is not None and "K1" in text
 
 
 def read_smac_report(source: CameraSource) -> CameraFile:
     """The camera of a report. Raises InputError naming what is missing."""
     text = source.text()
     # Where its own number is torn away, that of the principal point is not to be taken for it.
-    focal = _FOCAL.search(_POINT.sub(" ", text))
-    values, named = _values(source, text)
-    missing = [name for name in _PARAMETERS if name in named.union(_NEEDED) and name not in values]
+    plain = _POINT.sub(" ", text)
+    named = _FOCAL.search(plain)
+    focal = _IN_MM.search(plain, named.end()) if named is not None else None
+    values, listed = _values(source, text)
+    missing = [name for name in _PARAMETERS if name in listed.union(_NEEDED) and name not in values]
     if focal is None:
         missing.insert(0, "the Calibrated Focal Length in mm")
     if focal is None or missing:
@@ -88,7 +95,7 @@ def _values(source: CameraSource, text: str) -> tuple[dict[str, float], set[str]
     """
     tokens = [(m.lastgroup, m.group()) for m in _TOKEN.finditer(text)]
     values: dict[str, float] = {}
-    waiting: list[str] = []
+    waiting: collections.deque[str] = collections.deque()
     signs = k = 0
     while k < len(tokens):
         kind, token = tokens[k]
@@ -101,7 +108,7 @@ def _values(source: CameraSource, text: str) -> tuple[dict[str, float], set[str]
         elif kind == "equals":
             signs += 1
         elif signs and waiting:
-            name = waiting.pop(0)
+            name = waiting.popleft()
             values.setdefault(name, _number(source, name, token))
             signs -= 1
         k += 1

@@ -4,6 +4,7 @@ import itertools
 from collections.abc import Collection
 
 from jaxphoto.io.block_folder.section import Section
+from jaxphoto.io.recipe import sizes
 from jaxphoto.io.recipe.keys import camera_of, one_or_more, tables
 from jaxphoto.simulation import ConvergentPlan, Field, Station
 
@@ -17,11 +18,13 @@ def read_convergent(section: Section, cameras: Collection[str]) -> ConvergentPla
     stations: list[Station] = []
     names: set[str] = set()
     for table in tables(section, "stations"):
-        name = table.text("name")
+        name = table.name("name")
         if name in names:
             raise table.error("name", f"there are other stations {name}; give these another name")
         names.add(name)
         stations += _stations(name, table, cameras)
+        if len(stations) > sizes.IMAGES:
+            raise section.error("stations", f"there are more than {sizes.IMAGES} images in all; give fewer")
     if len(stations) < 2:
         raise section.error(
             "stations",
@@ -40,5 +43,8 @@ def _stations(name: str, table: Section, cameras: Collection[str]) -> list[Stati
     if min(tilts) < 0 or max(tilts) >= 90:
         raise table.error("tilt_deg", "a field is seen from tilts of 0 or more and less than 90; give one of these")
     azimuths, rolls = (one_or_more(table, key, 0.0) for key in ("azimuth_deg", "roll_deg"))
+    n = len(distances) * len(azimuths) * len(tilts) * len(rolls)
+    if n > sizes.IMAGES:
+        raise table.error("", f"these are {n} images, the most are {sizes.IMAGES}; give fewer distances or angles")
     each = itertools.product(distances, azimuths, tilts, rolls)
     return [Station(f"{name}_{k:02d}", camera, *numbers) for k, numbers in enumerate(each, start=1)]

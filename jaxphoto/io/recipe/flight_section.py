@@ -4,8 +4,10 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from jaxphoto.camera import InteriorOrientation, Sensor
+from jaxphoto.errors import quoted
 from jaxphoto.georeferencing.mount import ImageX
 from jaxphoto.io.block_folder.section import Section
+from jaxphoto.io.recipe import sizes
 from jaxphoto.io.recipe.keys import camera_of, tables
 from jaxphoto.simulation import FlightPlan, Strip, footprint
 
@@ -38,11 +40,15 @@ def read_flight(section: Section, cameras: Mapping[str, Mounted]) -> FlightPlan:
     if not listed:
         raise section.error("strips", "there is no strip; add a table [[flight.strips]]")
     strips: list[Strip] = []
+    names: set[str] = set()
     for table in listed:
         for strip in _strips(table, section, cameras):
-            if strip.name in {s.name for s in strips}:
+            if strip.name in names:
                 raise table.error("name", f"there is another strip {strip.name}; give each its own name")
+            names.add(strip.name)
             strips.append(strip)
+        if sum(s.images for s in strips) > sizes.IMAGES:
+            raise table.error("images", f"there are more than {sizes.IMAGES} images in all; give fewer")
     if sum(s.images for s in strips) < 2:
         raise section.error("strips", "there is one image in all, so no point is seen twice; add images or strips")
     speed = section.positive("speed_m_per_s") if "speed_m_per_s" in section else FlightPlan.speed_m_per_s
@@ -52,9 +58,9 @@ def read_flight(section: Section, cameras: Mapping[str, Mounted]) -> FlightPlan:
 def _strips(table: Section, flight: Section, cameras: Mapping[str, Mounted]) -> list[Strip]:
     """The parallel strips of one table, flown to and fro, from left to right of the first."""
     table.known(*_OWN, *_SHARED)
-    name, heading = table.text("name"), table.number("heading_deg")
+    name, heading = table.name("name"), table.number("heading_deg")
     if not name or name == "default":
-        raise table.error("name", f"a strip cannot be called {name!r}; give it another name")
+        raise table.error("name", f"a strip cannot be called {quoted(name)}; give it another name")
     if abs(heading) > 360:
         raise table.error("heading_deg", f"{heading:g} is more than a turn; give degrees clockwise from north")
     camera = camera_of(table, cameras)
@@ -64,7 +70,7 @@ def _strips(table: Section, flight: Section, cameras: Mapping[str, Mounted]) -> 
     height = where.positive(key) * (1.0 if key == "height_m" else c / sensor.pixel_mm)
     ground = footprint(sensor, c, height, image_x)
     base = _step("base", table, flight, ground.along)
-    count = table.count("count") if "count" in table else 1
+    count = table.count("count", sizes.IMAGES) if "count" in table else 1
     across = table.number("across_spacings", 0.0)
     spacing = _step("spacing", table, flight, ground.across) if count > 1 or across else 0.0
     along_m = table.number("along_m", 0.0) + table.number("along_bases", 0.0) * base
@@ -78,7 +84,7 @@ def _strips(table: Section, flight: Section, cameras: Mapping[str, Mounted]) -> 
                 name=f"{name}{k + 1}" if count > 1 else name,
                 camera=camera,
                 heading_deg=heading + 180 * back,
-                images=table.count("images"),
+                images=table.count("images", sizes.IMAGES),
                 base_m=base,
                 height_m=height,
                 footprint=ground,

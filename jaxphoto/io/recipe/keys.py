@@ -2,7 +2,8 @@
 
 from collections.abc import Collection, Sequence
 
-from jaxphoto.io.block_folder.section import Section
+from jaxphoto.errors import quoted
+from jaxphoto.io.block_folder.section import MOST, Section
 from jaxphoto.simulation.recipe import Triple
 
 
@@ -31,11 +32,13 @@ def not_negative(section: Section, key: str, default: float | None = None) -> fl
     return value
 
 
-def whole(section: Section, key: str, default: int) -> int:
-    """A whole number, zero or more."""
+def whole(section: Section, key: str, default: int, most: int = MOST) -> int:
+    """A whole number, zero or more, and not above `most`."""
     value = section.values.get(key, default)
     if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-        raise section.error(key, f"{value!r} is not a whole number of zero or more; give one")
+        raise section.error(key, f"{quoted(value)} is not a whole number of zero or more; give one")
+    if value > most:
+        raise section.error(key, f"{quoted(value)} is too large, the most are {most}; ask for fewer")
     return value
 
 
@@ -43,7 +46,7 @@ def flag(section: Section, key: str) -> bool:
     """true or false, false where it is absent."""
     value = section.values.get(key, False)
     if not isinstance(value, bool):
-        raise section.error(key, f"{value!r} is neither true nor false; write one of them")
+        raise section.error(key, f"{quoted(value)} is neither true nor false; write one of them")
     return value
 
 
@@ -74,9 +77,9 @@ def places(section: Section, key: str, sizes: Sequence[int]) -> tuple[tuple[floa
     values = section.values.get(key, [])
     allowed = " or ".join(map(str, sizes))
     if not isinstance(values, list):
-        raise section.error(key, f"{values!r} is no list; write places like [[0.0, 0.0], [100.0, 0.0]]")
+        raise section.error(key, f"{quoted(values)} is no list; write places like [[0.0, 0.0], [100.0, 0.0]]")
     for place in values:
         if not isinstance(place, list) or len(place) not in sizes:
-            raise section.error(key, f"{place!r} is no place; give {allowed} numbers, like [0.0, 0.0]")
+            raise section.error(key, f"{quoted(place)} is no place; give {allowed} numbers, like [0.0, 0.0]")
     each = [[Section(section.file, section.path, {key: v}).number(key) for v in place] for place in values]
     return tuple(map(tuple, each))

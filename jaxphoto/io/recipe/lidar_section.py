@@ -2,7 +2,9 @@
 
 import numpy as np
 
+from jaxphoto.errors import quoted
 from jaxphoto.io.block_folder.section import Section
+from jaxphoto.io.recipe import sizes
 from jaxphoto.io.recipe.keys import sigmas, tables
 from jaxphoto.simulation import ConvergentPlan, FlightPlan, Footprint, ScanPlan, Sigmas, Strip, Terrain
 
@@ -55,17 +57,20 @@ def _strips(section: Section, plan: FlightPlan) -> tuple[Strip, ...]:
     strips: list[Strip] = []
     for table in tables(section, "strips"):
         table.known("name", "heading_deg", "length_m", "height_m", "along_m", "across_m")
-        name, length = table.text("name"), table.positive("length_m")
+        name, length = table.name("name"), table.positive("length_m")
         if name in ("", "default", *(strip.name for strip in strips)):
-            raise table.error("name", f"a strip cannot be called {name!r}; give each its own name")
-        nodes = 1 + max(1, int(np.ceil(length / (_NODES_S * plan.speed_m_per_s))))
+            raise table.error("name", f"a strip cannot be called {quoted(name)}; give each its own name")
+        nodes = 1 + max(1.0, np.ceil(length / (_NODES_S * plan.speed_m_per_s)))
+        if nodes > sizes.IMAGES:
+            hours = length / plan.speed_m_per_s / 3600
+            raise table.error("length_m", f"a strip of {length:g} m takes {hours:.3g} hours; give a shorter one")
         strips.append(
             Strip(
                 name=name,
                 camera="",
                 heading_deg=table.number("heading_deg"),
-                images=nodes,
-                base_m=length / (nodes - 1),
+                images=int(nodes),
+                base_m=float(length / (nodes - 1)),
                 height_m=table.positive("height_m"),
                 footprint=Footprint(0.0, 0.0),
                 along_m=table.number("along_m", 0.0),

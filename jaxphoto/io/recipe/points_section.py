@@ -4,8 +4,9 @@ import dataclasses
 
 import numpy as np
 
-from jaxphoto.errors import InputError
+from jaxphoto.errors import InputError, quoted
 from jaxphoto.io.block_folder.section import Section
+from jaxphoto.io.recipe import sizes
 from jaxphoto.io.recipe.keys import flag, not_negative, places, sigmas, tables, whole
 from jaxphoto.simulation import (
     ROLES,
@@ -41,7 +42,7 @@ def read_terrain(section: Section) -> Terrain:
     """The ground; flat at Z = 0 where nothing is said."""
     kind = section.text("kind", "flat")
     if kind not in _KINDS:
-        raise section.error("kind", f"no terrain is called {kind!r}; use {', '.join(_KINDS)}")
+        raise section.error("kind", f"no terrain is called {quoted(kind)}; use {', '.join(_KINDS)}")
     section.known("kind", *_KINDS[kind], *_ON_EVERY)
     seed = whole(section, "seed", 0) if "seed" in section else None
     if kind == "rolling":
@@ -52,7 +53,9 @@ def read_terrain(section: Section) -> Terrain:
         slope = [section.number(f"slope_{side}_percent", 0.0) / 100 for side in ("east", "north")]
         return dataclasses.replace(ground, slope=(slope[0], slope[1]))
     if kind == "random":
-        waves = RandomWaves(section.count("count"), section.positive("rms_m"), section.positive("length_m"))
+        waves = RandomWaves(
+            section.count("count", sizes.WAVES), section.positive("rms_m"), section.positive("length_m")
+        )
         return dataclasses.replace(ground, random=waves)
     return dataclasses.replace(ground, waves=tuple(map(_wave, tables(section, "waves"))))
 
@@ -72,7 +75,7 @@ def read_points(section: Section, *, in_swaths: bool) -> PointPlan:
     if on_roofs > 1:
         raise section.error("on_roofs", f"{on_roofs:g} is no part of the tie points; give a number from 0 to 1")
     return PointPlan(
-        ties=whole(section, "ties", 0),
+        ties=whole(section, "ties", 0, sizes.POINTS),
         min_images=minimum,
         mean_rays=rays,
         across=section.positive("across") if "across" in section else PointPlan.across,
@@ -85,9 +88,9 @@ def read_points(section: Section, *, in_swaths: bool) -> PointPlan:
 def read_targets(section: Section) -> TargetPlan:
     """One group of targets."""
     section.known("role", "prefix", "count", "at_m", "at", "grid", "choice")
-    prefix = section.text("prefix", TargetPlan.prefix)
+    prefix = section.name("prefix") if "prefix" in section else TargetPlan.prefix
     if not prefix or prefix[-1].isdigit() or prefix[0] == "#":
-        raise section.error("prefix", f'{prefix!r} does not tell targets apart; use letters, like "T"')
+        raise section.error("prefix", f'{quoted(prefix)} does not tell targets apart; use letters, like "T"')
     choice = None
     if "choice" in section:
         table = section.section("choice")
@@ -97,7 +100,7 @@ def read_targets(section: Section) -> TargetPlan:
     return TargetPlan(
         role=_role(section),
         prefix=prefix,
-        count=whole(section, "count", 0),
+        count=whole(section, "count", 0, sizes.POINTS),
         at_m=places(section, "at_m", (2, 3)),
         at=places(section, "at", (2,)) + _grid(section),  # type: ignore[arg-type]
         choice=choice,
@@ -152,13 +155,14 @@ def read_start(section: Section, plan: FlightPlan | ConvergentPlan) -> Approxima
     )
 
 
-def check_points(top: Section, points: PointPlan, targets: tuple[TargetPlan, ...]) -> None:
-    """Raise InputError where there is nothing to measure."""
+def check_points(top: Section, points: PointPlan, targets: tuple[TargetPlan, ...], images: int) -> None:
+    """Raise InputError where there is nothing to measure, or too much in so many `images`."""
     n = points.ties + sum(t.count + len(t.at) + len(t.at_m) for t in targets)
     if n < 3:
         raise InputError(
             f"{top.file}, [points] ties: there are {n} points in all; an orientation needs 3, so ask for more"
         )
+    sizes.check_pairs(top.file, images, n)
 
 
 def _grid(section: Section) -> tuple[tuple[float, float], ...]:
@@ -167,7 +171,9 @@ def _grid(section: Section) -> tuple[tuple[float, float], ...]:
         return ()
     sides = section.values["grid"]
     if not isinstance(sides, list) or len(sides) != 2 or any(type(n) is not int or n < 2 for n in sides):
-        raise section.error("grid", f"{sides!r} is no grid; give two whole numbers from 2 on, like [7, 5]")
+        raise section.error("grid", f"{quoted(sides)} is no grid; give two whole numbers from 2 on, like [7, 5]")
+    if sides[0] * sides[1] > sizes.POINTS:
+        raise section.error("grid", f"{quoted(sides)} are too many places, the most are {sizes.POINTS}; ask for fewer")
     x, y = (np.linspace(-1, 1, n).tolist() for n in sides)
     return tuple((a, b) for b in y for a in x)
 
@@ -175,7 +181,7 @@ def _grid(section: Section) -> tuple[tuple[float, float], ...]:
 def _role(section: Section) -> Role:
     role = section.text("role")
     if role not in ROLES:
-        raise section.error("role", f"the role {role!r} is unknown; write {', '.join(ROLES)}")
+        raise section.error("role", f"the role {quoted(role)} is unknown; write {', '.join(ROLES)}")
     return role
 
 

@@ -17,7 +17,7 @@ from jaxphoto.georeferencing import Mount, StripBias
 from jaxphoto.io.block_folder.camera_section import Camera, read_camera
 from jaxphoto.io.block_folder.mount_sections import read_mounts, read_strips
 from jaxphoto.io.block_folder.section import Section
-from jaxphoto.io.block_folder.settings import read_settings, read_toml
+from jaxphoto.io.block_folder.settings import read_settings
 from jaxphoto.io.recipe.convergent_section import read_convergent
 from jaxphoto.io.recipe.flight_section import Mounted, read_flight
 from jaxphoto.io.recipe.keys import sigmas, tables
@@ -32,6 +32,7 @@ from jaxphoto.io.recipe.points_section import (
     read_terrain,
 )
 from jaxphoto.io.recipe.settlement_section import read_settlement
+from jaxphoto.io.toml import read_toml
 from jaxphoto.simulation import Assumed, ConvergentPlan, FlightPlan, Recipe, SimulatedBias
 
 _KEYS = (
@@ -67,7 +68,7 @@ def recipe_from(values: Mapping[str, Any], file: str = "recipe.toml") -> Recipe:
     strips = [strip.name for strip in plan.strips] if isinstance(plan, FlightPlan) else []
     points = read_points(top.section("points"), in_swaths=isinstance(plan, FlightPlan))
     targets = tuple(map(read_targets, tables(top, "targets")))
-    check_points(top, points, targets)
+    check_points(top, points, targets, plan.n_images)
     stated, noise = read_sigmas(top, targets)
     terrain = read_terrain(top.section("terrain"))
     truth = top.section("truth")

@@ -1,6 +1,8 @@
 """[[terrain.buildings]] and [[terrain.trees]] of a recipe -> `Settlement`."""
 
+from jaxphoto.errors import quoted
 from jaxphoto.io.block_folder.section import Section
+from jaxphoto.io.recipe import sizes
 from jaxphoto.io.recipe.keys import one_or_more, places, tables, whole
 from jaxphoto.simulation import ROOFS, Buildings, Settlement, Trees
 from jaxphoto.simulation.settlement import Range
@@ -19,7 +21,7 @@ def _buildings(section: Section) -> Buildings:
     section.known("roof", "count", "at_m", "length_m", "width_m", "height_m", "slope_deg", "heading_deg")
     roof = section.text("roof", Buildings.roof)
     if roof not in ROOFS:
-        raise section.error("roof", f"no roof is called {roof!r}; use {', '.join(ROOFS)}")
+        raise section.error("roof", f"no roof is called {quoted(roof)}; use {', '.join(ROOFS)}")
     if roof == "flat" and "slope_deg" in section:
         raise section.error("slope_deg", "a flat roof has no slope; remove the key, or choose another roof")
     slope = _range(section, "slope_deg", Buildings.slope_deg)
@@ -27,7 +29,7 @@ def _buildings(section: Section) -> Buildings:
         raise section.error("slope_deg", f"{slope[1]:g} is steeper than {_STEEPEST_DEG:g} degrees; give less")
     return Buildings(
         roof=roof,
-        count=whole(section, "count", 0),
+        count=whole(section, "count", 0, sizes.BUILDINGS),
         at_m=places(section, "at_m", (2,)),  # type: ignore[arg-type]
         length_m=_range(section, "length_m", Buildings.length_m),
         width_m=_range(section, "width_m", Buildings.width_m),
@@ -40,7 +42,7 @@ def _buildings(section: Section) -> Buildings:
 def _trees(section: Section) -> Trees:
     section.known("count", "at_m", "height_m", "radius_m")
     return Trees(
-        whole(section, "count", 0),
+        whole(section, "count", 0, sizes.TREES),
         places(section, "at_m", (2,)),  # type: ignore[arg-type]
         _range(section, "height_m", Trees.height_m),
         _range(section, "radius_m", Trees.radius_m),

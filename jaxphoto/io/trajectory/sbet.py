@@ -11,7 +11,9 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxphoto.errors import InputError
+from jaxphoto.io.text_tables import LARGEST
 from jaxphoto.io.trajectory.records import Records, check_records
+from jaxphoto.io.whole_text import read_whole
 
 FIELDS = (
     "time", "latitude", "longitude", "altitude", "x_velocity", "y_velocity", "z_velocity", "roll", "pitch",
@@ -21,24 +23,23 @@ FIELDS = (
 """The numbers of a record in their order: s, rad, m, m/s, m/s^2, rad/s."""
 _TYPE = np.dtype("<f8")
 _RECORD = len(FIELDS) * _TYPE.itemsize
+# Forty hours at 200 Hz.
+_MOST = 4_000_000_000
 
 
 def read_sbet(path: Path) -> Float[np.ndarray, "records 17"]:
     """The records as they stand, columns `FIELDS`. Raises InputError for a file that cannot be an SBET."""
-    try:
-        data = path.read_bytes()
-    except FileNotFoundError:
-        raise InputError(f"there is no file {path}; add it, or correct the name") from None
-    except OSError as error:
-        raise InputError(f"{path.name} cannot be read ({error.strerror}); check that it is a readable file") from None
+    data = read_whole(path, _MOST)
     if len(data) % _RECORD:
         raise InputError(
             f"{path.name}: {len(data)} bytes are no whole number of SBET records of {_RECORD} bytes; the file is cut "
             "off or of another format, so export it again"
         )
     values = np.frombuffer(data, _TYPE).reshape(-1, len(FIELDS)).astype(float)
-    for k, _ in np.argwhere(~np.isfinite(values))[:1]:
-        raise InputError(f"{path.name}, record {k + 1}: a number is not finite; export the file again as SBET")
+    for k, _ in np.argwhere(~(np.abs(values) <= LARGEST))[:1]:
+        raise InputError(
+            f"{path.name}, record {k + 1}: a number is not finite, or impossibly large; export the file again as SBET"
+        )
     angles = values[:, [FIELDS.index("latitude"), FIELDS.index("longitude"), FIELDS.index("roll")]]
     for k, axis in np.argwhere(np.abs(angles) > [np.pi / 2, 2 * np.pi, np.pi])[:1]:
         name = ("latitude", "longitude", "roll")[axis]

@@ -1,0 +1,39 @@
+"""What ids and names of files may not be, because of the places where results show them.
+
+A control character is a command to a terminal, and characters that turn the direction of writing show another name
+than there is. What begins like a formula is computed by a spreadsheet that opens the results: such names are refused
+rather than changed, so that all tables have the ids of the user's files.
+"""
+
+import re
+
+LONGEST = 256
+"""Characters of a name."""
+_UNSEEN = "\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff"
+_CONTROL = re.compile(f"[{_UNSEEN}]")
+# A signed word or number (-1, +5a) is what it looks like.
+_FORMULA = re.compile(r"\s*(?:[=@]|[-+](?![\w.]*$))")
+# What may be any of these, in names joined by line ends.
+_SUSPECT = re.compile(f"^\\s*[=@+-]|[{_UNSEEN.replace(chr(10), '')}]|.{{{LONGEST + 1}}}", re.MULTILINE)
+
+
+def harm_in(name: str) -> str:
+    """What is wrong with a name, and the mend; empty where nothing is."""
+    if len(name) > LONGEST:
+        return f"has {len(name)} characters, and a name has at most {LONGEST}; give it a shorter one"
+    if control_in(name):
+        return "has a control character, which a terminal would obey; give it another name"
+    if _FORMULA.match(name):
+        return "begins like a formula, which a spreadsheet would compute; give it another name"
+    return ""
+
+
+def control_in(text: str) -> bool:
+    """Whether a text has characters that are commands, or that cannot be written."""
+    return _CONTROL.search(text) is not None
+
+
+def harmless(names: list[str]) -> bool:
+    """Whether `harm_in` finds nothing in any of many names; False where one has to look."""
+    joined = "\n".join(names)
+    return joined.count("\n") == max(len(names) - 1, 0) and _SUSPECT.search(joined) is None
