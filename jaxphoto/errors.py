@@ -19,8 +19,12 @@ def shown(text: str) -> str:
 
     Names and cells of files are in messages; their control characters would be commands to the terminal.
     """
-    text = "".join(c if c.isprintable() else repr(c)[1:-1] for c in _short(text))
-    return _WORD.sub(lambda word: f"{word[0][:200]}...{word[0][-50:]}", text)
+    return _WORD.sub(lambda word: f"{word[0][:200]}...{word[0][-50:]}", printable(_short(text)))
+
+
+def printable(text: str) -> str:
+    """`text` with escapes in place of what cannot be printed."""
+    return text if text.isprintable() else "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
 def quoted(value: object) -> str:

@@ -6,7 +6,7 @@ import warnings
 import typer
 
 from jaxphoto.cli.app import app
-from jaxphoto.errors import JaxphotoError
+from jaxphoto.errors import JaxphotoError, printable, shown
 
 __all__ = ["app", "main"]
 
@@ -21,10 +21,13 @@ def main() -> None:
         sys.exit(2)
     except OSError as error:
         where = error.filename if error.filename is not None else "a file"
-        typer.echo(f"jaxphoto: {where}: {error.strerror or error}; name a place that can be read and written", err=True)
+        typer.echo(
+            f"jaxphoto: {printable(str(where))}: {error.strerror or error}; name a place that can be read and written",
+            err=True,
+        )
         sys.exit(2)
 
 
 def _show_warning(message, category, filename, lineno, file=None, line=None) -> None:
     """Warnings for the user in one line, without the place in our code."""
-    typer.echo(f"warning: {message}", err=True)
+    typer.echo(f"warning: {shown(str(message))}", err=True)

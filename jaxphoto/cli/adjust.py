@@ -6,10 +6,10 @@ from threading import Thread
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 import jaxphoto
 from jaxphoto.cli.app import app
+from jaxphoto.cli.console import plain_console
 from jaxphoto.errors import JaxphotoError
 from jaxphoto.io import read_block, write_block
 from jaxphoto.procedures import adjust_for_tables
@@ -49,7 +49,7 @@ def adjust_command(
         raise JaxphotoError(f"--rotations {rotations}: there are {', '.join(EOP_NAMES)}")
     check_target(out, block)
     Thread(target=prepare_pictures, daemon=True).start()
-    console, errors = Console(), Console(stderr=True)
+    console, errors = plain_console(), plain_console(stderr=True)
     began = time.perf_counter()
     with errors.status("reading the block") as status:
         read = read_block(block)
@@ -76,6 +76,6 @@ def adjust_command(
                 left_out_table(snooped, read).to_csv(work / "left_out.csv", index=False)
                 write_block(adjusted.block, work / "block")
     print_adjustment(tables, verdict, console)
-    console.print(f"results in {out} (open report.html)", highlight=False, markup=False)
+    console.print(f"results in {out} (open report.html)")
     if verdict.level == Level.ALARM:
         raise typer.Exit(1)

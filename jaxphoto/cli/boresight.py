@@ -5,10 +5,10 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 import jaxphoto
 from jaxphoto.cli.app import app
+from jaxphoto.cli.console import plain_console
 from jaxphoto.io import read_block
 from jaxphoto.procedures import boresight
 from jaxphoto.report import check_target, print_boresight, write_boresight
@@ -25,7 +25,7 @@ def boresight_command(
 ) -> None:
     """Boresight misalignment in four steps. Exit code 1: written, but a step is not passed or not converged."""
     check_target(out, block)
-    console, errors = Console(), Console(stderr=True)
+    console, errors = plain_console(), plain_console(stderr=True)
     began = time.perf_counter()
     with errors.status("reading the block") as status:
         read = read_block(block)
@@ -35,6 +35,6 @@ def boresight_command(
         status.update(f"writing {out}")
         write_boresight(steps, out, seconds)
     print_boresight(steps, console)
-    console.print(f"results in {out} (open report.html)", highlight=False, markup=False)
+    console.print(f"results in {out} (open report.html)")
     if not all(step.go_on for step in steps):
         raise typer.Exit(1)

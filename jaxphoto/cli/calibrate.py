@@ -7,12 +7,11 @@ from threading import Thread
 from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.markup import escape
 
 import jaxphoto
 from jaxphoto.camera import DISTORTIONS
 from jaxphoto.cli.app import app
+from jaxphoto.cli.console import plain_console
 from jaxphoto.errors import InputError
 from jaxphoto.image_measurement.grey_values import read_grey
 from jaxphoto.image_measurement.targets import SYNTAX, find_targets, read_board
@@ -49,10 +48,10 @@ def calibrate_command(
     wanted = None if free is None else [name.strip() for name in free.split(",") if name.strip()]
     free_parameters(model, distortion_model(model, start.sensor, r0_mm), wanted)
     Thread(target=prepare_pictures, daemon=True).start()
-    console, errors = Console(), Console(stderr=True)
+    console, errors = plain_console(), plain_console(stderr=True)
     began = time.perf_counter()
     with errors.status("looking for the board") as status:
-        targets = find_targets(taken, pattern, lambda image: status.update(escape(f"looking for the board in {image}")))
+        targets = find_targets(taken, pattern, lambda image: status.update(f"looking for the board in {image}"))
         seconds = {"read": time.perf_counter() - began}
         status.update(f"calibrating with {len(targets.detections)} photographs")
         done = calibrate(
@@ -67,7 +66,7 @@ def calibrate_command(
             max_steps=max_steps,
         )
         done = done._replace(left_out=targets.left_out | done.left_out)
-        status.update(escape(f"writing {out}"))
+        status.update(f"writing {out}")
         pictures = {photograph.name: partial(read_grey, photograph.path) for photograph in taken}
         tables = write_calibration(
             done,
@@ -80,9 +79,9 @@ def calibrate_command(
             # A size that nobody gave is the unit of every length in the report.
             notes=() if pixel_mm is not None else (start.origin,),
         )
-    console.print(start.origin, highlight=False, markup=False)
+    console.print(start.origin)
     print_adjustment(tables, verdict_of(tables), console)
     print_calibration(done, console)
-    console.print(f"results in {out} (open report.html and photographs.html)", highlight=False, markup=False)
+    console.print(f"results in {out} (open report.html and photographs.html)")
     if not done.converged:
         raise typer.Exit(1)

@@ -4,10 +4,10 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from jaxphoto.camera import DISTORTIONS, AbstractDistortion, get_parameter, parameter_names
 from jaxphoto.cli.app import app
+from jaxphoto.cli.console import plain_console
 from jaxphoto.errors import InputError
 from jaxphoto.io.cameras import CAMERA_FORMATS, read_camera_file, write_camera_file
 
@@ -41,20 +41,23 @@ def camera_command(
     read = read_camera_file(source, camera=camera, pixel_mm=pixel_mm, size_px=size, block=block)
     kind = known[distortion] if distortion is not None else None
     done = write_camera_file(out, read.sensor, read.interior, out_format, name=read.name, distortion=kind)
-    console = Console(highlight=False, markup=False, soft_wrap=True)
+    console = plain_console()
     console.print(
-        f"{read.name}: {type(read.interior.distortion).__name__} -> {type(done.interior.distortion).__name__}"
+        f"{read.name}: {type(read.interior.distortion).__name__} -> {type(done.interior.distortion).__name__}",
+        soft_wrap=True,
     )
     if read.note:
-        console.print(f"note: {read.note}")
+        console.print(f"note: {read.note}", soft_wrap=True)
     for name in parameter_names(done.interior):
         value = float(get_parameter(done.interior, name))
         if value != 0 or name == "c_mm":
-            console.print(f"  {name} = {value:.9g}")
+            console.print(f"  {name} = {value:.9g}", soft_wrap=True)
     if done.max_px == 0:
-        console.print("the conversion is exact")
+        console.print("the conversion is exact", soft_wrap=True)
     else:
-        console.print(f"fitted over the format: rms {done.rms_px:.3g} px, largest {done.max_px:.3g} px")
+        console.print(f"fitted over the format: rms {done.rms_px:.3g} px, largest {done.max_px:.3g} px", soft_wrap=True)
     if done.covered < 1:
-        console.print(f"the given distortion folds in {1 - done.covered:.1%} of the format, which was left out")
-    console.print(f"wrote {out}")
+        console.print(
+            f"the given distortion folds in {1 - done.covered:.1%} of the format, which was left out", soft_wrap=True
+        )
+    console.print(f"wrote {out}", soft_wrap=True)

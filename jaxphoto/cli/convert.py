@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from jaxphoto.cli.app import app
+from jaxphoto.cli.console import plain_console
 from jaxphoto.errors import InputError
 from jaxphoto.io import convert, read_source
 from jaxphoto.io.block_folder import check_block_target
@@ -33,5 +34,5 @@ def convert_command(
         check_model_target(out, source)
         for name, conversion in write_colmap_model(read_source(source, source_format), out).items():
             fit = f"fitted, rms {conversion.rms_px:.3g} px, largest {conversion.max_px:.3g} px"
-            typer.echo(f"camera {name}: {'exact' if conversion.max_px == 0 else fit}")
-    typer.echo(f"wrote {out}")
+            plain_console().print(f"camera {name}: {'exact' if conversion.max_px == 0 else fit}", soft_wrap=True)
+    plain_console().print(f"wrote {out}", soft_wrap=True)

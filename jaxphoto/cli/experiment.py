@@ -4,10 +4,10 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 from rich.table import Table
 
 from jaxphoto.cli.app import app
+from jaxphoto.cli.console import plain_console
 from jaxphoto.experiment import (
     check_run_target,
     compare,
@@ -33,7 +33,7 @@ def experiment_command(
     chosen = find_experiments(experiments, name)
     check_run_target(out)
     declared = {folder: load_experiment(folder) for folder in chosen}
-    console, errors = Console(), Console(stderr=True)
+    console, errors = plain_console(), plain_console(stderr=True)
     runs = {}
     for folder, experiment in declared.items():
         with errors.status(folder.name) as status:
@@ -42,8 +42,8 @@ def experiment_command(
         write_runs(runs, out)
         console.print(_judgement(experiment.title, compare(runs[folder], folder)))
         for failure in runs[folder].failures:
-            console.print(f"left out: {failure}", highlight=False, markup=False)
-    console.print(f"results in {out} (open report.html)", highlight=False, markup=False)
+            console.print(f"left out: {failure}")
+    console.print(f"results in {out} (open report.html)")
 
 
 def _judgement(title: str, table) -> Table:

@@ -13,6 +13,7 @@ from rich.console import Console
 from jaxphoto.block import Block
 from jaxphoto.cli.app import app
 from jaxphoto.cli.cloud_options import Classes, CloudEpsg, CloudUnit, ReturnsOption, class_numbers
+from jaxphoto.cli.console import plain_console
 from jaxphoto.cloud import Cloud
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import Scanner
@@ -70,7 +71,7 @@ def lidar_control_command(
     if method not in METHODS:
         raise InputError(f"--method {method} is no method: choose one of {', '.join(METHODS)}")
     settings = _settings(sigma_z_m, sigma_xy_m, sigma_systematic_m)
-    chosen, errors = class_numbers(classes), Console(stderr=True)
+    chosen, errors = class_numbers(classes), plain_console(stderr=True)
     check_block_target(out, block)
     with errors.status("reading the block") as status:
         read = read_block(block)
@@ -84,7 +85,7 @@ def lidar_control_command(
         heights.to_csv(out / "lidar_heights.csv", index=False)
         rounds.to_csv(out / "lidar_rounds.csv", index=False)
         figure.savefig(out / "lidar_heights.png")
-    console = Console()
+    console = plain_console()
     print_rounds(found.rounds, found.still, console)
     refused = ", ".join(
         f"{name.lower()} {n}" for name, n in flag_counts(found.flag[~np.isfinite(found.height)]).items()
@@ -92,7 +93,6 @@ def lidar_control_command(
     console.print(
         f"wrote {out}: {int(found.used.sum())} of {len(found.points)} tie points have a control height"
         + (f" (refused: {refused})" if refused else ""),
-        highlight=False,
         soft_wrap=True,
     )
     if not found.still:
@@ -114,7 +114,7 @@ def roof_control_command(
     max_rounds: Rounds = MAX_ROUNDS,
 ) -> None:
     """Hold tie points on the planes of roof faces, and centroids of roofs in X, Y and Z; write the block with it."""
-    settings, chosen, errors = _settings(sigma_z_m, sigma_xy_m, 0.0), class_numbers(classes), Console(stderr=True)
+    settings, chosen, errors = _settings(sigma_z_m, sigma_xy_m, 0.0), class_numbers(classes), plain_console(stderr=True)
     check_block_target(out, block)
     with errors.status("reading the block") as status:
         read = read_block(block)
@@ -125,11 +125,9 @@ def roof_control_command(
         found = roof_control(read, points, settings, centroids=named, max_rounds=max_rounds, report=report)
         status.update(f"writing {out}")
         write_block(found.block, out)
-    console = Console()
+    console = plain_console()
     print_rounds(found.rounds, found.still, console)
-    console.print(
-        f"wrote {out}: {len(found.points)} tie points lie on {found.faces} roof faces", highlight=False, soft_wrap=True
-    )
+    console.print(f"wrote {out}: {len(found.points)} tie points lie on {found.faces} roof faces", soft_wrap=True)
     if not found.still:
         raise typer.Exit(1)
 
@@ -170,7 +168,7 @@ def simultaneous_command(
     if trajectory is None and boresight not in (None, "fixed"):
         raise InputError(f"--boresight {boresight} needs --trajectory, which says from where each point was measured")
     turn = _prior("--boresight", boresight or ("fixed" if trajectory is None else "free"), np.pi / 180)
-    slide, chosen, errors = _prior("--shift", shift, 1.0), class_numbers(classes), Console(stderr=True)
+    slide, chosen, errors = _prior("--shift", shift, 1.0), class_numbers(classes), plain_console(stderr=True)
     check_target(out, block, cloud)
     began = time.perf_counter()
     with errors.status("reading the block") as status:
@@ -209,10 +207,10 @@ def simultaneous_command(
                 moved = with_positions(records, np.asarray(result.trajectory.position), read.frame)
                 moved = moved._replace(time=moved.time + trajectory_shift_s)
                 write_flight_csv(moved, folder / "trajectory.csv")
-    console = Console()
+    console = plain_console()
     print_rounds(result.rounds, result.still, console)
     print_moved(result, console)
-    console.print(f"results in {out}", highlight=False, markup=False)
+    console.print(f"results in {out}")
     if not result.still:
         raise typer.Exit(1)
 
@@ -254,7 +252,7 @@ def _reporter(errors: Console, show: Callable[[str], None]) -> Callable[[Round],
         if np.isfinite(made.largest_change):
             line += f", largest change {made.largest_change:.2g} standard deviations"
         if errors.is_terminal:
-            errors.print(line, highlight=False)
+            errors.print(line)
         show(f"{line}; looking at the cloud")
 
     return report

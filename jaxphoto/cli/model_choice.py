@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from jaxphoto.cli.app import app
+from jaxphoto.cli.console import plain_console
 from jaxphoto.io import read_block
 from jaxphoto.procedures.model_choice import FOLDS, model_choice
 from jaxphoto.report import check_target
@@ -28,7 +28,7 @@ def models_command(
 ) -> None:
     """Compare distortion models by cross-validation, information criteria and significance."""
     check_target(out, block)
-    console, errors = Console(), Console(stderr=True)
+    console, errors = plain_console(), plain_console(stderr=True)
     began = time.perf_counter()
     with errors.status("reading the block") as status:
         read = read_block(block)
@@ -40,6 +40,6 @@ def models_command(
         status.update(f"writing {out}")
         write_model_choice(choice, read.title, out, seconds)
     print_model_choice(choice, console)
-    console.print(f"results in {out} (open report.html)", highlight=False, markup=False)
+    console.print(f"results in {out} (open report.html)")
     if not choice.by_bic:
         raise typer.Exit(1)

@@ -5,13 +5,12 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from rich.console import Console
-from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from jaxphoto.block import Block
 from jaxphoto.cli.app import app
+from jaxphoto.cli.console import plain_console
 from jaxphoto.errors import InputError
 from jaxphoto.experiment import MonteCarlo
 from jaxphoto.io import read_block
@@ -56,7 +55,7 @@ def monte_carlo_command(
         raise InputError("--bias noise is of every observation: it takes no --per, --on or --parameter")
     check_place(out)
     sigmas = _sigma_of(kind, {"m": sigma_m, "deg": sigma_deg, "mm": sigma_mm, "own": sigma})
-    errors = Console(stderr=True)
+    errors = plain_console(stderr=True)
     with errors.status("reading the block") as status:
         read = read_block(block)
         drawn = _bias_of(read, kind, sigmas, per, on or [], parameter)
@@ -75,13 +74,12 @@ def monte_carlo_command(
     with Progress(*columns, console=errors, transient=True) as progress:
         task = progress.add_task("", total=draws)
         study.draw(lambda done: progress.update(task, completed=done))
-    with errors.status(escape(f"writing {out}")):
+    with errors.status(f"writing {out}"):
         summary, table = study.write()
-    console = Console()
+    console = plain_console()
     console.print(
         f"{summary['draws']} draws, {summary['converged']} converged, {summary['fallbacks']} by a full adjustment; "
         f"{summary['draws_per_second']:.0f} draws a second",
-        highlight=False,
     )
     shown = Table("quantity", "nominal", "mean", "sd", "predicted sigma", "ratio", title="estimates over the draws")
     shown_numbers = ["nominal", "mean", "sd", "predicted_sigma", "ratio"]
@@ -89,7 +87,7 @@ def monte_carlo_command(
         if not str(name).startswith(("bias.", "exterior.", "point.", "check.")):
             shown.add_row(str(name), *(f"{float(v):.5g}" for v in numbers))
     console.print(shown)
-    console.print(f"results in {out}", highlight=False, markup=False)
+    console.print(f"results in {out}")
 
 
 def _sigma_of(kind: str, given: dict[str, str | None]) -> list[float]:

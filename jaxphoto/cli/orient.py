@@ -6,11 +6,10 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from rich.console import Console
-from rich.markup import escape
 
 from jaxphoto.camera import DISTORTIONS, InteriorOrientation
 from jaxphoto.cli.app import app
+from jaxphoto.cli.console import plain_console
 from jaxphoto.errors import InputError
 from jaxphoto.image_measurement.matching import MatchedPhotographs, match_photographs
 from jaxphoto.image_measurement.photograph_pairs import photograph_pairs
@@ -45,19 +44,19 @@ def orient_command(
     converged or not settled.
     """
     check_block_target(out, *images)
-    console, errors = Console(), Console(stderr=True)
+    console, errors = plain_console(), plain_console(stderr=True)
     if len(images) == 1 and (images[0] / TOML).is_file():
         _refuse_options(images[0], pairs=pairs, c_mm=c_mm, pixel_mm=pixel_mm, model=model, r0_mm=r0_mm)
         with errors.status("reading the block") as status:
-            n_known, n = _orient_folder(images[0], out, lambda said: status.update(escape(said)))
-        console.print(f"{n_known} of {n} images oriented; wrote {escape(str(out))}", highlight=False, soft_wrap=True)
+            n_known, n = _orient_folder(images[0], out, lambda said: status.update(said))
+        console.print(f"{n_known} of {n} images oriented; wrote {out}", soft_wrap=True)
         return
     with errors.status("reading the photographs") as status:
         read = photographs(images)
         camera = sensor_and_interior(read, pixel_mm, c_mm)
         distortion = distortion_model(model or "brown", camera.sensor, r0_mm or 0.0)
         compared = photograph_pairs(read, pairs or "exhaustive")
-        console.print(camera.origin, highlight=False, markup=False, soft_wrap=True)
+        console.print(camera.origin, soft_wrap=True)
         start = camera.interior
         matched = match_photographs(
             read,
@@ -74,21 +73,20 @@ def orient_command(
             matched.pairs,
             matched.sigma_mm,
             title=f"{len(read)} photographs",
-            report=lambda said: status.update(escape(said)),
+            report=lambda said: status.update(said),
         )
         found = _with_reasons(found, matched)
-        status.update(f"writing {escape(str(out))}")
+        status.update(f"writing {out}")
         write_block(found.block, out)
         write_orientation(found, out, n_gross=matched.n_gross, sigma_factor=matched.sigma_factor)
     console.print(
         f"{matched.n_gross} matches by looks left out before: off the epipolar line, or of pairs with too few; the "
         f"others scatter {matched.sigma_factor:.2g} times as much as in views of a plane",
-        highlight=False,
         soft_wrap=True,
     )
     print_orientation(found.report, console)
     said = f"wrote {out}: adjust it with jaxphoto adjust {out} --out DIR"
-    console.print(said, highlight=False, markup=False, soft_wrap=True)
+    console.print(said, soft_wrap=True)
     if not found.report.converged:
         raise typer.Exit(1)
 

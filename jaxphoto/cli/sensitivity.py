@@ -6,10 +6,10 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from rich.console import Console
 
 import jaxphoto
 from jaxphoto.cli.app import app
+from jaxphoto.cli.console import plain_console
 from jaxphoto.errors import InputError
 from jaxphoto.io import read_block
 from jaxphoto.procedures import adjust_for_tables
@@ -33,7 +33,7 @@ def sensitivity_command(
     if bias_m == 0 or not np.isfinite(bias_m):
         raise InputError(f"--bias-m {bias_m:g} is no bias: give its size in metres")
     check_target(out, block)
-    console, errors = Console(), Console(stderr=True)
+    console, errors = plain_console(), plain_console(stderr=True)
     began = time.perf_counter()
     with errors.status("reading the block") as status:
         read = read_block(block)
@@ -51,5 +51,5 @@ def sensitivity_command(
     largest = interior.loc[interior.groupby("estimate", sort=False)["exact"].apply(lambda v: v.abs().idxmax())]
     for row in largest.head(_SHOWN).itertuples(index=False):
         line = f"  {row.estimate}: {row.exact:.4g}, {row.first_order:.4g} (stations of {row.unit} in {row.axis})"
-        console.print(line, highlight=False, markup=False)
-    console.print(f"results in {out}", highlight=False, markup=False)
+        console.print(line)
+    console.print(f"results in {out}")

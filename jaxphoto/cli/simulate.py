@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from jaxphoto.cli.app import app
+from jaxphoto.cli.console import plain_console
 from jaxphoto.io import read_recipe, write_simulation
 from jaxphoto.io.recipe.scan_files import CLOUD, TRAJECTORY
 from jaxphoto.simulation import simulate
@@ -22,7 +23,8 @@ def simulate_command(
     write_simulation(simulation, out)
     block, cloud = simulation.block, simulation.cloud
     scanned = "" if cloud is None else f", {len(cloud)} laser points in {CLOUD}, their trajectory in {TRAJECTORY}"
-    typer.echo(
+    plain_console().print(
         f"wrote {out}: {len(block.images)} images, {len(block.points)} points, "
-        f"{len(block.image_points.image)} image points{scanned} (seed {seed}); the truth is in {out / 'truth'}"
+        f"{len(block.image_points.image)} image points{scanned} (seed {seed}); the truth is in {out / 'truth'}",
+        soft_wrap=True,
     )

@@ -5,13 +5,12 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.markup import escape
 
 from jaxphoto.cli.app import app
+from jaxphoto.cli.console import plain_console
 from jaxphoto.errors import InputError
 from jaxphoto.io.cameras import CameraFile, read_camera_file
-from jaxphoto.report import check_target
+from jaxphoto.report import check_target, print_warning
 from jaxphoto.report.stability import Compared, print_stability, write_stability
 from jaxphoto.stability import METHODS, UNKNOWNS, Method, analyse, image_grid
 
@@ -55,7 +54,7 @@ def stability_command(
     _check_one_sensor(a, b, first, second)
     points = image_grid(a.sensor, columns, rows, _extent(extent))
     found = analyse(a.interior, b.interior, points, (a.covariance, b.covariance), relief)
-    console, noise_mm = Console(), noise_px * a.sensor.pixel_mm
+    console, noise_mm = plain_console(), noise_px * a.sensor.pixel_mm
     chosen: Method = method  # type: ignore[assignment]
     one, other = (
         Compared(f"{letter} ({path})", file.interior, file.covariance is not None)
@@ -63,11 +62,11 @@ def stability_command(
     )
     for letter, file in zip("AB", both, strict=True):
         if file.note:
-            console.print(f"[yellow]![/yellow] {letter}: {escape(file.note)}", highlight=False, soft_wrap=True)
+            print_warning(f"{letter}: {file.note}", console, soft_wrap=True)
     print_stability(found, (one, other), a.sensor.pixel_mm, noise_mm, chosen, console)
     if out is not None:
         write_stability(found, (one, other), a.sensor, noise_mm, chosen, out)
-        console.print(f"results in {out} (open report.html)", highlight=False, markup=False)
+        console.print(f"results in {out} (open report.html)")
 
 
 def _grid(text: str) -> tuple[int, int]:

@@ -6,12 +6,12 @@ from typing import Annotated
 import jax
 import numpy as np
 import typer
-from rich.console import Console
 
 import jaxphoto
 from jaxphoto.block import Block
 from jaxphoto.cli.app import app
 from jaxphoto.cli.cloud_options import Classes, CloudEpsg, CloudUnit, ReturnsOption, class_numbers
+from jaxphoto.cli.console import plain_console
 from jaxphoto.errors import BlockError, InputError
 from jaxphoto.io import clouds, raster, read_block
 from jaxphoto.lidar.orthophoto import orthophoto
@@ -35,7 +35,7 @@ def dsm_command(
     """Make a surface model of a cloud."""
     chosen = class_numbers(classes)
     said = {"epsg": cloud_epsg, "unit": cloud_unit}
-    with Console(stderr=True).status("reading the cloud"):
+    with plain_console(stderr=True).status("reading the cloud"):
         system = clouds.cloud_system(cloud, **said)  # type: ignore[arg-type]
         ends = clouds.extent(cloud, **said)[:, :2]  # type: ignore[arg-type]
         # One cell more all around: headers are rounded. What stays empty is left out again.
@@ -49,9 +49,10 @@ def dsm_command(
     rows, columns = surface.heights.shape
     there = 100 * (1 - np.isnan(surface.heights).mean())
     low, high = np.nanmin(surface.heights), np.nanmax(surface.heights)
-    typer.echo(
+    plain_console().print(
         f"wrote {out}: {columns} x {rows} cells of {cell_m:g} m, {there:.0f} % with heights, {low:.2f} to "
-        f"{high:.2f} m, in {system.name}"
+        f"{high:.2f} m, in {system.name}",
+        soft_wrap=True,
     )
 
 
@@ -66,7 +67,7 @@ def orthophoto_command(
     max_steps: Annotated[int, typer.Option(min=1, help="Most iterations.")] = jaxphoto.MAX_STEPS,
 ) -> None:
     """Adjust a block, and lay the photograph of one of its images over a surface model."""
-    with Console(stderr=True).status("reading") as status:
+    with plain_console(stderr=True).status("reading") as status:
         read = read_block(block)
         at = _image(read, image)
         sensor = read.sensors[read.image_camera[at]]
@@ -98,7 +99,9 @@ def orthophoto_command(
                 f"{np.nanmax(surface.heights):.1f} m); name the surface model of this area"
             )
         raster.write_orthophoto(out, picture, surface, system)
-    typer.echo(f"wrote {out}: image {image} on {100 * picture.seen.mean():.0f} % of the cells of {dsm.name}")
+    plain_console().print(
+        f"wrote {out}: image {image} on {100 * picture.seen.mean():.0f} % of the cells of {dsm.name}", soft_wrap=True
+    )
 
 
 def _image(block: Block, name: str) -> int:

@@ -14,6 +14,7 @@ import pandas as pd
 
 from jaxphoto.block import Block
 from jaxphoto.io.draws_folder import DrawsFolder, digest_of, write_whole
+from jaxphoto.io.json_file import read_json
 from jaxphoto.report.draws import (
     Moments,
     column_of,
@@ -35,6 +36,9 @@ _PART, _PART_NUMBERS, _PART_ROWS = 1000, 5_000_000, 12_000_000
 _FIRST_DRAWS, _SECONDS, _TIMES = 100, 10.0, 20
 # Columns of all draws that are read at a time.
 _AT_ONCE = 200
+# What a summary and its table have at least.
+_TOLD = ("draws", "converged", "fallbacks", "draws_per_second")
+_COLUMNS = {"quantity", "nominal", "mean", "sd", "predicted_sigma", "ratio"}
 _OF_DRAWS = ("draw", "converged", "iterations", "fallback")
 # Errors of which the effect of each by itself is worth its time, and errors of a picture.
 _PREDICTED, _PICTURED = 20_000, 60
@@ -101,13 +105,22 @@ class MonteCarlo:
 
         Where all that was written before and nothing was drawn since, it is only read.
         """
-        directory = self.folder.directory
-        if self.computed == 0 and (directory / "summary.json").is_file():
-            summary = json.loads((directory / "summary.json").read_text(encoding="utf-8"))
-            # Not what was summed up on the way.
-            if summary["draws"] == self.folder.draws:
-                return summary, pd.read_csv(directory / "summary.csv")
+        if self.computed == 0 and (written := self._written()) is not None:
+            return written
         return self._sum_up([c for c in self.folder.columns() if c not in _OF_DRAWS])
+
+    def _written(self) -> tuple[dict, pd.DataFrame] | None:
+        """The summary and its table as they were written of all draws; None where they are not there as a whole."""
+        directory = self.folder.directory
+        try:
+            summary, table = read_json(directory / "summary.json"), pd.read_csv(directory / "summary.csv")
+        except (ValueError, OSError):
+            return None
+        # Not what was summed up on the way.
+        numbers = all(isinstance(summary.get(key), int | float) for key in _TOLD)
+        columns = {"quantity", *table.select_dtypes("number").columns} & set(table.columns)
+        whole = numbers and summary["draws"] == self.folder.draws and columns >= _COLUMNS
+        return (summary, table) if whole else None
 
     @property
     def _columns_of_few(self) -> list[str]:

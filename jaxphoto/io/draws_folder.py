@@ -7,7 +7,8 @@ the same file as one that was not.
 import hashlib
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import jax
@@ -18,6 +19,7 @@ import pyarrow.parquet as pq
 
 from jaxphoto.block import Block
 from jaxphoto.errors import InputError
+from jaxphoto.io.json_file import read_json
 from jaxphoto.unknowns import Prior
 
 _RUN, _PARTS, DRAWS = "run.json", "parts", "draws.parquet"
@@ -60,9 +62,11 @@ class DrawsFolder:
 
     @property
     def next_part(self) -> int:
-        """The first part that is not there; parts are written in order."""
+        """The first part that is not there; parts are written in order. Raises InputError for one that is damaged."""
         k = 0
         while self._part(k).is_file():
+            with _reading(self._part(k)):
+                pq.read_schema(self._part(k))
             k += 1
         return k
 
@@ -73,16 +77,17 @@ class DrawsFolder:
 
     def write_part(self, k: int, table: pd.DataFrame) -> None:
         """Keep the draws of part `k`."""
-        write_whole(self._part(k), lambda path: pq.write_table(_arrow(table), path))
+        write_whole(self._part(k), lambda path: pq.write_table(_arrow(table), path, write_page_checksum=True))
 
     def join(self) -> None:
         """Bring all parts to one file, part by part."""
         parts = [self._part(k) for k in range(self.n_parts)]
 
         def write(path: Path) -> None:
-            with pq.ParquetWriter(path, pq.read_schema(parts[0])) as writer:
+            with pq.ParquetWriter(path, pq.read_schema(parts[0]), write_page_checksum=True) as writer:
                 for part in parts:
-                    writer.write_table(pq.read_table(part))
+                    with _reading(part):
+                        writer.write_table(pq.read_table(part, page_checksum_verification=True))
 
         write_whole(self.directory / DRAWS, write)
 
@@ -95,11 +100,16 @@ class DrawsFolder:
 
     def columns(self) -> list[str]:
         """Names of the columns of the draws there are."""
-        return pq.read_schema(self._files[0]).names
+        with _reading(self._files[0]):
+            return pq.read_schema(self._files[0]).names
 
     def read(self, names: list[str]) -> dict[str, np.ndarray]:
         """Columns of the draws there are."""
-        table = pa.concat_tables(pq.read_table(file, columns=names) for file in self._files)
+        tables = []
+        for file in self._files:
+            with _reading(file):
+                tables.append(pq.read_table(file, columns=names, page_checksum_verification=True).select(names))
+        table = pa.concat_tables(tables)
         return {name: table.column(name).to_numpy() for name in names}
 
     @property
@@ -132,12 +142,18 @@ def check_place(directory: Path) -> None:
 
 def _settings_in(run: Path) -> dict:
     try:
-        held = json.loads(run.read_text(encoding="utf-8"))
-    except ValueError:
-        held = None
-    if not isinstance(held, dict):
-        raise InputError(f"{run} holds no settings of a Monte Carlo run: name a new folder")
-    return held
+        return read_json(run)
+    except InputError:
+        raise InputError(f"{run} holds no settings of a Monte Carlo run: name a new folder") from None
+
+
+@contextmanager
+def _reading(file: Path) -> Iterator[None]:
+    """Raises InputError where a file of draws is cut off or was changed."""
+    try:
+        yield
+    except (pa.ArrowException, OSError, KeyError):
+        raise InputError(f"{file} is damaged: delete it, and its draws are made anew") from None
 
 
 def write_whole(path: Path, write: Callable[[Path], object]) -> None:

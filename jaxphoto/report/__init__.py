@@ -14,7 +14,7 @@ from jaxphoto.report.plots import (
 from jaxphoto.report.results import check_target, made_whole, summary_of, write_results
 from jaxphoto.report.snooped import left_out_table, snooped_findings
 from jaxphoto.report.tables import Tables
-from jaxphoto.report.terminal import print_adjustment
+from jaxphoto.report.terminal import print_adjustment, print_warning
 from jaxphoto.report.verdict import verdict_of
 
 __all__ = [
@@ -33,6 +33,7 @@ __all__ = [
     "prepare_pictures",
     "print_adjustment",
     "print_boresight",
+    "print_warning",
     "report_page",
     "residuals_figure",
     "snooped_findings",

@@ -7,6 +7,7 @@ import pandas as pd
 from jinja2 import Environment
 from markupsafe import Markup
 from rich.console import Console
+from rich.text import Text
 
 from jaxphoto.procedures import Step
 from jaxphoto.report.page import STYLE
@@ -117,8 +118,8 @@ def write_boresight(steps: tuple[Step, ...], directory: Path, seconds: dict[str,
 def print_boresight(steps: tuple[Step, ...], console: Console) -> None:
     """Print the judgement, then what each step found."""
     colour = "green" if all(step.go_on for step in steps) else "red"
-    console.print(f"[{colour}]{boresight_verdict(steps)}[/{colour}]", highlight=False)
+    console.print(boresight_verdict(steps), style=colour, highlight=False, markup=False)
     for step in steps:
-        console.print(f"[bold]step {step.number}[/bold]: {step.title}", highlight=False)
+        console.print(Text.assemble((f"step {step.number}", "bold"), f": {step.title}"))
         for finding in step.findings:
             console.print(f"  - {finding}", highlight=False, markup=False)

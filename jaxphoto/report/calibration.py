@@ -17,7 +17,7 @@ from jaxphoto.camera import Sensor
 from jaxphoto.procedures.calibration import Calibration, Detection, rms_px
 from jaxphoto.report.findings import Finding, Level, Verdict
 from jaxphoto.report.page import STYLE
-from jaxphoto.report.plots import new_figure
+from jaxphoto.report.plots import drawn, new_figure
 from jaxphoto.report.results import made_whole, write_results, write_summary
 from jaxphoto.report.tables import Tables
 from jaxphoto.report.verdict import verdict_of
@@ -91,8 +91,7 @@ def _photograph_figure(sensor: Sensor, picture: np.ndarray | None, title: str) -
         extent = (0, sensor.width_px, sensor.height_px, 0)
         axes.imshow(picture[::step, ::step], cmap="gray", extent=extent, vmin=0, vmax=255)
     axes.set(xlim=(0, sensor.width_px), ylim=(sensor.height_px, 0), xlabel="column [px]", ylabel="row [px]")
-    # A dollar sign in the name of a file begins no formula.
-    axes.set_title("\n".join(wrap(title, _LINE)), fontsize=10, parse_math=False)
+    axes.set_title("\n".join(map(drawn, wrap(title, _LINE))), fontsize=10)
     axes.set_aspect("equal")
     return figure
 

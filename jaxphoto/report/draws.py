@@ -10,7 +10,7 @@ import pandas as pd
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.observations import AXES
-from jaxphoto.report.plots import new_figure
+from jaxphoto.report.plots import drawn, new_figure
 from jaxphoto.sensitivity import Draws
 
 if TYPE_CHECKING:
@@ -119,7 +119,7 @@ def draws_figure(columns: Mapping[str, np.ndarray], summary: pd.DataFrame) -> Fi
             at = row["nominal"] + row["predicted_sigma"] * np.linspace(-4, 4, 200)
             density = np.exp(-0.5 * np.linspace(-4, 4, 200) ** 2) / row["predicted_sigma"] / np.sqrt(2 * np.pi)
             axes.plot(at, density, color="tab:blue", lw=1)
-        axes.set_title(name, fontsize=9)
+        axes.set_title(drawn(name), fontsize=9)
         axes.set_yticks([])
         axes.tick_params(labelsize=7)
     for axes in figure.axes[len(chosen) :]:
@@ -134,7 +134,7 @@ def effects_figure(effects: pd.DataFrame, summary: pd.DataFrame, quantities: lis
     figure = new_figure(1.8 + 0.8 * len(quantities), 1.2 + 0.24 * len(effects))
     axes = figure.subplots()
     image = axes.imshow(parts, cmap="RdBu_r", vmin=-1, vmax=1, aspect="auto")
-    axes.set_xticks(range(len(quantities)), quantities, rotation=45, ha="right", fontsize=8)
-    axes.set_yticks(range(len(effects)), list(effects["error"]), fontsize=7)
+    axes.set_xticks(range(len(quantities)), list(map(drawn, quantities)), rotation=45, ha="right", fontsize=8)
+    axes.set_yticks(range(len(effects)), list(map(drawn, effects["error"])), fontsize=7)
     figure.colorbar(image, label="effect of one sigma / predicted sigma")
     return figure

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jaxphoto.errors import printable
 from jaxphoto.report.tables import Tables
 
 if TYPE_CHECKING:
@@ -23,6 +24,11 @@ def new_figure(width: float, height: float) -> Figure:
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height), dpi=_DPI, layout="constrained")
+
+
+def drawn(name: str) -> str:
+    """A name of a file as matplotlib draws it: a dollar would begin a formula."""
+    return printable(name).replace("$", r"\$")
 
 
 def prepare_pictures() -> None:
@@ -77,7 +83,7 @@ def residuals_figure(tables: Tables, camera: str) -> Figure:
     xy, v = np.asarray(a.values.xy)[:, mine], (np.asarray(a.residuals.image) * np.asarray(a.values.sigma_xy))[:, mine]
     sensor = a.block.sensors[camera]
     figure, ((axes,),) = _panels(6.4, 5.0)
-    key, title = _round_key(v), f"image residuals of camera {camera}"
+    key, title = _round_key(v), f"image residuals of camera {drawn(camera)}"
     if (n := v.shape[1]) > _ARROWS:
         one_in = -(-n // _ARROWS)
         shown = np.union1d(np.arange(0, n, one_in), np.argsort(np.hypot(*v))[-_LARGEST:])
@@ -116,7 +122,7 @@ def check_points_figure(adjustments: Mapping[str, Tables]) -> Figure:
             axes.plot(*at[:, surveyed], ".", ms=4, color="tab:green")
             _vectors(axes, at[:, surveyed], v[:, surveyed], key, length, f"{key:g} m", width=0.003, above=0.12 / high)
             axes.set(xlabel="X [m]", ylabel="Y [m]")
-            axes.set_title(f"{name}: {what}" if name else what, loc="left", fontsize=10)
+            axes.set_title(f"{drawn(name)}: {what}" if name else what, loc="left", fontsize=10)
             axes.set_aspect("equal", adjustable="datalim")
     figure.suptitle(
         "discrepancies at check points, surveyed minus computed", fontsize=11, y=1 - 0.1 / figure.get_figheight()
@@ -133,8 +139,8 @@ def correlation_figure(tables: Tables, camera: str) -> Figure:
         (right, c.mean_abs, c.eop_names, "mean |correlation| of EOP and IOP"),
     ):
         image = axes.imshow(values, vmin=-1, vmax=1, cmap="RdBu_r", aspect="auto")
-        axes.set_xticks(range(len(c.parameters)), c.parameters, rotation=45, ha="right", fontsize=8)
-        axes.set_yticks(range(len(rows)), rows, fontsize=8)
+        axes.set_xticks(range(len(c.parameters)), list(map(drawn, c.parameters)), rotation=45, ha="right", fontsize=8)
+        axes.set_yticks(range(len(rows)), list(map(drawn, rows)), fontsize=8)
         for i, j in np.ndindex(values.shape):
             colour = "white" if abs(values[i, j]) > 0.6 else "black"
             axes.text(j, i, f"{values[i, j]:.2f}", ha="center", va="center", fontsize=7, color=colour)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from jaxphoto.report.plots import new_figure
+from jaxphoto.report.plots import drawn, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -81,7 +81,7 @@ def _names(posterior: Posterior) -> tuple[list[str], np.ndarray]:
         last = parameter.rsplit(".", 1)[-1]
         if last in _ANGLES:
             factor[j] = np.rad2deg(1.0)
-        names.append(parameter + ("_deg" if last in _ANGLES else "_m" if last in ("X", "Y", "Z") else ""))
+        names.append(drawn(parameter) + ("_deg" if last in _ANGLES else "_m" if last in ("X", "Y", "Z") else ""))
     return names, factor
 
 

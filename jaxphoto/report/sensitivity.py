@@ -12,7 +12,7 @@ import pandas as pd
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.observations import AXES
-from jaxphoto.report.plots import new_figure
+from jaxphoto.report.plots import drawn, new_figure
 from jaxphoto.report.results import made_whole, versions, write_summary
 from jaxphoto.report.tables import Tables
 from jaxphoto.sensitivity.exact import Sensitivity, sensitivity
@@ -136,9 +136,9 @@ class SensitivityTables:
                 (("exact", "tab:blue"), ("first_order", "0.6"), ("difference", "tab:red"))
             ):
                 axes.bar(at + 0.27 * (k - 1), values[name], 0.27, color=colour, label=name.replace("_", " "))
-            axes.set_xticks(at, [f"{unit} {axis}" for unit, axis in values.index], rotation=90, fontsize=7)
+            axes.set_xticks(at, [drawn(f"{unit} {axis}") for unit, axis in values.index], rotation=90, fontsize=7)
             axes.axhline(0, color="0.4", lw=0.6)
-            axes.set_title(title, fontsize=10)
+            axes.set_title(drawn(title), fontsize=10)
             axes.tick_params(axis="y", labelsize=8)
         for axes in figure.axes[len(panels) :]:
             axes.remove()

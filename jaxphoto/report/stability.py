@@ -108,8 +108,8 @@ def print_stability(
 ) -> None:  # fmt: skip
     """Both sets, a column for each method in micrometres, and the verdict by `method`."""
     for compared in sets:
-        console.print(str(compared), highlight=False, soft_wrap=True)
-    console.print(_missing(sets), highlight=False, soft_wrap=True)
+        console.print(str(compared), highlight=False, markup=False, soft_wrap=True)
+    console.print(_missing(sets), highlight=False, markup=False, soft_wrap=True)
     table = Table(title=f"stability (um); noise {1e3 * noise_mm:.4g} um = {noise_mm / pixel_mm:.4g} px")
     table.add_column("", no_wrap=True)
     for name in analyses:
@@ -122,7 +122,7 @@ def print_stability(
     chosen = analyses[method]
     colour = "green" if chosen.similar(noise_mm) else "red"
     verdict = chosen.verdict(noise_mm)
-    console.print(f"[{colour}]{method}: {verdict}[/{colour}]", highlight=False, soft_wrap=True)
+    console.print(f"{method}: {verdict}", style=colour, highlight=False, markup=False, soft_wrap=True)
 
 
 def _shown(row: Mapping[Hashable, Any]) -> dict[str, str]:

@@ -10,7 +10,7 @@ import pandas as pd
 
 from jaxphoto.errors import InputError
 from jaxphoto.observations import AXES
-from jaxphoto.report.plots import new_figure
+from jaxphoto.report.plots import drawn, new_figure
 from jaxphoto.sensitivity.sweep import Sweep
 
 if TYPE_CHECKING:
@@ -122,7 +122,7 @@ def sweep_figure(table: pd.DataFrame, x: str, shown: Sequence[tuple[str, str]], 
             )
         _lines(axes, rows, x, by)
         unit = rows["unit"].iloc[0]
-        axes.set_title(f"{quantity} {of}" + f" [{unit}]" * bool(unit), fontsize=9)
+        axes.set_title(drawn(f"{quantity} {of}" + f" [{unit}]" * bool(unit)), fontsize=9)
     for axes in panels[len(shown) :]:
         axes.set_axis_off()
     if by:
@@ -134,16 +134,16 @@ def _lines(axes: Axes, rows: pd.DataFrame, x: str, by: Sequence[str]) -> None:
     places = rows[x].drop_duplicates()
     numbers = pd.api.types.is_numeric_dtype(places) and not pd.api.types.is_bool_dtype(places)
     for name, line in rows.groupby(list(by), sort=False) if by else [((), rows)]:
-        label = ", ".join(f"{p} {v}" for p, v in zip(by, name, strict=True))
+        label = drawn(", ".join(f"{p} {v}" for p, v in zip(by, name, strict=True)))
         at = line.sort_values(x) if numbers else line
-        axes.plot(at[x] if numbers else at[x].astype(str), at["value"], "o-", ms=3, lw=1, label=label)
+        axes.plot(at[x] if numbers else at[x].astype(str).map(drawn), at["value"], "o-", ms=3, lw=1, label=label)
     if numbers and _far_apart(places):
         axes.set_xscale("log")
     if rows["quantity"].iloc[0].endswith("abs_rho"):
         axes.set_ylim(0, 1.02)
     elif _far_apart(rows["value"]):
         axes.set_yscale("log")
-    axes.set_xlabel(x, fontsize=8)
+    axes.set_xlabel(drawn(x), fontsize=8)
     axes.tick_params(labelsize=7)
     axes.grid(lw=0.3)
 

@@ -1,9 +1,10 @@
 """One screen of text: outcome, sigma naught, warnings first, then the interior orientation."""
 
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
+from jaxphoto.errors import printable
 from jaxphoto.report.findings import Level, Verdict
 from jaxphoto.report.tables import Tables
 from jaxphoto.statistics import residual_spread
@@ -14,21 +15,25 @@ _MARKS = {Level.INFORMATION: "-", Level.WARNING: "!", Level.ALARM: "!!"}
 _PARAMETERS = 18
 
 
+def plain(text: str) -> Text:
+    """Names of files as they are: what is markup of rich's in them stays text."""
+    return Text(printable(text))
+
+
 def print_adjustment(tables: Tables, verdict: Verdict, console: Console) -> None:
     """Print the verdict on an adjustment with its reasons, and the interior orientation with its sigmas."""
     adjusted = tables.adjusted
     n, u = sum(adjusted.n_observations.values()), sum(adjusted.n_unknowns.values())
-    console.print(f"[bold]{escape(adjusted.block.title)}[/bold]" if adjusted.block.title else "[bold]block[/bold]")
-    colour = _COLOURS[verdict.level]
-    console.print(f"[bold {colour}]{verdict.headline}[/bold {colour}]", highlight=False)
+    console.print(plain(adjusted.block.title or "block"), style="bold")
+    console.print(Text(verdict.headline, f"bold {_COLOURS[verdict.level]}"))
     for finding in verdict.findings[:_FINDINGS]:
-        mark = _COLOURS[finding.level]
-        console.print(f"[{mark}]{_MARKS[finding.level]}[/{mark}] {escape(finding.text)}", highlight=False)
+        mark = Text(f"{_MARKS[finding.level]} ", _COLOURS[finding.level])
+        console.print(mark + plain(finding.text))
     if len(verdict.findings) > _FINDINGS:
         console.print(f"and {len(verdict.findings) - _FINDINGS} more in report.html")
-    console.print(f"{adjusted.outcome.value} ({int(adjusted.steps)} iterations)", highlight=False)
+    console.print(f"{adjusted.outcome.value} ({int(adjusted.steps)} iterations)")
     console.print(
-        f"sigma0 [bold]{float(adjusted.sigma0):.6g}[/bold]   redundancy {adjusted.redundancy} = {n} observations"
+        f"sigma0 {float(adjusted.sigma0):.6g}   redundancy {adjusted.redundancy} = {n} observations"
         + (f" + {adjusted.n_constraints} constraints" if adjusted.n_constraints else "")
         + f" - {u} unknowns"
     )
@@ -38,15 +43,25 @@ def print_adjustment(tables: Tables, verdict: Verdict, console: Console) -> None
         )
         for s in tables.significance:
             table.add_row(
-                s.camera, s.parameter, f"{s.value:.8g}", f"{s.sigma:.3g}", f"{s.ratio:.4g}", f"{s.p_value:.2g}"
+                plain(s.camera),
+                plain(s.parameter),
+                f"{s.value:.8g}",
+                f"{s.sigma:.3g}",
+                f"{s.ratio:.4g}",
+                f"{s.p_value:.2g}",
             )
         console.print(table)
     if len(tables.georeferencing):
         table = Table("parameter", "value", "sigma", title="mounts and strips (a posteriori)")
         for parameter, value, sigma in tables.georeferencing.head(_PARAMETERS).itertuples(index=False):
-            table.add_row(parameter, f"{value:.6g}", f"{sigma:.3g}")
+            table.add_row(plain(parameter), f"{value:.6g}", f"{sigma:.3g}")
         console.print(table)
     spread = Table("group", "axis", "n", "RMSE", "maximum", "unit", title="residuals")
     for v in residual_spread(adjusted):
         spread.add_row(v.group, v.axis, str(v.n), f"{v.rmse:.4g}", f"{v.max_abs:.4g}", v.unit)
     console.print(spread)
+
+
+def print_warning(warning: str, console: Console, **options) -> None:
+    """Print a warning behind a yellow mark."""
+    console.print(Text.assemble(("!", "yellow"), " ", plain(warning)), **options)

@@ -23,6 +23,8 @@ from jaxphoto.observations.columns import FILE_UNITS
 KNOWN = "known_parameters"
 JOINT = "correlated_"
 _MATRIX = "_covariance"
+# Numbers that one covariance matrix joins: some take minutes to invert.
+_LARGEST_SET = 5_000
 
 
 def joint_layouts(kinds: Iterable[Kind]) -> dict[str, TableLayout]:
@@ -100,13 +102,18 @@ def _sets(table: Table, matrices: Table, unit: str, scale: float, k: int) -> Ite
         raise matrices.misfit(line, f"set {owner[line]} is not in {table.file}; add it there or delete the row")
     places = np.stack([matrices.numbers(name) for name in "ab"], axis=1)
     value = matrices.numbers(f"covariance{unit}") * scale
+    lines_of, entries_of = (pd.Series(names).groupby(names, sort=False).indices for names in (named, owner))
     for name in dict.fromkeys(named):
-        lines, entries = np.flatnonzero(named == name), np.flatnonzero(owner == name)
+        lines, entries = np.asarray(lines_of[name]), np.asarray(entries_of.get(name, ()), int)
         n = k * len(lines)
+        if n > _LARGEST_SET:
+            raise table.bad(
+                lines[0], f"set {name} has {n} numbers, and a covariance matrix has at most {_LARGEST_SET}; divide it"
+            )
         matrix = np.full((n, n), np.nan)
         for line in entries:
             a, b = places[line]
-            if not (a in range(1, n + 1) and b in range(1, n + 1)):
+            if not (min(a, b) >= 1 and max(a, b) <= n and a % 1 == 0 and b % 1 == 0):
                 raise matrices.bad(line, f"a and b count the numbers of set {name}, 1 to {n}; correct {a:g}, {b:g}")
             row, column = int(a) - 1, int(b) - 1
             if np.isfinite(matrix[row, column]) and matrix[row, column] != value[line]:

@@ -115,13 +115,14 @@ def _check_area(file: str, coordinates: np.ndarray, place: np.ndarray, frame: Fr
 
 
 def _numbers(table: Table, names: dict[str, str]) -> pd.DataFrame:
-    """Ids and role as text, all else that is to be converted as numbers, coordinates named `XYZ`."""
-    columns: dict[str, np.ndarray] = {}
-    for column in table.columns:
-        if column in ("image", "point", "role"):
-            columns[column] = table.columns[column]
-        elif column in names or column in (*ANGLES, *ATTITUDE, *VELOCITY):
-            columns[names.get(column, column)] = table.numbers(column, empty=True)
+    """Ids and role as text, all else that is to be converted as numbers, coordinates named `XYZ`.
+
+    What is converted together is there together: NaN where the file lacks a column.
+    """
+    columns = {column: table.columns[column] for column in ("image", "point", "role") if column in table}
+    for together in (tuple(names), ANGLES, ATTITUDE, VELOCITY):
+        if any(column in table for column in together):
+            columns |= {names.get(column, column): table.numbers(column, empty=True) for column in together}
     return pd.DataFrame(columns)
 
 
@@ -157,7 +158,7 @@ def _converted(tables: Numbers, frame: Frame, back: bool, refuse: Refuse) -> Num
         # The incomplete orientation of an image is kept for the warning that it is not used.
         to = given.copy()
         to[~partly] = system.map(whole[~partly]) if back else system.local(whole[~partly])
-        for line in np.flatnonzero(np.isinf(to).any(axis=1)):
+        for line in np.flatnonzero((~np.isfinite(to) & ~np.isnan(given)).any(axis=1)):
             refuse(name, int(line), f"the coordinates lie where EPSG:{frame.code} does not reach; correct them")
         local[name] = whole if back else to
         columns = table.assign(**dict(zip(XYZ, np.where(np.isnan(given), np.nan, to).T, strict=True)))

@@ -14,6 +14,7 @@ from jaxphoto.errors import BlockError
 from jaxphoto.io.block_folder.control import default_sigma
 from jaxphoto.io.block_folder.image_points import ObservedPoints
 from jaxphoto.io.block_folder.images import Images, check_angles, refuse_duplicates
+from jaxphoto.io.block_folder.section import MOST
 from jaxphoto.io.block_folder.settings import Settings
 from jaxphoto.io.block_folder.table_layout import LAYOUTS, TableLayout
 from jaxphoto.io.text_tables import Table
@@ -130,8 +131,8 @@ def _read(table: Table, column: Column, ids: Ids) -> np.ndarray:
         return ids.find(table, column.name, column.touches)
     values = table.numbers(column.name)
     if column.whole:
-        for line in np.flatnonzero(values != np.round(values)):
-            raise table.bad(line, f"{column.name} is {values[line]:g}, not a whole number; write it like 2")
+        for line in np.flatnonzero((values != np.round(values)) | (np.abs(values) > MOST)):
+            raise table.bad(line, f"{column.name} is {values[line]:g}, not a whole number like 2; correct it")
         return values.astype(int)
     if column.name.endswith("_deg"):
         check_angles(table, values[:, None], (column.name,))
