@@ -6,6 +6,8 @@ hundred times, and `benchmarks/mutations.py` as often as it is asked to, each re
 
 import functools
 import re
+import shutil
+import struct
 import tempfile
 import time
 import traceback
@@ -16,13 +18,18 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 
+from jaxphoto.camera import InteriorOrientation, OpenCv
 from jaxphoto.errors import JaxphotoError
 from jaxphoto.io import read_block, read_recipe
-from jaxphoto.io.cameras import read_camera_file
+from jaxphoto.io.cameras import read_camera_file, write_camera_file
+from jaxphoto.io.draws_folder import DrawsFolder
 from jaxphoto.io.trajectory import Records, read_records, write_flight_csv, write_sbet
 from tests.io import test_cameras as cameras
+from tests.io import test_surfaces as surfaces
 from tests.io.conftest import FILES
+from tests.simulation.small import RECIPES
 
 Files = dict[str, bytes]
 SLOWEST_S = 10.0
@@ -131,6 +138,49 @@ def _camera(name: str, **options) -> Callable[[Path], object]:
     return lambda folder: read_camera_file(folder / name, **options)
 
 
+def _joint_block(folder: Path) -> None:
+    """With surfaces, a scanner, and rows that covariances join."""
+    for name, content in FILES.items():
+        (folder / name).write_text(content, encoding="utf-8")
+    toml = FILES["block.toml"].replace("[datum]", surfaces.SCANNER + "[datum]")
+    (folder / "block.toml").write_text(toml, encoding="utf-8")
+    (folder / "surfaces.csv").write_text(surfaces.HEAD + surfaces.ROWS, encoding="utf-8")
+    joined = "set,image,axis,value_m\n1,c,0,20.0\n1,c,1,0.5\n2,c,2,100.5\n"
+    (folder / "correlated_stations.csv").write_text(joined, encoding="utf-8")
+    matrix = "set,a,b,covariance_m2\n1,1,1,0.01\n1,2,1,0.002\n1,2,2,0.02\n2,1,1,0.05\n"
+    (folder / "correlated_stations_covariance.csv").write_text(matrix, encoding="utf-8")
+
+
+_SETTINGS = {"seed": 1, "sigma": "0.1", "versions": {"jaxphoto": "0"}}
+
+
+def _draws(folder: Path) -> None:
+    run = DrawsFolder(folder, _SETTINGS, 30, 10)
+    for k in range(2):
+        run.write_part(k, pd.DataFrame({"draw": np.arange(10), "converged": [True] * 10, "kodak.c_mm": np.ones(10)}))
+
+
+def _read_draws(folder: Path) -> object:
+    run = DrawsFolder(folder, _SETTINGS, 30, 10)
+    return run.next_part, run.columns(), run.read(["converged", "kodak.c_mm"])
+
+
+def _recipe(name: str) -> Reader:
+    return Reader(
+        lambda: {"recipe.toml": (RECIPES / f"{name}.toml").read_bytes()},
+        lambda folder: read_recipe(folder / "recipe.toml"),
+    )
+
+
+def _open_cv(suffix: str) -> Reader:
+    """As OpenCV writes a camera."""
+    return Reader(
+        written_by(lambda folder: write_camera_file(folder / f"a{suffix}", cameras.SENSOR, _OPEN_CV, "opencv")),
+        _camera(f"a{suffix}"),
+    )
+
+
+_OPEN_CV = InteriorOrientation(35.0, 0.1, -0.2, OpenCv(k1=-0.2, k2=0.1, p1=1e-3, p2=-2e-3, k3=0.01))
 SUMMARY = (
     '{"cameras": {"nadir": {"width_px": 4500, "height_px": 3000, "pixel_mm": 0.008, "distortion": "smac", '
     '"sign": "add"}}}'
@@ -149,6 +199,21 @@ READERS: dict[str, Reader] = {
         lambda folder: read_recipe(folder / "recipe.toml"),
     ),
     "camera-opencv": Reader(text(a__yml=cameras.OPENCV), _camera("a.yml")),
+    "recipe-flight": _recipe("001"),
+    "recipe-convergent": _recipe("002"),
+    "recipe-lidar": _recipe("004"),
+    "draws": Reader(written_by(_draws), _read_draws),
+    "block-joint": Reader(written_by(_joint_block), read_block),
+    "camera-opencv-xml": _open_cv(".xml"),
+    "camera-opencv-json": _open_cv(".json"),
+    "camera-colmap-bin": Reader(
+        written_by(
+            lambda folder: (folder / "cameras.bin").write_bytes(
+                struct.pack("<QIiQQ8d", 1, 3, 4, 3072, 2304, 2560.0, 2561.0, 1536.0, 1152.0, -0.02, 0.01, 1e-3, -7e-4)
+            )
+        ),
+        _camera("cameras.bin"),
+    ),
     "camera-agisoft": Reader(text(a__xml=cameras.AGISOFT), _camera("a.xml")),
     "camera-colmap": Reader(text(cameras__txt=cameras.COLMAP), _camera("cameras.txt", camera="5")),
     "camera-smac": Reader(text(a__txt=cameras.SMAC), _camera("a.txt")),
@@ -180,6 +245,7 @@ def spoilt(reader: str, seed: int) -> Files:
 
 def tried(reader: str, seed: int, folder: Path) -> list[Finding]:
     """Spoil the files of a reader, read them, and say what it did that it must not do."""
+    shutil.rmtree(folder, ignore_errors=True)
     for name, content in spoilt(reader, seed).items():
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)

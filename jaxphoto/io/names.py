@@ -9,12 +9,13 @@ import re
 
 LONGEST = 256
 """Characters of a name."""
-_UNSEEN = "\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff"
-_CONTROL = re.compile(f"[{_UNSEEN}]")
+# Without the end of a line.
+_UNSEEN = "\x00-\x09\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff"
+_CONTROL = re.compile(f"[\n{_UNSEEN}]")
 # A signed word or number (-1, +5a) is what it looks like.
 _FORMULA = re.compile(r"\s*(?:[=@]|[-+](?![\w.]*$))")
 # What may be any of these, in names joined by line ends.
-_SUSPECT = re.compile(f"^\\s*[=@+-]|[{_UNSEEN.replace(chr(10), '')}]|.{{{LONGEST + 1}}}", re.MULTILINE)
+_SUSPECT = re.compile(f"^\\s*[=@+-]|[{_UNSEEN}]|.{{{LONGEST + 1}}}", re.MULTILINE)
 
 
 def harm_in(name: str) -> str:

@@ -60,12 +60,12 @@ def posterior_figure(posterior: Posterior) -> Figure:
     laplace = posterior.laplace * np.outer(factor, factor)
     for j, axes in enumerate(places[:k]):
         _marginal(axes, draws[:, j], optimum[j], np.sqrt(laplace[j, j]))
-        axes.set_xlabel(names[j], fontsize=8)
+        axes.set_xlabel(drawn(names[j]), fontsize=8)
     if k > 1:
         pair = list(np.unravel_index(np.argmax(posterior.outside), posterior.outside.shape))
         _pair(places[k], draws[:, pair], optimum[pair], laplace[np.ix_(pair, pair)])
-        places[k].set_xlabel(names[pair[0]], fontsize=8)
-        places[k].set_ylabel(names[pair[1]], fontsize=8)
+        places[k].set_xlabel(drawn(names[pair[0]]), fontsize=8)
+        places[k].set_ylabel(drawn(names[pair[1]]), fontsize=8)
         places[k].set_title(f"{100 * posterior.outside[tuple(pair)]:.0f} % outside, not 5 %", fontsize=8)
     for axes in places:
         axes.tick_params(labelsize=7)
@@ -81,7 +81,7 @@ def _names(posterior: Posterior) -> tuple[list[str], np.ndarray]:
         last = parameter.rsplit(".", 1)[-1]
         if last in _ANGLES:
             factor[j] = np.rad2deg(1.0)
-        names.append(drawn(parameter) + ("_deg" if last in _ANGLES else "_m" if last in ("X", "Y", "Z") else ""))
+        names.append(parameter + ("_deg" if last in _ANGLES else "_m" if last in ("X", "Y", "Z") else ""))
     return names, factor
 
 

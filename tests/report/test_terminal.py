@@ -1,0 +1,72 @@
+"""Names of files are text on the terminal and in pictures, whatever they look like."""
+
+import dataclasses
+import io
+
+import pytest
+from rich.console import Console
+from rich.table import Table
+
+from jaxphoto import Tables
+from jaxphoto.cli.console import plain_console
+from jaxphoto.report import print_adjustment, residuals_figure
+from jaxphoto.report.plots import drawn, new_figure
+from tests.blocks import adjusted
+
+NAMES = ("[/red]", "[bold]x", ":smile:", "$\\frac{1$", "a$b$c", "\\$", "\x1b[31mred", "x_$^{")
+
+
+def printed(console: Console, *things) -> str:
+    console.file = io.StringIO()
+    for thing in things:
+        console.print(thing)
+    return console.file.getvalue()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_console_of_commands_prints_names_as_they_are(name):
+    table = Table(name, title=name)
+    table.add_row(name)
+    said = printed(plain_console(), f"wrote {name}", table)
+    plain = name.replace("\x1b", "\\x1b")
+    assert said.count(plain) == 4 and "\x1b" not in said
+    status = plain_console(stderr=True).status(f"reading {name}")
+    assert status.renderable.text.plain == f"reading {plain}"
+    status.update(f"writing {name}")
+    assert status.renderable.text.plain == f"writing {plain}"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_report_on_any_console_has_the_names(name):
+    tables = Tables(adjusted("cross"))
+    tables.significance = [dataclasses.replace(s, camera=name) for s in tables.significance]
+    block = dataclasses.replace(tables.adjusted.block, title=name)
+    tables.adjusted = dataclasses.replace(tables.adjusted, block=block)
+    console = Console(width=200, file=io.StringIO())
+    print_adjustment(tables, [f"image {name} is far off"], console)
+    said = console.file.getvalue()
+    plain = name.replace("\x1b", "\\x1b")
+    assert said.count(plain) == 2 + len(tables.significance)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_names_in_pictures_are_no_formulas(name):
+    figure = new_figure(2.0, 2.0)
+    axes = figure.subplots()
+    axes.plot([0, 1], [0, 1], label=drawn(name) or "none")
+    axes.set_title(drawn(name))
+    axes.set_xticks([0.5], [drawn(name)])
+    axes.legend()
+    figure.savefig(io.BytesIO(), format="png")
+    shown, formula = axes.title._preprocess_math(axes.title.get_text())
+    assert not formula and shown == name.replace("\x1b", "\\x1b")
+
+
+def test_the_camera_of_residuals_is_no_formula():
+    tables = Tables(adjusted("cross"))
+    block, name = tables.adjusted.block, "$\\frac{1$"
+    block = dataclasses.replace(
+        block, sensors={name: next(iter(block.sensors.values()))}, image_camera=(name,) * len(block.images)
+    )
+    tables.adjusted = dataclasses.replace(tables.adjusted, block=block)
+    residuals_figure(tables, name).savefig(io.BytesIO(), format="png")
