@@ -1,5 +1,6 @@
 """What has no end, or is larger than anything that is measured, is refused soon and in a short sentence."""
 
+import dataclasses
 import os
 import time
 import tomllib
@@ -9,7 +10,7 @@ import pandas as pd
 import pytest
 
 from jaxphoto.errors import InputError, JaxphotoError, quoted, shown
-from jaxphoto.io import read_block, recipe_from
+from jaxphoto.io import read_block, recipe_from, write_block
 from jaxphoto.io.cameras import read_camera_file
 from jaxphoto.io.draws_folder import DrawsFolder
 from jaxphoto.io.json_file import read_json
@@ -171,6 +172,13 @@ def test_names_of_every_language_and_signed_numbers_are_names():
     assert [harm_in(name) for name in good] == [""] * len(good)
     assert harmless([name for name in good if name[:1] not in ("-", "+")])
     assert not harmless(["a", "=b"]) and not harmless(["a\nb"]) and not harmless(["x" * 300]) and not harmless(["\x7f"])
+
+
+def test_names_that_could_not_be_read_again_are_not_written(write_folder, tmp_path):
+    block = read_block(write_folder())
+    for changes in ({"images": ("=a", *block.images[1:])}, {"points": ("\x1b", *block.points[1:])}):
+        refused(lambda changes=changes: write_block(dataclasses.replace(block, **changes), tmp_path / "copy"), "name")
+    assert not (tmp_path / "copy").exists()
 
 
 def test_a_map_frame_needs_no_angle(write_folder):

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from jaxphoto.block import Block
-from jaxphoto.errors import BlockError, InputError
+from jaxphoto.errors import BlockError, InputError, quoted
 from jaxphoto.io.block_folder.camera_section import Camera, camera_section
 from jaxphoto.io.block_folder.declared_unknowns import unknown_sections
 from jaxphoto.io.block_folder.frame_sections import corrections_section, frame_section
@@ -34,6 +34,7 @@ from jaxphoto.io.block_folder.table_layout import (
     XYZ,
 )
 from jaxphoto.io.block_folder.tables import declared_tables, kinds_of, layouts
+from jaxphoto.io.names import harm_in, harmless
 from jaxphoto.io.toml import read_toml
 from jaxphoto.observations import OBSERVATIONS, AbstractCoordinates
 from jaxphoto.unknowns import FIXED, FREE
@@ -60,6 +61,7 @@ def write_block(block: Block, folder: str | Path) -> None:
     """
     folder = Path(folder).absolute()
     check_block_target(folder)
+    _check_names(block)
     settings, tables = _settings(block), _tables(block) | declared_tables(block)
     if block.frame.kind == "epsg":
         tables = tables_to_map(tables, block.frame)
@@ -77,6 +79,20 @@ def write_block(block: Block, folder: str | Path) -> None:
         _replace(folder, made, {TOML, *(f"{name}.csv" for name in layouts((*OBSERVATIONS, *kinds_of(block))))})
     finally:
         shutil.rmtree(made, ignore_errors=True)
+
+
+def _check_names(block: Block) -> None:
+    """Raise BlockError for names that `read_block` would refuse."""
+    for kind, names in (
+        ("image", block.images),
+        ("point", block.points),
+        ("camera", block.sensors),
+        ("strip", block.image_strip),
+    ):
+        distinct = list(dict.fromkeys(names))
+        for name in [] if harmless(distinct) else distinct:
+            if harm := harm_in(name):
+                raise BlockError(f"the {kind} {quoted(name)} {harm}")
 
 
 def _replace(folder: Path, made: Path, written: set[str]) -> None:
