@@ -27,6 +27,11 @@ class _Leaf:
     """Stands for a leaf of a tree of which only the structure is known."""
 
 
+def is_known(module: str) -> bool:
+    """Whether the key says what a name in `module` means."""
+    return module.split(".")[0] in _KNOWN
+
+
 def describe(value: Any) -> str:
     """The text for arguments, static and not: of arrays their types only. Raises Indescribable."""
     if type(value) in _PLAIN:
@@ -71,6 +76,6 @@ def _array(value: Any) -> str:
 
 def _name(value: type | types.FunctionType) -> str:
     module, name = value.__module__ or "", value.__qualname__
-    if module.split(".")[0] not in _KNOWN or "<" in name:
+    if not is_known(module) or "<" in name:
         raise Indescribable(f"{module}.{name} may mean something else elsewhere")
     return f"{module}.{name}"

@@ -17,14 +17,11 @@ import jax
 
 from jaxphoto.compiling import store
 from jaxphoto.compiling.options import options_here
-
-
-class _Slot:
-    """Stands for an array in the tree of a result."""
+from jaxphoto.compiling.plain_tree import Slot
 
 
 class _Program(NamedTuple):
-    """A compiled function of arrays, and the tree that its results fill: leaves that are `_Slot` are arrays."""
+    """A compiled function of arrays, and the tree that its results fill: leaves that are `Slot` are arrays."""
 
     compiled: jax.stages.Compiled
     leaves: list
@@ -34,7 +31,7 @@ class _Program(NamedTuple):
     def __call__(self, arrays: list) -> Any:
         """The result, ready."""
         found = iter(jax.block_until_ready(self.compiled(*arrays)))
-        leaves = [next(found) if isinstance(leaf, _Slot) else leaf for leaf in self.leaves]
+        leaves = [next(found) if isinstance(leaf, Slot) else leaf for leaf in self.leaves]
         return jax.tree.unflatten(self.structure, leaves)
 
 
@@ -66,8 +63,8 @@ def run_compiled(function: Any, arguments: tuple, seconds: dict[str, float], nam
     ready = time.perf_counter()
     try:
         result = program(arrays)
-    except jax.errors.JaxRuntimeError:
-        # Read whole, but not fit to run after all: that shows in the call only.
+    except Exception:
+        # Read whole, but not fit to run after all: that shows in the call only, and in many ways.
         if not program.loaded:
             raise
         program = _program_of(function.__wrapped__, arguments, thorough, anew=True)()
@@ -160,7 +157,7 @@ def _lowered(function: Any, arguments: tuple) -> tuple[jax.stages.Lowered, Any]:
     def flat(*arrays):
         nonlocal skeleton
         result = function(*eqx.combine(jax.tree.unflatten(structure, arrays), static))
-        skeleton = jax.tree.map(lambda leaf: _Slot() if eqx.is_array(leaf) else leaf, result)
+        skeleton = jax.tree.map(lambda leaf: Slot() if eqx.is_array(leaf) else leaf, result)
         return [leaf for leaf in jax.tree.leaves(result) if eqx.is_array(leaf)]
 
     # A name of its own: what JAX's cache holds of `function` itself must not be taken for it (`_not_in_cache`).

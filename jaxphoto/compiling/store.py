@@ -1,18 +1,17 @@
 """Compiled programs on disk, beside JAX's own cache, to be run by a later process without tracing them again.
 
 JAX's cache holds what XLA compiled, but needs the traced and lowered program to find it; these are half of a start.
-A file's name is a hash of all that a program depends on (`key_of`); its content is a hash of itself, then the pickled
-program. Like JAX's cache it holds code that is run: the folder is to be trusted.
+A file's name is a hash of all that a program depends on (`key_of`); its content is a JSON text and what XLA writes of
+the program, in a folder that only takes what this user wrote (`private_folder`): like JAX's cache it holds code.
 """
 
 import contextlib
 import functools
 import hashlib
+import json
 import os
-import pickle
 import platform
 import sys
-import tempfile
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,15 +21,18 @@ import jaxlib
 import lineax as lx
 import numpy as np
 import optimistix as optx
-from jax.experimental.serialize_executable import deserialize_and_load, serialize
 from jaxlib import lapack
 
+from jaxphoto.compiling import private_folder
 from jaxphoto.compiling.description import Indescribable, describe
+from jaxphoto.compiling.plain_program import PlainProgram, as_plain, program_of
+from jaxphoto.compiling.plain_tree import told, tree_of
 
 # What the folder may hold (bytes): beyond, what was not used for longest goes.
 MOST = 1_000_000_000
 _PACKAGES = (jax, jaxlib, eqx, optx, lx, np)
-_DIGEST = hashlib.sha256().digest_size
+# Of the number of bytes of the text, which comes first.
+_LENGTH = 8
 
 
 class Stored(NamedTuple):
@@ -65,32 +67,20 @@ def key_of(function: Any, arguments: tuple, options: dict | None) -> str | None:
 
 
 def load(key: str) -> Stored | None:
-    """The program kept under `key`; None where there is none, or it cannot be read or does not fit."""
+    """The program kept under `key`; None where there is none that this user kept, or it does not fit."""
     folder = _folder()
-    if folder is None:
-        return None
-    path = folder / key
-    try:
-        content = path.read_bytes()
-        os.utime(path)
-    except OSError:
-        return None
-    if hashlib.sha256(content[_DIGEST:]).digest() != content[:_DIGEST]:
+    content = private_folder.read(folder, key) if folder is not None else None
+    if content is None:
         return None
     # A program finds LAPACK by pointers that JAX sets when it lowers a call of it; here nothing is lowered.
     lapack.prepare_lapack_call("potrf", np.dtype(float))
     try:
-        program, n_arguments, n_results, skeleton, ids = pickle.loads(content[_DIGEST:])
-        by_id = {device.id: device for device in jax.devices()}
-        compiled = deserialize_and_load(
-            program,
-            jax.tree.structure(((0,) * n_arguments, {})),
-            jax.tree.structure([0] * n_results),
-            execution_devices=[by_id[k] for k in ids],
-        )
+        length = int.from_bytes(content[:_LENGTH], "big")
+        text = json.loads(content[_LENGTH : _LENGTH + length])
+        compiled = program_of(PlainProgram(text["program"], content[_LENGTH + length :]))
+        return Stored(compiled, tree_of(text["skeleton"]))
     except Exception:  # Whatever is wrong with a file, the program can be compiled.
         return None
-    return Stored(compiled, skeleton)
 
 
 def save(key: str, program: Stored) -> None:
@@ -99,30 +89,12 @@ def save(key: str, program: Stored) -> None:
     if folder is None:
         return
     try:
-        serialized, arguments, results = serialize(program.compiled)
-        executable: Any = program.compiled.runtime_executable()
-        ids = [device.id for device in executable.local_devices()]
-        content = pickle.dumps((serialized, arguments.num_leaves, results.num_leaves, program.skeleton, ids))
-    except Exception:  # JAX and pickle say in many ways that something cannot be kept.
+        plain = as_plain(program.compiled)
+        text = json.dumps({"program": plain.text, "skeleton": told(program.skeleton)}).encode()
+    except Exception:  # JAX and XLA say in many ways that something cannot be kept.
         return
-    with contextlib.suppress(OSError):
-        folder.mkdir(parents=True, exist_ok=True)
-        # Written whole, then named: another process sees all of it or nothing.
-        with tempfile.NamedTemporaryFile(dir=folder, delete=False) as file:
-            file.write(hashlib.sha256(content).digest() + content)
-        Path(file.name).replace(folder / key)
-        _limit(folder)
-
-
-def _limit(folder: Path) -> None:
-    """Delete what was not used for longest until the rest is below `MOST`."""
-    files = sorted(((path, path.stat()) for path in folder.iterdir()), key=lambda f: f[1].st_mtime)
-    size = sum(stat.st_size for _, stat in files)
-    for path, stat in files:
-        if size <= MOST:
-            break
-        path.unlink(missing_ok=True)
-        size -= stat.st_size
+    private_folder.write(folder, key, len(text).to_bytes(_LENGTH, "big") + text + plain.executable)
+    private_folder.limit(folder, MOST)
 
 
 def _folder() -> Path | None:

@@ -1,0 +1,110 @@
+"""A folder of files that this user wrote, as this process or another one of theirs wrote them, under these names.
+
+What is read from it is run, so nobody else may have put it there: the folder and its files belong to the user, nobody
+else may write to them, and every file begins with a keyed hash (HMAC-SHA256) of its name and content, by a secret that
+only the user can read. A file of another machine, one put under another name, or damaged, is as good as none.
+"""
+
+import contextlib
+import hashlib
+import hmac
+import os
+import re
+import secrets
+import stat
+import tempfile
+import time
+from pathlib import Path
+
+_SECRET = "secret"
+_DIGEST = hashlib.sha256().digest_size
+# Names are hashes; anything else was left by a process that was killed while it wrote (seconds).
+_NAME, _LEFT = re.compile("[0-9a-f]{64}"), 3600.0
+
+
+def read(folder: Path, name: str) -> bytes | None:
+    """The content of a file; None where there is none that can be trusted, whole, of that name. Marks it as used."""
+    try:
+        _make_private(folder)
+        content = _own_content(folder / name)
+        secret = _own_content(folder / _SECRET)
+        os.utime(folder / name)
+    except OSError:
+        return None
+    if len(secret) != _DIGEST or not hmac.compare_digest(_hash(secret, name, content[_DIGEST:]), content[:_DIGEST]):
+        return None
+    return content[_DIGEST:]
+
+
+def write(folder: Path, name: str, content: bytes) -> None:
+    """Write a file whole, or not at all where it cannot be written, and nobody notices."""
+    with contextlib.suppress(OSError):
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        _make_private(folder)
+        _write(folder / name, _hash(_secret(folder), name, content) + content)
+
+
+def limit(folder: Path, most: float) -> None:
+    """Delete what was not used for longest until the rest is below `most` bytes, and what was never finished."""
+    with contextlib.suppress(OSError):
+        files = sorted(
+            ((path, path.stat()) for path in folder.iterdir() if path.name != _SECRET), key=lambda f: f[1].st_mtime
+        )
+        size = sum(found.st_size for _, found in files)
+        for path, found in files:
+            unfinished = not _NAME.fullmatch(path.name) and time.time() - found.st_mtime > _LEFT
+            if size > most or unfinished:
+                path.unlink(missing_ok=True)
+                size -= found.st_size
+
+
+def _secret(folder: Path) -> bytes:
+    """The secret of this folder, made where there is none."""
+    path = folder / _SECRET
+    with contextlib.suppress(OSError):
+        if len(known := _own_content(path)) == _DIGEST:
+            return known
+    # Of two who make one at once, the later wins; what the other has hashed is written anew.
+    _write(path, secrets.token_bytes(_DIGEST))
+    return _own_content(path)
+
+
+def _hash(secret: bytes, name: str, content: bytes) -> bytes:
+    return hmac.digest(secret, name.encode() + b"\n" + content, "sha256")
+
+
+def _make_private(folder: Path) -> None:
+    """Raise PermissionError where the folder is another user's; keep others out where it is this one's."""
+    found = folder.stat()
+    if hasattr(os, "getuid") and found.st_uid != os.getuid():
+        raise PermissionError(folder)
+    if os.name == "posix" and found.st_mode & 0o077:
+        folder.chmod(0o700)
+
+
+def _own_content(path: Path) -> bytes:
+    """Raises OSError where there is no such file, or somebody else can write to it."""
+    with open(path, "rb", opener=_opened_itself) as file:
+        found = os.fstat(file.fileno())
+        if not stat.S_ISREG(found.st_mode):
+            raise PermissionError(path)
+        if hasattr(os, "getuid") and (found.st_uid != os.getuid() or found.st_mode & 0o022):
+            raise PermissionError(path)
+        return file.read()
+
+
+def _opened_itself(path: str, flags: int) -> int:
+    """Not what a link leads to; and without waiting for the other end of a pipe."""
+    return os.open(path, flags | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0))
+
+
+def _write(path: Path, content: bytes) -> None:
+    # Written whole, then named: another process sees all of it or nothing. It is for this user only.
+    opened, beside = tempfile.mkstemp(dir=path.parent)
+    try:
+        with open(opened, "wb") as file:
+            file.write(content)
+        os.replace(beside, path)
+    except OSError:
+        Path(beside).unlink(missing_ok=True)
+        raise
