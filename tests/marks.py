@@ -64,5 +64,6 @@ QUICK = {
         "statistics/test_significance.py",
     ),
     "unknowns": ("io/test_surfaces.py",),
+    "writing": ("test_writing.py",),
     "variants": ("test_variants.py::test_control_only_keeps_the_points_named",),
 }

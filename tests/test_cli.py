@@ -12,11 +12,12 @@ import pytest
 import jaxphoto
 from jaxphoto.errors import InputError
 from jaxphoto.io import write_block
-from jaxphoto.report import check_target
+from jaxphoto.writing import MARKER, check_folder
 from tests.blocks import simulated
 from tests.commands import run
 
 FILES = {
+    MARKER,
     "summary.json",
     "interior.csv",
     "exterior.csv",
@@ -113,11 +114,18 @@ def test_results_replace_earlier_results_and_nothing_else(results, folder, monke
     assert code == 2
     assert "thesis" in error
     assert (other / "chapter.txt").read_text() == "years of work"
-    stale = results[0] / "stale.csv"
-    stale.write_text("")
+    (results[0] / "notes.txt").write_text("mine")
     code, _, _ = run(monkeypatch, capsys, "adjust", folder, "--out", results[0])
     assert code == 0
-    assert {p.name for p in results[0].iterdir()} == FILES
+    assert {p.name for p in results[0].iterdir()} == FILES | {"notes.txt"}
+    assert (results[0] / "notes.txt").read_text() == "mine"
+    foreign = tmp_path / "foreign"
+    foreign.mkdir()
+    (foreign / "summary.json").write_text("{}")
+    code, _, error = run(monkeypatch, capsys, "adjust", folder, "--out", foreign)
+    assert code == 2
+    assert "foreign is not empty" in error
+    assert [p.name for p in foreign.iterdir()] == ["summary.json"]
 
 
 def test_not_converged_is_written_and_exit_code_one(folder, monkeypatch, capsys, tmp_path):
@@ -213,5 +221,4 @@ def test_results_never_take_the_place_of_what_they_are_made_of(tmp_path):
     (results / "summary.json").write_text("{}")
     for given in (results, results / "block", results / "interior.csv"):
         with pytest.raises(InputError, match="would be lost"):
-            check_target(results, tmp_path / "another", given)
-    check_target(results, tmp_path / "block")
+            check_folder(results, tmp_path / "another", given)

@@ -17,9 +17,7 @@ from jaxphoto.report import (
     Level,
     Tables,
     Verdict,
-    check_target,
     left_out_table,
-    made_whole,
     prepare_pictures,
     print_adjustment,
     snooped_findings,
@@ -27,6 +25,7 @@ from jaxphoto.report import (
     write_results,
 )
 from jaxphoto.statistics import EOP_NAMES
+from jaxphoto.writing import check_folder, whole_folder
 
 
 @app.command("adjust")
@@ -47,7 +46,7 @@ def adjust_command(
     """Adjust a block and write tables, statistics and a report. Exit code 1: written, but the verdict is red."""
     if rotations not in EOP_NAMES:
         raise JaxphotoError(f"--rotations {rotations}: there are {', '.join(EOP_NAMES)}")
-    check_target(out, block)
+    check_folder(out, block)
     Thread(target=prepare_pictures, daemon=True).start()
     console, errors = plain_console(), plain_console(stderr=True)
     began = time.perf_counter()
@@ -70,7 +69,7 @@ def adjust_command(
         status.update(f"writing {out}")
         times = adjusted.seconds | seconds
         order = ("read", "compile", "solve", "covariance")
-        with made_whole(out) as work:
+        with whole_folder(out) as work:
             write_results(tables, verdict, work, {name: times[name] for name in order})
             if snooped:
                 left_out_table(snooped, read).to_csv(work / "left_out.csv", index=False)

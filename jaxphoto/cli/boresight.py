@@ -11,7 +11,8 @@ from jaxphoto.cli.app import app
 from jaxphoto.cli.console import plain_console
 from jaxphoto.io import read_block
 from jaxphoto.procedures import boresight
-from jaxphoto.report import check_target, print_boresight, write_boresight
+from jaxphoto.report import print_boresight, write_boresight
+from jaxphoto.writing import check_folder
 
 
 @app.command("boresight")
@@ -24,7 +25,7 @@ def boresight_command(
     max_steps: Annotated[int, typer.Option(min=1, help="Most iterations of each adjustment.")] = jaxphoto.MAX_STEPS,
 ) -> None:
     """Boresight misalignment in four steps. Exit code 1: written, but a step is not passed or not converged."""
-    check_target(out, block)
+    check_folder(out, block)
     console, errors = plain_console(), plain_console(stderr=True)
     began = time.perf_counter()
     with errors.status("reading the block") as status:

@@ -18,8 +18,9 @@ from jaxphoto.image_measurement.targets import SYNTAX, find_targets, read_board
 from jaxphoto.io import write_block
 from jaxphoto.io.photographs import photographs, sensor_and_interior
 from jaxphoto.procedures.calibration import calibrate, distortion_model, free_parameters
-from jaxphoto.report import check_target, prepare_pictures, print_adjustment, verdict_of
+from jaxphoto.report import prepare_pictures, print_adjustment, verdict_of
 from jaxphoto.report.calibration import print_calibration, write_calibration
+from jaxphoto.writing import check_folder
 
 
 @app.command("calibrate")
@@ -42,7 +43,7 @@ def calibrate_command(
     """Calibrate a camera with photographs of a board. Exit code 1: written, but not converged or not settled."""
     if board_sigma_mm is not None and not board_sigma_mm > 0:
         raise InputError(f"--board-sigma-mm {board_sigma_mm:g} is not positive; leave it out for a board that is exact")
-    check_target(out, *images)
+    check_folder(out, *images)
     pattern, taken = read_board(board), photographs(images)
     start = sensor_and_interior(taken, pixel_mm, c_mm)
     wanted = None if free is None else [name.strip() for name in free.split(",") if name.strip()]

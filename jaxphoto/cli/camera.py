@@ -10,6 +10,7 @@ from jaxphoto.cli.app import app
 from jaxphoto.cli.console import plain_console
 from jaxphoto.errors import InputError
 from jaxphoto.io.cameras import CAMERA_FORMATS, read_camera_file, write_camera_file
+from jaxphoto.writing import check_file
 
 
 @app.command("camera")
@@ -30,8 +31,7 @@ def camera_command(
     ] = None,
 ) -> None:
     """Convert a camera file: exactly where the models allow it, otherwise fitted, the residual stated in pixels."""
-    if out.exists():
-        raise InputError(f"{out} exists already: name a new file")
+    check_file(out, source)
     known = AbstractDistortion.known()
     if distortion is not None and distortion not in known:
         raise InputError(f"--distortion {distortion}: there are {', '.join(known)}")

@@ -28,7 +28,7 @@ def convert_command(
     if to not in _TARGETS:
         raise InputError(f"--to {to}: there are {', '.join(_TARGETS)}")
     if to == "block":
-        check_block_target(out)
+        check_block_target(out, source)
         convert(source, out, source_format)
     else:
         check_model_target(out, source)

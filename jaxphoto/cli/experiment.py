@@ -9,13 +9,13 @@ from rich.table import Table
 from jaxphoto.cli.app import app
 from jaxphoto.cli.console import plain_console
 from jaxphoto.experiment import (
-    check_run_target,
     compare,
     find_experiments,
     load_experiment,
     run_experiment,
     write_runs,
 )
+from jaxphoto.writing import check_folder
 
 
 @app.command("experiment")
@@ -31,7 +31,7 @@ def experiment_command(
 ) -> None:
     """Run experiments; write tables.csv and report.html, ours beside what the paper prints."""
     chosen = find_experiments(experiments, name)
-    check_run_target(out)
+    check_folder(out, *chosen)
     declared = {folder: load_experiment(folder) for folder in chosen}
     console, errors = plain_console(), plain_console(stderr=True)
     runs = {}

@@ -18,7 +18,7 @@ from jaxphoto.cloud import Cloud
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import Scanner
 from jaxphoto.io import clouds, read_block, write_block
-from jaxphoto.io.block_folder import check_block_target
+from jaxphoto.io.block_folder import check_block_target, whole_block
 from jaxphoto.io.text_tables import is_number
 from jaxphoto.io.trajectory import read_records, write_flight_csv
 from jaxphoto.io.trajectory.in_frame import trajectory_in, with_positions
@@ -29,7 +29,6 @@ from jaxphoto.procedures.lidar import Round, lidar_control, roof_control, simult
 from jaxphoto.procedures.lidar.images_and_cloud import SHIFT_SIGMA, SURFACES
 from jaxphoto.procedures.lidar.until_still import MAX_ROUNDS
 from jaxphoto.procedures.lidar.vertical_control import METHODS, flag_counts
-from jaxphoto.report import check_target
 from jaxphoto.report.lidar import (
     heights_figure,
     heights_table,
@@ -39,6 +38,7 @@ from jaxphoto.report.lidar import (
     write_simultaneous,
 )
 from jaxphoto.unknowns import FIXED, FREE, Weighted
+from jaxphoto.writing import check_folder
 
 # Beyond the outermost points, in m and as a part of the block: as far as approximate points may be off.
 _MARGIN_M, _MARGIN = 100.0, 0.1
@@ -72,7 +72,7 @@ def lidar_control_command(
         raise InputError(f"--method {method} is no method: choose one of {', '.join(METHODS)}")
     settings = _settings(sigma_z_m, sigma_xy_m, sigma_systematic_m)
     chosen, errors = class_numbers(classes), plain_console(stderr=True)
-    check_block_target(out, block)
+    check_block_target(out, block, cloud)
     with errors.status("reading the block") as status:
         read = read_block(block)
         status.update("reading the cloud")
@@ -81,10 +81,10 @@ def lidar_control_command(
         found = lidar_control(read, points, method, settings, max_rounds=max_rounds, report=report)  # type: ignore[arg-type]
         status.update(f"writing {out}")
         heights, rounds, figure = heights_table(found), rounds_table(found.rounds), heights_figure(found)
-        write_block(found.block, out)
-        heights.to_csv(out / "lidar_heights.csv", index=False)
-        rounds.to_csv(out / "lidar_rounds.csv", index=False)
-        figure.savefig(out / "lidar_heights.png")
+        with whole_block(found.block, out) as folder:
+            heights.to_csv(folder / "lidar_heights.csv", index=False)
+            rounds.to_csv(folder / "lidar_rounds.csv", index=False)
+            figure.savefig(folder / "lidar_heights.png")
     console = plain_console()
     print_rounds(found.rounds, found.still, console)
     refused = ", ".join(
@@ -115,7 +115,7 @@ def roof_control_command(
 ) -> None:
     """Hold tie points on the planes of roof faces, and centroids of roofs in X, Y and Z; write the block with it."""
     settings, chosen, errors = _settings(sigma_z_m, sigma_xy_m, 0.0), class_numbers(classes), plain_console(stderr=True)
-    check_block_target(out, block)
+    check_block_target(out, block, cloud)
     with errors.status("reading the block") as status:
         read = read_block(block)
         status.update("reading the cloud")
@@ -127,7 +127,10 @@ def roof_control_command(
         write_block(found.block, out)
     console = plain_console()
     print_rounds(found.rounds, found.still, console)
-    console.print(f"wrote {out}: {len(found.points)} tie points lie on {found.faces} roof faces", soft_wrap=True)
+    console.print(
+        f"wrote {out}: {len(found.points)} tie points lie on {found.faces} roof faces",
+        soft_wrap=True,
+    )
     if not found.still:
         raise typer.Exit(1)
 
@@ -169,7 +172,7 @@ def simultaneous_command(
         raise InputError(f"--boresight {boresight} needs --trajectory, which says from where each point was measured")
     turn = _prior("--boresight", boresight or ("fixed" if trajectory is None else "free"), np.pi / 180)
     slide, chosen, errors = _prior("--shift", shift, 1.0), class_numbers(classes), plain_console(stderr=True)
-    check_target(out, block, cloud)
+    check_folder(out, block, cloud, *([] if trajectory is None else [trajectory]))
     began = time.perf_counter()
     with errors.status("reading the block") as status:
         read = read_block(block)

@@ -10,8 +10,8 @@ from jaxphoto.cli.app import app
 from jaxphoto.cli.console import plain_console
 from jaxphoto.io import read_block
 from jaxphoto.procedures.model_choice import FOLDS, model_choice
-from jaxphoto.report import check_target
 from jaxphoto.report.model_choice import print_model_choice, write_model_choice
+from jaxphoto.writing import check_folder
 
 _MODELS = "brown:none,brown:k1,brown:k1+k2,brown:k1+k2+k3,brown,brown:all"
 
@@ -27,7 +27,7 @@ def models_command(
     seed: Annotated[int, typer.Option(min=0, help="Of the draw of what is left out.")] = 0,
 ) -> None:
     """Compare distortion models by cross-validation, information criteria and significance."""
-    check_target(out, block)
+    check_folder(out, block)
     console, errors = plain_console(), plain_console(stderr=True)
     began = time.perf_counter()
     with errors.status("reading the block") as status:

@@ -14,7 +14,7 @@ from jaxphoto.errors import InputError
 from jaxphoto.image_measurement.matching import MatchedPhotographs, match_photographs
 from jaxphoto.image_measurement.photograph_pairs import photograph_pairs
 from jaxphoto.io import read_block, write_block
-from jaxphoto.io.block_folder import check_block_target
+from jaxphoto.io.block_folder import check_block_target, whole_block
 from jaxphoto.io.block_folder.table_layout import TOML
 from jaxphoto.io.photographs import photographs, sensor_and_interior
 from jaxphoto.procedures.adjust import needs_orientation
@@ -77,8 +77,8 @@ def orient_command(
         )
         found = _with_reasons(found, matched)
         status.update(f"writing {out}")
-        write_block(found.block, out)
-        write_orientation(found, out, n_gross=matched.n_gross, sigma_factor=matched.sigma_factor)
+        with whole_block(found.block, out) as folder:
+            write_orientation(found, folder, n_gross=matched.n_gross, sigma_factor=matched.sigma_factor)
     console.print(
         f"{matched.n_gross} matches by looks left out before: off the epipolar line, or of pairs with too few; the "
         f"others scatter {matched.sigma_factor:.2g} times as much as in views of a plane",

@@ -13,9 +13,9 @@ from jaxphoto.cli.console import plain_console
 from jaxphoto.errors import InputError
 from jaxphoto.io import read_block
 from jaxphoto.procedures import adjust_for_tables
-from jaxphoto.report import check_target
 from jaxphoto.report.sensitivity import SensitivityTables, write_sensitivity
 from jaxphoto.sensitivity.influence import DELTA0
+from jaxphoto.writing import check_folder
 
 _SHOWN = 12
 
@@ -32,7 +32,7 @@ def sensitivity_command(
     """Exact sensitivity of the interior orientation and the check points to stations, and to undetected errors."""
     if bias_m == 0 or not np.isfinite(bias_m):
         raise InputError(f"--bias-m {bias_m:g} is no bias: give its size in metres")
-    check_target(out, block)
+    check_folder(out, block)
     console, errors = plain_console(), plain_console(stderr=True)
     began = time.perf_counter()
     with errors.status("reading the block") as status:

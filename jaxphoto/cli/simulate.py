@@ -8,6 +8,7 @@ import typer
 from jaxphoto.cli.app import app
 from jaxphoto.cli.console import plain_console
 from jaxphoto.io import read_recipe, write_simulation
+from jaxphoto.io.block_folder import check_block_target
 from jaxphoto.io.recipe.scan_files import CLOUD, TRAJECTORY
 from jaxphoto.simulation import simulate
 
@@ -19,6 +20,7 @@ def simulate_command(
     seed: Annotated[int, typer.Option(min=0, help="Another seed draws another flight, other points and noise.")] = 0,
 ) -> None:
     """Simulate a block with known truth."""
+    check_block_target(out, recipe)
     simulation = simulate(read_recipe(recipe), seed)
     write_simulation(simulation, out)
     block, cloud = simulation.block, simulation.cloud

@@ -10,9 +10,10 @@ from jaxphoto.cli.app import app
 from jaxphoto.cli.console import plain_console
 from jaxphoto.errors import InputError
 from jaxphoto.io.cameras import CameraFile, read_camera_file
-from jaxphoto.report import check_target, print_warning
+from jaxphoto.report import print_warning
 from jaxphoto.report.stability import Compared, print_stability, write_stability
 from jaxphoto.stability import METHODS, UNKNOWNS, Method, analyse, image_grid
+from jaxphoto.writing import check_folder
 
 
 @app.command("stability")
@@ -45,7 +46,7 @@ def stability_command(
         raise InputError(f"--relief {relief:g}: give a part of the object's distance, from 0 to less than 1")
     columns, rows = _grid(grid)
     if out is not None:
-        check_target(out, first, second)
+        check_folder(out, first, second)
     names = (camera, camera_b if camera_b is not None else camera)
     both = a, b = [
         read_camera_file(path, camera=name, pixel_mm=pixel_mm, block=block)

@@ -17,6 +17,7 @@ from jaxphoto.io import clouds, raster, read_block
 from jaxphoto.lidar.orthophoto import orthophoto
 from jaxphoto.lidar.raster import filled, hillshade, surface_model
 from jaxphoto.procedures import adjust
+from jaxphoto.writing import check_file
 
 
 @app.command("dsm")
@@ -33,6 +34,9 @@ def dsm_command(
     shading: Annotated[Path | None, typer.Option("--hillshade", help="PNG of the shaded surface to write.")] = None,
 ) -> None:
     """Make a surface model of a cloud."""
+    check_file(out, cloud)
+    if shading is not None:
+        check_file(shading, cloud, out)
     chosen = class_numbers(classes)
     said = {"epsg": cloud_epsg, "unit": cloud_unit}
     with plain_console(stderr=True).status("reading the cloud"):
@@ -67,6 +71,7 @@ def orthophoto_command(
     max_steps: Annotated[int, typer.Option(min=1, help="Most iterations.")] = jaxphoto.MAX_STEPS,
 ) -> None:
     """Adjust a block, and lay the photograph of one of its images over a surface model."""
+    check_file(out, block, photo, dsm)
     with plain_console(stderr=True).status("reading") as status:
         read = read_block(block)
         at = _image(read, image)

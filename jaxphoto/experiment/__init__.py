@@ -2,7 +2,7 @@
 
 from jaxphoto.experiment.comparison import compare, read_published, side_by_side
 from jaxphoto.experiment.declaration import Cells, Experiment, Measure, Results, Variant
-from jaxphoto.experiment.folder import check_run_target, find_experiments, load_experiment, write_runs
+from jaxphoto.experiment.folder import find_experiments, load_experiment, write_runs
 from jaxphoto.experiment.measures import (
     boresight_correlation,
     check_points,
@@ -24,7 +24,7 @@ from jaxphoto.experiment.runner import Run, run_experiment, simulated, summary
 
 __all__ = [
     "Cells", "Experiment", "Measure", "MonteCarlo", "Results", "Run", "Variant", "boresight_correlation",
-    "check_points", "check_run_target", "compare", "comparison_figure", "effects", "find_experiments", "iops",
+    "check_points", "compare", "comparison_figure", "effects", "find_experiments", "iops",
     "load_experiment", "mean_correlations", "misalignment", "misalignment_agreement", "named",
     "orientation_differences", "principal_point", "read_published", "recovered", "residuals", "run_experiment",
     "side_by_side", "simulated", "summary", "tie_point_differences", "write_runs",

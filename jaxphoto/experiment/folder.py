@@ -1,8 +1,6 @@
 """Experiments on disk: found by name, run, and written down whole."""
 
 import importlib.util
-import shutil
-import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -13,6 +11,7 @@ from jaxphoto.experiment.comparison import compare
 from jaxphoto.experiment.declaration import Experiment
 from jaxphoto.experiment.page import experiment_page, index_page
 from jaxphoto.experiment.runner import Run
+from jaxphoto.writing import whole_folder
 
 FILE = "experiment.py"
 
@@ -52,11 +51,8 @@ def load_experiment(folder: Path) -> Experiment:
 def write_runs(runs: Mapping[Path, Run], out: Path) -> None:
     """tables.csv, cells.csv (every layout) and report.html of the `runs` of some experiment folders, in `out`.
 
-    Several experiments have a page each, to which report.html leads. All is made whole and then moved into place.
-    Raises InputError where `out` holds something else than an earlier run.
+    Several experiments have a page each, to which report.html leads. Raises what `whole_folder` raises.
     """
-    check_run_target(out)
-    out.parent.mkdir(parents=True, exist_ok=True)
     tables = {folder: compare(run, folder) for folder, run in runs.items()}
     only = len(runs) == 1
     pages = {
@@ -66,21 +62,8 @@ def write_runs(runs: Mapping[Path, Run], out: Path) -> None:
     if not only:
         pages["report.html"] = index_page({f.name: (run.experiment.title, tables[f]) for f, run in runs.items()})
     cells = [run.cells.assign(experiment=folder.name) for folder, run in runs.items()]
-    with tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as place:
-        made = Path(place) / "run"
-        made.mkdir()
-        pd.concat(tables.values(), ignore_index=True).to_csv(made / "tables.csv", index=False)
-        pd.concat(cells, ignore_index=True).to_csv(made / "cells.csv", index=False)
+    with whole_folder(out) as work:
+        pd.concat(tables.values(), ignore_index=True).to_csv(work / "tables.csv", index=False)
+        pd.concat(cells, ignore_index=True).to_csv(work / "cells.csv", index=False)
         for name, page in pages.items():
-            (made / name).write_text(page, encoding="utf-8")
-        if out.exists():
-            shutil.move(out, Path(place) / "old")
-        made.rename(out)
-
-
-def check_run_target(out: Path) -> None:
-    """Raise InputError where a run must not be written."""
-    if out.is_file():
-        raise InputError(f"{out} is a file: name a folder for the results")
-    if out.is_dir() and any(out.iterdir()) and not (out / "tables.csv").is_file():
-        raise InputError(f"{out} is not empty and holds no earlier run: name a new folder")
+            (work / name).write_text(page, encoding="utf-8")

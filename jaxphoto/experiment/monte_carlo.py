@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from jaxphoto.block import Block
-from jaxphoto.io.draws_folder import DrawsFolder, digest_of, write_whole
+from jaxphoto.io.draws_folder import DrawsFolder, digest_of
 from jaxphoto.io.json_file import read_json
 from jaxphoto.report.draws import (
     Moments,
@@ -27,6 +27,7 @@ from jaxphoto.report.draws import (
 )
 from jaxphoto.report.results import versions
 from jaxphoto.sensitivity import Bias, Readjustment, joined_draws
+from jaxphoto.writing import whole_file
 
 # Draws of a part, which a run that is stopped loses at most; fewer where they are more numbers than this, or more image
 # rows, which take some seconds.
@@ -67,7 +68,14 @@ class MonteCarlo:
         self.computed, self.seconds = 0, 0.0
 
     def draw(self, progress: Callable[[int], object] = lambda done: None) -> None:
-        """Draw what is missing; `progress` is told how many draws there are."""
+        """Draw what is missing; `progress` is told how many draws there are.
+
+        Raises InputError where another process draws into the folder.
+        """
+        with self.folder.alone():
+            self._draw(progress)
+
+    def _draw(self, progress: Callable[[int], object]) -> None:
         folder = self.folder
         if folder.done:
             folder.tidy()
@@ -140,15 +148,19 @@ class MonteCarlo:
             some = folder.read(names[first : first + _AT_ONCE])
             found |= {name: moments(values[good]) for name, values in some.items()}
         table = summary_table(found, nominal, predicted)
-        write_whole(directory / "summary.csv", lambda path: table.to_csv(path, index=False))
+        with whole_file(directory / "summary.csv") as work:
+            table.to_csv(work, index=False)
         if len(effects):
-            effects.to_csv(directory / "effects.csv", index=False)
+            with whole_file(directory / "effects.csv") as work:
+                effects.to_csv(work, index=False)
         shared = [column_of(label) for label in self.run.adjusted.structure.labels]
         if shared:
             pictured = {name: values[good] for name, values in folder.read(shared).items()}
-            draws_figure(pictured, table).savefig(directory / "interior.png")
+            with whole_file(directory / "interior.png") as work:
+                draws_figure(pictured, table).savefig(work)
         if shared and 0 < len(effects) <= _PICTURED:
-            effects_figure(effects, table, shared).savefig(directory / "effects.png")
+            with whole_file(directory / "effects.png") as work:
+                effects_figure(effects, table, shared).savefig(work)
         summary = {
             "title": self.title,
             "draws": len(good),
@@ -160,8 +172,8 @@ class MonteCarlo:
             "draws_per_second": self.computed / self.seconds if self.seconds else 0.0,
             "versions": versions(),
         }
-        text = json.dumps(summary, indent=2) + "\n"
-        write_whole(directory / "summary.json", lambda path: path.write_text(text, encoding="utf-8"))
+        with whole_file(directory / "summary.json") as work:
+            work.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
         return summary, table
 
     def _sigmas(self) -> dict[str, float]:

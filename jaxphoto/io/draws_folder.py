@@ -4,10 +4,10 @@ A part is written whole or not at all, so a run that was stopped at any moment g
 the same file as one that was not.
 """
 
+import contextlib
 import hashlib
 import json
-import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -21,9 +21,9 @@ from jaxphoto.block import Block
 from jaxphoto.errors import InputError
 from jaxphoto.io.json_file import read_json
 from jaxphoto.unknowns import Prior
+from jaxphoto.writing import check_room, clear_leftovers, is_place, locked, whole_file
 
 _RUN, _PARTS, DRAWS = "run.json", "parts", "draws.parquet"
-_HALF = ".tmp"
 
 
 class DrawsFolder:
@@ -40,8 +40,8 @@ class DrawsFolder:
         if run.is_file():
             self._check(_settings_in(run), settings)
         else:
-            directory.mkdir(parents=True, exist_ok=True)
-            write_whole(run, lambda path: path.write_text(json.dumps(settings, indent=2) + "\n", encoding="utf-8"))
+            with whole_file(run) as work:
+                work.write_text(json.dumps(settings, indent=2) + "\n", encoding="utf-8")
         if not self.done:
             (directory / _PARTS).mkdir(exist_ok=True)
 
@@ -75,27 +75,37 @@ class DrawsFolder:
         """Parts of the whole run."""
         return -(-self.draws // self.per_part)
 
+    @contextlib.contextmanager
+    def alone(self) -> Iterator[None]:
+        """Keep other processes from drawing into this folder meanwhile. Raises InputError where one does."""
+        with locked(self.directory / _PARTS) as own:
+            if own is False:
+                raise InputError(f"another run is drawing into {self.directory}: wait for it, or name a new folder")
+            yield
+
     def write_part(self, k: int, table: pd.DataFrame) -> None:
         """Keep the draws of part `k`."""
-        write_whole(self._part(k), lambda path: pq.write_table(_arrow(table), path, write_page_checksum=True))
+        with whole_file(self._part(k)) as work:
+            pq.write_table(_arrow(table), work, write_page_checksum=True)
 
     def join(self) -> None:
         """Bring all parts to one file, part by part."""
         parts = [self._part(k) for k in range(self.n_parts)]
-
-        def write(path: Path) -> None:
-            with pq.ParquetWriter(path, pq.read_schema(parts[0]), write_page_checksum=True) as writer:
-                for part in parts:
-                    with _reading(part):
-                        writer.write_table(pq.read_table(part, page_checksum_verification=True))
-
-        write_whole(self.directory / DRAWS, write)
+        schema = pq.read_schema(parts[0])
+        with (
+            whole_file(self.directory / DRAWS) as work,
+            pq.ParquetWriter(work, schema, write_page_checksum=True) as writer,
+        ):
+            for part in parts:
+                with _reading(part):
+                    writer.write_table(pq.read_table(part, page_checksum_verification=True))
 
     def tidy(self) -> None:
-        """Remove the parts, which the file of all draws holds, and what was left half-written."""
-        for path in (*(self.directory / _PARTS).glob("*"), *self.directory.glob(f"*{_HALF}")):
-            path.unlink()
-        if (self.directory / _PARTS).is_dir():
+        """Remove the parts, which the file of all draws holds; what else somebody put beside them stays."""
+        for k in range(self.n_parts):
+            self._part(k).unlink(missing_ok=True)
+        clear_leftovers(self.directory / _PARTS)
+        with contextlib.suppress(OSError):
             (self.directory / _PARTS).rmdir()
 
     def columns(self) -> list[str]:
@@ -135,9 +145,11 @@ def check_place(directory: Path) -> None:
     for path in (directory, *directory.parents):
         if path.is_file():
             raise InputError(f"{path} is a file: name a folder for the draws")
+    clear_leftovers(directory)
     known = not directory.is_dir() or (directory / _RUN).is_file()
-    if not known and any(not path.name.endswith(_HALF) for path in directory.iterdir()):
+    if not known and any(not is_place(path.name) for path in directory.iterdir()):
         raise InputError(f"{directory} is not empty and holds no Monte Carlo run: name a new folder")
+    check_room(directory / _RUN)
 
 
 def _settings_in(run: Path) -> dict:
@@ -154,16 +166,6 @@ def _reading(file: Path) -> Iterator[None]:
         yield
     except (pa.ArrowException, OSError, KeyError):
         raise InputError(f"{file} is damaged: delete it, and its draws are made anew") from None
-
-
-def write_whole(path: Path, write: Callable[[Path], object]) -> None:
-    """Write a file beside its place, and move it there when it is whole and on the disk."""
-    # A name of its own for each process: none moves what another is writing.
-    beside = path.with_name(f"{path.name}.{os.getpid()}{_HALF}")
-    write(beside)
-    with beside.open("rb") as file:
-        os.fsync(file.fileno())
-    os.replace(beside, path)
 
 
 def _arrow(table: pd.DataFrame) -> pa.Table:

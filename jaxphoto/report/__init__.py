@@ -11,7 +11,7 @@ from jaxphoto.report.plots import (
     prepare_pictures,
     residuals_figure,
 )
-from jaxphoto.report.results import check_target, made_whole, summary_of, write_results
+from jaxphoto.report.results import summary_of, write_results
 from jaxphoto.report.snooped import left_out_table, snooped_findings
 from jaxphoto.report.tables import Tables
 from jaxphoto.report.terminal import print_adjustment, print_warning
@@ -24,11 +24,9 @@ __all__ = [
     "Tables",
     "Verdict",
     "check_points_figure",
-    "check_target",
     "correlation_figure",
     "layout_figure",
     "left_out_table",
-    "made_whole",
     "new_figure",
     "prepare_pictures",
     "print_adjustment",

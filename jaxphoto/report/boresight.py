@@ -11,9 +11,10 @@ from rich.text import Text
 
 from jaxphoto.procedures import Step
 from jaxphoto.report.page import STYLE
-from jaxphoto.report.results import made_whole, versions, write_results, write_summary
+from jaxphoto.report.results import versions, write_results, write_summary
 from jaxphoto.report.tables import Tables
 from jaxphoto.report.verdict import verdict_of
+from jaxphoto.writing import whole_folder
 
 _PAGE = """<!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8"><title>{{ title }}</title><style>{{ style }}</style></head><body>
@@ -82,7 +83,7 @@ def write_boresight(steps: tuple[Step, ...], directory: Path, seconds: dict[str,
     Raises InputError where `directory` holds something that is not an earlier result.
     """
     began = time.perf_counter()
-    with made_whole(directory) as work:
+    with whole_folder(directory) as work:
         for step in steps:
             tables = Tables(step.adjusted)
             verdict, times = verdict_of(tables), step.adjusted.seconds

@@ -18,9 +18,10 @@ from jaxphoto.procedures.calibration import Calibration, Detection, rms_px
 from jaxphoto.report.findings import Finding, Level, Verdict
 from jaxphoto.report.page import STYLE
 from jaxphoto.report.plots import drawn, new_figure
-from jaxphoto.report.results import made_whole, write_results, write_summary
+from jaxphoto.report.results import write_results, write_summary
 from jaxphoto.report.tables import Tables
 from jaxphoto.report.verdict import verdict_of
+from jaxphoto.writing import whole_folder
 
 PICTURES = "photographs"
 _PAGE = """<!DOCTYPE html>
@@ -149,7 +150,7 @@ def write_calibration(
     said = [Finding(Level.INFORMATION, text) for text in (*notes, *findings(calibration))]
     verdict = Verdict.of([*said, *verdict_of(tables).findings])
     times = calibration.adjusted.seconds
-    with made_whole(directory) as work:
+    with whole_folder(directory) as work:
         write_results(tables, verdict, work, seconds | {k: times[k] for k in ("compile", "solve", "covariance")})
         photographs = photographs_table(calibration)
         photographs.to_csv(work / "photographs.csv", index=False)

@@ -17,10 +17,11 @@ from jaxphoto.lidar import HeightFlag
 from jaxphoto.observations import AXES
 from jaxphoto.procedures.lidar import LidarControl, Round, Simultaneous
 from jaxphoto.report.plots import new_figure
-from jaxphoto.report.results import made_whole, summary_of, write_results, write_summary
+from jaxphoto.report.results import summary_of, write_results, write_summary
 from jaxphoto.report.tables import Tables
 from jaxphoto.report.verdict import verdict_of
 from jaxphoto.statistics import angle_differences, correlation_matrix
+from jaxphoto.writing import whole_folder
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -158,7 +159,7 @@ def write_simultaneous(result: Simultaneous, directory: Path, seconds: dict[str,
     holds something that is not an earlier result.
     """
     began = time.perf_counter()
-    with made_whole(directory) as work:
+    with whole_folder(directory) as work:
         tables = Tables(result.adjusted)
         verdict, times = verdict_of(tables), result.adjusted.seconds
         write_results(tables, verdict, work / "adjustment", {name: times[name] for name in _ORDER})

@@ -17,7 +17,8 @@ from rich.table import Table
 from jaxphoto.procedures.model_choice import ModelChoice
 from jaxphoto.report.page import STYLE
 from jaxphoto.report.plots import new_figure
-from jaxphoto.report.results import made_whole, versions, write_summary
+from jaxphoto.report.results import versions, write_summary
+from jaxphoto.writing import whole_folder
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -144,7 +145,7 @@ def write_model_choice(choice: ModelChoice, title: str, directory: Path, seconds
     """
     began = time.perf_counter()
     table, parameters, verdict = choice_table(choice), parameter_table(choice), choice_verdict(choice)
-    with made_whole(directory) as work:
+    with whole_folder(directory) as work:
         table.to_csv(work / "models.csv", index=False)
         parameters.to_csv(work / "parameters.csv", index=False)
         choice_figure(choice).savefig(work / "models.png")

@@ -1,20 +1,16 @@
-"""The result folder of an adjustment: written whole beside its place, then moved into it."""
+"""The result folder of an adjustment, written whole or not at all."""
 
 import json
-import shutil
-import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.camera import model_keys
-from jaxphoto.errors import InputError
 from jaxphoto.report.findings import Verdict
 from jaxphoto.report.page import report_page
 from jaxphoto.report.tables import Tables
+from jaxphoto.writing import whole_folder
 
 _TABLES = (
     "interior",
@@ -30,31 +26,14 @@ _MAP_TABLES = ("exterior_map", "object_points_map")
 _PACKAGES = ("jaxphoto", "jax", "optimistix", "equinox", "lineax", "numpy", "pandas")
 
 
-def check_target(directory: Path, *inputs: Path) -> None:
-    """Raise InputError where results must not or cannot be written: a file, below a file, among something else.
-
-    Nor in place of one of the `inputs`, or of a folder that holds it: they would be gone.
-    """
-    for given in inputs:
-        if directory.resolve() in (given.resolve(), *given.resolve().parents):
-            raise InputError(
-                f"--out {directory} is or holds the input {given}, which would be lost: name another folder"
-            )
-    for path in (directory, *directory.parents):
-        if path.is_file():
-            raise InputError(f"{path} is a file: name a folder for the results")
-    if directory.is_dir() and any(directory.iterdir()) and not (directory / "summary.json").is_file():
-        raise InputError(f"{directory} is not empty and holds no earlier results: name a new folder")
-
-
 def write_results(tables: Tables, verdict: Verdict, directory: Path, seconds: dict[str, float]) -> None:
     """Write the files of docs/block_folder.md into `directory`, replacing earlier results only when all is written.
 
-    `seconds` (read, compile, solve, covariance) goes into summary.json with the time of writing. Raises InputError
-    where `directory` holds something that is not an earlier result.
+    `seconds` (read, compile, solve, covariance) goes into summary.json with the time of writing. Raises what
+    `whole_folder` raises.
     """
     began = time.perf_counter()
-    with made_whole(directory) as work:
+    with whole_folder(directory) as work:
         in_map = tables.adjusted.block.frame.kind == "epsg"
         for name in (*_TABLES, *(_MAP_TABLES if in_map else ())):
             getattr(tables, name).to_csv(work / f"{name}.csv", index=False)
@@ -63,28 +42,8 @@ def write_results(tables: Tables, verdict: Verdict, directory: Path, seconds: di
         write_summary(summary, work)
 
 
-@contextmanager
-def made_whole(directory: Path) -> Iterator[Path]:
-    """A folder to write into, which takes the place of `directory` when all is written, and is removed on an error.
-
-    Raises InputError where `directory` holds something that is not an earlier result.
-    """
-    check_target(directory)
-    directory.parent.mkdir(parents=True, exist_ok=True)
-    work = Path(tempfile.mkdtemp(prefix=f".{directory.name}-", dir=directory.parent))
-    try:
-        work.chmod(0o755)
-        yield work
-        if directory.exists():
-            shutil.rmtree(directory)
-        work.rename(directory)
-    except BaseException:
-        shutil.rmtree(work, ignore_errors=True)
-        raise
-
-
 def write_summary(summary: dict, directory: Path) -> None:
-    """summary.json, by which a folder of results is known."""
+    """summary.json."""
     (directory / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
 
 

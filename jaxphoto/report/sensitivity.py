@@ -13,10 +13,11 @@ import pandas as pd
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.observations import AXES
 from jaxphoto.report.plots import drawn, new_figure
-from jaxphoto.report.results import made_whole, versions, write_summary
+from jaxphoto.report.results import versions, write_summary
 from jaxphoto.report.tables import Tables
 from jaxphoto.sensitivity.exact import Sensitivity, sensitivity
 from jaxphoto.sensitivity.influence import DELTA0, Per, external_reliability, station_bias, variance_shares
+from jaxphoto.writing import whole_folder
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -159,7 +160,7 @@ def write_sensitivity(tables: SensitivityTables, directory: Path, seconds: dict[
     is not an earlier result.
     """
     began = time.perf_counter()
-    with made_whole(directory) as work:
+    with whole_folder(directory) as work:
         tables.bias.to_csv(work / "sensitivity.csv", index=False)
         tables.variance_shares.to_csv(work / "variance_shares.csv", index=False)
         tables.external_reliability.to_csv(work / "external_reliability.csv", index=False)

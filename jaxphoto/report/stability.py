@@ -18,8 +18,9 @@ from rich.table import Table
 from jaxphoto.camera import InteriorOrientation, Sensor
 from jaxphoto.report.page import STYLE
 from jaxphoto.report.plots import new_figure
-from jaxphoto.report.results import made_whole, versions, write_summary
+from jaxphoto.report.results import versions, write_summary
 from jaxphoto.stability import Analysis, Method
+from jaxphoto.writing import whole_folder
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -157,7 +158,7 @@ def write_stability(
     verdict = f"{method}: {chosen.verdict(noise_mm)}"
     figure = io.BytesIO()
     offsets_figure(chosen, sensor).savefig(figure, format="png")
-    with made_whole(directory) as work:
+    with whole_folder(directory) as work:
         table.to_csv(work / "stability.csv", index=False)
         offsets_table(chosen).to_csv(work / "offsets.csv", index=False)
         (work / "offsets.png").write_bytes(figure.getvalue())

@@ -321,7 +321,7 @@ def test_the_command_converts_there_and_back(tmp_path, monkeypatch, capsys):
     assert "camera 5: exact" in said
     same_block(read_source(tmp_path / "back"), read_source(model))
     for out, to, message in (
-        (tmp_path / "block", "colmap", "is the input itself, which would be lost"),
+        (tmp_path / "block", "colmap", "is or holds the input"),
         (tmp_path / "new", "colmop", "--to colmop: there are block, colmap"),
     ):
         code, _, error = run(monkeypatch, capsys, "convert", tmp_path / "block", out, "--to", to)

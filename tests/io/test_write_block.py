@@ -99,25 +99,43 @@ def test_numbers_and_ids_come_back_exactly(write_folder, tmp_path_factory, value
 
 
 def test_an_existing_block_is_replaced_whole(write_folder, tmp_path):
-    folder = write_folder()
+    block, folder = read_block(write_folder()), tmp_path / "copy"
+    write_block(block, folder)
     (folder / "notes.txt").write_text("mine")
-    block = read_block(folder)
     fewer = dataclasses.replace(block, distances=type(block.distances).none())
     write_block(fewer, folder)
     assert not (folder / "distances.csv").exists()
     assert (folder / "notes.txt").read_text() == "mine"
     assert_same(read_block(folder), fewer)
-    assert [path.name for path in tmp_path.iterdir()] == ["block"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["block", "copy"]
+
+
+def test_what_is_not_jaxphotos_is_never_replaced(write_folder, tmp_path):
+    """A block of the user's own, a table that was changed by hand, one that would be read with another block."""
+    own = write_folder()
+    block, before = read_block(own), {path: path.read_bytes() for path in own.iterdir()}
+    with pytest.raises(InputError, match="block is not empty, and nothing in it says"):
+        write_block(block, own)
+    assert {path: path.read_bytes() for path in own.iterdir()} == before
+    write_block(block, tmp_path / "changed")
+    with (tmp_path / "changed" / "stations.csv").open("a") as file:
+        file.write("# measured again\n")
+    with pytest.raises(InputError, match=r"stations\.csv was changed since jaxphoto wrote it"):
+        write_block(block, tmp_path / "changed")
+    write_block(dataclasses.replace(block, distances=type(block.distances).none()), tmp_path / "added")
+    (tmp_path / "added" / "distances.csv").write_bytes((own / "distances.csv").read_bytes())
+    with pytest.raises(InputError, match=r"distances\.csv is not jaxphoto's and would belong to what is written"):
+        write_block(block, tmp_path / "added")
 
 
 def test_another_folder_is_left_alone(write_folder, tmp_path):
     block = read_block(write_folder())
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "1.jpg").write_text("")
-    with pytest.raises(InputError, match=r"photos is not empty and holds no block; empty it"):
+    with pytest.raises(InputError, match=r"photos is not empty, and nothing in it says that jaxphoto wrote it"):
         write_block(block, tmp_path / "photos")
     assert [path.name for path in (tmp_path / "photos").iterdir()] == ["1.jpg"]
-    with pytest.raises(InputError, match=r"1\.jpg is a file; give the name of a folder"):
+    with pytest.raises(InputError, match=r"1\.jpg is a file: name a folder"):
         write_block(block, tmp_path / "photos" / "1.jpg")
 
 

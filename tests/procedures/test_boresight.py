@@ -15,6 +15,7 @@ from jaxphoto.georeferencing import Mount, StripBias
 from jaxphoto.io import write_block
 from jaxphoto.observations import Attitudes, ControlRows, StationRows
 from jaxphoto.procedures import step_block
+from jaxphoto.writing import MARKER
 from tests.blocks import BORESIGHT, BROWN, CONTROL, Simulated, aerial, all_attitudes, all_stations, bare, measured, rows
 from tests.blocks import free as free_interior
 
@@ -252,7 +253,7 @@ def test_the_command_writes_all_four_steps(monkeypatch, capsys, tmp_path):
     write_block(block(), folder)
     code, screen, _ = run(monkeypatch, capsys, folder, "--out", out)
     assert code == 0
-    names = {"steps.csv", "summary.json", "report.html", "step_1", "step_2", "step_3", "step_4"}
+    names = {MARKER, "steps.csv", "summary.json", "report.html", "step_1", "step_2", "step_3", "step_4"}
     assert {p.name for p in out.iterdir()} == names
     assert all((out / f"step_{k}" / "exterior.csv").is_file() for k in (1, 2, 3, 4))
     table = pd.read_csv(out / "steps.csv")

@@ -9,6 +9,7 @@ import pytest
 
 from jaxphoto.io import read_block, write_simulation
 from jaxphoto.io.clouds import read_cloud
+from jaxphoto.writing import MARKER
 from tests.commands import run
 from tests.procedures.lidar import misaligned
 
@@ -50,7 +51,7 @@ def test_simultaneous(folder, tmp_path, monkeypatch, capsys):
     given = ("--trajectory", folder / "trajectory.csv", "--shift", "2", *SIGMAS)
     code, said, _ = run(monkeypatch, capsys, "simultaneous", folder, cloud, "--out", out, *given)
     assert code == 0 and "nothing changes any more" in said
-    names = {"moved.csv", "rounds.csv", "surfaces.csv", "scanner_correlation.csv", "above.png", "summary.json"}
+    names = {MARKER, "moved.csv", "rounds.csv", "surfaces.csv", "scanner_correlation.csv", "above.png", "summary.json"}
     assert names | {"cloud.laz", "trajectory.csv", "adjustment"} == {path.name for path in out.iterdir()}
     moved = pd.read_csv(out / "moved.csv").set_index("what")
     found = moved.loc[moved.index.str.startswith("scanner.boresight")]

@@ -14,6 +14,7 @@ from jaxphoto.observations import ImageRows
 from jaxphoto.procedures.camera_candidates import candidate_of, with_candidate
 from jaxphoto.procedures.cross_validation import folds, measured_discrepancies, without_rows
 from jaxphoto.procedures.model_choice import model_choice
+from jaxphoto.writing import MARKER
 from tests.blocks import VARIANTS, with_priors
 from tests.commands import run
 from tests.formulas import collinearity
@@ -250,7 +251,7 @@ def test_command_writes_the_table_and_says_the_choice(block, perfect, tmp_path, 
     assert rows[1]["smaller"] == "brown:k1"
     assert json.loads((out / "summary.json").read_text())["by_bic"] == "brown:k1+k2"
     assert {p.name for p in out.iterdir()} == {
-        "models.csv", "parameters.csv", "models.png", "report.html", "summary.json",
+        MARKER, "models.csv", "parameters.csv", "models.png", "report.html", "summary.json",
     }  # fmt: skip
     with (out / "parameters.csv").open() as file:
         first = next(csv.DictReader(file))

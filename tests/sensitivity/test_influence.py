@@ -19,6 +19,7 @@ from jaxphoto.report.sensitivity import SensitivityTables
 from jaxphoto.sensitivity.exact import sensitivity
 from jaxphoto.sensitivity.influence import Per, external_reliability, station_bias, variance_shares
 from jaxphoto.statistics import redundancy_numbers
+from jaxphoto.writing import MARKER
 from tests.blocks import adjusted, simulated
 from tests.checked_types import unchecked
 from tests.test_examples import EXAMPLES
@@ -136,7 +137,7 @@ def test_tables_and_command(tmp_path) -> None:
     assert result.exit_code == 0, result.output
     written = {path.name for path in (tmp_path / "s").iterdir()}
     assert written == {
-        "sensitivity.csv", "variance_shares.csv", "external_reliability.csv", "summary.json", "sensitivity.png",
+        MARKER, "sensitivity.csv", "variance_shares.csv", "external_reliability.csv", "summary.json", "sensitivity.png",
     }  # fmt: skip
     bias = pd.read_csv(tmp_path / "s" / "sensitivity.csv")
     np.testing.assert_allclose(bias["exact"] - bias["first_order"], bias["difference"], atol=1e-15)

@@ -1,9 +1,9 @@
-"""`Block` -> a block folder, made whole beside its place and then moved there."""
+"""`Block` -> a block folder, whole or not at all."""
 
 import csv
 import math
-import shutil
-import tempfile
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,14 +12,13 @@ import numpy as np
 import pandas as pd
 
 from jaxphoto.block import Block
-from jaxphoto.errors import BlockError, InputError, quoted
+from jaxphoto.errors import BlockError, quoted
 from jaxphoto.io.block_folder.camera_section import Camera, camera_section
 from jaxphoto.io.block_folder.declared_unknowns import unknown_sections
 from jaxphoto.io.block_folder.frame_sections import corrections_section, frame_section
-from jaxphoto.io.block_folder.joint import JOINT
 from jaxphoto.io.block_folder.map_tables import tables_to_map
 from jaxphoto.io.block_folder.mount_sections import mount_section, mounts_of, strip_section
-from jaxphoto.io.block_folder.section import Section
+from jaxphoto.io.block_folder.observed import Kind
 from jaxphoto.io.block_folder.settings import datum_section, toml_text
 from jaxphoto.io.block_folder.surfaces import scanner_section, surface_table
 from jaxphoto.io.block_folder.table_layout import (
@@ -35,19 +34,14 @@ from jaxphoto.io.block_folder.table_layout import (
 )
 from jaxphoto.io.block_folder.tables import declared_tables, kinds_of, layouts
 from jaxphoto.io.names import harm_in, harmless
-from jaxphoto.io.toml import read_toml
 from jaxphoto.observations import OBSERVATIONS, AbstractCoordinates
 from jaxphoto.unknowns import FIXED, FREE
+from jaxphoto.writing import Clashes, check_folder, whole_folder
 
 
 def check_block_target(folder: Path, *inputs: Path) -> None:
-    """Raise InputError where no block can be written: a file, among something else, in place of one of the `inputs`."""
-    if folder.resolve() in [given.resolve() for given in inputs]:
-        raise InputError(f"--out {folder} is the input itself, which would be lost: name another folder")
-    if folder.exists() and not folder.is_dir():
-        raise InputError(f"{folder} is a file; give the name of a folder")
-    if folder.is_dir() and any(folder.iterdir()) and not (folder / TOML).is_file():
-        raise InputError(f"{folder} is not empty and holds no block; empty it or give another folder")
+    """Raise InputError where no block can be written (`check_folder`), or a table lies that would be read with it."""
+    check_folder(folder, *inputs, clashes=_tables_of(OBSERVATIONS))
 
 
 def write_block(block: Block, folder: str | Path) -> None:
@@ -55,30 +49,23 @@ def write_block(block: Block, folder: str | Path) -> None:
 
     Angles are written in degrees and come back to rounding, as do coordinates of a frame of kind epsg, which are
     written in its system (1e-6 m). Velocities are written for images with a station, rates for those with an attitude.
-    A block folder of that name is replaced.
+    A block that jaxphoto wrote there is replaced; what else lies in the folder stays (`whole_folder`).
 
-    Raises InputError where `folder` holds anything else, BlockError for priors that block.toml cannot express.
+    Raises InputError where `folder` holds a block or anything else that jaxphoto did not write, or that was changed
+    since, BlockError for priors that block.toml cannot express.
     """
-    folder = Path(folder).absolute()
-    check_block_target(folder)
+    with whole_block(block, folder):
+        pass
+
+
+@contextmanager
+def whole_block(block: Block, folder: str | Path) -> Iterator[Path]:
+    """`write_block`, and what else belongs there: a folder with the files of the block, to write more into."""
     _check_names(block)
-    settings, tables = _settings(block), _tables(block) | declared_tables(block)
-    if block.frame.kind == "epsg":
-        tables = tables_to_map(tables, block.frame)
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    made = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
-    try:
-        (made / TOML).write_text(toml_text(settings), encoding="utf-8")
-        for name, frame in tables.items():
-            if len(frame) or (name in LAYOUTS and LAYOUTS[name].needed):
-                # A first id that starts with # is quoted, or its line would be a comment.
-                comment = frame.iloc[:, 0].astype(str).str.startswith("#").any()
-                quoting: Literal[0, 2] = csv.QUOTE_NONNUMERIC if comment else csv.QUOTE_MINIMAL
-                frame.to_csv(made / f"{name}.csv", index=False, quoting=quoting)
-        made.chmod(0o755)
-        _replace(folder, made, {TOML, *(f"{name}.csv" for name in layouts((*OBSERVATIONS, *kinds_of(block))))})
-    finally:
-        shutil.rmtree(made, ignore_errors=True)
+    clashes = _tables_of((*OBSERVATIONS, *kinds_of(block)))
+    with whole_folder(Path(folder), clashes) as work:
+        _write_files(block, work)
+        yield work
 
 
 def _check_names(block: Block) -> None:
@@ -95,27 +82,18 @@ def _check_names(block: Block) -> None:
                 raise BlockError(f"the {kind} {quoted(name)} {harm}")
 
 
-def _replace(folder: Path, made: Path, written: set[str]) -> None:
-    """Put `made` in the place of `folder`; whatever the old folder holds besides what is `written` moves along."""
-    if not folder.exists():
-        made.rename(folder)
-        return
-    own = _own_tables(folder / TOML) if (folder / TOML).is_file() else []
-    written = written | {f"{start}{name}.csv" for name in own for start in ("", JOINT)}
-    for path in folder.iterdir():
-        if path.name not in written:
-            _copy(path, made / path.name)
-    old = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
-    folder.rename(old / "block")
-    made.rename(folder)
-    shutil.rmtree(old)
-
-
-def _copy(path: Path, to: Path) -> None:
-    if path.is_dir():
-        shutil.copytree(path, to, symlinks=True)
-    else:
-        shutil.copy2(path, to, follow_symlinks=False)
+def _write_files(block: Block, folder: Path) -> None:
+    """The files of `write_block`, into a folder that is being made."""
+    settings, tables = _settings(block), _tables(block) | declared_tables(block)
+    if block.frame.kind == "epsg":
+        tables = tables_to_map(tables, block.frame)
+    (folder / TOML).write_text(toml_text(settings), encoding="utf-8")
+    for name, frame in tables.items():
+        if len(frame) or (name in LAYOUTS and LAYOUTS[name].needed):
+            # A first id that starts with # is quoted, or its line would be a comment.
+            comment = frame.iloc[:, 0].astype(str).str.startswith("#").any()
+            quoting: Literal[0, 2] = csv.QUOTE_NONNUMERIC if comment else csv.QUOTE_MINIMAL
+            frame.to_csv(folder / f"{name}.csv", index=False, quoting=quoting)
 
 
 def _settings(block: Block) -> dict[str, Any]:
@@ -151,12 +129,9 @@ def _settings(block: Block) -> dict[str, Any]:
     }
 
 
-def _own_tables(path: Path) -> list[str]:
-    """The tables of an older block that only a class of somebody's own reads."""
-    try:
-        return list(Section(TOML, "", read_toml(path)).texts("observations"))
-    except InputError:
-        return []
+def _tables_of(kinds: Iterable[Kind]) -> Clashes:
+    """Whether a file is one that a block folder with these kinds of rows would be read from."""
+    return {TOML, *(f"{name}.csv" for name in layouts(kinds))}.__contains__
 
 
 def _mode_section(block: Block) -> dict[str, str]:

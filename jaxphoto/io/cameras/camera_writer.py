@@ -14,7 +14,7 @@ from jaxphoto.io.cameras.colmap import write_colmap
 from jaxphoto.io.cameras.open_cv import write_open_cv
 from jaxphoto.io.cameras.own_cameras import write_block_camera
 from jaxphoto.io.cameras.smac_report import write_smac_report
-from jaxphoto.io.whole_file import whole_file
+from jaxphoto.writing import whole_file
 
 
 class _WriteFormat(NamedTuple):

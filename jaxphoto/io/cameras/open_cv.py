@@ -64,20 +64,23 @@ def read_open_cv(source: CameraSource) -> CameraFile:
 
 
 def write_open_cv(path: Path, name: str, sensor: Sensor, interior: InteriorOrientation) -> None:
-    """Write a camera that is a `PLANE` or `FISHEYE`; the suffix of `path` says in which of the three ways."""
+    """Write a camera that is a `PLANE` or `FISHEYE`; the suffix of `path` says in which of the three ways.
+
+    Raises OSError where it cannot be written, of which OpenCV itself would say nothing.
+    """
     fx, fy, column, row = from_centre_px(interior, sensor)
     d = interior.distortion
     fisheye = isinstance(d, OpenCvFisheye)
     values = [float(getattr(d, k)) for k in (_FISHEYE_ORDER if fisheye else _ORDER)]
     coefficients = np.array(values if any(values[5:]) else values[:5])
-    storage = cv2.FileStorage(str(path), cv2.FileStorage_WRITE)
+    storage = cv2.FileStorage(path.name, cv2.FileStorage_WRITE | cv2.FileStorage_MEMORY)
     storage.write("image_width", sensor.width_px)
     storage.write("image_height", sensor.height_px)
     if fisheye:
         storage.write("fisheye_model", 1)
     storage.write("camera_matrix", np.array([[fx, 0.0, column - 0.5], [0.0, fy, row - 0.5], [0.0, 0.0, 1.0]]))
     storage.write("distortion_coefficients", coefficients[:, None])
-    storage.release()
+    path.write_text(storage.releaseAndGetString(), encoding="utf-8")
 
 
 def _is_deep(text: str) -> bool:

@@ -1,8 +1,12 @@
 """Writing clouds: LAS, LAZ, CSV and PLY, whole or not at all."""
 
+import errno
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import laspy
+import lazrs
 import numpy as np
 import pandas as pd
 from pyproj import CRS
@@ -15,7 +19,7 @@ from jaxphoto.io.clouds.cloud_source import CHUNK, check_file
 from jaxphoto.io.clouds.las import opened, raw_chunks
 from jaxphoto.io.clouds.placement import Placement
 from jaxphoto.io.clouds.table import RETURNS, XYZ
-from jaxphoto.io.whole_file import whole_file
+from jaxphoto.writing import whole_file
 
 # A millimetre holds what a scanner measures, and leaves 4,000 km of room.
 _SCALE_M, _SCALE_DEG = 1e-3, 1e-8
@@ -38,7 +42,8 @@ def write_cloud(
     system of `frame` where that is of kind epsg, or as it stands, in metres; LAS 1.4 to the millimetre, CSV and PLY in
     double precision.
 
-    Raises InputError where `like` has another number of points, and for names that are no cloud's.
+    Raises OSError where it cannot be written whole, InputError where `like` has another number of points, and for names
+    that are no cloud's.
     """
     path = Path(path)
     kind = path.suffix.lower()
@@ -50,17 +55,26 @@ def write_cloud(
             raise InputError(f"{path.name} cannot be written like {Path(like).name}: both must be .las or .laz")
         source = open_source(like, epsg, unit)
         placement = Placement(source.name, source.system, frame)
-        with whole_file(path) as work:
+        with _said_of(path), whole_file(path) as work:
             _write_like(cloud, work, Path(like), placement)
         return
     in_map = frame is not None and frame.kind == "epsg"
-    with whole_file(path) as work:
+    with _said_of(path), whole_file(path) as work:
         if kind in _LAS:
             _write_las(cloud, work, frame if in_map else None)
         elif kind == ".csv":
             _write_csv(cloud, work, frame if in_map else None)
         else:
             _write_ply(cloud, work, frame if in_map else None)
+
+
+@contextmanager
+def _said_of(path: Path) -> Iterator[None]:
+    """Have what the LAZ encoder meets, a full disk for one, be the OSError of `path` that it is elsewhere."""
+    try:
+        yield
+    except lazrs.LazrsError as error:
+        raise OSError(errno.EIO, f"the file cannot be written whole ({error})", str(path)) from error
 
 
 def _parts(cloud: Cloud, frame: Frame | None):

@@ -19,9 +19,9 @@ from jaxphoto.errors import InputError
 from jaxphoto.io.cameras.colmap import FISHEYE, PLANE, cameras_text, colmap_camera
 from jaxphoto.io.colmap.model import FILES
 from jaxphoto.io.colmap.model_reader import CAMERA_TURN
-from jaxphoto.io.whole_file import whole_file
 from jaxphoto.procedures.adjust import start_of
 from jaxphoto.unknowns import Unknowns
+from jaxphoto.writing import check_folder, whole_folder
 
 _IMAGES = "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n# POINTS2D[] as (X, Y, POINT3D_ID)\n"
 _POINTS = "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n"
@@ -34,8 +34,8 @@ def write_colmap_model(block: Block, folder: str | Path, unknowns: Unknowns | No
     adjustment; in its own Cartesian frame. An image has its id as name; ids of cameras and points that are numbers
     stay, others are counted from 1. Warns (UserWarning) of refraction and earth curvature, which COLMAP does not know.
 
-    Raises InputError where `folder` holds something else than such a model and for a camera that cannot be fitted,
-    BlockError where no start values can be found.
+    Raises InputError where `folder` holds something else than such a model that jaxphoto wrote and for a camera that
+    cannot be fitted, BlockError where no start values can be found.
     """
     folder = Path(folder)
     check_model_target(folder)
@@ -46,22 +46,21 @@ def write_colmap_model(block: Block, folder: str | Path, unknowns: Unknowns | No
     camera_ids, point_ids = _ids(tuple(cameras)), np.array(list(_ids(block.points).values()), int)
     written = {camera_ids[k]: colmap_camera(block.sensors[k], c.interior) for k, c in cameras.items()}
     images, tracks = _images_text(block, values, point_ids, camera_ids)
-    # All three are made before the first takes its place.
     texts = (cameras_text(written), images, _points_text(still(values.points), point_ids, tracks))
-    for name, text in zip(FILES, texts, strict=True):
-        with whole_file(folder / f"{name}.txt") as work:
-            work.write_text(text, encoding="utf-8")
+    with whole_folder(folder, _all_clash) as work:
+        for name, text in zip(FILES, texts, strict=True):
+            (work / f"{name}.txt").write_text(text, encoding="utf-8")
     return cameras
 
 
 def check_model_target(folder: Path, *inputs: Path) -> None:
-    """Raise InputError where no model can be written: a file, among something else, in place of one of the `inputs`."""
-    if folder.resolve() in [given.resolve() for given in inputs]:
-        raise InputError(f"{folder} is the input itself, which would be lost: name another folder")
-    if folder.exists() and not folder.is_dir():
-        raise InputError(f"{folder} is a file; give the name of a folder")
-    if folder.is_dir() and {path.name for path in folder.iterdir()} - {f"{name}.txt" for name in FILES}:
-        raise InputError(f"{folder} holds something else than {', '.join(FILES)} as .txt; name a new folder")
+    """Raise InputError where no model can be written (`check_folder`), or anything else lies in the folder."""
+    check_folder(folder, *inputs, clashes=_all_clash)
+
+
+def _all_clash(name: str) -> bool:
+    # COLMAP reads what it finds: binary files before text, rigs and frames of another model.
+    return True
 
 
 def _conversions(block: Block, unknowns: Unknowns) -> dict[str, Conversion]:

@@ -9,9 +9,9 @@ from jaxphoto.camera import Sensor
 from jaxphoto.errors import InputError
 from jaxphoto.io.clouds.cloud_source import check_file
 from jaxphoto.io.clouds.coordinate_system import CoordinateSystem
-from jaxphoto.io.raster.opened import opened_raster, quiet
+from jaxphoto.io.raster.opened import opened_raster
 from jaxphoto.io.raster.surface import layout
-from jaxphoto.io.whole_file import whole_file
+from jaxphoto.io.raster.whole_raster import whole_raster
 from jaxphoto.lidar.orthophoto import Picture
 from jaxphoto.lidar.raster import Raster
 
@@ -44,13 +44,7 @@ def write_orthophoto(
     # rasterio has no predictor for floats of all kinds; 2 is that of whole numbers.
     predictor = 2 if picture.pixels.dtype.kind in "iu" else 3
     colours = {"photometric": "RGB"} if bands == 3 else {}
-    with (
-        whole_file(Path(path)) as work,
-        quiet(),
-        rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True),
-        rasterio.open(
-            work, "w", **layout(raster, system), dtype=picture.pixels.dtype, count=bands, predictor=predictor, **colours
-        ) as file,
-    ):
+    kind = {**layout(raster, system), "dtype": picture.pixels.dtype, "count": bands, "predictor": predictor, **colours}
+    with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True), whole_raster(path, **kind) as file:
         file.write(picture.pixels)
         file.write_mask(picture.seen)

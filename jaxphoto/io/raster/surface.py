@@ -10,8 +10,8 @@ from pyproj import CRS
 from jaxphoto.errors import InputError
 from jaxphoto.io.clouds.cloud_source import check_file
 from jaxphoto.io.clouds.coordinate_system import CoordinateSystem, epsg_system, system_of
-from jaxphoto.io.raster.opened import opened_raster, quiet
-from jaxphoto.io.whole_file import whole_file
+from jaxphoto.io.raster.opened import opened_raster
+from jaxphoto.io.raster.whole_raster import whole_raster
 from jaxphoto.lidar.raster import Raster
 
 _NODATA = -9999.0
@@ -24,14 +24,11 @@ def write_dsm(path: str | Path, raster: Raster, system: CoordinateSystem = Coord
     `system` is that of its coordinates; a local frame writes none. Cells without height are nodata (-9999).
     """
     heights = np.where(np.isnan(raster.heights), _NODATA, raster.heights).astype(np.float32)
-    with (
-        whole_file(Path(path)) as work,
-        quiet(),
-        rasterio.open(work, "w", **layout(raster, system), dtype="float32", count=1, nodata=_NODATA, predictor=3) as f,
-    ):
-        f.write(heights, 1)
-        f.units = ("metre",)
-        f.set_band_description(1, "height")
+    kind = {**layout(raster, system), "dtype": "float32", "count": 1, "nodata": _NODATA, "predictor": 3}
+    with whole_raster(path, **kind) as file:
+        file.write(heights, 1)
+        file.units = ("metre",)
+        file.set_band_description(1, "height")
 
 
 def layout(raster: Raster, system: CoordinateSystem) -> dict:
@@ -87,5 +84,5 @@ def write_hillshade(path: str | Path, shade: Float[np.ndarray, "rows columns"]) 
     alpha = np.where(np.isnan(shade), 0, 255).astype(np.uint8)
     rows, columns = shade.shape
     kind = {"driver": "PNG", "height": rows, "width": columns, "count": 2, "dtype": "uint8"}
-    with whole_file(Path(path)) as work, quiet(), rasterio.open(work, "w", **kind) as file:
+    with whole_raster(path, **kind) as file:
         file.write(np.stack([grey, alpha]))

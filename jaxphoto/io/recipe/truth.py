@@ -1,16 +1,14 @@
 """A simulation -> its block folder; beside the block's tables the truth, in the columns of the result tables."""
 
-import shutil
-import tempfile
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
 from jaxphoto.camera import constant_names, get_parameter, parameter_names
-from jaxphoto.io.block_folder import write_block
+from jaxphoto.io.block_folder import whole_block
 from jaxphoto.io.block_folder.table_layout import ANGLES, XYZ
-from jaxphoto.io.recipe.scan_files import CLOUD, TRAJECTORY, scanner_rows, write_scan
+from jaxphoto.io.recipe.scan_files import scanner_rows, write_scan
 from jaxphoto.observations import AXES
 from jaxphoto.simulation import Simulation
 from jaxphoto.simulation.flight import omega_phi_kappa
@@ -22,28 +20,15 @@ _SCANNER = "scanner"
 def write_simulation(simulation: Simulation, folder: str | Path) -> None:
     """Write the block as `write_block` does, with the truth in its sub-folder `truth` (docs/simulation.md).
 
-    Of a lidar there are also `cloud.laz` and `trajectory.csv`. All this is made whole before anything is replaced;
-    cloud and trajectory of an older simulation go. Raises what `write_block` raises.
+    Of a lidar there are also `cloud.laz` and `trajectory.csv`. All of it takes its place in one step, and that of an
+    older simulation goes. Raises what `write_block` raises.
     """
-    folder = Path(folder).absolute()
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{folder.name}-", dir=folder.parent) as place:
-        made = Path(place) / FOLDER
-        made.mkdir()
+    with whole_block(simulation.block, folder) as work:
+        (work / FOLDER).mkdir()
         for name, table in truth_tables(simulation).items():
-            table.to_csv(made / f"{name}.csv", index=False)
+            table.to_csv(work / FOLDER / f"{name}.csv", index=False)
         if simulation.cloud is not None and simulation.trajectory is not None:
-            write_scan(simulation.cloud, simulation.trajectory, Path(place))
-        write_block(simulation.block, folder)
-        scanned_before = (folder / FOLDER / f"{_SCANNER}.csv").exists()
-        if (folder / FOLDER).exists():
-            shutil.move(folder / FOLDER, Path(place) / "old")
-        made.rename(folder / FOLDER)
-        for name in (CLOUD, TRAJECTORY):
-            if simulation.cloud is not None:
-                (Path(place) / name).replace(folder / name)
-            elif scanned_before:
-                (folder / name).unlink(missing_ok=True)
+            write_scan(simulation.cloud, simulation.trajectory, work)
 
 
 def truth_tables(simulation: Simulation) -> dict[str, pd.DataFrame]:
