@@ -7,6 +7,8 @@ import typer
 
 from jaxphoto.cli.app import app
 from jaxphoto.errors import JaxphotoError, printable, shown
+from jaxphoto.writing import discard_all
+from jaxphoto_command import tidy_up, wait_if_ending
 
 __all__ = ["app", "main"]
 
@@ -14,12 +16,15 @@ __all__ = ["app", "main"]
 def main() -> None:
     """Entry point of the command `jaxphoto`."""
     warnings.showwarning = _show_warning
+    tidy_up.append(discard_all)
     try:
         app(standalone_mode=True)
     except JaxphotoError as error:
+        wait_if_ending()
         typer.echo(f"jaxphoto: {error}", err=True)
         sys.exit(2)
     except OSError as error:
+        wait_if_ending()
         where = error.filename if error.filename is not None else "a file"
         typer.echo(
             f"jaxphoto: {printable(str(where))}: {error.strerror or error}; name a place that can be read and written",
