@@ -1,6 +1,7 @@
 """What a reader of one format gives: a cloud file that is open, before its coordinates are placed and filtered."""
 
 import dataclasses
+import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -49,8 +50,10 @@ class StripNumbers:
 
 
 def check_file(path: Path) -> None:
-    """Raise InputError where there is no file at `path`."""
+    """Raise InputError where there is no file at `path` that can be read; a pipe or a device has no end."""
     if path.is_dir():
         raise InputError(f"{path} is a folder; name a file")
     if not path.exists():
         raise InputError(f"there is no file {path}; correct the name")
+    if not (path.is_file() and os.access(path, os.R_OK)):
+        raise InputError(f"{path} is no file that you may read; name another, or have its rights changed")

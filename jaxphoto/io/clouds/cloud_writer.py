@@ -89,7 +89,7 @@ def _write_like(cloud: Cloud, path: Path, like: Path, placement: Placement) -> N
         header = reader.header
         with laspy.open(path, "w", header=header) as writer:
             done = 0
-            for points in raw_chunks(reader, like.name):
+            for points in raw_chunks(reader, like):
                 xyz = placement.file(cloud.xyz[done : done + len(points)])
                 if len(xyz) < len(points):
                     break

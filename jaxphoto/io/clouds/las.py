@@ -6,7 +6,6 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import laspy
-import lazrs
 import numpy as np
 from pyproj import CRS
 from pyproj.exceptions import CRSError
@@ -15,11 +14,12 @@ from jaxphoto.cloud import Cloud
 from jaxphoto.errors import InputError
 from jaxphoto.io.clouds.cloud_source import CHUNK, CloudSource, StripNumbers
 from jaxphoto.io.clouds.coordinate_system import CoordinateSystem, system_of
+from jaxphoto.io.clouds.laz_chunks import unpacker
 
-# How a damaged file shows, in laspy, its backend and NumPy.
-_DAMAGE = (laspy.errors.LaspyException, lazrs.LazrsError, ValueError, OverflowError, struct.error, EOFError)
-# Bytes of the head of a record before and after the points.
-_RECORD, _RECORD_AFTER = 54, 60
+# Bytes of the head of a record before the points; that of one after them ends with its length and a description.
+_RECORD, _RECORD_AFTER = 54, struct.Struct("<20xQ32x")
+# Of points that are read together: a point may be long, by the extra bytes that its format allows.
+_CHUNK_BYTES = 64 << 20
 # Keys of GeoTIFF, and the metres in its codes of lengths.
 _PLANE_UNIT, _HEIGHTS, _HEIGHT_UNIT = 3076, 4096, 4099
 _LENGTHS = {9001: 1.0, 9002: 0.3048, 9003: 1200 / 3937}
@@ -40,6 +40,7 @@ def open_las(path: Path, given: CoordinateSystem | None) -> CloudSource:
         if there < count and not header.are_points_compressed:
             raise _cut_off(path.name, count, there)
         extent = np.stack([header.mins, header.maxs])
+        _check_counting(header, path.name)
     if count == 0:
         raise InputError(f"{path.name} holds no points; name another cloud")
     return CloudSource(path.name, system, count, extent, lambda: _chunks(path))
@@ -47,39 +48,77 @@ def open_las(path: Path, given: CoordinateSystem | None) -> CloudSource:
 
 @contextmanager
 def opened(path: Path) -> Iterator[laspy.LasReader]:
-    """A reader of `path`; whatever shows damage within is an InputError that says so."""
-    try:
+    """A reader of `path`. Raises InputError where what stands before or after the points is damaged."""
+    with _damage(path):
         _check_records(path)
-        with laspy.open(path) as reader:
-            yield reader
-    except InputError:
+        reader = laspy.open(path)
+    with reader:
+        yield reader
+
+
+@contextmanager
+def _damage(path: Path) -> Iterator[None]:
+    """Whatever goes wrong in laspy or its decoder on bytes that are not what they should be, as InputError."""
+    try:
+        yield
+    except (KeyboardInterrupt, SystemExit, GeneratorExit):
         raise
-    except _DAMAGE as error:
+    # They have no errors of their own for most of it, and a panic of the decoder is no Exception.
+    except BaseException as error:
         said = (str(error).strip() or type(error).__name__).splitlines()[0][:80]
         raise InputError(f"{path.name} is cut off or damaged ({said}); copy it anew from its source") from None
 
 
 def _check_records(path: Path) -> None:
-    """Raise LaspyException where a header counts more records than fit in: laspy would look for all of them."""
+    """Raise LaspyException where a header counts more or longer records than fit in: laspy would take room for all."""
+    size = path.stat().st_size
     with path.open("rb") as file:
         header = file.read(375).ljust(375, b"\0")
-    minor, length, begin, n_records = header[25], *struct.unpack_from("<HII", header, 94)
-    if length + _RECORD * n_records > begin:
-        raise laspy.errors.LaspyException("its header counts more records than it has room for")
-    after, n_after = struct.unpack_from("<QI", header, 235)
-    if minor >= 4 and n_after and after + _RECORD_AFTER * n_after > path.stat().st_size:
-        raise laspy.errors.LaspyException("its header counts more records after the points than there are")
+        minor, length, begin, n_records = header[25], *struct.unpack_from("<HII", header, 94)
+        if begin > size:
+            raise laspy.errors.LaspyException("its points begin after its end")
+        if length + _RECORD * n_records > begin:
+            raise laspy.errors.LaspyException("its header counts more records than it has room for")
+        after, n_after = struct.unpack_from("<QI", header, 235)
+        if minor < 4 or not n_after:
+            return
+        if after + _RECORD_AFTER.size * n_after > size:
+            raise laspy.errors.LaspyException("its header counts more records after the points than there are")
+        for _ in range(n_after):
+            file.seek(after)
+            after += _RECORD_AFTER.size + _RECORD_AFTER.unpack(file.read(_RECORD_AFTER.size))[0]
+            if after > size:
+                raise laspy.errors.LaspyException("a record after the points is longer than the file")
 
 
-def raw_chunks(reader: laspy.LasReader, name: str) -> Iterator[laspy.ScaleAwarePointRecord]:
-    """The points of an open file without those withheld. Raises InputError where there are fewer than promised."""
-    read = 0
-    for points in reader.chunk_iterator(CHUNK):
+def _check_counting(header: laspy.LasHeader, name: str) -> None:
+    """Raise InputError where scales, offsets and extent of a header are no numbers that coordinates can have."""
+    for what, values in (
+        ("scale", header.scales), ("offset", header.offsets), ("least", header.mins), ("greatest", header.maxs),
+    ):  # fmt: skip
+        if not np.isfinite(values).all() or (what == "scale" and not (values > 0).all()):
+            said = ", ".join(f"{value:g}" for value in values)
+            raise InputError(
+                f"{name} is damaged: its header gives {said} as {what} X, Y, Z; copy the file anew from its source, or "
+                "have its header mended (lasinfo -repair)"
+            )
+
+
+def raw_chunks(reader: laspy.LasReader, path: Path) -> Iterator[laspy.ScaleAwarePointRecord]:
+    """The points of `path`, open, without those withheld. Raises InputError where they are damaged or too few."""
+    read, promised = 0, reader.header.point_count
+    if reader.header.are_points_compressed:
+        with _damage(path):
+            reader.laz_backend = unpacker(path, reader.header)
+    at_once = min(CHUNK, max(1, _CHUNK_BYTES // reader.header.point_format.size))
+    while read < promised:
+        with _damage(path):
+            points = reader.read_points(at_once)
+            withheld = np.asarray(points.withheld, bool)
+        if not len(points):
+            raise _cut_off(path.name, promised, read)
         read += len(points)
-        withheld = np.asarray(points.withheld, bool)
         yield points[~withheld] if withheld.any() else points
-    if read < reader.header.point_count:
-        raise _cut_off(name, reader.header.point_count, read)
 
 
 def _cut_off(name: str, promised: int, there: int) -> InputError:
@@ -101,7 +140,7 @@ def _chunks(path: Path) -> Iterator[Cloud]:
         # Headers are rounded in their own ways.
         slack = 2 * np.asarray(reader.header.scales) + 1e-6 * (high - low)
         has_time = "gps_time" in reader.header.point_format.dimension_names
-        for points in raw_chunks(reader, path.name):
+        for points in raw_chunks(reader, path):
             xyz = coordinates(points)
             outside = ~((xyz >= low - slack) & (xyz <= high + slack)).all(axis=1)
             if outside.any():
@@ -110,11 +149,18 @@ def _chunks(path: Path) -> Iterator[Cloud]:
                     f"{path.name} is damaged: the point ({at}) lies outside the extent that the header gives; copy the "
                     "file anew from its source, or have its header mended (lasinfo -repair)"
                 )
+            time = np.array(points.gps_time, float) if has_time else None
+            if time is not None and not np.isfinite(time).all():
+                at = ", ".join(f"{value:.2f}" for value in xyz[~np.isfinite(time)][0])
+                raise InputError(
+                    f"{path.name} is damaged: the time of the point ({at}) is no finite number; copy the file anew "
+                    "from its source, or set that time"
+                )
             yield Cloud(
                 xyz,
                 classification=np.array(points.classification, np.uint8),
                 returns=np.stack([points.return_number, points.number_of_returns], axis=1).astype(np.uint8),
-                time=np.array(points.gps_time, float) if has_time else None,
+                time=time,
                 strip=strips.of(np.asarray(points.point_source_id)),
                 strips=strips.names,
             )
