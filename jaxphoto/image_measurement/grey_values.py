@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from jaxphoto.errors import InputError
+from jaxphoto.io.photographs import photographs
 
 _FLAGS = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 
@@ -16,12 +17,12 @@ def read_grey(path: str | Path) -> UInt8[np.ndarray, "rows columns"]:
 
     Colours, palettes and CMYK become grey; transparency is not looked at. Values of more than 8 bits are divided by the
     power of two with which the brightest still fits: what 12 bits of 16 hold keeps its contrast.
-    Raises InputError for a file that is missing, is no picture or is cut off, and for values that are no whole numbers
-    from 0.
+    Raises InputError for a file that is missing, is no picture or is cut off, for one that is far too small for the
+    size it says, and for values that are no whole numbers from 0.
     """
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: there is no such photograph; correct the name")
+    # Pillow's judgement first: OpenCV takes room for whatever a damaged file says.
+    photographs([path])
     try:
         picture = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), _FLAGS)
     except (OSError, cv2.error):  # OpenCV's where the file is empty or the picture too large

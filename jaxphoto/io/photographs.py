@@ -5,16 +5,16 @@ it lies in the file, which is as the sensor saw it: the EXIF orientation flag tu
 """
 
 import math
-import struct
 import warnings
 from collections.abc import Callable, Hashable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from PIL import ExifTags, Image, UnidentifiedImageError
+from PIL import ExifTags, Image
 
 from jaxphoto.camera import InteriorOrientation, Sensor
 from jaxphoto.errors import InputError
+from jaxphoto.io.picture_size import check_pixels
 
 _DIAGONAL_35_MM = math.hypot(36, 24)
 # What lenses there are for it: fields of 154 to half a degree. Some cameras note 1 or 65535 where they do not know.
@@ -25,8 +25,6 @@ _USUAL_C = 1.2
 _NOMINAL_PIXEL_MM = 0.005
 _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _TAG = ExifTags.Base
-# What Pillow raises on bytes that are not what they should be.
-_DAMAGED = (OSError, SyntaxError, ValueError, TypeError, KeyError, IndexError, EOFError, struct.error)
 
 
 class Gps(NamedTuple):
@@ -186,14 +184,21 @@ def _photograph(path: Path) -> Photograph:
         raise InputError(f"{path} is a folder; name its photographs, for example {path}/*.jpg")
     if not path.is_file():
         raise InputError(f"{path}: there is no such photograph; correct the name")
-    # Pillow takes more than 179 million pixels for an attack. Aerial cameras have more, and no pixel is read here.
+    # Pillow takes more than 179 million pixels for an attack. Aerial cameras have more; `check_pixels` looks at them.
     limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
+            # The lengths within a PNG, which OpenCV believes; it cannot be read after that.
             with Image.open(path) as picture:
+                picture.verify()
+            with Image.open(path) as picture:
+                check_pixels(path, *picture.size)
                 return Photograph(path.stem, path, *picture.size, **_exif(picture))
-    except (UnidentifiedImageError, *_DAMAGED) as error:
+    except InputError:
+        raise
+    # On bytes that are not what they should be Pillow raises what its formats do, each in its own way.
+    except Exception as error:
         raise InputError(f"{path}: this is no picture that can be read; give a TIFF, PNG or JPEG") from error
     finally:
         Image.MAX_IMAGE_PIXELS = limit
@@ -204,7 +209,7 @@ def _exif(picture: Image.Image) -> dict[str, Any]:
     try:
         top = picture.getexif()
         taken, gps = top.get_ifd(ExifTags.IFD.Exif), top.get_ifd(ExifTags.IFD.GPSInfo)
-    except _DAMAGED:
+    except Exception:
         return {}
     flag, film = top.get(_TAG.Orientation, 1), _positive(taken.get(_TAG.FocalLengthIn35mmFilm))
     return {

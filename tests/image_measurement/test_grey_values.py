@@ -1,5 +1,9 @@
 """Grey values from files of every kind that a camera or a program writes: the same picture each time."""
 
+import io
+import struct
+import zlib
+
 import cv2
 import numpy as np
 import pytest
@@ -75,3 +79,26 @@ def test_what_is_no_picture_is_one_sentence(kind, tmp_path, capfd):
         read_grey(path)
     assert path.name in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def png(picture=GREY):
+    buffer = io.BytesIO()
+    Image.fromarray(picture).save(buffer, "PNG")
+    return buffer.getvalue()
+
+
+def test_a_small_file_that_says_it_is_large(tmp_path):
+    """900 million pixels, which a file of no content would fill memory with."""
+    path = tmp_path / "a.png"
+    head = b"IHDR" + struct.pack(">II", 30_000, 30_000) + png()[24:29]
+    path.write_bytes(png()[:12] + head + struct.pack(">I", zlib.crc32(head)) + png()[33:])
+    with pytest.raises(InputError, match="30000 x 30000 pixels, which is far more than its"):
+        read_grey(path)
+
+
+def test_lengths_within_a_file_that_are_longer_than_it(tmp_path):
+    """OpenCV would take gigabytes for them."""
+    path = tmp_path / "a.png"
+    path.write_bytes(png()[:33] + b"\x7f" + png()[34:])
+    with pytest.raises(InputError, match="this is no picture that can be read"):
+        read_grey(path)

@@ -161,6 +161,11 @@ def test_rasters_that_are_no_surface_models(tmp_path):
         path.write_bytes(content)
         with pytest.raises(InputError, match=r"d\.tif cannot be read as a raster"):
             raster.read_dsm(path)
+    many = kind | {"height": 40_000, "width": 40_000, "transform": north_up(5, 5, 1, 1)}
+    with rasterio.open(tmp_path / "empty.tif", "w", **many, tiled=True, sparse_ok=True):
+        pass
+    with pytest.raises(InputError, match="40000 x 40000 pixels, which is far more than its"):
+        raster.read_dsm(tmp_path / "empty.tif")
 
 
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.float32])

@@ -9,6 +9,7 @@ from jaxphoto.camera import Sensor
 from jaxphoto.errors import InputError
 from jaxphoto.io.clouds.cloud_source import check_file
 from jaxphoto.io.clouds.coordinate_system import CoordinateSystem
+from jaxphoto.io.picture_size import check_pixels
 from jaxphoto.io.raster.opened import opened_raster
 from jaxphoto.io.raster.surface import layout
 from jaxphoto.io.raster.whole_raster import whole_raster
@@ -30,6 +31,7 @@ def read_photograph(path: str | Path, sensor: Sensor) -> np.ndarray:
                 f"{path.name} has {file.width} x {file.height} pixels, but its camera {sensor.width_px} x "
                 f"{sensor.height_px}; name {'the photograph as it was before it was turned' if turned else 'another'}"
             )
+        check_pixels(path, file.width, file.height, sum(np.dtype(kind).itemsize for kind in file.dtypes))
         return file.read()
 
 

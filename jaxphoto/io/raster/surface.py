@@ -10,12 +10,15 @@ from pyproj import CRS
 from jaxphoto.errors import InputError
 from jaxphoto.io.clouds.cloud_source import check_file
 from jaxphoto.io.clouds.coordinate_system import CoordinateSystem, epsg_system, system_of
+from jaxphoto.io.picture_size import check_pixels
 from jaxphoto.io.raster.opened import opened_raster
 from jaxphoto.io.raster.whole_raster import whole_raster
 from jaxphoto.lidar.raster import Raster
 
 _NODATA = -9999.0
 _TILE = 256
+# In memory, of a cell that is read: its height in double precision besides what the file has.
+_BYTES = 16
 
 
 def write_dsm(path: str | Path, raster: Raster, system: CoordinateSystem = CoordinateSystem()) -> None:  # noqa: B008
@@ -57,6 +60,7 @@ def read_dsm(path: str | Path, epsg: int | None = None) -> tuple[Raster, Coordin
     path = Path(path)
     check_file(path)
     with opened_raster(path) as file:
+        check_pixels(path, file.width, file.height, _BYTES)
         bands = file.read(1, masked=True)
         place, crs = file.transform, file.crs
     if epsg is not None:
