@@ -213,7 +213,8 @@ class MonteCarlo:
 def _told(drawn: Bias) -> str:
     """What is drawn, in a line: how many errors, of what, and a digest of which gets which."""
     where = sorted({path[0] if path[0] != "start" else path[2] for path in drawn.targets})
-    digest = _digest(*drawn.index, *(np.frombuffer(".".join(path).encode(), np.uint8) for path in drawn.targets))
+    paths = (".".join(map(str, path)).encode() for path in drawn.targets)
+    digest = _digest(*drawn.index, *(np.frombuffer(path, np.uint8) for path in paths))
     return f"{len(drawn.names)} of {', '.join(where)}, {digest[:12]}"
 
 

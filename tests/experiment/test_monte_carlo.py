@@ -1,5 +1,6 @@
 """A Monte Carlo on disk: what is promised of its files, and what becomes of a run that is stopped."""
 
+import dataclasses
 import json
 import signal
 import subprocess
@@ -13,11 +14,13 @@ import pytest
 
 from jaxphoto import InputError, bias
 from jaxphoto.experiment import MonteCarlo
+from jaxphoto.experiment.monte_carlo import _told
 from jaxphoto.io import write_block
 from jaxphoto.sensitivity import Readjustment, noise
 from jaxphoto.sensitivity.exact import sensitivity
 from tests.blocks import adjusted, simulated
 from tests.commands import run
+from tests.levelling import HeightDifferences
 from tests.marks import slow_but
 
 NOMINAL = "strips"
@@ -207,6 +210,15 @@ def test_a_block_that_estimates_a_scanner(tmp_path):
     assert np.radians(turn) == pytest.approx(np.asarray(scanner.boresight), rel=1e-9)
     for strip, shift in scanner.shifts.items():
         assert [of[f"scanner.{strip}.shift_{axis}_m"] for axis in "XYZ"] == pytest.approx(np.asarray(shift), rel=1e-9)
+
+
+def test_noise_of_observations_of_further_kinds_is_told(tmp_path):
+    """They are found by their number in `Block.more`."""
+    nominal = adjusted("cross")
+    levelled = HeightDifferences(np.array([0]), np.array([1]), np.zeros(1), np.array([0.01]))
+    drawn = noise(dataclasses.replace(nominal.block, more=(levelled,)))
+    assert ("more", 0, "value") in drawn.targets
+    assert _told(drawn).startswith(f"{len(drawn.names)} of control, image_points, more, stations, ")
 
 
 @pytest.fixture(scope="module")
