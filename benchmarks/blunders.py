@@ -1,0 +1,156 @@
+"""Blunders spoil a block; what `jaxphoto.snoop` finds of them, what it loses, and what that does to the camera.
+
+python benchmarks/blunders.py [--block examples/cross_block] [--draws 20]
+"""
+
+import argparse
+import dataclasses
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from machine import HERE, machine, markdown, sentence, write_results
+
+import jaxphoto
+from jaxphoto import Block, JaxphotoError, covariance, snoop
+from jaxphoto.camera import get_parameter
+
+# Sizes of the blunders in image points, in standard deviations.
+_SIZES = 10.0, 1000.0
+# A camera is as good as without the blunders within so many of its standard deviations.
+_NEAR = 3.0
+
+
+class Spoilt(NamedTuple):
+    """A block with blunders: the rows that are wrong, by group."""
+
+    block: Block
+    wrong: frozenset[tuple[str, int]]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--block", type=Path, default=HERE.parent / "examples" / "cross_block")
+    parser.add_argument("--draws", type=int, default=20, help="blocks of each kind")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--out", type=Path, help="folder for results.jsonl and results.md")
+    arguments = parser.parse_args()
+    block = jaxphoto.read_block(arguments.block)
+    clean = jaxphoto.adjust(block)
+    records: list[dict] = [{"kind": "head", **machine()}]
+    for name, spoil in _cases(block).items():
+        rng = np.random.default_rng(arguments.seed)
+        for k in range(arguments.draws):
+            records.append({"kind": "draw", "case": name, "draw": k, **_tried(spoil(block, rng), clean)})
+        print(_row(name, records), flush=True)
+    titles = ["blunders", "blocks", "left out", "not left out", "sound rows left out", "gone with their point",
+              f"camera within {_NEAR:g} sigma", "worst", "refused", "s a block"]  # fmt: skip
+    command = f"python benchmarks/blunders.py --draws {arguments.draws}"
+    rows = [_row(name, records) for name in _cases(block)]
+    lines = [f"### Blunders in {arguments.block.name}", "", sentence(records[0]), "", f"`{command}`", ""]
+    write_results(arguments.out, "blunders", records, "\n".join([*lines, *markdown(titles, rows)]))
+
+
+def _cases(block: Block) -> dict[str, Callable[[Block, np.random.Generator], Spoilt]]:
+    n = len(block.image_points)
+    points = {"1": 1, "5": 5, "10": 10, "1 %": round(0.01 * n), "5 %": round(0.05 * n), "10 %": round(0.1 * n)}
+    found = {f"{label} of image points": lambda b, rng, k=k: _image_points(b, rng, k) for label, k in points.items()}
+    found["two names of an image exchanged"] = _exchanged
+    found["control off by 1 m"] = lambda b, rng: _coordinate(b, rng, "control_points", 1.0)
+    found["station off by 5 m"] = lambda b, rng: _coordinate(b, rng, "stations", 5.0)
+    found["5 image points and a station"] = lambda b, rng: _both(b, rng)
+    return found
+
+
+def _image_points(block: Block, rng: np.random.Generator, n: int) -> Spoilt:
+    p = block.image_points
+    rows = rng.choice(len(p), n, replace=False)
+    angle, size = rng.uniform(0, 2 * np.pi, n), np.exp(rng.uniform(*np.log(_SIZES), n))
+    xy = np.array(p.xy)
+    xy[rows] += size[:, None] * np.column_stack([np.cos(angle), np.sin(angle)]) * np.asarray(p.sigma)[rows]
+    return Spoilt(_with(block, p.group, xy=xy), frozenset((p.group, k) for k in rows.tolist()))
+
+
+def _exchanged(block: Block, rng: np.random.Generator) -> Spoilt:
+    p = block.image_points
+    pair = rng.choice(np.flatnonzero(p.image == rng.integers(len(block.images))), 2, replace=False)
+    xy = np.array(p.xy)
+    xy[pair] = xy[pair[::-1]]
+    return Spoilt(_with(block, p.group, xy=xy), frozenset((p.group, k) for k in pair.tolist()))
+
+
+def _coordinate(block: Block, rng: np.random.Generator, group: str, size: float) -> Spoilt:
+    rows = block.named_observations[group]
+    value = np.array(rows.observation)
+    row = int(rng.integers(len(value)))
+    value[row] += size * rng.choice([-1, 1])
+    return Spoilt(_with(block, group, value=value), frozenset({(group, row)}))
+
+
+def _both(block: Block, rng: np.random.Generator) -> Spoilt:
+    points = _image_points(block, rng, 5)
+    station = _coordinate(points.block, rng, "stations", 5.0)
+    return Spoilt(station.block, points.wrong | station.wrong)
+
+
+def _with(block: Block, group: str, **fields: np.ndarray) -> Block:
+    rows = block.named_observations[group]
+    return block.with_observations({group: dataclasses.replace(rows, **fields)})
+
+
+def _tried(spoilt: Spoilt, clean: jaxphoto.Adjustment) -> dict:
+    """What became of one spoilt block."""
+    began = time.perf_counter()
+    try:
+        found = snoop(spoilt.block)
+    except JaxphotoError as error:
+        return {"refused": str(error), "seconds": time.perf_counter() - began}
+    block, seconds = spoilt.block, time.perf_counter() - began
+    left = {(s.group, s.row) for s in found.left_out}
+    group = block.image_points.group
+    gone = np.isin(block.image_points.point, [block.points.index(name) for name in found.points])
+    gone_rows = {(group, k) for k in np.flatnonzero(gone).tolist()} - left
+    right = {(group, k) for e in found.exchanged for k in _rows_of(block, e.image, e.points)}
+    missed = spoilt.wrong - left - gone_rows - right
+    return {
+        "wrong": len(spoilt.wrong),
+        "missed": len(missed),
+        "innocent": len(left - spoilt.wrong),
+        "gone": len(gone_rows - spoilt.wrong),
+        "off": _off(found.adjusted, clean),
+        "sigma0": float(found.adjusted.sigma0),
+        "seconds": seconds,
+    }
+
+
+def _rows_of(block: Block, image: str, points: tuple[str, ...]) -> list[int]:
+    p = block.image_points
+    chosen = np.isin(p.point, [block.points.index(name) for name in points]) & (p.image == block.images.index(image))
+    return np.flatnonzero(chosen).tolist()
+
+
+def _off(adjusted: jaxphoto.Adjustment, clean: jaxphoto.Adjustment) -> float:
+    """The largest difference of an interior parameter to that without blunders, over its standard deviation."""
+    largest = 0.0
+    for s in jaxphoto.significance(clean, covariance(clean)):
+        value = float(get_parameter(adjusted.unknowns.interior[s.camera], s.parameter))
+        largest = max(largest, abs(value - s.value) / s.sigma)
+    return largest
+
+
+def _row(name: str, records: list[dict]) -> list[str]:
+    own = [r for r in records if r.get("case") == name]
+    done = [r for r in own if "off" in r]
+    total = lambda key: sum(r[key] for r in done)  # noqa: E731
+    off = [r["off"] for r in done] or [np.nan]
+    return [
+        name, str(len(own)), str(total("wrong") - total("missed")), str(total("missed")), str(total("innocent")),
+        str(total("gone")), f"{sum(v < _NEAR for v in off)} of {len(own)}", f"{max(off):.2f}",
+        str(len(own) - len(done)), f"{np.median([r['seconds'] for r in own]):.2f}",
+    ]  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()
