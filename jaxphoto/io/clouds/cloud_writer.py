@@ -187,4 +187,5 @@ def _write_ply(cloud: Cloud, path: Path, frame: Frame | None) -> None:
                 records[name] = values
             if part.strip is not None:
                 records["point_source_id"] = _source_ids(part)
-            records.tofile(file)
+            # By `write`, which says why where it cannot.
+            file.write(records.tobytes())
