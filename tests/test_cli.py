@@ -1,5 +1,6 @@
 """The command line: files written, exit codes, and one sentence for every mistake."""
 
+import dataclasses
 import json
 import re
 import subprocess
@@ -34,7 +35,18 @@ COLUMNS = {
     "interior": ["camera", "parameter", "value", "sigma", "significant"],
     "exterior": ["image", *EOP, *(f"sigma_{n}" for n in EOP)],
     "object_points": ["point", *XYZ, *(f"sigma_{n}" for n in XYZ), "n_images"],
-    "residuals": ["group", "image", "point", "axis", "residual", "sigma", "unit", "redundancy_number", "w"],
+    "residuals": [
+        "group",
+        "image",
+        "point",
+        "axis",
+        "residual",
+        "sigma",
+        "unit",
+        "redundancy_number",
+        "w",
+        "detectable",
+    ],
     "check_points": ["point", "dX_m", "dY_m", "dZ_m"],
     "correlation": ["parameter_a", "parameter_b", "rho"],
     "correlation_summary": ["camera", "exterior", "interior", "mean_abs_rho", "max_abs_rho"],
@@ -78,6 +90,8 @@ def test_files_say_what_the_adjustment_says(results, folder):
     assert summary["sigma0"] == pytest.approx(float(adjusted.sigma0), rel=1e-9)
     assert summary["redundancy"] == adjusted.redundancy
     assert summary["converged"] is True
+    assert summary["verdict"] == jaxphoto.report.verdict_of(tables).colour != "red"
+    assert [f["text"] for f in summary["findings"]] == jaxphoto.report.verdict_of(tables).texts
     assert summary["outcome"].startswith("converged")
     counts = summary["n_observations"]
     assert counts["total"] == sum(n for group, n in counts.items() if group != "total")
@@ -134,7 +148,32 @@ def test_not_converged_is_written_and_exit_code_one(folder, monkeypatch, capsys,
     assert "not converged" in screen
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["converged"] is False
+    assert summary["verdict"] == "red"
     assert "step limit" in summary["outcome"]
+    # What reads results takes no calibration from these.
+    code, _, error = run(monkeypatch, capsys, "camera", tmp_path / "out", tmp_path / "camera.toml")
+    assert code == 2
+    assert "did not converge" in error
+
+
+def test_blunders_are_left_out_and_written(folder, monkeypatch, capsys, tmp_path):
+    spoilt, out = tmp_path / "spoilt", tmp_path / "out"
+    block = jaxphoto.read_block(folder)
+    rows, value = block.stations, np.array(block.stations.value)
+    value[5] += 7.0
+    write_block(block.with_observations({"stations": dataclasses.replace(rows, value=value)}), spoilt)
+    code, screen, _ = run(monkeypatch, capsys, "adjust", spoilt, "--out", out)
+    named = str(rows.words(block.images, block.points)[5])
+    assert code == 1
+    assert screen.splitlines()[1].startswith("red")
+    assert named in screen
+    code, screen, _ = run(monkeypatch, capsys, "adjust", spoilt, "--out", out, "--snoop")
+    assert code == 0
+    assert f"left out: {named}" in " ".join(screen.split())
+    left = pd.read_csv(out / "left_out.csv")
+    assert left["observation"].tolist() == [named]
+    assert abs(left["error"][0] - 7.0) < 5 * left["sigma"][0]
+    assert len(jaxphoto.read_block(out / "block").stations) == len(rows) - 1
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ import pandas as pd
 
 from jaxphoto.arrays import on_device
 from jaxphoto.camera import InteriorOrientation, Sensor, constant_names, empty_camera, parameter_names, set_parameter
+from jaxphoto.errors import InputError
 from jaxphoto.io.block_folder.camera_section import Camera, camera_section
 from jaxphoto.io.block_folder.section import Section
 from jaxphoto.io.block_folder.settings import read_settings, toml_text
@@ -42,8 +43,9 @@ def read_results(source: CameraSource) -> CameraFile:
     """A camera of interior.csv, with the covariance that its sigmas and the table of correlations make.
 
     Model and sensor are those of summary.json beside it, or of the block that `source.block` names.
-    Raises InputError where neither tells them, and for tables that do not fit.
+    Raises InputError where neither tells them, for an adjustment that did not converge, and for tables that do not fit.
     """
+    _check_converged(source)
     table = read_csv(source.path, _COLUMNS, ("sigma", "significant"))
     of = table.ids("camera")
     name = source.chosen(list(dict.fromkeys(of.tolist())))
@@ -72,7 +74,32 @@ def read_results(source: CameraSource) -> CameraFile:
     for parameter in (*names, *constants):
         interior = set_parameter(interior, parameter, on_device(values[parameter]))
     sigma = np.array([sigmas[n] for n in names])
-    return CameraFile(name, sensor, interior, _covariance(source, name, names, sigma))
+    return CameraFile(name, sensor, interior, _covariance(source, name, names, sigma), _reservation(source))
+
+
+def _summary(source: CameraSource) -> dict:
+    """What summary.json beside it says; nothing where there is none that can be read."""
+    try:
+        return read_json(source.path.with_name("summary.json"))
+    except (InputError, OSError):
+        return {}
+
+
+def _check_converged(source: CameraSource) -> None:
+    if _summary(source).get("converged") is False:
+        raise source.error(
+            "summary.json beside it says that the adjustment did not converge, so its numbers are no calibration: mend "
+            "the block and adjust again"
+        )
+
+
+def _reservation(source: CameraSource) -> str:
+    """The first alarm of an adjustment whose verdict is red."""
+    summary = _summary(source)
+    if summary.get("verdict") != "red":
+        return ""
+    alarms = [f["text"] for f in summary.get("findings", []) if isinstance(f, dict) and f.get("level") == "alarm"]
+    return f"the verdict on this adjustment is red: {alarms[0] if alarms else 'see its report'}"
 
 
 def _covariance(source: CameraSource, camera: str, names: tuple[str, ...], sigma: np.ndarray) -> np.ndarray | None:
