@@ -38,6 +38,8 @@ MOST_MB = 1000.0
 """And with so much memory beyond what was used before."""
 # A sentence about one place; what it quotes is cut.
 _LONGEST = 1500
+# Bytes of a spoilt file: what takes long in it takes long by its form, not by its size.
+_LARGEST = 3_000_000
 # No control characters: they would be commands to a terminal.
 _CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f]")
 _EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
@@ -239,7 +241,7 @@ def spoilt(reader: str, seed: int) -> Files:
     name = str(rng.choice(sorted(READERS[reader].spoilt or files)))
     content = files[name]
     for _ in range(1 + rng.integers(3)):
-        content = _WAYS[rng.integers(len(_WAYS))](content, rng)
+        content = _WAYS[rng.integers(len(_WAYS))](content, rng)[:_LARGEST]
     return files | {name: content}
 
 
