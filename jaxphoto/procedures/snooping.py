@@ -16,8 +16,7 @@ from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
-from scipy.special import gammainccinv
+from jaxtyping import Bool, Float, Int
 
 from jaxphoto.adjustment import MAX_STEPS, Adjustment, Outcome, Sizes, common_sizes, linearise, solve
 from jaxphoto.arrays import still
@@ -161,8 +160,16 @@ def _sizes(at: Adjustment, r: Blocks, predicted: bool = False) -> dict[str, Floa
         known = np.where(checked[name], values, 1.0)
         squares = np.sum(np.where(checked[name], along * known if predicted else along / known, 0.0), axis=1)
         freedom = np.maximum(checked[name].sum(axis=1), 1)
-        found[name] = np.sqrt(squares / (2 * gammainccinv(freedom / 2, LEVEL / max(n, 1))))
+        found[name] = np.sqrt(squares / _limit(freedom, n))
     return found
+
+
+def _limit(freedom: Int[np.ndarray, "*n"], n: int) -> Float[np.ndarray, "*n"]:
+    """What the largest of `n` squares of so many degrees of freedom exceeds with probability `LEVEL` at most."""
+    # Imported when first wanted: SciPy takes a fifth of a second, and importing jaxphoto does not need it.
+    from scipy.special import gammainccinv
+
+    return 2 * gammainccinv(freedom / 2, LEVEL / max(n, 1))
 
 
 def _scales(at: Adjustment, r: Blocks) -> dict[str, float]:
@@ -245,7 +252,7 @@ def _exchanged(at: Adjustment, left: Masks, sigma0: float) -> list[tuple[int, in
     """Rows of image points left out, two of an image, that fit each other's prediction."""
     p, r = at.block.image_points, _redundancy(at)[at.block.image_points.group]
     # Both coordinates of two points are tested; as all others, against all others.
-    limit = sigma0 * float(np.sqrt(2 * gammainccinv(1.0, LEVEL / len(p))))
+    limit = sigma0**2 * float(_limit(np.array(2), len(p)))
     measured, missed = still(p.xy), measured_discrepancies(at.block, at.unknowns)
     predicted = measured - missed
     found: list[tuple[int, int]] = []
@@ -256,7 +263,7 @@ def _exchanged(at: Adjustment, left: Masks, sigma0: float) -> list[tuple[int, in
             # So far from where it was predicted, a difference is no measure: once more with the names exchanged.
             block, _ = _exchange(at.block, left, [(a, b)])
             off = measured_discrepancies(block, at.unknowns)[[a, b]] / still(p.sigma)[[a, b]]
-            if np.all(np.einsum("ni,nij,nj->n", off, r[[a, b]], off) < limit**2):
+            if np.all(np.einsum("ni,nij,nj->n", off, r[[a, b]], off) < limit):
                 found.append((a, b))
     return found
 

@@ -13,7 +13,6 @@ from typing import NamedTuple
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
-from scipy.special import stdtrit
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.arrays import still
@@ -83,6 +82,9 @@ def critical_w(n: int, redundancy: int, level: float = LEVEL) -> float:
     """
     if redundancy < 2 or n == 0:
         return float("inf")
+    # Imported when first wanted: SciPy takes a fifth of a second, and importing jaxphoto does not need it.
+    from scipy.special import stdtrit
+
     t = float(-stdtrit(redundancy - 1, level / (2 * n)))
     return t * redundancy**0.5 / (redundancy - 1 + t * t) ** 0.5
 

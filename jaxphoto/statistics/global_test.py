@@ -6,7 +6,6 @@ redundancy numbers (Förstner 1979). It varies at most as chi-square of nu_g doe
 
 import equinox as eqx
 import numpy as np
-from scipy.special import gammainc, gammaincc
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.statistics.discrepancy import observation_groups
@@ -46,5 +45,8 @@ def group_factors(adjusted: Adjustment, redundancy: Redundancy) -> list[Variance
 def _tested(group: str, n: int, square_sum: float, redundancy: float) -> VarianceFactor:
     if redundancy <= 0:
         return VarianceFactor(group, n, redundancy, 1.0, 1.0)
+    # Imported when first wanted: SciPy takes a fifth of a second, and importing jaxphoto does not need it.
+    from scipy.special import gammainc, gammaincc
+
     p = 2 * min(tail(redundancy / 2, square_sum / 2) for tail in (gammainc, gammaincc))
     return VarianceFactor(group, n, redundancy, square_sum / redundancy, min(float(p), 1.0))
