@@ -25,8 +25,8 @@ LARGEST = 1e30
 """No length, angle, time or coefficient is larger; the square of it is a number yet."""
 # What fits into 64 bits.
 _DIGITS = 18
-# Of a table: the widest one here has some twenty columns.
-_MOST_COLUMNS, _LONGEST_LINE = 1_000, 100_000
+MOST_COLUMNS, LONGEST_LINE = 1_000, 100_000
+"""Columns of a table, the widest of which has some fifty, and characters of a row."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -213,10 +213,10 @@ def _records(path: Path, lines: list[str], rows: list[int], separator: str) -> I
     """The cells of one line after the other, as many as the first has."""
     width = 0
     for line, row in zip(lines, rows, strict=True):
-        if len(line) > _LONGEST_LINE:
+        if len(line) > LONGEST_LINE:
             raise InputError(
                 f"{path.name}, row {row}: the row has {len(line)} characters, and one of a table has at most "
-                f"{_LONGEST_LINE}; correct it"
+                f"{LONGEST_LINE}; correct it"
             )
         try:
             (record,) = csv.reader([line], delimiter=separator, skipinitialspace=True, strict=True)
@@ -225,9 +225,9 @@ def _records(path: Path, lines: list[str], rows: list[int], separator: str) -> I
                 f"{path.name}, row {row}: the quotation marks do not pair; close or remove them in that row"
             ) from None
         width = width or len(record)
-        if width > _MOST_COLUMNS:
+        if width > MOST_COLUMNS:
             raise InputError(
-                f"{path.name}, row {row}: the header has {width} columns, and a table has at most {_MOST_COLUMNS}; "
+                f"{path.name}, row {row}: the header has {width} columns, and a table has at most {MOST_COLUMNS}; "
                 "correct it"
             )
         if len(record) > width:

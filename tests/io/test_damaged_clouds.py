@@ -1,5 +1,6 @@
-"""Damaged LAS and LAZ files: what would take room, end the process or pass for a cloud is refused before it does."""
+"""Damaged clouds: what would take room, end the process or pass for a point is refused before it does."""
 
+import os
 import struct
 
 import laspy
@@ -129,3 +130,58 @@ def test_points_that_begin_after_the_end(tmp_path):
     path = write_las(tmp_path / "c.las", sample().xyz)
     path.write_bytes(with_number(path.read_bytes(), "<I", POINTS, 2**32 - 1))
     assert "begin after its end" in complaint(path)
+
+
+PLY = (
+    "ply\nformat ascii 1.0\nelement vertex {n}\n"
+    + "".join(f"property double {name}\n" for name in ("x", "y", "z", "classification", "time_s", "strip"))
+    + "end_header\n1 2 3 1 5 7\n1 2 3 1 5 7\n{row}"
+)
+
+
+@pytest.mark.parametrize(
+    ("row", "says"),
+    [
+        ("1 2 3 1 5", "row 13: the strip is not a whole number"),
+        ('1 2 "3 1 5 7', "row 13: there are not 6 numbers"),
+        ("1 2 3 one 5 7", "row 13: there are not 6 numbers"),
+        ("1 2 " + "9" * 400 + " 1 5 7", "row 13: x, y, z are not three finite numbers"),
+        ("1 2 3 1.5 5 7", "row 13: classification is not a whole number"),
+        ("1 2 3 1 nan 7", "row 13: the time is not a finite number"),
+        ("1 2 3 1 5 1e300", "row 13: the strip is not a whole number"),
+    ],
+)
+def test_rows_of_a_ply_file_in_text(tmp_path, row, says):
+    path = tmp_path / "c.ply"
+    path.write_text(PLY.format(n=3, row=row))
+    assert says in complaint(path)
+    path.write_text(PLY.format(n=3, row="1 2 3 1 5 7"))
+    assert len(clouds.read_cloud(path)) == 3
+
+
+@pytest.mark.parametrize("n", ["9" * 17, "9" * 5000, "\u00b2"])
+def test_a_promise_that_a_ply_file_cannot_hold(tmp_path, n):
+    path = tmp_path / "c.ply"
+    path.write_text(PLY.format(n=n, row=""), encoding="utf-8")
+    assert "cut off" in (said := complaint(path)) or "header" in said
+
+
+def test_tables_wider_and_longer_than_any(tmp_path):
+    """A million columns, and a name that an array of text would give room for in every row."""
+    path = tmp_path / "c.csv"
+    path.write_text("X_m,Y_m,Z_m" + "," * 1_000_000 + "\n1,2,3\n")
+    assert "row has more than 100000 characters" in complaint(path)
+    path.write_text("X_m,Y_m,Z_m" + "," * 1_000 + "\n1,2,3\n")
+    assert "1003 columns" in complaint(path)
+    path.write_text("X_m,Y_m,Z_m,strip\n" + "1,2,3,a\n" * 100 + f"1,2,3,{'x' * 50_000}\n")
+    assert "row 102: the strip 'xxx" in (said := complaint(path)) and "at most 256" in said
+    path.write_text("X_m;Y_m;Z_m\n")
+    assert "no points" in complaint(path)
+    path.write_text("X_m,Y_m,Z_m,X_m\n1,2,3,4\n")
+    assert "column X_m stands there twice" in complaint(path)
+
+
+def test_what_is_no_file(tmp_path):
+    os.mkfifo(tmp_path / "pipe.csv")
+    with pytest.raises(InputError, match="is no file that you may read"):
+        clouds.read_cloud(tmp_path / "pipe.csv")

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 from jaxtyping import Float
 
 from jaxphoto.cloud import Cloud
@@ -14,6 +15,8 @@ from jaxphoto.io.clouds.coordinate_system import CoordinateSystem
 
 CHUNK = 500_000
 """Points that are read, placed and filtered together."""
+# What they may take: a point is long where a file says much of each.
+_CHUNK_BYTES = 64 << 20
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,7 +42,7 @@ class StripNumbers:
 
     def of(self, ids: np.ndarray) -> np.ndarray:
         """The index in `names` of each of the strips `ids`."""
-        known, place = np.unique(ids, return_inverse=True)
+        place, known = pd.factorize(ids, sort=True)
         numbers = [self._index.setdefault(str(name), len(self._index)) for name in known]
         return np.array(numbers, np.int32)[place]
 
@@ -47,6 +50,11 @@ class StripNumbers:
     def names(self) -> tuple[str, ...]:
         """The strips met so far."""
         return tuple(self._index)
+
+
+def at_once(point_bytes: int, most: int = CHUNK) -> int:
+    """How many points of so many bytes each are read together, at most `most`."""
+    return max(1, min(most, _CHUNK_BYTES // point_bytes))
 
 
 def check_file(path: Path) -> None:

@@ -19,6 +19,7 @@ from jaxphoto.io.clouds.cloud_source import CHUNK, check_file
 from jaxphoto.io.clouds.las import opened, raw_chunks
 from jaxphoto.io.clouds.placement import Placement
 from jaxphoto.io.clouds.table import RETURNS, XYZ
+from jaxphoto.io.text_tables import natural
 from jaxphoto.writing import whole_file
 
 # A millimetre holds what a scanner measures, and leaves 4,000 km of room.
@@ -144,8 +145,9 @@ def _check_room(xyz: np.ndarray, header: laspy.LasHeader, name: str) -> None:
 
 def _source_ids(cloud: Cloud) -> np.ndarray:
     """Point source IDs: the strips' own where they are such numbers, else their index from 1."""
-    numbers = [int(name) if name.isdigit() and int(name) < 1 << 16 else -1 for name in cloud.strips]
-    ids = np.arange(1, len(numbers) + 1) if min(numbers) < 0 else np.array(numbers)
+    numbers = [natural(name) for name in cloud.strips]
+    own = [number for number in numbers if number is not None and number < 1 << 16]
+    ids = np.array(own) if len(own) == len(numbers) else np.arange(1, len(numbers) + 1)
     assert cloud.strip is not None
     return ids[cloud.strip].astype(np.uint16)
 

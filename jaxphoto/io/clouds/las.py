@@ -12,14 +12,12 @@ from pyproj.exceptions import CRSError
 
 from jaxphoto.cloud import Cloud
 from jaxphoto.errors import InputError
-from jaxphoto.io.clouds.cloud_source import CHUNK, CloudSource, StripNumbers
+from jaxphoto.io.clouds.cloud_source import CHUNK, CloudSource, StripNumbers, at_once
 from jaxphoto.io.clouds.coordinate_system import CoordinateSystem, system_of
 from jaxphoto.io.clouds.laz_chunks import unpacker
 
 # Bytes of the head of a record before the points; that of one after them ends with its length and a description.
 _RECORD, _RECORD_AFTER = 54, struct.Struct("<20xQ32x")
-# Of points that are read together: a point may be long, by the extra bytes that its format allows.
-_CHUNK_BYTES = 64 << 20
 # Keys of GeoTIFF, and the metres in its codes of lengths.
 _PLANE_UNIT, _HEIGHTS, _HEIGHT_UNIT = 3076, 4096, 4099
 _LENGTHS = {9001: 1.0, 9002: 0.3048, 9003: 1200 / 3937}
@@ -110,10 +108,10 @@ def raw_chunks(reader: laspy.LasReader, path: Path) -> Iterator[laspy.ScaleAware
     if reader.header.are_points_compressed:
         with _damage(path):
             reader.laz_backend = unpacker(path, reader.header)
-    at_once = min(CHUNK, max(1, _CHUNK_BYTES // reader.header.point_format.size))
+    together = at_once(reader.header.point_format.size, CHUNK)
     while read < promised:
         with _damage(path):
-            points = reader.read_points(at_once)
+            points = reader.read_points(together)
             withheld = np.asarray(points.withheld, bool)
         if not len(points):
             raise _cut_off(path.name, promised, read)

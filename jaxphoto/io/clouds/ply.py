@@ -1,6 +1,8 @@
 """PLY: the vertices of an ASCII or binary file."""
 
+import csv
 import dataclasses
+import itertools
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,8 +11,9 @@ import pandas as pd
 
 from jaxphoto.cloud import Cloud
 from jaxphoto.errors import InputError
-from jaxphoto.io.clouds.cloud_source import CHUNK, CloudSource, StripNumbers
+from jaxphoto.io.clouds.cloud_source import CHUNK, CloudSource, StripNumbers, at_once
 from jaxphoto.io.clouds.coordinate_system import CoordinateSystem
+from jaxphoto.io.text_tables import LONGEST_LINE, is_number, natural
 
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
@@ -27,8 +30,9 @@ _NAMES = {
     "strip": ("strip", "point_source_id", "pointsourceid"),
 }
 _LONGEST_HEADER = 1000
-# What a cloud holds as a byte.
+# What a cloud holds as a byte, and as a whole number, which a double holds up to here.
 _BYTES = {"classification", "return_number", "number_of_returns"}
+_LARGEST_STRIP = 2**53
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,6 +45,11 @@ class _Vertices:
     begin: int
     lines: int
 
+    @property
+    def least_bytes(self) -> int:
+        """Of a vertex: of its numbers, or in a text of a digit and the end of the line."""
+        return sum(np.dtype(code).itemsize for _, code in self.fields) if self.order else 2
+
 
 def open_ply(path: Path, given: CoordinateSystem | None) -> CloudSource:
     """A PLY file as a source, in the system `given`; elements other than vertices are left out.
@@ -50,6 +59,10 @@ def open_ply(path: Path, given: CoordinateSystem | None) -> CloudSource:
     vertices = _header(path)
     if vertices.count == 0:
         raise InputError(f"{path.name} holds no points; name another cloud")
+    # Of a text it is known only that there cannot be more. Its last line may have no end.
+    there = (path.stat().st_size - vertices.begin + (vertices.order == "")) // vertices.least_bytes
+    if there < vertices.count:
+        raise _cut_off(path, vertices, there)
     return CloudSource(path.name, given or CoordinateSystem(), vertices.count, None, lambda: _chunks(path, vertices))
 
 
@@ -59,19 +72,10 @@ def _chunks(path: Path, vertices: _Vertices) -> Iterator[Cloud]:
     strips, read = StripNumbers(), 0
     for table in (_lines if vertices.order == "" else _records)(path, vertices):
         xyz = np.stack([np.asarray(table[places[axis]], float) for axis in "xyz"], axis=1)
-        lost = ~np.isfinite(xyz).all(axis=1)
-        if lost.any():
-            at = read + int(np.flatnonzero(lost)[0])
-            where = f"row {vertices.lines + at + 1}" if vertices.order == "" else f"vertex {at + 1}"
-            raise InputError(f"{path.name}, {where}: x, y, z are not three finite numbers; mend or delete it")
         values = {own: np.asarray(table[name]) for own, name in known.items()}
-        for name in _BYTES & set(values):
-            wrong = ~((values[name] >= 0) & (values[name] <= 255))
+        for wrong, what in _wrong(xyz, values):
             if wrong.any():
-                at = read + int(np.flatnonzero(wrong)[0])
-                raise InputError(
-                    f"{path.name}, vertex {at + 1}: {name} is not a number from 0 to 255; mend or delete it"
-                )
+                raise _fault(path, vertices, read + int(np.flatnonzero(wrong)[0]), what)
         yield Cloud(
             xyz,
             classification=values["classification"].astype(np.uint8) if "classification" in values else None,
@@ -84,10 +88,34 @@ def _chunks(path: Path, vertices: _Vertices) -> Iterator[Cloud]:
         )
         read += len(xyz)
     if read < vertices.count:
-        raise InputError(
-            f"{path.name} is cut off: its header promises {vertices.count} points, but there are {read}; copy it anew "
-            "from its source"
-        )
+        raise _cut_off(path, vertices, read)
+
+
+def _wrong(xyz: np.ndarray, values: dict[str, np.ndarray]) -> Iterator[tuple[np.ndarray, str]]:
+    """Which vertices have something that is no value for a cloud, and what is wrong with it."""
+    yield ~np.isfinite(xyz).all(axis=1), "x, y, z are not three finite numbers"
+    for name in sorted(_BYTES & set(values)):
+        yield ~_whole(values[name], 0, 255), f"{name} is not a whole number from 0 to 255"
+    if "time_s" in values:
+        yield ~np.isfinite(values["time_s"]), "the time is not a finite number"
+    if "strip" in values:
+        yield ~_whole(values["strip"], -_LARGEST_STRIP, _LARGEST_STRIP), "the strip is not a whole number"
+
+
+def _whole(values: np.ndarray, least: int, most: int) -> np.ndarray:
+    return (values >= least) & (values <= most) & (np.floor(values) == values)
+
+
+def _fault(path: Path, vertices: _Vertices, vertex: int, what: str) -> InputError:
+    where = f"row {vertices.lines + vertex + 1}" if vertices.order == "" else f"vertex {vertex + 1}"
+    return InputError(f"{path.name}, {where}: {what}; mend or delete it")
+
+
+def _cut_off(path: Path, vertices: _Vertices, there: int) -> InputError:
+    return InputError(
+        f"{path.name} is cut off: its header promises {vertices.count} points, but there are {there}"
+        f"{' at most' if vertices.order == '' else ''}; copy it anew from its source"
+    )
 
 
 def _records(path: Path, vertices: _Vertices) -> Iterator[np.ndarray]:
@@ -95,29 +123,46 @@ def _records(path: Path, vertices: _Vertices) -> Iterator[np.ndarray]:
     with path.open("rb") as file:
         file.seek(vertices.begin)
         left = vertices.count
-        while left and len(records := np.fromfile(file, kind, min(CHUNK, left))):
+        while left and len(records := np.fromfile(file, kind, min(at_once(kind.itemsize, CHUNK), left))):
             left -= len(records)
             yield records
 
 
 def _lines(path: Path, vertices: _Vertices) -> Iterator[pd.DataFrame]:
     names = [name for name, _ in vertices.fields]
+    try:
+        with path.open("rb") as file:
+            file.seek(vertices.begin)
+            # No more rows than vertices: lines of other elements have other lengths.
+            with pd.read_csv(
+                file,
+                sep=r"\s+",
+                header=None,
+                names=names,
+                usecols=range(len(names)),
+                nrows=vertices.count,
+                dtype=float,
+                quoting=csv.QUOTE_NONE,
+                skip_blank_lines=False,
+                chunksize=at_once(8 * len(names), CHUNK),
+                encoding_errors="replace",
+            ) as tables:
+                yield from tables
+    # What pandas finds wrong with a line is a ValueError too.
+    except ValueError:
+        raise _faulty_row(path, vertices) from None
+
+
+def _faulty_row(path: Path, vertices: _Vertices) -> InputError:
+    """The error about the first row that is not as many numbers as there are properties."""
     with path.open("rb") as file:
         file.seek(vertices.begin)
-        # No more rows than vertices: lines of other elements have other lengths.
-        with pd.read_csv(
-            file,
-            sep=r"\s+",
-            header=None,
-            names=names,
-            usecols=range(len(names)),
-            nrows=vertices.count,
-            skip_blank_lines=False,
-            chunksize=CHUNK,
-            encoding_errors="replace",
-        ) as tables:
-            for table in tables:
-                yield table.apply(pd.to_numeric, errors="coerce")
+        rows = iter(lambda: file.readline(LONGEST_LINE), b"")
+        for vertex, line in enumerate(itertools.islice(rows, vertices.count)):
+            cells = line.decode("ascii", "replace").split()
+            if len(cells) < len(vertices.fields) or not all(map(is_number, cells[: len(vertices.fields)])):
+                return _fault(path, vertices, vertex, f"there are not {len(vertices.fields)} numbers")
+    return InputError(f"{path.name} cannot be read as a table of numbers; write the cloud anew")
 
 
 def _header(path: Path) -> _Vertices:
@@ -130,8 +175,8 @@ def _header(path: Path) -> _Vertices:
             match words:
                 case ["format", name, _] if name in _ORDERS:
                     order = name
-                case ["element", "vertex", n] if n.isdigit():
-                    count, element = int(n), "vertex"
+                case ["element", "vertex", n] if (number := natural(n)) is not None:
+                    count, element = number, "vertex"
                 case ["element", name, n]:
                     before |= count < 0 and n != "0"
                     element = name

@@ -10,10 +10,11 @@ import numpy as np
 import pandas as pd
 
 from jaxphoto.cloud import Cloud
-from jaxphoto.errors import InputError
+from jaxphoto.errors import InputError, quoted
 from jaxphoto.io.clouds.cloud_source import CHUNK, CloudSource, StripNumbers
 from jaxphoto.io.clouds.coordinate_system import CoordinateSystem
-from jaxphoto.io.text_tables import is_number
+from jaxphoto.io.names import harm_in
+from jaxphoto.io.text_tables import LONGEST_LINE, MOST_COLUMNS, is_number
 
 XYZ = ("X_m", "Y_m", "Z_m")
 RETURNS = ("return_number", "number_of_returns")
@@ -46,7 +47,9 @@ class _Dialect:
 
 def _chunks(path: Path, layout: _Dialect) -> Iterator[Cloud]:
     numbers = [name for name in layout.header if name in COLUMNS and name != "strip"]
-    kinds: dict[str, type] = {name: float if name in numbers else str for name in layout.header}
+    # Names of ours, since pandas strips none and takes none twice.
+    names = [name if name in COLUMNS else f"#{j}" for j, name in enumerate(layout.header)]
+    kinds: dict[str, type] = {name: float if name in numbers else str for name in names}
     strips = StripNumbers()
     try:
         # Without an index and with all columns: else surplus cells would shift the others unnoticed.
@@ -57,6 +60,8 @@ def _chunks(path: Path, layout: _Dialect) -> Iterator[Cloud]:
             comment="#",
             skipinitialspace=True,
             index_col=False,
+            header=0,
+            names=names,
             dtype=kinds,  # type: ignore[arg-type]
             keep_default_na=False,
             na_values=[""],
@@ -65,8 +70,11 @@ def _chunks(path: Path, layout: _Dialect) -> Iterator[Cloud]:
         ) as tables:
             for table in tables:
                 values = {name: table[name].to_numpy() for name in numbers}
-                if not all(np.isfinite(v).all() for v in values.values()) or not all(
-                    np.isin(values[name], np.arange(256)).all() for name in _BYTES if name in values
+                strip = table["strip"].fillna("").to_numpy(object) if "strip" in table else None
+                if (
+                    not all(np.isfinite(v).all() for v in values.values())
+                    or not all(np.isin(values[name], np.arange(256)).all() for name in _BYTES if name in values)
+                    or (strip is not None and any(map(harm_in, pd.unique(strip))))
                 ):
                     raise _fault(path, layout, numbers)
                 small = {name: values[name].astype(np.uint8) for name in _BYTES if name in values}
@@ -76,7 +84,7 @@ def _chunks(path: Path, layout: _Dialect) -> Iterator[Cloud]:
                     classification=small.get("classification"),
                     returns=np.stack([small[name] for name in RETURNS], axis=1) if has_returns else None,
                     time=values.get("time_s"),
-                    strip=strips.of(table["strip"].fillna("").to_numpy(str)) if "strip" in table else None,
+                    strip=None if strip is None else strips.of(strip),
                     strips=strips.names,
                 )
     except InputError:
@@ -97,10 +105,12 @@ def _fault(path: Path, layout: _Dialect, numbers: list[str]) -> InputError:
         for name in numbers:
             cell = found[name].replace(layout.decimal, ".")
             if not is_number(cell) or not math.isfinite(float(cell)):
-                what = repr(found[name]) if found[name] else "empty"
+                what = quoted(found[name]) if found[name] else "empty"
                 return InputError(f"{path.name}, row {row}: {name} is {what}; give a finite number or delete the row")
             if name in _BYTES and not (float(cell).is_integer() and 0 <= float(cell) <= 255):
                 return InputError(f"{path.name}, row {row}: {name} is {found[name]}; give a whole number from 0 to 255")
+        if harm := harm_in(found.get("strip", "")):
+            return InputError(f"{path.name}, row {row}: the strip {quoted(found['strip'])} {harm}")
     return InputError(f"{path.name} cannot be read as a table; see that its cells are numbers without quotation marks")
 
 
@@ -118,10 +128,20 @@ def _layout(path: Path) -> _Dialect:
         raise InputError(f"{path.name} is empty; give it a header with the columns {', '.join(XYZ)}")
     separator = ";" if ";" in lines[0][1] else ","
     header, *first = [[cell.strip() for cell in text.split(separator)] for _, text in lines]
+    if len(header) > MOST_COLUMNS:
+        raise InputError(
+            f"{path.name}, row {lines[0][0]}: the header has {len(header)} columns, and a table has at most "
+            f"{MOST_COLUMNS}; correct it"
+        )
+    for name in COLUMNS:
+        if header.count(name) > 1:
+            raise InputError(f"{path.name}, row {lines[0][0]}: the column {name} stands there twice; keep one of them")
     for cells in first:
         if len(cells) > len(header):
             raise _surplus(path, lines[1][0], cells, header)
-    return _Dialect(header, separator, "," if separator == ";" and "," in "".join(*first) else ".")
+    return _Dialect(
+        header, separator, "," if separator == ";" and any("," in cell for cells in first for cell in cells) else "."
+    )
 
 
 def _rows(path: Path, separator: str) -> Iterator[tuple[int, list[str]]]:
@@ -129,8 +149,12 @@ def _rows(path: Path, separator: str) -> Iterator[tuple[int, list[str]]]:
     row = 0
     try:
         with path.open(encoding="utf-8-sig") as lines:
-            for row, line in enumerate(lines, start=1):
+            for row, line in enumerate(iter(lambda: lines.readline(LONGEST_LINE + 1), ""), start=1):
                 text = line.strip()
+                if len(line) > LONGEST_LINE:
+                    raise InputError(
+                        f"{path.name}, row {row}: the row has more than {LONGEST_LINE} characters; correct it"
+                    )
                 if text and not text.startswith("#"):
                     yield row, [cell.strip() for cell in text.split(separator)]
     except UnicodeDecodeError:
