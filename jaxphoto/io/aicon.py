@@ -13,7 +13,7 @@ import numpy as np
 from jaxphoto.errors import InputError
 from jaxphoto.io.block_folder import BlockTables
 from jaxphoto.io.block_folder.table_layout import ANGLES, XYZ
-from jaxphoto.io.text_tables import Table, content_lines, read_columns
+from jaxphoto.io.text_tables import Table, content_lines, finite, read_columns
 
 _MM = 0.001
 # What the program gives every image coordinate; columns 5 and 6 of the .phc file are results.
@@ -101,10 +101,12 @@ def _camera(path: Path) -> tuple[str, dict[str, Any]]:
         )
     values = []
     for parts, row in zip(cells, rows, strict=True):
-        try:
-            values.append([float(cell) for cell in parts])
-        except ValueError:
-            raise InputError(f"{path.name}, row {row}: a cell is not a number; correct it") from None
+        numbers = [number for cell in parts if (number := finite(cell)) is not None]
+        if len(numbers) < len(parts):
+            raise InputError(f"{path.name}, row {row}: a cell is not a finite number; correct it")
+        values.append(numbers)
+    if min(values[-1]) <= 0:
+        raise InputError(f"{path.name}, row {rows[-1]}: the format in mm and pixels is positive; correct it")
     (_, _, c, x, y, a1, a2, r0), (a3,), (b1, b2), (c1, c2), (width_mm, height_mm, width, height) = values
     # One pixel size serves both axes: only the format is derived from it, the image coordinates are millimetres.
     pixel = (width_mm / width + height_mm / height) / 2

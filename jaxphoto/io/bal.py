@@ -18,10 +18,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxphoto.errors import InputError
+from jaxphoto.errors import InputError, quoted
 from jaxphoto.io.block_folder import BlockTables
 from jaxphoto.io.block_folder.table_layout import ANGLES, XYZ
-from jaxphoto.io.text_tables import Table, content_lines, is_number
+from jaxphoto.io.text_tables import LARGEST, Table, content_lines, is_number, natural
 from jaxphoto.rotation import omega_phi_kappa_from_matrix, small_rotation
 
 _PIXEL_MM = 0.001
@@ -135,14 +135,15 @@ def _opens_as_bal(path: Path) -> bool:
 
 
 def _counts(path: Path, lines: list[str], rows: list[int]) -> list[int]:
-    cells = lines[0].split() if lines else []
-    if len(cells) != len(_COUNTS) or not all(cell.isdecimal() and int(cell) > 0 for cell in cells):
+    counts = [natural(cell) for cell in lines[0].split()] if lines else []
+    known = [count for count in counts if count]
+    if len(counts) != len(_COUNTS) or len(known) != len(_COUNTS):
         row = rows[0] if rows else 1
         raise InputError(
             f"{path.name}, row {row}: a BAL problem begins with the numbers of its cameras, points and observations; "
             "write these three, or give a text file of that kind (the published ones are unpacked by bunzip2)"
         )
-    return [int(cell) for cell in cells]
+    return known
 
 
 def _observations(path: Path, lines: list[str], rows: list[int], count: int) -> Table:
@@ -163,11 +164,15 @@ def _observations(path: Path, lines: list[str], rows: list[int], count: int) -> 
 
 def _indices(observed: Table, column: str, count: int) -> np.ndarray:
     """A column of numbers from 0 to `count` - 1."""
-    cells = observed.text(column)
-    for line, cell in enumerate(cells):
-        if not (cell.isdecimal() and int(cell) < count):
-            raise observed.bad(line, f"{column} is {cell!r}; the {count} {column}s are counted from 0 to {count - 1}")
-    return cells.astype(int)
+    indices = np.zeros(len(observed), int)
+    for line, cell in enumerate(observed.text(column)):
+        index = natural(cell)
+        if index is None or index >= count:
+            raise observed.bad(
+                line, f"{column} is {quoted(cell)}; the {count} {column}s are counted from 0 to {count - 1}"
+            )
+        indices[line] = index
+    return indices
 
 
 def _parameters(path: Path, lines: list[str], rows: list[int], needed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -182,10 +187,12 @@ def _parameters(path: Path, lines: list[str], rows: list[int], needed: int) -> t
         )
     for cell, row in zip(cells, row_of, strict=True):
         if not is_number(cell):
-            raise InputError(f"{path.name}, row {row}: {cell!r} is not a number; write it like 12.34")
-    values = np.array(cells, float)
-    for k in np.flatnonzero(~np.isfinite(values)):
-        raise InputError(f"{path.name}, row {row_of[k]}: {cells[k]!r} is not finite; give a finite number")
+            raise InputError(f"{path.name}, row {row}: {quoted(cell)} is not a number; write it like 12.34")
+    values = np.array(list(map(float, cells)))
+    for k in np.flatnonzero(~(np.abs(values) <= LARGEST)):
+        raise InputError(
+            f"{path.name}, row {row_of[k]}: {quoted(cells[k])} is not finite or too large; give a finite number"
+        )
     return values, row_of
 
 

@@ -13,7 +13,7 @@ from jaxphoto.errors import InputError
 from jaxphoto.io.block_folder import BlockTables
 from jaxphoto.io.block_folder.table_layout import SIGMA_XYZ, XYZ
 from jaxphoto.io.dbat import CAMERA, control_table
-from jaxphoto.io.text_tables import Table, content_lines, is_number, read_columns
+from jaxphoto.io.text_tables import Table, content_lines, finite, is_number, read_columns
 
 CONTROL, STATIONS = "ctrlpts-weighted.txt", "fake-camera-positions.txt"
 # The export's own standard deviations mark the kind of point (1 manual, 0 automatic); DBAT takes 1 pixel for all.
@@ -37,6 +37,8 @@ def read_photomodeler(source: Path) -> BlockTables:
     cells = [line.split() for line in lines]
     _, _, width, height = _numbers(path, rows[1], cells[1], 4)
     c, px, py, sensor_width, _, *coefficients = _numbers(path, rows[3], cells[3], 10)
+    if min(width, height, sensor_width) <= 0:
+        raise InputError(f"{path.name}: the format of the camera is not positive; export it again")
     pixel = sensor_width / width
     if any(coefficients):
         raise InputError(f"{path.name}, row {rows[3]}: lens distortion is not read from an export; use a DBAT script")
@@ -98,9 +100,10 @@ def _stations(path: Path) -> Table:
 
 
 def _numbers(path: Path, row: int, cells: list[str], n: int) -> list[float]:
-    if len(cells) != n or not all(map(is_number, cells)):
+    numbers = [number for cell in cells if (number := finite(cell)) is not None]
+    if len(cells) != n or len(numbers) != n:
         raise InputError(f"{path.name}, row {row}: {n} numbers are expected here; export it again")
-    return [float(cell) for cell in cells]
+    return numbers
 
 
 def _column(cells: list[list[str]], chosen: np.ndarray, j: int) -> np.ndarray:

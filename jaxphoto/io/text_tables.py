@@ -6,6 +6,7 @@ A row is counted as a spreadsheet counts it: header, comments and empty lines in
 import collections
 import csv
 import dataclasses
+import math
 import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -259,6 +260,12 @@ def _objects(cells: list[str]) -> np.ndarray:
 def natural(cell: str) -> int | None:
     """The whole number, zero or more, that a cell is; None where it is none, or has more digits than any count."""
     return int(cell) if cell.isascii() and cell.isdigit() and len(cell) <= _DIGITS else None
+
+
+def finite(cell: str) -> float | None:
+    """The number that a cell is; None where it is none, not finite or larger than any can be here."""
+    value = float(cell) if is_number(cell) else math.inf
+    return value if abs(value) <= LARGEST else None
 
 
 def is_number(cell: str) -> bool:

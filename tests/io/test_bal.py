@@ -152,6 +152,8 @@ def shortened(lines):
     [
         (replaced(1, "3 5"), ("row 1:", "cameras, points and observations", "write these three")),
         (replaced(1, "3 5 0"), ("row 1:", "write these three")),
+        (replaced(1, "3 5 " + "9" * 5000), ("row 1:", "write these three")),
+        (replaced(4, "0 " + "9" * 5000 + " 1.0 2.0"), ("row 4: point is '999", "counted from 0 to 4")),
         (replaced(1, "3 5 14.0"), ("row 1:", "write these three")),
         (replaced(4, None), ("row 15: 1 cells instead of 4", "complete the row, or correct the 14")),
         (replaced(1, "3 5 13"), ("46 numbers follow", "have 42", "correct that row")),

@@ -177,6 +177,14 @@ def test_unknown_formats_list_the_known_ones(tmp_path):
         ("<model>3</model>", "<model>4</model>", ("project.xml", "model 4", "use one of")),
         ("<image>2272,1704</image>", "<image>2272</image>", ("project.xml", "<image>", "2 numbers")),
         ("auto,5.43764", "auto,auto", ("project.xml", "<sensor>", "give width,height")),
+        ("auto,5.43764", "auto,nan", ("project.xml", "<sensor>", "give width,height")),
+        ("<image>2272,1704</image>", "<image>1e999,1704</image>", ("project.xml", "<image>", "2 numbers")),
+        (
+            "<image>2272,1704</image>",
+            "<image>0,1704</image>",
+            ("project.xml", "<image> is 0 x 1704", "give the format"),
+        ),
+        ('encoding="', 'encoding="X', ("project.xml", "unknown encoding", "correct the XML")),
         ("<skew>false</skew>", "<focus>false</focus>", ("project.xml", "<focus>", "use all")),
         ("<skew>false</skew>", "<skew>no</skew>", ("project.xml", "<skew>", "true or false")),
         ("im,id,x,y,sxy", "im,id,x,y,s", ("project.xml", "markpts.txt", "add sxy")),
@@ -215,7 +223,9 @@ def test_a_bad_row_of_an_aicon_file_is_named(data_dir, tmp_path):
     ("line", "old", "new", "message"),
     [
         (0, "28.78507", "28.7 8507", r"example\.ior: the five lines of one camera"),
-        (0, "-28.78507", "c", r"example\.ior, row 1: a cell is not a number; correct it"),
+        (0, "-28.78507", "c", r"example\.ior, row 1: a cell is not a finite number; correct it"),
+        (4, "35.96800", "9" * 400, r"example\.ior, row 5: a cell is not a finite number; correct it"),
+        (4, "35.96800", "0", r"example\.ior, row 5: the format in mm and pixels is positive; correct it"),
         (4, "35.96800", "0.035968", r"pixel_mm: a pixel of .* cannot be"),
     ],
 )
@@ -225,7 +235,7 @@ def test_a_bad_camera_of_an_aicon_project_is_named(data_dir, tmp_path, line, old
     lines = (folder / "example.ior").read_text().split("\n")
     assert old in lines[line]
     lines[line] = lines[line].replace(old, new)
-    if line == 4:
+    if new == "0.035968":
         lines[line] = lines[line].replace("23.97900", "0.023979")
     (folder / "example.ior").write_text("\n".join(lines))
     with pytest.raises(InputError, match=message):
@@ -244,6 +254,8 @@ def test_an_aicon_project_needs_its_files(data_dir, tmp_path):
         ("   0      333 2158.2500", "   9      333 2158.2500", r"pmexport\.txt, row \d+: image 9 is not among"),
         ("53.14800 77.97600 0.00000", "53.14800 77.97600 0.00100", r"pmexport\.txt, row 4: lens distortion"),
         ("0.000500 20 8858 12996", "0.000500 20 8858", r"pmexport\.txt, row 2: 4 numbers are expected"),
+        ("0.000500 20 8858 12996", "0.000500 20 1e999 12996", r"pmexport\.txt, row 2: 4 numbers are expected"),
+        ("0.000500 20 8858 12996", "0.000500 20 0 12996", r"the format of the camera is not positive"),
     ],
 )
 def test_a_bad_export_is_refused(data_dir, tmp_path, old, new, message):

@@ -4,6 +4,7 @@ Frames and rigs, which newer models have beside them, repeat the poses of the im
 Source: the documentation of COLMAP, "Output format".
 """
 
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -79,9 +80,9 @@ def _sound(model: ColmapModel) -> ColmapModel:
                 "the model again"
             )
     for what, ids in (("image", [i.name for i in model.images]), ("point", model.point_ids.tolist())):
-        values, times = np.unique(np.array(ids), return_counts=True)
-        if (times > 1).any():
-            raise InputError(f"{model.folder}: {what} {values[times > 1][0]} is there twice; keep one of them")
+        for value, times in Counter(ids).items():
+            if times > 1:
+                raise InputError(f"{model.folder}: {what} {value} is there twice; keep one of them")
     return model
 
 

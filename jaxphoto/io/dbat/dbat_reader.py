@@ -5,12 +5,12 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxphoto.errors import InputError
+from jaxphoto.errors import InputError, quoted
 from jaxphoto.io.block_folder import BlockTables
 from jaxphoto.io.block_folder.table_layout import SIGMA_XYZ, XYZ
 from jaxphoto.io.dbat.script import Script, open_script
 from jaxphoto.io.dbat.script_camera import camera_settings
-from jaxphoto.io.text_tables import Table, concatenate, read_columns
+from jaxphoto.io.text_tables import Table, concatenate, finite, read_columns
 
 CAMERA = "camera"
 _METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
@@ -51,7 +51,12 @@ def read_dbat(source: Path) -> BlockTables:
 
 def _scripts(source: Path) -> list[Path]:
     paths = sorted(source.glob("*.xml")) if source.is_dir() else [source] if source.suffix == ".xml" else []
-    return [path for path in paths if path.is_file() and b"dbat_script_version" in path.read_bytes()[:2000]]
+    return [path for path in paths if path.is_file() and _names_itself(path)]
+
+
+def _names_itself(path: Path) -> bool:
+    with path.open("rb") as file:
+        return b"dbat_script_version" in file.read(2000)
 
 
 def _read(script: Script, element: ET.Element) -> Table:
@@ -98,10 +103,10 @@ def _image_sigma(script: Script, element: ET.Element, table: Table, axis: str) -
     """Pixels: the attribute overrides the columns."""
     for name in ("sxy", f"s{axis}"):
         if name in element.attrib:
-            try:
-                return np.full(len(table), float(element.attrib[name]))
-            except ValueError:
-                raise script.error(f"{name} = {element.attrib[name]!r} is not a number; give it in pixels") from None
+            value = finite(element.attrib[name])
+            if value is None:
+                raise script.error(f"{name} = {quoted(element.attrib[name])} is not a number; give it in pixels")
+            return np.full(len(table), value)
     for name in ("sxy", f"s{axis}"):
         if name in table:
             return table.sigmas(name)
@@ -121,13 +126,13 @@ def _control(script: Script, tag: str, role: str) -> Table | None:
         raise script.error(f"<{tag}> names no file; add <file format='id,label,x,y,z,sx,sy,sz'>")
     table = concatenate([control_table(_read(script, e), role, _METRES[metres]) for e in elements])
     for element in section.findall("filter"):
-        wanted = [part.strip() for part in element.get("id", "").split(",")]
+        wanted = {part.strip() for part in element.get("id", "").split(",")}
         action = (element.text or "").strip()
-        if action not in ("keep", "remove") or wanted == [""]:
+        if action not in ("keep", "remove") or wanted == {""}:
             raise script.error(
                 f"a <filter> of <{tag}> is not understood; write <filter id='1,2'>keep or remove</filter>"
             )
-        chosen = np.isin(table.text("point").astype(str), wanted)
+        chosen = np.array([point in wanted for point in table.text("point")], bool)
         table = table.take(chosen if action == "keep" else ~chosen)
     return table
 

@@ -4,7 +4,9 @@ import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import NamedTuple
 
-from jaxphoto.errors import InputError
+from jaxphoto.errors import InputError, quoted
+from jaxphoto.io.text_tables import finite
+from jaxphoto.io.whole_text import SMALL, read_whole
 
 
 class Script(NamedTuple):
@@ -36,14 +38,12 @@ class Script(NamedTuple):
     def numbers(self, place: str, default: str, n: int | None = None) -> list[float]:
         """The comma-separated numbers of an element, `n` of them if that is given."""
         text = self.text(place, default)
-        try:
-            values = [float(part) for part in text.split(",")]
-        except ValueError:
-            values = []
-        if not values or n not in (None, len(values)):
+        values = [finite(part) for part in text.split(",")]
+        known = [value for value in values if value is not None]
+        if len(known) < len(values) or n not in (None, len(values)):
             many = f"{n} numbers" if n else "numbers"
-            raise self.error(f"<{place.split('/')[-1]}> is {text!r}; give {many} separated by commas")
-        return values
+            raise self.error(f"<{place.split('/')[-1]}> is {quoted(text)}; give {many} separated by commas")
+        return known
 
     def file(self, element: ET.Element) -> Path:
         """The file an element names, by the base folder of <input>."""
@@ -57,9 +57,11 @@ class Script(NamedTuple):
 
 def open_script(path: Path) -> Script:
     """The script in a file. Raises InputError with the line of a syntax error."""
+    content = read_whole(path, SMALL)
     try:
-        return Script(path, ET.parse(path).getroot())
-    except ET.ParseError as error:
+        return Script(path, ET.fromstring(content))
+    # An encoding that is unknown, or that the parser does not read, has errors of its own.
+    except (ET.ParseError, LookupError, ValueError) as error:
         raise InputError(f"{path.name}: {error}; correct the XML there") from None
 
 

@@ -7,7 +7,9 @@ so all of them change sign. Its model 3 applies 1 + as before the polynomial: `a
 
 from typing import Any
 
+from jaxphoto.errors import quoted
 from jaxphoto.io.dbat.script import Script, setting
+from jaxphoto.io.text_tables import finite
 
 # Lens models of DBAT that agree with Brown's here up to sign ("Backward (Photogrammetry)").
 _MODELS = ("1", "3")
@@ -23,6 +25,8 @@ def camera_settings(script: Script) -> dict[str, Any]:
     if (model := script.text(f"{c}/model", "3")) not in _MODELS:
         raise script.error(f"lens model {model} has no equal here; use one of {', '.join(_MODELS)}")
     width, height = (int(n) for n in script.numbers(f"{c}/image", "", 2))
+    if min(width, height) < 1:
+        raise script.error(f"<image> is {width} x {height} pixels; give the format of the camera")
     pixel = _pixel_mm(script, f"{c}/sensor", width, height)
     interior = dict.fromkeys(("c_mm", "xp_mm", "yp_mm", "k1", "k2", "k3", "p1", "p2", "b1"), 0.0)
     interior["c_mm"] = script.numbers(f"{c}/focal", "0")[0]
@@ -46,12 +50,10 @@ def camera_settings(script: Script) -> dict[str, Any]:
 def _pixel_mm(script: Script, place: str, width: int, height: int) -> float:
     text = script.text(place, "")
     parts = [part.strip() for part in text.split(",")]
-    try:
-        sizes = [float(p) / n for p, n in zip(parts, (width, height), strict=True) if p != "auto"]
-    except ValueError:
-        sizes = []
-    if not sizes:
-        raise script.error(f"<sensor> is {text!r}; give width,height in mm, one of which may be auto")
+    given = [(finite(part), n) for part, n in zip(parts, (width, height), strict=False) if part != "auto"]
+    sizes = [length / n for length, n in given if length is not None and length > 0]
+    if len(parts) != 2 or not sizes or len(sizes) < len(given):
+        raise script.error(f"<sensor> is {quoted(text)}; give width,height in mm, one of which may be auto")
     if abs(sizes[0] - sizes[-1]) > 1e-6 * sizes[0]:
         raise script.error(f"the pixels of {sizes[0]:g} x {sizes[-1]:g} mm are not square; give the aspect instead")
     return sizes[-1]
