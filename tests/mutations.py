@@ -14,6 +14,7 @@ import traceback
 import warnings
 import zlib
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,10 +23,16 @@ import pandas as pd
 
 from jaxphoto.camera import InteriorOrientation, OpenCv
 from jaxphoto.errors import JaxphotoError
-from jaxphoto.io import read_block, read_recipe
+from jaxphoto.image_measurement import read_grey
+from jaxphoto.io import clouds, read_block, read_recipe, read_source
 from jaxphoto.io.cameras import read_camera_file, write_camera_file
+from jaxphoto.io.dbat import read_dbat
 from jaxphoto.io.draws_folder import DrawsFolder
+from jaxphoto.io.photomodeler import read_photomodeler
+from jaxphoto.io.raster import read_dsm
 from jaxphoto.io.trajectory import Records, read_records, write_flight_csv, write_sbet
+from tests import sound_files
+from tests.io import test_bal, test_colmap
 from tests.io import test_cameras as cameras
 from tests.io import test_surfaces as surfaces
 from tests.io.conftest import FILES
@@ -187,6 +194,16 @@ SUMMARY = (
     '{"cameras": {"nadir": {"width_px": 4500, "height_px": 3000, "pixel_mm": 0.008, "distortion": "smac", '
     '"sign": "add"}}}'
 )
+
+
+def _cloud(kind: str) -> Callable[[Path], object]:
+    return lambda folder: clouds.read_cloud(folder / f"a.{kind}")
+
+
+def _picture(kind: str) -> Callable[[Path], object]:
+    return lambda folder: read_grey(folder / f"a.{kind}")
+
+
 READERS: dict[str, Reader] = {
     "block": Reader(lambda: {name: content.encode() for name, content in FILES.items()}, read_block),
     "block-map": Reader(written_by(_map_block), read_block),
@@ -224,6 +241,20 @@ READERS: dict[str, Reader] = {
     "camera-results": Reader(
         text(interior__csv=cameras.INTERIOR, correlation__csv=cameras.CORRELATION, summary__json=SUMMARY), _camera("")
     ),
+    "aicon": Reader(text(**sound_files.AICON), lambda folder: read_source(folder, "aicon")),
+    "bal": Reader(text(problem__txt="\n".join(test_bal.lines_of())), lambda folder: read_source(folder, "bal")),
+    "colmap-text": Reader(written_by(test_colmap.write_text), lambda folder: read_source(folder, "colmap")),
+    "colmap-binary": Reader(written_by(test_colmap.write_binary), lambda folder: read_source(folder, "colmap")),
+    "dbat": Reader(text(**sound_files.DBAT), read_dbat),
+    "photomodeler": Reader(text(**sound_files.PHOTOMODELER), read_photomodeler),
+    "dsm": Reader(sound_files.surface, lambda folder: read_dsm(folder / "a.tif")),
+    "cloud-ply-text": Reader(sound_files.ply_text, lambda folder: clouds.read_cloud(folder / "a.ply")),
+    **{f"cloud-{kind}": Reader(partial(sound_files.cloud, kind), _cloud(kind)) for kind in ("csv", "ply")},
+    **{
+        f"cloud-{kind}-{of}": Reader(partial(sound_files.cloud, kind, of), _cloud(kind))
+        for kind, of in (("las", 3), ("las", 6), ("laz", 1), ("laz", 3), ("laz", 6), ("laz", 8), ("laz", 10))
+    },
+    **{f"picture-{kind}": Reader(partial(sound_files.picture, kind), _picture(kind)) for kind in ("jpg", "png", "tif")},
 }
 """The readers by name."""
 

@@ -16,7 +16,7 @@ from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from jaxphoto.adjustment import MAX_STEPS, Adjustment, Outcome, Sizes, common_sizes, linearise, solve
 from jaxphoto.arrays import still
@@ -24,7 +24,7 @@ from jaxphoto.block import Block
 from jaxphoto.errors import BlockError
 from jaxphoto.procedures.adjust import start_of
 from jaxphoto.procedures.cross_validation import measured_discrepancies
-from jaxphoto.statistics import LEAST_CHECKED, LEVEL, Suspect, covariance, redundancy_numbers
+from jaxphoto.statistics import LEAST_CHECKED, LEVEL, Suspect, chi_square_limit, covariance, redundancy_numbers
 from jaxphoto.unknowns import Unknowns
 from jaxphoto.variants import without_observations
 
@@ -160,16 +160,8 @@ def _sizes(at: Adjustment, r: Blocks, predicted: bool = False) -> dict[str, Floa
         known = np.where(checked[name], values, 1.0)
         squares = np.sum(np.where(checked[name], along * known if predicted else along / known, 0.0), axis=1)
         freedom = np.maximum(checked[name].sum(axis=1), 1)
-        found[name] = np.sqrt(squares / _limit(freedom, n))
+        found[name] = np.sqrt(squares / chi_square_limit(freedom, LEVEL / max(n, 1)))
     return found
-
-
-def _limit(freedom: Int[np.ndarray, "*n"], n: int) -> Float[np.ndarray, "*n"]:
-    """What the largest of `n` squares of so many degrees of freedom exceeds with probability `LEVEL` at most."""
-    # Imported when first wanted: SciPy takes a fifth of a second, and importing jaxphoto does not need it.
-    from scipy.special import gammainccinv
-
-    return 2 * gammainccinv(freedom / 2, LEVEL / max(n, 1))
 
 
 def _scales(at: Adjustment, r: Blocks) -> dict[str, float]:
@@ -252,7 +244,7 @@ def _exchanged(at: Adjustment, left: Masks, sigma0: float) -> list[tuple[int, in
     """Rows of image points left out, two of an image, that fit each other's prediction."""
     p, r = at.block.image_points, _redundancy(at)[at.block.image_points.group]
     # Both coordinates of two points are tested; as all others, against all others.
-    limit = sigma0**2 * float(_limit(np.array(2), len(p)))
+    limit = sigma0**2 * float(chi_square_limit(np.array(2), LEVEL / len(p)))
     measured, missed = still(p.xy), measured_discrepancies(at.block, at.unknowns)
     predicted = measured - missed
     found: list[tuple[int, int]] = []

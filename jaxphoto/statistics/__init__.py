@@ -25,6 +25,7 @@ from jaxphoto.statistics.discrepancy import (
     spread_of,
 )
 from jaxphoto.statistics.global_test import VarianceFactor, global_test, group_factors
+from jaxphoto.statistics.quantiles import chi_square_limit
 from jaxphoto.statistics.reliability import (
     LEAST_CHECKED,
     Redundancy,
@@ -45,7 +46,7 @@ from jaxphoto.statistics.significance import (
 __all__ = [
     "DELTA0", "EOP_NAMES", "LEAST_CHECKED", "LEVEL", "SIGNIFICANCE_LEVEL", "BlunderTest", "Correlations", "Covariance",
     "Hidden", "IfZero", "Redundancy", "Rotations", "Significance", "Spread", "Suspect", "VarianceFactor",
-    "a_priori_sigmas", "angle_differences", "blunder_test", "check_discrepancies", "chi_square_p",
+    "a_priori_sigmas", "angle_differences", "blunder_test", "check_discrepancies", "chi_square_limit", "chi_square_p",
     "correlation_matrix", "correlations", "covariance", "critical_w", "detectable_errors", "error_precision",
     "global_test", "group_factors", "if_zero", "normalised_residuals", "observation_groups", "physical_residuals",
     "point_differences", "prepare_statistics", "redundancy_numbers", "residual_spread", "significance", "spread_of",

@@ -17,6 +17,7 @@ from jaxtyping import Float
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.arrays import still
 from jaxphoto.statistics.discrepancy import observation_groups
+from jaxphoto.statistics.quantiles import student_limit
 from jaxphoto.statistics.reliability import LEAST_CHECKED, UNCHECKED, Redundancy, error_precision, normalised_residuals
 
 LEVEL = 1e-3
@@ -82,10 +83,7 @@ def critical_w(n: int, redundancy: int, level: float = LEVEL) -> float:
     """
     if redundancy < 2 or n == 0:
         return float("inf")
-    # Imported when first wanted: SciPy takes a fifth of a second, and importing jaxphoto does not need it.
-    from scipy.special import stdtrit
-
-    t = float(-stdtrit(redundancy - 1, level / (2 * n)))
+    t = student_limit(redundancy - 1, level / n)
     return t * redundancy**0.5 / (redundancy - 1 + t * t) ** 0.5
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.statistics.discrepancy import observation_groups
+from jaxphoto.statistics.quantiles import chi_square_tails
 from jaxphoto.statistics.reliability import Redundancy
 
 
@@ -45,8 +46,5 @@ def group_factors(adjusted: Adjustment, redundancy: Redundancy) -> list[Variance
 def _tested(group: str, n: int, square_sum: float, redundancy: float) -> VarianceFactor:
     if redundancy <= 0:
         return VarianceFactor(group, n, redundancy, 1.0, 1.0)
-    # Imported when first wanted: SciPy takes a fifth of a second, and importing jaxphoto does not need it.
-    from scipy.special import gammainc, gammaincc
-
-    p = 2 * min(tail(redundancy / 2, square_sum / 2) for tail in (gammainc, gammaincc))
-    return VarianceFactor(group, n, redundancy, square_sum / redundancy, min(float(p), 1.0))
+    p = 2 * min(chi_square_tails(square_sum, redundancy))
+    return VarianceFactor(group, n, redundancy, square_sum / redundancy, min(p, 1.0))

@@ -1,0 +1,91 @@
+"""Small sound files of formats whose real ones are large or not ours, for tests that spoil them."""
+
+import io
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from jaxphoto.io import clouds
+from jaxphoto.io.clouds.coordinate_system import epsg_system
+from jaxphoto.io.raster import write_dsm
+from jaxphoto.lidar.raster import Raster
+from tests.io.test_clouds import sample, write_las
+
+Files = dict[str, bytes]
+
+AICON = {
+    "a.ior": "1 1 -28.785 0.01 -0.02 -1.0e-4 1.5e-7 8.0\n-2.0e-10\n1.0e-5 -2.0e-5\n3.0e-5 4.0e-5\n"
+    "35.968 23.979 6000 4000\n",
+    "a.phc": "".join(
+        f"{i} {p} {x}.5 {-x}.25 0.0005 0.0005 0.0 0.0 1 1 1\n" for i in (1, 2) for p, x in ((11, 1), (12, 2), (13, 5))
+    ),
+    "a.eor": "1 1 10.0 20.0 3000.0 0.1 0.2 0.3 1 1 1\n2 1 500.0 20.0 3000.0 -0.1 0.2 0.3 1 1 1\n",
+    "a.obc": "".join(f"{p} {p}.5 {2 * p} 0.125 0.01 0.01 0.01 2 1 1 1\n" for p in (11, 12, 13)),
+    "a.scale": "1 bar 11 12 1000.25 0.01 1\n",
+}
+DBAT = {
+    "a.xml": """<?xml version="1.0" encoding="utf-8"?>
+<document dbat_script_version="1.0"><meta><name>small</name><project_unit>m</project_unit></meta>
+<input base_dir="$HERE">
+<ctrl_pts><file format="id,label,x,y,z,sxyz">control.txt</file><filter id="11,12">keep</filter></ctrl_pts>
+<images><file format="id,path">images.txt</file></images>
+<image_pts><file format="im,id,x,y" sxy="0.5">points.txt</file></image_pts>
+<cameras><camera><name>one</name><unit>mm</unit><sensor>auto,5.4</sensor><image>2272,1704</image><focal>7.5</focal>
+<model>3</model><nK>3</nK><nP>2</nP><K>0,0,0</K><pp>0,0</pp></camera></cameras></input>
+<operations><operation><set_initial_values><io><all>default</all></io></set_initial_values></operation>
+<operation><set_bundle_estimate_params><io><all>true</all><skew>false</skew></io><eo>true</eo><op>true</op>
+</set_bundle_estimate_params></operation></operations></document>
+""",
+    "control.txt": "11,a,1.0,2.0,3.0,0.01\n12,b,1.5,2.5,3.0,0.01\n",
+    "images.txt": "1,a/one.jpg\n2,a/two.jpg\n",
+    "points.txt": "1,11,100.5,200.25\n1,12,300.5,200.25\n2,11,150.5,210.0\n2,12,350.5,210.0\n",
+}
+PHOTOMODELER = {
+    "a-pmexport.txt": "small\n0.0005 20 2272 1704\nmm\n7.5 3.6 2.7 7.2 5.4 0 0 0 0 0\n0\n0 one.jpg\n1 two.jpg\n"
+    "0 11 100.5 200.25 1 1\n0 12 300.5 200.25 1 1\n1 11 150.5 210.0 1 1\n1 12 350.5 210.0 1 1\n",
+    "ctrlpts-weighted.txt": DBAT["control.txt"].replace(",0.01", ",0.01,0.01,0.01"),
+    "fake-camera-positions.txt": "one.jpg,1.0,2.0,3.0,0.5\ntwo.jpg,2.0,2.0,3.0,0.5\n",
+}
+
+
+def cloud(kind: str, point_format: int | None = None) -> Files:
+    """A cloud of some hundred points; LAS and LAZ of a format of points, by laspy alone."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"a.{kind}"
+        few = sample(400)
+        if point_format is None:
+            clouds.write_cloud(few, path)
+        else:
+            write_las(path, few.xyz, "EPSG:32722", point_format=point_format, classification=few.classification)
+        return {path.name: path.read_bytes()}
+
+
+def ply_text() -> Files:
+    """A PLY file in text."""
+    names = ("x", "y", "z", "classification", "time_s", "strip")
+    header = ["ply", "format ascii 1.0", "element vertex 40", *(f"property double {name}" for name in names)]
+    rows = [f"{k}.5 {2 * k} -{k}.25 2 {k}.125 {k // 20}" for k in range(40)]
+    return {"a.ply": "\n".join([*header, "end_header", *rows, ""]).encode()}
+
+
+def picture(kind: str) -> Files:
+    """A small photograph with EXIF."""
+    rows, columns = np.mgrid[:48, :64]
+    exif = Image.Exif()
+    exif[271], exif[274] = "Maker", 1
+    exif.get_ifd(0x8769).update({37386: 24.0, 41989: 36, 41486: 3000.0, 41488: 2})
+    buffer = io.BytesIO()
+    Image.fromarray(np.stack([rows * 5, columns * 3, rows + columns], axis=2).astype(np.uint8)).save(
+        buffer, {"jpg": "JPEG", "tif": "TIFF"}.get(kind, kind), exif=exif
+    )
+    return {f"a.{kind}": buffer.getvalue()}
+
+
+def surface() -> Files:
+    """A surface model of a map system."""
+    with tempfile.TemporaryDirectory() as folder:
+        heights = np.add.outer(np.arange(40.0), np.arange(50.0))
+        write_dsm(Path(folder) / "a.tif", Raster(heights, 5e5, 5e6, 1.0), epsg_system(32633, "a"))
+        return {"a.tif": (Path(folder) / "a.tif").read_bytes()}
