@@ -66,7 +66,14 @@ from jaxphoto.observations import (
 from jaxphoto.parameters import AbstractParameters
 from jaxphoto.procedures import adjust, boresight, georeference, snoop
 from jaxphoto.simulation import simulate
-from jaxphoto.statistics import angle_differences, covariance, point_differences, significance
+from jaxphoto.statistics import (
+    Selection,
+    angle_differences,
+    covariance,
+    point_differences,
+    significance,
+    variance_components,
+)
 from jaxphoto.unknowns import FIXED, FREE, Unknowns, Weighted, default_priors
 
 if TYPE_CHECKING:
@@ -84,14 +91,14 @@ __all__ = [
     "FIXED", "FREE", "MAX_STEPS", "AbstractDistortion", "AbstractObservations", "AbstractParameters",
     "AbstractProjection", "Adjustment", "Attitudes", "Block", "BlockError", "ControlRows", "Corrections", "Datum",
     "DatumError", "Distances", "Exposure", "ExteriorOrientation", "Frame", "ImageRows", "InputError",
-    "InteriorOrientation", "JaxphotoError", "KnownParameters", "Mount", "Outcome", "RankError", "Sensor", "Start",
-    "StationRows", "StripBias", "Surface", "SurfaceRows", "Tables", "Unknowns", "Weighted", "adjust",
+    "InteriorOrientation", "JaxphotoError", "KnownParameters", "Mount", "Outcome", "RankError", "Selection", "Sensor",
+    "Start", "StationRows", "StripBias", "Surface", "SurfaceRows", "Tables", "Unknowns", "Weighted", "adjust",
     "angle_differences", "bias", "boresight", "calibrate", "common_sizes", "conversion_error", "convert",
     "correlated", "covariance", "decentring_from_symmetry", "default_priors", "direct_orientation", "georeference",
     "ground_point", "image_ray", "intersect", "monte_carlo", "orient", "point_differences", "principal_points",
     "project", "read_block", "read_recipe", "read_source", "readjust", "rebalance", "rebalance_covariance",
-    "significance", "simulate", "simultaneous", "snoop", "symmetry_from_decentring", "touching", "write_block",
-    "write_simulation",
+    "significance", "simulate", "simultaneous", "snoop", "symmetry_from_decentring", "touching",
+    "variance_components", "write_block", "write_simulation",
 ]  # fmt: skip
 
 # Files and tables bring pandas and more, a third of a second, and studies are not for every day: they are imported when

@@ -6,7 +6,6 @@ One block, because what costs is compiling: all tests of `test_declared` ask the
 import dataclasses
 import functools
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -121,15 +120,8 @@ def residuals_of(block: Block, unknowns: Unknowns):
 
 def changed(block: Block, change) -> Block:
     """The block with `change(rows, k)` in place of all observations; k is the place of their group, -1 for images."""
-    where = lambda b: (b.stations, b.attitudes, b.control, b.surfaces, b.distances)  # noqa: E731
-    given = [change(block.image_points, -1)]
-    for k, of in enumerate(block.observations):
-        given.append(change(of, k))
-    more = iter(given[6:])
-    block = eqx.tree_at(lambda b: (b.image_points, *where(b)), block, tuple(given[:6]))
-    return dataclasses.replace(
-        block, more=tuple(next(more) if isinstance(m, AbstractObservations) else m for m in block.more)
-    )
+    others = [change(of, k) for k, of in enumerate(block.observations)]
+    return block.with_observations(change(block.image_points, -1), others)
 
 
 def _observed(block: Block, truth: Unknowns, seed: int) -> Block:

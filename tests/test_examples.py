@@ -20,7 +20,16 @@ ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "examples"
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), *EXAMPLES.glob("*.md")])
 # Whole procedures on blocks of their own size, for each of which there are tests.
-LONG = ("boresight", "correlation_studies", "experiments", "extending", "monte_carlo", "network_design", "sensitivity")
+LONG = (
+    "boresight",
+    "correlation_studies",
+    "experiments",
+    "extending",
+    "monte_carlo",
+    "network_design",
+    "sensitivity",
+    "weights",
+)
 
 
 @pytest.fixture(scope="module")

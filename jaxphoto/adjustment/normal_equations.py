@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxphoto.adjustment.layout.tiled import TiledStructure, TiledValues
+from jaxphoto.adjustment.layout.tiled import TiledResiduals, TiledStructure, TiledValues
 from jaxphoto.adjustment.model.numbers import Increments, UnknownArrays, state_at, zero_increments
 from jaxphoto.adjustment.solver.band import Band, dense, factor_band, invert_band, pivots, solve_band
 from jaxphoto.adjustment.solver.elimination import FactoredNormal, gradient, reduce_right, solve_factored, solve_reduced
@@ -57,6 +57,16 @@ class NormalEquations(eqx.Module):
     def solve(self, b: Increments) -> Increments:
         """x of N x = b; of many by `jax.vmap`."""
         return solve_factored(self.factored.reduced, self.factored.factor, b, self.at)
+
+    def seen(self, z: TiledResiduals) -> TiledResiduals:
+        """J N^-1 J' z: by how much adjusted observations move with the observed ones, all over their sigmas.
+
+        I minus it is Q_vv P of whitened observations; of many z by `jax.vmap`.
+        """
+        at = self.at
+        _, moved = jax.linearize(lambda y: at._replace(increments=y).residuals(), at.increments)
+        (b,) = jax.linear_transpose(moved, at.increments)(z)
+        return moved(self.solve(b))
 
     def cofactors(self, of_rows: Bool[Numbers, ""]) -> tuple[Cofactors, RowCofactors]:
         """The inverse of N for images, shared unknowns and each point, and of rows in tiles, if these are wanted."""

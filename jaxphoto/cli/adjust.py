@@ -17,15 +17,20 @@ from jaxphoto.report import (
     Level,
     Tables,
     Verdict,
+    component_findings,
+    component_tables,
     left_out_table,
     prepare_pictures,
     print_adjustment,
+    print_components,
     snooped_findings,
     verdict_of,
     write_results,
 )
-from jaxphoto.statistics import EOP_NAMES
+from jaxphoto.statistics import EOP_NAMES, SPLITS
 from jaxphoto.writing import check_folder, whole_folder
+
+_SPLITS = ", ".join(SPLITS)
 
 
 @app.command("adjust")
@@ -42,10 +47,14 @@ def adjust_command(
         ),
     ] = False,
     max_steps: Annotated[int, typer.Option(min=1, help="Most iterations.")] = jaxphoto.MAX_STEPS,
+    weights: Annotated[
+        str | None, typer.Option(help=f"Estimate variance components, adjust with them: group, or by {_SPLITS}.")
+    ] = None,
 ) -> None:
     """Adjust a block and write tables, statistics and a report. Exit code 1: written, but the verdict is red."""
     if rotations not in EOP_NAMES:
         raise JaxphotoError(f"--rotations {rotations}: there are {', '.join(EOP_NAMES)}")
+    splits = None if weights is None else _splits_of(weights)
     check_folder(out, block)
     Thread(target=prepare_pictures, daemon=True).start()
     console, errors = plain_console(), plain_console(stderr=True)
@@ -61,20 +70,38 @@ def adjust_command(
         if snoop:
             snooped = jaxphoto.snoop(read, max_steps=max_steps, report=status.update)
         adjusted = snooped.adjusted if snooped else adjust_for_tables(read, max_steps)
+        components = None
+        if splits is not None and bool(adjusted.converged):
+            status.update("estimating variance components")
+            components = jaxphoto.variance_components(adjusted, splits, max_steps=max_steps)
+            adjusted = components.adjusted
         status.update("computing statistics")
         tables = Tables(adjusted, rotations)  # type: ignore[arg-type]
         verdict = verdict_of(tables)
-        if snooped:
-            verdict = Verdict.of([*snooped_findings(snooped), *verdict.findings])
+        found = snooped_findings(snooped) if snooped else []
+        found += component_findings(components) if components else []
+        verdict = Verdict.of([*found, *verdict.findings])
         status.update(f"writing {out}")
         times = adjusted.seconds | seconds
         order = ("read", "compile", "solve", "covariance")
         with whole_folder(out) as work:
             write_results(tables, verdict, work, {name: times[name] for name in order})
+            for name, table in (component_tables(components) if components else {}).items():
+                table.to_csv(work / f"{name}.csv", index=False)
             if snooped:
                 left_out_table(snooped, read).to_csv(work / "left_out.csv", index=False)
                 write_block(adjusted.block, work / "block")
     print_adjustment(tables, verdict, console)
+    if components:
+        print_components(components, console)
     console.print(f"results in {out} (open report.html)")
     if verdict.level == Level.ALARM:
         raise typer.Exit(1)
+
+
+def _splits_of(words: str) -> tuple[str, ...]:
+    """The splits that `--weights` names; none for "group", one component a group."""
+    splits = tuple(dict.fromkeys(word.strip() for word in words.split(",")))
+    if unknown := [word for word in splits if word not in (*SPLITS, "group")]:
+        raise JaxphotoError(f"--weights {unknown[0]}: there are group, {_SPLITS}, with commas between")
+    return tuple(word for word in splits if word != "group")

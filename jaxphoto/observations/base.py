@@ -100,14 +100,13 @@ class AbstractObservations(eqx.Module):
         """The residual of one row over its standard deviation."""
         return residual / self.sigma  # type: ignore[attr-defined]
 
+    def with_sigmas_times(self, factor: Float[Numbers, "..."]) -> Self:
+        """The same rows with `factor` times the standard deviations, number by number: (n,) or (n, axes)."""
+        return eqx.tree_at(lambda rows: rows.sigma, self, self.sigmas * factor)
+
     def without_weight(self) -> Self:
         """The same rows, which count for nothing: what padding is made of."""
         return eqx.tree_at(lambda rows: rows.sigma, self, np.full(np.shape(self.sigmas), np.inf))
-
-    def scaled(self, factor: Float[Numbers, "n"]) -> Self:
-        """The same rows with standard deviations `factor` times as large, one a row."""
-        sigma = still(self.sigmas)
-        return eqx.tree_at(lambda rows: rows.sigma, self, (sigma.T * factor).T)
 
     def indices(self) -> list[tuple[str, Int[Numbers, "..."]]]:
         """What the rows touch, and which: (n,), or more axes where a row touches several."""

@@ -44,6 +44,12 @@ class Correlated(AbstractObservations):
         """L^-1 times the residuals."""
         return self.whitener @ residual
 
+    def with_sigmas_times(self, factor: Float[Numbers, "sets n"]) -> "Correlated":
+        """The same sets with D C D for the covariance C, D the diagonal matrix of `factor`: correlations stay."""
+        where = lambda sets: (sets.covariance, sets.whitener)  # noqa: E731
+        new = self.covariance * factor[:, :, None] * factor[:, None], self.whitener / factor[:, None]
+        return eqx.tree_at(where, self, new)
+
     def without_weight(self) -> "Correlated":
         """The same sets, which count for nothing."""
         return eqx.tree_at(lambda sets: sets.whitener, self, np.zeros(np.shape(self.whitener)))
@@ -61,12 +67,6 @@ class Correlated(AbstractObservations):
         """The same sets with other numbers observed."""
         inner = self.rows.with_observation(value.reshape(self.rows.observation.shape))
         return eqx.tree_at(lambda sets: sets.rows, self, inner)
-
-    def scaled(self, factor: Float[Numbers, "sets"]) -> "Correlated":
-        """The same sets with standard deviations `factor` times as large, one factor a set."""
-        f = np.asarray(factor)[:, None, None]
-        where = lambda sets: (sets.covariance, sets.whitener)  # noqa: E731
-        return eqx.tree_at(where, self, (still(self.covariance) * f**2, still(self.whitener) / f))
 
     @property
     def sigmas(self) -> Numbers:

@@ -22,6 +22,7 @@ from jaxphoto.adjustment import MAX_STEPS, Adjustment, Outcome, Sizes, common_si
 from jaxphoto.arrays import still
 from jaxphoto.block import Block
 from jaxphoto.errors import BlockError
+from jaxphoto.observations import AbstractObservations
 from jaxphoto.procedures.adjust import start_of
 from jaxphoto.procedures.cross_validation import measured_discrepancies
 from jaxphoto.statistics import LEAST_CHECKED, LEVEL, Suspect, chi_square_limit, covariance, redundancy_numbers
@@ -118,7 +119,7 @@ def _robust(
     r: Blocks = {}
     for step in range(_ROBUST_STEPS + 1):
         report(f"robust step {step}" if step else "adjusting all observations")
-        weighed = block.with_observations({name: own.scaled(weight[name] ** -0.5) for name, own in rows.items()})
+        weighed = block.with_observations({name: _weighed(own, weight[name]) for name, own in rows.items()})
         kept, point = without_observations(weighed, left)
         found = solve(kept, _some_points(unknowns, point), kept.priors, max_steps, sizes)
         if found.astray.any():
@@ -137,6 +138,12 @@ def _robust(
     if at is None:
         raise BlockError(f"too many object points fly away: {Outcome.ASTRAY.value}")
     return at, r, left
+
+
+def _weighed(rows: AbstractObservations, weight: Float[np.ndarray, "_"]) -> AbstractObservations:
+    """The rows with other weights, one factor a row."""
+    factor = (weight**-0.5).reshape(-1, *[1] * (np.ndim(rows.sigmas) - 1))
+    return rows.with_sigmas_times(np.broadcast_to(factor, np.shape(rows.sigmas)))
 
 
 def _redundancy(adjusted: Adjustment) -> Blocks:

@@ -16,6 +16,7 @@ from jaxphoto.report.snooped import left_out_table, snooped_findings
 from jaxphoto.report.tables import Tables
 from jaxphoto.report.terminal import print_adjustment, print_warning
 from jaxphoto.report.verdict import verdict_of
+from jaxphoto.report.weights import component_findings, component_tables, print_components
 
 __all__ = [
     "STYLE",
@@ -24,6 +25,8 @@ __all__ = [
     "Tables",
     "Verdict",
     "check_points_figure",
+    "component_findings",
+    "component_tables",
     "correlation_figure",
     "layout_figure",
     "left_out_table",
@@ -31,6 +34,7 @@ __all__ = [
     "prepare_pictures",
     "print_adjustment",
     "print_boresight",
+    "print_components",
     "print_warning",
     "report_page",
     "residuals_figure",

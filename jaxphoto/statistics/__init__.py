@@ -25,6 +25,8 @@ from jaxphoto.statistics.discrepancy import (
     spread_of,
 )
 from jaxphoto.statistics.global_test import VarianceFactor, global_test, group_factors
+from jaxphoto.statistics.partial_redundancy import PartialRedundancy, partial_redundancy
+from jaxphoto.statistics.partition import SPLITS, Partition, Parts, Selection, parts_of
 from jaxphoto.statistics.quantiles import chi_square_limit
 from jaxphoto.statistics.reliability import (
     LEAST_CHECKED,
@@ -42,13 +44,15 @@ from jaxphoto.statistics.significance import (
     if_zero,
     significance,
 )
+from jaxphoto.statistics.variance_components import VarianceComponents, variance_components
 
 __all__ = [
-    "DELTA0", "EOP_NAMES", "LEAST_CHECKED", "LEVEL", "SIGNIFICANCE_LEVEL", "BlunderTest", "Correlations", "Covariance",
-    "Hidden", "IfZero", "Redundancy", "Rotations", "Significance", "Spread", "Suspect", "VarianceFactor",
-    "a_priori_sigmas", "angle_differences", "blunder_test", "check_discrepancies", "chi_square_limit", "chi_square_p",
+    "DELTA0", "EOP_NAMES", "LEAST_CHECKED", "LEVEL", "SIGNIFICANCE_LEVEL", "SPLITS", "BlunderTest", "Correlations",
+    "Covariance", "Hidden", "IfZero", "PartialRedundancy", "Partition", "Parts", "Redundancy", "Rotations",
+    "Selection", "Significance", "Spread", "Suspect", "VarianceComponents", "VarianceFactor", "a_priori_sigmas",
+    "angle_differences", "blunder_test", "check_discrepancies", "chi_square_limit", "chi_square_p",
     "correlation_matrix", "correlations", "covariance", "critical_w", "detectable_errors", "error_precision",
-    "global_test", "group_factors", "if_zero", "normalised_residuals", "observation_groups", "physical_residuals",
-    "point_differences", "prepare_statistics", "redundancy_numbers", "residual_spread", "significance", "spread_of",
-    "worst_checked",
+    "global_test", "group_factors", "if_zero", "normalised_residuals", "observation_groups", "partial_redundancy",
+    "parts_of", "physical_residuals", "point_differences", "prepare_statistics", "redundancy_numbers",
+    "residual_spread", "significance", "spread_of", "variance_components", "worst_checked",
 ]  # fmt: skip

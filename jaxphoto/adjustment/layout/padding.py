@@ -9,6 +9,7 @@ and put back in the block's own order. Ids stay outside: no program depends on t
 import dataclasses
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -17,7 +18,7 @@ from jaxphoto.adjustment.layout.tile_layout import LEAST, Places, Sizes, TileLay
 from jaxphoto.adjustment.layout.tiled import TiledResiduals, TiledStructure, TiledValues, Tiles
 from jaxphoto.adjustment.layout.tiling import size_class
 from jaxphoto.adjustment.model.numbers import Residuals, UnknownArrays, Values
-from jaxphoto.adjustment.model.observed_groups import ObservedGroup
+from jaxphoto.adjustment.model.observed_groups import ObservedGroup, RowsAtPoints
 from jaxphoto.adjustment.model.structure import CameraGroup, Structure
 from jaxphoto.arrays import still
 
@@ -44,6 +45,28 @@ class TiledBlock(NamedTuple):
         groups = zip(self.own.observed, residuals.others, strict=True)
         others = tuple(self.crop_rows(g, still(v)) for g, v in groups)
         return Residuals(others, still(residuals.datum), residuals.names, self.crop_image(residuals.image))
+
+    def pad_residuals(self, own: Residuals, fill: float) -> TiledResiduals:
+        """The reverse of `crop_residuals`: a number for each observation at its place, `fill` in all other places."""
+        s = self.structure
+
+        def rows(g: ObservedGroup) -> tuple[int, ...]:
+            return np.shape(jax.tree.leaves(g.own)[0])[-2 if isinstance(g.rows, RowsAtPoints) else -1 :]
+
+        image = (*s.tiles.image.shape[:2], 2, s.tiles.image.shape[2], s.tiles.per_tile)
+        shapes = (image, *((g.components, *rows(g)) for g in s.observed), np.shape(own.datum))
+        starts = np.cumsum([0, *(np.prod(shape, dtype=int) for shape in shapes)])
+
+        def split(numbers: np.ndarray) -> TiledResiduals:
+            pieces = zip(shapes, np.split(numbers, starts[1:-1]), strict=True)
+            image, *others, datum = (piece.reshape(shape) for shape, piece in pieces)
+            return TiledResiduals(tuple(others), datum, own.names, image)
+
+        laid = np.full(starts[-1], fill)
+        places = self.crop_residuals(split(np.arange(starts[-1], dtype=float)))
+        for place, values in zip(jax.tree.leaves(places), jax.tree.leaves(own), strict=True):
+            laid[place.astype(int)] = values
+        return split(laid)
 
     def crop_rows(self, group: ObservedGroup, numbers: np.ndarray) -> np.ndarray:
         """Numbers of padded rows, (components, ...), in the block's own order: (rows) where a row is one number."""

@@ -1,0 +1,51 @@
+"""Variance components as tables, a line each on the screen, and what to be warned of."""
+
+import pandas as pd
+from rich.console import Console
+
+from jaxphoto.report.findings import Finding, Level
+from jaxphoto.report.terminal import plain
+from jaxphoto.statistics import VarianceComponents
+
+
+def component_tables(found: VarianceComponents) -> dict[str, pd.DataFrame]:
+    """By the name of the file: variance_components, and variance_component_correlation.
+
+    Columns are group, observations, redundancy, factor, sigma_factor, degrees_of_freedom, supported; and group_a,
+    group_b, rho. A group that cannot support a component has the factor 1 and no sigma.
+    """
+    table = pd.DataFrame(
+        {
+            "group": found.labels,
+            "observations": found.observations,
+            "redundancy": found.redundancy,
+            "factor": found.factor,
+            "sigma_factor": found.sigma,
+            "degrees_of_freedom": found.degrees,
+            "supported": found.supported,
+        }
+    )
+    known = [(k, label) for k, label in enumerate(found.labels) if found.supported[k]]
+    rows = [(a, b, found.correlation[j, k]) for j, a in known for k, b in known if j != k]
+    return {
+        "variance_components": table,
+        "variance_component_correlation": pd.DataFrame(rows, columns=["group_a", "group_b", "rho"]),
+    }
+
+
+def component_findings(found: VarianceComponents) -> list[Finding]:
+    """Components that have not settled, then a sentence for each group that cannot support one."""
+    lost = f"the variance components have not settled after {found.rounds} rounds: estimate them for fewer groups"
+    sentences = [*([] if found.converged else [lost]), *found.sentences.values()]
+    return [Finding(Level.WARNING, text) for text in sentences]
+
+
+def print_components(found: VarianceComponents, console: Console) -> None:
+    """A line for each group: by what its standard deviations were multiplied, and the variance factor."""
+    console.print(f"variance components, adjusted with them ({found.rounds} rounds):")
+    for k, label in enumerate(found.labels):
+        factor, sigma = found.factor[k], found.sigma[k]
+        said = f"standard deviations x {factor**0.5:.3g}, variances x {factor:.3g} +- {sigma:.2g}"
+        counted = f"({found.observations[k]} observations, redundancy {found.redundancy[k]:.4g})"
+        line = f"  {label}: {said if found.supported[k] else 'as stated'} {counted}"
+        console.print(plain(line), soft_wrap=True)

@@ -1,0 +1,172 @@
+"""Variance components: the traces against dense matrices, the fixed point of REML, what cannot be estimated, truth."""
+
+import equinox as eqx
+import numpy as np
+import pytest
+
+from benchmarks.variance_components import TRUE, estimates, flight
+from jaxphoto import InputError, Selection, correlated, variance_components
+from jaxphoto.observations import StationRows
+from jaxphoto.report import component_tables, component_warnings
+from jaxphoto.statistics import partial_redundancy, parts_of
+from tests.adjustment.dense import at_optimum
+from tests.blocks import adjusted, rows
+from tests.checked_types import unchecked
+from tests.commands import run
+
+BLOCK = "everything"
+# Of seven parts each, so that one program serves all.
+SPLITS = (("xy-z",), ("camera",))
+
+
+def dense_traces(parts) -> np.ndarray:
+    """|R_kl|^2 by a dense projector; the last part is what is known beforehand."""
+    j = at_optimum(BLOCK).jacobian[:, at_optimum(BLOCK).free]
+    r = np.eye(len(j)) - j @ np.linalg.solve(j.T @ j, j.T)
+    of = np.concatenate([np.ravel(v) for v in parts.of.values()])
+    own = np.eye(len(parts.labels) + 1)[of]
+    return own.T @ r**2 @ own
+
+
+@pytest.mark.parametrize("split", SPLITS)
+def test_traces_are_those_of_dense_matrices(split):
+    parts = parts_of(adjusted(BLOCK), split)
+    assert len(parts.labels) == 7
+    found, expected = partial_redundancy(adjusted(BLOCK), parts, probes=10**6), dense_traces(parts)
+    np.testing.assert_allclose(found.matrix, expected, atol=1e-9)
+    np.testing.assert_allclose(found.redundancy, expected.sum(axis=1), atol=1e-9)
+    assert found.redundancy.sum() == pytest.approx(adjusted(BLOCK).redundancy)
+    assert found.square_sums.sum() == pytest.approx(float(adjusted(BLOCK).square_sum))
+    assert (found.uncertainty == 0).all()
+
+
+def test_random_vectors_agree_with_exact_traces():
+    """Image points of three cameras have 164, 154 and 104 coordinates: two of the parts take random vectors."""
+    parts = parts_of(adjusted(BLOCK), ("camera",))
+    found = partial_redundancy(adjusted(BLOCK), parts, probes=32)
+    error = found.matrix - dense_traces(parts)
+    random = found.uncertainty > 0
+    assert 1 < random.sum() < random.size
+    assert np.abs(error[~random]).max() < 1e-9
+    # The uncertainty is a bound.
+    assert np.abs(error[random]).max() > 0
+    assert (np.abs(error[random]) < 4 * found.uncertainty[random]).all()
+    assert (found.uncertainty < 0.1 * found.matrix.diagonal().max()).all()
+
+
+@pytest.fixture(scope="module")
+def components():
+    return variance_components(adjusted(BLOCK), ("camera",))
+
+
+def test_the_estimate_is_the_fixed_point(components):
+    """v'Pv of every estimated part is its redundancy; all others are weighted as they were."""
+    a, found = adjusted(BLOCK), components
+    assert found.converged
+    parts = parts_of(found.adjusted, ("camera",))
+    now = partial_redundancy(found.adjusted, parts)
+    free = found.supported
+    assert 2 <= free.sum() < len(free)
+    np.testing.assert_allclose(now.square_sums[:-1][free], now.redundancy[:-1][free], rtol=1e-3)
+    expected = np.sqrt(np.diagonal(2 * np.linalg.inv(now.matrix[:-1, :-1][np.ix_(free, free)])))
+    np.testing.assert_allclose(found.sigma[free], found.factor[free] * expected, rtol=1e-6)
+    np.testing.assert_allclose(np.diagonal(found.correlation)[free], 1.0)
+    assert np.isnan(found.sigma[~free]).all()
+    assert (found.factor[~free] == 1).all()
+    before, after = a.block.image_points.sigma, found.adjusted.block.image_points.sigma
+    times = np.sqrt(found.factor)[parts.of["image_points"]].T
+    np.testing.assert_allclose(after, before * times, rtol=1e-12)
+    assert np.ptp(times) > 0
+    # What is known beforehand has no component.
+    assert found.adjusted.priors is a.priors
+
+
+def test_what_cannot_support_a_component_says_so_and_stays_as_stated(components):
+    weak = [label for label, good in zip(components.labels, components.supported, strict=True) if not good]
+    assert "distances" in weak or "control_points" in weak
+    assert set(components.sentences) == set(weak)
+    for label, sentence in components.sentences.items():
+        assert sentence.startswith(f"{label} (")
+        assert "cannot support a variance component" in sentence
+    assert component_warnings(components) == list(components.sentences.values())
+    assert np.isnan(components.degrees[~components.supported]).all()
+    assert (components.degrees[components.supported] > 2).all()
+    tables = component_tables(components)
+    table = tables["variance_components"].set_index("group")
+    assert list(table.index) == list(components.labels)
+    assert not table.loc[weak, "supported"].any()
+    n = components.supported.sum()
+    assert len(tables["variance_component_correlation"]) == n * (n - 1)
+
+
+def test_parts_are_what_was_selected():
+    a = adjusted(BLOCK)
+    parts = parts_of(
+        a,
+        {
+            "plan": [Selection("control_points", axes=("X", "Y")), Selection("stations", axes=("X", "Y"))],
+            "one image": Selection("image_points", images="i3"),
+        },
+    )
+    np.testing.assert_array_equal(parts.of["control_points"] == 0, np.asarray(a.block.control.axis) < 2)
+    np.testing.assert_array_equal(parts.of["stations"] == 0, np.asarray(a.block.stations.axis) < 2)
+    np.testing.assert_array_equal(parts.of["image_points"][0] == 1, np.asarray(a.block.image_points.image) == 3)
+    assert (parts.of["attitudes"] == 2).all()
+    assert (parts.of["priors"] == 2).all()
+
+
+@pytest.mark.parametrize(
+    "partition, words",
+    [
+        (("colour",), "no split 'colour' of observations: there are xy-z, axis, camera, image"),
+        ({"a": Selection("priors")}, "observes no 'priors'"),
+        ({"a": Selection("stations", images=("i99",))}, "no row of stations is of the images i99"),
+        ({"a": Selection("stations"), "b": Selection("stations", axes="Z")}, "b and a share observations"),
+        ({"a": ()}, "a part 'a' of the partition has no name or no observations"),
+    ],
+)
+def test_a_partition_that_is_none_is_refused(partition, words):
+    with unchecked(), pytest.raises(InputError, match=words):
+        parts_of(adjusted(BLOCK), partition)
+
+
+def test_components_are_those_of_an_optimum():
+    lost = eqx.tree_at(lambda a: a.converged, adjusted(BLOCK), np.array(False))
+    with pytest.raises(InputError, match="those of an optimum, but the block is not converged"):
+        variance_components(lost)
+
+
+def test_sets_of_a_covariance_are_scaled_as_a_whole():
+    """D C D, whose whitener is that of C over D; correlations stay."""
+    factor = np.random.default_rng(3).normal(0, 0.02, (2, 3, 3)) + 0.05 * np.eye(3)
+    sets = correlated(rows(range(2), sigma=1.0, kind=StationRows), np.arange(6).reshape(2, 3), factor @ factor.mT)
+    d = np.array([[2.0, 2, 2], [0.5, 1, 3]])
+    scaled = sets.with_sigmas_times(d)
+    np.testing.assert_allclose(scaled.sigmas, sets.sigmas * d)
+    unit = scaled.whitener @ scaled.covariance @ scaled.whitener.mT
+    np.testing.assert_allclose(unit, np.broadcast_to(np.eye(3), unit.shape), atol=1e-12)
+    np.testing.assert_allclose(scaled.covariance[0], 4 * sets.covariance[0])
+
+
+def test_unknown_weights_are_one_sentence_and_nothing_written(monkeypatch, capsys, tmp_path):
+    out = tmp_path / "out"
+    code, _, error = run(monkeypatch, capsys, "adjust", tmp_path, "--out", out, "--weights", "xy-z,colour")
+    assert code == 2
+    assert "--weights colour: there are group, xy-z, axis, camera, image" in error
+    assert not out.exists()
+
+
+@pytest.mark.slow
+def test_scatter_is_sigma_and_the_truth_lies_within_three():
+    """Of P31, measured with other standard deviations than are stated (`benchmarks/variance_components.py`)."""
+    draws = 100
+    found = estimates(*flight(), draws)
+    assert found["converged"].all()
+    for k, of in enumerate(TRUE.values()):
+        kept = found["supported"][:, k]
+        assert kept.mean() > 0.95
+        factor, sigma = found["factor"][kept, k], found["sigma"][kept, k]
+        assert np.mean(np.abs(factor - of**2) < 3 * sigma) >= 0.95
+        # Scatter of n draws is off by 1 / sqrt(2 n), and a component that is a chi-square has the heavier tail.
+        assert abs(factor.std(ddof=1) / np.sqrt(np.mean(sigma**2)) - 1) < 4 / np.sqrt(2 * draws)
+        assert abs(factor.mean() - of**2) < 4 * np.sqrt(np.mean(sigma**2) / draws)
