@@ -25,7 +25,15 @@ from jaxphoto.errors import BlockError
 from jaxphoto.observations import AbstractObservations
 from jaxphoto.procedures.adjust import start_of
 from jaxphoto.procedures.cross_validation import measured_discrepancies
-from jaxphoto.statistics import LEAST_CHECKED, LEVEL, Suspect, chi_square_limit, covariance, redundancy_numbers
+from jaxphoto.statistics import (
+    LEAST_CHECKED,
+    LEAST_SIGMA0,
+    LEVEL,
+    Suspect,
+    chi_square_limit,
+    covariance,
+    redundancy_numbers,
+)
 from jaxphoto.unknowns import Unknowns
 from jaxphoto.variants import without_observations
 
@@ -85,25 +93,28 @@ def snoop(
     worst = _worst(block, {name: size / scale[name] for name, size in _sizes(at, r).items()}, 1.0)
     left = {name: flown[name] | worst[name] for name in worst}
     tried: list[Masks] = []
-    exchanged: list[Exchanged] = []
+    # Once only: what is exchanged twice is as it was.
+    done: list[tuple[int, int]] = []
     while True:
         report(f"adjusting without {sum(int(m.sum()) for m in left.values())} observations")
         kept, point = without_observations(block, left)
         adjusted = solve(kept, _some_points(at.unknowns, point), kept.priors, max_steps, sizes)
         at = linearise(block, _all_points(adjusted.unknowns, at.unknowns, point), block.priors, max_steps, sizes)
-        pairs = _exchanged(at, left, float(adjusted.sigma0))
+        sigma0 = max(float(adjusted.sigma0), LEAST_SIGMA0)
+        pairs = [pair for pair in _exchanged(at, left, sigma0) if pair not in done]
         if pairs:
             block, left = _exchange(block, left, pairs)
-            exchanged += [_named(block, pair) for pair in pairs]
+            done += pairs
             continue
-        found = _tested(adjusted, at, left, point)
+        found = _tested(adjusted, at, left, point, sigma0)
         if len(tried) == _ROUNDS or any(_same(found, old) for old in (left, *tried)):
             break
         tried.append(left)
         left = found
     gone = np.setdiff1d(np.arange(len(block.points)), point)
-    told = _told(at, left, _stays(block, point), _redundancy(at), float(adjusted.sigma0))
-    return Snooped(adjusted, told, tuple(exchanged), tuple(block.points[p] for p in gone))
+    told = _told(at, left, _stays(block, point), _redundancy(at), sigma0)
+    exchanged = tuple(_named(block, pair) for pair in done)
+    return Snooped(adjusted, told, exchanged, tuple(block.points[p] for p in gone))
 
 
 def _robust(
@@ -179,14 +190,14 @@ def _scales(at: Adjustment, r: Blocks) -> dict[str, float]:
         checked = diagonal > LEAST_CHECKED
         if int(checked.sum()) >= _ENOUGH:
             size = np.abs(np.atleast_2d(at.residuals[name]))[checked] / np.sqrt(diagonal[checked])
-            found[name] = float(np.median(size)) / _MEDIAN
+            found[name] = max(float(np.median(size)) / _MEDIAN, LEAST_SIGMA0)
     usual = found.get(at.block.image_points.group, 1.0)
     return {name: found.get(name, usual) for name in r}
 
 
-def _tested(adjusted: Adjustment, at: Adjustment, left: Masks, point: np.ndarray) -> Masks:
+def _tested(adjusted: Adjustment, at: Adjustment, left: Masks, point: np.ndarray, sigma0: float) -> Masks:
     """What is to be left out next: `adjusted` is without `left`, `at` the whole block linearised there."""
-    sigma0, stays = float(adjusted.sigma0), _stays(at.block, point)
+    stays = _stays(at.block, point)
     wrong = {name: size > sigma0 for name, size in _sizes(at, _redundancy(at), predicted=True).items()}
     found = {name: out & (wrong[name] | ~stays[name]) for name, out in left.items()}
     sizes = {}

@@ -2,6 +2,7 @@
 
 from jaxphoto.statistics.blunder_test import (
     DELTA0,
+    LEAST_SIGMA0,
     LEVEL,
     BlunderTest,
     Hidden,
@@ -47,10 +48,10 @@ from jaxphoto.statistics.significance import (
 from jaxphoto.statistics.variance_components import VarianceComponents, variance_components
 
 __all__ = [
-    "DELTA0", "EOP_NAMES", "LEAST_CHECKED", "LEVEL", "SIGNIFICANCE_LEVEL", "SPLITS", "BlunderTest", "Correlations",
-    "Covariance", "Hidden", "IfZero", "PartialRedundancy", "Partition", "Parts", "Redundancy", "Rotations",
-    "Selection", "Significance", "Spread", "Suspect", "VarianceComponents", "VarianceFactor", "a_priori_sigmas",
-    "angle_differences", "blunder_test", "check_discrepancies", "chi_square_limit", "chi_square_p",
+    "DELTA0", "EOP_NAMES", "LEAST_CHECKED", "LEAST_SIGMA0", "LEVEL", "SIGNIFICANCE_LEVEL", "SPLITS", "BlunderTest",
+    "Correlations", "Covariance", "Hidden", "IfZero", "PartialRedundancy", "Partition", "Parts", "Redundancy",
+    "Rotations", "Selection", "Significance", "Spread", "Suspect", "VarianceComponents", "VarianceFactor",
+    "a_priori_sigmas", "angle_differences", "blunder_test", "check_discrepancies", "chi_square_limit", "chi_square_p",
     "correlation_matrix", "correlations", "covariance", "critical_w", "detectable_errors", "error_precision",
     "global_test", "group_factors", "if_zero", "normalised_residuals", "observation_groups", "partial_redundancy",
     "parts_of", "physical_residuals", "point_differences", "prepare_statistics", "redundancy_numbers",

@@ -22,6 +22,8 @@ from jaxphoto.statistics.reliability import LEAST_CHECKED, UNCHECKED, Redundancy
 
 LEVEL = 1e-3
 """Error probability of a test of the whole adjustment: of sigma naught, and of all normalised residuals together."""
+LEAST_SIGMA0 = 1e-3
+"""Below this, residuals are the rounding of exact numbers, and none of them contradicts another."""
 DELTA0 = 4.13
 """Shift of a normalised residual that a test of level 0.1 % finds with a power of 80 % (Baarda)."""
 
@@ -60,6 +62,8 @@ def blunder_test(adjusted: Adjustment, redundancy: Redundancy, level: float = LE
     sizes = {name: np.where(still(redundancy[name]) > LEAST_CHECKED, np.abs(w[name]), 0.0) for name in groups}
     n = sum(int((v > 0).sum()) for v in sizes.values())
     limit, block, found = critical_w(n, adjusted.redundancy, level), adjusted.block, []
+    if sigma0 < LEAST_SIGMA0:
+        return BlunderTest((), limit, n)
     for name, rows in groups.items():
         size = np.atleast_2d(sizes[name])
         bad = np.flatnonzero(size.max(axis=0, initial=0.0) > limit)
