@@ -30,6 +30,8 @@ _OBSERVATION = ("camera", "point", "x", "y")
 _PER_CAMERA, _PER_POINT = 9, 3
 # Where f, k1 and k2 stand among the nine of a camera.
 _F = 6
+# Half a format that no camera has: what is larger is refused as one.
+_LARGEST_HALF = 1e9
 _FREE = ("c_mm", "k1", "k2")
 
 
@@ -229,7 +231,7 @@ def _cameras(names: np.ndarray, problem: _Problem) -> dict[str, dict[str, Any]]:
     # A tenth of f at least, so that few points about the centre leave a format that can be.
     half = np.maximum(1.0, problem.cameras[:, [_F, _F]] / 20)
     np.maximum.at(half, problem.camera, np.abs(problem.xy))
-    sizes = (2 * np.ceil(half)).astype(int).tolist()
+    sizes = (2 * np.ceil(np.minimum(half, _LARGEST_HALF))).astype(int).tolist()
     return {
         name: {
             "width_px": width, "height_px": height, "pixel_mm": _PIXEL_MM, "distortion": "bundler_radial",

@@ -168,6 +168,16 @@ def test_rasters_that_are_no_surface_models(tmp_path):
         raster.read_dsm(tmp_path / "empty.tif")
 
 
+def test_heights_that_are_none(tmp_path):
+    path = tmp_path / "d.tif"
+    place = {"transform": north_up(5, 5, 1, 1), "crs": "EPSG:32633"}
+    signalling = np.array([0x7F800001], "<u4").view("<f4")[0]
+    heights = np.array([[1.0, np.inf, signalling], [-np.inf, np.nan, 2.0]], "<f4")
+    with rasterio.open(path, "w", driver="GTiff", height=2, width=3, count=1, dtype="float32", **place) as file:
+        file.write(heights, 1)
+    np.testing.assert_array_equal(raster.read_dsm(path)[0].heights, [[1, np.nan, np.nan], [np.nan, np.nan, 2]])
+
+
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.float32])
 @pytest.mark.parametrize("bands", [1, 3])
 def test_orthophotos_carry_a_mask(tmp_path, kind, bands):

@@ -55,7 +55,8 @@ def read_dsm(path: str | Path, epsg: int | None = None) -> tuple[Raster, Coordin
     """The surface model in the first band of a raster, in metres, and the system of its coordinates.
 
     `epsg` names the system in place of what the file says. Raises InputError for a file that is no raster or damaged,
-    without place, turned against its system, in degrees, with cells that are no squares, or without any height.
+    without place, turned against its system, in degrees, with cells that are no squares, or without any height. A cell
+    whose height is not finite has none.
     """
     path = Path(path)
     check_file(path)
@@ -75,7 +76,10 @@ def read_dsm(path: str | Path, epsg: int | None = None) -> tuple[Raster, Coordin
         raise InputError(f"{path.name} is in {system.name}, in degrees; resample it to a map system")
     if not np.isclose(place.a, -place.e, rtol=1e-6):
         raise InputError(f"{path.name} has cells of {place.a:g} x {-place.e:g}; resample it to squares")
-    heights = np.where(np.ma.getmaskarray(bands), np.nan, bands.astype(float).data) * system.units[1]
+    # Some of what is not a number would warn when it becomes double.
+    known = ~np.ma.getmaskarray(bands) & np.isfinite(bands.data)
+    heights = np.where(known, bands.data, 0).astype(float) * system.units[1]
+    heights[~known] = np.nan
     if np.isnan(heights).all():
         raise InputError(f"{path.name} has no heights; name another surface model")
     plane = system.units[0]
