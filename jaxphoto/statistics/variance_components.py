@@ -4,10 +4,10 @@ REML of normal observations. With v_k' P_k v_k and S of `partial_redundancy` at 
 
     s = S^-1 q,    q_k = v_k' P_k v_k,    covariance 2 S^-1,
 
-after which the sigmas of part k are multiplied by sqrt(s_k) and the block is adjusted anew, until all s_k are one: then
-q_k = r_k for every part, the equation of restricted maximum likelihood. As r_k is exact, so are the components; only
-their standard deviations depend on random vectors, where S does. Where a step would lead to a variance that is not
-positive, it is Foerstner's: s_k = q_k / r_k.
+after which the sigmas of part k are multiplied by sqrt(s_k) and the block is adjusted anew (by half the step where it
+leads back), until all s_k are one: then q_k = r_k for every part, the equation of restricted maximum likelihood. As r_k
+is exact, so are the components; only their standard deviations depend on random vectors, where S does. Where a step
+would lead to a variance that is not positive, it is Foerstner's: s_k = q_k / r_k.
 
 Sources: F. R. Helmert, Die Ausgleichungsrechnung (1907); W. Foerstner, Ein Verfahren zur Schaetzung von Varianz- und
 Kovarianzkomponenten (1979); K. R. Koch, Parameter Estimation and Hypothesis Testing in Linear Models (1999), 3.6;
@@ -123,7 +123,7 @@ def variance_components(
     given, parts = adjusted, parts_of(adjusted, partition)
     factor, free = np.ones(len(parts.labels)), np.ones(len(parts.labels), bool)
     sentences: dict[str, str] = {}
-    falls, rounds, settled = np.zeros(len(factor), int), 0, False
+    falls, last, rounds, settled = np.zeros(len(factor), int), np.zeros(len(factor)), 0, False
     while rounds < max_rounds:
         rounds += 1
         now = partial_redundancy(adjusted, parts, probes)
@@ -138,7 +138,10 @@ def variance_components(
             k, sentences[parts.labels[k]] = weak
             factor[k], free[k] = 1.0, False
         else:
-            factor[free] *= _positive(step.change, now, free)
+            # A step back was too far before: where few observations speak, residuals bend more than they should.
+            change = np.where(step.change * last[free] < 0, step.change / 2, step.change)
+            factor[free] *= _positive(change, now, free)
+            last[free] = step.change
         settled = False
         if (factor != before).any():
             adjusted = _reweighted(given, adjusted, parts, factor, max_steps)
@@ -176,14 +179,13 @@ def _cannot(
     least = min(known, key=lambda k: now.redundancy[k])
     if now.redundancy[least] < _UNCHECKED:
         return least, _sentence(parts, least, "no other observation checks it")
-    worst = int(np.argmax(np.where(settled | (falls[free] >= _FALLS), step.sigma, 0.0)))
-    k, relative = known[worst], step.sigma[worst]
-    if falls[k] >= _FALLS:
-        return k, _sentence(parts, k, "its estimate goes to zero")
-    if settled and step.is_weak[worst]:
-        told = f"its estimate {factor[k]:.2g} has the standard deviation {factor[k] * relative:.2g}"
-        return k, _sentence(parts, k, f"{told}, with redundancy {now.redundancy[k]:.2g}")
-    return None
+    judged = step.is_weak & (settled | (falls[free] >= _FALLS))
+    if not judged.any():
+        return None
+    worst = int(np.argmax(np.where(judged, step.sigma, 0.0)))
+    k, sigma = known[worst], factor[free][worst] * step.sigma[worst]
+    told = f"its estimate {factor[k]:.2g} has the standard deviation {sigma:.2g}"
+    return k, _sentence(parts, k, f"{told}, with redundancy {now.redundancy[k]:.2g}")
 
 
 def _sentence(parts: Parts, k: int, why: str) -> str:
