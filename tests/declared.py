@@ -120,8 +120,9 @@ def residuals_of(block: Block, unknowns: Unknowns):
 
 def changed(block: Block, change) -> Block:
     """The block with `change(rows, k)` in place of all observations; k is the place of their group, -1 for images."""
-    others = [change(of, k) for k, of in enumerate(block.observations)]
-    return block.with_observations(change(block.image_points, -1), others)
+    place = {id(of): k for k, of in enumerate(block.observations)}
+    named = block.named_observations.items()
+    return block.with_observations({name: change(of, place.get(id(of), -1)) for name, of in named})
 
 
 def _observed(block: Block, truth: Unknowns, seed: int) -> Block:

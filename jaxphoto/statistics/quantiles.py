@@ -14,7 +14,7 @@ def chi_square_tails(square_sum: float, freedom: float) -> tuple[float, float]:
 
 def chi_square_limit(freedom: Int[np.ndarray, "*n"], level: float) -> Float[np.ndarray, "*n"]:
     """What a square sum exceeds with probability `level`."""
-    return 2 * _special().gammainccinv(freedom / 2, level)
+    return np.asarray(2 * _special().gammainccinv(freedom / 2, level))
 
 
 def student_limit(freedom: int, level: float) -> float:
