@@ -44,10 +44,8 @@ def estimates(block: Block, truth: Unknowns, draws: int, first: int = 0) -> dict
     """Factor, sigma and whether it is supported of each part, a flight a row."""
     image, control, plan, height = TRUE.values()
     times = {"control_points": control, "stations": np.where(block.stations.axis == 2, height, plan)}
-    true = block.with_observations(
-        block.image_points.with_sigmas_times(image),
-        [rows.with_sigmas_times(times.get(rows.group, 1.0)) for rows in block.observations],
-    )
+    named = block.named_observations.items()
+    true = block.with_observations({name: rows.with_sigmas_times(times.get(name, image)) for name, rows in named})
     observed = lambda b: (b.image_points.xy, b.stations.value, b.control.value)  # noqa: E731
     drawn = jax.jit(lambda key: observed(remeasure(true, truth, key)))
     rows = []
