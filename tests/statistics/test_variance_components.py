@@ -159,7 +159,7 @@ def test_unknown_weights_are_one_sentence_and_nothing_written(monkeypatch, capsy
 @pytest.mark.slow
 def test_scatter_is_sigma_and_the_truth_lies_within_three():
     """Of P31, measured with other standard deviations than are stated (`benchmarks/variance_components.py`)."""
-    draws = 100
+    draws = 40
     found = estimates(*flight(), draws)
     assert found["converged"].all()
     for k, of in enumerate(TRUE.values()):
