@@ -9,7 +9,7 @@ from rich.table import Table
 
 from jaxphoto import Tables
 from jaxphoto.cli.console import plain_console
-from jaxphoto.report import print_adjustment, residuals_figure
+from jaxphoto.report import Finding, Level, Verdict, print_adjustment, residuals_figure
 from jaxphoto.report.plots import drawn, new_figure
 from tests.blocks import adjusted
 
@@ -43,7 +43,7 @@ def test_a_report_on_any_console_has_the_names(name):
     block = dataclasses.replace(tables.adjusted.block, title=name)
     tables.adjusted = dataclasses.replace(tables.adjusted, block=block)
     console = Console(width=200, file=io.StringIO())
-    print_adjustment(tables, [f"image {name} is far off"], console)
+    print_adjustment(tables, Verdict((Finding(Level.WARNING, f"image {name} is far off"),)), console)
     said = console.file.getvalue()
     plain = name.replace("\x1b", "\\x1b")
     assert said.count(plain) == 2 + len(tables.significance)
