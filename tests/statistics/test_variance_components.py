@@ -7,7 +7,7 @@ import pytest
 from benchmarks.variance_components import TRUE, estimates, flight
 from jaxphoto import InputError, Selection, correlated, variance_components
 from jaxphoto.observations import StationRows
-from jaxphoto.report import component_tables, component_warnings
+from jaxphoto.report import component_findings, component_tables
 from jaxphoto.statistics import partial_redundancy, parts_of
 from tests.adjustment.dense import at_optimum
 from tests.blocks import adjusted, rows
@@ -88,7 +88,7 @@ def test_what_cannot_support_a_component_says_so_and_stays_as_stated(components)
     for label, sentence in components.sentences.items():
         assert sentence.startswith(f"{label} (")
         assert "cannot support a variance component" in sentence
-    assert component_warnings(components) == list(components.sentences.values())
+    assert [f.text for f in component_findings(components)] == list(components.sentences.values())
     assert np.isnan(components.degrees[~components.supported]).all()
     assert (components.degrees[components.supported] > 2).all()
     tables = component_tables(components)
