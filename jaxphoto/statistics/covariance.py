@@ -69,9 +69,10 @@ class Covariance(eqx.Module):
 
     def _sigma(self, variance: Numbers) -> Any:
         xp = jnp if isinstance(variance * self.variance_factor, jax.Array) else np
-        # Double where: the root of what is fixed, zero, has no derivative. What is no number stays none.
-        fixed = variance == 0
-        return xp.where(fixed, 0.0, xp.sqrt(xp.where(fixed, 1.0, variance) * self.variance_factor))
+        # What is held comes out as zero or, by rounding, on either side of it. What is no number stays none.
+        # Double where: the root of zero has no derivative.
+        held = variance <= 0
+        return xp.where(held, 0.0, xp.sqrt(xp.where(held, 1.0, variance) * self.variance_factor))
 
 
 def covariance(adjusted: Adjustment, rotations: Rotations = "omega_phi_kappa") -> Covariance:
