@@ -79,6 +79,7 @@ from jaxphoto.unknowns import FIXED, FREE, Unknowns, Weighted, default_priors
 if TYPE_CHECKING:
     from jaxphoto.io import convert, read_block, read_recipe, read_source, write_block, write_simulation
     from jaxphoto.procedures.calibration import calibrate
+    from jaxphoto.procedures.halves import halves
     from jaxphoto.procedures.lidar import simultaneous
     from jaxphoto.procedures.orientation import orient
     from jaxphoto.report import Tables
@@ -95,9 +96,9 @@ __all__ = [
     "Start", "StationRows", "StripBias", "Surface", "SurfaceRows", "Tables", "Unknowns", "Weighted", "adjust",
     "angle_differences", "bias", "boresight", "calibrate", "common_sizes", "conversion_error", "convert",
     "correlated", "covariance", "decentring_from_symmetry", "default_priors", "direct_orientation", "georeference",
-    "ground_point", "image_ray", "intersect", "monte_carlo", "orient", "point_differences", "principal_points",
-    "project", "read_block", "read_recipe", "read_source", "readjust", "rebalance", "rebalance_covariance",
-    "significance", "simulate", "simultaneous", "snoop", "symmetry_from_decentring", "touching",
+    "ground_point", "halves", "image_ray", "intersect", "monte_carlo", "orient", "point_differences",
+    "principal_points", "project", "read_block", "read_recipe", "read_source", "readjust", "rebalance",
+    "rebalance_covariance", "significance", "simulate", "simultaneous", "snoop", "symmetry_from_decentring", "touching",
     "variance_components", "write_block", "write_simulation",
 ]  # fmt: skip
 
@@ -106,6 +107,7 @@ __all__ = [
 _LATER = {
     "io": ("convert", "read_block", "read_recipe", "read_source", "write_block", "write_simulation"),
     "procedures.calibration": ("calibrate",),
+    "procedures.halves": ("halves",),
     "procedures.lidar": ("simultaneous",),
     "procedures.orientation": ("orient",),
     "report": ("Tables",),

@@ -153,7 +153,12 @@ def strips(block: Block, names: Collection[str]) -> Block:
     if unknown := [name for name in names if not name or name not in block.image_strip]:
         known = ", ".join(sorted(set(block.image_strip) - {""}))
         raise ValueError(f"{unknown[0]!r} is no strip of this block; its strips are {known or 'none'}")
-    image = np.flatnonzero([strip in names for strip in block.image_strip])
+    return some_images(block, np.array([strip in names for strip in block.image_strip]))
+
+
+def some_images(block: Block, chosen: Bool[np.ndarray, "images"]) -> Block:
+    """Only the images `chosen`, and the points that at least two of them show; what `strips` says of the rest."""
+    image = np.flatnonzero(chosen)
     seen = block.image_points.point[np.isin(block.image_points.image, image)]
     point = np.flatnonzero(np.bincount(seen, minlength=len(block.points)) >= 2)
     return _part(block, image, point)

@@ -7,7 +7,7 @@ of the last two than a result asks `NormalEquations`.
 from jaxphoto.adjustment.adjust import MAX_STEPS, LaidOut, common_sizes, lay_out, linearise, solve
 from jaxphoto.adjustment.layout.padding import TiledBlock
 from jaxphoto.adjustment.layout.tile_layout import LEAST, Sizes
-from jaxphoto.adjustment.layout.tiled import TiledStructure, TiledValues
+from jaxphoto.adjustment.layout.tiled import TiledResiduals, TiledStructure, TiledValues
 from jaxphoto.adjustment.normal_equations import Cofactors, Linearised, NormalEquations, RowCofactors, optimise
 from jaxphoto.adjustment.result import Adjustment, Outcome
 
@@ -23,6 +23,7 @@ __all__ = [
     "RowCofactors",
     "Sizes",
     "TiledBlock",
+    "TiledResiduals",
     "TiledStructure",
     "TiledValues",
     "common_sizes",

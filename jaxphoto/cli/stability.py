@@ -8,11 +8,12 @@ import typer
 
 from jaxphoto.cli.app import app
 from jaxphoto.cli.console import plain_console
+from jaxphoto.cli.grid_options import check_grid, method_of, points_of
 from jaxphoto.errors import InputError
 from jaxphoto.io.cameras import CameraFile, read_camera_file
 from jaxphoto.report import print_warning
 from jaxphoto.report.stability import Compared, print_stability, write_stability
-from jaxphoto.stability import METHODS, UNKNOWNS, Method, analyse, image_grid
+from jaxphoto.stability import METHODS, analyse
 from jaxphoto.writing import check_folder
 
 
@@ -38,13 +39,12 @@ def stability_command(
     out: Annotated[Path | None, typer.Option(help="Folder for tables, map and page.")] = None,
 ) -> None:
     """Compare the bundles of rays of two interior orientations (Habib et al. 2006), with uncertainty."""
-    if method not in METHODS:
-        raise InputError(f"--method {method}: there are {', '.join(METHODS)}")
+    chosen = method_of(method)
     if not (math.isfinite(noise_px) and noise_px > 0):
         raise InputError(f"--noise-px {noise_px:g}: give the noise of image coordinates, a positive number of pixels")
     if not 0 <= relief < 1:
         raise InputError(f"--relief {relief:g}: give a part of the object's distance, from 0 to less than 1")
-    columns, rows = _grid(grid)
+    check_grid(grid, extent)
     if out is not None:
         check_folder(out, first, second)
     names = (camera, camera_b if camera_b is not None else camera)
@@ -53,10 +53,8 @@ def stability_command(
         for path, name in zip((first, second), names, strict=True)
     ]
     _check_one_sensor(a, b, first, second)
-    points = image_grid(a.sensor, columns, rows, _extent(extent))
-    found = analyse(a.interior, b.interior, points, (a.covariance, b.covariance), relief)
+    found = analyse(a.interior, b.interior, points_of(a.sensor, grid, extent), (a.covariance, b.covariance), relief)
     console, noise_mm = plain_console(), noise_px * a.sensor.pixel_mm
-    chosen: Method = method  # type: ignore[assignment]
     one, other = (
         Compared(f"{letter} ({path})", file.interior, file.covariance is not None)
         for letter, path, file in zip("AB", (first, second), both, strict=True)
@@ -68,33 +66,6 @@ def stability_command(
     if out is not None:
         write_stability(found, (one, other), a.sensor, noise_mm, chosen, out)
         console.print(f"results in {out} (open report.html)")
-
-
-def _grid(text: str) -> tuple[int, int]:
-    columns, rows = _pair("--grid", text, "15x11")
-    least = max(UNKNOWNS.values()) // 2 + 1
-    if columns != int(columns) or rows != int(rows) or min(columns, rows) < 2 or columns * rows < least:
-        raise InputError(f"--grid {text}: give whole numbers of 2 or more, like 15x11")
-    return int(columns), int(rows)
-
-
-def _extent(text: str | None) -> tuple[float, float] | None:
-    if text is None:
-        return None
-    width, height = _pair("--extent", text, "4.0x3.0")
-    if not (width > 0 and height > 0):
-        raise InputError(f"--extent {text}: give a positive width and height in mm, like 4.0x3.0")
-    return width, height
-
-
-def _pair(option: str, text: str, like: str) -> tuple[float, float]:
-    try:
-        first, second = (float(part) for part in text.lower().split("x"))
-    except ValueError:
-        raise InputError(f"{option} {text}: give two numbers with an x between them, like {like}") from None
-    if not (math.isfinite(first) and math.isfinite(second)):
-        raise InputError(f"{option} {text}: give two numbers with an x between them, like {like}")
-    return first, second
 
 
 def _check_one_sensor(a: CameraFile, b: CameraFile, first: Path, second: Path) -> None:

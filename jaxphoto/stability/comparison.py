@@ -28,7 +28,15 @@ class BundleOffsets(eqx.Module):
     """The offsets carried back through the first distortion into the image as it is measured: free of R0."""
     alignment: Float[Array, "u"]
     jacobian: Float[Array, "2*points parameters"]
+    stretch: Float[Array, "points 2 2"]
+    """d(ideal) / d(measured) coordinate of the first camera: `offsets` are `stretch` times `measured`."""
     converged: Bool[Array, ""]
+
+    @property
+    def measured_jacobian(self) -> Float[Array, "coordinates parameters"]:
+        """dv/dp like `jacobian`, of the offsets in the image as it is measured, to first order."""
+        by_point = self.jacobian.reshape(len(self.points), 2, -1)
+        return jnp.linalg.solve(self.stretch, by_point).reshape(self.jacobian.shape)
 
     @property
     def redundancy(self) -> int:
@@ -102,7 +110,7 @@ def _compared(first, second, points, method, depth) -> BundleOffsets:
     (j1, j2), (v, alignment, converged) = jax.jacfwd(offsets, argnums=(0, 1), has_aux=True)(p1, p2)
     stretch = jax.vmap(jax.jacfwd(first.ideal_from_measured))(points)
     measured = jnp.linalg.solve(stretch, v[..., None])[..., 0]
-    return BundleOffsets(points, v, measured, alignment, jnp.hstack([j1, j2]), converged)
+    return BundleOffsets(points, v, measured, alignment, jnp.hstack([j1, j2]), stretch, converged)
 
 
 @eqx.filter_jit

@@ -12,6 +12,7 @@ from jaxphoto.statistics.blunder_test import (
     detectable_errors,
     worst_checked,
 )
+from jaxphoto.statistics.common_observations import common_covariance
 from jaxphoto.statistics.correlation import Correlations, correlation_matrix, correlations
 from jaxphoto.statistics.covariance import EOP_NAMES, Covariance, Rotations, covariance
 from jaxphoto.statistics.discrepancy import (
@@ -52,8 +53,8 @@ __all__ = [
     "Correlations", "Covariance", "Hidden", "IfZero", "PartialRedundancy", "Partition", "Parts", "Redundancy",
     "Rotations", "Selection", "Significance", "Spread", "Suspect", "VarianceComponents", "VarianceFactor",
     "a_priori_sigmas", "angle_differences", "blunder_test", "check_discrepancies", "chi_square_limit", "chi_square_p",
-    "correlation_matrix", "correlations", "covariance", "critical_w", "detectable_errors", "error_precision",
-    "global_test", "group_factors", "if_zero", "normalised_residuals", "observation_groups", "partial_redundancy",
-    "parts_of", "physical_residuals", "point_differences", "prepare_statistics", "redundancy_numbers",
-    "residual_spread", "significance", "spread_of", "variance_components", "worst_checked",
+    "common_covariance", "correlation_matrix", "correlations", "covariance", "critical_w", "detectable_errors",
+    "error_precision", "global_test", "group_factors", "if_zero", "normalised_residuals", "observation_groups",
+    "partial_redundancy", "parts_of", "physical_residuals", "point_differences", "prepare_statistics",
+    "redundancy_numbers", "residual_spread", "significance", "spread_of", "variance_components", "worst_checked",
 ]  # fmt: skip

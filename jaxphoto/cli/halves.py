@@ -1,0 +1,51 @@
+"""`jaxphoto halves`: a block in; by which factor its standard deviations lie, and a band over the format out."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from jaxphoto.cli.app import app
+from jaxphoto.cli.console import plain_console
+from jaxphoto.cli.grid_options import check_grid, method_of, points_of
+from jaxphoto.io import read_block
+from jaxphoto.procedures.halves import CUTS, camera_of, halves
+from jaxphoto.report.halves import print_halves, write_halves
+from jaxphoto.stability import METHODS
+from jaxphoto.writing import check_folder
+
+
+@app.command("halves")
+def halves_command(
+    block: Annotated[Path, typer.Argument(help="Block folder (see docs/block_folder.md).")],
+    out: Annotated[Path, typer.Option(help="Folder for the results; earlier results in it are replaced.")],
+    by: Annotated[
+        str, typer.Option(help="What stays together: image, strip, or a partition of block.toml such as day.")
+    ] = "image",
+    cuts: Annotated[int, typer.Option(min=1, help="Times that the block is cut.")] = CUTS,
+    seed: Annotated[int, typer.Option(min=0, help="Of the draw of the cuts.")] = 0,
+    method: Annotated[
+        str, typer.Option(help=f"What the orientation of images may take up: {', '.join(METHODS)}.")
+    ] = "rot",
+    grid: Annotated[str, typer.Option(help="Columns and rows of cells.")] = "15x11",
+    extent: Annotated[
+        str | None, typer.Option(help="Width and height of the grid in mm, such as 4.0x3.0; the format if not given.")
+    ] = None,
+    camera: Annotated[str | None, typer.Option(help="Which camera, where the block has several.")] = None,
+) -> None:
+    """Judge the standard deviations of a calibration by random halves of its block.
+
+    Both halves of each cut are adjusted, and what they differ by is compared with what their covariances promise.
+    """
+    chosen = method_of(method)
+    check_grid(grid, extent)
+    check_folder(out, block)
+    console, errors = plain_console(), plain_console(stderr=True)
+    with errors.status("reading the block") as status:
+        read = read_block(block)
+        cells = points_of(read.sensors[camera_of(read, camera)], grid, extent)
+        found = halves(read, cells, by=by, camera=camera, n_cuts=cuts, seed=seed, method=chosen, report=status.update)
+        status.update(f"writing {out}")
+        write_halves(found, out)
+    print_halves(found, console)
+    console.print(f"results in {out} (open report.html)")

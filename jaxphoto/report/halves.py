@@ -1,0 +1,170 @@
+"""A calibration judged by its halves: tables, maps over the format, a page and words in the terminal."""
+
+from __future__ import annotations
+
+import base64
+import io
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pandas as pd
+from jinja2 import Environment
+from markupsafe import Markup
+from rich.console import Console
+
+from jaxphoto.procedures.halves import Halves
+from jaxphoto.report.page import STYLE
+from jaxphoto.report.plots import new_figure
+from jaxphoto.report.results import versions, write_summary
+from jaxphoto.writing import whole_folder
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_PAGE = """<!DOCTYPE html>
+<html lang="en"><head><meta charset="utf-8"><title>{{ title }}</title><style>{{ style }}</style></head><body>
+<h1>{{ title }}</h1>
+{% for sentence in verdict %}<p>{{ sentence }}</p>{% endfor %}
+<img alt="maps over the format" src="{{ picture }}">
+<h2>Cuts</h2><div class="wide">{{ cuts }}</div>
+</body></html>
+"""
+# Below so many standard deviations from 1 a factor says nothing.
+_SURE = 2.0
+
+
+def cell_table(found: Halves) -> pd.DataFrame:
+    """A row each cell: x_mm, y_mm from the image centre; then, in pixels of the measured image, both axes together,
+
+    promised_px (root mean square error by the covariance of the whole block), factor, halves_px (root mean square
+    difference of two halves), halves_band_px and band_px: radii that hold 95 % of the differences of halves, and of the
+    errors of the calibration by the whole block.
+    """
+    offsets = np.stack([cut.offsets_px for cut in found.cuts])
+    columns = {
+        "x_mm": found.cells_mm[:, 0],
+        "y_mm": found.cells_mm[:, 1],
+        "promised_px": found.promised_px,
+        "factor": found.band.cell_factor,
+        "halves_px": np.sqrt((offsets**2).sum(axis=2).mean(axis=0)),
+        "halves_band_px": found.band.halves,
+        "band_px": found.band.calibration,
+    }
+    return pd.DataFrame(columns)
+
+
+def cut_table(found: Halves) -> pd.DataFrame:
+    """A row each cut: cut, factor (of this cut alone), inside (part of the cells within the band that the others give),
+    rms_px (of the difference over the format), sigma0_first, sigma0_second, problem, first: the units of one half.
+    """
+    by = found.adjusted.block.owners(found.by)
+    both = [*found.cuts, *found.failed]
+    rows = []
+    for k, cut in enumerate(both):
+        good = k < len(found.cuts)
+        rms = float(np.sqrt((cut.offsets_px**2).sum(axis=1).mean())) if good else np.nan
+        units = dict.fromkeys(unit for unit, first in zip(by, cut.first, strict=True) if first)
+        row = {"cut": k + 1, "factor": found.band.of_cuts[k] if good else np.nan}
+        row |= {"inside": found.band.inside[k] if good else np.nan, "rms_px": rms}
+        row |= dict(zip(("sigma0_first", "sigma0_second"), cut.sigma0 or (np.nan, np.nan), strict=True))
+        rows.append(row | {"problem": cut.problem, "first": " ".join(units)})
+    return pd.DataFrame(rows)
+
+
+def halves_verdict(found: Halves) -> list[str]:
+    """What the halves say, in sentences."""
+    band, n = found.band, len(found.cuts)
+    off = (band.factor - 1) / band.sigma_factor
+    how = f"{band.factor:.2f} +- {band.sigma_factor:.2f}"
+    if off > _SURE:
+        said = f"standard deviations of camera {found.camera} are too small by a factor of {how}"
+    elif off < -_SURE:
+        said = f"standard deviations of camera {found.camera} are too large: their factor is {how}"
+    else:
+        said = f"nothing speaks against the standard deviations of camera {found.camera}: their factor is {how}"
+    cell, wide = band.cell_factor, band.calibration
+    cuts = f"{n} cuts" if n > 1 else "1 cut"
+    sentences = [
+        f"{said} ({cuts} by {found.by}, aligned by {found.method})",
+        f"over the format the factor is {cell.min():.2f} to {cell.max():.2f}; 95 % of the errors lie within "
+        f"{wide.min():.3g} to {wide.max():.3g} px, by the covariances as they are it would be "
+        f"{(wide / cell).min():.3g} to {(wide / cell).max():.3g} px",
+    ]
+    share, error = found.inside
+    if np.isfinite(error):
+        sentences.append(
+            f"{100 * share:.1f} +- {100 * error:.1f} % of the cells differ by less than the band, each cut by the band "
+            "that the others give"
+        )
+    if found.failed:
+        sentences.append(
+            f"{len(found.failed)} of {n + len(found.failed)} cuts could not be compared, the first of them: "
+            f"{found.failed[0].problem}"
+        )
+    return [*sentences, "errors that both halves share, such as those of points held fixed, show in no difference"]
+
+
+def halves_figure(found: Halves) -> Figure:
+    """Maps over the format: the factor of the standard deviations, and the radius of the band in pixels."""
+    figure = new_figure(9.6, 3.9)
+    sensor = found.adjusted.block.sensors[found.camera]
+    w, h = sensor.width_mm / 2, sensor.height_mm / 2
+    for axes, values, label in zip(
+        figure.subplots(1, 2),
+        (found.band.cell_factor, found.band.calibration),
+        ("factor of the standard deviations", "95 % of the errors are smaller [px]"),
+        strict=True,
+    ):
+        shown = axes.tricontourf(*found.cells_mm.T, values, levels=12, cmap="viridis")
+        figure.colorbar(shown, ax=axes, shrink=0.85)
+        axes.plot([-w, w, w, -w, -w], [-h, -h, h, h, -h], color="0.4", lw=0.8)
+        axes.set_title(label, loc="left", fontsize=10)
+        axes.set(xlabel="x [mm]", ylabel="y [mm]", aspect="equal")
+    return figure
+
+
+def print_halves(found: Halves, console: Console) -> None:
+    """The sentences."""
+    for sentence in halves_verdict(found):
+        console.print(sentence, soft_wrap=True)
+
+
+def write_halves(found: Halves, directory: Path) -> None:
+    """cells.csv, cuts.csv, halves.png, report.html and summary.json.
+
+    Raises InputError where `directory` holds something that is not an earlier result.
+    """
+    cells, cuts, verdict = cell_table(found), cut_table(found), halves_verdict(found)
+    title = f"{found.adjusted.block.title or 'block'}: halves"
+    figure = io.BytesIO()
+    halves_figure(found).savefig(figure, format="png")
+    with whole_folder(directory) as work:
+        cells.to_csv(work / "cells.csv", index=False)
+        cuts.to_csv(work / "cuts.csv", index=False)
+        (work / "halves.png").write_bytes(figure.getvalue())
+        page = Environment(autoescape=True).from_string(_PAGE)
+        html = page.render(
+            style=STYLE,
+            title=title,
+            verdict=verdict,
+            picture="data:image/png;base64," + base64.b64encode(figure.getvalue()).decode(),
+            cuts=Markup(cuts.to_html(index=False, border=0, na_rep="", float_format="{:.3g}".format)),
+        )
+        (work / "report.html").write_text(html, encoding="utf-8")
+        share, error = found.inside
+        summary = {
+            "title": found.adjusted.block.title,
+            "verdict": verdict,
+            "camera": found.camera,
+            "by": found.by,
+            "method": found.method,
+            "factor": found.band.factor,
+            "sigma_factor": found.band.sigma_factor,
+            "inside": share if np.isfinite(share) else None,
+            "sigma_inside": error if np.isfinite(error) else None,
+            "n_cuts": len(found.cuts),
+            "n_failed": len(found.failed),
+            "versions": versions(),
+        }
+        write_summary(summary, work)

@@ -1,0 +1,105 @@
+"""By which factor standard deviations lie, and a band over the format that holds nevertheless: from repeated halves.
+
+A block is cut in two K times. The bundles of rays of the two halves of cut k differ at cell j of the format by d_kj,
+and the covariances of both promise C_kj for it. Then
+
+    f_j^2 = mean over cuts of |d_kj|^2 / tr C_kj        the factor of a cell
+    F^2   = mean over cells of f_j^2                    the factor of the whole format
+
+are 1 but for chance where the covariances tell the truth. F^2 is a sum of squares of normal variables with the weights
+w of the axes of d (sum w = 1), so one cut gives it with the variance 2 sum w^2 F^4. Cuts of one block are not
+independent: d_k = sum over units i of s_ki z_i, where s_ki = +1 or -1 says in which half unit i is, so that two cuts
+have the correlation r_kl = sum n_i s_ki s_li / sum n_i, and their squares r_kl^2. Hence
+
+    var F^2 = 2 F^4 sum w^2 rho,     rho = mean over k and l of r_kl^2
+
+which no number of cuts makes smaller than the number of units allows. In a cell of the covariance C the squared length
+of an error over f^2 tr C is distributed about as F with a and a / rho degrees of freedom, a = (tr C)^2 / tr C^2
+(Satterthwaite): its 95 % quantile is the squared radius of the band.
+Source of the overlap of half-samples: McCarthy (1969), Review of the International Statistical Institute 37, 239-264.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.special import fdtri
+
+from jaxphoto.arrays import Numbers
+from jaxphoto.stability.uncertainty import LEVEL
+
+
+class Differences(NamedTuple):
+    """What the halves of all cuts differ by, and what their covariances promise; pixels of the measured image."""
+
+    offsets: Float[np.ndarray, "cuts cells 2"]
+    promised: Float[np.ndarray, "cuts cells 2 2"]
+    concentration: float
+    """sum w^2 of the axes of a difference over the whole format, w their parts in F^2."""
+    overlap: Float[np.ndarray, "cuts cuts"]
+    """r_kl^2."""
+
+
+class Band(NamedTuple):
+    """The factor by which standard deviations are too small, and what holds 95 % of the errors; in pixels."""
+
+    factor: float
+    """F of the whole format,"""
+    sigma_factor: float
+    """and its standard deviation over repeated measurements of the block."""
+    cell_factor: Float[np.ndarray, "cells"]
+    halves: Float[np.ndarray, "cells"]
+    """Radius that holds 95 % of the differences of halves of this block, of their mean covariance,"""
+    calibration: Float[np.ndarray, "cells"]
+    """and 95 % of the errors of the calibration by the whole block, as far as halves show them."""
+    of_cuts: Float[np.ndarray, "cuts"]
+    """F of each cut alone."""
+    inside: Float[np.ndarray, "cuts"]
+    """Of each cut, the part of the cells whose difference lies within the band of its own covariance times the factors
+    that the *other* cuts give."""
+
+
+def band_of(found: Differences, whole: Float[np.ndarray, "cells 2 2"]) -> Band:
+    """The factors and bands of `found`; `whole` is what the calibration by the whole block promises (px^2)."""
+    squares, n = (found.offsets**2).sum(axis=2), len(found.offsets)
+    ratio = squares / np.trace(found.promised, axis1=2, axis2=3)
+    rho = float(found.overlap.mean())
+    cell_square = ratio.mean(axis=0)
+    factor = float(cell_square.mean()) ** 0.5
+    inside = np.full(n, np.nan)
+    for k in range(n if n > 1 else 0):
+        others = np.delete(ratio, k, axis=0).mean(axis=0)
+        inside[k] = (squares[k] <= others * _square_radius(found.promised[k], 1 / (n - 1))).mean()
+    return Band(
+        factor=factor,
+        sigma_factor=factor * (found.concentration * rho / 2) ** 0.5,
+        cell_factor=np.sqrt(cell_square),
+        halves=np.sqrt(cell_square * _square_radius(found.promised.mean(axis=0), 1 / n)),
+        calibration=np.sqrt(cell_square * _square_radius(whole, rho)),
+        of_cuts=np.sqrt(ratio.mean(axis=1)),
+        inside=inside,
+    )
+
+
+def concentration(
+    jacobian: Float[np.ndarray, "coordinates parameters"], covariance: Float[np.ndarray, "parameters parameters"]
+) -> float:
+    """sum w^2 of differences J e over cells, e of this covariance: 1 if they have one axis, 1/m if m alike."""
+    by_cell = jacobian.reshape(-1, 2, jacobian.shape[1])
+    trace = np.einsum("cip,pq,ciq->c", by_cell, covariance, by_cell)
+    scaled = (by_cell / np.sqrt(len(trace) * trace)[:, None, None]).reshape(jacobian.shape)
+    form = scaled.T @ scaled @ covariance
+    return float(np.trace(form @ form))
+
+
+def overlap(first: Bool[np.ndarray, "cuts units"], size: Numbers) -> Float[np.ndarray, "cuts cuts"]:
+    """r_kl^2 of cuts that have the units `first` in their first half; `size` is how much each unit weighs."""
+    side = np.where(first, 1.0, -1.0)
+    return ((side * size) @ side.T / size.sum()) ** 2
+
+
+def _square_radius(covariance: Float[np.ndarray, "cells 2 2"], rho: float) -> Float[np.ndarray, "cells"]:
+    """What LEVEL of |e|^2 / f^2 stay below, where f^2 is estimated from squares that are as good as 1 / rho."""
+    trace = np.trace(covariance, axis1=1, axis2=2)
+    a = trace**2 / (covariance**2).sum(axis=(1, 2))
+    return trace * fdtri(a, a / rho, LEVEL)

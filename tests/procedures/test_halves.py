@@ -1,0 +1,144 @@
+"""Halves of a block: factors that simulation confirms, bands that hold, and what both halves share."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import numpy as np
+import pandas as pd
+import pytest
+
+from jaxphoto import adjust
+from jaxphoto.camera import get_parameter
+from jaxphoto.errors import InputError
+from jaxphoto.io import write_block
+from jaxphoto.procedures.halves import halves
+from jaxphoto.simulation import image_coordinates, remeasure
+from jaxphoto.stability import Differences, band_of, bundle_offsets, concentration, image_grid, overlap
+from jaxphoto.statistics import common_covariance
+from jaxphoto.variants import some_images
+from tests.blocks import FIELDS, FIVE, SENSOR, simulated
+from tests.commands import run
+
+CELLS = image_grid(SENSOR, 7, 5)
+
+
+def test_of_many_linear_calibrations_the_factor_scatters_as_stated_and_the_band_holds():
+    """Errors of 30 units z_i twice as large as promised: F is 2 with its sigma, and 95 % of new errors are inside."""
+    rng = np.random.default_rng(4)
+    cells, p, units, cuts, true = 12, 3, 30, 25, 2.0
+    jacobian = rng.normal(size=(2 * cells, p))
+    root = rng.normal(size=(p, p))
+    by_cell = jacobian.reshape(cells, 2, p) @ root
+    whole = units * np.einsum("cip,cjp->cij", by_cell, by_cell)
+    size = np.ones(units)
+    factors, sigmas, inside, fresh = [], [], [], []
+    for _ in range(400):
+        first = np.argsort(rng.random((cuts + 40, units)), axis=1) < units // 2
+        z = true * np.einsum("cip,up->uci", by_cell, rng.normal(size=(units, p)))
+        offsets = 2 * np.einsum("ku,uci->kci", np.where(first, 1.0, -1.0), z)
+        promised = np.broadcast_to(4 * whole, (cuts, *whole.shape))
+        axes = concentration(jacobian, root @ root.T)
+        band = band_of(Differences(offsets[:cuts], promised, axes, overlap(first[:cuts], size)), whole)
+        factors.append(band.factor)
+        sigmas.append(band.sigma_factor / band.factor)
+        error = true * units**0.5 * by_cell @ rng.normal(size=p)
+        inside.append((np.linalg.norm(error, axis=1) < band.calibration).mean())
+        fresh.append((np.linalg.norm(offsets[cuts:], axis=2) < band.halves).mean())
+    assert np.mean(np.square(factors)) == pytest.approx(true**2, rel=0.05)
+    assert np.std(factors) / true == pytest.approx(np.mean(sigmas), rel=0.12)
+    assert np.mean(inside) == pytest.approx(0.95, abs=0.02)
+    assert np.mean(fresh) == pytest.approx(0.95, abs=0.01)
+
+
+@pytest.fixture(scope="module")
+def field():
+    """Photographs of a field of exact points."""
+    return FIELDS["field"](26)
+
+
+def measured(field, seed, **lens):
+    block, truth = field
+    distortion = dataclasses.replace(truth.interior["one"].distortion, **lens)
+    truth = eqx.tree_at(lambda t: t.interior["one"].distortion, truth, distortion)
+    new = remeasure(eqx.tree_at(lambda b: b.start.unknowns, block, truth), truth, jax.random.key(seed))
+    return jax.tree.map(lambda v: np.asarray(v) if isinstance(v, jax.Array) else v, new)
+
+
+def test_what_control_does_to_both_halves_is_what_moving_it_does():
+    """Against central differences of both adjustments by every coordinate of control."""
+    block, truth = simulated("cross")
+    # Without residuals, which would add their curvature to the differences and nothing to the linear covariance.
+    exact = image_coordinates(block, truth), truth.points[block.control.who, block.control.axis]
+    block = eqx.tree_at(lambda b: (b.image_points.xy, b.control.value), block, tuple(map(np.asarray, exact)))
+    parts = [some_images(block, np.arange(10) % 2 == k) for k in (0, 1)]
+    both = [adjust(part, part.start.unknowns) for part in parts]
+    found = common_covariance(*both, "one", FIVE)
+
+    def moved(part, at, name, axis, step):
+        c = part.control
+        own = (np.array(part.points, object)[c.who] == name) & (c.axis == axis)
+        there = dataclasses.replace(part, control=dataclasses.replace(c, value=np.asarray(c.value) + step * own))
+        return np.array([get_parameter(adjust(there, at.unknowns).unknowns.interior["one"], n) for n in FIVE], float)
+
+    names = [{(part.points[w], a) for w, a in zip(part.control.who, part.control.axis, strict=True)} for part in parts]
+    expected, sigma = np.zeros((5, 5)), float(parts[0].control.sigma[0])
+    for name, axis in sorted(names[0] & names[1]):
+        changes = [
+            moved(part, at, name, axis, sigma) - moved(part, at, name, axis, -sigma)
+            for part, at in zip(parts, both, strict=True)
+        ]
+        expected += np.outer(*changes) / 4
+    size = np.sqrt(np.outer(*2 * [np.abs(np.diag(expected))]))
+    assert (np.diag(expected) != 0).all()
+    assert np.abs((found - expected) / size).max() < 0.02
+
+
+def test_halves_of_a_sound_block_are_as_close_as_promised(field):
+    found = halves(measured(field, 3), CELLS, n_cuts=12)
+    assert len(found.cuts) == 12 and not found.failed
+    null = found.band.sigma_factor / found.band.factor
+    assert abs(found.band.factor - 1) < 3 * null
+    first, second = found.cuts[0].cameras
+    again = np.asarray(bundle_offsets(first, second, CELLS, "rot").measured) / SENSOR.pixel_mm
+    np.testing.assert_allclose(found.cuts[0].offsets_px, again)
+
+
+@pytest.mark.slow
+def test_the_factor_is_one_without_model_error_and_the_band_covers_with_it(field):
+    """Sixteen blocks; then as many of a lens whose decentring the model lacks, judged by cuts that made no band."""
+    factors = [halves(measured(field, seed), CELLS, n_cuts=20, seed=seed).band for seed in range(16)]
+    null = np.mean([band.sigma_factor / band.factor for band in factors])
+    assert abs(np.mean([band.factor**2 for band in factors]) - 1) < 4 * 2 * null / 16**0.5
+    inside = []
+    for seed in range(16):
+        block = measured(field, seed, p1=4e-5)
+        band = halves(block, CELLS, n_cuts=20, seed=1).band
+        fresh = halves(block, CELLS, n_cuts=20, seed=2).cuts
+        inside += [(np.linalg.norm(cut.offsets_px, axis=1) < band.halves).mean() for cut in fresh]
+    assert np.mean(inside) == pytest.approx(0.95, abs=0.03)
+
+
+def test_the_command_writes_cells_and_cuts(field, tmp_path, monkeypatch, capsys):
+    write_block(measured(field, 3), tmp_path / "block")
+    out = tmp_path / "out"
+    command = ("halves", tmp_path / "block", "--cuts", 3, "--grid", "7x5", "--out", out)
+    code, text, _ = run(monkeypatch, capsys, *command)
+    assert code == 0
+    assert "standard deviations of camera one" in text
+    cells, cuts = pd.read_csv(out / "cells.csv"), pd.read_csv(out / "cuts.csv")
+    assert (len(cells), len(cuts)) == (35, 3)
+    rms = np.sqrt((cells.halves_px**2).mean())
+    assert rms == pytest.approx(np.sqrt((cuts.rms_px**2).mean()), rel=1e-6)
+    assert {path.name for path in out.iterdir()} >= {"halves.png", "report.html", "summary.json"}
+    code, _, error = run(monkeypatch, capsys, *command, "--by", "strip")
+    assert (code, "image i0 is in no strip; give it one, or cut by image" in error) == (2, True)
+
+
+def test_what_cannot_be_cut_is_said(field):
+    block, _ = simulated("strips")
+    with pytest.raises(InputError, match="name one of one"):
+        halves(block, CELLS, camera="two")
+    one = dataclasses.replace(block, image_strip=("a",) * len(block.images))
+    with pytest.raises(InputError, match="all images of camera one are in one strip"):
+        halves(one, CELLS, by="strip")
