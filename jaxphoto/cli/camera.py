@@ -40,7 +40,9 @@ def camera_command(
     size = None if width_px is None or height_px is None else (width_px, height_px)
     read = read_camera_file(source, camera=camera, pixel_mm=pixel_mm, size_px=size, block=block)
     kind = known[distortion] if distortion is not None else None
-    done = write_camera_file(out, read.sensor, read.interior, out_format, name=read.name, distortion=kind)
+    done = write_camera_file(
+        out, read.sensor, read.interior, out_format, name=read.name, distortion=kind, covariance=read.covariance
+    )
     console = plain_console()
     console.print(
         f"{read.name}: {type(read.interior.distortion).__name__} -> {type(done.interior.distortion).__name__}",

@@ -30,6 +30,7 @@ from jaxphoto.observations.columns import sigma_key as sigma_key
 from jaxphoto.observations.correlated import Correlated as Correlated
 from jaxphoto.observations.correlated import correlated as correlated
 from jaxphoto.observations.correlated import exponential_covariance as exponential_covariance
+from jaxphoto.observations.correlated import is_covariance as is_covariance
 from jaxphoto.observations.priors import PRIORS as PRIORS
 from jaxphoto.observations.priors import KnownParameters as KnownParameters
 from jaxphoto.observations.priors import ParameterRows as ParameterRows

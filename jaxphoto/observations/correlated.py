@@ -141,3 +141,12 @@ def exponential_covariance(
     """sigma_i sigma_j exp(-|t_i - t_j| / T): a first-order Gauss-Markov process at `time` (s), T in s."""
     time, sigma = np.asarray(time, float), np.broadcast_to(np.asarray(sigma, float), np.shape(time))
     return sigma[:, None] * sigma * np.exp(-np.abs(time[:, None] - time) / correlation_time)
+
+
+def is_covariance(matrix: Float[np.ndarray, "n n"]) -> bool:
+    """Whether a symmetric matrix is positive definite, in whatever units its numbers are: by its correlations."""
+    variance = matrix.diagonal()
+    if not (variance > 0).all():
+        return False
+    sigma = np.sqrt(variance)
+    return bool(np.linalg.eigvalsh(matrix / sigma[:, None] / sigma).min(initial=1.0) > 0)

@@ -18,6 +18,7 @@ from jaxphoto.georeferencing import Mount
 from jaxphoto.io.block_folder.attitude_units import check_attitude_units
 from jaxphoto.io.block_folder.control import check_datum_points, read_control
 from jaxphoto.io.block_folder.declared_unknowns import known_unknowns, read_unknowns
+from jaxphoto.io.block_folder.earlier_calibration import known_cameras, with_earlier_calibrations
 from jaxphoto.io.block_folder.frame_sections import read_corrections, read_frame
 from jaxphoto.io.block_folder.georeferencing import read_attitudes, read_stations
 from jaxphoto.io.block_folder.image_points import check_rays, read_image_points
@@ -88,7 +89,7 @@ def read_folder(folder: Path, more: Iterable[type] = ()) -> BlockTables:
     for file in needed:
         if not (folder / file).is_file():
             raise InputError(f"{folder} has no file {file}; add it ({', '.join(needed)} are needed)")
-    settings = read_toml(folder / TOML)
+    settings = with_earlier_calibrations(read_toml(folder / TOML), TOML, folder)
     tables: dict[str, Table] = {}
     top = Section(TOML, "", settings)
     frame, flight = read_frame(top.section("frame")), top.section("trajectory")
@@ -193,7 +194,7 @@ def assemble(source: BlockTables) -> Block:
         start=dataclasses.replace(block.start, unknowns=start),
         priors=priors,
         distances=distances,
-        more=further,
+        more=(*further, *known_cameras(cameras)),
     )
     posed = MODES[settings.mode](block)
     if settings.mode == "direct":

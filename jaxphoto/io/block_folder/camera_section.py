@@ -23,7 +23,7 @@ from jaxphoto.camera import (
 from jaxphoto.camera.declared import Declared
 from jaxphoto.errors import BlockError, InputError, quoted
 from jaxphoto.io.block_folder.section import Section
-from jaxphoto.unknowns import FIXED, Prior, Weighted
+from jaxphoto.unknowns import FIXED, FREE, Prior, Weighted
 
 _KEYS = ("width_px", "height_px", "pixel_mm", "distortion", "projection", "residuals")
 # A principal distance beyond these multiples of the format's diagonal is in another unit than millimetres.
@@ -34,19 +34,29 @@ _PIXEL_MM = (2e-4, 0.1)
 Part = TypeVar("Part", bound=Declared)
 
 
+class KnownTogether(NamedTuple):
+    """Parameters of a camera that an earlier calibration knows: as they stand in its interior orientation, with this
+    covariance (in their own units)."""
+
+    parameters: tuple[str, ...]
+    covariance: np.ndarray
+
+
 class Camera(NamedTuple):
     """A camera as block.toml gives it; `priors` has a prior in place of each number of `interior`."""
 
     sensor: Sensor
     interior: InteriorOrientation
     priors: InteriorOrientation
+    known: KnownTogether | None = None
+    """What is known beforehand together; free in `priors`."""
 
 
 def read_camera(section: Section) -> Camera:
     """The camera that a [cameras.X] table describes. Raises InputError for what cannot be one."""
     distortion = _kind(section, "distortion", AbstractDistortion.called)
     projection = _kind(section, "projection", AbstractProjection.called, Perspective.name)
-    section.known(*_KEYS, *distortion.choices, *projection.choices, "interior", "unknowns")
+    section.known(*_KEYS, *distortion.choices, *projection.choices, "interior", "unknowns", "known")
     sensor = Sensor(section.count("width_px"), section.count("height_px"), section.positive("pixel_mm"))
     if not _PIXEL_MM[0] <= sensor.pixel_mm <= _PIXEL_MM[1]:
         raise section.error("pixel_mm", f"a pixel of {sensor.pixel_mm:g} mm cannot be; give its size in millimetres")
@@ -57,12 +67,19 @@ def read_camera(section: Section) -> Camera:
     priors = jax.tree.map(lambda _: FIXED, interior)
     for name in status:
         priors = set_parameter(priors, name, status.prior(name, get_parameter(interior, name)))
-    return Camera(sensor, interior, priors)
+    known = _read_known(section.section("known"), parameter_names(interior))
+    for name in () if known is None else known.parameters:
+        if status.values.get(name, "free") != "free":
+            raise status.error(
+                name, f"it is known beforehand by [{section.path}.known]; remove it here, or there with its covariance"
+            )
+        priors = set_parameter(priors, name, FREE)
+    return Camera(sensor, interior, priors, known)
 
 
 def camera_section(camera: Camera) -> dict[str, Any]:
     """The [cameras.X] table that `read_camera` reads as `camera`."""
-    sensor, interior, priors = camera
+    sensor, interior, priors, known = camera
     written: dict[str, Any] = {"width_px": sensor.width_px, "height_px": sensor.height_px, "pixel_mm": sensor.pixel_mm}
     written |= model_keys(interior)
     if interior.residuals != "model":
@@ -70,6 +87,8 @@ def camera_section(camera: Camera) -> dict[str, Any]:
     names = parameter_names(interior)
     written["interior"] = {n: float(get_parameter(interior, n)) for n in (*names, *constant_names(interior))}
     written["unknowns"] = {name: status(get_parameter(priors, name), get_parameter(interior, name)) for name in names}
+    if known is not None:
+        written["known"] = {"parameters": list(known.parameters), "matrix": known.covariance.tolist()}
     return written
 
 
@@ -86,6 +105,18 @@ def status(prior: Any, start, scale: float = 1.0) -> str | dict[str, Any]:
     if not np.array_equal(np.asarray(prior.value), np.asarray(start)):
         written["value"] = (np.asarray(prior.value) / scale).tolist()
     return written
+
+
+def _read_known(section: Section, names: tuple[str, ...]) -> KnownTogether | None:
+    if not section.values:
+        return None
+    section.known("parameters", "matrix")
+    parameters = section.texts("parameters")
+    for name in parameters:
+        if name not in names or parameters.count(name) > 1:
+            raise section.error("parameters", f"{quoted(name)} is none, or stands there twice; {', '.join(names)} are")
+    matrix = section.covariance("matrix", section.values.get("matrix"), len(parameters))
+    return KnownTogether(parameters, matrix)
 
 
 def _kind(section: Section, key: str, called: Callable[[str], type[Part]], usual: str | None = None) -> type[Part]:

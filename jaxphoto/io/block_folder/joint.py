@@ -17,7 +17,7 @@ from jaxphoto.errors import InputError
 from jaxphoto.io.block_folder.observed import Ids, Kind, cells, layout_of, read_fields, rows_of
 from jaxphoto.io.block_folder.table_layout import TableLayout
 from jaxphoto.io.text_tables import Table
-from jaxphoto.observations import Correlated, KnownParameters, columns_of, correlated
+from jaxphoto.observations import Correlated, KnownParameters, columns_of, correlated, is_covariance
 from jaxphoto.observations.columns import FILE_UNITS
 
 KNOWN = "known_parameters"
@@ -121,7 +121,7 @@ def _sets(table: Table, matrices: Table, unit: str, scale: float, k: int) -> Ite
                 raise matrices.bad(line, said)
             matrix[row, column] = matrix[column, row] = value[line]
         matrix = np.nan_to_num(matrix)
-        if not np.all(np.linalg.eigvalsh(matrix) > 0):
+        if not is_covariance(matrix):
             raise InputError(
                 f"{matrices.file}: the covariance matrix of set {name} is not positive definite; give a variance "
                 f"of each of its {n} numbers (a = b), and covariances that go with them"

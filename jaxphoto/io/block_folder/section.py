@@ -9,6 +9,7 @@ from jaxphoto.arrays import on_device
 from jaxphoto.errors import InputError, quoted
 from jaxphoto.io.names import harm_in
 from jaxphoto.io.text_tables import LARGEST
+from jaxphoto.observations import is_covariance
 from jaxphoto.unknowns import FIXED, FREE, Prior, Weighted
 
 MOST = 10**9
@@ -115,21 +116,22 @@ class Section:
             raise self.error(key, f'{quoted(status)} is no status; write "free", "fixed" or {{ sigma{unit} = ... }}')
         value = self._array(key, status[names["value"][0]], shape) * scale if names["value"] else np.asarray(start)
         if names["covariance"]:
-            return Weighted(on_device(value), covariance=on_device(self._covariance(key, status, *shape) * scale**2))
+            matrix = self.covariance(key, status["covariance"], *shape)
+            return Weighted(on_device(value), covariance=on_device(matrix * scale**2))
         sigma = self._array(key, status[names["sigma"][0]], shape) * scale
         if not np.all(sigma > 0):
             raise self.error(key, f'sigma = {status[names["sigma"][0]]} is not positive; give the true one or "fixed"')
         return Weighted(on_device(value), on_device(sigma))
 
-    def _covariance(self, key: str, status: dict[str, Any], size: int) -> np.ndarray:
-        rows = status["covariance"]
+    def covariance(self, key: str, rows: Any, size: int) -> np.ndarray:
+        """A covariance matrix of `size` numbers, which `key` gives by `rows`."""
         lengths = [len(row) if isinstance(row, list) else 0 for row in rows] if isinstance(rows, list) else []
         if lengths != [size] * size:
             raise self.error(
                 key, f"the covariance is no matrix of {size} x {size}; write {size} lists of {size} numbers"
             )
         matrix = np.array([[self._finite(key, v) for v in row] for row in rows])
-        if not np.array_equal(matrix, matrix.T) or not np.all(np.linalg.eigvalsh(matrix) > 0):
+        if not np.array_equal(matrix, matrix.T) or not is_covariance(matrix):
             raise self.error(key, "the covariance is not symmetric and positive definite; correct it, or give sigma")
         return matrix
 

@@ -4,6 +4,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 from jaxphoto.camera import AbstractDistortion, Agisoft, InteriorOrientation, Perspective, Sensor, Smac
 from jaxphoto.camera.conversion import Conversion, converted
 from jaxphoto.errors import InputError
@@ -50,11 +52,13 @@ def write_camera_file(
     *,
     name: str = "camera",
     distortion: type[AbstractDistortion] | None = None,
+    covariance: np.ndarray | None = None,
 ) -> Conversion:
     """Write a camera in one of `CAMERA_FORMATS`, and say by how much the file's camera differs from `interior`.
 
     `format` None: cameras.txt is COLMAP's, else the suffix tells. The distortion is converted exactly where its terms
-    allow it, else fitted over the format (`camera.conversion`). `distortion` chooses the model in a block.toml.
+    allow it, else fitted over the format (`camera.conversion`). `distortion` chooses the model in a block.toml, where
+    the `covariance` of `parameter_names(interior)` is kept, too, if the model stays what it is.
 
     Raises InputError for unknown formats, for a `distortion` that is not the format's and for cameras that the format
     cannot hold.
@@ -79,5 +83,8 @@ def write_camera_file(
     except ValueError as error:
         raise InputError(f"{path} cannot be written: {error}") from None
     with whole_file(path) as work:
-        known.write(work, name, sensor, conversion.interior)
+        if format == "block" and type(conversion.interior.distortion) is type(interior.distortion):
+            write_block_camera(work, name, sensor, conversion.interior, covariance)
+        else:
+            known.write(work, name, sensor, conversion.interior)
     return conversion

@@ -10,6 +10,7 @@ from jaxphoto.arrays import on_device
 from jaxphoto.camera import InteriorOrientation, Sensor, constant_names, empty_camera, parameter_names, set_parameter
 from jaxphoto.errors import InputError
 from jaxphoto.io.block_folder.camera_section import Camera, camera_section
+from jaxphoto.io.block_folder.earlier_calibration import known_together
 from jaxphoto.io.block_folder.section import Section
 from jaxphoto.io.block_folder.settings import read_settings, toml_text
 from jaxphoto.io.block_folder.table_layout import TOML
@@ -30,12 +31,26 @@ def read_block_camera(source: CameraSource) -> CameraFile:
     cameras = read_settings(read_toml(source.path), source.path.name).cameras
     name = source.chosen(list(cameras))
     camera = cameras[name]
-    return CameraFile(name, camera.sensor, camera.interior)
+    covariance = None
+    if camera.known is not None:
+        names = parameter_names(camera.interior)
+        which = [names.index(parameter) for parameter in camera.known.parameters]
+        covariance = np.zeros((len(names), len(names)))
+        covariance[np.ix_(which, which)] = camera.known.covariance
+    return CameraFile(name, camera.sensor, camera.interior, covariance)
 
 
-def write_block_camera(path: Path, name: str, sensor: Sensor, interior: InteriorOrientation) -> None:
-    """Write the [cameras.NAME] table of a block.toml, everything fixed."""
-    section = camera_section(Camera(sensor, interior, jax.tree.map(lambda _: FIXED, interior)))
+def write_block_camera(
+    path: Path, name: str, sensor: Sensor, interior: InteriorOrientation, covariance: np.ndarray | None = None
+) -> None:
+    """Write the [cameras.NAME] table of a block.toml, everything fixed but what has a covariance: that is known by it.
+
+    `covariance` is that of `parameter_names(interior)`.
+    """
+    known = None if covariance is None else known_together(interior, covariance)
+    section = camera_section(Camera(sensor, interior, jax.tree.map(lambda _: FIXED, interior), known))
+    for parameter in () if known is None else known.parameters:
+        section["unknowns"][parameter] = "free"
     path.write_text(toml_text({"cameras": {name: section}}), encoding="utf-8")
 
 
