@@ -9,10 +9,10 @@ import typer
 from jaxphoto.cli.app import app
 from jaxphoto.cli.console import plain_console
 from jaxphoto.cli.grid_options import check_grid, method_of, points_of
+from jaxphoto.cli.two_cameras import compared, read_two
 from jaxphoto.errors import InputError
-from jaxphoto.io.cameras import CameraFile, read_camera_file
 from jaxphoto.report import print_warning
-from jaxphoto.report.stability import Compared, print_stability, write_stability
+from jaxphoto.report.stability import print_stability, write_stability
 from jaxphoto.stability import METHODS, analyse
 from jaxphoto.writing import check_folder
 
@@ -47,18 +47,10 @@ def stability_command(
     check_grid(grid, extent)
     if out is not None:
         check_folder(out, first, second)
-    names = (camera, camera_b if camera_b is not None else camera)
-    both = a, b = [
-        read_camera_file(path, camera=name, pixel_mm=pixel_mm, block=block)
-        for path, name in zip((first, second), names, strict=True)
-    ]
-    _check_one_sensor(a, b, first, second)
+    both = a, b = read_two((first, second), (camera, camera_b), pixel_mm, block)
     found = analyse(a.interior, b.interior, points_of(a.sensor, grid, extent), (a.covariance, b.covariance), relief)
     console, noise_mm = plain_console(), noise_px * a.sensor.pixel_mm
-    one, other = (
-        Compared(f"{letter} ({path})", file.interior, file.covariance is not None)
-        for letter, path, file in zip("AB", (first, second), both, strict=True)
-    )
+    one, other = compared("A", first, a), compared("B", second, b)
     for letter, file in zip("AB", both, strict=True):
         if file.note:
             print_warning(f"{letter}: {file.note}", console, soft_wrap=True)
@@ -66,17 +58,3 @@ def stability_command(
     if out is not None:
         write_stability(found, (one, other), a.sensor, noise_mm, chosen, out)
         console.print(f"results in {out} (open report.html)")
-
-
-def _check_one_sensor(a: CameraFile, b: CameraFile, first: Path, second: Path) -> None:
-    one, other = a.sensor, b.sensor
-    if (one.width_px, one.height_px) != (other.width_px, other.height_px):
-        raise InputError(
-            f"{first} is of {one.width_px} x {one.height_px} px, {second} of {other.width_px} x {other.height_px} px; "
-            "compare two sets of one camera"
-        )
-    if not math.isclose(one.pixel_mm, other.pixel_mm, rel_tol=1e-6):
-        raise InputError(
-            f"the pixel of {first} is {one.pixel_mm:g} mm, that of {second} {other.pixel_mm:g} mm; where one of them "
-            "was assumed, give the true one by --pixel-mm"
-        )

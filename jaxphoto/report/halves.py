@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import io
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,8 +12,8 @@ from markupsafe import Markup
 from rich.console import Console
 
 from jaxphoto.procedures.halves import Halves
+from jaxphoto.report.maps import format_maps, png_of
 from jaxphoto.report.page import STYLE
-from jaxphoto.report.plots import new_figure
 from jaxphoto.report.results import versions, write_summary
 from jaxphoto.writing import whole_folder
 
@@ -107,21 +105,11 @@ def halves_verdict(found: Halves) -> list[str]:
 
 def halves_figure(found: Halves) -> Figure:
     """Maps over the format: the factor of the standard deviations, and the radius of the band in pixels."""
-    figure = new_figure(9.6, 3.9)
-    sensor = found.adjusted.block.sensors[found.camera]
-    w, h = sensor.width_mm / 2, sensor.height_mm / 2
-    for axes, values, label in zip(
-        figure.subplots(1, 2),
-        (found.band.cell_factor, found.band.calibration),
-        ("factor of the standard deviations", "95 % of the errors are smaller [px]"),
-        strict=True,
-    ):
-        shown = axes.tricontourf(*found.cells_mm.T, values, levels=12, cmap="viridis")
-        figure.colorbar(shown, ax=axes, shrink=0.85)
-        axes.plot([-w, w, w, -w, -w], [-h, -h, h, h, -h], color="0.4", lw=0.8)
-        axes.set_title(label, loc="left", fontsize=10)
-        axes.set(xlabel="x [mm]", ylabel="y [mm]", aspect="equal")
-    return figure
+    maps = {
+        "factor of the standard deviations": found.band.cell_factor,
+        "95 % of the errors are smaller [px]": found.band.calibration,
+    }
+    return format_maps(found.adjusted.block.sensors[found.camera], found.cells_mm, maps)
 
 
 def print_halves(found: Halves, console: Console) -> None:
@@ -137,18 +125,17 @@ def write_halves(found: Halves, directory: Path) -> None:
     """
     cells, cuts, verdict = cell_table(found), cut_table(found), halves_verdict(found)
     title = f"{found.adjusted.block.title or 'block'}: halves"
-    figure = io.BytesIO()
-    halves_figure(found).savefig(figure, format="png")
+    content, picture = png_of(halves_figure(found))
     with whole_folder(directory) as work:
         cells.to_csv(work / "cells.csv", index=False)
         cuts.to_csv(work / "cuts.csv", index=False)
-        (work / "halves.png").write_bytes(figure.getvalue())
+        (work / "halves.png").write_bytes(content)
         page = Environment(autoescape=True).from_string(_PAGE)
         html = page.render(
             style=STYLE,
             title=title,
             verdict=verdict,
-            picture="data:image/png;base64," + base64.b64encode(figure.getvalue()).decode(),
+            picture=picture,
             cuts=Markup(cuts.to_html(index=False, border=0, na_rep="", float_format="{:.3g}".format)),
         )
         (work / "report.html").write_text(html, encoding="utf-8")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import io
 from collections.abc import Hashable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -16,6 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from jaxphoto.camera import InteriorOrientation, Sensor
+from jaxphoto.report.maps import png_of
 from jaxphoto.report.page import STYLE
 from jaxphoto.report.plots import new_figure
 from jaxphoto.report.results import versions, write_summary
@@ -110,7 +109,7 @@ def print_stability(
     """Both sets, a column for each method in micrometres, and the verdict by `method`."""
     for compared in sets:
         console.print(str(compared), highlight=False, markup=False, soft_wrap=True)
-    console.print(_missing(sets), highlight=False, markup=False, soft_wrap=True)
+    console.print(missing_covariances(sets), highlight=False, markup=False, soft_wrap=True)
     table = Table(title=f"stability (um); noise {1e3 * noise_mm:.4g} um = {noise_mm / pixel_mm:.4g} px")
     table.add_column("", no_wrap=True)
     for name in analyses:
@@ -156,12 +155,11 @@ def write_stability(
     table = stability_table(analyses, sensor.pixel_mm, noise_mm)
     chosen = analyses[method]
     verdict = f"{method}: {chosen.verdict(noise_mm)}"
-    figure = io.BytesIO()
-    offsets_figure(chosen, sensor).savefig(figure, format="png")
+    content, picture = png_of(offsets_figure(chosen, sensor))
     with whole_folder(directory) as work:
         table.to_csv(work / "stability.csv", index=False)
         offsets_table(chosen).to_csv(work / "offsets.csv", index=False)
-        (work / "offsets.png").write_bytes(figure.getvalue())
+        (work / "offsets.png").write_bytes(content)
         page = (
             Environment(autoescape=True)
             .from_string(_PAGE)
@@ -169,9 +167,9 @@ def write_stability(
                 style=STYLE,
                 similar=chosen.similar(noise_mm),
                 verdict=verdict,
-                about=[str(sets[0]), str(sets[1]), _missing(sets)],
+                about=[str(sets[0]), str(sets[1]), missing_covariances(sets)],
                 table=Markup(table.to_html(index=False, border=0, na_rep="", float_format="{:.4g}".format)),
-                picture="data:image/png;base64," + base64.b64encode(figure.getvalue()).decode(),
+                picture=picture,
             )
         )
         (work / "report.html").write_text(page, encoding="utf-8")
@@ -188,7 +186,7 @@ def write_stability(
         write_summary(summary, work)
 
 
-def _missing(sets: tuple[Compared, Compared]) -> str:
+def missing_covariances(sets: tuple[Compared, Compared]) -> str:
     """What the uncertainty is made of."""
     without = [one.name for one in sets if not one.known]
     if len(without) == 2:

@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.special import fdtri
+from scipy.special import fdtri, gammaincinv
 
 from jaxphoto.arrays import Numbers
 from jaxphoto.stability.uncertainty import LEVEL
@@ -69,13 +69,13 @@ def band_of(found: Differences, whole: Float[np.ndarray, "cells 2 2"]) -> Band:
     inside = np.full(n, np.nan)
     for k in range(n if n > 1 else 0):
         others = np.delete(ratio, k, axis=0).mean(axis=0)
-        inside[k] = (squares[k] <= others * _square_radius(found.promised[k], 1 / (n - 1))).mean()
+        inside[k] = (squares[k] <= others * square_radius(found.promised[k], 1 / (n - 1))).mean()
     return Band(
         factor=factor,
         sigma_factor=factor * (found.concentration * rho / 2) ** 0.5,
         cell_factor=np.sqrt(cell_square),
-        halves=np.sqrt(cell_square * _square_radius(found.promised.mean(axis=0), 1 / n)),
-        calibration=np.sqrt(cell_square * _square_radius(whole, rho)),
+        halves=np.sqrt(cell_square * square_radius(found.promised.mean(axis=0), 1 / n)),
+        calibration=np.sqrt(cell_square * square_radius(whole, rho)),
         of_cuts=np.sqrt(ratio.mean(axis=1)),
         inside=inside,
     )
@@ -98,8 +98,11 @@ def overlap(first: Bool[np.ndarray, "cuts units"], size: Numbers) -> Float[np.nd
     return ((side * size) @ side.T / size.sum()) ** 2
 
 
-def _square_radius(covariance: Float[np.ndarray, "cells 2 2"], rho: float) -> Float[np.ndarray, "cells"]:
-    """What LEVEL of |e|^2 / f^2 stay below, where f^2 is estimated from squares that are as good as 1 / rho."""
+def square_radius(covariance: Float[np.ndarray, "cells 2 2"], rho: float = 0.0) -> Float[np.ndarray, "cells"]:
+    """What LEVEL of |e|^2 of errors e with this covariance stay below.
+
+    Or of |e|^2 / f^2, where f^2 is estimated from as many squares as 1 / rho.
+    """
     trace = np.trace(covariance, axis1=1, axis2=2)
     a = trace**2 / (covariance**2).sum(axis=(1, 2))
-    return trace * fdtri(a, a / rho, LEVEL)
+    return trace * (fdtri(a, a / rho, LEVEL) if rho else 2 * gammaincinv(a / 2, LEVEL) / a)

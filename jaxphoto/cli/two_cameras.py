@@ -1,0 +1,41 @@
+"""Camera files that are compared or combined: of one format and one size of pixel."""
+
+import math
+from pathlib import Path
+
+from jaxphoto.errors import InputError
+from jaxphoto.io.cameras import CameraFile, read_camera_file
+from jaxphoto.report.stability import Compared
+
+
+def read_two(
+    paths: tuple[Path, Path], cameras: tuple[str | None, str | None], pixel_mm: float | None, block: Path | None
+) -> tuple[CameraFile, CameraFile]:
+    """A and B; the camera of B is called as that of A where it has no other name. Raises what the reader raises."""
+    names = (cameras[0], cameras[1] if cameras[1] is not None else cameras[0])
+    a, b = (
+        read_camera_file(path, camera=name, pixel_mm=pixel_mm, block=block)
+        for path, name in zip(paths, names, strict=True)
+    )
+    check_one_sensor(a, b, *paths)
+    return a, b
+
+
+def compared(letter: str, path: Path, file: CameraFile) -> Compared:
+    """What tables and pictures call a camera file."""
+    return Compared(f"{letter} ({path})", file.interior, file.covariance is not None)
+
+
+def check_one_sensor(a: CameraFile, b: CameraFile, first: Path, second: Path) -> None:
+    """Raise InputError where two camera files are of different formats or sizes of pixel."""
+    one, other = a.sensor, b.sensor
+    if (one.width_px, one.height_px) != (other.width_px, other.height_px):
+        raise InputError(
+            f"{first} is of {one.width_px} x {one.height_px} px, {second} of {other.width_px} x {other.height_px} px; "
+            "compare two sets of one camera"
+        )
+    if not math.isclose(one.pixel_mm, other.pixel_mm, rel_tol=1e-6):
+        raise InputError(
+            f"the pixel of {first} is {one.pixel_mm:g} mm, that of {second} {other.pixel_mm:g} mm; where one of them "
+            "was assumed, give the true one by --pixel-mm"
+        )

@@ -1,0 +1,144 @@
+"""Two calibrations of a camera compared: tables, maps, a page and words in the terminal."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from jinja2 import Environment
+from markupsafe import Markup
+from rich.console import Console
+from rich.table import Table
+
+from jaxphoto.camera import Sensor
+from jaxphoto.report.maps import format_maps, png_of
+from jaxphoto.report.page import STYLE
+from jaxphoto.report.results import versions, write_summary
+from jaxphoto.report.stability import Compared, missing_covariances
+from jaxphoto.stability import LEVEL, Change
+from jaxphoto.stability.analysis import SIGNIFICANT_P
+from jaxphoto.writing import whole_folder
+
+_PAGE = """<!DOCTYPE html>
+<html lang="en"><head><meta charset="utf-8"><title>Change of a camera</title><style>{{ style }}</style></head><body>
+<h1>Change of a camera</h1>
+{% for line in about %}<p>{{ line }}</p>{% endfor %}
+{% for sentence in verdict %}<p><b>{{ sentence }}</b></p>{% endfor %}
+<img alt="maps over the format" src="{{ picture }}">
+{{ parameters }}
+</body></html>
+"""
+
+
+def parameter_changes(found: Change) -> pd.DataFrame:
+    """parameter, first, second, difference (second minus first), sigma (of it), ratio, p_value; none of two models."""
+    columns = ["parameter", "first", "second", "difference", "sigma", "p_value"]
+    table = pd.DataFrame(found.parameters, columns=columns)
+    known = table["sigma"] > 0
+    table.insert(5, "ratio", table["difference"].where(known) / table["sigma"].where(known))
+    return table
+
+
+def change_cells(found: Change, sensor: Sensor) -> pd.DataFrame:
+    """A row each point of the format: x_mm, y_mm; dx_px, dy_px (first minus second bundle, aligned, in the measured
+    image), offset_px (its length), limit_px (95 % of two calibrations of one camera), beyond.
+    """
+    v = found.field.offsets
+    columns = ["x_mm", "y_mm", "dx_px", "dy_px"]
+    table = pd.DataFrame(np.hstack([v.points, np.asarray(v.measured) / sensor.pixel_mm]), columns=columns)
+    return table.assign(
+        offset_px=found.offset_mm / sensor.pixel_mm, limit_px=found.limit_mm / sensor.pixel_mm, beyond=found.beyond
+    )
+
+
+def change_verdict(found: Change, sensor: Sensor) -> list[str]:
+    """What the tests say, in sentences."""
+    said = []
+    if found.degrees_of_freedom:
+        said.append(
+            f"by its parameters: chi-square {found.chi_square:.1f} of {found.degrees_of_freedom}, "
+            f"p = {found.p_parameters:.2g}: {_meaning(found.p_parameters)}"
+        )
+    elif not found.parameters:
+        said.append("the calibrations are of different models, so their parameters are not compared")
+    held = [one.parameter for one in found.parameters if one.sigma == 0 and one.difference != 0]
+    if held:
+        said.append(f"held at different values, and in no test of parameters: {', '.join(held)}")
+    known = found.field.uncertainty
+    rmse = float(found.field.offsets.rmse_measured_mm) / sensor.pixel_mm
+    if known is not None:
+        said.append(
+            f"by its bundle of rays, aligned by {found.field.method}: {rmse:.3g} px root mean square over the format, "
+            f"p = {known.p_value:.2g}: {_meaning(known.p_value)}"
+        )
+    worst = int(np.argmax(found.offset_mm / found.limit_mm))
+    x, y = np.asarray(found.field.offsets.points)[worst]
+    n = len(found.limit_mm)
+    said.append(
+        f"at {found.beyond.sum()} of {n} points the offset is beyond what {100 * LEVEL:.0f} % of calibrations of one "
+        f"camera stay below ({(1 - LEVEL) * n:.0f} would be usual); farthest at x {x:.3g}, y {y:.3g} mm: "
+        f"{found.offset_mm[worst] / sensor.pixel_mm:.3g} px, where {found.limit_mm[worst] / sensor.pixel_mm:.3g} px is "
+        "the limit"
+    )
+    return said
+
+
+def _meaning(p_value: float) -> str:
+    changed = "the camera has changed, or many image points of a calibration share errors (jaxphoto halves tells)"
+    return changed if p_value < SIGNIFICANT_P else "nothing says that it has changed"
+
+
+def print_change(found: Change, sets: tuple[Compared, Compared], sensor: Sensor, console: Console) -> None:
+    """Both calibrations, the table of parameters and the sentences."""
+    for line in (*map(str, sets), missing_covariances(sets)):
+        console.print(line, soft_wrap=True)
+    if found.parameters:
+        table = Table("parameter", "A", "B", "B - A", "sigma", "p")
+        for one in found.parameters:
+            if one.sigma > 0 or one.first or one.second:
+                p = f"{one.p_value:.2g}" if one.sigma > 0 else "held"
+                values = (f"{one.first:.8g}", f"{one.second:.8g}", f"{one.difference:.3g}", f"{one.sigma:.3g}")
+                table.add_row(one.parameter, *values, p)
+        console.print(table)
+    for sentence in change_verdict(found, sensor):
+        console.print(sentence, soft_wrap=True)
+
+
+def write_change(found: Change, sets: tuple[Compared, Compared], sensor: Sensor, directory: Path) -> None:
+    """parameters.csv, cells.csv, change.png, report.html and summary.json.
+
+    Raises InputError where `directory` holds something that is not an earlier result.
+    """
+    parameters, verdict = parameter_changes(found), change_verdict(found, sensor)
+    maps = {
+        "offset [px]": found.offset_mm / sensor.pixel_mm,
+        f"offset over what {100 * LEVEL:.0f} % stay below": found.offset_mm / found.limit_mm,
+    }
+    content, picture = png_of(format_maps(sensor, np.asarray(found.field.offsets.points), maps))
+    known = found.field.uncertainty
+    with whole_folder(directory) as work:
+        parameters.to_csv(work / "parameters.csv", index=False)
+        change_cells(found, sensor).to_csv(work / "cells.csv", index=False)
+        (work / "change.png").write_bytes(content)
+        html = Environment(autoescape=True).from_string(_PAGE)
+        page = html.render(
+            style=STYLE,
+            about=[str(sets[0]), str(sets[1]), missing_covariances(sets)],
+            verdict=verdict,
+            picture=picture,
+            parameters=Markup(parameters.to_html(index=False, border=0, na_rep="", float_format="{:.6g}".format)),
+        )
+        (work / "report.html").write_text(page, encoding="utf-8")
+        summary = {
+            "verdict": verdict,
+            "method": found.field.method,
+            "chi_square": found.chi_square if found.degrees_of_freedom else None,
+            "degrees_of_freedom": found.degrees_of_freedom,
+            "p_parameters": found.p_parameters if found.degrees_of_freedom else None,
+            "p_field": None if known is None else known.p_value,
+            "n_beyond": int(found.beyond.sum()),
+            "n_points": len(found.limit_mm),
+            "versions": versions(),
+        }
+        write_summary(summary, work)
