@@ -31,6 +31,7 @@ COMMANDS = {
     ),
     "stability": _Command("stability", "Compare the bundles of rays of two interior orientations."),
     "compare": _Command("compare", "Test whether a camera has changed between two calibrations."),
+    "combine": _Command("combine", "Combine calibrations of one camera by their full covariances."),
     "halves": _Command("halves", "Judge the standard deviations of a calibration by random halves of its block."),
     "camera": _Command("camera", "Convert a camera file."),
     "convert": _Command("convert", "Turn another program's files into a block folder, or a block into a COLMAP model."),

@@ -9,6 +9,7 @@ from jaxphoto.cli.app import app
 from jaxphoto.cli.console import plain_console
 from jaxphoto.cli.grid_options import check_grid, method_of, points_of
 from jaxphoto.io import read_block
+from jaxphoto.io.cameras import write_camera_file
 from jaxphoto.procedures.halves import CUTS, camera_of, halves
 from jaxphoto.report.halves import print_halves, write_halves
 from jaxphoto.stability import METHODS
@@ -46,6 +47,17 @@ def halves_command(
         cells = points_of(read.sensors[camera_of(read, camera)], grid, extent)
         found = halves(read, cells, by=by, camera=camera, n_cuts=cuts, seed=seed, method=chosen, report=status.update)
         status.update(f"writing {out}")
-        write_halves(found, out)
+        interior = found.adjusted.unknowns.interior[found.camera]
+        write_halves(
+            found,
+            out,
+            lambda folder: write_camera_file(
+                folder / "camera.toml",
+                read.sensors[found.camera],
+                interior,
+                name=found.camera,
+                covariance=found.widened,
+            ),
+        )
     print_halves(found, console)
     console.print(f"results in {out} (open report.html)")

@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.linalg import hadamard
 
 from jaxphoto.adjustment import Adjustment, Sizes, common_sizes
 from jaxphoto.block import Block
@@ -25,8 +26,8 @@ from jaxphoto.stability import Band, Differences, Method, band_of, bundle_offset
 from jaxphoto.statistics import common_covariance, covariance
 from jaxphoto.variants import some_images
 
-CUTS = 50
-_TRIES = 20
+CUTS = 64
+_TRIES = 50
 
 
 class Cut(NamedTuple):
@@ -55,6 +56,8 @@ class Halves(NamedTuple):
     method: Method
     cells_mm: Float[np.ndarray, "cells 2"]
     """Of the format, from its centre."""
+    covariance: Float[np.ndarray, "parameters parameters"]
+    """A posteriori, of the camera by the whole block, as it is."""
     promised_px: Float[np.ndarray, "cells"]
     """Root mean square length of the error that the covariance of the whole block promises, both axes together."""
     cuts: tuple[Cut, ...]
@@ -62,6 +65,12 @@ class Halves(NamedTuple):
     failed: tuple[Cut, ...]
     """and the others."""
     band: Band
+
+    @property
+    def widened(self) -> Float[np.ndarray, "parameters parameters"]:
+        """The covariance with the model error that halves show: times the square of the factor, where that is above
+        1."""
+        return self.covariance * max(self.band.factor, 1.0) ** 2
 
     @property
     def inside(self) -> tuple[float, float]:
@@ -126,6 +135,7 @@ def halves(
         by=by,
         method=method,
         cells_mm=cells_mm,
+        covariance=own,
         promised_px=np.sqrt(np.trace(whole, axis1=1, axis2=2)),
         cuts=cuts,
         failed=tuple(cut for cut in done if cut.problem),
@@ -155,26 +165,37 @@ def _units(block: Block, by: str) -> tuple[list[str], np.ndarray]:
 def _cuts(block: Block, by: str, camera: str, n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """How many image points each unit has, and of each cut which units are in its first half (cuts, units).
 
-    Cuts are at random and different; either half has half of the units, and of those that show the camera.
+    Either half of each cut shows the camera.
     """
     names, unit = _units(block, by)
     own = np.array([c == camera for c in block.image_camera])
     shows = np.bincount(unit[own], minlength=len(names)) > 0
     if shows.sum() < 2:
         raise InputError(f"all images of camera {camera} are in one {by}: there is nothing to cut; take another --by")
-    rng = np.random.default_rng(seed)
-    found: dict[bytes, np.ndarray] = {}
-    for _ in range(_TRIES * n):
-        order = rng.permutation(len(names))
-        order = order[np.argsort(~shows[order], kind="stable")]
-        first = np.zeros(len(names), bool)
-        first[order[::2]] = True
-        # Which half is called the first does not make another cut.
-        found.setdefault((first ^ ~first[0]).tobytes(), first)
-        if len(found) == n:
+    rng, found = np.random.default_rng(seed), np.zeros((0, len(names)), bool)
+    for _ in range(_TRIES):
+        more = _balanced(len(names), rng)
+        more = more[more[:, shows].any(axis=1) & ~more[:, shows].all(axis=1)]
+        # Which half is called the first makes no other cut.
+        both = np.concatenate([found, more])
+        _, at = np.unique(both ^ ~both[:, :1], axis=0, return_index=True)
+        found = both[np.sort(at)]
+        if len(found) >= n:
             break
-    size = np.bincount(unit[block.image_points.image], minlength=len(names))
-    return size, np.stack(list(found.values()))
+    return np.bincount(unit[block.image_points.image], minlength=len(names)), found[:n]
+
+
+def _balanced(units: int, rng: np.random.Generator) -> Bool[np.ndarray, "cuts units"]:
+    """Cuts at random that are balanced: in half of them any two units are in one half, in the others apart.
+
+    All together they tell the scatter of halves as all cuts there are would, to first order. Rows of a Hadamard matrix
+    whose columns are chosen and turned over at random, so that no half is much larger than the other.
+    Source: McCarthy (1969), balanced half-samples.
+    """
+    order = 1 << (units - 1).bit_length()
+    rows = hadamard(order)[rng.permutation(order)]
+    tried = [rows[:, rng.permutation(order)[:units]] * rng.choice([-1, 1], units) for _ in range(_TRIES)]
+    return min(tried, key=lambda cuts: np.abs(cuts.sum(axis=1)).max()) > 0
 
 
 def _halved(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -118,8 +119,8 @@ def print_halves(found: Halves, console: Console) -> None:
         console.print(sentence, soft_wrap=True)
 
 
-def write_halves(found: Halves, directory: Path) -> None:
-    """cells.csv, cuts.csv, halves.png, report.html and summary.json.
+def write_halves(found: Halves, directory: Path, write_camera: Callable[[Path], object]) -> None:
+    """cells.csv, cuts.csv, halves.png, report.html and summary.json; `write_camera` writes the camera beside them.
 
     Raises InputError where `directory` holds something that is not an earlier result.
     """
@@ -129,6 +130,7 @@ def write_halves(found: Halves, directory: Path) -> None:
     with whole_folder(directory) as work:
         cells.to_csv(work / "cells.csv", index=False)
         cuts.to_csv(work / "cuts.csv", index=False)
+        write_camera(work)
         (work / "halves.png").write_bytes(content)
         page = Environment(autoescape=True).from_string(_PAGE)
         html = page.render(

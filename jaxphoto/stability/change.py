@@ -88,7 +88,7 @@ def change(
     by_point += np.einsum("nip,pq,njq->nij", rows[..., p:], q2, rows[..., p:])
     parameters: tuple[ParameterChange, ...] = ()
     chi_square, freedom, p_value = float("nan"), 0, float("nan")
-    if _of_one_model(first, second):
+    if of_one_model(first, second):
         parameters = _parameters(first, second, q1 + q2)
         chi_square, freedom = mahalanobis(np.array([one.difference for one in parameters]), q1 + q2)
         p_value = float(chdtrc(freedom, chi_square)) if freedom else float("nan")
@@ -106,7 +106,7 @@ def mahalanobis(difference: Float[np.ndarray, "n"], covariance: Float[np.ndarray
     return float((along**2 / values[kept]).sum()), int(kept.sum())
 
 
-def _of_one_model(first: InteriorOrientation, second: InteriorOrientation) -> bool:
+def of_one_model(first: InteriorOrientation, second: InteriorOrientation) -> bool:
     """Whether the parameters of both mean the same."""
     constants = [{n: float(get_parameter(i, n)) for n in constant_names(i)} for i in (first, second)]
     return model_keys(first) == model_keys(second) and constants[0] == constants[1]

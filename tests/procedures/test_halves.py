@@ -1,6 +1,7 @@
 """Halves of a block: factors that simulation confirms, bands that hold, and what both halves share."""
 
 import dataclasses
+import json
 
 import equinox as eqx
 import jax
@@ -8,10 +9,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from jaxphoto import adjust
-from jaxphoto.camera import get_parameter
+from jaxphoto import adjust, covariance, read_block
+from jaxphoto.camera import get_parameter, parameter_names
 from jaxphoto.errors import InputError
 from jaxphoto.io import write_block
+from jaxphoto.io.cameras import read_camera_file
 from jaxphoto.procedures.halves import halves
 from jaxphoto.simulation import image_coordinates, remeasure
 from jaxphoto.stability import Differences, band_of, bundle_offsets, concentration, image_grid, overlap
@@ -130,6 +132,11 @@ def test_the_command_writes_cells_and_cuts(field, tmp_path, monkeypatch, capsys)
     assert (len(cells), len(cuts)) == (35, 3)
     rms = np.sqrt((cells.halves_px**2).mean())
     assert rms == pytest.approx(np.sqrt((cuts.rms_px**2).mean()), rel=1e-6)
+    factor = json.loads((out / "summary.json").read_text())["factor"]
+    own = adjust(read_block(tmp_path / "block"))
+    sigma = np.sqrt(np.diag(read_camera_file(out).covariance))
+    expected = np.sqrt(np.diag(covariance(own).of_interior("one", parameter_names(own.unknowns.interior["one"]))))
+    np.testing.assert_allclose(sigma, expected * max(factor, 1.0), rtol=1e-6)
     assert {path.name for path in out.iterdir()} >= {"halves.png", "report.html", "summary.json"}
     code, _, error = run(monkeypatch, capsys, *command, "--by", "strip")
     assert (code, "image i0 is in no strip; give it one, or cut by image" in error) == (2, True)

@@ -26,7 +26,7 @@ _FORMATS = {
     "opencv": _ReadFormat(open_cv.recognises, open_cv.read_open_cv),
 }
 # In a folder, what its camera file is called.
-_IN_FOLDER = (own_cameras.INTERIOR, TOML, colmap.TEXT, colmap.BINARY)
+_IN_FOLDER = (own_cameras.INTERIOR, TOML, own_cameras.CAMERA, colmap.TEXT, colmap.BINARY)
 
 
 def read_camera_file(

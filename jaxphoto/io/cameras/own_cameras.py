@@ -21,6 +21,7 @@ from jaxphoto.io.toml import read_toml
 from jaxphoto.unknowns import FIXED
 
 INTERIOR = "interior.csv"
+CAMERA = "camera.toml"
 _COLUMNS = ("camera", "parameter", "value")
 _CORRELATION = ("parameter_a", "parameter_b", "rho")
 _ROUNDING = 1e-5
