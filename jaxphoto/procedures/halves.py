@@ -189,13 +189,13 @@ def _balanced(units: int, rng: np.random.Generator) -> Bool[np.ndarray, "cuts un
     """Cuts at random that are balanced: in half of them any two units are in one half, in the others apart.
 
     All together they tell the scatter of halves as all cuts there are would, to first order. Rows of a Hadamard matrix
-    whose columns are chosen and turned over at random, so that no half is much larger than the other.
+    whose columns are chosen and turned over at random, but for those whose one half has less than a third.
     Source: McCarthy (1969), balanced half-samples.
     """
     order = 1 << (units - 1).bit_length()
     rows = hadamard(order)[rng.permutation(order)]
     tried = [rows[:, rng.permutation(order)[:units]] * rng.choice([-1, 1], units) for _ in range(_TRIES)]
-    return min(tried, key=lambda cuts: np.abs(cuts.sum(axis=1)).max()) > 0
+    return max((cuts[np.abs(cuts.sum(axis=1)) <= units / 3] for cuts in tried), key=len) > 0
 
 
 def _halved(
