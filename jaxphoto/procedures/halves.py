@@ -114,7 +114,7 @@ def halves(
     done = []
     for k, units in enumerate(first):
         report(f"adjusting halves: cut {k + 1} of {len(first)}")
-        done.append(_halved(adjusted, units[_units(block, by)[1]], name, cells_mm, method, sizes))
+        done.append(halved(adjusted, units[_units(block, by)[1]], name, cells_mm, method, sizes))
     good = [k for k, cut in enumerate(done) if not cut.problem]
     if not good:
         raise InputError(f"no two halves of this block can be compared: {done[0].problem}")
@@ -198,10 +198,10 @@ def _balanced(units: int, rng: np.random.Generator) -> Bool[np.ndarray, "cuts un
     return max((cuts[np.abs(cuts.sum(axis=1)) <= units / 3] for cuts in tried), key=len) > 0
 
 
-def _halved(
+def halved(
     adjusted: Adjustment, first: np.ndarray, camera: str, cells_mm: np.ndarray, method: Method, sizes: Sizes
 ) -> Cut:
-    """Both halves adjusted and compared."""
+    """The images `first` of an adjusted block and the others, adjusted for themselves and compared at `cells_mm`."""
     block = adjusted.block
     start = dataclasses.replace(block.start, unknowns=adjusted.unknowns)
     try:
