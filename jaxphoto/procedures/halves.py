@@ -22,7 +22,16 @@ from jaxphoto.block import Block
 from jaxphoto.camera import InteriorOrientation, parameter_names
 from jaxphoto.errors import BlockError, DatumError, InputError, RankError
 from jaxphoto.procedures.adjust import adjust
-from jaxphoto.stability import Band, Differences, Method, band_of, bundle_offsets, check_rays, concentration, overlap
+from jaxphoto.stability import (
+    Differences,
+    ErrorBand,
+    Method,
+    band_of,
+    bundle_offsets,
+    check_rays,
+    concentration,
+    overlap,
+)
 from jaxphoto.statistics import common_covariance, covariance
 from jaxphoto.variants import some_images
 
@@ -64,7 +73,7 @@ class Halves(NamedTuple):
     """Those that could be compared,"""
     failed: tuple[Cut, ...]
     """and the others."""
-    band: Band
+    band: ErrorBand
 
     @property
     def widened(self) -> Float[np.ndarray, "parameters parameters"]:

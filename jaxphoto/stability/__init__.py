@@ -2,7 +2,7 @@
 
 from jaxphoto.stability.alignment import METHODS, UNKNOWNS, Method
 from jaxphoto.stability.analysis import Analysis, analyse
-from jaxphoto.stability.band import Band, Differences, band_of, concentration, overlap
+from jaxphoto.stability.band import Differences, ErrorBand, band_of, concentration, overlap
 from jaxphoto.stability.bundles import image_grid, image_rays, parameter_vector, with_parameters
 from jaxphoto.stability.change import Change, ParameterChange, change, mahalanobis
 from jaxphoto.stability.combination import Combination, combine
@@ -11,8 +11,8 @@ from jaxphoto.stability.quadratic_form import QuadraticForm
 from jaxphoto.stability.uncertainty import LEVEL, OffsetUncertainty, offset_uncertainty
 
 __all__ = [
-    "LEVEL", "METHODS", "UNKNOWNS", "Analysis", "Band", "BundleOffsets", "Change", "Combination", "Differences",
-    "Method", "OffsetUncertainty", "ParameterChange", "QuadraticForm", "analyse", "band_of", "bundle_offsets", "change",
-    "check_rays", "combine", "concentration", "image_grid", "image_rays", "mahalanobis", "offset_uncertainty",
-    "overlap", "parameter_vector", "rmse_offset", "with_parameters",
+    "LEVEL", "METHODS", "UNKNOWNS", "Analysis", "BundleOffsets", "Change", "Combination", "Differences", "ErrorBand",
+    "Method", "OffsetUncertainty", "ParameterChange", "QuadraticForm", "analyse", "band_of", "bundle_offsets",
+    "change", "check_rays", "combine", "concentration", "image_grid", "image_rays", "mahalanobis",
+    "offset_uncertainty", "overlap", "parameter_vector", "rmse_offset", "with_parameters",
 ]  # fmt: skip

@@ -40,7 +40,7 @@ class Differences(NamedTuple):
     """r_kl^2."""
 
 
-class Band(NamedTuple):
+class ErrorBand(NamedTuple):
     """The factor by which standard deviations are too small, and what holds 95 % of the errors; in pixels."""
 
     factor: float
@@ -59,7 +59,7 @@ class Band(NamedTuple):
     that the *other* cuts give."""
 
 
-def band_of(found: Differences, whole: Float[np.ndarray, "cells 2 2"]) -> Band:
+def band_of(found: Differences, whole: Float[np.ndarray, "cells 2 2"]) -> ErrorBand:
     """The factors and bands of `found`; `whole` is what the calibration by the whole block promises (px^2)."""
     squares, n = (found.offsets**2).sum(axis=2), len(found.offsets)
     ratio = squares / np.trace(found.promised, axis1=2, axis2=3)
@@ -70,7 +70,7 @@ def band_of(found: Differences, whole: Float[np.ndarray, "cells 2 2"]) -> Band:
     for k in range(n if n > 1 else 0):
         others = np.delete(ratio, k, axis=0).mean(axis=0)
         inside[k] = (squares[k] <= others * square_radius(found.promised[k], 1 / (n - 1))).mean()
-    return Band(
+    return ErrorBand(
         factor=factor,
         sigma_factor=factor * (found.concentration * rho / 2) ** 0.5,
         cell_factor=np.sqrt(cell_square),

@@ -77,6 +77,14 @@ def read_camera(section: Section) -> Camera:
     return Camera(sensor, interior, priors, known)
 
 
+def known_together(interior: InteriorOrientation, covariance: np.ndarray) -> KnownTogether:
+    """What a covariance of all parameters knows: those that it does not hold at their values."""
+    names = parameter_names(interior)
+    free = np.flatnonzero(np.diagonal(covariance) > 0)
+    own = covariance[np.ix_(free, free)]
+    return KnownTogether(tuple(names[k] for k in free), (own + own.T) / 2)
+
+
 def camera_section(camera: Camera) -> dict[str, Any]:
     """The [cameras.X] table that `read_camera` reads as `camera`."""
     sensor, interior, priors, known = camera

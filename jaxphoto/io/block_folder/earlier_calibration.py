@@ -11,9 +11,12 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxphoto.camera import InteriorOrientation, get_parameter, parameter_names
-from jaxphoto.io.block_folder.camera_section import Camera, KnownTogether, camera_section
+from jaxphoto.camera import get_parameter
+from jaxphoto.io.block_folder.camera_section import Camera, camera_section, known_together
 from jaxphoto.io.block_folder.section import Section
+
+# The module, not its function: a camera file may be a block.toml, which it reads by modules of this package.
+from jaxphoto.io.cameras import camera_reader
 from jaxphoto.observations import KnownParameters
 from jaxphoto.unknowns import FIXED
 
@@ -27,9 +30,6 @@ def with_earlier_calibrations(settings: dict[str, Any], file: str, folder: Path)
 
     Raises InputError for calibrations that cannot be read, are without covariance, or stand beside what they say.
     """
-    # Here, because a camera file may be a block.toml, which this package reads.
-    from jaxphoto.io.cameras.camera_reader import read_camera_file
-
     cameras = settings.get("cameras", {})
     if not isinstance(cameras, dict) or not any(isinstance(own, dict) and _KEY in own for own in cameras.values()):
         return settings
@@ -44,7 +44,7 @@ def with_earlier_calibrations(settings: dict[str, Any], file: str, folder: Path)
         named = Section(file, f"cameras.{name}.{_KEY}", given)
         named.known("file", "camera")
         camera = named.text("camera") if "camera" in named else None
-        read = read_camera_file(folder / named.text("file"), camera=camera)
+        read = camera_reader.read_camera_file(folder / named.text("file"), camera=camera)
         if read.covariance is None:
             raise section.error(
                 _KEY, f"{named.text('file')} has no covariance; name results of jaxphoto adjust, or a camera file of it"
@@ -56,14 +56,6 @@ def with_earlier_calibrations(settings: dict[str, Any], file: str, folder: Path)
         found[name] = table | own | {"unknowns": fixed | own.get("unknowns", {})}
         del found[name][_KEY]
     return settings | {"cameras": found}
-
-
-def known_together(interior: InteriorOrientation, covariance: np.ndarray) -> KnownTogether:
-    """What a covariance of all parameters knows: those that it does not hold at their values."""
-    names = parameter_names(interior)
-    free = np.flatnonzero(np.diagonal(covariance) > 0)
-    own = covariance[np.ix_(free, free)]
-    return KnownTogether(tuple(names[k] for k in free), (own + own.T) / 2)
 
 
 def known_cameras(cameras: Mapping[str, Camera]) -> tuple[KnownParameters, ...]:

@@ -9,8 +9,7 @@ import pandas as pd
 from jaxphoto.arrays import on_device
 from jaxphoto.camera import InteriorOrientation, Sensor, constant_names, empty_camera, parameter_names, set_parameter
 from jaxphoto.errors import InputError
-from jaxphoto.io.block_folder.camera_section import Camera, camera_section
-from jaxphoto.io.block_folder.earlier_calibration import known_together
+from jaxphoto.io.block_folder.camera_section import Camera, camera_section, known_together
 from jaxphoto.io.block_folder.section import Section
 from jaxphoto.io.block_folder.settings import read_settings, toml_text
 from jaxphoto.io.block_folder.table_layout import TOML
