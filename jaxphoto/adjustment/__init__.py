@@ -10,10 +10,13 @@ from jaxphoto.adjustment.layout.tile_layout import LEAST, Sizes
 from jaxphoto.adjustment.layout.tiled import TiledResiduals, TiledStructure, TiledValues
 from jaxphoto.adjustment.normal_equations import Cofactors, Linearised, NormalEquations, RowCofactors, optimise
 from jaxphoto.adjustment.result import Adjustment, Outcome
+from jaxphoto.adjustment.weak_directions import POOR, WeakDirection, weak_directions, yardsticks
+from jaxphoto.adjustment.weak_words import Weakness, weaknesses_of
 
 __all__ = [
     "LEAST",
     "MAX_STEPS",
+    "POOR",
     "Adjustment",
     "Cofactors",
     "LaidOut",
@@ -26,9 +29,14 @@ __all__ = [
     "TiledResiduals",
     "TiledStructure",
     "TiledValues",
+    "WeakDirection",
+    "Weakness",
     "common_sizes",
     "lay_out",
     "linearise",
     "optimise",
     "solve",
+    "weak_directions",
+    "weaknesses_of",
+    "yardsticks",
 ]  # fmt: skip

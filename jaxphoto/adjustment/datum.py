@@ -9,6 +9,7 @@ it.
 from functools import partial
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,6 +21,7 @@ from jaxphoto.adjustment.model.observed_groups import ObservedGroup
 from jaxphoto.adjustment.model.row_functions import group_residuals, rows_of
 from jaxphoto.adjustment.model.structure import Structure
 from jaxphoto.adjustment.solver.similarity import motions, similarity
+from jaxphoto.arrays import still
 from jaxphoto.block import Block
 from jaxphoto.compiling import QUICK_TO_COMPILE
 from jaxphoto.errors import DatumError
@@ -36,6 +38,8 @@ MOTIONS = (
 )
 # Singular values of the scaled sensitivity below this are zero.
 _OPEN = 1e-9
+# A rotation (rad), or a scale, that observations know no better than this is as good as open: it is no longer small.
+_VAGUE = 0.05
 
 
 class DatumRows(NamedTuple):
@@ -51,8 +55,12 @@ def close_datum(block: Block, values: Values, structure: Structure) -> DatumRows
     Raises DatumError where the block's datum is open and its kind "control", or where the constraints asked for cannot
     close it.
     """
+    judged = block.datum.kind == "control" and not _traced(values) and not _traced(block)
     values = _concrete(values, block)
-    if _plainly_closed(block, values, structure):
+    if judged:
+        # Where things were observed to be: approximate values scatter about a line on which control lies.
+        values = _as_observed(block, values)
+    if _plainly_closed(block, values, structure, _VAGUE if judged else np.inf):
         return DatumRows(np.zeros((0, 6, structure.n_images)), np.zeros((0, 3, structure.n_points)))
     motions, centre, size = _motions(values)
     sensitivity, named = _datum_sensitivity(block, values, structure, motions, centre, size)
@@ -62,6 +70,8 @@ def close_datum(block: Block, values: Values, structure: Structure) -> DatumRows
     if kind == "control":
         if len(null_motions):
             raise DatumError(_sentence(null_motions, block, named))
+        if judged:
+            _check_vague(block, sensitivity, named)
         return null
     if block.datum.scale is not None:
         scale_open = bool(len(null_motions)) and bool(np.abs(null_motions[:, 6]).max() > 1e-6)
@@ -99,32 +109,62 @@ def _concrete(values: Values, block: Block) -> Values:
     return jax.tree_util.tree_map_with_path(number, values)
 
 
-def _plainly_closed(block: Block, values: Values, structure: Structure) -> bool:
-    """Three full control points (or stations without free mounts and strips) that do not lie on a line will do."""
+def _traced(tree: Any) -> bool:
+    return any(isinstance(v, jax.core.Tracer) for v in jax.tree.leaves(tree))
+
+
+def _as_observed(block: Block, values: Values) -> Values:
+    """The same with control points and images where they were observed to be."""
+    position, points = np.array(values.position), np.array(values.points)
+    position[block.stations.axis, block.stations.who] = still(block.stations.value)
+    points[block.control.axis, block.control.who] = still(block.control.value)
+    return eqx.tree_at(lambda v: (v.position, v.points), values, (position, points))
+
+
+def _plainly_closed(block: Block, values: Values, structure: Structure, vague: float) -> bool:
+    """Three full control points (or stations without free mounts and strips) that do not lie on a line will do.
+
+    They do where the rotation about the line that fits them best is known better than `vague` (rad).
+    """
     seen = np.zeros((3, structure.n_points))
     seen[block.control.axis, block.control.who] = 1
     seen[structure.point_free == 0] = 1
-    sets = [np.asarray(values.points)[:, seen.all(0)]]
+    sets = [(np.asarray(values.points)[:, seen.all(0)], block.control.sigma)]
     if not (structure.free >= structure.n_cameras).any():
         stations = np.zeros((3, structure.n_images))
         stations[block.stations.axis, block.stations.who] = 1
-        sets.append(np.asarray(values.position)[:, stations.all(0)])
-    for places in sets:
+        sets.append((np.asarray(values.position)[:, stations.all(0)], block.stations.sigma))
+    for places, sigma in sets:
         if places.shape[1] >= 3:
             spread = np.linalg.svd(places - places.mean(1, keepdims=True), compute_uv=False)
-            if spread[1] > 1e-6 * spread[0]:
+            known = vague == np.inf or np.max(still(sigma), initial=0.0) < vague * spread[1]
+            if spread[1] > 1e-6 * spread[0] and known:
                 return True
     return False
 
 
-_motions_of = jax.jit(motions, compiler_options=QUICK_TO_COMPILE)
+def _check_vague(block: Block, sensitivity: np.ndarray, named: list[str]) -> None:
+    """Raise DatumError where observations close the datum by their noise alone, as control on a line does."""
+    by_motion, by_shared = sensitivity[:, :7], sensitivity[:, 7:]
+    norm = np.sqrt((by_shared**2).sum(0))
+    by_shared = by_shared / np.where(norm > 0, norm, 1.0)
+    seen = by_motion - by_shared @ np.linalg.lstsq(by_shared, by_motion, rcond=_OPEN)[0]
+    _, s, vt = np.linalg.svd(seen, full_matrices=False)
+    # Of the rotations and the scale in each: they are seen through the shifts that go along.
+    sigma = np.linalg.norm(vt[:, 3:], axis=1) / np.maximum(s, 1e-300)
+    if (vague := sigma > _VAGUE).any():
+        raise DatumError(_sentence(vt[vague], block, named, float(sigma.max())))
+
+
+motions_of = jax.jit(motions, compiler_options=QUICK_TO_COMPILE)
+"""`similarity.motions`, compiled."""
 
 
 def _motions(values: Values) -> tuple[DatumRows, np.ndarray, float]:
     points = np.asarray(values.points)
     centre = points.mean(axis=1)
     size = float(np.sqrt(((points - centre[:, None]) ** 2).sum(0).mean())) or 1.0
-    eop, pts = _motions_of(values.position, values.rotation, values.points, centre, size)
+    eop, pts = motions_of(values.position, values.rotation, values.points, centre, size)
     return DatumRows(np.asarray(eop), np.asarray(pts)), centre, size
 
 
@@ -229,9 +269,21 @@ def _minimal(null: DatumRows, structure: Structure) -> DatumRows:
     return DatumRows(np.zeros_like(null.eop), points)
 
 
-def _sentence(null_motions: np.ndarray, block: Block, named: list[str]) -> str:
-    shares = np.sqrt((null_motions**2).sum(0))
-    names = [m for m, share in zip(MOTIONS, shares, strict=True) if share > 0.05]
+def motion_names(combinations: Float[np.ndarray, "n motions"]) -> list[str]:
+    """Names of the motions that combinations are made of.
+
+    A rotation about another place than the centre is one with a shift: shifts are told only where there are more
+    combinations than rotations and scale.
+    """
+    shares = np.sqrt((combinations**2).sum(0))
+    named = [m for m, share in zip(MOTIONS, shares, strict=True) if share > 0.05 * shares.max()]
+    turns = [name for name in named if not name.startswith("shift")]
+    return turns if len(turns) >= len(combinations) else named
+
+
+def _sentence(null_motions: np.ndarray, block: Block, named: list[str], sigma: float = np.inf) -> str:
+    """What is open, of what there is, and the mend; `sigma` of what is closed by noise alone (rad, or a part of 1)."""
+    names = motion_names(null_motions)
     counts = {rows.group: int(np.size(rows.observation)) for rows in block.observations if len(rows)}
     if n := counts.pop(ControlRows.group, 0) + len(block.fixed.who):
         counts[ControlRows.group] = n
@@ -240,10 +292,23 @@ def _sentence(null_motions: np.ndarray, block: Block, named: list[str]) -> str:
     order = ["control_points", *(name for name in counts if name != "control_points")]
     named_counts = [(counts[name], what.get(name, name.replace("_", " "))) for name in order if name in counts]
     observed = [f"{n} {noun[:-1] if n == 1 else noun}" for n, noun in named_counts]
-    mends = 'add control points or camera stations, or set [datum] kind = "inner" (or "minimal") in block.toml'
+    mends = "add control points or camera stations"
+    if names == ["scale"]:
+        mends += ", or a distance"
+    if not np.isfinite(sigma):
+        mends += ', or set [datum] kind = "inner" (or "minimal") in block.toml'
+    elif any("rotation" in name for name in names):
+        mends = "add control points or camera stations away from the line on which those there are lie"
     if named:
         mends = "add control points, or fix " + ", ".join(named[:3]) + (" ..." if len(named) > 3 else "")
+    from_what = " and ".join(observed) if observed else "image coordinates alone"
+    if np.isfinite(sigma):
+        known = f"{100 * sigma:.2g} %" if names == ["scale"] else f"{np.degrees(sigma):.2g} deg"
+        return (
+            f"the datum of the block is as good as open: {', '.join(names)} cannot be determined from {from_what} "
+            f"better than to {known}, which is noise; {mends}"
+        )
     return (
         f"the datum of the block has a defect of {len(null_motions)}: {', '.join(names)} cannot be determined from "
-        f"{' and '.join(observed) if observed else 'image coordinates alone'}; {mends}"
+        f"{from_what}; {mends}"
     )

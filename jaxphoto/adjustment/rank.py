@@ -8,9 +8,10 @@ import numpy as np
 from jaxphoto.adjustment.layout.sharding import EVERYWHERE, sharded
 from jaxphoto.adjustment.normal_equations import NormalEquations
 from jaxphoto.adjustment.result import Adjustment
-from jaxphoto.adjustment.solver.band import Band, dense, pivots
+from jaxphoto.adjustment.solver.band import Band, pivots
 from jaxphoto.adjustment.solver.normal import Linearised
 from jaxphoto.adjustment.solver.reduced import reduce_normal
+from jaxphoto.adjustment.weak_words import weaknesses_of
 from jaxphoto.block import Block
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import DatumError, RankError
@@ -130,27 +131,16 @@ def _images_of(name: str, names: Iterable[str]) -> set[int]:
 
 
 def check_rank(adjusted: Adjustment) -> None:
-    """Raise RankError where the normal matrix at the optimum is singular; the message names the unknowns."""
+    """Raise RankError where the normal matrix at the optimum is singular, with what is open and the mend."""
     if adjusted.factored is None or not bool(adjusted.converged):
         return
-    s, equations = adjusted.structure, adjusted.equations
-    factored = equations.factored
+    factored = adjusted.equations.factored
     left = np.asarray(call_compiled(_pivots, factored.reduced.diagonal, factored.factor))
     if left.min() > DEFECT:
         return
-    band = call_compiled(reduced_matrix, equations)
-    a = adjusted.tiled.crop_reduced(dense(band))
-    diagonal = np.diagonal(a)
-    d = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
-    weakest, vectors = np.linalg.eigh(a * d[:, None] * d[None, :])
-    null = np.abs(vectors[:, 0])
-    names = [f"exterior[{i}].{n}" for i in adjusted.block.images for n in ("X", "Y", "Z", "rx", "ry", "rz")]
-    names += list(s.labels)
-    worst = [names[k] for k in np.argsort(-null, kind="stable")[:6] if null[k] > 0.05]
-    raise RankError(
-        f"the observations cannot tell these unknowns apart: {', '.join(worst)}; hold one of them fixed, or give it a "
-        f"weight, or add observations that see it (smallest eigenvalue of the scaled normal matrix {weakest[0]:.1e})"
-    )
+    if found := weaknesses_of(adjusted):
+        sentences = "; ".join(weakness.sentence for weakness in found)
+        raise RankError(f"the observations cannot tell these unknowns apart: {sentences}")
 
 
 # Operation by operation it would compile each of them, a fifth of a second in all.

@@ -10,7 +10,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from jaxphoto.adjustment import Adjustment
+from jaxphoto.adjustment import POOR, Adjustment, weaknesses_of, yardsticks
 from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
 from jaxphoto.block import Block
 from jaxphoto.camera import Sensor
@@ -38,12 +38,17 @@ def _findings(tables: Tables) -> Iterator[Finding]:
         yield Finding(Level.ALARM, adjusted.outcome.value)
         if names := [adjusted.block.points[p] for p in np.flatnonzero(adjusted.astray)]:
             yield Finding(Level.ALARM, f"gone astray: point {_few(names)}")
+        # Observations that fit one another where it stopped: then it is no bad start, but what the block cannot tell.
+        if float(adjusted.sigma0) <= NOTHING_FITS:
+            yield from (Finding(Level.ALARM, w.sentence) for w in weaknesses_of(adjusted))
         # Nothing that is said of an optimum holds elsewhere.
         return
     yield from _global_test(tables)
     yield from _blunders(tables)
+    of_cameras = {camera: weaknesses(tables, camera, c) for camera, c in tables.correlations.items()}
+    yield from _weak(tables, frozenset().union(*(w.labels for weak in of_cameras.values() for w in weak)))
     for camera, c in tables.correlations.items():
-        weak = weaknesses(tables, camera, c)
+        weak = of_cameras[camera]
         yield from (Finding(Level.WARNING, w.sentence) for w in weak)
         yield from _correlated(camera, c, frozenset().union(*(w.explains for w in weak)), _all_known(adjusted.block))
     yield from (_not_significant(tables, s) for s in tables.significance if not s.significant)
@@ -55,6 +60,21 @@ def _findings(tables: Tables) -> Iterator[Finding]:
                 "use fewer coefficients or more points in the corners",
             )
     yield from _unchecked(tables)
+
+
+def _weak(tables: Tables, told: frozenset[str]) -> Iterator[Finding]:
+    """What gives way by more than `POOR`, but for interior orientations that are `told` already."""
+    adjusted, q = tables.adjusted, tables.covariance
+    yard, a_priori = yardsticks(adjusted), 1 / np.sqrt(float(q.variance_factor))
+    in_yardsticks = (
+        q.exterior_sigma[:, :3] / yard.ground,
+        q.exterior_sigma[:, 3:] / yard.angle,
+        q.point_sigma / yard.ground,
+        q.shared_sigma / yard.shared,
+    )
+    if max(a_priori * np.max(v, initial=0.0) for v in in_yardsticks) > POOR:
+        found = weaknesses_of(adjusted)
+        yield from (Finding(Level.WARNING, w.sentence) for w in found if not (w.labels and w.labels <= told))
 
 
 def _few(names: list[str]) -> str:

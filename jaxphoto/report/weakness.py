@@ -1,8 +1,10 @@
-"""Interior orientations that a block cannot see, in words: what it means, and what would cure it.
+"""Interior orientations that a block hardly sees, in words: what it means, and what would cure it.
 
-Over flat ground, in near-vertical images, a longer principal distance and a higher flight make the same images, and so
-do a moved principal point and a moved, tilted camera. Only stations, relief, two flying heights or oblique images tell
-them apart (docs/models.md, principal points; docs/statistics.md).
+Whether it does is decided by what came out: a correlation with the exterior orientation above `WEAK_CORRELATION`, and a
+standard deviation that moves the corner of the image by more than `FELT` standard deviations of an image point. Over
+flat ground, in near-vertical images, a longer principal distance and a higher flight make the same images, and so do a
+moved principal point and a moved, tilted camera. Only stations, relief, two flying heights or oblique images tell them
+apart (docs/models.md, principal points; docs/statistics.md).
 """
 
 from typing import NamedTuple
@@ -12,12 +14,14 @@ import numpy as np
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.report.tables import Tables
 from jaxphoto.statistics import Correlations
-from jaxphoto.unknowns import FREE
+from jaxphoto.unknowns import FIXED
 
 WEAK_CORRELATION = 0.9
 FLAT = 0.2
 """Range of the heights over the flying height, up to which the ground is called nearly flat."""
 NEAR_VERTICAL_DEG = 15.0
+FELT = 2.0
+"""An image point that is wrong by more than this, and all alike towards the corner, is worse than its measurement."""
 # Rows of the correlations: positions stand first, then rotations of whichever kind.
 _PLAN, _HEIGHT, _TILTS = slice(0, 2), slice(2, 3), slice(3, 5)
 _C, _POINT = ("c_mm",), ("xp_mm", "yp_mm")
@@ -28,6 +32,8 @@ class Weakness(NamedTuple):
 
     sentence: str
     explains: frozenset[tuple[str, str]]
+    labels: frozenset[str]
+    """Paths of its parameters."""
 
 
 class _Geometry(NamedTuple):
@@ -53,28 +59,41 @@ def weaknesses(tables: Tables, camera: str, c: Correlations) -> list[Weakness]:
     if geometry is None or not geometry.weak:
         return []
     sigma = {s.parameter: s.sigma for s in tables.significance if s.camera == camera}
+    sensor = adjusted.block.sensors[camera]
+    mine = np.isin(adjusted.structure.image, images)
+    measured = float(np.median(np.asarray(adjusted.block.image_points.sigma)[mine]))
     found = []
-    rho = _strongest(c, _HEIGHT, _C)
-    if rho > WEAK_CORRELATION and not _stations(adjusted, images, (2,)):
-        share = 100 * sigma["c_mm"] / float(adjusted.unknowns.interior[camera].c)
+    rho, c_mm = _strongest(c, _HEIGHT, _C), float(adjusted.unknowns.interior[camera].c)
+    corner = sigma.get("c_mm", 0.0) / c_mm * np.hypot(sensor.width_mm, sensor.height_mm) / 2
+    if rho > WEAK_CORRELATION and corner > FELT * measured:
+        why, cure = _stations(adjusted, images, (2,))
+        share = 100 * sigma["c_mm"] / c_mm
         sentence = (
             f"c of camera {camera} is hardly determined: sigma {sigma['c_mm']:.3g} mm ({share:.2g} % of c), |rho| with "
             f"Z up to {rho:.4f}; over {geometry} a longer c and a higher flight give the same image coordinates, and "
-            "no station tells them apart: add camera stations (GNSS), relief or a second flying height, or oblique "
-            "images, or hold c fixed"
+            f"{why}: {cure}, relief or a second flying height, or oblique images, or hold c fixed"
         )
-        found.append(Weakness(sentence, _pairs(c, _HEIGHT, _C)))
+        found.append(_weakness(camera, sentence, c, (_HEIGHT,), _C))
     turned, moved = _strongest(c, _TILTS, _POINT), _strongest(c, _PLAN, _POINT)
-    if max(turned, moved) > WEAK_CORRELATION and not _stations(adjusted, images, (0, 1)):
+    shift = max((sigma[name] for name in _POINT if name in sigma), default=0.0)
+    if max(turned, moved) > WEAK_CORRELATION and shift > FELT * measured:
+        why, cure = _stations(adjusted, images, (0, 1))
         sigmas = ", ".join(f"sigma of {name} {sigma[name]:.3g} mm" for name in _POINT if name in sigma)
         sentence = (
             f"the principal point of camera {camera} is hardly determined: {sigmas}, |rho| with "
             f"{' and '.join(c.eop_names[_TILTS])} up to {turned:.4f}, with X and Y up to {moved:.4f}; over {geometry} "
-            "a tilt and a shift of every image make good for it: add camera stations (GNSS) with strips flown in "
+            f"a tilt and a shift of every image make good for it, and {why}: {cure} with strips flown in "
             "opposite directions, relief or oblique images, or hold it fixed"
         )
-        found.append(Weakness(sentence, _pairs(c, _TILTS, _POINT) | _pairs(c, _PLAN, _POINT)))
+        found.append(_weakness(camera, sentence, c, (_TILTS, _PLAN), _POINT))
     return found
+
+
+def _weakness(
+    camera: str, sentence: str, c: Correlations, rows: tuple[slice, ...], parameters: tuple[str, ...]
+) -> Weakness:
+    pairs = frozenset().union(*(_pairs(c, own, parameters) for own in rows))
+    return Weakness(sentence, pairs, frozenset(f"interior[{camera}].{name}" for name in parameters))
 
 
 def _geometry(adjusted: Adjustment, images: np.ndarray) -> _Geometry | None:
@@ -89,14 +108,25 @@ def _geometry(adjusted: Adjustment, images: np.ndarray) -> _Geometry | None:
     return _Geometry(float(np.ptp(heights) / flying), float(np.degrees(np.arccos(np.clip(axis, -1.0, 1.0))).max()))
 
 
-def _stations(adjusted: Adjustment, images: np.ndarray, axes: tuple[int, ...]) -> bool:
-    """Whether a station, not free to shift with its strip or mount, holds an image on one of `axes`."""
+def _stations(adjusted: Adjustment, images: np.ndarray, axes: tuple[int, ...]) -> tuple[str, str]:
+    """Why stations of `images` on `axes` do not tell the interior orientation, and what of them would."""
     block, priors = adjusted.block, adjusted.priors
-    loose = {name for name, bias in priors.strips.items() if bias.shift is FREE}
-    swung = {name for name, mount in priors.mounts.items() if mount.lever_arm is FREE}
     rows = np.isin(block.stations.who, images) & np.isin(block.stations.axis, axes)
     held = np.unique(block.stations.who[rows]).tolist()
-    return any(block.image_strip[i] not in loose and block.image_mount[i] not in swung for i in held)
+    if not held:
+        return "no station tells them apart", "add camera stations (GNSS)"
+    loose = {name for name, bias in priors.strips.items() if bias.shift is not FIXED}
+    swung = {name for name, mount in priors.mounts.items() if mount.lever_arm is not FIXED}
+    if all(block.image_strip[i] in loose or block.image_mount[i] in swung for i in held):
+        return (
+            "stations tell them apart only as well as their shifts and lever arms are known",
+            "hold these fixed or give them smaller sigmas, add camera stations (GNSS) without",
+        )
+    sigma = float(np.median(np.asarray(block.stations.sigma)[rows]))
+    return (
+        f"stations of sigma {sigma:.2g} m hardly tell them apart",
+        "add better camera stations (GNSS), control points all over the block",
+    )
 
 
 def _strongest(c: Correlations, rows: slice, parameters: tuple[str, ...]) -> float:

@@ -76,7 +76,9 @@ def test_two_control_points_leave_a_rotation_about_their_line():
     """Two points along X at one height: a turn about X; scale and the other turns are seen."""
     points = np.array(BARE.truth.points)
     points[37] = points[3] + [300.0, 0.0, 0.0]
-    block = eqx.tree_at(lambda b: b.start.unknowns.points, block_with(control=rows((3, 37))), points)
+    control = rows((3, 37))
+    surveyed = points[control.who, control.axis]
+    block = eqx.tree_at(lambda b: b.control.value, block_with(control=control), surveyed)
     count, named, _ = defect_of(block)
     assert count == 1
     assert "rotation about X" in named
@@ -92,17 +94,24 @@ def test_control_in_height_only():
     assert (count, named) == (3, {"shift in X", "shift in Y", "rotation about Z"})
 
 
+def stations_at(places):
+    stations = rows(range(len(places)), sigma=0.1, kind=StationRows)
+    block = block_with(stations=stations)
+    return eqx.tree_at(lambda b: b.stations.value, block, places[stations.who, stations.axis])
+
+
 def test_stations_on_a_line_leave_a_rotation():
-    block = block_with(stations=rows(range(5), sigma=0.1, kind=StationRows))
-    position = np.array(block.start.unknowns.exterior.position)
-    position[:5] = np.linspace([-400.0, 0.0, 1000.0], [400.0, 0.0, 1000.0], 5)
-    block = eqx.tree_at(lambda b: b.start.unknowns.exterior.position, block, position)
-    count, named, _ = defect_of(block)
+    """Whatever the approximate positions; with noise in the stations, too, which closes it by nothing but itself."""
+    line = np.linspace([-400.0, 0.0, 1000.0], [400.0, 0.0, 1000.0], 5)
+    count, named, _ = defect_of(stations_at(line))
     assert count == 1
     assert "rotation about X" in named
+    with pytest.raises(DatumError, match=r"as good as open: rotation about X cannot .* away from the line") as caught:
+        with_constraints(stations_at(line + 0.1 * np.random.default_rng(3).standard_normal(line.shape)))
+    # What it is said to be known to follows from how far the stations are off the line.
+    assert 5 < float(re.search(r"than to (\S+) deg", str(caught.value))[1]) < 60
     # One station beside the line closes it.
-    position[2] += [0.0, 30.0, 0.0]
-    with_constraints(eqx.tree_at(lambda b: b.start.unknowns.exterior.position, block, position))
+    with_constraints(stations_at(line + np.eye(5)[:, 2:3] * [0.0, 30.0, 0.0]))
 
 
 def test_free_shifts_leave_the_position():

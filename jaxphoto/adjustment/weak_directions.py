@@ -1,0 +1,206 @@
+"""Weak directions: combinations of unknowns that the observations hardly see, from the normal equations.
+
+Unknowns are measured in yardsticks: what moves an image point by about its standard deviation, or, where that is more,
+the standard deviation of the observed positions or attitudes. With C the covariance of all unknowns in yardsticks,
+
+    C u = mu u,    |u| = 1
+
+a direction u of large mu is one along which the block gives way: within one standard deviation unknown k moves by
+u_k sqrt(mu). A standard deviation in yardsticks is what GNSS calls a dilution of precision: by how much the geometry
+makes the errors of observations larger. Found by subspace iteration with the factored normal matrix, damped by so
+little that a direction which nothing sees comes out with an enormous standard deviation instead of none.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from jaxphoto.adjustment.layout.padding import TiledBlock
+from jaxphoto.adjustment.model.numbers import Increments
+from jaxphoto.adjustment.normal_equations import NormalEquations
+from jaxphoto.adjustment.result import Adjustment
+from jaxphoto.adjustment.solver.band import factor_band
+from jaxphoto.adjustment.solver.elimination import solve_factored
+from jaxphoto.adjustment.solver.reduced import reduce_normal
+from jaxphoto.arrays import still
+from jaxphoto.compiling import call_compiled
+
+POOR = 20.0
+"""Standard deviation in yardsticks above which an unknown is weak. GNSS calls a dilution of precision above 20 poor:
+such positions are to be thrown away (Langley, Dilution of precision, GPS World 10(5), 1999)."""
+OPEN = 1e4
+"""Above this nothing sees it at all: what is left is the damping, or noise."""
+# Relative to the diagonal of N: rounding is smaller, what any observation sees is larger.
+_DAMPING = 1e-12
+_DIRECTIONS, _ITERATIONS = 12, 6
+# The part of a direction's largest motion from which on an unknown takes part in it.
+_MOVES = 0.1
+
+
+class Yardsticks(NamedTuple):
+    """Of positions and points (m), rotations (rad), and each shared unknown (its own unit)."""
+
+    ground: float
+    angle: float
+    shared: Float[np.ndarray, "shared"]
+
+
+class Motion(NamedTuple):
+    """Of all unknowns, in the block's order and in yardsticks."""
+
+    exterior: Float[np.ndarray, "images 6"]
+    """X, Y, Z and a small rotation in the camera frame."""
+    shared: Float[np.ndarray, "shared"]
+    points: Float[np.ndarray, "points 3"]
+
+    @property
+    def largest(self) -> float:
+        """Of all absolute numbers."""
+        return max(float(np.abs(v).max(initial=0.0)) for v in self)
+
+
+class WeakDirection(NamedTuple):
+    """One standard deviation along a direction, in yardsticks."""
+
+    moved: Motion
+    share: Float[np.ndarray, "shared"]
+    """The part of each shared unknown's variance that this direction makes: the square of their correlation. Held, the
+    unknown takes that part of the direction's variance with it."""
+
+    @property
+    def sigma(self) -> float:
+        """That of the unknown which moves most, in yardsticks."""
+        return self.moved.largest
+
+    def _moves(self, motion: Float[np.ndarray, "n k"]) -> np.ndarray:
+        return np.flatnonzero(np.abs(motion).max(axis=1, initial=0.0) > _MOVES * self.sigma)
+
+    @property
+    def images(self) -> np.ndarray:
+        """Images that take part."""
+        return self._moves(self.moved.exterior)
+
+    @property
+    def points(self) -> np.ndarray:
+        """Points that take part."""
+        return self._moves(self.moved.points)
+
+    @property
+    def shared(self) -> np.ndarray:
+        """Shared unknowns that take part, and those that it makes most of the variance of."""
+        moves = np.abs(self.moved.shared) > _MOVES * self.sigma
+        return np.flatnonzero((self.share > 0.5) | (moves & (self.share > _MOVES)))
+
+
+def yardsticks(adjusted: Adjustment) -> Yardsticks:
+    """What unknowns of `adjusted` are measured in."""
+    scale, block = jax.tree.map(still, adjusted.equations.scale), adjusted.block
+    ground = float(max(scale.eop[:3].max(initial=0.0), scale.points.max(initial=0.0)))
+    angle = float(scale.eop[3:].max(initial=0.0))
+    observed = [float(np.median(still(rows.sigma))) for rows in (block.stations, block.control) if len(rows)]
+    farther = max([1.0, *(sigma / ground for sigma in observed)])
+    turned = max(1.0, float(np.median(still(block.attitudes.sigma))) / angle) if len(block.attitudes) else 1.0
+    by_unit = {"m": farther, "s": farther, "m_per_s": farther, "rad": turned, "rad_per_s": turned}
+    factors = [by_unit.get(_unit(label), 1.0) for label in adjusted.structure.labels]
+    return Yardsticks(farther * ground, turned * angle, scale.shared * np.array(factors))
+
+
+def _unit(label: str) -> str:
+    """That of a declared parameter, by the end of its name; "" for an interior orientation."""
+    if label.startswith("interior["):
+        return ""
+    ends = ("m_per_s", "rad_per_s", "m", "rad", "s")
+    return next((unit for unit in ends if label.endswith(f"_{unit}")), "")
+
+
+def weak_directions(adjusted: Adjustment, least: float = POOR) -> list[WeakDirection]:
+    """Directions whose standard deviation is above `least` yardsticks, the weakest first; a dozen at most.
+
+    Where the unknowns of `adjusted` are: at the optimum, or wherever the solver stopped. None where numbers are
+    infinite there. The standard deviations are a priori.
+    """
+    equations, tiled = adjusted.equations.on_one_device, adjusted.tiled
+    yard = yardsticks(adjusted)
+    scale = jax.tree.map(still, equations.scale)
+    sizes = np.repeat([yard.ground, yard.angle], 3)[:, None]
+    units = _increments(np.where(scale.eop > 0, sizes, 0.0), yard.shared, np.where(scale.points > 0, yard.ground, 0.0))
+    # Yardsticks in scaled increments, and their reciprocals; zero for what is held.
+    over = jax.tree.map(lambda s, u: np.where(u > 0, s / np.where(u > 0, u, 1.0), 0.0), scale, units)
+    flat = _flat(over)
+    rng, free = np.random.default_rng(0), np.flatnonzero(flat > 0)
+    k, q = min(_DIRECTIONS, len(free)), len(yard.shared)
+    basis = np.zeros((len(flat), _DIRECTIONS))
+    basis[free, :k] = np.linalg.qr(rng.standard_normal((len(free), k)))[0]
+    system = call_compiled(_damped, equations)
+
+    def covariance_times(columns: np.ndarray) -> np.ndarray:
+        product = call_compiled(_solve, equations, system, _tree(columns * flat[:, None], over))
+        return _columns(product) * flat[:, None]
+
+    for _ in range(_ITERATIONS):
+        moved = covariance_times(basis)
+        if not np.isfinite(moved).all():
+            return []
+        basis[:, :k] = np.linalg.qr(moved[:, :k])[0]
+    inner = basis[:, :k].T @ covariance_times(basis)[:, :k]
+    mu, vectors = np.linalg.eigh((inner + inner.T) / 2)
+    along = (basis[:, :k] @ vectors * np.sqrt(np.maximum(mu, 0.0))).T[::-1]
+    columns = np.zeros((len(flat), -(-q // _DIRECTIONS) * _DIRECTIONS))
+    own = scale.eop.size + np.arange(q)
+    columns[own, np.arange(q)] = 1.0
+    batches = (
+        [covariance_times(part) for part in np.split(columns, columns.shape[1] // _DIRECTIONS, axis=1)] if q else []
+    )
+    variance = np.array([batches[j // _DIRECTIONS][row, j % _DIRECTIONS] for j, row in enumerate(own)])
+    found = [_direction(_tree(v[:, None], over), variance, tiled) for v in along]
+    return [d for d in found if d.sigma > least]
+
+
+def _direction(of: Increments, variance: np.ndarray, tiled: TiledBlock) -> WeakDirection:
+    eop, shared, points = (np.asarray(v)[0] for v in of)
+    places = tiled.places
+    share = np.clip(shared**2 / np.where(variance > 0, variance, np.inf), 0.0, 1.0)
+    return WeakDirection(Motion(eop[:, places.image].T, shared, points[:, places.point].T), share)
+
+
+def _increments(eop: Any, shared: Any, points: Any) -> Increments:
+    """Increments of NumPy's arrays."""
+    return Increments(eop, shared, points)
+
+
+def _flat(tree: Increments) -> np.ndarray:
+    return np.concatenate([np.ravel(v) for v in tree])
+
+
+def _columns(tree: Increments) -> np.ndarray:
+    """Increments along a leading axis as columns."""
+    return np.concatenate([still(v).reshape(len(v), -1) for v in tree], axis=1).T
+
+
+def _tree(columns: np.ndarray, like: Increments) -> Increments:
+    """The reverse of `_columns`."""
+    ends = np.cumsum([v.size for v in like])[:-1]
+    parts = zip(np.split(columns.T, ends, axis=1), like, strict=True)
+    return _increments(*(part.reshape(len(part), *v.shape) for part, v in parts))
+
+
+@eqx.filter_jit
+def _damped(equations: NormalEquations):
+    """The normal equations, reduced and factored, with a damping that rounding cannot turn negative."""
+    a, reduced, _ = reduce_normal(equations.at, _DAMPING)
+    return reduced, factor_band(a)
+
+
+@eqx.filter_jit
+def _solve(equations: NormalEquations, system, right: Increments) -> Increments:
+    """x of N x = b of several b along a leading axis."""
+    reduced, factor = system
+    at = equations.at
+
+    def one(b: Increments) -> Increments:
+        return solve_factored(reduced, factor, b, at)
+
+    return jax.vmap(one)(right)

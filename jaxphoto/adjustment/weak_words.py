@@ -1,0 +1,282 @@
+"""Weak directions in words: which unknowns give way together, how far, and the cheapest cure.
+
+What a direction is called follows from what moves in it: points alone, an image, the block or a part of it as a rigid
+body, or shared parameters with what the images do to make good for them. A parameter is to be held only where that
+leaves the direction no weaker than `POOR`, and control is proposed only where points move.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxphoto.adjustment.datum import MOTIONS, motion_names, motions_of
+from jaxphoto.adjustment.result import Adjustment
+from jaxphoto.adjustment.weak_directions import OPEN, POOR, WeakDirection, weak_directions, yardsticks
+from jaxphoto.arrays import still
+
+# A motion that a similarity explains to this part of its square is one.
+_RIGID = 0.9
+# Image points whose second principal extent is below this part of the first lie on a line.
+_LINE = 0.15
+# A motion of more than this part of all images is one of the whole block.
+_WHOLE = 0.9
+_SHOWN = 3
+_SENTENCES = 3
+_HEADING = "fly strips in opposite directions"
+
+
+class Weakness(NamedTuple):
+    """What is hardly determined, in one sentence with its cure, and the shared unknowns that take part."""
+
+    sentence: str
+    labels: frozenset[str]
+    sigma: float
+    """In yardsticks."""
+
+
+def weaknesses_of(adjusted: Adjustment, least: float = POOR) -> list[Weakness]:
+    """`weak_directions` in words, the weakest first; directions of the same unknowns make one sentence."""
+    words = _Words(adjusted)
+    alike: dict[tuple[str, ...], list[WeakDirection]] = {}
+    for direction in weak_directions(adjusted, least):
+        if words.harmless(direction):
+            continue
+        alike.setdefault(words.kind(direction), []).append(direction)
+    return [words.told(*kind_and_directions) for kind_and_directions in list(alike.items())[:_SENTENCES]]
+
+
+class _Words:
+    """What is known of a block, to describe its directions with."""
+
+    def __init__(self, adjusted: Adjustment) -> None:
+        self.block, self.structure = adjusted.block, adjusted.structure
+        self.values, self.yard = adjusted.values, yardsticks(adjusted)
+        self.position = still(adjusted.unknowns.exterior.position)
+        self.rotation = still(adjusted.unknowns.exterior.camera_from_object)
+        self.xyz = still(adjusted.unknowns.points)
+        self.cameras = adjusted.unknowns.interior
+
+    def kind(self, d: WeakDirection) -> tuple[str, ...]:
+        """What directions must have in common to be told together."""
+        images, fields = tuple(self.block.images[i] for i in d.images), _fields(self._labels(d))
+        if not images:
+            return ("shared", *fields) if fields else ("points",)
+        if len(images) == 1 and len(self.block.images) > 2 and not fields:
+            return ("image", *images)
+        if self._as_body(d) is not None:
+            return ("block", *fields) if len(images) > _WHOLE * len(self.block.images) else ("part", *fields)
+        return ("images", *fields)
+
+    def harmless(self, d: WeakDirection) -> bool:
+        """Whether images alone move, and so that what they show stays: a tilt makes good for a shift.
+
+        Images of few points do so in sound blocks; where they would place a new point in the middle or a corner moves
+        by less than `POOR` yardsticks, seen from the image.
+        """
+        images = d.images
+        if not len(images) or len(d.shared) or np.abs(d.moved.points).max(initial=0.0) > POOR:
+            return False
+        cameras = [self.block.image_camera[i] for i in images]
+        half = [np.array([self.block.sensors[k].width_mm, self.block.sensors[k].height_mm]) / 2 for k in cameras]
+        c = [float(self.cameras[k].c) for k in cameras]
+        signs = np.array([[0, 0], [1, 1], [1, -1], [-1, 1], [-1, -1]])
+        rays = np.array([np.column_stack([h * signs, np.full(len(signs), -k)]) for h, k in zip(half, c, strict=True)])
+        rays /= np.linalg.norm(rays, axis=2, keepdims=True)
+        s = self.structure
+        distance = np.linalg.norm(self.xyz[s.point] - self.position[s.image], axis=1)
+        depth = np.array([np.median(distance[s.image == i]) for i in images])[:, None, None]
+        moved, turn = d.moved.exterior[images, None, :3] * self.yard.ground, d.moved.exterior[images, None, 3:]
+        shift = np.einsum("nij,nkj->nki", self.rotation[images], moved)
+        seen = shift + np.cross(turn * self.yard.angle, depth * rays)
+        across = seen - np.sum(seen * rays, axis=2, keepdims=True) * rays
+        return bool(np.linalg.norm(across, axis=2).max() < POOR * self.yard.ground)
+
+    def told(self, kind: tuple[str, ...], directions: list[WeakDirection]) -> Weakness:
+        """The sentence of directions of one kind, after the weakest."""
+        d = directions[0]
+        labels = list(dict.fromkeys(label for one in directions for label in self._labels(one)))
+        if kind[0] in ("block", "part"):
+            bodies = [body for one in directions if (body := self._as_body(one)) is not None]
+            names = motion_names(np.array(bodies))
+            sentence = self._block(d, labels, names) if kind[0] == "block" else self._part(d, labels, names)
+        elif kind[0] == "points":
+            sentence = self._points(d)
+        elif kind[0] == "image":
+            sentence = self._image(d)
+        else:
+            sentence = self._shared(d, labels) if kind[0] == "shared" else self._images(d, labels)
+        return Weakness(sentence, frozenset(labels), d.sigma)
+
+    def _labels(self, d: WeakDirection) -> list[str]:
+        return [self.structure.labels[j] for j in sorted(d.shared, key=lambda j: -d.share[j])]
+
+    def _points(self, d: WeakDirection) -> str:
+        angle = max(self._angle(p) for p in d.points)
+        cure = "measure them in an image from another place, or leave them out"
+        if 2 * len(d.points) > len(self.block.points):
+            cure = "all images stand nearly at one place: take photographs from other places as well"
+        return (
+            f"point {few(self.block.points, d.points)}: {_hardly(d)} along the rays ({self._sigmas(d)}), which are "
+            f"nearly parallel, {angle:.2g} deg apart at most: {cure}"
+        )
+
+    def _image(self, d: WeakDirection) -> str:
+        (image,) = d.images
+        mine = self.structure.image == image
+        xy = still(self.block.image_points.xy)[mine]
+        extent = np.linalg.svd(xy - xy.mean(axis=0), compute_uv=False) if len(xy) > 2 else np.array([1.0, 1.0])
+        on_line = ", nearly on a line" if extent[1] < _LINE * extent[0] else ""
+        return (
+            f"image {self.block.images[image]}: its orientation is {_hardly(d)} ({self._sigmas(d)}) by its "
+            f"{mine.sum()} points{on_line}: measure more points in it{', beside that line' if on_line else ''}, give "
+            "its station and attitude, or leave it out"
+        )
+
+    def _shared(self, d: WeakDirection, labels: list[str]) -> str:
+        along = f" with the place of {len(d.points)} of {len(self.block.points)} points" if len(d.points) else ""
+        cures = [self._holding(d, labels)]
+        if along:
+            cures.append(f"add control points (point {self._farthest(d)} moves most)")
+            if _turns_with_heading(labels):
+                cures.append(_HEADING)
+        return f"{_few(labels)}{along}: {_hardly(d)} ({self._sigmas(d)}) and not told apart: {_or(cures)}"
+
+    def _part(self, d: WeakDirection, labels: list[str], names: list[str]) -> str:
+        joint = f" together with {_few(labels)}" if labels else ""
+        s = self.structure
+        inside = np.isin(s.image, d.images)
+        none = "too little" if len(np.intersect1d(s.point[inside], s.point[~inside])) else "no points"
+        return (
+            f"image {few(self.block.images, d.images)}, which share {none} with "
+            f"the others: {_and(names)} of this part{joint} {_hardly(d)} ({self._sigmas(d)}): measure points that it "
+            "shares with the others, or give it control points or stations of its own"
+        )
+
+    def _block(self, d: WeakDirection, labels: list[str], names: list[str]) -> str:
+        joint = f" together with {_few(labels)}" if labels else ""
+        cures = [self._holding(d, labels)] if labels else []
+        turns = any("rotation" in name for name in names)
+        if len(d.points):
+            beside = ", away from the line on which those there are lie" if turns and len(self.block.control) else ""
+            cures.append(f"add control points{beside} (point {self._farthest(d)} moves most)")
+        if _turns_with_heading(labels):
+            cures.append(_HEADING)
+        elif not labels:
+            cures.append("add a cross strip" if len(self.block.stations) else "add camera stations")
+        return f"the whole block: {_and(names)}{joint} {_hardly(d)} ({self._sigmas(d)}): {_or(cures)}"
+
+    def _farthest(self, d: WeakDirection) -> str:
+        """The point that moves most."""
+        return self.block.points[int(np.abs(d.moved.points).max(axis=1).argmax())]
+
+    def _images(self, d: WeakDirection, labels: list[str]) -> str:
+        n, images = len(self.block.images), d.images
+        who = "all images" if len(images) == n else f"image {few(self.block.images, images)}"
+        what = f"{_few(labels)} with {self._coordinates(d)} of {who}" if labels else f"{self._coordinates(d)} of {who}"
+        cures = [self._holding(d, labels)] if labels else []
+        owners = {label.split("[")[0] for label in labels}
+        if len(d.points):
+            cures.append(f"add control points (point {self._farthest(d)} moves most)")
+        if "interior" in owners and not owners & {"mounts", "strips"}:
+            cures.append("add camera stations (GNSS), relief, a second flying height or oblique images")
+        elif _turns_with_heading(labels):
+            cures.append(_HEADING)
+        elif not labels:
+            cures.append("measure more points in these images, or give their stations and attitudes")
+        return f"{what}: {_hardly(d)} ({self._sigmas(d)}) and not told apart: {_or(cures)}"
+
+    def _holding(self, d: WeakDirection, labels: list[str]) -> str:
+        """Those that would do if held, one at a time."""
+        enough = {label for label, left in zip(self.structure.labels, self._left(d), strict=True) if left < POOR}
+        will_do = [label for label in labels if label in enough]
+        if will_do:
+            return f"hold {_few(will_do, ' or ')} fixed, or give it a weight"
+        return f"hold {_few(labels, ' and ')} fixed, or give them weights"
+
+    def _left(self, d: WeakDirection) -> np.ndarray:
+        """What is left of the direction's sigma if each shared unknown were held."""
+        return np.sqrt(1 - d.share) * d.sigma
+
+    def _as_body(self, d: WeakDirection) -> Float[np.ndarray, "motions"] | None:
+        """The similarity that what moves makes; None where it makes none."""
+        images, points = d.images, d.points
+        places = self.xyz[points] if len(points) else self.position[images]
+        centre = places.mean(axis=0)
+        size = float(np.sqrt(((places - centre) ** 2).sum(1).mean())) or 1.0
+        eop, xyz = motions_of(self.values.position, self.values.rotation, self.values.points, centre, size)
+        yard = np.repeat([self.yard.ground, self.yard.angle], 3)
+        columns = np.concatenate(
+            [
+                (np.asarray(eop)[:, :, images] / yard[:, None]).transpose(0, 2, 1).reshape(len(MOTIONS), -1),
+                np.asarray(xyz)[:, :, points].transpose(0, 2, 1).reshape(len(MOTIONS), -1) / self.yard.ground,
+            ],
+            axis=1,
+        ).T
+        seen = np.concatenate([d.moved.exterior[images].ravel(), d.moved.points[points].ravel()])
+        found, *_ = np.linalg.lstsq(columns, seen, rcond=None)
+        left = np.sum((seen - columns @ found) ** 2) / np.sum(seen**2)
+        # Without points the images alone say little: a similarity takes its points along.
+        return found / np.abs(found).max() if left < 1 - _RIGID and len(points) else None
+
+    def _coordinates(self, d: WeakDirection) -> str:
+        """X, Y, Z and rotations about the object's axes in which the images move."""
+        moved = d.moved.exterior[d.images]
+        turned = np.einsum("nij,ni->nj", self.rotation[d.images], moved[:, 3:])
+        parts = np.sqrt((np.concatenate([moved[:, :3], turned], axis=1) ** 2).mean(axis=0))
+        names = ("X", "Y", "Z", "rotation about X", "rotation about Y", "rotation about Z")
+        return _and([name for name, part in zip(names, parts, strict=True) if part > 0.3 * parts.max()])
+
+    def _sigmas(self, d: WeakDirection) -> str:
+        """How far what takes part moves."""
+        if d.sigma > OPEN:
+            return "nothing sees it"
+        moved, yard, found = d.moved, self.yard, []
+        if len(d.points):
+            found.append(f"points {yard.ground * np.abs(moved.points).max():.2g} m")
+        if len(d.images):
+            found.append(f"images {yard.ground * np.abs(moved.exterior[:, :3]).max():.2g} m")
+            found.append(f"{np.degrees(yard.angle * np.abs(moved.exterior[:, 3:]).max()):.2g} deg")
+        for j in sorted(d.shared, key=lambda j: -d.share[j])[:_SHOWN]:
+            found.append(f"{self.structure.labels[j]} {yard.shared[j] * abs(moved.shared[j]):.2g}")
+        return f"sigma of {', '.join(found)}"
+
+    def _angle(self, point: int) -> float:
+        """The largest angle between two rays of a point, in degrees."""
+        s = self.structure
+        to = self.position[s.image[s.point == point]] - self.xyz[point]
+        to /= np.linalg.norm(to, axis=1, keepdims=True)
+        return float(np.degrees(np.arccos(np.clip(to @ to.T, -1.0, 1.0)).max(initial=0.0)))
+
+
+def few(names: tuple[str, ...], which: np.ndarray) -> str:
+    """The first names and a count."""
+    return _few([names[k] for k in which])
+
+
+def _few(names: list[str], joint: str = ", ") -> str:
+    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+    return joint.join(names[:_SHOWN]) + more
+
+
+def _fields(labels: list[str]) -> tuple[str, ...]:
+    """The parameters without their axes: mounts[a].lever_arm; both coordinates of a principal point are one."""
+    return tuple(sorted({label.replace("yp_mm", "xp_mm").rsplit("_", 2)[0] for label in labels}))
+
+
+def _turns_with_heading(labels: list[str]) -> bool:
+    """Whether what these do on the ground turns with the aircraft, so that strips flown both ways tell them."""
+    ours = any(label.startswith(("mounts[", "interior[")) for label in labels)
+    return ours and not any(label.endswith(("lever_arm_up_m", "c_mm")) for label in labels)
+
+
+def _hardly(d: WeakDirection) -> str:
+    return "not determined" if d.sigma > OPEN else "hardly determined"
+
+
+def _and(names: list[str]) -> str:
+    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
+
+
+def _or(cures: list[str]) -> str:
+    return ", or ".join(cures)
