@@ -43,7 +43,10 @@ def weaknesses_of(adjusted: Adjustment, least: float = POOR) -> list[Weakness]:
         if words.harmless(direction):
             continue
         alike.setdefault(words.kind(direction), []).append(direction)
-    return [words.told(*kind_and_directions) for kind_and_directions in list(alike.items())[:_SENTENCES]]
+    told = [words.told(kind, directions) for kind, directions in list(alike.items())[:_SENTENCES]]
+    # Where hardly a point is placed, nothing else needs a cure of its own.
+    nowhere = next(iter(alike), ()) == ("points",) and 2 * len(next(iter(alike.values()))[0].points) > len(words.xyz)
+    return told[:1] if nowhere else told
 
 
 class _Words:
@@ -150,7 +153,7 @@ class _Words:
         return (
             f"image {few(self.block.images, d.images)}, which share {none} with "
             f"the others: {_and(names)} of this part{joint} {_hardly(d)} ({self._sigmas(d)}): measure points that it "
-            "shares with the others, or give it control points or stations of its own"
+            "shares with the others, or give it control points of its own"
         )
 
     def _block(self, d: WeakDirection, labels: list[str], names: list[str]) -> str:

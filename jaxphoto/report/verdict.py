@@ -17,7 +17,7 @@ from jaxphoto.camera import Sensor
 from jaxphoto.compiling import call_compiled
 from jaxphoto.report.findings import Finding, Level, Verdict
 from jaxphoto.report.tables import Tables, in_file_unit
-from jaxphoto.report.weakness import weaknesses
+from jaxphoto.report.weakness import FELT, at_corner, weaknesses
 from jaxphoto.statistics import LEVEL, Correlations, Significance, global_test, group_factors, if_zero, worst_checked
 
 HIGH_CORRELATION = 0.9
@@ -50,7 +50,9 @@ def _findings(tables: Tables) -> Iterator[Finding]:
     for camera, c in tables.correlations.items():
         weak = of_cameras[camera]
         yield from (Finding(Level.WARNING, w.sentence) for w in weak)
-        yield from _correlated(camera, c, frozenset().union(*(w.explains for w in weak)), _all_known(adjusted.block))
+        explained = frozenset().union(*(w.explains for w in weak))
+        felt = {name for name, moved in at_corner(tables, camera).items() if moved > FELT}
+        yield from _correlated(camera, c, explained, felt, _all_known(adjusted.block))
     yield from (_not_significant(tables, s) for s in tables.significance if not s.significant)
     for name, sensor in adjusted.block.sensors.items():
         if _folds(adjusted, name, sensor):
@@ -74,7 +76,7 @@ def _weak(tables: Tables, told: frozenset[str]) -> Iterator[Finding]:
     )
     if max(a_priori * np.max(v, initial=0.0) for v in in_yardsticks) > POOR:
         found = weaknesses_of(adjusted)
-        yield from (Finding(Level.WARNING, w.sentence) for w in found if not (w.labels and w.labels <= told))
+        yield from (Finding(Level.WARNING, w.sentence) for w in found if not w.labels & told)
 
 
 def _few(names: list[str]) -> str:
@@ -182,10 +184,13 @@ def _all_known(block: Block) -> bool:
     return len(np.union1d(block.control.who, block.fixed.who)) == len(block.points)
 
 
-def _correlated(camera: str, c: Correlations, explained: frozenset[tuple[str, str]], field: bool) -> Iterator[Finding]:
+def _correlated(
+    camera: str, c: Correlations, explained: frozenset[tuple[str, str]], felt: set[str], field: bool
+) -> Iterator[Finding]:
     """High correlations, but for the pairs of exterior and interior orientation that are `explained` already.
 
-    What cures them depends on whether all images show a `field` of known targets.
+    They are a reservation where a parameter is so badly known that images feel it (`felt`), else to be known. What
+    cures them depends on whether all images show a `field` of known targets.
     """
     cure = "add cross strips, control or height differences"
     usual = "usual without camera stations or attitudes, their effects on the ground cancel"
@@ -215,7 +220,7 @@ def _correlated(camera: str, c: Correlations, explained: frozenset[tuple[str, st
         where = zip(high, images, strict=True)
         names = _few([f"{c.eop_names[i]} with {c.parameters[j]} {worst[i, j]:.3f} (image {k})" for (i, j), k in where])
         yield Finding(
-            Level.WARNING,
+            Level.WARNING if any(c.parameters[j] in felt for _, j in high) else Level.INFORMATION,
             f"high correlation of exterior with interior orientation of camera {camera}: {names}; {cure}",
         )
     own = np.abs(c.within_image).max(axis=0)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxphoto.adjustment import Adjustment
+from jaxphoto.adjustment import Adjustment, yardsticks
 from jaxphoto.report.tables import Tables
 from jaxphoto.statistics import Correlations
 from jaxphoto.unknowns import FIXED
@@ -20,8 +20,12 @@ WEAK_CORRELATION = 0.9
 FLAT = 0.2
 """Range of the heights over the flying height, up to which the ground is called nearly flat."""
 NEAR_VERTICAL_DEG = 15.0
-FELT = 2.0
-"""An image point that is wrong by more than this, and all alike towards the corner, is worse than its measurement."""
+FELT = 10.0
+"""Standard deviations of an image point by which an interior parameter may move the corner of the image.
+
+Half of `adjustment.POOR`: up to here GNSS calls a dilution of precision moderate. Sound blocks over flat ground stay
+below 8, those that cannot tell begin at 15 (benchmarks/defects.py).
+"""
 # Rows of the correlations: positions stand first, then rotations of whichever kind.
 _PLAN, _HEIGHT, _TILTS = slice(0, 2), slice(2, 3), slice(3, 5)
 _C, _POINT = ("c_mm",), ("xp_mm", "yp_mm")
@@ -59,13 +63,10 @@ def weaknesses(tables: Tables, camera: str, c: Correlations) -> list[Weakness]:
     if geometry is None or not geometry.weak:
         return []
     sigma = {s.parameter: s.sigma for s in tables.significance if s.camera == camera}
-    sensor = adjusted.block.sensors[camera]
-    mine = np.isin(adjusted.structure.image, images)
-    measured = float(np.median(np.asarray(adjusted.block.image_points.sigma)[mine]))
+    corner = at_corner(tables, camera)
     found = []
     rho, c_mm = _strongest(c, _HEIGHT, _C), float(adjusted.unknowns.interior[camera].c)
-    corner = sigma.get("c_mm", 0.0) / c_mm * np.hypot(sensor.width_mm, sensor.height_mm) / 2
-    if rho > WEAK_CORRELATION and corner > FELT * measured:
+    if rho > WEAK_CORRELATION and corner["c_mm"] > FELT:
         why, cure = _stations(adjusted, images, (2,))
         share = 100 * sigma["c_mm"] / c_mm
         sentence = (
@@ -75,18 +76,35 @@ def weaknesses(tables: Tables, camera: str, c: Correlations) -> list[Weakness]:
         )
         found.append(_weakness(camera, sentence, c, (_HEIGHT,), _C))
     turned, moved = _strongest(c, _TILTS, _POINT), _strongest(c, _PLAN, _POINT)
-    shift = max((sigma[name] for name in _POINT if name in sigma), default=0.0)
-    if max(turned, moved) > WEAK_CORRELATION and shift > FELT * measured:
+    shift = max((corner[name] for name in _POINT if name in corner), default=0.0)
+    if max(turned, moved) > WEAK_CORRELATION and shift > FELT:
         why, cure = _stations(adjusted, images, (0, 1))
         sigmas = ", ".join(f"sigma of {name} {sigma[name]:.3g} mm" for name in _POINT if name in sigma)
         sentence = (
             f"the principal point of camera {camera} is hardly determined: {sigmas}, |rho| with "
             f"{' and '.join(c.eop_names[_TILTS])} up to {turned:.4f}, with X and Y up to {moved:.4f}; over {geometry} "
-            f"a tilt and a shift of every image make good for it, and {why}: {cure} with strips flown in "
-            "opposite directions, relief or oblique images, or hold it fixed"
+            f"a tilt and a shift of every image make good for it, and {why}: {cure} with strips flown in both "
+            "directions, relief or oblique images, or hold it fixed"
         )
         found.append(_weakness(camera, sentence, c, (_TILTS, _PLAN), _POINT))
     return found
+
+
+def at_corner(tables: Tables, camera: str) -> dict[str, float]:
+    """By how many standard deviations of its image points each estimated parameter moves the corner of the image.
+
+    c along the radius, the principal point as it is; coefficients in yardsticks (`adjustment.yardsticks`).
+    """
+    adjusted = tables.adjusted
+    sensor, rows = adjusted.block.sensors[camera], adjusted.block.image_points
+    mine = np.isin(adjusted.structure.image, np.flatnonzero(np.array(adjusted.block.image_camera) == camera))
+    measured = float(np.median(np.asarray(rows.sigma)[mine])) if mine.any() else 1.0
+    tangent = np.hypot(sensor.width_mm, sensor.height_mm) / 2 / float(adjusted.unknowns.interior[camera].c)
+    units = dict(zip(adjusted.structure.labels, yardsticks(adjusted).shared.tolist(), strict=True))
+    units |= {f"interior[{camera}].c_mm": measured / tangent}
+    units |= {f"interior[{camera}].{name}": measured for name in _POINT}
+    own = [s for s in tables.significance if s.camera == camera]
+    return {s.parameter: s.sigma / units[f"interior[{camera}].{s.parameter}"] for s in own}
 
 
 def _weakness(
@@ -120,12 +138,12 @@ def _stations(adjusted: Adjustment, images: np.ndarray, axes: tuple[int, ...]) -
     if all(block.image_strip[i] in loose or block.image_mount[i] in swung for i in held):
         return (
             "stations tell them apart only as well as their shifts and lever arms are known",
-            "hold these fixed or give them smaller sigmas, add camera stations (GNSS) without",
+            "hold these fixed, or add camera stations (GNSS) that do not shift,",
         )
     sigma = float(np.median(np.asarray(block.stations.sigma)[rows]))
     return (
         f"stations of sigma {sigma:.2g} m hardly tell them apart",
-        "add better camera stations (GNSS), control points all over the block",
+        "add better camera stations (GNSS)",
     )
 
 

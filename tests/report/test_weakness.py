@@ -13,12 +13,15 @@ from tests.blocks import BROWN, CONTROL, Scene, Simulated, adjusted, aerial, all
 
 
 @functools.cache
-def tables(relief: float, stations: bool, names=("c_mm", "xp_mm", "yp_mm")):
-    """The aerial block with its relief (150 m at a height of 1000 m) times `relief`, flown at one height."""
+def tables(relief: float, stations: bool | float, names=("c_mm", "xp_mm", "yp_mm")):
+    """The aerial block with its relief (150 m at a height of 1000 m) times `relief`, flown at one height.
+
+    `stations` may be their sigma (m).
+    """
     scene = aerial()
     positions = scene.positions * [1, 1, 0] + [0, 0, 1000.0]
     built, truth = bare(Scene(positions, scene.angles, scene.points * [1, 1, relief]), {"one": BROWN}, ("one",) * 10)
-    observed = all_stations(built) if stations else StationRows.none()
+    observed = all_stations(built, 0.10 if stations is True else stations) if stations else StationRows.none()
     built = dataclasses.replace(built, control=rows(CONTROL), stations=observed)
     return Tables(adjust(measured(Simulated(free(built, "one", names), truth)).block))
 
@@ -65,6 +68,13 @@ def test_stations_cure_it():
     assert not weak(found)
     sigma = [next(s.sigma for s in tables(0.1, stations).significance if s.parameter == "c_mm") for stations in (0, 1)]
     assert sigma[0] > 50 * sigma[1]
+
+
+def test_stations_that_are_too_weak_do_not_cure_it():
+    """It is rho and sigma that decide, not whether stations exist; the cure is not the one for a block without any."""
+    found = weak(verdict_of(tables(0.1, 50.0)).texts)
+    assert [text.startswith("c of camera one") for text in found][0]
+    assert "stations of sigma 50 m hardly tell them apart: add better camera stations" in found[0]
 
 
 def test_relief_cures_it():
