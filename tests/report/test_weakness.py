@@ -77,6 +77,16 @@ def test_stations_that_are_too_weak_do_not_cure_it():
     assert "stations of sigma 50 m hardly tell them apart: add better camera stations" in found[0]
 
 
+def test_a_solve_that_stopped_says_what_was_open():
+    """Where it was before the optimum the observations fit already, and the same direction is weak."""
+    optimum = tables(0.1, False).adjusted
+    stopped = dataclasses.replace(optimum, converged=np.array(False))
+    first, *others = verdict_of(Tables(stopped)).findings
+    assert "step limit" in first.text
+    assert any("interior[one].c_mm with Z of all images: hardly determined" in f.text for f in others)
+    assert {f.level for f in (first, *others)} == {verdict.Level.ALARM}
+
+
 def test_relief_cures_it():
     assert not weak(verdict_of(tables(2.0, False)).texts)
 
