@@ -11,7 +11,7 @@ from jaxphoto.adjustment.layout.tiled import TiledResiduals, TiledStructure, Til
 from jaxphoto.adjustment.normal_equations import Cofactors, Linearised, NormalEquations, RowCofactors, optimise
 from jaxphoto.adjustment.result import Adjustment, Outcome
 from jaxphoto.adjustment.weak_directions import POOR, WeakDirection, weak_directions, yardsticks
-from jaxphoto.adjustment.weak_words import Weakness, weaknesses_of
+from jaxphoto.adjustment.weak_words import WeakUnknowns, weaknesses_of
 
 __all__ = [
     "LEAST",
@@ -30,7 +30,7 @@ __all__ = [
     "TiledStructure",
     "TiledValues",
     "WeakDirection",
-    "Weakness",
+    "WeakUnknowns",
     "common_sizes",
     "lay_out",
     "linearise",

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from jaxphoto.adjustment.datum_words import datum_sentence
 from jaxphoto.adjustment.model.block_values import with_start
 from jaxphoto.adjustment.model.numbers import UnknownArrays, Values, zero_increments
 from jaxphoto.adjustment.model.observed_groups import ObservedGroup
@@ -27,15 +28,6 @@ from jaxphoto.compiling import QUICK_TO_COMPILE
 from jaxphoto.errors import DatumError
 from jaxphoto.observations import PRIORS, ControlRows
 
-MOTIONS = (
-    "shift in X",
-    "shift in Y",
-    "shift in Z",
-    "rotation about X",
-    "rotation about Y",
-    "rotation about Z",
-    "scale",
-)
 # Singular values of the scaled sensitivity below this are zero.
 _OPEN = 1e-9
 # A rotation (rad), or a scale, that observations know no better than this is as good as open: it is no longer small.
@@ -69,7 +61,7 @@ def close_datum(block: Block, values: Values, structure: Structure) -> DatumRows
     kind, over = block.datum.kind, block.datum.over
     if kind == "control":
         if len(null_motions):
-            raise DatumError(_sentence(null_motions, block, named))
+            raise DatumError(datum_sentence(null_motions, block, named))
         if judged:
             _check_vague(block, sensitivity, named)
         return null
@@ -153,7 +145,7 @@ def _check_vague(block: Block, sensitivity: np.ndarray, named: list[str]) -> Non
     # Of the rotations and the scale in each: they are seen through the shifts that go along.
     sigma = np.linalg.norm(vt[:, 3:], axis=1) / np.maximum(s, 1e-300)
     if (vague := sigma > _VAGUE).any():
-        raise DatumError(_sentence(vt[vague], block, named, float(sigma.max())))
+        raise DatumError(datum_sentence(vt[vague], block, named, float(sigma.max())))
 
 
 motions_of = jax.jit(motions, compiler_options=QUICK_TO_COMPILE)
@@ -267,48 +259,3 @@ def _minimal(null: DatumRows, structure: Structure) -> DatumRows:
         left -= np.outer(direction, direction @ left)
     points = rows.reshape(k, structure.n_points, 3).transpose(0, 2, 1)
     return DatumRows(np.zeros_like(null.eop), points)
-
-
-def motion_names(combinations: Float[np.ndarray, "n motions"]) -> list[str]:
-    """Names of the motions that combinations are made of.
-
-    A rotation about another place than the centre is one with a shift: shifts are told only where there are more
-    combinations than rotations and scale.
-    """
-    shares = np.sqrt((combinations**2).sum(0))
-    named = [m for m, share in zip(MOTIONS, shares, strict=True) if share > 0.05 * shares.max()]
-    turns = [name for name in named if not name.startswith("shift")]
-    return turns if len(turns) >= len(combinations) else named
-
-
-def _sentence(null_motions: np.ndarray, block: Block, named: list[str], sigma: float = np.inf) -> str:
-    """What is open, of what there is, and the mend; `sigma` of what is closed by noise alone (rad, or a part of 1)."""
-    names = motion_names(null_motions)
-    counts = {rows.group: int(np.size(rows.observation)) for rows in block.observations if len(rows)}
-    if n := counts.pop(ControlRows.group, 0) + len(block.fixed.who):
-        counts[ControlRows.group] = n
-    what = {"control_points": "control coordinates", "stations": "station coordinates", "attitudes": "attitude angles"}
-    what |= {"surfaces": "points on surfaces"}
-    order = ["control_points", *(name for name in counts if name != "control_points")]
-    named_counts = [(counts[name], what.get(name, name.replace("_", " "))) for name in order if name in counts]
-    observed = [f"{n} {noun[:-1] if n == 1 else noun}" for n, noun in named_counts]
-    mends = "add control points or camera stations"
-    if names == ["scale"]:
-        mends += ", or a distance"
-    if not np.isfinite(sigma):
-        mends += ', or set [datum] kind = "inner" (or "minimal") in block.toml'
-    elif any("rotation" in name for name in names):
-        mends = "add control points or camera stations away from the line on which those there are lie"
-    if named:
-        mends = "add control points, or fix " + ", ".join(named[:3]) + (" ..." if len(named) > 3 else "")
-    from_what = " and ".join(observed) if observed else "image coordinates alone"
-    if np.isfinite(sigma):
-        known = f"{100 * sigma:.2g} %" if names == ["scale"] else f"{np.degrees(sigma):.2g} deg"
-        return (
-            f"the datum of the block is as good as open: {', '.join(names)} cannot be determined from {from_what} "
-            f"better than to {known}, which is noise; {mends}"
-        )
-    return (
-        f"the datum of the block has a defect of {len(null_motions)}: {', '.join(names)} cannot be determined from "
-        f"{from_what}; {mends}"
-    )

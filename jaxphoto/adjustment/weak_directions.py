@@ -48,7 +48,7 @@ class Yardsticks(NamedTuple):
     shared: Float[np.ndarray, "shared"]
 
 
-class Motion(NamedTuple):
+class MovedUnknowns(NamedTuple):
     """Of all unknowns, in the block's order and in yardsticks."""
 
     exterior: Float[np.ndarray, "images 6"]
@@ -65,7 +65,7 @@ class Motion(NamedTuple):
 class WeakDirection(NamedTuple):
     """One standard deviation along a direction, in yardsticks."""
 
-    moved: Motion
+    moved: MovedUnknowns
     share: Float[np.ndarray, "shared"]
     """The part of each shared unknown's variance that this direction makes: the square of their correlation. Held, the
     unknown takes that part of the direction's variance with it."""
@@ -163,7 +163,7 @@ def _direction(of: Increments, variance: np.ndarray, tiled: TiledBlock) -> WeakD
     eop, shared, points = (np.asarray(v)[0] for v in of)
     places = tiled.places
     share = np.clip(shared**2 / np.where(variance > 0, variance, np.inf), 0.0, 1.0)
-    return WeakDirection(Motion(eop[:, places.image].T, shared, points[:, places.point].T), share)
+    return WeakDirection(MovedUnknowns(eop[:, places.image].T, shared, points[:, places.point].T), share)
 
 
 def _increments(eop: Any, shared: Any, points: Any) -> Increments:

@@ -10,7 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxphoto.adjustment.datum import MOTIONS, motion_names, motions_of
+from jaxphoto.adjustment.datum import motions_of
+from jaxphoto.adjustment.datum_words import MOTIONS, motion_names
 from jaxphoto.adjustment.result import Adjustment
 from jaxphoto.adjustment.weak_directions import OPEN, POOR, WeakDirection, weak_directions, yardsticks
 from jaxphoto.arrays import still
@@ -26,7 +27,7 @@ _SENTENCES = 3
 _HEADING = "fly strips in opposite directions"
 
 
-class Weakness(NamedTuple):
+class WeakUnknowns(NamedTuple):
     """What is hardly determined, in one sentence with its cure, and the shared unknowns that take part."""
 
     sentence: str
@@ -35,7 +36,7 @@ class Weakness(NamedTuple):
     """In yardsticks."""
 
 
-def weaknesses_of(adjusted: Adjustment, least: float = POOR) -> list[Weakness]:
+def weaknesses_of(adjusted: Adjustment, least: float = POOR) -> list[WeakUnknowns]:
     """`weak_directions` in words, the weakest first; directions of the same unknowns make one sentence."""
     words = _Words(adjusted)
     alike: dict[tuple[str, ...], list[WeakDirection]] = {}
@@ -95,7 +96,7 @@ class _Words:
         across = seen - np.sum(seen * rays, axis=2, keepdims=True) * rays
         return bool(np.linalg.norm(across, axis=2).max() < POOR * self.yard.ground)
 
-    def told(self, kind: tuple[str, ...], directions: list[WeakDirection]) -> Weakness:
+    def told(self, kind: tuple[str, ...], directions: list[WeakDirection]) -> WeakUnknowns:
         """The sentence of directions of one kind, after the weakest."""
         d = directions[0]
         labels = list(dict.fromkeys(label for one in directions for label in self._labels(one)))
@@ -109,7 +110,7 @@ class _Words:
             sentence = self._image(d)
         else:
             sentence = self._shared(d, labels) if kind[0] == "shared" else self._images(d, labels)
-        return Weakness(sentence, frozenset(labels), d.sigma)
+        return WeakUnknowns(sentence, frozenset(labels), d.sigma)
 
     def _labels(self, d: WeakDirection) -> list[str]:
         return [self.structure.labels[j] for j in sorted(d.shared, key=lambda j: -d.share[j])]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxphoto import FIXED, FREE, DatumError, adjust
-from jaxphoto.adjustment.datum import MOTIONS
+from jaxphoto.adjustment.datum_words import MOTIONS
 from jaxphoto.block import Datum
 from jaxphoto.georeferencing import StripBias
 from jaxphoto.observations import ControlRows, Distances, StationRows
