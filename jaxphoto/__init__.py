@@ -64,7 +64,7 @@ from jaxphoto.observations import (
     touching,
 )
 from jaxphoto.parameters import AbstractParameters
-from jaxphoto.procedures import adjust, boresight, georeference, snoop
+from jaxphoto.procedures import adjust, boresight, georeference, robust, snoop
 from jaxphoto.simulation import simulate
 from jaxphoto.statistics import (
     Selection,
@@ -98,7 +98,8 @@ __all__ = [
     "correlated", "covariance", "decentring_from_symmetry", "default_priors", "direct_orientation", "georeference",
     "ground_point", "halves", "image_ray", "intersect", "monte_carlo", "orient", "point_differences",
     "principal_points", "project", "read_block", "read_recipe", "read_source", "readjust", "rebalance",
-    "rebalance_covariance", "significance", "simulate", "simultaneous", "snoop", "symmetry_from_decentring", "touching",
+    "rebalance_covariance", "robust", "significance", "simulate", "simultaneous", "snoop",
+    "symmetry_from_decentring", "touching",
     "variance_components", "write_block", "write_simulation",
 ]  # fmt: skip
 

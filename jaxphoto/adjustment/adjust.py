@@ -3,7 +3,8 @@
 import dataclasses
 import functools
 import operator
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
+from types import MappingProxyType
 from typing import NamedTuple
 
 import equinox as eqx
@@ -30,6 +31,7 @@ from jaxphoto.arrays import gathered, still
 from jaxphoto.block import Block
 from jaxphoto.compiling import prepare, run_compiled
 from jaxphoto.devices import usable
+from jaxphoto.losses import AbstractLoss
 from jaxphoto.unknowns import Unknowns
 
 MAX_STEPS = 100
@@ -42,6 +44,7 @@ def solve(
     max_steps: int = MAX_STEPS,
     sizes: Sizes = LEAST,
     meanwhile: Callable[[NormalEquations, dict[str, float]], None] = lambda equations, seconds: None,
+    losses: Mapping[str, AbstractLoss] = MappingProxyType({}),
 ) -> Adjustment:
     """Least-squares adjustment of `block` from `start`, with what `priors` leaves free.
 
@@ -52,11 +55,16 @@ def solve(
     `sizes` are sizes to compile for at least (`common_sizes`). `meanwhile` is called while the adjustment compiles,
     with arrays of the types that its result will have, to `prepare` what will be wanted of it, and with its seconds.
 
+    `losses`, by group of observations, say what its rows cost in place of their squares. The unknowns are then where
+    all costs together are least, while residuals and normal equations of the result are those of least squares there:
+    `jaxphoto.robust` makes statistics of them.
+
     Raises DatumError where the observations leave the datum open and no constraint closes it, RankError where they
     do not see an unknown or cannot tell unknowns apart.
     """
     laid = lay_out(block, start, priors, sizes)
-    numbers, structure = laid.tiled_values, laid.tiled.structure
+    numbers, plain = laid.tiled_values, laid.tiled.structure
+    structure = plain.with_losses(losses)
     seconds: dict[str, float] = {}
     if laid.traced:
         found = find_optimum(weigh_datum(numbers, structure), structure=structure, max_steps=max_steps)
@@ -65,8 +73,8 @@ def solve(
         arguments = (numbers, structure, max_steps, np.array(False))
         # The longest first: the others are traced while it compiles.
         if prepare(_optimise, arguments, seconds):
-            prepare(_residuals, (numbers, structure), seconds)
-            meanwhile(NormalEquations(numbers, structure, _factored_like(numbers, structure)), seconds)
+            prepare(_residuals, (numbers, plain), seconds)
+            meanwhile(NormalEquations(numbers, plain, _factored_like(numbers, plain)), seconds)
         found = run_compiled(_optimise, arguments, seconds, "solve")
         # What comes back from several devices is of another type to a program than what went in.
         state = UnknownArrays(*map(still, found.state))

@@ -12,6 +12,7 @@ from jaxphoto.cli.app import app
 from jaxphoto.cli.console import plain_console
 from jaxphoto.errors import JaxphotoError
 from jaxphoto.io import read_block, write_block
+from jaxphoto.losses import LOSSES
 from jaxphoto.procedures import adjust_for_tables
 from jaxphoto.report import (
     Level,
@@ -46,6 +47,9 @@ def adjust_command(
             "--snoop", help="Leave out what contradicts the other observations, and write what went and the block left."
         ),
     ] = False,
+    robust: Annotated[
+        str | None, typer.Option(help=f"As --snoop, from a robust adjustment with this loss: {', '.join(LOSSES)}.")
+    ] = None,
     max_steps: Annotated[int, typer.Option(min=1, help="Most iterations.")] = jaxphoto.MAX_STEPS,
     weights: Annotated[
         str | None, typer.Option(help=f"Estimate variance components, adjust with them: group, or by {_SPLITS}.")
@@ -54,6 +58,8 @@ def adjust_command(
     """Adjust a block and write tables, statistics and a report. Exit code 1: written, but the verdict is red."""
     if rotations not in EOP_NAMES:
         raise JaxphotoError(f"--rotations {rotations}: there are {', '.join(EOP_NAMES)}")
+    if robust is not None and robust not in LOSSES:
+        raise JaxphotoError(f"--robust {robust}: there are {', '.join(LOSSES)}")
     splits = None if weights is None else _splits_of(weights)
     check_folder(out, block)
     Thread(target=prepare_pictures, daemon=True).start()
@@ -67,8 +73,9 @@ def adjust_command(
             f"{len(read.image_points.image)} image points"
         )
         snooped = None
-        if snoop:
-            snooped = jaxphoto.snoop(read, max_steps=max_steps, report=status.update)
+        if snoop or robust:
+            loss = LOSSES[robust]() if robust else None
+            snooped = jaxphoto.snoop(read, loss=loss, max_steps=max_steps, report=status.update)
         adjusted = snooped.adjusted if snooped else adjust_for_tables(read, max_steps)
         components = None
         if splits is not None and bool(adjusted.converged):

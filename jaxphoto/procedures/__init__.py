@@ -4,12 +4,14 @@ from jaxphoto.procedures.adjust import adjust, adjust_for_tables
 from jaxphoto.procedures.boresight import boresight, step_block
 from jaxphoto.procedures.boresight_judgement import BoresightEstimate, Step, judge
 from jaxphoto.procedures.georeference import Georeferenced, georeference
+from jaxphoto.procedures.robust import Robust, robust
 from jaxphoto.procedures.snooping import Exchanged, Snooped, snoop
 
 __all__ = [
     "BoresightEstimate",
     "Exchanged",
     "Georeferenced",
+    "Robust",
     "Snooped",
     "Step",
     "adjust",
@@ -17,6 +19,7 @@ __all__ = [
     "boresight",
     "georeference",
     "judge",
+    "robust",
     "snoop",
     "step_block",
 ]

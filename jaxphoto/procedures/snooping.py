@@ -16,38 +16,40 @@ from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from jaxphoto.adjustment import MAX_STEPS, Adjustment, Outcome, Sizes, common_sizes, linearise, solve
 from jaxphoto.arrays import still
 from jaxphoto.block import Block
 from jaxphoto.errors import BlockError
+from jaxphoto.losses import AbstractLoss
 from jaxphoto.observations import AbstractObservations
 from jaxphoto.procedures.adjust import start_of
 from jaxphoto.procedures.cross_validation import measured_discrepancies
+from jaxphoto.procedures.robust import (
+    Blocks,
+    Masks,
+    all_points,
+    checked_parts,
+    residual_scales,
+    robust,
+    some_points,
+)
 from jaxphoto.statistics import (
     LEAST_CHECKED,
     LEAST_SIGMA0,
     LEVEL,
     Suspect,
     chi_square_limit,
-    covariance,
-    redundancy_numbers,
 )
 from jaxphoto.unknowns import Unknowns
 from jaxphoto.variants import without_observations
 
-Masks = dict[str, Bool[np.ndarray, "_"]]
-"""By group of observations: which rows."""
-Blocks = dict[str, Float[np.ndarray, "_ _ _"]]
-"""By group of observations: (rows, numbers of a row, numbers of a row)."""
 # Huber's constant: residuals of so many standard deviations count whole (95 % efficient where all are normal).
 _HUBER = 1.345
 _ROBUST_STEPS, _ROUNDS = 10, 20
 # A weight that changes by less, in a robust step, no longer changes what is suspected.
 _STILL = 0.02
-# Median size of a standard normal number; of fewer numbers than these it says too little of a group by itself.
-_MEDIAN, _ENOUGH = 0.6745, 30
 # Two image points may have each other's name where one lies as near to the prediction of the other, beside how far
 # apart they are.
 _NEAR = 0.2
@@ -79,17 +81,24 @@ def snoop(
     block: Block,
     start: Unknowns | None = None,
     *,
+    loss: AbstractLoss | None = None,
     max_steps: int = MAX_STEPS,
     report: Callable[[str], object] = lambda text: None,
 ) -> Snooped:
     """Adjust `block` without the observations that contradict the others.
 
     All observations are tested, image points, control, stations and every further kind, but not priors. A row goes as a
-    whole: both coordinates of an image point, one coordinate of a control point. Raises what `adjust` raises.
+    whole: both coordinates of an image point, one coordinate of a control point. With `loss` it begins with the robust
+    adjustment that this means (`jaxphoto.robust`). Raises what `adjust` raises.
     """
     sizes = common_sizes([block])
-    at, r, flown = _robust(block, start_of(block) if start is None else start, max_steps, sizes, report)
-    scale = _scales(at, r)
+    start = start_of(block) if start is None else start
+    if loss is None:
+        at, r, flown = _reweighted(block, start, max_steps, sizes, report)
+    else:
+        begun = robust(block, loss, start, max_steps=max_steps, sizes=sizes, report=report)
+        at, r, flown = begun.at, checked_parts(begun.at), begun.astray
+    scale = residual_scales(at, r)
     worst = _worst(block, {name: size / scale[name] for name, size in _sizes(at, r).items()}, 1.0)
     left = {name: flown[name] | worst[name] for name in worst}
     tried: list[Masks] = []
@@ -98,8 +107,8 @@ def snoop(
     while True:
         report(f"adjusting without {sum(int(m.sum()) for m in left.values())} observations")
         kept, point = without_observations(block, left)
-        adjusted = solve(kept, _some_points(at.unknowns, point), kept.priors, max_steps, sizes)
-        at = linearise(block, _all_points(adjusted.unknowns, at.unknowns, point), block.priors, max_steps, sizes)
+        adjusted = solve(kept, some_points(at.unknowns, point), kept.priors, max_steps, sizes)
+        at = linearise(block, all_points(adjusted.unknowns, at.unknowns, point), block.priors, max_steps, sizes)
         sigma0 = max(float(adjusted.sigma0), LEAST_SIGMA0)
         pairs = [pair for pair in _exchanged(at, left, sigma0) if pair not in done]
         if pairs:
@@ -112,12 +121,12 @@ def snoop(
         tried.append(left)
         left = found
     gone = np.setdiff1d(np.arange(len(block.points)), point)
-    told = _told(at, left, _stays(block, point), _redundancy(at), sigma0)
+    told = _told(at, left, _stays(block, point), checked_parts(at), sigma0)
     exchanged = tuple(_named(block, pair) for pair in done)
     return Snooped(adjusted, told, exchanged, tuple(block.points[p] for p in gone))
 
 
-def _robust(
+def _reweighted(
     block: Block, start: Unknowns, max_steps: int, sizes: Sizes, report: Callable[[str], object]
 ) -> tuple[Adjustment, Blocks, Masks]:
     """The block where weights that fall with the residual have led, linearised; the redundancy numbers there; and the
@@ -132,16 +141,16 @@ def _robust(
         report(f"robust step {step}" if step else "adjusting all observations")
         weighed = block.with_observations({name: _weighed(own, weight[name]) for name, own in rows.items()})
         kept, point = without_observations(weighed, left)
-        found = solve(kept, _some_points(unknowns, point), kept.priors, max_steps, sizes)
+        found = solve(kept, some_points(unknowns, point), kept.priors, max_steps, sizes)
         if found.astray.any():
             # Blunders that leave their point no place: without it, from where the last step began.
             flown = np.isin(block.image_points.point, point[found.astray])
             left[block.image_points.group] |= flown
             continue
-        unknowns = _all_points(found.unknowns, unknowns, point)
+        unknowns = all_points(found.unknowns, unknowns, point)
         at = linearise(block, unknowns, block.priors, max_steps, sizes)
-        r = r or _redundancy(at)
-        scale = _scales(at, r)
+        r = r or checked_parts(at)
+        scale = residual_scales(at, r)
         new = {name: 1 / np.maximum(_largest(at, name, r) / (_HUBER * scale[name]), 1.0) for name in rows}
         if max(float(np.abs(new[name] - weight[name]).max(initial=0.0)) for name in rows) < _STILL:
             break
@@ -155,12 +164,6 @@ def _weighed(rows: AbstractObservations, weight: Float[np.ndarray, "_"]) -> Abst
     """The rows with other weights, one factor a row."""
     factor = (weight**-0.5).reshape(-1, *[1] * (np.ndim(rows.sigmas) - 1))
     return rows.with_sigmas_times(np.broadcast_to(factor, np.shape(rows.sigmas)))
-
-
-def _redundancy(adjusted: Adjustment) -> Blocks:
-    """Of each row, what its own residuals show of a change of its whitened numbers."""
-    blocks = redundancy_numbers(adjusted, covariance(adjusted)).blocks
-    return {name: blocks[name] for name in adjusted.block.named_observations}
 
 
 def _sizes(at: Adjustment, r: Blocks, predicted: bool = False) -> dict[str, Float[np.ndarray, "_"]]:
@@ -182,26 +185,13 @@ def _sizes(at: Adjustment, r: Blocks, predicted: bool = False) -> dict[str, Floa
     return found
 
 
-def _scales(at: Adjustment, r: Blocks) -> dict[str, float]:
-    """By group, a standard deviation of whitened residuals that blunders hardly move."""
-    found = {}
-    for name, own in r.items():
-        diagonal = np.diagonal(own, axis1=1, axis2=2).T
-        checked = diagonal > LEAST_CHECKED
-        if int(checked.sum()) >= _ENOUGH:
-            size = np.abs(np.atleast_2d(at.residuals[name]))[checked] / np.sqrt(diagonal[checked])
-            found[name] = max(float(np.median(size)) / _MEDIAN, LEAST_SIGMA0)
-    usual = found.get(at.block.image_points.group, 1.0)
-    return {name: found.get(name, usual) for name in r}
-
-
 def _tested(adjusted: Adjustment, at: Adjustment, left: Masks, point: np.ndarray, sigma0: float) -> Masks:
     """What is to be left out next: `adjusted` is without `left`, `at` the whole block linearised there."""
     stays = _stays(at.block, point)
-    wrong = {name: size > sigma0 for name, size in _sizes(at, _redundancy(at), predicted=True).items()}
+    wrong = {name: size > sigma0 for name, size in _sizes(at, checked_parts(at), predicted=True).items()}
     found = {name: out & (wrong[name] | ~stays[name]) for name, out in left.items()}
     sizes = {}
-    for name, size in _sizes(adjusted, _redundancy(adjusted)).items():
+    for name, size in _sizes(adjusted, checked_parts(adjusted)).items():
         sizes[name] = np.zeros(len(left[name]))
         sizes[name][~left[name] & stays[name]] = size / sigma0
     least = max(1.0, _BESIDE_THE_WORST * max(float(size.max(initial=0.0)) for size in sizes.values()))
@@ -247,20 +237,9 @@ def _same(one: Masks, other: Masks) -> bool:
     return all(np.array_equal(one[name], other[name]) for name in one)
 
 
-def _some_points(unknowns: Unknowns, point: np.ndarray) -> Unknowns:
-    return dataclasses.replace(unknowns, points=still(unknowns.points)[point])
-
-
-def _all_points(unknowns: Unknowns, before: Unknowns, point: np.ndarray) -> Unknowns:
-    """The unknowns with all points: those that are gone, where they were."""
-    points = np.array(before.points)
-    points[point] = still(unknowns.points)
-    return dataclasses.replace(unknowns, points=points)
-
-
 def _exchanged(at: Adjustment, left: Masks, sigma0: float) -> list[tuple[int, int]]:
     """Rows of image points left out, two of an image, that fit each other's prediction."""
-    p, r = at.block.image_points, _redundancy(at)[at.block.image_points.group]
+    p, r = at.block.image_points, checked_parts(at)[at.block.image_points.group]
     # Both coordinates of two points are tested; as all others, against all others.
     limit = sigma0**2 * float(chi_square_limit(np.array(2), LEVEL / len(p)))
     measured, missed = still(p.xy), measured_discrepancies(at.block, at.unknowns)

@@ -22,6 +22,23 @@ def student_limit(freedom: int, level: float) -> float:
     return float(-_special().stdtrit(freedom, level / 2))
 
 
+def student_freedom(square: Float[np.ndarray, "n"], numbers: int) -> float:
+    """Degrees of freedom, 1 to 100, of the Student's distribution that is most likely for rows of so many numbers.
+
+    `square` are v'v over the square of the distribution's scale. From 100 on it is the normal distribution.
+    """
+    from scipy.optimize import minimize_scalar
+
+    gammaln, k = _special().gammaln, numbers
+
+    def cost(log_nu: float) -> float:
+        nu = float(np.exp(log_nu))
+        density = gammaln((nu + k) / 2) - gammaln(nu / 2) - k / 2 * np.log(nu)
+        return float((nu + k) / 2 * np.mean(np.log1p(square / nu)) - density)
+
+    return float(np.exp(minimize_scalar(cost, bounds=np.log((1.0, 100.0)), method="bounded").x))
+
+
 def _special() -> ModuleType:
     """SciPy takes a fifth of a second, and importing jaxphoto does not need it."""
     from scipy import special

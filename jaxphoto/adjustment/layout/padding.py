@@ -123,6 +123,7 @@ def pad_structure(structure: Structure, sizes: Sizes = LEAST, *, shards: int = 1
         n_image_colours=s.n_image_colours,
         free=s.free,
         colour=s.colour,
+        image_loss=s.image_loss,
         groups=tuple(_pad_group(g, at, n_images) for g in s.groups),
         n_images=n_images,
         n_points=n_points,

@@ -21,6 +21,7 @@ from jaxphoto.adjustment.model.parameter_tables import JointPrior, ParameterTabl
 from jaxphoto.arrays import vector_of
 from jaxphoto.block import Block, named_rows
 from jaxphoto.errors import BlockError
+from jaxphoto.losses import AbstractLoss, LinearisedLoss
 from jaxphoto.observations import (
     PRIORS,
     AbstractObservations,
@@ -80,6 +81,8 @@ class ObservedGroup(eqx.Module):
     """Which of these are unknowns in any row."""
     column: Int[np.ndarray, "l _"]
     """The shared unknowns that they are; the number of these where a row has none."""
+    loss: AbstractLoss | LinearisedLoss | None
+    """What rows cost, where it is not their square."""
     pair: Int[np.ndarray, "pairs rows 4"]
     """Of a padded structure: where two images of a row meet in the band (see `Tiles.block`), and whether transposed."""
 
@@ -229,6 +232,7 @@ def group_of(
         parameter=parameter,
         place=tuple(int(k) for k in place),
         column=column,
+        loss=None,
         pair=np.zeros((0, n, 4), np.int32),
     )
 

@@ -139,7 +139,8 @@ def row_function(group: ObservedGroup, s: AbstractStructure) -> Callable[[Touche
                 touched.append(_stacked([filled(form, take(size)) for _ in range(count)], shape))
             else:
                 touched.append(None)
-        return jnp.ravel(given.row.whitened(given.row.residual(*touched)))
+        v = jnp.ravel(given.row.whitened(given.row.residual(*touched)))
+        return v if group.loss is None else jnp.stack(group.loss.reduced(*v))
 
     return residual
 

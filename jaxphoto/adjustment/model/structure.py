@@ -14,7 +14,8 @@ compiles nothing.
 
 import abc
 import dataclasses
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import NamedTuple, Self
 
 import equinox as eqx
 import jax
@@ -34,7 +35,8 @@ from jaxphoto.camera import InteriorOrientation
 from jaxphoto.devices import AXIS
 from jaxphoto.errors import BlockError
 from jaxphoto.georeferencing import Corrections
-from jaxphoto.observations import PRIORS, AbstractObservations
+from jaxphoto.losses import AbstractLoss, LinearisedLoss
+from jaxphoto.observations import PRIORS, AbstractObservations, ImageRows
 from jaxphoto.unknowns import FIXED, Unknowns
 
 
@@ -73,8 +75,31 @@ class AbstractStructure(eqx.Module):
     colour: Int[np.ndarray, "shared"]
     observed: tuple[ObservedGroup, ...]
     """All observations but image rows, and what is known beforehand."""
+    image_loss: AbstractLoss | LinearisedLoss | None
+    """What image rows cost, where it is not their square."""
     eop_free: Float[np.ndarray, "6 images"]
     point_free: Float[np.ndarray, "3 points"]
+
+    def with_losses(self, losses: Mapping[str, AbstractLoss]) -> Self:
+        """The same with losses by the names of groups."""
+
+        def of(name: str, numbers: int) -> AbstractLoss | None:
+            return losses[name].for_rows_of(numbers) if name in losses else None
+
+        observed = tuple(dataclasses.replace(g, loss=of(g.name, g.components)) for g in self.observed)
+        return dataclasses.replace(self, observed=observed, image_loss=of(ImageRows.group, len(ImageRows.axes)))
+
+    @property
+    def has_losses(self) -> bool:
+        """Whether any row costs anything but its square."""
+        return self.image_loss is not None or any(g.loss is not None for g in self.observed)
+
+    @property
+    def with_linearised_losses(self) -> Self:
+        """The same for normal equations."""
+        of = lambda loss: None if loss is None else LinearisedLoss(loss)  # noqa: E731
+        observed = tuple(dataclasses.replace(g, loss=of(g.loss)) for g in self.observed)
+        return dataclasses.replace(self, observed=observed, image_loss=of(self.image_loss))
 
     @property
     @abc.abstractmethod
@@ -207,6 +232,7 @@ def structure_of(block: Block, priors: Unknowns, observed: ObservedRows | None =
         column=column,
         colour=colour,
         observed=groups,
+        image_loss=None,
         eop_free=eop_free,
         point_free=point_free,
         labels=tuple(entries[k].label for k in free),

@@ -133,12 +133,18 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Increments, Scalar, Any
         return SolverState(damping, jnp.array(jnp.inf), no, empty, loose=no, tightened=no, done=no)
 
     def _factored(self, at: Linearised, damping) -> tuple[FactoredSystem, RightSide]:
-        a, reduced, right = reduce_normal(at, damping)
-        return FactoredSystem(at.increments, reduced, factor_band(a)), right
+        a, reduced, right = reduce_normal(at.for_normal_equations, damping)
+        return FactoredSystem(at.increments, reduced, factor_band(a)), self._with_cost(right, at)
 
     def _kept(self, at: Linearised, system: FactoredSystem) -> tuple[FactoredSystem, RightSide]:
         """The gradient there, taken down by the system that there is."""
-        return system, RightSide(*gradient(at, system.reduced, at._replace(increments=system.increments)))
+        here = at.for_normal_equations
+        right = RightSide(*gradient(here, system.reduced, here._replace(increments=system.increments)))
+        return system, self._with_cost(right, at)
+
+    def _with_cost(self, right: RightSide, at: Linearised) -> RightSide:
+        """With what is minimised for the square sum: of rows with losses, the normal equations do not tell."""
+        return right._replace(square_sum=at.square_sum()) if self.structure.has_losses else right
 
     def step(self, fn, y, args, options, state: SolverState, tags):
         """Propose a step; take it if it is good, and damp more if not."""
@@ -146,7 +152,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Increments, Scalar, Any
         system, right = jax.lax.cond(
             state.chord, lambda: self._kept(at, state.system), lambda: self._factored(at, state.damping)
         )
-        place = at._replace(increments=system.increments)
+        place = at.for_normal_equations._replace(increments=system.increments)
         x = jax.lax.cond(
             self.only_factor,
             lambda: jax.tree.map(jnp.zeros_like, y),

@@ -47,6 +47,11 @@ class Linearised(NamedTuple):
         """The unknowns there."""
         return state_at(self.increments, self.scale, self.values, self.structure)
 
+    @property
+    def for_normal_equations(self) -> "Linearised":
+        """The same with residuals that belong to normal equations, where rows have losses."""
+        return self._replace(structure=self.structure.with_linearised_losses)
+
     def constraints(self) -> Increments:
         """Derivatives of the constraints of the datum, along a leading axis."""
         _, scale, values, s = self

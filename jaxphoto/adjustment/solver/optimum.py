@@ -112,7 +112,7 @@ def _find_optimum_jvp(primals, tangents, *, structure: TiledStructure, max_steps
     scale = typical_scale(values, structure)
     # The preconditioner belongs to the optimum: it wants its place in scaled increments.
     place = jax.tree.map(lambda a, k: jnp.where(k > 0, a / jnp.where(k > 0, k, 1.0), 0.0), at, scale)
-    there = Linearised(place, scale, values, structure)
+    there = Linearised(place, scale, values, structure).for_normal_equations
     a, reduced, _ = reduce_normal(there, 0.0)
     factor = factor_band(a)
 

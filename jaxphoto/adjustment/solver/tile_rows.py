@@ -82,12 +82,14 @@ def _leaves_of(camera: Array) -> list[Array]:
 
 def _residuals(cameras: list[list[Array]], in_camera: Triple, seen: TileMeasurements, s: TiledStructure) -> Pair:
     parts = [_residuals_of(g, c, in_camera, seen) for g, c in zip(s.groups, cameras, strict=True)]
-    if len(parts) == 1:
-        return parts[0]
-    x, y = (
-        sum((jnp.where(own[:, None], v, 0.0) for own, v in zip(seen.member, of_groups, strict=True)), jnp.zeros(()))
-        for of_groups in zip(*parts, strict=True)
-    )
+    x, y = parts[0]
+    if len(parts) > 1:
+        x, y = (
+            sum((jnp.where(own[:, None], v, 0.0) for own, v in zip(seen.member, of_groups, strict=True)), jnp.zeros(()))
+            for of_groups in zip(*parts, strict=True)
+        )
+    if s.image_loss is not None:
+        x, y = s.image_loss.reduced(x, y)
     return x, y
 
 
