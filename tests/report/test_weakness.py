@@ -73,7 +73,7 @@ def test_stations_cure_it():
 def test_stations_that_are_too_weak_do_not_cure_it():
     """It is rho and sigma that decide, not whether stations exist; the cure is not the one for a block without any."""
     found = weak(verdict_of(tables(0.1, 50.0)).texts)
-    assert [text.startswith("c of camera one") for text in found][0]
+    assert found[0].startswith("c of camera one")
     assert "stations of sigma 50 m hardly tell them apart: add better camera stations" in found[0]
 
 
