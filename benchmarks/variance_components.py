@@ -45,7 +45,9 @@ def estimates(block: Block, truth: Unknowns, draws: int, first: int = 0) -> dict
     image, control, plan, height = TRUE.values()
     times = {"control_points": control, "stations": np.where(block.stations.axis == 2, height, plan)}
     named = block.named_observations.items()
-    true = block.with_observations({name: rows.with_sigmas_times(times.get(name, image)) for name, rows in named})
+    true = block.with_observations(
+        {name: rows.with_sigmas_times(np.asarray(times.get(name, image))) for name, rows in named}
+    )
     observed = lambda b: (b.image_points.xy, b.stations.value, b.control.value)  # noqa: E731
     drawn = jax.jit(lambda key: observed(remeasure(true, truth, key)))
     rows = []

@@ -1,11 +1,12 @@
 """The main job: complete the start values of a block and adjust it."""
 
 import dataclasses
-from collections.abc import Sequence
+import warnings
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from jaxphoto.adjustment import LEAST, MAX_STEPS, Adjustment, Sizes, solve
+from jaxphoto.adjustment import LEAST, MAX_STEPS, Adjustment, Outcome, Sizes, solve
 from jaxphoto.block import Block, sensor_rows
 from jaxphoto.errors import BlockError, DatumError, RankError
 from jaxphoto.observations import AbstractObservations, KnownParameters
@@ -16,6 +17,8 @@ from jaxphoto.procedures.orientation.network import empty_network, misfits, sigh
 from jaxphoto.statistics import prepare_statistics
 from jaxphoto.unknowns import Unknowns
 
+# A sigma naught that neither blunders nor weights explain: the place is wrong.
+_ABSURD = 30.0
 # Rays that miss by more (rad) are off by more than lenses distort.
 _NEAR = 0.02
 
@@ -32,8 +35,8 @@ def adjust(
     """Self-calibrating bundle adjustment of `block`.
 
     `start` gives every unknown an approximate value; where it is None, those of the block are completed by resection
-    and intersection, and where these do not reach all images, found from image points alone and brought to the frame
-    of what is known (docs/orient.md). `priors` says what is FREE, FIXED or Weighted; where it is None, what the block
+    and intersection, and where these do not reach all images, or lead nowhere, found from image points alone and
+    brought to the frame of what is known (docs/orient.md). `priors` says what is FREE, FIXED or Weighted; where it is None, what the block
     says. `more` are observations of any kind, those of your own among them (docs/extending.md), and parameters known
     beforehand together: they are added to `block.more`, so that the block of the result has them.
 
@@ -48,14 +51,47 @@ def adjust(
     """
     if more:
         block = dataclasses.replace(block, more=(*block.more, *more))
-    if start is None:
-        start = start_of(block)
-    return solve(block, start, block.priors if priors is None else priors, max_steps, sizes)
+    priors = block.priors if priors is None else priors
+    if start is not None:
+        return solve(block, start, priors, max_steps, sizes)
+    return _from_the_best_start(block, lambda start: solve(block, start, priors, max_steps, sizes), max_steps)
 
 
 def adjust_for_tables(block: Block, max_steps: int = MAX_STEPS) -> Adjustment:
     """`adjust`, with what tables and report will want compiled meanwhile."""
-    return solve(block, start_of(block), block.priors, max_steps, meanwhile=prepare_statistics)
+    from_start = lambda start: solve(block, start, block.priors, max_steps, meanwhile=prepare_statistics)  # noqa: E731
+    return _from_the_best_start(block, from_start, max_steps)
+
+
+def _from_the_best_start(block: Block, from_start: Callable[[Unknowns], Adjustment], max_steps: int) -> Adjustment:
+    """The adjustment from the approximate values that are given; or, where these lead nowhere, from image points alone.
+
+    Warns where the second is the better one.
+    """
+    first = from_start(start_of(block))
+    given = np.asarray(block.start.image_known)
+    if not given.any() or _somewhere(first, max_steps):
+        return first
+    forgotten = dataclasses.replace(block, start=dataclasses.replace(block.start, image_known=np.zeros_like(given)))
+    try:
+        second = from_start(approximate(orient_block(forgotten)))
+    except (BlockError, DatumError, RankError):
+        return first
+    if not bool(second.converged) or not float(second.square_sum) < float(np.nan_to_num(first.square_sum, nan=np.inf)):
+        return first
+    warnings.warn(
+        "the approximate exterior orientations that were given lead nowhere: the images were oriented by their common "
+        "points instead, which leads to an optimum; look at the frame, angles and units of images.csv",
+        stacklevel=3,
+    )
+    return second
+
+
+def _somewhere(adjusted: Adjustment, max_steps: int) -> bool:
+    """Whether an adjustment ended where its observations might belong; or was given too few steps to tell."""
+    if adjusted.factored is None or (adjusted.outcome is Outcome.STEPS and max_steps < MAX_STEPS):
+        return True
+    return adjusted.outcome in (Outcome.CONVERGED, Outcome.STEPS) and float(adjusted.sigma0) < _ABSURD
 
 
 def start_of(block: Block) -> Unknowns:

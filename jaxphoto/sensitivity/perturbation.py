@@ -156,7 +156,7 @@ def noise(block: Block) -> Bias:
     starts = np.cumsum([0, *(np.size(part.sigma) for part in parts)])
     names = tuple(f"{'.'.join(map(str, part.path))}.{k}" for part in parts for k in range(np.size(part.sigma)))
     index = tuple(
-        start + np.arange(np.size(part.sigma)).reshape(np.shape(part.sigma))
+        np.asarray(start + np.arange(np.size(part.sigma)).reshape(np.shape(part.sigma)))
         for start, part in zip(starts, parts, strict=False)
     )
     sigma = np.concatenate([np.ravel(part.sigma) for part in parts])

@@ -1,12 +1,19 @@
 """The main job: what is compiled ahead is what statistics then use."""
 
+from pathlib import Path
+
+import numpy as np
 import pytest
 
+from benchmarks.basin import far_off
+from jaxphoto import adjust, read_block
 from jaxphoto.compiling import run
 from jaxphoto.procedures import adjust_for_tables
 from jaxphoto.report import Tables
 from tests.blocks import simulated
 from tests.marks import slow_but
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "cross_block"
 
 
 @pytest.mark.parametrize("name", slow_but(("cross",), ("cross", "inner", "mount")))
@@ -19,3 +26,15 @@ def test_what_is_compiled_meanwhile_serves_the_tables(name, monkeypatch):
     tables = Tables(adjusted)
     tables.covariance, tables.redundancy  # noqa: B018
     assert not run._prepared
+
+
+def test_approximate_values_that_lead_nowhere_are_not_the_last_word():
+    """Off by up to 100 m, 10 degrees and 10 % of c: points fly away, but the images know how they lie."""
+    block, rng = read_block(EXAMPLE), np.random.default_rng(1)
+    best = adjust(block)
+    for _ in range(6):
+        spoilt = far_off(block, rng)
+    with pytest.warns(UserWarning, match="lead nowhere"):
+        found = adjust(spoilt)
+    assert bool(found.converged)
+    np.testing.assert_allclose(float(found.square_sum), float(best.square_sum), rtol=1e-6)

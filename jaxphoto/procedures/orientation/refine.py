@@ -190,12 +190,14 @@ def _numbers(kept: np.ndarray, n: int) -> np.ndarray:
 def bare(block: Block) -> Block:
     """`block` with its image rows only, and its datum free: no control, no sensor, no mount, no strip."""
     n = len(block.images)
-    unknowns = dataclasses.replace(block.start.unknowns, mounts={}, strips={}, scanner=None)
+    none: dict = {"mounts": {}, "strips": {}, "scanner": None, "more": {}}
     return dataclasses.replace(
         block,
         image_mount=("",) * n,
         image_strip=("",) * n,
         image_time=np.zeros(n),
+        flight_time=None,
+        partitions={},
         control=ControlRows.none(),
         fixed=ControlRows.none(),
         check=ControlRows.none(),
@@ -203,12 +205,13 @@ def bare(block: Block) -> Block:
         attitudes=Attitudes.none(),
         distances=Distances.none(),
         datum=Datum("inner", "points"),
-        start=dataclasses.replace(block.start, unknowns=unknowns),
-        priors=dataclasses.replace(block.priors, mounts={}, strips={}, scanner=None),
+        start=dataclasses.replace(block.start, unknowns=dataclasses.replace(block.start.unknowns, **none)),
+        priors=dataclasses.replace(block.priors, **none),
         motion=None,
         frame=Frame(),
         corrections=Corrections(),
         surfaces=SurfaceRows.none(),
+        more=(),
     )
 
 
