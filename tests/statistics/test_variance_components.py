@@ -164,7 +164,8 @@ def test_scatter_is_sigma_and_the_truth_lies_within_three():
     assert found["converged"].all()
     for k, of in enumerate(TRUE.values()):
         kept = found["supported"][:, k]
-        assert kept.mean() > 0.95
+        # Of stations in plan 71 of 75 other flights could support one (docs/weights.md); three sigma below that.
+        assert kept.mean() > 0.84
         factor, sigma = found["factor"][kept, k], found["sigma"][kept, k]
         assert np.mean(np.abs(factor - of**2) < 3 * sigma) >= 0.95
         # Scatter of n draws is off by 1 / sqrt(2 n), and a component that is a chi-square has the heavier tail.
