@@ -51,7 +51,8 @@ def far_off(block: Block, rng: np.random.Generator) -> Block:
     )
     position = np.asarray(truth.position) + rng.uniform(-_METRES, _METRES, (n, 3))
     turns = np.radians(rng.uniform(-_DEGREES, _DEGREES, (n, 3)))
-    matrices = np.array([np.asarray(small_rotation(t)) @ m for t, m in zip(turns, np.asarray(truth.camera_from_object), strict=True)])  # fmt: skip
+    truly = np.asarray(truth.camera_from_object)
+    matrices = np.array([np.asarray(small_rotation(turn)) @ m for turn, m in zip(turns, truly, strict=True)])
     interior = {
         name: set_parameter(own, "c_mm", float(get_parameter(own, "c_mm")) * (1 + rng.uniform(-_OF_C, _OF_C)))
         for name, own in start.interior.items()

@@ -126,7 +126,7 @@ class GemanMcClure(AbstractLoss):
 
 
 class StudentT(AbstractLoss):
-    """-2 log of Student's density of `scale` s and k0^2 degrees of freedom, multivariate where a row has several numbers.
+    """-2 log of Student's density of `scale` s and k0^2 degrees of freedom, multivariate for rows of several numbers.
 
     But for a factor, so that rows without residuals count as their sigmas say, beside those of other groups.
     """

@@ -23,6 +23,7 @@ QUICK = {
     "block": ("io/test_bad_blocks.py",),
     "block_from_arrays": ("test_block_from_arrays.py",),
     "block_parts": ("io/test_bad_blocks.py",),
+    "losses": ("test_losses.py",),
     "camera": ("camera/test_additional_parameters.py", "camera/test_balance.py", "camera/test_principal_points.py"),
     "cli": ("test_cli.py::test_version_and_help", "test_cli.py::test_bad_input_is_one_sentence_and_nothing_written"),
     "cloud": ("lidar/test_roofs.py",),

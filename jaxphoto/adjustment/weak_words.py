@@ -79,6 +79,9 @@ class _Words:
         by less than `POOR` yardsticks, seen from the image.
         """
         images = d.images
+        if not (len(images) or len(d.shared) or len(d.points)):
+            # What moves most is a parameter of which another direction makes most of the variance: it is told there.
+            return True
         if not len(images) or len(d.shared) or np.abs(d.moved.points).max(initial=0.0) > POOR:
             return False
         cameras = [self.block.image_camera[i] for i in images]

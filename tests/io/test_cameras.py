@@ -428,7 +428,7 @@ def test_bad_files_are_refused_in_one_sentence(tmp_path, text, name, message):
 def test_wrong_use_is_refused(tmp_path):
     with pytest.raises(InputError, match="there is no file"):
         read_camera_file(tmp_path / "none.yml")
-    with pytest.raises(InputError, match=r"holds none of interior.csv, block.toml, cameras.txt"):
+    with pytest.raises(InputError, match=r"holds none of interior.csv, block.toml, camera.toml, cameras.txt"):
         read_camera_file(tmp_path)
     (tmp_path / "b.yml").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(InputError, match="the file is no text"):
