@@ -24,6 +24,7 @@ FILES = {
     "exterior.csv",
     "object_points.csv",
     "residuals.csv",
+    "trends.csv",
     "check_points.csv",
     "correlation.csv",
     "correlation_summary.csv",

@@ -58,15 +58,19 @@ class NormalEquations(eqx.Module):
         """x of N x = b; of many by `jax.vmap`."""
         return solve_factored(self.factored.reduced, self.factored.factor, b, self.at)
 
-    def seen(self, z: TiledResiduals) -> TiledResiduals:
-        """J N^-1 J' z: by how much adjusted observations move with the observed ones, all over their sigmas.
-
-        I minus it is Q_vv P of whitened observations; of many z by `jax.vmap`.
+    def respond(self, b: Increments, z: TiledResiduals) -> tuple[Increments, TiledResiduals]:
+        """x = N^-1 (b + J' z) and J x: how unknowns and adjusted observations move with the observed ones, all over
+        their sigmas, and with what pulls at unknowns; of many by `jax.vmap`.
         """
         at = self.at
         _, moved = jax.linearize(lambda y: at._replace(increments=y).residuals(), at.increments)
-        (b,) = jax.linear_transpose(moved, at.increments)(z)
-        return moved(self.solve(b))
+        (pulled,) = jax.linear_transpose(moved, at.increments)(z)
+        x = self.solve(jax.tree.map(jnp.add, b, pulled))
+        return x, moved(x)
+
+    def seen(self, z: TiledResiduals) -> TiledResiduals:
+        """J N^-1 J' z; I minus it is Q_vv P of whitened observations."""
+        return self.respond(jax.tree.map(jnp.zeros_like, self.at.increments), z)[1]
 
     def cofactors(self, of_rows: Bool[Numbers, ""]) -> tuple[Cofactors, RowCofactors]:
         """The inverse of N for images, shared unknowns and each point, and of rows in tiles, if these are wanted."""

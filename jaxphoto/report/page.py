@@ -12,7 +12,13 @@ from jinja2 import Environment
 from markupsafe import Markup
 
 from jaxphoto.report.findings import Verdict
-from jaxphoto.report.plots import check_points_figure, correlation_figure, layout_figure, residuals_figure
+from jaxphoto.report.plots import (
+    check_points_figure,
+    correlation_figure,
+    layout_figure,
+    mean_residuals_figure,
+    residuals_figure,
+)
 from jaxphoto.report.tables import Tables
 from jaxphoto.statistics import LEAST_CHECKED
 
@@ -45,6 +51,7 @@ Standard deviations are a posteriori (times &sigma;<sub>0</sub>). Correlations r
 <h2>Block</h2><img alt="block layout" src="{{ layout }}">
 <h2>Residuals</h2>{{ spread }}
 {% for figure in residuals %}<img alt="image residuals" src="{{ figure }}">{% endfor %}
+<h3>Patterns: what the images have in common, and time and strips</h3>{{ trends }}
 <h3>Largest normalised residuals</h3>{{ largest }}
 {% if check %}<h2>Check points: surveyed minus computed</h2>{{ check_spread }}
 <img alt="discrepancies at check points" src="{{ check_picture }}">{{ check }}{% endif %}
@@ -84,7 +91,12 @@ def report_page(tables: Tables, verdict: Verdict) -> str:
             georeferencing=_html(tables.georeferencing) if len(tables.georeferencing) else "",
             layout=_picture(layout_figure(tables)),
             spread=_html(tables.residual_spread),
-            residuals=[_picture(residuals_figure(tables, c)) for c in a.unknowns.interior],
+            residuals=[
+                _picture(figure(tables, c))
+                for c in a.unknowns.interior
+                for figure in (residuals_figure, mean_residuals_figure)
+            ],
+            trends=_html(tables.trends),
             largest=_html(largest.drop(columns="size")),
             check_picture=_picture(check_points_figure({"": tables})) if len(check) else "",
             check=_html(check) if len(check) else "",
@@ -103,7 +115,25 @@ def _check_spread(check: pd.DataFrame) -> pd.DataFrame:
 
 def _html(table: pd.DataFrame) -> Markup:
     """A table; values with eight digits, standard deviations and residuals with three."""
-    short = ("sigma", "rho", "residual", "w", "rmse", "mean", "max_abs", "redundancy_number", "d")
+    short = (
+        "sigma",
+        "rho",
+        "residual",
+        "w",
+        "rmse",
+        "mean",
+        "max_abs",
+        "redundancy_number",
+        "d",
+        "p_value",
+        "share",
+        "amount",
+        "detectable",
+        "c_moves",
+        "xp_moves",
+        "yp_moves",
+        "most_moves",
+    )
     three = {c: "{:.3g}".format for c in table.select_dtypes("number") if str(c).split("_")[0] in short or c in short}
     page = table.to_html(index=False, border=0, na_rep="", float_format="{:.8g}".format, formatters=three)
     return Markup(f'<div class="wide">{page}</div>')

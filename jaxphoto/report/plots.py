@@ -78,16 +78,47 @@ _ARROWS, _LARGEST = 4000, 100
 
 def residuals_figure(tables: Tables, camera: str) -> Figure:
     """Residual vectors of one camera's image points over its format, all images together; of many, a part."""
-    a = tables.adjusted
-    mine = np.array([c == camera for c in a.block.image_camera])[a.structure.image]
-    xy, v = np.asarray(a.values.xy)[:, mine], (np.asarray(a.residuals.image) * np.asarray(a.values.sigma_xy))[:, mine]
-    sensor = a.block.sensors[camera]
-    figure, ((axes,),) = _panels(6.4, 5.0)
-    key, title = _round_key(v), f"image residuals of camera {drawn(camera)}"
+    xy, v = _of_camera(tables, camera)
+    title = f"image residuals of camera {drawn(camera)}"
     if (n := v.shape[1]) > _ARROWS:
         one_in = -(-n // _ARROWS)
         shown = np.union1d(np.arange(0, n, one_in), np.argsort(np.hypot(*v))[-_LARGEST:])
         xy, v, title = xy[:, shown], v[:, shown], f"{title}: 1 in {one_in}, and the largest {_LARGEST}"
+    return _over_format(tables, camera, xy, v, title)
+
+
+# Cells of the mean residuals along the longer side of the format; fewer residuals than these have no mean worth a look.
+_CELLS, _FEW = 12, 5
+
+
+def mean_residuals_figure(tables: Tables, camera: str) -> Figure:
+    """Means of one camera's residuals by cell of its format: what all its images have in common."""
+    xy, v = _of_camera(tables, camera)
+    sensor = tables.adjusted.block.sensors[camera]
+    size = np.array([sensor.width_mm, sensor.height_mm])[:, None]
+    across, down = np.maximum(1, np.round(_CELLS * size[:, 0] / size.max())).astype(int)
+    column, row = np.clip((xy / size + 0.5) * [[across], [down]], 0, [[across - 1], [down - 1]]).astype(int)
+    cell = row * across + column
+    n = np.bincount(cell, minlength=across * down)
+    mean = np.stack([np.bincount(cell, one, across * down) for one in v]) / np.maximum(n, 1)
+    centres = np.stack(
+        [np.tile(np.arange(across) + 0.5, down) / across, np.repeat(np.arange(down) + 0.5, across) / down]
+    )
+    shown = n >= _FEW
+    title = f"mean residuals of camera {drawn(camera)}, {n[shown].sum()} image points in {shown.sum()} cells"
+    return _over_format(tables, camera, ((centres - 0.5) * size)[:, shown], mean[:, shown], title)
+
+
+def _of_camera(tables: Tables, camera: str) -> tuple[np.ndarray, np.ndarray]:
+    """Image points of one camera and their residuals (2 x n, mm)."""
+    a = tables.adjusted
+    mine = np.array([c == camera for c in a.block.image_camera])[a.structure.image]
+    return np.asarray(a.values.xy)[:, mine], (np.asarray(a.residuals.image) * np.asarray(a.values.sigma_xy))[:, mine]
+
+
+def _over_format(tables: Tables, camera: str, xy: np.ndarray, v: np.ndarray, title: str) -> Figure:
+    sensor, key = tables.adjusted.block.sensors[camera], _round_key(v)
+    figure, ((axes,),) = _panels(6.4, 5.0)
     _vectors(axes, xy, v, key, 0.06 * sensor.width_mm, f"{1000 * key:g} µm", width=0.0015, above=0.03)
     w, h = sensor.width_mm / 2, sensor.height_mm / 2
     axes.plot([-w, w, w, -w, -w], [-h, -h, h, h, -h], color="0.4", lw=0.8)

@@ -17,6 +17,7 @@ _TABLES = (
     "exterior",
     "object_points",
     "residuals",
+    "trends",
     "check_points",
     "correlation",
     "correlation_summary",

@@ -17,15 +17,18 @@ from jaxphoto.statistics import (
     BlunderTest,
     Correlations,
     Covariance,
+    ExternalReliability,
     Redundancy,
     Rotations,
     Significance,
+    Trend,
     a_priori_sigmas,
     blunder_test,
     check_discrepancies,
     correlations,
     covariance,
     detectable_errors,
+    external_reliability,
     normalised_residuals,
     observation_groups,
     physical_residuals,
@@ -33,6 +36,7 @@ from jaxphoto.statistics import (
     redundancy_numbers,
     residual_spread,
     significance,
+    trends,
 )
 
 
@@ -73,6 +77,32 @@ class Tables:
     def blunders(self) -> BlunderTest:
         """Every normalised residual against the critical value of all together."""
         return blunder_test(self.adjusted, self.redundancy)
+
+    @cached_property
+    def tested_trends(self) -> list[Trend]:
+        """Patterns that the residuals may follow, tested; what contradicts the others has no part in them."""
+        suspects = [(s.group, s.row) for s in self.blunders.suspects]
+        return trends(self.adjusted, np.asarray(self.covariance.shared_sigma), suspects)
+
+    @cached_property
+    def trends(self) -> pd.DataFrame:
+        """One row a pattern: pattern, freedom, p_value, rms, unit; term, share, amount and sigma of what explains most.
+
+        `rms` is of what the pattern explains of the residuals, without its noise; units of terms are the camera's.
+        """
+        columns = ["pattern", "freedom", "p_value", "rms", "unit", "term", "share", "amount", "sigma"]
+        rows = []
+        for t in self.tested_trends:
+            factor, unit = in_file_unit(t.pattern.unit)
+            best = t.hints[0][:4] if t.hints else None
+            told = (best[0].name, *best[1:]) if best else ("", np.nan, np.nan, np.nan)
+            rows.append((t.pattern.what, t.freedom, t.p_value, factor * t.size, unit, *told))
+        return pd.DataFrame(rows, columns=columns)
+
+    @cached_property
+    def external(self) -> ExternalReliability:
+        """What an error that no test finds does to the result."""
+        return external_reliability(self.adjusted, self.covariance, self.redundancy)
 
     @cached_property
     def correlations(self) -> dict[str, Correlations]:
@@ -156,10 +186,12 @@ class Tables:
 
     @cached_property
     def residuals(self) -> pd.DataFrame:
-        """One row an observation: group, image, point, axis, residual, sigma, unit, redundancy_number, w, detectable.
+        """One row an observation: group, image, point, axis, residual, sigma, unit, redundancy_number, w, detectable,
+        c_moves, xp_moves, yp_moves, most_moves.
 
         `sigma` is a priori; `w` is the residual over its own standard deviation, sigma0 sigma sqrt(redundancy_number);
-        `detectable` is the least error in it alone that the test of w finds with a probability of 80 %.
+        `detectable` is the least error in it alone that the test of w finds with a probability of 80 %, and the last
+        four by how many standard deviations that error moves c, x_p, y_p, and anything at most.
         """
         detectable = detectable_errors(self.adjusted, self.redundancy)
         residual, sigma = physical_residuals(self.adjusted), a_priori_sigmas(self.adjusted)
@@ -184,6 +216,8 @@ class Tables:
                 "redundancy_number": flat(self.redundancy[group]),
                 "w": flat(self.w[group]),
                 "detectable": factor * flat(detectable[group]),
+                **{f"{p.removesuffix('_mm')}_moves": flat(v[group]) for p, v in self.external.interior.items()},
+                "most_moves": flat(self.external.most[group]),
             }
             if v.size:
                 frames.append(pd.DataFrame(columns))

@@ -1,7 +1,7 @@
 """What a person should know first: findings about an adjustment, the worst first, each with what to do.
 
 Red, amber or green follows from tests, not from convergence: of sigma naught as a whole and by group, of every
-normalised residual (`statistics.blunder_test`), of what the geometry leaves open.
+normalised residual, of patterns in them (`residual_findings`), of what the geometry leaves open.
 """
 
 from collections.abc import Iterator
@@ -11,20 +11,17 @@ import jax
 import numpy as np
 
 from jaxphoto.adjustment import POOR, Adjustment, weaknesses_of, yardsticks
-from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
 from jaxphoto.block import Block
 from jaxphoto.camera import Sensor
 from jaxphoto.compiling import call_compiled
-from jaxphoto.report.findings import Finding, Level, Verdict
-from jaxphoto.report.tables import Tables, in_file_unit
+from jaxphoto.report.findings import Finding, Level, Verdict, few
+from jaxphoto.report.residual_findings import NOTHING_FITS, of_residuals, of_what_is_not_checked
+from jaxphoto.report.tables import Tables
 from jaxphoto.report.weakness import FELT, at_corner, weaknesses
-from jaxphoto.statistics import LEVEL, Correlations, Significance, global_test, group_factors, if_zero, worst_checked
+from jaxphoto.statistics import Correlations, Significance, if_zero, prepare_responses
 
 HIGH_CORRELATION = 0.9
 HIGH_OWN_CORRELATION = 0.95
-NOTHING_FITS = 3.0
-"""A rejected sigma naught above this is no question of weights: something is wrong."""
-_SHOWN = 3
 
 
 def verdict_of(tables: Tables) -> Verdict:
@@ -37,14 +34,14 @@ def _findings(tables: Tables) -> Iterator[Finding]:
     if not bool(adjusted.converged):
         yield Finding(Level.ALARM, adjusted.outcome.value)
         if names := [adjusted.block.points[p] for p in np.flatnonzero(adjusted.astray)]:
-            yield Finding(Level.ALARM, f"gone astray: point {_few(names)}")
+            yield Finding(Level.ALARM, f"gone astray: point {few(names)}")
         # Observations that fit one another where it stopped: then it is no bad start, but what the block cannot tell.
         if float(adjusted.sigma0) <= NOTHING_FITS:
             yield from (Finding(Level.ALARM, w.sentence) for w in weaknesses_of(adjusted))
         # Nothing that is said of an optimum holds elsewhere.
         return
-    yield from _global_test(tables)
-    yield from _blunders(tables)
+    prepare_responses(adjusted.equations, adjusted.seconds)
+    yield from of_residuals(tables)
     of_cameras = {camera: weaknesses(tables, camera, c) for camera, c in tables.correlations.items()}
     yield from _weak(tables, frozenset().union(*(w.labels for weak in of_cameras.values() for w in weak)))
     for camera, c in tables.correlations.items():
@@ -61,7 +58,7 @@ def _findings(tables: Tables) -> Iterator[Finding]:
                 f"camera {name}: its distortion folds inside the format; image points beyond the fold mean nothing, "
                 "use fewer coefficients or more points in the corners",
             )
-    yield from _unchecked(tables)
+    yield from of_what_is_not_checked(tables)
 
 
 def _weak(tables: Tables, told: frozenset[str]) -> Iterator[Finding]:
@@ -79,65 +76,6 @@ def _weak(tables: Tables, told: frozenset[str]) -> Iterator[Finding]:
         yield from (Finding(Level.WARNING, w.sentence) for w in found if not w.labels & told)
 
 
-def _few(names: list[str]) -> str:
-    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-    return ", ".join(names[:_SHOWN]) + more
-
-
-def _global_test(tables: Tables) -> Iterator[Finding]:
-    """Sigma naught against 1, and which groups of observations it comes from."""
-    whole = global_test(tables.adjusted)
-    if whole.redundancy <= 0:
-        yield Finding(
-            Level.WARNING,
-            "the redundancy is 0: nothing checks anything, and standard deviations rest on those that were given; "
-            "add observations",
-        )
-        return
-    if whole.p_value >= LEVEL:
-        return
-    factors = [f for f in group_factors(tables.adjusted, tables.redundancy) if f.p_value < LEVEL]
-    groups = ", ".join(f"{f.group.replace('_', ' ')} {f.sigma:.2f}" for f in factors)
-    of_groups = f"; by group of observations: {groups}" if groups else ""
-    said = f"sigma naught {whole.sigma:.3g}, expected 1 (p = {whole.p_value:.1g})"
-    if whole.factor < 1:
-        yield Finding(
-            Level.WARNING,
-            f"{said}: residuals are smaller than the standard deviations that were given{of_groups}; those are too "
-            "large, and where they are not all so by the same factor, the weights are wrong: correct them",
-        )
-    elif whole.sigma <= NOTHING_FITS:
-        yield Finding(
-            Level.WARNING,
-            f"{said}: residuals are larger than the standard deviations that were given{of_groups}; these are "
-            "too small, or there are blunders, or the camera model lacks something",
-        )
-    else:
-        yield Finding(
-            Level.ALARM,
-            f"{said}: the observations contradict one another or the model{of_groups}; look at approximate values, "
-            "units, point ids and the largest residuals",
-        )
-
-
-def _blunders(tables: Tables) -> Iterator[Finding]:
-    """The likeliest culprit first: of several, all but the first may be innocent."""
-    suspects = tables.blunders.suspects
-    for s in suspects[:_SHOWN]:
-        factor, unit = in_file_unit(s.unit)
-        yield Finding(
-            Level.ALARM,
-            f"{s.words} contradicts the other observations: if it alone is wrong, by {factor * s.error:+.3g} +- "
-            f"{factor * s.sigma:.2g} {unit} (w {s.w:.1f}, critical {tables.blunders.limit:.1f})",
-        )
-    if len(suspects) > _SHOWN:
-        yield Finding(
-            Level.ALARM,
-            f"{len(suspects)} of {tables.blunders.n} observations are beyond the critical value; a blunder spoils what "
-            "is beside it: jaxphoto adjust --snoop finds those that must go",
-        )
-
-
 def _not_significant(tables: Tables, s: Significance) -> Finding:
     """What holding a parameter at zero would change, for whoever wants fewer of them."""
     adjusted = tables.adjusted
@@ -152,31 +90,6 @@ def _not_significant(tables: Tables, s: Significance) -> Finding:
         f"{s.parameter} of camera {s.camera} may be zero (p = {s.p_value:.2g}); held there, it would move {moved}the "
         f"corner of the image by {pixels}",
     )
-
-
-def _unchecked(tables: Tables) -> Iterator[Finding]:
-    """What no test could find: points of two rays, and how large an error of each further group may stay hidden."""
-    adjusted = tables.adjusted
-    rays = np.bincount(adjusted.structure.point, minlength=len(adjusted.block.points))
-    if twice := int((rays == 2).sum()):
-        yield Finding(
-            Level.INFORMATION,
-            f"{twice} of {len(rays)} points are in two images only: an error along the plane of their rays shows "
-            "nowhere",
-        )
-    for hidden in worst_checked(adjusted, tables.redundancy):
-        if hidden.group != IMAGE_POINTS and hidden.detectable > _HIDDEN * hidden.sigma:
-            factor, unit = in_file_unit(hidden.unit)
-            size = f"of {factor * hidden.detectable:.2g} {unit}" if np.isfinite(hidden.detectable) else "of any size"
-            yield Finding(
-                Level.INFORMATION,
-                f"{hidden.words}: an error {size} would be found with a probability of 80 % only, a smaller one less "
-                f"often (its sigma is {factor * hidden.sigma:.2g} {unit})",
-            )
-
-
-# An observation whose detectable error is more than this times its sigma is checked by hardly anything (r < 0.17).
-_HIDDEN = 10.0
 
 
 def _all_known(block: Block) -> bool:
@@ -204,7 +117,7 @@ def _correlated(
         if abs(c.interior[i, j]) > HIGH_CORRELATION
     ]
     if pairs:
-        names = _few([f"{a} and {b} {rho:+.3f}" for _, rho, a, b in sorted(pairs, reverse=True)])
+        names = few([f"{a} and {b} {rho:+.3f}" for _, rho, a, b in sorted(pairs, reverse=True)])
         yield Finding(
             Level.INFORMATION,
             f"high correlation within the interior orientation of camera {camera}: {names}; a change of one makes good "
@@ -218,7 +131,7 @@ def _correlated(
     if high:
         images = [c.images[int(np.abs(c.exterior[:, i, j]).argmax())] for i, j in high]
         where = zip(high, images, strict=True)
-        names = _few([f"{c.eop_names[i]} with {c.parameters[j]} {worst[i, j]:.3f} (image {k})" for (i, j), k in where])
+        names = few([f"{c.eop_names[i]} with {c.parameters[j]} {worst[i, j]:.3f} (image {k})" for (i, j), k in where])
         yield Finding(
             Level.WARNING if any(c.parameters[j] in felt for _, j in high) else Level.INFORMATION,
             f"high correlation of exterior with interior orientation of camera {camera}: {names}; {cure}",
@@ -226,7 +139,7 @@ def _correlated(
     own = np.abs(c.within_image).max(axis=0)
     strong = [(own[i, j], i, j) for i in range(6) for j in range(i) if own[i, j] > HIGH_OWN_CORRELATION]
     if strong:
-        names = _few([f"{c.eop_names[j]} and {c.eop_names[i]} (up to {r:.3f})" for r, i, j in sorted(strong)[::-1]])
+        names = few([f"{c.eop_names[j]} and {c.eop_names[i]} (up to {r:.3f})" for r, i, j in sorted(strong)[::-1]])
         yield Finding(
             Level.INFORMATION, f"exterior orientation of single images is highly correlated: {names}; {usual}"
         )

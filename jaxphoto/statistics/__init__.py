@@ -26,6 +26,7 @@ from jaxphoto.statistics.discrepancy import (
     residual_spread,
     spread_of,
 )
+from jaxphoto.statistics.external_reliability import ExternalReliability, Felt, external_reliability, most_felt
 from jaxphoto.statistics.global_test import VarianceFactor, global_test, group_factors
 from jaxphoto.statistics.partial_redundancy import PartialRedundancy, partial_redundancy
 from jaxphoto.statistics.partition import SPLITS, Partition, Parts, Selection, parts_of
@@ -38,6 +39,7 @@ from jaxphoto.statistics.reliability import (
     prepare_statistics,
     redundancy_numbers,
 )
+from jaxphoto.statistics.responses import prepare_responses
 from jaxphoto.statistics.significance import (
     SIGNIFICANCE_LEVEL,
     IfZero,
@@ -46,15 +48,17 @@ from jaxphoto.statistics.significance import (
     if_zero,
     significance,
 )
+from jaxphoto.statistics.trends import Trend, trends
 from jaxphoto.statistics.variance_components import VarianceComponents, variance_components
 
 __all__ = [
     "DELTA0", "EOP_NAMES", "LEAST_CHECKED", "LEAST_SIGMA0", "LEVEL", "SIGNIFICANCE_LEVEL", "SPLITS", "BlunderTest",
-    "Correlations", "Covariance", "Hidden", "IfZero", "PartialRedundancy", "Partition", "Parts", "Redundancy",
-    "Rotations", "Selection", "Significance", "Spread", "Suspect", "VarianceComponents", "VarianceFactor",
-    "a_priori_sigmas", "angle_differences", "blunder_test", "check_discrepancies", "chi_square_limit", "chi_square_p",
-    "common_covariance", "correlation_matrix", "correlations", "covariance", "critical_w", "detectable_errors",
-    "error_precision", "global_test", "group_factors", "if_zero", "normalised_residuals", "observation_groups",
-    "partial_redundancy", "parts_of", "physical_residuals", "point_differences", "prepare_statistics",
-    "redundancy_numbers", "residual_spread", "significance", "spread_of", "variance_components", "worst_checked",
+    "Correlations", "Covariance", "ExternalReliability", "Felt", "Hidden", "IfZero", "PartialRedundancy", "Partition",
+    "Parts", "Redundancy", "Rotations", "Selection", "Significance", "Spread", "Suspect", "Trend", "VarianceComponents",
+    "VarianceFactor", "a_priori_sigmas", "angle_differences", "blunder_test", "check_discrepancies", "chi_square_limit",
+    "chi_square_p", "common_covariance", "correlation_matrix", "correlations", "covariance", "critical_w",
+    "detectable_errors", "error_precision", "external_reliability", "global_test", "group_factors", "if_zero",
+    "most_felt", "normalised_residuals", "observation_groups", "partial_redundancy", "parts_of", "physical_residuals",
+    "point_differences", "prepare_responses", "prepare_statistics", "redundancy_numbers", "residual_spread",
+    "significance", "spread_of", "trends", "variance_components", "worst_checked",
 ]  # fmt: skip

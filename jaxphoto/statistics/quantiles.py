@@ -22,6 +22,11 @@ def student_limit(freedom: int, level: float) -> float:
     return float(-_special().stdtrit(freedom, level / 2))
 
 
+def beta_tail(share: float, a: float, b: float) -> float:
+    """Probability that a share that follows the beta distribution of `a` and `b` is as large as this or larger."""
+    return float(_special().betainc(b, a, np.clip(1 - share, 0.0, 1.0)))
+
+
 def student_freedom(square: Float[np.ndarray, "n"], numbers: int) -> float:
     """Degrees of freedom, 1 to 100, of the Student's distribution that is most likely for rows of so many numbers.
 

@@ -1,0 +1,141 @@
+"""What the residuals say, as findings: sigma naught, observations that contradict the others, patterns; and what no
+test of them could say.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
+from jaxphoto.report.findings import Finding, Level
+from jaxphoto.report.tables import Tables, in_file_unit
+from jaxphoto.statistics import LEVEL, Trend, global_test, group_factors, most_felt, worst_checked
+
+NOTHING_FITS = 3.0
+"""A rejected sigma naught above this is no question of weights: something is wrong."""
+_SHOWN = 3
+# A pattern matters where it is more than this of the observations' standard deviation, or moves an interior parameter
+# by more than `_MOVED` of its own; smaller ones are found in many observations, and change nothing.
+_VISIBLE, _MOVED = 0.25, 1.0
+# Of a pattern's square sum, what one term must explain to be named.
+_MOST_OF_IT = 0.5
+# An observation whose detectable error is more than this times its sigma is checked by hardly anything (r < 0.17).
+_HIDDEN = 10.0
+
+
+def of_residuals(tables: Tables) -> Iterator[Finding]:
+    """Whether they fit their standard deviations, which of them do not, and whether they follow a pattern."""
+    yield from _global_test(tables)
+    yield from _blunders(tables)
+    yield from _trends(tables)
+
+
+def _global_test(tables: Tables) -> Iterator[Finding]:
+    """Sigma naught against 1, and which groups of observations it comes from."""
+    whole = global_test(tables.adjusted)
+    if whole.redundancy <= 0:
+        yield Finding(
+            Level.WARNING,
+            "the redundancy is 0: nothing checks anything, and standard deviations rest on those that were given; "
+            "add observations",
+        )
+        return
+    if whole.p_value >= LEVEL:
+        return
+    factors = [f for f in group_factors(tables.adjusted, tables.redundancy) if f.p_value < LEVEL]
+    groups = ", ".join(f"{f.group.replace('_', ' ')} {f.sigma:.2f}" for f in factors)
+    of_groups = f"; by group of observations: {groups}" if groups else ""
+    said = f"sigma naught {whole.sigma:.3g}, expected 1 (p = {whole.p_value:.1g})"
+    if whole.factor < 1:
+        yield Finding(
+            Level.WARNING,
+            f"{said}: residuals are smaller than the standard deviations that were given{of_groups}; those are too "
+            "large, and where they are not all so by the same factor, the weights are wrong: correct them",
+        )
+    elif whole.sigma <= NOTHING_FITS:
+        yield Finding(
+            Level.WARNING,
+            f"{said}: residuals are larger than the standard deviations that were given{of_groups}; these are "
+            "too small, or there are blunders, or the camera model lacks something",
+        )
+    else:
+        yield Finding(
+            Level.ALARM,
+            f"{said}: the observations contradict one another or the model{of_groups}; look at approximate values, "
+            "units, point ids and the largest residuals",
+        )
+
+
+def _blunders(tables: Tables) -> Iterator[Finding]:
+    """The likeliest culprit first: of several, all but the first may be innocent."""
+    suspects = tables.blunders.suspects
+    for s in suspects[:_SHOWN]:
+        factor, unit = in_file_unit(s.unit)
+        yield Finding(
+            Level.ALARM,
+            f"{s.words} contradicts the other observations: if it alone is wrong, by {factor * s.error:+.3g} +- "
+            f"{factor * s.sigma:.2g} {unit} (w {s.w:.1f}, critical {tables.blunders.limit:.1f})",
+        )
+    if len(suspects) > _SHOWN:
+        yield Finding(
+            Level.ALARM,
+            f"{len(suspects)} of {tables.blunders.n} observations are beyond the critical value; a blunder spoils what "
+            "is beside it: jaxphoto adjust --snoop finds those that must go",
+        )
+
+
+def _trends(tables: Tables) -> Iterator[Finding]:
+    """Patterns that are beyond chance, the most certain first, each with the term that is most of it."""
+    level = LEVEL / max(len(tables.tested_trends), 1)
+    for t in sorted((t for t in tables.tested_trends if t.p_value < level), key=lambda t: t.p_value):
+        factor, unit = in_file_unit(t.pattern.unit)
+        said = (
+            f"residuals of {t.pattern.what} follow a pattern (p = {t.p_value:.1g}) of {factor * t.size:.2g} {unit} "
+            f"({t.size / t.pattern.sigma:.2g} of their sigma)"
+        )
+        matters = t.size > _VISIBLE * t.pattern.sigma
+        if t.hints and t.hints[0].share > _MOST_OF_IT:
+            likely = t.hints[0]
+            said += f", {100 * likely.share:.0f} % of it {_told(t)}"
+            path = max(likely.moves, key=lambda path: abs(likely.moves[path]), default="")
+            if path and abs(likely.moves[path]) > _MOVED:
+                matters = True
+                said += f"; {path} would move by {abs(likely.moves[path]):.1f} of its sigma"
+        elif t.pattern.camera:
+            said += ": no single usual term is most of it; try a distortion of more terms (docs/model_choice.md)"
+        yield Finding(Level.WARNING if matters else Level.INFORMATION, said)
+
+
+def _told(trend: Trend) -> str:
+    """The likeliest term, its amount where it is in the observations' own unit, and what cures it."""
+    likely = trend.hints[0]
+    if likely.term.amount_told:
+        factor, unit = in_file_unit(trend.pattern.unit)
+        name = f"{likely.term.name} {factor * likely.amount:+.3g} +- {factor * likely.sigma:.2g} {unit}"
+    else:
+        name = likely.term.name
+    return f"{name}, {likely.term.cure}" if likely.term.cure else name
+
+
+def of_what_is_not_checked(tables: Tables) -> Iterator[Finding]:
+    """What no test could find: points of two rays, and how large an error of each further group may stay hidden."""
+    adjusted = tables.adjusted
+    rays = np.bincount(adjusted.structure.point, minlength=len(adjusted.block.points))
+    if twice := int((rays == 2).sum()):
+        yield Finding(
+            Level.INFORMATION,
+            f"{twice} of {len(rays)} points are in two images only: an error along the plane of their rays shows "
+            "nowhere",
+        )
+    if felt := [f for f in most_felt(adjusted, tables.external) if f.moved > _MOVED]:
+        told = ", ".join(f"{f.parameter} by up to {f.moved:.1f} of its sigma ({f.words})" for f in felt)
+        yield Finding(Level.INFORMATION, f"an error that no test finds (power 80 %) would move {told}")
+    for hidden in worst_checked(adjusted, tables.redundancy):
+        if hidden.group != IMAGE_POINTS and hidden.detectable > _HIDDEN * hidden.sigma:
+            factor, unit = in_file_unit(hidden.unit)
+            size = f"of {factor * hidden.detectable:.2g} {unit}" if np.isfinite(hidden.detectable) else "of any size"
+            yield Finding(
+                Level.INFORMATION,
+                f"{hidden.words}: an error {size} would be found with a probability of 80 % only, a smaller one less "
+                f"often (its sigma is {factor * hidden.sigma:.2g} {unit})",
+            )

@@ -1,0 +1,246 @@
+"""Patterns that residuals may follow where a model lacks something, and the terms by which a sentence can name them.
+
+Over the format, polynomials of x and y up to the fifth degree of either coordinate: they hold the usual lens terms (k1,
+k2, p1, p2, affinity, shear) exactly and most of what is smooth. Over time, a camera that changes evenly; from strip to
+strip and over time, a mean and an even drift of whatever was observed of images.
+"""
+
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Array, Float, Int
+from numpy.polynomial import legendre
+
+from jaxphoto.adjustment import Adjustment
+from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
+from jaxphoto.camera import InteriorOrientation, Sensor, get_parameter, parameter_names, set_parameter
+from jaxphoto.compiling import call_compiled
+from jaxphoto.observations import AbstractObservations, Correlated
+from jaxphoto.statistics.discrepancy import observation_groups
+
+Places = Mapping[str, Int[np.ndarray, "..."]]
+# Numbers of all polynomials over a format together, beyond which those of the third degree do: seconds, and memory.
+_MOST = 100_000_000
+# Cameras, or strips, beyond which they are not tested one by one: the more tests, the less each can show.
+_PARTS = 40
+# Of the grid on which terms are written as polynomials, along a side.
+_GRID = 9
+
+
+class Term(NamedTuple):
+    """A combination of the columns of a pattern that has a name."""
+
+    name: str
+    coefficients: Float[np.ndarray, "columns"]
+    cure: str
+    """What a sentence says of it, and advises."""
+    amount_told: bool = True
+    """Whether a sentence says how large it is: in the unit of the observations."""
+
+
+class Part(NamedTuple):
+    """Columns that have numbers at the same observations."""
+
+    at: Int[np.ndarray, "m"]
+    """Places in the list of all observations."""
+    values: Float[np.ndarray, "k m"]
+    """In the unit of the observations."""
+    weight: Float[np.ndarray, "m"]
+    """One over their standard deviations."""
+
+
+class Pattern(NamedTuple):
+    """Columns of numbers that residuals may follow, part by part."""
+
+    what: str
+    """What a sentence calls it: "image points of camera A over the format"."""
+    unit: str
+    camera: str
+    """Whose image points they are; "" where they are none."""
+    parts: tuple[Part, ...]
+    terms: tuple[Term, ...]
+
+    @property
+    def many(self) -> int:
+        """Columns."""
+        return sum(len(p.values) for p in self.parts)
+
+    @property
+    def rows(self) -> int:
+        """Observations that have a part in it."""
+        return len(np.unique(np.concatenate([p.at for p in self.parts])))
+
+    @property
+    def sigma(self) -> float:
+        """The median standard deviation of these."""
+        return float(1 / np.median(np.concatenate([p.weight for p in self.parts])))
+
+    @property
+    def square(self) -> Float[np.ndarray, "columns columns"]:
+        """Products of the columns of each part with one another, in the unit."""
+        found, first = np.zeros((self.many, self.many)), 0
+        for p in self.parts:
+            last = first + len(p.values)
+            found[first:last, first:last] = p.values @ p.values.T
+            first = last
+        return found
+
+    def column(self, k: int, count: int) -> Float[np.ndarray, "count"]:
+        """Column `k` of `count` observations, whitened."""
+        found = np.zeros(count)
+        for p in self.parts:
+            if 0 <= k < len(p.values):
+                found[p.at] = p.values[k] * p.weight
+            k -= len(p.values)
+        return found
+
+    def times(self, whitened: Float[np.ndarray, "count"]) -> Float[np.ndarray, "columns"]:
+        """Products of all columns with whitened numbers of all observations."""
+        return np.concatenate([p.values @ (p.weight * whitened[p.at]) for p in self.parts])
+
+
+def patterns_of(adjusted: Adjustment, places: Places) -> Iterator[Pattern]:
+    """All that can be looked for in an adjustment; `places` numbers the observations.
+
+    What a covariance joins is not looked at.
+    """
+    groups = observation_groups(adjusted)
+    count = sum(np.size(v) for v in places.values())
+    for camera in adjusted.unknowns.interior if len(adjusted.unknowns.interior) <= _PARTS else ():
+        mine = np.array(adjusted.block.image_camera)[adjusted.structure.image] == camera
+        if mine.any():
+            yield _over_format(adjusted, camera, mine, places, 5 if count * 42 <= _MOST else 3)
+            if (time := _time(adjusted)) is not None:
+                yield _camera_over_time(adjusted, camera, mine, places, time[adjusted.structure.image])
+    for name, rows in groups.items():
+        if name != IMAGE_POINTS and rows.unit and not isinstance(rows, Correlated):
+            yield from _by_strip(adjusted, name, rows, places)
+
+
+def _over_format(adjusted: Adjustment, camera: str, mine: np.ndarray, places: Places, degree: int) -> Pattern:
+    sensor, interior = adjusted.block.sensors[camera], adjusted.unknowns.interior[camera]
+    values = _polynomials(_in_format(sensor, np.asarray(adjusted.values.xy)[:, mine]), degree)
+    parts = _parts_of_image(adjusted, mine, places, (values, values))
+    side = np.linspace(-1.0, 1.0, _GRID) * np.array([sensor.width_mm, sensor.height_mm])[:, None] / 2
+    grid = np.stack([v.ravel() for v in np.meshgrid(*side)])
+    inverse = np.linalg.pinv(_polynomials(_in_format(sensor, grid), degree).T)
+    terms = tuple(
+        Term(name, np.concatenate([inverse @ f for f in field]), _cure(adjusted, camera, name), False)
+        for name, field in _fields(interior, grid)
+    )
+    return Pattern(f"image points of camera {camera} over the format", "mm", camera, parts, terms)
+
+
+def _camera_over_time(adjusted: Adjustment, camera: str, mine: np.ndarray, places: Places, time: np.ndarray) -> Pattern:
+    """c and the principal point that change evenly, by so many mm from the first to the last image."""
+    interior, t = adjusted.unknowns.interior[camera], time[mine]
+    x, y = (np.asarray(adjusted.values.xy)[:, mine] - np.asarray(interior.principal_point)[:, None]) / float(interior.c)
+    none = np.zeros_like(t)
+    columns = (np.stack([x * t, t, none]), np.stack([y * t, none, t]))
+    # The same columns of x and of y: one part, of which each column has both.
+    (at_x, x_values, x_weight), (at_y, y_values, y_weight) = _parts_of_image(adjusted, mine, places, columns)
+    both = Part(np.append(at_x, at_y), np.hstack([x_values, y_values]), np.append(x_weight, y_weight))
+    names = ("c", "x_p", "y_p")
+    cure = "from the first image to the last: the camera changes in flight, give it parameters of shorter times"
+    terms = tuple(Term(name, one, cure) for name, one in zip(names, np.eye(3), strict=True))
+    return Pattern(f"image points of camera {camera} over time", "mm", camera, (both,), terms)
+
+
+def _parts_of_image(
+    adjusted: Adjustment, mine: np.ndarray, places: Places, values: tuple[np.ndarray, ...]
+) -> tuple[Part, ...]:
+    """Of the x and of the y coordinates of some image rows."""
+    sigma, at = np.asarray(adjusted.values.sigma_xy)[:, mine], places[IMAGE_POINTS][:, mine]
+    return tuple(Part(own, v, 1 / s) for own, v, s in zip(at, values, sigma, strict=True))
+
+
+def _by_strip(adjusted: Adjustment, name: str, rows: AbstractObservations, places: Places) -> Iterator[Pattern]:
+    """The mean of each strip, and an even drift over the whole flight, of each axis of rows that are of one image."""
+    block, at = adjusted.block, np.atleast_2d(places[name])
+    number = rows.names_of("image", [str(k) for k in range(len(block.images))])
+    if not len(number) or not all(n.isdigit() for n in number):
+        return
+    image = np.broadcast_to(number.astype(int), at.shape)
+    axis = np.broadcast_to(rows.axis_names(), at.shape)
+    sigma = np.broadcast_to(np.asarray(rows.sigmas).T, at.shape)
+    strips = np.array(block.image_strip, object)[image]
+    axes, of = list(dict.fromkeys(axis.ravel())), list(dict.fromkeys(strips[strips != ""].ravel()))
+    weight = 1 / sigma
+    thing = name.replace("_", " ")
+
+    def pattern(what: str, columns: list[tuple[str, np.ndarray]], cure: str) -> Pattern:
+        parts = tuple(Part(at.ravel(), v.ravel()[None], weight.ravel()) for _, v in columns)
+        terms = tuple(Term(n, one, cure) for (n, _), one in zip(columns, np.eye(len(columns)), strict=True))
+        return Pattern(f"{thing} {what}", rows.unit, "", parts, terms)
+
+    if 1 < len(of) <= _PARTS:
+        each = [(f"{a} of strip {s}", ((strips == s) & (axis == a)).astype(float)) for s in of for a in axes]
+        yield pattern("from strip to strip", each, "on the average: let that strip shift, or look at its recording")
+    if (time := _time(adjusted)) is not None:
+        over = [(a, np.where(axis == a, time[image], 0.0)) for a in axes]
+        yield pattern("over time", over, "from the first image to the last: let strips shift or drift")
+
+
+def _time(adjusted: Adjustment) -> Float[np.ndarray, "images"] | None:
+    """Of each image, -0.5 at the first and 0.5 at the last; None where times are not told."""
+    block = adjusted.block
+    time = np.asarray(block.image_time if block.flight_time is None else block.flight_time)
+    span = np.ptp(time)
+    return (time - time.min()) / span - 0.5 if span > 0 else None
+
+
+def _in_format(sensor: Sensor, xy: Float[np.ndarray, "2 n"]) -> Float[np.ndarray, "2 n"]:
+    return xy / np.array([sensor.width_mm, sensor.height_mm])[:, None] * 2
+
+
+def _polynomials(xy: Float[np.ndarray, "2 n"], degree: int) -> Float[np.ndarray, "k n"]:
+    """Products of Legendre polynomials of x and y, up to a total degree."""
+    x, y = (legendre.legvander(v, degree).T for v in xy)
+    return np.stack([x[i] * y[j] for i in range(degree + 1) for j in range(degree + 1 - i)])
+
+
+# Of Brown's model (docs/models.md), for cameras whose own model lacks them.
+_USUAL = {
+    "k1": lambda x, y: (x * (x * x + y * y), y * (x * x + y * y)),
+    "k2": lambda x, y: (x * (x * x + y * y) ** 2, y * (x * x + y * y) ** 2),
+    "p1": lambda x, y: (3 * x * x + y * y, 2 * x * y),
+    "p2": lambda x, y: (2 * x * y, x * x + 3 * y * y),
+    "b1 (affinity)": lambda x, y: (x, 0 * x),
+    "b2 (shear)": lambda x, y: (y, 0 * x),
+}
+
+
+def _fields(
+    interior: InteriorOrientation, grid: Float[np.ndarray, "2 n"]
+) -> list[tuple[str, Float[np.ndarray, "2 n"]]]:
+    """What each parameter of the camera does to the image, and the usual terms that it has not."""
+    centred = grid - np.asarray(interior.principal_point)[:, None]
+    names = parameter_names(interior)
+    values = np.array([float(get_parameter(interior, name)) for name in names])
+    slopes = np.asarray(call_compiled(_slopes, interior, names, values, centred.T))
+    found = [(name, slopes[..., k].T) for k, name in enumerate(names) if np.isfinite(slopes[..., k]).all()]
+    usual = {name: np.stack(field(*centred)) for name, field in _USUAL.items()}
+    return found + [(name, field) for name, field in usual.items() if name.split()[0] not in names]
+
+
+@eqx.filter_jit
+def _slopes(interior: InteriorOrientation, names: tuple[str, ...], values: Array, xy: Array) -> Array:
+    """Of the measured or the ideal coordinate, whichever the model gives in closed form, by each parameter."""
+
+    def of(v: Array, one: Array) -> Array:
+        own = interior
+        for name, value in zip(names, v, strict=True):
+            own = set_parameter(own, name, value)
+        return own.closed_form(one)
+
+    return jax.vmap(jax.jacfwd(of), in_axes=(None, 0))(values, xy)
+
+
+def _cure(adjusted: Adjustment, camera: str, name: str) -> str:
+    interior = adjusted.unknowns.interior[camera]
+    if name not in parameter_names(interior):
+        return f"which the distortion {interior.distortion.name} has not: choose one that has it"
+    return "which is held: free it" if f"interior[{camera}].{name}" not in adjusted.structure.labels else ""

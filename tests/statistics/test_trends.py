@@ -1,0 +1,87 @@
+"""Patterns in residuals: as rare by chance as said, and named where something is missing."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+from scipy import stats
+
+from jaxphoto import FIXED, Tables, adjust, covariance
+from jaxphoto.camera import set_parameter
+from jaxphoto.report import verdict_of
+from jaxphoto.simulation import remeasure
+from jaxphoto.statistics import trends
+from tests.blocks import Simulated, observed, simulated
+
+
+def in_strips() -> Simulated:
+    """The crossing strips with names and times; residuals in the image that has the noise."""
+    block, truth = simulated("cross")
+    time = np.concatenate([np.linspace(-6, 6, 5), np.linspace(20, 34, 5)])
+    block = dataclasses.replace(block, image_strip=("a",) * 5 + ("b",) * 5, image_time=time)
+    as_measured = lambda camera: dataclasses.replace(camera, residuals="measured")  # noqa: E731
+    cameras = lambda b: (b.start.unknowns.interior["one"], b.priors.interior["one"])  # noqa: E731
+    block = eqx.tree_at(cameras, block, tuple(map(as_measured, cameras(block))))
+    return Simulated(block, dataclasses.replace(truth, interior={"one": as_measured(truth.interior["one"])}))
+
+
+def found_in(block) -> dict:
+    a = adjust(block)
+    return {t.pattern.what: t for t in trends(a, np.asarray(covariance(a).shared_sigma))}
+
+
+def test_where_nothing_is_missing_p_values_are_uniform():
+    block, truth = in_strips()
+    draw = jax.jit(lambda key: observed(remeasure(block, truth, key)))
+    blocks = (eqx.tree_at(observed, block, draw(jax.random.key(seed))) for seed in range(40))
+    p = [{what: trend.p_value for what, trend in found_in(b).items()} for b in blocks]
+    assert set(p[0]) == {
+        "image points of camera one over the format", "image points of camera one over time",
+        "stations from strip to strip", "stations over time",
+    }  # fmt: skip
+    for what in p[0]:
+        assert stats.kstest([each[what] for each in p], "uniform").pvalue > 1e-3, what
+
+
+def test_a_lens_term_that_is_held_is_named():
+    held = "k2"
+    block, _ = in_strips()
+    path = lambda b: (b.start.unknowns.interior["one"], b.priors.interior["one"])  # noqa: E731
+    zero, fixed = (set_parameter(tree, held, value) for tree, value in zip(path(block), (0.0, FIXED), strict=True))
+    a = adjust(eqx.tree_at(path, block, (zero, fixed)))
+    tables = Tables(a)
+    found = tables.tested_trends[0]
+    assert found.p_value < 1e-10 and found.hints[0].term.name == held and found.hints[0].share > 0.8
+    said = [f.text for f in verdict_of(tables).findings if "over the format" in f.text]
+    assert len(said) == 1 and f"{held}, which is held: free it" in said[0]
+
+
+def test_stations_of_a_strip_that_are_off_are_named_with_their_shift():
+    block, _ = in_strips()
+    rows = block.stations
+    off = np.where((np.asarray(rows.who) >= 5) & (rows.axis == 2), 1.5, 0.0)
+    found = found_in(dataclasses.replace(block, stations=dataclasses.replace(rows, value=rows.value + off)))
+    trend = found["stations from strip to strip"]
+    best = trend.hints[0]
+    assert trend.p_value < 1e-4 and best.term.name in ("Z of strip b", "Z of strip a")
+    sign = 1 if best.term.name.endswith("b") else -1
+    assert abs(best.amount - sign * 1.5) < 4 * best.sigma
+
+
+def test_blunders_have_no_part_in_patterns():
+    block, _ = in_strips()
+    rows = block.image_points
+    row = int(np.argmax(np.bincount(rows.point)[rows.point]))
+    xy, kept = np.array(rows.xy), np.arange(len(rows)) != row
+    xy[row] += 0.1
+    a = adjust(dataclasses.replace(block, image_points=dataclasses.replace(rows, xy=xy)))
+    tables = Tables(a)
+    assert [s.row for s in tables.blunders.suspects][:1] == [row]
+    found = {t.pattern.what: t for t in trends(a, np.asarray(tables.covariance.shared_sigma), [("image_points", row)])}
+    # As if it had never been measured.
+    without = found_in(dataclasses.replace(block, image_points=rows.take(kept)))
+    for what, t in found.items():
+        assert t.freedom == without[what].freedom
+        assert t.p_value == pytest.approx(without[what].p_value, rel=0.05), what
