@@ -70,7 +70,8 @@ def _from_the_best_start(block: Block, from_start: Callable[[Unknowns], Adjustme
     """
     first = from_start(start_of(block))
     given = np.asarray(block.start.image_known)
-    if not given.any() or _somewhere(first, max_steps):
+    # What is held of exterior orientations is known: it is not to be looked for elsewhere.
+    if not given.any() or not first.structure.eop_free.all() or _somewhere(first, max_steps):
         return first
     forgotten = dataclasses.replace(block, start=dataclasses.replace(block.start, image_known=np.zeros_like(given)))
     try:

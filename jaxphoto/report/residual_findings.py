@@ -9,11 +9,13 @@ import numpy as np
 from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
 from jaxphoto.report.findings import Finding, Level
 from jaxphoto.report.tables import Tables, in_file_unit
-from jaxphoto.statistics import LEVEL, Trend, global_test, group_factors, most_felt, worst_checked
+from jaxphoto.statistics import LEVEL, Trend, global_test, group_factors, most_felt, stretch, worst_checked
 
 NOTHING_FITS = 3.0
 """A rejected sigma naught above this is no question of weights: something is wrong."""
 _SHOWN = 3
+# What is expected of sigma naught may be this for whatever reason; beyond, it is said.
+_STRETCHED = 1.01
 # A pattern matters where it is more than this of the observations' standard deviation, or moves an interior parameter
 # by more than `_MOVED` of its own; smaller ones are found in many observations, and change nothing.
 _VISIBLE, _MOVED = 0.25, 1.0
@@ -32,7 +34,7 @@ def of_residuals(tables: Tables) -> Iterator[Finding]:
 
 def _global_test(tables: Tables) -> Iterator[Finding]:
     """Sigma naught against 1, and which groups of observations it comes from."""
-    whole = global_test(tables.adjusted)
+    whole = global_test(tables.adjusted, tables.redundancy)
     if whole.redundancy <= 0:
         yield Finding(
             Level.WARNING,
@@ -40,6 +42,14 @@ def _global_test(tables: Tables) -> Iterator[Finding]:
             "add observations",
         )
         return
+    for camera, factor in stretch(tables.adjusted).items():
+        if factor > _STRETCHED:
+            yield Finding(
+                Level.INFORMATION,
+                f"camera {camera}: residuals are of corrected image coordinates, which its distortion stretches; sigma "
+                f'naught of its image points is expected to be {factor:.3g}, not 1: say residuals = "measured" in '
+                f"[cameras.{camera}]",
+            )
     if whole.p_value >= LEVEL:
         return
     factors = [f for f in group_factors(tables.adjusted, tables.redundancy) if f.p_value < LEVEL]

@@ -27,7 +27,7 @@ from jaxphoto.statistics.discrepancy import (
     spread_of,
 )
 from jaxphoto.statistics.external_reliability import ExternalReliability, Felt, external_reliability, most_felt
-from jaxphoto.statistics.global_test import VarianceFactor, global_test, group_factors
+from jaxphoto.statistics.global_test import VarianceFactor, global_test, group_factors, stretch
 from jaxphoto.statistics.partial_redundancy import PartialRedundancy, partial_redundancy
 from jaxphoto.statistics.partition import SPLITS, Partition, Parts, Selection, parts_of
 from jaxphoto.statistics.quantiles import chi_square_limit
@@ -60,5 +60,5 @@ __all__ = [
     "detectable_errors", "error_precision", "external_reliability", "global_test", "group_factors", "if_zero",
     "most_felt", "normalised_residuals", "observation_groups", "partial_redundancy", "parts_of", "physical_residuals",
     "point_differences", "prepare_responses", "prepare_statistics", "redundancy_numbers", "residual_spread",
-    "significance", "spread_of", "trends", "variance_components", "worst_checked",
+    "significance", "spread_of", "stretch", "trends", "variance_components", "worst_checked",
 ]  # fmt: skip

@@ -55,7 +55,7 @@ def recipe_from(values: Mapping[str, Any], file: str = "recipe.toml") -> Recipe:
 
     Experiments change `values` between reading and this: a variant is another dictionary. Raises InputError.
     """
-    top = Section(file, "", dict(values))
+    top = Section(file, "", _of_measured_coordinates(values))
     top.known(*_KEYS)
     # What the block says, as block.toml would say it.
     told = {key: _without_truth(top.section(key)) for key in ("cameras", "mounts", "strips")}
@@ -113,6 +113,16 @@ def _plan(top: Section, cameras: Mapping[str, Mounted]) -> FlightPlan | Converge
         if name not in plan.cameras:
             raise top.section("cameras").error(name, f"no {images} with this camera; use it or remove it")
     return plan
+
+
+def _of_measured_coordinates(values: Mapping[str, Any]) -> dict[str, Any]:
+    """The same, residuals being those of the image that has the noise where a camera does not say which."""
+    cameras = values.get("cameras")
+    if not isinstance(cameras, Mapping):
+        return dict(values)
+    usual = {"residuals": "measured"}
+    told = {name: {**usual, **camera} if isinstance(camera, Mapping) else camera for name, camera in cameras.items()}
+    return {**values, "cameras": told}
 
 
 def _without_truth(section: Section) -> dict[str, Any]:

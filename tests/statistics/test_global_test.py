@@ -1,0 +1,42 @@
+"""What is expected of sigma naught where residuals are of an image that the distortion has stretched."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+
+from jaxphoto.statistics import global_test, redundancy_numbers, stretch
+from tests.blocks import adjusted, covariance_of
+
+
+def test_noise_is_stretched_with_the_image_as_said():
+    a = adjusted("cross")
+    interior, rng = a.unknowns.interior["one"], np.random.default_rng(1)
+    xy, sigma = np.asarray(a.values.xy).T, np.asarray(a.values.sigma_xy).T
+    closed = eqx.filter_jit(jax.vmap(interior.closed_form))
+    shifted = [
+        closed(xy + sigma * rng.normal(size=xy.shape) - np.asarray(interior.principal_point)) for _ in range(400)
+    ]
+    residual = (np.asarray(shifted) - np.asarray(closed(xy - np.asarray(interior.principal_point)))) / sigma
+    assert stretch(a)["one"] == pytest.approx(np.sqrt((residual**2).mean()), abs=0.004)
+    assert stretch(a)["one"] > 1.01
+
+
+def test_it_is_counted_in_the_test_of_sigma_naught():
+    a = adjusted("cross")
+    numbers = redundancy_numbers(a, covariance_of("cross"))
+    counted, usual = global_test(a, numbers), global_test(a)
+    assert counted.factor == usual.factor
+    # One-sided probabilities of a square sum that is a few per cent smaller.
+    expected = 1 + float(np.sum(numbers.image)) / a.redundancy * (stretch(a)["one"] ** 2 - 1)
+    scaled = eqx.tree_at(lambda adjusted: adjusted.residuals, a, jax.tree.map(lambda v: v / expected**0.5, a.residuals))
+    assert counted.p_value == pytest.approx(global_test(scaled).p_value, rel=0.02)
+
+
+def test_residuals_of_measured_coordinates_are_not_stretched():
+    a = adjusted("cross")
+    interior = dataclasses.replace(a.unknowns.interior["one"], residuals="measured")
+    measured = eqx.tree_at(lambda adjusted: adjusted.unknowns.interior["one"], a, interior)
+    assert stretch(measured) == {"one": 1.0}
