@@ -137,7 +137,7 @@ def of_what_is_not_checked(tables: Tables) -> Iterator[Finding]:
             f"{twice} of {len(rays)} points are in two images only: an error along the plane of their rays shows "
             "nowhere",
         )
-    if felt := [f for f in most_felt(adjusted, tables.external) if f.moved > _MOVED]:
+    if felt := [f for f in most_felt(adjusted, tables.undetected) if f.moved > _MOVED]:
         told = ", ".join(f"{f.parameter} by up to {f.moved:.1f} of its sigma ({f.words})" for f in felt)
         yield Finding(Level.INFORMATION, f"an error that no test finds (power 80 %) would move {told}")
     for hidden in worst_checked(adjusted, tables.redundancy):

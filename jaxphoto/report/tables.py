@@ -17,18 +17,17 @@ from jaxphoto.statistics import (
     BlunderTest,
     Correlations,
     Covariance,
-    ExternalReliability,
     Redundancy,
     Rotations,
     Significance,
     Trend,
+    UndetectedEffects,
     a_priori_sigmas,
     blunder_test,
     check_discrepancies,
     correlations,
     covariance,
     detectable_errors,
-    external_reliability,
     normalised_residuals,
     observation_groups,
     physical_residuals,
@@ -37,6 +36,7 @@ from jaxphoto.statistics import (
     residual_spread,
     significance,
     trends,
+    undetected_effects,
 )
 
 
@@ -100,9 +100,9 @@ class Tables:
         return pd.DataFrame(rows, columns=columns)
 
     @cached_property
-    def external(self) -> ExternalReliability:
+    def undetected(self) -> UndetectedEffects:
         """What an error that no test finds does to the result."""
-        return external_reliability(self.adjusted, self.covariance, self.redundancy)
+        return undetected_effects(self.adjusted, self.covariance, self.redundancy)
 
     @cached_property
     def correlations(self) -> dict[str, Correlations]:
@@ -216,8 +216,8 @@ class Tables:
                 "redundancy_number": flat(self.redundancy[group]),
                 "w": flat(self.w[group]),
                 "detectable": factor * flat(detectable[group]),
-                **{f"{p.removesuffix('_mm')}_moves": flat(v[group]) for p, v in self.external.interior.items()},
-                "most_moves": flat(self.external.most[group]),
+                **{f"{p.removesuffix('_mm')}_moves": flat(v[group]) for p, v in self.undetected.interior.items()},
+                "most_moves": flat(self.undetected.most[group]),
             }
             if v.size:
                 frames.append(pd.DataFrame(columns))

@@ -26,7 +26,6 @@ from jaxphoto.statistics.discrepancy import (
     residual_spread,
     spread_of,
 )
-from jaxphoto.statistics.external_reliability import ExternalReliability, Felt, external_reliability, most_felt
 from jaxphoto.statistics.global_test import VarianceFactor, global_test, group_factors, stretch
 from jaxphoto.statistics.partial_redundancy import PartialRedundancy, partial_redundancy
 from jaxphoto.statistics.partition import SPLITS, Partition, Parts, Selection, parts_of
@@ -49,16 +48,17 @@ from jaxphoto.statistics.significance import (
     significance,
 )
 from jaxphoto.statistics.trends import Trend, trends
+from jaxphoto.statistics.undetected import Felt, UndetectedEffects, most_felt, undetected_effects
 from jaxphoto.statistics.variance_components import VarianceComponents, variance_components
 
 __all__ = [
     "DELTA0", "EOP_NAMES", "LEAST_CHECKED", "LEAST_SIGMA0", "LEVEL", "SIGNIFICANCE_LEVEL", "SPLITS", "BlunderTest",
-    "Correlations", "Covariance", "ExternalReliability", "Felt", "Hidden", "IfZero", "PartialRedundancy", "Partition",
-    "Parts", "Redundancy", "Rotations", "Selection", "Significance", "Spread", "Suspect", "Trend", "VarianceComponents",
+    "Correlations", "Covariance", "Felt", "Hidden", "IfZero", "PartialRedundancy", "Partition", "Parts", "Redundancy",
+    "Rotations", "Selection", "Significance", "Spread", "Suspect", "Trend", "UndetectedEffects", "VarianceComponents",
     "VarianceFactor", "a_priori_sigmas", "angle_differences", "blunder_test", "check_discrepancies", "chi_square_limit",
     "chi_square_p", "common_covariance", "correlation_matrix", "correlations", "covariance", "critical_w",
-    "detectable_errors", "error_precision", "external_reliability", "global_test", "group_factors", "if_zero",
-    "most_felt", "normalised_residuals", "observation_groups", "partial_redundancy", "parts_of", "physical_residuals",
+    "detectable_errors", "error_precision", "global_test", "group_factors", "if_zero", "most_felt",
+    "normalised_residuals", "observation_groups", "partial_redundancy", "parts_of", "physical_residuals",
     "point_differences", "prepare_responses", "prepare_statistics", "redundancy_numbers", "residual_spread",
-    "significance", "spread_of", "stretch", "trends", "variance_components", "worst_checked",
+    "significance", "spread_of", "stretch", "trends", "undetected_effects", "variance_components", "worst_checked",
 ]  # fmt: skip

@@ -30,7 +30,7 @@ _PARTS = 40
 _GRID = 9
 
 
-class Term(NamedTuple):
+class PatternTerm(NamedTuple):
     """A combination of the columns of a pattern that has a name."""
 
     name: str
@@ -52,7 +52,7 @@ class Part(NamedTuple):
     """One over their standard deviations."""
 
 
-class Pattern(NamedTuple):
+class ResidualPattern(NamedTuple):
     """Columns of numbers that residuals may follow, part by part."""
 
     what: str
@@ -61,7 +61,7 @@ class Pattern(NamedTuple):
     camera: str
     """Whose image points they are; "" where they are none."""
     parts: tuple[Part, ...]
-    terms: tuple[Term, ...]
+    terms: tuple[PatternTerm, ...]
 
     @property
     def many(self) -> int:
@@ -102,7 +102,7 @@ class Pattern(NamedTuple):
         return np.concatenate([p.values @ (p.weight * whitened[p.at]) for p in self.parts])
 
 
-def patterns_of(adjusted: Adjustment, places: Places) -> Iterator[Pattern]:
+def patterns_of(adjusted: Adjustment, places: Places) -> Iterator[ResidualPattern]:
     """All that can be looked for in an adjustment; `places` numbers the observations.
 
     What a covariance joins is not looked at.
@@ -120,7 +120,7 @@ def patterns_of(adjusted: Adjustment, places: Places) -> Iterator[Pattern]:
             yield from _by_strip(adjusted, name, rows, places)
 
 
-def _over_format(adjusted: Adjustment, camera: str, mine: np.ndarray, places: Places, degree: int) -> Pattern:
+def _over_format(adjusted: Adjustment, camera: str, mine: np.ndarray, places: Places, degree: int) -> ResidualPattern:
     sensor, interior = adjusted.block.sensors[camera], adjusted.unknowns.interior[camera]
     values = _polynomials(_in_format(sensor, np.asarray(adjusted.values.xy)[:, mine]), degree)
     parts = _parts_of_image(adjusted, mine, places, (values, values))
@@ -128,13 +128,15 @@ def _over_format(adjusted: Adjustment, camera: str, mine: np.ndarray, places: Pl
     grid = np.stack([v.ravel() for v in np.meshgrid(*side)])
     inverse = np.linalg.pinv(_polynomials(_in_format(sensor, grid), degree).T)
     terms = tuple(
-        Term(name, np.concatenate([inverse @ f for f in field]), _cure(adjusted, camera, name), False)
+        PatternTerm(name, np.concatenate([inverse @ f for f in field]), _cure(adjusted, camera, name), False)
         for name, field in _fields(interior, grid)
     )
-    return Pattern(f"image points of camera {camera} over the format", "mm", camera, parts, terms)
+    return ResidualPattern(f"image points of camera {camera} over the format", "mm", camera, parts, terms)
 
 
-def _camera_over_time(adjusted: Adjustment, camera: str, mine: np.ndarray, places: Places, time: np.ndarray) -> Pattern:
+def _camera_over_time(
+    adjusted: Adjustment, camera: str, mine: np.ndarray, places: Places, time: np.ndarray
+) -> ResidualPattern:
     """c and the principal point that change evenly, by so many mm from the first to the last image."""
     interior, t = adjusted.unknowns.interior[camera], time[mine]
     x, y = (np.asarray(adjusted.values.xy)[:, mine] - np.asarray(interior.principal_point)[:, None]) / float(interior.c)
@@ -145,8 +147,8 @@ def _camera_over_time(adjusted: Adjustment, camera: str, mine: np.ndarray, place
     both = Part(np.append(at_x, at_y), np.hstack([x_values, y_values]), np.append(x_weight, y_weight))
     names = ("c", "x_p", "y_p")
     cure = "from the first image to the last: the camera changes in flight, give it parameters of shorter times"
-    terms = tuple(Term(name, one, cure) for name, one in zip(names, np.eye(3), strict=True))
-    return Pattern(f"image points of camera {camera} over time", "mm", camera, (both,), terms)
+    terms = tuple(PatternTerm(name, one, cure) for name, one in zip(names, np.eye(3), strict=True))
+    return ResidualPattern(f"image points of camera {camera} over time", "mm", camera, (both,), terms)
 
 
 def _parts_of_image(
@@ -157,7 +159,7 @@ def _parts_of_image(
     return tuple(Part(own, v, 1 / s) for own, v, s in zip(at, values, sigma, strict=True))
 
 
-def _by_strip(adjusted: Adjustment, name: str, rows: AbstractObservations, places: Places) -> Iterator[Pattern]:
+def _by_strip(adjusted: Adjustment, name: str, rows: AbstractObservations, places: Places) -> Iterator[ResidualPattern]:
     """The mean of each strip, and an even drift over the whole flight, of each axis of rows that are of one image."""
     block, at = adjusted.block, np.atleast_2d(places[name])
     number = rows.names_of("image", [str(k) for k in range(len(block.images))])
@@ -171,10 +173,10 @@ def _by_strip(adjusted: Adjustment, name: str, rows: AbstractObservations, place
     weight = 1 / sigma
     thing = name.replace("_", " ")
 
-    def pattern(what: str, columns: list[tuple[str, np.ndarray]], cure: str) -> Pattern:
+    def pattern(what: str, columns: list[tuple[str, np.ndarray]], cure: str) -> ResidualPattern:
         parts = tuple(Part(at.ravel(), v.ravel()[None], weight.ravel()) for _, v in columns)
-        terms = tuple(Term(n, one, cure) for (n, _), one in zip(columns, np.eye(len(columns)), strict=True))
-        return Pattern(f"{thing} {what}", rows.unit, "", parts, terms)
+        terms = tuple(PatternTerm(n, one, cure) for (n, _), one in zip(columns, np.eye(len(columns)), strict=True))
+        return ResidualPattern(f"{thing} {what}", rows.unit, "", parts, terms)
 
     if 1 < len(of) <= _PARTS:
         each = [(f"{a} of strip {s}", ((strips == s) & (axis == a)).astype(float)) for s in of for a in axes]

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxphoto.adjustment import Adjustment
-from jaxphoto.statistics.patterns import Pattern, Term, patterns_of
+from jaxphoto.statistics.patterns import PatternTerm, ResidualPattern, patterns_of
 from jaxphoto.statistics.quantiles import beta_tail
 from jaxphoto.statistics.responses import Responses
 
@@ -31,7 +31,7 @@ _BLUNDERS = 16
 class Hint(NamedTuple):
     """One term that a pattern may be, and what it alone would be."""
 
-    term: Term
+    term: PatternTerm
     share: float
     """Of the whole pattern's square sum, 0 to 1."""
     amount: float
@@ -44,7 +44,7 @@ class Hint(NamedTuple):
 class Trend(NamedTuple):
     """The test of one pattern."""
 
-    pattern: Pattern
+    pattern: ResidualPattern
     freedom: int
     p_value: float
     size: float
@@ -102,7 +102,7 @@ class _LeftOut(NamedTuple):
 
 def _tested(
     responses: Responses,
-    pattern: Pattern,
+    pattern: ResidualPattern,
     v: Float[np.ndarray, "n"],
     out: _LeftOut,
     shared_sigma: Float[np.ndarray, "shared"],
@@ -130,7 +130,7 @@ def _tested(
 
 def _hints(
     adjusted: Adjustment,
-    pattern: Pattern,
+    pattern: ResidualPattern,
     u: Float[np.ndarray, "k"],
     c: Float[np.ndarray, "k k"],
     own: Float[np.ndarray, "k k"],

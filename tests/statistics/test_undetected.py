@@ -7,7 +7,7 @@ import pytest
 
 from jaxphoto import adjust, covariance
 from jaxphoto.observations import Correlated
-from jaxphoto.statistics import detectable_errors, external_reliability, most_felt, redundancy_numbers
+from jaxphoto.statistics import detectable_errors, most_felt, redundancy_numbers, undetected_effects
 from tests import declared
 from tests.blocks import adjusted, covariance_of
 
@@ -17,7 +17,7 @@ def external():
     a = adjusted("cross")
     q = covariance_of("cross")
     r = redundancy_numbers(a, q)
-    return a, q, detectable_errors(a, r), external_reliability(a, q, r)
+    return a, q, detectable_errors(a, r), undetected_effects(a, q, r)
 
 
 @pytest.mark.parametrize("group, field", [("stations", "stations"), ("control_points", "control")])
@@ -57,7 +57,7 @@ def test_the_worst_of_each_parameter_is_found(external):
 def test_image_rows_are_told_of_their_own_camera():
     a = adjusted("two_cameras")
     q = covariance_of("two_cameras")
-    e = external_reliability(a, q, redundancy_numbers(a, q))
+    e = undetected_effects(a, q, redundancy_numbers(a, q))
     assert np.isfinite(e.interior["c_mm"]["image_points"]).all()
 
 
@@ -65,7 +65,7 @@ def test_of_rows_that_a_covariance_joins_it_holds_too():
     a = declared.adjusted()
     q = covariance(a)
     r = redundancy_numbers(a, q)
-    e, detectable = external_reliability(a, q, r), detectable_errors(a, r)
+    e, detectable = undetected_effects(a, q, r), detectable_errors(a, r)
     sigma = np.sqrt(q.of_interior("one", ("c_mm",))[0, 0] / float(q.variance_factor))
     joint = [name for name, rows in a.block.named_observations.items() if isinstance(rows, Correlated)]
     for name in joint:

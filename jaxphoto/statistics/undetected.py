@@ -28,7 +28,7 @@ POINTED = ("c_mm", "xp_mm", "yp_mm")
 _CAMERAS = 40
 
 
-class ExternalReliability(eqx.Module):
+class UndetectedEffects(eqx.Module):
     """By group of observations, shaped like its residuals, in standard deviations of what moves; NaN: not checked."""
 
     interior: dict[str, dict[str, Float[np.ndarray, "..."]]]
@@ -45,7 +45,7 @@ class Felt(NamedTuple):
     moved: float
 
 
-def external_reliability(adjusted: Adjustment, covariance: Covariance, redundancy: Redundancy) -> ExternalReliability:
+def undetected_effects(adjusted: Adjustment, covariance: Covariance, redundancy: Redundancy) -> UndetectedEffects:
     """Of every observation."""
     groups, precision = observation_groups(adjusted), error_precision(adjusted, redundancy)
     detectable = detectable_errors(adjusted, redundancy)
@@ -70,10 +70,10 @@ def external_reliability(adjusted: Adjustment, covariance: Covariance, redundanc
             if name == adjusted.block.image_points.group:
                 moved = np.where(camera_of == camera, moved, np.nan)
             interior[parameter][name] = np.fmax(interior[parameter][name], moved)
-    return ExternalReliability(interior, most)
+    return UndetectedEffects(interior, most)
 
 
-def most_felt(adjusted: Adjustment, external: ExternalReliability) -> list[Felt]:
+def most_felt(adjusted: Adjustment, external: UndetectedEffects) -> list[Felt]:
     """For each of `POINTED`, the observation that is worst for it; parameters that no camera has free are left out."""
     found, block = [], adjusted.block
     for parameter, moved in external.interior.items():
