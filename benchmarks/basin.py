@@ -1,6 +1,6 @@
 """Starts that are far off: how many adjustments reach the optimum, and whether any other place is called good.
 
-python benchmarks/basin.py [--block examples/cross_block] [--starts 1000]
+python benchmarks/basin.py [--block examples/cross_block] [--starts 1000] [--points]
 """
 
 import argparse
@@ -17,6 +17,7 @@ import jaxphoto
 from jaxphoto import Block, JaxphotoError
 from jaxphoto.camera import get_parameter, set_parameter
 from jaxphoto.procedures import adjust_for_tables
+from jaxphoto.procedures.adjust import start_of
 from jaxphoto.report import Level, Tables, verdict_of
 from jaxphoto.rotation import small_rotation
 
@@ -31,6 +32,7 @@ def main() -> None:
     parser.add_argument("--block", type=Path, default=Path(__file__).parents[1] / "examples" / "cross_block")
     parser.add_argument("--starts", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--points", action="store_true", help="points are given, too, as far off")
     arguments = parser.parse_args()
     block = jaxphoto.read_block(arguments.block)
     best = float(jaxphoto.adjust(block).square_sum)
@@ -38,17 +40,15 @@ def main() -> None:
     count: collections.Counter[str] = collections.Counter()
     began = time.perf_counter()
     for k in range(arguments.starts):
-        count[_end(far_off(block, rng), best)] += 1
+        count[_end(far_off(block, rng, arguments.points), best)] += 1
         if k % 100 == 99 or k == arguments.starts - 1:
             print(f"{k + 1} starts, {(time.perf_counter() - began) / (k + 1):.2g} s each: {dict(count)}", flush=True)
 
 
-def far_off(block: Block, rng: np.random.Generator) -> Block:
-    """The block with all exterior orientations and principal distances given wrongly; points are not given."""
+def far_off(block: Block, rng: np.random.Generator, points: bool = False) -> Block:
+    """The block with all exterior orientations and principal distances given wrongly, and points not given or so."""
     start, n = block.start.unknowns, len(block.images)
-    truth = (
-        jaxphoto.procedures.adjust.start_of(block).exterior if not np.all(block.start.image_known) else start.exterior
-    )
+    truth = start_of(block).exterior if not np.all(block.start.image_known) else start.exterior
     position = np.asarray(truth.position) + rng.uniform(-_METRES, _METRES, (n, 3))
     turns = np.radians(rng.uniform(-_DEGREES, _DEGREES, (n, 3)))
     truly = np.asarray(truth.camera_from_object)
@@ -60,6 +60,11 @@ def far_off(block: Block, rng: np.random.Generator) -> Block:
     exterior = dataclasses.replace(start.exterior, position=position, camera_from_object=matrices)
     unknowns = dataclasses.replace(start, exterior=exterior, interior=interior)
     known = dataclasses.replace(block.start, unknowns=unknowns, image_known=np.ones(n, bool))
+    if points:
+        near = np.asarray(start_of(block).points)
+        near = near + rng.uniform(-_METRES, _METRES, near.shape)
+        unknowns = dataclasses.replace(unknowns, points=near)
+        known = dataclasses.replace(known, unknowns=unknowns, point_known=np.ones(len(near), bool))
     return eqx.tree_at(lambda b: b.start, block, known)
 
 

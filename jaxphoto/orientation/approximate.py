@@ -30,6 +30,10 @@ _BLUNDERS = 0.05
 _MEND = "give their X_m, Y_m, Z_m, omega_deg, phi_deg, kappa_deg in images.csv, or measure more control points in them"
 
 
+class PointsBehind(BlockError):
+    """Points lie behind cameras that measured them: approximate orientations or points are wrong."""
+
+
 def approximate(block: Block) -> Unknowns:
     """`block.start` with every image and every point that was unknown found.
 
@@ -225,7 +229,7 @@ def _check_in_front(block: Block, positions, matrices, points) -> None:
     bad = np.flatnonzero(~_in_front(block, positions, matrices, points))
     if len(bad):
         first = bad[0]
-        raise BlockError(
+        raise PointsBehind(
             f"point {block.points[point[first]]} lies behind image {block.images[image[first]]}, which measured it "
             f"({len(bad)} of {len(image)} image points are so): check the approximate angles and their units, the "
             "position of the image, and that the point's coordinates are in the same frame"

@@ -11,11 +11,11 @@ from jaxphoto.block import Block, sensor_rows
 from jaxphoto.errors import BlockError, DatumError, RankError
 from jaxphoto.observations import AbstractObservations, KnownParameters
 from jaxphoto.orientation import approximate
-from jaxphoto.orientation.approximate import completed
+from jaxphoto.orientation.approximate import PointsBehind, completed
 from jaxphoto.procedures.orientation import orient_block
 from jaxphoto.procedures.orientation.network import empty_network, misfits, sight_of
 from jaxphoto.statistics import prepare_statistics
-from jaxphoto.unknowns import Unknowns
+from jaxphoto.unknowns import FREE, Unknowns
 
 # A sigma naught that neither blunders nor weights explain: the place is wrong.
 _ABSURD = 30.0
@@ -54,31 +54,37 @@ def adjust(
     priors = block.priors if priors is None else priors
     if start is not None:
         return solve(block, start, priors, max_steps, sizes)
-    return _from_the_best_start(block, lambda start: solve(block, start, priors, max_steps, sizes), max_steps)
+    return _from_the_best_start(block, priors, lambda start: solve(block, start, priors, max_steps, sizes), max_steps)
 
 
 def adjust_for_tables(block: Block, max_steps: int = MAX_STEPS) -> Adjustment:
     """`adjust`, with what tables and report will want compiled meanwhile."""
     from_start = lambda start: solve(block, start, block.priors, max_steps, meanwhile=prepare_statistics)  # noqa: E731
-    return _from_the_best_start(block, from_start, max_steps)
+    return _from_the_best_start(block, block.priors, from_start, max_steps)
 
 
-def _from_the_best_start(block: Block, from_start: Callable[[Unknowns], Adjustment], max_steps: int) -> Adjustment:
+def _from_the_best_start(
+    block: Block, priors: Unknowns, from_start: Callable[[Unknowns], Adjustment], max_steps: int
+) -> Adjustment:
     """The adjustment from the approximate values that are given; or, where these lead nowhere, from image points alone.
 
     Warns where the second is the better one.
     """
-    first = from_start(start_of(block))
-    given = np.asarray(block.start.image_known)
-    # What is held of exterior orientations is known: it is not to be looked for elsewhere.
-    if not given.any() or not first.structure.eop_free.all() or _somewhere(first, max_steps):
-        return first
-    forgotten = dataclasses.replace(block, start=dataclasses.replace(block.start, image_known=np.zeros_like(given)))
+    first, refused = None, None
     try:
-        second = from_start(approximate(orient_block(forgotten)))
-    except (BlockError, DatumError, RankError):
+        first = from_start(start_of(block))
+    except PointsBehind as error:
+        refused = error
+    # What is known of exterior orientations is not to be looked for elsewhere.
+    free = priors.exterior.position is FREE and priors.exterior.camera_from_object is FREE
+    elsewhere = free and np.asarray(block.start.image_known).any()
+    if first is not None and (not elsewhere or _somewhere(first, max_steps)):
         return first
-    if not bool(second.converged) or not float(second.square_sum) < float(np.nan_to_num(first.square_sum, nan=np.inf)):
+    second = _from_image_points(block, from_start) if elsewhere else None
+    if second is None or (first is not None and not _less(second, first)):
+        if first is None:
+            assert refused is not None
+            raise refused
         return first
     warnings.warn(
         "the approximate exterior orientations that were given lead nowhere: the images were oriented by their common "
@@ -86,6 +92,26 @@ def _from_the_best_start(block: Block, from_start: Callable[[Unknowns], Adjustme
         stacklevel=3,
     )
     return second
+
+
+def _from_image_points(block: Block, from_start: Callable[[Unknowns], Adjustment]) -> Adjustment | None:
+    """The adjustment without given exterior orientations and points, but for known ones; None: it leads nowhere."""
+    known, s = np.zeros((len(block.points), 3), bool), block.start
+    for rows in (block.control, block.fixed):
+        known[rows.who, rows.axis] = True
+    images, points = np.zeros_like(np.asarray(s.image_known)), known.all(axis=1) & np.asarray(s.point_known)
+    try:
+        oriented = orient_block(
+            dataclasses.replace(block, start=dataclasses.replace(s, image_known=images, point_known=points))
+        )
+        found = from_start(approximate(oriented))
+    except (BlockError, DatumError, RankError):
+        return None
+    return found if bool(found.converged) else None
+
+
+def _less(one: Adjustment, other: Adjustment) -> bool:
+    return float(one.square_sum) < float(np.nan_to_num(other.square_sum, nan=np.inf))
 
 
 def _somewhere(adjusted: Adjustment, max_steps: int) -> bool:

@@ -1,5 +1,6 @@
 """The main job: what is compiled ahead is what statistics then use."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -37,4 +38,20 @@ def test_approximate_values_that_lead_nowhere_are_not_the_last_word():
     with pytest.warns(UserWarning, match="lead nowhere"):
         found = adjust(spoilt)
     assert bool(found.converged)
+    np.testing.assert_allclose(float(found.square_sum), float(best.square_sum), rtol=1e-6)
+
+
+def test_images_that_are_given_upside_down_are_oriented_by_their_points():
+    """omega off by 180 degrees, as between conventions: all points lie behind."""
+    block = read_block(EXAMPLE)
+    best = adjust(block)
+    start = block.start
+    exterior = best.unknowns.exterior
+    turned = np.diag([1.0, -1.0, -1.0]) @ np.asarray(exterior.camera_from_object)
+    exterior = dataclasses.replace(exterior, camera_from_object=turned)
+    unknowns = dataclasses.replace(start.unknowns, exterior=exterior)
+    known = np.ones(len(block.images), bool)
+    spoilt = dataclasses.replace(block, start=dataclasses.replace(start, unknowns=unknowns, image_known=known))
+    with pytest.warns(UserWarning, match="lead nowhere"):
+        found = adjust(spoilt)
     np.testing.assert_allclose(float(found.square_sum), float(best.square_sum), rtol=1e-6)
