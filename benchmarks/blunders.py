@@ -1,6 +1,7 @@
 """Blunders spoil a block; what `jaxphoto.snoop` finds of them, what it loses, and what that does to the camera.
 
 python benchmarks/blunders.py [--block examples/cross_block] [--draws 20]
+python benchmarks/blunders.py --problem P31 --cauchy    # a seeded block; and what Ceres with a Cauchy loss makes of it
 """
 
 import argparse
@@ -11,7 +12,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from blocks import SIZES, Problem, generate
 from machine import HERE, machine, markdown, sentence, write_results
+from ours import SIGN, block_of
 
 import jaxphoto
 from jaxphoto import Block, JaxphotoError, covariance, snoop
@@ -19,6 +22,8 @@ from jaxphoto.camera import get_parameter
 
 # Sizes of the blunders in image points, in standard deviations.
 _SIZES = 10.0, 1000.0
+# Of the Cauchy loss: 95 % efficient where errors are normal.
+_CAUCHY = 2.385
 # A camera is as good as without the blunders within so many of its standard deviations.
 _NEAR = 3.0
 
@@ -33,24 +38,66 @@ class Spoilt(NamedTuple):
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--block", type=Path, default=HERE.parent / "examples" / "cross_block")
+    parser.add_argument("--problem", choices=list(SIZES), help="a block of benchmarks/blocks.py instead")
+    parser.add_argument(
+        "--cauchy", action="store_true", help="with --problem: pyceres on the same blocks (pip install it)"
+    )
     parser.add_argument("--draws", type=int, default=20, help="blocks of each kind")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, help="folder for results.jsonl and results.md")
     arguments = parser.parse_args()
-    block = jaxphoto.read_block(arguments.block)
+    if arguments.cauchy and not arguments.problem:
+        parser.error("--cauchy needs --problem: the peer knows no blocks but those")
+    problem = generate(SIZES[arguments.problem]) if arguments.problem else None
+    block = block_of(problem, arguments.problem) if problem else jaxphoto.read_block(arguments.block)
     clean = jaxphoto.adjust(block)
+    peer = _Peer(problem, clean) if arguments.cauchy else None
     records: list[dict] = [{"kind": "head", **machine()}]
     for name, spoil in _cases(block).items():
         rng = np.random.default_rng(arguments.seed)
         for k in range(arguments.draws):
-            records.append({"kind": "draw", "case": name, "draw": k, **_tried(spoil(block, rng), clean)})
+            spoilt = spoil(block, rng)
+            of_peer = peer.tried(spoilt.block) if peer else {}
+            records.append({"kind": "draw", "case": name, "draw": k, **_tried(spoilt, clean), **of_peer})
         print(_row(name, records), flush=True)
     titles = ["blunders", "blocks", "left out", "not left out", "sound rows left out", "gone with their point",
               f"camera within {_NEAR:g} sigma", "worst", "refused", "s a block"]  # fmt: skip
-    command = f"python benchmarks/blunders.py --draws {arguments.draws}"
+    titles += ["Ceres, Cauchy loss: camera within", "worst"] if peer else []
+    given = f" --problem {arguments.problem}{' --cauchy' if peer else ''}" if problem else ""
+    command = f"python benchmarks/blunders.py{given} --draws {arguments.draws}"
     rows = [_row(name, records) for name in _cases(block)]
-    lines = [f"### Blunders in {arguments.block.name}", "", sentence(records[0]), "", f"`{command}`", ""]
+    lines = [
+        f"### Blunders in {arguments.problem or arguments.block.name}",
+        "",
+        sentence(records[0]),
+        "",
+        f"`{command}`",
+        "",
+    ]
     write_results(arguments.out, "blunders", records, "\n".join([*lines, *markdown(titles, rows)]))
+
+
+class _Peer:
+    """Ceres with a Cauchy loss on every cost, on the same observations."""
+
+    def __init__(self, problem: Problem, clean: jaxphoto.Adjustment) -> None:
+        # Of those who ask for it: pyceres is no part of what jaxphoto needs.
+        from pyceres_peer import robust_camera
+
+        self.solve, self.problem = robust_camera, problem
+        tested = jaxphoto.significance(clean, covariance(clean))
+        self.expected = np.array([s.value for s in tested])
+        self.sigma = np.array([s.sigma for s in tested])
+
+    def tried(self, block: Block) -> dict:
+        spoilt = dataclasses.replace(
+            self.problem,
+            obs_xy=np.asarray(block.image_points.xy),
+            sta_obs=np.asarray(block.stations.value).reshape(-1, 3),
+            gcp_obs=np.asarray(block.control.value).reshape(-1, 3),
+        )
+        camera = SIGN * self.solve(spoilt, _CAUCHY)
+        return {"peer_off": float(np.max(np.abs(camera - self.expected) / self.sigma))}
 
 
 def _cases(block: Block) -> dict[str, Callable[[Block, np.random.Generator], Spoilt]]:
@@ -149,7 +196,12 @@ def _row(name: str, records: list[dict]) -> list[str]:
         name, str(len(own)), str(total("wrong") - total("missed")), str(total("missed")), str(total("innocent")),
         str(total("gone")), f"{sum(v < _NEAR for v in off)} of {len(own)}", f"{max(off):.2f}",
         str(len(own) - len(done)), f"{np.median([r['seconds'] for r in own]):.2f}",
+        *_of_peer([r["peer_off"] for r in own if "peer_off" in r]),
     ]  # fmt: skip
+
+
+def _of_peer(off: list[float]) -> list[str]:
+    return [f"{sum(v < _NEAR for v in off)} of {len(off)}", f"{max(off):.2f}"] if off else []
 
 
 if __name__ == "__main__":

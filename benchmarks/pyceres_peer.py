@@ -86,13 +86,13 @@ class Observed(pyceres.CostFunction):
         return True
 
 
-def _problem(p: Problem) -> tuple[pyceres.Problem, list]:
-    """The problem, and what it refers to and must therefore be kept."""
+def _problem(p: Problem, loss: pyceres.LossFunction | None = None) -> tuple[pyceres.Problem, list]:
+    """The problem, and what it refers to and must therefore be kept, the camera first; `loss` is of every cost."""
     camera, images, points = p.init_iop.copy(), list(p.init_eop.copy()), list(p.init_pts.copy())
     problem, kept = pyceres.Problem(), [camera, images, points]
 
     def add(cost, blocks):
-        problem.add_residual_block(cost, None, blocks)
+        problem.add_residual_block(cost, loss, blocks)
         kept.append(cost)
 
     for i, j, xy in zip(p.obs_img, p.obs_pt, p.obs_xy.tolist(), strict=True):
@@ -104,13 +104,25 @@ def _problem(p: Problem) -> tuple[pyceres.Problem, list]:
     return problem, kept
 
 
-def _solve(file: Path) -> None:
-    problem, _kept = _problem(read_npz(file))
-    options, summary = pyceres.SolverOptions(), pyceres.SolverSummary()
+def robust_camera(p: Problem, scale: float) -> np.ndarray:
+    """c, x_p, y_p, k1, k2 where a Cauchy loss of `scale` standard deviations is put on every cost."""
+    problem, kept = _problem(p, loss=pyceres.CauchyLoss(scale))
+    pyceres.solve(_options(), problem, pyceres.SolverSummary())
+    return kept[0]
+
+
+def _options() -> pyceres.SolverOptions:
+    options = pyceres.SolverOptions()
     options.linear_solver_type = pyceres.LinearSolverType.DENSE_SCHUR
     options.function_tolerance, options.initial_trust_region_radius = 1e-8, 1e8
     options.gradient_tolerance = options.parameter_tolerance = 1e-14
     options.num_threads = 1
+    return options
+
+
+def _solve(file: Path) -> None:
+    problem, _kept = _problem(read_npz(file))
+    options, summary = _options(), pyceres.SolverSummary()
     began = time.perf_counter()
     pyceres.solve(options, problem, summary)
     record = {
