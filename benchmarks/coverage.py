@@ -147,10 +147,9 @@ def main() -> None:
     )
     print(f"sigma naught squared: KS against its chi-square p = {stats.kstest(p_of_s, 'uniform').pvalue:.2g}")
     print(f"correlations of the IOP ({len(rho)}): RMS of (Monte Carlo - said) over its error {np.std(rho):.2f}")
-    power, n = np.mean(found), len(found)
-    print(
-        f"power at the detectable error: {100 * power:.1f} +- {100 * (power * (1 - power) / n) ** 0.5:.1f} % (asked: 80)"
-    )
+    power = np.mean(found)
+    error = (power * (1 - power) / len(found)) ** 0.5
+    print(f"power at the detectable error: {100 * power:.1f} +- {100 * error:.1f} %")
 
 
 if __name__ == "__main__":
