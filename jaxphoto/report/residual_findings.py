@@ -5,15 +5,29 @@ test of them could say.
 from collections.abc import Iterator
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
 from jaxphoto.report.findings import Finding, Level
 from jaxphoto.report.tables import Tables, in_file_unit
-from jaxphoto.statistics import LEVEL, Trend, global_test, group_factors, most_felt, stretch, worst_checked
+from jaxphoto.statistics import (
+    DELTA0,
+    LEVEL,
+    Suspect,
+    Trend,
+    global_test,
+    group_factors,
+    most_felt,
+    stretch,
+    worst_checked,
+)
 
 NOTHING_FITS = 3.0
 """A rejected sigma naught above this is no question of weights: something is wrong."""
 _SHOWN = 3
+# A suspect is no reservation but an alarm beyond this times the critical value, or where it moves an interior parameter
+# by more than `_SPOILT` of its standard deviations; below `_TOLD` that is not worth telling.
+_FAR_OUT, _SPOILT, _TOLD = 1.25, 0.5, 0.05
 # What is expected of sigma naught may be this for whatever reason; beyond, it is said.
 _STRETCHED = 1.01
 # A pattern matters where it is more than this of the observations' standard deviation, or moves an interior parameter
@@ -77,21 +91,37 @@ def _global_test(tables: Tables) -> Iterator[Finding]:
 
 
 def _blunders(tables: Tables) -> Iterator[Finding]:
-    """The likeliest culprit first: of several, all but the first may be innocent."""
-    suspects = tables.blunders.suspects
+    """The likeliest culprit first: of several, all but the first may be innocent.
+
+    An alarm where it is far beyond the critical value or moves the interior orientation; else a reservation: of many
+    thousand real observations some are a little too far out.
+    """
+    suspects, limit = tables.blunders.suspects, tables.blunders.limit
+    worst = Level.WARNING
     for s in suspects[:_SHOWN]:
         factor, unit = in_file_unit(s.unit)
+        moved = {p: _moved(tables.undetected.interior[p][s.group], s) for p in tables.undetected.interior}
+        most = max(moved, key=lambda p: moved[p], default="")
+        told = f"; that moves {most} by {moved[most]:.1g} of its sigma" if most and moved[most] > _TOLD else ""
+        alarming = abs(s.w) > _FAR_OUT * limit or max(moved.values(), default=0.0) > _SPOILT
+        worst = max(worst, Level.ALARM if alarming else Level.WARNING)
         yield Finding(
-            Level.ALARM,
+            Level.ALARM if alarming else Level.WARNING,
             f"{s.words} contradicts the other observations: if it alone is wrong, by {factor * s.error:+.3g} +- "
-            f"{factor * s.sigma:.2g} {unit} (w {s.w:.1f}, critical {tables.blunders.limit:.1f})",
+            f"{factor * s.sigma:.2g} {unit} (w {s.w:.1f}, critical {limit:.1f}){told}",
         )
     if len(suspects) > _SHOWN:
         yield Finding(
-            Level.ALARM,
+            worst,
             f"{len(suspects)} of {tables.blunders.n} observations are beyond the critical value; a blunder spoils what "
             "is beside it: jaxphoto adjust --snoop finds those that must go",
         )
+
+
+def _moved(undetected: Float[np.ndarray, "..."], suspect: Suspect) -> float:
+    """By how many a posteriori standard deviations a parameter moves with the error of a suspect."""
+    of_row = undetected[..., suspect.row]
+    return float(np.max(np.nan_to_num(of_row), initial=0.0)) * abs(suspect.w) / DELTA0
 
 
 def _trends(tables: Tables) -> Iterator[Finding]:
