@@ -159,15 +159,15 @@ def test_unknown_weights_are_one_sentence_and_nothing_written(monkeypatch, capsy
 @pytest.mark.slow
 def test_scatter_is_sigma_and_the_truth_lies_within_three():
     """Of P31, measured with other standard deviations than are stated (`benchmarks/variance_components.py`)."""
-    draws = 40
+    draws = 12
     found = estimates(*flight(), draws)
     assert found["converged"].all()
     for k, of in enumerate(TRUE.values()):
         kept = found["supported"][:, k]
         # Of stations in plan 71 of 75 other flights could support one (docs/weights.md); three sigma below that.
-        assert kept.mean() > 0.84
+        assert kept.mean() >= 0.75
         factor, sigma = found["factor"][kept, k], found["sigma"][kept, k]
-        assert np.mean(np.abs(factor - of**2) < 3 * sigma) >= 0.95
+        assert (np.abs(factor - of**2) > 3 * sigma).sum() <= 1
         # Scatter of n draws is off by 1 / sqrt(2 n), and a component that is a chi-square has the heavier tail.
         assert abs(factor.std(ddof=1) / np.sqrt(np.mean(sigma**2)) - 1) < 4 / np.sqrt(2 * draws)
         assert abs(factor.mean() - of**2) < 4 * np.sqrt(np.mean(sigma**2) / draws)
