@@ -68,10 +68,6 @@ class NormalEquations(eqx.Module):
         x = self.solve(jax.tree.map(jnp.add, b, pulled))
         return x, moved(x)
 
-    def seen(self, z: TiledResiduals) -> TiledResiduals:
-        """J N^-1 J' z; I minus it is Q_vv P of whitened observations."""
-        return self.respond(jax.tree.map(jnp.zeros_like, self.at.increments), z)[1]
-
     def cofactors(self, of_rows: Bool[Numbers, ""]) -> tuple[Cofactors, RowCofactors]:
         """The inverse of N for images, shared unknowns and each point, and of rows in tiles, if these are wanted."""
         return cofactors_of(self.at, self.factored, of_rows)

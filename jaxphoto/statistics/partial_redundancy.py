@@ -5,7 +5,7 @@ With R = I - H, H = J Q J' of whitened observations, and R_kl the block of the r
     S_kl = |R_kl|^2    (the sum of its squares),    r_k = tr R_kk = sum_l S_kl,    E[v_k' P_k v_k] = sum_l S_kl s_l
 
 where s_l is the variance factor of part l; the middle one because R is idempotent. Off the diagonal |R_kl| = |H_kl|,
-which takes products H z (`NormalEquations.seen`): exactly, z is each unit vector of part k in turn; or, of a large
+which takes products H z (`Responses`): exactly, z is each unit vector of part k in turn; or, of a large
 part, the mean of |H_l z|^2 over vectors z of random signs in part k (Hutchinson). Its standard deviation is below
 sqrt(S_kl / (2 p)) for p vectors, because no singular value of an off-diagonal block of a projector exceeds 1/2. The
 diagonal follows from the redundancy numbers, which are exact, and so does the part that no vector is spent on: the
@@ -13,29 +13,19 @@ largest. Source: K. R. Koch, Parameter Estimation and Hypothesis Testing in Line
 (1989), A stochastic estimator of the trace of the influence matrix.
 """
 
-import dataclasses
-
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, Int32, UInt32
+from jaxtyping import Float
 
-from jaxphoto.adjustment import Adjustment, NormalEquations
-from jaxphoto.arrays import still
-from jaxphoto.compiling import run_compiled
+from jaxphoto.adjustment import Adjustment
 from jaxphoto.statistics.covariance import covariance
 from jaxphoto.statistics.partition import Parts
 from jaxphoto.statistics.reliability import redundancy_numbers
+from jaxphoto.statistics.responses import Responses
 
 PROBES = 64
 """Random vectors a part; a part of no more observations is exact. The standard deviations of variance components,
 which alone depend on it, are off by less than a per cent where a part has a redundancy of some tens."""
-# Vectors that are computed with side by side, and the numbers that they may have together.
-_AT_ONCE, _NUMBERS = 32, 8_000_000
-# Parts are numbered up to a multiple of this: what is compiled serves all partitions of so many.
-_PARTS = 8
 
 
 class PartialRedundancy(eqx.Module):
@@ -80,62 +70,24 @@ def _by_part(numbers: dict[str, np.ndarray], parts: Parts, n: int) -> Float[np.n
 
 def _products(adjusted: Adjustment, parts: Parts, probes: int) -> tuple[np.ndarray, np.ndarray]:
     """|H_kl|^2 off the diagonal, row by row, and how far to trust each: infinitely if exact, not if it was left out."""
-    n = len(parts.labels) + 1
-    of = _laid(adjusted, parts)
+    n, responses = len(parts.labels) + 1, Responses.of(adjusted)
+    # What the datum adds is in one part more.
+    of = np.full(responses.count, n)
+    for name, place in responses.places.items():
+        of[place] = parts.of[name]
     at = [np.flatnonzero(of == k) for k in range(n)]
     trust = np.array([np.inf if len(places) <= probes else 1.0 for places in at])
     trust[np.argmax([len(places) for places in at])] = 0.0
+    # Each unit vector of a part, or -1 for random signs in it.
+    units = [places if t == np.inf else np.full((t > 0) * probes, -1) for places, t in zip(at, trust, strict=True)]
+    whose, unit = np.repeat(np.arange(n), [len(u) for u in units]), np.concatenate(units)
+
+    def vector(k: int) -> Float[np.ndarray, "n"]:
+        z, own = np.zeros(responses.count), at[whose[k]] if unit[k] < 0 else unit[k : k + 1]
+        z[own] = np.random.default_rng(k).choice([-1.0, 1.0], len(own)) if unit[k] < 0 else 1.0
+        return z
+
     seen = np.zeros((n, n))
-    whose = np.concatenate(
-        [np.full((t > 0) * min(len(places), probes), k) for k, (places, t) in enumerate(zip(at, trust, strict=True))]
-    )
-    if not len(whose):
-        return seen, trust
-    unit = np.concatenate(
-        [places if t == np.inf else np.full((t > 0) * probes, -1) for places, t in zip(at, trust, strict=True)]
-    )
-    equations = adjusted.equations.on_one_device.weighed
-    batch = int(np.clip(_NUMBERS // len(of), 1, _AT_ONCE))
-    slots = -(-(n + 1) // _PARTS) * _PARTS
-    for first in range(0, len(whose), batch):
-        # Always as many, so that they are compiled for once.
-        some = np.minimum(first + np.arange(batch), len(whose) - 1)
-        vectors = _Vectors(some.astype(np.uint32), whose[some].astype(np.int32), unit[some].astype(np.int32))
-        found = still(run_compiled(_squares, (equations, of, vectors, slots), adjusted.seconds, "covariance"))
-        own = np.arange(batch) < len(whose) - first
-        np.add.at(seen, whose[some[own]], found[own, :n])
+    for k, (_, h) in zip(whose.tolist(), responses.to_errors(vector, len(whose)), strict=True):
+        seen[k] += np.bincount(of, h**2, minlength=n + 1)[:n]
     return seen / np.where(trust == 1.0, probes, 1.0)[:, None], trust
-
-
-class _Vectors(eqx.Module):
-    """Which z: numbers that make seeds, the part of each, and the place of its one, -1 where signs are random."""
-
-    number: UInt32[np.ndarray, "z"]
-    part: Int32[np.ndarray, "z"]
-    unit: Int32[np.ndarray, "z"]
-
-
-def _laid(adjusted: Adjustment, parts: Parts) -> Int32[np.ndarray, "places"]:
-    """The part of everything in the arrays that are computed with, as one list; one part more for what is padding."""
-    padding = len(parts.labels) + 1.0
-    image, *others = (np.asarray(of, float) for of in parts.of.values())
-    datum = np.full(adjusted.n_constraints, padding)
-    own = dataclasses.replace(adjusted.residuals, image=image, others=tuple(others), datum=datum)
-    laid = adjusted.tiled.pad_residuals(own, padding)
-    return np.concatenate([np.ravel(v) for v in jax.tree.leaves(laid)]).astype(np.int32)
-
-
-@eqx.filter_jit
-def _squares(
-    equations: NormalEquations, of: Int32[Array, "places"], vectors: _Vectors, n: int
-) -> Float[Array, "z parts"]:
-    """|H_l z|^2 of every part l of the residuals, for each of some vectors z."""
-    _, back = ravel_pytree(jax.tree.map(lambda v: jnp.zeros(v.shape), jax.eval_shape(equations.at.residuals)))
-    key, place = jax.random.key(0), jnp.arange(len(of))
-
-    def one(v: _Vectors) -> Float[Array, "parts"]:
-        sign = jax.random.rademacher(jax.random.fold_in(key, v.number), of.shape, float)
-        z = jnp.where(v.unit < 0, jnp.where(of == v.part, sign, 0.0), jnp.where(place == v.unit, 1.0, 0.0))
-        return jax.ops.segment_sum(ravel_pytree(equations.seen(back(z)))[0] ** 2, of, n)
-
-    return jax.vmap(one)(vectors)
