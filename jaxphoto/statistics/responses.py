@@ -20,7 +20,7 @@ from jaxphoto.arrays import still
 from jaxphoto.compiling import prepare, run_compiled
 
 # Directions that are computed with side by side, and the numbers that they may have together.
-_AT_ONCE, _NUMBERS = 16, 8_000_000
+_AT_ONCE, _NUMBERS = 8, 8_000_000
 
 
 class Responses(eqx.Module):
