@@ -3,6 +3,7 @@
 import gc
 import os
 from pathlib import Path
+from zlib import crc32
 
 import pytest
 
@@ -47,9 +48,20 @@ def data_dir() -> Path:
     return folder
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """`--part K/N`: of the slow tests the Kth of N parts, by their names; each function with all its cases."""
+    parser.addoption("--part", default="1/1", help="which part of the slow tests: K/N")
+
+
 @pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what `-m quick` runs, before pytest chooses by marks."""
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Mark what `-m quick` runs, and leave out other parts of the slow tests, before pytest chooses by marks."""
+    part, parts = map(int, config.getoption("--part").split("/"))
+    items[:] = [
+        item
+        for item in items
+        if not item.get_closest_marker("slow") or crc32(item.nodeid.split("[")[0].encode()) % parts == part - 1
+    ]
     chosen = {f"tests/{test}" for tests in QUICK.values() for test in tests}
     for item in items:
         # A module, a function or one case of it.
