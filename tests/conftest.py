@@ -57,6 +57,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Mark what `-m quick` runs, and leave out other parts of the slow tests, before pytest chooses by marks."""
     part, parts = map(int, config.getoption("--part").split("/"))
+    if not 1 <= part <= parts:
+        raise pytest.UsageError(f"--part is K/N with K from 1 to N, not {part}/{parts}")
     items[:] = [
         item
         for item in items

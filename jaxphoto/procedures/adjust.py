@@ -88,7 +88,8 @@ def _from_the_best_start(
         return first
     warnings.warn(
         "the approximate exterior orientations that were given lead nowhere: the images were oriented by their common "
-        "points instead, which leads to an optimum; look at the frame, angles and units of images.csv",
+        "points instead, which leads to an optimum; look at the frame, angles and units of images.csv, and at the "
+        "coordinates of points where they are given",
         stacklevel=3,
     )
     return second

@@ -286,5 +286,5 @@ def _told(at: Adjustment, left: Masks, stays: Masks, r: Blocks, sigma0: float) -
             k = int(np.abs(v[:, row] * own[:, row]).argmax())
             known = sigma0 * float(sigma[k, row] / own[k, row])
             off = float(error[k, row])
-            found.append(Suspect(name, row, str(words[k, row]), off / known, off, known, rows.unit))
+            found.append(Suspect(name, row, k, str(words[k, row]), off / known, off, known, rows.unit))
     return tuple(sorted(found, key=lambda out: -abs(out.w)))

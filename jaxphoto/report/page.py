@@ -51,7 +51,7 @@ Standard deviations are a posteriori (times &sigma;<sub>0</sub>). Correlations r
 <h2>Block</h2><img alt="block layout" src="{{ layout }}">
 <h2>Residuals</h2>{{ spread }}
 {% for figure in residuals %}<img alt="image residuals" src="{{ figure }}">{% endfor %}
-<h3>Patterns: what the images have in common, and time and strips</h3>{{ trends }}
+{% if trends %}<h3>Patterns: what the images have in common, and time and strips</h3>{{ trends }}{% endif %}
 <h3>Largest normalised residuals</h3>{{ largest }}
 {% if check %}<h2>Check points: surveyed minus computed</h2>{{ check_spread }}
 <img alt="discrepancies at check points" src="{{ check_picture }}">{{ check }}{% endif %}
@@ -96,7 +96,7 @@ def report_page(tables: Tables, verdict: Verdict) -> str:
                 for c in a.unknowns.interior
                 for figure in (residuals_figure, mean_residuals_figure)
             ],
-            trends=_html(tables.trends),
+            trends=_html(tables.trends) if len(tables.trends) else "",
             largest=_html(largest.drop(columns="size")),
             check_picture=_picture(check_points_figure({"": tables})) if len(check) else "",
             check=_html(check) if len(check) else "",
@@ -126,6 +126,7 @@ def _html(table: pd.DataFrame) -> Markup:
         "redundancy_number",
         "d",
         "p_value",
+        "rms",
         "share",
         "amount",
         "detectable",

@@ -104,7 +104,7 @@ def mean_residuals_figure(tables: Tables, camera: str) -> Figure:
     centres = np.stack(
         [np.tile(np.arange(across) + 0.5, down) / across, np.repeat(np.arange(down) + 0.5, across) / down]
     )
-    shown = n >= _FEW
+    shown = n >= max(1, min(_FEW, n.max()))
     title = f"mean residuals of camera {drawn(camera)}, {n[shown].sum()} image points in {shown.sum()} cells"
     return _over_format(tables, camera, ((centres - 0.5) * size)[:, shown], mean[:, shown], title)
 

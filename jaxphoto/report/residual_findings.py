@@ -5,7 +5,6 @@ test of them could say.
 from collections.abc import Iterator
 
 import numpy as np
-from jaxtyping import Float
 
 from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
 from jaxphoto.report.findings import Finding, Level
@@ -28,8 +27,8 @@ _SHOWN = 3
 # A suspect is no reservation but an alarm beyond this times the critical value, or where it moves an interior parameter
 # by more than `_SPOILT` of its standard deviations; below `_TOLD` that is not worth telling.
 _FAR_OUT, _SPOILT, _TOLD = 1.25, 0.5, 0.05
-# What is expected of sigma naught may be this for whatever reason; beyond, it is said.
-_STRETCHED = 1.01
+# What is expected of sigma naught may be off from 1 by this; beyond, it is said.
+_STRETCHED = 0.01
 # A pattern matters where it is more than this of the observations' standard deviation, or moves an interior parameter
 # by more than `_MOVED` of its own; smaller ones are found in many observations, and change nothing.
 _VISIBLE, _MOVED = 0.25, 1.0
@@ -57,20 +56,20 @@ def _global_test(tables: Tables) -> Iterator[Finding]:
         )
         return
     for camera, factor in stretch(tables.adjusted).items():
-        if factor > _STRETCHED:
+        if abs(factor - 1) > _STRETCHED:
             yield Finding(
                 Level.INFORMATION,
-                f"camera {camera}: residuals are of corrected image coordinates, which its distortion stretches; sigma "
-                f'naught of its image points is expected to be {factor:.3g}, not 1: say residuals = "measured" in '
-                f"[cameras.{camera}]",
+                f"camera {camera}: residuals are of corrected image coordinates, which its distortion "
+                f"{'stretches' if factor > 1 else 'shrinks'}; sigma naught of its image points is expected to be "
+                f'{factor:.3g}, not 1: say residuals = "measured" in [cameras.{camera}]',
             )
     if whole.p_value >= LEVEL:
         return
     factors = [f for f in group_factors(tables.adjusted, tables.redundancy) if f.p_value < LEVEL]
     groups = ", ".join(f"{f.group.replace('_', ' ')} {f.sigma:.2f}" for f in factors)
     of_groups = f"; by group of observations: {groups}" if groups else ""
-    said = f"sigma naught {whole.sigma:.3g}, expected 1 (p = {whole.p_value:.1g})"
-    if whole.factor < 1:
+    said = f"sigma naught {whole.factor**0.5:.3g}, expected {whole.expected**0.5:.3g} (p = {whole.p_value:.1g})"
+    if whole.sigma < 1:
         yield Finding(
             Level.WARNING,
             f"{said}: residuals are smaller than the standard deviations that were given{of_groups}; those are too "
@@ -96,32 +95,33 @@ def _blunders(tables: Tables) -> Iterator[Finding]:
     An alarm where it is far beyond the critical value or moves the interior orientation; else a reservation: of many
     thousand real observations some are a little too far out.
     """
-    suspects, limit = tables.blunders.suspects, tables.blunders.limit
-    worst = Level.WARNING
-    for s in suspects[:_SHOWN]:
+    limit = tables.blunders.limit
+    effects = [(s, *_effect(tables, s)) for s in tables.blunders.suspects]
+    judged = [(abs(s.w) > _FAR_OUT * limit or moved > _SPOILT, s, what, moved) for s, what, moved in effects]
+    for alarming, s, what, moved in sorted(judged, key=lambda j: not j[0])[:_SHOWN]:
         factor, unit = in_file_unit(s.unit)
-        moved = {p: _moved(tables.undetected.interior[p][s.group], s) for p in tables.undetected.interior}
-        most = max(moved, key=lambda p: moved[p], default="")
-        told = f"; that moves {most} by {moved[most]:.1g} of its sigma" if most and moved[most] > _TOLD else ""
-        alarming = abs(s.w) > _FAR_OUT * limit or max(moved.values(), default=0.0) > _SPOILT
-        worst = max(worst, Level.ALARM if alarming else Level.WARNING)
+        told = f"; that moves {what} by {moved:.1g} of its sigma" if moved > _TOLD else ""
         yield Finding(
             Level.ALARM if alarming else Level.WARNING,
             f"{s.words} contradicts the other observations: if it alone is wrong, by {factor * s.error:+.3g} +- "
             f"{factor * s.sigma:.2g} {unit} (w {s.w:.1f}, critical {limit:.1f}){told}",
         )
-    if len(suspects) > _SHOWN:
+    if len(judged) > _SHOWN:
         yield Finding(
-            worst,
-            f"{len(suspects)} of {tables.blunders.n} observations are beyond the critical value; a blunder spoils what "
+            Level.ALARM if any(alarming for alarming, *_ in judged) else Level.WARNING,
+            f"{len(judged)} of {tables.blunders.n} observations are beyond the critical value; a blunder spoils what "
             "is beside it: jaxphoto adjust --snoop finds those that must go",
         )
 
 
-def _moved(undetected: Float[np.ndarray, "..."], suspect: Suspect) -> float:
-    """By how many a posteriori standard deviations a parameter moves with the error of a suspect."""
-    of_row = undetected[..., suspect.row]
-    return float(np.max(np.nan_to_num(of_row), initial=0.0)) * abs(suspect.w) / DELTA0
+def _effect(tables: Tables, suspect: Suspect) -> tuple[str, float]:
+    """The interior parameter that moves most with the error of a suspect, in a posteriori standard deviations."""
+    moved = {
+        parameter: np.atleast_2d(of[suspect.group])[suspect.number, suspect.row] * abs(suspect.w) / DELTA0
+        for parameter, of in tables.undetected.interior.items()
+    }
+    known = {parameter: float(v) for parameter, v in moved.items() if np.isfinite(v)}
+    return max(known.items(), key=lambda item: item[1], default=("", 0.0))
 
 
 def _trends(tables: Tables) -> Iterator[Finding]:

@@ -34,6 +34,8 @@ class Suspect(eqx.Module):
     group: str
     row: int
     """Of its group in the block."""
+    number: int
+    """Which of the numbers of its row shows it."""
     words: str
     """What a sentence calls it."""
     w: float
@@ -73,9 +75,9 @@ def blunder_test(adjusted: Adjustment, redundancy: Redundancy, level: float = LE
         worst = size[:, bad].argmax(axis=0)
         words = np.broadcast_to(rows.words(block.images, block.points), np.shape(w[name]))
         of_worst = (np.atleast_2d(v)[worst, bad] for v in (words, w[name], precision[name]))
-        for row, word, value, p in zip(bad.tolist(), *of_worst, strict=True):
-            sigma = sigma0 / float(p) ** 0.5
-            found.append(Suspect(name, row, str(word), float(value), float(value) * sigma, sigma, rows.unit))
+        for row, number, word, value, p in zip(bad.tolist(), worst.tolist(), *of_worst, strict=True):
+            sigma, ratio = sigma0 / float(p) ** 0.5, float(value)
+            found.append(Suspect(name, row, number, str(word), ratio, ratio * sigma, sigma, rows.unit))
     return BlunderTest(tuple(sorted(found, key=lambda s: -abs(s.w))), limit, n)
 
 

@@ -26,11 +26,13 @@ class VarianceFactor(eqx.Module):
     redundancy: float
     factor: float
     p_value: float
+    expected: float = 1.0
+    """Of the factor, where the a priori standard deviations are true."""
 
     @property
     def sigma(self) -> float:
         """By what the a priori standard deviations of the group would be multiplied to fit."""
-        return self.factor**0.5
+        return (self.factor / self.expected) ** 0.5
 
 
 def global_test(adjusted: Adjustment, redundancy: Redundancy | None = None) -> VarianceFactor:
@@ -95,4 +97,4 @@ def _tested(group: str, n: int, square_sum: float, redundancy: float, expected: 
     if redundancy <= 0:
         return VarianceFactor(group, n, redundancy, 1.0, 1.0)
     p = 2 * min(chi_square_tails(square_sum / expected, redundancy))
-    return VarianceFactor(group, n, redundancy, square_sum / redundancy, min(p, 1.0))
+    return VarianceFactor(group, n, redundancy, square_sum / redundancy, min(p, 1.0), expected)

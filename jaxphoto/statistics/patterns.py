@@ -1,8 +1,8 @@
 """Patterns that residuals may follow where a model lacks something, and the terms by which a sentence can name them.
 
-Over the format, polynomials of x and y up to the fifth degree of either coordinate: they hold the usual lens terms (k1,
-k2, p1, p2, affinity, shear) exactly and most of what is smooth. Over time, a camera that changes evenly; from strip to
-strip and over time, a mean and an even drift of whatever was observed of images.
+Over the format, polynomials of x and y up to the fifth degree, the third in huge blocks: the first hold the usual lens
+terms (k1, k2, p1, p2, affinity, shear) exactly and most of what is smooth. Over time, a camera that changes evenly;
+from strip to strip and over time, a mean and an even drift of whatever was observed of images.
 """
 
 from collections.abc import Iterator, Mapping
@@ -28,6 +28,8 @@ _MOST = 100_000_000
 _PARTS = 40
 # Of the grid on which terms are written as polynomials, along a side.
 _GRID = 9
+# Of a term's largest number, what its polynomials may miss.
+_EXACT = 0.02
 
 
 class PatternTerm(NamedTuple):
@@ -71,7 +73,7 @@ class ResidualPattern(NamedTuple):
     @property
     def rows(self) -> int:
         """Observations that have a part in it."""
-        return len(np.unique(np.concatenate([p.at for p in self.parts])))
+        return len(np.unique(np.concatenate([p.at[(p.values != 0).any(axis=0)] for p in self.parts])))
 
     @property
     def sigma(self) -> float:
@@ -128,11 +130,13 @@ def _over_format(adjusted: Adjustment, camera: str, mine: np.ndarray, places: Pl
     side = np.linspace(-1.0, 1.0, _GRID) * np.array([sensor.width_mm, sensor.height_mm])[:, None] / 2
     grid = np.stack([v.ravel() for v in np.meshgrid(*side)])
     inverse = np.linalg.pinv(_polynomials(_in_format(sensor, grid), degree).T)
-    terms = tuple(
-        PatternTerm(name, np.concatenate([inverse @ f for f in field]), _cure(adjusted, camera, name), False)
-        for name, field in _fields(interior, grid)
-    )
-    return ResidualPattern(f"image points of camera {camera} over the format", "mm", camera, parts, terms)
+    terms, basis = [], np.linalg.pinv(inverse)
+    for name, field in _fields(interior, grid):
+        coefficients = np.stack([inverse @ f for f in field])
+        # What the polynomials cannot tell from a term of fewer degrees has no name here.
+        if np.abs(coefficients @ basis.T - field).max() < _EXACT * np.abs(field).max():
+            terms.append(PatternTerm(name, coefficients.ravel(), _cure(adjusted, camera, name), False))
+    return ResidualPattern(f"image points of camera {camera} over the format", "mm", camera, parts, tuple(terms))
 
 
 def _camera_over_time(
@@ -224,9 +228,12 @@ def _fields(
     names = parameter_names(interior)
     values = np.array([float(get_parameter(interior, name)) for name in names])
     slopes = np.asarray(call_compiled(_slopes, interior, names, values, centred.T))
-    found = [(name, slopes[..., k].T) for k, name in enumerate(names) if np.isfinite(slopes[..., k]).all()]
-    usual = {name: np.stack(field(*centred)) for name, field in _USUAL.items()}
-    return found + [(name, field) for name, field in usual.items() if name.split()[0] not in names]
+    one, none = np.ones(grid.shape[1]), np.zeros(grid.shape[1])
+    # A scale and two shifts: what distortion adds to them is far less than themselves.
+    found = {"c_mm": centred / float(interior.c), "xp_mm": np.stack([one, none]), "yp_mm": np.stack([none, one])}
+    found = {name: slopes[..., k].T for k, name in enumerate(names)} | found
+    usual = {name: np.stack(field(*centred)) for name, field in _USUAL.items() if name.split()[0] not in names}
+    return [(name, field) for name, field in (found | usual).items() if np.isfinite(field).all()]
 
 
 @eqx.filter_jit

@@ -82,6 +82,10 @@ class Responses(eqx.Module):
 
 def prepare_responses(equations: NormalEquations, seconds: dict[str, float]) -> None:
     """Have what `Responses` needs compiled in the background."""
+    if jax.process_count() > 1:
+        # What comes from several processes is of types of its own.
+        return
+    equations = equations.on_one_device.weighed
     shapes = jax.tree.leaves(jax.eval_shape(lambda e: e.at.residuals(), equations))
     n = sum(math.prod(v.shape) for v in shapes)
     given = (np.broadcast_to(0.0, (_batch(n), k)) for k in (len(equations.scale.shared), n))

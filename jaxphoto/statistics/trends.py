@@ -25,7 +25,7 @@ from jaxphoto.statistics.responses import Responses
 # small that how nearly the solver came to the optimum shows in it.
 _SEEN = 1e-3
 # Of many blunders the worst: each takes a solution, and more of them are a sign of the pattern itself.
-_BLUNDERS = 16
+_BLUNDERS, _NUMBERS = 16, 50_000_000
 
 
 class Hint(NamedTuple):
@@ -67,7 +67,8 @@ def trends(
     v = np.zeros(responses.count)
     for name, place in responses.places.items():
         v[place] = np.asarray(adjusted.residuals[name])
-    rows = [np.ravel(responses.places[name][..., row]) for name, row in blunders[:_BLUNDERS]]
+    most = min(_BLUNDERS, _NUMBERS // responses.count)
+    rows = [np.ravel(responses.places[name][..., row]) for name, row in blunders[:most]]
     out = _LeftOut.of(responses, v, np.concatenate([np.zeros(0, int), *rows]))
     found = (_tested(responses, p, v, out, shared_sigma) for p in patterns_of(adjusted, responses.places))
     return [trend for trend in found if trend is not None]

@@ -41,6 +41,7 @@ class Felt(NamedTuple):
     """The observation whose undetected error moves an interior parameter most."""
 
     parameter: str
+    """Of the camera of the image; of other rows, of the camera that it moves most."""
     words: str
     moved: float
 

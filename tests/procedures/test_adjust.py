@@ -10,7 +10,7 @@ from benchmarks.basin import far_off
 from jaxphoto import adjust, read_block
 from jaxphoto.compiling import run
 from jaxphoto.procedures import adjust_for_tables
-from jaxphoto.report import Tables
+from jaxphoto.report import Tables, verdict_of
 from tests.blocks import simulated
 from tests.marks import slow_but
 
@@ -26,6 +26,9 @@ def test_what_is_compiled_meanwhile_serves_the_tables(name, monkeypatch):
     assert {"_covariance", "_row_variances"} <= ahead
     tables = Tables(adjusted)
     tables.covariance, tables.redundancy  # noqa: B018
+    assert not run._prepared
+    # What the verdict has compiled in the background is what it runs.
+    verdict_of(tables)
     assert not run._prepared
 
 

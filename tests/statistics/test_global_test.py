@@ -33,6 +33,7 @@ def test_it_is_counted_in_the_test_of_sigma_naught():
     numbers = redundancy_numbers(a, covariance_of("cross"))
     counted, usual = global_test(a, numbers), global_test(a)
     assert counted.factor == usual.factor
+    assert counted.sigma == pytest.approx(usual.sigma / counted.expected**0.5) and usual.expected == 1
     # One-sided probabilities of a square sum that is a few per cent smaller.
     expected = 1 + float(np.sum(numbers.image)) / a.redundancy * (stretch(a)["one"] ** 2 - 1)
     scaled = eqx.tree_at(lambda adjusted: adjusted.residuals, a, jax.tree.map(lambda v: v / expected**0.5, a.residuals))
