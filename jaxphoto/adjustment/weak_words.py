@@ -119,7 +119,7 @@ class _Words:
         return [self.structure.labels[j] for j in sorted(d.shared, key=lambda j: -d.share[j])]
 
     def _points(self, d: WeakDirection) -> str:
-        angle = max(self._angle(p) for p in d.points)
+        angle = max(self._angle(int(p)) for p in d.points)
         cure = "measure them in an image from another place, or leave them out"
         if 2 * len(d.points) > len(self.block.points):
             cure = "all images stand nearly at one place: take photographs from other places as well"
