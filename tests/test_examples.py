@@ -130,5 +130,13 @@ def test_pages_name_every_distortion_and_coefficient() -> None:
 def test_pages_name_every_result_file_and_column(adjusted: jaxphoto.Adjustment) -> None:
     text = (ROOT / "docs/block_folder.md").read_text(encoding="utf-8")
     tables = jaxphoto.Tables(adjusted)
-    for name in ("interior", "object_points", "residuals", "check_points", "correlation", "correlation_summary"):
+    for name in (
+        "interior",
+        "object_points",
+        "residuals",
+        "trends",
+        "check_points",
+        "correlation",
+        "correlation_summary",
+    ):
         assert f"| `{name}.csv` | {', '.join(getattr(tables, name).columns)} |" in text
