@@ -6,6 +6,7 @@ not an error: it is an outcome of the result (see `jaxphoto.adjustment.result.Ou
 
 import re
 import reprlib
+from collections.abc import Sequence
 
 # Of a message: what is longer is left out in the middle, because the place stands first and the mend last.
 _BEGINNING, _END = 900, 500
@@ -53,6 +54,15 @@ class DatumError(JaxphotoError):
 
 class RankError(JaxphotoError):
     """Unknowns that the observations cannot tell apart, although the datum is determined."""
+
+
+def few(names: Sequence[str], joint: str = ", ") -> str:
+    """The first three names, and how many more there are."""
+    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    return joint.join(names[:_NAMED]) + more
+
+
+_NAMED = 3
 
 
 def _short(text: str) -> str:

@@ -79,8 +79,7 @@ class LinearisedLoss(eqx.Module):
         at = [jax.lax.stop_gradient(x) for x in v]
         square = jnp.asarray(sum(x * x for x in at))
         ones = jnp.ones_like(square)
-        cost = lambda q: q * self.loss.factor(q)  # noqa: E731
-        weight = lambda q: jax.jvp(cost, (q,), (ones,))[1]  # noqa: E731
+        weight = lambda q: jax.jvp(lambda q: _cost(q, self.loss), (q,), (ones,))[1]  # noqa: E731
         w, slope = jax.jvp(weight, (square,), (ones,))
         root = jnp.sqrt(jnp.where(w > 0, w, 0.0))
         along = jnp.sqrt(jnp.maximum(1 + 2 * slope * square / jnp.where(w > 0, w, 1.0), _LEAST_SLOPE))

@@ -15,6 +15,7 @@ from jaxphoto.adjustment.datum_words import MOTIONS, motion_names
 from jaxphoto.adjustment.result import Adjustment
 from jaxphoto.adjustment.weak_directions import OPEN, POOR, WeakDirection, weak_directions, yardsticks
 from jaxphoto.arrays import still
+from jaxphoto.errors import few
 
 # A motion that a similarity explains to this part of its square is one.
 _RIGID = 0.9
@@ -124,7 +125,7 @@ class _Words:
         if 2 * len(d.points) > len(self.block.points):
             cure = "all images stand nearly at one place: take photographs from other places as well"
         return (
-            f"point {few(self.block.points, d.points)}: {_hardly(d)} along the rays ({self._sigmas(d)}), which are "
+            f"point {_those(self.block.points, d.points)}: {_hardly(d)} along the rays ({self._sigmas(d)}), which are "
             f"nearly parallel, {angle:.2g} deg apart at most: {cure}"
         )
 
@@ -147,21 +148,21 @@ class _Words:
             cures.append(f"add control points (point {self._farthest(d)} moves most)")
             if _turns_with_heading(labels):
                 cures.append(_HEADING)
-        return f"{_few(labels)}{along}: {_hardly(d)} ({self._sigmas(d)}) and not told apart: {_or(cures)}"
+        return f"{few(labels)}{along}: {_hardly(d)} ({self._sigmas(d)}) and not told apart: {_or(cures)}"
 
     def _part(self, d: WeakDirection, labels: list[str], names: list[str]) -> str:
-        joint = f" together with {_few(labels)}" if labels else ""
+        joint = f" together with {few(labels)}" if labels else ""
         s = self.structure
         inside = np.isin(s.image, d.images)
         none = "too little" if len(np.intersect1d(s.point[inside], s.point[~inside])) else "no points"
         return (
-            f"image {few(self.block.images, d.images)}, which share {none} with "
+            f"image {_those(self.block.images, d.images)}, which share {none} with "
             f"the others: {_and(names)} of this part{joint} {_hardly(d)} ({self._sigmas(d)}): measure points that it "
             "shares with the others, or give it control points of its own"
         )
 
     def _block(self, d: WeakDirection, labels: list[str], names: list[str]) -> str:
-        joint = f" together with {_few(labels)}" if labels else ""
+        joint = f" together with {few(labels)}" if labels else ""
         cures = [self._holding(d, labels)] if labels else []
         turns = any("rotation" in name for name in names)
         if len(d.points):
@@ -179,8 +180,8 @@ class _Words:
 
     def _images(self, d: WeakDirection, labels: list[str]) -> str:
         n, images = len(self.block.images), d.images
-        who = "all images" if len(images) == n else f"image {few(self.block.images, images)}"
-        what = f"{_few(labels)} with {self._coordinates(d)} of {who}" if labels else f"{self._coordinates(d)} of {who}"
+        who = "all images" if len(images) == n else f"image {_those(self.block.images, images)}"
+        what = f"{few(labels)} with {self._coordinates(d)} of {who}" if labels else f"{self._coordinates(d)} of {who}"
         cures = [self._holding(d, labels)] if labels else []
         owners = {label.split("[")[0] for label in labels}
         if len(d.points):
@@ -198,8 +199,8 @@ class _Words:
         enough = {label for label, left in zip(self.structure.labels, self._left(d), strict=True) if left < POOR}
         will_do = [label for label in labels if label in enough]
         if will_do:
-            return f"hold {_few(will_do, ' or ')} fixed, or give it a weight"
-        return f"hold {_few(labels, ' and ')} fixed, or give them weights"
+            return f"hold {few(will_do, ' or ')} fixed, or give it a weight"
+        return f"hold {few(labels, ' and ')} fixed, or give them weights"
 
     def _left(self, d: WeakDirection) -> np.ndarray:
         """What is left of the direction's sigma if each shared unknown were held."""
@@ -256,14 +257,9 @@ class _Words:
         return float(np.degrees(np.arccos(np.clip(to @ to.T, -1.0, 1.0)).max(initial=0.0)))
 
 
-def few(names: tuple[str, ...], which: np.ndarray) -> str:
-    """The first names and a count."""
-    return _few([names[k] for k in which])
-
-
-def _few(names: list[str], joint: str = ", ") -> str:
-    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-    return joint.join(names[:_SHOWN]) + more
+def _those(names: tuple[str, ...], which: np.ndarray) -> str:
+    """Some of the names by their numbers."""
+    return few([names[k] for k in which])
 
 
 def _fields(labels: list[str]) -> tuple[str, ...]:

@@ -60,12 +60,3 @@ class Verdict(NamedTuple):
     def texts(self) -> list[str]:
         """The sentences alone."""
         return [f.text for f in self.findings]
-
-
-_SHOWN = 3
-
-
-def few(names: list[str]) -> str:
-    """The first three, and how many more."""
-    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-    return ", ".join(names[:_SHOWN]) + more

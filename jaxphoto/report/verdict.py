@@ -14,7 +14,8 @@ from jaxphoto.adjustment import POOR, Adjustment, weaknesses_of, yardsticks
 from jaxphoto.block import Block
 from jaxphoto.camera import Sensor
 from jaxphoto.compiling import call_compiled
-from jaxphoto.report.findings import Finding, Level, Verdict, few
+from jaxphoto.errors import few
+from jaxphoto.report.findings import Finding, Level, Verdict
 from jaxphoto.report.residual_findings import NOTHING_FITS, of_residuals, of_what_is_not_checked
 from jaxphoto.report.tables import Tables
 from jaxphoto.report.weakness import FELT, at_corner, weaknesses
