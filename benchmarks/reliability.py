@@ -6,6 +6,7 @@ Times of a first call hold its compiling; those of a second one are of another a
 """
 
 import argparse
+import sys
 import time
 from collections.abc import Callable
 from typing import Any
@@ -50,9 +51,10 @@ def _timed(adjusted: Adjustment) -> dict[str, float]:
         began = time.perf_counter()
         result = function()
         found[step] = time.perf_counter() - began
+        print(f"{step}: {found[step]:.1f} s", file=sys.stderr, flush=True)
         return result
 
-    q = of("covariances", lambda: covariance(adjusted))
+    q = of("covariances", lambda: covariance(adjusted, rows=True))
     r = of("redundancy numbers", lambda: redundancy_numbers(adjusted, q))
     of("w", lambda: normalised_residuals(adjusted, r))
     of("detectable errors", lambda: detectable_errors(adjusted, r))

@@ -13,7 +13,15 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxphoto.adjustment.layout.tiled import TiledResiduals, TiledStructure, TiledValues
 from jaxphoto.adjustment.model.numbers import Increments, UnknownArrays, state_at, zero_increments
 from jaxphoto.adjustment.solver.band import Band, dense, factor_band, invert_band, pivots, solve_band
-from jaxphoto.adjustment.solver.elimination import FactoredNormal, gradient, reduce_right, solve_factored, solve_reduced
+from jaxphoto.adjustment.solver.elimination import (
+    FactoredNormal,
+    gradient,
+    pull,
+    push,
+    reduce_right,
+    solve_factored,
+    solve_reduced,
+)
 from jaxphoto.adjustment.solver.inverse import Cofactors, RowCofactors, cofactors_of, row_variances
 from jaxphoto.adjustment.solver.normal import Linearised
 from jaxphoto.adjustment.solver.optimum import iterate, typical_scale, unit_scale, weigh_datum
@@ -58,15 +66,13 @@ class NormalEquations(eqx.Module):
         """x of N x = b; of many by `jax.vmap`."""
         return solve_factored(self.factored.reduced, self.factored.factor, b, self.at)
 
-    def respond(self, b: Increments, z: TiledResiduals) -> tuple[Increments, TiledResiduals]:
-        """x = N^-1 (b + J' z) and J x: how unknowns and adjusted observations move with the observed ones, all over
-        their sigmas, and with what pulls at unknowns; of many by `jax.vmap`.
-        """
-        at = self.at
-        _, moved = jax.linearize(lambda y: at._replace(increments=y).residuals(), at.increments)
-        (pulled,) = jax.linear_transpose(moved, at.increments)(z)
-        x = self.solve(jax.tree.map(jnp.add, b, pulled))
-        return x, moved(x)
+    def pull(self, z: TiledResiduals) -> Increments:
+        """J' z of many residuals over their sigmas, along a leading axis."""
+        return pull(z, self.at)
+
+    def push(self, x: Increments) -> TiledResiduals:
+        """J x: how what was adjusted moves, over its sigmas, with the unknowns; of many by `jax.vmap`."""
+        return push(x, self.at)
 
     def cofactors(self, of_rows: Bool[Numbers, ""]) -> tuple[Cofactors, RowCofactors]:
         """The inverse of N for images, shared unknowns and each point, and of rows in tiles, if these are wanted."""

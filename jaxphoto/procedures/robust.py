@@ -133,7 +133,7 @@ def residual_scales(at: Adjustment, r: Blocks) -> dict[str, float]:
 
 def checked_parts(adjusted: Adjustment) -> Blocks:
     """Of each row, what its own residuals show of a change of its whitened numbers."""
-    blocks = redundancy_numbers(adjusted, covariance(adjusted)).blocks
+    blocks = redundancy_numbers(adjusted, covariance(adjusted, rows=True)).blocks
     return {name: blocks[name] for name in adjusted.block.named_observations}
 
 

@@ -61,7 +61,7 @@ class Tables:
         """Covariance with omega, phi, kappa."""
         # Most tables need redundancy numbers, too.
         prepare_statistics(self.adjusted.equations, self.adjusted.seconds)
-        return covariance(self.adjusted)
+        return covariance(self.adjusted, rows=True)
 
     @cached_property
     def redundancy(self) -> Redundancy:

@@ -111,7 +111,7 @@ def external_reliability(adjusted: Adjustment, derivatives: Sensitivity, delta0:
     """
     if not delta0 > 0:
         raise InputError(f"delta0 is the shift that a test detects, a positive number, not {delta0}")
-    numbers = redundancy_numbers(adjusted, covariance(adjusted))
+    numbers = redundancy_numbers(adjusted, covariance(adjusted, rows=True))
     detectable, effect = {}, {}
     for name, errors in detectable_errors(adjusted, numbers, delta0).items():
         detectable[name] = _in_rows(errors)

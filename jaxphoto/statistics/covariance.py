@@ -36,6 +36,8 @@ class Covariance(eqx.Module):
     variance_factor: Float[Numbers, ""] | float
     cofactors: Cofactors
     """In tiles, see `Adjustment.tiled`."""
+    rows: RowCofactors | None
+    """j Q j' of observations, likewise, where they were asked for."""
     labels: tuple[str, ...] = eqx.field(static=True)
     n_images: int = eqx.field(static=True)
     rotations: Rotations = eqx.field(static=True)
@@ -75,21 +77,23 @@ class Covariance(eqx.Module):
         return xp.where(held, 0.0, xp.sqrt(xp.where(held, 1.0, variance) * self.variance_factor))
 
 
-def covariance(adjusted: Adjustment, rotations: Rotations = "omega_phi_kappa") -> Covariance:
+def covariance(adjusted: Adjustment, rotations: Rotations = "omega_phi_kappa", *, rows: bool = False) -> Covariance:
     """Covariance of exterior orientations, shared unknowns and points.
 
     `rotations` says which rotations the exterior rows mean: omega, phi, kappa; small rotations about the axes of the
-    object frame; or about those of the camera.
+    object frame; or about those of the camera. With `rows` it holds what `redundancy_numbers` wants, which
+    then need not compute it all again.
     """
     if rotations not in EOP_NAMES:
         raise ValueError(f"rotations is one of {', '.join(EOP_NAMES)}, got {rotations!r}")
-    cofactors, matrix, points, _ = _run(adjusted, rotations, of_rows=False)
+    cofactors, matrix, points, of_rows = _run(adjusted, rotations, of_rows=rows)
     labels = [f"exterior[{i}].{n}" for i in adjusted.block.images for n in EOP_NAMES[rotations]]
     return Covariance(
         matrix=adjusted.tiled.crop_reduced(matrix),
         points=still(points)[adjusted.tiled.places.point],
         variance_factor=adjusted.sigma0**2,
         cofactors=cofactors,
+        rows=of_rows if rows else None,
         labels=(*labels, *adjusted.structure.labels),
         n_images=adjusted.structure.n_images,
         rotations=rotations,

@@ -44,7 +44,7 @@ class PartialRedundancy(eqx.Module):
 def partial_redundancy(adjusted: Adjustment, parts: Parts, probes: int = PROBES) -> PartialRedundancy:
     """S, r and v'Pv by part, with `probes` random vectors for each part that has more observations than that."""
     n = len(parts.labels) + 1
-    numbers = {k: np.asarray(v) for k, v in redundancy_numbers(adjusted, covariance(adjusted)).named.items()}
+    numbers = {k: np.asarray(v) for k, v in redundancy_numbers(adjusted, covariance(adjusted, rows=True)).named.items()}
     squares = {name: np.asarray(v) ** 2 for name, v in adjusted.residuals.named.items()}
     seen, trust = _products(adjusted, parts, probes)
     # Of two estimates the better one; where they are alike, their mean.

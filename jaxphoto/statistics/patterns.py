@@ -80,14 +80,13 @@ class ResidualPattern(NamedTuple):
         """The median standard deviation of these."""
         return float(1 / np.median(np.concatenate([p.weight for p in self.parts])))
 
-    @property
-    def square(self) -> Float[np.ndarray, "columns columns"]:
-        """Products of the columns of each part with one another, in the unit."""
+    def products(self, whitened: bool) -> Float[np.ndarray, "columns columns"]:
+        """Of all columns with one another, in the unit or whitened; those of different parts share no observation."""
         found, first = np.zeros((self.many, self.many)), 0
         for p in self.parts:
-            last = first + len(p.values)
+            last, values = first + len(p.values), p.values * (p.weight if whitened else 1.0)
             # Not by BLAS, whose threads wait for one another on a busy machine: seconds for what takes milliseconds.
-            found[first:last, first:last] = np.einsum("in,jn->ij", p.values, p.values)
+            found[first:last, first:last] = np.einsum("in,jn->ij", values, values)
             first = last
         return found
 

@@ -73,7 +73,7 @@ def redundancy_numbers(adjusted: Adjustment, covariance: Covariance) -> Redundan
 
     Of correlated observations it is the diagonal of Q_vv P, which sums to the redundancy, too.
     """
-    of_rows = row_cofactors(adjusted, covariance.rotations)
+    of_rows = row_cofactors(adjusted, covariance.rotations) if covariance.rows is None else covariance.rows
     arguments = (adjusted.equations, covariance.cofactors, of_rows)
     image, others = run_compiled(_row_variances, arguments, adjusted.seconds, "covariance")
     groups, found = observation_groups(adjusted), []

@@ -2,11 +2,12 @@
 
 With J the derivatives of whitened residuals (observed minus computed), an error z of the observations moves the
 unknowns by -N^-1 J' z and what was adjusted by H z = J N^-1 J' z; unknown k moves by -(J N^-1 e_k)_i with
-observation i.
+observation i. Products z' H z of many errors need no J x: they are those of J' z with N^-1 J' z.
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from operator import itemgetter
 
 import equinox as eqx
 import jax
@@ -16,11 +17,17 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int, Int32
 
 from jaxphoto.adjustment import Adjustment, NormalEquations
+from jaxphoto.adjustment.model.numbers import Increments
 from jaxphoto.arrays import still
 from jaxphoto.compiling import prepare, run_compiled
 
 # Directions that are computed with side by side, and the numbers that they may have together.
-_AT_ONCE, _NUMBERS = 8, 8_000_000
+_AT_ONCE, _NUMBERS = 16, 40_000_000
+# Right-hand sides that are solved for side by side: making F of a large block anew costs more than they do.
+_SOLVED_AT_ONCE = 48
+
+
+Column = Callable[[int], Float[np.ndarray, "n"]]
 
 
 class Responses(eqx.Module):
@@ -46,38 +53,71 @@ class Responses(eqx.Module):
         places = {name: np.asarray(v).astype(int) for name, v in numbered.named.items()}
         return cls(adjusted, laid, int(ends[-1]), places)
 
-    def to_errors(
-        self, column: Callable[[int], Float[np.ndarray, "n"]], many: int
-    ) -> Iterator[tuple[Float[np.ndarray, "shared"], Float[np.ndarray, "n"]]]:
+    def to_errors(self, column: Column, many: int) -> Iterator[tuple[Float[np.ndarray, "shared"], np.ndarray]]:
         """Of each error z = `column(k)`, whitened and in the order of `places`: the shared unknowns' motion, in their
         own units, and H z."""
-        yield from self._run(many, column, None)
+        for first in range(0, many, _SOLVED_AT_ONCE):
+            x = self._solved(self._pulled(column, range(first, min(first + _SOLVED_AT_ONCE, many))))
+            yield from zip(self._moved(x), self._pushed(x), strict=True)
 
     def of_unknowns(self, shared: Sequence[int]) -> Iterator[Float[np.ndarray, "n"]]:
         """By how much each of some `shared` unknowns (places in `Structure.labels`) moves, in its unit, with an error
         of one standard deviation of each observation."""
-        scale = still(self.adjusted.equations.scale.shared)
-        for k, (_, moved) in zip(shared, self._run(len(shared), None, shared), strict=True):
-            yield -moved * scale[k]
+        zero = self._equations.at.increments
+        b = jax.tree.map(lambda v: np.zeros((len(shared), *v.shape)), zero)
+        b.shared[np.arange(len(shared)), list(shared)] = 1.0
+        for k, moved in zip(shared, self._pushed(self._solved(b)), strict=True):
+            yield -moved * self._scale[k]
 
-    def _run(self, many: int, column, shared) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        equations = self.adjusted.equations.on_one_device.weighed
-        scale = still(equations.scale.shared)
-        batch = _batch(len(self.laid))
-        kept = self.laid < self.count
-        for first in range(0, many, batch):
-            z, b = np.zeros((batch, len(self.laid))), np.zeros((batch, len(scale)))
-            some = range(first, min(first + batch, many))
-            for row, k in enumerate(some):
-                if column is not None:
+    def products(self, column: Column, many: int) -> tuple[Float[np.ndarray, "many many"], Float[np.ndarray, "m s"]]:
+        """z' H z of all errors z = `column(k)` with one another, and the shared unknowns' motions, as `to_errors`."""
+        pulled = self._pulled(column, range(many))
+        x = self._solved(pulled)
+        flat = (np.hstack([v.reshape(many, -1) for v in tree]) for tree in (pulled, x))
+        return np.matmul(next(flat), next(flat).T), self._moved(x)
+
+    @property
+    def _equations(self) -> NormalEquations:
+        return self.adjusted.equations.on_one_device.weighed
+
+    @property
+    def _scale(self) -> Float[np.ndarray, "shared"]:
+        return still(self.adjusted.equations.scale.shared)
+
+    def _moved(self, x: Increments) -> Float[np.ndarray, "m shared"]:
+        return -still(x.shared) * self._scale
+
+    def _pulled(self, column: Column, wanted: range) -> Increments:
+        """J' z of each."""
+
+        def batches() -> Iterator[Float[np.ndarray, "batch places"]]:
+            batch = _batch(len(self.laid))
+            for first in wanted[::batch]:
+                z = np.zeros((batch, len(self.laid)))
+                for row, k in enumerate(range(first, min(first + batch, wanted.stop))):
                     z[row] = np.append(column(k), 0.0)[self.laid]
-                else:
-                    b[row, shared[k]] = 1.0
-            x, moved = map(still, run_compiled(_respond, (equations, b, z), self.adjusted.seconds, "covariance"))
-            for row, _ in enumerate(some):
+                yield z
+
+        return self._run(_pull, batches(), len(wanted))
+
+    def _solved(self, b: Increments) -> Increments:
+        return self._run(_solve, _in_batches(b, _SOLVED_AT_ONCE), len(b.shared))
+
+    def _pushed(self, x: Increments) -> Iterator[Float[np.ndarray, "n"]]:
+        """J x of each, in the order of `places`."""
+        given, kept, many = self._equations, self.laid < self.count, len(x.shared)
+        for first, some in zip(range(0, many, size := _batch(len(self.laid))), _in_batches(x, size), strict=True):
+            moved = still(run_compiled(_push, (given, some), self.adjusted.seconds, "covariance"))
+            for row in moved[: many - first]:
                 own = np.empty(self.count)
-                own[self.laid[kept]] = moved[row, kept]
-                yield -x[row] * scale, own
+                own[self.laid[kept]] = row[kept]
+                yield own
+
+    def _run(self, function: Callable, batches: Iterable, many: int) -> Increments:
+        """`function` of all batches, joined, without what the last was filled up with."""
+        given, seconds = self._equations, self.adjusted.seconds
+        parts = [jax.tree.map(still, run_compiled(function, (given, one), seconds, "covariance")) for one in batches]
+        return jax.tree.map(lambda *v: np.concatenate(v)[:many], *parts)
 
 
 def prepare_responses(equations: NormalEquations, seconds: dict[str, float]) -> None:
@@ -88,23 +128,35 @@ def prepare_responses(equations: NormalEquations, seconds: dict[str, float]) -> 
     equations = equations.on_one_device.weighed
     shapes = jax.tree.leaves(jax.eval_shape(lambda e: e.at.residuals(), equations))
     n = sum(math.prod(v.shape) for v in shapes)
-    given = (np.broadcast_to(0.0, (_batch(n), k)) for k in (len(equations.scale.shared), n))
-    prepare(_respond, (equations, *given), seconds)
+    of = lambda k: jax.tree.map(lambda v: np.broadcast_to(0.0, (k, *v.shape)), equations.at.increments)  # noqa: E731
+    prepare(_pull, (equations, np.broadcast_to(0.0, (_batch(n), n))), seconds)
+    prepare(_solve, (equations, of(_SOLVED_AT_ONCE)), seconds)
+    prepare(_push, (equations, of(_batch(n))), seconds)
 
 
 def _batch(numbers: int) -> int:
     return int(np.clip(_NUMBERS // numbers, 1, _AT_ONCE))
 
 
+def _in_batches(tree: Increments, size: int) -> Iterator[Increments]:
+    """Of `size` each, the last filled up with zeros."""
+    rest = -len(tree.shared) % size
+    filled = jax.tree.map(lambda v: np.concatenate([v, np.zeros((rest, *v.shape[1:]))]), tree)
+    for first in range(0, len(filled.shared), size):
+        yield jax.tree.map(itemgetter(slice(first, first + size)), filled)
+
+
 @eqx.filter_jit
-def _respond(
-    equations: NormalEquations, b: Float[Array, "k shared"], z: Float[Array, "k places"]
-) -> tuple[Float[Array, "k shared"], Float[Array, "k places"]]:
-    _, back = ravel_pytree(jax.tree.map(lambda v: jnp.zeros(v.shape), jax.eval_shape(equations.at.residuals)))
-    none = equations.at.increments
+def _pull(equations: NormalEquations, z: Float[Array, "k places"]) -> Increments:
+    zero = jax.tree.map(lambda v: jnp.zeros(v.shape), jax.eval_shape(equations.at.residuals))
+    return equations.pull(jax.vmap(ravel_pytree(zero)[1])(z))
 
-    def one(b: Float[Array, "shared"], z: Float[Array, "places"]) -> tuple[Array, Array]:
-        x, moved = equations.respond(none._replace(shared=b), back(z))
-        return x.shared, ravel_pytree(moved)[0]
 
-    return jax.vmap(one)(b, z)
+@eqx.filter_jit
+def _solve(equations: NormalEquations, b: Increments) -> Increments:
+    return jax.vmap(equations.solve)(b)
+
+
+@eqx.filter_jit
+def _push(equations: NormalEquations, x: Increments) -> Float[Array, "k places"]:
+    return jax.vmap(lambda one: ravel_pytree(equations.push(one))[0])(x)

@@ -10,6 +10,7 @@ Sources: Kok (1984), On data snooping and multiple outlier testing, NOAA Technic
 Testing theory, 2.
 """
 
+import bisect
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -24,8 +25,8 @@ from jaxphoto.statistics.responses import Responses
 # Directions of which estimated parameters take up all but this are no part of the test: what is left of them is so
 # small that how nearly the solver came to the optimum shows in it.
 _SEEN = 1e-3
-# Of many blunders the worst: each takes a solution, and more of them are a sign of the pattern itself.
-_BLUNDERS, _NUMBERS = 16, 50_000_000
+# Of many blunders the worst: more of them are a sign of the pattern itself.
+_BLUNDERS = 16
 
 
 class Hint(NamedTuple):
@@ -67,63 +68,89 @@ def trends(
     v = np.zeros(responses.count)
     for name, place in responses.places.items():
         v[place] = np.asarray(adjusted.residuals[name])
-    most = min(_BLUNDERS, _NUMBERS // responses.count)
-    rows = [np.ravel(responses.places[name][..., row]) for name, row in blunders[:most]]
-    out = _LeftOut.of(responses, v, np.concatenate([np.zeros(0, int), *rows]))
-    found = (_tested(responses, p, v, out, shared_sigma) for p in patterns_of(adjusted, responses.places))
+    rows = [np.ravel(responses.places[name][..., row]) for name, row in blunders[:_BLUNDERS]]
+    directions = _Directions(
+        np.concatenate([np.zeros(0, int), *rows]), tuple(patterns_of(adjusted, responses.places)), responses.count
+    )
+    taken_up, moved = responses.products(directions.column, directions.ends[-1])
+    moved = moved / np.where(shared_sigma > 0, shared_sigma, np.inf)
+    out = _LeftOut.of(directions.at, v, taken_up, moved)
+    found = (_tested(adjusted, directions, k, v, out, taken_up, moved) for k in range(len(directions.patterns)))
     return [trend for trend in found if trend is not None]
+
+
+class _Directions(NamedTuple):
+    """All that is solved for at once: an error in each of some observations, then the columns of each pattern."""
+
+    at: Int[np.ndarray, "m"]
+    patterns: tuple[ResidualPattern, ...]
+    n_observations: int
+
+    @property
+    def ends(self) -> list[int]:
+        """Behind the observations, and behind each pattern."""
+        return np.cumsum([len(self.at), *(p.many for p in self.patterns)]).tolist()
+
+    def column(self, k: int) -> Float[np.ndarray, "n"]:
+        """Direction `k`, whitened."""
+        own = bisect.bisect_right(self.ends, k)
+        if own == 0:
+            return self.unit(k)
+        return self.patterns[own - 1].column(k - self.ends[own - 1], self.n_observations)
+
+    def unit(self, k: int) -> Float[np.ndarray, "n"]:
+        """An error of one in observation `at[k]`."""
+        return np.bincount(self.at[k : k + 1], minlength=self.n_observations).astype(float)
 
 
 class _LeftOut(NamedTuple):
     """Observations whose errors are unknowns beside all others."""
 
-    at: Int[np.ndarray, "m"]
     errors: Float[np.ndarray, "m"]
     """Estimated, whitened."""
     moved: Float[np.ndarray, "m shared"]
-    visible: Float[np.ndarray, "m n"]
-    """Q_vv P of an error in each of them."""
     inverse: Float[np.ndarray, "m m"]
     explained: float
     freedom: int
 
     @classmethod
-    def of(cls, responses: Responses, v: Float[np.ndarray, "n"], at: Int[np.ndarray, "m"]) -> "_LeftOut":
-        """Those at some places."""
-        visible = np.zeros((len(at), responses.count))
-        moved = np.zeros((len(at), responses.adjusted.structure.n_shared))
-        unit = lambda k: np.bincount(at[k : k + 1], minlength=responses.count).astype(float)  # noqa: E731
-        for k, (x, h) in enumerate(responses.to_errors(unit, len(at))):
-            visible[k], moved[k] = unit(k) - h, x
-        c = visible[:, at]
-        inverse, freedom = _inverse((c + c.T) / 2, np.eye(len(at)))
+    def of(
+        cls,
+        at: Int[np.ndarray, "m"],
+        v: Float[np.ndarray, "n"],
+        taken_up: Float[np.ndarray, "k k"],
+        moved: Float[np.ndarray, "k shared"],
+    ) -> "_LeftOut":
+        """Those at some places, the first directions."""
+        m = len(at)
+        inverse, freedom = _inverse(np.eye(m) - taken_up[:m, :m], np.eye(m))
         errors = inverse @ v[at]
-        return cls(at, errors, moved, visible, inverse, float(v[at] @ errors), freedom)
+        return cls(errors, moved[:m], inverse, float(v[at] @ errors), freedom)
 
 
 def _tested(
-    responses: Responses,
-    pattern: ResidualPattern,
+    adjusted: Adjustment,
+    directions: _Directions,
+    k: int,
     v: Float[np.ndarray, "n"],
     out: _LeftOut,
-    shared_sigma: Float[np.ndarray, "shared"],
+    taken_up: Float[np.ndarray, "k k"],
+    moved: Float[np.ndarray, "k shared"],
 ) -> Trend | None:
-    adjusted, many = responses.adjusted, pattern.many
-    column = lambda k: pattern.column(k, responses.count)  # noqa: E731
-    own = np.stack([pattern.times(column(k)) for k in range(many)])
-    moved, seen = map(
-        np.stack, zip(*((x, pattern.times(h)) for x, h in responses.to_errors(column, many)), strict=True)
-    )
-    beside = np.stack([pattern.times(z) for z in out.visible], axis=1) if len(out.at) else np.zeros((many, 0))
+    pattern, (first, last), m = directions.patterns[k], directions.ends[k : k + 2], len(directions.at)
+    own = pattern.products(whitened=True)
+    of_units = [pattern.times(directions.unit(i)) for i in range(m)]
+    beside = np.reshape(of_units, (m, pattern.many)).T - taken_up[first:last, :m]
     u = pattern.times(v) - beside @ out.errors
-    c = own - (seen + seen.T) / 2 - beside @ out.inverse @ beside.T
-    moved = (moved - beside @ out.inverse @ out.moved) / np.where(shared_sigma > 0, shared_sigma, np.inf)
+    c = own - taken_up[first:last, first:last] - beside @ out.inverse @ beside.T
+    moved = moved[first:last] - beside @ out.inverse @ out.moved
     inverse, freedom = _inverse(c, own)
     whole, redundancy = float(v @ v) - out.explained, adjusted.redundancy - out.freedom
     if freedom == 0 or redundancy <= freedom or whole <= 0:
         return None
     explained, b, sigma0 = float(u @ inverse @ u), inverse @ u, (whole / redundancy) ** 0.5
-    size2 = (b @ pattern.square @ b - sigma0**2 * np.sum(pattern.square * inverse)) / pattern.rows
+    square = pattern.products(whitened=False)
+    size2 = (b @ square @ b - sigma0**2 * np.sum(square * inverse)) / pattern.rows
     hints = [h._replace(share=h.share / explained) for h in _hints(adjusted, pattern, u, c, own, moved, sigma0)]
     p = beta_tail(explained / whole, freedom / 2, (redundancy - freedom) / 2)
     return Trend(pattern, freedom, p, max(float(size2), 0.0) ** 0.5, tuple(sorted(hints, key=lambda h: -h.share)))

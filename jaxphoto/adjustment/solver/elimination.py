@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxphoto.adjustment.layout.tiled import TiledStructure
+from jaxphoto.adjustment.layout.tiled import TiledResiduals, TiledStructure
 from jaxphoto.adjustment.model.image_orientations import ImageOrientations, by_image, of_images, orientations_of
 from jaxphoto.adjustment.model.numbers import Increments, NonImageResiduals, state_at
 from jaxphoto.adjustment.model.observed_groups import RowsAtPoints
@@ -24,7 +24,7 @@ from jaxphoto.adjustment.model.structure import total
 from jaxphoto.adjustment.solver.band import BandFactor, solve_band
 from jaxphoto.adjustment.solver.non_image_rows import non_image_rows
 from jaxphoto.adjustment.solver.normal import Linearised, Reduced, other_squares, squares
-from jaxphoto.adjustment.solver.reduced import tile_numbers, tile_parts
+from jaxphoto.adjustment.solver.reduced import tile_columns, tile_numbers, tile_parts
 from jaxphoto.adjustment.solver.tile_rows import seen_in, tile_residuals
 from jaxphoto.small_matrices import unwhiten, whiten
 
@@ -160,6 +160,52 @@ def gradient(at: Linearised, reduced: Reduced, there: Linearised):
     eop, shared = pull_scene(total(_by_image(to_scene, scene, s), s))
     b = Increments(eop + b_others.eop, shared + b_others.shared, s.by_point(b))
     return b, *reduce_right(reduced, b, there), total(jnp.sum(square), s) + other_squares(others, s)
+
+
+def pull(z: TiledResiduals, at: Linearised) -> Increments:
+    """J'z of many residuals, along a leading axis, on one device; J is computed once for all of them."""
+    _, scale, values, s = at
+    columns_of, image = tile_columns(at), s.tiles.image
+
+    def tile(numbers):
+        *measured, z = numbers
+        z = jnp.moveaxis(z, 1, 0)
+        columns = columns_of(measured)
+        both = [jnp.concatenate([j.eop, j.shared]) for j in columns]
+        of_image = sum((jnp.einsum("amp,kmp->mka", j, v) for j, v in zip(both, z, strict=True)), jnp.zeros(()))
+        each = zip(columns, z, strict=True)
+        of_point = sum((j.point[:, k] * v[:, None, k] for j, v in each for k in range(z.shape[2])), jnp.zeros(()))
+        return of_image, of_point
+
+    given = (values.xy, values.sigma_xy, s.by_tile(at.state.points), s.by_tile(scale.points))
+    of_images, of_points = s.each_tile(tile, (*given, jnp.moveaxis(z.image, 0, 2)))
+    of_images = jax.ops.segment_sum(of_images.reshape(-1, *of_images.shape[3:]), image.reshape(-1), s.n_images)
+    column = jnp.asarray(s.column)[:, : s.n_image_colours]
+    shared = jnp.zeros((s.n_shared + 1, len(z.image))).at[column].add(of_images[:, :, 6:].swapaxes(1, 2))[:-1].T
+    _, of_others = jax.vjp(lambda y: non_image_residuals(y, scale, values, s), at.increments)
+    (b_others,) = jax.vmap(lambda z: of_others(NonImageResiduals(z.others, z.datum, z.names)))(z)
+    b = Increments(of_images[:, :, :6].transpose(1, 2, 0), shared, s.by_point(of_points))
+    return jax.tree.map(jnp.add, b, b_others)
+
+
+def push(x: Increments, at: Linearised) -> TiledResiduals:
+    """J x of any increments, on one device; of many by `jax.vmap`.
+
+    Tile by tile: what lies between stays in the processor's cache.
+    """
+    _, scale, values, s = at
+    scene, moved = jax.jvp(partial(_scene_at, at), at.increments[:2], x[:2])
+
+    def tile(numbers):
+        image, point, step, xy, sigma = numbers
+        seen = seen_in(xy, sigma, image, s)
+        places, steps = (of_images(scene, image, s), point), (of_images(moved, image, s), step)
+        return jnp.stack(jax.jvp(lambda scene, point: tile_residuals(scene, point, seen, s), places, steps)[1])
+
+    numbers = (s.by_tile(at.state.points), s.by_tile(x.points * scale.points), values.xy, values.sigma_xy)
+    image = s.each_tile(tile, numbers)
+    _, others = jax.jvp(lambda y: non_image_residuals(y, scale, values, s), (at.increments,), (x,))
+    return TiledResiduals(others.others, others.datum, others.names, image)
 
 
 def _others_and_gradient(at: Linearised) -> tuple[NonImageResiduals, Increments]:
