@@ -11,6 +11,7 @@ from jaxphoto.camera import DISTORTIONS, InteriorOrientation
 from jaxphoto.cli.app import app
 from jaxphoto.cli.console import plain_console
 from jaxphoto.errors import InputError
+from jaxphoto.image_measurement.features import FEATURES, LONGEST_PX
 from jaxphoto.image_measurement.matching import MatchedPhotographs, match_photographs
 from jaxphoto.image_measurement.photograph_pairs import photograph_pairs
 from jaxphoto.io import read_block, write_block
@@ -31,6 +32,10 @@ def orient_command(
         str | None,
         typer.Option(help="Photographs to compare: exhaustive, sequence:K, position:K (default: exhaustive)."),
     ] = None,
+    features: Annotated[int | None, typer.Option(help="Of a photograph, at most (default: 5000).", min=100)] = None,
+    longest_px: Annotated[
+        int | None, typer.Option(help="Longer side, in pixels, to look for features (default: 3200).", min=200)
+    ] = None,
     c_mm: Annotated[float | None, typer.Option(help="Where the principal distance starts; else from EXIF.")] = None,
     pixel_mm: Annotated[float | None, typer.Option(help="Size of a pixel; else from EXIF.")] = None,
     model: Annotated[str | None, typer.Option(help=f"Distortion: {', '.join(DISTORTIONS)} (default: brown).")] = None,
@@ -46,7 +51,16 @@ def orient_command(
     check_block_target(out, *images)
     console, errors = plain_console(), plain_console(stderr=True)
     if len(images) == 1 and (images[0] / TOML).is_file():
-        _refuse_options(images[0], pairs=pairs, c_mm=c_mm, pixel_mm=pixel_mm, model=model, r0_mm=r0_mm)
+        _refuse_options(
+            images[0],
+            pairs=pairs,
+            features=features,
+            longest_px=longest_px,
+            c_mm=c_mm,
+            pixel_mm=pixel_mm,
+            model=model,
+            r0_mm=r0_mm,
+        )
         with errors.status("reading the block") as status:
             n_known, n = _orient_folder(images[0], out, lambda said: status.update(said))
         console.print(f"{n_known} of {n} images oriented; wrote {out}", soft_wrap=True)
@@ -63,6 +77,8 @@ def orient_command(
             camera.sensor,
             start,
             compared,
+            count=features or FEATURES,
+            longest_px=longest_px or LONGEST_PX,
             progress=lambda done, of: status.update(f"features and matches: {done} of {of}"),
         )
         found = orient(

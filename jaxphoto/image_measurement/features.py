@@ -11,13 +11,17 @@ from jaxphoto.camera import Sensor
 from jaxphoto.errors import InputError
 from jaxphoto.image_measurement.grey_values import read_grey
 
+FEATURES = 5000
+"""Of a photograph, where nothing else is said."""
+LONGEST_PX = 3200
+"""Longer side of a photograph as its features are looked for, where nothing else is said: they need gigabytes else."""
 # Of a corner's strength over that of the strongest, as OpenCV counts it.
 _WEAKEST = 0.01
 # Half a window of 11 pixels, in which a corner is found to a part of a pixel.
 _HALF_WINDOW = 5
 _BORDER_PX = 8
 _CELLS = 16
-# Half of what OpenCV asks: walls and streets have little contrast, and the strongest are taken first anyway.
+# Half of what OpenCV asks: walls and streets have little contrast.
 _CONTRAST = 0.02
 # A SIFT descriptor has this length before it is rounded; its parts are then below 256 but for odd ones.
 _LENGTH = 512
@@ -79,8 +83,13 @@ def interest_points(photograph: Path, sensor: Sensor, count: int) -> Features:
     return Features(sensor.mm_from_px(fine[stayed] + 0.5), (strength[stayed] / quality.max()).astype(float))
 
 
-def sift_features(photograph: Path, sensor: Sensor, count: int = 5000, longest_px: int = 3200) -> SiftFeatures:
-    """Up to `count` SIFT features of a photograph, those of most contrast, to a part of a pixel.
+def sift_features(
+    photograph: Path, sensor: Sensor, count: int = FEATURES, longest_px: int = LONGEST_PX
+) -> SiftFeatures:
+    """Up to `count` SIFT features of a photograph, to a part of a pixel: those of the largest s sqrt(contrast).
+
+    By contrast alone leaves and gravel would take them all, which no other photograph shows again; what is larger
+    (s, its width) is seen from elsewhere, too, but large and faint things are not found as well as stated here.
 
     A photograph whose longer side is above `longest_px` is made smaller first, as its features else need gigabytes of
     memory. The standard deviation of a blob s pixels wide (the scale of SIFT) is
@@ -102,13 +111,18 @@ def sift_features(photograph: Path, sensor: Sensor, count: int = 5000, longest_p
         picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
     # Without the last argument all features are a quarter of a pixel off, to the right and down.
     sift = cv2.SIFT_create(  # type: ignore[attr-defined]
-        count, contrastThreshold=_CONTRAST, enable_precise_upscale=True
+        0, contrastThreshold=_CONTRAST, enable_precise_upscale=True
     )
+    scale = np.array([sensor.width_px, sensor.height_px]) / picture.shape[::-1]
+    # All are described, of which a part is chosen: to come back for those would make the pyramid again.
     keys, described = sift.detectAndCompute(picture, None)
     if described is None:
         return SiftFeatures(np.zeros((0, 2)), np.zeros(0), np.zeros(0, int), np.zeros((0, 128), np.uint8))
-    places, feature = np.unique([(*key.pt, key.size) for key in keys], axis=0, return_inverse=True)
-    scale = np.array([sensor.width_px, sensor.height_px]) / picture.shape[::-1]
+    found = np.array([(*key.pt, key.size) for key in keys])
+    worth = found[:, 2] * np.sqrt([key.response for key in keys])
+    chosen = np.sort(np.argsort(-worth, kind="stable")[:count])
+    places, feature = np.unique(found[chosen], axis=0, return_inverse=True)
+    described = described[chosen]
     # OpenCV gives the diameter, two widths.
     sigma_px = np.hypot(_SIGMA_PX, _SIGMA_OF_WIDTH * places[:, 2] / 2) * scale.mean()
     roots = np.sqrt(described / np.maximum(described.sum(axis=1, keepdims=True), 1e-9))

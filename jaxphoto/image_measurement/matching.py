@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxphoto.camera import InteriorOrientation, Sensor
 from jaxphoto.errors import InputError
-from jaxphoto.image_measurement.features import SiftFeatures, sift_features
+from jaxphoto.image_measurement.features import FEATURES, LONGEST_PX, SiftFeatures, sift_features
 from jaxphoto.io.photographs import Photograph
 from jaxphoto.orientation.matches import PairMatches, connected_images, tracks
 from jaxphoto.orientation.rays import ideal_coordinates
@@ -79,10 +79,13 @@ def match_photographs(
     interior: InteriorOrientation,
     pairs: Iterable[tuple[int, int]],
     *,
-    count: int = 5000,
+    count: int = FEATURES,
+    longest_px: int = LONGEST_PX,
     progress: Callable[[int, int], None] | None = None,
 ) -> MatchedPhotographs:
     """SIFT features (up to `count` each) of photographs of one camera, and their matches in the `pairs` of indices.
+
+    Photographs are made smaller to `longest_px` before.
 
     `interior` is what is known of the camera; only its distortion and principal point count. `progress` is called with
     the numbers of steps done and of all: a step is a photograph read or a pair compared.
@@ -93,20 +96,20 @@ def match_photographs(
     joins.
     """
     paths = [p.path for p in photographs]
-    matched = _matched(paths, sensor, interior, pairs, count, progress or (lambda done, of: None))
+    matched = _matched(paths, sensor, interior, pairs, count, longest_px, progress or (lambda done, of: None))
     blank = [len(xy) == 0 for xy in matched.xy_mm]
     alone = _alone([path.name for path in paths], blank, matched.pairs)
     return matched._replace(left_out={photographs[k].name: _BLANK if blank[k] else _ALONE for k in alone})
 
 
-def tie_features(paths: list[Path], sensor: Sensor, count: int = 5000, least_photographs: int = 2) -> TieFeatures:
+def tie_features(paths: list[Path], sensor: Sensor, count: int = FEATURES, least_photographs: int = 2) -> TieFeatures:
     """Points that overlapping photographs of one camera show in common: pairs, triplets and more.
 
     All pairs are matched as by `match_photographs` and joined as by `tracks`; points in fewer than `least_photographs`
     are left out. Raises InputError as `sift_features`, and where no two photographs have enough in common.
     """
     each = itertools.combinations(range(len(paths)), 2)
-    matched = _matched(paths, sensor, InteriorOrientation(1.0), each, count, lambda done, of: None)
+    matched = _matched(paths, sensor, InteriorOrientation(1.0), each, count, LONGEST_PX, lambda done, of: None)
     image, feature, point, _ = tracks([len(xy) for xy in matched.xy_mm], matched.pairs)
     kept = np.bincount(point)[point] >= least_photographs
     if not kept.any():
@@ -131,13 +134,14 @@ def _matched(
     interior: InteriorOrientation,
     pairs: Iterable[tuple[int, int]],
     count: int,
+    longest_px: int,
     progress: Callable[[int, int], None],
 ) -> MatchedPhotographs:
     compared = sorted({(min(pair), max(pair)) for pair in pairs if pair[0] != pair[1]})
     steps = len(paths) + len(compared)
     features = []
     for k, path in enumerate(paths):
-        features.append(sift_features(path, sensor, count))
+        features.append(sift_features(path, sensor, count, longest_px))
         progress(k + 1, steps)
     # Of both coordinates alike, so that the unit of the epipolar lines is a pixel.
     ideal_px = [ideal_coordinates(interior, f.xy_mm) / sensor.pixel_mm for f in features]
