@@ -26,6 +26,7 @@ COMMANDS = {
     "boresight": _Command("boresight", "Boresight misalignment in four steps."),
     "calibrate": _Command("calibrate", "Calibrate a camera with photographs of a board."),
     "orient": _Command("orient", "Orient photographs to one another from their features alone."),
+    "fly": _Command("fly", "Calibrate the camera of a flight from its photographs and their positions."),
     "models": _Command(
         "model_choice", "Compare distortion models by cross-validation, information criteria and significance."
     ),

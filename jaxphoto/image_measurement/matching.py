@@ -63,6 +63,27 @@ class MatchedPhotographs(NamedTuple):
         """Matches by looks that are not on the epipolar lines, or of pairs that have too few."""
         return int((self.counts[:, 2] - self.counts[:, 3]).sum())
 
+    @property
+    def parts(self) -> list[Int[np.ndarray, "photographs"]]:
+        """Photographs that hang together, the most first; those that match no other are in none."""
+        return [group for group in connected_images(len(self.xy_mm), self.pairs) if len(group) > 1]
+
+    def of(self, photographs: Int[np.ndarray, "photographs"]) -> "MatchedPhotographs":
+        """The same of some photographs, counted anew."""
+        new = {int(k): i for i, k in enumerate(photographs)}
+        pairs = [
+            PairMatches(new[p.first], new[p.second], p.features)
+            for p in self.pairs
+            if p.first in new and p.second in new
+        ]
+        counts = [(new[a], new[b], *rest) for a, b, *rest in self.counts.tolist() if a in new and b in new]
+        return self._replace(
+            xy_mm=[self.xy_mm[k] for k in photographs],
+            sigma_mm=[self.sigma_mm[k] for k in photographs],
+            pairs=pairs,
+            counts=np.array(counts, int).reshape(-1, 4),
+        )
+
 
 class TieFeatures(NamedTuple):
     """Points seen in several photographs, one row for each measurement, sorted by point."""
@@ -81,6 +102,7 @@ def match_photographs(
     *,
     count: int = FEATURES,
     longest_px: int = LONGEST_PX,
+    in_parts: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> MatchedPhotographs:
     """SIFT features (up to `count` each) of photographs of one camera, and their matches in the `pairs` of indices.
@@ -93,12 +115,12 @@ def match_photographs(
     A photograph that shows no features, or matches no other one, is `left_out` by name.
 
     Raises InputError as `sift_features`, where no two photographs match, and where they fall into groups that nothing
-    joins.
+    joins, but not `in_parts`.
     """
     paths = [p.path for p in photographs]
     matched = _matched(paths, sensor, interior, pairs, count, longest_px, progress or (lambda done, of: None))
     blank = [len(xy) == 0 for xy in matched.xy_mm]
-    alone = _alone([path.name for path in paths], blank, matched.pairs)
+    alone = _alone([path.name for path in paths], blank, matched.pairs, in_parts)
     return matched._replace(left_out={photographs[k].name: _BLANK if blank[k] else _ALONE for k in alone})
 
 
@@ -248,8 +270,8 @@ def _over_sigma(matrix: np.ndarray, one: np.ndarray, other: np.ndarray, *sigmas:
     return (in_other * other).sum(axis=1) / np.sqrt(variance)
 
 
-def _alone(names: list[str], blank: list[bool], pairs: list[PairMatches]) -> list[int]:
-    """Photographs that match no other one; InputError unless all others hang together."""
+def _alone(names: list[str], blank: list[bool], pairs: list[PairMatches], in_parts: bool) -> list[int]:
+    """Photographs that match no other one; InputError unless all others hang together, or may be `in_parts`."""
     groups = connected_images(len(names), pairs)
     joined = [group for group in groups if len(group) > 1]
     if len(names) < 2:
@@ -261,7 +283,7 @@ def _alone(names: list[str], blank: list[bool], pairs: list[PairMatches]) -> lis
             f"no two of the {len(names)} photographs ({_listed(names)}) have {_LEAST_MATCHES} points in "
             f"common{beside}; give photographs that overlap by half at least, in sharp focus, or compare more pairs"
         )
-    if len(joined) > 1:
+    if len(joined) > 1 and not in_parts:
         each = "; ".join(_listed([names[k] for k in group]) for group in joined)
         raise InputError(
             f"the photographs fall into {len(joined)} groups without matches between them ({each}); add photographs "

@@ -14,6 +14,7 @@ from PIL import ExifTags, Image
 
 from jaxphoto.camera import InteriorOrientation, Sensor
 from jaxphoto.errors import InputError
+from jaxphoto.io.photograph_metadata import dji_fields, rtk_sigma
 from jaxphoto.io.picture_size import check_pixels
 
 _DIAGONAL_35_MM = math.hypot(36, 24)
@@ -33,6 +34,8 @@ class Gps(NamedTuple):
     latitude_deg: float
     longitude_deg: float
     altitude_m: float | None
+    sigma_m: tuple[float, float, float] | None = None
+    """East, north and up, of a receiver with corrections that says them (DJI's RTK)."""
 
 
 class Photograph(NamedTuple):
@@ -72,7 +75,7 @@ def photographs(paths: Sequence[str | Path]) -> list[Photograph]:
     """
     read: dict[str, Photograph] = {}
     for path in map(Path, paths):
-        photograph = _photograph(path)
+        photograph = read_photograph(path)
         other = read.setdefault(path.stem, photograph)
         if other is not photograph:
             raise InputError(
@@ -144,34 +147,34 @@ def _pixel(photograph: Photograph, given_mm: float | None) -> tuple[float | None
     return None, ""
 
 
+ONE_CAMERA: list[tuple[str, Callable[["Photograph"], Hashable], str]] = [
+    (
+        "size",
+        lambda p: f"{p.width_px} x {p.height_px} px",
+        "give those of one camera as they were taken: turn back what was turned, leave out what was cut or made "
+        "smaller",
+    ),
+    (
+        "orientation flag",
+        lambda p: p.orientation,
+        "pictures are read as they lie in the file, and a program may have turned some: where all are as the "
+        "sensor saw them, set one flag (exiftool -n -Orientation=1 FILES), else leave the odd ones out",
+    ),
+    ("camera", lambda p: " ".join(filter(None, (p.make, p.model))) or None, "give the photographs of one camera"),
+    ("focal length", lambda p: p.focal_length_mm and f"{p.focal_length_mm:.4g} mm", "give those of one zoom"),
+]
+"""What all photographs of one camera have in common, and the mend where they have not."""
+
+
 def _check_one_camera(photographs: Sequence[Photograph], c_mm: float | None) -> None:
-    checks: list[tuple[str, Callable[[Photograph], Hashable], str]] = [
-        (
-            "sizes",
-            lambda p: f"{p.width_px} x {p.height_px} px",
-            "give those of one camera as they were taken: turn back what was turned, leave out what was cut or made "
-            "smaller",
-        ),
-        (
-            "orientation flags",
-            lambda p: p.orientation,
-            "pictures are read as they lie in the file, and a program may have turned some: where all are as the "
-            "sensor saw them, set one flag (exiftool -n -Orientation=1 FILES), else leave the odd ones out",
-        ),
-        ("cameras", lambda p: " ".join(filter(None, (p.make, p.model))) or None, "give the photographs of one camera"),
-    ]
-    if c_mm is None:
-        checks.append(
-            ("focal lengths", lambda p: p.focal_length_mm and f"{p.focal_length_mm:.4g} mm", "give those of one zoom")
-        )
-    for what, of, mend in checks:
+    for what, of, mend in ONE_CAMERA if c_mm is None else ONE_CAMERA[:-1]:
         groups: dict[Any, list[Photograph]] = {}
         for p in photographs:
             if of(p) is not None:
                 groups.setdefault(of(p), []).append(p)
         if len(groups) > 1:
             listed = "; ".join(f"{value}: {_some(group)}" for value, group in groups.items())
-            raise InputError(f"the photographs of one camera have different {what} ({listed}); {mend}")
+            raise InputError(f"the photographs of one camera have different {what}s ({listed}); {mend}")
 
 
 def _some(group: list[Photograph]) -> str:
@@ -179,7 +182,8 @@ def _some(group: list[Photograph]) -> str:
     return names if len(group) <= 3 else f"{names} and {len(group) - 3} more"
 
 
-def _photograph(path: Path) -> Photograph:
+def read_photograph(path: Path) -> Photograph:
+    """What the file of one photograph says. Raises InputError for a file that is missing or no picture."""
     if path.is_dir():
         raise InputError(f"{path} is a folder; name its photographs, for example {path}/*.jpg")
     if not path.is_file():
@@ -219,7 +223,7 @@ def _exif(picture: Image.Image) -> dict[str, Any]:
         "focal_length_35mm_mm": film if film is not None and _FILM_MM[0] <= film <= _FILM_MM[1] else None,
         "sensor_width_mm": _sensor_width(taken, *picture.size),
         "orientation": flag if flag in range(1, 9) else 1,
-        "gps": _gps(gps),
+        "gps": _gps(gps, rtk_sigma(dji_fields(picture.info.get("xmp")))),
     }
 
 
@@ -248,7 +252,7 @@ def _words(value: Any) -> str | None:
     return words or None
 
 
-def _gps(tags: dict) -> Gps | None:
+def _gps(tags: dict, sigma_m: tuple[float, float, float] | None) -> Gps | None:
     try:
         latitude, longitude = (_degrees(tags[k]) * _sign(tags.get(k - 1)) for k in (2, 4))
         altitude = float(tags[6]) * (-1 if tags.get(5) in (1, b"\x01") else 1) if 6 in tags else None
@@ -257,7 +261,7 @@ def _gps(tags: dict) -> Gps | None:
     known = math.isfinite(latitude) and math.isfinite(longitude) and (abs(latitude) <= 90 and abs(longitude) <= 180)
     if not known:
         return None
-    return Gps(latitude, longitude, altitude if altitude is not None and math.isfinite(altitude) else None)
+    return Gps(latitude, longitude, altitude if altitude is not None and math.isfinite(altitude) else None, sigma_m)
 
 
 def _degrees(parts: Any) -> float:

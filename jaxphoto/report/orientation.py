@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 _SHOWN = 6
 # What chance alone may do to the standard deviations of a few hundred rays.
-_ALIKE = 1.2
+ALIKE = 1.2
 
 
 def orientation_sentences(report: OrientationReport) -> list[str]:
@@ -42,7 +42,7 @@ def orientation_sentences(report: OrientationReport) -> list[str]:
         *_doubts(report),
         f"free of the camera: {', '.join(report.estimated) or 'nothing'}",
     ]
-    if report.alike > _ALIKE:
+    if report.alike > ALIKE:
         said.append(
             f"neighbouring rays of an image err alike: standard deviations of the camera are {report.alike:.2g} times "
             "what an adjustment says, which takes them for independent"

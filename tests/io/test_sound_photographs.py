@@ -1,0 +1,79 @@
+"""What of a folder of photographs can be used: each spoilt one costs a sentence, never the rest."""
+
+import shutil
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from jaxphoto.errors import InputError
+from jaxphoto.io.photograph_metadata import dji_fields, rtk_sigma
+from jaxphoto.io.photographs import photographs
+from jaxphoto.io.sound_photographs import sound_photographs
+
+PACKET = """<?xpacket begin="" id="W5M0MpCehiHzreSzNTczkc9d"?><x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF>
+<rdf:Description xmlns:drone-dji="http://www.dji.com/drone-dji/1.0/" drone-dji:AbsoluteAltitude="+129.52"
+ drone-dji:RtkFlag="50" drone-dji:RtkStdLon="0.01174" drone-dji:RtkStdLat="0.01262" drone-dji:RtkStdHgt="0.02684">
+<drone-dji:GimbalYawDegree>-87.20</drone-dji:GimbalYawDegree></rdf:Description></rdf:RDF></x:xmpmeta>"""
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Four photographs of one camera, none like another."""
+    rng = np.random.default_rng(1)
+    for k in range(4):
+        exif = Image.Exif()
+        exif[271], exif[272] = "Maker", "Model"
+        exif.get_ifd(0x8825).update({1: "N", 2: (55.0, 40.0, float(k)), 3: "E", 4: (13.0, 10.0, 0.0), 6: 120.0})
+        picture = Image.fromarray(rng.integers(0, 255, (300, 400), dtype=np.uint8))
+        picture.save(tmp_path / f"{k}.jpg", exif=exif, xmp=PACKET.encode())
+    return tmp_path
+
+
+def test_sound_ones_are_kept_with_what_their_files_say(folder):
+    kept, left = sound_photographs([folder])
+    assert [p.name for p in kept] == ["0", "1", "2", "3"] and not left
+    assert kept[0].gps is not None and kept[0].gps.sigma_m == (0.01174, 0.01262, 0.02684)
+
+
+def test_spoilt_ones_are_left_out_each_with_a_sentence(folder):
+    whole = (folder / "1.jpg").read_bytes()
+    (folder / "cut.jpg").write_bytes(whole[: len(whole) // 2])
+    (folder / "text.png").write_text("no picture")
+    shutil.copy(folder / "2.jpg", folder / "copy.jpg")
+    Image.new("RGB", (640, 480)).save(folder / "screenshot.png")
+    shutil.copy(folder / "3.jpg", folder / "3.jpeg")
+    other = Image.open(folder / "0.jpg")
+    exif = other.getexif()
+    exif[272] = "Another"
+    other.save(folder / "other.jpg", exif=exif)
+    (folder / "notes.txt").write_text("not looked at")
+    kept, left = sound_photographs([folder])
+    assert [p.name for p in kept] == ["0", "1", "2", "3"]
+    for name, why in {
+        "cut.jpg": "cut off or damaged",
+        "text.png": "no picture that can be read",
+        "copy.jpg": "a copy of 2.jpg",
+        "3.jpg": "a copy of 3.jpeg",
+        "screenshot.png": "its size is 640 x 480 px, that of most is 400 x 300 px",
+        "other.jpg": "its camera is Maker Another, that of most is Maker Model",
+    }.items():
+        assert why in left.pop(str(folder / name))
+    assert not left
+
+
+def test_what_is_not_there_and_what_leaves_nothing_is_refused(folder, tmp_path):
+    with pytest.raises(InputError, match="there is no such photograph or folder"):
+        sound_photographs([folder / "absent"])
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    with pytest.raises(InputError, match="there is no photograph that can be read"):
+        sound_photographs([empty])
+
+
+def test_packets_of_others_and_damaged_ones_say_nothing(folder):
+    assert dji_fields(PACKET)["GimbalYawDegree"] == "-87.20"
+    assert dji_fields(PACKET[:-60])["RtkFlag"] == "50"
+    for packet in (None, b"", b"<x:xmpmeta/>", PACKET.replace("0.01174", "nan"), PACKET.replace("0.01262", "0")):
+        assert rtk_sigma(dji_fields(packet)) is None
+    assert photographs([folder / "0.jpg"])[0].gps.sigma_m == (0.01174, 0.01262, 0.02684)

@@ -1,0 +1,86 @@
+"""`jaxphoto fly`: a folder of photographs to blocks, results and a page; two parts, spoilt files, a wrong position."""
+
+import json
+
+import cv2
+import numpy as np
+import pandas as pd
+import pytest
+from PIL import Image
+
+from jaxphoto.georeferencing.map_frame import MapFrame
+from jaxphoto.io import read_block
+from jaxphoto.procedures.georeference_photographs import utm_of
+from tests.commands import run
+from tests.image_measurement.ground import SENSOR, photograph, texture
+
+ORIGIN = (13.2, 55.7, 0.0)
+PIXEL_MM, C_MM = SENSOR.pixel_mm, 3.6
+HEIGHT_M = 60.0
+SIGMA_M = 0.03
+RTK = '<rdf:Description drone-dji:RtkFlag="50"' + "".join(
+    f' drone-dji:RtkStd{axis}="{SIGMA_M}"' for axis in ("Lon", "Lat", "Hgt")
+)
+
+
+def with_position(path, place):
+    """The picture as a JPEG with a position in its EXIF."""
+    exif = Image.Exif()
+    longitude, latitude, height = place
+    parts = [(int(v), int(v % 1 * 60), v * 60 % 1 * 60) for v in (latitude, longitude)]
+    exif.get_ifd(0x8825).update({1: "N", 2: parts[0], 3: "E", 4: parts[1], 5: b"\0", 6: height})
+    Image.open(path).save(path.with_suffix(".jpg"), quality=97, exif=exif, xmp=RTK.encode())
+    path.unlink()
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory):
+    """Twelve photographs of one place, from three heights and turned, three of another, and what is spoilt."""
+    folder, rng = tmp_path_factory.mktemp("flown"), np.random.default_rng(4)
+    frame = MapFrame(utm_of(*ORIGIN[:2]), None, ORIGIN)
+    for name, far, number in (("a", 0.0, 12), ("b", 5000.0, 3)):
+        ground = texture(rng, 2400).astype(np.float32)
+        for k in range(number):
+            at = np.array([14.0 * (k % 4) - 21, 14.0 * (k // 4) - 14, HEIGHT_M + 8 * (k % 3)])
+            angles = (*rng.uniform(-14, 14, 2), 90.0 * (k % 4))
+            photograph(folder / f"{name}{k:02}.png", ground, at, angles, rng)
+            recorded = at + rng.normal(0, SIGMA_M, 3) + [far, 0, 0] + (40.0 if (name, k) == ("a", 5) else 0.0)
+            with_position(folder / f"{name}{k:02}.png", frame.place(frame.map(recorded[None]))[0])
+    whole = (folder / "a03.jpg").read_bytes()
+    (folder / "cut.jpg").write_bytes(whole[:20_000])
+    cv2.imwrite(str(folder / "blank.png"), np.full((SENSOR.height_px, SENSOR.width_px), 90, np.uint8))
+    return folder
+
+
+@pytest.mark.slow
+def test_a_folder_becomes_blocks_results_and_a_page(flown, tmp_path, monkeypatch, capsys):
+    out = tmp_path / "out"
+    given = ("--c-mm", 3.7, "--pixel-mm", PIXEL_MM, "--features", 500)
+    _, said, wrong = run(monkeypatch, capsys, "fly", flown, "--out", out, *given)
+    assert "cut.jpg: the picture is cut off or damaged" in wrong
+    assert "the position of a05 contradicts the others by" in said
+    summary = json.loads((out / "summary.json").read_text())
+    assert [p["n_images"] for p in summary["parts"]] == [12, 3]
+    assert summary["parts"][0]["positions_left_out"] == ["a05"]
+    assert any("cut.jpg" in name for name in summary["not_used"]) and "blank" in summary["not_used"]
+    images = pd.read_csv(out / "images.csv")
+    assert len(images) == 15 and (images["rms_px"] < 1).all()
+    # What was written can be adjusted again: the largest part, with its stations, in the map system.
+    block = read_block(out / "block")
+    assert block.frame.code == utm_of(*ORIGIN[:2]) and len(block.stations) == 33
+    interior = pd.read_csv(out / "result" / "interior.csv").set_index("parameter")
+    assert abs(interior.loc["c_mm", "value"] - C_MM) < 4 * interior.loc["c_mm", "sigma"] + 0.01
+    page = (out / "report.html").read_text()
+    for part in ("a05", "blank", "cut.jpg", "result/report.html", "result_2/report.html", "2 parts of 12, 3"):
+        assert part in page
+    assert (out / "result_2" / "report.html").is_file() and (out / "block_2" / "block.toml").is_file()
+
+
+def test_options_that_cannot_be(flown, tmp_path, monkeypatch, capsys):
+    for arguments, message in (
+        (["--epsg", 99], "EPSG code 99 is unknown"),
+        (["--model", "pinhole"], "no distortion model is called 'pinhole'"),
+        (["--pairs", "position:3"], "have no GPS position"),
+    ):
+        code, _, wrong = run(monkeypatch, capsys, "fly", flown, "--out", tmp_path / "o", *arguments)
+        assert code == 2 and message in wrong and not (tmp_path / "o").exists()
