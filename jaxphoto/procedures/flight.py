@@ -20,6 +20,8 @@ PARTS = {
     "stations X-Y": Selection("stations", axes=("X", "Y")),
     "stations Z": Selection("stations", axes="Z"),
 }
+# Random vectors: hundreds of thousands of image points make each expensive, and there are three parts to tell apart.
+_PROBES = 16
 
 
 class FlightPart(NamedTuple):
@@ -105,6 +107,7 @@ def _calibrated(
     components = None
     if placed and bool(adjusted.converged):
         report("estimating variance components")
-        components = variance_components(adjusted, PARTS)
-        adjusted = components.adjusted
+        components = variance_components(adjusted, PARTS, probes=_PROBES)
+        # Without an optimum they are no weights; the report says so.
+        adjusted = components.adjusted if bool(components.adjusted.converged) else adjusted
     return FlightPart(oriented, matched, placed, why_not, components, adjusted)

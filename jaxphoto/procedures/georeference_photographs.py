@@ -13,6 +13,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from pyproj.aoi import AreaOfInterest
 from pyproj.database import query_utm_crs_info
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 
 from jaxphoto.block import Block, Datum, Frame
 from jaxphoto.errors import InputError
@@ -22,9 +24,9 @@ from jaxphoto.observations import StationRows
 from jaxphoto.procedures.orientation.onto_known import Similarity, similarity_between
 
 SIGMA_M = (2.0, 2.0, 4.0)
-"""Of positions of a receiver without corrections, east, north and up, where the file says none: over the minutes of a
-flight most errors of GPS are common (SPS Performance Standard, 2020: 95 % within 8 m in plan, 13 m in height, once a
-position). Variance components tell more."""
+"""Of positions of a receiver without corrections, east, north and up, where the file says none and they scatter less:
+over the minutes of a flight most errors of GPS are common (SPS Performance Standard, 2020: 95 % within 8 m in plan and
+13 m in height, once a position). Variance components tell more."""
 # Samples of three positions: where 40 % are wrong, one in five is right throughout, and 200 hold one surely.
 _SAMPLES = 200
 # Of the median distance of all from where they should be: six standard deviations of a normal error in space.
@@ -67,7 +69,8 @@ def georeference_photographs(
     image = np.array([block.images.index(name) for name in known])
     there = np.asarray(block.start.unknowns.exterior.position, float)[image]
     similarity, used = _agreeing(there, here)
-    sigma = np.array([g.sigma_m or SIGMA_M for g in known.values()])
+    sigma = _sigmas(list(known.values()), (here - similarity.of(there))[used])
+    similarity = _nearest(similarity, there[used], here[used], sigma[used])
     rows, axis = np.flatnonzero(used).repeat(3), np.tile(np.arange(3), used.sum())
     stations = StationRows(image[rows], axis, here[rows, axis], sigma[rows, axis])
     placed = dataclasses.replace(
@@ -77,7 +80,8 @@ def georeference_photographs(
         frame=Frame("epsg", code, None, origin=origin),
     )
     offsets = here - similarity.of(there)
-    return GeoreferencedPhotographs(placed, tuple(known), offsets, used, tuple(_said(code, known, offsets, used)))
+    said = tuple(_said(code, known, offsets, used, sigma))
+    return GeoreferencedPhotographs(placed, tuple(known), offsets, used, said)
 
 
 def utm_of(longitude_deg: float, latitude_deg: float) -> int:
@@ -117,6 +121,33 @@ def _agreeing(there: Float[np.ndarray, "n 3"], here: Float[np.ndarray, "n 3"]) -
     return best, used
 
 
+def _sigmas(known: list[Gps], offsets: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
+    """What the files say; of those that say nothing `SIGMA_M`, or the scatter where that is more."""
+    plan = max(SIGMA_M[0], float(np.sqrt(np.mean(offsets[:, :2] ** 2))))
+    height = max(SIGMA_M[2], float(np.sqrt(np.mean(offsets[:, 2] ** 2))))
+    return np.array([gps.sigma_m or (plan, plan, height) for gps in known])
+
+
+def _nearest(
+    start: Similarity, there: Float[np.ndarray, "n 3"], here: Float[np.ndarray, "n 3"], sigma: Float[np.ndarray, "n 3"]
+) -> Similarity:
+    """The similarity of least squares with these weights.
+
+    An adjustment that began elsewhere would have to turn the whole block, in steps that images allow: hundreds.
+    """
+
+    def at(x: np.ndarray) -> Similarity:
+        turn = Rotation.from_rotvec(x[3:6]).as_matrix() @ start.turn
+        return Similarity(x[:3], turn, float(np.exp(x[6])))
+
+    # The shift is that of the middle, which a turn leaves where it is.
+    middle = there.mean(axis=0)
+    residual = lambda x: np.ravel((here - at(x).of(there - middle)) / sigma)  # noqa: E731
+    begin = np.concatenate([start.of(middle[None])[0], np.zeros(3), [np.log(start.scale)]])
+    best = at(least_squares(residual, begin, x_scale="jac").x)
+    return best._replace(shift=best.shift - best.scale * best.turn @ middle)
+
+
 def _moved(block: Block, s: Similarity) -> Block:
     """`block` whose start is brought to another frame."""
     unknowns = block.start.unknowns
@@ -129,18 +160,21 @@ def _moved(block: Block, s: Similarity) -> Block:
     return dataclasses.replace(block, start=dataclasses.replace(block.start, unknowns=unknowns))
 
 
-def _said(code: int, known: Mapping[str, Gps], offsets: np.ndarray, used: np.ndarray):
+def _said(code: int, known: Mapping[str, Gps], offsets: np.ndarray, used: np.ndarray, sigma: np.ndarray):
     n, own = len(known), sum(g.sigma_m is not None for g in known.values())
     plan, height = np.hypot(*offsets[used, :2].T), np.abs(offsets[used, 2])
     yield (
         f"{used.sum()} of {n} positions agree with the network: medians {np.median(plan):.2g} m in plan, "
         f"{np.median(height):.2g} m in height; map system EPSG:{code}"
     )
-    yield (
-        f"standard deviations of {own} positions are those of their files (RTK)"
-        if own
-        else f"no file says how good its position is: {SIGMA_M[0]:g} m in plan and {SIGMA_M[2]:g} m in height are taken"
-    )
+    if own:
+        yield f"standard deviations of {own} positions are those of their files (RTK)"
+    if own < n:
+        east, _, up = next(s for s, g in zip(sigma, known.values(), strict=True) if g.sigma_m is None)
+        yield (
+            f"{n - own} files do not say how good their positions are: {east:.2g} m east and north, {up:.2g} m up are "
+            "taken to begin with"
+        )
     yield "heights are as the files have them, which seldom say above what: the block is as high as they say"
     for name, off, good in zip(known, offsets, used, strict=True):
         if not good:
