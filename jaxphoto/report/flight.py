@@ -109,7 +109,8 @@ def positions_figure(report: PartReport) -> Figure:
     has = np.isfinite(d).all(axis=1)
     used = has & (table["position"] == "used").to_numpy()
     figure = new_figure(9.6, 7.0)
-    plan, (height, residual) = figure.add_subplot(1, 2, 1), (figure.add_subplot(2, 2, k) for k in (2, 4))
+    panels = figure.subplot_mosaic([["plan", "height"], ["plan", "residual"]])
+    plan, height, residual = (panels[name] for name in ("plan", "height", "residual"))
     plan.plot(station[:, 0], station[:, 1], "+", color="0.4", ms=6)
     if has.any():
         size = float(f"{max(np.median(np.hypot(*d[has, :2].T)), 1e-3):.0e}")
@@ -120,7 +121,7 @@ def positions_figure(report: PartReport) -> Figure:
                     *station[rows, :2].T, *d[rows, :2].T, angles="xy", scale_units="xy", scale=15 * size / wide,
                     color=colour, width=0.004, label=label,
                 )  # fmt: skip
-        plan.quiverkey(arrows, 0.8, 1.03, size, f"{size:g} m", labelpos="E")
+        plan.quiverkey(arrows, 0.08, 0.04, size, f"{size:g} m", labelpos="E")
         plan.legend(fontsize=8)
     plan.set(xlabel="X [m]", ylabel="Y [m]")
     plan.set_title("recorded minus adjusted", loc="left", fontsize=10)
