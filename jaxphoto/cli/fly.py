@@ -4,20 +4,21 @@ from pathlib import Path
 from threading import Thread
 from typing import Annotated
 
+import numpy as np
 import typer
 
-from jaxphoto.camera import DISTORTIONS
+from jaxphoto.camera import DISTORTIONS, InteriorOrientation
 from jaxphoto.cli.app import app
 from jaxphoto.cli.console import plain_console
 from jaxphoto.georeferencing.map_frame import map_system
 from jaxphoto.image_measurement.features import FEATURES, LONGEST_PX
-from jaxphoto.image_measurement.matching import match_photographs
+from jaxphoto.image_measurement.matching import MatchedPhotographs, match_photographs
 from jaxphoto.image_measurement.photograph_pairs import photograph_pairs
 from jaxphoto.io.block_folder import whole_block
 from jaxphoto.io.photographs import Photograph, sensor_and_interior
 from jaxphoto.io.sound_photographs import sound_photographs
 from jaxphoto.procedures.calibration import distortion_model
-from jaxphoto.procedures.flight import calibrate_flight
+from jaxphoto.procedures.flight import MatchedPart, calibrate_flight
 from jaxphoto.report import Level, prepare_pictures
 from jaxphoto.report.flight import block_folder, report_of, write_flight, write_part_orientation
 from jaxphoto.report.terminal import plain
@@ -75,7 +76,16 @@ def fly_command(
             in_parts=True,
             progress=lambda done, of: status.update(f"features and matches: {done} of {of}"),
         )
-        flight = calibrate_flight(read, camera, distortion, matched, epsg, status.update)
+        names, start = [p.name for p in read], camera.interior
+        flight = calibrate_flight(
+            [_part(names, group, matched.of(group)) for group in matched.parts],
+            camera.sensor,
+            InteriorOrientation(start.c, start.x_p, start.y_p, distortion),
+            {p.name: p.gps for p in read},
+            epsg,
+            status.update,
+        )
+        flight = flight._replace(left_out=matched.left_out | flight.left_out)
         status.update("computing statistics")
         reports = [report_of(part) for part in flight.parts]
         status.update(f"writing {out}")
@@ -99,6 +109,10 @@ def fly_command(
     console.print(f"results in {plain(str(out))} (open report.html)", soft_wrap=True)
     if verdict.level == Level.ALARM:
         raise typer.Exit(1)
+
+
+def _part(names: list[str], group: np.ndarray, own: MatchedPhotographs) -> MatchedPart:
+    return MatchedPart([names[k] for k in group], own.xy_mm, own.sigma_mm, own.pairs, own.n_gross, own.sigma_factor)
 
 
 def _usual_pairs(photographs: list[Photograph]) -> str:

@@ -14,6 +14,7 @@ from PIL import ExifTags, Image
 
 from jaxphoto.camera import InteriorOrientation, Sensor
 from jaxphoto.errors import InputError
+from jaxphoto.georeferencing.gps import Gps
 from jaxphoto.io.photograph_metadata import dji_fields, rtk_sigma
 from jaxphoto.io.picture_size import check_pixels
 
@@ -26,16 +27,6 @@ _USUAL_C = 1.2
 _NOMINAL_PIXEL_MM = 0.005
 _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _TAG = ExifTags.Base
-
-
-class Gps(NamedTuple):
-    """A position that the camera's own receiver gave, metres off at best."""
-
-    latitude_deg: float
-    longitude_deg: float
-    altitude_m: float | None
-    sigma_m: tuple[float, float, float] | None = None
-    """East, north and up, of a receiver with corrections that says them (DJI's RTK)."""
 
 
 class Photograph(NamedTuple):

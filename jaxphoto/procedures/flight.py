@@ -1,13 +1,16 @@
 """From matched photographs of a flight to calibrations: each part that hangs together, the largest first."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
+import numpy as np
+from jaxtyping import Float
+
 from jaxphoto.adjustment import Adjustment
-from jaxphoto.camera import AbstractDistortion, InteriorOrientation
+from jaxphoto.camera import InteriorOrientation, Sensor
 from jaxphoto.errors import BlockError, DatumError, InputError, RankError
-from jaxphoto.image_measurement.matching import MatchedPhotographs
-from jaxphoto.io.photographs import CameraStart, Photograph
+from jaxphoto.georeferencing.gps import Gps
+from jaxphoto.orientation.matches import PairMatches
 from jaxphoto.procedures.adjust import adjust_for_tables
 from jaxphoto.procedures.georeference_photographs import GeoreferencedPhotographs, georeference_photographs
 from jaxphoto.procedures.orientation import Oriented, orient
@@ -24,11 +27,24 @@ PARTS = {
 _PROBES = 16
 
 
+class MatchedPart(NamedTuple):
+    """Photographs that hang together: their features and which of them are the same places, as `orient` takes them."""
+
+    names: list[str]
+    xy_mm: list[Float[np.ndarray, "n 2"]]
+    sigma_mm: list[Float[np.ndarray, "n"]]
+    pairs: list[PairMatches]
+    n_gross: int
+    """Matches by looks that were left out."""
+    sigma_factor: float
+    """How far the others scatter, over what is expected of features of a plane."""
+
+
 class FlightPart(NamedTuple):
     """Photographs that hang together, oriented, brought to their positions where they have any, and adjusted."""
 
     oriented: Oriented
-    matched: MatchedPhotographs
+    matched: MatchedPart
     placed: GeoreferencedPhotographs | None
     why_not: str
     """Why there are no stations; "" where there are."""
@@ -37,68 +53,62 @@ class FlightPart(NamedTuple):
     adjusted: Adjustment
 
 
-class Flight(NamedTuple):
-    """The parts of a flight, and photographs that are in none, with the reason."""
+class CalibratedFlight(NamedTuple):
+    """The parts of a flight, the largest first, and photographs that are in none, with the reason."""
 
     parts: tuple[FlightPart, ...]
     left_out: dict[str, str]
 
 
 def calibrate_flight(
-    photographs: Sequence[Photograph],
-    camera: CameraStart,
-    distortion: AbstractDistortion,
-    matched: MatchedPhotographs,
+    matched: Sequence[MatchedPart],
+    sensor: Sensor,
+    interior: InteriorOrientation,
+    positions: Mapping[str, Gps | None],
     code: int | None = None,
     report: Report = lambda text: None,
-) -> Flight:
-    """Orient, georeference and adjust every part of the `matched` photographs of one `camera`.
+) -> CalibratedFlight:
+    """Orient, georeference and adjust every part of the photographs of one camera, which starts at `interior`.
 
-    `code` is the EPSG code of the map system (UTM where there is none). Photographs that nothing joins to others, that
+    `positions` are by name; `code` is the EPSG code of the map system (UTM where there is none). Photographs that
     cannot be oriented, and whole parts that cannot, are left out with the reason.
 
     Raises InputError where no part can be oriented.
     """
-    parts, left = [], dict(matched.left_out)
-    for number, group in enumerate(matched.parts, 1):
-        chosen = [photographs[k] for k in group]
-        report(f"part {number} of {len(matched.parts)}")
+    parts: list[FlightPart] = []
+    left: dict[str, str] = {}
+    for number, part in enumerate(matched, 1):
+        report(f"part {number} of {len(matched)}")
         try:
-            part = _calibrated(chosen, camera, distortion, matched.of(group), code, report)
+            parts.append(_calibrated(part, sensor, interior, positions, code, report))
         except BlockError as error:
-            left |= {p.name: f"its part of {len(chosen)} photographs cannot be oriented: {error}" for p in chosen}
+            left |= {
+                name: f"its part of {len(part.names)} photographs cannot be oriented: {error}" for name in part.names
+            }
             continue
-        parts.append(part)
-        left |= part.oriented.report.unoriented
+        left |= parts[-1].oriented.report.unoriented
     if not parts:
-        raise InputError(f"no photographs can be oriented; {next(iter(left.values()))}")
+        raise InputError(f"no photographs can be oriented; {next(iter(left.values()), 'there are none')}")
     parts.sort(key=lambda p: -len(p.oriented.block.images))
-    return Flight(tuple(parts), left)
+    return CalibratedFlight(tuple(parts), left)
 
 
 def _calibrated(
-    photographs: Sequence[Photograph],
-    camera: CameraStart,
-    distortion: AbstractDistortion,
-    matched: MatchedPhotographs,
+    matched: MatchedPart,
+    sensor: Sensor,
+    interior: InteriorOrientation,
+    positions: Mapping[str, Gps | None],
     code: int | None,
     report: Report,
 ) -> FlightPart:
-    start = camera.interior
+    title = f"flight of {len(matched.names)} photographs"
     oriented = orient(
-        [p.name for p in photographs],
-        camera.sensor,
-        InteriorOrientation(start.c, start.x_p, start.y_p, distortion),
-        matched.xy_mm,
-        matched.pairs,
-        matched.sigma_mm,
-        title=f"flight of {len(photographs)} photographs",
-        report=report,
+        matched.names, sensor, interior, matched.xy_mm, matched.pairs, matched.sigma_mm, title=title, report=report
     )
     report("adjusting")
     placed, why_not = None, ""
     try:
-        placed = georeference_photographs(oriented.block, {p.name: p.gps for p in photographs}, code)
+        placed = georeference_photographs(oriented.block, positions, code)
         adjusted = adjust_for_tables(placed.block)
     except (InputError, BlockError, DatumError, RankError) as error:
         # Positions that do not tell the frame, or too badly: the calibration does without.

@@ -18,8 +18,8 @@ from scipy.spatial.transform import Rotation
 
 from jaxphoto.block import Block, Datum, Frame
 from jaxphoto.errors import InputError
+from jaxphoto.georeferencing.gps import Gps
 from jaxphoto.georeferencing.map_frame import MapFrame
-from jaxphoto.io.photographs import Gps
 from jaxphoto.observations import StationRows
 from jaxphoto.procedures.orientation.onto_known import Similarity, similarity_between
 

@@ -11,7 +11,7 @@ import pandas as pd
 from jinja2 import Environment
 from markupsafe import Markup
 
-from jaxphoto.procedures.flight import Flight, FlightPart
+from jaxphoto.procedures.flight import CalibratedFlight, FlightPart
 from jaxphoto.report.findings import Finding, Level, Verdict
 from jaxphoto.report.maps import png_of
 from jaxphoto.report.orientation import ALIKE, orientation_sentences, write_orientation
@@ -137,7 +137,7 @@ def positions_figure(report: PartReport) -> Figure:
     return figure
 
 
-def flight_verdict(flight: Flight, reports: list[PartReport], spoilt: Mapping[str, str]) -> Verdict:
+def flight_verdict(flight: CalibratedFlight, reports: list[PartReport], spoilt: Mapping[str, str]) -> Verdict:
     """That of the largest part, and what there is besides it."""
     lost = len(flight.left_out) + len(spoilt)
     n = sum(len(r.part.oriented.block.images) for r in reports)
@@ -162,7 +162,7 @@ def block_folder(number: int) -> str:
     return "block" if number == 1 else f"block_{number}"
 
 
-def write_flight(flight: Flight, reports: list[PartReport], spoilt: Mapping[str, str], work: Path) -> Verdict:
+def write_flight(flight: CalibratedFlight, reports: list[PartReport], spoilt: Mapping[str, str], work: Path) -> Verdict:
     """report.html, flight.json and images.csv, and a result folder for every part, into the folder `work`."""
     verdict = flight_verdict(flight, reports, spoilt)
     for number, r in enumerate(reports, 1):
@@ -208,7 +208,7 @@ def _summary(r: PartReport, number: int) -> dict:
     }
 
 
-def _page(flight: Flight, reports: list[PartReport], spoilt: Mapping[str, str], verdict: Verdict) -> str:
+def _page(flight: CalibratedFlight, reports: list[PartReport], spoilt: Mapping[str, str], verdict: Verdict) -> str:
     each = []
     for number, r in enumerate(reports, 1):
         report, interior = r.part.oriented.report, r.tables.interior

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from jaxphoto.errors import InputError
+from jaxphoto.georeferencing.gps import Gps
 from jaxphoto.image_measurement.matching import epipolar_lines, match_photographs, tie_features
 from jaxphoto.image_measurement.photograph_pairs import nearest_pairs, photograph_pairs
-from jaxphoto.io.photographs import Gps, photographs, sensor_and_interior
+from jaxphoto.io.photographs import photographs, sensor_and_interior
 from jaxphoto.orientation.matches import PairMatches, connected_images, tracks
 from tests.image_measurement.ground import C_MM, SENSOR, mapped, photograph, texture
 

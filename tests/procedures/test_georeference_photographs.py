@@ -8,8 +8,8 @@ import pytest
 
 from jaxphoto import adjust
 from jaxphoto.errors import InputError
+from jaxphoto.georeferencing.gps import Gps
 from jaxphoto.georeferencing.map_frame import MapFrame
-from jaxphoto.io.photographs import Gps
 from jaxphoto.procedures.georeference_photographs import SIGMA_M, georeference_photographs, utm_of
 from jaxphoto.rotation import matrix_from_omega_phi_kappa
 from tests.blocks import free_network, simulated
