@@ -65,7 +65,7 @@ class Responses(eqx.Module):
         of one standard deviation of each observation."""
         zero = self._equations.at.increments
         b = jax.tree.map(lambda v: np.zeros((len(shared), *v.shape)), zero)
-        b.shared[np.arange(len(shared)), list(shared)] = 1.0
+        b.shared[np.arange(len(shared)), np.array(shared, int)] = 1.0
         for k, moved in zip(shared, self._pushed(self._solved(b)), strict=True):
             yield -moved * self._scale[k]
 
@@ -73,7 +73,7 @@ class Responses(eqx.Module):
         """z' H z of all errors z = `column(k)` with one another, and the shared unknowns' motions, as `to_errors`."""
         pulled = self._pulled(column, range(many))
         x = self._solved(pulled)
-        flat = (np.hstack([v.reshape(many, -1) for v in tree]) for tree in (pulled, x))
+        flat = (np.hstack([v.reshape(many, math.prod(v.shape[1:])) for v in tree]) for tree in (pulled, x))
         return np.matmul(next(flat), next(flat).T), self._moved(x)
 
     @property
@@ -116,8 +116,10 @@ class Responses(eqx.Module):
     def _run(self, function: Callable, batches: Iterable, many: int) -> Increments:
         """`function` of all batches, joined, without what the last was filled up with."""
         given, seconds = self._equations, self.adjusted.seconds
+        # Of none, too: blocks whose parameters are all held, or that have nothing to look for patterns in.
+        none = jax.tree.map(lambda v: np.zeros((0, *v.shape)), given.at.increments)
         parts = [jax.tree.map(still, run_compiled(function, (given, one), seconds, "covariance")) for one in batches]
-        return jax.tree.map(lambda *v: np.concatenate(v)[:many], *parts)
+        return jax.tree.map(lambda *v: np.concatenate(v)[:many], none, *parts)
 
 
 def prepare_responses(equations: NormalEquations, seconds: dict[str, float]) -> None:

@@ -12,8 +12,9 @@ from jaxphoto import FIXED, Tables, adjust, covariance
 from jaxphoto.camera import set_parameter
 from jaxphoto.report import verdict_of
 from jaxphoto.simulation import remeasure
-from jaxphoto.statistics import trends
-from tests.blocks import Simulated, observed, simulated
+from jaxphoto.statistics import patterns, trends
+from jaxphoto.statistics.responses import Responses
+from tests.blocks import Simulated, free_network, observed, simulated
 
 
 def in_strips() -> Simulated:
@@ -85,3 +86,11 @@ def test_blunders_have_no_part_in_patterns():
     for what, t in found.items():
         assert t.freedom == without[what].freedom
         assert t.p_value == pytest.approx(without[what].p_value, rel=0.05), what
+
+
+def test_where_there_is_nothing_to_look_for_nothing_is_found(monkeypatch):
+    """More cameras than are tested one by one, and no stations; and no parameter to ask after."""
+    a = adjust(free_network(), simulated("cross").truth)
+    monkeypatch.setattr(patterns, "_PARTS", 0)
+    assert trends(a, np.asarray(covariance(a).shared_sigma)) == []
+    assert list(Responses.of(a).of_unknowns([])) == []
