@@ -53,7 +53,14 @@ class DatumError(JaxphotoError):
 
 
 class RankError(JaxphotoError):
-    """Unknowns that the observations cannot tell apart, although the datum is determined."""
+    """Unknowns that the observations cannot tell apart, although the datum is determined.
+
+    `points` are the numbers of object points where they alone are at fault: rays that do not place them.
+    """
+
+    def __init__(self, message: str = "", points: Sequence[int] = ()):
+        super().__init__(message)
+        self.points = tuple(points)
 
 
 def few(names: Sequence[str], joint: str = ", ") -> str:

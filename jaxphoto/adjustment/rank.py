@@ -140,7 +140,8 @@ def check_rank(adjusted: Adjustment) -> None:
         return
     if found := weaknesses_of(adjusted):
         sentences = "; ".join(weakness.sentence for weakness in found)
-        raise RankError(f"the observations cannot tell these unknowns apart: {sentences}")
+        points = {p for weakness in found for p in weakness.points} if all(w.points for w in found) else set()
+        raise RankError(f"the observations cannot tell these unknowns apart: {sentences}", sorted(points))
 
 
 # Operation by operation it would compile each of them, a fifth of a second in all.

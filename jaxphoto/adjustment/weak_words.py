@@ -35,6 +35,8 @@ class WeakUnknowns(NamedTuple):
     labels: frozenset[str]
     sigma: float
     """In yardsticks."""
+    points: tuple[int, ...] = ()
+    """Points that lie anywhere along their rays, where nothing else takes part."""
 
 
 def weaknesses_of(adjusted: Adjustment, least: float = POOR) -> list[WeakUnknowns]:
@@ -109,7 +111,8 @@ class _Words:
             names = motion_names(np.array(bodies))
             sentence = self._block(d, labels, names) if kind[0] == "block" else self._part(d, labels, names)
         elif kind[0] == "points":
-            sentence = self._points(d)
+            points = tuple(sorted({int(p) for one in directions for p in one.points}))
+            return WeakUnknowns(self._points(d), frozenset(), d.sigma, points)
         elif kind[0] == "image":
             sentence = self._image(d)
         else:

@@ -11,12 +11,12 @@ from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from jaxphoto.adjustment import LEAST, MAX_STEPS, Adjustment, Outcome, Sizes, linearise, solve
 from jaxphoto.arrays import still
 from jaxphoto.block import Block
-from jaxphoto.errors import BlockError
+from jaxphoto.errors import BlockError, RankError
 from jaxphoto.losses import AbstractLoss, Huber, StudentT
 from jaxphoto.procedures.adjust import start_of
 from jaxphoto.statistics import LEAST_CHECKED, LEAST_SIGMA0, covariance, redundancy_numbers
@@ -78,12 +78,7 @@ def robust(
     converged = False
     for turn in range(_ROUNDS):
         report(f"robust adjustment, round {turn + 1}")
-        kept, point = without_observations(block, left)
-        solved = solve(kept, some_points(unknowns, point), kept.priors, max_steps, sizes, losses=found)
-        if solved.astray.any():
-            # Their place is anywhere: without them, from where the last round ended.
-            left[block.image_points.group] |= np.isin(block.image_points.point, point[solved.astray])
-            continue
+        solved, point, left = solve_placed(block, left, unknowns, max_steps, sizes, found)
         unknowns, converged = all_points(solved.unknowns, unknowns, point), bool(solved.converged)
         at = linearise(block, unknowns, block.priors, max_steps, sizes)
         r = r or checked_parts(at)
@@ -92,13 +87,42 @@ def robust(
         if change < _STILL:
             break
         found = new
-    if at is None:
-        raise BlockError(f"too many object points fly away: {Outcome.ASTRAY.value}")
+    assert at is not None
     weights = {name: np.ones(len(own)) for name, own in rows.items()}
     for name, own in found.items():
         v = np.atleast_2d(at.residuals[name])
         weights[name] = own.weights(np.sum(v**2, axis=0), len(v))
     return Robust(unknowns, converged, found, weights, at, left)
+
+
+def solve_placed(
+    block: Block,
+    left: Masks,
+    unknowns: Unknowns,
+    max_steps: int,
+    sizes: Sizes,
+    losses: Mapping[str, AbstractLoss] | None = None,
+) -> tuple[Adjustment, Int[np.ndarray, "points"], Masks]:
+    """`block` adjusted from `unknowns` without what is `left` out, and without points that the rest does not place.
+
+    With it the points that it has, and what is left out with the image points of the others: blunders may leave a point
+    any place along its rays. Raises what `solve` raises, and BlockError where points do not cease to be lost.
+    """
+    rows, left = block.image_points, dict(left)
+    for _ in range(_ROUNDS):
+        kept, point = without_observations(block, left)
+        try:
+            solved = solve(kept, some_points(unknowns, point), kept.priors, max_steps, sizes, losses=losses or {})
+            lost = np.flatnonzero(solved.astray)
+        except RankError as error:
+            if not error.points:
+                raise
+            lost = np.array(error.points)
+        if not len(lost):
+            return solved, point, left
+        # From where it began: what is lost has pulled at the others.
+        left[rows.group] = left[rows.group] | np.isin(rows.point, point[lost])
+    raise BlockError(f"too many object points fly away: {Outcome.ASTRAY.value}")
 
 
 def _rescaled(losses: dict[str, AbstractLoss], at: Adjustment, r: Blocks) -> dict[str, AbstractLoss]:

@@ -10,22 +10,18 @@
 Sources: Baarda (1968), A testing procedure for use in geodetic networks; Huber (1981), Robust statistics.
 """
 
-import dataclasses
 from collections.abc import Callable
-from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from jaxphoto.adjustment import MAX_STEPS, Adjustment, Outcome, Sizes, common_sizes, linearise, solve
-from jaxphoto.arrays import still
+from jaxphoto.adjustment import MAX_STEPS, Adjustment, Sizes, common_sizes, linearise
 from jaxphoto.block import Block
-from jaxphoto.errors import BlockError
 from jaxphoto.losses import AbstractLoss
 from jaxphoto.observations import AbstractObservations
 from jaxphoto.procedures.adjust import start_of
-from jaxphoto.procedures.cross_validation import measured_discrepancies
+from jaxphoto.procedures.exchanged_names import exchanged, name_exchanges, with_places
 from jaxphoto.procedures.robust import (
     Blocks,
     Masks,
@@ -33,7 +29,7 @@ from jaxphoto.procedures.robust import (
     checked_parts,
     residual_scales,
     robust,
-    some_points,
+    solve_placed,
 )
 from jaxphoto.statistics import (
     LEAST_CHECKED,
@@ -43,16 +39,12 @@ from jaxphoto.statistics import (
     chi_square_limit,
 )
 from jaxphoto.unknowns import Unknowns
-from jaxphoto.variants import without_observations
 
 # Huber's constant: residuals of so many standard deviations count whole (95 % efficient where all are normal).
 _HUBER = 1.345
 _ROBUST_STEPS, _ROUNDS = 10, 20
 # A weight that changes by less, in a robust step, no longer changes what is suspected.
 _STILL = 0.02
-# Two image points may have each other's name where one lies as near to the prediction of the other, beside how far
-# apart they are.
-_NEAR = 0.2
 # A blunder inflates the residuals around it: in one turn nothing goes that is less than this part of the worst.
 _BESIDE_THE_WORST = 0.5
 
@@ -106,14 +98,15 @@ def snoop(
     done: list[tuple[int, int]] = []
     while True:
         report(f"adjusting without {sum(int(m.sum()) for m in left.values())} observations")
-        kept, point = without_observations(block, left)
-        adjusted = solve(kept, some_points(at.unknowns, point), kept.priors, max_steps, sizes)
+        adjusted, point, left = solve_placed(block, left, at.unknowns, max_steps, sizes)
         at = linearise(block, all_points(adjusted.unknowns, at.unknowns, point), block.priors, max_steps, sizes)
         sigma0 = max(float(adjusted.sigma0), LEAST_SIGMA0)
-        pairs = [pair for pair in _exchanged(at, left, sigma0) if pair not in done]
+        lost = np.setdiff1d(np.arange(len(block.points)), point)
+        pairs = [e for e in name_exchanges(at, left, lost, sigma0, checked_parts(at)) if e.rows not in done]
+        for exchange in pairs:
+            (block, left), at = exchanged(block, left, exchange), with_places(at, exchange)
+            done.append(exchange.rows)
         if pairs:
-            block, left = _exchange(block, left, pairs)
-            done += pairs
             continue
         found = _tested(adjusted, at, left, point, sigma0)
         if len(tried) == _ROUNDS or any(_same(found, old) for old in (left, *tried)):
@@ -122,8 +115,8 @@ def snoop(
         left = found
     gone = np.setdiff1d(np.arange(len(block.points)), point)
     told = _told(at, left, _stays(block, point), checked_parts(at), sigma0)
-    exchanged = tuple(_named(block, pair) for pair in done)
-    return Snooped(adjusted, told, exchanged, tuple(block.points[p] for p in gone))
+    named = tuple(_named(block, pair) for pair in done)
+    return Snooped(adjusted, told, named, tuple(block.points[p] for p in gone))
 
 
 def _reweighted(
@@ -140,13 +133,7 @@ def _reweighted(
     for step in range(_ROBUST_STEPS + 1):
         report(f"robust step {step}" if step else "adjusting all observations")
         weighed = block.with_observations({name: _weighed(own, weight[name]) for name, own in rows.items()})
-        kept, point = without_observations(weighed, left)
-        found = solve(kept, some_points(unknowns, point), kept.priors, max_steps, sizes)
-        if found.astray.any():
-            # Blunders that leave their point no place: without it, from where the last step began.
-            flown = np.isin(block.image_points.point, point[found.astray])
-            left[block.image_points.group] |= flown
-            continue
+        found, point, left = solve_placed(weighed, left, unknowns, max_steps, sizes)
         unknowns = all_points(found.unknowns, unknowns, point)
         at = linearise(block, unknowns, block.priors, max_steps, sizes)
         r = r or checked_parts(at)
@@ -155,8 +142,7 @@ def _reweighted(
         if max(float(np.abs(new[name] - weight[name]).max(initial=0.0)) for name in rows) < _STILL:
             break
         weight = new
-    if at is None:
-        raise BlockError(f"too many object points fly away: {Outcome.ASTRAY.value}")
+    assert at is not None
     return at, r, left
 
 
@@ -235,37 +221,6 @@ def _stays(block: Block, point: np.ndarray) -> Masks:
 
 def _same(one: Masks, other: Masks) -> bool:
     return all(np.array_equal(one[name], other[name]) for name in one)
-
-
-def _exchanged(at: Adjustment, left: Masks, sigma0: float) -> list[tuple[int, int]]:
-    """Rows of image points left out, two of an image, that fit each other's prediction."""
-    p, r = at.block.image_points, checked_parts(at)[at.block.image_points.group]
-    # Both coordinates of two points are tested; as all others, against all others.
-    limit = sigma0**2 * float(chi_square_limit(np.array(2), LEVEL / len(p)))
-    measured, missed = still(p.xy), measured_discrepancies(at.block, at.unknowns)
-    predicted = measured - missed
-    found: list[tuple[int, int]] = []
-    for a, b in combinations(np.flatnonzero(left[p.group]).tolist(), 2):
-        apart = np.abs(measured[a] - measured[b]).max()
-        near = np.abs(measured[[a, b]] - predicted[[b, a]]).max() < _NEAR * apart
-        if p.image[a] == p.image[b] and near and not {a, b} & {k for pair in found for k in pair}:
-            # So far from where it was predicted, a difference is no measure: once more with the names exchanged.
-            block, _ = _exchange(at.block, left, [(a, b)])
-            off = measured_discrepancies(block, at.unknowns)[[a, b]] / still(p.sigma)[[a, b]]
-            if np.all(np.einsum("ni,nij,nj->n", off, r[[a, b]], off) < limit):
-                found.append((a, b))
-    return found
-
-
-def _exchange(block: Block, left: Masks, pairs: list[tuple[int, int]]) -> tuple[Block, Masks]:
-    """The block with the image points of `pairs` exchanged, and no longer left out."""
-    p, group = block.image_points, block.image_points.group
-    order, out = np.arange(len(p)), left[group].copy()
-    for a, b in pairs:
-        order[[a, b]] = b, a
-        out[[a, b]] = False
-    rows = dataclasses.replace(p, xy=still(p.xy)[order], sigma=still(p.sigma)[order])
-    return block.with_observations({group: rows}), left | {group: out}
 
 
 def _named(block: Block, pair: tuple[int, int]) -> Exchanged:

@@ -12,6 +12,7 @@ from jaxphoto.report.tables import Tables, in_file_unit
 from jaxphoto.statistics import (
     DELTA0,
     LEVEL,
+    MOST_PARTS,
     Suspect,
     Trend,
     global_test,
@@ -160,6 +161,12 @@ def _told(trend: Trend) -> str:
 def of_what_is_not_checked(tables: Tables) -> Iterator[Finding]:
     """What no test could find: points of two rays, and how large an error of each further group may stay hidden."""
     adjusted = tables.adjusted
+    if (n := len(adjusted.block.sensors)) > MOST_PARTS:
+        yield Finding(
+            Level.INFORMATION,
+            f"of {n} cameras neither patterns over their formats nor what undetected errors do to each are looked at; "
+            f"of up to {MOST_PARTS} they are",
+        )
     rays = np.bincount(adjusted.structure.point, minlength=len(adjusted.block.points))
     if twice := int((rays == 2).sum()):
         yield Finding(

@@ -24,8 +24,8 @@ from jaxphoto.statistics.discrepancy import observation_groups
 Places = Mapping[str, Int[np.ndarray, "..."]]
 # Numbers of all polynomials over a format together, beyond which those of the third degree do: seconds, and memory.
 _MOST = 100_000_000
-# Cameras, or strips, beyond which they are not tested one by one: the more tests, the less each can show.
-_PARTS = 40
+MOST_PARTS = 40
+"""Cameras, or strips, beyond which they are not judged one by one: the more tests, the less each can show."""
 # Of the grid on which terms are written as polynomials, along a side.
 _GRID = 9
 # Of a term's largest number, what its polynomials may miss.
@@ -111,7 +111,7 @@ def patterns_of(adjusted: Adjustment, places: Places) -> Iterator[ResidualPatter
     """
     groups = observation_groups(adjusted)
     count = sum(np.size(v) for v in places.values())
-    for camera in adjusted.unknowns.interior if len(adjusted.unknowns.interior) <= _PARTS else ():
+    for camera in adjusted.unknowns.interior if len(adjusted.unknowns.interior) <= MOST_PARTS else ():
         mine = np.array(adjusted.block.image_camera)[adjusted.structure.image] == camera
         if mine.any():
             yield _over_format(adjusted, camera, mine, places, 5 if count * 42 <= _MOST else 3)
@@ -182,7 +182,7 @@ def _by_strip(adjusted: Adjustment, name: str, rows: AbstractObservations, place
         terms = tuple(PatternTerm(n, one, cure) for (n, _), one in zip(columns, np.eye(len(columns)), strict=True))
         return ResidualPattern(f"{thing} {what}", rows.unit, "", parts, terms)
 
-    if 1 < len(of) <= _PARTS:
+    if 1 < len(of) <= MOST_PARTS:
         each = [(f"{a} of strip {s}", ((strips == s) & (axis == a)).astype(float)) for s in of for a in axes]
         yield pattern("from strip to strip", each, "on the average: let that strip shift, or look at its recording")
     if (time := _time(adjusted)) is not None:

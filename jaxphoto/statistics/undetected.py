@@ -19,13 +19,12 @@ from jaxphoto.observations import AbstractObservations, Correlated
 from jaxphoto.statistics.blunder_test import DELTA0, detectable_errors
 from jaxphoto.statistics.covariance import Covariance
 from jaxphoto.statistics.discrepancy import observation_groups
+from jaxphoto.statistics.patterns import MOST_PARTS
 from jaxphoto.statistics.reliability import UNCHECKED, Redundancy, error_precision
 from jaxphoto.statistics.responses import Responses
 
 POINTED = ("c_mm", "xp_mm", "yp_mm")
 """The interior parameters that are told of."""
-# Cameras beyond which none of them is told of: each takes three solutions.
-_CAMERAS = 40
 
 
 class UndetectedEffects(eqx.Module):
@@ -59,7 +58,7 @@ def undetected_effects(adjusted: Adjustment, covariance: Covariance, redundancy:
     variance = np.asarray(covariance.matrix).diagonal()[6 * covariance.n_images :]
     a_priori = np.sqrt(np.where(variance > 0, variance, np.nan))
     labels = {label: k for k, label in enumerate(adjusted.structure.labels)}
-    cameras = adjusted.unknowns.interior if len(adjusted.unknowns.interior) <= _CAMERAS else ()
+    cameras = adjusted.unknowns.interior if len(adjusted.unknowns.interior) <= MOST_PARTS else ()
     asked = [(c, p, labels[f"interior[{c}].{p}"]) for c in cameras for p in POINTED if f"interior[{c}].{p}" in labels]
     responses = Responses.of(adjusted)
     interior = {p: {name: np.full(np.shape(v), np.nan) for name, v in most.items()} for p in POINTED}

@@ -1,11 +1,13 @@
 """Blunders are found, named and left out; what is sound stays; exchanged names are put right."""
 
 import dataclasses
+import itertools
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from jaxphoto import adjust, snoop
+from jaxphoto import adjust, read_block, snoop
 from tests.blocks import simulated
 
 
@@ -101,3 +103,30 @@ def test_a_point_of_two_contradicting_rays_goes_as_a_whole(block):
     left = {s.row for s in found.left_out if s.group == "image_points"}
     assert block.points[point] in found.points or left <= set(rows.tolist())
     assert abs(float(found.adjusted.sigma0) / float(adjust(block).sigma0) - 1) < 0.1
+
+
+def test_exchanged_names_of_points_of_two_rays():
+    """Both points are gone with their rays; what was measured under the other's name brings them back."""
+    block = read_block(Path(__file__).parents[2] / "examples" / "cross_block")
+    p, position = block.image_points, np.asarray(block.start.unknowns.exterior.position)
+    rays, image = np.bincount(p.point)[p.point], block.images.index("A2")
+    pairs = []
+    for a, b in itertools.combinations(np.flatnonzero((p.image == image) & (rays == 2)).tolist(), 2):
+        others = [int(p.image[(p.point == p.point[k]) & (p.image != image)][0]) for k in (a, b)]
+        (x, y), (along, up) = np.asarray(p.xy)[b] - np.asarray(p.xy)[a], (position[others[0]] - position[image])[:2]
+        # Exchanged along their epipolar lines nothing would show.
+        if others[0] == others[1] and abs(x * up - y * along) > 4.0 * np.hypot(along, up):
+            pairs.append([a, b])
+    pair = pairs[0]
+
+    def exchange(xy):
+        xy[pair] = xy[pair[::-1]]
+
+    found = snoop(with_xy(block, exchange))
+    ((_, points),) = found.exchanged
+    assert set(points) == {block.points[p.point[k]] for k in pair}
+    assert not (found.left_out or found.points)
+    # Whichever of the two images they were exchanged in: the same two places.
+    places = np.asarray(adjust(block).unknowns.points)[p.point[pair]]
+    again = np.asarray(found.adjusted.unknowns.points)[p.point[pair]]
+    assert min(np.abs(again - places).max(), np.abs(again[::-1] - places).max()) < 1e-4

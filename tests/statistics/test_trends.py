@@ -91,6 +91,6 @@ def test_blunders_have_no_part_in_patterns():
 def test_where_there_is_nothing_to_look_for_nothing_is_found(monkeypatch):
     """More cameras than are tested one by one, and no stations; and no parameter to ask after."""
     a = adjust(free_network(), simulated("cross").truth)
-    monkeypatch.setattr(patterns, "_PARTS", 0)
+    monkeypatch.setattr(patterns, "MOST_PARTS", 0)
     assert trends(a, np.asarray(covariance(a).shared_sigma)) == []
     assert list(Responses.of(a).of_unknowns([])) == []
