@@ -68,7 +68,10 @@ def _one(rng: np.random.Generator, number: int) -> str:
     from jaxphoto.statistics import variance_components
 
     asked = rng.choice(["report", "report", "snoop", "weights", "covariance", "defect"])
-    block = _block(rng, asked)
+    try:
+        block = _block(rng, asked)
+    except JaxphotoError:
+        return "not simulated: an image sees too little"
     try:
         if asked == "snoop":
             jaxphoto.snoop(block)
@@ -99,7 +102,7 @@ def _block(rng: np.random.Generator, asked: str):
         "cameras.kodak.interior": {"c_mm": 34.0},
         "cameras.kodak.truth": {"c_mm": float(rng.normal(34.0, 0.3)), "xp_mm": float(rng.normal(0, 0.1))},
         "cameras.kodak.unknowns": {"c_mm": "free", "xp_mm": "free", "yp_mm": "free"},
-        "points.ties": int(rng.integers(30, 90)),
+        "points.ties": int(rng.integers(60, 120)),
         "flight.strips.0.images": int(rng.integers(4, 8)),
         "terrain": {"kind": "random", "count": 12, "rms_m": float(rng.uniform(5, 60)), "length_m": 700.0},
         "noise": {"image_mm": 0.004, "control_m": 0.03, "station_m": 0.1, "attitude_deg": 0.01},

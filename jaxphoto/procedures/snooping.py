@@ -1,7 +1,8 @@
 """Blunders found and left out: a robust start, then tests until nothing changes.
 
 1. The block is adjusted with weights that fall with the residual (Huber), again and again: many blunders hide one
-   another from the test of a single one, but hardly move such an estimate.
+   another from the test of a single one, but hardly move such an estimate. Where that leads to nothing that fits
+   (enormous errors in an image of few points), it begins again with Tukey's loss, which forgets them.
 2. What contradicts it is left out, and the block adjusted without it. Then, in turns: each observation left out is
    predicted by the others and put back where the prediction agrees; of those that are in, the worst of each point is
    left out where it contradicts the others (Baarda's data snooping). Until nothing changes.
@@ -18,7 +19,8 @@ from jaxtyping import Float
 
 from jaxphoto.adjustment import MAX_STEPS, Adjustment, Sizes, common_sizes, linearise
 from jaxphoto.block import Block
-from jaxphoto.losses import AbstractLoss
+from jaxphoto.errors import BlockError, JaxphotoError, RankError
+from jaxphoto.losses import AbstractLoss, Tukey
 from jaxphoto.observations import AbstractObservations
 from jaxphoto.procedures.adjust import start_of
 from jaxphoto.procedures.exchanged_names import exchanged, name_exchanges, with_places
@@ -45,6 +47,8 @@ _HUBER = 1.345
 _ROBUST_STEPS, _ROUNDS = 10, 20
 # A weight that changes by less, in a robust step, no longer changes what is suspected.
 _STILL = 0.02
+# Where the others agree no better than this, weights do not explain it (docs/trust.md), and there is another beginning.
+_FITS = 3.0
 # A blunder inflates the residuals around it: in one turn nothing goes that is less than this part of the worst.
 _BESIDE_THE_WORST = 0.5
 
@@ -85,11 +89,38 @@ def snoop(
     """
     sizes = common_sizes([block])
     start = start_of(block) if start is None else start
-    if loss is None:
-        at, r, flown = _reweighted(block, start, max_steps, sizes, report)
-    else:
-        begun = robust(block, loss, start, max_steps=max_steps, sizes=sizes, report=report)
-        at, r, flown = begun.at, checked_parts(begun.at), begun.astray
+    found: Snooped | None = None
+    failed: JaxphotoError | None = None
+    for beginning in (None, Tukey()) if loss is None else (loss,):
+        try:
+            if beginning is None:
+                begin = _reweighted(block, start, max_steps, sizes, report)
+            else:
+                begun = robust(block, beginning, start, max_steps=max_steps, sizes=sizes, report=report)
+                begin = begun.at, checked_parts(begun.at), begun.astray
+            new = _snooped(block, *begin, max_steps, sizes, report)
+        except (RankError, BlockError) as error:
+            failed = failed or error
+            continue
+        found = new if found is None or new.adjusted.sigma0 < found.adjusted.sigma0 else found
+        if bool(found.adjusted.converged) and float(found.adjusted.sigma0) <= _FITS:
+            return found
+    if found is None:
+        assert failed is not None
+        raise failed
+    return found
+
+
+def _snooped(
+    block: Block,
+    at: Adjustment,
+    r: Blocks,
+    flown: Masks,
+    max_steps: int,
+    sizes: Sizes,
+    report: Callable[[str], object],
+) -> Snooped:
+    """From where a robust adjustment has led: redundancy numbers there, and image points of points that flew away."""
     scale = residual_scales(at, r)
     worst = _worst(block, {name: size / scale[name] for name, size in _sizes(at, r).items()}, 1.0)
     left = {name: flown[name] | worst[name] for name in worst}

@@ -105,6 +105,19 @@ def test_a_point_of_two_contradicting_rays_goes_as_a_whole(block):
     assert abs(float(found.adjusted.sigma0) / float(adjust(block).sigma0) - 1) < 0.1
 
 
+@pytest.mark.parametrize("pair", [[202, 206], [202, 208]])
+def test_where_one_beginning_leads_nowhere_another_is_tried(block, pair):
+    """Exchanged names in the last image, whose orientation they turn: the first beginning ends at sigma naught 180."""
+
+    def exchange(xy):
+        xy[pair] = xy[pair[::-1]]
+
+    found = snoop(with_xy(block, exchange))
+    assert len(found.exchanged) == 1
+    assert not (found.left_out or found.points)
+    assert abs(float(found.adjusted.sigma0) / float(adjust(block).sigma0) - 1) < 1e-6
+
+
 def test_exchanged_names_of_points_of_two_rays():
     """Both points are gone with their rays; what was measured under the other's name brings them back."""
     block = read_block(Path(__file__).parents[2] / "examples" / "cross_block")
