@@ -26,13 +26,15 @@ from jaxphoto.errors import JaxphotoError
 from jaxphoto.image_measurement import read_grey
 from jaxphoto.io import clouds, read_block, read_recipe, read_source
 from jaxphoto.io.cameras import read_camera_file, write_camera_file
+from jaxphoto.io.control_files import read_control
 from jaxphoto.io.dbat import read_dbat
 from jaxphoto.io.draws_folder import DrawsFolder
 from jaxphoto.io.photomodeler import read_photomodeler
 from jaxphoto.io.raster import read_dsm
 from jaxphoto.io.trajectory import Records, read_records, write_flight_csv, write_sbet
+from jaxphoto.procedures.control.system import places, system_of
 from tests import sound_files
-from tests.io import test_bal, test_colmap
+from tests.io import control_files, test_bal, test_colmap
 from tests.io import test_cameras as cameras
 from tests.io import test_surfaces as surfaces
 from tests.io.conftest import FILES
@@ -204,6 +206,12 @@ def _picture(kind: str) -> Callable[[Path], object]:
     return lambda folder: read_grey(folder / f"a.{kind}")
 
 
+def _control(folder: Path, marks: Path | None = None) -> object:
+    """Points and marks, and the places of the points."""
+    read = read_control(folder / "a", marks)
+    return places(read.points, system_of(read.points.system, "a"), 4326) if read.points.system else read
+
+
 READERS: dict[str, Reader] = {
     "block": Reader(lambda: {name: content.encode() for name, content in FILES.items()}, read_block),
     "block-map": Reader(written_by(_map_block), read_block),
@@ -247,6 +255,17 @@ READERS: dict[str, Reader] = {
     "colmap-binary": Reader(written_by(test_colmap.write_binary), lambda folder: read_source(folder, "colmap")),
     "dbat": Reader(text(**sound_files.DBAT), read_dbat),
     "photomodeler": Reader(text(**sound_files.PHOTOMODELER), read_photomodeler),
+    "control-gcp-list": Reader(text(a=control_files.GCP_LIST), _control),
+    "control-metashape": Reader(text(a=control_files.MARKERS), _control),
+    "control-reference": Reader(text(a=control_files.REFERENCE), _control),
+    "control-pix4d": Reader(
+        text(a=control_files.PIX4D, b=control_files.PIX4D_MARKS),
+        lambda folder: _control(folder, folder / "b"),
+    ),
+    "control-own": Reader(
+        text(a=control_files.OWN, b=control_files.OWN_MARKS),
+        lambda folder: _control(folder, folder / "b"),
+    ),
     "dsm": Reader(sound_files.surface, lambda folder: read_dsm(folder / "a.tif")),
     "cloud-ply-text": Reader(sound_files.ply_text, lambda folder: clouds.read_cloud(folder / "a.ply")),
     **{f"cloud-{kind}": Reader(partial(sound_files.cloud, kind), _cloud(kind)) for kind in ("csv", "ply")},

@@ -23,6 +23,7 @@ PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), *EXAMPLES.glo
 # Whole procedures on blocks of their own size, for each of which there are tests.
 LONG = (
     "boresight",
+    "control",
     "correlation_studies",
     "experiments",
     "extending",

@@ -27,6 +27,9 @@ COMMANDS = {
     "calibrate": _Command("calibrate", "Calibrate a camera with photographs of a board."),
     "orient": _Command("orient", "Orient photographs to one another from their features alone."),
     "fly": _Command("fly", "Calibrate the camera of a flight from its photographs and their positions."),
+    "control": _Command(
+        "control", "Adjust an oriented block with control: surveyed points and where photographs show them."
+    ),
     "models": _Command(
         "model_choice", "Compare distortion models by cross-validation, information criteria and significance."
     ),

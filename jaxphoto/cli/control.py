@@ -1,0 +1,66 @@
+"""`jaxphoto control`: an oriented block and a file of control to the block with it, adjusted and judged."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from jaxphoto.cli.app import app
+from jaxphoto.cli.console import plain_console
+from jaxphoto.io import read_block
+from jaxphoto.io.block_folder import whole_block
+from jaxphoto.io.control_files import read_control
+from jaxphoto.procedures import adjust
+from jaxphoto.procedures.control import at_optimum, control_block
+from jaxphoto.report import Level, Tables, verdict_of
+from jaxphoto.report.control import control_findings, write_control
+from jaxphoto.report.findings import Verdict
+from jaxphoto.report.results import write_results
+from jaxphoto.report.terminal import plain
+from jaxphoto.writing import check_folder, whole_folder
+
+
+@app.command("control")
+def control_command(
+    block: Annotated[Path, typer.Argument(help="Block folder whose images are oriented.")],
+    file: Annotated[Path, typer.Argument(help="Surveyed points: gcp_list.txt, markers of Metashape as XML, or CSV.")],
+    out: Annotated[Path, typer.Option(help="Folder for block and result; earlier results in it are replaced.")],
+    marks: Annotated[Path | None, typer.Option(help="Marks of the points, where FILE has none.")] = None,
+    control_epsg: Annotated[
+        str | None,
+        typer.Option(help="System of the points where FILE does not say it: 25832, 25832+7837 with heights, local."),
+    ] = None,
+    epsg: Annotated[int | None, typer.Option(help="Map system of a block that has none (default: theirs).")] = None,
+) -> None:
+    """Adjust an oriented block with control: surveyed points and where photographs show them.
+
+    A block without a place is brought to that of the control. What contradicts the rest is left out and named. Exit
+    code 1: written, but the verdict is red.
+    """
+    check_folder(out, block, file, *((marks,) if marks else ()))
+    console, errors = plain_console(), plain_console(stderr=True)
+    with errors.status("reading") as status:
+        control, given = read_control(file, marks), read_block(block)
+        status.update("adjusting the block as it is")
+        oriented = at_optimum(adjust(given))
+        found = control_block(oriented, control, system=control_epsg, code=epsg, report=status.update)
+        status.update("computing statistics")
+        tables = Tables(found.adjusted)
+        verdict = Verdict.of([*verdict_of(tables).findings, *control_findings(found)])
+        status.update(f"writing {out}")
+        times = {name: found.adjusted.seconds[name] for name in ("compile", "solve", "covariance")}
+        with whole_folder(out) as work:
+            with whole_folder(work / "result") as folder:
+                write_results(tables, verdict, folder, times)
+            write_control(found, work)
+            with whole_block(found.adjusted.block, work / "block"):
+                pass
+    for sentence in found.sentences:
+        console.print(plain(sentence), soft_wrap=True)
+    console.print(plain(verdict.headline), soft_wrap=True)
+    for finding in verdict.findings:
+        if finding.level > Level.INFORMATION or "check points" in finding.text:
+            console.print(plain(f"  {finding.text}"), soft_wrap=True)
+    console.print(f"results in {plain(str(out))} (open result/report.html)", soft_wrap=True)
+    if verdict.level == Level.ALARM:
+        raise typer.Exit(1)

@@ -1,0 +1,5 @@
+"""Files of control points and of their marks in photographs, told apart by what is in them."""
+
+from jaxphoto.io.control_files.reader import read_control
+
+__all__ = ["read_control"]

@@ -1,0 +1,134 @@
+"""Tables of points, or of marks, as CSV or separated by semicolons, tabs or blanks: ours, Metashape's and Pix4D's.
+
+A comment may name the system: "# EPSG:25832", "# EPSG:25832+7837" with heights, "#CoordinateSystem: ..." with WKT.
+Roles are control and check; "enable" 0 of Metashape means check, too. Pixels are counted so that the centre of the
+upper-left one is (0.5, 0.5): Pix4D says no more than that the origin is the upper left of the image.
+"""
+
+import csv
+import re
+from pathlib import Path
+
+import numpy as np
+
+from jaxphoto.errors import InputError, quoted
+from jaxphoto.io.control_files.rows import Cells, Mark, PointRows, read_marks
+from jaxphoto.io.control_files.table_header import (
+    Columns,
+    columns_without_header,
+    in_degrees,
+    mark_columns,
+    point_columns,
+)
+from jaxphoto.io.text_tables import LONGEST_LINE, MOST_COLUMNS
+from jaxphoto.procedures.control.surveyed import Marks, SurveyedPoints
+
+_EPSG = re.compile(r"#.*\bEPSG:\s*(\d{4,6}(?:\+\d{4,6})?)\s*$", re.IGNORECASE)
+_WKT = re.compile(r"#\s*CoordinateSystem:\s*(\S.*)$")
+_ROLES = {
+    "": False, "control": False, "gcp": False, "3d gcp": False, "2d gcp": False,
+    "check": True, "cp": True, "check point": True, "checkpoint": True,
+}  # fmt: skip
+_OFF = ("0", "false", "no")
+
+
+def read_table(path: Path, lines: list[str], rows: list[int]) -> SurveyedPoints | Marks:
+    """The points or the marks of a table; `lines` are all that are not empty, comments among them.
+
+    Raises InputError for a table that is neither, and for cells that are wrong.
+    """
+    said = [match[1].strip() for line in lines for of in (_EPSG, _WKT) if (match := of.match(line.strip()))]
+    content = [(line, row) for line, row in zip(lines, rows, strict=True) if not line.lstrip().startswith("#")]
+    comments = [line for line in lines if line.lstrip().startswith("#")]
+    separator = _separator(content[0][0] if content else "")
+    cells = Cells(
+        path.name, [_split(path.name, line, row, separator) for line, row in content], [r for _, r in content]
+    )
+    for header in [*cells.records[:1], *(line.split(separator) for line in comments)]:
+        is_row = bool(cells.records) and header is cells.records[0]
+        own = cells._replace(records=cells.records[is_row:], rows=cells.rows[is_row:])
+        if columns := mark_columns(header):
+            return _marks(own, columns, separator)
+        if columns := point_columns(header):
+            return _points(own, columns, separator, "".join(said[:1]), bool(in_degrees(header, columns)))
+    found = columns_without_header(_dotted(cells, separator).records) if cells.records else None
+    if found is None:
+        raise cells.none(
+            "this is no file of control: give points (point, X_m, Y_m, Z_m), marks (image, point, x_px, y_px), a "
+            "gcp_list.txt, or markers of Metashape as XML"
+        )
+    kind, columns = found
+    if kind == "marks":
+        return _marks(cells, columns, separator)
+    return _points(cells, columns, separator, "".join(said[:1]), False)._replace(own_axes=True)
+
+
+def _points(cells: Cells, columns: Columns, separator: str, system: str, degrees: bool) -> SurveyedPoints:
+    cells, points = _dotted(cells, separator, columns["point"]), PointRows(cells.file)
+    for k, row in enumerate(cells.records):
+        # A table that ends in sums or in the points' errors has rows with another number of cells.
+        if len(row) <= max(columns["x"], columns["y"]):
+            raise cells.bad(k, f"{len(row)} cells are too few for the header; complete the row")
+        xyz = [cells.number(k, columns["x"], "X"), cells.number(k, columns["y"], "Y"), np.nan]
+        if "z" in columns and len(row) > columns["z"]:
+            xyz[2] = cells.height(k, columns["z"])
+        sigma = [cells.sigma(k, columns.get(f"sigma_{axis}"), f"sigma of {axis}") for axis in "xyz"]
+        plan = cells.sigma(k, columns.get("sigma_plan"), "sigma in plan")
+        sigma = [plan if np.isnan(v) and axis < 2 else v for axis, v in enumerate(sigma)]
+        if "sigma_x" in columns and "sigma_y" not in columns:
+            sigma = [sigma[0] if np.isnan(v) else v for v in sigma]
+        name = row[columns["point"]]
+        points.add(name, xyz, cells.place(k), sigma=sigma, check=_is_check(cells, k, columns), once=True)
+    found = points.surveyed(system)
+    if degrees and not (np.abs(found.coordinates[:, 0]) <= 360).all():
+        raise cells.none("the header says longitude and latitude, but the numbers are no degrees; correct the header")
+    return found
+
+
+def _is_check(cells: Cells, k: int, columns: Columns) -> bool:
+    row = cells.records[k]
+    cell = lambda name: row[columns[name]].lower() if name in columns and len(row) > columns[name] else ""  # noqa: E731
+    if cell("role") not in _ROLES:
+        raise cells.bad(k, f"the role {quoted(cell('role'))} is unknown; write control or check")
+    return _ROLES[cell("role")] or cell("enabled") in _OFF
+
+
+def _marks(cells: Cells, columns: Columns, separator: str) -> Marks:
+    cells = _dotted(cells, separator, columns["image"], columns["point"])
+    found: list[Mark] = []
+    for k, row in enumerate(cells.records):
+        if len(row) <= max(v for name, v in columns.items() if name != "sigma"):
+            raise cells.bad(k, f"{len(row)} cells are too few for the header; complete the row")
+        column_row = [cells.number(k, columns["x"], "x"), cells.number(k, columns["y"], "y")]
+        sigma = cells.sigma(k, columns.get("sigma"), "the sigma of the mark")
+        found.append((row[columns["image"]], row[columns["point"]], column_row, sigma, cells.place(k)))
+    if not found:
+        raise cells.none("there is no mark; add rows")
+    return read_marks(found)
+
+
+def _separator(line: str) -> str:
+    return next((s for s in ("\t", ";", ",") if s in line), " ")
+
+
+def _split(file: str, line: str, row: int, separator: str) -> list[str]:
+    if len(line) > LONGEST_LINE:
+        raise InputError(f"{file}, row {row}: the row has {len(line)} characters, at most {LONGEST_LINE}; correct it")
+    if separator == " ":
+        cells = line.split()
+    else:
+        try:
+            (cells,) = csv.reader([line], delimiter=separator, skipinitialspace=True, strict=True)
+        except csv.Error:
+            raise InputError(f"{file}, row {row}: the quotation marks do not pair; close or remove them") from None
+    if len(cells) > MOST_COLUMNS:
+        raise InputError(f"{file}, row {row}: the row has {len(cells)} cells, at most {MOST_COLUMNS}; correct it")
+    return [cell.strip() for cell in cells]
+
+
+def _dotted(cells: Cells, separator: str, *text: int) -> Cells:
+    """With points for decimal commas, which a separator other than a comma allows; not in the columns `text`."""
+    if separator == ",":
+        return cells
+    records = [[c if k in text else c.replace(",", ".") for k, c in enumerate(row)] for row in cells.records]
+    return cells._replace(records=records)

@@ -1,0 +1,6 @@
+"""Control of a block from files: surveyed points and marks, placed, adjusted with, tested."""
+
+from jaxphoto.procedures.control.control_block import ControlledBlock, at_optimum, control_block
+from jaxphoto.procedures.control.surveyed import Control, Marks, SurveyedPoints
+
+__all__ = ["Control", "ControlledBlock", "Marks", "SurveyedPoints", "at_optimum", "control_block"]

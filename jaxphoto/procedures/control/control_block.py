@@ -1,0 +1,220 @@
+"""An oriented block adjusted with control: placed, tested, and what contradicts the rest left out and named.
+
+1. Rays of the marks meet in points; a mark that contradicts the others of its point goes.
+2. Three control points or more that agree bring the block to their frame. With fewer it stays where it is.
+3. It is adjusted with them. Then, in turns, the one observation of control that contradicts the rest most is left out,
+   and points that were left out come back where they agree. Check points never enter.
+"""
+
+import dataclasses
+from collections.abc import Callable, Collection
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxphoto.adjustment import Adjustment
+from jaxphoto.block import Block, Start
+from jaxphoto.errors import InputError, few
+from jaxphoto.procedures.adjust import adjust_for_tables
+from jaxphoto.procedures.control.intersected import intersected
+from jaxphoto.procedures.control.into_block import into_block, with_gnss_bias, without_names
+from jaxphoto.procedures.control.judged import CRITICAL, Judged, beyond, judged
+from jaxphoto.procedures.control.marked import Marked, marked
+from jaxphoto.procedures.control.onto_control import LEAST, onto_control
+from jaxphoto.procedures.control.placed import InFrame, in_frame, moved
+from jaxphoto.procedures.control.surveyed import MARK_SIGMA_PX, SIGMA_M, Control
+
+_ROUNDS = 5
+
+
+class ControlledBlock(NamedTuple):
+    """A block adjusted with control, and what became of each surveyed point. Arrays are over the surveyed points."""
+
+    adjusted: Adjustment
+    ids: tuple[str, ...]
+    check: Bool[np.ndarray, "points"]
+    state: tuple[str, ...]
+    """control, check, left out (it contradicts the rest), not marked (in too few photographs)."""
+    n_marks: tuple[int, ...]
+    off_m: Float[np.ndarray, "points 3"]
+    """Surveyed minus adjusted, in the local frame of the block; NaN where there is none."""
+    survey_sigma_m: Float[np.ndarray, "points 3"]
+    sigma_m: Float[np.ndarray, "points 3"]
+    """Of the adjusted coordinates, a posteriori."""
+    w: Float[np.ndarray, "points 3"]
+    marks: Marked
+    """Those that were adjusted with; `point` counts the surveyed points."""
+    marks_px: Float[np.ndarray, "rows 2"]
+    """Their residuals, column and row."""
+    sentences: tuple[str, ...]
+
+
+def control_block(
+    block: Block,
+    control: Control,
+    *,
+    system: str | None = None,
+    code: int | None = None,
+    elsewhere: Collection[str] = (),
+    adjust: Callable[[Block], Adjustment] = adjust_for_tables,
+    report: Callable[[str], object] = lambda text: None,
+) -> ControlledBlock:
+    """`block`, whose images and points have a start, adjusted with `control`.
+
+    `system` names that of the points where their file does not, `code` the EPSG code of a block that has none yet.
+    `elsewhere` are photographs that are known but not of this block. Raises InputError for control that cannot be used
+    as it stands: see `in_frame` and `onto_control`; and where no mark is in a photograph of the block.
+    """
+    points, ids = control.points, control.points.ids
+    frame = in_frame(block, points, system, code)
+    rows, said = marked(block, points, control.marks, elsewhere)
+    if not len(rows.image):
+        first = f" ({few(list(dict.fromkeys(control.marks.image)))})" if control.marks.image else ""
+        raise InputError(f"{points.file}: no mark{first} is in a photograph of the block ({few(block.images)})")
+    met = intersected(block, block.start.unknowns, rows, ids)
+    rows, said = rows.take(met.good), [*said, *met.sentences]
+    sigma = np.where(np.isnan(points.sigma_m), SIGMA_M, points.sigma_m)
+    said += _assumed(control)
+    block, start, agree, told = _placed(block, frame, met.points, met.covariance, points.check, sigma, points)
+    said += told
+    count = np.bincount(rows.point, minlength=len(ids))
+    known = np.where(np.isnan(points.coordinates), np.nan, frame.xyz)
+    # One ray and a known place are an observation, one ray alone is none.
+    seen = (count > 1) & np.isfinite(start).all(axis=1) | (count == 1) & ~points.check & np.isfinite(known).all(axis=1)
+    start = np.where(np.isfinite(start), start, frame.xyz)
+    base = without_names(block, ids)
+    used = seen & ~points.check & agree
+    if len(base.stations) and all(np.isfinite(known[used, axis]).any() for axis in range(3)):
+        base = with_gnss_bias(base)
+        said.append("positions of the receiver have a shift of their own, which control tells")
+    now = rows.take(seen[rows.point])
+    tried: list[tuple] = []
+    for number in range(_ROUNDS):
+        report(f"adjusting with {int(used.sum())} control points")
+        which = np.flatnonzero(seen)
+        place = np.cumsum(seen) - 1
+        own = now._replace(point=place[now.point])
+        names = tuple(ids[k] for k in which)
+        made = into_block(base, names, known[which], sigma[which], start[which], own, used[which])
+        adjusted = adjust(made)
+        if not bool(adjusted.converged):
+            said.append("the adjustment with control did not converge; it is not tested")
+        found = _spread(judged(adjusted, len(which), known[which], sigma[which]), seen)
+        new, gone, text = _tested(found, now, used, seen & ~points.check, ids, block.images)
+        key = (used.tobytes(), len(now.image))
+        if number + 1 == _ROUNDS or not text or key in tried or not bool(adjusted.converged):
+            break
+        tried.append(key)
+        said += text
+        used, now = new, now.take(~gone)
+        count = np.bincount(now.point, minlength=len(ids))
+        seen &= count > 0
+        used &= seen
+        base = _from(base, adjusted)
+        start[which] = np.asarray(adjusted.unknowns.points)[len(base.points) :]
+    left = seen & ~points.check & ~used
+    said += _left_out(ids, left, found, frame)
+    state = np.where(points.check, "check", np.where(used, "control", "left out"))
+    state = np.where(seen, state, "not marked")
+    if not_marked := [ids[k] for k in np.flatnonzero(~seen)]:
+        said.append(f"{len(not_marked)} surveyed points are marked in too few photographs: {few(not_marked)}")
+    n_marks = tuple(int(v) for v in np.bincount(now.point, minlength=len(ids)))
+    return ControlledBlock(
+        adjusted, ids, points.check, tuple(state.tolist()), n_marks, found.off_m, sigma, found.sigma_m, found.w, now,
+        found.marks_px, tuple(dict.fromkeys(filter(None, said))),
+    )  # fmt: skip
+
+
+def _placed(block: Block, frame: InFrame, met, covariance, check, sigma, points):
+    """The block in the frame of control, where its points begin, which agree with it, and what is to be said."""
+    whole = np.isfinite(points.coordinates).all(axis=1)
+    known = np.flatnonzero(np.isfinite(met).all(axis=1) & ~check & whole)
+    agree = np.ones(len(met), bool)
+    if frame.at_place and len(known) < LEAST:
+        text = f"{len(known)} control points are marked in two photographs or more: the block stays at its positions"
+        return block, met, agree, [text]
+    spread = np.sqrt(np.trace(covariance[known], axis1=1, axis2=2))
+    if not frame.at_place:
+        # In the unit of the block's own frame, which a similarity is to tell.
+        first = onto_control(met[known], frame.xyz[known], np.linalg.norm(sigma[known], axis=1), points.file)
+        spread = spread * first.similarity.scale
+    onto = onto_control(
+        met[known], frame.xyz[known], np.hypot(np.linalg.norm(sigma[known], axis=1), spread), points.file
+    )
+    agree[known] = onto.agree
+    said = [f"{int(onto.agree.sum())} of {len(known)} control points bring the block to their frame"]
+    if frame.at_place:
+        off = np.median((frame.xyz - met)[known[onto.agree]], axis=0)
+        told = ", ".join(f"{v:.2f}" for v in off)
+        said.append(f"control lies {told} m (east, north, up) from where the positions of the photographs have it")
+    return moved(block, onto.similarity, frame.frame), onto.similarity.of(met), agree, said
+
+
+def _assumed(control: Control) -> list[str]:
+    said = []
+    n = int(np.isnan(control.points.sigma_m).any(axis=1).sum())
+    if n:
+        east, _, up = SIGMA_M
+        said.append(
+            f"{n} surveyed points have no standard deviations: {east:g} m east and north, {up:g} m up are taken"
+        )
+    if n := int(np.isnan(control.marks.sigma_px).sum()):
+        said.append(f"{n} marks have no standard deviations: {MARK_SIGMA_PX:g} px is taken")
+    return said
+
+
+def _tested(found: Judged, now: Marked, used, able, ids, images):
+    """Control points in use after the test, marks that go, and a sentence for each; nothing where all agree."""
+    new, gone, said = used.copy(), np.zeros(len(now.image), bool), []
+    w = np.nan_to_num(found.w).max(axis=1)
+    of_control, of_marks = np.where(used, w, 0.0), np.nan_to_num(found.marks_w)
+    worst = max(of_control.max(initial=0.0), of_marks.max(initial=0.0))
+    if worst > CRITICAL:
+        if of_marks.max(initial=0.0) == worst:
+            row = int(of_marks.argmax())
+            gone[row] = True
+            off = np.linalg.norm(found.marks_px[row])
+            name, image = ids[now.point[row]], images[now.image[row]]
+            said.append(f"the mark of {name} in {image} is {off:.3g} px off (w = {worst:.3g}) and left out")
+        else:
+            new[int(of_control.argmax())] = False
+            said.append("")
+    else:
+        back = able & ~used & ~beyond(found.w) & np.isfinite(found.w).any(axis=1)
+        if back.any():
+            new |= back
+            said.append("")
+    return new, gone, said
+
+
+def _left_out(ids, left, found: Judged, frame: InFrame):
+    for k in np.flatnonzero(left):
+        told = ", ".join(f"{v:.3g}" for v in found.off_m[k])
+        text = f"control point {ids[k]} contradicts the rest by {told} m (east, north, up) and is left out"
+        near = np.linalg.norm(frame.xyz - found.adjusted_m[k], axis=1)
+        other = int(np.argmin(np.where(np.arange(len(ids)) == k, np.inf, near)))
+        if near[other] < 0.1 * np.linalg.norm(found.off_m[k]):
+            text += f": its marks show {ids[other]}, so look at the names"
+        yield text
+
+
+def _spread(own: Judged, seen) -> Judged:
+    """Over all surveyed points, NaN for those that are not in the block."""
+    wide = lambda v: np.where(seen[:, None], v[np.cumsum(seen) - 1], np.nan)  # noqa: E731
+    return own._replace(
+        adjusted_m=wide(own.adjusted_m), off_m=wide(own.off_m), sigma_m=wide(own.sigma_m), w=wide(own.w)
+    )
+
+
+def at_optimum(adjusted: Adjustment) -> Block:
+    """The block of an adjustment, all of whose images and points start where that has led."""
+    block = adjusted.block
+    known = (np.ones(len(names), bool) for names in (block.images, block.points))
+    return dataclasses.replace(block, start=Start(adjusted.unknowns, *known))
+
+
+def _from(base: Block, adjusted: Adjustment) -> Block:
+    """`base` that starts at the optimum of the same with control."""
+    unknowns = dataclasses.replace(adjusted.unknowns, points=np.asarray(adjusted.unknowns.points)[: len(base.points)])
+    return dataclasses.replace(base, start=dataclasses.replace(base.start, unknowns=unknowns))

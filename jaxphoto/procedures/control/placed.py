@@ -1,0 +1,94 @@
+"""A block and control in one frame: the block in that of the control, or the control in that of the block."""
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxphoto.block import Block, Frame
+from jaxphoto.errors import InputError
+from jaxphoto.georeferencing.map_frame import MapFrame, check_heights
+from jaxphoto.procedures.control.surveyed import SurveyedPoints
+from jaxphoto.procedures.control.system import ControlSystem, check_near, filled, fitting, places, system_of
+from jaxphoto.procedures.georeference_photographs import utm_of
+from jaxphoto.procedures.orientation.onto_known import Similarity
+
+
+class InFrame(NamedTuple):
+    """Surveyed points in a Cartesian frame."""
+
+    frame: Frame
+    xyz: Float[np.ndarray, "points 3"]
+    """m; heights that are not known are those of the others."""
+    at_place: bool
+    """Whether the block was there before, so that it tells where the points should be."""
+
+
+def in_frame(block: Block, points: SurveyedPoints, words: str | None, code: int | None) -> InFrame:
+    """The points in the frame of `block`, or where it has none in one of theirs.
+
+    `words` name their system where the file does not. `code` is the EPSG code that a new frame has; without one it is
+    that of the points, or UTM. Raises InputError for a system that is not told, told twice, or cannot be, and for
+    points that lie far from the block, with what would fit.
+    """
+    system = _system(block, points, words)
+    if block.frame.kind == "epsg":
+        assert block.frame.code is not None and block.frame.origin is not None
+        if system.crs is None:
+            raise InputError(
+                f"{points.file} is in a local system and the block in EPSG:{block.frame.code}: give the control there, "
+                "or orient the photographs without their positions"
+            )
+        check_near(points, system, *block.frame.origin[:2])
+        there = places(points, system, block.frame.code)
+        return InFrame(block.frame, block.frame.map.local_from_place(there), True)
+    if system.crs is None:
+        return InFrame(dataclasses.replace(block.frame, kind="local"), filled(points), False)
+    if code is None:
+        code = system.code if system.code is not None and _serves(system) else None
+    if code is None:
+        middle = np.median(places(points, system, 4326), axis=0)
+        code = utm_of(*middle[:2])
+    there = places(points, system, code)
+    middle = np.median(there, axis=0)
+    origin = (round(float(middle[0]), 4), round(float(middle[1]), 4), 0.0)
+    vertical = system.vertical if code == system.code else None
+    if vertical is not None:
+        check_heights(code, vertical)
+    return InFrame(
+        Frame("epsg", code, vertical, origin=origin), MapFrame(code, vertical, origin).local_from_place(there), False
+    )
+
+
+def _system(block: Block, points: SurveyedPoints, words: str | None) -> ControlSystem:
+    own = system_of(points.system, points.file) if points.system else None
+    given = system_of(words, "the EPSG code of the control") if words else None
+    if own and given and own.crs != given.crs:
+        raise InputError(f"{points.file} says {own.name}, but {given.name} is given; leave out the one that is wrong")
+    found = own or given
+    if found is None:
+        would = ""
+        if block.frame.kind == "epsg" and block.frame.origin is not None:
+            would = fitting(points, None, *block.frame.origin[:2])
+        raise InputError(
+            f"{points.file} does not say the coordinate system of its points; give its EPSG code (or local, for "
+            "Cartesian metres of no map)" + (f": they would fit {would}" if would else "")
+        )
+    return found
+
+
+def _serves(system: ControlSystem) -> bool:
+    return system.crs is not None and (system.crs.is_projected or system.crs.is_geographic)
+
+
+def moved(block: Block, s: Similarity, frame: Frame) -> Block:
+    """`block` whose start is brought to another frame; stations stay where they are."""
+    unknowns = block.start.unknowns
+    exterior = dataclasses.replace(
+        unknowns.exterior,
+        position=s.of(np.asarray(unknowns.exterior.position, float)),  # type: ignore[arg-type]
+        camera_from_object=np.asarray(unknowns.exterior.camera_from_object, float) @ s.turn.T,
+    )
+    unknowns = dataclasses.replace(unknowns, exterior=exterior, points=s.of(np.asarray(unknowns.points, float)))
+    return dataclasses.replace(block, start=dataclasses.replace(block.start, unknowns=unknowns), frame=frame)

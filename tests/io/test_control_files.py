@@ -1,0 +1,117 @@
+"""Files of control in every form: told apart by content, read to the number, refused in a sentence."""
+
+import numpy as np
+import pytest
+
+from jaxphoto.errors import InputError
+from jaxphoto.io.control_files import read_control
+from jaxphoto.procedures.control.system import places, system_of
+from tests.io import control_files as files
+
+
+def read(folder, points, marks=None):
+    """From files whose names tell nothing."""
+    (folder / "a").write_text(points, encoding="utf-8")
+    if marks is not None:
+        (folder / "b").write_text(marks, encoding="utf-8")
+    return read_control(folder / "a", None if marks is None else folder / "b")
+
+
+def test_a_gcp_list_has_points_and_marks(tmp_path):
+    points, marks = read(tmp_path, files.GCP_LIST)
+    assert points.ids == ("G1", "G2", "P1") and points.system == "EPSG:32633" and not points.check.any()
+    np.testing.assert_array_equal(points.coordinates[0], (386800.10, 6175000.20, 30.5))
+    assert np.isnan(points.coordinates[1, 2]) and np.isnan(points.sigma_m).all()
+    assert marks.image[:2] == ("DJI_0001.JPG", "DJI_0002.JPG") and marks.point == ("G1", "G1", "G2", "P1", "P1")
+    # Their (0, 0) is the centre of the first pixel, ours is (0.5, 0.5) there.
+    np.testing.assert_array_equal(marks.column_row[[0, 2]], [(1013.0, 800.75), (100.0, 0.5)])
+
+
+def test_markers_of_metashape(tmp_path):
+    points, marks = read(tmp_path, files.MARKERS)
+    assert points.ids == ("point 1", "point 2") and points.check.tolist() == [False, True]
+    np.testing.assert_array_equal(points.coordinates[0], (13.2001, 55.7001, 30.5))
+    np.testing.assert_array_equal(points.sigma_m, [(0.01, 0.01, 0.02), (0.005,) * 3])
+    # What is not pinned was not measured.
+    assert list(zip(marks.image, marks.point, strict=True)) == [
+        ("DJI_0001.JPG", "point 1"), ("DJI_0002.JPG", "point 2"), ("DJI_0002.JPG", "tie"),
+    ]  # fmt: skip
+    np.testing.assert_array_equal(marks.column_row[0], (100.25, 200.5))
+    assert system_of(points.system, "a").code == 4326
+
+
+def test_the_reference_pane_of_metashape(tmp_path):
+    points, marks = read(tmp_path, files.REFERENCE)
+    assert points.ids == ("G1", "G2") and points.check.tolist() == [False, True] and not marks.image
+    np.testing.assert_array_equal(points.coordinates[1], (386900.0, 6175100.0, 31.5))
+    np.testing.assert_array_equal(points.sigma_m[0], (0.01, 0.01, 0.02))
+    assert np.isnan(points.sigma_m[1]).all() and system_of(points.system, "a").code == 32633
+
+
+def test_pix4d_without_headers_is_in_the_order_of_the_axes(tmp_path):
+    points, marks = read(tmp_path, files.PIX4D, files.PIX4D_MARKS)
+    np.testing.assert_array_equal(points.sigma_m[0], (0.02, 0.02, 0.03))
+    assert marks.image[0] == "D:/flight/DJI_0001.JPG" and marks.sigma_px.tolist() == [1.0, 0.5, 0.5]
+    there = places(points, system_of("EPSG:4326", "a"), 4326)
+    np.testing.assert_allclose(there[0], (13.20022, 55.70011, 29.931), rtol=1e-12)
+    with_header = read(
+        tmp_path, "Label,Latitude,Longitude,Altitude [m]\n" + files.PIX4D.replace(",0.02,0.03", "")
+    ).points
+    np.testing.assert_allclose(with_header.coordinates, there, rtol=1e-12)
+
+
+def test_our_own_tables(tmp_path):
+    points, marks = read(tmp_path, files.OWN, files.OWN_MARKS)
+    assert points.system == "32633" and points.check.tolist() == [False, True]
+    assert points.places == ("a, row 3", "a, row 4")
+    np.testing.assert_array_equal(marks.column_row, [(100.25, 200.5), (110.25, 210.5)])
+    assert marks.sigma_px[0] == 0.1 and np.isnan(marks.sigma_px[1])
+
+
+@pytest.mark.parametrize(
+    ("points", "marks", "words"),
+    [
+        ("", None, "the file is empty"),
+        ("hello\nworld\n", None, "this is no file of control"),
+        (files.OWN_MARKS, None, "has marks but no coordinates"),
+        (files.OWN, files.OWN, "has coordinates but no marks"),
+        (files.OWN + "G1,1,2,3,,,,\n", None, "row 5: the point 'G1' stands in a, row 3, too with other coordinates"),
+        (files.OWN.replace("386800.10", "east"), None, "row 3: X is 'east', not a number"),
+        (files.OWN.replace("control\n", "master\n"), None, "row 3: the role 'master' is unknown"),
+        (files.OWN.replace("0.02", "-0.02"), None, "row 3: sigma of z is -0.02"),
+        (files.OWN, files.OWN_MARKS.replace("G1", "H1"), "no mark is of a point that a has (H1; there are G1, G2)"),
+        (files.OWN, files.OWN_MARKS.replace("DJI_0002", "DJI_0001"), "'G1' is marked in 'DJI_0001' in b, row 2, too"),
+        (files.GCP_LIST + "1 2 3 4 5\n", None, "row 7: 5 cells"),
+        (
+            files.GCP_LIST.replace("30.5 512.5", "31.5 512.5"),
+            None,
+            "row 3: the point 'G1' stands in a, row 2, too",
+        ),
+        (files.GCP_LIST.replace("DJI_0003.JPG", "=DJI()"), None, "begins like a formula"),
+        (files.MARKERS[:900], None, "the XML is broken"),
+        (files.MARKERS.replace('camera_id="0"', 'camera_id="5"'), None, "the file has no such camera"),
+        (files.MARKERS.replace('x="100.25"', 'x="nan"'), None, "x is 'nan', not a number"),
+    ],
+)
+def test_what_cannot_be_is_refused_in_a_sentence(tmp_path, points, marks, words):
+    with pytest.raises(InputError) as caught:
+        read(tmp_path, points, marks)
+    assert words in str(caught.value), caught.value
+
+
+def test_words_for_systems():
+    for words, code, vertical in (
+        ("EPSG:25832", 25832, None),
+        ("25832+7837", 25832, 7837),
+        ("WGS84 UTM 16N", 32616, None),
+        ("WGS84 UTM 23S", 32723, None),
+        ("+proj=utm +zone=10 +ellps=WGS84 +datum=WGS84 +units=m +no_defs", 32610, None),
+        ("+proj=longlat +ellps=WGS84 +datum=WGS84 +no_defs", 4326, None),
+        ("local", None, None),
+    ):
+        found = system_of(words, "a")
+        assert (found.code, found.vertical) == (code, vertical), words
+    # Strings of PROJ that read files are none.
+    for words in ("+init=/dev/zero:1", "+proj=utm +zone=3 +nadgrids=/dev/zero", "UTM 33", "EPSG:99", "x" * 30_000):
+        with pytest.raises(InputError):
+            system_of(words, "a")

@@ -1,0 +1,66 @@
+"""An oriented block in a frame of its own whose control is known from files: surveyed points in UTM, and marks."""
+
+import dataclasses
+from typing import NamedTuple
+
+import equinox as eqx
+import numpy as np
+
+from jaxphoto.block import Block
+from jaxphoto.collinearity import ExteriorOrientation
+from jaxphoto.georeferencing.map_frame import MapFrame
+from jaxphoto.procedures.control.surveyed import Control, Marks, SurveyedPoints
+from jaxphoto.procedures.georeference_photographs import utm_of
+from jaxphoto.rotation import matrix_from_omega_phi_kappa
+from jaxphoto.unknowns import Unknowns
+from jaxphoto.variants import without_observations
+from tests.blocks import free_network, simulated
+
+ORIGIN = (13.2, 55.7, 0.0)
+CODE = utm_of(*ORIGIN[:2])
+CONTROL, CHECK = (0, 3, 10, 16, 32, 34), (12, 21, 25)
+SIGMA_M = 0.02
+TURN = np.asarray(matrix_from_omega_phi_kappa(np.array([0.4, -0.7, 2.1])))
+
+
+class Marked(NamedTuple):
+    block: Block
+    truth: Unknowns
+    control: Control
+    true_xyz: np.ndarray
+    """Of the surveyed points, in the frame at `ORIGIN`."""
+
+
+def marked_block(seed: int = 3) -> Marked:
+    """The crossing strips of `tests.blocks`, some of whose points are surveyed and marked instead."""
+    truth, block, rng = simulated("cross").truth, free_network(), np.random.default_rng(seed)
+    which = np.array(CONTROL + CHECK)
+    rows = block.image_points
+    own = np.isin(rows.point, which)
+    kept, points = without_observations(block, {"image_points": own})
+    sensor = block.sensors["one"]
+    marks = Marks(
+        tuple(f"DCIM/{block.images[i]}.JPG" for i in rows.image[own]),
+        tuple(f"G{p}" for p in rows.point[own]),
+        sensor.px_from_mm(np.asarray(rows.xy)[own]),
+        np.full(int(own.sum()), 0.5),
+        tuple(f"marks.csv, row {k + 2}" for k in range(own.sum())),
+    )
+    true = np.asarray(truth.points)[which]
+    surveyed = true + rng.normal(0, SIGMA_M, true.shape)
+    # As an orientation leaves it: adjusted, in a frame and a scale of its own.
+    away = lambda x: 0.01 * (np.asarray(x) - 300.0) @ TURN.T + 5.0  # noqa: E731
+    matrices = np.asarray(truth.exterior.camera_from_object) @ TURN.T
+    exterior = ExteriorOrientation(away(truth.exterior.position), matrices)
+    start = dataclasses.replace(truth, exterior=exterior, points=away(truth.points)[points])
+    kept = eqx.tree_at(lambda b: b.start.unknowns, kept, start)
+    control = SurveyedPoints(
+        "control.csv",
+        tuple(f"G{p}" for p in which),
+        MapFrame(CODE, None, ORIGIN).map(surveyed),
+        np.full(true.shape, SIGMA_M),
+        np.isin(which, CHECK),
+        tuple(f"control.csv, row {k + 2}" for k in range(len(which))),
+        f"EPSG:{CODE}",
+    )
+    return Marked(kept, truth, Control(control, marks), true)

@@ -1,0 +1,105 @@
+"""A block in a frame of its own, surveyed points in UTM and marks: the truth again, blunders named, nothing turned."""
+
+import numpy as np
+import pytest
+
+from jaxphoto import adjust
+from jaxphoto.errors import InputError
+from jaxphoto.georeferencing.map_frame import MapFrame
+from jaxphoto.procedures.control import control_block
+from tests.procedures.controlled import CHECK, CODE, CONTROL, ORIGIN, marked_block
+
+
+@pytest.fixture(scope="module")
+def marked():
+    return marked_block()
+
+
+def found_in(marked, control):
+    return control_block(marked.block, control, adjust=adjust)
+
+
+def in_true_frame(found):
+    """The surveyed points of the adjustment in the frame of the truth, by way of the map."""
+    a = found.adjusted
+    points = np.asarray(a.unknowns.points)[-len(found.ids) :]
+    return MapFrame(CODE, None, ORIGIN).local(a.block.frame.map.map(points))
+
+
+def with_coordinates(control, coordinates):
+    return control._replace(points=control.points._replace(coordinates=coordinates))
+
+
+def test_control_brings_the_block_to_its_place(marked):
+    found = found_in(marked, marked.control)
+    assert found.adjusted.block.frame.code == CODE and bool(found.adjusted.converged)
+    assert found.state == ("control",) * len(CONTROL) + ("check",) * len(CHECK)
+    # Against the truth, not against what was surveyed.
+    off = in_true_frame(found) - marked.true_xyz
+    sigma = found.sigma_m
+    assert np.abs(off / sigma).max() < 4.5 and np.sqrt(np.mean((off / sigma) ** 2)) < 1.6
+    check = np.array(found.state) == "check"
+    assert np.nanmax(found.w[check]) < 3.5 and np.nanmax(found.w[~check]) < 3.5
+    assert not [s for s in found.sentences if "left out" in s]
+
+
+def test_a_wrong_coordinate_and_a_wrong_mark_are_named_and_turn_nothing(marked):
+    control, sound = marked.control, found_in(marked, marked.control)
+    xyz, pixels = control.points.coordinates.copy(), control.marks.column_row.copy()
+    xyz[1] += (5.0, 0.0, 0.0)
+    pixels[2] += (300.0, 0.0)
+    image, name = control.marks.image[2], control.marks.point[2]
+    wrong = with_coordinates(control, xyz)._replace(marks=control.marks._replace(column_row=pixels))
+    found = found_in(marked, wrong)
+    said = " ".join(found.sentences)
+    assert f"the mark of {name} in {image[5:7]} contradicts those" in said
+    assert f"control point {control.points.ids[1]} contradicts the rest by 5" in said
+    assert found.state[1] == "left out" and found.n_marks[0] == sound.n_marks[0] - 1
+    moved = in_true_frame(found) - in_true_frame(sound)
+    others = np.arange(len(found.ids)) != 1
+    assert np.abs(moved / found.sigma_m)[others].max() < 2
+
+
+def test_a_blunder_that_the_places_hide_is_found_by_the_adjustment(marked):
+    """2 m, within what a block of this size may be bent by before it is adjusted."""
+    xyz = marked.control.points.coordinates.copy()
+    xyz[3, 0] += 2.0
+    found = found_in(marked, with_coordinates(marked.control, xyz))
+    assert [name for name, state in zip(found.ids, found.state, strict=True) if state == "left out"] == ["G16"]
+
+
+def test_exchanged_names_are_seen(marked):
+    xyz = marked.control.points.coordinates.copy()
+    xyz[[0, 4]] = xyz[[4, 0]]
+    found = found_in(marked, with_coordinates(marked.control, xyz))
+    said = " ".join(found.sentences)
+    for one, other in (("G0", "G32"), ("G32", "G0")):
+        assert f"control point {one} contradicts" in said and f"its marks show {other}" in said
+
+
+def test_marks_that_cannot_be_used_cost_a_sentence(marked):
+    control = marked.control
+    pixels = control.marks.column_row.copy()
+    pixels[0] = (9000.0, 10.0)
+    image = ("nowhere.jpg", *control.marks.image[1:2], "I2.jpg", *control.marks.image[3:])
+    spoilt = control._replace(marks=control.marks._replace(image=image))
+    said = " ".join(found_in(marked, spoilt).sentences)
+    assert "1 marks name no photograph that is used and are left out: nowhere.jpg (marks.csv, row 2)" in said
+    spoilt = control._replace(marks=control.marks._replace(column_row=pixels))
+    assert "1 marks lie outside of the picture" in " ".join(found_in(marked, spoilt).sentences)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda c: with_coordinates(c, c.points.coordinates[:, [1, 0, 2]]), "with X and Y exchanged"),
+        (lambda c: c._replace(points=c.points._replace(system="")), "does not say the coordinate system"),
+        (lambda c: c._replace(marks=c.marks.take(np.arange(3))), "1 control points are marked in two photographs"),
+        (lambda c: c._replace(marks=c.marks._replace(image=("x",) * len(c.marks.image))), "no mark (x) is in"),
+        (lambda c: with_coordinates(c, c.points.coordinates[[3, 0, 4, 1, 5, 2, 6, 7, 8]]), "do not fit"),
+    ],
+)
+def test_control_that_cannot_be_is_refused_in_a_sentence(marked, change, words):
+    with pytest.raises(InputError) as caught:
+        found_in(marked, change(marked.control))
+    assert words in str(caught.value), caught.value
