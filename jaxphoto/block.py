@@ -212,4 +212,5 @@ def exposures(block: Block) -> Exposure:
     mounts = block.start.unknowns.mounts
     nominal = np.stack([mounts[name].nominal if name in mounts else NOMINAL["forward"] for name in block.image_mount])
     flight_time = block.image_time if block.flight_time is None else block.flight_time
-    return Exposure(block.image_time, motion.velocity, motion.rate, nominal, flight_time)  # type: ignore[arg-type]
+    height = np.array([block.sensors[camera].height_mm for camera in block.image_camera])
+    return Exposure(block.image_time, motion.velocity, motion.rate, nominal, flight_time, height)  # type: ignore[arg-type]
