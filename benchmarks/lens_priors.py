@@ -2,8 +2,9 @@
 
     python benchmarks/lens_priors.py --flights 200 [--also-free] [--out DIR]
 
-Every flight has another lens, drawn from `jaxphoto.camera.lens_prior` about the nominal values that EXIF would tell, and
-positions by a receiver of --station-m (twice as bad in height). With --also-free each is adjusted once more without what is known of the lens.
+Every flight has another lens, drawn from `jaxphoto.camera.lens_prior` about the nominal values that EXIF would tell,
+and positions by a receiver of --station-m (twice as bad in height). With --also-free each is adjusted once more without
+what is known of the lens.
 """
 
 import argparse
@@ -91,8 +92,9 @@ def main() -> None:
     for case in ("prior", "free")[: 1 + args.also_free]:
         own = [r for r in rows if r["case"] == case]
         good = [r for r in own if r["outcome"] == Outcome.CONVERGED.value]
+        # c off by four standard deviations of the lens.
         ran = [r for r in good if abs(r["c_mm_off"]) > 4 * prior_sigmas(prior, camera.start, sensor)["c_mm"]]
-        print(f"{case}: {len(own)} flights, {len(good)} converged, of these {len(ran)} ran away (c off by 4 sigmas of the lens)")
+        print(f"{case}: {len(own)} flights, {len(good)} converged, of these {len(ran)} ran away")
         for n in NAMES:
             z = np.array([r[f"{n}_off"] / r[f"{n}_sigma"] for r in good])
             sigma = np.median([r[f"{n}_sigma"] for r in good])

@@ -96,8 +96,9 @@ def main() -> None:
             off, sigma = (np.array([r[f"{n}_{k}"] for r in good]) for k in ("off", "sigma"))
             z = off / sigma
             print(
-                f"  {n}: mean error {off.mean():.3g}, rms {np.sqrt(np.mean(off**2)):.3g}, largest {np.abs(off).max():.3g}; "
-                f"median sigma {np.median(sigma):.3g}; inside 95 %: {100 * np.mean(np.abs(z) < 1.96):.0f} %, "
+                f"  {n}: mean error {off.mean():.3g}, rms {np.sqrt(np.mean(off**2)):.3g}, "
+                f"largest {np.abs(off).max():.3g}; median sigma {np.median(sigma):.3g}; "
+                f"inside 95 %: {100 * np.mean(np.abs(z) < 1.96):.0f} %, "
                 f"largest {np.abs(z).max():.1f} sigma"
             )
     if args.out:

@@ -12,6 +12,7 @@ from importlib import resources
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -45,9 +46,7 @@ class LensPrior(NamedTuple):
 def lens_priors() -> tuple[tuple[tuple[str, ...], tuple[str, ...], LensPrior], ...]:
     """The table: models, beginnings of makes (and models), and the prior; the first that fits is taken."""
     table = tomllib.loads(resources.files(__package__).joinpath("lens_priors.toml").read_text("utf-8"))
-    return tuple(
-        (tuple(row.pop("models", ())), tuple(row.pop("makes", ())), LensPrior(**row)) for row in table["lens"]
-    )
+    return tuple((tuple(row.pop("models", ())), tuple(row.pop("makes", ())), LensPrior(**row)) for row in table["lens"])
 
 
 def lens_prior(make: str | None, model: str | None) -> LensPrior:
@@ -95,5 +94,5 @@ def _edge(sensor: Sensor) -> Float[np.ndarray, "places 2"]:
 
 def _moved(interior: InteriorOrientation, name: str, edge: np.ndarray) -> Float[np.ndarray, "places 2"]:
     """What a coefficient moves places by (mm), for each of its units."""
-    move = lambda v: jax.vmap(set_parameter(interior, name, v).closed_form)(edge)  # noqa: E731
+    move = lambda v: jax.vmap(set_parameter(interior, name, v).closed_form)(jnp.asarray(edge))  # noqa: E731
     return np.asarray(jax.jit(lambda: jax.jvp(move, (0.0,), (1.0,))[1])())

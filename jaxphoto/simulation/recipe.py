@@ -153,9 +153,10 @@ class Approximation:
 class Recipe:
     """A simulation but for its seed.
 
-    `mounts` are by name, "default" or that of a camera, `shutters` by camera; `biases` by name, "default" or that of a strip. `stated` sigmas
-    are those of the block's observations, `noise` those by which these are truly off. `datum_offset_m` is added to all
-    observed stations and is in no model. `settlement` is what stands on the terrain; `lidar` scans both, in strips.
+    `mounts` are by name, "default" or that of a camera, `shutters` by camera; `biases` by name, "default" or that of a
+    strip. `stated` sigmas are those of the block's observations, `noise` those by which these are truly off.
+    `datum_offset_m` is added to all observed stations and is in no model. `settlement` is what stands on the terrain;
+    `lidar` scans both, in strips.
     """
 
     title: str
