@@ -18,7 +18,7 @@ from jaxtyping import Float, Int
 from jaxphoto.arrays import Numbers, joined, still
 from jaxphoto.block_from_arrays import block_fields
 from jaxphoto.block_parts import Datum, Frame, Motion, Start
-from jaxphoto.camera import Sensor
+from jaxphoto.camera import ImageMotion, InteriorOrientation, RollingShutter, RowMotion, Sensor
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import BlockError
 from jaxphoto.georeferencing import NOMINAL, Corrections, Exposure, Mount, StripBias, direct_orientation
@@ -205,6 +205,22 @@ def _by_name(table: dict, names: tuple[str, ...], absent):
     return jax.tree.map(lambda *v: joined([still(x)[None] for x in v])[index], *table.values(), absent)
 
 
+def row_motions(block: Block, unknowns: Unknowns) -> RowMotion | None:
+    """How the rows of every image move (with a leading axis over the images); None where no shutter rolls."""
+    shutters = unknowns.more.get(RollingShutter.kind, {})
+    if not shutters:
+        return None
+    motions = unknowns.more.get(ImageMotion.kind, {})
+    readout = _by_name(shutters, block.image_camera, RollingShutter(jnp.zeros(())))
+    still = jnp.zeros(3)
+    motion = _by_name(motions, block.images, ImageMotion(still, still))
+
+    def of_one(shutter: RollingShutter, motion: ImageMotion, exposure: Exposure) -> RowMotion:
+        return motion.interior(shutter.interior(InteriorOrientation(1.0), exposure), exposure).rows
+
+    return jax.vmap(of_one)(readout, motion, jax.tree.map(jnp.asarray, exposures(block)))
+
+
 def exposures(block: Block) -> Exposure:
     """What is known of every exposure besides its observations, with a leading axis over the images."""
     none = np.zeros((len(block.images), 3))
@@ -212,4 +228,5 @@ def exposures(block: Block) -> Exposure:
     mounts = block.start.unknowns.mounts
     nominal = np.stack([mounts[name].nominal if name in mounts else NOMINAL["forward"] for name in block.image_mount])
     flight_time = block.image_time if block.flight_time is None else block.flight_time
-    return Exposure(block.image_time, motion.velocity, motion.rate, nominal, flight_time)  # type: ignore[arg-type]
+    height = np.array([block.sensors[camera].height_mm for camera in block.image_camera])
+    return Exposure(block.image_time, motion.velocity, motion.rate, nominal, flight_time, height)  # type: ignore[arg-type]

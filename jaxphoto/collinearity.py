@@ -16,6 +16,9 @@ from jaxphoto.camera import InteriorOrientation
 from jaxphoto.rotation import matrix_from_omega_phi_kappa, omega_phi_kappa_from_matrix, rotate
 from jaxphoto.single import single
 
+# Rounds to the row of a rolling shutter that sees a point: each leaves a hundredth of the error, or less.
+_ROWS = 10
+
 
 class ExteriorOrientation(eqx.Module):
     """Projection centre (m) and rotation of one image, or of many with a leading axis."""
@@ -71,9 +74,15 @@ def project(
 ) -> Float[Array, "2"]:
     """Measured image coordinate (mm, from the image centre) of an object point (m).
 
-    Where the point is not `in_field`, the value is meaningless.
+    Of a rolling shutter it is that of the row which sees the point while it is exposed, found by iteration. Where the
+    point is not `in_field`, the value is meaningless.
     """
-    return interior.measured_from_ideal(project_ideal(interior, _single(exterior), single("point", point, 3)))
+    in_camera = tuple(camera_coordinates(_single(exterior), single("point", point, 3)))
+    seen = lambda u, v, w: interior.measured_from_ideal(interior.ideal_from_direction(u, v, w))  # noqa: E731
+    rows = interior.rows
+    if rows is None:
+        return seen(*in_camera)
+    return jax.lax.fori_loop(0, _ROWS, lambda _, xy: seen(*rows.at_row(xy[1], in_camera)), seen(*in_camera))
 
 
 def image_ray(
@@ -96,7 +105,8 @@ def image_residual(
 
     `ideal(measured) - projection` for models in the measured coordinate; `measured - distorted projection` for
     models in the ideal one. Where `interior.residuals` is "measured", the first is taken back into the measured image
-    by the derivative of the distortion at the measured coordinate.
+    by the derivative of the distortion at the measured coordinate. A rolling shutter sees the point from where the
+    camera is while the row of the measured coordinate is exposed (`camera.rolling_shutter`).
     """
     return camera_residual(interior, camera_coordinates(exterior, point), xy)
 
@@ -107,6 +117,8 @@ def camera_residual(
     """`image_residual` of a point in the camera frame (m; see `camera_coordinates`)."""
     # By component to the end: arrays of two that are computed with in between cost an adjustment a tenth of its time.
     u, v, w = in_camera
+    if interior.rows is not None:
+        u, v, w = interior.rows.at_row(xy[1], (u, v, w))
     projection = interior.ideal_from_direction(u, v, w)
     reduced = jnp.stack([xy[0] - interior.x_p, xy[1] - interior.y_p])
     (x, y), (x0, y0) = (

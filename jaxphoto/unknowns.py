@@ -18,13 +18,15 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxphoto.arrays import Numbers
-from jaxphoto.camera import InteriorOrientation, PrincipalDistanceRate
+from jaxphoto.camera import ImageMotion, InteriorOrientation, PrincipalDistanceRate, RollingShutter
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import FlightBias, Mount, Scanner, StripBias
 from jaxphoto.parameters import AbstractParameters
 
-UNKNOWNS: tuple[type[AbstractParameters], ...] = (Scanner, Mount, StripBias, FlightBias, PrincipalDistanceRate)
+UNKNOWNS: tuple[type[AbstractParameters], ...] = (
+    Scanner, Mount, StripBias, FlightBias, PrincipalDistanceRate, RollingShutter, ImageMotion,
+)  # fmt: skip
 """The classes of declared parameters that a block folder may hold; one of your own is given to `read_block`."""
 
 

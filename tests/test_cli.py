@@ -28,6 +28,7 @@ FILES = {
     "check_points.csv",
     "correlation.csv",
     "correlation_summary.csv",
+    "correlation_ground.csv",
     "report.html",
 }
 XYZ = ["X_m", "Y_m", "Z_m"]
@@ -56,6 +57,7 @@ COLUMNS = {
     "check_points": ["point", "dX_m", "dY_m", "dZ_m"],
     "correlation": ["parameter_a", "parameter_b", "rho"],
     "correlation_summary": ["camera", "exterior", "interior", "mean_abs_rho", "max_abs_rho"],
+    "correlation_ground": ["camera", "ground", "sigma_m", "parameter", "rho"],
 }
 
 

@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float
 from jaxphoto.camera.declared import Declared
 from jaxphoto.camera.distortion import AbstractDistortion, Brown, invert
 from jaxphoto.camera.projection import AbstractProjection, Perspective
+from jaxphoto.camera.rolling_shutter import RowMotion
 from jaxphoto.errors import InputError
 from jaxphoto.single import single
 
@@ -35,6 +36,8 @@ class InteriorOrientation(eqx.Module):
     distortion: AbstractDistortion = dataclasses.field(default_factory=Brown)
     residuals: Literal["model", "measured"] = eqx.field(static=True, default="model")
     projection: AbstractProjection = dataclasses.field(default_factory=Perspective)
+    rows: RowMotion | None = None
+    """How the camera moves while rows are exposed: only within an adjustment that knows of it (`RollingShutter`)."""
 
     def __check_init__(self) -> None:
         if both := set(self.projection.coefficients) & set(self.distortion.coefficients):

@@ -15,7 +15,7 @@ from jaxphoto.image_measurement.features import FEATURES, LONGEST_PX
 from jaxphoto.image_measurement.matching import MatchedPhotographs, match_photographs
 from jaxphoto.image_measurement.photograph_pairs import photograph_pairs
 from jaxphoto.io.block_folder import whole_block
-from jaxphoto.io.photographs import Photograph, sensor_and_interior
+from jaxphoto.io.photographs import Photograph, known_lens, sensor_and_interior
 from jaxphoto.io.sound_photographs import sound_photographs
 from jaxphoto.procedures.calibration import distortion_model
 from jaxphoto.procedures.flight import MatchedPart, calibrate_flight
@@ -47,6 +47,9 @@ def fly_command(
     c_mm: Annotated[float | None, typer.Option(help="Where the principal distance starts; else from EXIF.")] = None,
     pixel_mm: Annotated[float | None, typer.Option(help="Size of a pixel; else from EXIF.")] = None,
     model: Annotated[str, typer.Option(help=f"Distortion: {', '.join(DISTORTIONS)}.")] = "brown",
+    lens_prior: Annotated[
+        bool, typer.Option(help="Observe the camera as what is known of such lenses (docs/lens_priors.md).")
+    ] = True,
 ) -> None:
     """Calibrate the camera of a flight from its photographs and their positions: orient, georeference, adjust, judge.
 
@@ -84,6 +87,7 @@ def fly_command(
             {p.name: p.gps for p in read},
             epsg,
             status.update,
+            known_lens(read, camera, distortion) if lens_prior else None,
         )
         flight = flight._replace(left_out=matched.left_out | flight.left_out)
         status.update("computing statistics")

@@ -12,17 +12,21 @@ from typing import Any, NamedTuple
 
 from PIL import ExifTags, Image
 
-from jaxphoto.camera import InteriorOrientation, Sensor
+from jaxphoto.camera import AbstractDistortion, InteriorOrientation, Sensor
+from jaxphoto.camera.lens_prior import lens_prior
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing.gps import Gps
 from jaxphoto.io.photograph_metadata import dji_fields, rtk_sigma
 from jaxphoto.io.picture_size import check_pixels
+from jaxphoto.procedures.known_lens import KnownLens
 
 _DIAGONAL_35_MM = math.hypot(36, 24)
 # What lenses there are for it: fields of 154 to half a degree. Some cameras note 1 or 65535 where they do not know.
 _FILM_MM = (5.0, 5000.0)
 # Of the longer side: the start of many programs where nothing is known, a field of 45 degrees.
 _USUAL_C = 1.2
+# Fields of 20 to 80 degrees are usual: c of 0.6 to 2.8 times the longer side.
+_GUESSED = 0.5
 # Of a pixel whose size is not known; c in pixels is what matters then.
 _NOMINAL_PIXEL_MM = 0.005
 _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
@@ -56,6 +60,8 @@ class CameraStart(NamedTuple):
     interior: InteriorOrientation
     origin: str
     """A sentence that says where pixel size and principal distance come from."""
+    c_rounding: float = 0.0
+    """Relative standard deviation of c, in pixels, that is due to how it was noted."""
 
 
 def photographs(paths: Sequence[str | Path]) -> list[Photograph]:
@@ -105,21 +111,39 @@ def sensor_and_interior(
     if pixel is None:
         pixel = _NOMINAL_PIXEL_MM
     if c_mm is not None:
-        c, c_origin = c_mm, "c as given"
+        c, c_origin, rounding = c_mm, "c as given", 0.0
     elif pixel_mm is None and first.focal_length_mm and pixel_origin:
         c, c_origin = first.focal_length_mm, "c is the focal length of EXIF"
+        # A pixel size that follows from both focal lengths is as good as the one that is noted in whole millimetres.
+        rounding = _rounded(c if first.sensor_width_mm else first.focal_length_35mm_mm or c)
     elif first.focal_length_35mm_mm:
         c = first.focal_length_35mm_mm / _DIAGONAL_35_MM * math.hypot(first.width_px, first.height_px) * pixel
         c_origin = f"c from {first.focal_length_35mm_mm:g} mm on film of 36 mm x 24 mm (EXIF)"
+        rounding = _rounded(first.focal_length_35mm_mm)
     elif pixel_mm is not None and first.focal_length_mm:
         c, c_origin = first.focal_length_mm, "c is the focal length of EXIF"
+        rounding = _rounded(c)
     else:
         c = _USUAL_C * longer * pixel
         c_origin = f"c a guess, {_USUAL_C:g} times the longer side: EXIF does not tell it"
+        rounding = _GUESSED
     pixel_origin = pixel_origin or "pixel size nominal: EXIF does not tell it, and only c in pixels matters"
     sensor = Sensor(first.width_px, first.height_px, pixel)
     sentence = f"c = {c:.6g} mm ({c / pixel:.5g} pixels of {pixel:.4g} mm): {c_origin}; {pixel_origin}."
-    return CameraStart(sensor, InteriorOrientation(c), sentence)
+    return CameraStart(sensor, InteriorOrientation(c), sentence, rounding)
+
+
+def known_lens(photographs: Sequence[Photograph], camera: CameraStart, distortion: AbstractDistortion) -> KnownLens:
+    """What is known of the lens of the photographs by make and model, about `camera` without any distortion."""
+    told = next((p for p in photographs if p.make or p.model), photographs[0])
+    nominal = InteriorOrientation(camera.interior.c, 0.0, 0.0, distortion)
+    return KnownLens(nominal, lens_prior(told.make, told.model), camera.c_rounding)
+
+
+def _rounded(mm: float) -> float:
+    """The relative standard deviation of a focal length as it is written: uniform within its last digit."""
+    step = next((step for step in (1.0, 0.1) if abs(mm / step - round(mm / step)) < 1e-6), 0.01)
+    return step / math.sqrt(12) / mm
 
 
 def _pixel(photograph: Photograph, given_mm: float | None) -> tuple[float | None, str]:

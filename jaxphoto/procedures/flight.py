@@ -13,7 +13,9 @@ from jaxphoto.georeferencing.gps import Gps
 from jaxphoto.orientation.matches import PairMatches
 from jaxphoto.procedures.adjust import adjust_for_tables
 from jaxphoto.procedures.georeference_photographs import GeoreferencedPhotographs, georeference_photographs
+from jaxphoto.procedures.known_lens import KnownLens, with_known_lens
 from jaxphoto.procedures.orientation import Oriented, orient
+from jaxphoto.procedures.orientation.orient_photographs import CAMERA
 from jaxphoto.procedures.orientation.related_pairs import Report
 from jaxphoto.statistics import Selection, VarianceComponents, variance_components
 
@@ -23,6 +25,7 @@ PARTS = {
     "stations X-Y": Selection("stations", axes=("X", "Y")),
     "stations Z": Selection("stations", axes="Z"),
 }
+IMAGE_POINTS = {"image points": PARTS["image points"]}
 # Random vectors: hundreds of thousands of image points make each expensive, and there are three parts to tell apart.
 _PROBES = 16
 
@@ -49,8 +52,10 @@ class FlightPart(NamedTuple):
     why_not: str
     """Why there are no stations; "" where there are."""
     components: VarianceComponents | None
-    """Of image points and stations, where these are stations and the adjustment converged."""
+    """Of image points, and of stations where there are any, if the adjustment converged."""
     adjusted: Adjustment
+    lens: tuple[str, ...] = ()
+    """What was known of the lens beforehand, where it was observed."""
 
 
 class CalibratedFlight(NamedTuple):
@@ -67,11 +72,12 @@ def calibrate_flight(
     positions: Mapping[str, Gps | None],
     code: int | None = None,
     report: Report = lambda text: None,
+    lens: KnownLens | None = None,
 ) -> CalibratedFlight:
     """Orient, georeference and adjust every part of the photographs of one camera, which starts at `interior`.
 
     `positions` are by name; `code` is the EPSG code of the map system (UTM where there is none). Photographs that
-    cannot be oriented, and whole parts that cannot, are left out with the reason.
+    cannot be oriented, and whole parts that cannot, are left out with the reason. `lens` is what is known of it before.
 
     Raises InputError where no part can be oriented.
     """
@@ -80,7 +86,7 @@ def calibrate_flight(
     for number, part in enumerate(matched, 1):
         report(f"part {number} of {len(matched)}")
         try:
-            parts.append(_calibrated(part, sensor, interior, positions, code, report))
+            parts.append(_calibrated(part, sensor, interior, positions, code, report, lens))
         except BlockError as error:
             left |= {
                 name: f"its part of {len(part.names)} photographs cannot be oriented: {error}" for name in part.names
@@ -100,11 +106,14 @@ def _calibrated(
     positions: Mapping[str, Gps | None],
     code: int | None,
     report: Report,
+    lens: KnownLens | None,
 ) -> FlightPart:
     title = f"flight of {len(matched.names)} photographs"
     oriented = orient(
         matched.names, sensor, interior, matched.xy_mm, matched.pairs, matched.sigma_mm, title=title, report=report
     )
+    if lens is not None:
+        oriented = oriented._replace(block=with_known_lens(oriented.block, CAMERA, lens))
     report("adjusting")
     placed, why_not = None, ""
     try:
@@ -115,9 +124,11 @@ def _calibrated(
         placed, why_not = None, str(error)
         adjusted = adjust_for_tables(oriented.block)
     components = None
-    if placed and bool(adjusted.converged):
+    # What is known of the lens has a weight that image points must be brought to, with stations or without.
+    if (placed or lens) and bool(adjusted.converged):
         report("estimating variance components")
-        components = variance_components(adjusted, PARTS, probes=_PROBES)
+        components = variance_components(adjusted, PARTS if placed else IMAGE_POINTS, probes=_PROBES)
         # Without an optimum they are no weights; the report says so.
         adjusted = components.adjusted if bool(components.adjusted.converged) else adjusted
-    return FlightPart(oriented, matched, placed, why_not, components, adjusted)
+    known = lens.sentences(oriented.block, CAMERA) if lens else ()
+    return FlightPart(oriented, matched, placed, why_not, components, adjusted, known)

@@ -13,6 +13,7 @@ from markupsafe import Markup
 
 from jaxphoto.procedures.flight import CalibratedFlight, FlightPart
 from jaxphoto.report.findings import Finding, Level, Verdict
+from jaxphoto.report.lens import lens_findings
 from jaxphoto.report.maps import png_of
 from jaxphoto.report.orientation import ALIKE, orientation_sentences, write_orientation
 from jaxphoto.report.page import STYLE
@@ -38,6 +39,7 @@ _PAGE = """<!DOCTYPE html>
 <p><a href="{{ p.folder }}/report.html">All tables and pictures of its adjustment</a></p>
 <h3>Interior orientation</h3>{{ p.interior }}
 {% if p.alike %}<p>{{ p.alike }}</p>{% endif %}
+{% if p.lens %}<h3>What was known of the lens</h3><ul>{% for s in p.lens %}<li>{{ s }}</li>{% endfor %}</ul>{% endif %}
 <h3>How it was oriented</h3><ul>{% for s in p.sentences %}<li>{{ s }}</li>{% endfor %}</ul>
 <h3>Photographs</h3>{% if p.picture %}<img alt="recorded positions minus those of the adjustment, in plan and in height,
 and residuals by photograph" src="{{ p.picture }}">{% endif %}{{ p.images }}
@@ -63,7 +65,7 @@ def report_of(part: FlightPart) -> PartReport:
     """Judge a part: what its adjustment says, its weights, its positions, and how far its rays are independent."""
     tables = Tables(part.adjusted)
     found = [*verdict_of(tables).findings, *(component_findings(part.components) if part.components else [])]
-    return PartReport(part, tables, Verdict.of([*found, *_findings(part)]), _images(part))
+    return PartReport(part, tables, Verdict.of([*found, *lens_findings(tables), *_findings(part)]), _images(part))
 
 
 def _findings(part: FlightPart) -> Iterator[Finding]:
@@ -221,6 +223,7 @@ def _page(flight: CalibratedFlight, reports: list[PartReport], spoilt: Mapping[s
                 "alike": f"Neighbouring rays err alike: these standard deviations times {report.alike:.2g}."
                 if report.alike > ALIKE
                 else "",
+                "lens": r.part.lens,
                 "sentences": [*orientation_sentences(report), *(r.part.placed.sentences if r.part.placed else ())],
                 "picture": png_of(positions_figure(r))[1],
                 "images": _table(r.images, "{:.3g}"),

@@ -57,6 +57,7 @@ Standard deviations are a posteriori (times &sigma;<sub>0</sub>). Correlations r
 <img alt="discrepancies at check points" src="{{ check_picture }}">{{ check }}{% endif %}
 <h2>Exterior orientation</h2>{{ exterior }}
 <h2>Correlation of exterior and interior orientation over the images</h2>{{ summary }}
+{% if ground %}<h2>Correlation of the interior orientation and the ground as a whole</h2>{{ ground }}{% endif %}
 </body></html>
 """
 _LARGEST = 20
@@ -103,6 +104,7 @@ def report_page(tables: Tables, verdict: Verdict) -> str:
             check_spread=_html(_check_spread(check)) if len(check) else "",
             exterior=_html(tables.exterior),
             summary=_html(tables.correlation_summary),
+            ground=_html(tables.correlation_ground) if len(tables.correlation_ground) else "",
         )
     )
 

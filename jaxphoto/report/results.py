@@ -21,6 +21,7 @@ _TABLES = (
     "check_points",
     "correlation",
     "correlation_summary",
+    "correlation_ground",
 )
 # Written beside them where the files of the block were in an EPSG system.
 _MAP_TABLES = ("exterior_map", "object_points_map")

@@ -17,6 +17,7 @@ from jaxphoto.statistics import (
     BlunderTest,
     Correlations,
     Covariance,
+    GroundCorrelations,
     Redundancy,
     Rotations,
     Significance,
@@ -28,6 +29,7 @@ from jaxphoto.statistics import (
     correlations,
     covariance,
     detectable_errors,
+    ground_correlations,
     normalised_residuals,
     observation_groups,
     physical_residuals,
@@ -38,6 +40,7 @@ from jaxphoto.statistics import (
     trends,
     undetected_effects,
 )
+from jaxphoto.statistics.ground import FORMS
 
 
 def in_file_unit(unit: str) -> tuple[float, str]:
@@ -134,7 +137,7 @@ class Tables:
         rows = []
         for k, label, sigma in zip(s.free, s.labels, np.asarray(self.covariance.shared_sigma), strict=True):
             if k >= s.n_cameras:
-                factor = 180 / np.pi if label.endswith("_rad") else 1.0
+                factor = 180 / np.pi if label.endswith(("_rad", "_rad_per_s")) else 1.0
                 value = float(self.adjusted.values.shared[k])
                 rows.append((label.replace("_rad", "_deg"), factor * value, factor * float(sigma)))
         return pd.DataFrame(rows, columns=["parameter", "value", "sigma"])
@@ -261,6 +264,22 @@ class Tables:
                     for j, parameter in enumerate(c.parameters)
                 ]
         return pd.DataFrame(rows, columns=["camera", "exterior", "interior", "mean_abs_rho", "max_abs_rho"])
+
+    @cached_property
+    def ground_correlations(self) -> dict[str, GroundCorrelations]:
+        """By camera, how it goes with height and dome of the ground, as arrays."""
+        return ground_correlations(self.adjusted, self.covariance)
+
+    @cached_property
+    def correlation_ground(self) -> pd.DataFrame:
+        """camera, ground (height, flying_height, dome), sigma_m, parameter, rho; of the parameter `all` the multiple
+        correlation with all of the camera. Empty where photographs do not look down."""
+        rows = []
+        for camera, g in self.ground_correlations.items():
+            for k, form in enumerate(FORMS):
+                own = zip((*g.parameters, "all"), (*g.rho[k], g.together[k]), strict=True)
+                rows += [(camera, form, g.sigma_m[k], parameter, rho) for parameter, rho in own]
+        return pd.DataFrame(rows, columns=["camera", "ground", "sigma_m", "parameter", "rho"])
 
     @cached_property
     def residual_spread(self) -> pd.DataFrame:

@@ -16,6 +16,7 @@ from jaxphoto.camera import Sensor
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import few
 from jaxphoto.report.findings import Finding, Level, Verdict
+from jaxphoto.report.ground import ground_findings
 from jaxphoto.report.residual_findings import NOTHING_FITS, of_residuals, of_what_is_not_checked
 from jaxphoto.report.tables import Tables
 from jaxphoto.report.weakness import FELT, at_corner, weaknesses
@@ -51,6 +52,7 @@ def _findings(tables: Tables) -> Iterator[Finding]:
         explained = frozenset().union(*(w.explains for w in weak))
         felt = {name for name, moved in at_corner(tables, camera).items() if moved > FELT}
         yield from _correlated(camera, c, explained, felt, _all_known(adjusted.block))
+    yield from ground_findings(tables)
     yield from (_not_significant(tables, s) for s in tables.significance if not s.significant)
     for name, sensor in adjusted.block.sensors.items():
         if _folds(adjusted, name, sensor):

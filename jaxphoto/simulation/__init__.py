@@ -13,6 +13,7 @@ from jaxphoto.simulation.recipe import (
     Recipe,
     Sigmas,
     SimulatedBias,
+    SimulatedShutter,
     TargetPlan,
 )
 from jaxphoto.simulation.remeasure import image_coordinates, remeasure
@@ -45,6 +46,7 @@ __all__ = [
     "Settlement",
     "Sigmas",
     "SimulatedBias",
+    "SimulatedShutter",
     "Simulation",
     "Station",
     "Strip",

@@ -1,5 +1,6 @@
 """A recipe and a seed -> a block with known truth."""
 
+import dataclasses
 from collections.abc import Iterator
 from typing import Any
 
@@ -21,6 +22,7 @@ from jaxphoto.simulation.flight import NO_BIAS, NO_MOUNT, Flight, fly, record, t
 from jaxphoto.simulation.platform_path import paths
 from jaxphoto.simulation.points import TruePoints, scatter
 from jaxphoto.simulation.recipe import Assumed, Recipe, SimulatedBias, Triple, triple
+from jaxphoto.simulation.rolling_shutter import camera_motions, rolled, with_shutters
 from jaxphoto.simulation.scan import Scan, scan
 from jaxphoto.simulation.streams import stream
 from jaxphoto.simulation.terrain import Terrain
@@ -68,6 +70,9 @@ def simulate(recipe: Recipe, seed: int = 0) -> Simulation:
     else:
         flight = fly(recipe, recipe.plan, height, seed)
     scene = _seen(recipe, flight, scatter(recipe, flight, terrain, seed), seed)
+    mounts = [recipe.mounts[name].truth if (name := recipe.mount_of(c)) else NO_MOUNT for c in flight.cameras]
+    motions = camera_motions(flight.exterior, flight.motion.velocity, flight.motion.rate, mounts)
+    scene = scene._replace(rays=rolled(recipe, flight, scene.rays, scene.xyz, motions))
     biases = _true_biases(recipe, flight, seed)
     cloud, trajectory, scanner = _scanned(recipe, flight, terrain, height, seed)
     truth = Unknowns(
@@ -81,6 +86,8 @@ def simulate(recipe: Recipe, seed: int = 0) -> Simulation:
     stations, attitudes = _georeferencing(recipe, flight, truth, seed)
     control, check = _control(recipe, scene, seed)
     start, priors = _start(recipe, flight, scene, control, seed)
+    unknowns, priors, truth = with_shutters(recipe, flight, motions, seed, start.unknowns, priors, truth)
+    start = dataclasses.replace(start, unknowns=unknowns)
     block = Block(
         title=recipe.title,
         images=flight.images,

@@ -27,6 +27,7 @@ from jaxphoto.statistics.discrepancy import (
     spread_of,
 )
 from jaxphoto.statistics.global_test import VarianceFactor, global_test, group_factors, stretch
+from jaxphoto.statistics.ground import GroundCorrelations, ground_correlations, linear_forms
 from jaxphoto.statistics.partial_redundancy import PartialRedundancy, partial_redundancy
 from jaxphoto.statistics.partition import SPLITS, Partition, Parts, Selection, parts_of
 from jaxphoto.statistics.patterns import MOST_PARTS
@@ -54,13 +55,13 @@ from jaxphoto.statistics.variance_components import VarianceComponents, variance
 
 __all__ = [
     "DELTA0", "EOP_NAMES", "LEAST_CHECKED", "LEAST_SIGMA0", "LEVEL", "MOST_PARTS", "SIGNIFICANCE_LEVEL", "SPLITS",
-    "BlunderTest", "Correlations", "Covariance", "Felt", "Hidden", "IfZero", "PartialRedundancy", "Partition", "Parts",
-    "Redundancy", "Rotations", "Selection", "Significance", "Spread", "Suspect", "Trend", "UndetectedEffects",
-    "VarianceComponents", "VarianceFactor", "a_priori_sigmas", "angle_differences", "blunder_test",
+    "BlunderTest", "Correlations", "Covariance", "Felt", "GroundCorrelations", "Hidden", "IfZero", "PartialRedundancy",
+    "Partition", "Parts", "Redundancy", "Rotations", "Selection", "Significance", "Spread", "Suspect", "Trend",
+    "UndetectedEffects", "VarianceComponents", "VarianceFactor", "a_priori_sigmas", "angle_differences", "blunder_test",
     "check_discrepancies", "chi_square_limit", "chi_square_p", "common_covariance", "correlation_matrix",
-    "correlations", "covariance", "critical_w", "detectable_errors", "error_precision", "global_test", "group_factors",
-    "if_zero", "most_felt", "normalised_residuals", "observation_groups", "partial_redundancy", "parts_of",
-    "physical_residuals", "point_differences", "prepare_responses", "prepare_statistics", "redundancy_numbers",
-    "residual_spread", "significance", "spread_of", "stretch", "trends", "undetected_effects", "variance_components",
-    "worst_checked",
+    "correlations", "covariance", "critical_w", "detectable_errors", "error_precision", "global_test",
+    "ground_correlations", "group_factors", "if_zero", "linear_forms", "most_felt", "normalised_residuals",
+    "observation_groups", "partial_redundancy", "parts_of", "physical_residuals", "point_differences",
+    "prepare_responses", "prepare_statistics", "redundancy_numbers", "residual_spread", "significance", "spread_of",
+    "stretch", "trends", "undetected_effects", "variance_components", "worst_checked",
 ]  # fmt: skip

@@ -57,7 +57,7 @@ class Responses(eqx.Module):
         """Of each error z = `column(k)`, whitened and in the order of `places`: the shared unknowns' motion, in their
         own units, and H z."""
         for first in range(0, many, _SOLVED_AT_ONCE):
-            x = self._solved(self._pulled(column, range(first, min(first + _SOLVED_AT_ONCE, many))))
+            x = self.solved(self._pulled(column, range(first, min(first + _SOLVED_AT_ONCE, many))))
             yield from zip(self._moved(x), self._pushed(x), strict=True)
 
     def of_unknowns(self, shared: Sequence[int]) -> Iterator[Float[np.ndarray, "n"]]:
@@ -66,13 +66,13 @@ class Responses(eqx.Module):
         zero = self._equations.at.increments
         b = jax.tree.map(lambda v: np.zeros((len(shared), *v.shape)), zero)
         b.shared[np.arange(len(shared)), np.array(shared, int)] = 1.0
-        for k, moved in zip(shared, self._pushed(self._solved(b)), strict=True):
+        for k, moved in zip(shared, self._pushed(self.solved(b)), strict=True):
             yield -moved * self._scale[k]
 
     def products(self, column: Column, many: int) -> tuple[Float[np.ndarray, "many many"], Float[np.ndarray, "m s"]]:
         """z' H z of all errors z = `column(k)` with one another, and the shared unknowns' motions, as `to_errors`."""
         pulled = self._pulled(column, range(many))
-        x = self._solved(pulled)
+        x = self.solved(pulled)
         flat = (np.hstack([v.reshape(many, math.prod(v.shape[1:])) for v in tree]) for tree in (pulled, x))
         return np.matmul(next(flat), next(flat).T), self._moved(x)
 
@@ -100,7 +100,8 @@ class Responses(eqx.Module):
 
         return self._run(_pull, batches(), len(wanted))
 
-    def _solved(self, b: Increments) -> Increments:
+    def solved(self, b: Increments) -> Increments:
+        """x of N x = b of right-hand sides along a leading axis, in scaled increments."""
         return self._run(_solve, _in_batches(b, _SOLVED_AT_ONCE), len(b.shared))
 
     def _pushed(self, x: Increments) -> Iterator[Float[np.ndarray, "n"]]:

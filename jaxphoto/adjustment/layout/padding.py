@@ -185,6 +185,7 @@ def pad_values(values: Values, structure: Structure, padded: TiledStructure, pla
         rate=images(v.rate, 0.0),
         nominal=images(v.nominal, np.eye(3)[:, :, None]),
         flight_time=images(v.flight_time, 0.0),
+        height=images(v.height, 1.0),
         position=images(v.position, v.position[..., :1]),
         rotation=images(v.rotation, v.rotation[..., :1]),
         shared=v.shared,

@@ -61,7 +61,7 @@ def _bent(
             interior = own.interior(interior, Exposure(*exposure))
         return jnp.stack([jnp.asarray(leaf, float) for leaf in jax.tree.leaves(interior)])
 
-    return jax.vmap(one, (0, -1, *[-1] * 5))(cameras, bending, *v.exposures)
+    return jax.vmap(one, (0, -1, *[-1] * len(v.exposures)))(cameras, bending, *v.exposures)
 
 
 def by_image(g: CameraGroup, s: AbstractStructure) -> bool:

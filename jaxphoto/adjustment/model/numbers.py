@@ -67,6 +67,7 @@ class AbstractValues(eqx.Module):
     rate: Float[Array, "3 images"]
     nominal: Float[Array, "3 3 images"]
     flight_time: Float[Array, "images"]
+    height: Float[Array, "images"]
     position: Float[Array, "3 images"]
     rotation: Float[Array, "3 3 images"]
     shared: Float[Array, "parameters"]
@@ -77,7 +78,7 @@ class AbstractValues(eqx.Module):
     @property
     def exposures(self) -> tuple[Float[Array, "... images"], ...]:
         """What an `Exposure` of each image holds."""
-        return self.time, self.velocity, self.rate, self.nominal, self.flight_time
+        return self.time, self.velocity, self.rate, self.nominal, self.flight_time, self.height
 
 
 class Values(AbstractValues):

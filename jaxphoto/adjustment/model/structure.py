@@ -34,9 +34,10 @@ from jaxphoto.block import Block
 from jaxphoto.camera import InteriorOrientation
 from jaxphoto.devices import AXIS
 from jaxphoto.errors import BlockError
-from jaxphoto.georeferencing import Corrections
+from jaxphoto.georeferencing import Corrections, Exposure
 from jaxphoto.losses import AbstractLoss, LinearisedLoss
 from jaxphoto.observations import PRIORS, AbstractObservations, ImageRows
+from jaxphoto.parameters import filled, size_of
 from jaxphoto.unknowns import FIXED, Unknowns
 
 
@@ -51,6 +52,8 @@ class CameraGroup(eqx.Module):
     member: Bool[np.ndarray, "images"]
     """Whether the image's camera is of this group."""
     free_leaves: tuple[int, ...] = eqx.field(static=True)
+    bent: jax.tree_util.PyTreeDef = eqx.field(static=True)
+    """Of an image, what bends its camera included: more leaves where rows move (`camera.RowMotion`)."""
 
 
 class AbstractStructure(eqx.Module):
@@ -158,8 +161,8 @@ def total(x, s: AbstractStructure):
 
 
 def interior_of(group: CameraGroup, table) -> InteriorOrientation:
-    """The group's interior orientations from its table of parameters, one column a parameter."""
-    return jax.tree.unflatten(group.treedef, table)
+    """The group's interior orientations from its table of parameters, one column a parameter, as they are or bent."""
+    return jax.tree.unflatten(group.treedef if len(table) == group.treedef.num_leaves else group.bent, table)
 
 
 class ObservedRows(NamedTuple):
@@ -325,7 +328,7 @@ def _groups(block: Block, image_camera: np.ndarray) -> tuple[CameraGroup, ...]:
         place = np.array([names.index(n) for n in ordered], np.int32)
         camera = np.zeros(len(image_camera), np.int32)
         camera[member] = place[np.searchsorted(ordered, image_camera[member])]
-        groups.append(CameraGroup(tuple(names), treedef, offset, camera, member, ()))
+        groups.append(CameraGroup(tuple(names), treedef, offset, camera, member, (), treedef))
         offset += len(names) * treedef.num_leaves
     return tuple(groups)
 
@@ -334,12 +337,22 @@ def _with_free(group: CameraGroup, free: np.ndarray, tables: tuple[ParameterTabl
     """The group with its list of parameters that are free, or bent, in any of its cameras."""
     m = group.treedef.num_leaves
     own = free[(free >= group.offset) & (free < group.offset + m * len(group.names))] - group.offset
-    moved = {int(k) % m for k in own}
-    fields = [
-        path[-1].name
-        for path, _ in jax.tree_util.tree_flatten_with_path(jax.tree.unflatten(group.treedef, range(m)))[0]
-    ]
-    for t in tables:
-        if t.bends:
-            moved |= {fields.index(name) for name in t.form[0].bends if name in fields}
-    return dataclasses.replace(group, free_leaves=tuple(sorted(moved)))
+    moved, bending = {int(k) % m for k in own}, [t for t in tables if t.bends]
+    bent = _bent_by(jax.tree.unflatten(group.treedef, [0.0] * m), [t.form for t in bending])
+    fields = [path[-1].name for path, _ in jax.tree_util.tree_flatten_with_path(bent)[0]]
+    for t in bending:
+        moved |= {fields.index(name) for name in t.form[0].bends if name in fields}
+    return dataclasses.replace(group, free_leaves=tuple(sorted(moved)), bent=jax.tree.structure(bent))
+
+
+def _bent_by(interior: InteriorOrientation, forms: list) -> InteriorOrientation:
+    """What becomes of an interior orientation that parameters of these forms bend: its tree, without numbers."""
+    still = np.zeros(3)
+
+    def bent(interior: InteriorOrientation) -> InteriorOrientation:
+        exposure = Exposure(0.0, still, still, np.eye(3), 0.0, 1.0)  # type: ignore[arg-type]
+        for form in forms:
+            interior = filled(form, np.zeros(size_of(form))).interior(interior, exposure)
+        return interior
+
+    return jax.eval_shape(bent, interior) if forms else interior

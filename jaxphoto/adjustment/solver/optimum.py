@@ -189,6 +189,7 @@ def typical_scale(values: TiledValues, structure: TiledStructure) -> Increments:
         "mm": sigma,
         "s": ground / jnp.maximum(jnp.max(jnp.abs(v.velocity)), 1.0),
     }
+    by_unit["ms"] = 1e3 * by_unit["s"]
     seconds = jnp.maximum(jnp.max(jnp.abs(v.time)), 1.0)
     by_unit |= {f"{unit}_per_s": by_unit[unit] / seconds for unit in ("m", "rad", "mm")}
     if s.tables:

@@ -11,7 +11,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jaxphoto.camera import InteriorOrientation, constant_names, parameter_names
+from jaxphoto.camera import InteriorOrientation, RollingShutter, constant_names, parameter_names
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import Mount, StripBias
 from jaxphoto.io.block_folder.camera_section import Camera, read_camera
@@ -33,11 +33,11 @@ from jaxphoto.io.recipe.points_section import (
 )
 from jaxphoto.io.recipe.settlement_section import read_settlement
 from jaxphoto.io.toml import read_toml
-from jaxphoto.simulation import Assumed, ConvergentPlan, FlightPlan, Recipe, SimulatedBias
+from jaxphoto.simulation import Assumed, ConvergentPlan, FlightPlan, Recipe, SimulatedBias, SimulatedShutter
 
 _KEYS = (
     "title", "cameras", "mounts", "strips", "datum", "truth", "flight", "convergent", "jitter", "terrain", "points",
-    "targets", "sigmas", "noise", "start", "lidar",
+    "targets", "sigmas", "noise", "start", "lidar", "shutters",
 )  # fmt: skip
 _ZERO = (0.0, 0.0, 0.0)
 
@@ -84,6 +84,7 @@ def recipe_from(values: Mapping[str, Any], file: str = "recipe.toml") -> Recipe:
         targets=targets,
         mounts=mounts,
         biases=_biases(top.section("strips"), settings.strips, strips),
+        shutters=_shutters(top.section("shutters"), cameras),
         datum_offset_m=tuple(truth.vector("datum_offset_m").tolist()),
         jitter=read_jitter(top.section("jitter")),
         terrain=terrain,
@@ -151,6 +152,31 @@ def _mounts(section: Section, told: Section, cameras: Iterable[str]) -> dict[str
         true = Mount(jnp.asarray(arm), jnp.asarray(boresight), jnp.asarray(offset), start.image_x)
         mounts[name] = Assumed(true, start, priors[name])
     return mounts
+
+
+def _shutters(section: Section, cameras: Iterable[str]) -> dict[str, SimulatedShutter]:
+    """Of a table that holds nothing but a `truth` the block's model does not know."""
+    section.known("default", *cameras)
+    shutters = {}
+    for name in cameras:
+        key = name if name in section else "default"
+        if key not in section:
+            continue
+        own = section.section(key)
+        own.known("readout_ms", "readout", "velocity_m_per_s", "rate_deg_per_s", "truth")
+        truth = own.section("truth")
+        truth.known("readout_ms")
+        start = own.number("readout_ms", 0.0)
+        errors = {word: own.positive(word) for word in ("velocity_m_per_s", "rate_deg_per_s") if word in own}
+        prior = own.prior("readout", np.asarray(start), "_ms")
+        model = (RollingShutter(np.asarray(start)), RollingShutter(prior))  # type: ignore[arg-type]
+        knows = any(word != "truth" for word in own)
+        shutters[name] = SimulatedShutter(
+            RollingShutter(np.asarray(truth.number("readout_ms", start))),  # type: ignore[arg-type]
+            **errors,
+            model=model if knows else None,
+        )
+    return shutters
 
 
 def _biases(section: Section, told: Section, strips: list[str]) -> dict[str, SimulatedBias]:

@@ -1,0 +1,46 @@
+"""What the camera shares with the ground, in words."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from jaxphoto.report.findings import Finding, Level
+from jaxphoto.report.tables import Tables
+from jaxphoto.statistics.ground import FORMS, GroundCorrelations
+
+HIGH = 0.9
+_WORDS = {
+    "height": "the height of the ground",
+    "flying_height": "the flying height over the ground",
+    "dome": "a dome of the ground (its middle over its edge)",
+}
+_CURES = {
+    "c_mm": "heights known on the ground, another flying height or oblique images tell them apart",
+    "all": "control in the middle and at the edge of the ground, oblique images or crossing strips tell them apart",
+}
+
+
+def ground_findings(tables: Tables) -> Iterator[Finding]:
+    """How c goes with the heights, and the camera as a whole with the dome, where nothing tells them apart."""
+    for camera, g in tables.ground_correlations.items():
+        yield from (Finding(Level.INFORMATION, text) for text in _sentences(camera, g, tables))
+
+
+def _sentences(camera: str, g: GroundCorrelations, tables: Tables) -> Iterator[str]:
+    known = tables.interior[tables.interior["camera"] == camera].set_index("parameter")["sigma"]
+    if "c_mm" in g.parameters:
+        rho = g.rho[:2, g.parameters.index("c_mm")]
+        k = int(np.abs(rho).argmax())
+        if abs(rho[k]) > HIGH:
+            yield (
+                f"c of camera {camera} goes with {_WORDS[FORMS[k]]} (correlation {rho[k]:.3f}): if c is off by its "
+                f"standard deviation of {known['c_mm']:.2g} mm, the height is by {abs(rho[k]) * g.sigma_m[k]:.2g} m, "
+                f"and no residual shows it; {_CURES['c_mm']}"
+            )
+    dome = FORMS.index("dome")
+    if g.together[dome] > HIGH:
+        yield (
+            f"the camera {camera} as a whole goes with {_WORDS['dome']} (multiple correlation {g.together[dome]:.3f}): "
+            f"one standard deviation of it is {g.sigma_m[dome]:.2g} m of dome, and no residual shows it; "
+            f"{_CURES['all']}"
+        )

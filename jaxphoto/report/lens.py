@@ -1,0 +1,39 @@
+"""What a block says of its lens beyond what was known of such lenses, in words."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from jaxphoto.camera import get_parameter
+from jaxphoto.report.findings import Finding, Level
+from jaxphoto.report.tables import Tables
+from jaxphoto.unknowns import Weighted
+
+# Of the standard deviation known beforehand: a block that leaves more of it has said little.
+_LITTLE = 0.7
+
+
+def lens_findings(tables: Tables) -> Iterator[Finding]:
+    """A warning where c is known to hardly better than what was known before; else by how much the block tells it."""
+    adjusted = tables.adjusted
+    if not bool(adjusted.converged):
+        return
+    sigma = tables.interior.set_index(["camera", "parameter"])["sigma"]
+    for camera, priors in adjusted.block.priors.interior.items():
+        prior = get_parameter(priors, "c_mm")
+        own = sigma[camera, "c_mm"]
+        if not isinstance(prior, Weighted) or not np.isfinite(own):
+            continue
+        known = float(prior.sigma)
+        if own > _LITTLE * known:
+            yield Finding(
+                Level.WARNING,
+                f"the block does not tell c of camera {camera}: its standard deviation of {own:.2g} mm is that of what "
+                f"was known before ({known:.2g} mm); another flying height, oblique images or heights known on the "
+                "ground would tell it",
+            )
+        else:
+            yield Finding(
+                Level.INFORMATION,
+                f"c of camera {camera}: {known:.2g} mm were known of it before, {own:.2g} mm with the block",
+            )

@@ -1,0 +1,96 @@
+"""A rolling shutter in a simulation: where each point is seen at the true time of its row, and what the block knows."""
+
+import dataclasses
+import functools
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from jaxphoto.camera import ImageMotion, RollingShutter, RowMotion
+from jaxphoto.collinearity import ExteriorOrientation, project
+from jaxphoto.georeferencing import Mount, body_from_camera
+from jaxphoto.simulation.chunks import in_chunks
+from jaxphoto.simulation.flight import Flight
+from jaxphoto.simulation.recipe import Recipe
+from jaxphoto.simulation.streams import stream
+from jaxphoto.simulation.visibility import Rays
+from jaxphoto.unknowns import FIXED, Unknowns, Weighted
+
+_CHUNK = 1024
+
+
+def camera_motions(exterior: ExteriorOrientation, velocity, rate, mounts: list[Mount]) -> Float[np.ndarray, "images 6"]:
+    """Velocity (m/s) and rate of turn (rad/s) in the axes of the camera, of a velocity in the object frame and a rate
+    about the body's right, forward and up axes."""
+    turned = np.einsum("nij,nj->ni", np.asarray(exterior.camera_from_object), velocity)
+    camera = np.stack([np.asarray(body_from_camera(m.boresight, m.nominal)).T for m in mounts])
+    return np.hstack([turned, np.einsum("nij,nj->ni", camera, rate)])
+
+
+def rolled(recipe: Recipe, flight: Flight, rays: Rays, points: np.ndarray, motions: np.ndarray) -> Rays:
+    """The rays as rows see them that are exposed one after another; cameras without a rolling shutter as they are.
+
+    A point at the edge may be seen a little beyond it.
+    """
+    xy = rays.xy.copy()
+    for name, shutter in recipe.shutters.items():
+        own = np.flatnonzero(np.array(flight.cameras)[rays.image] == name)
+        if not len(own):
+            continue
+        interior, image = recipe.cameras[name].truth, rays.image[own]
+        seen = functools.partial(_seen, jax.tree.map(np.float64, interior))
+        time = np.full(len(own), 1e-3 * float(shutter.truth.readout) / recipe.sensors[name].height_mm)
+        place = (flight.exterior.position, flight.exterior.camera_from_object)
+        xy[own] = in_chunks(
+            seen, _CHUNK, time, motions[image], *(np.asarray(v)[image] for v in place), points[rays.point[own]]
+        )
+    return rays._replace(xy=xy)
+
+
+@jax.jit
+def _seen(interior, time, motion, position, camera_from_object, point):
+    def one(time, motion, position, camera_from_object, point):
+        moving = dataclasses.replace(interior, rows=RowMotion(time, *motion))
+        return project(moving, ExteriorOrientation(position, camera_from_object), point)
+
+    return jax.vmap(one)(time, motion, position, camera_from_object, point)
+
+
+def with_shutters(
+    recipe: Recipe, flight: Flight, motions: np.ndarray, seed: int, start: Unknowns, priors: Unknowns, truth: Unknowns
+) -> tuple[Unknowns, Unknowns, Unknowns]:
+    """Start, priors and truth with the shutters and, of images whose camera the block knows to have one, the motions.
+
+    The block is told each motion with the error that it states, or exactly where it holds it.
+    """
+    if not recipe.shutters:
+        return start, priors, truth
+    of = [recipe.shutters.get(camera) for camera in flight.cameras]
+    true = {name: _motion(m) for name, m, own in zip(flight.images, motions, of, strict=True) if own}
+    error = stream(seed, "noise of motions").standard_normal(motions.shape)
+    told, known = {}, {}
+    for name, m, e, own in zip(flight.images, motions, error, of, strict=True):
+        if own is None or own.model is None:
+            continue
+        sigma = np.repeat([own.velocity_m_per_s, np.deg2rad(own.rate_deg_per_s)], 3)
+        told[name] = _motion(m + sigma * e)
+        known[name] = ImageMotion(
+            Weighted(told[name].velocity, sigma[:3]) if own.velocity_m_per_s else FIXED,  # type: ignore[arg-type]
+            Weighted(told[name].rate, sigma[3:]) if own.rate_deg_per_s else FIXED,  # type: ignore[arg-type]
+        )
+    models = {name: own.model for name, own in recipe.shutters.items() if own.model}
+    kinds = RollingShutter.kind, ImageMotion.kind
+
+    def more(shutters: dict, images: dict) -> dict:
+        return dict(zip(kinds, (shutters, images), strict=True)) if shutters else {}
+
+    return (
+        dataclasses.replace(start, more=more({name: model[0] for name, model in models.items()}, told)),
+        dataclasses.replace(priors, more=more({name: model[1] for name, model in models.items()}, known)),
+        dataclasses.replace(truth, more=more({name: own.truth for name, own in recipe.shutters.items()}, true)),
+    )
+
+
+def _motion(numbers: np.ndarray) -> ImageMotion:
+    return ImageMotion(numbers[:3], numbers[3:])  # type: ignore[arg-type]
