@@ -8,11 +8,18 @@ from typing import NamedTuple
 from jaxphoto.camera import Perspective
 from jaxphoto.camera.conversion import Conversion, converted
 from jaxphoto.errors import InputError
-from jaxphoto.io.cameras import colmap
+from jaxphoto.io.cameras import agisoft, colmap
 from jaxphoto.io.cameras.camera_file import CameraModel
+from jaxphoto.io.exports import blocks_exchange, nerfstudio, open_sfm, orthority
 from jaxphoto.io.exports.adjusted_photographs import AdjustedPhotographs
+from jaxphoto.io.exports.angles_text import write_angles_text
+from jaxphoto.io.exports.blocks_exchange import write_blocks_exchange
 from jaxphoto.io.exports.colmap_model import write_binary_model, write_text_model
 from jaxphoto.io.exports.map_photographs import Misfit, map_misfit
+from jaxphoto.io.exports.metashape import write_metashape
+from jaxphoto.io.exports.nerfstudio import write_nerfstudio
+from jaxphoto.io.exports.open_sfm import write_open_sfm
+from jaxphoto.io.exports.orthority import write_orthority
 from jaxphoto.writing import check_folder, whole_folder
 
 
@@ -40,6 +47,20 @@ EXPORTS = {
         write_text_model, colmap.PLANE, colmap.FISHEYE, False, "COLMAP model: cameras, images, points3D as text"
     ),
     "colmap-binary": ExportFormat(write_binary_model, colmap.PLANE, colmap.FISHEYE, False, "the same, binary"),
+    "metashape": ExportFormat(write_metashape, agisoft.PLANE, None, False, "cameras of Agisoft Metashape, XML"),
+    "opensfm": ExportFormat(
+        write_open_sfm, open_sfm.PLANE, open_sfm.FISHEYE, False, "reconstruction of OpenSfM, as in WebODM"
+    ),
+    "blocksexchange": ExportFormat(
+        write_blocks_exchange, blocks_exchange.PLANE, None, False, "BlocksExchange XML of Bentley, with tie points"
+    ),
+    "nerfstudio": ExportFormat(
+        write_nerfstudio, nerfstudio.PLANE, nerfstudio.FISHEYE, False, "transforms.json of nerfstudio"
+    ),
+    "opk": ExportFormat(write_angles_text, None, None, True, "text of positions and omega, phi, kappa"),
+    "orthority": ExportFormat(
+        write_orthority, orthority.PLANE, orthority.FISHEYE, True, "parameters of orthority, YAML and CSV"
+    ),
 }
 """The formats that `export` knows, in the order of docs and help."""
 

@@ -49,22 +49,25 @@ def in_map(photographs: AdjustedPhotographs) -> MapPhotographs:
 def map_misfit(photographs: AdjustedPhotographs) -> Misfit | None:
     """How far image points lie off where collinearity is computed in map coordinates; None where these are no metres.
 
-    Computed on the ideal plane, at the principal distance.
+    In the ideal image, before distortion.
     """
     on_map = in_map(photographs)
     if on_map.geographic or not len(photographs.image):
         return None
-    scale = {name: float(c.interior.c) / c.sensor.pixel_mm for name, c in photographs.cameras.items()}
-    px = np.array([scale[name] for name in photographs.image_camera])[photographs.image]
     there, here = (
-        _slopes(photographs, exterior, xyz)
+        _ideal_px(photographs, exterior, xyz)
         for exterior, xyz in ((on_map.exterior, on_map.xyz), (photographs.exterior, photographs.xyz))
     )
-    apart = px * np.linalg.norm(there - here, axis=1)
+    apart = np.linalg.norm(there - here, axis=1)
     return Misfit(float(np.sqrt(np.mean(apart**2))), float(apart.max()))
 
 
-def _slopes(photographs: AdjustedPhotographs, exterior: ExteriorOrientation, xyz: np.ndarray) -> np.ndarray:
+def _ideal_px(photographs: AdjustedPhotographs, exterior: ExteriorOrientation, xyz: np.ndarray) -> np.ndarray:
     ray = xyz[photographs.point] - np.asarray(exterior.position)[photographs.image]
-    u, v, w = np.einsum("nij,nj->in", np.asarray(exterior.camera_from_object)[photographs.image], ray)
-    return np.stack([u / w, v / w], axis=1)
+    in_camera = np.einsum("nij,nj->ni", np.asarray(exterior.camera_from_object)[photographs.image], ray)
+    of_row, ideal = np.array(photographs.image_camera, object)[photographs.image], np.zeros((len(ray), 2))
+    for name, (sensor, interior) in photographs.cameras.items():
+        own = of_row == name
+        xy = interior.projection.ideal_from_direction(still(interior.c), *in_camera[own].T)
+        ideal[own] = np.stack([still(v) for v in xy], axis=1) / sensor.pixel_mm
+    return ideal
