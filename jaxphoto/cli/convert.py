@@ -27,7 +27,7 @@ from jaxphoto.report.terminal import plain
 from jaxphoto.unknowns import Unknowns
 
 _TARGETS = ("block", *EXPORTS)
-_ABOUT = "; ".join(f"{name} ({known.about})" for name, known in EXPORTS.items())
+_ABOUT = "; ".join(f"{name}: {known.about}" for name, known in EXPORTS.items())
 
 
 @app.command("convert")
@@ -41,11 +41,7 @@ def convert_command(
     ] = None,
     to: Annotated[
         str,
-        typer.Option(
-            help="What OUT becomes. block: a block folder; "
-            + "; ".join(f"{k}: {f.about}" for k, f in EXPORTS.items())
-            + "."
-        ),
+        typer.Option(help=f"What OUT becomes. block: a block folder; {_ABOUT}."),
     ] = "block",
     block: Annotated[Path | None, typer.Option(help="Block of which SOURCE is the result, where it moved.")] = None,
     part: Annotated[int, typer.Option(min=1, help="Of a flight, which part; the largest is 1.")] = 1,

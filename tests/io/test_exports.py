@@ -1,12 +1,16 @@
 """Exports: object points projected by each format's own equations, in NumPy, fall where ours do; results are read."""
 
+import contextlib
 import csv
 import functools
 import json
 import math
 import re
+import sqlite3
+import struct
 import tomllib
 import xml.etree.ElementTree as ElementTree
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -23,6 +27,7 @@ from jaxphoto.errors import InputError
 from jaxphoto.io import EXPORTS, AdjustedPhotographs, export
 from jaxphoto.io.cameras import read_camera_file
 from jaxphoto.io.exports import ExportCamera
+from tests.commands import run
 from tests.formulas import camera_from_object
 
 EPSG = 32633
@@ -397,3 +402,81 @@ def test_what_cannot_be_exported(tmp_path):
     bessel = p._replace(frame=Frame("epsg", 31467, None, "true", (9.0, 50.0, 100.0)))
     export(bessel, tmp_path / "sfm", "opensfm")
     assert not (tmp_path / "sfm" / "reference_lla.json").exists()
+
+
+def ring_of(blob):
+    """Points of a geometry of a GeoPackage, and the system it says."""
+    magic, version, flags, srs, order, kind = struct.unpack_from("<2sBBiBI", blob)
+    assert (magic, version, flags, order) == (b"GP", 0, 1, 1)
+    if kind == 1003:
+        assert struct.unpack_from("<I", blob, 13)[0] == 1
+    return np.frombuffer(blob, "<f8", offset={1001: 13, 1003: 21}[kind]).reshape(-1, 3), srs
+
+
+def layer(folder, name):
+    with contextlib.closing(sqlite3.connect(folder / "photographs.gpkg")) as file:
+        file.row_factory = sqlite3.Row
+        return [dict(row) for row in file.execute(f"SELECT * FROM {name} ORDER BY fid")]
+
+
+def test_footprints_are_what_the_border_of_the_format_shows(tmp_path):
+    p = photographs("opencv", "local")
+    looking = p.exterior.camera_from_object.copy()
+    looking[3] = camera_from_object(0.0, 1.4, 0.0)
+    p = p._replace(exterior=ExteriorOrientation(p.exterior.position, looking))
+    export(p, tmp_path / "out", "geopackage")
+    rows = layer(tmp_path / "out", "footprints")
+    # The last one looks at the horizon.
+    assert rows[3]["geom"] is None and rows[3]["n_image_points"] == 40
+    for i, row in enumerate(rows[:3]):
+        assert (row["image"], row["file"], row["camera"]) == (p.images[i], NAMES[i], "one")
+        ring, srs = ring_of(row["geom"])
+        assert srs == -1 and len(ring) == 33
+        np.testing.assert_array_equal(ring[0], ring[-1])
+        np.testing.assert_allclose(ring[:, 2], p.xyz[:, 2].mean(), rtol=0, atol=1e-9)
+        x, y = (ring - p.exterior.position[i])[:, :2].T
+        assert np.sum(x[:-1] * y[1:] - x[1:] * y[:-1]) > 0
+        one = ExteriorOrientation(*(np.repeat(v[i][None], 33, 0) for v in (p.exterior.position, looking)))
+        border = SENSOR.px_from_mm(np.asarray(_projected(CAMERAS["opencv"], one, ring)))
+        ends = np.array([0, SENSOR.width_px]), np.array([0, SENSOR.height_px])
+        off = [np.abs(border[:, k, None] - ends[k]).min(axis=1) for k in (0, 1)]
+        assert np.min(off, axis=0).max() < 1e-6
+        corners = border[np.max(off, axis=0) < 1e-6]
+        assert {tuple(c) for c in np.rint(corners).astype(int).tolist()} == {(0, 0), (4000, 0), (0, 3000), (4000, 3000)}
+
+
+def test_features_lie_where_the_map_says(tmp_path):
+    p = photographs("opencv")
+    export(p, tmp_path / "package", "geopackage")
+    export(p, tmp_path / "json", "geojson")
+    to_map = Transformer.from_crs(CRS.from_epsg(4979), CRS.from_epsg(EPSG).to_3d(), always_xy=True)
+    for name, expected in (("stations", p.exterior.position), ("object_points", p.xyz)):
+        found = np.concatenate([ring_of(row["geom"])[0] for row in layer(tmp_path / "package", name)])
+        np.testing.assert_allclose(found, p.frame.map.map(expected), rtol=0, atol=1e-9)
+    stations, polygons = (
+        json.loads((tmp_path / "json" / f"{name}.geojson").read_text())["features"]
+        for name in ("stations", "footprints")
+    )
+    places = np.array([f["geometry"]["coordinates"] for f in stations])
+    on_map = np.stack(to_map.transform(*places.T), axis=1)
+    np.testing.assert_allclose(on_map, p.frame.map.map(p.exterior.position), rtol=0, atol=1e-6)
+    export(p, tmp_path / "opk", "opk")
+    line = (tmp_path / "opk" / "exterior.txt").read_text().splitlines()[3].split("\t")
+    assert [repr(stations[0]["properties"][f"{a}_deg"]) for a in ("omega", "phi", "kappa")] == line[4:]
+    for feature, row in zip(polygons, layer(tmp_path / "package", "footprints"), strict=True):
+        (ring,) = feature["geometry"]["coordinates"]
+        there, srs = ring_of(row["geom"])
+        assert srs == EPSG
+        easting, northing, _ = to_map.transform(*np.array(ring).T, there[:, 2])
+        np.testing.assert_allclose(np.stack([easting, northing], axis=1), there[:, :2], rtol=0, atol=1e-5)
+    with pytest.raises(InputError, match="the block is in a local frame; write a GeoPackage"):
+        export(photographs("opencv", "local"), tmp_path / "local", "geojson")
+
+
+def test_the_page_and_the_help_name_every_format(monkeypatch, capsys):
+    page = (Path(__file__).parents[2] / "docs" / "exports.md").read_text()
+    assert re.findall(r"^\| `([\w-]+)` \|", page.split("## Signs")[0], re.MULTILINE) == list(EXPORTS)
+    monkeypatch.setenv("COLUMNS", "250")
+    _, said, _ = run(monkeypatch, capsys, "convert", "--help")
+    words = re.sub(r"[\s│]+", " ", said)
+    assert all(f"{name}: {known.about}" in words for name, known in EXPORTS.items())

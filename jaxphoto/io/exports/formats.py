@@ -15,6 +15,8 @@ from jaxphoto.io.exports.adjusted_photographs import AdjustedPhotographs
 from jaxphoto.io.exports.angles_text import write_angles_text
 from jaxphoto.io.exports.blocks_exchange import write_blocks_exchange
 from jaxphoto.io.exports.colmap_model import write_binary_model, write_text_model
+from jaxphoto.io.exports.geo_json import write_geo_json
+from jaxphoto.io.exports.geo_package import write_geo_package
 from jaxphoto.io.exports.map_photographs import Misfit, map_misfit
 from jaxphoto.io.exports.metashape import write_metashape
 from jaxphoto.io.exports.nerfstudio import write_nerfstudio
@@ -61,6 +63,8 @@ EXPORTS = {
     "orthority": ExportFormat(
         write_orthority, orthority.PLANE, orthority.FISHEYE, True, "parameters of orthority, YAML and CSV"
     ),
+    "geojson": ExportFormat(write_geo_json, None, None, False, "stations and footprints in longitude and latitude"),
+    "geopackage": ExportFormat(write_geo_package, None, None, False, "stations, footprints and points for a GIS"),
 }
 """The formats that `export` knows, in the order of docs and help."""
 

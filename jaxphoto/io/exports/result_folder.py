@@ -4,6 +4,7 @@ A result has the values, by ids; image points, cameras of images and the frame a
 is stands in summary.json: beside the result of `adjust`, in the list of parts of a flight.
 """
 
+import csv
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
+import pandas as pd
 
 from jaxphoto.arrays import on_device
 from jaxphoto.block import Block, Start
@@ -88,8 +90,15 @@ def photograph_files(images: Sequence[str], folders: Iterable[Path], flight: Pat
     return found | {name: file.name for name, file in seen.items()}
 
 
+def write_photograph_files(files: Mapping[str, str], flight: Path) -> None:
+    """Write into the folder of a flight the names of its photographs by the ids of images."""
+    table = pd.DataFrame({"image": list(files), "file": list(files.values())})
+    table.to_csv(flight / PHOTOGRAPHS, index=False, quoting=csv.QUOTE_NONNUMERIC)
+
+
 def _noted(flight: Path) -> dict[str, str]:
-    path = flight / PHOTOGRAPHS
+    # Of a flight, or of the result in one.
+    path = flight / PHOTOGRAPHS if (flight / PHOTOGRAPHS).is_file() else flight.parent / PHOTOGRAPHS
     if not path.is_file():
         return {}
     table = read_csv(path, ("image", "file"))
