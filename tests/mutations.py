@@ -5,6 +5,7 @@ hundred times, and `benchmarks/mutations.py` as often as it is asked to, each re
 """
 
 import functools
+import json
 import re
 import shutil
 import struct
@@ -29,6 +30,7 @@ from jaxphoto.io.cameras import read_camera_file, write_camera_file
 from jaxphoto.io.control_files import read_control
 from jaxphoto.io.dbat import read_dbat
 from jaxphoto.io.draws_folder import DrawsFolder
+from jaxphoto.io.exports import adjusted_block, photograph_files
 from jaxphoto.io.photomodeler import read_photomodeler
 from jaxphoto.io.raster import read_dsm
 from jaxphoto.io.trajectory import Records, read_records, write_flight_csv, write_sbet
@@ -165,6 +167,34 @@ def _joint_block(folder: Path) -> None:
 _SETTINGS = {"seed": 1, "sigma": "0.1", "versions": {"jaxphoto": "0"}}
 
 
+def _results(folder: Path) -> None:
+    """Of the small block: a flight of one part with what it notes of its photographs."""
+    (folder / "block").mkdir()
+    (folder / "result").mkdir()
+    for name, content in FILES.items():
+        (folder / "block" / name).write_text(content, encoding="utf-8")
+    camera = {"width_px": 400, "height_px": 300, "pixel_mm": 0.01, "distortion": "brown"}
+    summary = {"converged": True, "cameras": {"kodak": camera}, "block": "../block"}
+    values = {"c_mm": 5.01} | dict.fromkeys(("xp_mm", "yp_mm", "k1", "k2", "k3", "p1", "p2", "b1", "b2"), 0.0)
+    interior = "".join(f"kodak,{name},{value},,\n" for name, value in values.items())
+    tables = {
+        "summary.json": json.dumps(summary),
+        "interior.csv": "camera,parameter,value,sigma,significant\n" + interior,
+        "exterior.csv": "image,X_m,Y_m,Z_m,omega_deg,phi_deg,kappa_deg\n"
+        + "".join(f"{name},{k}.5,0.25,100.0,0.5,-0.25,{k}0.0\n" for k, name in enumerate("abc")),
+        "object_points.csv": "point,X_m,Y_m,Z_m,n_images\n" + "".join(f"p{k},{k}.0,2.0,3.0,3\n" for k in range(1, 5)),
+    }
+    for name, content in tables.items():
+        (folder / "result" / name).write_text(content, encoding="utf-8")
+    (folder / "summary.json").write_text(json.dumps({"parts": [{"result": "result", "block": "block"}]}))
+    (folder / "photographs.csv").write_text("image,file\na,a.jpg\nb,b b.jpg\nc,c.tif\n")
+
+
+def _read_results(folder: Path) -> object:
+    block = adjusted_block(folder)
+    return photograph_files(block.images, (), folder)
+
+
 def _draws(folder: Path) -> None:
     run = DrawsFolder(folder, _SETTINGS, 30, 10)
     for k in range(2):
@@ -224,6 +254,15 @@ READERS: dict[str, Reader] = {
     "recipe": Reader(
         lambda: {"recipe.toml": (_EXAMPLES / "recipe.toml").read_bytes()},
         lambda folder: read_recipe(folder / "recipe.toml"),
+    ),
+    "results": Reader(
+        written_by(_results),
+        _read_results,
+        (
+            "summary.json",
+            "photographs.csv",
+            *(f"result/{n}" for n in ("summary.json", "exterior.csv", "object_points.csv")),
+        ),
     ),
     "camera-opencv": Reader(text(a__yml=cameras.OPENCV), _camera("a.yml")),
     "recipe-flight": _recipe("001"),

@@ -65,6 +65,10 @@ def test_a_folder_becomes_blocks_results_and_a_page(flown, tmp_path, monkeypatch
     assert any("cut.jpg" in name for name in summary["not_used"]) and "blank" in summary["not_used"]
     images = pd.read_csv(out / "images.csv")
     assert len(images) == 15 and (images["rms_px"] < 1).all()
+    # The folder knows its blocks and the files of its photographs.
+    assert run(monkeypatch, capsys, "convert", out, tmp_path / "sfm", "--to", "opensfm")[0] == 0
+    shots = json.loads((tmp_path / "sfm" / "reconstruction.json").read_text())[0]["shots"]
+    assert set(shots) == {f"a{k:02}.jpg" for k in range(12)}
     # What was written can be adjusted again: the largest part, with its stations, in the map system.
     block = read_block(out / "block")
     assert block.frame.code == utm_of(*ORIGIN[:2]) and len(block.stations) == 33

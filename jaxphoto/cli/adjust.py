@@ -1,5 +1,6 @@
 """`jaxphoto adjust`: a block in, tables and a report out."""
 
+import os
 import time
 from pathlib import Path
 from threading import Thread
@@ -92,7 +93,8 @@ def adjust_command(
         times = adjusted.seconds | seconds
         order = ("read", "compile", "solve", "covariance")
         with whole_folder(out) as work:
-            write_results(tables, verdict, work, {name: times[name] for name in order})
+            of = "block" if snooped else os.path.relpath(block.resolve(), out.resolve())
+            write_results(tables, verdict, work, {name: times[name] for name in order}, of)
             for name, table in (component_tables(components) if components else {}).items():
                 table.to_csv(work / f"{name}.csv", index=False)
             if snooped:

@@ -38,7 +38,10 @@ COMMANDS = {
     "combine": _Command("combine", "Combine calibrations of one camera by their full covariances."),
     "halves": _Command("halves", "Judge the standard deviations of a calibration by random halves of its block."),
     "camera": _Command("camera", "Convert a camera file."),
-    "convert": _Command("convert", "Turn another program's files into a block folder, or a block into a COLMAP model."),
+    "convert": _Command(
+        "convert",
+        "Turn another program's files into a block folder, or what was adjusted into another program's files.",
+    ),
     "simulate": _Command("simulate", "Simulate a block with known truth."),
     "sensitivity": _Command(
         "sensitivity",

@@ -15,6 +15,7 @@ from jaxphoto.image_measurement.features import FEATURES, LONGEST_PX
 from jaxphoto.image_measurement.matching import MatchedPhotographs, match_photographs
 from jaxphoto.image_measurement.photograph_pairs import photograph_pairs
 from jaxphoto.io.block_folder import whole_block
+from jaxphoto.io.exports import write_photograph_files
 from jaxphoto.io.photographs import Photograph, known_lens, sensor_and_interior
 from jaxphoto.io.sound_photographs import sound_photographs
 from jaxphoto.procedures.calibration import distortion_model
@@ -95,6 +96,7 @@ def fly_command(
         status.update(f"writing {out}")
         with whole_folder(out) as work:
             verdict = write_flight(flight, reports, spoilt, work)
+            write_photograph_files({p.name: p.path.name for p in read}, work)
             for number, part in enumerate(flight.parts, 1):
                 with whole_block(part.adjusted.block, work / block_folder(number)) as folder:
                     write_part_orientation(part, folder)

@@ -74,6 +74,11 @@ class MapFrame:
         east, north, _ = np.einsum("nji,nj->in", self.local_from_level(local), line)
         return np.arctan2(east, north)
 
+    def geocentric_from_local(self) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
+        """Rotation and translation (m): X, Y, Z from the centre of the ellipsoid = rotation @ local + translation."""
+        origin = np.array([self.origin], float)
+        return _geocentric_from_level(origin)[0], _transformed(_geocentric(map_system(self.code)), origin, "FORWARD")[0]
+
     def sea_level(self) -> float:
         """Local Z (m) of height zero at the origin; of the ellipsoid where heights are above it."""
         easting, northing, _ = self.map(np.zeros((1, 3)))[0]
@@ -151,14 +156,22 @@ def _to_place(code: int, vertical: int | None) -> Transformer:
 
 
 def _topocentric(system: CRS, origin: Place) -> Transformer:
+    longitude, latitude, height = (repr(float(value)) for value in origin)
+    there = f"+step +proj=topocentric {_size(system)} +lon_0={longitude} +lat_0={latitude} +h_0={height}"
+    return Transformer.from_pipeline(f"{_CARTESIAN} {_size(system)} {there}")
+
+
+def _geocentric(system: CRS) -> Transformer:
+    return Transformer.from_pipeline(f"{_CARTESIAN} {_size(system)}")
+
+
+_CARTESIAN = "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart"
+
+
+def _size(system: CRS) -> str:
     ellipsoid = system.ellipsoid
     assert ellipsoid is not None
-    size = f"+a={ellipsoid.semi_major_metre!r} +b={ellipsoid.semi_minor_metre!r}"
-    longitude, latitude, height = (repr(float(value)) for value in origin)
-    return Transformer.from_pipeline(
-        f"+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart {size} "
-        f"+step +proj=topocentric {size} +lon_0={longitude} +lat_0={latitude} +h_0={height}"
-    )
+    return f"+a={ellipsoid.semi_major_metre!r} +b={ellipsoid.semi_minor_metre!r}"
 
 
 def _transformed(transformer: Transformer, values: np.ndarray, direction: str) -> np.ndarray:

@@ -28,11 +28,13 @@ _MAP_TABLES = ("exterior_map", "object_points_map")
 _PACKAGES = ("jaxphoto", "jax", "optimistix", "equinox", "lineax", "numpy", "pandas")
 
 
-def write_results(tables: Tables, verdict: Verdict, directory: Path, seconds: dict[str, float]) -> None:
+def write_results(
+    tables: Tables, verdict: Verdict, directory: Path, seconds: dict[str, float], block: str | None = None
+) -> None:
     """Write the files of docs/block_folder.md into `directory`, replacing earlier results only when all is written.
 
-    `seconds` (read, compile, solve, covariance) goes into summary.json with the time of writing. Raises what
-    `whole_folder` raises.
+    `seconds` (read, compile, solve, covariance) goes into summary.json with the time of writing, and so does the folder
+    of the `block`, as seen from `directory`, where there is one. Raises what `whole_folder` raises.
     """
     began = time.perf_counter()
     with whole_folder(directory) as work:
@@ -41,7 +43,7 @@ def write_results(tables: Tables, verdict: Verdict, directory: Path, seconds: di
             getattr(tables, name).to_csv(work / f"{name}.csv", index=False)
         (work / "report.html").write_text(report_page(tables, verdict), encoding="utf-8")
         summary = summary_of(tables, verdict, seconds | {"write": time.perf_counter() - began})
-        write_summary(summary, work)
+        write_summary(summary | ({} if block is None else {"block": block}), work)
 
 
 def write_summary(summary: dict, directory: Path) -> None:

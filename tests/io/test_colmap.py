@@ -16,7 +16,8 @@ from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import Corrections
 from jaxphoto.io import convert, read_block, read_source
 from jaxphoto.io.cameras import read_camera_file
-from jaxphoto.io.colmap import write_colmap_model
+from jaxphoto.io.exports import AdjustedPhotographs, export
+from jaxphoto.procedures.adjust import start_of
 from jaxphoto.unknowns import FREE
 from tests.blocks import simulated
 from tests.commands import run
@@ -232,6 +233,11 @@ def test_pycolmap_writes_what_is_read(tmp_path):
 # Written ----------------------------------------------------------------------------------------------------
 
 
+def write_colmap_model(block, folder, unknowns=None, format="colmap"):
+    values = start_of(block) if unknowns is None else unknowns
+    return export(AdjustedPhotographs.of_block(block, values), folder, format).cameras
+
+
 def same_block(a, b):
     """Image points (px), orientations and points of both, whatever the sizes of their pixels."""
     assert a.images == b.images and len(a.points) == len(b.points)
@@ -245,6 +251,9 @@ def same_block(a, b):
 @pytest.mark.parametrize("write", [write_text, write_binary])
 def test_a_model_that_is_written_is_the_model_that_was_read(tmp_path, write):
     block = read_source(write(tmp_path / "model"))
+    write_colmap_model(block, tmp_path / "binary", format="colmap-binary")
+    binary = read_source(tmp_path / "binary")
+    same_block(binary, block)
     conversions = write_colmap_model(block, tmp_path / "again")
     assert [c.max_px for c in conversions.values()] == [0.0]
     again = read_source(tmp_path / "again")
@@ -282,9 +291,10 @@ def test_a_block_of_another_distortion_keeps_its_bundles(tmp_path):
         assert np.sqrt(np.mean(theirs**2)) < 1.1 * np.sqrt(np.mean(ours**2))
 
 
-def test_pycolmap_reads_what_is_written(tmp_path):
+@pytest.mark.parametrize("format", ["colmap", "colmap-binary"])
+def test_pycolmap_reads_what_is_written(tmp_path, format):
     pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is not installed")
-    write_colmap_model(read_source(write_text(tmp_path / "model")), tmp_path / "again")
+    write_colmap_model(read_source(write_text(tmp_path / "model")), tmp_path / "again", format=format)
     first, again = (pycolmap.Reconstruction(str(tmp_path / name)) for name in ("model", "again"))
     assert again.num_images() == 3 and again.num_points3D() == 6
     assert again.compute_num_observations() == 18
@@ -305,11 +315,11 @@ def test_where_no_model_can_be_written(tmp_path):
         write_colmap_model(block, tmp_path / "other" / "thesis.txt")
     terms = lambda b: (b.start.unknowns.interior["5"].distortion.k1, b.start.unknowns.interior["5"].distortion.b2)  # noqa: E731
     folding = eqx.tree_at(terms, block, (np.array(-9.0), np.array(0.1)))
-    with pytest.raises(InputError, match="camera 5 cannot be written for COLMAP: the distortion of this camera folds"):
+    with pytest.raises(InputError, match="camera 5 cannot be written as colmap: the distortion of this camera folds"):
         write_colmap_model(folding, tmp_path / "new")
     assert not (tmp_path / "new").exists()
     curved = dataclasses.replace(block, corrections=Corrections(curvature=True))
-    with pytest.warns(UserWarning, match="COLMAP knows no refraction or earth curvature"):
+    with pytest.warns(UserWarning, match="colmap knows no earth curvature"):
         write_colmap_model(curved, tmp_path / "curved")
 
 
@@ -322,7 +332,7 @@ def test_the_command_converts_there_and_back(tmp_path, monkeypatch, capsys):
     same_block(read_source(tmp_path / "back"), read_source(model))
     for out, to, message in (
         (tmp_path / "block", "colmap", "is or holds the input"),
-        (tmp_path / "new", "colmop", "--to colmop: there are block, colmap"),
+        (tmp_path / "new", "colmop", "--to colmop: there are block, colmap, colmap-binary"),
     ):
         code, _, error = run(monkeypatch, capsys, "convert", tmp_path / "block", out, "--to", to)
         assert (code, message in error) == (2, True)

@@ -13,10 +13,12 @@ from pathlib import Path
 import jax
 
 from jaxphoto.arrays import on_device
-from jaxphoto.camera import Agisoft, InteriorOrientation, Sensor
+from jaxphoto.camera import Agisoft, InteriorOrientation, Perspective, Sensor
 from jaxphoto.errors import quoted
-from jaxphoto.io.cameras.camera_file import CameraFile, CameraSource, joined_notes
+from jaxphoto.io.cameras.camera_file import CameraFile, CameraModel, CameraSource, joined_notes
 
+PLANE = CameraModel(Agisoft, ("p3", "p4"), Perspective())
+"""What its frame cameras are here."""
 _SCALED = ("b1", "b2")
 _COEFFICIENTS = tuple(name for name in Agisoft.coefficients if name not in _SCALED)
 _KNOWN = ("f", "fx", "fy", "cx", "cy", "skew", *Agisoft.coefficients)
@@ -55,19 +57,29 @@ def read_agisoft(source: CameraSource) -> CameraFile:
 
 def write_agisoft(path: Path, name: str, sensor: Sensor, interior: InteriorOrientation) -> None:
     """Write a camera with the distortion `Agisoft` as a calibration file; what is 0 is left out, as there."""
+    root = ElementTree.Element("calibration")
+    for key, text in (("projection", "frame"), ("width", str(sensor.width_px)), ("height", str(sensor.height_px))):
+        ElementTree.SubElement(root, key).text = text
+    add_values(root, sensor, interior)
+    path.write_text(xml_text(root), "utf-8")
+
+
+def add_values(calibration: ElementTree.Element, sensor: Sensor, interior: InteriorOrientation) -> None:
+    """The elements f, cx, cy and coefficients of a camera with the distortion `Agisoft`, without those that are 0."""
     f, d = float(interior.c) / sensor.pixel_mm, interior.distortion
     values: dict[str, float] = {"f": f}
     values |= {"cx": float(interior.x_p) / sensor.pixel_mm, "cy": -float(interior.y_p) / sensor.pixel_mm}
     values |= {key: float(getattr(d, key)) * f for key in _SCALED}
     values |= {key: float(getattr(d, key)) for key in _COEFFICIENTS}
-    root = ElementTree.Element("calibration")
-    for key, text in (("projection", "frame"), ("width", str(sensor.width_px)), ("height", str(sensor.height_px))):
-        ElementTree.SubElement(root, key).text = text
     for key, number in values.items():
         if number != 0:
-            ElementTree.SubElement(root, key).text = repr(number)
+            ElementTree.SubElement(calibration, key).text = repr(number)
+
+
+def xml_text(root: ElementTree.Element) -> str:
+    """The content of an XML file."""
     ElementTree.indent(root)
-    path.write_text(f'<?xml version="1.0" encoding="UTF-8"?>\n{ElementTree.tostring(root, "unicode")}\n', "utf-8")
+    return f'<?xml version="1.0" encoding="UTF-8"?>\n{ElementTree.tostring(root, "unicode")}\n'
 
 
 def _sensors(root: ElementTree.Element) -> dict[str, tuple[ElementTree.Element, str | None]]:

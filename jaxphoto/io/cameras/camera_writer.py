@@ -6,11 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxphoto.camera import AbstractDistortion, Agisoft, InteriorOrientation, Perspective, Sensor, Smac
+from jaxphoto.camera import AbstractDistortion, InteriorOrientation, Perspective, Sensor, Smac
 from jaxphoto.camera.conversion import Conversion, converted
 from jaxphoto.errors import InputError
-from jaxphoto.io.cameras import colmap, open_cv
-from jaxphoto.io.cameras.agisoft import write_agisoft
+from jaxphoto.io.cameras import agisoft, colmap, open_cv
 from jaxphoto.io.cameras.camera_file import CameraModel
 from jaxphoto.io.cameras.colmap import write_colmap
 from jaxphoto.io.cameras.open_cv import write_open_cv
@@ -36,7 +35,7 @@ class _WriteFormat(NamedTuple):
 _FORMATS = {
     "opencv": _WriteFormat(write_open_cv, open_cv.PLANE, open_cv.FISHEYE, (".yml", ".yaml", ".json")),
     "colmap": _WriteFormat(write_colmap, colmap.PLANE, colmap.FISHEYE, ()),
-    "agisoft": _WriteFormat(write_agisoft, CameraModel(Agisoft, ("p3", "p4"), Perspective()), None, (".xml",)),
+    "agisoft": _WriteFormat(agisoft.write_agisoft, agisoft.PLANE, None, (".xml",)),
     "smac": _WriteFormat(write_smac_report, CameraModel(Smac, (), Perspective()), None, (".txt", ".rpt")),
     "block": _WriteFormat(write_block_camera, None, None, (".toml",)),
 }

@@ -5,6 +5,7 @@ COLMAP's centre of the upper left pixel is (0.5, 0.5), as ours. All its models w
 Source: the documentation of COLMAP, "Camera models" and "Output format", and its src/colmap/sensor/models.h.
 """
 
+import struct
 from pathlib import Path
 from typing import NamedTuple
 
@@ -126,6 +127,15 @@ def cameras_text(cameras: dict[int, ColmapCamera]) -> str:
     for identifier, c in cameras.items():
         lines.append(" ".join([f"{identifier} {c.model} {c.width_px} {c.height_px}", *map(repr, c.values)]))
     return "\n".join(lines) + "\n"
+
+
+def cameras_bytes(cameras: dict[int, ColmapCamera]) -> bytes:
+    """The content of cameras.bin."""
+    records = [struct.pack("<Q", len(cameras))]
+    for identifier, c in cameras.items():
+        layout = f"<IiQQ{len(c.values)}d"
+        records.append(struct.pack(layout, identifier, _NUMBERS.index(c.model), c.width_px, c.height_px, *c.values))
+    return b"".join(records)
 
 
 def write_colmap(path: Path, name: str, sensor: Sensor, interior: InteriorOrientation) -> None:

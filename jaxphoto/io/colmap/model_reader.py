@@ -25,8 +25,8 @@ from jaxphoto.io.colmap.model import ColmapImage, ColmapModel, read_model
 from jaxphoto.io.text_tables import Table
 from jaxphoto.unknowns import FIXED, FREE
 
-CAMERA_TURN = np.array([[1.0], [-1.0], [-1.0]])
-"""Rows by which a rotation into COLMAP's camera frame becomes one into ours, and back."""
+# Rows by which a rotation into COLMAP's camera frame becomes one into ours.
+_CAMERA_TURN = np.array([[1.0], [-1.0], [-1.0]])
 _PLACES = ("f", "fx", "fy", "cx", "cy")
 _PHOTOGRAPHS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".jp2", ".ppm", ".pgm", ".dng")
 
@@ -113,7 +113,7 @@ def _orientations(images: list[ColmapImage]) -> tuple[np.ndarray, np.ndarray]:
     quaternions = np.array([i.quaternion for i in images])
     rotation = Rotation.from_quat(quaternions[:, [1, 2, 3, 0]]).as_matrix()
     centres = -np.einsum("nji,nj->ni", rotation, np.array([i.translation for i in images]))
-    return centres, np.asarray(ExteriorOrientation(centres, CAMERA_TURN * rotation).omega_phi_kappa)
+    return centres, np.asarray(ExteriorOrientation(centres, _CAMERA_TURN * rotation).omega_phi_kappa)
 
 
 def _camera(folder: Path, camera: ColmapCamera) -> dict[str, Any]:
