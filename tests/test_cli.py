@@ -26,6 +26,7 @@ FILES = {
     "residuals.csv",
     "trends.csv",
     "check_points.csv",
+    "positional_accuracy.csv",
     "correlation.csv",
     "correlation_summary.csv",
     "report.html",
@@ -54,6 +55,7 @@ COLUMNS = {
     ],
     "trends": ["pattern", "freedom", "p_value", "rms", "unit", "term", "share", "amount", "sigma"],
     "check_points": ["point", "dX_m", "dY_m", "dZ_m"],
+    "positional_accuracy": ["component", "check_points", "fit_m", "survey_m", "rmse_m", "class_cm", "claimed"],
     "correlation": ["parameter_a", "parameter_b", "rho"],
     "correlation_summary": ["camera", "exterior", "interior", "mean_abs_rho", "max_abs_rho"],
 }
