@@ -19,6 +19,7 @@ from jaxphoto.report.plots import (
     mean_residuals_figure,
     residuals_figure,
 )
+from jaxphoto.report.positional_accuracy import accuracy_sentences
 from jaxphoto.report.tables import Tables
 from jaxphoto.statistics import LEAST_CHECKED
 
@@ -54,6 +55,7 @@ Standard deviations are a posteriori (times &sigma;<sub>0</sub>). Correlations r
 {% if trends %}<h3>Patterns: what the images have in common, and time and strips</h3>{{ trends }}{% endif %}
 <h3>Largest normalised residuals</h3>{{ largest }}
 {% if check %}<h2>Check points: surveyed minus computed</h2>{{ check_spread }}
+{% for s in accuracy_said %}<p>{{ s }}</p>{% endfor %}{{ accuracy }}
 <img alt="discrepancies at check points" src="{{ check_picture }}">{{ check }}{% endif %}
 <h2>Exterior orientation</h2>{{ exterior }}
 <h2>Correlation of exterior and interior orientation over the images</h2>{{ summary }}
@@ -101,6 +103,8 @@ def report_page(tables: Tables, verdict: Verdict) -> str:
             largest=_html(largest.drop(columns="size")),
             check_picture=_picture(check_points_figure({"": tables})) if len(check) else "",
             check=_html(check) if len(check) else "",
+            accuracy=_html(tables.positional_accuracy) if len(check) else "",
+            accuracy_said=accuracy_sentences(tables.tested_accuracy),
             check_spread=_html(_check_spread(check)) if len(check) else "",
             exterior=_html(tables.exterior),
             summary=_html(tables.correlation_summary),

@@ -19,6 +19,7 @@ _TABLES = (
     "residuals",
     "trends",
     "check_points",
+    "positional_accuracy",
     "correlation",
     "correlation_summary",
     "correlation_ground",

@@ -12,12 +12,14 @@ from jaxphoto.adjustment.model.numbers import Residuals
 from jaxphoto.camera import constant_names, get_parameter, parameter_names
 from jaxphoto.compiling import call_compiled
 from jaxphoto.observations import AXES
+from jaxphoto.report.positional_accuracy import accuracy_table
 from jaxphoto.rotation import omega_phi_kappa_from_matrix
 from jaxphoto.statistics import (
     BlunderTest,
     Correlations,
     Covariance,
     GroundCorrelations,
+    PositionalAccuracy,
     Redundancy,
     Rotations,
     Significance,
@@ -33,6 +35,7 @@ from jaxphoto.statistics import (
     normalised_residuals,
     observation_groups,
     physical_residuals,
+    positional_accuracy,
     prepare_statistics,
     redundancy_numbers,
     residual_spread,
@@ -237,6 +240,16 @@ class Tables:
         table = pd.DataFrame(values, columns=[f"d{a}_m" for a in AXES])
         table.insert(0, "point", [self.adjusted.block.points[p] for p in points])
         return table
+
+    @cached_property
+    def tested_accuracy(self) -> PositionalAccuracy:
+        """Positional accuracy by the check points."""
+        return positional_accuracy(check_discrepancies(self.adjusted))
+
+    @cached_property
+    def positional_accuracy(self) -> pd.DataFrame:
+        """component, check_points, fit_m, survey_m, rmse_m, class_cm, claimed (ASPRS Edition 2)."""
+        return accuracy_table(self.tested_accuracy)
 
     @cached_property
     def correlation(self) -> pd.DataFrame:

@@ -31,6 +31,13 @@ from jaxphoto.statistics.ground import GroundCorrelations, ground_correlations, 
 from jaxphoto.statistics.partial_redundancy import PartialRedundancy, partial_redundancy
 from jaxphoto.statistics.partition import SPLITS, Partition, Parts, Selection, parts_of
 from jaxphoto.statistics.patterns import MOST_PARTS
+from jaxphoto.statistics.positional_accuracy import (
+    LEAST_CHECK_POINTS,
+    AxisErrors,
+    ComponentAccuracy,
+    PositionalAccuracy,
+    positional_accuracy,
+)
 from jaxphoto.statistics.quantiles import chi_square_limit
 from jaxphoto.statistics.reliability import (
     LEAST_CHECKED,
@@ -54,14 +61,15 @@ from jaxphoto.statistics.undetected import Felt, UndetectedEffects, most_felt, u
 from jaxphoto.statistics.variance_components import VarianceComponents, variance_components
 
 __all__ = [
-    "DELTA0", "EOP_NAMES", "LEAST_CHECKED", "LEAST_SIGMA0", "LEVEL", "MOST_PARTS", "SIGNIFICANCE_LEVEL", "SPLITS",
-    "BlunderTest", "Correlations", "Covariance", "Felt", "GroundCorrelations", "Hidden", "IfZero", "PartialRedundancy",
-    "Partition", "Parts", "Redundancy", "Rotations", "Selection", "Significance", "Spread", "Suspect", "Trend",
-    "UndetectedEffects", "VarianceComponents", "VarianceFactor", "a_priori_sigmas", "angle_differences", "blunder_test",
+    "DELTA0", "EOP_NAMES", "LEAST_CHECKED", "LEAST_CHECK_POINTS", "LEAST_SIGMA0", "LEVEL", "MOST_PARTS",
+    "SIGNIFICANCE_LEVEL", "SPLITS", "AxisErrors", "BlunderTest", "ComponentAccuracy", "Correlations", "Covariance",
+    "Felt", "GroundCorrelations", "Hidden", "IfZero", "PartialRedundancy", "Partition", "Parts", "PositionalAccuracy",
+    "Redundancy", "Rotations", "Selection", "Significance", "Spread", "Suspect", "Trend", "UndetectedEffects",
+    "VarianceComponents", "VarianceFactor", "a_priori_sigmas", "angle_differences", "blunder_test",
     "check_discrepancies", "chi_square_limit", "chi_square_p", "common_covariance", "correlation_matrix",
     "correlations", "covariance", "critical_w", "detectable_errors", "error_precision", "global_test",
     "ground_correlations", "group_factors", "if_zero", "linear_forms", "most_felt", "normalised_residuals",
     "observation_groups", "partial_redundancy", "parts_of", "physical_residuals", "point_differences",
-    "prepare_responses", "prepare_statistics", "redundancy_numbers", "residual_spread", "significance", "spread_of",
-    "stretch", "trends", "undetected_effects", "variance_components", "worst_checked",
+    "positional_accuracy", "prepare_responses", "prepare_statistics", "redundancy_numbers", "residual_spread",
+    "significance", "spread_of", "stretch", "trends", "undetected_effects", "variance_components", "worst_checked",
 ]  # fmt: skip
