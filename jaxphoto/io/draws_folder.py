@@ -91,7 +91,8 @@ class DrawsFolder:
     def join(self) -> None:
         """Bring all parts to one file, part by part."""
         parts = [self._part(k) for k in range(self.n_parts)]
-        schema = pq.read_schema(parts[0])
+        with _reading(parts[0]):
+            schema = pq.read_schema(parts[0])
         with (
             whole_file(self.directory / DRAWS) as work,
             pq.ParquetWriter(work, schema, write_page_checksum=True) as writer,
@@ -164,7 +165,8 @@ def _reading(file: Path) -> Iterator[None]:
     """Raises InputError where a file of draws is cut off or was changed."""
     try:
         yield
-    except (pa.ArrowException, OSError, KeyError):
+    # A name of a column that is no text is an error of Python's own.
+    except (pa.ArrowException, OSError, KeyError, UnicodeDecodeError):
         raise InputError(f"{file} is damaged: delete it, and its draws are made anew") from None
 
 
