@@ -89,11 +89,12 @@ def main() -> None:
                 row |= {f"{n}_off": value - lens[n], f"{n}_sigma": float(sigma[n])}
             rows.append(row)
     print(f"{len(rows)} adjustments in {time.perf_counter() - began:.0f} s")
+    far = 4 * prior_sigmas(prior, camera.start, sensor)["c_mm"]
     for case in ("prior", "free")[: 1 + args.also_free]:
         own = [r for r in rows if r["case"] == case]
         good = [r for r in own if r["outcome"] == Outcome.CONVERGED.value]
         # c off by four standard deviations of the lens.
-        ran = [r for r in good if abs(r["c_mm_off"]) > 4 * prior_sigmas(prior, camera.start, sensor)["c_mm"]]
+        ran = [r for r in good if abs(r["c_mm_off"]) > far]
         print(f"{case}: {len(own)} flights, {len(good)} converged, of these {len(ran)} ran away")
         for n in NAMES:
             z = np.array([r[f"{n}_off"] / r[f"{n}_sigma"] for r in good])

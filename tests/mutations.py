@@ -4,6 +4,7 @@
 hundred times, and `benchmarks/mutations.py` as often as it is asked to, each reader in a process of its own.
 """
 
+import dataclasses
 import functools
 import json
 import re
@@ -21,11 +22,12 @@ from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
+from PIL import Image
 
-from jaxphoto.camera import InteriorOrientation, OpenCv
+from jaxphoto.camera import ImageMotion, InteriorOrientation, OpenCv, RollingShutter
 from jaxphoto.errors import JaxphotoError
 from jaxphoto.image_measurement import read_grey
-from jaxphoto.io import clouds, read_block, read_recipe, read_source
+from jaxphoto.io import clouds, read_block, read_recipe, read_source, write_block
 from jaxphoto.io.cameras import read_camera_file, write_camera_file
 from jaxphoto.io.control_files import read_control
 from jaxphoto.io.dbat import read_dbat
@@ -35,6 +37,12 @@ from jaxphoto.io.photomodeler import read_photomodeler
 from jaxphoto.io.raster import read_dsm
 from jaxphoto.io.trajectory import Records, read_records, write_flight_csv, write_sbet
 from jaxphoto.procedures.control.system import places, system_of
+from jaxphoto.io.photograph_seconds import photograph_seconds
+from jaxphoto.io.photographs import photographs
+from jaxphoto.io.photomodeler import read_photomodeler
+from jaxphoto.io.raster import read_dsm
+from jaxphoto.io.trajectory import Records, read_records, write_flight_csv, write_sbet
+from jaxphoto.unknowns import FIXED, FREE, Weighted
 from tests import sound_files
 from tests.io import control_files, test_bal, test_colmap
 from tests.io import test_cameras as cameras
@@ -240,6 +248,30 @@ def _control(folder: Path, marks: Path | None = None) -> object:
     """Points and marks, and the places of the points."""
     read = read_control(folder / "a", marks)
     return places(read.points, system_of(read.points.system, "a"), 4326) if read.points.system else read
+_SHUTTER = b"""
+[shutters.kodak]
+readout_ms = 20.0
+readout = { sigma_ms = 5.0 }
+velocity_m_per_s = 0.3
+rate_deg_per_s = 0.3
+truth = { readout_ms = 30.0 }
+"""
+
+
+def _rolling_block(folder: Path) -> None:
+    block = read_block(_EXAMPLES / "cross_block")
+    motion = ImageMotion(np.array([0.0, 50.0, 0.0]), np.zeros(3))
+    more = {"shutters": {"kodak": RollingShutter(np.array(30.0))}, "motions": dict.fromkeys(block.images[:3], motion)}
+    known = ImageMotion(Weighted(motion.velocity, np.ones(3)), FIXED)
+    priors = {"shutters": {"kodak": RollingShutter(FREE)}, "motions": dict.fromkeys(block.images[:3], known)}
+    start = dataclasses.replace(block.start, unknowns=dataclasses.replace(block.start.unknowns, more=more))
+    write_block(dataclasses.replace(block, start=start, priors=dataclasses.replace(block.priors, more=priors)), folder)
+
+
+def _photograph(folder: Path) -> None:
+    exif = Image.Exif()
+    exif.get_ifd(0x8769).update({0x9003: "2024:05:01 10:00:03", 0x9291: "25"})
+    Image.new("RGB", (64, 48)).save(folder / "a.jpg", exif=exif)
 
 
 READERS: dict[str, Reader] = {
@@ -263,6 +295,13 @@ READERS: dict[str, Reader] = {
             "photographs.csv",
             *(f"result/{n}" for n in ("summary.json", "exterior.csv", "object_points.csv")),
         ),
+    "recipe-shutter": Reader(
+        lambda: {"recipe.toml": (_EXAMPLES / "recipe.toml").read_bytes() + _SHUTTER},
+        lambda folder: read_recipe(folder / "recipe.toml"),
+    ),
+    "block-shutter": Reader(written_by(_rolling_block), read_block),
+    "photograph-seconds": Reader(
+        written_by(_photograph), lambda folder: photograph_seconds(photographs([folder / "a.jpg"]))
     ),
     "camera-opencv": Reader(text(a__yml=cameras.OPENCV), _camera("a.yml")),
     "recipe-flight": _recipe("001"),

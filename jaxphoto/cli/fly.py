@@ -16,6 +16,7 @@ from jaxphoto.image_measurement.matching import MatchedPhotographs, match_photog
 from jaxphoto.image_measurement.photograph_pairs import photograph_pairs
 from jaxphoto.io.block_folder import whole_block
 from jaxphoto.io.exports import write_photograph_files
+from jaxphoto.io.photograph_seconds import photograph_seconds
 from jaxphoto.io.photographs import Photograph, known_lens, sensor_and_interior
 from jaxphoto.io.sound_photographs import sound_photographs
 from jaxphoto.procedures.calibration import distortion_model
@@ -51,6 +52,9 @@ def fly_command(
     lens_prior: Annotated[
         bool, typer.Option(help="Observe the camera as what is known of such lenses (docs/lens_priors.md).")
     ] = True,
+    rolling_shutter: Annotated[
+        bool, typer.Option(help="Estimate the readout time of the rows, with speeds from positions and times of EXIF.")
+    ] = False,
 ) -> None:
     """Calibrate the camera of a flight from its photographs and their positions: orient, georeference, adjust, judge.
 
@@ -89,6 +93,7 @@ def fly_command(
             epsg,
             status.update,
             known_lens(read, camera, distortion) if lens_prior else None,
+            photograph_seconds(read) if rolling_shutter else None,
         )
         flight = flight._replace(left_out=matched.left_out | flight.left_out)
         status.update("computing statistics")

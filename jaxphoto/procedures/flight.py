@@ -17,6 +17,7 @@ from jaxphoto.procedures.known_lens import KnownLens, with_known_lens
 from jaxphoto.procedures.orientation import Oriented, orient
 from jaxphoto.procedures.orientation.orient_photographs import CAMERA
 from jaxphoto.procedures.orientation.related_pairs import Report
+from jaxphoto.procedures.rolling_shutter import Moment, with_rolling_shutter
 from jaxphoto.statistics import Selection, VarianceComponents, variance_components
 
 # Stations by what differs between receivers; the features' own scale comes with them.
@@ -26,6 +27,8 @@ PARTS = {
     "stations Z": Selection("stations", axes="Z"),
 }
 IMAGE_POINTS = {"image points": PARTS["image points"]}
+# What adjusted positions are off by against their neighbours.
+_NEIGHBOUR_M = 0.05
 # Random vectors: hundreds of thousands of image points make each expensive, and there are three parts to tell apart.
 _PROBES = 16
 
@@ -56,6 +59,8 @@ class FlightPart(NamedTuple):
     adjusted: Adjustment
     lens: tuple[str, ...] = ()
     """What was known of the lens beforehand, where it was observed."""
+    why_still: str = ""
+    """Why no rolling shutter was estimated, though one was asked for."""
 
 
 class CalibratedFlight(NamedTuple):
@@ -73,11 +78,13 @@ def calibrate_flight(
     code: int | None = None,
     report: Report = lambda text: None,
     lens: KnownLens | None = None,
+    taken: Mapping[str, Moment] | None = None,
 ) -> CalibratedFlight:
     """Orient, georeference and adjust every part of the photographs of one camera, which starts at `interior`.
 
     `positions` are by name; `code` is the EPSG code of the map system (UTM where there is none). Photographs that
     cannot be oriented, and whole parts that cannot, are left out with the reason. `lens` is what is known of it before.
+    With the times at which photographs were `taken` a rolling shutter is estimated, where these have positions.
 
     Raises InputError where no part can be oriented.
     """
@@ -86,7 +93,7 @@ def calibrate_flight(
     for number, part in enumerate(matched, 1):
         report(f"part {number} of {len(matched)}")
         try:
-            parts.append(_calibrated(part, sensor, interior, positions, code, report, lens))
+            parts.append(_calibrated(part, sensor, interior, positions, code, report, lens, taken))
         except BlockError as error:
             left |= {
                 name: f"its part of {len(part.names)} photographs cannot be oriented: {error}" for name in part.names
@@ -107,6 +114,7 @@ def _calibrated(
     code: int | None,
     report: Report,
     lens: KnownLens | None,
+    taken: Mapping[str, Moment] | None,
 ) -> FlightPart:
     title = f"flight of {len(matched.names)} photographs"
     oriented = orient(
@@ -123,6 +131,9 @@ def _calibrated(
         # Positions that do not tell the frame, or too badly: the calibration does without.
         placed, why_not = None, str(error)
         adjusted = adjust_for_tables(oriented.block)
+    why_still = ""
+    if taken is not None:
+        adjusted, why_still = _rolling(adjusted, taken, placed is not None)
     components = None
     # What is known of the lens has a weight that image points must be brought to, with stations or without.
     if (placed or lens) and bool(adjusted.converged):
@@ -131,4 +142,17 @@ def _calibrated(
         # Without an optimum they are no weights; the report says so.
         adjusted = components.adjusted if bool(components.adjusted.converged) else adjusted
     known = lens.sentences(oriented.block, CAMERA) if lens else ()
-    return FlightPart(oriented, matched, placed, why_not, components, adjusted, known)
+    return FlightPart(oriented, matched, placed, why_not, components, adjusted, known, why_still)
+
+
+def _rolling(adjusted: Adjustment, taken: Mapping[str, Moment], metric: bool) -> tuple[Adjustment, str]:
+    """The adjustment with a rolling shutter; the one that was given, and why, where that cannot be estimated."""
+    if not metric or not bool(adjusted.converged):
+        return adjusted, "no rolling shutter is estimated: without positions and an optimum nothing tells speeds"
+    try:
+        found = adjust_for_tables(with_rolling_shutter(adjusted.block, taken, _NEIGHBOUR_M, known=adjusted.unknowns))
+    except (InputError, RankError) as error:
+        return adjusted, f"no rolling shutter is estimated: {error}"
+    if not bool(found.converged):
+        return adjusted, f"no rolling shutter is estimated: {found.outcome.value}"
+    return found, ""

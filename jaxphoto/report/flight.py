@@ -12,6 +12,7 @@ from jinja2 import Environment
 from markupsafe import Markup
 
 from jaxphoto.procedures.flight import CalibratedFlight, FlightPart
+from jaxphoto.report.alike import with_alike
 from jaxphoto.report.findings import Finding, Level, Verdict
 from jaxphoto.report.lens import lens_findings
 from jaxphoto.report.maps import png_of
@@ -72,6 +73,8 @@ def _findings(part: FlightPart) -> Iterator[Finding]:
     report = part.oriented.report
     if not report.converged:
         yield Finding(Level.ALARM, "the orientation of the photographs did not settle: see how it was oriented")
+    if part.why_still:
+        yield Finding(Level.WARNING, part.why_still)
     if part.why_not:
         yield Finding(Level.WARNING, f"the block has a frame and a scale of its own: {part.why_not}")
     if part.placed and not part.placed.used.all():
@@ -171,6 +174,9 @@ def write_flight(flight: CalibratedFlight, reports: list[PartReport], spoilt: Ma
         times = {name: r.part.adjusted.seconds[name] for name in ("compile", "solve", "covariance")}
         with whole_folder(work / part_folder(number)) as folder:
             write_results(r.tables, r.verdict, folder, times)
+            with_alike(r.tables.interior, r.part.adjusted, r.part.oriented.report.alike).to_csv(
+                folder / "interior_alike.csv", index=False
+            )
             for name, table in (component_tables(r.part.components) if r.part.components else {}).items():
                 table.to_csv(folder / f"{name}.csv", index=False)
     images = pd.concat([r.images.assign(part=k) for k, r in enumerate(reports, 1)], ignore_index=True)
@@ -213,16 +219,16 @@ def _summary(r: PartReport, number: int) -> dict:
 def _page(flight: CalibratedFlight, reports: list[PartReport], spoilt: Mapping[str, str], verdict: Verdict) -> str:
     each = []
     for number, r in enumerate(reports, 1):
-        report, interior = r.part.oriented.report, r.tables.interior
+        report = r.part.oriented.report
+        interior = with_alike(r.tables.interior, r.part.adjusted, report.alike)
         interior = interior[interior["sigma"].notna() | (interior["value"] != 0)]
         each.append(
             {
                 "title": f"Part {number}" if len(reports) > 1 else "The block",
                 "folder": part_folder(number),
                 "interior": _table(interior.replace({True: "yes", False: "no", None: ""}), "{:.6g}"),
-                "alike": f"Neighbouring rays err alike: these standard deviations times {report.alike:.2g}."
-                if report.alike > ALIKE
-                else "",
+                "alike": f"Neighbouring rays err alike: sigma_alike is sigma with what the rays say of it times "
+                f"{report.alike:.2g}.",
                 "lens": r.part.lens,
                 "sentences": [*orientation_sentences(report), *(r.part.placed.sentences if r.part.placed else ())],
                 "picture": png_of(positions_figure(r))[1],

@@ -18,6 +18,7 @@ from jaxphoto.errors import few
 from jaxphoto.report.findings import Finding, Level, Verdict
 from jaxphoto.report.ground import ground_findings
 from jaxphoto.report.residual_findings import NOTHING_FITS, of_residuals, of_what_is_not_checked
+from jaxphoto.report.rolling_shutter import shutter_findings
 from jaxphoto.report.tables import Tables
 from jaxphoto.report.weakness import FELT, at_corner, weaknesses
 from jaxphoto.statistics import Correlations, Significance, if_zero, prepare_responses
@@ -53,6 +54,7 @@ def _findings(tables: Tables) -> Iterator[Finding]:
         felt = {name for name, moved in at_corner(tables, camera).items() if moved > FELT}
         yield from _correlated(camera, c, explained, felt, _all_known(adjusted.block))
     yield from ground_findings(tables)
+    yield from shutter_findings(tables)
     yield from (_not_significant(tables, s) for s in tables.significance if not s.significant)
     for name, sensor in adjusted.block.sensors.items():
         if _folds(adjusted, name, sensor):

@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxphoto.adjustment import Adjustment, NormalEquations, TiledStructure, TiledValues
+from jaxphoto.adjustment.model.image_orientations import cameras_at
 from jaxphoto.adjustment.model.numbers import Increments, UnknownArrays, state_at
 from jaxphoto.adjustment.model.row_functions import non_image_residuals
 from jaxphoto.adjustment.model.structure import CameraGroup, interior_of
@@ -121,10 +122,25 @@ def image_gradients(y: Increments, varying: Varying, common: Common) -> Incremen
     state, pull = jax.vjp(lambda y: states(y, varying, common), y)
     xy, sigma = (jnp.asarray(varying.get(name, getattr(common, name))) for name in ("xy", "sigma_xy"))
     cotangent = jax.tree.map(jnp.zeros_like, state)
-    for group, rows in zip(common.structure.groups, common.lists, strict=True):
-        of_group = _group_cotangent(group, rows, state, (xy, sigma), common.structure)
+    bent, pull_bent = None, None
+    if common.structure.bends:
+        bent, pull_bent = jax.vjp(lambda shared: _bent_cameras(shared, varying, common), state.shared)
+    of_images = []
+    for k, (group, rows) in enumerate(zip(common.structure.groups, common.lists, strict=True)):
+        by_image = None if bent is None else bent[k]
+        of_group, of_bent = _group_cotangent(group, rows, state, by_image, (xy, sigma), common.structure)
+        of_images.append(of_bent)
         cotangent = jax.tree.map(jnp.add, cotangent, of_group)
+    if pull_bent is not None:
+        cotangent = cotangent._replace(shared=cotangent.shared + pull_bent(tuple(of_images))[0])
     return pull(cotangent)[0]
+
+
+def _bent_cameras(shared: Float[Array, "parameters draws"], varying: Varying, common: Common) -> tuple[Array, ...]:
+    """Of each group of cameras the parameters by image (images, m, draws), bent by what is declared to bend them."""
+    return jax.vmap(
+        lambda shared, varying: cameras_at(shared, _values_with(varying, common), common.structure), (-1, -1), -1
+    )(shared, varying)
 
 
 def _values_with(varying: Varying, common: Common) -> TiledValues:
@@ -151,27 +167,44 @@ class _Sums(NamedTuple):
 
     centre: Float[Array, "images 3 draws"]
     turn: Float[Array, "images 3 draws"]
-    shared: Float[Array, "parameters draws"]
+    cameras: Float[Array, "owners m draws"]
+    """By camera of the group; by image where something bends them."""
     points: Float[Array, "points 3 draws"]
 
 
 def _group_cotangent(
-    group: CameraGroup, rows: RowList, state: UnknownArrays, seen: tuple[Array, Array], s: TiledStructure
-) -> UnknownArrays:
-    """Derivatives of the sum of q over the rows of a group with respect to the state."""
+    group: CameraGroup,
+    rows: RowList,
+    state: UnknownArrays,
+    bent: Array | None,
+    seen: tuple[Array, Array],
+    s: TiledStructure,
+) -> tuple[UnknownArrays, Array]:
+    """Derivatives of the sum of q over the rows of a group with respect to the state, and to `bent`, the parameters of
+    the cameras by image where something bends them (those of the state are zero then)."""
     n, size = state.position.shape[1:]
     of_images = jnp.concatenate([state.rotation.reshape(9, n, size), state.position]).transpose(1, 0, 2)
     of_points = state.points.transpose(1, 0, 2)
     nothing = jnp.zeros((n, 3, size))
-    zero = _Sums(nothing, nothing, jnp.zeros_like(state.shared), jnp.zeros_like(of_points))
+    m, cameras = group.treedef.num_leaves, len(group.names)
+    own = slice(group.offset, group.offset + m * cameras)
+    table = state.shared[own].reshape(cameras, m, size) if bent is None else bent
+    zero = _Sums(nothing, nothing, jnp.zeros_like(table), jnp.zeros_like(of_points))
+    if bent is not None:
+        # Every image is a camera of its own.
+        rows = eqx.tree_at(lambda r: r.camera, rows, rows.image)
 
     def add(sums: _Sums, rows: RowList) -> tuple[_Sums, None]:
-        return _with_chunk(sums, group, rows, of_images, of_points, state.shared, seen, s), None
+        return _with_chunk(sums, group, rows, of_images, of_points, table, seen, s), None
 
     sums, _ = jax.lax.scan(add, zero, rows)
     # Of all cotangents of a matrix R that changes by -t x R, the one along such changes.
     rotation = -0.5 * jnp.cross(sums.turn.transpose(1, 0, 2)[:, None], state.rotation, axis=0)
-    return UnknownArrays(sums.centre.transpose(1, 0, 2), rotation, sums.shared, sums.points.transpose(1, 0, 2))
+    shared = jnp.zeros_like(state.shared)
+    if bent is None:
+        shared = shared.at[own].set(sums.cameras.reshape(-1, size))
+    of_state = UnknownArrays(sums.centre.transpose(1, 0, 2), rotation, shared, sums.points.transpose(1, 0, 2))
+    return of_state, sums.cameras
 
 
 def _with_chunk(
@@ -180,7 +213,7 @@ def _with_chunk(
     rows: RowList,
     of_images: Float[Array, "images 12 draws"],
     of_points: Float[Array, "points 3 draws"],
-    shared: Float[Array, "parameters draws"],
+    table: Float[Array, "owners m draws"],
     seen: tuple[Array, Array],
     s: TiledStructure,
 ) -> _Sums:
@@ -215,7 +248,7 @@ def _with_chunk(
     )
     xy, sigma = (v[:, rows.row] for v in seen)
     weight = jnp.expand_dims(rows.counts, range(1, sigma.ndim - 1)) / sigma
-    to_chosen, to_u = _camera_cotangent(group, rows, shared, u, (xy, weight), s)
+    to_chosen, to_u = _camera_cotangent(group, rows, table, u, (xy, weight), s)
     to_aim = once(lambda i, to_u: _each_row(back_to_aim, _at(i, rows.image), to_u), s.eop_free, of_images, to_u)
     to_centre, to_point = 0.0, to_aim
     if s.corrections != NO_CORRECTIONS:
@@ -223,7 +256,7 @@ def _with_chunk(
     return _Sums(
         sums.centre.at[rows.image].add(to_centre - to_aim),
         sums.turn.at[rows.image].add(_each_row(back_to_turn, u, to_u)),
-        sums.shared + to_chosen,
+        sums.cameras + to_chosen,
         sums.points.at[rows.point].add(to_point, indices_are_sorted=True),
     )
 
@@ -244,14 +277,13 @@ def _at(array: Array, index: Numbers) -> Array:
 def _camera_cotangent(
     group: CameraGroup,
     rows: RowList,
-    shared: Float[Array, "parameters draws"],
+    table: Float[Array, "owners m draws"],
     u: tuple[Array, ...],
     seen: tuple[Array, Array],
     s: TiledStructure,
 ) -> tuple[Array, tuple[Array, ...]]:
-    """dq/d(shared), summed over the rows of a group, and dq/du of each."""
-    m, cameras = group.treedef.num_leaves, len(group.names)
-    table = shared[group.offset : group.offset + m * cameras].reshape(cameras, m, -1)
+    """dq/d(table), summed over the rows of a group, and dq/du of each."""
+    cameras, m = table.shape[:2]
     # One camera: the same for all rows.
     leaves = [table[rows.camera, k] if cameras > 1 else table[0, k] for k in range(m)]
     chosen = tuple(leaves[k] for k in group.free_leaves)
@@ -285,12 +317,12 @@ def _camera_cotangent(
     given = chosen, u, leaves, seen[0]
     to_residual = once(each(weighed, weight_last, 1), s.eop_free, *given, seen[1])
     to_chosen, to_u = (once(each(by, -1, 0), s.eop_free, *given, to_residual) for by in (back_to_camera, back_to_u))
-    cotangent = jnp.zeros_like(shared)
+    cotangent = jnp.zeros_like(table)
     for k, of_rows in zip(group.free_leaves, to_chosen, strict=True):
         if cameras > 1:
             summed = jax.ops.segment_sum(of_rows, rows.camera, cameras)
         else:
             # Many times faster than a sum along the first axis.
             summed = jnp.ones((1, len(of_rows))) @ of_rows
-        cotangent = cotangent.at[group.offset + k + m * np.arange(cameras)].set(summed)
+        cotangent = cotangent.at[:, k].set(summed)
     return cotangent, to_u

@@ -34,11 +34,11 @@ class OrientationDerivatives(NamedTuple):
 def orientations_of(state: UnknownArrays, values: AbstractValues, s: AbstractStructure) -> ImageOrientations:
     """The state, image by image."""
     return ImageOrientations(
-        state.position.T, state.rotation.transpose(2, 0, 1), _cameras_at(jnp.asarray(state.shared), values, s)
+        state.position.T, state.rotation.transpose(2, 0, 1), cameras_at(jnp.asarray(state.shared), values, s)
     )
 
 
-def _cameras_at(shared: Array, values: AbstractValues, s: AbstractStructure) -> tuple[Array, ...]:
+def cameras_at(shared: Array, values: AbstractValues, s: AbstractStructure) -> tuple[Array, ...]:
     """The parameters of the cameras (see `ImageOrientations`), bent by what is declared to bend them."""
     cameras = []
     for g in s.groups:
@@ -84,7 +84,7 @@ def orientation_derivatives(
     if s.bends:
         shared = jnp.asarray(values.shared).at[s.free].add(y.shared * scale.shared, unique_indices=True)
         # A product for each colour: an image has one owner of each kind, so nothing of another's comes in.
-        along = jax.vmap(lambda d: jax.jvp(lambda p: _cameras_at(p, values, s), (shared,), (d,))[1], -1, 1)(by_colour)
+        along = jax.vmap(lambda d: jax.jvp(lambda p: cameras_at(p, values, s), (shared,), (d,))[1], -1, 1)(by_colour)
         cameras = [c[..., list(g.free_leaves)] for g, c in zip(s.groups, along, strict=True)]
     else:
         for g in s.groups:
