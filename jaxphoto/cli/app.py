@@ -39,6 +39,7 @@ COMMANDS = {
         "convert",
         "Turn another program's files into a block folder, or what was adjusted into another program's files.",
     ),
+    "undistort": _Command("undistort", "Resample photographs to a camera without distortion."),
     "simulate": _Command("simulate", "Simulate a block with known truth."),
     "sensitivity": _Command(
         "sensitivity",
