@@ -40,8 +40,9 @@ COMMANDS = {
     "camera": _Command("camera", "Convert a camera file."),
     "convert": _Command(
         "convert",
-        "Turn another program's files into a block folder, or what was adjusted into another program's files.",
+        "Turn another program's files into a block folder, or what was adjusted into files of others.",
     ),
+    "undistort": _Command("undistort", "Resample photographs to a camera without distortion."),
     "simulate": _Command("simulate", "Simulate a block with known truth."),
     "sensitivity": _Command(
         "sensitivity",

@@ -14,7 +14,7 @@ from jaxphoto.block import Frame
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing.map_frame import map_system
 from jaxphoto.io.exports.adjusted_photographs import AdjustedPhotographs
-from jaxphoto.io.exports.features import features
+from jaxphoto.io.exports.map_features import map_features
 
 _WGS84_3D = 4979
 
@@ -27,7 +27,7 @@ def write_geo_json(photographs: AdjustedPhotographs, folder: Path) -> None:
     frame = photographs.frame
     if frame.kind != "epsg":
         raise InputError("GeoJSON is in longitude and latitude, and the block is in a local frame; write a GeoPackage")
-    told = features(photographs)
+    told = map_features(photographs)
     stations = [
         _feature({"type": "Point", "coordinates": at}, attributes)
         for at, attributes in zip(_places(frame, told.positions).tolist(), told.attributes, strict=True)

@@ -17,7 +17,7 @@ import numpy as np
 from jaxphoto.block import Frame
 from jaxphoto.georeferencing.map_frame import map_system
 from jaxphoto.io.exports.adjusted_photographs import AdjustedPhotographs
-from jaxphoto.io.exports.features import features
+from jaxphoto.io.exports.map_features import map_features
 
 FILE = "photographs.gpkg"
 # "GPKG", and version 1.3.0.
@@ -43,7 +43,7 @@ _POINT_Z, _POLYGON_Z = 1001, 1003
 
 def write_geo_package(photographs: AdjustedPhotographs, folder: Path) -> None:
     """Write photographs.gpkg into `folder`; a photograph of the horizon has no footprint."""
-    p, told = photographs, features(photographs)
+    p, told = photographs, map_features(photographs)
     on_map = (lambda local: p.frame.map.map(local)) if p.frame.kind == "epsg" else np.asarray
     n_images = np.bincount(p.point, minlength=len(p.points)).tolist()
     points = [{"point": name, "n_images": n} for name, n in zip(p.points, n_images, strict=True)]

@@ -8,7 +8,7 @@ import csv
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeGuard
 
 import equinox as eqx
 import numpy as np
@@ -26,6 +26,7 @@ from jaxphoto.io.block_folder.table_layout import ANGLES, TOML, XYZ
 from jaxphoto.io.cameras import read_camera_file
 from jaxphoto.io.cameras.own_cameras import INTERIOR
 from jaxphoto.io.json_file import read_json
+from jaxphoto.io.names import control_in
 from jaxphoto.io.text_tables import Table, read_csv
 
 EXTERIOR, POINTS, SUMMARY = "exterior.csv", "object_points.csv", "summary.json"
@@ -33,6 +34,8 @@ PHOTOGRAPHS = "photographs.csv"
 """Of a flight: the file of the photograph that each image is."""
 _from_angles = eqx.filter_jit(ExteriorOrientation.from_angles)
 _MEND = "name the block that was adjusted by --block, or adjust again"
+# Bytes of a name, characters of a path as seen from another folder.
+_LONGEST_NAME, _LONGEST_PATH = 255, 1000
 _PICTURES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".dng", ".bmp", ".webp", ".jp2")
 
 
@@ -136,7 +139,7 @@ def _own_block(folder: Path) -> Path:
     """The block of a result: what its summary says, or the flight that it lies in."""
     summary = read_json(folder / SUMMARY) if (folder / SUMMARY).is_file() else {}
     told = summary.get("block")
-    if isinstance(told, str) and told and "\0" not in told:
+    if _is_path(told):
         return folder / told
     for other in _parts(folder.parent) or []:
         if isinstance(other, dict) and other.get("result") == folder.name:
@@ -148,8 +151,14 @@ def _own_block(folder: Path) -> Path:
 
 def _below(folder: Path, name: Any) -> Path | None:
     """A folder in `folder`; None for a name that is none, or leads elsewhere."""
-    plain = isinstance(name, str) and name not in ("", ".", "..") and not set(name) & set("/\\\0")
-    return folder / name if plain else None
+    return folder / name if _is_path(name) and name not in (".", "..") and not set(name) & set("/\\") else None
+
+
+def _is_path(text: Any) -> TypeGuard[str]:
+    """Whether a word of a file can be the path of a folder, of a length that systems know."""
+    if not isinstance(text, str) or text == "" or control_in(text) or len(text) > _LONGEST_PATH:
+        return False
+    return max(len(part.encode()) for part in text.split("/")) <= _LONGEST_NAME
 
 
 def _checked(result: Path, block: Path) -> _Sources:

@@ -10,7 +10,7 @@ from jaxphoto.io.exports.footprints import footprints
 from jaxphoto.io.exports.map_photographs import in_map
 
 
-class Features(NamedTuple):
+class MapFeatures(NamedTuple):
     """One entry a photograph; positions and rings in the block's own frame (m)."""
 
     positions: np.ndarray
@@ -20,7 +20,7 @@ class Features(NamedTuple):
     """image, file, camera, omega_deg, phi_deg, kappa_deg against the grid of the map, n_image_points."""
 
 
-def features(photographs: AdjustedPhotographs) -> Features:
+def map_features(photographs: AdjustedPhotographs) -> MapFeatures:
     """Stations, footprints and their attributes."""
     p = photographs
     angles = angles_deg(in_map(p).exterior).tolist()
@@ -33,4 +33,4 @@ def features(photographs: AdjustedPhotographs) -> Features:
         )
     ]
     rings = [None if ring is None else np.vstack([ring, ring[:1]]) for ring in footprints(p)]
-    return Features(np.asarray(p.exterior.position), rings, attributes)
+    return MapFeatures(np.asarray(p.exterior.position), rings, attributes)
