@@ -33,15 +33,12 @@ from jaxphoto.io.control_files import read_control
 from jaxphoto.io.dbat import read_dbat
 from jaxphoto.io.draws_folder import DrawsFolder
 from jaxphoto.io.exports import adjusted_block, photograph_files
-from jaxphoto.io.photomodeler import read_photomodeler
-from jaxphoto.io.raster import read_dsm
-from jaxphoto.io.trajectory import Records, read_records, write_flight_csv, write_sbet
-from jaxphoto.procedures.control.system import places, system_of
 from jaxphoto.io.photograph_seconds import photograph_seconds
 from jaxphoto.io.photographs import photographs
 from jaxphoto.io.photomodeler import read_photomodeler
 from jaxphoto.io.raster import read_dsm
 from jaxphoto.io.trajectory import Records, read_records, write_flight_csv, write_sbet
+from jaxphoto.procedures.control.system import places, system_of
 from jaxphoto.unknowns import FIXED, FREE, Weighted
 from tests import sound_files
 from tests.io import control_files, test_bal, test_colmap
@@ -248,6 +245,8 @@ def _control(folder: Path, marks: Path | None = None) -> object:
     """Points and marks, and the places of the points."""
     read = read_control(folder / "a", marks)
     return places(read.points, system_of(read.points.system, "a"), 4326) if read.points.system else read
+
+
 _SHUTTER = b"""
 [shutters.kodak]
 readout_ms = 20.0
@@ -295,6 +294,7 @@ READERS: dict[str, Reader] = {
             "photographs.csv",
             *(f"result/{n}" for n in ("summary.json", "exterior.csv", "object_points.csv")),
         ),
+    ),
     "recipe-shutter": Reader(
         lambda: {"recipe.toml": (_EXAMPLES / "recipe.toml").read_bytes() + _SHUTTER},
         lambda folder: read_recipe(folder / "recipe.toml"),
