@@ -28,6 +28,8 @@ from jaxphoto.io import clouds, read_block, read_recipe, read_source
 from jaxphoto.io.cameras import read_camera_file, write_camera_file
 from jaxphoto.io.dbat import read_dbat
 from jaxphoto.io.draws_folder import DrawsFolder
+from jaxphoto.io.exposures import read_exposures
+from jaxphoto.io.photograph_metadata import drone_record, xmp_fields
 from jaxphoto.io.photomodeler import read_photomodeler
 from jaxphoto.io.raster import read_dsm
 from jaxphoto.io.trajectory import Records, read_records, write_flight_csv, write_sbet
@@ -200,6 +202,10 @@ def _cloud(kind: str) -> Callable[[Path], object]:
     return lambda folder: clouds.read_cloud(folder / f"a.{kind}")
 
 
+def _drone_record(path: Path) -> object:
+    return drone_record(xmp_fields(path.read_bytes()))
+
+
 def _picture(kind: str) -> Callable[[Path], object]:
     return lambda folder: read_grey(folder / f"a.{kind}")
 
@@ -247,6 +253,12 @@ READERS: dict[str, Reader] = {
     "colmap-binary": Reader(written_by(test_colmap.write_binary), lambda folder: read_source(folder, "colmap")),
     "dbat": Reader(text(**sound_files.DBAT), read_dbat),
     "photomodeler": Reader(text(**sound_files.PHOTOMODELER), read_photomodeler),
+    "exposures-marks": Reader(text(a__MRK=sound_files.MARKS), lambda folder: read_exposures(folder / "a.MRK")),
+    "exposures-pos": Reader(text(a__pos=sound_files.POS), lambda folder: read_exposures(folder / "a.pos")),
+    "exposures-table": Reader(
+        text(a__csv=sound_files.EXPOSURES), lambda folder: read_exposures(folder / "a.csv", 32633)
+    ),
+    "photograph-xmp": Reader(text(a__xmp=sound_files.XMP), lambda folder: _drone_record(folder / "a.xmp")),
     "dsm": Reader(sound_files.surface, lambda folder: read_dsm(folder / "a.tif")),
     "cloud-ply-text": Reader(sound_files.ply_text, lambda folder: clouds.read_cloud(folder / "a.ply")),
     **{f"cloud-{kind}": Reader(partial(sound_files.cloud, kind), _cloud(kind)) for kind in ("csv", "ply")},

@@ -125,7 +125,7 @@ def _sigmas(known: list[Gps], offsets: Float[np.ndarray, "n 3"]) -> Float[np.nda
     """What the files say; of those that say nothing `SIGMA_M`, or the scatter where that is more."""
     plan = max(SIGMA_M[0], float(np.sqrt(np.mean(offsets[:, :2] ** 2))))
     height = max(SIGMA_M[2], float(np.sqrt(np.mean(offsets[:, 2] ** 2))))
-    return np.array([gps.sigma_m or (plan, plan, height) for gps in known])
+    return np.array([gps.stated_sigma_m or (plan, plan, height) for gps in known])
 
 
 def _nearest(
