@@ -104,6 +104,7 @@ def fly_command(
             {p.name: p.gps for p in read},
             epsg,
             status.update,
+            {p.name: p.attitude for p in read},
         )
         flight = flight._replace(left_out=matched.left_out | flight.left_out)
         status.update("computing statistics")

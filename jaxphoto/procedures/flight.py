@@ -9,6 +9,7 @@ from jaxtyping import Float
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.camera import InteriorOrientation, Sensor
 from jaxphoto.errors import BlockError, DatumError, InputError, RankError
+from jaxphoto.georeferencing.camera_attitude import CameraAttitude
 from jaxphoto.georeferencing.gps import Gps
 from jaxphoto.orientation.matches import PairMatches
 from jaxphoto.procedures.adjust import adjust_for_tables
@@ -67,11 +68,12 @@ def calibrate_flight(
     positions: Mapping[str, Gps | None],
     code: int | None = None,
     report: Report = lambda text: None,
+    attitudes: Mapping[str, CameraAttitude | None] | None = None,
 ) -> CalibratedFlight:
     """Orient, georeference and adjust every part of the photographs of one camera, which starts at `interior`.
 
-    `positions` are by name; `code` is the EPSG code of the map system (UTM where there is none). Photographs that
-    cannot be oriented, and whole parts that cannot, are left out with the reason.
+    `positions` and `attitudes` are by name; `code` is the EPSG code of the map system (UTM where there is none).
+    Photographs that cannot be oriented, and whole parts that cannot, are left out with the reason.
 
     Raises InputError where no part can be oriented.
     """
@@ -80,7 +82,7 @@ def calibrate_flight(
     for number, part in enumerate(matched, 1):
         report(f"part {number} of {len(matched)}")
         try:
-            parts.append(_calibrated(part, sensor, interior, positions, code, report))
+            parts.append(_calibrated(part, sensor, interior, positions, attitudes, code, report))
         except BlockError as error:
             left |= {
                 name: f"its part of {len(part.names)} photographs cannot be oriented: {error}" for name in part.names
@@ -98,6 +100,7 @@ def _calibrated(
     sensor: Sensor,
     interior: InteriorOrientation,
     positions: Mapping[str, Gps | None],
+    attitudes: Mapping[str, CameraAttitude | None] | None,
     code: int | None,
     report: Report,
 ) -> FlightPart:
@@ -108,7 +111,7 @@ def _calibrated(
     report("adjusting")
     placed, why_not = None, ""
     try:
-        placed = georeference_photographs(oriented.block, positions, code)
+        placed = georeference_photographs(oriented.block, positions, code, attitudes)
         adjusted = adjust_for_tables(placed.block)
     except (InputError, BlockError, DatumError, RankError) as error:
         # Positions that do not tell the frame, or too badly: the calibration does without.
