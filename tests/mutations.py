@@ -35,6 +35,8 @@ from jaxphoto.io.draws_folder import DrawsFolder
 from jaxphoto.io.exports import adjusted_block, photograph_files
 from jaxphoto.io.photograph_seconds import photograph_seconds
 from jaxphoto.io.photographs import photographs
+from jaxphoto.io.exposures import read_exposures
+from jaxphoto.io.photograph_metadata import drone_record, xmp_fields
 from jaxphoto.io.photomodeler import read_photomodeler
 from jaxphoto.io.raster import read_dsm
 from jaxphoto.io.trajectory import Records, read_records, write_flight_csv, write_sbet
@@ -237,6 +239,10 @@ def _cloud(kind: str) -> Callable[[Path], object]:
     return lambda folder: clouds.read_cloud(folder / f"a.{kind}")
 
 
+def _drone_record(path: Path) -> object:
+    return drone_record(xmp_fields(path.read_bytes()))
+
+
 def _picture(kind: str) -> Callable[[Path], object]:
     return lambda folder: read_grey(folder / f"a.{kind}")
 
@@ -344,6 +350,12 @@ READERS: dict[str, Reader] = {
         text(a=control_files.OWN, b=control_files.OWN_MARKS),
         lambda folder: _control(folder, folder / "b"),
     ),
+    "exposures-marks": Reader(text(a__MRK=sound_files.MARKS), lambda folder: read_exposures(folder / "a.MRK")),
+    "exposures-pos": Reader(text(a__pos=sound_files.POS), lambda folder: read_exposures(folder / "a.pos")),
+    "exposures-table": Reader(
+        text(a__csv=sound_files.EXPOSURES), lambda folder: read_exposures(folder / "a.csv", 32633)
+    ),
+    "photograph-xmp": Reader(text(a__xmp=sound_files.XMP), lambda folder: _drone_record(folder / "a.xmp")),
     "dsm": Reader(sound_files.surface, lambda folder: read_dsm(folder / "a.tif")),
     "cloud-ply-text": Reader(sound_files.ply_text, lambda folder: clouds.read_cloud(folder / "a.ply")),
     **{f"cloud-{kind}": Reader(partial(sound_files.cloud, kind), _cloud(kind)) for kind in ("csv", "ply")},

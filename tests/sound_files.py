@@ -89,3 +89,32 @@ def surface() -> Files:
         heights = np.add.outer(np.arange(40.0), np.arange(50.0))
         write_dsm(Path(folder) / "a.tif", Raster(heights, 5e5, 5e6, 1.0), epsg_system(32633, "a"))
         return {"a.tif": (Path(folder) / "a.tif").read_bytes()}
+
+
+MARKS = (
+    "1\t268619.354051\t[2129]\t    24,N\t     9,E\t   193,V\t-21.97273819,Lat\t113.93433129,Lon\t91.071,Ellh\t"
+    "1.056360, 1.085926, 3.245131\t16,Q\n"
+    "2\t268621.283927\t[2129]\t    20,N\t    15,E\t   193,V\t-21.97253139,Lat\t113.93438555,Lon\t91.182,Ellh\t"
+    "0.012977, 0.011731, 0.031695\t50,Q\n"
+)
+POS = """% program   : RTKPOST ver.2.4.3
+% (lat/lon/height=WGS84/ellipsoidal,Q=1:fix,2:float,5:single,ns=# of satellites)
+%  GPST                  latitude(deg) longitude(deg)  height(m)   Q  ns   sdn(m)   sde(m)   sdu(m)
+2021/03/10 09:12:01.200   47.480948244   19.056512467   177.0515   1   9   0.0065   0.0064   0.0144
+2021/03/10 09:12:03.400   47.480947993   19.056507472   176.6958   2   9   0.1220   0.1519   0.4474
+2148 292325.200   47.480947993   19.056507472   176.6958   5   5
+"""
+EXPOSURES = """# of a flight
+image,X_m,Y_m,Z_m,omega_deg,phi_deg,kappa_deg,sigma_X_m,sigma_Y_m,sigma_Z_m,sigma_omega_deg,sigma_phi_deg,sigma_kappa_deg,fix
+a.JPG,500010.5,6170000.25,120.5,1.5,-2.25,91,0.02,0.02,0.04,0.1,0.1,0.5,fixed
+b.JPG,500030.5,6170000.75,120.75,0.5,-1.25,90,,,,,,,
+"""
+XMP = """<?xpacket begin=""?><rdf:Description rdf:about="DJI Meta Data" drone-dji:AltitudeType="RtkAlt"
+ drone-dji:AbsoluteAltitude="+139.231" drone-dji:RelativeAltitude="+80.012" drone-dji:GimbalRollDegree="+180.00"
+ drone-dji:GimbalYawDegree="-92.70" drone-dji:GimbalPitchDegree="-90.00" drone-dji:FlightYawDegree="+87.20"
+ drone-dji:RtkFlag="50" drone-dji:RtkStdLon="0.01174" drone-dji:UTCAtExposure="2022-07-23T07:12:22.872778"
+ Camera:GPSXYAccuracy="845389/2097152" Camera:GPSZAccuracy="5117051/8388608" Camera:IMUYawAccuracy="10">
+<Camera:Roll>-6.93</Camera:Roll><Camera:Pitch>2.5</Camera:Pitch><Camera:Yaw>-146.9</Camera:Yaw>
+<drone-skydio:CameraOrientationNED rdf:parseType="Resource"><drone-skydio:Yaw>101.5</drone-skydio:Yaw>
+<drone-skydio:Pitch>-7.4</drone-skydio:Pitch></drone-skydio:CameraOrientationNED></rdf:Description>
+"""

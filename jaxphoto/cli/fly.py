@@ -2,7 +2,7 @@
 
 from pathlib import Path
 from threading import Thread
-from typing import Annotated
+from typing import Annotated, get_args
 
 import numpy as np
 import typer
@@ -10,6 +10,8 @@ import typer
 from jaxphoto.camera import DISTORTIONS, InteriorOrientation
 from jaxphoto.cli.app import app
 from jaxphoto.cli.console import plain_console
+from jaxphoto.errors import InputError, quoted
+from jaxphoto.georeferencing.gps import Heights
 from jaxphoto.georeferencing.map_frame import map_system
 from jaxphoto.image_measurement.features import FEATURES, LONGEST_PX
 from jaxphoto.image_measurement.matching import MatchedPhotographs, match_photographs
@@ -18,7 +20,10 @@ from jaxphoto.io.block_folder import whole_block
 from jaxphoto.io.exports import write_photograph_files
 from jaxphoto.io.photograph_seconds import photograph_seconds
 from jaxphoto.io.photographs import Photograph, known_lens, sensor_and_interior
+from jaxphoto.io.exposures import located
+from jaxphoto.io.photographs import Photograph, sensor_and_interior
 from jaxphoto.io.sound_photographs import sound_photographs
+from jaxphoto.io.text_tables import finite
 from jaxphoto.procedures.calibration import distortion_model
 from jaxphoto.procedures.flight import MatchedPart, calibrate_flight
 from jaxphoto.report import Level, prepare_pictures
@@ -55,6 +60,16 @@ def fly_command(
     rolling_shutter: Annotated[
         bool, typer.Option(help="Estimate the readout time of the rows, with speeds from positions and times of EXIF.")
     ] = False,
+    exposures: Annotated[
+        list[Path] | None,
+        typer.Option(help="Files of exposures elsewhere than in the folders: .MRK, .pos, SBET, a table."),
+    ] = None,
+    lever_arm: Annotated[
+        str | None, typer.Option(help="From camera to antenna, in metres: right,forward,up of the aircraft.")
+    ] = None,
+    heights: Annotated[
+        str | None, typer.Option(help="Heights are above the ellipsoid, geoid or take-off, where files do not say it.")
+    ] = None,
 ) -> None:
     """Calibrate the camera of a flight from its photographs and their positions: orient, georeference, adjust, judge.
 
@@ -69,6 +84,12 @@ def fly_command(
         read, spoilt = sound_photographs(photographs)
         for sentence in spoilt.values():
             errors.print(f"left out: {plain(sentence)}", soft_wrap=True)
+        told = located(
+            read, photographs, exposures or (), code=epsg, arm=_lever_arm(lever_arm), heights=_heights(heights)
+        )
+        read = told.photographs
+        for sentence in told.sentences:
+            console.print(plain(sentence), soft_wrap=True)
         camera = sensor_and_interior(read, pixel_mm, c_mm)
         distortion = distortion_model(model, camera.sensor)
         compared = photograph_pairs(read, pairs or _usual_pairs(read))
@@ -94,6 +115,7 @@ def fly_command(
             status.update,
             known_lens(read, camera, distortion) if lens_prior else None,
             photograph_seconds(read) if rolling_shutter else None,
+            {p.name: p.attitude for p in read},
         )
         flight = flight._replace(left_out=matched.left_out | flight.left_out)
         status.update("computing statistics")
@@ -124,6 +146,25 @@ def fly_command(
 
 def _part(names: list[str], group: np.ndarray, own: MatchedPhotographs) -> MatchedPart:
     return MatchedPart([names[k] for k in group], own.xy_mm, own.sigma_mm, own.pairs, own.n_gross, own.sigma_factor)
+
+
+def _lever_arm(text: str | None) -> tuple[float, float, float] | None:
+    if text is None:
+        return None
+    numbers = [finite(part.strip()) for part in text.split(",")]
+    known = [v for v in numbers if v is not None]
+    if len(numbers) != 3 or len(known) != 3:
+        raise InputError(f"--lever-arm is {quoted(text)}; give three numbers of metres, right,forward,up: 0,0.03,0.19")
+    return known[0], known[1], known[2]
+
+
+def _heights(text: str | None) -> Heights | None:
+    for kind in get_args(Heights):
+        if text == kind != "unknown":
+            return kind
+    if text is None:
+        return None
+    raise InputError(f"--heights is {quoted(text)}; give ellipsoid, geoid or take-off")
 
 
 def _usual_pairs(photographs: list[Photograph]) -> str:

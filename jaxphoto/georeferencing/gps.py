@@ -1,13 +1,61 @@
-"""What the file of a photograph says of where it was taken."""
+"""What a photograph's file, or one beside it, says of where the photograph was taken."""
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+Heights = Literal["ellipsoid", "geoid", "take-off", "unknown"]
+"""What heights are above; a geoid is that of some model, mean sea level in common words."""
+HEIGHTS: dict[Heights, str] = {
+    "ellipsoid": "above the ellipsoid",
+    "geoid": "above a geoid (mean sea level)",
+    "take-off": "above take-off",
+    "unknown": "above what the files do not say",
+}
+"""In words."""
+Fix = Literal["fixed", "float", "single", "unknown"]
+"""How a receiver solved for the position: with corrections and whole ambiguities, with real ones, or without both."""
+FIX_SIGMA_M: dict[Fix, tuple[float, float, float]] = {"fixed": (0.02, 0.02, 0.04), "float": (0.3, 0.3, 0.6)}
+"""East, north and up, where the file says the solution but no standard deviations.
+
+A fixed solution has 1 cm + 1 ppm in plan and 1.5 cm + 1 ppm in height (DJI, specifications of the Phantom 4 RTK) while
+nothing else errs, a float one decimetres (DJI, manuals: RtkFlag); twice the former allows for base and interpolation.
+"""
 
 
 class Gps(NamedTuple):
-    """A position that the camera's own receiver gave, metres off at best."""
+    """A position of the projection centre that a receiver gave, metres off where it had no corrections."""
 
     latitude_deg: float
     longitude_deg: float
     altitude_m: float | None
     sigma_m: tuple[float, float, float] | None = None
-    """East, north and up, of a receiver with corrections that says them (DJI's RTK)."""
+    """East, north and up, where the file says them."""
+    heights: Heights = "unknown"
+    """What `altitude_m` is above."""
+    fix: Fix = "unknown"
+
+    @property
+    def stated_sigma_m(self) -> tuple[float, float, float] | None:
+        """East, north and up: those of the file, else those of the kind of solution; None where it tells neither."""
+        return self.sigma_m or FIX_SIGMA_M.get(self.fix)
+
+
+def moved(gps: Gps, east_north_up_m: Float[np.ndarray, "3"]) -> Gps:
+    """`gps` a lever arm farther (metres on WGS 84, to micrometres for arms of metres)."""
+    east, north, up = np.asarray(east_north_up_m, float).tolist()
+    s = np.sin(np.deg2rad(gps.latitude_deg))
+    w = 1 - _E2 * s * s
+    latitude = gps.latitude_deg + float(np.rad2deg(north / (_A_M * (1 - _E2) / w**1.5)))
+    across = _A_M / w**0.5 * np.cos(np.deg2rad(gps.latitude_deg))
+    height = None if gps.altitude_m is None else gps.altitude_m + up
+    return gps._replace(
+        latitude_deg=latitude,
+        longitude_deg=gps.longitude_deg + float(np.rad2deg(east / max(across, 1.0))),
+        altitude_m=height,
+    )
+
+
+# WGS 84.
+_A_M, _E2 = 6_378_137.0, 0.006_694_379_990_141

@@ -15,8 +15,11 @@ from PIL import ExifTags, Image
 from jaxphoto.camera import AbstractDistortion, InteriorOrientation, Sensor
 from jaxphoto.camera.lens_prior import lens_prior
 from jaxphoto.errors import InputError
+from jaxphoto.georeferencing.camera_attitude import CameraAttitude
+from jaxphoto.georeferencing.exposure_times import Taken
 from jaxphoto.georeferencing.gps import Gps
-from jaxphoto.io.photograph_metadata import dji_fields, rtk_sigma
+from jaxphoto.io.photograph_metadata import DroneRecord, drone_record, xmp_fields
+from jaxphoto.io.photograph_times import taken
 from jaxphoto.io.picture_size import check_pixels
 from jaxphoto.procedures.known_lens import KnownLens
 
@@ -51,6 +54,12 @@ class Photograph(NamedTuple):
     orientation: int = 1
     """The flag by which viewers turn the picture, 1 to 8; 1 where there is none."""
     gps: Gps | None = None
+    above_takeoff_m: float | None = None
+    """The height above take-off, which drones note beside that of `gps`."""
+    attitude: CameraAttitude | None = None
+    aircraft_deg: tuple[float, float, float] | None = None
+    """Roll, pitch and yaw of the aircraft, where its camera hangs in a gimbal."""
+    taken: Taken | None = None
 
 
 class CameraStart(NamedTuple):
@@ -227,18 +236,23 @@ def _exif(picture: Image.Image) -> dict[str, Any]:
     """The fields of `Photograph` after the first four, from EXIF that may be absent or damaged."""
     try:
         top = picture.getexif()
-        taken, gps = top.get_ifd(ExifTags.IFD.Exif), top.get_ifd(ExifTags.IFD.GPSInfo)
+        shot, gps = top.get_ifd(ExifTags.IFD.Exif), top.get_ifd(ExifTags.IFD.GPSInfo)
     except Exception:
         return {}
-    flag, film = top.get(_TAG.Orientation, 1), _positive(taken.get(_TAG.FocalLengthIn35mmFilm))
+    flag, film = top.get(_TAG.Orientation, 1), _positive(shot.get(_TAG.FocalLengthIn35mmFilm))
+    drone = drone_record(xmp_fields(picture.info.get("xmp")))
     return {
         "make": _words(top.get(_TAG.Make)),
         "model": _words(top.get(_TAG.Model)),
-        "focal_length_mm": _positive(taken.get(_TAG.FocalLength)),
+        "focal_length_mm": _positive(shot.get(_TAG.FocalLength)),
         "focal_length_35mm_mm": film if film is not None and _FILM_MM[0] <= film <= _FILM_MM[1] else None,
-        "sensor_width_mm": _sensor_width(taken, *picture.size),
+        "sensor_width_mm": _sensor_width(shot, *picture.size),
         "orientation": flag if flag in range(1, 9) else 1,
-        "gps": _gps(gps, rtk_sigma(dji_fields(picture.info.get("xmp")))),
+        "gps": _gps(gps, drone),
+        "above_takeoff_m": drone.above_takeoff_m,
+        "attitude": drone.attitude,
+        "aircraft_deg": drone.aircraft_deg,
+        "taken": taken(shot, gps, drone.utc),
     }
 
 
@@ -267,16 +281,22 @@ def _words(value: Any) -> str | None:
     return words or None
 
 
-def _gps(tags: dict, sigma_m: tuple[float, float, float] | None) -> Gps | None:
+def _gps(tags: dict, drone: DroneRecord) -> Gps | None:
+    """The position of EXIF with the height and what else the packet of the drone says; (0, 0) is a receiver's nothing.
+
+    Latitudes beyond the poles stay: `georeferencing.recorded_positions` knows two numbers that changed places.
+    """
     try:
         latitude, longitude = (_degrees(tags[k]) * _sign(tags.get(k - 1)) for k in (2, 4))
         altitude = float(tags[6]) * (-1 if tags.get(5) in (1, b"\x01") else 1) if 6 in tags else None
     except (KeyError, TypeError, ValueError, ZeroDivisionError):
         return None
-    known = math.isfinite(latitude) and math.isfinite(longitude) and (abs(latitude) <= 90 and abs(longitude) <= 180)
-    if not known:
+    if not (math.isfinite(latitude) and math.isfinite(longitude) and max(abs(latitude), abs(longitude)) <= 180):
         return None
-    return Gps(latitude, longitude, altitude if altitude is not None and math.isfinite(altitude) else None, sigma_m)
+    if drone.altitude_m is not None:
+        altitude = drone.altitude_m
+    known = altitude if altitude is not None and math.isfinite(altitude) else None
+    return Gps(latitude, longitude, known, drone.sigma_m, drone.heights, drone.fix)
 
 
 def _degrees(parts: Any) -> float:

@@ -18,9 +18,12 @@ from scipy.spatial.transform import Rotation
 
 from jaxphoto.block import Block, Datum, Frame
 from jaxphoto.errors import InputError
+from jaxphoto.georeferencing.camera_attitude import CameraAttitude
 from jaxphoto.georeferencing.gps import Gps
 from jaxphoto.georeferencing.map_frame import MapFrame
 from jaxphoto.observations import StationRows
+from jaxphoto.procedures.attitudes_of_photographs import RecordedTurn, recorded_turn, with_attitudes
+from jaxphoto.procedures.georeferencing_words import attitude_words, position_words
 from jaxphoto.procedures.orientation.onto_known import Similarity, similarity_between
 
 SIGMA_M = (2.0, 2.0, 4.0)
@@ -32,6 +35,8 @@ _SAMPLES = 200
 # Of the median distance of all from where they should be: six standard deviations of a normal error in space.
 _BEYOND = 4.0
 _LEAST = 3
+# With attitudes, which give the turn.
+_LEAST_TURNED = 2
 
 
 class GeoreferencedPhotographs(NamedTuple):
@@ -47,30 +52,44 @@ class GeoreferencedPhotographs(NamedTuple):
 
 
 def georeference_photographs(
-    block: Block, positions: Mapping[str, Gps | None], code: int | None = None
+    block: Block,
+    positions: Mapping[str, Gps | None],
+    code: int | None = None,
+    attitudes: Mapping[str, CameraAttitude | None] | None = None,
 ) -> GeoreferencedPhotographs:
     """`block`, oriented as a free network, in the EPSG system `code` (else UTM), with the `positions` of its images.
 
     The stations' standard deviations are those of the file, else `SIGMA_M`. Heights are taken as the files have them.
+    Where `attitudes` tell the turn better than the positions do, as of a single strip, they are observed as well.
 
-    Raises InputError where fewer than three positions agree or all lie on a line, and for a code that is unknown.
+    Raises InputError where fewer than three positions agree, or all lie on a line that no attitudes turn, and for a
+    code that is unknown.
     """
     known = {name: gps for name in block.images if (gps := positions.get(name)) and gps.altitude_m is not None}
-    if len(known) < _LEAST:
+    turned = {name for name in known if attitudes and attitudes.get(name) is not None}
+    if len(known) < (_LEAST_TURNED if turned else _LEAST):
         raise InputError(
             f"{len(known)} of {len(block.images)} photographs have a position with a height in their files; three tell "
-            "place, scale and attitude of a block"
+            "place, scale and attitude of a block, and two where they have attitudes as well"
         )
     places = np.array([(g.longitude_deg, g.latitude_deg, g.altitude_m) for g in known.values()], float)
     middle = np.median(places, axis=0)
     origin = (round(float(middle[0]), 4), round(float(middle[1]), 4), 0.0)
     code = utm_of(*origin[:2]) if code is None else code
-    here = MapFrame(code, None, origin).local_from_place(places)
+    frame = MapFrame(code, None, origin)
+    here = frame.local_from_place(places)
     image = np.array([block.images.index(name) for name in known])
     there = np.asarray(block.start.unknowns.exterior.position, float)[image]
-    similarity, used = _agreeing(there, here)
+    recorded = recorded_turn(block, attitudes or {}, dict(zip(known, places, strict=True)), frame)
+    given = np.array([gps.stated_sigma_m or SIGMA_M for gps in known.values()])
+    helping = None
+    if isinstance(recorded, RecordedTurn):
+        similarity, used = _turned(there, here, recorded.turn)
+        helping = recorded if recorded.turn_sigma_rad < _turn_sigma(here[used], given[used]) else None
+    if helping is None:
+        similarity, used = _agreeing(there, here)
     sigma = _sigmas(list(known.values()), (here - similarity.of(there))[used])
-    similarity = _nearest(similarity, there[used], here[used], sigma[used])
+    similarity = _nearest(similarity, there[used], here[used], sigma[used], helping)
     rows, axis = np.flatnonzero(used).repeat(3), np.tile(np.arange(3), used.sum())
     stations = StationRows(image[rows], axis, here[rows, axis], sigma[rows, axis])
     placed = dataclasses.replace(
@@ -79,9 +98,44 @@ def georeference_photographs(
         datum=Datum(),
         frame=Frame("epsg", code, None, origin=origin),
     )
+    if helping is not None:
+        placed = with_attitudes(placed, helping)
     offsets = here - similarity.of(there)
-    said = tuple(_said(code, known, offsets, used, sigma))
+    said = (
+        *position_words(code, block.images, known, offsets, used, sigma),
+        *attitude_words(recorded, helping is not None, similarity.turn),
+    )
     return GeoreferencedPhotographs(placed, tuple(known), offsets, used, said)
+
+
+def _turn_sigma(here: Float[np.ndarray, "n 3"], sigma: Float[np.ndarray, "n 3"]) -> float:
+    """How well positions tell the turn about their longest direction (rad): by what is across it."""
+    across = np.linalg.svd(here - np.median(here, axis=0), compute_uv=False)
+    # A part of what is across is the positions' own scatter.
+    noise = float(np.sqrt(np.mean(np.median(sigma, axis=0) ** 2)))
+    apart = np.sqrt(max(across[1] ** 2 - len(here) * noise**2, 0.0)) if len(across) > 1 else 0.0
+    return noise / apart if apart > 0 else np.inf
+
+
+def _turned(
+    there: Float[np.ndarray, "n 3"], here: Float[np.ndarray, "n 3"], turn: Float[np.ndarray, "3 3"]
+) -> tuple[Similarity, np.ndarray]:
+    """Scale and shift of most positions where the turn is known, and which positions agree."""
+    a = there @ turn.T
+    one, other = np.triu_indices(len(here), 1)
+    length = np.linalg.norm(a[one] - a[other], axis=1)
+    scale = float(np.median(np.linalg.norm(here[one] - here[other], axis=1)[length > 0] / length[length > 0]))
+    found, used = Similarity(np.median(here - scale * a, axis=0), turn, scale), np.ones(len(here), bool)
+    for _ in range(10):
+        off = np.linalg.norm(here - found.of(there), axis=1)
+        agree = off <= max(_BEYOND * float(np.median(off)), 1e-9)
+        b, c = a[agree] - a[agree].mean(axis=0), here[agree] - here[agree].mean(axis=0)
+        scale = float(np.sum(b * c) / np.sum(b * b))
+        found = Similarity(here[agree].mean(axis=0) - scale * a[agree].mean(axis=0), turn, scale)
+        if (agree == used).all():
+            break
+        used = agree
+    return found, used
 
 
 def utm_of(longitude_deg: float, latitude_deg: float) -> int:
@@ -104,7 +158,7 @@ def _agreeing(there: Float[np.ndarray, "n 3"], here: Float[np.ndarray, "n 3"]) -
     if whole is None:
         raise InputError(
             f"the {n} positions of the photographs lie on a line, which leaves a turn about it open: fly a cross "
-            "strip, or measure control points"
+            "strip, measure control points, or give attitudes"
         )
     rng = np.random.default_rng(0)
     samples = [rng.choice(n, 3, replace=False) for _ in range(_SAMPLES)]
@@ -125,13 +179,17 @@ def _sigmas(known: list[Gps], offsets: Float[np.ndarray, "n 3"]) -> Float[np.nda
     """What the files say; of those that say nothing `SIGMA_M`, or the scatter where that is more."""
     plan = max(SIGMA_M[0], float(np.sqrt(np.mean(offsets[:, :2] ** 2))))
     height = max(SIGMA_M[2], float(np.sqrt(np.mean(offsets[:, 2] ** 2))))
-    return np.array([gps.sigma_m or (plan, plan, height) for gps in known])
+    return np.array([gps.stated_sigma_m or (plan, plan, height) for gps in known])
 
 
 def _nearest(
-    start: Similarity, there: Float[np.ndarray, "n 3"], here: Float[np.ndarray, "n 3"], sigma: Float[np.ndarray, "n 3"]
+    start: Similarity,
+    there: Float[np.ndarray, "n 3"],
+    here: Float[np.ndarray, "n 3"],
+    sigma: Float[np.ndarray, "n 3"],
+    recorded: RecordedTurn | None = None,
 ) -> Similarity:
-    """The similarity of least squares with these weights.
+    """The similarity of least squares with these weights, and the turn that attitudes say.
 
     An adjustment that began elsewhere would have to turn the whole block, in steps that images allow: hundreds.
     """
@@ -142,7 +200,14 @@ def _nearest(
 
     # The shift is that of the middle, which a turn leaves where it is.
     middle = there.mean(axis=0)
-    residual = lambda x: np.ravel((here - at(x).of(there - middle)) / sigma)  # noqa: E731
+
+    def residual(x: np.ndarray) -> np.ndarray:
+        off = np.ravel((here - at(x).of(there - middle)) / sigma)
+        if recorded is None:
+            return off
+        apart = Rotation.from_matrix(at(x).turn @ recorded.turn.T).as_rotvec() / recorded.turn_sigma_rad
+        return np.concatenate([off, apart])
+
     begin = np.concatenate([start.of(middle[None])[0], np.zeros(3), [np.log(start.scale)]])
     best = at(least_squares(residual, begin, x_scale="jac").x)
     return best._replace(shift=best.shift - best.scale * best.turn @ middle)
@@ -158,25 +223,3 @@ def _moved(block: Block, s: Similarity) -> Block:
     )
     unknowns = dataclasses.replace(unknowns, exterior=exterior, points=s.of(np.asarray(unknowns.points, float)))
     return dataclasses.replace(block, start=dataclasses.replace(block.start, unknowns=unknowns))
-
-
-def _said(code: int, known: Mapping[str, Gps], offsets: np.ndarray, used: np.ndarray, sigma: np.ndarray):
-    n, own = len(known), sum(g.sigma_m is not None for g in known.values())
-    plan, height = np.hypot(*offsets[used, :2].T), np.abs(offsets[used, 2])
-    yield (
-        f"{used.sum()} of {n} positions agree with the network: medians {np.median(plan):.2g} m in plan, "
-        f"{np.median(height):.2g} m in height; map system EPSG:{code}"
-    )
-    if own:
-        yield f"standard deviations of {own} positions are those of their files (RTK)"
-    if own < n:
-        east, _, up = next(s for s, g in zip(sigma, known.values(), strict=True) if g.sigma_m is None)
-        yield (
-            f"{n - own} files do not say how good their positions are: {east:.2g} m east and north, {up:.2g} m up are "
-            "taken to begin with"
-        )
-    yield "heights are as the files have them, which seldom say above what: the block is as high as they say"
-    for name, off, good in zip(known, offsets, used, strict=True):
-        if not good:
-            told = ", ".join(f"{v:.1f}" for v in off)
-            yield f"the position of {name} contradicts the others by {told} m (east, north, up) and is left out"

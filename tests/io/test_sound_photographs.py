@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from jaxphoto.errors import InputError
-from jaxphoto.io.photograph_metadata import dji_fields, rtk_sigma
+from jaxphoto.io.photograph_metadata import drone_record, xmp_fields
 from jaxphoto.io.photographs import photographs
 from jaxphoto.io.sound_photographs import sound_photographs
 
@@ -72,8 +72,8 @@ def test_what_is_not_there_and_what_leaves_nothing_is_refused(folder, tmp_path):
 
 
 def test_packets_of_others_and_damaged_ones_say_nothing(folder):
-    assert dji_fields(PACKET)["GimbalYawDegree"] == "-87.20"
-    assert dji_fields(PACKET[:-60])["RtkFlag"] == "50"
+    assert xmp_fields(PACKET)["drone-dji:GimbalYawDegree"] == "-87.20"
+    assert xmp_fields(PACKET[:-60])["drone-dji:RtkFlag"] == "50"
     for packet in (None, b"", b"<x:xmpmeta/>", PACKET.replace("0.01174", "nan"), PACKET.replace("0.01262", "0")):
-        assert rtk_sigma(dji_fields(packet)) is None
+        assert drone_record(xmp_fields(packet)).sigma_m is None
     assert photographs([folder / "0.jpg"])[0].gps.sigma_m == (0.01174, 0.01262, 0.02684)

@@ -5,9 +5,11 @@ import dataclasses
 import equinox as eqx
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from jaxphoto import adjust
+from jaxphoto import adjust, covariance
 from jaxphoto.errors import InputError
+from jaxphoto.georeferencing.camera_attitude import CameraAttitude
 from jaxphoto.georeferencing.gps import Gps
 from jaxphoto.georeferencing.map_frame import MapFrame
 from jaxphoto.procedures.georeference_photographs import SIGMA_M, georeference_photographs, utm_of
@@ -83,3 +85,85 @@ def test_too_few_positions_and_those_on_a_line_are_refused():
         georeference_photographs(block, line)
     with pytest.raises(InputError, match="EPSG code 99 is unknown"):
         georeference_photographs(block, known, 99)
+
+
+def strip_attitudes(block, truth, rng, common_deg=0.0):
+    """Attitudes of all images as their files would have them, the zero of the roll off by `common_deg`."""
+    frame = MapFrame(utm_of(*ORIGIN[:2]), None, ORIGIN)
+    level = frame.local_from_level(np.asarray(truth.exterior.position, float))
+    off = np.concatenate([np.zeros((10, 1)), np.full((10, 1), common_deg), np.zeros((10, 1))], axis=1)
+    noise = Rotation.from_rotvec(np.deg2rad(off + rng.normal(0, 0.3, (10, 3)))).as_matrix()
+    own = np.swapaxes(level, 1, 2) @ np.swapaxes(np.asarray(truth.exterior.camera_from_object, float), 1, 2) @ noise
+    return {n: CameraAttitude(m, (0.3, 0.3, 0.3)) for n, m in zip(block.images, own, strict=True)}
+
+
+def turned_deg(found, truth):
+    """Of each image, how far its attitude is from the truth; the frames of both are parallel to a thousandth."""
+    apart = np.asarray(found.camera_from_object) @ np.swapaxes(np.asarray(truth.exterior.camera_from_object), 1, 2)
+    return np.degrees(Rotation.from_matrix(apart).magnitude())
+
+
+def of_one_strip(block, truth, rng):
+    """Positions of the first strip, which runs east, by a receiver without corrections; one of them jumps."""
+    position = np.asarray(truth.exterior.position) + rng.normal(0, 1.5, (10, 3))
+    position[3, 1] += 90.0
+    return recorded(position[:5], block.images[:5])
+
+
+def test_a_single_strip_is_turned_by_its_attitudes():
+    block, truth = network()
+    rng = np.random.default_rng(5)
+    attitudes = strip_attitudes(block, truth, rng, common_deg=1.0)
+    attitudes[block.images[1]] = CameraAttitude(np.eye(3)[[1, 0, 2]] * [1, 1, -1], (0.3, 0.3, 0.3))
+    positions = of_one_strip(block, truth, rng)
+    found = georeference_photographs(block, positions, attitudes=attitudes)
+    assert np.asarray(found.block.attitudes.image).tolist() == [0, 2, 3, 4]
+    assert found.used.tolist() == [True, True, True, False, True]
+    # By what the attitudes have in common, and what four of them scatter.
+    assert turned_deg(found.block.start.unknowns.exterior, truth).max() < 1.5
+    assert any("they are observed" in s for s in found.sentences)
+    assert any("5 photographs have no position" in s for s in found.sentences)
+    assert any(f"the attitudes of {block.images[1]} contradict the others" in s for s in found.sentences)
+    two = {n: positions[n] for n in (block.images[0], block.images[2])}
+    found = georeference_photographs(block, two, attitudes=attitudes)
+    assert turned_deg(found.block.start.unknowns.exterior, truth).max() < 1.5
+
+
+@pytest.mark.slow
+def test_a_single_strip_is_adjusted_with_what_attitudes_share():
+    block, truth = network()
+    rng = np.random.default_rng(5)
+    attitudes = strip_attitudes(block, truth, rng, common_deg=2.0)
+    found = georeference_photographs(block, of_one_strip(block, truth, rng), attitudes=attitudes)
+    a = adjust(found.block)
+    assert bool(a.converged) and 0.7 < a.sigma0 < 1.4
+    assert turned_deg(a.unknowns.exterior, truth).max() < 2.5
+    # What all have in common is found, and as unsure as positions and the prior leave it, not as four attitudes would.
+    found = covariance(a)
+    label = next(n for n in found.labels if "boresight_y" in n)
+    sigma = np.degrees(found.shared_sigma[found.labels.index(label) - 6 * found.n_images])
+    assert 0.5 < sigma < 2.1
+    assert abs(np.degrees(a.unknowns.mounts["default"].boresight[1]) - 2.0) < 3 * sigma
+
+
+def test_attitudes_beside_better_positions_are_compared_and_not_used():
+    block, truth = network()
+    rng = np.random.default_rng(6)
+    known = recorded(np.asarray(truth.exterior.position), block.images, (0.02, 0.02, 0.04))
+    found = georeference_photographs(block, known, attitudes=strip_attitudes(block, truth, rng, 1.0))
+    assert not len(found.block.attitudes) and turned_deg(found.block.start.unknowns.exterior, truth).max() < 0.1
+    (said,) = (s for s in found.sentences if "attitudes" in s)
+    assert said.startswith("10 recorded attitudes agree") and "the positions tell the turn better" in said
+    wrong = {n: CameraAttitude(Rotation.random(random_state=k).as_matrix()) for k, n in enumerate(block.images)}
+    said = georeference_photographs(block, known, attitudes=wrong).sentences
+    assert any("the attitudes of the files contradict the photographs" in s for s in said)
+
+
+def test_heights_from_another_zero_are_one_sentence():
+    block, truth = network()
+    position = np.array(truth.exterior.position)
+    position[[1, 4, 8], 2] -= 130.0
+    found = georeference_photographs(block, recorded(position, block.images, (0.02, 0.02, 0.04)))
+    assert np.flatnonzero(~found.used).tolist() == [1, 4, 8]
+    (said,) = (s for s in found.sentences if "left out" in s)
+    assert "the heights of 3 photographs" in said and "-130 m" in said and "another zero" in said

@@ -1,0 +1,170 @@
+"""Which exposure of a receiver's record is which photograph, by the times of two clocks that differ by a constant.
+
+The clock of a camera is in some time zone, counts UTC or not, and is seconds off; a receiver counts GPS time. Of all
+differences between the times of photographs and those of exposures the one that most photographs share is the
+difference of the clocks: a gap, a missing or a surplus exposure moves no other. Where exposures follow at equal
+intervals a shift by one fits nearly as well: then the positions that the photographs themselves know decide, and where
+they have none nothing does.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+GPS_EPOCH_UNIX_S = 315_964_800.0
+"""Midnight of 6 January 1980 UTC, where GPS weeks begin."""
+LEAP_SECONDS = 18.0
+"""GPS time minus UTC since 2017."""
+WEEK_S = 604_800.0
+_HOUR_S = 3600.0
+# A camera's clock is set by hand, or by the receiver: what is left besides zone and leap seconds.
+_NEAR_ZONE_S = 300.0
+# Zones are quarters of an hour.
+_ZONE_S = 900.0
+# Shifts whose positions miss by this many times the best's are no candidates.
+_WORSE = 1.5
+
+
+class Taken(NamedTuple):
+    """When a photograph was taken, as its file says."""
+
+    clock_s: float
+    """Seconds since 1980-01-06 of the camera's own clock, in whatever zone it is set to."""
+    resolution_s: float
+    """1 where the file counts whole seconds."""
+    ahead_of_utc_s: float | None = None
+    """By how much that clock is ahead of UTC, where the file tells."""
+
+
+class Matched(NamedTuple):
+    """The exposure of every photograph, and how the clocks differ."""
+
+    exposure: Int[np.ndarray, "photographs"]
+    """Index of the exposure; -1 where there is none."""
+    offset_s: float
+    """The clock of the photographs minus that of the exposures; NaN where they are joined without times."""
+
+
+class Ambiguous(NamedTuple):
+    """Two differences of the clocks that fit as many photographs."""
+
+    offsets_s: tuple[float, float]
+    fitted: int
+
+
+def match_times(
+    photographs_s: Float[np.ndarray, "photographs"],
+    exposures_s: Float[np.ndarray, "exposures"],
+    tolerance_s: float,
+    photographs_at: Float[np.ndarray, "photographs 3"] | None = None,
+    exposures_at: Float[np.ndarray, "exposures 3"] | None = None,
+) -> Matched | Ambiguous | None:
+    """The exposure of each photograph by times that differ by a constant; NaN where one has no time.
+
+    `tolerance_s` is that of a single difference. `photographs_at` and `exposures_at` (m, NaN where unknown) decide
+    between constants that fit equally many. None where no two photographs share a constant.
+    """
+    known = np.flatnonzero(np.isfinite(photographs_s))
+    order = known[np.argsort(photographs_s[known], kind="stable")]
+    rank = np.argsort(exposures_s, kind="stable")
+    if min(len(order), len(rank)) < 2:
+        return None
+    times, events = photographs_s[order], exposures_s[rank]
+    tried = [_joined(times, events, offset, tolerance_s) for offset in _offsets(times, events, tolerance_s)]
+    most = max(int((found >= 0).sum()) for found, _ in tried)
+    if most < 2:
+        return None
+    # One photograph less may be the end of a shifted row.
+    near = [(found, offset) for found, offset in tried if (found >= 0).sum() >= most]
+    if photographs_at is not None and exposures_at is not None:
+        off = [_apart(photographs_at[order], exposures_at[rank], found) for found, _ in tried]
+        if np.isfinite(off).any():
+            # Positions tell a row that is shifted, also by one that fits more times.
+            enough = [k for k, (found, _) in enumerate(tried) if (found >= 0).sum() >= 0.8 * most]
+            best = min(enough, key=lambda k: off[k])
+            near = [tried[k] for k in enough if off[k] <= _WORSE * off[best]]
+            near.sort(key=lambda t: -int((t[0] >= 0).sum()))
+            near = [t for t in near if (t[0] >= 0).sum() == (near[0][0] >= 0).sum()]
+    distinct = [t for t in near if abs(t[1] - near[0][1]) > tolerance_s]
+    if distinct:
+        return Ambiguous((near[0][1], distinct[0][1]), most)
+    found, offset = near[0]
+    exposure = np.full(len(photographs_s), -1)
+    exposure[order[found >= 0]] = rank[found[found >= 0]]
+    return Matched(exposure, offset)
+
+
+def _offsets(times: np.ndarray, events: np.ndarray, tolerance_s: float, most: int = 12) -> list[float]:
+    """Constants that many pairs share, the most shared first: middles of windows, as seconds are cut off evenly."""
+    every = np.sort((times[:, None] - events[None, :]).ravel())
+    count = np.searchsorted(every, every + 2 * tolerance_s, side="right") - np.arange(len(every))
+    offsets: list[float] = []
+    for k in np.argsort(-count, kind="stable"):
+        middle = float(every[k]) + tolerance_s
+        if all(abs(middle - other) > 2 * tolerance_s for other in offsets):
+            offsets.append(middle)
+        if len(offsets) == most or count[k] < 0.3 * count.max():
+            break
+    return offsets
+
+
+def _joined(times: np.ndarray, events: np.ndarray, offset: float, tolerance_s: float) -> tuple[np.ndarray, float]:
+    """The exposure of each time, each once and in order, and the constant of those joined."""
+    best, left = _in_order(times, events, offset, tolerance_s)
+    # The window may lie at the edge of what it should hold: its mean is the middle of fine times, half way between the
+    # first and the last that of seconds cut off.
+    for _ in range(2):
+        for middle in (np.mean, lambda v: (np.min(v) + np.max(v)) / 2):
+            if not len(left):
+                return best, offset
+            tried = offset + float(middle(left))
+            found, apart = _in_order(times, events, tried, tolerance_s)
+            if len(apart) >= len(left):
+                best, left, offset = found, apart, tried
+    return best, offset + float(np.mean(left))
+
+
+def _in_order(
+    times: np.ndarray, events: np.ndarray, offset: float, tolerance_s: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """With windows of one width the first exposure that is free makes the most pairs; and what is left of each."""
+    found, k = np.full(len(times), -1), 0
+    for i, time in enumerate(times):
+        while k < len(events) and time - events[k] - offset > tolerance_s:
+            k += 1
+        if k < len(events) and abs(time - events[k] - offset) <= tolerance_s:
+            found[i] = k
+            k += 1
+    return found, (times - events[found] - offset)[found >= 0]
+
+
+def _apart(at: np.ndarray, there: np.ndarray, found: np.ndarray) -> float:
+    """Median distance of the positions of those joined; infinite where none is known.
+
+    What they have in common is left in it: of a single strip it is all that a shift by one changes.
+    """
+    d = (at - there[found])[found >= 0]
+    d = d[np.isfinite(d).all(axis=1)]
+    return float(np.median(np.linalg.norm(d, axis=1))) if len(d) >= 3 else np.inf
+
+
+def clock_words(offset_s: float) -> str:
+    """What a difference to GPS time is made of: hours of a time zone, leap seconds, the rest."""
+    best = min(
+        ((zone, leap) for zone in _near_zones(offset_s) for leap in (-LEAP_SECONDS, 0.0, LEAP_SECONDS)),
+        key=lambda parts: (round(abs(offset_s - sum(parts))), parts[1]),
+    )
+    zone, leap = best
+    rest = offset_s - zone - leap
+    if abs(rest) > _NEAR_ZONE_S:
+        return f"{offset_s:+.1f} s, which is no time zone: it is counted from somewhere else"
+    parts = [f"{zone / _HOUR_S:+g} h (time zone)"] if zone else []
+    parts += [f"{leap:+g} s (leap seconds: GPS time against UTC)"] if leap else []
+    parts += [f"{rest:+.2f} s"] if abs(rest) >= 0.005 or not parts else []
+    return ", ".join(parts)
+
+
+def _near_zones(offset_s: float) -> tuple[float, ...]:
+    middle = round(offset_s / _ZONE_S)
+    return tuple(_ZONE_S * k for k in (middle - 1, middle, middle + 1) if abs(_ZONE_S * k) <= 14 * _HOUR_S) or (0.0,)

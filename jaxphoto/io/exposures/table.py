@@ -1,0 +1,118 @@
+"""A table of exposures: CSV with a header, one line a photograph (docs/exposures.md)."""
+
+from pathlib import Path
+from typing import get_args
+
+import jax
+import numpy as np
+
+from jaxphoto.compiling import QUICK_TO_COMPILE
+from jaxphoto.errors import InputError, quoted
+from jaxphoto.georeferencing.camera_attitude import USUAL_SIGMA_DEG, CameraAttitude, level_from_belly
+from jaxphoto.georeferencing.gps import Fix, Heights
+from jaxphoto.georeferencing.map_frame import MapFrame
+from jaxphoto.io.exposures.records import Exposures, check_places
+from jaxphoto.io.text_tables import Table, read_csv
+from jaxphoto.rotation import matrix_from_omega_phi_kappa
+
+_MAP, _PLACE = ("X_m", "Y_m", "Z_m"), ("longitude_deg", "latitude_deg", "height_m")
+_OPK, _RPY = ("omega_deg", "phi_deg", "kappa_deg"), ("roll_deg", "pitch_deg", "yaw_deg")
+_SIGMA_M = ("sigma_X_m", "sigma_Y_m", "sigma_Z_m")
+_SIGMA_OPK, _SIGMA_RPY = tuple(f"sigma_{name}" for name in _OPK), tuple(f"sigma_{name}" for name in _RPY)
+_LARGEST_DEG = 360.0
+
+
+def read_table(path: Path, code: int | None = None, heights: Heights = "unknown") -> Exposures:
+    """The exposures of a CSV: image, and X_m, Y_m, Z_m (EPSG system `code`) or longitude_deg, latitude_deg, height_m.
+
+    Optional are omega_deg, phi_deg, kappa_deg or roll_deg, pitch_deg, yaw_deg (of the camera: all zero where it looks
+    down with the top of its picture to the north that the coordinates have), standard deviations sigma_X_m ...
+    sigma_yaw_deg, and fix (fixed, float, single). Raises InputError, naming file and row.
+    """
+    optional = (*_MAP, *_PLACE, *_OPK, *_RPY, *_SIGMA_M, *_SIGMA_OPK, *_SIGMA_RPY, "fix")
+    table = read_csv(path, ("image",), optional, text=("fix",))
+    ids = [Path(name).stem if "." in name else name for name in table.ids("image")]
+    twice = {name for name in ids if ids.count(name) > 1} if len(set(ids)) < len(ids) else set()
+    for line, name in enumerate(ids):
+        if name in twice:
+            raise table.bad(line, f"the image {quoted(name)} stands there twice; keep one of the lines")
+    on_map = _set_of(table, _MAP, _PLACE, "positions") is _MAP
+    if on_map and code is None:
+        raise InputError(f"{path.name}: its positions are map coordinates; give the EPSG code of their system (--epsg)")
+    place = _columns(table, _MAP if on_map else _PLACE)
+    turn = np.broadcast_to(np.eye(3), (len(place), 3, 3))
+    if on_map and len(place):
+        assert code is not None
+        place, turn = _from_map(path.name, table, place, code)
+    check_places(path.name, table.rows, place)
+    sigma = np.stack([table.sigmas(name) for name in _SIGMA_M], axis=1)
+    return Exposures(
+        path.name,
+        table.rows,
+        np.full(len(ids), np.nan),
+        place,
+        sigma,
+        tuple(_fixes(table)),
+        heights,
+        names=tuple(ids),
+        attitude=tuple(_attitudes(table, turn)),
+    )
+
+
+def _set_of(table: Table, one: tuple[str, ...], other: tuple[str, ...], what: str) -> tuple[str, ...] | None:
+    """The one of two sets of columns that the table has."""
+    there = [names for names in (one, other) if any(name in table for name in names)]
+    if len(there) > 1 or (there and not all(name in table for name in there[0])):
+        raise InputError(
+            f"{table.file}: the {what} are not given by one set of columns; use either {', '.join(one)} or "
+            f"{', '.join(other)}"
+        )
+    if not there and what == "positions":
+        raise InputError(f"{table.file}: it has no {what}; add {', '.join(one)} or {', '.join(other)}")
+    return there[0] if there else None
+
+
+def _columns(table: Table, names: tuple[str, ...]) -> np.ndarray:
+    return np.stack([table.numbers(name) for name in names], axis=1)
+
+
+def _from_map(file: str, table: Table, coordinates: np.ndarray, code: int) -> tuple[np.ndarray, np.ndarray]:
+    """Longitude, latitude, height, and the turns from axes of the map's grid to those of true north."""
+    place = MapFrame(code, None, (0.0, 0.0, 0.0)).place(coordinates)
+    for k in np.flatnonzero(~np.isfinite(place).all(axis=1))[:1]:
+        raise table.bad(int(k), f"the coordinates lie where EPSG:{code} does not reach; correct them or the code")
+    frame = MapFrame(code, None, (*np.median(place[:, :2], axis=0).tolist(), 0.0))
+    local = frame.local_from_place(place)
+    return place, np.swapaxes(frame.local_from_level(local), 1, 2) @ frame.local_from_grid(local)
+
+
+def _attitudes(table: Table, level_from_axes: np.ndarray):
+    """Of each line, None where it has no angles."""
+    names = _set_of(table, _OPK, _RPY, "attitudes")
+    if names is None:
+        yield from [None] * len(table)
+        return
+    angles = _columns(table, names)
+    for k, axis in np.argwhere(np.abs(angles) > _LARGEST_DEG)[:1]:
+        raise table.bad(int(k), f"{names[axis]} = {angles[k, axis]:g} is more than a turn; give degrees")
+    sigma = np.stack([table.sigmas(name) for name in (_SIGMA_OPK if names is _OPK else _SIGMA_RPY)], axis=1)
+    if names is _OPK:
+        # Near the nadir, which is what such tables are of: omega is about x, right, as pitch; phi about y, as roll.
+        sigma = sigma[:, [1, 0, 2]]
+        turned = np.swapaxes(np.asarray(_matrices(np.deg2rad(angles))), 1, 2)
+    else:
+        turned = np.array([level_from_belly(yaw, pitch, roll) for roll, pitch, yaw in angles]).reshape(-1, 3, 3)
+    for matrix, own in zip(level_from_axes @ turned, sigma.tolist(), strict=True):
+        said = (own[0], own[1], own[2]) if np.isfinite(own).all() else USUAL_SIGMA_DEG
+        yield CameraAttitude(matrix, said)
+
+
+def _fixes(table: Table):
+    known = get_args(Fix)
+    for line, cell in enumerate(table.text("fix")):
+        if cell and cell not in known:
+            raise table.bad(line, f"fix is {quoted(cell)}; give one of {', '.join(known)}, or nothing")
+        yield cell or "unknown"
+
+
+_matrices = jax.jit(jax.vmap(matrix_from_omega_phi_kappa), compiler_options=QUICK_TO_COMPILE)

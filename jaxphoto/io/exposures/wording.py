@@ -1,0 +1,61 @@
+"""What came of a file of exposures, in words."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Int
+
+from jaxphoto.errors import few
+from jaxphoto.georeferencing.exposure_times import Ambiguous, Matched, clock_words
+from jaxphoto.io.exposures.joining import FINE_S, Clock
+from jaxphoto.io.exposures.records import Exposures
+from jaxphoto.io.photographs import Photograph
+
+# Differences of clocks (s) that need no word: EXIF counts seconds, and notes them when it is written.
+_SMALL_S = 1.5
+
+
+def joined_words(
+    photographs: Sequence[Photograph], file: Exposures, found: Matched, clock: Clock, how: str = "by time"
+) -> str:
+    """How many photographs a file gives positions to, what is missing or left over, and how its clock differs."""
+    words = f"positions of {counts(photographs, file, found.exposure)} {how}{fixes(file, found.exposure)}"
+    if not np.isfinite(found.offset_s):
+        return words
+    if clock.gps:
+        small = _SMALL_S if clock.tolerance_s > FINE_S else FINE_S
+        if abs(found.offset_s) <= small:
+            return words
+        return f"{words}; the times of photographs and file differ by {clock_words(found.offset_s)}, which is taken off"
+    return f"{words}; the clock of the photographs is {clock_words(found.offset_s)} ahead of it, which is taken off"
+
+
+def why_not(result: Ambiguous | None) -> str:
+    """Why times join nothing."""
+    if result is None:
+        return "no two photographs have times that differ from its times by one constant; not used"
+    one, other = map(clock_words, result.offsets_s)
+    return (
+        f"{result.fitted} photographs fit its times as well with clocks that differ by {one} as by {other}, and no "
+        "position tells which; not used (a table with names does it: --exposures)"
+    )
+
+
+def counts(photographs: Sequence[Photograph], file: Exposures, exposure: Int[np.ndarray, "n"]) -> str:
+    """How many photographs have an exposure; which have none, and which rows of the file have no photograph."""
+    used = set(exposure[exposure >= 0].tolist())
+    without = [p.name for p, k in zip(photographs, exposure, strict=True) if k < 0]
+    surplus = [str(row) for k, row in enumerate(file.rows.tolist()) if k not in used]
+    parts = [f"none for {few(without)}"] if without else []
+    if surplus:
+        rows = "row" if len(surplus) == 1 else "rows"
+        parts.append(f"{len(surplus)} of its exposures without a photograph, {rows} {few(surplus)}")
+    more = f" ({'; '.join(parts)})" if parts else ""
+    return f"{len(used)} of {len(photographs)} photographs{more}"
+
+
+def fixes(file: Exposures, exposure: Int[np.ndarray, "n"]) -> str:
+    """How many solutions are of which kind."""
+    kinds = [file.fix[k] for k in exposure if k >= 0]
+    parts = [f"{kinds.count(kind)} {kind}" for kind in ("fixed", "float", "single") if kind in kinds]
+    return f", {', '.join(parts)}" if parts else ""

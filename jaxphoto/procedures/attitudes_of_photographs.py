@@ -1,0 +1,114 @@
+"""Attitudes that photographs record, against a network's: how it is turned, and as observations where that helps.
+
+Each photograph says how the network is turned to the map: the product of its recorded and its oriented attitude. Their
+average is what a single strip does not tell by positions, the turn about its line. What all attitudes have in common
+of an error, the zero of a gimbal or a mounting, stays in it; as observations they have a boresight with a prior of
+that size, so that a strip is not given a turn that is surer.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from jaxphoto.arrays import on_device
+from jaxphoto.block import Block
+from jaxphoto.compiling import QUICK_TO_COMPILE
+from jaxphoto.georeferencing import Mount
+from jaxphoto.georeferencing.camera_attitude import CameraAttitude
+from jaxphoto.georeferencing.map_frame import MapFrame
+from jaxphoto.observations import Attitudes
+from jaxphoto.orientation.averaging import average_rotation
+from jaxphoto.rotation import roll_pitch_yaw_from_matrix
+from jaxphoto.unknowns import FIXED, Weighted
+
+BORESIGHT_DEG = (2.0, 2.0, 2.0)
+"""Of what attitudes of one flight have in common, about the camera's axes: a gimbal hung or a camera mounted by hand,
+and the declination where a compass is read."""
+# Attitudes farther from most are wrong by more than noise: of the median, but this at least.
+_BEYOND, _LEAST_DEG = 4.0, 5.0
+# Attitudes that are apart by more (median) tell nothing.
+_CONTRADICT_DEG = 15.0
+# Of mounts: the name by which a block folder finds it for every camera.
+_MOUNT = "default"
+
+
+class RecordedTurn(NamedTuple):
+    """How recorded attitudes say that a network is turned."""
+
+    image: np.ndarray
+    """Of the block, those that agree."""
+    local_from_camera: Float[np.ndarray, "n 3 3"]
+    sigma_rad: Float[np.ndarray, "n 3"]
+    """Of roll, pitch, yaw."""
+    turn: Float[np.ndarray, "3 3"]
+    """From the network's axes to those of the local frame."""
+    turn_sigma_rad: float
+    """Of a turn about a level axis, the boresight included."""
+    scatter_rad: float
+    """Root mean square of single ones about `turn`."""
+    left_out: tuple[str, ...]
+
+
+def recorded_turn(
+    block: Block,
+    attitudes: Mapping[str, CameraAttitude | None],
+    places: Mapping[str, Float[np.ndarray, "3"]],
+    frame: MapFrame,
+) -> RecordedTurn | str | None:
+    """The turn by the `attitudes` of images that have `places` (longitude, latitude, height) too.
+
+    None where there are none; a sentence where they contradict one another.
+    """
+    known = [(k, name, a) for k, name in enumerate(block.images) if name in places and (a := attitudes.get(name))]
+    if not known:
+        return None
+    image = np.array([k for k, _, _ in known])
+    local = frame.local_from_place(np.array([places[name] for _, name, _ in known], float))
+    own = frame.local_from_level(local) @ np.array([a.level_from_camera for _, _, a in known])
+    said = own @ np.asarray(block.start.unknowns.exterior.camera_from_object, float)[image]
+    sigma = np.deg2rad([a.sigma_deg for _, _, a in known])
+    kept, off = np.ones(len(said), bool), np.zeros(len(said))
+    # The one that most are nearest to, then the average of those near it.
+    apart = _angles(np.einsum("nji,mjk->nmik", said, said))
+    turn = said[np.argmin(np.median(apart, axis=1))]
+    for _ in range(5):
+        off = _angles(said @ turn.T)
+        kept = off <= max(_BEYOND * float(np.median(off)), np.deg2rad(_LEAST_DEG))
+        turn, _ = average_rotation(said[kept])
+    apart_deg = np.rad2deg(np.median(off))
+    if apart_deg > _CONTRADICT_DEG:
+        return f"the attitudes of the files contradict the photographs, by {apart_deg:.0f} degrees: they are not used"
+    scatter = float(np.sqrt(np.mean(_angles(said[kept] @ turn.T) ** 2)))
+    level = np.sqrt(np.mean(sigma[kept, :2] ** 2) / kept.sum() + np.deg2rad(max(BORESIGHT_DEG[:2])) ** 2)
+    lost = tuple(name for (_, name, _), good in zip(known, kept, strict=True) if not good)
+    return RecordedTurn(image[kept], own[kept], sigma[kept], turn, float(level), scatter, lost)
+
+
+def with_attitudes(block: Block, recorded: RecordedTurn) -> Block:
+    """`block` with the attitudes observed, of a camera that looks down with the top of its pictures forward."""
+    angles = _roll_pitch_yaw(recorded.local_from_camera)
+    zero = np.zeros(3)
+    mount = Mount(on_device(zero), on_device(zero), on_device(0.0), "right")  # type: ignore[arg-type]
+    boresight = Weighted(zero, np.deg2rad(BORESIGHT_DEG))
+    prior = Mount(FIXED, boresight, FIXED, "right")  # type: ignore[arg-type]
+    unknowns = dataclasses.replace(block.start.unknowns, mounts={_MOUNT: mount})
+    return dataclasses.replace(
+        block,
+        attitudes=Attitudes(recorded.image, on_device(np.asarray(angles)), on_device(recorded.sigma_rad)),
+        image_mount=(_MOUNT,) * len(block.images),
+        start=dataclasses.replace(block.start, unknowns=unknowns),
+        priors=dataclasses.replace(block.priors, mounts={_MOUNT: prior}),
+    )
+
+
+def _angles(matrices: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "*n"]:
+    """How far rotations turn (rad), from the chord, which has all digits of small ones."""
+    chord = np.linalg.norm(matrices - np.eye(3), axis=(-2, -1))
+    return 2 * np.arcsin(np.clip(chord / np.sqrt(8), 0, 1))
+
+
+_roll_pitch_yaw = jax.jit(jax.vmap(roll_pitch_yaw_from_matrix), compiler_options=QUICK_TO_COMPILE)

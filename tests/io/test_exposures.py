@@ -1,0 +1,270 @@
+"""Files of exposures beside photographs: read, matched with their gaps, brought to the camera; the spoilt are named."""
+
+from datetime import datetime, timedelta
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from jaxphoto.errors import InputError
+from jaxphoto.georeferencing.camera_attitude import CameraAttitude, level_from_belly
+from jaxphoto.georeferencing.exposure_times import LEAP_SECONDS, WEEK_S, Taken
+from jaxphoto.georeferencing.gps import Gps, moved
+from jaxphoto.georeferencing.map_frame import MapFrame
+from jaxphoto.io.exposures import located, read_marks, read_pos, read_table, with_exposures
+from jaxphoto.io.photographs import Photograph, photographs
+from jaxphoto.io.trajectory import write_sbet
+
+ORIGIN = Gps(55.7, 13.2, 100.0)
+BEGIN_S = 2200 * WEEK_S + 200_000.0
+ARM = np.array([-0.02, 0.05, -0.19])
+
+
+class Flight:
+    """Two strips of five exposures: times (GPS), cameras; the antenna is `-ARM` away, east, north, up."""
+
+    def __init__(self, n=10):
+        rng = np.random.default_rng(6)
+        interval = np.where(np.arange(1, n) % 5 == 0, 20.0, 2.5) + rng.normal(0, 0.1, n - 1)
+        self.time = BEGIN_S + np.concatenate([[0], np.cumsum(interval)])
+        strip, along = np.divmod(np.arange(n), 5)
+        at = np.stack([strip * 40.0, np.where(strip % 2, 4 - along, along) * 20.0, 0.3 * along], axis=1)
+        self.camera = [moved(ORIGIN, p) for p in at]
+
+    def mark(self, k, number=None, shift_s=0.0, sigma=0.012, flag=50):
+        gps, t = self.camera[k], self.time[k] + shift_s
+        east, north, up = 1000 * ARM
+        return (
+            f"{number or k + 1}\t{t % WEEK_S:.6f}\t[{int(t // WEEK_S)}]\t {north:.0f},N\t {east:.0f},E\t {-up:.0f},V\t"
+            f"{gps.latitude_deg:.8f},Lat\t{gps.longitude_deg:.8f},Lon\t{gps.altitude_m:.3f},Ellh\t"
+            f"{sigma:.6f}, {2 * sigma:.6f}, {3 * sigma:.6f}\t{flag},Q\n"
+        )
+
+    def photograph(self, k, ahead_s=7200.0, told=False, **more):
+        clock = np.floor(self.time[k] - LEAP_SECONDS + ahead_s)
+        gps = self.camera[k]._replace(altitude_m=57.0)
+        own = Photograph(f"DJI_{k + 1:04}", None, 400, 300, gps=gps, taken=Taken(clock, 1.0, ahead_s if told else None))
+        return own._replace(**more)
+
+    def antenna(self, k):
+        return moved(self.camera[k], -ARM)
+
+
+FLIGHT = Flight()
+ALL = range(10)
+
+
+def pos_line(time_s, gps, q=1):
+    at = datetime(1980, 1, 6) + timedelta(seconds=time_s)
+    place = f"{gps.latitude_deg:.9f} {gps.longitude_deg:.9f} {gps.altitude_m:.4f}"
+    return f"{at:%Y/%m/%d %H:%M:%S.%f}  {place}   {q}  12  0.0061 0.0072 0.0143 0 0 0 0.00 9.9\n"
+
+
+HEAD = "% program   : RTKPOST\n% (lat/lon/height=WGS84/ellipsoidal,Q=1:fix)\n%  GPST  latitude(deg) longitude(deg)\n"
+
+
+def written(path, text):
+    path.write_text(text)
+    return path
+
+
+def same(gps, other, within_m=1e-3):
+    scale = np.array([1.1e5, 0.6e5, 1.0])
+    d = scale * (np.array(gps[:3], float) - np.array(other[:3], float))
+    return float(np.abs(d).max()) < within_m
+
+
+def test_marks_are_read(tmp_path):
+    found = read_marks(written(tmp_path / "a.MRK", FLIGHT.mark(3, number=7)))
+    assert found.sequence.tolist() == [7] and found.time_s[0] == pytest.approx(FLIGHT.time[3], abs=1e-5)
+    gps = found.gps(0)
+    assert same(gps, FLIGHT.camera[3]) and gps.sigma_m == (0.024, 0.012, 0.036)
+    assert (gps.fix, gps.heights) == ("fixed", "ellipsoid")
+    np.testing.assert_allclose(found.camera_from_antenna_m, [ARM], atol=1e-9)
+    nothing = read_marks(written(tmp_path / "a.MRK", FLIGHT.mark(3, flag=0)))
+    assert nothing.gps(0) is None
+    with pytest.raises(InputError, match=r"row 2: '2.* is no line of time marks"):
+        read_marks(written(tmp_path / "b.MRK", FLIGHT.mark(0) + FLIGHT.mark(1)[:60]))
+
+
+def test_marks_by_number_with_fewer_and_more_lines_than_photographs(tmp_path):
+    file = read_marks(written(tmp_path / "a.MRK", "".join(FLIGHT.mark(k) for k in (0, 1, 3, 4, 5, 6, 7, 8, 9))))
+    taken, said = with_exposures([FLIGHT.photograph(k) for k in ALL if k not in (5, 9)], [file])
+    assert [same(p.gps, FLIGHT.camera[int(p.name[4:]) - 1]) for p in taken] == [k != 2 for k in range(8)]
+    assert taken[2].gps.altitude_m == 57.0
+    for words in (
+        "7 of 8 photographs (none for DJI_0003; 2 of its exposures without a photograph, rows 5, 9) by number, 7 fixed",
+        "+2 h (time zone), -18 s (leap seconds",
+    ):
+        assert words in said[0], said
+
+
+@pytest.mark.parametrize(("shift_s", "words"), [(-8 * 3600.0, "+8 h (time zone)"), (-18.0, "+18 s (leap seconds")])
+def test_marks_in_a_wrong_time_zone_or_in_utc_are_found_and_said(tmp_path, shift_s, words):
+    file = read_marks(written(tmp_path / "a.MRK", "".join(FLIGHT.mark(k, k + 31, shift_s) for k in ALL)))
+    taken, said = with_exposures([FLIGHT.photograph(k, told=True, name=f"IMG{k}") for k in ALL], [file])
+    assert all(same(p.gps, c) for p, c in zip(taken, FLIGHT.camera, strict=True))
+    assert "by time" in said[0] and words in said[0] and "which is taken off" in said[0]
+
+
+def test_marks_of_another_flight_are_not_used(tmp_path):
+    file = read_marks(written(tmp_path / "a.MRK", "".join(FLIGHT.mark(k) for k in ALL)))
+    away = [FLIGHT.photograph(k, gps=moved(FLIGHT.camera[k], np.array([900.0, 0, 0]))) for k in ALL]
+    taken, said = with_exposures(away, [file])
+    assert taken == away and "as of another flight; not used" in said[0]
+    unknown = [FLIGHT.photograph(k, taken=None, name=f"IMG{k}") for k in ALL]
+    assert "differ from its times by one constant; not used" in with_exposures(unknown, [file]).sentences[0]
+
+
+def test_events_of_the_antenna_are_brought_to_the_camera_by_the_arms_of_the_marks(tmp_path):
+    marks = read_marks(written(tmp_path / "a.MRK", "".join(FLIGHT.mark(k, sigma=1.1, flag=16) for k in ALL)))
+    # One event is missing, and one is surplus.
+    lines = "".join(pos_line(FLIGHT.time[k], FLIGHT.antenna(k), 2 if k == 1 else 1) for k in ALL if k != 4)
+    events = read_pos(written(tmp_path / "a_events.pos", HEAD + pos_line(BEGIN_S - 30, ORIGIN) + lines))
+    taken, said = with_exposures([FLIGHT.photograph(k) for k in ALL], [events, marks])
+    assert all(same(p.gps, c, 2e-3) for p, c in zip(taken, FLIGHT.camera, strict=True))
+    assert [p.gps.fix for p in taken] == ["fixed", "float", *["fixed"] * 2, "single", *["fixed"] * 5]
+    assert taken[0].gps.sigma_m == (0.0072, 0.0061, 0.0143)
+    assert "9 of 10 photographs (none for DJI_0005; 1 of its exposures without a photograph, row 4)" in said[1]
+    assert "8 fixed, 1 float; lever arms of 9 are those of the time marks" in said[1]
+
+
+@pytest.mark.parametrize("clock", ["GPST", "UTC", "JST", "week"])
+def test_a_trajectory_is_interpolated_at_the_marks(tmp_path, clock):
+    marks = read_marks(written(tmp_path / "a.MRK", "".join(FLIGHT.mark(k) for k in ALL)))
+    at = np.arange(FLIGHT.time[0] - 2, FLIGHT.time[-2] + 0.5, 0.2)
+    behind = {"UTC": LEAP_SECONDS, "JST": LEAP_SECONDS - 32400}.get(clock, 0.0)
+    middle = np.array([g[:3] for g in (FLIGHT.antenna(k) for k in ALL)])
+    place = np.stack([np.interp(at, FLIGHT.time, middle[:, k]) for k in range(3)], axis=1)
+    lines = [pos_line(t - behind, Gps(*p)) for t, p in zip(at, place, strict=True)]
+    if clock == "week":
+        rest = [line.split(maxsplit=2)[2] for line in lines]
+        lines = [f"{t // WEEK_S:.0f} {t % WEEK_S:.3f} {part}" for t, part in zip(at, rest, strict=True)]
+    gap = (at > FLIGHT.time[3] - 0.5) & (at < FLIGHT.time[3] + 0.5)
+    text = HEAD.replace("GPST", clock if clock != "week" else "GPST") + "".join(np.array(lines)[~gap])
+    track = read_pos(written(tmp_path / "a.pos", text))
+    taken, said = with_exposures([FLIGHT.photograph(k) for k in ALL], [track, marks])
+    # Straight between exposures: the spline rounds the corners by centimetres.
+    assert all(same(p.gps, c, 0.25) for p, c in zip(taken, FLIGHT.camera, strict=True))
+    assert "positions of 8 photographs by interpolation" in said[1]
+    assert "2 before, after or in a gap of it: DJI_0004, DJI_0010" in said[1]
+
+
+def test_a_trajectory_without_exact_times_is_not_used(tmp_path):
+    lines = "".join(pos_line(BEGIN_S + 0.2 * k, ORIGIN) for k in range(100))
+    file = read_pos(written(tmp_path / "a.pos", HEAD + lines))
+    assert (
+        "needs the time of every exposure to the millisecond"
+        in with_exposures([FLIGHT.photograph(k) for k in ALL], [file]).sentences[0]
+    )
+    exact = [FLIGHT.photograph(k, taken=Taken(FLIGHT.time[k] - 18 + 9e6, 1e-6, 0.0)) for k in ALL]
+    assert "no photograph was taken while it lasts" in with_exposures(exact, [file]).sentences[0]
+
+
+def test_a_lever_arm_that_is_given_turns_with_the_aircraft(tmp_path):
+    arm = (0.02, -0.1, 0.3)
+    yaw = 70.0
+    turn = level_from_belly(yaw, 3.0, -2.0)
+    lines = "".join(pos_line(FLIGHT.time[k], moved(FLIGHT.camera[k], turn @ np.array(arm))) for k in ALL)
+    events = read_pos(written(tmp_path / "a.pos", HEAD + lines))
+    flown = [FLIGHT.photograph(k, told=True, aircraft_deg=(-2.0, 3.0, yaw)) for k in ALL]
+    taken, said = with_exposures(flown, [events], arm)
+    assert all(same(p.gps, c) for p, c in zip(taken, FLIGHT.camera, strict=True)) and "10 is as given" in said[0]
+    fixed = [p._replace(aircraft_deg=None, attitude=CameraAttitude(turn)) for p in flown]
+    assert all(same(p.gps, c) for p, c in zip(with_exposures(fixed, [events], arm)[0], FLIGHT.camera, strict=True))
+    plain = [p._replace(aircraft_deg=None) for p in flown]
+    assert "no attitude of the aircraft turns it" in with_exposures(plain, [events], arm).sentences[0]
+    assert "--lever-arm gives it" in with_exposures(plain, [events]).sentences[0]
+    own = [p._replace(gps=moved(c, turn @ np.array(arm))) for p, c in zip(flown, FLIGHT.camera, strict=True)]
+    taken, said = with_exposures(own, [], arm)
+    assert all(same(p.gps, c) for p, c in zip(taken, FLIGHT.camera, strict=True)) and "taken off 10" in said[0]
+
+
+def test_an_sbet_gives_positions_and_attitudes(tmp_path):
+    at = np.arange(FLIGHT.time[0] - 2, FLIGHT.time[-1] + 2, 0.05)
+    values = np.zeros((len(at), 17))
+    place = np.array([g[:3] for g in FLIGHT.camera])
+    track = np.stack([np.interp(at, FLIGHT.time, place[:, k]) for k in range(3)], axis=1)
+    values[:, 0], values[:, 1:3], values[:, 3] = at % WEEK_S, np.deg2rad(track[:, :2]), track[:, 2]
+    values[:, 7], values[:, 9], values[:, 10] = 0.01, 1.3, 0.2
+    write_sbet(values, tmp_path / "flight.sbet")
+    (tmp_path / "x.MRK").write_text("".join(FLIGHT.mark(k) for k in ALL))
+    taken, said = located([FLIGHT.photograph(k) for k in ALL], [tmp_path])
+    assert all(same(p.gps, c, 0.1) for p, c in zip(taken, FLIGHT.camera, strict=True))
+    expected = level_from_belly(np.degrees(1.1), 0.0, np.degrees(0.01))
+    np.testing.assert_allclose(taken[0].attitude.level_from_camera, expected, atol=1e-9)
+    assert any("flight.sbet: positions of 10 photographs by interpolation" in s for s in said)
+    assert any("10 are positions of the IMU, the lever arm is not known" in s for s in said)
+
+
+TABLE = "image,longitude_deg,latitude_deg,height_m,omega_deg,phi_deg,kappa_deg,sigma_X_m,sigma_Y_m,sigma_Z_m,fix\n"
+
+
+def test_a_table_by_name(tmp_path):
+    gps = FLIGHT.camera[2]
+    row = f"{gps.longitude_deg!r},{gps.latitude_deg!r},{gps.altitude_m!r}"
+    file = written(tmp_path / "t.csv", TABLE + f"DJI_0003.JPG,{row},0,0,-40,0.02,0.03,0.05,fixed\nother,{row},,,,,,,\n")
+    with pytest.raises(InputError, match="omega_deg is empty"):
+        read_table(file)
+    file = written(tmp_path / "t.csv", file.read_text().replace(",,,,,,,\n", ",1,2,3,,,,\n"))
+    found = read_table(file, heights="geoid")
+    taken, said = with_exposures([FLIGHT.photograph(k) for k in ALL], [found])
+    assert taken[2].gps == gps._replace(sigma_m=(0.02, 0.03, 0.05), heights="geoid", fix="fixed")
+    # kappa turns the camera to the left, yaw to the right.
+    np.testing.assert_allclose(taken[2].attitude.level_from_camera, level_from_belly(40, 0, 0), atol=1e-6)
+    assert "1 of 10 photographs (none for DJI_0001, DJI_0002, DJI_0004 and 6 more; 1 of its" in said[0]
+
+
+def test_a_table_on_the_map_counts_yaw_from_grid_north(tmp_path):
+    place = np.array([[16.5, 57.0, 80.0]])
+    at = MapFrame(3006, None, (16.5, 57.0, 0.0)).map(np.array([[0.0, 0.0, 80.0]]))[0]
+    file = written(tmp_path / "t.csv", "image,X_m,Y_m,Z_m,roll_deg,pitch_deg,yaw_deg\na,{},{},{},0,0,10\n".format(*at))
+    with pytest.raises(InputError, match="give the EPSG code"):
+        read_table(file)
+    found = read_table(file, 3006)
+    np.testing.assert_allclose(found.place, place, atol=1e-7)
+    # East of the central meridian (15 degrees) grid north lies east of true north by about dL sin(B).
+    level = found.attitude[0].level_from_camera
+    yaw = np.degrees(np.arctan2(level[0, 1], level[1, 1]))
+    assert yaw == pytest.approx(10 + 1.5 * np.sin(np.deg2rad(57)), abs=1e-3)
+
+
+def test_a_folder_of_pictures_and_all_that_lies_in_it(tmp_path):
+    """Small JPEGs with EXIF and XMP: marks, spoilt files, and photographs without positions are each one sentence."""
+    rng = np.random.default_rng(0)
+    for k in ALL:
+        gps = FLIGHT.camera[k]
+        exif = Image.Exif()
+        at = datetime(1980, 1, 6) + timedelta(seconds=int(FLIGHT.time[k] - 18 + 7200))
+        exif.get_ifd(0x8769).update({0x9003: f"{at:%Y:%m:%d %H:%M:%S}", 0x9011: "+02:00"})
+        parts = [(v, 0, 0) for v in (gps.latitude_deg, gps.longitude_deg)]
+        if k == 3:
+            parts = parts[::-1]
+        if k == 4:
+            parts = [(0, 0, 0), (0, 0, 0)]
+        if k != 5:
+            exif.get_ifd(0x8825).update({1: "N", 2: parts[0], 3: "E", 4: parts[1], 5: b"\0", 6: 57.0})
+        heights = {"Absolute": 40 * (k != 6) + 17 + k, "Relative": 17 + k}
+        xmp = "<rdf:Description " + " ".join(f'drone-dji:{n}Altitude="+{h}"' for n, h in heights.items()) + "/>"
+        picture = Image.fromarray(rng.integers(0, 255, (30, 40), dtype=np.uint8))
+        picture.save(tmp_path / f"DJI_{k + 1:04}.jpg", exif=exif, xmp=xmp.encode())
+    read = photographs(sorted(tmp_path.glob("*.jpg")))
+    taken, said = located(read, [tmp_path])
+    assert [p.name for p in taken if p.gps is None] == ["DJI_0005", "DJI_0006"]
+    assert same(taken[3].gps._replace(altitude_m=0.0), FLIGHT.camera[3]._replace(altitude_m=0.0), 0.5)
+    assert [p.gps.altitude_m for p in taken if p.gps] == [57 + k for k in ALL if k not in (4, 5)]
+    for words in (
+        "DJI_0004 have changed places",
+        "DJI_0005 are (0, 0)",
+        "DJI_0006 of 10 have no position",
+        "DJI_0007 are above take-off",
+    ):
+        assert sum(words in s for s in said) == 1, said
+    (tmp_path / "bad.MRK").write_text("no marks\n")
+    (tmp_path / "DJI_Timestamp.MRK").write_text("".join(FLIGHT.mark(k) for k in ALL))
+    taken, said = located(read, [tmp_path])
+    assert all(same(p.gps, c) for p, c in zip(taken, FLIGHT.camera, strict=True))
+    assert {p.gps.heights for p in taken} == {"ellipsoid"} and "heights are above the ellipsoid" in said
+    assert any("bad.MRK, row 1" in s and s.endswith("the file is not used") for s in said)
+    with pytest.raises(InputError, match=r"bad.MRK, row 1"):
+        located(read, [], [tmp_path / "bad.MRK"])
