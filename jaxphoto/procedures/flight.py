@@ -12,17 +12,13 @@ from jaxphoto.errors import BlockError, DatumError, InputError, RankError
 from jaxphoto.georeferencing.gps import Gps
 from jaxphoto.orientation.matches import PairMatches
 from jaxphoto.procedures.adjust import adjust_for_tables
+from jaxphoto.procedures.control import ControlledBlock
+from jaxphoto.procedures.control.of_flight import FlightControl, controlled_or_why, parts_with_marks
 from jaxphoto.procedures.georeference_photographs import GeoreferencedPhotographs, georeference_photographs
 from jaxphoto.procedures.orientation import Oriented, orient
 from jaxphoto.procedures.orientation.related_pairs import Report
-from jaxphoto.statistics import Selection, VarianceComponents, variance_components
+from jaxphoto.statistics import VarianceComponents, variance_components
 
-# Stations by what differs between receivers; the features' own scale comes with them.
-PARTS = {
-    "image points": Selection("image_points"),
-    "stations X-Y": Selection("stations", axes=("X", "Y")),
-    "stations Z": Selection("stations", axes="Z"),
-}
 # Random vectors: hundreds of thousands of image points make each expensive, and there are three parts to tell apart.
 _PROBES = 16
 
@@ -51,6 +47,10 @@ class FlightPart(NamedTuple):
     components: VarianceComponents | None
     """Of image points and stations, where these are stations and the adjustment converged."""
     adjusted: Adjustment
+    controlled: ControlledBlock | None = None
+    """With the control that was given."""
+    no_control: str = ""
+    """Why it has none of what was given."""
 
 
 class CalibratedFlight(NamedTuple):
@@ -67,11 +67,13 @@ def calibrate_flight(
     positions: Mapping[str, Gps | None],
     code: int | None = None,
     report: Report = lambda text: None,
+    control: FlightControl | None = None,
 ) -> CalibratedFlight:
     """Orient, georeference and adjust every part of the photographs of one camera, which starts at `interior`.
 
     `positions` are by name; `code` is the EPSG code of the map system (UTM where there is none). Photographs that
-    cannot be oriented, and whole parts that cannot, are left out with the reason.
+    cannot be oriented, and whole parts that cannot, are left out with the reason. A part that `control` does not fit
+    goes without.
 
     Raises InputError where no part can be oriented.
     """
@@ -80,7 +82,7 @@ def calibrate_flight(
     for number, part in enumerate(matched, 1):
         report(f"part {number} of {len(matched)}")
         try:
-            parts.append(_calibrated(part, sensor, interior, positions, code, report))
+            parts.append(_calibrated(part, sensor, interior, positions, code, report, control))
         except BlockError as error:
             left |= {
                 name: f"its part of {len(part.names)} photographs cannot be oriented: {error}" for name in part.names
@@ -100,24 +102,33 @@ def _calibrated(
     positions: Mapping[str, Gps | None],
     code: int | None,
     report: Report,
+    control: FlightControl | None,
 ) -> FlightPart:
     title = f"flight of {len(matched.names)} photographs"
     oriented = orient(
         matched.names, sensor, interior, matched.xy_mm, matched.pairs, matched.sigma_mm, title=title, report=report
     )
     report("adjusting")
-    placed, why_not = None, ""
+    placed, why_not, controlled, no_control = None, "", None, ""
     try:
         placed = georeference_photographs(oriented.block, positions, code)
-        adjusted = adjust_for_tables(placed.block)
+    except (InputError, BlockError) as error:
+        why_not = str(error)
+    if control is not None:
+        controlled, no_control = controlled_or_why(placed.block if placed else oriented.block, control, code, report)
+    try:
+        adjusted = controlled.adjusted if controlled else adjust_for_tables(placed.block if placed else oriented.block)
     except (InputError, BlockError, DatumError, RankError) as error:
+        if placed is None:
+            raise
         # Positions that do not tell the frame, or too badly: the calibration does without.
         placed, why_not = None, str(error)
         adjusted = adjust_for_tables(oriented.block)
     components = None
-    if placed and bool(adjusted.converged):
+    if (placed or controlled) and bool(adjusted.converged):
         report("estimating variance components")
-        components = variance_components(adjusted, PARTS, probes=_PROBES)
+        marked = {controlled.ids[p] for p in controlled.marks.point} if controlled else ()
+        components = variance_components(adjusted, parts_with_marks(adjusted, marked), probes=_PROBES)
         # Without an optimum they are no weights; the report says so.
         adjusted = components.adjusted if bool(components.adjusted.converged) else adjusted
-    return FlightPart(oriented, matched, placed, why_not, components, adjusted)
+    return FlightPart(oriented, matched, placed, why_not, components, adjusted, controlled, no_control)
