@@ -12,7 +12,7 @@ from jaxphoto.errors import BlockError, DatumError, InputError, RankError
 from jaxphoto.georeferencing.gps import Gps
 from jaxphoto.orientation.matches import PairMatches
 from jaxphoto.procedures.adjust import adjust_for_tables
-from jaxphoto.procedures.control import ControlledBlock
+from jaxphoto.procedures.control import ControlledBlock, rejudged
 from jaxphoto.procedures.control.of_flight import FlightControl, controlled_or_why, parts_with_marks
 from jaxphoto.procedures.georeference_photographs import GeoreferencedPhotographs, georeference_photographs
 from jaxphoto.procedures.orientation import Oriented, orient
@@ -131,4 +131,5 @@ def _calibrated(
         components = variance_components(adjusted, parts_with_marks(adjusted, marked), probes=_PROBES)
         # Without an optimum they are no weights; the report says so.
         adjusted = components.adjusted if bool(components.adjusted.converged) else adjusted
+        controlled = rejudged(controlled, adjusted) if controlled else None
     return FlightPart(oriented, matched, placed, why_not, components, adjusted, controlled, no_control)

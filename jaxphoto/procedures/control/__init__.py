@@ -1,6 +1,6 @@
 """Control of a block from files: surveyed points and marks, placed, adjusted with, tested."""
 
-from jaxphoto.procedures.control.control_block import ControlledBlock, at_optimum, control_block
+from jaxphoto.procedures.control.control_block import ControlledBlock, at_optimum, control_block, rejudged
 from jaxphoto.procedures.control.surveyed import Control, Marks, SurveyedPoints
 from jaxphoto.procedures.control.with_targets import control_block_with_targets
 
@@ -12,4 +12,5 @@ __all__ = [
     "at_optimum",
     "control_block",
     "control_block_with_targets",
+    "rejudged",
 ]

@@ -44,7 +44,10 @@ def in_frame(block: Block, points: SurveyedPoints, words: str | None, code: int 
             )
         check_near(points, system, *block.frame.origin[:2])
         there = places(points, system, block.frame.code)
-        return InFrame(block.frame, block.frame.map.local_from_place(there), True)
+        frame, same = block.frame, block.frame.code == system.code and block.frame.vertical is None
+        # Brought onto the points, the block has heights of theirs.
+        frame = dataclasses.replace(frame, vertical=system.vertical) if same else frame
+        return InFrame(frame, block.frame.map.local_from_place(there), True)
     if system.crs is None:
         return InFrame(dataclasses.replace(block.frame, kind="local"), filled(points), False)
     code = new_code(points, system) if code is None else code
@@ -76,8 +79,8 @@ def told_system(points: SurveyedPoints, words: str | None, guess: Callable[[], s
 
 
 def new_code(points: SurveyedPoints, system: ControlSystem) -> int:
-    """The EPSG code for a block that has none: that of the points, or the zone of UTM."""
-    if system.code is not None and system.crs is not None and not system.crs.is_geocentric:
+    """The EPSG code for a block that has none: that of a map in which the points are, or the zone of UTM."""
+    if system.code is not None and system.crs is not None and system.crs.is_projected:
         return system.code
     longitude, latitude, _ = np.median(places(points, system, 4326), axis=0)
     return utm_of(longitude, latitude)
