@@ -1,4 +1,4 @@
-"""CPU seconds of every step from photographs to a calibrated block, ours beside COLMAP's (pycolmap, as it comes, on the CPU).
+"""CPU seconds of every step from photographs to a calibrated block, ours beside COLMAP's (pycolmap, on the CPU).
 
 python benchmarks/flight.py FOLDER [--photographs 15] [--pairs exhaustive | position:20 | sequence:5] [--out DIR]
 

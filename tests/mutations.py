@@ -33,10 +33,9 @@ from jaxphoto.io.control_files import read_control
 from jaxphoto.io.dbat import read_dbat
 from jaxphoto.io.draws_folder import DrawsFolder
 from jaxphoto.io.exports import adjusted_block, photograph_files
-from jaxphoto.io.photograph_seconds import photograph_seconds
-from jaxphoto.io.photographs import photographs
 from jaxphoto.io.exposures import read_exposures
 from jaxphoto.io.photograph_metadata import drone_record, xmp_fields
+from jaxphoto.io.photographs import photographs
 from jaxphoto.io.photomodeler import read_photomodeler
 from jaxphoto.io.raster import read_dsm
 from jaxphoto.io.trajectory import Records, read_records, write_flight_csv, write_sbet
@@ -306,9 +305,7 @@ READERS: dict[str, Reader] = {
         lambda folder: read_recipe(folder / "recipe.toml"),
     ),
     "block-shutter": Reader(written_by(_rolling_block), read_block),
-    "photograph-seconds": Reader(
-        written_by(_photograph), lambda folder: photograph_seconds(photographs([folder / "a.jpg"]))
-    ),
+    "photograph": Reader(written_by(_photograph), lambda folder: photographs([folder / "a.jpg"])),
     "camera-opencv": Reader(text(a__yml=cameras.OPENCV), _camera("a.yml")),
     "recipe-flight": _recipe("001"),
     "recipe-convergent": _recipe("002"),

@@ -8,7 +8,12 @@ import pytest
 
 from jaxphoto import adjust, covariance, read_source
 from jaxphoto.adjustment import Outcome
+from jaxphoto.block import Frame
 from jaxphoto.camera import get_parameter
+from jaxphoto.procedures.control import at_optimum, control_block
+from jaxphoto.procedures.control.placed import moved
+from jaxphoto.procedures.orientation.onto_known import Similarity
+from jaxphoto.rotation import matrix_from_omega_phi_kappa
 from jaxphoto.statistics import (
     check_discrepancies,
     correlation_matrix,
@@ -18,6 +23,7 @@ from jaxphoto.statistics import (
     redundancy_numbers,
 )
 from tests.dbat_report import EOP, assert_printed, read_report
+from tests.procedures.controlled import surveyed_and_without
 
 
 def adjusted_block(block, rotations="omega_phi_kappa"):
@@ -77,6 +83,21 @@ def test_sxb_main_report(sxb):
     check_summary(adjusted, report, 5)
     check_exterior(adjusted, cov, report)
     assert check_high_correlations(adjusted, cov, report) > 0
+
+
+def test_sxb_from_a_frame_of_its_own_by_control_and_marks(sxb):
+    """Turned, shifted and made smaller, its surveyed points given as files give them: the same adjustment again."""
+    adjusted, _, report = sxb
+    control, without = surveyed_and_without(at_optimum(adjusted))
+    turn = np.asarray(matrix_from_omega_phi_kappa(np.array([0.3, -0.5, 1.0])))
+    away = moved(without, Similarity(np.array([3.0, 4.0, 5.0]), turn, 1e-3), Frame("local"))
+    found = control_block(away, control, adjust=adjust)
+    assert found.state.count("control") == 14 and found.state.count("check") == 2
+    # No mark is left out, though they scatter by more than was said of them.
+    assert found.adjusted.redundancy == report.redundancy
+    np.testing.assert_allclose(float(found.adjusted.sigma0), float(adjusted.sigma0), rtol=1e-9)
+    there, again = (np.asarray(a.unknowns.exterior.position) for a in (adjusted, found.adjusted))
+    np.testing.assert_allclose(again, there, atol=1e-5)
 
 
 def test_sxb_control_and_check_points(sxb):

@@ -1,17 +1,21 @@
 """`jaxphoto control`: an oriented block and a file of control to the block with it, adjusted and judged."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from jaxphoto.cli.app import app
 from jaxphoto.cli.console import plain_console
+from jaxphoto.errors import InputError
+from jaxphoto.image_measurement.control_targets import target_looker
+from jaxphoto.image_measurement.targets.on_ground import SYNTAX, read_target
 from jaxphoto.io import read_block
 from jaxphoto.io.block_folder import whole_block
 from jaxphoto.io.control_files import read_control
+from jaxphoto.io.sound_photographs import sound_photographs
 from jaxphoto.procedures import adjust
-from jaxphoto.procedures.control import at_optimum, control_block
+from jaxphoto.procedures.control import at_optimum, control_block, control_block_with_targets
 from jaxphoto.report import Level, Tables, verdict_of
 from jaxphoto.report.control import control_findings, write_control
 from jaxphoto.report.findings import Verdict
@@ -30,6 +34,12 @@ def control_command(
         str | None,
         typer.Option(help="System of the points where FILE does not say it: 25832, 25832+7837 with heights, local."),
     ] = None,
+    targets: Annotated[
+        str | None, typer.Option(help=f"Targets to find at the points: {', '.join(SYNTAX.values())}.")
+    ] = None,
+    photographs: Annotated[
+        list[Path] | None, typer.Option(help="Folder of the photographs of the block, to find targets in.")
+    ] = None,
     epsg: Annotated[int | None, typer.Option(help="Map system of a block that has none (default: theirs).")] = None,
 ) -> None:
     """Adjust an oriented block with control: surveyed points and where photographs show them.
@@ -38,12 +48,20 @@ def control_command(
     code 1: written, but the verdict is red.
     """
     check_folder(out, block, file, *((marks,) if marks else ()))
+    if (targets is None) != (not photographs):
+        raise InputError("targets are found in photographs: give both --targets and --photographs, or neither")
+    target = read_target(targets) if targets else None
     console, errors = plain_console(), plain_console(stderr=True)
     with errors.status("reading") as status:
         control, given = read_control(file, marks), read_block(block)
         status.update("adjusting the block as it is")
         oriented = at_optimum(adjust(given))
-        found = control_block(oriented, control, system=control_epsg, code=epsg, report=status.update)
+        how: dict[str, Any] = {"system": control_epsg, "code": epsg, "report": status.update}
+        if target:
+            paths = {p.name: p.path for p in sound_photographs(photographs or [])[0]}
+            found = control_block_with_targets(oriented, control, target_looker(target, paths, status.update), **how)
+        else:
+            found = control_block(oriented, control, **how)
         status.update("computing statistics")
         tables = Tables(found.adjusted)
         verdict = Verdict.of([*verdict_of(tables).findings, *control_findings(found)])

@@ -13,19 +13,21 @@ from jaxphoto.cli.console import plain_console
 from jaxphoto.errors import InputError, quoted
 from jaxphoto.georeferencing.gps import Heights
 from jaxphoto.georeferencing.map_frame import map_system
+from jaxphoto.image_measurement.control_targets import target_looker
 from jaxphoto.image_measurement.features import FEATURES, LONGEST_PX
 from jaxphoto.image_measurement.matching import MatchedPhotographs, match_photographs
 from jaxphoto.image_measurement.photograph_pairs import photograph_pairs
+from jaxphoto.image_measurement.targets.on_ground import SYNTAX, read_target
 from jaxphoto.io.block_folder import whole_block
+from jaxphoto.io.control_files import read_control
 from jaxphoto.io.exports import write_photograph_files
-from jaxphoto.io.photograph_seconds import photograph_seconds
-from jaxphoto.io.photographs import Photograph, known_lens, sensor_and_interior
 from jaxphoto.io.exposures import located
-from jaxphoto.io.photographs import Photograph, sensor_and_interior
+from jaxphoto.io.photographs import Photograph, known_lens, sensor_and_interior
 from jaxphoto.io.sound_photographs import sound_photographs
 from jaxphoto.io.text_tables import finite
 from jaxphoto.procedures.calibration import distortion_model
-from jaxphoto.procedures.flight import MatchedPart, calibrate_flight
+from jaxphoto.procedures.control.of_flight import flight_control
+from jaxphoto.procedures.flight import KnownOfFlight, MatchedPart, calibrate_flight
 from jaxphoto.report import Level, prepare_pictures
 from jaxphoto.report.flight import block_folder, report_of, write_flight, write_part_orientation
 from jaxphoto.report.terminal import plain
@@ -70,12 +72,26 @@ def fly_command(
     heights: Annotated[
         str | None, typer.Option(help="Heights are above the ellipsoid, geoid or take-off, where files do not say it.")
     ] = None,
+    control: Annotated[
+        Path | None, typer.Option(help="Surveyed points: gcp_list.txt, markers of Metashape as XML, or CSV.")
+    ] = None,
+    marks: Annotated[Path | None, typer.Option(help="Marks of the points, where --control has none.")] = None,
+    control_epsg: Annotated[
+        str | None,
+        typer.Option(help="System of the points where no file says it: 25832, 25832+7837, local."),
+    ] = None,
+    targets: Annotated[
+        str | None, typer.Option(help=f"Targets to find at the points: {', '.join(SYNTAX.values())}.")
+    ] = None,
 ) -> None:
     """Calibrate the camera of a flight from its photographs and their positions: orient, georeference, adjust, judge.
 
     What cannot be used is left out and named. Exit code 1: written, but the verdict is red.
     """
-    check_folder(out, *photographs)
+    check_folder(out, *photographs, *filter(None, (control, marks)))
+    if control is None and (marks or control_epsg or targets):
+        raise InputError("something is told of control, but no points are given; add --control FILE")
+    surveyed, target = read_control(control, marks) if control else None, read_target(targets) if targets else None
     if epsg is not None:
         map_system(epsg)
     Thread(target=prepare_pictures, daemon=True).start()
@@ -90,6 +106,13 @@ def fly_command(
         read = told.photographs
         for sentence in told.sentences:
             console.print(plain(sentence), soft_wrap=True)
+        given, placed = None, True
+        if surveyed:
+            look = target_looker(target, {p.name: p.path for p in read}) if target else None
+            given, own = flight_control(surveyed, control_epsg, [p.name for p in read], [p.gps for p in read], look)
+            epsg = own if epsg is None else epsg
+            # In a local system positions tell nothing.
+            placed = own is not None
         camera = sensor_and_interior(read, pixel_mm, c_mm)
         distortion = distortion_model(model, camera.sensor)
         compared = photograph_pairs(read, pairs or _usual_pairs(read))
@@ -110,12 +133,15 @@ def fly_command(
             [_part(names, group, matched.of(group)) for group in matched.parts],
             camera.sensor,
             InteriorOrientation(start.c, start.x_p, start.y_p, distortion),
-            {p.name: p.gps for p in read},
-            epsg,
+            KnownOfFlight(
+                {p.name: p.gps if placed else None for p in read},
+                {p.name: p.attitude for p in read},
+                epsg,
+                given,
+                known_lens(read, camera, distortion) if lens_prior else None,
+                {p.name: (p.taken.clock_s, p.taken.resolution_s) for p in read if p.taken} if rolling_shutter else None,
+            ),
             status.update,
-            known_lens(read, camera, distortion) if lens_prior else None,
-            photograph_seconds(read) if rolling_shutter else None,
-            {p.name: p.attitude for p in read},
         )
         flight = flight._replace(left_out=matched.left_out | flight.left_out)
         status.update("computing statistics")
@@ -132,6 +158,8 @@ def fly_command(
         sizes = f"{len(report.order)} photographs, {report.n_image_points} image points, {report.mean_px:.2f} px"
         console.print(f"part {number}: {sizes}", soft_wrap=True)
         for sentence in part.placed.sentences if part.placed else (part.why_not,):
+            console.print(f"  {plain(sentence)}", soft_wrap=True)
+        for sentence in part.controlled.sentences if part.controlled else ():
             console.print(f"  {plain(sentence)}", soft_wrap=True)
     for name, why in flight.left_out.items():
         console.print(plain(f"{name} is not used: {why}"), soft_wrap=True)

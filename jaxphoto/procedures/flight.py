@@ -9,27 +9,23 @@ from jaxtyping import Float
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.camera import InteriorOrientation, Sensor
 from jaxphoto.errors import BlockError, DatumError, InputError, RankError
+from jaxphoto.georeferencing.camera_attitude import CameraAttitude
 from jaxphoto.georeferencing.gps import Gps
 from jaxphoto.orientation.matches import PairMatches
 from jaxphoto.procedures.adjust import adjust_for_tables
+from jaxphoto.procedures.control import ControlledBlock, rejudged
+from jaxphoto.procedures.control.of_flight import FlightControl, controlled_or_why, parts_with_marks
 from jaxphoto.procedures.georeference_photographs import GeoreferencedPhotographs, georeference_photographs
 from jaxphoto.procedures.known_lens import KnownLens, with_known_lens
 from jaxphoto.procedures.orientation import Oriented, orient
 from jaxphoto.procedures.orientation.orient_photographs import CAMERA
 from jaxphoto.procedures.orientation.related_pairs import Report
 from jaxphoto.procedures.rolling_shutter import Moment, with_rolling_shutter
-from jaxphoto.statistics import Selection, VarianceComponents, variance_components
+from jaxphoto.statistics import VarianceComponents, variance_components
 
-# Stations by what differs between receivers; the features' own scale comes with them.
-PARTS = {
-    "image points": Selection("image_points"),
-    "stations X-Y": Selection("stations", axes=("X", "Y")),
-    "stations Z": Selection("stations", axes="Z"),
-}
-IMAGE_POINTS = {"image points": PARTS["image points"]}
 # What adjusted positions are off by against their neighbours.
 _NEIGHBOUR_M = 0.05
-# Random vectors: hundreds of thousands of image points make each expensive, and there are three parts to tell apart.
+# Random vectors: hundreds of thousands of image points make each expensive, and there are few parts to tell apart.
 _PROBES = 16
 
 
@@ -46,6 +42,19 @@ class MatchedPart(NamedTuple):
     """How far the others scatter, over what is expected of features of a plane."""
 
 
+class KnownOfFlight(NamedTuple):
+    """What is known of a flight besides what its photographs show; by the names of the photographs."""
+
+    positions: Mapping[str, Gps | None] = {}
+    attitudes: Mapping[str, CameraAttitude | None] = {}
+    code: int | None = None
+    """EPSG code of the map system; None: the zone of UTM."""
+    control: FlightControl | None = None
+    lens: KnownLens | None = None
+    taken: Mapping[str, Moment] | None = None
+    """When photographs were taken; given where a rolling shutter is to be estimated."""
+
+
 class FlightPart(NamedTuple):
     """Photographs that hang together, oriented, brought to their positions where they have any, and adjusted."""
 
@@ -55,8 +64,12 @@ class FlightPart(NamedTuple):
     why_not: str
     """Why there are no stations; "" where there are."""
     components: VarianceComponents | None
-    """Of image points, and of stations where there are any, if the adjustment converged."""
+    """Of image points, and of stations and marks where there are any, if the adjustment converged."""
     adjusted: Adjustment
+    controlled: ControlledBlock | None = None
+    """With the control that was given."""
+    no_control: str = ""
+    """Why it has none of what was given."""
     lens: tuple[str, ...] = ()
     """What was known of the lens beforehand, where it was observed."""
     why_still: str = ""
@@ -74,17 +87,13 @@ def calibrate_flight(
     matched: Sequence[MatchedPart],
     sensor: Sensor,
     interior: InteriorOrientation,
-    positions: Mapping[str, Gps | None],
-    code: int | None = None,
+    known: KnownOfFlight,
     report: Report = lambda text: None,
-    lens: KnownLens | None = None,
-    taken: Mapping[str, Moment] | None = None,
 ) -> CalibratedFlight:
     """Orient, georeference and adjust every part of the photographs of one camera, which starts at `interior`.
 
-    `positions` are by name; `code` is the EPSG code of the map system (UTM where there is none). Photographs that
-    cannot be oriented, and whole parts that cannot, are left out with the reason. `lens` is what is known of it before.
-    With the times at which photographs were `taken` a rolling shutter is estimated, where these have positions.
+    Photographs that cannot be oriented, and whole parts that cannot, are left out with the reason. What is `known` and
+    does not fit a part, it goes without, and says why.
 
     Raises InputError where no part can be oriented.
     """
@@ -93,7 +102,7 @@ def calibrate_flight(
     for number, part in enumerate(matched, 1):
         report(f"part {number} of {len(matched)}")
         try:
-            parts.append(_calibrated(part, sensor, interior, positions, code, report, lens, taken))
+            parts.append(_calibrated(part, sensor, interior, known, report))
         except BlockError as error:
             left |= {
                 name: f"its part of {len(part.names)} photographs cannot be oriented: {error}" for name in part.names
@@ -107,46 +116,58 @@ def calibrate_flight(
 
 
 def _calibrated(
-    matched: MatchedPart,
-    sensor: Sensor,
-    interior: InteriorOrientation,
-    positions: Mapping[str, Gps | None],
-    code: int | None,
-    report: Report,
-    lens: KnownLens | None,
-    taken: Mapping[str, Moment] | None,
+    matched: MatchedPart, sensor: Sensor, interior: InteriorOrientation, known: KnownOfFlight, report: Report
 ) -> FlightPart:
-    title = f"flight of {len(matched.names)} photographs"
+    title, lens = f"flight of {len(matched.names)} photographs", known.lens
     oriented = orient(
         matched.names, sensor, interior, matched.xy_mm, matched.pairs, matched.sigma_mm, title=title, report=report
     )
     if lens is not None:
         oriented = oriented._replace(block=with_known_lens(oriented.block, CAMERA, lens))
     report("adjusting")
-    placed, why_not = None, ""
+    placed, why_not, controlled, no_control = None, "", None, ""
     try:
-        placed = georeference_photographs(oriented.block, positions, code)
-        adjusted = adjust_for_tables(placed.block)
+        placed = georeference_photographs(oriented.block, known.positions, known.code, known.attitudes)
+    except (InputError, BlockError) as error:
+        why_not = str(error)
+    block = placed.block if placed else oriented.block
+    if known.control is not None:
+        controlled, no_control = controlled_or_why(block, known.control, known.code, report)
+    try:
+        adjusted = controlled.adjusted if controlled else adjust_for_tables(block)
     except (InputError, BlockError, DatumError, RankError) as error:
+        if placed is None:
+            raise
         # Positions that do not tell the frame, or too badly: the calibration does without.
         placed, why_not = None, str(error)
         adjusted = adjust_for_tables(oriented.block)
-    why_still = ""
-    if taken is not None:
-        adjusted, why_still = _rolling(adjusted, taken, placed is not None)
+    adjusted, why_still = _rolling(adjusted, known.taken, metric=bool(placed or controlled))
     components = None
     # What is known of the lens has a weight that image points must be brought to, with stations or without.
-    if (placed or lens) and bool(adjusted.converged):
+    if (placed or controlled or lens) and bool(adjusted.converged):
         report("estimating variance components")
-        components = variance_components(adjusted, PARTS if placed else IMAGE_POINTS, probes=_PROBES)
+        marked = {controlled.ids[p] for p in controlled.marks.point} if controlled else ()
+        components = variance_components(adjusted, parts_with_marks(adjusted, marked), probes=_PROBES)
         # Without an optimum they are no weights; the report says so.
         adjusted = components.adjusted if bool(components.adjusted.converged) else adjusted
-    known = lens.sentences(oriented.block, CAMERA) if lens else ()
-    return FlightPart(oriented, matched, placed, why_not, components, adjusted, known, why_still)
+    return FlightPart(
+        oriented,
+        matched,
+        placed,
+        why_not,
+        components,
+        adjusted,
+        rejudged(controlled, adjusted) if controlled else None,
+        no_control,
+        lens.sentences(oriented.block, CAMERA) if lens else (),
+        why_still,
+    )
 
 
-def _rolling(adjusted: Adjustment, taken: Mapping[str, Moment], metric: bool) -> tuple[Adjustment, str]:
+def _rolling(adjusted: Adjustment, taken: Mapping[str, Moment] | None, metric: bool) -> tuple[Adjustment, str]:
     """The adjustment with a rolling shutter; the one that was given, and why, where that cannot be estimated."""
+    if taken is None:
+        return adjusted, ""
     if not metric or not bool(adjusted.converged):
         return adjusted, "no rolling shutter is estimated: without positions and an optimum nothing tells speeds"
     try:

@@ -13,6 +13,7 @@ from markupsafe import Markup
 
 from jaxphoto.procedures.flight import CalibratedFlight, FlightPart
 from jaxphoto.report.alike import with_alike
+from jaxphoto.report.control import control_findings, control_summary, surveyed_points, write_control
 from jaxphoto.report.findings import Finding, Level, Verdict
 from jaxphoto.report.lens import lens_findings
 from jaxphoto.report.maps import png_of
@@ -41,6 +42,7 @@ _PAGE = """<!DOCTYPE html>
 <h3>Interior orientation</h3>{{ p.interior }}
 {% if p.alike %}<p>{{ p.alike }}</p>{% endif %}
 {% if p.lens %}<h3>What was known of the lens</h3><ul>{% for s in p.lens %}<li>{{ s }}</li>{% endfor %}</ul>{% endif %}
+{% if p.control %}<h3>Control</h3>{{ p.control }}<ul>{% for s in p.said %}<li>{{ s }}</li>{% endfor %}</ul>{% endif %}
 <h3>How it was oriented</h3><ul>{% for s in p.sentences %}<li>{{ s }}</li>{% endfor %}</ul>
 <h3>Photographs</h3>{% if p.picture %}<img alt="recorded positions minus those of the adjustment, in plan and in height,
 and residuals by photograph" src="{{ p.picture }}">{% endif %}{{ p.images }}
@@ -75,7 +77,11 @@ def _findings(part: FlightPart) -> Iterator[Finding]:
         yield Finding(Level.ALARM, "the orientation of the photographs did not settle: see how it was oriented")
     if part.why_still:
         yield Finding(Level.WARNING, part.why_still)
-    if part.why_not:
+    if part.no_control:
+        yield Finding(Level.ALARM, f"the control is not used: {part.no_control}")
+    if part.controlled:
+        yield from control_findings(part.controlled)
+    if part.why_not and not part.controlled:
         yield Finding(Level.WARNING, f"the block has a frame and a scale of its own: {part.why_not}")
     if part.placed and not part.placed.used.all():
         n = int((~part.placed.used).sum())
@@ -177,6 +183,8 @@ def write_flight(flight: CalibratedFlight, reports: list[PartReport], spoilt: Ma
             with_alike(r.tables.interior, r.part.adjusted, r.part.oriented.report.alike).to_csv(
                 folder / "interior_alike.csv", index=False
             )
+            if r.part.controlled:
+                write_control(r.part.controlled, folder)
             for name, table in (component_tables(r.part.components) if r.part.components else {}).items():
                 table.to_csv(folder / f"{name}.csv", index=False)
     images = pd.concat([r.images.assign(part=k) for k, r in enumerate(reports, 1)], ignore_index=True)
@@ -209,10 +217,11 @@ def _summary(r: PartReport, number: int) -> dict:
         "n_points": report.n_points,
         "mean_px": report.mean_px,
         "alike": report.alike,
-        "epsg": placed.block.frame.code if placed else None,
+        "epsg": r.part.adjusted.block.frame.code,
         "positions_used": int(placed.used.sum()) if placed else 0,
         "positions_left_out": [n for n, u in zip(placed.images, placed.used, strict=True) if not u] if placed else [],
         "sigma0": float(r.part.adjusted.sigma0),
+        "control": control_summary(r.part.controlled) if r.part.controlled else None,
     }
 
 
@@ -231,6 +240,8 @@ def _page(flight: CalibratedFlight, reports: list[PartReport], spoilt: Mapping[s
                 f"{report.alike:.2g}.",
                 "lens": r.part.lens,
                 "sentences": [*orientation_sentences(report), *(r.part.placed.sentences if r.part.placed else ())],
+                "control": _table(surveyed_points(r.part.controlled), "{:.3g}") if r.part.controlled else "",
+                "said": r.part.controlled.sentences if r.part.controlled else (),
                 "picture": png_of(positions_figure(r))[1],
                 "images": _table(r.images, "{:.3g}"),
             }

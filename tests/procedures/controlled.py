@@ -9,6 +9,7 @@ import numpy as np
 from jaxphoto.block import Block
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.georeferencing.map_frame import MapFrame
+from jaxphoto.procedures.control.into_block import without_names
 from jaxphoto.procedures.control.surveyed import Control, Marks, SurveyedPoints
 from jaxphoto.procedures.georeference_photographs import utm_of
 from jaxphoto.rotation import matrix_from_omega_phi_kappa
@@ -64,3 +65,24 @@ def marked_block(seed: int = 3) -> Marked:
         f"EPSG:{CODE}",
     )
     return Marked(kept, truth, Control(control, marks), true)
+
+
+def surveyed_and_without(block: Block) -> tuple[Control, Block]:
+    """The control and check points of a block in a local system with their marks, as files give them, and the rest."""
+    who = np.unique(np.concatenate([block.control.who, block.check.who]))
+    xyz, sigma = np.full((len(who), 3), np.nan), np.full((len(who), 3), np.nan)
+    for rows in (block.control, block.check):
+        at = np.searchsorted(who, rows.who), np.asarray(rows.axis)
+        xyz[at], sigma[at] = rows.value, np.where(np.asarray(rows.sigma) > 0, rows.sigma, np.nan)
+    rows, sensor = block.image_points, block.sensors[block.image_camera[0]]
+    own = np.isin(rows.point, who)
+    ids, places = tuple(block.points[p] for p in who), ("",) * int(own.sum())
+    marks = Marks(
+        tuple(block.images[i] for i in rows.image[own]),
+        tuple(block.points[p] for p in rows.point[own]),
+        sensor.px_from_mm(np.asarray(rows.xy)[own]),
+        np.asarray(rows.sigma)[own, 0] / sensor.pixel_mm,
+        places,
+    )
+    points = SurveyedPoints("survey", ids, xyz, sigma, np.isin(who, block.check.who), ids, "local")
+    return Control(points, marks), without_names(block, ids)

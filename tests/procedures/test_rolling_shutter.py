@@ -7,7 +7,6 @@ import pytest
 from PIL import Image
 
 from jaxphoto.errors import InputError
-from jaxphoto.io.photograph_seconds import photograph_seconds
 from jaxphoto.io.photographs import photographs
 from jaxphoto.procedures.rolling_shutter import velocities, with_rolling_shutter
 from jaxphoto.unknowns import FREE
@@ -75,6 +74,6 @@ def test_times_come_from_exif(tmp_path):
         exif = Image.Exif()
         exif.get_ifd(0x8769).update({0x9003: when} | ({0x9291: digits} if digits else {}))
         Image.new("RGB", (64, 48)).save(tmp_path / f"{name}.jpg", exif=exif)
-    found = photograph_seconds(photographs(sorted(tmp_path.glob("*.jpg"))))
-    assert set(found) == {"a", "b"}
-    assert found["b"][0] - found["a"][0] == pytest.approx(1.75) and found["a"][1] == 0.01 and found["b"][1] == 1.0
+    a, b, none = (p.taken for p in photographs(sorted(tmp_path.glob("*.jpg"))))
+    assert none is None
+    assert b.clock_s - a.clock_s == pytest.approx(1.75) and a.resolution_s == 0.01 and b.resolution_s == 1.0

@@ -1,11 +1,13 @@
 """Boards of ArUco markers, and ChArUco boards: chessboards with a marker in each white square. Any part may be seen."""
 
+from typing import NamedTuple
+
 import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxphoto.image_measurement.targets.chessboard import grid_points
-from jaxphoto.image_measurement.targets.corners import fit_crossings, fit_square_corners
+from jaxphoto.image_measurement.targets.corners import TargetPlaces, fit_crossings, fit_square_corners
 from jaxphoto.image_measurement.targets.pattern import FoundBoard, Pattern
 from jaxphoto.procedures.calibration import Board
 
@@ -32,23 +34,12 @@ class ArucoGrid(Pattern):
 
     def find(self, picture: np.ndarray) -> FoundBoard | None:
         """The corners of all markers of the board that are seen; None where there is none."""
-        corners, ids, _ = cv2.aruco.ArucoDetector(self._dictionary).detectMarkers(picture)
-        if ids is None:
-            return None
-        marker = np.asarray(ids).ravel()
-        own = (marker < self.columns * self.rows) & (np.bincount(marker)[marker] == 1)
+        found = found_markers(picture, self._dictionary, self.gap_m / self.marker_m)
+        own = (found.number < self.columns * self.rows) & (np.bincount(found.number)[found.number] == 1)
         if not own.any():
             return None
-        near = np.array(corners, float).reshape(-1, 4, 2)[own]
-        sides = np.roll(near, -1, axis=1) - near
-        length = np.linalg.norm(sides, axis=2, keepdims=True)
-        along = sides / length
-        edges = np.stack([along, -np.roll(along, 1, axis=1)], axis=2)
-        cells = self._dictionary.markerSize + 2
-        width = np.minimum(1 / cells, self.gap_m / self.marker_m) * length.min(axis=(1, 2))
-        reach = np.repeat(_PART * width, 4)
-        point = (4 * marker[own][:, None] + np.arange(4)).ravel()
-        return FoundBoard(point, fit_square_corners(picture, near.reshape(-1, 2), edges.reshape(-1, 2, 2), reach))
+        point = (4 * found.number[own][:, None] + np.arange(4)).ravel()
+        return FoundBoard(point, TargetPlaces(*(v[np.repeat(own, 4)] for v in found.corners)))
 
     def reflectance(self, xy_m: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
         """Black-framed markers on white."""
@@ -58,6 +49,29 @@ class ArucoGrid(Pattern):
         u, v = xy_m[:, 0] - column * pitch, -xy_m[:, 1] - row * pitch
         number = np.where(inside, row * self.columns + column, 0)
         return _marker_reflectance(self._dictionary, number, u / self.marker_m, v / self.marker_m, inside)
+
+
+class FoundMarkers(NamedTuple):
+    """Markers in a picture."""
+
+    number: Int[np.ndarray, "n"]
+    corners: TargetPlaces
+    """Four of each, one marker after the other."""
+
+
+def found_markers(picture: np.ndarray, dictionary, margin: float) -> FoundMarkers:
+    """All markers of a dictionary that a picture shows, with a bright `margin` (in sides of a marker) around each."""
+    corners, ids, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(picture)
+    if ids is None:
+        return FoundMarkers(np.zeros(0, int), TargetPlaces(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, bool)))
+    near = np.array(corners, float).reshape(-1, 4, 2)
+    sides = np.roll(near, -1, axis=1) - near
+    length = np.linalg.norm(sides, axis=2, keepdims=True)
+    along = sides / length
+    edges = np.stack([along, -np.roll(along, 1, axis=1)], axis=2)
+    width = np.minimum(1 / (dictionary.markerSize + 2), margin) * length.min(axis=(1, 2))
+    places = fit_square_corners(picture, near.reshape(-1, 2), edges.reshape(-1, 2, 2), np.repeat(_PART * width, 4))
+    return FoundMarkers(np.asarray(ids).ravel().astype(int), places)
 
 
 class CharucoBoard(Pattern):

@@ -35,6 +35,9 @@ _MARK = {
 _PICTURE = re.compile(r"\.(jpe?g|tiff?|png|dng)$", re.IGNORECASE)
 _UNIT = re.compile(r"\s*[\[(][^\])]*[\])]|\s+m$|\s+deg$")
 
+# Characters of a word that means a column.
+_LONGEST = 60
+
 Columns = dict[str, int]
 """The place of each column by what it means."""
 
@@ -85,6 +88,8 @@ def _columns(header: Sequence[str], known: dict[str, tuple[str, ...]]) -> Column
 
 def _words(cell: str) -> list[str]:
     """A cell of a header as a whole, without its unit, and its words on both sides of a stroke."""
+    if len(cell) > _LONGEST:
+        return []
     text = re.sub(r"[\s_]+", " ", cell.strip().lstrip("#").strip().lower())
     text = _UNIT.sub("", text).strip()
     return [text, *(text.split("/") if "accuracy" not in text else ())]

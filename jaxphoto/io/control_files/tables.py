@@ -29,6 +29,8 @@ _ROLES = {
     "": False, "control": False, "gcp": False, "3d gcp": False, "2d gcp": False,
     "check": True, "cp": True, "check point": True, "checkpoint": True,
 }  # fmt: skip
+# Lines among which a header or the system may be a comment.
+_HEAD = 20
 _OFF = ("0", "false", "no")
 
 
@@ -37,9 +39,9 @@ def read_table(path: Path, lines: list[str], rows: list[int]) -> SurveyedPoints 
 
     Raises InputError for a table that is neither, and for cells that are wrong.
     """
-    said = [match[1].strip() for line in lines for of in (_EPSG, _WKT) if (match := of.match(line.strip()))]
+    said = [match[1].strip() for line in lines[:_HEAD] for of in (_EPSG, _WKT) if (match := of.match(line.strip()))]
     content = [(line, row) for line, row in zip(lines, rows, strict=True) if not line.lstrip().startswith("#")]
-    comments = [line for line in lines if line.lstrip().startswith("#")]
+    comments = [line for line in lines[:_HEAD] if line.lstrip().startswith("#")]
     separator = _separator(content[0][0] if content else "")
     cells = Cells(
         path.name, [_split(path.name, line, row, separator) for line, row in content], [r for _, r in content]

@@ -19,13 +19,15 @@ from jaxphoto.errors import InputError, few
 from jaxphoto.procedures.adjust import adjust_for_tables
 from jaxphoto.procedures.control.intersected import intersected
 from jaxphoto.procedures.control.into_block import into_block, with_gnss_bias, without_names
-from jaxphoto.procedures.control.judged import CRITICAL, Judged, beyond, judged
+from jaxphoto.procedures.control.judged import CRITICAL, Judged, beyond, judged, scatter
 from jaxphoto.procedures.control.marked import Marked, marked
 from jaxphoto.procedures.control.onto_control import LEAST, onto_control
 from jaxphoto.procedures.control.placed import InFrame, in_frame, moved
 from jaxphoto.procedures.control.surveyed import MARK_SIGMA_PX, SIGMA_M, Control
 
-_ROUNDS = 5
+_ROUNDS = 8
+# Of the worst normalised residual: what is less is not left out beside it.
+_BESIDE_THE_WORST = 0.7
 
 
 class ControlledBlock(NamedTuple):
@@ -37,6 +39,8 @@ class ControlledBlock(NamedTuple):
     state: tuple[str, ...]
     """control, check, left out (it contradicts the rest), not marked (in too few photographs)."""
     n_marks: tuple[int, ...]
+    xyz_m: Float[np.ndarray, "points 3"]
+    """Surveyed, in the local frame of the block; NaN for what is not known."""
     off_m: Float[np.ndarray, "points 3"]
     """Surveyed minus adjusted, in the local frame of the block; NaN where there is none."""
     survey_sigma_m: Float[np.ndarray, "points 3"]
@@ -121,8 +125,8 @@ def control_block(
         said.append(f"{len(not_marked)} surveyed points are marked in too few photographs: {few(not_marked)}")
     n_marks = tuple(int(v) for v in np.bincount(now.point, minlength=len(ids)))
     return ControlledBlock(
-        adjusted, ids, points.check, tuple(state.tolist()), n_marks, found.off_m, sigma, found.sigma_m, found.w, now,
-        found.marks_px, tuple(dict.fromkeys(filter(None, said))),
+        adjusted, ids, points.check, tuple(state.tolist()), n_marks, known, found.off_m, sigma, found.sigma_m,
+        found.w, now, found.marks_px, tuple(dict.fromkeys(filter(None, said))),
     )  # fmt: skip
 
 
@@ -167,24 +171,25 @@ def _assumed(control: Control) -> list[str]:
 def _tested(found: Judged, now: Marked, used, able, ids, images):
     """Control points in use after the test, marks that go, and a sentence for each; nothing where all agree."""
     new, gone, said = used.copy(), np.zeros(len(now.image), bool), []
-    w = np.nan_to_num(found.w).max(axis=1)
-    of_control, of_marks = np.where(used, w, 0.0), np.nan_to_num(found.marks_w)
-    worst = max(of_control.max(initial=0.0), of_marks.max(initial=0.0))
-    if worst > CRITICAL:
-        if of_marks.max(initial=0.0) == worst:
-            row = int(of_marks.argmax())
-            gone[row] = True
-            off = np.linalg.norm(found.marks_px[row])
-            name, image = ids[now.point[row]], images[now.image[row]]
-            said.append(f"the mark of {name} in {image} is {off:.3g} px off (w = {worst:.3g}) and left out")
-        else:
-            new[int(of_control.argmax())] = False
-            said.append("")
-    else:
+    of_points, of_marks = np.where(used, np.nan_to_num(found.w).max(axis=1), 0.0), np.nan_to_num(found.marks_w)
+    wide = scatter(found.marks_w)
+    worst = max(of_points.max(initial=0.0), of_marks.max(initial=0.0) / wide)
+    if not worst > CRITICAL:
         back = able & ~used & ~beyond(found.w) & np.isfinite(found.w).any(axis=1)
-        if back.any():
-            new |= back
+        return new | back, gone, [""] * bool(back.any())
+    # What a blunder does to the residuals about it is no second one.
+    limit = max(CRITICAL, _BESIDE_THE_WORST * worst)
+    for p in np.unique(now.point).tolist():
+        row = max(np.flatnonzero(now.point == p), key=lambda k: of_marks[k])
+        if max(of_marks[row] / wide, of_points[p]) < limit:
+            continue
+        if of_marks[row] < of_points[p]:
+            new[p] = False
             said.append("")
+            continue
+        gone[row] = True
+        off, image = np.linalg.norm(found.marks_px[row]), images[now.image[row]]
+        said.append(f"the mark of {ids[p]} in {image} is {off:.3g} px off (w = {found.marks_w[row]:.3g}) and left out")
     return new, gone, said
 
 
@@ -205,6 +210,13 @@ def _spread(own: Judged, seen) -> Judged:
     return own._replace(
         adjusted_m=wide(own.adjusted_m), off_m=wide(own.off_m), sigma_m=wide(own.sigma_m), w=wide(own.w)
     )
+
+
+def rejudged(found: ControlledBlock, adjusted: Adjustment) -> ControlledBlock:
+    """The same by another adjustment of its block, as with other weights."""
+    seen = np.array(found.state, object) != "not marked"
+    own = _spread(judged(adjusted, int(seen.sum()), found.xyz_m[seen], found.survey_sigma_m[seen]), seen)
+    return found._replace(adjusted=adjusted, off_m=own.off_m, sigma_m=own.sigma_m, w=own.w, marks_px=own.marks_px)
 
 
 def at_optimum(adjusted: Adjustment) -> Block:

@@ -93,15 +93,15 @@ def _passing(origins, directions, limit) -> Bool[np.ndarray, "rays"]:
     met, determined = intersect_points(origins[ray], directions[ray], number, len(pairs), min_angle=_PARALLEL)
     if not determined.any():
         return np.ones(n, bool)
-    off = _misses(met[determined], origins, directions)
+    off = misses(met[determined], origins, directions)
     inside = off < limit
     score = inside.sum(axis=1) - np.minimum(off / limit, 1.0).mean(axis=1)
     passing = inside[np.argmax(score)]
     place, sure = intersect_points(origins[passing], directions[passing], np.zeros(passing.sum(), int), 1)
-    return _misses(place, origins, directions)[0] < limit if sure[0] else passing
+    return misses(place, origins, directions)[0] < limit if sure[0] else passing
 
 
-def _misses(places, origins, directions) -> Float[np.ndarray, "places rays"]:
+def misses(places, origins, directions) -> Float[np.ndarray, "places rays"]:
     """Angles (rad) by which rays miss places; infinite behind."""
     towards = places[:, None] - origins
     along = np.sum(towards * directions, axis=2)

@@ -15,6 +15,9 @@ from jaxphoto.statistics import LEAST_CHECKED, covariance, normalised_residuals,
 CRITICAL = 4.0
 """Normalised residuals beyond this are errors: one in 16,000 is not."""
 
+# Residuals whose scatter is told, and the median of the larger of two normal errors.
+_ENOUGH, _LARGER = 8, 1.05
+
 
 class Judged(NamedTuple):
     """The last `points` of a block and the marks of them."""
@@ -65,6 +68,15 @@ def _largest(w: Float[np.ndarray, "2 rows"]) -> Float[np.ndarray, "rows"]:
     """Over the first axis; NaN where all are."""
     found = np.max(np.nan_to_num(w, nan=-1.0), axis=0, initial=-1.0)
     return np.where(found < 0, np.nan, found)
+
+
+def scatter(marks_w: Float[np.ndarray, "rows"]) -> float:
+    """How much more the normalised residuals of marks scatter than they should; 1 at least, and where they are few.
+
+    What people mark seldom is as good as they say, which makes no blunders of it.
+    """
+    known = marks_w[np.isfinite(marks_w)]
+    return max(1.0, float(np.median(known)) / _LARGER) if len(known) >= _ENOUGH else 1.0
 
 
 def beyond(w: Float[np.ndarray, "points 3"]) -> Bool[np.ndarray, "points"]:

@@ -38,8 +38,8 @@ def marked(
     An image is found by the name of its file, whatever folder, ending and case. `elsewhere` are images that are known,
     but in no block or another: no word is lost on marks in these.
     """
-    image = _found(marks.image, block.images)
-    other = _found(marks.image, tuple(elsewhere)) >= 0
+    image = images_of(marks.image, block.images)
+    other = images_of(marks.image, tuple(elsewhere)) >= 0
     place = {name: k for k, name in enumerate(points.ids)}
     point = np.array([place.get(name, -1) for name in marks.point], int)
     said: list[str] = []
@@ -63,7 +63,7 @@ def marked(
     return Marked(image[kept], point[kept], xy, sigma * pixel), said
 
 
-def _found(names: Sequence[str], images: Sequence[str]) -> Int[np.ndarray, "names"]:
+def images_of(names: Sequence[str], images: Sequence[str]) -> Int[np.ndarray, "names"]:
     """The image that each name means; -1 for none, or for more than one."""
     exact = {name: k for k, name in enumerate(images)}
     loose: dict[str, int] = {}

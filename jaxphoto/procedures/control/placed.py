@@ -1,6 +1,7 @@
 """A block and control in one frame: the block in that of the control, or the control in that of the block."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -32,7 +33,8 @@ def in_frame(block: Block, points: SurveyedPoints, words: str | None, code: int 
     that of the points, or UTM. Raises InputError for a system that is not told, told twice, or cannot be, and for
     points that lie far from the block, with what would fit.
     """
-    system = _system(block, points, words)
+    at = block.frame.origin
+    system = told_system(points, words, lambda: fitting(points, None, *at[:2]) if at is not None else "")
     if block.frame.kind == "epsg":
         assert block.frame.code is not None and block.frame.origin is not None
         if system.crs is None:
@@ -42,14 +44,13 @@ def in_frame(block: Block, points: SurveyedPoints, words: str | None, code: int 
             )
         check_near(points, system, *block.frame.origin[:2])
         there = places(points, system, block.frame.code)
-        return InFrame(block.frame, block.frame.map.local_from_place(there), True)
+        frame, same = block.frame, block.frame.code == system.code and block.frame.vertical is None
+        # Brought onto the points, the block has heights of theirs.
+        frame = dataclasses.replace(frame, vertical=system.vertical) if same else frame
+        return InFrame(frame, block.frame.map.local_from_place(there), True)
     if system.crs is None:
         return InFrame(dataclasses.replace(block.frame, kind="local"), filled(points), False)
-    if code is None:
-        code = system.code if system.code is not None and _serves(system) else None
-    if code is None:
-        middle = np.median(places(points, system, 4326), axis=0)
-        code = utm_of(*middle[:2])
+    code = new_code(points, system) if code is None else code
     there = places(points, system, code)
     middle = np.median(there, axis=0)
     origin = (round(float(middle[0]), 4), round(float(middle[1]), 4), 0.0)
@@ -61,16 +62,15 @@ def in_frame(block: Block, points: SurveyedPoints, words: str | None, code: int 
     )
 
 
-def _system(block: Block, points: SurveyedPoints, words: str | None) -> ControlSystem:
+def told_system(points: SurveyedPoints, words: str | None, guess: Callable[[], str]) -> ControlSystem:
+    """The system that the file of `points` says, or `words`. Raises InputError for none, with a `guess`, or two."""
     own = system_of(points.system, points.file) if points.system else None
     given = system_of(words, "the EPSG code of the control") if words else None
     if own and given and own.crs != given.crs:
         raise InputError(f"{points.file} says {own.name}, but {given.name} is given; leave out the one that is wrong")
     found = own or given
     if found is None:
-        would = ""
-        if block.frame.kind == "epsg" and block.frame.origin is not None:
-            would = fitting(points, None, *block.frame.origin[:2])
+        would = guess()
         raise InputError(
             f"{points.file} does not say the coordinate system of its points; give its EPSG code (or local, for "
             "Cartesian metres of no map)" + (f": they would fit {would}" if would else "")
@@ -78,8 +78,12 @@ def _system(block: Block, points: SurveyedPoints, words: str | None) -> ControlS
     return found
 
 
-def _serves(system: ControlSystem) -> bool:
-    return system.crs is not None and (system.crs.is_projected or system.crs.is_geographic)
+def new_code(points: SurveyedPoints, system: ControlSystem) -> int:
+    """The EPSG code for a block that has none: that of a map in which the points are, or the zone of UTM."""
+    if system.code is not None and system.crs is not None and system.crs.is_projected:
+        return system.code
+    longitude, latitude, _ = np.median(places(points, system, 4326), axis=0)
+    return utm_of(longitude, latitude)
 
 
 def moved(block: Block, s: Similarity, frame: Frame) -> Block:
