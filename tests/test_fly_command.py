@@ -63,6 +63,8 @@ def test_a_folder_becomes_blocks_results_and_a_page(flown, tmp_path, monkeypatch
     assert [p["n_images"] for p in summary["parts"]] == [12, 3]
     assert summary["parts"][0]["positions_left_out"] == ["a05"]
     assert any("cut.jpg" in name for name in summary["not_used"]) and "blank" in summary["not_used"]
+    assert "blank" in summary["positions_from"][0]
+    assert summary["positions_from"][-1] == "heights are above the ellipsoid"
     images = pd.read_csv(out / "images.csv")
     assert len(images) == 15 and (images["rms_px"] < 1).all()
     # The folder knows its blocks and the files of its photographs.
@@ -85,6 +87,9 @@ def test_options_that_cannot_be(flown, tmp_path, monkeypatch, capsys):
         (["--epsg", 99], "EPSG code 99 is unknown"),
         (["--model", "pinhole"], "no distortion model is called 'pinhole'"),
         (["--pairs", "position:3"], "have no GPS position"),
+        (["--lever-arm", "0,1"], "--lever-arm is '0,1'; give three numbers of metres"),
+        (["--heights", "ground"], "--heights is 'ground'; give ellipsoid, geoid or take-off"),
+        (["--exposures", tmp_path / "absent.MRK"], "absent.MRK; add it, or correct the name"),
     ):
         code, _, wrong = run(monkeypatch, capsys, "fly", flown, "--out", tmp_path / "o", *arguments)
         assert code == 2 and message in wrong and not (tmp_path / "o").exists()

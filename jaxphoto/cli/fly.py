@@ -148,8 +148,8 @@ def fly_command(
         reports = [report_of(part) for part in flight.parts]
         status.update(f"writing {out}")
         with whole_folder(out) as work:
-            verdict = write_flight(flight, reports, spoilt, work)
             write_photograph_files({p.name: p.path.name for p in read}, work)
+            verdict = write_flight(flight, reports, spoilt, work, told.sentences)
             for number, part in enumerate(flight.parts, 1):
                 with whole_block(part.adjusted.block, work / block_folder(number)) as folder:
                     write_part_orientation(part, folder)

@@ -54,8 +54,8 @@ def plausible_positions(positions: Mapping[str, Gps | None]) -> tuple[Positions,
     if nowhere:
         said.append(f"the positions of {_named(nowhere)} are (0, 0), which receivers write without one: not used")
     if absent:
-        said.append(f"{_named(absent)} of {len(positions)} have no position" if len(absent) < len(positions) else
-                    "no photograph has a position")  # fmt: skip
+        some = f"{len(positions)} photographs have no position"
+        said.append(f"{_named(absent)} of {some}" if len(absent) < len(positions) else f"all {some}")
     return found, said
 
 

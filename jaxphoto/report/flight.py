@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -47,6 +47,7 @@ _PAGE = """<!DOCTYPE html>
 <h3>Photographs</h3>{% if p.picture %}<img alt="recorded positions minus those of the adjustment, in plan and in height,
 and residuals by photograph" src="{{ p.picture }}">{% endif %}{{ p.images }}
 {% endfor %}
+{% if told %}<h2>Where positions come from</h2><ul>{% for s in told %}<li>{{ s }}</li>{% endfor %}</ul>{% endif %}
 {% if lost %}<h2>Photographs that are not used</h2>
 <ul>{% for s in lost %}<li>{{ s }}</li>{% endfor %}</ul>{% endif %}
 </body></html>
@@ -173,8 +174,17 @@ def block_folder(number: int) -> str:
     return "block" if number == 1 else f"block_{number}"
 
 
-def write_flight(flight: CalibratedFlight, reports: list[PartReport], spoilt: Mapping[str, str], work: Path) -> Verdict:
-    """report.html, flight.json and images.csv, and a result folder for every part, into the folder `work`."""
+def write_flight(
+    flight: CalibratedFlight,
+    reports: list[PartReport],
+    spoilt: Mapping[str, str],
+    work: Path,
+    told: Sequence[str] = (),
+) -> Verdict:
+    """report.html, summary.json and images.csv, and a result folder for every part, into the folder `work`.
+
+    `told` says where positions come from.
+    """
     verdict = flight_verdict(flight, reports, spoilt)
     for number, r in enumerate(reports, 1):
         times = {name: r.part.adjusted.seconds[name] for name in ("compile", "solve", "covariance")}
@@ -189,11 +199,12 @@ def write_flight(flight: CalibratedFlight, reports: list[PartReport], spoilt: Ma
                 table.to_csv(folder / f"{name}.csv", index=False)
     images = pd.concat([r.images.assign(part=k) for k, r in enumerate(reports, 1)], ignore_index=True)
     images.to_csv(work / "images.csv", index=False)
-    (work / "report.html").write_text(_page(flight, reports, spoilt, verdict), encoding="utf-8")
+    (work / "report.html").write_text(_page(flight, reports, spoilt, verdict, told), encoding="utf-8")
     summary = {
         "verdict": verdict.colour,
         "findings": [{"level": f.level.name.lower(), "text": f.text} for f in verdict.findings],
         "parts": [_summary(r, number) for number, r in enumerate(reports, 1)],
+        "positions_from": list(told),
         "not_used": {**spoilt, **flight.left_out},
         "versions": versions(),
     }
@@ -225,7 +236,13 @@ def _summary(r: PartReport, number: int) -> dict:
     }
 
 
-def _page(flight: CalibratedFlight, reports: list[PartReport], spoilt: Mapping[str, str], verdict: Verdict) -> str:
+def _page(
+    flight: CalibratedFlight,
+    reports: list[PartReport],
+    spoilt: Mapping[str, str],
+    verdict: Verdict,
+    told: Sequence[str],
+) -> str:
     each = []
     for number, r in enumerate(reports, 1):
         report = r.part.oriented.report
@@ -251,7 +268,7 @@ def _page(flight: CalibratedFlight, reports: list[PartReport], spoilt: Mapping[s
     parts = pd.DataFrame([{c: _summary(r, k)[c] for c in columns} for k, r in enumerate(reports, 1)])
     page = Environment(autoescape=True).from_string(_PAGE)
     return page.render(
-        style=STYLE, title="Flight", verdict=verdict, parts=_table(parts, "{:.3g}"), each=each, lost=lost
+        style=STYLE, title="Flight", verdict=verdict, parts=_table(parts, "{:.3g}"), each=each, told=told, lost=lost
     )
 
 
