@@ -24,6 +24,7 @@ from jaxphoto.adjustment.model.structure import Structure
 from jaxphoto.adjustment.solver.similarity import motions, similarity
 from jaxphoto.arrays import still
 from jaxphoto.block import Block
+from jaxphoto.camera import RollingShutter
 from jaxphoto.compiling import QUICK_TO_COMPILE
 from jaxphoto.errors import DatumError
 from jaxphoto.observations import PRIORS, ControlRows
@@ -58,6 +59,12 @@ def close_datum(block: Block, values: Values, structure: Structure) -> DatumRows
     sensitivity, named = _datum_sensitivity(block, values, structure, motions, centre, size)
     null_motions = _null_motions(sensitivity)
     null = _combine(motions, null_motions)
+    scale_open = bool(len(null_motions)) and bool(np.abs(null_motions[:, 6]).max() > 1e-6)
+    if scale_open and any(t.kind == RollingShutter.kind for t in structure.tables):
+        raise DatumError(
+            "a rolling shutter sees by how many metres cameras move, but nothing in the block gives it a scale: add "
+            "stations, control or a distance, or leave the shutter out"
+        )
     kind, over = block.datum.kind, block.datum.over
     if kind == "control":
         if len(null_motions):
@@ -65,20 +72,20 @@ def close_datum(block: Block, values: Values, structure: Structure) -> DatumRows
         if judged:
             _check_vague(block, sensitivity, named)
         return null
-    if block.datum.scale is not None:
-        scale_open = bool(len(null_motions)) and bool(np.abs(null_motions[:, 6]).max() > 1e-6)
-        if scale_open != block.datum.scale:
-            raise DatumError(
-                "[datum] scale = false, but nothing in the block gives it a scale: add a distance, stations or "
-                "control, or set scale = true"
-                if scale_open
-                else "[datum] scale = true, but distances, stations or control give it already: set scale = false"
-            )
+    if block.datum.scale is not None and scale_open != block.datum.scale:
+        raise DatumError(
+            "[datum] scale = false, but nothing in the block gives it a scale: add a distance, stations or "
+            "control, or set scale = true"
+            if scale_open
+            else "[datum] scale = true, but distances, stations or control give it already: set scale = false"
+        )
+    if not len(null_motions):
+        return null
     constraints = _minimal(null, structure) if kind == "minimal" else _inner(null, block, over)
     product = np.einsum("kci,jci->kj", constraints.eop, null.eop) + np.einsum(
         "kcp,jcp->kj", constraints.points, null.points
     )
-    if len(null_motions) and np.linalg.svd(product, compute_uv=False)[-1] < 1e-9 * np.abs(product).max():
+    if np.linalg.svd(product, compute_uv=False)[-1] < 1e-9 * np.abs(product).max():
         raise DatumError(
             f'[datum] over = "{over}" cannot fix the datum (they lie on a line or in a point): take all points'
         )

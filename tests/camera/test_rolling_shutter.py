@@ -8,10 +8,13 @@ import pytest
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
-from jaxphoto import FIXED, FREE, ExteriorOrientation, Outcome, Weighted, adjust, covariance
+from jaxphoto import FIXED, FREE, ExteriorOrientation, Outcome, Weighted, adjust, correlated, covariance
+from jaxphoto.block import Datum
 from jaxphoto.camera import ImageMotion, RollingShutter, RowMotion
 from jaxphoto.collinearity import image_residual
+from jaxphoto.errors import BlockError, DatumError
 from jaxphoto.io import read_block, write_block
+from jaxphoto.observations import ControlRows, StationRows
 from jaxphoto.rotation import small_rotation
 from tests.blocks import BROWN, SENSOR, simulated
 from tests.derivatives import check_derivatives, compiled
@@ -140,6 +143,17 @@ def test_motions_are_unknowns_by_image_where_they_are_weighted(rolling):
     rates = np.array([np.asarray(own.rate) for own in found.unknowns.more["motions"].values()])
     before, after = (np.sqrt(np.mean((r - motions[:, 3:]) ** 2)) for r in (off[:, 3:], rates))
     assert after < 0.8 * before
+
+
+def test_what_it_cannot_do_is_refused(rolling):
+    block, none = with_shutter(*rolling), ControlRows.none()
+    loose = dataclasses.replace(block, control=none, stations=StationRows.none(), datum=Datum("inner", "points"))
+    with pytest.raises(DatumError, match="nothing in the block gives it a scale: add stations"):
+        adjust(loose)
+    rows = block.image_points.take(np.arange(4))
+    joined = correlated(rows, [range(4)], np.eye(8)[None] * 0.004**2)
+    with pytest.raises(BlockError, match="leave out shutters, motions"):
+        adjust(block, more=(joined,))
 
 
 def test_it_comes_back_from_a_block_folder(rolling, tmp_path):

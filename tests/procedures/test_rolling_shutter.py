@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from jaxphoto import Tables, adjust
 from jaxphoto.errors import InputError
 from jaxphoto.io.photographs import photographs
+from jaxphoto.procedures.flight import _rolling
 from jaxphoto.procedures.rolling_shutter import velocities, with_rolling_shutter
 from jaxphoto.unknowns import FREE
 from tests.simulation.small import made
@@ -77,3 +79,40 @@ def test_times_come_from_exif(tmp_path):
     a, b, none = (p.taken for p in photographs(sorted(tmp_path.glob("*.jpg"))))
     assert none is None
     assert b.clock_s - a.clock_s == pytest.approx(1.75) and a.resolution_s == 0.01 and b.resolution_s == 1.0
+
+
+@pytest.mark.slow
+def test_a_flight_tells_the_readout_by_its_times():
+    """Whole seconds, rates of turn that nobody tells, and a block that knew nothing of its shutter."""
+    drone = {"width_px": 5472, "height_px": 3648, "pixel_mm": 0.0024, "distortion": "brown"}
+    drone |= {"interior": {"c_mm": 8.8}, "unknowns": dict.fromkeys(("c_mm", "xp_mm", "yp_mm", "k1"), "free")}
+    strips = [
+        {"name": "S", "heading_deg": 0.0, "images": 6, "count": 3},
+        {"name": "X", "heading_deg": 90.0, "images": 6, "count": 2},
+    ]
+    flight = {
+        "height_m": 100.0, "forward_overlap_percent": 75.0, "side_overlap_percent": 60.0, "speed_m_per_s": 10.0,
+        "strips": strips,
+    }  # fmt: skip
+    changes = {
+        "cameras": {"kodak": drone},
+        "flight": flight,
+        "mounts": {"default": {"image_x": "right"}},
+        "shutters": {"kodak": {"truth": {"readout_ms": 30.0}}},
+        "jitter": {"position_m": 0.5, "angle_deg": 1.0, "rate_deg_per_s": 0.3},
+        "points": {"ties": 300, "min_images": 3},
+        "targets": [],
+        "sigmas": {"image_mm": 0.0012, "station_m": 0.03},
+        "noise": {},
+        "start": {"position_m": 0.5, "angle_deg": 0.3},
+    }
+    block = made(changes).block
+    late = {name: 60.0 * k for k, name in enumerate(dict.fromkeys(block.image_strip))}
+    rows = zip(block.images, block.image_time, block.image_strip, strict=True)
+    taken = {name: (np.floor(float(t) + late[strip]), 1.0) for name, t, strip in rows}
+    found, why = _rolling(adjust(block), taken, True)
+    assert not why and 0.9 < float(found.sigma0) < 1.1
+    table = Tables(found).georeferencing.set_index("parameter").loc["shutters[kodak].readout_ms"]
+    assert abs(table["value"] - 30.0) < 3 * table["sigma"] < 6.0
+    still, why = _rolling(found, taken, False)
+    assert still is found and "without positions" in why

@@ -185,6 +185,9 @@ def group_of(
 ) -> ObservedGroup:
     """The index arrays of a group: `cameras` are the places of the interior orientation of each image, `unknown_of`
     gives the shared unknown of each parameter, `n_shared` for none."""
+    if rows.through_camera and any(t.bends for t in tables):
+        names = ", ".join(t.kind for t in tables if t.bends)
+        raise BlockError(f"{rows.group} with covariances go through cameras that nothing bends: leave out {names}")
     n, nowhere = len(rows), len(unknown_of) - 1
     by_kind = {t.kind: t for t in tables}
     images, points, of_images, of_others, arguments = [], [], [], [], []
