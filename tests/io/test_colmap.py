@@ -298,7 +298,9 @@ def test_pycolmap_reads_what_is_written(tmp_path, format):
     first, again = (pycolmap.Reconstruction(str(tmp_path / name)) for name in ("model", "again"))
     assert again.num_images() == 3 and again.num_points3D() == 6
     assert again.compute_num_observations() == 18
-    assert again.compute_mean_reprojection_error() < 1e-9
+    # By its own projection: what the file says of errors is that they are not known.
+    again.update_point_3d_errors()
+    assert all(0 <= point.error < 1e-9 for point in again.points3D.values())
     for image in again.images.values():
         (other,) = (i for i in first.images.values() if i.name.removesuffix(".jpg") == image.name)
         pose = [i.cam_from_world().matrix() for i in (image, other)]

@@ -20,7 +20,7 @@ FILE = "blocks_exchange.xml"
 PLANE = CameraModel(Agisoft, ("k4", "p3", "p4", "b1", "b2"), Perspective())
 # The centre of its first pixel is (0, 0).
 _FIRST_PX = 0.5
-_COLOUR = {"Red": "0", "Green": "0", "Blue": "0"}
+_COLOUR = "<Color><Red>0</Red><Green>0</Green><Blue>0</Blue></Color>"
 
 
 def write_blocks_exchange(photographs: AdjustedPhotographs, folder: Path) -> None:
@@ -43,17 +43,26 @@ def write_blocks_exchange(photographs: AdjustedPhotographs, folder: Path) -> Non
         _add_camera(group, name, camera)
         for i in np.flatnonzero(np.array(p.image_camera, object) == name).tolist():
             _add_photo(group, i, p.files[i], rotations[i], centres[i])
-    ties = _add(block, "TiePoints")
-    for at, rows in zip(p.xyz + shift, p.rows_of_points, strict=True):
+    _add(block, "TiePoints")
+    # Of a million image points a tree of elements takes a gigabyte.
+    before, after = xml_text(root).split("<TiePoints />")
+    text = f"{before}<TiePoints>\n{_ties(p, shift)}    </TiePoints>{after}"
+    (folder / FILE).write_text(text, encoding="utf-8")
+
+
+def _ties(p: AdjustedPhotographs, shift: np.ndarray) -> str:
+    """The element <TiePoint> of every point that photographs show."""
+    images, places = p.image.tolist(), (p.column_row - _FIRST_PX).tolist()
+    found = []
+    for (x, y, z), rows in zip((p.xyz + shift).tolist(), p.rows_of_points, strict=True):
         if len(rows):
-            tie = _add(ties, "TiePoint")
-            _add_numbers(_add(tie, "Position"), "xyz", at)
-            _add_texts(_add(tie, "Color"), _COLOUR)
-            for i, xy in zip(p.image[rows].tolist(), p.column_row[rows] - _FIRST_PX, strict=True):
-                measured = _add(tie, "Measurement")
-                _add_texts(measured, {"PhotoId": str(i)})
-                _add_numbers(measured, "xy", xy)
-    (folder / FILE).write_text(xml_text(root), encoding="utf-8")
+            measured = (
+                f"<Measurement><PhotoId>{images[k]}</PhotoId><x>{places[k][0]!r}</x><y>{places[k][1]!r}</y></Measurement>"
+                for k in rows.tolist()
+            )
+            position = f"<Position><x>{x!r}</x><y>{y!r}</y><z>{z!r}</z></Position>"
+            found.append(f"<TiePoint>{position}{_COLOUR}{''.join(measured)}</TiePoint>\n")
+    return "".join(found)
 
 
 def _add_camera(group: ElementTree.Element, name: str, camera: ExportCamera) -> None:

@@ -6,6 +6,7 @@ is stands in summary.json: beside the result of `adjust`, in the list of parts o
 
 import csv
 import dataclasses
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeGuard
@@ -56,7 +57,8 @@ def adjusted_block(folder: str | Path, block: str | Path | None = None, part: in
     being 1. `block` is the block folder where the result does not say it, or it lies elsewhere now. Mounts, strips and
     other unknowns keep the start values of the block.
 
-    Raises InputError where it is no result, of an adjustment that did not converge, or not of that block.
+    Warns (UserWarning) where the verdict on it is red. Raises InputError where it is no result, of an adjustment that
+    did not converge, or not of that block.
     """
     sources = _sources(Path(folder), None if block is None else Path(block), part)
     given = read_block(sources.block)
@@ -169,6 +171,8 @@ def _checked(result: Path, block: Path) -> _Sources:
 
 def _camera(sources: _Sources, name: str, block: Block) -> InteriorOrientation:
     read = read_camera_file(sources.result / INTERIOR, camera=name)
+    if read.note:
+        warnings.warn(f"{sources.result}: {read.note}", UserWarning, stacklevel=3)
     if read.sensor != block.sensors[name]:
         raise InputError(f"{sources.result}: camera {name} has another sensor than in {sources.block}; {_MEND}")
     return read.interior
