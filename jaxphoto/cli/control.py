@@ -17,9 +17,9 @@ from jaxphoto.io.sound_photographs import sound_photographs
 from jaxphoto.procedures import adjust
 from jaxphoto.procedures.control import at_optimum, control_block, control_block_with_targets
 from jaxphoto.report import Level, Tables, verdict_of
-from jaxphoto.report.control import control_findings, write_control
+from jaxphoto.report.control import control_findings, control_summary, write_control
 from jaxphoto.report.findings import Verdict
-from jaxphoto.report.results import write_results
+from jaxphoto.report.results import versions, write_results, write_summary
 from jaxphoto.report.terminal import plain
 from jaxphoto.writing import check_folder, whole_folder
 
@@ -71,6 +71,10 @@ def control_command(
             with whole_folder(work / "result") as folder:
                 write_results(tables, verdict, folder, times)
             write_control(found, work)
+            told = [{"level": f.level.name.lower(), "text": f.text} for f in verdict.findings]
+            write_summary(
+                {"verdict": verdict.colour, "findings": told, **control_summary(found), "versions": versions()}, work
+            )
             with whole_block(found.adjusted.block, work / "block"):
                 pass
     for sentence in found.sentences:

@@ -10,7 +10,7 @@ from jaxphoto.block import Block
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.georeferencing.map_frame import MapFrame
 from jaxphoto.procedures.control.into_block import without_names
-from jaxphoto.procedures.control.surveyed import Control, Marks, SurveyedPoints
+from jaxphoto.procedures.control.surveyed import GivenControl, Marks, SurveyedPoints
 from jaxphoto.procedures.georeference_photographs import utm_of
 from jaxphoto.rotation import matrix_from_omega_phi_kappa
 from jaxphoto.unknowns import Unknowns
@@ -27,7 +27,7 @@ TURN = np.asarray(matrix_from_omega_phi_kappa(np.array([0.4, -0.7, 2.1])))
 class Marked(NamedTuple):
     block: Block
     truth: Unknowns
-    control: Control
+    control: GivenControl
     true_xyz: np.ndarray
     """Of the surveyed points, in the frame at `ORIGIN`."""
 
@@ -64,10 +64,10 @@ def marked_block(seed: int = 3) -> Marked:
         tuple(f"control.csv, row {k + 2}" for k in range(len(which))),
         f"EPSG:{CODE}",
     )
-    return Marked(kept, truth, Control(control, marks), true)
+    return Marked(kept, truth, GivenControl(control, marks), true)
 
 
-def surveyed_and_without(block: Block) -> tuple[Control, Block]:
+def surveyed_and_without(block: Block) -> tuple[GivenControl, Block]:
     """The control and check points of a block in a local system with their marks, as files give them, and the rest."""
     who = np.unique(np.concatenate([block.control.who, block.check.who]))
     xyz, sigma = np.full((len(who), 3), np.nan), np.full((len(who), 3), np.nan)
@@ -85,4 +85,4 @@ def surveyed_and_without(block: Block) -> tuple[Control, Block]:
         places,
     )
     points = SurveyedPoints("survey", ids, xyz, sigma, np.isin(who, block.check.who), ids, "local")
-    return Control(points, marks), without_names(block, ids)
+    return GivenControl(points, marks), without_names(block, ids)

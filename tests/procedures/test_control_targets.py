@@ -7,14 +7,21 @@ import cv2
 import numpy as np
 import pytest
 
-from jaxphoto import adjust
+from jaxphoto import adjust, covariance
 from jaxphoto.block import Block, Frame
 from jaxphoto.camera import InteriorOrientation
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing.map_frame import MapFrame
 from jaxphoto.image_measurement.control_targets import target_looker
 from jaxphoto.image_measurement.targets.on_ground import read_target
-from jaxphoto.procedures.control import Control, Marks, SurveyedPoints, control_block_with_targets
+from jaxphoto.procedures.control import (
+    GivenControl,
+    Marks,
+    SurveyedPoints,
+    at_optimum,
+    control_block,
+    control_block_with_targets,
+)
 from jaxphoto.procedures.control.search import Candidates, Looker
 from tests.image_measurement.ground import C_MM, GROUND_M, SENSOR, mapped, photograph, texture
 from tests.procedures.controlled import CODE, ORIGIN, marked_block
@@ -153,7 +160,7 @@ def flown(folder, kind, rng):
         ("survey.csv",) * len(true),
         f"EPSG:{CODE}",
     )
-    return block, Control(points, Marks.none()), true
+    return block, GivenControl(points, Marks.none()), true
 
 
 @pytest.mark.slow
@@ -170,3 +177,15 @@ def test_targets_are_found_in_photographs_by_the_survey_alone(tmp_path, kind):
     assert np.sqrt(np.mean(found.marks_px**2)) < 0.25
     shift = np.asarray(found.adjusted.unknowns.more["flight_bias"][""].shift)
     np.testing.assert_allclose(shift, (1.5, 0.0, 20.0), atol=0.3)
+    # One control point leaves the block at its stations, but for their shift.
+    marks, names = found.marks, found.adjusted.block.images
+    own = marks.point == 2
+    column_row = SENSOR.px_from_mm(marks.xy_mm[own])
+    images = tuple(names[i] for i in marks.image[own])
+    by_hand = Marks(images, ("P2",) * len(images), column_row, np.full(len(images), 0.2), ("a",) * len(images))
+    one = control_block(at_optimum(adjust(block)), control._replace(marks=by_hand), adjust=adjust)
+    assert one.state[2] == "control" and one.state.count("not marked") == 6
+    assert any("the block stays at its positions" in said for said in one.sentences)
+    label = one.adjusted.structure.labels.index("flight_bias.shift_Z_m")
+    sigma = float(covariance(one.adjusted).shared_sigma[label])
+    assert sigma < 0.5 and abs(float(one.adjusted.unknowns.more["flight_bias"][""].shift[2]) - 20) < 3 * sigma + 0.05

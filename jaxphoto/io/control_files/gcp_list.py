@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 
 from jaxphoto.errors import quoted
-from jaxphoto.io.control_files.rows import Cells, PointRows, read_marks
+from jaxphoto.io.control_files.rows import Cells, SurveyRows, read_marks
 from jaxphoto.io.text_tables import is_number
-from jaxphoto.procedures.control.surveyed import Control
+from jaxphoto.procedures.control.surveyed import GivenControl
 
 _SYSTEM = re.compile(r"EPSG:\d|\+proj=|WGS84\s+UTM\s", re.IGNORECASE)
 _LEAST = 6
@@ -32,10 +32,10 @@ def recognises(lines: list[str]) -> bool:
     return bool(_SYSTEM.match(lines[0].strip())) and (numbers or len(lines) == 1)
 
 
-def read_gcp_list(path: Path, lines: list[str], rows: list[int]) -> Control:
+def read_gcp_list(path: Path, lines: list[str], rows: list[int]) -> GivenControl:
     """Points, all of them control, and marks. Raises InputError for a row that is none."""
     cells = Cells(path.name, [line.split() for line in lines[1:]], rows[1:])
-    points = PointRows(path.name)
+    points = SurveyRows(path.name)
     marks = []
     for k, row in enumerate(cells.records):
         if len(row) < _LEAST:
@@ -51,4 +51,4 @@ def read_gcp_list(path: Path, lines: list[str], rows: list[int]) -> Control:
         marks.append((row[5], name, column_row, np.nan, cells.place(k)))
     if not marks:
         raise cells.none(f"there is no mark after {quoted(lines[0].strip())}; add rows")
-    return Control(points.surveyed(lines[0].strip()), read_marks(marks))
+    return GivenControl(points.surveyed(lines[0].strip()), read_marks(marks))

@@ -17,9 +17,9 @@ from pathlib import Path
 import numpy as np
 
 from jaxphoto.errors import InputError, quoted
-from jaxphoto.io.control_files.rows import Mark, PointRows, read_marks
+from jaxphoto.io.control_files.rows import Mark, SurveyRows, read_marks
 from jaxphoto.io.text_tables import finite
-from jaxphoto.procedures.control.surveyed import Control
+from jaxphoto.procedures.control.surveyed import GivenControl
 
 _TRUE, _FALSE = ("true", "1"), ("false", "0")
 _WKT = re.compile(r"\s*[A-Z_]{5,}\[")
@@ -30,7 +30,7 @@ def recognises(text: str) -> bool:
     return text.lstrip().startswith("<") and "<marker" in text
 
 
-def read_metashape_markers(path: Path, text: str) -> Control:
+def read_metashape_markers(path: Path, text: str) -> GivenControl:
     """Markers with reference coordinates and their pinned projections.
 
     Raises InputError for broken XML, and for numbers, cameras or markers that are none.
@@ -45,7 +45,7 @@ def read_metashape_markers(path: Path, text: str) -> Control:
         raise InputError(f"{file}: there is no <chunk>; export the markers of a chunk (File, Export, Export Markers)")
     cameras = _labels(chunk.iterfind("cameras//camera"), file, "camera")
     labels = _labels(chunk.iterfind("markers//marker"), file, "marker")
-    points = PointRows(file)
+    points = SurveyRows(file)
     for marker in chunk.iterfind("markers//marker"):
         reference = marker.find("reference")
         if reference is None or reference.get("x") is None or reference.get("y") is None:
@@ -71,7 +71,7 @@ def read_metashape_markers(path: Path, text: str) -> Control:
             column_row = [_number(location, key, place) for key in "xy"]
             marks.append((image, labels[number], column_row, np.nan, place))
     words = (chunk.findtext("reference") or "").strip()
-    return Control(points.surveyed(words if _WKT.match(words) else ""), read_marks(marks))
+    return GivenControl(points.surveyed(words if _WKT.match(words) else ""), read_marks(marks))
 
 
 def _labels(elements, file: str, what: str) -> dict[str, str]:

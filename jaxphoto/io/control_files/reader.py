@@ -11,10 +11,10 @@ from jaxphoto.io.control_files.metashape import read_metashape_markers
 from jaxphoto.io.control_files.metashape import recognises as is_metashape
 from jaxphoto.io.control_files.tables import read_table
 from jaxphoto.io.whole_text import SMALL, read_text
-from jaxphoto.procedures.control.surveyed import Control, Marks, SurveyedPoints
+from jaxphoto.procedures.control.surveyed import GivenControl, Marks, SurveyedPoints
 
 
-def read_control(control: str | Path, marks: str | Path | None = None) -> Control:
+def read_control(control: str | Path, marks: str | Path | None = None) -> GivenControl:
     """The points of the file `control` with the marks that it has, and those of the file `marks`.
 
     Forms are told apart by content: gcp_list.txt, Metashape's markers as XML, tables of points or marks. A file `marks`
@@ -25,17 +25,17 @@ def read_control(control: str | Path, marks: str | Path | None = None) -> Contro
         raise InputError(
             f"{Path(control).name} has marks but no coordinates; give it as the marks, and the points as well"
         )
-    points, seen = (own.points, own.marks) if isinstance(own, Control) else (own, Marks.none())
+    points, seen = (own.points, own.marks) if isinstance(own, GivenControl) else (own, Marks.none())
     if marks is not None:
         more = _read(Path(marks))
         if isinstance(more, SurveyedPoints):
             raise InputError(f"{Path(marks).name} has coordinates but no marks; give rows of image, point, x_px, y_px")
-        seen = _joined(seen, more.marks if isinstance(more, Control) else more)
+        seen = _joined(seen, more.marks if isinstance(more, GivenControl) else more)
     _check_known(points, seen)
-    return Control(points, seen)
+    return GivenControl(points, seen)
 
 
-def _read(path: Path) -> Control | SurveyedPoints | Marks:
+def _read(path: Path) -> GivenControl | SurveyedPoints | Marks:
     text = read_text(path, SMALL)
     if is_metashape(text):
         return read_metashape_markers(path, text)

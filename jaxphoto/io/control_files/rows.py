@@ -55,7 +55,7 @@ class Cells(NamedTuple):
         return value
 
 
-class PointRows:
+class SurveyRows:
     """Surveyed points as they are met, in the order of the file."""
 
     def __init__(self, file: str) -> None:

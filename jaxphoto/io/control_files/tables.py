@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxphoto.errors import InputError, quoted
-from jaxphoto.io.control_files.rows import Cells, Mark, PointRows, read_marks
+from jaxphoto.io.control_files.rows import Cells, Mark, SurveyRows, read_marks
 from jaxphoto.io.control_files.table_header import (
     Columns,
     columns_without_header,
@@ -66,7 +66,7 @@ def read_table(path: Path, lines: list[str], rows: list[int]) -> SurveyedPoints 
 
 
 def _points(cells: Cells, columns: Columns, separator: str, system: str, degrees: bool) -> SurveyedPoints:
-    cells, points = _dotted(cells, separator, columns["point"]), PointRows(cells.file)
+    cells, points = _dotted(cells, separator, columns["point"]), SurveyRows(cells.file)
     for k, row in enumerate(cells.records):
         # A table that ends in sums or in the points' errors has rows with another number of cells.
         if len(row) <= max(columns["x"], columns["y"]):

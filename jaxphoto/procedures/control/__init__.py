@@ -1,12 +1,12 @@
 """Control of a block from files: surveyed points and marks, placed, adjusted with, tested."""
 
 from jaxphoto.procedures.control.control_block import ControlledBlock, at_optimum, control_block, rejudged
-from jaxphoto.procedures.control.surveyed import Control, Marks, SurveyedPoints
+from jaxphoto.procedures.control.surveyed import GivenControl, Marks, SurveyedPoints
 from jaxphoto.procedures.control.with_targets import control_block_with_targets
 
 __all__ = [
-    "Control",
     "ControlledBlock",
+    "GivenControl",
     "Marks",
     "SurveyedPoints",
     "at_optimum",

@@ -19,11 +19,11 @@ from jaxphoto.errors import InputError, few
 from jaxphoto.procedures.adjust import adjust_for_tables
 from jaxphoto.procedures.control.intersected import intersected
 from jaxphoto.procedures.control.into_block import into_block, with_gnss_bias, without_names
-from jaxphoto.procedures.control.judged import CRITICAL, Judged, beyond, judged, scatter
+from jaxphoto.procedures.control.judged import CRITICAL, JudgedControl, beyond, judged, scatter
 from jaxphoto.procedures.control.marked import Marked, marked
 from jaxphoto.procedures.control.onto_control import LEAST, onto_control
 from jaxphoto.procedures.control.placed import InFrame, in_frame, moved
-from jaxphoto.procedures.control.surveyed import MARK_SIGMA_PX, SIGMA_M, Control
+from jaxphoto.procedures.control.surveyed import MARK_SIGMA_PX, SIGMA_M, GivenControl
 
 _ROUNDS = 8
 # Of the worst normalised residual: what is less is not left out beside it.
@@ -56,7 +56,7 @@ class ControlledBlock(NamedTuple):
 
 def control_block(
     block: Block,
-    control: Control,
+    control: GivenControl,
     *,
     system: str | None = None,
     code: int | None = None,
@@ -155,7 +155,7 @@ def _placed(block: Block, frame: InFrame, met, covariance, check, sigma, points)
     return moved(block, onto.similarity, frame.frame), onto.similarity.of(met), agree, said
 
 
-def _assumed(control: Control) -> list[str]:
+def _assumed(control: GivenControl) -> list[str]:
     said = []
     n = int(np.isnan(control.points.sigma_m).any(axis=1).sum())
     if n:
@@ -168,7 +168,7 @@ def _assumed(control: Control) -> list[str]:
     return said
 
 
-def _tested(found: Judged, now: Marked, used, able, ids, images):
+def _tested(found: JudgedControl, now: Marked, used, able, ids, images):
     """Control points in use after the test, marks that go, and a sentence for each; nothing where all agree."""
     new, gone, said = used.copy(), np.zeros(len(now.image), bool), []
     of_points, of_marks = np.where(used, np.nan_to_num(found.w).max(axis=1), 0.0), np.nan_to_num(found.marks_w)
@@ -193,7 +193,7 @@ def _tested(found: Judged, now: Marked, used, able, ids, images):
     return new, gone, said
 
 
-def _left_out(ids, left, found: Judged, frame: InFrame):
+def _left_out(ids, left, found: JudgedControl, frame: InFrame):
     for k in np.flatnonzero(left):
         told = ", ".join(f"{v:.3g}" for v in found.off_m[k])
         text = f"control point {ids[k]} contradicts the rest by {told} m (east, north, up) and is left out"
@@ -204,7 +204,7 @@ def _left_out(ids, left, found: Judged, frame: InFrame):
         yield text
 
 
-def _spread(own: Judged, seen) -> Judged:
+def _spread(own: JudgedControl, seen) -> JudgedControl:
     """Over all surveyed points, NaN for those that are not in the block."""
     wide = lambda v: np.where(seen[:, None], v[np.cumsum(seen) - 1], np.nan)  # noqa: E731
     return own._replace(

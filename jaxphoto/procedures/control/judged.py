@@ -19,7 +19,7 @@ CRITICAL = 4.0
 _ENOUGH, _LARGER = 8, 1.05
 
 
-class Judged(NamedTuple):
+class JudgedControl(NamedTuple):
     """The last `points` of a block and the marks of them."""
 
     adjusted_m: Float[np.ndarray, "points 3"]
@@ -37,7 +37,7 @@ class Judged(NamedTuple):
 
 def judged(
     adjusted: Adjustment, n: int, xyz: Float[np.ndarray, "points 3"], sigma: Float[np.ndarray, "points 3"]
-) -> Judged:
+) -> JudgedControl:
     """The last `n` points, surveyed at `xyz` with `sigma` (m); whatever their role."""
     block = adjusted.block
     first = len(block.points) - n
@@ -61,7 +61,7 @@ def judged(
         np.asarray(redundancy.image)[:, rows] > LEAST_CHECKED, np.abs(np.asarray(tested.image)[:, rows]), np.nan
     )
     marks_px = residual.T / pixel[:, None] * (1, -1)
-    return Judged(place, off, own, w, marks_px, _largest(of_marks))
+    return JudgedControl(place, off, own, w, marks_px, _largest(of_marks))
 
 
 def _largest(w: Float[np.ndarray, "2 rows"]) -> Float[np.ndarray, "rows"]:

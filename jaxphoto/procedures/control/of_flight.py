@@ -13,7 +13,7 @@ from jaxphoto.procedures.control.control_block import ControlledBlock, control_b
 from jaxphoto.procedures.control.marked import images_of
 from jaxphoto.procedures.control.placed import new_code, told_system
 from jaxphoto.procedures.control.search import Looker
-from jaxphoto.procedures.control.surveyed import Control
+from jaxphoto.procedures.control.surveyed import GivenControl
 from jaxphoto.procedures.control.system import check_near, fitting
 from jaxphoto.procedures.control.with_targets import control_block_with_targets
 from jaxphoto.procedures.orientation.related_pairs import Report
@@ -23,7 +23,7 @@ from jaxphoto.statistics import Selection
 class FlightControl(NamedTuple):
     """Control as files have it, and the system of its points where they do not say it."""
 
-    control: Control
+    control: GivenControl
     system: str | None
     images: tuple[str, ...]
     """All photographs of the flight that can be read."""
@@ -32,7 +32,7 @@ class FlightControl(NamedTuple):
 
 
 def flight_control(
-    control: Control,
+    control: GivenControl,
     system: str | None,
     images: Iterable[str],
     positions: Iterable[Gps | None],

@@ -51,7 +51,7 @@ class Looker(NamedTuple):
     """Whether a target tells which point it is."""
 
 
-class Found(NamedTuple):
+class FoundTargets(NamedTuple):
     """Marks of targets that were found, and a sentence for every point that was looked for."""
 
     marks: Marks
@@ -67,7 +67,7 @@ def found_marks(
     marks: Marked | None,
     looker: Looker,
     placed: bool,
-) -> Found:
+) -> FoundTargets:
     """Targets of the points `ids` at `xyz` (m, +- `sigma`) in the images of `adjusted` that have no mark of them yet.
 
     `placed`: control has placed the block; else its plan is that of receivers, and heights are those of its own ground.
@@ -100,7 +100,7 @@ def _on_own_ground(adjusted: Adjustment, xyz) -> tuple[Float[np.ndarray, "points
     return xyz - [0.0, 0.0, shift], max(scatter, 1.0)
 
 
-def _believed(adjusted, ids, xyz, of_points, at: Predicted, seen: Candidates, named: bool, radius) -> Found:
+def _believed(adjusted, ids, xyz, of_points, at: Predicted, seen: Candidates, named: bool, radius) -> FoundTargets:
     block, unknowns = adjusted.block, adjusted.unknowns
     image, point = at.image[seen.row], at.point[seen.row]
     sensors = [block.sensors[block.image_camera[i]] for i in image]
@@ -134,7 +134,7 @@ def _believed(adjusted, ids, xyz, of_points, at: Predicted, seen: Candidates, na
         seen.sigma_px[kept],
         tuple(f"found in {block.images[i]}" for i in image[kept]),
     )
-    return Found(marks, said)
+    return FoundTargets(marks, said)
 
 
 def _meeting(origins, directions, image, limit, near, of_point) -> tuple[np.ndarray, str]:

@@ -62,7 +62,7 @@ class Marks(NamedTuple):
         return Marks(one.image + other.image, one.point + other.point, column_row, sigma, places)
 
 
-class Control(NamedTuple):
+class GivenControl(NamedTuple):
     """Surveyed points and marks of them; there may be none of these, where targets are to be found."""
 
     points: SurveyedPoints

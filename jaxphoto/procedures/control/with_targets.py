@@ -16,14 +16,14 @@ from jaxphoto.procedures.control.control_block import ControlledBlock, control_b
 from jaxphoto.procedures.control.marked import marked
 from jaxphoto.procedures.control.placed import in_frame
 from jaxphoto.procedures.control.search import Looker, found_marks
-from jaxphoto.procedures.control.surveyed import SIGMA_M, Control, Marks
+from jaxphoto.procedures.control.surveyed import SIGMA_M, GivenControl, Marks
 
 _ROUNDS = 3
 
 
 def control_block_with_targets(
     block: Block,
-    control: Control,
+    control: GivenControl,
     looker: Looker,
     *,
     system: str | None = None,
