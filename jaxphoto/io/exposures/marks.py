@@ -5,7 +5,7 @@
 are number, seconds of the GPS week, week, from the antenna's phase centre to the centre of the sensor in north, east
 and down (mm), latitude, longitude and height above the ellipsoid of the camera, standard deviations north, east, up (m)
 and the kind of solution (DJI, user manual of the Matrice 4 series, "Image Log File": "after compensation"; Phantom 4
-RTK, "Timestamp.MRK Information"). Skydio writes the same.
+RTK, "Timestamp.MRK Information").
 """
 
 import re

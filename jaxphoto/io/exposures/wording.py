@@ -22,12 +22,10 @@ def joined_words(
     words = f"positions of {counts(photographs, file, found.exposure)} {how}{fixes(file, found.exposure)}"
     if not np.isfinite(found.offset_s):
         return words
-    if clock.gps:
-        small = _SMALL_S if clock.tolerance_s > FINE_S else FINE_S
-        if abs(found.offset_s) <= small:
-            return words
-        return f"{words}; the times of photographs and file differ by {clock_words(found.offset_s)}, which is taken off"
-    return f"{words}; the clock of the photographs is {clock_words(found.offset_s)} ahead of it, which is taken off"
+    small = _SMALL_S if clock.tolerance_s > FINE_S else FINE_S
+    if clock.gps and abs(found.offset_s) <= small:
+        return words
+    return f"{words}; the clocks of photographs and file differ by {clock_words(found.offset_s)}, which is taken off"
 
 
 def why_not(result: Ambiguous | None) -> str:
