@@ -32,9 +32,14 @@ class Marked(NamedTuple):
     """Of the surveyed points, in the frame at `ORIGIN`."""
 
 
-def marked_block(seed: int = 3) -> Marked:
-    """The crossing strips of `tests.blocks`, some of whose points are surveyed and marked instead."""
+def marked_block(seed: int = 3, xy_mm: np.ndarray | None = None) -> Marked:
+    """The crossing strips of `tests.blocks`, some of whose points are surveyed and marked instead.
+
+    `xy_mm` are other measurements of all image points of `free_network`.
+    """
     truth, block, rng = simulated("cross").truth, free_network(), np.random.default_rng(seed)
+    if xy_mm is not None:
+        block = eqx.tree_at(lambda b: b.image_points.xy, block, xy_mm)
     which = np.array(CONTROL + CHECK)
     rows = block.image_points
     own = np.isin(rows.point, which)

@@ -7,6 +7,8 @@ from jaxphoto import adjust
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing.map_frame import MapFrame
 from jaxphoto.procedures.control import control_block
+from jaxphoto.simulation.remeasure import image_coordinates
+from tests.blocks import free_network, simulated
 from tests.procedures.controlled import CHECK, CODE, CONTROL, ORIGIN, marked_block
 
 
@@ -41,6 +43,26 @@ def test_control_brings_the_block_to_its_place(marked):
     check = np.array(found.state) == "check"
     assert np.nanmax(found.w[check]) < 3.5 and np.nanmax(found.w[~check]) < 3.5
     assert not [s for s in found.sentences if "left out" in s]
+
+
+@pytest.mark.slow
+def test_differences_scatter_as_their_standard_deviations_say():
+    """Forty surveys and flights drawn anew: check points and residuals of control over their standard deviations."""
+    block, truth = free_network(), simulated("cross").truth
+    true, sigma = np.asarray(image_coordinates(block, truth)), np.asarray(block.image_points.sigma)
+    check, control, left = [], [], 0
+    for seed in range(40):
+        m = marked_block(seed, true + sigma * np.random.default_rng(1000 + seed).normal(size=true.shape))
+        found = found_in(m, m.control)
+        state = np.array(found.state)
+        left += int((state == "left out").sum())
+        check.append(found.w[state == "check"].ravel())
+        control.append(found.w[state == "control"].ravel())
+    for values, spread in ((np.concatenate(check), 0.25), (np.concatenate(control), 0.2)):
+        known = values[np.isfinite(values)]
+        assert len(known) > 200 and abs(np.mean(known**2) - 1) < spread, np.mean(known**2)
+    # Of 40 x 6 control points hardly one is off by four standard deviations.
+    assert left <= 1
 
 
 def test_a_wrong_coordinate_and_a_wrong_mark_are_named_and_turn_nothing(marked):
