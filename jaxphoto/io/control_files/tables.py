@@ -55,9 +55,10 @@ def read_table(path: Path, lines: list[str], rows: list[int]) -> SurveyedPoints 
             return _points(own, columns, separator, "".join(said[:1]), bool(in_degrees(header, columns)))
     found = columns_without_header(_dotted(cells, separator).records) if cells.records else None
     if found is None:
+        first = f" (it begins with {quoted(' '.join(cells.records[0]))})" if cells.records else ""
         raise cells.none(
-            "this is no file of control: give points (point, X_m, Y_m, Z_m), marks (image, point, x_px, y_px), a "
-            "gcp_list.txt, or markers of Metashape as XML"
+            f"this is no file of control{first}: give points (point, X_m, Y_m, Z_m), marks (image, point, x_px, y_px), "
+            "a gcp_list.txt, or markers of Metashape as XML"
         )
     kind, columns = found
     if kind == "marks":
@@ -68,7 +69,6 @@ def read_table(path: Path, lines: list[str], rows: list[int]) -> SurveyedPoints 
 def _points(cells: Cells, columns: Columns, separator: str, system: str, degrees: bool) -> SurveyedPoints:
     cells, points = _dotted(cells, separator, columns["point"]), SurveyRows(cells.file)
     for k, row in enumerate(cells.records):
-        # A table that ends in sums or in the points' errors has rows with another number of cells.
         if len(row) <= max(columns["x"], columns["y"]):
             raise cells.bad(k, f"{len(row)} cells are too few for the header; complete the row")
         xyz = [cells.number(k, columns["x"], "X"), cells.number(k, columns["y"], "Y"), np.nan]
