@@ -25,9 +25,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxphoto.adjustment import Adjustment, TiledStructure, TiledValues
+from jaxphoto.adjustment.model.camera_groups import CameraGroup, interior_of
 from jaxphoto.adjustment.model.image_orientations import by_image, orientation_derivatives, orientations_of
 from jaxphoto.adjustment.model.numbers import Increments, state_at
-from jaxphoto.adjustment.model.structure import CameraGroup, interior_of
 from jaxphoto.arrays import Numbers, still
 from jaxphoto.collinearity import camera_residual
 from jaxphoto.compiling import once

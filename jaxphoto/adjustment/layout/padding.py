@@ -17,9 +17,10 @@ from jaxphoto.adjustment.layout.padded_groups import crop_rows, pad_groups, pad_
 from jaxphoto.adjustment.layout.tile_layout import LEAST, Places, Sizes, TileLayout
 from jaxphoto.adjustment.layout.tiled import TiledResiduals, TiledStructure, TiledValues, Tiles
 from jaxphoto.adjustment.layout.tiling import size_class
+from jaxphoto.adjustment.model.camera_groups import CameraGroup
 from jaxphoto.adjustment.model.numbers import Residuals, UnknownArrays, Values
 from jaxphoto.adjustment.model.observed_groups import ObservedGroup, RowsAtPoints
-from jaxphoto.adjustment.model.structure import CameraGroup, Structure
+from jaxphoto.adjustment.model.structure import Structure
 from jaxphoto.arrays import still
 
 

@@ -6,8 +6,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxphoto.adjustment.model.camera_groups import CameraGroup, interior_of
 from jaxphoto.adjustment.model.numbers import AbstractValues, Increments, UnknownArrays
-from jaxphoto.adjustment.model.structure import AbstractStructure, CameraGroup, interior_of
+from jaxphoto.adjustment.model.structure import AbstractStructure
 from jaxphoto.georeferencing import Exposure
 from jaxphoto.rotation import small_rotation
 

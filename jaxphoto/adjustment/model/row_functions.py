@@ -14,9 +14,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jaxphoto.adjustment.model.camera_groups import interior_of
 from jaxphoto.adjustment.model.numbers import AbstractValues, Increments, NonImageResiduals, datum_residuals
 from jaxphoto.adjustment.model.observed_groups import ObservedGroup, RowsAtPoints, image_tables
-from jaxphoto.adjustment.model.structure import AbstractStructure, interior_of
+from jaxphoto.adjustment.model.structure import AbstractStructure
 from jaxphoto.georeferencing import Exposure
 from jaxphoto.observations import AbstractObservations, ImageState
 from jaxphoto.parameters import filled

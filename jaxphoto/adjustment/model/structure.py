@@ -20,8 +20,15 @@ from typing import NamedTuple, Self
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
+from jaxphoto.adjustment.model.camera_groups import (
+    CameraGroup,
+    camera_groups,
+    n_parameters,
+    places_of_cameras,
+    with_free,
+)
 from jaxphoto.adjustment.model.observed_groups import (
     ObservedGroup,
     RowsAtPoints,
@@ -31,29 +38,12 @@ from jaxphoto.adjustment.model.observed_groups import (
 )
 from jaxphoto.adjustment.model.parameter_tables import ParameterTable, SharedParameter, shared_entries, tables_of
 from jaxphoto.block import Block
-from jaxphoto.camera import InteriorOrientation
 from jaxphoto.devices import AXIS
 from jaxphoto.errors import BlockError
-from jaxphoto.georeferencing import Corrections, Exposure
+from jaxphoto.georeferencing import Corrections
 from jaxphoto.losses import AbstractLoss, LinearisedLoss
 from jaxphoto.observations import PRIORS, AbstractObservations, ImageRows
-from jaxphoto.parameters import filled, size_of
 from jaxphoto.unknowns import FIXED, Unknowns
-
-
-class CameraGroup(eqx.Module):
-    """Cameras of one model: their parameters are rows of one table, so one `vmap` serves them all."""
-
-    names: tuple[str, ...] = eqx.field(static=True)
-    treedef: jax.tree_util.PyTreeDef = eqx.field(static=True)
-    offset: int = eqx.field(static=True)
-    camera: Int[np.ndarray, "images"]
-    """Camera (within the group) of each image; 0 where the image's camera is of another group."""
-    member: Bool[np.ndarray, "images"]
-    """Whether the image's camera is of this group."""
-    free_leaves: tuple[int, ...] = eqx.field(static=True)
-    bent: jax.tree_util.PyTreeDef = eqx.field(static=True)
-    """Of an image, what bends its camera included: more leaves where rows move (`camera.RowMotion`)."""
 
 
 class AbstractStructure(eqx.Module):
@@ -117,7 +107,7 @@ class AbstractStructure(eqx.Module):
     @property
     def n_cameras(self) -> int:
         """Number of parameters of all cameras: the first ones of the vector of all shared parameters."""
-        return _n_parameters(self.groups)
+        return n_parameters(self.groups)
 
     @property
     def coupled(self) -> tuple[ObservedGroup, ...]:
@@ -160,11 +150,6 @@ def total(x, s: AbstractStructure):
     return jax.lax.psum(x, AXIS) if s.shards > 1 else x
 
 
-def interior_of(group: CameraGroup, table) -> InteriorOrientation:
-    """The group's interior orientations from its table of parameters, one column a parameter, as they are or bent."""
-    return jax.tree.unflatten(group.treedef if len(table) == group.treedef.num_leaves else group.bent, table)
-
-
 class ObservedRows(NamedTuple):
     """What an adjustment observes besides image points, and the order of the shared parameters."""
 
@@ -185,8 +170,8 @@ def observed_in(block: Block, priors: Unknowns) -> ObservedRows:
 
     Raises InputError or BlockError for priors and rows that are none.
     """
-    cameras = _groups(block, np.array(block.image_camera))
-    tables = tables_of(block, block.start.unknowns, _n_parameters(cameras))
+    cameras = camera_groups(block, np.array(block.image_camera))
+    tables = tables_of(block, block.start.unknowns, n_parameters(cameras))
     entries, together = shared_entries(block, priors, [name for g in cameras for name in g.names], tables)
     named = observations_of(block, priors, together, [e.label for e in entries])
     weighted = weighted_parameters([e.prior for e in entries], together)
@@ -209,8 +194,8 @@ def structure_of(block: Block, priors: Unknowns, observed: ObservedRows | None =
     unknown_of[free] = np.arange(len(free))
     colour, column, n_image_colours = _colours(block, given, free)
     bent = sum(t.size * len(t.owners) for t in tables if t.bends)
-    n_interior = int((free < _n_parameters(given.cameras) + bent).sum())
-    cameras = _places_of_cameras(given.cameras)
+    n_interior = int((free < n_parameters(given.cameras) + bent).sum())
+    cameras = places_of_cameras(given.cameras)
     groups = tuple(group_of(name, rows, tables, cameras, unknown_of, len(free)) for name, rows in given.named)
     met = [int(g.column.max(initial=-1)) + 1 for g in groups if g.elimination == "point"]
 
@@ -221,7 +206,7 @@ def structure_of(block: Block, priors: Unknowns, observed: ObservedRows | None =
     eop_free[:3] *= priors.exterior.position is not FIXED
     eop_free[3:] *= priors.exterior.camera_from_object is not FIXED
     return Structure(
-        groups=tuple(_with_free(g, free, tables) for g in given.cameras),
+        groups=tuple(with_free(g, free, tables) for g in given.cameras),
         tables=tables,
         n_images=len(block.images),
         n_points=len(block.points),
@@ -268,11 +253,6 @@ def _check_coupled(block: Block, groups: tuple[ObservedGroup, ...], point: np.nd
             )
 
 
-def _n_parameters(cameras: tuple[CameraGroup, ...]) -> int:
-    """Of all cameras."""
-    return sum(len(g.names) * g.treedef.num_leaves for g in cameras)
-
-
 def _colours(block: Block, given: ObservedRows, free: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
     """Colour of each shared unknown, what each means for an image, and how many of them image rows touch.
 
@@ -306,53 +286,3 @@ def _colours(block: Block, given: ObservedRows, free: np.ndarray) -> tuple[np.nd
             for j in of_owner.get(f"{kind}:{name}", ()):
                 column[i, colour[j]] = j
     return colour, column, n_image_colours
-
-
-def _places_of_cameras(cameras: tuple[CameraGroup, ...]) -> np.ndarray | None:
-    """Places of the parameters of each image's camera (parameters, images); None where models differ."""
-    if len(cameras) != 1:
-        return None
-    (g,) = cameras
-    m = g.treedef.num_leaves
-    return g.offset + m * g.camera + np.arange(m)[:, None]
-
-
-def _groups(block: Block, image_camera: np.ndarray) -> tuple[CameraGroup, ...]:
-    by_model: dict[jax.tree_util.PyTreeDef, list[str]] = {}
-    for name, interior in block.start.unknowns.interior.items():
-        by_model.setdefault(jax.tree.structure(interior), []).append(name)
-    groups, offset = [], 0
-    for treedef, names in by_model.items():
-        member = np.isin(image_camera, names)
-        ordered = np.array(sorted(names))
-        place = np.array([names.index(n) for n in ordered], np.int32)
-        camera = np.zeros(len(image_camera), np.int32)
-        camera[member] = place[np.searchsorted(ordered, image_camera[member])]
-        groups.append(CameraGroup(tuple(names), treedef, offset, camera, member, (), treedef))
-        offset += len(names) * treedef.num_leaves
-    return tuple(groups)
-
-
-def _with_free(group: CameraGroup, free: np.ndarray, tables: tuple[ParameterTable, ...]) -> CameraGroup:
-    """The group with its list of parameters that are free, or bent, in any of its cameras."""
-    m = group.treedef.num_leaves
-    own = free[(free >= group.offset) & (free < group.offset + m * len(group.names))] - group.offset
-    moved, bending = {int(k) % m for k in own}, [t for t in tables if t.bends]
-    bent = _bent_by(jax.tree.unflatten(group.treedef, [0.0] * m), [t.form for t in bending])
-    fields = [path[-1].name for path, _ in jax.tree_util.tree_flatten_with_path(bent)[0]]
-    for t in bending:
-        moved |= {fields.index(name) for name in t.form[0].bends if name in fields}
-    return dataclasses.replace(group, free_leaves=tuple(sorted(moved)), bent=jax.tree.structure(bent))
-
-
-def _bent_by(interior: InteriorOrientation, forms: list) -> InteriorOrientation:
-    """What becomes of an interior orientation that parameters of these forms bend: its tree, without numbers."""
-    still = np.zeros(3)
-
-    def bent(interior: InteriorOrientation) -> InteriorOrientation:
-        exposure = Exposure(0.0, still, still, np.eye(3), 0.0, 1.0)  # type: ignore[arg-type]
-        for form in forms:
-            interior = filled(form, np.zeros(size_of(form))).interior(interior, exposure)
-        return interior
-
-    return jax.eval_shape(bent, interior) if forms else interior

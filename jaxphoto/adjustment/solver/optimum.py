@@ -18,8 +18,8 @@ from jaxtyping import Array, Bool, Int
 
 from jaxphoto.adjustment.layout.sharding import EVERYWHERE, TILES, along_points, sharded
 from jaxphoto.adjustment.layout.tiled import TiledStructure, TiledValues
+from jaxphoto.adjustment.model.camera_groups import interior_of
 from jaxphoto.adjustment.model.numbers import Increments
-from jaxphoto.adjustment.model.structure import interior_of
 from jaxphoto.adjustment.solver.band import factor_band
 from jaxphoto.adjustment.solver.elimination import solve_factored
 from jaxphoto.adjustment.solver.levenberg_marquardt import FactoredSystem, LevenbergMarquardt

@@ -15,8 +15,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxphoto.adjustment.layout.tiled import TiledStructure
+from jaxphoto.adjustment.model.camera_groups import CameraGroup, interior_of
 from jaxphoto.adjustment.model.image_orientations import ImageOrientations, OrientationDerivatives
-from jaxphoto.adjustment.model.structure import CameraGroup, interior_of
 from jaxphoto.collinearity import ExteriorOrientation, camera_coordinates, camera_residual
 from jaxphoto.compiling import once
 from jaxphoto.georeferencing import apparent_point
