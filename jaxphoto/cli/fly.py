@@ -1,5 +1,6 @@
 """`jaxphoto fly`: a folder of photographs to a georeferenced block, its adjustment and one page about both."""
 
+from contextlib import ExitStack
 from pathlib import Path
 from threading import Thread
 from typing import Annotated
@@ -10,12 +11,14 @@ import typer
 from jaxphoto.camera import DISTORTIONS, InteriorOrientation
 from jaxphoto.cli.app import app
 from jaxphoto.cli.console import plain_console
+from jaxphoto.cli.progress import FEWER_PAIRS, StepsLeft
 from jaxphoto.georeferencing.map_frame import map_system
 from jaxphoto.image_measurement.features import FEATURES, LONGEST_PX
 from jaxphoto.image_measurement.matching import MatchedPhotographs, match_photographs
-from jaxphoto.image_measurement.photograph_pairs import photograph_pairs
+from jaxphoto.image_measurement.photograph_pairs import MostAlike, photograph_pairs, usual_choice
 from jaxphoto.io.block_folder import whole_block
-from jaxphoto.io.photographs import Photograph, sensor_and_interior
+from jaxphoto.io.kept_pieces import KeptPieces, beside, check_pieces
+from jaxphoto.io.photographs import sensor_and_interior
 from jaxphoto.io.sound_photographs import sound_photographs
 from jaxphoto.procedures.calibration import distortion_model
 from jaxphoto.procedures.flight import MatchedPart, calibrate_flight
@@ -23,10 +26,6 @@ from jaxphoto.report import Level, prepare_pictures
 from jaxphoto.report.flight import block_folder, report_of, write_flight, write_part_orientation
 from jaxphoto.report.terminal import plain
 from jaxphoto.writing import check_folder, whole_folder
-
-# So many nearest of each are compared where all have positions: as far as photographs of four fifths overlap still show
-# the same, in all directions.
-_NEAREST = 20
 
 
 @app.command("fly")
@@ -36,7 +35,8 @@ def fly_command(
     pairs: Annotated[
         str | None,
         typer.Option(
-            help="Photographs to compare: exhaustive, sequence:K, position:K (default: position:20 where all have one)."
+            help="Photographs to compare: exhaustive, sequence:K, position:K, similar:K (default: position:20 or, "
+            "where not all have one, similar:20; exhaustive up to 40)."
         ),
     ] = None,
     epsg: Annotated[int | None, typer.Option(help="Map system of the block (default: the zone of UTM).")] = None,
@@ -53,19 +53,21 @@ def fly_command(
     What cannot be used is left out and named. Exit code 1: written, but the verdict is red.
     """
     check_folder(out, *photographs)
+    check_pieces(beside(out))
     if epsg is not None:
         map_system(epsg)
     Thread(target=prepare_pictures, daemon=True).start()
     console, errors = plain_console(), plain_console(stderr=True)
-    with errors.status("reading the photographs") as status:
+    with errors.status("reading the photographs") as status, ExitStack() as opened:
         read, spoilt = sound_photographs(photographs)
         for sentence in spoilt.values():
             errors.print(f"left out: {plain(sentence)}", soft_wrap=True)
         camera = sensor_and_interior(read, pixel_mm, c_mm)
         distortion = distortion_model(model, camera.sensor)
-        compared = photograph_pairs(read, pairs or _usual_pairs(read))
+        compared = photograph_pairs(read, pairs or usual_choice(read))
         console.print(camera.origin, soft_wrap=True)
-        console.print(f"{len(read)} photographs, {len(compared)} pairs to compare", soft_wrap=True)
+        console.print(f"{len(read)} photographs, {_in_words(compared)}", soft_wrap=True)
+        keep = opened.enter_context(KeptPieces(beside(out)).alone())
         matched = match_photographs(
             read,
             camera.sensor,
@@ -74,7 +76,8 @@ def fly_command(
             count=features,
             longest_px=longest_px,
             in_parts=True,
-            progress=lambda done, of: status.update(f"features and matches: {done} of {of}"),
+            keep=keep,
+            progress=StepsLeft(errors, status, FEWER_PAIRS),
         )
         names, start = [p.name for p in read], camera.interior
         flight = calibrate_flight(
@@ -94,6 +97,7 @@ def fly_command(
             for number, part in enumerate(flight.parts, 1):
                 with whole_block(part.adjusted.block, work / block_folder(number)) as folder:
                     write_part_orientation(part, folder)
+        keep.remove()
     for number, part in enumerate(flight.parts, 1):
         report = part.oriented.report
         sizes = f"{len(report.order)} photographs, {report.n_image_points} image points, {report.mean_px:.2f} px"
@@ -115,6 +119,7 @@ def _part(names: list[str], group: np.ndarray, own: MatchedPhotographs) -> Match
     return MatchedPart([names[k] for k in group], own.xy_mm, own.sigma_mm, own.pairs, own.n_gross, own.sigma_factor)
 
 
-def _usual_pairs(photographs: list[Photograph]) -> str:
-    placed = all(p.gps is not None for p in photographs)
-    return f"position:{_NEAREST}" if placed and len(photographs) > 2 * _NEAREST else "exhaustive"
+def _in_words(compared: list[tuple[int, int]] | MostAlike) -> str:
+    if isinstance(compared, MostAlike):
+        return f"each to compare with the {compared.number} that look most like it"
+    return f"{len(compared)} pairs to compare"
