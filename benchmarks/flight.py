@@ -1,4 +1,4 @@
-"""CPU seconds of every step from photographs to a calibrated block, ours beside COLMAP's (pycolmap, on the CPU).
+"""CPU seconds of every step from photographs to a calibrated block, ours beside COLMAP's (pycolmap with its defaults).
 
 python benchmarks/flight.py FOLDER [--photographs 15] [--pairs exhaustive | position:20 | sequence:5] [--out DIR]
 
@@ -115,8 +115,8 @@ def ours(arguments: argparse.Namespace) -> dict:
     camera = sensor_and_interior(read)
     compared = photograph_pairs(read, arguments.pairs)
 
-    def progress(done: int, of: int) -> None:
-        if done == len(read):
+    def progress(what: str, done: int, of: int) -> None:
+        if what == "features" and done == of:
             clock.step("features")
 
     matched = match_photographs(

@@ -34,6 +34,7 @@ from jaxphoto.io.dbat import read_dbat
 from jaxphoto.io.draws_folder import DrawsFolder
 from jaxphoto.io.exports import adjusted_block, photograph_files
 from jaxphoto.io.exposures import read_exposures
+from jaxphoto.io.kept_pieces import KeptPieces
 from jaxphoto.io.photograph_metadata import drone_record, xmp_fields
 from jaxphoto.io.photographs import photographs
 from jaxphoto.io.photomodeler import read_photomodeler
@@ -212,6 +213,10 @@ def _read_draws(folder: Path) -> object:
     return run.next_part, run.columns(), run.read(["converged", "kodak.c_mm"])
 
 
+def _piece(folder: Path) -> None:
+    KeptPieces(folder).write("a", xy_mm=np.arange(20.0).reshape(10, 2), feature=np.arange(10))
+
+
 def _recipe(name: str) -> Reader:
     return Reader(
         lambda: {"recipe.toml": (RECIPES / f"{name}.toml").read_bytes()},
@@ -310,6 +315,7 @@ READERS: dict[str, Reader] = {
     "recipe-flight": _recipe("001"),
     "recipe-convergent": _recipe("002"),
     "recipe-lidar": _recipe("004"),
+    "kept-piece": Reader(written_by(_piece), lambda folder: KeptPieces(folder).read("a")),
     "draws": Reader(written_by(_draws), _read_draws),
     "block-joint": Reader(written_by(_joint_block), read_block),
     "camera-opencv-xml": _open_cv(".xml"),

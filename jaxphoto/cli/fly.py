@@ -1,8 +1,9 @@
 """`jaxphoto fly`: a folder of photographs to a georeferenced block, its adjustment and one page about both."""
 
+from contextlib import ExitStack
 from pathlib import Path
 from threading import Thread
-from typing import Annotated, get_args
+from typing import Annotated
 
 import numpy as np
 import typer
@@ -10,21 +11,22 @@ import typer
 from jaxphoto.camera import DISTORTIONS, InteriorOrientation
 from jaxphoto.cli.app import app
 from jaxphoto.cli.console import plain_console
-from jaxphoto.errors import InputError, quoted
-from jaxphoto.georeferencing.gps import Heights
+from jaxphoto.cli.exposure_options import heights_of, lever_arm_of
+from jaxphoto.cli.progress import FEWER_PAIRS, StepsLeft
+from jaxphoto.errors import InputError
 from jaxphoto.georeferencing.map_frame import map_system
 from jaxphoto.image_measurement.control_targets import target_looker
 from jaxphoto.image_measurement.features import FEATURES, LONGEST_PX
 from jaxphoto.image_measurement.matching import MatchedPhotographs, match_photographs
-from jaxphoto.image_measurement.photograph_pairs import photograph_pairs
+from jaxphoto.image_measurement.photograph_pairs import MostAlike, photograph_pairs, usual_choice
 from jaxphoto.image_measurement.targets.on_ground import SYNTAX, read_target
 from jaxphoto.io.block_folder import whole_block
 from jaxphoto.io.control_files import read_control
 from jaxphoto.io.exports import write_photograph_files
 from jaxphoto.io.exposures import located
-from jaxphoto.io.photographs import Photograph, known_lens, sensor_and_interior
+from jaxphoto.io.kept_pieces import KeptPieces, beside, check_pieces
+from jaxphoto.io.photographs import known_lens, sensor_and_interior
 from jaxphoto.io.sound_photographs import sound_photographs
-from jaxphoto.io.text_tables import finite
 from jaxphoto.procedures.calibration import distortion_model
 from jaxphoto.procedures.control.of_flight import flight_control
 from jaxphoto.procedures.flight import KnownOfFlight, MatchedPart, calibrate_flight
@@ -32,10 +34,6 @@ from jaxphoto.report import Level, prepare_pictures
 from jaxphoto.report.flight import block_folder, report_of, write_flight, write_part_orientation
 from jaxphoto.report.terminal import plain
 from jaxphoto.writing import check_folder, whole_folder
-
-# So many nearest of each are compared where all have positions: as far as photographs of four fifths overlap still show
-# the same, in all directions.
-_NEAREST = 20
 
 
 @app.command("fly")
@@ -45,7 +43,8 @@ def fly_command(
     pairs: Annotated[
         str | None,
         typer.Option(
-            help="Photographs to compare: exhaustive, sequence:K, position:K (default: position:20 where all have one)."
+            help="Photographs to compare: exhaustive, sequence:K, position:K, similar:K (default: position:20 or, "
+            "where not all have one, similar:20; exhaustive up to 40)."
         ),
     ] = None,
     epsg: Annotated[int | None, typer.Option(help="Map system of the block (default: the zone of UTM).")] = None,
@@ -92,16 +91,17 @@ def fly_command(
     if control is None and (marks or control_epsg or targets):
         raise InputError("something is told of control, but no points are given; add --control FILE")
     surveyed, target = read_control(control, marks) if control else None, read_target(targets) if targets else None
+    check_pieces(beside(out))
     if epsg is not None:
         map_system(epsg)
     Thread(target=prepare_pictures, daemon=True).start()
     console, errors = plain_console(), plain_console(stderr=True)
-    with errors.status("reading the photographs") as status:
+    with errors.status("reading the photographs") as status, ExitStack() as opened:
         read, spoilt = sound_photographs(photographs)
         for sentence in spoilt.values():
             errors.print(f"left out: {plain(sentence)}", soft_wrap=True)
         told = located(
-            read, photographs, exposures or (), code=epsg, arm=_lever_arm(lever_arm), heights=_heights(heights)
+            read, photographs, exposures or (), code=epsg, arm=lever_arm_of(lever_arm), heights=heights_of(heights)
         )
         read = told.photographs
         for sentence in told.sentences:
@@ -115,9 +115,10 @@ def fly_command(
             placed = own is not None
         camera = sensor_and_interior(read, pixel_mm, c_mm)
         distortion = distortion_model(model, camera.sensor)
-        compared = photograph_pairs(read, pairs or _usual_pairs(read))
+        compared = photograph_pairs(read, pairs or usual_choice(read))
         console.print(camera.origin, soft_wrap=True)
-        console.print(f"{len(read)} photographs, {len(compared)} pairs to compare", soft_wrap=True)
+        console.print(f"{len(read)} photographs, {_in_words(compared)}", soft_wrap=True)
+        keep = opened.enter_context(KeptPieces(beside(out)).alone())
         matched = match_photographs(
             read,
             camera.sensor,
@@ -126,7 +127,8 @@ def fly_command(
             count=features,
             longest_px=longest_px,
             in_parts=True,
-            progress=lambda done, of: status.update(f"features and matches: {done} of {of}"),
+            keep=keep,
+            progress=StepsLeft(errors, status, FEWER_PAIRS),
         )
         names, start = [p.name for p in read], camera.interior
         flight = calibrate_flight(
@@ -153,6 +155,7 @@ def fly_command(
             for number, part in enumerate(flight.parts, 1):
                 with whole_block(part.adjusted.block, work / block_folder(number)) as folder:
                     write_part_orientation(part, folder)
+        keep.remove()
     for number, part in enumerate(flight.parts, 1):
         report = part.oriented.report
         sizes = f"{len(report.order)} photographs, {report.n_image_points} image points, {report.mean_px:.2f} px"
@@ -176,25 +179,7 @@ def _part(names: list[str], group: np.ndarray, own: MatchedPhotographs) -> Match
     return MatchedPart([names[k] for k in group], own.xy_mm, own.sigma_mm, own.pairs, own.n_gross, own.sigma_factor)
 
 
-def _lever_arm(text: str | None) -> tuple[float, float, float] | None:
-    if text is None:
-        return None
-    numbers = [finite(part.strip()) for part in text.split(",")]
-    known = [v for v in numbers if v is not None]
-    if len(numbers) != 3 or len(known) != 3:
-        raise InputError(f"--lever-arm is {quoted(text)}; give three numbers of metres, right,forward,up: 0,0.03,0.19")
-    return known[0], known[1], known[2]
-
-
-def _heights(text: str | None) -> Heights | None:
-    for kind in get_args(Heights):
-        if text == kind != "unknown":
-            return kind
-    if text is None:
-        return None
-    raise InputError(f"--heights is {quoted(text)}; give ellipsoid, geoid or take-off")
-
-
-def _usual_pairs(photographs: list[Photograph]) -> str:
-    placed = all(p.gps is not None for p in photographs)
-    return f"position:{_NEAREST}" if placed and len(photographs) > 2 * _NEAREST else "exhaustive"
+def _in_words(compared: list[tuple[int, int]] | MostAlike) -> str:
+    if isinstance(compared, MostAlike):
+        return f"each to compare with the {compared.number} that look most like it"
+    return f"{len(compared)} pairs to compare"

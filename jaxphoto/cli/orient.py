@@ -1,6 +1,7 @@
 """`jaxphoto orient`: photographs, or a block without approximate values, to an oriented block."""
 
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated
 
@@ -10,13 +11,15 @@ import typer
 from jaxphoto.camera import DISTORTIONS, InteriorOrientation
 from jaxphoto.cli.app import app
 from jaxphoto.cli.console import plain_console
+from jaxphoto.cli.progress import FEWER_PAIRS, StepsLeft
 from jaxphoto.errors import InputError
 from jaxphoto.image_measurement.features import FEATURES, LONGEST_PX
 from jaxphoto.image_measurement.matching import MatchedPhotographs, match_photographs
-from jaxphoto.image_measurement.photograph_pairs import photograph_pairs
+from jaxphoto.image_measurement.photograph_pairs import photograph_pairs, usual_choice
 from jaxphoto.io import read_block, write_block
 from jaxphoto.io.block_folder import check_block_target, whole_block
 from jaxphoto.io.block_folder.table_layout import TOML
+from jaxphoto.io.kept_pieces import KeptPieces, beside, check_pieces
 from jaxphoto.io.photographs import photographs, sensor_and_interior
 from jaxphoto.procedures.adjust import needs_orientation
 from jaxphoto.procedures.calibration import distortion_model
@@ -30,7 +33,10 @@ def orient_command(
     out: Annotated[Path, typer.Option(help="Block folder to write; a block in it is replaced.")],
     pairs: Annotated[
         str | None,
-        typer.Option(help="Photographs to compare: exhaustive, sequence:K, position:K (default: exhaustive)."),
+        typer.Option(
+            help="Photographs to compare: exhaustive, sequence:K, position:K, similar:K (default: exhaustive up to 40, "
+            "else position:20 or, where not all have one, similar:20)."
+        ),
     ] = None,
     features: Annotated[int | None, typer.Option(help="Of a photograph, at most (default: 5000).", min=100)] = None,
     longest_px: Annotated[
@@ -65,13 +71,15 @@ def orient_command(
             n_known, n = _orient_folder(images[0], out, lambda said: status.update(said))
         console.print(f"{n_known} of {n} images oriented; wrote {out}", soft_wrap=True)
         return
-    with errors.status("reading the photographs") as status:
+    check_pieces(beside(out))
+    with errors.status("reading the photographs") as status, ExitStack() as opened:
         read = photographs(images)
         camera = sensor_and_interior(read, pixel_mm, c_mm)
         distortion = distortion_model(model or "brown", camera.sensor, r0_mm or 0.0)
-        compared = photograph_pairs(read, pairs or "exhaustive")
+        compared = photograph_pairs(read, pairs or usual_choice(read))
         console.print(camera.origin, soft_wrap=True)
         start = camera.interior
+        keep = opened.enter_context(KeptPieces(beside(out)).alone())
         matched = match_photographs(
             read,
             camera.sensor,
@@ -79,7 +87,8 @@ def orient_command(
             compared,
             count=features or FEATURES,
             longest_px=longest_px or LONGEST_PX,
-            progress=lambda done, of: status.update(f"features and matches: {done} of {of}"),
+            keep=keep,
+            progress=StepsLeft(errors, status, FEWER_PAIRS),
         )
         found = orient(
             [p.name for p in read],
@@ -95,6 +104,7 @@ def orient_command(
         status.update(f"writing {out}")
         with whole_block(found.block, out) as folder:
             write_orientation(found, folder, n_gross=matched.n_gross, sigma_factor=matched.sigma_factor)
+        keep.remove()
     console.print(
         f"{matched.n_gross} matches by looks left out before: off the epipolar line, or of pairs with too few; the "
         f"others scatter {matched.sigma_factor:.2g} times as much as in views of a plane",

@@ -22,12 +22,14 @@ _HALF_WINDOW = 5
 _BORDER_PX = 8
 _CELLS = 16
 # Half of what OpenCV asks: walls and streets have little contrast.
-_CONTRAST = 0.02
+_CONTRAST = 0.0133
 # A SIFT descriptor has this length before it is rounded; its parts are then below 256 but for odd ones.
 _LENGTH = 512
 # Of a feature whose blob is a point, and what each pixel of its width adds.
 _SIGMA_PX = 0.07
 _SIGMA_OF_WIDTH = 0.025
+METHOD = (1, _CONTRAST, _SIGMA_PX, _SIGMA_OF_WIDTH)
+"""What features depend on beside photograph and options; the number changes with the way they are found and matched."""
 
 
 class Features(NamedTuple):

@@ -6,40 +6,44 @@ but needs no principal distance: that of EXIF may be a third off, and would refu
 matrix.
 """
 
+import functools
 import itertools
 import os
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from jaxphoto.camera import InteriorOrientation, Sensor
 from jaxphoto.errors import InputError
-from jaxphoto.image_measurement.features import FEATURES, LONGEST_PX, SiftFeatures, sift_features
+from jaxphoto.image_measurement.descriptors import match_descriptors
+from jaxphoto.image_measurement.epipolar import LEAST_MATCHES, epipolar_lines, over_sigma
+from jaxphoto.image_measurement.features import FEATURES, LONGEST_PX, METHOD, SiftFeatures, sift_features
+from jaxphoto.image_measurement.likely_pairs import largest_of, most_alike
+from jaxphoto.image_measurement.photograph_pairs import MostAlike
+from jaxphoto.io.kept_pieces import KeptPieces, name_of
 from jaxphoto.io.photographs import Photograph
 from jaxphoto.orientation.matches import PairMatches, connected_images, tracks
 from jaxphoto.orientation.rays import ideal_coordinates
 
-# Lowe's: how much nearer the best match must be than the second best.
-_RATIO = 0.8
 # Off the epipolar line at most, of the diagonal: 4 pixels of 1,300. A distortion not known yet grows with the format.
 _OFF_LINE = 0.003
-# Fewer may lie on the epipolar lines of some matrix by chance.
-_LEAST_MATCHES = 15
-_LEAST_SHARE = 0.3
-_CONFIDENCE = 0.9999
-_TRIALS = 10_000
 # Scatter is measured where nine tenths lie, 1.645 standard deviations of a normal distribution: the median would be
 # blind to the long tails that features have, the square sum to nothing but the false matches left.
 _MOST, _MOST_SIGMA = 0.9, 1.6449
 _BLANK = "it shows no features: it is blank or out of focus"
-_ALONE = f"it has {_LEAST_MATCHES} points in common with no other photograph it was compared with"
-# Rows of a table of all products that the cache of a processor holds.
-_ROWS = 256
+_ALONE = f"it has {LEAST_MATCHES} points in common with no other photograph it was compared with"
+# Pairs that are kept in one piece at most, so that a run that is killed loses some seconds; and pieces at least, which
+# are shared among the cores.
+_AT_ONCE, _LEAST_PIECES = 20, 8
+# Photographs whose descriptors are in memory, where they are also on the disk: those of one piece and some more.
+_IN_MEMORY = 64
+Progress = Callable[[str, int, int], None]
+"""What is done, how many of it are, and of how many."""
 
 
 class MatchedPhotographs(NamedTuple):
@@ -98,19 +102,21 @@ def match_photographs(
     photographs: Sequence[Photograph],
     sensor: Sensor,
     interior: InteriorOrientation,
-    pairs: Iterable[tuple[int, int]],
+    pairs: Iterable[tuple[int, int]] | MostAlike,
     *,
     count: int = FEATURES,
     longest_px: int = LONGEST_PX,
     in_parts: bool = False,
-    progress: Callable[[int, int], None] | None = None,
+    keep: KeptPieces | None = None,
+    progress: Progress | None = None,
 ) -> MatchedPhotographs:
     """SIFT features (up to `count` each) of photographs of one camera, and their matches in the `pairs` of indices.
 
     Photographs are made smaller to `longest_px` before.
 
-    `interior` is what is known of the camera; only its distortion and principal point count. `progress` is called with
-    the numbers of steps done and of all: a step is a photograph read or a pair compared.
+    `interior` is what is known of the camera; only its distortion and principal point count. What is found goes to
+    `keep` as it is found, and what is there already is not found again: a run that was killed goes on, to the same
+    result. `progress` is called with the numbers of photographs or pairs done and of all.
 
     A photograph that shows no features, or matches no other one, is `left_out` by name.
 
@@ -118,7 +124,7 @@ def match_photographs(
     joins, but not `in_parts`.
     """
     paths = [p.path for p in photographs]
-    matched = _matched(paths, sensor, interior, pairs, count, longest_px, progress or (lambda done, of: None))
+    matched = _matched(paths, sensor, interior, pairs, count, longest_px, keep or _InMemory(), progress or _untold)
     blank = [len(xy) == 0 for xy in matched.xy_mm]
     alone = _alone([path.name for path in paths], blank, matched.pairs, in_parts)
     return matched._replace(left_out={photographs[k].name: _BLANK if blank[k] else _ALONE for k in alone})
@@ -131,7 +137,7 @@ def tie_features(paths: list[Path], sensor: Sensor, count: int = FEATURES, least
     are left out. Raises InputError as `sift_features`, and where no two photographs have enough in common.
     """
     each = itertools.combinations(range(len(paths)), 2)
-    matched = _matched(paths, sensor, InteriorOrientation(1.0), each, count, LONGEST_PX, lambda done, of: None)
+    matched = _matched(paths, sensor, InteriorOrientation(1.0), each, count, LONGEST_PX, _InMemory(), _untold)
     image, feature, point, _ = tracks([len(xy) for xy in matched.xy_mm], matched.pairs)
     kept = np.bincount(point)[point] >= least_photographs
     if not kept.any():
@@ -142,132 +148,130 @@ def tie_features(paths: list[Path], sensor: Sensor, count: int = FEATURES, least
     return TieFeatures(image[kept], np.unique(point[kept], return_inverse=True)[1], xy_mm)
 
 
-class _Compared(NamedTuple):
-    """Of a pair: how many look alike, those kept, and their distances from the epipolar lines over their sigmas."""
+def _untold(what: str, done: int, of: int) -> None:
+    """Nobody is told how far it is."""
 
-    n_alike: int
+
+@runtime_checkable
+class _Pieces(Protocol):
+    def read(self, name: str) -> dict[str, np.ndarray] | None: ...
+
+    def write(self, name: str, **arrays: np.ndarray) -> None: ...
+
+
+class _InMemory(dict[str, dict[str, np.ndarray]]):
+    """Pieces that nobody goes on from."""
+
+    def read(self, name: str) -> dict[str, np.ndarray] | None:
+        return self.get(name)
+
+    def write(self, name: str, **arrays: np.ndarray) -> None:
+        self[name] = arrays
+
+
+class _Compared(NamedTuple):
+    """Of some pairs, one after the other."""
+
+    counts: Int[np.ndarray, "pairs 2"]
+    """How many look alike, and how many of these are kept."""
     kept: Int[np.ndarray, "kept 2"]
     off_line: Float[np.ndarray, "kept"]
+    """Distances from the epipolar lines over their sigmas."""
 
 
 def _matched(
     paths: list[Path],
     sensor: Sensor,
     interior: InteriorOrientation,
-    pairs: Iterable[tuple[int, int]],
+    pairs: Iterable[tuple[int, int]] | MostAlike,
     count: int,
     longest_px: int,
-    progress: Callable[[int, int], None],
+    pieces: _Pieces,
+    progress: Progress,
 ) -> MatchedPhotographs:
-    compared = sorted({(min(pair), max(pair)) for pair in pairs if pair[0] != pair[1]})
-    steps = len(paths) + len(compared)
-    features = []
-    for k, path in enumerate(paths):
-        features.append(sift_features(path, sensor, count, longest_px))
-        progress(k + 1, steps)
-    # Of both coordinates alike, so that the unit of the epipolar lines is a pixel.
-    ideal_px = [ideal_coordinates(interior, f.xy_mm) / sensor.pixel_mm for f in features]
-    off_line_px = _OFF_LINE * float(np.hypot(sensor.width_px, sensor.height_px))
+    names: list[str] = []
 
-    def compare(pair: tuple[int, int]) -> _Compared:
-        alike = match_descriptors(*(features[k] for k in pair))
-        one, other = (ideal_px[k][side] for k, side in zip(pair, alike.T, strict=True))
-        matrix, kept = epipolar_lines(one, other, off_line_px)
-        if matrix is None:
-            return _Compared(len(alike), alike[kept], np.zeros(0))
-        sigmas = (features[k].sigma_mm[side[kept]] / sensor.pixel_mm for k, side in zip(pair, alike.T, strict=True))
-        return _Compared(len(alike), alike[kept], _over_sigma(matrix, one[kept], other[kept], *sigmas))
+    def described(k: int) -> SiftFeatures:
+        kept = pieces.read(names[k])
+        # Damaged since it was written, where it is not there.
+        return SiftFeatures(**kept) if kept else sift_features(paths[k], sensor, count, longest_px)
 
-    results = []
+    def find(path: Path) -> tuple[str, np.ndarray, np.ndarray, np.ndarray]:
+        name = name_of("features", *METHOD, cv2.__version__, count, longest_px, sensor, path.read_bytes())
+        kept = pieces.read(name)
+        if kept is None:
+            kept = sift_features(path, sensor, count, longest_px)._asdict()
+            pieces.write(name, **kept)
+        return name, kept["xy_mm"], kept["sigma_mm"], largest_of(SiftFeatures(**kept))
+
+    xy_mm, sigma_mm, largest = [], [], []
     with ThreadPoolExecutor(os.cpu_count()) as workers:
-        for k, result in enumerate(workers.map(compare, compared)):
+        for k, (name, xy, sigma, wide) in enumerate(workers.map(find, paths)):
+            names.append(name)
+            xy_mm.append(xy)
+            sigma_mm.append(sigma)
+            largest.append(wide)
+            progress("features", k + 1, len(paths))
+    if isinstance(pairs, MostAlike):
+        pairs = most_alike(largest, pairs.number, lambda done, of: progress("comparing the largest features", done, of))
+    compared = sorted({(min(pair), max(pair)) for pair in pairs if pair[0] != pair[1]})
+    # Of both coordinates alike, so that the unit of the epipolar lines is a pixel.
+    ideal_px = [ideal_coordinates(interior, xy) / sensor.pixel_mm for xy in xy_mm]
+    sigma_px = [sigma / sensor.pixel_mm for sigma in sigma_mm]
+    off_line_px = _OFF_LINE * float(np.hypot(sensor.width_px, sensor.height_px))
+    lately = functools.lru_cache(_IN_MEMORY)(described)
+
+    def compare(some: list[tuple[int, int]]) -> _Compared:
+        each = [(names[k], ideal_px[k].tobytes()) for pair in some for k in pair]
+        name = name_of("matches", *METHOD, cv2.__version__, off_line_px, *itertools.chain(*each))
+        kept = pieces.read(name)
+        if kept is None:
+            kept = _compared(some, lately, ideal_px, sigma_px, off_line_px)._asdict()
+            pieces.write(name, **kept)
+        return _Compared(**kept)
+
+    results, done = [], 0
+    size = min(_AT_ONCE, max(1, len(compared) // _LEAST_PIECES))
+    some = [compared[k : k + size] for k in range(0, len(compared), size)]
+    with ThreadPoolExecutor(os.cpu_count()) as workers:
+        for pairs_done, result in zip(some, workers.map(compare, some), strict=True):
             results.append(result)
-            progress(len(paths) + k + 1, steps)
-    found = [PairMatches(*pair, r.kept) for pair, r in zip(compared, results, strict=True) if len(r.kept)]
-    counts = [(*pair, r.n_alike, len(r.kept)) for pair, r in zip(compared, results, strict=True)]
+            done += len(pairs_done)
+            progress("matches", done, len(compared))
+    numbers = np.concatenate([np.zeros((0, 2), int), *(r.counts for r in results)])
+    kept = np.concatenate([np.zeros((0, 2), int), *(r.kept for r in results)])
     off_line = np.concatenate([np.zeros(0), *(r.off_line for r in results)])
+    own = np.split(kept, np.cumsum(numbers[:, 1]))[:-1]
     factor = float(np.quantile(np.abs(off_line), _MOST)) / _MOST_SIGMA if len(off_line) else 1.0
     return MatchedPhotographs(
-        [f.xy_mm for f in features],
-        [factor * f.sigma_mm for f in features],
+        xy_mm,
+        [factor * sigma for sigma in sigma_mm],
         factor,
-        found,
-        np.array(counts, int).reshape(-1, 4),
+        [PairMatches(*pair, features) for pair, features in zip(compared, own, strict=True) if len(features)],
+        np.column_stack([np.array(compared, int).reshape(-1, 2), numbers]),
         {},
     )
 
 
-def match_descriptors(one: SiftFeatures, other: SiftFeatures) -> Int[np.ndarray, "matches 2"]:
-    """Features of two photographs that look alike: indices in `one` and `other`, each feature once at most.
-
-    The nearest descriptor must be below 0.8 of the distance of the second, and so must it be seen from the other side.
-    """
-    a, b = one.descriptors.astype(np.float32), other.descriptors.astype(np.float32)
-    if min(len(a), len(b)) < 2:
-        return np.zeros((0, 2), int)
-    rows = np.arange(len(a))
-    best, clear = _nearest(a, b)
-    rows, best = rows[clear], best[clear]
-    # From the other side only where it matters.
-    columns, where = np.unique(best, return_inverse=True)
-    back, clear_back = _nearest(b[columns], a)
-    mutual = (back[where] == rows) & clear_back[where]
-    pairs = np.column_stack([one.feature[rows[mutual]], other.feature[best[mutual]]])
-    # A place with several descriptors may match twice.
-    pairs = np.unique(pairs, axis=0)
-    once = np.ones(len(pairs), bool)
-    for side in pairs.T:
-        _, inverse, times = np.unique(side, return_inverse=True, return_counts=True)
-        once &= times[inverse] == 1
-    return pairs[once]
-
-
-def _nearest(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of each row of `a` the nearest of `b`, and whether it is clearly nearer than the second.
-
-    |a - b|^2 = |a|^2 - (2 a.b - |b|^2). All are whole numbers below 2^24, which single precision holds exactly: no
-    order of summation, and so no number of threads, changes a match.
-    """
-    turned = np.concatenate([2 * a, np.full((len(a), 1), -1, np.float32)], axis=1)
-    upright = np.concatenate([b, np.square(b).sum(axis=1, keepdims=True)], axis=1).T
-    best, clear = np.zeros(len(a), int), np.zeros(len(a), bool)
-    for begin in range(0, len(a), _ROWS):
-        part = slice(begin, begin + _ROWS)
-        score = turned[part] @ upright
-        rows = np.arange(len(score))
-        nearest = score.argmax(axis=1)
-        square = np.square(a[part]).sum(axis=1)
-        first = square - score[rows, nearest]
-        score[rows, nearest] = -np.inf
-        second = square - score.max(axis=1)
-        best[part], clear[part] = nearest, first < _RATIO**2 * second
-    return best, clear
-
-
-def epipolar_lines(
-    one: Float[np.ndarray, "matches 2"], other: Float[np.ndarray, "matches 2"], off_line: float
-) -> tuple[Float[np.ndarray, "3 3"] | None, Bool[np.ndarray, "matches"]]:
-    """The fundamental matrix F of two photographs, other' F one = 0, and which matches lie within `off_line` of it.
-
-    None, and no match, where that are fewer than 15 or than 30 % of all: random matches get nearly that far. By the
-    sampling of OpenCV's USAC with the weights of MAGSAC++ (Barath and others, 2020), from a fixed seed.
-    """
-    none = np.zeros(len(one), bool)
-    if len(one) < _LEAST_MATCHES:
-        return None, none
-    matrix, good = cv2.findFundamentalMat(one, other, cv2.USAC_MAGSAC, off_line, _CONFIDENCE, _TRIALS)
-    if matrix is None or good.sum() < max(_LEAST_MATCHES, _LEAST_SHARE * len(one)):
-        return None, none
-    return matrix, good.ravel() > 0
-
-
-def _over_sigma(matrix: np.ndarray, one: np.ndarray, other: np.ndarray, *sigmas: np.ndarray) -> np.ndarray:
-    """other' F one over its standard deviation, to first order; `sigmas` of both, in the unit of the coordinates."""
-    one, other = (np.column_stack([xy, np.ones(len(xy))]) for xy in (one, other))
-    in_other, in_one = one @ matrix.T, other @ matrix
-    slopes = (np.square(line[:, :2]).sum(axis=1) for line in (in_one, in_other))
-    variance = sum(slope * sigma**2 for slope, sigma in zip(slopes, sigmas, strict=True))
-    return (in_other * other).sum(axis=1) / np.sqrt(variance)
+def _compared(
+    pairs: list[tuple[int, int]],
+    described: Callable[[int], SiftFeatures],
+    ideal_px: list[Float[np.ndarray, "_ 2"]],
+    sigma_px: list[Float[np.ndarray, "_"]],
+    off_line_px: float,
+) -> _Compared:
+    counts, kept, off_line = [], [np.zeros((0, 2), int)], [np.zeros(0)]
+    for a, b in pairs:
+        alike = match_descriptors(described(a), described(b))
+        one, other = ideal_px[a][alike[:, 0]], ideal_px[b][alike[:, 1]]
+        matrix, good = epipolar_lines(one, other, off_line_px)
+        own = alike[good]
+        counts.append((len(alike), len(own)))
+        kept.append(own)
+        if matrix is not None:
+            sigmas = sigma_px[a][own[:, 0]], sigma_px[b][own[:, 1]]
+            off_line.append(over_sigma(matrix, one[good], other[good], *sigmas))
+    return _Compared(np.array(counts, int), np.concatenate(kept), np.concatenate(off_line))
 
 
 def _alone(names: list[str], blank: list[bool], pairs: list[PairMatches], in_parts: bool) -> list[int]:
@@ -280,7 +284,7 @@ def _alone(names: list[str], blank: list[bool], pairs: list[PairMatches], in_par
         empty = [name for name, nothing in zip(names, blank, strict=True) if nothing]
         beside = f"; {_listed(empty)} show no features: blank or out of focus" if empty else ""
         raise InputError(
-            f"no two of the {len(names)} photographs ({_listed(names)}) have {_LEAST_MATCHES} points in "
+            f"no two of the {len(names)} photographs ({_listed(names)}) have {LEAST_MATCHES} points in "
             f"common{beside}; give photographs that overlap by half at least, in sharp focus, or compare more pairs"
         )
     if len(joined) > 1 and not in_parts:

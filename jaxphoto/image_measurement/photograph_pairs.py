@@ -1,7 +1,8 @@
-"""Which photographs to compare: each with each, with its neighbours in the row, or with those taken nearby."""
+"""Which photographs to compare: each with each, with neighbours in the row or in space, or with what looks alike."""
 
 import itertools
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -11,24 +12,45 @@ from jaxphoto.errors import InputError
 from jaxphoto.io.photographs import Photograph
 
 _EARTH_M = 6_371_000.0
+# So many of each are compared where photographs are many: as far as those of four fifths overlap still show the same,
+# in all directions.
+_NEAREST = 20
 
 
-def photograph_pairs(photographs: Sequence[Photograph], choice: str = "exhaustive") -> list[tuple[int, int]]:
+class MostAlike(NamedTuple):
+    """Each photograph with the `number` that look most like it, which their features tell."""
+
+    number: int
+
+
+def usual_choice(photographs: Sequence[Photograph]) -> str:
+    """The choice of pairs where nobody makes one: all of few, else neighbours, else those that look alike."""
+    if len(photographs) <= 2 * _NEAREST:
+        return "exhaustive"
+    return f"{'position' if all(p.gps for p in photographs) else 'similar'}:{_NEAREST}"
+
+
+def photograph_pairs(
+    photographs: Sequence[Photograph], choice: str = "exhaustive"
+) -> list[tuple[int, int]] | MostAlike:
     """The pairs (first < second) of indices of photographs that `choice` names.
 
     `exhaustive`: all; for many photographs they are too many. `sequence:K`: each with the K that follow it in the order
     given. `position:K`: each with the K nearest by the GPS positions of EXIF, heights left out.
+    `similar:K`: each with the K that look most like it, for `match_photographs` to find.
 
     Raises InputError for another choice, and for `position` where a photograph has no position.
     """
     name, _, number = choice.partition(":")
     if name == "exhaustive" and not number:
         return list(itertools.combinations(range(len(photographs)), 2))
-    if name not in ("sequence", "position") or not number.isdecimal() or int(number) < 1:
+    if name not in ("sequence", "position", "similar") or not number.isdecimal() or int(number) < 1:
         raise InputError(
-            f"the choice of pairs is {choice!r}; give exhaustive, sequence:K or position:K with a whole number K, for "
-            "example sequence:10"
+            f"the choice of pairs is {choice!r}; give exhaustive, sequence:K, position:K or similar:K with a "
+            "whole number K, for example sequence:10"
         )
+    if name == "similar":
+        return MostAlike(int(number))
     if name == "sequence":
         n = len(photographs)
         return [(k, other) for k in range(n) for other in range(k + 1, min(n, k + 1 + int(number)))]
@@ -36,7 +58,7 @@ def photograph_pairs(photographs: Sequence[Photograph], choice: str = "exhaustiv
     if without:
         raise InputError(
             f"{len(without)} photograph(s) have no GPS position in their EXIF ({', '.join(without[:5])}); choose the "
-            "pairs by sequence:K or exhaustive"
+            "pairs by similar:K, sequence:K or exhaustive"
         )
     places = np.deg2rad([(p.gps.longitude_deg, p.gps.latitude_deg) for p in photographs if p.gps])
     longitude, latitude = places.reshape(-1, 2).T

@@ -9,7 +9,8 @@ import pytest
 
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing.gps import Gps
-from jaxphoto.image_measurement.matching import epipolar_lines, match_photographs, tie_features
+from jaxphoto.image_measurement.epipolar import epipolar_lines
+from jaxphoto.image_measurement.matching import match_photographs, tie_features
 from jaxphoto.image_measurement.photograph_pairs import nearest_pairs, photograph_pairs
 from jaxphoto.io.photographs import photographs, sensor_and_interior
 from jaxphoto.orientation.matches import PairMatches, connected_images, tracks
@@ -34,7 +35,7 @@ def taken(tmp_path_factory):
     steps = []
     pairs = photograph_pairs(taken)
     matched = match_photographs(taken, camera.sensor, camera.interior, pairs, progress=lambda *s: steps.append(s))
-    assert steps == [(k, 10) for k in range(1, 11)]
+    assert steps == [*(("features", k, 4) for k in range(1, 5)), *(("matches", k, 6) for k in range(1, 7))]
     return taken, camera, matrices, matched
 
 

@@ -1,0 +1,54 @@
+"""How far a command is and how long the rest takes: on a terminal in its status, off a terminal a line now and then."""
+
+import time
+from collections import deque
+from collections.abc import Callable
+
+from rich.console import Console
+from rich.status import Status
+
+# Between lines off a terminal, and before a hint is worth its line.
+_LINE_S, _LONG_S = 30.0, 600.0
+# The last steps, by which the rest is judged: those of a run that goes on from an earlier one begin fast.
+_LAST = 20
+FEWER_PAIRS = "--pairs similar:20, sequence:K or position:K compares fewer pairs"
+
+
+class StepsLeft:
+    """To be called with what is done, how much of it is, and of how much; `hint` is said once where it takes long."""
+
+    def __init__(
+        self, console: Console, status: Status, hint: str = "", clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._console, self._status, self._hint, self._clock = console, status, hint, clock
+        self._what = ""
+        self._steps: deque[tuple[float, int]] = deque(maxlen=_LAST)
+        self._last_line = clock()
+        self._began = self._last_line
+
+    def __call__(self, what: str, done: int, of: int) -> None:
+        """`done` of the `of` steps of `what` are done."""
+        now = self._clock()
+        if what != self._what:
+            self._what = what
+            self._steps.clear()
+            self._steps.append((self._began, 0))
+        self._steps.append((now, done))
+        self._began = now
+        (first, before), full = self._steps[0], len(self._steps) == _LAST
+        left = (now - first) / max(done - before, 1) * (of - done)
+        said = f"{what}: {done} of {of}" + (f", {in_words(left)} left" if done < of else "")
+        self._status.update(said)
+        if self._hint and full and left > _LONG_S:
+            self._console.print(f"{said}; {self._hint}", soft_wrap=True)
+            self._hint, self._last_line = "", now
+        elif not self._console.is_terminal and now - self._last_line >= _LINE_S:
+            self._console.print(said, soft_wrap=True)
+            self._last_line = now
+
+
+def in_words(seconds: float) -> str:
+    """A duration as it is worth knowing beforehand."""
+    if seconds < 90:
+        return f"{max(1, round(seconds)):d} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
