@@ -146,7 +146,7 @@ def test_pairs_are_chosen(taken):
     near = {(k, j) for k in range(12) for j in np.argsort(distance[k])[:3].tolist()}
     assert nearest_pairs(xy, 3) == sorted({(min(pair), max(pair)) for pair in near})
     for wrong in ("nearest", "sequence", "sequence:0", "position:x", "exhaustive:3"):
-        with pytest.raises(InputError, match="give exhaustive, sequence:K or position:K"):
+        with pytest.raises(InputError, match="give exhaustive, sequence:K, position:K or similar:K"):
             photograph_pairs(images, wrong)
     with pytest.raises(InputError, match=r"4 photograph\(s\) have no GPS position in their EXIF \(0.png, 1.png"):
         photograph_pairs(images, "position:3")
