@@ -27,6 +27,7 @@ COMMANDS = {
     "calibrate": _Command("calibrate", "Calibrate a camera with photographs of a board."),
     "orient": _Command("orient", "Orient photographs to one another from their features alone."),
     "fly": _Command("fly", "Calibrate the camera of a flight from its photographs and their positions."),
+    "certificate": _Command("certificate", "Write the certificate of a calibration."),
     "models": _Command(
         "model_choice", "Compare distortion models by cross-validation, information criteria and significance."
     ),

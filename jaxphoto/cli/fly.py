@@ -10,6 +10,7 @@ import typer
 from jaxphoto.camera import DISTORTIONS, InteriorOrientation
 from jaxphoto.cli.app import app
 from jaxphoto.cli.console import plain_console
+from jaxphoto.cli.provenance import Provenance
 from jaxphoto.georeferencing.map_frame import map_system
 from jaxphoto.image_measurement.features import FEATURES, LONGEST_PX
 from jaxphoto.image_measurement.matching import MatchedPhotographs, match_photographs
@@ -88,12 +89,16 @@ def fly_command(
         flight = flight._replace(left_out=matched.left_out | flight.left_out)
         status.update("computing statistics")
         reports = [report_of(part) for part in flight.parts]
+        options = {"features": features, "longest_px": longest_px, "model": model, "pairs": pairs or _usual_pairs(read)}
+        signed = Provenance.of([p.path for p in read], options | {"epsg": epsg, "c_mm": c_mm, "pixel_mm": pixel_mm})
         status.update(f"writing {out}")
         with whole_folder(out) as work:
-            verdict = write_flight(flight, reports, spoilt, work)
+            verdict = write_flight(flight, reports, spoilt, work, signed.told, signed.write)
             for number, part in enumerate(flight.parts, 1):
                 with whole_block(part.adjusted.block, work / block_folder(number)) as folder:
                     write_part_orientation(part, folder)
+                    signed.write(part, folder)
+            why_not = signed.certify(work)
     for number, part in enumerate(flight.parts, 1):
         report = part.oriented.report
         sizes = f"{len(report.order)} photographs, {report.n_image_points} image points, {report.mean_px:.2f} px"
@@ -106,6 +111,8 @@ def fly_command(
     for finding in verdict.findings:
         if finding.level > Level.INFORMATION:
             console.print(plain(f"  {finding.text}"), soft_wrap=True)
+    if why_not:
+        console.print(plain(f"no certificate: {why_not}"), soft_wrap=True)
     console.print(f"results in {plain(str(out))} (open report.html)", soft_wrap=True)
     if verdict.level == Level.ALARM:
         raise typer.Exit(1)

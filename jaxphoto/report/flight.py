@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -21,6 +22,7 @@ from jaxphoto.report.results import versions, write_results, write_summary
 from jaxphoto.report.tables import Tables
 from jaxphoto.report.verdict import verdict_of
 from jaxphoto.report.weights import component_findings, component_tables
+from jaxphoto.statistics.coverage import Coverage, coverage
 from jaxphoto.writing import whole_folder
 
 if TYPE_CHECKING:
@@ -57,13 +59,15 @@ class PartReport(NamedTuple):
     images: pd.DataFrame
     """image, oriented, n_image_points, rms_px, dX_m to dZ_m (recorded minus adjusted position), position (used, left
     out, none)."""
+    coverage: Coverage
+    """What the photographs show of the ground; in the block's own scale where it has no positions."""
 
 
 def report_of(part: FlightPart) -> PartReport:
     """Judge a part: what its adjustment says, its weights, its positions, and how far its rays are independent."""
     tables = Tables(part.adjusted)
     found = [*verdict_of(tables).findings, *(component_findings(part.components) if part.components else [])]
-    return PartReport(part, tables, Verdict.of([*found, *_findings(part)]), _images(part))
+    return PartReport(part, tables, Verdict.of([*found, *_findings(part)]), _images(part), coverage(part.adjusted))
 
 
 def _findings(part: FlightPart) -> Iterator[Finding]:
@@ -162,13 +166,26 @@ def block_folder(number: int) -> str:
     return "block" if number == 1 else f"block_{number}"
 
 
-def write_flight(flight: CalibratedFlight, reports: list[PartReport], spoilt: Mapping[str, str], work: Path) -> Verdict:
-    """report.html, flight.json and images.csv, and a result folder for every part, into the folder `work`."""
+def write_flight(
+    flight: CalibratedFlight,
+    reports: list[PartReport],
+    spoilt: Mapping[str, str],
+    work: Path,
+    told: Mapping[str, Any] = MappingProxyType({}),
+    beside: Callable[[FlightPart, Path], None] = lambda part, folder: None,
+) -> Verdict:
+    """report.html, summary.json and images.csv, and a result folder for every part, into the folder `work`.
+
+    What is `told` of how the results came about goes into the summaries, and `beside` writes more into result folders.
+    """
     verdict = flight_verdict(flight, reports, spoilt)
     for number, r in enumerate(reports, 1):
         times = {name: r.part.adjusted.seconds[name] for name in ("compile", "solve", "covariance")}
         with whole_folder(work / part_folder(number)) as folder:
-            write_results(r.tables, r.verdict, folder, times)
+            alike = r.part.oriented.report.alike
+            own = {"sigma_factor": alike if alike > ALIKE else 1.0, "flight": flight_words(r)}
+            write_results(r.tables, r.verdict, folder, times, {**told, **own})
+            beside(r.part, folder)
             for name, table in (component_tables(r.part.components) if r.part.components else {}).items():
                 table.to_csv(folder / f"{name}.csv", index=False)
     images = pd.concat([r.images.assign(part=k) for k, r in enumerate(reports, 1)], ignore_index=True)
@@ -181,7 +198,7 @@ def write_flight(flight: CalibratedFlight, reports: list[PartReport], spoilt: Ma
         "not_used": {**spoilt, **flight.left_out},
         "versions": versions(),
     }
-    write_summary(summary, work)
+    write_summary(summary | dict(told), work)
     return verdict
 
 
@@ -238,3 +255,16 @@ def _page(flight: CalibratedFlight, reports: list[PartReport], spoilt: Mapping[s
 def _table(table: pd.DataFrame, digits: str) -> Markup:
     page = table.to_html(index=False, border=0, na_rep="", float_format=digits.format)
     return Markup(f'<div class="wide">{page}</div>')
+
+
+def flight_words(r: PartReport) -> dict[str, str]:
+    """The flight in words, for the certificate."""
+    placed, c = r.part.placed, r.coverage
+    if not placed:
+        return {"map system": "none: the block has a frame and a scale of its own"}
+    height, gsd = np.nanmedian(c.height_m), np.nanmedian(c.gsd_m)
+    return {
+        "map system": f"EPSG:{placed.block.frame.code}, adjusted in a local frame",
+        "height over ground": f"{height:.4g} m (median), pixel there {100 * gsd:.3g} cm",
+        "area": f"{c.area_m2(2) / 1e4:.3g} ha seen by two photographs or more",
+    }
