@@ -13,6 +13,8 @@ from jaxphoto.cli.app import app
 from jaxphoto.cli.console import plain_console
 from jaxphoto.errors import JaxphotoError
 from jaxphoto.io import read_block, write_block
+from jaxphoto.io.conditions import CONDITIONS, read_conditions, write_conditions
+from jaxphoto.io.input_hashes import block_inputs, write_inputs
 from jaxphoto.losses import LOSSES
 from jaxphoto.procedures import adjust_for_tables
 from jaxphoto.report import (
@@ -68,6 +70,7 @@ def adjust_command(
     began = time.perf_counter()
     with errors.status("reading the block") as status:
         read = read_block(block)
+        inputs = block_inputs(block)
         seconds = {"read": time.perf_counter() - began}
         status.update(
             f"adjusting {len(read.images)} images, {len(read.points)} points, "
@@ -93,8 +96,19 @@ def adjust_command(
         times = adjusted.seconds | seconds
         order = ("read", "compile", "solve", "covariance")
         with whole_folder(out) as work:
+            options = {
+                "rotations": rotations,
+                "snoop": snoop,
+                "robust": robust,
+                "max_steps": max_steps,
+                "weights": weights,
+            }
             of = "block" if snooped else os.path.relpath(block.resolve(), out.resolve())
-            write_results(tables, verdict, work, {name: times[name] for name in order}, of)
+            told = {"block": of, "method": {"command": "adjust", **options}}
+            write_results(tables, verdict, work, {name: times[name] for name in order}, told)
+            write_inputs(inputs, work)
+            if (block / CONDITIONS).is_file():
+                write_conditions(read_conditions(block / CONDITIONS), work, read.images)
             for name, table in (component_tables(components) if components else {}).items():
                 table.to_csv(work / f"{name}.csv", index=False)
             if snooped:

@@ -30,6 +30,7 @@ COMMANDS = {
     "control": _Command(
         "control", "Adjust an oriented block with control: surveyed points and where photographs show them."
     ),
+    "certificate": _Command("certificate", "Write the certificate of a calibration."),
     "models": _Command(
         "model_choice", "Compare distortion models by cross-validation, information criteria and significance."
     ),

@@ -13,6 +13,7 @@ from jaxphoto.cli.app import app
 from jaxphoto.cli.console import plain_console
 from jaxphoto.cli.exposure_options import heights_of, lever_arm_of
 from jaxphoto.cli.progress import FEWER_PAIRS, StepsLeft
+from jaxphoto.cli.provenance import Provenance
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing.map_frame import map_system
 from jaxphoto.image_measurement.control_targets import target_looker
@@ -148,13 +149,17 @@ def fly_command(
         flight = flight._replace(left_out=matched.left_out | flight.left_out)
         status.update("computing statistics")
         reports = [report_of(part) for part in flight.parts]
+        options = {"features": features, "longest_px": longest_px, "model": model, "pairs": pairs or usual_choice(read)}
+        signed = Provenance.of([p.path for p in read], options | {"epsg": epsg, "c_mm": c_mm, "pixel_mm": pixel_mm})
         status.update(f"writing {out}")
         with whole_folder(out) as work:
             write_photograph_files({p.name: p.path.name for p in read}, work)
-            verdict = write_flight(flight, reports, spoilt, work, told.sentences)
+            verdict = write_flight(flight, reports, spoilt, work, told.sentences, signed.told, signed.write)
             for number, part in enumerate(flight.parts, 1):
                 with whole_block(part.adjusted.block, work / block_folder(number)) as folder:
                     write_part_orientation(part, folder)
+                    signed.write(part, folder)
+            why_not = signed.certify(work)
         keep.remove()
     for number, part in enumerate(flight.parts, 1):
         report = part.oriented.report
@@ -170,6 +175,8 @@ def fly_command(
     for finding in verdict.findings:
         if finding.level > Level.INFORMATION:
             console.print(plain(f"  {finding.text}"), soft_wrap=True)
+    if why_not:
+        console.print(plain(f"no certificate: {why_not}"), soft_wrap=True)
     console.print(f"results in {plain(str(out))} (open report.html)", soft_wrap=True)
     if verdict.level == Level.ALARM:
         raise typer.Exit(1)

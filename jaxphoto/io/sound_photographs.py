@@ -23,7 +23,7 @@ def sound_photographs(paths: Sequence[str | Path]) -> tuple[list[Photograph], di
     a second of the same name, one that is another's copy byte for byte, and those of another size, orientation flag,
     camera or focal length than most. Raises InputError for what is neither file nor folder, and where nothing is left.
     """
-    files = [file for path in map(Path, paths) for file in (_pictures(path) if path.is_dir() else [path])]
+    files = pictures_in(paths)
     if missing := [file for file in files if not file.is_file()]:
         raise InputError(f"{missing[0]}: there is no such photograph or folder; correct the name")
     left: dict[str, str] = {}
@@ -55,6 +55,11 @@ def sound_photographs(paths: Sequence[str | Path]) -> tuple[list[Photograph], di
         beside = f"; {next(iter(left.values()))}" if left else ""
         raise InputError(f"{', '.join(map(str, paths))}: there is no photograph that can be read{beside}")
     return kept, left
+
+
+def pictures_in(paths: Sequence[str | Path]) -> list[Path]:
+    """The files among `paths`, and all pictures of folders among them, in the order of their names."""
+    return [file for path in map(Path, paths) for file in (_pictures(path) if path.is_dir() else [path])]
 
 
 def _pictures(folder: Path) -> list[Path]:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -24,6 +25,7 @@ from jaxphoto.report.results import versions, write_results, write_summary
 from jaxphoto.report.tables import Tables
 from jaxphoto.report.verdict import verdict_of
 from jaxphoto.report.weights import component_findings, component_tables
+from jaxphoto.statistics.coverage import Coverage, coverage
 from jaxphoto.writing import whole_folder
 
 if TYPE_CHECKING:
@@ -47,7 +49,7 @@ _PAGE = """<!DOCTYPE html>
 <h3>Photographs</h3>{% if p.picture %}<img alt="recorded positions minus those of the adjustment, in plan and in height,
 and residuals by photograph" src="{{ p.picture }}">{% endif %}{{ p.images }}
 {% endfor %}
-{% if told %}<h2>Where positions come from</h2><ul>{% for s in told %}<li>{{ s }}</li>{% endfor %}</ul>{% endif %}
+{% if positions_from %}<h2>Where positions come from</h2><ul>{% for s in positions_from %}<li>{{ s }}</li>{% endfor %}</ul>{% endif %}
 {% if lost %}<h2>Photographs that are not used</h2>
 <ul>{% for s in lost %}<li>{{ s }}</li>{% endfor %}</ul>{% endif %}
 </body></html>
@@ -63,13 +65,16 @@ class PartReport(NamedTuple):
     images: pd.DataFrame
     """image, oriented, n_image_points, rms_px, dX_m to dZ_m (recorded minus adjusted position), position (used, left
     out, none)."""
+    coverage: Coverage
+    """What the photographs show of the ground; in the block's own scale where it has no positions."""
 
 
 def report_of(part: FlightPart) -> PartReport:
     """Judge a part: what its adjustment says, its weights, its positions, and how far its rays are independent."""
     tables = Tables(part.adjusted)
     found = [*verdict_of(tables).findings, *(component_findings(part.components) if part.components else [])]
-    return PartReport(part, tables, Verdict.of([*found, *lens_findings(tables), *_findings(part)]), _images(part))
+    judged = Verdict.of([*found, *lens_findings(tables), *_findings(part)])
+    return PartReport(part, tables, judged, _images(part), coverage(part.adjusted))
 
 
 def _findings(part: FlightPart) -> Iterator[Finding]:
@@ -179,36 +184,40 @@ def write_flight(
     reports: list[PartReport],
     spoilt: Mapping[str, str],
     work: Path,
-    told: Sequence[str] = (),
+    positions_from: Sequence[str] = (),
+    told: Mapping[str, Any] = MappingProxyType({}),
+    beside: Callable[[FlightPart, Path], None] = lambda part, folder: None,
 ) -> Verdict:
     """report.html, summary.json and images.csv, and a result folder for every part, into the folder `work`.
 
-    `told` says where positions come from.
+    `positions_from` says where positions come from. What is `told` of how the results came about goes into the
+    summaries, and `beside` writes more into result folders.
     """
     verdict = flight_verdict(flight, reports, spoilt)
     for number, r in enumerate(reports, 1):
         times = {name: r.part.adjusted.seconds[name] for name in ("compile", "solve", "covariance")}
         with whole_folder(work / part_folder(number)) as folder:
-            write_results(r.tables, r.verdict, folder, times)
-            with_alike(r.tables.interior, r.part.adjusted, r.part.oriented.report.alike).to_csv(
-                folder / "interior_alike.csv", index=False
-            )
+            alike = r.part.oriented.report.alike
+            own = {"sigma_factor": alike if alike > ALIKE else 1.0, "flight": flight_words(r)}
+            write_results(r.tables, r.verdict, folder, times, {**told, **own})
+            with_alike(r.tables.interior, r.part.adjusted, alike).to_csv(folder / "interior_alike.csv", index=False)
             if r.part.controlled:
                 write_control(r.part.controlled, folder)
+            beside(r.part, folder)
             for name, table in (component_tables(r.part.components) if r.part.components else {}).items():
                 table.to_csv(folder / f"{name}.csv", index=False)
     images = pd.concat([r.images.assign(part=k) for k, r in enumerate(reports, 1)], ignore_index=True)
     images.to_csv(work / "images.csv", index=False)
-    (work / "report.html").write_text(_page(flight, reports, spoilt, verdict, told), encoding="utf-8")
+    (work / "report.html").write_text(_page(flight, reports, spoilt, verdict, positions_from), encoding="utf-8")
     summary = {
         "verdict": verdict.colour,
         "findings": [{"level": f.level.name.lower(), "text": f.text} for f in verdict.findings],
         "parts": [_summary(r, number) for number, r in enumerate(reports, 1)],
-        "positions_from": list(told),
+        "positions_from": list(positions_from),
         "not_used": {**spoilt, **flight.left_out},
         "versions": versions(),
     }
-    write_summary(summary, work)
+    write_summary(summary | dict(told), work)
     return verdict
 
 
@@ -241,7 +250,7 @@ def _page(
     reports: list[PartReport],
     spoilt: Mapping[str, str],
     verdict: Verdict,
-    told: Sequence[str],
+    positions_from: Sequence[str],
 ) -> str:
     each = []
     for number, r in enumerate(reports, 1):
@@ -268,10 +277,29 @@ def _page(
     parts = pd.DataFrame([{c: _summary(r, k)[c] for c in columns} for k, r in enumerate(reports, 1)])
     page = Environment(autoescape=True).from_string(_PAGE)
     return page.render(
-        style=STYLE, title="Flight", verdict=verdict, parts=_table(parts, "{:.3g}"), each=each, told=told, lost=lost
+        style=STYLE,
+        title="Flight",
+        verdict=verdict,
+        parts=_table(parts, "{:.3g}"),
+        each=each,
+        positions_from=positions_from,
+        lost=lost,
     )
 
 
 def _table(table: pd.DataFrame, digits: str) -> Markup:
     page = table.to_html(index=False, border=0, na_rep="", float_format=digits.format)
     return Markup(f'<div class="wide">{page}</div>')
+
+
+def flight_words(r: PartReport) -> dict[str, str]:
+    """The flight in words, for the certificate."""
+    placed, c = r.part.placed, r.coverage
+    if not placed:
+        return {"map system": "none: the block has a frame and a scale of its own"}
+    height, gsd = np.nanmedian(c.height_m), np.nanmedian(c.gsd_m)
+    return {
+        "map system": f"EPSG:{placed.block.frame.code}, adjusted in a local frame",
+        "height over ground": f"{height:.4g} m (median), pixel there {100 * gsd:.3g} cm",
+        "area": f"{c.area_m2(2) / 1e4:.3g} ha seen by two photographs or more",
+    }

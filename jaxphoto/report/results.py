@@ -2,13 +2,17 @@
 
 import json
 import time
+from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.camera import model_keys
 from jaxphoto.report.findings import Verdict
 from jaxphoto.report.page import report_page
+from jaxphoto.report.positional_accuracy import accuracy_sentences
 from jaxphoto.report.tables import Tables
 from jaxphoto.writing import whole_folder
 
@@ -30,12 +34,16 @@ _PACKAGES = ("jaxphoto", "jax", "optimistix", "equinox", "lineax", "numpy", "pan
 
 
 def write_results(
-    tables: Tables, verdict: Verdict, directory: Path, seconds: dict[str, float], block: str | None = None
+    tables: Tables,
+    verdict: Verdict,
+    directory: Path,
+    seconds: dict[str, float],
+    told: Mapping[str, Any] = MappingProxyType({}),
 ) -> None:
     """Write the files of docs/block_folder.md into `directory`, replacing earlier results only when all is written.
 
-    `seconds` (read, compile, solve, covariance) goes into summary.json with the time of writing, and so does the folder
-    of the `block`, as seen from `directory`, where there is one. Raises what `whole_folder` raises.
+    `seconds` (read, compile, solve, covariance) goes into summary.json with the time of writing, and so does what is
+    `told` of how the results came about. Raises what `whole_folder` raises.
     """
     began = time.perf_counter()
     with whole_folder(directory) as work:
@@ -44,7 +52,7 @@ def write_results(
             getattr(tables, name).to_csv(work / f"{name}.csv", index=False)
         (work / "report.html").write_text(report_page(tables, verdict), encoding="utf-8")
         summary = summary_of(tables, verdict, seconds | {"write": time.perf_counter() - began})
-        write_summary(summary | ({} if block is None else {"block": block}), work)
+        write_summary(summary | dict(told), work)
 
 
 def write_summary(summary: dict, directory: Path) -> None:
@@ -62,6 +70,7 @@ def summary_of(tables: Tables, verdict: Verdict, seconds: dict[str, float]) -> d
         "findings": [{"level": f.level.name.lower(), "text": f.text} for f in verdict.findings],
         "converged": bool(adjusted.converged),
         "outcome": adjusted.outcome.value,
+        "n_images": len(adjusted.block.images),
         "sigma0": float(adjusted.sigma0),
         "redundancy": adjusted.redundancy,
         "n_observations": {"total": sum(observations.values()), **observations},
@@ -70,6 +79,7 @@ def summary_of(tables: Tables, verdict: Verdict, seconds: dict[str, float]) -> d
         "iterations": int(adjusted.steps),
         "cameras": _cameras(adjusted),
         "georeferencing": {p: {"value": v, "sigma": s} for p, v, s in tables.georeferencing.itertuples(index=False)},
+        "positional_accuracy": accuracy_sentences(tables.tested_accuracy),
         "seconds": {name: round(value, 6) for name, value in seconds.items()},
         "versions": versions(),
     }

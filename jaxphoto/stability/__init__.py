@@ -7,12 +7,15 @@ from jaxphoto.stability.bundles import image_grid, image_rays, parameter_vector,
 from jaxphoto.stability.change import Change, ParameterChange, change, mahalanobis
 from jaxphoto.stability.combination import Combination, combine
 from jaxphoto.stability.comparison import BundleOffsets, bundle_offsets, check_rays, rmse_offset
+from jaxphoto.stability.distortion_curve import NORMAL_95, DistortionCurve, distortion_curve
+from jaxphoto.stability.format_sigma import format_sigma
 from jaxphoto.stability.quadratic_form import QuadraticForm
 from jaxphoto.stability.uncertainty import LEVEL, OffsetUncertainty, offset_uncertainty
 
 __all__ = [
-    "LEVEL", "METHODS", "UNKNOWNS", "Analysis", "BundleOffsets", "Change", "Combination", "Differences", "ErrorBand",
+    "LEVEL", "METHODS", "NORMAL_95", "UNKNOWNS", "Analysis", "BundleOffsets", "Change", "Combination", "Differences",
+    "DistortionCurve", "ErrorBand",
     "Method", "OffsetUncertainty", "ParameterChange", "QuadraticForm", "analyse", "band_of", "bundle_offsets",
-    "change", "check_rays", "combine", "concentration", "image_grid", "image_rays", "mahalanobis",
-    "offset_uncertainty", "overlap", "parameter_vector", "rmse_offset", "with_parameters",
+    "change", "check_rays", "combine", "concentration", "distortion_curve", "format_sigma", "image_grid",
+    "image_rays", "mahalanobis", "offset_uncertainty", "overlap", "parameter_vector", "rmse_offset", "with_parameters",
 ]  # fmt: skip

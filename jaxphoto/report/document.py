@@ -1,0 +1,57 @@
+"""A document of headings, sentences, tables and pictures, for a page of HTML or sheets of paper alike."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+class Heading(NamedTuple):
+    """Of a section."""
+
+    text: str
+
+
+class Paragraph(NamedTuple):
+    """A sentence or several; `kind` is "", or a class of the style sheet."""
+
+    text: str
+    kind: str = ""
+
+
+class Rows(NamedTuple):
+    """A table of texts; columns without a heading are a list of names and what they are."""
+
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+
+class Picture(NamedTuple):
+    """One panel."""
+
+    draw: Callable[[Axes], None]
+    alt: str
+    """What it shows, for those who do not see it."""
+    height: float = 3.0
+    """Inches, of a width of 4.8."""
+
+
+class Pictures(NamedTuple):
+    """Panels beside one another, as far as there is room."""
+
+    panels: tuple[Picture, ...]
+
+
+Element = Heading | Paragraph | Rows | Pictures
+
+
+class Document(NamedTuple):
+    """What is written."""
+
+    title: str
+    foot: str
+    """At the bottom of each sheet."""
+    elements: tuple[Element, ...]

@@ -1,0 +1,117 @@
+"""What the photographs of a block show of the ground: height, ground sample distance, overlap and area.
+
+The format of an image, as a polygon on the ideal image, is what a cell of the ground is looked for in, at the height of
+the object points around it; trees and roofs between two points hide nothing here.
+"""
+
+import itertools
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+from scipy.spatial import cKDTree
+
+from jaxphoto.adjustment import Adjustment
+from jaxphoto.camera import InteriorOrientation, Sensor
+from jaxphoto.compiling import call_compiled
+
+# Of the polygon that stands for the format: corners of each side.
+_SIDE = 8
+# Cells along the longer side of the block: a map, no survey.
+_CELLS = 120
+# The height of a cell is the median of so many points nearest to it.
+_NEAR = 5
+# Beyond the footprints of the points, of the flying height: what is seen of the ground past the last point.
+_AROUND = 0.5
+
+
+class Coverage(NamedTuple):
+    """A block from above; metres."""
+
+    height_m: Float[np.ndarray, "images"]
+    """Of each projection centre over the ground that its image points show (median),"""
+    gsd_m: Float[np.ndarray, "images"]
+    """and a pixel there, along the optical axis."""
+    x: Float[np.ndarray, "columns"]
+    """Centres of cells,"""
+    y: Float[np.ndarray, "rows"]
+    seen_by: Int[np.ndarray, "rows columns"]
+    """and how many images see them."""
+
+    def area_m2(self, least: int) -> float:
+        """What `least` images see or more."""
+        cell = (self.x[1] - self.x[0]) * (self.y[1] - self.y[0])
+        return float((self.seen_by >= least).sum() * cell)
+
+
+def coverage(adjusted: Adjustment) -> Coverage:
+    """The coverage of an adjusted block whose Z is up."""
+    s, block = adjusted.structure, adjusted.block
+    position = np.asarray(adjusted.unknowns.exterior.position)
+    turn = np.asarray(adjusted.unknowns.exterior.camera_from_object)
+    points = np.asarray(adjusted.unknowns.points)
+    away = points[s.point] - position[s.image]
+    depth = -np.einsum("nk,nk->n", turn[s.image][:, 2], away)
+    order = np.argsort(s.image, kind="stable")
+    first = np.searchsorted(s.image[order], np.arange(len(position) + 1))
+    parts = [order[a:b] for a, b in itertools.pairwise(first)]
+    middle = lambda v: np.array([np.median(v[part]) if len(part) else np.nan for part in parts])  # noqa: E731
+    height, depth = middle(-away[:, 2]), middle(depth)
+    angle = {
+        name: block.sensors[name].pixel_mm / float(interior.c) for name, interior in adjusted.unknowns.interior.items()
+    }
+    gsd = depth * np.array([angle[name] for name in block.image_camera])
+    x, y, ground = _cells(points, position, _AROUND * float(np.nanmedian(height)))
+    seen = np.zeros((len(y), len(x)), int)
+    for name, interior in adjusted.unknowns.interior.items():
+        polygon = _format(interior, block.sensors[name])
+        for image in np.flatnonzero(np.array(block.image_camera) == name):
+            there = (ground - position[image]) @ turn[image].T
+            ahead = there[..., 2] < 0
+            flat = there[..., :2] / np.where(ahead, -there[..., 2], 1.0)[..., None]
+            seen += ahead & _inside(flat, polygon)
+    return Coverage(height, gsd, x, y, seen)
+
+
+def _cells(points: np.ndarray, position: np.ndarray, around: float):
+    """Centres of cells over points and stations, without the points that lie astray, and their places on the ground."""
+    low, high = np.percentile(points, [1, 99], axis=0)
+    low = np.minimum(low[:2], position[:, :2].min(axis=0)) - around
+    high = np.maximum(high[:2], position[:, :2].max(axis=0)) + around
+    step = float((high - low).max()) / _CELLS
+    x, y = (np.arange(a + step / 2, b + step / 2, step) for a, b in zip(low, high, strict=True))
+    plan = np.stack(np.meshgrid(x, y), axis=-1)
+    _, near = cKDTree(points[:, :2]).query(plan.reshape(-1, 2), k=min(_NEAR, len(points)))
+    z = np.median(points[near.reshape(len(near), -1), 2], axis=1)
+    return x, y, np.dstack([plan, z.reshape(plan.shape[:2])])
+
+
+def _format(interior: InteriorOrientation, sensor: Sensor) -> Float[np.ndarray, "corners 2"]:
+    """The edge of the format as tangents of angles from the axis, to the right and up."""
+    part = np.arange(_SIDE) / _SIDE * 2 - 1
+    one = np.ones(_SIDE)
+    edge = np.concatenate([np.stack(v, axis=1) for v in ((part, -one), (one, part), (-part, one), (-one, -part))])
+    given = jax.tree.map(lambda v: jnp.asarray(v, float), interior)
+    return np.asarray(call_compiled(_tangents, given, jnp.asarray(edge * [sensor.width_mm / 2, sensor.height_mm / 2])))
+
+
+@eqx.filter_jit
+def _tangents(interior: InteriorOrientation, xy: Float[Array, "n 2"]) -> Float[Array, "n 2"]:
+    def one(at):
+        u, v, w = interior.direction_from_ideal(interior.ideal_from_measured(at))
+        return jnp.stack([u, v]) / -w
+
+    return jax.vmap(one)(xy)
+
+
+def _inside(at: Float[np.ndarray, "rows columns 2"], polygon: Float[np.ndarray, "corners 2"]) -> np.ndarray:
+    """Whether places lie in a polygon: a line from each to the right crosses it an odd number of times."""
+    x, y = at[..., 0], at[..., 1]
+    odd = np.zeros(x.shape, bool)
+    for (x1, y1), (x2, y2) in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
+        if y1 != y2:
+            odd ^= ((y1 > y) != (y2 > y)) & (x < (x2 - x1) * (y - y1) / (y2 - y1) + x1)
+    return odd
