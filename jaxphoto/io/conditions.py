@@ -76,7 +76,8 @@ def _time(taken: dict) -> str:
     if not found:
         return ""
     fraction = _words(taken.get(_TAG.SubsecTimeOriginal))
-    offset = _words(taken.get(_TAG.OffsetTimeOriginal))
+    # Not as words are looked at: those that begin with a plus sign could be formulas.
+    offset = str(taken.get(_TAG.OffsetTimeOriginal, "")).strip("\0 ")
     said = "{}-{}-{} {}".format(*found.groups())
     said += f".{fraction}" if fraction.isascii() and fraction.isdigit() else ""
     return said + (offset if re.fullmatch(r"[+-]\d\d:\d\d|Z", offset) else "")

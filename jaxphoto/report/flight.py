@@ -16,6 +16,7 @@ from jaxphoto.procedures.flight import CalibratedFlight, FlightPart
 from jaxphoto.report.alike import with_alike
 from jaxphoto.report.control import control_findings, control_summary, surveyed_points, write_control
 from jaxphoto.report.findings import Finding, Level, Verdict
+from jaxphoto.report.flight_coverage import coverage_figure, flight_words
 from jaxphoto.report.lens import lens_findings
 from jaxphoto.report.maps import png_of
 from jaxphoto.report.orientation import ALIKE, orientation_sentences, write_orientation
@@ -45,11 +46,15 @@ _PAGE = """<!DOCTYPE html>
 {% if p.alike %}<p>{{ p.alike }}</p>{% endif %}
 {% if p.lens %}<h3>What was known of the lens</h3><ul>{% for s in p.lens %}<li>{{ s }}</li>{% endfor %}</ul>{% endif %}
 {% if p.control %}<h3>Control</h3>{{ p.control }}<ul>{% for s in p.said %}<li>{{ s }}</li>{% endfor %}</ul>{% endif %}
+<h3>The ground</h3>{% if p.overlap %}<img alt="map of how many photographs see each place of the ground, and number of
+points by number of rays" src="{{ p.overlap }}">{% endif %}
+<ul>{% for what, words in p.ground.items() %}<li>{{ what }}: {{ words }}</li>{% endfor %}</ul>
 <h3>How it was oriented</h3><ul>{% for s in p.sentences %}<li>{{ s }}</li>{% endfor %}</ul>
 <h3>Photographs</h3>{% if p.picture %}<img alt="recorded positions minus those of the adjustment, in plan and in height,
 and residuals by photograph" src="{{ p.picture }}">{% endif %}{{ p.images }}
 {% endfor %}
-{% if positions_from %}<h2>Where positions come from</h2><ul>{% for s in positions_from %}<li>{{ s }}</li>{% endfor %}</ul>{% endif %}
+{% if positions_from %}<h2>Where positions come from</h2>
+<ul>{% for s in positions_from %}<li>{{ s }}</li>{% endfor %}</ul>{% endif %}
 {% if lost %}<h2>Photographs that are not used</h2>
 <ul>{% for s in lost %}<li>{{ s }}</li>{% endfor %}</ul>{% endif %}
 </body></html>
@@ -65,7 +70,8 @@ class PartReport(NamedTuple):
     images: pd.DataFrame
     """image, oriented, n_image_points, rms_px, dX_m to dZ_m (recorded minus adjusted position), position (used, left
     out, none)."""
-    coverage: Coverage
+    coverage: Coverage | None
+    """None where the block has no metres."""
     """What the photographs show of the ground; in the block's own scale where it has no positions."""
 
 
@@ -74,7 +80,8 @@ def report_of(part: FlightPart) -> PartReport:
     tables = Tables(part.adjusted)
     found = [*verdict_of(tables).findings, *(component_findings(part.components) if part.components else [])]
     judged = Verdict.of([*found, *lens_findings(tables), *_findings(part)])
-    return PartReport(part, tables, judged, _images(part), coverage(part.adjusted))
+    metric = part.placed or part.controlled
+    return PartReport(part, tables, judged, _images(part), coverage(part.adjusted) if metric else None)
 
 
 def _findings(part: FlightPart) -> Iterator[Finding]:
@@ -198,7 +205,10 @@ def write_flight(
         times = {name: r.part.adjusted.seconds[name] for name in ("compile", "solve", "covariance")}
         with whole_folder(work / part_folder(number)) as folder:
             alike = r.part.oriented.report.alike
-            own = {"sigma_factor": alike if alike > ALIKE else 1.0, "flight": flight_words(r)}
+            own = {
+                "sigma_factor": alike if alike > ALIKE else 1.0,
+                "flight": flight_words(r.coverage, r.part.adjusted.block),
+            }
             write_results(r.tables, r.verdict, folder, times, {**told, **own})
             with_alike(r.tables.interior, r.part.adjusted, alike).to_csv(folder / "interior_alike.csv", index=False)
             if r.part.controlled:
@@ -268,6 +278,8 @@ def _page(
                 "sentences": [*orientation_sentences(report), *(r.part.placed.sentences if r.part.placed else ())],
                 "control": _table(surveyed_points(r.part.controlled), "{:.3g}") if r.part.controlled else "",
                 "said": r.part.controlled.sentences if r.part.controlled else (),
+                "ground": flight_words(r.coverage, r.part.adjusted.block),
+                "overlap": png_of(coverage_figure(r.coverage, r.part.adjusted))[1] if r.coverage else "",
                 "picture": png_of(positions_figure(r))[1],
                 "images": _table(r.images, "{:.3g}"),
             }
@@ -290,16 +302,3 @@ def _page(
 def _table(table: pd.DataFrame, digits: str) -> Markup:
     page = table.to_html(index=False, border=0, na_rep="", float_format=digits.format)
     return Markup(f'<div class="wide">{page}</div>')
-
-
-def flight_words(r: PartReport) -> dict[str, str]:
-    """The flight in words, for the certificate."""
-    placed, c = r.part.placed, r.coverage
-    if not placed:
-        return {"map system": "none: the block has a frame and a scale of its own"}
-    height, gsd = np.nanmedian(c.height_m), np.nanmedian(c.gsd_m)
-    return {
-        "map system": f"EPSG:{placed.block.frame.code}, adjusted in a local frame",
-        "height over ground": f"{height:.4g} m (median), pixel there {100 * gsd:.3g} cm",
-        "area": f"{c.area_m2(2) / 1e4:.3g} ha seen by two photographs or more",
-    }

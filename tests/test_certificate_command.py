@@ -1,0 +1,122 @@
+"""`jaxphoto certificate`: a document from results, the same bytes from the same inputs, that says what they say."""
+
+import hashlib
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+from PIL import Image
+
+from jaxphoto import Tables
+from jaxphoto.io import write_block
+from jaxphoto.io.conditions import CONDITIONS, conditions_of, read_conditions, write_conditions
+from jaxphoto.io.input_hashes import block_inputs, read_inputs, write_inputs
+from jaxphoto.procedures import adjust_for_tables
+from jaxphoto.report import verdict_of
+from jaxphoto.report.results import write_results
+from jaxphoto.statistics.coverage import coverage
+from tests.blocks import simulated
+from tests.commands import run
+
+
+@pytest.fixture(scope="module")
+def adjusted():
+    return adjust_for_tables(simulated("cross").block)
+
+
+@pytest.fixture(scope="module")
+def results(adjusted, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("certified")
+    write_block(adjusted.block, folder / "block")
+    tables = Tables(adjusted)
+    told = {"method": {"command": "adjust"}}
+    seconds = dict.fromkeys(("read", "compile", "solve", "covariance"), 0.0)
+    write_results(tables, verdict_of(tables), folder / "results", seconds, told)
+    write_inputs(block_inputs(folder / "block"), folder / "results")
+    return folder / "results"
+
+
+def certified(results, out, monkeypatch, capsys, *options):
+    code, _, error = run(monkeypatch, capsys, "certificate", results, "--out", out, *options)
+    assert code == 0, error
+    return out.read_bytes()
+
+
+@pytest.mark.parametrize("suffix", [".html", ".pdf"])
+def test_the_same_inputs_make_the_same_bytes(results, tmp_path, monkeypatch, capsys, suffix):
+    one = certified(results, tmp_path / f"a{suffix}", monkeypatch, capsys)
+    assert certified(results, tmp_path / f"b{suffix}", monkeypatch, capsys) == one
+
+
+def test_it_says_what_the_results_say(results, tmp_path, monkeypatch, capsys):
+    page = certified(results, tmp_path / "a.html", monkeypatch, capsys).decode()
+    interior = pd.read_csv(results / "interior.csv").set_index("parameter")
+    # Two digits of sigma, and the value to the same place.
+    places = 1 - int(np.floor(np.log10(interior.loc["c_mm", "sigma"])))
+    assert f"{interior.loc['c_mm', 'value']:.{places}f}" in page
+    for file in (results.parent / "block").glob("*.csv"):
+        assert hashlib.sha256(file.read_bytes()).hexdigest() in page
+    for heading in ("Interior orientation", "Distortion", "Precision", "Correlations", "Stability", "Inputs"):
+        assert heading in page
+
+
+def test_inputs_are_told_by_their_hashes(results):
+    told = {f.file: f.sha256 for f in read_inputs(results / "inputs.csv")}
+    block = results.parent / "block"
+    assert told == {p.name: hashlib.sha256(p.read_bytes()).hexdigest() for p in block.iterdir() if p.suffix != ".json"}
+
+
+def test_against_itself_a_camera_has_not_changed(results, tmp_path, monkeypatch, capsys):
+    page = certified(results, tmp_path / "a.html", monkeypatch, capsys, "--last", results).decode()
+    assert "No earlier calibration was given" not in page
+
+
+def test_bad_input_is_one_sentence(results, tmp_path, monkeypatch, capsys):
+    code, _, error = run(monkeypatch, capsys, "certificate", results, "--out", tmp_path / "a.doc")
+    assert code == 2 and "name a file that ends in .html or .pdf" in error
+    code, _, error = run(monkeypatch, capsys, "certificate", tmp_path, "--out", tmp_path / "a.pdf")
+    assert code == 2 and "holds no interior.csv" in error
+    open_end = tmp_path / "open"
+    open_end.mkdir()
+    for file in results.glob("*.*"):
+        (open_end / file.name).write_bytes(file.read_bytes())
+    summary = json.loads((open_end / "summary.json").read_text())
+    (open_end / "summary.json").write_text(json.dumps(summary | {"converged": False, "outcome": "no"}))
+    code, _, error = run(monkeypatch, capsys, "certificate", open_end, "--out", tmp_path / "a.pdf")
+    assert code == 2 and error.count("\n") == 1
+    assert not (tmp_path / "a.pdf").exists()
+
+
+def test_conditions_come_from_exif_and_back_from_their_table(tmp_path):
+    exif = Image.Exif()
+    exif[0x010F], exif[0x0110] = "Maker", "Model 1"
+    exif.get_ifd(0x8769).update(
+        {0x9003: "2024:05:01 10:00:03", 0x9291: "25", 0x9011: "+02:00", 0xA431: "S-7", 0x829D: 4.0, 0x829A: 0.001}
+    )
+    Image.new("RGB", (32, 24)).save(tmp_path / "a.jpg", exif=exif)
+    told = conditions_of(tmp_path / "a.jpg")
+    assert (told.make, told.model, told.serial, told.f_number) == ("Maker", "Model 1", "S-7", 4.0)
+    assert told.time == "2024-05-01 10:00:03.25+02:00" and told.exposure_s == pytest.approx(0.001)
+    assert told.sha256 == hashlib.sha256((tmp_path / "a.jpg").read_bytes()).hexdigest()
+    write_conditions([told], tmp_path, ["a"])
+    assert read_conditions(tmp_path / CONDITIONS) == [told]
+
+
+def test_what_photographs_see_is_what_points_in_them_say(adjusted):
+    """Where image points are, their photographs see the ground; height and pixel are those of the rays."""
+    found = coverage(adjusted)
+    block, s = adjusted.block, adjusted.structure
+    points = np.asarray(adjusted.unknowns.points)
+    rays = np.bincount(s.point, minlength=len(points))
+    column = np.abs(found.x - points[:, :1]).argmin(axis=1)
+    row = np.abs(found.y - points[:, 1:2]).argmin(axis=1)
+    # At least as many photographs as measured it, but for those in whose edge half a cell decides.
+    assert np.mean(found.seen_by[row, column] >= rays) > 0.9
+    position = np.asarray(adjusted.unknowns.exterior.position)
+    own = points[s.point[s.image == 0]]
+    assert found.height_m[0] == pytest.approx(position[0, 2] - np.median(own[:, 2]))
+    camera = block.image_camera[0]
+    pixel = block.sensors[camera].pixel_mm / float(adjusted.unknowns.interior[camera].c)
+    assert found.gsd_m[0] == pytest.approx(pixel * found.height_m[0], rel=0.05)
+    assert 0 < found.area_m2(2) < found.area_m2(1)
