@@ -17,7 +17,7 @@ from jaxphoto.report.certificate_conditions import condition_rows, flight_rows
 from jaxphoto.report.certificate_figures import draw_correlations, draw_curve, draw_map
 from jaxphoto.report.certified import Certified
 from jaxphoto.report.change import change_verdict
-from jaxphoto.report.document import Document, Element, Heading, Paragraph, Picture, Pictures, Rows
+from jaxphoto.report.document import Document, DocumentPicture, Element, Heading, Paragraph, Pictures, Rows
 from jaxphoto.stability import LEVEL, NORMAL_95, Method, change, distortion_curve, format_sigma, image_grid
 from jaxphoto.writing.inputs import digest_of_all
 
@@ -129,7 +129,7 @@ def _distortion(given: Certified) -> Iterator[Element]:
     yield Heading("Distortion")
     curve = distortion_curve(given.interior, given.sensor, given.covariance)
     factor = given.sigma_factor
-    picture = Picture(
+    picture = DocumentPicture(
         lambda axes: draw_curve(axes, curve, factor),
         f"Curve of radial distortion, {1e3 * np.abs(curve.radial).max():.3g} µm at most, with its 95 % band",
     )
@@ -157,7 +157,7 @@ def _precision(given: Certified) -> Iterator[Element]:
     for method, words in _GIVEN_UP:
         found.append((words, per_mm * format_sigma(given.interior, given.covariance, points, method)))
     panels = [
-        Picture(
+        DocumentPicture(
             partial(draw_map, sensor=given.sensor, cells_mm=points, values=sigma, title=f"sigma [px], {words}"),
             f"Map of standard deviations over the format, {sigma.min():.2g} to {sigma.max():.2g} pixels, {words}",
         )
@@ -166,7 +166,7 @@ def _precision(given: Certified) -> Iterator[Element]:
     if given.band:
         b = given.band
         panels.append(
-            Picture(
+            DocumentPicture(
                 partial(
                     draw_map, sensor=given.sensor, cells_mm=b.cells_mm, values=b.band_px, title="95 % by halves [px]"
                 ),
@@ -202,7 +202,9 @@ def _correlations(given: Certified) -> Iterator[Element]:
         if abs(rho[i, j]) > _HIGH
     ]
     said = f"Above {_HIGH}: {', '.join(high)}." if high else f"None is above {_HIGH}."
-    yield Pictures((Picture(lambda axes: draw_correlations(axes, names, rho), f"Matrix of correlations. {said}", 3.6),))
+    yield Pictures(
+        (DocumentPicture(lambda axes: draw_correlations(axes, names, rho), f"Matrix of correlations. {said}", 3.6),)
+    )
     yield Paragraph(f"{said} Only together do parameters that are so correlated mean anything.")
     if given.with_exterior:
         table: dict[str, dict[str, str]] = {}
@@ -228,11 +230,11 @@ def _stability(given: Certified) -> Iterator[Element]:
     offset = found.offset_mm / given.sensor.pixel_mm
     yield Pictures(
         (
-            Picture(
+            DocumentPicture(
                 partial(draw_map, sensor=given.sensor, cells_mm=points, values=offset, title="offset of rays [px]"),
                 f"Map of the offsets of rays since the last calibration, at most {offset.max():.2g} pixels",
             ),
-            Picture(
+            DocumentPicture(
                 partial(
                     draw_map, sensor=given.sensor, cells_mm=points, values=found.offset_mm / found.limit_mm,
                     title=f"over what {100 * LEVEL:.0f} % stay below",

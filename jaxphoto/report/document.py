@@ -29,7 +29,7 @@ class Rows(NamedTuple):
     rows: tuple[tuple[str, ...], ...]
 
 
-class Picture(NamedTuple):
+class DocumentPicture(NamedTuple):
     """One panel."""
 
     draw: Callable[[Axes], None]
@@ -42,7 +42,7 @@ class Picture(NamedTuple):
 class Pictures(NamedTuple):
     """Panels beside one another, as far as there is room."""
 
-    panels: tuple[Picture, ...]
+    panels: tuple[DocumentPicture, ...]
 
 
 Element = Heading | Paragraph | Rows | Pictures

@@ -7,7 +7,7 @@ import re
 from jinja2 import Environment
 from markupsafe import Markup
 
-from jaxphoto.report.document import Document, Heading, Paragraph, Picture, Pictures, Rows
+from jaxphoto.report.document import Document, DocumentPicture, Heading, Paragraph, Pictures, Rows
 from jaxphoto.report.page import STYLE
 from jaxphoto.report.plots import new_figure
 
@@ -72,7 +72,7 @@ def anchor(heading: str) -> str:
     return re.sub(r"\W+", "-", heading.lower()).strip("-")
 
 
-def _image(picture: Picture) -> Markup:
+def _image(picture: DocumentPicture) -> Markup:
     figure = new_figure(WIDTH_INCHES, picture.height)
     picture.draw(figure.subplots())
     drawn = io.BytesIO()
