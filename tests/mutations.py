@@ -29,11 +29,13 @@ from jaxphoto.errors import JaxphotoError
 from jaxphoto.image_measurement import read_grey
 from jaxphoto.io import clouds, read_block, read_recipe, read_source, write_block
 from jaxphoto.io.cameras import read_camera_file, write_camera_file
+from jaxphoto.io.conditions import read_conditions
 from jaxphoto.io.control_files import read_control
 from jaxphoto.io.dbat import read_dbat
 from jaxphoto.io.draws_folder import DrawsFolder
 from jaxphoto.io.exports import adjusted_block, photograph_files
 from jaxphoto.io.exposures import read_exposures
+from jaxphoto.io.input_hashes import read_inputs
 from jaxphoto.io.kept_pieces import KeptPieces
 from jaxphoto.io.photograph_metadata import drone_record, xmp_fields
 from jaxphoto.io.photographs import photographs
@@ -335,6 +337,17 @@ READERS: dict[str, Reader] = {
     "camera-toml": Reader(text(a__toml=cameras.TOML), _camera("a.toml")),
     "camera-results": Reader(
         text(interior__csv=cameras.INTERIOR, correlation__csv=cameras.CORRELATION, summary__json=SUMMARY), _camera("")
+    ),
+    "conditions": Reader(
+        text(
+            conditions__csv="image,file,sha256,used,time,serial,exposure_s\n"
+            + f"a,a.jpg,{'0' * 64},True,2025-03-14 09:26:53,42,0.001\nb,b.jpg,{'1' * 64},False,,,\n"
+        ),
+        lambda folder: read_conditions(folder / "conditions.csv"),
+    ),
+    "inputs": Reader(
+        text(inputs__csv=f"file,n_bytes,sha256\nblock.toml,488,{'a' * 64}\n"),
+        lambda folder: read_inputs(folder / "inputs.csv"),
     ),
     "aicon": Reader(text(**sound_files.AICON), lambda folder: read_source(folder, "aicon")),
     "bal": Reader(text(problem__txt="\n".join(test_bal.lines_of())), lambda folder: read_source(folder, "bal")),

@@ -30,6 +30,7 @@ FILES = {
     "correlation.csv",
     "correlation_summary.csv",
     "correlation_ground.csv",
+    "inputs.csv",
     "report.html",
 }
 XYZ = ["X_m", "Y_m", "Z_m"]

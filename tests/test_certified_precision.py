@@ -1,0 +1,31 @@
+"""What a certificate draws, by hand: the distortion with its band, and standard deviations over the format."""
+
+import numpy as np
+import pytest
+
+from jaxphoto.camera import Brown, InteriorOrientation, Sensor, parameter_names
+from jaxphoto.stability import distortion_curve, format_sigma, image_grid
+
+CAMERA = InteriorOrientation(35.0, 0.4, -0.3, Brown(k1=-9e-5, k2=1e-7))
+SENSOR = Sensor(4500, 3000, 0.008)
+
+
+def test_the_curve_is_brown_s_polynomial_and_its_band_that_of_its_coefficients():
+    names, covariance = parameter_names(CAMERA), np.zeros((len(parameter_names(CAMERA)),) * 2)
+    q = np.array([[1e-12, -3e-15], [-3e-15, 1.6e-17]])
+    which = [names.index("k1"), names.index("k2")]
+    covariance[np.ix_(which, which)] = q
+    curve = distortion_curve(CAMERA, SENSOR, covariance)
+    powers = np.stack([curve.r**3, curve.r**5], axis=1)
+    np.testing.assert_allclose(curve.radial, powers @ [-9e-5, 1e-7], rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(curve.sigma, np.sqrt(np.einsum("ri,ij,rj->r", powers, q, powers)), rtol=1e-9)
+    assert curve.r[-1] == pytest.approx(np.hypot(18 - 0.4, 12 - 0.3)) and np.abs(curve.other).max() < 1e-12
+
+
+def test_sigma_over_the_format_is_that_of_the_principal_point():
+    """x_p and y_p alone, 1 and 2 um: sqrt(5) um everywhere where position and attitude are known."""
+    plain = InteriorOrientation(35.0)
+    covariance = np.diag([0, 1e-6, 4e-6, *np.zeros(len(parameter_names(plain)) - 3)])
+    points = image_grid(SENSOR, 5, 3)
+    np.testing.assert_allclose(format_sigma(plain, covariance, points, "zrot"), np.sqrt(5e-6), rtol=1e-9)
+    assert format_sigma(plain, covariance, points, "rot").max() < 0.6 * np.sqrt(5e-6)
