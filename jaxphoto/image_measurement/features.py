@@ -22,7 +22,7 @@ _HALF_WINDOW = 5
 _BORDER_PX = 8
 _CELLS = 16
 # Half of what OpenCV asks: walls and streets have little contrast.
-_CONTRAST = 0.0133
+_CONTRAST = 0.02
 # A SIFT descriptor has this length before it is rounded; its parts are then below 256 but for odd ones.
 _LENGTH = 512
 # Of a feature whose blob is a point, and what each pixel of its width adds.
