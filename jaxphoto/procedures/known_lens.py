@@ -35,7 +35,7 @@ class KnownLens(NamedTuple):
             f"{p.radial_percent:g} % of the distance of the corner for each radial term, {p.decentring_percent:g} % "
             "for each other one",
             f"source: {' '.join(p.source.split())}" + ("" if p.published else "; an earlier calibration says more"),
-            f"c of such lenses changes by about {_KELVIN * p.drift_ppm_per_K * c:.2g} µm with {_KELVIN:g} K, "
+            f"c of such lenses changes by about {1e-3 * _KELVIN * p.drift_ppm_per_K * c:.2g} µm with {_KELVIN:g} K, "
             "so much less than this is not known of another day's c",
         )
 

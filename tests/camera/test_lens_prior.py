@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 from jaxphoto.camera import DISTORTIONS, Brown, InteriorOrientation, Sensor, set_parameter
-from jaxphoto.camera.lens_prior import lens_prior, lens_priors, prior_sigmas
+from jaxphoto.camera.lens_prior import LensPrior, lens_prior, lens_priors, prior_sigmas
+from jaxphoto.procedures.known_lens import KnownLens
+from tests.blocks import simulated
 
 SENSOR = Sensor(5472, 3648, 0.0024)
 NOMINAL = InteriorOrientation(8.8, 0.0, 0.0, Brown())
@@ -65,3 +67,12 @@ def test_every_model_has_sigmas(name):
     sigma = prior_sigmas(lens_prior("DJI", "M3E"), interior, SENSOR)
     usual = interior.distortion.usual()
     assert all(0 < sigma[n] < np.inf for n in usual)
+
+
+def test_the_drift_is_told_in_micrometres():
+    """30 ppm a kelvin of 10 mm over 10 K are 3 um."""
+    prior = LensPrior("lenses of a test", 1.0, 1.0, 1.0, 1.0, 30.0, True, "nobody")
+    block = simulated("cross").block
+    camera = next(iter(block.sensors))
+    known = KnownLens(InteriorOrientation(10.0, 0.0, 0.0, Brown()), prior, 0.0)
+    assert "changes by about 3 µm with 10 K" in known.sentences(block, camera)[2]
