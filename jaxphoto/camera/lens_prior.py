@@ -81,7 +81,8 @@ def prior_sigmas(
         most = np.hypot(*moved.T).max()
         radial = across < 1e-6 * corner * most
         percent = prior.radial_percent if radial else prior.decentring_percent
-        found[name] = percent / 100 * corner / most if most > 0 else math.inf
+        # What moves nothing is the place that distortion is about, where there is none yet: as the principal point.
+        found[name] = percent / 100 * corner / most if most > 0 else point
     return found
 
 
