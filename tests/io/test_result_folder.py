@@ -22,7 +22,7 @@ def folders(tmp_path_factory):
     """A block and its results, side by side as in a flight."""
     folder, found = tmp_path_factory.mktemp("flown"), adjusted("cross")
     write_block(found.block, folder / "block")
-    write_results(Tables(found), Verdict(()), folder / "result", {}, "../block")
+    write_results(Tables(found), Verdict(()), folder / "result", {}, {"block": "../block"})
     return folder
 
 
