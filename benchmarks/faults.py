@@ -171,7 +171,8 @@ class Tried:
 
         clear_leftovers(place)
         out = place / self.case.out
-        if others := _names(place) - {self.case.out}:
+        # What a killed run has worked out so far stays beside its place, for the next one to go on from.
+        if others := _names(place) - {self.case.out} - ({f"{self.case.out}.progress"} if not finished else set()):
             yield f"{when}: {sorted(others)} left"
         if not out.exists():
             if must_be and self.name not in _GOES_ON:
