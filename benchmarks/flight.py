@@ -105,10 +105,10 @@ def ours(arguments: argparse.Namespace) -> dict:
     from jaxphoto.image_measurement.features import FEATURES
     from jaxphoto.image_measurement.matching import match_photographs
     from jaxphoto.image_measurement.photograph_pairs import photograph_pairs
-    from jaxphoto.io.photographs import sensor_and_interior
+    from jaxphoto.io.photographs import known_lens, sensor_and_interior
     from jaxphoto.io.sound_photographs import sound_photographs
     from jaxphoto.procedures.calibration import distortion_model
-    from jaxphoto.procedures.flight import MatchedPart, calibrate_flight
+    from jaxphoto.procedures.flight import KnownOfFlight, MatchedPart, calibrate_flight
     from jaxphoto.report.flight import report_of, write_flight
 
     read, spoilt = sound_photographs(_files(arguments))
@@ -155,7 +155,12 @@ def ours(arguments: argparse.Namespace) -> dict:
             clock.tell(doing)
 
         interior = InteriorOrientation(start.c, start.x_p, start.y_p, distortion)
-        flight = calibrate_flight(parts, camera.sensor, interior, {p.name: p.gps for p in read}, None, report)
+        known = KnownOfFlight(
+            {p.name: p.gps for p in read},
+            {p.name: p.attitude for p in read},
+            lens=known_lens(read, camera, distortion),
+        )
+        flight = calibrate_flight(parts, camera.sensor, interior, known, report)
         clock.step("adjustment")
         reports = [report_of(part) for part in flight.parts]
         with tempfile.TemporaryDirectory() as folder:

@@ -40,7 +40,7 @@ def orient_command(
     ] = None,
     features: Annotated[int | None, typer.Option(help="Of a photograph, at most (default: 5000).", min=100)] = None,
     longest_px: Annotated[
-        int | None, typer.Option(help="Longer side, in pixels, to look for features (default: 3200).", min=200)
+        int | None, typer.Option(help="Longer side, in pixels, to look for features (default: 2400).", min=200)
     ] = None,
     c_mm: Annotated[float | None, typer.Option(help="Where the principal distance starts; else from EXIF.")] = None,
     pixel_mm: Annotated[float | None, typer.Option(help="Size of a pixel; else from EXIF.")] = None,
