@@ -10,8 +10,7 @@ from jaxphoto.cli.console import plain_console
 from jaxphoto.errors import InputError
 from jaxphoto.image_measurement.control_targets import target_looker
 from jaxphoto.image_measurement.targets.on_ground import SYNTAX, read_target
-from jaxphoto.io import read_block
-from jaxphoto.io.block_folder import whole_block
+from jaxphoto.io import read_block, write_block
 from jaxphoto.io.control_files import read_control
 from jaxphoto.io.sound_photographs import sound_photographs
 from jaxphoto.procedures import adjust
@@ -75,8 +74,7 @@ def control_command(
             write_summary(
                 {"verdict": verdict.colour, "findings": told, **control_summary(found), "versions": versions()}, work
             )
-            with whole_block(found.adjusted.block, work / "block"):
-                pass
+            write_block(found.adjusted.block, work / "block")
     for sentence in found.sentences:
         console.print(plain(sentence), soft_wrap=True)
     console.print(plain(verdict.headline), soft_wrap=True)

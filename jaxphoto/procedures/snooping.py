@@ -133,19 +133,20 @@ def _snooped(
         at = linearise(block, all_points(adjusted.unknowns, at.unknowns, point), block.priors, max_steps, sizes)
         sigma0 = max(float(adjusted.sigma0), LEAST_SIGMA0)
         lost = np.setdiff1d(np.arange(len(block.points)), point)
-        pairs = [e for e in name_exchanges(at, left, lost, sigma0, checked_parts(at)) if e.rows not in done]
+        r = checked_parts(at)
+        pairs = [e for e in name_exchanges(at, left, lost, sigma0, r) if e.rows not in done]
         for exchange in pairs:
             (block, left), at = exchanged(block, left, exchange), with_places(at, exchange)
             done.append(exchange.rows)
         if pairs:
             continue
-        found = _tested(adjusted, at, left, point, sigma0)
+        found = _tested(adjusted, at, left, point, sigma0, r)
         if len(tried) == _ROUNDS or any(_same(found, old) for old in (left, *tried)):
             break
         tried.append(left)
         left = found
     gone = np.setdiff1d(np.arange(len(block.points)), point)
-    told = _told(at, left, _stays(block, point), checked_parts(at), sigma0)
+    told = _told(at, left, _stays(block, point), r, sigma0)
     named = tuple(_named(block, pair) for pair in done)
     return Snooped(adjusted, told, named, tuple(block.points[p] for p in gone))
 
@@ -202,10 +203,10 @@ def _sizes(at: Adjustment, r: Blocks, predicted: bool = False) -> dict[str, Floa
     return found
 
 
-def _tested(adjusted: Adjustment, at: Adjustment, left: Masks, point: np.ndarray, sigma0: float) -> Masks:
+def _tested(adjusted: Adjustment, at: Adjustment, left: Masks, point: np.ndarray, sigma0: float, r: Blocks) -> Masks:
     """What is to be left out next: `adjusted` is without `left`, `at` the whole block linearised there."""
     stays = _stays(at.block, point)
-    wrong = {name: size > sigma0 for name, size in _sizes(at, checked_parts(at), predicted=True).items()}
+    wrong = {name: size > sigma0 for name, size in _sizes(at, r, predicted=True).items()}
     found = {name: out & (wrong[name] | ~stays[name]) for name, out in left.items()}
     sizes = {}
     for name, size in _sizes(adjusted, checked_parts(adjusted)).items():

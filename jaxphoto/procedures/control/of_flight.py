@@ -1,6 +1,7 @@
 """Control of a flight: looked at before hours of matching, then tried on every part; a part can do without it."""
 
-from collections.abc import Collection, Iterable
+from collections.abc import Callable, Collection, Iterable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -64,21 +65,11 @@ def controlled_or_why(
     block: Block, given: FlightControl, code: int | None, report: Report
 ) -> tuple[ControlledBlock | None, str]:
     """`block` with the control of the flight, or why it has to do without."""
+    of: Callable[..., ControlledBlock] = control_block
+    if given.looker is not None:
+        of = partial(control_block_with_targets, looker=given.looker)
     try:
-        if given.looker is not None:
-            found = control_block_with_targets(
-                block,
-                given.control,
-                given.looker,
-                system=given.system,
-                code=code,
-                elsewhere=given.images,
-                report=report,
-            )
-        else:
-            found = control_block(
-                block, given.control, system=given.system, code=code, elsewhere=given.images, report=report
-            )
+        found = of(block, given.control, system=given.system, code=code, elsewhere=given.images, report=report)
     except JaxphotoError as error:
         return None, str(error)
     return found, ""
