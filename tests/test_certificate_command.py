@@ -94,9 +94,11 @@ def test_conditions_come_from_exif_and_back_from_their_table(tmp_path):
     exif.get_ifd(0x8769).update(
         {0x9003: "2024:05:01 10:00:03", 0x9291: "25", 0x9011: "+02:00", 0xA431: "S-7", 0x829D: 4.0, 0x829A: 0.001}
     )
-    Image.new("RGB", (32, 24)).save(tmp_path / "a.jpg", exif=exif)
+    packet = b'<rdf:Description drone-dji:CameraSerialNumber="C-9" drone-dji:DroneSerialNumber="D-3"/>'
+    Image.new("RGB", (32, 24)).save(tmp_path / "a.jpg", exif=exif, xmp=packet)
     told = conditions_of(tmp_path / "a.jpg")
     assert (told.make, told.model, told.serial, told.f_number) == ("Maker", "Model 1", "S-7", 4.0)
+    assert told.drone == "D-3"
     assert told.time == "2024-05-01 10:00:03.25+02:00" and told.exposure_s == pytest.approx(0.001)
     assert told.sha256 == hashlib.sha256((tmp_path / "a.jpg").read_bytes()).hexdigest()
     write_conditions([told], tmp_path, ["a"])

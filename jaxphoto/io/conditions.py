@@ -16,6 +16,8 @@ from PIL import ExifTags, Image
 from jaxphoto.camera.conditions import NUMBERS, TEXTS, Conditions
 from jaxphoto.errors import InputError
 from jaxphoto.io.names import LONGEST, harm_in
+from jaxphoto.io.photograph_metadata import xmp_fields
+from jaxphoto.io.picture_size import pictures_of_any_size
 from jaxphoto.io.text_tables import LARGEST, read_csv
 from jaxphoto.writing.inputs import input_file
 
@@ -23,11 +25,6 @@ CONDITIONS = "conditions.csv"
 _TAG = ExifTags.Base
 # EXIF 2.31 and later; Pillow has no names for them.
 _TEMPERATURE, _HUMIDITY, _PRESSURE = 0x9400, 0x9401, 0x9402
-_XMP = re.compile(
-    rb"\w+:(CameraSerialNumber|DroneSerialNumber|DroneModel)\s*(?:=\s*\"([^\"]{0,100})\"|>([^<]{0,100})<)"
-)
-# Of an XMP packet, what is looked at.
-_MOST_BYTES = 1_000_000
 _TIME = re.compile(r"(\d{4}):(\d\d):(\d\d) (\d\d:\d\d:\d\d)")
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 
@@ -36,17 +33,13 @@ def conditions_of(path: Path, used: bool = True) -> Conditions:
     """What the file of one photograph says of how it was taken; damaged EXIF says nothing."""
     read = input_file(path)
     known = Conditions(path.stem, path.name, read.sha256, used)
-    # Pillow takes more than 179 million pixels for an attack; no pixel is read here.
-    limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
     try:
-        with Image.open(path) as picture:
+        with pictures_of_any_size(), Image.open(path) as picture:
             top = picture.getexif()
             return known._replace(**_said(top, top.get_ifd(ExifTags.IFD.Exif), _xmp(picture.info.get("xmp"))))
     # On bytes that are not what they should be Pillow raises what its formats do, each in its own way.
     except Exception:
         return known
-    finally:
-        Image.MAX_IMAGE_PIXELS = limit
 
 
 def _said(top: Any, taken: dict, xmp: dict[str, str]) -> dict[str, Any]:
@@ -84,11 +77,8 @@ def _time(taken: dict) -> str:
 
 
 def _xmp(packet: Any) -> dict[str, str]:
-    content = packet.encode("utf-8", "replace") if isinstance(packet, str) else packet
-    if not isinstance(content, bytes):
-        return {}
-    found = _XMP.findall(content[:_MOST_BYTES])
-    return {name.decode(): (given or inner).decode("utf-8", "replace") for name, given, inner in found}
+    """The attributes of a drone's packet by their names, whatever the namespace."""
+    return {key.partition(":")[2]: value for key, value in xmp_fields(packet).items()}
 
 
 def _words(value: Any) -> str:

@@ -20,7 +20,7 @@ from jaxphoto.georeferencing.exposure_times import Taken
 from jaxphoto.georeferencing.gps import Gps
 from jaxphoto.io.photograph_metadata import DroneRecord, drone_record, xmp_fields
 from jaxphoto.io.photograph_times import taken
-from jaxphoto.io.picture_size import check_pixels
+from jaxphoto.io.picture_size import check_pixels, pictures_of_any_size
 from jaxphoto.procedures.known_lens import KnownLens
 
 _DIAGONAL_35_MM = math.hypot(36, 24)
@@ -212,10 +212,8 @@ def read_photograph(path: Path) -> Photograph:
         raise InputError(f"{path} is a folder; name its photographs, for example {path}/*.jpg")
     if not path.is_file():
         raise InputError(f"{path}: there is no such photograph; correct the name")
-    # Pillow takes more than 179 million pixels for an attack. Aerial cameras have more; `check_pixels` looks at them.
-    limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
     try:
-        with warnings.catch_warnings():
+        with pictures_of_any_size(), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             # The lengths within a PNG, which OpenCV believes; it cannot be read after that.
             with Image.open(path) as picture:
@@ -228,8 +226,6 @@ def read_photograph(path: Path) -> Photograph:
     # On bytes that are not what they should be Pillow raises what its formats do, each in its own way.
     except Exception as error:
         raise InputError(f"{path}: this is no picture that can be read; give a TIFF, PNG or JPEG") from error
-    finally:
-        Image.MAX_IMAGE_PIXELS = limit
 
 
 def _exif(picture: Image.Image) -> dict[str, Any]:

@@ -1,6 +1,10 @@
 """Whether a file can hold the pixels that it says it has."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+
+from PIL import Image
 
 from jaxphoto.errors import InputError
 
@@ -22,3 +26,13 @@ def check_pixels(path: Path, width: int, height: int, bytes_each: int = 1) -> No
             f"{path.name} says it has {width} x {height} pixels, which is far more than its {path.stat().st_size} "
             "bytes can show; if it is not damaged, store it without compression"
         )
+
+
+@contextmanager
+def pictures_of_any_size() -> Iterator[None]:
+    """Have Pillow open what it takes for an attack: more than 179 million pixels, which aerial cameras have."""
+    limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
+    try:
+        yield
+    finally:
+        Image.MAX_IMAGE_PIXELS = limit

@@ -1,7 +1,6 @@
 """Photographs of one flight: what can be used of files and folders, and why the rest cannot."""
 
 import collections
-import hashlib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -9,6 +8,7 @@ from PIL import Image
 
 from jaxphoto.errors import InputError
 from jaxphoto.io.photographs import ONE_CAMERA, Photograph, read_photograph
+from jaxphoto.writing.inputs import input_file
 
 # Of files that are taken from a folder.
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
@@ -28,7 +28,7 @@ def sound_photographs(paths: Sequence[str | Path]) -> tuple[list[Photograph], di
         raise InputError(f"{missing[0]}: there is no such photograph or folder; correct the name")
     left: dict[str, str] = {}
     read: dict[str, Photograph] = {}
-    content: dict[bytes, str] = {}
+    content: dict[str, str] = {}
     for file in files:
         try:
             photograph = read_photograph(file)
@@ -36,7 +36,7 @@ def sound_photographs(paths: Sequence[str | Path]) -> tuple[list[Photograph], di
         except InputError as error:
             left[str(file)] = str(error)
             continue
-        digest = hashlib.sha256(file.read_bytes()).digest()
+        digest = input_file(file).sha256
         if digest in content:
             left[str(file)] = f"{file}: it is a copy of {content[digest]}"
         elif photograph.name in read:
