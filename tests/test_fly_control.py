@@ -1,5 +1,6 @@
 """`jaxphoto fly` with control: circles found in rendered photographs, whose positions are 20 m too high."""
 
+import hashlib
 import json
 
 import numpy as np
@@ -56,6 +57,10 @@ def test_a_flight_is_brought_onto_targets_that_it_finds(flown, tmp_path, monkeyp
     interior = pd.read_csv(out / "result" / "interior.csv").set_index("parameter")
     assert abs(interior.loc["c_mm", "value"] - C_MM) < 4 * interior.loc["c_mm", "sigma"] + 0.01
     assert "P6" in (out / "report.html").read_text()
+    # What was read besides photographs is among the inputs, and options among what the certificate tells.
+    inputs = pd.read_csv(out / "result" / "inputs.csv").set_index("file")["sha256"]
+    assert inputs["survey.csv"] == hashlib.sha256((flown / "survey.csv").read_bytes()).hexdigest() and len(inputs) == 13
+    assert "circle:diameter_mm=1600" in (out / "certificate.html").read_text()
 
 
 @pytest.mark.parametrize(

@@ -70,10 +70,7 @@ def control_command(
             with whole_folder(work / "result") as folder:
                 write_results(tables, verdict, folder, times)
             write_control(found, work)
-            told = [{"level": f.level.name.lower(), "text": f.text} for f in verdict.findings]
-            write_summary(
-                {"verdict": verdict.colour, "findings": told, **control_summary(found), "versions": versions()}, work
-            )
+            write_summary({**verdict.summary, **control_summary(found), "versions": versions()}, work)
             write_block(found.adjusted.block, work / "block")
     for sentence in found.sentences:
         console.print(plain(sentence), soft_wrap=True)

@@ -24,7 +24,7 @@ from jaxphoto.image_measurement.targets.on_ground import SYNTAX, read_target
 from jaxphoto.io.block_folder import whole_block
 from jaxphoto.io.control_files import read_control
 from jaxphoto.io.exports import write_photograph_files
-from jaxphoto.io.exposures import located
+from jaxphoto.io.exposures import exposure_files, located
 from jaxphoto.io.kept_pieces import KeptPieces, beside, check_pieces
 from jaxphoto.io.photographs import known_lens, sensor_and_interior
 from jaxphoto.io.sound_photographs import sound_photographs
@@ -149,8 +149,24 @@ def fly_command(
         flight = flight._replace(left_out=matched.left_out | flight.left_out)
         status.update("computing statistics")
         reports = [report_of(part) for part in flight.parts]
-        options = {"features": features, "longest_px": longest_px, "model": model, "pairs": pairs or usual_choice(read)}
-        signed = Provenance.of([p.path for p in read], options | {"epsg": epsg, "c_mm": c_mm, "pixel_mm": pixel_mm})
+        options = {
+            "pairs": pairs or usual_choice(read),
+            "epsg": epsg,
+            "features": features,
+            "longest_px": longest_px,
+            "c_mm": c_mm,
+            "pixel_mm": pixel_mm,
+            "model": model,
+            "lens_prior": lens_prior,
+            "rolling_shutter": rolling_shutter,
+            "lever_arm": lever_arm,
+            "heights": heights,
+            "control_epsg": control_epsg,
+            "targets": targets,
+        }
+        beside_them = [path for folder in photographs if folder.is_dir() for path in exposure_files(folder)]
+        others = dict.fromkeys([*filter(None, (control, marks)), *(exposures or ()), *beside_them])
+        signed = Provenance.of([p.path for p in read], list(others), options)
         status.update(f"writing {out}")
         with whole_folder(out) as work:
             write_photograph_files({p.name: p.path.name for p in read}, work)

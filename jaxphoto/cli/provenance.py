@@ -10,7 +10,7 @@ from jaxphoto.errors import InputError
 from jaxphoto.io.conditions import conditions_of, write_conditions
 from jaxphoto.io.input_hashes import write_inputs
 from jaxphoto.procedures.flight import FlightPart
-from jaxphoto.writing.inputs import InputFile
+from jaxphoto.writing.inputs import InputFile, input_file
 
 CERTIFICATE = "certificate"
 
@@ -23,12 +23,13 @@ class Provenance(NamedTuple):
     told: Mapping[str, Any]
 
     @classmethod
-    def of(cls, photographs: Sequence[Path], options: Mapping[str, Any]) -> "Provenance":
-        """What the files of `photographs` say."""
+    def of(cls, photographs: Sequence[Path], others: Sequence[Path], options: Mapping[str, Any]) -> "Provenance":
+        """What the files of `photographs` say; `others` are the files of control and of exposures."""
         conditions = [conditions_of(path) for path in photographs]
         inputs = [
             InputFile(c.file, path.stat().st_size, c.sha256) for c, path in zip(conditions, photographs, strict=True)
         ]
+        inputs += [input_file(path) for path in others]
         return cls(conditions, inputs, {"method": {"command": "fly", **options}})
 
     def write(self, part: FlightPart, folder: Path) -> None:

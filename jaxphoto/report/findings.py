@@ -57,6 +57,12 @@ class Verdict(NamedTuple):
         return "green: the observations agree with one another and with their standard deviations"
 
     @property
+    def summary(self) -> dict:
+        """What a summary.json says of it."""
+        told = [{"level": f.level.name.lower(), "text": f.text} for f in self.findings]
+        return {"verdict": self.colour, "findings": told}
+
+    @property
     def texts(self) -> list[str]:
         """The sentences alone."""
         return [f.text for f in self.findings]

@@ -220,8 +220,7 @@ def write_flight(
     images.to_csv(work / "images.csv", index=False)
     (work / "report.html").write_text(_page(flight, reports, spoilt, verdict, positions_from), encoding="utf-8")
     summary = {
-        "verdict": verdict.colour,
-        "findings": [{"level": f.level.name.lower(), "text": f.text} for f in verdict.findings],
+        **verdict.summary,
         "parts": [_summary(r, number) for number, r in enumerate(reports, 1)],
         "positions_from": list(positions_from),
         "not_used": {**spoilt, **flight.left_out},

@@ -66,8 +66,7 @@ def summary_of(tables: Tables, verdict: Verdict, seconds: dict[str, float]) -> d
     observations, unknowns = adjusted.n_observations, adjusted.n_unknowns
     return {
         "title": adjusted.block.title,
-        "verdict": verdict.colour,
-        "findings": [{"level": f.level.name.lower(), "text": f.text} for f in verdict.findings],
+        **verdict.summary,
         "converged": bool(adjusted.converged),
         "outcome": adjusted.outcome.value,
         "n_images": len(adjusted.block.images),
