@@ -1,5 +1,6 @@
 """Real measurements and the published results of their adjustment by other programs."""
 
+import dataclasses
 import re
 
 import equinox as eqx
@@ -11,7 +12,6 @@ from jaxphoto.adjustment import Outcome
 from jaxphoto.block import Frame
 from jaxphoto.camera import get_parameter
 from jaxphoto.procedures.control import at_optimum, control_block
-from jaxphoto.procedures.control.placed import moved
 from jaxphoto.procedures.orientation.onto_known import Similarity
 from jaxphoto.rotation import matrix_from_omega_phi_kappa
 from jaxphoto.statistics import (
@@ -90,7 +90,8 @@ def test_sxb_from_a_frame_of_its_own_by_control_and_marks(sxb):
     adjusted, _, report = sxb
     control, without = surveyed_and_without(at_optimum(adjusted))
     turn = np.asarray(matrix_from_omega_phi_kappa(np.array([0.3, -0.5, 1.0])))
-    away = moved(without, Similarity(np.array([3.0, 4.0, 5.0]), turn, 1e-3), Frame("local"))
+    similarity = Similarity(np.array([3.0, 4.0, 5.0]), turn, 1e-3)
+    away = dataclasses.replace(similarity.of_block(without), frame=Frame("local"))
     found = control_block(away, control, adjust=adjust)
     assert found.state.count("control") == 14 and found.state.count("check") == 2
     # No mark is left out, though they scatter by more than was said of them.

@@ -93,7 +93,7 @@ def georeference_photographs(
     rows, axis = np.flatnonzero(used).repeat(3), np.tile(np.arange(3), used.sum())
     stations = StationRows(image[rows], axis, here[rows, axis], sigma[rows, axis])
     placed = dataclasses.replace(
-        _moved(block, similarity),
+        similarity.of_block(block),
         stations=stations,
         datum=Datum(),
         frame=Frame("epsg", code, None, origin=origin),
@@ -211,15 +211,3 @@ def _nearest(
     begin = np.concatenate([start.of(middle[None])[0], np.zeros(3), [np.log(start.scale)]])
     best = at(least_squares(residual, begin, x_scale="jac").x)
     return best._replace(shift=best.shift - best.scale * best.turn @ middle)
-
-
-def _moved(block: Block, s: Similarity) -> Block:
-    """`block` whose start is brought to another frame."""
-    unknowns = block.start.unknowns
-    exterior = dataclasses.replace(
-        unknowns.exterior,
-        position=s.of(np.asarray(unknowns.exterior.position, float)),  # type: ignore[arg-type]
-        camera_from_object=np.asarray(unknowns.exterior.camera_from_object, float) @ s.turn.T,
-    )
-    unknowns = dataclasses.replace(unknowns, exterior=exterior, points=s.of(np.asarray(unknowns.points, float)))
-    return dataclasses.replace(block, start=dataclasses.replace(block.start, unknowns=unknowns))

@@ -22,7 +22,7 @@ from jaxphoto.procedures.control.into_block import into_block, with_gnss_bias, w
 from jaxphoto.procedures.control.judged import CRITICAL, JudgedControl, beyond, judged, scatter
 from jaxphoto.procedures.control.marked import Marked, marked
 from jaxphoto.procedures.control.onto_control import LEAST, onto_control
-from jaxphoto.procedures.control.placed import InFrame, in_frame, moved
+from jaxphoto.procedures.control.placed import InFrame, in_frame
 from jaxphoto.procedures.control.surveyed import MARK_SIGMA_PX, SIGMA_M, GivenControl
 
 _ROUNDS = 8
@@ -152,7 +152,7 @@ def _placed(block: Block, frame: InFrame, met, covariance, check, sigma, points)
         off = np.median((frame.xyz - met)[known[onto.agree]], axis=0)
         told = ", ".join(f"{v:.2f}" for v in off)
         said.append(f"control lies {told} m (east, north, up) from where the positions of the photographs have it")
-    return moved(block, onto.similarity, frame.frame), onto.similarity.of(met), agree, said
+    return dataclasses.replace(onto.similarity.of_block(block), frame=frame.frame), onto.similarity.of(met), agree, said
 
 
 def _assumed(control: GivenControl) -> list[str]:

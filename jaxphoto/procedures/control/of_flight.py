@@ -78,10 +78,10 @@ def controlled_or_why(
 def parts_with_marks(adjusted: Adjustment, marked: Collection[str]) -> dict[str, Selection]:
     """What has a variance component of its own: features, marks set by hand or found, stations in plan and height."""
     own = set(marked)
-    ties = [name for name in adjusted.block.points if name not in own]
-    parts = {"image points": Selection("image_points", points=ties)}
+    parts = {"image points": Selection("image_points")}
     if own:
-        parts["marks"] = Selection("image_points", points=sorted(own))
+        ties = [name for name in adjusted.block.points if name not in own]
+        parts = {"image points": Selection("image_points", points=ties), "marks": Selection("image_points", points=own)}
     if len(adjusted.block.stations):
         parts |= {"stations X-Y": Selection("stations", axes=("X", "Y")), "stations Z": Selection("stations", axes="Z")}
     return parts

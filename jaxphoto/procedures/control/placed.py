@@ -13,7 +13,6 @@ from jaxphoto.georeferencing.map_frame import MapFrame, check_heights
 from jaxphoto.procedures.control.surveyed import SurveyedPoints
 from jaxphoto.procedures.control.system import ControlSystem, check_near, filled, fitting, places, system_of
 from jaxphoto.procedures.georeference_photographs import utm_of
-from jaxphoto.procedures.orientation.onto_known import Similarity
 
 
 class InFrame(NamedTuple):
@@ -84,15 +83,3 @@ def new_code(points: SurveyedPoints, system: ControlSystem) -> int:
         return system.code
     longitude, latitude, _ = np.median(places(points, system, 4326), axis=0)
     return utm_of(longitude, latitude)
-
-
-def moved(block: Block, s: Similarity, frame: Frame) -> Block:
-    """`block` whose start is brought to another frame; stations stay where they are."""
-    unknowns = block.start.unknowns
-    exterior = dataclasses.replace(
-        unknowns.exterior,
-        position=s.of(np.asarray(unknowns.exterior.position, float)),  # type: ignore[arg-type]
-        camera_from_object=np.asarray(unknowns.exterior.camera_from_object, float) @ s.turn.T,
-    )
-    unknowns = dataclasses.replace(unknowns, exterior=exterior, points=s.of(np.asarray(unknowns.points, float)))
-    return dataclasses.replace(block, start=dataclasses.replace(block.start, unknowns=unknowns), frame=frame)

@@ -1,5 +1,6 @@
 """The similarity that brings a network in a frame of its own to points, stations and images that are known."""
 
+import dataclasses
 from typing import NamedTuple
 
 import numpy as np
@@ -26,6 +27,21 @@ class Similarity(NamedTuple):
     def of(self, x: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """Places in the other frame."""
         return self.shift + self.scale * x @ self.turn.T
+
+    def turned(self, camera_from_object: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 3 3"]:
+        """Rotations from the other frame."""
+        return camera_from_object @ self.turn.T
+
+    def of_block(self, block: Block) -> Block:
+        """`block` whose start is in the other frame; what was observed stays where it is."""
+        unknowns = block.start.unknowns
+        exterior = dataclasses.replace(
+            unknowns.exterior,
+            position=self.of(np.asarray(unknowns.exterior.position, float)),  # type: ignore[arg-type]
+            camera_from_object=self.turned(np.asarray(unknowns.exterior.camera_from_object, float)),  # type: ignore[arg-type]
+        )
+        unknowns = dataclasses.replace(unknowns, exterior=exterior, points=self.of(np.asarray(unknowns.points, float)))
+        return dataclasses.replace(block, start=dataclasses.replace(block.start, unknowns=unknowns))
 
 
 def similarity_between(
@@ -73,7 +89,7 @@ def onto_known(block: Block, network: Network, known: Start) -> Network:
         found = Similarity(np.zeros(3), np.eye(3), _scale_of_bars(block, network))
     return network._replace(
         positions=found.of(network.positions),
-        camera_from_object=network.camera_from_object @ found.turn.T,
+        camera_from_object=found.turned(network.camera_from_object),
         points=found.of(network.points),
     )
 
