@@ -5,8 +5,8 @@ from jaxtyping import Int
 
 from jaxphoto.image_measurement.features import SiftFeatures
 
-# Lowe's: how much nearer the best match must be than the second best.
-_RATIO = 0.8
+RATIO = 0.8
+"""Lowe's: how much nearer the best match must be than the second best."""
 # Rows of a table of all products that the cache of a processor holds.
 _ROWS = 256
 
@@ -54,5 +54,5 @@ def _nearest(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         first = square - score[rows, nearest]
         score[rows, nearest] = -np.inf
         second = square - score.max(axis=1)
-        best[part], clear[part] = nearest, first < _RATIO**2 * second
+        best[part], clear[part] = nearest, first < RATIO**2 * second
     return best, clear

@@ -9,11 +9,11 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Int, UInt8
 
+from jaxphoto.image_measurement.descriptors import RATIO
 from jaxphoto.image_measurement.features import SiftFeatures
 
 LARGEST = 300
 """Features of a photograph that are compared, those of the largest width."""
-_RATIO = 0.8
 # Photographs whose products with one are in memory at a time.
 _AT_ONCE = 32
 # Fewer matches among the largest come by chance.
@@ -63,4 +63,4 @@ def _votes(one: UInt8[np.ndarray, "_ 128"], others: Sequence[UInt8[np.ndarray, "
     first = np.take_along_axis(apart, nearest[:, :, None], axis=2)
     np.put_along_axis(apart, nearest[:, :, None], np.inf, axis=2)
     second = apart.min(axis=2)
-    return ((first[:, :, 0] < _RATIO**2 * second) & np.isfinite(second)).sum(axis=0)
+    return ((first[:, :, 0] < RATIO**2 * second) & np.isfinite(second)).sum(axis=0)
