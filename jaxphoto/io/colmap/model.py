@@ -4,6 +4,7 @@ Frames and rigs, which newer models have beside them, repeat the poses of the im
 Source: the documentation of COLMAP, "Output format".
 """
 
+import math
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,6 +21,8 @@ from jaxphoto.io.cameras.colmap import ColmapCamera, read_cameras
 FILES = ("cameras", "images", "points3D")
 # What a binary file has for a feature that is of no point.
 _NO_POINT = 2**64 - 1
+# Programs write quaternions of length 1, people now and then others; what is far from all of them is damaged.
+_LONGEST = 1e6
 
 
 class ColmapImage(NamedTuple):
@@ -74,10 +77,11 @@ def _sound(model: ColmapModel) -> ColmapModel:
         if image.camera not in model.cameras:
             missing = f"{model.folder}: image {image.name} is of camera {image.camera}, which is missing; add it"
             raise InputError(missing)
-        if not np.linalg.norm(image.quaternion) > 0:
+        length = math.hypot(*image.quaternion)
+        if not 1 / _LONGEST < length < _LONGEST:
             raise InputError(
-                f"{model.folder}: the quaternion of image {image.name} is zero, which is no rotation; let COLMAP write "
-                "the model again"
+                f"{model.folder}: the quaternion of image {image.name} has the length {length:.3g} instead of 1, which "
+                "is no rotation; let COLMAP write the model again"
             )
     for what, ids in (("image", [i.name for i in model.images]), ("point", model.point_ids.tolist())):
         for value, times in Counter(ids).items():
