@@ -219,6 +219,59 @@ def test_what_was_not_used_for_longest_is_let_go(kept, monkeypatch):
     assert [key[3] for key in run._programs] == [(None, 2), (None, 4)]
 
 
+def test_jax_forgets_traces_when_as_many_programs_have_gone_as_are_kept(kept, monkeypatch):
+    monkeypatch.setattr(run, "MOST", 2)
+    monkeypatch.setattr(run, "_gone", 0)
+    traced: list[int] = []
+
+    def seen(x):
+        traced.append(1)
+        return x + 1.0
+
+    other = jax.jit(seen)
+    counts = []
+    for power in range(2, 8):
+        run_compiled(root, (MATRIX, power), {}, "run")
+        other(1.0)
+        counts.append(len(traced))
+    # The fourth program and the sixth are those with which two have gone.
+    assert counts == [1, 1, 1, 2, 2, 3]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only glibc keeps what is freed")
+def test_freed_memory_goes_back():
+    # A process of its own: what others left free would hide it. Pieces below the size that gets pages of its own.
+    done = subprocess.run(
+        [sys.executable, "-c", FREED], cwd=ROOT, capture_output=True, text=True, check=True, timeout=300
+    )
+    kept, returned = map(float, done.stdout.split())
+    assert kept > 150
+    assert returned < 20
+
+
+FREED = """
+import ctypes, os
+from jaxphoto.compiling.freed_memory import return_freed_memory
+
+def resident_mb():
+    return int(open("/proc/self/statm").read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+libc = ctypes.CDLL(None)
+libc.malloc.restype, libc.free.argtypes = ctypes.c_void_p, [ctypes.c_void_p]
+return_freed_memory()
+before = resident_mb()
+pieces = [libc.malloc(60_000) for _ in range(4000)]
+for piece in pieces:
+    ctypes.memset(piece, 1, 60_000)
+# The last stays, so that the rest lies below something.
+for piece in pieces[:-1]:
+    libc.free(piece)
+kept = resident_mb() - before
+return_freed_memory()
+print(kept, resident_mb() - before)
+"""
+
+
 def test_prepared_programs_are_used(kept, monkeypatch):
     seconds: dict[str, float] = {}
     run.prepare(root, (MATRIX, 5), seconds)

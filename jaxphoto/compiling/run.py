@@ -16,6 +16,7 @@ import equinox as eqx
 import jax
 
 from jaxphoto.compiling import store
+from jaxphoto.compiling.freed_memory import return_freed_memory
 from jaxphoto.compiling.options import options_here
 from jaxphoto.compiling.plain_tree import Slot
 
@@ -39,6 +40,8 @@ class _Program(NamedTuple):
 # memory, and Linux gives a process 65,530; the one that finds none left crashes.
 MOST = 100
 _programs: dict[object, _Program] = {}
+_gone = 0
+"""Programs that went since JAX forgot what it traced."""
 _prepared: dict[object, Future[_Program]] = {}
 _workers = ThreadPoolExecutor(max_workers=os.cpu_count(), thread_name_prefix="jaxphoto-compile")
 
@@ -99,11 +102,19 @@ def prepare(function: Any, arguments: tuple, seconds: dict[str, float]) -> bool:
 
 
 def _keep(key: object, program: _Program) -> None:
-    """Keep `program` as the one used last; the one that was not used for longest goes where there are too many."""
+    """Keep `program` as the one used last; the one that was not used for longest goes where there are too many.
+
+    JAX keeps what it traced of each, some MB; it forgets that when as many have gone as are kept.
+    """
+    global _gone
     _programs.pop(key, None)
     _programs[key] = program
     while len(_programs) > MOST:
         del _programs[next(iter(_programs))]
+        _gone += 1
+    if _gone >= MOST:
+        _gone = 0
+        jax.clear_caches()
 
 
 def _key_and_arrays(function: Any, arguments: tuple, thorough: bool) -> tuple[object, list] | None:
@@ -135,6 +146,7 @@ def _program_of(function: Any, arguments: tuple, thorough: bool, anew: bool = Fa
     stored = store.load(key) if key and not anew else None
     if stored is not None:
         program = _Program(stored.compiled, *jax.tree.flatten(stored.skeleton), loaded=True)
+        return_freed_memory()
         return lambda: program
     lowered, skeleton = _lowered(function, arguments)
 
@@ -143,6 +155,7 @@ def _program_of(function: Any, arguments: tuple, thorough: bool, anew: bool = Fa
             program = lowered.compile(compiler_options=options)  # type: ignore[arg-type]
         if key:
             store.save(key, store.Stored(program, skeleton))
+        return_freed_memory()
         return _Program(program, *jax.tree.flatten(skeleton), loaded=False)
 
     return compiled

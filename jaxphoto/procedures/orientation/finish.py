@@ -30,9 +30,9 @@ from jaxphoto.procedures.orientation.related_pairs import Report
 # Gross errors are beyond so many robust standard deviations, and never within the second, in a priori ones.
 _LIMIT, _LEAST_LIMIT = 4.0, 1.0
 # Rounds end where less than this part of the image points, or so few of them, change sides; before the last adjustment
-# they need not come to that.
+# they need not come to that, and before the second look at all matches two are enough.
 _STILL, _FEW = 1e-3, 2
-ROUNDS, LAST_ROUNDS = 6, 20
+FIRST_ROUNDS, ROUNDS, LAST_ROUNDS = 2, 6, 20
 # The images tell a parameter that they know by so much better than anybody beforehand.
 _TOLD = 0.5
 # Cells along the longer side of an image.

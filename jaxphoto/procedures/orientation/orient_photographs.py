@@ -21,7 +21,7 @@ from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.observations import Attitudes, ControlRows, Distances, ImageRows, StationRows
 from jaxphoto.orientation.matches import PairMatches, Tracks, tracks
 from jaxphoto.orientation.rays import ideal_coordinates, unit_rays
-from jaxphoto.procedures.orientation.finish import LAST_ROUNDS, finished, told
+from jaxphoto.procedures.orientation.finish import FIRST_ROUNDS, LAST_ROUNDS, finished, told
 from jaxphoto.procedures.orientation.growing import grown
 from jaxphoto.procedures.orientation.network import Fate, Network, empty_network, meet, sight_of
 from jaxphoto.procedures.orientation.refine import (
@@ -142,7 +142,9 @@ def orient(
     block = _block_of(title, names, sensor, interior, features, sigmas_mm, found)
     calibration = calibration_of(block)
     start = grown(block, related.pairs, calibration, LEAST_POINTS, MOST * loose * c / sigma, report)
-    first = finished(block, start.network, calibration, early(calibration), start.angle, LEAST_POINTS, report)
+    first = finished(
+        block, start.network, calibration, early(calibration), start.angle, LEAST_POINTS, report, FIRST_ROUNDS
+    )
 
     look = second_look(first.network, first.network.interior[CAMERA], features, matches, sigma, first.limit)
     found = tracks(number, list(look.matches))
