@@ -70,7 +70,11 @@ def fly_command(
         str | None, typer.Option(help="From camera to antenna, in metres: right,forward,up of the aircraft.")
     ] = None,
     heights: Annotated[
-        str | None, typer.Option(help="Heights are above the ellipsoid, geoid or take-off, where files do not say it.")
+        str | None,
+        typer.Option(
+            help="Heights are above the ellipsoid, geoid or take-off, where files do not say it; an EPSG code of "
+            "heights (5773: EGM96) has its geoid added."
+        ),
     ] = None,
     control: Annotated[
         Path | None, typer.Option(help="Surveyed points: gcp_list.txt, markers of Metashape as XML, or CSV.")
