@@ -84,6 +84,8 @@ def main() -> None:
             labels = [label.removeprefix(f"interior[{name}].") for label in adjusted.structure.labels]
             sigma = dict(zip(labels, np.asarray(covariance(adjusted).shared_sigma), strict=True))
             row = {"flight": k, "case": case, "outcome": adjusted.outcome.value, "sigma0": float(adjusted.sigma0)}
+            # Of the lens that was drawn: where a flight tells nothing of c, its error is this.
+            row["c_drawn"] = (lens["c_mm"] - float(camera.start.c)) / prior_sigmas(prior, camera.start, sensor)["c_mm"]
             for n in NAMES:
                 value = float(get_parameter(adjusted.unknowns.interior[name], n))
                 row |= {f"{n}_off": value - lens[n], f"{n}_sigma": float(sigma[n])}
@@ -96,6 +98,10 @@ def main() -> None:
         # c off by four standard deviations of the lens.
         ran = [r for r in good if abs(r["c_mm_off"]) > far]
         print(f"{case}: {len(own)} flights, {len(good)} converged, of these {len(ran)} ran away")
+        z = np.array([r["c_drawn"] for r in good])
+        print(
+            f"  c of the lenses inside 95 %: {100 * np.mean(np.abs(z) < 1.96):.1f} %, rms {np.sqrt(np.mean(z**2)):.2f}"
+        )
         for n in NAMES:
             z = np.array([r[f"{n}_off"] / r[f"{n}_sigma"] for r in good])
             sigma = np.median([r[f"{n}_sigma"] for r in good])

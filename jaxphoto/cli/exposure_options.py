@@ -4,7 +4,7 @@ from typing import get_args
 
 from jaxphoto.errors import InputError, quoted
 from jaxphoto.georeferencing.gps import Heights
-from jaxphoto.io.text_tables import finite
+from jaxphoto.io.text_tables import finite, natural
 
 
 def lever_arm_of(text: str | None) -> tuple[float, float, float] | None:
@@ -18,11 +18,17 @@ def lever_arm_of(text: str | None) -> tuple[float, float, float] | None:
     return known[0], known[1], known[2]
 
 
-def heights_of(text: str | None) -> Heights | None:
-    """Above what heights are. Raises InputError for what is none."""
+def heights_of(text: str | None) -> Heights | int | None:
+    """Above what heights are, or the EPSG code of their system. Raises InputError for what is none."""
     for kind in get_args(Heights):
         if text == kind != "unknown":
             return kind
     if text is None:
         return None
-    raise InputError(f"--heights is {quoted(text)}; give ellipsoid, geoid or take-off")
+    code = natural(text.removeprefix("EPSG:"))
+    if code is None:
+        raise InputError(
+            f"--heights is {quoted(text)}; give ellipsoid, geoid, take-off, or the EPSG code of their system (5773 is "
+            "EGM96)"
+        )
+    return code

@@ -70,7 +70,11 @@ def fly_command(
         str | None, typer.Option(help="From camera to antenna, in metres: right,forward,up of the aircraft.")
     ] = None,
     heights: Annotated[
-        str | None, typer.Option(help="Heights are above the ellipsoid, geoid or take-off, where files do not say it.")
+        str | None,
+        typer.Option(
+            help="Heights are above the ellipsoid, geoid or take-off, where files do not say it; an EPSG code of "
+            "heights (5773: EGM96) has its geoid added."
+        ),
     ] = None,
     control: Annotated[
         Path | None, typer.Option(help="Surveyed points: gcp_list.txt, markers of Metashape as XML, or CSV.")
@@ -107,13 +111,11 @@ def fly_command(
         read = told.photographs
         for sentence in told.sentences:
             console.print(plain(sentence), soft_wrap=True)
-        given, placed = None, True
+        given = None
         if surveyed:
             look = target_looker(target, {p.name: p.path for p in read}) if target else None
-            given, own = flight_control(surveyed, control_epsg, [p.name for p in read], [p.gps for p in read], look)
-            epsg = own if epsg is None else epsg
-            # In a local system positions tell nothing.
-            placed = own is not None
+            names, at = [p.name for p in read], [p.gps for p in read]
+            given, epsg = flight_control(surveyed, control_epsg, names, at, look, epsg)
         camera = sensor_and_interior(read, pixel_mm, c_mm)
         distortion = distortion_model(model, camera.sensor)
         compared = photograph_pairs(read, pairs or usual_choice(read))
@@ -137,7 +139,7 @@ def fly_command(
             camera.sensor,
             InteriorOrientation(start.c, start.x_p, start.y_p, distortion),
             KnownOfFlight(
-                {p.name: p.gps if placed else None for p in read},
+                {p.name: p.gps for p in read},
                 {p.name: p.attitude for p in read},
                 epsg,
                 given,

@@ -145,12 +145,13 @@ def _to_place(code: int, vertical: int | None) -> Transformer:
         if not grids:
             raise InputError(
                 f"PROJ knows no way from the heights of EPSG:{vertical} ({heights.name}) to the ellipsoid of "
-                f'EPSG:{code}; convert the heights and write vertical = "ellipsoidal"'
+                f'EPSG:{code}; give them above the ellipsoid (vertical = "ellipsoidal" in block.toml)'
             )
         name = grids[0].short_name
         raise InputError(
             f"the heights of EPSG:{vertical} ({heights.name}) need the geoid {name}, which is not on this computer; "
-            f'get it by "pyproj sync --file {name}", or convert the heights and write vertical = "ellipsoidal"'
+            f'get it by "pyproj sync --file {name}", or give them above the ellipsoid (vertical = "ellipsoidal" in '
+            "block.toml)"
         )
     return group.transformers[0]
 

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxphoto.errors import few
+from jaxphoto.georeferencing.geoid_heights import above_ellipsoid
 from jaxphoto.georeferencing.gps import HEIGHTS, Gps, Heights
 
 Positions = dict[str, Gps | None]
@@ -60,12 +61,15 @@ def plausible_positions(positions: Mapping[str, Gps | None]) -> tuple[Positions,
 
 
 def one_height(
-    positions: Mapping[str, Gps | None], above_takeoff_m: Mapping[str, float | None], wanted: Heights | None = None
+    positions: Mapping[str, Gps | None],
+    above_takeoff_m: Mapping[str, float | None],
+    wanted: Heights | int | None = None,
 ) -> tuple[Positions, list[str]]:
     """The positions with heights above one thing, and what that is in a sentence.
 
-    `wanted` take-off takes the heights that drones note above it; any other says what the files do not. Without it,
-    heights of two kinds are brought together by those above take-off, where photographs have both.
+    `wanted` take-off takes the heights that drones note above it; any other says what the files do not, an EPSG code of
+    heights so that its geoid is added. Without it, heights of two kinds are brought together by those above take-off,
+    where photographs have both. Raises what `above_ellipsoid` does.
     """
     found: Positions = dict(positions)
     known = {n: g for n, g in found.items() if g and g.altitude_m is not None}
@@ -91,7 +95,10 @@ def one_height(
             "is added"
         )
         zero |= dict.fromkeys(relative, own)
-    if wanted is not None:
+    if isinstance(wanted, int):
+        found, more = above_ellipsoid(found, wanted)
+        said += more
+    elif wanted is not None:
         found = {n: g and g._replace(heights=wanted) for n, g in found.items()}
     else:
         found, more = _joined(found, zero)

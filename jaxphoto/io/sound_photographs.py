@@ -20,15 +20,16 @@ def sound_photographs(paths: Sequence[str | Path]) -> tuple[list[Photograph], di
     """The photographs of one camera among files and folders `paths`, and why each other file is left out.
 
     Of a folder all pictures, in the order of their names. Left out, a sentence each: what is no picture or is cut off,
-    a second of the same name, one that is another's copy byte for byte, and those of another size, orientation flag,
-    camera or focal length than most. Raises InputError for what is neither file nor folder, and where nothing is left.
+    a second of the same name, one that is another's copy byte for byte (of the two that with the longer name), and
+    those of another size, orientation flag, camera or focal length than most. Raises InputError for what is neither
+    file nor folder, and where nothing is left.
     """
     files = pictures_in(paths)
     if missing := [file for file in files if not file.is_file()]:
         raise InputError(f"{missing[0]}: there is no such photograph or folder; correct the name")
     left: dict[str, str] = {}
     read: dict[str, Photograph] = {}
-    content: dict[str, str] = {}
+    content: dict[str, Photograph] = {}
     for file in files:
         try:
             photograph = read_photograph(file)
@@ -37,12 +38,18 @@ def sound_photographs(paths: Sequence[str | Path]) -> tuple[list[Photograph], di
             left[str(file)] = str(error)
             continue
         digest = input_file(file).sha256
-        if digest in content:
-            left[str(file)] = f"{file}: it is a copy of {content[digest]}"
-        elif photograph.name in read:
+        twin = content.get(digest)
+        if twin is not None and len(twin.name) <= len(photograph.name):
+            left[str(file)] = f"{file}: it is a copy of {twin.path.name}"
+            continue
+        if photograph.name in read:
             left[str(file)] = f"{file}: {read[photograph.name].path} has the same name; rename one of them"
-        else:
-            content[digest], read[photograph.name] = file.name, photograph
+            continue
+        if twin is not None:
+            # "DJI_0002 (1).jpg" comes before the photograph that tables and marks name.
+            left[str(twin.path)] = f"{twin.path}: it is a copy of {file.name}"
+            del read[twin.name]
+        content[digest] = read[photograph.name] = photograph
     kept = list(read.values())
     for what, of, _ in ONE_CAMERA:
         said = [of(p) for p in kept]

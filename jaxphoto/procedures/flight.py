@@ -126,10 +126,13 @@ def _calibrated(
         oriented = oriented._replace(block=with_known_lens(oriented.block, CAMERA, lens))
     report("adjusting")
     placed, why_not, controlled, no_control = None, "", None, ""
-    try:
-        placed = georeference_photographs(oriented.block, known.positions, known.code, known.attitudes)
-    except (InputError, BlockError) as error:
-        why_not = str(error)
+    if known.control is not None and known.control.local:
+        why_not = "the control is in a local system, in which positions of photographs tell nothing: none is used"
+    else:
+        try:
+            placed = georeference_photographs(oriented.block, known.positions, known.code, known.attitudes)
+        except (InputError, BlockError) as error:
+            why_not = str(error)
     block = placed.block if placed else oriented.block
     if known.control is not None:
         controlled, no_control = controlled_or_why(block, known.control, known.code, report)

@@ -107,6 +107,10 @@ def _findings(part: FlightPart) -> Iterator[Finding]:
         yield Finding(Level.WARNING, text)
 
 
+def _position_sentences(part: FlightPart) -> tuple[str, ...]:
+    return part.placed.sentences if part.placed else (f"positions: {part.why_not}",)
+
+
 def _images(part: FlightPart) -> pd.DataFrame:
     a = part.adjusted
     block, n = a.block, len(a.block.images)
@@ -274,7 +278,7 @@ def _page(
                 "alike": f"Neighbouring rays err alike: sigma_alike is sigma with what the rays say of it times "
                 f"{report.alike:.2g}.",
                 "lens": r.part.lens,
-                "sentences": [*orientation_sentences(report), *(r.part.placed.sentences if r.part.placed else ())],
+                "sentences": [*orientation_sentences(report), *_position_sentences(r.part)],
                 "control": _table(surveyed_points(r.part.controlled), "{:.3g}") if r.part.controlled else "",
                 "said": r.part.controlled.sentences if r.part.controlled else (),
                 "ground": flight_words(r.coverage, r.part.adjusted.block),

@@ -384,7 +384,7 @@ def test_a_block_may_get_another_model(tmp_path):
         (OPENCV.replace("912.25", "-912.25"), "a.yml", "-912.25 and 910.75 pixels cannot be"),
         (OPENCV + "fisheye_model: 1\n", "a.yml", "8 distortion_coefficients; OpenCV's fisheye model has 4"),
         (AGISOFT[:400], "a.xml", "the XML is broken"),
-        (AGISOFT.replace("frame", "fisheye"), "a.xml", "projection 'fisheye' is not known"),
+        (AGISOFT.replace("frame", "spherical"), "a.xml", "projection 'spherical' is not known here; known are frame"),
         (AGISOFT.replace("<f>3268.30117351641</f>", ""), "a.xml", "<f> is missing"),
         (AGISOFT.replace("<width>4032</width>", ""), "a.xml", "<width> or <height> is missing"),
         (AGISOFT.replace("<f>", "<fx>").replace("</f>", "</fx>"), "a.xml", "<fy> is missing; add it"),

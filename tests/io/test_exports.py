@@ -21,7 +21,17 @@ from pyproj import CRS, Proj, Transformer
 from scipy.spatial.transform import Rotation
 
 from jaxphoto.block import Frame
-from jaxphoto.camera import Agisoft, Brown, Equidistant, InteriorOrientation, OpenCv, OpenCvFisheye, Sensor
+from jaxphoto.camera import (
+    Agisoft,
+    Brown,
+    Equidistant,
+    Equisolid,
+    InteriorOrientation,
+    OpenCv,
+    OpenCvFisheye,
+    Sensor,
+    Smac,
+)
 from jaxphoto.collinearity import ExteriorOrientation, project
 from jaxphoto.errors import InputError
 from jaxphoto.io import EXPORTS, AdjustedPhotographs, export
@@ -43,12 +53,16 @@ CAMERAS = {
     "fisheye": InteriorOrientation(
         5.0, 0.031, -0.022, OpenCvFisheye(-0.02, 0.01, -0.003, 0.001), projection=Equidistant()
     ),
+    "agisoft fisheye": InteriorOrientation(
+        5.0, 0.031, -0.022, Agisoft(-0.02, 0.01, -0.003, 0.001, 1e-3, -7e-4, b1=3e-4, b2=-2e-4),
+        projection=Equidistant(),
+    ),
 }  # fmt: skip
 # What each format holds exactly, and is given.
 HELD = [
-    ("metashape", "agisoft"), ("blocksexchange", "brown"), ("opensfm", "opencv"), ("opensfm", "fisheye"),
-    ("nerfstudio", "opencv"), ("nerfstudio", "fisheye"), ("orthority", "opencv"), ("orthority", "rational"),
-    ("orthority", "fisheye"), ("colmap", "rational"),
+    ("metashape", "agisoft"), ("metashape", "agisoft fisheye"), ("metashape", "fisheye"), ("blocksexchange", "brown"),
+    ("opensfm", "opencv"), ("opensfm", "fisheye"), ("nerfstudio", "opencv"), ("nerfstudio", "fisheye"),
+    ("orthority", "opencv"), ("orthority", "rational"), ("orthority", "fisheye"), ("colmap", "rational"),
 ]  # fmt: skip
 NAMES = ("a b.jpg", 'c<&">.jpg', "d,e.JPG", "f.tif")
 _projected = jax.jit(jax.vmap(project, (None, 0, 0)))
@@ -134,6 +148,8 @@ def by_metashape(folder, p):
         matrix = np.array(camera.findtext("transform").split(), float).reshape(4, 4)
         x, y, z = np.linalg.inv(matrix)[:3] @ np.column_stack([chunk, np.ones(len(chunk))]).T
         x, y = x / z, y / z
+        if calibration.get("type") == "fisheye":
+            x, y = np.stack([x, y]) * np.arctan(np.hypot(x, y)) / np.hypot(x, y)
         r2 = x * x + y * y
         q = 1 + get("k1") * r2 + get("k2") * r2**2 + get("k3") * r2**3 + get("k4") * r2**4
         u = x * q + get("p1") * (r2 + 2 * x * x) + 2 * get("p2") * x * y
@@ -314,12 +330,34 @@ def test_a_camera_that_is_fitted_misses_by_no_more_than_is_said(tmp_path):
     assert said.rms_px <= said.max_px
 
 
-def test_a_camera_of_metashape_comes_back(tmp_path):
-    export(photographs("agisoft"), tmp_path / "out", "metashape")
+@pytest.mark.parametrize("camera", ["agisoft", "agisoft fisheye"])
+def test_a_camera_of_metashape_comes_back(tmp_path, camera):
+    export(photographs(camera), tmp_path / "out", "metashape")
     again = read_camera_file(tmp_path / "out" / "cameras.xml")
     assert (again.name, again.sensor) == ("one", SENSOR)
-    leaves = [np.array(jax.tree.leaves(i), float) for i in (again.interior, CAMERAS["agisoft"])]
+    assert type(again.interior.projection) is type(CAMERAS[camera].projection)
+    leaves = [np.array(jax.tree.leaves(i), float) for i in (again.interior, CAMERAS[camera])]
     np.testing.assert_allclose(*leaves, rtol=1e-12, atol=1e-16)
+
+
+@pytest.mark.parametrize("format", EXPORTS)
+def test_every_format_holds_a_camera_says_what_it_loses_or_names_formats_that_have_it(tmp_path, format):
+    """Brown's and SMAC's lens, whose polynomials go the other way, and one that sees beyond 90 degrees."""
+    known, p = EXPORTS[format], photographs("opencv")
+    lenses = {
+        "brown": InteriorOrientation(8.8, 0.031, -0.022, Brown(k1=-2e-4, k2=3e-6, p1=1e-5)),
+        "smac": InteriorOrientation(8.8, 0.031, -0.022, Smac(k0=1e-4, k1=-2e-4, p1=1e-5)),
+        "fisheye": InteriorOrientation(3.0, 0.031, -0.022, projection=Equisolid()),
+    }
+    for name, interior in lenses.items():
+        given = p._replace(cameras={"one": ExportCamera(SENSOR, interior)})
+        if name == "fisheye" and known.plane and not known.fisheye:
+            with pytest.raises(InputError, match=r"fisheye; write one of colmap, .*metashape, .*orthority"):
+                export(given, tmp_path / name, format)
+            assert not (tmp_path / name).exists()
+            continue
+        said = export(given, tmp_path / name, format).cameras["one"]
+        assert (said.max_px == 0) == (known.plane is None) and said.max_px < 0.02, (name, said)
 
 
 def test_angles_on_the_map_are_against_the_lines_of_its_grid(tmp_path):

@@ -3,8 +3,10 @@
 cx and cy run from the image centre, y down. Exported cameras (<document>) hold the same per sensor, with the size of a
 pixel. Files with fx, fy and skew are of PhotoScan before 1.2 and of Agisoft Lens: cx and cy run from the upper left
 corner, f = fy, b1 = fx - fy, b2 = skew, and p1 and p2 are in OpenCV's order.
-Source: Agisoft Metashape User Manual, Appendix D "Camera models"; Agisoft Lens User Manual 0.4; Agisoft's forum, topic
-6437.
+A "fisheye" is the same polynomial on the equidistant projection, (x, y) = theta (X, Y) / |(X, Y)|; since version 2.3 it
+is called equidistant there, beside an equisolid one.
+Source: Agisoft Metashape User Manual, Appendix D "Camera models"; Metashape Expert Manual, "Fisheye and spherical
+sensors"; Agisoft Lens User Manual 0.4; Agisoft's forum, topic 6437.
 """
 
 import xml.etree.ElementTree as ElementTree
@@ -13,12 +15,14 @@ from pathlib import Path
 import jax
 
 from jaxphoto.arrays import on_device
-from jaxphoto.camera import Agisoft, InteriorOrientation, Perspective, Sensor
+from jaxphoto.camera import Agisoft, Equidistant, InteriorOrientation, Perspective, Sensor
 from jaxphoto.errors import quoted
 from jaxphoto.io.cameras.camera_file import CameraFile, CameraModel, CameraSource, joined_notes
 
 PLANE = CameraModel(Agisoft, ("p3", "p4"), Perspective())
-"""What its frame cameras are here."""
+FISHEYE = CameraModel(Agisoft, ("p3", "p4"), Equidistant())
+"""What its cameras are here."""
+_MODELS = {"frame": PLANE, "fisheye": FISHEYE, "equidistant_fisheye": FISHEYE}
 _SCALED = ("b1", "b2")
 _COEFFICIENTS = tuple(name for name in Agisoft.coefficients if name not in _SCALED)
 _KNOWN = ("f", "fx", "fy", "cx", "cy", "skew", *Agisoft.coefficients)
@@ -30,9 +34,9 @@ def recognises(path: Path, text: str) -> bool:
 
 
 def read_agisoft(source: CameraSource) -> CameraFile:
-    """The frame camera of a calibration file, or one sensor of exported cameras.
+    """The camera of a calibration file, or one sensor of exported cameras.
 
-    Raises InputError for a file that is cut off, other projections than "frame", missing elements, and what is no
+    Raises InputError for a file that is cut off, projections that are not known, missing elements, and what is no
     number.
     """
     try:
@@ -42,26 +46,33 @@ def read_agisoft(source: CameraSource) -> CameraFile:
     found = {source.path.stem: (root, None)} if root.tag == "calibration" else _sensors(root)
     name = source.chosen(list(found))
     calibration, pixel = found[name]
-    kind = calibration.findtext("projection") or calibration.get("type") or "frame"
-    if kind.strip() != "frame":
-        raise source.error(f'the projection {quoted(kind.strip())} is not known here; only "frame" is')
+    kind = (calibration.findtext("projection") or calibration.get("type") or "frame").strip()
+    if kind not in _MODELS:
+        raise source.error(f"the projection {quoted(kind)} is not known here; known are {', '.join(_MODELS)}")
     pixel_mm = source.number("pixel_width", pixel) if pixel is not None else None
     sensor, assumed = source.sensor(*_size(source, calibration), pixel_mm)
     values, note = _values(source, calibration, sensor)
     f = values.pop("f")
     x_p, y_p = values.pop("cx") * sensor.pixel_mm, -values.pop("cy") * sensor.pixel_mm
     distortion = Agisoft(**{k: v / f if k in _SCALED else v for k, v in values.items()})
-    interior = InteriorOrientation(f * sensor.pixel_mm, x_p, y_p, distortion)
+    projection = _MODELS[kind].projection
+    interior = InteriorOrientation(f * sensor.pixel_mm, x_p, y_p, distortion, projection=projection)
     return CameraFile(name, sensor, jax.tree.map(on_device, interior), None, joined_notes(note, assumed))
 
 
 def write_agisoft(path: Path, name: str, sensor: Sensor, interior: InteriorOrientation) -> None:
-    """Write a camera with the distortion `Agisoft` as a calibration file; what is 0 is left out, as there."""
+    """Write a camera that is a `PLANE` or `FISHEYE` as a calibration file; what is 0 is left out, as there."""
     root = ElementTree.Element("calibration")
-    for key, text in (("projection", "frame"), ("width", str(sensor.width_px)), ("height", str(sensor.height_px))):
+    texts = {"projection": kind_of(interior), "width": str(sensor.width_px), "height": str(sensor.height_px)}
+    for key, text in texts.items():
         ElementTree.SubElement(root, key).text = text
     add_values(root, sensor, interior)
     path.write_text(xml_text(root), "utf-8")
+
+
+def kind_of(interior: InteriorOrientation) -> str:
+    """What its files call a `PLANE` or `FISHEYE`."""
+    return next(kind for kind, model in _MODELS.items() if type(model.projection) is type(interior.projection))
 
 
 def add_values(calibration: ElementTree.Element, sensor: Sensor, interior: InteriorOrientation) -> None:

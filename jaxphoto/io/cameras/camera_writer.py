@@ -35,7 +35,7 @@ class _WriteFormat(NamedTuple):
 _FORMATS = {
     "opencv": _WriteFormat(write_open_cv, open_cv.PLANE, open_cv.FISHEYE, (".yml", ".yaml", ".json")),
     "colmap": _WriteFormat(write_colmap, colmap.PLANE, colmap.FISHEYE, ()),
-    "agisoft": _WriteFormat(agisoft.write_agisoft, agisoft.PLANE, None, (".xml",)),
+    "agisoft": _WriteFormat(agisoft.write_agisoft, agisoft.PLANE, agisoft.FISHEYE, (".xml",)),
     "smac": _WriteFormat(write_smac_report, CameraModel(Smac, (), Perspective()), None, (".txt", ".rpt")),
     "block": _WriteFormat(write_block_camera, None, None, (".toml",)),
 }

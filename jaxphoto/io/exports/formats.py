@@ -26,8 +26,8 @@ from jaxphoto.writing import check_folder, whole_folder
 
 
 class ExportFormat(NamedTuple):
-    """A format: its writer, what its perspective cameras and its fisheyes are (None: those of perspective cameras, any
-    camera where there are none either), whether it is in map coordinates, and what it is in a line."""
+    """A format: its writer, what its perspective cameras and its fisheyes are (None: it has no such, and where it has
+    neither any camera goes), whether it is in map coordinates, and what it is in a line."""
 
     write: Callable[[AdjustedPhotographs, Path], None]
     plane: CameraModel | None
@@ -49,7 +49,9 @@ EXPORTS = {
         write_text_model, colmap.PLANE, colmap.FISHEYE, False, "COLMAP model: cameras, images, points3D as text"
     ),
     "colmap-binary": ExportFormat(write_binary_model, colmap.PLANE, colmap.FISHEYE, False, "the same, binary"),
-    "metashape": ExportFormat(write_metashape, agisoft.PLANE, None, False, "cameras of Agisoft Metashape, XML"),
+    "metashape": ExportFormat(
+        write_metashape, agisoft.PLANE, agisoft.FISHEYE, False, "cameras of Agisoft Metashape, XML"
+    ),
     "opensfm": ExportFormat(
         write_open_sfm, open_sfm.PLANE, open_sfm.FISHEYE, False, "reconstruction of OpenSfM, as in WebODM"
     ),
@@ -113,9 +115,16 @@ def _converted(photographs: AdjustedPhotographs, name: str, format: str) -> Conv
     """A camera as one that the format has."""
     sensor, interior = photographs.cameras[name]
     known = EXPORTS[format]
-    model = known.plane if type(interior.projection) is Perspective else known.fisheye or known.plane
-    if model is None:
+    model = known.plane if type(interior.projection) is Perspective else known.fisheye
+    if known.plane is None:
         return Conversion(interior, 0.0, 0.0, 1.0)
+    if model is None:
+        # A polynomial on the plane would miss by hundreds of pixels where the fisheye looks aside.
+        others = ", ".join(key for key, other in EXPORTS.items() if other.fisheye)
+        raise InputError(
+            f"camera {name} cannot be written as {format}, whose cameras are perspective, because it is a fisheye; "
+            f"write one of {others}, or undistort its photographs"
+        )
     try:
         return converted(interior, model.distortion, sensor, model.lacks, model.projection)
     except ValueError as error:

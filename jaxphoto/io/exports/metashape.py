@@ -15,7 +15,7 @@ from pyproj import CRS
 
 from jaxphoto.block import Frame
 from jaxphoto.georeferencing.map_frame import map_system
-from jaxphoto.io.cameras.agisoft import add_values, xml_text
+from jaxphoto.io.cameras.agisoft import add_values, kind_of, xml_text
 from jaxphoto.io.exports.adjusted_photographs import AdjustedPhotographs, ExportCamera, downwards
 
 FILE = "cameras.xml"
@@ -46,14 +46,14 @@ def write_metashape(photographs: AdjustedPhotographs, folder: Path) -> None:
 
 
 def _add_sensor(sensors: ElementTree.Element, number: int, name: str, camera: ExportCamera) -> None:
-    given = camera.sensor
-    sensor = ElementTree.SubElement(sensors, "sensor", id=str(number), label=name, type="frame")
+    given, kind = camera.sensor, kind_of(camera.interior)
+    sensor = ElementTree.SubElement(sensors, "sensor", id=str(number), label=name, type=kind)
     size = {"width": str(given.width_px), "height": str(given.height_px)}
     ElementTree.SubElement(sensor, "resolution", size)
     values = {"pixel_width": given.pixel_mm, "pixel_height": given.pixel_mm, "focal_length": float(camera.interior.c)}
     for key, value in values.items():
         ElementTree.SubElement(sensor, "property", name=key, value=repr(value))
-    calibration = ElementTree.SubElement(sensor, "calibration", {"type": "frame", "class": "adjusted"})
+    calibration = ElementTree.SubElement(sensor, "calibration", {"type": kind, "class": "adjusted"})
     ElementTree.SubElement(calibration, "resolution", size)
     add_values(calibration, given, camera.interior)
 

@@ -25,22 +25,23 @@ def located(
     *,
     code: int | None = None,
     arm: Arm | None = None,
-    heights: Heights | None = None,
+    heights: Heights | int | None = None,
 ) -> Assigned:
     """The photographs where the files `given` and those in `folders` say they were taken, with heights above one thing.
 
     `code` is the EPSG system of map coordinates in tables, `arm` the lever arm from camera to antenna (m: right,
     forward, up of the aircraft), `heights` says above what the heights are that do not say it themselves; "take-off"
-    takes those above it. Every source has a sentence, and so has every file in a folder that cannot be read. Raises
-    InputError for such a file that is given.
+    takes those above it, an EPSG code of heights adds its geoid. Every source has a sentence, and so has every file in
+    a folder that cannot be read. Raises InputError for such a file that is given, and for a geoid that is not at hand.
     """
-    files, said = [read_exposures(path, code, heights or "unknown") for path in given], []
+    kind: Heights = "geoid" if isinstance(heights, int) else heights or "unknown"
+    files, said = [read_exposures(path, code, kind) for path in given], []
     known = {path.resolve() for path in given}
     for path in (path for folder in folders if folder.is_dir() for path in exposure_files(folder)):
         if path.resolve() in known:
             continue
         try:
-            files.append(read_exposures(path, code, heights or "unknown"))
+            files.append(read_exposures(path, code, kind))
         except InputError as error:
             said.append(f"{error}; the file is not used")
     assigned = with_exposures(photographs, files, arm)

@@ -30,6 +30,8 @@ class FlightControl(NamedTuple):
     """All photographs of the flight that can be read."""
     looker: Looker | None
     """What finds targets in them."""
+    local: bool
+    """Whether the points are in Cartesian metres of no map, where positions of photographs tell nothing."""
 
 
 def flight_control(
@@ -38,11 +40,12 @@ def flight_control(
     images: Iterable[str],
     positions: Iterable[Gps | None],
     looker: Looker | None = None,
+    code: int | None = None,
 ) -> tuple[FlightControl, int | None]:
-    """Control that may fit photographs, and the EPSG code of the map system of its points, None for none.
+    """Control that may fit photographs, and the EPSG code of the flight: `code`, else that of the points' map system.
 
-    Raises InputError where no mark names one of the `images`, where the system is not told or cannot be, and where the
-    points lie far from the `positions`, with what would fit.
+    Raises InputError where no mark names one of the `images`, where the system is not told or cannot be, where it is a
+    local one though a `code` is given, and where the points lie far from the `positions`, with what would fit.
     """
     known = [gps for gps in positions if gps is not None]
     place = np.median([(g.longitude_deg, g.latitude_deg) for g in known], axis=0) if known else None
@@ -56,9 +59,15 @@ def flight_control(
             f"{control.marks.places[0]}: no mark is in one of the {len(names)} photographs ({few(names)}), but in "
             f"{few(list(dict.fromkeys(control.marks.image)))}; use the names of their files"
         )
-    return FlightControl(control, system, names, looker), new_code(
-        control.points, told
-    ) if told.crs is not None else None
+    if told.crs is None:
+        if code is not None:
+            raise InputError(
+                f"{control.points.file} is in a local system, and EPSG:{code} is given for the block; leave out the "
+                "code, or give the control in a map system"
+            )
+        return FlightControl(control, system, names, looker, local=True), None
+    own = new_code(control.points, told) if code is None else code
+    return FlightControl(control, system, names, looker, local=False), own
 
 
 def controlled_or_why(

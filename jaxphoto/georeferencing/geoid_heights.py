@@ -1,0 +1,45 @@
+"""Recorded heights above a geoid brought to the ellipsoid, by the grid that PROJ has of it."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from jaxphoto.errors import InputError, quoted
+from jaxphoto.georeferencing.gps import Gps
+from jaxphoto.georeferencing.map_frame import MapFrame
+
+_WGS84 = 4326
+
+
+def above_ellipsoid(positions: Mapping[str, Gps | None], vertical: int) -> tuple[dict[str, Gps | None], list[str]]:
+    """The positions with heights above the ellipsoid, and a sentence of what was added.
+
+    Heights that are not above it by their files are those of the EPSG system `vertical`: h = H + N, N the height of its
+    geoid above the ellipsoid (m). Raises InputError for a code that is no system of heights, for a geoid that is not on
+    this computer, and for a place that it does not reach.
+    """
+    found = dict(positions)
+    names, rows = [], []
+    for name, gps in found.items():
+        if gps and gps.altitude_m is not None and gps.heights != "ellipsoid":
+            names.append(name)
+            rows.append((gps.longitude_deg, gps.latitude_deg, gps.altitude_m))
+    # A wrong code is wrong where no height needs it, too.
+    system = MapFrame(_WGS84, vertical, (0.0, 0.0, 0.0))
+    if not names:
+        return found, [f"no height needs the geoid of EPSG:{vertical}: all are above the ellipsoid by their files"]
+    given = np.array(rows)
+    height = system.place(given)[:, 2]
+    for k in np.flatnonzero(~np.isfinite(height))[:1]:
+        raise InputError(
+            f"the geoid of the heights EPSG:{vertical} does not reach the photograph {quoted(names[k])} at "
+            f"{rows[k][0]:.4f}, {rows[k][1]:.4f} degrees; give the system of heights of that place"
+        )
+    for name, h in zip(names, height.tolist(), strict=True):
+        if gps := found[name]:
+            found[name] = gps._replace(altitude_m=h, heights="ellipsoid")
+    added = height - given[:, 2]
+    return found, [
+        f"the heights of {len(names)} photographs are taken as those of EPSG:{vertical}; its geoid, {added.min():+.2f} "
+        f"to {added.max():+.2f} m, is added"
+    ]

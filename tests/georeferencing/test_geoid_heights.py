@@ -1,0 +1,75 @@
+"""Heights above a geoid, brought to the ellipsoid by a grid of PROJ: a made one, as no grids are in the package."""
+
+import os
+import struct
+
+import numpy as np
+import pytest
+from pyproj import datadir
+
+from jaxphoto.cli.exposure_options import heights_of
+from jaxphoto.errors import InputError
+from jaxphoto.georeferencing import map_frame
+from jaxphoto.georeferencing.gps import Gps
+from jaxphoto.georeferencing.recorded_positions import one_height
+
+EGM96, GRID = 5773, "us_nga_egm96_15.tif"
+FOLDERS = [f for f in (*datadir.get_data_dir().split(os.pathsep), datadir.get_user_data_dir()) if os.path.isdir(f)]
+HERE = Gps(55.7, 13.3, 100.0)
+# 30 m at 55 N, 13 E, and as steep as a plane of the grid keeps exactly.
+UNDULATION_M = 30 + 0.5 * 0.7 + 0.25 * 0.3
+
+
+@pytest.fixture
+def geoid(tmp_path):
+    """The grid of EGM96 under the name that PROJ looks for, from 50 N, 5 E to 60 N, 20 E: NOAA's GTX, big-endian."""
+    latitude, longitude = np.meshgrid(np.arange(50, 61.0), np.arange(5, 21.0), indexing="ij")
+    n = (30 + 0.5 * (latitude - 55) + 0.25 * (longitude - 13)).astype(">f4")
+    (tmp_path / "egm96_15.gtx").write_bytes(struct.pack(">4d2i", 50, 5, 1, 1, *n.shape) + n.tobytes())
+    before = datadir.get_data_dir()
+    datadir.append_data_dir(str(tmp_path))
+    map_frame._to_place.cache_clear()
+    yield
+    datadir.set_data_dir(before)
+    map_frame._to_place.cache_clear()
+
+
+def test_the_geoid_is_added_to_what_is_not_above_the_ellipsoid(geoid):
+    given = {"a": HERE, "b": HERE._replace(heights="geoid"), "c": HERE._replace(heights="ellipsoid"), "d": None}
+    found, said = one_height(given, {}, EGM96)
+    assert [g and g.altitude_m for g in found.values()] == pytest.approx([100 + UNDULATION_M] * 2 + [100.0, None])
+    assert {g.heights for g in found.values() if g} == {"ellipsoid"} and said[0] == "heights are above the ellipsoid"
+    assert said[1:] == [
+        f"the heights of 2 photographs are taken as those of EPSG:5773; its geoid, {UNDULATION_M:+.2f} to "
+        f"{UNDULATION_M:+.2f} m, is added"
+    ]
+    assert "all are above the ellipsoid by their files" in one_height({"c": given["c"]}, {}, EGM96)[1][1]
+
+
+def test_heights_above_take_off_among_them_are_brought_to_them_first(geoid):
+    above = {"a": 60.0, "b": 61.0, "c": 60.5}
+    given = {n: HERE._replace(altitude_m=40 + h) for n, h in above.items()} | {"c": HERE._replace(altitude_m=60.5)}
+    found, _ = one_height(given, above, EGM96)
+    assert [g.altitude_m for g in found.values()] == pytest.approx([40 + UNDULATION_M + h for h in above.values()])
+
+
+def test_a_place_that_the_geoid_does_not_reach_is_named(geoid):
+    with pytest.raises(InputError, match=r"EPSG:5773 does not reach the photograph 'far' at 13.3000, 20.0000 degrees"):
+        one_height({"a": HERE, "far": HERE._replace(latitude_deg=20.0)}, {}, EGM96)
+
+
+@pytest.mark.skipif(any(GRID in os.listdir(folder) for folder in FOLDERS), reason="PROJ has the grid here")
+def test_a_geoid_that_is_not_here_is_refused_with_how_to_get_it():
+    with pytest.raises(InputError, match=rf'geoid {GRID}, which is not on this computer; get it by "pyproj sync'):
+        one_height({"a": HERE}, {}, EGM96)
+
+
+def test_a_code_of_no_heights_is_refused():
+    with pytest.raises(InputError, match=r"EPSG:25832 .* is no system of heights"):
+        one_height({"a": HERE._replace(heights="ellipsoid")}, {}, 25832)
+
+
+def test_what_the_option_takes():
+    assert [heights_of(text) for text in ("take-off", "5773", "EPSG:7837", None)] == ["take-off", 5773, 7837, None]
+    with pytest.raises(InputError, match="--heights is 'sea'; give ellipsoid, geoid, take-off, or the EPSG code"):
+        heights_of("sea")
