@@ -48,7 +48,8 @@ def html_of(element: Heading | Paragraph | Rows | Pictures) -> Markup:
         return Markup('<p class="{}">{}</p>' if element.kind else "<p{}>{}</p>").format(element.kind, element.text)
     if isinstance(element, Rows):
         head = any(element.columns)
-        kinds = [Markup(' class="text"') if head and _is_text(c) else "" for c in zip(*element.rows, strict=True)]
+        of = ("number", "text")
+        kinds = [Markup(' class="{}"').format(of[_is_text(c)]) if head else "" for c in zip(*element.rows, strict=True)]
         kinds += [""] * (len(element.columns) - len(kinds))
         return Markup(_ROWS.render(columns=element.columns, rows=element.rows, head=head, kinds=kinds))
     return Markup('<div class="pictures">{}</div>').format(Markup("").join(map(_image, element.panels)))

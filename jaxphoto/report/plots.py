@@ -146,9 +146,10 @@ def _of_camera(tables: Tables, camera: str) -> tuple[np.ndarray, np.ndarray]:
 
 def _over_format(axes: Axes, sensor: Sensor, xy: np.ndarray, v: np.ndarray, title: str) -> None:
     """Arrows (2 x n, mm) at places of the format."""
-    key = _round_key(v)
+    # Thousands of thin arrows, or a hundred that are seen.
+    key, width = _round_key(v), 0.0015 if v.shape[1] > _ARROWS / 10 else 0.003
     in_px = f" = {key / sensor.pixel_mm:.2g} px" if sensor.pixel_mm else ""
-    _vectors(axes, xy, v, key, 0.06 * sensor.width_mm, f"{1000 * key:g} µm{in_px}", width=0.0015, key_at=-0.11)
+    _vectors(axes, xy, v, key, 0.06 * sensor.width_mm, f"{1000 * key:g} µm{in_px}", width=width, key_at=-0.11)
     w, h = sensor.width_mm / 2, sensor.height_mm / 2
     axes.plot([-w, w, w, -w, -w], [-h, -h, h, h, -h], color="0.4", lw=0.8)
     axes.set(xlabel="x [mm]", ylabel="y [mm]")

@@ -34,7 +34,7 @@ _STRETCHED = 0.01
 # by more than `_MOVED` of its own; smaller ones are found in many observations, and change nothing.
 _VISIBLE, _MOVED = 0.25, 1.0
 # Of a pattern's square sum, what one term must explain to be named.
-_MOST_OF_IT = 0.5
+MOST_OF_IT = 0.5
 # An observation whose detectable error is more than this times its sigma is checked by hardly anything (r < 0.17).
 _HIDDEN = 10.0
 
@@ -135,7 +135,7 @@ def _trends(tables: Tables) -> Iterator[Finding]:
             f"({t.size / t.pattern.sigma:.2g} of their sigma)"
         )
         matters = t.size > _VISIBLE * t.pattern.sigma
-        if t.hints and t.hints[0].share > _MOST_OF_IT:
+        if t.hints and t.hints[0].share > MOST_OF_IT:
             likely = t.hints[0]
             said += f", {100 * likely.share:.0f} % of it {_told(t)}"
             path = max(likely.moves, key=lambda path: abs(likely.moves[path]), default="")

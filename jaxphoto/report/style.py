@@ -23,8 +23,10 @@ thead th:first-child { background: var(--head) }
   white-space: nowrap }
 .names td, .text { text-align: left } .names td { overflow-wrap: anywhere }
 img { max-width: 100%; background: #fff }
-.pictures { display: flex; flex-wrap: wrap; align-items: flex-start; gap: .8rem; margin: .5rem 0 1rem }
-.pictures img { width: 29.5rem; height: auto }
+.number { white-space: nowrap }
+.pictures { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(20rem, 100%), 1fr)); gap: .8rem;
+  align-items: start; margin: .5rem 0 1rem }
+.pictures img { width: 100%; max-width: 29.5rem; height: auto }
 .good { color: var(--good) } .bad { color: var(--bad) }
 .verdict { font-size: 17px; padding: .4rem .8rem; border-radius: 4px }
 .verdict.green { background: var(--green); color: var(--on-green) }
@@ -37,5 +39,5 @@ img { max-width: 100%; background: #fff }
 @media print { :root { color-scheme: light } body { max-width: none; margin: 0; padding: 0; font-size: 10.5px }
   table { font-size: 9px } th, td { padding: .15rem .35rem; overflow-wrap: anywhere } .wide { overflow: visible }
   h2, h3 { break-after: avoid } tr, img, .alarm, .warning, .information { break-inside: avoid }
-  .pictures img { width: 48% } .verdict { font-size: 12px } }
+  .pictures { grid-template-columns: 1fr 1fr } .verdict { font-size: 12px } }
 """

@@ -1,6 +1,7 @@
 """The page of a flight says what its adjustment has, in an order that a stranger can follow."""
 
 import re
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -15,7 +16,7 @@ from jaxphoto.report.flight.camera import interior_rows
 from jaxphoto.report.flight.links import strength_classes
 from jaxphoto.report.flight.page import flight_page
 from jaxphoto.report.flight.points import point_table
-from jaxphoto.report.flight.positions import draw_plan, offset_statistics
+from jaxphoto.report.flight.positions import draw_plan, offset_statistics, positions_section
 from jaxphoto.report.flight.time_line import time_line
 from jaxphoto.report.plots import draw_density
 from tests.blocks import BROWN
@@ -37,6 +38,13 @@ def test_the_verdict_is_first_then_linked_contents_of_all_sections(page):
     assert links == re.findall(r'<h2 id="([^"]+)">([^<]+)</h2>', page) and len(dict(links)) == len(links) > 15
 
 
+def test_the_documentation_lists_the_sections_of_the_page(page):
+    told = re.findall(r'<h2 id="[^"]+">([^<]+)</h2>', page)
+    document = (Path(__file__).parents[2] / "docs" / "flight_report.md").read_text(encoding="utf-8")
+    listed = re.findall(r"^\| ([^|]+) \|", document.split("## ")[0], re.MULTILINE)[2:]
+    assert [t for t in told if t not in ("Part 2", "Files")] == listed
+
+
 def test_every_picture_says_what_it_shows(page):
     pictures = re.findall(r"<img [^>]*?>", page)
     alternative = [re.match(r'<img alt="([^"]{15,})" src="data:image/png;base64,', p) for p in pictures]
@@ -50,7 +58,7 @@ def test_lost_photographs_and_what_was_computed_how_are_named(page):
     # An option that was not given is none.
     assert "jaxphoto fly, with features 500<" in page
     n = len(part_report().images)
-    assert f"<td>{n} of {2 * n + 2}</td>" in page or f'<td class="text">{n} of {2 * n + 2}</td>' in page
+    assert ["photographs oriented", *[f"{n} of {2 * n + 2}"] * 2] in rows
 
 
 def test_the_camera_is_where_it_began_and_where_it_came_to():
@@ -82,6 +90,16 @@ def test_steps_of_white_offsets_scatter_as_they_do_and_of_drift_less():
     table = pd.DataFrame({"image": [str(k) for k in range(n)], "dX_m": white, "dY_m": drift, "dZ_m": white})
     found = offset_statistics(table).set_index("axis")
     assert found.loc["X", "step_rms"] == pytest.approx(0.1, rel=0.1) and found.loc["Y", "step_rms"] < 0.01
+
+
+def test_residuals_of_positions_are_held_against_their_sigmas():
+    report = part_report()
+    (rows,) = (e.rows for e in positions_section(report) if isinstance(e, Rows) and "residuals of" in e.columns)
+    a = report.part.adjusted
+    w, axis = np.abs(np.asarray(a.residuals["stations"])), a.block.stations.axis
+    for k, row in enumerate(rows):
+        assert row[:3] == ("stations", "XYZ"[k], str((axis == k).sum()))
+        assert row[5:] == tuple(f"{100 * (w[axis == k] <= limit).mean():.0f} %" for limit in (1, 2, 3))
 
 
 def test_arrows_of_positions_are_their_offsets_and_those_left_out_are_told_apart():
@@ -136,7 +154,8 @@ def test_columns_of_words_are_read_from_the_left_and_numbers_from_the_right():
     html = html_of(
         Rows(("name", "n", "why"), (("a", "-1.5 px", "2 of them"), ("b", "", "cut off"), ("c", "3", "blank")))
     )
-    assert html.count('class="text"') == 8 and '<td>-1.5 px</td><td class="text">2 of them</td>' in html
+    assert html.count('class="text"') == 8 and html.count('class="number"') == 4
+    assert '<td class="number">-1.5 px</td><td class="text">2 of them</td>' in html
 
 
 def test_symbols_keep_their_letter():

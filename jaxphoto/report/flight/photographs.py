@@ -35,6 +35,10 @@ def exterior_section(report: PartReport) -> Iterator[Element]:
                      table["image"].iloc[k]))  # fmt: skip
     yield Rows(("standard deviation of", "unit", "least", "median", "largest", "photograph"), tuple(rows))
     yield Paragraph("A posteriori. All orientations are in result/exterior.csv.")
+    further = report.tables.georeferencing
+    if len(further):
+        cells = ((p["parameter"], f"{p['value']:.6g}", f"{p['sigma']:.2g}") for p in further.to_dict("records"))
+        yield Rows(("estimated besides", "value", "sigma"), tuple(cells))
 
 
 _EXTERIOR = ("X_m", "Y_m", "Z_m", "omega_deg", "phi_deg", "kappa_deg")

@@ -96,7 +96,7 @@ def _kept(report: PartReport) -> Iterator[Element]:
     """How residuals of what was recorded keep to its standard deviations."""
     residuals = report.tables.residuals
     rows = []
-    for group in ("camera_stations", "attitudes"):
+    for group in ("stations", "attitudes"):
         own = residuals[residuals["group"] == group]
         for axis, of in own.groupby("axis", sort=False):
             w = (of["residual"] / of["sigma"]).abs()

@@ -13,6 +13,7 @@ from jaxphoto.report.findings import p_words
 from jaxphoto.report.flight.part import PartReport
 from jaxphoto.report.flight.positions import name_ends
 from jaxphoto.report.plots import draw_density, draw_mean_residuals, drawn
+from jaxphoto.report.residual_findings import MOST_OF_IT
 from jaxphoto.statistics import LEVEL, MOST_PARTS, residual_spread
 
 if TYPE_CHECKING:
@@ -60,7 +61,8 @@ def pattern_sentence(report: PartReport, camera: str) -> str:
     size = f"{trend.size / pixel:.2g} px ({trend.size / trend.pattern.sigma:.2g} of the sigma of an image point)"
     if trend.p_value >= LEVEL:
         return f"The mean field is noise: the test for a pattern over the format has {p_words(trend.p_value, 2)}."
-    hint = f", {100 * trend.hints[0].share:.0f} % of it a change of {trend.hints[0].term.name}" if trend.hints else ""
+    most = next((h for h in trend.hints[:1] if h.share > MOST_OF_IT), None)
+    hint = f", {100 * most.share:.0f} % of it {most.term.name}" if most else ", and no single usual term is most of it"
     return (
         f"The mean field is no noise ({p_words(trend.p_value)}, {trend.freedom} degrees of freedom): the camera model "
         f"lacks {size}{hint}. Neighbouring rays that err alike make p too small; the size in pixels says whether it "
