@@ -23,8 +23,8 @@ thead th:first-child { background: var(--head) }
   white-space: nowrap }
 .names td, .text { text-align: left } .names td { overflow-wrap: anywhere }
 img { max-width: 100%; background: #fff }
-.number { white-space: nowrap }
-.pictures { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(20rem, 100%), 1fr)); gap: .8rem;
+td.number { white-space: nowrap }
+.pictures { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(23rem, 100%), 1fr)); gap: .8rem;
   align-items: start; margin: .5rem 0 1rem }
 .pictures img { width: 100%; max-width: 29.5rem; height: auto }
 .good { color: var(--good) } .bad { color: var(--bad) }

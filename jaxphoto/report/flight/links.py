@@ -78,7 +78,7 @@ def draw_network(axes: Axes, report: PartReport, links: ImageLinks, weak: list[W
         label = "weakest" if k == 0 else None
         axes.plot(*station[[w.first, w.second]].T, "--", color="tab:red", lw=1.2, label=label)
     axes.plot(*station.T, "o", ms=3, color="tab:blue")
-    axes.legend(fontsize=6, title="common points", title_fontsize=6)
+    axes.legend(fontsize=6, title="common points", title_fontsize=6, loc="upper left", bbox_to_anchor=(1.0, 1.0))
     axes.set(xlabel=f"X [{report.unit}]", ylabel=f"Y [{report.unit}]")
     axes.set_title("photographs and their common points", loc="left", fontsize=9)
     axes.set_aspect("equal", adjustable="datalim")

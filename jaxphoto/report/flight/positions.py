@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 AXES = ("X", "Y", "Z")
 # Photographs that are named in the plan.
 _NAMED = 3
+# Of the largest offset that is used.
+_ROOM = 1.25
 # Standard deviations within which a normal error lies with these probabilities.
 _WITHIN = ((1, 68.3), (2, 95.4), (3, 99.7))
 
@@ -40,15 +42,19 @@ def positions_section(report: PartReport) -> Iterator[Element]:
     yield offset_rows(offset_statistics(used))
     yield Paragraph(
         "rms of steps is that of the differences from one photograph to the next over the square root of 2: where it "
-        "is much less than sd, offsets drift more than they jump."
+        "is much less than sd, offsets drift more than they jump. The pictures show offsets less their mean."
     )
     yield Pictures(
         (
             DocumentPicture(
-                partial(draw_plan, report=report), f"Arrows of recorded minus adjusted positions, {_worst(used)}", 4.2
+                partial(draw_plan, report=report),
+                f"Arrows of recorded minus adjusted positions less their mean; with it {_worst(used)}",
+                4.2,
             ),
             DocumentPicture(
-                partial(draw_height, report=report), "Bars of recorded minus adjusted heights by photograph", 4.2
+                partial(draw_height, report=report),
+                "Bars of recorded minus adjusted heights less their mean, by photograph",
+                4.2,
             ),
         )
     )
@@ -105,25 +111,33 @@ def _kept(report: PartReport) -> Iterator[Element]:
             rows.append((group.replace("_", " "), str(axis), str(len(of)), f"{rms:.3g} {unit}",
                          f"{of['sigma'].median():.3g} {unit}", *inside))  # fmt: skip
     if rows:
-        within = tuple(f"within {k} sigma ({p:.0f} %)" for k, p in _WITHIN)
+        within = tuple(f"within {k} sigma ({p:g} %)" for k, p in _WITHIN)
         yield Rows(("residuals of", "axis", "n", "rms", "sigma (median)", *within), tuple(rows))
         yield Paragraph("In brackets the share of a normal error; sigma is that of the adjustment, by its weights.")
+
+
+def less_mean(report: PartReport) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Offsets (images x 3, m) less the mean of those used, which may be a shift of the receiver and would hide the
+    rest; which photographs have one, and which are used."""
+    d = report.images[["dX_m", "dY_m", "dZ_m"]].to_numpy(float)
+    has = np.isfinite(d).all(axis=1)
+    used = has & (report.images["position"] == "used").to_numpy()
+    return d - (d[used].mean(axis=0) if used.any() else 0.0), has, used
 
 
 def draw_plan(axes: Axes, report: PartReport) -> None:
     """Stations in plan with arrows, those left out in red; the largest are named."""
     table, station = report.images, np.asarray(report.part.adjusted.unknowns.exterior.position)
-    d = table[["dX_m", "dY_m"]].to_numpy()
-    has = np.isfinite(d).all(axis=1)
-    used = has & (table["position"] == "used").to_numpy()
+    d, has, used = less_mean(report)
+    d = d[:, :2]
     axes.plot(station[:, 0], station[:, 1], "+", color="0.4", ms=5)
     if has.any():
         size = float(f"{max(np.median(np.hypot(*d[has].T)), 1e-3):.0e}")
-        wide = max(np.ptp(station[:, :2], axis=0).max(), 1e-9)
+        scale = 15 * size / max(np.ptp(station[:, :2], axis=0).max(), 1e-9)
         for rows, colour, label in ((used, "tab:blue", "used"), (has & ~used, "tab:red", "left out")):
             if rows.any():
                 arrows = axes.quiver(
-                    *station[rows, :2].T, *d[rows].T, angles="xy", scale_units="xy", scale=15 * size / wide,
+                    *station[rows, :2].T, *d[rows].T, angles="xy", scale_units="xy", scale=scale,
                     color=colour, width=0.005, label=label,
                 )  # fmt: skip
         axes.quiverkey(arrows, 0.75, 1.04, size, f"{size:g} m", labelpos="E")
@@ -131,22 +145,25 @@ def draw_plan(axes: Axes, report: PartReport) -> None:
             axes.legend(fontsize=7)
         for k in np.argsort(-np.where(has, np.hypot(*np.nan_to_num(d).T), -1.0))[: min(_NAMED, has.sum())]:
             axes.annotate(drawn(table["image"].iloc[k]), (station[k, 0], station[k, 1]), fontsize=6, color="0.3")
+        axes.update_datalim(station[used, :2] + d[used] / scale)
+        axes.autoscale_view()
     axes.set(xlabel="X [m]", ylabel="Y [m]")
-    axes.set_title("recorded minus adjusted, in plan", loc="left", fontsize=9)
+    axes.set_title("in plan, less the mean", loc="left", fontsize=9)
     axes.set_aspect("equal", adjustable="datalim")
 
 
 def draw_height(axes: Axes, report: PartReport) -> None:
     """Bars in height, by photograph."""
-    table = report.images
-    dz, used = table["dZ_m"].to_numpy(float), (table["position"] == "used").to_numpy()
-    number = np.arange(len(table))
-    has = np.isfinite(dz)
-    axes.bar(number[has], dz[has], color=np.where(used[has], "tab:blue", "tab:red"))
+    d, has, used = less_mean(report)
+    number = np.flatnonzero(has)
+    axes.bar(number, d[has, 2], color=np.where(used[has], "tab:blue", "tab:red"))
     axes.axhline(0, color="0.4", lw=0.6)
+    if used.any() and (most := _ROOM * np.abs(d[used, 2]).max()) > 0:
+        # Those left out may be tens of metres off: their bars are cut.
+        axes.set_ylim(-most, most)
     axes.set(ylabel="dZ [m]")
-    name_ends(axes, table["image"])
-    axes.set_title("recorded minus adjusted, in height", loc="left", fontsize=9)
+    name_ends(axes, report.images["image"])
+    axes.set_title("in height, less the mean", loc="left", fontsize=9)
 
 
 def name_ends(axes: Axes, images: pd.Series) -> None:

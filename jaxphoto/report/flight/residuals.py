@@ -76,9 +76,11 @@ def _spread(report: PartReport) -> Rows:
     rows = []
     for s in residual_spread(report.part.adjusted):
         factor, unit = (1 / sensor.pixel_mm, "px") if s.unit == "mm" else (1.0, s.unit)
+        # What free unknowns take up is zero but for rounding.
+        mean = s.mean if abs(s.mean) > 1e-6 * s.rmse else 0.0
         if unit == "rad":
             factor, unit = 180 / np.pi, "deg"
-        values = (f"{factor * v:.3g} {unit}" for v in (s.mean, s.rmse, s.max_abs))
+        values = (f"{factor * v:.3g} {unit}" for v in (mean, s.rmse, s.max_abs))
         rows.append((s.group.replace("_", " "), s.axis, str(s.n), *values))
     return Rows(("residuals of", "axis", "n", "mean", "rms", "largest"), tuple(rows))
 

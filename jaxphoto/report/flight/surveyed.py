@@ -39,8 +39,9 @@ def surveyed_section(report: PartReport) -> Iterator[Element]:
         )
         rows.append((what, str(len(off)), *spread))
     yield Rows(("points", "n", *(f"d{axis}: mean / sd / rms [m]" for axis in "XYZ")), tuple(rows))
-    yield from (Paragraph(as_sentence(s)) for s in found.sentences)
-    yield from map(Paragraph, accuracy_sentences(tables.tested_accuracy))
+    for sentences in (found.sentences, accuracy_sentences(tables.tested_accuracy)):
+        if sentences:
+            yield Paragraph(" ".join(map(as_sentence, sentences)))
     if len(tables.check_points):
         yield Pictures(
             tuple(

@@ -13,7 +13,7 @@ from jaxphoto.errors import few
 from jaxphoto.procedures.rolling_shutter import Moment, velocities
 from jaxphoto.report.document import DocumentPicture, Element, Heading, Paragraph, Pictures
 from jaxphoto.report.flight.part import PartReport
-from jaxphoto.report.flight.positions import AXES
+from jaxphoto.report.flight.positions import AXES, less_mean
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -70,8 +70,8 @@ def time_section(report: PartReport, taken: Mapping[str, Moment]) -> Iterator[El
     line = time_line(report, taken)
     yield Paragraph(" ".join(_sentences(line, report.part.adjusted.block.images)))
     panels = []
-    if report.images["position"].ne("none").any():
-        alt = "Recorded minus adjusted positions by axis, in the order of the photographs"
+    if report.images["position"].eq("used").any():
+        alt = "Recorded minus adjusted positions less their mean by axis, in the order of the photographs"
         panels.append(DocumentPicture(partial(draw_offsets, line=line, report=report), alt, _HEIGHT))
     panels.append(
         DocumentPicture(
@@ -121,11 +121,10 @@ def _sentences(line: TimeLine, images: tuple[str, ...]) -> Iterator[str]:
 
 
 def draw_offsets(axes: Axes, line: TimeLine, report: PartReport) -> None:
-    """Recorded minus adjusted positions that are used, by axis."""
-    table = report.images.iloc[line.order]
-    used = (table["position"] == "used").to_numpy()
-    values = {a: np.where(used, table[f"d{a}_m"].to_numpy(float), np.nan) for a in AXES}
-    _draw(axes, line, values, "recorded - adjusted [m]")
+    """Recorded minus adjusted positions that are used, less their mean, by axis."""
+    d, _, used = less_mean(report)
+    shown = np.where(used[:, None], d, np.nan)[line.order]
+    _draw(axes, line, dict(zip(AXES, shown.T, strict=True)), "offset less mean [m]")
 
 
 def _draw(axes: Axes, line: TimeLine, values: Mapping[str, np.ndarray], what: str) -> None:
