@@ -37,7 +37,10 @@ td.number { white-space: nowrap }
 @media (max-width: 32rem) { body { margin: .5rem auto; padding: 0 .6rem } th, td { padding: .15rem .35rem }
   .names th { white-space: normal } h1 { font-size: 1.4rem } }
 @media print { :root { color-scheme: light } body { max-width: none; margin: 0; padding: 0; font-size: 10.5px }
-  table { font-size: 9px } th, td { padding: .15rem .35rem; overflow-wrap: anywhere } .wide { overflow: visible }
+  table { font-size: 9px } th, td { padding: .15rem .35rem } th, td.text { overflow-wrap: anywhere }
+  table:has(th:nth-child(9)) { font-size: 7.5px } table:has(th:nth-child(13)) { font-size: 6.5px }
+  table:has(th:nth-child(9)) :is(th, td) { padding: .1rem .2rem } .wide { overflow: visible }
+  th:first-child, td:first-child { position: static }
   h2, h3 { break-after: avoid } tr, img, .alarm, .warning, .information { break-inside: avoid }
   .pictures { grid-template-columns: 1fr 1fr } .verdict { font-size: 12px } }
 """

@@ -105,7 +105,7 @@ def test_residuals_of_positions_are_held_against_their_sigmas():
 def test_arrows_of_positions_are_their_offsets_and_those_left_out_are_told_apart():
     axes = Figure().subplots()
     draw_plan(axes, part_report())
-    used, left = (child for child in axes.get_children() if isinstance(child, Quiver))
+    left, used = (child for child in axes.get_children() if isinstance(child, Quiver))
     mean = OFFSETS_M[:3, :2].mean(axis=0)
     np.testing.assert_allclose(np.stack([used.U, used.V], 1), OFFSETS_M[:3, :2] - mean)
     np.testing.assert_allclose(np.stack([left.U, left.V], 1), OFFSETS_M[3:, :2] - mean)

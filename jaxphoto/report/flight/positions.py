@@ -34,10 +34,10 @@ def positions_section(report: PartReport) -> Iterator[Element]:
         return
     table = report.images
     used = table[table["position"] == "used"]
+    n = table["position"].value_counts()
     yield Paragraph(
-        f"Recorded minus adjusted, X east, Y north, Z up, of the {len(used)} positions that are used; "
-        f"{int((table['position'] == 'left out').sum())} were left out because they contradict the others, and "
-        f"{int((table['position'] == 'none').sum())} photographs have none."
+        f"Recorded minus adjusted, X east, Y north, Z up. Positions used: {len(used)}; left out because they "
+        f"contradict the others: {n.get('left out', 0)}; photographs without one: {n.get('none', 0)}."
     )
     yield offset_rows(offset_statistics(used))
     yield Paragraph(
@@ -134,12 +134,11 @@ def draw_plan(axes: Axes, report: PartReport) -> None:
     if has.any():
         size = float(f"{max(np.median(np.hypot(*d[has].T)), 1e-3):.0e}")
         scale = 15 * size / max(np.ptp(station[:, :2], axis=0).max(), 1e-9)
-        for rows, colour, label in ((used, "tab:blue", "used"), (has & ~used, "tab:red", "left out")):
-            if rows.any():
-                arrows = axes.quiver(
-                    *station[rows, :2].T, *d[rows].T, angles="xy", scale_units="xy", scale=scale,
-                    color=colour, width=0.005, label=label,
-                )  # fmt: skip
+        for rows, colour, label in ((has & ~used, "tab:red", "left out"), (used, "tab:blue", "used")):
+            arrows = axes.quiver(
+                *station[rows, :2].T, *d[rows].T, angles="xy", scale_units="xy", scale=scale,
+                color=colour, width=0.005, label=label,
+            )  # fmt: skip
         axes.quiverkey(arrows, 0.75, 1.04, size, f"{size:g} m", labelpos="E")
         if (has & ~used).any():
             axes.legend(fontsize=7)

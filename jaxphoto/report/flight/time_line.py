@@ -91,7 +91,7 @@ def time_section(report: PartReport, taken: Mapping[str, Moment]) -> Iterator[El
         panels.append(
             DocumentPicture(
                 lambda axes: _draw(axes, line, {"speed": line.speed}, "speed [m/s]"),
-                f"Speed, {np.nanmedian(line.speed):.2g} m/s in the median", _HEIGHT,
+                f"Speed, {np.nanmedian(line.speed):.3g} m/s in the median", _HEIGHT,
             )
         )  # fmt: skip
     yield Pictures(tuple(panels))
@@ -115,7 +115,7 @@ def _sentences(line: TimeLine, images: tuple[str, ...]) -> Iterator[str]:
     yield f"{what} of more than {_GAP:g} times that (grey): {few(gaps, '; ')}." if gaps else "There are no gaps."
     if np.isfinite(line.speed).any():
         low, middle, high = np.nanpercentile(line.speed, [0, 50, 100])
-        yield f"Speed {middle:.2g} m/s in the median, {low:.2g} to {high:.2g} m/s, from adjusted positions."
+        yield f"Speed {middle:.3g} m/s in the median, {low:.3g} to {high:.3g} m/s, from adjusted positions."
     if without:
         yield f"Of {without} photographs no time is known; they are not shown."
 
