@@ -109,7 +109,7 @@ def ours(arguments: argparse.Namespace) -> dict:
     from jaxphoto.io.sound_photographs import sound_photographs
     from jaxphoto.procedures.calibration import distortion_model
     from jaxphoto.procedures.flight import KnownOfFlight, MatchedPart, calibrate_flight
-    from jaxphoto.report.flight import report_of, write_flight
+    from jaxphoto.report.flight import FlightSource, report_of, write_flight
 
     read, spoilt = sound_photographs(_files(arguments))
     camera = sensor_and_interior(read)
@@ -164,7 +164,7 @@ def ours(arguments: argparse.Namespace) -> dict:
         clock.step("adjustment")
         reports = [report_of(part) for part in flight.parts]
         with tempfile.TemporaryDirectory() as folder:
-            write_flight(flight, reports, spoilt, Path(folder))
+            write_flight(flight, reports, spoilt, Path(folder), FlightSource())
         clock.step("report")
         oriented = [part.oriented.report for part in flight.parts]
         found |= {

@@ -1,5 +1,6 @@
 """`jaxphoto fly`: a folder of photographs to a georeferenced block, its adjustment and one page about both."""
 
+import datetime
 from contextlib import ExitStack
 from pathlib import Path
 from threading import Thread
@@ -32,7 +33,7 @@ from jaxphoto.procedures.calibration import distortion_model
 from jaxphoto.procedures.control.of_flight import flight_control
 from jaxphoto.procedures.flight import KnownOfFlight, MatchedPart, calibrate_flight
 from jaxphoto.report import Level, prepare_pictures
-from jaxphoto.report.flight import block_folder, report_of, write_flight, write_part_orientation
+from jaxphoto.report.flight import FlightSource, block_folder, report_of, write_flight, write_part_orientation
 from jaxphoto.report.terminal import plain
 from jaxphoto.writing import check_folder, whole_folder
 
@@ -134,6 +135,7 @@ def fly_command(
             progress=StepsLeft(errors, status, FEWER_PAIRS),
         )
         names, start = [p.name for p in read], camera.interior
+        taken = {p.name: (p.taken.clock_s, p.taken.resolution_s) for p in read if p.taken}
         flight = calibrate_flight(
             [_part(names, group, matched.of(group)) for group in matched.parts],
             camera.sensor,
@@ -144,7 +146,7 @@ def fly_command(
                 epsg,
                 given,
                 known_lens(read, camera, distortion) if lens_prior else None,
-                {p.name: (p.taken.clock_s, p.taken.resolution_s) for p in read if p.taken} if rolling_shutter else None,
+                taken if rolling_shutter else None,
             ),
             status.update,
         )
@@ -172,7 +174,17 @@ def fly_command(
         status.update(f"writing {out}")
         with whole_folder(out) as work:
             write_photograph_files({p.name: p.path.name for p in read}, work)
-            verdict = write_flight(flight, reports, spoilt, work, told.sentences, signed.told, signed.write)
+            source = FlightSource(
+                told.sentences,
+                camera.origin,
+                start,
+                taken,
+                signed.conditions,
+                signed.inputs,
+                signed.told,
+                datetime.date.today().isoformat(),
+            )
+            verdict = write_flight(flight, reports, spoilt, work, source, signed.write)
             for number, part in enumerate(flight.parts, 1):
                 with whole_block(part.adjusted.block, work / block_folder(number)) as folder:
                     write_part_orientation(part, folder)

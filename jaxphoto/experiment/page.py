@@ -20,11 +20,12 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _PAGE = """<!DOCTYPE html>
-<html lang="en"><head><meta charset="utf-8"><title>{{ title }}</title><style>{{ style }}
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{{ title }}</title><style>{{ style }}
 body { max-width: 86rem } td, th { white-space: nowrap } th { font-weight: 600 } .tables td, .tables th { line-height: 1.3; padding: .2rem .4rem }
-.no { background: #fbe3e0 } .yes { background: #e4f3e6 } .chip { padding: 0 .5em; border-radius: 3px }
-.ours { font-weight: 600 } .spread, .paper { color: #777 } .spread { font-size: 90% }
-ol.notes { margin: 0 0 1.5rem; font-size: 13px; color: #555 } sup { color: #777; font-size: 75% }
+.no { background: var(--red) } .yes { background: var(--green) } .chip { padding: 0 .5em; border-radius: 3px }
+.ours { font-weight: 600 } .spread, .paper { color: var(--grey) } .spread { font-size: 90% }
+ol.notes { margin: 0 0 1.5rem; font-size: 13px; color: var(--grey) } sup { color: var(--grey); font-size: 75% }
 </style></head><body>
 <h1>{{ title }}</h1>
 <p>{% if judged %}<b>{{ good }} of {{ judged }}</b> printed values for which a tolerance is promised are within it.
@@ -59,7 +60,8 @@ Small numbers at cells and headings refer to the notes below the table.</p>
 
 
 _INDEX = """<!DOCTYPE html>
-<html lang="en"><head><meta charset="utf-8"><title>Experiments</title><style>{{ style }}</style></head><body>
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
+<title>Experiments</title><style>{{ style }}</style></head><body>
 <h1>Experiments</h1>
 <table><tr><th>experiment</th><th>within</th><th>of the values promised</th></tr>
 {% for row in rows %}<tr><td><a href="{{ row.name }}.html">{{ row.title }}</a></td><td>{{ row.good }}</td><td>{{ row.judged }}</td></tr>

@@ -2,7 +2,7 @@
 
 from jaxphoto.report.boresight import print_boresight, write_boresight
 from jaxphoto.report.findings import Finding, Level, Verdict
-from jaxphoto.report.page import STYLE, report_page
+from jaxphoto.report.page import report_page
 from jaxphoto.report.plots import (
     check_points_figure,
     correlation_figure,
@@ -14,6 +14,7 @@ from jaxphoto.report.plots import (
 )
 from jaxphoto.report.results import summary_of, write_results
 from jaxphoto.report.snooped import left_out_table, snooped_findings
+from jaxphoto.report.style import STYLE
 from jaxphoto.report.tables import Tables
 from jaxphoto.report.terminal import print_adjustment, print_warning
 from jaxphoto.report.verdict import verdict_of

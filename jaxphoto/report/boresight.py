@@ -10,14 +10,15 @@ from rich.console import Console
 from rich.text import Text
 
 from jaxphoto.procedures import Step
-from jaxphoto.report.page import STYLE
 from jaxphoto.report.results import versions, write_results, write_summary
+from jaxphoto.report.style import STYLE
 from jaxphoto.report.tables import Tables
 from jaxphoto.report.verdict import verdict_of
 from jaxphoto.writing import whole_folder
 
 _PAGE = """<!DOCTYPE html>
-<html lang="en"><head><meta charset="utf-8"><title>{{ title }}</title><style>{{ style }}</style></head><body>
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{{ title }}</title><style>{{ style }}</style></head><body>
 <h1>{{ title }}</h1>
 <p class="{{ 'good' if good else 'bad' }}"><b>{{ verdict }}</b></p>
 {% for step in steps %}

@@ -18,7 +18,9 @@ from jaxphoto.report.certificate_figures import draw_correlations, draw_curve, d
 from jaxphoto.report.certified import Certified
 from jaxphoto.report.change import change_verdict
 from jaxphoto.report.document import Document, DocumentPicture, Element, Heading, Paragraph, Pictures, Rows
+from jaxphoto.report.findings import as_sentence
 from jaxphoto.stability import LEVEL, NORMAL_95, Method, change, distortion_curve, format_sigma, image_grid
+from jaxphoto.statistics.correlation import high_pairs
 from jaxphoto.writing.inputs import digest_of_all
 
 _COLUMNS, _ROWS = 15, 11
@@ -90,7 +92,7 @@ def _method(given: Certified) -> Iterator[Element]:
     of = given.summary
     n = of.get("n_observations", {})
     counts = ", ".join(f"{v} of {k.replace('_', ' ')}" for k, v in n.items() if k != "total" and v)
-    options = ", ".join(f"{k} {_word(v)}" for k, v in dict(of.get("method", {})).items())
+    options = ", ".join(f"{k} {option_word(v)}" for k, v in dict(of.get("method", {})).items())
     versions = ", ".join(f"{k} {v}" for k, v in dict(of.get("versions", {})).items())
     distortion, projection = given.interior.distortion.name, given.interior.projection.name
     yield _names(
@@ -195,12 +197,7 @@ def _correlations(given: Certified) -> Iterator[Element]:
     free = np.flatnonzero(sigma > 0)
     names = [parameter_names(given.interior)[k] for k in free]
     rho = given.covariance[np.ix_(free, free)] / sigma[free, None] / sigma[free]
-    high = [
-        f"{names[i]} and {names[j]} {rho[i, j]:+.3f}"
-        for i in range(len(free))
-        for j in range(i)
-        if abs(rho[i, j]) > _HIGH
-    ]
+    high = [f"{a} and {b} {r:+.3f}" for a, b, r in high_pairs(names, rho, _HIGH)]
     said = f"Above {_HIGH}: {', '.join(high)}." if high else f"None is above {_HIGH}."
     yield Pictures(
         (DocumentPicture(lambda axes: draw_correlations(axes, names, rho), f"Matrix of correlations. {said}", 3.6),)
@@ -226,7 +223,7 @@ def _stability(given: Certified) -> Iterator[Element]:
     found = change(last.interior, given.interior, points, (last.covariance, widened))
     yield Paragraph(f"Compared with {last.name} (first: that, second: this).")
     for sentence in change_verdict(found, given.sensor):
-        yield Paragraph(f"{sentence[0].upper()}{sentence[1:]}.")
+        yield Paragraph(as_sentence(sentence))
     offset = found.offset_mm / given.sensor.pixel_mm
     yield Pictures(
         (
@@ -335,7 +332,8 @@ def _names(*rows: tuple[str, str]) -> Rows:
     return Rows(("", ""), rows)
 
 
-def _word(value: Any) -> str:
+def option_word(value: Any) -> str:
+    """An option as a person says it."""
     if value is None or isinstance(value, bool):
         return {None: "none", True: "yes", False: "no"}[value]
     return str(value)

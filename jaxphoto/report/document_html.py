@@ -8,24 +8,12 @@ from jinja2 import Environment
 from markupsafe import Markup
 
 from jaxphoto.report.document import Document, DocumentPicture, Heading, Paragraph, Pictures, Rows
-from jaxphoto.report.page import STYLE
 from jaxphoto.report.plots import new_figure
+from jaxphoto.report.style import STYLE
 
 WIDTH_INCHES = 4.8
 # Pictures are drawn finer than screens show them: for print, and for screens of many pixels.
 _DPI = 200
-MORE_STYLE = """\
-html { overflow-wrap: anywhere } table { overflow-wrap: normal } nav a { margin-right: 1rem; white-space: nowrap }
-.pictures { display: flex; flex-wrap: wrap; gap: .8rem; margin: .5rem 0 1rem }
-.pictures img { width: 29.5rem; height: auto }
-.names th { background: none; font-weight: normal; color: #555; white-space: nowrap } .names td { text-align: left }
-h2 { margin-top: 2rem; border-bottom: 1px solid #ccc } code { font-size: 12px }
-@media (max-width: 32rem) { body { margin: .5rem auto; padding: 0 .6rem } th, td { padding: .15rem .35rem }
-  h1 { font-size: 1.4rem } }
-@media print { body { max-width: none; margin: 0; font-size: 10.5px } table { font-size: 9px } nav { display: none }
-  h2, h3 { break-after: avoid } tr, img { break-inside: avoid } .pictures img { width: 48% }
-  .wide { overflow: visible } }
-"""
 _PAGE = """<!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
 <title>{{ title }}</title><style>{{ style }}</style></head><body>
@@ -35,10 +23,13 @@ _PAGE = """<!DOCTYPE html>
 </body></html>
 """
 _HTML = Environment(autoescape=True)
+# A number, with a unit or what it is good to.
+_NUMBER = re.compile(r"[-+]?[\d.]+(e[-+]?\d+)?([ ,/)]|$)")
 _ROWS = _HTML.from_string(
     '<div class="wide"><table{% if not head %} class="names"{% endif %}>{% if head %}<thead><tr>{% for c in columns %}'
-    "<th>{{ c }}</th>{% endfor %}</tr></thead>{% endif %}<tbody>{% for row in rows %}<tr>{% for cell in row %}"
-    "{% if loop.first and not head %}<th>{{ cell }}</th>{% else %}<td>{{ cell }}</td>{% endif %}{% endfor %}</tr>"
+    "<th{{ kinds[loop.index0] }}>{{ c }}</th>{% endfor %}</tr></thead>{% endif %}<tbody>{% for row in rows %}<tr>"
+    "{% for cell in row %}{% if loop.first and not head %}<th>{{ cell }}</th>{% else %}"
+    "<td{{ kinds[loop.index0] }}>{{ cell }}</td>{% endif %}{% endfor %}</tr>"
     "{% endfor %}</tbody></table></div>"
 )
 
@@ -46,8 +37,7 @@ _ROWS = _HTML.from_string(
 def html_page(document: Document) -> str:
     """The document with its pictures inside."""
     elements = [html_of(element) for element in document.elements]
-    style = Markup(STYLE + MORE_STYLE)
-    return _HTML.from_string(_PAGE).render(title=document.title, style=style, elements=elements, foot=document.foot)
+    return _HTML.from_string(_PAGE).render(title=document.title, style=STYLE, elements=elements, foot=document.foot)
 
 
 def html_of(element: Heading | Paragraph | Rows | Pictures) -> Markup:
@@ -57,8 +47,18 @@ def html_of(element: Heading | Paragraph | Rows | Pictures) -> Markup:
     if isinstance(element, Paragraph):
         return Markup('<p class="{}">{}</p>' if element.kind else "<p{}>{}</p>").format(element.kind, element.text)
     if isinstance(element, Rows):
-        return Markup(_ROWS.render(columns=element.columns, rows=element.rows, head=any(element.columns)))
+        head = any(element.columns)
+        of = ("number", "text")
+        kinds = [Markup(' class="{}"').format(of[_is_text(c)]) if head else "" for c in zip(*element.rows, strict=True)]
+        kinds += [""] * (len(element.columns) - len(kinds))
+        return Markup(_ROWS.render(columns=element.columns, rows=element.rows, head=head, kinds=kinds))
     return Markup('<div class="pictures">{}</div>').format(Markup("").join(map(_image, element.panels)))
+
+
+def _is_text(column: tuple[str, ...]) -> bool:
+    """Whether most cells of a column begin with no number: they are read from the left."""
+    told = [cell for cell in column if cell]
+    return sum(_NUMBER.match(cell) is None for cell in told) > len(told) / 2
 
 
 def contents(headings: list[str]) -> Markup:

@@ -66,3 +66,15 @@ class Verdict(NamedTuple):
     def texts(self) -> list[str]:
         """The sentences alone."""
         return [f.text for f in self.findings]
+
+
+def as_sentence(text: str) -> str:
+    """A finding as it stands among others on a page: with a capital, but for symbols such as c, and a full stop."""
+    first = text.split(maxsplit=1)[0] if text.strip() else ""
+    begun = text if len(first) == 1 or "_" in first else f"{text[:1].upper()}{text[1:]}"
+    return begun if begun.endswith((".", "!", "?")) else f"{begun}."
+
+
+def p_words(p_value: float, digits: int = 1) -> str:
+    """The p-value of a test; what is too small for a number is no zero."""
+    return f"p = {p_value:.{digits}g}" if p_value > 0 else "p < 1e-300"

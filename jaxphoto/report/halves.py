@@ -14,15 +14,16 @@ from rich.console import Console
 
 from jaxphoto.procedures.halves import Halves
 from jaxphoto.report.maps import format_maps, png_of
-from jaxphoto.report.page import STYLE
 from jaxphoto.report.results import versions, write_summary
+from jaxphoto.report.style import STYLE
 from jaxphoto.writing import whole_folder
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _PAGE = """<!DOCTYPE html>
-<html lang="en"><head><meta charset="utf-8"><title>{{ title }}</title><style>{{ style }}</style></head><body>
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{{ title }}</title><style>{{ style }}</style></head><body>
 <h1>{{ title }}</h1>
 {% for sentence in verdict %}<p>{{ sentence }}</p>{% endfor %}
 <img alt="maps over the format" src="{{ picture }}">

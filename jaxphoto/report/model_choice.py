@@ -15,16 +15,17 @@ from rich.console import Console
 from rich.table import Table
 
 from jaxphoto.procedures.model_choice import ModelChoice
-from jaxphoto.report.page import STYLE
 from jaxphoto.report.plots import new_figure
 from jaxphoto.report.results import versions, write_summary
+from jaxphoto.report.style import STYLE
 from jaxphoto.writing import whole_folder
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _PAGE = """<!DOCTYPE html>
-<html lang="en"><head><meta charset="utf-8"><title>{{ title }}</title><style>{{ style }}</style></head><body>
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{{ title }}</title><style>{{ style }}</style></head><body>
 <h1>{{ title }}</h1>
 {% for sentence in verdict %}<p><b>{{ sentence }}</b></p>{% endfor %}
 <h2>Models</h2>{{ models }}

@@ -20,26 +20,16 @@ from jaxphoto.report.plots import (
     residuals_figure,
 )
 from jaxphoto.report.positional_accuracy import accuracy_sentences
+from jaxphoto.report.style import STYLE
 from jaxphoto.report.tables import Tables
 from jaxphoto.statistics import LEAST_CHECKED
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-STYLE = """\
-body { font: 15px/1.45 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: #222 }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; margin: .5rem 0 1.5rem; font-size: 13px }
-th, td { padding: .2rem .7rem; border-bottom: 1px solid #ddd; text-align: right } th { background: #f4f4f4 }
-th:first-child, td:first-child { text-align: left } img { max-width: 100% } .wide { overflow-x: auto }
-.good { color: #176b2c } .bad { color: #a11 }
-.verdict { font-size: 17px; padding: .4rem .8rem; border-radius: 4px }
-.verdict.green { background: #e2f2e5; color: #124d20 } .verdict.amber { background: #fdf0d5; color: #6b4700 }
-.verdict.red { background: #fbe0e0; color: #7d0d0d }
-.alarm, .warning, .information { border-left: 4px solid #89a; padding-left: .6rem; margin: .4rem 0 }
-.alarm { border-color: #a11 } .warning { border-color: #d90 }
-"""
 _PAGE = """<!DOCTYPE html>
-<html lang="en"><head><meta charset="utf-8"><title>{{ title }}</title><style>{{ style }}</style></head><body>
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{{ title }}</title><style>{{ style }}</style></head><body>
 <h1>{{ title }}</h1>
 <p class="verdict {{ verdict.colour }}"><b>{{ verdict.headline }}</b></p>
 {% for f in verdict.findings %}<p class="{{ f.level.name.lower() }}">{{ f.text }}</p>{% endfor %}

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jaxphoto.camera import Sensor
 from jaxphoto.errors import printable
 from jaxphoto.report.tables import Tables
 
@@ -84,7 +85,9 @@ def residuals_figure(tables: Tables, camera: str) -> Figure:
         one_in = -(-n // _ARROWS)
         shown = np.union1d(np.arange(0, n, one_in), np.argsort(np.hypot(*v))[-_LARGEST:])
         xy, v, title = xy[:, shown], v[:, shown], f"{title}: 1 in {one_in}, and the largest {_LARGEST}"
-    return _over_format(tables, camera, xy, v, title)
+    figure, ((axes,),) = _panels(6.4, 5.0)
+    _over_format(axes, tables.adjusted.block.sensors[camera], xy, v, title)
+    return figure
 
 
 # Cells of the mean residuals along the longer side of the format; fewer residuals than these have no mean worth a look.
@@ -93,20 +96,45 @@ _CELLS, _FEW = 12, 5
 
 def mean_residuals_figure(tables: Tables, camera: str) -> Figure:
     """Means of one camera's residuals by cell of its format: what all its images have in common."""
+    figure, ((axes,),) = _panels(6.4, 5.0)
+    draw_mean_residuals(axes, tables, camera)
+    return figure
+
+
+def draw_mean_residuals(axes: Axes, tables: Tables, camera: str) -> None:
+    """The same in a panel."""
     xy, v = _of_camera(tables, camera)
     sensor = tables.adjusted.block.sensors[camera]
+    cell, centres = _cells(sensor, xy)
+    n = np.bincount(cell, minlength=centres.shape[1])
+    mean = np.stack([np.bincount(cell, one, centres.shape[1]) for one in v]) / np.maximum(n, 1)
+    shown = n >= max(1, min(_FEW, n.max()))
+    title = f"mean residuals by cell, camera {drawn(camera)}"
+    _over_format(axes, sensor, centres[:, shown], mean[:, shown], title)
+
+
+def draw_density(axes: Axes, tables: Tables, camera: str) -> None:
+    """How many image points of one camera lie in each cell of its format, all images together."""
+    xy, _ = _of_camera(tables, camera)
+    sensor = tables.adjusted.block.sensors[camera]
+    cell, centres = _cells(sensor, xy)
+    across = len(np.unique(centres[0]))
+    number = np.bincount(cell, minlength=centres.shape[1]).reshape(-1, across)
+    w, h = sensor.width_mm / 2, sensor.height_mm / 2
+    shown = axes.imshow(number, origin="lower", extent=(-w, w, -h, h), cmap="cividis", vmin=0)
+    axes.figure.colorbar(shown, ax=axes, shrink=0.8)
+    axes.set(xlabel="x [mm]", ylabel="y [mm]")
+    axes.set_title("image points by cell of the format, all images", loc="left", fontsize=9)
+
+
+def _cells(sensor: Sensor, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of image points (2 x n, mm) the number of the cell of the format, and the centres of all cells (2 x cells, mm),
+    row by row from below."""
     size = np.array([sensor.width_mm, sensor.height_mm])[:, None]
     across, down = np.maximum(1, np.round(_CELLS * size[:, 0] / size.max())).astype(int)
     column, row = np.clip((xy / size + 0.5) * [[across], [down]], 0, [[across - 1], [down - 1]]).astype(int)
-    cell = row * across + column
-    n = np.bincount(cell, minlength=across * down)
-    mean = np.stack([np.bincount(cell, one, across * down) for one in v]) / np.maximum(n, 1)
-    centres = np.stack(
-        [np.tile(np.arange(across) + 0.5, down) / across, np.repeat(np.arange(down) + 0.5, across) / down]
-    )
-    shown = n >= max(1, min(_FEW, n.max()))
-    title = f"mean residuals of camera {drawn(camera)}, {n[shown].sum()} image points in {shown.sum()} cells"
-    return _over_format(tables, camera, ((centres - 0.5) * size)[:, shown], mean[:, shown], title)
+    places = [np.tile(np.arange(across) + 0.5, down) / across, np.repeat(np.arange(down) + 0.5, across) / down]
+    return row * across + column, (np.stack(places) - 0.5) * size
 
 
 def _of_camera(tables: Tables, camera: str) -> tuple[np.ndarray, np.ndarray]:
@@ -116,16 +144,17 @@ def _of_camera(tables: Tables, camera: str) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(a.values.xy)[:, mine], (np.asarray(a.residuals.image) * np.asarray(a.values.sigma_xy))[:, mine]
 
 
-def _over_format(tables: Tables, camera: str, xy: np.ndarray, v: np.ndarray, title: str) -> Figure:
-    sensor, key = tables.adjusted.block.sensors[camera], _round_key(v)
-    figure, ((axes,),) = _panels(6.4, 5.0)
-    _vectors(axes, xy, v, key, 0.06 * sensor.width_mm, f"{1000 * key:g} µm", width=0.0015, above=0.03)
+def _over_format(axes: Axes, sensor: Sensor, xy: np.ndarray, v: np.ndarray, title: str) -> None:
+    """Arrows (2 x n, mm) at places of the format."""
+    # Thousands of thin arrows, or a hundred that are seen.
+    key, width = _round_key(v), 0.0015 if v.shape[1] > _ARROWS / 10 else 0.003
+    in_px = f" = {key / sensor.pixel_mm:.2g} px" if sensor.pixel_mm else ""
+    _vectors(axes, xy, v, key, 0.06 * sensor.width_mm, f"{1000 * key:g} µm{in_px}", width=width, key_at=-0.11)
     w, h = sensor.width_mm / 2, sensor.height_mm / 2
     axes.plot([-w, w, w, -w, -w], [-h, -h, h, h, -h], color="0.4", lw=0.8)
     axes.set(xlabel="x [mm]", ylabel="y [mm]")
     axes.set_title(title, loc="left", fontsize=10)
     axes.set_aspect("equal")
-    return figure
 
 
 def check_points_figure(adjustments: Mapping[str, Tables]) -> Figure:
@@ -133,32 +162,42 @@ def check_points_figure(adjustments: Mapping[str, Tables]) -> Figure:
 
     One line for each of `adjustments`, which are named; all arrows have one scale, so they can be compared.
     """
-    found = {
-        name: tables.check_points[["dX_m", "dY_m", "dZ_m"]].to_numpy(float).T for name, tables in adjustments.items()
-    }
-    key = _round_key(np.concatenate([d.ravel() for d in found.values()]))
+    key = _round_key(np.concatenate([_discrepancies(tables).ravel() for tables in adjustments.values()]))
     extent = np.max([np.ptp(of.adjusted.unknowns.exterior.position, axis=0) for of in adjustments.values()], axis=0)
     high = 4.2 * float(np.clip(extent[1] / max(extent[0], 1e-9), 0.2, 0.8))
-    figure, rows = _panels(9.6, 0.4 + (0.8 + high) * len(found), len(found), 2, top=0.55)
-    for pair, (name, d) in zip(rows, found.items(), strict=True):
-        a = adjustments[name].adjusted
-        number = {point: k for k, point in enumerate(a.block.points)}
-        at = np.asarray(a.unknowns.points)[[number[p] for p in adjustments[name].check_points["point"]], :2].T
-        stations = np.asarray(a.unknowns.exterior.position)[:, :2].T
-        length = 0.12 * float(np.ptp(np.hstack([stations, at]), axis=1).max())
-        upright = np.stack([np.zeros(d.shape[1]), d[2]])
-        for axes, v, what in zip(pair, (d[:2], upright), ("dX, dY", "dZ"), strict=True):
-            surveyed = np.isfinite(v).all(axis=0)
-            axes.plot(*stations, "+", ms=6, color="0.75")
-            axes.plot(*at[:, surveyed], ".", ms=4, color="tab:green")
-            _vectors(axes, at[:, surveyed], v[:, surveyed], key, length, f"{key:g} m", width=0.003, above=0.12 / high)
-            axes.set(xlabel="X [m]", ylabel="Y [m]")
-            axes.set_title(f"{drawn(name)}: {what}" if name else what, loc="left", fontsize=10)
-            axes.set_aspect("equal", adjustable="datalim")
+    figure, rows = _panels(9.6, 0.4 + (0.8 + high) * len(adjustments), len(adjustments), 2, top=0.55)
+    for pair, (name, tables) in zip(rows, adjustments.items(), strict=True):
+        for axes, upright in zip(pair, (False, True), strict=True):
+            draw_check_points(axes, tables, upright, key, 1 + 0.12 / high, f"{drawn(name)}: " if name else "")
     figure.suptitle(
         "discrepancies at check points, surveyed minus computed", fontsize=11, y=1 - 0.1 / figure.get_figheight()
     )
     return figure
+
+
+def draw_check_points(
+    axes: Axes, tables: Tables, upright: bool, key: float | None = None, key_at: float = 1.04, of: str = ""
+) -> None:
+    """Discrepancies of one adjustment, in height where `upright`; arrows are scaled for a length of `key` metres."""
+    a, d = tables.adjusted, _discrepancies(tables)
+    key = _round_key(d) if key is None else key
+    number = {point: k for k, point in enumerate(a.block.points)}
+    at = np.asarray(a.unknowns.points)[[number[p] for p in tables.check_points["point"]], :2].T
+    stations = np.asarray(a.unknowns.exterior.position)[:, :2].T
+    length = 0.12 * float(np.ptp(np.hstack([stations, at]), axis=1).max())
+    v = np.stack([np.zeros(d.shape[1]), d[2]]) if upright else d[:2]
+    surveyed = np.isfinite(v).all(axis=0)
+    axes.plot(*stations, "+", ms=6, color="0.75")
+    axes.plot(*at[:, surveyed], ".", ms=4, color="tab:green")
+    _vectors(axes, at[:, surveyed], v[:, surveyed], key, length, f"{key:g} m", width=0.003, key_at=key_at)
+    axes.set(xlabel="X [m]", ylabel="Y [m]")
+    axes.set_title(f"{of}{'dZ' if upright else 'dX, dY'}", loc="left", fontsize=10)
+    axes.set_aspect("equal", adjustable="datalim")
+
+
+def _discrepancies(tables: Tables) -> np.ndarray:
+    """Surveyed minus computed coordinates of the check points (3 x n, m)."""
+    return tables.check_points[["dX_m", "dY_m", "dZ_m"]].to_numpy(float).T
 
 
 def correlation_figure(tables: Tables, camera: str) -> Figure:
@@ -187,10 +226,11 @@ def _round_key(v: np.ndarray) -> float:
 
 
 def _vectors(
-    axes: Axes, at: np.ndarray, v: np.ndarray, key: float, length: float, label: str, *, width: float, above: float
+    axes: Axes, at: np.ndarray, v: np.ndarray, key: float, length: float, label: str, *, width: float, key_at: float
 ) -> None:
-    """Arrows `v` at `at` (both 2 x n); in the key, `above` the axes, one of size `key` that is `length` long."""
+    """Arrows `v` at `at` (both 2 x n), and at the height `key_at` (of that of the axes) one of size `key` that is
+    `length` long."""
     arrows = axes.quiver(*at, *v, angles="xy", scale_units="xy", scale=key / length, width=width, color="tab:blue")
-    axes.quiverkey(arrows, 0.85, 1 + above, key, label, labelpos="E")
+    axes.quiverkey(arrows, 0.93, key_at, key, label, labelpos="W")
     axes.update_datalim((at + v * length / key).T)
     axes.autoscale_view()

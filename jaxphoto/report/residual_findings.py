@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
-from jaxphoto.report.findings import Finding, Level
+from jaxphoto.report.findings import Finding, Level, p_words
 from jaxphoto.report.tables import Tables, in_file_unit
 from jaxphoto.statistics import (
     DELTA0,
@@ -34,7 +34,7 @@ _STRETCHED = 0.01
 # by more than `_MOVED` of its own; smaller ones are found in many observations, and change nothing.
 _VISIBLE, _MOVED = 0.25, 1.0
 # Of a pattern's square sum, what one term must explain to be named.
-_MOST_OF_IT = 0.5
+MOST_OF_IT = 0.5
 # An observation whose detectable error is more than this times its sigma is checked by hardly anything (r < 0.17).
 _HIDDEN = 10.0
 
@@ -69,7 +69,7 @@ def _global_test(tables: Tables) -> Iterator[Finding]:
     factors = [f for f in group_factors(tables.adjusted, tables.redundancy) if f.p_value < LEVEL]
     groups = ", ".join(f"{f.group.replace('_', ' ')} {f.sigma:.2f}" for f in factors)
     of_groups = f"; by group of observations: {groups}" if groups else ""
-    said = f"sigma naught {whole.factor**0.5:.3g}, expected {whole.expected**0.5:.3g} (p = {whole.p_value:.1g})"
+    said = f"sigma naught {whole.factor**0.5:.3g}, expected {whole.expected**0.5:.3g} ({p_words(whole.p_value)})"
     if whole.sigma < 1:
         yield Finding(
             Level.WARNING,
@@ -131,11 +131,11 @@ def _trends(tables: Tables) -> Iterator[Finding]:
     for t in sorted((t for t in tables.tested_trends if t.p_value < level), key=lambda t: t.p_value):
         factor, unit = in_file_unit(t.pattern.unit)
         said = (
-            f"residuals of {t.pattern.what} follow a pattern (p = {t.p_value:.1g}) of {factor * t.size:.2g} {unit} "
+            f"residuals of {t.pattern.what} follow a pattern ({p_words(t.p_value)}) of {factor * t.size:.2g} {unit} "
             f"({t.size / t.pattern.sigma:.2g} of their sigma)"
         )
         matters = t.size > _VISIBLE * t.pattern.sigma
-        if t.hints and t.hints[0].share > _MOST_OF_IT:
+        if t.hints and t.hints[0].share > MOST_OF_IT:
             likely = t.hints[0]
             said += f", {100 * likely.share:.0f} % of it {_told(t)}"
             path = max(likely.moves, key=lambda path: abs(likely.moves[path]), default="")

@@ -15,9 +15,9 @@ from rich.table import Table
 
 from jaxphoto.camera import InteriorOrientation, Sensor
 from jaxphoto.report.maps import png_of
-from jaxphoto.report.page import STYLE
 from jaxphoto.report.plots import new_figure
 from jaxphoto.report.results import versions, write_summary
+from jaxphoto.report.style import STYLE
 from jaxphoto.stability import Analysis, Method
 from jaxphoto.writing import whole_folder
 
@@ -25,7 +25,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _PAGE = """<!DOCTYPE html>
-<html lang="en"><head><meta charset="utf-8"><title>Stability</title><style>{{ style }}</style></head><body>
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
+<title>Stability</title><style>{{ style }}</style></head><body>
 <h1>Stability of interior orientation</h1>
 <p class="{{ 'good' if similar else 'bad' }}"><b>{{ verdict }}</b></p>
 {% for line in about %}<p>{{ line }}</p>{% endfor %}

@@ -22,6 +22,7 @@ from jaxphoto.report.rolling_shutter import shutter_findings
 from jaxphoto.report.tables import Tables
 from jaxphoto.report.weakness import FELT, at_corner, weaknesses
 from jaxphoto.statistics import Correlations, Significance, if_zero, prepare_responses
+from jaxphoto.statistics.correlation import high_pairs
 
 HIGH_CORRELATION = 0.9
 HIGH_OWN_CORRELATION = 0.95
@@ -115,14 +116,9 @@ def _correlated(
     if field:
         cure = "add photographs turned by 90 degrees about the line of sight, and tilted ones"
         usual = "usual where targets alone orient an image, their effects on it cancel"
-    pairs = [
-        (abs(c.interior[i, j]), c.interior[i, j], a, c.parameters[j])
-        for i, a in enumerate(c.parameters)
-        for j in range(i)
-        if abs(c.interior[i, j]) > HIGH_CORRELATION
-    ]
+    pairs = high_pairs(c.parameters, c.interior, HIGH_CORRELATION)
     if pairs:
-        names = few([f"{a} and {b} {rho:+.3f}" for _, rho, a, b in sorted(pairs, reverse=True)])
+        names = few([f"{a} and {b} {rho:+.3f}" for a, b, rho in pairs])
         yield Finding(
             Level.INFORMATION,
             f"high correlation within the interior orientation of camera {camera}: {names}; a change of one makes good "

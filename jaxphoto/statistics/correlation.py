@@ -3,6 +3,8 @@
 Source: paper 000, Table 4 (mean absolute correlation over the images, per angle or coordinate and IOP).
 """
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
@@ -63,3 +65,10 @@ def correlations(adjusted: Adjustment, covariance: Covariance) -> dict[str, Corr
             np.array([rho[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] for i in images]).reshape(-1, 6, 6),
         )
     return result
+
+
+def high_pairs(names: Sequence[str], rho: Float[np.ndarray, "n n"], above: float) -> list[tuple[str, str, float]]:
+    """Pairs of parameters whose correlation is larger than `above`, either sign, and it; the largest first."""
+    lower = [(i, j) for i in range(len(names)) for j in range(i)]
+    pairs = [(names[i], names[j], float(rho[i, j])) for i, j in lower if abs(rho[i, j]) > above]
+    return sorted(pairs, key=lambda pair: -abs(pair[2]))

@@ -1,0 +1,46 @@
+"""The one style sheet of all pages: on wide and narrow screens, light and dark, and on paper."""
+
+STYLE = """\
+:root { color-scheme: light dark; --ink: #222; --paper: #fff; --line: #ddd; --head: #f4f4f4; --grey: #555;
+  --link: #0b57a4; --good: #176b2c; --bad: #a11; --alarm: #a11; --warning: #d90; --information: #89a;
+  --green: #e2f2e5; --on-green: #124d20; --amber: #fdf0d5; --on-amber: #6b4700; --red: #fbe0e0; --on-red: #7d0d0d }
+@media screen and (prefers-color-scheme: dark) { :root { --ink: #ddd; --paper: #16181b; --line: #3a3e44;
+  --head: #23262b; --grey: #a5abb3; --link: #8ab8f0; --good: #7fcf93; --bad: #f29a9a; --alarm: #e66;
+  --green: #143a1e; --on-green: #c4ecce; --amber: #43330c; --on-amber: #f5dfae; --red: #4a1717; --on-red: #f7caca } }
+html { overflow-wrap: anywhere }
+body { font: 15px/1.45 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: var(--ink);
+  background: var(--paper) }
+a { color: var(--link) } li { margin: .2rem 0 } code { font-size: 12px }
+h2 { margin-top: 2rem; border-bottom: 1px solid var(--line) }
+nav { columns: 15rem; margin: 1rem 0; padding: .5rem 1rem; background: var(--head); border-radius: 4px }
+nav a { display: block }
+.wide { overflow-x: auto; margin: .5rem 0 1.5rem }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: 13px; overflow-wrap: normal }
+th, td { padding: .2rem .7rem; border-bottom: 1px solid var(--line); text-align: right } th { background: var(--head) }
+th:first-child, td:first-child { text-align: left; position: sticky; left: 0; background: var(--paper) }
+thead th:first-child { background: var(--head) }
+.names th { font-weight: normal; color: var(--grey); vertical-align: top; background: var(--paper);
+  white-space: nowrap }
+.names td, .text { text-align: left } .names td { overflow-wrap: anywhere }
+img { max-width: 100%; background: #fff }
+td.number { white-space: nowrap }
+.pictures { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(23rem, 100%), 1fr)); gap: .8rem;
+  align-items: start; margin: .5rem 0 1rem }
+.pictures img { width: 100%; max-width: 29.5rem; height: auto }
+.good { color: var(--good) } .bad { color: var(--bad) }
+.verdict { font-size: 17px; padding: .4rem .8rem; border-radius: 4px }
+.verdict.green { background: var(--green); color: var(--on-green) }
+.verdict.amber { background: var(--amber); color: var(--on-amber) }
+.verdict.red { background: var(--red); color: var(--on-red) }
+.alarm, .warning, .information { border-left: 4px solid var(--information); padding-left: .6rem; margin: .4rem 0 }
+.alarm { border-color: var(--alarm) } .warning { border-color: var(--warning) }
+@media (max-width: 32rem) { body { margin: .5rem auto; padding: 0 .6rem } th, td { padding: .15rem .35rem }
+  .names th { white-space: normal } h1 { font-size: 1.4rem } }
+@media print { :root { color-scheme: light } body { max-width: none; margin: 0; padding: 0; font-size: 10.5px }
+  table { font-size: 9px } th, td { padding: .15rem .35rem } th, td.text { overflow-wrap: anywhere }
+  table:has(th:nth-child(9)) { font-size: 7.5px } table:has(th:nth-child(13)) { font-size: 6.5px }
+  table:has(th:nth-child(9)) :is(th, td) { padding: .1rem .2rem } .wide { overflow: visible }
+  th:first-child, td:first-child { position: static }
+  h2, h3 { break-after: avoid } tr, img, .alarm, .warning, .information { break-inside: avoid }
+  .pictures { grid-template-columns: 1fr 1fr } .verdict { font-size: 12px } }
+"""

@@ -1,0 +1,58 @@
+"""The report of a flight without a flight: a small adjusted block in the place of photographs."""
+
+import functools
+
+import numpy as np
+import pandas as pd
+
+from jaxphoto import Tables
+from jaxphoto.camera.conditions import Conditions
+from jaxphoto.procedures.flight import FlightPart, MatchedPart
+from jaxphoto.procedures.georeference_photographs import GeoreferencedPhotographs
+from jaxphoto.procedures.orientation import Oriented
+from jaxphoto.procedures.orientation.orient_photographs import GrossErrors, OrientationReport
+from jaxphoto.report.findings import Finding, Level, Verdict
+from jaxphoto.report.flight import FlightSource, PartReport
+from jaxphoto.statistics.coverage import coverage
+from jaxphoto.writing.inputs import InputFile
+from tests.blocks import BROWN, adjusted
+
+# Recorded minus adjusted (m), X, Y, Z of the first images; the last of them is left out.
+OFFSETS_M = np.array([[0.1, -0.2, 0.3], [0.3, 0.2, 0.1], [-0.1, 0.3, 0.2], [9.0, 0.0, 0.0]])
+VERDICT = Verdict.of([Finding(Level.WARNING, "one thing to know"), Finding(Level.INFORMATION, "c of camera one")])
+
+
+@functools.cache
+def part_report() -> PartReport:
+    """The block "cross" as the only part of a flight, whose first photographs have positions."""
+    found = adjusted("cross")
+    block, n = found.block, len(found.block.images)
+    report = OrientationReport(
+        n, 500, 20, block.images, {}, GrossErrors(0, 3, 2, 1, 0, 0, 4), len(block.points), 300, 2,
+        True, True, 2.0, 0.5, 1.0, ("c_mm",), (), 1.5,
+    )  # fmt: skip
+    placed = GeoreferencedPhotographs(block, block.images[:4], OFFSETS_M, np.array([True] * 3 + [False]), ())
+    matched = MatchedPart(list(block.images), [np.zeros((k + 5, 2)) for k in range(n)], [], [], 0, 1.0)
+    part = FlightPart(Oriented(block, found, report), matched, placed, "", None, found)
+    d = np.full((n, 3), np.nan)
+    d[:4] = OFFSETS_M
+    images = pd.DataFrame({"image": block.images, "n_image_points": np.bincount(found.structure.image, minlength=n)})
+    images = images.assign(rms_px=np.linspace(0.3, 1.2, n), dX_m=d[:, 0], dY_m=d[:, 1], dZ_m=d[:, 2])
+    images = images.assign(position=["used"] * 3 + ["left out"] + ["none"] * (n - 4))
+    return PartReport(part, Tables(found), VERDICT, images, coverage(found))
+
+
+def source() -> FlightSource:
+    """Times two seconds apart, with ten seconds in the middle; a photograph and another file as inputs."""
+    images = part_report().part.adjusted.block.images
+    at = 2.0 * np.arange(len(images)) + np.where(np.arange(len(images)) >= 5, 8.0, 0.0)
+    return FlightSource(
+        ("positions are of EXIF",),
+        "c is the focal length of EXIF.",
+        BROWN,
+        {name: (float(t), 0.01) for name, t in zip(images, at, strict=True)},
+        (Conditions("i0", "i0.jpg", "0" * 64, time="2024-05-01 10:00:00"),),
+        (InputFile("i0.jpg", 3, "0" * 64), InputFile("survey.csv", 5, "ab" * 32)),
+        {"method": {"command": "fly", "features": 500, "epsg": None}},
+        "2024-05-02",
+    )

@@ -1,0 +1,165 @@
+"""The page of a flight says what its adjustment has, in an order that a stranger can follow."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.figure import Figure
+from matplotlib.quiver import Quiver
+
+from jaxphoto.report.document import Rows
+from jaxphoto.report.document_html import html_of
+from jaxphoto.report.findings import as_sentence, p_words
+from jaxphoto.report.flight.camera import interior_rows
+from jaxphoto.report.flight.links import strength_classes
+from jaxphoto.report.flight.page import flight_page
+from jaxphoto.report.flight.points import point_table
+from jaxphoto.report.flight.positions import draw_plan, offset_statistics, positions_section
+from jaxphoto.report.flight.time_line import time_line
+from jaxphoto.report.plots import draw_density
+from tests.blocks import BROWN
+from tests.report.flights import OFFSETS_M, VERDICT, part_report, source
+
+
+@pytest.fixture(scope="module")
+def page():
+    """Two parts, the second the same as the first; a photograph lost at each of two stages."""
+    parts = [part_report(), part_report()]
+    return flight_page(
+        parts, {"x9": "nothing like it"}, {"cut.jpg": "cut.jpg: cut off"}, VERDICT, source(), ["r", "r2"]
+    )
+
+
+def test_the_verdict_is_first_then_linked_contents_of_all_sections(page):
+    assert page.index(VERDICT.headline) < page.index("one thing to know") < page.index("<nav>") < page.index("<h2")
+    links = re.findall(r'<a href="#([^"]+)">([^<]+)</a>', page)
+    assert links == re.findall(r'<h2 id="([^"]+)">([^<]+)</h2>', page) and len(dict(links)) == len(links) > 15
+
+
+def test_the_documentation_lists_the_sections_of_the_page(page):
+    told = re.findall(r'<h2 id="[^"]+">([^<]+)</h2>', page)
+    document = (Path(__file__).parents[2] / "docs" / "flight_report.md").read_text(encoding="utf-8")
+    listed = re.findall(r"^\| ([^|]+) \|", document.split("## ")[0], re.MULTILINE)[2:]
+    assert [t for t in told if t not in ("Part 2", "Files")] == listed
+
+
+def test_every_picture_says_what_it_shows(page):
+    pictures = re.findall(r"<img [^>]*?>", page)
+    alternative = [re.match(r'<img alt="([^"]{15,})" src="data:image/png;base64,', p) for p in pictures]
+    assert len(pictures) > 12 and all(alternative)
+
+
+def test_lost_photographs_and_what_was_computed_how_are_named(page):
+    rows = [re.findall(r"<td[^>]*>([^<]*)</td>", row) for row in re.findall(r"<tr>.*?</tr>", page)]
+    assert ["x9", "nothing like it"] in rows and ["cut.jpg", "cut off"] in rows
+    assert ["survey.csv", "5", "ab" * 32] in rows
+    # An option that was not given is none.
+    assert "jaxphoto fly, with features 500<" in page
+    n = len(part_report().images)
+    assert ["photographs oriented", *[f"{n} of {2 * n + 2}"] * 2] in rows
+
+
+def test_the_camera_is_where_it_began_and_where_it_came_to():
+    report = part_report()
+    rows = {row[0]: row for row in interior_rows(report, BROWN).rows}
+    table = report.tables.interior.set_index("parameter")
+    assert float(rows["c_mm"][1]) == BROWN.c
+    c, sigma = table.loc["c_mm", ["value", "sigma"]].astype(float)
+    assert float(rows["c_mm"][2]) == pytest.approx(c, abs=0.06 * sigma)
+    # Nothing was known beforehand, so rays that err alike widen all of it.
+    assert float(rows["c_mm"][4]) == pytest.approx(1.5 * sigma, rel=0.05)
+
+
+def test_offsets_by_axis():
+    table = part_report().images
+    found = offset_statistics(table[table["position"] == "used"]).set_index("axis")
+    d = OFFSETS_M[:3]
+    np.testing.assert_allclose(found["mean"].astype(float), d.mean(axis=0))
+    np.testing.assert_allclose(found["sd"].astype(float), d.std(axis=0, ddof=1))
+    np.testing.assert_allclose(found["rms"].astype(float), np.sqrt((d**2).mean(axis=0)))
+    np.testing.assert_allclose(found["largest"].astype(float), [0.3, 0.3, 0.3])
+    assert found["image"].tolist() == ["i1", "i2", "i0"]
+    assert len(offset_statistics(table[table["position"] == "none"])) == 0
+
+
+def test_steps_of_white_offsets_scatter_as_they_do_and_of_drift_less():
+    rng, n = np.random.default_rng(1), 2000
+    white, drift = rng.normal(0, 0.1, n), np.linspace(-1, 1, n)
+    table = pd.DataFrame({"image": [str(k) for k in range(n)], "dX_m": white, "dY_m": drift, "dZ_m": white})
+    found = offset_statistics(table).set_index("axis")
+    assert found.loc["X", "step_rms"] == pytest.approx(0.1, rel=0.1) and found.loc["Y", "step_rms"] < 0.01
+
+
+def test_residuals_of_positions_are_held_against_their_sigmas():
+    report = part_report()
+    (rows,) = (e.rows for e in positions_section(report) if isinstance(e, Rows) and "residuals of" in e.columns)
+    a = report.part.adjusted
+    w, axis = np.abs(np.asarray(a.residuals["stations"])), a.block.stations.axis
+    for k, row in enumerate(rows):
+        assert row[:3] == ("stations", "XYZ"[k], str((axis == k).sum()))
+        assert row[5:] == tuple(f"{100 * (w[axis == k] <= limit).mean():.0f} %" for limit in (1, 2, 3))
+
+
+def test_arrows_of_positions_are_their_offsets_and_those_left_out_are_told_apart():
+    axes = Figure().subplots()
+    draw_plan(axes, part_report())
+    left, used = (child for child in axes.get_children() if isinstance(child, Quiver))
+    mean = OFFSETS_M[:3, :2].mean(axis=0)
+    np.testing.assert_allclose(np.stack([used.U, used.V], 1), OFFSETS_M[:3, :2] - mean)
+    np.testing.assert_allclose(np.stack([left.U, left.V], 1), OFFSETS_M[3:, :2] - mean)
+    assert used.scale == left.scale
+
+
+def test_gaps_are_seen_and_speed_is_way_over_time():
+    report, taken = part_report(), source().taken
+    line = time_line(report, taken)
+    assert line.timed and np.flatnonzero(line.gap).tolist() == [4] and line.usual == pytest.approx(2.0)
+    # The first strip is flown in even steps of 210 m along X.
+    position = np.asarray(report.part.adjusted.unknowns.exterior.position)
+    way = np.linalg.norm(np.diff(position[:5], axis=0), axis=1) / 2.0
+    assert way.min() - 3 < np.nanmin(line.speed[:5]) and np.nanmax(line.speed[:5]) < way.max() + 3
+    # Names in another order than times are put in order; without times there is neither speed nor gap.
+    turned = {name: (-t, step) for name, (t, step) in taken.items()}
+    assert time_line(report, turned).order.tolist() == line.order.tolist()[::-1]
+    without = time_line(report, {})
+    assert not without.timed and not without.gap.any() and np.isnan(without.speed).all()
+
+
+def test_density_counts_every_image_point():
+    report = part_report()
+    axes = Figure().subplots()
+    draw_density(axes, report.tables, "one")
+    number = axes.images[0].get_array()
+    a = report.part.adjusted
+    assert number.sum() == len(a.structure.image)
+    # The first row of cells is the lowest.
+    low = np.asarray(a.values.xy)[1] < -a.block.sensors["one"].height_mm * (0.5 - 1 / number.shape[0])
+    assert number[0].sum() == low.sum()
+
+
+def test_points_of_more_rays_are_surer():
+    table = point_table(part_report())
+    few, many = (table[table["n_images"] <= 3], table[table["n_images"] >= 5])
+    assert few["sigma_Z_m"].median() > many["sigma_Z_m"].median()
+    assert few["angle_deg"].median() < many["angle_deg"].median()
+
+
+def test_classes_of_links_are_whole_numbers_from_one():
+    assert strength_classes(np.array([1, 900])) == [1, 5, 21, 98, 450]
+    assert strength_classes(np.array([1, 1])) == [1]
+
+
+def test_columns_of_words_are_read_from_the_left_and_numbers_from_the_right():
+    html = html_of(
+        Rows(("name", "n", "why"), (("a", "-1.5 px", "2 of them"), ("b", "", "cut off"), ("c", "3", "blank")))
+    )
+    assert html.count('class="text"') == 8 and html.count('class="number"') == 4
+    assert '<td class="number">-1.5 px</td><td class="text">2 of them</td>' in html
+
+
+def test_symbols_keep_their_letter():
+    assert as_sentence("c of camera one") == "c of camera one."
+    assert as_sentence("xp_mm moves") == "xp_mm moves." and as_sentence("all is well.") == "All is well."
+    assert p_words(0.0) == "p < 1e-300" and p_words(0.0123, 2) == "p = 0.012"
