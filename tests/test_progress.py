@@ -1,33 +1,52 @@
-"""How long the rest takes, by the last steps, and the lines that say so off a terminal."""
+"""How long the rest takes, by the last steps, and the lines that say what is done off a terminal."""
+
+import io
 
 from types import SimpleNamespace
 
 import pytest
+from rich.console import Console
 
+from jaxphoto.cli.console import PlainStatus
 from jaxphoto.cli.progress import StepsLeft, in_words
 
 
 @pytest.fixture
 def shown():
-    said = SimpleNamespace(now=0.0, lines=[], status="", is_terminal=False)
+    said = SimpleNamespace(now=0.0, lines=[], status="")
     said.print = lambda text, **options: said.lines.append(text)
     said.update = lambda text: setattr(said, "status", text)
     return said
 
 
-def test_lines_off_a_terminal_say_what_is_left(shown):
-    steps = StepsLeft(shown, shown, clock=lambda: shown.now)
+@pytest.mark.parametrize("terminal", [False, True])
+def test_off_a_terminal_a_line_now_and_then_says_what_is_done(terminal):
+    now, written = [0.0], io.StringIO()
+    console = Console(file=written, force_terminal=terminal, width=200)
+    # Never started, so that on a terminal nothing is drawn between the lines.
+    status = PlainStatus("reading", lambda: now[0], console=console)
     for k in range(1, 11):
+        now[0] = 8.0 * k
+        status.update(f"adjusting [round] {k}")
+    lines = [] if terminal else ["adjusting [round] 4", "adjusting [round] 8"]
+    assert written.getvalue().splitlines() == lines
+
+
+def test_what_is_left_is_judged_by_the_last_steps(shown):
+    steps = StepsLeft(shown, shown, clock=lambda: shown.now)
+    for k in range(1, 5):
         shown.now = 8.0 * k
         steps("features", k, 10)
-    assert shown.lines == ["features: 4 of 10, 48 s left", "features: 8 of 10, 16 s left"]
+    assert shown.status == "features: 4 of 10, 48 s left"
+    shown.now = 80.0
+    steps("features", 10, 10)
+    assert shown.status == "features: 10 of 10"
     shown.now = 95.0
     steps("matches", 5, 50)
     assert shown.status == "matches: 5 of 50, 2 min left"
 
 
-def test_on_a_terminal_there_are_no_lines_but_one_hint_where_it_takes_long(shown):
-    shown.is_terminal = True
+def test_one_hint_where_it_takes_long(shown):
     steps = StepsLeft(shown, shown, "take fewer", clock=lambda: shown.now)
     for k in range(1, 60):
         # The first are there from an earlier run.

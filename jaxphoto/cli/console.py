@@ -1,5 +1,8 @@
 """Where commands print: names of files and of users are text there, never markup or commands to a terminal."""
 
+import time
+from collections.abc import Callable
+
 from rich.console import Console, RenderableType
 from rich.status import Status
 from rich.text import Text
@@ -7,14 +10,23 @@ from rich.text import Text
 from jaxphoto.errors import printable
 
 
-class _PlainStatus(Status):
-    """What is being done, as plain text."""
+# Between lines off a terminal.
+_LINE_S = 30.0
 
-    def __init__(self, status: RenderableType, **options):
+
+class PlainStatus(Status):
+    """What is being done, as plain text: off a terminal, where nothing moves, a line of it now and then."""
+
+    def __init__(self, status: RenderableType, clock: Callable[[], float] = time.monotonic, **options):
         super().__init__(_plain(status), **options)
+        self._clock, self._last_line = clock, clock()
 
     def update(self, status: RenderableType | None = None, **options) -> None:
         super().update(None if status is None else _plain(status), **options)
+        now = self._clock()
+        if status is not None and not self.console.is_terminal and now - self._last_line >= _LINE_S:
+            self.console.print(_plain(status), soft_wrap=True)
+            self._last_line = now
 
 
 class _PlainConsole(Console):
@@ -24,7 +36,7 @@ class _PlainConsole(Console):
         return super().render_str(_lines(text), **options)
 
     def status(self, status: RenderableType, **options) -> Status:
-        return _PlainStatus(status, console=self, **options)
+        return PlainStatus(status, console=self, **options)
 
 
 def plain_console(*, stderr: bool = False) -> Console:

@@ -1,4 +1,4 @@
-"""How far a command is and how long the rest takes: on a terminal in its status, off a terminal a line now and then."""
+"""How far a command is and how long the rest takes, in its status."""
 
 import time
 from collections import deque
@@ -7,8 +7,8 @@ from collections.abc import Callable
 from rich.console import Console
 from rich.status import Status
 
-# Between lines off a terminal, and before a hint is worth its line.
-_LINE_S, _LONG_S = 30.0, 600.0
+# Before a hint is worth its line.
+_LONG_S = 600.0
 # The last steps, by which the rest is judged: those of a run that goes on from an earlier one begin fast.
 _LAST = 20
 FEWER_PAIRS = "--pairs similar:20, sequence:K or position:K compares fewer pairs"
@@ -23,8 +23,7 @@ class StepsLeft:
         self._console, self._status, self._hint, self._clock = console, status, hint, clock
         self._what = ""
         self._steps: deque[tuple[float, int]] = deque(maxlen=_LAST)
-        self._last_line = clock()
-        self._began = self._last_line
+        self._began = clock()
 
     def __call__(self, what: str, done: int, of: int) -> None:
         """`done` of the `of` steps of `what` are done."""
@@ -41,10 +40,7 @@ class StepsLeft:
         self._status.update(said)
         if self._hint and full and left > _LONG_S:
             self._console.print(f"{said}; {self._hint}", soft_wrap=True)
-            self._hint, self._last_line = "", now
-        elif not self._console.is_terminal and now - self._last_line >= _LINE_S:
-            self._console.print(said, soft_wrap=True)
-            self._last_line = now
+            self._hint = ""
 
 
 def in_words(seconds: float) -> str:

@@ -22,7 +22,11 @@ def epipolar_lines(
     none = np.zeros(len(one), bool)
     if len(one) < LEAST_MATCHES:
         return None, none
-    matrix, good = cv2.findFundamentalMat(one, other, cv2.USAC_MAGSAC, off_line, _CONFIDENCE, _TRIALS)
+    try:
+        matrix, good = cv2.findFundamentalMat(one, other, cv2.USAC_MAGSAC, off_line, _CONFIDENCE, _TRIALS)
+    except cv2.error:
+        # OpenCV's own check fails where no sample gave a matrix, instead of saying that there is none.
+        return None, none
     if matrix is None or good.sum() < max(LEAST_MATCHES, _LEAST_SHARE * len(one)):
         return None, none
     return matrix, good.ravel() > 0

@@ -118,6 +118,15 @@ def test_random_matches_are_refused():
             assert matrix is None and not kept.any()
 
 
+def test_a_pair_for_which_the_library_gives_up_has_no_matches(monkeypatch):
+    def gives_up(*_):
+        raise cv2.error("(-215:Assertion failed) !model.empty()")
+
+    monkeypatch.setattr(cv2, "findFundamentalMat", gives_up)
+    matrix, kept = epipolar_lines(*np.random.default_rng(5).uniform(0, 1000, (2, 20, 2)), 3.84)
+    assert matrix is None and kept.shape == (20,) and not kept.any()
+
+
 def test_gross_errors_are_found_among_true_matches(taken):
     _, _, _, matched = taken
     rng = np.random.default_rng(4)
