@@ -1,7 +1,6 @@
 """How long the rest takes, by the last steps, and the lines that say what is done off a terminal."""
 
 import io
-
 from types import SimpleNamespace
 
 import pytest

@@ -9,7 +9,6 @@ from rich.text import Text
 
 from jaxphoto.errors import printable
 
-
 # Between lines off a terminal.
 _LINE_S = 30.0
 
