@@ -21,6 +21,7 @@ class PlainStatus(Status):
         self._clock, self._last_line = clock, clock()
 
     def update(self, status: RenderableType | None = None, **options) -> None:
+        """What is done from now on."""
         super().update(None if status is None else _plain(status), **options)
         now = self._clock()
         if status is not None and not self.console.is_terminal and now - self._last_line >= _LINE_S:
