@@ -19,7 +19,16 @@ from jax.sharding import SingleDeviceSharding
 
 from jaxphoto.camera import Brown, Brown14
 from jaxphoto.collinearity import project
-from jaxphoto.compiling import description, plain_tree, private_folder, run, run_compiled, store
+from jaxphoto.compiling import (
+    description,
+    jit_quickly,
+    plain_tree,
+    private_folder,
+    quickly,
+    run,
+    run_compiled,
+    store,
+)
 from jaxphoto.compiling.description import Indescribable, describe
 from jaxphoto.compiling.plain_tree import Slot
 from tests.compiled_programs import MATRIX, root
@@ -236,6 +245,21 @@ def test_jax_forgets_traces_when_as_many_programs_have_gone_as_are_kept(kept, mo
         counts.append(len(traced))
     # The fourth program and the sixth are those with which two have gone.
     assert counts == [1, 1, 1, 2, 2, 3]
+
+
+def test_shapes_of_what_runs_once_are_forgotten(monkeypatch):
+    monkeypatch.setattr(quickly, "_SHAPES", 3)
+    traced = []
+
+    @jit_quickly
+    def seen(x):
+        traced.append(len(x))
+        return 2 * x
+
+    for n in (1, 2, 3, 3, 4, 1):
+        np.testing.assert_array_equal(seen(np.ones(n)), np.full(n, 2.0))
+    # The fourth shape is one too many: all are forgotten with it.
+    assert traced == [1, 2, 3, 4, 1]
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only glibc keeps what is freed")

@@ -6,7 +6,6 @@ perhaps together with a free shift or lever arm. What none sees is the datum def
 it.
 """
 
-from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -25,7 +24,7 @@ from jaxphoto.adjustment.solver.similarity import motions, similarity
 from jaxphoto.arrays import still
 from jaxphoto.block import Block
 from jaxphoto.camera import RollingShutter
-from jaxphoto.compiling import QUICK_TO_COMPILE
+from jaxphoto.compiling import jit_quickly
 from jaxphoto.errors import DatumError
 from jaxphoto.observations import PRIORS, ControlRows
 
@@ -155,7 +154,7 @@ def _check_vague(block: Block, sensitivity: np.ndarray, named: list[str]) -> Non
         raise DatumError(datum_sentence(vt[vague], block, named, float(sigma.max())))
 
 
-motions_of = jax.jit(motions, compiler_options=QUICK_TO_COMPILE)
+motions_of = jit_quickly(motions)
 """`similarity.motions`, compiled."""
 
 
@@ -197,7 +196,7 @@ def _control_sigma(values: Values, s: Structure) -> np.ndarray:
     )
 
 
-@partial(jax.jit, compiler_options=QUICK_TO_COMPILE)
+@jit_quickly
 def _row_sensitivity(values: Values, structure: Structure, shared, centre, size):
     def rows(parameters, moved):
         v = values

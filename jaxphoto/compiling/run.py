@@ -104,7 +104,8 @@ def prepare(function: Any, arguments: tuple, seconds: dict[str, float]) -> bool:
 def _keep(key: object, program: _Program) -> None:
     """Keep `program` as the one used last; the one that was not used for longest goes where there are too many.
 
-    JAX keeps what it traced of each, some MB; it forgets that when as many have gone as are kept.
+    JAX keeps what it traced of each, some MB; it forgets that when as many have gone as are kept, and with it whatever
+    the calling process has compiled itself, which is compiled anew when it is called.
     """
     global _gone
     _programs.pop(key, None)

@@ -8,14 +8,14 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxphoto.camera import InteriorOrientation, Perspective
-from jaxphoto.compiling import QUICK_TO_COMPILE
+from jaxphoto.compiling import jit_quickly
 
 # Cosine of the angle from the axis beyond which a ray of a fisheye is not taken to the perspective plane: 80 degrees,
 # where a pixel there is 30 times as large as in the middle.
 _FLATTEST = 0.17
 
 
-@partial(jax.jit, compiler_options=QUICK_TO_COMPILE)
+@jit_quickly
 def _directions(interior: InteriorOrientation, xy):
     return jax.vmap(lambda one: jnp.stack(interior.direction_from_ideal(interior.ideal_from_measured(one))))(xy)
 

@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from jaxphoto.arrays import on_device
 from jaxphoto.block import Block
-from jaxphoto.compiling import QUICK_TO_COMPILE
+from jaxphoto.compiling import jit_quickly
 from jaxphoto.georeferencing import Mount
 from jaxphoto.georeferencing.camera_attitude import CameraAttitude
 from jaxphoto.georeferencing.map_frame import MapFrame
@@ -111,4 +111,4 @@ def _angles(matrices: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "*n"]:
     return 2 * np.arcsin(np.clip(chord / np.sqrt(8), 0, 1))
 
 
-_roll_pitch_yaw = jax.jit(jax.vmap(roll_pitch_yaw_from_matrix), compiler_options=QUICK_TO_COMPILE)
+_roll_pitch_yaw = jit_quickly(jax.vmap(roll_pitch_yaw_from_matrix))

@@ -21,7 +21,7 @@ from jaxphoto.arrays import Numbers
 from jaxphoto.block import Block, SensorRows, direct_exterior, sensor_rows
 from jaxphoto.camera import InteriorOrientation, get_parameter, parameter_names
 from jaxphoto.collinearity import ExteriorOrientation
-from jaxphoto.compiling import QUICK_TO_COMPILE
+from jaxphoto.compiling import jit_quickly
 from jaxphoto.errors import BlockError
 from jaxphoto.georeferencing import Corrections, DirectPartials, direct_partials
 from jaxphoto.georeferencing.intersection_covariance import (
@@ -190,18 +190,18 @@ def _numbers(interior: InteriorOrientation) -> InteriorOrientation:
     return jax.tree.map(partial(np.asarray, dtype=float), interior)
 
 
-_of_rows = partial(jax.jit, static_argnums=3, compiler_options=QUICK_TO_COMPILE)
+_of_rows = partial(jit_quickly, static_argnums=3)
 _gain, _step, _own_covariance = _of_rows(intersection_gain), _of_rows(intersection_step), _of_rows(own_covariance)
-_shared_covariance = jax.jit(shared_covariance, static_argnums=4, compiler_options=QUICK_TO_COMPILE)
+_shared_covariance = jit_quickly(shared_covariance, static_argnums=4)
 
 
-@partial(jax.jit, static_argnums=4, compiler_options=QUICK_TO_COMPILE)
+@partial(jit_quickly, static_argnums=4)
 def _ray_partials(interior, exterior, points, xy, corrections: Corrections) -> RayPartials:
     one = lambda e, point, measured: ray_partials(interior, e, point, measured, corrections)  # noqa: E731
     return jax.vmap(one)(exterior, points, xy)
 
 
-@partial(jax.jit, compiler_options=QUICK_TO_COMPILE)
+@jit_quickly
 def _direct_partials(sensors: SensorRows) -> DirectPartials:
     one = lambda s: direct_partials(s.station, s.roll_pitch_yaw, s.mount, s.bias, s.exposure)  # noqa: E731
     return jax.vmap(one)(sensors)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxphoto.block import Frame, Motion
-from jaxphoto.compiling import QUICK_TO_COMPILE
+from jaxphoto.compiling import jit_quickly
 from jaxphoto.errors import BlockError, InputError
 from jaxphoto.georeferencing import Poses, Trajectory, covered, interpolate
 from jaxphoto.georeferencing.trajectory import SHORTEST
@@ -24,7 +24,7 @@ _MARGIN = 64
 # An interval is a gap from this many times the usual interval: one record may be lost.
 _GAP = 2.5
 
-_interpolate = jax.jit(interpolate, compiler_options=QUICK_TO_COMPILE)
+_interpolate = jit_quickly(interpolate)
 
 
 def read_flight(records: Records, images: Images, frame: Frame, settings: Settings) -> ObservedFlight:
@@ -168,4 +168,4 @@ def _check_leap_seconds(
         )
 
 
-_angles = jax.jit(jax.vmap(roll_pitch_yaw_from_matrix), compiler_options=QUICK_TO_COMPILE)
+_angles = jit_quickly(jax.vmap(roll_pitch_yaw_from_matrix))

@@ -6,7 +6,7 @@ from typing import get_args
 import jax
 import numpy as np
 
-from jaxphoto.compiling import QUICK_TO_COMPILE
+from jaxphoto.compiling import jit_quickly
 from jaxphoto.errors import InputError, quoted
 from jaxphoto.georeferencing.camera_attitude import USUAL_SIGMA_DEG, CameraAttitude, level_from_belly
 from jaxphoto.georeferencing.gps import Fix, Heights
@@ -115,4 +115,4 @@ def _fixes(table: Table):
         yield cell or "unknown"
 
 
-_matrices = jax.jit(jax.vmap(matrix_from_omega_phi_kappa), compiler_options=QUICK_TO_COMPILE)
+_matrices = jit_quickly(jax.vmap(matrix_from_omega_phi_kappa))

@@ -1,14 +1,12 @@
 """A trajectory's records brought to the object frame of a block."""
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from jaxphoto.block import Frame
-from jaxphoto.compiling import QUICK_TO_COMPILE
+from jaxphoto.compiling import jit_quickly
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import Trajectory
 from jaxphoto.io.trajectory.records import Records
@@ -58,7 +56,7 @@ def with_positions(records: Records, position: Float[np.ndarray, "records 3"], f
     return records._replace(coordinates=frame.map.place(coordinates) if records.geographic else coordinates)
 
 
-@partial(jax.jit, compiler_options=QUICK_TO_COMPILE)
+@jit_quickly
 @jax.vmap
 def _quaternions(turn, angles):
     return quaternion_from_matrix(turn @ matrix_from_roll_pitch_yaw(angles))

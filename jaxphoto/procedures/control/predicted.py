@@ -18,7 +18,7 @@ from jaxphoto.adjustment import Adjustment
 from jaxphoto.arrays import still
 from jaxphoto.camera import parameter_names
 from jaxphoto.collinearity import ExteriorOrientation, in_field, project
-from jaxphoto.compiling import QUICK_TO_COMPILE
+from jaxphoto.compiling import jit_quickly
 from jaxphoto.georeferencing import apparent_point
 from jaxphoto.georeferencing.ground import moved_exterior, moved_interior
 from jaxphoto.orientation.rays import padded_length
@@ -91,7 +91,7 @@ def predicted(
     return Predicted(*(np.concatenate(parts) for parts in zip(none, *found, strict=True)))
 
 
-@partial(jax.jit, static_argnums=3, compiler_options=QUICK_TO_COMPILE)
+@partial(jit_quickly, static_argnums=3)
 def _projected(interior, exterior, points, corrections):
     def one(exterior, point):
         def place(d_point, d_exterior, d_interior):
