@@ -3,7 +3,7 @@
 python benchmarks/rendered_flight.py FOLDER [--photographs 500] [--width-px 2000] [--judge DIR]
 
 A drone (c 8.8 mm, 13.2 mm wide) flies strips to and fro 100 m over hills of some ten metres that are covered by
-blotches of every size down to two centimetres. FOLDER/photographs gets JPEG files with focal length, time and a
+blotches of every size down to five centimetres. FOLDER/photographs gets JPEG files with focal length, time and a
 position that is off by 2 m (4 m in height); FOLDER/truth.csv the true exterior orientation, in metres east, north and
 up of the middle of the flight, and FOLDER/truth.json the true camera.
 
@@ -24,6 +24,7 @@ import cv2
 import numpy as np
 import pandas as pd
 from PIL import Image
+from pyproj import CRS, Transformer
 
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent))
@@ -37,10 +38,9 @@ _STRIP = 25
 _TILT_DEG = 2.0
 _POSITION_M = (2.0, 2.0, 4.0)
 _NOISE_GREY = 2.0
-# Of the texture, in m; finer than a pixel on the ground.
+# Of the texture, in m: finer than a pixel on the ground up to 3,000 pixels across.
 _GROUND_M = 0.05
 _PLACE = (15.0, 47.0)
-_EARTH_M = 6378137.0
 
 
 class Flight(NamedTuple):
@@ -69,6 +69,8 @@ def main() -> int:
         return judge(arguments.folder, arguments.judge)
     flight = drawn(arguments.photographs, arguments.width_px, arguments.seed)
     photographs = arguments.folder / "photographs"
+    if photographs.exists():
+        raise SystemExit(f"{photographs} is there already; name another folder")
     photographs.mkdir(parents=True)
     write_truth(flight, arguments.folder)
     texture(flight, arguments.folder, arguments.seed)
@@ -165,8 +167,8 @@ def _exif(told: np.ndarray, k: int) -> Image.Exif:
     seconds = int(k * _ALONG * HEIGHT_M * WIDTH_MM * 0.75 / C_MM / SPEED_M_PER_S)
     clock = f"2026:06:01 {10 + seconds // 3600:02}:{seconds // 60 % 60:02}:{seconds % 60:02}"
     exif.get_ifd(0x8769).update({0x9003: clock, 0x920A: C_MM, 0xA405: 24})
-    longitude = _PLACE[0] + math.degrees(told[0] / (_EARTH_M * math.cos(math.radians(_PLACE[1]))))
-    latitude = _PLACE[1] + math.degrees(told[1] / _EARTH_M)
+    around = CRS.from_proj4(f"+proj=aeqd +lon_0={_PLACE[0]} +lat_0={_PLACE[1]} +ellps=WGS84 +units=m")
+    longitude, latitude = Transformer.from_crs(around, 4326, always_xy=True).transform(*told[:2])
     gps = {1: "N", 2: _dms(latitude), 3: "E", 4: _dms(longitude), 5: b"\0", 6: float(told[2] + 400.0)}
     exif.get_ifd(0x8825).update(gps)
     return exif

@@ -16,7 +16,8 @@ from jaxphoto.cli.exposure_options import heights_of, lever_arm_of
 from jaxphoto.cli.progress import FEWER_PAIRS, StepsLeft
 from jaxphoto.cli.provenance import Provenance
 from jaxphoto.errors import InputError
-from jaxphoto.georeferencing.map_frame import map_system
+from jaxphoto.georeferencing.geoid_heights import WGS84
+from jaxphoto.georeferencing.map_frame import check_heights, map_system
 from jaxphoto.image_measurement.control_targets import target_looker
 from jaxphoto.image_measurement.features import FEATURES, LONGEST_PX
 from jaxphoto.image_measurement.matching import MatchedPhotographs, match_photographs
@@ -100,15 +101,16 @@ def fly_command(
     check_pieces(beside(out))
     if epsg is not None:
         map_system(epsg)
+    above, arm = heights_of(heights), lever_arm_of(lever_arm)
+    if isinstance(above, int):
+        check_heights(WGS84, above)
     Thread(target=prepare_pictures, daemon=True).start()
     console, errors = plain_console(), plain_console(stderr=True)
     with errors.status("reading the photographs") as status, ExitStack() as opened:
         read, spoilt = sound_photographs(photographs)
         for sentence in spoilt.values():
             errors.print(f"left out: {plain(sentence)}", soft_wrap=True)
-        told = located(
-            read, photographs, exposures or (), code=epsg, arm=lever_arm_of(lever_arm), heights=heights_of(heights)
-        )
+        told = located(read, photographs, exposures or (), code=epsg, arm=arm, heights=above)
         read = told.photographs
         for sentence in told.sentences:
             console.print(plain(sentence), soft_wrap=True)

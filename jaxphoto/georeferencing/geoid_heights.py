@@ -8,7 +8,8 @@ from jaxphoto.errors import InputError, quoted
 from jaxphoto.georeferencing.gps import Gps
 from jaxphoto.georeferencing.map_frame import MapFrame
 
-_WGS84 = 4326
+WGS84 = 4326
+"""Longitude and latitude as receivers have them."""
 
 
 def above_ellipsoid(positions: Mapping[str, Gps | None], vertical: int) -> tuple[dict[str, Gps | None], list[str]]:
@@ -25,9 +26,11 @@ def above_ellipsoid(positions: Mapping[str, Gps | None], vertical: int) -> tuple
             names.append(name)
             rows.append((gps.longitude_deg, gps.latitude_deg, gps.altitude_m))
     # A wrong code is wrong where no height needs it, too.
-    system = MapFrame(_WGS84, vertical, (0.0, 0.0, 0.0))
+    system = MapFrame(WGS84, vertical, (0.0, 0.0, 0.0))
     if not names:
-        return found, [f"no height needs the geoid of EPSG:{vertical}: all are above the ellipsoid by their files"]
+        any_height = any(gps and gps.altitude_m is not None for gps in found.values())
+        all_are = "all are above the ellipsoid by their files" if any_height else "no photograph has one"
+        return found, [f"no height needs the geoid of EPSG:{vertical}: {all_are}"]
     given = np.array(rows)
     height = system.place(given)[:, 2]
     for k in np.flatnonzero(~np.isfinite(height))[:1]:

@@ -130,11 +130,13 @@ def _to_place(code: int, vertical: int | None) -> Transformer:
     try:
         heights = CRS.from_epsg(vertical)
     except CRSError:
-        raise InputError(f'the EPSG code {vertical} is unknown; correct it or write "ellipsoidal"') from None
+        raise InputError(
+            f"the EPSG code {vertical} of the heights is unknown; correct it, or give heights above the ellipsoid"
+        ) from None
     if not heights.is_vertical:
         raise InputError(
-            f"EPSG:{vertical} ({heights.name}) is no system of heights; give the code of one (5773 is EGM96) or "
-            '"ellipsoidal"'
+            f"EPSG:{vertical} ({heights.name}) is no system of heights; give the code of one (5773 is EGM96), or "
+            "heights above the ellipsoid"
         )
     # pyproj warns of what is said below as an error.
     with warnings.catch_warnings():
@@ -145,7 +147,7 @@ def _to_place(code: int, vertical: int | None) -> Transformer:
         if not grids:
             raise InputError(
                 f"PROJ knows no way from the heights of EPSG:{vertical} ({heights.name}) to the ellipsoid of "
-                f'EPSG:{code}; give them above the ellipsoid (vertical = "ellipsoidal" in block.toml)'
+                f'EPSG:{code}; give them above the ellipsoid (in block.toml vertical = "ellipsoidal")'
             )
         name = grids[0].short_name
         raise InputError(

@@ -30,6 +30,7 @@ def sound_photographs(paths: Sequence[str | Path]) -> tuple[list[Photograph], di
     left: dict[str, str] = {}
     read: dict[str, Photograph] = {}
     content: dict[str, Photograph] = {}
+    copies: dict[Path, str] = {}
     for file in files:
         try:
             photograph = read_photograph(file)
@@ -40,16 +41,17 @@ def sound_photographs(paths: Sequence[str | Path]) -> tuple[list[Photograph], di
         digest = input_file(file).sha256
         twin = content.get(digest)
         if twin is not None and len(twin.name) <= len(photograph.name):
-            left[str(file)] = f"{file}: it is a copy of {twin.path.name}"
+            copies[file] = digest
             continue
         if photograph.name in read:
             left[str(file)] = f"{file}: {read[photograph.name].path} has the same name; rename one of them"
             continue
         if twin is not None:
             # "DJI_0002 (1).jpg" comes before the photograph that tables and marks name.
-            left[str(twin.path)] = f"{twin.path}: it is a copy of {file.name}"
+            copies[twin.path] = digest
             del read[twin.name]
         content[digest] = read[photograph.name] = photograph
+    left |= {str(file): f"{file}: it is a copy of {content[digest].path.name}" for file, digest in copies.items()}
     kept = list(read.values())
     for what, of, _ in ONE_CAMERA:
         said = [of(p) for p in kept]

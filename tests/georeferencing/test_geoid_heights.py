@@ -64,6 +64,18 @@ def test_a_geoid_that_is_not_here_is_refused_with_how_to_get_it():
         one_height({"a": HERE}, {}, EGM96)
 
 
+def test_without_any_height_none_is_said_to_be_right(geoid):
+    given = {"a": None, "b": HERE._replace(altitude_m=None)}
+    assert "no photograph has one" in one_height(given, {}, EGM96)[1][-1]
+
+
+def test_a_code_that_is_none_is_refused():
+    with pytest.raises(
+        InputError, match="EPSG code 99999 of the heights is unknown; correct it, or give heights above"
+    ):
+        one_height({"a": HERE}, {}, 99999)
+
+
 def test_a_code_of_no_heights_is_refused():
     with pytest.raises(InputError, match=r"EPSG:25832 .* is no system of heights"):
         one_height({"a": HERE._replace(heights="ellipsoid")}, {}, 25832)

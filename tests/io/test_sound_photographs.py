@@ -36,6 +36,14 @@ def test_sound_ones_are_kept_with_what_their_files_say(folder):
     assert kept[0].gps is not None and kept[0].gps.sigma_m == (0.01174, 0.01262, 0.02684)
 
 
+def test_of_several_copies_each_names_the_one_that_is_kept(folder):
+    for n in (1, 2):
+        shutil.copy(folder / "2.jpg", folder / f"0 copy {n} of 2.jpg")
+    kept, left = sound_photographs([folder])
+    assert [p.name for p in kept] == ["0", "1", "2", "3"]
+    assert len(left) == 2 and all(why.endswith(": it is a copy of 2.jpg") for why in left.values())
+
+
 def test_spoilt_ones_are_left_out_each_with_a_sentence(folder):
     whole = (folder / "1.jpg").read_bytes()
     (folder / "cut.jpg").write_bytes(whole[: len(whole) // 2])

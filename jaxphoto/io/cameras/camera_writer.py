@@ -19,8 +19,8 @@ from jaxphoto.writing import whole_file
 
 
 class _WriteFormat(NamedTuple):
-    """How a format is written, what its perspective cameras and its fisheyes are (None: any, and those of perspective
-    cameras), and how its files are called."""
+    """How a format is written, what its perspective cameras and its fisheyes are (None: it has no such, and
+    where it has neither any camera goes), and how its files are called."""
 
     write: Callable[[Path, str, Sensor, InteriorOrientation], None]
     plane: CameraModel | None
@@ -29,7 +29,7 @@ class _WriteFormat(NamedTuple):
 
     def model_of(self, interior: InteriorOrientation) -> CameraModel | None:
         """What a camera is written as."""
-        return self.plane if type(interior.projection) is Perspective else self.fisheye or self.plane
+        return self.plane if type(interior.projection) is Perspective else self.fisheye
 
 
 _FORMATS = {
@@ -69,6 +69,12 @@ def write_camera_file(
     if format not in _FORMATS:
         raise InputError(f"{path}: the name does not tell the format; name one of {', '.join(_FORMATS)}")
     known = _FORMATS[format]
+    if known.plane is not None and known.fisheye is None and type(interior.projection) is not Perspective:
+        # A polynomial on the plane misses by hundreds of pixels where the fisheye looks aside.
+        others = ", ".join(key for key, other in _FORMATS.items() if other.fisheye or not other.plane)
+        raise InputError(
+            f"{path}: cameras of {format} are perspective, and this one is a fisheye; write one of {others}"
+        )
     model = known.model_of(interior)
     if model is None:
         model = CameraModel(distortion or type(interior.distortion), (), interior.projection)
