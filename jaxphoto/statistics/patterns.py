@@ -24,6 +24,8 @@ from jaxphoto.statistics.discrepancy import observation_groups
 Places = Mapping[str, Int[np.ndarray, "..."]]
 # Numbers of all polynomials over a format together, beyond which those of the third degree do: seconds, and memory.
 _MOST = 100_000_000
+# Observations whose weighted copies are in memory.
+_AT_ONCE = 50_000
 MOST_PARTS = 40
 """Cameras, or strips, beyond which they are not judged one by one: the more tests, the less each can show."""
 # Of the grid on which terms are written as polynomials, along a side.
@@ -84,9 +86,11 @@ class ResidualPattern(NamedTuple):
         """Of all columns with one another, in the unit or whitened; those of different parts share no observation."""
         found, first = np.zeros((self.many, self.many)), 0
         for p in self.parts:
-            last, values = first + len(p.values), p.values * (p.weight if whitened else 1.0)
-            # Not by BLAS, whose threads wait for one another on a busy machine: seconds for what takes milliseconds.
-            found[first:last, first:last] = np.einsum("in,jn->ij", values, values)
+            last = first + len(p.values)
+            for k in range(0, len(p.at), _AT_ONCE):
+                values = p.values[:, k : k + _AT_ONCE] * (p.weight[k : k + _AT_ONCE] if whitened else 1.0)
+                # Not by BLAS, whose threads wait for one another on a busy machine: seconds for milliseconds' work.
+                found[first:last, first:last] += np.einsum("in,jn->ij", values, values)
             first = last
         return found
 
