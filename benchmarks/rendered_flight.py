@@ -17,6 +17,7 @@ import json
 import math
 import multiprocessing
 import sys
+import tomllib
 from pathlib import Path
 from typing import NamedTuple
 
@@ -193,6 +194,10 @@ def judge(folder: Path, results: Path) -> int:
     from jaxphoto.procedures.orientation.onto_known import similarity_between
 
     truth = json.loads((folder / "truth.json").read_text())
+    (sensor,) = tomllib.loads((results / "block" / "block.toml").read_text())["cameras"].values()
+    # EXIF tells the size of a pixel by that of a film: what counts is in pixels.
+    scale = sensor["pixel_mm"] / truth["pixel_mm"]
+    truth = {name: value * scale ** (-2 if name == "k1" else 1) for name, value in truth.items()}
     interior = pd.read_csv(results / "result" / "interior.csv").set_index("parameter")
     for name, row in interior.iterrows():
         off = row["value"] - truth.get(str(name), 0.0)
