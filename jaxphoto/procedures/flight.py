@@ -20,11 +20,9 @@ from jaxphoto.procedures.known_lens import KnownLens, with_known_lens
 from jaxphoto.procedures.orientation import Oriented, orient
 from jaxphoto.procedures.orientation.orient_photographs import CAMERA
 from jaxphoto.procedures.orientation.related_pairs import Report
-from jaxphoto.procedures.rolling_shutter import Moment, with_rolling_shutter
+from jaxphoto.procedures.rolling_shutter import NEIGHBOUR_M, Moment, with_rolling_shutter
 from jaxphoto.statistics import VarianceComponents, variance_components
 
-# What adjusted positions are off by against their neighbours.
-_NEIGHBOUR_M = 0.05
 # Random vectors: hundreds of thousands of image points make each expensive, and there are few parts to tell apart.
 _PROBES = 16
 
@@ -174,7 +172,7 @@ def _rolling(adjusted: Adjustment, taken: Mapping[str, Moment] | None, metric: b
     if not metric or not bool(adjusted.converged):
         return adjusted, "no rolling shutter is estimated: without positions and an optimum nothing tells speeds"
     try:
-        found = adjust_for_tables(with_rolling_shutter(adjusted.block, taken, _NEIGHBOUR_M, known=adjusted.unknowns))
+        found = adjust_for_tables(with_rolling_shutter(adjusted.block, taken, NEIGHBOUR_M, known=adjusted.unknowns))
     except (InputError, RankError) as error:
         return adjusted, f"no rolling shutter is estimated: {error}"
     if not bool(found.converged):

@@ -21,13 +21,25 @@ Moment = tuple[float, float]
 """When a photograph was taken (s, of any origin), and the step in which that is counted (s)."""
 RATE_DEG_PER_S = 0.5
 """Standard deviation of the rates of turn of a camera in a gimbal: a judgement."""
-# Photographs on either side that a line goes through, while the track turns by less, and no gap is longer than so many
-# usual ones.
-_NEIGHBOURS, _STRAIGHT_DEG, _GAP = 2, 20.0, 3.0
+# Photographs on either side that a line goes through, while the track turns by less, and no gap is between them.
+_NEIGHBOURS, _STRAIGHT_DEG = 2, 20.0
+GAP = 3.0
+"""Of the usual interval between photographs: a longer one is a gap."""
+NEIGHBOUR_M = 0.05
+"""What adjusted positions are off by against their neighbours (m): a judgement."""
 # Drones speed up and slow down between photographs by so much of their speed, and are never still.
 _UNSTEADY, _LEAST_M_PER_S = 0.03, 0.1
 # Share of the photographs whose neighbours have to tell how they move.
 _ENOUGH = 0.5
+
+
+def usual_interval(time: Float[np.ndarray, "images"]) -> float:
+    """The median interval (s) between times in their order, infinite where there is none.
+
+    Of those that are no zero: photographs that follow one another within a step of the clock have the same time.
+    """
+    later = np.diff(time)
+    return float(np.median(later[later > 0])) if (later > 0).any() else np.inf
 
 
 class Velocities(NamedTuple):
@@ -49,10 +61,9 @@ def velocities(
     n = len(time)
     velocity, sigma, known = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros(n, bool)
     order = [int(k) for k in np.argsort(time, kind="stable") if np.isfinite(time[k])]
-    later = np.diff(time[order])
-    usual = float(np.median(later[later > 0])) if (later > 0).any() else np.inf
+    usual = usual_interval(time[order])
     for rank, k in enumerate(order):
-        before, after = (_run(order, rank, side, position, time, _GAP * usual) for side in (-1, 1))
+        before, after = (_run(order, rank, side, position, time, GAP * usual) for side in (-1, 1))
         if before and after and not _straight(position[k] - position[before[0]], position[after[0]] - position[k]):
             # The end of a strip: it belongs to the one whose next photograph is nearer in time.
             nearer = time[k] - time[before[0]] <= time[after[0]] - time[k]

@@ -46,10 +46,15 @@ def dates(conditions: Sequence[Conditions]) -> str:
 
 def condition_rows(conditions: Sequence[Conditions]) -> Iterator[tuple[str, str]]:
     """Ranges of exposure, aperture, sensitivity, focus and weather over the photographs that were used."""
+    told = dict(told_conditions(conditions))
+    yield from ((name, told.get(name, _UNSAID)) for name, _, _ in _QUANTITIES)
+
+
+def told_conditions(conditions: Sequence[Conditions]) -> Iterator[tuple[str, str]]:
+    """The same without what the photographs do not say."""
     for name, field, unit in _QUANTITIES:
         values = [v for c in conditions if c.used and (v := getattr(c, field)) is not None]
         if not values:
-            yield name, _UNSAID
             continue
         low, middle, high = min(values), float(np.median(values)), max(values)
         said = f"{middle:.4g}" if low == high else f"{low:.4g} to {high:.4g}, median {middle:.4g}"

@@ -23,8 +23,11 @@ _PAGE = """<!DOCTYPE html>
 </body></html>
 """
 _HTML = Environment(autoescape=True)
-# A number, with a unit or what it is good to.
-_NUMBER = re.compile(r"[-+]?[\d.]+(e[-+]?\d+)?([ ,/)]|$)")
+# Numbers, with a unit, with what they are good to, several beside one another: all of a cell, which is short.
+_ONE = r"([-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?(\([\d.]+\))?|-)"
+_UNIT = r"( ?[^\W\d_]{1,7}| ?%)"
+_NUMBER = re.compile(rf"{_ONE}{_UNIT}?(( (\+-|/|x|to|=) |, ?|/){_ONE}{_UNIT}?)*( or more)?")
+_LONGEST = 40
 _ROWS = _HTML.from_string(
     '<div class="wide"><table{% if not head %} class="names"{% endif %}>{% if head %}<thead><tr>{% for c in columns %}'
     "<th{{ kinds[loop.index0] }}>{{ c }}</th>{% endfor %}</tr></thead>{% endif %}<tbody>{% for row in rows %}<tr>"
@@ -56,9 +59,9 @@ def html_of(element: Heading | Paragraph | Rows | Pictures) -> Markup:
 
 
 def _is_text(column: tuple[str, ...]) -> bool:
-    """Whether most cells of a column begin with no number: they are read from the left."""
+    """Whether most cells of a column are more than a number: they are read from the left, and broken into lines."""
     told = [cell for cell in column if cell]
-    return sum(_NUMBER.match(cell) is None for cell in told) > len(told) / 2
+    return sum(len(cell) > _LONGEST or _NUMBER.fullmatch(cell) is None for cell in told) > len(told) / 2
 
 
 def contents(headings: list[str]) -> Markup:

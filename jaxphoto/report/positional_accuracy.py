@@ -21,7 +21,7 @@ def accuracy_sentences(found: PositionalAccuracy) -> list[str]:
     if not found.tested:
         return []
     said = [f"Positional accuracy by the {STANDARD}; survey errors of the check points are included where known."]
-    said += [_sentence(t) for t in found.tested]
+    said += class_sentences(found)
     unknown = [t.name for t in found.tested if math.isnan(t.survey_m) and t.n >= LEAST_CHECK_POINTS]
     if unknown:
         said.append(
@@ -41,6 +41,11 @@ def accuracy_sentences(found: PositionalAccuracy) -> list[str]:
             "standard asks: survey them better"
         )
     return said
+
+
+def class_sentences(found: PositionalAccuracy) -> list[str]:
+    """Which class each component is, and why it cannot be claimed where it cannot; horizontal first."""
+    return [_sentence(t) for t in found.tested]
 
 
 def _sentence(t: ComponentAccuracy) -> str:

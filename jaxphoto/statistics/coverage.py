@@ -39,12 +39,13 @@ class Coverage(NamedTuple):
     """Centres of cells,"""
     y: Float[np.ndarray, "rows"]
     seen_by: Int[np.ndarray, "rows columns"]
-    """and how many images see them."""
+    """and how many images see them;"""
+    step_m: float
+    """the side of a cell."""
 
     def area_m2(self, least: int) -> float:
         """What `least` images see or more."""
-        cell = (self.x[1] - self.x[0]) * (self.y[1] - self.y[0])
-        return float((self.seen_by >= least).sum() * cell)
+        return float((self.seen_by >= least).sum() * self.step_m**2)
 
 
 def coverage(adjusted: Adjustment) -> Coverage:
@@ -64,7 +65,7 @@ def coverage(adjusted: Adjustment) -> Coverage:
         name: block.sensors[name].pixel_mm / float(interior.c) for name, interior in adjusted.unknowns.interior.items()
     }
     gsd = depth * np.array([angle[name] for name in block.image_camera])
-    x, y, ground = _cells(points, position, _AROUND * float(np.nanmedian(height)))
+    x, y, ground, step = _cells(points, position, _AROUND * float(np.nanmedian(height)))
     seen = np.zeros((len(y), len(x)), int)
     for name, interior in adjusted.unknowns.interior.items():
         polygon = _format(interior, block.sensors[name])
@@ -73,11 +74,12 @@ def coverage(adjusted: Adjustment) -> Coverage:
             ahead = there[..., 2] < 0
             flat = there[..., :2] / np.where(ahead, -there[..., 2], 1.0)[..., None]
             seen += ahead & _inside(flat, polygon)
-    return Coverage(height, gsd, x, y, seen)
+    return Coverage(height, gsd, x, y, seen, step)
 
 
 def _cells(points: np.ndarray, position: np.ndarray, around: float):
-    """Centres of cells over points and stations, without the points that lie astray, and their places on the ground."""
+    """Centres of cells over points and stations, without the points that lie astray, their places on the ground,
+    and the side of one."""
     low, high = np.percentile(points, [1, 99], axis=0)
     low = np.minimum(low[:2], position[:, :2].min(axis=0)) - around
     high = np.maximum(high[:2], position[:, :2].max(axis=0)) + around
@@ -86,7 +88,7 @@ def _cells(points: np.ndarray, position: np.ndarray, around: float):
     plan = np.stack(np.meshgrid(x, y), axis=-1)
     _, near = cKDTree(points[:, :2]).query(plan.reshape(-1, 2), k=min(_NEAR, len(points)))
     z = np.median(points[near.reshape(len(near), -1), 2], axis=1)
-    return x, y, np.dstack([plan, z.reshape(plan.shape[:2])])
+    return x, y, np.dstack([plan, z.reshape(plan.shape[:2])]), step
 
 
 def _format(interior: InteriorOrientation, sensor: Sensor) -> Float[np.ndarray, "corners 2"]:

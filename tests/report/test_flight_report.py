@@ -9,16 +9,20 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver
 
-from jaxphoto.report.document import Rows
+from jaxphoto.report.document import Paragraph, Pictures, Rows
 from jaxphoto.report.document_html import html_of
 from jaxphoto.report.findings import as_sentence, p_words
 from jaxphoto.report.flight.camera import interior_rows
-from jaxphoto.report.flight.links import strength_classes
-from jaxphoto.report.flight.page import flight_page
+from jaxphoto.report.flight.links import draw_network, strength_classes, thinned
+from jaxphoto.report.flight.page import flight_page, summary_section
+from jaxphoto.report.flight.photographs import exterior_section
 from jaxphoto.report.flight.points import point_table
-from jaxphoto.report.flight.positions import draw_plan, offset_statistics, positions_section
-from jaxphoto.report.flight.time_line import time_line
+from jaxphoto.report.flight.positions import draw_plan, in_order, offset_statistics, positions_section
+from jaxphoto.report.flight.provenance import provenance_section
+from jaxphoto.report.flight.surveyed import axis_cell
+from jaxphoto.report.flight.time_line import time_line, time_section
 from jaxphoto.report.plots import draw_density
+from jaxphoto.statistics.image_links import ImageLinks
 from tests.blocks import BROWN
 from tests.report.flights import OFFSETS_M, VERDICT, part_report, source
 
@@ -94,7 +98,9 @@ def test_steps_of_white_offsets_scatter_as_they_do_and_of_drift_less():
 
 def test_residuals_of_positions_are_held_against_their_sigmas():
     report = part_report()
-    (rows,) = (e.rows for e in positions_section(report) if isinstance(e, Rows) and "residuals of" in e.columns)
+    (rows,) = (
+        e.rows for e in positions_section(report, source().taken) if isinstance(e, Rows) and "residuals of" in e.columns
+    )
     a = report.part.adjusted
     w, axis = np.abs(np.asarray(a.residuals["stations"])), a.block.stations.axis
     for k, row in enumerate(rows):
@@ -151,12 +157,114 @@ def test_classes_of_links_are_whole_numbers_from_one():
     assert strength_classes(np.array([1, 1])) == [1]
 
 
+def test_of_many_links_an_even_part_is_drawn_from_first_to_last_photograph():
+    few = np.arange(5000) % 2 == 0
+    own, one_in = thinned(few)
+    assert one_in == 2 and len(own) == 1250 and few[own].all() and own[-1] > 4990
+    assert thinned(np.arange(100) > 90)[0].tolist() == list(range(91, 100))
+
+
+def test_the_picture_of_a_network_says_that_links_are_left_out_and_keeps_its_lines_thin():
+    report = part_report()
+    n = len(report.images)
+    links = ImageLinks(np.tile(np.arange(n - 1), 3000), np.tile(np.arange(1, n), 3000), np.full(3000 * (n - 1), 7))
+    many, one = Figure().subplots(), Figure().subplots()
+    draw_network(many, report, links, [])
+    draw_network(one, report, ImageLinks(*(v[: n - 1] for v in links)), [])
+    total = len(links.common)
+    drawn = len(thinned(links.common > 0)[0])
+    assert many.get_title("left").endswith(f": {drawn} of {total} links")
+    assert "links" not in one.get_title("left")
+    width = [max(line.get_linewidth() for line in axes.lines if line.get_linestyle() == "-") for axes in (many, one)]
+    assert width[0] < width[1] / 5
+
+
+def test_clocks_of_whole_seconds_make_no_gaps():
+    report = part_report()
+    taken = {name: (float(int(0.45 * k)), 1.0) for k, name in enumerate(report.images["image"])}
+    line = time_line(report, taken)
+    assert line.usual == 1.0 and not line.gap.any()
+    # All within one step of the clock: nothing is usual.
+    assert not time_line(report, dict.fromkeys(taken, (5.0, 1.0))).gap.any()
+    said = next(e.text for e in time_section(report, dict.fromkeys(taken, (5.0, 1.0))) if isinstance(e, Paragraph))
+    assert "0 s passed. There are no gaps." in said
+
+
+def test_heights_that_are_not_known_are_no_picture():
+    report = part_report()
+    without = report._replace(coverage=report.coverage._replace(height_m=np.full(len(report.images), np.nan)))
+    panels = [
+        len(p.panels) for r in (report, without) for p in time_section(r, source().taken) if isinstance(p, Pictures)
+    ]
+    assert panels[1] == panels[0] - 1
+
+
+def test_the_summary_has_the_rows_of_every_part_and_its_sentences_are_no_numbers():
+    report = part_report()
+    _, rows = summary_section([report._replace(coverage=None), report], 9)
+    told = {name: cells for name, *cells in rows.rows}
+    assert told["area"][0] == "" and "ha seen by" in told["area"][1]
+    assert 'class="number"' not in html_of(rows)
+
+
+def test_the_spread_of_surveyed_points_is_of_those_that_have_the_axis():
+    assert axis_cell(np.full(2, np.nan), np.nan) == ""
+    assert axis_cell(np.array([0.25, np.nan]), 0.25) == "+0.250 / - / 0.250"
+    assert axis_cell(np.array([0.1, np.nan, 0.3]), 0.2236) == f"+0.200 / {np.sqrt(0.02):.3f} / 0.224"
+
+
+def test_offsets_are_in_the_order_of_times_where_all_are_known():
+    table = part_report().images[:3]
+    taken = {"i0": (3.0, 1.0), "i1": (1.0, 1.0), "i2": (2.0, 1.0)}
+    assert in_order(table, taken)[0]["image"].tolist() == ["i1", "i2", "i0"]
+    del taken["i1"]
+    same, order = in_order(table, taken)
+    assert same is table and "block" in order
+
+
+def test_standard_deviations_that_are_not_known_are_said_to_be():
+    report = part_report()
+
+    class Without:
+        exterior = report.tables.exterior.assign(sigma_X_m=np.nan)
+        georeferencing = report.tables.georeferencing
+
+    rows = next(e for e in exterior_section(report._replace(tables=Without())) if isinstance(e, Rows)).rows
+    assert rows[0][2:] == ("not known",) * 3 + ("",) and rows[1][5] in tuple(report.images["image"])
+
+
+def test_provenance_is_silent_of_what_photographs_do_not_say():
+    told = source()
+    bare = told._replace(conditions=tuple(c._replace(time="") for c in told.conditions))
+    names = lambda s: [row[0] for e in provenance_section(s) if isinstance(e, Rows) for row in e.rows]  # noqa: E731
+    assert "photographs taken" in names(told) and "photographs taken" not in names(bare)
+    assert "exposure" not in names(told)
+
+
 def test_columns_of_words_are_read_from_the_left_and_numbers_from_the_right():
     html = html_of(
         Rows(("name", "n", "why"), (("a", "-1.5 px", "2 of them"), ("b", "", "cut off"), ("c", "3", "blank")))
     )
     assert html.count('class="text"') == 8 and html.count('class="number"') == 4
     assert '<td class="number">-1.5 px</td><td class="text">2 of them</td>' in html
+
+
+def test_a_number_is_all_of_its_cell():
+    kind = lambda cell: re.findall(r'<td class="(\w+)">', html_of(Rows(("", "a"), (("x", cell),))))[1]  # noqa: E731
+    numbers = (
+        "12",
+        "-1.5e-05 px",
+        "+0.010 / - / 0.020",
+        "366.7 +- 0.2",
+        "68 %",
+        "2 to 3",
+        "21 or more",
+        "8.4(12)",
+        "3 µm",
+    )
+    assert {kind(cell) for cell in numbers} == {"number"}
+    words = "0.5 px on average, rms 0.7 px", "12 of 14", "1 2024", "12 " + "1, " * 20 + "1"
+    assert {kind(cell) for cell in words} == {"text"}
 
 
 def test_symbols_keep_their_letter():

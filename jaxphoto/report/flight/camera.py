@@ -15,7 +15,6 @@ from jaxphoto.report.findings import as_sentence
 from jaxphoto.report.flight.part import PartReport
 from jaxphoto.report.flight.source import FlightSource
 from jaxphoto.report.ground import ground_findings
-from jaxphoto.report.orientation import ALIKE
 from jaxphoto.stability import distortion_curve
 from jaxphoto.statistics.correlation import high_pairs
 
@@ -63,7 +62,7 @@ def camera_section(report: PartReport, source: FlightSource) -> Iterator[Element
     yield Paragraph(
         "Lengths in mm, x to the right and y up from the centre of the format. Sigma is a posteriori; sigma alike is "
         f"that with what the rays say of it times {alike:.2g}, because neighbouring rays err alike."
-        if alike > ALIKE
+        if report.sigma_factor > 1
         else "Lengths in mm, x to the right and y up from the centre of the format. Sigma is a posteriori; sigma alike "
         "differs from it where neighbouring rays err alike, which they hardly do here."
     )
@@ -75,7 +74,7 @@ def camera_section(report: PartReport, source: FlightSource) -> Iterator[Element
     c = report.tables.correlations[name]
     panels = [
         DocumentPicture(
-            lambda axes: draw_curve(axes, curve, max(alike, 1.0) if alike > ALIKE else 1.0),
+            lambda axes: draw_curve(axes, curve, report.sigma_factor),
             f"Curve of radial distortion, {1e3 * most:.3g} µm or {most / sensor.pixel_mm:.3g} px at most, with its "
             "95 % band",
             3.6,

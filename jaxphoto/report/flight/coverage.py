@@ -69,7 +69,8 @@ def coverage_section(report: PartReport) -> Iterator[Element]:
 def draw_overlap(axes: Axes, coverage: Coverage, adjusted: Adjustment) -> None:
     """How many photographs see each cell of the ground."""
     seen = np.ma.masked_less(coverage.seen_by, 1)
-    shown = axes.pcolormesh(coverage.x, coverage.y, seen, cmap="viridis", shading="nearest")
+    x, y = (np.append(v - coverage.step_m / 2, v[-1] + coverage.step_m / 2) for v in (coverage.x, coverage.y))
+    shown = axes.pcolormesh(x, y, seen, cmap="viridis")
     axes.figure.colorbar(shown, ax=axes, label="photographs", shrink=0.8)
     station = np.asarray(adjusted.unknowns.exterior.position)
     axes.plot(station[:, 0], station[:, 1], "w+", ms=5, mew=0.8)

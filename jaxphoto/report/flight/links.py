@@ -7,8 +7,9 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 
+from jaxphoto.errors import few
 from jaxphoto.report.document import DocumentPicture, Element, Heading, Paragraph, Pictures, Rows
 from jaxphoto.report.flight.part import PartReport
 from jaxphoto.statistics.image_links import ImageLinks, WeakLink, image_links, weak_links
@@ -20,7 +21,10 @@ _SHOWN = 5
 # Of a class: more lines than these hide one another.
 _LINES = 2000
 _CLASSES = 5
-_NAMES = 3
+# Share of the picture that lines may cover, which is so many points (of 1/72 inch) across: where photographs are linked
+# with dozens of others, all lines are thinner.
+_INK, _ACROSS = 0.5, 200.0
+_THINNEST = 0.05
 
 
 def links_section(report: PartReport) -> Iterator[Element]:
@@ -48,40 +52,59 @@ def links_section(report: PartReport) -> Iterator[Element]:
     )
     yield Paragraph(
         "Of the strongest links that join all photographs these are the weakest: there the block would come apart "
-        "first. Any other pair across has fewer common points; points on both sides are those of all pairs across."
+        "first. Any other pair across has no more common points; points on both sides are those of all pairs across."
     )
     rows = tuple(
-        (images[w.first], images[w.second], str(w.common), str(w.across), _names([images[k] for k in w.side]))
+        (images[w.first], images[w.second], str(w.common), str(w.across), few([images[k] for k in w.side]))
         for w in weak
     )
     yield Rows(("photograph", "photograph", "common points", "points on both sides", "smaller side"), rows)
 
 
-def _names(names: list[str]) -> str:
-    told = ", ".join(names[:_NAMES])
-    return f"{told} and {len(names) - _NAMES} more" if len(names) > _NAMES else told
-
-
 def draw_network(axes: Axes, report: PartReport, links: ImageLinks, weak: list[WeakLink]) -> None:
-    """Stations in plan, and lines the wider and darker the more points two photographs share; the weakest in red."""
+    """Stations in plan, and lines the wider and darker the more points two photographs share; the weakest in red.
+
+    Of a class of many links an even part is drawn, which title and legend say.
+    """
     station = np.asarray(report.part.adjusted.unknowns.exterior.position)[:, :2]
     limits = strength_classes(links.common)
     # Dark lines above light ones.
+    lines = []
     for k, low in enumerate(limits):
         high = limits[k + 1] if k + 1 < len(limits) else np.inf
-        own = np.flatnonzero((links.common >= low) & (links.common < high))[:_LINES]
-        ends = np.stack([station[links.first[own]], station[links.second[own]], np.full((len(own), 2), np.nan)], axis=1)
-        strong = k / max(len(limits) - 1, 1)
+        own, one_in = thinned((links.common >= low) & (links.common < high))
         name = f"{low} or more" if np.isinf(high) else f"{low} to {high - 1}"
-        axes.plot(*ends.reshape(-1, 2).T, "-", color=str(0.85 - 0.75 * strong), lw=0.3 + 2 * strong, label=name)
+        lines.append((own, k / max(len(limits) - 1, 1), name if one_in == 1 else f"{name}: 1 in {one_in}"))
+    way = np.linalg.norm(station[links.second] - station[links.first], axis=1)
+    size = max(float(np.ptp(station, axis=0).max()), 1e-9)
+    ink = sum(float(way[own].sum()) * _width(strong) for own, strong, _ in lines) / (size * _ACROSS)
+    thinner = min(1.0, _INK / ink) if ink > 0 else 1.0
+    for own, strong, name in lines:
+        ends = np.stack([station[links.first[own]], station[links.second[own]], np.full((len(own), 2), np.nan)], axis=1)
+        width = max(_THINNEST, thinner * _width(strong))
+        axes.plot(*ends.reshape(-1, 2).T, "-", color=str(0.85 - 0.75 * strong), lw=width, label=name)
     for k, w in enumerate(weak):
         label = "weakest" if k == 0 else None
         axes.plot(*station[[w.first, w.second]].T, "--", color="tab:red", lw=1.2, label=label)
     axes.plot(*station.T, "o", ms=3, color="tab:blue")
     axes.legend(fontsize=6, title="common points", title_fontsize=6, loc="upper left", bbox_to_anchor=(1.0, 1.0))
     axes.set(xlabel=f"X [{report.unit}]", ylabel=f"Y [{report.unit}]")
-    axes.set_title("photographs and their common points", loc="left", fontsize=9)
+    shown, n = sum(len(own) for own, _, _ in lines), len(links.common)
+    part = f": {shown} of {n} links" if shown < n else ""
+    axes.set_title(f"photographs and their common points{part}", loc="left", fontsize=9)
     axes.set_aspect("equal", adjustable="datalim")
+
+
+def _width(strong: float) -> float:
+    """Of a line, in points, before all are made thinner alike."""
+    return 0.3 + 2 * strong
+
+
+def thinned(of_class: Bool[np.ndarray, pairs]) -> tuple[Int[np.ndarray, shown], int]:
+    """Which links of a class are drawn, from all of its photographs alike, and that they are one in how many."""
+    own = np.flatnonzero(of_class)
+    one_in = max(1, -(-len(own) // _LINES))
+    return own[::one_in], one_in
 
 
 def strength_classes(common: Int[np.ndarray, pairs]) -> list[int]:

@@ -16,14 +16,14 @@ from jaxphoto.report.flight.oriented import orientation_section, weights_section
 from jaxphoto.report.flight.part import PartReport
 from jaxphoto.report.flight.photographs import exterior_section, lost_section, photographs_section
 from jaxphoto.report.flight.points import points_section
-from jaxphoto.report.flight.positions import offset_rows, offset_statistics, positions_section
+from jaxphoto.report.flight.positions import in_order, offset_rows, offset_statistics, positions_section
 from jaxphoto.report.flight.provenance import provenance_section
 from jaxphoto.report.flight.residuals import residuals_section
 from jaxphoto.report.flight.source import FlightSource
-from jaxphoto.report.flight.surveyed import surveyed_section
+from jaxphoto.report.flight.surveyed import surveyed_elements, surveyed_section
 from jaxphoto.report.flight.time_line import time_section
 from jaxphoto.report.orientation import orientation_sentences
-from jaxphoto.report.positional_accuracy import accuracy_sentences
+from jaxphoto.report.positional_accuracy import class_sentences
 from jaxphoto.report.style import STYLE
 
 _PAGE = """<!DOCTYPE html>
@@ -78,7 +78,7 @@ def _elements(
     yield from summary_section(reports, sum(len(r.images) for r in reports) + len(left_out) + len(spoilt))
     yield from lost_section(left_out, spoilt)
     yield from coverage_section(first)
-    yield from positions_section(first)
+    yield from positions_section(first, source.taken)
     yield from (Paragraph(as_sentence(s)) for s in source.positions_from)
     yield from surveyed_section(first)
     yield from camera_section(first, source)
@@ -99,7 +99,7 @@ def summary_section(reports: list[PartReport], given: int) -> Iterator[Element]:
     """The numbers that one asks for first, of each part of the photographs that were `given`."""
     yield Heading("Summary")
     told = [_summary(r, given) for r in reports]
-    rows = [(name, *(t.get(name, "") for t in told)) for name in told[0]]
+    rows = [(name, *(t.get(name, "") for t in told)) for name in dict.fromkeys(n for t in told for n in t)]
     columns = ("", *(f"part {k}" for k in range(1, len(reports) + 1))) if len(reports) > 1 else ("", "")
     yield Rows(columns, tuple(rows))
 
@@ -128,18 +128,24 @@ def _summary(report: PartReport, given: int) -> dict[str, str]:
     )
     state = part.controlled.state if part.controlled else ()
     told["surveyed points"] = f"{state.count('control')} control, {state.count('check')} check"
-    if classes := accuracy_sentences(report.tables.tested_accuracy)[1:2]:
-        told["accuracy"] = classes[0]
+    # Horizontal and vertical; the three-dimensional follows from both.
+    if classes := class_sentences(report.tables.tested_accuracy)[:2]:
+        told["accuracy"] = " ".join(classes)
     return told
 
 
 def _short(report: PartReport, number: int, source: FlightSource) -> Iterable[Element]:
-    """A smaller part: findings, camera, offsets, and how it was oriented."""
+    """A smaller part: findings, camera, offsets, surveyed points, and how it was oriented."""
+    part = report.part
     yield Heading(f"Part {number}")
     yield Paragraph(report.verdict.headline, f"verdict {report.verdict.colour}")
     yield from (Paragraph(f.text, f.level.name.lower()) for f in report.verdict.findings)
     yield interior_rows(report, source.start)
+    yield from (Paragraph(as_sentence(s)) for s in part.lens)
     used = report.images[report.images["position"] == "used"]
     if len(used):
-        yield offset_rows(offset_statistics(used))
-    yield from (Paragraph(as_sentence(s)) for s in orientation_sentences(report.part.oriented.report))
+        yield offset_rows(offset_statistics(in_order(used, source.taken)[0]))
+    if part.controlled:
+        yield from surveyed_elements(part.controlled, report.tables)
+    said = [*orientation_sentences(part.oriented.report), *(part.placed.sentences if part.placed else ())]
+    yield from (Paragraph(as_sentence(s)) for s in said)

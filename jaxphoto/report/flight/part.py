@@ -34,6 +34,12 @@ class PartReport(NamedTuple):
         """Of coordinates: metres, or the block's own."""
         return "units" if self.coverage is None else "m"
 
+    @property
+    def sigma_factor(self) -> float:
+        """By what standard deviations of the camera are too small; 1 where neighbouring rays hardly err alike."""
+        alike = self.part.oriented.report.alike
+        return alike if alike > ALIKE else 1.0
+
 
 def report_of(part: FlightPart) -> PartReport:
     """Judge a part: what its adjustment says, its weights, its positions, and how far its rays are independent."""

@@ -30,7 +30,10 @@ def exterior_section(report: PartReport) -> Iterator[Element]:
     rows = []
     for name, unit in ((n, u) for n, u in zip(_EXTERIOR, (*[report.unit] * 3, *["deg"] * 3), strict=True)):
         sigma = table[f"sigma_{name}"]
-        k = int(sigma.argmax())
+        if not np.isfinite(sigma).any():
+            rows.append((name.split("_")[0], unit, *["not known"] * 3, ""))
+            continue
+        k = int(np.nanargmax(sigma))
         rows.append((name.split("_")[0], unit, *(f"{v:.3g}" for v in (sigma.min(), sigma.median(), sigma.max())),
                      table["image"].iloc[k]))  # fmt: skip
     yield Rows(("standard deviation of", "unit", "least", "median", "largest", "photograph"), tuple(rows))

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
 
+from jaxphoto.procedures.rolling_shutter import Moment
 from jaxphoto.report.document import DocumentPicture, Element, Heading, Paragraph, Pictures, Rows
 from jaxphoto.report.flight.part import PartReport
 from jaxphoto.report.plots import drawn
@@ -25,8 +26,8 @@ _ROOM = 1.25
 _WITHIN = ((1, 68.3), (2, 95.4), (3, 99.7))
 
 
-def positions_section(report: PartReport) -> Iterator[Element]:
-    """Statistics, pictures, and how standard deviations are kept to."""
+def positions_section(report: PartReport, taken: Mapping[str, Moment]) -> Iterator[Element]:
+    """Statistics, pictures, and how standard deviations are kept to; `taken` is when photographs were taken."""
     yield Heading("Recorded positions")
     part = report.part
     if not part.placed:
@@ -39,10 +40,11 @@ def positions_section(report: PartReport) -> Iterator[Element]:
         f"Recorded minus adjusted, X east, Y north, Z up. Positions used: {len(used)}; left out because they "
         f"contradict the others: {n.get('left out', 0)}; photographs without one: {n.get('none', 0)}."
     )
-    yield offset_rows(offset_statistics(used))
+    ordered, order = in_order(used, taken)
+    yield offset_rows(offset_statistics(ordered))
     yield Paragraph(
-        "rms of steps is that of the differences from one photograph to the next over the square root of 2: where it "
-        "is much less than sd, offsets drift more than they jump. The pictures show offsets less their mean."
+        f"rms of steps is that of the differences from one photograph to the next ({order}) over the square root of 2: "
+        "where it is much less than sd, offsets drift more than they jump. The pictures show offsets less their mean."
     )
     yield Pictures(
         (
@@ -59,6 +61,14 @@ def positions_section(report: PartReport) -> Iterator[Element]:
         )
     )
     yield from _kept(report)
+
+
+def in_order(table: pd.DataFrame, taken: Mapping[str, Moment]) -> tuple[pd.DataFrame, str]:
+    """Photographs as they were taken, where the time of all is known, else as they are; and which order that is."""
+    if not all(name in taken for name in table["image"]):
+        return table, "in the order of the block"
+    at = np.array([taken[name][0] for name in table["image"]])
+    return table.iloc[np.argsort(at, kind="stable")], "by their times"
 
 
 def offset_statistics(table: pd.DataFrame) -> pd.DataFrame:

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 
 from jaxphoto.report.certificate import option_word
-from jaxphoto.report.certificate_conditions import condition_rows, dates
+from jaxphoto.report.certificate_conditions import dates, told_conditions
 from jaxphoto.report.document import Element, Heading, Paragraph, Rows
 from jaxphoto.report.flight.source import FlightSource
 from jaxphoto.report.results import versions
@@ -21,8 +21,8 @@ def provenance_section(source: FlightSource) -> Iterator[Element]:
         )
     if source.inputs:
         yield Paragraph(
-            "result/inputs.csv has the SHA-256 of every file, the certificate (certificate.html, certificate.pdf) what "
-            "is to be signed. The same inputs, options and versions give the same numbers."
+            "result/inputs.csv has the SHA-256 of every file; where the calibration may be signed, certificate.html "
+            "and certificate.pdf say what is to be signed. The same inputs, options and versions give the same numbers."
         )
 
 
@@ -30,12 +30,13 @@ def _rows(source: FlightSource) -> Iterator[tuple[str, str]]:
     if source.written:
         yield "computed", source.written
     if source.conditions:
-        yield "photographs taken", dates(source.conditions)
+        if any(c.time for c in source.conditions):
+            yield "photographs taken", dates(source.conditions)
         for name, field in (("camera", "model"), ("aircraft", "drone")):
             if said := ", ".join(dict.fromkeys(v for c in source.conditions if (v := getattr(c, field)))):
                 yield name, said
         # What no photograph says is told in the certificate.
-        yield from ((name, said) for name, said in condition_rows(source.conditions) if "not said" not in said)
+        yield from told_conditions(source.conditions)
     method = dict(source.told.get("method", {}))
     if method:
         command = method.pop("command", "")

@@ -14,7 +14,8 @@ from jaxphoto.report.flight.part import PartReport
 from jaxphoto.report.flight.positions import name_ends
 from jaxphoto.report.plots import draw_density, draw_mean_residuals, drawn
 from jaxphoto.report.residual_findings import MOST_OF_IT
-from jaxphoto.statistics import LEVEL, MOST_PARTS, residual_spread
+from jaxphoto.report.tables import in_file_unit
+from jaxphoto.statistics import LEVEL, residual_spread
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -52,10 +53,7 @@ def pattern_sentence(report: PartReport, camera: str) -> str:
         t for t in report.tables.tested_trends if t.pattern.camera == camera and "over the format" in t.pattern.what
     ]
     if not found:
-        return (
-            "No test of a pattern over the format: the adjustment did not converge, or has more than "
-            f"{MOST_PARTS} cameras."
-        )
+        return "No test of a pattern over the format: the adjustment did not converge."
     (trend,) = found
     pixel = report.part.adjusted.block.sensors[camera].pixel_mm
     size = f"{trend.size / pixel:.2g} px ({trend.size / trend.pattern.sigma:.2g} of the sigma of an image point)"
@@ -75,11 +73,9 @@ def _spread(report: PartReport) -> Rows:
     (sensor,) = report.part.adjusted.block.sensors.values()
     rows = []
     for s in residual_spread(report.part.adjusted):
-        factor, unit = (1 / sensor.pixel_mm, "px") if s.unit == "mm" else (1.0, s.unit)
+        factor, unit = (1 / sensor.pixel_mm, "px") if s.unit == "mm" else in_file_unit(s.unit)
         # What free unknowns take up is zero but for rounding.
         mean = s.mean if abs(s.mean) > 1e-6 * s.rmse else 0.0
-        if unit == "rad":
-            factor, unit = 180 / np.pi, "deg"
         values = (f"{factor * v:.3g} {unit}" for v in (mean, s.rmse, s.max_abs))
         rows.append((s.group.replace("_", " "), s.axis, str(s.n), *values))
     return Rows(("residuals of", "axis", "n", "mean", "rms", "largest"), tuple(rows))

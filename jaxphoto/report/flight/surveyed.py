@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from functools import partial
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxphoto.procedures.control import ControlledBlock
 from jaxphoto.report.control import rmse, surveyed_points
@@ -12,6 +13,7 @@ from jaxphoto.report.findings import as_sentence
 from jaxphoto.report.flight.part import PartReport
 from jaxphoto.report.plots import draw_check_points
 from jaxphoto.report.positional_accuracy import accuracy_sentences
+from jaxphoto.report.tables import Tables
 
 _STATES = ("control", "check")
 
@@ -19,24 +21,25 @@ _STATES = ("control", "check")
 def surveyed_section(report: PartReport) -> Iterator[Element]:
     """Statistics by state, the class of accuracy, pictures, and every point."""
     yield Heading("Control and check points")
-    found, tables = report.part.controlled, report.tables
-    if not found:
+    if not report.part.controlled:
         why = f" ({report.part.no_control})" if report.part.no_control else ""
         yield Paragraph(
             f"No surveyed points are used{why}: nothing outside the photographs and their positions judges this block. "
             "Points measured independently (--control, role check) would."
         )
         return
+    yield from surveyed_elements(report.part.controlled, report.tables)
+
+
+def surveyed_elements(found: ControlledBlock, tables: Tables) -> Iterator[Element]:
+    """The same without a heading."""
     state = np.array(found.state, object)
     rows = []
     for what in _STATES:
         off = found.off_m[state == what]
         if not len(off):
             continue
-        spread = (
-            f"{np.nanmean(d):+.3f} / {np.nanstd(d):.3f} / {r:.3f}"
-            for d, r in zip(off.T, rmse(found, what), strict=True)
-        )
+        spread = (axis_cell(d, r) for d, r in zip(off.T, rmse(found, what), strict=True))
         rows.append((what, str(len(off)), *spread))
     yield Rows(("points", "n", *(f"d{axis}: mean / sd / rms [m]" for axis in "XYZ")), tuple(rows))
     for sentences in (found.sentences, accuracy_sentences(tables.tested_accuracy)):
@@ -53,6 +56,15 @@ def surveyed_section(report: PartReport) -> Iterator[Element]:
             )
         )  # fmt: skip
     yield _points(found)
+
+
+def axis_cell(off_m: Float[np.ndarray, " points"], rms_m: float) -> str:
+    """Mean, standard deviation and rms of the points that have the axis; "-" is what one point does not tell."""
+    known = off_m[np.isfinite(off_m)]
+    if not len(known):
+        return ""
+    sd = f"{np.std(known, ddof=1):.3f}" if len(known) > 1 else "-"
+    return f"{known.mean():+.3f} / {sd} / {rms_m:.3f}"
 
 
 def _points(found: ControlledBlock) -> Rows:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxphoto.errors import few
-from jaxphoto.procedures.rolling_shutter import Moment, velocities
+from jaxphoto.procedures.rolling_shutter import GAP, NEIGHBOUR_M, Moment, usual_interval, velocities
 from jaxphoto.report.document import DocumentPicture, Element, Heading, Paragraph, Pictures
 from jaxphoto.report.flight.part import PartReport
 from jaxphoto.report.flight.positions import AXES, less_mean
@@ -18,10 +18,6 @@ from jaxphoto.report.flight.positions import AXES, less_mean
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# Of the usual interval: a longer one is a gap.
-_GAP = 3.0
-# What adjusted positions are off by against their neighbours, m.
-_NEIGHBOUR_M = 0.05
 _HEIGHT = 2.6
 
 
@@ -34,14 +30,14 @@ class TimeLine(NamedTuple):
     """Seconds from the first; numbers from 0 where no time is known."""
     timed: bool
     gap: Bool[np.ndarray, intervals]
-    """Which intervals, from each photograph to the next, are longer than `_GAP` usual ones."""
+    """Which intervals, from each photograph to the next, are longer than `GAP` usual ones."""
     speed: Float[np.ndarray, taken]
     """m/s; NaN where neighbours do not tell it, or nothing is in metres."""
 
     @property
     def usual(self) -> float:
-        """The median interval (s)."""
-        return float(np.median(np.diff(self.at))) if len(self.at) > 1 else np.nan
+        """The usual interval (s); infinite where no two times differ."""
+        return usual_interval(self.at)
 
 
 def time_line(report: PartReport, taken: Mapping[str, Moment]) -> TimeLine:
@@ -58,10 +54,9 @@ def time_line(report: PartReport, taken: Mapping[str, Moment]) -> TimeLine:
     at = moments[order, 0] - moments[order[0], 0]
     speed = np.full(len(images), np.nan)
     if report.coverage is not None:
-        found = velocities(position, moments[:, 0], moments[:, 1], _NEIGHBOUR_M)
+        found = velocities(position, moments[:, 0], moments[:, 1], NEIGHBOUR_M)
         speed[found.known] = np.linalg.norm(found.velocity[found.known], axis=1)
-    later = np.diff(at)
-    return TimeLine(order, at, True, later > _GAP * np.median(later), speed[order])
+    return TimeLine(order, at, True, np.diff(at) > GAP * usual_interval(at), speed[order])
 
 
 def time_section(report: PartReport, taken: Mapping[str, Moment]) -> Iterator[Element]:
@@ -79,7 +74,7 @@ def time_section(report: PartReport, taken: Mapping[str, Moment]) -> Iterator[El
             "Residuals of photographs in their order", _HEIGHT,
         )
     )  # fmt: skip
-    if report.coverage is not None:
+    if report.coverage is not None and np.isfinite(report.coverage.height_m[line.order]).any():
         height = report.coverage.height_m[line.order]
         panels.append(
             DocumentPicture(
@@ -99,20 +94,18 @@ def time_section(report: PartReport, taken: Mapping[str, Moment]) -> Iterator[El
 
 def _sentences(line: TimeLine, images: tuple[str, ...]) -> Iterator[str]:
     if not line.timed:
-        yield "No times are known: photographs are in the order of their names, and no speeds or gaps are told."
+        yield "No times are known: photographs are in the order of the block, and no speeds or gaps are told."
         return
     without = len(images) - len(line.order)
-    yield (
-        f"From the first to the last photograph {line.at[-1]:.0f} s passed, usually {line.usual:.3g} s from one to the "
-        "next."
-    )
+    usual = f", usually {line.usual:.3g} s from one to the next" if np.isfinite(line.usual) else ""
+    yield f"From the first to the last photograph {line.at[-1]:.0f} s passed{usual}."
     gaps = [
         f"{later:.3g} s from {images[line.order[k]]} to {images[line.order[k + 1]]}"
         for k, later in enumerate(np.diff(line.at))
         if line.gap[k]
     ]
     what = "1 gap" if len(gaps) == 1 else f"{len(gaps)} gaps"
-    yield f"{what} of more than {_GAP:g} times that (grey): {few(gaps, '; ')}." if gaps else "There are no gaps."
+    yield f"{what} of more than {GAP:g} times that (grey): {few(gaps, '; ')}." if gaps else "There are no gaps."
     if np.isfinite(line.speed).any():
         low, middle, high = np.nanpercentile(line.speed, [0, 50, 100])
         yield f"Speed {middle:.3g} m/s in the median, {low:.3g} to {high:.3g} m/s, from adjusted positions."

@@ -13,7 +13,7 @@ from jaxphoto.report.flight.coverage import flight_words
 from jaxphoto.report.flight.page import flight_page
 from jaxphoto.report.flight.part import PartReport
 from jaxphoto.report.flight.source import FlightSource
-from jaxphoto.report.orientation import ALIKE, write_orientation
+from jaxphoto.report.orientation import write_orientation
 from jaxphoto.report.results import versions, write_results, write_summary
 from jaxphoto.report.weights import component_tables
 from jaxphoto.writing import whole_folder
@@ -62,7 +62,7 @@ def write_flight(
         with whole_folder(work / part_folder(number)) as folder:
             alike = r.part.oriented.report.alike
             own = {
-                "sigma_factor": alike if alike > ALIKE else 1.0,
+                "sigma_factor": r.sigma_factor,
                 "flight": flight_words(r.coverage, r.part.adjusted.block),
             }
             write_results(r.tables, r.verdict, folder, times, {**source.told, **own})
