@@ -33,7 +33,7 @@ from jaxphoto.observations import (
     SurfaceRows,
 )
 from jaxphoto.short_repr import block_repr
-from jaxphoto.unknowns import Unknowns
+from jaxphoto.unknowns import FREE, Unknowns
 
 
 class Block(eqx.Module):
@@ -128,6 +128,18 @@ class Block(eqx.Module):
     def of(*args: Any, **kwargs: Any) -> "Block":
         """The block of arrays and tables: see `block_fields`."""
         return Block(**block_fields(*args, **kwargs))
+
+
+def empty_block(title: str) -> Block:
+    """A block of nothing at all, for observations that need neither images nor points."""
+    places, known = np.zeros((0, 3)), np.zeros(0, bool)
+    start = Unknowns({}, ExteriorOrientation(places, np.zeros((0, 3, 3))), places, {}, {})  # type: ignore[arg-type]
+    priors = Unknowns({}, ExteriorOrientation(FREE, FREE), FREE, {}, {})  # type: ignore[arg-type]
+    none = ControlRows.none()
+    return Block(
+        title, (), (), {}, (), (), (), np.zeros(0), ImageRows.none(), none, none, none, StationRows.none(),
+        Attitudes.none(), Distances.none(), Datum(), Start(start, known, known), priors,
+    )  # fmt: skip
 
 
 def named_rows(groups: Iterable[AbstractObservations]) -> dict[str, AbstractObservations]:
@@ -226,7 +238,8 @@ def exposures(block: Block) -> Exposure:
     none = np.zeros((len(block.images), 3))
     motion = block.motion if block.motion is not None else Motion(none, none)
     mounts = block.start.unknowns.mounts
-    nominal = np.stack([mounts[name].nominal if name in mounts else NOMINAL["forward"] for name in block.image_mount])
+    each = [mounts[name].nominal if name in mounts else NOMINAL["forward"] for name in block.image_mount]
+    nominal = np.array(each).reshape(-1, 3, 3)
     flight_time = block.image_time if block.flight_time is None else block.flight_time
     height = np.array([block.sensors[camera].height_mm for camera in block.image_camera])
     return Exposure(block.image_time, motion.velocity, motion.rate, nominal, flight_time, height)  # type: ignore[arg-type]

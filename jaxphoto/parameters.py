@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Literal
 import equinox as eqx
 import numpy as np
 
-UNITS = ("m", "rad", "mm", "s", "ms", "m_per_s", "rad_per_s", "mm_per_s")
+UNITS = ("m", "rad", "mm", "s", "ms", "m_per_s", "rad_per_s", "mm_per_s", "ppm")
 """Units that the names of declared parameters may end in; a typical scale is known of these."""
 Owner = Literal["image", "camera", "mount", "strip", "block"] | str
 """Whose parameters are: of each image, of each camera and so on, or of the whole block. Any other word is a partition
@@ -26,7 +26,7 @@ class AbstractParameters(eqx.Module):
     """The table that holds them: the first word of their labels, as in `strips[a].shift_X_m`."""
     owner: eqx.AbstractClassVar[str]
     names: eqx.AbstractClassVar[Mapping[str, tuple[str, ...]]]
-    """The name of every number of every field. Its end is its unit: _m, _rad, _s, _ms, _mm, _m_per_s ..."""
+    """The name of every number of every field. Its end is its unit: _m, _rad, _s, _ms, _mm, _m_per_s, _ppm ..."""
     bends: ClassVar[tuple[str, ...]] = ()
     """Fields of the interior orientation that `interior` changes, such as ("c",); then it is asked for every image."""
 

@@ -21,11 +21,12 @@ from jaxphoto.arrays import Numbers
 from jaxphoto.camera import ImageMotion, InteriorOrientation, PrincipalDistanceRate, RollingShutter
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import InputError
-from jaxphoto.georeferencing import FlightBias, Mount, Scanner, StripBias
+from jaxphoto.georeferencing import FlightBias, Mount, Scanner, ScannerCalibration, StripBias, TrajectoryKnot
 from jaxphoto.parameters import AbstractParameters
 
 UNKNOWNS: tuple[type[AbstractParameters], ...] = (
-    Scanner, Mount, StripBias, FlightBias, PrincipalDistanceRate, RollingShutter, ImageMotion,
+    Scanner, ScannerCalibration, TrajectoryKnot, Mount, StripBias, FlightBias, PrincipalDistanceRate, RollingShutter,
+    ImageMotion,
 )  # fmt: skip
 """The classes of declared parameters that a block folder may hold; one of your own is given to `read_block`."""
 

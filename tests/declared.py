@@ -18,8 +18,17 @@ from jaxphoto.adjustment.model.structure import structure_of
 from jaxphoto.arrays import Numbers
 from jaxphoto.block import Block, Motion
 from jaxphoto.compiling import run_compiled
-from jaxphoto.georeferencing import Mount
-from jaxphoto.observations import AXES, Distances, ImageState, StationRows, exponential_covariance
+from jaxphoto.georeferencing import Mount, ScannerCalibration, StripSpline, TrajectoryKnot
+from jaxphoto.observations import (
+    AXES,
+    AttitudeSteps,
+    Distances,
+    ImageState,
+    PositionSteps,
+    StationRows,
+    StripPlanes,
+    exponential_covariance,
+)
 from jaxphoto.rotation import small_rotation
 from jaxphoto.unknowns import FIXED, FREE, Unknowns, Weighted
 from tests.blocks import VARIANTS, Simulated, free, measured, rows, with_priors
@@ -102,6 +111,18 @@ OWN = {
     "shifts": {"": CommonShift(np.array([0.3, -0.2]))},
 }
 """Truth of the unknowns of a user's own, one of each kind of owner."""
+LASER = {
+    "scanner_calibration": {
+        "": ScannerCalibration(
+            np.array([0.03, -0.02, 0.05]), *map(np.float64, (0.04, 60.0, 90.0)), np.array([2e-5, -3e-5])
+        )
+    },
+    "trajectory_knots": {
+        f"1 at {k} s": TrajectoryKnot(0.05 * np.array([1, -k, k % 2]), 1e-4 * np.array([k - 2, 1, -k]))
+        for k in range(5)
+    },
+}
+"""Truth of a laser scanner's, all known beforehand to about their size."""
 KNOWN = ("interior[one].c_mm", "interior[one].k1")
 
 
@@ -160,10 +181,29 @@ def _further(n_images: int) -> tuple:
     start, end = np.array([0, 3, 8, 20, 30]), np.array([7, 9, 25, 33, 5])
     first = np.array([0, 2, 5, 4])
     return (
+        *_strips(),
         HeightDifferences(start, end, np.zeros(5), np.array([0.005, 0.01, 0.02, 0.01, 0.005])),
         Baselines(first, np.array([1, 3, 9, 6]), np.zeros((4, 3)), np.full((4, 3), 0.03) * [1, 1, 2]),
         correlated(gnss, np.arange(3 * n_images).reshape(-1, 3), factor @ factor.transpose(0, 2, 1)),
         correlated(heights, np.arange(n_images).reshape(2, -1), in_time),
+    )
+
+
+def _strips() -> tuple:
+    """Planes that two strips see, and steps from knot to knot of one of them."""
+    rng, n = np.random.default_rng(6), 12
+    point = rng.uniform(-300, 300, (n, 3)) * [1, 1, 0.05]
+    knots, weights = StripSpline(0, 5, 0.0, 1.0).weights(np.linspace(0, 2, n))
+    normal = rng.normal(0, 0.3, (n, 3)) + np.array([0, 0, 1])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    scanner = point + rng.uniform(-200, 200, (2, n, 3)) * [1, 1, 0.1] + np.array([0, 0, 700])
+    angles = rng.uniform(-0.1, 0.1, (2, n, 3)) + np.array([0, 0, 1])
+    sides = (knots, knots[::-1], weights, weights[::-1], point, point + 0.01, *scanner, *angles)
+    start, kept, none = np.arange(4), np.full(4, 0.9), np.zeros((4, 3))
+    return (
+        StripPlanes(*sides, normal, np.full(n, 0.02), np.zeros(n)),
+        PositionSteps(start, start + 1, kept, np.full((4, 3), 0.03), none),
+        AttitudeSteps(start, start + 1, kept, np.full((4, 3), 5e-5), none),
     )
 
 
@@ -183,14 +223,14 @@ def simulated(seed: int = 1) -> Simulated:
         partitions={"session": ("early",) * 4 + ("late",) * 5 + ("",)},
     )
     block, _ = measured(Simulated(free(block, "one"), truth))
-    truth = dataclasses.replace(truth, more=OWN)
-    start = dataclasses.replace(block.start.unknowns, more=jax.tree.map(np.zeros_like, OWN))
+    truth = dataclasses.replace(truth, more=OWN | LASER)
+    start = dataclasses.replace(block.start.unknowns, more=jax.tree.map(np.zeros_like, truth.more))
     camera = truth.interior["one"]
     block = with_priors(block, "one", k2=_weighted(rng, np.float64(camera.distortion.k2), 3e-9))
     turns = rng.normal(0, 2e-3, (n, 3))
     priors = dataclasses.replace(
         block.priors,
-        more=own_priors(lambda _: FREE),
+        more=own_priors(lambda _: FREE) | jax.tree.map(lambda v: _weighted(rng, v, np.abs(v).max() + 1e-5), LASER),
         exterior=dataclasses.replace(
             block.priors.exterior,
             position=_weighted(rng, truth.exterior.position, [0.1, 0.1, 0.2]),

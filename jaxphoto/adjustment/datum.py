@@ -122,8 +122,11 @@ def _as_observed(block: Block, values: Values) -> Values:
 def _plainly_closed(block: Block, values: Values, structure: Structure, vague: float) -> bool:
     """Three full control points (or stations without free mounts and strips) that do not lie on a line will do.
 
-    They do where the rotation about the line that fits them best is known better than `vague` (rad).
+    They do where the rotation about the line that fits them best is known better than `vague` (rad). Without images
+    and points nothing is there to move.
     """
+    if not structure.n_images and not structure.n_points:
+        return True
     seen = np.zeros((3, structure.n_points))
     seen[block.control.axis, block.control.who] = 1
     seen[structure.point_free == 0] = 1

@@ -15,6 +15,7 @@ from jaxphoto.adjustment.weak_words import weaknesses_of
 from jaxphoto.block import Block
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import DatumError, RankError
+from jaxphoto.observations import AbstractObservations
 from jaxphoto.unknowns import FREE, Unknowns
 
 # A pivot of the unit-diagonal reduced matrix below this is a rank defect: at float64 it is rounding, not geometry.
@@ -112,7 +113,8 @@ def _check_shifts(block: Block, priors: Unknowns, with_station: set[int]) -> Non
 def _check_scanner(block: Block, priors: Unknowns) -> None:
     if priors.scanner is None:
         return
-    if priors.scanner.boresight is FREE and not np.any(np.asarray(block.surfaces.turn)):
+    others = any("scanner" in rows.also for rows in block.more if isinstance(rows, AbstractObservations))
+    if priors.scanner.boresight is FREE and not others and not np.any(np.asarray(block.surfaces.turn)):
         raise RankError(
             "scanner.boresight is free, but no point lies on a laser scanner's surface that the boresight moves: add "
             "such points, measured from known positions of the scanner, or hold the boresight fixed"

@@ -112,7 +112,8 @@ class Adjustment(eqx.Module):
         s, u = self.structure, self.unknowns
         distance = np.linalg.norm(still(u.points)[s.point] - still(u.exterior.position)[s.image], axis=1)
         far = np.zeros(len(self.block.points), bool)
-        far[s.point[~(distance < _FARTHEST * np.median(distance))]] = True
+        if len(distance):
+            far[s.point[~(distance < _FARTHEST * np.median(distance))]] = True
         return far
 
     @property

@@ -53,6 +53,7 @@ COMMANDS = {
     "lidar-control": _Command("lidar", "Give tie points the height of the laser points there as control."),
     "roof-control": _Command("lidar", "Hold tie points on the planes of roof faces."),
     "simultaneous": _Command("lidar", "Adjust a block and a cloud together."),
+    "strips": _Command("strips", "Fit the strips of a cloud to each other."),
     "dsm": _Command("surface_model", "Make a surface model of a cloud."),
     "orthophoto": _Command(
         "surface_model", "Adjust a block, and lay the photograph of one of its images over a surface model."

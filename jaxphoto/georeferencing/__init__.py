@@ -30,13 +30,17 @@ from jaxphoto.georeferencing.mount import (
     sensor_position,
 )
 from jaxphoto.georeferencing.scanner import Scanner, corrected_point, raised_by_boresight
+from jaxphoto.georeferencing.scanner_calibration import ScannerCalibration, corrected_return, corrected_shot
+from jaxphoto.georeferencing.strip_errors import StripErrors
 from jaxphoto.georeferencing.trajectory import Poses, Trajectory, covered, interpolate
+from jaxphoto.georeferencing.trajectory_knots import StripSpline, TrajectoryKnot, weighted_knot
 
 __all__ = [
     "IMAGE_X", "NOMINAL", "Corrections", "DirectPartials", "Exposure", "FlightBias", "Mount", "Poses",
-    "RayCovariance", "Scanner", "SensorCovariance", "StripBias", "Surface", "Trajectory", "apparent_point",
-    "arm_to_camera", "attitude_residual", "body_from_camera", "corrected_point", "covered", "direct_covariance",
+    "RayCovariance", "Scanner", "ScannerCalibration", "SensorCovariance", "StripBias", "StripErrors", "StripSpline",
+    "Surface", "Trajectory", "TrajectoryKnot", "apparent_point", "arm_to_camera", "attitude_residual",
+    "body_from_camera", "corrected_point", "corrected_return", "corrected_shot", "covered", "direct_covariance",
     "direct_orientation", "direct_partials", "exact_offset", "ground_covariance", "ground_point", "interpolate",
     "level_error", "level_offset", "object_from_body", "raised_by_boresight", "recorded_attitude",
-    "refraction_constant", "sensor_position", "worst_level_error",
+    "refraction_constant", "sensor_position", "weighted_knot", "worst_level_error",
 ]  # fmt: skip

@@ -14,8 +14,8 @@ from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import BlockError
 from jaxphoto.georeferencing import Scanner, Trajectory, corrected_point, covered, interpolate
 
-# Laser points at once; smaller clouds are padded to a power of two.
-_PORTION = 1 << 20
+PORTION = 1 << 20
+"""Laser points at once; smaller clouds are padded to a power of two."""
 # An interval is a gap from this many times the usual interval: one record may be lost.
 _GAP = 2.5
 
@@ -35,9 +35,9 @@ def scanner_poses(trajectory: Trajectory, time: Float[np.ndarray, "n"]) -> Scann
     """
     max_gap = _GAP * float(np.median(np.diff(np.asarray(trajectory.time))))
     parts = []
-    for first in range(0, len(time), _PORTION):
-        some = np.asarray(time[first : first + _PORTION], float)
-        padded = np.concatenate([some, np.full(_room(len(some)) - len(some), some[0])])
+    for first in range(0, len(time), PORTION):
+        some = np.asarray(time[first : first + PORTION], float)
+        padded = np.concatenate([some, np.full(padded_size(len(some)) - len(some), some[0])])
         position, turn, known = (v[: len(some)] for v in call_compiled(_poses, trajectory, padded, np.array(max_gap)))
         if not np.all(known):
             raise _not_covered(trajectory, time, int((~np.asarray(known)).sum()))
@@ -66,11 +66,11 @@ def corrected_xyz(
     if poses is None or not np.any(np.asarray(boresight)):
         return xyz - shift
     result = np.empty_like(xyz)
-    for first in range(0, len(xyz), _PORTION):
-        own = slice(first, first + _PORTION)
+    for first in range(0, len(xyz), PORTION):
+        own = slice(first, first + PORTION)
         some = xyz[own], poses.position[own], poses.object_from_body[own]
         n = len(some[0])
-        padded = (np.concatenate([v, np.broadcast_to(v[:1], (_room(n) - n, *v.shape[1:]))]) for v in some)
+        padded = (np.concatenate([v, np.broadcast_to(v[:1], (padded_size(n) - n, *v.shape[1:]))]) for v in some)
         result[own] = call_compiled(_corrected, *padded, np.asarray(boresight), shift)[:n]
     return result
 
@@ -83,8 +83,8 @@ def correct_cloud(cloud: Cloud, scanner: Scanner, trajectory: Trajectory | None)
     xyz = np.array(cloud.xyz)
     turned = trajectory is not None and bool(np.any(np.asarray(scanner.boresight)))
     for strip, shift in _strips(cloud, scanner):
-        for first in range(0, len(strip), _PORTION):
-            own = strip[first : first + _PORTION]
+        for first in range(0, len(strip), PORTION):
+            own = strip[first : first + PORTION]
             poses = scanner_poses(trajectory, cloud.time[own]) if turned and cloud.time is not None else None  # type: ignore[arg-type]
             xyz[own] = corrected_xyz(cloud.xyz[own], poses, scanner.boresight, shift)
     return dataclasses.replace(cloud, xyz=xyz)
@@ -125,8 +125,9 @@ def _not_covered(trajectory: Trajectory, time: np.ndarray, n: int) -> BlockError
     )
 
 
-def _room(n: int) -> int:
-    return min(1 << max(n - 1, 0).bit_length(), _PORTION)
+def padded_size(n: int) -> int:
+    """How many laser points a program is compiled for that takes `n`."""
+    return min(1 << max(n - 1, 0).bit_length(), PORTION)
 
 
 @eqx.filter_jit

@@ -19,6 +19,8 @@ from jaxphoto.observations.stations import StationRows as StationRows
 from jaxphoto.observations.attitudes import ATTITUDE_AXES as ATTITUDE_AXES, Attitudes as Attitudes
 from jaxphoto.observations.control import ControlRows as ControlRows
 from jaxphoto.observations.surfaces import SurfaceRows as SurfaceRows
+from jaxphoto.observations.strip_planes import StripPlanes as StripPlanes
+from jaxphoto.observations.knot_steps import PositionSteps as PositionSteps, AttitudeSteps as AttitudeSteps
 from jaxphoto.observations.distances import Distances as Distances
 from jaxphoto.observations.priors import PositionRows as PositionRows
 from jaxphoto.observations.priors import RotationRows as RotationRows, PointRows as PointRows

@@ -13,11 +13,13 @@ from jaxtyping import Float, Int, UInt8
 
 from jaxphoto.cloud import Cloud
 from jaxphoto.errors import BlockError
-from jaxphoto.georeferencing import Scanner, Trajectory
-from jaxphoto.rotation import small_rotation
+from jaxphoto.georeferencing import Scanner, StripErrors, Trajectory
+from jaxphoto.rotation import quaternion_from_matrix, small_rotation
 from jaxphoto.simulation.buildings import entered, solids
+from jaxphoto.simulation.chunks import in_chunks
 from jaxphoto.simulation.nearby import pairs_along
 from jaxphoto.simulation.platform_path import Path, matrices
+from jaxphoto.simulation.scan_errors import drawn_errors, drawn_shift, measured_shot, turned_by
 from jaxphoto.simulation.scan_plan import ScanPlan
 from jaxphoto.simulation.streams import stream
 from jaxphoto.simulation.terrain import Terrain
@@ -31,6 +33,7 @@ _ENOUGH_M = 1e-7
 _ROUNDS = 60
 # Pulses worked on at once: bounds the memory.
 _CHUNK = 500_000
+_CHUNK_RECORDS = 65_536
 # What a computer can hold of a cloud, and of a trajectory.
 _PULSES, _RECORDS = 1e8, 2e7
 
@@ -41,6 +44,9 @@ class Scan(NamedTuple):
     cloud: Cloud
     trajectory: Trajectory
     scanner: Scanner
+    """Boresight and the shifts of the strips, without their drifts."""
+    errors: StripErrors
+    """All of it."""
 
 
 class _Returns(NamedTuple):
@@ -60,13 +66,11 @@ def scan(
 ) -> Scan:
     """Scan `terrain`, which is drawn and settled, from the path of every strip; strips are called 1, 2 ... in turn.
 
-    The trajectory is off by the shift of each strip, and the rays by the boresight: with these, `corrected_point` of
-    every point is the point that was hit plus normal noise of `noise_m` (X, Y, Z). Raises BlockError where nothing
-    comes back.
+    The trajectory is off by shift and drift of each strip, the shots by boresight and calibration: with these,
+    `corrected_return` of every point is the point that was hit plus normal noise of `noise_m` (X, Y, Z). Raises
+    BlockError where nothing comes back.
     """
-    shifts = [_shift(plan, path.strip, seed) for path in paths]
-    boresight = np.deg2rad(plan.boresight_deg)
-    body_from_scanner = np.asarray(_small_rotation(boresight))
+    errors = drawn_errors(plan, paths, seed)
     leaves, noise = stream(seed, "laser returns from crowns"), stream(seed, "noise of laser points")
     parts = []
     pulses_of = [plan.density_per_m2 * 2 * plan.half_width * path.height_m * path.length_m for path in paths]
@@ -84,22 +88,16 @@ def scan(
         for begin in range(0, n, _CHUNK):
             pulses = np.arange(begin, min(begin + _CHUNK, n))
             time, across = _pattern(plan, path, pulses, n)
-            parts.append(
-                _measured(path, time, across, terrain, body_from_scanner, shifts[number], noise_m, leaves, noise)
-            )
+            parts.append(_measured(path, time, across, terrain, errors, number, noise_m, leaves, noise))
             parts[-1]["strip"] = np.full(len(parts[-1]["time"]), number)
     if not sum(len(part["time"]) for part in parts):
         raise BlockError("no laser pulse reaches the ground; raise density_per_m2, or scan longer strips over it")
     of_points = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     # Numbers, because files of clouds have nothing else.
     names = tuple(f"{number + 1}" for number in range(len(paths)))
-    truth = Scanner(boresight, dict(zip(names, shifts, strict=True)))  # type: ignore[arg-type]
-    return Scan(Cloud(**of_points, strips=names), _trajectory(paths, shifts), truth)
-
-
-def _shift(plan: ScanPlan, strip: str, seed: int) -> Float[np.ndarray, "3"]:
-    drawn = stream(seed, f"shift of lidar strip {strip}").standard_normal(3)
-    return plan.shift_of(strip) + np.array(plan.shift_sigma_m) * drawn
+    shifts = [drawn_shift(plan, path.strip, seed) for path in paths]
+    truth = Scanner(errors.boresight, dict(zip(names, shifts, strict=True)))  # type: ignore[arg-type]
+    return Scan(Cloud(**of_points, strips=names), _trajectory(paths, errors), truth, errors)
 
 
 def _pattern(
@@ -120,15 +118,17 @@ def _measured(
     time: Float[np.ndarray, "n"],
     across: Float[np.ndarray, "n"],
     terrain: Terrain,
-    body_from_scanner: Float[np.ndarray, "3 3"],
-    shift: Float[np.ndarray, "3"],
+    errors: StripErrors,
+    strip: int,
     noise_m: Float[np.ndarray, "3"],
     leaves: np.random.Generator,
     noise: np.random.Generator,
 ) -> dict[str, np.ndarray]:
     """The fields of the cloud of some pulses, in the order of time and returns."""
-    origin, quaternion = path.pose(time)
+    position, quaternion = path.pose(time)
     object_from_body = matrices(quaternion)
+    origin = position - object_from_body @ errors.calibration.lever_arm
+    body_from_scanner = np.asarray(_small_rotation(errors.boresight))
     # The scanner believes that its axes are those of the body.
     believed = np.column_stack([across, 0 * across, -np.ones(len(across))])
     believed /= np.linalg.norm(believed, axis=1, keepdims=True)
@@ -138,12 +138,14 @@ def _measured(
     pulse, at, by = (a[order] for a in returns)
     _, first, of_pulse, count = np.unique(pulse, return_index=True, return_inverse=True, return_counts=True)
     number = np.arange(len(pulse)) - first[of_pulse] + 1
-    # As `corrected_point` has it, resolved for the point of the file; noise is that of the corrected point.
-    hit = ray[pulse] * at[:, None] + noise.standard_normal((len(pulse), 3)) * noise_m
-    body_from_object = object_from_body[pulse].transpose(0, 2, 1)
-    as_believed = _rotated(object_from_body[pulse], _rotated(body_from_object, hit) @ body_from_scanner)
+    # As `corrected_return` has it, resolved for the point of the file; noise is that of the corrected point.
+    hit = ray[pulse] * at[:, None] + origin[pulse] - position[pulse] + noise.standard_normal((len(pulse), 3)) * noise_m
+    shot = measured_shot(
+        _rotated(object_from_body[pulse].transpose(0, 2, 1), hit), errors.boresight, errors.calibration
+    )
+    shift, turn = errors.at(strip, time[pulse])
     return {
-        "xyz": origin[pulse] + shift + as_believed,
+        "xyz": position[pulse] + shift + _rotated(turned_by(object_from_body[pulse], turn), shot),
         "classification": by,
         "returns": np.column_stack([number, count[of_pulse]]).astype(np.uint8),
         "time": time[pulse],
@@ -198,14 +200,17 @@ def _built(
     return roof, wall
 
 
-def _trajectory(paths: list[Path], shifts: list[np.ndarray]) -> Trajectory:
-    """As recorded: `_RATE_HZ` records a second from begin to end of every path, off by the shift of its strip."""
+def _trajectory(paths: list[Path], errors: StripErrors) -> Trajectory:
+    """As recorded: `_RATE_HZ` records a second from begin to end of every path, off by the errors of its strip."""
     ends = [(path.node[0], path.node[-1]) for path in paths]
     times = [np.linspace(begin, end, int(np.ceil((end - begin) * _RATE_HZ)) + 1) for begin, end in ends]
     poses = [path.pose(time) for path, time in zip(paths, times, strict=True)]
-    position = np.vstack([x + shift for shift, (x, _) in zip(shifts, poses, strict=True)])
+    off = [errors.at(k, time) for k, time in enumerate(times)]
+    position = np.vstack([x + shift for (shift, _), (x, _) in zip(off, poses, strict=True)])
     exact = np.zeros((len(position), 3))
-    quaternion = np.vstack([q for _, q in poses])
+    quaternion, turn = np.vstack([q for _, q in poses]), np.vstack([turn for _, turn in off])
+    if np.any(turn):
+        quaternion = in_chunks(_quaternions, _CHUNK_RECORDS, turned_by(matrices(quaternion), turn))
     return Trajectory(np.concatenate(times), position, quaternion, exact, exact)  # type: ignore[arg-type]
 
 
@@ -214,3 +219,4 @@ def _rotated(matrix: Float[np.ndarray, "n 3 3"], vector: Float[np.ndarray, "n 3"
 
 
 _small_rotation = jax.jit(small_rotation)
+_quaternions = jax.jit(jax.vmap(quaternion_from_matrix))

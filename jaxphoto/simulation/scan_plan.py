@@ -18,7 +18,10 @@ class ScanPlan:
     `density_per_m2` is that of the pulses of one strip on level ground at the mean height of the terrain. It scans the
     flight's own strips, or `strips` of a flight of its own. `boresight_deg` (about the body's right, forward and up
     axes) is the true misalignment; the true shift of a strip is that of `shift_m`, by its name or "default", plus a
-    normal one of `shift_sigma_m`: by so much the trajectory of the strip, and so its points, are off.
+    normal one of `shift_sigma_m`: by so much the trajectory of the strip, and so its points, are off. On top of it
+    position and attitude (about right, forward, up) drift with `drift_sigma_m`, `drift_sigma_deg` and `correlation_s`,
+    from knot to knot `knots_s` apart. `lever_arm_m`, `range_offset_m` and the scales are those of
+    `georeferencing.ScannerCalibration`.
     """
 
     density_per_m2: float
@@ -27,6 +30,14 @@ class ScanPlan:
     boresight_deg: Triple = _ZERO
     shift_m: dict[str, Triple] = dataclasses.field(default_factory=dict)
     shift_sigma_m: Triple = _ZERO
+    drift_sigma_m: Triple = _ZERO
+    drift_sigma_deg: Triple = _ZERO
+    correlation_s: float = 100.0
+    knots_s: float = 5.0
+    lever_arm_m: Triple = _ZERO
+    range_offset_m: float = 0.0
+    range_scale_ppm: float = 0.0
+    angle_scale_ppm: float = 0.0
 
     @property
     def half_width(self) -> float:

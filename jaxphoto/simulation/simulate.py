@@ -14,7 +14,7 @@ from jaxphoto.camera import InteriorOrientation
 from jaxphoto.cloud import Cloud
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import BlockError
-from jaxphoto.georeferencing import Mount, StripBias, Trajectory
+from jaxphoto.georeferencing import Mount, StripBias, StripErrors, Trajectory
 from jaxphoto.observations import Attitudes, ControlRows, Distances, ImageRows, StationRows
 from jaxphoto.simulation.convergent import take_images
 from jaxphoto.simulation.convergent_plan import ConvergentPlan
@@ -48,9 +48,11 @@ class Simulation(eqx.Module):
     terrain: Terrain = eqx.field(static=True)
     """The ground that was drawn, and what stands on it."""
     cloud: Cloud | None = None
-    """As measured: `corrected_point` with `truth.scanner` brings it to where pulses were reflected, but for noise."""
+    """As measured; where neither drifts nor calibration are wrong, `corrected_point` with `truth.scanner` mends it."""
     trajectory: Trajectory | None = None
     """Of the scanner, as GNSS and IMU gave it; its time is that of the cloud."""
+    errors: StripErrors | None = None
+    """All that the cloud is truly off by: `corrected_return` by these is where pulses came back, but for noise."""
 
     def __iter__(self) -> Iterator[Any]:
         return iter((self.block, self.truth, self.datum_offset_m))
@@ -74,7 +76,7 @@ def simulate(recipe: Recipe, seed: int = 0) -> Simulation:
     motions = camera_motions(flight.exterior, flight.motion.velocity, flight.motion.rate, mounts)
     scene = scene._replace(rays=rolled(recipe, flight, scene.rays, scene.xyz, motions))
     biases = _true_biases(recipe, flight, seed)
-    cloud, trajectory, scanner = _scanned(recipe, flight, terrain, height, seed)
+    cloud, trajectory, scanner, errors = _scanned(recipe, flight, terrain, height, seed)
     truth = Unknowns(
         {name: _numbers(camera.truth) for name, camera in recipe.cameras.items()},
         flight.exterior,
@@ -109,14 +111,14 @@ def simulate(recipe: Recipe, seed: int = 0) -> Simulation:
         priors=priors,
         motion=flight.motion if any(map(_runs_late, recipe.mounts.values())) else None,
     )
-    return Simulation(block, truth, triple(recipe.datum_offset_m), terrain, cloud, trajectory)
+    return Simulation(block, truth, triple(recipe.datum_offset_m), terrain, cloud, trajectory, errors)
 
 
 def _scanned(
     recipe: Recipe, flight: Flight, terrain: Terrain, height: float, seed: int
-) -> Scan | tuple[None, None, None]:
+) -> Scan | tuple[None, None, None, None]:
     if recipe.lidar is None:
-        return None, None, None
+        return None, None, None, None
     flown = paths(recipe, recipe.lidar, flight, height, seed)
     return scan(recipe.lidar, flown, terrain, _sigma(recipe.noise.lidar_m), seed)
 

@@ -158,7 +158,7 @@ def pad_values(values: Values, structure: Structure, padded: TiledStructure, pla
 
     Slots that no image row fills have infinite standard deviation: finite everywhere, and of no weight.
     """
-    v, p = values, padded
+    v, p, own = values, padded, structure
     n_images, n_points = p.n_images, p.n_points
     slots = (*p.tiles.image.shape, p.tiles.per_tile)
 
@@ -175,7 +175,7 @@ def pad_values(values: Values, structure: Structure, padded: TiledStructure, pla
 
     def everywhere(x: Any) -> Any:
         # Padding looks like the first point: -1 would be the last.
-        return x[..., np.maximum(places.point_at, 0)]
+        return x[..., np.maximum(places.point_at, 0)] if own.n_points else np.zeros((*x.shape[:-1], n_points))
 
     return TiledValues(
         xy=observed(v.xy, 0.0),
@@ -187,8 +187,8 @@ def pad_values(values: Values, structure: Structure, padded: TiledStructure, pla
         nominal=images(v.nominal, np.eye(3)[:, :, None]),
         flight_time=images(v.flight_time, 0.0),
         height=images(v.height, 1.0),
-        position=images(v.position, v.position[..., :1]),
-        rotation=images(v.rotation, v.rotation[..., :1]),
+        position=images(v.position, v.position[..., :1] if own.n_images else 0.0),
+        rotation=images(v.rotation, v.rotation[..., :1] if own.n_images else np.eye(3)[..., None]),
         shared=v.shared,
         points=everywhere(v.points),
         datum_eop=images(v.datum_eop, 0.0),

@@ -98,7 +98,7 @@ def field_shape(image: np.ndarray, point: np.ndarray, n_images: int, n_points: i
         tiles = len(_best_cut(*_orders(image[order], copy[order], len(point_of)), m, p)[1])
         return tiles * (m * p + _TILE)
 
-    return min((min(m, size_class(n_images, 4)) for m in _WIDTHS), key=cost), p
+    return min((min(m, size_class(max(n_images, 1), 4)) for m in _WIDTHS), key=cost), p
 
 
 # Points on which tile shapes are tried: so many runs of so many.

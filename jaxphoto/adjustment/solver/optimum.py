@@ -176,11 +176,7 @@ def typical_scale(values: TiledValues, structure: TiledStructure) -> Increments:
         typical = jnp.where(jnp.isfinite(typical), typical, 1.0)
         stop = group.offset + m * len(group.names)
         vector = vector.at[group.offset : stop].set(jnp.tile(typical, len(group.names)))
-    c = v.shared[s.groups[0].offset]
-    apart = s.by_tile(v.points)[..., None, :] - jnp.moveaxis(v.position[:, s.tiles.image], 0, 2)[..., None]
-    distance = jnp.sqrt(jnp.sum(apart**2, axis=2))
-    depth = jnp.sum(distance * filled[:, :, 0]) / jnp.sum(filled[:, :, 0])
-    ground, angle = sigma * depth / c, sigma / c
+    sigma, ground, angle = _typical_of_places(s, v, filled, sigma)
     eop = jnp.stack([ground, ground, ground, angle, angle, angle])
     # By the unit that ends a declared parameter's name.
     by_unit = {
@@ -189,10 +185,25 @@ def typical_scale(values: TiledValues, structure: TiledStructure) -> Increments:
         "mm": sigma,
         "s": ground / jnp.maximum(jnp.max(jnp.abs(v.velocity)), 1.0),
     }
-    by_unit["ms"] = 1e3 * by_unit["s"]
+    by_unit |= {"ms": 1e3 * by_unit["s"], "ppm": 1e6 * angle}
     seconds = jnp.maximum(jnp.max(jnp.abs(v.time)), 1.0)
     by_unit |= {f"{unit}_per_s": by_unit[unit] / seconds for unit in ("m", "rad", "mm")}
     if s.tables:
         declared = [by_unit.get(unit, jnp.ones(())) for t in s.tables for _ in t.owners for unit in t.units]
         vector = vector.at[s.n_cameras :].set(jnp.stack(declared))
     return Increments(eop[:, None] * s.eop_free, vector[s.free], ground * s.point_free)
+
+
+# Of laser strips alone, which nothing saw in an image: that of a laser point, and of the attitude it is measured with.
+_LASER_M, _LASER_RAD = 0.01, 1e-5
+
+
+def _typical_of_places(s: TiledStructure, v: TiledValues, filled: Array, sigma: Array) -> tuple[Array, Array, Array]:
+    """Typical sigma of an image point (mm), and what it is on the ground (m) and as an angle (rad)."""
+    if not s.groups:
+        return jnp.ones(()), jnp.array(_LASER_M), jnp.array(_LASER_RAD)
+    c = v.shared[s.groups[0].offset]
+    apart = s.by_tile(v.points)[..., None, :] - jnp.moveaxis(v.position[:, s.tiles.image], 0, 2)[..., None]
+    distance = jnp.sqrt(jnp.sum(apart**2, axis=2))
+    depth = jnp.sum(distance * filled[:, :, 0]) / jnp.sum(filled[:, :, 0])
+    return sigma, sigma * depth / c, sigma / c

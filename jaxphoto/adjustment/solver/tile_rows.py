@@ -82,7 +82,8 @@ def _leaves_of(camera: Array) -> list[Array]:
 
 def _residuals(cameras: list[list[Array]], in_camera: Triple, seen: TileMeasurements, s: TiledStructure) -> Pair:
     parts = [_residuals_of(g, c, in_camera, seen) for g, c in zip(s.groups, cameras, strict=True)]
-    x, y = parts[0]
+    # Without cameras there are empty slots only.
+    x, y = parts[0] if parts else (0 * in_camera[0], 0 * in_camera[0])
     if len(parts) > 1:
         x, y = (
             sum((jnp.where(own[:, None], v, 0.0) for own, v in zip(seen.member, of_groups, strict=True)), jnp.zeros(()))

@@ -1,5 +1,7 @@
 """[lidar] of a recipe -> `ScanPlan`."""
 
+from typing import Any
+
 import numpy as np
 
 from jaxphoto.errors import quoted
@@ -39,16 +41,22 @@ def read_lidar(top: Section, plan: FlightPlan | ConvergentPlan, terrain: Terrain
     if angle > _WIDEST_DEG:
         raise section.error("scan_angle_deg", f"{angle:g} to either side is too wide; give {_WIDEST_DEG:g} or less")
     strips = _strips(section, plan)
-    truth.known("boresight_deg", "shift_m", "shift_sigma_m")
+    single = ("range_offset_m", "range_scale_ppm", "angle_scale_ppm")
+    triples = ("boresight_deg", "lever_arm_m")
+    drawn = ("shift_sigma_m", "drift_sigma_m", "drift_sigma_deg")
+    truth.known(*triples, *single, *drawn, "shift_m", "correlation_s", "knots_s")
     shifts = truth.section("shift_m")
     shifts.known("default", *(strip.name for strip in strips or plan.strips))
+    given: dict[str, Any] = {name: tuple(truth.vector(name).tolist()) for name in triples}
+    given |= {name: truth.number(name, 0.0) for name in single}
+    given |= {name: sigmas(truth, name) or _ZERO for name in drawn}
+    given |= {name: truth.positive(name) for name in ("correlation_s", "knots_s") if name in truth}
     return ScanPlan(
         density_per_m2=section.positive("density_per_m2"),
         scan_angle_deg=angle,
         strips=strips,
-        boresight_deg=tuple(truth.vector("boresight_deg").tolist()),
         shift_m={name: tuple(shifts.vector(name).tolist()) for name in shifts},
-        shift_sigma_m=sigmas(truth, "shift_sigma_m") or _ZERO,
+        **given,
     )
 
 

@@ -8,7 +8,7 @@ import pandas as pd
 from jaxphoto.camera import constant_names, get_parameter, parameter_names
 from jaxphoto.io.block_folder import whole_block
 from jaxphoto.io.block_folder.table_layout import ANGLES, XYZ
-from jaxphoto.io.recipe.scan_files import scanner_rows, write_scan
+from jaxphoto.io.recipe.scan_files import drift_table, scanner_rows, write_scan
 from jaxphoto.observations import AXES
 from jaxphoto.parameters import numbers_of
 from jaxphoto.simulation import Simulation
@@ -16,6 +16,7 @@ from jaxphoto.simulation.flight import omega_phi_kappa
 
 FOLDER = "truth"
 _SCANNER = "scanner"
+_DRIFT = "trajectory_errors"
 
 
 def write_simulation(simulation: Simulation, folder: str | Path) -> None:
@@ -35,7 +36,8 @@ def write_simulation(simulation: Simulation, folder: str | Path) -> None:
 def truth_tables(simulation: Simulation) -> dict[str, pd.DataFrame]:
     """The truth by name of the result table that it joins: interior, exterior, object_points, georeferencing.
 
-    That of a scanner, which joins georeferencing too, is the table scanner.
+    That of a scanner, which joins georeferencing too, is the table scanner; what its trajectory is off by, shift and
+    drift, is trajectory_errors.
     """
     block, truth = simulation.block, simulation.truth
     interior = [
@@ -50,8 +52,11 @@ def truth_tables(simulation: Simulation) -> dict[str, pd.DataFrame]:
         "object_points": _table("point", block.points, XYZ, np.asarray(truth.points)),
         "georeferencing": pd.DataFrame(_georeferencing(simulation), columns=["parameter", "value"]),
     }
-    if truth.scanner is not None:
-        tables[_SCANNER] = pd.DataFrame(scanner_rows(truth.scanner), columns=["parameter", "value"])
+    errors = simulation.errors
+    if truth.scanner is not None and errors is not None:
+        tables[_SCANNER] = pd.DataFrame(scanner_rows(truth.scanner, errors), columns=["parameter", "value"])
+        if np.ptp(errors.position, axis=0).any() or errors.attitude.any():
+            tables[_DRIFT] = drift_table(errors, tuple(truth.scanner.shifts))
     return tables
 
 

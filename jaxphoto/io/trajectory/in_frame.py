@@ -1,4 +1,4 @@
-"""A trajectory's records brought to the object frame of a block."""
+"""A trajectory's records brought to the object frame of a block, and back."""
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +10,12 @@ from jaxphoto.compiling import jit_quickly
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import Trajectory
 from jaxphoto.io.trajectory.records import Records
-from jaxphoto.rotation import matrix_from_roll_pitch_yaw, quaternion_from_matrix
+from jaxphoto.rotation import (
+    matrix_from_quaternion,
+    matrix_from_roll_pitch_yaw,
+    quaternion_from_matrix,
+    roll_pitch_yaw_from_matrix,
+)
 
 
 def positions_in(records: Records, frame: Frame) -> Float[np.ndarray, "records 3"]:
@@ -48,6 +53,14 @@ def trajectory_in(
     return Trajectory(*map(jnp.asarray, arrays))
 
 
+def records_of(trajectory: Trajectory, file: str) -> Records:
+    """Records in the object frame, without standard deviations: what `trajectory_in` makes `trajectory` of."""
+    position = np.asarray(trajectory.position)
+    angles = np.rad2deg(np.asarray(_roll_pitch_yaw(np.asarray(trajectory.quaternion))))
+    unknown = np.full(position.shape, np.nan)
+    return Records(file, np.asarray(trajectory.time), position, False, angles, unknown, unknown)
+
+
 def with_positions(records: Records, position: Float[np.ndarray, "records 3"], frame: Frame) -> Records:
     """The same records at other positions (m), given in the frame of the block."""
     if frame.kind != "epsg":
@@ -60,3 +73,9 @@ def with_positions(records: Records, position: Float[np.ndarray, "records 3"], f
 @jax.vmap
 def _quaternions(turn, angles):
     return quaternion_from_matrix(turn @ matrix_from_roll_pitch_yaw(angles))
+
+
+@jit_quickly
+@jax.vmap
+def _roll_pitch_yaw(quaternion):
+    return roll_pitch_yaw_from_matrix(matrix_from_quaternion(quaternion))

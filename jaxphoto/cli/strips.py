@@ -1,0 +1,134 @@
+"""`jaxphoto strips`: from a cloud of several strips and its trajectory, both without what they are off by."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+
+from jaxphoto.block import Frame
+from jaxphoto.cli.app import app
+from jaxphoto.cli.cloud_options import Classes, CloudEpsg, CloudUnit, ReturnsOption, class_numbers
+from jaxphoto.cli.console import plain_console
+from jaxphoto.cloud import Cloud
+from jaxphoto.errors import InputError
+from jaxphoto.georeferencing import ScannerCalibration, StripErrors
+from jaxphoto.io import clouds
+from jaxphoto.io.trajectory import read_records, write_flight_csv
+from jaxphoto.io.trajectory.in_frame import records_of, trajectory_in
+from jaxphoto.lidar.strip_correction import correct_strips
+from jaxphoto.lidar.strip_settings import StripSettings
+from jaxphoto.parameters import dynamic_fields
+from jaxphoto.procedures.lidar import ScannerPriors, StripAdjustment, StripRound, adjust_strips
+from jaxphoto.procedures.lidar.strip_adjustment import MAX_STRIP_ROUNDS
+from jaxphoto.report.strips import print_strips, write_strips
+from jaxphoto.unknowns import FIXED, FREE
+from jaxphoto.writing import check_folder
+
+_USUAL = StripSettings()
+_SCANNER = ("boresight", *(name.replace("_", "-") for name in dynamic_fields(ScannerCalibration)))
+
+
+@app.command("strips")
+def strips_command(
+    cloud: Annotated[Path, typer.Argument(help="Cloud of several strips: .las, .laz, .csv or .ply (docs/clouds.md).")],
+    out: Annotated[Path, typer.Option(help="Folder for the results; earlier results in it are replaced.")],
+    trajectory: Annotated[
+        Path | None,
+        typer.Option(help="Trajectory of the scanner (docs/trajectory.md), on the cloud's clock, in its system."),
+    ] = None,
+    trajectory_shift_s: Annotated[float, typer.Option(help="Cloud's time + this is the trajectory's.")] = 0.0,
+    adjust: Annotated[
+        str, typer.Option(help=f"What of the scanner is estimated, by commas: {', '.join(_SCANNER)}; or none.")
+    ] = "boresight",
+    hold: Annotated[str, typer.Option(help="Strips whose trajectory is right, by commas.")] = "",
+    cell_m: Annotated[float, typer.Option(help="Side of the cells in which planes are sought.")] = _USUAL.cell_m,
+    roughness_m: Annotated[
+        float, typer.Option(help="Most that the returns of a plane scatter about it.")
+    ] = _USUAL.roughness_m,
+    knots_s: Annotated[float, typer.Option(help="From knot to knot of the trajectory's errors.")] = _USUAL.knots_s,
+    correlation_s: Annotated[float, typer.Option(help="Correlation time of these errors.")] = _USUAL.correlation_s,
+    sigma_position_m: Annotated[float, typer.Option(help="Their standard deviation.")] = _USUAL.sigma_position_m,
+    sigma_attitude_deg: Annotated[
+        float, typer.Option(help="That about right and forward.")
+    ] = _USUAL.sigma_attitude_deg,
+    sigma_heading_deg: Annotated[float, typer.Option(help="That about up.")] = _USUAL.sigma_heading_deg,
+    classes: Classes = None,
+    returns: ReturnsOption = "all",
+    cloud_epsg: CloudEpsg = None,
+    cloud_unit: CloudUnit = None,
+    max_rounds: Annotated[int, typer.Option(min=1, help="Most rounds of search and adjustment.")] = MAX_STRIP_ROUNDS,
+) -> None:
+    """Fit the strips of a cloud to each other; write the corrected cloud and trajectory, and what was wrong.
+
+    --class and --returns choose the points of the planes; the whole cloud is corrected. Exit code 1: written, but it
+    still changed.
+    """
+    settings = StripSettings(
+        cell_m=cell_m,
+        roughness_m=roughness_m,
+        knots_s=knots_s,
+        correlation_s=correlation_s,
+        sigma_position_m=sigma_position_m,
+        sigma_attitude_deg=sigma_attitude_deg,
+        sigma_heading_deg=sigma_heading_deg,
+    )
+    priors, chosen, errors = _priors(adjust), class_numbers(classes), plain_console(stderr=True)
+    held = [name.strip() for name in hold.split(",") if name.strip()]
+    check_folder(out, cloud, *([] if trajectory is None else [trajectory]))
+    with errors.status("reading the cloud") as status:
+        records = path = None
+        if trajectory is not None:
+            records = read_records(trajectory)
+            if records.geographic:
+                raise InputError(
+                    f"{trajectory.name}: the trajectory gives longitude and latitude, and the cloud X, Y and Z: bring "
+                    "the trajectory into the cloud's system"
+                )
+            exact = np.zeros((len(records.time), 3))
+            path = trajectory_in(records._replace(time=records.time - trajectory_shift_s), Frame(), exact, exact)
+        said: dict[str, Any] = {"epsg": cloud_epsg, "unit": cloud_unit}
+        whole = planes = clouds.read_cloud(cloud, **said)
+        if chosen is not None or returns != "all":
+            planes = clouds.read_cloud(cloud, classes=chosen, returns=returns, **said)  # type: ignore[arg-type]
+
+        def report(made: StripRound) -> None:
+            line = f"round {made.number}: {made.planes} planes, strips {made.rms_m:.3f} m apart before"
+            status.update(f"{line}; largest change {made.largest_change:.2g} standard deviations")
+
+        result = adjust_strips(planes, path, settings, priors, held=held, max_rounds=max_rounds, report=report)
+        corrected = result.cloud if planes is whole else correct_strips(whole, _for_all(result, whole), path)
+        status.update(f"writing {out}")
+        like = cloud if cloud.suffix.lower() in (".las", ".laz") else None
+        with write_strips(result, out) as folder:
+            name = cloud.name if like is not None else f"corrected_{cloud.name}"
+            clouds.write_cloud(corrected, folder / name, like=like, **said)
+            if records is not None and result.trajectory is not None:
+                moved = records_of(result.trajectory, records.file)
+                write_flight_csv(moved._replace(time=moved.time + trajectory_shift_s), folder / "trajectory.csv")
+    console = plain_console()
+    print_strips(result, console)
+    console.print(f"results in {out}")
+    if not result.still:
+        raise typer.Exit(1)
+
+
+def _for_all(result: StripAdjustment, whole: Cloud) -> StripErrors:
+    """The errors in the order of the strips of the whole cloud. Raises InputError for one that showed no plane."""
+    names = result.cloud.strips
+    for name in whole.strips:
+        if name not in names:
+            raise InputError(f"strip {name} has no points of these classes and returns: take others, or leave it out")
+    splines = tuple(result.errors.splines[names.index(name)] for name in whole.strips)
+    return dataclasses.replace(result.errors, splines=splines)
+
+
+def _priors(text: str) -> ScannerPriors:
+    """FREE what `text` names of the scanner. Raises InputError for what it does not have."""
+    names = [] if text.strip() == "none" else [name.strip() for name in text.split(",")]
+    for name in names:
+        if name not in _SCANNER:
+            raise InputError(f"--adjust {name}: a scanner has {', '.join(_SCANNER)}; name some of these, or none")
+    boresight, *calibration = (FREE if name in names else FIXED for name in _SCANNER)
+    return ScannerPriors(boresight, ScannerCalibration(*calibration))  # type: ignore[arg-type]

@@ -1,0 +1,82 @@
+"""A laser return: where it lies by the trajectory at its time, and by what is wrong with its scanner.
+
+A cloud holds X, and a trajectory the position p and attitude R of the scanner at the time of X; range and angle of the
+shot are those of s = R' (X - p), in the axes of the body (right, forward, up):
+
+    rho = |s|,    theta = atan2(s_right, -s_up)        from the nadir, about the axis that points forward
+
+What each of them is off by is estimated and taken off. With the corrections of a trajectory dp, da at that time
+(`TrajectoryKnot`), the boresight b of `Scanner` and `ScannerCalibration` the return lies at
+
+    X' = p - dp + R S(da) (S(b) s' - l),       S = rotation.small_rotation
+    s'  is s, of length rho (1 - m) - d, turned about the forward axis by -(k theta + e1 cos theta + e2 sin theta)
+
+An offset of the encoder is a boresight about the forward axis (of the other sign), and is found as such.
+
+Sources: Skaloud and Lichti (2006), Rigorous approach to bore-sight self-calibration in airborne laser
+scanning; Glira, Pfeifer and Mandlburger (2016), Rigorous strip adjustment of UAV-based laserscanning data including
+time-dependent correction of trajectory errors. Frames and signs: docs/conventions.md.
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxphoto.parameters import AbstractParameters
+from jaxphoto.rotation import rotate, small_rotation
+
+_PPM = 1e-6
+_AXES = ("right", "forward", "up")
+
+
+class ScannerCalibration(AbstractParameters):
+    """What is wrong with the scanner besides its boresight, all of which makes its cloud wrong by so much.
+
+    `lever_arm` of the scanner beside the one used (m: right, forward, up); `range_offset` (m) and `range_scale` (ppm)
+    of measured ranges; `angle_scale` (ppm) and `eccentricity` (rad, of cos theta and sin theta) of measured angles.
+    """
+
+    kind = "scanner_calibration"
+    owner = "lidar"
+    names = {  # noqa: RUF012
+        "lever_arm": tuple(f"lever_arm_{axis}_m" for axis in _AXES),
+        "range_offset": ("range_offset_m",),
+        "range_scale": ("range_scale_ppm",),
+        "angle_scale": ("angle_scale_ppm",),
+        "eccentricity": ("eccentricity_cos_rad", "eccentricity_sin_rad"),
+    }
+
+    lever_arm: Float[Array, "3"]
+    range_offset: Float[Array, ""] | float = 0.0
+    range_scale: Float[Array, ""] | float = 0.0
+    angle_scale: Float[Array, ""] | float = 0.0
+    eccentricity: Float[Array, "2"] | tuple[float, float] = (0.0, 0.0)
+
+
+def corrected_shot(shot: Float[Array, "3"], calibration: ScannerCalibration) -> Float[Array, "3"]:
+    """From the scanner to the return (m, in the body's axes), by the range and the angle as they should be."""
+    right, forward, up = shot
+    distance = jnp.sqrt(jnp.sum(shot**2))
+    angle = jnp.arctan2(right, -up)
+    by_cos, by_sin = calibration.eccentricity
+    turn = _PPM * calibration.angle_scale * angle + by_cos * jnp.cos(angle) + by_sin * jnp.sin(angle)
+    cos, sin = jnp.cos(turn), jnp.sin(turn)
+    turned = jnp.stack([cos * right + sin * up, forward, cos * up - sin * right])
+    return turned * (1 - _PPM * calibration.range_scale - calibration.range_offset / distance)
+
+
+def corrected_return(
+    point: Float[Array, "3"],
+    position: Float[Array, "3"],
+    object_from_body: Float[Array, "3 3"],
+    off_position: Float[Array, "3"],
+    off_attitude: Float[Array, "3"],
+    boresight: Float[Array, "3"],
+    calibration: ScannerCalibration,
+) -> Float[Array, "3"]:
+    """A laser point (m) as it is; `position` and `object_from_body` are the scanner's, as the trajectory gave them.
+
+    `off_position` (m) and `off_attitude` (rad) are what the trajectory is off by at its time.
+    """
+    shot = corrected_shot(rotate(object_from_body.T, point - position), calibration)
+    in_body = rotate(small_rotation(boresight), shot) - calibration.lever_arm
+    return position - off_position + rotate(object_from_body, rotate(small_rotation(off_attitude), in_body))

@@ -1,0 +1,77 @@
+"""What a trajectory is off by, strip by strip: a cubic B-spline of time for position and attitude.
+
+With knots h apart from the begin of a strip, the correction at time t in interval i, u of the interval gone, is that
+of four coefficients c[i] to c[i + 3]:
+
+    [(1 - u)^3, 3 u^3 - 6 u^2 + 4, -3 u^3 + 3 u^2 + 3 u + 1, u^3] / 6
+
+Source: de Boor, A practical guide to splines. What holds the coefficients together is `observations.PositionSteps`.
+"""
+
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxphoto.parameters import AbstractParameters
+
+
+class TrajectoryKnot(AbstractParameters):
+    """One coefficient of the splines of a strip.
+
+    `position` is what positions are off by (m, in the object frame), `attitude` a small rotation about the body's
+    right, forward and up axes (rad): the true attitude is `object_from_body @ small_rotation(attitude)`.
+    """
+
+    kind = "trajectory_knots"
+    owner = "lidar"
+    names = {  # noqa: RUF012
+        "position": tuple(f"{axis}_m" for axis in "XYZ"),
+        "attitude": tuple(f"{axis}_rad" for axis in ("right", "forward", "up")),
+    }
+
+    position: Float[Array, "3"]
+    attitude: Float[Array, "3"]
+
+
+class StripSpline(NamedTuple):
+    """The knots of a strip, numbered from `first` among those of all strips; one knot alone is a constant."""
+
+    first: int
+    size: int
+    start: float
+    """Seconds."""
+    interval: float
+
+    @classmethod
+    def over(cls, first: int, start: float, end: float, apart: float) -> "StripSpline":
+        """Knots about `apart` (s), evenly over a strip from `start` to `end`."""
+        pieces = max(1, round((end - start) / apart))
+        return cls(first, pieces + 3, start, max(end - start, 1e-9) / pieces)
+
+    @classmethod
+    def constant(cls, first: int) -> "StripSpline":
+        """What a strip is off by at all times."""
+        return cls(first, 1, 0.0, 1.0)
+
+    @property
+    def times(self) -> Float[np.ndarray, "size"]:
+        """Where each coefficient weighs most (s)."""
+        return self.start + (np.arange(self.size) - (self.size > 1)) * self.interval
+
+    def weights(self, time: Float[np.ndarray, "n"]) -> tuple[Int[np.ndarray, "n 4"], Float[np.ndarray, "n 4"]]:
+        """The knots that make up the correction at each time, and by how much; before and after as at the ends."""
+        n = len(time)
+        if self.size == 1:
+            return np.full((n, 4), self.first), np.tile([1.0, 0.0, 0.0, 0.0], (n, 1))
+        gone = np.clip((np.asarray(time) - self.start) / self.interval, 0.0, self.size - 3)
+        piece = np.minimum(gone.astype(int), self.size - 4)
+        u = gone - piece
+        cubic = [(1 - u) ** 3, 3 * u**3 - 6 * u**2 + 4, -3 * u**3 + 3 * u**2 + 3 * u + 1, u**3]
+        return self.first + piece[:, None] + np.arange(4), np.column_stack(cubic) / 6
+
+
+def weighted_knot(knots: TrajectoryKnot, weights: Float[Array, "4"]) -> TrajectoryKnot:
+    """The correction that four knots (leading axis) make up."""
+    return jax.tree.map(lambda v: sum(weights[k] * v[k] for k in range(4)), knots)

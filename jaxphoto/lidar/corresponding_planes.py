@@ -1,0 +1,154 @@
+"""Corresponding planes of two laser strips: patches of both, cell by cell of one grid.
+
+The plane of a cell is that of least squared distances from its returns: through their mean, the normal the eigenvector
+of the least eigenvalue of their scatter. Cells are kept where the returns are many, spread over the cell and no rougher
+than a hard surface is (no vegetation, no edge); planes of two strips correspond where their normals agree and their
+means lie close. All sums are made in one pass over the returns. Source: Glira, Pfeifer, Briese and Ressl (2015), A
+correspondence framework for ALS strip adjustments based on variants of the ICP algorithm: selection, matching and
+rejection there are of single points, of cells here.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxphoto.lidar.strip_settings import StripSettings
+
+# Spread of a patch along the shorter of its axes, as a part of the cell; a full cell has 0.29.
+_SPREAD = 0.15
+# Means of two patches that lie closer, as a part of the cell, are of one place.
+_CLOSE = 0.3
+
+
+class StripPatches(NamedTuple):
+    """The planes of one strip, by cell in ascending order."""
+
+    cell: Int[np.ndarray, "n"]
+    returns: Int[np.ndarray, "n"]
+    mean: Float[np.ndarray, "n 3"]
+    """Of the returns, corrected (m)."""
+    measured: Float[np.ndarray, "n 3"]
+    """The same of the returns as measured."""
+    time: Float[np.ndarray, "n"]
+    """Mean time of the returns (s)."""
+    normal: Float[np.ndarray, "n 3"]
+    """Unit vectors, upwards."""
+    roughness: Float[np.ndarray, "n"]
+    """Standard deviation of a return from the plane (m)."""
+    cofactor: Float[np.ndarray, "n 3 3"]
+    """Inverse scatter within the plane (1/m^2): what the tilt of the plane is off by for returns that are off by 1."""
+
+
+class PlanePairs(NamedTuple):
+    """Places that two strips have planes at, and how far these are apart."""
+
+    a: Int[np.ndarray, "n"]
+    """StripPatches of the one strip."""
+    b: Int[np.ndarray, "n"]
+    cell: Int[np.ndarray, "n"]
+    foot_a: Float[np.ndarray, "n 3"]
+    """The place on a's plane (m), corrected."""
+    foot_b: Float[np.ndarray, "n 3"]
+    normal: Float[np.ndarray, "n 3"]
+    gap: Float[np.ndarray, "n"]
+    """By how much a's plane lies above b's, along the normal (m)."""
+    sigma: Float[np.ndarray, "n"]
+    """Of the gap (m), by the roughness of both patches."""
+
+
+def cells_of(
+    xyz: Float[np.ndarray, "n 3"], origin: Float[np.ndarray, "2"], settings: StripSettings
+) -> Int[np.ndarray, "n"]:
+    """The cell of each return, of a grid that begins at `origin` (m)."""
+    row, column = np.floor((xyz[:, :2] - origin) / settings.cell_m).astype(np.int64).T
+    return (row << 32) + column
+
+
+def planes_of(
+    xyz: Float[np.ndarray, "n 3"],
+    measured: Float[np.ndarray, "n 3"],
+    time: Float[np.ndarray, "n"],
+    cell: Int[np.ndarray, "n"],
+    settings: StripSettings,
+) -> StripPatches:
+    """The planes of a strip's returns `xyz` (m), corrected; `measured` is where they were, `cell` as of `cells_of`."""
+    cells, of = np.unique(cell, return_inverse=True)
+    count = np.bincount(of)
+    kept = count >= settings.returns
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        return np.bincount(of, values, len(cells)) / count
+
+    middle = np.column_stack([mean(v) for v in xyz.T])
+    before = np.column_stack([mean(v) for v in measured.T])
+    off = xyz - middle[of]
+    scatter = np.empty((len(cells), 3, 3))
+    for i in range(3):
+        for j in range(i + 1):
+            scatter[:, i, j] = scatter[:, j, i] = mean(off[:, i] * off[:, j]) * count
+    value, axes = np.linalg.eigh(scatter)
+    roughness = np.sqrt(np.maximum(value[:, 0], 0.0) / np.maximum(count - 3, 1))
+    kept &= (roughness <= settings.roughness_m) & (
+        np.sqrt(np.maximum(value[:, 1], 0.0) / count) > _SPREAD * settings.cell_m
+    )
+    normal = axes[:, :, 0] * np.where(axes[:, 2, 0] < 0, -1.0, 1.0)[:, None]
+    along = axes[kept][:, :, 1:]
+    return StripPatches(
+        cells[kept],
+        count[kept],
+        middle[kept],
+        before[kept],
+        mean(time)[kept],
+        normal[kept],
+        # A patch that is smoother than any scanner is one by chance.
+        np.maximum(roughness[kept], settings.least_roughness_m),
+        np.einsum("nik,nk,njk->nij", along, 1 / value[kept][:, 1:], along),
+    )
+
+
+def corresponding(one: StripPatches, other: StripPatches, settings: StripSettings) -> PlanePairs:
+    """The planes that both strips have, robust against what is no plane of both but for the blunders of `outliers`."""
+    cell, a, b = np.intersect1d(one.cell, other.cell, assume_unique=True, return_indices=True)
+    cosine = np.einsum("ni,ni->n", one.normal[a], other.normal[b])
+    apart = np.linalg.norm((one.mean[a] - other.mean[b])[:, :2], axis=1)
+    alike = (cosine > np.cos(np.deg2rad(settings.normals_deg))) & (apart < _CLOSE * settings.cell_m)
+    a, b = a[alike], b[alike]
+    weight = (one.returns[a] / (one.returns[a] + other.returns[b]))[:, None]
+    place = weight * one.mean[a] + (1 - weight) * other.mean[b]
+    normal = weight * one.normal[a] + (1 - weight) * other.normal[b]
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    up_a, up_b = (_up(p, k, place, normal) for p, k in ((one, a), (other, b)))
+    variance = _variance(one, a, place) + _variance(other, b, place)
+    return PlanePairs(
+        a,
+        b,
+        cell[alike],
+        place + up_a[:, None] * normal,
+        place + up_b[:, None] * normal,
+        normal,
+        up_a - up_b,
+        np.sqrt(variance),
+    )
+
+
+def fitting(gap: Float[np.ndarray, "n"], sigma: Float[np.ndarray, "n"], limit: float) -> np.ndarray:
+    """Which gaps lie within `limit` standard deviations of their median, by the spread that the middle half has."""
+    w = gap / sigma
+    middle = np.median(w) if len(w) else 0.0
+    # 1.4826 of the median deviation is the standard deviation of normal errors.
+    spread = max(1.0, 1.4826 * float(np.median(np.abs(w - middle)))) if len(w) else 1.0
+    return np.abs(w - middle) <= limit * spread
+
+
+def _up(patches: StripPatches, which: np.ndarray, place: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """How far along the normal the planes lie from places."""
+    own = patches.normal[which]
+    return np.einsum("ni,ni->n", own, patches.mean[which] - place) / np.einsum("ni,ni->n", own, normal)
+
+
+def _variance(patches: StripPatches, which: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """Of the heights of the planes at places (m^2)."""
+    off = place - patches.mean[which]
+    tilt = np.einsum("ni,nij,nj->n", off, patches.cofactor[which], off)
+    return patches.roughness[which] ** 2 * (1 / patches.returns[which] + tilt)

@@ -1,0 +1,84 @@
+"""A cloud and its trajectory, corrected by what a strip adjustment has found of the scanner and of the trajectory."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxphoto.cloud import Cloud
+from jaxphoto.compiling import call_compiled
+from jaxphoto.georeferencing import StripErrors, Trajectory, corrected_return
+from jaxphoto.lidar.correction import PORTION, padded_size, scanner_poses
+from jaxphoto.rotation import matrix_from_quaternion, quaternion_from_matrix, small_rotation
+
+
+def corrected_strip(
+    xyz: Float[np.ndarray, "n 3"],
+    time: Float[np.ndarray, "n"],
+    strip: int,
+    errors: StripErrors,
+    trajectory: Trajectory | None,
+) -> Float[np.ndarray, "n 3"]:
+    """`georeferencing.corrected_return` of returns of one strip; without a trajectory its constant shift alone.
+
+    Raises as `scanner_poses`.
+    """
+    off, turn = errors.at(strip, time)
+    if trajectory is None:
+        return xyz - off
+    result = np.empty_like(xyz)
+    for first in range(0, len(xyz), PORTION):
+        own = slice(first, first + PORTION)
+        poses = scanner_poses(trajectory, time[own])
+        some = xyz[own], poses.position, poses.object_from_body, off[own], turn[own]
+        n = len(some[0])
+        padded = (np.concatenate([v, np.broadcast_to(v[:1], (padded_size(n) - n, *v.shape[1:]))]) for v in some)
+        result[own] = call_compiled(_corrected, *padded, errors.boresight, errors.calibration)[:n]
+    return result
+
+
+def correct_strips(cloud: Cloud, errors: StripErrors, trajectory: Trajectory | None) -> Cloud:
+    """The cloud that the scanner would have measured without these errors; all its other fields are kept."""
+    xyz = np.array(cloud.xyz)
+    for k in range(len(errors.splines)):
+        own = np.flatnonzero(cloud.strip == k) if cloud.strip is not None else np.arange(len(cloud))
+        if len(own):
+            xyz[own] = corrected_strip(cloud.xyz[own], times_of(cloud)[own], k, errors, trajectory)
+    return dataclasses.replace(cloud, xyz=xyz)
+
+
+def correct_flight(trajectory: Trajectory, errors: StripErrors) -> Trajectory:
+    """The trajectory without its errors; between two strips, by those of the end that is nearer in time."""
+    time = np.asarray(trajectory.time)
+    ends = np.array([(s.start, s.start + s.interval * max(s.size - 3, 0)) for s in errors.splines])
+    away = np.maximum(ends[:, :1] - time, time - ends[:, 1:])
+    nearest = np.argmin(np.maximum(away, 0.0), axis=0)
+    off, turn = np.zeros((len(time), 3)), np.zeros((len(time), 3))
+    for k in range(len(ends)):
+        own = nearest == k
+        off[own], turn[own] = errors.at(k, time[own])
+    quaternion = call_compiled(_turned, np.asarray(trajectory.quaternion), turn)
+    return dataclasses.replace(
+        trajectory, position=jnp.asarray(np.asarray(trajectory.position) - off), quaternion=quaternion
+    )
+
+
+def times_of(cloud: Cloud) -> Float[np.ndarray, "n"]:
+    """Of the points (s); zero where the cloud has none, of which a constant shift needs none."""
+    return np.zeros(len(cloud)) if cloud.time is None else cloud.time
+
+
+@eqx.filter_jit
+def _corrected(point, position, object_from_body, off, turn, boresight, calibration) -> Float[Array, "n 3"]:
+    each = (0, 0, 0, 0, 0, None, None)
+    return jax.vmap(corrected_return, each)(point, position, object_from_body, off, turn, boresight, calibration)
+
+
+@eqx.filter_jit
+@jax.vmap
+def _turned(quaternion: Float[Array, "4"], turn: Float[Array, "3"]) -> Float[Array, "4"]:
+    turned = quaternion_from_matrix(jnp.matmul(matrix_from_quaternion(quaternion), small_rotation(turn)))
+    return jnp.where(jnp.sum(turned * quaternion) < 0, -turned, turned)

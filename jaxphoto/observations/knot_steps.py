@@ -1,0 +1,69 @@
+"""Steps of a trajectory's error from knot to knot: how GNSS and IMU drift, by which it is regularised.
+
+A process of Gauss and Markov with standard deviation s and correlation time T goes on from c[k] to
+
+    c[k + 1] = f c[k] + noise,    f = exp(-h / T),    noise with standard deviation s sqrt(1 - f^2)
+
+after h seconds. T without end is a constant; s and T that grow together, s^2 / T = q / 2, a random walk of q (m^2/s),
+which is what accelerometers and gyros leave. The first knot of a strip is known beforehand to s. Source: Gelb (1974),
+Applied optimal estimation; Cucci, Rehak and Skaloud (2017) have the raw inertial measurements in its place.
+"""
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxphoto.arrays import Numbers
+from jaxphoto.georeferencing import TrajectoryKnot
+from jaxphoto.observations.base import AXES, AbstractObservations, touching
+
+
+class PositionSteps(AbstractObservations):
+    """What the position's error at knot `end` is beside `kept` of that at `start`: nothing, to `sigma` (m)."""
+
+    group = "position_steps"
+    unit = "m"
+    axes = AXES
+    observed = "step"
+    columns = {"step": (), "kept": "kept"}  # noqa: RUF012
+
+    start: Int[np.ndarray, "n"] = touching("trajectory_knots")
+    end: Int[np.ndarray, "n"] = touching("trajectory_knots")
+    kept: Float[Numbers, "n"]
+    sigma: Float[Numbers, "n 3"]
+    step: Float[Numbers, "n 3"]
+
+    def residual(self, start: TrajectoryKnot, end: TrajectoryKnot) -> Float[Numbers, "3"]:
+        """Observed minus computed step (m)."""
+        return self.step - (end.position - self.kept * start.position)
+
+    def words(self, images, points) -> np.ndarray:
+        """Such as "step 12 of the trajectory's position in Z"."""
+        return np.array(
+            [[f"step {k + 1} of the trajectory in {a}" for k in range(len(self))] for a in self.axes], object
+        )
+
+
+class AttitudeSteps(AbstractObservations):
+    """The same of the attitude's error, about the body's right, forward and up axes (rad)."""
+
+    group = "attitude_steps"
+    unit = "rad"
+    axes = ("right", "forward", "up")
+    observed = "step"
+    columns = {"step": (), "kept": "kept"}  # noqa: RUF012
+
+    start: Int[np.ndarray, "n"] = touching("trajectory_knots")
+    end: Int[np.ndarray, "n"] = touching("trajectory_knots")
+    kept: Float[Numbers, "n"]
+    sigma: Float[Numbers, "n 3"]
+    step: Float[Numbers, "n 3"]
+
+    def residual(self, start: TrajectoryKnot, end: TrajectoryKnot) -> Float[Numbers, "3"]:
+        """Observed minus computed step (rad)."""
+        return self.step - (end.attitude - self.kept * start.attitude)
+
+    def words(self, images, points) -> np.ndarray:
+        """Such as "turn 12 of the trajectory about up"."""
+        return np.array(
+            [[f"turn {k + 1} of the trajectory about {a}" for k in range(len(self))] for a in self.axes], object
+        )

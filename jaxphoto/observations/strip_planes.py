@@ -1,0 +1,75 @@
+"""Strip planes: what two laser strips measured of one plane."""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxphoto.arrays import Numbers
+from jaxphoto.georeferencing import Scanner, ScannerCalibration, TrajectoryKnot, corrected_return, weighted_knot
+from jaxphoto.observations.base import AbstractObservations, touching
+from jaxphoto.rotation import matrix_from_roll_pitch_yaw
+
+_ANGLES = ("roll", "pitch", "yaw")
+
+
+class StripPlanes(AbstractObservations):
+    """A place of a plane as one strip has it (a) and as another has it (b): corrected, they lie on one plane.
+
+        normal . (X'_a - X'_b) = gap
+
+    with standard deviation `sigma` (m). `point_a` (m) is the place on strip a's plane as measured, `scanner_a` and
+    `roll_pitch_yaw_a` the pose of the scanner when it was, by the trajectory; `knots_a` and `weights_a` give what that
+    is off by (`georeferencing.StripSpline.weights`). X' is `georeferencing.corrected_return`. `gap` is what was
+    observed: zero, unless somebody adds an error to it. Without a trajectory a scanner may stand anywhere above.
+    """
+
+    group = "strip_planes"
+    unit = "m"
+    axes = ("normal",)
+    also = ("scanner", "scanner_calibration")
+    observed = "gap"
+    columns = {  # noqa: RUF012
+        **{f"point_{s}": tuple(f"point_{s}_{x}_m" for x in "XYZ") for s in "ab"},
+        **{f"scanner_{s}": tuple(f"scanner_{s}_{x}_m" for x in "XYZ") for s in "ab"},
+        **{f"roll_pitch_yaw_{s}": tuple(f"{angle}_{s}_deg" for angle in _ANGLES) for s in "ab"},
+        **{f"weights_{s}": tuple(f"weight_{s}_{k}" for k in range(1, 5)) for s in "ab"},
+        "normal": ("normal_X", "normal_Y", "normal_Z"),
+        "gap": (),
+    }
+
+    knots_a: Int[np.ndarray, "n 4"] = touching("trajectory_knots")
+    knots_b: Int[np.ndarray, "n 4"] = touching("trajectory_knots")
+    weights_a: Float[Numbers, "n 4"]
+    weights_b: Float[Numbers, "n 4"]
+    point_a: Float[Numbers, "n 3"]
+    point_b: Float[Numbers, "n 3"]
+    scanner_a: Float[Numbers, "n 3"]
+    scanner_b: Float[Numbers, "n 3"]
+    roll_pitch_yaw_a: Float[Numbers, "n 3"]
+    roll_pitch_yaw_b: Float[Numbers, "n 3"]
+    normal: Float[Numbers, "n 3"]
+    sigma: Float[Numbers, "n"]
+    gap: Float[Numbers, "n"]
+
+    def residual(
+        self,
+        knots_a: TrajectoryKnot,
+        knots_b: TrajectoryKnot,
+        scanner: Scanner | None,
+        calibration: ScannerCalibration | None,
+    ) -> Float[Numbers, ""]:
+        """By how much a's plane lies below b's (m), along the normal."""
+        boresight = jnp.zeros(3) if scanner is None else scanner.boresight
+        known = ScannerCalibration(jnp.zeros(3)) if calibration is None else calibration
+
+        def at(point, position, roll_pitch_yaw, knots, weights) -> Float[Array, "3"]:
+            off, turn = weighted_knot(knots, weights), matrix_from_roll_pitch_yaw(jnp.asarray(roll_pitch_yaw))
+            return corrected_return(point, position, turn, off.position, off.attitude, boresight, known)
+
+        a = at(self.point_a, self.scanner_a, self.roll_pitch_yaw_a, knots_a, self.weights_a)
+        b = at(self.point_b, self.scanner_b, self.roll_pitch_yaw_b, knots_b, self.weights_b)
+        return self.gap - jnp.sum(self.normal * (a - b))
+
+    def words(self, images, points) -> np.ndarray:
+        """Such as "plane 12 of two strips"."""
+        return np.array([f"plane {k + 1} of two strips" for k in range(len(self))], object)

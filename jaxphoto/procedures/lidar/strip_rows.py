@@ -1,0 +1,90 @@
+"""The observations of a strip adjustment: planes of two strips, and how a trajectory's error goes on."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxphoto.compiling import call_compiled
+from jaxphoto.georeferencing import StripErrors, StripSpline, Trajectory
+from jaxphoto.lidar.correction import scanner_poses
+from jaxphoto.lidar.corresponding_planes import PlanePairs, StripPatches
+from jaxphoto.lidar.strip_correction import corrected_strip
+from jaxphoto.lidar.strip_settings import StripSettings
+from jaxphoto.observations import AttitudeSteps, PositionSteps, StripPlanes
+from jaxphoto.rotation import roll_pitch_yaw_from_matrix
+
+# Steps towards the measured point of a corrected one: each leaves a part of it as small as the corrections are.
+_STEPS = 2
+# Planes steeper than this (degrees) are what tells shifts in X and Y.
+_STEEP_DEG = 5.0
+# An odd multiplier (Knuth) that scatters neighbouring numbers over all of 64 bits.
+_SCATTER = np.uint64(0x9E3779B97F4A7C15)
+
+
+class Side(NamedTuple):
+    """One strip's part of rows: knots (n, 4), weights (n, 4), point, scanner, roll_pitch_yaw (n, 3)."""
+
+    knots: np.ndarray
+    weights: np.ndarray
+    point: np.ndarray
+    scanner: np.ndarray
+    roll_pitch_yaw: np.ndarray
+
+
+def side_of(
+    patches: StripPatches,
+    which: Int[np.ndarray, "n"],
+    foot: Float[np.ndarray, "n 3"],
+    strip: int,
+    errors: StripErrors,
+    trajectory: Trajectory | None,
+) -> Side:
+    """The places `foot` (m, corrected by `errors`) of patches of a strip as it measured them, and from where."""
+    time = patches.time[which]
+    knots, weights = errors.splines[strip].weights(time)
+    point = foot + patches.measured[which] - patches.mean[which]
+    for _ in range(_STEPS):
+        point = point - (corrected_strip(point, time, strip, errors, trajectory) - foot)
+    if trajectory is None or not len(time):
+        # From straight above: nothing that would turn the shot is estimated.
+        return Side(knots, weights, point, point + np.array([0.0, 0.0, 1.0]), np.zeros_like(point))
+    poses = scanner_poses(trajectory, time)
+    return Side(knots, weights, point, poses.position, np.asarray(call_compiled(_angles, poses.object_from_body)))
+
+
+def plane_rows(pairs: PlanePairs, a: Side, b: Side) -> StripPlanes:
+    """The planes that two strips have in common, as observations."""
+    of_a = {f"{name}_a": v for name, v in a._asdict().items()}
+    of_b = {f"{name}_b": v for name, v in b._asdict().items()}
+    return StripPlanes(**of_a, **of_b, normal=pairs.normal, sigma=pairs.sigma, gap=np.zeros(len(pairs.gap)))
+
+
+def thinned(normal: Float[np.ndarray, "n 3"], cell: Int[np.ndarray, "n"], most: int) -> np.ndarray:
+    """Which planes to take where there are more than `most`: half of them steep ones if there are, else by chance.
+
+    Chance is the cell's, so that the same are taken of nearly the same planes.
+    """
+    steep = normal[:, 2] < np.cos(np.deg2rad(_STEEP_DEG))
+    order = np.argsort(cell.astype(np.uint64) * _SCATTER, kind="stable")
+    parts = order[steep[order]], order[~steep[order]]
+    first = min(len(parts[0]), max(most // 2, most - len(parts[1])))
+    return np.sort(np.concatenate([parts[0][:first], parts[1][: most - first]]))
+
+
+def step_rows(splines: tuple[StripSpline, ...], settings: StripSettings) -> tuple[PositionSteps, AttitudeSteps]:
+    """From knot to knot of every strip."""
+    start = np.concatenate([s.first + np.arange(s.size - 1) for s in splines])
+    apart = np.concatenate([np.full(s.size - 1, s.interval) for s in splines])
+    kept = np.exp(-apart / settings.correlation_s)
+    new = np.sqrt(1 - kept**2)[:, None]
+    none = np.zeros((len(start), 3))
+    return (
+        PositionSteps(start, start + 1, kept, np.repeat(settings.sigma_position_m * new, 3, axis=1), none),
+        AttitudeSteps(start, start + 1, kept, settings.sigma_attitude * new, none),
+    )
+
+
+_angles = eqx.filter_jit(jax.vmap(roll_pitch_yaw_from_matrix))

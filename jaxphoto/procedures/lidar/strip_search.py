@@ -1,0 +1,86 @@
+"""Looking for planes that two strips have in common, in the cloud as it is corrected so far."""
+
+import itertools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool
+
+from jaxphoto.cloud import Cloud
+from jaxphoto.errors import BlockError
+from jaxphoto.georeferencing import StripErrors, Trajectory
+from jaxphoto.lidar.corresponding_planes import PlanePairs, StripPatches, cells_of, corresponding, fitting, planes_of
+from jaxphoto.lidar.strip_correction import corrected_strip, times_of
+from jaxphoto.lidar.strip_settings import StripSettings
+from jaxphoto.observations import StripPlanes
+from jaxphoto.procedures.lidar.strip_rows import plane_rows, side_of, thinned
+
+# Fewer planes of a pair of strips are chance.
+_FEWEST = 10
+
+
+class CommonPlanes(NamedTuple):
+    """The planes of two strips, and which of them fit."""
+
+    one: int
+    other: int
+    patches: tuple[StripPatches, StripPatches]
+    pairs: PlanePairs
+    fits: Bool[np.ndarray, "n"]
+
+
+class StripSearch:
+    """Searches that follow one another: returns stay in the cells in which they were when `settled`.
+
+    With each correction some return would else leave its cell, and another come: a scatter that is part of the
+    unknowns' standard deviations, but would never come to rest.
+    """
+
+    def __init__(self, cloud: Cloud, trajectory: Trajectory | None, settings: StripSettings) -> None:
+        self.cloud, self.trajectory, self.settings = cloud, trajectory, settings
+        self.strips = [np.flatnonzero(cloud.strip == k) for k in range(len(cloud.strips))]
+        self.cells: list[np.ndarray] = []
+
+    def look(self, errors: StripErrors, settled: bool) -> list[CommonPlanes]:
+        """The planes of every two strips that have some."""
+        patches, cells = [], []
+        for k, own in enumerate(self.strips):
+            measured, time = self.cloud.xyz[own], times_of(self.cloud)[own]
+            xyz = corrected_strip(measured, time, k, errors, self.trajectory)
+            cells.append(self.cells[k] if settled else cells_of(xyz, self.cloud.extent[0, :2], self.settings))
+            patches.append(planes_of(xyz, measured, time, cells[-1], self.settings))
+        self.cells = cells
+        pairs = itertools.combinations(range(len(self.strips)), 2)
+        return [found for one, other in pairs if (found := self._common(one, other, patches)) is not None]
+
+    def _common(self, one: int, other: int, patches: list[StripPatches]) -> CommonPlanes | None:
+        pairs = corresponding(patches[one], patches[other], self.settings)
+        if len(pairs.gap) < _FEWEST:
+            return None
+        fits = fitting(pairs.gap, pairs.sigma, self.settings.outlier)
+        return CommonPlanes(one, other, (patches[one], patches[other]), pairs, fits)
+
+    def rows(self, seen: Sequence[CommonPlanes], errors: StripErrors) -> StripPlanes:
+        """The planes that fit as observations, `most` of them shared out among the pairs of strips."""
+        total, parts = sum(int(f.fits.sum()) for f in seen), []
+        for f in seen:
+            own = np.flatnonzero(f.fits)
+            share = max(_FEWEST, self.settings.most * len(own) // total)
+            own = own[thinned(f.pairs.normal[own], f.pairs.cell[own], share)]
+            pairs = PlanePairs(*(v[own] for v in f.pairs))
+            a = side_of(f.patches[0], pairs.a, pairs.foot_a, f.one, errors, self.trajectory)
+            b = side_of(f.patches[1], pairs.b, pairs.foot_b, f.other, errors, self.trajectory)
+            parts.append(plane_rows(pairs, a, b))
+        return StripPlanes.joined(*parts)
+
+
+def check_joined(names: Sequence[str], seen: Sequence[CommonPlanes]) -> None:
+    """Raise BlockError for a strip that no plane joins to another."""
+    joined = {k for found in seen for k in (found.one, found.other)}
+    alone = [name for k, name in enumerate(names) if k not in joined]
+    if alone:
+        raise BlockError(
+            f"strip {alone[0]} has fewer than {_FEWEST} planes in common with any other: leave it out, take larger "
+            "cells (cell_m) or rougher planes (roughness_m), or check that all strips overlap and are in one system"
+        )

@@ -1,0 +1,68 @@
+"""The unknowns of a strip adjustment: knots of every strip's trajectory, boresight and calibration of the scanner."""
+
+import dataclasses
+from collections.abc import Collection, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxphoto.block import Block, empty_block
+from jaxphoto.georeferencing import Scanner, ScannerCalibration, StripErrors, StripSpline, TrajectoryKnot
+from jaxphoto.lidar.strip_settings import StripSettings
+from jaxphoto.parameters import AbstractParameters
+from jaxphoto.procedures.lidar.until_still import at_result
+from jaxphoto.unknowns import FIXED, FREE, Unknowns, Weighted
+
+_ZERO = np.zeros(3)
+NO_CALIBRATION = ScannerCalibration(_ZERO, np.zeros(()), np.zeros(()), np.zeros(()), np.zeros(2))  # type: ignore[arg-type]
+"""A scanner that is right."""
+
+
+class ScannerPriors(NamedTuple):
+    """What is known of the scanner beforehand: FREE, FIXED or Weighted, each."""
+
+    boresight: Any = FREE
+    calibration: ScannerCalibration = ScannerCalibration(*[FIXED] * 5)  # type: ignore[arg-type]
+
+
+def strip_block(
+    names: Sequence[str],
+    splines: Sequence[StripSpline],
+    held: Collection[str],
+    settings: StripSettings,
+    priors: ScannerPriors | None,
+) -> Block:
+    """A block of these unknowns alone, all zero: the first knot of each strip is known to the trajectory's sigma.
+
+    Without `priors` strips have a shift alone, which is free. The trajectory of strips that are `held` is right.
+    """
+    knots: dict[str, AbstractParameters] = {}
+    known: dict[str, AbstractParameters] = {}
+    sigmas = np.full(3, settings.sigma_position_m), settings.sigma_attitude
+    first, later = TrajectoryKnot(*(Weighted(_ZERO, s) for s in sigmas)), TrajectoryKnot(FREE, FREE)  # type: ignore[arg-type]
+    shift, right = TrajectoryKnot(FREE, FIXED), TrajectoryKnot(FIXED, FIXED)  # type: ignore[arg-type]
+    for name, spline in zip(names, splines, strict=True):
+        for k, time in enumerate(spline.times):
+            owner = name if priors is None else f"{name} at {time:.3f} s"
+            knots[owner] = TrajectoryKnot(_ZERO, _ZERO)  # type: ignore[arg-type]
+            known[owner] = right if name in held else shift if priors is None else later if k else first
+    block = empty_block("strips of a laser scanner")
+    start = dataclasses.replace(block.start.unknowns, more={TrajectoryKnot.kind: knots})
+    prior = dataclasses.replace(block.priors, more={TrajectoryKnot.kind: known})
+    if priors is not None:
+        of_scanner, own = ScannerCalibration.kind, priors.calibration
+        right_scanner = Scanner(_ZERO, {})  # type: ignore[arg-type]
+        start = dataclasses.replace(start, scanner=right_scanner, more=start.more | {of_scanner: {"": NO_CALIBRATION}})
+        prior = dataclasses.replace(
+            prior, scanner=Scanner(priors.boresight, {}), more=prior.more | {of_scanner: {"": own}}
+        )
+    return dataclasses.replace(at_result(block, start), priors=prior)
+
+
+def errors_of(unknowns: Unknowns, splines: tuple[StripSpline, ...]) -> StripErrors:
+    """What the strips are off by, by the unknowns of `strip_block`."""
+    knots = unknowns.more[TrajectoryKnot.kind].values()
+    position, attitude = (np.array([getattr(k, name) for k in knots], float) for name in ("position", "attitude"))
+    calibration: Any = unknowns.more.get(ScannerCalibration.kind, {"": NO_CALIBRATION})[""]
+    boresight = _ZERO if unknowns.scanner is None else np.asarray(unknowns.scanner.boresight)
+    return StripErrors(splines, position, attitude, boresight, calibration)

@@ -1,0 +1,102 @@
+"""What a strip adjustment found, as tables: differences of strips, the scanner, and the errors of its trajectory."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from rich.console import Console
+
+from jaxphoto.georeferencing import TrajectoryKnot
+from jaxphoto.procedures.lidar import StripAdjustment, StripDifference, StripRound
+from jaxphoto.statistics import correlation_matrix
+from jaxphoto.writing import whole_folder
+
+
+def differences_table(differences: Sequence[StripDifference]) -> pd.DataFrame:
+    """One row for two strips: planes, mean and root mean square of their gaps (m) before and after."""
+    return pd.DataFrame(differences, columns=list(StripDifference._fields))
+
+
+def strip_rounds_table(rounds: Sequence[StripRound]) -> pd.DataFrame:
+    """round, planes, left_out, rms_m, largest_change (in standard deviations)."""
+    return pd.DataFrame(rounds, columns=["round", *StripRound._fields[1:]])
+
+
+def calibration_table(result: StripAdjustment) -> pd.DataFrame:
+    """parameter, value, sigma, and the parameter that it is least told from: `with`, rho. Angles in degrees."""
+    known, s = result.covariance, result.adjusted.structure
+    rho, sigma = correlation_matrix(known), np.asarray(known.shared_sigma)
+    value = np.asarray(result.adjusted.values.shared)[s.free]
+    first, rows = len(rho) - len(s.free), []
+    for k, label in enumerate(s.labels):
+        if label.startswith(TrajectoryKnot.kind):
+            continue
+        to = np.abs(rho[first + k, first:])
+        to[k] = -1.0
+        other = int(np.argmax(to))
+        unit = 180 / np.pi if label.endswith("_rad") else 1.0
+        rows.append(
+            (
+                label.replace("_rad", "_deg"),
+                unit * value[k],
+                unit * sigma[k],
+                s.labels[other],
+                rho[first + k, first + other],
+            )
+        )
+    return pd.DataFrame(rows, columns=["parameter", "value", "sigma", "with", "rho"])
+
+
+def trajectory_errors_table(result: StripAdjustment) -> pd.DataFrame:
+    """strip, time_s, and the coefficients of its spline there with sigmas: X_m ... right_deg ...; 0 where held."""
+    known, s, owners = (
+        result.covariance,
+        result.adjusted.structure,
+        iter(result.adjusted.unknowns.more[TrajectoryKnot.kind]),
+    )
+    of_label = dict(zip(s.labels, np.asarray(known.shared_sigma), strict=True))
+    errors, rows = result.errors, []
+    zero = np.zeros(3)
+    for name, spline in zip(result.cloud.strips, errors.splines, strict=True):
+        for k, time in enumerate(spline.times):
+            labels = TrajectoryKnot(zero, zero).labels(next(owners))  # type: ignore[arg-type]
+            sigma = np.array([of_label.get(label, 0.0) for label in labels])
+            value = np.concatenate([errors.position[spline.first + k], errors.attitude[spline.first + k]])
+            value[3:], sigma[3:] = np.rad2deg(value[3:]), np.rad2deg(sigma[3:])
+            rows.append((name, time, *value, *sigma))
+    columns = ["X_m", "Y_m", "Z_m", "right_deg", "forward_deg", "up_deg"]
+    return pd.DataFrame(rows, columns=["strip", "time_s", *columns, *(f"sigma_{c}" for c in columns)])
+
+
+@contextmanager
+def write_strips(result: StripAdjustment, directory: Path) -> Iterator[Path]:
+    """strips.csv, rounds.csv, scanner.csv and trajectory_errors.csv; yields the folder for what else belongs there.
+
+    Raises InputError where `directory` holds something that is not an earlier result.
+    """
+    with whole_folder(directory) as work:
+        differences_table(result.differences).to_csv(work / "strips.csv", index=False)
+        strip_rounds_table(result.rounds).to_csv(work / "rounds.csv", index=False)
+        calibration_table(result).to_csv(work / "scanner.csv", index=False)
+        trajectory_errors_table(result).to_csv(work / "trajectory_errors.csv", index=False)
+        yield work
+
+
+def print_strips(result: StripAdjustment, console: Console) -> None:
+    """What the rounds came to, how far strips were apart, and the scanner, a line each."""
+    last = result.rounds[-1]
+    end = "nothing changes any more" if result.still else "it still changes: ask for more rounds"
+    console.print(f"{last.number} rounds, {end}; {last.planes} planes, {last.left_out} left out", highlight=False)
+    for d in result.differences:
+        before = f"{d.rms_before_m:.3f} m" if np.isfinite(d.rms_before_m) else "unknown"
+        console.print(
+            f"  strips {d.one} and {d.other}: from {before} to {d.rms_m:.3f} m apart (RMS of {d.planes} planes, whose "
+            f"noise is {d.noise_m:.3f} m)",
+            highlight=False,
+            markup=False,
+            soft_wrap=True,
+        )
+    for row in calibration_table(result).itertuples():
+        console.print(f"  {row.parameter}: {row.value:.6g} (sigma {row.sigma:.2g})", highlight=False, markup=False)

@@ -1,0 +1,81 @@
+"""What a simulated cloud is off by, drawn, and where the file of the cloud has a point that was truly hit."""
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxphoto.georeferencing import ScannerCalibration, StripErrors, StripSpline, corrected_shot
+from jaxphoto.rotation import small_rotation
+from jaxphoto.simulation.chunks import in_chunks
+from jaxphoto.simulation.platform_path import Path
+from jaxphoto.simulation.scan_plan import ScanPlan
+from jaxphoto.simulation.streams import stream
+
+_CHUNK = 65_536
+# Steps from a corrected shot to the one measured: each leaves a part of what is left as small as the errors are.
+_STEPS = 3
+
+
+def drawn_errors(plan: ScanPlan, paths: list[Path], seed: int) -> StripErrors:
+    """The errors of the scanner of `plan`, and those of its trajectory: shifts, and what drifts about them.
+
+    Drifts are processes of Gauss and Markov (`observations.knot_steps`) from knot to knot.
+    """
+    splines: list[StripSpline] = []
+    position, attitude = [], []
+    for path in paths:
+        first = sum(s.size for s in splines)
+        splines.append(StripSpline.over(first, float(path.node[0]), float(path.node[-1]), plan.knots_s))
+        drift = _drift(splines[-1], plan.correlation_s, stream(seed, f"drift of lidar strip {path.strip}"))
+        position.append(drawn_shift(plan, path.strip, seed) + np.array(plan.drift_sigma_m) * drift[:, :3])
+        attitude.append(np.deg2rad(plan.drift_sigma_deg) * drift[:, 3:])
+    scales = (np.array(v) for v in (plan.range_offset_m, plan.range_scale_ppm, plan.angle_scale_ppm))
+    calibration = ScannerCalibration(np.array(plan.lever_arm_m), *scales, np.zeros(2))  # type: ignore[arg-type,call-arg]
+    boresight = np.deg2rad(plan.boresight_deg)
+    return StripErrors(tuple(splines), np.concatenate(position), np.concatenate(attitude), boresight, calibration)
+
+
+def drawn_shift(plan: ScanPlan, strip: str, seed: int) -> Float[np.ndarray, "3"]:
+    """The shift of a strip (m), about which it drifts."""
+    drawn = stream(seed, f"shift of lidar strip {strip}").standard_normal(3)
+    return plan.shift_of(strip) + np.array(plan.shift_sigma_m) * drawn
+
+
+def measured_shot(
+    in_body: Float[np.ndarray, "n 3"], boresight: Float[np.ndarray, "3"], calibration: ScannerCalibration
+) -> Float[np.ndarray, "n 3"]:
+    """The shots (m) that georeferencing takes for true, of those that lead from the trajectory to what was hit.
+
+    The inverse of `georeferencing.corrected_return` at a trajectory without error.
+    """
+    true = (in_body + calibration.lever_arm) @ np.asarray(_rotation(boresight))
+    shot = true
+    if any(np.any(of) for of in jax.tree.leaves(calibration)):
+        for _ in range(_STEPS):
+            shot = shot + true - in_chunks(lambda s: _corrected(s, calibration), _CHUNK, shot)
+    return shot
+
+
+def turned_by(
+    object_from_body: Float[np.ndarray, "n 3 3"], attitude: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n 3 3"]:
+    """The attitudes of a trajectory that is off by `attitude` (rad)."""
+    return object_from_body @ in_chunks(_rotations, _CHUNK, -attitude) if np.any(attitude) else object_from_body
+
+
+def _drift(spline: StripSpline, correlation_s: float, rng: np.random.Generator) -> Float[np.ndarray, "knots 6"]:
+    """Six processes of standard deviation 1."""
+    noise = rng.standard_normal((spline.size, 6))
+    kept = np.exp(-spline.interval / correlation_s)
+    for k in range(1, spline.size):
+        noise[k] = kept * noise[k - 1] + np.sqrt(1 - kept**2) * noise[k]
+    return noise
+
+
+_rotation = jax.jit(small_rotation)
+_rotations = jax.jit(jax.vmap(small_rotation))
+
+
+@jax.jit
+def _corrected(shot: Float[Array, "n 3"], calibration: ScannerCalibration) -> Float[Array, "n 3"]:
+    return jax.vmap(corrected_shot, (0, None))(shot, calibration)

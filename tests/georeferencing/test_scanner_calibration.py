@@ -1,0 +1,106 @@
+"""Where a laser return lies by scanner and trajectory: known displacements, derivatives, and the splines of time."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.interpolate import BSpline
+
+from jaxphoto.georeferencing import (
+    ScannerCalibration,
+    StripSpline,
+    corrected_point,
+    corrected_return,
+    corrected_shot,
+)
+from tests.formulas import camera_from_object
+
+POSITION, TURN = np.array([10.0, -20.0, 900.0]), camera_from_object(0.03, -0.05, 1.2)
+SHOT = np.array([180.0, 15.0, -600.0])
+NONE = np.zeros(3)
+RIGHT = ScannerCalibration(jnp.zeros(3), jnp.zeros(()), jnp.zeros(()), jnp.zeros(()), jnp.zeros(2))
+
+
+def moved(**errors) -> np.ndarray:
+    """How a shot of SHOT changes by errors of the scanner."""
+    own = {name: jnp.asarray(value, float) for name, value in errors.items()}
+    return np.asarray(corrected_shot(jnp.asarray(SHOT), ScannerCalibration(**{"lever_arm": jnp.zeros(3)} | own))) - SHOT
+
+
+def test_ranges_that_are_too_long_are_shortened_along_the_shot():
+    length = np.linalg.norm(SHOT)
+    np.testing.assert_allclose(moved(range_offset=0.3), -0.3 * SHOT / length, atol=1e-12)
+    np.testing.assert_allclose(moved(range_scale=50.0), -50e-6 * SHOT, atol=1e-12)
+
+
+def test_angles_that_are_too_large_are_turned_back_about_the_forward_axis():
+    right, forward, up = SHOT
+    angle, across = np.arctan2(right, -up), np.hypot(right, up)
+
+    def at(angle):
+        return np.array([across * np.sin(angle), forward, -across * np.cos(angle)]) - SHOT
+
+    np.testing.assert_allclose(moved(angle_scale=200.0), at(angle * (1 - 200e-6)), atol=1e-9)
+    turn = 3e-4 * np.cos(angle) - 2e-4 * np.sin(angle)
+    np.testing.assert_allclose(moved(eccentricity=(3e-4, -2e-4)), at(angle - turn), atol=1e-9)
+
+
+def test_an_offset_of_the_encoder_is_a_boresight_about_the_forward_axis():
+    """An angle counts from the nadir to the right, a boresight from up to the right: their signs differ."""
+    angle = np.arctan2(SHOT[0], -SHOT[2])
+    # cos^2 + sin^2 = 1: at this angle, an offset of 1e-6 rad.
+    found = POSITION + TURN @ (SHOT + moved(eccentricity=1e-6 * np.array([np.cos(angle), np.sin(angle)])))
+    by_boresight = corrected_point(POSITION + TURN @ SHOT, POSITION, TURN, np.array([0.0, -1e-6, 0.0]), NONE)
+    np.testing.assert_allclose(found, by_boresight, atol=1e-9)
+
+
+def test_without_calibration_and_drift_a_return_is_a_corrected_point():
+    point, boresight, shift = POSITION + TURN @ SHOT, np.array([3e-4, -2e-4, 5e-4]), np.array([0.2, -0.1, 0.3])
+    expected = corrected_point(point, POSITION, TURN, boresight, shift)
+    found = corrected_return(point, POSITION, TURN, shift, NONE, boresight, RIGHT)
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+def test_an_attitude_is_off_as_a_boresight_is():
+    point, turn = POSITION + TURN @ SHOT, np.array([3e-4, -2e-4, 5e-4])
+    one = corrected_return(point, POSITION, TURN, NONE, turn, NONE, RIGHT)
+    other = corrected_return(point, POSITION, TURN, NONE, NONE, turn, RIGHT)
+    np.testing.assert_allclose(one, other, atol=1e-9)
+
+
+@pytest.mark.parametrize("shot", [SHOT, [0.0, 0.0, -500.0], [-400.0, 100.0, 30.0]])
+def test_derivatives(shot):
+    """Forward, reverse and central differences agree, at the nadir and above the horizon, too."""
+    point = POSITION + TURN @ np.array(shot)
+
+    def at(v):
+        own = ScannerCalibration(v[9:12], v[12], 1e3 * v[13], 1e3 * v[14], v[15:17])
+        return corrected_return(point, POSITION, TURN, v[:3], v[3:6], v[6:9], own)
+
+    compiled, start, step = jax.jit(at), np.linspace(-1e-3, 2e-3, 17), 1e-4
+    forward, reverse = jax.jit(jax.jacfwd(at))(start), jax.jit(jax.jacrev(at))(start)
+    differences = np.stack(
+        [(compiled(start + step * e) - compiled(start - step * e)) / (2 * step) for e in np.eye(17)], 1
+    )
+    np.testing.assert_allclose(forward, reverse, atol=1e-9)
+    np.testing.assert_allclose(forward, differences, atol=1e-5)
+    # At the nadir a scale of angles moves nothing.
+    assert (np.abs(forward).max(axis=0) > 1e-3).sum() == (15 if shot[0] == 0 else 17)
+
+
+def test_splines_are_those_of_scipy():
+    spline, time = StripSpline.over(7, 100.0, 131.0, 4.0), np.linspace(100.0, 131.0, 200)
+    knots, weights = spline.weights(time)
+    assert knots.min() == 7 and knots.max() == 7 + spline.size - 1
+    values = np.random.default_rng(1).normal(size=spline.size)
+    nodes = spline.start + spline.interval * np.arange(-3, spline.size + 1)
+    found = np.sum(weights * values[knots - 7], axis=1)
+    np.testing.assert_allclose(found, BSpline(nodes, values, 3)(time), atol=1e-12)
+    # A straight line in the times of the coefficients is one in time.
+    np.testing.assert_allclose(np.sum(weights * spline.times[knots - 7], axis=1), time, atol=1e-10)
+
+
+def test_one_knot_is_a_constant():
+    knots, weights = StripSpline.constant(3).weights(np.array([0.0, 1e6]))
+    assert (knots == 3).all()
+    np.testing.assert_array_equal(weights.sum(axis=1), 1.0)

@@ -1,0 +1,154 @@
+"""Strips are fitted to each other, and what was wrong with scanner and trajectory is found."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from jaxphoto import BlockError, InputError
+from jaxphoto.adjustment import Outcome
+from jaxphoto.cloud import Cloud
+from jaxphoto.georeferencing import TrajectoryKnot
+from jaxphoto.lidar.strip_correction import correct_flight, correct_strips
+from jaxphoto.lidar.strip_settings import StripSettings
+from jaxphoto.procedures.lidar import adjust_strips
+from jaxphoto.report.strips import calibration_table, trajectory_errors_table
+from tests.lidar.clouds import SURFACES, ground
+from tests.procedures.strips import NOISE_M, fitted, flown
+
+GROUND = 2
+
+
+def above_ground(cloud: Cloud) -> np.ndarray:
+    some = np.flatnonzero(cloud.classification == GROUND)[::20]
+    return cloud.xyz[some, 2] - flown().terrain.height(cloud.xyz[some, :2])
+
+
+def test_the_truth_mends_the_cloud():
+    flight = flown()
+    off = above_ground(correct_strips(flight.cloud, flight.errors, flight.trajectory))
+    assert abs(off.mean()) < 0.002 and off.std() == pytest.approx(NOISE_M, rel=0.1)
+    assert above_ground(flight.cloud).std() > 2 * NOISE_M
+
+
+def test_strips_fit_to_the_noise_of_their_planes():
+    found = fitted()
+    assert found.still and found.adjusted.outcome is Outcome.CONVERGED
+    assert len(found.differences) == 3
+    for d in found.differences:
+        assert d.rms_before_m > 0.06
+        assert d.rms_m < 0.016
+        assert d.rms_m == pytest.approx(d.noise_m, rel=0.15)
+    assert float(found.adjusted.sigma0) == pytest.approx(1.0, abs=0.1)
+
+
+def test_the_scanner_is_found():
+    """All of it together: chi squared of five, because some of it is told apart badly."""
+    errors, found = flown().errors, fitted()
+    truth = [*errors.boresight, float(errors.calibration.range_offset), float(errors.calibration.angle_scale)]
+    own = [k for k, label in enumerate(found.adjusted.structure.labels) if label.startswith("scanner")]
+    value = np.asarray(found.adjusted.values.shared)[found.adjusted.structure.free][own]
+    # Of a block without images there are shared unknowns alone.
+    matrix = np.asarray(found.covariance.matrix)
+    assert len(matrix) == len(found.adjusted.structure.free)
+    off = value - truth
+    assert off @ np.linalg.solve(matrix[np.ix_(own, own)], off) < 20.5  # 99.9 %
+    # All but the range offset are many sigma: not to find them would show.
+    table = calibration_table(found).set_index("parameter")
+    assert len(table) == 5 and (table.value.abs() > 4 * table.sigma).sum() >= 4
+
+
+def test_the_errors_of_the_trajectory_are_found():
+    """At the times of the flight, as far as their covariance says."""
+    table, errors, w = trajectory_errors_table(fitted()), flown().errors, []
+    names = ["X_m", "Y_m", "Z_m", "right_deg", "forward_deg", "up_deg"]
+    for k, (_, own) in enumerate(table.groupby("strip", sort=False)):
+        spline = errors.splines[k]
+        assert len(own) == spline.size
+        true = np.column_stack([errors.position, np.rad2deg(errors.attitude)])[spline.first :][: spline.size]
+        w.append((own[names].to_numpy() - true) / own[[f"sigma_{n}" for n in names]].to_numpy())
+    assert np.mean(np.abs(np.concatenate(w)) < 3) > 0.95
+
+
+def test_cloud_and_trajectory_are_mended_alike():
+    found, flight = fitted(), flown()
+    assert found.cloud.strips == flight.cloud.strips
+    np.testing.assert_array_equal(found.cloud.time, flight.cloud.time)
+    true = correct_flight(flight.trajectory, flight.errors)
+    before, after = (
+        np.asarray(t.quaternion) - np.asarray(true.quaternion) for t in (flight.trajectory, found.trajectory)
+    )
+    assert np.sqrt((after**2).mean()) < np.sqrt((before**2).mean())
+    # What strips have in common no difference of strips can tell.
+    assert above_ground(found.cloud).std() < 1.2 * NOISE_M
+
+
+def two_strips(shift, side: float = 150.0) -> Cloud:
+    parts = [ground(SURFACES["rolling"], 4.0, 0.02, 0.02, side, seed) for seed in (1, 2)]
+    strip = np.repeat([0, 1], [len(p) for p in parts])
+    return Cloud(np.concatenate([parts[0], parts[1] + shift]), strip=strip, strips=("1", "2"))
+
+
+COARSE = StripSettings(cell_m=2.0, roughness_m=0.04, returns=8)
+
+
+def test_without_a_trajectory_shifts_are_found():
+    shift = np.array([0.15, -0.2, 0.1])
+    found = adjust_strips(two_strips(shift), settings=COARSE)
+    sigma = np.asarray(found.covariance.shared_sigma)
+    assert found.still
+    assert (np.abs(found.errors.position[1] - shift) < 3.5 * sigma).all() and (sigma < 0.01).all()
+    assert not found.errors.position[0].any()
+    other = adjust_strips(two_strips(shift), settings=COARSE, held=("2",))
+    np.testing.assert_allclose(other.errors.position[0], -found.errors.position[1], atol=2 * sigma.max())
+
+
+def test_a_real_cloud_cut_in_two(data_dir):
+    from jaxphoto.io.clouds import read_cloud
+
+    path = data_dir / "lidar" / "autzen_trim.laz"
+    if not path.exists():
+        pytest.skip(f"no {path}: set JAXPHOTO_DATA to the folder that holds lidar/autzen_trim.laz")
+    cloud, shift = read_cloud(path), np.array([0.4, -0.3, 0.25])
+    half = np.random.default_rng(0).random(len(cloud)) < 0.5
+    both = Cloud(cloud.xyz + half[:, None] * shift, strip=half.astype(int), strips=("1", "2"))
+    found = adjust_strips(both, settings=StripSettings(cell_m=3.0, returns=8, roughness_m=0.08))
+    sigma = np.asarray(found.covariance.shared_sigma)
+    assert (np.abs(found.errors.position[1] - shift) < 3 * sigma).all() and (sigma < 0.015).all()
+
+
+def test_what_cannot_be_adjusted():
+    cloud, flight = two_strips(np.zeros(3), 30.0), flown()
+    with pytest.raises(InputError, match="the cloud has one strip"):
+        adjust_strips(dataclasses.replace(cloud, strip=None, strips=()))
+    with pytest.raises(InputError, match="north is no strip of the cloud, which has 1, 2"):
+        adjust_strips(cloud, held=("north",))
+    with pytest.raises(InputError, match="all strips are held"):
+        adjust_strips(cloud, held=("1", "2"))
+    with pytest.raises(InputError, match="the cloud has no times"):
+        adjust_strips(cloud, flight.trajectory)
+    with pytest.raises(InputError, match="strip 3 of the cloud has no points"):
+        adjust_strips(dataclasses.replace(cloud, strips=("1", "2", "3")))
+    apart = dataclasses.replace(cloud, xyz=cloud.xyz + 1000.0 * cloud.strip[:, None])
+    with pytest.raises(BlockError, match="strip 1 has fewer than 10 planes in common with any other"):
+        adjust_strips(apart, settings=COARSE)
+
+
+def test_trajectories_that_do_not_go_with_the_cloud():
+    flight = flown()
+    path = flight.trajectory
+    cut = dataclasses.replace(path, **{f: getattr(path, f)[:1500] for f in vars(path)})
+    with pytest.raises(BlockError, match="measured where the trajectory has no records"):
+        adjust_strips(flight.cloud, cut)
+    moved = dataclasses.replace(path, position=np.asarray(path.position) + np.array([5e5, 4e6, 0.0]))
+    with pytest.raises(BlockError, match="bring cloud and trajectory into one coordinate system"):
+        adjust_strips(flight.cloud, moved)
+    time = np.asarray(path.time)
+    jump = dataclasses.replace(path, time=np.where(time > time[700], time + 1.0, time))
+    with pytest.raises(BlockError, match="measured where the trajectory has no records"):
+        adjust_strips(flight.cloud, jump)
+
+
+def test_knots_are_called_by_strip_and_time():
+    owners = list(fitted().adjusted.unknowns.more[TrajectoryKnot.kind])
+    assert owners[1].startswith("1 at 0.0") and owners[-1].startswith("3 at ")

@@ -1,0 +1,79 @@
+"""`jaxphoto strips`, as a shell calls it."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from jaxphoto.cloud import Cloud
+from jaxphoto.io import clouds
+from tests.commands import run
+from tests.lidar.clouds import SURFACES, ground
+
+SHIFT = np.array([0.15, -0.2, 0.1])
+OPTIONS = ("--cell-m", "2", "--roughness-m", "0.04")
+
+
+@pytest.fixture(scope="module")
+def cloud_file(tmp_path_factory):
+    parts = [ground(SURFACES["rolling"], 5.0, 0.02, 0.02, 100.0, seed) for seed in (1, 2)]
+    strip = np.repeat([0, 1], [len(p) for p in parts])
+    # Flown along X at 50 m/s, the second strip ten seconds after the first.
+    time = np.concatenate(parts)[:, 0] / 50.0 + 10.0 * strip
+    path = tmp_path_factory.mktemp("strips") / "both.laz"
+    clouds.write_cloud(
+        Cloud(np.concatenate([parts[0], parts[1] + SHIFT]), time=time, strip=strip, strips=("1", "2")), path
+    )
+    return path
+
+
+def test_shifts_are_taken_off_the_cloud(cloud_file, tmp_path, monkeypatch, capsys):
+    code, output, errors = run(monkeypatch, capsys, "strips", cloud_file, "--out", tmp_path / "out", *OPTIONS)
+    assert code == 0, errors
+    assert "strips 1 and 2: from " in output
+    out = tmp_path / "out"
+    before, after = clouds.read_cloud(cloud_file), clouds.read_cloud(out / "both.laz")
+    moved = before.xyz - after.xyz
+    np.testing.assert_allclose(moved[before.strip == 0], 0.0, atol=1e-3)
+    np.testing.assert_allclose(moved[before.strip == 1], np.tile(SHIFT, ((before.strip == 1).sum(), 1)), atol=0.03)
+    np.testing.assert_allclose(after.time, before.time, atol=1e-9)
+    strips = pd.read_csv(out / "strips.csv")
+    assert strips.rms_m[0] < 0.2 * strips.rms_before_m[0]
+    knots = pd.read_csv(out / "trajectory_errors.csv")
+    assert (knots.sigma_X_m[1] > 0) and (knots.sigma_X_m[0] == 0)
+    assert {f.name for f in out.iterdir() if f.suffix == ".csv"} == {
+        "strips.csv", "rounds.csv", "scanner.csv", "trajectory_errors.csv"
+    }  # fmt: skip
+
+
+def test_a_trajectory_is_mended_with_the_cloud(cloud_file, tmp_path, monkeypatch, capsys):
+    """The second strip's shift is one of its trajectory; the first is held."""
+    time = np.concatenate([start + np.arange(-1.0, 4.0, 0.1) for start in (0.0, 10.0)])
+    columns = {"X_m": 50.0 * (time % 10 - 10 * (time % 10 > 5)), "Y_m": 50.0, "Z_m": 500.0}
+    flown = {"time_s": time, **columns, "roll_deg": 0.0, "pitch_deg": 0.0, "yaw_deg": 90.0}
+    pd.DataFrame(flown).to_csv(tmp_path / "flight.csv", index=False)
+    given = ("--trajectory", tmp_path / "flight.csv", "--adjust", "none", "--hold", "1", "--sigma-position-m", "0.3")
+    code, output, errors = run(monkeypatch, capsys, "strips", cloud_file, "--out", tmp_path / "out", *given, *OPTIONS)
+    assert code == 0, errors + output
+    before, after = pd.read_csv(tmp_path / "flight.csv"), pd.read_csv(tmp_path / "out" / "trajectory.csv")
+    moved = before[["X_m", "Y_m", "Z_m"]].to_numpy() - after[["X_m", "Y_m", "Z_m"]].to_numpy()
+    np.testing.assert_allclose(moved[time < 3], 0.0, atol=1e-6)
+    middle = (time > 10.2) & (time < 11.8)
+    np.testing.assert_allclose(moved[middle, 2].mean(), SHIFT[2], atol=0.05)
+    np.testing.assert_allclose(after.time_s, before.time_s)
+    assert pd.read_csv(tmp_path / "out" / "strips.csv").rms_m[0] < 0.02
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (("--adjust", "boresight,mirror"), "--adjust mirror: a scanner has boresight, lever-arm"),
+        (("--hold", "3"), "3 is no strip of the cloud, which has 1, 2"),
+        (("--cell-m", "0"), "cell_m is 0, but must be positive"),
+        (("--cell-m", "0.3"), "strip 1 has fewer than 10 planes in common"),
+    ],
+)
+def test_bad_input_is_one_sentence_and_nothing_is_written(cloud_file, tmp_path, monkeypatch, capsys, options, sentence):
+    code, _, errors = run(monkeypatch, capsys, "strips", cloud_file, "--out", tmp_path / "out", *options)
+    assert code == 2
+    assert sentence in " ".join(errors.split())
+    assert not (tmp_path / "out").exists()
