@@ -21,14 +21,16 @@ from jaxphoto.arrays import Numbers
 from jaxphoto.camera import ImageMotion, InteriorOrientation, PrincipalDistanceRate, RollingShutter
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import InputError
-from jaxphoto.georeferencing import FlightBias, Mount, Scanner, ScannerCalibration, StripBias, TrajectoryKnot
+from jaxphoto.georeferencing import FlightBias, Mount, Scanner, StripBias
 from jaxphoto.parameters import AbstractParameters
 
 UNKNOWNS: tuple[type[AbstractParameters], ...] = (
-    Scanner, ScannerCalibration, TrajectoryKnot, Mount, StripBias, FlightBias, PrincipalDistanceRate, RollingShutter,
-    ImageMotion,
+    Scanner, Mount, StripBias, FlightBias, PrincipalDistanceRate, RollingShutter, ImageMotion,
 )  # fmt: skip
-"""The classes of declared parameters that a block folder may hold; one of your own is given to `read_block`."""
+"""The classes of declared parameters that a block folder may hold; one of your own is given to `read_block`.
+
+Those of laser strips (`ScannerCalibration`, `TrajectoryKnot`) belong to no image, which a block folder has no word for.
+"""
 
 
 class Prior(enum.Enum):
