@@ -9,6 +9,7 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver
 
+from jaxphoto.errors import camera_words
 from jaxphoto.report.document import Paragraph, Pictures, Rows
 from jaxphoto.report.document_html import html_of
 from jaxphoto.report.findings import as_sentence, p_words
@@ -265,6 +266,10 @@ def test_a_number_is_all_of_its_cell():
     assert {kind(cell) for cell in numbers} == {"number"}
     words = "0.5 px on average, rms 0.7 px", "12 of 14", "1 2024", "12 " + "1, " * 20 + "1"
     assert {kind(cell) for cell in words} == {"text"}
+
+
+def test_a_camera_without_a_name_of_its_own_is_called_so_once():
+    assert camera_words("camera") == "the camera" and camera_words("one") == "camera one"
 
 
 def test_symbols_keep_their_letter():
