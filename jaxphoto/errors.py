@@ -72,6 +72,11 @@ def few(names: Sequence[str], joint: str = ", ") -> str:
 _NAMED = 3
 
 
+def camera_words(name: str) -> str:
+    """How a sentence calls a camera: by its name, but for one that is called just that."""
+    return "the camera" if name == "camera" else f"camera {name}"
+
+
 def _short(text: str) -> str:
     return text if len(text) <= _BEGINNING + _END else f"{text[:_BEGINNING]} ... {text[-_END:]}"
 

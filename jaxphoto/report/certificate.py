@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from jaxphoto.camera import constant_names, get_parameter, parameter_names
+from jaxphoto.errors import camera_words
 from jaxphoto.report.certificate_conditions import condition_rows, flight_rows
 from jaxphoto.report.certificate_figures import draw_correlations, draw_curve, draw_map
 from jaxphoto.report.certified import Certified
@@ -39,7 +40,7 @@ def certificate_of(given: Certified) -> Document:
     elements = [e for section in _SECTIONS for e in section(given)]
     sha = digest_of_all(_all_inputs(given))
     model = next((f"{c.make} {c.model} {c.serial}".strip() for c in given.conditions if c.make or c.model), "")
-    title = f"Certificate of calibration: {model or 'camera ' + given.camera}"
+    title = f"Certificate of calibration: {model or camera_words(given.camera)}"
     return Document(title, f"inputs SHA-256 {sha[:16]}", tuple(elements))
 
 

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from jaxphoto.errors import camera_words
 from jaxphoto.report.findings import Finding, Level
 from jaxphoto.report.tables import Tables
 from jaxphoto.statistics.ground import FORMS, GroundCorrelations
@@ -33,14 +34,14 @@ def _sentences(camera: str, g: GroundCorrelations, tables: Tables) -> Iterator[s
         k = int(np.abs(rho).argmax())
         if abs(rho[k]) > HIGH:
             yield (
-                f"c of camera {camera} goes with {_WORDS[FORMS[k]]} (correlation {rho[k]:.3f}): if c is off by its "
-                f"standard deviation of {known['c_mm']:.2g} mm, the height is by {abs(rho[k]) * g.sigma_m[k]:.2g} m, "
-                f"and no residual shows it; {_CURES['c_mm']}"
+                f"c of {camera_words(camera)} goes with {_WORDS[FORMS[k]]} (correlation {rho[k]:.3f}): if c is off by "
+                f"its standard deviation of {known['c_mm']:.2g} mm, the height is by {abs(rho[k]) * g.sigma_m[k]:.2g} "
+                f"m, and no residual shows it; {_CURES['c_mm']}"
             )
     dome = FORMS.index("dome")
     if g.together[dome] > HIGH:
         yield (
-            f"the camera {camera} as a whole goes with {_WORDS['dome']} (multiple correlation {g.together[dome]:.3f}): "
-            f"one standard deviation of it is {g.sigma_m[dome]:.2g} m of dome, and no residual shows it; "
-            f"{_CURES['all']}"
+            f"{camera_words(camera)} as a whole goes with {_WORDS['dome']} (multiple correlation "
+            f"{g.together[dome]:.3f}): one standard deviation of it is {g.sigma_m[dome]:.2g} m of dome, and no "
+            f"residual shows it; {_CURES['all']}"
         )

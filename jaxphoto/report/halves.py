@@ -12,6 +12,7 @@ from jinja2 import Environment
 from markupsafe import Markup
 from rich.console import Console
 
+from jaxphoto.errors import camera_words
 from jaxphoto.procedures.halves import Halves
 from jaxphoto.report.maps import format_maps, png_of
 from jaxphoto.report.results import versions, write_summary
@@ -78,11 +79,11 @@ def halves_verdict(found: Halves) -> list[str]:
     off = (band.factor - 1) / band.sigma_factor
     how = f"{band.factor:.2f} +- {band.sigma_factor:.2f}"
     if off > _SURE:
-        said = f"standard deviations of camera {found.camera} are too small by a factor of {how}"
+        said = f"standard deviations of {camera_words(found.camera)} are too small by a factor of {how}"
     elif off < -_SURE:
-        said = f"standard deviations of camera {found.camera} are too large: their factor is {how}"
+        said = f"standard deviations of {camera_words(found.camera)} are too large: their factor is {how}"
     else:
-        said = f"nothing speaks against the standard deviations of camera {found.camera}: their factor is {how}"
+        said = f"nothing speaks against the standard deviations of {camera_words(found.camera)}: their factor is {how}"
     cell, wide = band.cell_factor, band.calibration
     cuts = f"{n} cuts" if n > 1 else "1 cut"
     sentences = [

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from jaxphoto.camera import get_parameter
+from jaxphoto.errors import camera_words
 from jaxphoto.report.findings import Finding, Level
 from jaxphoto.report.tables import Tables
 from jaxphoto.unknowns import Weighted
@@ -28,12 +29,12 @@ def lens_findings(tables: Tables) -> Iterator[Finding]:
         if own > _LITTLE * known:
             yield Finding(
                 Level.WARNING,
-                f"the block does not tell c of camera {camera}: its standard deviation of {own:.2g} mm is that of what "
-                f"was known before ({known:.2g} mm); another flying height, oblique images or heights known on the "
-                "ground would tell it",
+                f"the block does not tell c of {camera_words(camera)}: its standard deviation of {own:.2g} mm is that "
+                f"of what was known before ({known:.2g} mm); another flying height, oblique images or heights known on "
+                "the ground would tell it",
             )
         else:
             yield Finding(
                 Level.INFORMATION,
-                f"c of camera {camera}: {known:.2g} mm were known of it before, {own:.2g} mm with the block",
+                f"c of {camera_words(camera)}: {known:.2g} mm were known of it before, {own:.2g} mm with the block",
             )

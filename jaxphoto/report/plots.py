@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxphoto.camera import Sensor
-from jaxphoto.errors import printable
+from jaxphoto.errors import camera_words, printable
 from jaxphoto.report.tables import Tables
 
 if TYPE_CHECKING:
@@ -80,7 +80,7 @@ _ARROWS, _LARGEST = 4000, 100
 def residuals_figure(tables: Tables, camera: str) -> Figure:
     """Residual vectors of one camera's image points over its format, all images together; of many, a part."""
     xy, v = _of_camera(tables, camera)
-    title = f"image residuals of camera {drawn(camera)}"
+    title = f"image residuals of {drawn(camera_words(camera))}"
     if (n := v.shape[1]) > _ARROWS:
         one_in = -(-n // _ARROWS)
         shown = np.union1d(np.arange(0, n, one_in), np.argsort(np.hypot(*v))[-_LARGEST:])
@@ -109,7 +109,7 @@ def draw_mean_residuals(axes: Axes, tables: Tables, camera: str) -> None:
     n = np.bincount(cell, minlength=centres.shape[1])
     mean = np.stack([np.bincount(cell, one, centres.shape[1]) for one in v]) / np.maximum(n, 1)
     shown = n >= max(1, min(_FEW, n.max()))
-    title = f"mean residuals by cell, camera {drawn(camera)}"
+    title = f"mean residuals by cell, {drawn(camera_words(camera))}"
     _over_format(axes, sensor, centres[:, shown], mean[:, shown], title)
 
 

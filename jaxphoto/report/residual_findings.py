@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
+from jaxphoto.errors import camera_words
 from jaxphoto.report.findings import Finding, Level, p_words
 from jaxphoto.report.tables import Tables, in_file_unit
 from jaxphoto.statistics import (
@@ -60,7 +61,7 @@ def _global_test(tables: Tables) -> Iterator[Finding]:
         if abs(factor - 1) > _STRETCHED:
             yield Finding(
                 Level.INFORMATION,
-                f"camera {camera}: residuals are of corrected image coordinates, which its distortion "
+                f"{camera_words(camera)}: residuals are of corrected image coordinates, which its distortion "
                 f"{'stretches' if factor > 1 else 'shrinks'}; sigma naught of its image points is expected to be "
                 f'{factor:.3g}, not 1: say residuals = "measured" in [cameras.{camera}]',
             )

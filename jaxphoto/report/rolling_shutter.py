@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 
 from jaxphoto.camera import RollingShutter
+from jaxphoto.errors import camera_words
 from jaxphoto.report.findings import Finding, Level
 from jaxphoto.report.tables import Tables
 
@@ -16,7 +17,7 @@ def shutter_findings(tables: Tables) -> Iterator[Finding]:
     for label, value, sigma in table[table["parameter"].str.startswith(f"{RollingShutter.kind}[")].to_numpy():
         camera = label.split("[", 1)[1].rsplit("]", 1)[0]
         order = "first row first" if value > 0 else "last row first"
-        said = f"camera {camera} reads its rows in {abs(value):.3g} +- {sigma:.2g} ms ({order})"
+        said = f"{camera_words(camera)} reads its rows in {abs(value):.3g} +- {sigma:.2g} ms ({order})"
         if abs(value) < _SEEN * sigma:
-            said = f"no rolling shutter of camera {camera} is seen: readout {value:.2g} +- {sigma:.2g} ms"
+            said = f"no rolling shutter of {camera_words(camera)} is seen: readout {value:.2g} +- {sigma:.2g} ms"
         yield Finding(Level.INFORMATION, said)

@@ -14,7 +14,7 @@ from jaxphoto.adjustment import POOR, Adjustment, weaknesses_of, yardsticks
 from jaxphoto.block import Block
 from jaxphoto.camera import Sensor
 from jaxphoto.compiling import call_compiled
-from jaxphoto.errors import few
+from jaxphoto.errors import camera_words, few
 from jaxphoto.report.findings import Finding, Level, Verdict
 from jaxphoto.report.ground import ground_findings
 from jaxphoto.report.residual_findings import NOTHING_FITS, of_residuals, of_what_is_not_checked
@@ -61,8 +61,8 @@ def _findings(tables: Tables) -> Iterator[Finding]:
         if _folds(adjusted, name, sensor):
             yield Finding(
                 Level.WARNING,
-                f"camera {name}: its distortion folds inside the format; image points beyond the fold mean nothing, "
-                "use fewer coefficients or more points in the corners",
+                f"{camera_words(name)}: its distortion folds inside the format; image points beyond the fold mean "
+                "nothing, use fewer coefficients or more points in the corners",
             )
     yield from of_what_is_not_checked(tables)
 
@@ -93,8 +93,8 @@ def _not_significant(tables: Tables, s: Significance) -> Finding:
     pixels = f"{change.corner_mm / sensor.pixel_mm:.2g} px" if sensor.pixel_mm else f"{change.corner_mm:.2g} mm"
     return Finding(
         Level.INFORMATION,
-        f"{s.parameter} of camera {s.camera} may be zero (p = {s.p_value:.2g}); held there, it would move {moved}the "
-        f"corner of the image by {pixels}",
+        f"{s.parameter} of {camera_words(s.camera)} may be zero (p = {s.p_value:.2g}); held there, it would move "
+        f"{moved}the corner of the image by {pixels}",
     )
 
 
@@ -121,8 +121,8 @@ def _correlated(
         names = few([f"{a} and {b} {rho:+.3f}" for a, b, rho in pairs])
         yield Finding(
             Level.INFORMATION,
-            f"high correlation within the interior orientation of camera {camera}: {names}; a change of one makes good "
-            "for the other, and only together they mean much",
+            f"high correlation within the interior orientation of {camera_words(camera)}: {names}; a change of one "
+            "makes good for the other, and only together they mean much",
         )
     if len(c.images) == 0:
         return
@@ -135,7 +135,7 @@ def _correlated(
         names = few([f"{c.eop_names[i]} with {c.parameters[j]} {worst[i, j]:.3f} (image {k})" for (i, j), k in where])
         yield Finding(
             Level.WARNING if any(c.parameters[j] in felt for _, j in high) else Level.INFORMATION,
-            f"high correlation of exterior with interior orientation of camera {camera}: {names}; {cure}",
+            f"high correlation of exterior with interior orientation of {camera_words(camera)}: {names}; {cure}",
         )
     own = np.abs(c.within_image).max(axis=0)
     strong = [(own[i, j], i, j) for i in range(6) for j in range(i) if own[i, j] > HIGH_OWN_CORRELATION]

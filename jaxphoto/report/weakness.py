@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxphoto.adjustment import Adjustment, yardsticks
+from jaxphoto.errors import camera_words
 from jaxphoto.report.tables import Tables
 from jaxphoto.statistics import Correlations
 from jaxphoto.unknowns import FIXED
@@ -70,9 +71,9 @@ def weaknesses(tables: Tables, camera: str, c: Correlations) -> list[Weakness]:
         why, cure = _stations(adjusted, images, (2,))
         share = 100 * sigma["c_mm"] / c_mm
         sentence = (
-            f"c of camera {camera} is hardly determined: sigma {sigma['c_mm']:.3g} mm ({share:.2g} % of c), |rho| with "
-            f"Z up to {rho:.4f}; over {geometry} a longer c and a higher flight give the same image coordinates, and "
-            f"{why}: {cure}, relief or a second flying height, or oblique images, or hold c fixed"
+            f"c of {camera_words(camera)} is hardly determined: sigma {sigma['c_mm']:.3g} mm ({share:.2g} % of c), "
+            f"|rho| with Z up to {rho:.4f}; over {geometry} a longer c and a higher flight give the same image "
+            f"coordinates, and {why}: {cure}, relief or a second flying height, or oblique images, or hold c fixed"
         )
         found.append(_weakness(camera, sentence, c, (_HEIGHT,), _C))
     turned, moved = _strongest(c, _TILTS, _POINT), _strongest(c, _PLAN, _POINT)
@@ -81,7 +82,7 @@ def weaknesses(tables: Tables, camera: str, c: Correlations) -> list[Weakness]:
         why, cure = _stations(adjusted, images, (0, 1))
         sigmas = ", ".join(f"sigma of {name} {sigma[name]:.3g} mm" for name in _POINT if name in sigma)
         sentence = (
-            f"the principal point of camera {camera} is hardly determined: {sigmas}, |rho| with "
+            f"the principal point of {camera_words(camera)} is hardly determined: {sigmas}, |rho| with "
             f"{' and '.join(c.eop_names[_TILTS])} up to {turned:.4f}, with X and Y up to {moved:.4f}; over {geometry} "
             f"a tilt and a shift of every image make good for it, and {why}: {cure} with strips flown in both "
             "directions, relief or oblique images, or hold it fixed"

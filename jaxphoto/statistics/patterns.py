@@ -18,6 +18,7 @@ from jaxphoto.adjustment import Adjustment
 from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
 from jaxphoto.camera import InteriorOrientation, Sensor, get_parameter, parameter_names, set_parameter
 from jaxphoto.compiling import call_compiled
+from jaxphoto.errors import camera_words
 from jaxphoto.observations import AbstractObservations, Correlated
 from jaxphoto.statistics.discrepancy import observation_groups
 
@@ -139,7 +140,7 @@ def _over_format(adjusted: Adjustment, camera: str, mine: np.ndarray, places: Pl
         # What the polynomials cannot tell from a term of fewer degrees has no name here.
         if np.abs(coefficients @ basis.T - field).max() < _EXACT * np.abs(field).max():
             terms.append(PatternTerm(name, coefficients.ravel(), _cure(adjusted, camera, name), False))
-    return ResidualPattern(f"image points of camera {camera} over the format", "mm", camera, parts, tuple(terms))
+    return ResidualPattern(f"image points of {camera_words(camera)} over the format", "mm", camera, parts, tuple(terms))
 
 
 def _camera_over_time(
@@ -156,7 +157,7 @@ def _camera_over_time(
     names = ("c", "x_p", "y_p")
     cure = "from the first image to the last: the camera changes in flight, give it parameters of shorter times"
     terms = tuple(PatternTerm(name, one, cure) for name, one in zip(names, np.eye(3), strict=True))
-    return ResidualPattern(f"image points of camera {camera} over time", "mm", camera, (both,), terms)
+    return ResidualPattern(f"image points of {camera_words(camera)} over time", "mm", camera, (both,), terms)
 
 
 def _parts_of_image(

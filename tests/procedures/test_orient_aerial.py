@@ -63,7 +63,7 @@ def test_flat_ground_and_vertical_images_leave_c_open(tmp_path):
     check(oriented, scene)
     open_ = {"c_mm", "xp_mm", "yp_mm"}
     assert not open_ & set(oriented.report.estimated)
-    said = next(sentence for sentence in oriented.report.observed if sentence.startswith("c_mm of camera camera is "))
+    said = next(sentence for sentence in oriented.report.observed if sentence.startswith("c_mm of the camera is "))
     assert "observed where it starts, 8.8 +- 0.88: the images leave the corner of the format open by" in said
     write_block(oriented.block, tmp_path / "block")
     priors = read_block(tmp_path / "block").priors.interior["camera"]

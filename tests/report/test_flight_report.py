@@ -9,6 +9,9 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver
 
+from jaxphoto.errors import camera_words
+from jaxphoto.procedures.control import ControlledBlock
+from jaxphoto.procedures.control.marked import Marked
 from jaxphoto.report.document import Paragraph, Pictures, Rows
 from jaxphoto.report.document_html import html_of
 from jaxphoto.report.findings import as_sentence, p_words
@@ -213,6 +216,22 @@ def test_the_spread_of_surveyed_points_is_of_those_that_have_the_axis():
     assert axis_cell(np.array([0.1, np.nan, 0.3]), 0.2236) == f"+0.200 / {np.sqrt(0.02):.3f} / 0.224"
 
 
+def test_a_smaller_part_tells_its_surveyed_points_and_its_lens():
+    report = part_report()
+    off = np.array([[0.1, 0.2, np.nan], [0.3, 0.2, np.nan]])
+    marks = Marked(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)), np.zeros(0))
+    nothing = np.full((2, 3), np.nan)
+    found = ControlledBlock(
+        report.part.adjusted, ("q1", "q2"), np.zeros(2, bool), ("control", "control"), (3, 3), nothing, off, nothing,
+        nothing, nothing, marks, np.zeros((0, 2)), ("two points were surveyed",),
+    )  # fmt: skip
+    part = report.part._replace(controlled=found, lens=("the lens is of a class",))
+    html = flight_page([report, report._replace(part=part)], {}, {}, VERDICT, source(), ["r", "r2"])
+    after = html[html.index(">Part 2</h2>") :]
+    assert "Two points were surveyed." in after and "The lens is of a class." in after
+    assert "+0.200 / 0.141 / 0.224" in after and not re.search(r"\bnan\b", after)
+
+
 def test_offsets_are_in_the_order_of_times_where_all_are_known():
     table = part_report().images[:3]
     taken = {"i0": (3.0, 1.0), "i1": (1.0, 1.0), "i2": (2.0, 1.0)}
@@ -265,6 +284,10 @@ def test_a_number_is_all_of_its_cell():
     assert {kind(cell) for cell in numbers} == {"number"}
     words = "0.5 px on average, rms 0.7 px", "12 of 14", "1 2024", "12 " + "1, " * 20 + "1"
     assert {kind(cell) for cell in words} == {"text"}
+
+
+def test_a_camera_without_a_name_of_its_own_is_called_so_once():
+    assert camera_words("camera") == "the camera" and camera_words("one") == "camera one"
 
 
 def test_symbols_keep_their_letter():

@@ -22,6 +22,7 @@ from jaxtyping import Array, Float
 from jaxphoto.adjustment import Adjustment, NormalEquations
 from jaxphoto.block import Block
 from jaxphoto.compiling import call_compiled
+from jaxphoto.errors import camera_words
 from jaxphoto.procedures.orientation.depths import supported
 from jaxphoto.procedures.orientation.network import Network, meet, normalised_misfits, robust_scale, sight_of
 from jaxphoto.procedures.orientation.refine import Asked, Names, SelfCalibration, hardly_known, observation, refined
@@ -116,7 +117,7 @@ def told(adjusted: Adjustment, calibration: SelfCalibration) -> Told:
         left_open = _open(names, images / (float(adjusted.sigma0) * alike) ** 2, sigma, hardly)
         kept[camera] = tuple(name for name in names if name not in left_open)
         said += [
-            f"{name} of camera {camera} is observed where it starts, {float(prior.value):.6g} +- "
+            f"{name} of {camera_words(camera)} is observed where it starts, {float(prior.value):.6g} +- "
             f"{float(prior.sigma):.2g}: the images leave the corner of the format open by "
             f"{left_open[name] / calibration.unit[camera][name]:.1%} of its radius"
             for name, prior in zip(names, known, strict=True)
