@@ -181,11 +181,11 @@ def _further(n_images: int) -> tuple:
     start, end = np.array([0, 3, 8, 20, 30]), np.array([7, 9, 25, 33, 5])
     first = np.array([0, 2, 5, 4])
     return (
-        *_strips(),
         HeightDifferences(start, end, np.zeros(5), np.array([0.005, 0.01, 0.02, 0.01, 0.005])),
         Baselines(first, np.array([1, 3, 9, 6]), np.zeros((4, 3)), np.full((4, 3), 0.03) * [1, 1, 2]),
         correlated(gnss, np.arange(3 * n_images).reshape(-1, 3), factor @ factor.transpose(0, 2, 1)),
         correlated(heights, np.arange(n_images).reshape(2, -1), in_time),
+        *_strips(),
     )
 
 

@@ -258,7 +258,7 @@ def test_shapes_of_what_runs_once_are_forgotten(monkeypatch):
 
     for n in (1, 2, 3, 3, 4, 1):
         np.testing.assert_array_equal(seen(np.ones(n)), np.full(n, 2.0))
-    # The fourth shape is one too many: all are forgotten with it.
+    # The fourth shape is one too many: all are forgotten before the next.
     assert traced == [1, 2, 3, 4, 1]
 
 

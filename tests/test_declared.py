@@ -368,14 +368,16 @@ def test_truth_of_an_own_unknown_is_recovered(label):
 
 def with_own(prior_of):
     block = simulated().block
-    return dataclasses.replace(block, priors=dataclasses.replace(block.priors, more=own_priors(prior_of)))
+    more = block.priors.more | own_priors(prior_of)
+    return dataclasses.replace(block, priors=dataclasses.replace(block.priors, more=more))
 
 
 @functools.cache
 def by_prior(kind: str):
     """Own unknowns held at half their truth, or known beforehand as that, hardly or well."""
     half = jax.tree.map(lambda v: 0.5 * v, OWN)
-    start = dataclasses.replace(simulated().block.start.unknowns, more=half)
+    given = simulated().block.start.unknowns
+    start = dataclasses.replace(given, more=given.more | half)
     of = {
         "fixed": lambda v: FIXED,
         "hardly": lambda v: Weighted(0.5 * v, 1e4 * np.ones(np.shape(v))),

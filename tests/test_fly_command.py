@@ -88,7 +88,7 @@ def test_options_that_cannot_be(flown, tmp_path, monkeypatch, capsys):
         (["--model", "pinhole"], "no distortion model is called 'pinhole'"),
         (["--pairs", "position:3"], "have no GPS position"),
         (["--lever-arm", "0,1"], "--lever-arm is '0,1'; give three numbers of metres"),
-        (["--heights", "ground"], "--heights is 'ground'; give ellipsoid, geoid or take-off"),
+        (["--heights", "ground"], "--heights is 'ground'; give ellipsoid, geoid, take-off, or the EPSG code"),
         (["--exposures", tmp_path / "absent.MRK"], "absent.MRK; add it, or correct the name"),
     ):
         code, _, wrong = run(monkeypatch, capsys, "fly", flown, "--out", tmp_path / "o", *arguments)

@@ -19,7 +19,7 @@ def jit_quickly(function: Callable[..., _Result], static_argnums: int | tuple[in
 
     @wraps(function)
     def call(*arguments: Any, **named: Any) -> _Result:
-        if jitted._cache_size() >= _SHAPES:
+        if jitted._cache_size() > _SHAPES:
             jitted.clear_cache()
         return jitted(*arguments, **named)
 

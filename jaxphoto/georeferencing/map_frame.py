@@ -131,7 +131,7 @@ def _to_place(code: int, vertical: int | None) -> Transformer:
         heights = CRS.from_epsg(vertical)
     except CRSError:
         raise InputError(
-            f"the EPSG code {vertical} of the heights is unknown; correct it, or give heights above the ellipsoid"
+            f"the EPSG code {vertical} is unknown; correct it, or give heights above the ellipsoid"
         ) from None
     if not heights.is_vertical:
         raise InputError(

@@ -37,12 +37,15 @@ from jaxphoto.observations.priors import PRIORS as PRIORS
 from jaxphoto.observations.priors import KnownParameters as KnownParameters
 from jaxphoto.observations.priors import ParameterRows as ParameterRows
 
+# What a block folder has no names for: any parameter, and the knots of laser strips, which belong to no image.
+_UNSAID = ("parameter", "trajectory_knots")
+
 
 def _has_a_table(kind: object) -> bool:
     """Whether it is a class of rows that files can say: with a name, and of what files have names for."""
     if not (isinstance(kind, type) and issubclass(kind, AbstractObservations) and kind.__dict__.get("group")):
         return False
-    return all(f.metadata.get("touches") != "parameter" for f in dataclasses.fields(kind))
+    return all(f.metadata.get("touches") not in _UNSAID for f in dataclasses.fields(kind))
 
 
 OBSERVATIONS: tuple[type[AbstractObservations], ...] = tuple(filter(_has_a_table, list(globals().values())))

@@ -90,7 +90,7 @@ REFUSED = {
     (5773, None): ["EPSG:5773", "no map or geographic system", "vertical"],
     (2227, None): ["EPSG:2227", "US survey foot", "convert"],
     (2053, None): ["EPSG:2053", "southwards", "convert"],
-    (32722, 99999): ["EPSG code 99999 is unknown", "ellipsoidal"],
+    (32722, 99999): ["EPSG code 99999 is unknown", "above the ellipsoid"],
     (32722, 4326): ["EPSG:4326", "no system of heights", "5773"],
     (32722, 5773): ["EGM96 height", "us_nga_egm96_15.tif", "not on this computer", "pyproj sync", "ellipsoidal"],
 }
