@@ -60,7 +60,9 @@ def test_ended_at_any_moment_it_leaves_whole_results(tmp_path, command, number):
         ended = interrupted(arguments, delay, number)
         if ended is not None and number != signal.SIGKILL:
             code, error, seconds = ended
-            assert (code, error) == (128 + number, "jaxphoto: interrupted\n"), delay
+            # All was written, and the process about to end, when the signal came.
+            over = code == 0 and out.exists()
+            assert over or (code, error) == (128 + number, "jaxphoto: interrupted\n"), delay
             assert seconds < 2
             assert [p.name for p in tmp_path.iterdir()] == ["out"]
         check_folder(out)
