@@ -1,6 +1,8 @@
 """A cloud and its trajectory, corrected by what an adjustment has found of the scanner."""
 
 import dataclasses
+from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -65,14 +67,7 @@ def corrected_xyz(
     shift = np.asarray(shift)
     if poses is None or not np.any(np.asarray(boresight)):
         return xyz - shift
-    result = np.empty_like(xyz)
-    for first in range(0, len(xyz), PORTION):
-        own = slice(first, first + PORTION)
-        some = xyz[own], poses.position[own], poses.object_from_body[own]
-        n = len(some[0])
-        padded = (np.concatenate([v, np.broadcast_to(v[:1], (padded_size(n) - n, *v.shape[1:]))]) for v in some)
-        result[own] = call_compiled(_corrected, *padded, np.asarray(boresight), shift)[:n]
-    return result
+    return in_portions(_corrected, (xyz, poses.position, poses.object_from_body), np.asarray(boresight), shift)
 
 
 def correct_cloud(cloud: Cloud, scanner: Scanner, trajectory: Trajectory | None) -> Cloud:
@@ -123,6 +118,20 @@ def _not_covered(trajectory: Trajectory, time: np.ndarray, n: int) -> BlockError
         f"to {time.max():.3f} s, the trajectory from {known[0]:.3f} to {known[-1]:.3f} s; give the trajectory of this "
         "flight on the cloud's clock (--trajectory-shift-s)"
     )
+
+
+def in_portions(
+    function: Callable, points: tuple[Float[np.ndarray, "n ..."], ...], *common: Any
+) -> Float[np.ndarray, "n 3"]:
+    """`function` of the rows of `points`, made by `eqx.filter_jit`, and of what all have in `common`, bit by bit."""
+    result = np.empty_like(points[0])
+    for first in range(0, len(result), PORTION):
+        own = slice(first, first + PORTION)
+        some = [v[own] for v in points]
+        n = len(some[0])
+        padded = (np.concatenate([v, np.broadcast_to(v[:1], (padded_size(n) - n, *v.shape[1:]))]) for v in some)
+        result[own] = call_compiled(function, *padded, *common)[:n]
+    return result
 
 
 def padded_size(n: int) -> int:

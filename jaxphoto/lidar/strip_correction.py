@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from jaxphoto.cloud import Cloud
 from jaxphoto.compiling import call_compiled
 from jaxphoto.georeferencing import StripErrors, Trajectory, corrected_return
-from jaxphoto.lidar.correction import PORTION, padded_size, scanner_poses
+from jaxphoto.lidar.correction import PORTION, in_portions, scanner_poses
 from jaxphoto.rotation import matrix_from_quaternion, quaternion_from_matrix, small_rotation
 
 
@@ -30,13 +30,12 @@ def corrected_strip(
     if trajectory is None:
         return xyz - off
     result = np.empty_like(xyz)
+    # Poses of all returns at once would fill the memory.
     for first in range(0, len(xyz), PORTION):
         own = slice(first, first + PORTION)
         poses = scanner_poses(trajectory, time[own])
-        some = xyz[own], poses.position, poses.object_from_body, off[own], turn[own]
-        n = len(some[0])
-        padded = (np.concatenate([v, np.broadcast_to(v[:1], (padded_size(n) - n, *v.shape[1:]))]) for v in some)
-        result[own] = call_compiled(_corrected, *padded, errors.boresight, errors.calibration)[:n]
+        points = xyz[own], poses.position, poses.object_from_body, off[own], turn[own]
+        result[own] = in_portions(_corrected, points, errors.boresight, errors.calibration)
     return result
 
 

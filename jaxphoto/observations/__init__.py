@@ -6,6 +6,7 @@ A new kind is one file here and its line below.
 import dataclasses
 from typing import TYPE_CHECKING
 
+from jaxphoto.georeferencing import TrajectoryKnot
 from jaxphoto.observations.base import AXES as AXES
 from jaxphoto.observations.base import AbstractCoordinates as AbstractCoordinates
 from jaxphoto.observations.base import AbstractObservations as AbstractObservations
@@ -38,7 +39,7 @@ from jaxphoto.observations.priors import KnownParameters as KnownParameters
 from jaxphoto.observations.priors import ParameterRows as ParameterRows
 
 # What a block folder has no names for: any parameter, and the knots of laser strips, which belong to no image.
-_UNSAID = ("parameter", "trajectory_knots")
+_UNSAID = ("parameter", TrajectoryKnot.kind)
 
 
 def _has_a_table(kind: object) -> bool:

@@ -9,6 +9,7 @@ which is what accelerometers and gyros leave. The first knot of a strip is known
 Applied optimal estimation; Cucci, Rehak and Skaloud (2017) have the raw inertial measurements in its place.
 """
 
+import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -17,12 +18,10 @@ from jaxphoto.georeferencing import TrajectoryKnot
 from jaxphoto.observations.base import AXES, AbstractObservations, touching
 
 
-class PositionSteps(AbstractObservations):
-    """What the position's error at knot `end` is beside `kept` of that at `start`: nothing, to `sigma` (m)."""
+class _KnotSteps(AbstractObservations):
+    """What an error at knot `end` is beside `kept` of that at `start`: nothing, to `sigma`."""
 
-    group = "position_steps"
-    unit = "m"
-    axes = AXES
+    _words: eqx.AbstractClassVar[tuple[str, str]]
     observed = "step"
     columns = {"step": (), "kept": "kept"}  # noqa: RUF012
 
@@ -31,39 +30,36 @@ class PositionSteps(AbstractObservations):
     kept: Float[Numbers, "n"]
     sigma: Float[Numbers, "n 3"]
     step: Float[Numbers, "n 3"]
+
+    def words(self, images, points) -> np.ndarray:
+        """Such as "step 12 of the trajectory in Z"."""
+        step, along = self._words
+        return np.array(
+            [[f"{step} {k + 1} of the trajectory {along} {a}" for k in range(len(self))] for a in self.axes], object
+        )
+
+
+class PositionSteps(_KnotSteps):
+    """Steps of the position's error (m)."""
+
+    group = "position_steps"
+    unit = "m"
+    axes = AXES
+    _words = ("step", "in")
 
     def residual(self, start: TrajectoryKnot, end: TrajectoryKnot) -> Float[Numbers, "3"]:
         """Observed minus computed step (m)."""
         return self.step - (end.position - self.kept * start.position)
 
-    def words(self, images, points) -> np.ndarray:
-        """Such as "step 12 of the trajectory's position in Z"."""
-        return np.array(
-            [[f"step {k + 1} of the trajectory in {a}" for k in range(len(self))] for a in self.axes], object
-        )
 
-
-class AttitudeSteps(AbstractObservations):
-    """The same of the attitude's error, about the body's right, forward and up axes (rad)."""
+class AttitudeSteps(_KnotSteps):
+    """Steps of the attitude's error, about the body's right, forward and up axes (rad)."""
 
     group = "attitude_steps"
     unit = "rad"
     axes = ("right", "forward", "up")
-    observed = "step"
-    columns = {"step": (), "kept": "kept"}  # noqa: RUF012
-
-    start: Int[np.ndarray, "n"] = touching("trajectory_knots")
-    end: Int[np.ndarray, "n"] = touching("trajectory_knots")
-    kept: Float[Numbers, "n"]
-    sigma: Float[Numbers, "n 3"]
-    step: Float[Numbers, "n 3"]
+    _words = ("turn", "about")
 
     def residual(self, start: TrajectoryKnot, end: TrajectoryKnot) -> Float[Numbers, "3"]:
         """Observed minus computed step (rad)."""
         return self.step - (end.attitude - self.kept * start.attitude)
-
-    def words(self, images, points) -> np.ndarray:
-        """Such as "turn 12 of the trajectory about up"."""
-        return np.array(
-            [[f"turn {k + 1} of the trajectory about {a}" for k in range(len(self))] for a in self.axes], object
-        )
