@@ -181,7 +181,7 @@ def fly_command(
                 camera.origin,
                 start,
                 taken,
-                signed.conditions,
+                signed.conditions_for(flight.parts[0]),
                 signed.inputs,
                 signed.told,
                 datetime.date.today().isoformat(),

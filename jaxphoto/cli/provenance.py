@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 from jaxphoto.camera.conditions import Conditions
 from jaxphoto.cli.certificate import certificate_document, write_certificate
 from jaxphoto.errors import InputError
-from jaxphoto.io.conditions import conditions_of, write_conditions
+from jaxphoto.io.conditions import conditions_of, marked, write_conditions
 from jaxphoto.io.input_hashes import write_inputs
 from jaxphoto.procedures.flight import FlightPart
 from jaxphoto.writing.inputs import InputFile, input_file
@@ -31,6 +31,10 @@ class Provenance(NamedTuple):
         ]
         inputs += [input_file(path) for path in others]
         return cls(conditions, inputs, {"method": {"command": "fly", **options}})
+
+    def conditions_for(self, part: FlightPart) -> list[Conditions]:
+        """The conditions of all photographs, those of `part` marked as used."""
+        return marked(self.conditions, part.adjusted.block.images)
 
     def write(self, part: FlightPart, folder: Path) -> None:
         """conditions.csv and inputs.csv of all photographs, those of `part` marked as used."""

@@ -100,9 +100,14 @@ def _number(value: Any, positive: bool = False) -> float | None:
     return number if known else None
 
 
+def marked(conditions: Sequence[Conditions], used: Collection[str]) -> list[Conditions]:
+    """The same, those of the images `used` marked as that, and no others."""
+    return [one._replace(used=one.image in used) for one in conditions]
+
+
 def write_conditions(conditions: Sequence[Conditions], folder: Path, used: Collection[str]) -> None:
     """conditions.csv: a row each photograph, columns as of `Conditions`; `used` are the images of the block."""
-    rows = [one._replace(used=one.image in used) for one in conditions]
+    rows = marked(conditions, used)
     pd.DataFrame(rows, columns=Conditions._fields).to_csv(folder / CONDITIONS, index=False)
 
 
