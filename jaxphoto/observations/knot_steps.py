@@ -18,7 +18,7 @@ from jaxphoto.georeferencing import TrajectoryKnot
 from jaxphoto.observations.base import AXES, AbstractObservations, touching
 
 
-class _KnotSteps(AbstractObservations):
+class AbstractKnotSteps(AbstractObservations):
     """What an error at knot `end` is beside `kept` of that at `start`: nothing, to `sigma`."""
 
     _words: eqx.AbstractClassVar[tuple[str, str]]
@@ -39,7 +39,7 @@ class _KnotSteps(AbstractObservations):
         )
 
 
-class PositionSteps(_KnotSteps):
+class PositionSteps(AbstractKnotSteps):
     """Steps of the position's error (m)."""
 
     group = "position_steps"
@@ -52,7 +52,7 @@ class PositionSteps(_KnotSteps):
         return self.step - (end.position - self.kept * start.position)
 
 
-class AttitudeSteps(_KnotSteps):
+class AttitudeSteps(AbstractKnotSteps):
     """Steps of the attitude's error, about the body's right, forward and up axes (rad)."""
 
     group = "attitude_steps"
