@@ -45,7 +45,7 @@ from jaxphoto.io.trajectory import Records, read_records, write_flight_csv, writ
 from jaxphoto.procedures.control.system import places, system_of
 from jaxphoto.unknowns import FIXED, FREE, Weighted
 from tests import sound_files
-from tests.io import control_files, test_bal, test_colmap
+from tests.io import control_files, test_bal, test_colmap, test_reconstructions
 from tests.io import test_cameras as cameras
 from tests.io import test_surfaces as surfaces
 from tests.io.conftest import FILES
@@ -353,6 +353,15 @@ READERS: dict[str, Reader] = {
     "bal": Reader(text(problem__txt="\n".join(test_bal.lines_of())), lambda folder: read_source(folder, "bal")),
     "colmap-text": Reader(written_by(test_colmap.write_text), lambda folder: read_source(folder, "colmap")),
     "colmap-binary": Reader(written_by(test_colmap.write_binary), lambda folder: read_source(folder, "colmap")),
+    **{
+        name: Reader(written_by(write), lambda folder, name=name: read_source(folder, name))
+        for name, write in (
+            ("opensfm", test_reconstructions.write_open_sfm),
+            ("openmvg", test_reconstructions.write_open_mvg),
+            ("blocksexchange", test_reconstructions.write_blocks_exchange),
+            ("bundler", test_reconstructions.write_bundler),
+        )
+    },
     "dbat": Reader(text(**sound_files.DBAT), read_dbat),
     "photomodeler": Reader(text(**sound_files.PHOTOMODELER), read_photomodeler),
     "control-gcp-list": Reader(text(a=control_files.GCP_LIST), _control),

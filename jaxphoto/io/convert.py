@@ -10,6 +10,7 @@ from jaxphoto.io import aicon, bal, colmap, dbat, photomodeler
 from jaxphoto.io.block_folder import BlockTables, assemble, write_block
 from jaxphoto.io.block_folder.block_reader import read_folder
 from jaxphoto.io.block_folder.table_layout import TOML
+from jaxphoto.io.reconstructions import blocks_exchange, bundler, open_mvg, open_sfm
 
 
 class Format(NamedTuple):
@@ -26,6 +27,10 @@ FORMATS = {
     "aicon": Format(aicon.recognises, aicon.read_aicon),
     "bal": Format(bal.recognises, bal.read_bal),
     "colmap": Format(colmap.recognises, colmap.read_colmap_model),
+    "opensfm": Format(open_sfm.recognises, open_sfm.read_open_sfm),
+    "openmvg": Format(open_mvg.recognises, open_mvg.read_open_mvg),
+    "blocksexchange": Format(blocks_exchange.recognises, blocks_exchange.read_blocks_exchange),
+    "bundler": Format(bundler.recognises, bundler.read_bundler),
 }
 
 

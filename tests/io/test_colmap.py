@@ -196,7 +196,7 @@ def spoil(file, row, text):
         (spoil("images", 3, "1.0 2.0"), "row 4: 2 cells are not X Y POINT3D_ID"),
         (spoil("images", 3, "1.0 2.0 99"), "points3D has not, for example 99"),
         (spoil("points3D", 1, "3 0 0"), "row 2: 3 cells instead of POINT3D_ID"),
-        (lambda name, lines: lines[:2] if name == "images" else lines, "no image of the model is oriented"),
+        (lambda name, lines: lines[:2] if name == "images" else lines, "no image is oriented"),
     ],
 )  # fmt: skip
 def test_what_is_no_model_is_told_in_a_sentence(tmp_path, change, message):

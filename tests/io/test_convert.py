@@ -162,7 +162,7 @@ def test_a_block_folder_is_a_format_too(write_folder, tmp_path):
 
 def test_unknown_formats_list_the_known_ones(tmp_path):
     (tmp_path / "photo.jpg").write_text("")
-    for source, name in ((tmp_path / "photo.jpg", None), (tmp_path, "bundler")):
+    for source, name in ((tmp_path / "photo.jpg", None), (tmp_path, "rhinophoto")):
         with pytest.raises(InputError) as caught:
             read_source(source, name)
         assert all(known in str(caught.value) for known in FORMATS)

@@ -3,14 +3,14 @@
 1. The two images of the start, its base the unit of length; the points that their rays meet in.
 2. Of the images that see nearly most of the points met so far, the one whose pairs agree best on its rotation is
    oriented by two steps (`two_steps`) and then by its points; where that fails it is resected from its points alone.
-3. Points are met anew; each time the network has grown by two fifths, everything is adjusted.
+3. The points that it sees are met anew; each time the network has grown by two fifths, everything is adjusted.
 """
 
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from jaxphoto.block import Block
 from jaxphoto.errors import BlockError
@@ -21,6 +21,7 @@ from jaxphoto.procedures.orientation.network import (
     Network,
     empty_network,
     meet,
+    meet_some,
     misfits,
     normalised_misfits,
     robust_scale,
@@ -134,19 +135,32 @@ class _Growth:
         self.adjusted = 0
         self.angle = ANGLES[0]
         self.limit = most
+        self.by_point = np.argsort(self.sight.point, kind="stable")
+        self.begins = np.searchsorted(self.sight.point[self.by_point], np.arange(len(block.points) + 1))
 
     def meet(self) -> None:
         """Points anew, with the limit that follows from those before."""
         self.network = meet(self.sight, self.network, self.limit, self.angle)
+        self._limit(normalised_misfits(self.sight, self.network))
+
+    def meet_seen_by(self, image: int) -> None:
+        """The points that `image` sees anew: when it joins the network, no others change."""
+        point = self.sight.point[self.sight.of_image(image)]
+        begin, many = self.begins[point], self.begins[point + 1] - self.begins[point]
+        within = np.arange(many.sum()) - np.repeat(np.cumsum(many) - many, many)
+        rows = self.by_point[np.repeat(begin, many) + within]
+        self.network, missed = meet_some(self.sight, self.network, rows, self.limit, self.angle)
+        self._limit(missed)
+
+    def _limit(self, missed: Float[np.ndarray, " used"]) -> None:
         if self.adjusted >= _TELLING:
-            scale = robust_scale(normalised_misfits(self.sight, self.network))
-            self.limit = min(max(_LEAST_LIMIT, _LIMIT * scale), self.most)
+            self.limit = min(max(_LEAST_LIMIT, _LIMIT * robust_scale(missed)), self.most)
 
     def add(self, image: int, position: np.ndarray, matrix: np.ndarray) -> bool:
         """Orient `image`; False, and nothing changed, where it then sees too few points."""
         before = self.network
         self.network = before.with_image(image, position, matrix)
-        self.meet()
+        self.meet_seen_by(image)
         if len(self.order) >= 1 and self.network.used[self.sight.of_image(image)].sum() < self.least:
             self.network = before
             return False

@@ -176,6 +176,19 @@ def meet(sight: Sight, network: Network, limit: float, min_angle: float) -> Netw
     return network._replace(points=points, fate=fate)
 
 
+def meet_some(
+    sight: Sight, network: Network, rows: Int[np.ndarray, " n"], limit: float, min_angle: float
+) -> tuple[Network, Float[np.ndarray, " used"]]:
+    """`meet` of some points, of which `rows` are all image rows; and the `normalised_misfits` of those in use."""
+    seen, point = np.unique(sight.point[rows], return_inverse=True)
+    part = Sight(*(values[rows] for values in sight))._replace(point=point)
+    own = network._replace(points=network.points[seen], fate=network.fate[rows])
+    own = meet(part, own, limit, min_angle)
+    points, fate = network.points.copy(), network.fate.copy()
+    points[seen], fate[rows] = own.points, own.fate
+    return network._replace(points=points, fate=fate), normalised_misfits(part, own)
+
+
 def _meet_once(sight: Sight, network: Network, rows, fate, points, min_angle: float):
     """Points anew from the rays `rows`; those of points of one ray, or whose rays are parallel, go."""
     image, point, n = sight.image[rows], sight.point[rows], len(points)

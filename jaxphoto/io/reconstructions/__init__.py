@@ -1,0 +1,1 @@
+"""What other programs have oriented, with tie points -> the tables of a free network."""

@@ -1,0 +1,34 @@
+"""Numbers out of files that are trees: thousands of lists at once, or one that is named."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxphoto.errors import InputError, quoted
+from jaxphoto.io.text_tables import LARGEST
+
+
+def number_rows(
+    values: Sequence[Any], shape: tuple[int, ...], place: Callable[[int], str]
+) -> Float[np.ndarray, "n *shape"]:
+    """Values of one shape each as an array. Raises InputError at `place(k)` for the first that is not of it."""
+    try:
+        rows = np.array(values, float).reshape(-1, *shape) if len(values) else np.zeros((0, *shape))
+        if len(rows) == len(values) and (np.abs(rows) <= LARGEST).all() and np.shape(values)[1:] == shape:
+            return rows
+        if not len(values):
+            return rows
+    except (TypeError, ValueError, OverflowError):
+        pass
+    for k, value in enumerate(values):
+        try:
+            row = np.array(value, float)
+            good = row.shape == shape and bool((np.abs(row) <= LARGEST).all())
+        except (TypeError, ValueError, OverflowError):
+            good = False
+        if not good:
+            many = "a finite number" if shape == () else f"{' x '.join(map(str, shape))} finite numbers"
+            raise InputError(f"{place(k)}: {quoted(value)} is not {many}; correct it, or export the file anew")
+    raise InputError(f"{place(0)}: these are no numbers of one kind; export the file anew")

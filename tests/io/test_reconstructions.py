@@ -1,0 +1,363 @@
+"""What other programs oriented: read as each means it, by its own equations; written and read again; refused."""
+
+import dataclasses
+import json
+import re
+
+import jax
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from jaxphoto.camera import get_parameter, parameter_names
+from jaxphoto.collinearity import project
+from jaxphoto.errors import InputError
+from jaxphoto.io import read_source
+from jaxphoto.io.exports import AdjustedPhotographs, ExportCamera, export
+from jaxphoto.unknowns import FREE
+from tests.io.test_exports import CAMERAS, SENSOR, fisheye, photographs, plane
+
+RNG = np.random.default_rng(5)
+ROTATIONS = Rotation.from_rotvec([[3.1, 0.02, 0.1], [0.1, 3.0, 0.3], [2.2, 2.1, 0.1]])
+CENTRES = np.array([[0.5, -0.3, 8.0], [1.3, 0.4, 9.0], [-1.2, 0.1, 7.5]])
+POINTS = RNG.uniform(-1.5, 1.5, (7, 3))
+WIDTH, HEIGHT = 640, 480
+NAMES = ["b.jpg", "a.jpg", "c.jpg"]
+_projected = jax.jit(jax.vmap(project, (None, 0, 0)))
+
+
+def seen(image):
+    """x / z and y / z, x right, y down."""
+    x, y, z = ROTATIONS[image].apply(POINTS - CENTRES[image]).T
+    assert (z > 0).all()
+    return x / z, y / z
+
+
+def pixels(image, kind, f=800.0, centre=(325.5, 239.0), k=(-0.12, 0.03, -0.01, 0.002), p=(1e-3, -2e-3)):
+    """Column and row, the centre of the first pixel at (0.5, 0.5), of a camera with the first of these terms."""
+    x, y = seen(image)
+    terms = {"none": 0, "k1": 1, "k2": 2, "k3": 3, "brown": 3, "fisheye2": 2, "fisheye": 4}[kind]
+    if kind.startswith("fisheye"):
+        return fisheye(x, y, f, f, *centre, (*k[:terms], *[0] * (4 - terms)))
+    return plane(x, y, f, f, *centre, (*k[:terms], *[0] * (6 - terms)), p if kind == "brown" else (0, 0))
+
+
+def misfits_px(block):
+    """Measured minus projected of the start values."""
+    rows, start = block.image_points, block.start.unknowns
+    found = np.zeros((len(rows.image), 2))
+    for i in range(len(block.images)):
+        own = np.flatnonzero(np.asarray(rows.image) == i)
+        at = jax.tree.map(lambda leaf, own=own: np.repeat(leaf[i : i + 1], len(own), axis=0), start.exterior)  # noqa: B023
+        to = np.asarray(start.points)[np.asarray(rows.point)[own]]
+        found[own] = np.asarray(rows.xy)[own] - _projected(start.interior[block.image_camera[i]], at, to)
+    return found / block.sensors[block.image_camera[0]].pixel_mm
+
+
+def free_of(block, camera):
+    priors = block.priors.interior[camera]
+    return {name for name in parameter_names(priors) if get_parameter(priors, name) is FREE}
+
+
+# OpenSfM ------------------------------------------------------------------------------------------------------------
+
+OPENSFM = {
+    "perspective": ("k2", {"focal": 800 / WIDTH, "k1": -0.12, "k2": 0.03}, {"c_mm", "k1", "k2"}),
+    "brown": (
+        "brown",
+        {"focal_x": 800 / WIDTH, "focal_y": 800 / WIDTH, "c_x": 5.5 / WIDTH, "c_y": -1.0 / WIDTH}
+        | {"k1": -0.12, "k2": 0.03, "k3": -0.01, "p1": 1e-3, "p2": -2e-3},
+        {"c_mm", "xp_mm", "yp_mm", "k1", "k2", "k3", "p1", "p2"},
+    ),
+    "fisheye": ("fisheye2", {"focal": 800 / WIDTH, "k1": -0.12, "k2": 0.03}, {"c_mm", "k1", "k2"}),
+}  # fmt: skip
+
+
+def write_open_sfm(folder, kind="brown", change=lambda content: content, version="OPENSFM_TRACKS_VERSION_v2\n"):
+    terms, camera, _ = OPENSFM[kind]
+    centre = (325.5, 239.0) if kind == "brown" else (WIDTH / 2, HEIGHT / 2)
+    translations = -ROTATIONS.apply(CENTRES)
+    content = {
+        "cameras": {"v2 one": {"projection_type": kind, "width": WIDTH, "height": HEIGHT, **camera}},
+        "shots": {
+            name: {"rotation": r.tolist(), "translation": t.tolist(), "camera": "v2 one", "gps_dop": 10.0}
+            for name, r, t in zip(NAMES, ROTATIONS.as_rotvec(), translations, strict=True)
+        },
+        "points": {str(10 + k): {"color": [1, 2, 3], "coordinates": x} for k, x in enumerate(POINTS.tolist())},
+    }
+    folder.mkdir(exist_ok=True)
+    (folder / "reconstruction.json").write_text(json.dumps(change([content])))
+    lines = ["x.jpg\t10\t1\t0.1\t0.1\t1\t1\t1\t1\t-1\t-1"]
+    for i, name in enumerate(NAMES):
+        normalised = (pixels(i, terms, centre=centre) - [WIDTH / 2, HEIGHT / 2]) / WIDTH
+        lines += [
+            f"{name}\t{10 + k}\t{k}\t{x!r}\t{y!r}\t0.004\t1\t2\t3\t-1\t-1"
+            for k, (x, y) in enumerate(normalised.tolist())
+        ]
+    (folder / "tracks.csv").write_text(version + "\n".join(lines) + "\n")
+    return folder
+
+
+# OpenMVG ------------------------------------------------------------------------------------------------------------
+
+OPENMVG = {
+    "pinhole": ("none", None),
+    "pinhole_radial_k3": ("k3", ("disto_k3", [-0.12, 0.03, -0.01])),
+    "pinhole_brown_t2": ("brown", ("disto_t2", [-0.12, 0.03, -0.01, 1e-3, -2e-3])),
+    "fisheye": ("fisheye", ("fisheye", [-0.12, 0.03, -0.01, 0.002])),
+}
+
+
+def write_open_mvg(folder, kind="pinhole_radial_k3", nested=False, change=lambda content: content):
+    terms, coefficients = OPENMVG[kind]
+    pinhole = {"width": WIDTH, "height": HEIGHT, "focal_length": 800.0, "principal_point": [325.0, 238.5]}
+    camera = {"value0": pinhole} if nested else dict(pinhole)
+    if coefficients:
+        camera[coefficients[0]] = coefficients[1]
+    view = lambda k, name: {"local_path": "/", "filename": name, "id_view": k, "id_intrinsic": 3, "id_pose": 20 + k}  # noqa: E731
+    views = [view(k, name) for k, name in enumerate([*NAMES, "lost.jpg"])]
+    xy = [pixels(i, terms) - 0.5 for i in range(3)]
+    content = {
+        "sfm_data_version": "0.3",
+        "root_path": "/home/somebody/photographs",
+        "views": [
+            {"key": v["id_view"], "value": {"polymorphic_id": 1, "ptr_wrapper": {"id": 7, "data": v}}} for v in views
+        ],
+        "intrinsics": [{"key": 3, "value": {"polymorphic_name": kind, "ptr_wrapper": {"id": 9, "data": camera}}}],
+        "extrinsics": [
+            {"key": 20 + k, "value": {"rotation": r.tolist(), "center": c.tolist()}}
+            for k, (r, c) in enumerate(zip(ROTATIONS.as_matrix(), CENTRES, strict=True))
+        ],
+        "structure": [
+            {
+                "key": 100 + k,
+                "value": {
+                    "X": x,
+                    "observations": [{"key": i, "value": {"id_feat": k, "x": xy[i][k].tolist()}} for i in range(3)]
+                    + [{"key": 3, "value": {"id_feat": k, "x": [1.0, 2.0]}}],
+                },
+            }
+            for k, x in enumerate(POINTS.tolist())
+        ],
+        "control_points": [],
+    }
+    folder.mkdir(exist_ok=True)
+    (folder / "sfm_data.json").write_text(json.dumps(change(content)))
+    return folder
+
+
+# BlocksExchange -----------------------------------------------------------------------------------------------------
+
+POSE = "<Pose><Rotation>{matrix}</Rotation><Center><x>{0}</x><y>{1}</y><z>{2}</z></Center></Pose>"
+GROUP = """<Photogroup><Name>one</Name><ImageDimensions><Width>640</Width><Height>480</Height></ImageDimensions>
+<CameraModelType>Perspective</CameraModelType>{focal}{axes}
+<PrincipalPoint><x>325.0</x><y>238.5</y></PrincipalPoint>
+<Distortion><K1>-0.12</K1><K2>0.03</K2><K3>-0.01</K3><P1>-0.002</P1><P2>0.001</P2></Distortion>
+{photos}</Photogroup>"""
+
+
+def write_blocks_exchange(folder, upwards=False, pixels_of_focal=True, system="", change=lambda text: text):
+    """P1 and P2 are Agisoft's, the second and first of OpenCV's."""
+    photos = ""
+    for k, name in enumerate(NAMES):
+        r = ROTATIONS[k].as_matrix() * ([[1], [-1], [-1]] if upwards else 1)
+        matrix = "".join(
+            f"<M_{i}{j}>{r[i, j]!r}</M_{i}{j}>".replace("np.float64", "") for i in range(3) for j in range(3)
+        )
+        pose = POSE.format(*CENTRES[k].tolist(), matrix=re.sub(r"[()]", "", matrix))
+        photos += f"<Photo><Id>{k + 5}</Id><ImagePath>C:\\flight\\{name}</ImagePath>{pose}</Photo>"
+    photos += "<Photo><Id>9</Id><ImagePath>C:\\flight\\lost.jpg</ImagePath></Photo>"
+    focal = (
+        "<FocalLengthPixels>800</FocalLengthPixels>"
+        if pixels_of_focal
+        else "<FocalLength>8</FocalLength><SensorSize>6.4</SensorSize>"
+    )
+    axes = "<CameraOrientation>XRightYUp</CameraOrientation>" if upwards else ""
+    xy, ties = [(pixels(i, "brown") - 0.5).tolist() for i in range(3)], ""
+    for k, (x, y, z) in enumerate(POINTS.tolist()):
+        measured = "".join(
+            f"<Measurement><PhotoId>{i + 5}</PhotoId><x>{xy[i][k][0]!r}</x><y>{xy[i][k][1]!r}</y></Measurement>"
+            for i in range(3)
+        )
+        ties += f"<TiePoint><Position><x>{x!r}</x><y>{y!r}</y><z>{z!r}</z></Position>{measured}</TiePoint>\n"
+    text = (
+        f'<?xml version="1.0" encoding="utf-8"?>\n<BlocksExchange version="2.1">{system}<Block><Name>small</Name>'
+        f"<SRSId>0</SRSId><Photogroups>{GROUP.format(focal=focal, axes=axes, photos=photos)}</Photogroups>"
+        f"<ControlPoints><ControlPoint><Name>A</Name></ControlPoint></ControlPoints><TiePoints>{ties}</TiePoints>"
+        "</Block></BlocksExchange>"
+    )
+    folder.mkdir(exist_ok=True)
+    (folder / "block.xml").write_text(change(text))
+    return folder
+
+
+# Bundler ------------------------------------------------------------------------------------------------------------
+
+
+def write_bundler(folder, names=True, change=lambda lines: lines):
+    turn = np.array([[1.0], [-1.0], [-1.0]])
+    words = lambda values: " ".join(map(repr, np.ravel(values).tolist()))  # noqa: E731
+    lines = ["# Bundle file v0.3", f"4 {len(POINTS)}"]
+    for k in range(3):
+        r = turn * ROTATIONS[k].as_matrix()
+        lines += ["800.0 -0.12 0.03", *map(words, r), words(-r @ CENTRES[k])]
+    lines += ["0 0 0"] * 5
+    measured = [(pixels(i, "k2", centre=(0.0, 0.0)) * [1, -1]).tolist() for i in range(3)]
+    for k, x in enumerate(POINTS):
+        lines += [
+            words(x),
+            "1 2 3",
+            " ".join(["4", *(f"{i} {k} {measured[i][k][0]!r} {measured[i][k][1]!r}" for i in range(3)), "3 1 5.0 6.0"]),
+        ]
+    folder.mkdir(exist_ok=True)
+    (folder / "bundle.out").write_text("\n".join(change(lines)) + "\n")
+    if names:
+        (folder / "list.txt").write_text("".join(f"{name} 0 800.0\n" for name in [*NAMES, "lost.jpg"]))
+    return folder
+
+
+WRITERS = {
+    "opensfm": lambda folder: write_open_sfm(folder),
+    "opensfm perspective": lambda folder: write_open_sfm(folder, "perspective", version=""),
+    "opensfm fisheye": lambda folder: write_open_sfm(folder, "fisheye"),
+    **{f"openmvg {kind}": lambda folder, kind=kind: write_open_mvg(folder, kind) for kind in OPENMVG},
+    "openmvg nested": lambda folder: write_open_mvg(folder, "pinhole_brown_t2", nested=True),
+    "blocksexchange": lambda folder: write_blocks_exchange(folder),
+    "blocksexchange upwards": lambda folder: write_blocks_exchange(folder, upwards=True, pixels_of_focal=False),
+    "bundler": lambda folder: write_bundler(folder),
+}
+
+
+@pytest.mark.filterwarnings("ignore:.*are not read")
+@pytest.mark.parametrize("name", WRITERS)
+def test_it_is_read_as_the_program_means_it(tmp_path, name):
+    block = read_source(WRITERS[name](tmp_path / "in"))
+    assert block.images == ("a", "b", "c")
+    assert len(block.points) == 7 and len(block.image_points.image) == 21
+    assert np.abs(misfits_px(block)).max() < 1e-9
+    np.testing.assert_allclose(block.start.unknowns.exterior.position, CENTRES[[1, 0, 2]], atol=1e-12)
+    assert block.datum.kind == "inner" and block.start.image_known.all()
+
+
+@pytest.mark.parametrize("kind", OPENSFM)
+def test_a_camera_is_free_in_what_the_program_estimates(tmp_path, kind):
+    block = read_source(write_open_sfm(tmp_path / "in", kind), "opensfm")
+    assert free_of(block, "v2 one") == OPENSFM[kind][2]
+
+
+ROUND_TRIPS = [("opensfm", "opencv"), ("opensfm", "fisheye"), ("blocksexchange", "brown")]
+
+
+@pytest.mark.filterwarnings("ignore:.*fewer than two images")
+@pytest.mark.parametrize(("format", "camera"), ROUND_TRIPS)
+def test_what_was_exported_is_read_again(tmp_path, format, camera):
+    p = photographs(camera, "local")
+    inside = ((p.column_row > 0) & (p.column_row < [SENSOR.width_px, SENSOR.height_px])).all(axis=1)
+    p = p._replace(image=p.image[inside], point=p.point[inside], column_row=p.column_row[inside])
+    # Pixels have no size there.
+    held = dataclasses.replace(SENSOR, pixel_mm=0.001)
+    p = p._replace(cameras={"one": ExportCamera(SENSOR, CAMERAS[camera])})
+    export(p, tmp_path / "out", format)
+    block = read_source(tmp_path / "out", format)
+    assert isinstance(p, AdjustedPhotographs) and block.sensors["one"] == held
+    order = [block.images.index(name) for name in sorted(block.images)]
+    assert order == list(range(4))
+    by_name = np.argsort(np.array(p.images, object))
+    np.testing.assert_allclose(
+        block.start.unknowns.exterior.camera_from_object, p.exterior.camera_from_object[by_name], atol=1e-12
+    )
+    np.testing.assert_allclose(block.start.unknowns.exterior.position, p.exterior.position[by_name], atol=1e-9)
+    assert np.abs(misfits_px(block)).max() < 1e-9
+    assert float(block.start.unknowns.interior["one"].c) == pytest.approx(float(CAMERAS[camera].c) / 2.4, abs=1e-12)
+
+
+def test_of_several_reconstructions_the_largest_is_read_and_told(tmp_path):
+    small = lambda content: [{**content[0], "shots": dict(list(content[0]["shots"].items())[:1])}, *content]  # noqa: E731
+    with pytest.warns(UserWarning, match="of 2 reconstructions the one of 3 shots is read, 4 are in all"):
+        assert len(read_source(write_open_sfm(tmp_path / "in", change=small)).images) == 3
+
+
+def test_what_a_block_of_blocks_exchange_loses_is_told(tmp_path):
+    with pytest.warns(UserWarning, match="1 photographs without pose and 1 control points are not read"):
+        read_source(write_blocks_exchange(tmp_path / "in"))
+
+
+def test_without_a_list_photographs_of_bundler_have_numbers(tmp_path):
+    with pytest.warns(UserWarning, match=r"bundle.out: photographs have numbers"):
+        assert read_source(write_bundler(tmp_path / "in", names=False)).images == ("0", "1", "2")
+
+
+def _set(path, value):
+    """Changes one place of a tree of lists and names."""
+
+    def change(content):
+        place = content
+        for key in path[:-1]:
+            place = place[key]
+        place[path[-1]] = value
+        return content
+
+    return change
+
+
+def _geographic(text):
+    system = (
+        "<SpatialReferenceSystems><SRS><Id>0</Id><Definition>EPSG:4326</Definition></SRS></SpatialReferenceSystems>"
+    )
+    return text.replace("<Block>", system + "<Block>")
+
+
+def _replaced(old, new):
+    return lambda text: text.replace(old, new)
+
+
+def _sfm(*path_and_value, **more):
+    return lambda folder: write_open_sfm(folder, change=_set(*path_and_value), **more)
+
+
+def _mvg(*path_and_value):
+    return lambda folder: write_open_mvg(folder, change=_set(*path_and_value))
+
+
+def _blocks(change, **more):
+    return lambda folder: write_blocks_exchange(folder, change=change, **more)
+
+
+def _bundle(change):
+    return lambda folder: write_bundler(folder, change=change)
+
+
+_CAMERA, _SHOT = (0, "cameras", "v2 one"), (0, "shots", "a.jpg")
+_KIND, _DATA = ("intrinsics", 0, "value", "polymorphic_name"), ("intrinsics", 0, "value", "ptr_wrapper", "data")
+_TURN = ("extrinsics", 1, "value", "rotation")
+REFUSED = {
+    "kind": (_sfm((*_CAMERA, "projection_type"), "dual"), "'dual' is not known here"),
+    "camera": (_sfm((*_SHOT, "camera"), "two"), "shots.a.jpg.*no camera 'two'"),
+    "rotation": (_sfm((*_SHOT, "rotation"), [1, "x", 2]), "'a.jpg', rotation: .* is not 3 finite numbers"),
+    "no shots": (lambda f: write_open_sfm(f, change=lambda _: []), "no reconstruction with shots"),
+    "row": (lambda f: write_open_sfm(f, version="OPENSFM_TRACKS_VERSION_v2\na\tb\n"), "tracks.csv, row 2: 2 cells"),
+    "track": (lambda f: write_open_sfm(f, version="a.jpg\t10\t1\tx\t0\n"), "row 1: .* is not 2 finite numbers"),
+    "lists": (_mvg(("structure",), 5), "has not the lists views"),
+    "twice": (
+        lambda f: write_open_mvg(f, change=lambda c: {**c, "extrinsics": c["extrinsics"] * 2}), "20 is there twice"
+    ),
+    "mirror": (_mvg(_TURN, np.diag([1.0, 1, -1]).tolist()), "image a.jpg is no rotation"),
+    "model": (_mvg(_KIND, "spherical"), "'spherical' is not known here"),
+    "terms": (_mvg((*_DATA, "disto_k3"), [1.0]), "intrinsics 3. disto_k3: .*not a list of three"),
+    "cut": (_blocks(lambda text: text[:-30]), "the XML is broken"),
+    "angles": (_blocks(_geographic), "longitude and latitude; export it in a map system"),
+    "axes": (_blocks(_replaced("XRightYUp", "XUpYLeft"), upwards=True), "'XUpYLeft' is not read"),
+    "fisheye": (_blocks(_replaced(">Perspective<", ">Fisheye<")), "is a 'Fisheye'"),
+    "centre": (_blocks(_replaced("<x>0.5</x>", "<x>a</x>")), "photo 5, Center: .* is not 3 finite numbers"),
+    "end": (_bundle(lambda lines: lines[:-1]), "number of measurements of point 6"),
+    "words": (_bundle(lambda lines: [*lines, "x"]), "a word that is no number"),
+    "of camera": (_bundle(lambda lines: [*lines[:-1], "1 17 0 1.0 1.0"]), "in a camera that is none of 0 to 3"),
+}  # fmt: skip
+
+
+@pytest.mark.filterwarnings("ignore:.*are not read")
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_cannot_be_is_told_in_a_sentence(tmp_path, name):
+    write, message = REFUSED[name]
+    with pytest.raises(InputError, match=message):
+        read_source(write(tmp_path / "in"))
