@@ -47,6 +47,7 @@ from jaxphoto.unknowns import FIXED, FREE, Weighted
 from tests import sound_files
 from tests.io import control_files, test_bal, test_colmap, test_reconstructions
 from tests.io import test_cameras as cameras
+from tests.io import test_robotics_cameras as robotics
 from tests.io import test_surfaces as surfaces
 from tests.io.conftest import FILES
 from tests.simulation.small import RECIPES
@@ -330,6 +331,8 @@ READERS: dict[str, Reader] = {
         ),
         _camera("cameras.bin"),
     ),
+    "camera-mrcal": Reader(text(a__cameramodel=robotics.mrcal("OPENCV8", robotics.RATIONAL)), _camera("a.cameramodel")),
+    "camera-kalibr": Reader(text(a__yaml=robotics.KALIBR), _camera("a.yaml", camera="cam1")),
     "camera-agisoft": Reader(text(a__xml=cameras.AGISOFT), _camera("a.xml")),
     "camera-colmap": Reader(text(cameras__txt=cameras.COLMAP), _camera("cameras.txt", camera="5")),
     "camera-smac": Reader(text(a__txt=cameras.SMAC), _camera("a.txt")),

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from jaxphoto.errors import InputError
 from jaxphoto.io.block_folder.table_layout import TOML
-from jaxphoto.io.cameras import agisoft, colmap, open_cv, own_cameras, smac_report
+from jaxphoto.io.cameras import agisoft, colmap, kalibr, mrcal, open_cv, own_cameras, smac_report
 from jaxphoto.io.cameras.camera_file import CameraFile, CameraSource
 
 
@@ -23,6 +23,8 @@ _FORMATS = {
     "agisoft": _ReadFormat(agisoft.recognises, agisoft.read_agisoft),
     "smac": _ReadFormat(smac_report.recognises, smac_report.read_smac_report),
     "colmap": _ReadFormat(colmap.recognises, colmap.read_colmap),
+    "mrcal": _ReadFormat(mrcal.recognises, mrcal.read_mrcal),
+    "kalibr": _ReadFormat(kalibr.recognises, kalibr.read_kalibr),
     "opencv": _ReadFormat(open_cv.recognises, open_cv.read_open_cv),
 }
 # In a folder, what its camera file is called.
@@ -37,7 +39,7 @@ def read_camera_file(
     size_px: tuple[int, int] | None = None,
     block: str | Path | None = None,
 ) -> CameraFile:
-    """The camera in a file of OpenCV, COLMAP, Agisoft or the USGS (docs/camera_files.md), or of jaxphoto itself.
+    """The camera in a file of another program (docs/camera_files.md), or of jaxphoto itself.
 
     The format is told by the content. `path` may be a folder of results, a block folder or a COLMAP model. `camera`
     names one where there are several; `pixel_mm` is the size of a pixel and `size_px` the width and height where the
@@ -61,5 +63,8 @@ def read_camera_file(
             return known.read(source)
     if not text.strip():
         raise source.error("the file is empty; write it anew")
-    formats = "OpenCV's YAML, COLMAP's cameras.txt, Agisoft's XML, a SMAC report, interior.csv and block.toml"
+    formats = (
+        "OpenCV's and ROS' YAML, COLMAP's cameras.txt, Agisoft's XML, mrcal's .cameramodel, Kalibr's camera chain, a "
+        "SMAC report, interior.csv and block.toml"
+    )
     raise source.error(f"this is no camera file that is known; {formats} are")

@@ -9,7 +9,7 @@ import numpy as np
 from jaxphoto.camera import AbstractDistortion, InteriorOrientation, Perspective, Sensor, Smac
 from jaxphoto.camera.conversion import Conversion, converted
 from jaxphoto.errors import InputError
-from jaxphoto.io.cameras import agisoft, colmap, open_cv
+from jaxphoto.io.cameras import agisoft, colmap, mrcal, open_cv
 from jaxphoto.io.cameras.camera_file import CameraModel
 from jaxphoto.io.cameras.colmap import write_colmap
 from jaxphoto.io.cameras.open_cv import write_open_cv
@@ -36,6 +36,8 @@ _FORMATS = {
     "opencv": _WriteFormat(write_open_cv, open_cv.PLANE, open_cv.FISHEYE, (".yml", ".yaml", ".json")),
     "colmap": _WriteFormat(write_colmap, colmap.PLANE, colmap.FISHEYE, ()),
     "agisoft": _WriteFormat(agisoft.write_agisoft, agisoft.PLANE, agisoft.FISHEYE, (".xml",)),
+    "mrcal": _WriteFormat(mrcal.write_mrcal, mrcal.PLANE, None, (".cameramodel",)),
+    "ros": _WriteFormat(open_cv.write_ros, open_cv.PLANE, open_cv.FISHEYE, ()),
     "smac": _WriteFormat(write_smac_report, CameraModel(Smac, (), Perspective()), None, (".txt", ".rpt")),
     "block": _WriteFormat(write_block_camera, None, None, (".toml",)),
 }

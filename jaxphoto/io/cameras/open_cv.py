@@ -4,13 +4,17 @@ OpenCV's centre of the upper left pixel is (0, 0), ours (0.5, 0.5). It ignores w
 of cv2.fisheye say `fisheye_model: 1` and have four coefficients.
 """
 
+import json
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from jaxphoto.camera import Equidistant, InteriorOrientation, OpenCv, OpenCvFisheye, Perspective, Sensor
+from jaxphoto.errors import quoted
 from jaxphoto.io.cameras.camera_file import (
     CameraFile,
     CameraModel,
@@ -23,6 +27,8 @@ from jaxphoto.io.cameras.camera_file import (
 _ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _COUNTS = (4, 5, 8, 12, 14)
 _FISHEYE_ORDER = ("k1", "k2", "k3", "k4")
+# What ROS calls them (sensor_msgs/CameraInfo).
+_ROS_PLANES, _ROS_FISHEYE = ("plumb_bob", "rational_polynomial"), "equidistant"
 # Its parser came to the end of the stack at some 20,000 levels (OpenCV 5.0); files have five.
 _NESTING = re.compile(r"[\[{]|<(?![/?!])|[\]}]|</|/>")
 _DEEPEST, _SIGNS = 100, 1_000
@@ -40,8 +46,16 @@ def recognises(path: Path, text: str) -> bool:
 def read_open_cv(source: CameraSource) -> CameraFile:
     """camera_matrix, distortion_coefficients, image_width, image_height and avg_reprojection_error of a file.
 
-    Raises InputError for a file that is cut off, for missing keys, and terms of thin prisms or tilt.
+    Files of ROS (camera_info) hold the same, and a distortion_model. Raises InputError for a file that is cut off, for
+    missing keys, and terms of thin prisms or tilt.
     """
+    with _opened(source) as storage:
+        return _camera(source, storage)
+
+
+@contextmanager
+def _opened(source: CameraSource) -> Iterator[cv2.FileStorage]:
+    """A file as OpenCV reads it. Raises InputError where it cannot, or finds something else than it is asked for."""
     text = source.text()
     if _is_deep(text):
         raise source.error("lists or keys are nested more deeply than in any file of OpenCV; write it anew")
@@ -49,13 +63,13 @@ def read_open_cv(source: CameraSource) -> CameraFile:
         text = "%YAML:1.0\n---\n" + text.lstrip().removeprefix("---")
     storage = cv2.FileStorage()
     try:
-        opened = storage.open(text, cv2.FileStorage_READ | cv2.FileStorage_MEMORY)
+        is_open = storage.open(text, cv2.FileStorage_READ | cv2.FileStorage_MEMORY)
     except cv2.error:
-        opened = False
-    if not opened:
+        is_open = False
+    if not is_open:
         raise source.error("OpenCV cannot read it; it is cut off or was changed, so write it anew")
     try:
-        return _camera(source, storage)
+        yield storage
     except cv2.error:
         # Such as a list where names and values are expected.
         raise source.error("OpenCV finds no camera in it; write it anew") from None
@@ -83,6 +97,29 @@ def write_open_cv(path: Path, name: str, sensor: Sensor, interior: InteriorOrien
     path.write_text(storage.releaseAndGetString(), encoding="utf-8")
 
 
+def write_ros(path: Path, name: str, sensor: Sensor, interior: InteriorOrientation) -> None:
+    """Write a camera that is a `PLANE` or `FISHEYE` as a camera_info file of ROS, whose image is not rectified."""
+    fx, fy, column, row = from_centre_px(interior, sensor)
+    d = interior.distortion
+    fisheye = isinstance(d, OpenCvFisheye)
+    values = [float(getattr(d, k)) for k in (_FISHEYE_ORDER if fisheye else _ORDER)]
+    rational = not fisheye and any(values[5:])
+    model = _ROS_FISHEYE if fisheye else _ROS_PLANES[rational]
+    matrix = [fx, 0.0, column - 0.5, 0.0, fy, row - 0.5, 0.0, 0.0, 1.0]
+    projection = [*matrix[:3], 0.0, *matrix[3:6], 0.0, *matrix[6:], 0.0]
+    lines = [f"image_width: {sensor.width_px}", f"image_height: {sensor.height_px}", f"camera_name: {json.dumps(name)}"]
+    lines += [*_ros_matrix("camera_matrix", 3, 3, matrix), f"distortion_model: {model}"]
+    lines += _ros_matrix("distortion_coefficients", 1, n := 4 if fisheye else 8 if rational else 5, values[:n])
+    lines += _ros_matrix("rectification_matrix", 3, 3, np.eye(3).ravel().tolist())
+    lines += _ros_matrix("projection_matrix", 3, 4, projection)
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _ros_matrix(name: str, rows: int, columns: int, values: list[float]) -> list[str]:
+    data = ", ".join(map(repr, values))
+    return [f"{name}:", f"  rows: {rows}", f"  cols: {columns}", f"  data: [{data}]"]
+
+
 def _is_deep(text: str) -> bool:
     """Whether OpenCV's parser might end the process: it calls itself for everything that is in something else."""
     depth = 0
@@ -99,7 +136,11 @@ def _is_deep(text: str) -> bool:
 
 
 def _camera(source: CameraSource, storage: cv2.FileStorage) -> CameraFile:
-    fisheye = _number(storage, "fisheye_model") not in (None, 0.0)
+    kind = storage.getNode("distortion_model")
+    if not kind.empty() and kind.string() not in (*_ROS_PLANES, _ROS_FISHEYE):
+        known = ", ".join((*_ROS_PLANES, _ROS_FISHEYE))
+        raise source.error(f"the distortion_model {quoted(kind.string())} is not known here; known are {known}")
+    fisheye = _number(storage, "fisheye_model") not in (None, 0.0) or kind.string() == _ROS_FISHEYE
     matrix = _matrix(source, storage, "camera_matrix")
     if matrix.shape != (3, 3):
         raise source.error(f"camera_matrix is {' x '.join(map(str, matrix.shape))}; it has to be 3 x 3")
@@ -139,6 +180,7 @@ def _value(node: cv2.FileNode) -> float | None:
 
 
 def _values(node: cv2.FileNode) -> list[float | None]:
+    """The numbers of a list, with None for what is no number; none where it is no list."""
     return [_value(node.at(k)) for k in range(node.size())] if node.isSeq() else []
 
 

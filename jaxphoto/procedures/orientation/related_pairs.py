@@ -1,6 +1,8 @@
 """The relative orientations of all pairs of images, and the matches that they bear out."""
 
+import os
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
@@ -68,21 +70,25 @@ def relate(
     pairs: list[Pair] = []
     kept: list[PairMatches] = []
     refused: dict[tuple[int, int], str] = {}
-    for k, match in enumerate(matches):
-        if k % 10 == 0:
-            report(f"relative orientation of pair {k + 1} of {len(matches)}")
+
+    def orientations(match: PairMatches) -> list[RelativeOrientation] | str:
         one, other = match.features.T
         both = f"images {names[match.first]} and {names[match.second]}"
-        found = _orientations(rays[match.first][one], rays[match.second][other], sigma_rad, least, both)
-        if isinstance(found, str):
-            refused[match.first, match.second] = found
-            continue
-        agrees = found[0].agrees
-        kept.append(match._replace(features=match.features[agrees]))
-        for r in found:
-            n = int(r.agrees.sum())
-            ends = (match.first, match.second)
-            pairs.append(Pair(*ends, r.camera_2_from_camera_1, r.base, n, r.parallactic_angle))
+        return _orientations(rays[match.first][one], rays[match.second][other], sigma_rad, least, both)
+
+    with ThreadPoolExecutor(os.cpu_count()) as workers:
+        for k, (match, found) in enumerate(zip(matches, workers.map(orientations, matches), strict=True)):
+            if k % 10 == 0:
+                report(f"relative orientation of pair {k + 1} of {len(matches)}")
+            if isinstance(found, str):
+                refused[match.first, match.second] = found
+                continue
+            agrees = found[0].agrees
+            kept.append(match._replace(features=match.features[agrees]))
+            for r in found:
+                n = int(r.agrees.sum())
+                ends = (match.first, match.second)
+                pairs.append(Pair(*ends, r.camera_2_from_camera_1, r.base, n, r.parallactic_angle))
     return Related(tuple(pairs), tuple(kept), refused)
 
 
