@@ -6,10 +6,16 @@ the long tracks first, which have most matches and are worth most; `tracks` grow
 instead, those first that other matches confirm, and leaves out a match that would show a photograph twice.
 """
 
+import itertools
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Int
+from scipy.sparse import csr_array
+
+# Matches that are looked at together.
+_AT_ONCE = 200_000
 
 
 class PairMatches(NamedTuple):
@@ -50,23 +56,24 @@ def tracks(n_features: list[int], pairs: list[PairMatches]) -> Tracks:
     photograph = np.repeat(np.arange(len(number)), number).tolist()
     edges = edges[np.argsort(-support, kind="stable")]
     parent = list(range(int(first[-1])))
-    shown: dict[int, set[int]] = {}
+    # The photographs of a component, a bit each.
+    shown: dict[int, int] = {}
     n_conflicting = 0
-    for a, b in edges.tolist():
+    for a, b in itertools.chain.from_iterable(map(np.ndarray.tolist, _portions(edges))):
         a, b = _root(parent, a), _root(parent, b)
         if a == b:
             continue
-        of_a, of_b = shown.get(a, {photograph[a]}), shown.get(b, {photograph[b]})
-        if not of_a.isdisjoint(of_b):
+        of_a, of_b = shown.get(a) or 1 << photograph[a], shown.get(b) or 1 << photograph[b]
+        if of_a & of_b:
             n_conflicting += 1
             continue
-        if len(of_a) < len(of_b):
-            a, b, of_a, of_b = b, a, of_b, of_a
+        if of_a.bit_count() < of_b.bit_count():
+            a, b = b, a
         parent[b] = a
         shown[a] = of_a | of_b
         shown.pop(b, None)
     rows = np.unique(edges)
-    roots = np.array([_root(parent, k) for k in rows.tolist()], int)
+    roots = np.fromiter((_root(parent, k) for k in rows.tolist()), int, len(rows))
     _, begins, point, times = np.unique(roots, return_index=True, return_inverse=True, return_counts=True)
     # A feature whose every match was left out makes no point.
     kept = times[point] >= 2
@@ -103,11 +110,21 @@ def _edges(first: np.ndarray, pairs: list[PairMatches]) -> Int[np.ndarray, "edge
 
 def _support(edges: np.ndarray, n: int) -> Int[np.ndarray, "edges"]:
     """How many third features both ends of each match are matched to: the triangles of the graph over it."""
-    partners: list[set[int]] = [set() for _ in range(n)]
-    for a, b in edges.tolist():
-        partners[a].add(b)
-        partners[b].add(a)
-    return np.array([len(partners[a] & partners[b]) for a, b in edges.tolist()], int)
+    both = np.concatenate([edges, edges[:, ::-1]])
+    matched = csr_array((np.ones(len(both), np.int32), (both[:, 0], both[:, 1])), (n, n))
+    # Of a match that is there twice.
+    matched.data[:] = 1
+    found = [np.zeros(0, int)]
+    for some in _portions(edges):
+        one, other = (matched[some[:, side]] for side in (0, 1))
+        found.append(np.asarray(one.multiply(other).sum(axis=1), int).ravel())
+    return np.concatenate(found)
+
+
+def _portions(edges: np.ndarray) -> Iterator[np.ndarray]:
+    """Some at a time: all as Python's numbers, or with all their partners, would be gigabytes."""
+    for begin in range(0, len(edges), _AT_ONCE):
+        yield edges[begin : begin + _AT_ONCE]
 
 
 def _root(parent: list[int], k: int) -> int:

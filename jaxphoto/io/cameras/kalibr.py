@@ -39,7 +39,7 @@ def read_kalibr(source: CameraSource) -> CameraFile:
     kind, distortion = camera.get("camera_model"), camera.get("distortion_model")
     if kind != "pinhole":
         raise source.error(f"{name} is a {quoted(kind)}; cameras that are pinhole are known here")
-    if distortion not in _MODELS:
+    if not isinstance(distortion, str) or distortion not in _MODELS:
         known = ", ".join(_MODELS)
         raise source.error(f"the distortion {quoted(distortion)} of {name} is not known here; known are {known}")
     model, order = _MODELS[distortion]

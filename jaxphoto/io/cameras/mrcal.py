@@ -39,7 +39,7 @@ def read_mrcal(source: CameraSource) -> CameraFile:
     if not isinstance(values, dict):
         raise source.error("it has no names and values; let mrcal write it anew")
     model = values.get("lensmodel", values.get("lens_model"))
-    if model not in _MODELS:
+    if not isinstance(model, str) or model not in _MODELS:
         raise source.error(f"the lens model {quoted(model)} is not known here; known are {', '.join(_MODELS)}")
     numbers = _numbers(source, values, "intrinsics", _PLACES + _MODELS[model])
     if np.any(numbers[_PLACES + len(_ORDER) :] != 0):

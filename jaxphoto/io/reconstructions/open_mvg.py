@@ -136,7 +136,7 @@ def _data(value: dict[str, Any]) -> dict[str, Any]:
 def _camera(path: Path, key: str, value: dict[str, Any]) -> TiedCamera:
     given = Section(path.name, f"intrinsics {key}", _data(value))
     kind = value.get("polymorphic_name")
-    if kind not in _KINDS:
+    if not isinstance(kind, str) or kind not in _KINDS:
         raise given.error("polymorphic_name", f"{quoted(kind)} is not known here; known are {', '.join(_KINDS)}")
     model, name, coefficients = _KINDS[kind]
     source = CameraSource(path)

@@ -209,9 +209,8 @@ def _block_of(title, names, sensor, interior, features, sigmas_mm, found: Tracks
     unknowns = Unknowns({CAMERA: interior}, exterior, np.zeros((n_points, 3)), {}, {})
     priors = default_priors(unknowns)
     free = freed(priors.interior[CAMERA], _candidates(interior))
-    rows = list(zip(found.image.tolist(), found.feature.tolist(), strict=True))
-    xy = np.array([features[i][f] for i, f in rows]).reshape(-1, 2)
-    sigma = np.array([sigmas_mm[i][f] for i, f in rows])
+    rows = np.concatenate([[0], np.cumsum([len(xy) for xy in features])])[found.image] + found.feature
+    xy, sigma = np.concatenate(features)[rows], np.concatenate(sigmas_mm)[rows]
     return Block(
         title=title,
         images=tuple(names),
