@@ -1,0 +1,37 @@
+"""A stranger's half hour: every command of docs/half_an_hour.md, in a folder of its own, ends as the page says."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.mark.slow
+def test_every_command_of_the_page_works(tmp_path):
+    page = (ROOT / "docs" / "half_an_hour.md").read_text(encoding="utf-8")
+    script = "\n".join(re.findall(r"```sh\n(.*?)```", page, re.DOTALL))
+    beside = Path(sys.executable).parent
+    assert shutil.which("jaxphoto", path=str(beside)), "jaxphoto is not installed beside this Python"
+    found = subprocess.run(
+        ["bash", "-euc", script],
+        cwd=tmp_path,
+        env=os.environ | {"PATH": f"{beside}{os.pathsep}{os.environ['PATH']}"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert found.returncode == 0, found.stdout + found.stderr
+    for folder in ("results", "results_of_project", "what_if"):
+        assert (tmp_path / folder / "report.html").stat().st_size > 10_000
+    both = [pd.read_csv(tmp_path / name / "interior.csv") for name in ("results", "results_of_project")]
+    c, sigma = (both[0].set_index("parameter").loc["c_mm", key] for key in ("value", "sigma"))
+    assert abs(c - 34.25) < 4 * sigma
+    # A pixel of the export has no size: one is a micrometre.
+    assert abs(both[1].set_index("parameter").loc["c_mm", "value"] * 8 - c) < 0.05
