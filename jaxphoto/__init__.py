@@ -71,6 +71,7 @@ from jaxphoto.statistics import (
     angle_differences,
     covariance,
     point_differences,
+    sigma_map,
     significance,
     variance_components,
 )
@@ -98,7 +99,7 @@ __all__ = [
     "correlated", "covariance", "decentring_from_symmetry", "default_priors", "direct_orientation", "georeference",
     "ground_point", "halves", "image_ray", "intersect", "monte_carlo", "orient", "point_differences",
     "principal_points", "project", "read_block", "read_recipe", "read_source", "readjust", "rebalance",
-    "rebalance_covariance", "robust", "significance", "simulate", "simultaneous", "snoop",
+    "rebalance_covariance", "robust", "sigma_map", "significance", "simulate", "simultaneous", "snoop",
     "symmetry_from_decentring", "touching",
     "variance_components", "write_block", "write_simulation",
 ]  # fmt: skip

@@ -20,6 +20,7 @@ from jaxphoto.report.plots import (
     residuals_figure,
 )
 from jaxphoto.report.positional_accuracy import accuracy_sentences
+from jaxphoto.report.sigma_map import sigma_map_figure, sigma_map_words
 from jaxphoto.report.style import STYLE
 from jaxphoto.report.tables import Tables
 from jaxphoto.statistics import LEAST_CHECKED
@@ -37,7 +38,11 @@ _PAGE = """<!DOCTYPE html>
 <p>&sigma;<sub>0</sub> = <b>{{ sigma0 }}</b>, redundancy {{ redundancy }}: {{ counts }}.
 Standard deviations are a posteriori (times &sigma;<sub>0</sub>). Correlations refer to the rotations {{ rotations }}.</p>
 <h2>Interior orientation</h2>{{ interior }}
-{% for figure in correlation %}<img alt="correlations" src="{{ figure }}">{% endfor %}
+{% for figure in correlation %}<div class="wide"><img alt="correlations of the interior orientation with itself and with the exterior one" src="{{ figure }}"></div>{% endfor %}
+{% if sigma_maps %}<h2>How sure the camera is, over its format</h2>
+<p>Standard deviation of where the calibrated camera says that a point is seen, interior and exterior orientation taken together, in the direction in which it is largest
+(<code>sigma_map.csv</code>). Of a direction the whole error of the principal distance counts; of a point as far away as those that were seen, only what its distance does not make good.</p>
+{% for s in sigma_maps %}<p>{{ s.words }}</p><div class="wide"><img alt="{{ s.words }}" src="{{ s.picture }}"></div>{% endfor %}{% endif %}
 {% if georeferencing %}<h2>Mounts and strips</h2>{{ georeferencing }}{% endif %}
 <h2>Block</h2><img alt="block layout" src="{{ layout }}">
 <h2>Residuals</h2>{{ spread }}
@@ -81,6 +86,10 @@ def report_page(tables: Tables, verdict: Verdict) -> str:
             verdict=verdict,
             interior=_html(interior.replace({True: "yes", False: "no", None: ""})),
             correlation=[_picture(correlation_figure(tables, c)) for c in used],
+            sigma_maps=[
+                {"words": sigma_map_words(a.block.sensors[c], maps), "picture": _picture(sigma_map_figure(tables, c))}
+                for c, maps in tables.sigma_maps.items()
+            ],
             georeferencing=_html(tables.georeferencing) if len(tables.georeferencing) else "",
             layout=_picture(layout_figure(tables)),
             spread=_html(tables.residual_spread),

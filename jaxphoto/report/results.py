@@ -27,6 +27,7 @@ _TABLES = (
     "correlation",
     "correlation_summary",
     "correlation_ground",
+    "sigma_map",
 )
 # Written beside them where the files of the block were in an EPSG system.
 _MAP_TABLES = ("exterior_map", "object_points_map")

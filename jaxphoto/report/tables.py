@@ -22,6 +22,7 @@ from jaxphoto.statistics import (
     PositionalAccuracy,
     Redundancy,
     Rotations,
+    SigmaMap,
     Significance,
     Trend,
     UndetectedEffects,
@@ -39,6 +40,7 @@ from jaxphoto.statistics import (
     prepare_statistics,
     redundancy_numbers,
     residual_spread,
+    sigma_maps,
     significance,
     trends,
     undetected_effects,
@@ -293,6 +295,23 @@ class Tables:
                 own = zip((*g.parameters, "all"), (*g.rho[k], g.together[k]), strict=True)
                 rows += [(camera, form, g.sigma_m[k], parameter, rho) for parameter, rho in own]
         return pd.DataFrame(rows, columns=["camera", "ground", "sigma_m", "parameter", "rho"])
+
+    @cached_property
+    def sigma_maps(self) -> dict[str, tuple[SigmaMap, SigmaMap]]:
+        """By camera that was estimated, at infinity and at the distance of its points, as arrays."""
+        return sigma_maps(self.adjusted)
+
+    @cached_property
+    def sigma_map(self) -> pd.DataFrame:
+        """camera, distance_m (inf: a direction), x_mm, y_mm, sigma_x_px, sigma_y_px, worst_px; a row a cell."""
+        numbers = ["distance_m", "x_mm", "y_mm", "sigma_x_px", "sigma_y_px", "worst_px"]
+        frames = [pd.DataFrame({"camera": [], **dict.fromkeys(numbers, np.zeros(0))})]
+        for one in (m for maps in self.sigma_maps.values() for m in maps):
+            in_mm = np.column_stack([np.sqrt(np.diagonal(one.covariance, axis1=1, axis2=2)), one.worst])
+            sigma = in_mm / self.adjusted.block.sensors[one.camera].pixel_mm
+            rows = np.column_stack([np.full(len(sigma), one.distance_m), one.points, sigma])
+            frames.append(pd.DataFrame(rows, columns=numbers).assign(camera=one.camera))
+        return pd.concat(frames[1:] or frames, ignore_index=True)[["camera", *numbers]]
 
     @cached_property
     def residual_spread(self) -> pd.DataFrame:
