@@ -75,7 +75,7 @@ def test_no_import_hides_in_a_function():
         # Those that are worth it: matplotlib takes a third of a second, and most uses draw nothing; scipy's graphs take
         # a tenth, and blocks of few images need none; its distributions take a fifth, and only tests compare with them.
         worth_it = {
-            "from matplotlib.figure import Figure", "from matplotlib.text import Text",
+            "from matplotlib.figure import Figure", "from matplotlib.text import Text", "from matplotlib import pyplot",
             "from matplotlib.backends.backend_pdf import PdfPages", "from scipy.sparse import csr_matrix",
             "from scipy import special",
         }  # fmt: skip

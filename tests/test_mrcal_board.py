@@ -14,7 +14,7 @@ from jaxphoto.adjustment.normal_equations import factor_normal
 from jaxphoto.camera import Brown, InteriorOrientation, OpenCv, Sensor, get_parameter, set_parameter
 from jaxphoto.procedures.calibration import CAMERA, Board, Detection, TargetRows, calibration_block
 from jaxphoto.procedures.calibration.resections import resected
-from jaxphoto.statistics import sigma_map
+from jaxphoto.statistics.sigma_map import sigma_map
 from tests.adjustment.dense import prepared
 
 FREE = ("c_mm", "xp_mm", "yp_mm", "b1", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")

@@ -11,7 +11,7 @@ from jaxphoto.camera import Sensor
 from jaxphoto.errors import camera_words
 from jaxphoto.report.plots import new_figure
 from jaxphoto.report.tables import Tables
-from jaxphoto.statistics import SigmaMap
+from jaxphoto.statistics.sigma_map import SigmaMap
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

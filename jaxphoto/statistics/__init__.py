@@ -49,7 +49,6 @@ from jaxphoto.statistics.reliability import (
     redundancy_numbers,
 )
 from jaxphoto.statistics.responses import prepare_responses
-from jaxphoto.statistics.sigma_map import SigmaMap, seen_distance_m, sigma_map, sigma_maps
 from jaxphoto.statistics.significance import (
     SIGNIFICANCE_LEVEL,
     IfZero,
@@ -66,13 +65,13 @@ __all__ = [
     "DELTA0", "EOP_NAMES", "LEAST_CHECKED", "LEAST_CHECK_POINTS", "LEAST_SIGMA0", "LEVEL", "MOST_PARTS",
     "SIGNIFICANCE_LEVEL", "SPLITS", "AxisErrors", "BlunderTest", "ComponentAccuracy", "Correlations", "Covariance",
     "Felt", "GroundCorrelations", "Hidden", "IfZero", "LinearForms", "PartialRedundancy", "Partition", "Parts",
-    "PositionalAccuracy", "Redundancy", "Rotations", "Selection", "SigmaMap", "Significance", "Spread", "Suspect",
+    "PositionalAccuracy", "Redundancy", "Rotations", "Selection", "Significance", "Spread", "Suspect",
     "Trend", "UndetectedEffects", "VarianceComponents", "VarianceFactor", "a_priori_sigmas", "angle_differences",
     "blunder_test", "check_discrepancies", "chi_square_limit", "chi_square_p", "common_covariance",
     "correlation_matrix", "correlations", "covariance", "critical_w", "detectable_errors", "error_precision",
     "global_test", "ground_correlations", "group_factors", "if_zero", "linear_forms", "most_felt",
     "normalised_residuals", "observation_groups", "partial_redundancy", "parts_of", "physical_residuals",
     "point_differences", "positional_accuracy", "prepare_responses", "prepare_statistics", "redundancy_numbers",
-    "residual_spread", "seen_distance_m", "sigma_map", "sigma_maps", "significance", "spread_of", "stretch", "trends",
+    "residual_spread", "significance", "spread_of", "stretch", "trends",
     "undetected_effects", "variance_components", "worst_checked",
 ]  # fmt: skip

@@ -24,6 +24,7 @@ from jaxtyping import Array, Float
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.arrays import Numbers
+from jaxphoto.block import one_camera
 from jaxphoto.camera import InteriorOrientation, Sensor, parameter_names
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import InputError
@@ -68,7 +69,7 @@ def sigma_map(
     orientation, such as a rolling shutter, is taken as known. Raises InputError for a camera that the block has not,
     and for a distance that is not positive.
     """
-    name = _one_camera(adjusted, camera)
+    name = one_camera(adjusted.block, camera)
     if not distance_m > 0:
         raise InputError(f"distance_m is the distance of a point from the camera, so it is positive, got {distance_m}")
     interior, sensor = adjusted.unknowns.interior[name], adjusted.block.sensors[name]
@@ -86,7 +87,7 @@ def sigma_map(
 
 def seen_distance_m(adjusted: Adjustment, camera: str | None = None) -> float:
     """The median distance at which the images of a camera saw points (m)."""
-    s, name = adjusted.structure, _one_camera(adjusted, camera)
+    s, name = adjusted.structure, one_camera(adjusted.block, camera)
     mine = np.array([c == name for c in adjusted.block.image_camera], bool)[s.image]
     places = np.asarray(adjusted.unknowns.points)[s.point] - np.asarray(adjusted.unknowns.exterior.position)[s.image]
     return float(np.median(np.linalg.norm(places[mine], axis=1)))
@@ -101,16 +102,6 @@ def sigma_maps(adjusted: Adjustment) -> dict[str, tuple[SigmaMap, SigmaMap]]:
         for name in adjusted.unknowns.interior
         if name in seen and any(label.startswith(f"interior[{name}].") for label in s.labels)
     }
-
-
-def _one_camera(adjusted: Adjustment, camera: str | None) -> str:
-    cameras = tuple(adjusted.unknowns.interior)
-    if camera is None and len(cameras) == 1:
-        return cameras[0]
-    if camera not in cameras:
-        asked = "say which camera" if camera is None else f"there is no camera {camera}"
-        raise InputError(f"{asked}: the block has {', '.join(cameras) or 'none'}")
-    return camera
 
 
 def _cells(sensor: Sensor) -> Float[np.ndarray, "cells 2"]:

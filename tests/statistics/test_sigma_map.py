@@ -11,7 +11,7 @@ import pytest
 from jaxphoto import InputError, covariance
 from jaxphoto.camera import get_parameter, set_parameter
 from jaxphoto.rotation import small_rotation
-from jaxphoto.statistics import seen_distance_m, sigma_map
+from jaxphoto.statistics.sigma_map import seen_distance_m, sigma_map
 from tests.blocks import adjusted
 
 PLACES = np.array([[0.0, 0.0], [14.0, -9.0], [-16.0, 10.0]])
