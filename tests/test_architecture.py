@@ -43,7 +43,9 @@ def test_the_table_of_floors_is_the_contract():
     rows = re.findall(r"^\| (\d+) \| (.+?) \|$", (ROOT / "CONTRIBUTING.md").read_text(), re.MULTILINE)
     assert [int(number) for number, _ in rows] == list(range(len(floors)))[::-1]
     assert [set(re.findall(r"`(\w+)`", rooms)) for _, rooms in rows] == floors
-    assert set().union(*floors) | {"__init__"} == {p.stem for p in PACKAGE.iterdir() if p.name != "__pycache__"}
+    assert set().union(*floors) | {"__init__"} == {
+        p.stem for p in PACKAGE.iterdir() if p.name not in ("__pycache__", "py.typed")
+    }
 
 
 def test_a_class_name_stands_once():

@@ -45,6 +45,7 @@ COMMANDS = {
         "Turn another program's files into a block folder, or what was adjusted into files of others.",
     ),
     "undistort": _Command("undistort", "Resample photographs to a camera without distortion."),
+    "example": _Command("example", "Write an example block, recipe or experiment that comes with jaxphoto."),
     "simulate": _Command("simulate", "Simulate a block with known truth."),
     "sensitivity": _Command(
         "sensitivity",
