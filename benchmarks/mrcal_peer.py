@@ -1,4 +1,5 @@
-"""mrcal as a peer: PYTHON benchmarks/mrcal_peer.py FILE.npz reads a board's corners and solves once a line it is sent.
+"""mrcal as a peer: PYTHON benchmarks/mrcal_peer.py FILE.npz reads a board's corners and solves once a line it is sent,
+then maps its projection uncertainty over 60 x 40 cells.
 
 For the interpreter that has mrcal, which is the system's (Debian: python3-mrcal), so it imports nothing else of ours.
 FILE holds `corners` (images, rows, columns, 3: x, y, weight; -1 where there is none), `intrinsics`, `rotation` and
@@ -34,6 +35,11 @@ def _inputs(problem) -> dict:
         "calibration_object_spacing": float(problem["spacing_m"]),
         "calobject_warp": None,
         "do_optimize_calobject_warp": False,
+        # These are so without saying, but `projection_uncertainty` looks for them.
+        "do_optimize_intrinsics_core": True,
+        "do_optimize_intrinsics_distortions": True,
+        "do_optimize_extrinsics": True,
+        "do_optimize_frames": True,
         "do_apply_outlier_rejection": False,
         "do_apply_regularization": False,
     }
@@ -55,6 +61,17 @@ def _work(file: str) -> None:
             "solve_s": time.perf_counter() - wall,
             "cpu_s": time.process_time() - cpu,
             "square_sum": float(np.sum(found["x"] ** 2)),
+        }
+        model = mrcal.cameramodel(optimization_inputs=inputs, icam_intrinsics=0)
+        x, y = (np.linspace(0, problem[key] - 1, n) for key, n in (("width_px", 60), ("height_px", 40)))
+        cells = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+        wall, cpu = time.perf_counter(), time.process_time()
+        rays = mrcal.unproject(cells, *model.intrinsics(), normalize=True)
+        worst = mrcal.projection_uncertainty(rays, model, atinfinity=True, what="worstdirection-stdev")
+        record |= {
+            "map_s": time.perf_counter() - wall,
+            "map_cpu_s": time.process_time() - cpu,
+            "map_px": worst.tolist(),
             "memory_mb": _memory_mb(),
         }
         print(json.dumps(record), flush=True)

@@ -79,11 +79,13 @@ from jaxphoto.unknowns import FIXED, FREE, Unknowns, Weighted, default_priors
 if TYPE_CHECKING:
     from jaxphoto.io import convert, read_block, read_recipe, read_source, write_block, write_simulation
     from jaxphoto.procedures.calibration import calibrate
+    from jaxphoto.procedures.compare import compare
     from jaxphoto.procedures.halves import halves
     from jaxphoto.procedures.lidar import simultaneous
     from jaxphoto.procedures.orientation import orient
     from jaxphoto.report import Tables
     from jaxphoto.sensitivity import bias, monte_carlo, readjust
+    from jaxphoto.statistics.sigma_map import sigma_map
 
 __version__ = "0.1.0"
 
@@ -94,11 +96,11 @@ __all__ = [
     "DatumError", "Distances", "Exposure", "ExteriorOrientation", "Frame", "ImageRows", "InputError",
     "InteriorOrientation", "JaxphotoError", "KnownParameters", "Mount", "Outcome", "RankError", "Selection", "Sensor",
     "Start", "StationRows", "StripBias", "Surface", "SurfaceRows", "Tables", "Unknowns", "Weighted", "adjust",
-    "angle_differences", "bias", "boresight", "calibrate", "common_sizes", "conversion_error", "convert",
+    "angle_differences", "bias", "boresight", "calibrate", "common_sizes", "compare", "conversion_error", "convert",
     "correlated", "covariance", "decentring_from_symmetry", "default_priors", "direct_orientation", "georeference",
     "ground_point", "halves", "image_ray", "intersect", "monte_carlo", "orient", "point_differences",
     "principal_points", "project", "read_block", "read_recipe", "read_source", "readjust", "rebalance",
-    "rebalance_covariance", "robust", "significance", "simulate", "simultaneous", "snoop",
+    "rebalance_covariance", "robust", "sigma_map", "significance", "simulate", "simultaneous", "snoop",
     "symmetry_from_decentring", "touching",
     "variance_components", "write_block", "write_simulation",
 ]  # fmt: skip
@@ -108,11 +110,13 @@ __all__ = [
 _LATER = {
     "io": ("convert", "read_block", "read_recipe", "read_source", "write_block", "write_simulation"),
     "procedures.calibration": ("calibrate",),
+    "procedures.compare": ("compare",),
     "procedures.halves": ("halves",),
     "procedures.lidar": ("simultaneous",),
     "procedures.orientation": ("orient",),
     "report": ("Tables",),
     "sensitivity": ("bias", "monte_carlo", "readjust"),
+    "statistics.sigma_map": ("sigma_map",),
 }
 
 

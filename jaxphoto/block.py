@@ -6,7 +6,7 @@ infinite sigma, and the redundancy is a count. Units are metres, radians and mil
 
 import dataclasses
 import functools
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import equinox as eqx
@@ -20,7 +20,7 @@ from jaxphoto.block_from_arrays import block_fields
 from jaxphoto.block_parts import Datum, Frame, Motion, Start
 from jaxphoto.camera import ImageMotion, InteriorOrientation, RollingShutter, RowMotion, Sensor
 from jaxphoto.collinearity import ExteriorOrientation
-from jaxphoto.errors import BlockError
+from jaxphoto.errors import BlockError, InputError
 from jaxphoto.georeferencing import NOMINAL, Corrections, Exposure, Mount, StripBias, direct_orientation
 from jaxphoto.observations import (
     AbstractObservations,
@@ -32,8 +32,8 @@ from jaxphoto.observations import (
     StationRows,
     SurfaceRows,
 )
-from jaxphoto.short_repr import block_repr
-from jaxphoto.unknowns import FREE, Unknowns
+from jaxphoto.short_repr import block_html, block_repr, from_upstairs
+from jaxphoto.unknowns import FIXED, FREE, Unknowns, Weighted, with_prior
 
 
 class Block(eqx.Module):
@@ -121,13 +121,59 @@ class Block(eqx.Module):
             )
         return known[owner]
 
+    def fix(self, *names: str, of: str | None = None) -> "Block":
+        """A copy in which parameters are held at their start values: `block.fix("k2")`.
+
+        Names are those of tables (`c_mm`, `k1`), fields of mounts and strips (`lever_arm`, `shift`), and `position`,
+        `rotation` (all images) and `points`. `of` names the camera, mount or strip; all that have it without. Raises
+        InputError for a parameter that the block has not.
+        """
+        return self._with_priors(names, lambda start: FIXED, of)
+
+    def free(self, *names: str, of: str | None = None) -> "Block":
+        """A copy in which parameters are free; names as in `fix`."""
+        return self._with_priors(names, lambda start: FREE, of)
+
+    def weigh(self, name: str, sigma: Any, value: Any = None, of: str | None = None) -> "Block":
+        """A copy in which a parameter is observed with `sigma`, in its own unit (mm, m, rad), names as in `fix`.
+
+        The observed `value` is the start value unless one is given; that of all positions, rotations or points has to
+        be.
+        """
+        if value is None and name in ("position", "rotation", "points"):
+            raise InputError(f"weigh({name!r}) needs a value beside its sigma: where it starts, nobody observed it")
+        return self._with_priors((name,), lambda start: Weighted(start if value is None else value, sigma), of)
+
+    def _with_priors(self, names: tuple[str, ...], prior_of: Callable[[Any], Any], of: str | None) -> "Block":
+        priors = self.priors
+        for name in names:
+            priors = with_prior(priors, name, prior_of, self.start.unknowns, of)
+        return dataclasses.replace(self, priors=priors)
+
+    def plot(self, axes: Any = None, *, in_3d: bool = False) -> Any:
+        """The block as it starts, in plan or in space, on matplotlib axes, which are returned; new ones if none are."""
+        return from_upstairs("plot_block")(self, axes, in_3d=in_3d)
+
     __repr__ = block_repr
+
+    def _repr_html_(self) -> str:
+        return block_html(self, {f"known of {name}": words for name, words in self.priors.words.items()})
 
     @staticmethod
     @functools.wraps(block_fields)
     def of(*args: Any, **kwargs: Any) -> "Block":
         """The block of arrays and tables: see `block_fields`."""
         return Block(**block_fields(*args, **kwargs))
+
+
+def one_camera(block: Block, camera: str | None) -> str:
+    """The camera of that name, or the only one where none is named. Raises InputError where there is none such."""
+    if camera is None and len(block.sensors) == 1:
+        return next(iter(block.sensors))
+    if camera is None or camera not in block.sensors:
+        asked = "say which camera" if camera is None else f"there is no camera {camera}"
+        raise InputError(f"{asked}: the block has {', '.join(block.sensors) or 'none'}")
+    return camera
 
 
 def empty_block(title: str) -> Block:

@@ -1,13 +1,49 @@
-"""What the console shows of a block and of an adjustment, in lines instead of pages: counts, outcome, sigma naught."""
+"""What the console and notebooks show of things, in lines instead of pages: counts, numbers, outcome, sigma naught.
 
+Tables and pictures are made upstairs (`jaxphoto.report`), which nothing down here may import. What an object offers of
+them for notebooks is asked for by name, when it is wanted: `from_upstairs`.
+"""
+
+import importlib
+from collections.abc import Mapping
+from html import escape
 from typing import Any
 
 import numpy as np
 
 
-def block_repr(block: Any) -> str:
-    """`Block 'title': 31 images of 1 camera, 352 points in 2415 image points; ...` with what else is observed."""
-    observed = {
+def from_upstairs(name: str) -> Any:
+    """A function of `jaxphoto.report`, which is imported now."""
+    return getattr(importlib.import_module("jaxphoto.report"), name)
+
+
+def html_of(title: str, rows: Mapping[str, object]) -> str:
+    """A small table under a title, as notebooks show it."""
+    cells = "".join(
+        f'<tr><th style="text-align:left">{escape(name)}</th><td style="text-align:left">{escape(str(value))}</td></tr>'
+        for name, value in rows.items()
+    )
+    return f"<b>{escape(title)}</b><table>{cells}</table>"
+
+
+def number_word(value: Any) -> str:
+    """A number in six digits, a prior or an array in a word."""
+    if np.ndim(value) == 0 and isinstance(value, int | float | np.generic | np.ndarray):
+        return f"{float(value):.6g}"
+    if hasattr(value, "shape") and not np.ndim(value):
+        # JAX's: a traced one has no value.
+        return f"{float(value):.6g}" if getattr(value, "is_fully_addressable", False) else type(value).__name__
+    return f"array{tuple(value.shape)}" if hasattr(value, "shape") else " ".join(repr(value).split())
+
+
+def numbers_words(numbers: Mapping[str, Any]) -> str:
+    """`c_mm 34.25, k1 -9.12e-05`."""
+    return ", ".join(f"{name} {number_word(value)}" for name, value in numbers.items())
+
+
+def _observed(block: Any) -> dict[str, int]:
+    """How much of each kind is observed besides image points."""
+    rows = {
         "control coordinate": block.control.who,
         "fixed coordinate": block.fixed.who,
         "check coordinate": block.check.who,
@@ -16,7 +52,38 @@ def block_repr(block: Any) -> str:
         "distance": block.distances.value,
         "surface point": block.surfaces.point,
     }
-    more = ", ".join(_counted(n, name) for name, rows in observed.items() if (n := _length(rows)))
+    return {name: n for name, own in rows.items() if (n := _length(own))}
+
+
+def block_html(block: Any, unknowns: Mapping[str, object]) -> str:
+    """Counts of a block, and what is known beforehand of its `unknowns`, in words by owner."""
+    counts: dict[str, object] = {
+        "images": f"{len(block.images)} of {_counted(len(block.sensors), 'camera')}",
+        "points": f"{len(block.points)} in {_counted(_length(block.image_points.image), 'image point')}",
+    }
+    return html_of(
+        f"Block {block.title!r}", counts | {f"{k}s": n for k, n in _observed(block).items()} | dict(unknowns)
+    )
+
+
+def adjustment_html(adjusted: Any, unknowns: Mapping[str, object]) -> str:
+    """Outcome and quality of an adjustment, and its shared unknowns in words by owner."""
+    if adjusted.factored is None or np.ndim(adjusted.converged) != 0:
+        return escape(adjustment_repr(adjusted))
+    rows: dict[str, object] = {
+        "outcome": adjusted.outcome.value,
+        "iterations": int(adjusted.steps),
+        "sigma naught": f"{float(adjusted.sigma0):.4g}",
+        "redundancy": adjusted.redundancy,
+    }
+    groups = {name.replace("_", " "): n for name, n in adjusted.n_observations.items() if n}
+    rows["observations"] = ", ".join(f"{n} {name}" for name, n in groups.items())
+    return html_of(f"Adjustment of {adjusted.block.title!r}", rows | dict(unknowns))
+
+
+def block_repr(block: Any) -> str:
+    """`Block 'title': 31 images of 1 camera, 352 points in 2415 image points; ...` with what else is observed."""
+    more = ", ".join(_counted(n, name) for name, n in _observed(block).items())
     return (
         f"Block {block.title!r}: {_counted(len(block.images), 'image')} of {_counted(len(block.sensors), 'camera')}, "
         f"{_counted(len(block.points), 'point')} in {_counted(_length(block.image_points.image), 'image point')}"

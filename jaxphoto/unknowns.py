@@ -1,15 +1,17 @@
 """What an adjustment solves for, and what is known of it beforehand.
 
 `Unknowns` is a tree of numbers; `priors` is the same tree with FREE, FIXED or Weighted(value, sigma) in place of
-them. "The second experiment without k_2" is one `eqx.tree_at`:
+them. "The second experiment without k_2" is `block.fix("k2")`, or of the tree itself
 
-    priors = eqx.tree_at(lambda u: u.interior["kodak"].distortion.k2, priors, FIXED)
+    priors = with_prior(priors, "k2", lambda start: FIXED, start)
 
 For interior orientation the leaves are scalars. `exterior.position`, `exterior.camera_from_object`, `points`, and each
 vector of declared parameters (mounts, strips, scanner, `more`) take one prior for the whole array.
 """
 
+import dataclasses
 import enum
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -18,11 +20,20 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxphoto.arrays import Numbers
-from jaxphoto.camera import ImageMotion, InteriorOrientation, PrincipalDistanceRate, RollingShutter
+from jaxphoto.camera import (
+    ImageMotion,
+    InteriorOrientation,
+    PrincipalDistanceRate,
+    RollingShutter,
+    get_parameter,
+    parameter_names,
+    set_parameter,
+)
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import FlightBias, Mount, Scanner, StripBias
-from jaxphoto.parameters import AbstractParameters
+from jaxphoto.parameters import AbstractParameters, dynamic_fields
+from jaxphoto.short_repr import html_of, number_word, numbers_words
 
 UNKNOWNS: tuple[type[AbstractParameters], ...] = (
     Scanner, Mount, StripBias, FlightBias, PrincipalDistanceRate, RollingShutter, ImageMotion,
@@ -64,6 +75,9 @@ class Weighted(eqx.Module):
         self.value, self.covariance = value, covariance
         self.sigma = sigma if covariance is None else np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
 
+    def __repr__(self) -> str:
+        return f"Weighted({number_word(self.value)}, sigma {number_word(self.sigma)})"
+
 
 class Unknowns(eqx.Module):
     """All parameters of a block: per camera, per image, per point, per mount and per strip; and of a laser scanner.
@@ -80,6 +94,30 @@ class Unknowns(eqx.Module):
     strips: dict[str, StripBias]
     scanner: Scanner | None = None
     more: dict[str, dict[str, AbstractParameters]] = eqx.field(default_factory=dict)
+
+    @property
+    def words(self) -> dict[str, str]:
+        """Its shared parameters, or the priors of them, by owner: {"camera kodak": "c_mm 34.25, xp_mm FIXED ..."}."""
+        told = {
+            f"camera {camera}": numbers_words({name: get_parameter(own, name) for name in parameter_names(own)})
+            for camera, own in self.interior.items()
+        }
+        for kind, owners in self.tables.items():
+            for owner, own in owners.items():
+                numbers = {name: getattr(own, name) for name in dynamic_fields(type(own))}
+                told[f"{kind} {owner}".strip()] = numbers_words(numbers)
+        return told
+
+    @property
+    def _all_words(self) -> dict[str, str]:
+        whole = {name: number_word(of(self)) for name, of in _WHOLE.items()}
+        return self.words | whole
+
+    def __repr__(self) -> str:
+        return "Unknowns\n" + "\n".join(f"  {name}: {words}" for name, words in self._all_words.items())
+
+    def _repr_html_(self) -> str:
+        return html_of("Unknowns", self._all_words)
 
     @property
     def tables(self) -> dict[str, dict[str, Any]]:
@@ -118,3 +156,54 @@ def default_priors(unknowns: Unknowns) -> Unknowns:
     priors = uniform_priors(unknowns, FIXED)
     places = lambda u: (u.exterior.position, u.exterior.camera_from_object, u.points)  # noqa: E731
     return eqx.tree_at(places, priors, (FREE, FREE, FREE))
+
+
+# What has one prior for all images or all points, by the names that `with_prior` has for it.
+_WHOLE: dict[str, Callable[[Unknowns], Any]] = {
+    "position": lambda u: u.exterior.position,
+    "rotation": lambda u: u.exterior.camera_from_object,
+    "points": lambda u: u.points,
+}
+# Of the interior orientation, as Python has them.
+_FIELDS = {"c": "c_mm", "x_p": "xp_mm", "y_p": "yp_mm"}
+
+
+def with_prior(
+    priors: Unknowns, name: str, prior_of: Callable[[Any], Any], start: Unknowns, of: str | None = None
+) -> Unknowns:
+    """`priors` with another prior of the parameter `name`, which is made from its value in `start`.
+
+    Names are those of the interior orientation (`c_mm` or `c`, `k1` ...), the fields of declared parameters
+    (`lever_arm`, `boresight`, `shift` ...), and `position`, `rotation` and `points` for those of all images and points.
+    `of` is the owner, such as a camera or a strip; without it, it is done for each that has such a parameter. Raises
+    InputError where none has.
+    """
+    if name in _WHOLE and of is None:
+        return eqx.tree_at(_WHOLE[name], priors, prior_of(_WHOLE[name](start)))
+    known, label = [], _FIELDS.get(name, name)
+    interior, tables, done = dict(priors.interior), priors.tables, False
+    for camera, own in interior.items():
+        known += [(camera, one) for one in parameter_names(own)]
+        if (camera, label) in known[-len(parameter_names(own)) :] and of in (None, camera):
+            interior[camera] = set_parameter(own, label, prior_of(get_parameter(start.interior[camera], label)))
+            done = True
+    for kind, owners in tables.items():
+        changed = dict(owners)
+        for owner, own in owners.items():
+            fields = dynamic_fields(type(own))
+            known += [(owner, one) for one in fields]
+            if name in fields and of in (None, owner):
+                changed[owner] = dataclasses.replace(own, **{name: prior_of(getattr(start.tables[kind][owner], name))})
+                done = True
+        tables[kind] = changed
+    if not done:
+        whose = "" if of is None else f" of {of!r}"
+        there = [one for owner, one in known if of in (None, owner)]
+        if known and not there:
+            raise InputError(
+                f"nothing is called {of!r}; parameters are of {', '.join(dict.fromkeys(o for o, _ in known))}"
+            )
+        raise InputError(
+            f"there is no parameter {name!r}{whose}; there are {', '.join(dict.fromkeys([*there, *_WHOLE]))}"
+        )
+    return dataclasses.replace(priors, interior=interior).with_tables(tables)

@@ -30,6 +30,7 @@ FILES = {
     "correlation.csv",
     "correlation_summary.csv",
     "correlation_ground.csv",
+    "sigma_map.csv",
     "inputs.csv",
     "report.html",
 }
@@ -61,6 +62,7 @@ COLUMNS = {
     "correlation": ["parameter_a", "parameter_b", "rho"],
     "correlation_summary": ["camera", "exterior", "interior", "mean_abs_rho", "max_abs_rho"],
     "correlation_ground": ["camera", "ground", "sigma_m", "parameter", "rho"],
+    "sigma_map": ["camera", "distance_m", "x_mm", "y_mm", "sigma_x_px", "sigma_y_px", "worst_px"],
 }
 
 

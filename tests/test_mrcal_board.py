@@ -14,6 +14,7 @@ from jaxphoto.adjustment.normal_equations import factor_normal
 from jaxphoto.camera import Brown, InteriorOrientation, OpenCv, Sensor, get_parameter, set_parameter
 from jaxphoto.procedures.calibration import CAMERA, Board, Detection, TargetRows, calibration_block
 from jaxphoto.procedures.calibration.resections import resected
+from jaxphoto.statistics.sigma_map import sigma_map
 from tests.adjustment.dense import prepared
 
 FREE = ("c_mm", "xp_mm", "yp_mm", "b1", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
@@ -135,3 +136,18 @@ def test_a_board_is_laid_out_as_an_arrow_of_tiles_of_few_images(calibrated):
         len(calibrated.structure.image) > 0.8 * tiles.image[:, : tiles.batches[0] * tiles.at_once].size * tiles.per_tile
     )
     assert jax.tree.leaves(calibrated.factored.reduced.f)[0].size == 0
+
+
+def test_the_sigma_map_is_mrcals_in_every_cell(calibrated, folder):
+    """At infinity, in the direction in which it is largest.
+
+    mrcal takes the root mean square of the residuals for the sigma of a corner, without regard to the redundancy. The
+    file was made so, too, as mrcal itself shows, though the sigma that its JSON states is 2 pixels.
+    """
+    expected = pd.read_csv(folder / "flat_board_sigma_map_px.csv")
+    assert len(expected) == 60 * 40
+    sensor = calibrated.block.sensors[CAMERA]
+    found = sigma_map(calibrated, points=sensor.mm_from_px(expected[["x_px", "y_px"]].to_numpy() + 0.5))
+    n = calibrated.n_observations["image_points"]
+    theirs = np.sqrt(calibrated.redundancy / n) * found.worst / sensor.pixel_mm
+    np.testing.assert_allclose(theirs, expected["worst_direction_sigma_px"], rtol=2e-5)

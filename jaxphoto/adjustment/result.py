@@ -1,6 +1,7 @@
 """What an adjustment gives: unknowns, residuals, sigma naught, redundancy, the normal equations, an outcome."""
 
 import enum
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -16,7 +17,7 @@ from jaxphoto.arrays import Numbers, still
 from jaxphoto.block import Block
 from jaxphoto.compiling import call_compiled
 from jaxphoto.observations import PRIORS
-from jaxphoto.short_repr import adjustment_repr
+from jaxphoto.short_repr import adjustment_html, adjustment_repr, from_upstairs
 from jaxphoto.unknowns import Unknowns
 
 
@@ -66,6 +67,13 @@ class Adjustment(eqx.Module):
     seconds: dict[str, float]
 
     __repr__ = adjustment_repr
+
+    def _repr_html_(self) -> str:
+        return adjustment_html(self, self.unknowns.words)
+
+    def plot(self, axes: Any = None, *, in_3d: bool = False) -> Any:
+        """The adjusted block, in plan or in space, on matplotlib axes, which are returned; new ones if none are."""
+        return from_upstairs("plot_block")(self, axes, in_3d=in_3d)
 
     @property
     def structure(self) -> Structure:

@@ -13,6 +13,7 @@ from jaxphoto.camera.distortion import AbstractDistortion, Brown, invert
 from jaxphoto.camera.projection import AbstractProjection, Perspective
 from jaxphoto.camera.rolling_shutter import RowMotion
 from jaxphoto.errors import InputError
+from jaxphoto.short_repr import html_of, number_word
 from jaxphoto.single import single
 
 Part = TypeVar("Part", bound=Declared)
@@ -80,6 +81,17 @@ class InteriorOrientation(eqx.Module):
     def ideal_from_direction(self, u: Array, v: Array, w: Array) -> Float[Array, "2"]:
         """Ideal image coordinate (mm, from the principal point) of a direction, or point, in the camera's frame."""
         return jnp.stack(self.projection.ideal_from_direction(self.c, u, v, w))
+
+    @property
+    def _words(self) -> dict[str, str]:
+        numbers = (*parameter_names(self), *constant_names(self))
+        return model_keys(self) | {name: number_word(get_parameter(self, name)) for name in numbers}
+
+    def __repr__(self) -> str:
+        return f"InteriorOrientation({', '.join(f'{name} {word}' for name, word in self._words.items())})"
+
+    def _repr_html_(self) -> str:
+        return html_of("InteriorOrientation", self._words)
 
     @property
     def principal_point(self) -> Float[Array, "2"]:

@@ -5,6 +5,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxphoto.arrays import Numbers
+from jaxphoto.short_repr import html_of
 
 
 class Sensor(eqx.Module):
@@ -20,6 +21,11 @@ class Sensor(eqx.Module):
                 f"a sensor has a positive width, height and pixel size, got {self.width_px} x "
                 f"{self.height_px} px of {self.pixel_mm} mm"
             )
+
+    def _repr_html_(self) -> str:
+        format_mm = f"{self.width_mm:.6g} x {self.height_mm:.6g} mm"
+        pixels = f"{self.width_px} x {self.height_px} of {1e3 * self.pixel_mm:.6g} µm"
+        return html_of("Sensor", {"pixels": pixels, "format": format_mm})
 
     @property
     def width_mm(self) -> float:

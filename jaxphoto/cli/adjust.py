@@ -12,7 +12,7 @@ import jaxphoto
 from jaxphoto.cli.app import app
 from jaxphoto.cli.console import plain_console
 from jaxphoto.errors import JaxphotoError
-from jaxphoto.io import read_block, write_block
+from jaxphoto.io import read_block, read_truth, write_block
 from jaxphoto.io.conditions import CONDITIONS, read_conditions, write_conditions
 from jaxphoto.io.input_hashes import block_inputs, write_inputs
 from jaxphoto.losses import LOSSES
@@ -87,7 +87,7 @@ def adjust_command(
             components = jaxphoto.variance_components(adjusted, splits, max_steps=max_steps)
             adjusted = components.adjusted
         status.update("computing statistics")
-        tables = Tables(adjusted, rotations)  # type: ignore[arg-type]
+        tables = Tables(adjusted, rotations, read_truth(block))  # type: ignore[arg-type]
         verdict = verdict_of(tables)
         found = snooped_findings(snooped) if snooped else []
         found += component_findings(components) if components else []

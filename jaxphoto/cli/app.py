@@ -39,11 +39,13 @@ COMMANDS = {
     "combine": _Command("combine", "Combine calibrations of one camera by their full covariances."),
     "halves": _Command("halves", "Judge the standard deviations of a calibration by random halves of its block."),
     "camera": _Command("camera", "Convert a camera file."),
+    "tables": _Command("tables", "Write tables of results as CSV, Parquet, Markdown or LaTeX."),
     "convert": _Command(
         "convert",
         "Turn another program's files into a block folder, or what was adjusted into files of others.",
     ),
     "undistort": _Command("undistort", "Resample photographs to a camera without distortion."),
+    "example": _Command("example", "Write an example block, recipe or experiment that comes with jaxphoto."),
     "simulate": _Command("simulate", "Simulate a block with known truth."),
     "sensitivity": _Command(
         "sensitivity",

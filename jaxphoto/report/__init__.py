@@ -1,20 +1,32 @@
 """Tables, plots, the HTML report and the result folder of an adjustment."""
 
+from jaxphoto.report.block_plot import layout_figure, plot_block
 from jaxphoto.report.boresight import print_boresight, write_boresight
+from jaxphoto.report.figures import (
+    plot_check_points,
+    plot_density,
+    plot_distortion,
+    plot_exterior_correlation,
+    plot_interior_correlation,
+    plot_mean_residuals,
+    plot_residuals,
+    plot_sigma_map,
+)
 from jaxphoto.report.findings import Finding, Level, Verdict
 from jaxphoto.report.page import report_page
 from jaxphoto.report.plots import (
     check_points_figure,
     correlation_figure,
-    layout_figure,
     mean_residuals_figure,
     new_figure,
     prepare_pictures,
     residuals_figure,
 )
-from jaxphoto.report.results import summary_of, write_results
+from jaxphoto.report.recovery import recovery_spread, recovery_table
+from jaxphoto.report.results import summary_of, write_results, write_tables
 from jaxphoto.report.snooped import left_out_table, snooped_findings
 from jaxphoto.report.style import STYLE
+from jaxphoto.report.table_files import TABLE_FORMATS, check_table_format, to_latex, to_markdown, write_table
 from jaxphoto.report.tables import Tables
 from jaxphoto.report.terminal import print_adjustment, print_warning
 from jaxphoto.report.verdict import verdict_of
@@ -22,11 +34,13 @@ from jaxphoto.report.weights import component_findings, component_tables, print_
 
 __all__ = [
     "STYLE",
+    "TABLE_FORMATS",
     "Finding",
     "Level",
     "Tables",
     "Verdict",
     "check_points_figure",
+    "check_table_format",
     "component_findings",
     "component_tables",
     "correlation_figure",
@@ -34,16 +48,31 @@ __all__ = [
     "left_out_table",
     "mean_residuals_figure",
     "new_figure",
+    "plot_block",
+    "plot_check_points",
+    "plot_density",
+    "plot_distortion",
+    "plot_exterior_correlation",
+    "plot_interior_correlation",
+    "plot_mean_residuals",
+    "plot_residuals",
+    "plot_sigma_map",
     "prepare_pictures",
     "print_adjustment",
     "print_boresight",
     "print_components",
     "print_warning",
+    "recovery_spread",
+    "recovery_table",
     "report_page",
     "residuals_figure",
     "snooped_findings",
     "summary_of",
+    "to_latex",
+    "to_markdown",
     "verdict_of",
     "write_boresight",
     "write_results",
+    "write_table",
+    "write_tables",
 ]  # fmt: skip

@@ -5,7 +5,6 @@ conditions, method, interior orientation, distortion, precision over the format,
 conformity is claimed by it. Nothing of the hour in which it is written is in it: the same inputs give the same bytes.
 """
 
-import math
 from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import Any
@@ -18,6 +17,7 @@ from jaxphoto.report.certificate_conditions import condition_rows, flight_rows
 from jaxphoto.report.certificate_figures import draw_correlations, draw_curve, draw_map
 from jaxphoto.report.certified import Certified
 from jaxphoto.report.change import change_verdict
+from jaxphoto.report.digits import with_sigma
 from jaxphoto.report.document import Document, DocumentPicture, Element, Heading, Paragraph, Pictures, Rows
 from jaxphoto.report.findings import as_sentence
 from jaxphoto.stability import LEVEL, NORMAL_95, Method, change, distortion_curve, format_sigma, image_grid
@@ -293,14 +293,6 @@ _SECTIONS = (
     _statement, _camera, _flight, _method, _interior, _distortion, _precision, _correlations, _stability, _accuracy,
     _found, _inputs, _signature,
 )  # fmt: skip
-
-
-def with_sigma(value: float, sigma: float) -> str:
-    """A number with as many digits as its standard deviation has a use for: to the second digit of that."""
-    if not sigma > 0 or not value:
-        return f"{value:.8g}"
-    digits = math.floor(math.log10(abs(value))) - math.floor(math.log10(sigma)) + 2
-    return f"{value:#.{min(max(digits, 2), 12)}g}"
 
 
 def _in_px(given: Certified, name: str, sigma: float) -> str:

@@ -11,16 +11,19 @@ import pandas as pd
 from jinja2 import Environment
 from markupsafe import Markup
 
+from jaxphoto.report.block_plot import layout_figure
 from jaxphoto.report.findings import Verdict
 from jaxphoto.report.plots import (
     check_points_figure,
     correlation_figure,
-    layout_figure,
     mean_residuals_figure,
     residuals_figure,
 )
 from jaxphoto.report.positional_accuracy import accuracy_sentences
+from jaxphoto.report.recovery import recovery_spread
+from jaxphoto.report.sigma_map import sigma_map_figure, sigma_map_words
 from jaxphoto.report.style import STYLE
+from jaxphoto.report.table_files import head_of, readable
 from jaxphoto.report.tables import Tables
 from jaxphoto.statistics import LEAST_CHECKED
 
@@ -37,7 +40,14 @@ _PAGE = """<!DOCTYPE html>
 <p>&sigma;<sub>0</sub> = <b>{{ sigma0 }}</b>, redundancy {{ redundancy }}: {{ counts }}.
 Standard deviations are a posteriori (times &sigma;<sub>0</sub>). Correlations refer to the rotations {{ rotations }}.</p>
 <h2>Interior orientation</h2>{{ interior }}
-{% for figure in correlation %}<img alt="correlations" src="{{ figure }}">{% endfor %}
+{% for figure in correlation %}<div class="wide"><img alt="correlations of the interior orientation with itself and with the exterior one" src="{{ figure }}"></div>{% endfor %}
+{% if sigma_maps %}<h2>How sure the camera is, over its format</h2>
+<p>Standard deviation of where the calibrated camera says that a point is seen, interior and exterior orientation taken together, in the direction in which it is largest
+(<code>sigma_map.csv</code>). Of a direction the whole error of the principal distance counts; of a point as far away as those that were seen, only what its distance does not make good.</p>
+{% for s in sigma_maps %}<p>{{ s.words }}</p><div class="wide"><img alt="{{ s.words }}" src="{{ s.picture }}"></div>{% endfor %}{% endif %}
+{% if recovery %}<h2>Beside the truth of the simulation</h2>
+<p>Estimate minus truth in standard deviations (<code>recovery.csv</code>): about 1 in the root mean square, and 5 % beyond 2, where the model of the adjustment is that of the simulation.</p>
+{{ recovery }}{{ recovery_interior }}{% endif %}
 {% if georeferencing %}<h2>Mounts and strips</h2>{{ georeferencing }}{% endif %}
 <h2>Block</h2><img alt="block layout" src="{{ layout }}">
 <h2>Residuals</h2>{{ spread }}
@@ -79,8 +89,14 @@ def report_page(tables: Tables, verdict: Verdict) -> str:
             counts=", ".join(counts) + f"; {sum(a.n_unknowns.values())} unknowns",
             rotations=tables.rotations.replace("_", ", "),
             verdict=verdict,
-            interior=_html(interior.replace({True: "yes", False: "no", None: ""})),
+            interior=_html(interior),
             correlation=[_picture(correlation_figure(tables, c)) for c in used],
+            sigma_maps=[
+                {"words": sigma_map_words(a.block.sensors[c], maps), "picture": _picture(sigma_map_figure(tables, c))}
+                for c, maps in tables.sigma_maps.items()
+            ],
+            recovery=_html(recovery_spread(tables.recovery)) if tables.truth else "",
+            recovery_interior=_html(tables.recovery[tables.recovery["parameter"].str.startswith("interior[")]),
             georeferencing=_html(tables.georeferencing) if len(tables.georeferencing) else "",
             layout=_picture(layout_figure(tables)),
             spread=_html(tables.residual_spread),
@@ -110,30 +126,10 @@ def _check_spread(check: pd.DataFrame) -> pd.DataFrame:
 
 
 def _html(table: pd.DataFrame) -> Markup:
-    """A table; values with eight digits, standard deviations and residuals with three."""
-    short = (
-        "sigma",
-        "rho",
-        "residual",
-        "w",
-        "rmse",
-        "mean",
-        "max_abs",
-        "redundancy_number",
-        "d",
-        "p_value",
-        "rms",
-        "share",
-        "amount",
-        "detectable",
-        "c_moves",
-        "xp_moves",
-        "yp_moves",
-        "most_moves",
-    )
-    three = {c: "{:.3g}".format for c in table.select_dtypes("number") if str(c).split("_")[0] in short or c in short}
-    page = table.to_html(index=False, border=0, na_rep="", float_format="{:.8g}".format, formatters=three)
-    return Markup(f'<div class="wide">{page}</div>')
+    """A table as it is to be read: units in the heads, digits that follow sigmas."""
+    shown = readable(table)
+    shown.columns = [head_of(str(name)) for name in table.columns]
+    return Markup(f'<div class="wide">{shown.to_html(index=False, border=0)}</div>')
 
 
 def _picture(figure: Figure) -> str:

@@ -1,15 +1,15 @@
-"""Pictures of an adjustment: block layout, residuals, check points, correlations. Matplotlib figures."""
+"""Pictures of an adjustment: residuals, check points, correlations. Matplotlib figures, and the panels of them."""
 
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from jaxphoto.camera import Sensor
-from jaxphoto.errors import camera_words, printable
+from jaxphoto.errors import InputError, camera_words, printable
 from jaxphoto.report.tables import Tables
 
 if TYPE_CHECKING:
@@ -27,6 +27,23 @@ def new_figure(width: float, height: float) -> Figure:
     return Figure(figsize=(width, height), dpi=_DPI, layout="constrained")
 
 
+def axes_or_new(axes: Axes | None, *, in_3d: bool = False) -> Axes:
+    """`axes`, or where there are none those of a new figure of pyplot's, which a notebook shows by itself.
+
+    Raises InputError where a picture in space is to be drawn on flat axes.
+    """
+    if axes is None:
+        # Here as above; and whoever gives axes has chosen a backend already.
+        from matplotlib import pyplot
+
+        if in_3d:
+            return pyplot.figure(figsize=(7.0, 5.6)).add_axes((0.02, 0.02, 0.86, 0.92), projection="3d")
+        return pyplot.figure(figsize=(6.4, 5.6), layout="constrained").add_subplot()
+    if in_3d and axes.name != "3d":
+        raise InputError('in_3d draws on axes in space: make them with subplot_kw={"projection": "3d"}')
+    return axes
+
+
 def drawn(name: str) -> str:
     """A name of a file as matplotlib draws it: a dollar would begin a formula."""
     return printable(name).replace("$", r"\$")
@@ -37,7 +54,7 @@ def prepare_pictures() -> None:
     new_figure(1.0, 1.0).savefig(io.BytesIO())
 
 
-def _panels(
+def panels(
     width: float, height: float, down: int = 1, across: int = 1, *,
     left: float = 0.85, right: float = 0.15, bottom: float = 0.5, top: float = 0.4, between: float = 0.95,
 ):  # fmt: skip
@@ -51,43 +68,26 @@ def _panels(
     return figure, figure.subplots(down, across, squeeze=False, gridspec_kw=box | spaces)
 
 
-def layout_figure(tables: Tables) -> Figure:
-    """Plan of the block: camera stations, object points, control and check points."""
-    a = tables.adjusted
-    figure, ((axes,),) = _panels(6.4, 5.6)
-    points, stations = np.asarray(a.unknowns.points), np.asarray(a.unknowns.exterior.position)
-    control = np.union1d(a.block.control.who, a.block.fixed.who).astype(int)
-    check = np.unique(a.block.check.who)
-    axes.plot(points[:, 0], points[:, 1], ".", ms=2, color="0.65", label="object points")
-    axes.plot(stations[:, 0], stations[:, 1], "+", ms=8, color="tab:blue", label="camera stations")
-    strips = np.array(a.block.image_strip)
-    for strip in dict.fromkeys(strips[strips != ""]):
-        axes.plot(*stations[strips == strip, :2].T, "-", lw=0.7, color="tab:blue", alpha=0.5)
-    if len(control):
-        axes.plot(*points[control, :2].T, "^", ms=6, color="tab:red", label="control points")
-    if len(check):
-        axes.plot(*points[check, :2].T, "s", ms=5, mfc="none", color="tab:green", label="check points")
-    axes.set(xlabel="X [m]", ylabel="Y [m]", title="block layout")
-    axes.set_aspect("equal", adjustable="datalim")
-    axes.legend(fontsize=8)
-    return figure
-
-
 # More arrows than the first hide one another and take seconds to draw; among them are the largest ones.
 _ARROWS, _LARGEST = 4000, 100
 
 
 def residuals_figure(tables: Tables, camera: str) -> Figure:
     """Residual vectors of one camera's image points over its format, all images together; of many, a part."""
+    figure, ((axes,),) = panels(6.4, 5.0)
+    draw_residuals(axes, tables, camera)
+    return figure
+
+
+def draw_residuals(axes: Axes, tables: Tables, camera: str) -> None:
+    """The same in a panel."""
     xy, v = _of_camera(tables, camera)
     title = f"image residuals of {drawn(camera_words(camera))}"
     if (n := v.shape[1]) > _ARROWS:
         one_in = -(-n // _ARROWS)
         shown = np.union1d(np.arange(0, n, one_in), np.argsort(np.hypot(*v))[-_LARGEST:])
         xy, v, title = xy[:, shown], v[:, shown], f"{title}: 1 in {one_in}, and the largest {_LARGEST}"
-    figure, ((axes,),) = _panels(6.4, 5.0)
     _over_format(axes, tables.adjusted.block.sensors[camera], xy, v, title)
-    return figure
 
 
 # Cells of the mean residuals along the longer side of the format; fewer residuals than these have no mean worth a look.
@@ -96,7 +96,7 @@ _CELLS, _FEW = 12, 5
 
 def mean_residuals_figure(tables: Tables, camera: str) -> Figure:
     """Means of one camera's residuals by cell of its format: what all its images have in common."""
-    figure, ((axes,),) = _panels(6.4, 5.0)
+    figure, ((axes,),) = panels(6.4, 5.0)
     draw_mean_residuals(axes, tables, camera)
     return figure
 
@@ -165,7 +165,7 @@ def check_points_figure(adjustments: Mapping[str, Tables]) -> Figure:
     key = _round_key(np.concatenate([_discrepancies(tables).ravel() for tables in adjustments.values()]))
     extent = np.max([np.ptp(of.adjusted.unknowns.exterior.position, axis=0) for of in adjustments.values()], axis=0)
     high = 4.2 * float(np.clip(extent[1] / max(extent[0], 1e-9), 0.2, 0.8))
-    figure, rows = _panels(9.6, 0.4 + (0.8 + high) * len(adjustments), len(adjustments), 2, top=0.55)
+    figure, rows = panels(9.6, 0.4 + (0.8 + high) * len(adjustments), len(adjustments), 2, top=0.55)
     for pair, (name, tables) in zip(rows, adjustments.items(), strict=True):
         for axes, upright in zip(pair, (False, True), strict=True):
             draw_check_points(axes, tables, upright, key, 1 + 0.12 / high, f"{drawn(name)}: " if name else "")
@@ -202,21 +202,33 @@ def _discrepancies(tables: Tables) -> np.ndarray:
 
 def correlation_figure(tables: Tables, camera: str) -> Figure:
     """Heat maps: IOP x IOP, and mean |rho| of EOP x IOP."""
-    c = tables.correlations[camera]
-    figure, ((left, right),) = _panels(9.6, 4.4, 1, 2, left=0.6, right=1.1, bottom=0.55, top=0.3, between=0.65)
-    for axes, values, rows, title in (
-        (left, c.interior, c.parameters, "correlation of IOP"),
-        (right, c.mean_abs, c.eop_names, "mean |correlation| of EOP and IOP"),
-    ):
-        image = axes.imshow(values, vmin=-1, vmax=1, cmap="RdBu_r", aspect="auto")
-        axes.set_xticks(range(len(c.parameters)), list(map(drawn, c.parameters)), rotation=45, ha="right", fontsize=8)
-        axes.set_yticks(range(len(rows)), list(map(drawn, rows)), fontsize=8)
-        for i, j in np.ndindex(values.shape):
-            colour = "white" if abs(values[i, j]) > 0.6 else "black"
-            axes.text(j, i, f"{values[i, j]:.2f}", ha="center", va="center", fontsize=7, color=colour)
-        axes.set_title(title, fontsize=10)
-    figure.colorbar(image, cax=figure.add_axes((0.91, 0.2, 0.015, 0.6)))
+    figure, ((left, right),) = panels(9.6, 4.4, 1, 2, left=0.6, right=1.1, bottom=0.55, top=0.3, between=0.65)
+    draw_interior_correlation(left, tables, camera)
+    draw_exterior_correlation(right, tables, camera)
+    figure.colorbar(right.images[0], cax=figure.add_axes((0.91, 0.2, 0.015, 0.6)))
     return figure
+
+
+def draw_interior_correlation(axes: Axes, tables: Tables, camera: str) -> None:
+    """Correlation of the interior orientation of a camera with itself."""
+    c = tables.correlations[camera]
+    _heat_map(axes, c.interior, c.parameters, c.parameters, "correlation of IOP")
+
+
+def draw_exterior_correlation(axes: Axes, tables: Tables, camera: str) -> None:
+    """Mean over the images of the correlation of exterior and interior orientation, without its sign."""
+    c = tables.correlations[camera]
+    _heat_map(axes, c.mean_abs, c.eop_names, c.parameters, "mean |correlation| of EOP and IOP")
+
+
+def _heat_map(axes: Axes, values: np.ndarray, rows: Sequence[str], columns: Sequence[str], title: str) -> None:
+    axes.imshow(values, vmin=-1, vmax=1, cmap="RdBu_r", aspect="auto")
+    axes.set_xticks(range(len(columns)), list(map(drawn, columns)), rotation=45, ha="right", fontsize=8)
+    axes.set_yticks(range(len(rows)), list(map(drawn, rows)), fontsize=8)
+    for i, j in np.ndindex(values.shape):
+        colour = "white" if abs(values[i, j]) > 0.6 else "black"
+        axes.text(j, i, f"{values[i, j]:.2f}", ha="center", va="center", fontsize=7, color=colour)
+    axes.set_title(title, fontsize=10)
 
 
 def _round_key(v: np.ndarray) -> float:

@@ -2,7 +2,7 @@
 
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from types import MappingProxyType
@@ -10,9 +10,11 @@ from typing import Any
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.camera import model_keys
+from jaxphoto.errors import InputError
 from jaxphoto.report.findings import Verdict
 from jaxphoto.report.page import report_page
 from jaxphoto.report.positional_accuracy import accuracy_sentences
+from jaxphoto.report.table_files import check_table_format, write_table
 from jaxphoto.report.tables import Tables
 from jaxphoto.writing import whole_folder
 
@@ -27,6 +29,7 @@ _TABLES = (
     "correlation",
     "correlation_summary",
     "correlation_ground",
+    "sigma_map",
 )
 # Written beside them where the files of the block were in an EPSG system.
 _MAP_TABLES = ("exterior_map", "object_points_map")
@@ -47,12 +50,31 @@ def write_results(
     """
     began = time.perf_counter()
     with whole_folder(directory) as work:
-        in_map = tables.adjusted.block.frame.kind == "epsg"
-        for name in (*_TABLES, *(_MAP_TABLES if in_map else ())):
+        for name in table_names(tables):
             getattr(tables, name).to_csv(work / f"{name}.csv", index=False)
         (work / "report.html").write_text(report_page(tables, verdict), encoding="utf-8")
         summary = summary_of(tables, verdict, seconds | {"write": time.perf_counter() - began})
         write_summary(summary | dict(told), work)
+
+
+def table_names(tables: Tables) -> tuple[str, ...]:
+    """What the result folder of an adjustment has tables of."""
+    in_map = tables.adjusted.block.frame.kind == "epsg"
+    return (*_TABLES, *(_MAP_TABLES if in_map else ()), *(("recovery",) if tables.truth else ()))
+
+
+def write_tables(tables: Tables, directory: str | Path, kind: str = "csv", names: Sequence[str] = ()) -> None:
+    """Write the tables of an adjustment, or those of `names`, as csv, parquet, markdown or latex into a folder.
+
+    Raises InputError for a format or a table that there is not, and what `whole_folder` raises.
+    """
+    check_table_format(kind)
+    known = table_names(tables)
+    if missing := [name for name in names if name not in known]:
+        raise InputError(f"there is no table {missing[0]}; there are {', '.join(known)}")
+    with whole_folder(Path(directory)) as work:
+        for name in names or known:
+            write_table(getattr(tables, name), name, work, kind)
 
 
 def write_summary(summary: dict, directory: Path) -> None:

@@ -35,7 +35,7 @@ td.number { white-space: nowrap }
 .alarm, .warning, .information { border-left: 4px solid var(--information); padding-left: .6rem; margin: .4rem 0 }
 .alarm { border-color: var(--alarm) } .warning { border-color: var(--warning) }
 @media (max-width: 32rem) { body { margin: .5rem auto; padding: 0 .6rem } th, td { padding: .15rem .35rem }
-  .names th { white-space: normal } h1 { font-size: 1.4rem } }
+  .names th { white-space: normal } h1 { font-size: 1.4rem } .wide img { max-width: none; width: 44rem } }
 @media print { :root { color-scheme: light } body { max-width: none; margin: 0; padding: 0; font-size: 10.5px }
   table { font-size: 9px } th, td { padding: .15rem .35rem } th, td.text { overflow-wrap: anywhere }
   table:has(th:nth-child(9)) { font-size: 7.5px } table:has(th:nth-child(13)) { font-size: 6.5px }

@@ -1,5 +1,6 @@
 """The tables of an adjustment as pandas frames: the columns of the result folder (docs/block_folder.md)."""
 
+from collections.abc import Mapping
 from functools import cached_property
 
 import equinox as eqx
@@ -13,6 +14,8 @@ from jaxphoto.camera import constant_names, get_parameter, parameter_names
 from jaxphoto.compiling import call_compiled
 from jaxphoto.observations import AXES
 from jaxphoto.report.positional_accuracy import accuracy_table
+from jaxphoto.report.recovery import recovery_table
+from jaxphoto.report.sigma_map_table import sigma_map_table
 from jaxphoto.rotation import omega_phi_kappa_from_matrix
 from jaxphoto.statistics import (
     BlunderTest,
@@ -44,6 +47,7 @@ from jaxphoto.statistics import (
     undetected_effects,
 )
 from jaxphoto.statistics.ground import FORMS
+from jaxphoto.statistics.sigma_map import SigmaMap, sigma_maps
 
 
 def in_file_unit(unit: str) -> tuple[float, str]:
@@ -55,12 +59,30 @@ class Tables:
     """An adjustment as tables, each computed when first asked for.
 
     `rotations` says which rotations the correlations mean (see `jaxphoto.covariance`). Sigmas are a posteriori (times
-    sigma0) unless a column says otherwise; units stand in the column names or in a column `unit`.
+    sigma0) unless a column says otherwise; units stand in the column names or in a column `unit`. `truth` is that of a
+    simulation (`jaxphoto.io.truth_tables`, `read_truth`), for `recovery`.
     """
 
-    def __init__(self, adjusted: Adjustment, rotations: Rotations = "omega_phi_kappa"):
+    def __init__(
+        self,
+        adjusted: Adjustment,
+        rotations: Rotations = "omega_phi_kappa",
+        truth: Mapping[str, pd.DataFrame] | None = None,
+    ):
         self.adjusted = adjusted
         self.rotations: Rotations = rotations
+        self.truth = truth
+
+    def __repr__(self) -> str:
+        names = [name for name, own in vars(Tables).items() if _is_table(own)]
+        return f"Tables of {self.adjusted!r};\n  {', '.join(names)}"
+
+    def _repr_html_(self) -> str:
+        """The interior orientation and the spread of residuals; the others are named."""
+        shown = "".join(
+            table.to_html(index=False, border=0, na_rep="") for table in (self.interior, self.residual_spread)
+        )
+        return f"{self.adjusted._repr_html_()}{shown}"
 
     @cached_property
     def covariance(self) -> Covariance:
@@ -295,10 +317,30 @@ class Tables:
         return pd.DataFrame(rows, columns=["camera", "ground", "sigma_m", "parameter", "rho"])
 
     @cached_property
+    def sigma_maps(self) -> dict[str, tuple[SigmaMap, SigmaMap]]:
+        """By camera that was estimated, at infinity and at the distance of its points, as arrays."""
+        return sigma_maps(self.adjusted)
+
+    @cached_property
+    def sigma_map(self) -> pd.DataFrame:
+        """camera, distance_m (inf: a direction), x_mm, y_mm, sigma_x_px, sigma_y_px, worst_px; a row a cell."""
+        maps = (one for both in self.sigma_maps.values() for one in both)
+        return sigma_map_table(maps, self.adjusted.block.sensors)
+
+    @cached_property
+    def recovery(self) -> pd.DataFrame:
+        """parameter, estimate, truth, error, sigma, ratio: of a simulation, what was found beside what is true."""
+        return recovery_table(self, self.truth or {})
+
+    @cached_property
     def residual_spread(self) -> pd.DataFrame:
         """group, axis, n, mean, rmse, max_abs, unit (paper 000, Table 3)."""
         columns = ["group", "axis", "n", "mean", "rmse", "max_abs", "unit"]
         return pd.DataFrame([[getattr(s, c) for c in columns] for s in residual_spread(self.adjusted)], columns=columns)
+
+
+def _is_table(member: object) -> bool:
+    return isinstance(member, cached_property) and member.func.__annotations__["return"] is pd.DataFrame
 
 
 @eqx.filter_jit

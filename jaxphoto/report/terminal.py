@@ -6,6 +6,7 @@ from rich.text import Text
 
 from jaxphoto.errors import printable
 from jaxphoto.report.findings import Level, Verdict
+from jaxphoto.report.recovery import recovery_spread
 from jaxphoto.report.tables import Tables
 from jaxphoto.statistics import residual_spread
 
@@ -60,6 +61,11 @@ def print_adjustment(tables: Tables, verdict: Verdict, console: Console) -> None
     for v in residual_spread(adjusted):
         spread.add_row(v.group, v.axis, str(v.n), f"{v.rmse:.4g}", f"{v.max_abs:.4g}", v.unit)
     console.print(spread)
+    if tables.truth:
+        found = Table("group", "n", "rms ratio", "beyond 2 sigma", title="(estimate - truth) / sigma")
+        for group, n, ratio, beyond in recovery_spread(tables.recovery).itertuples(index=False):
+            found.add_row(plain(group), str(n), f"{ratio:.3g}", f"{beyond:.1%}")
+        console.print(found)
 
 
 def print_warning(warning: str, console: Console, **options) -> None:

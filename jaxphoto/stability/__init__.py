@@ -6,7 +6,7 @@ from jaxphoto.stability.band import Differences, ErrorBand, band_of, concentrati
 from jaxphoto.stability.bundles import image_grid, image_rays, parameter_vector, with_parameters
 from jaxphoto.stability.change import Change, ParameterChange, change, mahalanobis
 from jaxphoto.stability.combination import Combination, combine
-from jaxphoto.stability.comparison import BundleOffsets, bundle_offsets, check_rays, rmse_offset
+from jaxphoto.stability.comparison import BundleOffsets, bundle_offsets, check_rays, regular_rays, rmse_offset
 from jaxphoto.stability.distortion_curve import NORMAL_95, DistortionCurve, distortion_curve
 from jaxphoto.stability.format_sigma import format_sigma
 from jaxphoto.stability.quadratic_form import QuadraticForm
@@ -17,5 +17,6 @@ __all__ = [
     "DistortionCurve", "ErrorBand",
     "Method", "OffsetUncertainty", "ParameterChange", "QuadraticForm", "analyse", "band_of", "bundle_offsets",
     "change", "check_rays", "combine", "concentration", "distortion_curve", "format_sigma", "image_grid",
-    "image_rays", "mahalanobis", "offset_uncertainty", "overlap", "parameter_vector", "rmse_offset", "with_parameters",
+    "image_rays", "mahalanobis", "offset_uncertainty", "overlap", "parameter_vector", "regular_rays", "rmse_offset",
+    "with_parameters",
 ]  # fmt: skip

@@ -91,13 +91,18 @@ def bundle_offsets(
 
 def check_rays(interior: InteriorOrientation, points: Float[Numbers, "points 2"], name: str) -> None:
     """Raise InputError where the distortion of `interior`, called `name`, folds or has no ray at some of `points`."""
-    good = np.asarray(call_compiled(_regular, _as_arrays(interior), jnp.asarray(points, float)))
+    good = regular_rays(interior, points)
     if not good.all():
         reach = np.hypot(*np.asarray(points)[~good].T).min()
         raise InputError(
             f"{name}: its distortion means nothing at {(~good).sum()} of {len(good)} points of the grid, or they look "
             f"behind the camera, the nearest {reach:.3g} mm from the image centre; compare over a smaller extent"
         )
+
+
+def regular_rays(interior: InteriorOrientation, points: Float[Numbers, "points 2"]) -> Bool[np.ndarray, "points"]:
+    """At which image points (mm) the distortion does not fold, and the ray looks ahead."""
+    return np.asarray(call_compiled(_regular, _as_arrays(interior), jnp.asarray(points, float)))
 
 
 @eqx.filter_jit

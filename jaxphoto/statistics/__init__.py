@@ -27,7 +27,8 @@ from jaxphoto.statistics.discrepancy import (
     spread_of,
 )
 from jaxphoto.statistics.global_test import VarianceFactor, global_test, group_factors, stretch
-from jaxphoto.statistics.ground import GroundCorrelations, ground_correlations, linear_forms
+from jaxphoto.statistics.ground import GroundCorrelations, ground_correlations
+from jaxphoto.statistics.linear_forms import LinearForms, linear_forms
 from jaxphoto.statistics.partial_redundancy import PartialRedundancy, partial_redundancy
 from jaxphoto.statistics.partition import SPLITS, Partition, Parts, Selection, parts_of
 from jaxphoto.statistics.patterns import MOST_PARTS
@@ -63,13 +64,14 @@ from jaxphoto.statistics.variance_components import VarianceComponents, variance
 __all__ = [
     "DELTA0", "EOP_NAMES", "LEAST_CHECKED", "LEAST_CHECK_POINTS", "LEAST_SIGMA0", "LEVEL", "MOST_PARTS",
     "SIGNIFICANCE_LEVEL", "SPLITS", "AxisErrors", "BlunderTest", "ComponentAccuracy", "Correlations", "Covariance",
-    "Felt", "GroundCorrelations", "Hidden", "IfZero", "PartialRedundancy", "Partition", "Parts", "PositionalAccuracy",
-    "Redundancy", "Rotations", "Selection", "Significance", "Spread", "Suspect", "Trend", "UndetectedEffects",
-    "VarianceComponents", "VarianceFactor", "a_priori_sigmas", "angle_differences", "blunder_test",
-    "check_discrepancies", "chi_square_limit", "chi_square_p", "common_covariance", "correlation_matrix",
-    "correlations", "covariance", "critical_w", "detectable_errors", "error_precision", "global_test",
-    "ground_correlations", "group_factors", "if_zero", "linear_forms", "most_felt", "normalised_residuals",
-    "observation_groups", "partial_redundancy", "parts_of", "physical_residuals", "point_differences",
-    "positional_accuracy", "prepare_responses", "prepare_statistics", "redundancy_numbers", "residual_spread",
-    "significance", "spread_of", "stretch", "trends", "undetected_effects", "variance_components", "worst_checked",
+    "Felt", "GroundCorrelations", "Hidden", "IfZero", "LinearForms", "PartialRedundancy", "Partition", "Parts",
+    "PositionalAccuracy", "Redundancy", "Rotations", "Selection", "Significance", "Spread", "Suspect",
+    "Trend", "UndetectedEffects", "VarianceComponents", "VarianceFactor", "a_priori_sigmas", "angle_differences",
+    "blunder_test", "check_discrepancies", "chi_square_limit", "chi_square_p", "common_covariance",
+    "correlation_matrix", "correlations", "covariance", "critical_w", "detectable_errors", "error_precision",
+    "global_test", "ground_correlations", "group_factors", "if_zero", "linear_forms", "most_felt",
+    "normalised_residuals", "observation_groups", "partial_redundancy", "parts_of", "physical_residuals",
+    "point_differences", "positional_accuracy", "prepare_responses", "prepare_statistics", "redundancy_numbers",
+    "residual_spread", "significance", "spread_of", "stretch", "trends",
+    "undetected_effects", "variance_components", "worst_checked",
 ]  # fmt: skip

@@ -15,17 +15,13 @@ Source: the dome as the typical deformation of flat blocks, M. R. James and S. R
 topographic models derived from UAV and ground-based image networks, Earth Surface Processes and Landforms 39 (2014).
 """
 
-from typing import NamedTuple
-
 import equinox as eqx
-import jax
 import numpy as np
 from jaxtyping import Float
 
 from jaxphoto.adjustment import Adjustment
-from jaxphoto.arrays import still
 from jaxphoto.statistics.covariance import Covariance
-from jaxphoto.statistics.responses import Responses
+from jaxphoto.statistics.linear_forms import linear_forms
 
 FORMS = ("height", "flying_height", "dome")
 # Points of two rays are as good as these meet: they would be most of the variance of a mean.
@@ -34,13 +30,6 @@ _RAYS, _ENOUGH = 3, 10
 _DOWN = 0.7
 # Of the yardstick: a form that is held by the datum has a variance of rounding.
 _NOTHING = 1e-9
-
-
-class LinearForms(NamedTuple):
-    """Covariances of linear functions of coordinates, with one another and with the shared unknowns."""
-
-    variance: Float[np.ndarray, "forms forms"]
-    with_shared: Float[np.ndarray, "forms shared"]
 
 
 class GroundCorrelations(eqx.Module):
@@ -56,21 +45,6 @@ class GroundCorrelations(eqx.Module):
     """The multiple correlation with all parameters of the camera together."""
 
 
-def linear_forms(
-    adjusted: Adjustment, points: Float[np.ndarray, "forms points 3"], positions: Float[np.ndarray, "forms images 3"]
-) -> LinearForms:
-    """Covariances (a posteriori) of sums of coordinates of points and projection centres with these weights."""
-    responses, scale, places = Responses.of(adjusted), adjusted.equations.scale, adjusted.tiled.places
-    b = jax.tree.map(lambda v: np.zeros((len(points), *np.shape(v))), scale)
-    b.points[:, :, places.point] = np.moveaxis(points, 1, 2)
-    b.eop[:, :3, places.image] = np.moveaxis(positions, 1, 2)
-    b = jax.tree.map(lambda v, s: v * still(s), b, scale)
-    x = responses.solved(b)
-    factor = float(adjusted.sigma0) ** 2
-    flat = [np.hstack([np.reshape(v, (len(points), -1)) for v in tree]) for tree in (b, x)]
-    return LinearForms(factor * flat[0] @ flat[1].T, factor * np.asarray(x.shared) * still(scale.shared))
-
-
 def looks_down(adjusted: Adjustment) -> bool:
     """Whether the photographs, on average, look down on what they see."""
     up = np.asarray(adjusted.unknowns.exterior.camera_from_object)[:, 2, 2]
@@ -83,7 +57,9 @@ def ground_correlations(adjusted: Adjustment, covariance: Covariance) -> dict[st
     chosen = rays >= _RAYS if (rays >= _RAYS).sum() >= _ENOUGH else rays > 0
     if not looks_down(adjusted) or chosen.sum() < 5:
         return {}
-    found = linear_forms(adjusted, *_weights(np.asarray(adjusted.unknowns.points), chosen, len(adjusted.block.images)))
+    points, positions = _weights(np.asarray(adjusted.unknowns.points), chosen, len(adjusted.block.images))
+    exterior = np.concatenate([positions, np.zeros_like(positions)], axis=2)
+    found = linear_forms(adjusted, len(FORMS), points=points, exterior=exterior)
     variance, n = np.diagonal(found.variance), 6 * covariance.n_images
     moves = variance > _NOTHING * np.max(np.square(covariance.point_sigma), initial=0.0)
     sigma = np.where(moves, np.sqrt(np.maximum(variance, 0.0)), 0.0)

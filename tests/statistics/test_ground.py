@@ -8,16 +8,17 @@ import pytest
 from jaxphoto import covariance, monte_carlo
 from jaxphoto.procedures.adjust import adjust
 from jaxphoto.sensitivity.perturbation import noise
-from jaxphoto.statistics.ground import FORMS, _weights, ground_correlations, linear_forms
+from jaxphoto.statistics.ground import FORMS, _weights, ground_correlations
+from jaxphoto.statistics.linear_forms import linear_forms
 from tests.blocks import adjusted, simulated
 
 
 def test_of_one_coordinate_it_is_what_the_covariance_says():
     found = adjusted("cross")
     known, n = covariance(found), len(found.block.images)
-    points, positions = np.zeros((2, len(found.block.points), 3)), np.zeros((2, n, 3))
-    points[0, 7, 2], positions[1, 3, 0] = 1.0, 2.0
-    got = linear_forms(found, points, positions)
+    points, exterior = np.zeros((2, len(found.block.points), 3)), np.zeros((2, n, 6))
+    points[0, 7, 2], exterior[1, 3, 0] = 1.0, 2.0
+    got = linear_forms(found, 2, points=points, exterior=exterior)
     assert got.variance[0, 0] == pytest.approx(float(known.point_sigma[7, 2]) ** 2, rel=1e-6)
     matrix = np.asarray(known.matrix) * float(known.variance_factor)
     assert got.variance[1, 1] == pytest.approx(4 * matrix[18, 18], rel=1e-6)

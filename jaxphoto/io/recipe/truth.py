@@ -9,6 +9,7 @@ from jaxphoto.camera import constant_names, get_parameter, parameter_names
 from jaxphoto.io.block_folder import whole_block
 from jaxphoto.io.block_folder.table_layout import ANGLES, XYZ
 from jaxphoto.io.recipe.scan_files import drift_table, scanner_rows, write_scan
+from jaxphoto.io.result_tables import read_table
 from jaxphoto.observations import AXES
 from jaxphoto.parameters import numbers_of
 from jaxphoto.simulation import Simulation
@@ -58,6 +59,11 @@ def truth_tables(simulation: Simulation) -> dict[str, pd.DataFrame]:
         if np.ptp(errors.position, axis=0).any() or errors.attitude.any():
             tables[_DRIFT] = drift_table(errors, tuple(truth.scanner.shifts))
     return tables
+
+
+def read_truth(folder: str | Path) -> dict[str, pd.DataFrame]:
+    """The tables that `write_simulation` wrote beside a block; none where the block of `folder` was not simulated."""
+    return {path.stem: read_table(path) for path in sorted((Path(folder) / FOLDER).glob("*.csv"))}
 
 
 def _table(id_column: str, ids: tuple[str, ...], names: tuple[str, ...], values: np.ndarray) -> pd.DataFrame:

@@ -1,0 +1,41 @@
+"""Has a camera changed between two adjustments?"""
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxphoto.adjustment import Adjustment
+from jaxphoto.arrays import Numbers
+from jaxphoto.block import one_camera
+from jaxphoto.camera import parameter_names
+from jaxphoto.errors import InputError
+from jaxphoto.stability import Change, Method, change, image_grid
+from jaxphoto.statistics import covariance
+
+
+def compare(
+    first: Adjustment,
+    second: Adjustment,
+    camera: str | None = None,
+    camera_b: str | None = None,
+    *,
+    points: Float[Numbers, "points 2"] | None = None,
+    method: Method = "rot",
+) -> Change:
+    """Compare a camera in two adjustments of different photographs: parameter by parameter, and by its bundle of rays.
+
+    `camera` and `camera_b` name it in either where a block has several. `points` (mm from the centre) are those of the
+    format at which rays are compared, 15 x 11 from edge to edge where they are not given; `method` is what the
+    orientation of images may take up (docs/stability.md). `jaxphoto.report.change` has tables and words of the result.
+    Raises InputError for formats that differ, and where the bundles cannot be compared.
+    """
+    names = [one_camera(a.block, given) for a, given in ((first, camera), (second, camera_b or camera))]
+    sensors = [a.block.sensors[name] for a, name in zip((first, second), names, strict=True)]
+    if sensors[0] != sensors[1]:
+        raise InputError(f"{names[0]} is a {sensors[0]}, {names[1]} a {sensors[1]}; compare two sets of one camera")
+    interiors = [a.unknowns.interior[name] for a, name in zip((first, second), names, strict=True)]
+    covariances = [
+        covariance(a).of_interior(name, parameter_names(interior))
+        for a, name, interior in zip((first, second), names, interiors, strict=True)
+    ]
+    at = image_grid(sensors[0]) if points is None else np.asarray(points, float)
+    return change(interiors[0], interiors[1], at, (covariances[0], covariances[1]), method)

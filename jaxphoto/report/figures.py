@@ -1,0 +1,96 @@
+"""The pictures of the report of an adjustment, one by one, for notebooks: each takes and returns matplotlib axes.
+
+`axes` are any that matplotlib made; where there are none, those of a new figure. `camera` may be left out where the
+block has one camera.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from jaxphoto.block import one_camera
+from jaxphoto.camera import parameter_names
+from jaxphoto.errors import InputError
+from jaxphoto.report.certificate_figures import draw_curve
+from jaxphoto.report.plots import (
+    axes_or_new,
+    draw_check_points,
+    draw_density,
+    draw_exterior_correlation,
+    draw_interior_correlation,
+    draw_mean_residuals,
+    draw_residuals,
+)
+from jaxphoto.report.sigma_map import draw_sigma_map
+from jaxphoto.report.tables import Tables
+from jaxphoto.stability import distortion_curve
+from jaxphoto.statistics.sigma_map import sigma_map
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+def plot_residuals(tables: Tables, camera: str | None = None, axes: Axes | None = None) -> Axes:
+    """Image residuals over the format of a camera, all images together."""
+    axes = axes_or_new(axes)
+    draw_residuals(axes, tables, one_camera(tables.adjusted.block, camera))
+    return axes
+
+
+def plot_mean_residuals(tables: Tables, camera: str | None = None, axes: Axes | None = None) -> Axes:
+    """Means of the residuals by cell of the format: what all images have in common."""
+    axes = axes_or_new(axes)
+    draw_mean_residuals(axes, tables, one_camera(tables.adjusted.block, camera))
+    return axes
+
+
+def plot_density(tables: Tables, camera: str | None = None, axes: Axes | None = None) -> Axes:
+    """How many image points lie in each cell of the format."""
+    axes = axes_or_new(axes)
+    draw_density(axes, tables, one_camera(tables.adjusted.block, camera))
+    return axes
+
+
+def plot_check_points(tables: Tables, axes: Axes | None = None, *, upright: bool = False) -> Axes:
+    """Discrepancies at check points, surveyed minus computed: in plan, or in height where `upright`.
+
+    Raises InputError where there are no check points.
+    """
+    if not len(tables.check_points):
+        raise InputError("the block has no check points to be drawn")
+    axes = axes_or_new(axes)
+    draw_check_points(axes, tables, upright)
+    return axes
+
+
+def plot_interior_correlation(tables: Tables, camera: str | None = None, axes: Axes | None = None) -> Axes:
+    """Correlation of the interior orientation with itself."""
+    axes = axes_or_new(axes)
+    draw_interior_correlation(axes, tables, one_camera(tables.adjusted.block, camera))
+    return axes
+
+
+def plot_exterior_correlation(tables: Tables, camera: str | None = None, axes: Axes | None = None) -> Axes:
+    """Mean absolute correlation of exterior and interior orientation over the images."""
+    axes = axes_or_new(axes)
+    draw_exterior_correlation(axes, tables, one_camera(tables.adjusted.block, camera))
+    return axes
+
+
+def plot_sigma_map(
+    tables: Tables, camera: str | None = None, axes: Axes | None = None, *, distance_m: float = float("inf")
+) -> Axes:
+    """How sure the camera is of where it sees a point at a distance, over its format (`jaxphoto.sigma_map`)."""
+    name = one_camera(tables.adjusted.block, camera)
+    one = sigma_map(tables.adjusted, name, distance_m=distance_m)
+    return draw_sigma_map(axes_or_new(axes), tables.adjusted.block.sensors[name], one)
+
+
+def plot_distortion(tables: Tables, camera: str | None = None, axes: Axes | None = None) -> Axes:
+    """Radial distortion against the distance from the principal point, with its 95 % band, and the rest of it."""
+    name, a = one_camera(tables.adjusted.block, camera), tables.adjusted
+    interior = a.unknowns.interior[name]
+    covariance = tables.covariance.of_interior(name, parameter_names(interior))
+    axes = axes_or_new(axes)
+    draw_curve(axes, distortion_curve(interior, a.block.sensors[name], covariance), 1.0)
+    return axes

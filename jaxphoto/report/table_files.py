@@ -1,0 +1,130 @@
+"""Result tables for papers and programs: CSV, Parquet, Markdown, and LaTeX with booktabs.
+
+CSV and Parquet hold the numbers as they are, under the names of docs/block_folder.md. Markdown and LaTeX are to be
+read: units stand in the heads, and a number that has a standard deviation ends at the second digit of that.
+"""
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from jaxphoto.errors import InputError
+from jaxphoto.report.digits import of_sigma, with_sigma
+
+# Columns whose numbers are as sure as the column `sigma` of the same row says.
+_BY_SIGMA = ("value", "estimate", "truth", "error", "first", "second", "difference", "residual", "amount")
+# Names end in their units, the longest first.
+_UNITS = {
+    "m_per_s": "m/s", "deg_per_s": "deg/s", "mm_per_s": "mm/s", "deg": "deg", "mm": "mm", "ms": "ms", "m": "m",
+    "s": "s", "px": "px", "cm": "cm", "ppm": "ppm",
+}  # fmt: skip
+_UNIT = re.compile(r"_(" + "|".join(_UNITS) + r")$")
+_COORDINATE = re.compile(r"^([XYZENH]|height|longitude|latitude|distance)_(m|deg)$")
+_SPECIAL = {letter: f"\\{letter}" for letter in "&%$#_{}"} | {
+    "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "\\": r"\textbackslash{}",
+}  # fmt: skip
+_POWER = re.compile(r"^(-?[\d.]+)e([+-]?\d+)$")
+_GREEK = ("omega", "phi", "kappa", "sigma")
+# A LaTeX table of more rows goes over several pages.
+_PAGE = 45
+
+
+def readable(table: pd.DataFrame) -> pd.DataFrame:
+    """The table as text: the digits that standard deviations allow, "yes" and "no", nothing where nothing is known."""
+    return pd.DataFrame({name: _texts(table, name) for name in table.columns}, columns=table.columns)
+
+
+def _texts(table: pd.DataFrame, name: str) -> list[str]:
+    column = table[name]
+    if name == "parameter":
+        # Paths, as of mounts[default].boresight_x_deg, stay what they are.
+        return [head_of(v) if "[" not in v and _UNIT.search(v) else v for v in column.astype(str)]
+    if not pd.api.types.is_float_dtype(column):
+        return ["" if pd.isna(v) else {True: "yes", False: "no"}.get(v, str(v)) for v in column.astype(object)]
+    if name.startswith("sigma"):
+        return ["" if np.isnan(v) else of_sigma(v) for v in column]
+    of = f"sigma_{name}" if f"sigma_{name}" in table else "sigma" if name in _BY_SIGMA and "sigma" in table else None
+    digits = 10 if _COORDINATE.match(name) else 4
+    sigmas = table[of] if of else np.full(len(table), np.nan)
+    return [
+        "" if np.isnan(v) else with_sigma(v, s) if s > 0 else f"{v:.{digits}g}"
+        for v, s in zip(column, sigmas, strict=True)
+    ]
+
+
+def head_of(name: str) -> str:
+    """A column's name with its unit in brackets: "sigma X [m]" of sigma_X_m."""
+    unit = _UNIT.search(name)
+    return (name[: unit.start()] if unit else name).replace("_", " ") + (f" [{_UNITS[unit[1]]}]" if unit else "")
+
+
+def to_markdown(table: pd.DataFrame, name: str = "") -> str:
+    """A table of Markdown, numbers to the right."""
+    shown, right = readable(table), _right(table)
+    cells = [[head_of(str(c)) for c in shown.columns], *shown.to_numpy(object).tolist()]
+    lines = ["| " + " | ".join(str(cell).replace("|", r"\|") for cell in row) + " |" for row in cells]
+    lines.insert(1, "| " + " | ".join("---:" if r else "---" for r in right) + " |")
+    return "\n".join(([f"## {head_of(name)}", ""] if name else []) + lines) + "\n"
+
+
+def to_latex(table: pd.DataFrame, name: str = "") -> str:
+    """A table of LaTeX with the rules of booktabs (\\usepackage{booktabs}, and longtable for long ones)."""
+    shown = readable(table)
+    shown = pd.DataFrame({_latex_head(str(c)): [_latex(v) for v in shown[c]] for c in shown.columns})
+    return shown.to_latex(
+        index=False,
+        escape=False,
+        column_format="".join("r" if r else "l" for r in _right(table)),
+        longtable=len(table) > _PAGE,
+        caption=_latex(head_of(name)) if name else None,
+        label=f"tab:{name}" if name else None,
+    )
+
+
+def _right(table: pd.DataFrame) -> list[bool]:
+    return [bool(pd.api.types.is_numeric_dtype(table[c]) and table[c].dtype != bool) for c in table.columns]
+
+
+def _latex(text: str) -> str:
+    if power := _POWER.match(text):
+        return rf"${power[1]} \times 10^{{{int(power[2])}}}$"
+    escaped = "".join(_SPECIAL.get(letter, letter) for letter in text)
+    return rf"$-${escaped[1:]}" if re.fullmatch(r"-[\d.]+", text) else escaped
+
+
+def _latex_head(name: str) -> str:
+    """Sigma and angles as Greek letters: `$\\sigma_{\\omega}$ [deg]` of sigma_omega_deg."""
+    said, _, unit = head_of(name).partition(" [")
+    words = [rf"\{word}" if word in _GREEK else word for word in said.split()]
+    if words[:1] == [r"\sigma"] and len(words) == 2:
+        said = rf"$\sigma_{{{words[1]}}}$"
+    else:
+        said = " ".join(f"${word}$" if word.startswith("\\") else _latex(word) for word in words)
+    return f"{said} [{unit}" if unit else said
+
+
+_WRITERS: dict[str, tuple[str, Callable[[pd.DataFrame, str, Path], object]]] = {
+    "csv": (".csv", lambda table, name, path: table.to_csv(path, index=False)),
+    "parquet": (".parquet", lambda table, name, path: table.to_parquet(path, index=False)),
+    "markdown": (".md", lambda table, name, path: path.write_text(to_markdown(table, name), encoding="utf-8")),
+    "latex": (".tex", lambda table, name, path: path.write_text(to_latex(table, name), encoding="utf-8")),
+}
+TABLE_FORMATS = tuple(_WRITERS)
+
+
+def check_table_format(kind: str) -> None:
+    """Raise InputError for a format that there is not."""
+    if kind not in _WRITERS:
+        raise InputError(f"there is no table format {kind}: give {', '.join(TABLE_FORMATS)}")
+
+
+def write_table(table: pd.DataFrame, name: str, folder: Path, kind: str) -> Path:
+    """Write a table as `name` with the ending of its format into a folder, and return where."""
+    check_table_format(kind)
+    ending, write = _WRITERS[kind]
+    path = folder / f"{name}{ending}"
+    write(table, name, path)
+    return path

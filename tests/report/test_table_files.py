@@ -1,0 +1,105 @@
+"""Tables of results in other formats: the numbers as they are, or as many digits of them as their sigmas allow."""
+
+import re
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from jaxphoto import InputError, Tables
+from jaxphoto.io import read_result_tables
+from jaxphoto.report import to_latex, to_markdown, write_tables
+from jaxphoto.report.digits import of_sigma, with_sigma
+from jaxphoto.report.table_files import head_of
+from tests.blocks import adjusted
+from tests.commands import run
+
+FEW = ["interior", "exterior", "check_points"]
+
+
+@pytest.mark.parametrize(
+    ("value", "sigma", "text", "sigma_text"),
+    [
+        (34.250186, 0.00337, "34.2502", "0.0034"),
+        (-9.0867162e-05, 7.5e-07, "-9.087e-05", "7.5e-07"),
+        (1500.04, 25.0, "1500", "25"),
+        (0.001, 0.02, "0.0010", "0.020"),
+        (0.0, 0.1, "0", "0.10"),
+        (35.0, 0.0, "35", ""),
+    ],
+)
+def test_a_number_ends_at_the_second_digit_of_its_sigma(value, sigma, text, sigma_text):
+    assert (with_sigma(value, sigma), of_sigma(sigma)) == (text, sigma_text)
+
+
+def test_heads_have_units_in_brackets():
+    names = {"X_m": "X [m]", "sigma_omega_deg": "sigma omega [deg]", "drift_X_m_per_s": "drift X [m/s]", "rho": "rho"}
+    assert {name: head_of(name) for name in names} == names
+
+
+def test_numbers_come_back_from_csv_and_parquet(tmp_path):
+    tables = Tables(adjusted("cross"))
+    write_tables(tables, tmp_path / "csv", "csv", FEW)
+    write_tables(tables, tmp_path / "parquet", "parquet", FEW)
+    back = read_result_tables(tmp_path / "csv", FEW)
+    for name in FEW:
+        ours = getattr(tables, name)
+        numbers = ours.select_dtypes("number").columns
+        pd.testing.assert_frame_equal(back[name][numbers], ours[numbers], check_dtype=False, rtol=1e-14)
+        binary = pd.read_parquet(tmp_path / "parquet" / f"{name}.parquet")
+        pd.testing.assert_frame_equal(binary, ours, check_dtype=False, rtol=0)
+
+
+def test_markdown_is_a_table_of_as_many_cells():
+    table = Tables(adjusted("cross")).exterior
+    lines = to_markdown(table, "exterior").splitlines()
+    assert lines[0] == "## exterior" and lines[2].startswith("| image | X [m] | Y [m] |")
+    assert {line.count("|") for line in lines[2:]} == {14} and len(lines) == 4 + len(table)
+    x, sigma = (re.split(r" *\| *", lines[4])[k] for k in (2, 8))
+    assert abs(float(x) - table.loc[0, "X_m"]) < table.loc[0, "sigma_X_m"] / 10
+    # The same place of the last digit.
+    assert len(x.partition(".")[2]) == len(sigma.partition(".")[2])
+
+
+def test_latex_has_the_rules_of_booktabs_and_no_bare_signs():
+    table = Tables(adjusted("cross")).interior
+    text = to_latex(table.assign(camera="c_1 & 50%"), "interior")
+    for rule in (r"\toprule", r"\midrule", r"\bottomrule", r"\begin{tabular}{llrrl}", r"\label{tab:interior}"):
+        assert rule in text
+    assert r"c\_1 \& 50\%" in text and r"$\sigma$" in text and r"c [mm]" in text
+    assert re.search(r"\$-?\d\.\d+ \\times 10\^\{-5\}\$ & \$\d\.\d \\times 10\^\{-\d\}\$", text)
+    assert not re.search(r"\de-\d", text)
+    long = pd.DataFrame({"a": np.arange(100)})
+    assert r"\begin{longtable}" in to_latex(long)
+
+
+def test_the_command_writes_those_that_are_asked_for(tmp_path, monkeypatch, capsys):
+    write_tables(Tables(adjusted("cross")), tmp_path / "results", "csv", FEW)
+    out = tmp_path / "tex"
+    code, screen, _ = run(
+        monkeypatch,
+        capsys,
+        "tables",
+        tmp_path / "results",
+        "--to",
+        "latex",
+        "--out",
+        out,
+        "--only",
+        "interior, exterior",
+    )
+    assert code == 0 and "2 tables" in screen
+    assert {p.name for p in out.glob("*.tex")} == {"interior.tex", "exterior.tex"}
+    for words, message in (
+        (("--to", "excel"), "there is no table format excel: give csv, parquet, markdown, latex"),
+        (("--to", "latex", "--only", "inner"), "has no table inner; it has check_points, exterior, interior"),
+    ):
+        code, _, error = run(monkeypatch, capsys, "tables", tmp_path / "results", *words, "--out", tmp_path / "no")
+        assert code != 0 and message in " ".join(error.split()) and not (tmp_path / "no").exists()
+    code, _, error = run(monkeypatch, capsys, "tables", tmp_path, "--to", "csv", "--out", tmp_path / "no")
+    assert code != 0 and "holds no tables" in " ".join(error.split())
+
+
+def test_a_table_that_there_is_not_is_named():
+    with pytest.raises(InputError, match="there is no table inner; there are interior, exterior"):
+        write_tables(Tables(adjusted("cross")), "nowhere", names=["inner"])

@@ -1,0 +1,169 @@
+"""What a notebook asks of things: how they show themselves, priors by name, pictures, two adjustments compared."""
+
+import dataclasses
+
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.figure import Figure
+
+import jaxphoto
+from jaxphoto import FIXED, FREE, InputError, Tables, Weighted, report
+from jaxphoto.io.block_folder.table_layout import ANGLES, XYZ
+from tests.blocks import adjusted, simulated
+
+PANELS = (
+    "plot_residuals", "plot_mean_residuals", "plot_density", "plot_check_points", "plot_interior_correlation",
+    "plot_exterior_correlation", "plot_sigma_map", "plot_distortion",
+)  # fmt: skip
+
+
+@pytest.fixture
+def axes():
+    """Those of a figure that needs no screen."""
+    return Figure().add_subplot()
+
+
+def test_things_show_themselves_in_a_few_lines():
+    block, result = simulated("everything").block, adjusted("everything")
+    shown = [block, result, result.unknowns, result.priors, *block.sensors.values(), *result.unknowns.interior.values()]
+    for thing in shown:
+        assert len(repr(thing)) < 2500 and len(repr(thing).splitlines()) < 20
+        assert thing._repr_html_().startswith(("<b>", "Adjustment")) and "<script" not in thing._repr_html_()
+    assert "c_mm 35.1" in repr(simulated("cross").truth.interior["one"])
+    assert "k1 FREE" in repr(adjusted("cross").priors)
+    evil = dataclasses.replace(block, title="<script>")
+    assert "&lt;script&gt;" in evil._repr_html_()
+
+
+def test_tables_name_what_they_have():
+    tables = Tables(adjusted("cross"))
+    assert {"interior", "residuals", "sigma_map", "check_points"} <= set(
+        repr(tables).split("\n")[-1].strip().split(", ")
+    )
+    assert tables._repr_html_().count("<table") == 3
+
+
+def test_priors_are_changed_by_name_and_the_block_stays():
+    block = simulated("cross").block
+    held = block.fix("k2")
+    assert held.priors.interior["one"].distortion.k2 is FIXED
+    assert block.priors.interior["one"].distortion.k2 is FREE
+    assert held.priors.interior["one"].distortion.k1 is FREE
+    again = held.free("k2", "p1")
+    assert again.priors.interior["one"].distortion.k2 is FREE and again.priors.interior["one"].distortion.p1 is FREE
+    assert block.fix("position").priors.exterior.position is FIXED
+    near = block.weigh("c", 0.02).priors.interior["one"].c
+    assert isinstance(near, Weighted)
+    assert (near.value, near.sigma) == (block.start.unknowns.interior["one"].c, 0.02)
+    assert block.weigh("x_p", 0.1, value=0.5).priors.interior["one"].x_p.value == 0.5
+    # A weighted parameter can be held, too.
+    assert block.weigh("c", 0.02).fix("c_mm").priors.interior["one"].c is FIXED
+
+
+def test_of_several_owners_one_is_named_or_all_are_meant():
+    block = simulated("everything").block
+    cameras = [name for name, own in block.priors.interior.items() if "k1" in own.distortion.coefficients]
+    held = block.fix("c_mm", of=cameras[0]).priors.interior
+    assert held[cameras[0]].c is FIXED
+    assert all(held[name] == block.priors.interior[name] for name in held if name != cameras[0])
+    assert all(own.c is FIXED for own in block.fix("c").priors.interior.values())
+    mount = next(iter(block.priors.mounts))
+    assert block.fix("boresight").priors.mounts[mount].boresight is FIXED
+    assert block.weigh("lever_arm", 0.01).priors.mounts[mount].lever_arm.sigma == 0.01
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (
+            lambda b: b.fix("k9"),
+            r"there is no parameter 'k9'; there are c_mm, xp_mm, .*k1.* position, rotation",
+        ),
+        (lambda b: b.free("k1", of="sony"), "nothing is called 'sony'; parameters are of one"),
+        (lambda b: b.fix("a1", of="one"), "there is no parameter 'a1' of 'one'; there are c_mm"),
+        (lambda b: b.weigh("points", 0.1), r"weigh\('points'\) needs a value beside its sigma"),
+    ],
+)
+def test_what_is_not_there_is_named(call, message):
+    with pytest.raises(InputError, match=message):
+        call(simulated("cross").block)
+
+
+@pytest.mark.parametrize("name", PANELS)
+def test_each_picture_is_drawn_on_the_axes_that_are_given(name, axes):
+    tables = Tables(adjusted("cross"))
+    assert getattr(report, name)(tables, axes=axes) is axes
+    assert axes.has_data() and (axes.get_title() or axes.get_title(loc="left"))
+    axes.figure.draw_without_rendering()
+
+
+def test_a_block_is_drawn_as_it_starts_and_as_it_ended(axes):
+    result = adjusted("cross")
+    assert result.plot(axes) is axes
+    stations = next(line for line in axes.lines if line.get_label() == "camera stations")
+    np.testing.assert_array_equal(np.stack(stations.get_data(), 1), result.unknowns.exterior.position[:, :2])
+    before = Figure().add_subplot()
+    simulated("cross").block.plot(before)
+    assert "before" in before.get_title()
+    start = next(line for line in before.lines if line.get_label() == "control points")
+    assert len(start.get_xdata()) == len(np.unique(result.block.control.who))
+
+
+def test_of_a_block_without_start_values_observed_positions_are_drawn(axes):
+    block = simulated("cross").block
+    unknown = dataclasses.replace(
+        block.start, image_known=np.zeros(len(block.images), bool), point_known=np.zeros(len(block.points), bool)
+    )
+    dataclasses.replace(block, start=unknown).plot(axes)
+    stations = next(line for line in axes.lines if line.get_label() == "camera stations")
+    x = block.stations.value[block.stations.axis == 0]
+    np.testing.assert_array_equal(stations.get_xdata(), x)
+
+
+def test_in_space_each_image_has_its_frame():
+    axes = Figure().add_subplot(projection="3d")
+    result = adjusted("cross")
+    result.plot(axes, in_3d=True)
+    frames = [line for line in axes.lines if len(line.get_data_3d()[0]) == 13]
+    assert len(frames) == len(result.block.images)
+    # Below the projection centre, as far as it looks down.
+    z = np.array([np.asarray(line.get_data_3d())[2] for line in frames])
+    assert (z[:, :4].max(axis=1) < np.asarray(result.unknowns.exterior.position)[:, 2]).all()
+    with pytest.raises(InputError, match="in_3d draws on axes in space"):
+        result.plot(Figure().add_subplot(), in_3d=True)
+
+
+def test_two_adjustments_of_one_block_are_alike_and_of_another_camera_are_not():
+    one = adjusted("cross")
+    same = jaxphoto.compare(one, one)
+    assert same.chi_square == 0 and not same.beyond.any()
+    moved = dataclasses.replace(one.unknowns.interior["one"], x_p=one.unknowns.interior["one"].x_p + 0.2)
+    unknowns = dataclasses.replace(one.unknowns, interior={"one": moved})
+    other = jaxphoto.compare(one, dataclasses.replace(one, unknowns=unknowns), method="zrot")
+    (row,) = [p for p in other.parameters if p.parameter == "xp_mm"]
+    assert row.difference == pytest.approx(0.2) and other.beyond.all() and other.p_parameters < 1e-6
+    with pytest.raises(InputError, match="there is no camera two"):
+        jaxphoto.compare(one, one, camera="two")
+
+
+def test_an_adjustment_is_set_beside_the_truth():
+    """By how many standard deviations, as a calculation by hand has it."""
+    result, truth = adjusted("cross"), simulated("cross").truth
+    angles = Tables(dataclasses.replace(result, unknowns=truth)).exterior[list(ANGLES)].to_numpy()
+    exterior = pd.DataFrame(np.hstack([truth.exterior.position, angles]), columns=[*XYZ, *ANGLES])
+    exterior.insert(0, "image", result.block.images)
+    exterior.loc[0, "kappa_deg"] += 360.0
+    interior = pd.DataFrame({"camera": "one", "parameter": ["c_mm", "k9"], "value": [truth.interior["one"].c, 1.0]})
+    tables = Tables(result, truth={"interior": interior, "exterior": exterior})
+    found = tables.recovery.set_index("parameter")
+    assert len(found) == 1 + 6 * len(result.block.images)
+    c = tables.interior.set_index("parameter").loc["c_mm"]
+    assert found.loc["interior[one].c_mm", "ratio"] == pytest.approx((c.value - 35.1) / c.sigma)
+    assert np.abs(found["ratio"]).max() < 5
+    spread = report.recovery_spread(tables.recovery).set_index("group")
+    assert list(spread.index) == ["interior[one]", *(f"exterior {name}" for name in (*XYZ, *ANGLES))]
+    assert spread.loc["exterior X_m", "n"] == 10
+    z = found[found.index.str.endswith("Z_m")]["ratio"]
+    assert spread.loc["exterior Z_m", "rms_ratio"] == pytest.approx(np.sqrt((z**2).mean()))
+    assert Tables(result).recovery.empty
