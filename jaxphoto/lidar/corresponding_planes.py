@@ -118,8 +118,8 @@ def corresponding(one: StripPatches, other: StripPatches, settings: StripSetting
     place = weight * one.mean[a] + (1 - weight) * other.mean[b]
     normal = weight * one.normal[a] + (1 - weight) * other.normal[b]
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    up_a, up_b = (_up(p, k, place, normal) for p, k in ((one, a), (other, b)))
-    variance = _variance(one, a, place) + _variance(other, b, place)
+    up_a, up_b = (up_to_plane(p, k, place, normal) for p, k in ((one, a), (other, b)))
+    variance = variance_of_plane(one, a, place) + variance_of_plane(other, b, place)
     return PlanePairs(
         a,
         b,
@@ -141,13 +141,13 @@ def fitting(gap: Float[np.ndarray, "n"], sigma: Float[np.ndarray, "n"], limit: f
     return np.abs(w - middle) <= limit * spread
 
 
-def _up(patches: StripPatches, which: np.ndarray, place: np.ndarray, normal: np.ndarray) -> np.ndarray:
+def up_to_plane(patches: StripPatches, which: np.ndarray, place: np.ndarray, normal: np.ndarray) -> np.ndarray:
     """How far along the normal the planes lie from places."""
     own = patches.normal[which]
     return np.einsum("ni,ni->n", own, patches.mean[which] - place) / np.einsum("ni,ni->n", own, normal)
 
 
-def _variance(patches: StripPatches, which: np.ndarray, place: np.ndarray) -> np.ndarray:
+def variance_of_plane(patches: StripPatches, which: np.ndarray, place: np.ndarray) -> np.ndarray:
     """Of the heights of the planes at places (m^2)."""
     off = place - patches.mean[which]
     tilt = np.einsum("ni,nij,nj->n", off, patches.cofactor[which], off)
