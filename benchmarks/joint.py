@@ -3,13 +3,13 @@
 python benchmarks/joint.py [--flights 40] [--first 2000] [--draws 400] [--out DIR]
 
 Each flight is that of tests/procedures/joint.py (three strips of laser returns and photographs on one trajectory that
-drifts; boresight, range offset and angle scale of the scanner, c, principal point, radial distortion and boresight of the
-camera unknown), with errors, noise and trees of its own. The two steps are those of the commands: `strips`, then
+drifts; boresight, range offset and angle scale of the scanner, c, principal point, radial distortion and boresight of
+the camera unknown), with errors, noise and trees of its own. The two steps are those of the commands: `strips`, then
 `simultaneous` with the corrected cloud held, stations and attitudes from the corrected trajectory.
 
 Figures: standard deviations and errors of both ways, parts of errors inside their 95 %; tie points that were not
-observed to lie on planes beside the surface; correlations of scanner and camera beside those of Monte Carlo draws of the
-first flight, and beside the scatter of all.
+observed to lie on planes beside the surface; correlations of scanner and camera beside those of Monte Carlo draws of
+the first flight, and beside the scatter of all.
 """
 
 import argparse

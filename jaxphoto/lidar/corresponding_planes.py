@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxphoto.lidar.moderated_variances import moderated_variances
 from jaxphoto.lidar.strip_settings import StripSettings
 
 # Spread of a patch along the shorter of its axes, as a part of the cell; a full cell has 0.29.
@@ -35,7 +36,7 @@ class StripPatches(NamedTuple):
     normal: Float[np.ndarray, "n 3"]
     """Unit vectors, upwards."""
     roughness: Float[np.ndarray, "n"]
-    """Standard deviation of a return from the plane (m)."""
+    """Standard deviation of a return from the plane (m), drawn towards that of the strip's other planes."""
     cofactor: Float[np.ndarray, "n 3 3"]
     """Inverse scatter within the plane (1/m^2): what the tilt of the plane is off by for returns that are off by 1."""
 
@@ -94,6 +95,8 @@ def planes_of(
     )
     normal = axes[:, :, 0] * np.where(axes[:, 2, 0] < 0, -1.0, 1.0)[:, None]
     along = axes[kept][:, :, 1:]
+    # A patch that is smoother than any scanner is one by chance.
+    variance = np.maximum(roughness[kept], settings.least_roughness_m) ** 2
     return StripPatches(
         cells[kept],
         count[kept],
@@ -101,8 +104,7 @@ def planes_of(
         before[kept],
         mean(time)[kept],
         normal[kept],
-        # A patch that is smoother than any scanner is one by chance.
-        np.maximum(roughness[kept], settings.least_roughness_m),
+        np.sqrt(moderated_variances(variance, count[kept] - 3)),
         np.einsum("nik,nk,njk->nij", along, 1 / value[kept][:, 1:], along),
     )
 

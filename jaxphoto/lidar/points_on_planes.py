@@ -38,8 +38,8 @@ def returns_about(
     ordered = cell[order]
     found: list[np.ndarray] = []
     # A window is as wide as a cell: it reaches into the cells of its four corners, and into no other.
-    for corner in ((-half, -half), (-half, half), (half, -half), (half, half)):
-        at = cells_of(points[:, :2] + np.array(corner), origin, settings)
+    for corner in ((-half, -half, 0.0), (-half, half, 0.0), (half, -half, 0.0), (half, half, 0.0)):
+        at = cells_of(points + np.array(corner), origin, settings)
         first, last = np.searchsorted(ordered, at, "left"), np.searchsorted(ordered, at, "right")
         count = last - first
         point = np.repeat(np.arange(len(points)), count)

@@ -68,7 +68,7 @@ class StripDifference(NamedTuple):
     mean_m: float
     rms_m: float
     noise_m: float
-    """What the roughness of the planes lets expect of `rms_m` where nothing else is wrong; of tie points that is most."""
+    """What the roughness of the planes lets expect of `rms_m` where nothing else is wrong; of tie points, at most."""
 
 
 class StripAdjustment(eqx.Module):
