@@ -7,7 +7,8 @@ s0^2, the expected one given s^2 is
     (v0 s0^2 + v s^2) / (v0 + v)
 
 v0 and s0^2 follow from mean and variance of log s^2 over all; no more scatter than chance has makes v0 infinite, and
-all variances one. Source: Smyth (2004), Linear models and empirical Bayes methods for assessing differential expression.
+all variances one. Source: Smyth (2004), Linear models and empirical Bayes methods for assessing differential
+expression in microarray experiments.
 """
 
 import numpy as np

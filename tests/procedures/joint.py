@@ -1,6 +1,5 @@
 """The flight of `strips` with photographs on the same erroneous trajectory, simulated once, and adjusted once."""
 
-import copy
 import functools
 
 import numpy as np
@@ -38,7 +37,7 @@ JOINT = STRIPS | {
 
 def simulated(seed: int) -> Simulation:
     """Such a flight; another seed has another one over other ground, with other errors."""
-    return made(copy.deepcopy(JOINT), seed)
+    return made(JOINT, seed)
 
 
 def photographs(flight: Simulation) -> Photographs:

@@ -66,8 +66,8 @@ def test_the_table_of_correlations_is_complete():
     assert list(table.columns) == list(table.index) == list(labels)
     n = len(labels)
     np.testing.assert_array_equal(table.to_numpy(), correlation_matrix(fitted().covariance)[-n:, -n:])
-    # Both boresights have the attitude of the trajectory in common.
-    assert abs(table.loc["scanner.boresight_right_rad", "mounts[default].boresight_x_rad"]) > 0.1
+    # Both boresights have the headings of the trajectory in common.
+    assert table.loc["scanner.boresight_up_rad", "mounts[default].boresight_z_rad"] > 0.5
 
 
 def vector_of(adjusted) -> np.ndarray:
