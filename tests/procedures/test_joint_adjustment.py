@@ -80,7 +80,7 @@ def turned(roll_pitch_yaw: np.ndarray) -> np.ndarray:
     """From right, forward, up to east, north, up: yaw from north clockwise, nose up, right wing down."""
     roll, pitch, yaw = np.moveaxis(np.asarray(roll_pitch_yaw), -1, 0)
     about = zip("zxy", (-yaw, pitch, roll), strict=True)
-    heading, nose, wing = (Rotation.from_euler(axis, angle) for axis, angle in about)
+    heading, nose, wing = (Rotation.from_euler(axis, angle[:, None]) for axis, angle in about)
     return (heading * nose * wing).as_matrix()
 
 

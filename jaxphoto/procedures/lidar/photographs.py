@@ -58,10 +58,11 @@ def check_photographs(photographs: Photographs, trajectory: Trajectory | None) -
         )
     rows = block.stations
     at = scanner_poses(trajectory, time[rows.who]).position
-    off = np.abs(np.asarray(rows.value) - at[np.arange(len(rows)), rows.axis])
-    if np.median(off) > _FAR_M:
+    off = np.asarray(rows.value) - at[np.arange(len(rows)), rows.axis]
+    apart = float(np.median(np.sqrt(np.bincount(rows.who, off**2)[np.unique(rows.who)])))
+    if apart > _FAR_M:
         raise BlockError(
-            f"the stations of the block lie {np.median(off):.0f} m from where the trajectory is at their times: bring "
+            f"the stations of the block lie {apart:.0f} m from where the trajectory is at their times: bring "
             "both onto one clock (--exposure-shift-s) and into one coordinate system"
         )
 
