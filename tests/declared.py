@@ -27,6 +27,9 @@ from jaxphoto.observations import (
     PositionSteps,
     StationRows,
     StripPlanes,
+    StripPoints,
+    TrajectoryAttitudes,
+    TrajectoryStations,
     exponential_covariance,
 )
 from jaxphoto.rotation import small_rotation
@@ -170,7 +173,7 @@ def _weighted(rng, truth, sigma) -> Weighted:
     return Weighted(truth + sigma * rng.normal(size=np.shape(truth)), np.array(sigma))
 
 
-def _further(n_images: int) -> tuple:
+def _further(n_images: int, angles: np.ndarray) -> tuple:
     """Observations of all further kinds; values are for `_observed` to fill."""
     rng = np.random.default_rng(4)
     factor = rng.normal(0, 0.02, (n_images, 3, 3)) + 0.05 * np.eye(3)
@@ -186,6 +189,7 @@ def _further(n_images: int) -> tuple:
         correlated(gnss, np.arange(3 * n_images).reshape(-1, 3), factor @ factor.transpose(0, 2, 1)),
         correlated(heights, np.arange(n_images).reshape(2, -1), in_time),
         *_strips(),
+        *_exposures_and_ties(angles),
     )
 
 
@@ -204,6 +208,28 @@ def _strips() -> tuple:
         StripPlanes(*sides, normal, np.full(n, 0.02), np.zeros(n)),
         PositionSteps(start, start + 1, kept, np.full((4, 3), 0.03), none),
         AttitudeSteps(start, start + 1, kept, np.full((4, 3), 5e-5), none),
+    )
+
+
+def _exposures_and_ties(angles: np.ndarray) -> tuple:
+    """Exposures on the trajectory of the scanner, and tie points on planes of its strip; two points on two planes."""
+    n_images = len(angles)
+    rng, spline = np.random.default_rng(7), StripSpline(0, 5, 0.0, 1.0)
+    who, axis = np.repeat(np.arange(n_images), 3), np.tile(np.arange(3), n_images)
+    knots, weights = spline.weights(np.linspace(0.1, 1.9, n_images))
+    station = np.array([0.02, 0.02, 0.04])[axis]
+    point = np.array([1, 2, 2, 6, 11, 15, 15, 22, 30, 38])
+    n = len(point)
+    foot = rng.uniform(-300, 300, (n, 3)) * [1, 1, 0.05]
+    normal = rng.normal(0, 0.3, (n, 3)) + np.array([0, 0, 1])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    pose = foot + rng.uniform(-200, 200, (n, 3)) * [1, 1, 0.1] + np.array([0, 0, 700])
+    turned = rng.uniform(-0.1, 0.1, (n, 3)) - np.array([0, 0, 1])
+    every, weight = spline.all_weights(np.linspace(0, 2, n))
+    return (
+        TrajectoryStations(who, knots[who], weights[who], axis, np.zeros(len(who)), station),
+        TrajectoryAttitudes(np.arange(n_images), knots, weights, angles, np.full((n_images, 3), 5e-5) * [1, 1, 2]),
+        StripPoints(point, every, weight, foot, pose, turned, normal, np.full(n, 0.03), np.zeros(n)),
     )
 
 
@@ -248,7 +274,7 @@ def simulated(seed: int = 1) -> Simulated:
         block,
         start=dataclasses.replace(block.start, unknowns=start),
         priors=priors,
-        more=(*_further(n), KnownParameters(KNOWN, known, covariance)),
+        more=(*_further(n, np.asarray(block.attitudes.roll_pitch_yaw)), KnownParameters(KNOWN, known, covariance)),
     )
     return Simulated(_observed(unfinished, truth, seed), truth)
 

@@ -37,6 +37,9 @@ SHOWN = {
     "ControlRows": ("control_points",),
     "SurfaceRows": ("surfaces",),
     "StripPlanes": ("strip_planes",),
+    "StripPoints": ("strip_points",),
+    "TrajectoryStations": ("trajectory_stations",),
+    "TrajectoryAttitudes": ("trajectory_attitudes",),
     "PositionSteps": ("position_steps",),
     "AttitudeSteps": ("attitude_steps",),
     "Distances": ("distances",),
@@ -218,7 +221,7 @@ def test_noise_moves_every_number_by_its_own_standard_deviation(group):
 
 # By how much what is observed differs from what the residual is of: ideal coordinates, small rotations of an aircraft
 # that is tilted (errors of two angles meet in one axis), small rotations from what is off by 2 mrad.
-_BENT = {"image_points": 0.1, "attitudes": 0.15, "prior_rotations": 0.01}
+_BENT = {"image_points": 0.1, "attitudes": 0.15, "trajectory_attitudes": 0.15, "prior_rotations": 0.01}
 
 
 def test_noise_knows_each_number_once():
@@ -323,9 +326,10 @@ def test_the_table_of_residuals_names_each_number(group):
     own = table()[table()["group"] == group]
     assert len(own) == np.size(adjusted().residuals[group])
     names = own[["image", "point", "axis"]]
-    # Two numbers that are called the same could not be told apart. Points may lie on surfaces of two strips.
+    # Two numbers that are called the same could not be told apart. Points may lie on several surfaces.
     # Planes and steps of strips belong to no image and no point: their place in the table tells them.
-    assert not names.duplicated().any() or group in ("surfaces", "strip_planes", "position_steps", "attitude_steps")
+    alike = ("surfaces", "strip_planes", "strip_points", "position_steps", "attitude_steps")
+    assert not names.duplicated().any() or group in alike
     assert (names != "").any(axis=1).all()
     rows = observation_groups(adjusted())[group]
     assert set(own["unit"]) == {"deg" if rows.unit == "rad" else rows.unit}

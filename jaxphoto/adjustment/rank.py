@@ -30,10 +30,18 @@ def check_priors(block: Block, priors: Unknowns) -> None:
     _check_scales(priors)
     with_station = set(np.asarray(block.stations.who).tolist())
     with_attitude = set(np.asarray(block.attitudes.image).tolist())
-    _check_mounts(block, priors, with_station, with_attitude)
+    # What else touches an image may see its mount, as the trajectory that a scanner has in common with it.
+    further = _images_touched(block)
+    _check_mounts(block, priors, with_station | further, with_attitude | further)
     _check_strips(block, priors, with_station)
     _check_shifts(block, priors, with_station)
     _check_scanner(block, priors)
+
+
+def _images_touched(block: Block) -> set[int]:
+    """The images that further observations touch."""
+    rows = [of for of in block.more if isinstance(of, AbstractObservations)]
+    return {int(i) for of in rows for what, index in of.indices() if what == "image" for i in np.ravel(index)}
 
 
 def _check_scales(priors: Unknowns) -> None:

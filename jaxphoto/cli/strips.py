@@ -14,13 +14,14 @@ from jaxphoto.cli.console import plain_console
 from jaxphoto.cloud import Cloud
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import ScannerCalibration, StripErrors
-from jaxphoto.io import clouds
+from jaxphoto.io import clouds, read_block
+from jaxphoto.io.block_folder import exposure_times
 from jaxphoto.io.trajectory import read_records, write_flight_csv
-from jaxphoto.io.trajectory.in_frame import records_of, trajectory_in
+from jaxphoto.io.trajectory.in_frame import trajectory_in, with_poses
 from jaxphoto.lidar.strip_correction import correct_strips
 from jaxphoto.lidar.strip_settings import StripSettings
 from jaxphoto.parameters import dynamic_fields
-from jaxphoto.procedures.lidar import ScannerPriors, StripAdjustment, StripRound, adjust_strips
+from jaxphoto.procedures.lidar import Photographs, ScannerPriors, StripAdjustment, StripRound, adjust_strips
 from jaxphoto.procedures.lidar.strip_adjustment import MAX_STRIP_ROUNDS
 from jaxphoto.report.strips import print_strips, write_strips
 from jaxphoto.unknowns import FIXED, FREE
@@ -42,6 +43,11 @@ def strips_command(
     adjust: Annotated[
         str, typer.Option(help=f"What of the scanner is estimated, by commas: {', '.join(_SCANNER)}; or none.")
     ] = "boresight",
+    block: Annotated[
+        Path | None,
+        typer.Option(help="Block folder of photographs taken on this trajectory, which are adjusted with the strips."),
+    ] = None,
+    exposure_shift_s: Annotated[float, typer.Option(help="time_s of images.csv + this is the cloud's time.")] = 0.0,
     hold: Annotated[str, typer.Option(help="Strips whose trajectory is right, by commas.")] = "",
     cell_m: Annotated[float, typer.Option(help="Side of the cells in which planes are sought.")] = _USUAL.cell_m,
     roughness_m: Annotated[
@@ -54,6 +60,12 @@ def strips_command(
         float, typer.Option(help="That about right and forward.")
     ] = _USUAL.sigma_attitude_deg,
     sigma_heading_deg: Annotated[float, typer.Option(help="That about up.")] = _USUAL.sigma_heading_deg,
+    sigma_exposure_m: Annotated[
+        float, typer.Option(help="What stations of photographs are off by besides.")
+    ] = _USUAL.sigma_exposure_m,
+    sigma_exposure_deg: Annotated[
+        float, typer.Option(help="What their attitudes are off by besides.")
+    ] = _USUAL.sigma_exposure_deg,
     classes: Classes = None,
     returns: ReturnsOption = "all",
     cloud_epsg: CloudEpsg = None,
@@ -61,6 +73,8 @@ def strips_command(
     max_rounds: Annotated[int, typer.Option(min=1, help="Most rounds of search and adjustment.")] = MAX_STRIP_ROUNDS,
 ) -> None:
     """Fit the strips of a cloud to each other; write the corrected cloud and trajectory, and what was wrong.
+
+    With --block the photographs of the flight, too: trajectory, scanner and camera at once.
 
     --class and --returns choose the points of the planes; the whole cloud is corrected. Exit code 1: written, but it
     still changed.
@@ -73,39 +87,49 @@ def strips_command(
         sigma_position_m=sigma_position_m,
         sigma_attitude_deg=sigma_attitude_deg,
         sigma_heading_deg=sigma_heading_deg,
+        sigma_exposure_m=sigma_exposure_m,
+        sigma_exposure_deg=sigma_exposure_deg,
     )
     priors, chosen, errors = _priors(adjust), class_numbers(classes), plain_console(stderr=True)
     held = [name.strip() for name in hold.split(",") if name.strip()]
-    check_folder(out, cloud, *([] if trajectory is None else [trajectory]))
+    check_folder(out, cloud, *(path for path in (trajectory, block) if path is not None))
     with errors.status("reading the cloud") as status:
+        photographs, frame = None, Frame()
+        if block is not None:
+            photographs = Photographs(read_block(block), exposure_times(block) + exposure_shift_s)
+            frame = photographs.block.frame
         records = path = None
         if trajectory is not None:
+            # On the cloud's clock from here on.
             records = read_records(trajectory)
-            if records.geographic:
+            records = records._replace(time=records.time - trajectory_shift_s)
+            if records.geographic and block is None:
                 raise InputError(
                     f"{trajectory.name}: the trajectory gives longitude and latitude, and the cloud X, Y and Z: bring "
                     "the trajectory into the cloud's system"
                 )
             exact = np.zeros((len(records.time), 3))
-            path = trajectory_in(records._replace(time=records.time - trajectory_shift_s), Frame(), exact, exact)
+            path = trajectory_in(records, frame, exact, exact)
         said: dict[str, Any] = {"epsg": cloud_epsg, "unit": cloud_unit}
-        whole = planes = clouds.read_cloud(cloud, **said)
+        own = None if block is None else frame
+        whole = planes = clouds.read_cloud(cloud, own, **said)
         if chosen is not None or returns != "all":
-            planes = clouds.read_cloud(cloud, classes=chosen, returns=returns, **said)  # type: ignore[arg-type]
+            planes = clouds.read_cloud(cloud, own, classes=chosen, returns=returns, **said)  # type: ignore[arg-type]
 
         def report(made: StripRound) -> None:
             line = f"round {made.number}: {made.planes} planes, strips {made.rms_m:.3f} m apart before"
             status.update(f"{line}; largest change {made.largest_change:.2g} standard deviations")
 
-        result = adjust_strips(planes, path, settings, priors, held=held, max_rounds=max_rounds, report=report)
+        options: dict[str, Any] = {"held": held, "max_rounds": max_rounds, "report": report}
+        result = adjust_strips(planes, path, settings, priors, photographs=photographs, **options)
         corrected = result.cloud if planes is whole else correct_strips(whole, _for_all(result, whole), path)
         status.update(f"writing {out}")
         like = cloud if cloud.suffix.lower() in (".las", ".laz") else None
         with write_strips(result, out) as folder:
             name = cloud.name if like is not None else f"corrected_{cloud.name}"
-            clouds.write_cloud(corrected, folder / name, like=like, **said)
+            clouds.write_cloud(corrected, folder / name, like=like, frame=own, **said)
             if records is not None and result.trajectory is not None:
-                moved = records_of(result.trajectory, records.file)
+                moved = with_poses(records, result.trajectory, frame)
                 write_flight_csv(moved._replace(time=moved.time + trajectory_shift_s), folder / "trajectory.csv")
     console = plain_console()
     print_strips(result, console)

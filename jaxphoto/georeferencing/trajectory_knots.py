@@ -14,6 +14,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jaxphoto.arrays import Numbers
 from jaxphoto.parameters import AbstractParameters
 
 
@@ -71,7 +72,16 @@ class StripSpline(NamedTuple):
         cubic = [(1 - u) ** 3, 3 * u**3 - 6 * u**2 + 4, -3 * u**3 + 3 * u**2 + 3 * u + 1, u**3]
         return self.first + piece[:, None] + np.arange(4), np.column_stack(cubic) / 6
 
+    def all_weights(
+        self, time: Float[np.ndarray, "n"]
+    ) -> tuple[Int[np.ndarray, "n size"], Float[np.ndarray, "n size"]]:
+        """The same of all knots of the strip, most of which weigh nothing."""
+        knots, weights = self.weights(time)
+        every = np.zeros((len(knots), self.size))
+        np.add.at(every, (np.arange(len(knots))[:, None], knots - self.first), weights)
+        return np.tile(self.first + np.arange(self.size), (len(knots), 1)), every
 
-def weighted_knot(knots: TrajectoryKnot, weights: Float[Array, "4"]) -> TrajectoryKnot:
-    """The correction that four knots (leading axis) make up."""
-    return jax.tree.map(lambda v: sum(weights[k] * v[k] for k in range(4)), knots)
+
+def weighted_knot(knots: TrajectoryKnot, weights: Float[Numbers, "knots"]) -> TrajectoryKnot:
+    """The correction that some knots (leading axis) make up: four, or all of a strip."""
+    return jax.tree.map(lambda v: sum(weights[k] * v[k] for k in range(len(weights))), knots)

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxphoto.lidar.moderated_variances import moderated_variances
 from jaxphoto.lidar.strip_settings import StripSettings
 
 # Spread of a patch along the shorter of its axes, as a part of the cell; a full cell has 0.29.
@@ -35,7 +36,7 @@ class StripPatches(NamedTuple):
     normal: Float[np.ndarray, "n 3"]
     """Unit vectors, upwards."""
     roughness: Float[np.ndarray, "n"]
-    """Standard deviation of a return from the plane (m)."""
+    """Standard deviation of a return from the plane (m), drawn towards that of the strip's other planes."""
     cofactor: Float[np.ndarray, "n 3 3"]
     """Inverse scatter within the plane (1/m^2): what the tilt of the plane is off by for returns that are off by 1."""
 
@@ -94,6 +95,8 @@ def planes_of(
     )
     normal = axes[:, :, 0] * np.where(axes[:, 2, 0] < 0, -1.0, 1.0)[:, None]
     along = axes[kept][:, :, 1:]
+    # A patch that is smoother than any scanner is one by chance.
+    variance = np.maximum(roughness[kept], settings.least_roughness_m) ** 2
     return StripPatches(
         cells[kept],
         count[kept],
@@ -101,8 +104,7 @@ def planes_of(
         before[kept],
         mean(time)[kept],
         normal[kept],
-        # A patch that is smoother than any scanner is one by chance.
-        np.maximum(roughness[kept], settings.least_roughness_m),
+        np.sqrt(moderated_variances(variance, count[kept] - 3)),
         np.einsum("nik,nk,njk->nij", along, 1 / value[kept][:, 1:], along),
     )
 
@@ -118,8 +120,8 @@ def corresponding(one: StripPatches, other: StripPatches, settings: StripSetting
     place = weight * one.mean[a] + (1 - weight) * other.mean[b]
     normal = weight * one.normal[a] + (1 - weight) * other.normal[b]
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    up_a, up_b = (_up(p, k, place, normal) for p, k in ((one, a), (other, b)))
-    variance = _variance(one, a, place) + _variance(other, b, place)
+    up_a, up_b = (up_to_plane(p, k, place, normal) for p, k in ((one, a), (other, b)))
+    variance = variance_of_plane(one, a, place) + variance_of_plane(other, b, place)
     return PlanePairs(
         a,
         b,
@@ -141,13 +143,13 @@ def fitting(gap: Float[np.ndarray, "n"], sigma: Float[np.ndarray, "n"], limit: f
     return np.abs(w - middle) <= limit * spread
 
 
-def _up(patches: StripPatches, which: np.ndarray, place: np.ndarray, normal: np.ndarray) -> np.ndarray:
+def up_to_plane(patches: StripPatches, which: np.ndarray, place: np.ndarray, normal: np.ndarray) -> np.ndarray:
     """How far along the normal the planes lie from places."""
     own = patches.normal[which]
     return np.einsum("ni,ni->n", own, patches.mean[which] - place) / np.einsum("ni,ni->n", own, normal)
 
 
-def _variance(patches: StripPatches, which: np.ndarray, place: np.ndarray) -> np.ndarray:
+def variance_of_plane(patches: StripPatches, which: np.ndarray, place: np.ndarray) -> np.ndarray:
     """Of the heights of the planes at places (m^2)."""
     off = place - patches.mean[which]
     tilt = np.einsum("ni,nij,nj->n", off, patches.cofactor[which], off)

@@ -8,7 +8,7 @@ from jaxphoto.errors import InputError
 
 _POSITIVE = (
     "cell_m", "roughness_m", "least_roughness_m", "normals_deg", "outlier", "knots_s", "correlation_s",
-    "sigma_position_m", "sigma_attitude_deg", "sigma_heading_deg",
+    "sigma_position_m", "sigma_attitude_deg", "sigma_heading_deg", "sigma_exposure_m", "sigma_exposure_deg",
 )  # fmt: skip
 
 
@@ -19,7 +19,8 @@ class StripSettings:
     Of two strips their normals agree to `normals_deg`; at most `most` planes of all pairs of strips together are
     observed. A gap of more than `outlier` standard deviations is none of one plane. The trajectory's knots are
     `knots_s` apart; its errors have `sigma_position_m`, `sigma_attitude_deg` (about right and forward) and
-    `sigma_heading_deg`, and `correlation_s` as correlation time (`observations.knot_steps`).
+    `sigma_heading_deg`, and `correlation_s` as correlation time (`observations.knot_steps`). What it gives an exposure
+    of a photograph is off by that and, independently, by `sigma_exposure_m` and `sigma_exposure_deg`.
     """
 
     cell_m: float = 3.0
@@ -34,6 +35,8 @@ class StripSettings:
     sigma_position_m: float = 0.08
     sigma_attitude_deg: float = 0.005
     sigma_heading_deg: float = 0.01
+    sigma_exposure_m: float = 0.01
+    sigma_exposure_deg: float = 0.002
 
     def __post_init__(self) -> None:
         for name in _POSITIVE:

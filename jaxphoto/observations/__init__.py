@@ -21,6 +21,9 @@ from jaxphoto.observations.attitudes import ATTITUDE_AXES as ATTITUDE_AXES, Atti
 from jaxphoto.observations.control import ControlRows as ControlRows
 from jaxphoto.observations.surfaces import SurfaceRows as SurfaceRows
 from jaxphoto.observations.strip_planes import StripPlanes as StripPlanes
+from jaxphoto.observations.strip_points import StripPoints as StripPoints
+from jaxphoto.observations.trajectory_poses import TrajectoryStations as TrajectoryStations
+from jaxphoto.observations.trajectory_poses import TrajectoryAttitudes as TrajectoryAttitudes
 from jaxphoto.observations.knot_steps import PositionSteps as PositionSteps, AttitudeSteps as AttitudeSteps
 from jaxphoto.observations.distances import Distances as Distances
 from jaxphoto.observations.priors import PositionRows as PositionRows

@@ -1,11 +1,22 @@
 """Camera stations: what GNSS observed at the exposures."""
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 
 from jaxphoto.arrays import Numbers
 from jaxphoto.georeferencing import sensor_position
 from jaxphoto.observations.base import AXES, AbstractCoordinates, ImageState, touching
+
+
+def station_of(image: ImageState) -> Float[Array, "3"]:
+    """What GNSS would observe without error at the exposure of an image (m); see `georeferencing.sensor_position`."""
+    if not image.parameters:
+        # Neither mounts nor strips: a station is the projection centre itself.
+        return image.position
+    at = sensor_position(image.position, image.camera_from_object, image.mount, image.strip, image.exposure)
+    for own in image.parameters.values():
+        at = own.station(at, image.exposure)
+    return at
 
 
 class StationRows(AbstractCoordinates):
@@ -21,14 +32,8 @@ class StationRows(AbstractCoordinates):
     sigma: Float[Numbers, "n"]
 
     def residual(self, image: ImageState) -> Float[Numbers, ""]:
-        """Observed minus computed (m); see `georeferencing.sensor_position`."""
-        if not image.parameters:
-            # Neither mounts nor strips: a station is the projection centre itself.
-            return self.value - image.position[self.axis]
-        at = sensor_position(image.position, image.camera_from_object, image.mount, image.strip, image.exposure)
-        for own in image.parameters.values():
-            at = own.station(at, image.exposure)
-        return self.value - at[self.axis]
+        """Observed minus computed (m)."""
+        return self.value - station_of(image)[self.axis]
 
     def words(self, images, points) -> np.ndarray:
         """Such as "station of image 12 in Z"."""

@@ -1,5 +1,7 @@
 """Strip planes: what two laser strips measured of one plane."""
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -10,6 +12,21 @@ from jaxphoto.observations.base import AbstractObservations, touching
 from jaxphoto.rotation import matrix_from_roll_pitch_yaw
 
 _ANGLES = ("roll", "pitch", "yaw")
+
+
+def return_at(
+    point: Any,
+    position: Any,
+    roll_pitch_yaw: Any,
+    off: TrajectoryKnot,
+    scanner: Scanner | None,
+    calibration: ScannerCalibration | None,
+) -> Float[Array, "3"]:
+    """`georeferencing.corrected_return` of a place as a strip has it (m), seen from a scanner's pose that is `off`."""
+    boresight = jnp.zeros(3) if scanner is None else scanner.boresight
+    known = ScannerCalibration(jnp.zeros(3)) if calibration is None else calibration
+    turn = matrix_from_roll_pitch_yaw(jnp.asarray(roll_pitch_yaw))
+    return corrected_return(point, position, turn, off.position, off.attitude, boresight, known)
 
 
 class StripPlanes(AbstractObservations):
@@ -59,15 +76,10 @@ class StripPlanes(AbstractObservations):
         calibration: ScannerCalibration | None,
     ) -> Float[Numbers, ""]:
         """By how much a's plane lies below b's (m), along the normal."""
-        boresight = jnp.zeros(3) if scanner is None else scanner.boresight
-        known = ScannerCalibration(jnp.zeros(3)) if calibration is None else calibration
-
-        def at(point, position, roll_pitch_yaw, knots, weights) -> Float[Array, "3"]:
-            off, turn = weighted_knot(knots, weights), matrix_from_roll_pitch_yaw(jnp.asarray(roll_pitch_yaw))
-            return corrected_return(point, position, turn, off.position, off.attitude, boresight, known)
-
-        a = at(self.point_a, self.scanner_a, self.roll_pitch_yaw_a, knots_a, self.weights_a)
-        b = at(self.point_b, self.scanner_b, self.roll_pitch_yaw_b, knots_b, self.weights_b)
+        known = scanner, calibration
+        off_a, off_b = weighted_knot(knots_a, self.weights_a), weighted_knot(knots_b, self.weights_b)
+        a = return_at(self.point_a, self.scanner_a, self.roll_pitch_yaw_a, off_a, *known)
+        b = return_at(self.point_b, self.scanner_b, self.roll_pitch_yaw_b, off_b, *known)
         return self.gap - jnp.sum(self.normal * (a - b))
 
     def words(self, images, points) -> np.ndarray:

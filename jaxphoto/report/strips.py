@@ -10,8 +10,15 @@ from rich.console import Console
 
 from jaxphoto.georeferencing import TrajectoryKnot
 from jaxphoto.procedures.lidar import StripAdjustment, StripDifference, StripRound
+from jaxphoto.procedures.lidar.strip_adjustment import PHOTOGRAPHS
+from jaxphoto.report.results import write_results
+from jaxphoto.report.tables import Tables
+from jaxphoto.report.verdict import verdict_of
 from jaxphoto.statistics import correlation_matrix
 from jaxphoto.writing import whole_folder
+
+# Of correlations.
+_DIGITS = 6
 
 
 def differences_table(differences: Sequence[StripDifference]) -> pd.DataFrame:
@@ -20,12 +27,22 @@ def differences_table(differences: Sequence[StripDifference]) -> pd.DataFrame:
 
 
 def strip_rounds_table(rounds: Sequence[StripRound]) -> pd.DataFrame:
-    """round, planes, left_out, rms_m, largest_change (in standard deviations)."""
+    """round, planes, points, left_out, rms_m, largest_change (in standard deviations)."""
     return pd.DataFrame(rounds, columns=["round", *StripRound._fields[1:]])
 
 
+def all_correlations(result: StripAdjustment) -> pd.DataFrame:
+    """Of all unknowns of scanner, trajectory and cameras: a row and a column each, named by `parameter`."""
+    labels = list(result.adjusted.structure.labels)
+    rho = correlation_matrix(result.covariance)[-len(labels) :, -len(labels) :]
+    return pd.DataFrame(rho, columns=labels).set_index(pd.Index(labels, name="parameter"))
+
+
 def calibration_table(result: StripAdjustment) -> pd.DataFrame:
-    """parameter, value, sigma, and the parameter that it is least told from: `with`, rho. Angles in degrees."""
+    """parameter, value, sigma, and the parameter that it is least told from: `with`, rho. Angles in degrees.
+
+    Of scanner, cameras and mounts: of all unknowns but the trajectory's.
+    """
     known, s = result.covariance, result.adjusted.structure
     rho, sigma = correlation_matrix(known), np.asarray(known.shared_sigma)
     value = np.asarray(result.adjusted.values.shared)[s.free]
@@ -72,15 +89,20 @@ def trajectory_errors_table(result: StripAdjustment) -> pd.DataFrame:
 
 @contextmanager
 def write_strips(result: StripAdjustment, directory: Path) -> Iterator[Path]:
-    """strips.csv, rounds.csv, scanner.csv and trajectory_errors.csv; yields the folder for what else belongs there.
+    """strips.csv, rounds.csv, scanner.csv, trajectory_errors.csv and correlation.csv, of photographs `adjustment`, too.
 
-    Raises InputError where `directory` holds something that is not an earlier result.
+    Yields the folder while it is not yet in its place, for what else belongs there. Raises InputError where `directory`
+    holds something that is not an earlier result.
     """
     with whole_folder(directory) as work:
         differences_table(result.differences).to_csv(work / "strips.csv", index=False)
         strip_rounds_table(result.rounds).to_csv(work / "rounds.csv", index=False)
         calibration_table(result).to_csv(work / "scanner.csv", index=False)
         trajectory_errors_table(result).to_csv(work / "trajectory_errors.csv", index=False)
+        all_correlations(result).round(_DIGITS).to_csv(work / "correlation.csv")
+        if result.before is not None:
+            tables, times = Tables(result.adjusted), result.adjusted.seconds
+            write_results(tables, verdict_of(tables), work / "adjustment", dict(times))
         yield work
 
 
@@ -88,11 +110,13 @@ def print_strips(result: StripAdjustment, console: Console) -> None:
     """What the rounds came to, how far strips were apart, and the scanner, a line each."""
     last = result.rounds[-1]
     end = "nothing changes any more" if result.still else "it still changes: ask for more rounds"
-    console.print(f"{last.number} rounds, {end}; {last.planes} planes, {last.left_out} left out", highlight=False)
+    ties = f" and {last.points} tie points on them" if last.points else ""
+    console.print(f"{last.number} rounds, {end}; {last.planes} planes{ties}, {last.left_out} left out", highlight=False)
     for d in result.differences:
         before = f"{d.rms_before_m:.3f} m" if np.isfinite(d.rms_before_m) else "unknown"
+        strips = f"{d.one} and strip {d.other}" if d.one == PHOTOGRAPHS else f"strips {d.one} and {d.other}"
         console.print(
-            f"  strips {d.one} and {d.other}: from {before} to {d.rms_m:.3f} m apart (RMS of {d.planes} planes, whose "
+            f"  {strips}: from {before} to {d.rms_m:.3f} m apart (RMS of {d.planes} planes, whose "
             f"noise is {d.noise_m:.3f} m)",
             highlight=False,
             markup=False,

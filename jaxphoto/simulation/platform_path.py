@@ -51,6 +51,8 @@ def matrices(quaternion: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 3 3"]
 def paths(recipe: Recipe, plan: ScanPlan, flight: Flight, mean_height: float, seed: int) -> list[Path]:
     """The path of every strip that `plan` scans, one after the other, from time zero: of `flight` or of its own.
 
+    Where exposures lie on the trajectory of the scanner, time zero is the mean of theirs.
+
     The scanner sits where GNSS and IMU refer to, and has their true positions. Positions and quaternions are cubic
     Hermite splines: at each exposure they have its velocity and its rate of turn. Over the ground that the first and
     last image show, the path leads on straight beyond their exposures. Nodes of a flight of its own leave the plan as
@@ -75,6 +77,9 @@ def paths(recipe: Recipe, plan: ScanPlan, flight: Flight, mean_height: float, se
         length = (time[-1] - time[0]) * flown.speed_m_per_s
         found.append(Path(strip.name, strip.height_m, length, time - time[0] + begin, *nodes))
         begin = found[-1].node[-1] + _GAP_S
+    if plan.same_trajectory:
+        middle = np.mean(np.concatenate([path.node[1:-1] for path in found]))
+        found = [path._replace(node=path.node - middle) for path in found]
     return found
 
 

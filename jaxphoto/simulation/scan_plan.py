@@ -21,7 +21,8 @@ class ScanPlan:
     normal one of `shift_sigma_m`: by so much the trajectory of the strip, and so its points, are off. On top of it
     position and attitude (about right, forward, up) drift with `drift_sigma_m`, `drift_sigma_deg` and `correlation_s`,
     from knot to knot `knots_s` apart. `lever_arm_m`, `range_offset_m` and the scales are those of
-    `georeferencing.ScannerCalibration`.
+    `georeferencing.ScannerCalibration`. With `same_trajectory` the stations and attitudes of the exposures are those of
+    this trajectory, with all that it is off by; their noise comes on top.
     """
 
     density_per_m2: float
@@ -38,6 +39,7 @@ class ScanPlan:
     range_offset_m: float = 0.0
     range_scale_ppm: float = 0.0
     angle_scale_ppm: float = 0.0
+    same_trajectory: bool = False
 
     @property
     def half_width(self) -> float:

@@ -18,8 +18,9 @@ from jaxphoto.georeferencing import Mount, StripBias, StripErrors, Trajectory
 from jaxphoto.observations import Attitudes, ControlRows, Distances, ImageRows, StationRows
 from jaxphoto.simulation.convergent import take_images
 from jaxphoto.simulation.convergent_plan import ConvergentPlan
+from jaxphoto.simulation.exposures_on_path import exposure_times, recorded_on_path
 from jaxphoto.simulation.flight import NO_BIAS, NO_MOUNT, Flight, fly, record, turned
-from jaxphoto.simulation.platform_path import paths
+from jaxphoto.simulation.platform_path import Path, paths
 from jaxphoto.simulation.points import TruePoints, scatter
 from jaxphoto.simulation.recipe import Assumed, Recipe, SimulatedBias, Triple, triple
 from jaxphoto.simulation.rolling_shutter import camera_motions, rolled, with_shutters
@@ -76,7 +77,9 @@ def simulate(recipe: Recipe, seed: int = 0) -> Simulation:
     motions = camera_motions(flight.exterior, flight.motion.velocity, flight.motion.rate, mounts)
     scene = scene._replace(rays=rolled(recipe, flight, scene.rays, scene.xyz, motions))
     biases = _true_biases(recipe, flight, seed)
-    cloud, trajectory, scanner, errors = _scanned(recipe, flight, terrain, height, seed)
+    flown = [] if recipe.lidar is None else paths(recipe, recipe.lidar, flight, height, seed)
+    cloud, trajectory, scanner, errors = _scanned(recipe, flown, terrain, seed)
+    clock = exposure_times(flown, flight) if recipe.lidar is not None and recipe.lidar.same_trajectory else None
     truth = Unknowns(
         {name: _numbers(camera.truth) for name, camera in recipe.cameras.items()},
         flight.exterior,
@@ -85,7 +88,10 @@ def simulate(recipe: Recipe, seed: int = 0) -> Simulation:
         biases,
         scanner,
     )
-    stations, attitudes = _georeferencing(recipe, flight, truth, seed)
+    position, attitude = record(flight, mounts, [biases.get(s, NO_BIAS) for s in flight.strips])
+    if clock is not None and errors is not None:
+        position, attitude = recorded_on_path(position, attitude, clock, flown, flight, errors)
+    stations, attitudes = _georeferencing(recipe, position, attitude, seed)
     control, check = _control(recipe, scene, seed)
     start, priors = _start(recipe, flight, scene, control, seed)
     unknowns, priors, truth = with_shutters(recipe, flight, motions, seed, start.unknowns, priors, truth)
@@ -110,16 +116,14 @@ def simulate(recipe: Recipe, seed: int = 0) -> Simulation:
         start=start,
         priors=priors,
         motion=flight.motion if any(map(_runs_late, recipe.mounts.values())) else None,
+        flight_time=clock,
     )
     return Simulation(block, truth, triple(recipe.datum_offset_m), terrain, cloud, trajectory, errors)
 
 
-def _scanned(
-    recipe: Recipe, flight: Flight, terrain: Terrain, height: float, seed: int
-) -> Scan | tuple[None, None, None, None]:
+def _scanned(recipe: Recipe, flown: list[Path], terrain: Terrain, seed: int) -> Scan | tuple[None, None, None, None]:
     if recipe.lidar is None:
         return None, None, None, None
-    flown = paths(recipe, recipe.lidar, flight, height, seed)
     return scan(recipe.lidar, flown, terrain, _sigma(recipe.noise.lidar_m), seed)
 
 
@@ -159,10 +163,11 @@ def _control(recipe: Recipe, scene: TruePoints, seed: int) -> tuple[ControlRows,
     return rows("control", "vertical"), rows("check")
 
 
-def _georeferencing(recipe: Recipe, flight: Flight, truth: Unknowns, seed: int) -> tuple[StationRows, Attitudes]:
-    mounts = [truth.mounts.get(recipe.mount_of(camera), NO_MOUNT) for camera in flight.cameras]
-    position, attitude = record(flight, mounts, [truth.strips.get(s, NO_BIAS) for s in flight.strips])
-    n = len(flight.images)
+def _georeferencing(
+    recipe: Recipe, position: Float[np.ndarray, "images 3"], attitude: Float[np.ndarray, "images 3"], seed: int
+) -> tuple[StationRows, Attitudes]:
+    """What GNSS and IMU observe of exposures at `position` (m) and roll, pitch, yaw (rad)."""
+    n = len(position)
     stations, attitudes = StationRows.none(), Attitudes.none()
     if recipe.stated.station_m is not None:
         position = position + _sigma(recipe.noise.station_m) * _draw(seed, "noise of stations", (n, 3))

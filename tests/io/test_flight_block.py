@@ -13,6 +13,7 @@ from jaxphoto.errors import BlockError, InputError
 from jaxphoto.io import read_block, write_block
 from jaxphoto.io.block_folder.frame_sections import frame_section
 from jaxphoto.io.trajectory import FIELDS, Records, write_flight_csv, write_sbet
+from jaxphoto.io.trajectory.in_frame import trajectory_in, with_poses
 from jaxphoto.rotation import matrix_from_roll_pitch_yaw, roll_pitch_yaw_from_matrix
 from tests.derivatives import compiled
 
@@ -158,6 +159,19 @@ def test_csv_in_a_map_system(fly, north):
     assert block.frame == frame
     np.testing.assert_allclose(np.asarray(block.stations.value).reshape(-1, 3), position, rtol=0, atol=1e-5)
     np.testing.assert_allclose(np.rad2deg(block.attitudes.roll_pitch_yaw), expected, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("frame", [Frame(), Frame("epsg", 32722, None, "grid", (-51.2, -25.1, 0.0))], ids=str)
+def test_poses_in_the_frame_of_a_block_go_back_into_records(frame):
+    """Whatever becomes of a trajectory, its file has the axes and the system that it came in."""
+    records, none = flight(), np.zeros((len(flight().time), 3))
+    if frame.kind == "epsg":
+        records = records._replace(coordinates=frame.map.map(records.coordinates))
+    there = trajectory_in(records, frame, none, none)
+    back = with_poses(records._replace(coordinates=none, roll_pitch_yaw_deg=none), there, frame)
+    np.testing.assert_allclose(back.coordinates, records.coordinates, rtol=0, atol=1e-6)
+    off = (back.roll_pitch_yaw_deg - records.roll_pitch_yaw_deg + 180) % 360 - 180
+    np.testing.assert_allclose(off, 0.0, rtol=0, atol=1e-9)
 
 
 def test_longitude_and_latitude_need_an_epsg_frame(fly):

@@ -6,8 +6,11 @@ import pytest
 
 from jaxphoto.cloud import Cloud
 from jaxphoto.io import clouds
+from jaxphoto.io.recipe.truth import write_simulation
+from jaxphoto.lidar.strip_correction import correct_flight
 from tests.commands import run
 from tests.lidar.clouds import SURFACES, ground
+from tests.procedures.joint import BORESIGHT_DEG, flown
 
 SHIFT = np.array([0.15, -0.2, 0.1])
 OPTIONS = ("--cell-m", "2", "--roughness-m", "0.04")
@@ -41,7 +44,7 @@ def test_shifts_are_taken_off_the_cloud(cloud_file, tmp_path, monkeypatch, capsy
     knots = pd.read_csv(out / "trajectory_errors.csv")
     assert (knots.sigma_X_m[1] > 0) and (knots.sigma_X_m[0] == 0)
     assert {f.name for f in out.iterdir() if f.suffix == ".csv"} == {
-        "strips.csv", "rounds.csv", "scanner.csv", "trajectory_errors.csv"
+        "strips.csv", "rounds.csv", "scanner.csv", "trajectory_errors.csv", "correlation.csv"
     }  # fmt: skip
 
 
@@ -76,4 +79,42 @@ def test_bad_input_is_one_sentence_and_nothing_is_written(cloud_file, tmp_path, 
     code, _, errors = run(monkeypatch, capsys, "strips", cloud_file, "--out", tmp_path / "out", *options)
     assert code == 2
     assert sentence in " ".join(errors.split())
+    assert not (tmp_path / "out").exists()
+
+
+def test_photographs_are_adjusted_with_the_strips(tmp_path, monkeypatch, capsys):
+    """From files; the same flight as of `test_joint_adjustment`, to the millimetre of its cloud."""
+    folder, out = tmp_path / "flight", tmp_path / "out"
+    write_simulation(flown(), folder)
+    drifts = ("--knots-s", "5", "--correlation-s", "60", "--sigma-position-m", "0.05", "--sigma-attitude-deg", "0.003")
+    given = ("--trajectory", folder / "trajectory.csv", "--block", folder, "--adjust", "boresight,angle-scale")
+    fine = (*drifts, "--sigma-heading-deg", "0.006", "--cell-m", "8")
+    code, output, errors = run(monkeypatch, capsys, "strips", folder / "cloud.laz", "--out", out, *given, *fine)
+    assert code == 0, errors + output
+    assert "photographs and strip 1: from " in output
+    interior = pd.read_csv(out / "adjustment" / "interior.csv").set_index("parameter")
+    assert abs(interior.value["c_mm"] - 34.25) < 4 * interior.sigma["c_mm"] < 0.02
+    scanner = pd.read_csv(out / "scanner.csv").set_index("parameter")
+    turned = [f"mounts[default].boresight_{axis}_deg" for axis in "xyz"]
+    assert (np.abs(scanner.value[turned] - BORESIGHT_DEG) < 4 * scanner.sigma[turned]).all()
+    rho = pd.read_csv(out / "correlation.csv", index_col="parameter")
+    assert {"scanner.boresight_up_rad", "interior[kodak].c_mm", "mounts[default].boresight_x_rad"} <= set(rho.columns)
+    assert rho.shape[0] == rho.shape[1] > 200 and np.allclose(np.diagonal(rho), 1.0)
+    # The trajectory is mended: where it truly went, but for what strips and photographs do not tell.
+    true = correct_flight(flown().trajectory, flown().errors)
+    before, after = (pd.read_csv(f / "trajectory.csv")[["X_m", "Y_m", "Z_m"]].to_numpy() for f in (folder, out))
+    off = [np.sqrt(np.mean((v - np.asarray(true.position)) ** 2)) for v in (before, after)]
+    assert off[1] < 0.8 * off[0]
+
+
+def test_photographs_without_times_are_refused(tmp_path, monkeypatch, capsys):
+    folder = tmp_path / "flight"
+    write_simulation(flown(), folder)
+    images = pd.read_csv(folder / "images.csv")
+    images.loc[2, "time_s"] = np.nan
+    images.to_csv(folder / "images.csv", index=False)
+    given = ("--block", folder, "--trajectory", folder / "trajectory.csv")
+    code, _, errors = run(monkeypatch, capsys, "strips", folder / "cloud.laz", "--out", tmp_path / "out", *given)
+    assert code == 2
+    assert "image A_03 has no time_s" in " ".join(errors.split())
     assert not (tmp_path / "out").exists()

@@ -52,7 +52,8 @@ def changed(changes: dict[str, Any], base: dict[str, Any] = SMALL) -> dict[str, 
         if value is None:
             del place[int(last) if isinstance(place, list) else last]
         else:
-            place[int(last) if isinstance(place, list) else last] = value
+            # A copy: a later change may lie within it.
+            place[int(last) if isinstance(place, list) else last] = copy.deepcopy(value)
     return values
 
 

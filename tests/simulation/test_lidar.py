@@ -42,6 +42,7 @@ SCENE: dict[str, Any] = {
     "noise.lidar_m": 0.0,
     "lidar": {"density_per_m2": 0.3, "truth": TRUTH},
 }
+OWN = {"name": "L", "heading_deg": 0.0, "length_m": 500.0, "height_m": 400.0}
 GROUND, TREES, ROOFS = 2, 5, 6
 
 
@@ -224,6 +225,26 @@ def test_the_trajectory_passes_through_the_exposures():
     np.testing.assert_allclose(lengths, 1, atol=1e-12)
 
 
+def test_photographs_have_the_errors_of_the_trajectory_that_they_share_with_the_scanner():
+    """Without noise: stations and attitudes are those of the recorded trajectory at the times of the exposures."""
+    drifts = {"drift_sigma_m": [0.3, 0.3, 0.3], "drift_sigma_deg": [0.05, 0.05, 0.1], "knots_s": 5.0}
+    given = {"lidar.same_trajectory": True, "lidar.truth": TRUTH | drifts}
+    flight, alone = made(SCENE | given), made(SCENE | {"lidar.truth": TRUTH | drifts})
+    block, time = flight.block, np.asarray(flight.block.flight_time)
+    assert abs(time.mean()) < 1e-9 and (np.diff(time) > 0).all()
+    poses = _poses(flight.trajectory, time)
+    np.testing.assert_allclose(np.reshape(block.stations.value, (-1, 3)), poses.position, rtol=0, atol=1e-5)
+    body = np.stack([_body(*a) for a in np.asarray(block.attitudes.roll_pitch_yaw)])
+    np.testing.assert_allclose(body, poses.object_from_body, rtol=0, atol=1e-6)
+    # Everything else is that of a flight whose stations know nothing of the scanner's errors.
+    np.testing.assert_array_equal(block.image_points.xy, alone.block.image_points.xy)
+    np.testing.assert_array_equal(flight.cloud.xyz, alone.cloud.xyz)
+    off = np.reshape(block.stations.value - alone.block.stations.value, (-1, 3))
+    at = [flight.errors.at(k, time[3 * k : 3 * k + 3])[0] for k in (0, 1)]
+    np.testing.assert_allclose(off, np.concatenate(at), rtol=0, atol=1e-9)
+    assert np.abs(off).max() > 0.2
+
+
 def _body(roll: float, pitch: float, yaw: float) -> np.ndarray:
     (sr, sp, sy), (cr, cp, cy) = np.sin([roll, pitch, yaw]), np.cos([roll, pitch, yaw])
     ned = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]]) @ [[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]]
@@ -336,6 +357,8 @@ def test_the_command_says_what_it_writes(tmp_path, monkeypatch, capsys):
         ({"lidar.truth.shift_m.C": [0, 0, 0]}, r"\[lidar.truth.shift_m\] C: no such key is known; use default, A, B"),
         ({"lidar.truth.boresight": [0, 0, 0]}, r"\[lidar.truth\] boresight: no such key"),
         ({"lidar.strips": [{"name": "default", "length_m": 5.0}]}, "a strip cannot be called 'default'"),
+        ({"lidar.same_trajectory": 1}, r"\[lidar\] same_trajectory: 1 is neither true nor false"),
+        ({"lidar.same_trajectory": True, "lidar.strips": [OWN]}, "same_trajectory: the scanner has a flight of"),
         ({"terrain.roughness_m": 2.0}, r"\[terrain\] roughness_m: points 2 m above or below the ground lie on no surf"),
         ({"terrain": {"kind": "rolling"}}, r"roughness_m: points 6 m .* in place of .rolling. give its waves"),
     ],

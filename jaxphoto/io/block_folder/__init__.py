@@ -1,6 +1,14 @@
 """The block folder: one TOML file and CSV tables (docs/block_folder.md)."""
 
-from jaxphoto.io.block_folder.block_reader import BlockTables, assemble, read_block
+from jaxphoto.io.block_folder.block_reader import BlockTables, assemble, exposure_times, read_block
 from jaxphoto.io.block_folder.block_writer import check_block_target, whole_block, write_block
 
-__all__ = ["BlockTables", "assemble", "check_block_target", "read_block", "whole_block", "write_block"]
+__all__ = [
+    "BlockTables",
+    "assemble",
+    "check_block_target",
+    "exposure_times",
+    "read_block",
+    "whole_block",
+    "write_block",
+]

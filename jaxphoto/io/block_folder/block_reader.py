@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxphoto.arrays import on_device
 from jaxphoto.block import Block, Frame, Start, sensor_rows
@@ -79,6 +80,11 @@ def read_block(folder: str | Path, more: Iterable[type] = ()) -> Block:
     together. Warns (UserWarning) of columns, points and cameras that are not used.
     """
     return assemble(read_folder(Path(folder), more))
+
+
+def exposure_times(folder: str | Path) -> Float[np.ndarray, "images"]:
+    """`time_s` of images.csv, as it stands there, in the order of the block; NaN where there is none."""
+    return read_folder(Path(folder)).tables["images"].numbers("time_s", empty=True)
 
 
 def read_folder(folder: Path, more: Iterable[type] = ()) -> BlockTables:

@@ -7,7 +7,7 @@ import numpy as np
 from jaxphoto.errors import quoted
 from jaxphoto.io.block_folder.section import Section
 from jaxphoto.io.recipe import sizes
-from jaxphoto.io.recipe.keys import sigmas, tables
+from jaxphoto.io.recipe.keys import flag, sigmas, tables
 from jaxphoto.simulation import ConvergentPlan, FlightPlan, Footprint, ScanPlan, Sigmas, Strip, Terrain
 
 _ZERO = (0.0, 0.0, 0.0)
@@ -24,7 +24,7 @@ def read_lidar(top: Section, plan: FlightPlan | ConvergentPlan, terrain: Terrain
             raise top.section("sigmas").error("lidar_m", "there is no table [lidar]; add it, or remove this key")
         return None
     section, truth = top.section("lidar"), top.section("lidar").section("truth")
-    section.known("density_per_m2", "scan_angle_deg", "strips", "truth")
+    section.known("density_per_m2", "scan_angle_deg", "strips", "same_trajectory", "truth")
     if isinstance(plan, ConvergentPlan):
         raise top.error("lidar", "a convergent set is not flown, so it has no lidar strips; remove the table")
     if terrain.roughness_m:
@@ -40,7 +40,11 @@ def read_lidar(top: Section, plan: FlightPlan | ConvergentPlan, terrain: Terrain
     angle = section.positive("scan_angle_deg") if "scan_angle_deg" in section else ScanPlan.scan_angle_deg
     if angle > _WIDEST_DEG:
         raise section.error("scan_angle_deg", f"{angle:g} to either side is too wide; give {_WIDEST_DEG:g} or less")
-    strips = _strips(section, plan)
+    strips, same = _strips(section, plan), flag(section, "same_trajectory")
+    if same and strips:
+        raise section.error(
+            "same_trajectory", "the scanner has a flight of its own, [[lidar.strips]]; remove these, or this key"
+        )
     single = ("range_offset_m", "range_scale_ppm", "angle_scale_ppm")
     triples = ("boresight_deg", "lever_arm_m")
     drawn = ("shift_sigma_m", "drift_sigma_m", "drift_sigma_deg")
@@ -55,6 +59,7 @@ def read_lidar(top: Section, plan: FlightPlan | ConvergentPlan, terrain: Terrain
         density_per_m2=section.positive("density_per_m2"),
         scan_angle_deg=angle,
         strips=strips,
+        same_trajectory=same,
         shift_m={name: tuple(shifts.vector(name).tolist()) for name in shifts},
         **given,
     )

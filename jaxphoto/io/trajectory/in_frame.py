@@ -44,11 +44,7 @@ def trajectory_in(
 ) -> Trajectory:
     """The trajectory in the frame of the block, with the standard deviations given. Raises as `positions_in`."""
     position = positions_in(records, frame)
-    turn = np.broadcast_to(np.eye(3), (len(position), 3, 3))
-    if frame.kind == "epsg":
-        true_north = records.geographic or frame.yaw == "true"
-        turn = frame.map.local_from_level(position) if true_north else frame.map.local_from_grid(position)
-    quaternion = _quaternions(turn, np.deg2rad(records.roll_pitch_yaw_deg))
+    quaternion = _quaternions(_levelled(records, frame, position), np.deg2rad(records.roll_pitch_yaw_deg))
     arrays = (records.time, position, quaternion, sigma_m, sigma_rad)
     return Trajectory(*map(jnp.asarray, arrays))
 
@@ -61,12 +57,35 @@ def records_of(trajectory: Trajectory, file: str) -> Records:
     return Records(file, np.asarray(trajectory.time), position, False, angles, unknown, unknown)
 
 
+def with_poses(records: Records, trajectory: Trajectory, frame: Frame) -> Records:
+    """The same records with the positions and attitudes of `trajectory`, in the frame of the block: `trajectory_in`
+    of the result is that."""
+    position = np.asarray(trajectory.position)
+    turn = np.swapaxes(_levelled(records, frame, position), 1, 2)
+    angles = np.rad2deg(np.asarray(_turned_angles(turn, np.asarray(trajectory.quaternion))))
+    return with_positions(records, position, frame)._replace(roll_pitch_yaw_deg=angles)
+
+
 def with_positions(records: Records, position: Float[np.ndarray, "records 3"], frame: Frame) -> Records:
     """The same records at other positions (m), given in the frame of the block."""
     if frame.kind != "epsg":
         return records._replace(coordinates=position)
     coordinates = frame.map.map(position)
     return records._replace(coordinates=frame.map.place(coordinates) if records.geographic else coordinates)
+
+
+def _levelled(records: Records, frame: Frame, position: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 3"]:
+    """From the axes that roll, pitch and yaw of records refer to, to those of the frame, at positions in it."""
+    if frame.kind != "epsg":
+        return np.broadcast_to(np.eye(3), (len(position), 3, 3))
+    true_north = records.geographic or frame.yaw == "true"
+    return frame.map.local_from_level(position) if true_north else frame.map.local_from_grid(position)
+
+
+@jit_quickly
+@jax.vmap
+def _turned_angles(turn, quaternion):
+    return roll_pitch_yaw_from_matrix(turn @ matrix_from_quaternion(quaternion))
 
 
 @jit_quickly

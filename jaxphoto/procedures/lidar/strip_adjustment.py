@@ -18,16 +18,21 @@ from jaxphoto.cloud import Cloud
 from jaxphoto.errors import BlockError, InputError
 from jaxphoto.georeferencing import StripErrors, StripSpline, Trajectory
 from jaxphoto.lidar.correction import check_covered, scanner_poses
-from jaxphoto.lidar.strip_correction import correct_flight, correct_strips
+from jaxphoto.lidar.strip_correction import correct_flight, correct_strips, times_of
 from jaxphoto.lidar.strip_settings import StripSettings
 from jaxphoto.procedures.adjust import adjust
+from jaxphoto.procedures.lidar.photographs import Photographs, check_photographs, on_trajectory, spans_with
 from jaxphoto.procedures.lidar.strip_rows import step_rows
 from jaxphoto.procedures.lidar.strip_search import CommonPlanes, StripSearch, check_joined
 from jaxphoto.procedures.lidar.strip_unknowns import ScannerPriors, errors_of, strip_block
-from jaxphoto.procedures.lidar.until_still import STILL, at_result
+from jaxphoto.procedures.lidar.tie_point_search import PointPlanes, TiePointSearch
+from jaxphoto.procedures.lidar.until_still import STILL, at_result, with_interior_held
+from jaxphoto.procedures.lidar.vertical_control import tie_points
 from jaxphoto.statistics import Covariance, covariance
 
 MAX_STRIP_ROUNDS = 10
+PHOTOGRAPHS = "photographs"
+"""What differences call the tie points of photographs beside strips."""
 # From this round on returns stay in their cells: strips fit to their noise by then.
 _SETTLED = 2
 # No laser scanner measures farther; so many points are looked at.
@@ -40,33 +45,37 @@ class StripRound(NamedTuple):
     number: int
     planes: int
     """Observed; of all that fit at most `StripSettings.most`."""
+    points: int
+    """Tie points of photographs observed to lie on a plane; one that lies on those of two strips counts twice."""
     left_out: int
-    """Those that did not fit."""
+    """Planes and points that did not fit."""
     rms_m: float
-    """Of the gaps of all that fit, before this adjustment."""
+    """Of the gaps of all planes that fit, before this adjustment."""
     largest_change: float
-    """Of an unknown of scanner and trajectory, in standard deviations."""
+    """Of an unknown of scanner, trajectory and cameras, in standard deviations."""
 
 
 class StripDifference(NamedTuple):
-    """Two strips where they overlap, before and after."""
+    """Two strips where they overlap, or tie points of photographs over the planes of a strip, before and after."""
 
     one: str
     other: str
     planes_before: int
     planes: int
     mean_before_m: float
-    """Of the gaps along the normals of the planes that fit, by which the first strip lies above the other."""
+    """Of the gaps along the normals of the planes that fit, by which the first lies above the other."""
     rms_before_m: float
     mean_m: float
     rms_m: float
     noise_m: float
-    """What the roughness of the planes lets expect of `rms_m` where nothing else is wrong."""
+    """What the roughness of the planes lets expect of `rms_m` where nothing else is wrong; of tie points, at most."""
 
 
 class StripAdjustment(eqx.Module):
     """Strips after their adjustment, and before."""
 
+    before: Adjustment | None
+    """The photographs alone, their interior orientation held; None without any."""
     adjusted: Adjustment
     covariance: Covariance
     cloud: Cloud
@@ -87,51 +96,69 @@ def adjust_strips(
     settings: StripSettings | None = None,
     priors: ScannerPriors | None = None,
     *,
+    photographs: Photographs | None = None,
     held: Collection[str] = (),
     max_rounds: int = MAX_STRIP_ROUNDS,
     report: Callable[[StripRound], None] = lambda made: None,
 ) -> StripAdjustment:
     """Adjust the strips of `cloud`; `trajectory` is that of its scanner, on the cloud's clock.
 
+    `photographs` that were taken on it are adjusted with them: their exposures have the trajectory's errors, and their
+    tie points lie on the planes of the strips. What of their cameras and mounts is estimated their block says; its
+    stations and attitudes are taken for the trajectory's.
+
     `priors` are those of the scanner; by default its boresight is FREE and all else FIXED. The trajectory of strips
     named in `held` is right. Without a trajectory each strip has a shift alone, and the first is held where none is
     named.
 
     Raises InputError for a cloud of one strip, of strips without points or without the times that a trajectory needs,
-    BlockError for strips that no plane joins and for a trajectory that does not cover the cloud, and as
-    `jaxphoto.adjust`.
+    BlockError for strips that no plane joins and for a trajectory that does not cover the cloud or the exposures, and
+    as `jaxphoto.adjust`.
     """
     settings = StripSettings() if settings is None else settings
     names = _check(cloud, trajectory, held)
-    splines = _splines(cloud, trajectory, settings)
+    spans, images = _spans(cloud), None
+    if photographs is not None:
+        check_photographs(photographs, trajectory)
+        spans = spans_with(photographs.time, spans)
+    splines = _splines(spans, trajectory, settings)
+    alone = None if photographs is None else with_interior_held(photographs.block)
+    if photographs is not None and alone is not None:
+        images = at_result(on_trajectory(photographs, splines, spans, settings), alone.unknowns)
     if trajectory is None:
         block = strip_block(names, splines, held or names[:1], settings, None)
     else:
-        block = strip_block(names, splines, held, settings, priors or ScannerPriors())
+        block = strip_block(names, splines, held, settings, priors or ScannerPriors(), images)
     steps = tuple(rows for rows in step_rows(splines, settings) if len(rows))
     search, errors = StripSearch(cloud, trajectory, settings), errors_of(block.start.unknowns, splines)
     first = seen = search.look(errors, settled=False)
     check_joined(names, seen)
+    ties = None if images is None else TiePointSearch(search, tie_points(images))
+    first_on = on = [] if ties is None or alone is None else ties.look(alone, covariance(alone), settled=False)
     rounds: list[StripRound] = []
     before, still = np.zeros(()), False
     while not still and len(rounds) < max_rounds:
-        rows = search.rows(seen, errors)
-        posed = dataclasses.replace(block, more=(rows, *steps))
+        planes, points = search.rows(seen, errors), () if ties is None else ties.rows(on, errors)
+        posed = dataclasses.replace(block, more=(*block.more, planes, *points, *steps))
         adjusted = adjust(posed, posed.start.unknowns)
         known = covariance(adjusted)
         now = np.asarray(adjusted.values.shared)[adjusted.structure.free]
-        rounds.append(_round(len(rounds) + 1, len(rows), seen, _change(now - before, known)))
+        counted = len(planes), sum(map(len, points))
+        rounds.append(_round(len(rounds) + 1, counted, seen, on, _change(now - before, known)))
         report(rounds[-1])
         still = rounds[-1].largest_change < STILL and bool(adjusted.converged)
         block, before, errors = at_result(block, adjusted.unknowns), now, errors_of(adjusted.unknowns, splines)
-        seen = search.look(errors, settled=len(rounds) >= _SETTLED)
+        settled = len(rounds) >= _SETTLED
+        seen = search.look(errors, settled)
+        on = [] if ties is None else ties.look(adjusted, known, settled)
     return StripAdjustment(
+        alone,
         adjusted,
         known,
         correct_strips(cloud, errors, trajectory),
         None if trajectory is None else correct_flight(trajectory, errors),
         errors,
-        _differences(names, first, seen),
+        _differences(names, first, seen) + _point_differences(names, first_on, on),
         tuple(rounds),
         still,
     )
@@ -176,21 +203,32 @@ def _check_above(cloud: Cloud, trajectory: Trajectory) -> None:
         )
 
 
-def _splines(cloud: Cloud, trajectory: Trajectory | None, settings: StripSettings) -> tuple[StripSpline, ...]:
+def _spans(cloud: Cloud) -> Float[np.ndarray, "strips 2"]:
+    """First and last time of each strip (s)."""
+    time = times_of(cloud)
+    own = [time[cloud.strip == k] for k in range(len(cloud.strips))]
+    return np.array([(t.min(), t.max()) for t in own])
+
+
+def _splines(
+    spans: Float[np.ndarray, "strips 2"], trajectory: Trajectory | None, settings: StripSettings
+) -> tuple[StripSpline, ...]:
     splines: list[StripSpline] = []
-    for k in range(len(cloud.strips)):
+    for start, end in spans.tolist():
         first = sum(s.size for s in splines)
-        if trajectory is None or cloud.time is None:
-            splines.append(StripSpline.constant(first))
-        else:
-            time = cloud.time[cloud.strip == k]
-            splines.append(StripSpline.over(first, float(time.min()), float(time.max()), settings.knots_s))
+        constant = trajectory is None
+        splines.append(
+            StripSpline.constant(first) if constant else StripSpline.over(first, start, end, settings.knots_s)
+        )
     return tuple(splines)
 
 
-def _round(number: int, planes: int, seen: Sequence[CommonPlanes], change: float) -> StripRound:
+def _round(
+    number: int, observed: tuple[int, int], seen: Sequence[CommonPlanes], on: Sequence[PointPlanes], change: float
+) -> StripRound:
     gaps = np.concatenate([f.pairs.gap[f.fits] for f in seen])
-    return StripRound(number, planes, sum(int((~f.fits).sum()) for f in seen), _rms(gaps), change)
+    left_out = sum(int((~f).sum()) for f in (*(f.fits for f in seen), *(f.fits for f in on)))
+    return StripRound(number, *observed, left_out, _rms(gaps), change)
 
 
 def _change(moved: Float[np.ndarray, "unknowns"], known: Covariance) -> float:
@@ -208,6 +246,20 @@ def _differences(
         gap, noise = f.pairs.gap[f.fits], _rms(f.pairs.sigma[f.fits])
         told = (float(was.mean()), _rms(was), float(gap.mean()), _rms(gap), noise)
         rows.append(StripDifference(names[f.one], names[f.other], int(np.isfinite(was).sum()), len(gap), *told))
+    return tuple(rows)
+
+
+def _point_differences(
+    names: Sequence[str], before: Sequence[PointPlanes], after: Sequence[PointPlanes]
+) -> tuple[StripDifference, ...]:
+    """Of tie points over the planes of each strip."""
+    rows = []
+    for was, now in zip(before, after, strict=True):
+        if not now.fits.any():
+            continue
+        then, gap = was.found.gap[was.fits], now.found.gap[now.fits]
+        told = (float(then.mean()), _rms(then), float(gap.mean()), _rms(gap), _rms(now.found.sigma[now.fits]))
+        rows.append(StripDifference(PHOTOGRAPHS, names[now.strip], len(then), len(gap), *told))
     return tuple(rows)
 
 

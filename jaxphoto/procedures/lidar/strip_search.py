@@ -41,16 +41,19 @@ class StripSearch:
         self.cloud, self.trajectory, self.settings = cloud, trajectory, settings
         self.strips = [np.flatnonzero(cloud.strip == k) for k in range(len(cloud.strips))]
         self.cells: list[np.ndarray] = []
+        self.corrected: list[np.ndarray] = []
+        """The returns of each strip as the last search found them."""
 
     def look(self, errors: StripErrors, settled: bool) -> list[CommonPlanes]:
         """The planes of every two strips that have some."""
-        patches, cells = [], []
+        patches, cells, corrected = [], [], []
         for k, own in enumerate(self.strips):
             measured, time = self.cloud.xyz[own], times_of(self.cloud)[own]
             xyz = corrected_strip(measured, time, k, errors, self.trajectory)
+            corrected.append(xyz)
             cells.append(self.cells[k] if settled else cells_of(xyz, self.cloud.extent[0, :2], self.settings))
             patches.append(planes_of(xyz, measured, time, cells[-1], self.settings))
-        self.cells = cells
+        self.cells, self.corrected = cells, corrected
         pairs = itertools.combinations(range(len(self.strips)), 2)
         return [found for one, other in pairs if (found := self._common(one, other, patches)) is not None]
 

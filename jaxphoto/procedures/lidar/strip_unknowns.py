@@ -31,8 +31,11 @@ def strip_block(
     held: Collection[str],
     settings: StripSettings,
     priors: ScannerPriors | None,
+    photographs: Block | None = None,
 ) -> Block:
-    """A block of these unknowns alone, all zero: the first knot of each strip is known to the trajectory's sigma.
+    """A block of these unknowns, all zero, and those of `photographs`; without any, of these alone.
+
+    The first knot of each strip is known to the trajectory's sigma.
 
     Without `priors` strips have a shift alone, which is free. The trajectory of strips that are `held` is right.
     """
@@ -46,9 +49,10 @@ def strip_block(
             owner = name if priors is None else f"{name} at {time:.3f} s"
             knots[owner] = TrajectoryKnot(_ZERO, _ZERO)  # type: ignore[arg-type]
             known[owner] = right if name in held else shift if priors is None else later if k else first
-    block = empty_block("strips of a laser scanner")
-    start = dataclasses.replace(block.start.unknowns, more={TrajectoryKnot.kind: knots})
-    prior = dataclasses.replace(block.priors, more={TrajectoryKnot.kind: known})
+    block = empty_block("strips of a laser scanner") if photographs is None else photographs
+    start, prior = block.start.unknowns, block.priors
+    start = dataclasses.replace(start, more=start.more | {TrajectoryKnot.kind: knots})
+    prior = dataclasses.replace(prior, more=prior.more | {TrajectoryKnot.kind: known})
     if priors is not None:
         of_scanner, own = ScannerCalibration.kind, priors.calibration
         right_scanner = Scanner(_ZERO, {})  # type: ignore[arg-type]

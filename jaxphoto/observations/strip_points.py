@@ -1,0 +1,55 @@
+"""Strip points: tie points of images on planes that a laser strip measured."""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxphoto.arrays import Numbers
+from jaxphoto.georeferencing import Scanner, ScannerCalibration, TrajectoryKnot, weighted_knot
+from jaxphoto.observations.base import AbstractObservations, touching
+from jaxphoto.observations.strip_planes import return_at
+
+
+class StripPoints(AbstractObservations):
+    """Object points that lie on the plane of the returns of one strip about them, once these are corrected.
+
+        normal . (X - F') = rise
+
+    with standard deviation `sigma` (m). `foot` F (m) is a place on the strip's plane as measured, `scanner` and
+    `roll_pitch_yaw` the pose of the scanner when it was, and F' is `georeferencing.corrected_return` of it. `rise` is
+    what was observed: zero, unless somebody adds an error to it. The rows of a strip name all knots of its trajectory,
+    most of them with zero in `weights`: so all rows meet the same unknowns, and points are eliminated with them
+    (`adjustment.model.observed_groups`). Rows of several strips are several groups.
+    """
+
+    group = "strip_points"
+    unit = "m"
+    axes = ("normal",)
+    also = ("scanner", "scanner_calibration")
+    observed = "rise"
+
+    point: Int[np.ndarray, "n"] = touching("point")
+    knots: Int[np.ndarray, "n knots"] = touching("trajectory_knots")
+    weights: Float[Numbers, "n knots"]
+    foot: Float[Numbers, "n 3"]
+    scanner: Float[Numbers, "n 3"]
+    roll_pitch_yaw: Float[Numbers, "n 3"]
+    normal: Float[Numbers, "n 3"]
+    sigma: Float[Numbers, "n"]
+    rise: Float[Numbers, "n"]
+
+    def residual(
+        self,
+        point: Float[Array, "3"],
+        knots: TrajectoryKnot,
+        scanner: Scanner | None,
+        calibration: ScannerCalibration | None,
+    ) -> Float[Numbers, ""]:
+        """By how much the point lies below the plane (m), along its normal."""
+        off = weighted_knot(knots, self.weights)
+        foot = return_at(self.foot, self.scanner, self.roll_pitch_yaw, off, scanner, calibration)
+        return self.rise - jnp.sum(self.normal * (point - foot))
+
+    def words(self, images, points) -> np.ndarray:
+        """Such as "point 12 on its plane of a strip"."""
+        return np.array([f"point {points[p]} on its plane of a strip" for p in self.point], object)

@@ -1,0 +1,79 @@
+"""Poses of exposures on the trajectory of a laser scanner, whose errors they share.
+
+What GNSS and IMU say of an exposure is off by what the trajectory is off by at that time, dp and da
+(`georeferencing.TrajectoryKnot`, of the knots about it), and by little of its own:
+
+    p = X + R l + dp + noise,    R_p S(da) = R + noise
+
+with the projection centre X, the lever arm l and the attitude R of the body, which follows from that of the camera by
+its boresight (`georeferencing.sensor_position`, `recorded_attitude`). Laser returns of that time have the same dp and
+da (`observations.strip_planes`). Source: Glira, Pfeifer and Mandlburger (2019), Hybrid orientation of airborne lidar
+point clouds and aerial images.
+"""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxphoto.arrays import Numbers
+from jaxphoto.georeferencing import TrajectoryKnot, attitude_residual, recorded_attitude, weighted_knot
+from jaxphoto.observations.attitudes import ATTITUDE_AXES
+from jaxphoto.observations.base import AXES, AbstractCoordinates, AbstractObservations, ImageState, touching
+from jaxphoto.observations.stations import station_of
+from jaxphoto.rotation import matrix_from_roll_pitch_yaw, small_rotation
+
+
+class TrajectoryStations(AbstractCoordinates):
+    """Coordinates that the trajectory gives the exposure of image `who`: `axis` (0, 1, 2), `value` and `sigma` (m).
+
+    `knots` and `weights` make up what the trajectory is off by then (`georeferencing.StripSpline.weights`); `sigma` is
+    of what remains.
+    """
+
+    group = "trajectory_stations"
+    unit = "m"
+
+    who: Int[np.ndarray, "n"] = touching("image")
+    knots: Int[np.ndarray, "n 4"] = touching("trajectory_knots")
+    weights: Float[Numbers, "n 4"]
+    axis: Int[np.ndarray, "n"]
+    value: Float[Numbers, "n"]
+    sigma: Float[Numbers, "n"]
+
+    def residual(self, image: ImageState, knots: TrajectoryKnot) -> Float[Numbers, ""]:
+        """Observed minus computed (m)."""
+        off = weighted_knot(knots, self.weights)
+        return self.value - (station_of(image) + off.position)[self.axis]
+
+    def words(self, images, points) -> np.ndarray:
+        """Such as "trajectory at image 12 in Z"."""
+        rows = zip(self.who, self.axis, strict=True)
+        return np.array([f"trajectory at image {images[i]} in {AXES[a]}" for i, a in rows], object)
+
+
+class TrajectoryAttitudes(AbstractObservations):
+    """Roll, pitch and yaw (rad) that the trajectory gives the exposure of `image`; else as `TrajectoryStations`."""
+
+    group = "trajectory_attitudes"
+    unit = "rad"
+    axes = ATTITUDE_AXES
+    observed = "roll_pitch_yaw"
+
+    image: Int[np.ndarray, "n"] = touching("image")
+    knots: Int[np.ndarray, "n 4"] = touching("trajectory_knots")
+    weights: Float[Numbers, "n 4"]
+    roll_pitch_yaw: Float[Numbers, "n 3"]
+    sigma: Float[Numbers, "n 3"]
+
+    def residual(self, image: ImageState, knots: TrajectoryKnot) -> Float[Array, "3"]:
+        """Observed minus computed as a small rotation (rad); see `georeferencing.attitude_residual`."""
+        off = weighted_knot(knots, self.weights)
+        observed = matrix_from_roll_pitch_yaw(jnp.asarray(self.roll_pitch_yaw))
+        computed = recorded_attitude(image.camera_from_object, image.mount, image.exposure)
+        return attitude_residual(jnp.matmul(observed, small_rotation(off.attitude)), computed)
+
+    def words(self, images, points) -> np.ndarray:
+        """Such as "roll of the trajectory at image 12"."""
+        return np.array(
+            [[f"{axis} of the trajectory at image {images[i]}" for i in self.image] for axis in self.axes], object
+        )

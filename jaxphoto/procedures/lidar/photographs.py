@@ -1,0 +1,106 @@
+"""Photographs of the flight that strips were measured on: their exposures lie on the trajectory of the scanner."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxphoto.block import Block
+from jaxphoto.errors import BlockError, InputError
+from jaxphoto.georeferencing import StripSpline, Trajectory
+from jaxphoto.lidar.correction import scanner_poses
+from jaxphoto.lidar.strip_settings import StripSettings
+from jaxphoto.observations import Attitudes, StationRows, TrajectoryAttitudes, TrajectoryStations
+from jaxphoto.procedures.lidar.until_still import check_without_surfaces
+
+# Stations farther off the trajectory (m) are those of another one, or of another time.
+_FAR_M = 10.0
+
+
+class Photographs(NamedTuple):
+    """A block of images, and when each was exposed on the clock of the cloud and its trajectory."""
+
+    block: Block
+    """Its stations and attitudes are what the trajectory says of the exposures."""
+    time: Float[np.ndarray, "images"]
+    """Seconds."""
+
+
+def check_photographs(photographs: Photographs, trajectory: Trajectory | None) -> None:
+    """Raise InputError or BlockError for photographs that do not go with the trajectory."""
+    block, time = photographs
+    if trajectory is None:
+        raise InputError(
+            "photographs and strips are joined by the trajectory on which both were measured: give it (--trajectory), "
+            "or adjust the strips alone"
+        )
+    check_without_surfaces(block)
+    unknown = np.flatnonzero(~np.isfinite(time))
+    if len(unknown):
+        raise InputError(
+            f"image {block.images[unknown[0]]} has no time_s, so that nothing says where on the trajectory it was "
+            "exposed: give the times of all exposures in images.csv"
+        )
+    if not len(block.stations):
+        raise InputError(
+            "the block has no stations, which the trajectory gives the exposures: add [trajectory] to block.toml, or "
+            "stations.csv"
+        )
+    known = np.asarray(trajectory.time)
+    outside = np.flatnonzero((time < known[0]) | (time > known[-1]))
+    if len(outside):
+        raise BlockError(
+            f"image {block.images[outside[0]]} was exposed at {time[outside[0]]:.3f} s, and the trajectory goes from "
+            f"{known[0]:.3f} to {known[-1]:.3f} s: give the trajectory of the whole flight, or the exposures on its "
+            "clock (--exposure-shift-s)"
+        )
+    rows = block.stations
+    at = scanner_poses(trajectory, time[rows.who]).position
+    off = np.asarray(rows.value) - at[np.arange(len(rows)), rows.axis]
+    apart = float(np.median(np.sqrt(np.bincount(rows.who, off**2)[np.unique(rows.who)])))
+    if apart > _FAR_M:
+        raise BlockError(
+            f"the stations of the block lie {apart:.0f} m from where the trajectory is at their times: bring "
+            "both onto one clock (--exposure-shift-s) and into one coordinate system"
+        )
+
+
+def spans_with(
+    time: Float[np.ndarray, "images"], spans: Float[np.ndarray, "strips 2"]
+) -> Float[np.ndarray, "strips 2"]:
+    """First and last times of strips (s) and of the exposures on their trajectories."""
+    strip = _strip_of(time, spans)
+    own = [np.append(time[strip == k], span) for k, span in enumerate(spans)]
+    return np.array([(t.min(), t.max()) for t in own])
+
+
+def on_trajectory(
+    photographs: Photographs,
+    splines: Sequence[StripSpline],
+    spans: Float[np.ndarray, "strips 2"],
+    settings: StripSettings,
+) -> Block:
+    """The block, its stations and attitudes those of a trajectory that is off by `splines` over `spans`.
+
+    They are in place of its own: the same instruments count once.
+    """
+    block, time = photographs
+    strip, knots, weights = _strip_of(time, spans), np.zeros((len(time), 4), int), np.zeros((len(time), 4))
+    for k, spline in enumerate(splines):
+        own = strip == k
+        knots[own], weights[own] = spline.weights(time[own])
+    s, a = block.stations, block.attitudes
+    sigma, turn = np.full(len(s), settings.sigma_exposure_m), np.deg2rad(settings.sigma_exposure_deg)
+    position = TrajectoryStations(s.who, knots[s.who], weights[s.who], s.axis, np.asarray(s.value), sigma)
+    angles = np.asarray(a.roll_pitch_yaw)
+    attitude = TrajectoryAttitudes(a.image, knots[a.image], weights[a.image], angles, np.full(angles.shape, turn))
+    more = (*block.more, position, *([attitude] if len(attitude) else []))
+    return dataclasses.replace(block, stations=StationRows.none(), attitudes=Attitudes.none(), more=more)
+
+
+def _strip_of(time: Float[np.ndarray, "images"], spans: Float[np.ndarray, "strips 2"]) -> Int[np.ndarray, "images"]:
+    """The laser strip on whose trajectory each exposure lies: that nearest in time."""
+    away = np.maximum(spans[:, :1] - time, time - spans[:, 1:])
+    return np.argmin(np.maximum(away, 0.0), axis=0)

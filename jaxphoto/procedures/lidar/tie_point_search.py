@@ -1,0 +1,67 @@
+"""Looking for the planes that strips have about the tie points of photographs, in the cloud as corrected so far."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxphoto.adjustment import Adjustment
+from jaxphoto.georeferencing import StripErrors
+from jaxphoto.lidar.corresponding_planes import StripPatches, fitting, planes_of
+from jaxphoto.lidar.points_on_planes import PointsOnPlanes, on_planes, returns_about
+from jaxphoto.lidar.strip_correction import times_of
+from jaxphoto.observations import StripPoints
+from jaxphoto.procedures.lidar.strip_rows import side_of
+from jaxphoto.procedures.lidar.strip_search import StripSearch
+from jaxphoto.statistics import Covariance
+
+
+class PointPlanes(NamedTuple):
+    """The tie points that lie over planes of one strip, and which of them fit."""
+
+    strip: int
+    patches: StripPatches
+    found: PointsOnPlanes
+    """Its points are numbers among `TiePointSearch.points`."""
+    sigma: Float[np.ndarray, "n"]
+    """Of the gaps, by plane and point (m)."""
+    fits: Bool[np.ndarray, "n"]
+
+
+class TiePointSearch:
+    """Searches that follow one another: returns stay about their points when `settled`, as those of `StripSearch`."""
+
+    def __init__(self, search: StripSearch, points: Int[np.ndarray, "points"]) -> None:
+        self.search, self.points = search, points
+        self.about: list[tuple[np.ndarray, np.ndarray]] = []
+
+    def look(self, adjusted: Adjustment, known: Covariance, settled: bool) -> list[PointPlanes]:
+        """The planes about the points as adjusted, in the strips as the other search corrected them last."""
+        place, spread = (np.asarray(of)[self.points] for of in (adjusted.unknowns.points, known.points))
+        search, about, seen = self.search, [], []
+        for k, (own, xyz) in enumerate(zip(search.strips, search.corrected, strict=True)):
+            about.append(self.about[k] if settled else returns_about(xyz, place, search.settings))
+            index, point = about[-1]
+            measured, time = search.cloud.xyz[own], times_of(search.cloud)[own]
+            patches = planes_of(xyz[index], measured[index], time[index], point, search.settings)
+            found = on_planes(patches, place)
+            of_points = np.einsum("ni,nij,nj->n", patches.normal, spread[found.point], patches.normal)
+            sigma = np.sqrt(found.sigma**2 + of_points)
+            seen.append(PointPlanes(k, patches, found, sigma, fitting(found.gap, sigma, search.settings.outlier)))
+        self.about = about
+        return seen
+
+    def rows(self, seen: Sequence[PointPlanes], errors: StripErrors) -> tuple[StripPoints, ...]:
+        """The points that fit as observations, strip by strip."""
+        groups = []
+        for f in (f for f in seen if f.fits.any()):
+            found = PointsOnPlanes(*(v[f.fits] for v in f.found))
+            side = side_of(f.patches, found.patch, found.foot, f.strip, errors, self.search.trajectory)
+            knots, weights = errors.splines[f.strip].all_weights(f.patches.time[found.patch])
+            normal = f.patches.normal[found.patch]
+            pose = side.scanner, side.roll_pitch_yaw
+            none = np.zeros(len(normal))
+            point = self.points[found.point]
+            groups.append(StripPoints(point, knots, weights, side.point, *pose, normal, found.sigma, none))
+        return tuple(groups)

@@ -1,0 +1,226 @@
+"""Trajectory, scanner and camera of one flight are found at once, and are what formulas written down again say."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from jaxphoto import BlockError, InputError
+from jaxphoto.adjustment import Outcome
+from jaxphoto.camera import get_parameter
+from jaxphoto.observations import Attitudes, StationRows
+from jaxphoto.procedures.lidar import adjust_strips
+from jaxphoto.report.strips import all_correlations
+from jaxphoto.statistics import correlation_matrix
+from tests.procedures.joint import CAMERA, fitted, flown, photographs, truth
+from tests.procedures.strips import SETTINGS
+
+
+def estimates() -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
+    """Labels, values and covariance of all shared unknowns."""
+    adjusted = fitted().adjusted
+    labels = adjusted.structure.labels
+    value = np.asarray(adjusted.values.shared)[adjusted.structure.free]
+    return labels, value, np.asarray(fitted().covariance.matrix)[-len(labels) :, -len(labels) :]
+
+
+def test_camera_and_scanner_are_found():
+    """All of it together: chi squared of thirteen, because some of it is told apart badly."""
+    labels, value, matrix = estimates()
+    true = truth(flown())
+    own = [labels.index(label) for label in true]
+    off = value[own] - np.array(list(true.values()))
+    assert len(own) == 13
+    assert off @ np.linalg.solve(matrix[np.ix_(own, own)], off) < 34.5  # 99.9 %
+    sigma = dict(zip(labels, np.sqrt(np.diagonal(matrix)), strict=True))
+    # The photographs begin 0.25 mm off, which is sixty standard deviations.
+    assert sigma["interior[kodak].c_mm"] < 0.006
+    assert max(v for label, v in sigma.items() if label.startswith("mounts")) < 2e-4
+
+
+def test_nothing_changes_any_more_and_weights_are_right():
+    found = fitted()
+    assert found.still and found.adjusted.outcome is Outcome.CONVERGED
+    assert float(found.adjusted.sigma0) == pytest.approx(1.0, abs=0.1)
+    over = [d for d in found.differences if d.one == "photographs"]
+    assert [d.other for d in over] == ["1", "2", "3"]
+    for d in over:
+        # The principal distance that the photographs begin with is 0.7 % off.
+        assert abs(d.mean_before_m) > 2.0 and abs(d.mean_m) < 0.003
+        assert d.planes > 50 and d.rms_m < d.noise_m
+
+
+def test_errors_of_the_trajectory_are_found():
+    labels, value, matrix = estimates()
+    errors = flown().errors
+    own = [k for k, label in enumerate(labels) if label.startswith("trajectory_knots")]
+    off = value[own] - np.column_stack([errors.position, errors.attitude]).ravel()
+    assert np.mean(np.abs(off) < 3 * np.sqrt(np.diagonal(matrix)[own])) > 0.97
+
+
+def test_the_table_of_correlations_is_complete():
+    labels, _, _ = estimates()
+    table = all_correlations(fitted())
+    assert list(table.columns) == list(table.index) == list(labels)
+    n = len(labels)
+    np.testing.assert_array_equal(table.to_numpy(), correlation_matrix(fitted().covariance)[-n:, -n:])
+    # Both boresights have the headings of the trajectory in common.
+    assert table.loc["scanner.boresight_up_rad", "mounts[default].boresight_z_rad"] > 0.5
+
+
+def vector_of(adjusted) -> np.ndarray:
+    """All that is estimated: increments of exterior orientations, shared unknowns, points."""
+    shared = np.asarray(adjusted.values.shared)[adjusted.structure.free]
+    return np.concatenate([np.zeros(6 * len(adjusted.block.images)), shared, np.ravel(adjusted.unknowns.points)])
+
+
+def turned(roll_pitch_yaw: np.ndarray) -> np.ndarray:
+    """From right, forward, up to east, north, up: yaw from north clockwise, nose up, right wing down."""
+    roll, pitch, yaw = np.moveaxis(np.asarray(roll_pitch_yaw), -1, 0)
+    about = zip("zxy", (-yaw, pitch, roll), strict=True)
+    heading, nose, wing = (Rotation.from_euler(axis, angle[:, None]) for axis, angle in about)
+    return (heading * nose * wing).as_matrix()
+
+
+def small(angles: np.ndarray) -> np.ndarray:
+    """`rotation.small_rotation` of many: I - [angles]x to first order."""
+    return Rotation.from_rotvec(-np.asarray(angles)).as_matrix()
+
+
+def rotated(matrix: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    return np.einsum("nij,nj->ni", matrix, vector)
+
+
+class Twin:
+    """All residuals over their standard deviations by formulas written down here, as a function of one vector."""
+
+    def __init__(self, adjusted) -> None:
+        self.adjusted, self.block = adjusted, adjusted.block
+        self.labels = list(adjusted.structure.labels)
+        self.rows = {of.group: [] for of in self.block.more}
+        for of in self.block.more:
+            self.rows[of.group].append(jax.tree.map(np.asarray, of))
+        self.n = len(self.block.images)
+
+    def __call__(self, x: np.ndarray) -> np.ndarray:
+        n, s = self.n, len(self.labels)
+        eop, shared, points = x[: 6 * n].reshape(n, 6), x[6 * n : 6 * n + s], x[6 * n + s :].reshape(-1, 3)
+        known = dict(zip(self.labels, shared, strict=True))
+        exterior = self.adjusted.unknowns.exterior
+        centre = np.asarray(exterior.position) + eop[:, :3]
+        camera = small(eop[:, 3:]) @ np.asarray(exterior.camera_from_object)
+        knots = np.array([known[label] for label in self.labels if label.startswith("trajectory_knots")]).reshape(-1, 6)
+        calibration = [known[f"scanner_calibration.{name}"] for name in ("range_offset_m", "angle_scale_ppm")]
+        boresight = np.array([known[f"scanner.boresight_{axis}_rad"] for axis in ("right", "forward", "up")])
+
+        def returned(point, scanner, angles, which, weights):
+            off, body = np.einsum("nk,nkc->nc", weights, knots[which]), turned(angles)
+            right, forward, up = rotated(body.transpose(0, 2, 1), point - scanner).T
+            length = np.sqrt(right**2 + forward**2 + up**2)
+            turn = 1e-6 * calibration[1] * np.arctan2(right, -up)
+            shot = [np.cos(turn) * right + np.sin(turn) * up, forward, np.cos(turn) * up - np.sin(turn) * right]
+            shot = np.column_stack(shot) * (1 - calibration[0] / length)[:, None]
+            shot = rotated(small(off[:, 3:]), rotated(np.tile(small(boresight), (len(shot), 1, 1)), shot))
+            return scanner - off[:, :3] + rotated(body, shot)
+
+        return np.concatenate(
+            [
+                self.image_points(known, centre, camera, points),
+                *self.exposures(known, centre, camera, knots),
+                *self.planes(returned, points),
+                *self.steps(knots, calibration[0]),
+            ]
+        )
+
+    def image_points(self, known, centre, camera, points) -> np.ndarray:
+        rows = self.block.image_points
+        c, x_p, y_p, k1, k2 = (known[f"interior[kodak].{name}"] for name in CAMERA)
+        u, v, w = rotated(camera[rows.image], points[rows.point] - centre[rows.image]).T
+        measured = np.asarray(rows.xy) - [x_p, y_p]
+        r2 = np.sum(measured**2, axis=1)
+        shrunk = 1 - k1 * r2 - k2 * r2**2
+        off = measured * shrunk[:, None] + c * np.column_stack([u, v]) / w[:, None]
+        # Back into the measured image, by the derivative of the ideal coordinate.
+        outer = measured[:, :, None] * measured[:, None] * (2 * k1 + 4 * k2 * r2)[:, None, None]
+        slope = shrunk[:, None, None] * np.eye(2) - outer
+        return np.ravel(np.linalg.solve(slope, off[:, :, None])[:, :, 0] / np.asarray(rows.sigma))
+
+    def exposures(self, known, centre, camera, knots):
+        (s,), (a,) = self.rows["trajectory_stations"], self.rows["trajectory_attitudes"]
+        boresight = np.array([known[f"mounts[default].boresight_{axis}_rad"] for axis in "xyz"])
+        # The camera's x axis points forward, its y axis to the left.
+        nominal = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+        body = camera.transpose(0, 2, 1) @ (nominal @ small(boresight)).T
+        arm = np.asarray(self.block.start.unknowns.mounts["default"].lever_arm)
+        off = np.einsum("nk,nkc->nc", s.weights, knots[s.knots])[:, :3]
+        at = (centre + body @ arm)[s.who] + off
+        yield (s.value - at[np.arange(len(at)), s.axis]) / s.sigma
+        off = np.einsum("nk,nkc->nc", a.weights, knots[a.knots])[:, 3:]
+        apart = body[a.image].transpose(0, 2, 1) @ turned(a.roll_pitch_yaw) @ small(off)
+        right, forward, up = Rotation.from_matrix(apart).as_rotvec().T
+        yield np.ravel(np.column_stack([forward, right, -up]) / a.sigma)
+
+    def planes(self, returned, points):
+        (of,) = self.rows["strip_planes"]
+        names = ("point", "scanner", "roll_pitch_yaw", "knots", "weights")
+        one, other = (returned(*(getattr(of, f"{name}_{side}") for name in names)) for side in "ab")
+        yield np.einsum("ni,ni->n", of.normal, one - other) / of.sigma
+        for of in self.rows["strip_points"]:
+            foot = returned(of.foot, of.scanner, of.roll_pitch_yaw, of.knots, of.weights)
+            yield np.einsum("ni,ni->n", of.normal, points[of.point] - foot) / of.sigma
+
+    def steps(self, knots, range_offset):
+        for group, own in (("position_steps", slice(0, 3)), ("attitude_steps", slice(3, 6))):
+            (of,) = self.rows[group]
+            yield np.ravel((knots[of.end, own] - of.kept[:, None] * knots[of.start, own]) / of.sigma)
+        first = knots[[spline.first for spline in fitted().errors.splines]]
+        yield np.ravel(first / np.append(np.full(3, SETTINGS.sigma_position_m), SETTINGS.sigma_attitude))
+        yield np.array([range_offset / 0.1])
+
+
+def test_the_result_is_that_of_dense_least_squares_by_other_formulas():
+    adjusted = fitted().adjusted
+    twin, x = Twin(adjusted), vector_of(adjusted)
+    r = twin(x)
+    assert r @ r == pytest.approx(float(adjusted.square_sum), rel=1e-9)
+    n = 6 * twin.n + len(twin.labels)
+    # Steps of a hundredth of a standard deviation or so: differences are right to five digits.
+    step = np.full(len(x), 1e-4)
+    step[:n] = 0.01 * np.sqrt(np.diagonal(np.asarray(fitted().covariance.matrix)))
+    steps = np.diag(step)
+    scaled = np.column_stack([(twin(x + h) - twin(x - h)) / 2 for h in steps])
+    normal = scaled.T @ scaled
+    cofactors = np.linalg.inv(normal) * step[:, None] * step
+    sigma = np.sqrt(np.diagonal(cofactors))
+    move = -np.linalg.solve(normal, scaled.T @ r) * step
+    assert np.max(np.abs(move) / sigma) < 1e-3
+    expected = np.asarray(fitted().covariance.matrix)
+    unit = sigma[:n, None] * sigma[:n]
+    np.testing.assert_allclose(cofactors[:n, :n] / unit, expected / unit, atol=1e-4)
+
+
+def test_the_camera_of_the_photographs_alone_is_told_from_the_start():
+    """Before all of it the photographs were adjusted with their interior orientation held."""
+    before = fitted().before
+    assert before is not None
+    held = float(get_parameter(before.unknowns.interior["kodak"], "c_mm"))
+    assert held == float(get_parameter(flown().block.start.unknowns.interior["kodak"], "c_mm"))
+
+
+def test_what_cannot_be_adjusted_together():
+    flight, taken = flown(), photographs(flown())
+
+    def refused(error, match, changed=taken, trajectory=flight.trajectory):
+        with pytest.raises(error, match=match):
+            adjust_strips(flight.cloud, trajectory, SETTINGS, photographs=changed)
+
+    refused(InputError, "joined by the trajectory on which both were measured", trajectory=None)
+    untimed = np.where(np.arange(len(taken.time)) == 3, np.nan, taken.time)
+    refused(InputError, "image A_04 has no time_s", taken._replace(time=untimed))
+    refused(BlockError, "image A_01 was exposed at .* the trajectory goes from", taken._replace(time=taken.time - 60.0))
+    bare = dataclasses.replace(taken.block, stations=StationRows.none(), attitudes=Attitudes.none())
+    refused(InputError, "the block has no stations", taken._replace(block=bare))
+    late = taken.time + np.where(taken.time > 0, -1.0, 1.0)
+    refused(BlockError, "stations of the block lie .* m from where the trajectory is", taken._replace(time=late))
