@@ -28,7 +28,8 @@ def test_every_command_of_the_page_works(tmp_path):
         check=False,
     )
     assert found.returncode == 0, found.stdout + found.stderr
-    for folder in ("results", "results_of_project", "what_if"):
+    assert list((tmp_path / "what_if").glob("*.csv"))
+    for folder in ("results", "results_of_project"):
         assert (tmp_path / folder / "report.html").stat().st_size > 10_000
     both = [pd.read_csv(tmp_path / name / "interior.csv") for name in ("results", "results_of_project")]
     c, sigma = (both[0].set_index("parameter").loc["c_mm", key] for key in ("value", "sigma"))

@@ -73,7 +73,8 @@ def finished(
     settled = False
     for number in range(1, rounds + 1):
         report(f"adjusting {int(network.oriented.sum())} images, round {number}")
-        network, adjusted = refined(block, network, calibration, estimated)
+        # Of a large block each adjustment is hundreds of megabytes: only the last one is kept.
+        network = refined(block, network, calibration, estimated)[0]
         sight, before = sight_of(block, network.interior), network.fate
         limit = max(_LEAST_LIMIT, _LIMIT * robust_scale(normalised_misfits(sight, network)))
         network = supported(sight, meet(sight, network, limit, angle))

@@ -142,22 +142,22 @@ def orient(
     block = _block_of(title, names, sensor, interior, features, sigmas_mm, found)
     calibration = calibration_of(block)
     start = grown(block, related.pairs, calibration, LEAST_POINTS, MOST * loose * c / sigma, report)
-    first = finished(
+    network, _, limit, rounds, _, lost = finished(
         block, start.network, calibration, early(calibration), start.angle, LEAST_POINTS, report, FIRST_ROUNDS
     )
 
-    look = second_look(first.network, first.network.interior[CAMERA], features, matches, sigma, first.limit)
+    look = second_look(network, network.interior[CAMERA], features, matches, sigma, limit)
     found = tracks(number, list(look.matches))
     block = _block_of(title, names, sensor, interior, features, sigmas_mm, found)
     again = calibration_of(block)
     calibration = again._replace(sizes=again.sizes | calibration.sizes)
     network = empty_network(block)._replace(
-        interior=first.network.interior,
-        positions=first.network.positions,
-        camera_from_object=first.network.camera_from_object,
-        oriented=first.network.oriented,
+        interior=network.interior,
+        positions=network.positions,
+        camera_from_object=network.camera_from_object,
+        oriented=network.oriented,
     )
-    network = meet(sight_of(block, network.interior), network, first.limit, start.angle)
+    network = meet(sight_of(block, network.interior), network, limit, start.angle)
     observed = asked(calibration, {CAMERA: ()})
     second = finished(block, network, calibration, observed, start.angle, LEAST_POINTS, report)
     camera = told(second.adjusted, calibration)
@@ -165,7 +165,7 @@ def orient(
     last = finished(block, second.network, calibration, estimated, start.angle, LEAST_POINTS, report, LAST_ROUNDS)
 
     network = last.network
-    refused = start.refused | first.lost | second.lost | last.lost
+    refused = start.refused | lost | second.lost | last.lost
     made = _oriented_block(block, network, calibration, estimated)
     residual = np.asarray(last.adjusted.residuals.image).T * np.asarray(made.image_points.sigma)
     fate = np.bincount(network.fate, minlength=len(Fate))
@@ -183,7 +183,7 @@ def orient(
             ),
             n_points=len(made.points),
             n_image_points=len(made.image_points.image),
-            rounds=first.rounds + second.rounds + last.rounds,
+            rounds=rounds + second.rounds + last.rounds,
             settled=last.settled,
             converged=last.settled and bool(last.adjusted.converged),
             limit_px=last.limit * sigma / sensor.pixel_mm,
