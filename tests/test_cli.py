@@ -256,6 +256,14 @@ def test_convert_writes_a_block_that_reads_the_same(folder, monkeypatch, capsys,
     assert "bingo" in error
 
 
+def test_other_programs_get_the_summary_and_who_asks_for_silence_gets_it(folder, monkeypatch, capsys):
+    out = folder.parent / "silent"
+    code, screen, errors = run(monkeypatch, capsys, "adjust", folder, "--out", out, "--json", "--quiet")
+    assert code == 0 and errors == ""
+    assert json.loads(screen) == json.loads((out / "summary.json").read_text())
+    assert run(monkeypatch, capsys, "adjust", folder, "--out", out, "-q") == (0, "", "")
+
+
 def test_version_and_help(monkeypatch, capsys):
     assert run(monkeypatch, capsys, "--version")[1].strip() == f"jaxphoto {jaxphoto.__version__}"
     assert "adjust" in run(monkeypatch, capsys, "--help")[1]

@@ -3,8 +3,12 @@
 import importlib
 import inspect
 import os
+import shlex
 import subprocess
 import sys
+
+import pytest
+import typer
 
 from jaxphoto.cli.app import COMMANDS, app
 
@@ -57,3 +61,21 @@ def test_importing_needs_no_list_of_cores():
     clean = {k: v for k, v in os.environ.items() if k != "XLA_FLAGS"}
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, env=clean)
     assert done.stdout.strip() == "True", done.stderr
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_example_in_the_help_of_a_command_is_one(name):
+    """Its own options take it, and nothing that they need is missing."""
+    words = shlex.split(COMMANDS[name].example)
+    assert words[:2] == ["jaxphoto", name]
+    importlib.import_module(f"jaxphoto.cli.{COMMANDS[name].module}")
+    commands = typer.main.get_command(app).commands
+    assert commands[name].make_context(name, words[2:]).params is not None
+
+
+def test_help_is_short_too_and_ends_with_an_example():
+    _, said = after("compare", "-h")
+    assert "Example: jaxphoto compare results_2025 results_2026" in said and "zrot | rot | spr" in said
+    _, said = after("-h")
+    headings = [said.index(title) for title in ("Adjust and judge", "From photographs", "Lidar", "Files and formats")]
+    assert headings == sorted(headings) and headings[0] < said.index("monte-carlo") < headings[1]

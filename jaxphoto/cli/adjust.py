@@ -42,7 +42,7 @@ def adjust_command(
     block: Annotated[Path, typer.Argument(help="Block folder (see docs/block_folder.md).")],
     out: Annotated[Path, typer.Option(help="Folder for the results; earlier results in it are replaced.")],
     rotations: Annotated[
-        str, typer.Option(help=f"Rotations the correlations mean: {', '.join(EOP_NAMES)}.")
+        str, typer.Option(metavar=" | ".join(EOP_NAMES), help="Rotations that the correlations mean.")
     ] = "omega_phi_kappa",
     snoop: Annotated[
         bool,
@@ -51,12 +51,17 @@ def adjust_command(
         ),
     ] = False,
     robust: Annotated[
-        str | None, typer.Option(help=f"As --snoop, from a robust adjustment with this loss: {', '.join(LOSSES)}.")
+        str | None,
+        typer.Option(metavar=" | ".join(LOSSES), help="As --snoop, from a robust adjustment with this loss."),
     ] = None,
     max_steps: Annotated[int, typer.Option(min=1, help="Most iterations.")] = jaxphoto.MAX_STEPS,
     weights: Annotated[
         str | None, typer.Option(help=f"Estimate variance components, adjust with them: group, or by {_SPLITS}.")
     ] = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print summary.json in place of tables, for other programs.")
+    ] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but warnings and errors.")] = False,
 ) -> None:
     """Adjust a block and write tables, statistics and a report. Exit code 1: written, but the verdict is red."""
     if rotations not in EOP_NAMES:
@@ -66,7 +71,7 @@ def adjust_command(
     splits = None if weights is None else _splits_of(weights)
     check_folder(out, block)
     Thread(target=prepare_pictures, daemon=True).start()
-    console, errors = plain_console(), plain_console(stderr=True)
+    console, errors = plain_console(quiet=quiet or as_json), plain_console(stderr=True, quiet=quiet)
     began = time.perf_counter()
     with errors.status("reading the block") as status:
         read = read_block(block)
@@ -118,6 +123,8 @@ def adjust_command(
     if components:
         print_components(components, console)
     console.print(f"results in {out} (open report.html)")
+    if as_json:
+        typer.echo((out / "summary.json").read_text(encoding="utf-8"), nl=False)
     if verdict.level == Level.ALARM:
         raise typer.Exit(1)
 

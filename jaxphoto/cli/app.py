@@ -15,56 +15,152 @@ import jaxphoto
 
 
 class _Command(NamedTuple):
-    """The module of `jaxphoto.cli` that has a command, and how its docstring begins."""
+    """The module of `jaxphoto.cli` that has a command, how its docstring begins, and how it is called."""
 
     module: str
     sentence: str
+    example: str
 
 
-COMMANDS = {
-    "adjust": _Command("adjust", "Adjust a block and write tables, statistics and a report."),
-    "boresight": _Command("boresight", "Boresight misalignment in four steps."),
-    "calibrate": _Command("calibrate", "Calibrate a camera with photographs of a board."),
-    "orient": _Command("orient", "Orient photographs to one another from their features alone."),
-    "fly": _Command("fly", "Calibrate the camera of a flight from its photographs and their positions."),
-    "control": _Command(
-        "control", "Adjust an oriented block with control: surveyed points and where photographs show them."
-    ),
-    "certificate": _Command("certificate", "Write the certificate of a calibration."),
-    "models": _Command(
-        "model_choice", "Compare distortion models by cross-validation, information criteria and significance."
-    ),
-    "stability": _Command("stability", "Compare the bundles of rays of two interior orientations."),
-    "compare": _Command("compare", "Test whether a camera has changed between two calibrations."),
-    "combine": _Command("combine", "Combine calibrations of one camera by their full covariances."),
-    "halves": _Command("halves", "Judge the standard deviations of a calibration by random halves of its block."),
-    "camera": _Command("camera", "Convert a camera file."),
-    "tables": _Command("tables", "Write tables of results as CSV, Parquet, Markdown or LaTeX."),
-    "convert": _Command(
-        "convert",
-        "Turn another program's files into a block folder, or what was adjusted into files of others.",
-    ),
-    "undistort": _Command("undistort", "Resample photographs to a camera without distortion."),
-    "example": _Command("example", "Write an example block, recipe or experiment that comes with jaxphoto."),
-    "simulate": _Command("simulate", "Simulate a block with known truth."),
-    "sensitivity": _Command(
-        "sensitivity",
-        "Exact sensitivity of the interior orientation and the check points to stations, and to undetected errors.",
-    ),
-    "monte-carlo": _Command("monte_carlo", "Re-adjust a block with drawn errors."),
-    "lidar-control": _Command("lidar", "Give tie points the height of the laser points there as control."),
-    "roof-control": _Command("lidar", "Hold tie points on the planes of roof faces."),
-    "simultaneous": _Command("lidar", "Adjust a block and a cloud together."),
-    "strips": _Command("strips", "Fit the strips of a cloud to each other."),
-    "dsm": _Command("surface_model", "Make a surface model of a cloud."),
-    "orthophoto": _Command(
-        "surface_model", "Adjust a block, and lay the photograph of one of its images over a surface model."
-    ),
-    "experiment": _Command(
-        "experiment", "Run experiments; write tables.csv and report.html, ours beside what the paper prints."
-    ),
+_CONTENTS = {
+    "Adjust and judge": {
+        "adjust": _Command(
+            "adjust", "Adjust a block and write tables, statistics and a report.", "jaxphoto adjust BLOCK --out results"
+        ),
+        "boresight": _Command(
+            "boresight", "Boresight misalignment in four steps.", "jaxphoto boresight BLOCK --out boresight"
+        ),
+        "certificate": _Command(
+            "certificate", "Write the certificate of a calibration.", "jaxphoto certificate results --out camera.pdf"
+        ),
+        "tables": _Command(
+            "tables",
+            "Write tables of results as CSV, Parquet, Markdown or LaTeX.",
+            "jaxphoto tables results --to latex --only interior --out tables",
+        ),
+        "monte-carlo": _Command(
+            "monte_carlo",
+            "Re-adjust a block with drawn errors.",
+            "jaxphoto monte-carlo BLOCK --bias station --per strip --sigma-m 0.15 --draws 1000 --out draws",
+        ),
+        "sensitivity": _Command(
+            "sensitivity",
+            "Exact sensitivity of the interior orientation and the check points to stations, and to undetected errors.",
+            "jaxphoto sensitivity BLOCK --out sensitivity",
+        ),
+        "halves": _Command(
+            "halves",
+            "Judge the standard deviations of a calibration by random halves of its block.",
+            "jaxphoto halves BLOCK --by image --cuts 64 --out halves",
+        ),
+    },
+    "From photographs": {
+        "fly": _Command(
+            "fly",
+            "Calibrate the camera of a flight from its photographs and their positions.",
+            "jaxphoto fly photographs --out flight",
+        ),
+        "control": _Command(
+            "control",
+            "Adjust an oriented block with control: surveyed points and where photographs show them.",
+            "jaxphoto control flight/block gcp_list.txt --out controlled",
+        ),
+        "calibrate": _Command(
+            "calibrate",
+            "Calibrate a camera with photographs of a board.",
+            "jaxphoto calibrate board/*.jpg --board chessboard:8x6:square_mm=30 --out camera",
+        ),
+        "orient": _Command(
+            "orient",
+            "Orient photographs to one another from their features alone.",
+            "jaxphoto orient photographs/*.jpg --out BLOCK",
+        ),
+        "undistort": _Command(
+            "undistort",
+            "Resample photographs to a camera without distortion.",
+            "jaxphoto undistort photographs --camera results --out straight",
+        ),
+    },
+    "Cameras compared": {
+        "stability": _Command(
+            "stability",
+            "Compare the bundles of rays of two interior orientations.",
+            "jaxphoto stability camera_2025 camera_2026 --out stability",
+        ),
+        "compare": _Command(
+            "compare",
+            "Test whether a camera has changed between two calibrations.",
+            "jaxphoto compare results_2025 results_2026",
+        ),
+        "combine": _Command(
+            "combine",
+            "Combine calibrations of one camera by their full covariances.",
+            "jaxphoto combine 2023 2024 2025 --out camera.toml",
+        ),
+        "models": _Command(
+            "model_choice",
+            "Compare distortion models by cross-validation, information criteria and significance.",
+            "jaxphoto models BLOCK --models brown:k1,brown:k1+k2,opencv --out models",
+        ),
+    },
+    "Lidar": {
+        "lidar-control": _Command(
+            "lidar",
+            "Give tie points the height of the laser points there as control.",
+            "jaxphoto lidar-control BLOCK CLOUD.laz --out BLOCK2 --class 2,6",
+        ),
+        "roof-control": _Command(
+            "lidar",
+            "Hold tie points on the planes of roof faces.",
+            "jaxphoto roof-control BLOCK CLOUD.laz --out BLOCK2",
+        ),
+        "simultaneous": _Command(
+            "lidar",
+            "Adjust a block and a cloud together.",
+            "jaxphoto simultaneous BLOCK CLOUD.laz --trajectory flight.csv --out both",
+        ),
+        "strips": _Command(
+            "strips",
+            "Fit the strips of a cloud to each other.",
+            "jaxphoto strips CLOUD.laz --trajectory flight.csv --out strips",
+        ),
+        "dsm": _Command(
+            "surface_model",
+            "Make a surface model of a cloud.",
+            "jaxphoto dsm CLOUD.laz --out dsm.tif --cell-m 1.0 --hillshade hill.png",
+        ),
+        "orthophoto": _Command(
+            "surface_model",
+            "Adjust a block, and lay the photograph of one of its images over a surface model.",
+            "jaxphoto orthophoto BLOCK photo.jpg dsm.tif --image A1 --out ortho.tif",
+        ),
+    },
+    "Files and formats": {
+        "convert": _Command(
+            "convert",
+            "Turn another program's files into a block folder, or what was adjusted into files of others.",
+            "jaxphoto convert SOURCE BLOCK",
+        ),
+        "camera": _Command("camera", "Convert a camera file.", "jaxphoto camera results cameras.txt"),
+    },
+    "Examples and simulation": {
+        "example": _Command(
+            "example",
+            "Write an example block, recipe or experiment that comes with jaxphoto.",
+            "jaxphoto example cross_block",
+        ),
+        "simulate": _Command(
+            "simulate", "Simulate a block with known truth.", "jaxphoto simulate recipe.toml --out BLOCK --seed 1"
+        ),
+        "experiment": _Command(
+            "experiment",
+            "Run experiments; write tables.csv and report.html, ours beside what the paper prints.",
+            "jaxphoto experiment 000 --layouts 4 --out runs",
+        ),
+    },
 }
-"""All commands in the order of `jaxphoto --help`: what they are about in one line each."""
+COMMANDS = {name: command for commands in _CONTENTS.values() for name, command in commands.items()}
+"""All commands in the order of `jaxphoto --help`: what they are about in one line each, and how they are called."""
 
 
 class _WhenCalled(TyperGroup):
@@ -78,12 +174,15 @@ class _WhenCalled(TyperGroup):
             gc.freeze()
             # Made anew, the group has what the module has just registered.
             self.commands = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+            self.commands[args[0]].epilog = f"Example: {COMMANDS[args[0]].example}"
         return super().resolve_command(ctx, args)
 
 
 app = typer.Typer(
     cls=_WhenCalled,
     help="Differentiable photogrammetry: calibrate a camera as it flies.",
+    epilog="Begin with: jaxphoto example cross_block, then jaxphoto adjust cross_block --out results",
+    context_settings={"help_option_names": ["-h", "--help"]},
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -103,5 +202,6 @@ def _in_its_module() -> None:
     """Stands in the list for a command whose module is not imported yet."""
 
 
-for _name, _known in COMMANDS.items():
-    app.command(_name, help=_known.sentence)(_in_its_module)
+for _title, _commands in _CONTENTS.items():
+    for _name, _known in _commands.items():
+        app.command(_name, help=_known.sentence, rich_help_panel=_title)(_in_its_module)

@@ -20,7 +20,7 @@ def compare_command(
     first: Annotated[Path, typer.Argument(metavar="A", help="Results or camera file of one calibration.")],
     second: Annotated[Path, typer.Argument(metavar="B", help="The same of the other, by other photographs.")],
     method: Annotated[
-        str, typer.Option(help=f"What the orientation of images may take up: {', '.join(METHODS)}.")
+        str, typer.Option(metavar=" | ".join(METHODS), help="What the orientation of images may take up.")
     ] = "rot",
     grid: Annotated[str, typer.Option(help="Columns and rows of the grid.")] = "15x11",
     extent: Annotated[

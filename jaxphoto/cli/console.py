@@ -39,9 +39,9 @@ class _PlainConsole(Console):
         return PlainStatus(status, console=self, **options)
 
 
-def plain_console(*, stderr: bool = False) -> Console:
-    """A console that prints names as they are: what is markup of rich's in them stays text."""
-    return _PlainConsole(stderr=stderr, markup=False, highlight=False, emoji=False)
+def plain_console(*, stderr: bool = False, quiet: bool = False) -> Console:
+    """A console that prints names as they are: what is markup of rich's in them stays text. Or nothing, if `quiet`."""
+    return _PlainConsole(stderr=stderr, markup=False, highlight=False, emoji=False, quiet=quiet)
 
 
 def _plain(text: RenderableType) -> RenderableType:

@@ -26,7 +26,7 @@ def halves_command(
     cuts: Annotated[int, typer.Option(min=1, help="Times that the block is cut.")] = CUTS,
     seed: Annotated[int, typer.Option(min=0, help="Of the draw of the cuts.")] = 0,
     method: Annotated[
-        str, typer.Option(help=f"What the orientation of images may take up: {', '.join(METHODS)}.")
+        str, typer.Option(metavar=" | ".join(METHODS), help="What the orientation of images may take up.")
     ] = "rot",
     grid: Annotated[str, typer.Option(help="Columns and rows of cells.")] = "15x11",
     extent: Annotated[

@@ -49,7 +49,7 @@ SigmaZ = Annotated[float, typer.Option(help="Standard deviation of a laser point
 SigmaXY = Annotated[float, typer.Option(help="Standard deviation of a laser point's X, and of its Y.")]
 Systematic = Annotated[float, typer.Option(help="Standard deviation of what all its heights are off by.")]
 Rounds = Annotated[int, typer.Option(min=1, help="Most rounds of looking at the cloud and adjusting.")]
-Method = Annotated[str, typer.Option(help=f"How heights follow from laser points: {', '.join(METHODS)}.")]
+Method = Annotated[str, typer.Option(metavar=" | ".join(METHODS), help="How heights follow from laser points.")]
 
 
 @app.command("lidar-control")

@@ -21,7 +21,7 @@ from jaxphoto.writing import check_folder
 def stability_command(
     first: Annotated[Path, typer.Argument(metavar="A", help="Results, interior.csv or camera file of one set.")],
     second: Annotated[Path, typer.Argument(metavar="B", help="The same of the other set.")],
-    method: Annotated[str, typer.Option(help=f"Alignment that the verdict is of: {', '.join(METHODS)}.")] = "rot",
+    method: Annotated[str, typer.Option(metavar=" | ".join(METHODS), help="Alignment that the verdict is of.")] = "rot",
     grid: Annotated[str, typer.Option(help="Columns and rows of the grid.")] = "15x11",
     extent: Annotated[
         str | None, typer.Option(help="Width and height of the grid in mm, such as 4.0x3.0; the format if not given.")

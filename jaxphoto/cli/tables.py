@@ -15,7 +15,7 @@ from jaxphoto.writing import check_folder, whole_folder
 @app.command("tables")
 def tables_command(
     results: Annotated[Path, typer.Argument(help="Folder of results, such as adjust writes.")],
-    to: Annotated[str, typer.Option(help=f"Format: {', '.join(TABLE_FORMATS)}.")],
+    to: Annotated[str, typer.Option(metavar=" | ".join(TABLE_FORMATS), help="Format.")],
     out: Annotated[Path, typer.Option(help="Folder for the tables; earlier ones in it are replaced.")],
     only: Annotated[
         str, typer.Option(help="Which tables, with commas between, such as interior,exterior; all if not given.")
