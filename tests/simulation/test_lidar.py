@@ -238,7 +238,7 @@ def test_photographs_have_the_errors_of_the_trajectory_that_they_share_with_the_
     np.testing.assert_allclose(body, poses.object_from_body, rtol=0, atol=1e-6)
     # Everything else is that of a flight whose stations know nothing of the scanner's errors.
     np.testing.assert_array_equal(block.image_points.xy, alone.block.image_points.xy)
-    np.testing.assert_array_equal(flight.cloud.xyz, alone.cloud.xyz)
+    np.testing.assert_allclose(flight.cloud.xyz, alone.cloud.xyz, rtol=0, atol=1e-6)
     off = np.reshape(block.stations.value - alone.block.stations.value, (-1, 3))
     at = [flight.errors.at(k, time[3 * k : 3 * k + 3])[0] for k in (0, 1)]
     np.testing.assert_allclose(off, np.concatenate(at), rtol=0, atol=1e-9)
