@@ -2,6 +2,7 @@
 
 import importlib.util
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -55,3 +56,14 @@ def test_the_site_is_built_without_a_warning(tmp_path):
     assert {"index.html", "conventions.html", "reference/procedures.html"} <= pages
     assert len([page for page in pages if page.startswith("notebooks/")]) == len(list(ROOT.glob("notebooks/*.ipynb")))
     assert "jaxphoto.procedures.adjust.adjust" in (tmp_path / "site" / "reference" / "procedures.html").read_text()
+
+
+def test_functions_of_the_papers_are_there():
+    page = (ROOT / "docs" / "papers.md").read_text(encoding="utf-8")
+    names = re.findall(r"`jaxphoto\.([\w.]+)`", page)
+    assert len(names) > 15
+    for name in names:
+        *rooms, last = name.split(".")
+        # A room is imported when it is asked for, and a name of the top from its own room.
+        room = importlib.import_module(".".join(["jaxphoto", *rooms]))
+        assert hasattr(room, last), name
