@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Int
-from scipy.sparse import csr_array
 
 # Matches that are looked at together.
 _AT_ONCE = 200_000
@@ -110,6 +109,9 @@ def _edges(first: np.ndarray, pairs: list[PairMatches]) -> Int[np.ndarray, "edge
 
 def _support(edges: np.ndarray, n: int) -> Int[np.ndarray, "edges"]:
     """How many third features both ends of each match are matched to: the triangles of the graph over it."""
+    # SciPy takes a quarter of a second to import, and few orient photographs.
+    from scipy.sparse import csr_array
+
     both = np.concatenate([edges, edges[:, ::-1]])
     matched = csr_array((np.ones(len(both), np.int32), (both[:, 0], both[:, 1])), (n, n))
     # Of a match that is there twice.

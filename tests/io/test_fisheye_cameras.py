@@ -113,7 +113,7 @@ def test_a_perspective_camera_stays_one(tmp_path):
 def test_a_format_of_planes_refuses_a_fisheye_and_names_those_that_have_one(tmp_path, c_mm):
     wide = InteriorOrientation(c_mm, 0.0, 0.0, projection=Equidistant())
     with pytest.raises(
-        InputError, match=r"a\.txt: cameras of smac are perspective.* one of opencv, colmap, agisoft, bl"
+        InputError, match=r"a\.txt: cameras of smac are perspective.* one of opencv, colmap, agisoft, ros, bl"
     ):
         write_camera_file(tmp_path / "a.txt", SENSOR, wide)
     assert not (tmp_path / "a.txt").exists()
