@@ -110,10 +110,10 @@ def _edges(first: np.ndarray, pairs: list[PairMatches]) -> Int[np.ndarray, "edge
 def _support(edges: np.ndarray, n: int) -> Int[np.ndarray, "edges"]:
     """How many third features both ends of each match are matched to: the triangles of the graph over it."""
     # SciPy takes a quarter of a second to import, and few orient photographs.
-    from scipy.sparse import csr_array
+    from scipy.sparse import csr_matrix
 
     both = np.concatenate([edges, edges[:, ::-1]])
-    matched = csr_array((np.ones(len(both), np.int32), (both[:, 0], both[:, 1])), (n, n))
+    matched = csr_matrix((np.ones(len(both), np.int32), (both[:, 0], both[:, 1])), (n, n))
     # Of a match that is there twice.
     matched.data[:] = 1
     found = [np.zeros(0, int)]
