@@ -14,8 +14,7 @@ from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).resolve().parents[2]
-_REPOSITORY = "https://github.com/jaxphoto/jaxphoto/blob/main/"
-_LINK = re.compile(r"\]\(\.\./([^)#]+)(#[^)]*)?\)")
+_LINK = re.compile(r"\[([^\]]*)\]\(\.\./([^)#]+)(#[^)]*)?\)")
 
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
@@ -49,13 +48,13 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Links out of docs/: to a notebook on the site, or to the file in the repository."""
+    """Links out of docs/: to a notebook on the site; of another file of the repository its place."""
 
     def linked(match: re.Match[str]) -> str:
-        target, place = match.group(1), match.group(2) or ""
+        text, target, place = match.group(1), match.group(2), match.group(3) or ""
         if not (ROOT / target).exists():
             raise ValueError(f"{page.file.src_uri} links to ../{target}, which is not there")
-        return f"]({target if target.startswith('notebooks/') else _REPOSITORY + target}{place})"
+        return f"[{text}]({target}{place})" if target.startswith("notebooks/") else f"{text} (`{target}`)"
 
     return _LINK.sub(linked, markdown)
 
