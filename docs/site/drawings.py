@@ -82,39 +82,23 @@ def frames() -> plt.Figure:
 
 def camera_angles() -> plt.Figure:
     """omega, phi and kappa, each alone and positive."""
-    figure, panels = plt.subplots(1, 3, figsize=(9, 3.2))
-    # The axis one looks along from its end, what is drawn to the right and upwards, and names.
     views = (
-        ("omega > 0", 0, 1, 2, "seen from the end of X (east)"),
-        ("phi > 0", 1, 0, 2, "seen from the end of -Y (south)"),
-        ("kappa > 0", 2, 0, 1, "seen from above"),
+        ("omega > 0\nseen from the end of X (east)", 0, 1, 2),
+        ("phi > 0\nseen from the end of -Y (south)", 1, 0, 2),
+        ("kappa > 0\nseen from above", 2, 0, 1),
     )
-    for k, (panel, (title, _, right, up, seen)) in enumerate(zip(panels, views, strict=True)):
-        angles = np.zeros(3)
-        angles[k] = np.deg2rad(_TURN_DEG)
-        rows = np.asarray(matrix_from_omega_phi_kappa(angles))
-        _turned(panel, rows, right, up, ("x", "y", "z"), ("X", "Y", "Z"), f"{title}\n{seen}")
-    figure.tight_layout()
-    return figure
+    return _panels(views, matrix_from_omega_phi_kappa, ("x", "y", "z"), ("X", "Y", "Z"))
 
 
 def body_angles() -> plt.Figure:
     """roll, pitch and yaw, each alone and positive; object frame with north ahead."""
-    figure, panels = plt.subplots(1, 3, figsize=(9, 3.2))
     views = (
-        ("roll > 0: right wing down", 0, 0, 2, "seen from behind"),
-        ("pitch > 0: nose up", 1, 1, 2, "seen from the right"),
-        ("yaw > 0: clockwise from north", 2, 0, 1, "seen from above"),
+        ("roll > 0: right wing down\nseen from behind", 0, 0, 2),
+        ("pitch > 0: nose up\nseen from the right", 1, 1, 2),
+        ("yaw > 0: clockwise from north\nseen from above", 2, 0, 1),
     )
-    for panel, (title, angle, right, up, seen) in zip(panels, views, strict=True):
-        angles = np.zeros(3)
-        angles[angle] = np.deg2rad(_TURN_DEG)
-        columns = np.asarray(matrix_from_roll_pitch_yaw(angles))
-        _turned(
-            panel, columns.T, right, up, ("right", "forward", "up"), ("X east", "Y north", "Z up"), f"{title}\n{seen}"
-        )
-    figure.tight_layout()
-    return figure
+    rows = lambda angles: matrix_from_roll_pitch_yaw(angles).T  # noqa: E731
+    return _panels(views, rows, ("right", "forward", "up"), ("X east", "Y north", "Z up"))
 
 
 def image_coordinates() -> plt.Figure:
@@ -168,18 +152,23 @@ def image_coordinates() -> plt.Figure:
 
 def boresight() -> plt.Figure:
     """The three angles of the boresight, each positive; the camera's x axis forward, level flight to the north."""
-    figure, panels = plt.subplots(1, 3, figsize=(9, 3.2))
     views = (
-        ("b_x > 0", 1, 2, "seen from ahead, the end of x"),
-        ("b_y > 0", 0, 2, "seen from the right"),
-        ("b_z > 0", 0, 1, "seen from above"),
+        ("b_x > 0\nseen from ahead, the end of x", 0, 1, 2),
+        ("b_y > 0\nseen from the right", 1, 0, 2),
+        ("b_z > 0\nseen from above", 2, 0, 1),
     )
     nominal = np.asarray(_oriented(Mount(np.zeros(3), np.zeros(3))).camera_from_object)
-    for k, (panel, (title, right, up, seen)) in enumerate(zip(panels, views, strict=True)):
+    rows = lambda angles: _oriented(Mount(np.zeros(3), angles)).camera_from_object @ nominal.T  # noqa: E731
+    return _panels(views, rows, ("x", "y", "z"), ("nominal x", "nominal y", "nominal z"))
+
+
+def _panels(views, rows_of, names, fixed) -> plt.Figure:
+    """A panel for each angle, alone and positive: its title, its number, and which axes lie to the right and up."""
+    figure, panels = plt.subplots(1, 3, figsize=(9, 3.2))
+    for panel, (title, angle, right, up) in zip(panels, views, strict=True):
         angles = np.zeros(3)
-        angles[k] = np.deg2rad(_TURN_DEG)
-        rows = np.asarray(_oriented(Mount(np.zeros(3), angles)).camera_from_object) @ nominal.T
-        _turned(panel, rows, right, up, ("x", "y", "z"), ("nominal x", "nominal y", "nominal z"), f"{title}\n{seen}")
+        angles[angle] = np.deg2rad(_TURN_DEG)
+        _turned(panel, np.asarray(rows_of(angles)), right, up, names, fixed, title)
     figure.tight_layout()
     return figure
 

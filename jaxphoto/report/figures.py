@@ -6,6 +6,7 @@ block has one camera.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from jaxphoto.block import one_camera
@@ -30,25 +31,25 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
+def _drawn(draw: Callable[[Axes, Tables, str], object], tables: Tables, camera: str | None, axes: Axes | None) -> Axes:
+    axes = axes_or_new(axes)
+    draw(axes, tables, one_camera(tables.adjusted.block, camera))
+    return axes
+
+
 def plot_residuals(tables: Tables, camera: str | None = None, axes: Axes | None = None) -> Axes:
     """Image residuals over the format of a camera, all images together."""
-    axes = axes_or_new(axes)
-    draw_residuals(axes, tables, one_camera(tables.adjusted.block, camera))
-    return axes
+    return _drawn(draw_residuals, tables, camera, axes)
 
 
 def plot_mean_residuals(tables: Tables, camera: str | None = None, axes: Axes | None = None) -> Axes:
     """Means of the residuals by cell of the format: what all images have in common."""
-    axes = axes_or_new(axes)
-    draw_mean_residuals(axes, tables, one_camera(tables.adjusted.block, camera))
-    return axes
+    return _drawn(draw_mean_residuals, tables, camera, axes)
 
 
 def plot_density(tables: Tables, camera: str | None = None, axes: Axes | None = None) -> Axes:
     """How many image points lie in each cell of the format."""
-    axes = axes_or_new(axes)
-    draw_density(axes, tables, one_camera(tables.adjusted.block, camera))
-    return axes
+    return _drawn(draw_density, tables, camera, axes)
 
 
 def plot_check_points(tables: Tables, axes: Axes | None = None, *, upright: bool = False) -> Axes:
@@ -65,16 +66,12 @@ def plot_check_points(tables: Tables, axes: Axes | None = None, *, upright: bool
 
 def plot_interior_correlation(tables: Tables, camera: str | None = None, axes: Axes | None = None) -> Axes:
     """Correlation of the interior orientation with itself."""
-    axes = axes_or_new(axes)
-    draw_interior_correlation(axes, tables, one_camera(tables.adjusted.block, camera))
-    return axes
+    return _drawn(draw_interior_correlation, tables, camera, axes)
 
 
 def plot_exterior_correlation(tables: Tables, camera: str | None = None, axes: Axes | None = None) -> Axes:
     """Mean absolute correlation of exterior and interior orientation over the images."""
-    axes = axes_or_new(axes)
-    draw_exterior_correlation(axes, tables, one_camera(tables.adjusted.block, camera))
-    return axes
+    return _drawn(draw_exterior_correlation, tables, camera, axes)
 
 
 def plot_sigma_map(

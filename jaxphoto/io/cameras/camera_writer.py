@@ -36,7 +36,7 @@ _FORMATS = {
     "opencv": _WriteFormat(write_open_cv, open_cv.PLANE, open_cv.FISHEYE, (".yml", ".yaml", ".json")),
     "colmap": _WriteFormat(write_colmap, colmap.PLANE, colmap.FISHEYE, ()),
     "agisoft": _WriteFormat(agisoft.write_agisoft, agisoft.PLANE, agisoft.FISHEYE, (".xml",)),
-    "mrcal": _WriteFormat(mrcal.write_mrcal, mrcal.PLANE, None, (".cameramodel",)),
+    "mrcal": _WriteFormat(mrcal.write_mrcal, open_cv.PLANE, None, (".cameramodel",)),
     "ros": _WriteFormat(open_cv.write_ros, open_cv.PLANE, open_cv.FISHEYE, ()),
     "smac": _WriteFormat(write_smac_report, CameraModel(Smac, (), Perspective()), None, (".txt", ".rpt")),
     "block": _WriteFormat(write_block_camera, None, None, (".toml",)),

@@ -11,12 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxphoto.camera import InteriorOrientation, OpenCv, Perspective, Sensor
+from jaxphoto.camera import InteriorOrientation, Sensor
 from jaxphoto.errors import quoted
-from jaxphoto.io.cameras.camera_file import CameraFile, CameraModel, CameraSource, from_centre_px, in_pixels
+from jaxphoto.io.cameras.camera_file import CameraFile, CameraSource, from_centre_px, in_pixels
+from jaxphoto.io.cameras.open_cv import ORDER, PLANE
 
-PLANE = CameraModel(OpenCv, ("b2",), Perspective())
-_ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _PLACES = 4
 # Of each model the number of coefficients; those beyond k6 are of a thin prism.
 _MODELS = {"LENSMODEL_PINHOLE": 0} | {f"LENSMODEL_OPENCV{n}": n for n in (4, 5, 8, 12)}
@@ -42,11 +41,11 @@ def read_mrcal(source: CameraSource) -> CameraFile:
     if not isinstance(model, str) or model not in _MODELS:
         raise source.error(f"the lens model {quoted(model)} is not known here; known are {', '.join(_MODELS)}")
     numbers = _numbers(source, values, "intrinsics", _PLACES + _MODELS[model])
-    if np.any(numbers[_PLACES + len(_ORDER) :] != 0):
+    if np.any(numbers[_PLACES + len(ORDER) :] != 0):
         raise source.error("its terms of a thin prism are not known here; calibrate with LENSMODEL_OPENCV8")
     sensor, assumed = source.sensor(*_numbers(source, values, "imagersize", 2).tolist())
     fx, fy, cx, cy = numbers[:_PLACES].tolist()
-    named = dict(zip(_ORDER, numbers[_PLACES:].tolist(), strict=False))
+    named = dict(zip(ORDER, numbers[_PLACES:].tolist(), strict=False))
     interior = in_pixels(source, sensor, fx, fy, (cx + 0.5, cy + 0.5), PLANE, **named)
     return CameraFile(source.path.stem, sensor, interior, None, assumed)
 
@@ -54,7 +53,7 @@ def read_mrcal(source: CameraSource) -> CameraFile:
 def write_mrcal(path: Path, name: str, sensor: Sensor, interior: InteriorOrientation) -> None:
     """Write a camera that is a `PLANE`, by the smallest model that holds it, at the origin."""
     fx, fy, column, row = from_centre_px(interior, sensor)
-    coefficients = [float(getattr(interior.distortion, k)) for k in _ORDER]
+    coefficients = [float(getattr(interior.distortion, k)) for k in ORDER]
     model = next(m for m, n in _MODELS.items() if not any(coefficients[n:]))
     values = [fx, fy, column - 0.5, row - 0.5, *coefficients[: _MODELS[model]]]
     lines = [

@@ -24,7 +24,8 @@ from jaxphoto.io.cameras.camera_file import (
     joined_notes,
 )
 
-_ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+"""Its coefficients, as its files list them."""
 _COUNTS = (4, 5, 8, 12, 14)
 _FISHEYE_ORDER = ("k1", "k2", "k3", "k4")
 # What ROS calls them (sensor_msgs/CameraInfo).
@@ -85,7 +86,7 @@ def write_open_cv(path: Path, name: str, sensor: Sensor, interior: InteriorOrien
     fx, fy, column, row = from_centre_px(interior, sensor)
     d = interior.distortion
     fisheye = isinstance(d, OpenCvFisheye)
-    values = [float(getattr(d, k)) for k in (_FISHEYE_ORDER if fisheye else _ORDER)]
+    values = [float(getattr(d, k)) for k in (_FISHEYE_ORDER if fisheye else ORDER)]
     coefficients = np.array(values if any(values[5:]) else values[:5])
     storage = cv2.FileStorage(path.name, cv2.FileStorage_WRITE | cv2.FileStorage_MEMORY)
     storage.write("image_width", sensor.width_px)
@@ -102,7 +103,7 @@ def write_ros(path: Path, name: str, sensor: Sensor, interior: InteriorOrientati
     fx, fy, column, row = from_centre_px(interior, sensor)
     d = interior.distortion
     fisheye = isinstance(d, OpenCvFisheye)
-    values = [float(getattr(d, k)) for k in (_FISHEYE_ORDER if fisheye else _ORDER)]
+    values = [float(getattr(d, k)) for k in (_FISHEYE_ORDER if fisheye else ORDER)]
     rational = not fisheye and any(values[5:])
     model = _ROS_FISHEYE if fisheye else _ROS_PLANES[rational]
     matrix = [fx, 0.0, column - 0.5, 0.0, fy, row - 0.5, 0.0, 0.0, 1.0]
@@ -150,11 +151,11 @@ def _camera(source: CameraSource, storage: cv2.FileStorage) -> CameraFile:
     if len(coefficients) not in _COUNTS:
         counts = ", ".join(map(str, _COUNTS))
         raise source.error(f"there are {len(coefficients)} distortion_coefficients; OpenCV has one of {counts}")
-    if np.any(coefficients[len(_ORDER) :] != 0):
+    if np.any(coefficients[len(ORDER) :] != 0):
         raise source.error("its terms of a thin prism or a tilted sensor are not known here; calibrate without them")
     sensor, assumed = source.sensor(*_size(source, storage))
     (fx, _, cx), (_, fy, cy), _ = matrix.tolist()
-    named = dict(zip(_FISHEYE_ORDER if fisheye else _ORDER, coefficients.tolist(), strict=False))
+    named = dict(zip(_FISHEYE_ORDER if fisheye else ORDER, coefficients.tolist(), strict=False))
     model = FISHEYE if fisheye else PLANE
     interior = in_pixels(source, sensor, fx, fy, (cx + 0.5, cy + 0.5), model, **named)
     rms = _number(storage, "avg_reprojection_error")

@@ -22,17 +22,16 @@ import numpy as np
 from pyproj import CRS
 from pyproj.exceptions import CRSError
 
-from jaxphoto.camera import Agisoft, Perspective
 from jaxphoto.errors import InputError, quoted
 from jaxphoto.io.block_folder import BlockTables
-from jaxphoto.io.cameras.camera_file import CameraModel, CameraSource, in_pixels
+from jaxphoto.io.cameras.agisoft import PLANE
+from jaxphoto.io.cameras.camera_file import CameraSource, in_pixels
 from jaxphoto.io.reconstructions.numbers import number_rows
 from jaxphoto.io.reconstructions.tied_photographs import TiedCamera, TiedPhotographs, free_network
 from jaxphoto.io.whole_text import LARGE, read_whole
 
 _ROOT = "<BlocksExchange"
 _FIRST_PX = 0.5
-_MODEL = CameraModel(Agisoft, (), Perspective())
 _COEFFICIENTS = ("k1", "k2", "k3", "p1", "p2")
 _MATRIX = [f"M_{row}{column}" for row in range(3) for column in range(3)]
 # Camera axes: the signs of y and z by which they are x right, y down, z ahead.
@@ -227,5 +226,5 @@ def _camera(source: CameraSource, name: str, group: ElementTree.Element) -> Tied
     middle = (width / 2 - _FIRST_PX, height / 2 - _FIRST_PX)
     centre = [number(f"PrincipalPoint/{axis}", at) + _FIRST_PX for axis, at in zip("xy", middle, strict=True)]
     values = {key: number(f"Distortion/{key.upper()}", 0.0) for key in _COEFFICIENTS}
-    interior = in_pixels(source, sensor, focal, focal, (centre[0], centre[1]), _MODEL, **values)
+    interior = in_pixels(source, sensor, focal, focal, (centre[0], centre[1]), PLANE, **values)
     return TiedCamera(sensor, interior, ("c_mm", "xp_mm", "yp_mm", *_COEFFICIENTS))

@@ -16,11 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from jaxphoto.camera import Equidistant, OpenCv, OpenCvFisheye, Perspective
 from jaxphoto.errors import InputError, quoted
 from jaxphoto.io.block_folder import BlockTables
 from jaxphoto.io.block_folder.section import Section
 from jaxphoto.io.cameras.camera_file import CameraModel, CameraSource, in_pixels
+from jaxphoto.io.cameras.open_cv import FISHEYE, PLANE
 from jaxphoto.io.json_file import read_any_json
 from jaxphoto.io.reconstructions.numbers import number_rows
 from jaxphoto.io.reconstructions.tied_photographs import TiedCamera, TiedPhotographs, free_network
@@ -29,14 +29,13 @@ from jaxphoto.io.whole_text import LARGE
 FILE = "sfm_data.json"
 _KEYS = ("views", "intrinsics", "extrinsics", "structure")
 _FIRST_PX = 0.5
-_PLANE, _FISHEYE = CameraModel(OpenCv, (), Perspective()), CameraModel(OpenCvFisheye, (), Equidistant())
 # Of each kind of camera: what it is here, where its coefficients stand, and which they are.
 _KINDS: dict[str, tuple[CameraModel, str, tuple[str, ...]]] = {
-    "pinhole": (_PLANE, "", ()),
-    "pinhole_radial_k1": (_PLANE, "disto_k1", ("k1",)),
-    "pinhole_radial_k3": (_PLANE, "disto_k3", ("k1", "k2", "k3")),
-    "pinhole_brown_t2": (_PLANE, "disto_t2", ("k1", "k2", "k3", "p1", "p2")),
-    "fisheye": (_FISHEYE, "fisheye", ("k1", "k2", "k3", "k4")),
+    "pinhole": (PLANE, "", ()),
+    "pinhole_radial_k1": (PLANE, "disto_k1", ("k1",)),
+    "pinhole_radial_k3": (PLANE, "disto_k3", ("k1", "k2", "k3")),
+    "pinhole_brown_t2": (PLANE, "disto_t2", ("k1", "k2", "k3", "p1", "p2")),
+    "fisheye": (FISHEYE, "fisheye", ("k1", "k2", "k3", "k4")),
 }
 
 

@@ -18,11 +18,11 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
-from jaxphoto.camera import Equidistant, OpenCv, OpenCvFisheye, Perspective
 from jaxphoto.errors import InputError, quoted
 from jaxphoto.io.block_folder import BlockTables
 from jaxphoto.io.block_folder.section import Section
-from jaxphoto.io.cameras.camera_file import CameraModel, CameraSource, in_pixels
+from jaxphoto.io.cameras.camera_file import CameraSource, in_pixels
+from jaxphoto.io.cameras.open_cv import FISHEYE, PLANE
 from jaxphoto.io.json_file import read_any_json
 from jaxphoto.io.reconstructions.numbers import number_rows
 from jaxphoto.io.reconstructions.tied_photographs import TiedCamera, TiedPhotographs, free_network
@@ -30,15 +30,14 @@ from jaxphoto.io.whole_text import LARGE, read_text
 
 RECONSTRUCTION, TRACKS = "reconstruction.json", "tracks.csv"
 _VERSION = "OPENSFM_TRACKS_VERSION_"
-_PLANE, _FISHEYE = CameraModel(OpenCv, (), Perspective()), CameraModel(OpenCvFisheye, (), Equidistant())
 # Of each kind of camera: what it is here, and the coefficients it has.
 _KINDS = {
-    "perspective": (_PLANE, ("k1", "k2")),
-    "simple_radial": (_PLANE, ("k1",)),
-    "radial": (_PLANE, ("k1", "k2")),
-    "brown": (_PLANE, ("k1", "k2", "k3", "p1", "p2")),
-    "fisheye": (_FISHEYE, ("k1", "k2")),
-    "fisheye_opencv": (_FISHEYE, ("k1", "k2", "k3", "k4")),
+    "perspective": (PLANE, ("k1", "k2")),
+    "simple_radial": (PLANE, ("k1",)),
+    "radial": (PLANE, ("k1", "k2")),
+    "brown": (PLANE, ("k1", "k2", "k3", "p1", "p2")),
+    "fisheye": (FISHEYE, ("k1", "k2")),
+    "fisheye_opencv": (FISHEYE, ("k1", "k2", "k3", "k4")),
 }
 _ONE_FOCAL = ("perspective", "fisheye")
 
