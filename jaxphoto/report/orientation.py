@@ -94,9 +94,8 @@ def network_figure(oriented: Oriented) -> Figure:
 
 def image_residuals_figure(oriented: Oriented) -> Figure:
     """Residuals of all image points: averaged over cells of the format, and how they scatter."""
-    adjusted, sensor = oriented.adjusted, oriented.block.sensors[CAMERA]
-    xy = np.asarray(adjusted.values.xy)
-    v = np.asarray(adjusted.residuals.image) * np.asarray(adjusted.values.sigma_xy) / sensor.pixel_mm
+    sensor, xy = oriented.block.sensors[CAMERA], np.asarray(oriented.block.image_points.xy).T
+    v = oriented.residuals_mm.T / sensor.pixel_mm
     across = 12
     down = max(1, round(across * sensor.height_px / sensor.width_px))
     column = np.clip(((xy[0] / sensor.width_mm + 0.5) * across).astype(int), 0, across - 1)

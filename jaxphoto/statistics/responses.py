@@ -21,10 +21,9 @@ from jaxphoto.adjustment.model.numbers import Increments
 from jaxphoto.arrays import still
 from jaxphoto.compiling import prepare, run_compiled
 
-# Directions that are computed with side by side, and the numbers that they may have together.
-_AT_ONCE, _NUMBERS = 16, 40_000_000
-# Right-hand sides that are solved for side by side: making F of a large block anew costs more than they do.
-_SOLVED_AT_ONCE = 48
+# Directions that are computed with side by side, and right-hand sides that are solved for: making F of a large block
+# anew costs more than these do. Together they have no more numbers than this, as several arrays of them are held.
+_AT_ONCE, _SOLVED_AT_ONCE, _NUMBERS = 16, 48, 20_000_000
 
 
 Column = Callable[[int], Float[np.ndarray, "n"]]
@@ -56,8 +55,9 @@ class Responses(eqx.Module):
     def to_errors(self, column: Column, many: int) -> Iterator[tuple[Float[np.ndarray, "shared"], np.ndarray]]:
         """Of each error z = `column(k)`, whitened and in the order of `places`: the shared unknowns' motion, in their
         own units, and H z."""
-        for first in range(0, many, _SOLVED_AT_ONCE):
-            x = self.solved(self._pulled(column, range(first, min(first + _SOLVED_AT_ONCE, many))))
+        size = _many_solved(self.adjusted.equations.scale)
+        for first in range(0, many, size):
+            x = self.solved(self._pulled(column, range(first, min(first + size, many))))
             yield from zip(self._moved(x), self._pushed(x), strict=True)
 
     def of_unknowns(self, shared: Sequence[int]) -> Iterator[Float[np.ndarray, "n"]]:
@@ -102,7 +102,7 @@ class Responses(eqx.Module):
 
     def solved(self, b: Increments) -> Increments:
         """x of N x = b of right-hand sides along a leading axis, in scaled increments."""
-        return self._run(_solve, _in_batches(b, _SOLVED_AT_ONCE), len(b.shared))
+        return self._run(_solve, _in_batches(b, _many_solved(self.adjusted.equations.scale)), len(b.shared))
 
     def _pushed(self, x: Increments) -> Iterator[Float[np.ndarray, "n"]]:
         """J x of each, in the order of `places`."""
@@ -133,12 +133,16 @@ def prepare_responses(equations: NormalEquations, seconds: dict[str, float]) -> 
     n = sum(math.prod(v.shape) for v in shapes)
     of = lambda k: jax.tree.map(lambda v: np.broadcast_to(0.0, (k, *v.shape)), equations.at.increments)  # noqa: E731
     prepare(_pull, (equations, np.broadcast_to(0.0, (_batch(n), n))), seconds)
-    prepare(_solve, (equations, of(_SOLVED_AT_ONCE)), seconds)
+    prepare(_solve, (equations, of(_many_solved(equations.scale))), seconds)
     prepare(_push, (equations, of(_batch(n))), seconds)
 
 
 def _batch(numbers: int) -> int:
     return int(np.clip(_NUMBERS // numbers, 1, _AT_ONCE))
+
+
+def _many_solved(one: Increments) -> int:
+    return int(np.clip(_NUMBERS // sum(np.size(v) for v in jax.tree.leaves(one)), 1, _SOLVED_AT_ONCE))
 
 
 def _in_batches(tree: Increments, size: int) -> Iterator[Increments]:

@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxphoto.adjustment import MAX_STEPS, Adjustment, solve
+from jaxphoto.block import Block
 from jaxphoto.errors import InputError
 from jaxphoto.observations import AbstractObservations
 from jaxphoto.statistics.partial_redundancy import PROBES, PartialRedundancy, partial_redundancy
@@ -120,7 +121,7 @@ def variance_components(
         raise InputError(f"max_rounds and probes are 1 at least, got {max_rounds} and {probes}")
     if not bool(adjusted.converged):
         raise InputError(f"variance components are those of an optimum, but the block is {adjusted.outcome.value}")
-    given, parts = adjusted, parts_of(adjusted, partition)
+    block, priors, parts = adjusted.block, adjusted.priors, parts_of(adjusted, partition)
     factor, free = np.ones(len(parts.labels)), np.ones(len(parts.labels), bool)
     sentences: dict[str, str] = {}
     falls, last, rounds, settled = np.zeros(len(factor), int), np.zeros(len(factor)), 0, False
@@ -144,7 +145,9 @@ def variance_components(
             last[free] = step.change
         settled = False
         if (factor != before).any():
-            adjusted = _reweighted(given, adjusted, parts, factor, max_steps)
+            # Of a large block an adjustment is hundreds of megabytes: the last one goes before the next is made.
+            reached, adjusted = adjusted.unknowns, None  # type: ignore[assignment]
+            adjusted = solve(_reweighted(block, parts, factor), reached, priors, max_steps)
         if not bool(adjusted.converged):
             break
     return _result(parts, factor, free, sentences, adjusted, now, rounds, settled)
@@ -201,15 +204,14 @@ def _positive(change: np.ndarray, now: PartialRedundancy, free: np.ndarray) -> n
     return np.clip(np.where(change > -1, 1 + change, foerstner), 1 / _FARTHEST, _FARTHEST)
 
 
-def _reweighted(given: Adjustment, present: Adjustment, parts: Parts, factor: np.ndarray, max_steps: int) -> Adjustment:
-    """The block of `given` with its variances times `factor`, adjusted from where it is at present."""
-    scale, block = np.sqrt(np.append(factor, 1.0)), given.block
+def _reweighted(block: Block, parts: Parts, factor: np.ndarray) -> Block:
+    """The block with its variances times `factor`."""
+    scale = np.sqrt(np.append(factor, 1.0))
 
     def scaled(name: str, rows: AbstractObservations) -> AbstractObservations:
         return rows.with_sigmas_times(scale[parts.of[name]].T.reshape(np.shape(rows.sigmas)))
 
-    block = block.with_observations({name: scaled(name, rows) for name, rows in block.named_observations.items()})
-    return solve(block, present.unknowns, given.priors, max_steps)
+    return block.with_observations({name: scaled(name, rows) for name, rows in block.named_observations.items()})
 
 
 def _result(

@@ -171,30 +171,30 @@ def with_epipolar_matches(photographs, per_pair, noise_px=0.3, seed=7):
     return photographs._replace(features=features, matches=matches, point_of=point_of)
 
 
-def placed(oriented, scene):
+def placed(adjusted, scene):
     """Stations and matrices of a network after the similarity that brings its stations nearest to the true ones."""
-    order = [int(name[1:]) for name in oriented.block.images]
-    exterior = oriented.adjusted.unknowns.exterior
+    order = [int(name[1:]) for name in adjusted.block.images]
+    exterior = adjusted.unknowns.exterior
     there = np.asarray(exterior.position)
     s = similarity_between(there, scene.positions[order])
     return order, s, s.of(there), np.asarray(exterior.camera_from_object) @ s.turn.T
 
 
-def errors_over_sigmas(oriented, scene):
+def errors_over_sigmas(adjusted, scene):
     """Errors (images, 6) of stations and rotations after `placed`, over their standard deviations in that datum."""
-    errors, matrix = errors_with_covariance(oriented, scene)
+    errors, matrix = errors_with_covariance(adjusted, scene)
     return (errors / np.sqrt(np.diagonal(matrix))).reshape(-1, 6)
 
 
-def errors_with_covariance(oriented, scene, camera=None):
+def errors_with_covariance(adjusted, scene, camera=None):
     """Errors of stations and rotations after `placed`, by image, and of c and principal point if the true one is given.
 
     A network has errors e in its own datum. What the similarity leaves of them is S e, S = I - G (G_s' G_s)^-1 G_s',
     with the seven motions G, of which G_s are the rows of stations; so their covariance is S C S' in any datum.
     """
-    order, s, stations, matrices = placed(oriented, scene)
+    order, s, stations, matrices = placed(adjusted, scene)
     n, true = len(order), scene.matrices[order]
-    found = covariance(oriented.adjusted, "camera")
+    found = covariance(adjusted, "camera")
     turned = np.einsum("nij,nkj->nik", matrices, true)
     # A small rotation theta takes M to (I - [theta]x) M.
     rotations = 0.5 * np.stack([turned[:, i, j] - turned[:, j, i] for i, j in ((1, 2), (2, 0), (0, 1))], axis=1)
@@ -214,7 +214,7 @@ def errors_with_covariance(oriented, scene, camera=None):
     apply = np.einsum("anj,njk->ank", left.reshape(6 * n, n, 6), datum).reshape(6 * n, 6 * n)
     shown = list(range(6 * n))
     if camera is not None:
-        interior = oriented.adjusted.unknowns.interior["camera"]
+        interior = adjusted.unknowns.interior["camera"]
         errors = np.append(errors, np.array([interior.c, interior.x_p, interior.y_p]) - camera[:3])
         shown += [found.labels.index(f"interior[camera].{name}") for name in ("c_mm", "xp_mm", "yp_mm")]
         apply = np.block([[apply, np.zeros((6 * n, 3))], [np.zeros((3, 6 * n)), np.eye(3)]])

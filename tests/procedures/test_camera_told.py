@@ -80,8 +80,8 @@ def flown(seed, camera):
     return scene, p, orient(p.names, SENSOR, START, p.features, p.matches, sigmas)
 
 
-def over_sigmas(oriented, scene, camera):
-    errors, matrix = errors_with_covariance(oriented, scene, camera)
+def over_sigmas(adjusted, scene, camera):
+    errors, matrix = errors_with_covariance(adjusted, scene, camera)
     return errors / np.sqrt(np.diagonal(matrix))
 
 
@@ -113,5 +113,5 @@ def test_errors_are_those_that_a_block_with_observed_parameters_announces(draws)
             xy[own] += projected(scene, camera, image, scene.points[true[own]])[0]
         again = dataclasses.replace(block, image_points=dataclasses.replace(rows, xy=xy))
         adjusted = adjust(again, max_steps=300)
-        ratios.append(over_sigmas(oriented._replace(adjusted=adjusted), scene, camera))
+        ratios.append(over_sigmas(adjusted, scene, camera))
     check_scatter(np.array(ratios))

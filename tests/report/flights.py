@@ -33,7 +33,8 @@ def part_report() -> PartReport:
     )  # fmt: skip
     placed = GeoreferencedPhotographs(block, block.images[:4], OFFSETS_M, np.array([True] * 3 + [False]), ())
     matched = MatchedPart(list(block.images), [np.zeros((k + 5, 2)) for k in range(n)], [], [], 0, 1.0)
-    part = FlightPart(Oriented(block, found, report), matched, placed, "", None, found)
+    residuals = np.asarray(found.residuals.image).T * np.asarray(block.image_points.sigma)
+    part = FlightPart(Oriented(block, residuals, report), matched, placed, "", None, found)
     d = np.full((n, 3), np.nan)
     d[:4] = OFFSETS_M
     images = pd.DataFrame({"image": block.images, "n_image_points": np.bincount(found.structure.image, minlength=n)})

@@ -15,15 +15,15 @@ from jaxtyping import Bool, Float
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.block import Block, Start
-from jaxphoto.errors import InputError, few
+from jaxphoto.errors import DatumError, InputError, few
 from jaxphoto.procedures.adjust import adjust_for_tables
 from jaxphoto.procedures.control.intersected import intersected
 from jaxphoto.procedures.control.into_block import into_block, with_gnss_bias, without_names
-from jaxphoto.procedures.control.judged import CRITICAL, JudgedControl, beyond, judged, scatter
+from jaxphoto.procedures.control.judged import CRITICAL, JudgedControl, beyond, judged, poorer_survey, scatter
 from jaxphoto.procedures.control.marked import Marked, marked
 from jaxphoto.procedures.control.onto_control import LEAST, onto_control
 from jaxphoto.procedures.control.placed import InFrame, in_frame
-from jaxphoto.procedures.control.surveyed import MARK_SIGMA_PX, SIGMA_M, GivenControl
+from jaxphoto.procedures.control.surveyed import MARK_SIGMA_PX, SIGMA_M, GivenControl, SurveyedPoints
 
 _ROUNDS = 8
 # Of the worst normalised residual: what is less is not left out beside it.
@@ -79,8 +79,10 @@ def control_block(
     met = intersected(block, block.start.unknowns, rows, ids)
     rows, said = rows.take(met.good), [*said, *met.sentences]
     sigma = np.where(np.isnan(points.sigma_m), SIGMA_M, points.sigma_m)
-    said += _assumed(control)
-    block, start, agree, told = _placed(block, frame, met.points, met.covariance, points.check, sigma, points)
+    try:
+        block, start, agree, sigma, told = _placed(block, frame, met.points, met.covariance, sigma, points)
+    except InputError as error:
+        raise InputError("; ".join([str(error), *_one_height(points)])) from error
     said += told
     count = np.bincount(rows.point, minlength=len(ids))
     known = np.where(np.isnan(points.coordinates), np.nan, frame.xyz)
@@ -101,10 +103,19 @@ def control_block(
         own = now._replace(point=place[now.point])
         names = tuple(ids[k] for k in which)
         made = into_block(base, names, known[which], sigma[which], start[which], own, used[which])
-        adjusted = adjust(made)
+        try:
+            adjusted = adjust(made)
+        except DatumError as error:
+            # What is taken of the control beforehand may be why it does not tell enough.
+            raise DatumError("; ".join([str(error), *_assumed(control, sigma)])) from error
         if not bool(adjusted.converged):
             said.append("the adjustment with control did not converge; it is not tested")
         found = _spread(judged(adjusted, len(which), known[which], sigma[which]), seen)
+        poorer = poorer_survey(found.w[used], sigma[used], np.isnan(points.sigma_m[used]), SIGMA_M)
+        if poorer is not None and number + 1 < _ROUNDS and bool(adjusted.converged):
+            # Before any is judged by a guess that most contradict.
+            sigma = np.where(np.isnan(points.sigma_m), poorer, sigma)
+            continue
         new, gone, text = _tested(found, now, used, seen & ~points.check, ids, block.images)
         key = (used.tobytes(), len(now.image))
         if number + 1 == _ROUNDS or not text or key in tried or not bool(adjusted.converged):
@@ -118,6 +129,7 @@ def control_block(
         base = _from(base, adjusted)
         start[which] = np.asarray(adjusted.unknowns.points)[len(base.points) :]
     left = seen & ~points.check & ~used
+    said = [*_assumed(control, sigma), *said]
     said += _left_out(ids, left, found, frame)
     state = np.where(points.check, "check", np.where(used, "control", "left out"))
     state = np.where(seen, state, "not marked")
@@ -130,42 +142,58 @@ def control_block(
     )  # fmt: skip
 
 
-def _placed(block: Block, frame: InFrame, met, covariance, check, sigma, points):
-    """The block in the frame of control, where its points begin, which agree with it, and what is to be said."""
+def _placed(block: Block, frame: InFrame, met, covariance, sigma, points: SurveyedPoints):
+    """The block in the frame of control, where its points begin, which agree with it, how well they were surveyed, and
+    what is to be said."""
     whole = np.isfinite(points.coordinates).all(axis=1)
-    known = np.flatnonzero(np.isfinite(met).all(axis=1) & ~check & whole)
+    known = np.flatnonzero(np.isfinite(met).all(axis=1) & ~points.check & whole)
     agree = np.ones(len(met), bool)
     if frame.at_place and len(known) < LEAST:
         text = f"{len(known)} control points are marked in two photographs or more: the block stays at its positions"
-        return block, met, agree, [text]
+        return block, met, agree, sigma, [text]
     spread = np.sqrt(np.trace(covariance[known], axis1=1, axis2=2))
+    assumed, surveyed = np.isnan(points.sigma_m[known]).any(axis=1), np.linalg.norm(sigma[known], axis=1)
     if not frame.at_place:
         # In the unit of the block's own frame, which a similarity is to tell.
-        first = onto_control(met[known], frame.xyz[known], np.linalg.norm(sigma[known], axis=1), points.file)
+        first = onto_control(met[known], frame.xyz[known], surveyed, points.file, assumed)
         spread = spread * first.similarity.scale
-    onto = onto_control(
-        met[known], frame.xyz[known], np.hypot(np.linalg.norm(sigma[known], axis=1), spread), points.file
-    )
+    onto = onto_control(met[known], frame.xyz[known], np.hypot(surveyed, spread), points.file, assumed)
+    if onto.scatter_m is not None:
+        sigma = np.where(np.isnan(points.sigma_m), onto.scatter_m, sigma)
     agree[known] = onto.agree
     said = [f"{int(onto.agree.sum())} of {len(known)} control points bring the block to their frame"]
     if frame.at_place:
         off = np.median((frame.xyz - met)[known[onto.agree]], axis=0)
         told = ", ".join(f"{v:.2f}" for v in off)
         said.append(f"control lies {told} m (east, north, up) from where the positions of the photographs have it")
-    return dataclasses.replace(onto.similarity.of_block(block), frame=frame.frame), onto.similarity.of(met), agree, said
+    block = dataclasses.replace(onto.similarity.of_block(block), frame=frame.frame)
+    return block, onto.similarity.of(met), agree, sigma, said
 
 
-def _assumed(control: GivenControl) -> list[str]:
-    said = []
-    n = int(np.isnan(control.points.sigma_m).any(axis=1).sum())
-    if n:
-        east, _, up = SIGMA_M
+def _assumed(control: GivenControl, sigma: Float[np.ndarray, "points 3"]) -> list[str]:
+    said, none = [], np.isnan(control.points.sigma_m)
+    if n := int(none.any(axis=1).sum()):
+        taken = np.where(none, sigma, 0.0).max(axis=0)
+        why = "they scatter about the photographs: " if (taken > SIGMA_M).any() else ""
+        east, north, up = np.where(none.any(axis=0), np.maximum(taken, SIGMA_M), SIGMA_M)
         said.append(
-            f"{n} surveyed points have no standard deviations: {east:g} m east and north, {up:g} m up are taken"
+            f"{n} surveyed points have no standard deviations: {why}{max(east, north):.2g} m east and north, "
+            f"{up:.2g} m up are taken"
         )
+    said += _one_height(control.points)
     if n := int(np.isnan(control.marks.sigma_px).sum()):
         said.append(f"{n} marks have no standard deviations: {MARK_SIGMA_PX:g} px is taken")
     return said
+
+
+def _one_height(points: SurveyedPoints) -> list[str]:
+    height = points.coordinates[:, 2]
+    if len(height) < LEAST or np.ptp(height) != 0:
+        return []
+    return [
+        f"all {len(height)} surveyed heights are {height[0]:g} m; where nobody surveyed them, leave them empty and "
+        "give positions of the photographs, which tell how the block lies"
+    ]
 
 
 def _tested(found: JudgedControl, now: Marked, used, able, ids, images):

@@ -17,6 +17,11 @@ CRITICAL = 4.0
 
 # Residuals whose scatter is told, and the median of the larger of two normal errors.
 _ENOUGH, _LARGER = 8, 1.05
+# Surveyed points whose scatter is told, the median of a normal error, and by how much they scatter more than a guess
+# before it is given up: the median of twelve is beyond 1.9 times what it should be in one block of a hundred.
+_POINTS, _MEDIAN, _MORE = 6, 0.6745, 2.0
+# Change (of the logarithm) that another adjustment is not worth.
+_STILL = 0.15
 
 
 class JudgedControl(NamedTuple):
@@ -77,6 +82,33 @@ def scatter(marks_w: Float[np.ndarray, "rows"]) -> float:
     """
     known = marks_w[np.isfinite(marks_w)]
     return max(1.0, float(np.median(known)) / _LARGER) if len(known) >= _ENOUGH else 1.0
+
+
+def poorer_survey(
+    w: Float[np.ndarray, "points 3"],
+    sigma_m: Float[np.ndarray, "points 3"],
+    assumed: Bool[np.ndarray, "points 3"],
+    guess_m: tuple[float, float, float],
+) -> Float[np.ndarray, "3"] | None:
+    """Standard deviations (m) of the coordinates `assumed` by which most of them fit; None where `sigma_m` will do.
+
+    The median of the normalised residuals tells, of plan and height each; up to half of the points may spoil it.
+    A block gives way to what is held too firmly, so that more than one adjustment is needed to tell: once they are not
+    `guess_m` any more, standard deviations become smaller, too. Heights are at first taken to be as poor as the plan.
+    """
+    now, given_up = np.array(guess_m), bool((sigma_m[assumed] > max(guess_m)).any())
+    factor = np.ones(3)
+    for axes in ([0, 1], [2]):
+        told = assumed[:, axes] & np.isfinite(w[:, axes])
+        if told.any(axis=1).sum() >= _POINTS:
+            now[axes] = np.median(sigma_m[:, axes][told])
+            factor[axes] = np.median(w[:, axes][told]) / _MEDIAN
+    if given_up:
+        return None if np.abs(np.log(factor)).max() < _STILL else np.maximum(factor * now, guess_m)
+    if factor.max() < _MORE:
+        return None
+    poorer = np.maximum(factor, 1) * now
+    return np.maximum(poorer, poorer[0])
 
 
 def beyond(w: Float[np.ndarray, "points 3"]) -> Bool[np.ndarray, "points"]:

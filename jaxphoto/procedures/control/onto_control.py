@@ -4,8 +4,13 @@ Every three points (or 300 samples of three) give a similarity; that counts whic
 these. How well points have to fit leaves room for what an adjustment will take out: a block that is bent by a lens or
 stands on weak positions misses by a part of its size. What does not fit is not judged here: it is left out of the first
 adjustment, which judges it.
+
+Where no file says how well points were surveyed and most do not fit, they may be worse than is usual: a hand-held
+receiver is off by metres. The similarity of the least median difference tells by how much (P. J. Rousseeuw, Least
+median of squares regression, JASA 79, 1984), as long as more than half of the points are not gross errors.
 """
 
+from collections.abc import Iterator
 from itertools import combinations
 from typing import NamedTuple
 
@@ -19,6 +24,13 @@ _SAMPLES = 300
 # Standard deviations, and part of the size of the control, within which a point fits.
 _BEYOND, _BENT = 5.0, 0.01
 LEAST = 3
+# Fewer than this part of the points that fit, of so many at least, may be poor ones.
+_MOST, _ENOUGH = 2 / 3, 6
+# Of a median of lengths of normal errors in space to one coordinate, and what a similarity takes up.
+_MEDIAN, _PARAMETERS = 1.54, 7
+# Standard deviations beyond which a difference does not count for those of the others; part of the size of the control
+# that standard deviations are at most: beyond, coordinates are of other points, or of another order.
+_WITHIN, _POOREST = 3.5, 0.05
 
 
 class OntoControl(NamedTuple):
@@ -26,6 +38,8 @@ class OntoControl(NamedTuple):
 
     similarity: Similarity
     agree: Bool[np.ndarray, "points"]
+    scatter_m: float | None = None
+    """Standard deviation of a coordinate of the points that no file says one of, where they are worse than usual."""
 
 
 def onto_control(
@@ -33,8 +47,11 @@ def onto_control(
     here: Float[np.ndarray, "points 3"],
     sigma_m: Float[np.ndarray, "points"],
     file: str,
+    assumed: Bool[np.ndarray, "points"],
 ) -> OntoControl:
     """From places `there` in a frame of a block to the same as surveyed, `here`; `sigma_m` of the differences.
+
+    Those of the `assumed` are a guess, which most of the points may correct.
 
     Raises InputError for fewer than three, for such as lie on a line, and where no three and a fourth agree; it says
     where exchanged coordinates would.
@@ -49,6 +66,8 @@ def onto_control(
         raise InputError(
             f"{file}: the control points lie on a line, which leaves a turn about it open; mark one beside it"
         )
+    if best.agree.mean() < _MOST and assumed.any() and (poor := _poor(there, here, sigma_m, assumed)) is not None:
+        return poor
     if len(here) > LEAST and best.agree.sum() > LEAST:
         return best
     if best.agree.all() and len(here) == LEAST:
@@ -58,26 +77,62 @@ def onto_control(
         raise InputError(
             f"{file}: the control points fit the photographs with X and Y exchanged; exchange the two columns"
         )
-    off = np.linalg.norm(here - best.similarity.of(there), axis=1)
+    off = _off(best.similarity, there, here)
     raise InputError(
         f"{file}: the marks of the control points do not fit their coordinates ({np.median(off):.3g} m off in the "
         "median); look at names, system and order of coordinates"
     )
 
 
-def _best(there, here, sigma_m) -> OntoControl | None:
-    size = float(np.linalg.norm(np.ptp(here, axis=0)))
-    tolerance = _BEYOND * sigma_m + _BENT * size
+def _poor(there, here, sigma_m, assumed) -> OntoControl | None:
+    """Where most points agree if those `assumed` were surveyed poorly; None where they do not then either."""
+    n = len(here)
+    if n < _ENOUGH:
+        return None
+    similarity = min(_of_threes(there, here), key=lambda s: np.median(_off(s, there, here)))
+    # Rousseeuw's factor for few points.
+    scatter = (1 + 5 / (n - LEAST)) * float(np.median(_off(similarity, there, here))) / _MEDIAN
+    for _ in range(5):
+        near = _off(similarity, there, here) < _WITHIN * scatter
+        found = similarity_between(there[near], here[near])
+        if found is None or near.sum() <= LEAST:
+            return None
+        similarity = found
+        squares = np.sum(_off(similarity, there, here)[near] ** 2)
+        scatter = float(np.sqrt(squares / (3 * near.sum() - _PARAMETERS)))
+    agree = _off(similarity, there, here) < np.where(assumed, _BEYOND * scatter, _tolerance(here, sigma_m))
+    is_poor = agree.mean() >= _MOST and scatter < _POOREST * _size(here)
+    return OntoControl(similarity, agree, scatter) if is_poor else None
+
+
+def _off(similarity: Similarity, there, here) -> Float[np.ndarray, "points"]:
+    return np.linalg.norm(here - similarity.of(there), axis=1)
+
+
+def _size(here) -> float:
+    return float(np.linalg.norm(np.ptp(here, axis=0)))
+
+
+def _tolerance(here, sigma_m) -> Float[np.ndarray, "points"]:
+    return _BEYOND * sigma_m + _BENT * _size(here)
+
+
+def _of_threes(there, here) -> Iterator[Similarity]:
     samples = list(combinations(range(len(here)), LEAST))
     if len(samples) > _SAMPLES:
         rng = np.random.default_rng(0)
         samples = [tuple(rng.choice(len(here), LEAST, replace=False)) for _ in range(_SAMPLES)]
-    best: tuple[float, Similarity] | None = None
     for pick in samples:
         similarity = similarity_between(there[list(pick)], here[list(pick)], 0.02)
-        if similarity is None:
-            continue
-        off = np.linalg.norm(here - similarity.of(there), axis=1) / tolerance
+        if similarity is not None:
+            yield similarity
+
+
+def _best(there, here, sigma_m) -> OntoControl | None:
+    tolerance = _tolerance(here, sigma_m)
+    best: tuple[float, Similarity] | None = None
+    for similarity in _of_threes(there, here):
+        off = _off(similarity, there, here) / tolerance
         score = float(np.sum(off < 1) - np.minimum(off, 1).mean())
         if best is None or score > best[0]:
             best = score, similarity
@@ -85,9 +140,9 @@ def _best(there, here, sigma_m) -> OntoControl | None:
         return None
     similarity = best[1]
     for _ in range(5):
-        agree = np.linalg.norm(here - similarity.of(there), axis=1) < tolerance
+        agree = _off(similarity, there, here) < tolerance
         found = similarity_between(there[agree], here[agree])
         if found is None:
             break
         similarity = found
-    return OntoControl(similarity, np.linalg.norm(here - similarity.of(there), axis=1) < tolerance)
+    return OntoControl(similarity, _off(similarity, there, here) < tolerance)

@@ -14,7 +14,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxphoto.adjustment import Adjustment
 from jaxphoto.block import Block, Datum, Start
 from jaxphoto.camera import InteriorOrientation, Sensor, get_parameter, parameter_names, set_parameter
 from jaxphoto.collinearity import ExteriorOrientation
@@ -105,7 +104,9 @@ class Oriented(NamedTuple):
     """A block of photographs, oriented as a free network of arbitrary scale, and how it was made."""
 
     block: Block
-    adjusted: Adjustment
+    """It starts where the orientation left it; `jaxphoto.adjust` gives its statistics."""
+    residuals_mm: Float[np.ndarray, "rows 2"]
+    """Of its image points, observed minus computed."""
     report: OrientationReport
 
 
@@ -171,7 +172,7 @@ def orient(
     fate = np.bincount(network.fate, minlength=len(Fate))
     return Oriented(
         made,
-        last.adjusted,
+        residual,
         OrientationReport(
             n_images=len(names),
             n_matches=sum(len(m.features) for m in matches),
