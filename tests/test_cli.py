@@ -270,6 +270,22 @@ def test_version_and_help(monkeypatch, capsys):
     assert "adjust" in run(monkeypatch, capsys, "--help")[1]
 
 
+@pytest.mark.parametrize(
+    ("words", "ends"),
+    [
+        ("jaxphoto stab", ["stability"]),
+        ("jaxphoto adjust --ro", ["--rotations", "--robust"]),
+        ("jaxphoto adjust block --robust t", ["tukey"]),
+        ("jaxphoto stability a b --method ", ["zrot", "rot", "spr"]),
+    ],
+)
+def test_a_shell_completes_commands_options_and_what_they_take(words, ends, monkeypatch, capsys):
+    monkeypatch.setenv("_JAXPHOTO_COMPLETE", "complete_bash")
+    monkeypatch.setenv("COMP_WORDS", words)
+    monkeypatch.setenv("COMP_CWORD", str(len(words.split(" ")) - 1))
+    assert run(monkeypatch, capsys)[1].split() == ends
+
+
 def _replace(path, old: str, new: str) -> None:
     text = path.read_text()
     assert old in text

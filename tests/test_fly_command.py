@@ -85,7 +85,7 @@ def test_a_folder_becomes_blocks_results_and_a_page(flown, tmp_path, monkeypatch
 def test_options_that_cannot_be(flown, tmp_path, monkeypatch, capsys):
     for arguments, message in (
         (["--epsg", 99], "EPSG code 99 is unknown"),
-        (["--model", "pinhole"], "no distortion model is called 'pinhole'"),
+        (["--model", "pinhole"], "--model pinhole: there are brown"),
         (["--pairs", "position:3"], "have no GPS position"),
         (["--lever-arm", "0,1"], "--lever-arm is '0,1'; give three numbers of metres"),
         (["--heights", "ground"], "--heights is 'ground'; give ellipsoid, geoid, take-off, or the EPSG code"),

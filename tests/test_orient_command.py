@@ -55,7 +55,7 @@ def test_photographs_become_a_block(taken, tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--model", "pinhole"], "no distortion model is called 'pinhole'; choose one of brown"),
+        (["--model", "pinhole"], "--model pinhole: there are brown"),
         (["--model", "brown", "--r0-mm", "3"], "R0 belongs to the model smac"),
         (["--r0-mm", "nan"], "R0 belongs to the model smac"),
         (["--model", "smac", "--r0-mm", "-1"], "R0 = -1 mm does not lie on an image"),

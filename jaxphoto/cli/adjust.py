@@ -10,6 +10,7 @@ import typer
 
 import jaxphoto
 from jaxphoto.cli.app import app
+from jaxphoto.cli.choices import one_of
 from jaxphoto.cli.console import plain_console
 from jaxphoto.errors import JaxphotoError
 from jaxphoto.io import read_block, read_truth, write_block
@@ -41,19 +42,14 @@ _SPLITS = ", ".join(SPLITS)
 def adjust_command(
     block: Annotated[Path, typer.Argument(help="Block folder (see docs/block_folder.md).")],
     out: Annotated[Path, typer.Option(help="Folder for the results; earlier results in it are replaced.")],
-    rotations: Annotated[
-        str, typer.Option(metavar=" | ".join(EOP_NAMES), help="Rotations that the correlations mean.")
-    ] = "omega_phi_kappa",
+    rotations: Annotated[str, one_of(EOP_NAMES, help="Rotations that the correlations mean.")] = "omega_phi_kappa",
     snoop: Annotated[
         bool,
         typer.Option(
             "--snoop", help="Leave out what contradicts the other observations, and write what went and the block left."
         ),
     ] = False,
-    robust: Annotated[
-        str | None,
-        typer.Option(metavar=" | ".join(LOSSES), help="As --snoop, from a robust adjustment with this loss."),
-    ] = None,
+    robust: Annotated[str | None, one_of(LOSSES, help="As --snoop, from a robust adjustment with this loss.")] = None,
     max_steps: Annotated[int, typer.Option(min=1, help="Most iterations.")] = jaxphoto.MAX_STEPS,
     weights: Annotated[
         str | None, typer.Option(help=f"Estimate variance components, adjust with them: group, or by {_SPLITS}.")
@@ -64,10 +60,6 @@ def adjust_command(
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but warnings and errors.")] = False,
 ) -> None:
     """Adjust a block and write tables, statistics and a report. Exit code 1: written, but the verdict is red."""
-    if rotations not in EOP_NAMES:
-        raise JaxphotoError(f"--rotations {rotations}: there are {', '.join(EOP_NAMES)}")
-    if robust is not None and robust not in LOSSES:
-        raise JaxphotoError(f"--robust {robust}: there are {', '.join(LOSSES)}")
     splits = None if weights is None else _splits_of(weights)
     check_folder(out, block)
     Thread(target=prepare_pictures, daemon=True).start()

@@ -184,7 +184,6 @@ app = typer.Typer(
     epilog="Begin with: jaxphoto example cross_block, then jaxphoto adjust cross_block --out results",
     context_settings={"help_option_names": ["-h", "--help"]},
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
 )
 

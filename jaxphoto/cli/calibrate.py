@@ -11,6 +11,7 @@ import typer
 import jaxphoto
 from jaxphoto.camera import DISTORTIONS
 from jaxphoto.cli.app import app
+from jaxphoto.cli.choices import one_of
 from jaxphoto.cli.console import plain_console
 from jaxphoto.errors import InputError
 from jaxphoto.image_measurement.grey_values import read_grey
@@ -28,7 +29,7 @@ def calibrate_command(
     images: Annotated[list[Path], typer.Argument(help="Photographs of the board, all by one camera at one focus.")],
     board: Annotated[str, typer.Option(help=f"The board: {', '.join(SYNTAX.values())}.")],
     out: Annotated[Path, typer.Option(help="Folder for the results; earlier results in it are replaced.")],
-    model: Annotated[str, typer.Option(help=f"Distortion: {', '.join(DISTORTIONS)}.")] = "smac",
+    model: Annotated[str, one_of(DISTORTIONS, help="Distortion.")] = "smac",
     r0_mm: Annotated[float, typer.Option(help="Balance radius R0 of SMAC.")] = 0.0,
     free: Annotated[
         str | None, typer.Option(help="What is estimated, by commas: c,xp,yp,k1,... (default: usual).")

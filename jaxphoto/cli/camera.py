@@ -5,8 +5,9 @@ from typing import Annotated
 
 import typer
 
-from jaxphoto.camera import DISTORTIONS, AbstractDistortion, get_parameter, parameter_names
+from jaxphoto.camera import AbstractDistortion, get_parameter, parameter_names
 from jaxphoto.cli.app import app
+from jaxphoto.cli.choices import one_of
 from jaxphoto.cli.console import plain_console
 from jaxphoto.errors import InputError
 from jaxphoto.io.cameras import CAMERA_FORMATS, read_camera_file, write_camera_file
@@ -19,7 +20,7 @@ def camera_command(
     out: Annotated[Path, typer.Argument(help="Camera file to write.")],
     out_format: Annotated[
         str | None,
-        typer.Option("--format", help=f"Of OUT: {', '.join(CAMERA_FORMATS)}; told by its name when not given."),
+        one_of(CAMERA_FORMATS, "--format", help="Of OUT; told by its name when not given."),
     ] = None,
     camera: Annotated[str | None, typer.Option(help="Which camera, where IN holds several.")] = None,
     pixel_mm: Annotated[float | None, typer.Option(help="Size of a pixel, where IN does not give it.")] = None,
@@ -27,19 +28,16 @@ def camera_command(
     height_px: Annotated[int | None, typer.Option(min=1, help="Height, where IN does not give it.")] = None,
     block: Annotated[Path | None, typer.Option(help="Block of which IN is the result.")] = None,
     distortion: Annotated[
-        str | None, typer.Option(help=f"Model in a block.toml: {', '.join(DISTORTIONS)}; that of IN when not given.")
+        str | None, one_of(AbstractDistortion.known(), help="Model in a block.toml; that of IN when not given.")
     ] = None,
 ) -> None:
     """Convert a camera file: exactly where the models allow it, otherwise fitted, the residual stated in pixels."""
     check_file(out, source)
-    known = AbstractDistortion.known()
-    if distortion is not None and distortion not in known:
-        raise InputError(f"--distortion {distortion}: there are {', '.join(known)}")
     if (width_px is None) != (height_px is None):
         raise InputError("--width-px and --height-px belong together; give both or none")
     size = None if width_px is None or height_px is None else (width_px, height_px)
     read = read_camera_file(source, camera=camera, pixel_mm=pixel_mm, size_px=size, block=block)
-    kind = known[distortion] if distortion is not None else None
+    kind = AbstractDistortion.known()[distortion] if distortion is not None else None
     done = write_camera_file(
         out, read.sensor, read.interior, out_format, name=read.name, distortion=kind, covariance=read.covariance
     )

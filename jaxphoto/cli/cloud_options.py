@@ -1,15 +1,18 @@
 """What every command says of the cloud it reads."""
 
-from typing import Annotated
+from typing import Annotated, get_args
 
 import typer
 
+from jaxphoto.cli.choices import one_of
 from jaxphoto.errors import InputError
+from jaxphoto.io.clouds.cloud_reader import Returns
+from jaxphoto.io.clouds.coordinate_system import UNITS
 
 Classes = Annotated[str | None, typer.Option("--class", help="Classes to take, by commas: 2,6.")]
-ReturnsOption = Annotated[str, typer.Option("--returns", help="Returns to take: all, first, last, only.")]
+ReturnsOption = Annotated[Returns, one_of(get_args(Returns), "--returns", help="Returns to take.")]
 CloudEpsg = Annotated[int | None, typer.Option(help="EPSG code of the cloud, in place of what it says.")]
-CloudUnit = Annotated[str | None, typer.Option(help="What the cloud counts in: m, ft, us_ft.")]
+CloudUnit = Annotated[str | None, one_of(UNITS, help="What the cloud counts in.")]
 
 
 def class_numbers(text: str | None) -> list[int] | None:

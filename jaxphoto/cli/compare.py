@@ -6,12 +6,13 @@ from typing import Annotated
 import typer
 
 from jaxphoto.cli.app import app
+from jaxphoto.cli.choices import one_of
 from jaxphoto.cli.console import plain_console
-from jaxphoto.cli.grid_options import check_grid, method_of, points_of
+from jaxphoto.cli.grid_options import check_grid, points_of
 from jaxphoto.cli.two_cameras import compared, read_two
 from jaxphoto.report import print_warning
 from jaxphoto.report.change import print_change, write_change
-from jaxphoto.stability import METHODS, change
+from jaxphoto.stability import METHODS, Method, change
 from jaxphoto.writing import check_folder
 
 
@@ -19,9 +20,7 @@ from jaxphoto.writing import check_folder
 def compare_command(
     first: Annotated[Path, typer.Argument(metavar="A", help="Results or camera file of one calibration.")],
     second: Annotated[Path, typer.Argument(metavar="B", help="The same of the other, by other photographs.")],
-    method: Annotated[
-        str, typer.Option(metavar=" | ".join(METHODS), help="What the orientation of images may take up.")
-    ] = "rot",
+    method: Annotated[Method, one_of(METHODS, help="What the orientation of images may take up.")] = "rot",
     grid: Annotated[str, typer.Option(help="Columns and rows of the grid.")] = "15x11",
     extent: Annotated[
         str | None, typer.Option(help="Width and height of the grid in mm, such as 4.0x3.0; the format if not given.")
@@ -35,12 +34,11 @@ def compare_command(
     out: Annotated[Path | None, typer.Option(help="Folder for tables, maps and page.")] = None,
 ) -> None:
     """Test whether a camera has changed between two calibrations: by parameters, by its rays, and where."""
-    chosen = method_of(method)
     check_grid(grid, extent)
     if out is not None:
         check_folder(out, first, second)
     a, b = read_two((first, second), (camera, camera_b), pixel_mm, block)
-    found = change(a.interior, b.interior, points_of(a.sensor, grid, extent), (a.covariance, b.covariance), chosen)
+    found = change(a.interior, b.interior, points_of(a.sensor, grid, extent), (a.covariance, b.covariance), method)
     console = plain_console()
     sets = compared("A", first, a), compared("B", second, b)
     for letter, file in (("A", a), ("B", b)):

@@ -8,6 +8,7 @@ import typer
 import jaxphoto
 from jaxphoto.block import Block
 from jaxphoto.cli.app import app
+from jaxphoto.cli.choices import one_of
 from jaxphoto.cli.console import plain_console
 from jaxphoto.errors import InputError
 from jaxphoto.io import convert, read_source, write_block
@@ -41,7 +42,7 @@ def convert_command(
     ] = None,
     to: Annotated[
         str,
-        typer.Option(help=f"What OUT becomes. block: a block folder; {_ABOUT}."),
+        one_of(_TARGETS, help=f"What OUT becomes. block: a block folder; {_ABOUT}."),
     ] = "block",
     block: Annotated[Path | None, typer.Option(help="Block of which SOURCE is the result, where it moved.")] = None,
     part: Annotated[int, typer.Option(min=1, help="Of a flight, which part; the largest is 1.")] = 1,
@@ -52,8 +53,6 @@ def convert_command(
     adjust: Annotated[bool, typer.Option("--adjust", help="Adjust the block in SOURCE first.")] = False,
 ) -> None:
     """Turn another program's files into a block folder, or what was adjusted into files of others."""
-    if to not in _TARGETS:
-        raise InputError(f"--to {to}: there are {', '.join(_TARGETS)}")
     result = is_result(source) if source_format is None else False
     if adjust and (result or to == "block"):
         why = "SOURCE is a result already" if result else "a block folder has start values"

@@ -11,6 +11,7 @@ import typer
 
 from jaxphoto.camera import DISTORTIONS, InteriorOrientation
 from jaxphoto.cli.app import app
+from jaxphoto.cli.choices import one_of
 from jaxphoto.cli.console import plain_console
 from jaxphoto.cli.exposure_options import heights_of, lever_arm_of
 from jaxphoto.cli.progress import FEWER_PAIRS, StepsLeft
@@ -57,7 +58,7 @@ def fly_command(
     ] = LONGEST_PX,
     c_mm: Annotated[float | None, typer.Option(help="Where the principal distance starts; else from EXIF.")] = None,
     pixel_mm: Annotated[float | None, typer.Option(help="Size of a pixel; else from EXIF.")] = None,
-    model: Annotated[str, typer.Option(help=f"Distortion: {', '.join(DISTORTIONS)}.")] = "brown",
+    model: Annotated[str, one_of(DISTORTIONS, help="Distortion.")] = "brown",
     lens_prior: Annotated[
         bool, typer.Option(help="Observe the camera as what is known of such lenses (docs/lens_priors.md).")
     ] = True,

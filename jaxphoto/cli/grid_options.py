@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxphoto.camera import Sensor
 from jaxphoto.errors import InputError
-from jaxphoto.stability import METHODS, UNKNOWNS, Method, image_grid
+from jaxphoto.stability import UNKNOWNS, image_grid
 
 
 def points_of(sensor: Sensor, grid: str, extent: str | None) -> np.ndarray:
@@ -19,14 +19,6 @@ def check_grid(grid: str, extent: str | None) -> None:
     """Raise InputError for options that say no grid, before anything is read."""
     _grid(grid)
     _extent(extent)
-
-
-def method_of(name: str) -> Method:
-    """The alignment that --method names. Raises InputError where there is none of that name."""
-    for method in METHODS:
-        if method == name:
-            return method
-    raise InputError(f"--method {name}: there are {', '.join(METHODS)}")
 
 
 def _grid(text: str) -> tuple[int, int]:

@@ -6,13 +6,14 @@ from typing import Annotated
 import typer
 
 from jaxphoto.cli.app import app
+from jaxphoto.cli.choices import one_of
 from jaxphoto.cli.console import plain_console
-from jaxphoto.cli.grid_options import check_grid, method_of, points_of
+from jaxphoto.cli.grid_options import check_grid, points_of
 from jaxphoto.io import read_block
 from jaxphoto.io.cameras import write_camera_file
 from jaxphoto.procedures.halves import CUTS, camera_of, halves
 from jaxphoto.report.halves import print_halves, write_halves
-from jaxphoto.stability import METHODS
+from jaxphoto.stability import METHODS, Method
 from jaxphoto.writing import check_folder
 
 
@@ -25,9 +26,7 @@ def halves_command(
     ] = "image",
     cuts: Annotated[int, typer.Option(min=1, help="Times that the block is cut.")] = CUTS,
     seed: Annotated[int, typer.Option(min=0, help="Of the draw of the cuts.")] = 0,
-    method: Annotated[
-        str, typer.Option(metavar=" | ".join(METHODS), help="What the orientation of images may take up.")
-    ] = "rot",
+    method: Annotated[Method, one_of(METHODS, help="What the orientation of images may take up.")] = "rot",
     grid: Annotated[str, typer.Option(help="Columns and rows of cells.")] = "15x11",
     extent: Annotated[
         str | None, typer.Option(help="Width and height of the grid in mm, such as 4.0x3.0; the format if not given.")
@@ -38,14 +37,13 @@ def halves_command(
 
     Both halves of each cut are adjusted, and what they differ by is compared with what their covariances promise.
     """
-    chosen = method_of(method)
     check_grid(grid, extent)
     check_folder(out, block)
     console, errors = plain_console(), plain_console(stderr=True)
     with errors.status("reading the block") as status:
         read = read_block(block)
         cells = points_of(read.sensors[camera_of(read, camera)], grid, extent)
-        found = halves(read, cells, by=by, camera=camera, n_cuts=cuts, seed=seed, method=chosen, report=status.update)
+        found = halves(read, cells, by=by, camera=camera, n_cuts=cuts, seed=seed, method=method, report=status.update)
         status.update(f"writing {out}")
         interior = found.adjusted.unknowns.interior[found.camera]
         write_halves(

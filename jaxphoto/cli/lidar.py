@@ -12,6 +12,7 @@ from rich.console import Console
 
 from jaxphoto.block import Block
 from jaxphoto.cli.app import app
+from jaxphoto.cli.choices import one_of
 from jaxphoto.cli.cloud_options import Classes, CloudEpsg, CloudUnit, ReturnsOption, class_numbers
 from jaxphoto.cli.console import plain_console
 from jaxphoto.cloud import Cloud
@@ -49,7 +50,7 @@ SigmaZ = Annotated[float, typer.Option(help="Standard deviation of a laser point
 SigmaXY = Annotated[float, typer.Option(help="Standard deviation of a laser point's X, and of its Y.")]
 Systematic = Annotated[float, typer.Option(help="Standard deviation of what all its heights are off by.")]
 Rounds = Annotated[int, typer.Option(min=1, help="Most rounds of looking at the cloud and adjusting.")]
-Method = Annotated[str, typer.Option(metavar=" | ".join(METHODS), help="How heights follow from laser points.")]
+Method = Annotated[str, one_of(METHODS, help="How heights follow from laser points.")]
 
 
 @app.command("lidar-control")
@@ -68,8 +69,6 @@ def lidar_control_command(
     max_rounds: Rounds = MAX_ROUNDS,
 ) -> None:
     """Give tie points the height of the laser points there as control, and write the block with it."""
-    if method not in METHODS:
-        raise InputError(f"--method {method} is no method: choose one of {', '.join(METHODS)}")
     settings = _settings(sigma_z_m, sigma_xy_m, sigma_systematic_m)
     chosen, errors = class_numbers(classes), plain_console(stderr=True)
     check_block_target(out, block, cloud)
@@ -150,7 +149,7 @@ def simultaneous_command(
     shift: Annotated[
         str, typer.Option(help="Of each lidar strip: free, fixed, or its sigma in m.")
     ] = f"{SHIFT_SIGMA:g}",
-    method: Annotated[str, typer.Option(help=f"How the surface is found: {', '.join(SURFACES)}.")] = "local",
+    method: Annotated[str, one_of(SURFACES, help="How the surface is found.")] = "local",
     sigma_z_m: SigmaZ = 0.15,
     sigma_xy_m: SigmaXY = 0.5,
     sigma_systematic_m: Systematic = 0.0,
@@ -165,8 +164,6 @@ def simultaneous_command(
     --class and --returns choose the points of the surface; the whole cloud is corrected. Exit code 1: written, but it
     still changed.
     """
-    if method not in SURFACES:
-        raise InputError(f"--method {method} is no method: choose one of {', '.join(SURFACES)}")
     settings = _settings(sigma_z_m, sigma_xy_m, sigma_systematic_m)
     if trajectory is None and boresight not in (None, "fixed"):
         raise InputError(f"--boresight {boresight} needs --trajectory, which says from where each point was measured")

@@ -10,6 +10,7 @@ from rich.table import Table
 
 from jaxphoto.block import Block
 from jaxphoto.cli.app import app
+from jaxphoto.cli.choices import one_of
 from jaxphoto.cli.console import plain_console
 from jaxphoto.errors import InputError
 from jaxphoto.experiment import MonteCarlo
@@ -30,7 +31,7 @@ _KEPT = ("exterior", "points")
 def monte_carlo_command(
     block: Annotated[Path, typer.Argument(help="Block folder (see docs/block_folder.md).")],
     out: Annotated[Path, typer.Option(help="Folder for the draws; a run in it with the same settings goes on.")],
-    kind: Annotated[str, typer.Option("--bias", help=f"What is wrong: {', '.join(_KINDS)}.")],
+    kind: Annotated[str, one_of(_KINDS, "--bias", help="What is wrong.")],
     per: Annotated[str | None, typer.Option(help="Whose own an error is: block, strip, image, point ...")] = None,
     sigma_m: Annotated[
         str | None, typer.Option(help="Standard deviation in m: one number, or three by commas.")
@@ -92,8 +93,6 @@ def monte_carlo_command(
 
 def _sigma_of(kind: str, given: dict[str, str | None]) -> list[float]:
     """The standard deviation in the units of the adjustment; raises InputError where it is in others."""
-    if kind not in _KINDS:
-        raise InputError(f"--bias {kind}: there are {', '.join(_KINDS)}")
     option = {"m": "--sigma-m", "deg": "--sigma-deg", "mm": "--sigma-mm", "own": "--sigma"}
     named = [unit for unit, text in given.items() if text is not None]
     if kind == "noise":

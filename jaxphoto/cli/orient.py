@@ -10,6 +10,7 @@ import typer
 
 from jaxphoto.camera import DISTORTIONS, InteriorOrientation
 from jaxphoto.cli.app import app
+from jaxphoto.cli.choices import one_of
 from jaxphoto.cli.console import plain_console
 from jaxphoto.cli.progress import FEWER_PAIRS, StepsLeft
 from jaxphoto.errors import InputError
@@ -44,7 +45,7 @@ def orient_command(
     ] = None,
     c_mm: Annotated[float | None, typer.Option(help="Where the principal distance starts; else from EXIF.")] = None,
     pixel_mm: Annotated[float | None, typer.Option(help="Size of a pixel; else from EXIF.")] = None,
-    model: Annotated[str | None, typer.Option(help=f"Distortion: {', '.join(DISTORTIONS)} (default: brown).")] = None,
+    model: Annotated[str | None, one_of(DISTORTIONS, help="Distortion (default: brown).")] = None,
     r0_mm: Annotated[
         float | None, typer.Option(help="Balance radius R0 of smac (default: 0), where radial distortion is none.")
     ] = None,

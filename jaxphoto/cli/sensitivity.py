@@ -2,19 +2,20 @@
 
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, get_args
 
 import numpy as np
 import typer
 
 import jaxphoto
 from jaxphoto.cli.app import app
+from jaxphoto.cli.choices import one_of
 from jaxphoto.cli.console import plain_console
 from jaxphoto.errors import InputError
 from jaxphoto.io import read_block
 from jaxphoto.procedures import adjust_for_tables
 from jaxphoto.report.sensitivity import SensitivityTables, write_sensitivity
-from jaxphoto.sensitivity.influence import DELTA0
+from jaxphoto.sensitivity.influence import DELTA0, Per
 from jaxphoto.writing import check_folder
 
 _SHOWN = 12
@@ -24,7 +25,7 @@ _SHOWN = 12
 def sensitivity_command(
     block: Annotated[Path, typer.Argument(help="Block folder (see docs/block_folder.md).")],
     out: Annotated[Path, typer.Option(help="Folder for the results; earlier results in it are replaced.")],
-    per: Annotated[str, typer.Option(help="Whose stations have a bias: block, strip, image.")] = "strip",
+    per: Annotated[Per, one_of(get_args(Per), help="Whose stations have a bias.")] = "strip",
     bias_m: Annotated[float, typer.Option(help="Size of the station bias.")] = 0.10,
     delta0: Annotated[float, typer.Option(help="Non-centrality of the test of normalised residuals.")] = DELTA0,
     max_steps: Annotated[int, typer.Option(min=1, help="Most iterations.")] = jaxphoto.MAX_STEPS,
@@ -41,7 +42,7 @@ def sensitivity_command(
         status.update(f"adjusting {len(read.images)} images, {len(read.points)} points")
         adjusted = adjust_for_tables(read, max_steps)
         status.update("differentiating")
-        tables = SensitivityTables(adjusted, per, bias_m, delta0)  # type: ignore[arg-type]
+        tables = SensitivityTables(adjusted, per, bias_m, delta0)
         table = tables.bias
         status.update(f"writing {out}")
         order = ("compile", "solve", "covariance", "sensitivity")

@@ -7,13 +7,14 @@ from typing import Annotated
 import typer
 
 from jaxphoto.cli.app import app
+from jaxphoto.cli.choices import one_of
 from jaxphoto.cli.console import plain_console
-from jaxphoto.cli.grid_options import check_grid, method_of, points_of
+from jaxphoto.cli.grid_options import check_grid, points_of
 from jaxphoto.cli.two_cameras import compared, read_two
 from jaxphoto.errors import InputError
 from jaxphoto.report import print_warning
 from jaxphoto.report.stability import print_stability, write_stability
-from jaxphoto.stability import METHODS, analyse
+from jaxphoto.stability import METHODS, Method, analyse
 from jaxphoto.writing import check_folder
 
 
@@ -21,7 +22,7 @@ from jaxphoto.writing import check_folder
 def stability_command(
     first: Annotated[Path, typer.Argument(metavar="A", help="Results, interior.csv or camera file of one set.")],
     second: Annotated[Path, typer.Argument(metavar="B", help="The same of the other set.")],
-    method: Annotated[str, typer.Option(metavar=" | ".join(METHODS), help="Alignment that the verdict is of.")] = "rot",
+    method: Annotated[Method, one_of(METHODS, help="Alignment that the verdict is of.")] = "rot",
     grid: Annotated[str, typer.Option(help="Columns and rows of the grid.")] = "15x11",
     extent: Annotated[
         str | None, typer.Option(help="Width and height of the grid in mm, such as 4.0x3.0; the format if not given.")
@@ -39,7 +40,6 @@ def stability_command(
     out: Annotated[Path | None, typer.Option(help="Folder for tables, map and page.")] = None,
 ) -> None:
     """Compare the bundles of rays of two interior orientations (Habib et al. 2006), with uncertainty."""
-    chosen = method_of(method)
     if not (math.isfinite(noise_px) and noise_px > 0):
         raise InputError(f"--noise-px {noise_px:g}: give the noise of image coordinates, a positive number of pixels")
     if not 0 <= relief < 1:
@@ -54,7 +54,7 @@ def stability_command(
     for letter, file in zip("AB", both, strict=True):
         if file.note:
             print_warning(f"{letter}: {file.note}", console, soft_wrap=True)
-    print_stability(found, (one, other), a.sensor.pixel_mm, noise_mm, chosen, console)
+    print_stability(found, (one, other), a.sensor.pixel_mm, noise_mm, method, console)
     if out is not None:
-        write_stability(found, (one, other), a.sensor, noise_mm, chosen, out)
+        write_stability(found, (one, other), a.sensor, noise_mm, method, out)
         console.print(f"results in {out} (open report.html)")

@@ -1,7 +1,7 @@
 """`jaxphoto dsm` and `jaxphoto orthophoto`: a surface model from a cloud, and a photograph laid over it."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, get_args
 
 import jax
 import numpy as np
@@ -10,12 +10,13 @@ import typer
 import jaxphoto
 from jaxphoto.block import Block
 from jaxphoto.cli.app import app
+from jaxphoto.cli.choices import one_of
 from jaxphoto.cli.cloud_options import Classes, CloudEpsg, CloudUnit, ReturnsOption, class_numbers
 from jaxphoto.cli.console import plain_console
 from jaxphoto.errors import BlockError, InputError
 from jaxphoto.io import clouds, raster, read_block
 from jaxphoto.lidar.orthophoto import orthophoto
-from jaxphoto.lidar.raster import filled, hillshade, surface_model
+from jaxphoto.lidar.raster import Statistic, filled, hillshade, surface_model
 from jaxphoto.procedures import adjust
 from jaxphoto.writing import check_file
 
@@ -27,7 +28,7 @@ def dsm_command(
     cell_m: Annotated[float, typer.Option(help="Size of a cell in m.")] = 1.0,
     classes: Classes = None,
     returns: ReturnsOption = "all",
-    statistic: Annotated[str, typer.Option(help="Height of a cell: highest, mean, lowest.")] = "highest",
+    statistic: Annotated[Statistic, one_of(get_args(Statistic), help="Height of a cell.")] = "highest",
     fill_m: Annotated[float, typer.Option(min=0.0, help="Close holes whose cells lie within this of heights.")] = 0.0,
     cloud_epsg: CloudEpsg = None,
     cloud_unit: CloudUnit = None,

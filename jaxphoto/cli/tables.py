@@ -6,23 +6,23 @@ from typing import Annotated
 import typer
 
 from jaxphoto.cli.app import app
+from jaxphoto.cli.choices import one_of
 from jaxphoto.cli.console import plain_console
 from jaxphoto.io import read_result_tables
-from jaxphoto.report import TABLE_FORMATS, check_table_format, write_table
+from jaxphoto.report import TABLE_FORMATS, write_table
 from jaxphoto.writing import check_folder, whole_folder
 
 
 @app.command("tables")
 def tables_command(
     results: Annotated[Path, typer.Argument(help="Folder of results, such as adjust writes.")],
-    to: Annotated[str, typer.Option(metavar=" | ".join(TABLE_FORMATS), help="Format.")],
+    to: Annotated[str, one_of(TABLE_FORMATS, help="Format.")],
     out: Annotated[Path, typer.Option(help="Folder for the tables; earlier ones in it are replaced.")],
     only: Annotated[
         str, typer.Option(help="Which tables, with commas between, such as interior,exterior; all if not given.")
     ] = "",
 ) -> None:
     """Write tables of results as CSV, Parquet, Markdown or LaTeX, with as many digits as their sigmas allow."""
-    check_table_format(to)
     check_folder(out, results)
     tables = read_result_tables(results, [name.strip() for name in only.split(",") if name.strip()])
     with whole_folder(out) as work:

@@ -1,20 +1,19 @@
 """`jaxphoto undistort`: photographs and their camera in, photographs without distortion and a pinhole camera out."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, get_args
 
 import typer
 
+from jaxphoto.camera.undistortion import Keep
 from jaxphoto.cli.app import app
+from jaxphoto.cli.choices import one_of
 from jaxphoto.cli.console import plain_console
-from jaxphoto.errors import InputError
 from jaxphoto.io.cameras import read_camera_file
 from jaxphoto.io.sound_photographs import sound_photographs
 from jaxphoto.io.undistorted import write_undistorted
 from jaxphoto.report.terminal import plain
 from jaxphoto.writing import check_folder
-
-_KEEP = ("crop", "all")
 
 
 @app.command("undistort")
@@ -24,12 +23,10 @@ def undistort_command(
     out: Annotated[Path, typer.Option(help="Folder for the photographs and their camera.toml.")],
     which: Annotated[str | None, typer.Option(help="Which camera, where the file holds several.")] = None,
     keep: Annotated[
-        str, typer.Option(help="crop: what fills the new photographs; all: everything, with black corners.")
+        Keep, one_of(get_args(Keep), help="crop: what fills the new photographs; all: everything, with black corners.")
     ] = "crop",
 ) -> None:
     """Resample photographs to a camera without distortion. Exit code 1: written, but some were left out."""
-    if keep not in _KEEP:
-        raise InputError(f"--keep {keep}: there are {', '.join(_KEEP)}")
     check_folder(out, camera, *photographs)
     console, errors = plain_console(), plain_console(stderr=True)
     with errors.status("reading the photographs") as status:
@@ -39,7 +36,7 @@ def undistort_command(
             read,
             given,
             out,
-            keep,  # type: ignore[arg-type]
+            keep,
             progress=lambda n, of: status.update(f"undistorting: {n} of {of}"),
         )
     left = spoilt | done.left_out

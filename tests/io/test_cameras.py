@@ -441,7 +441,7 @@ def test_wrong_use_is_refused(tmp_path):
     with pytest.raises(InputError, match="there is no camera '9' in it"):
         read_camera_file(written(tmp_path, COLMAP, "cameras.txt"), camera="9")
     interior = InteriorOrientation(35.0, 0.0, 0.0, Brown())
-    with pytest.raises(InputError, match="name one of opencv, colmap, agisoft, mrcal, ros, smac, block"):
+    with pytest.raises(InputError, match="there are opencv, colmap, agisoft, mrcal, ros, smac, block"):
         write_camera_file(tmp_path / "a.dat", SENSOR, interior)
     folding = InteriorOrientation(10.0, 0.0, 0.0, Brown(k1=5e-3))
     with pytest.raises(InputError, match=r"a\.xml cannot be written: .* folds within"):
@@ -486,7 +486,7 @@ def test_command_converts_and_says_how_well(tmp_path, monkeypatch, capsys):
         ("lens.xml", [], "exists already"),
         ("new.xml", ["--width-px", "100"], "--width-px and --height-px belong together"),
         ("new.xml", ["--distortion", "none"], "--distortion none: there are brown"),
-        ("new.xml", ["--format", "none"], "name one of opencv"),
+        ("new.xml", ["--format", "none"], "there are opencv"),
         ("new.xml", ["--distortion", "brown"], "the format agisoft has the distortion Agisoft, not Brown; leave"),
     ):
         monkeypatch.setattr("sys.argv", ["jaxphoto", *arguments[:2], str(tmp_path / out), *arguments[3:], *more])

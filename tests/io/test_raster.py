@@ -305,10 +305,10 @@ def test_what_the_command_cannot_do(tmp_path, monkeypatch, capsys, changes, says
     [
         (("--class", "two"), "give numbers of classes by commas"),
         (("--class", "9"), "no points of class 9"),
-        (("--returns", "none"), "'none' are unknown"),
-        (("--statistic", "median"), "'median' is unknown"),
+        (("--returns", "none"), "--returns none: there are all"),
+        (("--statistic", "median"), "--statistic median: there are highest"),
         (("--cell-m", "0"), "positive size"),
-        (("--cloud-unit", "yd"), "'yd' is unknown"),
+        (("--cloud-unit", "yd"), "--cloud-unit yd: there are m"),
         (("--cloud-epsg", "1"), "EPSG code 1 is unknown"),
     ],
 )

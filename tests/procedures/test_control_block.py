@@ -129,6 +129,14 @@ def test_heights_that_nobody_surveyed_cost_a_sentence(marked):
         found_in(marked, with_coordinates(marked.control, xyz))
 
 
+def test_marks_that_fit_nothing_are_why_there_is_no_control(marked):
+    """Such as lists that count in shrunk copies of the photographs."""
+    marks = marked.control.marks
+    shrunk = marked.control._replace(marks=marks._replace(column_row=0.4 * marks.column_row))
+    with pytest.raises(InputError, match=r"control points are marked in two.*the marks of G0 in .* contradict one"):
+        found_in(marked, shrunk)
+
+
 def test_exchanged_names_are_seen(marked):
     xyz = marked.control.points.coordinates.copy()
     xyz[[0, 4]] = xyz[[4, 0]]

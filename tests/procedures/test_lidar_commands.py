@@ -72,7 +72,7 @@ def test_simultaneous(folder, tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("--method", "magic"), "--method magic is no method: choose one of idw, plane, tin, local, image"),
+        (("--method", "magic"), "--method magic: there are idw, plane, tin, local, image"),
         (("--sigma-z-m", "-1"), "sigma_z_m"),
         (("--class", "ground"), "--class ground: give numbers of classes"),
         (("--class", "9"), "9"),
@@ -89,7 +89,7 @@ def test_bad_options_of_lidar_control(folder, tmp_path, monkeypatch, capsys, arg
     ("arguments", "said"),
     [
         (("--shift", "much"), "--shift much: write free, fixed, or a standard deviation"),
-        (("--method", "image"), "choose one of idw, plane, tin, local"),
+        (("--method", "image"), "there are idw, plane, tin, local"),
         (("--trajectory", "nowhere.csv"), "nowhere.csv"),
     ],
 )

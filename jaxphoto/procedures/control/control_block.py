@@ -26,6 +26,8 @@ from jaxphoto.procedures.control.placed import InFrame, in_frame
 from jaxphoto.procedures.control.surveyed import MARK_SIGMA_PX, SIGMA_M, GivenControl, SurveyedPoints
 
 _ROUNDS = 8
+# Sentences about marks in an error, which is one line.
+_SAID = 2
 # Of the worst normalised residual: what is less is not left out beside it.
 _BESIDE_THE_WORST = 0.7
 
@@ -82,7 +84,8 @@ def control_block(
     try:
         block, start, agree, sigma, told = _placed(block, frame, met.points, met.covariance, sigma, points)
     except InputError as error:
-        raise InputError("; ".join([str(error), *_one_height(points)])) from error
+        # What marks say of one another is why there is too little, where there is.
+        raise InputError("; ".join([str(error), *_one_height(points), *met.sentences[:_SAID]])) from error
     said += told
     count = np.bincount(rows.point, minlength=len(ids))
     known = np.where(np.isnan(points.coordinates), np.nan, frame.xyz)
