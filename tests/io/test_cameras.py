@@ -441,7 +441,7 @@ def test_wrong_use_is_refused(tmp_path):
     with pytest.raises(InputError, match="there is no camera '9' in it"):
         read_camera_file(written(tmp_path, COLMAP, "cameras.txt"), camera="9")
     interior = InteriorOrientation(35.0, 0.0, 0.0, Brown())
-    with pytest.raises(InputError, match="there are opencv, colmap, agisoft, mrcal, ros, smac, block"):
+    with pytest.raises(InputError, match="name one of opencv, colmap, agisoft, mrcal, ros, smac, block"):
         write_camera_file(tmp_path / "a.dat", SENSOR, interior)
     folding = InteriorOrientation(10.0, 0.0, 0.0, Brown(k1=5e-3))
     with pytest.raises(InputError, match=r"a\.xml cannot be written: .* folds within"):
