@@ -363,6 +363,7 @@ READERS: dict[str, Reader] = {
             ("openmvg", test_reconstructions.write_open_mvg),
             ("blocksexchange", test_reconstructions.write_blocks_exchange),
             ("bundler", test_reconstructions.write_bundler),
+            ("pix4d", test_reconstructions.write_pix4d),
         )
     },
     "dbat": Reader(text(**sound_files.DBAT), read_dbat),

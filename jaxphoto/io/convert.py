@@ -10,7 +10,7 @@ from jaxphoto.io import aicon, bal, colmap, dbat, photomodeler
 from jaxphoto.io.block_folder import BlockTables, assemble, write_block
 from jaxphoto.io.block_folder.block_reader import read_folder
 from jaxphoto.io.block_folder.table_layout import TOML
-from jaxphoto.io.reconstructions import blocks_exchange, bundler, open_mvg, open_sfm
+from jaxphoto.io.reconstructions import blocks_exchange, bundler, open_mvg, open_sfm, pix4d
 
 
 class Format(NamedTuple):
@@ -30,6 +30,7 @@ FORMATS = {
     "opensfm": Format(open_sfm.recognises, open_sfm.read_open_sfm),
     "openmvg": Format(open_mvg.recognises, open_mvg.read_open_mvg),
     "blocksexchange": Format(blocks_exchange.recognises, blocks_exchange.read_blocks_exchange),
+    "pix4d": Format(pix4d.recognises, pix4d.read_pix4d),
     "bundler": Format(bundler.recognises, bundler.read_bundler),
 }
 

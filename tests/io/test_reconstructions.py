@@ -14,6 +14,7 @@ from jaxphoto.collinearity import project
 from jaxphoto.errors import InputError
 from jaxphoto.io import read_source
 from jaxphoto.io.exports import AdjustedPhotographs, ExportCamera, export
+from jaxphoto.orientation.approximate import approximate
 from jaxphoto.unknowns import FREE
 from tests.io.test_exports import CAMERAS, SENSOR, fisheye, photographs, plane
 
@@ -43,8 +44,10 @@ def pixels(image, kind, f=800.0, centre=(325.5, 239.0), k=(-0.12, 0.03, -0.01, 0
 
 
 def misfits_px(block):
-    """Measured minus projected of the start values."""
+    """Measured minus projected of the start values, which have no points where the program writes none."""
     rows, start = block.image_points, block.start.unknowns
+    if not block.start.point_known.any():
+        start = dataclasses.replace(start, points=POINTS[[int(name) - 100 for name in block.points]])
     found = np.zeros((len(rows.image), 2))
     for i in range(len(block.images)):
         own = np.flatnonzero(np.asarray(rows.image) == i)
@@ -216,6 +219,30 @@ def write_bundler(folder, names=True, change=lambda lines: lines):
     return folder
 
 
+# Pix4D --------------------------------------------------------------------------------------------------------------
+
+
+def write_pix4d(folder, offset=(0.0, 0.0, 0.0), change=lambda text: text, points=lambda text: text):
+    words = lambda values: " ".join(map(repr, np.ravel(values).tolist()))  # noqa: E731
+    text = (
+        "fileName imageWidth imageHeight\ncamera matrix K [3x3]\nradial distortion [3x1]\ntangential distortion [2x1]\n"
+    )
+    text += "camera position t [3x1]\ncamera rotation R [3x3]\ncamera model m = K [R|-Rt] X\n\n"
+    ties = ""
+    for i, name in enumerate(NAMES):
+        text += f"{name} {WIDTH} {HEIGHT}\n800.0 0 325.5\n0 800.0 239.0\n0 0 1\n-0.12 0.03 -0.01\n0.001 -0.002\n"
+        text += f"{words(CENTRES[i] - offset)}\n" + "".join(f"{words(row)}\n" for row in ROTATIONS[i].as_matrix())
+        ties += f"{name.removesuffix('.jpg')}\n"
+        ties += "".join(f"{100 + k} {words(xy)} 2.5\n" for k, xy in enumerate(pixels(i, "brown"))) + "-99\n"
+    ties += "lost\n100 5.0 6.0 2.5\n-99\n"
+    params = folder / "1_initial" / "params"
+    params.mkdir(parents=True, exist_ok=True)
+    (params / "flight_calibrated_camera_parameters.txt").write_text(change(text))
+    (params / "flight_tp_pix4d.txt").write_text(points(ties))
+    (params / "flight_offset.xyz").write_text(words(np.array(offset)) + "\n")
+    return folder
+
+
 WRITERS = {
     "opensfm": lambda folder: write_open_sfm(folder),
     "opensfm perspective": lambda folder: write_open_sfm(folder, "perspective", version=""),
@@ -225,10 +252,12 @@ WRITERS = {
     "blocksexchange": lambda folder: write_blocks_exchange(folder),
     "blocksexchange upwards": lambda folder: write_blocks_exchange(folder, upwards=True, pixels_of_focal=False),
     "bundler": lambda folder: write_bundler(folder),
+    "pix4d": lambda folder: write_pix4d(folder),
+    "pix4d offset": lambda folder: write_pix4d(folder, offset=(0.25, -1.0, 3.0)),
 }
 
 
-@pytest.mark.filterwarnings("ignore:.*are not read")
+@pytest.mark.filterwarnings("ignore:.*are not read", "ignore:.*are left out")
 @pytest.mark.parametrize("name", WRITERS)
 def test_it_is_read_as_the_program_means_it(tmp_path, name):
     block = read_source(WRITERS[name](tmp_path / "in"))
@@ -287,6 +316,28 @@ def test_without_a_list_photographs_of_bundler_have_numbers(tmp_path):
         assert read_source(write_bundler(tmp_path / "in", names=False)).images == ("0", "1", "2")
 
 
+def test_photographs_of_pix4d_without_a_camera_are_told_and_its_points_are_found_by_their_rays(tmp_path):
+    with pytest.warns(UserWarning, match="1 photographs are not in flight_calibrated.*: 'lost'"):
+        block = read_source(write_pix4d(tmp_path / "in", offset=(0.25, -1.0, 3.0)))
+    assert free_of(block, "0") == {"c_mm", "xp_mm", "yp_mm", "k1", "k2", "k3", "p1", "p2"}
+    found = np.asarray(approximate(block).points)
+    assert np.abs(found - POINTS[[int(name) - 100 for name in block.points]]).max() < 1e-6
+
+
+@pytest.mark.filterwarnings("ignore:.*are left out")
+def test_a_matrix_of_pix4d_itself_has_the_angles_that_it_prints(tmp_path):
+    """One photograph of a project that is public: R in one file, omega, phi, kappa in another."""
+    rows = (
+        "-0.49632901575943477734 0.86794436424468834890 -0.01816834310427051929\n"
+        "0.86649900151927328196 0.49400145706385401034 -0.07170802454019638366\n"
+        "-0.05326338781351704077 -0.05133362440616233424 -0.99726018196053234366\n"
+    )
+    words = "".join(" ".join(map(repr, row.tolist())) + "\n" for row in ROTATIONS[0].as_matrix())
+    block = read_source(write_pix4d(tmp_path / "in", change=_replaced(words, rows)))
+    angles = np.rad2deg(np.asarray(block.start.unknowns.exterior.omega_phi_kappa))[block.images.index("b")]
+    np.testing.assert_allclose(angles, [-2.946680, 3.053212, 119.804001], rtol=0, atol=1e-6)
+
+
 def _set(path, value):
     """Changes one place of a tree of lists and names."""
 
@@ -323,6 +374,10 @@ def _blocks(change, **more):
     return lambda folder: write_blocks_exchange(folder, change=change, **more)
 
 
+def _pix4d(change=lambda text: text, **more):
+    return lambda folder: write_pix4d(folder, change=change, **more)
+
+
 def _bundle(change):
     return lambda folder: write_bundler(folder, change=change)
 
@@ -351,11 +406,15 @@ REFUSED = {
     "centre": (_blocks(_replaced("<x>0.5</x>", "<x>a</x>")), "photo 5, Center: .* is not 3 finite numbers"),
     "end": (_bundle(lambda lines: lines[:-1]), "number of measurements of point 6"),
     "words": (_bundle(lambda lines: [*lines, "x"]), "a word that is no number"),
+    "cameras that end": (_pix4d(lambda text: text[: text.rindex("\n", 0, -1)]), "has 29 rows"),
+    "focal lengths": (_pix4d(_replaced("0 800.0 239", "0 801.0 239")), "one focal"),
+    "no number": (_pix4d(_replaced("0.001 -0.002", "0.001 x")), "row 14: .* 2 numb"),
+    "short row": (_pix4d(points=_replaced("100 5.0 6.0 2.5", "100 5.0")), "is not point, x"),
     "of camera": (_bundle(lambda lines: [*lines[:-1], "1 17 0 1.0 1.0"]), "in a camera that is none of 0 to 3"),
 }  # fmt: skip
 
 
-@pytest.mark.filterwarnings("ignore:.*are not read")
+@pytest.mark.filterwarnings("ignore:.*are not read", "ignore:.*are left out")
 @pytest.mark.parametrize("name", REFUSED)
 def test_what_cannot_be_is_told_in_a_sentence(tmp_path, name):
     write, message = REFUSED[name]

@@ -53,7 +53,8 @@ class TiedPhotographs(NamedTuple):
     """World to camera: x right, y down, z ahead."""
     centres: Float[np.ndarray, "images 3"]
     points: Sequence[str]
-    xyz: Float[np.ndarray, "points 3"]
+    xyz: Float[np.ndarray, "points 3"] | None
+    """None where the file has none, and rays tell it."""
     image: Int[np.ndarray, "n"]
     point: Int[np.ndarray, "n"]
     column_row: Float[np.ndarray, "n 2"]
@@ -94,8 +95,9 @@ def free_network(given: TiedPhotographs) -> BlockTables:
             "column_px": column_row[:, 0],
             "row_px": column_row[:, 1],
         },
-        "object_points": {"point": ids} | dict(zip(XYZ, given.xyz[seen].T, strict=True)),
     }
+    if given.xyz is not None:
+        tables["object_points"] = {"point": ids} | dict(zip(XYZ, given.xyz[seen].T, strict=True))
     used = set(given.camera_of)
     settings = {
         "title": given.title,
