@@ -163,8 +163,9 @@ def _read_points(path: Path, cameras: Path, names: list[str]) -> tuple[np.ndarra
             points.append(words[0])
             rows.append(_numbers(path, k, words[1:3], 2))
     if unknown:
+        left = few([quoted(name) for name in unknown])
         warnings.warn(
-            f"{path.name}: {len(unknown)} photographs are not in {cameras.name} and are left out: {few(list(map(quoted, unknown)))}",
+            f"{path.name}: {len(unknown)} photographs are not in {cameras.name} and are left out: {left}",
             UserWarning,
             stacklevel=3,
         )
