@@ -28,6 +28,7 @@ from jaxphoto.io.block_folder import whole_block
 from jaxphoto.io.control_files import read_control
 from jaxphoto.io.exports import write_photograph_files
 from jaxphoto.io.exposures import exposure_files, located
+from jaxphoto.io.kept_orientation import kept_orient
 from jaxphoto.io.kept_pieces import KeptPieces, beside, check_pieces
 from jaxphoto.io.photographs import known_lens, sensor_and_interior
 from jaxphoto.io.sound_photographs import sound_photographs
@@ -152,6 +153,7 @@ def fly_command(
                 taken if rolling_shutter else None,
             ),
             status.update,
+            kept_orient(keep),
         )
         flight = flight._replace(left_out=matched.left_out | flight.left_out)
         status.update("computing statistics")

@@ -20,11 +20,12 @@ from jaxphoto.image_measurement.photograph_pairs import photograph_pairs, usual_
 from jaxphoto.io import read_block, write_block
 from jaxphoto.io.block_folder import check_block_target, whole_block
 from jaxphoto.io.block_folder.table_layout import TOML
+from jaxphoto.io.kept_orientation import kept_orient
 from jaxphoto.io.kept_pieces import KeptPieces, beside, check_pieces
 from jaxphoto.io.photographs import photographs, sensor_and_interior
 from jaxphoto.procedures.adjust import needs_orientation
 from jaxphoto.procedures.calibration import distortion_model
-from jaxphoto.procedures.orientation import Oriented, orient, orient_block
+from jaxphoto.procedures.orientation import Oriented, orient_block
 from jaxphoto.report.orientation import print_orientation, write_orientation
 
 
@@ -91,7 +92,7 @@ def orient_command(
             keep=keep,
             progress=StepsLeft(errors, status, FEWER_PAIRS),
         )
-        found = orient(
+        found = kept_orient(keep)(
             [p.name for p in read],
             camera.sensor,
             InteriorOrientation(start.c, start.x_p, start.y_p, distortion),

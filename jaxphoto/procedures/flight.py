@@ -1,6 +1,6 @@
 """From matched photographs of a flight to calibrations: each part that hangs together, the largest first."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -87,8 +87,11 @@ def calibrate_flight(
     interior: InteriorOrientation,
     known: KnownOfFlight,
     report: Report = lambda text: None,
+    orient: Callable[..., Oriented] = orient,
 ) -> CalibratedFlight:
     """Orient, georeference and adjust every part of the photographs of one camera, which starts at `interior`.
+
+    `orient` is the function of this name, or one that keeps its outcome.
 
     Photographs that cannot be oriented, and whole parts that cannot, are left out with the reason. What is `known` and
     does not fit a part, it goes without, and says why.
@@ -100,7 +103,7 @@ def calibrate_flight(
     for number, part in enumerate(matched, 1):
         report(f"part {number} of {len(matched)}")
         try:
-            parts.append(_calibrated(part, sensor, interior, known, report))
+            parts.append(_calibrated(part, sensor, interior, known, report, orient))
         except BlockError as error:
             left |= {
                 name: f"its part of {len(part.names)} photographs cannot be oriented: {error}" for name in part.names
@@ -114,7 +117,7 @@ def calibrate_flight(
 
 
 def _calibrated(
-    matched: MatchedPart, sensor: Sensor, interior: InteriorOrientation, known: KnownOfFlight, report: Report
+    matched: MatchedPart, sensor: Sensor, interior: InteriorOrientation, known: KnownOfFlight, report: Report, orient
 ) -> FlightPart:
     title, lens = f"flight of {len(matched.names)} photographs", known.lens
     oriented = orient(

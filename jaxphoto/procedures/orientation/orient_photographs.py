@@ -39,6 +39,8 @@ from jaxphoto.unknowns import Unknowns, default_priors
 
 CAMERA = "camera"
 """What the camera of the photographs is called in the block."""
+METHOD = 1
+"""Changes with the way photographs are oriented: what a run has kept of another way is not taken up."""
 SIGMA_PX = 0.5
 """Standard deviation of a feature, in pixels, where none is given."""
 LEAST_MATCHES = 15
@@ -205,23 +207,45 @@ def _block_of(title, names, sensor, interior, features, sigmas_mm, found: Tracks
     n, n_points = len(names), int(found.point.max(initial=-1)) + 1
     for name in parameter_names(interior):
         interior = set_parameter(interior, name, np.asarray(get_parameter(interior, name), float))
-    interior = dataclasses.replace(interior, residuals="measured")
     exterior = ExteriorOrientation(np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1)))  # type: ignore[arg-type]
-    unknowns = Unknowns({CAMERA: interior}, exterior, np.zeros((n_points, 3)), {}, {})
-    priors = default_priors(unknowns)
-    free = freed(priors.interior[CAMERA], _candidates(interior))
     rows = np.concatenate([[0], np.cumsum([len(xy) for xy in features])])[found.image] + found.feature
     xy, sigma = np.concatenate(features)[rows], np.concatenate(sigmas_mm)[rows]
+    block = photographs_block(
+        title,
+        names,
+        [f"t{k + 1}" for k in range(n_points)],
+        sensor,
+        (interior, freed(interior, _candidates(interior))),
+        (exterior, np.zeros((n_points, 3))),
+        ImageRows(found.image, found.point, xy, np.stack([sigma, sigma], axis=1)),
+    )
+    nothing = dataclasses.replace(block.start, image_known=np.zeros(n, bool), point_known=np.zeros(n_points, bool))
+    return dataclasses.replace(block, start=nothing)
+
+
+def photographs_block(
+    title: str,
+    names: Sequence[str],
+    points: Sequence[str],
+    sensor: Sensor,
+    camera: tuple[InteriorOrientation, InteriorOrientation],
+    start: tuple[ExteriorOrientation, Float[np.ndarray, "points 3"]],
+    rows: ImageRows,
+) -> Block:
+    """Photographs of one `camera`, its interior orientation and the priors of that, as a free network from `start`."""
+    interior, priors = (dataclasses.replace(part, residuals="measured") for part in camera)
+    unknowns = Unknowns({CAMERA: interior}, *start, {}, {})
+    n, n_points = len(names), len(points)
     return Block(
         title=title,
         images=tuple(names),
-        points=tuple(f"t{k + 1}" for k in range(n_points)),
+        points=tuple(points),
         sensors={CAMERA: sensor},
         image_camera=(CAMERA,) * n,
         image_mount=("",) * n,
         image_strip=("",) * n,
         image_time=np.zeros(n),
-        image_points=ImageRows(found.image, found.point, xy, np.stack([sigma, sigma], axis=1)),
+        image_points=rows,
         control=ControlRows.none(),
         fixed=ControlRows.none(),
         check=ControlRows.none(),
@@ -229,8 +253,8 @@ def _block_of(title, names, sensor, interior, features, sigmas_mm, found: Tracks
         attitudes=Attitudes.none(),
         distances=Distances.none(),
         datum=Datum("inner", "points"),
-        start=Start(unknowns, np.zeros(n, bool), np.zeros(n_points, bool)),
-        priors=dataclasses.replace(priors, interior={CAMERA: free}),
+        start=Start(unknowns, np.ones(n, bool), np.ones(n_points, bool)),
+        priors=dataclasses.replace(default_priors(unknowns), interior={CAMERA: priors}),
     )
 
 
