@@ -85,6 +85,8 @@ def test_a_folder_becomes_blocks_results_and_a_page(flown, tmp_path, monkeypatch
 def test_options_that_cannot_be(flown, tmp_path, monkeypatch, capsys):
     for arguments, message in (
         (["--epsg", 99], "EPSG code 99 is unknown"),
+        (["--epsg", "25832+"], "--epsg is '25832+'; give the code"),
+        (["--epsg", "25832+4326"], "EPSG:4326 (WGS 84) is no system of heights"),
         (["--model", "pinhole"], "--model pinhole: there are brown"),
         (["--pairs", "position:3"], "have no GPS position"),
         (["--lever-arm", "0,1"], "--lever-arm is '0,1'; give three numbers of metres"),

@@ -13,12 +13,12 @@ from jaxphoto.camera import DISTORTIONS, InteriorOrientation
 from jaxphoto.cli.app import app
 from jaxphoto.cli.choices import one_of
 from jaxphoto.cli.console import plain_console
-from jaxphoto.cli.exposure_options import heights_of, lever_arm_of
+from jaxphoto.cli.exposure_options import heights_of, lever_arm_of, map_codes
 from jaxphoto.cli.progress import FEWER_PAIRS, StepsLeft
 from jaxphoto.cli.provenance import Provenance
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing.geoid_heights import WGS84
-from jaxphoto.georeferencing.map_frame import check_heights, map_system
+from jaxphoto.georeferencing.map_frame import check_heights
 from jaxphoto.image_measurement.control_targets import target_looker
 from jaxphoto.image_measurement.features import FEATURES, LONGEST_PX
 from jaxphoto.image_measurement.matching import MatchedPhotographs, match_photographs
@@ -52,7 +52,10 @@ def fly_command(
             "where not all have one, similar:20; exhaustive up to 40)."
         ),
     ] = None,
-    epsg: Annotated[int | None, typer.Option(help="Map system of the block (default: the zone of UTM).")] = None,
+    epsg: Annotated[
+        str | None,
+        typer.Option(help="Map system of the block, such as 25832 or 25832+7837 (default: the zone of UTM)."),
+    ] = None,
     features: Annotated[int, typer.Option(help="Of a photograph, at most.", min=100)] = FEATURES,
     longest_px: Annotated[
         int, typer.Option(help="Longer side, in pixels, to look for features.", min=200)
@@ -101,8 +104,7 @@ def fly_command(
         raise InputError("something is told of control, but no points are given; add --control FILE")
     surveyed, target = read_control(control, marks) if control else None, read_target(targets) if targets else None
     check_pieces(beside(out))
-    if epsg is not None:
-        map_system(epsg)
+    code, vertical = map_codes(epsg)
     above, arm = heights_of(heights), lever_arm_of(lever_arm)
     if isinstance(above, int):
         check_heights(WGS84, above)
@@ -112,7 +114,7 @@ def fly_command(
         read, spoilt = sound_photographs(photographs)
         for sentence in spoilt.values():
             errors.print(f"left out: {plain(sentence)}", soft_wrap=True)
-        told = located(read, photographs, exposures or (), code=epsg, arm=arm, heights=above)
+        told = located(read, photographs, exposures or (), code=code, arm=arm, heights=above)
         read = told.photographs
         for sentence in told.sentences:
             console.print(plain(sentence), soft_wrap=True)
@@ -120,7 +122,7 @@ def fly_command(
         if surveyed:
             look = target_looker(target, {p.name: p.path for p in read}) if target else None
             names, at = [p.name for p in read], [p.gps for p in read]
-            given, epsg = flight_control(surveyed, control_epsg, names, at, look, epsg)
+            given, code = flight_control(surveyed, control_epsg, names, at, look, code)
         camera = sensor_and_interior(read, pixel_mm, c_mm)
         distortion = distortion_model(model, camera.sensor)
         compared = photograph_pairs(read, pairs or usual_choice(read))
@@ -147,10 +149,11 @@ def fly_command(
             KnownOfFlight(
                 {p.name: p.gps for p in read},
                 {p.name: p.attitude for p in read},
-                epsg,
+                code,
                 given,
                 known_lens(read, camera, distortion) if lens_prior else None,
                 taken if rolling_shutter else None,
+                vertical,
             ),
             status.update,
             kept_orient(keep),

@@ -119,6 +119,11 @@ def check_heights(code: int, vertical: int) -> None:
     _to_place(code, vertical)
 
 
+def map_name(code: int, vertical: int | None) -> str:
+    """A map system with its heights, as programs of surveyors and PROJ write it: EPSG:25832+7837."""
+    return f"EPSG:{code}" + (f"+{vertical}" if vertical is not None else "")
+
+
 @functools.cache
 def _to_place(code: int, vertical: int | None) -> Transformer:
     """From map coordinates to longitude, latitude and ellipsoidal height of the same datum."""

@@ -51,6 +51,8 @@ class KnownOfFlight(NamedTuple):
     lens: KnownLens | None = None
     taken: Mapping[str, Moment] | None = None
     """When photographs were taken; given where a rolling shutter is to be estimated."""
+    vertical: int | None = None
+    """EPSG code of the heights of the map system; None: above the ellipsoid."""
 
 
 class FlightPart(NamedTuple):
@@ -131,7 +133,9 @@ def _calibrated(
         why_not = "the control is in a local system, in which positions of photographs tell nothing: none is used"
     else:
         try:
-            placed = georeference_photographs(oriented.block, known.positions, known.code, known.attitudes)
+            placed = georeference_photographs(
+                oriented.block, known.positions, known.code, known.attitudes, known.vertical
+            )
         except (InputError, BlockError) as error:
             why_not = str(error)
     block = placed.block if placed else oriented.block

@@ -20,7 +20,7 @@ from jaxphoto.block import Block, Datum, Frame
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing.camera_attitude import CameraAttitude
 from jaxphoto.georeferencing.gps import Gps
-from jaxphoto.georeferencing.map_frame import MapFrame
+from jaxphoto.georeferencing.map_frame import MapFrame, map_name
 from jaxphoto.observations import StationRows
 from jaxphoto.procedures.attitudes_of_photographs import RecordedTurn, recorded_turn, with_attitudes
 from jaxphoto.procedures.georeferencing_words import attitude_words, position_words
@@ -56,14 +56,17 @@ def georeference_photographs(
     positions: Mapping[str, Gps | None],
     code: int | None = None,
     attitudes: Mapping[str, CameraAttitude | None] | None = None,
+    vertical: int | None = None,
 ) -> GeoreferencedPhotographs:
     """`block`, oriented as a free network, in the EPSG system `code` (else UTM), with the `positions` of its images.
+
+    `vertical` is the EPSG code of the heights that the block is to have in files; None: above the ellipsoid.
 
     The stations' standard deviations are those of the file, else `SIGMA_M`. Heights are taken as the files have them.
     Where `attitudes` tell the turn better than the positions do, as of a single strip, they are observed as well.
 
-    Raises InputError where fewer than three positions agree, or all lie on a line that no attitudes turn, and for a
-    code that is unknown.
+    Raises InputError where fewer than three positions agree, or all lie on a line that no attitudes turn, and for
+    codes that are unknown, or heights whose geoid is not at hand.
     """
     known = {name: gps for name in block.images if (gps := positions.get(name)) and gps.altitude_m is not None}
     turned = {name for name in known if attitudes and attitudes.get(name) is not None}
@@ -76,7 +79,7 @@ def georeference_photographs(
     middle = np.median(places, axis=0)
     origin = (round(float(middle[0]), 4), round(float(middle[1]), 4), 0.0)
     code = utm_of(*origin[:2]) if code is None else code
-    frame = MapFrame(code, None, origin)
+    frame = MapFrame(code, vertical, origin)
     here = frame.local_from_place(places)
     image = np.array([block.images.index(name) for name in known])
     there = np.asarray(block.start.unknowns.exterior.position, float)[image]
@@ -96,13 +99,13 @@ def georeference_photographs(
         similarity.of_block(block),
         stations=stations,
         datum=Datum(),
-        frame=Frame("epsg", code, None, origin=origin),
+        frame=Frame("epsg", code, vertical, origin=origin),
     )
     if helping is not None:
         placed = with_attitudes(placed, helping)
     offsets = here - similarity.of(there)
     said = (
-        *position_words(code, block.images, known, offsets, used, sigma),
+        *position_words(map_name(code, vertical), block.images, known, offsets, used, sigma),
         *attitude_words(recorded, helping is not None, similarity.turn),
     )
     return GeoreferencedPhotographs(placed, tuple(known), offsets, used, said)

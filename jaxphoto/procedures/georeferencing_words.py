@@ -17,7 +17,7 @@ _BEYOND = 4.0
 
 
 def position_words(
-    code: int,
+    system: str,
     images: Sequence[str],
     known: Mapping[str, Gps],
     offsets: Float[np.ndarray, "n 3"],
@@ -29,7 +29,7 @@ def position_words(
     plan, height = np.hypot(*offsets[used, :2].T), np.abs(offsets[used, 2])
     yield (
         f"{used.sum()} of {n} positions agree with the network: medians {np.median(plan):.2g} m in plan, "
-        f"{np.median(height):.2g} m in height; map system EPSG:{code}"
+        f"{np.median(height):.2g} m in height; map system {system}"
     )
     if without := [name for name in images if name not in known]:
         yield f"{len(without)} photographs have no position with a height, and follow from the others ({few(without)})"

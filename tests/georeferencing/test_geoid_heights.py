@@ -12,6 +12,8 @@ from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import map_frame
 from jaxphoto.georeferencing.gps import Gps
 from jaxphoto.georeferencing.recorded_positions import one_height
+from jaxphoto.procedures.georeference_photographs import georeference_photographs
+from tests.procedures.test_georeference_photographs import network, recorded
 
 EGM96, GRID = 5773, "us_nga_egm96_15.tif"
 FOLDERS = [f for f in (*datadir.get_data_dir().split(os.pathsep), datadir.get_user_data_dir()) if os.path.isdir(f)]
@@ -51,6 +53,18 @@ def test_heights_above_take_off_among_them_are_brought_to_them_first(geoid):
     given = {n: HERE._replace(altitude_m=40 + h) for n, h in above.items()} | {"c": HERE._replace(altitude_m=60.5)}
     found, _ = one_height(given, above, EGM96)
     assert [g.altitude_m for g in found.values()] == pytest.approx([40 + UNDULATION_M + h for h in above.values()])
+
+
+def test_a_block_has_heights_above_the_geoid_in_its_files(geoid):
+    block, truth = network()
+    known = recorded(truth.exterior.position, block.images)
+    above, plain = (georeference_photographs(block, known, vertical=code) for code in (EGM96, None))
+    assert "map system EPSG:32633+5773" in above.sentences[0]
+    position = above.block.start.unknowns.exterior.position
+    np.testing.assert_allclose(position, plain.block.start.unknowns.exterior.position, atol=1e-9)
+    lower = plain.block.frame.map.map(np.asarray(position)) - above.block.frame.map.map(np.asarray(position))
+    east, north, up = lower.T
+    assert np.abs([east, north]).max() < 1e-6 and np.abs(up - 30.4).max() < 0.1
 
 
 def test_a_place_that_the_geoid_does_not_reach_is_named(geoid):

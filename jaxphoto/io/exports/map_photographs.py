@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from jaxphoto.arrays import still
 from jaxphoto.collinearity import ExteriorOrientation
+from jaxphoto.georeferencing.map_frame import map_name
 from jaxphoto.io.exports.adjusted_photographs import AdjustedPhotographs
 
 
@@ -37,11 +38,11 @@ class Misfit(NamedTuple):
 def in_map(photographs: AdjustedPhotographs) -> MapPhotographs:
     """The photographs in the system of the block's files; a local frame is that of its files already."""
     frame = photographs.frame
-    if frame.kind != "epsg":
+    if frame.kind != "epsg" or frame.code is None:
         return MapPhotographs(photographs.exterior, photographs.xyz, "", False)
     system, position = frame.map, np.asarray(photographs.exterior.position)
     rotations = np.asarray(photographs.exterior.camera_from_object) @ system.local_from_grid(position)
-    name = f"EPSG:{frame.code}" + (f"+{frame.vertical}" if frame.vertical is not None else "")
+    name = map_name(frame.code, frame.vertical)
     exterior = ExteriorOrientation(still(system.map(position)), still(rotations))
     return MapPhotographs(exterior, system.map(photographs.xyz), name, system.geographic)
 
