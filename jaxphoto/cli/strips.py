@@ -16,14 +16,18 @@ from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import ScannerCalibration, StripErrors
 from jaxphoto.io import clouds, read_block
 from jaxphoto.io.block_folder import exposure_times
+from jaxphoto.io.clouds.coordinate_system import CoordinateSystem
+from jaxphoto.io.raster import write_dsm
 from jaxphoto.io.trajectory import read_records, write_flight_csv
 from jaxphoto.io.trajectory.in_frame import trajectory_in, with_poses
+from jaxphoto.lidar.raster import Raster
 from jaxphoto.lidar.strip_correction import correct_strips
+from jaxphoto.lidar.strip_differences import strip_differences
 from jaxphoto.lidar.strip_settings import StripSettings
 from jaxphoto.parameters import dynamic_fields
 from jaxphoto.procedures.lidar import Photographs, ScannerPriors, StripAdjustment, StripRound, adjust_strips
 from jaxphoto.procedures.lidar.strip_adjustment import MAX_STRIP_ROUNDS
-from jaxphoto.report.strips import print_strips, write_strips
+from jaxphoto.report.strips import differences_figure, print_strips, write_strips
 from jaxphoto.unknowns import FIXED, FREE
 from jaxphoto.writing import check_folder
 
@@ -125,7 +129,9 @@ def strips_command(
         corrected = result.cloud if planes is whole else correct_strips(whole, _for_all(result, whole), path)
         status.update(f"writing {out}")
         like = cloud if cloud.suffix.lower() in (".las", ".laz") else None
+        maps = [strip_differences(own_cloud, settings) for own_cloud in (planes, result.cloud)]
         with write_strips(result, out) as folder:
+            _write_maps(maps, CoordinateSystem() if block is not None else clouds.cloud_system(cloud, **said), folder)
             name = cloud.name if like is not None else f"corrected_{cloud.name}"
             clouds.write_cloud(corrected, folder / name, like=like, frame=own, **said)
             if records is not None and result.trajectory is not None:
@@ -136,6 +142,15 @@ def strips_command(
     console.print(f"results in {out}")
     if not result.still:
         raise typer.Exit(1)
+
+
+def _write_maps(maps: list[Raster | None], system: CoordinateSystem, folder: Path) -> None:
+    before, after = maps
+    if before is None or after is None:
+        return
+    for raster, name in ((before, "before"), (after, "after")):
+        write_dsm(folder / f"differences_{name}.tif", raster, system)
+    differences_figure(before, after).savefig(folder / "differences.png")
 
 
 def _for_all(result: StripAdjustment, whole: Cloud) -> StripErrors:

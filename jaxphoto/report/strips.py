@@ -1,21 +1,29 @@
 """What a strip adjustment found, as tables: differences of strips, the scanner, and the errors of its trajectory."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
 from rich.console import Console
 
 from jaxphoto.georeferencing import TrajectoryKnot
+from jaxphoto.lidar.raster import Raster
 from jaxphoto.procedures.lidar import StripAdjustment, StripDifference, StripRound
 from jaxphoto.procedures.lidar.strip_adjustment import PHOTOGRAPHS
+from jaxphoto.report.plots import new_figure
 from jaxphoto.report.results import write_results
 from jaxphoto.report.tables import Tables
 from jaxphoto.report.verdict import verdict_of
 from jaxphoto.statistics import correlation_matrix
 from jaxphoto.writing import whole_folder
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 # Of correlations.
 _DIGITS = 6
@@ -104,6 +112,25 @@ def write_strips(result: StripAdjustment, directory: Path) -> Iterator[Path]:
             tables, times = Tables(result.adjusted), result.adjusted.seconds
             write_results(tables, verdict_of(tables), work / "adjustment", dict(times))
         yield work
+
+
+def differences_figure(before: Raster, after: Raster) -> Figure:
+    """Gaps of strips over the ground before and after, in the same colours, which reach 95 % of those before."""
+    figure = new_figure(10.0, 4.6)
+    both = figure.subplots(1, 2, sharex=True, sharey=True)
+    limit = 100 * float(np.nanpercentile(np.abs(before.heights), 95)) or 1.0
+    for axes, raster, name in zip(both, (before, after), ("before", "after"), strict=True):
+        (west, south), (east, north) = raster.extent
+        shown = axes.imshow(
+            100 * raster.heights, extent=(west, east, south, north), cmap="RdBu_r", vmin=-limit, vmax=limit
+        )
+        rms = float(np.sqrt(np.nanmean(raster.heights**2)))
+        axes.set_title(f"{name}: {100 * rms:.2g} cm RMS", loc="left")
+        axes.set(xlabel="X (m)", aspect="equal")
+        axes.ticklabel_format(useOffset=False, style="plain")
+    both[0].set_ylabel("Y (m)")
+    figure.colorbar(shown, ax=list(both), label="later strip above earlier (cm)", shrink=0.8)
+    return figure
 
 
 def print_strips(result: StripAdjustment, console: Console) -> None:

@@ -6,6 +6,7 @@ import pytest
 
 from jaxphoto.cloud import Cloud
 from jaxphoto.io import clouds
+from jaxphoto.io.raster import read_dsm
 from jaxphoto.io.recipe.truth import write_simulation
 from jaxphoto.lidar.strip_correction import correct_flight
 from tests.commands import run
@@ -43,6 +44,10 @@ def test_shifts_are_taken_off_the_cloud(cloud_file, tmp_path, monkeypatch, capsy
     assert strips.rms_m[0] < 0.2 * strips.rms_before_m[0]
     knots = pd.read_csv(out / "trajectory_errors.csv")
     assert (knots.sigma_X_m[1] > 0) and (knots.sigma_X_m[0] == 0)
+    (before, _), (after, _) = (read_dsm(out / f"differences_{name}.tif") for name in ("before", "after"))
+    # On rolling ground a shift in X and Y makes gaps of both signs about that in Z.
+    assert np.nanmedian(before.heights) == pytest.approx(SHIFT[2], abs=0.03) and np.nanstd(before.heights) > 0.01
+    assert np.sqrt(np.nanmean(after.heights**2)) < 0.015 and (out / "differences.png").stat().st_size > 10_000
     assert {f.name for f in out.iterdir() if f.suffix == ".csv"} == {
         "strips.csv", "rounds.csv", "scanner.csv", "trajectory_errors.csv", "correlation.csv"
     }  # fmt: skip
