@@ -10,15 +10,17 @@ import pandas as pd
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.adjustment.model.numbers import Residuals
-from jaxphoto.camera import constant_names, get_parameter, parameter_names
+from jaxphoto.camera import CameraRates, constant_names, get_parameter, parameter_names
 from jaxphoto.compiling import call_compiled
 from jaxphoto.observations import AXES
+from jaxphoto.parameters import unit_of
 from jaxphoto.report.positional_accuracy import accuracy_table
 from jaxphoto.report.recovery import recovery_table
 from jaxphoto.report.sigma_map_table import sigma_map_table
 from jaxphoto.rotation import omega_phi_kappa_from_matrix
 from jaxphoto.statistics import (
     BlunderTest,
+    CameraDrift,
     Correlations,
     Covariance,
     GroundCorrelations,
@@ -30,6 +32,7 @@ from jaxphoto.statistics import (
     UndetectedEffects,
     a_priori_sigmas,
     blunder_test,
+    camera_drifts,
     check_discrepancies,
     correlations,
     covariance,
@@ -166,6 +169,26 @@ class Tables:
                 value = float(self.adjusted.values.shared[k])
                 rows.append((label.replace("_rad", "_deg"), factor * value, factor * float(sigma)))
         return pd.DataFrame(rows, columns=["parameter", "value", "sigma"])
+
+    @cached_property
+    def tested_drifts(self) -> list[CameraDrift]:
+        """Of every camera with estimated rates, whether it changed during the flight."""
+        return camera_drifts(self.adjusted, self.covariance)
+
+    @cached_property
+    def camera_drift(self) -> pd.DataFrame:
+        """camera, parameter, hours, change, sigma, p_value, detectable, unit: what changed from first to last exposure.
+
+        `p_value` is that of no change at all of this parameter, `detectable` what the test of all rates of the camera
+        finds with a probability of 80 % where this parameter alone changes.
+        """
+        columns = ["camera", "parameter", "hours", "change", "sigma", "p_value", "detectable", "unit"]
+        rows = [
+            (d.camera, name, d.hours, *numbers, unit_of(CameraRates.names[f"{name}_rate"][0]).removesuffix("_per_h"))
+            for d in self.tested_drifts
+            for name, *numbers in zip(d.parameters, d.change, d.sigma, d.p_values, d.detectable, strict=True)
+        ]
+        return pd.DataFrame(rows, columns=columns)
 
     @cached_property
     def exterior(self) -> pd.DataFrame:

@@ -1,6 +1,7 @@
 """A camera that changes in time: simulated, recovered, and in files."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -35,8 +36,8 @@ def with_rates(block, priors: CameraRates):
     )
 
 
-@pytest.fixture(scope="module")
-def changing():
+@functools.cache
+def changing_block():
     """Images of a camera that changes over an hour; stations tell it from heights, two directions from shifts."""
     block, truth = simulated("cross")
     rows, seconds = block.image_points, np.linspace(-1800.0, 1800.0, len(block.images))
@@ -53,6 +54,11 @@ def changing():
     xy = np.asarray(rows.xy) + np.asarray(moved(seconds[rows.image], rows.image, rows.point))
     block = dataclasses.replace(block, flight_time=seconds, image_points=dataclasses.replace(rows, xy=xy))
     return with_rates(block, CameraRates(FREE, FREE, FREE, FREE))
+
+
+@pytest.fixture
+def changing():
+    return changing_block()
 
 
 def test_each_rate_changes_its_own_parameter():
