@@ -99,8 +99,9 @@ def told(case: str, rows: list[dict]) -> None:
         change, inside = column["change"][:, k], np.mean(np.abs(z[:, k]) < 1.96)
         sigma, least = (np.median(column[key][:, k]) for key in ("sigma", "detectable"))
         print(
-            f"  {name}: true {column['true'][0, k]:.2f} um, mean {change.mean():.2f}, scatter {change.std(ddof=1):.2f}, "
-            f"sigma {sigma:.2f}, detectable {least:.2f}; inside 95 %: {inside:.1%}; p < 5 % by itself: {alone[k]:.1%}"
+            f"  {name}: true {column['true'][0, k]:.2f} um, mean {change.mean():.2f}, "
+            f"scatter {change.std(ddof=1):.2f}, sigma {sigma:.2f}, detectable {least:.2f}; "
+            f"inside 95 %: {inside:.1%}; p < 5 % by itself: {alone[k]:.1%}"
         )
 
 

@@ -26,11 +26,12 @@ from jaxphoto.camera.projection import *  # noqa: F403
 from jaxphoto.camera.projection import PROJECTIONS, AbstractProjection
 from jaxphoto.camera.rolling_shutter import ImageMotion, RollingShutter, RowMotion
 from jaxphoto.camera.sensor import Sensor
+from jaxphoto.camera.strip_camera import StripCamera
 
 __all__ = [
     *(model.__name__ for model in (*DISTORTIONS.values(), *PROJECTIONS.values())), "DISTORTIONS", "PROJECTIONS",
     "AbstractDistortion", "AbstractProjection", "CameraRates", "ConversionError", "ImageMotion", "InteriorOrientation",
-    "PrincipalPoints", "RollingShutter", "RowMotion", "Sensor",
+    "PrincipalPoints", "RollingShutter", "RowMotion", "Sensor", "StripCamera",
     "constant_names", "conversion_error", "decentring_from_symmetry", "empty_camera", "exact", "get_parameter",
     "invert", "model_keys", "parameter_names", "principal_points", "rebalance", "rebalance_covariance",
     "set_parameter", "symmetry_from_decentring", "with_sign",

@@ -18,7 +18,12 @@ _UM = 1e3
 def drift_findings(tables: Tables) -> Iterator[Finding]:
     """Of every camera whose rates were estimated: how it changed, or what change this flight would have shown."""
     for drift in tables.tested_drifts:
-        yield Finding(Level.INFORMATION, _moved(drift) if drift.moved else _still(drift))
+        yield Finding(Level.INFORMATION, drift_words(drift))
+
+
+def drift_words(drift: CameraDrift) -> str:
+    """One camera in one sentence."""
+    return _moved(drift) if drift.moved else _still(drift)
 
 
 def _moved(drift: CameraDrift) -> str:

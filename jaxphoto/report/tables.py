@@ -183,8 +183,11 @@ class Tables:
         finds with a probability of 80 % where this parameter alone changes.
         """
         columns = ["camera", "parameter", "hours", "change", "sigma", "p_value", "detectable", "unit"]
+        units = {
+            name: unit_of(CameraRates.names[f"{name}_rate"][0]) for d in self.tested_drifts for name in d.parameters
+        }
         rows = [
-            (d.camera, name, d.hours, *numbers, unit_of(CameraRates.names[f"{name}_rate"][0]).removesuffix("_per_h"))
+            (d.camera, name, d.hours, *numbers, units[name].removesuffix("per_h").removesuffix("_"))
             for d in self.tested_drifts
             for name, *numbers in zip(d.parameters, d.change, d.sigma, d.p_values, d.detectable, strict=True)
         ]
