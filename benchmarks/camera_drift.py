@@ -71,12 +71,13 @@ def drawn(flights: int, first: int) -> Iterator[dict]:
             own = eqx.tree_at(observed, block, jax.tree.map(np.asarray, new))
             found = adjust(own, changed(truth, block.start.unknowns.more[CameraRates.kind]["mapper"]))
             (drift,) = camera_drifts(found, covariance(found))
+            test = drift.change
             yield {
                 "case": case, "flight": seed, "outcome": found.outcome.name, "sigma0": float(found.sigma0),
-                "images": len(block.images), "hours": drift.hours, "p_value": drift.p_value,
-                "p_values": drift.p_values.tolist(), "change": (1e3 * drift.change).tolist(),
+                "images": len(block.images), "hours": drift.hours, "p_value": test.p_value,
+                "p_values": test.p_values.tolist(), "change": (1e3 * test.value).tolist(),
                 "true": [drift.hours * c, drift.hours * x_p, 0.0],
-                "sigma": (1e3 * drift.sigma).tolist(), "detectable": (1e3 * drift.detectable).tolist(),
+                "sigma": (1e3 * test.sigma).tolist(), "detectable": (1e3 * test.detectable).tolist(),
             }  # fmt: skip
 
 

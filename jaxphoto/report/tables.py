@@ -28,6 +28,7 @@ from jaxphoto.statistics import (
     Redundancy,
     Rotations,
     Significance,
+    StripDifferences,
     Trend,
     UndetectedEffects,
     a_priori_sigmas,
@@ -46,6 +47,7 @@ from jaxphoto.statistics import (
     redundancy_numbers,
     residual_spread,
     significance,
+    strip_differences,
     trends,
     undetected_effects,
 )
@@ -176,6 +178,11 @@ class Tables:
         return camera_drifts(self.adjusted, self.covariance)
 
     @cached_property
+    def tested_strips(self) -> StripDifferences | None:
+        """Whether cameras were others in some strips than in others, where those of strips were estimated."""
+        return strip_differences(self.adjusted, self.covariance)
+
+    @cached_property
     def camera_drift(self) -> pd.DataFrame:
         """camera, parameter, hours, change, sigma, p_value, detectable, unit: what changed from first to last exposure.
 
@@ -189,7 +196,7 @@ class Tables:
         rows = [
             (d.camera, name, d.hours, *numbers, units[name].removesuffix("per_h").removesuffix("_"))
             for d in self.tested_drifts
-            for name, *numbers in zip(d.parameters, d.change, d.sigma, d.p_values, d.detectable, strict=True)
+            for name, *numbers in zip(d.parameters, *d.change[:4], strict=True)
         ]
         return pd.DataFrame(rows, columns=columns)
 
