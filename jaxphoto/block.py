@@ -18,7 +18,7 @@ from jaxtyping import Float, Int
 from jaxphoto.arrays import Numbers, joined, still
 from jaxphoto.block_from_arrays import block_fields
 from jaxphoto.block_parts import Datum, Frame, Motion, Start
-from jaxphoto.camera import ImageMotion, InteriorOrientation, RollingShutter, RowMotion, Sensor
+from jaxphoto.camera import InteriorOrientation, Sensor
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import BlockError, InputError
 from jaxphoto.georeferencing import NOMINAL, Corrections, Exposure, Mount, StripBias, direct_orientation
@@ -263,20 +263,28 @@ def _by_name(table: dict, names: tuple[str, ...], absent):
     return jax.tree.map(lambda *v: joined([still(x)[None] for x in v])[index], *table.values(), absent)
 
 
-def row_motions(block: Block, unknowns: Unknowns) -> RowMotion | None:
-    """How the rows of every image move (with a leading axis over the images); None where no shutter rolls."""
-    shutters = unknowns.more.get(RollingShutter.kind, {})
-    if not shutters:
+def bent_cameras(block: Block, unknowns: Unknowns) -> dict[str, InteriorOrientation] | None:
+    """By camera, the interior orientation at every exposure of the block (with a leading axis over its images).
+
+    None where nothing bends any: no shutter rolls, and no camera changes during the flight.
+    """
+    bending = []
+    for owners in unknowns.tables.values():
+        for first in list(owners.values())[:1]:
+            if first.bends:
+                absent = jax.tree.map(jnp.zeros_like, first)
+                bending.append(_by_name(owners, block.owners(first.owner), absent))
+    if not bending:
         return None
-    motions = unknowns.more.get(ImageMotion.kind, {})
-    readout = _by_name(shutters, block.image_camera, RollingShutter(jnp.zeros(())))
-    still = jnp.zeros(3)
-    motion = _by_name(motions, block.images, ImageMotion(still, still))
 
-    def of_one(shutter: RollingShutter, motion: ImageMotion, exposure: Exposure) -> RowMotion:
-        return motion.interior(shutter.interior(InteriorOrientation(1.0), exposure), exposure).rows
+    def of_one(interior: InteriorOrientation, parameters: list, exposure: Exposure) -> InteriorOrientation:
+        for own in parameters:
+            interior = own.interior(interior, exposure)
+        return jax.tree.map(jnp.asarray, interior)
 
-    return jax.vmap(of_one)(readout, motion, jax.tree.map(jnp.asarray, exposures(block)))
+    taken = jax.tree.map(jnp.asarray, exposures(block))
+    at_each = jax.vmap(of_one, (None, 0, 0))
+    return {name: at_each(interior, bending, taken) for name, interior in unknowns.interior.items()}
 
 
 def exposures(block: Block) -> Exposure:

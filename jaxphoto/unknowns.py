@@ -21,10 +21,11 @@ from jaxtyping import Float
 
 from jaxphoto.arrays import Numbers
 from jaxphoto.camera import (
+    CameraRates,
     ImageMotion,
     InteriorOrientation,
-    PrincipalDistanceRate,
     RollingShutter,
+    StripCamera,
     get_parameter,
     parameter_names,
     set_parameter,
@@ -36,7 +37,7 @@ from jaxphoto.parameters import AbstractParameters, dynamic_fields
 from jaxphoto.short_repr import html_of, number_word, numbers_words
 
 UNKNOWNS: tuple[type[AbstractParameters], ...] = (
-    Scanner, Mount, StripBias, FlightBias, PrincipalDistanceRate, RollingShutter, ImageMotion,
+    Scanner, Mount, StripBias, FlightBias, CameraRates, StripCamera, RollingShutter, ImageMotion,
 )  # fmt: skip
 """The classes of declared parameters that a block folder may hold; one of your own is given to `read_block`.
 
@@ -83,8 +84,8 @@ class Unknowns(eqx.Module):
     """All parameters of a block: per camera, per image, per point, per mount and per strip; and of a laser scanner.
 
     `exterior` has a leading axis over the block's images and `points` (m) over its points, in the block's order. `more`
-    holds further declared parameters (`jaxphoto.parameters`) by kind and owner: `{"c_rates": {"kodak": rate}}`. The
-    owner of what belongs to the whole block is "".
+    holds further declared parameters (`jaxphoto.parameters`) by kind and owner, `{"camera_rates": {"kodak": rates}}`.
+    The owner of what belongs to the whole block is "".
     """
 
     interior: dict[str, InteriorOrientation]

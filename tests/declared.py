@@ -17,6 +17,7 @@ from jaxphoto.adjustment.model.block_values import values_of
 from jaxphoto.adjustment.model.structure import structure_of
 from jaxphoto.arrays import Numbers
 from jaxphoto.block import Block, Motion
+from jaxphoto.camera import StripCamera
 from jaxphoto.compiling import run_compiled
 from jaxphoto.georeferencing import Mount, ScannerCalibration, StripSpline, TrajectoryKnot
 from jaxphoto.observations import (
@@ -26,6 +27,7 @@ from jaxphoto.observations import (
     ImageState,
     PositionSteps,
     StationRows,
+    StripCameraSteps,
     StripPlanes,
     StripPoints,
     TrajectoryAttitudes,
@@ -126,6 +128,13 @@ LASER = {
     },
 }
 """Truth of a laser scanner's, all known beforehand to about their size."""
+STRIPS = {
+    "strip_cameras": {
+        "a": StripCamera(*map(np.float64, (0.02, -0.01, 0.015))),
+        "b": StripCamera(*map(np.float64, (-0.01, 0.02, 0.005))),
+    }
+}
+"""Truth of what cameras of strips have more than that of the block, likewise."""
 KNOWN = ("interior[one].c_mm", "interior[one].k1")
 
 
@@ -208,6 +217,7 @@ def _strips() -> tuple:
         StripPlanes(*sides, normal, np.full(n, 0.02), np.zeros(n)),
         PositionSteps(start, start + 1, kept, np.full((4, 3), 0.03), none),
         AttitudeSteps(start, start + 1, kept, np.full((4, 3), 5e-5), none),
+        StripCameraSteps(np.array([0]), np.array([1]), np.zeros((1, 3)), np.full((1, 3), 0.02)),
     )
 
 
@@ -249,14 +259,15 @@ def simulated(seed: int = 1) -> Simulated:
         partitions={"session": ("early",) * 4 + ("late",) * 5 + ("",)},
     )
     block, _ = measured(Simulated(free(block, "one"), truth))
-    truth = dataclasses.replace(truth, more=OWN | LASER)
+    truth = dataclasses.replace(truth, more=OWN | LASER | STRIPS)
     start = dataclasses.replace(block.start.unknowns, more=jax.tree.map(np.zeros_like, truth.more))
     camera = truth.interior["one"]
     block = with_priors(block, "one", k2=_weighted(rng, np.float64(camera.distortion.k2), 3e-9))
     turns = rng.normal(0, 2e-3, (n, 3))
     priors = dataclasses.replace(
         block.priors,
-        more=own_priors(lambda _: FREE) | jax.tree.map(lambda v: _weighted(rng, v, np.abs(v).max() + 1e-5), LASER),
+        more=own_priors(lambda _: FREE)
+        | jax.tree.map(lambda v: _weighted(rng, v, np.abs(v).max() + 1e-5), LASER | STRIPS),
         exterior=dataclasses.replace(
             block.priors.exterior,
             position=_weighted(rng, truth.exterior.position, [0.1, 0.1, 0.2]),

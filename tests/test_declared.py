@@ -42,6 +42,7 @@ SHOWN = {
     "TrajectoryAttitudes": ("trajectory_attitudes",),
     "PositionSteps": ("position_steps",),
     "AttitudeSteps": ("attitude_steps",),
+    "StripCameraSteps": ("strip_camera_steps",),
     "Distances": ("distances",),
     "HeightDifferences": ("height_differences",),
     "Baselines": ("baselines",),

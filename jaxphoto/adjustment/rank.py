@@ -12,10 +12,12 @@ from jaxphoto.adjustment.solver.band import Band, pivots
 from jaxphoto.adjustment.solver.normal import Linearised
 from jaxphoto.adjustment.solver.reduced import reduce_normal
 from jaxphoto.adjustment.weak_words import weaknesses_of
-from jaxphoto.block import Block
+from jaxphoto.block import Block, exposures
+from jaxphoto.camera import CameraRates
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import DatumError, RankError
 from jaxphoto.observations import AbstractObservations
+from jaxphoto.parameters import dynamic_fields
 from jaxphoto.unknowns import FREE, Unknowns
 
 # A pivot of the unit-diagonal reduced matrix below this is a rank defect: at float64 it is rounding, not geometry.
@@ -36,6 +38,7 @@ def check_priors(block: Block, priors: Unknowns) -> None:
     _check_strips(block, priors, with_station)
     _check_shifts(block, priors, with_station)
     _check_scanner(block, priors)
+    _check_camera_rates(block, priors)
 
 
 def _images_touched(block: Block) -> set[int]:
@@ -132,6 +135,23 @@ def _check_scanner(block: Block, priors: Unknowns) -> None:
             raise RankError(
                 f"scanner[{name}].shift is free, but no point lies on a surface of that lidar strip: hold the shift "
                 "fixed, or leave the strip out"
+            )
+
+
+def _check_camera_rates(block: Block, priors: Unknowns) -> None:
+    times = np.asarray(exposures(block).in_flight)
+    for name, prior in priors.more.get(CameraRates.kind, {}).items():
+        free = [field for field in dynamic_fields(type(prior)) if getattr(prior, field) is FREE]
+        if free and np.ptp(times[sorted(_images_of(name, block.image_camera))]) == 0:
+            raise RankError(
+                f"{CameraRates.kind}[{name}].{free[0]} is free, but all images of the camera have one time: give the "
+                "times of their exposures, or hold the rate fixed"
+            )
+        distortion = priors.interior[name].distortion
+        if "k1_rate" in free and "k1" not in distortion.coefficients:
+            raise RankError(
+                f"{CameraRates.kind}[{name}].k1_rate is free, but the distortion {distortion.name} has no k1: hold the "
+                "rate fixed"
             )
 
 

@@ -1,6 +1,7 @@
 """What the camera does to light: sensor, interior orientation, projection, distortion."""
 
 from jaxphoto.camera.balance import rebalance, rebalance_covariance
+from jaxphoto.camera.camera_rates import CameraRates
 from jaxphoto.camera.distortion import *  # noqa: F403 - what is declared there is public here
 from jaxphoto.camera.distortion import DISTORTIONS, AbstractDistortion, invert
 from jaxphoto.camera.equivalence import exact, with_sign
@@ -13,7 +14,6 @@ from jaxphoto.camera.interior import (
     parameter_names,
     set_parameter,
 )
-from jaxphoto.camera.principal_distance_rate import PrincipalDistanceRate
 from jaxphoto.camera.principal_points import (
     ConversionError,
     PrincipalPoints,
@@ -26,11 +26,12 @@ from jaxphoto.camera.projection import *  # noqa: F403
 from jaxphoto.camera.projection import PROJECTIONS, AbstractProjection
 from jaxphoto.camera.rolling_shutter import ImageMotion, RollingShutter, RowMotion
 from jaxphoto.camera.sensor import Sensor
+from jaxphoto.camera.strip_camera import StripCamera
 
 __all__ = [
     *(model.__name__ for model in (*DISTORTIONS.values(), *PROJECTIONS.values())), "DISTORTIONS", "PROJECTIONS",
-    "AbstractDistortion", "AbstractProjection", "ConversionError", "ImageMotion", "InteriorOrientation",
-    "PrincipalDistanceRate", "PrincipalPoints", "RollingShutter", "RowMotion", "Sensor",
+    "AbstractDistortion", "AbstractProjection", "CameraRates", "ConversionError", "ImageMotion", "InteriorOrientation",
+    "PrincipalPoints", "RollingShutter", "RowMotion", "Sensor", "StripCamera",
     "constant_names", "conversion_error", "decentring_from_symmetry", "empty_camera", "exact", "get_parameter",
     "invert", "model_keys", "parameter_names", "principal_points", "rebalance", "rebalance_covariance",
     "set_parameter", "symmetry_from_decentring", "with_sign",

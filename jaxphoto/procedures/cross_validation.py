@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxphoto.adjustment import Sizes, common_sizes
 from jaxphoto.arrays import still
-from jaxphoto.block import Block, row_motions
+from jaxphoto.block import Block, bent_cameras
 from jaxphoto.collinearity import ExteriorOrientation, image_residual
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import BlockError
@@ -71,23 +71,23 @@ def measured_discrepancies(block: Block, unknowns: Unknowns) -> Float[np.ndarray
     found = np.zeros((len(p.image), 2))
     camera = np.array(block.image_camera, object)[p.image]
     positions, matrices = (still(v) for v in (unknowns.exterior.position, unknowns.exterior.camera_from_object))
-    motions = row_motions(block, unknowns)
+    bent = bent_cameras(block, unknowns)
     for name, interior in unknowns.interior.items():
         own = np.flatnonzero(camera == name)
         if len(own):
             image, point = p.image[own], p.point[own]
             exterior = ExteriorOrientation(positions[image], matrices[image])
-            numbers = jax.tree.map(lambda v: np.asarray(v, float), dataclasses.replace(interior, residuals="measured"))
-            moving = jax.tree.map(lambda v: still(v)[image], motions)  # noqa: B023
-            rows = (exterior, still(unknowns.points)[point], still(p.xy)[own], moving)
-            found[own] = call_compiled(_discrepancies, numbers, *rows, block.corrections)
+            taken = interior if bent is None else jax.tree.map(lambda v: still(v)[image], bent[name])  # noqa: B023
+            numbers = jax.tree.map(lambda v: np.asarray(v, float), dataclasses.replace(taken, residuals="measured"))
+            rows = (exterior, still(unknowns.points)[point], still(p.xy)[own])
+            found[own] = call_compiled(_discrepancies, numbers, *rows, block.corrections, bent is not None)
     return found
 
 
 @eqx.filter_jit
-def _discrepancies(interior, exterior, points, xy, motions, corrections):
-    def of_one(exterior, point, xy, rows):
+def _discrepancies(interior, exterior, points, xy, corrections, by_row: bool):
+    def of_one(interior, exterior, point, xy):
         aim = apparent_point(exterior.position, point, corrections)
-        return image_residual(dataclasses.replace(interior, rows=rows), exterior, aim, xy)
+        return image_residual(interior, exterior, aim, xy)
 
-    return jax.vmap(of_one)(exterior, points, xy, motions)
+    return jax.vmap(of_one, (0 if by_row else None, 0, 0, 0))(interior, exterior, points, xy)

@@ -10,15 +10,17 @@ import pandas as pd
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.adjustment.model.numbers import Residuals
-from jaxphoto.camera import constant_names, get_parameter, parameter_names
+from jaxphoto.camera import CameraRates, constant_names, get_parameter, parameter_names
 from jaxphoto.compiling import call_compiled
 from jaxphoto.observations import AXES
+from jaxphoto.parameters import unit_of
 from jaxphoto.report.positional_accuracy import accuracy_table
 from jaxphoto.report.recovery import recovery_table
 from jaxphoto.report.sigma_map_table import sigma_map_table
 from jaxphoto.rotation import omega_phi_kappa_from_matrix
 from jaxphoto.statistics import (
     BlunderTest,
+    CameraDrift,
     Correlations,
     Covariance,
     GroundCorrelations,
@@ -26,10 +28,12 @@ from jaxphoto.statistics import (
     Redundancy,
     Rotations,
     Significance,
+    StripDifferences,
     Trend,
     UndetectedEffects,
     a_priori_sigmas,
     blunder_test,
+    camera_drifts,
     check_discrepancies,
     correlations,
     covariance,
@@ -43,6 +47,7 @@ from jaxphoto.statistics import (
     redundancy_numbers,
     residual_spread,
     significance,
+    strip_differences,
     trends,
     undetected_effects,
 )
@@ -166,6 +171,34 @@ class Tables:
                 value = float(self.adjusted.values.shared[k])
                 rows.append((label.replace("_rad", "_deg"), factor * value, factor * float(sigma)))
         return pd.DataFrame(rows, columns=["parameter", "value", "sigma"])
+
+    @cached_property
+    def tested_drifts(self) -> list[CameraDrift]:
+        """Of every camera with estimated rates, whether it changed during the flight."""
+        return camera_drifts(self.adjusted, self.covariance)
+
+    @cached_property
+    def tested_strips(self) -> StripDifferences | None:
+        """Whether cameras were others in some strips than in others, where those of strips were estimated."""
+        return strip_differences(self.adjusted, self.covariance)
+
+    @cached_property
+    def camera_drift(self) -> pd.DataFrame:
+        """camera, parameter, hours, change, sigma, p_value, detectable, unit: what changed from first to last exposure.
+
+        `p_value` is that of no change at all of this parameter, `detectable` what the test of all rates of the camera
+        finds with a probability of 80 % where this parameter alone changes.
+        """
+        columns = ["camera", "parameter", "hours", "change", "sigma", "p_value", "detectable", "unit"]
+        units = {
+            name: unit_of(CameraRates.names[f"{name}_rate"][0]) for d in self.tested_drifts for name in d.parameters
+        }
+        rows = [
+            (d.camera, name, d.hours, *numbers, units[name].removesuffix("per_h").removesuffix("_"))
+            for d in self.tested_drifts
+            for name, *numbers in zip(d.parameters, *d.change[:4], strict=True)
+        ]
+        return pd.DataFrame(rows, columns=columns)
 
     @cached_property
     def exterior(self) -> pd.DataFrame:

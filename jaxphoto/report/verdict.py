@@ -15,6 +15,7 @@ from jaxphoto.block import Block
 from jaxphoto.camera import Sensor
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import camera_words, few
+from jaxphoto.report.camera_drift import drift_findings
 from jaxphoto.report.findings import Finding, Level, Verdict
 from jaxphoto.report.ground import ground_findings
 from jaxphoto.report.residual_findings import NOTHING_FITS, of_residuals, of_what_is_not_checked
@@ -56,6 +57,7 @@ def _findings(tables: Tables) -> Iterator[Finding]:
         yield from _correlated(camera, c, explained, felt, _all_known(adjusted.block))
     yield from ground_findings(tables)
     yield from shutter_findings(tables)
+    yield from drift_findings(tables)
     yield from (_not_significant(tables, s) for s in tables.significance if not s.significant)
     for name, sensor in adjusted.block.sensors.items():
         if _folds(adjusted, name, sensor):

@@ -13,6 +13,7 @@ from jaxphoto.simulation.recipe import (
     Recipe,
     Sigmas,
     SimulatedBias,
+    SimulatedRates,
     SimulatedShutter,
     TargetPlan,
 )
@@ -46,6 +47,7 @@ __all__ = [
     "Settlement",
     "Sigmas",
     "SimulatedBias",
+    "SimulatedRates",
     "SimulatedShutter",
     "Simulation",
     "Station",

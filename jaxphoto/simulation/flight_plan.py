@@ -66,10 +66,25 @@ class Strip:
 
 @dataclasses.dataclass(frozen=True)
 class FlightPlan:
-    """Strips in the order of their flight, at a ground speed."""
+    """Strips in the order of their flight, at a ground speed, with turns between them.
+
+    `turn_s` is the time from the last exposure of a strip to the first of the next.
+    """
 
     strips: tuple[Strip, ...]
     speed_m_per_s: float = 60.0
+    turn_s: float = 60.0
+
+    @property
+    def clock(self) -> Float[np.ndarray, "images"]:
+        """The time of every exposure from the mean of all (s)."""
+        times, begin = [], 0.0
+        for strip in self.strips:
+            own = strip.along / self.speed_m_per_s
+            times.append(own - own[0] + begin)
+            begin = times[-1][-1] + self.turn_s
+        every = np.concatenate(times)
+        return every - every.mean()
 
     @property
     def cameras(self) -> set[str]:

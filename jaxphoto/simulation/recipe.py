@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxphoto.block import Datum
-from jaxphoto.camera import InteriorOrientation, RollingShutter, Sensor
+from jaxphoto.camera import CameraRates, InteriorOrientation, RollingShutter, Sensor
 from jaxphoto.georeferencing import Mount, StripBias
 from jaxphoto.simulation.convergent_plan import ConvergentPlan, Field
 from jaxphoto.simulation.flight_plan import FlightPlan, Swaths
@@ -59,6 +59,14 @@ class SimulatedShutter:
     velocity_m_per_s: float = 0.0
     rate_deg_per_s: float = 0.0
     model: tuple[RollingShutter, RollingShutter] | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class SimulatedRates:
+    """How a camera changes during the flight; `model` is the block's start and prior, None where it knows of none."""
+
+    truth: CameraRates
+    model: tuple[CameraRates, CameraRates] | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -153,10 +161,10 @@ class Approximation:
 class Recipe:
     """A simulation but for its seed.
 
-    `mounts` are by name, "default" or that of a camera, `shutters` by camera; `biases` by name, "default" or that of a
-    strip. `stated` sigmas are those of the block's observations, `noise` those by which these are truly off.
-    `datum_offset_m` is added to all observed stations and is in no model. `settlement` is what stands on the terrain;
-    `lidar` scans both, in strips.
+    `mounts` are by name, "default" or that of a camera, `shutters` and `rates` by camera; `biases` by name, "default"
+    or that of a strip. `stated` sigmas are those of the block's observations, `noise` those by which these are truly
+    off. `datum_offset_m` is added to all observed stations and is in no model. `settlement` is what stands on the
+    terrain; `lidar` scans both, in strips.
     """
 
     title: str
@@ -170,6 +178,7 @@ class Recipe:
     mounts: dict[str, Assumed[Mount]] = dataclasses.field(default_factory=dict)
     biases: dict[str, SimulatedBias] = dataclasses.field(default_factory=dict)
     shutters: dict[str, SimulatedShutter] = dataclasses.field(default_factory=dict)
+    rates: dict[str, SimulatedRates] = dataclasses.field(default_factory=dict)
     datum_offset_m: Triple = (0.0, 0.0, 0.0)
     jitter: Jitter = Jitter()
     terrain: Terrain = dataclasses.field(default_factory=Terrain)

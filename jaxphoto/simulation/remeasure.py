@@ -1,14 +1,12 @@
 """Measure a block anew: the same rows, computed from known unknowns, with fresh noise of their own sigmas."""
 
-import dataclasses
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxphoto.block import Block, exposures, mountings, row_motions
+from jaxphoto.block import Block, bent_cameras, exposures, mountings
 from jaxphoto.collinearity import ExteriorOrientation, project
 from jaxphoto.georeferencing import apparent_point
 from jaxphoto.observations import SurfaceRows
@@ -62,17 +60,14 @@ def image_coordinates(block: Block, truth: Unknowns) -> Float[Array, "rows 2"]:
     image, point = np.asarray(block.image_points.image), np.asarray(block.image_points.point)
     camera = np.array(block.image_camera)[image]
     exterior, points = jax.tree.map(jnp.asarray, (truth.exterior, truth.points))
-    xy, motions = jnp.zeros((len(image), 2)), row_motions(block, truth)
+    xy, bent = jnp.zeros((len(image), 2)), bent_cameras(block, truth)
     for name, interior in truth.interior.items():
         mine = np.flatnonzero(camera == name)
         eo = ExteriorOrientation(exterior.position[image[mine]], exterior.camera_from_object[image[mine]])
         aim = jax.vmap(apparent_point, in_axes=(0, 0, None))(eo.position, points[point[mine]], block.corrections)
-        if motions is None:
-            xy = xy.at[mine].set(jax.vmap(project, in_axes=(None, 0, 0))(interior, eo, aim))
-        else:
-            rolling = lambda rows, eo, aim: project(dataclasses.replace(interior, rows=rows), eo, aim)  # noqa: B023, E731
-            of_rows = jax.tree.map(lambda v: v[image[mine]], motions)  # noqa: B023
-            xy = xy.at[mine].set(jax.vmap(rolling)(of_rows, eo, aim))
+        camera_of_row = None if bent is None else 0
+        own = interior if bent is None else jax.tree.map(lambda v: v[image[mine]], bent[name])  # noqa: B023
+        xy = xy.at[mine].set(jax.vmap(project, in_axes=(camera_of_row, 0, 0))(own, eo, aim))
     return xy
 
 

@@ -1,23 +1,17 @@
-"""A rolling shutter in a simulation: where each point is seen at the true time of its row, and what the block knows."""
+"""A rolling shutter in a simulation: how cameras move while rows are exposed, and what the block knows of it."""
 
 import dataclasses
-import functools
 
-import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxphoto.camera import ImageMotion, RollingShutter, RowMotion
-from jaxphoto.collinearity import ExteriorOrientation, project
+from jaxphoto.camera import ImageMotion, RollingShutter
+from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.georeferencing import Mount, body_from_camera
-from jaxphoto.simulation.chunks import in_chunks
 from jaxphoto.simulation.flight import Flight
 from jaxphoto.simulation.recipe import Recipe
 from jaxphoto.simulation.streams import stream
-from jaxphoto.simulation.visibility import Rays
 from jaxphoto.unknowns import FIXED, Unknowns, Weighted
-
-_CHUNK = 1024
 
 
 def camera_motions(exterior: ExteriorOrientation, velocity, rate, mounts: list[Mount]) -> Float[np.ndarray, "images 6"]:
@@ -26,35 +20,6 @@ def camera_motions(exterior: ExteriorOrientation, velocity, rate, mounts: list[M
     turned = np.einsum("nij,nj->ni", np.asarray(exterior.camera_from_object), velocity)
     camera = np.stack([np.asarray(body_from_camera(m.boresight, m.nominal)).T for m in mounts])
     return np.hstack([turned, np.einsum("nij,nj->ni", camera, rate)])
-
-
-def rolled(recipe: Recipe, flight: Flight, rays: Rays, points: np.ndarray, motions: np.ndarray) -> Rays:
-    """The rays as rows see them that are exposed one after another; cameras without a rolling shutter as they are.
-
-    A point at the edge may be seen a little beyond it.
-    """
-    xy = rays.xy.copy()
-    for name, shutter in recipe.shutters.items():
-        own = np.flatnonzero(np.array(flight.cameras)[rays.image] == name)
-        if not len(own):
-            continue
-        interior, image = recipe.cameras[name].truth, rays.image[own]
-        seen = functools.partial(_seen, jax.tree.map(np.float64, interior))
-        time = np.full(len(own), 1e-3 * float(shutter.truth.readout) / recipe.sensors[name].height_mm)
-        place = (flight.exterior.position, flight.exterior.camera_from_object)
-        xy[own] = in_chunks(
-            seen, _CHUNK, time, motions[image], *(np.asarray(v)[image] for v in place), points[rays.point[own]]
-        )
-    return rays._replace(xy=xy)
-
-
-@jax.jit
-def _seen(interior, time, motion, position, camera_from_object, point):
-    def one(time, motion, position, camera_from_object, point):
-        moving = dataclasses.replace(interior, rows=RowMotion(time, *motion))
-        return project(moving, ExteriorOrientation(position, camera_from_object), point)
-
-    return jax.vmap(one)(time, motion, position, camera_from_object, point)
 
 
 def with_shutters(

@@ -16,14 +16,16 @@ from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import BlockError
 from jaxphoto.georeferencing import Mount, StripBias, StripErrors, Trajectory
 from jaxphoto.observations import Attitudes, ControlRows, Distances, ImageRows, StationRows
+from jaxphoto.simulation.changing_cameras import seen_by_changing, with_rates
 from jaxphoto.simulation.convergent import take_images
 from jaxphoto.simulation.convergent_plan import ConvergentPlan
 from jaxphoto.simulation.exposures_on_path import exposure_times, recorded_on_path
 from jaxphoto.simulation.flight import NO_BIAS, NO_MOUNT, Flight, fly, record, turned
+from jaxphoto.simulation.flight_plan import FlightPlan
 from jaxphoto.simulation.platform_path import Path, paths
 from jaxphoto.simulation.points import TruePoints, scatter
 from jaxphoto.simulation.recipe import Assumed, Recipe, SimulatedBias, Triple, triple
-from jaxphoto.simulation.rolling_shutter import camera_motions, rolled, with_shutters
+from jaxphoto.simulation.rolling_shutter import camera_motions, with_shutters
 from jaxphoto.simulation.scan import Scan, scan
 from jaxphoto.simulation.streams import stream
 from jaxphoto.simulation.terrain import Terrain
@@ -75,11 +77,13 @@ def simulate(recipe: Recipe, seed: int = 0) -> Simulation:
     scene = _seen(recipe, flight, scatter(recipe, flight, terrain, seed), seed)
     mounts = [recipe.mounts[name].truth if (name := recipe.mount_of(c)) else NO_MOUNT for c in flight.cameras]
     motions = camera_motions(flight.exterior, flight.motion.velocity, flight.motion.rate, mounts)
-    scene = scene._replace(rays=rolled(recipe, flight, scene.rays, scene.xyz, motions))
     biases = _true_biases(recipe, flight, seed)
     flown = [] if recipe.lidar is None else paths(recipe, recipe.lidar, flight, height, seed)
     cloud, trajectory, scanner, errors = _scanned(recipe, flown, terrain, seed)
-    clock = exposure_times(flown, flight) if recipe.lidar is not None and recipe.lidar.same_trajectory else None
+    on_path = recipe.lidar is not None and recipe.lidar.same_trajectory
+    clock = exposure_times(flown, flight) if on_path else _clock(recipe)
+    times = flight.time if clock is None else clock
+    scene = scene._replace(rays=seen_by_changing(recipe, flight, scene.rays, scene.xyz, motions, times))
     truth = Unknowns(
         {name: _numbers(camera.truth) for name, camera in recipe.cameras.items()},
         flight.exterior,
@@ -89,12 +93,13 @@ def simulate(recipe: Recipe, seed: int = 0) -> Simulation:
         scanner,
     )
     position, attitude = record(flight, mounts, [biases.get(s, NO_BIAS) for s in flight.strips])
-    if clock is not None and errors is not None:
+    if on_path and clock is not None and errors is not None:
         position, attitude = recorded_on_path(position, attitude, clock, flown, flight, errors)
     stations, attitudes = _georeferencing(recipe, position, attitude, seed)
     control, check = _control(recipe, scene, seed)
     start, priors = _start(recipe, flight, scene, control, seed)
-    unknowns, priors, truth = with_shutters(recipe, flight, motions, seed, start.unknowns, priors, truth)
+    known = with_shutters(recipe, flight, motions, seed, start.unknowns, priors, truth)
+    unknowns, priors, truth = with_rates(recipe, *known)
     start = dataclasses.replace(start, unknowns=unknowns)
     block = Block(
         title=recipe.title,
@@ -125,6 +130,12 @@ def _scanned(recipe: Recipe, flown: list[Path], terrain: Terrain, seed: int) -> 
     if recipe.lidar is None:
         return None, None, None, None
     return scan(recipe.lidar, flown, terrain, _sigma(recipe.noise.lidar_m), seed)
+
+
+def _clock(recipe: Recipe) -> Float[np.ndarray, "images"] | None:
+    """The time of every exposure from the middle of the flight (s); None where that from the middle of its strip
+    does."""
+    return recipe.plan.clock if recipe.rates and isinstance(recipe.plan, FlightPlan) else None
 
 
 def _seen(recipe: Recipe, flight: Flight, scene: TruePoints, seed: int) -> TruePoints:

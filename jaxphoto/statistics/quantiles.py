@@ -17,6 +17,12 @@ def chi_square_limit(freedom: Int[np.ndarray, "*n"], level: float) -> Float[np.n
     return np.asarray(2 * _special().gammainccinv(freedom / 2, level))
 
 
+def chi_square_shift(freedom: int, level: float, power: float) -> float:
+    """The noncentrality with which a square sum exceeds its limit of `level` with the probability `power`."""
+    special = _special()
+    return float(special.chndtrinc(chi_square_limit(np.array(freedom), level), freedom, 1 - power))
+
+
 def student_limit(freedom: int, level: float) -> float:
     """What the size of Student's t exceeds with probability `level`."""
     return float(-_special().stdtrit(freedom, level / 2))

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxphoto.arrays import Numbers
 from jaxphoto.block import Block
+from jaxphoto.camera import StripCamera
 from jaxphoto.errors import BlockError, InputError
 from jaxphoto.io import read_block, write_block
 from jaxphoto.observations import (
@@ -26,6 +27,7 @@ from jaxphoto.observations import (
 )
 from jaxphoto.observations.columns import columns_of, row_fields
 from jaxphoto.rotation import small_rotation
+from jaxphoto.unknowns import FIXED
 from tests.io.test_write_block import assert_same
 from tests.levelling import HeightDifferences
 
@@ -102,7 +104,14 @@ def assert_rows(got: AbstractObservations, want: AbstractObservations) -> None:
 
 @pytest.fixture
 def block(write_folder: Callable) -> Block:
-    return read_block(write_folder())
+    """With a camera of each strip, which steps touch."""
+    block = read_block(write_folder())
+    strips = [name for name in dict.fromkeys(block.image_strip) if name]
+    more = lambda u, value: dataclasses.replace(  # noqa: E731
+        u, more={StripCamera.kind: {name: StripCamera(value, value, value) for name in strips}}
+    )
+    start = dataclasses.replace(block.start, unknowns=more(block.start.unknowns, 0.0))
+    return dataclasses.replace(block, start=start, priors=more(block.priors, FIXED))
 
 
 def many(kind: type[AbstractObservations]) -> int:

@@ -179,8 +179,9 @@ def test_what_block_toml_says(write_folder):
     text = """[unknowns.flight_bias]
 shift_m = [0.1, 0.2, 0.3]
 shift = "free"
-[unknowns.c_rates.kodak]
-rate = { sigma_mm_per_s = 1e-5 }
+[unknowns.camera_rates.kodak]
+c_rate = { sigma_mm_per_h = 1e-3 }
+k1_rate_per_h = 1e-7
 [unknowns.refractivity.default]
 turn_deg = [0.0, 180.0]
 [unknowns.refractivity.8]
@@ -195,7 +196,8 @@ model = "ciddor"
     np.testing.assert_array_equal(start["flight_bias"][""].shift, [0.1, 0.2, 0.3])
     assert priors["flight_bias"][""].shift is FREE
     assert priors["flight_bias"][""].drift is FIXED
-    assert float(priors["c_rates"]["kodak"].rate.sigma) == 1e-5
+    assert float(priors["camera_rates"]["kodak"].c_rate.sigma) == 1e-3
+    assert float(start["camera_rates"]["kodak"].k1_rate) == 1e-7
     assert list(start["refractivity"]) == ["8", "9"]
     assert float(start["refractivity"]["8"].height) == 4.0
     assert [start["refractivity"][hour].model for hour in "89"] == ["ciddor", "edlen"]
@@ -208,8 +210,8 @@ model = "ciddor"
     [
         ([section("[unknowns.tides]")], r"\[unknowns\] tides: jaxphoto has no class for these unknowns; give yours"),
         (
-            [section("[unknowns.c_rates.leica]")],
-            r"\[unknowns\.c_rates\] leica: no such key is known; use default, kodak",
+            [section("[unknowns.camera_rates.leica]")],
+            r"\[unknowns\.camera_rates\] leica: no such key is known; use default, kodak",
         ),
         ([section("[unknowns.flight_bias]\nshift_mm = 1")], r"flight_bias\] shift_mm: no such key is known"),
         ([section("[unknowns.flight_bias]\nshift_m = [1, 2]")], r"shift_m: \[1, 2\] is not a list of three numbers"),

@@ -5,6 +5,7 @@ second derivative (Gauss-Newton part and curvature). H is never formed: conjugat
 preconditioned by the factored normal matrix, from which it differs by the residuals' curvature only.
 """
 
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -14,19 +15,24 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxphoto.adjustment.layout.sharding import EVERYWHERE, TILES, along_points, sharded
 from jaxphoto.adjustment.layout.tiled import TiledStructure, TiledValues
-from jaxphoto.adjustment.model.camera_groups import interior_of
+from jaxphoto.adjustment.model.camera_groups import CameraGroup, interior_of
 from jaxphoto.adjustment.model.numbers import Increments
+from jaxphoto.adjustment.model.parameter_tables import ParameterTable
 from jaxphoto.adjustment.solver.band import factor_band
 from jaxphoto.adjustment.solver.elimination import solve_factored
 from jaxphoto.adjustment.solver.levenberg_marquardt import FactoredSystem, LevenbergMarquardt
 from jaxphoto.adjustment.solver.normal import Linearised, Reduced
 from jaxphoto.adjustment.solver.reduced import reduce_normal
 from jaxphoto.arrays import Numbers
+from jaxphoto.camera import InteriorOrientation
+from jaxphoto.camera.camera_rates import HOUR_S
 from jaxphoto.collinearity import ExteriorOrientation, image_residual
+from jaxphoto.georeferencing import Exposure
+from jaxphoto.parameters import filled
 
 # No unknown misses its optimum by more than this fraction of its standard deviation.
 TOLERANCE = 1e-5
@@ -164,16 +170,10 @@ def typical_scale(values: TiledValues, structure: TiledStructure) -> Increments:
     sigma = jnp.sum(filled) / jnp.sum(weight)
     corner = jnp.max(jnp.where(filled, jnp.abs(v.xy), 0.0), axis=(0, 1, 3, 4))
     vector = jnp.ones(v.shared.shape)
-    # A point halfway to the corner and a ray beside it: c moves the one, coefficients the other.
-    aim, centre = jnp.array([0.1, 0.1, -1.0]), ExteriorOrientation(jnp.zeros(3), jnp.eye(3))
     for group in s.groups:
         m = group.treedef.num_leaves
         first = v.shared[group.offset : group.offset + m]
-        by_parameter = jax.jacfwd(lambda p, g=group: image_residual(interior_of(g, list(p)), centre, aim, corner))(
-            first
-        )
-        typical = sigma / jnp.maximum(jnp.max(jnp.abs(by_parameter), axis=0), 1e-30)
-        typical = jnp.where(jnp.isfinite(typical), typical, 1.0)
+        typical = _typical_of_camera(partial(_camera_of, group), first, sigma, corner)
         stop = group.offset + m * len(group.names)
         vector = vector.at[group.offset : stop].set(jnp.tile(typical, len(group.names)))
     sigma, ground, angle = _typical_of_places(s, v, filled, sigma)
@@ -188,10 +188,43 @@ def typical_scale(values: TiledValues, structure: TiledStructure) -> Increments:
     by_unit |= {"ms": 1e3 * by_unit["s"], "ppm": 1e6 * angle}
     seconds = jnp.maximum(jnp.max(jnp.abs(v.time)), 1.0)
     by_unit |= {f"{unit}_per_s": by_unit[unit] / seconds for unit in ("m", "rad", "mm")}
+    by_unit["mm_per_h"] = by_unit["mm"] * HOUR_S / jnp.maximum(jnp.max(jnp.abs(v.flight_time)), 1.0)
     if s.tables:
-        declared = [by_unit.get(unit, jnp.ones(())) for t in s.tables for _ in t.owners for unit in t.units]
+        declared: list[Array] = []
+        for t in s.tables:
+            felt = t.bends and not set(t.units) <= set(by_unit)
+            other = _typical_of_bending(s, v, t, sigma, corner) if felt else jnp.ones(t.size)
+            declared += [by_unit.get(unit, other[k]) for k, unit in enumerate(t.units)] * len(t.owners)
         vector = vector.at[s.n_cameras :].set(jnp.stack(declared))
     return Increments(eop[:, None] * s.eop_free, vector[s.free], ground * s.point_free)
+
+
+def _camera_of(group: CameraGroup, numbers: Array) -> InteriorOrientation:
+    return interior_of(group, list(numbers))
+
+
+def _typical_of_camera(
+    interior_at: Callable[[Array], InteriorOrientation], at: Float[Array, "n"], sigma: Array, corner: Float[Array, "2"]
+) -> Float[Array, "n"]:
+    """What moves the image of a point by `sigma` (mm), of numbers that make up a camera; one where nothing moves it."""
+    # A point halfway to the corner and a ray beside it: c moves the one, coefficients the other.
+    aim, centre = jnp.array([0.1, 0.1, -1.0]), ExteriorOrientation(jnp.zeros(3), jnp.eye(3))
+    by_number = jax.jacfwd(lambda p: image_residual(interior_at(p), centre, aim, corner))(at)
+    typical = sigma / jnp.maximum(jnp.max(jnp.abs(by_number), axis=0), 1e-30)
+    return jnp.where(jnp.isfinite(typical), typical, 1.0)
+
+
+def _typical_of_bending(
+    s: TiledStructure, v: TiledValues, t: ParameterTable, sigma: Array, corner: Float[Array, "2"]
+) -> Float[Array, "n"]:
+    """The same of what bends cameras, at the exposure farthest from the middle of the flight."""
+    farthest = jnp.argmax(jnp.abs(v.flight_time))
+    exposure, of_groups = Exposure(*(jnp.asarray(a)[..., farthest] for a in v.exposures)), []
+    for group in s.groups:
+        camera = _camera_of(group, v.shared[group.offset : group.offset + group.treedef.num_leaves])
+        bent = lambda p, camera=camera: filled(t.form, p).interior(camera, exposure)  # noqa: E731
+        of_groups.append(_typical_of_camera(bent, jnp.zeros(t.size), sigma, corner))
+    return jnp.min(jnp.stack(of_groups), axis=0)
 
 
 # Of laser strips alone, which nothing saw in an image: that of a laser point, and of the attitude it is measured with.

@@ -23,7 +23,7 @@ from jaxphoto.io.block_folder.earlier_calibration import known_cameras, with_ear
 from jaxphoto.io.block_folder.frame_sections import read_corrections, read_frame
 from jaxphoto.io.block_folder.georeferencing import read_attitudes, read_stations
 from jaxphoto.io.block_folder.image_points import check_rays, read_image_points
-from jaxphoto.io.block_folder.images import Images, check_times, read_images
+from jaxphoto.io.block_folder.images import Images, check_flight_times, check_times, read_images
 from jaxphoto.io.block_folder.map_tables import origin_of, tables_to_local
 from jaxphoto.io.block_folder.motion import ObservedFlight, check_time_offsets, read_motion
 from jaxphoto.io.block_folder.mount_sections import mounts_of, read_mounts, read_strips
@@ -193,6 +193,7 @@ def assemble(source: BlockTables) -> Block:
     )
     more, more_priors = read_unknowns(settings.unknowns, source.unknowns, block)
     start, priors = dataclasses.replace(start, more=more), dataclasses.replace(priors, more=more_priors)
+    check_flight_times(images, start, priors)
     ids = Ids(images, points, {kind: tuple(owners) for kind, owners in start.tables.items()})
     distances, further = read_declared(kinds, tables, ids, settings)
     block = dataclasses.replace(

@@ -79,7 +79,7 @@ def read_unknowns(section: Section, kinds: Iterable[Kind], block: Block) -> tupl
     priors: dict[str, dict[str, Any]] = {}
     for kind in (kind for kind in kinds if kind.kind in section):
         given = section.section(kind.kind)
-        of_each = {name: _read(kind, table) for name, table in _tables(kind, given, block)}
+        of_each = {name: read_parameters(kind, table) for name, table in _tables(kind, given, block)}
         starts[kind.kind] = {name: start for name, (start, _) in of_each.items()}
         priors[kind.kind] = {name: prior for name, (_, prior) in of_each.items()}
     return starts, priors
@@ -119,7 +119,8 @@ def _tables(kind: Kind, given: Section, block: Block) -> Iterator[tuple[str, Sec
             yield name, given.section(key)
 
 
-def _read(kind: Kind, table: Section) -> tuple[Any, Any]:
+def read_parameters(kind: Kind, table: Section) -> tuple[Any, Any]:
+    """Start values and priors of one owner. Raises InputError for keys that the class does not have."""
     keys, static = keys_of(kind), _static(kind)
     table.known(*(k.start for k in keys), *static, *(k.field for k in keys))
     starts: dict[str, Any] = {name: table.values.get(name, default) for name, default in static.items()}

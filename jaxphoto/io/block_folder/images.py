@@ -7,13 +7,14 @@ import equinox as eqx
 import numpy as np
 import pandas as pd
 
+from jaxphoto.camera import CameraRates
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import BlockError
 from jaxphoto.io.block_folder.settings import Settings
 from jaxphoto.io.block_folder.table_layout import ANGLES, XYZ
 from jaxphoto.io.text_tables import Table
-from jaxphoto.unknowns import FIXED
+from jaxphoto.unknowns import FIXED, Unknowns
 
 _from_angles = eqx.filter_jit(ExteriorOrientation.from_angles)
 
@@ -92,6 +93,22 @@ def check_times(images: Images, strips: dict, priors: dict) -> None:
                     f"image {images.ids[i]} has no time_s, but its strip {strip} drifts; add the time, or make the "
                     'drift "fixed"',
                 )
+
+
+def check_flight_times(images: Images, starts: Unknowns, priors: Unknowns) -> None:
+    """Raise BlockError where a camera that changes during the flight needs a time that is missing."""
+    changing = {
+        name: any(prior is not FIXED for prior in vars(priors.more[CameraRates.kind][name]).values())
+        or any(np.any(np.asarray(rate) != 0) for rate in vars(start).values())
+        for name, start in starts.more.get(CameraRates.kind, {}).items()
+    }
+    for i in np.flatnonzero(~images.time_known):
+        if changing.get(camera := images.cameras[i]):
+            raise images.table.misfit(
+                int(i),
+                f"image {images.ids[i]} has no time_s, but its camera {camera} changes during the flight "
+                f'([unknowns.{CameraRates.kind}]); add the time, or make its rates "fixed"',
+            )
 
 
 def refuse_duplicates(table: Table, keys: dict[str, np.ndarray], message: str) -> None:

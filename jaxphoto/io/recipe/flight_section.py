@@ -33,7 +33,7 @@ class Mounted(NamedTuple):
 
 def read_flight(section: Section, cameras: Mapping[str, Mounted]) -> FlightPlan:
     """The plan that [flight] describes. Raises InputError for what cannot be flown."""
-    section.known(*_SHARED, "speed_m_per_s", "strips")
+    section.known(*_SHARED, "speed_m_per_s", "turn_s", "strips")
     for pair in _EITHER.values():
         _one_of(section, pair)
     listed = tables(section, "strips")
@@ -52,7 +52,8 @@ def read_flight(section: Section, cameras: Mapping[str, Mounted]) -> FlightPlan:
     if sum(s.images for s in strips) < 2:
         raise section.error("strips", "there is one image in all, so no point is seen twice; add images or strips")
     speed = section.positive("speed_m_per_s") if "speed_m_per_s" in section else FlightPlan.speed_m_per_s
-    return FlightPlan(tuple(strips), speed)
+    turn = section.positive("turn_s") if "turn_s" in section else FlightPlan.turn_s
+    return FlightPlan(tuple(strips), speed, turn)
 
 
 def _strips(table: Section, flight: Section, cameras: Mapping[str, Mounted]) -> list[Strip]:

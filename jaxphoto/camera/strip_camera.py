@@ -1,0 +1,39 @@
+"""A camera that is another one in every strip: strip-variant principal distance and principal point.
+
+The interior orientation of the camera is what all strips have in common; each strip adds its own c, x_p and y_p to it.
+Where all of these are free, only what strips differ by can be told: know them about zero, which leaves the camera the
+mean of its strips, or from strip to strip (`observations.StripCameraSteps`).
+Source: Moniwa (1981), The concept of photo-variant self-calibration and its application in block adjustment with
+bundles, Photogrammetria 36.
+"""
+
+import dataclasses
+from typing import Any
+
+from jaxtyping import Array, Float
+
+from jaxphoto.parameters import AbstractParameters
+
+Scalar = Float[Array, "*images"] | float
+
+
+class StripCamera(AbstractParameters):
+    """What the camera of a strip has more than the camera of the block: of c, x_p and y_p (mm)."""
+
+    kind = "strip_cameras"
+    owner = "strip"
+    names = {"c_more": ("c_more_mm",), "xp_more": ("xp_more_mm",), "yp_more": ("yp_more_mm",)}  # noqa: RUF012
+    bends = ("c", "x_p", "y_p")
+
+    c_more: Scalar
+    xp_more: Scalar
+    yp_more: Scalar
+
+    def interior(self, interior: Any, exposure: Any) -> Any:
+        """The interior orientation of the strip."""
+        return dataclasses.replace(
+            interior,
+            c=interior.c + self.c_more,
+            x_p=interior.x_p + self.xp_more,
+            y_p=interior.y_p + self.yp_more,
+        )

@@ -1,0 +1,31 @@
+"""Steps of a camera from strip to strip: a random walk of its interior orientation, by which it is held together.
+
+A random walk of q (mm^2/h) moves on in the time h between the middles of two strips by nothing, with the standard
+deviation sqrt(q h). Source: Gelb (1974), Applied optimal estimation.
+"""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxphoto.arrays import Numbers
+from jaxphoto.camera import StripCamera
+from jaxphoto.observations.base import AbstractObservations, touching
+
+
+class StripCameraSteps(AbstractObservations):
+    """By how much c, x_p and y_p of strip `end` are more than those of strip `start` (mm)."""
+
+    group = "strip_camera_steps"
+    unit = "mm"
+    axes = ("c", "xp", "yp")
+
+    start: Int[np.ndarray, "n"] = touching(StripCamera.kind)
+    end: Int[np.ndarray, "n"] = touching(StripCamera.kind)
+    value: Float[Numbers, "n 3"]
+    sigma: Float[Numbers, "n 3"]
+
+    def residual(self, start: StripCamera, end: StripCamera) -> Float[Numbers, "3"]:
+        """Observed minus computed step (mm)."""
+        steps = (end.c_more - start.c_more, end.xp_more - start.xp_more, end.yp_more - start.yp_more)
+        return self.value - jnp.stack([jnp.asarray(step) for step in steps])

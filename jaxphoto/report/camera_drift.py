@@ -1,0 +1,91 @@
+"""Whether cameras changed during the flight, in words."""
+
+import math
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from jaxphoto.errors import camera_words
+from jaxphoto.report.digits import of_sigma, with_sigma
+from jaxphoto.report.findings import Finding, Level, p_words
+from jaxphoto.report.tables import Tables
+from jaxphoto.statistics import POWER, SIGNIFICANCE_LEVEL, CameraDrift, StripDifferences, ZeroTest
+
+_NAMES = {"c": "c", "xp": "x_p", "yp": "y_p", "k1": "K1"}
+# Of an hour: a shorter flight is told in minutes.
+_HOURS = 1.5
+_UM = 1e3
+
+
+def drift_findings(tables: Tables) -> Iterator[Finding]:
+    """Of every camera whose rates were estimated, and of those of strips: what changed, or would have been seen."""
+    for drift in tables.tested_drifts:
+        yield Finding(Level.INFORMATION, drift_words(drift))
+    if tables.tested_strips is not None:
+        yield Finding(Level.INFORMATION, strip_words(tables.tested_strips))
+
+
+def drift_words(drift: CameraDrift) -> str:
+    """One camera in one sentence; where it changed, by what did beyond chance, or else by all."""
+    test, over = drift.change, _duration(drift)
+    if not test.rejected:
+        shown = _least(drift.parameters, test.detectable.tolist())
+        return (
+            f"no drift of {camera_words(drift.camera)} is seen ({p_words(test.p_value)}); over its {over} this flight "
+            f"would have shown, with a probability of {POWER:.0%}, {shown}"
+        )
+    told = [k for k, p in enumerate(test.p_values) if p < SIGNIFICANCE_LEVEL] or range(len(drift.parameters))
+    changes = ", ".join(_change(drift, k) for k in told)
+    return f"{camera_words(drift.camera)} changed over the {over} of its flight ({p_words(test.p_value)}): {changes}"
+
+
+def strip_words(strips: StripDifferences) -> str:
+    """The cameras of all strips in one sentence."""
+    test, names = strips.more, np.array(strips.parameters)
+    each = [(name, np.flatnonzero(names == name)) for name in dict.fromkeys(strips.parameters)]
+    if not test.rejected:
+        shown = _least([name for name, _ in each], [float(test.detectable[own].max()) for _, own in each])
+        return (
+            f"no difference between the cameras of strips is seen ({p_words(test.p_value)}); any one strip alone would "
+            f"have shown, with a probability of {POWER:.0%}, {shown}"
+        )
+    told = []
+    for name, own in each:
+        low, high = (int(own[end(test.value[own])]) for end in (np.argmin, np.argmax))
+        ends = (f"{_signed(name, test, k)} in strip {strips.strips[k]}" for k in (low, high))
+        told.append(f"{_NAMES[name]} from {' to '.join(ends)}")
+    return f"the camera is not the same in all strips ({p_words(test.p_value)}): {', '.join(told)}"
+
+
+def _least(names: Sequence[str], sizes: Sequence[float]) -> str:
+    return ", ".join(
+        f"{of_sigma(_factor(name) * size)}{_unit(name)} of {_NAMES[name]}"
+        if math.isfinite(size)
+        else f"no change of {_NAMES[name]} at all"
+        for name, size in zip(names, sizes, strict=True)
+    )
+
+
+def _signed(name: str, test: ZeroTest, k: int) -> str:
+    value, sigma = (_factor(name) * float(v) for v in (test.value[k], test.sigma[k]))
+    return f"{with_sigma(value, sigma)} +- {of_sigma(sigma)}{_unit(name)}"
+
+
+def _change(drift: CameraDrift, k: int) -> str:
+    name, test = drift.parameters[k], drift.change
+    if name != "c":
+        return f"{_NAMES[name]} changed by {_signed(name, test, k)}"
+    grown = test._replace(value=np.abs(test.value))
+    return f"c {'grew' if test.value[k] > 0 else 'shrank'} by {_signed(name, grown, k)}"
+
+
+def _duration(drift: CameraDrift) -> str:
+    return f"{drift.hours:.2g} h" if drift.hours > _HOURS else f"{60 * drift.hours:.2g} min"
+
+
+def _factor(name: str) -> float:
+    return 1.0 if name == "k1" else _UM
+
+
+def _unit(name: str) -> str:
+    return "" if name == "k1" else " um"

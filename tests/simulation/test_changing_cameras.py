@@ -1,0 +1,92 @@
+"""A camera that changes in a recipe: each exposure sees through the camera of its time, and the block is told so."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from jaxphoto import FREE, BlockError, InputError
+from jaxphoto.collinearity import ExteriorOrientation, project
+from jaxphoto.io import read_block, read_truth, recipe_from, write_simulation
+from jaxphoto.simulation import image_coordinates
+from tests.derivatives import compiled
+from tests.simulation.small import changed, made, plain
+
+TRUE = {"c_rate_mm_per_h": 0.5, "xp_rate_mm_per_h": -0.3}
+RATES = {"camera_rates": {"kodak": {"c_rate": "free", "xp_rate": {"sigma_mm_per_h": 0.4}, "truth": TRUE}}}
+
+
+def test_every_exposure_sees_through_the_camera_of_its_time():
+    block, truth, _ = made(RATES | {"flight.turn_s": 120.0})
+    rows, camera = block.image_points, truth.interior["kodak"]
+    time = block.flight_time
+    assert abs(time.mean()) < 1e-9
+    strips = np.array(block.image_strip)
+    a, b = time[strips == "A"], time[strips == "B"]
+    assert b[0] - a[-1] == pytest.approx(120.0)
+    np.testing.assert_allclose(a - a.mean(), block.image_time[strips == "A"], atol=1e-9)
+    seen = compiled(lambda c, x_p, position, rotation, point: project(
+        dataclasses.replace(camera, c=c, x_p=x_p), ExteriorOrientation(position, rotation), point
+    ))  # fmt: skip
+    for k in range(0, len(rows), 41):
+        i, hours = rows.image[k], time[rows.image[k]] / 3600
+        position, rotation = (np.asarray(v)[i] for v in (truth.exterior.position, truth.exterior.camera_from_object))
+        own = seen(camera.c + 0.5 * hours, camera.x_p - 0.3 * hours, position, rotation, truth.points[rows.point[k]])
+        np.testing.assert_allclose(rows.xy[k], own, atol=1e-9)
+    assert 0.01 < np.abs(rows.xy - plain().block.image_points.xy).max() < 0.1
+
+
+def test_the_block_knows_what_the_recipe_says_and_truth_is_told():
+    block, truth, _ = made(RATES)
+    start, prior = block.start.unknowns.more["camera_rates"]["kodak"], block.priors.more["camera_rates"]["kodak"]
+    assert float(start.c_rate) == 0.0 and prior.c_rate is FREE and float(prior.xp_rate.sigma) == 0.4
+    assert float(truth.more["camera_rates"]["kodak"].c_rate) == 0.5
+    unknowing = made({"camera_rates": {"default": {"truth": TRUE}}})
+    assert not unknowing.block.start.unknowns.more
+    assert np.array_equal(unknowing.block.image_points.xy, block.image_points.xy)
+
+
+def test_measured_once_more_it_is_the_same_flight():
+    block, truth, _ = made(RATES)
+    np.testing.assert_allclose(image_coordinates(block, truth), block.image_points.xy, atol=1e-9)
+
+
+def test_it_goes_through_files(tmp_path):
+    simulation = made(RATES)
+    write_simulation(simulation, tmp_path / "block")
+    again = read_block(tmp_path / "block")
+    assert again.priors.more == simulation.block.priors.more
+    np.testing.assert_allclose(again.flight_time, simulation.block.flight_time, atol=1e-9)
+    told = read_truth(tmp_path / "block")["georeferencing"].set_index("parameter").value
+    assert told["camera_rates[kodak].c_rate_mm_per_h"] == 0.5
+
+
+def test_a_photograph_without_a_time_is_named(tmp_path):
+    write_simulation(made(RATES), tmp_path / "block")
+    table = tmp_path / "block" / "images.csv"
+    lines = table.read_text().splitlines()
+    cells = lines[3].split(",")
+    cells[lines[0].split(",").index("time_s")] = ""
+    table.write_text("\n".join([*lines[:3], ",".join(cells), *lines[4:]]) + "\n")
+    with pytest.raises(BlockError, match=r"row 4: image A_03 has no time_s, but its camera kodak changes"):
+        read_block(tmp_path / "block")
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"camera_rates.kodak.rate": 1.0}, r"\[camera_rates.kodak\] rate: no such key is known"),
+        ({"camera_rates.kodak.truth.c_rate": 1.0}, r"\[camera_rates.kodak.truth\] c_rate: no such key is known"),
+        ({"camera_rates.leica": {}}, r"\[camera_rates\] leica: no such key is known"),
+        ({"flight.turn_s": -1.0}, r"\[flight\] turn_s"),
+    ],
+)
+def test_what_cannot_be_is_refused(changes, words):
+    with pytest.raises(InputError, match=words):
+        recipe_from(changed(RATES | changes))
+
+
+def test_a_convergent_set_has_no_time():
+    set_ = {"field_m": [1.0, 1.0], "stations": [{"name": "a", "distance_m": 2.0, "tilt_deg": 30.0}]}
+    with pytest.raises(InputError, match=r"camera_rates: a convergent set has no times that a camera could change in"):
+        recipe_from(changed(RATES | {"flight": None, "convergent": set_}))
