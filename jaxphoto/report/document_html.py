@@ -28,8 +28,11 @@ _ONE = r"([-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?(\([\d.]+\))?|-)"
 _UNIT = r"( ?[^\W\d_]{1,7}| ?%)"
 _NUMBER = re.compile(rf"{_ONE}{_UNIT}?(( (\+-|/|x|to|=) |, ?|/){_ONE}{_UNIT}?)*( or more)?")
 _LONGEST = 40
+# Rows of a table that scrolls in a box of its own.
+_LONG = 30
 _ROWS = _HTML.from_string(
-    '<div class="wide"><table{% if not head %} class="names"{% endif %}>{% if head %}<thead><tr>{% for c in columns %}'
+    '<div class="wide{% if rows|length > long %} long" tabindex="0{% endif %}"><table{% if not head %} class="names"'
+    "{% endif %}>{% if head %}<thead><tr>{% for c in columns %}"
     "<th{{ kinds[loop.index0] }}>{{ c }}</th>{% endfor %}</tr></thead>{% endif %}<tbody>{% for row in rows %}<tr>"
     "{% for cell in row %}{% if loop.first and not head %}<th>{{ cell }}</th>{% else %}"
     "<td{{ kinds[loop.index0] }}>{{ cell }}</td>{% endif %}{% endfor %}</tr>"
@@ -54,7 +57,7 @@ def html_of(element: Heading | Paragraph | Rows | Pictures) -> Markup:
         of = ("number", "text")
         kinds = [Markup(' class="{}"').format(of[_is_text(c)]) if head else "" for c in zip(*element.rows, strict=True)]
         kinds += [""] * (len(element.columns) - len(kinds))
-        return Markup(_ROWS.render(columns=element.columns, rows=element.rows, head=head, kinds=kinds))
+        return Markup(_ROWS.render(columns=element.columns, rows=element.rows, head=head, kinds=kinds, long=_LONG))
     return Markup('<div class="pictures">{}</div>').format(Markup("").join(map(_image, element.panels)))
 
 
