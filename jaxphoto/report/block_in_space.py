@@ -10,15 +10,17 @@ from jaxtyping import Float
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.block import Block
 from jaxphoto.observations import AXES
-from jaxphoto.report.block_places import Places, places_of, pyramids
+from jaxphoto.report.block_places import BlockPlaces, places_of, pyramids
 from jaxphoto.report.error_ellipsoids import ellipsoid_mesh
 from jaxphoto.statistics import Covariance, physical_residuals
 
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure
 
-# Points that a browser turns smoothly, and images whose pyramids do not hide one another.
-_POINTS, _PYRAMIDS = 20_000, 300
+# Points that a browser turns smoothly, and pyramids.
+_POINTS, _PYRAMIDS = 10_000, 500
+# Of more images pyramids and offsets hide the rest: they are shown when the legend is asked for them.
+_CROWDED = 150
 # Ellipsoids of stations and tie points, each; control and check points have theirs besides.
 _ELLIPSOIDS = 150
 # Drawn lengths, as parts of the extent of the block: of the median ellipsoid's longest axis, and of an rms offset.
@@ -32,32 +34,33 @@ _GREY, _BLUE, _RED, _GREEN, _PURPLE, _SKY = "#8a8f96", "#2f8fd0", "#d55e00", "#0
 def block_in_space(source: Block | Adjustment, covariance: Covariance | None = None) -> Figure:
     """Stations with the pyramids of their images, strips, object points, control and check points, in metres.
 
-    Of an adjustment also by how much observed positions (GNSS) differ from it, as arrows; with its `covariance` the
-    error ellipsoids of stations and points (one sigma, a posteriori). Both are drawn larger than they are; by how
-    much says the legend. Many points are thinned. What stands for an image or a point carries its name as `text`, and
-    its trace says of what as `meta`.
+    Of an adjustment also by how much observed positions (GNSS) differ from it, as lines from the stations; with its
+    `covariance` the error ellipsoids of stations and points (one sigma, a posteriori). Both are drawn larger than they
+    are; by how much says the legend. Many points are thinned. What stands for an image or a point carries its name as
+    `text`, and its trace says of what as `meta`.
     """
     # Here, because importing plotly takes half a second that most uses of jaxphoto need not wait for.
     from plotly.graph_objects import Figure
 
     block, places = (source, places_of(source)) if isinstance(source, Block) else (source.block, places_of(source))
     origin = origin_of(places)
-    traces = [*_point_traces(block, places, origin), *_image_traces(source, block, places, origin)]
+    traces = [*_point_traces(block, places, origin), *_image_traces(source, places, origin)]
     if not isinstance(source, Block):
         traces += _offset_traces(source, places, origin)
         if covariance is not None:
             traces += _ellipsoid_traces(covariance, places, origin)
     axes = zip(AXES, origin, strict=True)
     shown = {f"{a.lower()}axis": {"title": {"text": _axis_title(a, v)}, "showbackground": False} for a, v in axes}
+    camera = {"eye": {"x": 0.4, "y": -1.7, "z": 1.1}, "center": {"x": 0, "y": 0, "z": -0.15}}
     layout = {
-        "scene": {"aspectmode": "data", "camera": {"eye": {"x": 0.4, "y": -1.7, "z": 1.1}}, **shown},
+        "scene": {"aspectmode": "data", "camera": camera, **shown},
         "legend": {"orientation": "h", "yanchor": "top", "y": 0, "itemsizing": "constant"},
         "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
     }
     return Figure(data=traces, layout=layout, skip_invalid=False)
 
 
-def origin_of(places: Places) -> Float[np.ndarray, 3]:
+def origin_of(places: BlockPlaces) -> Float[np.ndarray, 3]:
     """What the drawn coordinates are less of (m): round, and zero where coordinates are small."""
     known = places.points[places.point_known] if places.point_known.any() else places.stations[places.image_known]
     middle = np.median(known, axis=0) if len(known) else np.zeros(3)
@@ -68,7 +71,7 @@ def _axis_title(axis: str, origin: float) -> str:
     return f"{axis} [m]" if not origin else f"{axis} {'-' if origin > 0 else '+'} {abs(origin):.0f} [m]"
 
 
-def _point_traces(block: Block, places: Places, origin: np.ndarray) -> list[dict[str, Any]]:
+def _point_traces(block: Block, places: BlockPlaces, origin: np.ndarray) -> list[dict[str, Any]]:
     tie = np.setdiff1d(places.ties(_POINTS), np.concatenate([places.control, places.check]))
     shown = places.point_known.sum()
     thinned = f" (1 in {-(-shown // _POINTS)})" if shown > _POINTS else ""
@@ -81,7 +84,8 @@ def _point_traces(block: Block, places: Places, origin: np.ndarray) -> list[dict
     return [_marks(name, "point", places.points[who] - origin, names[who], m) for name, who, m in kinds if len(who)]
 
 
-def _image_traces(source: Block | Adjustment, block: Block, places: Places, origin: np.ndarray) -> list[dict[str, Any]]:
+def _image_traces(source: Block | Adjustment, places: BlockPlaces, origin: np.ndarray) -> list[dict[str, Any]]:
+    block = source if isinstance(source, Block) else source.block
     known = np.flatnonzero(places.image_known)
     if not len(known):
         return []
@@ -90,19 +94,20 @@ def _image_traces(source: Block | Adjustment, block: Block, places: Places, orig
     traces = [_marks("camera stations", "image", places.stations[known] - origin, names, mark)]
     lines = pyramids(source, places, _PYRAMIDS)
     if len(lines):
-        traces.append(_lines("images", lines - origin, _BLUE, 1.5))
+        traces.append(_lines("images", lines - origin, _BLUE, 1.5) | _hidden_among(len(known)))
     if places.strips:
         flown = [places.stations[strip] - origin for strip in places.strips]
         traces.append(_lines("strips", flown, _BLUE, 1, dash="dot"))
     return traces
 
 
-def _offset_traces(adjusted: Adjustment, places: Places, origin: np.ndarray) -> list[dict[str, Any]]:
-    """Arrows from stations; what was not observed of a position has no part in them."""
+def _offset_traces(adjusted: Adjustment, places: BlockPlaces, origin: np.ndarray) -> list[dict[str, Any]]:
+    """Lines that begin at stations; what was not observed of a position has no part in them."""
     rows = adjusted.block.stations
     offset = np.zeros_like(places.stations)
     offset[rows.who, rows.axis] = physical_residuals(adjusted)[rows.group]
     images = np.unique(rows.who).astype(int)
+    # Root mean square of the lengths.
     size = float(np.sqrt((offset[images] ** 2).sum(axis=1).mean())) if len(images) else 0.0
     if not size:
         return []
@@ -110,16 +115,11 @@ def _offset_traces(adjusted: Adjustment, places: Places, origin: np.ndarray) -> 
     start = places.stations[images] - origin
     tip = start + factor * offset[images]
     name = f"observed minus adjusted positions, {factor:,.0f} times"
-    u, v, w = (tip - start).T.astype(np.float32)
-    heads = {
-        "type": "cone", "u": u, "v": v, "w": w, "anchor": "tip", "sizemode": "scaled", "sizeref": 0.3,
-        "colorscale": [[0, _PURPLE], [1, _PURPLE]], "showscale": False, "hoverinfo": "skip", "legendgroup": "offsets",
-    }  # fmt: skip
     lines = _lines(name, np.stack([start, tip], axis=1), _PURPLE, 3)
-    return [lines | {"legendgroup": "offsets"}, heads | _xyz(tip)]
+    return [lines | _hidden_among(len(images))]
 
 
-def _ellipsoid_traces(covariance: Covariance, places: Places, origin: np.ndarray) -> list[dict[str, Any]]:
+def _ellipsoid_traces(covariance: Covariance, places: BlockPlaces, origin: np.ndarray) -> list[dict[str, Any]]:
     n, factor2 = covariance.n_images, float(covariance.variance_factor)
     own = np.asarray(covariance.matrix)[: 6 * n, : 6 * n].reshape(n, 6, n, 6)[np.arange(n), :3, np.arange(n), :3]
     images = np.arange(n)[:: max(1, -(-n // _ELLIPSOIDS))]
@@ -137,6 +137,11 @@ def _ellipsoid_traces(covariance: Covariance, places: Places, origin: np.ndarray
         "name": f"error ellipsoids, {factor:,.0f} times", "showlegend": True, "flatshading": False,
     }  # fmt: skip
     return [mesh | _xyz(at)]
+
+
+def _hidden_among(images: int) -> dict[str, Any]:
+    """What a trace of so many images is given beside its lines."""
+    return {"visible": "legendonly" if images > _CROWDED else True}
 
 
 def _round_factor(factor: float) -> float:

@@ -15,7 +15,7 @@ _AROUND = (None, 0, 1, None, 2, 3, None, 0, 3, 2, 1)
 _CORNERS = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) / 2
 
 
-class Places(NamedTuple):
+class BlockPlaces(NamedTuple):
     """Positions in the system of the block (m), and whose are known."""
 
     stations: Float[np.ndarray, "images 3"]
@@ -40,7 +40,7 @@ class Places(NamedTuple):
         return known[:: max(1, -(-len(known) // most))]
 
 
-def places_of(source: Block | Adjustment) -> Places:
+def places_of(source: Block | Adjustment) -> BlockPlaces:
     """Of an adjusted block the estimates; of a block what is known to start with, of coordinates that are observed."""
     block, found = (source, _given(source)) if isinstance(source, Block) else (source.block, _adjusted(source))
     stations, points, image_known, point_known = found
@@ -49,10 +49,10 @@ def places_of(source: Block | Adjustment) -> Places:
     strip = np.array(block.image_strip)
     strips = tuple(np.flatnonzero((strip == s) & image_known) for s in dict.fromkeys(strip[strip != ""]))
     control, check = (who[point_known[who]] for who in (control, check))
-    return Places(stations, points, image_known, point_known, control, check, strips)
+    return BlockPlaces(stations, points, image_known, point_known, control, check, strips)
 
 
-def pyramids(source: Block | Adjustment, places: Places, most: int) -> Float[np.ndarray, "images corners 3"]:
+def pyramids(source: Block | Adjustment, places: BlockPlaces, most: int) -> Float[np.ndarray, "images corners 3"]:
     """For each image a line that goes around the pyramid from its projection centre to its format, which is drawn a
     part of the block's extent away; of more than `most` images, for every so manyeth."""
     block, start = (source, source.start.unknowns) if isinstance(source, Block) else (source.block, source.unknowns)

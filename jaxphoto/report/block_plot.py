@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.block import Block
-from jaxphoto.report.block_places import Places, places_of, pyramids
+from jaxphoto.report.block_places import BlockPlaces, places_of, pyramids
 from jaxphoto.report.plots import axes_or_new, panels
 from jaxphoto.report.tables import Tables
 
@@ -59,6 +61,15 @@ def layout_figure(tables: Tables) -> Figure:
     return figure
 
 
-def _draw_pyramids(axes: Any, source: Block | Adjustment, places: Places) -> None:
+def block_words(block: Block) -> str:
+    """What a picture of a block shows, for those who do not see it."""
+    control, check = (len(np.unique(rows.who)) for rows in (block.control, block.check))
+    return (
+        f"The block: {len(block.images)} camera stations, {len(block.points)} object points, {control} control points, "
+        f"{check} check points"
+    )
+
+
+def _draw_pyramids(axes: Any, source: Block | Adjustment, places: BlockPlaces) -> None:
     for pyramid in pyramids(source, places, _FRAMES):
         axes.plot(*pyramid.T, lw=0.5, color="tab:blue", alpha=0.6)

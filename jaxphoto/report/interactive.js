@@ -1,9 +1,10 @@
 // What a page does besides being read: tables sort and filter, the block turns, and an image or a point that is chosen
 // in one place shows in the others. Without it, and in print, the page has all its tables and still pictures.
-"use strict";
-(() => {
-  const LONG_TABLE = 12;
-  const CHOSEN = "#e69f00", OF_POINT = "#cc79a7";
+{
+  const LONG_TABLE = 12, NARROW = 600;
+  // As in block_in_space.py of colours that those who see no red or green tell apart.
+  const OF_IMAGE = "#e69f00", OF_POINT = "#f0308a", BLUE = "#2f8fd0", GREY = "#8a8f96";
+  const NOTHING = { x: [], y: [], z: [] };
   // Length of an arrow of three times the rms residual, as a part of the width of the format.
   const ARROW = 0.06;
   const HEADS = { image: "image", photograph: "image", point: "point" };
@@ -18,15 +19,17 @@
 
   // ---- tables
 
+  // A number, and after it at most a unit or what it is good to: "-1.5e-05", "0.35 px", "12 +- 3".
+  const NUMBER = /^[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?($|[\s(,/%])/i;
   const order = new Intl.Collator(undefined, { numeric: true });
 
   const sortBy = (table, heads, column) => {
     const head = heads[column], falling = head.getAttribute("aria-sort") === "ascending";
-    const number = head.classList.contains("number");
-    const keyed = [...table.tBodies[0].rows].map((row) => {
-      const text = row.cells[column].textContent;
-      return { row, key: number ? parseFloat(text) : text };
-    });
+    const rows = [...table.tBodies[0].rows], texts = rows.map((row) => row.cells[column].textContent.trim());
+    const told = texts.filter((text) => text && text !== "-");
+    const number = told.filter((text) => NUMBER.test(text)).length > told.length / 2;
+    const key = (text) => (!number ? text : NUMBER.test(text) ? parseFloat(text) : NaN);
+    const keyed = rows.map((row, k) => ({ row, key: key(texts[k]) }));
     // What is no number, and what is empty, comes last either way.
     const none = (key) => (number ? Number.isNaN(key) : key === "");
     keyed.sort((a, b) => none(a.key) - none(b.key)
@@ -130,7 +133,9 @@
     return own;
   };
 
-  const CONFIG = { responsive: true, displaylogo: false, modeBarButtonsToRemove: ["tableRotation", "resetCameraLastSave3d"] };
+  const CONFIG = {
+    responsive: true, displaylogo: false, modeBarButtonsToRemove: ["tableRotation", "resetCameraLastSave3d"],
+  };
   const dark = matchMedia("(prefers-color-scheme: dark)");
 
   const drawn = async (place, data, layout) => {
@@ -171,18 +176,18 @@
 
   const showChosen = async (place, first) => {
     const m = chosen.image !== null || chosen.point !== null ? await measurements() : null;
-    const rays = { image: [], point: [] }, marks = { x: [], y: [], z: [] }, told = [];
+    const rays = { image: [], point: [] }, marks = { image: NOTHING, point: NOTHING }, told = [];
     for (const of of ["image", "point"]) {
       const k = m?.number[of].get(chosen[of]);
       if (k === undefined) continue;
       rays[of] = of === "image" ? raysOfImage(m, k) : raysOfPoint(m, k);
-      const at = place3(of === "image" ? m.stations : m.places, k);
-      ["x", "y", "z"].forEach((axis, n) => marks[axis].push(at[n]));
+      const [x, y, z] = place3(of === "image" ? m.stations : m.places, k);
+      marks[of] = { x: [x], y: [y], z: [z] };
       told.push(`${of} ${chosen[of]}: ${rays[of].length} rays`);
     }
-    const all = [lines(rays.image), lines(rays.point), marks];
+    const all = [lines(rays.image), lines(rays.point), marks.image, marks.point];
     await Plotly.restyle(place, Object.fromEntries(["x", "y", "z"].map((axis) => [axis, all.map((one) => one[axis])])),
-      [first, first + 1, first + 2]);
+      all.map((_, k) => first + k));
     return told.join("; ");
   };
 
@@ -200,7 +205,8 @@
       vy.push(m.v[2 * k + 1] * m.v_step_mm);
       square += vx.at(-1) ** 2 + vy.at(-1) ** 2;
     }
-    const rms = Math.sqrt(square / Math.max(1, 2 * x.length)), factor = Number(((ARROW * width) / (3 * rms || 1)).toPrecision(1));
+    const rms = Math.sqrt(square / Math.max(1, 2 * x.length));
+    const factor = Number(((ARROW * width) / (3 * rms || 1)).toPrecision(1));
     const arrows = { x: [], y: [] };
     x.forEach((at, k) => {
       arrows.x.push(at, at + factor * vx[k], null);
@@ -210,18 +216,25 @@
     const around = [-1, 1, 1, -1, -1];
     const data = [
       { x: around.map((s) => (s * width) / 2), y: [-1, -1, 1, 1, -1].map((s) => (s * height) / 2), mode: "lines",
-        line: { color: "#8a8f96", width: 1 }, hoverinfo: "skip" },
-      { ...arrows, mode: "lines", line: { color: "#2f8fd0", width: 1.2 }, hoverinfo: "skip" },
+        line: { color: GREY, width: 1 }, hoverinfo: "skip" },
+      { ...arrows, mode: "lines", line: { color: BLUE, width: 1.2 }, hoverinfo: "skip" },
       { x, y, mode: "markers", meta: "point", text: names, customdata: vx.map((v, k) => [v / pixel, vy[k] / pixel]),
-        marker: { size: names.map((name) => (isChosen(name) ? 12 : 5)), color: names.map((name) => (isChosen(name) ? OF_POINT : "#2f8fd0")) },
+        marker: {
+          size: names.map((name) => (isChosen(name) ? 12 : 5)),
+          color: names.map((name) => (isChosen(name) ? OF_POINT : BLUE)),
+        },
         hovertemplate: "point %{text}<br>%{customdata[0]:.2f}, %{customdata[1]:.2f} px<extra></extra>" },
     ];
     const layout = {
       showlegend: false, dragmode: "pan", margin: { l: 50, r: 10, t: 10, b: 40 },
-      xaxis: { title: { text: "x [mm]" }, zeroline: false }, yaxis: { title: { text: "y [mm]" }, scaleanchor: "x", zeroline: false },
+      xaxis: { title: { text: "x [mm]" }, range: [-0.56 * width, 0.56 * width], constrain: "domain", zeroline: false },
+      yaxis: {
+        title: { text: "y [mm]" }, range: [-0.56 * height, 0.56 * height], constrain: "domain", scaleanchor: "x",
+        zeroline: false,
+      },
     };
-    place.previousElementSibling.textContent =
-      `Residuals of image ${chosen.image}, ${factor.toLocaleString("en")} times: ${x.length} image points, rms ${(rms / pixel).toFixed(2)} px`;
+    place.previousElementSibling.textContent = `Residuals of image ${chosen.image}, ${factor.toLocaleString("en")} times: `
+      + `${x.length} image points, rms ${(rms / pixel).toFixed(2)} px`;
     await drawn(place, data, layout);
   };
 
@@ -246,31 +259,43 @@
 
   const drawBlock = async (figure) => {
     const { data, layout } = JSON.parse(await unpacked(figure.querySelector("script")));
-    const first = data.length, empty = { x: [], y: [], z: [], type: "scatter3d", hoverinfo: "skip", showlegend: false };
-    data.push({ ...empty, mode: "lines", line: { color: CHOSEN, width: 2 } });
-    data.push({ ...empty, mode: "lines", line: { color: OF_POINT, width: 4 } });
-    data.push({ ...empty, mode: "markers", marker: { color: CHOSEN, size: 9, symbol: "circle" } });
+    const first = data.length, own = { ...NOTHING, type: "scatter3d", hoverinfo: "skip", showlegend: false };
+    for (const [color, width] of [[OF_IMAGE, 2], [OF_POINT, 4]]) {
+      data.push({ ...own, mode: "lines", line: { color, width } });
+    }
+    for (const color of [OF_IMAGE, OF_POINT]) data.push({ ...own, mode: "markers", marker: { color, size: 9 } });
     const place = made("div", { className: "plot", role: "group", ariaLabel: figure.querySelector("img").alt });
     const said = made("output");
     const names = data.filter(({ meta }) => meta === "image").flatMap(({ text }) => text);
-    const residuals = made("div", { className: "plot" });
+    const residuals = made("div", { className: "plot flat" });
     figure.append(chooser(names, said), place, made("div", { hidden: true }, made("p"), residuals));
     figure.dataset.drawn = "";
+    // From farther off where the figure is narrow, so that its axes are in it.
+    if (place.clientWidth < NARROW) for (const axis of ["x", "y", "z"]) layout.scene.camera.eye[axis] *= 1.4;
     await drawn(place, data, layout);
-    listeners.push(async () => {
+    const show = async () => {
       said.textContent = await showChosen(place, first);
       await showResiduals(residuals);
-    });
-  };
-
-  const begin = async () => {
-    const figure = document.querySelector("figure.block");
-    const canTurn = figure && window.DecompressionStream && document.createElement("canvas").getContext("webgl");
-    for (const table of document.querySelectorAll("table:has(thead)")) prepareTable(table, canTurn);
-    if (!canTurn) return;
-    document.head.append(made("script", { textContent: await unpacked(document.getElementById("plotly")) }));
-    await drawBlock(figure);
+    };
+    listeners.push(show);
+    if (chosen.image !== null || chosen.point !== null) await show();
     performance.mark("figures drawn");
   };
-  begin();
-})();
+
+  // When it comes into sight: a page is there to be read before its figures are drawn.
+  const drawInSight = (figure) => {
+    const observer = new IntersectionObserver(async ([{ isIntersecting }]) => {
+      if (!isIntersecting) return;
+      observer.disconnect();
+      document.head.append(made("script", { textContent: await unpacked(document.getElementById("plotly")) }));
+      await drawBlock(figure);
+    }, { rootMargin: "300px" });
+    observer.observe(figure);
+  };
+
+  const figure = document.querySelector("figure.block");
+  // Where a browser draws nothing in space, the still picture stays.
+  const canTurn = figure && window.DecompressionStream && window.WebGLRenderingContext;
+  for (const table of document.querySelectorAll("table:has(thead)")) prepareTable(table, canTurn);
+  if (canTurn) drawInSight(figure);
+}

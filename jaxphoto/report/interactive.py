@@ -1,4 +1,4 @@
-"""What makes a page more than paper: plotly and a script of our own inside it, so that it opens offline."""
+"""The block in a page as a figure that turns and answers, with plotly inside, so that it opens offline."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import base64
 import functools
 import gzip
 import json
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,12 +22,6 @@ if TYPE_CHECKING:
 # Image points whose residuals a page holds, some 12 bytes each; of more, every so manyeth.
 _MOST = 600_000
 _STEPS = np.iinfo(np.int16).max
-_SCRIPT = Path(__file__).with_name("interactive.js")
-
-
-def page_script() -> Markup:
-    """Tables that sort and filter, and figures that answer: once, at the end of a page."""
-    return Markup("<script>{}</script>").format(Markup(_SCRIPT.read_text(encoding="utf-8")))
 
 
 def live_block(adjusted: Adjustment, covariance: Covariance, still: str, alt: str) -> Markup:
@@ -38,7 +31,7 @@ def live_block(adjusted: Adjustment, covariance: Covariance, still: str, alt: st
     says what it shows.
     """
     figure: Figure = block_in_space(adjusted, covariance)
-    shown = '<figure class="block"><img class="still" alt="{}" src="{}">{}</figure>{}{}'
+    shown = '<figure class="block"><img alt="{}" src="{}">{}</figure>{}{}'
     return Markup(shown).format(
         alt,
         still,

@@ -11,12 +11,11 @@ from jinja2 import Environment
 from markupsafe import Markup
 
 from jaxphoto.errors import camera_words
-from jaxphoto.report.block_plot import layout_figure
-from jaxphoto.report.document import Heading, Paragraph, Rows
+from jaxphoto.report.document import BlockInSpace, Heading, Paragraph, Rows
 from jaxphoto.report.document_html import contents, html_of
 from jaxphoto.report.findings import Verdict
-from jaxphoto.report.interactive import live_block, page_script
 from jaxphoto.report.maps import png_of
+from jaxphoto.report.page_head import page_head
 from jaxphoto.report.plots import (
     check_points_figure,
     correlation_figure,
@@ -26,7 +25,6 @@ from jaxphoto.report.plots import (
 from jaxphoto.report.positional_accuracy import accuracy_sentences
 from jaxphoto.report.recovery import recovery_spread
 from jaxphoto.report.sigma_map import sigma_map_figure, sigma_map_words
-from jaxphoto.report.style import STYLE
 from jaxphoto.report.table_files import head_of, readable
 from jaxphoto.report.tables import Tables
 from jaxphoto.statistics import LEAST_CHECKED
@@ -34,9 +32,7 @@ from jaxphoto.statistics import LEAST_CHECKED
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_PAGE = """<!DOCTYPE html>
-<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{{ title }}</title><style>{{ style }}</style></head><body>
+_PAGE = """{{ head(title) }}<body>
 <h1>{{ title }}</h1>
 <p class="verdict {{ verdict.colour }}"><b>{{ verdict.headline }}</b></p>
 {% for f in verdict.findings %}<p class="{{ f.level.name.lower() }}">{{ f.text }}</p>{% endfor %}
@@ -47,8 +43,7 @@ Standard deviations are a posteriori (times &sigma;<sub>0</sub>). Correlations r
 {{ contents }}
 {% for heading, body in sections %}{{ heading }}
 {{ body }}
-{% endfor %}{{ script }}
-</body></html>
+{% endfor %}</body></html>
 """
 _SIGMA_MAP = (
     "Standard deviation of where the calibrated camera says that a point is seen, interior and exterior orientation "
@@ -73,7 +68,7 @@ def report_page(tables: Tables, verdict: Verdict) -> str:
         Environment(autoescape=True)
         .from_string(_PAGE)
         .render(
-            style=STYLE,
+            head=page_head,
             title=a.block.title or "jaxphoto adjustment",
             outcome=a.outcome.value,
             steps=int(a.steps),
@@ -84,14 +79,13 @@ def report_page(tables: Tables, verdict: Verdict) -> str:
             verdict=verdict,
             contents=contents([heading for heading, body in sections]),
             sections=[(html_of(Heading(heading)), body) for heading, body in sections],
-            script=page_script(),
         )
     )
 
 
 def _sections(tables: Tables) -> Iterator[tuple[str, list[Markup]]]:
     """Headings with what is below them, of what there is."""
-    a, check = tables.adjusted, tables.check_points
+    check = tables.check_points
     yield "Interior orientation", _interior(tables)
     if tables.sigma_maps:
         yield "How sure the camera is, over its format", [_said(_SIGMA_MAP), *_sigma_maps(tables)]
@@ -103,7 +97,7 @@ def _sections(tables: Tables) -> Iterator[tuple[str, list[Markup]]]:
         )
     if len(tables.georeferencing):
         yield "Mounts and strips", [_html(tables.georeferencing)]
-    yield "Block", [live_block(a, tables.covariance, png_of(layout_figure(tables))[1], _block_words(tables))]
+    yield "Block", [html_of(BlockInSpace(tables))]
     yield "Residuals", _residuals(tables)
     if len(check):
         accuracy = [_said(s) for s in accuracy_sentences(tables.tested_accuracy)]
@@ -129,14 +123,6 @@ def _sigma_maps(tables: Tables) -> Iterator[Markup]:
         words = sigma_map_words(tables.adjusted.block.sensors[camera], maps)
         yield _said(words)
         yield _wide(_picture(sigma_map_figure(tables, camera), words))
-
-
-def _block_words(tables: Tables) -> str:
-    block = tables.adjusted.block
-    return (
-        f"The block: {len(block.images)} camera stations, {len(block.points)} object points, "
-        f"{len(np.unique(block.control.who))} control points, {len(np.unique(block.check.who))} check points"
-    )
 
 
 def _residuals(tables: Tables) -> list[Markup]:

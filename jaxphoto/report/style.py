@@ -38,7 +38,8 @@ th button::after { content: " \\2195"; color: var(--grey); font-weight: normal }
 .name { color: var(--link); text-decoration: underline dotted } .is-chosen > * { background: var(--chosen) !important }
 :focus-visible { outline: 2px solid var(--link); outline-offset: 1px }
 .filter { margin: .8rem 0 -.2rem; color: var(--grey); font-size: 13px }
-figure.block { margin: .5rem 0 1rem } .plot { height: min(36rem, 75vh) } [data-drawn] .still { display: none }
+figure.block { margin: .5rem 0 1rem } .plot { height: min(36rem, 75vh) }
+.plot.flat { height: auto; aspect-ratio: 4 / 3; max-width: 44rem } [data-drawn] > img { display: none }
 .chooser { display: flex; flex-wrap: wrap; gap: .3rem 1rem; align-items: baseline; font-size: 13px }
 .chooser select, .chooser input { max-width: 11rem }
 .good { color: var(--good) } .bad { color: var(--bad) }
@@ -50,12 +51,13 @@ figure.block { margin: .5rem 0 1rem } .plot { height: min(36rem, 75vh) } [data-d
 .alarm { border-color: var(--alarm) } .warning { border-color: var(--warning) }
 @media (max-width: 32rem) { body { margin: .5rem auto; padding: 0 .6rem } th, td { padding: .15rem .35rem }
   .names th { white-space: normal } h1 { font-size: 1.4rem } .wide img { max-width: none; width: 44rem } }
+@page { margin: 12mm }
 @media print { :root { color-scheme: light } body { max-width: none; margin: 0; padding: 0; font-size: 10.5px }
   table { font-size: 9px } th, td { padding: .15rem .35rem } th, td.text { overflow-wrap: anywhere }
   table:has(th:nth-child(9)) { font-size: 7.5px } table:has(th:nth-child(13)) { font-size: 6.5px }
   table:has(th:nth-child(9)) :is(th, td) { padding: .1rem .2rem } .wide { overflow: visible; max-height: none }
   .filter, .chooser, .plot, figure.block p { display: none } th button::after { content: "" }
-  [data-drawn] .still { display: inline }
+  [data-drawn] > img { display: inline }
   .name { color: inherit; text-decoration: none } .is-chosen > * { background: none !important }
   th:first-child, td:first-child { position: static }
   h2, h3 { break-after: avoid } tr, img, .alarm, .warning, .information { break-inside: avoid }
