@@ -27,6 +27,7 @@ _ELLIPSOIDS = 150
 _AXIS, _OFFSET = 0.015, 0.05
 # Coordinates beyond this are shown less a round number: WebGL has seven digits.
 _FAR, _ROUND = 1e4, 1e3
+_MOST = 1e30
 # Colours that those who see no red or green tell apart, on light and dark paper (Okabe and Ito 2008).
 _GREY, _BLUE, _RED, _GREEN, _PURPLE, _SKY = "#8a8f96", "#2f8fd0", "#d55e00", "#009e73", "#cc79a7", "#56b4e9"
 
@@ -63,8 +64,14 @@ def block_in_space(source: Block | Adjustment, covariance: Covariance | None = N
 def origin_of(places: BlockPlaces) -> Float[np.ndarray, 3]:
     """What the drawn coordinates are less of (m): round, and zero where coordinates are small."""
     known = places.points[places.point_known] if places.point_known.any() else places.stations[places.image_known]
+    known = known[np.isfinite(known).all(axis=1)]
     middle = np.median(known, axis=0) if len(known) else np.zeros(3)
     return np.where(np.abs(middle) > _FAR, np.round(middle / _ROUND) * _ROUND, 0.0)
+
+
+def drawable(at: np.ndarray) -> np.ndarray:
+    """Coordinates as WebGL has them; those of an adjustment that diverged may be larger than any such number."""
+    return np.clip(at, -_MOST, _MOST).astype(np.float32)
 
 
 def _axis_title(axis: str, origin: float) -> str:
@@ -104,12 +111,15 @@ def _image_traces(source: Block | Adjustment, places: BlockPlaces, origin: np.nd
 def _offset_traces(adjusted: Adjustment, places: BlockPlaces, origin: np.ndarray) -> list[dict[str, Any]]:
     """Lines that begin at stations; what was not observed of a position has no part in them."""
     rows = adjusted.block.stations
+    residuals = physical_residuals(adjusted)
+    if rows.group not in residuals:
+        return []
     offset = np.zeros_like(places.stations)
-    offset[rows.who, rows.axis] = physical_residuals(adjusted)[rows.group]
+    offset[rows.who, rows.axis] = residuals[rows.group]
     images = np.unique(rows.who).astype(int)
     # Root mean square of the lengths.
     size = float(np.sqrt((offset[images] ** 2).sum(axis=1).mean())) if len(images) else 0.0
-    if not size:
+    if not 0 < size < np.inf:
         return []
     factor = _round_factor(_OFFSET * places.extent / size)
     start = places.stations[images] - origin
@@ -163,4 +173,4 @@ def _lines(name: str, lines: Any, colour: str, width: float, dash: str = "solid"
 
 
 def _xyz(at: np.ndarray) -> dict[str, np.ndarray]:
-    return dict(zip("xyz", at.T.astype(np.float32), strict=True))
+    return dict(zip("xyz", drawable(at).T, strict=True))

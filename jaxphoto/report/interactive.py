@@ -12,7 +12,7 @@ import numpy as np
 from markupsafe import Markup
 
 from jaxphoto.adjustment import Adjustment
-from jaxphoto.report.block_in_space import block_in_space, origin_of
+from jaxphoto.report.block_in_space import block_in_space, drawable, origin_of
 from jaxphoto.report.block_places import places_of
 from jaxphoto.statistics import Covariance
 
@@ -56,8 +56,10 @@ def measurements(adjusted: Adjustment) -> dict:
     origin = origin_of(places)
     steps: dict[str, Any] = {}
     for name, of in (("xy", xy), ("v", v)):
-        step = float(np.abs(of).max(initial=0.0)) / _STEPS or 1.0
-        steps |= {name: _array(np.round(of.T / step), "i2"), f"{name}_step_mm": step}
+        # Where an adjustment diverged, residuals are no numbers.
+        finite = np.where(np.isfinite(of), of, 0.0)
+        step = float(np.abs(finite).max(initial=0.0)) / _STEPS or 1.0
+        steps |= {name: _array(np.round(finite.T / step), "i2"), f"{name}_step_mm": step}
     return {
         "images": list(block.images),
         "points": list(block.points),
@@ -68,8 +70,8 @@ def measurements(adjusted: Adjustment) -> dict:
         "first": _array(np.searchsorted(image[order], np.arange(len(block.images) + 1)), "i4"),
         "point": _array(np.asarray(adjusted.structure.point)[order], "i4"),
         **steps,
-        "stations": _array(places.stations - origin, "f4"),
-        "places": _array(places.points - origin, "f4"),
+        "stations": _array(drawable(places.stations - origin), "f4"),
+        "places": _array(drawable(places.points - origin), "f4"),
     }
 
 

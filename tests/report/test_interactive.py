@@ -60,6 +60,22 @@ def test_the_figure_has_what_the_block_has(tables):
     assert "camera stations" in start and "error ellipsoids" not in start
 
 
+@pytest.mark.parametrize("name", ["fixed_interior", "inner", "everything"])
+def test_blocks_of_any_kind_have_a_figure(name):
+    a = adjusted(name)
+    found = traces(block_in_space(a, Tables(a).covariance))
+    assert ("observed minus adjusted positions" in found) == bool(len(a.block.stations.who))
+
+
+def test_what_diverged_is_drawn_as_far_as_it_has_numbers(tables):
+    points = np.asarray(tables.adjusted.unknowns.points).copy()
+    points[:3] = [np.nan, np.inf, 1e200]
+    lost = eqx.tree_at(lambda a: (a.unknowns.points, a.residuals.image), tables.adjusted,
+                       (points, np.asarray(tables.adjusted.residuals.image) * np.nan))  # fmt: skip
+    assert len(block_in_space(lost, tables.covariance).to_json()) > 1000
+    json.dumps(measurements(lost), allow_nan=False)
+
+
 def test_coordinates_far_from_zero_are_shown_less_a_round_number(tables, monkeypatch):
     of = lambda a: (a.unknowns.points, a.unknowns.exterior.position)  # noqa: E731
     shift = np.array([512_000.0, 5_403_000.0, 0.0])
