@@ -29,12 +29,16 @@ td.number { white-space: nowrap }
 .pictures { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(23rem, 100%), 1fr)); gap: .8rem;
   align-items: start; margin: .5rem 0 1rem }
 .pictures img { width: 100%; max-width: 29.5rem; height: auto }
+/* Wide tables have the room to the right of the text. */
+@media screen and (min-width: 80rem) { .wide { margin-right: calc((62rem - 100vw) / 2 + 1.5rem) }
+  .wide img { max-width: 62rem } }
 .long { max-height: 75vh; overflow: auto } .long thead th { position: sticky; top: 0; z-index: 1 }
 .long thead th:first-child { z-index: 2 }
 th button, .name { font: inherit; color: inherit; background: none; border: 0; padding: 0; cursor: pointer;
   text-align: inherit }
-th button::after { content: " \\2195"; color: var(--grey); font-weight: normal }
-[aria-sort=ascending] button::after { content: " \\2191" } [aria-sort=descending] button::after { content: " \\2193" }
+th button::after { content: "\\a0\\2195"; color: var(--grey); font-weight: normal }
+[aria-sort=ascending] button::after { content: "\\a0\\2191" }
+[aria-sort=descending] button::after { content: "\\a0\\2193" }
 .name { color: var(--link); text-decoration: underline dotted } .is-chosen > * { background: var(--chosen) !important }
 :focus-visible { outline: 2px solid var(--link); outline-offset: 1px }
 .filter { margin: .8rem 0 -.2rem; color: var(--grey); font-size: 13px }
@@ -49,7 +53,8 @@ figure.block { margin: .5rem 0 1rem } .plot { height: min(36rem, 75vh) }
 .verdict.red { background: var(--red); color: var(--on-red) }
 .alarm, .warning, .information { border-left: 4px solid var(--information); padding-left: .6rem; margin: .4rem 0 }
 .alarm { border-color: var(--alarm) } .warning { border-color: var(--warning) }
-@media (max-width: 32rem) { body { margin: .5rem auto; padding: 0 .6rem } th, td { padding: .15rem .35rem }
+@media (max-width: 32rem) { th:not([aria-sort]) button::after { content: "" }
+  body { margin: .5rem auto; padding: 0 .6rem } th, td { padding: .15rem .35rem }
   .names th { white-space: normal } h1 { font-size: 1.4rem } .wide img { max-width: none; width: 44rem } }
 @page { margin: 12mm }
 @media print { :root { color-scheme: light } body { max-width: none; margin: 0; padding: 0; font-size: 10.5px }
