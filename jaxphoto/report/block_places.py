@@ -10,8 +10,8 @@ from jaxphoto.block import Block
 
 # Length of the drawn pyramid of an image, as a part of the extent of the block.
 _PYRAMID = 0.06
-# From the projection centre to a corner of the format and on around it, so that one line draws a pyramid.
-_AROUND = (None, 0, 1, None, 2, 3, None, 0, 3, 2, 1)
+# Around the format, and to each corner from the projection centre (None), so that one line draws a pyramid.
+_AROUND = (0, 1, 2, 3, 0, None, 0, None, 1, None, 2, None, 3)
 _CORNERS = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) / 2
 
 
@@ -53,7 +53,7 @@ def places_of(source: Block | Adjustment) -> BlockPlaces:
 
 
 def pyramids(source: Block | Adjustment, places: BlockPlaces, most: int) -> Float[np.ndarray, "images corners 3"]:
-    """For each image a line that goes around the pyramid from its projection centre to its format, which is drawn a
+    """For each image a line along the edges of the pyramid from its projection centre to its format, which is drawn a
     part of the block's extent away; of more than `most` images, for every so manyeth."""
     block, start = (source, source.start.unknowns) if isinstance(source, Block) else (source.block, source.unknowns)
     turned = places.image_known & (np.asarray(block.start.image_known, bool) | (source is not block))

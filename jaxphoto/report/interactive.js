@@ -179,7 +179,11 @@
     const rays = { image: [], point: [] }, marks = { image: NOTHING, point: NOTHING }, told = [];
     for (const of of ["image", "point"]) {
       const k = m?.number[of].get(chosen[of]);
-      if (k === undefined) continue;
+      if (k === undefined) {
+        // As those that could not be oriented, and those of a smaller part of a flight.
+        if (chosen[of] !== null) told.push(`${of} ${chosen[of]} is not in this block`);
+        continue;
+      }
       rays[of] = of === "image" ? raysOfImage(m, k) : raysOfPoint(m, k);
       const [x, y, z] = place3(of === "image" ? m.stations : m.places, k);
       marks[of] = { x: [x], y: [y], z: [z] };

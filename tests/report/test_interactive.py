@@ -92,8 +92,8 @@ def test_a_pyramid_opens_towards_what_the_image_sees(tables):
     s = a.structure
     seen = np.asarray(a.unknowns.points)[s.point]
     for image, line in enumerate(pyramids(a, places_of(a), 10**6)):
-        axis = line[1:3].mean(axis=0) + line[4:6].mean(axis=0) - 2 * line[0]
-        assert ((seen[s.image == image] - line[0]) @ axis > 0).all()
+        centre, corners = line[5], line[:4]
+        assert ((seen[s.image == image] - centre) @ (corners.mean(axis=0) - centre) > 0).all()
 
 
 def test_ellipsoids_have_the_size_and_directions_of_their_covariance():
