@@ -66,7 +66,7 @@ def test_modules_can_be_read_at_one_sitting():
 def test_tables_pictures_and_progress_live_upstairs_only():
     for path in PACKAGE.rglob("*.py"):
         if path.relative_to(PACKAGE).parts[0] not in TABLES_AND_FILES:
-            assert not imported(path) & {"pandas", "matplotlib", "rich", "typer", "jinja2"}, path
+            assert not imported(path) & {"pandas", "matplotlib", "plotly", "rich", "typer", "jinja2"}, path
 
 
 def test_no_import_hides_in_a_function():
@@ -75,11 +75,13 @@ def test_no_import_hides_in_a_function():
         inner = [n for f in ast.walk(tree) if isinstance(f, ast.FunctionDef) for n in ast.walk(f)]
         hidden = [ast.unparse(n) for n in inner if isinstance(n, ast.Import | ast.ImportFrom)]
         # Those that are worth it: matplotlib takes a third of a second, and most uses draw nothing; scipy's graphs take
-        # a tenth, and blocks of few images need none; its distributions take a fifth, and only tests compare with them.
+        # a tenth, and blocks of few images need none; its distributions take a fifth, and only tests compare with them;
+        # plotly takes half a second, and only reports need it.
         worth_it = {
             "from matplotlib.figure import Figure", "from matplotlib.text import Text", "from matplotlib import pyplot",
             "from matplotlib.backends.backend_pdf import PdfPages", "from scipy.sparse import csr_matrix",
-            "from scipy import special",
+            "from scipy import special", "from plotly.graph_objects import Figure",
+            "from plotly.offline import get_plotlyjs",
         }  # fmt: skip
         assert set(hidden) <= worth_it | {
             "from scipy.sparse.csgraph import reverse_cuthill_mckee",
@@ -88,7 +90,7 @@ def test_no_import_hides_in_a_function():
 
 
 def test_importing_brings_neither_tables_nor_pictures():
-    late = {"pandas", "matplotlib", "rich", "typer", "jinja2", "scipy"}
+    late = {"pandas", "matplotlib", "plotly", "rich", "typer", "jinja2", "scipy"}
     program = "import sys, jaxphoto; print(*{name.split('.')[0] for name in sys.modules})"
     done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
     assert not late & set(done.stdout.split())

@@ -14,19 +14,18 @@ from jinja2 import Environment
 from jaxphoto.experiment.comparison import MEAN_DIFFERENCE
 from jaxphoto.experiment.runner import Run
 from jaxphoto.experiment.wording import heading, own_decimals, power_of, printed_decimals, table_title
-from jaxphoto.report import STYLE, check_points_figure, layout_figure
+from jaxphoto.report import check_points_figure, layout_figure, page_head
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_PAGE = """<!DOCTYPE html>
-<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{{ title }}</title><style>{{ style }}
+_STYLE = """\
 body { max-width: 86rem } td, th { white-space: nowrap } th { font-weight: 600 } .tables td, .tables th { line-height: 1.3; padding: .2rem .4rem }
 .no { background: var(--red) } .yes { background: var(--green) } .chip { padding: 0 .5em; border-radius: 3px }
 .ours { font-weight: 600 } .spread, .paper { color: var(--grey) } .spread { font-size: 90% }
 ol.notes { margin: 0 0 1.5rem; font-size: 13px; color: var(--grey) } sup { color: var(--grey); font-size: 75% }
-</style></head><body>
+"""
+_PAGE = """{{ head }}<body>
 <h1>{{ title }}</h1>
 <p>{% if judged %}<b>{{ good }} of {{ judged }}</b> printed values for which a tolerance is promised are within it.
 {% else %}Nothing is promised here: no printed value has a tolerance.{% endif %}</p>
@@ -59,9 +58,7 @@ Small numbers at cells and headings refer to the notes below the table.</p>
 """
 
 
-_INDEX = """<!DOCTYPE html>
-<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
-<title>Experiments</title><style>{{ style }}</style></head><body>
+_INDEX = """{{ head("Experiments") }}<body>
 <h1>Experiments</h1>
 <table><tr><th>experiment</th><th>within</th><th>of the values promised</th></tr>
 {% for row in rows %}<tr><td><a href="{{ row.name }}.html">{{ row.title }}</a></td><td>{{ row.good }}</td><td>{{ row.judged }}</td></tr>
@@ -80,7 +77,7 @@ def index_page(experiments: Mapping[str, tuple[str, pd.DataFrame]]) -> str:
         }
         for name, (title, t) in experiments.items()
     ]
-    return Environment(autoescape=True).from_string(_INDEX).render(style=STYLE, rows=rows)
+    return Environment(autoescape=True).from_string(_INDEX).render(head=page_head, rows=rows)
 
 
 def experiment_page(run: Run, comparison: pd.DataFrame) -> str:
@@ -92,7 +89,7 @@ def experiment_page(run: Run, comparison: pd.DataFrame) -> str:
         .from_string(_PAGE)
         .render(
             title=run.experiment.title,
-            style=STYLE,
+            head=page_head(run.experiment.title, _STYLE),
             judged=sum(table["judged"] for table in tables),
             good=sum(table["good"] for table in tables),
             layouts=run.cells["layout"].nunique(),

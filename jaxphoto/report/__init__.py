@@ -1,5 +1,6 @@
 """Tables, plots, the HTML report and the result folder of an adjustment."""
 
+from jaxphoto.report.block_in_space import block_in_space
 from jaxphoto.report.block_plot import layout_figure, plot_block
 from jaxphoto.report.boresight import print_boresight, write_boresight
 from jaxphoto.report.figures import (
@@ -14,6 +15,7 @@ from jaxphoto.report.figures import (
 )
 from jaxphoto.report.findings import Finding, Level, Verdict
 from jaxphoto.report.page import report_page
+from jaxphoto.report.page_head import page_head
 from jaxphoto.report.plots import (
     check_points_figure,
     correlation_figure,
@@ -25,7 +27,6 @@ from jaxphoto.report.plots import (
 from jaxphoto.report.recovery import recovery_spread, recovery_table
 from jaxphoto.report.results import summary_of, write_results, write_tables
 from jaxphoto.report.snooped import left_out_table, snooped_findings
-from jaxphoto.report.style import STYLE
 from jaxphoto.report.table_files import TABLE_FORMATS, check_table_format, to_latex, to_markdown, write_table
 from jaxphoto.report.tables import Tables
 from jaxphoto.report.terminal import print_adjustment, print_warning
@@ -33,12 +34,12 @@ from jaxphoto.report.verdict import verdict_of
 from jaxphoto.report.weights import component_findings, component_tables, print_components
 
 __all__ = [
-    "STYLE",
     "TABLE_FORMATS",
     "Finding",
     "Level",
     "Tables",
     "Verdict",
+    "block_in_space",
     "check_points_figure",
     "check_table_format",
     "component_findings",
@@ -48,6 +49,7 @@ __all__ = [
     "left_out_table",
     "mean_residuals_figure",
     "new_figure",
+    "page_head",
     "plot_block",
     "plot_check_points",
     "plot_density",

@@ -10,15 +10,13 @@ from rich.console import Console
 from rich.text import Text
 
 from jaxphoto.procedures import Step
+from jaxphoto.report.page_head import page_head
 from jaxphoto.report.results import versions, write_results, write_summary
-from jaxphoto.report.style import STYLE
 from jaxphoto.report.tables import Tables
 from jaxphoto.report.verdict import verdict_of
 from jaxphoto.writing import whole_folder
 
-_PAGE = """<!DOCTYPE html>
-<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{{ title }}</title><style>{{ style }}</style></head><body>
+_PAGE = """{{ head(title) }}<body>
 <h1>{{ title }}</h1>
 <p class="{{ 'good' if good else 'bad' }}"><b>{{ verdict }}</b></p>
 {% for step in steps %}
@@ -68,7 +66,7 @@ def boresight_page(steps: tuple[Step, ...]) -> str:
         Environment(autoescape=True)
         .from_string(_PAGE)
         .render(
-            style=STYLE,
+            head=page_head,
             title=f"{steps[0].adjusted.block.title or 'block'}: boresight",
             verdict=boresight_verdict(steps),
             good=all(step.go_on for step in steps),

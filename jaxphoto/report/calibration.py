@@ -16,17 +16,15 @@ from rich.console import Console
 from jaxphoto.camera import Sensor
 from jaxphoto.procedures.calibration import Calibration, Detection, rms_px
 from jaxphoto.report.findings import Finding, Level, Verdict
+from jaxphoto.report.page_head import page_head
 from jaxphoto.report.plots import drawn, new_figure
 from jaxphoto.report.results import write_results, write_summary
-from jaxphoto.report.style import STYLE
 from jaxphoto.report.tables import Tables
 from jaxphoto.report.verdict import verdict_of
 from jaxphoto.writing import whole_folder
 
 PICTURES = "photographs"
-_PAGE = """<!DOCTYPE html>
-<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{{ title }}</title><style>{{ style }}</style></head><body>
+_PAGE = """{{ head(title) }}<body>
 <h1>{{ title }}: photographs</h1>
 {{ table }}
 {% for name in pictures %}<h2>{{ name }}</h2>
@@ -171,7 +169,7 @@ def write_calibration(
         (work / "photographs.html").write_text(
             page.render(
                 title=calibration.adjusted.block.title,
-                style=STYLE,
+                head=page_head,
                 table=Markup(table),
                 pictures=shown,
             ),

@@ -13,16 +13,14 @@ from rich.table import Table
 
 from jaxphoto.camera import Sensor
 from jaxphoto.report.maps import format_maps, png_of
+from jaxphoto.report.page_head import page_head
 from jaxphoto.report.results import versions, write_summary
 from jaxphoto.report.stability import Compared, missing_covariances
-from jaxphoto.report.style import STYLE
 from jaxphoto.stability import LEVEL, Change
 from jaxphoto.stability.analysis import SIGNIFICANT_P
 from jaxphoto.writing import whole_folder
 
-_PAGE = """<!DOCTYPE html>
-<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
-<title>Change of a camera</title><style>{{ style }}</style></head><body>
+_PAGE = """{{ head("Change of a camera") }}<body>
 <h1>Change of a camera</h1>
 {% for line in about %}<p>{{ line }}</p>{% endfor %}
 {% for sentence in verdict %}<p><b>{{ sentence }}</b></p>{% endfor %}
@@ -124,7 +122,7 @@ def write_change(found: Change, sets: tuple[Compared, Compared], sensor: Sensor,
         (work / "change.png").write_bytes(content)
         html = Environment(autoescape=True).from_string(_PAGE)
         page = html.render(
-            style=STYLE,
+            head=page_head,
             about=[str(sets[0]), str(sets[1]), missing_covariances(sets)],
             verdict=verdict,
             picture=picture,

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
+from jaxphoto.report.tables import Tables
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
@@ -32,7 +34,7 @@ class Rows(NamedTuple):
 class DocumentPicture(NamedTuple):
     """One panel."""
 
-    draw: Callable[[Axes], None]
+    draw: Callable[[Axes], object]
     alt: str
     """What it shows, for those who do not see it."""
     height: float = 3.0
@@ -45,7 +47,13 @@ class Pictures(NamedTuple):
     panels: tuple[DocumentPicture, ...]
 
 
-Element = Heading | Paragraph | Rows | Pictures
+class BlockInSpace(NamedTuple):
+    """An adjusted block that turns on a screen, once a document; on paper its plan."""
+
+    tables: Tables
+
+
+Element = Heading | Paragraph | Rows | Pictures | BlockInSpace
 
 
 class Document(NamedTuple):

@@ -7,16 +7,17 @@ import re
 from jinja2 import Environment
 from markupsafe import Markup
 
-from jaxphoto.report.document import Document, DocumentPicture, Heading, Paragraph, Pictures, Rows
+from jaxphoto.report.block_plot import block_words, layout_figure
+from jaxphoto.report.document import BlockInSpace, Document, DocumentPicture, Element, Heading, Paragraph, Rows
+from jaxphoto.report.interactive import live_block
+from jaxphoto.report.maps import png_of
+from jaxphoto.report.page_head import page_head
 from jaxphoto.report.plots import new_figure
-from jaxphoto.report.style import STYLE
 
 WIDTH_INCHES = 4.8
 # Pictures are drawn finer than screens show them: for print, and for screens of many pixels.
 _DPI = 200
-_PAGE = """<!DOCTYPE html>
-<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{{ title }}</title><style>{{ style }}</style></head><body>
+_PAGE = """{{ head(title) }}<body>
 <h1>{{ title }}</h1>
 {% for e in elements %}{{ e }}
 {% endfor %}<p><small>{{ foot }}</small></p>
@@ -28,8 +29,11 @@ _ONE = r"([-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?(\([\d.]+\))?|-)"
 _UNIT = r"( ?[^\W\d_]{1,7}| ?%)"
 _NUMBER = re.compile(rf"{_ONE}{_UNIT}?(( (\+-|/|x|to|=) |, ?|/){_ONE}{_UNIT}?)*( or more)?")
 _LONGEST = 40
+# Rows of a table that scrolls in a box of its own.
+_LONG = 30
 _ROWS = _HTML.from_string(
-    '<div class="wide"><table{% if not head %} class="names"{% endif %}>{% if head %}<thead><tr>{% for c in columns %}'
+    '<div class="wide{% if rows|length > long %} long" tabindex="0{% endif %}"><table{% if not head %} class="names"'
+    "{% endif %}>{% if head %}<thead><tr>{% for c in columns %}"
     "<th{{ kinds[loop.index0] }}>{{ c }}</th>{% endfor %}</tr></thead>{% endif %}<tbody>{% for row in rows %}<tr>"
     "{% for cell in row %}{% if loop.first and not head %}<th>{{ cell }}</th>{% else %}"
     "<td{{ kinds[loop.index0] }}>{{ cell }}</td>{% endif %}{% endfor %}</tr>"
@@ -40,10 +44,10 @@ _ROWS = _HTML.from_string(
 def html_page(document: Document) -> str:
     """The document with its pictures inside."""
     elements = [html_of(element) for element in document.elements]
-    return _HTML.from_string(_PAGE).render(title=document.title, style=STYLE, elements=elements, foot=document.foot)
+    return _HTML.from_string(_PAGE).render(title=document.title, head=page_head, elements=elements, foot=document.foot)
 
 
-def html_of(element: Heading | Paragraph | Rows | Pictures) -> Markup:
+def html_of(element: Element) -> Markup:
     """One element."""
     if isinstance(element, Heading):
         return Markup('<h2 id="{}">{}</h2>').format(anchor(element.text), element.text)
@@ -54,7 +58,11 @@ def html_of(element: Heading | Paragraph | Rows | Pictures) -> Markup:
         of = ("number", "text")
         kinds = [Markup(' class="{}"').format(of[_is_text(c)]) if head else "" for c in zip(*element.rows, strict=True)]
         kinds += [""] * (len(element.columns) - len(kinds))
-        return Markup(_ROWS.render(columns=element.columns, rows=element.rows, head=head, kinds=kinds))
+        return Markup(_ROWS.render(columns=element.columns, rows=element.rows, head=head, kinds=kinds, long=_LONG))
+    if isinstance(element, BlockInSpace):
+        tables = element.tables
+        still, alt = png_of(layout_figure(tables))[1], block_words(tables.adjusted.block)
+        return live_block(tables.adjusted, tables.covariance, still, alt)
     return Markup('<div class="pictures">{}</div>').format(Markup("").join(map(_image, element.panels)))
 
 

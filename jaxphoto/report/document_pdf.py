@@ -5,11 +5,22 @@ from __future__ import annotations
 import io
 import warnings
 from collections.abc import Callable, Iterator
+from functools import partial
 from textwrap import wrap
 from typing import TYPE_CHECKING, NamedTuple
 
 from jaxphoto.errors import printable
-from jaxphoto.report.document import Document, Element, Heading, Paragraph, Pictures, Rows
+from jaxphoto.report.block_plot import block_words, plot_block
+from jaxphoto.report.document import (
+    BlockInSpace,
+    Document,
+    DocumentPicture,
+    Element,
+    Heading,
+    Paragraph,
+    Pictures,
+    Rows,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -85,6 +96,10 @@ def _boxes(element: Element) -> Iterator[_Box]:
         yield _Box(0.05, lambda page, top: None)
     elif isinstance(element, Rows):
         yield from _table(element)
+    elif isinstance(element, BlockInSpace):
+        adjusted = element.tables.adjusted
+        plan = DocumentPicture(partial(plot_block, adjusted), block_words(adjusted.block), 4.2)
+        yield from _pictures(Pictures((plan,)))
     else:
         yield from _pictures(element)
 

@@ -15,16 +15,14 @@ from rich.console import Console
 from jaxphoto.errors import camera_words
 from jaxphoto.procedures.halves import Halves
 from jaxphoto.report.maps import format_maps, png_of
+from jaxphoto.report.page_head import page_head
 from jaxphoto.report.results import versions, write_summary
-from jaxphoto.report.style import STYLE
 from jaxphoto.writing import whole_folder
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_PAGE = """<!DOCTYPE html>
-<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{{ title }}</title><style>{{ style }}</style></head><body>
+_PAGE = """{{ head(title) }}<body>
 <h1>{{ title }}</h1>
 {% for sentence in verdict %}<p>{{ sentence }}</p>{% endfor %}
 <img alt="maps over the format" src="{{ picture }}">
@@ -136,7 +134,7 @@ def write_halves(found: Halves, directory: Path, write_camera: Callable[[Path], 
         (work / "halves.png").write_bytes(content)
         page = Environment(autoescape=True).from_string(_PAGE)
         html = page.render(
-            style=STYLE,
+            head=page_head,
             title=title,
             verdict=verdict,
             picture=picture,

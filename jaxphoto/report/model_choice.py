@@ -15,17 +15,15 @@ from rich.console import Console
 from rich.table import Table
 
 from jaxphoto.procedures.model_choice import ModelChoice
+from jaxphoto.report.page_head import page_head
 from jaxphoto.report.plots import new_figure
 from jaxphoto.report.results import versions, write_summary
-from jaxphoto.report.style import STYLE
 from jaxphoto.writing import whole_folder
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_PAGE = """<!DOCTYPE html>
-<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{{ title }}</title><style>{{ style }}</style></head><body>
+_PAGE = """{{ head(title) }}<body>
 <h1>{{ title }}</h1>
 {% for sentence in verdict %}<p><b>{{ sentence }}</b></p>{% endfor %}
 <h2>Models</h2>{{ models }}
@@ -152,7 +150,7 @@ def write_model_choice(choice: ModelChoice, title: str, directory: Path, seconds
         choice_figure(choice).savefig(work / "models.png")
         page = Environment(autoescape=True).from_string(_PAGE)
         html = page.render(
-            style=STYLE,
+            head=page_head,
             title=f"{title or 'block'}: models",
             verdict=verdict,
             models=_html(_shown(table)),

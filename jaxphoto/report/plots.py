@@ -74,7 +74,7 @@ _ARROWS, _LARGEST = 4000, 100
 
 def residuals_figure(tables: Tables, camera: str) -> Figure:
     """Residual vectors of one camera's image points over its format, all images together; of many, a part."""
-    figure, ((axes,),) = panels(6.4, 5.0)
+    figure, ((axes,),) = panels(6.4, 5.1, bottom=0.6)
     draw_residuals(axes, tables, camera)
     return figure
 
@@ -96,7 +96,7 @@ _CELLS, _FEW = 12, 5
 
 def mean_residuals_figure(tables: Tables, camera: str) -> Figure:
     """Means of one camera's residuals by cell of its format: what all its images have in common."""
-    figure, ((axes,),) = panels(6.4, 5.0)
+    figure, ((axes,),) = panels(6.4, 5.1, bottom=0.6)
     draw_mean_residuals(axes, tables, camera)
     return figure
 

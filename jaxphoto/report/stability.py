@@ -15,18 +15,16 @@ from rich.table import Table
 
 from jaxphoto.camera import InteriorOrientation, Sensor
 from jaxphoto.report.maps import png_of
+from jaxphoto.report.page_head import page_head
 from jaxphoto.report.plots import new_figure
 from jaxphoto.report.results import versions, write_summary
-from jaxphoto.report.style import STYLE
 from jaxphoto.stability import Analysis, Method
 from jaxphoto.writing import whole_folder
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_PAGE = """<!DOCTYPE html>
-<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
-<title>Stability</title><style>{{ style }}</style></head><body>
+_PAGE = """{{ head("Stability") }}<body>
 <h1>Stability of interior orientation</h1>
 <p class="{{ 'good' if similar else 'bad' }}"><b>{{ verdict }}</b></p>
 {% for line in about %}<p>{{ line }}</p>{% endfor %}
@@ -165,7 +163,7 @@ def write_stability(
             Environment(autoescape=True)
             .from_string(_PAGE)
             .render(
-                style=STYLE,
+                head=page_head,
                 similar=chosen.similar(noise_mm),
                 verdict=verdict,
                 about=[str(sets[0]), str(sets[1]), missing_covariances(sets)],

@@ -43,7 +43,7 @@ def _texts(table: pd.DataFrame, name: str) -> list[str]:
         # Paths, as of mounts[default].boresight_x_deg, stay what they are.
         return [head_of(v) if "[" not in v and _UNIT.search(v) else v for v in column.astype(str)]
     if not pd.api.types.is_float_dtype(column):
-        return ["" if pd.isna(v) else {True: "yes", False: "no"}.get(v, str(v)) for v in column.astype(object)]
+        return ["" if pd.isna(v) else _word(v) for v in column.astype(object)]
     if name.startswith("sigma"):
         return ["" if np.isnan(v) else of_sigma(v) for v in column]
     of = f"sigma_{name}" if f"sigma_{name}" in table else "sigma" if name in _BY_SIGMA and "sigma" in table else None
@@ -53,6 +53,11 @@ def _texts(table: pd.DataFrame, name: str) -> list[str]:
         "" if np.isnan(v) else with_sigma(v, s) if s > 0 else f"{v:.{digits}g}"
         for v, s in zip(column, sigmas, strict=True)
     ]
+
+
+def _word(value: object) -> str:
+    # Not by a dictionary: the number 1 is equal to True.
+    return {"True": "yes", "False": "no"}[str(value)] if isinstance(value, bool | np.bool_) else str(value)
 
 
 def head_of(name: str) -> str:

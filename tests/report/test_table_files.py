@@ -10,7 +10,7 @@ from jaxphoto import InputError, Tables
 from jaxphoto.io import read_result_tables
 from jaxphoto.report import to_latex, to_markdown, write_tables
 from jaxphoto.report.digits import of_sigma, with_sigma
-from jaxphoto.report.table_files import head_of
+from jaxphoto.report.table_files import head_of, readable
 from tests.blocks import adjusted
 from tests.commands import run
 
@@ -30,6 +30,11 @@ FEW = ["interior", "exterior", "check_points"]
 )
 def test_a_number_ends_at_the_second_digit_of_its_sigma(value, sigma, text, sigma_text):
     assert (with_sigma(value, sigma), of_sigma(sigma)) == (text, sigma_text)
+
+
+def test_yes_and_no_are_no_numbers():
+    shown = readable(pd.DataFrame({"freedom": [1, 0, 34], "significant": [True, False, None]}))
+    assert shown["freedom"].tolist() == ["1", "0", "34"] and shown["significant"].tolist() == ["yes", "no", ""]
 
 
 def test_heads_have_units_in_brackets():

@@ -6,7 +6,7 @@ import numpy as np
 from jinja2 import Environment
 
 from jaxphoto.report.alike import with_alike
-from jaxphoto.report.document import Element, Heading, Paragraph, Rows
+from jaxphoto.report.document import BlockInSpace, Element, Heading, Paragraph, Rows
 from jaxphoto.report.document_html import contents, html_of
 from jaxphoto.report.findings import Verdict, as_sentence
 from jaxphoto.report.flight.camera import camera_section, interior_rows
@@ -23,12 +23,10 @@ from jaxphoto.report.flight.source import FlightSource
 from jaxphoto.report.flight.surveyed import surveyed_elements, surveyed_section
 from jaxphoto.report.flight.time_line import time_section
 from jaxphoto.report.orientation import orientation_sentences
+from jaxphoto.report.page_head import page_head
 from jaxphoto.report.positional_accuracy import class_sentences
-from jaxphoto.report.style import STYLE
 
-_PAGE = """<!DOCTYPE html>
-<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{{ title }}</title><style>{{ style }}</style></head><body>
+_PAGE = """{{ head(title) }}<body>
 <h1>{{ title }}</h1>
 <p class="verdict {{ verdict.colour }}"><b>{{ verdict.headline }}</b></p>
 {% for f in verdict.findings %}<p class="{{ f.level.name.lower() }}">{{ f.text }}</p>{% endfor %}
@@ -61,7 +59,7 @@ def flight_page(
         Environment(autoescape=True)
         .from_string(_PAGE)
         .render(
-            style=STYLE,
+            head=page_head,
             title=f"Flight report: {reports[0].part.adjusted.block.title}",
             verdict=verdict,
             contents=contents([*headings, "Files"]),
@@ -77,6 +75,8 @@ def _elements(
     first, *others = reports
     yield from summary_section(reports, sum(len(r.images) for r in reports) + len(left_out) + len(spoilt))
     yield from lost_section(left_out, spoilt)
+    yield Heading("Block")
+    yield BlockInSpace(first.tables)
     yield from coverage_section(first)
     yield from positions_section(first, source.taken)
     yield from (Paragraph(as_sentence(s)) for s in source.positions_from)
