@@ -9,7 +9,7 @@ from jaxphoto.errors import camera_words
 from jaxphoto.report.digits import of_sigma, with_sigma
 from jaxphoto.report.findings import Finding, Level, p_words
 from jaxphoto.report.tables import Tables
-from jaxphoto.statistics import POWER, SIGNIFICANCE_LEVEL, CameraDrift, StripDifferences, ZeroTest
+from jaxphoto.statistics import POWER, SIGNIFICANCE_LEVEL, CameraDrift, StripDifferences, ZeroTest, strip_differences
 
 _NAMES = {"c": "c", "xp": "x_p", "yp": "y_p", "k1": "K1"}
 # Of an hour: a shorter flight is told in minutes.
@@ -21,8 +21,8 @@ def drift_findings(tables: Tables) -> Iterator[Finding]:
     """Of every camera whose rates were estimated, and of those of strips: what changed, or would have been seen."""
     for drift in tables.tested_drifts:
         yield Finding(Level.INFORMATION, drift_words(drift))
-    if tables.tested_strips is not None:
-        yield Finding(Level.INFORMATION, strip_words(tables.tested_strips))
+    if (strips := strip_differences(tables.adjusted, tables.covariance)) is not None:
+        yield Finding(Level.INFORMATION, strip_words(strips))
 
 
 def drift_words(drift: CameraDrift) -> str:

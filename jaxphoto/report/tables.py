@@ -10,10 +10,11 @@ import pandas as pd
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.adjustment.model.numbers import Residuals
-from jaxphoto.camera import CameraRates, constant_names, get_parameter, parameter_names
+from jaxphoto.camera import constant_names, get_parameter, parameter_names
 from jaxphoto.compiling import call_compiled
 from jaxphoto.observations import AXES
-from jaxphoto.parameters import unit_of
+from jaxphoto.report.camera_drift_table import camera_drift_table
+from jaxphoto.report.correlation_tables import correlation_ground_table, correlation_summary_table
 from jaxphoto.report.positional_accuracy import accuracy_table
 from jaxphoto.report.recovery import recovery_table
 from jaxphoto.report.sigma_map_table import sigma_map_table
@@ -28,7 +29,6 @@ from jaxphoto.statistics import (
     Redundancy,
     Rotations,
     Significance,
-    StripDifferences,
     Trend,
     UndetectedEffects,
     a_priori_sigmas,
@@ -47,11 +47,9 @@ from jaxphoto.statistics import (
     redundancy_numbers,
     residual_spread,
     significance,
-    strip_differences,
     trends,
     undetected_effects,
 )
-from jaxphoto.statistics.ground import FORMS
 from jaxphoto.statistics.sigma_map import SigmaMap, sigma_maps
 
 
@@ -178,27 +176,12 @@ class Tables:
         return camera_drifts(self.adjusted, self.covariance)
 
     @cached_property
-    def tested_strips(self) -> StripDifferences | None:
-        """Whether cameras were others in some strips than in others, where those of strips were estimated."""
-        return strip_differences(self.adjusted, self.covariance)
-
-    @cached_property
     def camera_drift(self) -> pd.DataFrame:
-        """camera, parameter, hours, change, sigma, p_value, detectable, unit: what changed from first to last exposure.
+        """camera, parameter, hours, change, sigma, p_value, detectable, unit: from first to last exposure.
 
-        `p_value` is that of no change at all of this parameter, `detectable` what the test of all rates of the camera
-        finds with a probability of 80 % where this parameter alone changes.
+        `p_value` and `detectable` (found with a probability of 80 %) are of a change of this parameter alone.
         """
-        columns = ["camera", "parameter", "hours", "change", "sigma", "p_value", "detectable", "unit"]
-        units = {
-            name: unit_of(CameraRates.names[f"{name}_rate"][0]) for d in self.tested_drifts for name in d.parameters
-        }
-        rows = [
-            (d.camera, name, d.hours, *numbers, units[name].removesuffix("per_h").removesuffix("_"))
-            for d in self.tested_drifts
-            for name, *numbers in zip(d.parameters, *d.change[:4], strict=True)
-        ]
-        return pd.DataFrame(rows, columns=columns)
+        return camera_drift_table(self.tested_drifts)
 
     @cached_property
     def exterior(self) -> pd.DataFrame:
@@ -322,16 +305,7 @@ class Tables:
     @cached_property
     def correlation_summary(self) -> pd.DataFrame:
         """camera, exterior, interior, mean_abs_rho, max_abs_rho over the camera's images (paper 000, Table 4)."""
-        rows = []
-        for camera, c in self.correlations.items():
-            if c.images and c.parameters:
-                mean, largest = c.mean_abs, c.max_abs
-                rows += [
-                    (camera, name, parameter, mean[i, j], largest[i, j])
-                    for i, name in enumerate(c.eop_names)
-                    for j, parameter in enumerate(c.parameters)
-                ]
-        return pd.DataFrame(rows, columns=["camera", "exterior", "interior", "mean_abs_rho", "max_abs_rho"])
+        return correlation_summary_table(self.correlations)
 
     @cached_property
     def ground_correlations(self) -> dict[str, GroundCorrelations]:
@@ -342,12 +316,7 @@ class Tables:
     def correlation_ground(self) -> pd.DataFrame:
         """camera, ground (height, flying_height, dome), sigma_m, parameter, rho; of the parameter `all` the multiple
         correlation with all of the camera. Empty where photographs do not look down."""
-        rows = []
-        for camera, g in self.ground_correlations.items():
-            for k, form in enumerate(FORMS):
-                own = zip((*g.parameters, "all"), (*g.rho[k], g.together[k]), strict=True)
-                rows += [(camera, form, g.sigma_m[k], parameter, rho) for parameter, rho in own]
-        return pd.DataFrame(rows, columns=["camera", "ground", "sigma_m", "parameter", "rho"])
+        return correlation_ground_table(self.ground_correlations)
 
     @cached_property
     def sigma_maps(self) -> dict[str, tuple[SigmaMap, SigmaMap]]:
