@@ -42,6 +42,8 @@ def test_the_optimum_is_that_of_least_squares_with_its_weights(block):
     np.testing.assert_allclose(again.unknowns.points, found.unknowns.points, atol=1e-5)
 
 
+# Least squares of a block with blunders may find its optimum from elsewhere, and say so; by the last bits of a machine.
+@pytest.mark.filterwarnings("ignore:the approximate exterior orientations")
 def test_student_s_estimate_hardly_moves_with_the_blunders(block):
     clean, found = adjust(simulated("cross").block), robust(block, {"image_points": StudentT()})
     assert list(found.losses) == ["image_points"]
@@ -51,6 +53,8 @@ def test_student_s_estimate_hardly_moves_with_the_blunders(block):
     assert abs(float(other - one)) < 0.2 * abs(float(spoilt - one))
 
 
+# Least squares of a block with blunders may find its optimum from elsewhere, and say so; by the last bits of a machine.
+@pytest.mark.filterwarnings("ignore:the approximate exterior orientations")
 def test_derivatives_go_through_the_robust_optimum(block):
     start, p = adjust(block).unknowns, block.image_points
     losses = {p.group: Huber(scale=1.3)}
