@@ -99,9 +99,10 @@ def poorer_survey(
     now, given_up = np.array(guess_m), bool((sigma_m[assumed] > max(guess_m)).any())
     factor = np.ones(3)
     for axes in ([0, 1], [2]):
+        if assumed[:, axes].any():
+            now[axes] = np.median(sigma_m[:, axes][assumed[:, axes]])
         told = assumed[:, axes] & np.isfinite(w[:, axes])
         if told.any(axis=1).sum() >= _POINTS:
-            now[axes] = np.median(sigma_m[:, axes][told])
             factor[axes] = np.median(w[:, axes][told]) / _MEDIAN
     if given_up:
         return None if np.abs(np.log(factor)).max() < _STILL else np.maximum(factor * now, guess_m)
