@@ -62,8 +62,13 @@ def cells_of(
     xyz: Float[np.ndarray, "n 3"], origin: Float[np.ndarray, "2"], settings: StripSettings
 ) -> Int[np.ndarray, "n"]:
     """The cell of each return, of a grid that begins at `origin` (m)."""
-    row, column = np.floor((xyz[:, :2] - origin) / settings.cell_m).astype(np.int64).T
-    return (row << 32) + column
+    column, up = np.floor((xyz[:, :2] - origin) / settings.cell_m).astype(np.int64).T
+    return (column << 32) + up
+
+
+def columns_and_rows(cell: Int[np.ndarray, "n"]) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]]:
+    """Of cells of `cells_of`, how many lie between each and the origin in X and in Y, where none lies before it."""
+    return cell >> 32, cell & 0xFFFFFFFF
 
 
 def planes_of(

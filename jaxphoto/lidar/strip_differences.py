@@ -10,7 +10,7 @@ from itertools import combinations
 import numpy as np
 
 from jaxphoto.cloud import Cloud
-from jaxphoto.lidar.corresponding_planes import cells_of, corresponding, planes_of
+from jaxphoto.lidar.corresponding_planes import cells_of, columns_and_rows, corresponding, planes_of
 from jaxphoto.lidar.raster import Raster
 from jaxphoto.lidar.strip_settings import StripSettings
 
@@ -27,7 +27,7 @@ def strip_differences(cloud: Cloud, settings: StripSettings) -> Raster | None:
     gaps = np.full((rows, columns), np.nan)
     for one, other in combinations(range(len(patches)), 2):
         pairs = corresponding(patches[one], patches[other], settings)
-        column, up = pairs.cell >> 32, pairs.cell & 0xFFFFFFFF
+        column, up = columns_and_rows(pairs.cell)
         # Along the normal, of the earlier over the later.
         height = -pairs.gap / pairs.normal[:, 2]
         row = rows - 1 - up

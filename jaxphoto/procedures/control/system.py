@@ -18,7 +18,7 @@ from pyproj.enums import PJType
 from pyproj.exceptions import CRSError, ProjError
 
 from jaxphoto.errors import InputError, quoted
-from jaxphoto.georeferencing.map_frame import MapFrame, map_system
+from jaxphoto.georeferencing.map_frame import MapFrame, map_name, map_system
 from jaxphoto.procedures.control.surveyed import SurveyedPoints
 
 LOCAL = "local"
@@ -50,7 +50,7 @@ class ControlSystem(NamedTuple):
         """As sentences name it."""
         if self.crs is None:
             return "a local system"
-        code = f"EPSG:{self.code}" + (f"+{self.vertical}" if self.vertical else "") if self.code else ""
+        code = map_name(self.code, self.vertical) if self.code else ""
         return f"{code} ({self.crs.name})" if code else str(self.crs.name)
 
 
