@@ -7,6 +7,7 @@ were exchanged; the points are the same.
 """
 
 import dataclasses
+from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 import equinox as eqx
@@ -96,10 +97,26 @@ def exchanged(block: Block, left: Masks, exchange: NameExchange) -> tuple[Block,
     return block.with_observations({group: rows}), left | {group: out}
 
 
-def with_places(at: Adjustment, exchange: NameExchange) -> Adjustment:
-    """`at` with points that were gone where their rays meet."""
+def points_that_meet(
+    at: Adjustment, left: Masks, gone: Int[np.ndarray, "points"], sigma0: float
+) -> dict[int, Float[np.ndarray, "3"]]:
+    """Of the points that are `gone`, those all of whose rays meet after all, and where (m)."""
+    seen, p = _seen(at, left, gone, sigma0), at.block.image_points
+    rays = {point: np.flatnonzero(p.point == point) for point in gone.tolist()}
+    met = [_met(seen, int(own[0]), int(own[0])) for own in rays.values() if len(own)]
+    return {point: place for point, place, _ in (side for side in met if side is not None)}
+
+
+def put_back(block: Block, left: Masks, points: Iterable[int]) -> Masks:
+    """`left` without the image points of these."""
+    p = block.image_points
+    return left | {p.group: left[p.group] & ~np.isin(p.point, list(points))}
+
+
+def with_places(at: Adjustment, places: Mapping[int, Float[np.ndarray, "3"]]) -> Adjustment:
+    """`at` with points that were gone at these places."""
     points = np.array(still(at.unknowns.points))
-    for point, place in exchange.places.items():
+    for point, place in places.items():
         points[point] = place
     return eqx.tree_at(lambda a: a.unknowns.points, at, points)
 

@@ -23,7 +23,7 @@ from jaxphoto.errors import BlockError, JaxphotoError, RankError
 from jaxphoto.losses import AbstractLoss, Tukey
 from jaxphoto.observations import AbstractObservations
 from jaxphoto.procedures.adjust import start_of
-from jaxphoto.procedures.exchanged_names import exchanged, name_exchanges, with_places
+from jaxphoto.procedures.exchanged_names import exchanged, name_exchanges, points_that_meet, put_back, with_places
 from jaxphoto.procedures.robust import (
     Blocks,
     Masks,
@@ -125,8 +125,9 @@ def _snooped(
     worst = _worst(block, {name: size / scale[name] for name, size in _sizes(at, r).items()}, 1.0)
     left = {name: flown[name] | worst[name] for name in worst}
     tried: list[Masks] = []
-    # Once only: what is exchanged twice is as it was.
+    # Once only: what is exchanged twice is as it was, and what went twice would go again.
     done: list[tuple[int, int]] = []
+    returned: set[int] = set()
     while True:
         report(f"adjusting without {sum(int(m.sum()) for m in left.values())} observations")
         adjusted, point, left = solve_placed(block, left, at.unknowns, max_steps, sizes)
@@ -136,19 +137,29 @@ def _snooped(
         r = checked_parts(at)
         pairs = [e for e in name_exchanges(at, left, lost, sigma0, r) if e.rows not in done]
         for exchange in pairs:
-            (block, left), at = exchanged(block, left, exchange), with_places(at, exchange)
+            (block, left), at = exchanged(block, left, exchange), with_places(at, exchange.places)
             done.append(exchange.rows)
         if pairs:
+            # Another block: what led nowhere in the old one may lead on.
+            tried.clear()
             continue
         found = _tested(adjusted, at, left, point, sigma0, r)
-        if len(tried) == _ROUNDS or any(_same(found, old) for old in (left, *tried)):
+        if _same(found, left):
+            # What went while blunders still turned the images.
+            back = {p: place for p, place in points_that_meet(at, left, lost, sigma0).items() if p not in returned}
+            if not back:
+                break
+            returned |= set(back)
+            left, at = put_back(block, left, back), with_places(at, back)
+            tried.clear()
+            continue
+        if len(tried) == _ROUNDS or any(_same(found, old) for old in tried):
             break
         tried.append(left)
         left = found
-    gone = np.setdiff1d(np.arange(len(block.points)), point)
     told = _told(at, left, _stays(block, point), r, sigma0)
     named = tuple(_named(block, pair) for pair in done)
-    return Snooped(adjusted, told, named, tuple(block.points[p] for p in gone))
+    return Snooped(adjusted, told, named, tuple(block.points[p] for p in lost))
 
 
 def _reweighted(
