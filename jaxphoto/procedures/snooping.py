@@ -7,6 +7,7 @@
    predicted by the others and put back where the prediction agrees; of those that are in, the worst of each point is
    left out where it contradicts the others (Baarda's data snooping). Until nothing changes.
 3. Two image points of one image that each lie where the other should be have changed names, and get them back.
+4. At the end, points that went while blunders still turned the images are put back where their rays meet after all.
 
 Sources: Baarda (1968), A testing procedure for use in geodetic networks; Huber (1981), Robust statistics.
 """
