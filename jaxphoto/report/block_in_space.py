@@ -131,11 +131,10 @@ def _offset_traces(adjusted: Adjustment, places: BlockPlaces, origin: np.ndarray
 
 def _ellipsoid_traces(covariance: Covariance, places: BlockPlaces, origin: np.ndarray) -> list[dict[str, Any]]:
     n, factor2 = covariance.n_images, float(covariance.variance_factor)
-    own = np.asarray(covariance.matrix)[: 6 * n, : 6 * n].reshape(n, 6, n, 6)[np.arange(n), :3, np.arange(n), :3]
     images = np.arange(n)[:: max(1, -(-n // _ELLIPSOIDS))]
     who = np.union1d(places.ties(_ELLIPSOIDS), np.concatenate([places.control, places.check]))
     centre = np.concatenate([places.stations[images], places.points[who]]) - origin
-    matrix = np.concatenate([own[images], np.asarray(covariance.points)[who]]) * factor2
+    matrix = np.concatenate([covariance.positions[images], np.asarray(covariance.points)[who]]) * factor2
     longest = np.sqrt(np.maximum(np.linalg.eigvalsh(matrix)[:, -1], 0.0)) if np.isfinite(matrix).all() else np.zeros(0)
     if not (longest > 0).any():
         return []

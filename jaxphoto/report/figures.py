@@ -13,6 +13,7 @@ from jaxphoto.block import one_camera
 from jaxphoto.camera import parameter_names
 from jaxphoto.errors import InputError
 from jaxphoto.report.certificate_figures import draw_curve
+from jaxphoto.report.error_ellipses import draw_error_ellipses
 from jaxphoto.report.plots import (
     axes_or_new,
     draw_check_points,
@@ -72,6 +73,13 @@ def plot_interior_correlation(tables: Tables, camera: str | None = None, axes: A
 def plot_exterior_correlation(tables: Tables, camera: str | None = None, axes: Axes | None = None) -> Axes:
     """Mean absolute correlation of exterior and interior orientation over the images."""
     return _drawn(draw_exterior_correlation, tables, camera, axes)
+
+
+def plot_error_ellipses(tables: Tables, axes: Axes | None = None) -> Axes:
+    """Standard error ellipses of the projection centres in plan, enlarged; their colours are sigmas in height."""
+    axes = axes_or_new(axes)
+    draw_error_ellipses(axes, tables)
+    return axes
 
 
 def plot_sigma_map(

@@ -13,6 +13,7 @@ from markupsafe import Markup
 from jaxphoto.errors import camera_words
 from jaxphoto.report.document import BlockInSpace, Heading, Paragraph, Rows
 from jaxphoto.report.document_html import contents, html_of
+from jaxphoto.report.error_ellipses import ellipses_figure
 from jaxphoto.report.findings import Verdict
 from jaxphoto.report.maps import png_of
 from jaxphoto.report.page_head import page_head
@@ -104,7 +105,8 @@ def _sections(tables: Tables) -> Iterator[tuple[str, list[Markup]]]:
         picture = _picture(check_points_figure({"": tables}), "discrepancies at check points")
         body = [_html(_check_spread(check)), *accuracy, _html(tables.positional_accuracy), picture, _html(check)]
         yield "Check points: surveyed minus computed", body
-    yield "Exterior orientation", [_html(tables.exterior)]
+    ellipses = _picture(ellipses_figure(tables), "error ellipses of the projection centres in plan")
+    yield "Exterior orientation", [ellipses, _html(tables.exterior)]
     yield "Correlation of exterior and interior orientation over the images", [_html(tables.correlation_summary)]
     if len(tables.correlation_ground):
         yield "Correlation of the interior orientation and the ground as a whole", [_html(tables.correlation_ground)]

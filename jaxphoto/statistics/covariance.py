@@ -48,6 +48,13 @@ class Covariance(eqx.Module):
         return self._sigma(self.matrix.diagonal())[: 6 * self.n_images].reshape(-1, 6)
 
     @property
+    def positions(self) -> Float[np.ndarray, "images 3 3"]:
+        """A priori covariance of each projection centre (m^2)."""
+        n = self.n_images
+        own = np.asarray(self.matrix)[: 6 * n, : 6 * n].reshape(n, 6, n, 6)
+        return own[np.arange(n), :3, np.arange(n), :3]
+
+    @property
     def shared_sigma(self) -> Float[Numbers, "shared"]:
         """A posteriori standard deviations of the shared unknowns, in the order of `labels`' end."""
         return self._sigma(self.matrix.diagonal())[6 * self.n_images :]

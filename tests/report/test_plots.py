@@ -1,10 +1,13 @@
 """Figures draw what the tables hold."""
 
 import numpy as np
+from matplotlib.collections import EllipseCollection
+from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver, QuiverKey
 
 from jaxphoto import Tables
-from jaxphoto.report import check_points_figure, plots
+from jaxphoto.report import check_points_figure, plot_error_ellipses, plots
+from jaxphoto.report.error_ellipses import ellipse_axes
 from tests.blocks import adjusted
 
 
@@ -55,3 +58,27 @@ def test_of_many_residuals_a_part_is_drawn_and_the_largest(monkeypatch):
     size = lambda axes: np.sort(np.hypot(arrows(axes).U, arrows(axes).V))  # noqa: E731
     np.testing.assert_allclose(size(part)[-3:], size(whole)[-3:])
     assert arrows(part).scale == arrows(whole).scale
+
+
+def test_ellipses_are_where_the_quadratic_form_is_one():
+    root = np.random.default_rng(1).normal(size=(40, 2, 2))
+    covariance = root @ root.transpose(0, 2, 1)
+    a, b, turn = ellipse_axes(covariance)
+    assert (a >= b).all()
+    for angle in np.linspace(0, 2 * np.pi, 9):
+        along, across = a * np.cos(angle), b * np.sin(angle)
+        d = np.stack([np.cos(turn) * along - np.sin(turn) * across, np.sin(turn) * along + np.cos(turn) * across], 1)
+        np.testing.assert_allclose(np.einsum("ni,nij,nj->n", d, np.linalg.inv(covariance), d), 1.0, rtol=1e-6)
+
+
+def test_ellipses_are_as_long_as_the_standard_deviations_of_the_table():
+    """Their widest reach along X and Y, and their colour in Z, all by the factor that the title says."""
+    tables = Tables(adjusted("cross"))
+    axes = plot_error_ellipses(tables, Figure().add_subplot())
+    (drawn,) = [child for child in axes.get_children() if isinstance(child, EllipseCollection)]
+    factor = float(axes.get_title(loc="left").split(", ")[1].split()[0])
+    a, b, turn = drawn.get_widths() / 2, drawn.get_heights() / 2, np.radians(drawn.get_angles())
+    reach = np.sqrt((a * [np.cos(turn), np.sin(turn)]) ** 2 + (b * [np.sin(turn), np.cos(turn)]) ** 2) / factor
+    sigma = tables.exterior[["sigma_X_m", "sigma_Y_m", "sigma_Z_m"]].to_numpy().T
+    np.testing.assert_allclose(reach, sigma[:2], rtol=1e-9)
+    np.testing.assert_allclose(drawn.get_array(), sigma[2], rtol=1e-9)

@@ -1,11 +1,13 @@
 """The photographs of a flight one by one, those that are not used, and how sure orientations are."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 import pandas as pd
 
-from jaxphoto.report.document import Element, Heading, Paragraph, Rows
+from jaxphoto.report.document import DocumentPicture, Element, Heading, Paragraph, Pictures, Rows
+from jaxphoto.report.error_ellipses import draw_error_ellipses
 from jaxphoto.report.flight.part import PartReport
 
 # Rows of a table that is still read; of more photographs those with the largest residuals.
@@ -38,6 +40,8 @@ def exterior_section(report: PartReport) -> Iterator[Element]:
                      table["image"].iloc[k]))  # fmt: skip
     yield Rows(("standard deviation of", "unit", "least", "median", "largest", "photograph"), tuple(rows))
     yield Paragraph("A posteriori. All orientations are in result/exterior.csv.")
+    draw = partial(draw_error_ellipses, tables=report.tables, unit=report.unit)
+    yield Pictures((DocumentPicture(draw, "Error ellipses of the projection centres in plan, enlarged", 4.2),))
     further = report.tables.georeferencing
     if len(further):
         cells = ((p["parameter"], f"{p['value']:.6g}", f"{p['sigma']:.2g}") for p in further.to_dict("records"))
