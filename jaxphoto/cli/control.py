@@ -7,6 +7,7 @@ import typer
 
 from jaxphoto.cli.app import app
 from jaxphoto.cli.console import plain_console
+from jaxphoto.cli.exposure_options import map_codes
 from jaxphoto.errors import InputError
 from jaxphoto.image_measurement.control_targets import target_looker
 from jaxphoto.image_measurement.targets.on_ground import SYNTAX, read_target
@@ -39,7 +40,10 @@ def control_command(
     photographs: Annotated[
         list[Path] | None, typer.Option(help="Folder of the photographs of the block, to find targets in.")
     ] = None,
-    epsg: Annotated[int | None, typer.Option(help="Map system of a block that has none (default: theirs).")] = None,
+    epsg: Annotated[
+        str | None,
+        typer.Option(help="Map system of a block that has none: 25832, 25832+7837 with heights (default: theirs)."),
+    ] = None,
 ) -> None:
     """Adjust an oriented block with control: surveyed points and where photographs show them.
 
@@ -49,13 +53,13 @@ def control_command(
     check_folder(out, block, file, *((marks,) if marks else ()))
     if (targets is None) != (not photographs):
         raise InputError("targets are found in photographs: give both --targets and --photographs, or neither")
-    target = read_target(targets) if targets else None
+    target, (code, vertical) = read_target(targets) if targets else None, map_codes(epsg)
     console, errors = plain_console(), plain_console(stderr=True)
     with errors.status("reading") as status:
         control, given = read_control(file, marks), read_block(block)
         status.update("adjusting the block as it is")
         oriented = at_optimum(adjust(given))
-        how: dict[str, Any] = {"system": control_epsg, "code": epsg, "report": status.update}
+        how: dict[str, Any] = {"system": control_epsg, "code": code, "vertical": vertical, "report": status.update}
         if target:
             paths = {p.name: p.path for p in sound_photographs(photographs or [])[0]}
             found = control_block_with_targets(oriented, control, target_looker(target, paths, status.update), **how)

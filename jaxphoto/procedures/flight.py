@@ -140,7 +140,7 @@ def _calibrated(
             why_not = str(error)
     block = placed.block if placed else oriented.block
     if known.control is not None:
-        controlled, no_control = controlled_or_why(block, known.control, known.code, report)
+        controlled, no_control = controlled_or_why(block, known.control, known.code, known.vertical, report)
     try:
         adjusted = controlled.adjusted if controlled else adjust_for_tables(block)
     except (InputError, BlockError, DatumError, RankError) as error:

@@ -1,5 +1,6 @@
 """Heights above a geoid, brought to the ellipsoid by a grid of PROJ: a made one, as no grids are in the package."""
 
+import dataclasses
 import os
 import struct
 
@@ -12,7 +13,9 @@ from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import map_frame
 from jaxphoto.georeferencing.gps import Gps
 from jaxphoto.georeferencing.recorded_positions import one_height
+from jaxphoto.procedures.control.placed import in_frame
 from jaxphoto.procedures.georeference_photographs import georeference_photographs
+from tests.procedures.controlled import CODE, marked_block
 from tests.procedures.test_georeference_photographs import network, recorded
 
 EGM96, GRID = 5773, "us_nga_egm96_15.tif"
@@ -65,6 +68,20 @@ def test_a_block_has_heights_above_the_geoid_in_its_files(geoid):
     lower = plain.block.frame.map.map(np.asarray(position)) - above.block.frame.map.map(np.asarray(position))
     east, north, up = lower.T
     assert np.abs([east, north]).max() < 1e-6 and np.abs(up - 30.4).max() < 0.1
+
+
+def test_a_block_that_control_places_has_the_heights_that_are_asked_for(geoid):
+    """The places are the same as without; a block that has a map system keeps it."""
+    made = marked_block()
+    plain, above = (in_frame(made.block, made.control.points, None, CODE, code) for code in (None, EGM96))
+    assert (above.frame.code, above.frame.vertical) == (CODE, EGM96)
+    np.testing.assert_allclose(above.xyz, plain.xyz, atol=1e-9)
+    lower = plain.frame.map.map(plain.xyz) - above.frame.map.map(plain.xyz)
+    assert np.abs(lower[:, :2]).max() < 1e-6 and np.abs(lower[:, 2] - 30.4).max() < 0.1
+    placed = dataclasses.replace(made.block, frame=plain.frame)
+    assert in_frame(placed, made.control.points, None, None, EGM96).frame.vertical == EGM96
+    with pytest.raises(InputError, match=f"the block is in EPSG:{CODE} already, and EPSG:25832 is given"):
+        in_frame(placed, made.control.points, None, 25832)
 
 
 def test_a_place_that_the_geoid_does_not_reach_is_named(geoid):

@@ -62,18 +62,20 @@ def control_block(
     *,
     system: str | None = None,
     code: int | None = None,
+    vertical: int | None = None,
     elsewhere: Collection[str] = (),
     adjust: Callable[[Block], Adjustment] = adjust_for_tables,
     report: Callable[[str], object] = lambda text: None,
 ) -> ControlledBlock:
     """`block`, whose images and points have a start, adjusted with `control`.
 
-    `system` names that of the points where their file does not, `code` the EPSG code of a block that has none yet.
-    `elsewhere` are photographs that are known but not of this block. Raises InputError for control that cannot be used
-    as it stands: see `in_frame` and `onto_control`; and where no mark is in a photograph of the block.
+    `system` names that of the points where their file does not, `code` the EPSG code of a block that has none yet,
+    `vertical` that of the heights that it has in files. `elsewhere` are photographs that are known but not of this
+    block. Raises InputError for control that cannot be used as it stands: see `in_frame` and `onto_control`; and where
+    no mark is in a photograph of the block.
     """
     points, ids = control.points, control.points.ids
-    frame = in_frame(block, points, system, code)
+    frame = in_frame(block, points, system, code, vertical)
     rows, said = marked(block, points, control.marks, elsewhere)
     if not len(rows.image):
         first = f" ({few(list(dict.fromkeys(control.marks.image)))})" if control.marks.image else ""

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Collection, Iterable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -71,14 +71,15 @@ def flight_control(
 
 
 def controlled_or_why(
-    block: Block, given: FlightControl, code: int | None, report: Report
+    block: Block, given: FlightControl, code: int | None, vertical: int | None, report: Report
 ) -> tuple[ControlledBlock | None, str]:
     """`block` with the control of the flight, or why it has to do without."""
     of: Callable[..., ControlledBlock] = control_block
     if given.looker is not None:
         of = partial(control_block_with_targets, looker=given.looker)
     try:
-        found = of(block, given.control, system=given.system, code=code, elsewhere=given.images, report=report)
+        how: dict[str, Any] = {"system": given.system, "code": code, "vertical": vertical, "elsewhere": given.images}
+        found = of(block, given.control, **how, report=report)
     except JaxphotoError as error:
         return None, str(error)
     return found, ""

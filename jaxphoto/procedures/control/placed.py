@@ -25,17 +25,21 @@ class InFrame(NamedTuple):
     """Whether the block was there before, so that it tells where the points should be."""
 
 
-def in_frame(block: Block, points: SurveyedPoints, words: str | None, code: int | None) -> InFrame:
+def in_frame(
+    block: Block, points: SurveyedPoints, words: str | None, code: int | None, vertical: int | None = None
+) -> InFrame:
     """The points in the frame of `block`, or where it has none in one of theirs.
 
     `words` name their system where the file does not. `code` is the EPSG code that a new frame has; without one it is
-    that of the points, or UTM. Raises InputError for a system that is not told, told twice, or cannot be, and for
-    points that lie far from the block, with what would fit.
+    that of the points, or UTM. `vertical` is that of its heights; without one it is theirs. Raises InputError for a
+    system that is not told, told twice, or cannot be, and for points that lie far from the block, with what would fit.
     """
     at = block.frame.origin
     system = told_system(points, words, lambda: fitting(points, None, *at[:2]) if at is not None else "")
     if block.frame.kind == "epsg":
         assert block.frame.code is not None and block.frame.origin is not None
+        if code is not None and code != block.frame.code:
+            raise InputError(f"the block is in EPSG:{block.frame.code} already, and EPSG:{code} is given; leave it out")
         if system.crs is None:
             raise InputError(
                 f"{points.file} is in a local system and the block in EPSG:{block.frame.code}: give the control there, "
@@ -43,17 +47,21 @@ def in_frame(block: Block, points: SurveyedPoints, words: str | None, code: int 
             )
         check_near(points, system, *block.frame.origin[:2])
         there = places(points, system, block.frame.code)
-        frame, same = block.frame, block.frame.code == system.code and block.frame.vertical is None
-        # Brought onto the points, the block has heights of theirs.
-        frame = dataclasses.replace(frame, vertical=system.vertical) if same else frame
-        return InFrame(frame, block.frame.map.local_from_place(there), True)
+        heights = block.frame.vertical if vertical is None else vertical
+        if heights is None and block.frame.code == system.code:
+            # Brought onto the points, the block has heights of theirs.
+            heights = system.vertical
+        return InFrame(
+            dataclasses.replace(block.frame, vertical=heights), block.frame.map.local_from_place(there), True
+        )
     if system.crs is None:
         return InFrame(dataclasses.replace(block.frame, kind="local"), filled(points), False)
     code = new_code(points, system) if code is None else code
     there = places(points, system, code)
     middle = np.median(there, axis=0)
     origin = (round(float(middle[0]), 4), round(float(middle[1]), 4), 0.0)
-    vertical = system.vertical if code == system.code else None
+    if vertical is None and code == system.code:
+        vertical = system.vertical
     if vertical is not None:
         check_heights(code, vertical)
     return InFrame(

@@ -5,6 +5,7 @@ targets that were found does, which decides between targets that look alike.
 """
 
 from collections.abc import Callable, Collection
+from typing import Any
 
 import numpy as np
 
@@ -28,6 +29,7 @@ def control_block_with_targets(
     *,
     system: str | None = None,
     code: int | None = None,
+    vertical: int | None = None,
     elsewhere: Collection[str] = (),
     adjust: Callable[[Block], Adjustment] = adjust_for_tables,
     report: Callable[[str], object] = lambda text: None,
@@ -41,8 +43,10 @@ def control_block_with_targets(
     sigma = np.where(np.isnan(points.sigma_m), SIGMA_M, points.sigma_m)
     by_hand, _ = marked(block, points, control.marks, elsewhere)
     now: ControlledBlock | None = None
+    how: dict[str, Any] = {"system": system, "code": code, "vertical": vertical, "elsewhere": elsewhere}
+    how |= {"adjust": adjust, "report": report}
     if len(by_hand.image):
-        now = control_block(block, control, system=system, code=code, elsewhere=elsewhere, adjust=adjust, report=report)
+        now = control_block(block, control, **how)
     elif block.frame.kind != "epsg":
         raise InputError(
             f"{points.file}: the block has no place, so nobody knows where its photographs show the points; mark three "
@@ -53,7 +57,7 @@ def control_block_with_targets(
     every = control.marks
     for _ in range(_ROUNDS):
         report("looking for targets")
-        frame = in_frame(adjusted.block, points, system, code)
+        frame = in_frame(adjusted.block, points, system, code, vertical)
         placed = now is not None and "control" in now.state
         own = now.marks if now else None
         found = found_marks(adjusted, ids, frame.xyz, sigma, own, looker, placed)
@@ -65,15 +69,7 @@ def control_block_with_targets(
         if not len(found.marks.image):
             break
         every = Marks.joined(every, found.marks)
-        now = control_block(
-            block,
-            control._replace(marks=every),
-            system=system,
-            code=code,
-            elsewhere=elsewhere,
-            adjust=adjust,
-            report=report,
-        )
+        now = control_block(block, control._replace(marks=every), **how)
         adjusted = now.adjusted
     texts = tuple(text for of in said.values() for text in of)
     if now is None:
