@@ -75,7 +75,8 @@ def main() -> int:
     photographs.mkdir(parents=True)
     write_truth(flight, arguments.folder)
     texture(flight, arguments.folder, arguments.seed)
-    with multiprocessing.Pool() as pool:
+    # Not forked: OpenCV's threads would be held for ever in the child.
+    with multiprocessing.get_context("spawn").Pool() as pool:
         draw = functools.partial(write_photograph, flight, arguments.folder, arguments.seed)
         for done, _ in enumerate(pool.imap_unordered(draw, range(len(flight.names))), 1):
             if done % 25 == 0:

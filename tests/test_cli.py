@@ -57,7 +57,7 @@ COLUMNS = {
         "most_moves",
     ],
     "trends": ["pattern", "freedom", "p_value", "rms", "unit", "term", "share", "amount", "sigma"],
-    "check_points": ["point", "dX_m", "dY_m", "dZ_m"],
+    "check_points": ["point", "dX_m", "dY_m", "dZ_m", "sigma_dX_m", "sigma_dY_m", "sigma_dZ_m"],
     "positional_accuracy": ["component", "check_points", "fit_m", "survey_m", "rmse_m", "class_cm", "claimed"],
     "correlation": ["parameter_a", "parameter_b", "rho"],
     "correlation_summary": ["camera", "exterior", "interior", "mean_abs_rho", "max_abs_rho"],

@@ -12,6 +12,7 @@ import jaxphoto
 from jaxphoto.cli.app import app
 from jaxphoto.cli.choices import one_of
 from jaxphoto.cli.console import plain_console
+from jaxphoto.cli.made import made_by
 from jaxphoto.errors import JaxphotoError
 from jaxphoto.io import read_block, read_truth, write_block
 from jaxphoto.io.conditions import CONDITIONS, read_conditions, write_conditions
@@ -40,6 +41,7 @@ _SPLITS = ", ".join(SPLITS)
 
 @app.command("adjust")
 def adjust_command(
+    context: typer.Context,
     block: Annotated[Path, typer.Argument(help="Block folder (see docs/block_folder.md).")],
     out: Annotated[Path, typer.Option(help="Folder for the results; earlier results in it are replaced.")],
     rotations: Annotated[str, one_of(EOP_NAMES, help="Rotations that the correlations mean.")] = "omega_phi_kappa",
@@ -67,7 +69,7 @@ def adjust_command(
     began = time.perf_counter()
     with errors.status("reading the block") as status:
         read = read_block(block)
-        inputs = block_inputs(block)
+        inputs, made = block_inputs(block), made_by(context, block)
         seconds = {"read": time.perf_counter() - began}
         status.update(
             f"adjusting {len(read.images)} images, {len(read.points)} points, "
@@ -102,7 +104,7 @@ def adjust_command(
             }
             of = "block" if snooped else os.path.relpath(block.resolve(), out.resolve())
             told = {"block": of, "method": {"command": "adjust", **options}}
-            write_results(tables, verdict, work, {name: times[name] for name in order}, told)
+            write_results(tables, verdict, work, {name: times[name] for name in order}, told, made)
             write_inputs(inputs, work)
             if (block / CONDITIONS).is_file():
                 write_conditions(read_conditions(block / CONDITIONS), work, read.images)

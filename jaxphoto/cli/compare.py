@@ -9,6 +9,7 @@ from jaxphoto.cli.app import app
 from jaxphoto.cli.choices import one_of
 from jaxphoto.cli.console import plain_console
 from jaxphoto.cli.grid_options import check_grid, points_of
+from jaxphoto.cli.made import made_by
 from jaxphoto.cli.two_cameras import compared, read_two
 from jaxphoto.report import print_warning
 from jaxphoto.report.change import print_change, write_change
@@ -18,6 +19,7 @@ from jaxphoto.writing import check_folder
 
 @app.command("compare")
 def compare_command(
+    context: typer.Context,
     first: Annotated[Path, typer.Argument(metavar="A", help="Results or camera file of one calibration.")],
     second: Annotated[Path, typer.Argument(metavar="B", help="The same of the other, by other photographs.")],
     method: Annotated[Method, one_of(METHODS, help="What the orientation of images may take up.")] = "rot",
@@ -46,5 +48,5 @@ def compare_command(
             print_warning(f"{letter}: {file.note}", console, soft_wrap=True)
     print_change(found, sets, a.sensor, console)
     if out is not None:
-        write_change(found, sets, a.sensor, out)
+        write_change(found, sets, a.sensor, out, made_by(context, first, second))
         console.print(f"results in {out} (open report.html)")

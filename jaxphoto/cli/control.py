@@ -19,7 +19,8 @@ from jaxphoto.procedures.control import at_optimum, control_block, control_block
 from jaxphoto.report import Level, Tables, verdict_of
 from jaxphoto.report.control import control_findings, control_summary, write_control
 from jaxphoto.report.findings import Verdict
-from jaxphoto.report.results import versions, write_results, write_summary
+from jaxphoto.report.made import versions
+from jaxphoto.report.results import write_results, write_summary
 from jaxphoto.report.terminal import plain
 from jaxphoto.writing import check_folder, whole_folder
 

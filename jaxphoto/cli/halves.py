@@ -9,6 +9,7 @@ from jaxphoto.cli.app import app
 from jaxphoto.cli.choices import one_of
 from jaxphoto.cli.console import plain_console
 from jaxphoto.cli.grid_options import check_grid, points_of
+from jaxphoto.cli.made import made_by
 from jaxphoto.io import read_block
 from jaxphoto.io.cameras import write_camera_file
 from jaxphoto.procedures.halves import CUTS, camera_of, halves
@@ -19,6 +20,7 @@ from jaxphoto.writing import check_folder
 
 @app.command("halves")
 def halves_command(
+    context: typer.Context,
     block: Annotated[Path, typer.Argument(help="Block folder (see docs/block_folder.md).")],
     out: Annotated[Path, typer.Option(help="Folder for the results; earlier results in it are replaced.")],
     by: Annotated[
@@ -41,7 +43,7 @@ def halves_command(
     check_folder(out, block)
     console, errors = plain_console(), plain_console(stderr=True)
     with errors.status("reading the block") as status:
-        read = read_block(block)
+        read, made = read_block(block), made_by(context, block)
         cells = points_of(read.sensors[camera_of(read, camera)], grid, extent)
         found = halves(read, cells, by=by, camera=camera, n_cuts=cuts, seed=seed, method=method, report=status.update)
         status.update(f"writing {out}")
@@ -56,6 +58,7 @@ def halves_command(
                 name=found.camera,
                 covariance=found.widened,
             ),
+            made,
         )
     print_halves(found, console)
     console.print(f"results in {out} (open report.html)")

@@ -15,6 +15,7 @@ from jaxphoto.cli.app import app
 from jaxphoto.cli.choices import one_of
 from jaxphoto.cli.cloud_options import Classes, CloudEpsg, CloudUnit, ReturnsOption, class_numbers
 from jaxphoto.cli.console import plain_console
+from jaxphoto.cli.made import made_by
 from jaxphoto.cloud import Cloud
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import Scanner
@@ -32,12 +33,14 @@ from jaxphoto.procedures.lidar.until_still import MAX_ROUNDS
 from jaxphoto.procedures.lidar.vertical_control import METHODS, flag_counts
 from jaxphoto.report.lidar import (
     heights_figure,
+    heights_page,
     heights_table,
     print_moved,
     print_rounds,
     rounds_table,
     write_simultaneous,
 )
+from jaxphoto.report.study_page import WholePicture
 from jaxphoto.unknowns import FIXED, FREE, Weighted
 from jaxphoto.writing import check_folder
 
@@ -55,6 +58,7 @@ Method = Annotated[str, one_of(METHODS, help="How heights follow from laser poin
 
 @app.command("lidar-control")
 def lidar_control_command(
+    context: typer.Context,
     block: BlockFolder,
     cloud: CloudFile,
     out: Annotated[Path, typer.Option(help="Block folder to write; a block in it is replaced.")],
@@ -79,11 +83,14 @@ def lidar_control_command(
         report = _reporter(errors, status.update)
         found = lidar_control(read, points, method, settings, max_rounds=max_rounds, report=report)  # type: ignore[arg-type]
         status.update(f"writing {out}")
-        heights, rounds, figure = heights_table(found), rounds_table(found.rounds), heights_figure(found)
+        heights, rounds = heights_table(found), rounds_table(found.rounds)
+        picture = WholePicture.of(heights_figure(found), "where heights are control, and what they leave")
+        page = heights_page(found, picture, made_by(context, block, cloud))
         with whole_block(found.block, out) as folder:
             heights.to_csv(folder / "lidar_heights.csv", index=False)
             rounds.to_csv(folder / "lidar_rounds.csv", index=False)
-            figure.savefig(folder / "lidar_heights.png")
+            (folder / "lidar_heights.png").write_bytes(picture.png)
+            (folder / "report.html").write_text(page, encoding="utf-8")
     console = plain_console()
     print_rounds(found.rounds, found.still, console)
     refused = ", ".join(
@@ -136,6 +143,7 @@ def roof_control_command(
 
 @app.command("simultaneous")
 def simultaneous_command(
+    context: typer.Context,
     block: BlockFolder,
     cloud: CloudFile,
     out: Annotated[Path, typer.Option(help="Folder for the results; earlier results in it are replaced.")],
@@ -198,9 +206,10 @@ def simultaneous_command(
             report=_reporter(errors, status.update),
         )
         status.update(f"writing {out}")
+        made = made_by(context, block, cloud, trajectory)
         corrected = result.cloud if surface is whole else correct_cloud(whole, result.scanner, path)
         like = cloud if cloud.suffix.lower() in (".las", ".laz") else None
-        with write_simultaneous(result, out, seconds) as folder:
+        with write_simultaneous(result, out, seconds, made) as folder:
             name = cloud.name if like is not None else f"corrected_{cloud.name}"
             clouds.write_cloud(corrected, folder / name, like=like, frame=read.frame, **said)  # type: ignore[arg-type]
             if records is not None and result.trajectory is not None:

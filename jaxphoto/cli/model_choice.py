@@ -8,6 +8,7 @@ import typer
 
 from jaxphoto.cli.app import app
 from jaxphoto.cli.console import plain_console
+from jaxphoto.cli.made import made_by
 from jaxphoto.io import read_block
 from jaxphoto.procedures.model_choice import FOLDS, model_choice
 from jaxphoto.report.model_choice import print_model_choice, write_model_choice
@@ -18,6 +19,7 @@ _MODELS = "brown:none,brown:k1,brown:k1+k2,brown:k1+k2+k3,brown,brown:all"
 
 @app.command("models")
 def models_command(
+    context: typer.Context,
     block: Annotated[Path, typer.Argument(help="Block folder (see docs/block_folder.md).")],
     out: Annotated[Path, typer.Option(help="Folder for the results; earlier results in it are replaced.")],
     models: Annotated[
@@ -31,14 +33,14 @@ def models_command(
     console, errors = plain_console(), plain_console(stderr=True)
     began = time.perf_counter()
     with errors.status("reading the block") as status:
-        read = read_block(block)
+        read, made = read_block(block), made_by(context, block)
         seconds = {"read": time.perf_counter() - began}
         named = [name for name in models.split(",") if name.strip()]
         status.update(f"adjusting {len(named)} models of {len(read.images)} images, {len(read.points)} points")
         choice = model_choice(read, named, k=folds, seed=seed)
         seconds["adjust"] = time.perf_counter() - began - seconds["read"]
         status.update(f"writing {out}")
-        write_model_choice(choice, read.title, out, seconds)
+        write_model_choice(choice, read.title, out, seconds, made)
     print_model_choice(choice, console)
     console.print(f"results in {out} (open report.html)")
     if not choice.by_bic:

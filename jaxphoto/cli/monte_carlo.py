@@ -12,11 +12,13 @@ from jaxphoto.block import Block
 from jaxphoto.cli.app import app
 from jaxphoto.cli.choices import one_of
 from jaxphoto.cli.console import plain_console
+from jaxphoto.cli.made import made_by
 from jaxphoto.errors import InputError
 from jaxphoto.experiment import MonteCarlo
 from jaxphoto.io import read_block
 from jaxphoto.io.draws_folder import check_place
 from jaxphoto.procedures import adjust
+from jaxphoto.report.draws import write_draws_page
 from jaxphoto.sensitivity import PER, Bias, Readjustment, bias, check_draws, noise
 
 _KINDS = (*PER, "noise")
@@ -29,6 +31,7 @@ _KEPT = ("exterior", "points")
 
 @app.command("monte-carlo")
 def monte_carlo_command(
+    context: typer.Context,
     block: Annotated[Path, typer.Argument(help="Block folder (see docs/block_folder.md).")],
     out: Annotated[Path, typer.Option(help="Folder for the draws; a run in it with the same settings goes on.")],
     kind: Annotated[str, one_of(_KINDS, "--bias", help="What is wrong.")],
@@ -58,7 +61,7 @@ def monte_carlo_command(
     sigmas = _sigma_of(kind, {"m": sigma_m, "deg": sigma_deg, "mm": sigma_mm, "own": sigma})
     errors = plain_console(stderr=True)
     with errors.status("reading the block") as status:
-        read = read_block(block)
+        read, made = read_block(block), made_by(context, block)
         drawn = _bias_of(read, kind, sigmas, per, on or [], parameter)
         status.update("adjusting the nominal block")
         adjusted = adjust(read)
@@ -77,6 +80,7 @@ def monte_carlo_command(
         study.draw(lambda done: progress.update(task, completed=done))
     with errors.status(f"writing {out}"):
         summary, table = study.write()
+        write_draws_page(summary, table, out, made)
     console = plain_console()
     console.print(
         f"{summary['draws']} draws, {summary['converged']} converged, {summary['fallbacks']} by a full adjustment; "
@@ -88,7 +92,7 @@ def monte_carlo_command(
         if not str(name).startswith(("bias.", "exterior.", "point.", "check.")):
             shown.add_row(str(name), *(f"{float(v):.5g}" for v in numbers))
     console.print(shown)
-    console.print(f"results in {out}")
+    console.print(f"results in {out} (open report.html)")
 
 
 def _sigma_of(kind: str, given: dict[str, str | None]) -> list[float]:

@@ -11,6 +11,7 @@ import jaxphoto
 from jaxphoto.cli.app import app
 from jaxphoto.cli.choices import one_of
 from jaxphoto.cli.console import plain_console
+from jaxphoto.cli.made import made_by
 from jaxphoto.errors import InputError
 from jaxphoto.io import read_block
 from jaxphoto.procedures import adjust_for_tables
@@ -23,6 +24,7 @@ _SHOWN = 12
 
 @app.command("sensitivity")
 def sensitivity_command(
+    context: typer.Context,
     block: Annotated[Path, typer.Argument(help="Block folder (see docs/block_folder.md).")],
     out: Annotated[Path, typer.Option(help="Folder for the results; earlier results in it are replaced.")],
     per: Annotated[Per, one_of(get_args(Per), help="Whose stations have a bias.")] = "strip",
@@ -37,7 +39,7 @@ def sensitivity_command(
     console, errors = plain_console(), plain_console(stderr=True)
     began = time.perf_counter()
     with errors.status("reading the block") as status:
-        read = read_block(block)
+        read, made = read_block(block), made_by(context, block)
         seconds = {"read": time.perf_counter() - began}
         status.update(f"adjusting {len(read.images)} images, {len(read.points)} points")
         adjusted = adjust_for_tables(read, max_steps)
@@ -46,11 +48,11 @@ def sensitivity_command(
         table = tables.bias
         status.update(f"writing {out}")
         order = ("compile", "solve", "covariance", "sensitivity")
-        write_sensitivity(tables, out, seconds | {name: adjusted.seconds[name] for name in order})
+        write_sensitivity(tables, out, seconds | {name: adjusted.seconds[name] for name in order}, made)
     console.print(f"largest changes by a station bias of {bias_m:g} m per {per}: exact, first-order")
     interior = table[table["estimate"].str.startswith("interior")]
     largest = interior.loc[interior.groupby("estimate", sort=False)["exact"].apply(lambda v: v.abs().idxmax())]
     for row in largest.head(_SHOWN).itertuples(index=False):
         line = f"  {row.estimate}: {row.exact:.4g}, {row.first_order:.4g} (stations of {row.unit} in {row.axis})"
         console.print(line)
-    console.print(f"results in {out}")
+    console.print(f"results in {out} (open report.html)")

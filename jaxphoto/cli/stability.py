@@ -10,6 +10,7 @@ from jaxphoto.cli.app import app
 from jaxphoto.cli.choices import one_of
 from jaxphoto.cli.console import plain_console
 from jaxphoto.cli.grid_options import check_grid, points_of
+from jaxphoto.cli.made import made_by
 from jaxphoto.cli.two_cameras import compared, read_two
 from jaxphoto.errors import InputError
 from jaxphoto.report import print_warning
@@ -20,6 +21,7 @@ from jaxphoto.writing import check_folder
 
 @app.command("stability")
 def stability_command(
+    context: typer.Context,
     first: Annotated[Path, typer.Argument(metavar="A", help="Results, interior.csv or camera file of one set.")],
     second: Annotated[Path, typer.Argument(metavar="B", help="The same of the other set.")],
     method: Annotated[Method, one_of(METHODS, help="Alignment that the verdict is of.")] = "rot",
@@ -56,5 +58,5 @@ def stability_command(
             print_warning(f"{letter}: {file.note}", console, soft_wrap=True)
     print_stability(found, (one, other), a.sensor.pixel_mm, noise_mm, method, console)
     if out is not None:
-        write_stability(found, (one, other), a.sensor, noise_mm, method, out)
+        write_stability(found, (one, other), a.sensor, noise_mm, method, out, made_by(context, first, second))
         console.print(f"results in {out} (open report.html)")

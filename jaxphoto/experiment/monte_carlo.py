@@ -25,7 +25,7 @@ from jaxphoto.report.draws import (
     moments,
     summary_table,
 )
-from jaxphoto.report.results import versions
+from jaxphoto.report.made import versions
 from jaxphoto.sensitivity import Bias, Readjustment, joined_draws
 from jaxphoto.writing import whole_file
 

@@ -10,8 +10,9 @@ from rich.console import Console
 from rich.text import Text
 
 from jaxphoto.procedures import Step
+from jaxphoto.report.made import versions
 from jaxphoto.report.page_head import page_head
-from jaxphoto.report.results import versions, write_results, write_summary
+from jaxphoto.report.results import write_results, write_summary
 from jaxphoto.report.tables import Tables
 from jaxphoto.report.verdict import verdict_of
 from jaxphoto.writing import whole_folder

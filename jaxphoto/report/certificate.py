@@ -20,6 +20,7 @@ from jaxphoto.report.change import change_verdict
 from jaxphoto.report.digits import with_sigma
 from jaxphoto.report.document import Document, DocumentPicture, Element, Heading, Paragraph, Pictures, Rows
 from jaxphoto.report.findings import as_sentence
+from jaxphoto.report.made import option_word
 from jaxphoto.stability import LEVEL, NORMAL_95, Method, change, distortion_curve, format_sigma, image_grid
 from jaxphoto.statistics.correlation import high_pairs
 from jaxphoto.writing.inputs import digest_of_all
@@ -323,13 +324,6 @@ def _one(conditions: Sequence, field: str) -> str:
 
 def _names(*rows: tuple[str, str]) -> Rows:
     return Rows(("", ""), rows)
-
-
-def option_word(value: Any) -> str:
-    """An option as a person says it."""
-    if value is None or isinstance(value, bool):
-        return {None: "none", True: "yes", False: "no"}[value]
-    return str(value)
 
 
 def _number(value: Any, digits: str) -> str:

@@ -6,28 +6,19 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from jinja2 import Environment
-from markupsafe import Markup
 from rich.console import Console
 from rich.table import Table
 
 from jaxphoto.camera import Sensor
-from jaxphoto.report.maps import format_maps, png_of
-from jaxphoto.report.page_head import page_head
-from jaxphoto.report.results import versions, write_summary
+from jaxphoto.report.document import Heading, Paragraph, rows_of
+from jaxphoto.report.made import Made, made_section, versions
+from jaxphoto.report.maps import format_maps
+from jaxphoto.report.results import write_summary
 from jaxphoto.report.stability import Compared, missing_covariances
+from jaxphoto.report.study_page import WholePicture, study_page
 from jaxphoto.stability import LEVEL, Change
 from jaxphoto.stability.analysis import SIGNIFICANT_P
 from jaxphoto.writing import whole_folder
-
-_PAGE = """{{ head("Change of a camera") }}<body>
-<h1>Change of a camera</h1>
-{% for line in about %}<p>{{ line }}</p>{% endfor %}
-{% for sentence in verdict %}<p><b>{{ sentence }}</b></p>{% endfor %}
-<img alt="maps over the format" src="{{ picture }}">
-{{ parameters }}
-</body></html>
-"""
 
 
 def parameter_changes(found: Change) -> pd.DataFrame:
@@ -104,7 +95,7 @@ def print_change(found: Change, sets: tuple[Compared, Compared], sensor: Sensor,
         console.print(sentence, soft_wrap=True)
 
 
-def write_change(found: Change, sets: tuple[Compared, Compared], sensor: Sensor, directory: Path) -> None:
+def write_change(found: Change, sets: tuple[Compared, Compared], sensor: Sensor, directory: Path, made: Made) -> None:
     """parameters.csv, cells.csv, change.png, report.html and summary.json.
 
     Raises InputError where `directory` holds something that is not an earlier result.
@@ -114,20 +105,16 @@ def write_change(found: Change, sets: tuple[Compared, Compared], sensor: Sensor,
         "offset [px]": found.offset_mm / sensor.pixel_mm,
         f"offset over what {100 * LEVEL:.0f} % stay below": found.offset_mm / found.limit_mm,
     }
-    content, picture = png_of(format_maps(sensor, np.asarray(found.field.offsets.points), maps))
+    figure = format_maps(sensor, np.asarray(found.field.offsets.points), maps)
+    picture = WholePicture.of(figure, "maps over the format")
+    about = [str(sets[0]), str(sets[1]), missing_covariances(sets)]
+    parts = [*map(Paragraph, about), picture, Heading("Parameters"), rows_of(parameters), *made_section(made)]
     known = found.field.uncertainty
     with whole_folder(directory) as work:
         parameters.to_csv(work / "parameters.csv", index=False)
         change_cells(found, sensor).to_csv(work / "cells.csv", index=False)
-        (work / "change.png").write_bytes(content)
-        html = Environment(autoescape=True).from_string(_PAGE)
-        page = html.render(
-            head=page_head,
-            about=[str(sets[0]), str(sets[1]), missing_covariances(sets)],
-            verdict=verdict,
-            picture=picture,
-            parameters=Markup(parameters.to_html(index=False, border=0, na_rep="", float_format="{:.6g}".format)),
-        )
+        (work / "change.png").write_bytes(picture.png)
+        page = study_page("Change of a camera", verdict, parts)
         (work / "report.html").write_text(page, encoding="utf-8")
         summary = {
             "verdict": verdict,

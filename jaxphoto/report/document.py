@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
+import pandas as pd
+
+from jaxphoto.report.table_files import head_of, readable
 from jaxphoto.report.tables import Tables
 
 if TYPE_CHECKING:
@@ -29,6 +32,12 @@ class Rows(NamedTuple):
 
     columns: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
+
+
+def rows_of(table: pd.DataFrame) -> Rows:
+    """A table as it is to be read: units in the heads, digits that follow sigmas."""
+    heads = tuple(head_of(str(name)) for name in table.columns)
+    return Rows(heads, tuple(readable(table).itertuples(index=False, name=None)))
 
 
 class DocumentPicture(NamedTuple):

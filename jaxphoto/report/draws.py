@@ -3,19 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, NamedTuple
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.observations import AXES
+from jaxphoto.report.document import Element, Heading, Paragraph, rows_of
+from jaxphoto.report.made import Made, made_section
 from jaxphoto.report.plots import drawn, new_figure
+from jaxphoto.report.study_page import WholePicture, study_page
 from jaxphoto.sensitivity import Draws
+from jaxphoto.writing import whole_file
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+_PICTURES = {"interior": "Estimates over the draws", "effects": "Which error is behind which estimate"}
+# Rows of the page's table that are of images and points: their number has no end.
+_LONG = ("exterior.", "point.", "check.")
 _EXTERIOR = ("X_m", "Y_m", "Z_m", "omega_rad", "phi_rad", "kappa_rad")
 _QUANTILES = {"q025": 0.025, "q50": 0.5, "q975": 0.975}
 # Histograms of a picture.
@@ -131,10 +139,36 @@ def effects_figure(effects: pd.DataFrame, summary: pd.DataFrame, quantities: lis
     """What one sigma of each error does to some quantities, as parts of their predicted standard deviations."""
     predicted = summary.set_index("quantity")["predicted_sigma"][quantities].to_numpy()
     parts = effects[quantities].to_numpy() / np.where(predicted > 0, predicted, np.nan)
-    figure = new_figure(1.8 + 0.8 * len(quantities), 1.2 + 0.24 * len(effects))
+    figure = new_figure(1.8 + 0.8 * len(quantities), max(2.8, 1.2 + 0.24 * len(effects)))
     axes = figure.subplots()
     image = axes.imshow(parts, cmap="RdBu_r", vmin=-1, vmax=1, aspect="auto")
     axes.set_xticks(range(len(quantities)), list(map(drawn, quantities)), rotation=45, ha="right", fontsize=8)
     axes.set_yticks(range(len(effects)), list(map(drawn, effects["error"])), fontsize=7)
     figure.colorbar(image, label="effect of one sigma / predicted sigma")
     return figure
+
+
+def write_draws_page(summary: Mapping[str, Any], table: pd.DataFrame, directory: Path, made: Made) -> None:
+    """report.html of the draws in `directory`, from the summary, its table and the pictures that are there."""
+    few = ~table["quantity"].str.startswith(_LONG)
+    said = [
+        f"{summary['draws']} draws, of which {summary['converged']} converged. {_ratios(table[few])}",
+        "The predicted sigma is the effect of the errors to first order; the ratio says how far draws agree with it.",
+    ]
+    parts: list[Element | WholePicture] = []
+    for name, heading in _PICTURES.items():
+        if (file := directory / f"{name}.png").is_file():
+            parts += [Heading(heading), WholePicture.read(file, heading)]
+    parts += [Heading("Means and standard deviations"), rows_of(table[few])]
+    if not few.all():
+        parts.append(Paragraph("Images and points stand in summary.csv."))
+    page = study_page(f"Monte Carlo: {summary.get('title') or 'block'}", said, [*parts, *made_section(made)])
+    with whole_file(directory / "report.html") as work:
+        work.write_text(page, encoding="utf-8")
+
+
+def _ratios(table: pd.DataFrame) -> str:
+    ratio = table["ratio"].dropna()
+    if ratio.empty:
+        return "Nothing is predicted to change."
+    return f"Standard deviations of the draws are {ratio.min():.3g} to {ratio.max():.3g} times those predicted."

@@ -8,27 +8,20 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
-from jinja2 import Environment
-from markupsafe import Markup
 from rich.console import Console
 
 from jaxphoto.errors import camera_words
 from jaxphoto.procedures.halves import Halves
-from jaxphoto.report.maps import format_maps, png_of
-from jaxphoto.report.page_head import page_head
-from jaxphoto.report.results import versions, write_summary
+from jaxphoto.report.document import Heading, rows_of
+from jaxphoto.report.made import Made, made_section, versions
+from jaxphoto.report.maps import format_maps
+from jaxphoto.report.results import write_summary
+from jaxphoto.report.study_page import WholePicture, study_page
 from jaxphoto.writing import whole_folder
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_PAGE = """{{ head(title) }}<body>
-<h1>{{ title }}</h1>
-{% for sentence in verdict %}<p>{{ sentence }}</p>{% endfor %}
-<img alt="maps over the format" src="{{ picture }}">
-<h2>Cuts</h2><div class="wide">{{ cuts }}</div>
-</body></html>
-"""
 # Below so many standard deviations from 1 a factor says nothing.
 _SURE = 2.0
 
@@ -119,28 +112,21 @@ def print_halves(found: Halves, console: Console) -> None:
         console.print(sentence, soft_wrap=True)
 
 
-def write_halves(found: Halves, directory: Path, write_camera: Callable[[Path], object]) -> None:
+def write_halves(found: Halves, directory: Path, write_camera: Callable[[Path], object], made: Made) -> None:
     """cells.csv, cuts.csv, halves.png, report.html and summary.json; `write_camera` writes the camera beside them.
 
     Raises InputError where `directory` holds something that is not an earlier result.
     """
     cells, cuts, verdict = cell_table(found), cut_table(found), halves_verdict(found)
     title = f"{found.adjusted.block.title or 'block'}: halves"
-    content, picture = png_of(halves_figure(found))
+    picture = WholePicture.of(halves_figure(found), "maps over the format")
+    parts = (picture, Heading("Cuts"), rows_of(cuts), *made_section(made))
     with whole_folder(directory) as work:
         cells.to_csv(work / "cells.csv", index=False)
         cuts.to_csv(work / "cuts.csv", index=False)
         write_camera(work)
-        (work / "halves.png").write_bytes(content)
-        page = Environment(autoescape=True).from_string(_PAGE)
-        html = page.render(
-            head=page_head,
-            title=title,
-            verdict=verdict,
-            picture=picture,
-            cuts=Markup(cuts.to_html(index=False, border=0, na_rep="", float_format="{:.3g}".format)),
-        )
-        (work / "report.html").write_text(html, encoding="utf-8")
+        (work / "halves.png").write_bytes(picture.png)
+        (work / "report.html").write_text(study_page(title, verdict, parts), encoding="utf-8")
         share, error = found.inside
         summary = {
             "title": found.adjusted.block.title,

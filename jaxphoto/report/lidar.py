@@ -16,8 +16,12 @@ from jaxphoto.adjustment import Adjustment
 from jaxphoto.lidar import HeightFlag
 from jaxphoto.observations import AXES
 from jaxphoto.procedures.lidar import LidarControl, Round, Simultaneous
+from jaxphoto.procedures.lidar.vertical_control import flag_counts
+from jaxphoto.report.document import Element, Heading, Paragraph, Rows, rows_of
+from jaxphoto.report.made import Made, made_section
 from jaxphoto.report.plots import new_figure
 from jaxphoto.report.results import summary_of, write_results, write_summary
+from jaxphoto.report.study_page import WholePicture, study_page
 from jaxphoto.report.tables import Tables
 from jaxphoto.report.verdict import verdict_of
 from jaxphoto.statistics import angle_differences, correlation_matrix
@@ -27,6 +31,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _UNITS = {"_mm": "mm", "_m": "m", "_m_per_s": "m/s", "_s": "s"}
+# Correlations of the page.
+_STRONGEST = 30
 _ORDER = ("compile", "solve", "covariance")
 
 
@@ -152,8 +158,8 @@ def heights_figure(control: LidarControl) -> Figure:
 
 
 @contextmanager
-def write_simultaneous(result: Simultaneous, directory: Path, seconds: dict[str, float]) -> Iterator[Path]:
-    """Tables of rounds, moves, surfaces and correlations, a picture, summary.json, and the adjustment's own folder.
+def write_simultaneous(result: Simultaneous, directory: Path, seconds: dict[str, float], made: Made) -> Iterator[Path]:
+    """Tables of rounds, moves, surfaces and correlations, picture, report, summary.json, the adjustment's own folder.
 
     Yields the folder while it is not yet in its place, for what else belongs there. Raises InputError where `directory`
     holds something that is not an earlier result.
@@ -163,27 +169,62 @@ def write_simultaneous(result: Simultaneous, directory: Path, seconds: dict[str,
         tables = Tables(result.adjusted)
         verdict, times = verdict_of(tables), result.adjusted.seconds
         write_results(tables, verdict, work / "adjustment", {name: times[name] for name in _ORDER})
-        rounds_table(result.rounds).to_csv(work / "rounds.csv", index=False)
-        moved_table(result).to_csv(work / "moved.csv", index=False)
+        rounds, moved = rounds_table(result.rounds), moved_table(result)
+        rounds.to_csv(work / "rounds.csv", index=False)
+        moved.to_csv(work / "moved.csv", index=False)
         surfaces_table(result).to_csv(work / "surfaces.csv", index=False)
-        scanner_correlations(result.adjusted).to_csv(work / "scanner_correlation.csv", index=False)
-        above_figure(result).savefig(work / "above.png")
+        correlations = scanner_correlations(result.adjusted)
+        correlations.to_csv(work / "scanner_correlation.csv", index=False)
+        picture = WholePicture.of(above_figure(result), "points above the surface of the cloud, before and after")
+        (work / "above.png").write_bytes(picture.png)
+        strongest = correlations.reindex(correlations["rho"].abs().sort_values(ascending=False).index)
+        parts = (
+            Heading("What moved"),
+            rows_of(moved),
+            picture,
+            Heading("Rounds"),
+            rows_of(rounds),
+            Heading("Correlations of the scanner"),
+            Paragraph("The strongest; all stand in scanner_correlation.csv, all results of images in adjustment."),
+            rows_of(strongest.head(_STRONGEST)),
+            *made_section(made),
+        )
+        title = f"{tables.adjusted.block.title or 'Block'} and cloud, adjusted together"
+        said = (f"{verdict.headline} {' '.join(rounds_words(result.rounds, result.still))}",)
+        page = study_page(title, said, parts, verdict.colour)
+        (work / "report.html").write_text(page, encoding="utf-8")
         summary = summary_of(tables, verdict, seconds | {"write": time.perf_counter() - began})
         write_summary(summary | {"rounds": len(result.rounds), "came_to_rest": result.still}, work)
         yield work
 
 
-def print_rounds(rounds: Sequence[Round], still: bool, console: Console) -> None:
+def rounds_words(rounds: Sequence[Round], still: bool) -> tuple[str, str]:
     """What the rounds came to, in two sentences."""
     last = rounds[-1]
     end = "nothing changes any more" if still else "it still changes: ask for more rounds"
-    console.print(
+    return (
         f"{len(rounds)} rounds, {end} (largest change {last.largest_change:.2g} standard deviations); "
         f"{last.observed} observations of the cloud, {last.left_out} left out",
-        highlight=False,
-        soft_wrap=True,
+        f"points lie on the cloud's surface with an RMSE of {last.rmse_m:.3f} m",
     )
-    console.print(f"points lie on the cloud's surface with an RMSE of {last.rmse_m:.3f} m", highlight=False)
+
+
+def print_rounds(rounds: Sequence[Round], still: bool, console: Console) -> None:
+    """The same on a screen."""
+    for sentence in rounds_words(rounds, still):
+        console.print(sentence, highlight=False, soft_wrap=True)
+
+
+def heights_page(control: LidarControl, picture: WholePicture, made: Made) -> str:
+    """The page of heights of a cloud as control: rounds, flags, picture, and every height."""
+    flags = flag_counts(control.flag)
+    refused = Rows(("heights that are", "number"), tuple((name.lower(), str(n)) for name, n in flags.items()))
+    parts: list[Element | WholePicture] = [picture, Heading("Rounds"), rows_of(rounds_table(control.rounds))]
+    parts += [refused] if flags else []
+    parts += [Heading("Heights"), rows_of(heights_table(control)), *made_section(made)]
+    said = [*rounds_words(control.rounds, control.still)]
+    said.append(f"{int(control.used.sum())} of {len(control.points)} tie points have a control height")
+    return study_page(f"{control.block.title or 'Block'}: heights of a cloud as control", said, parts)
 
 
 def print_moved(result: Simultaneous, console: Console) -> None:

@@ -36,4 +36,9 @@ def png_of(figure: Figure) -> tuple[bytes, str]:
     """A picture as the content of a file, and as what an HTML page shows."""
     drawn = io.BytesIO()
     figure.savefig(drawn, format="png")
-    return drawn.getvalue(), "data:image/png;base64," + base64.b64encode(drawn.getvalue()).decode()
+    return drawn.getvalue(), png_uri(drawn.getvalue())
+
+
+def png_uri(png: bytes) -> str:
+    """A PNG as what an HTML page shows."""
+    return "data:image/png;base64," + base64.b64encode(png).decode()

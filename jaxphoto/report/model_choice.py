@@ -9,28 +9,20 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
-from jinja2 import Environment
-from markupsafe import Markup
 from rich.console import Console
 from rich.table import Table
 
 from jaxphoto.procedures.model_choice import ModelChoice
-from jaxphoto.report.page_head import page_head
+from jaxphoto.report.document import Heading, rows_of
+from jaxphoto.report.made import Made, made_section, versions
 from jaxphoto.report.plots import new_figure
-from jaxphoto.report.results import versions, write_summary
+from jaxphoto.report.results import write_summary
+from jaxphoto.report.study_page import WholePicture, study_page
 from jaxphoto.writing import whole_folder
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_PAGE = """{{ head(title) }}<body>
-<h1>{{ title }}</h1>
-{% for sentence in verdict %}<p><b>{{ sentence }}</b></p>{% endfor %}
-<h2>Models</h2>{{ models }}
-<img alt="models" src="models.png">
-<h2>Estimated parameters of every model</h2>{{ parameters }}
-</body></html>
-"""
 # The page shows these of `choice_table`, with that many digits; the terminal a few of them.
 _SHOWN = {
     "model": None, "parameters": "{:d}", "sigma0": "{:.3f}", "rms_px": "{:.4f}", "cv_rms_px": "{:.4f}",
@@ -137,26 +129,28 @@ def choice_figure(choice: ModelChoice) -> Figure:
     return figure
 
 
-def write_model_choice(choice: ModelChoice, title: str, directory: Path, seconds: dict[str, float]) -> None:
+def write_model_choice(choice: ModelChoice, title: str, directory: Path, seconds: dict[str, float], made: Made) -> None:
     """models.csv, parameters.csv, models.png, report.html and summary.json, in `directory` only when all is written.
 
     Raises InputError where `directory` holds something that is not an earlier result.
     """
     began = time.perf_counter()
     table, parameters, verdict = choice_table(choice), parameter_table(choice), choice_verdict(choice)
+    picture = WholePicture.of(choice_figure(choice), "predicted residuals and information criteria by model")
+    parts = (
+        Heading("Models"),
+        rows_of(_shown(table)),
+        picture,
+        Heading("Estimated parameters of every model"),
+        rows_of(parameters),
+        *made_section(made),
+    )
     with whole_folder(directory) as work:
         table.to_csv(work / "models.csv", index=False)
         parameters.to_csv(work / "parameters.csv", index=False)
-        choice_figure(choice).savefig(work / "models.png")
-        page = Environment(autoescape=True).from_string(_PAGE)
-        html = page.render(
-            head=page_head,
-            title=f"{title or 'block'}: models",
-            verdict=verdict,
-            models=_html(_shown(table)),
-            parameters=_html(parameters),
-        )
-        (work / "report.html").write_text(html, encoding="utf-8")
+        (work / "models.png").write_bytes(picture.png)
+        page = study_page(f"{title or 'block'}: models", verdict, parts)
+        (work / "report.html").write_text(page, encoding="utf-8")
         summary = {
             "title": title,
             "verdict": verdict,
@@ -190,8 +184,3 @@ def _shown(table: pd.DataFrame) -> pd.DataFrame:
         if any(cells):
             columns[name] = cells
     return pd.DataFrame(columns)
-
-
-def _html(table: pd.DataFrame) -> Markup:
-    page = table.to_html(index=False, border=0, na_rep="", float_format="{:.6g}".format)
-    return Markup(f'<div class="wide">{page}</div>')

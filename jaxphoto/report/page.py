@@ -11,10 +11,12 @@ from jinja2 import Environment
 from markupsafe import Markup
 
 from jaxphoto.errors import camera_words
-from jaxphoto.report.document import BlockInSpace, Heading, Paragraph, Rows
+from jaxphoto.observations import AXES
+from jaxphoto.report.document import BlockInSpace, Heading, Paragraph, rows_of
 from jaxphoto.report.document_html import contents, html_of
 from jaxphoto.report.error_ellipses import ellipses_figure
 from jaxphoto.report.findings import Verdict
+from jaxphoto.report.made import PROVENANCE, Made, made_section
 from jaxphoto.report.maps import png_of
 from jaxphoto.report.page_head import page_head
 from jaxphoto.report.plots import (
@@ -26,7 +28,6 @@ from jaxphoto.report.plots import (
 from jaxphoto.report.positional_accuracy import accuracy_sentences
 from jaxphoto.report.recovery import recovery_spread
 from jaxphoto.report.sigma_map import sigma_map_figure, sigma_map_words
-from jaxphoto.report.table_files import head_of, readable
 from jaxphoto.report.tables import Tables
 from jaxphoto.statistics import LEAST_CHECKED
 
@@ -59,12 +60,15 @@ _RECOVERY = (
 _LARGEST = 20
 
 
-def report_page(tables: Tables, verdict: Verdict) -> str:
+def report_page(tables: Tables, verdict: Verdict, made: Made | None = None) -> str:
     """The whole report as HTML: pictures, and what makes them and the tables answer, inside."""
     a = tables.adjusted
     counts = [f"{n} observations of {group.replace('_', ' ')}" for group, n in a.n_observations.items() if n]
     counts += [f"{a.n_constraints} constraints of the datum"] if a.n_constraints else []
     sections = [(heading, Markup("\n").join(body)) for heading, body in _sections(tables)]
+    if made:
+        _, *body = made_section(made)
+        sections.append((PROVENANCE, Markup("\n").join(map(html_of, body))))
     return (
         Environment(autoescape=True)
         .from_string(_PAGE)
@@ -147,15 +151,13 @@ def _residuals(tables: Tables) -> list[Markup]:
 
 
 def _check_spread(check: pd.DataFrame) -> pd.DataFrame:
-    values = check.drop(columns="point")
+    values = check[[f"d{axis}_m" for axis in AXES]]
     rows = {"mean": values.mean(), "rmse": np.sqrt((values**2).mean()), "max_abs": values.abs().max()}
     return pd.DataFrame(rows).T.reset_index(names="check points")
 
 
 def _html(table: pd.DataFrame) -> Markup:
-    """A table as it is to be read: units in the heads, digits that follow sigmas."""
-    heads = tuple(head_of(str(name)) for name in table.columns)
-    return html_of(Rows(heads, tuple(readable(table).itertuples(index=False, name=None))))
+    return html_of(rows_of(table))
 
 
 def _said(text: str) -> Markup:

@@ -3,7 +3,6 @@
 import json
 import time
 from collections.abc import Mapping, Sequence
-from importlib.metadata import version
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -12,6 +11,7 @@ from jaxphoto.adjustment import Adjustment
 from jaxphoto.camera import CameraRates, model_keys
 from jaxphoto.errors import InputError
 from jaxphoto.report.findings import Verdict
+from jaxphoto.report.made import Made, versions
 from jaxphoto.report.page import report_page
 from jaxphoto.report.positional_accuracy import accuracy_sentences
 from jaxphoto.report.table_files import check_table_format, write_table
@@ -33,7 +33,6 @@ _TABLES = (
 )
 # Written beside them where the files of the block were in an EPSG system.
 _MAP_TABLES = ("exterior_map", "object_points_map")
-_PACKAGES = ("jaxphoto", "jax", "optimistix", "equinox", "lineax", "numpy", "pandas")
 
 
 def write_results(
@@ -42,17 +41,18 @@ def write_results(
     directory: Path,
     seconds: dict[str, float],
     told: Mapping[str, Any] = MappingProxyType({}),
+    made: Made | None = None,
 ) -> None:
     """Write the files of docs/block_folder.md into `directory`, replacing earlier results only when all is written.
 
     `seconds` (read, compile, solve, covariance) goes into summary.json with the time of writing, and so does what is
-    `told` of how the results came about. Raises what `whole_folder` raises.
+    `told` of how the results came about; the report says how they were `made`. Raises what `whole_folder` raises.
     """
     began = time.perf_counter()
     with whole_folder(directory) as work:
         for name in table_names(tables):
             getattr(tables, name).to_csv(work / f"{name}.csv", index=False)
-        (work / "report.html").write_text(report_page(tables, verdict), encoding="utf-8")
+        (work / "report.html").write_text(report_page(tables, verdict, made), encoding="utf-8")
         summary = summary_of(tables, verdict, seconds | {"write": time.perf_counter() - began})
         write_summary(summary | dict(told), work)
 
@@ -120,8 +120,3 @@ def _cameras(adjusted: Adjustment) -> dict:
         size = {"width_px": sensor.width_px, "height_px": sensor.height_px, "pixel_mm": sensor.pixel_mm}
         told[name] = size | model_keys(interior)
     return told
-
-
-def versions() -> dict[str, str]:
-    """Versions of jaxphoto and of what its numbers depend on."""
-    return {name: version(name) for name in _PACKAGES}

@@ -12,8 +12,11 @@ import pandas as pd
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.observations import AXES
+from jaxphoto.report.document import Element, Heading, Paragraph, rows_of
+from jaxphoto.report.made import Made, made_section, versions
 from jaxphoto.report.plots import drawn, new_figure
-from jaxphoto.report.results import versions, write_summary
+from jaxphoto.report.results import write_summary
+from jaxphoto.report.study_page import WholePicture, study_page
 from jaxphoto.report.tables import Tables
 from jaxphoto.sensitivity.exact import Sensitivity, sensitivity
 from jaxphoto.sensitivity.influence import DELTA0, Per, external_reliability, station_bias, variance_shares
@@ -153,8 +156,8 @@ def _rms(values: pd.Series) -> float:
     return float(np.sqrt((values**2).mean()))
 
 
-def write_sensitivity(tables: SensitivityTables, directory: Path, seconds: dict[str, float]) -> None:
-    """sensitivity.csv, variance_shares.csv, external_reliability.csv, summary.json, sensitivity.png in `directory`.
+def write_sensitivity(tables: SensitivityTables, directory: Path, seconds: dict[str, float], made: Made) -> None:
+    """Three tables, sensitivity.png, report.html and summary.json in `directory`.
 
     All of it is written before earlier results are replaced. Raises InputError where `directory` holds something that
     is not an earlier result.
@@ -164,8 +167,33 @@ def write_sensitivity(tables: SensitivityTables, directory: Path, seconds: dict[
         tables.bias.to_csv(work / "sensitivity.csv", index=False)
         tables.variance_shares.to_csv(work / "variance_shares.csv", index=False)
         tables.external_reliability.to_csv(work / "external_reliability.csv", index=False)
-        tables.figure().savefig(work / "sensitivity.png")
+        picture = WholePicture.of(tables.figure(), "changes by a station bias: exact, first-order and their difference")
+        (work / "sensitivity.png").write_bytes(picture.png)
+        page = study_page("Sensitivity", *_page(tables, picture, made))
+        (work / "report.html").write_text(page, encoding="utf-8")
         write_summary(_summary(tables, seconds | {"write": time.perf_counter() - began}), work)
+
+
+def _page(
+    tables: SensitivityTables, picture: WholePicture, made: Made
+) -> tuple[list[str], list[Element | WholePicture]]:
+    """Sentences and parts of the page: interior orientation and check points, and what most of each is of."""
+    adjusted = tables.adjusted
+    said = [
+        f"What a bias of {tables.bias_m:g} m in the stations of a {tables.per} does to each estimate; what each hangs "
+        "on; and what an error that no test finds would do.",
+        f"{adjusted.block.title or 'Block'}: sigma naught {float(adjusted.sigma0):.4g}, redundancy "
+        f"{adjusted.redundancy}, {len(tables.check)} check points.",
+    ]
+    shown = tables.bias["estimate"].str.startswith("interior")
+    shares = tables.variance_shares[tables.variance_shares["estimate"].str.startswith("interior")]
+    undetected = tables.external_reliability
+    undetected = undetected[undetected["estimate"].str.startswith("interior")]
+    parts: list[Element | WholePicture] = [picture, Heading("Changes of the interior orientation")]
+    parts += [rows_of(tables.bias[shown]), Paragraph("Every estimate stands in sensitivity.csv.")]
+    parts += [Heading("Which observations the variance is of"), rows_of(shares)]
+    parts += [Heading("What an undetected error does"), rows_of(undetected), *made_section(made)]
+    return said, parts
 
 
 def _summary(tables: SensitivityTables, seconds: dict[str, float]) -> dict:

@@ -8,30 +8,20 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-from jinja2 import Environment
-from markupsafe import Markup
 from rich.console import Console
 from rich.table import Table
 
 from jaxphoto.camera import InteriorOrientation, Sensor
-from jaxphoto.report.maps import png_of
-from jaxphoto.report.page_head import page_head
+from jaxphoto.report.document import Heading, Paragraph, rows_of
+from jaxphoto.report.made import Made, made_section, versions
 from jaxphoto.report.plots import new_figure
-from jaxphoto.report.results import versions, write_summary
+from jaxphoto.report.results import write_summary
+from jaxphoto.report.study_page import WholePicture, study_page
 from jaxphoto.stability import Analysis, Method
 from jaxphoto.writing import whole_folder
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-_PAGE = """{{ head("Stability") }}<body>
-<h1>Stability of interior orientation</h1>
-<p class="{{ 'good' if similar else 'bad' }}"><b>{{ verdict }}</b></p>
-{% for line in about %}<p>{{ line }}</p>{% endfor %}
-{{ table }}
-<img alt="offsets of the two bundles over the image" src="{{ picture }}">
-</body></html>
-"""
 
 
 class Compared(NamedTuple):
@@ -145,7 +135,7 @@ def _shown(row: Mapping[Hashable, Any]) -> dict[str, str]:
 
 def write_stability(
     analyses: Mapping[Method, Analysis], sets: tuple[Compared, Compared], sensor: Sensor, noise_mm: float,
-    method: Method, directory: Path,
+    method: Method, directory: Path, made: Made,
 ) -> None:  # fmt: skip
     """stability.csv, and of `method` offsets.csv and offsets.png; report.html and summary.json of it all.
 
@@ -154,23 +144,15 @@ def write_stability(
     table = stability_table(analyses, sensor.pixel_mm, noise_mm)
     chosen = analyses[method]
     verdict = f"{method}: {chosen.verdict(noise_mm)}"
-    content, picture = png_of(offsets_figure(chosen, sensor))
+    picture = WholePicture.of(offsets_figure(chosen, sensor), "offsets of the two bundles over the image")
+    about = [str(sets[0]), str(sets[1]), missing_covariances(sets)]
+    parts = [*map(Paragraph, about), Heading("By method"), rows_of(table), picture, *made_section(made)]
+    colour = "green" if chosen.similar(noise_mm) else "amber"
     with whole_folder(directory) as work:
         table.to_csv(work / "stability.csv", index=False)
         offsets_table(chosen).to_csv(work / "offsets.csv", index=False)
-        (work / "offsets.png").write_bytes(content)
-        page = (
-            Environment(autoescape=True)
-            .from_string(_PAGE)
-            .render(
-                head=page_head,
-                similar=chosen.similar(noise_mm),
-                verdict=verdict,
-                about=[str(sets[0]), str(sets[1]), missing_covariances(sets)],
-                table=Markup(table.to_html(index=False, border=0, na_rep="", float_format="{:.4g}".format)),
-                picture=picture,
-            )
-        )
+        (work / "offsets.png").write_bytes(picture.png)
+        page = study_page("Stability of interior orientation", [f"Aligned by {verdict}"], parts, colour)
         (work / "report.html").write_text(page, encoding="utf-8")
         summary = {
             "verdict": verdict,

@@ -16,6 +16,10 @@ from jaxphoto.report.digits import of_sigma, with_sigma
 
 # Columns whose numbers are as sure as the column `sigma` of the same row says.
 _BY_SIGMA = ("value", "estimate", "truth", "error", "first", "second", "difference", "residual", "amount")
+# Those of draws, by their scatter.
+_BY_SD = ("nominal", "mean", "q025", "q50", "q975")
+# Standard deviations by other names.
+_SIGMAS = ("sd", "predicted_sigma")
 # Names end in their units, the longest first.
 _UNITS = {
     "m_per_s": "m/s", "deg_per_s": "deg/s", "mm_per_s": "mm/s", "mm_per_h": "mm/h", "per_h": "1/h", "deg": "deg",
@@ -44,15 +48,25 @@ def _texts(table: pd.DataFrame, name: str) -> list[str]:
         return [head_of(v) if "[" not in v and _UNIT.search(v) else v for v in column.astype(str)]
     if not pd.api.types.is_float_dtype(column):
         return ["" if pd.isna(v) else _word(v) for v in column.astype(object)]
-    if name.startswith("sigma"):
+    if (name.startswith("sigma") and not name.startswith("sigma0")) or name in _SIGMAS:
         return ["" if np.isnan(v) else of_sigma(v) for v in column]
-    of = f"sigma_{name}" if f"sigma_{name}" in table else "sigma" if name in _BY_SIGMA and "sigma" in table else None
+    of = _sigma_of(table, name)
     digits = 10 if _COORDINATE.match(name) else 4
     sigmas = table[of] if of else np.full(len(table), np.nan)
     return [
         "" if np.isnan(v) else with_sigma(v, s) if s > 0 else f"{v:.{digits}g}"
         for v, s in zip(column, sigmas, strict=True)
     ]
+
+
+def _sigma_of(table: pd.DataFrame, name: str) -> str | None:
+    """The column of the standard deviations of another one, where there is one."""
+    own = (
+        f"sigma_{name}",
+        "sigma" if name in _BY_SIGMA else "",
+        "sd" if name in _BY_SD else "",
+    )
+    return next((of for of in own if of in table), None)
 
 
 def _word(value: object) -> str:

@@ -14,6 +14,7 @@ from jaxphoto.camera import constant_names, get_parameter, parameter_names
 from jaxphoto.compiling import call_compiled
 from jaxphoto.observations import AXES
 from jaxphoto.report.camera_drift_table import camera_drift_table
+from jaxphoto.report.check_points import check_point_table
 from jaxphoto.report.correlation_tables import correlation_ground_table, correlation_summary_table
 from jaxphoto.report.positional_accuracy import accuracy_table
 from jaxphoto.report.recovery import recovery_table
@@ -269,15 +270,8 @@ class Tables:
 
     @cached_property
     def check_points(self) -> pd.DataFrame:
-        """point, dX_m, dY_m, dZ_m: surveyed minus computed; empty where an axis was not surveyed."""
-        rows = check_discrepancies(self.adjusted)
-        points = list(dict.fromkeys(rows.who.tolist()))
-        place = {p: k for k, p in enumerate(points)}
-        values = np.full((len(points), 3), np.nan)
-        values[[place[p] for p in rows.who.tolist()], rows.axis] = rows.value
-        table = pd.DataFrame(values, columns=[f"d{a}_m" for a in AXES])
-        table.insert(0, "point", [self.adjusted.block.points[p] for p in points])
-        return table
+        """point, dX_m, dY_m, dZ_m: surveyed minus computed; sigma_dX_m, ...; empty where an axis was not surveyed."""
+        return check_point_table(self.adjusted, self.covariance)
 
     @cached_property
     def tested_accuracy(self) -> PositionalAccuracy:

@@ -26,7 +26,7 @@ from tests.marks import slow_but
 # do. The other kinds (surfaces of a lidar, fixed control, free shifts, ...) are slow only by what compiling takes.
 QUICK = ("everything", "inner", "inner_images", "inner_some", "minimal")
 KINDS = slow_but(QUICK, [name for name in VARIANTS if name not in ("cross", "two_cameras", "mount")])
-KINDS += slow_but(("field",), FIELDS)
+KINDS += slow_but((), FIELDS)
 # The defect of each.
 FREE_NETWORKS = {"inner": 6, "inner_images": 6, "inner_some": 6, "inner_scale": 7, "inner_shift": 3, "minimal": 6}
 

@@ -77,7 +77,7 @@ def test_round_trip_of_smac_keeps_what_is_static(write_folder, tmp_path):
         lambda text: text.strip() == text and text not in ("p1", "p2", "p4") and not harm_in(text)
     ),
 )
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_numbers_and_ids_come_back_exactly(write_folder, tmp_path_factory, values, sigma, name):
     folder = tmp_path_factory.mktemp("any")
     source = folder.parent / "source"

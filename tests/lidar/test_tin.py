@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 from scipy.interpolate import LinearNDInterpolator
 
 from jaxphoto.cloud import Cloud
@@ -10,6 +11,7 @@ from jaxphoto.lidar import HeightFlag, HeightSettings, heights_at
 from tests.lidar.clouds import places_over, read_autzen
 
 
+@pytest.mark.slow
 def test_tin_of_real_cloud_is_that_of_the_whole_triangulation(data_dir: Path) -> None:
     autzen = read_autzen(data_dir)
     places = places_over(autzen)

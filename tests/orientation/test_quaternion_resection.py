@@ -66,6 +66,7 @@ def test_it_says_how_it_came_to_its_end():
     assert found.sigma0**2 == pytest.approx(np.sum(found.residuals**2) / SIGMA**2 / (2 * 12 - 6))
 
 
+@pytest.mark.slow
 def test_four_points_in_space():
     # Two orientations may fit four points equally well; where only one does, its covariance is right.
     squares, refused = [], 0

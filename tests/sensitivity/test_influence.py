@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import hashlib
 import json
 
 import equinox as eqx
@@ -138,7 +139,12 @@ def test_tables_and_command(tmp_path) -> None:
     written = {path.name for path in (tmp_path / "s").iterdir()}
     assert written == {
         MARKER, "sensitivity.csv", "variance_shares.csv", "external_reliability.csv", "summary.json", "sensitivity.png",
+        "report.html",
     }  # fmt: skip
+    page = (tmp_path / "s" / "report.html").read_text(encoding="utf-8")
+    assert hashlib.sha256((EXAMPLES / "cross_block" / "image_points.csv").read_bytes()).hexdigest() in page
+    assert "jaxphoto sensitivity, " in page and "bias m 0.1" in page and "data:image/png" in page
+    assert page.count("<h2") == page.count('<a href="#') == 4
     bias = pd.read_csv(tmp_path / "s" / "sensitivity.csv")
     np.testing.assert_allclose(bias["exact"] - bias["first_order"], bias["difference"], atol=1e-15)
     assert set(bias["axis"]) == {"X", "Y", "Z"}

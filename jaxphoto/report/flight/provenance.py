@@ -2,11 +2,10 @@
 
 from collections.abc import Iterator
 
-from jaxphoto.report.certificate import option_word
 from jaxphoto.report.certificate_conditions import dates, told_conditions
 from jaxphoto.report.document import Element, Heading, Paragraph, Rows
 from jaxphoto.report.flight.source import FlightSource
-from jaxphoto.report.results import versions
+from jaxphoto.report.made import option_word, versions
 from jaxphoto.writing.inputs import digest_of_all
 
 

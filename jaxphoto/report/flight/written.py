@@ -13,8 +13,9 @@ from jaxphoto.report.flight.coverage import flight_words
 from jaxphoto.report.flight.page import flight_page
 from jaxphoto.report.flight.part import PartReport
 from jaxphoto.report.flight.source import FlightSource
+from jaxphoto.report.made import versions
 from jaxphoto.report.orientation import write_orientation
-from jaxphoto.report.results import versions, write_results, write_summary
+from jaxphoto.report.results import write_results, write_summary
 from jaxphoto.report.weights import component_tables
 from jaxphoto.writing import whole_folder
 

@@ -1,0 +1,70 @@
+"""The page of a study: what it found in sentences, then tables and pictures, in one file that opens offline."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from jinja2 import Environment
+from markupsafe import Markup
+
+from jaxphoto.report.document import Element, Heading
+from jaxphoto.report.document_html import contents, html_of
+from jaxphoto.report.findings import as_sentence
+from jaxphoto.report.maps import png_of, png_uri
+from jaxphoto.report.page_head import page_head
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_PAGE = """{{ head(title) }}<body>
+<h1>{{ title }}</h1>
+{% for sentence in said %}<p{{ kind }}>{{ sentence }}</p>
+{% endfor %}{{ contents }}
+{% for part in parts %}{{ part }}
+{% endfor %}</body></html>
+"""
+
+
+class WholePicture(NamedTuple):
+    """A picture of several panels, as wide as it is."""
+
+    png: bytes
+    uri: str
+    alt: str
+
+    @classmethod
+    def of(cls, figure: Figure, alt: str) -> WholePicture:
+        """A figure, for a page and a file beside it."""
+        return cls(*png_of(figure), alt)
+
+    @classmethod
+    def read(cls, file: Path, alt: str) -> WholePicture:
+        """A PNG that was written before."""
+        png = file.read_bytes()
+        return cls(png, png_uri(png), alt)
+
+
+def study_page(title: str, said: Sequence[str], parts: Iterable[Element | WholePicture], colour: str = "") -> str:
+    """The page as HTML; `said` stands first, in `colour` (green, amber, red) where it is a verdict."""
+    shown = list(parts)
+    headings = [part.text for part in shown if isinstance(part, Heading)]
+    return (
+        Environment(autoescape=True)
+        .from_string(_PAGE)
+        .render(
+            head=page_head,
+            title=title,
+            said=map(as_sentence, said),
+            kind=Markup(' class="verdict {}"').format(colour) if colour else "",
+            contents=contents(headings) if len(headings) > 1 else "",
+            parts=[_shown(part) for part in shown],
+        )
+    )
+
+
+def _shown(part: Element | WholePicture) -> Markup:
+    if isinstance(part, WholePicture):
+        return Markup('<div class="wide"><img alt="{}" src="{}"></div>').format(part.alt, part.uri)
+    return html_of(part)
