@@ -45,7 +45,7 @@ from jaxphoto.io.trajectory import Records, read_records, write_flight_csv, writ
 from jaxphoto.procedures.control.system import places, system_of
 from jaxphoto.unknowns import FIXED, FREE, Weighted
 from tests import sound_files
-from tests.io import control_files, test_bal, test_colmap, test_reconstructions
+from tests.io import control_files, oriented_files, test_bal, test_colmap, test_reconstructions
 from tests.io import test_cameras as cameras
 from tests.io import test_robotics_cameras as robotics
 from tests.io import test_surfaces as surfaces
@@ -364,6 +364,7 @@ READERS: dict[str, Reader] = {
             ("blocksexchange", test_reconstructions.write_blocks_exchange),
             ("bundler", test_reconstructions.write_bundler),
             ("pix4d", test_reconstructions.write_pix4d),
+            ("metashape", oriented_files.write_metashape),
         )
     },
     "dbat": Reader(text(**sound_files.DBAT), read_dbat),

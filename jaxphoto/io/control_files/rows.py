@@ -63,6 +63,9 @@ class SurveyRows:
         self._of: dict[str, tuple[list[float], list[float], bool, str]] = {}
         self._at: dict[tuple[str, ...], str] = {}
 
+    def __len__(self) -> int:
+        return len(self._of)
+
     def named_by(self, xyz: Sequence[float]) -> str:
         """The name of a point that has none: P1, P2 ..., one for each place."""
         return self._at.setdefault(tuple(map(repr, xyz)), f"P{len(self._at) + 1}")

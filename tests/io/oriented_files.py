@@ -1,0 +1,56 @@
+"""Exported photographs of `tests.io.test_exports`, with image points as texts beside them."""
+
+import numpy as np
+
+from jaxphoto.io import export
+from tests.io.test_exports import SENSOR, photographs
+
+
+def inside(camera="agisoft", kind="epsg"):
+    """Four photographs, with the image points that lie in their formats."""
+    p = photographs(camera, kind)
+    there = ((p.column_row > 0) & (p.column_row < [SENSOR.width_px, SENSOR.height_px])).all(axis=1)
+    return p._replace(image=p.image[there], point=p.point[there], column_row=p.column_row[there])
+
+
+def text_of_points(p, head, unit_mm=1.0):
+    """Image points in a text: in units of `unit_mm` from the middle, y up, or pixels where that is 0."""
+    lines = []
+    for name, rows in zip(p.files, p.rows_of_images, strict=True):
+        lines.append(head.format(name.rsplit(".", 1)[0]))
+        for k in rows.tolist():
+            column, row = p.column_row[k].tolist()
+            x, y = (column - SENSOR.width_px / 2) * SENSOR.pixel_mm, (SENSOR.height_px / 2 - row) * SENSOR.pixel_mm
+            at = (x / unit_mm, y / unit_mm) if unit_mm else (column, row)
+            lines.append(f"{p.points[p.point[k]]} {at[0]!r} {at[1]!r} 0")
+        lines.append("-99")
+    return "\n".join(lines) + "\n"
+
+
+BINGO = "{} H_9.6_7.2"
+
+
+def write_metashape(folder, camera="agisoft", kind="epsg", change=lambda text: text, ties=True):
+    """cameras.xml as `--to metashape` writes it, and BINGO's image points."""
+    p = inside(camera, kind)
+    export(p, folder, "metashape")
+    path = folder / "cameras.xml"
+    path.write_text(change(path.read_text()))
+    if ties:
+        (folder / "bingo.txt").write_text(text_of_points(p, BINGO))
+    return folder
+
+
+def markers(p, names, coordinates):
+    """Elements of a chunk: markers with coordinates, marked where the photographs show points of these names."""
+    own, marks = "", ""
+    for k, (name, (x, y, z)) in enumerate(zip(names, np.asarray(coordinates).tolist(), strict=True)):
+        enabled = "true" if k else "false"
+        place = f'<reference x="{x!r}" y="{y!r}" z="{z!r}" enabled="{enabled}"/>'
+        own += f'<marker id="{k}" label="{name}">{place}</marker>'
+        marks += f'<marker marker_id="{k}">'
+        for row in np.flatnonzero(p.point == p.points.index(name)):
+            column, line = p.column_row[row].tolist()
+            marks += f'<location camera_id="{p.image[row]}" pinned="true" x="{column!r}" y="{line!r}"/>'
+        marks += "</marker>"
+    return f'<markers>{own}</markers><frames><frame id="0"><markers>{marks}</markers></frame></frames>'

@@ -1,0 +1,164 @@
+"""Orientations with image points beside them: read as they were written, in map systems too; refused in a sentence."""
+
+import re
+
+import jax
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from jaxphoto.collinearity import ExteriorOrientation
+from jaxphoto.errors import InputError
+from jaxphoto.io import export, read_source
+from jaxphoto.io.block_folder.table_layout import XYZ
+from jaxphoto.io.exports.map_photographs import in_map
+from jaxphoto.io.reconstructions.metashape import read_metashape
+from tests.formulas import camera_from_object
+from tests.io.oriented_files import inside, markers, write_metashape
+from tests.io.test_exports import SENSOR, photographs
+from tests.io.test_reconstructions import _projected, free_of
+
+
+def misfits_px(block, p):
+    """Measured minus projected, from the start values and the points that were photographed."""
+    rows = block.image_points
+    points = p.xyz[[p.points.index(name) for name in block.points]]
+    if block.frame.kind == "epsg":
+        points = block.frame.map.local(p.frame.map.map(points))
+    at = jax.tree.map(lambda leaf: np.asarray(leaf)[np.asarray(rows.image)], block.start.unknowns.exterior)
+    (camera,) = block.sensors
+    found = np.asarray(rows.xy) - _projected(block.start.unknowns.interior[camera], at, points[np.asarray(rows.point)])
+    return found / block.sensors[camera].pixel_mm
+
+
+@pytest.mark.filterwarnings("ignore:.*fewer than")
+@pytest.mark.parametrize(("camera", "kind"), [("agisoft", "epsg"), ("agisoft fisheye", "local")])
+def test_cameras_of_metashape_and_image_points_of_bingo_are_a_block(tmp_path, camera, kind):
+    p = inside(camera, kind)
+    block = read_source(write_metashape(tmp_path / "in", camera, kind))
+    assert block.sensors["one"] == SENSOR and block.frame.kind == kind and block.datum.kind == "inner"
+    assert len(block.images) == len(set(p.image.tolist())) and len(block.image_points.image) > 60
+    assert np.abs(misfits_px(block, p)).max() < 1e-6
+    assert free_of(block, "one") == {"c_mm", "xp_mm", "yp_mm", "k1", "k2", "k3", "k4", "p1", "p2", "b1", "b2"}
+
+
+angle = st.floats(-3.1, 3.1)
+metres = st.floats(-2000.0, 2000.0)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    kind=st.sampled_from(["local", "epsg"]),
+    poses=st.lists(st.tuples(metres, metres, metres, angle, st.floats(-1.5, 1.5), angle), min_size=4, max_size=4),
+)
+@pytest.mark.filterwarnings("ignore:.*fewer than", "ignore:.*not read")
+def test_positions_and_rotations_of_metashape_come_back(tmp_path_factory, kind, poses):
+    folder = tmp_path_factory.mktemp("poses")
+    values = np.array(poses)
+    turn = np.stack([camera_from_object(*angles) for angles in values[:, 3:]])
+    p = photographs("agisoft", kind)._replace(exterior=ExteriorOrientation(values[:, :3], turn))
+    export(p, folder, "metashape")
+    rows = "".join(f"{k} {k}.5 {k}.25\n" for k in range(3))
+    (folder / "ties.txt").write_text("".join(f"{name} camera\n{rows}-99\n" for name in p.images))
+    table = read_metashape(folder).tables["images"]
+    wanted = in_map(p).exterior
+    order = [p.images.index(name) for name in table.text("image")]
+    position = np.stack([table.numbers(name) for name in XYZ], axis=1)
+    # A northing of a map has nine digits before those of a nanometre.
+    tolerance = 1e-9 if kind == "local" else 1e-8
+    np.testing.assert_allclose(position, np.asarray(wanted.position)[order], rtol=0, atol=tolerance)
+    angles = np.deg2rad(np.stack([table.numbers(f"{name}_deg") for name in ("omega", "phi", "kappa")], axis=1))
+    again = np.stack([camera_from_object(*row) for row in angles])
+    np.testing.assert_allclose(again, np.asarray(wanted.camera_from_object)[order], rtol=0, atol=1e-9)
+
+
+REAL = """<document version="2.0.0"><chunk label="Chunk 1"><sensors><sensor id="0" label="M3M" type="frame">
+<resolution width="5280" height="3956"/><property name="pixel_width" value="0.00335820"/>
+<calibration type="frame" class="adjusted"><resolution width="5280" height="3956"/><f>3705.4728792737214</f>
+<cx>11.6738523909</cx><cy>-27.7497969199</cy><k1>-0.0919367147</k1></calibration></sensor></sensors>
+<components><component id="0"><transform><rotation locked="true">0.8710699454 0.3070967021 -0.3833128821 -0.4909742007
+0.5658364395 -0.6623997719 0.0134716110 0.7651932691 0.6436596744</rotation>
+<translation locked="true">-2499366.429888 -4256836.520906 4029217.965003</translation>
+<scale locked="true">12.354192447331316</scale></transform></component></components>
+<cameras><group id="0" label="Group 1" type="folder"><camera id="0" sensor_id="0" component_id="0" label="one.JPG">
+<transform>-0.99988146 -0.00872749 0.01268391 7.04224697 -0.00842932 0.99969124 0.02337453 7.05403071
+-0.01288400 0.02326485 -0.99964631 0.43561421 0 0 0 1</transform></camera></group></cameras></chunk></document>"""
+
+
+def test_a_camera_of_metashape_itself_is_where_its_receiver_was_and_looks_down(tmp_path):
+    """One photograph of a flight that is public: its GNSS says -120.417985477, 39.41191747, 2420.109."""
+    # Two of it, because points of one photograph tie nothing.
+    twice = re.sub(r"(<camera .*?</camera>)", lambda m: m[1] + m[1].replace("one.JPG", "two.JPG"), REAL, flags=re.S)
+    (tmp_path / "cameras.xml").write_text(twice)
+    rows = "1 0.5 0.5\n2 -0.5 0.5\n3 0.5 -0.5\n-99\n"
+    (tmp_path / "ties.dat").write_text(f"one c\n{rows}two c\n{rows}")
+    images = read_metashape(tmp_path).tables["images"]
+    at = [images.numbers(name)[0] for name in ("longitude_deg", "latitude_deg", "height_m")]
+    assert np.abs((at - np.array([-120.417985477, 39.41191747, 2420.109])) / [1e-4, 1e-4, 10]).max() < 1
+    # Yaw was 179.9 degrees: the camera's x axis points west.
+    omega, phi, kappa = (images.numbers(f"{name}_deg")[0] for name in ("omega", "phi", "kappa"))
+    assert abs(omega) < 3 and abs(phi) < 3 and abs(abs(kappa) - 180) < 3
+
+
+@pytest.mark.filterwarnings("ignore:.*fewer than")
+def test_markers_of_metashape_are_control_and_tie_photographs(tmp_path):
+    p = inside()
+    names = [p.points[k] for k in np.argsort(-np.bincount(p.point, minlength=40))[:8]]
+    at = in_map(p).xyz[[p.points.index(name) for name in names]]
+    more = markers(p, names, at)
+    write_metashape(tmp_path / "in", change=lambda text: text.replace("</chunk>", more + "</chunk>"), ties=False)
+    block = read_source(tmp_path / "in")
+    assert set(block.points) == set(names) and block.datum.kind == "control"
+    assert len(block.check.who) == 3 and len(block.control.who) == 21
+    assert np.asarray(block.control.sigma).tolist() == [0.02, 0.02, 0.03] * 7
+    assert np.abs(misfits_px(block, p)).max() < 1e-6
+
+
+def _without(pattern):
+    return lambda text: re.sub(pattern, "", text, flags=re.S)
+
+
+def _metashape(change=lambda text: text, **more):
+    return lambda folder: write_metashape(folder, change=change, **more)
+
+
+REFUSED = {
+    "no ties": (_metashape(ties=False), "cameras.xml has no tie points and no marks.*as BINGO or PATB"),
+    "not aligned": (_metashape(_without("<transform>-?[0-9].*?</transform>")), "no camera is aligned; align"),
+    "cut": (_metashape(lambda text: text[:-30]), "cameras.xml: the XML is broken"),
+    "no sensor": (_metashape(_without("<calibration.*</calibration>")), "'a b': its sensor is not calibrated"),
+    "matrix": (_metashape(lambda text: text.replace(" 1.0</tr", " x</tr")), "'a b', transform: .* 16 fi"),
+    "scale": (_metashape(lambda text: text.replace(">1.0</scale>", ">-1</scale>")), "a scale of -1 cannot be"),
+    "moved": (
+        _metashape(lambda text: re.sub("<translation.*?</translation>", "<translation>0 0 0</translation>", text)),
+        "not on the earth",
+    ),
+    "spherical": (_metashape(lambda text: text.replace('"frame"', '"spherical"')), "'spherical' is not known here"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_cannot_be_is_told_in_a_sentence(tmp_path, name):
+    write, message = REFUSED[name]
+    with pytest.raises(InputError, match=message):
+        read_source(write(tmp_path / "in"))
+
+
+def test_photographs_that_nothing_ties_are_told(tmp_path):
+    write_metashape(tmp_path / "in", ties=False)
+    (tmp_path / "in" / "ties.txt").write_text("a b camera\n1 0.5 0.5\n2 0.5 0.6\n3 0.5 0.7\n-99\nlost camera\n")
+    with (
+        pytest.raises(InputError, match="no image shows 3 points that others show, too"),
+        pytest.warns(UserWarning, match="1 photographs are not in cameras.xml .*'lost camera'"),
+        pytest.warns(UserWarning, match=r"nor are 3 point\(s\) that fewer than two images show"),
+    ):
+        read_source(tmp_path / "in")
+
+
+def test_two_texts_of_image_points_are_one_too_many(tmp_path):
+    write_metashape(tmp_path / "in")
+    text = (tmp_path / "in" / "bingo.txt").read_text()
+    (tmp_path / "in" / "again.dat").write_text(text)
+    with pytest.raises(InputError, match=r"holds 2 files of image points \(again.dat, bingo.txt\); leave one"):
+        read_source(tmp_path / "in")
