@@ -365,8 +365,10 @@ READERS: dict[str, Reader] = {
             ("bundler", test_reconstructions.write_bundler),
             ("pix4d", test_reconstructions.write_pix4d),
             ("metashape", oriented_files.write_metashape),
+            ("texts", oriented_files.write_angles),
         )
     },
+    "texts-patb": Reader(written_by(oriented_files.write_patb), lambda folder: read_source(folder, "texts")),
     "dbat": Reader(text(**sound_files.DBAT), read_dbat),
     "photomodeler": Reader(text(**sound_files.PHOTOMODELER), read_photomodeler),
     "control-gcp-list": Reader(text(a=control_files.GCP_LIST), _control),

@@ -10,7 +10,7 @@ from jaxphoto.io import aicon, bal, colmap, dbat, photomodeler
 from jaxphoto.io.block_folder import BlockTables, assemble, write_block
 from jaxphoto.io.block_folder.block_reader import read_folder
 from jaxphoto.io.block_folder.table_layout import TOML
-from jaxphoto.io.reconstructions import blocks_exchange, bundler, metashape, open_mvg, open_sfm, pix4d
+from jaxphoto.io.reconstructions import blocks_exchange, bundler, metashape, open_mvg, open_sfm, pix4d, text_project
 
 
 class Format(NamedTuple):
@@ -35,6 +35,11 @@ FORMATS = {
     ),
     "metashape": Format(metashape.recognises, metashape.read_metashape, "cameras of Metashape, XML, with tie points"),
     "pix4d": Format(pix4d.recognises, pix4d.read_pix4d, "folder params of Pix4D"),
+    "texts": Format(
+        text_project.recognises,
+        text_project.read_text_project,
+        "folder of texts: omega, phi, kappa or PATB's matrices, image points of BINGO or PATB, and a camera file",
+    ),
     "bundler": Format(bundler.recognises, bundler.read_bundler, "bundle.out of Bundler, VisualSFM"),
 }
 """The formats that `read_source` knows, in the order of help."""

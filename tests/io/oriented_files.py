@@ -3,6 +3,7 @@
 import numpy as np
 
 from jaxphoto.io import export
+from jaxphoto.io.exports.map_photographs import in_map
 from tests.io.test_exports import SENSOR, photographs
 
 
@@ -54,3 +55,31 @@ def markers(p, names, coordinates):
             marks += f'<location camera_id="{p.image[row]}" pinned="true" x="{column!r}" y="{line!r}"/>'
         marks += "</marker>"
     return f'<markers>{own}</markers><frames><frame id="0"><markers>{marks}</markers></frame></frames>'
+
+
+PATB = "{} 8800.0 0"
+
+
+def write_angles(folder, kind="epsg", change=lambda text: text, points="bingo"):
+    """exterior.txt and camera.toml as `--to opk` writes them, and image points in one of three forms."""
+    p = inside("opencv", kind)
+    export(p, folder, "opk")
+    path = folder / "exterior.txt"
+    path.write_text(change(path.read_text()))
+    head, unit = {"bingo": (BINGO, 1.0), "patb": (PATB, 1e-3), "pix4d": ("{}", 0.0)}[points]
+    (folder / "ties.dat").write_text(text_of_points(p, head, unit))
+    return folder
+
+
+def write_patb(folder, kind="local", turned=False, change=lambda text: text):
+    """PATB's orientations, in three rows a photograph, with PATB's image points and the camera of `--to opk`."""
+    p = inside("opencv", kind)
+    write_angles(folder, kind, points="patb")
+    (folder / "exterior.txt").unlink()
+    on_map = in_map(p).exterior
+    lines = []
+    for name, at, r in zip(p.images, *map(np.asarray, (on_map.position, on_map.camera_from_object)), strict=True):
+        a = [f"{value:.17g}" for value in (r if turned else r.T).ravel()]
+        lines += [" ".join([name, "8800.0", *map(repr, at.tolist())]), " ".join(a[:5]), " ".join(a[5:])]
+    (folder / "patb.ori").write_text(change("\n".join(lines) + "\n"))
+    return folder

@@ -14,8 +14,9 @@ from jaxphoto.io import export, read_source
 from jaxphoto.io.block_folder.table_layout import XYZ
 from jaxphoto.io.exports.map_photographs import in_map
 from jaxphoto.io.reconstructions.metashape import read_metashape
+from jaxphoto.io.reconstructions.text_project import read_text_project
 from tests.formulas import camera_from_object
-from tests.io.oriented_files import inside, markers, write_metashape
+from tests.io.oriented_files import inside, markers, write_angles, write_metashape, write_patb
 from tests.io.test_exports import SENSOR, photographs
 from tests.io.test_reconstructions import _projected, free_of
 
@@ -101,6 +102,52 @@ def test_a_camera_of_metashape_itself_is_where_its_receiver_was_and_looks_down(t
     assert abs(omega) < 3 and abs(phi) < 3 and abs(abs(kappa) - 180) < 3
 
 
+TEXTS = {
+    "bingo": lambda folder: write_angles(folder),
+    "pixels": lambda folder: write_angles(folder, "local", points="pix4d"),
+    "gon": lambda folder: write_angles(folder, change=in_gon, points="patb"),
+    "matrices": lambda folder: write_patb(folder),
+    "matrices turned": lambda folder: write_patb(folder, turned=True),
+}
+
+
+def in_gon(text):
+    """Angles in gon before the positions, and said so."""
+    lines = [line for line in text.split("\n") if line]
+    head = [line.replace("degrees", "gon") for line in lines if line.startswith("#")]
+    rows = [line.split("\t") for line in lines if not line.startswith(("#", "imageName"))]
+    turned = [[row[0], *(repr(float(v) / 0.9) for v in row[4:]), *row[1:4]] for row in rows]
+    return "\n".join([*head, "imageName omega phi kappa X Y Z", *map(" ".join, turned)])
+
+
+@pytest.mark.filterwarnings("ignore:.*fewer than")
+@pytest.mark.parametrize("name", TEXTS)
+def test_texts_of_orientations_image_points_and_a_camera_are_a_block(tmp_path, name):
+    block = read_source(TEXTS[name](tmp_path / "in"))
+    p = inside("opencv", block.frame.kind)
+    assert block.sensors["camera"] == SENSOR and set(block.images) <= set(p.images) and len(block.images) > 2
+    assert np.abs(misfits_px(block, p)).max() < 1e-6
+    assert free_of(block, "camera") == {"c_mm", "xp_mm", "yp_mm", "k1", "k2", "k3", "p1", "p2", "b1"}
+
+
+@settings(max_examples=25, deadline=None)
+@given(poses=st.lists(st.tuples(metres, metres, metres, angle, st.floats(-1.5, 1.5), angle), min_size=4, max_size=4))
+def test_positions_and_angles_come_back(tmp_path_factory, poses):
+    folder, values = tmp_path_factory.mktemp("angles"), np.array(poses)
+    turn = np.stack([camera_from_object(*angles) for angles in values[:, 3:]])
+    p = photographs("opencv", "local")._replace(exterior=ExteriorOrientation(values[:, :3], turn))
+    export(p, folder, "opk")
+    rows = "".join(f"{k} {k}.5 {k}.25\n" for k in range(3))
+    (folder / "ties.txt").write_text("".join(f"{name} camera\n{rows}-99\n" for name in p.images))
+    table = read_text_project(folder).tables["images"]
+    order = [p.images.index(name) for name in table.text("image")]
+    position = np.stack([table.numbers(name) for name in XYZ], axis=1)
+    np.testing.assert_allclose(position, values[order, :3], rtol=0, atol=1e-9)
+    angles = np.deg2rad(np.stack([table.numbers(f"{name}_deg") for name in ("omega", "phi", "kappa")], axis=1))
+    again = np.stack([camera_from_object(*row) for row in angles])
+    np.testing.assert_allclose(again, turn[order], rtol=0, atol=1e-9)
+
+
 @pytest.mark.filterwarnings("ignore:.*fewer than")
 def test_markers_of_metashape_are_control_and_tie_photographs(tmp_path):
     p = inside()
@@ -123,6 +170,25 @@ def _metashape(change=lambda text: text, **more):
     return lambda folder: write_metashape(folder, change=change, **more)
 
 
+def _angles(change):
+    return lambda folder: write_angles(folder, change=change) / "exterior.txt"
+
+
+def _patb(change):
+    return lambda folder: write_patb(folder, change=change) / "patb.ori"
+
+
+def without(folder, name):
+    (folder / name).unlink()
+    return folder
+
+
+def appended(folder, text):
+    path = folder / "ties.dat"
+    path.write_text(path.read_text() + text)
+    return folder
+
+
 REFUSED = {
     "no ties": (_metashape(ties=False), "cameras.xml has no tie points and no marks.*as BINGO or PATB"),
     "not aligned": (_metashape(_without("<transform>-?[0-9].*?</transform>")), "no camera is aligned; align"),
@@ -134,6 +200,15 @@ REFUSED = {
         _metashape(lambda text: re.sub("<translation.*?</translation>", "<translation>0 0 0</translation>", text)),
         "not on the earth",
     ),
+    "row": (_angles(lambda text: text + "lost 1 2 3\n" * 2), "row 8: 'lost 1 2 3' is not name, X, Y, Z, omega"),
+    "angle": (_angles(lambda text: text + "x.jpg 1 2 3 4 5 1e99\n" * 2), "row 8: '1 2 3 4 5 1e99' is not 6 numbers"),
+    "system": (_angles(lambda text: text.replace("EPSG:32633", "EPSG:99999")), "EPSG code 99999 is unknown"),
+    "no camera": (lambda folder: without(write_angles(folder), "camera.toml"), "0 camera files and needs one"),
+    "no points": (lambda folder: without(write_angles(folder), "ties.dat") / "exterior.txt", "has no image points for"),
+    "point": (lambda folder: appended(write_angles(folder), "a b c\n7 1\n"), "row [0-9]+: '7 1' is not point"),
+    "xy": (lambda folder: appended(write_angles(folder), "a b c\n7 1 x\n"), "'1 x' is not 2 numbers"),
+    "matrix end": (_patb(lambda text: text.rsplit("\n", 2)[0]), "patb.ori, row 10: .* first of three rows"),
+    "matrix row": (_patb(lambda text: text.rstrip() + "x\n"), "patb.ori, row 12: .* is not 4 numbers"),
     "spherical": (_metashape(lambda text: text.replace('"frame"', '"spherical"')), "'spherical' is not known here"),
 }  # fmt: skip
 

@@ -44,7 +44,7 @@ _HEAD = 2_000_000
 _PARAMETERS = {"f": "c_mm", "cx": "xp_mm", "cy": "yp_mm"} | {name: name for name in Agisoft.coefficients}
 
 
-class _Photo(NamedTuple):
+class _Aligned(NamedTuple):
     label: str
     sensor: str
     """The id of its sensor."""
@@ -129,7 +129,7 @@ def _opens_so(path: Path) -> bool:
     return all(word in head for word in _OPENS)
 
 
-def _photos(path: Path, chunk: ElementTree.Element) -> tuple[list[_Photo], str]:
+def _photos(path: Path, chunk: ElementTree.Element) -> tuple[list[_Aligned], str]:
     """The oriented photographs of the largest component, and that component; a UserWarning tells of the others."""
     photos, unposed = [], 0
     for camera in chunk.iterfind("cameras//camera"):
@@ -139,7 +139,7 @@ def _photos(path: Path, chunk: ElementTree.Element) -> tuple[list[_Photo], str]:
         elif not label:
             raise InputError(f"{path.name}: a <camera> has no label; export the cameras anew")
         else:
-            photos.append(_Photo(label, camera.get("sensor_id", ""), camera.get("component_id", ""), transform))
+            photos.append(_Aligned(label, camera.get("sensor_id", ""), camera.get("component_id", ""), transform))
     count = Counter(photo.component for photo in photos)
     component = max(count, key=lambda key: count[key], default="")
     other = len(photos) - count[component]

@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from jaxphoto.block import Frame
 from jaxphoto.errors import InputError
-from jaxphoto.georeferencing.map_frame import place_from_geocentric
+from jaxphoto.georeferencing.map_frame import MapFrame, map_name, place_from_geocentric
 
 WGS84 = 4326
 # Distances (m) from the centre of the earth, from the poles to high above the equator: no local system reaches there.
@@ -45,9 +45,23 @@ def on_map(
             f"{file}: photographs are not on the earth where its transform puts them; export it with its transform, or "
             "in local coordinates"
         )
-    longitude, latitude, _ = np.median(place_from_geocentric(code, centres), axis=0)
-    frame = Frame("epsg", code, vertical, "true", (round(float(longitude), 4), round(float(latitude), 4), 0.0))
+    frame = _amid(code, vertical, place_from_geocentric(code, centres))
     system = frame.map
     turn, moved = system.geocentric_from_local()
     local = (centres - moved) @ turn
     return OnMap(frame, system.map(local), rotations @ turn @ system.local_from_grid(local))
+
+
+def frame_of(file: str, code: int, vertical: int | None, positions: Float[np.ndarray, "images 3"]) -> Frame:
+    """The frame of positions in the EPSG system `code`. Raises InputError where they are none of it, and what
+    `MapFrame` raises."""
+    places = MapFrame(code, vertical, (0.0, 0.0, 0.0)).place(positions)
+    if not np.isfinite(places).all():
+        raise InputError(f"{file}: positions are no places of {map_name(code, vertical)}; correct the system")
+    return _amid(code, vertical, places)
+
+
+def _amid(code: int, vertical: int | None, places: Float[np.ndarray, "n 3"]) -> Frame:
+    """With a round place amid others as its origin."""
+    longitude, latitude, _ = np.median(places, axis=0)
+    return Frame("epsg", code, vertical, "true", (round(float(longitude), 4), round(float(latitude), 4), 0.0))
