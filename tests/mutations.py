@@ -27,7 +27,7 @@ from PIL import Image
 from jaxphoto.camera import ImageMotion, InteriorOrientation, OpenCv, RollingShutter
 from jaxphoto.errors import JaxphotoError
 from jaxphoto.image_measurement import read_grey
-from jaxphoto.io import clouds, read_block, read_recipe, read_source, write_block
+from jaxphoto.io import clouds, export, read_block, read_recipe, read_source, write_block
 from jaxphoto.io.cameras import read_camera_file, write_camera_file
 from jaxphoto.io.conditions import read_conditions
 from jaxphoto.io.control_files import read_control
@@ -373,6 +373,12 @@ READERS: dict[str, Reader] = {
     "photomodeler": Reader(text(**sound_files.PHOTOMODELER), read_photomodeler),
     "control-gcp-list": Reader(text(a=control_files.GCP_LIST), _control),
     "control-metashape": Reader(text(a=control_files.MARKERS), _control),
+    "control-geojson": Reader(text(a=control_files.GEO_JSON), _control),
+    "control-geopackage": Reader(
+        written_by(lambda folder: export(oriented_files.inside("opencv"), folder, "geopackage")),
+        lambda folder: read_control(folder / "photographs.gpkg"),
+        ("photographs.gpkg",),
+    ),
     "control-reference": Reader(text(a=control_files.REFERENCE), _control),
     "control-pix4d": Reader(
         text(a=control_files.PIX4D, b=control_files.PIX4D_MARKS),

@@ -20,10 +20,12 @@ class Cells(NamedTuple):
     file: str
     records: list[list[str]]
     rows: list[int]
+    called: str = "row"
+    """What the file calls a row."""
 
     def place(self, k: int) -> str:
         """File and row, as messages name them."""
-        return f"{self.file}, row {self.rows[k]}"
+        return f"{self.file}, {self.called} {self.rows[k]}"
 
     def bad(self, k: int, message: str) -> InputError:
         """An error about one row."""
