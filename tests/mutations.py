@@ -366,6 +366,8 @@ READERS: dict[str, Reader] = {
             ("pix4d", test_reconstructions.write_pix4d),
             ("metashape", oriented_files.write_metashape),
             ("texts", oriented_files.write_angles),
+            ("nerfstudio", oriented_files.write_nerfstudio),
+            ("orthority", oriented_files.write_orthority),
         )
     },
     "texts-patb": Reader(written_by(oriented_files.write_patb), lambda folder: read_source(folder, "texts")),

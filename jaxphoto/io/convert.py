@@ -10,7 +10,17 @@ from jaxphoto.io import aicon, bal, colmap, dbat, photomodeler
 from jaxphoto.io.block_folder import BlockTables, assemble, write_block
 from jaxphoto.io.block_folder.block_reader import read_folder
 from jaxphoto.io.block_folder.table_layout import TOML
-from jaxphoto.io.reconstructions import blocks_exchange, bundler, metashape, open_mvg, open_sfm, pix4d, text_project
+from jaxphoto.io.reconstructions import (
+    blocks_exchange,
+    bundler,
+    metashape,
+    nerfstudio,
+    open_mvg,
+    open_sfm,
+    orthority,
+    pix4d,
+    text_project,
+)
 
 
 class Format(NamedTuple):
@@ -35,6 +45,14 @@ FORMATS = {
     ),
     "metashape": Format(metashape.recognises, metashape.read_metashape, "cameras of Metashape, XML, with tie points"),
     "pix4d": Format(pix4d.recognises, pix4d.read_pix4d, "folder params of Pix4D"),
+    "nerfstudio": Format(
+        nerfstudio.recognises, nerfstudio.read_nerfstudio, "transforms.json of nerfstudio, with image points"
+    ),
+    "orthority": Format(
+        orthority.recognises,
+        orthority.read_orthority,
+        "parameters of orthority, with image points",
+    ),
     "texts": Format(
         text_project.recognises,
         text_project.read_text_project,

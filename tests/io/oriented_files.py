@@ -1,5 +1,9 @@
 """Exported photographs of `tests.io.test_exports`, with image points as texts beside them."""
 
+import csv
+import json
+import math
+
 import numpy as np
 
 from jaxphoto.io import export
@@ -82,4 +86,43 @@ def write_patb(folder, kind="local", turned=False, change=lambda text: text):
         a = [f"{value:.17g}" for value in (r if turned else r.T).ravel()]
         lines += [" ".join([name, "8800.0", *map(repr, at.tolist())]), " ".join(a[:5]), " ".join(a[5:])]
     (folder / "patb.ori").write_text(change("\n".join(lines) + "\n"))
+    return folder
+
+
+def write_nerfstudio(folder, camera="opencv", change=lambda content: content):
+    """transforms.json as `--to nerfstudio` writes it, and image_points.csv in place of a text."""
+    p = inside(camera, "local")
+    export(p, folder, "nerfstudio")
+    path = folder / "transforms.json"
+    path.write_text(json.dumps(change(json.loads(path.read_text()))))
+    with (folder / "image_points.csv").open("w", newline="") as file:
+        table = csv.writer(file)
+        table.writerow(["image", "point", "column_px", "row_px"])
+        for i, j, at in zip(p.image.tolist(), p.point.tolist(), p.column_row.tolist(), strict=True):
+            table.writerow([p.images[i], p.points[j], *map(repr, at)])
+    return folder
+
+
+def write_orthority(folder, camera="opencv", kind="epsg", collection=True, change=lambda text: text):
+    """Parameters as `--to orthority` writes them, the exterior ones as GeoJSON in radians, and BINGO's image points."""
+    p = inside(camera, kind)
+    export(p, folder, "orthority")
+    table = folder / "ext_param.csv"
+    if collection:
+        with table.open() as file:
+            rows = list(csv.DictReader(file))
+        system = {"world_crs": (folder / "ext_param.prj").read_text().strip()} if kind == "epsg" else {"world_crs": ""}
+        own = [
+            {"filename": row["filename"], "camera": row["camera"], "xyz": [float(row[k]) for k in "xyz"]}
+            | {"opk": [math.radians(float(row[k])) for k in ("omega", "phi", "kappa")]}
+            for row in rows
+        ]
+        point = {"type": "Point", "coordinates": [0.0, 0.0]}
+        features = [{"type": "Feature", "geometry": point, "properties": values} for values in own]
+        text = json.dumps({"type": "FeatureCollection", **system, "features": features})
+        (folder / "ext_param.geojson").write_text(change(text))
+        table.unlink()
+    else:
+        table.write_text(change(table.read_text()))
+    (folder / "bingo.txt").write_text(text_of_points(p, BINGO))
     return folder

@@ -1,5 +1,6 @@
 """Orientations with image points beside them: read as they were written, in map systems too; refused in a sentence."""
 
+import dataclasses
 import re
 
 import jax
@@ -8,15 +9,24 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from jaxphoto.camera import get_parameter, parameter_names
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import InputError
-from jaxphoto.io import export, read_source
+from jaxphoto.io import FORMATS, export, read_source
 from jaxphoto.io.block_folder.table_layout import XYZ
 from jaxphoto.io.exports.map_photographs import in_map
 from jaxphoto.io.reconstructions.metashape import read_metashape
 from jaxphoto.io.reconstructions.text_project import read_text_project
 from tests.formulas import camera_from_object
-from tests.io.oriented_files import inside, markers, write_angles, write_metashape, write_patb
+from tests.io.oriented_files import (
+    inside,
+    markers,
+    write_angles,
+    write_metashape,
+    write_nerfstudio,
+    write_orthority,
+    write_patb,
+)
 from tests.io.test_exports import SENSOR, photographs
 from tests.io.test_reconstructions import _projected, free_of
 
@@ -130,6 +140,57 @@ def test_texts_of_orientations_image_points_and_a_camera_are_a_block(tmp_path, n
     assert free_of(block, "camera") == {"c_mm", "xp_mm", "yp_mm", "k1", "k2", "k3", "p1", "p2", "b1"}
 
 
+PARAMETERS = {
+    "nerfstudio opencv": (lambda folder: write_nerfstudio(folder), "opencv"),
+    "nerfstudio fisheye": (lambda folder: write_nerfstudio(folder, "fisheye"), "fisheye"),
+    "nerfstudio cameras of frames": (
+        lambda f: write_nerfstudio(f, change=lambda t: {"frames": [{**t, **own} for own in t["frames"]]}), "opencv",
+    ),
+    "orthority collection": (lambda folder: write_orthority(folder), "opencv"),
+    "orthority table": (lambda folder: write_orthority(folder, "rational", collection=False), "rational"),
+    "orthority local": (lambda folder: write_orthority(folder, "fisheye", "local"), "fisheye"),
+}  # fmt: skip
+
+
+@pytest.mark.filterwarnings("ignore:.*fewer than")
+@pytest.mark.parametrize("name", PARAMETERS)
+def test_parameters_and_image_points_are_a_block(tmp_path, name):
+    write, camera = PARAMETERS[name]
+    block = read_source(write(tmp_path / "in"))
+    (own,) = block.sensors
+    assert np.abs(misfits_px(block, inside(camera, block.frame.kind))).max() < 1e-6
+    assert {"c_mm", "xp_mm", "yp_mm", "k1", "k2"} <= free_of(block, own)
+    # Pixels have no size in nerfstudio.
+    assert block.sensors[own] == (SENSOR if "orthority" in name else dataclasses.replace(SENSOR, pixel_mm=0.001))
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    format=st.sampled_from(["nerfstudio", "orthority"]),
+    poses=st.lists(st.tuples(metres, metres, metres, angle, st.floats(-1.5, 1.5), angle), min_size=4, max_size=4),
+)
+def test_poses_come_back(tmp_path_factory, format, poses):
+    folder, values = tmp_path_factory.mktemp("poses"), np.array(poses)
+    turn = np.stack([camera_from_object(*angles) for angles in values[:, 3:]])
+    p = photographs("opencv", "local")._replace(exterior=ExteriorOrientation(values[:, :3], turn))
+    export(p, folder, format)
+    rows = "".join(f"{k} {k}.5 {k}.25\n" for k in range(3))
+    (folder / "ties.txt").write_text("".join(f"{name} camera\n{rows}-99\n" for name in p.images))
+    tables = FORMATS[format].read(folder)
+    table, (camera,) = tables.tables["images"], tables.settings["cameras"].values()
+    order = [p.images.index(name) for name in table.text("image")]
+    position = np.stack([table.numbers(name) for name in XYZ], axis=1)
+    np.testing.assert_allclose(position, values[order, :3], rtol=0, atol=1e-9)
+    angles = np.deg2rad(np.stack([table.numbers(f"{name}_deg") for name in ("omega", "phi", "kappa")], axis=1))
+    again = np.stack([camera_from_object(*row) for row in angles])
+    np.testing.assert_allclose(again, turn[order], rtol=0, atol=1e-9)
+    given = p.cameras["one"].interior
+    scale = camera["pixel_mm"] / SENSOR.pixel_mm
+    interior = {key: value / scale if key.endswith("_mm") else value for key, value in camera["interior"].items()}
+    for name in parameter_names(given):
+        assert interior[name] == pytest.approx(float(get_parameter(given, name)), abs=1e-9)
+
+
 @settings(max_examples=25, deadline=None)
 @given(poses=st.lists(st.tuples(metres, metres, metres, angle, st.floats(-1.5, 1.5), angle), min_size=4, max_size=4))
 def test_positions_and_angles_come_back(tmp_path_factory, poses):
@@ -178,13 +239,27 @@ def _patb(change):
     return lambda folder: write_patb(folder, change=change) / "patb.ori"
 
 
+def _nerf(change):
+    return lambda folder: write_nerfstudio(folder, change=change)
+
+
+def _orthority(old, new):
+    return lambda folder: write_orthority(folder, change=lambda text: text.replace(old, new))
+
+
+def changed(folder, name, old, new):
+    path = folder / name
+    path.write_text(path.read_text().replace(old, new))
+    return folder
+
+
 def without(folder, name):
     (folder / name).unlink()
     return folder
 
 
-def appended(folder, text):
-    path = folder / "ties.dat"
+def appended(folder, text, name="ties.dat"):
+    path = folder / name
     path.write_text(path.read_text() + text)
     return folder
 
@@ -209,6 +284,21 @@ REFUSED = {
     "xy": (lambda folder: appended(write_angles(folder), "a b c\n7 1 x\n"), "'1 x' is not 2 numbers"),
     "matrix end": (_patb(lambda text: text.rsplit("\n", 2)[0]), "patb.ori, row 10: .* first of three rows"),
     "matrix row": (_patb(lambda text: text.rstrip() + "x\n"), "patb.ori, row 12: .* is not 4 numbers"),
+    "frames": (_nerf(lambda t: {**t, "frames": 5}), "has no list of frames; give transforms.json"),
+    "model": (_nerf(lambda t: {**t, "camera_model": "EQUIRECTANGULAR"}), "'EQUIRECTANGULAR' is not known here"),
+    "focal": (_nerf(lambda t: {**t, "fl_x": 0}), "fl_x: 0 is not positive"),
+    "pose": (_nerf(lambda t: {**t, "frames": [{**f, "transform_matrix": [1]} for f in t["frames"]]}), "is not 4 x"),
+    "no table": (lambda f: without(write_nerfstudio(f), "image_points.csv"), "json has no image points, and none are"),
+    "pixel": (
+        lambda f: appended(write_nerfstudio(f), "f,p1,x,2\n", "image_points.csv"), "points.csv, row [0-9]+: column_px",
+    ),
+    "opk": (_orthority('"opk": [', '"opk": ["x", '), "ext_param.geojson, feature 1: .* is not 3 finite numbers"),
+    "world": (_orthority("EPSG:32633", "nowhere"), "'nowhere' names no coordinate system"),
+    "camera": (_orthority('"camera": "one"', '"camera": "two"'), "photograph 1: there is no camera 'two' in the int"),
+    "interior": (
+        lambda f: changed(write_orthority(f), "int_param.yaml", ": brown", ": other"), r"\[one\] type: 'other' is",
+    ),
+    "yaml": (lambda f: changed(write_orthority(f), "int_param.yaml", "type: ", "type: {"), "no YAML that can be read"),
     "spherical": (_metashape(lambda text: text.replace('"frame"', '"spherical"')), "'spherical' is not known here"),
 }  # fmt: skip
 

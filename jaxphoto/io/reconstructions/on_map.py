@@ -7,7 +7,8 @@ from jaxtyping import Float
 
 from jaxphoto.block import Frame
 from jaxphoto.errors import InputError
-from jaxphoto.georeferencing.map_frame import MapFrame, map_name, place_from_geocentric
+from jaxphoto.georeferencing.map_frame import MapFrame, place_from_geocentric
+from jaxphoto.procedures.control.system import system_of
 
 WGS84 = 4326
 # Distances (m) from the centre of the earth, from the poles to high above the equator: no local system reaches there.
@@ -52,13 +53,21 @@ def on_map(
     return OnMap(frame, system.map(local), rotations @ turn @ system.local_from_grid(local))
 
 
-def frame_of(file: str, code: int, vertical: int | None, positions: Float[np.ndarray, "images 3"]) -> Frame:
-    """The frame of positions in the EPSG system `code`. Raises InputError where they are none of it, and what
-    `MapFrame` raises."""
-    places = MapFrame(code, vertical, (0.0, 0.0, 0.0)).place(positions)
+def frame_of_words(file: str, words: str, positions: Float[np.ndarray, "images 3"]) -> Frame:
+    """The frame of positions in the system that `words` name: an EPSG code, WKT, a string of PROJ, or "local".
+
+    Raises InputError where they name none, or one without EPSG code, where positions are no places of it, and what
+    `MapFrame` raises.
+    """
+    system = system_of(words, file)
+    if system.crs is None:
+        return Frame("local")
+    if system.code is None:
+        raise InputError(f"{file}: its system ({system.name}) has no EPSG code; write EPSG:25832, say, in its place")
+    places = MapFrame(system.code, system.vertical, (0.0, 0.0, 0.0)).place(positions)
     if not np.isfinite(places).all():
-        raise InputError(f"{file}: positions are no places of {map_name(code, vertical)}; correct the system")
-    return _amid(code, vertical, places)
+        raise InputError(f"{file}: positions are no places of {system.name}; correct the system")
+    return _amid(system.code, system.vertical, places)
 
 
 def _amid(code: int, vertical: int | None, places: Float[np.ndarray, "n 3"]) -> Frame:

@@ -14,11 +14,10 @@ from jaxphoto.io.block_folder import BlockTables
 from jaxphoto.io.cameras import read_camera_file
 from jaxphoto.io.reconstructions import pix4d
 from jaxphoto.io.reconstructions.exterior_text import ExteriorText, is_exterior, read_exterior
-from jaxphoto.io.reconstructions.on_map import frame_of
+from jaxphoto.io.reconstructions.on_map import frame_of_words
 from jaxphoto.io.reconstructions.points_beside import PhotographCamera, Shown, measured_texts, points_beside
 from jaxphoto.io.reconstructions.rays import ray_misfit
 from jaxphoto.io.reconstructions.tied_photographs import TiedCamera, TiedPhotographs, estimated, free_network
-from jaxphoto.procedures.control.system import system_of
 
 _EXTERIORS = (".txt", ".csv", ".dat", ".ori", ".eo", ".opk", ".pat", ".out", "")
 _CAMERAS = (".toml", ".xml", ".yml", ".yaml", ".json", ".cameramodel")
@@ -71,7 +70,7 @@ def read_text_project(source: Path) -> BlockTables:
             shown.image,
             shown.point,
             shown.column_row,
-            _frame(path, given),
+            frame_of_words(path.name, given.system, given.positions) if given.system else Frame("local"),
         )
     )
 
@@ -103,13 +102,3 @@ def _turned(given: ExteriorText, camera: TiedCamera, shown: Shown) -> Float[np.n
     other = np.swapaxes(rotations, 1, 2)
     own, turned = (ray_misfit(given.positions, r, rays, shown.image, shown.point) for r in (rotations, other))
     return other if turned * _WORSE < own else rotations
-
-
-def _frame(path: Path, given: ExteriorText) -> Frame:
-    """The frame of the file; local where nobody names a system."""
-    system = system_of(given.system or "local", path.name)
-    if system.crs is None:
-        return Frame("local")
-    if system.code is None:
-        raise InputError(f"{path.name}: its system ({system.name}) has no EPSG code; write like # EPSG:25832 into it")
-    return frame_of(path.name, system.code, system.vertical, given.positions)

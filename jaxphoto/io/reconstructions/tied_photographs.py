@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 from jaxphoto.block import Frame
 from jaxphoto.camera import InteriorOrientation, Sensor, get_parameter, parameter_names, set_parameter
 from jaxphoto.collinearity import ExteriorOrientation
-from jaxphoto.errors import InputError, few
+from jaxphoto.errors import InputError, few, quoted
 from jaxphoto.io.block_folder import BlockTables
 from jaxphoto.io.block_folder.camera_section import Camera, camera_section
 from jaxphoto.io.block_folder.frame_sections import frame_section
@@ -164,7 +164,7 @@ def _check_tied(given: TiedPhotographs, names: np.ndarray, kept: np.ndarray) -> 
         )
     left = np.delete(names, kept)
     if len(left):
-        told = few(left.tolist())
+        told = few([quoted(name) for name in left.tolist()])
         warnings.warn(
             f"{given.file}: {len(left)} image(s) with fewer than {_LEAST} points are left out: {told}",
             UserWarning,
