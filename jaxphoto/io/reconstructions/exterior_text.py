@@ -99,13 +99,15 @@ def _cells(line: str) -> list[str]:
 
 
 def _is_angles(row: list[str]) -> bool:
-    return len(row) > len(_COLUMNS) and all(map(is_number, row[-len(_COLUMNS) :]))
+    """Whether it is a name and numbers; a name of several words is no number."""
+    surplus = len(row) - len(_COLUMNS)
+    return surplus > 0 and all(map(is_number, row[surplus:])) and (surplus == 1 or not is_number(row[0]))
 
 
 def _first_of_angles(rows: list[list[str]]) -> int | None:
     found = [k for k, row in enumerate(rows) if _is_angles(row) and not row[0].startswith("#")]
-    # The row below the first one is of the same kind, where there is one.
-    return found[0] if found and all(map(_is_angles, rows[found[0] : found[0] + 2])) else None
+    # Most rows below the first one are of the same kind: those of other files are so by chance.
+    return found[0] if found and 2 * sum(map(_is_angles, rows[found[0] :])) > len(rows) - found[0] else None
 
 
 def _first_of_matrices(rows: list[list[str]]) -> int | None:
