@@ -27,7 +27,7 @@ from PIL import Image
 from jaxphoto.camera import ImageMotion, InteriorOrientation, OpenCv, RollingShutter
 from jaxphoto.errors import JaxphotoError
 from jaxphoto.image_measurement import read_grey
-from jaxphoto.io import clouds, read_block, read_recipe, read_source, write_block
+from jaxphoto.io import clouds, export, read_block, read_recipe, read_source, write_block
 from jaxphoto.io.cameras import read_camera_file, write_camera_file
 from jaxphoto.io.conditions import read_conditions
 from jaxphoto.io.control_files import read_control
@@ -45,7 +45,7 @@ from jaxphoto.io.trajectory import Records, read_records, write_flight_csv, writ
 from jaxphoto.procedures.control.system import places, system_of
 from jaxphoto.unknowns import FIXED, FREE, Weighted
 from tests import sound_files
-from tests.io import control_files, test_bal, test_colmap, test_reconstructions
+from tests.io import control_files, oriented_files, test_bal, test_colmap, test_reconstructions
 from tests.io import test_cameras as cameras
 from tests.io import test_robotics_cameras as robotics
 from tests.io import test_surfaces as surfaces
@@ -364,12 +364,23 @@ READERS: dict[str, Reader] = {
             ("blocksexchange", test_reconstructions.write_blocks_exchange),
             ("bundler", test_reconstructions.write_bundler),
             ("pix4d", test_reconstructions.write_pix4d),
+            ("metashape", oriented_files.write_metashape),
+            ("texts", oriented_files.write_angles),
+            ("nerfstudio", oriented_files.write_nerfstudio),
+            ("orthority", oriented_files.write_orthority),
         )
     },
+    "texts-patb": Reader(written_by(oriented_files.write_patb), lambda folder: read_source(folder, "texts")),
     "dbat": Reader(text(**sound_files.DBAT), read_dbat),
     "photomodeler": Reader(text(**sound_files.PHOTOMODELER), read_photomodeler),
     "control-gcp-list": Reader(text(a=control_files.GCP_LIST), _control),
     "control-metashape": Reader(text(a=control_files.MARKERS), _control),
+    "control-geojson": Reader(text(a=control_files.GEO_JSON), _control),
+    "control-geopackage": Reader(
+        written_by(lambda folder: export(oriented_files.inside("opencv"), folder, "geopackage")),
+        lambda folder: read_control(folder / "photographs.gpkg"),
+        ("photographs.gpkg",),
+    ),
     "control-reference": Reader(text(a=control_files.REFERENCE), _control),
     "control-pix4d": Reader(
         text(a=control_files.PIX4D, b=control_files.PIX4D_MARKS),

@@ -1,7 +1,8 @@
 """`jaxphoto convert`: another program's files in, a block folder out; or what was adjusted, in files of others."""
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -11,7 +12,7 @@ from jaxphoto.cli.app import app
 from jaxphoto.cli.choices import one_of
 from jaxphoto.cli.console import plain_console
 from jaxphoto.errors import InputError
-from jaxphoto.io import convert, read_source, write_block
+from jaxphoto.io import FORMATS, convert, read_source, write_block
 from jaxphoto.io.block_folder import check_block_target
 from jaxphoto.io.exports import (
     EXPORTS,
@@ -28,7 +29,11 @@ from jaxphoto.report.terminal import plain
 from jaxphoto.unknowns import Unknowns
 
 _TARGETS = ("block", *EXPORTS)
-_ABOUT = "; ".join(f"{name}: {known.about}" for name, known in EXPORTS.items())
+
+
+def _about(formats: Mapping[str, Any]) -> str:
+    """What each format of a registry is."""
+    return "; ".join(f"{name}: {known.about}" for name, known in formats.items())
 
 
 @app.command("convert")
@@ -38,11 +43,12 @@ def convert_command(
     ],
     out: Annotated[Path, typer.Argument(help="Folder to write.")],
     source_format: Annotated[
-        str | None, typer.Option("--format", help="Format of SOURCE; recognised when not given.")
+        str | None,
+        one_of(FORMATS, "--format", help=f"Format of SOURCE; recognised when not given. {_about(FORMATS)}."),
     ] = None,
     to: Annotated[
         str,
-        one_of(_TARGETS, help=f"What OUT becomes. block: a block folder; {_ABOUT}."),
+        one_of(_TARGETS, help=f"What OUT becomes. block: a block folder; {_about(EXPORTS)}."),
     ] = "block",
     block: Annotated[Path | None, typer.Option(help="Block of which SOURCE is the result, where it moved.")] = None,
     part: Annotated[int, typer.Option(min=1, help="Of a flight, which part; the largest is 1.")] = 1,

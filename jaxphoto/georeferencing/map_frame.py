@@ -88,6 +88,12 @@ class MapFrame:
         return _transformed(self._to_local, local, "INVERSE")
 
 
+def place_from_geocentric(code: int, xyz: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Longitude, latitude (degrees) and height (m) on the ellipsoid of the EPSG system `code`, of X, Y, Z from its
+    centre."""
+    return _transformed(_geocentric(map_system(code)), xyz, "INVERSE")
+
+
 @functools.cache
 def map_system(code: int) -> CRS:
     """The projected or geographic system of an EPSG code. Raises InputError for any other code."""

@@ -10,29 +10,57 @@ from jaxphoto.io import aicon, bal, colmap, dbat, photomodeler
 from jaxphoto.io.block_folder import BlockTables, assemble, write_block
 from jaxphoto.io.block_folder.block_reader import read_folder
 from jaxphoto.io.block_folder.table_layout import TOML
-from jaxphoto.io.reconstructions import blocks_exchange, bundler, open_mvg, open_sfm, pix4d
+from jaxphoto.io.reconstructions import (
+    blocks_exchange,
+    bundler,
+    metashape,
+    nerfstudio,
+    open_mvg,
+    open_sfm,
+    orthority,
+    pix4d,
+    text_project,
+)
 
 
 class Format(NamedTuple):
-    """A format: what tells it, and its reader."""
+    """A format: what tells it, its reader, and what it is in a line."""
 
     recognises: Callable[[Path], bool]
     read: Callable[[Path], BlockTables]
+    about: str
 
 
 FORMATS = {
-    "block": Format(lambda source: (source / TOML).is_file(), read_folder),
-    "dbat": Format(dbat.recognises, dbat.read_dbat),
-    "photomodeler": Format(photomodeler.recognises, photomodeler.read_photomodeler),
-    "aicon": Format(aicon.recognises, aicon.read_aicon),
-    "bal": Format(bal.recognises, bal.read_bal),
-    "colmap": Format(colmap.recognises, colmap.read_colmap_model),
-    "opensfm": Format(open_sfm.recognises, open_sfm.read_open_sfm),
-    "openmvg": Format(open_mvg.recognises, open_mvg.read_open_mvg),
-    "blocksexchange": Format(blocks_exchange.recognises, blocks_exchange.read_blocks_exchange),
-    "pix4d": Format(pix4d.recognises, pix4d.read_pix4d),
-    "bundler": Format(bundler.recognises, bundler.read_bundler),
+    "block": Format(lambda source: (source / TOML).is_file(), read_folder, "block folder"),
+    "dbat": Format(dbat.recognises, dbat.read_dbat, "script of DBAT, XML"),
+    "photomodeler": Format(photomodeler.recognises, photomodeler.read_photomodeler, "export of PhotoModeler"),
+    "aicon": Format(aicon.recognises, aicon.read_aicon, "AICON: .ior, .phc, .eor, .obc"),
+    "bal": Format(bal.recognises, bal.read_bal, "bundle adjustment in the large"),
+    "colmap": Format(colmap.recognises, colmap.read_colmap_model, "model of COLMAP"),
+    "opensfm": Format(open_sfm.recognises, open_sfm.read_open_sfm, "OpenSfM, OpenDroneMap, WebODM"),
+    "openmvg": Format(open_mvg.recognises, open_mvg.read_open_mvg, "sfm_data.json of OpenMVG"),
+    "blocksexchange": Format(
+        blocks_exchange.recognises, blocks_exchange.read_blocks_exchange, "BlocksExchange XML of Bentley"
+    ),
+    "metashape": Format(metashape.recognises, metashape.read_metashape, "cameras of Metashape, XML, with tie points"),
+    "pix4d": Format(pix4d.recognises, pix4d.read_pix4d, "folder params of Pix4D"),
+    "nerfstudio": Format(
+        nerfstudio.recognises, nerfstudio.read_nerfstudio, "transforms.json of nerfstudio, with image points"
+    ),
+    "orthority": Format(
+        orthority.recognises,
+        orthority.read_orthority,
+        "parameters of orthority, with image points",
+    ),
+    "texts": Format(
+        text_project.recognises,
+        text_project.read_text_project,
+        "folder of texts: omega, phi, kappa or PATB's matrices, image points of BINGO or PATB, and a camera file",
+    ),
+    "bundler": Format(bundler.recognises, bundler.read_bundler, "bundle.out of Bundler, VisualSFM"),
 }
+"""The formats that `read_source` knows, in the order of help."""
 
 
 def read_source(source: str | Path, format: str | None = None, *, stations: bool = True) -> Block:

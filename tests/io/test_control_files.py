@@ -1,12 +1,22 @@
 """Files of control in every form: told apart by content, read to the number, refused in a sentence."""
 
+import contextlib
+import json
+import sqlite3
+import warnings
+
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from jaxphoto.errors import InputError
+from jaxphoto.io import export
 from jaxphoto.io.control_files import read_control
+from jaxphoto.io.exports.map_photographs import in_map
 from jaxphoto.procedures.control.system import places, system_of
 from tests.io import control_files as files
+from tests.io.test_exports import photographs
 
 
 def read(folder, points, marks=None):
@@ -115,3 +125,95 @@ def test_words_for_systems():
     for words in ("+init=/dev/zero:1", "+proj=utm +zone=3 +nadgrids=/dev/zero", "UTM 33", "EPSG:99", "x" * 30_000):
         with pytest.raises(InputError):
             system_of(words, "a")
+
+
+def test_points_of_geo_json_in_a_system_of_its_own(tmp_path):
+    points, marks = read(tmp_path, files.GEO_JSON)
+    assert points.ids == ("G1", "G2") and points.check.tolist() == [False, True] and not marks.image
+    np.testing.assert_array_equal(points.coordinates, [(386800.1, 6175000.2, 30.5), (386900.0, 6175100.0, np.nan)])
+    np.testing.assert_array_equal(points.sigma_m[0], (0.01,) * 3)
+    assert points.system == "EPSG:32633" and points.places[1] == "a, feature 2"
+
+
+def test_points_of_geo_json_are_longitude_and_latitude_where_it_says_nothing(tmp_path):
+    point = {"type": "Point", "coordinates": [13.2, 55.7]}
+    one = {"type": "Feature", "id": "G7", "geometry": point, "properties": {"height": 12.5, "enabled": False}}
+    points = read(tmp_path, json.dumps({"type": "FeatureCollection", "features": [one]})).points
+    assert points.ids == ("G7",) and points.check.all() and not points.own_axes
+    there = places(points, system_of(points.system, "a"), 4326)
+    np.testing.assert_allclose(there, [(13.2, 55.7, 12.5)], rtol=1e-12)
+
+
+@settings(max_examples=20, deadline=None)
+@given(
+    xyz=st.lists(st.tuples(*[st.floats(-5e3, 5e3)] * 3), min_size=40, max_size=40),
+    kind=st.sampled_from(["local", "epsg"]),
+)
+def test_points_of_a_geo_package_come_back(tmp_path_factory, xyz, kind):
+    folder = tmp_path_factory.mktemp("package")
+    p = photographs("opencv", kind)._replace(xyz=np.array(xyz))
+    with warnings.catch_warnings():
+        # Some of these points lie behind a photograph, whose footprint is then nowhere.
+        warnings.simplefilter("ignore")
+        export(p, folder, "geopackage")
+    points = read_control(folder / "photographs.gpkg").points
+    assert points.ids == p.points and points.system == ("EPSG:32633" if kind == "epsg" else "local")
+    np.testing.assert_allclose(points.coordinates, in_map(p).xyz, rtol=0, atol=1e-9)
+
+
+def _geo(old, new):
+    return files.GEO_JSON.replace(old, new)
+
+
+GEO_REFUSED = {
+    "no point": (_geo('"Point"', '"LineString"'), "a, feature 1: the geometry is no point"),
+    "no number": (_geo("386800.1", '"x"'), "a, feature 1: the geometry is no point"),
+    "no name": (_geo('"name": "G', '"what": "G'), r"a: no attribute is the name of the points \(there are fid, what"),
+    "role": (_geo('"check"', '"both"'), "a, feature 2: the role 'both' is unknown"),
+    "twice": (_geo('"G2"', '"G1"'), "a, feature 2: the point 'G1' stands in a, feature 1, too"),
+    "system": (_geo("EPSG::32633", "ESRI::102100"), "the system 'urn:ogc:def:crs:ESRI::102100' is no EPSG code"),
+    "cut": (files.GEO_JSON[:-20], "no JSON that can be read"),
+    "no feature": ('{"type": "FeatureCollection", "features": []}', "there are no features"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", GEO_REFUSED)
+def test_geo_json_that_is_no_control_is_told_in_a_sentence(tmp_path, name):
+    text, message = GEO_REFUSED[name]
+    with pytest.raises(InputError, match=message):
+        read(tmp_path, text)
+
+
+def _package(folder, *statements):
+    export(photographs("opencv", "epsg"), folder, "geopackage")
+    path = folder / "photographs.gpkg"
+    with contextlib.closing(sqlite3.connect(path)) as file, file:
+        for statement in statements:
+            file.execute(statement)
+    return path
+
+
+PACKAGE_REFUSED = {
+    "layers": (("ALTER TABLE object_points RENAME COLUMN point TO what",), "has 0 layers of points with an attribute"),
+    "geometry": (("UPDATE object_points SET geom = x'4750' WHERE fid = 3",), "feature 3: the geometry is no point"),
+    "system": (("UPDATE gpkg_contents SET srs_id = 0",), "the layer is in no EPSG system"),
+    "tables": (("DROP TABLE gpkg_geometry_columns",), "is no GeoPackage that can be read"),
+    "names": (("UPDATE object_points SET point = 'p7'",), "feature 2: the point 'p7' stands in photographs.gpkg, fe"),
+}
+
+
+@pytest.mark.parametrize("name", PACKAGE_REFUSED)
+def test_a_geo_package_that_is_no_control_is_told_in_a_sentence(tmp_path, name):
+    statements, message = PACKAGE_REFUSED[name]
+    with pytest.raises(InputError, match=message):
+        read_control(_package(tmp_path, *statements))
+
+
+def test_a_geo_package_that_another_program_has_open_is_read_when_it_is_closed(tmp_path):
+    path = _package(tmp_path, "UPDATE object_points SET point = 'q' || point")
+    with contextlib.closing(sqlite3.connect(path)) as file:
+        file.execute("PRAGMA journal_mode = wal")
+    assert read_control(path).points.ids[0] == "qp0"
+    (tmp_path / "photographs.gpkg-wal").write_bytes(b"x")
+    with pytest.raises(InputError, match="open in another program"):
+        read_control(path)

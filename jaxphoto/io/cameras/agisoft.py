@@ -45,7 +45,16 @@ def read_agisoft(source: CameraSource) -> CameraFile:
         raise source.error(f"the XML is broken ({error}); it is cut off or was changed, so export it anew") from None
     found = {source.path.stem: (root, None)} if root.tag == "calibration" else _sensors(root)
     name = source.chosen(list(found))
-    calibration, pixel = found[name]
+    return _camera(source, name, *found[name])
+
+
+def read_sensor(source: CameraSource, name: str, sensor: ElementTree.Element) -> CameraFile | None:
+    """The camera of one <sensor> of exported cameras, None where it is not calibrated. Raises as `read_agisoft`."""
+    calibration, pixel = _calibration(sensor)
+    return None if calibration is None else _camera(source, name, calibration, pixel)
+
+
+def _camera(source: CameraSource, name: str, calibration: ElementTree.Element, pixel: str | None) -> CameraFile:
     kind = (calibration.findtext("projection") or calibration.get("type") or "frame").strip()
     if kind not in _MODELS:
         raise source.error(f"the projection {quoted(kind)} is not known here; known are {', '.join(_MODELS)}")
@@ -97,14 +106,18 @@ def _sensors(root: ElementTree.Element) -> dict[str, tuple[ElementTree.Element, 
     """Calibration and size of a pixel of every calibrated sensor, by its label."""
     found = {}
     for sensor in root.iter("sensor"):
-        calibrations = {c.get("class", "adjusted"): c for c in sensor.findall("calibration")}
-        # What was estimated goes before what was given.
-        best = calibrations.get("adjusted", calibrations.get("initial"))
-        sizes = {p.get("name"): p.get("value") for p in sensor.iter("property")}
-        if best is not None:
+        calibration, pixel = _calibration(sensor)
+        if calibration is not None:
             label = sensor.get("label", sensor.get("id", ""))
-            found[label if label not in found else f"{label} {sensor.get('id')}"] = (best, sizes.get("pixel_width"))
+            found[label if label not in found else f"{label} {sensor.get('id')}"] = (calibration, pixel)
     return found
+
+
+def _calibration(sensor: ElementTree.Element) -> tuple[ElementTree.Element | None, str | None]:
+    """The calibration of a <sensor>, and the size of its pixels: what was estimated goes before what was given."""
+    calibrations = {c.get("class", "adjusted"): c for c in sensor.findall("calibration")}
+    sizes = {p.get("name"): p.get("value") for p in sensor.iter("property")}
+    return calibrations.get("adjusted", calibrations.get("initial")), sizes.get("pixel_width")
 
 
 def _values(source: CameraSource, calibration: ElementTree.Element, sensor: Sensor) -> tuple[dict[str, float], str]:

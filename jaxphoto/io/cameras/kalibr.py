@@ -8,19 +8,16 @@ Source: Kalibr's wiki, "Supported models" and "YAML formats".
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from jaxphoto.errors import quoted
 from jaxphoto.io.cameras import open_cv
 from jaxphoto.io.cameras.camera_file import CameraFile, CameraSource, in_pixels
+from jaxphoto.io.yaml_text import yaml_values
 
 _MODELS = {
     "radtan": (open_cv.PLANE, ("k1", "k2", "p1", "p2")),
     "equidistant": (open_cv.FISHEYE, ("k1", "k2", "k3", "k4")),
     "none": (open_cv.PLANE, ()),
 }
-# A chain of ten cameras has 5,000 characters; the parser takes seconds for a million.
-_LONGEST = 100_000
 
 
 def recognises(path: Path, text: str) -> bool:
@@ -59,13 +56,8 @@ def read_kalibr(source: CameraSource) -> CameraFile:
 
 def _chain(source: CameraSource) -> dict[str, dict[str, Any]]:
     """The cameras by name."""
-    text = source.text()
-    if len(text) > _LONGEST:
-        raise source.error(f"{len(text)} characters are no camera chain of Kalibr; give the file that it wrote")
     try:
-        content = yaml.safe_load(text)
-    except (yaml.YAMLError, RecursionError, ValueError, TypeError, AttributeError, KeyError):
-        raise source.error("this is no YAML that can be read; it is cut off or was changed, so write it anew") from None
-    if not isinstance(content, dict):
-        raise source.error("it has no names and values; let Kalibr write it anew")
-    return {key: value for key, value in content.items() if isinstance(key, str) and isinstance(value, dict)}
+        content = yaml_values(source.text())
+    except ValueError as error:
+        raise source.error(str(error)) from None
+    return {key: value for key, value in content.items() if isinstance(value, dict)}

@@ -35,14 +35,36 @@ def read_metashape_markers(path: Path, text: str) -> GivenControl:
 
     Raises InputError for broken XML, and for numbers, cameras or markers that are none.
     """
-    file = path.name
+    chunk = only_chunk(path, text)
+    rows, marks = markers_of(path.name, chunk)
+    return GivenControl(rows.surveyed(system_words(chunk)), read_marks(marks))
+
+
+def only_chunk(path: Path, text: str) -> ElementTree.Element:
+    """The <chunk> of an exported file. Raises InputError for broken XML, and where there is none."""
     try:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
-        raise InputError(f"{file}: the XML is broken ({error}); it is cut off or was changed, export it anew") from None
+        raise InputError(
+            f"{path.name}: the XML is broken ({error}); it is cut off or was changed, export it anew"
+        ) from None
     chunk = root if root.tag == "chunk" else root.find("chunk")
     if chunk is None:
-        raise InputError(f"{file}: there is no <chunk>; export the markers of a chunk (File, Export, Export Markers)")
+        raise InputError(
+            f"{path.name}: there is no <chunk>; export the markers or cameras of a chunk (File, Export, Export "
+            "Markers, Export Cameras)"
+        )
+    return chunk
+
+
+def system_words(chunk: ElementTree.Element) -> str:
+    """What a chunk says of its coordinate system: WKT, or nothing."""
+    words = (chunk.findtext("reference") or "").strip()
+    return words if _WKT.match(words) else ""
+
+
+def markers_of(file: str, chunk: ElementTree.Element) -> tuple[SurveyRows, list[Mark]]:
+    """Markers with reference coordinates, and the pinned projections of all markers, by the labels of cameras."""
     cameras = _labels(chunk.iterfind("cameras//camera"), file, "camera")
     labels = _labels(chunk.iterfind("markers//marker"), file, "marker")
     points = SurveyRows(file)
@@ -70,8 +92,7 @@ def read_metashape_markers(path: Path, text: str) -> GivenControl:
                 )
             column_row = [_number(location, key, place) for key in "xy"]
             marks.append((image, labels[number], column_row, np.nan, place))
-    words = (chunk.findtext("reference") or "").strip()
-    return GivenControl(points.surveyed(words if _WKT.match(words) else ""), read_marks(marks))
+    return points, marks
 
 
 def _labels(elements, file: str, what: str) -> dict[str, str]:

@@ -7,6 +7,10 @@ import numpy as np
 from jaxphoto.errors import InputError, few
 from jaxphoto.io.control_files.gcp_list import read_gcp_list
 from jaxphoto.io.control_files.gcp_list import recognises as is_gcp_list
+from jaxphoto.io.control_files.geo_json import read_geo_json
+from jaxphoto.io.control_files.geo_json import recognises as is_geo_json
+from jaxphoto.io.control_files.geo_package import read_geo_package
+from jaxphoto.io.control_files.geo_package import recognises as is_geo_package
 from jaxphoto.io.control_files.metashape import read_metashape_markers
 from jaxphoto.io.control_files.metashape import recognises as is_metashape
 from jaxphoto.io.control_files.tables import read_table
@@ -17,7 +21,8 @@ from jaxphoto.procedures.control.surveyed import GivenControl, Marks, SurveyedPo
 def read_control(control: str | Path, marks: str | Path | None = None) -> GivenControl:
     """The points of the file `control` with the marks that it has, and those of the file `marks`.
 
-    Forms are told apart by content: gcp_list.txt, Metashape's markers as XML, tables of points or marks. A file `marks`
+    Forms are told apart by content: gcp_list.txt, Metashape's markers as XML, GeoJSON, a GeoPackage, tables of points
+    or marks. A file `marks`
     may be any form that has marks; coordinates in it are not used. Raises InputError where either is none.
     """
     own = _read(Path(control))
@@ -36,9 +41,13 @@ def read_control(control: str | Path, marks: str | Path | None = None) -> GivenC
 
 
 def _read(path: Path) -> GivenControl | SurveyedPoints | Marks:
+    if is_geo_package(path):
+        return read_geo_package(path)
     text = read_text(path, SMALL)
     if is_metashape(text):
         return read_metashape_markers(path, text)
+    if is_geo_json(text):
+        return read_geo_json(path)
     numbered = [(line, row) for row, line in enumerate(text.split("\n"), 1) if line.strip()]
     lines, rows = [line for line, _ in numbered], [row for _, row in numbered]
     if not lines:

@@ -20,10 +20,12 @@ class Cells(NamedTuple):
     file: str
     records: list[list[str]]
     rows: list[int]
+    called: str = "row"
+    """What the file calls a row."""
 
     def place(self, k: int) -> str:
         """File and row, as messages name them."""
-        return f"{self.file}, row {self.rows[k]}"
+        return f"{self.file}, {self.called} {self.rows[k]}"
 
     def bad(self, k: int, message: str) -> InputError:
         """An error about one row."""
@@ -62,6 +64,9 @@ class SurveyRows:
         self.file = file
         self._of: dict[str, tuple[list[float], list[float], bool, str]] = {}
         self._at: dict[tuple[str, ...], str] = {}
+
+    def __len__(self) -> int:
+        return len(self._of)
 
     def named_by(self, xyz: Sequence[float]) -> str:
         """The name of a point that has none: P1, P2 ..., one for each place."""

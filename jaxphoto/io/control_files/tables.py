@@ -52,21 +52,25 @@ def read_table(path: Path, lines: list[str], rows: list[int]) -> SurveyedPoints 
         if columns := mark_columns(header):
             return _marks(own, columns, separator)
         if columns := point_columns(header):
-            return _points(own, columns, separator, "".join(said[:1]), bool(in_degrees(header, columns)))
+            return read_points(own, columns, separator, "".join(said[:1]), bool(in_degrees(header, columns)))
     found = columns_without_header(_dotted(cells, separator).records) if cells.records else None
     if found is None:
         first = f" (it begins with {quoted(' '.join(cells.records[0]))})" if cells.records else ""
         raise cells.none(
             f"this is no file of control{first}: give points (point, X_m, Y_m, Z_m), marks (image, point, x_px, y_px), "
-            "a gcp_list.txt, or markers of Metashape as XML"
+            "a gcp_list.txt, markers of Metashape as XML, points as GeoJSON or a GeoPackage"
         )
     kind, columns = found
     if kind == "marks":
         return _marks(cells, columns, separator)
-    return _points(cells, columns, separator, "".join(said[:1]), False)._replace(own_axes=True)
+    return read_points(cells, columns, separator, "".join(said[:1]), False)._replace(own_axes=True)
 
 
-def _points(cells: Cells, columns: Columns, separator: str, system: str, degrees: bool) -> SurveyedPoints:
+def read_points(cells: Cells, columns: Columns, separator: str, system: str, degrees: bool) -> SurveyedPoints:
+    """Rows of points, whose columns are known; `degrees`: the header says longitude and latitude.
+
+    Raises InputError for cells that are wrong, and where there is no row.
+    """
     cells, points = _dotted(cells, separator, columns["point"]), SurveyRows(cells.file)
     for k, row in enumerate(cells.records):
         if len(row) <= max(columns["x"], columns["y"]):

@@ -1,6 +1,7 @@
-"""Numbers out of files that are trees: thousands of lists at once, or one that is named."""
+"""Numbers out of files that are trees or texts: thousands of lists at once, or one that is named."""
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -32,3 +33,14 @@ def number_rows(
             many = "a finite number" if shape == () else f"{' x '.join(map(str, shape))} finite numbers"
             raise InputError(f"{place(k)}: {quoted(value)} is not {many}; correct it, or export the file anew")
     raise InputError(f"{place(0)}: these are no numbers of one kind; export the file anew")
+
+
+def row_numbers(path: Path, row: int, words: Sequence[str], many: int) -> list[float]:
+    """So many numbers of a row of text. Raises InputError where they are others."""
+    try:
+        values = [float(word) for word in words]
+    except ValueError:
+        values = []
+    if len(values) != many or not all(abs(value) <= LARGEST for value in values):
+        raise InputError(f"{path.name}, row {row}: {quoted(' '.join(words))} is not {many} numbers; export it anew")
+    return values

@@ -13,19 +13,19 @@ Sources: Pix4D support, articles 202977149 ("What does the Output Params Folder 
 Internal and External Camera Parameters defined?").
 """
 
-import warnings
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from jaxphoto.errors import InputError, few, quoted
+from jaxphoto.errors import InputError, quoted
 from jaxphoto.io.block_folder import BlockTables
 from jaxphoto.io.cameras.camera_file import CameraSource, in_pixels
 from jaxphoto.io.cameras.open_cv import PLANE
+from jaxphoto.io.reconstructions.numbers import row_numbers
+from jaxphoto.io.reconstructions.points_beside import points_of
 from jaxphoto.io.reconstructions.tied_photographs import TiedCamera, TiedPhotographs, free_network
-from jaxphoto.io.text_tables import LARGEST
 from jaxphoto.io.whole_text import LARGE, SMALL, read_text
 
 CAMERAS, POINTS, OFFSET = "calibrated_camera_parameters.txt", "tp_pix4d.txt", "offset.xyz"
@@ -33,7 +33,6 @@ _HEAD = "fileName imageWidth imageHeight"
 # Rows of a photograph below its name and size, as numbers in each: K, radial, tangential, t, R.
 _ROWS = (3, 3, 3, 3, 2, 3, 3, 3, 3)
 _FREE = ("c_mm", "xp_mm", "yp_mm", "k1", "k2", "k3", "p1", "p2")
-_ENDS = "-99"
 
 
 class _Photographs(NamedTuple):
@@ -64,8 +63,7 @@ def read_pix4d(source: Path) -> BlockTables:
     kinds, number = np.unique(np.column_stack([given.sizes, radial_on]), axis=0, return_inverse=True)
     cameras = {str(k): _camera(path, values.tolist()) for k, values in enumerate(kinds)}
     tied = path.with_name(path.name.removesuffix(CAMERAS) + POINTS)
-    image, points, column_row = _read_points(tied, path, given.names)
-    ids, point = np.unique(np.array(points, object), return_inverse=True)
+    shown = points_of(tied, given.names, path.name)
     return free_network(
         TiedPhotographs(
             path.name,
@@ -76,11 +74,11 @@ def read_pix4d(source: Path) -> BlockTables:
             [str(k) for k in number.tolist()],
             turn,
             given.numbers[:, 14:17] + _offset(path.with_name(path.name.removesuffix(CAMERAS) + OFFSET)),
-            ids.tolist(),
+            shown.points,
             None,
-            image,
-            point,
-            column_row,
+            shown.image,
+            shown.point,
+            shown.column_row,
         )
     )
 
@@ -119,18 +117,10 @@ def _read_cameras(path: Path) -> _Photographs:
         names.append(words[0])
         sizes.append((int(words[1]), int(words[2])))
         own = rows[first + 1 : first + each]
-        numbers.append([x for (k, line), n in zip(own, _ROWS, strict=True) for x in _numbers(path, k, line.split(), n)])
+        numbers.append(
+            [x for (k, line), n in zip(own, _ROWS, strict=True) for x in row_numbers(path, k, line.split(), n)]
+        )
     return _Photographs(names, sizes, np.array(numbers))
-
-
-def _numbers(path: Path, row: int, words: list[str], many: int) -> list[float]:
-    try:
-        values = [float(word) for word in words]
-    except ValueError:
-        values = []
-    if len(values) != many or not all(abs(value) <= LARGEST for value in values):
-        raise InputError(f"{path.name}, row {row}: {quoted(' '.join(words))} is not {many} numbers; export it anew")
-    return values
 
 
 def _camera(path: Path, values: list[float]) -> TiedCamera:
@@ -143,36 +133,7 @@ def _camera(path: Path, values: list[float]) -> TiedCamera:
     return TiedCamera(sensor, interior, _FREE)
 
 
-def _read_points(path: Path, cameras: Path, names: list[str]) -> tuple[np.ndarray, list[str], np.ndarray]:
-    """Image, point and pixels of each measurement. The file names photographs without their endings."""
-    place = {Path(name).stem: k for k, name in enumerate(names)} | {name: k for k, name in enumerate(names)}
-    image, points, rows, unknown, now = [], [], [], [], None
-    for k, line in enumerate(read_text(path, LARGE).split("\n"), 1):
-        words = line.split()
-        if not words:
-            continue
-        if words == [_ENDS]:
-            now = None
-        elif now is None:
-            now = place.get(line.strip(), -1)
-            unknown += [line.strip()] if now < 0 else []
-        elif len(words) < 3:
-            raise InputError(f"{path.name}, row {k}: {quoted(line)} is not point, x, y; export the file anew")
-        elif now >= 0:
-            image.append(now)
-            points.append(words[0])
-            rows.append(_numbers(path, k, words[1:3], 2))
-    if unknown:
-        left = few([quoted(name) for name in unknown])
-        warnings.warn(
-            f"{path.name}: {len(unknown)} photographs are not in {cameras.name} and are left out: {left}",
-            UserWarning,
-            stacklevel=3,
-        )
-    return np.array(image, int), points, np.array(rows).reshape(-1, 2)
-
-
 def _offset(path: Path) -> Float[np.ndarray, "3"]:
     if not path.is_file():
         return np.zeros(3)
-    return np.array(_numbers(path, 1, read_text(path, SMALL).split(), 3))
+    return np.array(row_numbers(path, 1, read_text(path, SMALL).split(), 3))

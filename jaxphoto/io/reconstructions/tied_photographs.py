@@ -14,13 +14,16 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxphoto.camera import InteriorOrientation, Sensor, set_parameter
+from jaxphoto.block import Frame
+from jaxphoto.camera import InteriorOrientation, Sensor, get_parameter, parameter_names, set_parameter
 from jaxphoto.collinearity import ExteriorOrientation
-from jaxphoto.errors import InputError
+from jaxphoto.errors import InputError, few, quoted
 from jaxphoto.io.block_folder import BlockTables
 from jaxphoto.io.block_folder.camera_section import Camera, camera_section
-from jaxphoto.io.block_folder.table_layout import ANGLES, XYZ
+from jaxphoto.io.block_folder.frame_sections import frame_section
+from jaxphoto.io.block_folder.table_layout import ANGLES, SIGMA_XYZ, coordinate_names
 from jaxphoto.io.text_tables import Table
+from jaxphoto.procedures.control.surveyed import SIGMA_M, SurveyedPoints
 from jaxphoto.unknowns import FIXED, FREE
 
 # Rows by which a rotation into a camera frame of computer vision becomes one into ours.
@@ -28,6 +31,8 @@ _CAMERA_TURN = np.array([[1.0], [-1.0], [-1.0]])
 _PHOTOGRAPHS = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".jp2", ".ppm", ".pgm", ".dng")
 # R R' of numbers with few digits is off from I by no more.
 _NO_ROTATION = 1e-3
+# An orientation needs so many points, and the place of a block so many control points.
+_LEAST = 3
 
 
 class TiedCamera(NamedTuple):
@@ -59,17 +64,29 @@ class TiedPhotographs(NamedTuple):
     point: Int[np.ndarray, "n"]
     column_row: Float[np.ndarray, "n 2"]
     """In pixels; the centre of the upper left one is (0.5, 0.5)."""
+    frame: Frame = Frame("local")
+    """Of `centres` and of what `rotations` are against: grid east, grid north and up at the place of each."""
+    control: SurveyedPoints | None = None
+    """In coordinates of `frame`, easting or longitude first."""
+
+
+def estimated(interior: InteriorOrientation) -> tuple[str, ...]:
+    """What a program that does not say so may have estimated: c_mm, xp_mm, yp_mm and every coefficient that is not
+    zero."""
+    first = ("c_mm", "xp_mm", "yp_mm")
+    return tuple(n for n in parameter_names(interior) if n in first or float(get_parameter(interior, n)) != 0)
 
 
 def free_network(given: TiedPhotographs) -> BlockTables:
     """The free-network self-calibration of tied photographs, from the values they have.
 
     An image has its file's name without the ending as id. Every image coordinate has the standard deviation of one
-    pixel. The datum is inner over the points. A UserWarning counts what is left out: measurements that are there twice
-    (of one feature with two directions, or of two features in one image that are one point), and points that are then
-    in fewer than two images.
+    pixel. The datum is inner over the points, or that of the control where three points of it are given whole. A
+    UserWarning counts what is left out: measurements that are there twice (of one feature with two directions, or of
+    two features in one image that are one point), points that are then in fewer than two images, and images that then
+    show fewer than three.
 
-    Raises InputError where no photograph is oriented, two have one name, or a rotation is none.
+    Raises InputError where no photograph is oriented, two have one name, a rotation is none, or none is tied.
     """
     if not len(given.files):
         raise InputError(f"{given.file}: no image is oriented; give one that has images")
@@ -80,15 +97,20 @@ def free_network(given: TiedPhotographs) -> BlockTables:
     if len(set(names)) < len(names):
         twice = next(name for name in names if list(names).count(name) > 1)
         raise InputError(f"{given.file}: image {twice} is there twice; keep one of them")
-    image, point, column_row = _measurements(given, place[given.image])
+    control = _control_table(given)
+    image, point, column_row = _measurements(given, place[given.image], control)
+    kept = np.flatnonzero(np.bincount(image, minlength=len(names)))
+    _check_tied(given, names, kept)
+    order, names, image = order[kept], names[kept], np.searchsorted(kept, image)
     seen, point_of = np.unique(point, return_inverse=True)
     ids = np.array(given.points, object)[seen]
     exterior = ExteriorOrientation(given.centres[order], _CAMERA_TURN * given.rotations[order])  # type: ignore[arg-type]
     angles = np.rad2deg(np.asarray(exterior.omega_phi_kappa))
     camera = np.array(given.camera_of, object)[order]
+    coordinates = coordinate_names(given.frame)
     tables = {
         "images": {"image": names, "camera": camera}
-        | dict(zip((*XYZ, *ANGLES), np.column_stack([given.centres[order], angles]).T, strict=True)),
+        | dict(zip((*coordinates, *ANGLES), np.column_stack([given.centres[order], angles]).T, strict=True)),
         "image_points": {
             "image": names[image],
             "point": ids[point_of],
@@ -97,15 +119,57 @@ def free_network(given: TiedPhotographs) -> BlockTables:
         },
     }
     if given.xyz is not None:
-        tables["object_points"] = {"point": ids} | dict(zip(XYZ, given.xyz[seen].T, strict=True))
-    used = set(given.camera_of)
-    settings = {
-        "title": given.title,
-        "sigmas": {"image_px": 1.0},
-        "cameras": {name: _section(own) for name, own in given.cameras.items() if name in used},
-        "datum": {"kind": "inner", "over": "points"},
-    }
+        tables["object_points"] = {"point": ids} | dict(zip(coordinates, given.xyz[seen].T, strict=True))
+    settings: dict[str, Any] = {"title": given.title, "sigmas": {"image_px": 1.0}}
+    if given.frame.kind == "epsg":
+        settings["frame"] = frame_section(given.frame)
+    if control is None:
+        settings["datum"] = {"kind": "inner", "over": "points"}
+    else:
+        tables["control_points"] = control
+        settings["sigmas"] |= dict(zip(("control_X_m", "control_Y_m", "control_Z_m"), SIGMA_M, strict=True))
+    used = set(camera)
+    settings["cameras"] = {name: _section(own) for name, own in given.cameras.items() if name in used}
     return BlockTables(settings, {key: Table.of(given.file, values) for key, values in tables.items()}, given.file)
+
+
+def _control_table(given: TiedPhotographs) -> dict[str, np.ndarray] | None:
+    """control_points.csv: the points that images show. None where they do not hold the block."""
+    survey = given.control
+    if survey is None:
+        return None
+    shown = {given.points[k] for k in np.unique(given.point)}
+    there = [k for k, name in enumerate(survey.ids) if name in shown]
+    holds = [k for k in there if not survey.check[k] and np.isfinite(survey.coordinates[k]).all()]
+    if len(holds) < _LEAST:
+        warnings.warn(
+            f"{given.file}: images show {len(holds)} control point(s) with all coordinates, and a block needs "
+            f"{_LEAST}; none is used",
+            UserWarning,
+            stacklevel=4,
+        )
+        return None
+    cells = lambda values: np.array(["" if np.isnan(v) else repr(v) for v in values.tolist()], object)  # noqa: E731
+    numbers = np.column_stack([survey.coordinates[there], survey.sigma_m[there]])
+    columns = dict(zip((*coordinate_names(given.frame), *SIGMA_XYZ), map(cells, numbers.T), strict=True))
+    role = np.where(survey.check[there], "check", "control").astype(object)
+    return {"point": np.array([survey.ids[k] for k in there], object), **columns, "role": role}
+
+
+def _check_tied(given: TiedPhotographs, names: np.ndarray, kept: np.ndarray) -> None:
+    """Raise InputError where no image is tied to others; a UserWarning names those that are not."""
+    if not len(kept):
+        raise InputError(
+            f"{given.file}: no image shows {_LEAST} points that others show, too; export the tie points of the project"
+        )
+    left = np.delete(names, kept)
+    if len(left):
+        told = few([quoted(name) for name in left.tolist()])
+        warnings.warn(
+            f"{given.file}: {len(left)} image(s) with fewer than {_LEAST} points are left out: {told}",
+            UserWarning,
+            stacklevel=4,
+        )
 
 
 def _section(camera: TiedCamera) -> dict[str, Any]:
@@ -140,8 +204,11 @@ def _image_names(files: list[str]) -> list[str]:
     return short if len(set(short)) == len(short) else [str(path) for path in paths]
 
 
-def _measurements(given: TiedPhotographs, image: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Image, point and pixels of every measurement; none twice, each point in two images at least."""
+def _measurements(
+    given: TiedPhotographs, image: np.ndarray, control: dict[str, np.ndarray] | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Image, point and pixels of every measurement; none twice, each point in two images at least or control, each
+    image with three at least."""
     point, xy = given.point, given.column_row
     n_all = len(point)
     # The same feature, by the point with the smaller number; then the same image, by the feature that comes first.
@@ -151,14 +218,21 @@ def _measurements(given: TiedPhotographs, image: np.ndarray) -> tuple[np.ndarray
         columns = np.column_stack([image, xy if key == "xy" else point])
         kept = np.sort(np.unique(columns, axis=0, return_index=True)[1])
         image, point, xy = image[kept], point[kept], xy[kept]
-    n_once = len(point)
-    _, of_id, times = np.unique(point, return_inverse=True, return_counts=True)
-    several = times[of_id] >= 2
-    if n_once < n_all or not several.all():
+    n_once, n_points = len(point), len(np.unique(point))
+    own = set() if control is None else set(control["point"][control["role"] == "control"])
+    held = np.array([name in own for name in given.points], bool)
+    while True:
+        tied = (np.bincount(point, minlength=len(held))[point] >= 2) | held[point]
+        tied &= np.bincount(image[tied], minlength=len(given.files))[image] >= _LEAST
+        if tied.all():
+            break
+        image, point, xy = image[tied], point[tied], xy[tied]
+    n_left = n_points - len(np.unique(point))
+    if n_once < n_all or n_left:
         warnings.warn(
             f"{given.file}: {n_all - n_once} measurement(s) that are there twice are not used, nor are "
-            f"{int((times < 2).sum())} point(s) that fewer than two images show",
+            f"{n_left} point(s) that fewer than two images show",
             UserWarning,
             stacklevel=4,
         )
-    return image[several], point[several], xy[several]
+    return image, point, xy

@@ -1,0 +1,157 @@
+"""Where photographs show points, for orientations whose own file does not say so: texts that lie beside it, and marks.
+
+BINGO's coordinates are millimetres and PATB's in the unit of the principal distance in its heads, micrometres as a
+rule; x right, y up, from the middle of the photograph. Pix4D's and those of image_points.csv are pixels; the corner of
+the upper left one is (0, 0).
+"""
+
+import warnings
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxphoto.camera import InteriorOrientation, Sensor
+from jaxphoto.errors import InputError, few, quoted
+from jaxphoto.io.control_files.rows import Mark
+from jaxphoto.io.reconstructions.measured_text import is_measured, read_measured
+from jaxphoto.io.text_tables import is_number, read_csv
+
+TABLE = "image_points.csv"
+# What files of such texts end with.
+_ENDS = (".txt", ".dat", ".im", ".img", ".ima", ".pho", ".pat", ".bingo", ".patb", "")
+# A principal distance in micrometres is so many times one in millimetres, but for the difference of two calibrations.
+_UM = 1000.0
+_NEAR = 2.0
+
+
+class Shown(NamedTuple):
+    """Which photographs show which points, and where."""
+
+    points: list[str]
+    image: Int[np.ndarray, "n"]
+    point: Int[np.ndarray, "n"]
+    column_row: Float[np.ndarray, "n 2"]
+
+
+class PhotographCamera(NamedTuple):
+    """The camera of a photograph."""
+
+    sensor: Sensor
+    interior: InteriorOrientation
+
+
+def points_beside(path: Path, files: Sequence[str], cameras: Sequence[PhotographCamera]) -> Shown:
+    """What the one text, or image_points.csv, in the folder of `path` says of the photographs `files`; nothing where
+    there is none.
+
+    Raises InputError for several, and for rows that are no image points. A UserWarning tells of other photographs.
+    """
+    found = measured_texts(path)
+    if len(found) > 1:
+        told = few([other.name for other in found])
+        raise InputError(f"{path.parent} holds {len(found)} files of image points ({told}); leave one")
+    if not found:
+        return named([], [], np.zeros((0, 2)))
+    (text,) = found
+    if text.name == TABLE:
+        return _of_table(text, files, path.name)
+    return points_of(text, files, path.name, cameras)
+
+
+def measured_texts(path: Path) -> list[Path]:
+    """The files of image points in the folder of `path`, which is none of them."""
+    near = (p for p in sorted(path.parent.iterdir()) if p.is_file() and p != path)
+    return [p for p in near if p.name == TABLE or (p.suffix.lower() in _ENDS and is_measured(p))]
+
+
+def points_of(text: Path, files: Sequence[str], of: str, cameras: Sequence[PhotographCamera] | None = None) -> Shown:
+    """The image points in a text of the photographs `files`; without `cameras` they are pixels. A UserWarning tells of
+    photographs that are none of `files`, which the file `of` names.
+
+    Raises InputError for rows that are no image points.
+    """
+    measured = read_measured(text)
+    places = _places(files)
+    heads = [_photograph(head, places) for head in measured.heads]
+    _tell([head for head, (k, _) in zip(measured.heads, heads, strict=True) if k < 0], text, of)
+    image = np.array([k for k, _ in heads], int)[measured.photograph]
+    scales = [_scale(None if cameras is None or k < 0 else cameras[k], rest) for k, rest in heads]
+    scale, offset = np.array(scales).reshape(-1, 2, 2)[measured.photograph].transpose(1, 0, 2)
+    kept = image >= 0
+    points = [measured.points[k] for k in np.flatnonzero(kept).tolist()]
+    return named(image[kept], points, (measured.xy * scale + offset)[kept])
+
+
+def marks_shown(marks: Sequence[Mark], files: Sequence[str]) -> Shown:
+    """The marks of points in the photographs `files`, by their whole names; other photographs are left out."""
+    place = {name: k for k, name in enumerate(files)}
+    own = [mark for mark in marks if mark[0] in place]
+    at = np.array([mark[2] for mark in own]).reshape(-1, 2)
+    return named([place[mark[0]] for mark in own], [mark[1] for mark in own], at)
+
+
+def joined(one: Shown, other: Shown) -> Shown:
+    """Both; points of one name are one."""
+    names = [[shown.points[k] for k in shown.point.tolist()] for shown in (one, other)]
+    image, at = np.concatenate([one.image, other.image]), np.concatenate([one.column_row, other.column_row])
+    return named(image, names[0] + names[1], at)
+
+
+def named(image: Sequence[int] | np.ndarray, points: Sequence[str], column_row: Float[np.ndarray, "n 2"]) -> Shown:
+    """Measurements by the names of their points."""
+    ids, point = np.unique(np.array(points, object), return_inverse=True)
+    return Shown(ids.tolist(), np.array(image, int), point.astype(int), column_row)
+
+
+def _of_table(text: Path, files: Sequence[str], of: str) -> Shown:
+    table = read_csv(text, ("image", "point", "column_px", "row_px"), ("sigma_px",))
+    places = _places(files)
+    images, points = table.ids("image").tolist(), table.ids("point").tolist()
+    place = np.array([places.get(name, -1) for name in images], int)
+    _tell(list(dict.fromkeys(name for name, k in zip(images, place.tolist(), strict=True) if k < 0)), text, of)
+    at, kept = np.stack([table.numbers("column_px"), table.numbers("row_px")], axis=1), place >= 0
+    return named(place[kept], [name for name, k in zip(points, kept.tolist(), strict=True) if k], at[kept])
+
+
+def _places(files: Sequence[str]) -> dict[str, int]:
+    """Photographs by their names, and by those without folder and ending where only one has such."""
+    paths = [PurePosixPath(PureWindowsPath(file).as_posix()) for file in files]
+    found: dict[str, int] = {}
+    for names in ([path.stem for path in paths], [path.name for path in paths]):
+        times = Counter(names)
+        found |= {name: k for k, name in enumerate(names) if times[name] == 1}
+    return found | {name: k for k, name in enumerate(files)}
+
+
+def _photograph(head: str, places: dict[str, int]) -> tuple[int, list[str]]:
+    """The photograph that a head names, -1 for none, and what the head says of it beyond its name."""
+    words = head.split()
+    for n in range(len(words), 0, -1):
+        name = head if n == len(words) else " ".join(words[:n])
+        if name in places:
+            return places[name], words[n:]
+    return -1, []
+
+
+def _scale(camera: PhotographCamera | None, rest: list[str]) -> list[list[float]]:
+    """What makes pixels of a photograph's coordinates: factors and what is then added, by axis."""
+    if camera is None or not rest:
+        return [[1.0, 1.0], [0.0, 0.0]]
+    sensor, c_um = camera.sensor, float(camera.interior.c) * _UM
+    c = abs(float(rest[0])) if is_number(rest[0]) else 0.0
+    unit_px = (1 / _UM if c_um / _NEAR < c < c_um * _NEAR else 1.0) / sensor.pixel_mm
+    return [[unit_px, -unit_px], [sensor.width_px / 2, sensor.height_px / 2]]
+
+
+def _tell(unknown: list[str], text: Path, of: str) -> None:
+    if unknown:
+        left = few([quoted(name) for name in unknown])
+        warnings.warn(
+            f"{text.name}: {len(unknown)} photographs are not in {of} and are left out: {left}",
+            UserWarning,
+            stacklevel=4,
+        )

@@ -1,0 +1,128 @@
+"""Exported photographs of `tests.io.test_exports`, with image points as texts beside them."""
+
+import csv
+import json
+import math
+
+import numpy as np
+
+from jaxphoto.io import export
+from jaxphoto.io.exports.map_photographs import in_map
+from tests.io.test_exports import SENSOR, photographs
+
+
+def inside(camera="agisoft", kind="epsg"):
+    """Four photographs, with the image points that lie in their formats."""
+    p = photographs(camera, kind)
+    there = ((p.column_row > 0) & (p.column_row < [SENSOR.width_px, SENSOR.height_px])).all(axis=1)
+    return p._replace(image=p.image[there], point=p.point[there], column_row=p.column_row[there])
+
+
+def text_of_points(p, head, unit_mm=1.0):
+    """Image points in a text: in units of `unit_mm` from the middle, y up, or pixels where that is 0."""
+    lines = []
+    for name, rows in zip(p.files, p.rows_of_images, strict=True):
+        lines.append(head.format(name.rsplit(".", 1)[0]))
+        for k in rows.tolist():
+            column, row = p.column_row[k].tolist()
+            x, y = (column - SENSOR.width_px / 2) * SENSOR.pixel_mm, (SENSOR.height_px / 2 - row) * SENSOR.pixel_mm
+            at = (x / unit_mm, y / unit_mm) if unit_mm else (column, row)
+            lines.append(f"{p.points[p.point[k]]} {at[0]!r} {at[1]!r} 0")
+        lines.append("-99")
+    return "\n".join(lines) + "\n"
+
+
+BINGO = "{} H_9.6_7.2"
+
+
+def write_metashape(folder, camera="agisoft", kind="epsg", change=lambda text: text, ties=True):
+    """cameras.xml as `--to metashape` writes it, and BINGO's image points."""
+    p = inside(camera, kind)
+    export(p, folder, "metashape")
+    path = folder / "cameras.xml"
+    path.write_text(change(path.read_text()))
+    if ties:
+        (folder / "bingo.txt").write_text(text_of_points(p, BINGO))
+    return folder
+
+
+def markers(p, names, coordinates):
+    """Elements of a chunk: markers with coordinates, marked where the photographs show points of these names."""
+    own, marks = "", ""
+    for k, (name, (x, y, z)) in enumerate(zip(names, np.asarray(coordinates).tolist(), strict=True)):
+        enabled = "true" if k else "false"
+        place = f'<reference x="{x!r}" y="{y!r}" z="{z!r}" enabled="{enabled}"/>'
+        own += f'<marker id="{k}" label="{name}">{place}</marker>'
+        marks += f'<marker marker_id="{k}">'
+        for row in np.flatnonzero(p.point == p.points.index(name)):
+            column, line = p.column_row[row].tolist()
+            marks += f'<location camera_id="{p.image[row]}" pinned="true" x="{column!r}" y="{line!r}"/>'
+        marks += "</marker>"
+    return f'<markers>{own}</markers><frames><frame id="0"><markers>{marks}</markers></frame></frames>'
+
+
+PATB = "{} 8800.0 0"
+
+
+def write_angles(folder, kind="epsg", change=lambda text: text, points="bingo"):
+    """exterior.txt and camera.toml as `--to opk` writes them, and image points in one of three forms."""
+    p = inside("opencv", kind)
+    export(p, folder, "opk")
+    path = folder / "exterior.txt"
+    path.write_text(change(path.read_text()))
+    head, unit = {"bingo": (BINGO, 1.0), "patb": (PATB, 1e-3), "pix4d": ("{}", 0.0)}[points]
+    (folder / "ties.dat").write_text(text_of_points(p, head, unit))
+    return folder
+
+
+def write_patb(folder, kind="local", turned=False, change=lambda text: text):
+    """PATB's orientations, in three rows a photograph, with PATB's image points and the camera of `--to opk`."""
+    p = inside("opencv", kind)
+    write_angles(folder, kind, points="patb")
+    (folder / "exterior.txt").unlink()
+    on_map = in_map(p).exterior
+    lines = []
+    for name, at, r in zip(p.images, *map(np.asarray, (on_map.position, on_map.camera_from_object)), strict=True):
+        a = [f"{value:.17g}" for value in (r if turned else r.T).ravel()]
+        lines += [" ".join([name, "8800.0", *map(repr, at.tolist())]), " ".join(a[:5]), " ".join(a[5:])]
+    (folder / "patb.ori").write_text(change("\n".join(lines) + "\n"))
+    return folder
+
+
+def write_nerfstudio(folder, camera="opencv", change=lambda content: content):
+    """transforms.json as `--to nerfstudio` writes it, and image_points.csv in place of a text."""
+    p = inside(camera, "local")
+    export(p, folder, "nerfstudio")
+    path = folder / "transforms.json"
+    path.write_text(json.dumps(change(json.loads(path.read_text()))))
+    with (folder / "image_points.csv").open("w", newline="") as file:
+        table = csv.writer(file)
+        table.writerow(["image", "point", "column_px", "row_px"])
+        for i, j, at in zip(p.image.tolist(), p.point.tolist(), p.column_row.tolist(), strict=True):
+            table.writerow([p.images[i], p.points[j], *map(repr, at)])
+    return folder
+
+
+def write_orthority(folder, camera="opencv", kind="epsg", collection=True, change=lambda text: text):
+    """Parameters as `--to orthority` writes them, the exterior ones as GeoJSON in radians, and BINGO's image points."""
+    p = inside(camera, kind)
+    export(p, folder, "orthority")
+    table = folder / "ext_param.csv"
+    if collection:
+        with table.open() as file:
+            rows = list(csv.DictReader(file))
+        system = {"world_crs": (folder / "ext_param.prj").read_text().strip()} if kind == "epsg" else {"world_crs": ""}
+        own = [
+            {"filename": row["filename"], "camera": row["camera"], "xyz": [float(row[k]) for k in "xyz"]}
+            | {"opk": [math.radians(float(row[k])) for k in ("omega", "phi", "kappa")]}
+            for row in rows
+        ]
+        point = {"type": "Point", "coordinates": [0.0, 0.0]}
+        features = [{"type": "Feature", "geometry": point, "properties": values} for values in own]
+        text = json.dumps({"type": "FeatureCollection", **system, "features": features})
+        (folder / "ext_param.geojson").write_text(change(text))
+        table.unlink()
+    else:
+        table.write_text(change(table.read_text()))
+    (folder / "bingo.txt").write_text(text_of_points(p, BINGO))
+    return folder

@@ -1,0 +1,329 @@
+"""Orientations with image points beside them: read as they were written, in map systems too; refused in a sentence."""
+
+import dataclasses
+import re
+
+import jax
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from jaxphoto.camera import get_parameter, parameter_names
+from jaxphoto.collinearity import ExteriorOrientation
+from jaxphoto.errors import InputError
+from jaxphoto.io import FORMATS, export, read_source
+from jaxphoto.io.block_folder.table_layout import XYZ
+from jaxphoto.io.exports.map_photographs import in_map
+from jaxphoto.io.reconstructions.metashape import read_metashape
+from jaxphoto.io.reconstructions.text_project import read_text_project
+from tests.formulas import camera_from_object
+from tests.io.oriented_files import (
+    inside,
+    markers,
+    write_angles,
+    write_metashape,
+    write_nerfstudio,
+    write_orthority,
+    write_patb,
+)
+from tests.io.test_exports import SENSOR, photographs
+from tests.io.test_reconstructions import _projected, free_of
+
+
+def misfits_px(block, p):
+    """Measured minus projected, from the start values and the points that were photographed."""
+    rows = block.image_points
+    points = p.xyz[[p.points.index(name) for name in block.points]]
+    if block.frame.kind == "epsg":
+        points = block.frame.map.local(p.frame.map.map(points))
+    at = jax.tree.map(lambda leaf: np.asarray(leaf)[np.asarray(rows.image)], block.start.unknowns.exterior)
+    (camera,) = block.sensors
+    found = np.asarray(rows.xy) - _projected(block.start.unknowns.interior[camera], at, points[np.asarray(rows.point)])
+    return found / block.sensors[camera].pixel_mm
+
+
+@pytest.mark.filterwarnings("ignore:.*fewer than")
+@pytest.mark.parametrize(("camera", "kind"), [("agisoft", "epsg"), ("agisoft fisheye", "local")])
+def test_cameras_of_metashape_and_image_points_of_bingo_are_a_block(tmp_path, camera, kind):
+    p = inside(camera, kind)
+    block = read_source(write_metashape(tmp_path / "in", camera, kind))
+    assert block.sensors["one"] == SENSOR and block.frame.kind == kind and block.datum.kind == "inner"
+    assert len(block.images) == len(set(p.image.tolist())) and len(block.image_points.image) > 60
+    assert np.abs(misfits_px(block, p)).max() < 1e-6
+    assert free_of(block, "one") == {"c_mm", "xp_mm", "yp_mm", "k1", "k2", "k3", "k4", "p1", "p2", "b1", "b2"}
+
+
+angle = st.floats(-3.1, 3.1)
+metres = st.floats(-2000.0, 2000.0)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    kind=st.sampled_from(["local", "epsg"]),
+    poses=st.lists(st.tuples(metres, metres, metres, angle, st.floats(-1.5, 1.5), angle), min_size=4, max_size=4),
+)
+@pytest.mark.filterwarnings("ignore:.*fewer than", "ignore:.*not read")
+def test_positions_and_rotations_of_metashape_come_back(tmp_path_factory, kind, poses):
+    folder = tmp_path_factory.mktemp("poses")
+    values = np.array(poses)
+    turn = np.stack([camera_from_object(*angles) for angles in values[:, 3:]])
+    p = photographs("agisoft", kind)._replace(exterior=ExteriorOrientation(values[:, :3], turn))
+    export(p, folder, "metashape")
+    rows = "".join(f"{k} {k}.5 {k}.25\n" for k in range(3))
+    (folder / "ties.txt").write_text("".join(f"{name} camera\n{rows}-99\n" for name in p.images))
+    table = read_metashape(folder).tables["images"]
+    wanted = in_map(p).exterior
+    order = [p.images.index(name) for name in table.text("image")]
+    position = np.stack([table.numbers(name) for name in XYZ], axis=1)
+    # A northing of a map has nine digits before those of a nanometre.
+    tolerance = 1e-9 if kind == "local" else 1e-8
+    np.testing.assert_allclose(position, np.asarray(wanted.position)[order], rtol=0, atol=tolerance)
+    angles = np.deg2rad(np.stack([table.numbers(f"{name}_deg") for name in ("omega", "phi", "kappa")], axis=1))
+    again = np.stack([camera_from_object(*row) for row in angles])
+    np.testing.assert_allclose(again, np.asarray(wanted.camera_from_object)[order], rtol=0, atol=1e-9)
+
+
+REAL = """<document version="2.0.0"><chunk label="Chunk 1"><sensors><sensor id="0" label="M3M" type="frame">
+<resolution width="5280" height="3956"/><property name="pixel_width" value="0.00335820"/>
+<calibration type="frame" class="adjusted"><resolution width="5280" height="3956"/><f>3705.4728792737214</f>
+<cx>11.6738523909</cx><cy>-27.7497969199</cy><k1>-0.0919367147</k1></calibration></sensor></sensors>
+<components><component id="0"><transform><rotation locked="true">0.8710699454 0.3070967021 -0.3833128821 -0.4909742007
+0.5658364395 -0.6623997719 0.0134716110 0.7651932691 0.6436596744</rotation>
+<translation locked="true">-2499366.429888 -4256836.520906 4029217.965003</translation>
+<scale locked="true">12.354192447331316</scale></transform></component></components>
+<cameras><group id="0" label="Group 1" type="folder"><camera id="0" sensor_id="0" component_id="0" label="one.JPG">
+<transform>-0.99988146 -0.00872749 0.01268391 7.04224697 -0.00842932 0.99969124 0.02337453 7.05403071
+-0.01288400 0.02326485 -0.99964631 0.43561421 0 0 0 1</transform></camera></group></cameras></chunk></document>"""
+
+
+def test_a_camera_of_metashape_itself_is_where_its_receiver_was_and_looks_down(tmp_path):
+    """One photograph of a flight that is public: its GNSS says -120.417985477, 39.41191747, 2420.109."""
+    # Two of it, because points of one photograph tie nothing.
+    twice = re.sub(r"(<camera .*?</camera>)", lambda m: m[1] + m[1].replace("one.JPG", "two.JPG"), REAL, flags=re.S)
+    (tmp_path / "cameras.xml").write_text(twice)
+    rows = "1 0.5 0.5\n2 -0.5 0.5\n3 0.5 -0.5\n-99\n"
+    (tmp_path / "ties.dat").write_text(f"one c\n{rows}two c\n{rows}")
+    images = read_metashape(tmp_path).tables["images"]
+    at = [images.numbers(name)[0] for name in ("longitude_deg", "latitude_deg", "height_m")]
+    assert np.abs((at - np.array([-120.417985477, 39.41191747, 2420.109])) / [1e-4, 1e-4, 10]).max() < 1
+    # Yaw was 179.9 degrees: the camera's x axis points west.
+    omega, phi, kappa = (images.numbers(f"{name}_deg")[0] for name in ("omega", "phi", "kappa"))
+    assert abs(omega) < 3 and abs(phi) < 3 and abs(abs(kappa) - 180) < 3
+
+
+TEXTS = {
+    "bingo": lambda folder: write_angles(folder),
+    "pixels": lambda folder: write_angles(folder, "local", points="pix4d"),
+    "gon": lambda folder: write_angles(folder, change=in_gon, points="patb"),
+    "matrices": lambda folder: write_patb(folder),
+    "matrices turned": lambda folder: write_patb(folder, turned=True),
+}
+
+
+def in_gon(text):
+    """Angles in gon before the positions, and said so."""
+    lines = [line for line in text.split("\n") if line]
+    head = [line.replace("degrees", "gon") for line in lines if line.startswith("#")]
+    rows = [line.split("\t") for line in lines if not line.startswith(("#", "imageName"))]
+    turned = [[row[0], *(repr(float(v) / 0.9) for v in row[4:]), *row[1:4]] for row in rows]
+    return "\n".join([*head, "imageName omega phi kappa X Y Z", *map(" ".join, turned)])
+
+
+@pytest.mark.filterwarnings("ignore:.*fewer than")
+@pytest.mark.parametrize("name", TEXTS)
+def test_texts_of_orientations_image_points_and_a_camera_are_a_block(tmp_path, name):
+    block = read_source(TEXTS[name](tmp_path / "in"))
+    p = inside("opencv", block.frame.kind)
+    assert block.sensors["camera"] == SENSOR and set(block.images) <= set(p.images) and len(block.images) > 2
+    assert np.abs(misfits_px(block, p)).max() < 1e-6
+    assert free_of(block, "camera") == {"c_mm", "xp_mm", "yp_mm", "k1", "k2", "k3", "p1", "p2", "b1"}
+
+
+PARAMETERS = {
+    "nerfstudio opencv": (lambda folder: write_nerfstudio(folder), "opencv"),
+    "nerfstudio fisheye": (lambda folder: write_nerfstudio(folder, "fisheye"), "fisheye"),
+    "nerfstudio cameras of frames": (
+        lambda f: write_nerfstudio(f, change=lambda t: {"frames": [{**t, **own} for own in t["frames"]]}), "opencv",
+    ),
+    "orthority collection": (lambda folder: write_orthority(folder), "opencv"),
+    "orthority table": (lambda folder: write_orthority(folder, "rational", collection=False), "rational"),
+    "orthority local": (lambda folder: write_orthority(folder, "fisheye", "local"), "fisheye"),
+}  # fmt: skip
+
+
+@pytest.mark.filterwarnings("ignore:.*fewer than")
+@pytest.mark.parametrize("name", PARAMETERS)
+def test_parameters_and_image_points_are_a_block(tmp_path, name):
+    write, camera = PARAMETERS[name]
+    block = read_source(write(tmp_path / "in"))
+    (own,) = block.sensors
+    assert np.abs(misfits_px(block, inside(camera, block.frame.kind))).max() < 1e-6
+    assert {"c_mm", "xp_mm", "yp_mm", "k1", "k2"} <= free_of(block, own)
+    # Pixels have no size in nerfstudio.
+    assert block.sensors[own] == (SENSOR if "orthority" in name else dataclasses.replace(SENSOR, pixel_mm=0.001))
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    format=st.sampled_from(["nerfstudio", "orthority"]),
+    poses=st.lists(st.tuples(metres, metres, metres, angle, st.floats(-1.5, 1.5), angle), min_size=4, max_size=4),
+)
+def test_poses_come_back(tmp_path_factory, format, poses):
+    folder, values = tmp_path_factory.mktemp("poses"), np.array(poses)
+    turn = np.stack([camera_from_object(*angles) for angles in values[:, 3:]])
+    p = photographs("opencv", "local")._replace(exterior=ExteriorOrientation(values[:, :3], turn))
+    export(p, folder, format)
+    rows = "".join(f"{k} {k}.5 {k}.25\n" for k in range(3))
+    (folder / "ties.txt").write_text("".join(f"{name} camera\n{rows}-99\n" for name in p.images))
+    tables = FORMATS[format].read(folder)
+    table, (camera,) = tables.tables["images"], tables.settings["cameras"].values()
+    order = [p.images.index(name) for name in table.text("image")]
+    position = np.stack([table.numbers(name) for name in XYZ], axis=1)
+    np.testing.assert_allclose(position, values[order, :3], rtol=0, atol=1e-9)
+    angles = np.deg2rad(np.stack([table.numbers(f"{name}_deg") for name in ("omega", "phi", "kappa")], axis=1))
+    again = np.stack([camera_from_object(*row) for row in angles])
+    np.testing.assert_allclose(again, turn[order], rtol=0, atol=1e-9)
+    given = p.cameras["one"].interior
+    scale = camera["pixel_mm"] / SENSOR.pixel_mm
+    interior = {key: value / scale if key.endswith("_mm") else value for key, value in camera["interior"].items()}
+    for name in parameter_names(given):
+        assert interior[name] == pytest.approx(float(get_parameter(given, name)), abs=1e-9)
+
+
+@settings(max_examples=25, deadline=None)
+@given(poses=st.lists(st.tuples(metres, metres, metres, angle, st.floats(-1.5, 1.5), angle), min_size=4, max_size=4))
+def test_positions_and_angles_come_back(tmp_path_factory, poses):
+    folder, values = tmp_path_factory.mktemp("angles"), np.array(poses)
+    turn = np.stack([camera_from_object(*angles) for angles in values[:, 3:]])
+    p = photographs("opencv", "local")._replace(exterior=ExteriorOrientation(values[:, :3], turn))
+    export(p, folder, "opk")
+    rows = "".join(f"{k} {k}.5 {k}.25\n" for k in range(3))
+    (folder / "ties.txt").write_text("".join(f"{name} camera\n{rows}-99\n" for name in p.images))
+    table = read_text_project(folder).tables["images"]
+    order = [p.images.index(name) for name in table.text("image")]
+    position = np.stack([table.numbers(name) for name in XYZ], axis=1)
+    np.testing.assert_allclose(position, values[order, :3], rtol=0, atol=1e-9)
+    angles = np.deg2rad(np.stack([table.numbers(f"{name}_deg") for name in ("omega", "phi", "kappa")], axis=1))
+    again = np.stack([camera_from_object(*row) for row in angles])
+    np.testing.assert_allclose(again, turn[order], rtol=0, atol=1e-9)
+
+
+@pytest.mark.filterwarnings("ignore:.*fewer than")
+def test_markers_of_metashape_are_control_and_tie_photographs(tmp_path):
+    p = inside()
+    names = [p.points[k] for k in np.argsort(-np.bincount(p.point, minlength=40))[:8]]
+    at = in_map(p).xyz[[p.points.index(name) for name in names]]
+    more = markers(p, names, at)
+    write_metashape(tmp_path / "in", change=lambda text: text.replace("</chunk>", more + "</chunk>"), ties=False)
+    block = read_source(tmp_path / "in")
+    assert set(block.points) == set(names) and block.datum.kind == "control"
+    assert len(block.check.who) == 3 and len(block.control.who) == 21
+    assert np.asarray(block.control.sigma).tolist() == [0.02, 0.02, 0.03] * 7
+    assert np.abs(misfits_px(block, p)).max() < 1e-6
+
+
+def _without(pattern):
+    return lambda text: re.sub(pattern, "", text, flags=re.S)
+
+
+def _metashape(change=lambda text: text, **more):
+    return lambda folder: write_metashape(folder, change=change, **more)
+
+
+def _angles(change):
+    return lambda folder: write_angles(folder, change=change) / "exterior.txt"
+
+
+def _patb(change):
+    return lambda folder: write_patb(folder, change=change) / "patb.ori"
+
+
+def _nerf(change):
+    return lambda folder: write_nerfstudio(folder, change=change)
+
+
+def _orthority(old, new):
+    return lambda folder: write_orthority(folder, change=lambda text: text.replace(old, new))
+
+
+def changed(folder, name, old, new):
+    path = folder / name
+    path.write_text(path.read_text().replace(old, new))
+    return folder
+
+
+def without(folder, name):
+    (folder / name).unlink()
+    return folder
+
+
+def appended(folder, text, name="ties.dat"):
+    path = folder / name
+    path.write_text(path.read_text() + text)
+    return folder
+
+
+REFUSED = {
+    "no ties": (_metashape(ties=False), "cameras.xml has no tie points and no marks.*as BINGO or PATB"),
+    "not aligned": (_metashape(_without("<transform>-?[0-9].*?</transform>")), "no camera is aligned; align"),
+    "cut": (_metashape(lambda text: text[:-30]), "cameras.xml: the XML is broken"),
+    "no sensor": (_metashape(_without("<calibration.*</calibration>")), "'a b': its sensor is not calibrated"),
+    "matrix": (_metashape(lambda text: text.replace(" 1.0</tr", " x</tr")), "'a b', transform: .* 16 fi"),
+    "scale": (_metashape(lambda text: text.replace(">1.0</scale>", ">-1</scale>")), "a scale of -1 cannot be"),
+    "moved": (
+        _metashape(lambda text: re.sub("<translation.*?</translation>", "<translation>0 0 0</translation>", text)),
+        "not on the earth",
+    ),
+    "row": (_angles(lambda text: text + "lost 1 2 3\n" * 2), "row 8: 'lost 1 2 3' is not name, X, Y, Z, omega"),
+    "angle": (_angles(lambda text: text + "x.jpg 1 2 3 4 5 1e99\n" * 2), "row 8: '1 2 3 4 5 1e99' is not 6 numbers"),
+    "system": (_angles(lambda text: text.replace("EPSG:32633", "EPSG:99999")), "EPSG code 99999 is unknown"),
+    "no camera": (lambda folder: without(write_angles(folder), "camera.toml"), "0 camera files and needs one"),
+    "no points": (lambda folder: without(write_angles(folder), "ties.dat") / "exterior.txt", "has no image points for"),
+    "point": (lambda folder: appended(write_angles(folder), "a b c\n7 1\n"), "row [0-9]+: '7 1' is not point"),
+    "xy": (lambda folder: appended(write_angles(folder), "a b c\n7 1 x\n"), "'1 x' is not 2 numbers"),
+    "matrix end": (_patb(lambda text: text.rsplit("\n", 2)[0]), "patb.ori, row 10: .* first of three rows"),
+    "matrix row": (_patb(lambda text: text.rstrip() + "x\n"), "patb.ori, row 12: .* is not 4 numbers"),
+    "frames": (_nerf(lambda t: {**t, "frames": 5}), "has no list of frames; give transforms.json"),
+    "model": (_nerf(lambda t: {**t, "camera_model": "EQUIRECTANGULAR"}), "'EQUIRECTANGULAR' is not known here"),
+    "focal": (_nerf(lambda t: {**t, "fl_x": 0}), "fl_x: 0 is not positive"),
+    "pose": (_nerf(lambda t: {**t, "frames": [{**f, "transform_matrix": [1]} for f in t["frames"]]}), "is not 4 x"),
+    "no table": (lambda f: without(write_nerfstudio(f), "image_points.csv"), "json has no image points, and none are"),
+    "pixel": (
+        lambda f: appended(write_nerfstudio(f), "f,p1,x,2\n", "image_points.csv"), "points.csv, row [0-9]+: column_px",
+    ),
+    "opk": (_orthority('"opk": [', '"opk": ["x", '), "ext_param.geojson, feature 1: .* is not 3 finite numbers"),
+    "world": (_orthority("EPSG:32633", "nowhere"), "'nowhere' names no coordinate system"),
+    "camera": (_orthority('"camera": "one"', '"camera": "two"'), "photograph 1: there is no camera 'two' in the int"),
+    "interior": (
+        lambda f: changed(write_orthority(f), "int_param.yaml", ": brown", ": other"), r"\[one\] type: 'other' is",
+    ),
+    "yaml": (lambda f: changed(write_orthority(f), "int_param.yaml", "type: ", "type: {"), "no YAML that can be read"),
+    "spherical": (_metashape(lambda text: text.replace('"frame"', '"spherical"')), "'spherical' is not known here"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_cannot_be_is_told_in_a_sentence(tmp_path, name):
+    write, message = REFUSED[name]
+    with pytest.raises(InputError, match=message):
+        read_source(write(tmp_path / "in"))
+
+
+def test_photographs_that_nothing_ties_are_told(tmp_path):
+    write_metashape(tmp_path / "in", ties=False)
+    (tmp_path / "in" / "ties.txt").write_text("a b camera\n1 0.5 0.5\n2 0.5 0.6\n3 0.5 0.7\n-99\nlost camera\n")
+    with (
+        pytest.raises(InputError, match="no image shows 3 points that others show, too"),
+        pytest.warns(UserWarning, match="1 photographs are not in cameras.xml .*'lost camera'"),
+        pytest.warns(UserWarning, match=r"nor are 3 point\(s\) that fewer than two images show"),
+    ):
+        read_source(tmp_path / "in")
+
+
+def test_two_texts_of_image_points_are_one_too_many(tmp_path):
+    write_metashape(tmp_path / "in")
+    text = (tmp_path / "in" / "bingo.txt").read_text()
+    (tmp_path / "in" / "again.dat").write_text(text)
+    with pytest.raises(InputError, match=r"holds 2 files of image points \(again.dat, bingo.txt\); leave one"):
+        read_source(tmp_path / "in")
