@@ -12,9 +12,11 @@ from typing import Any, ClassVar, Literal
 import equinox as eqx
 import numpy as np
 
-UNITS = ("m", "rad", "mm", "s", "ms", "m_per_s", "rad_per_s", "mm_per_s", "mm_per_h", "per_h", "ppm")
-"""Units that the names of declared parameters may end in; a typical scale is known of these, of `per_h` where cameras
-are bent."""
+UNITS = (
+    "m", "rad", "mm", "s", "ms", "m_per_s", "rad_per_s", "mm_per_s", "mm_per_h", "per_h", "mm_per_K", "per_K", "ppm",
+)  # fmt: skip
+"""Units that the names of declared parameters may end in; a typical scale is known of these, of `per_h` and
+`per_K` where cameras are bent."""
 Owner = Literal["image", "camera", "mount", "strip", "block"] | str
 """Whose parameters are: of each image, of each camera and so on, or of the whole block. Any other word is a partition
 of the images that the block names (`Block.partitions`), such as intervals of time."""

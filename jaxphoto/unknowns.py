@@ -26,6 +26,7 @@ from jaxphoto.camera import (
     InteriorOrientation,
     RollingShutter,
     StripCamera,
+    ThermalRates,
     get_parameter,
     parameter_names,
     set_parameter,
@@ -37,7 +38,8 @@ from jaxphoto.parameters import AbstractParameters, dynamic_fields
 from jaxphoto.short_repr import html_of, number_word, numbers_words
 
 UNKNOWNS: tuple[type[AbstractParameters], ...] = (
-    Scanner, Mount, StripBias, FlightBias, CameraRates, StripCamera, RollingShutter, ImageMotion,
+    Scanner, Mount, StripBias, FlightBias, CameraRates, ThermalRates, StripCamera, RollingShutter,
+    ImageMotion,
 )  # fmt: skip
 """The classes of declared parameters that a block folder may hold; one of your own is given to `read_block`.
 

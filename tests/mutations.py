@@ -270,6 +270,17 @@ truth = { readout_ms = 30.0 }
 """
 
 
+def _warm_block(folder: Path) -> None:
+    """With temperatures of photographs beside the block."""
+    for name, content in FILES.items():
+        (folder / name).write_text(content, encoding="utf-8")
+    rates = "[unknowns.thermal_rates.kodak]\nc_rate = { sigma_mm_per_K = 1e-3 }\n"
+    top = "reference_temperature_c = 20.0\n" + FILES["block.toml"].replace("[datum]", rates + "[datum]")
+    (folder / "block.toml").write_text(top, encoding="utf-8")
+    rows = "".join(f"{name},{name}.jpg,{'0' * 64},True,1{k}.5\n" for k, name in enumerate("abc"))
+    (folder / "conditions.csv").write_text("image,file,sha256,used,lens_temperature_c\n" + rows)
+
+
 def _rolling_block(folder: Path) -> None:
     block = read_block(_EXAMPLES / "cross_block")
     motion = ImageMotion(np.array([0.0, 50.0, 0.0]), np.zeros(3))
@@ -313,6 +324,7 @@ READERS: dict[str, Reader] = {
         lambda folder: read_recipe(folder / "recipe.toml"),
     ),
     "block-shutter": Reader(written_by(_rolling_block), read_block),
+    "block-warm": Reader(written_by(_warm_block), read_block, ("block.toml", "images.csv", "conditions.csv")),
     "photograph": Reader(written_by(_photograph), lambda folder: photographs([folder / "a.jpg"])),
     "camera-opencv": Reader(text(a__yml=cameras.OPENCV), _camera("a.yml")),
     "recipe-flight": _recipe("001"),

@@ -13,7 +13,7 @@ from jaxphoto.adjustment.solver.normal import Linearised
 from jaxphoto.adjustment.solver.reduced import reduce_normal
 from jaxphoto.adjustment.weak_words import weaknesses_of
 from jaxphoto.block import Block, exposures
-from jaxphoto.camera import CameraRates
+from jaxphoto.camera import RATES
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import DatumError, RankError
 from jaxphoto.observations import AbstractObservations
@@ -139,20 +139,21 @@ def _check_scanner(block: Block, priors: Unknowns) -> None:
 
 
 def _check_camera_rates(block: Block, priors: Unknowns) -> None:
-    times = np.asarray(exposures(block).in_flight)
-    for name, prior in priors.more.get(CameraRates.kind, {}).items():
-        free = [field for field in dynamic_fields(type(prior)) if getattr(prior, field) is FREE]
-        if free and np.ptp(times[sorted(_images_of(name, block.image_camera))]) == 0:
-            raise RankError(
-                f"{CameraRates.kind}[{name}].{free[0]} is free, but all images of the camera have one time: give the "
-                "times of their exposures, or hold the rate fixed"
-            )
-        distortion = priors.interior[name].distortion
-        if "k1_rate" in free and "k1" not in distortion.coefficients:
-            raise RankError(
-                f"{CameraRates.kind}[{name}].k1_rate is free, but the distortion {distortion.name} has no k1: hold the "
-                "rate fixed"
-            )
+    for rates in RATES:
+        along, what = np.asarray(rates.argument(exposures(block))), rates.along.split("_")[0]
+        for name, prior in priors.more.get(rates.kind, {}).items():
+            free = [field for field in dynamic_fields(rates) if getattr(prior, field) is FREE]
+            if free and np.ptp(along[sorted(_images_of(name, block.image_camera))]) == 0:
+                raise RankError(
+                    f"{rates.kind}[{name}].{free[0]} is free, but all images of the camera have one {what}: give the "
+                    f"{what}s of their exposures, or hold the rate fixed"
+                )
+            distortion = priors.interior[name].distortion
+            if "k1_rate" in free and "k1" not in distortion.coefficients:
+                raise RankError(
+                    f"{rates.kind}[{name}].k1_rate is free, but the distortion {distortion.name} has no k1: hold the "
+                    "rate fixed"
+                )
 
 
 def _images_of(name: str, names: Iterable[str]) -> set[int]:

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from jaxphoto.camera import ThermalRates
 from jaxphoto.errors import camera_words
 from jaxphoto.report.digits import of_sigma, with_sigma
 from jaxphoto.report.findings import Finding, Level, p_words
@@ -27,16 +28,19 @@ def drift_findings(tables: Tables) -> Iterator[Finding]:
 
 def drift_words(drift: CameraDrift) -> str:
     """One camera in one sentence; where it changed, by what did beyond chance, or else by all."""
-    test, over = drift.change, _duration(drift)
+    test, over, camera = drift.change, _span(drift), camera_words(drift.camera)
+    warmed = drift.rates is ThermalRates
     if not test.rejected:
         shown = _least(drift.parameters, test.detectable.tolist())
+        what = f"no change of {camera} with its temperature" if warmed else f"no drift of {camera}"
         return (
-            f"no drift of {camera_words(drift.camera)} is seen ({p_words(test.p_value)}); over its {over} this flight "
-            f"would have shown, with a probability of {POWER:.0%}, {shown}"
+            f"{what} is seen ({p_words(test.p_value)}); over its {over} this flight would have shown, with a "
+            f"probability of {POWER:.0%}, {shown}"
         )
     told = [k for k, p in enumerate(test.p_values) if p < SIGNIFICANCE_LEVEL] or range(len(drift.parameters))
     changes = ", ".join(_change(drift, k) for k in told)
-    return f"{camera_words(drift.camera)} changed over the {over} of its flight ({p_words(test.p_value)}): {changes}"
+    when = f"changed as it warmed by {over}" if warmed else f"changed over the {over} of its flight"
+    return f"{camera} {when} ({p_words(test.p_value)}): {changes}"
 
 
 def strip_words(strips: StripDifferences) -> str:
@@ -79,8 +83,10 @@ def _change(drift: CameraDrift, k: int) -> str:
     return f"c {'grew' if test.value[k] > 0 else 'shrank'} by {_signed(name, grown, k)}"
 
 
-def _duration(drift: CameraDrift) -> str:
-    return f"{drift.hours:.2g} h" if drift.hours > _HOURS else f"{60 * drift.hours:.2g} min"
+def _span(drift: CameraDrift) -> str:
+    if drift.rates is ThermalRates:
+        return f"{drift.span:.2g} K"
+    return f"{drift.span:.2g} h" if drift.span > _HOURS else f"{60 * drift.span:.2g} min"
 
 
 def _factor(name: str) -> float:

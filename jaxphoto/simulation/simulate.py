@@ -9,14 +9,14 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxphoto.block import Block, Start
+from jaxphoto.block import Block, Start, Temperatures
 from jaxphoto.camera import InteriorOrientation
 from jaxphoto.cloud import Cloud
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import BlockError
 from jaxphoto.georeferencing import Mount, StripBias, StripErrors, Trajectory
 from jaxphoto.observations import Attitudes, ControlRows, Distances, ImageRows, StationRows
-from jaxphoto.simulation.changing_cameras import seen_by_changing, with_rates
+from jaxphoto.simulation.changing_cameras import Circumstances, seen_by_changing, with_changes
 from jaxphoto.simulation.convergent import take_images
 from jaxphoto.simulation.convergent_plan import ConvergentPlan
 from jaxphoto.simulation.exposures_on_path import exposure_times, recorded_on_path
@@ -83,7 +83,10 @@ def simulate(recipe: Recipe, seed: int = 0) -> Simulation:
     on_path = recipe.lidar is not None and recipe.lidar.same_trajectory
     clock = exposure_times(flown, flight) if on_path else _clock(recipe)
     times = flight.time if clock is None else clock
-    scene = scene._replace(rays=seen_by_changing(recipe, flight, scene.rays, scene.xyz, motions, times))
+    temperatures = _temperatures(recipe, times)
+    when = Circumstances(times, np.zeros(len(times)) if temperatures is None else np.asarray(temperatures.above))
+    changes = recipe.changes
+    scene = scene._replace(rays=seen_by_changing(recipe, flight, scene.rays, scene.xyz, motions, when, changes))
     truth = Unknowns(
         {name: _numbers(camera.truth) for name, camera in recipe.cameras.items()},
         flight.exterior,
@@ -99,7 +102,7 @@ def simulate(recipe: Recipe, seed: int = 0) -> Simulation:
     control, check = _control(recipe, scene, seed)
     start, priors = _start(recipe, flight, scene, control, seed)
     known = with_shutters(recipe, flight, motions, seed, start.unknowns, priors, truth)
-    unknowns, priors, truth = with_rates(recipe, *known)
+    unknowns, priors, truth = with_changes(changes, *known)
     start = dataclasses.replace(start, unknowns=unknowns)
     block = Block(
         title=recipe.title,
@@ -122,6 +125,7 @@ def simulate(recipe: Recipe, seed: int = 0) -> Simulation:
         priors=priors,
         motion=flight.motion if any(map(_runs_late, recipe.mounts.values())) else None,
         flight_time=clock,
+        temperatures=temperatures,
     )
     return Simulation(block, truth, triple(recipe.datum_offset_m), terrain, cloud, trajectory, errors)
 
@@ -135,7 +139,13 @@ def _scanned(recipe: Recipe, flown: list[Path], terrain: Terrain, seed: int) -> 
 def _clock(recipe: Recipe) -> Float[np.ndarray, "images"] | None:
     """The time of every exposure from the middle of the flight (s); None where that from the middle of its strip
     does."""
-    return recipe.plan.clock if recipe.rates and isinstance(recipe.plan, FlightPlan) else None
+    changing = recipe.changes or recipe.temperature
+    return recipe.plan.clock if changing and isinstance(recipe.plan, FlightPlan) else None
+
+
+def _temperatures(recipe: Recipe, times: Float[np.ndarray, "images"]) -> Temperatures | None:
+    cooling = recipe.temperature
+    return None if cooling is None else Temperatures(cooling.at(times), cooling.reference_c)
 
 
 def _seen(recipe: Recipe, flight: Flight, scene: TruePoints, seed: int) -> TruePoints:

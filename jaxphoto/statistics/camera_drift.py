@@ -1,4 +1,5 @@
-"""Did a camera change during its flight: along a straight line of time, or from strip to strip? See `zero_test`."""
+"""Did a camera change during its flight: along a straight line of time or temperature, or from strip
+to strip? See `zero_test`."""
 
 from typing import NamedTuple
 
@@ -6,19 +7,21 @@ import numpy as np
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.block import exposures
-from jaxphoto.camera import CameraRates, StripCamera
-from jaxphoto.camera.camera_rates import HOUR_S
+from jaxphoto.camera import RATES, AbstractCameraRates, StripCamera
 from jaxphoto.statistics.covariance import Covariance
 from jaxphoto.statistics.zero_test import ZeroTest, zero_test
 
 
 class CameraDrift(NamedTuple):
-    """How one camera changed from its first exposure to its last (mm; K1 in its unit); one entry a rate."""
+    """How one camera changed from its first exposure to its last, or from the coldest to the warmest (mm; K1 in its
+    unit); one entry a rate."""
 
     camera: str
-    hours: float
+    rates: type[AbstractCameraRates]
+    span: float
+    """From end to end, in the unit of `rates.along`."""
     parameters: tuple[str, ...]
-    """As `CameraRates` names them, without their ends: c, xp, yp, k1."""
+    """As `AbstractCameraRates` names them, without their ends: c, xp, yp, k1."""
     change: ZeroTest
 
 
@@ -32,15 +35,16 @@ class StripDifferences(NamedTuple):
 
 
 def camera_drifts(adjusted: Adjustment, covariance: Covariance) -> list[CameraDrift]:
-    """Of every camera with estimated rates."""
-    found, times = [], np.asarray(exposures(adjusted.block).in_flight)
-    cameras = np.array(adjusted.block.image_camera)
-    for camera in adjusted.unknowns.more.get(CameraRates.kind, {}):
-        estimated = _estimated(adjusted, CameraRates.kind, camera)
-        if estimated:
-            hours = float(np.ptp(times[cameras == camera])) / HOUR_S
-            names = tuple(name.split("_")[0] for name in estimated.values())
-            found.append(CameraDrift(camera, hours, names, zero_test(adjusted, covariance, [*estimated], hours)))
+    """Of every camera with estimated rates, those of time first."""
+    found, cameras = [], np.array(adjusted.block.image_camera)
+    for rates in RATES:
+        along = np.asarray(rates.argument(exposures(adjusted.block)))
+        for camera in adjusted.unknowns.more.get(rates.kind, {}):
+            if estimated := _estimated(adjusted, rates.kind, camera):
+                span = float(np.ptp(along[cameras == camera]))
+                names = tuple(name.split("_")[0] for name in estimated.values())
+                test = zero_test(adjusted, covariance, [*estimated], span)
+                found.append(CameraDrift(camera, rates, span, names, test))
     return found
 
 

@@ -46,9 +46,24 @@ def test_the_block_knows_what_the_recipe_says_and_truth_is_told():
     assert np.array_equal(unknowing.block.image_points.xy, block.image_points.xy)
 
 
-def test_measured_once_more_it_is_the_same_flight():
-    block, truth, _ = made(RATES)
+THERMAL = {
+    "thermal_rates": {"kodak": {"c_rate": "free", "truth": {"c_rate_mm_per_K": 0.002, "yp_rate_mm_per_K": -0.001}}},
+    "temperature": {"begin_c": 25.0, "air_c": 5.0, "time_constant_s": 100.0, "reference_c": 20.0},
+}
+
+
+def test_a_camera_cools_as_newton_says():
+    block, _, _ = made(THERMAL)
+    time = block.flight_time - block.flight_time[0]
+    np.testing.assert_allclose(block.temperatures.celsius, 5 + 20 * np.exp(-time / 100), atol=1e-9)
+    assert block.temperatures.reference_c == 20.0
+
+
+@pytest.mark.parametrize("changes", [RATES, THERMAL])
+def test_measured_once_more_it_is_the_same_flight(changes):
+    block, truth, _ = made(changes)
     np.testing.assert_allclose(image_coordinates(block, truth), block.image_points.xy, atol=1e-9)
+    assert 0.001 < np.abs(block.image_points.xy - plain().block.image_points.xy).max() < 0.1
 
 
 def test_it_goes_through_files(tmp_path):
@@ -79,6 +94,11 @@ def test_a_photograph_without_a_time_is_named(tmp_path):
         ({"camera_rates.kodak.truth.c_rate": 1.0}, r"\[camera_rates.kodak.truth\] c_rate: no such key is known"),
         ({"camera_rates.leica": {}}, r"\[camera_rates\] leica: no such key is known"),
         ({"flight.turn_s": -1.0}, r"\[flight\] turn_s"),
+        (
+            {"thermal_rates": THERMAL["thermal_rates"]},
+            "thermal_rates: the recipe says nothing of the temp",
+        ),
+        (THERMAL | {"temperature.time_constant_s": 0.0}, r"\[temperature\] time_constant_s: 0 is not positive"),
     ],
 )
 def test_what_cannot_be_is_refused(changes, words):
