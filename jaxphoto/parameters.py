@@ -32,6 +32,9 @@ class AbstractParameters(eqx.Module):
     """The name of every number of every field. Its end is its unit: _m, _rad, _s, _ms, _mm, _m_per_s, _ppm ..."""
     bends: ClassVar[tuple[str, ...]] = ()
     """Fields of the interior orientation that `interior` changes, such as ("c",); then it is asked for every image."""
+    sized: ClassVar[str] = ""
+    """The field that says how many numbers each of the others has, where that differs from block to block; `names` then
+    has one name for all of them, and `labels` says those of each."""
 
     def interior(self, interior: Any, exposure: Any) -> Any:
         """The interior orientation of one image; a subclass that names fields in `bends` says what becomes of it."""

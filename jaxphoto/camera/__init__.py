@@ -2,6 +2,7 @@
 
 from jaxphoto.camera.balance import rebalance, rebalance_covariance
 from jaxphoto.camera.camera_rates import RATES, AbstractCameraRates, CameraRates, ThermalRates
+from jaxphoto.camera.camera_spline import CameraSpline
 from jaxphoto.camera.distortion import *  # noqa: F403 - what is declared there is public here
 from jaxphoto.camera.distortion import DISTORTIONS, AbstractDistortion, invert
 from jaxphoto.camera.equivalence import exact, with_sign
@@ -30,7 +31,7 @@ from jaxphoto.camera.strip_camera import StripCamera
 
 __all__ = [
     *(model.__name__ for model in (*DISTORTIONS.values(), *PROJECTIONS.values())), "DISTORTIONS", "PROJECTIONS",
-    "RATES", "AbstractCameraRates", "AbstractDistortion", "AbstractProjection", "CameraRates",
+    "RATES", "AbstractCameraRates", "AbstractDistortion", "AbstractProjection", "CameraRates", "CameraSpline",
     "ConversionError", "ImageMotion", "InteriorOrientation", "PrincipalPoints", "RollingShutter", "RowMotion", "Sensor",
     "StripCamera", "ThermalRates",
     "constant_names", "conversion_error", "decentring_from_symmetry", "empty_camera", "exact", "get_parameter",

@@ -10,7 +10,15 @@ from jaxphoto.errors import camera_words
 from jaxphoto.report.digits import of_sigma, with_sigma
 from jaxphoto.report.findings import Finding, Level, p_words
 from jaxphoto.report.tables import Tables
-from jaxphoto.statistics import POWER, SIGNIFICANCE_LEVEL, CameraDrift, StripDifferences, ZeroTest, strip_differences
+from jaxphoto.statistics import (
+    POWER,
+    SIGNIFICANCE_LEVEL,
+    CameraDifferences,
+    CameraDrift,
+    ZeroTest,
+    camera_wanderings,
+    strip_differences,
+)
 
 _NAMES = {"c": "c", "xp": "x_p", "yp": "y_p", "k1": "K1"}
 # Of an hour: a shorter flight is told in minutes.
@@ -19,11 +27,13 @@ _UM = 1e3
 
 
 def drift_findings(tables: Tables) -> Iterator[Finding]:
-    """Of every camera whose rates were estimated, and of those of strips: what changed, or would have been seen."""
+    """Of cameras whose rates or splines were estimated, and of those of strips: what changed, or would have shown."""
     for drift in tables.tested_drifts:
         yield Finding(Level.INFORMATION, drift_words(drift))
+    for wandering in camera_wanderings(tables.adjusted, tables.covariance):
+        yield Finding(Level.INFORMATION, differences_words(wandering))
     if (strips := strip_differences(tables.adjusted, tables.covariance)) is not None:
-        yield Finding(Level.INFORMATION, strip_words(strips))
+        yield Finding(Level.INFORMATION, differences_words(strips))
 
 
 def drift_words(drift: CameraDrift) -> str:
@@ -43,22 +53,25 @@ def drift_words(drift: CameraDrift) -> str:
     return f"{camera} {when} ({p_words(test.p_value)}): {changes}"
 
 
-def strip_words(strips: StripDifferences) -> str:
-    """The cameras of all strips in one sentence."""
-    test, names = strips.more, np.array(strips.parameters)
-    each = [(name, np.flatnonzero(names == name)) for name in dict.fromkeys(strips.parameters)]
+def differences_words(found: CameraDifferences) -> str:
+    """The cameras of all strips, or of all knots of a spline, in one sentence."""
+    test, names, camera = found.more, np.array(found.parameters), camera_words(found.camera)
+    each = [(name, np.flatnonzero(names == name)) for name in dict.fromkeys(found.parameters)]
     if not test.rejected:
         shown = _least([name for name, _ in each], [float(test.detectable[own].max()) for _, own in each])
+        what = f"no wandering of {camera}" if found.camera else "no difference between the cameras of strips"
         return (
-            f"no difference between the cameras of strips is seen ({p_words(test.p_value)}); any one strip alone would "
-            f"have shown, with a probability of {POWER:.0%}, {shown}"
+            f"{what} is seen ({p_words(test.p_value)}); any one {'knot' if found.camera else 'strip'} alone would have "
+            f"shown, with a probability of {POWER:.0%}, {shown}"
         )
     told = []
     for name, own in each:
         low, high = (int(own[end(test.value[own])]) for end in (np.argmin, np.argmax))
-        ends = (f"{_signed(name, test, k)} in strip {strips.strips[k]}" for k in (low, high))
+        where = [f"at {found.at[k]} min" if found.camera else f"in strip {found.at[k]}" for k in (low, high)]
+        ends = (f"{_signed(name, test, k)} {place}" for k, place in zip((low, high), where, strict=True))
         told.append(f"{_NAMES[name]} from {' to '.join(ends)}")
-    return f"the camera is not the same in all strips ({p_words(test.p_value)}): {', '.join(told)}"
+    changed = f"{camera} wandered during its flight" if found.camera else "the camera is not the same in all strips"
+    return f"{changed} ({p_words(test.p_value)}): {', '.join(told)}"
 
 
 def _least(names: Sequence[str], sizes: Sequence[float]) -> str:

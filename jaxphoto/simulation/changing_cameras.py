@@ -12,18 +12,74 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxphoto.camera import RowMotion
+from jaxphoto.camera import RowMotion, StripCamera
+from jaxphoto.camera.camera_rates import HOUR_S
 from jaxphoto.collinearity import ExteriorOrientation, project
 from jaxphoto.georeferencing import Exposure
-from jaxphoto.parameters import AbstractParameters
+from jaxphoto.observations import StripCameraSteps
+from jaxphoto.parameters import AbstractParameters, dynamic_fields
 from jaxphoto.simulation.chunks import in_chunks
 from jaxphoto.simulation.flight import Flight
-from jaxphoto.simulation.recipe import Recipe, SimulatedChange
+from jaxphoto.simulation.recipe import Recipe, SimulatedChange, triple
+from jaxphoto.simulation.streams import stream
 from jaxphoto.simulation.visibility import Rays
-from jaxphoto.unknowns import Unknowns
+from jaxphoto.unknowns import Unknowns, Weighted
 
 Changes = Mapping[str, Mapping[str, SimulatedChange]]
 _CHUNK = 1024
+_WALKING = dynamic_fields(StripCamera)
+
+
+def drawn(recipe: Recipe, flight: Flight, clock: Float[np.ndarray, "images"], seed: int) -> Changes:
+    """The changes of the recipe with their truth: each owner's own deviations, and the walk from strip to strip."""
+    changes = {kind: deviated(owners, seed) for kind, owners in recipe.changes.items()}
+    if recipe.walk is not None:
+        strips, hours = _strip_hours(flight, clock)
+        steps = np.sqrt(np.diff(hours, prepend=hours[:1]))[:, None] * triple(recipe.walk.truth)
+        walked = np.cumsum(steps * stream(seed, "walk of cameras").standard_normal((len(strips), 3)), axis=0)
+        cameras = changes[StripCamera.kind]
+        for name, more in zip(strips, walked, strict=True):
+            if name in cameras:
+                own = cameras[name]
+                moved = {f: np.asarray(getattr(own.truth, f)) + v for f, v in zip(_WALKING, more, strict=True)}
+                cameras[name] = dataclasses.replace(own, truth=dataclasses.replace(own.truth, **moved))
+    return changes
+
+
+def deviated(owners: Mapping[str, SimulatedChange], seed: int) -> dict[str, SimulatedChange]:
+    """The changes with the deviations of each owner in their truth."""
+    found = {}
+    for name, own in owners.items():
+        rng, moved = stream(seed, f"{type(own.truth).kind} of {name}"), {}
+        for field in dynamic_fields(type(own.truth)):
+            value, prior = np.asarray(getattr(own.truth, field)), getattr(own.spread, field)
+            # Every field draws, so that no other's deviation depends on it.
+            z = rng.standard_normal(value.shape)
+            if isinstance(prior, Weighted):
+                joint = prior.covariance
+                off = prior.sigma * z if joint is None else np.linalg.cholesky(np.asarray(joint)) @ z
+                moved[field] = value + off
+        found[name] = dataclasses.replace(own, truth=dataclasses.replace(own.truth, **moved))
+    return found
+
+
+def camera_steps(
+    recipe: Recipe, flight: Flight, clock: Float[np.ndarray, "images"], start: Unknowns
+) -> tuple[StripCameraSteps, ...]:
+    """What the block says of the walk from each strip whose camera it knows to the next."""
+    if recipe.walk is None or recipe.walk.stated is None:
+        return ()
+    known = list(start.more.get(StripCamera.kind, {}))
+    hours = [hour for strip, hour in zip(*_strip_hours(flight, clock), strict=True) if strip in known]
+    n = len(known) - 1
+    sigma = np.sqrt(np.diff(hours))[:, None] * triple(recipe.walk.stated)
+    return (StripCameraSteps(np.arange(n), np.arange(n) + 1, np.zeros((n, 3)), sigma),) if n > 0 else ()
+
+
+def _strip_hours(flight: Flight, clock: Float[np.ndarray, "images"]) -> tuple[list[str], Float[np.ndarray, "strips"]]:
+    """The strips in their order, and their middles in hours."""
+    strips, of = list(dict.fromkeys(flight.strips)), np.array(flight.strips)
+    return strips, np.array([clock[of == strip].mean() for strip in strips]) / HOUR_S
 
 
 class Circumstances(eqx.Module):

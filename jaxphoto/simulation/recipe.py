@@ -64,10 +64,27 @@ class SimulatedShutter:
 
 @dataclasses.dataclass(frozen=True)
 class SimulatedChange:
-    """How a camera changes during the flight; `model` is the block's start and prior, None where it knows of none."""
+    """How a camera changes during the flight, or in a strip.
+
+    Truth is `truth`, plus what is drawn where the same field of `spread`, a tree of priors, is `Weighted`. `model` is
+    the block's start and prior, None where it knows of no change.
+    """
 
     truth: AbstractParameters
+    spread: AbstractParameters
     model: tuple[AbstractParameters, AbstractParameters] | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class CameraWalk:
+    """A random walk of c, x_p and y_p (mm) from strip to strip: standard deviations of a step of an hour.
+
+    `truth` is how far cameras of strips truly walk, `stated` what the block says of it in `StripCameraSteps`; None
+    where it says nothing.
+    """
+
+    truth: Triple
+    stated: Triple | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -155,7 +172,8 @@ class TargetPlan:
 
 @dataclasses.dataclass(frozen=True)
 class Sigmas:
-    """Standard deviations of tie points and targets in the images, control, stations, attitudes, laser points.
+    """Standard deviations of tie points and targets in the images, control, stations, attitudes, laser points,
+    places and turns of cameras in their rig.
 
     None where these are not observed.
     """
@@ -166,6 +184,8 @@ class Sigmas:
     station_m: Triple | None = None
     attitude_deg: Triple | None = None
     lidar_m: Triple | None = None
+    rig_place_m: Triple | None = None
+    rig_turn_deg: Triple | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -182,9 +202,10 @@ class Recipe:
     """A simulation but for its seed.
 
     `mounts` are by name, "default" or that of a camera, `shutters` by camera; `biases` by name, "default" or that of a
-    strip; `changes` of cameras by kind and owner. `stated` sigmas are those of the block's observations, `noise` those
-    by which these are truly off. `datum_offset_m` is added to all observed stations and is in no model. `settlement` is
-    what stands on the terrain; `lidar` scans both, in strips.
+    strip; `changes` of cameras by kind and owner; `rig` has the cameras of a rig beside the one that is flown. `stated`
+    sigmas are those of the block's observations, `noise` those by which these are truly off. `datum_offset_m` is added
+    to all observed stations and is in no model. `settlement` is what stands on the terrain; `lidar` scans both, in
+    strips.
     """
 
     title: str
@@ -200,6 +221,8 @@ class Recipe:
     shutters: dict[str, SimulatedShutter] = dataclasses.field(default_factory=dict)
     changes: dict[str, dict[str, SimulatedChange]] = dataclasses.field(default_factory=dict)
     temperature: Cooling | None = None
+    walk: CameraWalk | None = None
+    rig: dict[str, SimulatedChange] = dataclasses.field(default_factory=dict)
     datum_offset_m: Triple = (0.0, 0.0, 0.0)
     jitter: Jitter = Jitter()
     terrain: Terrain = dataclasses.field(default_factory=Terrain)

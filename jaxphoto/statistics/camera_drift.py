@@ -1,13 +1,13 @@
-"""Did a camera change during its flight: along a straight line of time or temperature, or from strip
-to strip? See `zero_test`."""
+"""Did a camera change during its flight: along a straight line of time or temperature, along a
+spline of time, or from strip to strip? See `zero_test`."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.block import exposures
-from jaxphoto.camera import RATES, AbstractCameraRates, StripCamera
+from jaxphoto.camera import RATES, AbstractCameraRates, CameraSpline, StripCamera
 from jaxphoto.statistics.covariance import Covariance
 from jaxphoto.statistics.zero_test import ZeroTest, zero_test
 
@@ -25,12 +25,15 @@ class CameraDrift(NamedTuple):
     change: ZeroTest
 
 
-class StripDifferences(NamedTuple):
-    """What the cameras of strips have more than the camera of the block (mm); one entry an estimated number."""
+class CameraDifferences(NamedTuple):
+    """What cameras have more than the camera of the block (mm), by strip or by knot; one entry an estimated number."""
 
-    strips: tuple[str, ...]
+    camera: str
+    """Whose knots; "" of strips."""
+    at: tuple[str, ...]
+    """The strip, or the time of the knot from the middle of the flight in minutes."""
     parameters: tuple[str, ...]
-    """As `StripCamera` names them, without their ends: c, xp, yp."""
+    """As `StripCamera` and `CameraSpline` name them, without their ends: c, xp, yp."""
     more: ZeroTest
 
 
@@ -48,7 +51,7 @@ def camera_drifts(adjusted: Adjustment, covariance: Covariance) -> list[CameraDr
     return found
 
 
-def strip_differences(adjusted: Adjustment, covariance: Covariance) -> StripDifferences | None:
+def strip_differences(adjusted: Adjustment, covariance: Covariance) -> CameraDifferences | None:
     """Of all strips whose cameras were estimated; None where none was. Steps from strip to strip are observations."""
     strips, names, labels = [], [], []
     for strip in adjusted.unknowns.more.get(StripCamera.kind, {}):
@@ -58,7 +61,19 @@ def strip_differences(adjusted: Adjustment, covariance: Covariance) -> StripDiff
             labels.append(label)
     if not labels:
         return None
-    return StripDifferences(tuple(strips), tuple(names), zero_test(adjusted, covariance, labels))
+    return CameraDifferences("", tuple(strips), tuple(names), zero_test(adjusted, covariance, labels))
+
+
+def camera_wanderings(adjusted: Adjustment, covariance: Covariance) -> list[CameraDifferences]:
+    """Of every camera with an estimated spline."""
+    found: list[CameraDifferences] = []
+    spline: Any
+    for camera, spline in adjusted.unknowns.more.get(CameraSpline.kind, {}).items():
+        if estimated := _estimated(adjusted, CameraSpline.kind, camera):
+            names, knots, _ = zip(*(name.split("_") for name in estimated.values()), strict=True)
+            minutes = tuple(f"{spline.times[int(knot) - 1] / 60:.3g}" for knot in knots)
+            found.append(CameraDifferences(camera, minutes, names, zero_test(adjusted, covariance, [*estimated])))
+    return found
 
 
 def _estimated(adjusted: Adjustment, kind: str, owner: str) -> dict[str, str]:

@@ -1,42 +1,92 @@
-"""Cameras that change, in a recipe: [camera_rates], [thermal_rates] and the temperature that they go with."""
+"""Cameras that change, in a recipe: tables as those of [unknowns] with their truth, and temperature."""
 
-from collections.abc import Iterable
+from collections.abc import Sequence
+from typing import Any
 
-from jaxphoto.camera import RATES, ThermalRates
-from jaxphoto.io.block_folder.declared_unknowns import keys_of, read_parameters
+from jaxphoto.camera import RATES, CameraSpline, StripCamera, ThermalRates
+from jaxphoto.georeferencing import RigCamera
+from jaxphoto.io.block_folder.declared_unknowns import keys_of, read_parameters, static_fields
 from jaxphoto.io.block_folder.section import Section
-from jaxphoto.parameters import AbstractParameters
-from jaxphoto.simulation import Cooling, SimulatedChange
+from jaxphoto.io.recipe.keys import not_negative
+from jaxphoto.parameters import AbstractParameters, dynamic_fields
+from jaxphoto.simulation import CameraWalk, Cooling, Sigmas, SimulatedChange
+from jaxphoto.simulation.recipe import Triple
+from jaxphoto.unknowns import FREE
 
-CHANGES: dict[str, type[AbstractParameters]] = {kind.kind: kind for kind in RATES}
+_KINDS: tuple[type[AbstractParameters], ...] = (*RATES, CameraSpline, StripCamera)
+CHANGES = {kind.kind: kind for kind in _KINDS}
 """What may change cameras, by the names of their tables."""
+WALK = "camera_walk"
+RIG = RigCamera.kind
 
 
-def read_changes(top: Section, cameras: Iterable[str]) -> dict[str, dict[str, SimulatedChange]]:
+def read_changes(top: Section, cameras: Sequence[str], strips: Sequence[str]) -> dict[str, dict[str, SimulatedChange]]:
     """By kind and owner, what truly changes, and what the block knows of it. Raises InputError."""
-    changes = {name: _changes(kind, top.section(name), tuple(cameras)) for name, kind in CHANGES.items() if name in top}
+    owners = {"camera": cameras, "strip": strips}
+    changes = {
+        name: _changes(kind, top.section(name), owners[kind.owner]) for name, kind in CHANGES.items() if name in top
+    }
     if ThermalRates.kind in changes and "temperature" not in top:
         raise top.error(ThermalRates.kind, "the recipe says nothing of the temperature; add a table [temperature]")
+    if WALK in top and StripCamera.kind not in changes:
+        raise top.error(WALK, "the cameras of strips walk, but there are none; add a table [strip_cameras.default]")
     return {name: owners for name, owners in changes.items() if owners}
 
 
-def _changes(kind: type[AbstractParameters], section: Section, owners: tuple[str, ...]) -> dict[str, SimulatedChange]:
+def read_rig(top: Section, cameras: Sequence[str], stated: Sigmas) -> dict[str, SimulatedChange]:
+    """[rig_cameras]: those that sit beside the one that is flown. Raises InputError for what cannot be."""
+    if RIG not in top:
+        return {}
+    section = top.section(RIG)
+    if len(section.values) != len(cameras) - 1 or "default" in section:
+        raise section.error("", "all cameras but one sit in a rig beside that one; give each of them a table")
+    if stated.rig_place_m is None or stated.rig_turn_deg is None:
+        raise top.section("sigmas").error("", "nothing says how rigid the rig is; add rig_place_m and rig_turn_deg")
+    for key in ("lidar", "convergent"):
+        if key in top:
+            raise top.error(key, "a rig is flown, and without a lidar; remove the table, or that of the rig")
+    return _changes(RigCamera, section, cameras)
+
+
+def _changes(kind: type[AbstractParameters], section: Section, owners: Sequence[str]) -> dict[str, SimulatedChange]:
     """Of a table that holds nothing but a `truth` the block's model does not know."""
     section.known("default", *owners)
-    keys, changes = [key.start for key in keys_of(kind)], {}
+    keys, static, changes = keys_of(kind), static_fields(kind), {}
     for name in owners:
         key = name if name in section else "default"
         if key not in section:
             continue
         own = section.section(key)
         truth, told = own.section("truth"), {word: v for word, v in own.values.items() if word != "truth"}
-        truth.known(*keys)
-        start, prior = read_parameters(kind, Section(own.file, own.path, told))
-        true = {word: v for word, v in told.items() if word in keys} | dict(truth.values)
-        changes[name] = SimulatedChange(
-            read_parameters(kind, Section(truth.file, truth.path, true))[0], (start, prior) if told else None
-        )
+        # What the truth does not name is as the block says, but for what it does not know.
+        same = {word: v for word, v in told.items() if word in static or word in [key.start for key in keys]}
+        true, spread = read_parameters(kind, Section(truth.file, truth.path, same | dict(truth.values)))
+        for field in dynamic_fields(kind):
+            if getattr(spread, field) is FREE:
+                raise truth.error(field, "what is true is not free; give its value, or the sigma that it is drawn by")
+        model: Any = read_parameters(kind, Section(own.file, own.path, told)) if told else None
+        changes[name] = SimulatedChange(true, spread, model)
     return changes
+
+
+def read_walk(top: Section) -> CameraWalk | None:
+    """[camera_walk]: how the cameras of strips walk. Raises InputError for what cannot be."""
+    if WALK not in top:
+        return None
+    section = top.section(WALK)
+    section.known("c_mm", "xp_mm", "yp_mm", "truth")
+    truth = section.section("truth")
+    truth.known("c_mm", "xp_mm", "yp_mm")
+    told = set(section.values) - {"truth"}
+    if told and not all(section.number(key, 0.0) > 0 for key in ("c_mm", "xp_mm", "yp_mm")):
+        raise section.error("", "the steps of c, x_p and y_p are all observed; give c_mm, xp_mm and yp_mm above zero")
+    stated = _three(section) if told else None
+    return CameraWalk(_three(truth) if truth.values else stated or (0.0, 0.0, 0.0), stated)
+
+
+def _three(section: Section) -> Triple:
+    c, x_p, y_p = (not_negative(section, key, 0.0) for key in ("c_mm", "xp_mm", "yp_mm"))
+    return c, x_p, y_p
 
 
 def read_temperature(top: Section) -> Cooling | None:
@@ -51,6 +101,6 @@ def read_temperature(top: Section) -> Cooling | None:
 
 def refuse_changes(top: Section) -> None:
     """Raise InputError where cameras are to change in a set of images that has no times."""
-    for key in (*CHANGES, "temperature"):
+    for key in (*CHANGES, "temperature", WALK):
         if key in top:
             raise top.error(key, "a convergent set has no times that a camera could change in; remove the table")

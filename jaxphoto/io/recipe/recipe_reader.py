@@ -18,7 +18,16 @@ from jaxphoto.io.block_folder.camera_section import Camera, read_camera
 from jaxphoto.io.block_folder.mount_sections import read_mounts, read_strips
 from jaxphoto.io.block_folder.section import Section
 from jaxphoto.io.block_folder.settings import read_settings
-from jaxphoto.io.recipe.camera_sections import CHANGES, read_changes, read_temperature, refuse_changes
+from jaxphoto.io.recipe.camera_sections import (
+    CHANGES,
+    RIG,
+    WALK,
+    read_changes,
+    read_rig,
+    read_temperature,
+    read_walk,
+    refuse_changes,
+)
 from jaxphoto.io.recipe.convergent_section import read_convergent
 from jaxphoto.io.recipe.flight_section import Mounted, read_flight
 from jaxphoto.io.recipe.keys import sigmas, tables
@@ -45,7 +54,7 @@ from jaxphoto.simulation import (
 
 _KEYS = (
     "title", "cameras", "mounts", "strips", "datum", "truth", "flight", "convergent", "jitter", "terrain", "points",
-    "targets", "sigmas", "noise", "start", "lidar", "shutters", "temperature", *CHANGES,
+    "targets", "sigmas", "noise", "start", "lidar", "shutters", "temperature", *CHANGES, WALK, RIG,
 )  # fmt: skip
 _ZERO = (0.0, 0.0, 0.0)
 
@@ -72,11 +81,12 @@ def recipe_from(values: Mapping[str, Any], file: str = "recipe.toml") -> Recipe:
     sensors = {name: camera.sensor for name, camera in settings.cameras.items()}
     mounts = _mounts(top.section("mounts"), settings.mounts, cameras)
     image_x = {n: (mounts.get(n) or mounts.get("default") or _NO_MOUNT).truth.image_x for n in cameras}
-    plan = _plan(top, {name: Mounted(sensors[name], cameras[name].truth, image_x[name]) for name in cameras})
+    flown = [name for name in cameras if name not in top.section(RIG)]
+    plan = _plan(top, {name: Mounted(sensors[name], cameras[name].truth, image_x[name]) for name in flown})
     strips = [strip.name for strip in plan.strips] if isinstance(plan, FlightPlan) else []
     points = read_points(top.section("points"), in_swaths=isinstance(plan, FlightPlan))
     targets = tuple(map(read_targets, tables(top, "targets")))
-    check_points(top, points, targets, plan.n_images)
+    check_points(top, points, targets, plan.n_images * (1 + len(top.section(RIG).values)))
     stated, noise = read_sigmas(top, targets)
     terrain = read_terrain(top.section("terrain"))
     truth = top.section("truth")
@@ -93,8 +103,10 @@ def recipe_from(values: Mapping[str, Any], file: str = "recipe.toml") -> Recipe:
         mounts=mounts,
         biases=_biases(top.section("strips"), settings.strips, strips),
         shutters=_shutters(top.section("shutters"), cameras),
-        changes=read_changes(top, cameras),
+        changes=read_changes(top, tuple(cameras), strips),
         temperature=read_temperature(top),
+        walk=read_walk(top),
+        rig=read_rig(top, tuple(cameras), stated),
         datum_offset_m=tuple(truth.vector("datum_offset_m").tolist()),
         jitter=read_jitter(top.section("jitter")),
         terrain=terrain,
