@@ -15,14 +15,12 @@ import json
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import equinox as eqx
 import jax
 import numpy as np
 
-from jaxphoto import FIXED, Block, adjust, covariance
-from jaxphoto.georeferencing import RigCamera
+from jaxphoto import Block, adjust, covariance
 from jaxphoto.io import recipe_from
 from jaxphoto.observations import StationRows
 from jaxphoto.parameters import numbers_of
@@ -34,6 +32,7 @@ HEADS = {"left": ([0, 45, 0], [-0.2, 0, 0]), "right": ([0, -45, 0], [0.2, 0, 0])
          "back": ([-45, 0, 0], [0, -0.2, 0])}  # fmt: skip
 """Turns (degrees) and places (m) as the block starts with them; true ones are a tenth of a degree and 1 cm away."""
 NADIR = "nadir"
+RULER_M = 0.01
 
 
 def camera(c_mm: float) -> dict:
@@ -84,10 +83,9 @@ def alone(block: Block) -> Block:
     return some_images(apart(block), np.array(block.image_camera) == NADIR)
 
 
-def held(block: Block) -> Block:
-    """A rig that is known."""
-    cameras: Any = {name: RigCamera(FIXED, FIXED) for name in HEADS}  # type: ignore[arg-type]
-    return dataclasses.replace(block, priors=dataclasses.replace(block.priors, more={RigCamera.kind: cameras}))
+def measured(block: Block) -> Block:
+    """A rig whose places were measured beforehand, to `RULER_M`."""
+    return block.weigh("place", RULER_M)
 
 
 def unguided(block: Block) -> Block:
@@ -99,7 +97,7 @@ CASES: dict[str, Callable[[Block], Block]] = {
     "the nadir camera alone": alone,
     "five cameras, each for itself": apart,
     "a rig of which nothing is known": lambda block: block,
-    "a rig that is known": held,
+    "a rig whose places are known to 1 cm": measured,
 }
 
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from jaxphoto.block import Motion
 from jaxphoto.collinearity import ExteriorOrientation
@@ -37,10 +37,8 @@ def rigged(
     # Turned on from its place in the rig.
     turn, off = np.broadcast_to([own.turn for own in truths], place.shape), noise[1] * bent[:, :, 1]
     at = np.repeat(np.arange(n), m - 1)
-    there = in_chunks(
-        _placed, _CHUNK, np.asarray(exterior.position)[at], np.asarray(exterior.camera_from_object)[at],
-        RigCamera(place.reshape(-1, 3), turn.reshape(-1, 3)), off.reshape(-1, 3),  # type: ignore[arg-type]
-    )  # fmt: skip
+    reference = np.asarray(exterior.position)[at], np.asarray(exterior.camera_from_object)[at]
+    there = in_chunks(_placed, _CHUNK, *reference, *(v.reshape(-1, 3) for v in (place, turn, off)))
     position, rotation = (
         _after_each(np.asarray(own), new)
         for own, new in zip((exterior.position, exterior.camera_from_object), there, strict=True)
@@ -86,6 +84,6 @@ def with_gnss(recipe: Recipe, flight: Flight) -> Int[np.ndarray, "n"]:
 
 @jax.jit
 @jax.vmap
-def _placed(position, camera_from_object, camera, off) -> tuple[Float[jax.Array, "3"], Float[jax.Array, "3 3"]]:
-    there, turned = in_rig(position, camera_from_object, camera)
+def _placed(position, camera_from_object, place, turn, off):
+    there, turned = in_rig(position, camera_from_object, RigCamera(place, turn))
     return there, small_rotation(off) @ turned

@@ -33,19 +33,24 @@ def read_changes(top: Section, cameras: Sequence[str], strips: Sequence[str]) ->
     return {name: owners for name, owners in changes.items() if owners}
 
 
-def read_rig(top: Section, cameras: Sequence[str], stated: Sigmas) -> dict[str, SimulatedChange]:
-    """[rig_cameras]: those that sit beside the one that is flown. Raises InputError for what cannot be."""
-    if RIG not in top:
-        return {}
+def flown_cameras(top: Section, cameras: Sequence[str]) -> list[str]:
+    """Those that are flown: all, or the one that the others sit beside in a rig. Raises InputError."""
     section = top.section(RIG)
-    if len(section.values) != len(cameras) - 1 or "default" in section:
+    section.known(*cameras)
+    flown = [name for name in cameras if name not in section]
+    if section.values and len(flown) != 1:
         raise section.error("", "all cameras but one sit in a rig beside that one; give each of them a table")
-    if stated.rig_place_m is None or stated.rig_turn_deg is None:
-        raise top.section("sigmas").error("", "nothing says how rigid the rig is; add rig_place_m and rig_turn_deg")
-    for key in ("lidar", "convergent"):
+    for key in ("lidar", "convergent") if section.values else ():
         if key in top:
             raise top.error(key, "a rig is flown, and without a lidar; remove the table, or that of the rig")
-    return _changes(RigCamera, section, cameras)
+    return flown
+
+
+def read_rig(top: Section, cameras: Sequence[str], stated: Sigmas) -> dict[str, SimulatedChange]:
+    """[rig_cameras]: those that sit beside the one that is flown. Raises InputError for what cannot be."""
+    if RIG in top and (stated.rig_place_m is None or stated.rig_turn_deg is None):
+        raise top.section("sigmas").error("", "nothing says how rigid the rig is; add rig_place_m and rig_turn_deg")
+    return _changes(RigCamera, top.section(RIG), cameras)
 
 
 def _changes(kind: type[AbstractParameters], section: Section, owners: Sequence[str]) -> dict[str, SimulatedChange]:

@@ -22,6 +22,7 @@ from jaxphoto.io.recipe.camera_sections import (
     CHANGES,
     RIG,
     WALK,
+    flown_cameras,
     read_changes,
     read_rig,
     read_temperature,
@@ -81,7 +82,7 @@ def recipe_from(values: Mapping[str, Any], file: str = "recipe.toml") -> Recipe:
     sensors = {name: camera.sensor for name, camera in settings.cameras.items()}
     mounts = _mounts(top.section("mounts"), settings.mounts, cameras)
     image_x = {n: (mounts.get(n) or mounts.get("default") or _NO_MOUNT).truth.image_x for n in cameras}
-    flown = [name for name in cameras if name not in top.section(RIG)]
+    flown = flown_cameras(top, tuple(cameras))
     plan = _plan(top, {name: Mounted(sensors[name], cameras[name].truth, image_x[name]) for name in flown})
     strips = [strip.name for strip in plan.strips] if isinstance(plan, FlightPlan) else []
     points = read_points(top.section("points"), in_swaths=isinstance(plan, FlightPlan))
