@@ -74,9 +74,9 @@ def drawn(flights: int, first: int) -> Iterator[dict]:
             test = drift.change
             yield {
                 "case": case, "flight": seed, "outcome": found.outcome.name, "sigma0": float(found.sigma0),
-                "images": len(block.images), "hours": drift.hours, "p_value": test.p_value,
+                "images": len(block.images), "hours": drift.span, "p_value": test.p_value,
                 "p_values": test.p_values.tolist(), "change": (1e3 * test.value).tolist(),
-                "true": [drift.hours * c, drift.hours * x_p, 0.0],
+                "true": [drift.span * c, drift.span * x_p, 0.0],
                 "sigma": (1e3 * test.sigma).tolist(), "detectable": (1e3 * test.detectable).tolist(),
             }  # fmt: skip
 

@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 
 from jaxphoto.arrays import Numbers, joined, still
 from jaxphoto.block_from_arrays import block_fields
-from jaxphoto.block_parts import Datum, Frame, Motion, Start
+from jaxphoto.block_parts import Datum, Frame, Motion, Start, Temperatures
 from jaxphoto.camera import InteriorOrientation, Sensor
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import BlockError, InputError
@@ -69,6 +69,8 @@ class Block(eqx.Module):
     """Observations of further kinds, and parameters known beforehand together."""
     flight_time: Float[Numbers, "images"] | None = None
     """Seconds from the middle of the flight; `image_time` is from those of the strips. None: they are the same."""
+    temperatures: Temperatures | None = None
+    """Of the cameras; None: they are not known, and no camera changes with them."""
     partitions: dict[str, tuple[str, ...]] = eqx.field(static=True, default_factory=dict)
     """Owners of parameters that are neither cameras nor mounts nor strips: by partition, the part that each image is in
     ("" for none), such as intervals of time."""
@@ -296,4 +298,6 @@ def exposures(block: Block) -> Exposure:
     nominal = np.array(each).reshape(-1, 3, 3)
     flight_time = block.image_time if block.flight_time is None else block.flight_time
     height = np.array([block.sensors[camera].height_mm for camera in block.image_camera])
-    return Exposure(block.image_time, motion.velocity, motion.rate, nominal, flight_time, height)  # type: ignore[arg-type]
+    above = np.zeros(len(block.images)) if block.temperatures is None else block.temperatures.above
+    known: Any = (block.image_time, motion.velocity, motion.rate, nominal, flight_time, height, above)
+    return Exposure(*known)

@@ -35,6 +35,20 @@ class Motion(eqx.Module):
     """About the body's right, forward and up axes, rad/s."""
 
 
+class Temperatures(eqx.Module):
+    """Of the camera at each exposure, for `camera.ThermalRates`."""
+
+    celsius: Float[Numbers, "images"]
+    """The reference where it is not known."""
+    reference_c: float = eqx.field(static=True)
+    """At which the interior orientation holds."""
+
+    @property
+    def above(self) -> Float[Numbers, "images"]:
+        """Kelvins above the reference."""
+        return self.celsius - self.reference_c
+
+
 @dataclasses.dataclass(frozen=True)
 class Frame:
     """The object frame of a block, and how to come back to the frame of its files.

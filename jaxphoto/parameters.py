@@ -12,9 +12,11 @@ from typing import Any, ClassVar, Literal
 import equinox as eqx
 import numpy as np
 
-UNITS = ("m", "rad", "mm", "s", "ms", "m_per_s", "rad_per_s", "mm_per_s", "mm_per_h", "per_h", "ppm")
-"""Units that the names of declared parameters may end in; a typical scale is known of these, of `per_h` where cameras
-are bent."""
+UNITS = (
+    "m", "rad", "mm", "s", "ms", "m_per_s", "rad_per_s", "mm_per_s", "mm_per_h", "per_h", "mm_per_K", "per_K", "ppm",
+)  # fmt: skip
+"""Units that the names of declared parameters may end in; a typical scale is known of these, of `per_h` and
+`per_K` where cameras are bent."""
 Owner = Literal["image", "camera", "mount", "strip", "block"] | str
 """Whose parameters are: of each image, of each camera and so on, or of the whole block. Any other word is a partition
 of the images that the block names (`Block.partitions`), such as intervals of time."""
@@ -30,6 +32,9 @@ class AbstractParameters(eqx.Module):
     """The name of every number of every field. Its end is its unit: _m, _rad, _s, _ms, _mm, _m_per_s, _ppm ..."""
     bends: ClassVar[tuple[str, ...]] = ()
     """Fields of the interior orientation that `interior` changes, such as ("c",); then it is asked for every image."""
+    sized: ClassVar[str] = ""
+    """The field that says how many numbers each of the others has, where that differs from block to block; `names` then
+    has one name for all of them, and `labels` says those of each."""
 
     def interior(self, interior: Any, exposure: Any) -> Any:
         """The interior orientation of one image; a subclass that names fields in `bends` says what becomes of it."""

@@ -22,22 +22,25 @@ from jaxtyping import Float
 from jaxphoto.arrays import Numbers
 from jaxphoto.camera import (
     CameraRates,
+    CameraSpline,
     ImageMotion,
     InteriorOrientation,
     RollingShutter,
     StripCamera,
+    ThermalRates,
     get_parameter,
     parameter_names,
     set_parameter,
 )
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import InputError
-from jaxphoto.georeferencing import FlightBias, Mount, Scanner, StripBias
+from jaxphoto.georeferencing import FlightBias, Mount, RigCamera, Scanner, StripBias
 from jaxphoto.parameters import AbstractParameters, dynamic_fields
 from jaxphoto.short_repr import html_of, number_word, numbers_words
 
 UNKNOWNS: tuple[type[AbstractParameters], ...] = (
-    Scanner, Mount, StripBias, FlightBias, CameraRates, StripCamera, RollingShutter, ImageMotion,
+    Scanner, Mount, StripBias, FlightBias, CameraRates, ThermalRates, CameraSpline, StripCamera, RollingShutter,
+    ImageMotion, RigCamera,
 )  # fmt: skip
 """The classes of declared parameters that a block folder may hold; one of your own is given to `read_block`.
 

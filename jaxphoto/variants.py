@@ -220,6 +220,7 @@ def _part(block: Block, image: np.ndarray, point: np.ndarray) -> Block:
         image_strip=strip,
         image_time=_taken(block.image_time, image),
         flight_time=_taken(block.flight_time, image),
+        temperatures=_taken(block.temperatures, image),
         image_points=kept(block.image_points),
         control=kept(block.control),
         fixed=kept(block.fixed),

@@ -17,15 +17,17 @@ from jaxphoto.adjustment.model.block_values import values_of
 from jaxphoto.adjustment.model.structure import structure_of
 from jaxphoto.arrays import Numbers
 from jaxphoto.block import Block, Motion
-from jaxphoto.camera import StripCamera
+from jaxphoto.camera import CameraSpline, StripCamera
 from jaxphoto.compiling import run_compiled
-from jaxphoto.georeferencing import Mount, ScannerCalibration, StripSpline, TrajectoryKnot
+from jaxphoto.georeferencing import Mount, RigCamera, ScannerCalibration, StripSpline, TrajectoryKnot
 from jaxphoto.observations import (
     AXES,
     AttitudeSteps,
     Distances,
     ImageState,
     PositionSteps,
+    RigPlaces,
+    RigTurns,
     StationRows,
     StripCameraSteps,
     StripPlanes,
@@ -135,6 +137,11 @@ STRIPS = {
     }
 }
 """Truth of what cameras of strips have more than that of the block, likewise."""
+_WANDERING = 0.01 * np.array([[1, -1, 2, 1], [-1, 0.5, 1, 2], [1, 2, -1, 1]])
+SPLINE = {"camera_splines": {"one": CameraSpline(*_WANDERING, 4, 20.0)}}
+"""Truth of how the camera wanders, likewise."""
+RIG = {"rig_cameras": {"one": RigCamera(np.array([0.2, -0.1, 0.05]), np.array([2e-3, -1e-3, 3e-3]))}}
+"""Truth of where it sits beside itself: any two photographs are a rig that bends by what is between them."""
 KNOWN = ("interior[one].c_mm", "interior[one].k1")
 
 
@@ -199,6 +206,8 @@ def _further(n_images: int, angles: np.ndarray) -> tuple:
         correlated(heights, np.arange(n_images).reshape(2, -1), in_time),
         *_strips(),
         *_exposures_and_ties(angles),
+        RigPlaces(np.array([0, 1, 6]), np.array([1, 2, 8]), np.zeros((3, 3)), np.full((3, 3), 0.03)),
+        RigTurns(np.array([0, 1, 6]), np.array([1, 2, 8]), np.zeros((3, 3)), np.full((3, 3), 2e-4)),
     )
 
 
@@ -259,7 +268,7 @@ def simulated(seed: int = 1) -> Simulated:
         partitions={"session": ("early",) * 4 + ("late",) * 5 + ("",)},
     )
     block, _ = measured(Simulated(free(block, "one"), truth))
-    truth = dataclasses.replace(truth, more=OWN | LASER | STRIPS)
+    truth = dataclasses.replace(truth, more=OWN | LASER | STRIPS | SPLINE | RIG)
     start = dataclasses.replace(block.start.unknowns, more=jax.tree.map(np.zeros_like, truth.more))
     camera = truth.interior["one"]
     block = with_priors(block, "one", k2=_weighted(rng, np.float64(camera.distortion.k2), 3e-9))
@@ -267,7 +276,7 @@ def simulated(seed: int = 1) -> Simulated:
     priors = dataclasses.replace(
         block.priors,
         more=own_priors(lambda _: FREE)
-        | jax.tree.map(lambda v: _weighted(rng, v, np.abs(v).max() + 1e-5), LASER | STRIPS),
+        | jax.tree.map(lambda v: _weighted(rng, v, np.abs(v).max() + 1e-5), LASER | STRIPS | SPLINE | RIG),
         exterior=dataclasses.replace(
             block.priors.exterior,
             position=_weighted(rng, truth.exterior.position, [0.1, 0.1, 0.2]),

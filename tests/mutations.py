@@ -28,6 +28,7 @@ from jaxphoto.camera import ImageMotion, InteriorOrientation, OpenCv, RollingShu
 from jaxphoto.errors import JaxphotoError
 from jaxphoto.image_measurement import read_grey
 from jaxphoto.io import clouds, export, read_block, read_recipe, read_source, write_block
+from jaxphoto.io.block_folder.settings import toml_text
 from jaxphoto.io.cameras import read_camera_file, write_camera_file
 from jaxphoto.io.conditions import read_conditions
 from jaxphoto.io.control_files import read_control
@@ -50,7 +51,9 @@ from tests.io import test_cameras as cameras
 from tests.io import test_robotics_cameras as robotics
 from tests.io import test_surfaces as surfaces
 from tests.io.conftest import FILES
-from tests.simulation.small import RECIPES
+from tests.simulation import test_changing_cameras as changing_cameras
+from tests.simulation import test_rig
+from tests.simulation.small import RECIPES, changed
 
 Files = dict[str, bytes]
 SLOWEST_S = 10.0
@@ -270,6 +273,23 @@ truth = { readout_ms = 30.0 }
 """
 
 
+def _warm_block(folder: Path) -> None:
+    """With temperatures of photographs beside the block."""
+    for name, content in FILES.items():
+        (folder / name).write_text(content, encoding="utf-8")
+    rates = "[unknowns.thermal_rates.kodak]\nc_rate = { sigma_mm_per_K = 1e-3 }\n"
+    top = "reference_temperature_c = 20.0\n" + FILES["block.toml"].replace("[datum]", rates + "[datum]")
+    (folder / "block.toml").write_text(top, encoding="utf-8")
+    rows = "".join(f"{name},{name}.jpg,{'0' * 64},True,1{k}.5\n" for k, name in enumerate("abc"))
+    (folder / "conditions.csv").write_text("image,file,sha256,used,lens_temperature_c\n" + rows)
+
+
+def _rig_recipe(folder: Path) -> None:
+    """With all that changes cameras, and a rig."""
+    changing = changing_cameras.RATES | changing_cameras.THERMAL | changing_cameras.STRIPS | changing_cameras.SPLINE
+    (folder / "recipe.toml").write_text(toml_text(changed(test_rig.RIG | changing)), encoding="utf-8")
+
+
 def _rolling_block(folder: Path) -> None:
     block = read_block(_EXAMPLES / "cross_block")
     motion = ImageMotion(np.array([0.0, 50.0, 0.0]), np.zeros(3))
@@ -313,6 +333,13 @@ READERS: dict[str, Reader] = {
         lambda folder: read_recipe(folder / "recipe.toml"),
     ),
     "block-shutter": Reader(written_by(_rolling_block), read_block),
+    "recipe-rig": Reader(written_by(_rig_recipe), lambda folder: read_recipe(folder / "recipe.toml")),
+    "block-rig": Reader(
+        written_by(lambda folder: write_block(test_rig.flown().block, folder)),
+        read_block,
+        ("block.toml", "rig_places.csv", "rig_turns.csv"),
+    ),
+    "block-warm": Reader(written_by(_warm_block), read_block, ("block.toml", "images.csv", "conditions.csv")),
     "photograph": Reader(written_by(_photograph), lambda folder: photographs([folder / "a.jpg"])),
     "camera-opencv": Reader(text(a__yml=cameras.OPENCV), _camera("a.yml")),
     "recipe-flight": _recipe("001"),

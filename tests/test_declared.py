@@ -43,6 +43,8 @@ SHOWN = {
     "PositionSteps": ("position_steps",),
     "AttitudeSteps": ("attitude_steps",),
     "StripCameraSteps": ("strip_camera_steps",),
+    "RigPlaces": ("rig_places",),
+    "RigTurns": ("rig_turns",),
     "Distances": ("distances",),
     "HeightDifferences": ("height_differences",),
     "Baselines": ("baselines",),

@@ -1,6 +1,8 @@
 """Rank: unknowns that the observations cannot tell apart, named."""
 
+import math
 from collections.abc import Iterable
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -13,10 +15,11 @@ from jaxphoto.adjustment.solver.normal import Linearised
 from jaxphoto.adjustment.solver.reduced import reduce_normal
 from jaxphoto.adjustment.weak_words import weaknesses_of
 from jaxphoto.block import Block, exposures
-from jaxphoto.camera import CameraRates
+from jaxphoto.camera import RATES, CameraSpline
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import DatumError, RankError
-from jaxphoto.observations import AbstractObservations
+from jaxphoto.georeferencing import RigCamera
+from jaxphoto.observations import AbstractObservations, RigPlaces, RigTurns
 from jaxphoto.parameters import dynamic_fields
 from jaxphoto.unknowns import FREE, Unknowns
 
@@ -39,6 +42,8 @@ def check_priors(block: Block, priors: Unknowns) -> None:
     _check_shifts(block, priors, with_station)
     _check_scanner(block, priors)
     _check_camera_rates(block, priors)
+    _check_camera_splines(block)
+    _check_rigs(block)
 
 
 def _images_touched(block: Block) -> set[int]:
@@ -139,20 +144,51 @@ def _check_scanner(block: Block, priors: Unknowns) -> None:
 
 
 def _check_camera_rates(block: Block, priors: Unknowns) -> None:
-    times = np.asarray(exposures(block).in_flight)
-    for name, prior in priors.more.get(CameraRates.kind, {}).items():
-        free = [field for field in dynamic_fields(type(prior)) if getattr(prior, field) is FREE]
-        if free and np.ptp(times[sorted(_images_of(name, block.image_camera))]) == 0:
+    for rates in RATES:
+        along, what = np.asarray(rates.argument(exposures(block))), rates.along.split("_")[0]
+        for name, prior in priors.more.get(rates.kind, {}).items():
+            free = [field for field in dynamic_fields(rates) if getattr(prior, field) is FREE]
+            if free and np.ptp(along[sorted(_images_of(name, block.image_camera))]) == 0:
+                raise RankError(
+                    f"{rates.kind}[{name}].{free[0]} is free, but all images of the camera have one {what}: give the "
+                    f"{what}s of their exposures, or hold the rate fixed"
+                )
+            distortion = priors.interior[name].distortion
+            if "k1_rate" in free and "k1" not in distortion.coefficients:
+                raise RankError(
+                    f"{rates.kind}[{name}].k1_rate is free, but the distortion {distortion.name} has no k1: hold the "
+                    "rate fixed"
+                )
+
+
+def _check_camera_splines(block: Block) -> None:
+    """Splines have to reach the ends of their flight, and have one interval: they are computed side by side."""
+    splines: Any = block.start.unknowns.more.get(CameraSpline.kind, {})
+    seconds = np.abs(np.asarray(exposures(block).in_flight))
+    for name, own in splines.items():
+        first, spline = next(iter(splines.items()))
+        if (own.knots, own.interval_s) != (spline.knots, spline.interval_s):
+            raise RankError(f"the splines of cameras {first} and {name} differ: give both the same knots and interval")
+        farthest = seconds[sorted(_images_of(name, block.image_camera))].max(initial=0.0)
+        reach = (own.knots - 3) / 2 * own.interval_s
+        if reach < farthest:
+            needed = 2 * math.ceil(farthest / own.interval_s + 1.5)
             raise RankError(
-                f"{CameraRates.kind}[{name}].{free[0]} is free, but all images of the camera have one time: give the "
-                "times of their exposures, or hold the rate fixed"
+                f"{CameraSpline.kind}[{name}] has {own.knots} knots, which reach {reach:g} s from the middle of the "
+                f"flight, but an image is {farthest:.0f} s from it: give it {needed} knots, or a longer interval"
             )
-        distortion = priors.interior[name].distortion
-        if "k1_rate" in free and "k1" not in distortion.coefficients:
-            raise RankError(
-                f"{CameraRates.kind}[{name}].k1_rate is free, but the distortion {distortion.name} has no k1: hold the "
-                "rate fixed"
-            )
+
+
+def _check_rigs(block: Block) -> None:
+    """Photographs that rows put into a rig are those of its cameras."""
+    known = block.start.unknowns.more.get(RigCamera.kind, {})
+    for rows in (of for of in block.more if isinstance(of, RigPlaces | RigTurns)):
+        for i in rows.image:
+            if (camera := block.image_camera[i]) not in known:
+                raise RankError(
+                    f"{rows.group} has image {block.images[i]}, but its camera {camera} is not in the rig: add "
+                    f"[unknowns.{RigCamera.kind}.{camera}], or leave the image out"
+                )
 
 
 def _images_of(name: str, names: Iterable[str]) -> set[int]:

@@ -1,7 +1,8 @@
 """What the camera does to light: sensor, interior orientation, projection, distortion."""
 
 from jaxphoto.camera.balance import rebalance, rebalance_covariance
-from jaxphoto.camera.camera_rates import CameraRates
+from jaxphoto.camera.camera_rates import RATES, AbstractCameraRates, CameraRates, ThermalRates
+from jaxphoto.camera.camera_spline import CameraSpline
 from jaxphoto.camera.distortion import *  # noqa: F403 - what is declared there is public here
 from jaxphoto.camera.distortion import DISTORTIONS, AbstractDistortion, invert
 from jaxphoto.camera.equivalence import exact, with_sign
@@ -30,8 +31,9 @@ from jaxphoto.camera.strip_camera import StripCamera
 
 __all__ = [
     *(model.__name__ for model in (*DISTORTIONS.values(), *PROJECTIONS.values())), "DISTORTIONS", "PROJECTIONS",
-    "AbstractDistortion", "AbstractProjection", "CameraRates", "ConversionError", "ImageMotion", "InteriorOrientation",
-    "PrincipalPoints", "RollingShutter", "RowMotion", "Sensor", "StripCamera",
+    "RATES", "AbstractCameraRates", "AbstractDistortion", "AbstractProjection", "CameraRates", "CameraSpline",
+    "ConversionError", "ImageMotion", "InteriorOrientation", "PrincipalPoints", "RollingShutter", "RowMotion", "Sensor",
+    "StripCamera", "ThermalRates",
     "constant_names", "conversion_error", "decentring_from_symmetry", "empty_camera", "exact", "get_parameter",
     "invert", "model_keys", "parameter_names", "principal_points", "rebalance", "rebalance_covariance",
     "set_parameter", "symmetry_from_decentring", "with_sign",

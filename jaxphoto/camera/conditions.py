@@ -30,12 +30,15 @@ class Conditions(NamedTuple):
     subject_distance_m: float | None = None
     """Where the lens was focused."""
     temperature_c: float | None = None
+    """Of the air."""
+    lens_temperature_c: float | None = None
+    sensor_temperature_c: float | None = None
     humidity_percent: float | None = None
     pressure_hpa: float | None = None
 
 
 TEXTS = ("time", "make", "model", "serial", "lens", "lens_serial", "drone", "firmware")
 NUMBERS = (
-    "focal_length_mm", "f_number", "exposure_s", "iso", "subject_distance_m", "temperature_c", "humidity_percent",
-    "pressure_hpa",
+    "focal_length_mm", "f_number", "exposure_s", "iso", "subject_distance_m", "temperature_c",
+    "lens_temperature_c", "sensor_temperature_c", "humidity_percent", "pressure_hpa",
 )  # fmt: skip

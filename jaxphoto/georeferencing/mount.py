@@ -80,7 +80,8 @@ class Exposure(eqx.Module):
     about the body's right, forward and up axes (rad/s). Velocity and rate are what a time offset acts on. `nominal` is
     needed only where mounts of several kinds are stacked (`Mount.image_x` is one for all): the `Mount.nominal` of each.
     `flight_time` is that from the middle of the flight (s), for what changes from strip to strip; None: as `time`.
-    `height` is that of the camera's format (mm), which a rolling shutter reads row by row.
+    `height` is that of the camera's format (mm), which a rolling shutter reads row by row. `temperature` is that of the
+    camera above the reference of its block (K).
     """
 
     time: Float[Array, "*images"] | float
@@ -89,6 +90,7 @@ class Exposure(eqx.Module):
     nominal: Float[Array, "*images 3 3"] | Float[Array, "3 3 *images"] | None = None
     flight_time: Float[Array, "*images"] | float | None = None
     height: Float[Array, "*images"] | float | None = None
+    temperature: Float[Array, "*images"] | float | None = None
 
     @property
     def in_flight(self) -> Float[Array, "*images"] | float:

@@ -1,7 +1,8 @@
 """How photographs were taken, from EXIF and XMP, and the table conditions.csv of a result folder.
 
 Tags are those of EXIF 2.32 (CIPA DC-008): body and lens serial numbers, temperature, humidity and pressure, times with
-fractions and offset. DJI writes the serial numbers of camera and drone into XMP.
+fractions and offset. DJI writes the serial numbers of camera and drone, and the temperatures of lens and sensor, into
+XMP.
 """
 
 import math
@@ -59,6 +60,8 @@ def _said(top: Any, taken: dict, xmp: dict[str, str]) -> dict[str, Any]:
         "iso": _number(_first(taken.get(_TAG.ISOSpeedRatings)), positive=True),
         "subject_distance_m": _number(taken.get(_TAG.SubjectDistance), positive=True),
         "temperature_c": _number(taken.get(_TEMPERATURE)),
+        "lens_temperature_c": _number(xmp.get("LensTemperature")),
+        "sensor_temperature_c": _number(xmp.get("SensorTemperature")),
         "humidity_percent": _number(taken.get(_HUMIDITY)),
         "pressure_hpa": _number(taken.get(_PRESSURE)),
     }

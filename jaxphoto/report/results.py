@@ -8,7 +8,7 @@ from types import MappingProxyType
 from typing import Any
 
 from jaxphoto.adjustment import Adjustment
-from jaxphoto.camera import CameraRates, model_keys
+from jaxphoto.camera import RATES, model_keys
 from jaxphoto.errors import InputError
 from jaxphoto.report.findings import Verdict
 from jaxphoto.report.made import Made, versions
@@ -60,7 +60,7 @@ def write_results(
 def table_names(tables: Tables) -> tuple[str, ...]:
     """What the result folder of an adjustment has tables of."""
     in_map = tables.adjusted.block.frame.kind == "epsg"
-    changing = CameraRates.kind in tables.adjusted.unknowns.more
+    changing = any(rates.kind in tables.adjusted.unknowns.more for rates in RATES)
     return (
         *_TABLES,
         *(("camera_drift",) if changing else ()),

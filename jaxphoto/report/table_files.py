@@ -22,8 +22,9 @@ _BY_SD = ("nominal", "mean", "q025", "q50", "q975")
 _SIGMAS = ("sd", "predicted_sigma")
 # Names end in their units, the longest first.
 _UNITS = {
-    "m_per_s": "m/s", "deg_per_s": "deg/s", "mm_per_s": "mm/s", "mm_per_h": "mm/h", "per_h": "1/h", "deg": "deg",
-    "mm": "mm", "ms": "ms", "m": "m", "s": "s", "px": "px", "cm": "cm", "ppm": "ppm",
+    "m_per_s": "m/s", "deg_per_s": "deg/s", "mm_per_s": "mm/s", "mm_per_h": "mm/h", "per_h": "1/h",
+    "mm_per_K": "mm/K", "per_K": "1/K", "deg": "deg", "mm": "mm", "ms": "ms",
+    "m": "m", "s": "s", "px": "px", "cm": "cm", "ppm": "ppm",
 }  # fmt: skip
 _UNIT = re.compile(r"_(" + "|".join(_UNITS) + r")$")
 _COORDINATE = re.compile(r"^([XYZENH]|height|longitude|latitude|distance)_(m|deg)$")

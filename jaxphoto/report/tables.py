@@ -178,7 +178,7 @@ class Tables:
 
     @cached_property
     def camera_drift(self) -> pd.DataFrame:
-        """camera, parameter, hours, change, sigma, p_value, detectable, unit: from first to last exposure.
+        """camera, along, span, parameter, change, sigma, p_value, detectable, unit: from end to end.
 
         `p_value` and `detectable` (found with a probability of 80 %) are of a change of this parameter alone.
         """

@@ -10,8 +10,9 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxphoto.block import Datum
-from jaxphoto.camera import CameraRates, InteriorOrientation, RollingShutter, Sensor
+from jaxphoto.camera import InteriorOrientation, RollingShutter, Sensor
 from jaxphoto.georeferencing import Mount, StripBias
+from jaxphoto.parameters import AbstractParameters
 from jaxphoto.simulation.convergent_plan import ConvergentPlan, Field
 from jaxphoto.simulation.flight_plan import FlightPlan, Swaths
 from jaxphoto.simulation.scan_plan import ScanPlan, Triple
@@ -62,11 +63,47 @@ class SimulatedShutter:
 
 
 @dataclasses.dataclass(frozen=True)
-class SimulatedRates:
-    """How a camera changes during the flight; `model` is the block's start and prior, None where it knows of none."""
+class SimulatedChange:
+    """How a camera changes during the flight, or in a strip.
 
-    truth: CameraRates
-    model: tuple[CameraRates, CameraRates] | None = None
+    Truth is `truth`, plus what is drawn where the same field of `spread`, a tree of priors, is `Weighted`. `model` is
+    the block's start and prior, None where it knows of no change.
+    """
+
+    truth: AbstractParameters
+    spread: AbstractParameters
+    model: tuple[AbstractParameters, AbstractParameters] | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class CameraWalk:
+    """A random walk of c, x_p and y_p (mm) from strip to strip: standard deviations of a step of an hour.
+
+    `truth` is how far cameras of strips truly walk, `stated` what the block says of it in `StripCameraSteps`; None
+    where it says nothing.
+    """
+
+    truth: Triple
+    stated: Triple | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Cooling:
+    """The temperature of the cameras (degrees Celsius): it approaches that of the air by Newton's law of cooling.
+
+    t after the first exposure it is air + (begin - air) exp(-t / time constant). The block knows it, and takes the
+    interior orientation to be that at `reference_c`.
+    """
+
+    begin_c: float
+    air_c: float
+    time_constant_s: float
+    reference_c: float
+
+    def at(self, time: Float[np.ndarray, "images"]) -> Float[np.ndarray, "images"]:
+        """At times (s) on any clock, of which the first is the least."""
+        gone = (time - np.min(time)) / self.time_constant_s
+        return self.air_c + (self.begin_c - self.air_c) * np.exp(-gone)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -135,7 +172,8 @@ class TargetPlan:
 
 @dataclasses.dataclass(frozen=True)
 class Sigmas:
-    """Standard deviations of tie points and targets in the images, control, stations, attitudes, laser points.
+    """Standard deviations of tie points and targets in the images, control, stations, attitudes, laser points,
+    places and turns of cameras in their rig.
 
     None where these are not observed.
     """
@@ -146,6 +184,8 @@ class Sigmas:
     station_m: Triple | None = None
     attitude_deg: Triple | None = None
     lidar_m: Triple | None = None
+    rig_place_m: Triple | None = None
+    rig_turn_deg: Triple | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -161,10 +201,11 @@ class Approximation:
 class Recipe:
     """A simulation but for its seed.
 
-    `mounts` are by name, "default" or that of a camera, `shutters` and `rates` by camera; `biases` by name, "default"
-    or that of a strip. `stated` sigmas are those of the block's observations, `noise` those by which these are truly
-    off. `datum_offset_m` is added to all observed stations and is in no model. `settlement` is what stands on the
-    terrain; `lidar` scans both, in strips.
+    `mounts` are by name, "default" or that of a camera, `shutters` by camera; `biases` by name, "default" or that of a
+    strip; `changes` of cameras by kind and owner; `rig` has the cameras of a rig beside the one that is flown. `stated`
+    sigmas are those of the block's observations, `noise` those by which these are truly off. `datum_offset_m` is added
+    to all observed stations and is in no model. `settlement` is what stands on the terrain; `lidar` scans both, in
+    strips.
     """
 
     title: str
@@ -178,7 +219,10 @@ class Recipe:
     mounts: dict[str, Assumed[Mount]] = dataclasses.field(default_factory=dict)
     biases: dict[str, SimulatedBias] = dataclasses.field(default_factory=dict)
     shutters: dict[str, SimulatedShutter] = dataclasses.field(default_factory=dict)
-    rates: dict[str, SimulatedRates] = dataclasses.field(default_factory=dict)
+    changes: dict[str, dict[str, SimulatedChange]] = dataclasses.field(default_factory=dict)
+    temperature: Cooling | None = None
+    walk: CameraWalk | None = None
+    rig: dict[str, SimulatedChange] = dataclasses.field(default_factory=dict)
     datum_offset_m: Triple = (0.0, 0.0, 0.0)
     jitter: Jitter = Jitter()
     terrain: Terrain = dataclasses.field(default_factory=Terrain)

@@ -1,5 +1,7 @@
 """Measure a block anew: the same rows, computed from known unknowns, with fresh noise of their own sigmas."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -11,15 +13,17 @@ from jaxphoto.collinearity import ExteriorOrientation, project
 from jaxphoto.georeferencing import apparent_point
 from jaxphoto.observations import SurfaceRows
 from jaxphoto.simulation.flight import recorded
+from jaxphoto.simulation.further_rows import observed_anew
 from jaxphoto.unknowns import Unknowns
 
 
 def remeasure(block: Block, truth: Unknowns, key: PRNGKeyArray) -> Block:
     """`block` with every observation replaced by its true value under `truth` plus normal noise of its sigma.
 
-    Image points, stations, attitudes, control, surfaces and distances are drawn independently; check and fixed
-    coordinates become true ones; weighted priors stay. Pure and differentiable in `truth`; `vmap` over keys gives many
-    blocks at once. Which unknowns it is called with is what an adjustment of it should recover.
+    Image points, stations, attitudes, control, surfaces, distances and further rows are drawn independently; check and
+    fixed coordinates become true ones; weighted priors and what covariances join stay. Pure and differentiable in
+    `truth`; `vmap` over keys gives many blocks at once. Which unknowns it is called with is what an adjustment of it
+    should recover.
     """
     keys = jax.random.split(key, 5)
     draw = lambda k, value, sigma: value + jnp.asarray(sigma) * jax.random.normal(k, value.shape)  # noqa: E731
@@ -41,7 +45,9 @@ def remeasure(block: Block, truth: Unknowns, key: PRNGKeyArray) -> Block:
         points[block.fixed.who, block.fixed.axis],
         _feet(block.surfaces, truth, jax.random.fold_in(key, 5)),
     )
-    return eqx.tree_at(where, block, new)
+    further = (jax.random.fold_in(key, 6 + k) for k in range(len(block.more)))
+    more = tuple(observed_anew(rows, block, truth, k) for rows, k in zip(block.more, further, strict=True))
+    return dataclasses.replace(eqx.tree_at(where, block, new), more=more)
 
 
 def _feet(surfaces: SurfaceRows, truth: Unknowns, key: PRNGKeyArray) -> Float[Array, "rows 3"]:

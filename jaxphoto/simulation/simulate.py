@@ -7,16 +7,23 @@ from typing import Any
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from jaxphoto.block import Block, Start
+from jaxphoto.block import Block, Start, Temperatures
 from jaxphoto.camera import InteriorOrientation
 from jaxphoto.cloud import Cloud
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import BlockError
-from jaxphoto.georeferencing import Mount, StripBias, StripErrors, Trajectory
+from jaxphoto.georeferencing import Mount, RigCamera, StripBias, StripErrors, Trajectory
 from jaxphoto.observations import Attitudes, ControlRows, Distances, ImageRows, StationRows
-from jaxphoto.simulation.changing_cameras import seen_by_changing, with_rates
+from jaxphoto.simulation.changing_cameras import (
+    Circumstances,
+    camera_steps,
+    deviated,
+    drawn,
+    seen_by_changing,
+    with_changes,
+)
 from jaxphoto.simulation.convergent import take_images
 from jaxphoto.simulation.convergent_plan import ConvergentPlan
 from jaxphoto.simulation.exposures_on_path import exposure_times, recorded_on_path
@@ -25,6 +32,7 @@ from jaxphoto.simulation.flight_plan import FlightPlan
 from jaxphoto.simulation.platform_path import Path, paths
 from jaxphoto.simulation.points import TruePoints, scatter
 from jaxphoto.simulation.recipe import Assumed, Recipe, SimulatedBias, Triple, triple
+from jaxphoto.simulation.rig import rig_rows, rigged, with_gnss
 from jaxphoto.simulation.rolling_shutter import camera_motions, with_shutters
 from jaxphoto.simulation.scan import Scan, scan
 from jaxphoto.simulation.streams import stream
@@ -74,6 +82,8 @@ def simulate(recipe: Recipe, seed: int = 0) -> Simulation:
         flight = take_images(recipe.plan, recipe.jitter, height, seed)
     else:
         flight = fly(recipe, recipe.plan, height, seed)
+    rig = deviated(recipe.rig, seed)
+    flight, event = rigged(recipe, flight, rig, seed)
     scene = _seen(recipe, flight, scatter(recipe, flight, terrain, seed), seed)
     mounts = [recipe.mounts[name].truth if (name := recipe.mount_of(c)) else NO_MOUNT for c in flight.cameras]
     motions = camera_motions(flight.exterior, flight.motion.velocity, flight.motion.rate, mounts)
@@ -81,9 +91,12 @@ def simulate(recipe: Recipe, seed: int = 0) -> Simulation:
     flown = [] if recipe.lidar is None else paths(recipe, recipe.lidar, flight, height, seed)
     cloud, trajectory, scanner, errors = _scanned(recipe, flown, terrain, seed)
     on_path = recipe.lidar is not None and recipe.lidar.same_trajectory
-    clock = exposure_times(flown, flight) if on_path else _clock(recipe)
+    clock = exposure_times(flown, flight) if on_path else _clock(recipe, event)
     times = flight.time if clock is None else clock
-    scene = scene._replace(rays=seen_by_changing(recipe, flight, scene.rays, scene.xyz, motions, times))
+    temperatures = _temperatures(recipe, times)
+    when = Circumstances(times, np.zeros(len(times)) if temperatures is None else np.asarray(temperatures.above))
+    changes = drawn(recipe, flight, times, seed)
+    scene = scene._replace(rays=seen_by_changing(recipe, flight, scene.rays, scene.xyz, motions, when, changes))
     truth = Unknowns(
         {name: _numbers(camera.truth) for name, camera in recipe.cameras.items()},
         flight.exterior,
@@ -95,11 +108,11 @@ def simulate(recipe: Recipe, seed: int = 0) -> Simulation:
     position, attitude = record(flight, mounts, [biases.get(s, NO_BIAS) for s in flight.strips])
     if on_path and clock is not None and errors is not None:
         position, attitude = recorded_on_path(position, attitude, clock, flown, flight, errors)
-    stations, attitudes = _georeferencing(recipe, position, attitude, seed)
+    stations, attitudes = _georeferencing(recipe, position, attitude, with_gnss(recipe, flight), seed)
     control, check = _control(recipe, scene, seed)
     start, priors = _start(recipe, flight, scene, control, seed)
     known = with_shutters(recipe, flight, motions, seed, start.unknowns, priors, truth)
-    unknowns, priors, truth = with_rates(recipe, *known)
+    unknowns, priors, truth = with_changes({**changes, RigCamera.kind: rig}, *known)
     start = dataclasses.replace(start, unknowns=unknowns)
     block = Block(
         title=recipe.title,
@@ -122,6 +135,8 @@ def simulate(recipe: Recipe, seed: int = 0) -> Simulation:
         priors=priors,
         motion=flight.motion if any(map(_runs_late, recipe.mounts.values())) else None,
         flight_time=clock,
+        temperatures=temperatures,
+        more=(*camera_steps(recipe, flight, times, start.unknowns), *rig_rows(recipe, flight)),
     )
     return Simulation(block, truth, triple(recipe.datum_offset_m), terrain, cloud, trajectory, errors)
 
@@ -132,10 +147,16 @@ def _scanned(recipe: Recipe, flown: list[Path], terrain: Terrain, seed: int) -> 
     return scan(recipe.lidar, flown, terrain, _sigma(recipe.noise.lidar_m), seed)
 
 
-def _clock(recipe: Recipe) -> Float[np.ndarray, "images"] | None:
+def _clock(recipe: Recipe, event: Int[np.ndarray, "images"]) -> Float[np.ndarray, "images"] | None:
     """The time of every exposure from the middle of the flight (s); None where that from the middle of its strip
     does."""
-    return recipe.plan.clock if recipe.rates and isinstance(recipe.plan, FlightPlan) else None
+    changing = recipe.changes or recipe.temperature
+    return recipe.plan.clock[event] if changing and isinstance(recipe.plan, FlightPlan) else None
+
+
+def _temperatures(recipe: Recipe, times: Float[np.ndarray, "images"]) -> Temperatures | None:
+    cooling = recipe.temperature
+    return None if cooling is None else Temperatures(cooling.at(times), cooling.reference_c)
 
 
 def _seen(recipe: Recipe, flight: Flight, scene: TruePoints, seed: int) -> TruePoints:
@@ -175,19 +196,23 @@ def _control(recipe: Recipe, scene: TruePoints, seed: int) -> tuple[ControlRows,
 
 
 def _georeferencing(
-    recipe: Recipe, position: Float[np.ndarray, "images 3"], attitude: Float[np.ndarray, "images 3"], seed: int
+    recipe: Recipe,
+    position: Float[np.ndarray, "images 3"],
+    attitude: Float[np.ndarray, "images 3"],
+    of: Int[np.ndarray, "n"],
+    seed: int,
 ) -> tuple[StationRows, Attitudes]:
-    """What GNSS and IMU observe of exposures at `position` (m) and roll, pitch, yaw (rad)."""
-    n = len(position)
+    """What GNSS and IMU observe of the exposures `of` some images, at `position` (m) and roll, pitch, yaw (rad)."""
+    n = len(of)
     stations, attitudes = StationRows.none(), Attitudes.none()
     if recipe.stated.station_m is not None:
-        position = position + _sigma(recipe.noise.station_m) * _draw(seed, "noise of stations", (n, 3))
+        position = position[of] + _sigma(recipe.noise.station_m) * _draw(seed, "noise of stations", (n, 3))
         who, axis = np.indices((n, 3)).reshape(2, -1)
-        stations = StationRows(who, axis, position.ravel(), _sigma(recipe.stated.station_m)[axis])
+        stations = StationRows(of[who], axis, position.ravel(), _sigma(recipe.stated.station_m)[axis])
     if recipe.stated.attitude_deg is not None:
         noise = np.deg2rad(_sigma(recipe.noise.attitude_deg)) * _draw(seed, "noise of attitudes", (n, 3))
         sigma = np.deg2rad(_sigma(recipe.stated.attitude_deg))
-        attitudes = Attitudes(np.arange(n), attitude + noise, np.tile(sigma, (n, 1)))
+        attitudes = Attitudes(of, attitude[of] + noise, np.tile(sigma, (n, 1)))
     return stations, attitudes
 
 

@@ -12,7 +12,13 @@ from jaxphoto.statistics.blunder_test import (
     detectable_errors,
     worst_checked,
 )
-from jaxphoto.statistics.camera_drift import CameraDrift, StripDifferences, camera_drifts, strip_differences
+from jaxphoto.statistics.camera_drift import (
+    CameraDifferences,
+    CameraDrift,
+    camera_drifts,
+    camera_wanderings,
+    strip_differences,
+)
 from jaxphoto.statistics.common_observations import common_covariance
 from jaxphoto.statistics.correlation import Correlations, correlation_matrix, correlations
 from jaxphoto.statistics.covariance import EOP_NAMES, Covariance, Rotations, covariance
@@ -65,12 +71,14 @@ from jaxphoto.statistics.zero_test import POWER, ZeroTest, zero_test
 
 __all__ = [
     "DELTA0", "EOP_NAMES", "LEAST_CHECKED", "LEAST_CHECK_POINTS", "LEAST_SIGMA0", "LEVEL", "MOST_PARTS", "POWER",
-    "SIGNIFICANCE_LEVEL", "SPLITS", "AxisErrors", "BlunderTest", "CameraDrift", "ComponentAccuracy", "Correlations",
-    "Covariance", "Felt", "GroundCorrelations", "Hidden", "IfZero", "LinearForms", "PartialRedundancy", "Partition",
-    "Parts", "PositionalAccuracy", "Redundancy", "Rotations", "Selection", "Significance", "Spread",
-    "StripDifferences", "Suspect", "Trend", "UndetectedEffects", "VarianceComponents", "VarianceFactor", "ZeroTest",
+    "SIGNIFICANCE_LEVEL", "SPLITS", "AxisErrors", "BlunderTest", "CameraDifferences", "CameraDrift",
+    "ComponentAccuracy", "Correlations", "Covariance", "Felt", "GroundCorrelations", "Hidden", "IfZero",
+    "LinearForms", "PartialRedundancy", "Partition", "Parts", "PositionalAccuracy", "Redundancy", "Rotations",
+    "Selection", "Significance", "Spread", "Suspect", "Trend", "UndetectedEffects", "VarianceComponents",
+    "VarianceFactor", "ZeroTest",
     "a_priori_sigmas", "angle_differences",
-    "blunder_test", "camera_drifts", "check_discrepancies", "chi_square_limit", "chi_square_p", "common_covariance",
+    "blunder_test", "camera_drifts", "camera_wanderings", "check_discrepancies", "chi_square_limit", "chi_square_p",
+    "common_covariance",
     "correlation_matrix", "correlations", "covariance", "critical_w", "detectable_errors", "error_precision",
     "global_test", "ground_correlations", "group_factors", "if_zero", "linear_forms", "most_felt",
     "normalised_residuals", "observation_groups", "partial_redundancy", "parts_of", "physical_residuals",

@@ -10,9 +10,9 @@ chi-square of f degrees of freedom is beyond its limit of 5 % with the power of 
 
     D_k = sigma0 sqrt(lambda(f) / (Q^-1)_kk)
 
-which is (1.96 + 0.84) sigma where there is one parameter. What was known of parameters beforehand, each by itself, has
-no part in this: it is taken out of Q and d. What then shows in no observation, such as a change of all strips together
-beside that of their camera, has no part in f.
+which is (1.96 + 0.84) sigma where there is one parameter. The priors of parameters, of vectors with their covariance,
+have no part in this: they are taken out of Q and d. What then shows in no observation, such as a change of all strips
+together beside that of their camera, has no part in f.
 
 Sources: Baarda (1968), A testing procedure for use in geodetic networks; Teunissen (2000), Testing theory.
 """
@@ -21,7 +21,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.adjustment.model.structure import observed_in
@@ -62,19 +62,13 @@ def zero_test(adjusted: Adjustment, covariance: Covariance, labels: Sequence[str
     own = np.asarray(s.free)[[of[label] for label in labels]]
     value = times * np.asarray(adjusted.values.shared)[own]
     q = times**2 * np.asarray(covariance.matrix)[np.ix_(places, places)]
-    entries, weight, known = (
-        observed_in(adjusted.block, adjusted.priors).entries,
-        np.zeros(len(own)),
-        np.zeros(len(own)),
-    )
-    for k, place in enumerate(own):
-        if isinstance(prior := entries[place].prior, Weighted):
-            weight[k], known[k] = 1 / (times * float(prior.sigma)) ** 2, times * float(prior.value)
+    weight, known = _known(adjusted, own)
+    weight, known = weight / times**2, times * known
     # In units of the standard deviations that the adjustment gives, all that it knows is the inverse correlation.
     sigma = np.sqrt(np.diagonal(q))
     whole = np.linalg.inv(q / np.outer(sigma, sigma))
-    shown = whole - np.diag(weight * sigma**2)
-    right = whole @ (value / sigma) - weight * sigma * known
+    shown = whole - weight * np.outer(sigma, sigma)
+    right = whole @ (value / sigma) - sigma * (weight @ known)
     factor, r = float(covariance.variance_factor), adjusted.redundancy
     explained, freedom, inverse = _solved(shown, right)
     alone, precision = np.diagonal(inverse), np.maximum(np.diagonal(shown), 0.0)
@@ -87,6 +81,21 @@ def zero_test(adjusted: Adjustment, covariance: Covariance, labels: Sequence[str
         sigma * np.sqrt(np.divide(least, precision, out=np.full(len(own), np.inf), where=precision > _SHOWS)),
         _tail(explained / factor, freedom, r),
     )
+
+
+def _known(adjusted: Adjustment, own: Int[np.ndarray, "k"]) -> tuple[Float[np.ndarray, "k k"], Float[np.ndarray, "k"]]:
+    """Weights and values of what was known of parameters beforehand; `own` are their places among all shared ones."""
+    given, at = observed_in(adjusted.block, adjusted.priors), {int(place): k for k, place in enumerate(own)}
+    weight, known = np.zeros((len(own), len(own))), np.zeros(len(own))
+    for k, place in enumerate(own):
+        if isinstance(prior := given.entries[place].prior, Weighted):
+            weight[k, k], known[k] = 1 / float(prior.sigma) ** 2, float(prior.value)
+    for joint in given.together:
+        inside = [k for k, place in enumerate(joint.parameters) if int(place) in at]
+        if inside:
+            mine = [at[int(joint.parameters[k])] for k in inside]
+            weight[np.ix_(mine, mine)] = np.linalg.inv(np.asarray(joint.covariance)[np.ix_(inside, inside)])
+    return weight, known
 
 
 def _solved(

@@ -37,7 +37,7 @@ def with_rates(block, priors: CameraRates):
 
 
 @functools.cache
-def changing_block():
+def changing_block(true=TRUE):
     """Images of a camera that changes over an hour; stations tell it from heights, two directions from shifts."""
     block, truth = simulated("cross")
     rows, seconds = block.image_points, np.linspace(-1800.0, 1800.0, len(block.images))
@@ -48,7 +48,7 @@ def changing_block():
     @jax.vmap
     def moved(seconds, image, point):
         own = ExteriorOrientation(exterior.position[image], exterior.camera_from_object[image])
-        changed = TRUE.interior(camera, at(seconds))
+        changed = true.interior(camera, at(seconds))
         return project(changed, own, points[point]) - project(camera, own, points[point])
 
     xy = np.asarray(rows.xy) + np.asarray(moved(seconds[rows.image], rows.image, rows.point))

@@ -11,7 +11,7 @@ import pytest
 from jaxphoto import ExteriorOrientation, Outcome, Weighted, adjust, covariance, project
 from jaxphoto.camera import StripCamera
 from jaxphoto.observations import StripCameraSteps
-from jaxphoto.report.camera_drift import strip_words
+from jaxphoto.report.camera_drift import differences_words
 from jaxphoto.statistics import strip_differences
 from tests.blocks import BROWN, simulated
 
@@ -66,7 +66,7 @@ def test_each_strip_has_its_own_camera():
 
 def test_what_strips_differ_by_is_recovered():
     adjusted, strips = found(0.1)
-    assert (strips.strips, strips.parameters) == (("a",) * 3 + ("b",) * 3, ("c", "xp", "yp") * 2)
+    assert (strips.at, strips.parameters) == (("a",) * 3 + ("b",) * 3, ("c", "xp", "yp") * 2)
     assert 0.9 < adjusted.sigma0 < 1.1
     q = covariance(adjusted)
     places = [k for k, label in enumerate(q.labels) if label.startswith("strip_cameras[")]
@@ -90,10 +90,10 @@ def test_steps_hold_the_strips_together():
 
 def test_words():
     _, strips = found(0.1)
-    assert strip_words(strips).startswith("the camera is not the same in all strips (p = ")
-    assert " um in strip a to " in strip_words(strips) and " um in strip b to " in strip_words(strips)
+    assert differences_words(strips).startswith("the camera is not the same in all strips (p = ")
+    assert " um in strip a to " in differences_words(strips) and " um in strip b to " in differences_words(strips)
     alike = strips._replace(more=strips.more._replace(p_value=0.4, detectable=np.array([4, 3, 2, 5, 1, 1]) * 1e-3))
-    assert strip_words(alike) == (
+    assert differences_words(alike) == (
         "no difference between the cameras of strips is seen (p = 0.4); any one strip alone would have shown, with a "
         "probability of 80%, 5.0 um of c, 3.0 um of x_p, 2.0 um of y_p"
     )

@@ -21,6 +21,8 @@ from jaxphoto.observations import (
     Correlated,
     Distances,
     KnownParameters,
+    RigPlaces,
+    RigTurns,
     StationRows,
     correlated,
     touching,
@@ -68,6 +70,8 @@ def rows_of(kind: type[AbstractObservations], n: int, seed: int = 0) -> Abstract
         index = (np.arange(n)[:, None] + np.arange(int(np.prod(shape)))) % size
         number = np.abs(rng.normal(1.0, 0.3, (n, *shape))) + 1e-3
         fields[name] = index.reshape(n, *shape) if whole else number if name in in_files else 0 * number
+    if kind in (RigPlaces, RigTurns):
+        fields["image"] = (fields["reference"] + 1) % 3
     if kind.group == "prior_rotations":
         fields["value"] = np.array(jax.vmap(small_rotation)(rng.normal(0, 0.3, (n, 3))))
     if kind.group == "surfaces":

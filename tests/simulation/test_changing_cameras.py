@@ -9,6 +9,8 @@ from jaxphoto import FREE, BlockError, InputError
 from jaxphoto.collinearity import ExteriorOrientation, project
 from jaxphoto.io import read_block, read_truth, recipe_from, write_simulation
 from jaxphoto.simulation import image_coordinates
+from jaxphoto.simulation.changing_cameras import drawn
+from jaxphoto.simulation.flight import fly
 from tests.derivatives import compiled
 from tests.simulation.small import changed, made, plain
 
@@ -46,9 +48,68 @@ def test_the_block_knows_what_the_recipe_says_and_truth_is_told():
     assert np.array_equal(unknowing.block.image_points.xy, block.image_points.xy)
 
 
-def test_measured_once_more_it_is_the_same_flight():
-    block, truth, _ = made(RATES)
+THERMAL = {
+    "thermal_rates": {"kodak": {"c_rate": "free", "truth": {"c_rate_mm_per_K": 0.002, "yp_rate_mm_per_K": -0.001}}},
+    "temperature": {"begin_c": 25.0, "air_c": 5.0, "time_constant_s": 100.0, "reference_c": 20.0},
+}
+
+
+def test_a_camera_cools_as_newton_says():
+    block, _, _ = made(THERMAL)
+    time = block.flight_time - block.flight_time[0]
+    np.testing.assert_allclose(block.temperatures.celsius, 5 + 20 * np.exp(-time / 100), atol=1e-9)
+    assert block.temperatures.reference_c == 20.0
+
+
+STRIPS = {
+    "strip_cameras": {
+        "default": {
+            "c_more": {"sigma_mm": 0.02}, "xp_more": {"sigma_mm": 0.02}, "yp_more": {"sigma_mm": 0.02},
+            "truth": {"yp_more": {"sigma_mm": 0.01}},
+        },
+        "A": {"truth": {"c_more_mm": 0.01}},
+    },
+    "camera_walk": {"c_mm": 0.1, "xp_mm": 0.05, "yp_mm": 0.05, "truth": {"xp_mm": 0.2}},
+    "flight.turn_s": 300.0,
+}  # fmt: skip
+SPLINE = {"camera_splines": {"kodak": {
+    "knots": 6, "interval_s": 100.0, "c_spline": {"walk_mm": 0.1}, "truth": {"c_spline": {"walk_mm": 0.3}},
+}}}  # fmt: skip
+
+
+def test_cameras_of_strips_walk():
+    """Of strip A the block knows nothing; each draws its own, and all a walk from strip to strip."""
+    block, truth, _ = made(STRIPS)
+    cameras, walks = truth.more["strip_cameras"], []
+    assert float(cameras["A"].c_more) == 0.01 and float(cameras["A"].xp_more) == 0.0
+    assert float(cameras["B"].c_more) == 0.0 and float(cameras["B"].yp_more) != 0.0
+    assert list(block.start.unknowns.more["strip_cameras"]) == ["B", "C"]
+    (steps,) = block.more
+    hours = np.diff([block.flight_time[np.array(block.image_strip) == name].mean() / 3600 for name in "ABC"])
+    np.testing.assert_allclose(steps.sigma, np.sqrt(hours[1:]) * [[0.1, 0.05, 0.05]])
+    for seed in range(60):
+        own = drawn(recipe_from(changed(STRIPS)), flown(), block.flight_time, seed)["strip_cameras"]
+        walks.append(np.diff([float(own[name].truth.xp_more) for name in "ABC"]) / np.sqrt(hours) / 0.2)
+    assert abs(np.std(walks) - 1) < 4 / np.sqrt(2 * np.size(walks))
+
+
+def flown():
+    recipe = recipe_from(changed(STRIPS))
+    return fly(recipe, recipe.plan, 0.0, 1)
+
+
+def test_a_camera_wanders_along_its_spline():
+    walks = [drawn(recipe_from(changed(SPLINE)), flown(), np.zeros(14), seed) for seed in range(60)]
+    ends = np.array([np.asarray(walk["camera_splines"]["kodak"].truth.c_spline)[[0, -1]] for walk in walks])
+    assert abs(np.std(ends) / (0.3 * np.sqrt(250 / 3600)) - 1) < 4 / np.sqrt(2 * ends.size)
+    assert not np.asarray(walks[0]["camera_splines"]["kodak"].truth.xp_spline).any()
+
+
+@pytest.mark.parametrize("changes", [RATES, THERMAL, STRIPS, SPLINE])
+def test_measured_once_more_it_is_the_same_flight(changes):
+    block, truth, _ = made(changes)
     np.testing.assert_allclose(image_coordinates(block, truth), block.image_points.xy, atol=1e-9)
+    assert 0.001 < np.abs(block.image_points.xy - plain().block.image_points.xy).max() < 0.1
 
 
 def test_it_goes_through_files(tmp_path):
@@ -76,9 +137,24 @@ def test_a_photograph_without_a_time_is_named(tmp_path):
     ("changes", "words"),
     [
         ({"camera_rates.kodak.rate": 1.0}, r"\[camera_rates.kodak\] rate: no such key is known"),
-        ({"camera_rates.kodak.truth.c_rate": 1.0}, r"\[camera_rates.kodak.truth\] c_rate: no such key is known"),
+        ({"camera_rates.kodak.truth.c_rate": 1.0}, r"\[camera_rates.kodak.truth\] c_rate: 1.0 is no status"),
         ({"camera_rates.leica": {}}, r"\[camera_rates\] leica: no such key is known"),
         ({"flight.turn_s": -1.0}, r"\[flight\] turn_s"),
+        (
+            {"thermal_rates": THERMAL["thermal_rates"]},
+            "thermal_rates: the recipe says nothing of the temp",
+        ),
+        ({"camera_walk": {"c_mm": 0.1}}, r"camera_walk: the cameras of strips walk, but there are none"),
+        (STRIPS | {"camera_walk.c_mm": 0.0}, r"\[camera_walk\]: the steps of c, x_p and y_p are all observed"),
+        (
+            STRIPS | {"strip_cameras.A.truth": {"c_more": "free"}},
+            r"A\.truth\] c_more: what is true is not free",
+        ),
+        (
+            SPLINE | {"camera_splines.kodak.knots": 7},
+            r"kodak\.truth\]: knots = 7 is not an even number",
+        ),
+        (THERMAL | {"temperature.time_constant_s": 0.0}, r"\[temperature\] time_constant_s: 0 is not positive"),
     ],
 )
 def test_what_cannot_be_is_refused(changes, words):

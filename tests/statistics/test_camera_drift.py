@@ -22,7 +22,7 @@ def judged(*priors, parameters=("c", "xp", "yp", "k1")):
     (drift,) = camera_drifts(found, q)
     assert drift.parameters == parameters
     places = [k for k, label in enumerate(q.labels) if label.startswith("camera_rates[")]
-    assert (drift.camera, drift.hours) == ("one", pytest.approx(1.0))
+    assert (drift.camera, drift.span) == ("one", pytest.approx(1.0))
     return found, drift.change, np.asarray(q.matrix)[np.ix_(places, places)] * float(found.sigma0) ** 2
 
 
@@ -67,7 +67,7 @@ def test_the_table_has_a_row_a_rate_where_cameras_change():
 
 def words(parameters, change, sigma, p_values, detectable, p_value, hours=1.0):
     test = ZeroTest(*map(np.array, (change, sigma, p_values, detectable)), p_value)
-    return drift_words(CameraDrift("kodak", hours, parameters, test))
+    return drift_words(CameraDrift("kodak", CameraRates, hours, parameters, test))
 
 
 def test_what_changed_is_said_with_its_standard_deviation():

@@ -187,6 +187,7 @@ def pad_values(values: Values, structure: Structure, padded: TiledStructure, pla
         nominal=images(v.nominal, np.eye(3)[:, :, None]),
         flight_time=images(v.flight_time, 0.0),
         height=images(v.height, 1.0),
+        temperature=images(v.temperature, 0.0),
         position=images(v.position, v.position[..., :1] if own.n_images else 0.0),
         rotation=images(v.rotation, v.rotation[..., :1] if own.n_images else np.eye(3)[..., None]),
         shared=v.shared,

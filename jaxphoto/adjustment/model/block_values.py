@@ -39,6 +39,7 @@ def values_of(
         nominal=_floats(known.nominal).transpose(1, 2, 0),
         flight_time=_floats(known.flight_time),
         height=_floats(known.height),
+        temperature=_floats(known.temperature),
         position=_floats(start.exterior.position).T,
         rotation=_floats(start.exterior.camera_from_object).transpose(1, 2, 0),
         shared=vector_of(shared_vector(start, given.camera_names, given.tables)),

@@ -82,7 +82,7 @@ def _bent_by(interior: InteriorOrientation, forms: list) -> InteriorOrientation:
     still = np.zeros(3)
 
     def bent(interior: InteriorOrientation) -> InteriorOrientation:
-        exposure = Exposure(0.0, still, still, np.eye(3), 0.0, 1.0)  # type: ignore[arg-type]
+        exposure = Exposure(0.0, still, still, np.eye(3), 0.0, 1.0, 0.0)  # type: ignore[arg-type]
         for form in forms:
             interior = filled(form, np.zeros(size_of(form))).interior(interior, exposure)
         return interior

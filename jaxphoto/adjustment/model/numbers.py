@@ -68,6 +68,7 @@ class AbstractValues(eqx.Module):
     nominal: Float[Array, "3 3 images"]
     flight_time: Float[Array, "images"]
     height: Float[Array, "images"]
+    temperature: Float[Array, "images"]
     position: Float[Array, "3 images"]
     rotation: Float[Array, "3 3 images"]
     shared: Float[Array, "parameters"]
@@ -78,7 +79,7 @@ class AbstractValues(eqx.Module):
     @property
     def exposures(self) -> tuple[Float[Array, "... images"], ...]:
         """What an `Exposure` of each image holds."""
-        return self.time, self.velocity, self.rate, self.nominal, self.flight_time, self.height
+        return self.time, self.velocity, self.rate, self.nominal, self.flight_time, self.height, self.temperature
 
 
 class Values(AbstractValues):

@@ -36,7 +36,13 @@ from jaxphoto.adjustment.model.observed_groups import (
     observations_of,
     weighted_parameters,
 )
-from jaxphoto.adjustment.model.parameter_tables import ParameterTable, SharedParameter, shared_entries, tables_of
+from jaxphoto.adjustment.model.parameter_tables import (
+    JointPrior,
+    ParameterTable,
+    SharedParameter,
+    shared_entries,
+    tables_of,
+)
 from jaxphoto.block import Block
 from jaxphoto.devices import AXIS
 from jaxphoto.errors import BlockError
@@ -156,6 +162,8 @@ class ObservedRows(NamedTuple):
     cameras: tuple[CameraGroup, ...]
     tables: tuple[ParameterTable, ...]
     entries: list[SharedParameter]
+    together: list[JointPrior]
+    """What is known of several numbers of a vector together."""
     named: list[tuple[str, AbstractObservations]]
     """Rows by the name of their group."""
 
@@ -175,7 +183,7 @@ def observed_in(block: Block, priors: Unknowns) -> ObservedRows:
     entries, together = shared_entries(block, priors, [name for g in cameras for name in g.names], tables)
     named = observations_of(block, priors, together, [e.label for e in entries])
     weighted = weighted_parameters([e.prior for e in entries], together)
-    return ObservedRows(cameras, tables, entries, named + [(PRIORS, weighted)] * (len(weighted) > 0))
+    return ObservedRows(cameras, tables, entries, together, named + [(PRIORS, weighted)] * (len(weighted) > 0))
 
 
 def structure_of(block: Block, priors: Unknowns, observed: ObservedRows | None = None) -> Structure:

@@ -5,6 +5,7 @@ second derivative (Gauss-Newton part and curvature). H is never formed: conjugat
 preconditioned by the factored normal matrix, from which it differs by the residuals' curvature only.
 """
 
+import dataclasses
 from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
@@ -189,6 +190,7 @@ def typical_scale(values: TiledValues, structure: TiledStructure) -> Increments:
     seconds = jnp.maximum(jnp.max(jnp.abs(v.time)), 1.0)
     by_unit |= {f"{unit}_per_s": by_unit[unit] / seconds for unit in ("m", "rad", "mm")}
     by_unit["mm_per_h"] = by_unit["mm"] * HOUR_S / jnp.maximum(jnp.max(jnp.abs(v.flight_time)), 1.0)
+    by_unit["mm_per_K"] = by_unit["mm"] / jnp.maximum(jnp.max(jnp.abs(v.temperature)), 1.0)
     if s.tables:
         declared: list[Array] = []
         for t in s.tables:
@@ -217,9 +219,10 @@ def _typical_of_camera(
 def _typical_of_bending(
     s: TiledStructure, v: TiledValues, t: ParameterTable, sigma: Array, corner: Float[Array, "2"]
 ) -> Float[Array, "n"]:
-    """The same of what bends cameras, at the exposure farthest from the middle of the flight."""
-    farthest = jnp.argmax(jnp.abs(v.flight_time))
-    exposure, of_groups = Exposure(*(jnp.asarray(a)[..., farthest] for a in v.exposures)), []
+    """The same of what bends cameras, far from the middle of the flight and from the reference temperature."""
+    farthest, of_groups = jnp.argmax(jnp.abs(v.flight_time)), []
+    exposure = Exposure(*(jnp.asarray(a)[..., farthest] for a in v.exposures))
+    exposure = dataclasses.replace(exposure, temperature=jnp.max(jnp.abs(v.temperature)))
     for group in s.groups:
         camera = _camera_of(group, v.shared[group.offset : group.offset + group.treedef.num_leaves])
         bent = lambda p, camera=camera: filled(t.form, p).interior(camera, exposure)  # noqa: E731

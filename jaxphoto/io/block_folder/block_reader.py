@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from jaxphoto.arrays import on_device
 from jaxphoto.block import Block, Frame, Start, sensor_rows
+from jaxphoto.camera import ThermalRates
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import Mount
 from jaxphoto.io.block_folder.attitude_units import check_attitude_units
@@ -23,7 +24,7 @@ from jaxphoto.io.block_folder.earlier_calibration import known_cameras, with_ear
 from jaxphoto.io.block_folder.frame_sections import read_corrections, read_frame
 from jaxphoto.io.block_folder.georeferencing import read_attitudes, read_stations
 from jaxphoto.io.block_folder.image_points import check_rays, read_image_points
-from jaxphoto.io.block_folder.images import Images, check_flight_times, check_times, read_images
+from jaxphoto.io.block_folder.images import Images, check_rates, check_times, read_images
 from jaxphoto.io.block_folder.map_tables import origin_of, tables_to_local
 from jaxphoto.io.block_folder.motion import ObservedFlight, check_time_offsets, read_motion
 from jaxphoto.io.block_folder.mount_sections import mounts_of, read_mounts, read_strips
@@ -33,6 +34,7 @@ from jaxphoto.io.block_folder.settings import Settings, read_partitions, read_se
 from jaxphoto.io.block_folder.surfaces import read_surfaces
 from jaxphoto.io.block_folder.table_layout import LAYOUTS, TOML, TableLayout, layout_in
 from jaxphoto.io.block_folder.tables import layouts, read_declared
+from jaxphoto.io.block_folder.temperatures import temperatures_of, with_temperatures
 from jaxphoto.io.block_folder.trajectory_section import read_flight
 from jaxphoto.io.text_tables import Table, read_csv
 from jaxphoto.io.toml import read_toml
@@ -105,6 +107,8 @@ def read_folder(folder: Path, more: Iterable[type] = ()) -> BlockTables:
         path = folder / f"{name}.csv"
         if path.exists():
             tables[name] = read_csv(path, *layout_in(frame, layout)[1:])
+    if ThermalRates.kind in top.section("unknowns"):
+        tables["images"] = with_temperatures(tables["images"], folder)
     return source
 
 
@@ -175,6 +179,7 @@ def assemble(source: BlockTables) -> Block:
         image_strip=images.strips,
         image_time=on_device(images.times),
         flight_time=None if images.strips_are_the_flight else on_device(images.flight_times),
+        temperatures=temperatures_of(images.temperatures, settings),
         image_points=points.rows,
         control=control.control,
         fixed=control.fixed,
@@ -193,7 +198,7 @@ def assemble(source: BlockTables) -> Block:
     )
     more, more_priors = read_unknowns(settings.unknowns, source.unknowns, block)
     start, priors = dataclasses.replace(start, more=more), dataclasses.replace(priors, more=more_priors)
-    check_flight_times(images, start, priors)
+    check_rates(images, start, priors)
     ids = Ids(images, points, {kind: tuple(owners) for kind, owners in start.tables.items()})
     distances, further = read_declared(kinds, tables, ids, settings)
     block = dataclasses.replace(

@@ -117,6 +117,7 @@ def _settings(block: Block) -> dict[str, Any]:
         "title": block.title,
         **({"observations": own} if own else {}),
         **({"partitions": list(block.partitions)} if block.partitions else {}),
+        **({"reference_temperature_c": block.temperatures.reference_c} if block.temperatures else {}),
         "frame": frame_section(block.frame),
         "corrections": corrections_section(block.corrections, block.frame),
         "cameras": cameras,
@@ -187,6 +188,8 @@ def _images(block: Block) -> pd.DataFrame:
     times = np.asarray(block.image_time if block.flight_time is None else block.flight_time)
     if times.any() or block.start.unknowns.strips:
         columns["time_s"] = times
+    if block.temperatures is not None:
+        columns["temperature_c"] = np.asarray(block.temperatures.celsius)
     if known.any():
         values = np.hstack([np.asarray(exterior.position), np.rad2deg(exterior.omega_phi_kappa)])
         values = np.where(known[:, None], values, math.nan)

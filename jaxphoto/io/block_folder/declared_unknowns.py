@@ -18,7 +18,7 @@ from jaxphoto.io.block_folder.camera_section import status
 from jaxphoto.io.block_folder.section import Section
 from jaxphoto.observations.columns import FILE_UNITS
 from jaxphoto.parameters import AbstractParameters, dynamic_fields, unit_of
-from jaxphoto.unknowns import UNKNOWNS
+from jaxphoto.unknowns import UNKNOWNS, Weighted
 
 Kind = type[AbstractParameters]
 # Those that have sections of their own.
@@ -60,7 +60,7 @@ def keys_of(kind: Kind) -> tuple[Key, ...]:
         (unit,) = units
         own = FILE_UNITS.get(unit, unit)
         end = f"_{own}" if own else ""
-        shape = (len(names),) if axes else ()
+        shape = (len(names),) if axes and not kind.sized else ()
         found.append(Key(field, f"{field}{end or '_start'}", end, np.pi / 180 if own != unit else 1.0, shape))
     return tuple(found)
 
@@ -121,23 +121,41 @@ def _tables(kind: Kind, given: Section, block: Block) -> Iterator[tuple[str, Sec
 
 def read_parameters(kind: Kind, table: Section) -> tuple[Any, Any]:
     """Start values and priors of one owner. Raises InputError for keys that the class does not have."""
-    keys, static = keys_of(kind), _static(kind)
+    keys, static = keys_of(kind), static_fields(kind)
     table.known(*(k.start for k in keys), *static, *(k.field for k in keys))
     starts: dict[str, Any] = {name: table.values.get(name, default) for name, default in static.items()}
     priors = dict(starts)
+    # How many numbers its fields have is known only where the field that counts them is sound.
+    bare = _made(kind, starts | dict.fromkeys((key.field for key in keys), np.zeros(0)), table) if kind.sized else None
     for key in keys:
-        value = table.vector(key.start, *key.shape) if key.shape else np.asarray(table.number(key.start, 0.0))
+        shape = (getattr(bare, kind.sized),) if kind.sized else key.shape
+        value = table.vector(key.start, *shape) if shape else np.asarray(table.number(key.start, 0.0))
         starts[key.field] = on_device(value * key.scale)
-        priors[key.field] = table.prior(key.field, value * key.scale, key.unit, key.scale)
+        walked = None if bare is None else _walked(table, key, bare)
+        priors[key.field] = walked or table.prior(key.field, value * key.scale, key.unit, key.scale)
+    return _made(kind, starts, table), _made(kind, priors, table)
+
+
+def _made(kind: Kind, values: dict[str, Any], table: Section) -> Any:
     try:
-        return kind(**starts), kind(**priors)
+        return kind(**values)
     except ValueError as error:
         raise table.error("", f"{error}; correct it") from None
 
 
+def _walked(table: Section, key: Key, own: Any) -> Weighted | None:
+    """The prior of coefficients that `{ walk_mm = ... }` describes: how far the camera wanders in an hour, or None."""
+    given, word = table.values.get(key.field), f"walk{key.unit}"
+    if not isinstance(given, dict) or word not in given:
+        return None
+    wander = table.section(key.field)
+    wander.known(word)
+    return Weighted(on_device(np.zeros(len(own.walk))), covariance=on_device(own.walk * wander.positive(word) ** 2))
+
+
 def _section(own: AbstractParameters, priors: AbstractParameters) -> dict[str, Any]:
     kind, written = type(own), {}
-    for name in _static(kind):
+    for name in static_fields(kind):
         written[name] = getattr(own, name)
     for key in keys_of(kind):
         value = np.asarray(getattr(own, key.field))
@@ -146,6 +164,6 @@ def _section(own: AbstractParameters, priors: AbstractParameters) -> dict[str, A
     return written
 
 
-def _static(kind: Kind) -> dict[str, Any]:
+def static_fields(kind: Kind) -> dict[str, Any]:
     """Fields that hold no numbers to solve for, with their defaults."""
     return {f.name: f.default for f in dataclasses.fields(kind) if f.name not in dynamic_fields(kind)}

@@ -7,12 +7,13 @@ import equinox as eqx
 import numpy as np
 import pandas as pd
 
-from jaxphoto.camera import CameraRates
+from jaxphoto.camera import RATES
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import BlockError
 from jaxphoto.io.block_folder.settings import Settings
 from jaxphoto.io.block_folder.table_layout import ANGLES, XYZ
+from jaxphoto.io.block_folder.temperatures import celsius_in
 from jaxphoto.io.text_tables import Table
 from jaxphoto.unknowns import FIXED, Unknowns
 
@@ -31,6 +32,8 @@ class Images(NamedTuple):
     flight_times: np.ndarray
     """Seconds from the mean of all images."""
     time_known: np.ndarray
+    temperatures: np.ndarray
+    """Degrees Celsius, NaN where not known."""
     exterior: ExteriorOrientation
     known: np.ndarray
 
@@ -77,6 +80,7 @@ def read_images(table: Table, settings: Settings) -> Images:
         _centred(times, strips),
         _centred(times, np.zeros(len(times))),
         ~np.isnan(times),
+        celsius_in(table),
         exterior,
         oriented,
     )
@@ -95,20 +99,27 @@ def check_times(images: Images, strips: dict, priors: dict) -> None:
                 )
 
 
-def check_flight_times(images: Images, starts: Unknowns, priors: Unknowns) -> None:
-    """Raise BlockError where a camera that changes during the flight needs a time that is missing."""
-    changing = {
-        name: any(prior is not FIXED for prior in vars(priors.more[CameraRates.kind][name]).values())
-        or any(np.any(np.asarray(rate) != 0) for rate in vars(start).values())
-        for name, start in starts.more.get(CameraRates.kind, {}).items()
+def check_rates(images: Images, starts: Unknowns, priors: Unknowns) -> None:
+    """Raise BlockError where a camera that changes during the flight needs a time or a temperature that is missing."""
+    columns = {
+        "time_h": ("time_s", images.time_known),
+        "temperature_K": ("temperature_c", ~np.isnan(images.temperatures)),
     }
-    for i in np.flatnonzero(~images.time_known):
-        if changing.get(camera := images.cameras[i]):
-            raise images.table.misfit(
-                int(i),
-                f"image {images.ids[i]} has no time_s, but its camera {camera} changes during the flight "
-                f'([unknowns.{CameraRates.kind}]); add the time, or make its rates "fixed"',
-            )
+    for rates in RATES:
+        column, known = columns[rates.along]
+        changing = {
+            name: any(prior is not FIXED for prior in vars(priors.more[rates.kind][name]).values())
+            or any(np.any(np.asarray(rate) != 0) for rate in vars(start).values())
+            for name, start in starts.more.get(rates.kind, {}).items()
+        }
+        what = column.partition("_")[0]
+        for i in np.flatnonzero(~known):
+            if changing.get(camera := images.cameras[i]):
+                raise images.table.misfit(
+                    int(i),
+                    f"image {images.ids[i]} has no {column}, but its camera {camera} changes during the flight "
+                    f'([unknowns.{rates.kind}]); add the {what}, or make its rates "fixed"',
+                )
 
 
 def refuse_duplicates(table: Table, keys: dict[str, np.ndarray], message: str) -> None:

@@ -28,6 +28,7 @@ _KEYS = (
     "observations",
     "unknowns",
     "partitions",
+    "reference_temperature_c",
 )
 _SIGMAS = (
     "image_mm", "image_px", "control_m", "control_X_m", "control_Y_m", "control_Z_m", "station_m", "attitude_deg",
@@ -55,6 +56,8 @@ class Settings(NamedTuple):
     unknowns: Section
     partitions: tuple[str, ...]
     """Columns of images.csv that say whose further unknowns are."""
+    reference_temperature_c: float | None
+    """At which cameras with thermal rates are what they are; None: the mean of all exposures."""
 
 
 def read_settings(values: dict[str, Any], file: str = TOML, sigma_keys: Sequence[str] = ()) -> Settings:
@@ -84,6 +87,7 @@ def read_settings(values: dict[str, Any], file: str = TOML, sigma_keys: Sequence
         top.texts("observations"),
         top.section("unknowns"),
         read_partitions(top),
+        top.number("reference_temperature_c") if "reference_temperature_c" in top else None,
     )
 
 

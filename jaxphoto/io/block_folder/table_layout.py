@@ -30,7 +30,7 @@ class TableLayout(NamedTuple):
 
 
 LAYOUTS = {
-    "images": TableLayout(True, ("image", "camera"), ("strip", "time_s", *XYZ, *ANGLES)),
+    "images": TableLayout(True, ("image", "camera"), ("strip", "time_s", "temperature_c", *XYZ, *ANGLES)),
     "image_points": TableLayout(
         True,
         ("image", "point"),

@@ -109,7 +109,9 @@ def read_targets(section: Section) -> TargetPlan:
 
 def read_sigmas(top: Section, targets: tuple[TargetPlan, ...]) -> tuple[Sigmas, Sigmas]:
     """The stated sigmas, and the true ones, which are the same where [noise] does not say otherwise."""
-    keys = ("image_mm", "target_mm", "control_m", "station_m", "attitude_deg", "lidar_m")
+    keys = (
+        "image_mm", "target_mm", "control_m", "station_m", "attitude_deg", "lidar_m", "rig_place_m", "rig_turn_deg",
+    )  # fmt: skip
     said, true = top.section("sigmas"), top.section("noise")
     said.known(*keys)
     true.known(*keys)

@@ -11,14 +11,24 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jaxphoto.camera import CameraRates, InteriorOrientation, RollingShutter, constant_names, parameter_names
+from jaxphoto.camera import InteriorOrientation, RollingShutter, constant_names, parameter_names
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import Mount, StripBias
 from jaxphoto.io.block_folder.camera_section import Camera, read_camera
-from jaxphoto.io.block_folder.declared_unknowns import keys_of, read_parameters
 from jaxphoto.io.block_folder.mount_sections import read_mounts, read_strips
 from jaxphoto.io.block_folder.section import Section
 from jaxphoto.io.block_folder.settings import read_settings
+from jaxphoto.io.recipe.camera_sections import (
+    CHANGES,
+    RIG,
+    WALK,
+    flown_cameras,
+    read_changes,
+    read_rig,
+    read_temperature,
+    read_walk,
+    refuse_changes,
+)
 from jaxphoto.io.recipe.convergent_section import read_convergent
 from jaxphoto.io.recipe.flight_section import Mounted, read_flight
 from jaxphoto.io.recipe.keys import sigmas, tables
@@ -40,13 +50,12 @@ from jaxphoto.simulation import (
     FlightPlan,
     Recipe,
     SimulatedBias,
-    SimulatedRates,
     SimulatedShutter,
 )
 
 _KEYS = (
     "title", "cameras", "mounts", "strips", "datum", "truth", "flight", "convergent", "jitter", "terrain", "points",
-    "targets", "sigmas", "noise", "start", "lidar", "shutters", "camera_rates",
+    "targets", "sigmas", "noise", "start", "lidar", "shutters", "temperature", *CHANGES, WALK, RIG,
 )  # fmt: skip
 _ZERO = (0.0, 0.0, 0.0)
 
@@ -73,11 +82,12 @@ def recipe_from(values: Mapping[str, Any], file: str = "recipe.toml") -> Recipe:
     sensors = {name: camera.sensor for name, camera in settings.cameras.items()}
     mounts = _mounts(top.section("mounts"), settings.mounts, cameras)
     image_x = {n: (mounts.get(n) or mounts.get("default") or _NO_MOUNT).truth.image_x for n in cameras}
-    plan = _plan(top, {name: Mounted(sensors[name], cameras[name].truth, image_x[name]) for name in cameras})
+    flown = flown_cameras(top, tuple(cameras))
+    plan = _plan(top, {name: Mounted(sensors[name], cameras[name].truth, image_x[name]) for name in flown})
     strips = [strip.name for strip in plan.strips] if isinstance(plan, FlightPlan) else []
     points = read_points(top.section("points"), in_swaths=isinstance(plan, FlightPlan))
     targets = tuple(map(read_targets, tables(top, "targets")))
-    check_points(top, points, targets, plan.n_images)
+    check_points(top, points, targets, plan.n_images * (1 + len(top.section(RIG).values)))
     stated, noise = read_sigmas(top, targets)
     terrain = read_terrain(top.section("terrain"))
     truth = top.section("truth")
@@ -94,7 +104,10 @@ def recipe_from(values: Mapping[str, Any], file: str = "recipe.toml") -> Recipe:
         mounts=mounts,
         biases=_biases(top.section("strips"), settings.strips, strips),
         shutters=_shutters(top.section("shutters"), cameras),
-        rates=_rates(top.section(CameraRates.kind), cameras),
+        changes=read_changes(top, tuple(cameras), strips),
+        temperature=read_temperature(top),
+        walk=read_walk(top),
+        rig=read_rig(top, tuple(cameras), stated),
         datum_offset_m=tuple(truth.vector("datum_offset_m").tolist()),
         jitter=read_jitter(top.section("jitter")),
         terrain=terrain,
@@ -117,9 +130,9 @@ def _plan(top: Section, cameras: Mapping[str, Mounted]) -> FlightPlan | Converge
     if "flight" in top:
         plan, images = read_flight(top.section("flight"), cameras), "strip is flown"
     else:
-        for key, what in (("strips", "strips"), (CameraRates.kind, "times that a camera could change in")):
-            if key in top:
-                raise top.error(key, f"a convergent set has no {what}; remove the table")
+        if "strips" in top:
+            raise top.error("strips", "a convergent set has no strips; remove the table")
+        refuse_changes(top)
         plan, images = read_convergent(top.section("convergent"), list(cameras)), "image is taken"
     for name in cameras:
         if name not in plan.cameras:
@@ -188,25 +201,6 @@ def _shutters(section: Section, cameras: Iterable[str]) -> dict[str, SimulatedSh
             model=model if knows else None,
         )
     return shutters
-
-
-def _rates(section: Section, cameras: Iterable[str]) -> dict[str, SimulatedRates]:
-    """Of a table that holds nothing but a `truth` the block's model does not know."""
-    section.known("default", *cameras)
-    keys, rates = [key.start for key in keys_of(CameraRates)], {}
-    for name in cameras:
-        key = name if name in section else "default"
-        if key not in section:
-            continue
-        own = section.section(key)
-        truth, told = own.section("truth"), {word: v for word, v in own.values.items() if word != "truth"}
-        truth.known(*keys)
-        start, prior = read_parameters(CameraRates, Section(own.file, own.path, told))
-        true = {word: v for word, v in told.items() if word in keys} | dict(truth.values)
-        rates[name] = SimulatedRates(
-            read_parameters(CameraRates, Section(truth.file, truth.path, true))[0], (start, prior) if told else None
-        )
-    return rates
 
 
 def _biases(section: Section, told: Section, strips: list[str]) -> dict[str, SimulatedBias]:

@@ -197,6 +197,7 @@ def bare(block: Block) -> Block:
         image_strip=("",) * n,
         image_time=np.zeros(n),
         flight_time=None,
+        temperatures=None,
         partitions={},
         control=ControlRows.none(),
         fixed=ControlRows.none(),

@@ -1,0 +1,86 @@
+"""A camera that wanders during a flight: principal distance and principal point as cubic B-splines of time.
+
+With n knots h apart, the middle of them in the middle of the flight, an exposure at time t from there sees through
+
+    c + sum over k of c_k B(t / h - (k - (n + 1) / 2)),    k = 1 ... n
+
+and likewise x_p and y_p, where B is the cubic B-spline of unit steps:
+
+    B(d) = (4 - 6 d^2 + 3 |d|^3) / 6  for |d| < 1,    (2 - |d|)^3 / 6  for 1 <= |d| < 2,    0 beyond
+
+Before the first whole interval and after the last, n - 3 of them, the camera is as at their ends. What holds the
+coefficients together is a random walk of q (mm^2/h) that begins at nothing in the middle of the flight and goes both
+ways: coefficients at times s and t on one side have the covariance q min(|s|, |t|), those on two sides none. So the
+interior orientation beside the spline is that of the middle of the flight, but for sqrt(q h) / 2.
+Sources: de Boor (1978), A practical guide to splines; Gelb (1974), Applied optimal estimation.
+"""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxphoto.arrays import Numbers
+from jaxphoto.camera.camera_rates import HOUR_S
+from jaxphoto.parameters import AbstractParameters, dynamic_fields
+
+MOST = 100
+"""Knots of a camera; each is a parameter of all its images."""
+
+
+class CameraSpline(AbstractParameters):
+    """Coefficients of what one camera has more than its interior orientation: of c, x_p and y_p (mm).
+
+    `knots` is an even number of them, 4 or more, `interval_s` the time from one to the next.
+    """
+
+    kind = "camera_splines"
+    owner = "camera"
+    names = {"c_spline": ("c_mm",), "xp_spline": ("xp_mm",), "yp_spline": ("yp_mm",)}  # noqa: RUF012
+    bends = ("c", "x_p", "y_p")
+    sized = "knots"
+
+    c_spline: Float[Array, "knots *images"]
+    xp_spline: Float[Array, "knots *images"]
+    yp_spline: Float[Array, "knots *images"]
+    knots: int = eqx.field(static=True, default=6)
+    interval_s: float = eqx.field(static=True, default=600.0)
+
+    def __check_init__(self) -> None:
+        if type(self.knots) is not int or self.knots % 2 or not 4 <= self.knots <= MOST:
+            raise ValueError(f"knots = {self.knots!r} is not an even number from 4 to {MOST}")
+        if type(self.interval_s) not in (int, float) or not 0 < self.interval_s < np.inf:
+            raise ValueError(f"interval_s = {self.interval_s!r} is no positive number of seconds")
+
+    def labels(self, owner: str) -> tuple[str, ...]:
+        """Such as `camera_splines[kodak].c_3_mm`."""
+        ends = [self.names[field][0].split("_") for field in dynamic_fields(type(self))]
+        return tuple(f"{self.kind}[{owner}].{name}_{k + 1}_{unit}" for name, unit in ends for k in range(self.knots))
+
+    def interior(self, interior: Any, exposure: Any) -> Any:
+        """The interior orientation at the exposure."""
+        weights = self.weights(exposure.in_flight)
+        c, x_p, y_p = (jnp.sum(weights * v) for v in (self.c_spline, self.xp_spline, self.yp_spline))
+        return dataclasses.replace(interior, c=interior.c + c, x_p=interior.x_p + x_p, y_p=interior.y_p + y_p)
+
+    def weights(self, time: Numbers | float) -> Float[Numbers, "knots"]:
+        """By how much each knot counts at a time from the middle of the flight (s)."""
+        end = (self.knots - 3) / 2
+        d = jnp.abs(jnp.clip(time / self.interval_s, -end, end) - self.times / self.interval_s)
+        near, far = (4 - 6 * d**2 + 3 * d**3) / 6, jnp.maximum(2 - d, 0.0) ** 3 / 6
+        return jnp.where(d < 1, near, far)
+
+    @property
+    def times(self) -> Float[np.ndarray, "knots"]:
+        """Where each knot counts most, from the middle of the flight (s)."""
+        return (np.arange(self.knots) - (self.knots - 1) / 2) * self.interval_s
+
+    @property
+    def walk(self) -> Float[np.ndarray, "knots knots"]:
+        """The covariance of the coefficients of a camera that wanders by 1 mm in an hour (mm^2)."""
+        hours = self.times / HOUR_S
+        least = np.minimum(np.abs(hours)[:, None], np.abs(hours))
+        return np.where(np.sign(hours)[:, None] == np.sign(hours), least, 0.0)

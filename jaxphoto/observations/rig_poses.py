@@ -1,0 +1,69 @@
+"""Cameras of a rig sit still: what each exposure says of it, to what the rig bends by (`georeferencing.RigCamera`).
+
+A row is a photograph and that of the reference camera of the same event. The poses of both are unknown, and the place
+of the camera in the rig may be: so a rig without GNSS and IMU holds its photographs together, and one with a trajectory
+of its reference needs none of the others.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxphoto.arrays import Numbers
+from jaxphoto.errors import BlockError
+from jaxphoto.georeferencing import RigCamera, rig_place, turn_off
+from jaxphoto.observations.base import AXES, AbstractObservations, ImageState, touching
+
+
+class AbstractRigRows(AbstractObservations):
+    """What a photograph is off its place in the rig by: nothing, to `sigma`."""
+
+    observed = "off"
+    columns = {"off": ()}  # noqa: RUF012
+
+    reference: Int[np.ndarray, "n"] = touching("image")
+    image: Int[np.ndarray, "n"] = touching("image")
+    off: Float[Numbers, "n 3"]
+    sigma: Float[Numbers, "n 3"]
+
+    def flaws(self) -> Iterator[tuple[int, str]]:
+        """A photograph beside itself."""
+        for row in np.flatnonzero(self.reference == self.image):
+            yield int(row), "the image is its own reference; name that of the reference camera of the same event"
+
+
+class RigPlaces(AbstractRigRows):
+    """Places of cameras in their rigs (m), in the axes of the reference camera."""
+
+    group = "rig_places"
+    unit = "m"
+    axes = tuple(axis.lower() for axis in AXES)
+
+    def residual(self, reference: ImageState, image: ImageState) -> Float[Numbers, "3"]:
+        """Observed minus computed (m)."""
+        seen = rig_place(reference.position, reference.camera_from_object, image.position)
+        return self.off - (seen - _camera_of(image).place)
+
+
+class RigTurns(AbstractRigRows):
+    """Turns of cameras in their rigs (rad), about the axes of the camera."""
+
+    group = "rig_turns"
+    unit = "rad"
+    rigid = True
+    axes = ("rx", "ry", "rz")
+
+    def residual(self, reference: ImageState, image: ImageState) -> Float[Numbers, "3"]:
+        """Observed minus computed (rad)."""
+        turn = _camera_of(image).turn
+        return self.off - turn_off(reference.camera_from_object, image.camera_from_object, turn)
+
+
+def _camera_of(image: ImageState) -> RigCamera:
+    if RigCamera.kind not in image.parameters:
+        raise BlockError(
+            f"there are rows of a rig, but the block knows of no camera in one: give [unknowns.{RigCamera.kind}.CAMERA]"
+        )
+    found: RigCamera = image.parameters[RigCamera.kind]
+    return found

@@ -1,0 +1,72 @@
+"""Photographs of one event as those of a rig: which belong together, and where its cameras are, roughly."""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxphoto.arrays import on_device, still
+from jaxphoto.block import Block
+from jaxphoto.errors import InputError
+from jaxphoto.georeferencing import RigCamera, rig_turn
+from jaxphoto.observations import RigPlaces, RigTurns
+from jaxphoto.unknowns import FREE
+
+EVENT = "event"
+"""The partition of the block that says which photographs were exposed together."""
+
+
+def with_rig(block: Block, reference: str, place_m: float, turn_rad: float) -> Block:
+    """The block with its cameras in a rig beside the camera `reference`.
+
+    `Block.partitions["event"]` (a column of images.csv) says which photographs belong together. The rig is rigid to
+    `place_m` and `turn_rad` from one event to the next. Relative orientations start at the medians of those of the
+    approximate orientations, and are free: `block.fix("place")`, `block.weigh("place", 0.005)`.
+
+    Raises InputError where nothing says what belongs together, or none of it is of the camera `reference`.
+    """
+    if EVENT not in block.partitions:
+        raise InputError(
+            f"the block has no partition {EVENT}; add the column {EVENT} to images.csv, and to the top of block.toml "
+            f'partitions = ["{EVENT}"]'
+        )
+    cameras, events = np.array(block.image_camera), np.array(block.partitions[EVENT])
+    own = np.flatnonzero((cameras == reference) & (events != ""))
+    if not len(own):
+        raise InputError(f"no image of camera {reference} is in an event, so no rig has it; name another camera")
+    first = {event: int(i) for i, event in zip(own[::-1], events[own[::-1]], strict=True)}
+    image = np.array([i for i, event in enumerate(events) if cameras[i] != reference and event in first], int)
+    at = np.array([first[event] for event in events[image]], int)
+    none, each = np.zeros((len(image), 3)), np.ones((len(image), 3))
+    rows = RigPlaces(at, image, none, place_m * each), RigTurns(at, image, none, turn_rad * each)
+    known = block.start.image_known[at] & block.start.image_known[image]
+    start: dict[str, Any] = {}
+    for camera in dict.fromkeys(cameras[image].tolist()):
+        mine = (cameras[image] == camera) & known
+        start[camera] = RigCamera(*map(on_device, _middle(block, at[mine], image[mine])))
+    free: Any = {camera: RigCamera(FREE, FREE) for camera in start}  # type: ignore[arg-type]
+    unknowns = dataclasses.replace(block.start.unknowns, more=block.start.unknowns.more | {RigCamera.kind: start})
+    return dataclasses.replace(
+        block,
+        more=(*block.more, *rows),
+        start=dataclasses.replace(block.start, unknowns=unknowns),
+        priors=dataclasses.replace(block.priors, more=block.priors.more | {RigCamera.kind: free}),
+    )
+
+
+def _middle(
+    block: Block, reference: Int[np.ndarray, "n"], image: Int[np.ndarray, "n"]
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    """The median place (m) and turn (rad) of images beside those of their reference, as they start; none of no images.
+
+    Turns are median matrices made orthogonal again: rotation vectors of half a turn may have either sign.
+    """
+    if not len(image):
+        return np.zeros(3), np.zeros(3)
+    exterior = block.start.unknowns.exterior
+    position, rotation = still(exterior.position), still(exterior.camera_from_object)
+    place = np.einsum("nij,nj->ni", rotation[reference], position[image] - position[reference])
+    u, _, v = np.linalg.svd(np.median(rotation[image] @ rotation[reference].transpose(0, 2, 1), axis=0))
+    turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ v)]) @ v
+    return np.median(place, axis=0), np.asarray(rig_turn(np.eye(3), turn))  # type: ignore[arg-type]

@@ -1,0 +1,52 @@
+"""Observations of further kinds measured anew: what their own residual says of the truth, and fresh noise."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PRNGKeyArray
+
+from jaxphoto.block import Block, exposures
+from jaxphoto.observations import AbstractObservations, Correlated, ImageState, KnownParameters
+from jaxphoto.unknowns import Unknowns
+
+Rows = AbstractObservations | KnownParameters
+
+
+def observed_anew(rows: Rows, block: Block, truth: Unknowns, key: PRNGKeyArray) -> Rows:
+    """The rows with what they would observe under `truth`, plus normal noise of their sigmas.
+
+    Those that covariances join, and those that touch what `truth` does not have, stay as they are.
+    """
+    if isinstance(rows, Correlated | KnownParameters) or rows.also or rows.through_camera or not len(rows):
+        return rows
+    missing = {what for what, _ in rows.indices()} - {"image", "point", *truth.tables}
+    if missing:
+        return rows
+    touched = [_touched(what, np.asarray(index), block, truth) for what, index in rows.indices()]
+    residual = jax.vmap(lambda row, of: row.residual(*of))(rows, touched)
+    noise = jnp.asarray(rows.sigmas) * jax.random.normal(key, np.shape(rows.sigmas))
+    return rows.with_observation(jnp.asarray(rows.observation) - residual + noise)
+
+
+def _touched(what: str, index: np.ndarray, block: Block, truth: Unknowns) -> Any:
+    if what == "point":
+        return jnp.asarray(truth.points)[index]
+    if what != "image":
+        return jax.tree.map(lambda *v: jnp.stack(v)[index], *map(_numbers, truth.tables[what].values()))
+    exterior, taken, own = truth.exterior, jax.tree.map(lambda v: jnp.asarray(v)[index], exposures(block)), {}
+    for kind, owners in truth.tables.items():
+        if not owners:
+            continue
+        table = jax.tree.map(lambda *v: jnp.stack([*v, jnp.zeros_like(v[0])]), *map(_numbers, owners.values()))
+        place = {name: k for k, name in enumerate(owners)}
+        names = block.owners(type(next(iter(owners.values()))).owner)
+        at = np.array([place.get(name, len(place)) for name in names])[index]
+        own[kind] = jax.tree.map(lambda v: v[at], table)  # noqa: B023
+    position, rotation = (jnp.asarray(v)[index] for v in (exterior.position, exterior.camera_from_object))
+    return ImageState(position, rotation, taken, own)
+
+
+def _numbers(parameters: Any) -> Any:
+    return jax.tree.map(lambda v: jnp.asarray(v, float), parameters)
