@@ -3,6 +3,7 @@
 from jaxphoto.report.block_in_space import block_in_space
 from jaxphoto.report.block_plot import layout_figure, plot_block
 from jaxphoto.report.boresight import print_boresight, write_boresight
+from jaxphoto.report.cubes import correlation_cube, covariance_array, draws_cube
 from jaxphoto.report.figures import (
     plot_check_points,
     plot_density,
@@ -45,7 +46,10 @@ __all__ = [
     "check_table_format",
     "component_findings",
     "component_tables",
+    "correlation_cube",
     "correlation_figure",
+    "covariance_array",
+    "draws_cube",
     "layout_figure",
     "left_out_table",
     "mean_residuals_figure",

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 _PICTURES = {"interior": "Estimates over the draws", "effects": "Which error is behind which estimate"}
 # Rows of the page's table that are of images and points: their number has no end.
 _LONG = ("exterior.", "point.", "check.")
-_EXTERIOR = ("X_m", "Y_m", "Z_m", "omega_rad", "phi_rad", "kappa_rad")
+EXTERIOR = ("X_m", "Y_m", "Z_m", "omega_rad", "phi_rad", "kappa_rad")
 _QUANTILES = {"q025": 0.025, "q50": 0.5, "q975": 0.975}
 # Histograms of a picture.
 _SHOWN = 12
@@ -47,7 +47,7 @@ def draws_table(draws: Draws, adjusted: Adjustment, first: int = 0) -> pd.DataFr
     columns |= {f"bias.{name}": v for name, v in draws.recorded.items()}
     columns |= dict(zip(map(_in_radians, draws.labels), draws.shared.T, strict=True))
     if draws.exterior is not None:
-        names = [f"exterior.{image}.{name}" for image in block.images for name in _EXTERIOR]
+        names = [f"exterior.{image}.{name}" for image in block.images for name in EXTERIOR]
         columns |= dict(zip(names, draws.exterior.reshape(len(draws.steps), -1).T, strict=True))
     if draws.points is not None:
         names = [f"point.{point}.{axis}_m" for point in block.points for axis in AXES]
