@@ -39,7 +39,7 @@ EOP = [*XYZ, "omega_deg", "phi_deg", "kappa_deg"]
 COLUMNS = {
     "interior": ["camera", "parameter", "value", "sigma", "significant"],
     "exterior": ["image", *EOP, *(f"sigma_{n}" for n in EOP)],
-    "object_points": ["point", *XYZ, *(f"sigma_{n}" for n in XYZ), "n_images"],
+    "object_points": ["point", *XYZ, *(f"sigma_{n}" for n in XYZ), "n_images", "angle_deg"],
     "residuals": [
         "group",
         "image",

@@ -18,6 +18,7 @@ from jaxphoto.report.error_ellipses import ellipses_figure
 from jaxphoto.report.findings import Verdict
 from jaxphoto.report.made import PROVENANCE, Made, made_section
 from jaxphoto.report.maps import png_of
+from jaxphoto.report.object_points import points_section
 from jaxphoto.report.page_head import page_head
 from jaxphoto.report.plots import (
     check_points_figure,
@@ -30,6 +31,7 @@ from jaxphoto.report.recovery import recovery_spread
 from jaxphoto.report.sigma_map import sigma_map_figure, sigma_map_words
 from jaxphoto.report.tables import Tables
 from jaxphoto.statistics import LEAST_CHECKED
+from jaxphoto.statistics.format_coverage import format_coverage
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -104,6 +106,8 @@ def _sections(tables: Tables) -> Iterator[tuple[str, list[Markup]]]:
         yield "Mounts and strips", [_html(tables.georeferencing)]
     yield "Block", [html_of(BlockInSpace(tables))]
     yield "Residuals", _residuals(tables)
+    _, *points = points_section(tables)
+    yield "Object points", [html_of(element) for element in points]
     if len(check):
         accuracy = [_said(s) for s in accuracy_sentences(tables.tested_accuracy)]
         picture = _picture(check_points_figure({"": tables}), "discrepancies at check points")
@@ -121,7 +125,19 @@ def _interior(tables: Tables) -> list[Markup]:
     alt = "correlations of the interior orientation with itself and with the exterior one"
     used = [c for c, corr in tables.correlations.items() if corr.parameters and corr.images]
     pictures = [_wide(_picture(correlation_figure(tables, c), alt)) for c in used]
-    return [_html(table[table["sigma"].notna() | (table["value"] != 0)]), *pictures]
+    reach = [_said(_reach(tables, camera)) for camera in tables.adjusted.unknowns.interior]
+    return [_html(table[table["sigma"].notna() | (table["value"] != 0)]), *reach, *pictures]
+
+
+def _reach(tables: Tables, camera: str) -> str:
+    found = format_coverage(tables.adjusted, camera)
+    if not len(found.images):
+        return f"No image point is of {camera_words(camera)}."
+    return (
+        f"Image points of {camera_words(camera)} reach {found.whole:.0%} of its format, those of an image "
+        f"{np.median(found.images):.0%} (median; {found.images.min():.0%} at least): beyond, the distortion is "
+        "an extrapolation."
+    )
 
 
 def _sigma_maps(tables: Tables) -> Iterator[Markup]:

@@ -51,6 +51,7 @@ from jaxphoto.statistics import (
     trends,
     undetected_effects,
 )
+from jaxphoto.statistics.intersection_angles import intersection_angles
 from jaxphoto.statistics.sigma_map import SigmaMap, sigma_maps
 
 
@@ -221,12 +222,13 @@ class Tables:
 
     @cached_property
     def object_points(self) -> pd.DataFrame:
-        """point, coordinates, sigmas, and in how many images it was measured."""
+        """point, coordinates, sigmas, in how many images it was measured, the largest angle between two of its rays."""
         names = [f"{a}_m" for a in AXES]
         values = np.hstack([np.asarray(self.adjusted.unknowns.points), np.asarray(self.covariance.point_sigma)])
         table = pd.DataFrame(values, columns=[*names, *(f"sigma_{n}" for n in names)])
         table.insert(0, "point", self.adjusted.block.points)
         table["n_images"] = np.bincount(self.adjusted.structure.point, minlength=len(table))
+        table["angle_deg"] = np.degrees(intersection_angles(self.adjusted))
         return table
 
     @cached_property

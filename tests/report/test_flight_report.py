@@ -19,7 +19,6 @@ from jaxphoto.report.flight.camera import interior_rows
 from jaxphoto.report.flight.links import draw_network, strength_classes, thinned
 from jaxphoto.report.flight.page import flight_page, summary_section
 from jaxphoto.report.flight.photographs import exterior_section
-from jaxphoto.report.flight.points import point_table
 from jaxphoto.report.flight.positions import draw_plan, in_order, offset_statistics, positions_section
 from jaxphoto.report.flight.provenance import provenance_section
 from jaxphoto.report.flight.surveyed import axis_cell
@@ -149,7 +148,7 @@ def test_density_counts_every_image_point():
 
 
 def test_points_of_more_rays_are_surer():
-    table = point_table(part_report())
+    table = part_report().tables.object_points
     few, many = (table[table["n_images"] <= 3], table[table["n_images"] >= 5])
     assert few["sigma_Z_m"].median() > many["sigma_Z_m"].median()
     assert few["angle_deg"].median() < many["angle_deg"].median()

@@ -15,13 +15,13 @@ from jaxphoto.report.flight.links import links_section
 from jaxphoto.report.flight.oriented import orientation_section, weights_section
 from jaxphoto.report.flight.part import PartReport
 from jaxphoto.report.flight.photographs import exterior_section, lost_section, photographs_section
-from jaxphoto.report.flight.points import points_section
 from jaxphoto.report.flight.positions import in_order, offset_rows, offset_statistics, positions_section
 from jaxphoto.report.flight.provenance import provenance_section
 from jaxphoto.report.flight.residuals import residuals_section
 from jaxphoto.report.flight.source import FlightSource
 from jaxphoto.report.flight.surveyed import surveyed_elements, surveyed_section
 from jaxphoto.report.flight.time_line import time_section
+from jaxphoto.report.object_points import points_section
 from jaxphoto.report.orientation import orientation_sentences
 from jaxphoto.report.page_head import page_head
 from jaxphoto.report.positional_accuracy import class_sentences
@@ -84,7 +84,7 @@ def _elements(
     yield from camera_section(first, source)
     yield from residuals_section(first)
     yield from links_section(first)
-    yield from points_section(first)
+    yield from points_section(first.tables, first.unit)
     yield from exterior_section(first)
     yield from time_section(first, source.taken)
     yield from weights_section(first)

@@ -10,8 +10,7 @@ import numpy as np
 import pandas as pd
 
 from jaxphoto.report.document import DocumentPicture, Element, Heading, Paragraph, Pictures, Rows
-from jaxphoto.report.flight.part import PartReport
-from jaxphoto.statistics.intersection_angles import intersection_angles
+from jaxphoto.report.tables import Tables
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -22,11 +21,15 @@ _FROM = (2, 3, 4, 6, 11, 21)
 _SMALL_DEG = 2.0
 
 
-def points_section(report: PartReport) -> Iterator[Element]:
-    """Rays, angles and standard deviations, as a table and pictures."""
+def points_section(tables: Tables, unit: str = "m") -> Iterator[Element]:
+    """Rays, angles and standard deviations of the points that images measured, as a table and pictures."""
     yield Heading("Object points")
-    table = point_table(report)
-    unit, angle = report.unit, table["angle_deg"]
+    table = tables.object_points
+    table = table[table["n_images"] > 0]
+    if table.empty:
+        yield Paragraph("No image measured a point.")
+        return
+    angle = table["angle_deg"]
     rows = []
     for low, high in zip(_FROM, (*_FROM[1:], np.inf), strict=True):
         of = table[(table["n_images"] >= low) & (table["n_images"] < high)]
@@ -50,12 +53,6 @@ def points_section(report: PartReport) -> Iterator[Element]:
             ),
         )
     )
-
-
-def point_table(report: PartReport) -> pd.DataFrame:
-    """`Tables.object_points` of measured points with `angle_deg`, the largest between two rays."""
-    table = report.tables.object_points.assign(angle_deg=np.degrees(intersection_angles(report.part.adjusted)))
-    return table[table["n_images"] > 0]
 
 
 def _row(of: pd.DataFrame, n: int) -> tuple[str, ...]:
