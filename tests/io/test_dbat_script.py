@@ -1,4 +1,4 @@
-"""Cameras of DBAT's scripts: its lens models by their own equations, written down independently, and their refusals."""
+"""DBAT's scripts: lens models by their own equations, cameras from a file, prior orientations, and refusals."""
 
 import numpy as np
 import pytest
@@ -69,3 +69,62 @@ def test_the_principal_point_of_model_5_is_that_of_model_3_in_the_reports_of_dba
 def test_a_lens_model_that_has_no_equal_is_refused(tmp_path, model, aspect, estimated, message):
     with pytest.raises(InputError, match=message):
         read_dbat(script(tmp_path, model, aspect, estimated))
+
+
+def eo_script(folder, form="id,x,y,z,omega,phi,kappa", units="gon", rows="2,1.5,2.5,9,10,-20,100\n1,1,2,8,5,0,50\n"):
+    """With the camera in a file of its own, and <prior_eo>."""
+    script(folder, 3)
+    text = (folder / "a.xml").read_text()
+    camera = text[text.index("<cameras>") : text.index("</cameras>") + len("</cameras>")]
+    (folder / "camera.txt").write_text(f'<document dbat_camera_version="1.0">{camera}</document>')
+    (folder / "eo.txt").write_text(rows)
+    prior = f'<prior_eo><file format="{form}" units="{units}">eo.txt</file></prior_eo>'
+    (folder / "a.xml").write_text(text.replace(camera, prior + "<cameras><file>camera.txt</file></cameras>"))
+    return folder
+
+
+def test_a_camera_in_a_file_is_that_of_the_script(tmp_path):
+    (tmp_path / "one").mkdir()
+    (tmp_path / "two").mkdir()
+    one, two = read_dbat(script(tmp_path / "one", 3)), read_dbat(eo_script(tmp_path / "two"))
+    assert one.settings["cameras"] == two.settings["cameras"]
+
+
+def test_prior_orientations_are_where_images_start(tmp_path):
+    images = read_dbat(eo_script(tmp_path)).tables["images"]
+    assert images.text("image").tolist() == ["one", "two"]
+    names = ("X_m", "Y_m", "Z_m", "omega_deg", "phi_deg", "kappa_deg")
+    found = np.stack([images.numbers(name) for name in names], axis=1)
+    np.testing.assert_allclose(found, [(1, 2, 8, 4.5, 0, 45), (1.5, 2.5, 9, 9, -18, 90)], rtol=0, atol=1e-12)
+
+
+def test_prior_positions_with_standard_deviations_are_stations(tmp_path):
+    tables = read_dbat(eo_script(tmp_path, "id,x,y,z,sxyz", "", "2,1.5,2.5,9,0.05\n")).tables
+    assert "X_m" not in tables["images"] and tables["stations"].ids("image").tolist() == ["two"]
+    assert [tables["stations"].numbers(name)[0] for name in ("Z_m", "sigma_X_m", "sigma_Z_m")] == [9, 0.05, 0.05]
+
+
+def test_a_dependent_datum_is_a_minimal_one(tmp_path):
+    path = script(tmp_path, 3) / "a.xml"
+    datum = '<operation><set_datum ref_cam="1" ref_base="longest">depend</set_datum></operation></operations>'
+    path.write_text(path.read_text().replace("</operations>", datum))
+    assert read_dbat(tmp_path).settings["datum"] == {"kind": "minimal"}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"units": "turns"}, "the units 'turns' of <prior_eo> are unknown; use one of degrees, radian, gon"),
+        ({"form": "id,x,y,z,omega,phi,skappa"}, "the column 'skappa', which is not read"),
+        ({"rows": "7,1,2,8,5,0,50\n"}, r"eo.txt, row 1: image 7 is not in images.txt"),
+    ],
+)
+def test_prior_orientations_that_cannot_be_are_refused(tmp_path, change, message):
+    with pytest.raises(InputError, match=message):
+        read_dbat(eo_script(tmp_path, **change))
+
+
+def test_a_camera_file_without_camera_is_refused(tmp_path):
+    (eo_script(tmp_path) / "camera.txt").write_text("<document/>")
+    with pytest.raises(InputError, match=r"camera.txt has no <cameras><camera>; name a camera file of DBAT"):
+        read_dbat(tmp_path)
