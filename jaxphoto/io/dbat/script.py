@@ -65,6 +65,18 @@ def open_script(path: Path) -> Script:
         raise InputError(f"{path.name}: {error}; correct the XML there") from None
 
 
+def include_cameras(script: Script) -> None:
+    """Put the cameras of the files that <cameras> names in place of these."""
+    cameras = script.find("input/cameras")
+    for element in cameras.findall("file"):
+        path = script.file(element)
+        found = open_script(path).root.findall("cameras/camera")
+        if not found:
+            raise script.error(f"{path.name} has no <cameras><camera>; name a camera file of DBAT")
+        cameras.remove(element)
+        cameras.extend(found)
+
+
 def setting(script: Script, operation: str, key: str) -> str:
     """What an operation says of `key` as a whole: its text or its <all>."""
     element = script.root.find(f"operations/operation/{operation}/{key}")

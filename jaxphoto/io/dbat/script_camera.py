@@ -2,7 +2,9 @@
 
 DBAT counts pixels from (1, 1) at the centre of the upper left one, we from (0.5, 0.5); its principal point is in mm
 from pixel (0, 0); it *adds* K, P and the aspect `as` to the measured coordinate where our Brown model subtracts,
-so all of them change sign. Its model 3 applies 1 + as before the polynomial: `affine_brown` with b1 = -as.
+so all of them change sign. Its model 3 applies 1 + as before the polynomial: `affine_brown` with b1 = -as; <aspect> is
+1 - as. Models 1 and 2 have neither aspect nor skew. Model 5 applies 1 + as before the principal point is taken off,
+which divides px by it, and skew after the polynomial, as nothing here does. Model 4 applies both after it.
 """
 
 from typing import Any
@@ -12,7 +14,8 @@ from jaxphoto.io.dbat.script import Script, setting
 from jaxphoto.io.text_tables import finite
 
 # Lens models of DBAT that agree with Brown's here up to sign ("Backward (Photogrammetry)").
-_MODELS = ("1", "3")
+_MODELS = ("1", "2", "3", "5")
+_WITHOUT_AFFINITY = ("1", "2")
 
 
 def camera_settings(script: Script) -> dict[str, Any]:
@@ -38,12 +41,22 @@ def camera_settings(script: Script) -> dict[str, Any]:
             interior["xp_mm"] = px - pixel * (width / 2 + 0.5)
             interior["yp_mm"] = -(py - pixel * (height / 2 + 0.5))
         interior |= _coefficients(script, f"{c}/K", "k", 3) | _coefficients(script, f"{c}/P", "p", 2)
-        interior["b1"] = 1.0 - script.numbers(f"{c}/aspect", "1")[0]
+        interior["b1"] = script.numbers(f"{c}/aspect", "1")[0] - 1.0
         if script.numbers(f"{c}/skew", "0")[0] != 0:
             raise script.error("a <skew> other than 0 cannot be read; set it to 0")
+    unknowns = _free(script, c)
+    if model in _WITHOUT_AFFINITY:
+        if interior["b1"] != 0 or {"b1", "b2"} & set(unknowns):
+            raise script.error(f"lens model {model} has neither aspect nor skew; set aspect to 1 and estimate none")
+    elif model == "5":
+        if "b2" in unknowns:
+            raise script.error("the skew of lens model 5 has no equal here; do not estimate it, or use model 3")
+        if interior["xp_mm"] != 0:
+            middle = pixel * (width / 2 + 0.5)
+            interior["xp_mm"] = (interior["xp_mm"] + middle) / (1.0 - interior["b1"]) - middle
     return {
         "width_px": width, "height_px": height, "pixel_mm": pixel, "distortion": "affine_brown", "interior": interior,
-        "unknowns": _free(script, c),
+        "unknowns": unknowns,
     }  # fmt: skip
 
 
