@@ -97,8 +97,9 @@ def flights(case: str, n: int, first: int) -> Iterator[dict]:
                 pairs = zip(own.labels(name), numbers_of(found.unknowns.more[kind][name]), numbers_of(own), strict=True)
                 row |= {label: float((v - t) / sigma[label]) for label, v, t in pairs if label in sigma}
         tests = [d.change for d in camera_drifts(found, cov)] + [w.more for w in camera_wanderings(found, cov)]
-        strips = strip_differences(found, cov)
-        yield row | {"p_value": (tests + [strips.more] * (strips is not None))[0].p_value}
+        if (strips := strip_differences(found, cov)) is not None:
+            tests.append(strips.more)
+        yield row | {"p_value": tests[0].p_value}
 
 
 def told(case: str, rows: list[dict]) -> None:

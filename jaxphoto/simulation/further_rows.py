@@ -45,7 +45,11 @@ def _touched(what: str, index: np.ndarray, block: Block, truth: Unknowns) -> Any
         at = np.array([place.get(name, len(place)) for name in names])[index]
         own[kind] = jax.tree.map(lambda v: v[at], table)  # noqa: B023
     position, rotation = (jnp.asarray(v)[index] for v in (exterior.position, exterior.camera_from_object))
-    return ImageState(position, rotation, taken, own)
+    states = ImageState
+    # One image each: a state is declared as that of one.
+    for _ in range(index.ndim):
+        states = jax.vmap(states)
+    return states(position, rotation, taken, own)
 
 
 def _numbers(parameters: Any) -> Any:

@@ -137,13 +137,16 @@ def test_a_photograph_of_a_camera_outside_the_rig_is_refused():
         adjust(dataclasses.replace(block, more=(places,)))
 
 
+def test_a_rig_of_which_nobody_says_how_rigid_it_is_is_refused():
+    unsaid = {key: value for key, value in RIG.items() if not key.startswith("sigmas")}
+    with pytest.raises(InputError, match=r"\[sigmas\]: nothing says how rigid the rig is; add rig_place_m"):
+        recipe_from(changed(unsaid))
+
+
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        (
-            {"sigmas.rig_turn_deg": None},
-            r"\[sigmas\]: nothing says how rigid the rig is; add rig_place_m",
-        ),
+        ({"sigmas.rig_turn_deg": 0.0}, r"\[sigmas\] rig_turn_deg: 0\.0 is not positive"),
         ({"cameras.third": OBLIQUE}, r"\[rig_cameras\]: all cameras but one sit in a rig beside that one"),
         ({"rig_cameras.oblique.turn_deg": [1.0]}, r"turn_deg: \[1\.0\] is not a list of three numbers"),
     ],
