@@ -23,8 +23,8 @@ from tests.blocks import FIELDS, VARIANTS, adjusted, covariance_of, simulated
 from tests.marks import slow_but
 
 # Each shape of block is compiled for itself: what one camera, two, and a mount without more would show, the others
-# do. The other kinds (surfaces of a lidar, fixed control, free shifts, ...) are slow only by what compiling takes; all of
-# them together are in `tests.test_declared`.
+# do. The other kinds (surfaces of a lidar, fixed control, free shifts, ...) are slow only by what compiling takes; all
+# of them together are in `tests.test_declared`.
 QUICK = ("inner", "inner_images", "inner_some", "minimal")
 KINDS = slow_but(QUICK, [name for name in VARIANTS if name not in ("cross", "two_cameras", "mount")])
 KINDS += slow_but((), FIELDS)
