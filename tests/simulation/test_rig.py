@@ -24,6 +24,8 @@ TRUE_TURN, TRUE_PLACE = [10.1, -25.1, 80.2], [0.52, 0.08, -0.06]
 OBLIQUE = SMALL["cameras"]["kodak"] | {"interior": {"c_mm": 40.0}, "truth": {"c_mm": 40.05}}
 RIG = {
     "cameras.oblique": OBLIQUE,
+    # What is held is true.
+    "cameras.kodak.truth": {"c_mm": 34.05},
     "rig_cameras": {"oblique": {
         "turn_deg": TURN, "turn": "free", "place_m": PLACE, "place": {"sigma_m": 0.03},
         "truth": {"turn_deg": TRUE_TURN, "place_m": TRUE_PLACE},
