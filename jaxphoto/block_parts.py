@@ -4,6 +4,7 @@ import dataclasses
 from typing import Literal
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -39,14 +40,14 @@ class Temperatures(eqx.Module):
     """Of the camera at each exposure, for `camera.ThermalRates`."""
 
     celsius: Float[Numbers, "images"]
-    """The reference where it is not known."""
+    """NaN where it is not known: there the interior orientation is taken to be that of the reference."""
     reference_c: float = eqx.field(static=True)
     """At which the interior orientation holds."""
 
     @property
     def above(self) -> Float[Numbers, "images"]:
         """Kelvins above the reference."""
-        return self.celsius - self.reference_c
+        return jnp.where(jnp.isnan(self.celsius), 0.0, self.celsius - self.reference_c)
 
 
 @dataclasses.dataclass(frozen=True)

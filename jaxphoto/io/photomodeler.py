@@ -4,16 +4,19 @@
     of every photograph six lines with its number: name; X Y Z kappa phi omega; their sigmas; covariances or nothing;
         its camera; its sigmas
     an empty line, then of each control point, object point and mark in turn, an empty line after each kind:
-        id X Y Z and sigmas; the same; photograph id x y and sigmas (pixels, counted as DBAT does, see dbat.py)
+        id X Y Z and sigmas; the same; photograph id x y and sigmas (pixels, counted as by DBAT,
+            see dbat/script_camera.py)
 
 K and P are added to a coordinate that is reduced to the principal point, where our Brown model subtracts: all change
-sign. px and py are from the upper left corner, y down. The angles are those of docs/conventions.md in degrees.
-Control is read from `ctrlpts-weighted.txt`, camera stations from `fake-camera-positions.txt`, in the same folder. The
-orientations and object points are in a frame of their own, and read only where there is no such control.
+sign. px and py count from pixel (0, 0), as DBAT takes them, half a pixel outside the upper left corner; y down. The
+angles are those of docs/conventions.md in degrees. Control is read from `ctrlpts-weighted.txt`, camera stations from
+`fake-camera-positions.txt`, in the same folder. The orientations and object points are in a frame of their own, and
+read only where there is no such control.
 Sources: PhotoModeler's help, "Lens Distortion Formulation" and "Decentering lens distortion"; exports that come with
 DBAT.
 """
 
+import warnings
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -100,6 +103,13 @@ def read_photomodeler(source: Path) -> BlockTables:
         tables["object_points"] = Table(path.name, {"point": points.ids("point")} | names, points.files, points.rows)
         found = [name for name, value in camera["interior"].items() if value != 0 and name not in _KEPT]
         camera["unknowns"] = _KEPT | dict.fromkeys(found, "free")
+        if 0 < len(control) < _LEAST:
+            warnings.warn(
+                f"{path.name}: {len(control)} control points are too few for a datum, and are not used; the block is a "
+                "free network",
+                UserWarning,
+                stacklevel=2,
+            )
         if len(control) < _LEAST:
             settings["datum"] = {"kind": "inner", "over": "points"}
         else:

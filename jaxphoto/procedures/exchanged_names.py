@@ -102,9 +102,9 @@ def points_that_meet(
 ) -> dict[int, Float[np.ndarray, "3"]]:
     """Of the points that are `gone`, those all of whose rays meet after all, and where (m)."""
     seen, p = _seen(at, left, gone, sigma0), at.block.image_points
-    rays = {point: np.flatnonzero(p.point == point) for point in gone.tolist()}
-    met = [_met(seen, int(own[0]), int(own[0])) for own in rays.values() if len(own)]
-    return {point: place for point, place, _ in (side for side in met if side is not None)}
+    met = {point: np.flatnonzero(p.point == point) for point in gone.tolist()}
+    places = {point: _meeting(seen, rays) for point, rays in met.items() if len(rays) > 1}
+    return {point: place for point, place in places.items() if place is not None}
 
 
 def put_back(block: Block, left: Masks, points: Iterable[int]) -> Masks:
@@ -194,23 +194,25 @@ def _off_plane(seen: _Seen, one: int, other: int) -> float:
 
 def _met(seen: _Seen, row: int, other: int) -> tuple[int, Float[np.ndarray, "3"], list[int]] | None:
     """The point of `row`, where its rays meet if it was measured in `other`, and these; None where they do not meet."""
-    p = seen.block.image_points
     partners = seen.partners(row)
-    rays = np.array([other, *partners])
+    place = _meeting(seen, np.array([other, *partners])) if len(partners) else None
+    return None if place is None else (int(seen.block.image_points.point[row]), place, partners.tolist())
+
+
+def _meeting(seen: _Seen, rays: Int[np.ndarray, "rays"]) -> Float[np.ndarray, "3"] | None:
+    """Where the rays of these rows meet, two at least; None where they do not, or not where other points are."""
     origins, directions = seen.origins[rays], seen.directions[rays]
     places, determined = intersect_points(origins, directions, np.zeros(len(rays), int), 1)
-    if len(partners) == 0 or not determined[0]:
+    if not determined[0]:
         return None
     towards = places[0] - origins
     far = np.sum(towards * directions, axis=1)
-    nearest, farthest = seen.depths[p.image[rays]].T
+    nearest, farthest = seen.depths[seen.block.image_points.image[rays]].T
     if not np.all((far > nearest) & (far < farthest)):
         return None
     off = np.linalg.norm(towards - far[:, None] * directions, axis=1) / far / seen.sigma[rays]
     freedom = 2 * len(rays) - 3
-    if float(np.sum(off**2)) > seen.limit * freedom:
-        return None
-    return int(p.point[row]), places[0], partners.tolist()
+    return places[0] if float(np.sum(off**2)) <= seen.limit * freedom else None
 
 
 def _predicted(at: Adjustment, seen: _Seen, pair: tuple[int, int], r: Blocks, sigma0: float) -> bool:

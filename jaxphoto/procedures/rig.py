@@ -1,6 +1,7 @@
 """Photographs of one event as those of a rig: which belong together, and where its cameras are, roughly."""
 
 import dataclasses
+import warnings
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,8 @@ def with_rig(block: Block, reference: str, place_m: float, turn_rad: float) -> B
     `place_m` and `turn_rad` from one event to the next. Relative orientations start at the medians of those of the
     approximate orientations, and are free: `block.fix("place")`, `block.weigh("place", 0.005)`.
 
-    Raises InputError where nothing says what belongs together, or none of it is of the camera `reference`.
+    Raises InputError where nothing says what belongs together, none of it is of the camera `reference`, or of a camera
+    no orientation is known beside it. A UserWarning tells of photographs that are in no event of it.
     """
     if EVENT not in block.partitions:
         raise InputError(
@@ -37,6 +39,12 @@ def with_rig(block: Block, reference: str, place_m: float, turn_rad: float) -> B
         raise InputError(f"no image of camera {reference} is in an event, so no rig has it; name another camera")
     first = {event: int(i) for i, event in zip(own[::-1], events[own[::-1]], strict=True)}
     image = np.array([i for i, event in enumerate(events) if cameras[i] != reference and event in first], int)
+    if not len(image):
+        raise InputError(
+            f"no image of another camera is in an event of camera {reference}; correct the column {EVENT}, in which "
+            "photographs that were exposed together have the same word"
+        )
+    _tell_left_out(block, image, own, len(first))
     at = np.array([first[event] for event in events[image]], int)
     none, each = np.zeros((len(image), 3)), np.ones((len(image), 3))
     rows = RigPlaces(at, image, none, place_m * each), RigTurns(at, image, none, turn_rad * each)
@@ -44,6 +52,11 @@ def with_rig(block: Block, reference: str, place_m: float, turn_rad: float) -> B
     start: dict[str, Any] = {}
     for camera in dict.fromkeys(cameras[image].tolist()):
         mine = (cameras[image] == camera) & known
+        if not mine.any():
+            raise InputError(
+                f"no images of cameras {camera} and {reference} in one event have approximate orientations, so nothing "
+                f"says where {camera} is in the rig; orient the block first"
+            )
         start[camera] = RigCamera(*map(on_device, _middle(block, at[mine], image[mine])))
     free: Any = {camera: RigCamera(FREE, FREE) for camera in start}  # type: ignore[arg-type]
     unknowns = dataclasses.replace(block.start.unknowns, more=block.start.unknowns.more | {RigCamera.kind: start})
@@ -55,15 +68,25 @@ def with_rig(block: Block, reference: str, place_m: float, turn_rad: float) -> B
     )
 
 
+def _tell_left_out(block: Block, image: Int[np.ndarray, "n"], own: Int[np.ndarray, "m"], n_events: int) -> None:
+    """A UserWarning of photographs that the rig does not hold."""
+    alone = len(block.images) - len(image) - len(own)
+    if alone:
+        warnings.warn(f"{alone} photographs are in no event of the rig and stand by themselves", stacklevel=3)
+    if len(own) > n_events:
+        warnings.warn(
+            f"{len(own) - n_events} events have a second photograph of the reference camera, which stands by itself",
+            stacklevel=3,
+        )
+
+
 def _middle(
     block: Block, reference: Int[np.ndarray, "n"], image: Int[np.ndarray, "n"]
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """The median place (m) and turn (rad) of images beside those of their reference, as they start; none of no images.
+    """The median place (m) and turn (rad) of images beside those of their reference, as they start.
 
     Turns are median matrices made orthogonal again: rotation vectors of half a turn may have either sign.
     """
-    if not len(image):
-        return np.zeros(3), np.zeros(3)
     exterior = block.start.unknowns.exterior
     position, rotation = still(exterior.position), still(exterior.camera_from_object)
     place = np.einsum("nij,nj->ni", rotation[reference], position[image] - position[reference])

@@ -47,7 +47,7 @@ def correlation_cube(correlations: Correlations) -> xr.Dataset:
 
 def covariance_array(known: Covariance) -> xr.DataArray:
     """All correlations of exterior orientations and shared unknowns: (unknown, with_unknown), with `sigma` (unknown),
-    a posteriori, in the units of the labels. What is held has neither.
+    a posteriori, in the units of the labels. What is held has a sigma of zero, and no correlation.
     """
     import xarray as xr
 

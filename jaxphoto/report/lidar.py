@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _UNITS = {"_mm": "mm", "_m": "m", "_m_per_s": "m/s", "_s": "s"}
-# Correlations of the page.
+# Rows of a table that has no end.
 _STRONGEST = 30
 _ORDER = ("compile", "solve", "covariance")
 
@@ -216,12 +216,15 @@ def print_rounds(rounds: Sequence[Round], still: bool, console: Console) -> None
 
 
 def heights_page(control: LidarControl, picture: WholePicture, made: Made) -> str:
-    """The page of heights of a cloud as control: rounds, flags, picture, and every height."""
+    """The page of heights of a cloud as control: rounds, flags, picture, and the heights that differ most."""
     flags = flag_counts(control.flag)
     refused = Rows(("heights that are", "number"), tuple((name.lower(), str(n)) for name, n in flags.items()))
     parts: list[Element | WholePicture] = [picture, Heading("Rounds"), rows_of(rounds_table(control.rounds))]
     parts += [refused] if flags else []
-    parts += [Heading("Heights"), rows_of(heights_table(control)), *made_section(made)]
+    heights = heights_table(control)
+    off = (heights["height_m"] - heights["Z_m"]).abs().sort_values(ascending=False, na_position="last")
+    parts += [Heading("Heights that differ most"), rows_of(heights.loc[off.index[:_STRONGEST]])]
+    parts += [Paragraph("All stand in lidar_heights.csv."), *made_section(made)]
     said = [*rounds_words(control.rounds, control.still)]
     said.append(f"{int(control.used.sum())} of {len(control.points)} tie points have a control height")
     return study_page(f"{control.block.title or 'Block'}: heights of a cloud as control", said, parts)

@@ -32,7 +32,7 @@ def made_section(made: Made) -> Iterator[Element]:
     yield Rows(("", ""), tuple(rows))
     if made.inputs:
         files = tuple((f.file, str(f.n_bytes), f.sha256) for f in made.inputs)
-        yield Rows(("file that was read", "bytes", "SHA-256"), files)
+        yield Rows(("file", "bytes", "SHA-256"), files)
 
 
 def versions() -> dict[str, str]:

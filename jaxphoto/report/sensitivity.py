@@ -81,7 +81,7 @@ class SensitivityTables:
             table = rows.iloc[most][["image", "point", "axis"]].reset_index(drop=True)
             table.insert(0, "share", share.sum(axis=1))
             table.insert(0, "group", group)
-            table.insert(0, "estimate", self.exact.labels[self._rows])
+            table.insert(0, "estimate", np.array(self.exact.labels[self._rows], object))
             table["largest_share"] = share.max(axis=1)
             found.append(table)
         return pd.concat(found, ignore_index=True).sort_values("estimate", kind="stable", ignore_index=True)
@@ -106,7 +106,7 @@ class SensitivityTables:
             worst = np.where(checked, np.abs(effect), -1.0).argmax(axis=1)
             table = rows.iloc[worst].reset_index(drop=True).drop(columns=["group", "factor"])
             table.insert(0, "group", group)
-            table.insert(0, "estimate", self.exact.labels[self._rows])
+            table.insert(0, "estimate", np.array(self.exact.labels[self._rows], object))
             table.insert(6, "detectable", rows["factor"].to_numpy()[worst] * detectable[worst])
             table["effect"] = effect[np.arange(len(effect)), worst]
             table["effect_over_sigma"] = table["effect"] / np.where(sigma > 0, sigma, np.nan)

@@ -133,6 +133,16 @@ def test_photographs_say_their_temperatures(tmp_path):
         read_block(folder)
 
 
+def test_a_temperature_that_is_not_known_stays_so(tmp_path):
+    write_block(thermal(FIXED), tmp_path / "block")
+    in_table(tmp_path / "block", lambda row, k: row | {"temperature_c": ""} if k == 2 else row)
+    block = read_block(tmp_path / "block")
+    assert np.flatnonzero(np.isnan(block.temperatures.celsius)).tolist() == [2]
+    assert np.isfinite(block.temperatures.above).all() and float(block.temperatures.above[2]) == 0
+    write_block(block, tmp_path / "again")
+    np.testing.assert_array_equal(read_block(tmp_path / "again").temperatures.celsius, block.temperatures.celsius)
+
+
 def test_rates_that_are_held_need_no_temperature(tmp_path):
     write_block(thermal(FIXED), tmp_path / "block")
     in_table(tmp_path / "block", lambda row, k: row | {"temperature_c": ""})

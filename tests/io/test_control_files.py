@@ -144,6 +144,16 @@ def test_points_of_geo_json_are_longitude_and_latitude_where_it_says_nothing(tmp
     np.testing.assert_allclose(there, [(13.2, 55.7, 12.5)], rtol=1e-12)
 
 
+def test_a_photograph_of_a_feature_is_no_image_of_a_mark(tmp_path):
+    point = {"type": "Point", "coordinates": [13.2, 55.7, 12.5]}
+    one = {"type": "Feature", "properties": {"name": "G1", "photo": "DCIM/x.jpg"}, "geometry": point}
+    (tmp_path / "a").write_text(json.dumps({"type": "FeatureCollection", "features": [one]}))
+    assert read_control(tmp_path / "a", None).points.ids == ("G1",)
+    (tmp_path / "a").write_text(json.dumps({"type": "FeatureCollection", "features": []}))
+    with pytest.raises(InputError, match="there are no points in it"):
+        read_control(tmp_path / "a", None)
+
+
 @settings(max_examples=20, deadline=None)
 @given(
     xyz=st.lists(st.tuples(*[st.floats(-5e3, 5e3)] * 3), min_size=40, max_size=40),

@@ -1,6 +1,7 @@
 """Orientations with image points beside them: read as they were written, in map systems too; refused in a sentence."""
 
 import dataclasses
+import json
 import re
 
 import jax
@@ -9,14 +10,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxphoto.camera import get_parameter, parameter_names
+from jaxphoto.camera import Brown, InteriorOrientation, Sensor, get_parameter, parameter_names
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import InputError
 from jaxphoto.io import FORMATS, export, read_source
 from jaxphoto.io.block_folder.table_layout import XYZ
 from jaxphoto.io.exports.map_photographs import in_map
+from jaxphoto.io.reconstructions.exterior_text import is_exterior, read_exterior
 from jaxphoto.io.reconstructions.metashape import read_metashape
+from jaxphoto.io.reconstructions.points_beside import PhotographCamera, joined, named, points_of
 from jaxphoto.io.reconstructions.text_project import read_text_project
+from jaxphoto.rotation import matrix_from_omega_phi_kappa
 from tests.formulas import camera_from_object
 from tests.io.oriented_files import (
     inside,
@@ -327,3 +331,76 @@ def test_two_texts_of_image_points_are_one_too_many(tmp_path):
     (tmp_path / "in" / "again.dat").write_text(text)
     with pytest.raises(InputError, match=r"holds 2 files of image points \(again.dat, bingo.txt\); leave one"):
         read_source(tmp_path / "in")
+
+
+@pytest.mark.parametrize(
+    ("head", "row"),
+    [
+        ("imageName X Y Z Omega Phi Kappa", "{name} 1.5 2.5 100 3 -2 90"),
+        ("# Name, Easting, Northing, Height, Phi (deg), Omega (deg), Kappa (deg)", "{name}, 1.5, 2.5, 100, -2, 3, 90"),
+        ("Name;Latitude;Longitude;Altitude;Omega;Phi;Kappa", "{name};2.5;1.5;100;3;-2;90"),
+        ("PhotoID X Y Z Omega Phi Kappa r11 r12 r13 r21", "{name} 1.5 2.5 100 3 -2 90 1 0 0 0"),
+        ("angles in gon\nPhoto X Y Z Omega Phi Kappa", "{name} 1.5 2.5 100 3.3333333333333335 -2.2222222222222223 100"),
+        ("nothing said", "two words {name} 1.5 2.5 100 3 -2 90"),
+    ],
+)
+def test_columns_of_orientations_are_those_that_their_header_names(tmp_path, head, row):
+    path = tmp_path / "ext.txt"
+    path.write_text(head + "\n" + "".join(row.format(name=name) + "\n" for name in ("a.jpg", "b.jpg", "c.jpg")))
+    assert is_exterior(path)
+    found = read_exterior(path)
+    assert [name.split()[-1] for name in found.names] == ["a.jpg", "b.jpg", "c.jpg"]
+    np.testing.assert_allclose(found.positions, [[1.5, 2.5, 100.0]] * 3)
+    expected = matrix_from_omega_phi_kappa(np.radians([3.0, -2.0, 90.0]))
+    np.testing.assert_allclose(found.camera_from_object[1], expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("head", "said"),
+    [
+        ("Name X Y Z Winkel Phi Kappa", "row 1: .* does not name X, Y, Z, Omega, Phi and Kappa once each; call the"),
+        ("Winkel in Grad", "degrees to some and gon to others; write degrees or gon"),
+    ],
+)
+def test_angles_that_may_be_others_are_refused(tmp_path, head, said):
+    path = tmp_path / "ext.txt"
+    path.write_text(head + "\n" + "a.jpg 1.5 2.5 100 3 -2 90\n" * 3)
+    with pytest.raises(InputError, match=said):
+        read_exterior(path)
+
+
+def test_a_tie_point_of_a_markers_name_is_another_point_unless_it_lies_there():
+    names, at = ["1", "2", "3"], np.array([[10.0, 10.0], [20.0, 20.0], [30.0, 30.0]])
+    ties = named([0, 0, 0, 1], [*names, "1"], np.vstack([at, [[50.0, 50.0]]]))
+    marks = named([0, 0, 1], ["1", "2", "2"], np.array([[10.5, 10.0], [200.0, 200.0], [5.0, 5.0]]))
+    with pytest.warns(UserWarning, match=r"1 tie points have the name of a marker but lie elsewhere \(2\)"):
+        both = joined(ties, marks, "a.xml")
+    rows = {(i, both.points[p], *at) for i, p, at in zip(both.image, both.point, both.column_row.tolist(), strict=True)}
+    assert rows == {
+        (0, "1", 10.5, 10.0), (1, "1", 50.0, 50.0), (0, "2 (tie)", 20.0, 20.0), (0, "3", 30.0, 30.0),
+        (0, "2", 200.0, 200.0), (1, "2", 5.0, 5.0),
+    }  # fmt: skip
+
+
+def test_an_empty_line_ends_a_photograph_and_millimetres_are_told_by_their_signs(tmp_path):
+    text = tmp_path / "ties.txt"
+    text.write_text("a.jpg\n1 -1.0 2.0\n2 3.0 1.0\n\nb.jpg\n1 4.0 2.0\n2 1.0 0.5\n\n")
+    sensor = Sensor(1000, 800, 0.01)
+    camera = PhotographCamera(sensor, InteriorOrientation(20.0, 0.0, 0.0, Brown()))
+    found = points_of(text, ["a.jpg", "b.jpg"], "ext.txt", [camera] * 2)
+    np.testing.assert_allclose(found.column_row, [[400.0, 200.0], [800.0, 300.0], [900.0, 200.0], [600.0, 350.0]])
+    text.write_text(text.read_text().replace("-", ""))
+    pixels = points_of(text, ["a.jpg", "b.jpg"], "ext.txt", [camera] * 2).column_row
+    np.testing.assert_allclose(pixels, [[1.0, 2.0], [3.0, 1.0], [4.0, 2.0], [1.0, 0.5]])
+
+
+def test_a_fisheye_of_instant_ngp_is_one_and_a_term_that_is_not_read_is_refused(tmp_path):
+    path = write_nerfstudio(tmp_path, "fisheye") / "transforms.json"
+    content = json.loads(path.read_text())
+    del content["camera_model"]
+    path.write_text(json.dumps(content | {"is_fisheye": True}))
+    (fisheye,) = read_source(tmp_path, "nerfstudio").start.unknowns.interior.values()
+    assert fisheye.projection.name == "equidistant"
+    path.write_text(json.dumps(content | {"k4": 0.1}))
+    with pytest.raises(InputError, match="k4: cameras of kind OPENCV have no such term here"):
+        read_source(tmp_path, "nerfstudio")

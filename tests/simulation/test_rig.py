@@ -130,6 +130,15 @@ def test_a_rig_is_made_of_photographs_of_one_event():
         with_rig(bare, "leica", 0.001, 1e-5)
     with pytest.raises(InputError, match="has no partition event"):
         with_rig(block, "kodak", 0.001, 1e-5)
+    apart = dataclasses.replace(bare, partitions={"event": bare.images})
+    with pytest.raises(InputError, match="no image of another camera is in an event of camera kodak"):
+        with_rig(apart, "kodak", 0.001, 1e-5)
+    unknown = dataclasses.replace(bare.start, image_known=np.zeros(28, bool))
+    with pytest.raises(InputError, match="nothing says where oblique is in the rig; orient the block first"):
+        with_rig(dataclasses.replace(bare, start=unknown), "kodak", 0.001, 1e-5)
+    fewer = tuple(f"{name} alone" if k == 1 else name for k, name in enumerate(events))
+    with pytest.warns(UserWarning, match="1 photographs are in no event of the rig"):
+        assert len(with_rig(dataclasses.replace(bare, partitions={"event": fewer}), "kodak", 0.001, 1e-5).more[0]) == 13
 
 
 def test_a_photograph_of_a_camera_outside_the_rig_is_refused():

@@ -49,4 +49,4 @@ def temperatures_of(celsius: np.ndarray, settings: Settings) -> Temperatures | N
         return None
     told = settings.reference_temperature_c
     reference = float(celsius[known].mean()) if told is None else told
-    return Temperatures(on_device(np.where(known, celsius, reference)), reference)
+    return Temperatures(on_device(celsius), reference)

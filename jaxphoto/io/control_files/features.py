@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 from jaxphoto.errors import InputError, few
 from jaxphoto.io.control_files.rows import Cells
-from jaxphoto.io.control_files.table_header import point_columns
+from jaxphoto.io.control_files.table_header import feature_columns
 from jaxphoto.io.control_files.tables import read_points
 from jaxphoto.procedures.control.surveyed import SurveyedPoints
 
@@ -22,7 +22,7 @@ class PointFeature(NamedTuple):
 
 def names_points(attributes: Sequence[str]) -> bool:
     """Whether one of the attributes of features is the name of a point, and none that of an image."""
-    return point_columns([*_XYZ, *attributes]) is not None
+    return feature_columns([*_XYZ, *attributes]) is not None
 
 
 def surveyed_features(file: str, features: Sequence[PointFeature], system: str) -> SurveyedPoints:
@@ -31,10 +31,12 @@ def surveyed_features(file: str, features: Sequence[PointFeature], system: str) 
     A height is that of the geometry, else an attribute. Raises InputError where no attribute is the name of the points,
     and what a table with these columns raises.
     """
+    if not features:
+        raise InputError(f"{file}: there are no points in it; export them again")
     keys = list(dict.fromkeys(key for feature in features for key in feature.attributes))
     solid = any(len(feature.coordinates) > 2 for feature in features)
     header = [*_XYZ[: 3 if solid else 2], *keys]
-    columns = point_columns(header)
+    columns = feature_columns(header)
     if columns is None:
         found = f" (there are {few(keys)})" if keys else ""
         raise InputError(f"{file}: no attribute is the name of the points{found}; call it point, name, label or id")

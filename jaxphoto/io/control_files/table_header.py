@@ -32,6 +32,8 @@ _MARK = {
     "y": ("y px", "y", "py", "row px", "row", "im y", "pixel y", "v", "image v"),
     "sigma": ("sigma px", "sigma", "accuracy px", "accuracy"),
 }
+# What features are called that are images, such as camera stations.
+_OF_IMAGES = {"image", "image name", "filename"}
 _PICTURE = re.compile(r"\.(jpe?g|tiff?|png|dng)$", re.IGNORECASE)
 _UNIT = re.compile(r"\s*[\[(][^\])]*[\])]|\s+m$|\s+deg$")
 
@@ -46,6 +48,12 @@ def point_columns(header: Sequence[str]) -> Columns | None:
     """Of a table of points; None where these are not the words of one."""
     found = _columns(header, _POINT)
     return found if {"point", "x", "y"} <= set(found) and "image" not in _columns(header, _MARK) else None
+
+
+def feature_columns(header: Sequence[str]) -> Columns | None:
+    """Of attributes of points that have a geometry: a photograph among them shows the point, and measures nothing."""
+    found = _columns(header, _POINT)
+    return found if {"point", "x", "y"} <= set(found) and not _OF_IMAGES & set(map(str.lower, header)) else None
 
 
 def mark_columns(header: Sequence[str]) -> Columns | None:

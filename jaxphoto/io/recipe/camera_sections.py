@@ -28,7 +28,7 @@ def read_changes(top: Section, cameras: Sequence[str], strips: Sequence[str]) ->
     }
     if ThermalRates.kind in changes and "temperature" not in top:
         raise top.error(ThermalRates.kind, "the recipe says nothing of the temperature; add a table [temperature]")
-    if WALK in top and StripCamera.kind not in changes:
+    if WALK in top and not changes.get(StripCamera.kind):
         raise top.error(WALK, "the cameras of strips walk, but there are none; add a table [strip_cameras.default]")
     return {name: owners for name, owners in changes.items() if owners}
 

@@ -6,9 +6,10 @@
     a11 a12 a13 a21 a22
     a23 a31 a32 a33
 
-omega, phi, kappa are those of docs/conventions.md, in degrees, or gon where the lines above the first row say gon or
-grad. PATB's matrix takes the axes of the camera, x right, y up, z backwards, to those of the object. A comment or a
-.prj beside names the system.
+omega, phi, kappa are those of docs/conventions.md, in degrees, or gon where the lines above the first row say gon,
+grads or gradians. Other columns and another order are read where the last line above the first row names them. PATB's
+matrix takes the axes of the camera, x right, y up, z backwards, to those of the object. A comment or a .prj beside
+names the system.
 Sources: Pix4D support, articles 202977149 and 202558969 ("Yaw, Pitch, Roll and Omega, Phi, Kappa angles"); PCI
 Geomatics support, article 204186705 ("Using Pat-B in OrthoEngine").
 """
@@ -28,9 +29,22 @@ from jaxphoto.io.text_tables import is_number
 from jaxphoto.io.whole_text import LARGE, SMALL, read_text
 
 _SEPARATORS = ("\t", ";", ",")
-_GON = re.compile(r"\b(gon|grads?|gradians?)\b", re.IGNORECASE)
+_GON = re.compile(r"\b(gons?|grads|gradians?)\b", re.IGNORECASE)
+# Gon in English, degrees in German.
+_GRAD = re.compile(r"\bgrad\b", re.IGNORECASE)
+_UNIT = re.compile(r"[\[(][^\])]*[\])]")
 _SYSTEM = re.compile(r"\b(EPSG:\s*\d{4,6}(?:\s*\+\s*\d{4,6})?)", re.IGNORECASE)
-_COLUMNS = ("x", "y", "z", "omega", "phi", "kappa")
+# Words of a header, by what they mean.
+_WORDS = {
+    "x": ("x", "easting", "east", "e", "longitude", "lon"),
+    "y": ("y", "northing", "north", "n", "latitude", "lat"),
+    "z": ("z", "altitude", "height", "elevation", "h"),
+    "omega": ("omega",),
+    "phi": ("phi",),
+    "kappa": ("kappa",),
+}
+_COLUMNS = tuple(_WORDS)
+_ANGLES = _COLUMNS[3:]
 _FIRST, _MATRIX = 3, (5, 4)
 # Lines of a file among which its first row stands, and their characters.
 _BEGIN, _HEAD = 40, 20_000
@@ -58,28 +72,38 @@ def is_exterior(path: Path) -> bool:
     """Whether a file begins as one of these."""
     with path.open("rb") as file:
         lines = file.read(_HEAD).decode("utf-8", "replace").splitlines()[:_BEGIN]
-    rows = [_cells(line) for line in lines if line.strip()]
-    return _first_of_angles(rows) is not None or _first_of_matrices(rows) is not None
+    lines = [line for line in lines if line.strip()]
+    return _first_of_angles(lines) is not None or _first_of_matrices([_cells(line) for line in lines]) is not None
 
 
 def read_exterior(path: Path) -> ExteriorText:
     """The orientations in a file. Raises InputError for rows that are none."""
     numbered = [(k, line) for k, line in enumerate(read_text(path, LARGE).split("\n"), 1) if line.strip()]
-    begin = [_cells(line) for _, line in numbered[:_BEGIN]]
+    begin = [line for _, line in numbered[:_BEGIN]]
     first = _first_of_angles(begin)
     matrices = first is None
     if first is None:
-        first = _first_of_matrices(begin)
+        first = _first_of_matrices([_cells(line) for line in begin])
     if first is None:
         raise InputError(f"{path.name} has no row of name, X, Y, Z, omega, phi, kappa; export the orientations anew")
     head = "\n".join(line for _, line in numbered[:first])
-    said = _SYSTEM.search(head)
+    said, above = _SYSTEM.search(head), numbered[first - 1] if first else (0, "")
     rows = [(k, _cells(line), line) for k, line in numbered[first:] if not line.lstrip().startswith("#")]
     if matrices:
         names, positions, rotations = _of_matrices(path, rows)
     else:
-        order = _order(numbered[first - 1][1]) if first else list(range(len(_COLUMNS)))
-        names, positions, rotations = _of_angles(path, rows, order, 0.9 if _GON.search(head) else 1.0)
+        if _GRAD.search(head) and not _GON.search(head):
+            raise InputError(
+                f"{path.name} has angles in grad, which are degrees to some and gon to others; write degrees or gon"
+            )
+        places = _places(above[1])
+        if places is None and set(_ANGLES) & set(_meanings(above[1])):
+            raise InputError(
+                f"{path.name}, row {above[0]}: {quoted(above[1])} does not name X, Y, Z, Omega, Phi and Kappa once "
+                "each; call the columns so"
+            )
+        places = places or dict(zip(_COLUMNS, range(-len(_COLUMNS), 0), strict=True))
+        names, positions, rotations = _of_angles(path, rows, places, 0.9 if _GON.search(head) else 1.0)
     return ExteriorText(names, positions, rotations, matrices, said[1] if said else _beside(path))
 
 
@@ -99,12 +123,20 @@ def _cells(line: str) -> list[str]:
 
 
 def _is_angles(row: list[str]) -> bool:
-    """Whether it is a name and numbers; a name of several words is no number."""
+    """Whether it is a name and numbers; a name of several words is no number, and has no three numbers in it."""
     surplus = len(row) - len(_COLUMNS)
-    return surplus > 0 and all(map(is_number, row[surplus:])) and (surplus == 1 or not is_number(row[0]))
+    if surplus < 1 or not all(map(is_number, row[surplus:])):
+        return False
+    return surplus == 1 or (not is_number(row[0]) and sum(map(is_number, row[1:surplus])) < _FIRST)
 
 
-def _first_of_angles(rows: list[list[str]]) -> int | None:
+def _first_of_angles(lines: list[str]) -> int | None:
+    rows = [_cells(line) for line in lines]
+    for k, line in enumerate(lines[:-1]):
+        places = _places(line)
+        below = rows[k + 1]
+        if places and len(below) > -min(places.values()) and all(is_number(below[at]) for at in places.values()):
+            return k + 1
     found = [k for k, row in enumerate(rows) if _is_angles(row) and not row[0].startswith("#")]
     # Most rows below the first one are of the same kind: those of other files are so by chance.
     return found[0] if found and 2 * sum(map(_is_angles, rows[found[0] :])) > len(rows) - found[0] else None
@@ -119,23 +151,34 @@ def _first_of_matrices(rows: list[list[str]]) -> int | None:
     return None
 
 
-def _order(head: str) -> list[int]:
-    """Where each of `_COLUMNS` stands among the last ones, by the words above them; in this order without such."""
-    words = [word[0].lower() if (word := re.findall(r"[A-Za-z]+", cell)) else "" for cell in _cells(head)]
-    last = words[-len(_COLUMNS) :]
-    return [last.index(name) for name in _COLUMNS] if set(last) == set(_COLUMNS) else list(range(len(_COLUMNS)))
+def _meanings(head: str) -> list[str]:
+    """What the words of a header mean, "" for other words; its units are no words."""
+    known = {word: meaning for meaning, words in _WORDS.items() for word in words}
+    cells = _cells(_UNIT.sub("", head))
+    words = [word[0].lower() if (word := re.findall(r"[A-Za-z]+", cell)) else "" for cell in cells]
+    return [known.get(word, "") for word in words]
 
 
-def _of_angles(path: Path, rows: list[_Row], order: list[int], degrees: float) -> _Read:
-    names, values = [], []
+def _places(head: str) -> dict[str, int] | None:
+    """Where each of `_COLUMNS` stands, counted from the end of a row, by the words above it; None where not all do, or
+    one does twice.
+    """
+    found = _meanings(head)
+    if any(found.count(name) != 1 for name in _COLUMNS):
+        return None
+    return {name: found.index(name) - len(found) for name in _COLUMNS}
+
+
+def _of_angles(path: Path, rows: list[_Row], places: dict[str, int], degrees: float) -> _Read:
+    names, values, most = [], [], -min(places.values())
     for k, cells, line in rows:
-        if len(cells) <= len(_COLUMNS):
+        if len(cells) <= most:
             raise InputError(
                 f"{path.name}, row {k}: {quoted(line)} is not name, X, Y, Z, omega, phi, kappa; complete the row"
             )
-        values.append(row_numbers(path, k, cells[-len(_COLUMNS) :], len(_COLUMNS)))
-        names.append(" ".join(cells[: -len(_COLUMNS)]))
-    numbers = np.array(values).reshape(-1, len(_COLUMNS))[:, order]
+        values.append(row_numbers(path, k, [cells[places[name]] for name in _COLUMNS], len(_COLUMNS)))
+        names.append(" ".join(cells[:-most]))
+    numbers = np.array(values).reshape(-1, len(_COLUMNS))
     exterior = ExteriorOrientation.from_angles(numbers[:, :3], np.deg2rad(numbers[:, 3:] * degrees))  # type: ignore[arg-type]
     return names, numbers[:, :3], still(exterior.camera_from_object)
 

@@ -52,9 +52,7 @@ def read_measured(path: Path) -> MeasuredText:
     within = False
     for k, line in enumerate(read_text(path, LARGE).split("\n"), 1):
         words = line.split()
-        if not words:
-            continue
-        if words == [ENDS]:
+        if not words or words == [ENDS]:
             within = False
         elif not within or _is_head(words):
             heads.append(line.strip())

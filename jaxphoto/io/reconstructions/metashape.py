@@ -87,11 +87,11 @@ def read_metashape(source: Path) -> BlockTables:
     system = _system(path, chunk, centres) if placed else ControlSystem(None, None, None)
     there = OnMap(Frame("local"), centres, rotations)
     if system.crs is not None:
-        there = on_map(path.name, system.code or WGS84, system.vertical, centres, rotations)
+        there = on_map(path.name, _datum_code(path, system), system.vertical, centres, rotations)
     rows, marks = markers_of(path.name, chunk)
     labels = [photo.label for photo in photos]
     of_photo = [PhotographCamera(*sensors[photo.sensor][:2]) for photo in photos]
-    shown = joined(points_beside(path, labels, of_photo), marks_shown(marks, labels))
+    shown = joined(points_beside(path, labels, of_photo), marks_shown(marks, labels), path.name)
     if not len(shown.image):
         raise InputError(
             f"{path.name} has no tie points and no marks, which cameras of Metashape never bring with them; export the "
@@ -203,6 +203,21 @@ def _system(path: Path, chunk: ElementTree.Element, centres: Float[np.ndarray, "
     if words:
         return system_of(words, path.name)
     return system_of(f"EPSG:{WGS84}", path.name) if of_the_earth(centres) else ControlSystem(None, None, None)
+
+
+def _datum_code(path: Path, system: ControlSystem) -> int:
+    """The EPSG code of the system, or where it has none that of the geographic system below. Raises InputError."""
+    if system.code is not None:
+        return system.code
+    geodetic = None if system.crs is None else system.crs.geodetic_crs
+    code = None if geodetic is None else geodetic.to_epsg()
+    if code is None:
+        raise InputError(
+            f"{path.name}: neither its system ({system.name}) nor the datum of that has an EPSG code; export it in a "
+            "system that has one"
+        )
+    warnings.warn(f"{path.name}: its system has no EPSG code; the block is in EPSG:{code}", UserWarning, stacklevel=3)
+    return code
 
 
 def _control(path: Path, points: SurveyedPoints | None, system: ControlSystem, placed: bool) -> SurveyedPoints | None:

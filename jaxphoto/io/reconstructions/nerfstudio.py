@@ -27,12 +27,13 @@ FILE = "transforms.json"
 _PLANE = ("k1", "k2", "k3", "p1", "p2")
 # Of each kind of camera: what it is here, and which coefficients it has.
 _KINDS: dict[str, tuple[CameraModel, tuple[str, ...]]] = {
+    # Its k4 is a further radial term, as OpenCV's rational model has it: no coefficient of `_PLANE`.
     "OPENCV": (PLANE, _PLANE),
     "PINHOLE": (PLANE, ()),
     "SIMPLE_PINHOLE": (PLANE, ()),
     "OPENCV_FISHEYE": (FISHEYE, ("k1", "k2", "k3", "k4")),
 }
-_OF_CAMERA = ("camera_model", "w", "h", "fl_x", "fl_y", "cx", "cy", *_PLANE, "k4", "camera_angle_x")
+_OF_CAMERA = ("camera_model", "w", "h", "fl_x", "fl_y", "cx", "cy", *_PLANE, "k4", "camera_angle_x", "is_fisheye")
 
 
 def recognises(source: Path) -> bool:
@@ -95,10 +96,14 @@ def read_nerfstudio(source: Path) -> BlockTables:
 
 def _camera(path: Path, place: str, values: dict[str, Any]) -> TiedCamera:
     given, source = Section(path.name, place, values), CameraSource(path)
-    kind = given.text("camera_model", "OPENCV")
+    # instant-ngp names no kind.
+    kind = given.text("camera_model", "OPENCV_FISHEYE" if given.values.get("is_fisheye") is True else "OPENCV")
     if kind not in _KINDS:
         raise given.error("camera_model", f"{quoted(kind)} is not known here; known are {', '.join(_KINDS)}")
     model, coefficients = _KINDS[kind]
+    for name in (*_PLANE, "k4"):
+        if name not in coefficients and given.number(name, 0.0) != 0:
+            raise given.error(name, f"cameras of kind {kind} have no such term here; calibrate without it")
     width, height = given.number("w"), given.number("h")
     sensor, _ = source.sensor(width, height)
     if "fl_x" not in given and "camera_angle_x" in given:

@@ -26,6 +26,9 @@ _ENDS = (".txt", ".dat", ".im", ".img", ".ima", ".pho", ".pat", ".bingo", ".patb
 # A principal distance in micrometres is so many times one in millimetres, but for the difference of two calibrations.
 _UM = 1000.0
 _NEAR = 2.0
+# A mark that was exported among tie points is rounded by less.
+_SAME_PX = 2.0
+_OTHER = " (tie)"
 
 
 class Shown(NamedTuple):
@@ -79,7 +82,8 @@ def points_of(text: Path, files: Sequence[str], of: str, cameras: Sequence[Photo
     heads = [_photograph(head, places) for head in measured.heads]
     _tell([head for head, (k, _) in zip(measured.heads, heads, strict=True) if k < 0], text, of)
     image = np.array([k for k, _ in heads], int)[measured.photograph]
-    scales = [_scale(None if cameras is None or k < 0 else cameras[k], rest) for k, rest in heads]
+    centred = bool((measured.xy < 0).any())
+    scales = [_scale(None if cameras is None or k < 0 else cameras[k], rest, centred) for k, rest in heads]
     scale, offset = np.array(scales).reshape(-1, 2, 2)[measured.photograph].transpose(1, 0, 2)
     kept = image >= 0
     points = [measured.points[k] for k in np.flatnonzero(kept).tolist()]
@@ -94,11 +98,31 @@ def marks_shown(marks: Sequence[Mark], files: Sequence[str]) -> Shown:
     return named([place[mark[0]] for mark in own], [mark[1] for mark in own], at)
 
 
-def joined(one: Shown, other: Shown) -> Shown:
-    """Both; points of one name are one."""
-    names = [[shown.points[k] for k in shown.point.tolist()] for shown in (one, other)]
-    image, at = np.concatenate([one.image, other.image]), np.concatenate([one.column_row, other.column_row])
-    return named(image, names[0] + names[1], at)
+def joined(ties: Shown, marks: Shown, of: str) -> Shown:
+    """Both. A tie point of a mark's name is the mark where a photograph shows both at one place; else it is another
+    point, which gets another name (UserWarning).
+    """
+    names = [[shown.points[k] for k in shown.point.tolist()] for shown in (ties, marks)]
+    marked = dict(zip(zip(marks.image.tolist(), names[1], strict=True), marks.column_row, strict=True))
+    where = list(zip(ties.image.tolist(), names[0], strict=True))
+    same = {
+        place[1]
+        for place, at in zip(where, ties.column_row, strict=True)
+        if place in marked and float(np.hypot(*(marked[place] - at))) < _SAME_PX
+    }
+    clash = set(names[0]) & set(names[1]) - same
+    if clash:
+        warnings.warn(
+            f"{of}: {len(clash)} tie points have the name of a marker but lie elsewhere ({few(sorted(clash))}); they "
+            f"get another, with {_OTHER!r} behind",
+            UserWarning,
+            stacklevel=3,
+        )
+    # What is a mark's is measured once.
+    kept = np.array([place[1] not in same or place not in marked for place in where], bool)
+    own = [name + _OTHER if name in clash else name for name, keep in zip(names[0], kept.tolist(), strict=True) if keep]
+    image = np.concatenate([ties.image[kept], marks.image])
+    return named(image, own + names[1], np.concatenate([ties.column_row[kept], marks.column_row]))
 
 
 def named(image: Sequence[int] | np.ndarray, points: Sequence[str], column_row: Float[np.ndarray, "n 2"]) -> Shown:
@@ -137,12 +161,15 @@ def _photograph(head: str, places: dict[str, int]) -> tuple[int, list[str]]:
     return -1, []
 
 
-def _scale(camera: PhotographCamera | None, rest: list[str]) -> list[list[float]]:
-    """What makes pixels of a photograph's coordinates: factors and what is then added, by axis."""
-    if camera is None or not rest:
+def _scale(camera: PhotographCamera | None, rest: list[str], centred: bool) -> list[list[float]]:
+    """What makes pixels of a photograph's coordinates: factors and what is then added, by axis.
+
+    Where its head is but its name, they are pixels if none of the file is negative: half of those from the middle are.
+    """
+    if camera is None or not (rest or centred):
         return [[1.0, 1.0], [0.0, 0.0]]
     sensor, c_um = camera.sensor, float(camera.interior.c) * _UM
-    c = abs(float(rest[0])) if is_number(rest[0]) else 0.0
+    c = abs(float(rest[0])) if rest and is_number(rest[0]) else 0.0
     unit_px = (1 / _UM if c_um / _NEAR < c < c_um * _NEAR else 1.0) / sensor.pixel_mm
     return [[unit_px, -unit_px], [sensor.width_px / 2, sensor.height_px / 2]]
 

@@ -12,7 +12,7 @@ from jaxphoto.block import Frame
 from jaxphoto.errors import InputError, few
 from jaxphoto.io.block_folder import BlockTables
 from jaxphoto.io.cameras import read_camera_file
-from jaxphoto.io.reconstructions import pix4d
+from jaxphoto.io.reconstructions import orthority, pix4d
 from jaxphoto.io.reconstructions.exterior_text import ExteriorText, is_exterior, read_exterior
 from jaxphoto.io.reconstructions.on_map import frame_of_words
 from jaxphoto.io.reconstructions.points_beside import PhotographCamera, Shown, measured_texts, points_beside
@@ -30,8 +30,9 @@ def recognises(source: Path) -> bool:
     if source.is_file():
         return source.suffix.lower() in _EXTERIORS and is_exterior(source)
     found = _exteriors(source)
-    # The folder of Pix4D has such texts, and more.
-    return len(found) == 1 and bool(measured_texts(found[0])) and not pix4d.recognises(source)
+    # The folders of these have such texts, and more.
+    others = pix4d.recognises(source) or orthority.recognises(source)
+    return len(found) == 1 and bool(measured_texts(found[0])) and not others
 
 
 def read_text_project(source: Path) -> BlockTables:
