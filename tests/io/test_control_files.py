@@ -150,7 +150,7 @@ def test_a_photograph_of_a_feature_is_no_image_of_a_mark(tmp_path):
     (tmp_path / "a").write_text(json.dumps({"type": "FeatureCollection", "features": [one]}))
     assert read_control(tmp_path / "a", None).points.ids == ("G1",)
     (tmp_path / "a").write_text(json.dumps({"type": "FeatureCollection", "features": []}))
-    with pytest.raises(InputError, match="there are no points in it"):
+    with pytest.raises(InputError, match="there are no features"):
         read_control(tmp_path / "a", None)
 
 
