@@ -11,10 +11,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from jaxtyping import Array, Float
 
-from jaxphoto.block import Block, Motion
+from jaxphoto.block import Block, Motion, Temperatures
 from jaxphoto.errors import BlockError, InputError
 from jaxphoto.io import read_block, write_block
-from jaxphoto.io.block_folder.declared_unknowns import keys_of, known_unknowns
+from jaxphoto.io.block_folder.declared_unknowns import keys_of, known_unknowns, static_fields
 from jaxphoto.parameters import AbstractParameters, leaves_in_order
 from jaxphoto.unknowns import FIXED, FREE, UNKNOWNS, Weighted, is_prior
 
@@ -45,15 +45,17 @@ def read(folder) -> Block:
 
 @pytest.fixture
 def block(write_folder: Callable) -> Block:
-    # The time offset of a mount needs the motion of its images.
-    motion = Motion(np.ones((3, 3)), np.ones((3, 3)))
-    return dataclasses.replace(read_block(write_folder()), partitions={"hour": ("8", "9", "")}, motion=motion)
+    # The time offset of a mount needs the motion of its images, and what changes with temperature that of each.
+    motion, warm = Motion(np.ones((3, 3)), np.ones((3, 3))), Temperatures(np.array([20.0, 21.5, 19.0]), 20.5)
+    hours = {"hour": ("8", "9", "")}
+    return dataclasses.replace(read_block(write_folder()), partitions=hours, motion=motion, temperatures=warm)
 
 
 def parameters_of(kind: type[AbstractParameters], prior=None, seed: int = 0):
     """Start values of a class, or priors: `prior` of each field, made of its start where it is callable."""
     rng, static = np.random.default_rng(seed), {"model": "ciddor"} if kind is Refractivity else {}
-    start = {key.field: rng.normal(size=key.shape) for key in keys_of(kind)}
+    many = (static_fields(kind)[kind.sized],) if kind.sized else None
+    start = {key.field: rng.normal(size=many or key.shape) for key in keys_of(kind)}
     if prior is None:
         return kind(**start, **static)
     return kind(**{name: prior(value) if callable(prior) else prior for name, value in start.items()}, **static)
