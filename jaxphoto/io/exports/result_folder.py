@@ -193,7 +193,7 @@ def _values(sources: _Sources, file: str, column: str, ids: Sequence[str], numbe
 def _table(path: Path, column: str, numbers: tuple[str, ...]) -> Table:
     if not path.is_file():
         raise InputError(f"{path} is missing, which results have; adjust again")
-    table = read_csv(path, (column, *numbers), (*(f"sigma_{name}" for name in numbers), "n_images"))
+    table = read_csv(path, (column, *numbers), (*(f"sigma_{name}" for name in numbers), "n_images", "angle_deg"))
     if ANGLES[0] in numbers:
         check_angles(table, np.stack([table.numbers(name) for name in ANGLES], axis=1), ANGLES)
     return table
