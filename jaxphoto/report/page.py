@@ -133,10 +133,10 @@ def _reach(tables: Tables, camera: str) -> str:
     found = format_coverage(tables.adjusted, camera)
     if not len(found.images):
         return f"No image point is of {camera_words(camera)}."
+    part = 100 * found.images
     return (
-        f"Image points of {camera_words(camera)} reach {found.whole:.0%} of its format, those of an image "
-        f"{np.median(found.images):.0%} (median; {found.images.min():.0%} at least): beyond, the distortion is "
-        "an extrapolation."
+        f"Image points of {camera_words(camera)} reach {100 * found.whole:.0f} % of its format, those of an image "
+        f"{np.median(part):.0f} % (median; {part.min():.0f} % at least): beyond, the distortion is an extrapolation."
     )
 
 
