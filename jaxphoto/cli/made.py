@@ -16,7 +16,9 @@ _READ = (".csv", ".json", ".toml")
 def made_by(context: typer.Context, *inputs: Path | None) -> Made:
     """The command with its options, and the hashes of the files and folders that it reads, as they are now."""
     given = [path for path in inputs if path is not None]
-    return Made(str(context.info_name), dict(context.params), [f for path in given for f in _files(path)])
+    # Where results lie is not how they were made.
+    options = {name: value for name, value in context.params.items() if name != "out"}
+    return Made(str(context.info_name), options, [f for path in given for f in _files(path)])
 
 
 def _files(path: Path) -> Iterator[InputFile]:
