@@ -181,6 +181,7 @@ def test_redundancy_numbers_sum_to_the_redundancy():
     assert abs(total - adjusted().redundancy) < 1e-5
 
 
+@pytest.mark.slow
 def test_larger_sizes_change_nothing():
     a = adjusted()
     sizes = sizes_of(a.structure)

@@ -9,6 +9,7 @@ from jaxphoto import RankError, adjust
 from jaxphoto.adjustment import POOR, weak_directions, yardsticks
 from tests.adjustment.dense import at_optimum
 from tests.blocks import adjusted, covariance_of, simulated
+from tests.marks import slow_but
 
 
 def dense_covariance(name):
@@ -27,7 +28,7 @@ def dense_covariance(name):
     return np.linalg.inv(j.T @ j) * np.outer(over, over), dense.free, s
 
 
-@pytest.mark.parametrize("name", ["everything", "inner"])
+@pytest.mark.parametrize("name", slow_but(("inner",), ("everything", "inner")))
 def test_directions_are_those_of_the_dense_covariance(name):
     covariance, free, s = dense_covariance(name)
     mu, vectors = np.linalg.eigh(covariance)

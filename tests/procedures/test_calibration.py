@@ -199,6 +199,7 @@ def test_another_model_begins_where_the_rays_are_nearest(name):
     assert off < {"smac": 1e-9, "balanced": 0.02, "bundler_radial": 0.06}[name]
 
 
+@pytest.mark.slow
 def test_circles_of_two_sizes_are_no_blunders():
     """Their centres are off by several times the noise before they are corrected for, each size by another amount."""
     board = flat_board()

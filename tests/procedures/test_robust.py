@@ -55,6 +55,7 @@ def test_student_s_estimate_hardly_moves_with_the_blunders(block):
 
 # Least squares of a block with blunders may find its optimum from elsewhere, and say so; by the last bits of a machine.
 @pytest.mark.filterwarnings("ignore:the approximate exterior orientations")
+@pytest.mark.slow
 def test_derivatives_go_through_the_robust_optimum(block):
     start, p = adjust(block).unknowns, block.image_points
     losses = {p.group: Huber(scale=1.3)}

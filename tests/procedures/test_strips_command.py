@@ -87,6 +87,7 @@ def test_bad_input_is_one_sentence_and_nothing_is_written(cloud_file, tmp_path, 
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_photographs_are_adjusted_with_the_strips(tmp_path, monkeypatch, capsys):
     """From files; the same flight as of `test_joint_adjustment`, to the millimetre of its cloud."""
     folder, out = tmp_path / "flight", tmp_path / "out"
