@@ -5,6 +5,7 @@ from collections.abc import Iterable
 from typing import Any
 
 import equinox as eqx
+import jax
 import numpy as np
 
 from jaxphoto.adjustment.layout.sharding import EVERYWHERE, sharded
@@ -145,8 +146,13 @@ def _check_scanner(block: Block, priors: Unknowns) -> None:
 
 def _check_camera_rates(block: Block, priors: Unknowns) -> None:
     for rates in RATES:
-        along, what = np.asarray(rates.argument(exposures(block))), rates.along.split("_")[0]
-        for name, prior in priors.more.get(rates.kind, {}).items():
+        owners, what = priors.more.get(rates.kind, {}), rates.along.split("_")[0]
+        if not owners:
+            continue
+        # Numbers, also where a user's function around this is traced.
+        with jax.ensure_compile_time_eval():
+            along = np.asarray(rates.argument(exposures(block)))
+        for name, prior in owners.items():
             free = [field for field in dynamic_fields(rates) if getattr(prior, field) is FREE]
             if free and np.ptp(along[sorted(_images_of(name, block.image_camera))]) == 0:
                 raise RankError(
@@ -164,6 +170,8 @@ def _check_camera_rates(block: Block, priors: Unknowns) -> None:
 def _check_camera_splines(block: Block) -> None:
     """Splines have to reach the ends of their flight, and have one interval: they are computed side by side."""
     splines: Any = block.start.unknowns.more.get(CameraSpline.kind, {})
+    if not splines:
+        return
     seconds = np.abs(np.asarray(exposures(block).in_flight))
     for name, own in splines.items():
         first, spline = next(iter(splines.items()))
