@@ -5,6 +5,7 @@ from pathlib import Path
 
 import typer
 
+from jaxphoto.io.block_folder.table_layout import TOML
 from jaxphoto.io.input_hashes import block_inputs
 from jaxphoto.report.made import Made
 from jaxphoto.writing.inputs import InputFile, input_file
@@ -24,7 +25,7 @@ def made_by(context: typer.Context, *inputs: Path | None) -> Made:
 def _files(path: Path) -> Iterator[InputFile]:
     if path.is_file():
         yield input_file(path)
-    elif (path / "block.toml").is_file():
+    elif (path / TOML).is_file():
         yield from (f._replace(file=f"{path.name}/{f.file}") for f in block_inputs(path))
     else:
         files = (file for file in sorted(path.iterdir()) if file.suffix in _READ and not file.name.startswith("."))
