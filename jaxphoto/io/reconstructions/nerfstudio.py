@@ -19,8 +19,8 @@ from jaxphoto.io.cameras.camera_file import CameraModel, CameraSource, in_pixels
 from jaxphoto.io.cameras.open_cv import FISHEYE, PLANE
 from jaxphoto.io.json_file import read_any_json
 from jaxphoto.io.reconstructions.numbers import number_rows
-from jaxphoto.io.reconstructions.points_beside import PhotographCamera, points_beside
-from jaxphoto.io.reconstructions.tied_photographs import TiedCamera, TiedPhotographs, estimated, free_network
+from jaxphoto.io.reconstructions.points_beside import PhotographCamera, network_beside, points_beside
+from jaxphoto.io.reconstructions.tied_photographs import TiedCamera, estimated
 from jaxphoto.io.whole_text import LARGE
 
 FILE = "transforms.json"
@@ -73,25 +73,8 @@ def read_nerfstudio(source: Path) -> BlockTables:
             f"{path.name} has no image points, and none are beside it; write image_points.csv into its folder, or "
             "convert the COLMAP model that it was made of"
         )
-    # Its axes are ours; the network takes those of computer vision.
-    rotations = np.swapaxes(poses[:, :3, :3] * [1.0, -1.0, -1.0], 1, 2)
-    return free_network(
-        TiedPhotographs(
-            path.name,
-            "the program",
-            path.resolve().parent.name,
-            cameras,
-            files,
-            camera_of,
-            rotations,
-            poses[:, :3, 3],
-            shown.points,
-            None,
-            shown.image,
-            shown.point,
-            shown.column_row,
-        )
-    )
+    rotations = np.swapaxes(poses[:, :3, :3], 1, 2)
+    return network_beside(path, cameras, files, camera_of, rotations, poses[:, :3, 3], shown)
 
 
 def _camera(path: Path, place: str, values: dict[str, Any]) -> TiedCamera:

@@ -16,7 +16,6 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxphoto.arrays import still
-from jaxphoto.block import Frame
 from jaxphoto.camera import InteriorOrientation
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import InputError, few, quoted
@@ -26,9 +25,8 @@ from jaxphoto.io.cameras.camera_file import CameraSource, in_pixels
 from jaxphoto.io.cameras.open_cv import FISHEYE, PLANE
 from jaxphoto.io.json_file import read_any_json
 from jaxphoto.io.reconstructions.numbers import number_rows
-from jaxphoto.io.reconstructions.on_map import frame_of_words
-from jaxphoto.io.reconstructions.points_beside import PhotographCamera, points_beside
-from jaxphoto.io.reconstructions.tied_photographs import TiedCamera, TiedPhotographs, estimated, free_network
+from jaxphoto.io.reconstructions.points_beside import PhotographCamera, network_beside, points_beside
+from jaxphoto.io.reconstructions.tied_photographs import TiedCamera, estimated
 from jaxphoto.io.text_tables import read_csv
 from jaxphoto.io.whole_text import LARGE, SMALL, read_text
 from jaxphoto.io.yaml_text import yaml_values
@@ -86,23 +84,15 @@ def read_orthority(source: Path) -> BlockTables:
             "folder, or write image_points.csv"
         )
     exterior = ExteriorOrientation.from_angles(given.positions, given.angles)  # type: ignore[arg-type]
-    return free_network(
-        TiedPhotographs(
-            path.name,
-            "the program",
-            path.resolve().parent.name,
-            cameras,
-            given.files,
-            camera_of,
-            np.array([[1.0], [-1.0], [-1.0]]) * still(exterior.camera_from_object),
-            given.positions,
-            shown.points,
-            None,
-            shown.image,
-            shown.point,
-            shown.column_row,
-            frame_of_words(path.name, given.system, given.positions) if given.system else Frame("local"),
-        )
+    return network_beside(
+        path,
+        cameras,
+        given.files,
+        camera_of,
+        still(exterior.camera_from_object),
+        given.positions,
+        shown,
+        given.system,
     )
 
 

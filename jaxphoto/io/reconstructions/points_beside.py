@@ -7,17 +7,21 @@ the upper left one is (0, 0).
 
 import warnings
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxphoto.block import Frame
 from jaxphoto.camera import InteriorOrientation, Sensor
 from jaxphoto.errors import InputError, few, quoted
+from jaxphoto.io.block_folder import BlockTables
 from jaxphoto.io.control_files.rows import Mark
 from jaxphoto.io.reconstructions.measured_text import is_measured, read_measured
+from jaxphoto.io.reconstructions.on_map import frame_of_words
+from jaxphoto.io.reconstructions.tied_photographs import TiedCamera, TiedPhotographs, free_network
 from jaxphoto.io.text_tables import is_number, read_csv
 
 TABLE = "image_points.csv"
@@ -88,6 +92,39 @@ def points_of(text: Path, files: Sequence[str], of: str, cameras: Sequence[Photo
     kept = image >= 0
     points = [measured.points[k] for k in np.flatnonzero(kept).tolist()]
     return named(image[kept], points, (measured.xy * scale + offset)[kept])
+
+
+def network_beside(
+    path: Path,
+    cameras: Mapping[str, TiedCamera],
+    files: Sequence[str],
+    camera_of: Sequence[str],
+    camera_from_object: Float[np.ndarray, "images 3 3"],
+    positions: Float[np.ndarray, "images 3"],
+    shown: Shown,
+    system: str = "",
+) -> BlockTables:
+    """The `free_network` of orientations in our axes that the file `path` gives in the system that these words name, ""
+    for one of its own, and of the points beside it. Raises what `free_network` and `frame_of_words` raise.
+    """
+    return free_network(
+        TiedPhotographs(
+            path.name,
+            "the program",
+            path.resolve().parent.name,
+            cameras,
+            files,
+            camera_of,
+            np.array([[1.0], [-1.0], [-1.0]]) * camera_from_object,
+            positions,
+            shown.points,
+            None,
+            shown.image,
+            shown.point,
+            shown.column_row,
+            frame_of_words(path.name, system, positions) if system else Frame("local"),
+        )
+    )
 
 
 def marks_shown(marks: Sequence[Mark], files: Sequence[str]) -> Shown:

@@ -8,17 +8,21 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from jaxphoto.block import Frame
 from jaxphoto.errors import InputError, few
 from jaxphoto.io.block_folder import BlockTables
 from jaxphoto.io.block_folder.table_layout import TOML
 from jaxphoto.io.cameras import read_camera_file
 from jaxphoto.io.reconstructions import orthority, pix4d
 from jaxphoto.io.reconstructions.exterior_text import ExteriorText, is_exterior, read_exterior
-from jaxphoto.io.reconstructions.on_map import frame_of_words
-from jaxphoto.io.reconstructions.points_beside import PhotographCamera, Shown, measured_texts, points_beside
+from jaxphoto.io.reconstructions.points_beside import (
+    PhotographCamera,
+    Shown,
+    measured_texts,
+    network_beside,
+    points_beside,
+)
 from jaxphoto.io.reconstructions.rays import ray_misfit
-from jaxphoto.io.reconstructions.tied_photographs import TiedCamera, TiedPhotographs, estimated, free_network
+from jaxphoto.io.reconstructions.tied_photographs import TiedCamera, estimated
 
 _EXTERIORS = (".txt", ".csv", ".dat", ".ori", ".eo", ".opk", ".pat", ".out", "")
 _CAMERAS = (".toml", ".xml", ".yml", ".yaml", ".json", ".cameramodel")
@@ -57,23 +61,15 @@ def read_text_project(source: Path) -> BlockTables:
             "PATB into this folder, or write image_points.csv"
         )
     rotations = _turned(given, camera, shown)
-    return free_network(
-        TiedPhotographs(
-            path.name,
-            "the program",
-            path.resolve().parent.name,
-            {"camera": camera},
-            given.names,
-            ["camera"] * len(given.names),
-            np.array([[1.0], [-1.0], [-1.0]]) * rotations,
-            given.positions,
-            shown.points,
-            None,
-            shown.image,
-            shown.point,
-            shown.column_row,
-            frame_of_words(path.name, given.system, given.positions) if given.system else Frame("local"),
-        )
+    return network_beside(
+        path,
+        {"camera": camera},
+        given.names,
+        ["camera"] * len(given.names),
+        rotations,
+        given.positions,
+        shown,
+        given.system,
     )
 
 
