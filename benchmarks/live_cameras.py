@@ -18,6 +18,7 @@ from pathlib import Path
 import equinox as eqx
 import jax
 import numpy as np
+from camera_drift import RECIPE
 
 from jaxphoto import adjust, covariance
 from jaxphoto.io import recipe_from
@@ -27,16 +28,8 @@ from jaxphoto.simulation.changing_cameras import drawn
 from jaxphoto.simulation.flight import fly
 from jaxphoto.statistics import SIGNIFICANCE_LEVEL, camera_drifts, camera_wanderings, strip_differences
 
-FLIGHT = {
-    "cameras": {
-        "mapper": {
-            "width_px": 7000, "height_px": 5000, "pixel_mm": 0.006, "distortion": "brown",
-            "interior": {"c_mm": 35.0},
-            "truth": {"c_mm": 35.04, "xp_mm": 0.02, "yp_mm": -0.03, "k1": -1e-5, "k2": 1e-9},
-            "unknowns": dict.fromkeys(("c_mm", "xp_mm", "yp_mm", "k1", "k2"), "free"),
-        }
-    },
-    "mounts": {"default": {"boresight": "free"}},
+# The camera, the aircraft and how well both are known are those of the other benchmark.
+FLIGHT = {name: RECIPE[name] for name in ("cameras", "mounts", "jitter", "sigmas")} | {
     "flight": {
         "height_m": 1000.0, "forward_overlap_percent": 60.0, "side_overlap_percent": 30.0, "turn_s": 300.0,
         "strips": [
@@ -44,12 +37,9 @@ FLIGHT = {
             {"name": "X", "heading_deg": 90.0, "images": 5},
         ],
     },
-    "jitter": {"position_m": 10.0, "angle_deg": 2.0, "crab_deg": 2.0},
     "terrain": {"kind": "rolling"},
     "points": {"ties": 200},
     "targets": [{"role": "control", "count": 4}],
-    "sigmas": {"image_mm": 0.002, "control_m": 0.03, "station_m": [0.03, 0.03, 0.05],
-               "attitude_deg": [0.0025, 0.0025, 0.005]},
 }  # fmt: skip
 RATES = ("c_rate", "xp_rate", "yp_rate")
 MORE = ("c_more", "xp_more", "yp_more")
