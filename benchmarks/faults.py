@@ -101,6 +101,11 @@ class Tried:
             self.whole = _digests(place / case.out)
             _remove(place / case.out)
 
+    @property
+    def kept(self) -> str:
+        """What a run that did not end has worked out so far, beside its place, for the next one to go on from."""
+        return f"{self.case.out}.progress"
+
     def words(self, place: Path) -> list[str]:
         """The command line of a run that writes below `place`."""
         return [self.name, *self.case.arguments, "--out", str(place / self.case.out)]
@@ -147,10 +152,11 @@ class Tried:
                 code = _ended(self.start(disk))
                 self.count("read-only disks" if read_only else "full disks")
                 here = f"on a {'read-only disk' if read_only else f'disk of {room} bytes'}"
+                left = _names(disk) - {self.kept}
                 if code == 0:
                     yield from self.judged(disk, here, must_be=True)
-                elif code != 2 or (_names(disk) and self.name not in _GOES_ON):
-                    yield f"{here}: exit code {code}, {sorted(_names(disk))} there"
+                elif code != 2 or (left and self.name not in _GOES_ON):
+                    yield f"{here}: exit code {code}, {sorted(left)} there"
 
     def twice_at_once(self, number: int) -> Iterator[str]:
         """Run twice at once into one place."""
@@ -171,8 +177,7 @@ class Tried:
 
         clear_leftovers(place)
         out = place / self.case.out
-        # What a killed run has worked out so far stays beside its place, for the next one to go on from.
-        if others := _names(place) - {self.case.out} - ({f"{self.case.out}.progress"} if not finished else set()):
+        if others := _names(place) - {self.case.out} - ({self.kept} if not finished else set()):
             yield f"{when}: {sorted(others)} left"
         if not out.exists():
             if must_be and self.name not in _GOES_ON:

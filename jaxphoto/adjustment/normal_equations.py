@@ -27,6 +27,7 @@ from jaxphoto.adjustment.solver.normal import Linearised
 from jaxphoto.adjustment.solver.optimum import iterate, typical_scale, unit_scale, weigh_datum
 from jaxphoto.adjustment.solver.reduced import reduce_normal
 from jaxphoto.arrays import Numbers, still
+from jaxphoto.compiling import call_compiled
 
 
 class NormalEquations(eqx.Module):
@@ -54,7 +55,9 @@ class NormalEquations(eqx.Module):
     @property
     def weighed(self) -> "NormalEquations":
         """The same with the constraints of the datum as `at` has them."""
-        return dataclasses.replace(self, values=self.at.values, is_weighed=True)
+        if self.is_weighed or not self.values.datum_eop.shape[0]:
+            return dataclasses.replace(self, is_weighed=True)
+        return dataclasses.replace(self, values=call_compiled(_weighed, self.values, self.structure), is_weighed=True)
 
     @property
     def on_one_device(self) -> "NormalEquations":
@@ -115,6 +118,10 @@ class NormalEquations(eqx.Module):
     def constraints(self) -> Increments:
         """Derivatives of the constraints of the datum, along a leading axis."""
         return self.at.constraints()
+
+
+# Operation by operation it takes half a second, and compiles each of them.
+_weighed = eqx.filter_jit(weigh_datum)
 
 
 def factor_normal(values: TiledValues, structure: TiledStructure) -> FactoredNormal:

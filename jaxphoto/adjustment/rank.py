@@ -11,13 +11,13 @@ import numpy as np
 from jaxphoto.adjustment.layout.sharding import EVERYWHERE, sharded
 from jaxphoto.adjustment.normal_equations import NormalEquations
 from jaxphoto.adjustment.result import Adjustment
-from jaxphoto.adjustment.solver.band import Band, pivots
+from jaxphoto.adjustment.solver.band import Band
 from jaxphoto.adjustment.solver.normal import Linearised
 from jaxphoto.adjustment.solver.reduced import reduce_normal
+from jaxphoto.adjustment.weak_directions import pivots_of
 from jaxphoto.adjustment.weak_words import weaknesses_of
 from jaxphoto.block import Block, exposures
 from jaxphoto.camera import RATES, CameraSpline
-from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import DatumError, RankError
 from jaxphoto.georeferencing import RigCamera
 from jaxphoto.observations import AbstractObservations, RigPlaces, RigTurns
@@ -208,18 +208,12 @@ def check_rank(adjusted: Adjustment) -> None:
     """Raise RankError where the normal matrix at the optimum is singular, with what is open and the mend."""
     if adjusted.factored is None or not bool(adjusted.converged):
         return
-    factored = adjusted.equations.factored
-    left = np.asarray(call_compiled(_pivots, factored.reduced.diagonal, factored.factor))
-    if left.min() > DEFECT:
+    if pivots_of(adjusted.equations).min() > DEFECT:
         return
     if found := weaknesses_of(adjusted):
         sentences = "; ".join(weakness.sentence for weakness in found)
         points = {p for weakness in found for p in weakness.points} if all(w.points for w in found) else set()
         raise RankError(f"the observations cannot tell these unknowns apart: {sentences}", sorted(points))
-
-
-# Operation by operation it would compile each of them, a fifth of a second in all.
-_pivots = eqx.filter_jit(pivots)
 
 
 @eqx.filter_jit

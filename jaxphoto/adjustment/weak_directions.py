@@ -11,6 +11,7 @@ makes the errors of observations larger. Found by subspace iteration with the fa
 little that a direction which nothing sees comes out with an enormous standard deviation instead of none.
 """
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -22,8 +23,9 @@ from jaxphoto.adjustment.layout.padding import TiledBlock
 from jaxphoto.adjustment.model.numbers import Increments
 from jaxphoto.adjustment.normal_equations import NormalEquations
 from jaxphoto.adjustment.result import Adjustment
-from jaxphoto.adjustment.solver.band import factor_band
-from jaxphoto.adjustment.solver.elimination import solve_factored
+from jaxphoto.adjustment.right_hand_sides import solve_many
+from jaxphoto.adjustment.solver.band import factor_band, pivots
+from jaxphoto.adjustment.solver.elimination import FactoredNormal
 from jaxphoto.adjustment.solver.reduced import reduce_normal
 from jaxphoto.arrays import still
 from jaxphoto.compiling import call_compiled
@@ -35,7 +37,11 @@ OPEN = 1e4
 """Above this nothing sees it at all: what is left is the damping, or noise."""
 # Relative to the diagonal of N: rounding is smaller, what any observation sees is larger.
 _DAMPING = 1e-12
+# Pivots above this it would change by a millionth, so that the adjustment's own equations will do.
+_FELT = 1e-6
 _DIRECTIONS, _ITERATIONS = 12, 6
+# Columns of the covariance matrix that are held side by side.
+_AT_ONCE = 48
 # The part of a direction's largest motion from which on an unknown takes part in it.
 _MOVES = 0.1
 
@@ -122,7 +128,7 @@ def weak_directions(adjusted: Adjustment, least: float = POOR) -> list[WeakDirec
     Where the unknowns of `adjusted` are: at the optimum, or wherever the solver stopped. None where numbers are
     infinite there. The standard deviations are a priori.
     """
-    equations, tiled = adjusted.equations.on_one_device, adjusted.tiled
+    equations, tiled = _sound(adjusted), adjusted.tiled
     yard = yardsticks(adjusted)
     scale = jax.tree.map(still, equations.scale)
     sizes = np.repeat([yard.ground, yard.angle], 3)[:, None]
@@ -134,10 +140,9 @@ def weak_directions(adjusted: Adjustment, least: float = POOR) -> list[WeakDirec
     k, q = min(_DIRECTIONS, len(free)), len(yard.shared)
     basis = np.zeros((len(flat), _DIRECTIONS))
     basis[free, :k] = np.linalg.qr(rng.standard_normal((len(free), k)))[0]
-    system = call_compiled(_damped, equations)
 
     def covariance_times(columns: np.ndarray) -> np.ndarray:
-        product = call_compiled(_solve, equations, system, _tree(columns * flat[:, None], over))
+        product = solve_many(equations, _tree(columns * flat[:, None], over), adjusted.seconds)
         return _columns(product) * flat[:, None]
 
     for _ in range(_ITERATIONS):
@@ -148,13 +153,12 @@ def weak_directions(adjusted: Adjustment, least: float = POOR) -> list[WeakDirec
     inner = basis[:, :k].T @ covariance_times(basis)[:, :k]
     mu, vectors = np.linalg.eigh((inner + inner.T) / 2)
     along = (basis[:, :k] @ vectors * np.sqrt(np.maximum(mu, 0.0))).T[::-1]
-    columns = np.zeros((len(flat), -(-q // _DIRECTIONS) * _DIRECTIONS))
     own = scale.eop.size + np.arange(q)
-    columns[own, np.arange(q)] = 1.0
-    batches = (
-        [covariance_times(part) for part in np.split(columns, columns.shape[1] // _DIRECTIONS, axis=1)] if q else []
-    )
-    variance = np.array([batches[j // _DIRECTIONS][row, j % _DIRECTIONS] for j, row in enumerate(own)])
+    variance = np.zeros(q)
+    for some in np.split(np.arange(q), range(_AT_ONCE, q, _AT_ONCE)):
+        columns = np.zeros((len(flat), len(some)))
+        columns[own[some], np.arange(len(some))] = 1.0
+        variance[some] = covariance_times(columns)[own[some], np.arange(len(some))]
     found = [_direction(_tree(v[:, None], over), variance, tiled) for v in along]
     return [d for d in found if d.sigma > least]
 
@@ -187,20 +191,23 @@ def _tree(columns: np.ndarray, like: Increments) -> Increments:
     return _increments(*(part.reshape(len(part), *v.shape) for part, v in parts))
 
 
+def _sound(adjusted: Adjustment) -> NormalEquations:
+    """Those of `adjusted`, with a damping that rounding cannot turn negative where they might be singular."""
+    equations = adjusted.equations.on_one_device.weighed
+    determined = bool(adjusted.converged) and pivots_of(equations).min() > _FELT
+    return equations if determined else call_compiled(_damped, equations)
+
+
+def pivots_of(equations: NormalEquations) -> Float[np.ndarray, "reduced"]:
+    """What is left of each reduced unknown when those before it are eliminated: 1 unharmed, 0 at a rank defect."""
+    return np.asarray(call_compiled(_pivots, equations.factored.reduced.diagonal, equations.factored.factor))
+
+
+# Operation by operation it would compile each of them, a fifth of a second in all.
+_pivots = eqx.filter_jit(pivots)
+
+
 @eqx.filter_jit
-def _damped(equations: NormalEquations):
-    """The normal equations, reduced and factored, with a damping that rounding cannot turn negative."""
+def _damped(equations: NormalEquations) -> NormalEquations:
     a, reduced, _ = reduce_normal(equations.at, _DAMPING)
-    return reduced, factor_band(a)
-
-
-@eqx.filter_jit
-def _solve(equations: NormalEquations, system, right: Increments) -> Increments:
-    """x of N x = b of several b along a leading axis."""
-    reduced, factor = system
-    at = equations.at
-
-    def one(b: Increments) -> Increments:
-        return solve_factored(reduced, factor, b, at)
-
-    return jax.vmap(one)(right)
+    return dataclasses.replace(equations, factored=FactoredNormal(reduced, factor_band(a), equations.scale))

@@ -6,8 +6,7 @@ observation i. Products z' H z of many errors need no J x: they are those of J' 
 """
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from operator import itemgetter
+from collections.abc import Callable, Iterator, Sequence
 
 import equinox as eqx
 import jax
@@ -18,12 +17,13 @@ from jaxtyping import Array, Float, Int, Int32
 
 from jaxphoto.adjustment import Adjustment, NormalEquations
 from jaxphoto.adjustment.model.numbers import Increments
+from jaxphoto.adjustment.right_hand_sides import at_once, blank, in_batches, prepare_solving, solve_many
 from jaxphoto.arrays import still
 from jaxphoto.compiling import prepare, run_compiled
 
-# Directions that are computed with side by side, and right-hand sides that are solved for: making F of a large block
-# anew costs more than these do. Together they have no more numbers than this, as several arrays of them are held.
-_AT_ONCE, _SOLVED_AT_ONCE, _NUMBERS = 16, 48, 20_000_000
+# Directions that are computed with side by side. Together they have no more numbers than this, as several arrays of
+# them are held.
+_AT_ONCE, _NUMBERS = 16, 20_000_000
 
 
 Column = Callable[[int], Float[np.ndarray, "n"]]
@@ -33,6 +33,8 @@ class Responses(eqx.Module):
     """What directions of errors of the observations do, computed in batches."""
 
     adjusted: Adjustment
+    equations: NormalEquations
+    """Of one device, weighed once for all."""
     laid: Int32[np.ndarray, "places"]
     """The number, in the block's own order, of everything in the arrays that are computed with; `count`: padding."""
     count: int
@@ -50,12 +52,12 @@ class Responses(eqx.Module):
         padded = adjusted.tiled.pad_residuals(numbered, float(ends[-1]))
         laid = np.concatenate([np.ravel(v) for v in jax.tree.leaves(padded)]).astype(np.int32)
         places = {name: np.asarray(v).astype(int) for name, v in numbered.named.items()}
-        return cls(adjusted, laid, int(ends[-1]), places)
+        return cls(adjusted, adjusted.equations.on_one_device.weighed, laid, int(ends[-1]), places)
 
     def to_errors(self, column: Column, many: int) -> Iterator[tuple[Float[np.ndarray, "shared"], np.ndarray]]:
         """Of each error z = `column(k)`, whitened and in the order of `places`: the shared unknowns' motion, in their
         own units, and H z."""
-        size = _many_solved(self.adjusted.equations.scale)
+        size = at_once(self.equations.scale)
         for first in range(0, many, size):
             x = self.solved(self._pulled(column, range(first, min(first + size, many))))
             yield from zip(self._moved(x), self._pushed(x), strict=True)
@@ -63,8 +65,7 @@ class Responses(eqx.Module):
     def of_unknowns(self, shared: Sequence[int]) -> Iterator[Float[np.ndarray, "n"]]:
         """By how much each of some `shared` unknowns (places in `Structure.labels`) moves, in its unit, with an error
         of one standard deviation of each observation."""
-        zero = self._equations.at.increments
-        b = jax.tree.map(lambda v: np.zeros((len(shared), *v.shape)), zero)
+        b = jax.tree.map(lambda v: np.zeros((len(shared), *v.shape)), self.equations.scale)
         b.shared[np.arange(len(shared)), np.array(shared, int)] = 1.0
         for k, moved in zip(shared, self._pushed(self.solved(b)), strict=True):
             yield -moved * self._scale[k]
@@ -77,12 +78,8 @@ class Responses(eqx.Module):
         return np.matmul(next(flat), next(flat).T), self._moved(x)
 
     @property
-    def _equations(self) -> NormalEquations:
-        return self.adjusted.equations.on_one_device.weighed
-
-    @property
     def _scale(self) -> Float[np.ndarray, "shared"]:
-        return still(self.adjusted.equations.scale.shared)
+        return still(self.equations.scale.shared)
 
     def _moved(self, x: Increments) -> Float[np.ndarray, "m shared"]:
         return -still(x.shared) * self._scale
@@ -98,29 +95,27 @@ class Responses(eqx.Module):
                     z[row] = np.append(column(k), 0.0)[self.laid]
                 yield z
 
-        return self._run(_pull, batches(), len(wanted))
+        # Of none, too: blocks whose parameters are all held, or that have nothing to look for patterns in.
+        none = jax.tree.map(lambda v: np.zeros((0, *v.shape)), self.equations.scale)
+        seconds = self.adjusted.seconds
+        parts = [
+            jax.tree.map(still, run_compiled(_pull, (self.equations, z), seconds, "covariance")) for z in batches()
+        ]
+        return jax.tree.map(lambda *v: np.concatenate(v)[: len(wanted)], none, *parts)
 
     def solved(self, b: Increments) -> Increments:
         """x of N x = b of right-hand sides along a leading axis, in scaled increments."""
-        return self._run(_solve, _in_batches(b, _many_solved(self.adjusted.equations.scale)), len(b.shared))
+        return solve_many(self.equations, b, self.adjusted.seconds)
 
     def _pushed(self, x: Increments) -> Iterator[Float[np.ndarray, "n"]]:
         """J x of each, in the order of `places`."""
-        given, kept, many = self._equations, self.laid < self.count, len(x.shared)
-        for first, some in zip(range(0, many, size := _batch(len(self.laid))), _in_batches(x, size), strict=True):
-            moved = still(run_compiled(_push, (given, some), self.adjusted.seconds, "covariance"))
+        kept, many = self.laid < self.count, len(x.shared)
+        for first, some in zip(range(0, many, size := _batch(len(self.laid))), in_batches(x, size), strict=True):
+            moved = still(run_compiled(_push, (self.equations, some), self.adjusted.seconds, "covariance"))
             for row in moved[: many - first]:
                 own = np.empty(self.count)
                 own[self.laid[kept]] = row[kept]
                 yield own
-
-    def _run(self, function: Callable, batches: Iterable, many: int) -> Increments:
-        """`function` of all batches, joined, without what the last was filled up with."""
-        given, seconds = self._equations, self.adjusted.seconds
-        # Of none, too: blocks whose parameters are all held, or that have nothing to look for patterns in.
-        none = jax.tree.map(lambda v: np.zeros((0, *v.shape)), given.at.increments)
-        parts = [jax.tree.map(still, run_compiled(function, (given, one), seconds, "covariance")) for one in batches]
-        return jax.tree.map(lambda *v: np.concatenate(v)[:many], none, *parts)
 
 
 def prepare_responses(equations: NormalEquations, seconds: dict[str, float]) -> None:
@@ -131,37 +126,19 @@ def prepare_responses(equations: NormalEquations, seconds: dict[str, float]) -> 
     equations = equations.on_one_device.weighed
     shapes = jax.tree.leaves(jax.eval_shape(lambda e: e.at.residuals(), equations))
     n = sum(math.prod(v.shape) for v in shapes)
-    of = lambda k: jax.tree.map(lambda v: np.broadcast_to(0.0, (k, *v.shape)), equations.at.increments)  # noqa: E731
     prepare(_pull, (equations, np.broadcast_to(0.0, (_batch(n), n))), seconds)
-    prepare(_solve, (equations, of(_many_solved(equations.scale))), seconds)
-    prepare(_push, (equations, of(_batch(n))), seconds)
+    prepare_solving(equations, seconds)
+    prepare(_push, (equations, blank(equations.scale, _batch(n))), seconds)
 
 
 def _batch(numbers: int) -> int:
     return int(np.clip(_NUMBERS // numbers, 1, _AT_ONCE))
 
 
-def _many_solved(one: Increments) -> int:
-    return int(np.clip(_NUMBERS // sum(np.size(v) for v in jax.tree.leaves(one)), 1, _SOLVED_AT_ONCE))
-
-
-def _in_batches(tree: Increments, size: int) -> Iterator[Increments]:
-    """Of `size` each, the last filled up with zeros."""
-    rest = -len(tree.shared) % size
-    filled = jax.tree.map(lambda v: np.concatenate([v, np.zeros((rest, *v.shape[1:]))]), tree)
-    for first in range(0, len(filled.shared), size):
-        yield jax.tree.map(itemgetter(slice(first, first + size)), filled)
-
-
 @eqx.filter_jit
 def _pull(equations: NormalEquations, z: Float[Array, "k places"]) -> Increments:
     zero = jax.tree.map(lambda v: jnp.zeros(v.shape), jax.eval_shape(equations.at.residuals))
     return equations.pull(jax.vmap(ravel_pytree(zero)[1])(z))
-
-
-@eqx.filter_jit
-def _solve(equations: NormalEquations, b: Increments) -> Increments:
-    return jax.vmap(equations.solve)(b)
 
 
 @eqx.filter_jit

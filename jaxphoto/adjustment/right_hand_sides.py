@@ -1,0 +1,55 @@
+"""x of N x = b of many right-hand sides, a few at a time, by one program of a block for all that asks so."""
+
+from collections.abc import Iterator
+from operator import itemgetter
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from jaxphoto.adjustment.model.numbers import Increments
+from jaxphoto.adjustment.normal_equations import NormalEquations
+from jaxphoto.arrays import still
+from jaxphoto.compiling import prepare, run_compiled
+
+# Right-hand sides that are solved for side by side: making F of a large block anew costs more than they do. Together
+# they have no more numbers than this, as several arrays of them are held.
+_AT_ONCE, _NUMBERS = 48, 20_000_000
+
+
+def solve_many(equations: NormalEquations, b: Increments, seconds: dict[str, float]) -> Increments:
+    """x of N x = b of right-hand sides along a leading axis, in scaled increments.
+
+    `equations` are those of one device, weighed: others are others' programs.
+    """
+    batches = in_batches(b, at_once(equations.scale))
+    parts = [jax.tree.map(still, run_compiled(_solve, (equations, one), seconds, "covariance")) for one in batches]
+    return jax.tree.map(lambda none, *v: np.concatenate([none[:0], *v])[: len(none)], b, *parts)
+
+
+def prepare_solving(equations: NormalEquations, seconds: dict[str, float]) -> None:
+    """Have what `solve_many` needs compiled in the background."""
+    prepare(_solve, (equations, blank(equations.scale, at_once(equations.scale))), seconds)
+
+
+def blank(one: Increments, many: int) -> Increments:
+    """So many right-hand sides of no memory, for their shapes."""
+    return jax.tree.map(lambda v: np.broadcast_to(0.0, (many, *v.shape)), one)
+
+
+def at_once(one: Increments) -> int:
+    """How many right-hand sides like `one` are solved for side by side."""
+    return int(np.clip(_NUMBERS // sum(np.size(v) for v in jax.tree.leaves(one)), 1, _AT_ONCE))
+
+
+def in_batches(tree: Increments, size: int) -> Iterator[Increments]:
+    """Of `size` each, the last filled up with zeros."""
+    rest = -len(tree.shared) % size
+    filled = jax.tree.map(lambda v: np.concatenate([v, np.zeros((rest, *v.shape[1:]))]), tree)
+    for first in range(0, len(filled.shared), size):
+        yield jax.tree.map(itemgetter(slice(first, first + size)), filled)
+
+
+@eqx.filter_jit
+def _solve(equations: NormalEquations, b: Increments) -> Increments:
+    return jax.vmap(equations.solve)(b)
