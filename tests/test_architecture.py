@@ -82,7 +82,7 @@ def test_no_import_hides_in_a_function():
             "from matplotlib.backends.backend_pdf import PdfPages", "from scipy.sparse import csr_matrix",
             "from scipy import special", "from plotly.graph_objects import Figure",
             "from plotly.offline import get_plotlyjs", "from matplotlib.collections import EllipseCollection",
-            "import xarray as xr",
+            "from matplotlib.colors import to_rgba", "import xarray as xr",
         }  # fmt: skip
         assert set(hidden) <= worth_it | {
             "from scipy.sparse.csgraph import reverse_cuthill_mckee",

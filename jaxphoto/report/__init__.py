@@ -32,6 +32,7 @@ from jaxphoto.report.snooped import left_out_table, snooped_findings
 from jaxphoto.report.table_files import TABLE_FORMATS, check_table_format, to_latex, to_markdown, write_table
 from jaxphoto.report.tables import Tables
 from jaxphoto.report.terminal import print_adjustment, print_warning
+from jaxphoto.report.to_plotly import to_plotly
 from jaxphoto.report.verdict import verdict_of
 from jaxphoto.report.weights import component_findings, component_tables, print_components
 
@@ -78,6 +79,7 @@ __all__ = [
     "summary_of",
     "to_latex",
     "to_markdown",
+    "to_plotly",
     "verdict_of",
     "write_boresight",
     "write_results",
