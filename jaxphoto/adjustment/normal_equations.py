@@ -11,13 +11,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxphoto.adjustment.layout.tiled import TiledResiduals, TiledStructure, TiledValues
-from jaxphoto.adjustment.model.numbers import Increments, UnknownArrays, state_at, zero_increments
+from jaxphoto.adjustment.model.numbers import Increments, NonImageResiduals, UnknownArrays, state_at, zero_increments
 from jaxphoto.adjustment.solver.band import Band, dense, factor_band, invert_band, pivots, solve_band
 from jaxphoto.adjustment.solver.elimination import (
     FactoredNormal,
     gradient,
     pull,
+    pull_others,
     push,
+    push_others,
     reduce_right,
     solve_factored,
     solve_reduced,
@@ -76,6 +78,14 @@ class NormalEquations(eqx.Module):
     def push(self, x: Increments) -> TiledResiduals:
         """J x: how what was adjusted moves, over its sigmas, with the unknowns; of many by `jax.vmap`."""
         return push(x, self.at)
+
+    def pull_others(self, z: NonImageResiduals) -> Increments:
+        """J' z of all but image rows, without a look at these; of many along a leading axis."""
+        return pull_others(z, self.at)
+
+    def push_others(self, x: Increments) -> NonImageResiduals:
+        """J x of all but image rows; of many by `jax.vmap`."""
+        return push_others(x, self.at)
 
     def cofactors(self, of_rows: Bool[Numbers, ""]) -> tuple[Cofactors, RowCofactors]:
         """The inverse of N for images, shared unknowns and each point, and of rows in tiles, if these are wanted."""

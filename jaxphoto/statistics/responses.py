@@ -7,6 +7,7 @@ observation i. Products z' H z of many errors need no J x: they are those of J' 
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -16,7 +17,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int, Int32
 
 from jaxphoto.adjustment import Adjustment, NormalEquations
-from jaxphoto.adjustment.model.numbers import Increments
+from jaxphoto.adjustment.model.numbers import Increments, NonImageResiduals
 from jaxphoto.adjustment.right_hand_sides import at_once, blank, in_batches, prepare_solving, solve_many
 from jaxphoto.arrays import still
 from jaxphoto.compiling import prepare, run_compiled
@@ -40,19 +41,23 @@ class Responses(eqx.Module):
     count: int
     places: dict[str, Int[np.ndarray, "..."]]
     """The number of each observation by the name of its group, shaped like the residuals."""
+    image_rows: bool = eqx.field(static=True, default=True)
+    """Whether errors are in image points, too; without these, H z is zero there, and takes next to no time."""
 
     @classmethod
-    def of(cls, adjusted: Adjustment) -> "Responses":
+    def of(cls, adjusted: Adjustment, *, image_rows: bool = True) -> "Responses":
         """Of an adjustment."""
         leaves, structure = jax.tree.flatten(adjusted.residuals)
         ends = np.cumsum([np.size(v) for v in leaves])
         numbers = [np.arange(e - np.size(v), e, dtype=float) for v, e in zip(leaves, ends, strict=True)]
         shaped = [n.reshape(np.shape(v)) for n, v in zip(numbers, leaves, strict=True)]
         numbered = jax.tree.unflatten(structure, shaped)
-        padded = adjusted.tiled.pad_residuals(numbered, float(ends[-1]))
+        padded: NonImageResiduals = adjusted.tiled.pad_residuals(numbered, float(ends[-1]))
+        if not image_rows:
+            padded = NonImageResiduals(padded.others, padded.datum, padded.names)
         laid = np.concatenate([np.ravel(v) for v in jax.tree.leaves(padded)]).astype(np.int32)
         places = {name: np.asarray(v).astype(int) for name, v in numbered.named.items()}
-        return cls(adjusted, adjusted.equations.on_one_device.weighed, laid, int(ends[-1]), places)
+        return cls(adjusted, adjusted.equations.on_one_device.weighed, laid, int(ends[-1]), places, image_rows)
 
     def to_errors(self, column: Column, many: int) -> Iterator[tuple[Float[np.ndarray, "shared"], np.ndarray]]:
         """Of each error z = `column(k)`, whitened and in the order of `places`: the shared unknowns' motion, in their
@@ -97,10 +102,8 @@ class Responses(eqx.Module):
 
         # Of none, too: blocks whose parameters are all held, or that have nothing to look for patterns in.
         none = jax.tree.map(lambda v: np.zeros((0, *v.shape)), self.equations.scale)
-        seconds = self.adjusted.seconds
-        parts = [
-            jax.tree.map(still, run_compiled(_pull, (self.equations, z), seconds, "covariance")) for z in batches()
-        ]
+        pull = _pull if self.image_rows else _pull_others
+        parts = [jax.tree.map(still, self._run(pull, z)) for z in batches()]
         return jax.tree.map(lambda *v: np.concatenate(v)[: len(wanted)], none, *parts)
 
     def solved(self, b: Increments) -> Increments:
@@ -109,13 +112,15 @@ class Responses(eqx.Module):
 
     def _pushed(self, x: Increments) -> Iterator[Float[np.ndarray, "n"]]:
         """J x of each, in the order of `places`."""
-        kept, many = self.laid < self.count, len(x.shared)
+        kept, many, push = self.laid < self.count, len(x.shared), _push if self.image_rows else _push_others
         for first, some in zip(range(0, many, size := _batch(len(self.laid))), in_batches(x, size), strict=True):
-            moved = still(run_compiled(_push, (self.equations, some), self.adjusted.seconds, "covariance"))
-            for row in moved[: many - first]:
-                own = np.empty(self.count)
+            for row in still(self._run(push, some))[: many - first]:
+                own = np.zeros(self.count)
                 own[self.laid[kept]] = row[kept]
                 yield own
+
+    def _run(self, program: Callable, given: Any) -> Any:
+        return run_compiled(program, (self.equations, given), self.adjusted.seconds, "covariance")
 
 
 def prepare_responses(equations: NormalEquations, seconds: dict[str, float]) -> None:
@@ -132,13 +137,24 @@ def prepare_responses(equations: NormalEquations, seconds: dict[str, float]) -> 
 
 
 def _batch(numbers: int) -> int:
-    return int(np.clip(_NUMBERS // numbers, 1, _AT_ONCE))
+    return int(np.clip(_NUMBERS // max(numbers, 1), 1, _AT_ONCE))
 
 
 @eqx.filter_jit
 def _pull(equations: NormalEquations, z: Float[Array, "k places"]) -> Increments:
     zero = jax.tree.map(lambda v: jnp.zeros(v.shape), jax.eval_shape(equations.at.residuals))
     return equations.pull(jax.vmap(ravel_pytree(zero)[1])(z))
+
+
+@eqx.filter_jit
+def _pull_others(equations: NormalEquations, z: Float[Array, "k places"]) -> Increments:
+    zero = jax.tree.map(lambda v: jnp.zeros(v.shape), jax.eval_shape(equations.push_others, equations.scale))
+    return equations.pull_others(jax.vmap(ravel_pytree(zero)[1])(z))
+
+
+@eqx.filter_jit
+def _push_others(equations: NormalEquations, x: Increments) -> Float[Array, "k places"]:
+    return jax.vmap(lambda one: ravel_pytree(equations.push_others(one))[0])(x)
 
 
 @eqx.filter_jit

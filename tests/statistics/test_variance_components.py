@@ -40,10 +40,12 @@ def test_traces_are_those_of_dense_matrices(split):
     assert (found.uncertainty == 0).all()
 
 
-def test_random_vectors_agree_with_exact_traces():
-    """Image points of three cameras have 164, 154 and 104 coordinates: two of the parts take random vectors."""
-    parts = parts_of(adjusted(BLOCK), ("camera",))
-    found = partial_redundancy(adjusted(BLOCK), parts, probes=32)
+@pytest.mark.parametrize(("split", "probes"), [(("camera",), 32), (("xy-z",), 12)])
+def test_random_vectors_agree_with_exact_traces(split, probes):
+    """Image points of three cameras have 164, 154 and 104 coordinates: two of the parts take random vectors. Where they
+    are one part, they take none, and nothing is computed of them."""
+    parts = parts_of(adjusted(BLOCK), split)
+    found = partial_redundancy(adjusted(BLOCK), parts, probes=probes)
     error = found.matrix - dense_traces(parts)
     random = found.uncertainty > 0
     assert 1 < random.sum() < random.size

@@ -182,10 +182,15 @@ def pull(z: TiledResiduals, at: Linearised) -> Increments:
     of_images = jax.ops.segment_sum(of_images.reshape(-1, *of_images.shape[3:]), image.reshape(-1), s.n_images)
     column = jnp.asarray(s.column)[:, : s.n_image_colours]
     shared = jnp.zeros((s.n_shared + 1, len(z.image))).at[column].add(of_images[:, :, 6:].swapaxes(1, 2))[:-1].T
-    _, of_others = jax.vjp(lambda y: non_image_residuals(y, scale, values, s), at.increments)
-    (b_others,) = jax.vmap(lambda z: of_others(NonImageResiduals(z.others, z.datum, z.names)))(z)
     b = Increments(of_images[:, :, :6].transpose(1, 2, 0), shared, s.by_point(of_points))
-    return jax.tree.map(jnp.add, b, b_others)
+    return jax.tree.map(jnp.add, b, pull_others(z, at))
+
+
+def pull_others(z: NonImageResiduals, at: Linearised) -> Increments:
+    """J'z of all but the image rows, of many along a leading axis."""
+    _, scale, values, s = at
+    _, of_others = jax.vjp(lambda y: non_image_residuals(y, scale, values, s), at.increments)
+    return jax.vmap(lambda one: of_others(NonImageResiduals(one.others, one.datum, one.names))[0])(z)
 
 
 def push(x: Increments, at: Linearised) -> TiledResiduals:
@@ -204,8 +209,14 @@ def push(x: Increments, at: Linearised) -> TiledResiduals:
 
     numbers = (s.by_tile(at.state.points), s.by_tile(x.points * scale.points), values.xy, values.sigma_xy)
     image = s.each_tile(tile, numbers)
-    _, others = jax.jvp(lambda y: non_image_residuals(y, scale, values, s), (at.increments,), (x,))
+    others = push_others(x, at)
     return TiledResiduals(others.others, others.datum, others.names, image)
+
+
+def push_others(x: Increments, at: Linearised) -> NonImageResiduals:
+    """J x of all but the image rows; of many by `jax.vmap`."""
+    _, scale, values, s = at
+    return jax.jvp(lambda y: non_image_residuals(y, scale, values, s), (at.increments,), (x,))[1]
 
 
 def _others_and_gradient(at: Linearised) -> tuple[NonImageResiduals, Increments]:
