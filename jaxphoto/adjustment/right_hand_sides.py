@@ -14,7 +14,7 @@ from jaxphoto.compiling import prepare, run_compiled
 
 # Right-hand sides that are solved for side by side: making F of a large block anew costs more than they do. Together
 # they have no more numbers than this, as several arrays of them are held.
-_AT_ONCE, _NUMBERS = 48, 20_000_000
+_AT_ONCE, _NUMBERS = 48, 8_000_000
 
 
 def solve_many(equations: NormalEquations, b: Increments, seconds: dict[str, float]) -> Increments:
