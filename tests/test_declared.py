@@ -15,18 +15,21 @@ from jax.flatten_util import ravel_pytree
 
 import jaxphoto.observations
 from jaxphoto import FIXED, FREE, AbstractObservations, JaxphotoError, Tables, Weighted, adjust, covariance, monte_carlo
-from jaxphoto.adjustment import Linearised
+from jaxphoto.adjustment.adjust import _residuals
 from jaxphoto.adjustment.layout.tile_layout import sizes_of
-from jaxphoto.adjustment.model.numbers import zero_increments
+from jaxphoto.adjustment.model.block_values import with_start
+from jaxphoto.adjustment.model.numbers import state_at, zero_increments
 from jaxphoto.adjustment.model.structure import structure_of
-from jaxphoto.adjustment.solver.optimum import typical_scale, weigh_datum
+from jaxphoto.adjustment.right_hand_sides import solve_many
+from jaxphoto.adjustment.solver.optimum import typical_scale
+from jaxphoto.compiling import run_compiled
 from jaxphoto.observations import Correlated, KnownParameters
 from jaxphoto.parameters import numbers_of
 from jaxphoto.report import Verdict, write_results
 from jaxphoto.sensitivity import noise, sensitivity
 from jaxphoto.sensitivity.designs import prepare_design
 from jaxphoto.statistics import observation_groups, redundancy_numbers
-from tests.adjustment.dense import dense_of, in_one_list, own_order
+from tests.adjustment.dense import in_order, own_order, rows_of
 from tests.declared import OWN, adjusted, own_priors, residuals_of, simulated
 
 # Every class that a file or a notebook gives rows of, by the groups of the block that show it.
@@ -74,7 +77,7 @@ def test_no_class_of_observations_is_forgotten():
 
 @functools.cache
 def dense():
-    return dense_of(adjusted())
+    return rows_of(adjusted())
 
 
 @functools.cache
@@ -89,24 +92,21 @@ def differences() -> tuple[np.ndarray, np.ndarray]:
     """What all residuals answer to eight random directions: by the Jacobian, and by central differences."""
     a = adjusted()
     equations = a.equations
-    s = equations.structure
+    values, s = equations.values, equations.structure
+    scale, back = typical_scale(values, s), ravel_pytree(zero_increments(s))[1]
 
-    def answered(values, direction):
-        values = weigh_datum(values, s)
-        scale = typical_scale(values, s)
-        _, back = ravel_pytree(zero_increments(s))
+    def at(increments) -> np.ndarray:
+        """By the program of the residuals alone, which knows of no derivative."""
+        there = with_start(values, state_at(back(increments), scale, values, s))
+        return in_order(a.tiled.crop_residuals(run_compiled(_residuals, (there, s), {}, "residuals")))
 
-        def at(h):
-            return in_one_list(Linearised(back(h * direction), scale, values, s).residuals())
-
-        return (at(-2 * _STEP) - 8 * at(-_STEP) + 8 * at(_STEP) - at(2 * _STEP)) / (12 * _STEP)
-
-    unknowns, rows = own_order(equations.values, a.tiled)
+    unknowns = own_order(values, a.tiled)[0]
     rng, n = np.random.default_rng(3), np.size(ravel_pytree(zero_increments(s))[0])
     directions = np.zeros((8, n))
     directions[:, unknowns] = rng.normal(size=(8, len(unknowns)))
-    found = np.array(jax.jit(lambda v, d: jax.lax.map(lambda one: answered(v, one), d))(equations.values, directions))
-    return dense().jacobian @ directions[:, unknowns].T, found[:, rows].T
+    h = _STEP * directions
+    found = [(at(-2 * d) - 8 * at(-d) + 8 * at(d) - at(2 * d)) / (12 * _STEP) for d in h]
+    return dense().jacobian @ directions[:, unknowns].T, np.stack(found, axis=1)
 
 
 # Of increments that are typical of an unknown: fourth-order differences are then right to eight digits and more.
@@ -133,11 +133,18 @@ def test_every_row_weighs_in_the_normal_equations(group):
 
 
 def test_elimination_solves_the_dense_normal_equations():
-    d = dense()
+    d, equations = dense(), adjusted().equations
     j = d.jacobian[:, d.free]
     n = j.T @ j
-    expected = scipy.linalg.cho_solve(scipy.linalg.cho_factor(n), d.vector[d.free])
-    error = d.solutions[0][d.free] - expected
+    unknowns = own_order(equations.values, adjusted().tiled)[0]
+    flat, back = ravel_pytree(zero_increments(equations.structure))
+    right = np.zeros(len(flat))
+    right[unknowns] = np.sin(1.0 + np.arange(len(unknowns))) * d.free
+    (x,) = jax.vmap(lambda tree: ravel_pytree(tree)[0])(
+        solve_many(equations.on_one_device.weighed, jax.tree.map(lambda v: np.asarray(v)[None], back(right)), {})
+    )
+    expected = scipy.linalg.cho_solve(scipy.linalg.cho_factor(n), right[unknowns][d.free])
+    error = np.asarray(x)[unknowns][d.free] - expected
     assert np.sqrt(error @ n @ error) < 1e-9 * np.sqrt(expected @ n @ expected)
 
 
