@@ -422,6 +422,7 @@ def test_an_own_unknown_held_fixed_stays_as_it_starts_and_a_strong_prior_does_th
     assert {numbers[kind] for kind in OWN} == {0}
 
 
+@pytest.mark.slow
 def test_a_covariance_of_a_vector_is_what_known_parameters_say_and_both_pull():
     """Known beforehand with a correlation near one, the shift moves along it."""
     known = np.array([0.5, -0.1])

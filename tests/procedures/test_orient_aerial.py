@@ -55,6 +55,7 @@ def test_rolling_ground_and_a_lens_that_nothing_is_known_of():
     assert abs(float(get_parameter(interior, "k1")) - CHEAP.k1) < 2e-4
 
 
+@pytest.mark.slow
 def test_flat_ground_and_vertical_images_leave_c_open(tmp_path):
     """What is known of c beforehand is in the block, and in the standard deviations."""
     scene = aerial(per_strip=4, relief=0.0, tilt=0.003)
