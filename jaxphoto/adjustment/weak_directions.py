@@ -7,11 +7,13 @@ the standard deviation of the observed positions or attitudes. With C the covari
 
 a direction u of large mu is one along which the block gives way: within one standard deviation unknown k moves by
 u_k sqrt(mu). A standard deviation in yardsticks is what GNSS calls a dilution of precision: by how much the geometry
-makes the errors of observations larger. Found by subspace iteration with the factored normal matrix, damped by so
-little that a direction which nothing sees comes out with an enormous standard deviation instead of none.
+makes the errors of observations larger. Found by subspace iteration with the factored normal matrix, which is damped
+where it might be singular, by so little that a direction which nothing sees comes out with an enormous standard
+deviation instead of none.
 """
 
 import dataclasses
+import math
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -23,7 +25,7 @@ from jaxphoto.adjustment.layout.padding import TiledBlock
 from jaxphoto.adjustment.model.numbers import Increments
 from jaxphoto.adjustment.normal_equations import NormalEquations
 from jaxphoto.adjustment.result import Adjustment
-from jaxphoto.adjustment.right_hand_sides import solve_many
+from jaxphoto.adjustment.right_hand_sides import at_once, solve_many
 from jaxphoto.adjustment.solver.band import factor_band, pivots
 from jaxphoto.adjustment.solver.elimination import FactoredNormal
 from jaxphoto.adjustment.solver.reduced import reduce_normal
@@ -37,11 +39,10 @@ OPEN = 1e4
 """Above this nothing sees it at all: what is left is the damping, or noise."""
 # Relative to the diagonal of N: rounding is smaller, what any observation sees is larger.
 _DAMPING = 1e-12
-# Pivots above this it would change by a millionth, so that the adjustment's own equations will do.
+# Where all pivots of the reduced unknowns are above this, it would change theirs by a millionth, and the adjustment's
+# own equations will do. Points whose rays are nearly parallel are then as the adjustment has them.
 _FELT = 1e-6
 _DIRECTIONS, _ITERATIONS = 12, 6
-# Columns of the covariance matrix that are held side by side.
-_AT_ONCE = 48
 # The part of a direction's largest motion from which on an unknown takes part in it.
 _MOVES = 0.1
 
@@ -138,8 +139,8 @@ def weak_directions(adjusted: Adjustment, least: float = POOR) -> list[WeakDirec
     flat = _flat(over)
     rng, free = np.random.default_rng(0), np.flatnonzero(flat > 0)
     k, q = min(_DIRECTIONS, len(free)), len(yard.shared)
-    basis = np.zeros((len(flat), _DIRECTIONS))
-    basis[free, :k] = np.linalg.qr(rng.standard_normal((len(free), k)))[0]
+    basis = np.zeros((len(flat), k))
+    basis[free] = np.linalg.qr(rng.standard_normal((len(free), k)))[0]
 
     def covariance_times(columns: np.ndarray) -> np.ndarray:
         product = solve_many(equations, _tree(columns * flat[:, None], over), adjusted.seconds)
@@ -149,13 +150,13 @@ def weak_directions(adjusted: Adjustment, least: float = POOR) -> list[WeakDirec
         moved = covariance_times(basis)
         if not np.isfinite(moved).all():
             return []
-        basis[:, :k] = np.linalg.qr(moved[:, :k])[0]
-    inner = basis[:, :k].T @ covariance_times(basis)[:, :k]
+        basis = np.linalg.qr(moved)[0]
+    inner = basis.T @ covariance_times(basis)
     mu, vectors = np.linalg.eigh((inner + inner.T) / 2)
-    along = (basis[:, :k] @ vectors * np.sqrt(np.maximum(mu, 0.0))).T[::-1]
+    along = (basis @ vectors * np.sqrt(np.maximum(mu, 0.0))).T[::-1]
     own = scale.eop.size + np.arange(q)
-    variance = np.zeros(q)
-    for some in np.split(np.arange(q), range(_AT_ONCE, q, _AT_ONCE)):
+    variance, step = np.zeros(q), at_once(equations.scale)
+    for some in np.split(np.arange(q), range(step, q, step)) if q else []:
         columns = np.zeros((len(flat), len(some)))
         columns[own[some], np.arange(len(some))] = 1.0
         variance[some] = covariance_times(columns)[own[some], np.arange(len(some))]
@@ -181,7 +182,7 @@ def _flat(tree: Increments) -> np.ndarray:
 
 def _columns(tree: Increments) -> np.ndarray:
     """Increments along a leading axis as columns."""
-    return np.concatenate([still(v).reshape(len(v), -1) for v in tree], axis=1).T
+    return np.concatenate([still(v).reshape(len(v), math.prod(np.shape(v)[1:])) for v in tree], axis=1).T
 
 
 def _tree(columns: np.ndarray, like: Increments) -> Increments:

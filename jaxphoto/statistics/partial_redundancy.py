@@ -9,7 +9,7 @@ which takes products H z (`Responses`): exactly, z is each unit vector of part k
 part, the mean of |H_l z|^2 over vectors z of random signs in part k (Hutchinson). Its standard deviation is below
 sqrt(S_kl / (2 p)) for p vectors, because no singular value of an off-diagonal block of a projector exceeds 1/2. The
 diagonal follows from the redundancy numbers, which are exact, and so does the part that no vector is spent on: the
-largest. Where that holds all image points, which are most of the work, none of it need be done: |H z|^2 = z'H z, which
+largest. Where that holds all image points, their rows need not be gone through for each vector: |H z|^2 = z'H z, which
 the part tells that z is in. Source: K. R. Koch, Parameter Estimation and Hypothesis Testing in Linear Models (1999),
 3.6; M. F. Hutchinson (1989), A stochastic estimator of the trace of the influence matrix.
 """
@@ -97,6 +97,7 @@ def _products(adjusted: Adjustment, parts: Parts, probes: int) -> tuple[np.ndarr
     for j, (_, h) in enumerate(responses.to_errors(vector, len(whose))):
         squares = np.bincount(of, h**2, minlength=n + 1)
         if without:
-            squares[largest] = vector(j) @ h - squares.sum() + squares[largest]
+            # Of a part that hardly meets the largest, rounding may leave less than nothing.
+            squares[largest] = max(0.0, vector(j) @ h - squares.sum() + squares[largest])
         seen[whose[j]] += squares[:n]
     return seen / np.where(trust == 1.0, probes, 1.0)[:, None], trust

@@ -42,7 +42,8 @@ class Responses(eqx.Module):
     places: dict[str, Int[np.ndarray, "..."]]
     """The number of each observation by the name of its group, shaped like the residuals."""
     image_rows: bool = eqx.field(static=True, default=True)
-    """Whether errors are in image points, too; without these, H z is zero there, and takes next to no time."""
+    """Whether errors are in image points, too; without these, H z is not computed there (zero stands for it), which
+    takes most of the time."""
 
     @classmethod
     def of(cls, adjusted: Adjustment, *, image_rows: bool = True) -> "Responses":

@@ -51,6 +51,15 @@ def test_directions_are_those_of_the_dense_covariance(name):
     assert left == pytest.approx((1 - found[0].share[held]) * mu[-1], rel=1e-3)
 
 
+def test_a_block_without_shared_unknowns_has_directions_too():
+    block = simulated("cross").block
+    held = adjust(block.fix("c_mm", "xp_mm", "yp_mm", "k1", "k2"))
+    assert not held.structure.free.size
+    found = weak_directions(held, 0.0)
+    assert len(found) == 12
+    assert all(np.isfinite(d.sigma) and not d.share.size for d in found)
+
+
 @pytest.mark.parametrize("name", ["cross", "everything", "inner", "inner_scale"])
 def test_sound_blocks_are_not_weak(name):
     a, q = adjusted(name), covariance_of(name)

@@ -37,11 +37,13 @@ def test_every_picture_of_a_report_has_its_twin(name, axes):
     assert len(found.data)
     assert found.layout.xaxis.range == pytest.approx(axes.get_xlim())
     assert found.layout.yaxis.title.text == axes.get_ylabel()
-    # All is drawn where matplotlib draws it: of the key that tells the scale alone the place is another.
-    shown = [t for t in found.data if t.type == "scatter" and t.x is not None and t.text is None]
-    for trace in shown:
-        inside = np.asarray(trace.x, float)
-        assert np.isnan(inside).all() or (np.nanmin(inside) <= max(axes.get_xlim()))
+    # Nothing lies farther outside than arrows reach.
+    limits = np.sort([axes.get_xlim(), axes.get_ylim()], axis=1)
+    span = np.diff(limits, axis=1)[:, 0]
+    for trace in (t for t in found.data if t.type == "scatter"):
+        at = xy(trace)[np.isfinite(xy(trace)).all(axis=1)]
+        assert (at >= limits[:, 0] - 0.5 * span).all()
+        assert (at <= limits[:, 1] + 0.5 * span).all()
 
 
 @pytest.mark.parametrize("in_3d", [False, True])
@@ -124,6 +126,7 @@ def test_scattered_markers_bring_their_colours_and_the_bar(axes):
     (found,) = traces(axes)
     np.testing.assert_array_equal(found["marker"]["color"], [0.0, 5.0, 10.0])
     assert found["marker"]["colorbar"]["title"]["text"] == "sigma [m]"
+    assert found["marker"]["size"] == pytest.approx(8.0)
     assert (found["marker"]["cmin"], found["marker"]["cmax"]) == (0.0, 10.0)
 
 
@@ -138,6 +141,41 @@ def test_words_at_axes_and_in_the_picture_are_kept(axes):
     assert (inside.x, inside.y, inside.xref, inside.textangle) == (0.5, 0.25, "x", -30.0)
     assert (corner.xref, corner.yref, corner.xanchor, corner.yanchor) == ("x domain", "y domain", "right", "top")
     assert found.title.text == "left one"
+
+
+def test_a_figure_of_no_window_has_its_arrows_and_key():
+    axes = report.new_figure(5, 4).subplots(1, 2)[0]
+    arrows = axes.quiver([0, 1], [0, 1], [1, 0.5], [0, 1], [1.0, 2.0], angles="xy", scale_units="xy", scale=1.0)
+    axes.quiverkey(arrows, 0.9, 1.05, 1.0, "1 m")
+    axes.figure.colorbar(arrows, ax=axes, label="sigma [m]")
+    found = to_plotly(axes)
+    assert "  1 m" in [t for trace in found.data if trace.text for t in trace.text]
+    assert [t.marker.colorbar.title.text for t in found.data if t.marker.showscale] == ["sigma [m]"]
+    # Of two panels the one.
+    assert (found.layout.width, found.layout.height) == (240, 384)
+
+
+def test_words_on_logarithmic_axes_and_steps(axes):
+    axes.set(xscale="log", xlim=(1, 1000))
+    axes.text(100.0, 0.5, "here")
+    axes.step([1, 10, 100], [0, 1, 0])
+    found = to_plotly(axes)
+    assert (found.layout.annotations[0].x, found.layout.annotations[0].y) == pytest.approx((2.0, 0.5))
+    assert found.data[0].line.shape == "vh"
+
+
+def test_nothing_scattered_and_markers_without_a_face(axes):
+    axes.scatter([], [], c=[])
+    axes.scatter([1, 2], [1, 2], facecolors="none", edgecolors=["r", "b"])
+    _, hollow = traces(axes)
+    assert hollow["marker"]["symbol"] == "circle-open"
+    assert list(hollow["marker"]["color"]) == ["rgba(255,0,0,1)", "rgba(0,0,255,1)"]
+
+
+def test_a_coloured_picture_has_no_twin(axes):
+    axes.imshow(np.zeros((2, 2, 3)))
+    with pytest.warns(UserWarning, match="AxesImage has no twin"):
+        to_plotly(axes)
 
 
 def test_what_has_no_twin_is_said(axes):

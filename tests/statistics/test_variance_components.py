@@ -15,7 +15,7 @@ from tests.checked_types import unchecked
 from tests.commands import run
 
 BLOCK = "everything"
-# Of seven parts each, so that one program serves all.
+# Of seven parts each; image points are one of them, and three.
 SPLITS = (("xy-z",), ("camera",))
 
 
