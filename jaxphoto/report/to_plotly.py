@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
+from jaxphoto.errors import InputError
 from jaxphoto.report.plotly_axes import (
     PX,
     Trace,
@@ -49,8 +50,10 @@ def to_plotly(axes: Axes) -> Figure:
     """The twin of matplotlib axes, flat or in space: lines, markers, arrows, areas, rasters, texts, axes and legend.
 
     Every `plot_...` returns such axes, and axes of a user's own will do. Values show where the pointer is; colour
-    bars come along. Warns of what the axes hold that has no twin.
+    bars come along. Warns of what the axes hold that has no twin. Raises InputError for axes of another kind (polar).
     """
+    if axes.name not in ("rectilinear", "3d"):
+        raise InputError(f"axes are {axes.name}; twins in plotly are of flat ones and of those in space")
     # Here, because importing plotly takes half a second that most uses of jaxphoto need not wait for.
     from plotly.graph_objects import Figure
 

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.collections import EllipseCollection
 
-from jaxphoto import report
+from jaxphoto import InputError, report
 from jaxphoto.report import Tables, plot_block, to_plotly
 from tests.blocks import adjusted
 
@@ -176,6 +176,13 @@ def test_a_coloured_picture_has_no_twin(axes):
     axes.imshow(np.zeros((2, 2, 3)))
     with pytest.warns(UserWarning, match="AxesImage has no twin"):
         to_plotly(axes)
+
+
+def test_polar_axes_are_refused():
+    figure, round_ones = plt.subplots(subplot_kw={"projection": "polar"})
+    with pytest.raises(InputError, match="axes are polar"):
+        to_plotly(round_ones)
+    plt.close(figure)
 
 
 def test_what_has_no_twin_is_said(axes):
