@@ -19,13 +19,13 @@ BLOCK = "everything"
 SPLITS = (("xy-z",), ("camera",))
 
 
-def dense_traces(parts) -> np.ndarray:
-    """|R_kl|^2 by a dense projector; the last part is what is known beforehand."""
-    j = at_optimum(BLOCK).jacobian[:, at_optimum(BLOCK).free]
+def dense_traces(parts, name=BLOCK) -> np.ndarray:
+    """|R_kl|^2 by a dense projector; the last part is what is known beforehand. Rows of the datum are none of it."""
+    j = at_optimum(name).jacobian[:, at_optimum(name).free]
     r = np.eye(len(j)) - j @ np.linalg.solve(j.T @ j, j.T)
     of = np.concatenate([np.ravel(v) for v in parts.of.values()])
     own = np.eye(len(parts.labels) + 1)[of]
-    return own.T @ r**2 @ own
+    return own.T @ r[: len(of), : len(of)] ** 2 @ own
 
 
 @pytest.mark.parametrize("split", SPLITS)
@@ -38,6 +38,17 @@ def test_traces_are_those_of_dense_matrices(split):
     assert found.redundancy.sum() == pytest.approx(adjusted(BLOCK).redundancy)
     assert found.square_sums.sum() == pytest.approx(float(adjusted(BLOCK).square_sum))
     assert (found.uncertainty == 0).all()
+
+
+@pytest.mark.slow
+def test_constraints_of_the_datum_take_no_part_of_an_observation():
+    """|H z|^2 = z'H z counts them: what the image points have of it is without."""
+    parts = parts_of(adjusted("inner"), ("xy-z",))
+    assert len(adjusted("inner").residuals.datum)
+    found, expected = partial_redundancy(adjusted("inner"), parts, probes=10**6), dense_traces(parts, "inner")
+    off = ~np.eye(len(expected), dtype=bool)
+    np.testing.assert_allclose(found.matrix[off], expected[off], atol=1e-9)
+    assert np.abs(expected[off]).max() > 1e-3
 
 
 @pytest.mark.parametrize(("split", "probes"), [(("camera",), 32), (("xy-z",), 12)])
