@@ -117,9 +117,13 @@ class NormalEquations(eqx.Module):
         """A^-1."""
         return invert_band(self.factored.factor)
 
+    def pivots(self) -> Float[Array, "reduced"]:
+        """What is left of each reduced unknown when those before it are eliminated: 1 unharmed, 0 at a rank defect."""
+        return call_compiled(_pivots, self.factored.reduced.diagonal, self.factored.factor)
+
     def least_pivot(self) -> Float[Array, ""]:
-        """What is left of the weakest unknown when those before it are eliminated: 1 unharmed, 0 at a rank defect."""
-        return jnp.min(pivots(self.factored.reduced.diagonal, self.factored.factor))
+        """That of the weakest."""
+        return jnp.min(self.pivots())
 
     def gradient(self, increments: Increments) -> tuple[Increments, Array, Array, Float[Array, ""]]:
         """b = J'r at other increments, the same as `reduce` takes it down, and the square sum r'r there."""
@@ -130,8 +134,9 @@ class NormalEquations(eqx.Module):
         return self.at.constraints()
 
 
-# Operation by operation it takes half a second, and compiles each of them.
+# Operation by operation they would compile each of these, and the first takes half a second every time.
 _weighed = eqx.filter_jit(weigh_datum)
+_pivots = eqx.filter_jit(pivots)
 
 
 def factor_normal(values: TiledValues, structure: TiledStructure) -> FactoredNormal:

@@ -14,7 +14,6 @@ from jaxphoto.adjustment.result import Adjustment
 from jaxphoto.adjustment.solver.band import Band
 from jaxphoto.adjustment.solver.normal import Linearised
 from jaxphoto.adjustment.solver.reduced import reduce_normal
-from jaxphoto.adjustment.weak_directions import pivots_of
 from jaxphoto.adjustment.weak_words import weaknesses_of
 from jaxphoto.block import Block, exposures
 from jaxphoto.camera import RATES, CameraSpline
@@ -208,7 +207,7 @@ def check_rank(adjusted: Adjustment) -> None:
     """Raise RankError where the normal matrix at the optimum is singular, with what is open and the mend."""
     if adjusted.factored is None or not bool(adjusted.converged):
         return
-    if pivots_of(adjusted.equations).min() > DEFECT:
+    if adjusted.equations.least_pivot() > DEFECT:
         return
     if found := weaknesses_of(adjusted):
         sentences = "; ".join(weakness.sentence for weakness in found)

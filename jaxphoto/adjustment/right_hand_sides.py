@@ -24,7 +24,12 @@ def solve_many(equations: NormalEquations, b: Increments, seconds: dict[str, flo
     """
     batches = in_batches(b, at_once(equations.scale))
     parts = [jax.tree.map(still, run_compiled(_solve, (equations, one), seconds, "covariance")) for one in batches]
-    return jax.tree.map(lambda none, *v: np.concatenate([none[:0], *v])[: len(none)], b, *parts)
+    return joined(parts, equations.scale, len(b.shared))
+
+
+def joined(parts: list[Increments], one: Increments, many: int) -> Increments:
+    """Batches of increments like `one` in a row, without what the last was filled up with; of none, too."""
+    return jax.tree.map(lambda like, *v: np.concatenate([np.zeros((0, *like.shape)), *v])[:many], one, *parts)
 
 
 def prepare_solving(equations: NormalEquations, seconds: dict[str, float]) -> None:

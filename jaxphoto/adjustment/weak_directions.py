@@ -26,7 +26,7 @@ from jaxphoto.adjustment.model.numbers import Increments
 from jaxphoto.adjustment.normal_equations import NormalEquations
 from jaxphoto.adjustment.result import Adjustment
 from jaxphoto.adjustment.right_hand_sides import at_once, solve_many
-from jaxphoto.adjustment.solver.band import factor_band, pivots
+from jaxphoto.adjustment.solver.band import factor_band
 from jaxphoto.adjustment.solver.elimination import FactoredNormal
 from jaxphoto.adjustment.solver.reduced import reduce_normal
 from jaxphoto.arrays import still
@@ -195,17 +195,8 @@ def _tree(columns: np.ndarray, like: Increments) -> Increments:
 def _sound(adjusted: Adjustment) -> NormalEquations:
     """Those of `adjusted`, with a damping that rounding cannot turn negative where they might be singular."""
     equations = adjusted.equations.on_one_device.weighed
-    determined = bool(adjusted.converged) and pivots_of(equations).min() > _FELT
+    determined = adjusted.converged and equations.least_pivot() > _FELT
     return equations if determined else call_compiled(_damped, equations)
-
-
-def pivots_of(equations: NormalEquations) -> Float[np.ndarray, "reduced"]:
-    """What is left of each reduced unknown when those before it are eliminated: 1 unharmed, 0 at a rank defect."""
-    return np.asarray(call_compiled(_pivots, equations.factored.reduced.diagonal, equations.factored.factor))
-
-
-# Operation by operation it would compile each of them, a fifth of a second in all.
-_pivots = eqx.filter_jit(pivots)
 
 
 @eqx.filter_jit

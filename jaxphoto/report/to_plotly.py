@@ -263,13 +263,12 @@ def _key(key: Any, axes: Axes) -> Trace:
     corner = axes.transAxes.transform((0.03, 0.95))
     colour = key.vector.get_facecolor()[0]
     area = _area([_moved(arrow, np.eye(2), corner - tail)], tuple(colour), tuple(colour), axes)
-    place = np.array([[area["x"][0], area["y"][0]]])
     end = float(np.nanmax(area["x"]))
     words = shown(key.text.get_text())
     return area | {
         "mode": "lines+text",
         "x": np.append(area["x"], [np.nan, end]),
-        "y": np.append(area["y"], [np.nan, place[0, 1]]),
+        "y": np.append(area["y"], [np.nan, area["y"][0]]),
         "text": [""] * (len(area["x"]) + 1) + [f"  {words}"],
         "textposition": "middle right",
     }

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Int, Int32
 
 from jaxphoto.adjustment import Adjustment, NormalEquations
 from jaxphoto.adjustment.model.numbers import Increments, NonImageResiduals
-from jaxphoto.adjustment.right_hand_sides import at_once, blank, in_batches, prepare_solving, solve_many
+from jaxphoto.adjustment.right_hand_sides import at_once, blank, in_batches, joined, prepare_solving, solve_many
 from jaxphoto.arrays import still
 from jaxphoto.compiling import prepare, run_compiled
 
@@ -101,11 +101,10 @@ class Responses(eqx.Module):
                     z[row] = np.append(column(k), 0.0)[self.laid]
                 yield z
 
-        # Of none, too: blocks whose parameters are all held, or that have nothing to look for patterns in.
-        none = jax.tree.map(lambda v: np.zeros((0, *v.shape)), self.equations.scale)
         pull = _pull if self.image_rows else _pull_others
         parts = [jax.tree.map(still, self._run(pull, z)) for z in batches()]
-        return jax.tree.map(lambda *v: np.concatenate(v)[: len(wanted)], none, *parts)
+        # There may be none: blocks whose parameters are all held, or that have nothing to look for patterns in.
+        return joined(parts, self.equations.scale, len(wanted))
 
     def solved(self, b: Increments) -> Increments:
         """x of N x = b of right-hand sides along a leading axis, in scaled increments."""
