@@ -26,6 +26,10 @@ LARGEST = 1e30
 """No length, angle, time or coefficient is larger; the square of it is a number yet."""
 # What fits into 64 bits.
 _DIGITS = 18
+# Cells of a column that are mostly different, as numbers are: a fifth of what Python's own texts need.
+_PACKED = np.dtypes.StringDType()
+# So many lines are taken apart at a time: memory for their cells then serves for the next ones as well.
+_PIECE = 10_000
 MOST_COLUMNS, LONGEST_LINE = 1_000, 100_000
 """Columns of a table, the widest of which has some fifty, and characters of a row."""
 
@@ -73,7 +77,10 @@ class Table:
 
     def text(self, column: str) -> np.ndarray:
         """A column as text; empty everywhere where the file has no such column."""
-        return self.columns.get(column, np.full(len(self), "", object))
+        cells = self.columns.get(column)
+        if cells is None:
+            return np.full(len(self), "", object)
+        return cells.astype(object) if cells.dtype == _PACKED else cells
 
     def ids(self, column: str) -> np.ndarray:
         """A column of ids, none of them empty."""
@@ -96,7 +103,7 @@ class Table:
         if column not in self.columns:
             return np.full(len(self), np.nan)
         cells = self.columns[column]
-        if cells.dtype == object:
+        if cells.dtype in (object, _PACKED):
             cells = self._parsed(column, cells)
         else:
             for line in np.flatnonzero(~np.isfinite(cells)):
@@ -124,7 +131,7 @@ class Table:
             # Python's own conversion: it rounds correctly, so a number written by repr comes back exactly.
             values[filled] = cells[filled].astype(float)
             # The one thing it reads that is no number in a table is 1_000.
-            bad = np.array(["_" in cell for cell in cells], bool)
+            bad = np.strings.find(cells.astype(_PACKED), "_") >= 0
         except ValueError:
             bad = np.array([cell != "" and not is_number(cell) for cell in cells], bool)
         for line in np.flatnonzero(bad):
@@ -162,8 +169,7 @@ def read_csv(path: Path, needed: Sequence[str], optional: Sequence[str] = (), te
     if not lines:
         raise InputError(f"{path.name}: the file is empty; give it a header with the columns {', '.join(needed)}")
     separator = ";" if ";" in lines[0] else ","
-    records = _records(path, lines, rows, separator)
-    header = [name.strip() for name in next(records)]
+    header = [name.strip() for name in _record(path, lines[0], rows[0], separator)]
     for name, count in collections.Counter(header).items():
         if name and count > 1:
             raise InputError(f"{path.name}, row {rows[0]}: the column {name} stands there twice; keep one of them")
@@ -175,14 +181,18 @@ def read_csv(path: Path, needed: Sequence[str], optional: Sequence[str] = (), te
     if unknown := [name for name in header if name and name not in known]:
         message = f"{path.name}: columns that jaxphoto does not know are not used: {', '.join(unknown)}"
         warnings.warn(shown(message), UserWarning, stacklevel=2)
-    # Only what is used is kept of a row.
-    kept = [[record[j].strip() for j in known.values()] for record in records]
-    columns = {}
-    for k, name in enumerate(known):
-        cells = [record[k] for record in kept]
-        if separator == ";" and name not in _TEXT and name not in text:
-            cells = [cell.replace(",", ".") for cell in cells]
-        columns[name] = _objects(cells)
+    parts: dict[str, list[np.ndarray]] = {name: [] for name in known}
+    named = {name: dict[str, str]() for name in known if name in _TEXT or name in text}
+    for piece in _pieces(path, lines, rows, separator, len(header)):
+        for name, j in known.items():
+            cells = [cell.strip() for cell in piece[j]]
+            if name in named:
+                # Ids come again and again: each is kept once.
+                parts[name].append(_objects([named[name].setdefault(cell, cell) for cell in cells]))
+            else:
+                plain = [cell.replace(",", ".") for cell in cells] if separator == ";" else cells
+                parts[name].append(np.array(plain, _PACKED))
+    columns = {name: np.concatenate(several) if several else _objects([]) for name, several in parts.items()}
     return _of_short_cells(Table.of(path.name, columns, np.array(rows[1:], int)))
 
 
@@ -205,39 +215,53 @@ def read_columns(path: Path, columns: Sequence[str], separator: str | None = ","
 def content_lines(path: Path) -> tuple[list[str], list[int]]:
     """The lines of a text file that are neither empty nor comments, and their row numbers."""
     # Not splitlines(): that also ends lines at form feeds and other characters an editor does not count.
-    numbered = enumerate(read_text(path, LARGE).split("\n"), start=1)
-    kept = [(line, row) for row, line in numbered if line.strip() and not line.lstrip().startswith("#")]
-    return [line for line, _ in kept], [row for _, row in kept]
+    lines = read_text(path, LARGE).split("\n")
+    rows = [row for row, line in enumerate(lines, 1) if line.strip() and not line.lstrip().startswith("#")]
+    return [lines[row - 1] for row in rows], rows
 
 
-def _records(path: Path, lines: list[str], rows: list[int], separator: str) -> Iterator[list[str]]:
-    """The cells of one line after the other, as many as the first has."""
-    width = 0
-    for line, row in zip(lines, rows, strict=True):
-        if len(line) > LONGEST_LINE:
-            raise InputError(
-                f"{path.name}, row {row}: the row has {len(line)} characters, and one of a table has at most "
-                f"{LONGEST_LINE}; correct it"
-            )
-        try:
-            (record,) = csv.reader([line], delimiter=separator, skipinitialspace=True, strict=True)
-        except csv.Error:
-            raise InputError(
-                f"{path.name}, row {row}: the quotation marks do not pair; close or remove them in that row"
-            ) from None
-        width = width or len(record)
-        if width > MOST_COLUMNS:
-            raise InputError(
-                f"{path.name}, row {row}: the header has {width} columns, and a table has at most {MOST_COLUMNS}; "
-                "correct it"
-            )
-        if len(record) > width:
-            raise InputError(
-                f"{path.name}, row {row}: {len(record)} cells, but the header has {width}; remove the surplus ones"
-                + (" (decimal commas need semicolons between the columns)" if separator == "," else "")
-            )
-        # Some spreadsheets leave out empty cells at the end of a row.
-        yield record + [""] * (width - len(record))
+def _pieces(path: Path, lines: list[str], rows: list[int], separator: str, width: int) -> Iterator[list[list[str]]]:
+    """The cells of all lines but the first, some thousand lines at a time, by column."""
+    for at in range(1, len(lines), _PIECE):
+        piece = lines[at : at + _PIECE]
+        text = separator.join(piece)
+        plain = '"' not in text and "\r" not in text and max(map(len, piece)) <= LONGEST_LINE
+        if plain and all(line.count(separator) == width - 1 for line in piece):
+            # Without a list for each line, of which Python would have to keep account.
+            cells = text.split(separator)
+            yield [cells[j::width] for j in range(width)]
+        else:
+            numbered = zip(piece, rows[at : at + _PIECE], strict=True)
+            records = [_record(path, line, row, separator, width) for line, row in numbered]
+            yield list(map(list, zip(*records, strict=True)))
+
+
+def _record(path: Path, line: str, row: int, separator: str, width: int = 0) -> list[str]:
+    """The cells of a line, as many as `width` (0: as there are, of the first line)."""
+    if len(line) > LONGEST_LINE:
+        raise InputError(
+            f"{path.name}, row {row}: the row has {len(line)} characters, and one of a table has at most "
+            f"{LONGEST_LINE}; correct it"
+        )
+    try:
+        (record,) = csv.reader([line], delimiter=separator, skipinitialspace=True, strict=True)
+    except csv.Error:
+        raise InputError(
+            f"{path.name}, row {row}: the quotation marks do not pair; close or remove them in that row"
+        ) from None
+    width = width or len(record)
+    if width > MOST_COLUMNS:
+        raise InputError(
+            f"{path.name}, row {row}: the header has {width} columns, and a table has at most {MOST_COLUMNS}; "
+            "correct it"
+        )
+    if len(record) > width:
+        raise InputError(
+            f"{path.name}, row {row}: {len(record)} cells, but the header has {width}; remove the surplus ones"
+            + (" (decimal commas need semicolons between the columns)" if separator == "," else "")
+        )
+    # Some spreadsheets leave out empty cells at the end of a row.
+    return record + [""] * (width - len(record))
 
 
 def _of_short_cells(table: Table) -> Table:
