@@ -208,6 +208,7 @@ PACKAGE_REFUSED = {
     "geometry": (("UPDATE object_points SET geom = x'4750' WHERE fid = 3",), "feature 3: the geometry is no point"),
     "system": (("UPDATE gpkg_contents SET srs_id = 0",), "the layer is in no EPSG system"),
     "tables": (("DROP TABLE gpkg_geometry_columns",), "is no GeoPackage that can be read"),
+    "column": (("UPDATE gpkg_geometry_columns SET column_name = 'shape'",), "has no column 'shape'"),
     "names": (("UPDATE object_points SET point = 'p7'",), "feature 2: the point 'p7' stands in photographs.gpkg, fe"),
 }
 
@@ -217,6 +218,13 @@ def test_a_geo_package_that_is_no_control_is_told_in_a_sentence(tmp_path, name):
     statements, message = PACKAGE_REFUSED[name]
     with pytest.raises(InputError, match=message):
         read_control(_package(tmp_path, *statements))
+
+
+def test_a_geo_package_whose_columns_have_no_names_in_text_is_told_in_a_sentence(tmp_path):
+    path = _package(tmp_path, "ALTER TABLE object_points RENAME COLUMN point TO point_nr")
+    path.write_bytes(path.read_bytes().replace(b"point_nr", b"point_\xff\xfe"))
+    with pytest.raises(InputError, match="is no GeoPackage that can be read"):
+        read_control(path)
 
 
 def test_a_geo_package_that_another_program_has_open_is_read_when_it_is_closed(tmp_path):

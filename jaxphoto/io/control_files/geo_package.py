@@ -53,7 +53,8 @@ def read_geo_package(path: Path) -> SurveyedPoints:
             file.deserialize(content[:_JOURNAL] + b"\1\1" + content[_JOURNAL + 2 :])
             file.text_factory = lambda text: text.decode("utf-8", "replace")
             return _read(path, file)
-    except (sqlite3.Error, OverflowError):
+    # Names of columns and messages of a damaged file are not always text.
+    except (sqlite3.Error, OverflowError, UnicodeDecodeError):
         raise InputError(f"{path.name} is no GeoPackage that can be read; export the layer anew") from None
 
 
@@ -67,6 +68,11 @@ def _read(path: Path, file: sqlite3.Connection) -> SurveyedPoints:
             "the control points alone"
         )
     name, geometry, srs, columns = named[0]
+    if geometry not in columns:
+        raise InputError(
+            f"{path.name}: layer {quoted(name)} has no column {quoted(geometry)}, where its geometries are said to be; "
+            "export it anew"
+        )
     place, kept = columns.index(geometry), [k for k, column in enumerate(columns) if column != geometry]
     features = [
         PointFeature(_point(path, k, row[place]), {columns[j]: row[j] for j in kept})
