@@ -235,3 +235,12 @@ def test_a_geo_package_that_another_program_has_open_is_read_when_it_is_closed(t
     (tmp_path / "photographs.gpkg-wal").write_bytes(b"x")
     with pytest.raises(InputError, match="open in another program"):
         read_control(path)
+
+
+def test_a_comment_is_a_header_unless_it_is_wider_than_any_table(tmp_path):
+    path = tmp_path / "points.txt"
+    rows = "A 1.5 2.5 3.5\nB 4 5 6\n"
+    for columns, from_comment in (("", True), (" " * 200_000, True), (" c" * 1_000, False)):
+        path.write_text(f"# point y x z{columns}\n{rows}")
+        first = read_control(path).points.coordinates[0]
+        assert first.tolist() == ([2.5, 1.5, 3.5] if from_comment else [1.5, 2.5, 3.5])

@@ -46,7 +46,8 @@ def read_table(path: Path, lines: list[str], rows: list[int]) -> SurveyedPoints 
     cells = Cells(
         path.name, [_split(path.name, line, row, separator) for line, row in content], [r for _, r in content]
     )
-    for header in [*cells.records[:1], *(line.split(separator) for line in comments)]:
+    said_in = [line.strip().lstrip("#").strip().split(None if separator == " " else separator) for line in comments]
+    for header in (*cells.records[:1], *(words for words in said_in if len(words) <= MOST_COLUMNS)):
         is_row = bool(cells.records) and header is cells.records[0]
         own = cells._replace(records=cells.records[is_row:], rows=cells.rows[is_row:])
         if columns := mark_columns(header):
