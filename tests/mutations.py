@@ -397,6 +397,7 @@ READERS: dict[str, Reader] = {
             ("orthority", oriented_files.write_orthority),
         )
     },
+    "texts-bingo": Reader(written_by(oriented_files.write_bingo), lambda folder: read_source(folder, "texts")),
     "texts-patb": Reader(written_by(oriented_files.write_patb), lambda folder: read_source(folder, "texts")),
     "dbat": Reader(text(**sound_files.DBAT), read_dbat),
     "photomodeler": Reader(text(**sound_files.PHOTOMODELER), read_photomodeler),
@@ -409,6 +410,7 @@ READERS: dict[str, Reader] = {
         ("photographs.gpkg",),
     ),
     "control-reference": Reader(text(a=control_files.REFERENCE), _control),
+    "control-bingo": Reader(text(a=control_files.GEOIN), _control),
     "control-pix4d": Reader(
         text(a=control_files.PIX4D, b=control_files.PIX4D_MARKS),
         lambda folder: _control(folder, folder / "b"),

@@ -87,8 +87,10 @@ def conclusion(notebook: nbformat.NotebookNode) -> str:
         for output in cell.get("outputs", ()):
             if "text/markdown" in output.get("data", {}):
                 return _on_page(output.data["text/markdown"].strip())
-    words = [cell.source for cell in notebook.cells if cell.cell_type == "markdown"]
-    return _on_page(re.sub(r"^#+ .*\n+", "", words[-1]).strip()) if len(words) > 1 else ""
+    words = [cell.source for cell in notebook.cells if cell.cell_type == "markdown"][-1]
+    paragraphs = re.sub(r"^#+ .*\n+", "", words).strip().split("\n\n")
+    # What announces the cell below it concludes nothing.
+    return _on_page("\n\n".join(text for text in paragraphs if not text.endswith(":")))
 
 
 def _on_page(text: str) -> str:

@@ -2,7 +2,7 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import typer
@@ -11,14 +11,24 @@ from jaxphoto.block import Frame
 from jaxphoto.cli.app import app
 from jaxphoto.cli.cloud_options import Classes, CloudEpsg, CloudUnit, ReturnsOption, class_numbers
 from jaxphoto.cli.console import plain_console
+from jaxphoto.cli.made import made_by
 from jaxphoto.cloud import Cloud
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import ScannerCalibration, StripErrors
 from jaxphoto.io import clouds, read_block
 from jaxphoto.io.block_folder import exposure_times
 from jaxphoto.io.clouds.coordinate_system import CoordinateSystem
+from jaxphoto.io.clouds.placement import Placement
 from jaxphoto.io.raster import write_dsm
-from jaxphoto.io.trajectory import read_records, write_flight_csv
+from jaxphoto.io.trajectory import (
+    Records,
+    is_sbet,
+    read_records,
+    read_sbet,
+    with_records,
+    write_flight_csv,
+    write_sbet,
+)
 from jaxphoto.io.trajectory.in_frame import trajectory_in, with_poses
 from jaxphoto.lidar.raster import Raster
 from jaxphoto.lidar.strip_correction import correct_strips
@@ -27,7 +37,8 @@ from jaxphoto.lidar.strip_settings import StripSettings
 from jaxphoto.parameters import dynamic_fields
 from jaxphoto.procedures.lidar import Photographs, ScannerPriors, StripAdjustment, StripRound, adjust_strips
 from jaxphoto.procedures.lidar.strip_adjustment import MAX_STRIP_ROUNDS
-from jaxphoto.report.strips import differences_figure, print_strips, write_strips
+from jaxphoto.report.strips import print_strips
+from jaxphoto.report.strips_folder import write_strips
 from jaxphoto.unknowns import FIXED, FREE
 from jaxphoto.writing import check_folder
 
@@ -37,6 +48,7 @@ _SCANNER = ("boresight", *(name.replace("_", "-") for name in dynamic_fields(Sca
 
 @app.command("strips")
 def strips_command(
+    context: typer.Context,
     cloud: Annotated[Path, typer.Argument(help="Cloud of several strips: .las, .laz, .csv or .ply (docs/clouds.md).")],
     out: Annotated[Path, typer.Option(help="Folder for the results; earlier results in it are replaced.")],
     trajectory: Annotated[
@@ -108,14 +120,11 @@ def strips_command(
             records = read_records(trajectory)
             records = records._replace(time=records.time - trajectory_shift_s)
             if records.geographic and block is None:
-                raise InputError(
-                    f"{trajectory.name}: the trajectory gives longitude and latitude, and the cloud X, Y and Z: bring "
-                    "the trajectory into the cloud's system"
-                )
+                frame = _about(records, clouds.cloud_system(cloud, epsg=cloud_epsg, unit=cloud_unit), cloud)
             exact = np.zeros((len(records.time), 3))
             path = trajectory_in(records, frame, exact, exact)
         said: dict[str, Any] = {"epsg": cloud_epsg, "unit": cloud_unit}
-        own = None if block is None else frame
+        own = frame if block is not None or frame.kind == "epsg" else None
         whole = planes = clouds.read_cloud(cloud, own, **said)
         if chosen is not None or returns != "all":
             planes = clouds.read_cloud(cloud, own, classes=chosen, returns=returns, **said)  # type: ignore[arg-type]
@@ -129,28 +138,55 @@ def strips_command(
         corrected = result.cloud if planes is whole else correct_strips(whole, _for_all(result, whole), path)
         status.update(f"writing {out}")
         like = cloud if cloud.suffix.lower() in (".las", ".laz") else None
-        maps = [strip_differences(own_cloud, settings) for own_cloud in (planes, result.cloud)]
-        with write_strips(result, out) as folder:
-            _write_maps(maps, CoordinateSystem() if block is not None else clouds.cloud_system(cloud, **said), folder)
+        maps = GapMaps(Placement(cloud.name, clouds.cloud_system(cloud, **said), own), settings)
+        gaps = maps.gaps(planes, result.cloud)
+        made = made_by(context, cloud, trajectory, block)
+        with write_strips(result, out, gaps, result.adjusted.seconds, made) as folder:
+            for raster, name in zip(gaps or (), ("before", "after"), strict=False):
+                write_dsm(folder / f"differences_{name}.tif", raster, maps.system)
             name = cloud.name if like is not None else f"corrected_{cloud.name}"
             clouds.write_cloud(corrected, folder / name, like=like, frame=own, **said)
             if records is not None and result.trajectory is not None:
                 moved = with_poses(records, result.trajectory, frame)
-                write_flight_csv(moved._replace(time=moved.time + trajectory_shift_s), folder / "trajectory.csv")
+                moved = moved._replace(time=moved.time + trajectory_shift_s)
+                write_flight_csv(moved, folder / "trajectory.csv")
+                if trajectory is not None and is_sbet(trajectory):
+                    write_sbet(with_records(read_sbet(trajectory), moved), folder / trajectory.name)
     console = plain_console()
     print_strips(result, console)
-    console.print(f"results in {out}")
+    console.print(f"results in {out} (open report.html)")
     if not result.still:
         raise typer.Exit(1)
 
 
-def _write_maps(maps: list[Raster | None], system: CoordinateSystem, folder: Path) -> None:
-    before, after = maps
-    if before is None or after is None:
-        return
-    for raster, name in ((before, "before"), (after, "after")):
-        write_dsm(folder / f"differences_{name}.tif", raster, system)
-    differences_figure(before, after).savefig(folder / "differences.png")
+class GapMaps(NamedTuple):
+    """Where the maps of gaps lie: in the cloud's own system, or where that counts degrees in the frame of the block."""
+
+    placement: Placement
+    settings: StripSettings
+
+    @property
+    def system(self) -> CoordinateSystem:
+        """The system of the maps."""
+        return CoordinateSystem() if self.placement.system.geographic else self.placement.system
+
+    def gaps(self, before: Cloud, after: Cloud) -> tuple[Raster, Raster] | None:
+        """The gaps of the strips before and after; None where strips have no planes in common."""
+        turned = (lambda xyz: xyz) if self.placement.system.geographic else self.placement.metres
+        of = [strip_differences(dataclasses.replace(c, xyz=turned(c.xyz)), self.settings) for c in (before, after)]
+        return None if of[0] is None or of[1] is None else (of[0], of[1])
+
+
+def _about(records: Records, system: CoordinateSystem, cloud: Path) -> Frame:
+    """The local frame about a trajectory in longitude and latitude. Raises InputError for a cloud without a system."""
+    code = None if system.plane is None else system.plane.to_epsg()
+    if code is None:
+        raise InputError(
+            f"{records.file}: the trajectory gives longitude and latitude, and {cloud.name} does not say in which EPSG "
+            "system its coordinates are; name it (--cloud-epsg)"
+        )
+    longitude, latitude, height = records.coordinates[len(records.time) // 2].tolist()
+    return Frame("epsg", code, origin=(longitude, latitude, height))
 
 
 def _for_all(result: StripAdjustment, whole: Cloud) -> StripErrors:

@@ -212,16 +212,17 @@ def correlation_figure(tables: Tables, camera: str) -> Figure:
 def draw_interior_correlation(axes: Axes, tables: Tables, camera: str) -> None:
     """Correlation of the interior orientation of a camera with itself."""
     c = tables.correlations[camera]
-    _heat_map(axes, c.interior, c.parameters, c.parameters, "correlation of IOP")
+    heat_map(axes, c.interior, c.parameters, c.parameters, "correlation of IOP")
 
 
 def draw_exterior_correlation(axes: Axes, tables: Tables, camera: str) -> None:
     """Mean over the images of the correlation of exterior and interior orientation, without its sign."""
     c = tables.correlations[camera]
-    _heat_map(axes, c.mean_abs, c.eop_names, c.parameters, "mean |correlation| of EOP and IOP")
+    heat_map(axes, c.mean_abs, c.eop_names, c.parameters, "mean |correlation| of EOP and IOP")
 
 
-def _heat_map(axes: Axes, values: np.ndarray, rows: Sequence[str], columns: Sequence[str], title: str) -> None:
+def heat_map(axes: Axes, values: np.ndarray, rows: Sequence[str], columns: Sequence[str], title: str) -> None:
+    """Correlations `values` of `rows` with `columns`, in colours and numbers."""
     axes.imshow(values, vmin=-1, vmax=1, cmap="RdBu_r", aspect="auto")
     axes.set_xticks(range(len(columns)), list(map(drawn, columns)), rotation=45, ha="right", fontsize=8)
     axes.set_yticks(range(len(rows)), list(map(drawn, rows)), fontsize=8)

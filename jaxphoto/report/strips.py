@@ -1,32 +1,26 @@
-"""What a strip adjustment found, as tables: differences of strips, the scanner, and the errors of its trajectory."""
+"""What a strip adjustment found: its verdict; tables of strips, scanner and trajectory; the lines on a screen."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
+from jaxtyping import Float
 from rich.console import Console
 
 from jaxphoto.georeferencing import TrajectoryKnot
-from jaxphoto.lidar.raster import Raster
 from jaxphoto.procedures.lidar import StripAdjustment, StripDifference, StripRound
 from jaxphoto.procedures.lidar.strip_adjustment import PHOTOGRAPHS
-from jaxphoto.report.plots import new_figure
-from jaxphoto.report.results import write_results
+from jaxphoto.report.digits import of_sigma, with_sigma
+from jaxphoto.report.findings import Finding, Level, Verdict, p_words
 from jaxphoto.report.tables import Tables
 from jaxphoto.report.verdict import verdict_of
-from jaxphoto.statistics import correlation_matrix
-from jaxphoto.writing import whole_folder
+from jaxphoto.statistics import LEVEL, correlation_matrix
+from jaxphoto.statistics.global_test import global_test
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-# Of correlations.
-_DIGITS = 6
+# From jaxphoto's units of a knot (m, rad) to those of files.
+_IN_FILES = np.array([1.0, 1.0, 1.0, 180 / np.pi, 180 / np.pi, 180 / np.pi])
 
 
 def differences_table(differences: Sequence[StripDifference]) -> pd.DataFrame:
@@ -76,61 +70,71 @@ def calibration_table(result: StripAdjustment) -> pd.DataFrame:
 
 def trajectory_errors_table(result: StripAdjustment) -> pd.DataFrame:
     """strip, time_s, and the coefficients of its spline there with sigmas: X_m ... right_deg ...; 0 where held."""
-    known, s, owners = (
-        result.covariance,
-        result.adjusted.structure,
-        iter(result.adjusted.unknowns.more[TrajectoryKnot.kind]),
-    )
-    of_label = dict(zip(s.labels, np.asarray(known.shared_sigma), strict=True))
-    errors, rows = result.errors, []
-    zero = np.zeros(3)
+    errors, labels, rows = result.errors, _knot_labels(result), []
+    of_label = dict(zip(result.adjusted.structure.labels, np.asarray(result.covariance.shared_sigma), strict=True))
     for name, spline in zip(result.cloud.strips, errors.splines, strict=True):
-        for k, time in enumerate(spline.times):
-            labels = TrajectoryKnot(zero, zero).labels(next(owners))  # type: ignore[arg-type]
-            sigma = np.array([of_label.get(label, 0.0) for label in labels])
-            value = np.concatenate([errors.position[spline.first + k], errors.attitude[spline.first + k]])
-            value[3:], sigma[3:] = np.rad2deg(value[3:]), np.rad2deg(sigma[3:])
-            rows.append((name, time, *value, *sigma))
+        for k, time in enumerate(spline.times, spline.first):
+            sigma = np.array([of_label.get(label, 0.0) for label in labels[k]])
+            value = np.concatenate([errors.position[k], errors.attitude[k]])
+            rows.append((name, time, *(value * _IN_FILES), *(sigma * _IN_FILES)))
     columns = ["X_m", "Y_m", "Z_m", "right_deg", "forward_deg", "up_deg"]
     return pd.DataFrame(rows, columns=["strip", "time_s", *columns, *(f"sigma_{c}" for c in columns)])
 
 
-@contextmanager
-def write_strips(result: StripAdjustment, directory: Path) -> Iterator[Path]:
-    """strips.csv, rounds.csv, scanner.csv, trajectory_errors.csv and correlation.csv, of photographs `adjustment`, too.
-
-    Yields the folder while it is not yet in its place, for what else belongs there. Raises InputError where `directory`
-    holds something that is not an earlier result.
-    """
-    with whole_folder(directory) as work:
-        differences_table(result.differences).to_csv(work / "strips.csv", index=False)
-        strip_rounds_table(result.rounds).to_csv(work / "rounds.csv", index=False)
-        calibration_table(result).to_csv(work / "scanner.csv", index=False)
-        trajectory_errors_table(result).to_csv(work / "trajectory_errors.csv", index=False)
-        all_correlations(result).round(_DIGITS).to_csv(work / "correlation.csv")
-        if result.before is not None:
-            tables, times = Tables(result.adjusted), result.adjusted.seconds
-            write_results(tables, verdict_of(tables), work / "adjustment", dict(times))
-        yield work
+def errors_along(
+    result: StripAdjustment, strip: int, time: Float[np.ndarray, n]
+) -> tuple[Float[np.ndarray, "n 6"], Float[np.ndarray, "n 6"]]:
+    """What the trajectory was off by at times (s) of a strip: X, Y, Z (m), right, forward, up (degrees), and sigmas."""
+    value = np.concatenate(result.errors.at(strip, time), axis=1)
+    spline, labels = result.errors.splines[strip], _knot_labels(result)
+    _, weights = spline.all_weights(time)
+    place = {label: k for k, label in enumerate(result.adjusted.structure.labels)}
+    covariances, variance = np.asarray(result.covariance.matrix)[-len(place) :, -len(place) :], np.zeros_like(value)
+    for c in range(value.shape[1]):
+        # A knot that is held has no label among the estimated ones.
+        own = np.array([place.get(labels[k][c], -1) for k in range(spline.first, spline.first + spline.size)])
+        known, by = own[own >= 0], weights[:, own >= 0]
+        variance[:, c] = np.einsum("ni,ij,nj->n", by, covariances[np.ix_(known, known)], by)
+    return value * _IN_FILES, np.sqrt(np.maximum(variance, 0.0)) * _IN_FILES
 
 
-def differences_figure(before: Raster, after: Raster) -> Figure:
-    """Gaps of strips over the ground before and after, in the same colours, which reach 95 % of those before."""
-    figure = new_figure(10.0, 4.6)
-    both = figure.subplots(1, 2, sharex=True, sharey=True)
-    limit = 100 * float(np.nanpercentile(np.abs(before.heights), 95)) or 1.0
-    for axes, raster, name in zip(both, (before, after), ("before", "after"), strict=True):
-        (west, south), (east, north) = raster.extent
-        shown = axes.imshow(
-            100 * raster.heights, extent=(west, east, south, north), cmap="RdBu_r", vmin=-limit, vmax=limit
+def _knot_labels(result: StripAdjustment) -> list[list[str]]:
+    """Of every knot of all strips the labels of its six numbers."""
+    zero = np.zeros(3)
+    knot = TrajectoryKnot(zero, zero)  # type: ignore[arg-type]
+    return [list(knot.labels(owner)) for owner in result.adjusted.unknowns.more[TrajectoryKnot.kind]]
+
+
+def strips_verdict(result: StripAdjustment, tables: Tables | None) -> Verdict:
+    """What is to be known of it first; `tables` are those of the adjustment where photographs are in it."""
+    return Verdict.of((*_of_rounds(result), *(verdict_of(tables).findings if tables else _of_strips(result))))
+
+
+def _of_rounds(result: StripAdjustment) -> Iterator[Finding]:
+    if not result.still:
+        change = result.rounds[-1].largest_change
+        yield Finding(
+            Level.ALARM,
+            f"planes were looked up {len(result.rounds)} times and it still changes (by {change:.2g} standard "
+            "deviations the last time): ask for more rounds",
         )
-        rms = float(np.sqrt(np.nanmean(raster.heights**2)))
-        axes.set_title(f"{name}: {100 * rms:.2g} cm RMS", loc="left")
-        axes.set(xlabel="X (m)", aspect="equal")
-        axes.ticklabel_format(useOffset=False, style="plain")
-    both[0].set_ylabel("Y (m)")
-    figure.colorbar(shown, ax=list(both), label="later strip above earlier (cm)", shrink=0.8)
-    return figure
+
+
+def _of_strips(result: StripAdjustment) -> Iterator[Finding]:
+    """Convergence and sigma naught of planes and trajectory alone."""
+    if not bool(result.adjusted.converged):
+        yield Finding(Level.ALARM, result.adjusted.outcome.value)
+        return
+    whole = global_test(result.adjusted)
+    if whole.redundancy > 0 and whole.p_value < LEVEL:
+        small = whole.factor < 1
+        yield Finding(
+            Level.WARNING,
+            f"sigma naught {whole.factor**0.5:.3g}, expected 1 ({p_words(whole.p_value)}): planes lie "
+            f"{'nearer to' if small else 'farther from'} one another than their roughness and the trajectory's "
+            f"standard deviations let expect; "
+            + ("these are too large" if small else "these are too small, or knots too far apart"),
+        )
 
 
 def print_strips(result: StripAdjustment, console: Console) -> None:
@@ -138,7 +142,8 @@ def print_strips(result: StripAdjustment, console: Console) -> None:
     last = result.rounds[-1]
     end = "nothing changes any more" if result.still else "it still changes: ask for more rounds"
     ties = f" and {last.points} tie points on them" if last.points else ""
-    console.print(f"{last.number} rounds, {end}; {last.planes} planes{ties}, {last.left_out} left out", highlight=False)
+    said = f"{last.number} rounds, {end}; {last.planes} planes{ties}, {last.left_out} left out"
+    console.print(said, highlight=False, soft_wrap=True)
     for d in result.differences:
         before = f"{d.rms_before_m:.3f} m" if np.isfinite(d.rms_before_m) else "unknown"
         strips = f"{d.one} and strip {d.other}" if d.one == PHOTOGRAPHS else f"strips {d.one} and {d.other}"
@@ -149,5 +154,8 @@ def print_strips(result: StripAdjustment, console: Console) -> None:
             markup=False,
             soft_wrap=True,
         )
-    for row in calibration_table(result).itertuples():
-        console.print(f"  {row.parameter}: {row.value:.6g} (sigma {row.sigma:.2g})", highlight=False, markup=False)
+    scanner = calibration_table(result)
+    numbers = scanner[["value", "sigma"]].to_numpy(float)
+    for parameter, (value, sigma) in zip(scanner["parameter"], numbers, strict=True):
+        said = f"  {parameter}: {with_sigma(value, sigma)} (sigma {of_sigma(sigma)})"
+        console.print(said, highlight=False, markup=False, soft_wrap=True)

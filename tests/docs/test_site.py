@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import nbformat
 import numpy as np
 import pytest
 
@@ -67,3 +68,16 @@ def test_functions_of_the_papers_are_there():
         # A room is imported when it is asked for, and a name of the top from its own room.
         room = importlib.import_module(".".join(["jaxphoto", *rooms]))
         assert hasattr(room, last), name
+
+
+def test_the_gallery_has_every_notebook_with_a_picture():
+    page = (ROOT / "docs" / "gallery.md").read_text(encoding="utf-8")
+    shown = re.findall(r"## \[(.+)\]\(\.\./notebooks/(.+)\)", page)
+    notebooks = sorted((ROOT / "notebooks").glob("*.ipynb"))
+    assert [name for _, name in shown] == [path.name for path in notebooks]
+    for (title, _), path in zip(shown, notebooks, strict=True):
+        assert f"# {title}\n" in nbformat.read(path, as_version=4).cells[0].source + "\n"
+    pictures = re.findall(r"!\[.+\]\((images/gallery/.+)\)", page)
+    assert len(pictures) == len(notebooks)
+    # Kept in the repository: small.
+    assert sum((ROOT / "docs" / picture).stat().st_size for picture in pictures) < 1e6

@@ -67,3 +67,10 @@ GEO_JSON = """{"type": "FeatureCollection", "name": "gcps",
  "geometry": {"type": "Point", "coordinates": [386900.0, 6175100.0]}}
 ]}
 """
+
+GEOIN = """* a project
+CAPA cam 1 50.1 0.01 -0.02
+CONT 11 500.5 600.5 70.25
+CHCK 12 510.5 610.5 71.25 0.02
+CONT A-3 520.5 620.5 nan
+"""

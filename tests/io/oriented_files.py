@@ -5,6 +5,7 @@ import json
 import math
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from jaxphoto.io import export
 from jaxphoto.io.exports.map_photographs import in_map
@@ -86,6 +87,20 @@ def write_patb(folder, kind="local", turned=False, change=lambda text: text):
         a = [f"{value:.17g}" for value in (r if turned else r.T).ravel()]
         lines += [" ".join([name, "8800.0", *map(repr, at.tolist())]), " ".join(a[:5]), " ".join(a[5:])]
     (folder / "patb.ori").write_text(change("\n".join(lines) + "\n"))
+    return folder
+
+
+def write_bingo(folder, kind="local", axes="YXZ", unit=0.9, change=lambda text: text):
+    """itera.dat: object points, then orientations whose angles turn about `axes` one after the other."""
+    p = inside("opencv", kind)
+    write_angles(folder, kind)
+    (folder / "exterior.txt").unlink()
+    on_map = in_map(p).exterior
+    lines = ["* phi omega kappa", *(f"CORD {k} {k}.5 2.5 3.5" for k in range(60))]
+    for name, at, r in zip(p.images, *map(np.asarray, (on_map.position, on_map.camera_from_object)), strict=True):
+        angles = Rotation.from_matrix(r.T).as_euler(axes, degrees=True) / unit
+        lines.append(" ".join(["ORIA", name, *map(repr, at.tolist()), *map(repr, angles.tolist()), "1"]))
+    (folder / "itera.dat").write_text(change("\n".join(lines) + "\n"))
     return folder
 
 

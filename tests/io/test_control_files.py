@@ -244,3 +244,16 @@ def test_a_comment_is_a_header_unless_it_is_wider_than_any_table(tmp_path):
         path.write_text(f"# point y x z{columns}\n{rows}")
         first = read_control(path).points.coordinates[0]
         assert first.tolist() == ([2.5, 1.5, 3.5] if from_comment else [1.5, 2.5, 3.5])
+
+
+def test_control_of_bingo(tmp_path):
+    path = tmp_path / "geoin.dat"
+    path.write_text(files.GEOIN)
+    points = read_control(path).points
+    assert points.ids == ("11", "12", "A-3") and points.check.tolist() == [False, True, False]
+    np.testing.assert_array_equal(points.coordinates[:2], [[500.5, 600.5, 70.25], [510.5, 610.5, 71.25]])
+    assert np.isnan(points.coordinates[2, 2])
+    for change, words in ((("620.5 nan", ""), "row 5: 3 cells; a row has CONT"), (("12 5", "11 5"), "'11' stands in")):
+        path.write_text(files.GEOIN.replace(*change))
+        with pytest.raises(InputError, match=words):
+            read_control(path)

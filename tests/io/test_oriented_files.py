@@ -26,6 +26,7 @@ from tests.io.oriented_files import (
     inside,
     markers,
     write_angles,
+    write_bingo,
     write_metashape,
     write_nerfstudio,
     write_orthority,
@@ -122,6 +123,10 @@ TEXTS = {
     "gon": lambda folder: write_angles(folder, change=in_gon, points="patb"),
     "matrices": lambda folder: write_patb(folder),
     "matrices turned": lambda folder: write_patb(folder, turned=True),
+    "bingo's angles": lambda folder: write_bingo(folder),
+    "bingo's on the map": lambda folder: write_bingo(folder, "epsg", change=lambda t: "* EPSG:32633\n" + t),
+    "bingo's in degrees": lambda folder: write_bingo(folder, unit=1.0),
+    "bingo's by omega": lambda folder: write_bingo(folder, axes="XYZ"),
 }
 
 
@@ -287,6 +292,10 @@ REFUSED = {
     "point": (lambda folder: appended(write_angles(folder), "a b c\n7 1\n"), "row [0-9]+: '7 1' is not point"),
     "xy": (lambda folder: appended(write_angles(folder), "a b c\n7 1 x\n"), "'1 x' is not 2 numbers"),
     "matrix end": (_patb(lambda text: text.rsplit("\n", 2)[0]), "patb.ori, row 10: .* first of three rows"),
+    "bingo's row": (
+        lambda folder: write_bingo(folder, change=lambda t: re.sub(r" \S+ 1$", "", t.rstrip())) / "itera.dat",
+        r"itera.dat, row \d+: .* is not ORIA, name, X, Y, Z, phi, omega, kappa",
+    ),
     "matrix row": (_patb(lambda text: text.rstrip() + "x\n"), "patb.ori, row 12: .* is not 4 numbers"),
     "frames": (_nerf(lambda t: {**t, "frames": 5}), "has no list of frames; give transforms.json"),
     "model": (_nerf(lambda t: {**t, "camera_model": "EQUIRECTANGULAR"}), "'EQUIRECTANGULAR' is not known here"),

@@ -13,6 +13,7 @@ from jaxphoto.io.trajectory import (
     read_records,
     read_sbet,
     sbet_records,
+    with_records,
     write_flight_csv,
     write_sbet,
 )
@@ -54,6 +55,17 @@ def test_sbet_comes_back_exactly(tmp_path):
     write_sbet(values, tmp_path / "flight.sbet")
     assert (tmp_path / "flight.sbet").stat().st_size == 12 * 136
     np.testing.assert_array_equal(read_sbet(tmp_path / "flight.sbet"), values)
+
+
+def test_sbet_with_other_poses_keeps_all_else():
+    values = random_sbet()
+    records = sbet_records(values, "flight.sbet")
+    np.testing.assert_allclose(with_records(values, records), values, atol=1e-13)
+    turned = records._replace(roll_pitch_yaw_deg=records.roll_pitch_yaw_deg + 0.5, coordinates=records.coordinates + 2)
+    again = sbet_records(with_records(values, turned), "flight.sbet")
+    np.testing.assert_allclose(again.coordinates, turned.coordinates, rtol=1e-13)
+    off = again.roll_pitch_yaw_deg - turned.roll_pitch_yaw_deg
+    np.testing.assert_allclose(np.mod(off + 180, 360) - 180, 0.0, atol=1e-11)
 
 
 def test_sbet_is_seventeen_little_endian_doubles(tmp_path):

@@ -12,7 +12,7 @@ from jaxphoto.adjustment import Outcome
 from jaxphoto.camera import get_parameter
 from jaxphoto.observations import Attitudes, StationRows
 from jaxphoto.procedures.lidar import adjust_strips
-from jaxphoto.report.strips import all_correlations
+from jaxphoto.report.strips import all_correlations, errors_along
 from jaxphoto.statistics import correlation_matrix
 from tests.procedures.joint import CAMERA, fitted, flown, photographs, truth
 from tests.procedures.strips import SETTINGS
@@ -50,6 +50,24 @@ def test_nothing_changes_any_more_and_weights_are_right():
         # The principal distance that the photographs begin with is 0.7 % off.
         assert abs(d.mean_before_m) > 2.0 and abs(d.mean_m) < 0.003
         assert d.planes > 50 and d.rms_m < d.noise_m
+
+
+def test_errors_along_a_strip_have_the_spread_of_their_knots():
+    """Of drawn knots, and about the truth."""
+    result, strip = fitted(), 1
+    labels, _, matrix = estimates()
+    spline = result.errors.splines[strip]
+    time = np.linspace(spline.times[0], spline.times[-1], 40)
+    value, sigma = errors_along(result, strip, time)
+    own = [k for k, label in enumerate(labels) if label.startswith("trajectory_knots")]
+    rng = np.random.default_rng(3)
+    knots = rng.multivariate_normal(np.zeros(len(own)), matrix[np.ix_(own, own)], 4000).reshape(4000, -1, 6)
+    index, weights = spline.weights(time)
+    drawn = np.einsum("tk,ntkc->ntc", weights, knots[:, index]).std(axis=0)
+    units = [1.0] * 3 + [np.rad2deg(1.0)] * 3
+    np.testing.assert_allclose(sigma, drawn * units, rtol=0.06)
+    true = np.concatenate(flown().errors.at(strip, time), axis=1) * units
+    assert (np.abs(value - true) < 4 * sigma).all()
 
 
 def test_errors_of_the_trajectory_are_found():

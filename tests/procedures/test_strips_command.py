@@ -1,13 +1,20 @@
 """`jaxphoto strips`, as a shell calls it."""
 
+import json
+
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.spatial.transform import Rotation
 
+from jaxphoto.block import Frame
 from jaxphoto.cloud import Cloud
+from jaxphoto.georeferencing import Trajectory
 from jaxphoto.io import clouds
 from jaxphoto.io.raster import read_dsm
 from jaxphoto.io.recipe.truth import write_simulation
+from jaxphoto.io.trajectory import FIELDS, read_sbet, sbet_records, with_records, write_sbet
+from jaxphoto.io.trajectory.in_frame import positions_in, records_of, with_poses
 from jaxphoto.lidar.strip_correction import correct_flight
 from tests.commands import run
 from tests.lidar.clouds import SURFACES, ground
@@ -69,6 +76,54 @@ def test_a_trajectory_is_mended_with_the_cloud(cloud_file, tmp_path, monkeypatch
     np.testing.assert_allclose(moved[middle, 2].mean(), SHIFT[2], atol=0.05)
     np.testing.assert_allclose(after.time_s, before.time_s)
     assert pd.read_csv(tmp_path / "out" / "strips.csv").rms_m[0] < 0.02
+
+
+@pytest.fixture(scope="module")
+def on_the_map(cloud_file, tmp_path_factory):
+    """The same cloud in UTM, and its trajectory as SBET."""
+    frame = Frame("epsg", 32633, origin=(15.4, 47.1, 400.0))
+    folder = tmp_path_factory.mktemp("map")
+    clouds.write_cloud(clouds.read_cloud(cloud_file), folder / "both.laz", frame=frame)
+    clouds.write_cloud(clouds.read_cloud(cloud_file), folder / "nowhere.laz")
+    time = np.concatenate([start + np.arange(-1.0, 4.0, 0.1) for start in (0.0, 10.0)])
+    xyz = np.column_stack([50.0 * (time % 10 - 10 * (time % 10 > 5)), np.full((len(time), 2), [50.0, 500.0])])
+    level = Rotation.from_euler("z", 0.0).as_quat()[[3, 0, 1, 2]]
+    flown = Trajectory(time, xyz, np.tile(level, (len(time), 1)), np.zeros_like(xyz), np.zeros_like(xyz))
+    records = with_poses(records_of(flown, "sbet")._replace(geographic=True), flown, frame)
+    empty = np.zeros((len(time), len(FIELDS)))
+    empty[:, FIELDS.index("time")] = time
+    empty[:, FIELDS.index("wander_angle")] = 0.3
+    write_sbet(with_records(empty, records), folder / "flight.sbet")
+    return folder, frame
+
+
+def test_a_cloud_on_the_map_and_a_trajectory_in_sbet(on_the_map, tmp_path, monkeypatch, capsys):
+    folder, frame = on_the_map
+    given = ("--trajectory", folder / "flight.sbet", "--adjust", "none", "--hold", "1", "--sigma-position-m", "0.3")
+    cloud, out = folder / "both.laz", tmp_path / "out"
+    code, output, errors = run(monkeypatch, capsys, "strips", cloud, "--out", out, *given, *OPTIONS)
+    assert code == 0, errors + output
+    before, after = (read_sbet(of / "flight.sbet") for of in (folder, out))
+    kept = [k for k, name in enumerate(FIELDS) if name in ("time", "wander_angle", "x_velocity", "z_rate")]
+    np.testing.assert_array_equal(after[:, kept], before[:, kept])
+    local = [positions_in(sbet_records(values, ""), frame) for values in (before, after)]
+    time, moved = before[:, 0], local[0] - local[1]
+    np.testing.assert_allclose(moved[time < 3], 0.0, atol=1e-6)
+    middle = (time > 10.2) & (time < 11.8)
+    np.testing.assert_allclose(moved[middle, 2].mean(), SHIFT[2], atol=0.05)
+    # Cloud and maps stay where they were on the map.
+    first = clouds.read_cloud(cloud).strip == 0
+    corrected = clouds.read_cloud(out / "both.laz")
+    np.testing.assert_allclose(corrected.xyz[first], clouds.read_cloud(cloud).xyz[first], atol=2e-3)
+    raster, system = read_dsm(out / "differences_before.tif")
+    assert system.plane.to_epsg() == 32633 and raster.west == pytest.approx(corrected.extent[0, 0], abs=3.0)
+    page, summary = (out / "report.html").read_text(encoding="utf-8"), json.loads((out / "summary.json").read_text())
+    assert "Errors of the trajectory" in page and summary["came_to_rest"] and summary["verdict"] in page.lower()
+
+    code, _, errors = run(
+        monkeypatch, capsys, "strips", folder / "nowhere.laz", "--out", tmp_path / "no", *given, *OPTIONS
+    )
+    assert code == 2 and "name it (--cloud-epsg)" in " ".join(errors.split()) and not (tmp_path / "no").exists()
 
 
 @pytest.mark.parametrize(

@@ -124,7 +124,8 @@ def _covariance(source: CameraSource, camera: str, names: tuple[str, ...], sigma
     if not free or not path.is_file():
         return None
     try:
-        table: pd.DataFrame = pd.read_csv(path, usecols=list(_CORRELATION), low_memory=False)
+        # As text: a long row of digits would become an integer that is no float.
+        table: pd.DataFrame = pd.read_csv(path, usecols=list(_CORRELATION), dtype=str)
     except ValueError:
         needed = ", ".join(_CORRELATION)
         raise source.error(f"{path.name} beside it is no table of {needed}; adjust again or remove it") from None

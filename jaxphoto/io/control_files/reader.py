@@ -5,6 +5,8 @@ from pathlib import Path
 import numpy as np
 
 from jaxphoto.errors import InputError, few
+from jaxphoto.io.control_files.bingo import read_geoin
+from jaxphoto.io.control_files.bingo import recognises as is_geoin
 from jaxphoto.io.control_files.gcp_list import read_gcp_list
 from jaxphoto.io.control_files.gcp_list import recognises as is_gcp_list
 from jaxphoto.io.control_files.geo_json import read_geo_json
@@ -21,9 +23,9 @@ from jaxphoto.procedures.control.surveyed import GivenControl, Marks, SurveyedPo
 def read_control(control: str | Path, marks: str | Path | None = None) -> GivenControl:
     """The points of the file `control` with the marks that it has, and those of the file `marks`.
 
-    Forms are told apart by content: gcp_list.txt, Metashape's markers as XML, GeoJSON, a GeoPackage, tables of points
-    or marks. A file `marks`
-    may be any form that has marks; coordinates in it are not used. Raises InputError where either is none.
+    Forms are told apart by content: gcp_list.txt, Metashape's markers as XML, GeoJSON, a GeoPackage, BINGO's geoin.dat,
+    tables of points or marks. A file `marks` may be any form that has marks; coordinates in it are not used. Raises
+    InputError where either is none.
     """
     own = _read(Path(control))
     if isinstance(own, Marks):
@@ -54,6 +56,8 @@ def _read(path: Path) -> GivenControl | SurveyedPoints | Marks:
         raise InputError(f"{path.name}: the file is empty; give it points or marks")
     if is_gcp_list(lines):
         return read_gcp_list(path, lines, rows)
+    if is_geoin(lines):
+        return read_geoin(path, lines, rows)
     return read_table(path, lines, rows)
 
 

@@ -1,4 +1,4 @@
-"""Texts of exterior orientations: omega, phi, kappa of Inpho, Pix4D and `--to opk`, and PATB's matrices.
+"""Texts of exterior orientations: omega, phi, kappa of Inpho, Pix4D and `--to opk`, PATB's matrices, BINGO's itera.dat.
 
     imageName X Y Z Omega Phi Kappa         a row a photograph, separated by blanks, tabs, commas or semicolons
 
@@ -6,12 +6,15 @@
     a11 a12 a13 a21 a22
     a23 a31 a32 a33
 
+    ORIA photograph X Y Z phi omega kappa   among rows that begin with other words
+
 omega, phi, kappa are those of docs/conventions.md, in degrees, or gon where the lines above the first row say gon,
 grads or gradians. Other columns and another order are read where the last line above the first row names them. PATB's
-matrix takes the axes of the camera, x right, y up, z backwards, to those of the object. A comment or a .prj beside
-names the system.
+matrix takes the axes of the camera, x right, y up, z backwards, to those of the object. BINGO's angles are
+camera_from_object = R3(kappa) R1(omega) R2(phi), in gon. A comment or a .prj beside names the system.
 Sources: Pix4D support, articles 202977149 and 202558969 ("Yaw, Pitch, Roll and Omega, Phi, Kappa angles"); PCI
-Geomatics support, article 204186705 ("Using Pat-B in OrthoEngine").
+Geomatics support, article 204186705 ("Using Pat-B in OrthoEngine"); of BINGO a program that reads its files (S. Turek's
+bundle block adjustment for GRASS, 2014), as its manual is not public.
 """
 
 import re
@@ -20,6 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from jaxphoto.arrays import still
 from jaxphoto.collinearity import ExteriorOrientation
@@ -46,8 +50,10 @@ _WORDS = {
 _COLUMNS = tuple(_WORDS)
 _ANGLES = _COLUMNS[3:]
 _FIRST, _MATRIX = 3, (5, 4)
-# Lines of a file among which its first row stands, and their characters.
-_BEGIN, _HEAD = 40, 20_000
+_ORIA = "ORIA"
+_GON_DEG = 0.9
+# Lines among which the first row stands, and characters among which BINGO's does, whose points may come before.
+_BEGIN, _HEAD = 40, 2_000_000
 
 
 _Row = tuple[int, list[str], str]
@@ -62,8 +68,8 @@ class ExteriorText(NamedTuple):
     names: list[str]
     positions: Float[np.ndarray, "images 3"]
     camera_from_object: Float[np.ndarray, "images 3 3"]
-    matrices: bool
-    """Whether these were PATB's matrices."""
+    others: tuple[Float[np.ndarray, "images 3 3"], ...]
+    """What the same numbers may mean besides: transposes of matrices, BINGO's angles in another order or unit."""
     system: str
     """The words that name the coordinate system; "" for none."""
 
@@ -71,19 +77,22 @@ class ExteriorText(NamedTuple):
 def is_exterior(path: Path) -> bool:
     """Whether a file begins as one of these."""
     with path.open("rb") as file:
-        lines = file.read(_HEAD).decode("utf-8", "replace").splitlines()[:_BEGIN]
-    lines = [line for line in lines if line.strip()]
-    return _first_of_angles(lines) is not None or _first_of_matrices([_cells(line) for line in lines]) is not None
+        lines = [line for line in file.read(_HEAD).decode("utf-8", "replace").splitlines() if line.strip()]
+    begin = lines[:_BEGIN]
+    return _is_of_bingo(lines) or _first_of_angles(begin) is not None or _first_of_matrices(begin) is not None
 
 
 def read_exterior(path: Path) -> ExteriorText:
     """The orientations in a file. Raises InputError for rows that are none."""
     numbered = [(k, line) for k, line in enumerate(read_text(path, LARGE).split("\n"), 1) if line.strip()]
     begin = [line for _, line in numbered[:_BEGIN]]
+    if _is_of_bingo([line for _, line in numbered]):
+        said = _SYSTEM.search("\n".join(begin))
+        return _of_bingo(path, numbered, said[1] if said else _beside(path))
     first = _first_of_angles(begin)
     matrices = first is None
     if first is None:
-        first = _first_of_matrices([_cells(line) for line in begin])
+        first = _first_of_matrices(begin)
     if first is None:
         raise InputError(f"{path.name} has no row of name, X, Y, Z, omega, phi, kappa; export the orientations anew")
     head = "\n".join(line for _, line in numbered[:first])
@@ -103,8 +112,9 @@ def read_exterior(path: Path) -> ExteriorText:
                 "each; call the columns so"
             )
         places = places or dict(zip(_COLUMNS, range(-len(_COLUMNS), 0), strict=True))
-        names, positions, rotations = _of_angles(path, rows, places, 0.9 if _GON.search(head) else 1.0)
-    return ExteriorText(names, positions, rotations, matrices, said[1] if said else _beside(path))
+        names, positions, rotations = _of_angles(path, rows, places, _GON_DEG if _GON.search(head) else 1.0)
+    others = (np.swapaxes(rotations, 1, 2),) if matrices else ()
+    return ExteriorText(names, positions, rotations, others, said[1] if said else _beside(path))
 
 
 def _beside(path: Path) -> str:
@@ -142,7 +152,8 @@ def _first_of_angles(lines: list[str]) -> int | None:
     return found[0] if found and 2 * sum(map(_is_angles, rows[found[0] :])) > len(rows) - found[0] else None
 
 
-def _first_of_matrices(rows: list[list[str]]) -> int | None:
+def _first_of_matrices(lines: list[str]) -> int | None:
+    rows = [_cells(line) for line in lines]
     widths = [len(row) if all(map(is_number, row)) else 0 for row in rows]
     for k in range(len(rows) - 2):
         above = len(rows[k]) > _FIRST and all(map(is_number, rows[k][-_FIRST:]))
@@ -199,3 +210,36 @@ def _of_matrices(path: Path, rows: list[_Row]) -> _Read:
         names.append(" ".join(name[:-1] if len(name) > 1 and is_number(name[-1]) else name))
     numbers = np.array(values).reshape(-1, 12)
     return names, numbers[:, :3], np.swapaxes(numbers[:, 3:].reshape(-1, 3, 3), 1, 2)
+
+
+def _oria(words: list[str]) -> int | None:
+    """Where the six numbers of a row of BINGO's orientations begin, after ORIA and a name; None for another row."""
+    if words[0] != _ORIA:
+        return None
+    return next((k for k in range(2, len(words) - 5) if all(map(is_number, words[k : k + 6]))), None)
+
+
+def _is_of_bingo(lines: list[str]) -> bool:
+    return any(_oria(line.split()) is not None for line in lines)
+
+
+def _of_bingo(path: Path, numbered: list[tuple[int, str]], system: str) -> ExteriorText:
+    names, values = [], []
+    for k, line in numbered:
+        words = line.split()
+        begin = _oria(words)
+        if words[0] == _ORIA and begin is None:
+            raise InputError(
+                f"{path.name}, row {k}: {quoted(line)} is not ORIA, name, X, Y, Z, phi, omega, kappa; complete the row"
+            )
+        if begin is not None:
+            names.append(" ".join(words[1:begin]))
+            values.append(row_numbers(path, k, words[begin : begin + 6], 6))
+    numbers = np.array(values).reshape(-1, 6)
+    # Axes turned one after the other; Rotation goes from the camera to the object.
+    read = [
+        Rotation.from_euler(axes, numbers[:, 3:] * degrees, degrees=True).inv().as_matrix()
+        for axes in ("YXZ", "XYZ")
+        for degrees in (_GON_DEG, 1.0)
+    ]
+    return ExteriorText(names, numbers[:, :3], read[0], tuple(read[1:]), system)

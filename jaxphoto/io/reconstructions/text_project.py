@@ -26,7 +26,7 @@ from jaxphoto.io.reconstructions.tied_photographs import TiedCamera, estimated
 
 _EXTERIORS = (".txt", ".csv", ".dat", ".ori", ".eo", ".opk", ".pat", ".out", "")
 _CAMERAS = (".toml", ".xml", ".yml", ".yaml", ".json", ".cameramodel")
-# A matrix is the transpose of what was taken where that makes rays miss by so many times more.
+# Numbers are read otherwise where that lets rays miss by so many times less.
 _WORSE = 3.0
 
 
@@ -60,7 +60,7 @@ def read_text_project(source: Path) -> BlockTables:
             f"{path.parent} has no image points for the orientations in {path.name}; export the tie points as BINGO or "
             "PATB into this folder, or write image_points.csv"
         )
-    rotations = _turned(given, camera, shown)
+    rotations = _best_turned(given, camera, shown)
     return network_beside(
         path,
         {"camera": camera},
@@ -90,13 +90,14 @@ def _camera(path: Path) -> TiedCamera:
     return TiedCamera(read.sensor, read.interior, estimated(read.interior))
 
 
-def _turned(given: ExteriorText, camera: TiedCamera, shown: Shown) -> Float[np.ndarray, "images 3 3"]:
-    """Rotations from the object to the camera; of matrices the transposes where rays say so."""
+def _best_turned(given: ExteriorText, camera: TiedCamera, shown: Shown) -> Float[np.ndarray, "images 3 3"]:
+    """Rotations from the object to the camera; one of their other readings where rays say so."""
     rotations = given.camera_from_object
-    if not given.matrices:
+    if not given.others:
         return rotations
     xy = camera.sensor.mm_from_px(shown.column_row) - [float(camera.interior.x_p), float(camera.interior.y_p)]
     rays = np.column_stack([xy, np.full(len(xy), -float(camera.interior.c))])
-    other = np.swapaxes(rotations, 1, 2)
-    own, turned = (ray_misfit(given.positions, r, rays, shown.image, shown.point) for r in (rotations, other))
-    return other if turned * _WORSE < own else rotations
+    read = (rotations, *given.others)
+    misfit = [ray_misfit(given.positions, r, rays, shown.image, shown.point) for r in read]
+    best = int(np.argmin(misfit))
+    return read[best] if misfit[best] * _WORSE < misfit[0] else rotations

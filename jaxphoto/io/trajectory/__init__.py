@@ -4,16 +4,21 @@ from pathlib import Path
 
 from jaxphoto.io.trajectory.flight_csv import read_flight_csv, write_flight_csv
 from jaxphoto.io.trajectory.records import Records
-from jaxphoto.io.trajectory.sbet import FIELDS, read_sbet, sbet_records, write_sbet
+from jaxphoto.io.trajectory.sbet import FIELDS, read_sbet, sbet_records, with_records, write_sbet
 
 __all__ = [
-    "FIELDS", "Records", "read_flight_csv", "read_records", "read_sbet", "sbet_records", "write_flight_csv",
-    "write_sbet",
+    "FIELDS", "Records", "is_sbet", "read_flight_csv", "read_records", "read_sbet", "sbet_records", "with_records",
+    "write_flight_csv", "write_sbet",
 ]  # fmt: skip
 
 
+def is_sbet(path: Path) -> bool:
+    """Whether a trajectory is called as SBET are: .sbet, or .out (POSPac's ending)."""
+    return path.suffix.lower() in (".sbet", ".out")
+
+
 def read_records(path: Path) -> Records:
-    """The records of a trajectory: SBET where the file is called .sbet or .out (POSPac's ending), CSV otherwise."""
-    if path.suffix.lower() in (".sbet", ".out"):
+    """The records of a trajectory: SBET where the file is called so, CSV otherwise."""
+    if is_sbet(path):
         return sbet_records(read_sbet(path), path.name)
     return read_flight_csv(path)

@@ -70,3 +70,23 @@ def sbet_records(values: Float[np.ndarray, "records 17"], file: str) -> Records:
         unknown,
     )
     return check_records(records, np.arange(1, len(values) + 1), "record")
+
+
+def with_records(values: Float[np.ndarray, "records 17"], records: Records) -> Float[np.ndarray, "records 17"]:
+    """SBET records with the places and attitudes of `records`, of which `sbet_records` makes the same again.
+
+    Velocities, accelerations, rates and the wander angle stay as they were.
+    """
+    longitude, latitude = np.deg2rad(records.coordinates[:, :2].T)
+    roll, pitch, yaw = np.deg2rad(records.roll_pitch_yaw_deg.T)
+    # Headings go on from those of the file, whichever turn they count from.
+    heading, wander = values[:, FIELDS.index("platform_heading")], values[:, FIELDS.index("wander_angle")]
+    turned = np.mod(yaw + wander - heading + np.pi, 2 * np.pi) - np.pi
+    new = {
+        "latitude": latitude, "longitude": longitude, "altitude": records.coordinates[:, 2],
+        "roll": roll, "pitch": pitch, "platform_heading": heading + turned,
+    }  # fmt: skip
+    changed = values.copy()
+    for name, column in new.items():
+        changed[:, FIELDS.index(name)] = column
+    return changed

@@ -1,0 +1,98 @@
+"""The result folder of a strip adjustment: tables, map, report, and the adjustment of photographs in it."""
+
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+from jaxphoto.lidar.raster import Raster
+from jaxphoto.procedures.lidar import StripAdjustment
+from jaxphoto.report.document import Element, Heading, Paragraph, rows_of
+from jaxphoto.report.findings import Verdict
+from jaxphoto.report.made import Made, made_section
+from jaxphoto.report.results import write_results, write_summary
+from jaxphoto.report.strip_figures import differences_figure, scanner_correlation_figure, trajectory_errors_figure
+from jaxphoto.report.strips import (
+    all_correlations,
+    calibration_table,
+    differences_table,
+    strip_rounds_table,
+    strips_verdict,
+    trajectory_errors_table,
+)
+from jaxphoto.report.study_page import WholePicture, study_page
+from jaxphoto.report.tables import Tables
+from jaxphoto.writing import whole_folder
+
+# Of correlations.
+_DIGITS = 6
+_TRAJECTORY = (
+    "What the trajectory was off by along each strip, with two standard deviations to either side. For the most part "
+    "they mean a shift or turn of all strips together, which overlaps do not show; between strips far less is open."
+)
+_CORRELATIONS = (
+    "Correlations of what is estimated of the scanner. Near 1 or -1, two of them cannot be told apart by this flight; "
+    "correlation.csv has them of all unknowns, those of the trajectory among them."
+)
+
+
+@contextmanager
+def write_strips(
+    result: StripAdjustment,
+    directory: Path,
+    gaps: tuple[Raster, Raster] | None,
+    seconds: Mapping[str, float],
+    made: Made,
+) -> Iterator[Path]:
+    """Tables, differences.png of the `gaps` before and after, report.html, summary.json, of photographs `adjustment`.
+
+    Yields the folder while it is not yet in its place, for what else belongs there. Raises InputError where `directory`
+    holds something that is not an earlier result.
+    """
+    began = time.perf_counter()
+    with whole_folder(directory) as work:
+        tables = None if result.before is None else Tables(result.adjusted)
+        verdict = strips_verdict(result, tables)
+        if tables is not None:
+            write_results(tables, verdict, work / "adjustment", dict(result.adjusted.seconds))
+        differences_table(result.differences).to_csv(work / "strips.csv", index=False)
+        strip_rounds_table(result.rounds).to_csv(work / "rounds.csv", index=False)
+        calibration_table(result).to_csv(work / "scanner.csv", index=False)
+        trajectory_errors_table(result).to_csv(work / "trajectory_errors.csv", index=False)
+        all_correlations(result).round(_DIGITS).to_csv(work / "correlation.csv")
+        picture = None
+        if gaps is not None:
+            picture = WholePicture.of(differences_figure(*gaps), "gaps of strips over the ground, before and after")
+            (work / "differences.png").write_bytes(picture.png)
+        (work / "report.html").write_text(_page(result, verdict, picture, made), encoding="utf-8")
+        told = {"rounds": len(result.rounds), "came_to_rest": result.still, "sigma0": float(result.adjusted.sigma0)}
+        times = {"seconds": {**seconds, "write": time.perf_counter() - began}}
+        write_summary(verdict.summary | told | times, work)
+        yield work
+
+
+def _page(result: StripAdjustment, verdict: Verdict, gaps: WholePicture | None, made: Made) -> str:
+    parts: list[Element | WholePicture] = [Paragraph(f.text, f.level.name.lower()) for f in verdict.findings]
+    parts += [
+        Heading("Strips before and after"),
+        rows_of(differences_table(result.differences)),
+        *([gaps] if gaps else []),
+    ]
+    scanner = calibration_table(result)
+    if len(scanner):
+        parts += [
+            Heading("Scanner and cameras" if result.before else "Scanner"),
+            Paragraph("What was found, and what each is least told from (with, rho)."),
+            rows_of(scanner),
+        ]
+    if scanner["parameter"].str.startswith("scanner").any():
+        picture = WholePicture.of(scanner_correlation_figure(result), "correlations of the scanner")
+        parts += [Heading("What cannot be told apart"), Paragraph(_CORRELATIONS), picture]
+    if len(result.errors.splines):
+        alt = "errors of the trajectory along each strip, with bands of two standard deviations"
+        picture = WholePicture.of(trajectory_errors_figure(result), alt)
+        parts += [Heading("Errors of the trajectory"), Paragraph(_TRAJECTORY), picture]
+    parts += [Heading("Rounds"), rows_of(strip_rounds_table(result.rounds)), *made_section(made)]
+    with_photographs = " and photographs" if result.before else ""
+    title = f"{', '.join(f'strip {name}' for name in result.cloud.strips[:6])}{with_photographs}: strip adjustment"
+    return study_page(title, (verdict.headline,), parts, verdict.colour)
