@@ -37,8 +37,11 @@ from jaxphoto.lidar.strip_settings import StripSettings
 from jaxphoto.parameters import dynamic_fields
 from jaxphoto.procedures.lidar import Photographs, ScannerPriors, StripAdjustment, StripRound, adjust_strips
 from jaxphoto.procedures.lidar.strip_adjustment import MAX_STRIP_ROUNDS
-from jaxphoto.report.strips import print_strips
+from jaxphoto.report.findings import Level
+from jaxphoto.report.strips import print_strips, strips_verdict
 from jaxphoto.report.strips_folder import write_strips
+from jaxphoto.report.tables import Tables
+from jaxphoto.report.terminal import print_verdict
 from jaxphoto.unknowns import FIXED, FREE
 from jaxphoto.writing import check_folder
 
@@ -92,8 +95,8 @@ def strips_command(
 
     With --block the photographs of the flight, too: trajectory, scanner and camera at once.
 
-    --class and --returns choose the points of the planes; the whole cloud is corrected. Exit code 1: written, but it
-    still changed.
+    --class and --returns choose the points of the planes; the whole cloud is corrected. Exit code 1: written, but
+    the verdict is red, as where it still changes.
     """
     settings = StripSettings(
         cell_m=cell_m,
@@ -140,8 +143,9 @@ def strips_command(
         like = cloud if cloud.suffix.lower() in (".las", ".laz") else None
         maps = GapMaps(Placement(cloud.name, clouds.cloud_system(cloud, **said), own), settings)
         gaps = maps.gaps(planes, result.cloud)
-        made = made_by(context, cloud, trajectory, block)
-        with write_strips(result, out, gaps, result.adjusted.seconds, made) as folder:
+        tables = None if photographs is None else Tables(result.adjusted)
+        made, verdict = made_by(context, cloud, trajectory, block), strips_verdict(result, tables)
+        with write_strips(result, tables, verdict, out, gaps, made) as folder:
             for raster, name in zip(gaps or (), ("before", "after"), strict=False):
                 write_dsm(folder / f"differences_{name}.tif", raster, maps.system)
             name = cloud.name if like is not None else f"corrected_{cloud.name}"
@@ -153,9 +157,10 @@ def strips_command(
                 if trajectory is not None and is_sbet(trajectory):
                     write_sbet(with_records(read_sbet(trajectory), moved), folder / trajectory.name)
     console = plain_console()
+    print_verdict(verdict, console)
     print_strips(result, console)
     console.print(f"results in {out} (open report.html)")
-    if not result.still:
+    if verdict.level == Level.ALARM:
         raise typer.Exit(1)
 
 

@@ -107,7 +107,8 @@ def _knot_labels(result: StripAdjustment) -> list[list[str]]:
 
 def strips_verdict(result: StripAdjustment, tables: Tables | None) -> Verdict:
     """What is to be known of it first; `tables` are those of the adjustment where photographs are in it."""
-    return Verdict.of((*_of_rounds(result), *(verdict_of(tables).findings if tables else _of_strips(result))))
+    found = _of_strips(result) if tables is None else verdict_of(tables).findings
+    return Verdict.of((*_of_rounds(result), *found))
 
 
 def _of_rounds(result: StripAdjustment) -> Iterator[Finding]:

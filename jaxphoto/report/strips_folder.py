@@ -1,7 +1,7 @@
 """The result folder of a strip adjustment: tables, map, report, and the adjustment of photographs in it."""
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -17,7 +17,6 @@ from jaxphoto.report.strips import (
     calibration_table,
     differences_table,
     strip_rounds_table,
-    strips_verdict,
     trajectory_errors_table,
 )
 from jaxphoto.report.study_page import WholePicture, study_page
@@ -39,22 +38,21 @@ _CORRELATIONS = (
 @contextmanager
 def write_strips(
     result: StripAdjustment,
+    tables: Tables | None,
+    verdict: Verdict,
     directory: Path,
     gaps: tuple[Raster, Raster] | None,
-    seconds: Mapping[str, float],
     made: Made,
 ) -> Iterator[Path]:
     """Tables, differences.png of the `gaps` before and after, report.html, summary.json, of photographs `adjustment`.
 
-    Yields the folder while it is not yet in its place, for what else belongs there. Raises InputError where `directory`
-    holds something that is not an earlier result.
+    `tables` are those of the adjustment where photographs are in it. Yields the folder while it is not yet in its
+    place, for what else belongs there. Raises InputError where `directory` holds what is not an earlier result.
     """
-    began = time.perf_counter()
+    began, seconds = time.perf_counter(), dict(result.adjusted.seconds)
     with whole_folder(directory) as work:
-        tables = None if result.before is None else Tables(result.adjusted)
-        verdict = strips_verdict(result, tables)
         if tables is not None:
-            write_results(tables, verdict, work / "adjustment", dict(result.adjusted.seconds))
+            write_results(tables, verdict, work / "adjustment", seconds)
         differences_table(result.differences).to_csv(work / "strips.csv", index=False)
         strip_rounds_table(result.rounds).to_csv(work / "rounds.csv", index=False)
         calibration_table(result).to_csv(work / "scanner.csv", index=False)
@@ -66,7 +64,7 @@ def write_strips(
             (work / "differences.png").write_bytes(picture.png)
         (work / "report.html").write_text(_page(result, verdict, picture, made), encoding="utf-8")
         told = {"rounds": len(result.rounds), "came_to_rest": result.still, "sigma0": float(result.adjusted.sigma0)}
-        times = {"seconds": {**seconds, "write": time.perf_counter() - began}}
+        times = {"seconds": seconds | {"write": time.perf_counter() - began}}
         write_summary(verdict.summary | told | times, work)
         yield work
 

@@ -21,17 +21,22 @@ def plain(text: str) -> Text:
     return Text(printable(text))
 
 
-def print_adjustment(tables: Tables, verdict: Verdict, console: Console) -> None:
-    """Print the verdict on an adjustment with its reasons, and the interior orientation with its sigmas."""
-    adjusted = tables.adjusted
-    n, u = sum(adjusted.n_observations.values()), sum(adjusted.n_unknowns.values())
-    console.print(plain(adjusted.block.title or "block"), style="bold")
+def print_verdict(verdict: Verdict, console: Console) -> None:
+    """Print a verdict with its first reasons."""
     console.print(Text(verdict.headline, f"bold {_COLOURS[verdict.level]}"))
     for finding in verdict.findings[:_FINDINGS]:
         mark = Text(f"{_MARKS[finding.level]} ", _COLOURS[finding.level])
         console.print(mark + plain(finding.text))
     if len(verdict.findings) > _FINDINGS:
         console.print(f"and {len(verdict.findings) - _FINDINGS} more in report.html")
+
+
+def print_adjustment(tables: Tables, verdict: Verdict, console: Console) -> None:
+    """Print the verdict on an adjustment with its reasons, and the interior orientation with its sigmas."""
+    adjusted = tables.adjusted
+    n, u = sum(adjusted.n_observations.values()), sum(adjusted.n_unknowns.values())
+    console.print(plain(adjusted.block.title or "block"), style="bold")
+    print_verdict(verdict, console)
     console.print(f"{adjusted.outcome.value} ({int(adjusted.steps)} iterations)")
     console.print(
         f"sigma0 {float(adjusted.sigma0):.6g}   redundancy {adjusted.redundancy} = {n} observations"
