@@ -22,7 +22,7 @@ from jaxphoto.georeferencing import Scanner
 from jaxphoto.io import clouds, read_block, write_block
 from jaxphoto.io.block_folder import check_block_target, whole_block
 from jaxphoto.io.text_tables import is_number
-from jaxphoto.io.trajectory import read_records, write_flight_csv
+from jaxphoto.io.trajectory import read_records, write_moved
 from jaxphoto.io.trajectory.in_frame import trajectory_in, with_positions
 from jaxphoto.lidar import HeightSettings
 from jaxphoto.lidar.correction import correct_cloud
@@ -190,9 +190,7 @@ def simultaneous_command(
             path = trajectory_in(records, read.frame, exact, exact)
         status.update("reading the cloud")
         said = {"epsg": cloud_epsg, "unit": cloud_unit}
-        whole = surface = clouds.read_cloud(cloud, read.frame, **said)  # type: ignore[arg-type]
-        if chosen is not None or returns != "all":
-            surface = clouds.read_cloud(cloud, read.frame, classes=chosen, returns=returns, **said)  # type: ignore[arg-type]
+        whole, surface = clouds.read_whole_and_chosen(cloud, read.frame, classes=chosen, returns=returns, **said)  # type: ignore[arg-type]
         seconds = {"read": time.perf_counter() - began}
         priors = Scanner(turn, dict.fromkeys(surface.strips or ("cloud",), slide))  # type: ignore[arg-type]
         result = simultaneous(
@@ -215,7 +213,7 @@ def simultaneous_command(
             if records is not None and result.trajectory is not None:
                 moved = with_positions(records, np.asarray(result.trajectory.position), read.frame)
                 moved = moved._replace(time=moved.time + trajectory_shift_s)
-                write_flight_csv(moved, folder / "trajectory.csv")
+                write_moved(moved, trajectory, folder)  # type: ignore[arg-type]
     console = plain_console()
     print_rounds(result.rounds, result.still, console)
     print_moved(result, console)

@@ -20,15 +20,7 @@ from jaxphoto.io.block_folder import exposure_times
 from jaxphoto.io.clouds.coordinate_system import CoordinateSystem
 from jaxphoto.io.clouds.placement import Placement
 from jaxphoto.io.raster import write_dsm
-from jaxphoto.io.trajectory import (
-    Records,
-    is_sbet,
-    read_records,
-    read_sbet,
-    with_records,
-    write_flight_csv,
-    write_sbet,
-)
+from jaxphoto.io.trajectory import Records, read_records, write_moved
 from jaxphoto.io.trajectory.in_frame import trajectory_in, with_poses
 from jaxphoto.lidar.raster import Raster
 from jaxphoto.lidar.strip_correction import correct_strips
@@ -128,9 +120,7 @@ def strips_command(
             path = trajectory_in(records, frame, exact, exact)
         said: dict[str, Any] = {"epsg": cloud_epsg, "unit": cloud_unit}
         own = frame if block is not None or frame.kind == "epsg" else None
-        whole = planes = clouds.read_cloud(cloud, own, **said)
-        if chosen is not None or returns != "all":
-            planes = clouds.read_cloud(cloud, own, classes=chosen, returns=returns, **said)  # type: ignore[arg-type]
+        whole, planes = clouds.read_whole_and_chosen(cloud, own, classes=chosen, returns=returns, **said)  # type: ignore[arg-type]
 
         def report(made: StripRound) -> None:
             line = f"round {made.number}: {made.planes} planes, strips {made.rms_m:.3f} m apart before"
@@ -149,13 +139,15 @@ def strips_command(
             for raster, name in zip(gaps or (), ("before", "after"), strict=False):
                 write_dsm(folder / f"differences_{name}.tif", raster, maps.system)
             name = cloud.name if like is not None else f"corrected_{cloud.name}"
+            if like is None and block is None and own is not None:
+                # Back where the file counts from: the frame was made up here.
+                corrected = dataclasses.replace(corrected, xyz=maps.placement.file(corrected.xyz))
+                own = None
             clouds.write_cloud(corrected, folder / name, like=like, frame=own, **said)
             if records is not None and result.trajectory is not None:
                 moved = with_poses(records, result.trajectory, frame)
                 moved = moved._replace(time=moved.time + trajectory_shift_s)
-                write_flight_csv(moved, folder / "trajectory.csv")
-                if trajectory is not None and is_sbet(trajectory):
-                    write_sbet(with_records(read_sbet(trajectory), moved), folder / trajectory.name)
+                write_moved(moved, trajectory, folder)  # type: ignore[arg-type]
     console = plain_console()
     print_verdict(verdict, console)
     print_strips(result, console)
@@ -184,7 +176,9 @@ class GapMaps(NamedTuple):
 
 def _about(records: Records, system: CoordinateSystem, cloud: Path) -> Frame:
     """The local frame about a trajectory in longitude and latitude. Raises InputError for a cloud without a system."""
-    code = None if system.plane is None else system.plane.to_epsg()
+    # Any system of the same datum will do for the frame: points come into it by their own.
+    datum = None if system.plane is None else system.plane.geodetic_crs
+    code = None if datum is None else datum.to_epsg()
     if code is None:
         raise InputError(
             f"{records.file}: the trajectory gives longitude and latitude, and {cloud.name} does not say in which EPSG "

@@ -6,10 +6,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jaxphoto.georeferencing import TrajectoryKnot
 from jaxphoto.lidar.raster import Raster
 from jaxphoto.procedures.lidar import StripAdjustment
-from jaxphoto.report.plots import heat_map, new_figure
-from jaxphoto.report.strips import all_correlations, calibration_table, errors_along
+from jaxphoto.report.plots import drawn, heat_map, new_figure
+from jaxphoto.report.strips import all_correlations, errors_along
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -45,15 +46,15 @@ def differences_figure(before: Raster, after: Raster) -> Figure:
 def scanner_correlation_figure(result: StripAdjustment) -> Figure:
     """What is estimated of the scanner against cameras and mounts, and against itself: a heat map each."""
     rho = all_correlations(result)
-    labels = [name.replace("_deg", "_rad") for name in calibration_table(result)["parameter"]]
+    labels = [name for name in rho.index if not name.startswith(TrajectoryKnot.kind)]
     scanner = [name for name in labels if name.startswith("scanner")]
     others = [name for name in labels if name not in scanner]
     sets = [("scanner with camera and mount", others), ("scanner with itself", scanner)]
-    drawn = [(title, names) for title, names in sets if names]
-    wide = sum(len(names) for _, names in drawn)
+    shown = [(title, names) for title, names in sets if names]
+    wide = sum(len(names) for _, names in shown)
     figure = new_figure(3.4 + 0.52 * wide, 1.9 + 0.33 * len(scanner))
-    many = figure.subplots(1, len(drawn), sharey=True, squeeze=False, width_ratios=[len(n) for _, n in drawn])[0]
-    for axes, (title, names) in zip(many, drawn, strict=True):
+    many = figure.subplots(1, len(shown), sharey=True, squeeze=False, width_ratios=[len(n) for _, n in shown])[0]
+    for axes, (title, names) in zip(many, shown, strict=True):
         heat_map(axes, rho.loc[scanner, names].to_numpy(), _short(scanner), _short(names), title)
     figure.colorbar(many[0].images[0], ax=list(many), shrink=0.9)
     return figure
@@ -76,7 +77,7 @@ def trajectory_errors_figure(result: StripAdjustment) -> Figure:
                 panel.fill_between(time, v - s, v + s, color=colour, alpha=0.18, lw=0)
                 panel.plot(time, v, color=colour, lw=1.3, label=axis)
             if part == 0:
-                panel.set_title(f"strip {name}", loc="left", fontsize=10)
+                panel.set_title(f"strip {drawn(name)}", loc="left", fontsize=10)
             else:
                 panel.set_xlabel("time (s)", fontsize=8)
             if k % _ABREAST == 0:
@@ -89,5 +90,7 @@ def trajectory_errors_figure(result: StripAdjustment) -> Figure:
 
 
 def _short(labels: list[str]) -> list[str]:
-    """Labels without the names of their owners and units."""
-    return [name.split(".")[-1].removesuffix("_rad") for name in labels]
+    """Labels without their units, and without the names of their owners where one alone is so called."""
+    short = [name.split(".")[-1].removesuffix("_rad") for name in labels]
+    owners = [name.rsplit(".", 1)[0].partition("[")[2].removesuffix("]") for name in labels]
+    return [f"{own} {name}" if short.count(name) > 1 and own else name for own, name in zip(owners, short, strict=True)]

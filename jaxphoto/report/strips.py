@@ -58,7 +58,7 @@ def calibration_table(result: StripAdjustment) -> pd.DataFrame:
         unit = 180 / np.pi if label.endswith("_rad") else 1.0
         rows.append(
             (
-                label.replace("_rad", "_deg"),
+                f"{label.removesuffix('_rad')}_deg" if label.endswith("_rad") else label,
                 unit * value[k],
                 unit * sigma[k],
                 s.labels[other],

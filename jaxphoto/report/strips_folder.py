@@ -25,6 +25,8 @@ from jaxphoto.writing import whole_folder
 
 # Of correlations.
 _DIGITS = 6
+# Where there is no trajectory, and each strip has a shift.
+_SHIFTS = ["strip", "X_m", "Y_m", "Z_m", "sigma_X_m", "sigma_Y_m", "sigma_Z_m"]
 _TRAJECTORY = (
     "What the trajectory was off by along each strip, with two standard deviations to either side. For the most part "
     "they mean a shift or turn of all strips together, which overlaps do not show; between strips far less is open."
@@ -86,7 +88,10 @@ def _page(result: StripAdjustment, verdict: Verdict, gaps: WholePicture | None, 
     if scanner["parameter"].str.startswith("scanner").any():
         picture = WholePicture.of(scanner_correlation_figure(result), "correlations of the scanner")
         parts += [Heading("What cannot be told apart"), Paragraph(_CORRELATIONS), picture]
-    if len(result.errors.splines):
+    if result.trajectory is None:
+        shifts = trajectory_errors_table(result)[_SHIFTS]
+        parts += [Heading("Shifts of the strips"), rows_of(shifts)]
+    else:
         alt = "errors of the trajectory along each strip, with bands of two standard deviations"
         picture = WholePicture.of(trajectory_errors_figure(result), alt)
         parts += [Heading("Errors of the trajectory"), Paragraph(_TRAJECTORY), picture]

@@ -100,6 +100,8 @@ def write_bingo(folder, kind="local", axes="YXZ", unit=0.9, change=lambda text: 
     for name, at, r in zip(p.images, *map(np.asarray, (on_map.position, on_map.camera_from_object)), strict=True):
         angles = Rotation.from_matrix(r.T).as_euler(axes, degrees=True) / unit
         lines.append(" ".join(["ORIA", name, *map(repr, at.tolist()), *map(repr, angles.tolist()), "1"]))
+    control = [f"CONT {k} {k}00.5 20.5 3.5 0.02 0.02 0.03" for k in range(9)]
+    (folder / "geoin.dat").write_text("\n".join(["* a project", *control]) + "\n")
     (folder / "itera.dat").write_text(change("\n".join(lines) + "\n"))
     return folder
 

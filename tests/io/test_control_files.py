@@ -257,3 +257,27 @@ def test_control_of_bingo(tmp_path):
         path.write_text(files.GEOIN.replace(*change))
         with pytest.raises(InputError, match=words):
             read_control(path)
+
+
+def test_tables_with_words_of_bingo_in_them_are_tables(tmp_path):
+    path = tmp_path / "points.txt"
+    path.write_text("point x y z sigma\nCONT 500.5 600.5 70.25 0.01\nA 501.5 601.5 71.25 0.01\n")
+    points = read_control(path).points
+    assert points.ids == ("CONT", "A") and points.coordinates[0].tolist() == [500.5, 600.5, 70.25]
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["# points in E N of name 25832\nA 1.5 2.5 3.5\n", "# measured by E N name\npoint x y z\nA 1.5 2.5 3.5\n"],
+)
+def test_a_comment_that_is_a_sentence_is_no_header(tmp_path, text):
+    path = tmp_path / "points.txt"
+    path.write_text(text)
+    assert read_control(path).points.coordinates[0].tolist() == [1.5, 2.5, 3.5]
+
+
+def test_rows_that_end_before_their_name_are_told(tmp_path):
+    path = tmp_path / "points.csv"
+    path.write_text("x,y,z,point\n1,2,3\n")
+    with pytest.raises(InputError, match="row 2: 3 cells are too few for the header"):
+        read_control(path)

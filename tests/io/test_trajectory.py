@@ -59,11 +59,15 @@ def test_sbet_comes_back_exactly(tmp_path):
 
 def test_sbet_with_other_poses_keeps_all_else():
     values = random_sbet()
+    # Counted from the other side of the turn, as records may be.
+    values[:, FIELDS.index("longitude")] += 4.0
     records = sbet_records(values, "flight.sbet")
     np.testing.assert_allclose(with_records(values, records), values, atol=1e-13)
     turned = records._replace(roll_pitch_yaw_deg=records.roll_pitch_yaw_deg + 0.5, coordinates=records.coordinates + 2)
     again = sbet_records(with_records(values, turned), "flight.sbet")
-    np.testing.assert_allclose(again.coordinates, turned.coordinates, rtol=1e-13)
+    np.testing.assert_allclose(again.coordinates, turned.coordinates, rtol=1e-12)
+    west = records._replace(coordinates=records.coordinates - [360.0, 0.0, 0.0])
+    np.testing.assert_allclose(with_records(values, west), values, atol=1e-12)
     off = again.roll_pitch_yaw_deg - turned.roll_pitch_yaw_deg
     np.testing.assert_allclose(np.mod(off + 180, 360) - 180, 0.0, atol=1e-11)
 

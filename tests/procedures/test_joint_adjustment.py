@@ -12,6 +12,8 @@ from jaxphoto.adjustment import Outcome
 from jaxphoto.camera import get_parameter
 from jaxphoto.observations import Attitudes, StationRows
 from jaxphoto.procedures.lidar import adjust_strips
+from jaxphoto.report.maps import png_of
+from jaxphoto.report.strip_figures import scanner_correlation_figure, trajectory_errors_figure
 from jaxphoto.report.strips import all_correlations, errors_along
 from jaxphoto.statistics import correlation_matrix
 from tests.procedures.joint import CAMERA, fitted, flown, photographs, truth
@@ -50,6 +52,16 @@ def test_nothing_changes_any_more_and_weights_are_right():
         # The principal distance that the photographs begin with is 0.7 % off.
         assert abs(d.mean_before_m) > 2.0 and abs(d.mean_m) < 0.003
         assert d.planes > 50 and d.rms_m < d.noise_m
+
+
+def test_pictures_take_names_as_they_are():
+    """A dollar begins a formula of matplotlib, and a unit may end a name."""
+    result = fitted()
+    named = dataclasses.replace(result, cloud=dataclasses.replace(result.cloud, strips=("L$^$1", "b_rad", "c")))
+    for figure in (trajectory_errors_figure(named), scanner_correlation_figure(named)):
+        assert png_of(figure)[0].startswith(b"\x89PNG")
+    first, second = scanner_correlation_figure(result).axes[:2]
+    assert len(first.get_xticks()) == 8 and len(first.get_yticks()) == len(second.get_xticks()) == 5
 
 
 def test_errors_along_a_strip_have_the_spread_of_their_knots():

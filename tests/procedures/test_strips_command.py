@@ -11,6 +11,7 @@ from jaxphoto.block import Frame
 from jaxphoto.cloud import Cloud
 from jaxphoto.georeferencing import Trajectory
 from jaxphoto.io import clouds
+from jaxphoto.io.clouds.cloud_reader import EVERY_CLASS
 from jaxphoto.io.raster import read_dsm
 from jaxphoto.io.recipe.truth import write_simulation
 from jaxphoto.io.trajectory import FIELDS, read_sbet, sbet_records, with_records, write_sbet
@@ -31,9 +32,11 @@ def cloud_file(tmp_path_factory):
     # Flown along X at 50 m/s, the second strip ten seconds after the first.
     time = np.concatenate(parts)[:, 0] / 50.0 + 10.0 * strip
     path = tmp_path_factory.mktemp("strips") / "both.laz"
-    clouds.write_cloud(
-        Cloud(np.concatenate([parts[0], parts[1] + SHIFT]), time=time, strip=strip, strips=("1", "2")), path
-    )
+    xyz = np.concatenate([parts[0], parts[1] + SHIFT])
+    # One of them is a blunder far below, which makes no plane.
+    xyz[7, 2] -= 50.0
+    kind = np.where(np.arange(len(xyz)) == 7, 7, 2).astype(np.uint8)
+    clouds.write_cloud(Cloud(xyz, classification=kind, time=time, strip=strip, strips=("1", "2")), path)
     return path
 
 
@@ -47,6 +50,10 @@ def test_shifts_are_taken_off_the_cloud(cloud_file, tmp_path, monkeypatch, capsy
     np.testing.assert_allclose(moved[before.strip == 0], 0.0, atol=1e-3)
     np.testing.assert_allclose(moved[before.strip == 1], np.tile(SHIFT, ((before.strip == 1).sum(), 1)), atol=0.03)
     np.testing.assert_allclose(after.time, before.time, atol=1e-9)
+    every, written = (clouds.read_cloud(f, classes=EVERY_CLASS) for f in (cloud_file, out / "both.laz"))
+    assert len(written) == len(every) == len(before) + 1 and (written.classification == every.classification).all()
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert "Shifts of the strips" in page and "Errors of the trajectory" not in page
     strips = pd.read_csv(out / "strips.csv")
     assert strips.rms_m[0] < 0.2 * strips.rms_before_m[0]
     knots = pd.read_csv(out / "trajectory_errors.csv")
@@ -84,6 +91,7 @@ def on_the_map(cloud_file, tmp_path_factory):
     frame = Frame("epsg", 32633, origin=(15.4, 47.1, 400.0))
     folder = tmp_path_factory.mktemp("map")
     clouds.write_cloud(clouds.read_cloud(cloud_file), folder / "both.laz", frame=frame)
+    clouds.write_cloud(clouds.read_cloud(cloud_file), folder / "both.csv", frame=frame)
     clouds.write_cloud(clouds.read_cloud(cloud_file), folder / "nowhere.laz")
     time = np.concatenate([start + np.arange(-1.0, 4.0, 0.1) for start in (0.0, 10.0)])
     xyz = np.column_stack([50.0 * (time % 10 - 10 * (time % 10 > 5)), np.full((len(time), 2), [50.0, 500.0])])
@@ -118,7 +126,15 @@ def test_a_cloud_on_the_map_and_a_trajectory_in_sbet(on_the_map, tmp_path, monke
     raster, system = read_dsm(out / "differences_before.tif")
     assert system.plane.to_epsg() == 32633 and raster.west == pytest.approx(corrected.extent[0, 0], abs=3.0)
     page, summary = (out / "report.html").read_text(encoding="utf-8"), json.loads((out / "summary.json").read_text())
-    assert "Errors of the trajectory" in page and summary["came_to_rest"] and summary["verdict"] in page.lower()
+    assert "Errors of the trajectory" in page and f'class="verdict {summary["verdict"]}"' in page
+    assert summary["came_to_rest"] and summary["verdict"] in ("green", "amber")
+
+    # A table comes back as the file counts, too.
+    options = ("--cloud-epsg", "32633", *given, *OPTIONS)
+    code, _, errors = run(monkeypatch, capsys, "strips", folder / "both.csv", "--out", tmp_path / "table", *options)
+    assert code == 0, errors
+    table = clouds.read_cloud(tmp_path / "table" / "corrected_both.csv").xyz[first]
+    np.testing.assert_allclose(table, clouds.read_cloud(folder / "both.csv").xyz[first], atol=2e-3)
 
     code, _, errors = run(
         monkeypatch, capsys, "strips", folder / "nowhere.laz", "--out", tmp_path / "no", *given, *OPTIONS

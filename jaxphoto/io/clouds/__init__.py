@@ -4,7 +4,14 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from jaxphoto.io.clouds.cloud_reader import Returns, cloud_chunks, cloud_system, extent, read_cloud
+    from jaxphoto.io.clouds.cloud_reader import (
+        Returns,
+        cloud_chunks,
+        cloud_system,
+        extent,
+        read_cloud,
+        read_whole_and_chosen,
+    )
     from jaxphoto.io.clouds.cloud_writer import write_cloud
     from jaxphoto.io.clouds.coordinate_system import CoordinateSystem, frame_system
     from jaxphoto.io.clouds.placement import Placement
@@ -12,7 +19,8 @@ if TYPE_CHECKING:
 _MODULES = {
     "CoordinateSystem": "coordinate_system", "Placement": "placement", "Returns": "cloud_reader",
     "cloud_chunks": "cloud_reader", "cloud_system": "cloud_reader", "extent": "cloud_reader",
-    "frame_system": "coordinate_system", "read_cloud": "cloud_reader", "write_cloud": "cloud_writer",
+    "frame_system": "coordinate_system", "read_cloud": "cloud_reader", "read_whole_and_chosen": "cloud_reader",
+    "write_cloud": "cloud_writer",
 }  # fmt: skip
 
 __all__ = [
@@ -24,6 +32,7 @@ __all__ = [
     "extent",
     "frame_system",
     "read_cloud",
+    "read_whole_and_chosen",
     "write_cloud",
 ]  # fmt: skip
 

@@ -29,6 +29,8 @@ _OPENERS: dict[str, Callable[[Path, CoordinateSystem | None], CloudSource]] = {
 }
 NOISE = (7, 18)
 """Classes of blunders, low and high, which are read only where they are asked for."""
+EVERY_CLASS = range(256)
+"""All classes, those of blunders, too, and points of a file without classes."""
 _FIELDS = ("xyz", "classification", "returns", "time", "strip")
 _NO_EXTENT = np.array([[np.inf] * 3, [-np.inf] * 3])
 
@@ -71,6 +73,23 @@ def read_cloud(
     for values in columns.values():
         values.resize((kept, *values.shape[1:]), refcheck=False)
     return _compact(Cloud(**columns, strips=strips))
+
+
+def read_whole_and_chosen(
+    path: str | Path,
+    frame: Frame | None = None,
+    *,
+    classes: Collection[int] | None = None,
+    returns: Returns = "all",
+    epsg: int | None = None,
+    unit: str | None = None,
+) -> tuple[Cloud, Cloud]:
+    """All points of a file, `NOISE` among them, and what `read_cloud` chooses: one and the same where that is all."""
+    whole = read_cloud(path, frame, classes=EVERY_CLASS, epsg=epsg, unit=unit)
+    noisy = whole.classification is not None and bool(np.isin(whole.classification, NOISE).any())
+    if classes is None and returns == "all" and not noisy:
+        return whole, whole
+    return whole, read_cloud(path, frame, classes=classes, returns=returns, epsg=epsg, unit=unit)
 
 
 def cloud_chunks(
@@ -152,11 +171,11 @@ def _placed(
 
 def _chosen(chunk: Cloud, classes: Collection[int] | None, returns: Returns, name: str) -> np.ndarray:
     chosen = np.ones(len(chunk), bool)
-    if classes is not None:
+    if classes is not None and classes != EVERY_CLASS:
         if chunk.classification is None:
             raise InputError(f"{name} has no classification, so no classes can be chosen; leave the filter out")
         chosen &= np.isin(chunk.classification, list(classes))
-    elif chunk.classification is not None:
+    elif classes is None and chunk.classification is not None:
         chosen &= ~np.isin(chunk.classification, NOISE)
     if returns != "all":
         if chunk.returns is None:

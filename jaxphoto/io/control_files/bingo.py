@@ -7,6 +7,7 @@ Source: a program that reads these files (S. Turek's bundle block adjustment for
 public.
 """
 
+import re
 from pathlib import Path
 
 from jaxphoto.io.control_files.rows import Cells, SurveyRows
@@ -14,12 +15,15 @@ from jaxphoto.io.text_tables import is_number
 from jaxphoto.procedures.control.surveyed import SurveyedPoints
 
 _CHECK = {"CONT": False, "CHCK": True}
+_RECORD = re.compile("[A-Z]{4}")
 
 
 def recognises(lines: list[str]) -> bool:
-    """Whether a row is a point of such a file."""
-    rows = (line.split(maxsplit=5) for line in lines if line.lstrip().startswith(tuple(_CHECK)))
-    return any(len(row) >= 5 and row[0] in _CHECK and all(map(is_number, row[2:5])) for row in rows)
+    """Whether these are records of such a file, each with its word of four capitals, and points among them."""
+    rows = [row for line in lines if (row := line.split(maxsplit=5)) and row[0][0] not in "*#"]
+    points = (row for row in rows if row[0] in _CHECK and len(row) >= 5)
+    records = all(_RECORD.fullmatch(row[0]) or row[0] == "C" for row in rows)
+    return records and any(all(map(is_number, row[2:5])) for row in points)
 
 
 def read_geoin(path: Path, lines: list[str], rows: list[int]) -> SurveyedPoints:

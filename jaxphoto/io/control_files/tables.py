@@ -47,13 +47,16 @@ def read_table(path: Path, lines: list[str], rows: list[int]) -> SurveyedPoints 
         path.name, [_split(path.name, line, row, separator) for line, row in content], [r for _, r in content]
     )
     said_in = [line.strip().lstrip("#").strip().split(None if separator == " " else separator) for line in comments]
+    width = len(cells.records[0]) if cells.records else 0
     for header in (*cells.records[:1], *(words for words in said_in if len(words) <= MOST_COLUMNS)):
         is_row = bool(cells.records) and header is cells.records[0]
         own = cells._replace(records=cells.records[is_row:], rows=cells.rows[is_row:])
-        if columns := mark_columns(header):
-            return _marks(own, columns, separator)
-        if columns := point_columns(header):
-            return read_points(own, columns, separator, "".join(said[:1]), bool(in_degrees(header, columns)))
+        marks, points = mark_columns(header), point_columns(header)
+        # A comment whose columns the rows have not is a sentence.
+        if marks and (is_row or max(marks[name] for name in ("image", "point", "x", "y")) < width):
+            return _marks(own, marks, separator)
+        if points and (is_row or max(points[name] for name in ("point", "x", "y")) < width):
+            return read_points(own, points, separator, "".join(said[:1]), bool(in_degrees(header, points)))
     found = columns_without_header(_dotted(cells, separator).records) if cells.records else None
     if found is None:
         first = f" (it begins with {quoted(' '.join(cells.records[0]))})" if cells.records else ""
@@ -74,7 +77,7 @@ def read_points(cells: Cells, columns: Columns, separator: str, system: str, deg
     """
     cells, points = _dotted(cells, separator, columns["point"]), SurveyRows(cells.file)
     for k, row in enumerate(cells.records):
-        if len(row) <= max(columns["x"], columns["y"]):
+        if len(row) <= max(columns["point"], columns["x"], columns["y"]):
             raise cells.bad(k, f"{len(row)} cells are too few for the header; complete the row")
         xyz = [cells.number(k, columns["x"], "X"), cells.number(k, columns["y"], "Y"), np.nan]
         if "z" in columns and len(row) > columns["z"]:

@@ -28,7 +28,8 @@ from scipy.spatial.transform import Rotation
 from jaxphoto.arrays import still
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import InputError, quoted
-from jaxphoto.io.reconstructions.numbers import row_numbers
+from jaxphoto.io.control_files.bingo import recognises as is_geoin
+from jaxphoto.io.reconstructions.numbers import beginning, row_numbers
 from jaxphoto.io.text_tables import is_number
 from jaxphoto.io.whole_text import LARGE, SMALL, read_text
 
@@ -51,9 +52,12 @@ _COLUMNS = tuple(_WORDS)
 _ANGLES = _COLUMNS[3:]
 _FIRST, _MATRIX = 3, (5, 4)
 _ORIA = "ORIA"
+_ORIA_ROW = re.compile(rb"\n[ \t]{0,20}ORIA[ \t]")
+# Bytes that are searched at a time, and of one piece those that may begin a row of the next.
+_PIECE, _PIECE_END = 1 << 20, 32
 _GON_DEG = 0.9
-# Lines among which the first row stands, and characters among which BINGO's does, whose points may come before.
-_BEGIN, _HEAD = 40, 2_000_000
+# Lines of a file among which its first row stands, and their characters.
+_BEGIN, _HEAD = 40, 20_000
 
 
 _Row = tuple[int, list[str], str]
@@ -76,10 +80,23 @@ class ExteriorText(NamedTuple):
 
 def is_exterior(path: Path) -> bool:
     """Whether a file begins as one of these."""
-    with path.open("rb") as file:
-        lines = [line for line in file.read(_HEAD).decode("utf-8", "replace").splitlines() if line.strip()]
+    if _has_oria(path):
+        return True
+    lines = beginning(path, _HEAD)
     begin = lines[:_BEGIN]
-    return _is_of_bingo(lines) or _first_of_angles(begin) is not None or _first_of_matrices(begin) is not None
+    angles = _first_of_angles(begin) is not None or _first_of_matrices(begin) is not None
+    return angles and not is_geoin(lines)
+
+
+def _has_oria(path: Path) -> bool:
+    """Whether a row of a file begins with ORIA, wherever: points may stand before."""
+    before = b"\n"
+    with path.open("rb") as file:
+        while piece := file.read(_PIECE):
+            if _ORIA_ROW.search(before + piece):
+                return True
+            before = piece[-_PIECE_END:]
+    return False
 
 
 def read_exterior(path: Path) -> ExteriorText:

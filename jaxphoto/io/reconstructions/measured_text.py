@@ -15,7 +15,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxphoto.errors import InputError, quoted
-from jaxphoto.io.reconstructions.numbers import row_numbers
+from jaxphoto.io.control_files.bingo import recognises as is_geoin
+from jaxphoto.io.reconstructions.numbers import beginning, row_numbers
 from jaxphoto.io.text_tables import is_number
 from jaxphoto.io.whole_text import LARGE, read_text
 
@@ -37,10 +38,9 @@ class MeasuredText(NamedTuple):
 
 def is_measured(path: Path) -> bool:
     """Whether a file begins as one of these: a head, a row of point, x, y, and somewhere an end."""
-    with path.open("rb") as file:
-        begin = file.read(_HEAD)
-    lines = [line.split() for line in begin.decode("utf-8", "replace").splitlines() if line.strip()]
-    if len(lines) < 3 or not _is_row(lines[1]) or _is_head(lines[1]):
+    begin = beginning(path, _HEAD)
+    lines = [line.split() for line in begin]
+    if len(lines) < 3 or is_geoin(begin) or not _is_row(lines[1]) or _is_head(lines[1]):
         return False
     return not _is_row(lines[0]) or [ENDS] in lines
 

@@ -35,6 +35,12 @@ def number_rows(
     raise InputError(f"{place(0)}: these are no numbers of one kind; export the file anew")
 
 
+def beginning(path: Path, most: int) -> list[str]:
+    """The lines that are not empty among the first `most` bytes of a file, whatever it is."""
+    with path.open("rb") as file:
+        return [line for line in file.read(most).decode("utf-8", "replace").splitlines() if line.strip()]
+
+
 def row_numbers(path: Path, row: int, words: Sequence[str], many: int) -> list[float]:
     """So many numbers of a row of text. Raises InputError where they are others."""
     try:

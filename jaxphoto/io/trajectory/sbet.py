@@ -77,16 +77,20 @@ def with_records(values: Float[np.ndarray, "records 17"], records: Records) -> F
 
     Velocities, accelerations, rates and the wander angle stay as they were.
     """
+    old = dict(zip(FIELDS, values.T, strict=True))
     longitude, latitude = np.deg2rad(records.coordinates[:, :2].T)
     roll, pitch, yaw = np.deg2rad(records.roll_pitch_yaw_deg.T)
-    # Headings go on from those of the file, whichever turn they count from.
-    heading, wander = values[:, FIELDS.index("platform_heading")], values[:, FIELDS.index("wander_angle")]
-    turned = np.mod(yaw + wander - heading + np.pi, 2 * np.pi) - np.pi
     new = {
-        "latitude": latitude, "longitude": longitude, "altitude": records.coordinates[:, 2],
-        "roll": roll, "pitch": pitch, "platform_heading": heading + turned,
+        "latitude": latitude, "longitude": _near(longitude, old["longitude"]), "altitude": records.coordinates[:, 2],
+        "roll": roll, "pitch": pitch,
+        "platform_heading": _near(yaw + old["wander_angle"], old["platform_heading"]),
     }  # fmt: skip
     changed = values.copy()
     for name, column in new.items():
         changed[:, FIELDS.index(name)] = column
     return changed
+
+
+def _near(angle: Float[np.ndarray, "records"], old: Float[np.ndarray, "records"]) -> Float[np.ndarray, "records"]:
+    """The same angles by whole turns nearest to those of the file, whichever turn that counts from."""
+    return old + np.mod(angle - old + np.pi, 2 * np.pi) - np.pi
