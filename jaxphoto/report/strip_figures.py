@@ -15,7 +15,7 @@ from jaxphoto.report.strips import all_correlations, errors_along
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# A knot has four times its influence on either side: so many places draw what lies between two.
+# Curves are drawn at so many places from knot to knot.
 _PLACES = 12
 # Strips side by side in a row of panels.
 _ABREAST = 4
