@@ -181,9 +181,11 @@ def of_what_is_not_checked(tables: Tables) -> Iterator[Finding]:
     for hidden in worst_checked(adjusted, tables.redundancy):
         if hidden.group != IMAGE_POINTS and hidden.detectable > _HIDDEN * hidden.sigma:
             factor, unit = in_file_unit(hidden.unit)
-            size = f"of {factor * hidden.detectable:.2g} {unit}" if np.isfinite(hidden.detectable) else "of any size"
-            yield Finding(
-                Level.INFORMATION,
-                f"{hidden.words}: an error {size} would be found with a probability of 80 % only, a smaller one less "
-                f"often (its sigma is {factor * hidden.sigma:.2g} {unit})",
+            told = (
+                f"an error of {factor * hidden.detectable:.2g} {unit} would be found with a probability of 80 % only, "
+                "a smaller one less often"
+                if np.isfinite(hidden.detectable)
+                else "nothing checks it, and no error of it would be found, however large"
             )
+            text = f"{hidden.words}: {told} (its sigma is {factor * hidden.sigma:.2g} {unit})"
+            yield Finding(Level.INFORMATION, text)

@@ -5,7 +5,8 @@ import dataclasses
 import numpy as np
 
 from jaxphoto import Tables, adjust
-from jaxphoto.report import verdict_of
+from jaxphoto.report import residual_findings, verdict_of
+from jaxphoto.statistics.blunder_test import Hidden
 from tests.blocks import adjusted, simulated
 
 
@@ -26,3 +27,14 @@ def test_blunders_are_named_the_largest_first():
     found = large(Tables(adjust(spoilt)))
     names = [f"point {block.points[rows.point[k]]} in image {block.images[rows.image[k]]}" for k in (first, second)]
     assert found[0].startswith(names[0]) and found[1].startswith(names[1])
+
+
+def test_what_nothing_checks_is_told_as_such(monkeypatch):
+    hidden = [
+        Hidden("stations", "station A in X", np.inf, 0.1, "m"),
+        Hidden("stations", "station B in X", 2.0, 0.1, "m"),
+    ]
+    monkeypatch.setattr(residual_findings, "worst_checked", lambda adjusted, redundancy: hidden)
+    told = [f.text for f in residual_findings.of_what_is_not_checked(Tables(adjusted("cross")))]
+    assert "station A in X: nothing checks it, and no error of it would be found, however large (its sigma" in told[-2]
+    assert "station B in X: an error of 2 m would be found with a probability of 80 % only" in told[-1]
