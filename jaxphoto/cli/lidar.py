@@ -210,10 +210,10 @@ def simultaneous_command(
         with write_simultaneous(result, out, seconds, made) as folder:
             name = cloud.name if like is not None else f"corrected_{cloud.name}"
             clouds.write_cloud(corrected, folder / name, like=like, frame=read.frame, **said)  # type: ignore[arg-type]
-            if records is not None and result.trajectory is not None:
+            if trajectory is not None and records is not None and result.trajectory is not None:
                 moved = with_positions(records, np.asarray(result.trajectory.position), read.frame)
                 moved = moved._replace(time=moved.time + trajectory_shift_s)
-                write_moved(moved, trajectory, folder)  # type: ignore[arg-type]
+                write_moved(moved, trajectory, folder)
     console = plain_console()
     print_rounds(result.rounds, result.still, console)
     print_moved(result, console)

@@ -144,10 +144,10 @@ def strips_command(
                 corrected = dataclasses.replace(corrected, xyz=maps.placement.file(corrected.xyz))
                 own = None
             clouds.write_cloud(corrected, folder / name, like=like, frame=own, **said)
-            if records is not None and result.trajectory is not None:
+            if trajectory is not None and records is not None and result.trajectory is not None:
                 moved = with_poses(records, result.trajectory, frame)
                 moved = moved._replace(time=moved.time + trajectory_shift_s)
-                write_moved(moved, trajectory, folder)  # type: ignore[arg-type]
+                write_moved(moved, trajectory, folder)
     console = plain_console()
     print_verdict(verdict, console)
     print_strips(result, console)

@@ -1,7 +1,5 @@
 """What a strip adjustment found: its verdict; tables of strips, scanner and trajectory; the lines on a screen."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -82,7 +80,7 @@ def trajectory_errors_table(result: StripAdjustment) -> pd.DataFrame:
 
 
 def errors_along(
-    result: StripAdjustment, strip: int, time: Float[np.ndarray, n]
+    result: StripAdjustment, strip: int, time: Float[np.ndarray, "n"]
 ) -> tuple[Float[np.ndarray, "n 6"], Float[np.ndarray, "n 6"]]:
     """What the trajectory was off by at times (s) of a strip: X, Y, Z (m), right, forward, up (degrees), and sigmas."""
     value = np.concatenate(result.errors.at(strip, time), axis=1)

@@ -5,6 +5,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import pandas as pd
+
 from jaxphoto.lidar.raster import Raster
 from jaxphoto.procedures.lidar import StripAdjustment
 from jaxphoto.report.document import Element, Heading, Paragraph, rows_of
@@ -57,28 +59,30 @@ def write_strips(
             write_results(tables, verdict, work / "adjustment", seconds)
         differences_table(result.differences).to_csv(work / "strips.csv", index=False)
         strip_rounds_table(result.rounds).to_csv(work / "rounds.csv", index=False)
-        calibration_table(result).to_csv(work / "scanner.csv", index=False)
+        scanner = calibration_table(result)
+        scanner.to_csv(work / "scanner.csv", index=False)
         trajectory_errors_table(result).to_csv(work / "trajectory_errors.csv", index=False)
         all_correlations(result).round(_DIGITS).to_csv(work / "correlation.csv")
         picture = None
         if gaps is not None:
             picture = WholePicture.of(differences_figure(*gaps), "gaps of strips over the ground, before and after")
             (work / "differences.png").write_bytes(picture.png)
-        (work / "report.html").write_text(_page(result, verdict, picture, made), encoding="utf-8")
+        (work / "report.html").write_text(_page(result, scanner, verdict, picture, made), encoding="utf-8")
         told = {"rounds": len(result.rounds), "came_to_rest": result.still, "sigma0": float(result.adjusted.sigma0)}
         times = {"seconds": seconds | {"write": time.perf_counter() - began}}
         write_summary(verdict.summary | told | times, work)
         yield work
 
 
-def _page(result: StripAdjustment, verdict: Verdict, gaps: WholePicture | None, made: Made) -> str:
+def _page(
+    result: StripAdjustment, scanner: pd.DataFrame, verdict: Verdict, gaps: WholePicture | None, made: Made
+) -> str:
     parts: list[Element | WholePicture] = [Paragraph(f.text, f.level.name.lower()) for f in verdict.findings]
     parts += [
         Heading("Strips before and after"),
         rows_of(differences_table(result.differences)),
         *([gaps] if gaps else []),
     ]
-    scanner = calibration_table(result)
     if len(scanner):
         parts += [
             Heading("Scanner and cameras" if result.before else "Scanner"),

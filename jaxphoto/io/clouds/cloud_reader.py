@@ -86,8 +86,7 @@ def read_whole_and_chosen(
 ) -> tuple[Cloud, Cloud]:
     """All points of a file, `NOISE` among them, and what `read_cloud` chooses: one and the same where that is all."""
     whole = read_cloud(path, frame, classes=EVERY_CLASS, epsg=epsg, unit=unit)
-    noisy = whole.classification is not None and bool(np.isin(whole.classification, NOISE).any())
-    if classes is None and returns == "all" and not noisy:
+    if _chosen(whole, classes, returns, Path(path).name).all():
         return whole, whole
     return whole, read_cloud(path, frame, classes=classes, returns=returns, epsg=epsg, unit=unit)
 
