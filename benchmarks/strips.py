@@ -1,6 +1,6 @@
 """Simulated laser strips fitted to each other: how well they fit, and whether what was wrong lies inside its intervals.
 
-python benchmarks/strips.py [--flights 200] [--first 1000] [--out DIR]
+python benchmarks/strips.py [--flights 200] [--first 1000] [--pattern circle] [--out DIR]
 
 Each flight is that of the tests (three strips over hills with roofs and trees; boresight, range offset and angle scale
 are wrong, the trajectory drifts) with errors of the trajectory, noise and trees of its own. Figures: gaps of the planes
@@ -26,27 +26,29 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--flights", type=int, default=200)
     parser.add_argument("--first", type=int, default=1000, help="seed of the first flight")
+    parser.add_argument("--pattern", choices=("line", "circle"), default="line", help="of the scanner")
     parser.add_argument("--out", type=Path, help="folder for results.jsonl and results.md")
     arguments = parser.parse_args()
     head, records = machine(), []
     for seed in range(arguments.first, arguments.first + arguments.flights):
         began = time.perf_counter()
-        records.append(flown(seed) | {"seed": seed, "seconds": time.perf_counter() - began})
+        records.append(adjusted(seed, arguments.pattern) | {"seed": seed, "seconds": time.perf_counter() - began})
         print({k: v for k, v in records[-1].items() if k != "trajectory"}, flush=True)
     write_results(arguments.out, "strips", records, f"{sentence(head)}\n\n{table(records)}")
     return 0
 
 
-def flown(seed: int) -> dict:
+def adjusted(seed: int, pattern: str) -> dict:
     """One flight: its parameters' errors over their standard deviations, and its gaps."""
     from jaxphoto.errors import JaxphotoError
     from jaxphoto.procedures.lidar import adjust_strips
-    from tests.procedures.strips import PRIORS, SETTINGS, STRIPS
+    from tests.procedures.strips import AROUND, PRIORS, PRIORS_AROUND, SETTINGS, STRIPS
     from tests.simulation.small import made
 
-    flight = made(STRIPS, seed)
+    recipe, priors = (AROUND, PRIORS_AROUND) if pattern == "circle" else (STRIPS, PRIORS)
+    flight = made(recipe, seed)
     try:
-        found = adjust_strips(flight.cloud, flight.trajectory, SETTINGS, PRIORS)
+        found = adjust_strips(flight.cloud, flight.trajectory, SETTINGS, priors)
     except JaxphotoError as error:
         return {"failed": str(error)}
     errors, structure = flight.errors, found.adjusted.structure

@@ -140,7 +140,7 @@ STRIPS = {
 _WANDERING = 0.01 * np.array([[1, -1, 2, 1], [-1, 0.5, 1, 2], [1, 2, -1, 1]])
 SPLINE = {"camera_splines": {"one": CameraSpline(*_WANDERING, 4, 20.0)}}
 """Truth of how the camera wanders, likewise."""
-RIG = {"rig_cameras": {"one": RigCamera(np.array([0.2, -0.1, 0.05]), np.array([2e-3, -1e-3, 3e-3]))}}
+RIG = {"rig_cameras": {"one": RigCamera(np.array([0.2, -0.1, 0.05]), np.array([2e-3, -1e-3, 3e-3]), np.asarray(4e-3))}}
 """Truth of where it sits beside itself: any two photographs are a rig that bends by what is between them."""
 KNOWN = ("interior[one].c_mm", "interior[one].k1")
 

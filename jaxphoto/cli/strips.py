@@ -9,12 +9,13 @@ import typer
 
 from jaxphoto.block import Frame
 from jaxphoto.cli.app import app
+from jaxphoto.cli.choices import one_of
 from jaxphoto.cli.cloud_options import Classes, CloudEpsg, CloudUnit, ReturnsOption, class_numbers
 from jaxphoto.cli.console import plain_console
 from jaxphoto.cli.made import made_by
 from jaxphoto.cloud import Cloud
 from jaxphoto.errors import InputError
-from jaxphoto.georeferencing import ScannerCalibration, StripErrors
+from jaxphoto.georeferencing import PATTERNS, ScannerCalibration, StripErrors
 from jaxphoto.io import clouds, read_block
 from jaxphoto.io.block_folder import exposure_times
 from jaxphoto.io.clouds.coordinate_system import CoordinateSystem
@@ -54,6 +55,9 @@ def strips_command(
     adjust: Annotated[
         str, typer.Option(help=f"What of the scanner is estimated, by commas: {', '.join(_SCANNER)}; or none.")
     ] = "boresight",
+    pattern: Annotated[
+        str, one_of(PATTERNS, help="Of the scanner: line by line across the track, or circle, all around the nadir.")
+    ] = "line",
     block: Annotated[
         Path | None,
         typer.Option(help="Block folder of photographs taken on this trajectory, which are adjusted with the strips."),
@@ -101,7 +105,9 @@ def strips_command(
         sigma_exposure_m=sigma_exposure_m,
         sigma_exposure_deg=sigma_exposure_deg,
     )
-    priors, chosen, errors = _priors(adjust), class_numbers(classes), plain_console(stderr=True)
+    priors, chosen, errors = _priors(adjust, pattern), class_numbers(classes), plain_console(stderr=True)
+    if trajectory is None and (pattern, adjust) not in (("line", "boresight"), ("line", "none")):
+        raise InputError("without --trajectory strips have shifts alone: give it, or neither --adjust nor --pattern")
     held = [name.strip() for name in hold.split(",") if name.strip()]
     check_folder(out, cloud, *(path for path in (trajectory, block) if path is not None))
     with errors.status("reading the cloud") as status:
@@ -198,11 +204,11 @@ def _for_all(result: StripAdjustment, whole: Cloud) -> StripErrors:
     return dataclasses.replace(result.errors, splines=splines)
 
 
-def _priors(text: str) -> ScannerPriors:
+def _priors(text: str, pattern: str) -> ScannerPriors:
     """FREE what `text` names of the scanner. Raises InputError for what it does not have."""
     names = [] if text.strip() == "none" else [name.strip() for name in text.split(",")]
     for name in names:
         if name not in _SCANNER:
             raise InputError(f"--adjust {name}: a scanner has {', '.join(_SCANNER)}; name some of these, or none")
     boresight, *calibration = (FREE if name in names else FIXED for name in _SCANNER)
-    return ScannerPriors(boresight, ScannerCalibration(*calibration))  # type: ignore[arg-type]
+    return ScannerPriors(boresight, ScannerCalibration(*calibration, pattern))  # type: ignore[arg-type, call-arg]

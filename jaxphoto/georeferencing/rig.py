@@ -9,12 +9,18 @@ reference camera, l (m), and a turn t (rad), the rotation vector of its orientat
 
     p = R_ref (X - X_ref) - l (m, in the axes of the reference),    r: small_rotation(r) = R R_ref' small_rotation(t)'
 
-which is nothing where the rig is rigid. Frames and signs: docs/conventions.md; what is known of rigs: docs/rigs.md.
+which is nothing where the rig is rigid. A camera that exposes a delay tau after the reference does so beside the
+reference as it is by then, with its velocity v and its rate of turn w about the body's axes:
+
+    X_ref(tau) = X_ref + v tau,    R_ref(tau) = small_rotation(M' w tau) R_ref        (M takes the camera to the body)
+
+Frames and signs: docs/conventions.md; what is known of rigs: docs/rigs.md.
 """
 
 from jaxtyping import Array, Float
 
 from jaxphoto.arrays import Numbers
+from jaxphoto.georeferencing.mount import Exposure, Mount, body_from_camera, nominal_mount
 from jaxphoto.parameters import AbstractParameters
 from jaxphoto.rotation import rotate, small_angles, small_rotation
 
@@ -23,7 +29,8 @@ class RigCamera(AbstractParameters):
     """Where a camera sits beside the reference camera of its rig, and how it is turned; that has none of its own.
 
     `place` of its projection centre in the axes of the reference camera (m: x right, y up, z out of its back), `turn`
-    about these axes (rad), the rotation vector of `camera_from_reference = small_rotation(turn)`.
+    about these axes (rad), the rotation vector of `camera_from_reference = small_rotation(turn)`, `delay` of its
+    exposures after those of the reference camera (s).
     """
 
     kind = "rig_cameras"
@@ -31,10 +38,24 @@ class RigCamera(AbstractParameters):
     names = {  # noqa: RUF012
         "place": tuple(f"place_{axis}_m" for axis in "xyz"),
         "turn": tuple(f"turn_{axis}_rad" for axis in "xyz"),
+        "delay": ("delay_s",),
     }
 
     place: Float[Array, "3 *images"]
     turn: Float[Array, "3 *images"]
+    delay: Float[Array, "*images"] | float = 0.0
+
+
+def reference_later(
+    delay: Float[Array, ""] | float,
+    position: Float[Array, "3"],
+    camera_from_object: Float[Array, "3 3"],
+    mount: Mount,
+    exposure: Exposure,
+) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
+    """Position (m) and orientation of the reference camera `delay` seconds after its exposure."""
+    rate = rotate(body_from_camera(mount.boresight, nominal_mount(mount, exposure)).T, exposure.rate)
+    return position + exposure.velocity * delay, small_rotation(rate * delay) @ camera_from_object
 
 
 def rig_place(

@@ -5,25 +5,38 @@ shot are those of s = R' (X - p), in the axes of the body (right, forward, up):
 
     rho = |s|,    theta = atan2(s_right, -s_up)        from the nadir, about the axis that points forward
 
+of a scanner whose mirror oscillates or turns, line by line across the track. Of one that looks all around its nadir,
+through the two prisms of Risley or over a mirror that nutates,
+
+    theta = atan2(h, -s_up), h = hypot(s_right, s_forward)    from the nadir,    alpha = atan2(s_right, s_forward)
+
 What each of them is off by is estimated and taken off. With the corrections of a trajectory dp, da at that time
 (`TrajectoryKnot`), the boresight b of `Scanner` and `ScannerCalibration` the return lies at
 
     X' = p - dp + R S(da) (S(b) s' - l),       S = rotation.small_rotation
-    s'  is s, of length rho (1 - m) - d, turned about the forward axis by -(k theta + e1 cos theta + e2 sin theta)
+    s'  is s, of length rho (1 - m) - d, turned about the forward axis by -(k theta + e1 cos theta + e2 sin theta);
+        all around: turned towards the nadir by k theta, and about it by -(e1 cos alpha + e2 sin alpha)
 
-An offset of the encoder is a boresight about the forward axis (of the other sign), and is found as such.
+An offset of the encoder is a boresight about the forward axis (of the other sign), all around one about the axis that
+points up, and is found as such. k of two prisms is by how much their wedges or their glass deflect more than assumed.
 
 Sources: Skaloud and Lichti (2006), Rigorous approach to bore-sight self-calibration in airborne laser
 scanning; Glira, Pfeifer and Mandlburger (2016), Rigorous strip adjustment of UAV-based laserscanning data including
 time-dependent correction of trajectory errors. Frames and signs: docs/conventions.md.
 """
 
+from typing import Literal, get_args
+
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxphoto.parameters import AbstractParameters
 from jaxphoto.rotation import rotate, small_rotation
 
+Pattern = Literal["line", "circle"]
+"""What a scanner draws on the ground: lines across the track, or figures all around its nadir."""
+PATTERNS: tuple[Pattern, ...] = get_args(Pattern)
 _PPM = 1e-6
 _AXES = ("right", "forward", "up")
 
@@ -32,7 +45,8 @@ class ScannerCalibration(AbstractParameters):
     """What is wrong with the scanner besides its boresight, all of which makes its cloud wrong by so much.
 
     `lever_arm` of the scanner beside the one used (m: right, forward, up); `range_offset` (m) and `range_scale` (ppm)
-    of measured ranges; `angle_scale` (ppm) and `eccentricity` (rad, of cos theta and sin theta) of measured angles.
+    of measured ranges; `angle_scale` (ppm) of theta and `eccentricity` (rad, of cos and sin) of theta, of a `pattern`
+    that is a "circle" of alpha.
     """
 
     kind = "scanner_calibration"
@@ -50,18 +64,48 @@ class ScannerCalibration(AbstractParameters):
     range_scale: Float[Array, ""] | float = 0.0
     angle_scale: Float[Array, ""] | float = 0.0
     eccentricity: Float[Array, "2"] | tuple[float, float] = (0.0, 0.0)
+    pattern: Pattern = eqx.field(static=True, default="line")
+
+    def __check_init__(self) -> None:
+        if self.pattern not in PATTERNS:
+            raise ValueError(f"pattern is one of {', '.join(PATTERNS)}, got {self.pattern!r}")
 
 
 def corrected_shot(shot: Float[Array, "3"], calibration: ScannerCalibration) -> Float[Array, "3"]:
     """From the scanner to the return (m, in the body's axes), by the range and the angle as they should be."""
-    right, forward, up = shot
     distance = jnp.sqrt(jnp.sum(shot**2))
+    turned = _turned_across(shot, calibration) if calibration.pattern == "line" else _turned_around(shot, calibration)
+    return turned * (1 - _PPM * calibration.range_scale - calibration.range_offset / distance)
+
+
+def _turned_across(shot: Float[Array, "3"], calibration: ScannerCalibration) -> Float[Array, "3"]:
+    """By the angle of a line."""
+    right, forward, up = shot
     angle = jnp.arctan2(right, -up)
     by_cos, by_sin = calibration.eccentricity
     turn = _PPM * calibration.angle_scale * angle + by_cos * jnp.cos(angle) + by_sin * jnp.sin(angle)
     cos, sin = jnp.cos(turn), jnp.sin(turn)
-    turned = jnp.stack([cos * right + sin * up, forward, cos * up - sin * right])
-    return turned * (1 - _PPM * calibration.range_scale - calibration.range_offset / distance)
+    return jnp.stack([cos * right + sin * up, forward, cos * up - sin * right])
+
+
+def _turned_around(shot: Float[Array, "3"], calibration: ScannerCalibration) -> Float[Array, "3"]:
+    """By both angles of a circle."""
+    right, forward, up = shot
+    square = right**2 + forward**2
+    # Straight down nothing is aside, and the root has no derivative.
+    aside = jnp.sqrt(jnp.where(square > 0, square, 1.0))
+    by_cos, by_sin = calibration.eccentricity
+    around = (by_cos * forward + by_sin * right) / aside
+    turn = _PPM * calibration.angle_scale * jnp.arctan2(jnp.where(square > 0, aside, 0.0), -up)
+    nearer = jnp.cos(turn) + jnp.sin(turn) * up / aside
+    cos, sin = nearer * jnp.cos(around), nearer * jnp.sin(around)
+    return jnp.stack(
+        [
+            cos * right - sin * forward,
+            cos * forward + sin * right,
+            jnp.cos(turn) * up - jnp.sin(turn) * jnp.where(square > 0, aside, 0.0),
+        ]
+    )
 
 
 def corrected_return(

@@ -8,11 +8,11 @@ of its reference needs none of the others.
 from collections.abc import Iterator
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 
 from jaxphoto.arrays import Numbers
 from jaxphoto.errors import BlockError
-from jaxphoto.georeferencing import RigCamera, rig_place, turn_off
+from jaxphoto.georeferencing import RigCamera, reference_later, rig_place, turn_off
 from jaxphoto.observations.base import AXES, AbstractObservations, ImageState, touching
 
 
@@ -42,8 +42,8 @@ class RigPlaces(AbstractRigRows):
 
     def residual(self, reference: ImageState, image: ImageState) -> Float[Numbers, "3"]:
         """Observed minus computed (m)."""
-        seen = rig_place(reference.position, reference.camera_from_object, image.position)
-        return self.off - (seen - _camera_of(image).place)
+        own = _camera_of(image)
+        return self.off - (rig_place(*_reference_for(reference, own), image.position) - own.place)
 
 
 class RigTurns(AbstractRigRows):
@@ -56,8 +56,15 @@ class RigTurns(AbstractRigRows):
 
     def residual(self, reference: ImageState, image: ImageState) -> Float[Numbers, "3"]:
         """Observed minus computed (rad)."""
-        turn = _camera_of(image).turn
-        return self.off - turn_off(reference.camera_from_object, image.camera_from_object, turn)
+        own = _camera_of(image)
+        _, turned = _reference_for(reference, own)
+        return self.off - turn_off(turned, image.camera_from_object, own.turn)
+
+
+def _reference_for(reference: ImageState, own: RigCamera) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
+    """Position and orientation of the reference camera when the other one exposes."""
+    at = reference.position, reference.camera_from_object
+    return reference_later(own.delay, *at, reference.mount, reference.exposure)
 
 
 def _camera_of(image: ImageState) -> RigCamera:

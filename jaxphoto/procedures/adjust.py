@@ -88,8 +88,8 @@ def _from_the_best_start(
         return first
     warnings.warn(
         "the approximate exterior orientations that were given lead nowhere: the images were oriented by their common "
-        "points instead, which leads to an optimum; look at the frame, angles and units of images.csv, and at the "
-        "coordinates of points where they are given",
+        "points instead, which leads to an optimum; look at the frame, angles and units of images.csv, at the "
+        "coordinates of points where they are given, and at the interior orientation where it is held",
         stacklevel=3,
     )
     return second

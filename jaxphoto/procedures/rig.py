@@ -12,7 +12,7 @@ from jaxphoto.block import Block
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import RigCamera, rig_turn
 from jaxphoto.observations import RigPlaces, RigTurns
-from jaxphoto.unknowns import FREE
+from jaxphoto.unknowns import FIXED, FREE
 
 EVENT = "event"
 """The partition of the block that says which photographs were exposed together."""
@@ -23,7 +23,8 @@ def with_rig(block: Block, reference: str, place_m: float, turn_rad: float) -> B
 
     `Block.partitions["event"]` (a column of images.csv) says which photographs belong together. The rig is rigid to
     `place_m` and `turn_rad` from one event to the next. Relative orientations start at the medians of those of the
-    approximate orientations, and are free: `block.fix("place")`, `block.weigh("place", 0.005)`.
+    approximate orientations, and are free: `block.fix("place")`, `block.weigh("place", 0.005)`. All cameras are taken
+    to expose at once; `block.free("delay")` of a block that knows how it moved finds out when they do.
 
     Raises InputError where nothing says what belongs together, none of it is of the camera `reference`, or of a camera
     no orientation is known beside it. A UserWarning tells of photographs that are in no event of it.
@@ -58,7 +59,7 @@ def with_rig(block: Block, reference: str, place_m: float, turn_rad: float) -> B
                 f"says where {camera} is in the rig; orient the block first"
             )
         start[camera] = RigCamera(*map(on_device, _middle(block, at[mine], image[mine])))
-    free: Any = {camera: RigCamera(FREE, FREE) for camera in start}  # type: ignore[arg-type]
+    free: Any = {camera: RigCamera(FREE, FREE, FIXED) for camera in start}  # type: ignore[arg-type]
     unknowns = dataclasses.replace(block.start.unknowns, more=block.start.unknowns.more | {RigCamera.kind: start})
     return dataclasses.replace(
         block,

@@ -4,18 +4,20 @@ from collections.abc import Mapping
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
 
 from jaxphoto.block import Motion
 from jaxphoto.collinearity import ExteriorOrientation
-from jaxphoto.georeferencing import RigCamera, in_rig
+from jaxphoto.georeferencing import Exposure, Mount, RigCamera, in_rig, reference_later
 from jaxphoto.observations import RigPlaces, RigTurns
 from jaxphoto.rotation import small_rotation
 from jaxphoto.simulation.chunks import in_chunks
-from jaxphoto.simulation.flight import Flight
+from jaxphoto.simulation.flight import NO_MOUNT, Flight
 from jaxphoto.simulation.recipe import Recipe, SimulatedChange, triple
 from jaxphoto.simulation.streams import stream
+from jaxphoto.unknowns import FIXED
 
 _CHUNK = 64
 
@@ -38,7 +40,12 @@ def rigged(
     turn, off = np.broadcast_to([own.turn for own in truths], place.shape), noise[1] * bent[:, :, 1]
     at = np.repeat(np.arange(n), m - 1)
     reference = np.asarray(exterior.position)[at], np.asarray(exterior.camera_from_object)[at]
-    there = in_chunks(_placed, _CHUNK, *reference, *(v.reshape(-1, 3) for v in (place, turn, off)))
+    mounts = [recipe.mounts[name].truth if (name := recipe.mount_of(c)) else NO_MOUNT for c in flight.cameras]
+    boresight, nominal = (np.array(v)[at] for v in ([m.boresight for m in mounts], [m.nominal for m in mounts]))
+    motion = flight.motion.velocity[at], flight.motion.rate[at]
+    delay = np.tile([float(own.delay) for own in truths], n)
+    rigid = (v.reshape(-1, 3) for v in (place, turn, off))
+    there = in_chunks(_placed, _CHUNK, *reference, *motion, boresight, nominal, delay, *rigid)
     position, rotation = (
         _after_each(np.asarray(own), new)
         for own, new in zip((exterior.position, exterior.camera_from_object), there, strict=True)
@@ -77,6 +84,13 @@ def rig_rows(recipe: Recipe, flight: Flight) -> tuple[RigPlaces | RigTurns, ...]
     )
 
 
+def runs_late(cameras: Mapping[str, SimulatedChange]) -> bool:
+    """Whether a camera of the rig may expose after the others: then the block needs to know how they move."""
+    known: list[Any] = [own.model for own in cameras.values() if own.model]
+    delays = [own.truth.delay for own in cameras.values()] + [start.delay for start, _ in known]  # type: ignore[attr-defined]
+    return any(float(delay) != 0 for delay in delays) or any(prior.delay is not FIXED for _, prior in known)
+
+
 def with_gnss(recipe: Recipe, flight: Flight) -> Int[np.ndarray, "n"]:
     """The images of which stations and attitudes are observed: all, or those of the reference camera of a rig."""
     return np.arange(0, len(flight.images), len(recipe.rig) + 1)
@@ -84,6 +98,8 @@ def with_gnss(recipe: Recipe, flight: Flight) -> Int[np.ndarray, "n"]:
 
 @jax.jit
 @jax.vmap
-def _placed(position, camera_from_object, place, turn, off):
-    there, turned = in_rig(position, camera_from_object, RigCamera(place, turn))
+def _placed(position, camera_from_object, velocity, rate, boresight, nominal, delay, place, turn, off):
+    mount, exposure = Mount(jnp.zeros(3), boresight), Exposure(0.0, velocity, rate, nominal)
+    then = reference_later(delay, position, camera_from_object, mount, exposure)
+    there, turned = in_rig(*then, RigCamera(place, turn))
     return there, small_rotation(off) @ turned

@@ -28,6 +28,8 @@ from jaxphoto.simulation.trees import met_leaves
 GROUND, VEGETATION, ROOF = 2, 5, 6
 """Classes of LAS (ASPRS): ground, high vegetation, building."""
 _RATE_HZ = 100.0
+# Of the two prisms; their figure does not come back within a strip.
+_PRISMS_HZ = (121.7, -77.3)
 # Rays meet the ground to this (m) or, where it is too steep for them, not at all.
 _ENOUGH_M = 1e-7
 _ROUNDS = 60
@@ -87,8 +89,8 @@ def scan(
         n = round(pulses_of[number])
         for begin in range(0, n, _CHUNK):
             pulses = np.arange(begin, min(begin + _CHUNK, n))
-            time, across = _pattern(plan, path, pulses, n)
-            parts.append(_measured(path, time, across, terrain, errors, number, noise_m, leaves, noise))
+            time, aside = _pattern(plan, path, pulses, n)
+            parts.append(_measured(path, time, aside, terrain, errors, number, noise_m, leaves, noise))
             parts[-1]["strip"] = np.full(len(parts[-1]["time"]), number)
     if not sum(len(part["time"]) for part in parts):
         raise BlockError("no laser pulse reaches the ground; raise density_per_m2, or scan longer strips over it")
@@ -102,21 +104,26 @@ def scan(
 
 def _pattern(
     plan: ScanPlan, path: Path, pulses: Int[np.ndarray, "n"], of: int
-) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
-    """Time (s) of pulses, and the tangent of their scan angle: lines as far apart on level ground as their pulses are.
+) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n 2"]]:
+    """Time (s) of pulses, and the tangents of their angles to the right and ahead.
 
-    A line runs from left to right, as those of a turning mirror.
+    Lines are as far apart on level ground as their pulses are, and run from left to right, as those of a turning
+    mirror. Two prisms that deflect alike, to first order, add a turning arrow each.
     """
-    per_line = max(1, round(2 * plan.half_width * path.height_m * np.sqrt(plan.density_per_m2)))
     begin, end = path.node[[0, -1]]
     time = begin + (pulses + 0.5) / of * (end - begin)
-    return time, plan.half_width * (2 * (pulses % per_line + 0.5) / per_line - 1)
+    if plan.pattern == "line":
+        per_line = max(1, round(2 * plan.half_width * path.height_m * np.sqrt(plan.density_per_m2)))
+        across = plan.half_width * (2 * (pulses % per_line + 0.5) / per_line - 1)
+        return time, np.column_stack([across, np.zeros(len(across))])
+    angles = 2 * np.pi * np.outer(time, _PRISMS_HZ)
+    return time, plan.half_width / 2 * np.column_stack([np.sin(angles).sum(1), np.cos(angles).sum(1)])
 
 
 def _measured(
     path: Path,
     time: Float[np.ndarray, "n"],
-    across: Float[np.ndarray, "n"],
+    aside: Float[np.ndarray, "n 2"],
     terrain: Terrain,
     errors: StripErrors,
     strip: int,
@@ -130,7 +137,7 @@ def _measured(
     origin = position - object_from_body @ errors.calibration.lever_arm
     body_from_scanner = np.asarray(_small_rotation(errors.boresight))
     # The scanner believes that its axes are those of the body.
-    believed = np.column_stack([across, 0 * across, -np.ones(len(across))])
+    believed = np.column_stack([aside, -np.ones(len(aside))])
     believed /= np.linalg.norm(believed, axis=1, keepdims=True)
     ray = _rotated(object_from_body, believed @ body_from_scanner.T)
     returns = _returned(origin, ray, terrain, leaves)

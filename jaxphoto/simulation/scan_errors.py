@@ -1,5 +1,7 @@
 """What a simulated cloud is off by, drawn, and where the file of the cloud has a point that was truly hit."""
 
+from typing import Any
+
 import jax
 import numpy as np
 from jaxtyping import Array, Float
@@ -30,7 +32,8 @@ def drawn_errors(plan: ScanPlan, paths: list[Path], seed: int) -> StripErrors:
         position.append(drawn_shift(plan, path.strip, seed) + np.array(plan.drift_sigma_m) * drift[:, :3])
         attitude.append(np.deg2rad(plan.drift_sigma_deg) * drift[:, 3:])
     scales = (np.array(v) for v in (plan.range_offset_m, plan.range_scale_ppm, plan.angle_scale_ppm))
-    calibration = ScannerCalibration(np.array(plan.lever_arm_m), *scales, np.zeros(2))  # type: ignore[arg-type,call-arg]
+    numbers: Any = (np.array(plan.lever_arm_m), *scales, np.zeros(2))
+    calibration = ScannerCalibration(*numbers, plan.pattern)  # type: ignore[call-arg]
     boresight = np.deg2rad(plan.boresight_deg)
     return StripErrors(tuple(splines), np.concatenate(position), np.concatenate(attitude), boresight, calibration)
 

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
+from jaxphoto.georeferencing import Pattern
 from jaxphoto.simulation.flight_plan import Strip
 
 Triple = tuple[float, float, float]
@@ -15,6 +16,7 @@ _ZERO = (0.0, 0.0, 0.0)
 class ScanPlan:
     """A scanner that sweeps across the track, line after line, `scan_angle_deg` to either side of the body's nadir.
 
+    One whose `pattern` is a "circle" looks through two prisms that turn against one another, as far to all sides.
     `density_per_m2` is that of the pulses of one strip on level ground at the mean height of the terrain. It scans the
     flight's own strips, or `strips` of a flight of its own. `boresight_deg` (about the body's right, forward and up
     axes) is the true misalignment; the true shift of a strip is that of `shift_m`, by its name or "default", plus a
@@ -27,6 +29,7 @@ class ScanPlan:
 
     density_per_m2: float
     scan_angle_deg: float = 20.0
+    pattern: Pattern = "line"
     strips: tuple[Strip, ...] = ()
     boresight_deg: Triple = _ZERO
     shift_m: dict[str, Triple] = dataclasses.field(default_factory=dict)

@@ -32,7 +32,7 @@ from jaxphoto.simulation.flight_plan import FlightPlan
 from jaxphoto.simulation.platform_path import Path, paths
 from jaxphoto.simulation.points import TruePoints, scatter
 from jaxphoto.simulation.recipe import Assumed, Recipe, SimulatedBias, Triple, triple
-from jaxphoto.simulation.rig import rig_rows, rigged, with_gnss
+from jaxphoto.simulation.rig import rig_rows, rigged, runs_late, with_gnss
 from jaxphoto.simulation.rolling_shutter import camera_motions, with_shutters
 from jaxphoto.simulation.scan import Scan, scan
 from jaxphoto.simulation.streams import stream
@@ -83,15 +83,16 @@ def simulate(recipe: Recipe, seed: int = 0) -> Simulation:
     else:
         flight = fly(recipe, recipe.plan, height, seed)
     rig = deviated(recipe.rig, seed)
-    flight, event = rigged(recipe, flight, rig, seed)
+    alone = flight
+    flight, event = rigged(recipe, alone, rig, seed)
     scene = _seen(recipe, flight, scatter(recipe, flight, terrain, seed), seed)
     mounts = [recipe.mounts[name].truth if (name := recipe.mount_of(c)) else NO_MOUNT for c in flight.cameras]
     motions = camera_motions(flight.exterior, flight.motion.velocity, flight.motion.rate, mounts)
     biases = _true_biases(recipe, flight, seed)
-    flown = [] if recipe.lidar is None else paths(recipe, recipe.lidar, flight, height, seed)
+    flown = [] if recipe.lidar is None else paths(recipe, recipe.lidar, alone, height, seed)
     cloud, trajectory, scanner, errors = _scanned(recipe, flown, terrain, seed)
     on_path = recipe.lidar is not None and recipe.lidar.same_trajectory
-    clock = exposure_times(flown, flight) if on_path else _clock(recipe, event)
+    clock = exposure_times(flown, alone)[event] if on_path else _clock(recipe, event)
     times = flight.time if clock is None else clock
     temperatures = _temperatures(recipe, times)
     when = Circumstances(times, np.zeros(len(times)) if temperatures is None else np.asarray(temperatures.above))
@@ -133,7 +134,7 @@ def simulate(recipe: Recipe, seed: int = 0) -> Simulation:
         datum=recipe.datum,
         start=start,
         priors=priors,
-        motion=flight.motion if any(map(_runs_late, recipe.mounts.values())) else None,
+        motion=flight.motion if runs_late(rig) or any(map(_runs_late, recipe.mounts.values())) else None,
         flight_time=clock,
         temperatures=temperatures,
         more=(*camera_steps(recipe, flight, times, start.unknowns), *rig_rows(recipe, flight)),

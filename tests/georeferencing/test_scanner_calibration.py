@@ -21,10 +21,10 @@ NONE = np.zeros(3)
 RIGHT = ScannerCalibration(jnp.zeros(3), jnp.zeros(()), jnp.zeros(()), jnp.zeros(()), jnp.zeros(2))
 
 
-def moved(**errors) -> np.ndarray:
+def moved(pattern="line", **errors) -> np.ndarray:
     """How a shot of SHOT changes by errors of the scanner."""
-    own = {name: jnp.asarray(value, float) for name, value in errors.items()}
-    return np.asarray(corrected_shot(jnp.asarray(SHOT), ScannerCalibration(**{"lever_arm": jnp.zeros(3)} | own))) - SHOT
+    own = {"lever_arm": jnp.zeros(3)} | {name: jnp.asarray(value, float) for name, value in errors.items()}
+    return np.asarray(corrected_shot(jnp.asarray(SHOT), ScannerCalibration(**own, pattern=pattern))) - SHOT
 
 
 def test_ranges_that_are_too_long_are_shortened_along_the_shot():
@@ -43,6 +43,35 @@ def test_angles_that_are_too_large_are_turned_back_about_the_forward_axis():
     np.testing.assert_allclose(moved(angle_scale=200.0), at(angle * (1 - 200e-6)), atol=1e-9)
     turn = 3e-4 * np.cos(angle) - 2e-4 * np.sin(angle)
     np.testing.assert_allclose(moved(eccentricity=(3e-4, -2e-4)), at(angle - turn), atol=1e-9)
+
+
+def test_angles_all_around_are_turned_towards_the_nadir_and_about_it():
+    right, forward, up = SHOT
+    length, aside, around = np.linalg.norm(SHOT), np.hypot(right, forward), np.arctan2(right, forward)
+
+    def at(angle, around):
+        out = length * np.sin(angle)
+        return np.array([out * np.sin(around), out * np.cos(around), -length * np.cos(angle)]) - SHOT
+
+    angle = np.arctan2(aside, -up)
+    found = moved("circle", angle_scale=200.0)
+    np.testing.assert_allclose(found, at(angle * (1 - 200e-6), around), atol=1e-9)
+    turn = 3e-4 * np.cos(around) - 2e-4 * np.sin(around)
+    np.testing.assert_allclose(moved("circle", eccentricity=(3e-4, -2e-4)), at(angle, around - turn), atol=1e-9)
+
+
+def test_prisms_that_deflect_too_much_scale_the_angle():
+    """Two thin prisms of equal wedges deflect by delta each, to where they point: k more of it is k more of theta."""
+    one, other = np.deg2rad(20.0), np.deg2rad(75.0)
+    arrows = np.array([[np.sin(one), np.cos(one)], [np.sin(other), np.cos(other)]]).sum(axis=0)
+    true, measured = (delta * arrows for delta in (0.1, 0.1 * (1 + 300e-6)))
+
+    def shot(deflection):
+        angle = np.linalg.norm(deflection)
+        return 500.0 * np.append(np.sin(angle) * deflection / angle, -np.cos(angle))
+
+    calibration = ScannerCalibration(jnp.zeros(3), angle_scale=300.0, pattern="circle")
+    np.testing.assert_allclose(corrected_shot(jnp.asarray(shot(measured)), calibration), shot(true), atol=2e-5)
 
 
 def test_an_offset_of_the_encoder_is_a_boresight_about_the_forward_axis():
@@ -68,13 +97,14 @@ def test_an_attitude_is_off_as_a_boresight_is():
     np.testing.assert_allclose(one, other, atol=1e-9)
 
 
+@pytest.mark.parametrize("pattern", ["line", "circle"])
 @pytest.mark.parametrize("shot", [SHOT, [0.0, 0.0, -500.0], [-400.0, 100.0, 30.0]])
-def test_derivatives(shot):
+def test_derivatives(shot, pattern):
     """Forward, reverse and central differences agree, at the nadir and above the horizon, too."""
     point = POSITION + TURN @ np.array(shot)
 
     def at(v):
-        own = ScannerCalibration(v[9:12], v[12], 1e3 * v[13], 1e3 * v[14], v[15:17])
+        own = ScannerCalibration(v[9:12], v[12], 1e3 * v[13], 1e3 * v[14], v[15:17], pattern)
         return corrected_return(point, POSITION, TURN, v[:3], v[3:6], v[6:9], own)
 
     compiled, start, step = jax.jit(at), np.linspace(-1e-3, 2e-3, 17), 1e-4
@@ -84,8 +114,9 @@ def test_derivatives(shot):
     )
     np.testing.assert_allclose(forward, reverse, atol=1e-9)
     np.testing.assert_allclose(forward, differences, atol=1e-5)
-    # At the nadir a scale of angles moves nothing.
-    assert (np.abs(forward).max(axis=0) > 1e-3).sum() == (15 if shot[0] == 0 else 17)
+    # At the nadir a scale of angles moves nothing; nor does an angle about it.
+    none = {"line": 2, "circle": 3}[pattern] if shot[0] == 0 else 0
+    assert (np.abs(forward).max(axis=0) > 1e-3).sum() == 17 - none
 
 
 def test_splines_are_those_of_scipy():

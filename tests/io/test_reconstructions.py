@@ -400,6 +400,8 @@ REFUSED = {
     "model": (_mvg(_KIND, "spherical"), "'spherical' is not known here"),
     "terms": (_mvg((*_DATA, "disto_k3"), [1.0]), "intrinsics 3. disto_k3: .*not a list of three"),
     "cut": (_blocks(lambda text: text[:-30]), "the XML is broken"),
+    "unknown encoding": (_blocks(_replaced("utf-8", "utf-0")), "the XML is broken .unknown encoding: utf-0"),
+    "wide encoding": (_blocks(_replaced("utf-8", "shift_jis")), "the XML is broken .multi-byte encodings are not"),
     "angles": (_blocks(_geographic), "longitude and latitude; export it in a map system"),
     "axes": (_blocks(_replaced("XRightYUp", "XUpYLeft"), upwards=True), "'XUpYLeft' is not read"),
     "fisheye": (_blocks(_replaced(">Perspective<", ">Fisheye<")), "is a 'Fisheye'"),

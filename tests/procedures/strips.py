@@ -1,6 +1,7 @@
 """A flight of three strips with everything wrong that a strip adjustment mends, simulated once, and adjusted once."""
 
 import copy
+import dataclasses
 import functools
 
 from jaxphoto.georeferencing import ScannerCalibration
@@ -53,6 +54,10 @@ SETTINGS = StripSettings(
     sigma_heading_deg=0.006,
 )
 PRIORS = ScannerPriors(FREE, ScannerCalibration(FIXED, Weighted(0.0, 0.1), FIXED, FREE, FIXED))  # type: ignore[arg-type]
+
+# The same with a scanner of two prisms, which looks all around.
+AROUND = STRIPS | {"lidar": {"density_per_m2": 0.2, "scan_angle_deg": 25.0, "pattern": "circle", "truth": TRUTH}}
+PRIORS_AROUND = ScannerPriors(FREE, dataclasses.replace(PRIORS.calibration, pattern="circle"))
 
 
 @functools.cache

@@ -1,6 +1,8 @@
 """Strips are fitted to each other, and what was wrong with scanner and trajectory is found."""
 
 import dataclasses
+import functools
+import warnings
 
 import numpy as np
 import pytest
@@ -12,9 +14,12 @@ from jaxphoto.georeferencing import TrajectoryKnot
 from jaxphoto.lidar.strip_correction import correct_flight, correct_strips
 from jaxphoto.lidar.strip_settings import StripSettings
 from jaxphoto.procedures.lidar import adjust_strips
+from jaxphoto.procedures.lidar.looks import check_pattern
 from jaxphoto.report.strips import calibration_table, trajectory_errors_table
+from jaxphoto.simulation import Simulation
 from tests.lidar.clouds import SURFACES, ground
-from tests.procedures.strips import NOISE_M, fitted, flown
+from tests.procedures.strips import AROUND, NOISE_M, PRIORS_AROUND, SETTINGS, fitted, flown
+from tests.simulation.small import made
 
 GROUND = 2
 
@@ -42,9 +47,14 @@ def test_strips_fit_to_the_noise_of_their_planes():
     assert float(found.adjusted.sigma0) == pytest.approx(1.0, abs=0.1)
 
 
-def test_the_scanner_is_found():
-    """All of it together: chi squared of five, because some of it is told apart badly."""
-    errors, found = flown().errors, fitted()
+@functools.cache
+def flown_around() -> Simulation:
+    return made(AROUND, 5)
+
+
+def chi_squared_of_the_scanner(flight, found) -> float:
+    """Of what was found of a scanner, all of it together, because some of it is told apart badly."""
+    errors = flight.errors
     truth = [*errors.boresight, float(errors.calibration.range_offset), float(errors.calibration.angle_scale)]
     own = [k for k, label in enumerate(found.adjusted.structure.labels) if label.startswith("scanner")]
     value = np.asarray(found.adjusted.values.shared)[found.adjusted.structure.free][own]
@@ -52,10 +62,41 @@ def test_the_scanner_is_found():
     matrix = np.asarray(found.covariance.matrix)
     assert len(matrix) == len(found.adjusted.structure.free)
     off = value - truth
-    assert off @ np.linalg.solve(matrix[np.ix_(own, own)], off) < 20.5  # 99.9 %
+    return float(off @ np.linalg.solve(matrix[np.ix_(own, own)], off))
+
+
+def test_the_scanner_is_found():
+    found = fitted()
+    assert chi_squared_of_the_scanner(flown(), found) < 20.5  # 99.9 %
     # All but the range offset are many sigma: not to find them would show.
     table = calibration_table(found).set_index("parameter")
     assert len(table) == 5 and (table.value.abs() > 4 * table.sigma).sum() >= 4
+
+
+def test_a_scanner_of_prisms_is_found_by_what_it_sees_ahead_and_behind():
+    flight = flown_around()
+    found = adjust_strips(flight.cloud, flight.trajectory, SETTINGS, PRIORS_AROUND)
+    assert found.still and float(found.adjusted.sigma0) == pytest.approx(1.0, abs=0.1)
+    assert chi_squared_of_the_scanner(flight, found) < 20.5  # 99.9 %
+    within = [d for d in found.differences if (d.one, d.other) == ("1 ahead", "1 behind")]
+    assert len(within) == 1 and within[0].rms_before_m > 0.03
+    assert within[0].rms_m == pytest.approx(within[0].noise_m, rel=0.2)
+    # What is seen ahead and behind tells the boresight about right, which lines across the track tell less well.
+    sigma = {r.parameter: r.sigma for r in calibration_table(found).itertuples()}
+    of_lines = {r.parameter: r.sigma for r in calibration_table(fitted()).itertuples()}
+    assert sigma["scanner.boresight_right_deg"] < 0.8 * of_lines["scanner.boresight_right_deg"]
+
+
+def test_another_pattern_than_that_of_the_scanner_is_told():
+    flight, other = flown(), flown_around()
+    with pytest.warns(UserWarning, match=r"spread to the side \(0\.\d+ of the height\), but not ahead"):
+        check_pattern(flight.cloud, flight.trajectory, "circle")
+    with pytest.warns(UserWarning, match=r"spread as far ahead \(0\.\d+ of the height\) as to the side"):
+        check_pattern(other.cloud, other.trajectory, "line")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_pattern(flight.cloud, flight.trajectory, "line")
+        check_pattern(other.cloud, other.trajectory, "circle")
 
 
 def test_the_errors_of_the_trajectory_are_found():

@@ -346,6 +346,21 @@ def test_the_command_says_what_it_writes(tmp_path, monkeypatch, capsys):
     assert f"{count} laser points in cloud.laz, their trajectory in trajectory.csv (seed 0)" in said
 
 
+def test_prisms_look_as_far_to_all_sides():
+    """What the scanner measured lies in a circle about its nadir."""
+    flight = made(SCENE | {"lidar": {"density_per_m2": 0.3, "pattern": "circle"}})
+    cloud = cloud_of(flight)
+    poses = _poses(flight.trajectory, cloud.time)
+    shot = np.einsum("nji,nj->ni", poses.object_from_body, cloud.xyz - poses.position)
+    aside = np.hypot(*(shot[:, :2] / -shot[:, 2:]).T) / np.tan(np.deg2rad(20.0))
+    assert aside.max() == pytest.approx(1.0, abs=0.02)
+    # Of two equal arrows whose directions are independent: |cos| of half the angle between them.
+    for part in (0.25, 0.5, 0.75):
+        assert np.quantile(aside, part) == pytest.approx(np.sin(np.pi / 2 * part), abs=0.06)
+    ahead = shot[:, 1] / -shot[:, 2]
+    assert abs((ahead > 0).mean() - 0.5) < 0.05
+
+
 @pytest.mark.parametrize(
     "changes, message",
     [
@@ -353,6 +368,7 @@ def test_the_command_says_what_it_writes(tmp_path, monkeypatch, capsys):
         ({"sigmas.lidar_m": None, "noise.lidar_m": None}, "lidar_m: the key is missing, but there is a lidar"),
         ({"lidar.density_per_m2": 0.0}, "density_per_m2: 0 is not positive"),
         ({"lidar.scan_angle_deg": 70.0}, "scan_angle_deg: 70 to either side is too wide"),
+        ({"lidar.pattern": "zigzag"}, r"\[lidar\] pattern: 'zigzag' is no pattern of a scanner; use line or circle"),
         ({"lidar.rate_hz": 100.0}, r"\[lidar\] rate_hz: no such key is known"),
         ({"lidar.truth.shift_m.C": [0, 0, 0]}, r"\[lidar.truth.shift_m\] C: no such key is known; use default, A, B"),
         ({"lidar.truth.boresight": [0, 0, 0]}, r"\[lidar.truth\] boresight: no such key"),

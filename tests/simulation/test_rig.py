@@ -5,11 +5,13 @@ import functools
 
 import jax
 import numpy as np
+import pandas as pd
 import pytest
+from scipy.spatial.transform import Rotation as scipy_rotation
 
-from jaxphoto import Outcome, RankError, adjust, covariance
-from jaxphoto.errors import InputError
-from jaxphoto.georeferencing import rig_place, rig_turn
+from jaxphoto import FREE, Outcome, RankError, adjust, covariance
+from jaxphoto.errors import BlockError, InputError
+from jaxphoto.georeferencing import NOMINAL, rig_place, rig_turn
 from jaxphoto.io import read_block, read_truth, recipe_from, write_simulation
 from jaxphoto.parameters import numbers_of
 from jaxphoto.procedures.rig import with_rig
@@ -82,7 +84,8 @@ def found():
 def test_the_relative_orientation_is_recovered():
     sigma = dict(zip(found().structure.labels, np.asarray(covariance(found()).shared_sigma), strict=True))
     own, true = (u.more["rig_cameras"]["oblique"] for u in (found().unknowns, flown().truth))
-    for label, value, want in zip(own.labels("oblique"), numbers_of(own), numbers_of(true), strict=True):
+    # All but the delay, which is held.
+    for label, value, want in list(zip(own.labels("oblique"), numbers_of(own), numbers_of(true), strict=True))[:-1]:
         assert abs(float(value) - want) < 3.3 * sigma[label], label
     assert sigma["rig_cameras[oblique].turn_z_rad"] < np.deg2rad(0.02)
     assert 0.9 < found().sigma0 < 1.1
@@ -139,6 +142,75 @@ def test_a_rig_is_made_of_photographs_of_one_event():
     fewer = tuple(f"{name} alone" if k == 1 else name for k, name in enumerate(events))
     with pytest.warns(UserWarning, match="1 photographs are in no event of the rig"):
         assert len(with_rig(dataclasses.replace(bare, partitions={"event": fewer}), "kodak", 0.001, 1e-5).more[0]) == 13
+
+
+LATE = {
+    "rig_cameras.oblique.delay_s": 0.0, "rig_cameras.oblique.delay": "free", "rig_cameras.oblique.truth.delay_s": 0.004,
+    "rig_cameras.oblique.place": {"sigma_m": 0.005}, "rig_cameras.oblique.truth.place_m": [0.503, 0.102, -0.049],
+    "jitter.rate_deg_per_s": 2.0,
+}  # fmt: skip
+
+
+@functools.cache
+def late(bends: bool = True):
+    still = {} if bends else {"noise.rig_place_m": 0.0, "noise.rig_turn_deg": 0.0}
+    return simulate(recipe_from(changed(RIG | LATE | still)), 1)
+
+
+def test_a_late_camera_is_where_the_rig_has_come_to():
+    """Beside the reference as it was at its own exposure: the way flown in the meantime, and the turn."""
+    simulation = late(bends=False)
+    position, rotation = (np.asarray(v) for v in vars(simulation.truth.exterior).values())
+    motion = simulation.block.motion
+    for k in range(0, 28, 2):
+        # The body's axes in the object frame; it turns about them for 4 ms, right-handed.
+        body = rotation[k].T @ NOMINAL["forward"].T
+        turn = scipy_rotation.from_rotvec(body @ np.asarray(motion.rate)[k] * 0.004).as_matrix()
+        there = position[k] + np.asarray(motion.velocity)[k] * 0.004 + turn @ rotation[k].T @ [0.503, 0.102, -0.049]
+        np.testing.assert_allclose(position[k + 1], there, atol=1e-8)
+        own = scipy_rotation.from_rotvec(-np.deg2rad(TRUE_TURN)).as_matrix() @ rotation[k] @ turn.T
+        np.testing.assert_allclose(rotation[k + 1], own, atol=1e-12)
+
+
+def test_the_delay_of_a_camera_is_found():
+    adjusted = adjust(late().block)
+    assert adjusted.outcome is Outcome.CONVERGED
+    sigma = dict(zip(adjusted.structure.labels, np.asarray(covariance(adjusted).shared_sigma), strict=True))
+    estimated = float(adjusted.unknowns.more["rig_cameras"]["oblique"].delay)
+    assert sigma["rig_cameras[oblique].delay_s"] < 4e-4
+    assert abs(estimated - 0.004) < 3.3 * sigma["rig_cameras[oblique].delay_s"]
+    assert 0.9 < adjusted.sigma0 < 1.1
+
+
+def test_a_delay_goes_through_files_and_needs_the_motion(tmp_path):
+    write_simulation(late(), tmp_path / "block")
+    again = read_block(tmp_path / "block")
+    np.testing.assert_allclose(again.motion.rate[::2], late().block.motion.rate[::2], rtol=1e-12)
+    assert again.priors.more["rig_cameras"]["oblique"].delay is FREE
+    table = pd.read_csv(tmp_path / "block/attitudes.csv")
+    table.loc[table.image == "A_03", [c for c in table.columns if "rate" in c]] = np.nan
+    table.to_csv(tmp_path / "block/attitudes.csv", index=False)
+    with pytest.raises(BlockError, match=r"delay of \[unknowns\.rig_cameras\.oblique\] needs the motion of image A_03"):
+        read_block(tmp_path / "block")
+    with pytest.raises(RankError, match=r"rig_cameras\[oblique\]\.delay acts with the motion of the rig"):
+        adjust(dataclasses.replace(late().block, motion=None))
+
+
+def test_a_rig_flies_beside_a_scanner_on_one_trajectory():
+    """As one camera would: the scanner sees the same, and stations are those of the reference, on its clock."""
+    with_rig_on = {name: RIG[name] for name in ("cameras.oblique", "rig_cameras", "points")}
+    drift = {"drift_sigma_m": [0.2] * 3, "correlation_s": 60.0}
+    bends = {"sigmas.rig_place_m": 0.001, "sigmas.rig_turn_deg": 0.001}
+    scanned = {"terrain": {"kind": "waves"}, "lidar": {"density_per_m2": 0.01, "same_trajectory": True, "truth": drift},
+               "sigmas.lidar_m": 0.03, "noise.station_m": 0.0}  # fmt: skip
+    one, rigged = (simulate(recipe_from(changed(own | scanned)), 1) for own in ({}, with_rig_on | bends))
+    np.testing.assert_array_equal(rigged.cloud.xyz, one.cloud.xyz)
+    time = np.asarray(rigged.block.flight_time)
+    np.testing.assert_array_equal(time[::2], one.block.flight_time)
+    np.testing.assert_array_equal(time[1::2], one.block.flight_time)
+    np.testing.assert_array_equal(rigged.block.stations.value, one.block.stations.value)
+    off = np.asarray(rigged.block.stations.value).reshape(-1, 3) - np.asarray(rigged.truth.exterior.position)[::2]
+    assert 0.05 < off.std() < 0.5 and np.abs(np.diff(off[:4], axis=0)).max() < 0.2
 
 
 def test_a_photograph_of_a_camera_outside_the_rig_is_refused():

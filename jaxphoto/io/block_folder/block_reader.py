@@ -26,7 +26,7 @@ from jaxphoto.io.block_folder.georeferencing import read_attitudes, read_station
 from jaxphoto.io.block_folder.image_points import check_rays, read_image_points
 from jaxphoto.io.block_folder.images import Images, check_rates, check_times, read_images
 from jaxphoto.io.block_folder.map_tables import origin_of, tables_to_local
-from jaxphoto.io.block_folder.motion import ObservedFlight, check_time_offsets, read_motion
+from jaxphoto.io.block_folder.motion import ObservedFlight, check_rig_delays, check_time_offsets, read_motion
 from jaxphoto.io.block_folder.mount_sections import mounts_of, read_mounts, read_strips
 from jaxphoto.io.block_folder.observed import Ids, Kind, known_kinds, own_tables
 from jaxphoto.io.block_folder.section import Section
@@ -201,6 +201,7 @@ def assemble(source: BlockTables) -> Block:
     check_rates(images, start, priors)
     ids = Ids(images, points, {kind: tuple(owners) for kind, owners in start.tables.items()})
     distances, further = read_declared(kinds, tables, ids, settings)
+    check_rig_delays(flight, further, start, priors, images)
     block = dataclasses.replace(
         block,
         start=dataclasses.replace(block.start, unknowns=start),

@@ -1,17 +1,18 @@
 """Velocity and rate of turn at the exposures, from columns of stations.csv and attitudes.csv."""
 
-from typing import NamedTuple
+from collections.abc import Iterable
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxphoto.arrays import on_device
 from jaxphoto.block import Motion
-from jaxphoto.georeferencing import Mount
+from jaxphoto.georeferencing import Mount, RigCamera
 from jaxphoto.io.block_folder.images import Images
 from jaxphoto.io.block_folder.table_layout import RATE, VELOCITY
 from jaxphoto.io.text_tables import Table
-from jaxphoto.observations import Attitudes, StationRows
-from jaxphoto.unknowns import FIXED
+from jaxphoto.observations import Attitudes, RigPlaces, RigTurns, StationRows
+from jaxphoto.unknowns import FIXED, Unknowns
 
 
 class ObservedFlight(NamedTuple):
@@ -58,6 +59,25 @@ def check_time_offsets(
                 f"{images.ids[image]}; give a [trajectory], add {', '.join(columns)} to {table}, or make time_offset "
                 '"fixed" at zero',
             )
+
+
+def check_rig_delays(
+    flight: ObservedFlight, rows: Iterable[Any], start: Unknowns, priors: Unknowns, images: Images
+) -> None:
+    """Raise BlockError where a camera of a rig exposes late beside a reference whose motion is not known."""
+    rig: dict[str, Any] = start.more.get(RigCamera.kind, {})
+    prior: dict[str, Any] = priors.more.get(RigCamera.kind, {})
+    late = {name for name, own in rig.items() if own.delay != 0 or prior[name].delay is not FIXED}
+    known = flight.velocity_known & flight.rate_known
+    for of in (of for of in rows if isinstance(of, RigPlaces | RigTurns)):
+        for reference, image in zip(of.reference, of.image, strict=True):
+            if images.cameras[image] in late and not known[reference]:
+                raise images.table.misfit(
+                    int(reference),
+                    f"the delay of [unknowns.{RigCamera.kind}.{images.cameras[image]}] needs the motion of image "
+                    f"{images.ids[reference]}; give a [trajectory], add {', '.join(VELOCITY)} to stations.csv and "
+                    f'{", ".join(RATE)} to attitudes.csv, or make delay "fixed" at zero',
+                )
 
 
 def _columns(table: Table, columns: tuple[str, ...], images: Images) -> tuple[np.ndarray, np.ndarray]:

@@ -40,9 +40,8 @@ def flown_cameras(top: Section, cameras: Sequence[str]) -> list[str]:
     flown = [name for name in cameras if name not in section]
     if section.values and len(flown) != 1:
         raise section.error("", "all cameras but one sit in a rig beside that one; give each of them a table")
-    for key in ("lidar", "convergent") if section.values else ():
-        if key in top:
-            raise top.error(key, "a rig is flown, and without a lidar; remove the table, or that of the rig")
+    if section.values and "convergent" in top:
+        raise top.error("convergent", "a rig is flown; remove the table, or that of the rig")
     return flown
 
 

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from jaxphoto.errors import quoted
+from jaxphoto.georeferencing import PATTERNS
 from jaxphoto.io.block_folder.section import Section
 from jaxphoto.io.recipe import sizes
 from jaxphoto.io.recipe.keys import flag, sigmas, tables
@@ -24,7 +25,7 @@ def read_lidar(top: Section, plan: FlightPlan | ConvergentPlan, terrain: Terrain
             raise top.section("sigmas").error("lidar_m", "there is no table [lidar]; add it, or remove this key")
         return None
     section, truth = top.section("lidar"), top.section("lidar").section("truth")
-    section.known("density_per_m2", "scan_angle_deg", "strips", "same_trajectory", "truth")
+    section.known("density_per_m2", "scan_angle_deg", "pattern", "strips", "same_trajectory", "truth")
     if isinstance(plan, ConvergentPlan):
         raise top.error("lidar", "a convergent set is not flown, so it has no lidar strips; remove the table")
     if terrain.roughness_m:
@@ -55,6 +56,9 @@ def read_lidar(top: Section, plan: FlightPlan | ConvergentPlan, terrain: Terrain
     given |= {name: truth.number(name, 0.0) for name in single}
     given |= {name: sigmas(truth, name) or _ZERO for name in drawn}
     given |= {name: truth.positive(name) for name in ("correlation_s", "knots_s") if name in truth}
+    given["pattern"] = section.text("pattern", "line")
+    if given["pattern"] not in PATTERNS:
+        raise section.error("pattern", f"{quoted(given['pattern'])} is no pattern of a scanner; use line or circle")
     return ScanPlan(
         density_per_m2=section.positive("density_per_m2"),
         scan_angle_deg=angle,

@@ -150,7 +150,8 @@ def _parsed(path: Path) -> tuple[ElementTree.Element, _Ties]:
             elif element.tag == "ControlPoint":
                 control += 1
                 element.clear()
-    except ElementTree.ParseError as error:
+    except (ElementTree.ParseError, LookupError, ValueError) as error:
+        # The others where it says to be of an encoding that is none, or that the parser does not know.
         raise InputError(
             f"{path.name}: the XML is broken ({error}); it is cut off or was changed, export it anew"
         ) from None

@@ -21,6 +21,7 @@ from jaxphoto.lidar.correction import check_covered, scanner_poses
 from jaxphoto.lidar.strip_correction import correct_flight, correct_strips, times_of
 from jaxphoto.lidar.strip_settings import StripSettings
 from jaxphoto.procedures.adjust import adjust
+from jaxphoto.procedures.lidar.looks import check_pattern
 from jaxphoto.procedures.lidar.photographs import Photographs, check_photographs, on_trajectory, spans_with
 from jaxphoto.procedures.lidar.strip_rows import step_rows
 from jaxphoto.procedures.lidar.strip_search import CommonPlanes, StripSearch, check_joined
@@ -107,7 +108,8 @@ def adjust_strips(
     tie points lie on the planes of the strips. What of their cameras and mounts is estimated their block says; its
     stations and attitudes are taken for the trajectory's.
 
-    `priors` are those of the scanner; by default its boresight is FREE and all else FIXED. The trajectory of strips
+    `priors` are those of the scanner and say its pattern; by default lines, its boresight FREE and all else FIXED. Of
+    one that looks all around, what a strip saw ahead and behind is compared, too. The trajectory of strips
     named in `held` is right. Without a trajectory each strip has a shift alone, and the first is held where none is
     named.
 
@@ -116,7 +118,10 @@ def adjust_strips(
     as `jaxphoto.adjust`.
     """
     settings = StripSettings() if settings is None else settings
+    priors = ScannerPriors() if priors is None else priors
     names = _check(cloud, trajectory, held)
+    if trajectory is not None:
+        check_pattern(cloud, trajectory, priors.calibration.pattern)
     spans, images = _spans(cloud), None
     if photographs is not None:
         check_photographs(photographs, trajectory)
@@ -128,9 +133,10 @@ def adjust_strips(
     if trajectory is None:
         block = strip_block(names, splines, held or names[:1], settings, None)
     else:
-        block = strip_block(names, splines, held, settings, priors or ScannerPriors(), images)
+        block = strip_block(names, splines, held, settings, priors, images)
     steps = tuple(rows for rows in step_rows(splines, settings) if len(rows))
-    search, errors = StripSearch(cloud, trajectory, settings), errors_of(block.start.unknowns, splines)
+    pattern = priors.calibration.pattern
+    search, errors = StripSearch(cloud, trajectory, settings, pattern), errors_of(block.start.unknowns, splines)
     first = seen = search.look(errors, settled=False)
     check_joined(names, seen)
     ties = None if images is None else TiePointSearch(search, tie_points(images))
@@ -158,7 +164,7 @@ def adjust_strips(
         correct_strips(cloud, errors, trajectory),
         None if trajectory is None else correct_flight(trajectory, errors),
         errors,
-        _differences(names, first, seen) + _point_differences(names, first_on, on),
+        _differences(first, seen) + _point_differences(first_on, on),
         tuple(rounds),
         still,
     )
@@ -237,21 +243,17 @@ def _change(moved: Float[np.ndarray, "unknowns"], known: Covariance) -> float:
     return float(np.max(np.abs(moved)[sigma > 0] / sigma[sigma > 0], initial=0.0))
 
 
-def _differences(
-    names: Sequence[str], before: Sequence[CommonPlanes], after: Sequence[CommonPlanes]
-) -> tuple[StripDifference, ...]:
-    then, rows = {(f.one, f.other): f.pairs.gap[f.fits] for f in before}, []
+def _differences(before: Sequence[CommonPlanes], after: Sequence[CommonPlanes]) -> tuple[StripDifference, ...]:
+    then, rows = {(f.one.name, f.other.name): f.pairs.gap[f.fits] for f in before}, []
     for f in after:
-        was = then.get((f.one, f.other), np.array([np.nan]))
+        was = then.get((f.one.name, f.other.name), np.array([np.nan]))
         gap, noise = f.pairs.gap[f.fits], _rms(f.pairs.sigma[f.fits])
         told = (float(was.mean()), _rms(was), float(gap.mean()), _rms(gap), noise)
-        rows.append(StripDifference(names[f.one], names[f.other], int(np.isfinite(was).sum()), len(gap), *told))
+        rows.append(StripDifference(f.one.name, f.other.name, int(np.isfinite(was).sum()), len(gap), *told))
     return tuple(rows)
 
 
-def _point_differences(
-    names: Sequence[str], before: Sequence[PointPlanes], after: Sequence[PointPlanes]
-) -> tuple[StripDifference, ...]:
+def _point_differences(before: Sequence[PointPlanes], after: Sequence[PointPlanes]) -> tuple[StripDifference, ...]:
     """Of tie points over the planes of each strip."""
     rows = []
     for was, now in zip(before, after, strict=True):
@@ -259,7 +261,7 @@ def _point_differences(
             continue
         then, gap = was.found.gap[was.fits], now.found.gap[now.fits]
         told = (float(then.mean()), _rms(then), float(gap.mean()), _rms(gap), _rms(now.found.sigma[now.fits]))
-        rows.append(StripDifference(PHOTOGRAPHS, names[now.strip], len(then), len(gap), *told))
+        rows.append(StripDifference(PHOTOGRAPHS, now.look.name, len(then), len(gap), *told))
     return tuple(rows)
 
 

@@ -9,11 +9,12 @@ from jaxtyping import Bool
 
 from jaxphoto.cloud import Cloud
 from jaxphoto.errors import BlockError
-from jaxphoto.georeferencing import StripErrors, Trajectory
+from jaxphoto.georeferencing import Pattern, StripErrors, Trajectory
 from jaxphoto.lidar.corresponding_planes import PlanePairs, StripPatches, cells_of, corresponding, fitting, planes_of
 from jaxphoto.lidar.strip_correction import corrected_strip, times_of
 from jaxphoto.lidar.strip_settings import StripSettings
 from jaxphoto.observations import StripPlanes
+from jaxphoto.procedures.lidar.looks import Look, looks_of
 from jaxphoto.procedures.lidar.strip_rows import plane_rows, side_of, thinned
 
 # Fewer planes of a pair of strips are chance.
@@ -23,8 +24,8 @@ _FEWEST = 10
 class CommonPlanes(NamedTuple):
     """The planes of two strips, and which of them fit."""
 
-    one: int
-    other: int
+    one: Look
+    other: Look
     patches: tuple[StripPatches, StripPatches]
     pairs: PlanePairs
     fits: Bool[np.ndarray, "n"]
@@ -37,24 +38,26 @@ class StripSearch:
     unknowns' standard deviations, but would never come to rest.
     """
 
-    def __init__(self, cloud: Cloud, trajectory: Trajectory | None, settings: StripSettings) -> None:
+    def __init__(
+        self, cloud: Cloud, trajectory: Trajectory | None, settings: StripSettings, pattern: Pattern = "line"
+    ) -> None:
         self.cloud, self.trajectory, self.settings = cloud, trajectory, settings
-        self.strips = [np.flatnonzero(cloud.strip == k) for k in range(len(cloud.strips))]
+        self.looks = looks_of(cloud, trajectory, pattern)
         self.cells: list[np.ndarray] = []
         self.corrected: list[np.ndarray] = []
-        """The returns of each strip as the last search found them."""
+        """The returns of each look as the last search found them."""
 
     def look(self, errors: StripErrors, settled: bool) -> list[CommonPlanes]:
-        """The planes of every two strips that have some."""
+        """The planes of every two strips that have some; of a strip with two looks, those of both."""
         patches, cells, corrected = [], [], []
-        for k, own in enumerate(self.strips):
-            measured, time = self.cloud.xyz[own], times_of(self.cloud)[own]
-            xyz = corrected_strip(measured, time, k, errors, self.trajectory)
+        for k, own in enumerate(self.looks):
+            measured, time = self.cloud.xyz[own.returns], times_of(self.cloud)[own.returns]
+            xyz = corrected_strip(measured, time, own.strip, errors, self.trajectory)
             corrected.append(xyz)
             cells.append(self.cells[k] if settled else cells_of(xyz, self.cloud.extent[0, :2], self.settings))
             patches.append(planes_of(xyz, measured, time, cells[-1], self.settings))
         self.cells, self.corrected = cells, corrected
-        pairs = itertools.combinations(range(len(self.strips)), 2)
+        pairs = itertools.combinations(range(len(self.looks)), 2)
         return [found for one, other in pairs if (found := self._common(one, other, patches)) is not None]
 
     def _common(self, one: int, other: int, patches: list[StripPatches]) -> CommonPlanes | None:
@@ -62,7 +65,7 @@ class StripSearch:
         if len(pairs.gap) < _FEWEST:
             return None
         fits = fitting(pairs.gap, pairs.sigma, self.settings.outlier)
-        return CommonPlanes(one, other, (patches[one], patches[other]), pairs, fits)
+        return CommonPlanes(self.looks[one], self.looks[other], (patches[one], patches[other]), pairs, fits)
 
     def rows(self, seen: Sequence[CommonPlanes], errors: StripErrors) -> StripPlanes:
         """The planes that fit as observations, `most` of them shared out among the pairs of strips."""
@@ -72,15 +75,16 @@ class StripSearch:
             share = max(_FEWEST, self.settings.most * len(own) // total)
             own = own[thinned(f.pairs.normal[own], f.pairs.cell[own], share)]
             pairs = PlanePairs(*(v[own] for v in f.pairs))
-            a = side_of(f.patches[0], pairs.a, pairs.foot_a, f.one, errors, self.trajectory)
-            b = side_of(f.patches[1], pairs.b, pairs.foot_b, f.other, errors, self.trajectory)
+            a = side_of(f.patches[0], pairs.a, pairs.foot_a, f.one.strip, errors, self.trajectory)
+            b = side_of(f.patches[1], pairs.b, pairs.foot_b, f.other.strip, errors, self.trajectory)
             parts.append(plane_rows(pairs, a, b))
         return StripPlanes.joined(*parts)
 
 
 def check_joined(names: Sequence[str], seen: Sequence[CommonPlanes]) -> None:
     """Raise BlockError for a strip that no plane joins to another."""
-    joined = {k for found in seen for k in (found.one, found.other)}
+    apart = (found for found in seen if found.one.strip != found.other.strip)
+    joined = {look.strip for found in apart for look in (found.one, found.other)}
     alone = [name for k, name in enumerate(names) if k not in joined]
     if alone:
         raise BlockError(

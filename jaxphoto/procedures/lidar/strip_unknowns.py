@@ -56,7 +56,8 @@ def strip_block(
     if priors is not None:
         of_scanner, own = ScannerCalibration.kind, priors.calibration
         right_scanner = Scanner(_ZERO, {})  # type: ignore[arg-type]
-        start = dataclasses.replace(start, scanner=right_scanner, more=start.more | {of_scanner: {"": NO_CALIBRATION}})
+        none = dataclasses.replace(NO_CALIBRATION, pattern=own.pattern)
+        start = dataclasses.replace(start, scanner=right_scanner, more=start.more | {of_scanner: {"": none}})
         prior = dataclasses.replace(
             prior, scanner=Scanner(priors.boresight, {}), more=prior.more | {of_scanner: {"": own}}
         )

@@ -12,6 +12,7 @@ from jaxphoto.lidar.corresponding_planes import StripPatches, fitting, planes_of
 from jaxphoto.lidar.points_on_planes import PointsOnPlanes, on_planes, returns_about
 from jaxphoto.lidar.strip_correction import times_of
 from jaxphoto.observations import StripPoints
+from jaxphoto.procedures.lidar.looks import Look
 from jaxphoto.procedures.lidar.strip_rows import side_of
 from jaxphoto.procedures.lidar.strip_search import StripSearch
 from jaxphoto.statistics import Covariance
@@ -20,7 +21,7 @@ from jaxphoto.statistics import Covariance
 class PointPlanes(NamedTuple):
     """The tie points that lie over planes of one strip, and which of them fit."""
 
-    strip: int
+    look: Look
     patches: StripPatches
     found: PointsOnPlanes
     """Its points are numbers among `TiePointSearch.points`."""
@@ -40,15 +41,15 @@ class TiePointSearch:
         """The planes about the points as adjusted, in the strips as the other search corrected them last."""
         place, spread = (np.asarray(of)[self.points] for of in (adjusted.unknowns.points, known.points))
         search, about, seen = self.search, [], []
-        for k, (own, xyz) in enumerate(zip(search.strips, search.corrected, strict=True)):
+        for k, (own, xyz) in enumerate(zip(search.looks, search.corrected, strict=True)):
             about.append(self.about[k] if settled else returns_about(xyz, place, search.settings))
             index, point = about[-1]
-            measured, time = search.cloud.xyz[own], times_of(search.cloud)[own]
+            measured, time = search.cloud.xyz[own.returns], times_of(search.cloud)[own.returns]
             patches = planes_of(xyz[index], measured[index], time[index], point, search.settings)
             found = on_planes(patches, place)
             of_points = np.einsum("ni,nij,nj->n", patches.normal, spread[found.point], patches.normal)
             sigma = np.sqrt(found.sigma**2 + of_points)
-            seen.append(PointPlanes(k, patches, found, sigma, fitting(found.gap, sigma, search.settings.outlier)))
+            seen.append(PointPlanes(own, patches, found, sigma, fitting(found.gap, sigma, search.settings.outlier)))
         self.about = about
         return seen
 
@@ -57,8 +58,8 @@ class TiePointSearch:
         groups = []
         for f in (f for f in seen if f.fits.any()):
             found = PointsOnPlanes(*(v[f.fits] for v in f.found))
-            side = side_of(f.patches, found.patch, found.foot, f.strip, errors, self.search.trajectory)
-            knots, weights = errors.splines[f.strip].all_weights(f.patches.time[found.patch])
+            side = side_of(f.patches, found.patch, found.foot, f.look.strip, errors, self.search.trajectory)
+            knots, weights = errors.splines[f.look.strip].all_weights(f.patches.time[found.patch])
             normal = f.patches.normal[found.patch]
             pose = side.scanner, side.roll_pitch_yaw
             none = np.zeros(len(normal))

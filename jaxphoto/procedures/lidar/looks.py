@@ -1,0 +1,75 @@
+"""Looks of a scanner: the returns of a strip that were measured ahead, and those that were measured behind.
+
+A scanner that draws lines across the track sees a place once in a strip. One that looks all around sees it ahead and
+again, seconds later, behind: by other angles, at another time of the trajectory. What two looks of one strip say of a
+plane is then compared as that of two strips is.
+"""
+
+import warnings
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxphoto.cloud import Cloud
+from jaxphoto.georeferencing import Pattern, Trajectory
+from jaxphoto.lidar.correction import PORTION, scanner_poses
+
+# So many returns are probed for the pattern; lines spread less ahead than this part of what they do to the side, and
+# what looks all around spreads more. Of a swath narrower than this part of the height nothing is said.
+_PROBED, _ALIKE, _NARROW = 1000, 0.5, 0.02
+
+
+class Look(NamedTuple):
+    """Returns of one strip."""
+
+    strip: int
+    name: str
+    returns: Int[np.ndarray, "n"]
+    """Which of the cloud."""
+
+
+def looks_of(cloud: Cloud, trajectory: Trajectory | None, pattern: Pattern) -> list[Look]:
+    """One of each strip; of a scanner that looks all around two, "1 ahead" and "1 behind" of strip 1."""
+    looks = []
+    for k, name in enumerate(cloud.strips):
+        own = np.flatnonzero(cloud.strip == k)
+        if pattern == "line" or trajectory is None:
+            looks.append(Look(k, name, own))
+            continue
+        ahead = _aside(cloud, own, trajectory)[:, 1] > 0
+        sides = (f"{name} ahead", own[ahead]), (f"{name} behind", own[~ahead])
+        looks += [Look(k, side, returns) for side, returns in sides if len(returns)]
+    return looks
+
+
+def check_pattern(cloud: Cloud, trajectory: Trajectory, pattern: Pattern) -> None:
+    """A UserWarning where the returns lie about the scanner as those of another pattern do."""
+    some = np.linspace(0, len(cloud) - 1, _PROBED).astype(int)
+    right, ahead = _aside(cloud, some, trajectory).std(axis=0)
+    around = ahead > _ALIKE * right
+    if right < _NARROW:
+        return
+    if around and pattern == "line":
+        warnings.warn(
+            f"the returns spread as far ahead ({ahead:.2f} of the height) as to the side ({right:.2f}), as those of a "
+            'scanner that looks all around: give its pattern as "circle" (--pattern circle)',
+            stacklevel=3,
+        )
+    if not around and pattern == "circle":
+        warnings.warn(
+            f"the returns spread to the side ({right:.2f} of the height), but not ahead ({ahead:.2f}), as those of a "
+            'scanner that draws lines: give its pattern as "line" (--pattern line)',
+            stacklevel=3,
+        )
+
+
+def _aside(cloud: Cloud, which: Int[np.ndarray, "n"], trajectory: Trajectory) -> Float[np.ndarray, "n 2"]:
+    """Tangents of the angles of returns to the right and ahead, from the body's nadir."""
+    parts = [np.zeros((0, 2))]
+    for first in range(0, len(which), PORTION):
+        own = which[first : first + PORTION]
+        poses = scanner_poses(trajectory, cloud.time[own])  # type: ignore[index]
+        shot = np.einsum("nji,nj->ni", poses.object_from_body, cloud.xyz[own] - poses.position)
+        parts.append(shot[:, :2] / np.maximum(-shot[:, 2:], 1e-9))
+    return np.concatenate(parts)
