@@ -32,9 +32,7 @@ def exact(interior: InteriorOrientation, target: type[AbstractDistortion]) -> In
     affine = {"b1", "b2"} & set(terms)
     mixed = bool(affine) and len(terms) > len(affine)
     if terms and (
-        d.domain != target.domain
-        or not set(terms) <= set(target.terms)
-        or (mixed and d.affinity_added != target.affinity_added)
+        d.domain != target.domain or not set(terms) <= set(target.terms) or (mixed and d.affinity != target.affinity)
     ):
         return None
     own = dict.fromkeys(target.coefficients, 0.0)

@@ -11,6 +11,7 @@ from jaxphoto.camera import (
     Balanced,
     Brown,
     Brown14,
+    BrownAffine,
     BundlerRadial,
     Ebner,
     Gruen,
@@ -20,6 +21,7 @@ from jaxphoto.camera import (
     PpsRadial,
     RadialPolynomial,
     Smac,
+    StretchedBrown,
 )
 
 # Per model: the coefficients in units of the size they have on a sensor of 36 mm x 24 mm.
@@ -31,6 +33,8 @@ _GRUEN = {name: 0.03 / (_POLYNOMIALS[int(name[1]) - 1] * _POLYNOMIALS[int(name[2
 UNITS = {
     Brown: _BROWN,
     AffineBrown: _BROWN,
+    BrownAffine: _BROWN,
+    StretchedBrown: _BROWN,
     Smac: {
         "k0": 1e-2,
         **_RADIAL,

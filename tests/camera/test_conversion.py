@@ -10,6 +10,7 @@ from jaxphoto.camera import (
     Agisoft,
     Balanced,
     Brown,
+    BrownAffine,
     BundlerRadial,
     Ebner,
     InteriorOrientation,
@@ -19,6 +20,7 @@ from jaxphoto.camera import (
     RadialPolynomial,
     Sensor,
     Smac,
+    StretchedBrown,
     exact,
     get_parameter,
     parameter_names,
@@ -52,6 +54,8 @@ NORMALISED = {"k1": -0.11, "k2": 0.15}
 FULL = {
     Brown: Brown(**MEASURED, **P, b1=1e-3, b2=-5e-4),
     AffineBrown: AffineBrown(**MEASURED, **P, b1=1e-3, b2=-5e-4),
+    BrownAffine: BrownAffine(**MEASURED, **P, b1=1e-3, b2=-5e-4),
+    StretchedBrown: StretchedBrown(**MEASURED, **P, b1=1e-3, b2=-5e-4),
     Smac: Smac(k0=0.01, **MEASURED, k4=1e-14, **P, p3=1e-3, p4=1e-6, r0=9.0, sign="add"),
     RadialPolynomial: RadialPolynomial(**MEASURED),
     PpsRadial: PpsRadial(**MEASURED, pps_x=0.1),
@@ -64,6 +68,8 @@ FULL = {
 USUAL = {
     Brown: Brown(**MEASURED, **P),
     AffineBrown: AffineBrown(**MEASURED, **P),
+    BrownAffine: BrownAffine(**MEASURED, **P),
+    StretchedBrown: StretchedBrown(**MEASURED, **P),
     Smac: Smac(k0=0.01, **MEASURED, **P, r0=9.0, sign="add"),
     PpsRadial: PpsRadial(**MEASURED),
     Balanced: Balanced(a1=-1e-4, a2=1e-7, a3=-1e-11, b1=1e-5, b2=-1e-5, r0=13.0),
@@ -72,14 +78,14 @@ USUAL = {
     OpenCvFisheye: OpenCvFisheye(**NORMALISED, k3=0.01, p1=1e-3, p2=-2e-3),
 }
 # Which others of its direction hold it exactly.
-FULL_TO = {Brown: (), AffineBrown: (), Smac: (), RadialPolynomial: (Brown, AffineBrown, Smac, PpsRadial), PpsRadial: ()}
+_BROWNS = (Brown, AffineBrown, BrownAffine, StretchedBrown)
+FULL_TO = {**dict.fromkeys(_BROWNS, ()), Smac: (), RadialPolynomial: (*_BROWNS, Smac, PpsRadial), PpsRadial: ()}
 FULL_TO |= {Balanced: (), BundlerRadial: (Balanced, OpenCv, Agisoft, OpenCvFisheye), OpenCv: (), Agisoft: ()}
 FULL_TO[OpenCvFisheye] = ()
 USUAL_TO = {
-    Brown: (AffineBrown, Smac),
-    AffineBrown: (Brown, Smac),
-    Smac: (Brown, AffineBrown),
-    PpsRadial: (Brown, AffineBrown, Smac, RadialPolynomial),
+    **{one: (*(other for other in _BROWNS if other is not one), Smac) for one in _BROWNS},
+    Smac: _BROWNS,
+    PpsRadial: (*_BROWNS, Smac, RadialPolynomial),
     Balanced: (OpenCv, Agisoft, OpenCvFisheye),
     OpenCv: (Balanced, Agisoft, OpenCvFisheye),
     Agisoft: (Balanced, OpenCv, OpenCvFisheye),

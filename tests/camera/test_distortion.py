@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxphoto.camera import DISTORTIONS, Balanced, Brown, BundlerRadial, InteriorOrientation, Sensor, Smac, invert
-from jaxphoto.camera.distortion import AffineBrown
+from jaxphoto.camera.distortion import AffineBrown, BrownAffine, StretchedBrown
 from tests.camera.models import AICON, FLICKR, GOPRO, GOPRO_XY, KODAK, MOST, UNITS, build
 from tests.checked_types import unchecked
 from tests.derivatives import check_derivatives, compiled
@@ -128,6 +128,16 @@ def test_affine_brown_is_brown_of_the_coordinate_freed_of_affinity():
     both = closed(AffineBrown(**radial, b1=3e-3, b2=-2e-3), xy)
     np.testing.assert_allclose(both, closed(Brown(**radial), freed), rtol=0, atol=1e-13)
     assert np.abs(both - closed(Brown(**radial, b1=3e-3, b2=-2e-3), xy)).max() > 1e-4
+
+
+@pytest.mark.parametrize("model", [BrownAffine, StretchedBrown])
+def test_affinity_after_browns_distortion_and_around_it(model):
+    radial = {"k1": -9e-5, "k2": 1e-7, "p1": 1e-5, "p2": -2e-5}
+    xy = np.array([[12.0, -7.0], [-3.0, 9.0]])
+    stretch, first = (np.diag([1 - 3e-3, 1.0]), model is StretchedBrown)
+    freed = closed(Brown(**radial), xy @ stretch if first else xy)
+    expected = np.column_stack([freed[:, 0] * (1.0 if first else 1 - 3e-3) + 2e-3 * freed[:, 1], freed[:, 1]])
+    np.testing.assert_allclose(closed(model(**radial, b1=3e-3, b2=-2e-3), xy), expected, rtol=0, atol=1e-13)
 
 
 def test_balanced_distortion_vanishes_at_r0():

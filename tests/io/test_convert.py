@@ -174,7 +174,7 @@ def test_unknown_formats_list_the_known_ones(tmp_path):
     ("old", "new", "words"),
     [
         ("</document>", "", ("project.xml", "line", "correct the XML")),
-        ("<model>3</model>", "<model>4</model>", ("project.xml", "model 4", "use one of")),
+        ("<model>3</model>", "<model>6</model>", ("project.xml", "model 6", "use one of")),
         ("<image>2272,1704</image>", "<image>2272</image>", ("project.xml", "<image>", "2 numbers")),
         ("auto,5.43764", "auto,auto", ("project.xml", "<sensor>", "give width,height")),
         ("auto,5.43764", "auto,nan", ("project.xml", "<sensor>", "give width,height")),

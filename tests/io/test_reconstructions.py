@@ -407,6 +407,10 @@ REFUSED = {
     "fisheye": (_blocks(_replaced(">Perspective<", ">Fisheye<")), "is a 'Fisheye'"),
     "centre": (_blocks(_replaced("<x>0.5</x>", "<x>a</x>")), "photo 5, Center: .* is not 3 finite numbers"),
     "end": (_bundle(lambda lines: lines[:-1]), "number of measurements of point 6"),
+    # The last point but one says that it was measured ten times, which leaves two numbers for the last.
+    "end amid a point": (
+        _bundle(lambda lines: [*lines[:-4], f"10{lines[-4][1:]}", *lines[-3:], "0 0 0"]), "measurements of point 6 is nan"
+    ),
     "words": (_bundle(lambda lines: [*lines, "x"]), "a word that is no number"),
     "cameras that end": (_pix4d(lambda text: text[: text.rindex("\n", 0, -1)]), "has 29 rows"),
     "focal lengths": (_pix4d(_replaced("0 800.0 239", "0 801.0 239")), "one focal"),

@@ -11,6 +11,8 @@ from jaxphoto.camera.distortion.base import AbstractDistortion as AbstractDistor
 from jaxphoto.camera.distortion.base import invert as invert
 from jaxphoto.camera.distortion.brown import Brown as Brown
 from jaxphoto.camera.distortion.affine_brown import AffineBrown as AffineBrown
+from jaxphoto.camera.distortion.brown_affine import BrownAffine as BrownAffine
+from jaxphoto.camera.distortion.stretched_brown import StretchedBrown as StretchedBrown
 from jaxphoto.camera.distortion.smac import Smac as Smac
 from jaxphoto.camera.distortion.balanced import Balanced as Balanced
 from jaxphoto.camera.distortion.radial_polynomial import RadialPolynomial as RadialPolynomial

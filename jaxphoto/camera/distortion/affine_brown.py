@@ -32,6 +32,7 @@ class AffineBrown(AbstractDistortion):
     coefficients: ClassVar[tuple[str, ...]] = ("k1", "k2", "k3", "p1", "p2", "b1", "b2")
     rare: ClassVar[tuple[str, ...]] = ("b1", "b2")
     terms: ClassVar[Mapping[str, Term] | None] = same_terms(*coefficients)
+    affinity: ClassVar[Literal["added", "before", "after", "around"]] = "before"
 
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
         """Ideal coordinate (mm) of a measured one, both reduced to the principal point."""

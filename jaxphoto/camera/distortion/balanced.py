@@ -39,7 +39,7 @@ class Balanced(AbstractDistortion):
         **{f"p{i}": Term(f"b{i}", 1.0, 1) for i in (1, 2)},
         **{f"b{i}": Term(f"c{i}") for i in (1, 2)},
     }
-    affinity_added: ClassVar[bool] = True
+    affinity: ClassVar[Literal["added", "before", "after", "around"]] = "added"
 
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
         """Measured coordinate (mm) of an ideal one, both reduced to the principal point."""

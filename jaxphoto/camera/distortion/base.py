@@ -51,8 +51,8 @@ class AbstractDistortion(Declared):
     does: never both can be free.
 
     `terms` makes exact conversions possible (`camera.equivalence`): which coefficients are the terms of one of its two
-    polynomials; None where the model is neither. `affinity_added` says that its affinity acts on the coordinate that
-    its other terms see; in other models it acts before or after them.
+    polynomials; None where the model is neither. `affinity` says when it acts: "added" to the other terms, on the
+    coordinate that these see; or in a step of its own, "before" or "after" them, or one part "around" each side.
     """
 
     domain: eqx.AbstractClassVar[Literal["measured", "ideal"]]
@@ -60,7 +60,7 @@ class AbstractDistortion(Declared):
     scales: ClassVar[tuple[str, ...]] = ()
     normalised: ClassVar[bool] = False
     terms: ClassVar[Mapping[str, Term] | None] = None
-    affinity_added: ClassVar[bool] = False
+    affinity: ClassVar[Literal["added", "before", "after", "around"]] = "after"
 
     @classmethod
     def plain(cls, sensor: Sensor) -> "AbstractDistortion":

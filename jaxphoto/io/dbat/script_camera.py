@@ -2,9 +2,10 @@
 
 DBAT counts pixels from (1, 1) at the centre of the upper left one, we from (0.5, 0.5); its principal point is in mm
 from pixel (0, 0); it *adds* K, P and the aspect `as` to the measured coordinate where our Brown model subtracts,
-so all of them change sign. Its model 3 applies 1 + as before the polynomial: `affine_brown` with b1 = -as; <aspect> is
-1 - as. Models 1 and 2 have neither aspect nor skew. Model 5 applies 1 + as before the principal point is taken off,
-which divides px by it, and skew after the polynomial, as nothing here does. Model 4 applies both after it.
+so all of them change sign. Its model 3 applies 1 + as and the skew before the polynomial: `affine_brown` with b1 = -as;
+<aspect> is 1 - as. Models 1 and 2 have neither aspect nor skew. Model 4 applies both after it, `brown_affine`. Model 5
+applies 1 + as before the principal point is taken off, which divides px by it, and the skew after the polynomial:
+`stretched_brown`.
 """
 
 from typing import Any
@@ -13,8 +14,10 @@ from jaxphoto.errors import quoted
 from jaxphoto.io.dbat.script import Script, setting
 from jaxphoto.io.text_tables import finite
 
-# Lens models of DBAT that agree with Brown's here up to sign ("Backward (Photogrammetry)").
-_MODELS = ("1", "2", "3", "5")
+# Lens models of DBAT by what they are here, up to sign ("Backward (Photogrammetry)").
+_MODELS = {
+    "1": "affine_brown", "2": "affine_brown", "3": "affine_brown", "4": "brown_affine", "5": "stretched_brown"
+}  # fmt: skip
 _WITHOUT_AFFINITY = ("1", "2")
 
 
@@ -48,15 +51,12 @@ def camera_settings(script: Script) -> dict[str, Any]:
     if model in _WITHOUT_AFFINITY:
         if interior["b1"] != 0 or {"b1", "b2"} & set(unknowns):
             raise script.error(f"lens model {model} has neither aspect nor skew; set aspect to 1 and estimate none")
-    elif model == "5":
-        if "b2" in unknowns:
-            raise script.error("the skew of lens model 5 has no equal here; do not estimate it, or use model 3")
-        if interior["xp_mm"] != 0:
-            middle = pixel * (width / 2 + 0.5)
-            interior["xp_mm"] = (interior["xp_mm"] + middle) / (1.0 - interior["b1"]) - middle
+    elif model == "5" and interior["xp_mm"] != 0:
+        middle = pixel * (width / 2 + 0.5)
+        interior["xp_mm"] = (interior["xp_mm"] + middle) / (1.0 - interior["b1"]) - middle
     return {
-        "width_px": width, "height_px": height, "pixel_mm": pixel, "distortion": "affine_brown", "interior": interior,
-        "unknowns": unknowns,
+        "width_px": width, "height_px": height, "pixel_mm": pixel, "distortion": _MODELS[model],
+        "interior": interior, "unknowns": unknowns,
     }  # fmt: skip
 
 

@@ -140,8 +140,9 @@ def _read(path: Path) -> _Bundle:
     cameras = numbers[2:at].reshape(n_cameras, 5, 3)
     xyz, many, rows = np.zeros((n_points, 3)), np.zeros(n_points, int), []
     for k in range(n_points):
-        xyz[k] = numbers[at : at + 3]
+        # Behind its coordinates and colours, so that these are there, too.
         many[k] = measurements = _count(path, numbers, at + _PER_POINT, f"measurements of point {k}")
+        xyz[k] = numbers[at : at + 3]
         at += _PER_POINT + 1
         rows.append(at + np.arange(_PER_MEASUREMENT * measurements))
         at += _PER_MEASUREMENT * measurements
