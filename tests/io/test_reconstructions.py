@@ -409,7 +409,8 @@ REFUSED = {
     "end": (_bundle(lambda lines: lines[:-1]), "number of measurements of point 6"),
     # The last point but one says that it was measured ten times, which leaves two numbers for the last.
     "end amid a point": (
-        _bundle(lambda lines: [*lines[:-4], f"10{lines[-4][1:]}", *lines[-3:], "0 0 0"]), "measurements of point 6 is nan"
+        _bundle(lambda lines: [*lines[:-4], f"10{lines[-4][1:]}", *lines[-3:], "0 0 0"]),
+        "number of measurements of point 6 is nan",
     ),
     "words": (_bundle(lambda lines: [*lines, "x"]), "a word that is no number"),
     "cameras that end": (_pix4d(lambda text: text[: text.rindex("\n", 0, -1)]), "has 29 rows"),
