@@ -150,6 +150,20 @@ def check_prior(label: str, prior: Any) -> None:
         )
 
 
+def late_cameras(start: Unknowns, priors: Unknowns) -> list[str]:
+    """Cameras of a rig whose delay acts, because it is not zero or not held: the motion of the rig is needed then.
+
+    Raises InputError for a delay without a prior.
+    """
+    late, own = [], RigCamera.kind
+    for name, camera in start.more.get(own, {}).items():
+        prior = priors.more[own][name].delay  # type: ignore[attr-defined]
+        check_prior(f"{own}[{name}].delay_s", prior)
+        if prior is not FIXED or np.any(camera.delay != 0):  # type: ignore[attr-defined]
+            late.append(name)
+    return late
+
+
 def uniform_priors(unknowns: Unknowns, prior: Prior) -> Unknowns:
     """A tree of priors shaped like `unknowns`, `prior` everywhere."""
     return jax.tree.map(lambda _: prior, unknowns)

@@ -22,7 +22,7 @@ from jaxphoto.errors import BlockError
 from jaxphoto.georeferencing import StripBias
 from jaxphoto.observations import AXES, AbstractObservations, Attitudes, ControlRows, StationRows
 from jaxphoto.parameters import AbstractParameters, dynamic_fields
-from jaxphoto.unknowns import FIXED, FREE
+from jaxphoto.unknowns import FIXED, FREE, late_cameras
 
 
 def indirect(block: Block) -> Block:
@@ -245,7 +245,7 @@ def _exterior(block: Block):
 
 
 def _hold_unseen(block: Block) -> Block:
-    """Mounts and strips FIXED where no observation is left that sees them; no motion where nothing moves with it."""
+    """Mounts and strips FIXED where no observation is left that sees them; no motion where nothing acts with it."""
     positions, turns = len(block.stations.who) > 0, len(block.attitudes.image) > 0
 
     def unseen(b: Block) -> list:
@@ -258,7 +258,8 @@ def _hold_unseen(block: Block) -> Block:
         return held + ([] if positions or turns else [m.time_offset for m in mounts])
 
     block = eqx.tree_at(unseen, block, replace_fn=lambda _: FIXED)
-    return block if positions or turns else dataclasses.replace(block, motion=None)
+    late = late_cameras(block.start.unknowns, block.priors)
+    return block if positions or turns or late else dataclasses.replace(block, motion=None)
 
 
 def _as_control(

@@ -264,7 +264,9 @@ def simulated(seed: int = 1) -> Simulated:
         distances=Distances(ends, np.zeros(3), np.array([0.02, 0.03, 0.01])),
         image_strip=("a",) * 5 + ("b",) * 5,
         image_time=np.concatenate([np.linspace(-6, 6, 5), np.linspace(-7, 7, 5)]),
-        motion=Motion(np.repeat([[60.0, 12, 0], [-8, 55.0, 0]], 5, axis=0), np.zeros((n, 3))),
+        motion=Motion(
+            np.repeat([[60.0, 12, 0], [-8, 55.0, 0]], 5, axis=0), np.linspace(-0.02, 0.03, 3 * n).reshape(n, 3)
+        ),
         partitions={"session": ("early",) * 4 + ("late",) * 5 + ("",)},
     )
     block, _ = measured(Simulated(free(block, "one"), truth))

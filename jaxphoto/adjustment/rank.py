@@ -21,7 +21,7 @@ from jaxphoto.errors import DatumError, RankError
 from jaxphoto.georeferencing import RigCamera
 from jaxphoto.observations import AbstractObservations, RigPlaces, RigTurns
 from jaxphoto.parameters import dynamic_fields
-from jaxphoto.unknowns import FIXED, FREE, Unknowns
+from jaxphoto.unknowns import FREE, Unknowns, late_cameras
 
 # A pivot of the unit-diagonal reduced matrix below this is a rank defect: at float64 it is rounding, not geometry.
 DEFECT = 1e-13
@@ -188,14 +188,14 @@ def _check_camera_splines(block: Block) -> None:
 
 def _check_rigs(block: Block, priors: Unknowns) -> None:
     """Photographs that rows put into a rig are those of its cameras; how they move is known where one exposes late."""
-    known: Any = block.start.unknowns.more.get(RigCamera.kind, {})
-    for name, own in known.items():
-        if block.motion is None and (priors.more[RigCamera.kind][name].delay is not FIXED or np.any(own.delay != 0)):  # type: ignore[attr-defined]
-            raise RankError(
-                f"{RigCamera.kind}[{name}].delay acts with the motion of the rig, of which nothing is said: give its "
-                "velocity and rates of turn (Block.motion; a [trajectory], or their columns in stations.csv and "
-                "attitudes.csv), or hold the delay fixed at zero"
-            )
+    known = block.start.unknowns.more.get(RigCamera.kind, {})
+    late = late_cameras(block.start.unknowns, priors)
+    if late and block.motion is None:
+        raise RankError(
+            f"{RigCamera.kind}[{late[0]}].delay acts with the motion of the rig, of which nothing is said: give its "
+            "velocity and rates of turn (Block.motion; a [trajectory], or their columns in stations.csv and "
+            "attitudes.csv), or hold the delay fixed at zero"
+        )
     for rows in (of for of in block.more if isinstance(of, RigPlaces | RigTurns)):
         for i in rows.image:
             if (camera := block.image_camera[i]) not in known:

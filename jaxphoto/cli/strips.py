@@ -53,11 +53,13 @@ def strips_command(
     ] = None,
     trajectory_shift_s: Annotated[float, typer.Option(help="Cloud's time + this is the trajectory's.")] = 0.0,
     adjust: Annotated[
-        str, typer.Option(help=f"What of the scanner is estimated, by commas: {', '.join(_SCANNER)}; or none.")
-    ] = "boresight",
+        str | None,
+        typer.Option(help=f"What of the scanner is estimated, by commas: {', '.join(_SCANNER)} (boresight); or none."),
+    ] = None,
     pattern: Annotated[
-        str, one_of(PATTERNS, help="Of the scanner: line by line across the track, or circle, all around the nadir.")
-    ] = "line",
+        str | None,
+        one_of(PATTERNS, help="Of the scanner: line by line across the track (default), or circle, all around."),
+    ] = None,
     block: Annotated[
         Path | None,
         typer.Option(help="Block folder of photographs taken on this trajectory, which are adjusted with the strips."),
@@ -106,8 +108,6 @@ def strips_command(
         sigma_exposure_deg=sigma_exposure_deg,
     )
     priors, chosen, errors = _priors(adjust, pattern), class_numbers(classes), plain_console(stderr=True)
-    if trajectory is None and (pattern, adjust) not in (("line", "boresight"), ("line", "none")):
-        raise InputError("without --trajectory strips have shifts alone: give it, or neither --adjust nor --pattern")
     held = [name.strip() for name in hold.split(",") if name.strip()]
     check_folder(out, cloud, *(path for path in (trajectory, block) if path is not None))
     with errors.status("reading the cloud") as status:
@@ -204,11 +204,17 @@ def _for_all(result: StripAdjustment, whole: Cloud) -> StripErrors:
     return dataclasses.replace(result.errors, splines=splines)
 
 
-def _priors(text: str, pattern: str) -> ScannerPriors:
-    """FREE what `text` names of the scanner. Raises InputError for what it does not have."""
+def _priors(adjust: str | None, pattern: str | None) -> ScannerPriors | None:
+    """FREE what `adjust` names of the scanner; None where nothing is said of it.
+
+    Raises InputError for what a scanner does not have.
+    """
+    if adjust is None and pattern is None:
+        return None
+    text = "boresight" if adjust is None else adjust
     names = [] if text.strip() == "none" else [name.strip() for name in text.split(",")]
     for name in names:
         if name not in _SCANNER:
             raise InputError(f"--adjust {name}: a scanner has {', '.join(_SCANNER)}; name some of these, or none")
     boresight, *calibration = (FREE if name in names else FIXED for name in _SCANNER)
-    return ScannerPriors(boresight, ScannerCalibration(*calibration, pattern))  # type: ignore[arg-type, call-arg]
+    return ScannerPriors(boresight, ScannerCalibration(*calibration, pattern or "line"))  # type: ignore[arg-type, call-arg]

@@ -77,8 +77,9 @@ class Exposure(eqx.Module):
     """What is known of an exposure besides its observations; of many with a leading (in an adjustment: last) axis.
 
     `time` from the strip's reference time (s), `velocity` of the GNSS/IMU in the object frame (m/s), `rate` of turn
-    about the body's right, forward and up axes (rad/s). Velocity and rate are what a time offset acts on. `nominal` is
-    needed only where mounts of several kinds are stacked (`Mount.image_x` is one for all): the `Mount.nominal` of each.
+    about the body's right, forward and up axes (rad/s). Velocity and rate are what a time offset, and a delay in a rig,
+    act with. `nominal` is needed only where mounts of several kinds are stacked (`Mount.image_x` is one for all): the
+    `Mount.nominal` of each.
     `flight_time` is that from the middle of the flight (s), for what changes from strip to strip; None: as `time`.
     `height` is that of the camera's format (mm), which a rolling shutter reads row by row. `temperature` is that of the
     camera above the reference of its block (K).

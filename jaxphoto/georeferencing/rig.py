@@ -10,13 +10,15 @@ reference camera, l (m), and a turn t (rad), the rotation vector of its orientat
     p = R_ref (X - X_ref) - l (m, in the axes of the reference),    r: small_rotation(r) = R R_ref' small_rotation(t)'
 
 which is nothing where the rig is rigid. A camera that exposes a delay tau after the reference does so beside the
-reference as it is by then, with its velocity v and its rate of turn w about the body's axes:
+reference as it is by then, by the velocity v of the GNSS/IMU, its lever arm a and the rate of turn w (both in the axes
+of the body), and M, which takes the camera to the body:
 
-    X_ref(tau) = X_ref + v tau,    R_ref(tau) = small_rotation(M' w tau) R_ref        (M takes the camera to the body)
+    X_ref(tau) = X_ref + (v - R_ref' M' (w x a)) tau,    R_ref(tau) = small_rotation(M' w tau) R_ref
 
 Frames and signs: docs/conventions.md; what is known of rigs: docs/rigs.md.
 """
 
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxphoto.arrays import Numbers
@@ -54,8 +56,11 @@ def reference_later(
     exposure: Exposure,
 ) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
     """Position (m) and orientation of the reference camera `delay` seconds after its exposure."""
-    rate = rotate(body_from_camera(mount.boresight, nominal_mount(mount, exposure)).T, exposure.rate)
-    return position + exposure.velocity * delay, small_rotation(rate * delay) @ camera_from_object
+    body = body_from_camera(mount.boresight, nominal_mount(mount, exposure))
+    # Of the GNSS/IMU, which a lever arm carries about the camera.
+    velocity = exposure.velocity - rotate(camera_from_object.T @ body.T, jnp.cross(exposure.rate, mount.lever_arm))
+    turn = small_rotation(rotate(body.T, exposure.rate) * delay)
+    return position + velocity * delay, turn @ camera_from_object
 
 
 def rig_place(

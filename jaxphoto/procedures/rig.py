@@ -24,7 +24,8 @@ def with_rig(block: Block, reference: str, place_m: float, turn_rad: float) -> B
     `Block.partitions["event"]` (a column of images.csv) says which photographs belong together. The rig is rigid to
     `place_m` and `turn_rad` from one event to the next. Relative orientations start at the medians of those of the
     approximate orientations, and are free: `block.fix("place")`, `block.weigh("place", 0.005)`. All cameras are taken
-    to expose at once; `block.free("delay")` of a block that knows how it moved finds out when they do.
+    to expose at once; `block.free("delay")` of a block that knows how it moved finds out when they do. The place that
+    it starts with holds what was flown in the meantime: weigh one that was measured, by its value.
 
     Raises InputError where nothing says what belongs together, none of it is of the camera `reference`, or of a camera
     no orientation is known beside it. A UserWarning tells of photographs that are in no event of it.

@@ -4,6 +4,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
@@ -68,7 +69,8 @@ def write_strips(
             picture = WholePicture.of(differences_figure(*gaps), "gaps of strips over the ground, before and after")
             (work / "differences.png").write_bytes(picture.png)
         (work / "report.html").write_text(_page(result, scanner, verdict, picture, made), encoding="utf-8")
-        told = {"rounds": len(result.rounds), "came_to_rest": result.still, "sigma0": float(result.adjusted.sigma0)}
+        told: dict[str, Any] = {"rounds": len(result.rounds), "came_to_rest": result.still}
+        told |= {"sigma0": float(result.adjusted.sigma0), "pattern": result.errors.calibration.pattern}
         times = {"seconds": seconds | {"write": time.perf_counter() - began}}
         write_summary(verdict.summary | told | times, work)
         yield work

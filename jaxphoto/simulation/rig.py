@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
 
@@ -41,11 +40,13 @@ def rigged(
     at = np.repeat(np.arange(n), m - 1)
     reference = np.asarray(exterior.position)[at], np.asarray(exterior.camera_from_object)[at]
     mounts = [recipe.mounts[name].truth if (name := recipe.mount_of(c)) else NO_MOUNT for c in flight.cameras]
-    boresight, nominal = (np.array(v)[at] for v in ([m.boresight for m in mounts], [m.nominal for m in mounts]))
+    arm, boresight, nominal = (
+        np.array([getattr(m, name) for m in mounts])[at] for name in ("lever_arm", "boresight", "nominal")
+    )
     motion = flight.motion.velocity[at], flight.motion.rate[at]
     delay = np.tile([float(own.delay) for own in truths], n)
     rigid = (v.reshape(-1, 3) for v in (place, turn, off))
-    there = in_chunks(_placed, _CHUNK, *reference, *motion, boresight, nominal, delay, *rigid)
+    there = in_chunks(_placed, _CHUNK, *reference, *motion, arm, boresight, nominal, delay, *rigid)
     position, rotation = (
         _after_each(np.asarray(own), new)
         for own, new in zip((exterior.position, exterior.camera_from_object), there, strict=True)
@@ -98,8 +99,8 @@ def with_gnss(recipe: Recipe, flight: Flight) -> Int[np.ndarray, "n"]:
 
 @jax.jit
 @jax.vmap
-def _placed(position, camera_from_object, velocity, rate, boresight, nominal, delay, place, turn, off):
-    mount, exposure = Mount(jnp.zeros(3), boresight), Exposure(0.0, velocity, rate, nominal)
+def _placed(position, camera_from_object, velocity, rate, arm, boresight, nominal, delay, place, turn, off):
+    mount, exposure = Mount(arm, boresight), Exposure(0.0, velocity, rate, nominal)
     then = reference_later(delay, position, camera_from_object, mount, exposure)
     there, turned = in_rig(*then, RigCamera(place, turn))
     return there, small_rotation(off) @ turned

@@ -158,6 +158,11 @@ def test_a_real_cloud_cut_in_two(data_dir):
     assert (np.abs(found.errors.position[1] - shift) < 3 * sigma).all() and (sigma < 0.015).all()
 
 
+def test_a_scanner_without_a_trajectory_is_refused():
+    with pytest.raises(InputError, match="without a trajectory strips have shifts alone"):
+        adjust_strips(flown().cloud, priors=PRIORS_AROUND)
+
+
 def test_what_cannot_be_adjusted():
     cloud, flight = two_strips(np.zeros(3), 30.0), flown()
     with pytest.raises(InputError, match="the cloud has one strip"):

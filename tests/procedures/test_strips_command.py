@@ -146,7 +146,8 @@ def test_a_cloud_on_the_map_and_a_trajectory_in_sbet(on_the_map, tmp_path, monke
     ("options", "sentence"),
     [
         (("--adjust", "boresight,mirror"), "--adjust mirror: a scanner has boresight, lever-arm"),
-        (("--pattern", "circle"), "without --trajectory strips have shifts alone"),
+        (("--pattern", "circle"), "without a trajectory strips have shifts alone"),
+        (("--adjust", "boresight"), "without a trajectory strips have shifts alone"),
         (("--pattern", "zigzag"), "--pattern zigzag: there are line, circle"),
         (("--hold", "3"), "3 is no strip of the cloud, which has 1, 2"),
         (("--cell-m", "0"), "cell_m is 0, but must be positive"),

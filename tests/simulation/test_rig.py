@@ -12,12 +12,12 @@ from scipy.spatial.transform import Rotation as scipy_rotation
 from jaxphoto import FREE, Outcome, RankError, adjust, covariance
 from jaxphoto.errors import BlockError, InputError
 from jaxphoto.georeferencing import NOMINAL, rig_place, rig_turn
-from jaxphoto.io import read_block, read_truth, recipe_from, write_simulation
+from jaxphoto.io import read_block, read_truth, recipe_from, write_block, write_simulation
 from jaxphoto.parameters import numbers_of
 from jaxphoto.procedures.rig import with_rig
 from jaxphoto.simulation import remeasure, simulate
 from jaxphoto.simulation.further_rows import observed_anew
-from jaxphoto.variants import some_images
+from jaxphoto.variants import indirect, some_images
 from tests.derivatives import compiled
 from tests.simulation.small import SMALL, changed
 
@@ -148,6 +148,7 @@ LATE = {
     "rig_cameras.oblique.delay_s": 0.0, "rig_cameras.oblique.delay": "free", "rig_cameras.oblique.truth.delay_s": 0.004,
     "rig_cameras.oblique.place": {"sigma_m": 0.005}, "rig_cameras.oblique.truth.place_m": [0.503, 0.102, -0.049],
     "jitter.rate_deg_per_s": 2.0,
+    "mounts": {"default": {"lever_arm_m": [0.3, 2.0, 1.0], "truth": {"lever_arm_m": [0.3, 2.0, 1.0]}}},
 }  # fmt: skip
 
 
@@ -164,9 +165,11 @@ def test_a_late_camera_is_where_the_rig_has_come_to():
     motion = simulation.block.motion
     for k in range(0, 28, 2):
         # The body's axes in the object frame; it turns about them for 4 ms, right-handed.
-        body = rotation[k].T @ NOMINAL["forward"].T
-        turn = scipy_rotation.from_rotvec(body @ np.asarray(motion.rate)[k] * 0.004).as_matrix()
-        there = position[k] + np.asarray(motion.velocity)[k] * 0.004 + turn @ rotation[k].T @ [0.503, 0.102, -0.049]
+        body, rate = rotation[k].T @ NOMINAL["forward"].T, np.asarray(motion.rate)[k]
+        turn = scipy_rotation.from_rotvec(body @ rate * 0.004).as_matrix()
+        # The GNSS/IMU goes about the camera with its lever arm, the camera does not.
+        flown = np.asarray(motion.velocity)[k] - body @ np.cross(rate, [0.3, 2.0, 1.0])
+        there = position[k] + flown * 0.004 + turn @ rotation[k].T @ [0.503, 0.102, -0.049]
         np.testing.assert_allclose(position[k + 1], there, atol=1e-8)
         own = scipy_rotation.from_rotvec(-np.deg2rad(TRUE_TURN)).as_matrix() @ rotation[k] @ turn.T
         np.testing.assert_allclose(rotation[k + 1], own, atol=1e-12)
@@ -194,6 +197,29 @@ def test_a_delay_goes_through_files_and_needs_the_motion(tmp_path):
         read_block(tmp_path / "block")
     with pytest.raises(RankError, match=r"rig_cameras\[oblique\]\.delay acts with the motion of the rig"):
         adjust(dataclasses.replace(late().block, motion=None))
+    bare = indirect(late().block)
+    assert bare.motion is not None and not len(bare.stations)
+    with pytest.raises(BlockError, match="needs the motion of image A_01, which a folder holds beside its station"):
+        write_block(bare, tmp_path / "bare")
+    assert indirect(flown().block).motion is None
+
+
+def test_a_trajectory_gives_nothing_to_heads_that_the_rig_alone_places(tmp_path):
+    write_simulation(flown(), tmp_path / "block")
+    images = pd.read_csv(tmp_path / "block/images.csv")
+    images["time_s"] = 10.0 + np.repeat(np.arange(14.0), 2)
+    images.to_csv(tmp_path / "block/images.csv", index=False)
+    for name in ("stations", "attitudes"):
+        (tmp_path / f"block/{name}.csv").unlink()
+    time = np.linspace(0.0, 40.0, 81)
+    level = {"roll_deg": 0.0, "pitch_deg": 0.0, "yaw_deg": 90.0}
+    level |= {f"sigma_{what}": 0.05 for what in ("X_m", "Y_m", "Z_m", "roll_deg", "pitch_deg", "yaw_deg")}
+    flight = pd.DataFrame({"time_s": time, "X_m": 60.0 * time, "Y_m": 0.0, "Z_m": 1000.0} | level)
+    flight.to_csv(tmp_path / "block/flight.csv", index=False)
+    with (tmp_path / "block/block.toml").open("a") as file:
+        file.write('\n[trajectory]\nfile = "flight.csv"\n')
+    block = read_block(tmp_path / "block")
+    assert set(block.stations.who) == set(block.attitudes.image) == set(range(0, 28, 2))
 
 
 def test_a_rig_flies_beside_a_scanner_on_one_trajectory():

@@ -6,7 +6,7 @@ from typing import ClassVar, Literal
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxphoto.camera.distortion.base import AbstractDistortion, Term, decentring
+from jaxphoto.camera.distortion.base import AbstractDistortion, Affinity, Term, decentring
 
 
 class Balanced(AbstractDistortion):
@@ -39,7 +39,7 @@ class Balanced(AbstractDistortion):
         **{f"p{i}": Term(f"b{i}", 1.0, 1) for i in (1, 2)},
         **{f"b{i}": Term(f"c{i}") for i in (1, 2)},
     }
-    affinity: ClassVar[Literal["added", "before", "after", "around"]] = "added"
+    affinity: ClassVar[Affinity] = "added"
 
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
         """Measured coordinate (mm) of an ideal one, both reduced to the principal point."""

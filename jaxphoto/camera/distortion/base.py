@@ -37,6 +37,9 @@ def same_terms(*names: str) -> dict[str, Term]:
     return {name: Term(name) for name in names}
 
 
+Affinity = Literal["added", "before", "after", "around"]
+
+
 class AbstractDistortion(Declared):
     """A lens distortion; its fields are scalars, its `domain` says where the polynomial lives.
 
@@ -60,7 +63,7 @@ class AbstractDistortion(Declared):
     scales: ClassVar[tuple[str, ...]] = ()
     normalised: ClassVar[bool] = False
     terms: ClassVar[Mapping[str, Term] | None] = None
-    affinity: ClassVar[Literal["added", "before", "after", "around"]] = "after"
+    affinity: ClassVar[Affinity] = "after"
 
     @classmethod
     def plain(cls, sensor: Sensor) -> "AbstractDistortion":

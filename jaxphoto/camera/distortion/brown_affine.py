@@ -6,7 +6,7 @@ from typing import ClassVar, Literal
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxphoto.camera.distortion.base import AbstractDistortion, Term, decentring, radial, same_terms
+from jaxphoto.camera.distortion.base import AbstractDistortion, Affinity, Term, decentring, radial, same_terms
 
 
 class BrownAffine(AbstractDistortion):
@@ -30,7 +30,7 @@ class BrownAffine(AbstractDistortion):
     coefficients: ClassVar[tuple[str, ...]] = ("k1", "k2", "k3", "p1", "p2", "b1", "b2")
     rare: ClassVar[tuple[str, ...]] = ("b1", "b2")
     terms: ClassVar[Mapping[str, Term] | None] = same_terms(*coefficients)
-    affinity: ClassVar[Literal["added", "before", "after", "around"]] = "after"
+    affinity: ClassVar[Affinity] = "after"
 
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
         """Ideal coordinate (mm) of a measured one, both reduced to the principal point."""

@@ -16,7 +16,7 @@ from jaxphoto.arrays import on_device
 from jaxphoto.block import Block, Frame, Start, sensor_rows
 from jaxphoto.camera import ThermalRates
 from jaxphoto.errors import InputError
-from jaxphoto.georeferencing import Mount
+from jaxphoto.georeferencing import Mount, RigCamera
 from jaxphoto.io.block_folder.attitude_units import check_attitude_units
 from jaxphoto.io.block_folder.control import check_datum_points, read_control
 from jaxphoto.io.block_folder.declared_unknowns import known_unknowns, read_unknowns
@@ -26,7 +26,13 @@ from jaxphoto.io.block_folder.georeferencing import read_attitudes, read_station
 from jaxphoto.io.block_folder.image_points import check_rays, read_image_points
 from jaxphoto.io.block_folder.images import Images, check_rates, check_times, read_images
 from jaxphoto.io.block_folder.map_tables import origin_of, tables_to_local
-from jaxphoto.io.block_folder.motion import ObservedFlight, check_rig_delays, check_time_offsets, read_motion
+from jaxphoto.io.block_folder.motion import (
+    ObservedFlight,
+    check_rig_delays,
+    check_time_offsets,
+    read_motion,
+    without_heads,
+)
 from jaxphoto.io.block_folder.mount_sections import mounts_of, read_mounts, read_strips
 from jaxphoto.io.block_folder.observed import Ids, Kind, known_kinds, own_tables
 from jaxphoto.io.block_folder.section import Section
@@ -150,6 +156,8 @@ def assemble(source: BlockTables) -> Block:
     check_times(images, strips, strip_priors)
     image_mount = tuple(mount_of[camera] for camera in images.cameras)
     flight = _flight(source, tables, images, frame, settings)
+    if source.trajectory is not None:
+        flight = without_heads(flight, images, image_mount, settings.unknowns.section(RigCamera.kind))
     check_time_offsets(flight, image_mount, mounts, mount_priors, images, source.file)
     if source.trajectory is None:
         check_attitude_units(given["attitudes"], flight.stations, images)

@@ -17,6 +17,7 @@ from jaxphoto.io.block_folder.camera_section import Camera, camera_section
 from jaxphoto.io.block_folder.declared_unknowns import unknown_sections
 from jaxphoto.io.block_folder.frame_sections import corrections_section, frame_section
 from jaxphoto.io.block_folder.map_tables import tables_to_map
+from jaxphoto.io.block_folder.motion import check_motion_held
 from jaxphoto.io.block_folder.mount_sections import mount_section, mounts_of, strip_section
 from jaxphoto.io.block_folder.observed import Kind
 from jaxphoto.io.block_folder.settings import datum_section, toml_text
@@ -62,6 +63,7 @@ def write_block(block: Block, folder: str | Path) -> None:
 def whole_block(block: Block, folder: str | Path) -> Iterator[Path]:
     """`write_block`, and what else belongs there: a folder with the files of the block, to write more into."""
     _check_names(block)
+    check_motion_held(block)
     clashes = _tables_of((*OBSERVATIONS, *kinds_of(block)))
     with whole_folder(Path(folder), clashes) as work:
         _write_files(block, work)

@@ -3,16 +3,19 @@
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from jaxphoto.arrays import on_device
-from jaxphoto.block import Motion
+from jaxphoto.block import Block, Motion
+from jaxphoto.errors import BlockError
 from jaxphoto.georeferencing import Mount, RigCamera
 from jaxphoto.io.block_folder.images import Images
+from jaxphoto.io.block_folder.section import Section
 from jaxphoto.io.block_folder.table_layout import RATE, VELOCITY
 from jaxphoto.io.text_tables import Table
 from jaxphoto.observations import Attitudes, RigPlaces, RigTurns, StationRows
-from jaxphoto.unknowns import FIXED, Unknowns
+from jaxphoto.unknowns import FIXED, Unknowns, late_cameras
 
 
 class ObservedFlight(NamedTuple):
@@ -61,13 +64,22 @@ def check_time_offsets(
             )
 
 
+def without_heads(flight: ObservedFlight, images: Images, image_mount: tuple[str, ...], rig: Section) -> ObservedFlight:
+    """Without stations and attitudes of cameras that the rig alone says how they sit, having no mount."""
+    head = np.array([c in rig and not m for c, m in zip(images.cameras, image_mount, strict=True)], bool)
+    stations, attitudes = flight.stations, flight.attitudes
+    own, turned = ~head[np.asarray(stations.who)], ~head[np.asarray(attitudes.image)]
+    return flight._replace(
+        stations=jax.tree.map(lambda v: np.asarray(v)[own], stations),
+        attitudes=jax.tree.map(lambda v: np.asarray(v)[turned], attitudes),
+    )
+
+
 def check_rig_delays(
     flight: ObservedFlight, rows: Iterable[Any], start: Unknowns, priors: Unknowns, images: Images
 ) -> None:
     """Raise BlockError where a camera of a rig exposes late beside a reference whose motion is not known."""
-    rig: dict[str, Any] = start.more.get(RigCamera.kind, {})
-    prior: dict[str, Any] = priors.more.get(RigCamera.kind, {})
-    late = {name for name, own in rig.items() if own.delay != 0 or prior[name].delay is not FIXED}
+    late = late_cameras(start, priors)
     known = flight.velocity_known & flight.rate_known
     for of in (of for of in rows if isinstance(of, RigPlaces | RigTurns)):
         for reference, image in zip(of.reference, of.image, strict=True):
@@ -77,6 +89,20 @@ def check_rig_delays(
                     f"the delay of [unknowns.{RigCamera.kind}.{images.cameras[image]}] needs the motion of image "
                     f"{images.ids[reference]}; give a [trajectory], add {', '.join(VELOCITY)} to stations.csv and "
                     f'{", ".join(RATE)} to attitudes.csv, or make delay "fixed" at zero',
+                )
+
+
+def check_motion_held(block: Block) -> None:
+    """Raise BlockError where a folder could not hold the motion that the delay of a camera in a rig needs."""
+    late = late_cameras(block.start.unknowns, block.priors)
+    held = set(np.asarray(block.stations.who).tolist()) & set(np.asarray(block.attitudes.image).tolist())
+    for of in (of for of in block.more if isinstance(of, RigPlaces | RigTurns)):
+        for reference, image in zip(of.reference.tolist(), of.image.tolist(), strict=True):
+            if block.image_camera[image] in late and reference not in held:
+                raise BlockError(
+                    f"the delay of {RigCamera.kind}[{block.image_camera[image]}] needs the motion of image "
+                    f"{block.images[reference]}, which a folder holds beside its station and its attitude: give it "
+                    "both, or hold the delay fixed at zero"
                 )
 
 

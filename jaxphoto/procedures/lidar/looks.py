@@ -46,7 +46,8 @@ def looks_of(cloud: Cloud, trajectory: Trajectory | None, pattern: Pattern) -> l
 def check_pattern(cloud: Cloud, trajectory: Trajectory, pattern: Pattern) -> None:
     """A UserWarning where the returns lie about the scanner as those of another pattern do."""
     some = np.linspace(0, len(cloud) - 1, _PROBED).astype(int)
-    right, ahead = _aside(cloud, some, trajectory).std(axis=0)
+    # From the first tenth to the last: a return from above the scanner is as far aside as can be.
+    right, ahead = np.subtract(*np.quantile(_aside(cloud, some, trajectory), (0.9, 0.1), axis=0)) / 2
     around = ahead > _ALIKE * right
     if right < _NARROW:
         return

@@ -118,6 +118,11 @@ def adjust_strips(
     as `jaxphoto.adjust`.
     """
     settings = StripSettings() if settings is None else settings
+    if trajectory is None and priors is not None:
+        raise InputError(
+            "without a trajectory strips have shifts alone, and nothing is estimated of their scanner: give the "
+            "trajectory (--trajectory), or say nothing of the scanner"
+        )
     priors = ScannerPriors() if priors is None else priors
     names = _check(cloud, trajectory, held)
     if trajectory is not None:
