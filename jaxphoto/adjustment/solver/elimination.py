@@ -5,7 +5,6 @@ memory than to make anew, a few tiles at a time. That pays for many right-hand s
 by two derivatives of the image rows each, in a direction and back: W z = J_e' (J_p z), W' x = J_p' (J_e x).
 """
 
-import dataclasses
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -17,9 +16,9 @@ from jaxtyping import Array
 
 from jaxphoto.adjustment.layout.tiled import TiledResiduals, TiledStructure
 from jaxphoto.adjustment.model.image_orientations import ImageOrientations, by_image, of_images, orientations_of
-from jaxphoto.adjustment.model.numbers import Increments, NonImageResiduals, state_at
+from jaxphoto.adjustment.model.numbers import Increments, NonImageResiduals, datum_residuals, state_at
 from jaxphoto.adjustment.model.observed_groups import RowsAtPoints
-from jaxphoto.adjustment.model.row_functions import non_image_residuals
+from jaxphoto.adjustment.model.row_functions import group_residuals, non_image_residuals
 from jaxphoto.adjustment.model.structure import total
 from jaxphoto.adjustment.solver.band import BandFactor, solve_band
 from jaxphoto.adjustment.solver.non_image_rows import non_image_rows
@@ -222,23 +221,31 @@ def push_others(x: Increments, at: Linearised) -> NonImageResiduals:
 def _others_and_gradient(at: Linearised) -> tuple[NonImageResiduals, Increments]:
     """All but the image rows, and their part of b."""
     increments, scale, values, s = at
-    others, pull = jax.vjp(lambda y: non_image_residuals(y, scale, values, s), increments)
-    nothing = dataclasses.replace(others, datum=jnp.zeros_like(others.datum))
-
-    def of(at_points: bool) -> Increments:
-        chosen = (isinstance(g.rows, RowsAtPoints) == at_points for g in s.observed)
-        pairs = zip(chosen, others.others, strict=True)
-        return pull(dataclasses.replace(nothing, others=tuple(v if own else jnp.zeros_like(v) for own, v in pairs)))[0]
-
-    b = of(at_points=False)
-    if any(isinstance(g.rows, RowsAtPoints) for g in s.observed):
-        # These alone are dealt out with their points and meet shared unknowns, which are on every device.
-        at_points = of(at_points=True)
+    # Each by itself: one derivative of all of them, taken once for each kind, would be twice the program.
+    parts = {at_points: _groups_and_gradient(at, at_points) for at_points in (False, True)}
+    of_each = {at_points: iter(residuals) for at_points, (residuals, _) in parts.items()}
+    residuals = tuple(next(of_each[isinstance(g.rows, RowsAtPoints)]) for g in s.observed)
+    datum = datum_residuals(increments, scale, values, s)
+    others = NonImageResiduals(residuals, datum, tuple(g.name for g in s.observed))
+    # Rows at points are dealt out with these and meet shared unknowns, which are on every device.
+    b, at_points = parts[False][1], parts[True][1]
+    if parts[True][0]:
         b = jax.tree.map(jnp.add, b, at_points._replace(shared=total(at_points.shared, s)))
     # The constraints of the datum go over all points.
-    eop = jnp.einsum("kci,k->ci", values.datum_eop * scale.eop, others.datum)
-    points = jnp.einsum("kcp,k->cp", values.datum_points * scale.points, others.datum)
+    eop = jnp.einsum("kci,k->ci", values.datum_eop * scale.eop, datum)
+    points = jnp.einsum("kcp,k->cp", values.datum_points * scale.points, datum)
     return others, b._replace(eop=b.eop + eop, points=b.points + points)
+
+
+def _groups_and_gradient(at: Linearised, at_points: bool) -> tuple[tuple[Array, ...], Increments]:
+    """Residuals of the groups that lie at points, or of all others, and their part of b on this device."""
+    increments, scale, values, s = at
+    pairs = zip(s.observed, values.groups, strict=True)
+    chosen = [(g, numbers) for g, numbers in pairs if isinstance(g.rows, RowsAtPoints) == at_points]
+    residuals, pull = jax.vjp(
+        lambda y: tuple(group_residuals(g, numbers, y, scale, values, s) for g, numbers in chosen), increments
+    )
+    return residuals, pull(residuals)[0]
 
 
 def _scene_and_pull(at: Linearised):
