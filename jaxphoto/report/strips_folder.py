@@ -40,6 +40,12 @@ _CORRELATIONS = (
 )
 
 
+_PATTERNS = {
+    "line": "Angles are those of lines across the track.",
+    "circle": "Angles are those of a scanner that looks all around its nadir; looks ahead and behind are compared, too.",
+}
+
+
 @contextmanager
 def write_strips(
     result: StripAdjustment,
@@ -85,10 +91,11 @@ def _page(
         rows_of(differences_table(result.differences)),
         *([gaps] if gaps else []),
     ]
+    pattern = result.errors.calibration.pattern
     if len(scanner):
         parts += [
             Heading("Scanner and cameras" if result.before else "Scanner"),
-            Paragraph("What was found, and what each is least told from (with, rho)."),
+            Paragraph(f"What was found, and what each is least told from (with, rho). {_PATTERNS[pattern]}"),
             rows_of(scanner),
         ]
     if scanner["parameter"].str.startswith("scanner").any():
