@@ -38,11 +38,9 @@ _CORRELATIONS = (
     "Correlations of what is estimated of the scanner. Near 1 or -1, two of them cannot be told apart by this flight; "
     "correlation.csv has them of all unknowns, those of the trajectory among them."
 )
-
-
 _PATTERNS = {
     "line": "Angles are those of lines across the track.",
-    "circle": "Angles are those of a scanner that looks all around its nadir; looks ahead and behind are compared, too.",
+    "circle": "Angles are those of a scanner that looks all around its nadir; looks ahead and behind are compared.",
 }
 
 
