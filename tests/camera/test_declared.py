@@ -158,7 +158,7 @@ def test_the_grid_of_orthogonal_polynomials_is_chosen_in_one_place():
 def test_a_misspelt_coefficient_is_refused_when_the_class_is_defined():
     with pytest.raises(InputError, match=r"Misspelt: k_1 in what it declares is no field of it; its fields are k1$"):
 
-        class Misspelt(Brown.__mro__[1]):
+        class Misspelt(AbstractDistortion):
             k1: float = 0.0
             name = "misspelt_of_a_test"
             domain = "measured"

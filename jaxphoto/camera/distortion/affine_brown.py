@@ -1,15 +1,14 @@
 """Brown's distortion after an affinity of the image axes, in the measured coordinate, subtracted."""
 
-from collections.abc import Mapping
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxphoto.camera.distortion.base import AbstractDistortion, Affinity, Term, decentring, radial, same_terms
+from jaxphoto.camera.distortion.base import AbstractBrown, Affinity
 
 
-class AffineBrown(AbstractDistortion):
+class AffineBrown(AbstractBrown):
     """Affinity and shear first, then radial and decentring distortion of what they leave.
 
         m = (x - b1 x - b2 y, y),   ideal = m - delta(m)
@@ -19,24 +18,9 @@ class AffineBrown(AbstractDistortion):
     a close-range camera shows. Units as there. Source: the "backward" model 3 of DBAT (Börlin and Grussenmeyer).
     """
 
-    k1: Float[Array, ""] | float = 0.0
-    k2: Float[Array, ""] | float = 0.0
-    k3: Float[Array, ""] | float = 0.0
-    p1: Float[Array, ""] | float = 0.0
-    p2: Float[Array, ""] | float = 0.0
-    b1: Float[Array, ""] | float = 0.0
-    b2: Float[Array, ""] | float = 0.0
-
     name: ClassVar[str] = "affine_brown"
-    domain: ClassVar[Literal["measured", "ideal"]] = "measured"
-    coefficients: ClassVar[tuple[str, ...]] = ("k1", "k2", "k3", "p1", "p2", "b1", "b2")
-    rare: ClassVar[tuple[str, ...]] = ("b1", "b2")
-    terms: ClassVar[Mapping[str, Term] | None] = same_terms(*coefficients)
     affinity: ClassVar[Affinity] = "before"
 
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
         """Ideal coordinate (mm) of a measured one, both reduced to the principal point."""
-        x, y = xy[0] - self.b1 * xy[0] - self.b2 * xy[1], xy[1]
-        dr = radial(x * x + y * y, self.k1, self.k2, self.k3)
-        dx, dy = decentring(self.p1, self.p2, jnp.stack([x, y]))
-        return jnp.stack([x - x * dr - dx, y - y * dr - dy])
+        return self.undistorted(jnp.stack([xy[0] - self.b1 * xy[0] - self.b2 * xy[1], xy[1]]))

@@ -162,3 +162,30 @@ def check_positive(distortion: AbstractDistortion, field: str, meaning: str) -> 
     value = getattr(distortion, field)
     if not isinstance(value, jax.core.Tracer) and not value > 0:
         raise ValueError(f"{field} of {type(distortion).__name__}, {meaning}, is positive and in mm, got {value}")
+
+
+class AbstractBrown(AbstractDistortion):
+    """Radial K1-K3, decentring P1, P2, affinity b1 and shear b2, of the measured coordinate, subtracted.
+
+    Brown's models differ in when affinity and shear act.
+    """
+
+    k1: Float[Array, ""] | float = 0.0
+    k2: Float[Array, ""] | float = 0.0
+    k3: Float[Array, ""] | float = 0.0
+    p1: Float[Array, ""] | float = 0.0
+    p2: Float[Array, ""] | float = 0.0
+    b1: Float[Array, ""] | float = 0.0
+    b2: Float[Array, ""] | float = 0.0
+
+    domain: ClassVar[Literal["measured", "ideal"]] = "measured"
+    coefficients: ClassVar[tuple[str, ...]] = ("k1", "k2", "k3", "p1", "p2", "b1", "b2")
+    rare: ClassVar[tuple[str, ...]] = ("b1", "b2")
+    terms: ClassVar[Mapping[str, Term] | None] = same_terms(*coefficients)
+
+    def undistorted(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
+        """A coordinate (mm) without radial and decentring distortion."""
+        x, y = xy
+        dr = radial(x * x + y * y, self.k1, self.k2, self.k3)
+        dx, dy = decentring(self.p1, self.p2, xy)
+        return jnp.stack([x - x * dr - dx, y - y * dr - dy])

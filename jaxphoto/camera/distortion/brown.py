@@ -1,15 +1,14 @@
 """Brown's distortion with affinity and shear, in the measured coordinate, subtracted."""
 
-from collections.abc import Mapping
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxphoto.camera.distortion.base import AbstractDistortion, Affinity, Term, decentring, radial, same_terms
+from jaxphoto.camera.distortion.base import AbstractBrown, Affinity
 
 
-class Brown(AbstractDistortion):
+class Brown(AbstractBrown):
     """Radial K1-K3, decentring P1, P2, affinity b1 and shear b2; `ideal = measured - delta(measured)`.
 
         delta_x = x (K1 r^2 + K2 r^4 + K3 r^6) + P1 (r^2 + 2 x^2) + 2 P2 x y + b1 x + b2 y
@@ -20,25 +19,10 @@ class Brown(AbstractDistortion):
     here: with his coefficients, change every sign.
     """
 
-    k1: Float[Array, ""] | float = 0.0
-    k2: Float[Array, ""] | float = 0.0
-    k3: Float[Array, ""] | float = 0.0
-    p1: Float[Array, ""] | float = 0.0
-    p2: Float[Array, ""] | float = 0.0
-    b1: Float[Array, ""] | float = 0.0
-    b2: Float[Array, ""] | float = 0.0
-
     name: ClassVar[str] = "brown"
-    domain: ClassVar[Literal["measured", "ideal"]] = "measured"
-    coefficients: ClassVar[tuple[str, ...]] = ("k1", "k2", "k3", "p1", "p2", "b1", "b2")
-    rare: ClassVar[tuple[str, ...]] = ("b1", "b2")
-    terms: ClassVar[Mapping[str, Term] | None] = same_terms(*coefficients)
     affinity: ClassVar[Affinity] = "added"
 
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
         """Ideal coordinate (mm) of a measured one, both reduced to the principal point."""
-        x, y = xy
-        r2 = x * x + y * y
-        dr = radial(r2, self.k1, self.k2, self.k3)
-        dx, dy = decentring(self.p1, self.p2, xy)
-        return jnp.stack([x - x * dr - dx - (self.b1 * x + self.b2 * y), y - y * dr - dy])
+        x, y = self.undistorted(xy)
+        return jnp.stack([x - (self.b1 * xy[0] + self.b2 * xy[1]), y])

@@ -1,15 +1,14 @@
 """Brown's distortion between a stretch and a shear of the image axes, in the measured coordinate, subtracted."""
 
-from collections.abc import Mapping
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxphoto.camera.distortion.base import AbstractDistortion, Affinity, Term, decentring, radial, same_terms
+from jaxphoto.camera.distortion.base import AbstractBrown, Affinity
 
 
-class StretchedBrown(AbstractDistortion):
+class StretchedBrown(AbstractBrown):
     """A stretch of the x axis first, then radial and decentring distortion, then a shear of what they leave.
 
         s = (x - b1 x, y),   m = s - delta(s),   ideal = (m_x - b2 m_y, m_y)
@@ -17,24 +16,10 @@ class StretchedBrown(AbstractDistortion):
     with delta as in `AffineBrown`, of s. Source: the "backward" model 5 of DBAT (Börlin and Grussenmeyer).
     """
 
-    k1: Float[Array, ""] | float = 0.0
-    k2: Float[Array, ""] | float = 0.0
-    k3: Float[Array, ""] | float = 0.0
-    p1: Float[Array, ""] | float = 0.0
-    p2: Float[Array, ""] | float = 0.0
-    b1: Float[Array, ""] | float = 0.0
-    b2: Float[Array, ""] | float = 0.0
-
     name: ClassVar[str] = "stretched_brown"
-    domain: ClassVar[Literal["measured", "ideal"]] = "measured"
-    coefficients: ClassVar[tuple[str, ...]] = ("k1", "k2", "k3", "p1", "p2", "b1", "b2")
-    rare: ClassVar[tuple[str, ...]] = ("b1", "b2")
-    terms: ClassVar[Mapping[str, Term] | None] = same_terms(*coefficients)
     affinity: ClassVar[Affinity] = "around"
 
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
         """Ideal coordinate (mm) of a measured one, both reduced to the principal point."""
-        stretched = jnp.stack([xy[0] - self.b1 * xy[0], xy[1]])
-        dr = radial(jnp.sum(stretched**2), self.k1, self.k2, self.k3)
-        x, y = stretched - stretched * dr - decentring(self.p1, self.p2, stretched)
+        x, y = self.undistorted(jnp.stack([xy[0] - self.b1 * xy[0], xy[1]]))
         return jnp.stack([x - self.b2 * y, y])

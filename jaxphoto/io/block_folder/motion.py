@@ -1,6 +1,6 @@
 """Velocity and rate of turn at the exposures, from columns of stations.csv and attitudes.csv."""
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -79,31 +79,35 @@ def check_rig_delays(
     flight: ObservedFlight, rows: Iterable[Any], start: Unknowns, priors: Unknowns, images: Images
 ) -> None:
     """Raise BlockError where a camera of a rig exposes late beside a reference whose motion is not known."""
-    late = late_cameras(start, priors)
     known = flight.velocity_known & flight.rate_known
-    for of in (of for of in rows if isinstance(of, RigPlaces | RigTurns)):
-        for reference, image in zip(of.reference, of.image, strict=True):
-            if images.cameras[image] in late and not known[reference]:
-                raise images.table.misfit(
-                    int(reference),
-                    f"the delay of [unknowns.{RigCamera.kind}.{images.cameras[image]}] needs the motion of image "
-                    f"{images.ids[reference]}; give a [trajectory], add {', '.join(VELOCITY)} to stations.csv and "
-                    f'{", ".join(RATE)} to attitudes.csv, or make delay "fixed" at zero',
-                )
+    for reference, camera in _late_pairs(rows, images.cameras, late_cameras(start, priors)):
+        if not known[reference]:
+            raise images.table.misfit(
+                reference,
+                f"the delay of [unknowns.{RigCamera.kind}.{camera}] needs the motion of image "
+                f"{images.ids[reference]}; give a [trajectory], add {', '.join(VELOCITY)} to stations.csv and "
+                f'{", ".join(RATE)} to attitudes.csv, or make delay "fixed" at zero',
+            )
 
 
 def check_motion_held(block: Block) -> None:
     """Raise BlockError where a folder could not hold the motion that the delay of a camera in a rig needs."""
     late = late_cameras(block.start.unknowns, block.priors)
     held = set(np.asarray(block.stations.who).tolist()) & set(np.asarray(block.attitudes.image).tolist())
-    for of in (of for of in block.more if isinstance(of, RigPlaces | RigTurns)):
+    for reference, camera in _late_pairs(block.more, block.image_camera, late):
+        if reference not in held:
+            raise BlockError(
+                f"the delay of {RigCamera.kind}[{camera}] needs the motion of image {block.images[reference]}, which a "
+                "folder holds beside its station and its attitude: give it both, or hold the delay fixed at zero"
+            )
+
+
+def _late_pairs(rows: Iterable[Any], cameras: Sequence[str], late: Collection[str]) -> Iterator[tuple[int, str]]:
+    """Of photographs that expose late: the image of the reference, and the camera that is late beside it."""
+    for of in (of for of in rows if isinstance(of, RigPlaces | RigTurns)):
         for reference, image in zip(of.reference.tolist(), of.image.tolist(), strict=True):
-            if block.image_camera[image] in late and reference not in held:
-                raise BlockError(
-                    f"the delay of {RigCamera.kind}[{block.image_camera[image]}] needs the motion of image "
-                    f"{block.images[reference]}, which a folder holds beside its station and its attitude: give it "
-                    "both, or hold the delay fixed at zero"
-                )
+            if cameras[image] in late:
+                yield reference, cameras[image]
 
 
 def _columns(table: Table, columns: tuple[str, ...], images: Images) -> tuple[np.ndarray, np.ndarray]:
