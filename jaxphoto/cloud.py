@@ -1,10 +1,13 @@
 """The points of a laser scanner."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int, UInt8
+
+_OF_POINTS = ("xyz", "classification", "returns", "time", "strip")
 
 
 class Cloud(eqx.Module):
@@ -27,11 +30,21 @@ class Cloud(eqx.Module):
 
     def take(self, chosen: np.ndarray) -> "Cloud":
         """The points that `chosen` (an index or a mask) names."""
-        of_points = ("xyz", "classification", "returns", "time", "strip")
-        kept = {name: v[chosen] for name in of_points if (v := getattr(self, name)) is not None}
+        kept = {name: v[chosen] for name in _OF_POINTS if (v := getattr(self, name)) is not None}
         return dataclasses.replace(self, **kept)
+
+    @staticmethod
+    def joined(parts: Sequence["Cloud"]) -> "Cloud":
+        """Parts of one cloud as a whole; the strips of the last are those of all."""
+        columns = {}
+        for name in _OF_POINTS:
+            values = [getattr(part, name) for part in parts]
+            if values[0] is not None:
+                columns[name] = np.concatenate(values)
+        return Cloud(**columns, strips=parts[-1].strips)
 
     @property
     def extent(self) -> Float[np.ndarray, "2 3"]:
         """Least and greatest X, Y, Z (m)."""
-        return np.stack([self.xyz.min(axis=0), self.xyz.max(axis=0)])
+        # Column by column: numpy takes ten times as long over an axis.
+        return np.array([[v.min() for v in self.xyz.T], [v.max() for v in self.xyz.T]])

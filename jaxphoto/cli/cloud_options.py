@@ -1,5 +1,6 @@
 """What every command says of the cloud it reads."""
 
+from pathlib import Path
 from typing import Annotated, get_args
 
 import typer
@@ -23,3 +24,8 @@ def class_numbers(text: str | None) -> list[int] | None:
     if not all(part.isdigit() for part in parts):
         raise InputError(f"--class {text}: give numbers of classes by commas, like 2,6")
     return [int(part) for part in parts]
+
+
+def corrected_name(cloud: Path) -> str:
+    """What a corrected cloud is called: LAS and LAZ, which keep all else, by their own name."""
+    return cloud.name if cloud.suffix.lower() in (".las", ".laz") else f"corrected_{cloud.name}"

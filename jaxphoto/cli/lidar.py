@@ -13,7 +13,7 @@ from rich.console import Console
 from jaxphoto.block import Block
 from jaxphoto.cli.app import app
 from jaxphoto.cli.choices import one_of
-from jaxphoto.cli.cloud_options import Classes, CloudEpsg, CloudUnit, ReturnsOption, class_numbers
+from jaxphoto.cli.cloud_options import Classes, CloudEpsg, CloudUnit, ReturnsOption, class_numbers, corrected_name
 from jaxphoto.cli.console import plain_console
 from jaxphoto.cli.made import made_by
 from jaxphoto.cloud import Cloud
@@ -25,7 +25,7 @@ from jaxphoto.io.text_tables import is_number
 from jaxphoto.io.trajectory import read_records, write_moved
 from jaxphoto.io.trajectory.in_frame import trajectory_in, with_positions
 from jaxphoto.lidar import HeightSettings
-from jaxphoto.lidar.correction import correct_cloud
+from jaxphoto.lidar.correction import correct_cloud, scanner_path
 from jaxphoto.orientation import approximate
 from jaxphoto.procedures.lidar import Round, lidar_control, roof_control, simultaneous
 from jaxphoto.procedures.lidar.images_and_cloud import SHIFT_SIGMA, SURFACES
@@ -190,7 +190,7 @@ def simultaneous_command(
             path = trajectory_in(records, read.frame, exact, exact)
         status.update("reading the cloud")
         said = {"epsg": cloud_epsg, "unit": cloud_unit}
-        whole, surface = clouds.read_whole_and_chosen(cloud, read.frame, classes=chosen, returns=returns, **said)  # type: ignore[arg-type]
+        surface = clouds.read_cloud(cloud, read.frame, classes=chosen, returns=returns, **said)  # type: ignore[arg-type]
         seconds = {"read": time.perf_counter() - began}
         priors = Scanner(turn, dict.fromkeys(surface.strips or ("cloud",), slide))  # type: ignore[arg-type]
         result = simultaneous(
@@ -205,11 +205,14 @@ def simultaneous_command(
         )
         status.update(f"writing {out}")
         made = made_by(context, block, cloud, trajectory)
-        corrected = result.cloud if surface is whole else correct_cloud(whole, result.scanner, path)
-        like = cloud if cloud.suffix.lower() in (".las", ".laz") else None
+
+        track = None if path is None else scanner_path(path)
+
+        def corrected(part: Cloud) -> Float[np.ndarray, "n 3"]:
+            return correct_cloud(part, result.scanner, track).xyz
+
         with write_simultaneous(result, out, seconds, made) as folder:
-            name = cloud.name if like is not None else f"corrected_{cloud.name}"
-            clouds.write_cloud(corrected, folder / name, like=like, frame=read.frame, **said)  # type: ignore[arg-type]
+            clouds.rewrite_cloud(cloud, folder / corrected_name(cloud), corrected, frame=read.frame, **said)  # type: ignore[arg-type]
             if trajectory is not None and records is not None and result.trajectory is not None:
                 moved = with_positions(records, np.asarray(result.trajectory.position), read.frame)
                 moved = moved._replace(time=moved.time + trajectory_shift_s)

@@ -1,21 +1,22 @@
 """`jaxphoto strips`: from a cloud of several strips and its trajectory, both without what they are off by."""
 
-import dataclasses
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import numpy as np
 import typer
+from jaxtyping import Float
 
-from jaxphoto.block import Frame
+from jaxphoto.block import Block, Frame
 from jaxphoto.cli.app import app
 from jaxphoto.cli.choices import one_of
-from jaxphoto.cli.cloud_options import Classes, CloudEpsg, CloudUnit, ReturnsOption, class_numbers
+from jaxphoto.cli.cloud_options import Classes, CloudEpsg, CloudUnit, ReturnsOption, class_numbers, corrected_name
 from jaxphoto.cli.console import plain_console
 from jaxphoto.cli.made import made_by
 from jaxphoto.cloud import Cloud
 from jaxphoto.errors import InputError
-from jaxphoto.georeferencing import PATTERNS, ScannerCalibration, StripErrors
+from jaxphoto.georeferencing import PATTERNS, ScannerCalibration
 from jaxphoto.io import clouds, read_block
 from jaxphoto.io.block_folder import exposure_times
 from jaxphoto.io.clouds.coordinate_system import CoordinateSystem
@@ -23,13 +24,25 @@ from jaxphoto.io.clouds.placement import Placement
 from jaxphoto.io.raster import write_dsm
 from jaxphoto.io.trajectory import Records, read_records, write_moved
 from jaxphoto.io.trajectory.in_frame import trajectory_in, with_poses
+from jaxphoto.lidar.cell_returns import CellTally
+from jaxphoto.lidar.correction import scanner_path
 from jaxphoto.lidar.raster import Raster
 from jaxphoto.lidar.strip_correction import correct_strips
 from jaxphoto.lidar.strip_differences import strip_differences
 from jaxphoto.lidar.strip_settings import StripSettings
+from jaxphoto.orientation import approximate
 from jaxphoto.parameters import dynamic_fields
-from jaxphoto.procedures.lidar import Photographs, ScannerPriors, StripAdjustment, StripRound, adjust_strips
+from jaxphoto.procedures.lidar import (
+    Photographs,
+    ScannerPriors,
+    StripAdjustment,
+    StripRound,
+    adjust_strips,
+    kept_returns,
+)
+from jaxphoto.procedures.lidar.looks import looks_of
 from jaxphoto.procedures.lidar.strip_adjustment import MAX_STRIP_ROUNDS
+from jaxphoto.procedures.lidar.vertical_control import tie_points
 from jaxphoto.report.findings import Level
 from jaxphoto.report.strips import print_strips, strips_verdict
 from jaxphoto.report.strips_folder import write_strips
@@ -70,6 +83,7 @@ def strips_command(
     roughness_m: Annotated[
         float, typer.Option(help="Most that the returns of a plane scatter about it.")
     ] = _USUAL.roughness_m,
+    most_planes: Annotated[int, typer.Option(min=1, help="Most planes that are observed.")] = _USUAL.most,
     knots_s: Annotated[float, typer.Option(help="From knot to knot of the trajectory's errors.")] = _USUAL.knots_s,
     correlation_s: Annotated[float, typer.Option(help="Correlation time of these errors.")] = _USUAL.correlation_s,
     sigma_position_m: Annotated[float, typer.Option(help="Their standard deviation.")] = _USUAL.sigma_position_m,
@@ -99,6 +113,7 @@ def strips_command(
     settings = StripSettings(
         cell_m=cell_m,
         roughness_m=roughness_m,
+        most=most_planes,
         knots_s=knots_s,
         correlation_s=correlation_s,
         sigma_position_m=sigma_position_m,
@@ -126,34 +141,45 @@ def strips_command(
             path = trajectory_in(records, frame, exact, exact)
         said: dict[str, Any] = {"epsg": cloud_epsg, "unit": cloud_unit}
         own = frame if block is not None or frame.kind == "epsg" else None
-        whole, planes = clouds.read_whole_and_chosen(cloud, own, classes=chosen, returns=returns, **said)  # type: ignore[arg-type]
+        track = None if path is None else scanner_path(path)
+        parts = partial(clouds.cloud_chunks, cloud, own, classes=chosen, returns=returns, **said)  # type: ignore[arg-type]
+        looked_at = kept_returns(
+            parts,
+            settings,
+            track,
+            "line" if priors is None else priors.calibration.pattern,
+            None if photographs is None else partial(_about_where, photographs.block),
+        )
 
         def report(made: StripRound) -> None:
             line = f"round {made.number}: {made.planes} planes, strips {made.rms_m:.3f} m apart before"
             status.update(f"{line}; largest change {made.largest_change:.2g} standard deviations")
 
         options: dict[str, Any] = {"held": held, "max_rounds": max_rounds, "report": report}
-        result = adjust_strips(planes, path, settings, priors, photographs=photographs, **options)
-        corrected = result.cloud if planes is whole else correct_strips(whole, _for_all(result, whole), path)
+        result = adjust_strips(looked_at, path, settings, priors, photographs=photographs, **options)
         status.update(f"writing {out}")
-        like = cloud if cloud.suffix.lower() in (".las", ".laz") else None
-        maps = GapMaps(Placement(cloud.name, clouds.cloud_system(cloud, **said), own), settings)
-        gaps = maps.gaps(planes, result.cloud)
+        gaps = Gaps(Placement(cloud.name, clouds.cloud_system(cloud, **said), own), settings)
         tables = None if photographs is None else Tables(result.adjusted)
         made, verdict = made_by(context, cloud, trajectory, block), strips_verdict(result, tables)
-        with write_strips(result, tables, verdict, out, gaps, made) as folder:
-            for raster, name in zip(gaps or (), ("before", "after"), strict=False):
-                write_dsm(folder / f"differences_{name}.tif", raster, maps.system)
-            name = cloud.name if like is not None else f"corrected_{cloud.name}"
-            if like is None and block is None and own is not None:
-                # Back where the file counts from: the frame was made up here.
-                corrected = dataclasses.replace(corrected, xyz=maps.placement.file(corrected.xyz))
-                own = None
-            clouds.write_cloud(corrected, folder / name, like=like, frame=own, **said)
+
+        def moved(part: Cloud) -> Float[np.ndarray, "n 3"]:
+            _check_known(part, result)
+            corrected = correct_strips(part, result.errors, track).xyz
+            seen = clouds.chosen_of(part, chosen, returns, cloud.name)  # type: ignore[arg-type]
+            gaps.add(part.take(seen), corrected[seen])
+            return corrected
+
+        def write_corrected(folder: Path) -> tuple[Raster, Raster] | None:
+            clouds.rewrite_cloud(cloud, folder / corrected_name(cloud), moved, frame=own, **said)
             if trajectory is not None and records is not None and result.trajectory is not None:
-                moved = with_poses(records, result.trajectory, frame)
-                moved = moved._replace(time=moved.time + trajectory_shift_s)
-                write_moved(moved, trajectory, folder)
+                back = with_poses(records, result.trajectory, frame)
+                write_moved(back._replace(time=back.time + trajectory_shift_s), trajectory, folder)
+            maps = gaps.maps
+            for raster, name in zip(maps or (), ("before", "after"), strict=False):
+                write_dsm(folder / f"differences_{name}.tif", raster, gaps.system)
+            return maps
+
+        write_strips(result, tables, verdict, out, write_corrected, made)
     console = plain_console()
     print_verdict(verdict, console)
     print_strips(result, console)
@@ -162,21 +188,31 @@ def strips_command(
         raise typer.Exit(1)
 
 
-class GapMaps(NamedTuple):
-    """Where the maps of gaps lie: in the cloud's own system, or where that counts degrees in the frame of the block."""
+class Gaps:
+    """The gaps of strips before and after, of a cloud that passes in parts.
 
-    placement: Placement
-    settings: StripSettings
+    Their maps lie in the cloud's own system, or where that counts degrees in the frame of the block.
+    """
+
+    def __init__(self, placement: Placement, settings: StripSettings) -> None:
+        self.settings = settings
+        own = placement.system
+        self._on_map = (lambda xyz: xyz) if own.geographic else placement.metres
+        self.system = CoordinateSystem() if own.geographic else own
+        """The system of the maps."""
+        self._before, self._after = CellTally(settings), CellTally(settings)
+
+    def add(self, part: Cloud, corrected: Float[np.ndarray, "n 3"]) -> None:
+        """Returns as they were measured, and corrected (m)."""
+        for look in looks_of(part, None, "line"):
+            if len(look.returns):
+                self._before.add(look.name, self._on_map(part.xyz[look.returns]))
+                self._after.add(look.name, self._on_map(corrected[look.returns]))
 
     @property
-    def system(self) -> CoordinateSystem:
-        """The system of the maps."""
-        return CoordinateSystem() if self.placement.system.geographic else self.placement.system
-
-    def gaps(self, before: Cloud, after: Cloud) -> tuple[Raster, Raster] | None:
-        """The gaps of the strips before and after; None where strips have no planes in common."""
-        turned = (lambda xyz: xyz) if self.placement.system.geographic else self.placement.metres
-        of = [strip_differences(dataclasses.replace(c, xyz=turned(c.xyz)), self.settings) for c in (before, after)]
+    def maps(self) -> tuple[Raster, Raster] | None:
+        """Before and after; None where strips have no planes in common."""
+        of = [strip_differences(tally.strips.values(), self.settings) for tally in (self._before, self._after)]
         return None if of[0] is None or of[1] is None else (of[0], of[1])
 
 
@@ -194,14 +230,15 @@ def _about(records: Records, system: CoordinateSystem, cloud: Path) -> Frame:
     return Frame("epsg", code, origin=(longitude, latitude, height))
 
 
-def _for_all(result: StripAdjustment, whole: Cloud) -> StripErrors:
-    """The errors in the order of the strips of the whole cloud. Raises InputError for one that showed no plane."""
-    names = result.cloud.strips
-    for name in whole.strips:
-        if name not in names:
-            raise InputError(f"strip {name} has no points of these classes and returns: take others, or leave it out")
-    splines = tuple(result.errors.splines[names.index(name)] for name in whole.strips)
-    return dataclasses.replace(result.errors, splines=splines)
+def _about_where(block: Block) -> Float[np.ndarray, "points 3"]:
+    """Where tie points are, about."""
+    return np.asarray(approximate(block).points)[tie_points(block)]
+
+
+def _check_known(part: Cloud, result: StripAdjustment) -> None:
+    """Raise InputError for a strip that has no returns of those looked at."""
+    for name in part.strips[len(result.cloud.strips) :]:
+        raise InputError(f"strip {name} has no points of these classes and returns: take others, or leave it out")
 
 
 def _priors(adjust: str | None, pattern: str | None) -> ScannerPriors | None:

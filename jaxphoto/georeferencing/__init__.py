@@ -39,17 +39,16 @@ from jaxphoto.georeferencing.scanner_calibration import (
     corrected_shot,
 )
 from jaxphoto.georeferencing.strip_errors import StripErrors
-from jaxphoto.georeferencing.trajectory import Poses, Trajectory, covered, interpolate
+from jaxphoto.georeferencing.trajectory import Poses, Trajectory, TrajectorySpline, covered, interpolate, spline_through
 from jaxphoto.georeferencing.trajectory_knots import StripSpline, TrajectoryKnot, weighted_knot
 
 __all__ = [
     "IMAGE_X", "NOMINAL", "PATTERNS", "Corrections", "DirectPartials", "Exposure", "FlightBias", "Mount", "Pattern",
-    "Poses",
-    "RayCovariance", "RigCamera", "Scanner", "ScannerCalibration", "SensorCovariance", "StripBias", "StripErrors",
-    "StripSpline", "Surface", "Trajectory", "TrajectoryKnot", "apparent_point", "arm_to_camera", "attitude_residual",
-    "body_from_camera", "corrected_point", "corrected_return", "corrected_shot", "covered", "direct_covariance",
-    "direct_orientation", "direct_partials", "exact_offset", "ground_covariance", "ground_point", "in_rig",
-    "interpolate", "level_error", "level_offset", "object_from_body", "raised_by_boresight", "recorded_attitude",
-    "reference_later", "refraction_constant", "rig_place", "rig_turn", "sensor_position", "turn_off", "weighted_knot",
-    "worst_level_error",
+    "Poses", "RayCovariance", "RigCamera", "Scanner", "ScannerCalibration", "SensorCovariance", "StripBias",
+    "StripErrors", "StripSpline", "Surface", "Trajectory", "TrajectoryKnot", "TrajectorySpline", "apparent_point",
+    "arm_to_camera", "attitude_residual", "body_from_camera", "corrected_point", "corrected_return", "corrected_shot",
+    "covered", "direct_covariance", "direct_orientation", "direct_partials", "exact_offset", "ground_covariance",
+    "ground_point", "in_rig", "interpolate", "level_error", "level_offset", "object_from_body", "raised_by_boresight",
+    "recorded_attitude", "reference_later", "refraction_constant", "rig_place", "rig_turn", "sensor_position",
+    "spline_through", "turn_off", "weighted_knot", "worst_level_error",
 ]  # fmt: skip

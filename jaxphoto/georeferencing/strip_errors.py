@@ -5,7 +5,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxphoto.georeferencing.scanner_calibration import ScannerCalibration
-from jaxphoto.georeferencing.trajectory_knots import StripSpline
+from jaxphoto.georeferencing.trajectory_knots import SplineKnots, StripSpline
 
 
 class StripErrors(eqx.Module):
@@ -23,3 +23,8 @@ class StripErrors(eqx.Module):
         """What the trajectory of a strip is off by at times (s): position (m) and attitude (rad), (n, 3) each."""
         knots, weights = self.splines[strip].weights(time)
         return tuple(np.einsum("nk,nkc->nc", weights, of[knots]) for of in (self.position, self.attitude))  # type: ignore[return-value]
+
+    def of_strip(self, strip: int) -> SplineKnots:
+        """The same for what is compiled: position (m) and attitude (rad), six numbers together."""
+        first, size, start, interval = (np.asarray(v) for v in self.splines[strip])
+        return SplineKnots(first, size, start, interval, np.concatenate([self.position, self.attitude], axis=1))

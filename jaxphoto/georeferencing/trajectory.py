@@ -62,18 +62,16 @@ def interpolate(trajectory: Trajectory, times: Float[Array, "times"], max_gap: F
     No spline runs across an interval longer than `max_gap` (s): what is returned for times there, and for times before
     the first or after the last record, is not to be used (`covered`).
     """
-    joined = _joined(trajectory, max_gap)
     trajectory = jax.tree.map(jnp.asarray, trajectory)
-    origin = trajectory.time[0]
-    times, nodes = times - origin, trajectory.time - origin
-    values = jnp.concatenate([trajectory.position, _continuous(trajectory.quaternion)], axis=1)
-    at, dot = _spline(nodes, values, joined, times)
+    spline = spline_through(trajectory, max_gap)
+    nodes, joined, times = spline.nodes, spline.joined, times - spline.origin
+    at, dot = spline.at(times)
     matrix, matrix_dot = jax.jvp(jax.vmap(matrix_from_quaternion), (at[:, 3:],), (dot[:, 3:],))
     # R' dR/dt is the cross product with the rate of turn about the body's axes.
     turn = jnp.einsum("nji,njk->nik", matrix, matrix_dot)
     rate = jnp.stack([turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]], axis=1)
 
-    error = _interpolation_error(nodes, values, joined)
+    error = _interpolation_error(nodes, spline.values, joined)
     interval = _interval(nodes, joined, times)
     part = ((times - nodes[interval]) / (nodes[interval + 1] - nodes[interval]))[:, None]
     # Nothing at the records, all of it half way between them.
@@ -88,9 +86,43 @@ def covered(
     trajectory: Trajectory, times: Float[Array, "times"], max_gap: Float[Array, ""] | float
 ) -> Bool[Array, "times"]:
     """Whether each time lies within the trajectory and in no gap of it."""
-    inside = (times >= trajectory.time[0]) & (times <= trajectory.time[-1])
-    joined = _joined(trajectory, max_gap)
-    return inside & joined[_interval(jnp.asarray(trajectory.time), joined, times)]
+    return _covered(jnp.asarray(trajectory.time), _joined(trajectory, max_gap), times)
+
+
+class TrajectorySpline(eqx.Module):
+    """The spline through a trajectory, solved once for all the times at which it is asked for."""
+
+    origin: Float[Array, ""]
+    """Time of the first record (s)."""
+    nodes: Float[Array, "records"]
+    """Seconds from there on."""
+    joined: Bool[Array, "intervals"]
+    """Which intervals are no gap."""
+    values: Float[Array, "records 7"]
+    """Position (m) and quaternion."""
+    second: Float[Array, "records 7"]
+    """Second derivatives."""
+
+    def at(self, times: Float[Array, "m"]) -> tuple[Float[Array, "m 7"], Float[Array, "m 7"]]:
+        """Values and derivatives at times from the first record on (s)."""
+        return _on_pieces(self.nodes, self.values, self.second, self.joined, times)
+
+    def poses(self, times: Float[Array, "m"]) -> tuple[Float[Array, "m 3"], Float[Array, "m 3 3"], Bool[Array, "m"]]:
+        """Position (m) and `object_from_body` at times of the trajectory's clock (s), and which of these it covers."""
+        times = times - self.origin
+        at, _ = self.at(times)
+        return at[:, :3], jax.vmap(matrix_from_quaternion)(at[:, 3:]), _covered(self.nodes, self.joined, times)
+
+
+def spline_through(trajectory: Trajectory, max_gap: Float[Array, ""] | float) -> TrajectorySpline:
+    """The spline of `interpolate`, which runs across no interval longer than `max_gap` (s)."""
+    joined, nodes = _joined(trajectory, max_gap), trajectory.time - trajectory.time[0]
+    values = jnp.concatenate([trajectory.position, _continuous(trajectory.quaternion)], axis=1)
+    return TrajectorySpline(trajectory.time[0], nodes, joined, values, _second(nodes, values, joined))
+
+
+def _covered(nodes: Float[Array, "n"], joined: Bool[Array, "intervals"], times: Float[Array, "m"]) -> Bool[Array, "m"]:
+    return (times >= nodes[0]) & (times <= nodes[-1]) & joined[_interval(nodes, joined, times)]
 
 
 def _joined(trajectory: Trajectory, max_gap: Float[Array, ""] | float) -> Bool[Array, "intervals"]:
@@ -111,11 +143,11 @@ def _interval(nodes: Float[Array, "n"], joined: Bool[Array, "intervals"], times:
     return jnp.where((times == nodes[i]) & ~joined[i], jnp.maximum(i - 1, 0), i)
 
 
-def _spline(nodes, values, joined, times) -> tuple[Float[Array, "m k"], Float[Array, "m k"]]:
-    """Values and derivatives at `times` of the cubic spline through `values` (n, k).
+def _second(nodes, values, joined) -> Float[Array, "n k"]:
+    """Second derivatives at the nodes of the cubic spline through `values` (n, k).
 
-    The second derivatives s of the pieces are continuous, h0 s0 + 2 (h0 + h1) s1 + h1 s2 = 6 (d1 - d0) with d the
-    divided differences; a piece next to an end, or to a gap (`joined` false), is a parabola.
+    Those of the pieces, s, are continuous, h0 s0 + 2 (h0 + h1) s1 + h1 s2 = 6 (d1 - d0) with d the divided differences;
+    a piece next to an end, or to a gap (`joined` false), is a parabola.
     """
     h, zero, no = jnp.diff(nodes), jnp.zeros(1), jnp.zeros(1, bool)
     slope = jnp.diff(values, axis=0) / h[:, None]
@@ -129,12 +161,15 @@ def _spline(nodes, values, joined, times) -> tuple[Float[Array, "m k"], Float[Ar
     diagonal = jnp.where(inner, 2 * (h0 + h1), 1.0)
     pad = jnp.zeros((1, values.shape[1]))
     bend = 6 * (jnp.concatenate([slope, pad]) - jnp.concatenate([pad, slope]))
-    second = jax.lax.linalg.tridiagonal_solve(lower, diagonal, upper, jnp.where(inner[:, None], bend, 0.0))
+    return jax.lax.linalg.tridiagonal_solve(lower, diagonal, upper, jnp.where(inner[:, None], bend, 0.0))
 
+
+def _on_pieces(nodes, values, second, joined, times) -> tuple[Float[Array, "m k"], Float[Array, "m k"]]:
+    """Values and derivatives at `times` of the spline with these second derivatives at its nodes."""
     i = _interval(nodes, joined, times)
-    step, t = h[i][:, None], (times - nodes[i])[:, None]
+    step, t = (nodes[i + 1] - nodes[i])[:, None], (times - nodes[i])[:, None]
     s0, s1 = second[i], second[i + 1]
-    b = slope[i] - step * (2 * s0 + s1) / 6
+    b = (values[i + 1] - values[i]) / step - step * (2 * s0 + s1) / 6
     d = (s1 - s0) / (6 * step)
     return values[i] + t * (b + t * (s0 / 2 + t * d)), b + t * (s0 + 3 * t * d)
 
@@ -164,7 +199,8 @@ def _misfit(nodes, values, joined, every: int, start: int) -> tuple[Float[Array,
     kept = jnp.arange(start, len(nodes), every)
     middle = kept[:-1] + every // 2
     whole = jnp.all(joined[kept[:-1, None] + jnp.arange(every)], axis=1)
-    at, _ = _spline(nodes[kept], values[kept], whole, nodes[middle])
+    coarse, some = nodes[kept], values[kept]
+    at, _ = _on_pieces(coarse, some, _second(coarse, some, whole), whole, nodes[middle])
     turned = jnp.einsum("nji,njk->nik", *(jax.vmap(matrix_from_quaternion)(v[:, 3:]) for v in (at, values[middle])))
     right, forward, up = jax.vmap(small_angles, out_axes=1)(turned)
     miss = jnp.concatenate([at[:, :3] - values[middle, :3], jnp.stack([forward, right, up], axis=1)], axis=1)

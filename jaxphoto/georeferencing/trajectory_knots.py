@@ -11,6 +11,7 @@ Source: de Boor, A practical guide to splines. What holds the coefficients toget
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
@@ -69,8 +70,7 @@ class StripSpline(NamedTuple):
         gone = np.clip((np.asarray(time) - self.start) / self.interval, 0.0, self.size - 3)
         piece = np.minimum(gone.astype(int), self.size - 4)
         u = gone - piece
-        cubic = [(1 - u) ** 3, 3 * u**3 - 6 * u**2 + 4, -3 * u**3 + 3 * u**2 + 3 * u + 1, u**3]
-        return self.first + piece[:, None] + np.arange(4), np.column_stack(cubic) / 6
+        return self.first + piece[:, None] + np.arange(4), np.column_stack(_cubic(u))
 
     def all_weights(
         self, time: Float[np.ndarray, "n"]
@@ -80,6 +80,32 @@ class StripSpline(NamedTuple):
         every = np.zeros((len(knots), self.size))
         np.add.at(every, (np.arange(len(knots))[:, None], knots - self.first), weights)
         return np.tile(self.first + np.arange(self.size), (len(knots), 1)), every
+
+
+class SplineKnots(NamedTuple):
+    """The spline of a strip with its coefficients, for what is compiled; a knot more costs no new program."""
+
+    first: Int[Numbers, ""]
+    """Of the knots of all strips that of this one."""
+    size: Int[Numbers, ""]
+    start: Float[Numbers, ""]
+    interval: Float[Numbers, ""]
+    knots: Float[Numbers, "knots k"]
+
+    def at(self, time: Float[Array, "n"]) -> Float[Array, "n k"]:
+        """`StripSpline.weights`, and with them the correction at each time (s)."""
+        gone = jnp.clip((time - self.start) / self.interval, 0.0, jnp.maximum(self.size - 3, 0))
+        piece = jnp.minimum(gone.astype(int), jnp.maximum(self.size - 4, 0))
+        # The weights sum up to 1: of one knot alone all four are that one.
+        index = (self.first + jnp.minimum(piece + k, self.size - 1) for k in range(4))
+        parts = zip(_cubic(gone - piece), index, strict=True)
+        return sum(w[:, None] * self.knots[k] for w, k in parts)  # type: ignore[return-value, misc]
+
+
+def _cubic(u: Float[Numbers, "n"]) -> list[Float[Numbers, "n"]]:
+    """The weights of four coefficients, `u` of an interval gone."""
+    weights = (1 - u) ** 3, 3 * u**3 - 6 * u**2 + 4, -3 * u**3 + 3 * u**2 + 3 * u + 1, u**3
+    return [w / 6 for w in weights]
 
 
 def weighted_knot(knots: TrajectoryKnot, weights: Float[Numbers, "knots"]) -> TrajectoryKnot:

@@ -14,10 +14,10 @@ from jaxphoto.arrays import Numbers
 from jaxphoto.cloud import Cloud
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import BlockError
-from jaxphoto.georeferencing import Scanner, Trajectory, corrected_point, covered, interpolate
+from jaxphoto.georeferencing import Scanner, Trajectory, TrajectorySpline, corrected_point, spline_through
 
-PORTION = 1 << 20
-"""Laser points at once; smaller clouds are padded to a power of two."""
+PORTION = 1 << 17
+"""Laser points at once, whose numbers stay in the processor's cache; fewer are padded to a power of two."""
 # An interval is a gap from this many times the usual interval: one record may be lost.
 _GAP = 2.5
 
@@ -30,20 +30,32 @@ class ScannerPoses(eqx.Module):
     object_from_body: Float[np.ndarray, "n 3 3"]
 
 
-def scanner_poses(trajectory: Trajectory, time: Float[np.ndarray, "n"]) -> ScannerPoses:
-    """Interpolated at the times of laser points, on the clock of the trajectory (s).
+class ScannerPath(eqx.Module):
+    """The trajectory of a scanner, ready to say where each of millions of laser points was measured from."""
+
+    trajectory: Trajectory
+    spline: TrajectorySpline
+
+
+def scanner_path(trajectory: Trajectory) -> ScannerPath:
+    """The path along `trajectory`, which is on the clock of the laser points."""
+    max_gap = _GAP * float(np.median(np.diff(np.asarray(trajectory.time))))
+    return ScannerPath(trajectory, call_compiled(_spline, trajectory, np.array(max_gap)))
+
+
+def scanner_poses(path: ScannerPath, time: Float[np.ndarray, "n"]) -> ScannerPoses:
+    """Interpolated at the times of laser points (s).
 
     Raises BlockError for times that the trajectory does not cover.
     """
-    max_gap = _GAP * float(np.median(np.diff(np.asarray(trajectory.time))))
     parts = []
     for first in range(0, len(time), PORTION):
         some = np.asarray(time[first : first + PORTION], float)
         padded = np.concatenate([some, np.full(padded_size(len(some)) - len(some), some[0])])
-        position, turn, known = (v[: len(some)] for v in call_compiled(_poses, trajectory, padded, np.array(max_gap)))
-        if not np.all(known):
-            raise _not_covered(trajectory, time, int((~np.asarray(known)).sum()))
-        parts.append((np.asarray(position), np.asarray(turn)))
+        position, turn, known = (np.asarray(v)[: len(some)] for v in call_compiled(_poses, path.spline, padded))
+        if not known.all():
+            raise not_covered(path.trajectory, time, int((~known).sum()))
+        parts.append((position, turn))
     if not parts:
         return ScannerPoses(np.zeros((0, 3)), np.zeros((0, 3, 3)))
     return ScannerPoses(*(np.concatenate(v) for v in zip(*parts, strict=True)))
@@ -54,7 +66,7 @@ def check_covered(trajectory: Trajectory, time: Float[np.ndarray, "n"]) -> None:
     known = np.asarray(trajectory.time)
     outside = int(((time < known[0]) | (time > known[-1])).sum())
     if outside:
-        raise _not_covered(trajectory, time, outside)
+        raise not_covered(trajectory, time, outside)
 
 
 def corrected_xyz(
@@ -70,17 +82,17 @@ def corrected_xyz(
     return in_portions(_corrected, (xyz, poses.position, poses.object_from_body), np.asarray(boresight), shift)
 
 
-def correct_cloud(cloud: Cloud, scanner: Scanner, trajectory: Trajectory | None) -> Cloud:
+def correct_cloud(cloud: Cloud, scanner: Scanner, path: ScannerPath | None) -> Cloud:
     """The cloud that the scanner would have measured without its boresight and the shifts of its strips.
 
     A strip that the scanner does not know stays where it is, but for the boresight. Raises as `scanner_poses`.
     """
     xyz = np.array(cloud.xyz)
-    turned = trajectory is not None and bool(np.any(np.asarray(scanner.boresight)))
+    turned = path is not None and bool(np.any(np.asarray(scanner.boresight)))
     for strip, shift in _strips(cloud, scanner):
         for first in range(0, len(strip), PORTION):
             own = strip[first : first + PORTION]
-            poses = scanner_poses(trajectory, cloud.time[own]) if turned and cloud.time is not None else None  # type: ignore[arg-type]
+            poses = scanner_poses(path, cloud.time[own]) if turned and cloud.time is not None else None  # type: ignore[arg-type]
             xyz[own] = corrected_xyz(cloud.xyz[own], poses, scanner.boresight, shift)
     return dataclasses.replace(cloud, xyz=xyz)
 
@@ -111,7 +123,8 @@ def _strips(cloud: Cloud, scanner: Scanner) -> list[tuple[np.ndarray, np.ndarray
     ]
 
 
-def _not_covered(trajectory: Trajectory, time: np.ndarray, n: int) -> BlockError:
+def not_covered(trajectory: Trajectory, time: np.ndarray, n: int) -> BlockError:
+    """That `n` points at some of the times `time` (s) were measured where no record is."""
     known = np.asarray(trajectory.time)
     return BlockError(
         f"{n} laser points were measured where the trajectory has no records: the points at {time.min():.3f} "
@@ -140,11 +153,15 @@ def padded_size(n: int) -> int:
 
 
 @eqx.filter_jit
+def _spline(trajectory: Trajectory, max_gap: Float[Array, ""]) -> TrajectorySpline:
+    return spline_through(jax.tree.map(jnp.asarray, trajectory), max_gap)
+
+
+@eqx.filter_jit
 def _poses(
-    trajectory: Trajectory, time: Float[Array, "n"], max_gap: Float[Array, ""]
+    spline: TrajectorySpline, time: Float[Array, "n"]
 ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3 3"], Bool[Array, "n"]]:
-    poses = interpolate(trajectory, time, max_gap)  # type: ignore[arg-type]
-    return poses.position, poses.object_from_body, covered(trajectory, time, max_gap)  # type: ignore[arg-type]
+    return spline.poses(time)
 
 
 @eqx.filter_jit

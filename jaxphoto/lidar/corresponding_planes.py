@@ -3,16 +3,17 @@
 The plane of a cell is that of least squared distances from its returns: through their mean, the normal the eigenvector
 of the least eigenvalue of their scatter. Cells are kept where the returns are many, spread over the cell and no rougher
 than a hard surface is (no vegetation, no edge); planes of two strips correspond where their normals agree and their
-means lie close. All sums are made in one pass over the returns. Source: Glira, Pfeifer, Briese and Ressl (2015), A
-correspondence framework for ALS strip adjustments based on variants of the ICP algorithm: selection, matching and
-rejection there are of single points, of cells here.
+means lie close. All sums are made in one pass over the returns (`cell_returns`).
+Source: Glira, Pfeifer, Briese and Ressl (2015), A correspondence framework for ALS strip adjustments based on variants
+of the ICP algorithm: selection, matching and rejection there are of single points, of cells here.
 """
 
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
+from jaxphoto.lidar.cell_returns import CellReturns, gathered
 from jaxphoto.lidar.moderated_variances import moderated_variances
 from jaxphoto.lidar.strip_settings import StripSettings
 
@@ -20,6 +21,10 @@ from jaxphoto.lidar.strip_settings import StripSettings
 _SPREAD = 0.15
 # Means of two patches that lie closer, as a part of the cell, are of one place.
 _CLOSE = 0.3
+
+
+# Planes steeper than this (degrees) are what tells shifts in X and Y.
+_STEEP_DEG = 5.0
 
 
 class StripPatches(NamedTuple):
@@ -36,7 +41,7 @@ class StripPatches(NamedTuple):
     normal: Float[np.ndarray, "n 3"]
     """Unit vectors, upwards."""
     roughness: Float[np.ndarray, "n"]
-    """Standard deviation of a return from the plane (m), drawn towards that of the strip's other planes."""
+    """Standard deviation of a return from the plane (m), drawn towards that of other planes as steep or as flat."""
     cofactor: Float[np.ndarray, "n 3 3"]
     """Inverse scatter within the plane (1/m^2): what the tilt of the plane is off by for returns that are off by 1."""
 
@@ -58,19 +63,6 @@ class PlanePairs(NamedTuple):
     """Of the gap (m), by the roughness of both patches."""
 
 
-def cells_of(
-    xyz: Float[np.ndarray, "n 3"], origin: Float[np.ndarray, "2"], settings: StripSettings
-) -> Int[np.ndarray, "n"]:
-    """The cell of each return, of a grid that begins at `origin` (m)."""
-    column, up = np.floor((xyz[:, :2] - origin) / settings.cell_m).astype(np.int64).T
-    return (column << 32) + up
-
-
-def columns_and_rows(cell: Int[np.ndarray, "n"]) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]]:
-    """Of cells of `cells_of`, how many lie between each and the origin in X and in Y, where none lies before it."""
-    return cell >> 32, cell & 0xFFFFFFFF
-
-
 def planes_of(
     xyz: Float[np.ndarray, "n 3"],
     measured: Float[np.ndarray, "n 3"],
@@ -79,39 +71,48 @@ def planes_of(
     settings: StripSettings,
 ) -> StripPatches:
     """The planes of a strip's returns `xyz` (m), corrected; `measured` is where they were, `cell` as of `cells_of`."""
-    cells, of = np.unique(cell, return_inverse=True)
-    count = np.bincount(of)
-    kept = count >= settings.returns
+    return planes_from(gathered(xyz, measured, time, cell), settings)
 
-    def mean(values: np.ndarray) -> np.ndarray:
-        return np.bincount(of, values, len(cells)) / count
 
-    middle = np.column_stack([mean(v) for v in xyz.T])
-    before = np.column_stack([mean(v) for v in measured.T])
-    off = xyz - middle[of]
-    scatter = np.empty((len(cells), 3, 3))
-    for i in range(3):
-        for j in range(i + 1):
-            scatter[:, i, j] = scatter[:, j, i] = mean(off[:, i] * off[:, j]) * count
-    value, axes = np.linalg.eigh(scatter)
+def planes_from(cells: CellReturns, settings: StripSettings) -> StripPatches:
+    """The planes of a strip's returns, gathered cell by cell."""
+    count = cells.returns
+    value, axes = np.linalg.eigh(cells.scatter)
     roughness = np.sqrt(np.maximum(value[:, 0], 0.0) / np.maximum(count - 3, 1))
-    kept &= (roughness <= settings.roughness_m) & (
-        np.sqrt(np.maximum(value[:, 1], 0.0) / count) > _SPREAD * settings.cell_m
+    kept = (
+        (count >= settings.returns)
+        & (roughness <= settings.roughness_m)
+        & (np.sqrt(np.maximum(value[:, 1], 0.0) / count) > _SPREAD * settings.cell_m)
     )
     normal = axes[:, :, 0] * np.where(axes[:, 2, 0] < 0, -1.0, 1.0)[:, None]
     along = axes[kept][:, :, 1:]
     # A patch that is smoother than any scanner is one by chance.
     variance = np.maximum(roughness[kept], settings.least_roughness_m) ** 2
     return StripPatches(
-        cells[kept],
+        cells.cell[kept],
         count[kept],
-        middle[kept],
-        before[kept],
-        mean(time)[kept],
+        cells.mean[kept],
+        cells.measured[kept],
+        cells.time[kept],
         normal[kept],
-        np.sqrt(moderated_variances(variance, count[kept] - 3)),
+        np.sqrt(_moderated(variance, count[kept] - 3, normal[kept])),
         np.einsum("nik,nk,njk->nij", along, 1 / value[kept][:, 1:], along),
     )
+
+
+def steep(normal: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
+    """Which planes are steep enough to tell shifts in X and Y."""
+    return normal[:, 2] < np.cos(np.deg2rad(_STEEP_DEG))
+
+
+def _moderated(
+    variance: Float[np.ndarray, "n"], freedom: Int[np.ndarray, "n"], normal: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n"]:
+    """Variances drawn towards those of the planes alike: errors in X and Y make steep ones rougher than flat ones."""
+    result, above = variance.copy(), steep(normal)
+    for own in (above, ~above):
+        result[own] = moderated_variances(variance[own], freedom[own])
+    return result
 
 
 def corresponding(one: StripPatches, other: StripPatches, settings: StripSettings) -> PlanePairs:

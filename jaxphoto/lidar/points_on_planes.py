@@ -9,7 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxphoto.lidar.corresponding_planes import StripPatches, cells_of, up_to_plane, variance_of_plane
+from jaxphoto.lidar.cell_returns import cells_of
+from jaxphoto.lidar.corresponding_planes import StripPatches, up_to_plane, variance_of_plane
 from jaxphoto.lidar.strip_settings import StripSettings
 
 
@@ -32,14 +33,14 @@ def returns_about(
     xyz: Float[np.ndarray, "returns 3"], points: Float[np.ndarray, "points 3"], settings: StripSettings
 ) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]]:
     """Returns in the window of each point, one cell wide, and the point that each of these is about."""
-    origin, half = xyz[:, :2].min(axis=0), settings.cell_m / 2
-    cell = cells_of(xyz, origin, settings)
+    half = settings.cell_m / 2
+    cell = cells_of(xyz, settings)
     order = np.argsort(cell, kind="stable")
     ordered = cell[order]
     found: list[np.ndarray] = []
     # A window is as wide as a cell: it reaches into the cells of its four corners, and into no other.
     for corner in ((-half, -half, 0.0), (-half, half, 0.0), (half, -half, 0.0), (half, half, 0.0)):
-        at = cells_of(points + np.array(corner), origin, settings)
+        at = cells_of(points + np.array(corner), settings)
         first, last = np.searchsorted(ordered, at, "left"), np.searchsorted(ordered, at, "right")
         count = last - first
         point = np.repeat(np.arange(len(points)), count)

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from jaxphoto.cloud import Cloud
 from jaxphoto.compiling import call_compiled
 from jaxphoto.georeferencing import StripErrors, Trajectory, corrected_return
-from jaxphoto.lidar.correction import PORTION, in_portions, scanner_poses
+from jaxphoto.lidar.correction import ScannerPath, in_portions, not_covered
 from jaxphoto.rotation import matrix_from_quaternion, quaternion_from_matrix, small_rotation
 
 
@@ -20,32 +20,29 @@ def corrected_strip(
     time: Float[np.ndarray, "n"],
     strip: int,
     errors: StripErrors,
-    trajectory: Trajectory | None,
+    path: ScannerPath | None,
 ) -> Float[np.ndarray, "n 3"]:
-    """`georeferencing.corrected_return` of returns of one strip; without a trajectory its constant shift alone.
+    """`georeferencing.corrected_return` of returns of one strip; without a path its constant shift alone.
 
-    Raises as `scanner_poses`.
+    Raises BlockError for times (s) that the trajectory does not cover.
     """
-    off, turn = errors.at(strip, time)
-    if trajectory is None:
-        return xyz - off
-    result = np.empty_like(xyz)
-    # Poses of all returns at once would fill the memory.
-    for first in range(0, len(xyz), PORTION):
-        own = slice(first, first + PORTION)
-        poses = scanner_poses(trajectory, time[own])
-        points = xyz[own], poses.position, poses.object_from_body, off[own], turn[own]
-        result[own] = in_portions(_corrected, points, errors.boresight, errors.calibration)
+    if path is None:
+        return xyz - errors.at(strip, time)[0]
+    common = path.spline, errors.of_strip(strip), errors.boresight, errors.calibration
+    result = in_portions(_corrected, (xyz, time), *common)
+    unknown = int(np.isnan(result[:, 0]).sum())
+    if unknown:
+        raise not_covered(path.trajectory, time, unknown)
     return result
 
 
-def correct_strips(cloud: Cloud, errors: StripErrors, trajectory: Trajectory | None) -> Cloud:
+def correct_strips(cloud: Cloud, errors: StripErrors, path: ScannerPath | None) -> Cloud:
     """The cloud that the scanner would have measured without these errors; all its other fields are kept."""
     xyz = np.array(cloud.xyz)
     for k in range(len(errors.splines)):
         own = np.flatnonzero(cloud.strip == k) if cloud.strip is not None else np.arange(len(cloud))
         if len(own):
-            xyz[own] = corrected_strip(cloud.xyz[own], times_of(cloud)[own], k, errors, trajectory)
+            xyz[own] = corrected_strip(cloud.xyz[own], times_of(cloud)[own], k, errors, path)
     return dataclasses.replace(cloud, xyz=xyz)
 
 
@@ -71,9 +68,12 @@ def times_of(cloud: Cloud) -> Float[np.ndarray, "n"]:
 
 
 @eqx.filter_jit
-def _corrected(point, position, object_from_body, off, turn, boresight, calibration) -> Float[Array, "n 3"]:
-    each = (0, 0, 0, 0, 0, None, None)
-    return jax.vmap(corrected_return, each)(point, position, object_from_body, off, turn, boresight, calibration)
+def _corrected(point, time, spline, errors, boresight, calibration) -> Float[Array, "n 3"]:
+    """NaN where the trajectory has no records."""
+    position, object_from_body, known = spline.poses(time)
+    off, each = errors.at(time), (0, 0, 0, 0, 0, None, None)
+    points = point, position, object_from_body, off[:, :3], off[:, 3:], boresight, calibration
+    return jnp.where(known[:, None], jax.vmap(corrected_return, each)(*points), jnp.nan)
 
 
 @eqx.filter_jit

@@ -1,8 +1,7 @@
 """The result folder of a strip adjustment: tables, map, report, and the adjustment of photographs in it."""
 
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -44,19 +43,19 @@ _PATTERNS = {
 }
 
 
-@contextmanager
 def write_strips(
     result: StripAdjustment,
     tables: Tables | None,
     verdict: Verdict,
     directory: Path,
-    gaps: tuple[Raster, Raster] | None,
+    write_corrected: Callable[[Path], tuple[Raster, Raster] | None],
     made: Made,
-) -> Iterator[Path]:
-    """Tables, differences.png of the `gaps` before and after, report.html, summary.json, of photographs `adjustment`.
+) -> None:
+    """Tables, differences.png, report.html, summary.json, of photographs `adjustment`, and what was corrected.
 
-    `tables` are those of the adjustment where photographs are in it. Yields the folder while it is not yet in its
-    place, for what else belongs there. Raises InputError where `directory` holds what is not an earlier result.
+    `tables` are those of the adjustment where photographs are in it. `write_corrected` writes cloud and trajectory into
+    the folder, while that is not yet in its place, and gives the gaps of the strips before and after. Raises InputError
+    where `directory` holds what is not an earlier result.
     """
     began, seconds = time.perf_counter(), dict(result.adjusted.seconds)
     with whole_folder(directory) as work:
@@ -68,7 +67,7 @@ def write_strips(
         scanner.to_csv(work / "scanner.csv", index=False)
         trajectory_errors_table(result).to_csv(work / "trajectory_errors.csv", index=False)
         all_correlations(result).round(_DIGITS).to_csv(work / "correlation.csv")
-        picture = None
+        gaps, picture = write_corrected(work), None
         if gaps is not None:
             picture = WholePicture.of(differences_figure(*gaps), "gaps of strips over the ground, before and after")
             (work / "differences.png").write_bytes(picture.png)
@@ -77,7 +76,6 @@ def write_strips(
         told |= {"sigma0": float(result.adjusted.sigma0), "pattern": result.errors.calibration.pattern}
         times = {"seconds": seconds | {"write": time.perf_counter() - began}}
         write_summary(verdict.summary | told | times, work)
-        yield work
 
 
 def _page(

@@ -1,5 +1,6 @@
 """Clouds: LAS, LAZ, CSV and PLY, their systems and units, filters, and what is said of those that cannot be used."""
 
+import dataclasses
 import warnings
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from jaxphoto import InputError
 from jaxphoto.block import Frame
 from jaxphoto.cloud import Cloud
 from jaxphoto.io import clouds
+from jaxphoto.io.clouds import EVERY_CLASS
 from jaxphoto.io.clouds import cloud_source as chunked
 from tests.checked_types import unchecked
 
@@ -277,6 +279,48 @@ def test_written_like_another_file(tmp_path, frame):
     with pytest.raises(InputError, match=r"2000 points.*1000"):
         clouds.write_cloud(moved.take(np.arange(2000) % 1000), tmp_path / "c.laz", like=tmp_path / "a.laz", frame=frame)
     assert not (tmp_path / "c.laz").exists()
+
+
+@pytest.mark.parametrize("name", ["c.laz", "c.csv", "c.ply"])
+@pytest.mark.parametrize(
+    ("frame", "said", "unit"), [(None, {}, 1.0), (None, {"unit": "ft"}, FT), (UTM, {"epsg": 32722}, 1.0)]
+)
+def test_rewritten_part_by_part_in_its_own_system_and_units(tmp_path, name, frame, said, unit):
+    cloud = sample()
+    # Blunders are moved, too, and stay where they are in the file.
+    classification = np.where(np.arange(len(cloud)) % 7 == 0, 7, cloud.classification).astype(np.uint8)
+    clouds.write_cloud(dataclasses.replace(cloud, classification=classification), tmp_path / name)
+    step, met = np.array([0.5, -0.25, 0.125]), []
+
+    def moved(part):
+        met.append(len(part))
+        return part.xyz + step
+
+    new = tmp_path / f"new{name[1:]}"
+    clouds.rewrite_cloud(tmp_path / name, new, moved, frame=frame, **said)
+    assert sum(met) == len(cloud) and max(met) <= 300
+    before, after = (clouds.read_cloud(f, frame, classes=EVERY_CLASS, **said) for f in (tmp_path / name, new))
+    np.testing.assert_allclose(after.xyz, before.xyz + step, atol=0.6e-3 * unit)
+    same(after, dataclasses.replace(before, xyz=after.xyz))
+    if frame is None:
+        np.testing.assert_allclose(
+            clouds.read_cloud(new, classes=EVERY_CLASS).xyz, cloud.xyz + step / unit, atol=0.6e-3
+        )
+
+
+def test_what_cannot_be_rewritten_leaves_nothing(tmp_path):
+    clouds.write_cloud(sample(), tmp_path / "c.laz")
+
+    def moved(part):
+        if not (part.time == sample().time[:300]).all():
+            raise InputError("no farther")
+        return part.xyz
+
+    with pytest.raises(InputError, match="no farther"):
+        clouds.rewrite_cloud(tmp_path / "c.laz", tmp_path / "d.laz", moved)
+    with pytest.raises(InputError, match="of one kind"):
+        clouds.rewrite_cloud(tmp_path / "c.laz", tmp_path / "d.csv", lambda part: part.xyz)
+    assert [p.name for p in tmp_path.iterdir()] == ["c.laz"]
 
 
 def test_written_in_the_system_of_the_frame(tmp_path):

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from jaxphoto import InputError
-from jaxphoto.lidar.corresponding_planes import cells_of, corresponding, fitting, planes_of
+from jaxphoto.lidar.cell_returns import cells_of
+from jaxphoto.lidar.corresponding_planes import corresponding, fitting, planes_of
 from jaxphoto.lidar.strip_settings import StripSettings
 from tests.lidar.clouds import SURFACES, ground
 
@@ -15,7 +16,7 @@ SHIFT = np.array([0.05, -0.08, 0.12])
 
 
 def patches_of(xyz: np.ndarray, settings: StripSettings = SETTINGS):
-    cells = cells_of(xyz, np.zeros(2), settings)
+    cells = cells_of(xyz, settings)
     return planes_of(xyz, xyz, np.zeros(len(xyz)), cells, settings)
 
 

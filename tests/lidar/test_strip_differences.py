@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxphoto.cloud import Cloud
+from jaxphoto.lidar.cell_returns import CellTally
 from jaxphoto.lidar.strip_differences import strip_differences
 from jaxphoto.lidar.strip_settings import StripSettings
 
@@ -16,13 +16,16 @@ def strip(west, east, height, rough=0.01, n=20_000):
     return np.column_stack([x, y, 0.2 * x + height + RNG.normal(0, rough, n)])
 
 
-def cloud_of(*parts):
-    number = np.repeat(np.arange(len(parts)), [len(p) for p in parts])
-    return Cloud(np.concatenate(parts), strip=number, strips=tuple("abc"[: len(parts)]))
+def cells_of_strips(*strips):
+    tally = CellTally(SETTINGS)
+    for name, xyz in zip("abc", strips, strict=False):
+        for part in np.array_split(xyz, 3):
+            tally.add(name, part)
+    return tally.strips.values()
 
 
 def test_gaps_are_where_strips_overlap_with_their_sign():
-    found = strip_differences(cloud_of(strip(0.0, 30.0, 0.0), strip(20.0, 50.0, 0.12)), SETTINGS)
+    found = strip_differences(cells_of_strips(strip(0.0, 30.0, 0.0), strip(20.0, 50.0, 0.12)), SETTINGS)
     assert found.west == 0.0 and found.cell_m == 2.0
     x, y, gap = found.centres().T
     there = np.isfinite(gap)
@@ -36,8 +39,8 @@ def test_of_three_strips_the_largest_gap_counts_and_rough_ground_has_none():
         strip(0.0, 30.0, -0.2),
         strip(0.0, 30.0, 0.05),
     )
-    found = strip_differences(cloud_of(*parts), SETTINGS)
+    found = strip_differences(cells_of_strips(*parts), SETTINGS)
     gap = found.heights[np.isfinite(found.heights)]
     np.testing.assert_allclose(gap, 0.25, atol=0.03)
-    assert strip_differences(cloud_of(parts[0], strip(0.0, 30.0, 0.1, rough=0.5)), SETTINGS) is None
-    assert strip_differences(cloud_of(parts[0], strip(60.0, 90.0, 0.1)), SETTINGS) is None
+    assert strip_differences(cells_of_strips(parts[0], strip(0.0, 30.0, 0.1, rough=0.5)), SETTINGS) is None
+    assert strip_differences(cells_of_strips(parts[0], strip(60.0, 90.0, 0.1)), SETTINGS) is None

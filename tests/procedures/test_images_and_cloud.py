@@ -10,7 +10,7 @@ import pytest
 from jaxphoto import FIXED, FREE, InputError, Weighted, covariance
 from jaxphoto.georeferencing import Scanner
 from jaxphoto.lidar import HeightSettings
-from jaxphoto.lidar.correction import correct_cloud, correct_trajectory
+from jaxphoto.lidar.correction import correct_cloud, correct_trajectory, scanner_path
 from jaxphoto.procedures.lidar import Simultaneous, simultaneous
 from jaxphoto.statistics import physical_residuals
 from tests.procedures.lidar import misaligned
@@ -81,7 +81,7 @@ def above_ground(cloud) -> np.ndarray:
 def test_cloud_and_trajectory_are_corrected_alike():
     """A shift moves both; a boresight the cloud alone. The truth mends all of it."""
     flight = misaligned()
-    mended = correct_cloud(flight.cloud, flight.truth.scanner, flight.trajectory)
+    mended = correct_cloud(flight.cloud, flight.truth.scanner, scanner_path(flight.trajectory))
     np.testing.assert_allclose(above_ground(mended), 0.0, atol=0.01)
     moved = correct_trajectory(flight.trajectory, flight.cloud, flight.truth.scanner)
     shift = np.asarray(flight.trajectory.position) - np.asarray(moved.position)

@@ -11,6 +11,7 @@ from jaxphoto import BlockError, InputError
 from jaxphoto.adjustment import Outcome
 from jaxphoto.cloud import Cloud
 from jaxphoto.georeferencing import TrajectoryKnot
+from jaxphoto.lidar.correction import scanner_path
 from jaxphoto.lidar.strip_correction import correct_flight, correct_strips
 from jaxphoto.lidar.strip_settings import StripSettings
 from jaxphoto.procedures.lidar import adjust_strips
@@ -31,7 +32,7 @@ def above_ground(cloud: Cloud) -> np.ndarray:
 
 def test_the_truth_mends_the_cloud():
     flight = flown()
-    off = above_ground(correct_strips(flight.cloud, flight.errors, flight.trajectory))
+    off = above_ground(correct_strips(flight.cloud, flight.errors, scanner_path(flight.trajectory)))
     assert abs(off.mean()) < 0.002 and off.std() == pytest.approx(NOISE_M, rel=0.1)
     assert above_ground(flight.cloud).std() > 2 * NOISE_M
 
@@ -90,13 +91,13 @@ def test_a_scanner_of_prisms_is_found_by_what_it_sees_ahead_and_behind():
 def test_another_pattern_than_that_of_the_scanner_is_told():
     flight, other = flown(), flown_around()
     with pytest.warns(UserWarning, match=r"spread to the side \(0\.\d+ of the height\), but not ahead"):
-        check_pattern(flight.cloud, flight.trajectory, "circle")
+        check_pattern(flight.cloud, scanner_path(flight.trajectory), "circle")
     with pytest.warns(UserWarning, match=r"spread as far ahead \(0\.\d+ of the height\) as to the side"):
-        check_pattern(other.cloud, other.trajectory, "line")
+        check_pattern(other.cloud, scanner_path(other.trajectory), "line")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        check_pattern(flight.cloud, flight.trajectory, "line")
-        check_pattern(other.cloud, other.trajectory, "circle")
+        check_pattern(flight.cloud, scanner_path(flight.trajectory), "line")
+        check_pattern(other.cloud, scanner_path(other.trajectory), "circle")
 
 
 def test_the_errors_of_the_trajectory_are_found():

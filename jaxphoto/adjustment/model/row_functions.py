@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, Shaped
 
 from jaxphoto.adjustment.model.camera_groups import interior_of
 from jaxphoto.adjustment.model.numbers import AbstractValues, Increments, NonImageResiduals, datum_residuals
@@ -45,6 +45,8 @@ class RowInputs(NamedTuple):
     points: Float[Array, "j 3"]
 
 
+# Numbers; more of them, as of a hundred thousand rows that touch fifty unknowns each, would fill the memory.
+_AT_ONCE = 1 << 24
 # Which axis of a row by point runs over the points, and which over the rows of one.
 _OVER_POINTS = Touched(None, None, -1), RowInputs(-1, Touched(None, None, -1), None, None, None, None, -1)  # type: ignore[arg-type]
 _OVER_ROWS = Touched(None, None, None), RowInputs(-1, Touched(None, None, None), None, None, None, None, None)  # type: ignore[arg-type]
@@ -180,8 +182,34 @@ def row_jacobian(
         slopes, residual = jax.jacfwd(lambda z: (function(z, given),) * 2, has_aux=True)(z)
         return residual, slopes
 
-    residual, slopes = each_row(one, group, *gathered_rows(group, numbers, y, scale, v))
-    return RowJacobian(residual, slopes.eop, slopes.shared, slopes.points)
+    touched, given = gathered_rows(group, numbers, y, scale, v)
+    # Of each row as many copies of its parameters as there are derivatives.
+    slopes = sum(leaf.size for leaf in jax.tree.leaves(touched)) // max(group.n_rows, 1)
+    size = rows_at_once(slopes * len(group.parameter))
+    if isinstance(group.rows, RowsAtPoints) or group.n_rows <= size:
+        residual, slope = each_row(one, group, touched, given)
+    else:
+        portions = jax.tree.map(lambda v: in_portions(v, size), (touched, given))
+        found = jax.lax.map(lambda own: each_row(one, group, *own), portions)
+        residual, slope = jax.tree.map(lambda v: _together(v)[..., : group.n_rows], found)
+    return RowJacobian(residual, slope.eop, slope.shared, slope.points)
+
+
+def rows_at_once(numbers: int) -> int:
+    """Of how many rows, `numbers` of each, all are in memory together."""
+    return max(1, _AT_ONCE // max(numbers, 1))
+
+
+def in_portions(values: Shaped[Array, "*k rows"], size: int) -> Shaped[Array, "portions *k size"]:
+    """`size` rows each; the last row over again fills the last portion."""
+    *k, n = values.shape
+    filled = jnp.pad(values, [(0, 0)] * len(k) + [(0, -n % size)], "edge")
+    return jnp.moveaxis(filled.reshape(*k, -(-n // size), size), -2, 0)
+
+
+def _together(portions: Shaped[Array, "portions *k size"]) -> Shaped[Array, "*k rows"]:
+    number, *k, size = portions.shape
+    return jnp.moveaxis(portions, 0, -2).reshape(*k, number * size)
 
 
 def reduced_places(g: ObservedGroup, n_images: int) -> Int[Array, "z rows"]:

@@ -5,12 +5,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxphoto.adjustment.layout.tiled import TiledStructure
 from jaxphoto.adjustment.model.numbers import NonImageResiduals, datum_residuals
 from jaxphoto.adjustment.model.observed_groups import ObservedGroup, RowsAtPoints
-from jaxphoto.adjustment.model.row_functions import RowJacobian, row_jacobian
+from jaxphoto.adjustment.model.row_functions import RowJacobian, in_portions, row_jacobian, rows_at_once
 from jaxphoto.adjustment.model.structure import total
 from jaxphoto.adjustment.solver.normal import Linearised
 from jaxphoto.compiling import once
@@ -147,10 +147,28 @@ def _add_reduced(sums: NormalSums, g: ObservedGroup, j: RowJacobian, s: TiledStr
             met = _products(own, j.shared)
             us = us.at[jnp.asarray(image)[:, None], :, jnp.asarray(g.column).T].add(met.transpose(0, 2, 1))
     if len(g.place):
-        column = jnp.asarray(g.column).T
-        uss = uss.at[column[:, :, None], column[:, None]].add(_products(j.shared, j.shared))
-        b_s = b_s.at[column].add(jnp.einsum("cln,cn->nl", j.shared, j.residual))
+        column = jnp.asarray(g.column)
+        uss = _add_products(uss, column, j.shared)
+        b_s = b_s.at[column.T].add(jnp.einsum("cln,cn->nl", j.shared, j.residual))
     return NormalSums(band, u, us, uss, b_s, b_e)
+
+
+def _add_products(
+    uss: Float[Array, "size size"], column: Int[Array, "l rows"], shared: Float[Array, "c l rows"]
+) -> Float[Array, "size size"]:
+    """The products of each row's derivatives with one another."""
+    length, n = column.shape
+    size = rows_at_once(length**2)
+
+    def added(uss: Array, rows: tuple[Array, Array]) -> tuple[Array, None]:
+        own = rows[0].T
+        return uss.at[own[:, :, None], own[:, None]].add(_products(rows[1], rows[1])), None
+
+    if n <= size:
+        return added(uss, (column, shared))[0]
+    # What fills the last portion up has no derivatives.
+    shared = jnp.pad(shared, ((0, 0), (0, 0), (0, -n % size)))
+    return jax.lax.scan(added, uss, (in_portions(column, size), in_portions(shared, size)))[0]
 
 
 def _products(a: Float[Array, "c a rows"], b: Float[Array, "c b rows"]) -> Float[Array, "rows a b"]:

@@ -5,34 +5,37 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from jaxphoto.io.clouds.cloud_reader import (
+        EVERY_CLASS,
         Returns,
+        chosen_of,
         cloud_chunks,
         cloud_system,
         extent,
         read_cloud,
-        read_whole_and_chosen,
     )
-    from jaxphoto.io.clouds.cloud_writer import write_cloud
+    from jaxphoto.io.clouds.cloud_writer import rewrite_cloud, write_cloud
     from jaxphoto.io.clouds.coordinate_system import CoordinateSystem, frame_system
     from jaxphoto.io.clouds.placement import Placement
 
 _MODULES = {
-    "CoordinateSystem": "coordinate_system", "Placement": "placement", "Returns": "cloud_reader",
-    "cloud_chunks": "cloud_reader", "cloud_system": "cloud_reader", "extent": "cloud_reader",
-    "frame_system": "coordinate_system", "read_cloud": "cloud_reader", "read_whole_and_chosen": "cloud_reader",
-    "write_cloud": "cloud_writer",
+    "CoordinateSystem": "coordinate_system", "EVERY_CLASS": "cloud_reader", "Placement": "placement",
+    "Returns": "cloud_reader", "chosen_of": "cloud_reader", "cloud_chunks": "cloud_reader",
+    "cloud_system": "cloud_reader", "extent": "cloud_reader", "frame_system": "coordinate_system",
+    "read_cloud": "cloud_reader", "rewrite_cloud": "cloud_writer", "write_cloud": "cloud_writer",
 }  # fmt: skip
 
 __all__ = [
+    "EVERY_CLASS",
     "CoordinateSystem",
     "Placement",
     "Returns",
+    "chosen_of",
     "cloud_chunks",
     "cloud_system",
     "extent",
     "frame_system",
     "read_cloud",
-    "read_whole_and_chosen",
+    "rewrite_cloud",
     "write_cloud",
 ]  # fmt: skip
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
-from jaxtyping import Float, Real
+from jaxtyping import Bool, Float, Real
 
 from jaxphoto.block import Frame
 from jaxphoto.cloud import Cloud
@@ -59,7 +59,7 @@ def read_cloud(
     source = open_source(path, epsg, unit)
     chunks = _placed(source, frame, classes, returns, within)
     if source.most is None:
-        return _compact(_joined(list(chunks)))
+        return _compact(Cloud.joined(list(chunks)))
     # Memory that is never written to is never taken: there is room for all points, and the rest is given back.
     columns: dict[str, np.ndarray] = {}
     kept, strips = 0, tuple[str, ...]()
@@ -73,22 +73,6 @@ def read_cloud(
     for values in columns.values():
         values.resize((kept, *values.shape[1:]), refcheck=False)
     return _compact(Cloud(**columns, strips=strips))
-
-
-def read_whole_and_chosen(
-    path: str | Path,
-    frame: Frame | None = None,
-    *,
-    classes: Collection[int] | None = None,
-    returns: Returns = "all",
-    epsg: int | None = None,
-    unit: str | None = None,
-) -> tuple[Cloud, Cloud]:
-    """All points of a file, `NOISE` among them, and what `read_cloud` chooses: one and the same where that is all."""
-    whole = read_cloud(path, frame, classes=EVERY_CLASS, epsg=epsg, unit=unit)
-    if _chosen(whole, classes, returns, Path(path).name).all():
-        return whole, whole
-    return whole, read_cloud(path, frame, classes=classes, returns=returns, epsg=epsg, unit=unit)
 
 
 def cloud_chunks(
@@ -157,7 +141,7 @@ def _placed(
     kept = 0
     for chunk in source.chunks():
         tally.count(chunk)
-        part = _taken(chunk, _chosen(chunk, classes, returns, source.name))
+        part = _taken(chunk, chosen_of(chunk, classes, returns, source.name))
         part = _at(part, placement.checked(part.xyz))
         if within is not None:
             part = _taken(part, ((part.xyz[:, :2] >= within[0]) & (part.xyz[:, :2] <= within[1])).all(axis=1))
@@ -168,7 +152,8 @@ def _placed(
         raise tally.nothing(placement, classes, returns, within)
 
 
-def _chosen(chunk: Cloud, classes: Collection[int] | None, returns: Returns, name: str) -> np.ndarray:
+def chosen_of(chunk: Cloud, classes: Collection[int] | None, returns: Returns, name: str) -> Bool[np.ndarray, "n"]:
+    """Which points `read_cloud` chooses of those of the file `name`. Raises InputError where it cannot tell."""
     chosen = np.ones(len(chunk), bool)
     if classes is not None and classes != EVERY_CLASS:
         if chunk.classification is None:
@@ -257,15 +242,6 @@ def _taken(cloud: Cloud, chosen: np.ndarray) -> Cloud:
 
 def _at(cloud: Cloud, xyz: np.ndarray) -> Cloud:
     return Cloud(xyz, cloud.classification, cloud.returns, cloud.time, cloud.strip, cloud.strips)
-
-
-def _joined(parts: list[Cloud]) -> Cloud:
-    columns = {}
-    for name in _FIELDS:
-        values = [getattr(part, name) for part in parts]
-        if values[0] is not None:
-            columns[name] = np.concatenate(values)
-    return Cloud(**columns, strips=parts[-1].strips)
 
 
 def _compact(cloud: Cloud) -> Cloud:

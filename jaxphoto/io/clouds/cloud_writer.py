@@ -1,7 +1,8 @@
 """Writing clouds: LAS, LAZ, CSV and PLY, whole or not at all."""
 
+import dataclasses
 import errno
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import laspy
 import lazrs
 import numpy as np
 import pandas as pd
+from jaxtyping import Float
 from pyproj import CRS
 
 from jaxphoto.block import Frame
@@ -16,7 +18,7 @@ from jaxphoto.cloud import Cloud
 from jaxphoto.errors import InputError
 from jaxphoto.io.clouds.cloud_reader import open_source
 from jaxphoto.io.clouds.cloud_source import CHUNK, check_file
-from jaxphoto.io.clouds.las import opened, raw_chunks
+from jaxphoto.io.clouds.las import opened, points_and_clouds
 from jaxphoto.io.clouds.placement import Placement
 from jaxphoto.io.clouds.table import RETURNS, XYZ
 from jaxphoto.io.text_tables import natural
@@ -25,6 +27,8 @@ from jaxphoto.writing import whole_file
 # A millimetre holds what a scanner measures, and leaves 4,000 km of room.
 _SCALE_M, _SCALE_DEG = 1e-3, 1e-8
 _LAS = (".las", ".laz")
+# Parts of a cloud, and their coordinates as they are to be written.
+_Parts = Iterator[tuple[Cloud, Float[np.ndarray, "n 3"]]]
 
 
 def write_cloud(
@@ -59,14 +63,47 @@ def write_cloud(
         with _said_of(path), whole_file(path) as work:
             _write_like(cloud, work, Path(like), placement)
         return
-    in_map = frame is not None and frame.kind == "epsg"
+    map_frame = frame if frame is not None and frame.kind == "epsg" else None
     with _said_of(path), whole_file(path) as work:
         if kind in _LAS:
-            _write_las(cloud, work, frame if in_map else None)
-        elif kind == ".csv":
-            _write_csv(cloud, work, frame if in_map else None)
+            _write_las(cloud, work, map_frame)
         else:
-            _write_ply(cloud, work, frame if in_map else None)
+            _WRITERS[kind](_parts(cloud, map_frame), len(cloud), work)
+
+
+def rewrite_cloud(
+    source: str | Path,
+    path: str | Path,
+    moved: Callable[[Cloud], Float[np.ndarray, "n 3"]],
+    *,
+    frame: Frame | None = None,
+    epsg: int | None = None,
+    unit: str | None = None,
+) -> None:
+    """Write to `path` the cloud in the file `source`, of one kind, with other coordinates; part by part, in its order.
+
+    `moved` takes each part as `read_cloud` gives it, those of noise, too, and gives X, Y, Z (m) in the same `frame`.
+    What is written is in the system and units of `source`; of LAS and LAZ with all else that it says of every point, of
+    CSV and PLY with what a `Cloud` holds. Memory holds one part, and nothing is left half-written.
+
+    Raises OSError where it cannot be written whole, and what `read_cloud` and `moved` raise.
+    """
+    source, path = Path(source), Path(path)
+    opened_source = open_source(source, epsg, unit)
+    kind = path.suffix.lower()
+    if kind != source.suffix.lower() and not {kind, source.suffix.lower()} <= set(_LAS):
+        raise InputError(f"{path.name} cannot be written like {source.name}: both must be files of one kind")
+    placement = Placement(opened_source.name, opened_source.system, frame)
+
+    def parts() -> Iterator[tuple[Cloud, np.ndarray]]:
+        for part in opened_source.chunks():
+            yield part, placement.file(moved(_placed(part, placement)))
+
+    with _said_of(path), whole_file(path) as work:
+        if kind in _LAS:
+            _rewrite_las(source, work, placement, moved)
+        else:
+            _WRITERS[kind](parts(), opened_source.most, work)
 
 
 @contextmanager
@@ -78,35 +115,52 @@ def _said_of(path: Path) -> Iterator[None]:
         raise OSError(errno.EIO, f"the file cannot be written whole ({error})", str(path)) from error
 
 
-def _parts(cloud: Cloud, frame: Frame | None):
+def _parts(cloud: Cloud, frame: Frame | None) -> _Parts:
     """The cloud in parts, with coordinates in the system of `frame`."""
     for begin in range(0, len(cloud), CHUNK):
         part = cloud.take(np.arange(begin, min(begin + CHUNK, len(cloud))))
         yield part, part.xyz if frame is None else frame.map.map(part.xyz)
 
 
+def _placed(part: Cloud, placement: Placement) -> Cloud:
+    return dataclasses.replace(part, xyz=placement.checked(part.xyz))
+
+
 def _write_like(cloud: Cloud, path: Path, like: Path, placement: Placement) -> None:
-    with opened(like) as reader:
+    done = 0
+
+    def moved(part: Cloud) -> np.ndarray:
+        nonlocal done
+        done += len(part)
+        return cloud.xyz[done - len(part) : done]
+
+    there = _rewrite_las(like, path, placement, moved)
+    if there != len(cloud):
+        raise InputError(
+            f"{path.name} cannot be written like {like.name}: the cloud has {len(cloud)} points, that file "
+            f"{there}; read the file whole, without filters"
+        )
+
+
+def _rewrite_las(
+    source: Path, path: Path, placement: Placement, moved: Callable[[Cloud], Float[np.ndarray, "n 3"]]
+) -> int:
+    """Write `source` with other coordinates, and say how many points there are; those that `moved` does not give go."""
+    there = 0
+    with opened(source) as reader:
         header = reader.header
         with laspy.open(path, "w", header=header) as writer:
-            done = 0
-            for points in raw_chunks(reader, like):
-                xyz = placement.file(cloud.xyz[done : done + len(points)])
+            for points, part in points_and_clouds(reader, source):
+                there += len(points)
+                xyz = placement.file(moved(_placed(part, placement)))
+                _check_room(xyz, header, source.name)
                 if len(xyz) < len(points):
-                    break
-                _check_room(xyz, header, like.name)
+                    continue
                 points.x, points.y, points.z = xyz.T
                 writer.write_points(points)
-                done += len(points)
-            else:
-                if header.evlrs:
-                    writer.write_evlrs(header.evlrs)
-                if done == len(cloud):
-                    return
-    raise InputError(
-        f"{path.name} cannot be written like {like.name}: the cloud has {len(cloud)} points, that file "
-        f"{header.point_count}; read the file whole, without filters"
-    )
+            if header.evlrs:
+                writer.write_evlrs(header.evlrs)
+    return there
 
 
 def _write_las(cloud: Cloud, path: Path, frame: Frame | None) -> None:
@@ -164,25 +218,26 @@ def _columns(cloud: Cloud) -> dict[str, np.ndarray]:
     return columns
 
 
-def _write_csv(cloud: Cloud, path: Path, frame: Frame | None) -> None:
+def _write_csv(parts: _Parts, count: int | None, path: Path) -> None:
     with path.open("w", encoding="utf-8", newline="") as file:
-        for k, (part, xyz) in enumerate(_parts(cloud, frame)):
+        for k, (part, xyz) in enumerate(parts):
             table = pd.DataFrame(dict(zip(XYZ, xyz.T, strict=True)) | _columns(part))
             if part.strip is not None:
                 table["strip"] = np.array(part.strips, object)[part.strip]
             table.to_csv(file, index=False, header=k == 0)
 
 
-def _write_ply(cloud: Cloud, path: Path, frame: Frame | None) -> None:
-    fields = [(axis, "<f8") for axis in "xyz"] + [(name, v.dtype.str) for name, v in _columns(cloud).items()]
-    if cloud.strip is not None:
-        fields.append(("point_source_id", "<u2"))
+def _write_ply(parts: _Parts, count: int | None, path: Path) -> None:
     named = {"<f8": "double", "|u1": "uchar", "<u2": "ushort"}
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(cloud)}"]
-    header += [f"property {named[kind]} {name}" for name, kind in fields]
     with path.open("wb") as file:
-        file.write("\n".join([*header, "end_header", ""]).encode("ascii"))
-        for part, xyz in _parts(cloud, frame):
+        for k, (part, xyz) in enumerate(parts):
+            fields = [(axis, "<f8") for axis in "xyz"] + [(name, v.dtype.str) for name, v in _columns(part).items()]
+            if part.strip is not None:
+                fields.append(("point_source_id", "<u2"))
+            if k == 0:
+                header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
+                header += [f"property {named[kind]} {name}" for name, kind in fields]
+                file.write("\n".join([*header, "end_header", ""]).encode("ascii"))
             records = np.empty(len(part), fields)
             records["x"], records["y"], records["z"] = xyz.T
             for name, values in _columns(part).items():
@@ -191,3 +246,6 @@ def _write_ply(cloud: Cloud, path: Path, frame: Frame | None) -> None:
                 records["point_source_id"] = _source_ids(part)
             # By `write`, which says why where it cannot.
             file.write(records.tobytes())
+
+
+_WRITERS: dict[str, Callable[[_Parts, int | None, Path], None]] = {".csv": _write_csv, ".ply": _write_ply}

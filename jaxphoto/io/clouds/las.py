@@ -132,36 +132,46 @@ def coordinates(points: laspy.ScaleAwarePointRecord) -> np.ndarray:
 
 
 def _chunks(path: Path) -> Iterator[Cloud]:
-    strips = StripNumbers()
     with opened(path) as reader:
-        low, high = np.asarray(reader.header.mins), np.asarray(reader.header.maxs)
-        # Headers are rounded in their own ways.
-        slack = 2 * np.asarray(reader.header.scales) + 1e-6 * (high - low)
-        has_time = "gps_time" in reader.header.point_format.dimension_names
-        for points in raw_chunks(reader, path):
-            xyz = coordinates(points)
-            outside = ~((xyz >= low - slack) & (xyz <= high + slack)).all(axis=1)
-            if outside.any():
-                at = ", ".join(f"{value:.2f}" for value in xyz[outside][0])
-                raise InputError(
-                    f"{path.name} is damaged: the point ({at}) lies outside the extent that the header gives; copy the "
-                    "file anew from its source, or have its header mended (lasinfo -repair)"
-                )
-            time = np.array(points.gps_time, float) if has_time else None
-            if time is not None and not np.isfinite(time).all():
-                at = ", ".join(f"{value:.2f}" for value in xyz[~np.isfinite(time)][0])
-                raise InputError(
-                    f"{path.name} is damaged: the time of the point ({at}) is no finite number; copy the file anew "
-                    "from its source, or set that time"
-                )
-            yield Cloud(
-                xyz,
-                classification=np.array(points.classification, np.uint8),
-                returns=np.stack([points.return_number, points.number_of_returns], axis=1).astype(np.uint8),
-                time=time,
-                strip=strips.of(np.asarray(points.point_source_id)),
-                strips=strips.names,
+        for _, chunk in points_and_clouds(reader, path):
+            yield chunk
+
+
+def points_and_clouds(reader: laspy.LasReader, path: Path) -> Iterator[tuple[laspy.ScaleAwarePointRecord, Cloud]]:
+    """Part by part, the points of `path`, open, as they stand in it and as a cloud in its own coordinates.
+
+    Raises as `raw_chunks`, and InputError for points that lie or are timed where none can be.
+    """
+    strips = StripNumbers()
+    low, high = np.asarray(reader.header.mins), np.asarray(reader.header.maxs)
+    # Headers are rounded in their own ways.
+    slack = 2 * np.asarray(reader.header.scales) + 1e-6 * (high - low)
+    has_time = "gps_time" in reader.header.point_format.dimension_names
+    for points in raw_chunks(reader, path):
+        xyz = coordinates(points)
+        outside = ~((xyz >= low - slack) & (xyz <= high + slack)).all(axis=1)
+        if outside.any():
+            at = ", ".join(f"{value:.2f}" for value in xyz[outside][0])
+            raise InputError(
+                f"{path.name} is damaged: the point ({at}) lies outside the extent that the header gives; copy the "
+                "file anew from its source, or have its header mended (lasinfo -repair)"
             )
+        time = np.array(points.gps_time, float) if has_time else None
+        if time is not None and not np.isfinite(time).all():
+            at = ", ".join(f"{value:.2f}" for value in xyz[~np.isfinite(time)][0])
+            raise InputError(
+                f"{path.name} is damaged: the time of the point ({at}) is no finite number; copy the file anew "
+                "from its source, or set that time"
+            )
+        cloud = Cloud(
+            xyz,
+            classification=np.array(points.classification, np.uint8),
+            returns=np.stack([points.return_number, points.number_of_returns], axis=1).astype(np.uint8),
+            time=time,
+            strip=strips.of(np.asarray(points.point_source_id)),
+            strips=strips.names,
+        )
+        yield points, cloud
 
 
 def _system(header: laspy.LasHeader, name: str) -> CoordinateSystem:

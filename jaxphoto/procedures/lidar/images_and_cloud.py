@@ -25,11 +25,13 @@ from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import Scanner, Trajectory, raised_by_boresight
 from jaxphoto.lidar import Grid, HeightSettings, index_cloud, nearest
 from jaxphoto.lidar.correction import (
+    ScannerPath,
     ScannerPoses,
     check_covered,
     correct_cloud,
     correct_trajectory,
     corrected_xyz,
+    scanner_path,
     scanner_poses,
 )
 from jaxphoto.lidar.heights import Method
@@ -84,11 +86,11 @@ class Simultaneous(eqx.Module):
 
 
 class _Strip(NamedTuple):
-    """The laser points of one strip as measured, and the trajectory that they were measured from."""
+    """The laser points of one strip as measured, and the path that they were measured from."""
 
     cloud: Cloud
     grid: Grid
-    trajectory: Trajectory | None
+    path: ScannerPath | None
 
 
 def simultaneous(
@@ -135,7 +137,8 @@ def simultaneous(
         check_covered(trajectory, cloud.time)  # type: ignore[arg-type]
     which = tie_points(block, points)
     first = with_interior_held(block)
-    strips = _strips(cloud, names, trajectory if timed else None)
+    path = scanner_path(trajectory) if timed else None  # type: ignore[arg-type]
+    strips = _strips(cloud, names, path)
     none: Scanner = jax.tree.map(np.asarray, Scanner(jnp.zeros(3), dict.fromkeys(names, jnp.zeros(3))))
     strip = np.repeat(np.arange(len(names)), len(which))
 
@@ -180,7 +183,7 @@ def simultaneous(
     found = until_still(first, look, build, max_rounds, report, "surfaces", carry)
     scanner = found.adjusted.unknowns.scanner
     assert scanner is not None
-    corrected, used = correct_cloud(cloud, scanner, trajectory if timed else None), found.used
+    corrected, used = correct_cloud(cloud, scanner, path), found.used
     after = look(found.adjusted)
     return Simultaneous(
         first,
@@ -198,7 +201,7 @@ def simultaneous(
     )
 
 
-def _strips(cloud: Cloud, names: tuple[str, ...], trajectory: Trajectory | None) -> list[_Strip]:
+def _strips(cloud: Cloud, names: tuple[str, ...], path: ScannerPath | None) -> list[_Strip]:
     """The cloud strip by strip."""
     strips = []
     for k, name in enumerate(names):
@@ -207,7 +210,7 @@ def _strips(cloud: Cloud, names: tuple[str, ...], trajectory: Trajectory | None)
             raise InputError(
                 f"strip {name} of the cloud has no points: leave it out, or read other classes and returns"
             )
-        strips.append(_Strip(own, index_cloud(own.xyz), trajectory))
+        strips.append(_Strip(own, index_cloud(own.xyz), path))
     return strips
 
 
@@ -222,8 +225,8 @@ def _near(
 
     def corrected(index: Int[np.ndarray, "m"]) -> tuple[Cloud, ScannerPoses | None]:
         own = strip.cloud.take(index)
-        timed = strip.trajectory is not None and own.time is not None
-        poses = scanner_poses(strip.trajectory, own.time) if timed else None  # type: ignore[arg-type]
+        timed = strip.path is not None and own.time is not None
+        poses = scanner_poses(strip.path, own.time) if timed else None  # type: ignore[arg-type]
         return dataclasses.replace(own, xyz=corrected_xyz(own.xyz, poses, boresight, shift)), poses
 
     order = np.asarray(strip.grid.order)

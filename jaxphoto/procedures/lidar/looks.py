@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxphoto.cloud import Cloud
-from jaxphoto.georeferencing import Pattern, Trajectory
-from jaxphoto.lidar.correction import PORTION, scanner_poses
+from jaxphoto.georeferencing import Pattern
+from jaxphoto.lidar.correction import PORTION, ScannerPath, scanner_poses
 
 # So many returns are probed for the pattern; lines spread less ahead than this part of what they do to the side, and
 # what looks all around spreads more. Of a swath narrower than this part of the height nothing is said.
@@ -29,25 +29,25 @@ class Look(NamedTuple):
     """Which of the cloud."""
 
 
-def looks_of(cloud: Cloud, trajectory: Trajectory | None, pattern: Pattern) -> list[Look]:
+def looks_of(cloud: Cloud, path: ScannerPath | None, pattern: Pattern) -> list[Look]:
     """One of each strip; of a scanner that looks all around two, "1 ahead" and "1 behind" of strip 1."""
     looks = []
     for k, name in enumerate(cloud.strips):
         own = np.flatnonzero(cloud.strip == k)
-        if pattern == "line" or trajectory is None:
+        if pattern == "line" or path is None:
             looks.append(Look(k, name, own))
             continue
-        ahead = _aside(cloud, own, trajectory)[:, 1] > 0
+        ahead = _aside(cloud, own, path)[:, 1] > 0
         sides = (f"{name} ahead", own[ahead]), (f"{name} behind", own[~ahead])
         looks += [Look(k, side, returns) for side, returns in sides if len(returns)]
     return looks
 
 
-def check_pattern(cloud: Cloud, trajectory: Trajectory, pattern: Pattern) -> None:
+def check_pattern(cloud: Cloud, path: ScannerPath, pattern: Pattern) -> None:
     """A UserWarning where the returns lie about the scanner as those of another pattern do."""
     some = np.linspace(0, len(cloud) - 1, _PROBED).astype(int)
     # From the first tenth to the last: a return from above the scanner is as far aside as can be.
-    right, ahead = np.subtract(*np.quantile(_aside(cloud, some, trajectory), (0.9, 0.1), axis=0)) / 2
+    right, ahead = np.subtract(*np.quantile(_aside(cloud, some, path), (0.9, 0.1), axis=0)) / 2
     around = ahead > _ALIKE * right
     if right < _NARROW:
         return
@@ -65,12 +65,12 @@ def check_pattern(cloud: Cloud, trajectory: Trajectory, pattern: Pattern) -> Non
         )
 
 
-def _aside(cloud: Cloud, which: Int[np.ndarray, "n"], trajectory: Trajectory) -> Float[np.ndarray, "n 2"]:
+def _aside(cloud: Cloud, which: Int[np.ndarray, "n"], path: ScannerPath) -> Float[np.ndarray, "n 2"]:
     """Tangents of the angles of returns to the right and ahead, from the body's nadir."""
     parts = [np.zeros((0, 2))]
     for first in range(0, len(which), PORTION):
         own = which[first : first + PORTION]
-        poses = scanner_poses(trajectory, cloud.time[own])  # type: ignore[index]
+        poses = scanner_poses(path, cloud.time[own])  # type: ignore[index]
         shot = np.einsum("nji,nj->ni", poses.object_from_body, cloud.xyz[own] - poses.position)
         parts.append(shot[:, :2] / np.maximum(-shot[:, 2:], 1e-9))
     return np.concatenate(parts)

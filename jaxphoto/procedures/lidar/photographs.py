@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from jaxphoto.block import Block
 from jaxphoto.errors import BlockError, InputError
 from jaxphoto.georeferencing import StripSpline, Trajectory
-from jaxphoto.lidar.correction import scanner_poses
+from jaxphoto.lidar.correction import scanner_path, scanner_poses
 from jaxphoto.lidar.strip_settings import StripSettings
 from jaxphoto.observations import Attitudes, StationRows, TrajectoryAttitudes, TrajectoryStations
 from jaxphoto.procedures.lidar.until_still import check_without_surfaces
@@ -57,7 +57,7 @@ def check_photographs(photographs: Photographs, trajectory: Trajectory | None) -
             "clock (--exposure-shift-s)"
         )
     rows = block.stations
-    at = scanner_poses(trajectory, time[rows.who]).position
+    at = scanner_poses(scanner_path(trajectory), time[rows.who]).position
     off = np.asarray(rows.value) - at[np.arange(len(rows)), rows.axis]
     apart = float(np.median(np.sqrt(np.bincount(rows.who, off**2)[np.unique(rows.who)])))
     if apart > _FAR_M:

@@ -17,7 +17,7 @@ from jaxphoto.adjustment import Adjustment
 from jaxphoto.cloud import Cloud
 from jaxphoto.errors import BlockError, InputError
 from jaxphoto.georeferencing import StripErrors, StripSpline, Trajectory
-from jaxphoto.lidar.correction import check_covered, scanner_poses
+from jaxphoto.lidar.correction import ScannerPath, check_covered, scanner_path, scanner_poses
 from jaxphoto.lidar.strip_correction import correct_flight, correct_strips, times_of
 from jaxphoto.lidar.strip_settings import StripSettings
 from jaxphoto.procedures.adjust import adjust
@@ -125,8 +125,10 @@ def adjust_strips(
         )
     priors = ScannerPriors() if priors is None else priors
     names = _check(cloud, trajectory, held)
-    if trajectory is not None:
-        check_pattern(cloud, trajectory, priors.calibration.pattern)
+    path = None if trajectory is None else scanner_path(trajectory)
+    if path is not None:
+        _check_above(cloud, path)
+        check_pattern(cloud, path, priors.calibration.pattern)
     spans, images = _spans(cloud), None
     if photographs is not None:
         check_photographs(photographs, trajectory)
@@ -141,7 +143,7 @@ def adjust_strips(
         block = strip_block(names, splines, held, settings, priors, images)
     steps = tuple(rows for rows in step_rows(splines, settings) if len(rows))
     pattern = priors.calibration.pattern
-    search, errors = StripSearch(cloud, trajectory, settings, pattern), errors_of(block.start.unknowns, splines)
+    search, errors = StripSearch(cloud, path, settings, pattern), errors_of(block.start.unknowns, splines)
     first = seen = search.look(errors, settled=False)
     check_joined(names, seen)
     ties = None if images is None else TiePointSearch(search, tie_points(images))
@@ -166,7 +168,7 @@ def adjust_strips(
         alone,
         adjusted,
         known,
-        correct_strips(cloud, errors, trajectory),
+        correct_strips(cloud, errors, path),
         None if trajectory is None else correct_flight(trajectory, errors),
         errors,
         _differences(first, seen) + _point_differences(first_on, on),
@@ -199,14 +201,13 @@ def _check(cloud: Cloud, trajectory: Trajectory | None, held: Collection[str]) -
         )
     if trajectory is not None:
         check_covered(trajectory, cloud.time)  # type: ignore[arg-type]
-        _check_above(cloud, trajectory)
     return names
 
 
-def _check_above(cloud: Cloud, trajectory: Trajectory) -> None:
+def _check_above(cloud: Cloud, path: ScannerPath) -> None:
     """Raise BlockError for points that no scanner on this trajectory can have measured, as of another system."""
     some = np.linspace(0, len(cloud) - 1, _PROBED).astype(int)
-    away = np.linalg.norm(cloud.xyz[some] - scanner_poses(trajectory, cloud.time[some]).position, axis=1)  # type: ignore[index]
+    away = np.linalg.norm(cloud.xyz[some] - scanner_poses(path, cloud.time[some]).position, axis=1)  # type: ignore[index]
     if np.median(away) > _FARTHEST_M:
         raise BlockError(
             f"the laser points lie {np.median(away) / 1000:.0f} km from where the trajectory says that the scanner "

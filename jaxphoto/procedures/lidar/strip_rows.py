@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxphoto.compiling import call_compiled
-from jaxphoto.georeferencing import StripErrors, StripSpline, Trajectory
-from jaxphoto.lidar.correction import scanner_poses
-from jaxphoto.lidar.corresponding_planes import PlanePairs, StripPatches
+from jaxphoto.georeferencing import StripErrors, StripSpline
+from jaxphoto.lidar.correction import ScannerPath, scanner_poses
+from jaxphoto.lidar.corresponding_planes import PlanePairs, StripPatches, steep
 from jaxphoto.lidar.strip_correction import corrected_strip
 from jaxphoto.lidar.strip_settings import StripSettings
 from jaxphoto.observations import AttitudeSteps, PositionSteps, StripPlanes
@@ -18,8 +18,6 @@ from jaxphoto.rotation import roll_pitch_yaw_from_matrix
 
 # Steps towards the measured point of a corrected one: each leaves a part of it as small as the corrections are.
 _STEPS = 2
-# Planes steeper than this (degrees) are what tells shifts in X and Y.
-_STEEP_DEG = 5.0
 # An odd multiplier (Knuth) that scatters neighbouring numbers over all of 64 bits.
 _SCATTER = np.uint64(0x9E3779B97F4A7C15)
 
@@ -40,18 +38,18 @@ def side_of(
     foot: Float[np.ndarray, "n 3"],
     strip: int,
     errors: StripErrors,
-    trajectory: Trajectory | None,
+    path: ScannerPath | None,
 ) -> Side:
     """The places `foot` (m, corrected by `errors`) of patches of a strip as it measured them, and from where."""
     time = patches.time[which]
     knots, weights = errors.splines[strip].weights(time)
     point = foot + patches.measured[which] - patches.mean[which]
     for _ in range(_STEPS):
-        point = point - (corrected_strip(point, time, strip, errors, trajectory) - foot)
-    if trajectory is None or not len(time):
+        point = point - (corrected_strip(point, time, strip, errors, path) - foot)
+    if path is None or not len(time):
         # From straight above: nothing that would turn the shot is estimated.
         return Side(knots, weights, point, point + np.array([0.0, 0.0, 1.0]), np.zeros_like(point))
-    poses = scanner_poses(trajectory, time)
+    poses = scanner_poses(path, time)
     return Side(knots, weights, point, poses.position, np.asarray(call_compiled(_angles, poses.object_from_body)))
 
 
@@ -67,9 +65,9 @@ def thinned(normal: Float[np.ndarray, "n 3"], cell: Int[np.ndarray, "n"], most: 
 
     Chance is the cell's, so that the same are taken of nearly the same planes.
     """
-    steep = normal[:, 2] < np.cos(np.deg2rad(_STEEP_DEG))
+    tells = steep(normal)
     order = np.argsort(cell.astype(np.uint64) * _SCATTER, kind="stable")
-    parts = order[steep[order]], order[~steep[order]]
+    parts = order[tells[order]], order[~tells[order]]
     first = min(len(parts[0]), max(most // 2, most - len(parts[1])))
     return np.sort(np.concatenate([parts[0][:first], parts[1][: most - first]]))
 

@@ -9,8 +9,10 @@ from jaxtyping import Bool
 
 from jaxphoto.cloud import Cloud
 from jaxphoto.errors import BlockError
-from jaxphoto.georeferencing import Pattern, StripErrors, Trajectory
-from jaxphoto.lidar.corresponding_planes import PlanePairs, StripPatches, cells_of, corresponding, fitting, planes_of
+from jaxphoto.georeferencing import Pattern, StripErrors
+from jaxphoto.lidar.cell_returns import cells_of
+from jaxphoto.lidar.correction import ScannerPath
+from jaxphoto.lidar.corresponding_planes import PlanePairs, StripPatches, corresponding, fitting, planes_of
 from jaxphoto.lidar.strip_correction import corrected_strip, times_of
 from jaxphoto.lidar.strip_settings import StripSettings
 from jaxphoto.observations import StripPlanes
@@ -39,10 +41,10 @@ class StripSearch:
     """
 
     def __init__(
-        self, cloud: Cloud, trajectory: Trajectory | None, settings: StripSettings, pattern: Pattern = "line"
+        self, cloud: Cloud, path: ScannerPath | None, settings: StripSettings, pattern: Pattern = "line"
     ) -> None:
-        self.cloud, self.trajectory, self.settings = cloud, trajectory, settings
-        self.looks = looks_of(cloud, trajectory, pattern)
+        self.cloud, self.path, self.settings = cloud, path, settings
+        self.looks = looks_of(cloud, path, pattern)
         self.cells: list[np.ndarray] = []
         self.corrected: list[np.ndarray] = []
         """The returns of each look as the last search found them."""
@@ -52,9 +54,9 @@ class StripSearch:
         patches, cells, corrected = [], [], []
         for k, own in enumerate(self.looks):
             measured, time = self.cloud.xyz[own.returns], times_of(self.cloud)[own.returns]
-            xyz = corrected_strip(measured, time, own.strip, errors, self.trajectory)
+            xyz = corrected_strip(measured, time, own.strip, errors, self.path)
             corrected.append(xyz)
-            cells.append(self.cells[k] if settled else cells_of(xyz, self.cloud.extent[0, :2], self.settings))
+            cells.append(self.cells[k] if settled else cells_of(xyz, self.settings))
             patches.append(planes_of(xyz, measured, time, cells[-1], self.settings))
         self.cells, self.corrected = cells, corrected
         pairs = itertools.combinations(range(len(self.looks)), 2)
@@ -75,8 +77,8 @@ class StripSearch:
             share = max(_FEWEST, self.settings.most * len(own) // total)
             own = own[thinned(f.pairs.normal[own], f.pairs.cell[own], share)]
             pairs = PlanePairs(*(v[own] for v in f.pairs))
-            a = side_of(f.patches[0], pairs.a, pairs.foot_a, f.one.strip, errors, self.trajectory)
-            b = side_of(f.patches[1], pairs.b, pairs.foot_b, f.other.strip, errors, self.trajectory)
+            a = side_of(f.patches[0], pairs.a, pairs.foot_a, f.one.strip, errors, self.path)
+            b = side_of(f.patches[1], pairs.b, pairs.foot_b, f.other.strip, errors, self.path)
             parts.append(plane_rows(pairs, a, b))
         return StripPlanes.joined(*parts)
 

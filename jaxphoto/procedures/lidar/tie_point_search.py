@@ -58,7 +58,7 @@ class TiePointSearch:
         groups = []
         for f in (f for f in seen if f.fits.any()):
             found = PointsOnPlanes(*(v[f.fits] for v in f.found))
-            side = side_of(f.patches, found.patch, found.foot, f.look.strip, errors, self.search.trajectory)
+            side = side_of(f.patches, found.patch, found.foot, f.look.strip, errors, self.search.path)
             knots, weights = errors.splines[f.look.strip].all_weights(f.patches.time[found.patch])
             normal = f.patches.normal[found.patch]
             pose = side.scanner, side.roll_pitch_yaw

@@ -1,0 +1,45 @@
+"""Of many rows, derivatives and their products are computed portion by portion, and are the same."""
+
+import jax
+import numpy as np
+import pytest
+
+from jaxphoto.adjustment.model import row_functions
+from jaxphoto.adjustment.model.numbers import zero_increments
+from jaxphoto.adjustment.model.observed_groups import RowsAtPoints
+from jaxphoto.adjustment.solver import non_image_rows
+from jaxphoto.adjustment.solver.optimum import unit_scale
+from tests.blocks import adjusted
+
+
+@pytest.mark.parametrize("at_once", [1, 16 * 7, 16 * 50, 1 << 24])
+def test_products_in_portions_are_those_at_once(at_once, monkeypatch):
+    rng = np.random.default_rng(3)
+    # The last unknown is none: products with it are not asked for.
+    column, shared = rng.integers(0, 10, (4, 50)), rng.normal(size=(2, 4, 50))
+    asked = np.zeros((10, 10))
+    for k in range(50):
+        full = np.zeros((2, 10))
+        np.add.at(full, (slice(None), column[:, k]), shared[:, :, k])
+        asked += full.T @ full
+    monkeypatch.setattr(row_functions, "_AT_ONCE", at_once)
+    found = jax.jit(non_image_rows._add_products)(np.zeros((10, 10)), column, shared)
+    np.testing.assert_allclose(found[:9, :9], asked[:9, :9], atol=1e-12)
+
+
+@pytest.mark.parametrize("at_once", [1, 3000])
+def test_derivatives_in_portions_are_those_at_once(at_once, monkeypatch):
+    equations = adjusted("everything").equations
+    values, s = equations.values, equations.structure
+    at, scale = zero_increments(s), unit_scale(s)
+    listed = [
+        (g, numbers)
+        for g, numbers in zip(s.observed, values.groups, strict=True)
+        if not isinstance(g.rows, RowsAtPoints)
+    ]
+    asked = [row_functions.row_jacobian(*group, at, scale, values, s) for group in listed]
+    monkeypatch.setattr(row_functions, "_AT_ONCE", at_once)
+    found = [row_functions.row_jacobian(*group, at, scale, values, s) for group in listed]
+    assert len(found) > 2
+    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(asked), strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-12)
