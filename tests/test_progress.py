@@ -3,11 +3,14 @@
 import io
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from rich.console import Console
 
+from jaxphoto.cli.cloud_progress import CloudProgress
 from jaxphoto.cli.console import PlainStatus
 from jaxphoto.cli.progress import StepsLeft, in_words
+from jaxphoto.cloud import Cloud
 
 
 @pytest.fixture
@@ -57,3 +60,26 @@ def test_one_hint_where_it_takes_long(shown):
 
 def test_durations_in_words():
     assert [in_words(s) for s in (0.2, 89, 100, 3600, 7000)] == ["1 s", "89 s", "2 min", "60 min", "1.9 h"]
+
+
+def test_parts_of_a_cloud_are_counted_until_it_has_passed_and_anew_when_it_passes_again(shown):
+    cloud = Cloud(np.zeros((30, 3)))
+
+    def parts():
+        for first in (0, 10, 20):
+            shown.now += 5.0
+            yield cloud.take(np.arange(first, first + 10))
+
+    progress = CloudProgress(StepsLeft(shown, shown, clock=lambda: shown.now), shown, 30)
+    told, said = progress.passes(parts), []
+    for _ in range(2):
+        for part in told():
+            assert len(part) == 10
+            said.append(shown.status)
+    progress("writing", cloud)
+    assert said[:3] == ["reading the cloud: 10 of 30, 10 s left", "reading the cloud: 20 of 30, 5 s left",
+                        "reading the cloud: 30 of 30"]  # fmt: skip
+    assert said[3].startswith("reading the cloud again: 10 of 30") and shown.status == "writing: 30 of 30"
+    unknown = CloudProgress(StepsLeft(shown, shown), shown, None)
+    unknown("reading", cloud)
+    assert shown.status == "reading: 30 points"

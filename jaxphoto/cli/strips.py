@@ -12,8 +12,10 @@ from jaxphoto.block import Block, Frame
 from jaxphoto.cli.app import app
 from jaxphoto.cli.choices import one_of
 from jaxphoto.cli.cloud_options import Classes, CloudEpsg, CloudUnit, ReturnsOption, class_numbers, corrected_name
+from jaxphoto.cli.cloud_progress import CloudProgress
 from jaxphoto.cli.console import plain_console
 from jaxphoto.cli.made import made_by
+from jaxphoto.cli.progress import StepsLeft
 from jaxphoto.cloud import Cloud
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import PATTERNS, ScannerCalibration
@@ -143,8 +145,11 @@ def strips_command(
         own = frame if block is not None or frame.kind == "epsg" else None
         track = None if path is None else scanner_path(path)
         parts = partial(clouds.cloud_chunks, cloud, own, classes=chosen, returns=returns, **said)  # type: ignore[arg-type]
+        # Of a file that is filtered nobody knows how much will come.
+        every = chosen is None and returns == "all"
+        progress = CloudProgress(StepsLeft(errors, status), status, clouds.most_points(cloud) if every else None)
         looked_at = kept_returns(
-            parts,
+            progress.passes(parts),
             settings,
             track,
             "line" if priors is None else priors.calibration.pattern,
@@ -163,6 +168,7 @@ def strips_command(
         made, verdict = made_by(context, cloud, trajectory, block), strips_verdict(result, tables)
 
         def moved(part: Cloud) -> Float[np.ndarray, "n 3"]:
+            progress("writing the corrected cloud", part)
             _check_known(part, result)
             corrected = correct_strips(part, result.errors, track).xyz
             seen = clouds.chosen_of(part, chosen, returns, cloud.name)  # type: ignore[arg-type]

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
         cloud_chunks,
         cloud_system,
         extent,
+        most_points,
         read_cloud,
     )
     from jaxphoto.io.clouds.cloud_writer import rewrite_cloud, write_cloud
@@ -21,7 +22,8 @@ _MODULES = {
     "CoordinateSystem": "coordinate_system", "EVERY_CLASS": "cloud_reader", "Placement": "placement",
     "Returns": "cloud_reader", "chosen_of": "cloud_reader", "cloud_chunks": "cloud_reader",
     "cloud_system": "cloud_reader", "extent": "cloud_reader", "frame_system": "coordinate_system",
-    "read_cloud": "cloud_reader", "rewrite_cloud": "cloud_writer", "write_cloud": "cloud_writer",
+    "most_points": "cloud_reader", "read_cloud": "cloud_reader", "rewrite_cloud": "cloud_writer",
+    "write_cloud": "cloud_writer",
 }  # fmt: skip
 
 __all__ = [
@@ -34,6 +36,7 @@ __all__ = [
     "cloud_system",
     "extent",
     "frame_system",
+    "most_points",
     "read_cloud",
     "rewrite_cloud",
     "write_cloud",

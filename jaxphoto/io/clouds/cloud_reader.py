@@ -114,6 +114,11 @@ def cloud_system(path: str | Path, *, epsg: int | None = None, unit: str | None 
     return open_source(path, epsg, unit).system
 
 
+def most_points(path: str | Path) -> int | None:
+    """How many points there are in a cloud at most, by its header; None where only reading tells."""
+    return open_source(path).most
+
+
 def open_source(path: str | Path, epsg: int | None = None, unit: str | None = None) -> CloudSource:
     """A cloud file before its points are read; `epsg` and `unit` in place of what it says of its coordinates."""
     path = Path(path)
