@@ -228,7 +228,8 @@ def heat_map(axes: Axes, values: np.ndarray, rows: Sequence[str], columns: Seque
     axes.set_yticks(range(len(rows)), list(map(drawn, rows)), fontsize=8)
     for i, j in np.ndindex(values.shape):
         colour = "white" if abs(values[i, j]) > 0.6 else "black"
-        axes.text(j, i, f"{values[i, j]:.2f}", ha="center", va="center", fontsize=7, color=colour)
+        # No minus sign before zeros.
+        axes.text(j, i, f"{round(float(values[i, j]), 2) + 0.0:.2f}", ha="center", va="center", fontsize=7, color=colour)
     axes.set_title(title, fontsize=10)
 
 

@@ -78,13 +78,20 @@ def write_strips(
         write_summary(verdict.summary | told | times, work)
 
 
+def _to_be_read(differences: pd.DataFrame) -> pd.DataFrame:
+    """Gaps to the tenth of a millimetre: what is left of their means has no digits of its own."""
+    gaps = differences.select_dtypes(float).round(4)
+    # No minus sign before zeros.
+    return differences.assign(**{str(name): gaps[name] + 0.0 for name in gaps})
+
+
 def _page(
     result: StripAdjustment, scanner: pd.DataFrame, verdict: Verdict, gaps: WholePicture | None, made: Made
 ) -> str:
     parts: list[Element | WholePicture] = [Paragraph(f.text, f.level.name.lower()) for f in verdict.findings]
     parts += [
         Heading("Strips before and after"),
-        rows_of(differences_table(result.differences)),
+        rows_of(_to_be_read(differences_table(result.differences))),
         *([gaps] if gaps else []),
     ]
     pattern = result.errors.calibration.pattern
@@ -106,5 +113,5 @@ def _page(
         parts += [Heading("Errors of the trajectory"), Paragraph(_TRAJECTORY), picture]
     parts += [Heading("Rounds"), rows_of(strip_rounds_table(result.rounds)), *made_section(made)]
     with_photographs = " and photographs" if result.before else ""
-    title = f"{', '.join(f'strip {name}' for name in result.cloud.strips[:6])}{with_photographs}: strip adjustment"
+    title = f"{len(result.cloud.strips)} strips{with_photographs}: strip adjustment"
     return study_page(title, (verdict.headline,), parts, verdict.colour)
