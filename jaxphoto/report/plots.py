@@ -226,10 +226,11 @@ def heat_map(axes: Axes, values: np.ndarray, rows: Sequence[str], columns: Seque
     axes.imshow(values, vmin=-1, vmax=1, cmap="RdBu_r", aspect="auto")
     axes.set_xticks(range(len(columns)), list(map(drawn, columns)), rotation=45, ha="right", fontsize=8)
     axes.set_yticks(range(len(rows)), list(map(drawn, rows)), fontsize=8)
+    # No minus sign before zeros.
+    shown = np.round(values, 2) + 0.0
     for i, j in np.ndindex(values.shape):
         colour = "white" if abs(values[i, j]) > 0.6 else "black"
-        # No minus sign before zeros.
-        axes.text(j, i, f"{round(float(values[i, j]), 2) + 0.0:.2f}", ha="center", va="center", fontsize=7, color=colour)
+        axes.text(j, i, f"{shown[i, j]:.2f}", ha="center", va="center", fontsize=7, color=colour)
     axes.set_title(title, fontsize=10)
 
 
