@@ -8,6 +8,7 @@ from scipy.interpolate import BSpline
 
 from jaxphoto.georeferencing import (
     ScannerCalibration,
+    StripErrors,
     StripSpline,
     corrected_point,
     corrected_return,
@@ -135,3 +136,15 @@ def test_one_knot_is_a_constant():
     knots, weights = StripSpline.constant(3).weights(np.array([0.0, 1e6]))
     assert (knots == 3).all()
     np.testing.assert_array_equal(weights.sum(axis=1), 1.0)
+
+
+@pytest.mark.parametrize("strip", [0, 1, 2])
+def test_what_is_compiled_takes_off_the_same(strip):
+    """Inside a strip and beyond its ends, and of one knot alone."""
+    splines = StripSpline.over(0, 100.0, 131.0, 4.0), StripSpline.over(11, 200.0, 203.0, 4.0), StripSpline.constant(15)
+    position, attitude = np.random.default_rng(2).normal(size=(2, 16, 3))
+    errors = StripErrors(splines, position, attitude, NONE, RIGHT)
+    assert sum(spline.size for spline in splines) == len(position)
+    time = np.linspace(95.0, 210.0, 300)
+    found = errors.of_strip(strip).at(jnp.asarray(time))
+    np.testing.assert_allclose(found, np.hstack(errors.at(strip, time)), atol=1e-12)
