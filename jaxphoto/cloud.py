@@ -7,7 +7,8 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-_OF_POINTS = ("xyz", "classification", "returns", "time", "strip")
+OF_POINTS = ("xyz", "classification", "returns", "time", "strip")
+"""What a `Cloud` says of each point."""
 
 
 class Cloud(eqx.Module):
@@ -30,14 +31,14 @@ class Cloud(eqx.Module):
 
     def take(self, chosen: np.ndarray) -> "Cloud":
         """The points that `chosen` (an index or a mask) names."""
-        kept = {name: v[chosen] for name in _OF_POINTS if (v := getattr(self, name)) is not None}
+        kept = {name: v[chosen] for name in OF_POINTS if (v := getattr(self, name)) is not None}
         return dataclasses.replace(self, **kept)
 
     @staticmethod
     def joined(parts: Sequence["Cloud"]) -> "Cloud":
         """Parts of one cloud as a whole; the strips of the last are those of all."""
         columns = {}
-        for name in _OF_POINTS:
+        for name in OF_POINTS:
             values = [getattr(part, name) for part in parts]
             if values[0] is not None:
                 columns[name] = np.concatenate(values)

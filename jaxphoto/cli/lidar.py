@@ -205,7 +205,6 @@ def simultaneous_command(
         )
         status.update(f"writing {out}")
         made = made_by(context, block, cloud, trajectory)
-
         track = None if path is None else scanner_path(path)
 
         def corrected(part: Cloud) -> Float[np.ndarray, "n 3"]:

@@ -21,8 +21,6 @@ from jaxphoto.lidar.strip_settings import StripSettings
 _SPREAD = 0.15
 # Means of two patches that lie closer, as a part of the cell, are of one place.
 _CLOSE = 0.3
-
-
 # Planes steeper than this (degrees) are what tells shifts in X and Y.
 _STEEP_DEG = 5.0
 

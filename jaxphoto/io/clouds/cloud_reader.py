@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Real
 
 from jaxphoto.block import Frame
-from jaxphoto.cloud import Cloud
+from jaxphoto.cloud import OF_POINTS, Cloud
 from jaxphoto.errors import InputError
 from jaxphoto.io.clouds.cloud_source import CloudSource, check_file
 from jaxphoto.io.clouds.coordinate_system import CoordinateSystem, epsg_system
@@ -31,7 +31,6 @@ NOISE = (7, 18)
 """Classes of blunders, low and high, which are read only where they are asked for."""
 EVERY_CLASS = range(256)
 """All classes, those of blunders, too, and points of a file without classes."""
-_FIELDS = ("xyz", "classification", "returns", "time", "strip")
 _NO_EXTENT = np.array([[np.inf] * 3, [-np.inf] * 3])
 
 
@@ -64,7 +63,7 @@ def read_cloud(
     columns: dict[str, np.ndarray] = {}
     kept, strips = 0, tuple[str, ...]()
     for chunk in chunks:
-        present = {name: values for name in _FIELDS if (values := getattr(chunk, name)) is not None}
+        present = {name: values for name in OF_POINTS if (values := getattr(chunk, name)) is not None}
         for name, values in present.items():
             if name not in columns:
                 columns[name] = _room(source, values)
@@ -147,7 +146,7 @@ def _placed(
     for chunk in source.chunks():
         tally.count(chunk)
         part = _taken(chunk, chosen_of(chunk, classes, returns, source.name))
-        part = _at(part, placement.checked(part.xyz))
+        part = placement.placed(part)
         if within is not None:
             part = _taken(part, ((part.xyz[:, :2] >= within[0]) & (part.xyz[:, :2] <= within[1])).all(axis=1))
         kept += len(part)
@@ -243,10 +242,6 @@ def _room(source: CloudSource, values: np.ndarray) -> np.ndarray:
 def _taken(cloud: Cloud, chosen: np.ndarray) -> Cloud:
     """`Cloud.take` of a mask; no copy where it is all."""
     return cloud if chosen.all() else cloud.take(chosen)
-
-
-def _at(cloud: Cloud, xyz: np.ndarray) -> Cloud:
-    return Cloud(xyz, cloud.classification, cloud.returns, cloud.time, cloud.strip, cloud.strips)
 
 
 def _compact(cloud: Cloud) -> Cloud:

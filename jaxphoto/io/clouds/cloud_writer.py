@@ -1,6 +1,5 @@
 """Writing clouds: LAS, LAZ, CSV and PLY, whole or not at all."""
 
-import dataclasses
 import errno
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -95,15 +94,15 @@ def rewrite_cloud(
         raise InputError(f"{path.name} cannot be written like {source.name}: both must be files of one kind")
     placement = Placement(opened_source.name, opened_source.system, frame)
 
-    def parts() -> Iterator[tuple[Cloud, np.ndarray]]:
-        for part in opened_source.chunks():
-            yield part, placement.file(moved(_placed(part, placement)))
+    def to_write(part: Cloud) -> np.ndarray:
+        return placement.file(moved(placement.placed(part)))
 
     with _said_of(path), whole_file(path) as work:
         if kind in _LAS:
-            _rewrite_las(source, work, placement, moved)
+            _rewrite_las(source, work, to_write)
         else:
-            _WRITERS[kind](parts(), opened_source.most, work)
+            parts = ((part, to_write(part)) for part in opened_source.chunks())
+            _WRITERS[kind](parts, opened_source.most, work)
 
 
 @contextmanager
@@ -122,19 +121,15 @@ def _parts(cloud: Cloud, frame: Frame | None) -> _Parts:
         yield part, part.xyz if frame is None else frame.map.map(part.xyz)
 
 
-def _placed(part: Cloud, placement: Placement) -> Cloud:
-    return dataclasses.replace(part, xyz=placement.checked(part.xyz))
-
-
 def _write_like(cloud: Cloud, path: Path, like: Path, placement: Placement) -> None:
     done = 0
 
-    def moved(part: Cloud) -> np.ndarray:
+    def to_write(part: Cloud) -> np.ndarray:
         nonlocal done
         done += len(part)
-        return cloud.xyz[done - len(part) : done]
+        return placement.file(cloud.xyz[done - len(part) : done])
 
-    there = _rewrite_las(like, path, placement, moved)
+    there = _rewrite_las(like, path, to_write)
     if there != len(cloud):
         raise InputError(
             f"{path.name} cannot be written like {like.name}: the cloud has {len(cloud)} points, that file "
@@ -142,17 +137,18 @@ def _write_like(cloud: Cloud, path: Path, like: Path, placement: Placement) -> N
         )
 
 
-def _rewrite_las(
-    source: Path, path: Path, placement: Placement, moved: Callable[[Cloud], Float[np.ndarray, "n 3"]]
-) -> int:
-    """Write `source` with other coordinates, and say how many points there are; those that `moved` does not give go."""
+def _rewrite_las(source: Path, path: Path, to_write: Callable[[Cloud], Float[np.ndarray, "n 3"]]) -> int:
+    """Write `source` with other coordinates of its own system, and say how many points it has.
+
+    A part of which `to_write` gives fewer coordinates than points is left out.
+    """
     there = 0
     with opened(source) as reader:
         header = reader.header
         with laspy.open(path, "w", header=header) as writer:
             for points, part in points_and_clouds(reader, source):
                 there += len(points)
-                xyz = placement.file(moved(_placed(part, placement)))
+                xyz = to_write(part)
                 _check_room(xyz, header, source.name)
                 if len(xyz) < len(points):
                     continue

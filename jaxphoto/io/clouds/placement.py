@@ -1,5 +1,6 @@
 """From the coordinates of a cloud or raster to the frame of a block, and back."""
 
+import dataclasses
 import warnings
 
 import numpy as np
@@ -9,6 +10,7 @@ from pyproj.aoi import AreaOfInterest
 from pyproj.transformer import TransformerGroup
 
 from jaxphoto.block import Frame
+from jaxphoto.cloud import Cloud
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing.map_frame import MapFrame, Place, map_system
 from jaxphoto.io.clouds.coordinate_system import CoordinateSystem
@@ -86,6 +88,10 @@ class Placement:
                 f"name the system of the file ({self.option})"
             )
         return placed
+
+    def placed(self, cloud: Cloud) -> Cloud:
+        """A cloud in coordinates of the file, in the frame of the block. Raises as `checked`."""
+        return dataclasses.replace(cloud, xyz=self.checked(cloud.xyz))
 
 
 def _check_kinds(name: str, system: CoordinateSystem, frame: Frame | None, option: str) -> None:

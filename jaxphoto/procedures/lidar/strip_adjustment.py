@@ -18,7 +18,7 @@ from jaxphoto.cloud import Cloud
 from jaxphoto.errors import BlockError, InputError
 from jaxphoto.georeferencing import StripErrors, StripSpline, Trajectory
 from jaxphoto.lidar.correction import ScannerPath, check_covered, scanner_path, scanner_poses
-from jaxphoto.lidar.strip_correction import correct_flight, correct_strips, times_of
+from jaxphoto.lidar.strip_correction import correct_flight, times_of
 from jaxphoto.lidar.strip_settings import StripSettings
 from jaxphoto.procedures.adjust import adjust
 from jaxphoto.procedures.lidar.looks import check_pattern
@@ -168,7 +168,7 @@ def adjust_strips(
         alone,
         adjusted,
         known,
-        correct_strips(cloud, errors, path),
+        search.corrected_cloud,
         None if trajectory is None else correct_flight(trajectory, errors),
         errors,
         _differences(first, seen) + _point_differences(first_on, on),

@@ -1,5 +1,6 @@
 """Looking for planes that two strips have in common, in the cloud as it is corrected so far."""
 
+import dataclasses
 import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -61,6 +62,14 @@ class StripSearch:
         self.cells, self.corrected = cells, corrected
         pairs = itertools.combinations(range(len(self.looks)), 2)
         return [found for one, other in pairs if (found := self._common(one, other, patches)) is not None]
+
+    @property
+    def corrected_cloud(self) -> Cloud:
+        """The cloud as the last search found it; all its other fields are kept."""
+        xyz = np.empty_like(self.cloud.xyz)
+        for own, corrected in zip(self.looks, self.corrected, strict=True):
+            xyz[own.returns] = corrected
+        return dataclasses.replace(self.cloud, xyz=xyz)
 
     def _common(self, one: int, other: int, patches: list[StripPatches]) -> CommonPlanes | None:
         pairs = corresponding(patches[one], patches[other], self.settings)
