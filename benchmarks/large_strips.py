@@ -10,6 +10,7 @@ import argparse
 import copy
 import json
 import os
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -34,7 +35,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=5)
     arguments = parser.parse_args()
     print(sentence(machine()))
-    folder = arguments.folder
+    folder = arguments.folder.resolve()
     folder.mkdir(parents=True, exist_ok=True)
     if not (folder / "flight.json").exists():
         fly(folder, arguments.density, arguments.seed)
@@ -42,8 +43,9 @@ def main() -> int:
     command = [sys.executable, "-c", "from jaxphoto_command import main; main()", "strips", folder / "cloud.laz"]
     command += ["--trajectory", folder / "trajectory.csv", "--out", folder / "results", *_OPTIONS.split()]
     began = time.perf_counter()
-    child = os.spawnv(os.P_NOWAIT, sys.executable, [*map(str, command), "--most-planes", str(arguments.planes)])
-    _, status, used = os.wait4(child, 0)
+    child = subprocess.Popen([*command, "--most-planes", str(arguments.planes)], cwd=HERE.parent)
+    # As `wait`, and what it used.
+    _, status, used = os.wait4(child.pid, 0)
     took = time.perf_counter() - began
     print(
         f"{flight['returns'] / 1e6:.1f} million returns, {took:.0f} s, {used.ru_utime + used.ru_stime:.0f} s of "
