@@ -24,6 +24,7 @@ import numpy as np
 
 from jaxphoto.errors import InputError, quoted
 from jaxphoto.io.block_folder import BlockTables
+from jaxphoto.io.block_folder.camera_section import PIXEL_MM
 from jaxphoto.io.block_folder.table_layout import ANGLES, SIGMA_XYZ, XYZ
 from jaxphoto.io.dbat import CAMERA, control_table
 from jaxphoto.io.text_tables import Table, finite, is_number, read_columns
@@ -145,10 +146,13 @@ def _camera(path: Path, lines: list[str]) -> dict[str, Any]:
     c, px, py, width_mm, height_mm, *coefficients = _numbers(path, 4, lines[3].split(), 10)
     if min(width, height, width_mm, height_mm) <= 0:
         raise InputError(f"{path.name}: the format of the camera is not positive; export it again")
-    square = abs(width_mm / width * height / height_mm - 1) < _SQUARE
+    sides = width_mm / width, height_mm / height
+    if not all(PIXEL_MM[0] <= side <= PIXEL_MM[1] for side in sides):
+        raise InputError(f"{path.name}: pixels of {sides[0]:g} x {sides[1]:g} mm cannot be; export it again")
+    square = abs(sides[0] / sides[1] - 1) < _SQUARE
     # The affinity makes all x as long as if pixels were square before anything else is applied.
-    pixel = width_mm / width if square else height_mm / height
-    b1 = 0.0 if square else 1.0 - width_mm / width / pixel
+    pixel = sides[0] if square else sides[1]
+    b1 = 0.0 if square else 1.0 - sides[0] / pixel
     interior = {
         "c_mm": c,
         "xp_mm": px / (1.0 - b1) - pixel * (width / 2 + 0.5),

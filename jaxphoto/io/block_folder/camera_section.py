@@ -29,7 +29,7 @@ _KEYS = ("width_px", "height_px", "pixel_mm", "distortion", "projection", "resid
 # A principal distance beyond these multiples of the format's diagonal is in another unit than millimetres.
 _LONGEST, _SHORTEST = 20.0, 0.05
 # Pixels of known sensors are 0.5 to 50 micrometres.
-_PIXEL_MM = (2e-4, 0.1)
+PIXEL_MM = (2e-4, 0.1)
 
 Part = TypeVar("Part", bound=Declared)
 
@@ -58,7 +58,7 @@ def read_camera(section: Section) -> Camera:
     projection = _kind(section, "projection", AbstractProjection.called, Perspective.name)
     section.known(*_KEYS, *distortion.choices, *projection.choices, "interior", "unknowns", "known")
     sensor = Sensor(section.count("width_px"), section.count("height_px"), section.positive("pixel_mm"))
-    if not _PIXEL_MM[0] <= sensor.pixel_mm <= _PIXEL_MM[1]:
+    if not PIXEL_MM[0] <= sensor.pixel_mm <= PIXEL_MM[1]:
         raise section.error("pixel_mm", f"a pixel of {sensor.pixel_mm:g} mm cannot be; give its size in millimetres")
     empty = _empty_interior(section, distortion, projection)
     interior = _read_interior(section.section("interior"), empty, sensor)
