@@ -1,14 +1,15 @@
 """`jaxphoto strips` on a simulated flight of ten strips and many returns: time, memory, and whether the truth is found.
 
-python benchmarks/large_strips.py FOLDER [--density 4] [--planes 4000] [--seed 5]
+python benchmarks/large_strips.py FOLDER [--density 4] [--planes 4000] [--photographs 1000] [--ties 10000] [--seed 5]
 
 The flight is that of the tests with eight parallel and two crossing strips of 2 to 3 km; 4 returns a square metre are
-50 million. Cloud and trajectory are kept in FOLDER and taken from there if they are there already.
+50 million. With photographs these are adjusted together with the strips, which are so long that there are as many, with
+80 % of overlap: 1,000 photographs and one return a square metre are 50 million, too. The flight is kept in FOLDER and
+taken from there if it is there already.
 """
 
 import argparse
 import copy
-import json
 import os
 import subprocess
 import sys
@@ -32,54 +33,69 @@ def main() -> int:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--density", type=float, default=4.0, help="returns a square metre of each strip")
     parser.add_argument("--planes", type=int, default=4000)
+    parser.add_argument("--photographs", type=int, default=0, help="about so many, taken with the strips")
+    parser.add_argument("--ties", type=int, default=10_000, help="tie points of the photographs")
     parser.add_argument("--seed", type=int, default=5)
     arguments = parser.parse_args()
+    from jaxphoto.io.clouds import most_points
+    from jaxphoto.io.recipe.truth import read_truth
+
     print(sentence(machine()))
     folder = arguments.folder.resolve()
     folder.mkdir(parents=True, exist_ok=True)
-    if not (folder / "flight.json").exists():
-        fly(folder, arguments.density, arguments.seed)
-    flight = json.loads((folder / "flight.json").read_text(encoding="utf-8"))
-    command = [sys.executable, "-c", "from jaxphoto_command import main; main()", "strips", folder / "cloud.laz"]
-    command += ["--trajectory", folder / "trajectory.csv", "--out", folder / "results", *_OPTIONS.split()]
+    if not (folder / "flight" / "cloud.laz").exists():
+        fly(folder / "flight", arguments)
+    flight = folder / "flight"
+    command = [sys.executable, "-c", "from jaxphoto_command import main; main()", "strips", flight / "cloud.laz"]
+    command += ["--trajectory", flight / "trajectory.csv", "--out", folder / "results", *_OPTIONS.split()]
+    if arguments.photographs:
+        command += ["--block", flight]
     began = time.perf_counter()
     child = subprocess.Popen([*command, "--most-planes", str(arguments.planes)], cwd=HERE.parent)
     # As `wait`, and what it used.
     _, status, used = os.wait4(child.pid, 0)
     took = time.perf_counter() - began
     print(
-        f"{flight['returns'] / 1e6:.1f} million returns, {took:.0f} s, {used.ru_utime + used.ru_stime:.0f} s of "
-        f"processor, {used.ru_maxrss / 1e6:.2f} GB, exit code {os.waitstatus_to_exitcode(status)}"
+        f"{most_points(flight / 'cloud.laz') / 1e6:.1f} million returns, {took:.0f} s, "
+        f"{used.ru_utime + used.ru_stime:.0f} s of processor, {used.ru_maxrss / 1e6:.2f} GB, exit code "
+        f"{os.waitstatus_to_exitcode(status)}"
     )
-    found = pd.read_csv(folder / "results" / "scanner.csv").set_index("parameter")
-    for name, true in flight["truth"].items():
-        value, sigma = found.loc[name, ["value", "sigma"]]
-        print(f"  {name}: {value:.5g}, sigma {sigma:.2g}, off by {(value - true) / sigma:+.2f} sigma")
+    if not (folder / "results").exists():
+        return 1
+    truth = read_truth(flight)
+    for name in ("scanner", "georeferencing", "interior") if arguments.photographs else ("scanner",):
+        keys = [key for key in truth[name].columns if key != "value"]
+        both = truth[name].merge(pd.read_csv(folder / "results" / f"{name}.csv"), on=keys, suffixes=("_true", ""))
+        for row in both[both["sigma"] > 0].to_dict("records"):
+            off = (row["value"] - row["value_true"]) / row["sigma"]
+            label = " ".join(str(row[key]) for key in keys)
+            print(f"  {label}: {row['value']:.5g}, sigma {row['sigma']:.2g}, off by {off:+.2f} sigma")
     print((folder / "results" / "rounds.csv").read_text(encoding="utf-8"))
     return 0
 
 
-def fly(folder: Path, density: float, seed: int) -> None:
-    """Simulate, and write the cloud, its trajectory and the truth."""
-    from jaxphoto.io.recipe.scan_files import write_scan
-    from tests.procedures.strips import STRIPS, TRUTH
+def fly(folder: Path, arguments: argparse.Namespace) -> None:
+    """Simulate, and write block, cloud, trajectory and the truth."""
+    from jaxphoto.io import write_simulation
+    from tests.procedures.joint import JOINT
+    from tests.procedures.strips import STRIPS
     from tests.simulation.small import made
 
-    recipe = copy.deepcopy(STRIPS)
-    along = [
-        {"name": f"S{k}", "heading_deg": 90.0 + 180.0 * (k % 2), "images": 12, "across_spacings": 0.4 * (k - 4)}
+    recipe = copy.deepcopy(JOINT if arguments.photographs else STRIPS)
+    along, across = 12, 8
+    if arguments.photographs:
+        along, across = round(0.108 * arguments.photographs), round(0.068 * arguments.photographs)
+        recipe["flight.forward_overlap_percent"] = 80
+    recipe["flight.strips"] = [
+        {"name": f"S{k}", "heading_deg": 90.0 + 180.0 * (k % 2), "images": along, "across_spacings": 0.4 * (k - 4)}
         for k in range(8)
     ]
-    across = [{"name": f"X{k}", "heading_deg": 180.0 * k, "images": 8, "across_spacings": 0.6 * k} for k in range(2)]
-    recipe["flight.strips"], recipe["points"] = along + across, {"ties": 600}
-    recipe["lidar"]["density_per_m2"] = density
-    flight = made(recipe, seed)
-    assert flight.cloud is not None and flight.trajectory is not None
-    write_scan(flight.cloud, flight.trajectory, folder)
-    axes = zip(("right", "forward", "up"), TRUTH["boresight_deg"], strict=True)
-    truth = {f"scanner.boresight_{axis}_deg": value for axis, value in axes}
-    truth |= {f"scanner_calibration.{name}": TRUTH[name] for name in ("range_offset_m", "angle_scale_ppm")}
-    (folder / "flight.json").write_text(json.dumps({"returns": len(flight.cloud), "truth": truth}), encoding="utf-8")
+    recipe["flight.strips"] += [
+        {"name": f"X{k}", "heading_deg": 180.0 * k, "images": across, "across_spacings": 0.6 * k} for k in range(2)
+    ]
+    recipe["points"] = {"ties": arguments.ties if arguments.photographs else 600}
+    recipe["lidar"]["density_per_m2"] = arguments.density
+    write_simulation(made(recipe, arguments.seed), folder)
 
 
 if __name__ == "__main__":
