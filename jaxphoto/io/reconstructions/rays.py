@@ -25,8 +25,10 @@ def ray_misfit(
     normal, right = np.zeros((point.max() + 1, 3, 3)), np.zeros((point.max() + 1, 3))
     np.add.at(normal, point, across)
     np.add.at(right, point, np.einsum("nij,nj->ni", across, start))
-    # Parallel rays meet nowhere: a little of the unit matrix keeps their place finite.
-    at = np.linalg.solve(normal + 1e-12 * np.eye(3), right[:, :, None])[:, :, 0]
+    # Parallel rays meet nowhere: a little of the unit matrix, more than the rounding of as many rays, keeps their place
+    # finite.
+    little = 1e-12 * np.maximum(np.einsum("pii->p", normal), 1.0)[:, None, None] * np.eye(3)
+    at = np.linalg.solve(normal + little, right[:, :, None])[:, :, 0]
     to = at[point] - start
     off = np.linalg.norm(np.einsum("nij,nj->ni", across, to), axis=1)
     ahead = np.einsum("ni,ni->n", along, to)
