@@ -11,10 +11,13 @@ taken from there if it is there already.
 import argparse
 import copy
 import os
+import shutil
 import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pandas as pd
 from machine import HERE, machine, sentence
@@ -37,17 +40,19 @@ def main() -> int:
     parser.add_argument("--ties", type=int, default=10_000, help="tie points of the photographs")
     parser.add_argument("--seed", type=int, default=5)
     arguments = parser.parse_args()
+    from jaxphoto.io import read_truth
     from jaxphoto.io.clouds import most_points
-    from jaxphoto.io.recipe.truth import read_truth
+    from jaxphoto.report import recovery_table
 
     print(sentence(machine()))
     folder = arguments.folder.resolve()
-    folder.mkdir(parents=True, exist_ok=True)
-    if not (folder / "flight" / "cloud.laz").exists():
-        fly(folder / "flight", arguments)
-    flight = folder / "flight"
+    flight, results = folder / "flight", folder / "results"
+    if not (flight / "cloud.laz").exists():
+        fly(flight, arguments)
+    # So that those of an earlier run are not taken for what this one found.
+    shutil.rmtree(results, ignore_errors=True)
     command = [sys.executable, "-c", "from jaxphoto_command import main; main()", "strips", flight / "cloud.laz"]
-    command += ["--trajectory", flight / "trajectory.csv", "--out", folder / "results", *_OPTIONS.split()]
+    command += ["--trajectory", flight / "trajectory.csv", "--out", results, *_OPTIONS.split()]
     if arguments.photographs:
         command += ["--block", flight]
     began = time.perf_counter()
@@ -60,17 +65,18 @@ def main() -> int:
         f"{used.ru_utime + used.ru_stime:.0f} s of processor, {used.ru_maxrss / 1e6:.2f} GB, exit code "
         f"{os.waitstatus_to_exitcode(status)}"
     )
-    if not (folder / "results").exists():
+    if not results.exists():
         return 1
     truth = read_truth(flight)
-    for name in ("scanner", "georeferencing", "interior") if arguments.photographs else ("scanner",):
-        keys = [key for key in truth[name].columns if key != "value"]
-        both = truth[name].merge(pd.read_csv(folder / "results" / f"{name}.csv"), on=keys, suffixes=("_true", ""))
-        for row in both[both["sigma"] > 0].to_dict("records"):
-            off = (row["value"] - row["value_true"]) / row["sigma"]
-            label = " ".join(str(row[key]) for key in keys)
-            print(f"  {label}: {row['value']:.5g}, sigma {row['sigma']:.2g}, off by {off:+.2f} sigma")
-    print((folder / "results" / "rounds.csv").read_text(encoding="utf-8"))
+    camera = truth["interior"]
+    camera = camera.assign(parameter="interior[" + camera["camera"] + "]." + camera["parameter"])
+    told = pd.concat([truth["scanner"], truth["georeferencing"], camera[["parameter", "value"]]])
+    # scanner.csv has mounts and cameras, too.
+    found: Any = SimpleNamespace(interior=None, georeferencing=pd.read_csv(results / "scanner.csv"))
+    for row in recovery_table(found, {"georeferencing": told}).to_dict("records"):
+        value = f"{row['estimate']:.5g}, sigma {row['sigma']:.2g}, off by {row['ratio']:+.2f} sigma"
+        print(f"  {row['parameter']}: {value}")
+    print((results / "rounds.csv").read_text(encoding="utf-8"))
     return 0
 
 
