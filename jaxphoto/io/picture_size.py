@@ -15,16 +15,18 @@ _FREE_BYTES = 200_000_000
 _LEAST_BYTES = 0.02
 
 
-def check_pixels(path: Path, width: int, height: int, bytes_each: int = 1) -> None:
+def check_pixels(path: Path, width: int, height: int, bytes_each: int = 1, bands: int = 1) -> None:
     """Raise InputError for a picture or raster that says it has far more pixels than its file can hold.
 
-    Memory, `bytes_each` a pixel, is taken by what it says: a damaged number, or a picture of one colour, else fills it.
+    Memory, `bytes_each` a pixel of each of its bands, is taken by what it says: a damaged number, or a picture of one
+    colour, else fills it.
     """
-    pixels = width * height
+    pixels = width * height * bands
     if pixels * bytes_each > _FREE_BYTES and pixels * _LEAST_BYTES > path.stat().st_size:
+        in_bands = f" in {bands} bands" if bands > 4 else ""
         raise InputError(
-            f"{path.name} says it has {width} x {height} pixels, which is far more than its {path.stat().st_size} "
-            "bytes can show; if it is not damaged, store it without compression"
+            f"{path.name} says it has {width} x {height} pixels{in_bands}, which is far "
+            f"more than its {path.stat().st_size} bytes can show; if it is not damaged, store it without compression"
         )
 
 

@@ -166,6 +166,12 @@ def test_rasters_that_are_no_surface_models(tmp_path):
         pass
     with pytest.raises(InputError, match="40000 x 40000 pixels, which is far more than its"):
         raster.read_dsm(tmp_path / "empty.tif")
+    # All bands of a tile are in one piece of memory.
+    bands = kind | {"count": 5_000, "transform": north_up(5, 5, 1, 1)}
+    with rasterio.open(tmp_path / "deep.tif", "w", **bands, tiled=True, interleave="pixel", sparse_ok=True):
+        pass
+    with pytest.raises(InputError, match="256 x 256 pixels in 5000 bands, which is far more than its"):
+        raster.read_dsm(tmp_path / "deep.tif")
 
 
 def test_heights_that_are_none(tmp_path):

@@ -31,7 +31,7 @@ def read_photograph(path: str | Path, sensor: Sensor) -> np.ndarray:
                 f"{path.name} has {file.width} x {file.height} pixels, but its camera {sensor.width_px} x "
                 f"{sensor.height_px}; name {'the photograph as it was before it was turned' if turned else 'another'}"
             )
-        check_pixels(path, file.width, file.height, sum(np.dtype(kind).itemsize for kind in file.dtypes))
+        check_pixels(path, file.width, file.height, max(np.dtype(kind).itemsize for kind in file.dtypes), file.count)
         return file.read()
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import rasterio
 from jaxtyping import Float
 from pyproj import CRS
+from rasterio.enums import Interleaving
 
 from jaxphoto.errors import InputError
 from jaxphoto.io.clouds.cloud_source import check_file
@@ -62,6 +63,10 @@ def read_dsm(path: str | Path, epsg: int | None = None) -> tuple[Raster, Coordin
     check_file(path)
     with opened_raster(path) as file:
         check_pixels(path, file.width, file.height, _BYTES)
+        if file.interleaving == Interleaving.pixel:
+            # Of the first band alone a whole tile cannot be read.
+            tile_height, tile_width = file.block_shapes[0]
+            check_pixels(path, tile_width, tile_height, np.dtype(file.dtypes[0]).itemsize, file.count)
         bands = file.read(1, masked=True)
         place, crs = file.transform, file.crs
     if epsg is not None:
