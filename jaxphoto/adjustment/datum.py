@@ -6,21 +6,19 @@ perhaps together with a free shift or lever arm. What none sees is the datum def
 it.
 """
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from scipy.sparse import csr_array
 
+from jaxphoto.adjustment.datum_sensitivity import DatumRows, Sensitivity, row_sensitivity
 from jaxphoto.adjustment.datum_words import datum_sentence
-from jaxphoto.adjustment.model.block_values import with_start
-from jaxphoto.adjustment.model.numbers import UnknownArrays, Values, zero_increments
-from jaxphoto.adjustment.model.observed_groups import ObservedGroup
-from jaxphoto.adjustment.model.row_functions import group_residuals, rows_of
+from jaxphoto.adjustment.model.numbers import Values
+from jaxphoto.adjustment.model.row_functions import rows_of
 from jaxphoto.adjustment.model.structure import Structure
-from jaxphoto.adjustment.solver.similarity import motions, similarity
+from jaxphoto.adjustment.solver.similarity import motions
 from jaxphoto.arrays import still
 from jaxphoto.block import Block
 from jaxphoto.camera import RollingShutter
@@ -28,17 +26,8 @@ from jaxphoto.compiling import jit_quickly
 from jaxphoto.errors import DatumError
 from jaxphoto.observations import PRIORS, ControlRows
 
-# Singular values of the scaled sensitivity below this are zero.
-_OPEN = 1e-9
 # A rotation (rad), or a scale, that observations know no better than this is as good as open: it is no longer small.
 _VAGUE = 0.05
-
-
-class DatumRows(NamedTuple):
-    """How each increment moves under the seven motions (about the centroid, shifts in units of the block's size)."""
-
-    eop: Float[np.ndarray, "7 6 images"]
-    points: Float[np.ndarray, "7 3 points"]
 
 
 def close_datum(block: Block, values: Values, structure: Structure) -> DatumRows:
@@ -54,9 +43,9 @@ def close_datum(block: Block, values: Values, structure: Structure) -> DatumRows
         values = _as_observed(block, values)
     if _plainly_closed(block, values, structure, _VAGUE if judged else np.inf):
         return DatumRows(np.zeros((0, 6, structure.n_images)), np.zeros((0, 3, structure.n_points)))
-    motions, centre, size = _motions(values)
-    sensitivity, named = _datum_sensitivity(block, values, structure, motions, centre, size)
-    null_motions = _null_motions(sensitivity)
+    motions = _motions(values)
+    sensitivity, named = _datum_sensitivity(block, values, structure, motions)
+    null_motions = sensitivity.null_motions()
     null = _combine(motions, null_motions)
     scale_open = bool(len(null_motions)) and bool(np.abs(null_motions[:, 6]).max() > 1e-6)
     if scale_open and any(t.kind == RollingShutter.kind for t in structure.tables):
@@ -144,34 +133,27 @@ def _plainly_closed(block: Block, values: Values, structure: Structure, vague: f
     return False
 
 
-def _check_vague(block: Block, sensitivity: np.ndarray, named: list[str]) -> None:
+def _check_vague(block: Block, sensitivity: Sensitivity, named: list[str]) -> None:
     """Raise DatumError where observations close the datum by their noise alone, as control on a line does."""
-    by_motion, by_shared = sensitivity[:, :7], sensitivity[:, 7:]
-    norm = np.sqrt((by_shared**2).sum(0))
-    by_shared = by_shared / np.where(norm > 0, norm, 1.0)
-    seen = by_motion - by_shared @ np.linalg.lstsq(by_shared, by_motion, rcond=_OPEN)[0]
-    _, s, vt = np.linalg.svd(seen, full_matrices=False)
-    # Of the rotations and the scale in each: they are seen through the shifts that go along.
-    sigma = np.linalg.norm(vt[:, 3:], axis=1) / np.maximum(s, 1e-300)
-    if (vague := sigma > _VAGUE).any():
-        raise DatumError(datum_sentence(vt[vague], block, named, float(sigma.max())))
+    weak, sigma = sensitivity.weak_motions(_VAGUE)
+    if len(weak):
+        raise DatumError(datum_sentence(weak, block, named, sigma))
 
 
 motions_of = jit_quickly(motions)
 """`similarity.motions`, compiled."""
 
 
-def _motions(values: Values) -> tuple[DatumRows, np.ndarray, float]:
+def _motions(values: Values) -> DatumRows:
     points = np.asarray(values.points)
     centre = points.mean(axis=1)
     size = float(np.sqrt(((points - centre[:, None]) ** 2).sum(0).mean())) or 1.0
     eop, pts = motions_of(values.position, values.rotation, values.points, centre, size)
-    return DatumRows(np.asarray(eop), np.asarray(pts)), centre, size
+    return DatumRows(np.asarray(eop), np.asarray(pts))
 
 
-def _datum_sensitivity(block: Block, values: Values, structure: Structure, motions: DatumRows, centre, size):
-    """d(datum rows / sigma) / d(seven motions, declared unknowns), and names of those of these that are free."""
-    s = structure
+def _datum_sensitivity(block: Block, values: Values, s: Structure, motions: DatumRows) -> tuple[Sensitivity, list[str]]:
+    """What is seen of the motions, and names of the free declared unknowns that may go along with them."""
     own = [j for j, k in enumerate(s.free) if k >= s.n_cameras]
     weighted = {int(j) for g in s.observed if g.name.startswith(PRIORS) for j in g.column.ravel()}
     placed = {g.name for g in s.observed if len(g.image) or len(g.point)}
@@ -179,16 +161,16 @@ def _datum_sensitivity(block: Block, values: Values, structure: Structure, motio
         # Control alone: nothing to differentiate, its rows are the motions of its points.
         control = block.control
         rows = motions.points[:, control.axis, control.who].T / _control_sigma(values, s)[:, None]
+        sensitivity = Sensitivity(csr_array(rows), csr_array((0, 7)))
     else:
-        rows = np.asarray(_row_sensitivity(values, s, np.array(own, int), centre, size))
+        sensitivity = row_sensitivity(values, s, motions, np.array(own, int))
     fixed_p = np.argwhere(s.point_free.T == 0)
     fixed_e = np.argwhere(s.eop_free.T == 0)
     held = np.concatenate(
         [motions.points[:, fixed_p[:, 1], fixed_p[:, 0]].T, motions.eop[:, fixed_e[:, 1], fixed_e[:, 0]].T]
     )
-    held = np.concatenate([held, np.zeros((len(held), rows.shape[1] - 7))], axis=1)
     weight = 1 / _control_sigma(values, s).min(initial=0.01)
-    return np.concatenate([rows, held * weight]), [s.labels[j] for j in own if j not in weighted]
+    return sensitivity.with_motions(held * weight), [s.labels[j] for j in own if j not in weighted]
 
 
 def _control_sigma(values: Values, s: Structure) -> np.ndarray:
@@ -197,38 +179,6 @@ def _control_sigma(values: Values, s: Structure) -> np.ndarray:
     return np.concatenate(
         [np.zeros(0), *(np.asarray(rows_of(g, n).sigmas) for g, n in groups if g.name == ControlRows.group)]
     )
-
-
-@jit_quickly
-def _row_sensitivity(values: Values, structure: Structure, shared, centre, size):
-    def rows(parameters, moved):
-        v = values
-        image = lambda x, r: similarity(parameters, x, r, centre, size)  # noqa: E731
-        position, rotation = jax.vmap(image, in_axes=(1, 2), out_axes=(1, 2))(v.position, v.rotation)
-        points = jax.vmap(lambda x: similarity(parameters, x, jnp.eye(3), centre, size)[0], 1, 1)(v.points)
-        vector = jnp.asarray(v.shared).at[structure.free[shared]].add(moved)
-        there = with_start(v, UnknownArrays(position, rotation, vector, points))
-        zero = zero_increments(structure)
-        groups: list[tuple[ObservedGroup, Any]] = list(zip(structure.observed, v.groups, strict=True))
-        return jnp.concatenate([group_residuals(g, n, zero, zero, there, structure).ravel() for g, n in groups])
-
-    by_motion, by_shared = jax.jacfwd(rows, argnums=(0, 1))(jnp.zeros(7), jnp.zeros(len(shared)))
-    return jnp.concatenate([by_motion, by_shared], axis=1)
-
-
-def _null_motions(sensitivity: np.ndarray) -> np.ndarray:
-    """Combinations of the seven motions that no row sees, orthonormal; free shared unknowns may go along."""
-    if not len(sensitivity):
-        return np.eye(7)
-    # The motions are alike in size by construction; the shared unknowns are brought to the same.
-    norm = np.sqrt((sensitivity**2).sum(0))
-    norm[:7] = norm[:7].max()
-    columns = sensitivity / np.where(norm > 0, norm, 1.0)
-    _, s, vt = np.linalg.svd(columns, full_matrices=True)
-    rank = int((s > _OPEN * max(s.max(initial=0.0), 1e-300)).sum())
-    null = (vt[rank:] / np.where(norm > 0, norm, 1.0))[:, :7]
-    _, s2, basis = np.linalg.svd(null / max(np.abs(null).max(initial=0.0), 1e-300), full_matrices=False)
-    return basis[s2 > 1e-9]
 
 
 def _combine(motions: DatumRows, combinations: np.ndarray) -> DatumRows:

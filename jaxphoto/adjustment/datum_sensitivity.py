@@ -1,0 +1,147 @@
+"""What the observations of a block see of its seven motions, whatever the declared unknowns do.
+
+Unknowns that rows of their own determine, as priors do and steps from knot to knot of a trajectory, cannot go along
+with a motion that no row sees. Of these, which may be thousands, nothing dense is made.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.sparse import coo_array, csr_array, vstack
+from scipy.sparse.csgraph import connected_components
+
+from jaxphoto.adjustment.model.numbers import Values, zero_increments
+from jaxphoto.adjustment.model.row_functions import row_jacobian
+from jaxphoto.adjustment.model.structure import Structure
+from jaxphoto.compiling import jit_quickly
+
+# Singular values of a scaled sensitivity below this are zero.
+_OPEN = 1e-9
+# The same of their squares, as far as double precision tells these from zero.
+_OPEN_SQUARED = 1e-13
+
+
+class DatumRows(NamedTuple):
+    """How each increment moves under the seven motions (about the centroid, shifts in units of the block's size)."""
+
+    eop: Float[np.ndarray, "7 6 images"]
+    points: Float[np.ndarray, "7 3 points"]
+
+
+class Sensitivity(NamedTuple):
+    """d(rows / sigma) / d(motions, declared unknowns): columns of the seven motions, then one of each unknown."""
+
+    placed: csr_array
+    """Rows that touch images or points."""
+    alone: csr_array
+    """Rows that touch declared unknowns alone."""
+
+    def null_motions(self) -> Float[np.ndarray, "defect 7"]:
+        """Combinations of the seven motions that no row sees, orthonormal; unknowns may go along.
+
+        Those that rows of their own determine may not: else these would see it.
+        """
+        open_ones = np.setdiff1d(np.arange(7, self.alone.shape[1]), self._determined())
+        kept = np.concatenate([np.arange(7), open_ones])
+        sensitivity = vstack([self.placed, self.alone]).tocsr()[:, kept].toarray()
+        # Those that see none of these are many.
+        sensitivity = sensitivity[sensitivity.any(axis=1)]
+        if not len(sensitivity):
+            return np.eye(7)
+        # The motions are alike in size by construction; the unknowns are brought to the same.
+        norm = np.sqrt((sensitivity**2).sum(0))
+        norm[:7] = norm[:7].max()
+        norm = np.where(norm > 0, norm, 1.0)
+        # The triangle has the same singular values and directions, and no more rows than columns.
+        _, s, vt = np.linalg.svd(np.linalg.qr(sensitivity / norm, mode="r"), full_matrices=True)
+        rank = int((s > _OPEN * max(s.max(initial=0.0), 1e-300)).sum())
+        null = (vt[rank:] / norm)[:, :7]
+        _, s2, basis = np.linalg.svd(null / max(np.abs(null).max(initial=0.0), 1e-300), full_matrices=False)
+        return basis[s2 > 1e-9]
+
+    def weak_motions(self, sigma: float) -> tuple[Float[np.ndarray, "weak 7"], float]:
+        """Combinations of motions whose rotations and scale are known no better than `sigma` (rad), and the worst.
+
+        All unknowns go along, as far as rows of their own let them.
+        """
+        rows = vstack([self.placed, self.alone]).tocsr()
+        normal = (rows.T @ rows).toarray()
+        gone = self._determined()
+        kept = np.setdiff1d(np.arange(len(normal)), gone)
+        normal = _eliminated(normal[np.ix_(kept, kept)], normal[np.ix_(kept, gone)], normal[np.ix_(gone, gone)])
+        squares, directions = np.linalg.eigh(_eliminated(normal[:7, :7], normal[:7, 7:], normal[7:, 7:]))
+        # Of the rotations and the scale in each: they are seen through the shifts that go along.
+        found = np.linalg.norm(directions[3:], axis=0) / np.sqrt(np.maximum(squares, 1e-300))
+        return directions.T[found > sigma], float(found.max())
+
+    def with_motions(self, rows: Float[np.ndarray, "rows 7"]) -> "Sensitivity":
+        """With rows more, which see motions alone."""
+        more = csr_array(np.pad(rows, [(0, 0), (0, self.placed.shape[1] - 7)]))
+        return self._replace(placed=vstack([self.placed, more]).tocsr())
+
+    def _determined(self) -> Int[np.ndarray, "k"]:
+        """Columns of unknowns that their own rows determine, which is judged of all together that these join."""
+        own = self.alone[:, 7:].tocsc()
+        count, part = connected_components(own.T @ own, directed=False)
+        found = [np.zeros(0, int)]
+        for columns in (np.flatnonzero(part == k) for k in range(count)):
+            rows = own[:, columns].toarray()
+            rows = rows[rows.any(axis=1)]
+            if len(rows) >= len(columns):
+                rows = rows / np.sqrt((rows**2).sum(0))
+                s = np.linalg.svd(np.linalg.qr(rows, mode="r"), compute_uv=False)
+                if s[-1] > _OPEN * s[0]:
+                    found.append(7 + columns)
+        return np.sort(np.concatenate(found))
+
+
+def _eliminated(
+    kept: Float[np.ndarray, "n n"], cross: Float[np.ndarray, "n k"], gone: Float[np.ndarray, "k k"]
+) -> Float[np.ndarray, "n n"]:
+    """The normal matrix without some unknowns; what nothing sees of these changes nothing."""
+    size = np.sqrt(np.diag(gone))
+    size = np.where(size > 0, size, 1.0)
+    values, vectors = np.linalg.eigh(gone / size / size[:, None])
+    seen = values > _OPEN_SQUARED * values.max(initial=0.0)
+    half = (cross / size) @ vectors[:, seen] / np.sqrt(values[seen])
+    return kept - half @ half.T
+
+
+def row_sensitivity(
+    values: Values, s: Structure, motions: DatumRows, chosen: Int[np.ndarray, "unknowns"]
+) -> Sensitivity:
+    """Of all rows but those of image points, which see no motion; `chosen` are the shared unknowns that it is by."""
+    width = 7 + len(chosen)
+    # What is not chosen, and what means no unknown, has a column behind the last.
+    place = np.full(s.n_shared + 1, width)
+    place[chosen] = 7 + np.arange(len(chosen))
+    found: dict[bool, list[csr_array]] = {True: [csr_array((0, width))], False: [csr_array((0, width))]}
+    for g, slope in zip(s.observed, jax.device_get(_slopes(values, s, motions)), strict=True):
+        by_motion, by_shared = slope
+        own = np.broadcast_to(place[g.column], by_shared.shape)
+        columns = np.concatenate([np.broadcast_to(np.arange(7)[:, None], by_motion.shape), own], axis=1)
+        numbers = np.concatenate([by_motion, by_shared], axis=1)
+        row = np.broadcast_to(np.arange(g.components * g.n_rows).reshape(g.components, 1, -1), numbers.shape)
+        shape = g.components * g.n_rows, width + 1
+        rows = coo_array((numbers.ravel(), (row.ravel(), columns.ravel())), shape).tocsr()[:, :width]
+        rows.eliminate_zeros()
+        found[bool(len(g.image) or len(g.point))].append(rows)
+    return Sensitivity(vstack(found[True]).tocsr(), vstack(found[False]).tocsr())
+
+
+@jit_quickly
+def _slopes(values: Values, s: Structure, motions: DatumRows):
+    """Of each group the derivatives of its rows by the motions and by the shared unknowns that each touches."""
+    zero = zero_increments(s)
+    one = jax.tree.map(jnp.ones_like, zero)
+    slopes = []
+    for g, numbers in zip(s.observed, values.groups, strict=True):
+        row = row_jacobian(g, numbers, zero, one, values, s)
+        # Rows last, of each an image's or point's numbers.
+        by_motion = jnp.einsum("ckar,makr->cmr", row.eop, jnp.asarray(motions.eop)[..., g.image])
+        by_motion += jnp.einsum("cjar,majr->cmr", row.points, jnp.asarray(motions.points)[..., g.point])
+        slopes.append((by_motion, row.shared))
+    return slopes
