@@ -1,0 +1,137 @@
+"""What the datum is judged by: rows as they are differenced, and directions as a dense matrix of everything has them."""
+
+import jax
+import numpy as np
+import pytest
+from scipy.sparse import csr_array
+
+from jaxphoto.adjustment.datum import _motions
+from jaxphoto.adjustment.datum_sensitivity import Sensitivity, row_sensitivity
+from jaxphoto.adjustment.model.block_values import values_of, with_start
+from jaxphoto.adjustment.model.numbers import UnknownArrays, zero_increments
+from jaxphoto.adjustment.model.row_functions import group_residuals
+from jaxphoto.adjustment.model.structure import structure_of
+from jaxphoto.adjustment.solver.similarity import similarity
+from jaxphoto.compiling import jit_quickly
+from tests.blocks import VARIANTS, measured
+
+
+@jit_quickly
+def _residuals(values, structure, motion, shared, centre, size):
+    """All rows with everything moved by `motion`, and shared unknowns by `shared`."""
+    move = lambda x, r: similarity(motion, x, r, centre, size)  # noqa: E731
+    position, rotation = jax.vmap(move, (1, 2), (1, 2))(values.position, values.rotation)
+    points = jax.vmap(lambda x: similarity(motion, x, np.eye(3), centre, size)[0], 1, 1)(values.points)
+    there = with_start(
+        values,
+        UnknownArrays(position, rotation, jax.numpy.asarray(values.shared).at[structure.free].add(shared), points),
+    )
+    zero = zero_increments(structure)
+    rows = zip(structure.observed, values.groups, strict=True)
+    return [group_residuals(g, n, zero, zero, there, structure).ravel() for g, n in rows]
+
+
+def test_rows_are_central_differences():
+    block = measured(VARIANTS["everything"]()).block
+    s = structure_of(block, block.priors)
+    values = values_of(block, block.start.unknowns, block.priors, s)
+    chosen = np.flatnonzero(s.free >= s.n_cameras)
+    assert 0 < len(chosen) < s.n_shared
+    found = row_sensitivity(values, s, _motions(values), chosen)
+    centre = values.points.mean(1)
+    size = np.sqrt(((values.points - centre[:, None]) ** 2).sum(0).mean())
+    columns = []
+    for k in range(7 + len(chosen)):
+        # Degrees of strips' drifts are small numbers, metres of shifts are not.
+        step = 1e-6 * np.eye(7 + len(chosen))[k]
+        moved = np.zeros(s.n_shared)
+        moved[chosen] = step[7:]
+        ahead = _residuals(values, s, step[:7], moved, centre, size)
+        behind = _residuals(values, s, -step[:7], -moved, centre, size)
+        columns.append([(np.asarray(a) - np.asarray(b)) / 2e-6 for a, b in zip(ahead, behind, strict=True)])
+    for placed, rows in ((True, found.placed), (False, found.alone)):
+        groups = [n for n, g in enumerate(s.observed) if bool(len(g.image) or len(g.point)) == placed]
+        expected = np.array([np.concatenate([c[n] for n in groups]) for c in columns]).T
+        rows = rows.toarray()
+        assert rows.shape == expected.shape
+        np.testing.assert_allclose(rows, expected, rtol=1e-6, atol=1e-6 * np.abs(expected).max())
+        assert np.linalg.matrix_rank(rows) > 3
+
+
+def dense_null(rows):
+    """Motions that no row sees, of all columns together."""
+    norm = np.sqrt((rows**2).sum(0))
+    norm = np.where(norm > 0, norm, 1.0)
+    _, s, vt = np.linalg.svd(rows / norm)
+    null = (vt[int((s > 1e-9).sum()) :] / norm)[:, :7]
+    _, s, basis = np.linalg.svd(null, full_matrices=False)
+    return basis[s > 1e-9]
+
+
+def dense_weak(rows, sigma):
+    """Motions by the covariance matrix of them and of all unknowns, where nothing is open."""
+    covariance = np.linalg.inv(rows.T @ rows)[:7, :7]
+    squares, directions = np.linalg.eigh(np.linalg.inv(covariance))
+    found = np.linalg.norm(directions[3:], axis=0) / np.sqrt(squares)
+    return directions.T[found > sigma], found.max()
+
+
+def chain(rng, free_end: bool):
+    """Rows of twelve unknowns from knot to knot, the first of which has a prior but where it is to be free."""
+    rows = np.zeros((12, 12))
+    for k in range(11):
+        rows[k, k : k + 2] = np.array([-0.9, 1.0]) * rng.uniform(5, 50)
+    if not free_end:
+        rows[11, 0] = 20.0
+    return rows
+
+
+def system(seed: int, seen: int, free_end: bool) -> tuple[Sensitivity, np.ndarray]:
+    """Rows that see `seen` combinations of motions, each with a knot and one of two free shifts, one with a prior."""
+    rng = np.random.default_rng(seed)
+    combinations = np.linalg.qr(rng.standard_normal((7, 7)))[0][:seen]
+    placed = np.zeros((60, 7 + 12 + 2))
+    placed[:, :7] = 100 * rng.standard_normal((60, seen)) @ combinations
+    placed[np.arange(60), 7 + rng.integers(0, 12, 60)] = rng.uniform(1, 30, 60)
+    placed[np.arange(60), 19 + rng.integers(0, 2, 60)] = rng.uniform(1, 30, 60)
+    alone = np.zeros((13, 21))
+    alone[:12, 7:19] = chain(rng, free_end)
+    alone[12, 20] = 3.0
+    return Sensitivity(csr_array(placed), csr_array(alone)), np.concatenate([placed, alone])
+
+
+@pytest.mark.parametrize("free_end", [False, True], ids=["prior", "free"])
+@pytest.mark.parametrize("seen", [0, 3, 6, 7])
+def test_null_motions_are_those_of_all_columns_together(seen, free_end):
+    for seed in range(5):
+        sensitivity, rows = system(seed, seen, free_end)
+        found, expected = sensitivity.null_motions(), dense_null(rows)
+        assert len(found) == 7 - seen
+        np.testing.assert_allclose(found.T @ found, expected.T @ expected, atol=1e-8)
+
+
+def test_a_motion_that_goes_along_with_unknowns_that_only_one_another_hold_is_open():
+    """As far as knots from one to the next may move all alike; with a prior of the first they may not."""
+    placed, alone = np.zeros((30, 7 + 4)), np.zeros((4, 7 + 4))
+    rng = np.random.default_rng(2)
+    placed[:, 1:7] = rng.standard_normal((30, 6))
+    placed[:, 0], placed[np.arange(30), 7 + np.arange(30) % 4] = 1.0, -1.0
+    for k in range(3):
+        alone[k, 7 + k : 9 + k] = -1.0, 1.0
+    (null,) = Sensitivity(csr_array(placed), csr_array(alone)).null_motions()
+    np.testing.assert_allclose(np.abs(null), np.eye(7)[0], atol=1e-9)
+    alone[3, 7] = 1e-3
+    assert not len(Sensitivity(csr_array(placed), csr_array(alone)).null_motions())
+
+
+@pytest.mark.parametrize("free_end", [False, True], ids=["prior", "free"])
+def test_weak_motions_are_those_of_the_covariance_matrix(free_end):
+    for seed in range(5):
+        sensitivity, rows = system(seed, 7, free_end)
+        _, worst = dense_weak(rows, 1.0)
+        for sigma in (0.5 * worst, 2 * worst):
+            weak, found = sensitivity.weak_motions(sigma)
+            expected, _ = dense_weak(rows, sigma)
+            assert (len(weak) > 0) == (sigma < worst)
+            np.testing.assert_allclose(found, worst, rtol=1e-6)
+            np.testing.assert_allclose(weak.T @ weak, expected.T @ expected, atol=1e-6)
