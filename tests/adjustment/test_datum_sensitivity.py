@@ -1,4 +1,4 @@
-"""What the datum is judged by: rows as they are differenced, and directions as a dense matrix of everything has them."""
+"""What the datum is judged by: rows as they are differenced, and directions as a dense matrix has them."""
 
 import jax
 import numpy as np
@@ -22,10 +22,8 @@ def _residuals(values, structure, motion, shared, centre, size):
     move = lambda x, r: similarity(motion, x, r, centre, size)  # noqa: E731
     position, rotation = jax.vmap(move, (1, 2), (1, 2))(values.position, values.rotation)
     points = jax.vmap(lambda x: similarity(motion, x, np.eye(3), centre, size)[0], 1, 1)(values.points)
-    there = with_start(
-        values,
-        UnknownArrays(position, rotation, jax.numpy.asarray(values.shared).at[structure.free].add(shared), points),
-    )
+    vector = jax.numpy.asarray(values.shared).at[structure.free].add(shared)
+    there = with_start(values, UnknownArrays(position, rotation, vector, points))
     zero = zero_increments(structure)
     rows = zip(structure.observed, values.groups, strict=True)
     return [group_residuals(g, n, zero, zero, there, structure).ravel() for g, n in rows]
@@ -42,7 +40,6 @@ def test_rows_are_central_differences():
     size = np.sqrt(((values.points - centre[:, None]) ** 2).sum(0).mean())
     columns = []
     for k in range(7 + len(chosen)):
-        # Degrees of strips' drifts are small numbers, metres of shifts are not.
         step = 1e-6 * np.eye(7 + len(chosen))[k]
         moved = np.zeros(s.n_shared)
         moved[chosen] = step[7:]
