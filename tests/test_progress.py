@@ -76,10 +76,16 @@ def test_parts_of_a_cloud_are_counted_until_it_has_passed_and_anew_when_it_passe
         for part in told():
             assert len(part) == 10
             said.append(shown.status)
-    progress("writing", cloud)
+        # Work between one pass and the next says nothing of how long that takes.
+        shown.now += 3600.0
+    progress.begins()
+    shown.now += 4.0
+    progress("writing", cloud.take(np.arange(10)))
+    assert shown.status == "writing: 10 of 30, 8 s left"
+    progress("writing", cloud.take(np.arange(20)))
     assert said[:3] == ["reading the cloud: 10 of 30, 10 s left", "reading the cloud: 20 of 30, 5 s left",
                         "reading the cloud: 30 of 30"]  # fmt: skip
-    assert said[3].startswith("reading the cloud again: 10 of 30") and shown.status == "writing: 30 of 30"
+    assert said[3] == "reading the cloud again: 10 of 30, 10 s left" and shown.status == "writing: 30 of 30"
     unknown = CloudProgress(StepsLeft(shown, shown), shown, None)
     unknown("reading", cloud)
     assert shown.status == "reading: 30 points"

@@ -24,12 +24,17 @@ class CloudProgress:
         else:
             self._left(what, self._passed, self._most)
 
+    def begins(self) -> None:
+        """The cloud begins to pass now."""
+        self._left.begins()
+
     def passes(self, parts: Callable[[], Iterator[Cloud]]) -> Callable[[], Iterator[Cloud]]:
         """`parts`, telling of each; they are read for the first time, and perhaps once more."""
         names = iter(("reading the cloud", "reading the cloud again"))
 
         def told() -> Iterator[Cloud]:
             what = next(names)
+            self.begins()
             for part in parts():
                 self(what, part)
                 yield part

@@ -25,6 +25,10 @@ class StepsLeft:
         self._steps: deque[tuple[float, int]] = deque(maxlen=_LAST)
         self._began = clock()
 
+    def begins(self) -> None:
+        """What comes next begins now, where other work lies between it and the steps before."""
+        self._began = self._clock()
+
     def __call__(self, what: str, done: int, of: int) -> None:
         """`done` of the `of` steps of `what` are done."""
         now = self._clock()

@@ -176,6 +176,7 @@ def strips_command(
             return corrected
 
         def write_corrected(folder: Path) -> tuple[Raster, Raster] | None:
+            progress.begins()
             clouds.rewrite_cloud(cloud, folder / corrected_name(cloud), moved, frame=own, **said)
             if trajectory is not None and records is not None and result.trajectory is not None:
                 back = with_poses(records, result.trajectory, frame)

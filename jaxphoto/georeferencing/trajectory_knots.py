@@ -110,4 +110,4 @@ def _cubic(u: Float[Numbers, "n"]) -> list[Float[Numbers, "n"]]:
 
 def weighted_knot(knots: TrajectoryKnot, weights: Float[Numbers, "knots"]) -> TrajectoryKnot:
     """The correction that some knots (leading axis) make up: four, or all of a strip."""
-    return jax.tree.map(lambda v: sum(weights[k] * v[k] for k in range(len(weights))), knots)
+    return jax.tree.map(lambda v: jnp.sum(weights[:, None] * v, axis=0), knots)

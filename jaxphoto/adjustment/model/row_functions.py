@@ -139,7 +139,11 @@ def row_function(group: ObservedGroup, s: AbstractStructure) -> Callable[[Touche
                 touched.append(take(count).reshape(shape))
             elif what in forms:
                 form, size = forms[what]
-                touched.append(_stacked([filled(form, take(size)) for _ in range(count)], shape))
+                numbers = take(count * size).reshape(*shape, size)
+                each = lambda v, form=form: filled(form, v)  # noqa: E731
+                for _ in shape:
+                    each = jax.vmap(each)
+                touched.append(each(numbers))
             else:
                 touched.append(None)
         v = jnp.ravel(given.row.whitened(given.row.residual(*touched)))
