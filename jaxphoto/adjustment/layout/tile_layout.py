@@ -109,7 +109,9 @@ class TileLayout(NamedTuple):
         n = size_class(images, 32 if images <= _SMALL else 16)
         columns, width = (1, n) if dense else column_blocks(n, min(n, size_class(bandwidth, 8)))
         per_shard = -(-tiles // shards)
-        chunks = -(-per_shard * (6 * m) ** 2 // _CHUNK)
+        # Of each tile there are sums for its images, and sums for what all points meet.
+        largest = max(6 * m, s.n_border + s.n_coupled)
+        chunks = -(-per_shard * largest**2 // _CHUNK)
         at_once = max(k for k in range(1, TILE_STEP + 1) if TILE_STEP % k == 0 and k * m * p <= max(_SLOTS, m * p))
         chunk = size_class(-(-per_shard // chunks), TILE_STEP)
         lists = _pair_lists(_images_of_free_points(tiling, own, p), chunk, width)
