@@ -114,6 +114,8 @@ class TileLayout(NamedTuple):
         chunks = -(-per_shard * largest**2 // _CHUNK)
         at_once = max(k for k in range(1, TILE_STEP + 1) if TILE_STEP % k == 0 and k * m * p <= max(_SLOTS, m * p))
         chunk = size_class(-(-per_shard // chunks), TILE_STEP)
+        # No more than it takes: a chunk may be larger than asked for.
+        chunks = -(-per_shard // chunk)
         lists = _pair_lists(_images_of_free_points(tiling, own, p), chunk, width)
         blocks = max(map(len, lists[2]), default=0)
         rows = tuple((g.name, g.depth if g.elimination == "point" else g.n_rows) for g in s.observed)
