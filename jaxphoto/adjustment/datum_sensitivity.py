@@ -4,6 +4,8 @@ Unknowns that rows of their own determine, as priors do and steps from knot to k
 with a motion that no row sees. Of these, which may be thousands, nothing dense is made.
 """
 
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import jax
@@ -31,7 +33,8 @@ class DatumRows(NamedTuple):
     points: Float[np.ndarray, "7 3 points"]
 
 
-class Sensitivity(NamedTuple):
+@dataclass(frozen=True)
+class Sensitivity:
     """d(rows / sigma) / d(motions, declared unknowns): columns of the seven motions, then one of each unknown."""
 
     placed: csr_array
@@ -44,7 +47,7 @@ class Sensitivity(NamedTuple):
 
         Those that rows of their own determine may not: else these would see it.
         """
-        open_ones = np.setdiff1d(np.arange(7, self.alone.shape[1]), self._determined())
+        open_ones = np.setdiff1d(np.arange(7, self.alone.shape[1]), self.determined)
         kept = np.concatenate([np.arange(7), open_ones])
         sensitivity = vstack([self.placed, self.alone]).tocsr()[:, kept].toarray()
         # Those that see none of these are many.
@@ -69,7 +72,7 @@ class Sensitivity(NamedTuple):
         """
         rows = vstack([self.placed, self.alone]).tocsr()
         normal = (rows.T @ rows).toarray()
-        gone = self._determined()
+        gone = self.determined
         kept = np.setdiff1d(np.arange(len(normal)), gone)
         normal = _eliminated(normal[np.ix_(kept, kept)], normal[np.ix_(kept, gone)], normal[np.ix_(gone, gone)])
         squares, directions = np.linalg.eigh(_eliminated(normal[:7, :7], normal[:7, 7:], normal[7:, 7:]))
@@ -80,9 +83,10 @@ class Sensitivity(NamedTuple):
     def with_motions(self, rows: Float[np.ndarray, "rows 7"]) -> "Sensitivity":
         """With rows more, which see motions alone."""
         more = csr_array(np.pad(rows, [(0, 0), (0, self.placed.shape[1] - 7)]))
-        return self._replace(placed=vstack([self.placed, more]).tocsr())
+        return replace(self, placed=vstack([self.placed, more]).tocsr())
 
-    def _determined(self) -> Int[np.ndarray, "k"]:
+    @cached_property
+    def determined(self) -> Int[np.ndarray, "k"]:
         """Columns of unknowns that their own rows determine, which is judged of all together that these join."""
         own = self.alone[:, 7:].tocsc()
         count, part = connected_components(own.T @ own, directed=False)
