@@ -79,19 +79,20 @@ class AtPointsSecond(NamedTuple):
     """Sums over the rows that lie at points (see `NonImageRows`)."""
 
     v: Float[Array, "3 3 points"]
-    w: Float[Array, "others 3 points"]
+    w: Float[Array, "b 3 points"]
+    """By what else the tiles of the points meet, `Tiles.met`."""
 
 
 def points_second(second: tuple[RowSecond, ...], at: Linearised) -> AtPointsSecond:
     """H of rows at points, by these, and by these and shared unknowns."""
     s, n = at.structure, at.increments.points.shape[1]
-    v, w = jnp.zeros((3, 3, n)), jnp.zeros((s.n_border - s.n_interior, 3, n))
+    v, w = jnp.zeros((3, 3, n)), jnp.zeros((s.tiles.met.shape[2], n, 3))
     for g, own in zip(s.observed, second, strict=True):
         if isinstance(g.rows, RowsAtPoints):
-            k, h = len(g.place), jnp.sum(own.h, axis=2)
-            v = v + h[k:, k:]
-            w = w.at[jnp.asarray(g.column)[:, 0] - s.n_interior].add(h[:k, k:], mode="drop")
-    return AtPointsSecond(v, w)
+            k = len(g.place)
+            v = v + jnp.sum(own.h[k:, k:], axis=2)
+            w = w.at[jnp.asarray(g.slot), jnp.arange(n)].add(jnp.moveaxis(own.h[:k, k:], 1, -1), mode="drop")
+    return AtPointsSecond(v, jnp.moveaxis(w, 2, 1))
 
 
 def coupling_rows(second: tuple[RowSecond, ...], at: Linearised) -> tuple[Array, Array, Array]:
@@ -137,9 +138,12 @@ def other_second(second: tuple[RowSecond, ...], s: TiledStructure) -> Float[Arra
     h = jnp.zeros((n, n))
     for g, own in zip(s.observed, second, strict=True):
         if isinstance(g.rows, RowsAtPoints):
-            k, place = len(g.place), 6 * s.n_images + jnp.asarray(g.column)[:, 0]
-            h = h.at[place[:, None], place].add(jnp.sum(own.h[:k, :k], axis=(2, 3)), mode="drop")
+            k = len(g.place)
+            place, of_rows = 6 * s.n_images + jnp.asarray(g.column).reshape(k, -1), own.h[:k, :k].reshape(k, k, -1)
         elif g.elimination == "reduced":
-            place = reduced_places(g, s.n_images).T
-            h = h.at[place[:, :, None], place[:, None]].add(jnp.moveaxis(own.h, 2, 0), mode="drop")
+            place, of_rows = reduced_places(g, s.n_images), own.h
+        else:
+            continue
+        # What means no unknown lies behind the last.
+        h = h.at[place.T[:, :, None], place.T[:, None]].add(jnp.moveaxis(of_rows, 2, 0), mode="drop")
     return h

@@ -79,7 +79,7 @@ def eliminated(at: Linearised, rows: ListedRows, curved: Float[Numbers, ""]) -> 
         image, slots, own_v, own_w, d_p = numbers
         met = h.by_point.at[:, :, slots].get(mode="promise_in_bounds")
         v = jnp.sum(met[6:9], axis=2) + own_v
-        # Of shared unknowns that points meet besides those of cameras, which they follow.
+        # Of shared unknowns that points meet besides those of cameras, which these follow.
         of_shared = jnp.concatenate([_by_interior(met[9:], image, s), own_w])
         added = jnp.where(jnp.einsum("iip->ip", v) == 0, 1.0, 0.0)
         l = cholesky_3x3(v + added[:, None] * jnp.eye(3)[:, :, None])  # noqa: E741
@@ -97,13 +97,18 @@ def eliminated(at: Linearised, rows: ListedRows, curved: Float[Numbers, ""]) -> 
     l = jnp.where(l[:, :1] == 0, jnp.array([1.0, 0, 1, 0, 0, 1])[:, None], l)  # noqa: E741
 
     image = jnp.asarray(s.tiles.image).reshape(len(l), -1)
-    border = jnp.concatenate([6 * s.n_images + jnp.arange(s.n_border), n + jnp.arange(k)])
+    met = jnp.asarray(s.tiles.met).reshape(len(l), -1)
+    # What means no unknown has no products, and its place is as good as any.
+    met = jnp.where(met < s.n_shared, 6 * s.n_images + met, 0)
+    all_meet = lambda v: jnp.broadcast_to(v, (len(l), len(v)))  # noqa: E731
+    interior = all_meet(6 * s.n_images + jnp.arange(s.n_interior))
+    border = jnp.concatenate([interior, met, all_meet(n + jnp.arange(k))], axis=1)
     m = jnp.zeros((n + k, n + k)).at[:n, :n].set(other_second(second, s) + _by_unknown(h, s))
     m = m.at[n:, :n].set(d_e).at[:n, n:].set(d_e.T) - _products(gram, border, n + k, s)
     fixed = jnp.where(jnp.diagonal(m) == 0, 1.0, 0.0)
     m = m.at[n:].set(c @ m[n:]) + jnp.diag(jnp.where(jnp.arange(n + k) < n, fixed, -1.0))
     by_eop = (6 * image[:, :, None] + jnp.arange(6)).reshape(len(l), -1)
-    touched = jnp.concatenate([by_eop, jnp.broadcast_to(border, (len(l), len(border)))], axis=1)
+    touched = jnp.concatenate([by_eop, border], axis=1)
     return Eliminated(m, c, gain, l, touched, h.measured)
 
 
@@ -120,8 +125,10 @@ def _by_unknown(h: RowProducts, s: TiledStructure) -> Float[Array, "n n"]:
     return m.at[of_shared[:, :, None], of_shared[:, None]].add(h.shared, mode="drop")
 
 
-def _products(gram: Float[Array, "chunks tiles f f"], border: Array, size: int, s: TiledStructure) -> Array:
-    """F F' of all tiles at their unknowns: pairs of images by the lists of `Tiles`, the border by image."""
+def _products(
+    gram: Float[Array, "chunks tiles f f"], border: Int[Array, "all_tiles b"], size: int, s: TiledStructure
+) -> Float[Array, "size size"]:
+    """F F' of all tiles at their unknowns: pairs of images by the lists of `Tiles`, the border by what it means."""
     tiles, n = s.tiles, s.n_images
     m, width = tiles.image.shape[2], n // tiles.columns
 
@@ -141,11 +148,12 @@ def _products(gram: Float[Array, "chunks tiles f f"], border: Array, size: int, 
     )
     eop = jnp.zeros((n, 6, n, 6)).at[row, :, column].add(found, mode="drop")
     eop = eop.at[column, :, mirrored].add(found.transpose(0, 2, 1), mode="drop").reshape(6 * n, 6 * n)
-    met = gram[:, :, : 6 * m, 6 * m :].reshape(tiles.image.size, 6, len(border))
-    met = jax.ops.segment_sum(met, tiles.image.reshape(-1), n).reshape(6 * n, len(border))
+    image, gram = jnp.asarray(tiles.image).reshape(len(border), m), gram.reshape(len(border), *gram.shape[2:])
+    met = gram[:, : 6 * m, 6 * m :].reshape(len(border), m, 6, -1).transpose(0, 1, 3, 2)
+    across = jnp.zeros((n, 6, size)).at[image[:, :, None], :, border[:, None]].add(met).reshape(6 * n, -1)
     result = jnp.zeros((size, size)).at[: 6 * n, : 6 * n].set(eop)
-    result = result.at[: 6 * n, border].set(met).at[border, : 6 * n].set(met.T)
-    return result.at[border[:, None], border].set(gram[:, :, 6 * m :, 6 * m :].sum((0, 1)))
+    result = result.at[: 6 * n].add(across).at[:, : 6 * n].add(across.T)
+    return result.at[border[:, :, None], border[:, None]].add(gram[:, 6 * m :, 6 * m :])
 
 
 def image_columns(s: TiledStructure) -> Int[Array, "images e_and_colours"]:

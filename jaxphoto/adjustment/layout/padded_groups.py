@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
 
-from jaxphoto.adjustment.layout.tile_layout import Places
+from jaxphoto.adjustment.layout.tile_layout import NO_SLOT, Places
 from jaxphoto.adjustment.layout.tiled import TiledStructure
 from jaxphoto.adjustment.layout.tiling import size_class
 from jaxphoto.adjustment.model.numbers import Values
@@ -23,26 +23,51 @@ from jaxphoto.arrays import still
 
 
 def pad_groups(
-    s: Structure, places: Places, n_images: int, n_points: int, width: int, rows: Mapping[str, int]
+    s: Structure,
+    places: Places,
+    n_images: int,
+    n_points: int,
+    width: int,
+    rows: Mapping[str, int],
+    slots: Mapping[str, Int[np.ndarray, "l rows"]],
 ) -> tuple[ObservedGroup, ...]:
-    """The groups of a structure in padded sizes: `rows` are wanted at least, `width` is images of a column block."""
-    return tuple(_pad_group(g, places, n_images, n_points, width, rows.get(g.name, 0)) for g in s.observed)
+    """The groups of a structure in padded sizes: `rows` are wanted at least, `width` is images of a column block.
+
+    `slots` say of groups by point which of their tile's shared unknowns rows touch.
+    """
+
+    def padded(g: ObservedGroup) -> ObservedGroup:
+        wanted = rows.get(g.name, 0)
+        if g.elimination == "point":
+            return _pad_at_points(g, slots[g.name], places, n_points, max(g.depth, wanted), s.n_shared)
+        return _pad_list(g, places, n_images, width, wanted)
+
+    return tuple(map(padded, s.observed))
 
 
-def _pad_group(
-    g: ObservedGroup, places: Places, n_images: int, n_points: int, width: int, wanted: int
+def _pad_at_points(
+    g: ObservedGroup, slot: Int[np.ndarray, "l rows"], places: Places, n_points: int, depth: int, n_shared: int
 ) -> ObservedGroup:
-    if g.elimination == "point":
-        index = _by_point(g, places, n_points, max(g.depth, wanted))
-        return dataclasses.replace(
-            g,
-            rows=RowsAtPoints(jax.tree.map(lambda v: v[..., index], g.own)),
-            image=np.zeros((0, 0), np.int32),
-            point=np.zeros((1, 0), np.int32),
-            parameter=g.parameter[:, :1],
-            column=g.column[:, :1],
-            pair=np.zeros((0, 0, 4), np.int32),
-        )
+    at = _row_places(g, places, n_points)
+    # The first row where there is none.
+    index = put(np.arange(g.n_rows), at, depth * n_points, 0).reshape(depth, n_points)
+
+    def of_rows(v: np.ndarray, fill: int) -> np.ndarray:
+        return put(v.T, at, depth * n_points, fill).T.reshape(len(v), depth, n_points)
+
+    return dataclasses.replace(
+        g,
+        rows=RowsAtPoints(jax.tree.map(lambda v: v[..., index], g.own)),
+        image=np.zeros((0, 0), np.int32),
+        point=np.zeros((1, 0), np.int32),
+        parameter=g.parameter[:, index],
+        column=of_rows(g.column, n_shared),
+        slot=of_rows(slot, NO_SLOT),
+        pair=np.zeros((0, 0, 4), np.int32),
+    )
+
+
+def _pad_list(g: ObservedGroup, places: Places, n_images: int, width: int, wanted: int) -> ObservedGroup:
     image = places.image[g.image].astype(np.int32)
     padded = dataclasses.replace(g, image=image, point=places.point[g.point], pair=_pairs(image, width))
     if g.elimination == "coupled":
@@ -71,13 +96,6 @@ def _pairs(image: Int[np.ndarray, "k rows"], width: int) -> Int[np.ndarray, "pai
             which = column // width
             found.append(np.stack([which, row - which * width, column % width, image[a] < image[b]], axis=1))
     return np.array(found, np.int32).reshape(-1, image.shape[1], 4)
-
-
-def _by_point(g: ObservedGroup, places: Places, n_points: int, depth: int) -> Int[np.ndarray, "rows points"]:
-    """The row in every place by point; the first where there is none."""
-    index = np.zeros(depth * n_points, int)
-    index[_row_places(g, places, n_points)] = np.arange(g.n_rows)
-    return index.reshape(depth, n_points)
 
 
 def _row_places(g: ObservedGroup, places: Places, n_points: int) -> Int[np.ndarray, "rows"]:

@@ -116,11 +116,11 @@ def pad_structure(structure: Structure, sizes: Sizes = LEAST, *, shards: int = 1
     point_at = put(layout.point_of, layout.tiling.place, n_points, -1)
     _, first = np.unique(layout.point_of, return_index=True)
     places = Places(layout.image_place, layout.tiling.place[first].astype(np.int32), layout.tiling.slot, point_at)
-    at = places.image
+    at, n_met = places.image, have.met
+    slots = {g.name: layout.met.slots(g) for g in s.observed if g.elimination == "point"}
     padded = TiledStructure(
         corrections=s.corrections,
         n_interior=s.n_interior,
-        n_border=s.n_border,
         n_image_colours=s.n_image_colours,
         free=s.free,
         colour=s.colour,
@@ -133,13 +133,14 @@ def pad_structure(structure: Structure, sizes: Sizes = LEAST, *, shards: int = 1
             dataclasses.replace(t, owners=("",) * len(t.owners), of_image=put(t.of_image, at, n_images, len(t.owners)))
             for t in s.tables
         ),
-        observed=pad_groups(s, places, n_images, n_points, layout.width, dict(have.rows)),
+        observed=pad_groups(s, places, n_images, n_points, layout.width, dict(have.rows), slots),
         eop_free=put(s.eop_free.T, at, n_images, 0.0).T,
         point_free=put(s.point_free.T, places.point, n_points, 0.0).T,
         tiles=Tiles(
             image=tile_image.reshape(n_chunks, layout.chunk, m),
             per_tile=p,
             free_points=layout.free_points,
+            met=layout.met.listed(n_chunks * layout.chunk, n_met).reshape(n_chunks, layout.chunk, n_met),
             batches=-(-np.clip(len(own) - layout.chunk * np.arange(n_chunks), 0, layout.chunk) // layout.at_once),
             at_once=layout.at_once,
             pair_tile=listed[..., 0],

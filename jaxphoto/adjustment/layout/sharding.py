@@ -25,7 +25,8 @@ def along_points(ndim: int) -> Any:
     return P(*[None] * (ndim - 1), AXIS)
 
 
-_OF_TILES = {"xy", "sigma_xy", "pair_tile", "pair_images", "pair_block", "block", "batches", "f"}
+_OF_TILES = {"xy", "sigma_xy", "met", "pair_tile", "pair_images", "pair_block", "block", "batches", "f"}
+_OF_ROWS = {"parameter", "column", "slot"}
 _OF_POINTS = {"points", "datum_points", "point_free", "l"}
 
 
@@ -62,4 +63,7 @@ def _spec(path: tuple[Any, ...], array: Any) -> P:
     # The images of tiles, not those of the rows of a block.
     if name in _OF_TILES or (name == "image" and array.ndim >= 3):
         return TILES
+    # What rows by point touch, not what those in lists do.
+    if name in _OF_ROWS and array.ndim == 3:
+        return along_points(array.ndim)
     return along_points(array.ndim) if name in _OF_POINTS else EVERYWHERE

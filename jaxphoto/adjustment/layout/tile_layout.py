@@ -20,6 +20,7 @@ from jaxphoto.adjustment.layout.tiling import (
     tile_points,
     tile_shape,
 )
+from jaxphoto.adjustment.model.observed_groups import ObservedGroup
 from jaxphoto.adjustment.model.structure import Structure
 
 
@@ -34,6 +35,8 @@ class Sizes(NamedTuple):
     tile_points: int = 8
     blocks: int = 1
     """Pairs of images that meet anywhere in a chunk, in the chunk that has most."""
+    met: int = 0
+    """Shared unknowns that rows at the points of a tile touch, in the tile that has most."""
     rows: tuple[tuple[str, int], ...] = ()
     """Of each group of observations; of rows at points, the most that a point has."""
 
@@ -43,8 +46,8 @@ class Sizes(NamedTuple):
             return NotImplemented
         most = [dict(self.rows), dict(other.rows)]
         rows = tuple((name, max(of.get(name, 0) for of in most)) for name in most[0] | most[1])
-        images, bandwidth, tiles, m, p, blocks = map(max, self[:-1], other[:-1])
-        return Sizes(images, bandwidth, tiles, m, p, blocks, rows)
+        images, bandwidth, tiles, m, p, blocks, met = map(max, self[:-1], other[:-1])
+        return Sizes(images, bandwidth, tiles, m, p, blocks, met, rows)
 
 
 LEAST = Sizes()
@@ -78,6 +81,53 @@ _OVERHEAD = 2e5
 _SLOTS = 4000
 
 
+NO_SLOT = int(np.iinfo(np.int32).max)
+"""For what is no unknown: no tile meets so many, and what is added there is dropped."""
+
+
+class MetUnknowns(NamedTuple):
+    """Which shared unknowns rows at points touch, tile by tile."""
+
+    tile_of: Int[np.ndarray, "points"]
+    key: Int[np.ndarray, "met"]
+    """Tile * (number of unknowns + 1) + unknown, sorted."""
+    slot: Int[np.ndarray, "met"]
+    """Which of its tile's it is."""
+    n_shared: int
+
+    @classmethod
+    def of(cls, s: Structure, tile_of: Int[np.ndarray, "points"]) -> "MetUnknowns":
+        """`tile_of` is the tile of each of the block's points."""
+        touched = [np.zeros(0, np.int64)]
+        for g in (g for g in s.observed if g.elimination == "point"):
+            touched.append(_keys(tile_of[g.point[0]], g.column, s.n_shared))
+        key = np.unique(np.concatenate(touched))
+        tile = key // (s.n_shared + 1)
+        return cls(tile_of, key, np.arange(len(key)) - np.searchsorted(tile, tile), s.n_shared)
+
+    @property
+    def most(self) -> int:
+        """How many lie in one tile, in steps of which there are few."""
+        return size_class(int(self.slot.max(initial=-1)) + 1, 8)
+
+    def listed(self, tiles: int, size: int) -> Int[np.ndarray, "tiles size"]:
+        """Those of every tile, and the number of unknowns in places too many."""
+        result = np.full((tiles, size), self.n_shared, np.int32)
+        result[self.key // (self.n_shared + 1), self.slot] = self.key % (self.n_shared + 1)
+        return result
+
+    def slots(self, g: ObservedGroup) -> Int[np.ndarray, "l rows"]:
+        """Which of its tile's each unknown of a row is."""
+        found = np.full(g.column.shape, NO_SLOT, np.int32)
+        free = g.column < self.n_shared
+        found[free] = self.slot[np.searchsorted(self.key, _keys(self.tile_of[g.point[0]], g.column, self.n_shared))]
+        return found
+
+
+def _keys(tile: np.ndarray, column: np.ndarray, n_shared: int) -> np.ndarray:
+    return (tile.astype(np.int64) * (n_shared + 1) + column)[column < n_shared]
+
+
 class TileLayout(NamedTuple):
     """Images in order, points in tiles, tiles in chunks."""
 
@@ -94,6 +144,7 @@ class TileLayout(NamedTuple):
     chunk: int
     at_once: int
     lists: tuple[list[np.ndarray], ...]
+    met: "MetUnknowns"
     sizes: Sizes
 
     @classmethod
@@ -109,8 +160,10 @@ class TileLayout(NamedTuple):
         n = size_class(images, 32 if images <= _SMALL else 16)
         columns, width = (1, n) if dense else column_blocks(n, min(n, size_class(bandwidth, 8)))
         per_shard = -(-tiles // shards)
-        # Of each tile there are sums for its images, and sums for what all points meet.
-        largest = max(6 * m, s.n_border + s.n_coupled)
+        _, first = np.unique(point_of, return_index=True)
+        met = MetUnknowns.of(s, tiling.place[first] // p)
+        # Of each tile there are sums for its images, and sums for what else its points meet.
+        largest = max(6 * m, s.n_interior + max(met.most, wanted.met) + s.n_coupled)
         chunks = -(-per_shard * largest**2 // _CHUNK)
         at_once = max(k for k in range(1, TILE_STEP + 1) if TILE_STEP % k == 0 and k * m * p <= max(_SLOTS, m * p))
         chunk = size_class(-(-per_shard // chunks), TILE_STEP)
@@ -119,9 +172,20 @@ class TileLayout(NamedTuple):
         lists = _pair_lists(_images_of_free_points(tiling, own, p), chunk, width)
         blocks = max(map(len, lists[2]), default=0)
         rows = tuple((g.name, g.depth if g.elimination == "point" else g.n_rows) for g in s.observed)
-        sizes = Sizes(images, bandwidth, tiles, m, p, blocks + 1, rows)
+        sizes = Sizes(images, bandwidth, tiles, m, p, blocks + 1, max(met.most, wanted.met), rows)
         return cls(
-            place, tiling, point_of, bool(free.any()), columns, width, shards * chunks, chunk, at_once, lists, sizes
+            place,
+            tiling,
+            point_of,
+            bool(free.any()),
+            columns,
+            width,
+            shards * chunks,
+            chunk,
+            at_once,
+            lists,
+            met,
+            sizes,
         )
 
     @property

@@ -32,6 +32,8 @@ class Tiles(eqx.Module):
     """How many batches of `at_once` tiles hold the points of each chunk: the first ones; the others are padding."""
     at_once: int = eqx.field(static=True)
     """Tiles that are computed with at a time: few enough for the cache of a core, enough to be worth its while."""
+    met: Int[np.ndarray, "chunks tiles b"]
+    """Shared unknowns that rows at the points of each tile touch; the number of these where it has fewer than most."""
     pair_tile: Int[np.ndarray, "chunks pairs"]
     """Tile within its chunk of each pair of images of a tile that meet (first image not before second)."""
     pair_images: Int[np.ndarray, "chunks pairs 2"]
@@ -98,6 +100,10 @@ class TiledStructure(AbstractStructure):
         """The reverse of `by_tile`."""
         joined = jnp.moveaxis(array, (0, 1), (-3, -2))
         return joined.reshape(*joined.shape[:-3], math.prod(joined.shape[-3:]))
+
+    def by_unknown(self, met: Float[Array, "chunks tiles b"]) -> Float[Array, "shared"]:
+        """Sums of numbers of `Tiles.met` by shared unknown."""
+        return jnp.zeros(self.n_shared).at[jnp.asarray(self.tiles.met)].add(met, mode="drop")
 
     def each_tile(self, function: Callable, numbers: tuple) -> Any:
         """`function` of (images, *numbers) of every tile, chunks and tiles first."""

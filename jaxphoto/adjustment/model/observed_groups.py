@@ -3,8 +3,8 @@
 What the rows of a group touch decides how they are eliminated; nobody declares it:
 
     reduced     no point: rows add to the reduced normal matrix, where images and shared unknowns meet
-    point       one point, and otherwise unknowns that are the same for all rows: they add to the point's own block
-                before it is eliminated
+    point       one point and no image: they add to the point's own block before it is eliminated, and meet few of
+                the shared unknowns there (`layout.tiled.Tiles.met`)
     coupled     all else, such as two points, or a point and an image: few rows, that extra unknowns carry
                 (`solver.normal`)
 """
@@ -74,13 +74,16 @@ class ObservedGroup(eqx.Module):
     image: Int[np.ndarray, "k rows"]
     """The images that a row touches."""
     point: Int[np.ndarray, "j rows"]
-    parameter: Int[np.ndarray, "p _"]
+    parameter: Int[np.ndarray, "p *_"]
     """Places of the parameters that a row touches in the vector of all shared ones; its length where there is none.
-    First those of each image, table by table, then those of the other arguments. (p, rows); of rows by point (p, 1)."""
+    First those of each image, table by table, then those of the other arguments. (p, rows), or by point (p, rows,
+    points)."""
     place: tuple[int, ...] = eqx.field(static=True)
     """Which of these are unknowns in any row."""
-    column: Int[np.ndarray, "l _"]
+    column: Int[np.ndarray, "l *_"]
     """The shared unknowns that they are; the number of these where a row has none."""
+    slot: Int[np.ndarray, "l _ _"]
+    """Of rows by point, which of the shared unknowns of the point's tile they are, see `Tiles.met`; else empty."""
     loss: AbstractLoss | LinearisedLoss | None
     """What rows cost, where it is not their square."""
     pair: Int[np.ndarray, "pairs rows 4"]
@@ -217,10 +220,7 @@ def group_of(
     column = unknown_of[parameter]
     place = np.flatnonzero((column < n_shared).any(axis=1))
     column = column[place].astype(np.int32)
-    alike = n > 0 and (parameter == parameter[:, :1]).all()
-    elimination: RowElimination = (
-        "reduced" if not points else "point" if len(points) == 1 and not images and alike else "coupled"
-    )
+    elimination: RowElimination = "reduced" if not points else "point" if len(points) == 1 and not images else "coupled"
     return ObservedGroup(
         name=name,
         elimination=elimination,
@@ -235,6 +235,7 @@ def group_of(
         parameter=parameter,
         place=tuple(int(k) for k in place),
         column=column,
+        slot=np.zeros((len(column), 0, 0), np.int32),
         loss=None,
         pair=np.zeros((0, n, 4), np.int32),
     )

@@ -50,8 +50,8 @@ _AT_ONCE = 1 << 24
 # From so many derivatives of each number on it is quicker to go back from the number: of one by 365 knots, forty times.
 _MANY_SLOPES = 16
 # Which axis of a row by point runs over the points, and which over the rows of one.
-_OVER_POINTS = Touched(None, None, -1), RowInputs(-1, Touched(None, None, -1), None, None, None, None, -1)  # type: ignore[arg-type]
-_OVER_ROWS = Touched(None, None, None), RowInputs(-1, Touched(None, None, None), None, None, None, None, None)  # type: ignore[arg-type]
+_OVER_POINTS = Touched(None, -1, -1), RowInputs(-1, Touched(None, -1, -1), None, None, None, -1, -1)  # type: ignore[arg-type]
+_OVER_ROWS = Touched(None, -1, None), RowInputs(-1, Touched(None, -1, None), None, None, None, -1, None)  # type: ignore[arg-type]
 
 
 def each_row(function: Callable[[Touched, RowInputs], Any], group: ObservedGroup, z: Touched, given: RowInputs) -> Any:
@@ -82,9 +82,7 @@ def gathered_rows(
         return a[None] if at_points else jnp.moveaxis(jnp.asarray(a)[..., group.point], -2, 0)
 
     def of_shared(a: Array, index: Any) -> Array:
-        found = jnp.append(a, 0.0)[index]
-        # Rows by point touch the same parameters all.
-        return found[:, 0] if at_points else found
+        return jnp.append(a, 0.0)[index]
 
     # An image's exterior orientation may be held fixed, which a scale of zero says.
     z = Touched(of_images(y.eop), of_shared(y.shared, group.column), of_points(y.points))

@@ -63,8 +63,6 @@ class AbstractStructure(eqx.Module):
     corrections: Corrections = eqx.field(static=True)
     n_interior: int = eqx.field(static=True)
     """Shared unknowns that image rows touch, those of cameras and what bends them: the first ones."""
-    n_border: int = eqx.field(static=True)
-    """These, and others that points meet: the next."""
     n_image_colours: int = eqx.field(static=True)
     free: Int[np.ndarray, "shared"]
     """Index, in the vector of all shared parameters, of each shared unknown."""
@@ -205,7 +203,6 @@ def structure_of(block: Block, priors: Unknowns, observed: ObservedRows | None =
     n_interior = int((free < n_parameters(given.cameras) + bent).sum())
     cameras = places_of_cameras(given.cameras)
     groups = tuple(group_of(name, rows, tables, cameras, unknown_of, len(free)) for name, rows in given.named)
-    met = [int(g.column.max(initial=-1)) + 1 for g in groups if g.elimination == "point"]
 
     point_free = np.ones((3, len(block.points))) * (priors.points is not FIXED)
     point_free[block.fixed.axis, block.fixed.who] = 0.0
@@ -220,7 +217,6 @@ def structure_of(block: Block, priors: Unknowns, observed: ObservedRows | None =
         n_points=len(block.points),
         corrections=block.corrections,
         n_interior=n_interior,
-        n_border=max([n_interior, *met]),
         n_image_colours=n_image_colours,
         image=image.astype(np.int32),
         point=point.astype(np.int32),

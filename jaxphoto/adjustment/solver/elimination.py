@@ -59,7 +59,7 @@ def solve_factored(reduced: Reduced, factor: BandFactor, b: Increments, at: Line
 
 def reduce_right(reduced: Reduced, b: Increments, at: Linearised, many: bool = False) -> tuple[Array, Array]:
     """A right-hand side, or one of `many` under `jax.vmap`, taken down to the reduced unknowns and to mu."""
-    s, i = at.structure, at.structure.n_border
+    s = at.structure
     if not s.tiles.free_points:
         return jnp.concatenate([b.eop.T.reshape(-1), b.shared]), jnp.zeros(len(reduced.k))
     z = jnp.stack(whiten(b.points, reduced.l))
@@ -70,8 +70,10 @@ def reduce_right(reduced: Reduced, b: Increments, at: Linearised, many: bool = F
     down = over_tiles(lambda f, _, z: f @ z.reshape(-1), at, reduced, (z,))
     of_images, border = jnp.split(down, [6 * image.shape[2]], axis=2)
     of_images = jax.ops.segment_sum(of_images.reshape(-1, 6), image.reshape(-1), s.n_images)
-    of_images, border = total((of_images, jnp.sum(border, (0, 1))), s)
-    return jnp.concatenate([(b.eop.T - of_images).reshape(-1), b.shared.at[:i].add(-border[:i])]), border[i:-1]
+    interior, met, rest = jnp.split(border, [s.n_interior, border.shape[2] - len(reduced.k) - 1], axis=2)
+    shared = s.by_unknown(met).at[: s.n_interior].add(jnp.sum(interior, (0, 1)))
+    of_images, shared, d = total((of_images, shared, jnp.sum(rest, (0, 1))[:-1]), s)
+    return jnp.concatenate([(b.eop.T - of_images).reshape(-1), b.shared - shared]), d
 
 
 def solve_reduced(
@@ -89,12 +91,12 @@ def solve_reduced(
     if r.f is None and not many:
         b_points = b_points - _up_by_rows(eop.T, shared, mu, at)
         return Increments(eop.T, shared, jnp.stack(unwhiten(whiten(b_points, r.l), r.l)))
-    border = jnp.concatenate([shared[: s.n_border], mu, jnp.zeros(1)])
+    interior, rest, met = shared[: s.n_interior], jnp.append(mu, 0.0), jnp.append(shared, 0.0)[s.tiles.met]
 
-    def up(f, image):
-        return (jnp.concatenate([eop[image].reshape(-1), border]) @ f).reshape(3, -1)
+    def up(f, image, met):
+        return (jnp.concatenate([eop[image].reshape(-1), interior, met, rest]) @ f).reshape(3, -1)
 
-    z = jnp.stack(whiten(b_points, r.l)) - s.by_point(over_tiles(up, at, r, ()))
+    z = jnp.stack(whiten(b_points, r.l)) - s.by_point(over_tiles(up, at, r, (met,)))
     return Increments(eop.T, shared, jnp.stack(unwhiten(z, r.l)))
 
 
@@ -113,8 +115,9 @@ def _down_by_rows(step: Array, at: Linearised) -> tuple[Array, Array, Array]:
     numbers = (s.by_tile(at.state.points), s.by_tile(step * scale.points))
     to_scene = s.each_tile(tile, (*numbers, values.xy, values.sigma_xy))
     eop, shared = pull_scene(total(_by_image(to_scene, scene, s), s))
-    if len(rest.w):
-        shared = shared.at[s.n_interior : s.n_border].add(total(jnp.einsum("lap,ap->l", rest.w, step), s))
+    for g, rows in zip(s.with_shared, rest.at_points, strict=True):
+        added = jnp.einsum("clrp,ckrp,kp->lrp", rows.shared, rows.points, step)
+        shared = shared + total(jnp.zeros_like(shared).at[jnp.asarray(g.column)].add(added, mode="drop"), s)
     return eop, shared, total(jnp.einsum("kcp,cp->k", rest.rows_p, step), s)
 
 
@@ -132,8 +135,9 @@ def _up_by_rows(eop: Array, shared: Array, mu: Array, at: Linearised) -> Array:
 
     numbers = (s.by_tile(at.state.points), values.xy, values.sigma_xy)
     result = s.by_point(s.each_tile(tile, numbers)) * scale.points + jnp.einsum("kcp,k->cp", rest.rows_p, mu)
-    if len(rest.w):
-        result = result + jnp.einsum("lap,l->ap", rest.w, shared[s.n_interior : s.n_border])
+    for g, rows in zip(s.with_shared, rest.at_points, strict=True):
+        moved = jnp.append(shared, 0.0)[jnp.asarray(g.column)]
+        result = result + jnp.einsum("ckrp,clrp,lrp->kp", rows.points, rows.shared, moved)
     return result
 
 

@@ -25,7 +25,7 @@ from jaxphoto.adjustment.model.observed_groups import ObservedGroup, RowsAtPoint
 from jaxphoto.adjustment.model.row_functions import RowJacobian, reduced_places
 from jaxphoto.adjustment.solver.band import invert_band
 from jaxphoto.adjustment.solver.elimination import FactoredNormal, over_tiles, solve_factored
-from jaxphoto.adjustment.solver.non_image_rows import NonImageRows, non_image_rows
+from jaxphoto.adjustment.solver.non_image_rows import non_image_rows
 from jaxphoto.adjustment.solver.normal import Linearised, Reduced, dot
 from jaxphoto.adjustment.solver.reduced import tile_columns
 from jaxphoto.adjustment.solver.similarity import along_motions, n_open_motions
@@ -71,17 +71,19 @@ def _of_points(
 ) -> tuple[Float[Array, "points 3 3"], RowCofactors]:
     """Cofactors of points, and j Q j' of rows."""
     _, scale, values, s = at
-    columns_of, groups = tile_columns(at), s.with_shared
-    by_rows = _by_rows(non_image_rows(at), s) if groups else ()
-    n, q, i, k = 6 * s.n_images, s.n_image_colours, s.n_border, len(reduced.k)
-    # One more than there are: zeros serve the last row of F, and colours that mean nothing in an image.
-    shared = jnp.concatenate([n + jnp.arange(i), n + s.n_shared + jnp.arange(k + 1)])
+    columns_of = tile_columns(at)
+    at_points = non_image_rows(at).at_points if s.with_shared else ()
+    n, q, k, n_met = 6 * s.n_images, s.n_image_colours, len(reduced.k), s.tiles.met.shape[2]
+    # One more than there are: zeros serve the last row of F, and what means nothing in an image or a tile.
+    interior, rest, none = n + jnp.arange(s.n_interior), n + s.n_shared + jnp.arange(k + 1), n + s.n_shared + k
+    met = jnp.asarray(s.tiles.met)
+    met = jnp.where(met < s.n_shared, n + met, none)
 
-    def tile(f, image, l, by_rows, *measured):  # noqa: E741
+    def tile(f, image, l, at_points, met, *measured):  # noqa: E741
         size = l.shape[1]
         if not s.tiles.free_points:
             f = jnp.zeros((len(f), 3 * size))
-        index = jnp.concatenate([(6 * image[:, None] + jnp.arange(6)).reshape(-1), shared])
+        index = jnp.concatenate([(6 * image[:, None] + jnp.arange(6)).reshape(-1), interior, met, rest])
         own = full.at[index[:, None], index].get(mode="fill", fill_value=0.0)
         a = own @ f
         # A product of matrices would want both turned round first.
@@ -89,15 +91,15 @@ def _of_points(
         inner = jnp.eye(3)[:, :, None] + g
         half = jnp.stack(unwhiten(inner, l))
         points = jnp.stack(unwhiten(half.transpose(1, 0, 2), l)).transpose(2, 0, 1)
-        none = tuple(jnp.zeros((len(j), len(j), *j.shape[2:])) for j in by_rows)
+        none = tuple(jnp.zeros((len(r), *r.shape)) for r, *_ in at_points)
         nothing = lambda *_: (jnp.zeros((3, len(image), size)), none)  # noqa: E731
-        return points, *jax.lax.cond(of_rows, rows, nothing, (image, *measured), by_rows, l, own, a, inner)
+        return points, *jax.lax.cond(of_rows, rows, nothing, (image, *measured), at_points, l, own, a, inner)
 
-    def rows(measured, by_rows, l, own, a, inner):  # noqa: E741
+    def rows(measured, at_points, l, own, a, inner):  # noqa: E741
         image, both = measured[0], columns_of(measured)
         m, size = both[0].residual.shape
         column = jnp.asarray(s.column)[image, :q]
-        column = jnp.where(column < i, 6 * m + column, 6 * m + i + k)
+        column = jnp.where(column < s.n_interior, 6 * m + column, len(own) - 1)
         touched = jnp.concatenate([6 * jnp.arange(m)[:, None] + jnp.arange(6), column], axis=1)
         j = jnp.stack([jnp.concatenate([c.eop, c.shared]) for c in both], axis=1).transpose(2, 0, 1, 3)
         z = jnp.stack([jnp.stack(whiten(c.point, l)) for c in both]).transpose(0, 2, 1, 3)
@@ -109,29 +111,21 @@ def _of_points(
             return jnp.sum(j[:, :, o] * seen[:, :, k], axis=1) - met + jnp.einsum("mkp,klp,mlp->mp", z[o], inner, z[k])
 
         found = jnp.stack([of_both(0, 0), of_both(1, 1), of_both(0, 1)])
-        first = 6 * m
-        return found, tuple(of_group(g, j, l, own, a, inner, first) for g, j in zip(groups, by_rows, strict=True))
+        return found, tuple(of_group(group, 6 * m, l, own, a, inner) for group in at_points)
 
-    def of_group(g, j, l, own, a, inner, first):  # noqa: E741
-        z, j = jnp.stack(whiten(j[:, :3].swapaxes(0, 1), l)), j[:, 3:]
-        met = first + jnp.asarray(g.column)[:, 0]
-        across = jnp.einsum("clrp,lkp->ckrp", j, a[met].reshape(len(met), 3, -1))
-        shared = jnp.einsum("clrp,lm,dmrp->cdrp", j, own[met[:, None], met], j)
+    def of_group(group, of_images, l, own, a, inner):  # noqa: E741
+        j, z = group.shared, jnp.stack(whiten(group.points.swapaxes(0, 1), l))
+        at = jnp.where(group.slot < n_met, of_images + s.n_interior + group.slot, len(own) - 1)
+        of_slot = a.reshape(len(a), 3, -1)[at, :, jnp.arange(at.shape[2])]
+        across = jnp.einsum("clrp,lrpk->ckrp", j, of_slot)
+        shared = jnp.einsum("clrp,lmrp,dmrp->cdrp", j, own[at[:, None], at[None]], j)
         both = jnp.einsum("kcrp,dkrp->cdrp", z, across)
         return shared - both - both.swapaxes(0, 1) + jnp.einsum("kcrp,klp,ldrp->cdrp", z, inner, z)
 
-    of_points = (reduced.l, by_rows, values.points, scale.points)
-    l, by_rows, *places = jax.tree.map(s.by_tile, of_points)  # noqa: E741
-    points, *found = over_tiles(tile, at, reduced, (l, by_rows, values.xy, values.sigma_xy, *places))
+    of_points = (reduced.l, at_points, values.points, scale.points)
+    l, at_points, *places = jax.tree.map(s.by_tile, of_points)  # noqa: E741
+    points, *found = over_tiles(tile, at, reduced, (l, at_points, met, values.xy, values.sigma_xy, *places))
     return points.reshape(-1, 3, 3), RowCofactors(found[0], tuple(s.by_point(v) for v in found[1]))
-
-
-def _by_rows(rest: NonImageRows, s: TiledStructure) -> tuple[Float[Array, "c touched rows points"], ...]:
-    """Derivatives of the groups of `AbstractStructure.with_shared` by their points and by shared unknowns."""
-    pairs = zip(s.observed, rest.jacobians, strict=True)
-    chosen = ((g, j) for g, j in pairs if isinstance(g.rows, RowsAtPoints) and g.place)
-    shared = lambda g, j: jnp.broadcast_to(j.shared, (g.components, len(g.place), *j.shared.shape[2:]))  # noqa: E731
-    return tuple(jnp.concatenate([j.points[:, 0], shared(g, j)], axis=1) for g, j in chosen)
 
 
 def _without_open_motions(q: Cofactors, at: Linearised, factored: FactoredNormal) -> Cofactors:

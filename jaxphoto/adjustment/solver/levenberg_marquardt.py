@@ -35,7 +35,7 @@ def zero_system(y: Increments, values: TiledValues, s: TiledStructure) -> Factor
     """A system of the right shapes, to begin with."""
     n, q, k = 6 * s.n_images, s.n_shared, s.n_coupled + len(values.datum_eop)
     *tiles, m = s.tiles.image.shape
-    f = (*tiles, 6 * m + s.n_border + k + 1, s.tiles.eliminated)
+    f = (*tiles, 6 * m + s.n_interior + s.tiles.met.shape[2] + k + 1, s.tiles.eliminated)
     size, inner = n // s.tiles.columns, s.tiles.columns - 1
     factor = BandFactor(
         jnp.zeros((inner, 2 * size, size)), jnp.zeros((q, inner * size)), jnp.zeros((size + q, size + q))

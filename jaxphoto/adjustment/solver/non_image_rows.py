@@ -11,9 +11,25 @@ from jaxphoto.adjustment.layout.tiled import TiledStructure
 from jaxphoto.adjustment.model.numbers import NonImageResiduals, datum_residuals
 from jaxphoto.adjustment.model.observed_groups import ObservedGroup, RowsAtPoints
 from jaxphoto.adjustment.model.row_functions import RowJacobian, in_portions, row_jacobian, rows_at_once
-from jaxphoto.adjustment.model.structure import total
 from jaxphoto.adjustment.solver.normal import Linearised
 from jaxphoto.compiling import once
+
+
+class RowsOfPoints(NamedTuple):
+    """Rows that touch a point and shared unknowns: residuals, and derivatives by both."""
+
+    residual: Float[Array, "c rows points"]
+    shared: Float[Array, "c l rows points"]
+    points: Float[Array, "c 3 rows points"]
+    slot: Int[Array, "l rows points"]
+    """Which of the unknowns of the point's tile these are."""
+
+    def of_tile(self, size: int) -> Float[Array, "size rows points c"]:
+        """The derivatives by all `size` shared unknowns of a tile, where points are those of the tile."""
+        _, rows, points = self.slot.shape
+        at = self.slot, jnp.arange(rows)[:, None], jnp.arange(points)
+        zero = jnp.zeros((size, rows, points, len(self.residual)))
+        return zero.at[at].add(jnp.moveaxis(self.shared, 0, -1), mode="drop")
 
 
 class NonImageRows(NamedTuple):
@@ -24,9 +40,9 @@ class NonImageRows(NamedTuple):
     v: Float[Array, "3 3 points"]
     """Sums over the rows that lie at points: of J_p' J_p,"""
     b: Float[Array, "3 points"]
-    """of J_p' r,"""
-    w: Float[Array, "others 3 points"]
-    """and of J_s' J_p, s being the unknowns that points meet besides those of cameras (`Structure.n_border`)."""
+    """and of J_p' r."""
+    at_points: tuple["RowsOfPoints", ...]
+    """Of those that touch shared unknowns, too (`AbstractStructure.with_shared`)."""
     rows_e: Float[Array, "constraints images 6"]
     """Rows that couple points, by what they touch: observations, then the constraints of the datum."""
     rows_s: Float[Array, "constraints shared"]
@@ -53,12 +69,13 @@ class NormalSums(NamedTuple):
 def non_image_rows(at: Linearised) -> NonImageRows:
     """Derivatives and residuals at `at`, and their sums by point."""
     increments, scale, values, s = at
-    n, q = increments.points.shape[1], s.n_border - s.n_interior
+    n = increments.points.shape[1]
     jacobians = tuple(
         row_jacobian(g, numbers, increments, scale, values, s)
         for g, numbers in zip(s.observed, values.groups, strict=True)
     )
-    v, b, w = jnp.zeros((3, 3, n)), jnp.zeros((3, n)), jnp.zeros((q, 3, n))
+    v, b = jnp.zeros((3, 3, n)), jnp.zeros((3, n))
+    at_points: list[RowsOfPoints] = []
     coupling: list[tuple[Array, Array, Array]] = []
     coupled = []
     for g, j in zip(s.observed, jacobians, strict=True):
@@ -68,10 +85,8 @@ def non_image_rows(at: Linearised) -> NonImageRows:
             flat = jnp.moveaxis(flat, 2, 1).reshape(-1, 3, n)
             r = j.residual.reshape(-1, n)
             v, b = v + jnp.einsum("rap,rbp->abp", flat, flat), b + jnp.einsum("rap,rp->ap", flat, r)
-            if len(g.place):
-                shared = jnp.moveaxis(j.shared, 1, 2).reshape(-1, len(g.place), n)
-                met = jnp.einsum("rlp,rap->lap", shared, flat)
-                w = w.at[jnp.asarray(g.column)[:, 0] - s.n_interior].add(met, mode="drop")
+            if g.place:
+                at_points.append(RowsOfPoints(j.residual, j.shared, j.points[:, 0], jnp.asarray(g.slot)))
         elif g.elimination == "coupled":
             coupling.append(_coupled(g, j, s, n))
             coupled.append(j.residual.reshape(-1))
@@ -87,7 +102,8 @@ def non_image_rows(at: Linearised) -> NonImageRows:
         constraints.points,
     )
     e, of_s, p = (jnp.concatenate(of) for of in zip(*coupling, datum, strict=True))
-    return NonImageRows(jacobians, residuals, v, b, w, e, of_s, p, jnp.concatenate([*coupled, residuals.datum]))
+    coupled_rows = jnp.concatenate([*coupled, residuals.datum])
+    return NonImageRows(jacobians, residuals, v, b, tuple(at_points), e, of_s, p, coupled_rows)
 
 
 def _coupled(g: ObservedGroup, j: RowJacobian, s: TiledStructure, n_points: int) -> tuple[Array, Array, Array]:
@@ -109,20 +125,9 @@ def _coupled(g: ObservedGroup, j: RowJacobian, s: TiledStructure, n_points: int)
 def add_non_image_rows(sums: NormalSums, rest: NonImageRows, s: TiledStructure) -> NormalSums:
     """The sums with those of all rows that meet images and shared unknowns."""
     for g, j in zip(s.observed, rest.jacobians, strict=True):
-        if isinstance(g.rows, RowsAtPoints):
-            if len(g.place):
-                sums = _add_shared(sums, g, j, s)
-        elif g.elimination == "reduced":
+        if g.elimination == "reduced":
             sums = _add_reduced(sums, g, j, s)
     return sums._replace(us=sums.us[:, :, :-1], uss=sums.uss[:-1, :-1], b_s=sums.b_s[:-1])
-
-
-def _add_shared(sums: NormalSums, g: ObservedGroup, j: RowJacobian, s: TiledStructure) -> NormalSums:
-    """Of rows at points, which are dealt out with these, what they add to the shared unknowns."""
-    flat = jnp.moveaxis(j.shared, 1, 0).reshape(len(g.place), -1)
-    column = jnp.asarray(g.column)[:, 0]
-    own, b = total((flat @ flat.T, flat @ j.residual.reshape(-1)), s)
-    return sums._replace(uss=sums.uss.at[column[:, None], column].add(own), b_s=sums.b_s.at[column].add(b))
 
 
 def _add_reduced(sums: NormalSums, g: ObservedGroup, j: RowJacobian, s: TiledStructure) -> NormalSums:

@@ -46,12 +46,14 @@ class TileParts(NamedTuple):
     """What a tile's sums are made of."""
 
     columns: tuple[TileJacobian, TileJacobian]
-    f: Float[Array, "6m+border 3p"]
-    """F, with the right-hand side for its last row."""
+    f: Float[Array, "f 3p"]
+    """F: images, interior unknowns, what else the tile's points meet, constraints; last the right-hand side."""
     l: Float[Array, "6 p"]  # noqa: E741
     b: Float[Array, "3 p"]
     diagonal: Float[Array, "3 p"]
     """That of V, without damping."""
+    met: Float[Array, "b b+1"]
+    """Of rows at points, J_s' J_s and J_s' r of what else the tile's points meet."""
 
 
 def reduce_normal(at: Linearised, damping) -> tuple[Band, Reduced, RightSide]:
@@ -63,9 +65,15 @@ def reduce_normal(at: Linearised, damping) -> tuple[Band, Reduced, RightSide]:
     rest = non_image_rows(at)
     coupled = rest.coupled
     parts_of = tile_parts(at, damping, coupled)
-    n, q, c = s.n_images, s.n_image_colours, s.n_border + len(coupled) + 1
+    n, q, k, i, b = s.n_images, s.n_image_colours, len(coupled), s.n_interior, tiles.met.shape[2]
+    c, n_shared = i + k + 1, s.n_shared
     _, chunk, m = tiles.image.shape
     width, inner = n // tiles.columns, tiles.columns - 1
+
+    def in_all(v: Array, axis: int) -> Array:
+        """Of the border, what all tiles have: not what only some of them meet."""
+        own, _, rest = jnp.split(v, [i, i + b], axis)
+        return jnp.concatenate([own, rest], axis)
 
     def tile(numbers):
         p = parts_of(numbers)
@@ -73,30 +81,34 @@ def reduce_normal(at: Linearised, damping) -> tuple[Band, Reduced, RightSide]:
         j = jnp.concatenate(whole, axis=2)
         gram = p.f @ p.f.T
         of_images = gram[: 6 * m, : 6 * m] if tiles.free_points else gram[:0, :0]
-        across = gram[: 6 * m, 6 * m :].reshape(m, -1)
-        own = jnp.concatenate([jnp.einsum("maj,mbj->mab", j, j).reshape(m, -1), across], axis=1)
+        across, border = gram[: 6 * m, 6 * m :].reshape(m, 6, -1), gram[6 * m :, 6 * m :]
+        square = jnp.einsum("maj,mbj->mab", j, j).reshape(m, -1)
+        own = jnp.concatenate([square, in_all(across, 2).reshape(m, -1)], axis=1)
         f = p.f if tiles.few else None
-        return of_images, own, gram[6 * m :, 6 * m :], f, p.l, p.b, p.diagonal
+        met = across[:, :, i : i + b].transpose(0, 2, 1), border[i : i + b], p.met
+        return of_images, own, in_all(in_all(border, 0), 1), met, f, p.l, p.b, p.diagonal
 
     def add_chunk(sums, numbers):
-        (pair_tile, pair_images, pair_block, block), batches, of_tiles = numbers
-        grams, own, border, *kept = tiles.each_of_chunk(tile, of_tiles, batches)
+        (pair_tile, pair_images, pair_block, block, which), batches, of_tiles = numbers
+        grams, own, border, met, *kept = tiles.each_of_chunk(tile, of_tiles, batches)
         own = sum_by(own.reshape(chunk * m, -1), of_tiles[0].reshape(-1), n)
+        of_met = _add_met(sums[3], met, which, of_tiles[0], i) if b else sums[3]
         if not tiles.free_points:
-            return (sums[0], sums[1] + own, sums[2]), kept
+            return (sums[0], sums[1] + own, sums[2], of_met), kept
         grams = grams.reshape(chunk, m, 6, m, 6)[pair_tile, pair_images[:, 0], :, pair_images[:, 1]]
         grams = jax.ops.segment_sum(grams, pair_block, len(block), indices_are_sorted=True)
         band = add_blocks(sums[0], -grams, block, distinct=True)
-        return (band, sums[1] + own, sums[2] + border.sum(0)), kept
+        return (band, sums[1] + own, sums[2] + border.sum(0), of_met), kept
 
     zero = (
         (jnp.zeros((inner, 2 * width, 6, width, 6)), jnp.zeros((width, 6, width, 6))),
         jnp.zeros((n, (7 + q) ** 2 + 6 * c)),
         jnp.zeros((c, c)),
+        _Met.none(n, n_shared, i, k) if b else None,
     )
-    lists = (tiles.pair_tile, tiles.pair_images, tiles.pair_block, tiles.block)
+    lists = (tiles.pair_tile, tiles.pair_images, tiles.pair_block, tiles.block, tiles.met)
     sums, (f, *of_points) = jax.lax.scan(add_chunk, zero, (lists, tiles.batches, tile_numbers(at, rest)))
-    (columns, last), own, border = total(sums, s)
+    (columns, last), own, border, of_met = total(sums, s)
     l, b_points, v = map(s.by_point, of_points)  # noqa: E741
     # Tiles that are padding were not computed: their points are each by itself.
     l = jnp.where(l[0] == 0, jnp.array([1.0, 0, 1, 0, 0, 1])[:, None], l)  # noqa: E741
@@ -107,6 +119,8 @@ def reduce_normal(at: Linearised, damping) -> tuple[Band, Reduced, RightSide]:
     images = NormalSums((columns, last), m_images[:, :6, :6], us, uss, b_s, m_images[:, :6, -1])
     (columns, last), u, us, uss, b_s, b_e = add_non_image_rows(images, rest, s)
     weight = Increments(jnp.einsum("nii->in", u), jnp.diagonal(uss), v)
+    if of_met is not None:
+        weight, b_s = weight._replace(shared=weight.shared + of_met.rows[:-1, 0]), b_s + of_met.rows[:-1, 1]
     added = damping * weight.eop.T + jnp.where(weight.eop.T == 0, 1.0, 0.0)
     u = u + added[:, :, None] * jnp.eye(6)
     each, of_inner = jnp.arange(n), inner * width
@@ -115,15 +129,21 @@ def reduce_normal(at: Linearised, damping) -> tuple[Band, Reduced, RightSide]:
     )
     last = last.at[each[:width], :, each[:width]].add(u[of_inner:], unique_indices=True)
 
-    i, k = s.n_border, len(coupled)
-    us = us.at[:, :, :i].add(-met[:, :, :i]).transpose(2, 0, 1).reshape(s.n_shared, 6 * n)
+    us = us.at[:, :, :i].add(-met[:, :, :i])
     uss = (uss + damping * jnp.diag(weight.shared)).at[:i, :i].add(-border[:i, :i])
     ge = rest.rows_e.transpose(1, 2, 0) - met[:, :, i : i + k]
     gs = rest.rows_s.T.at[:i].add(-border[:i, i : i + k])
+    if of_met is not None:
+        us = us - of_met.images[:, :, :-1]
+        # Of what is met with interior unknowns, both halves.
+        uss = (uss - of_met.shared[:-1, :-1]).at[:, :i].add(-of_met.interior[:-1])
+        uss = uss.at[:i].add(-of_met.interior[:-1].T)
+        gs = gs - of_met.constraints[:-1, :-1]
+    us = us.transpose(2, 0, 1).reshape(n_shared, 6 * n)
     g = jnp.concatenate([ge.reshape(6 * n, k), gs])
     kk = jnp.eye(k) + border[i : i + k, i : i + k]
     # Put together by parts that are written whole: `block` would be computed number by number.
-    end = jnp.zeros((6 * width + s.n_shared,) * 2).at[: 6 * width, : 6 * width].set(last.reshape(6 * width, -1))
+    end = jnp.zeros((6 * width + n_shared,) * 2).at[: 6 * width, : 6 * width].set(last.reshape(6 * width, -1))
     end = end.at[6 * width :, : 6 * width].set(us[:, 6 * of_inner :]).at[6 * width :, 6 * width :].set(uss)
     if k:
         # A = S + g K^-1 g' joins all images: the band has one full column block.
@@ -131,11 +151,46 @@ def reduce_normal(at: Linearised, damping) -> tuple[Band, Reduced, RightSide]:
     a = Band(columns.reshape(inner, 12 * width, 6 * width), us[:, : 6 * of_inner], end)
 
     b_e, b_s = b_e + jnp.einsum("cna,c->na", rest.rows_e, coupled), b_s + rest.rows_s.T @ coupled
-    right = jnp.concatenate([(b_e - met[:, :, -1]).reshape(-1), b_s.at[:i].add(-border[:i, -1])])
+    right_s = b_s.at[:i].add(-border[:i, -1])
+    if of_met is not None:
+        right_s = right_s - of_met.constraints[:-1, -1]
+    right = jnp.concatenate([(b_e - met[:, :, -1]).reshape(-1), right_s])
     reduced = Reduced(diagonal_of(a), g, kk, f, l, weight, jnp.asarray(damping, float))
     # Of the residuals' own square, the sums hold the image rows' part.
     squares = jnp.sum(m_images[:, -1, -1]) + other_squares(rest.residuals, s)
     return a, reduced, RightSide(Increments(b_e.T, b_s, b_points), right, border[i : i + k, -1], squares)
+
+
+class _Met(NamedTuple):
+    """Sums for shared unknowns that only some points meet, in the order of all of them and one that means none."""
+
+    images: Float[Array, "images 6 shared+1"]
+    interior: Float[Array, "shared+1 interior"]
+    shared: Float[Array, "shared+1 shared+1"]
+    """F F' of two of them, less the J_s' J_s of their rows."""
+    constraints: Float[Array, "shared+1 k+1"]
+    rows: Float[Array, "shared+1 2"]
+    """The diagonal of J_s' J_s, and J_s' r."""
+
+    @classmethod
+    def none(cls, images: int, shared: int, interior: int, k: int) -> "_Met":
+        n = shared + 1
+        return cls(*map(jnp.zeros, ((images, 6, n), (n, interior), (n, n), (n, k + 1), (n, 2))))
+
+
+def _add_met(sums: _Met, of_tiles: tuple[Array, Array, Array], which: Array, image: Array, i: int) -> _Met:
+    """The sums with those of a chunk: of images, of the border and of rows, by what each tile meets (tiles, b)."""
+    images, border, rows = of_tiles
+    b = which.shape[1]
+    interior, shared, rest = jnp.split(border, [i, i + b], axis=2)
+    diagonal = jnp.diagonal(rows, axis1=1, axis2=2)
+    return _Met(
+        sums.images.at[image[:, :, None], :, which[:, None, :]].add(images),
+        sums.interior.at[which].add(interior),
+        sums.shared.at[which[:, :, None], which[:, None, :]].add(shared - rows[:, :, :b]),
+        sums.constraints.at[which].add(rest),
+        sums.rows.at[which].add(jnp.stack([diagonal, rows[:, :, b]], axis=2)),
+    )
 
 
 def tile_numbers(at: Linearised, rest: NonImageRows):
@@ -143,8 +198,8 @@ def tile_numbers(at: Linearised, rest: NonImageRows):
     increments, scale, values, s = at
     tiles = s.tiles
     points = values.points + increments.points * scale.points
-    of_points = (s.by_tile(v) for v in (points, scale.points, rest.v, rest.b, rest.w, rest.rows_p))
-    return (tiles.image, values.xy, values.sigma_xy, *of_points)
+    of_points = (points, scale.points, rest.v, rest.b, rest.at_points, rest.rows_p)
+    return (tiles.image, values.xy, values.sigma_xy, *jax.tree.map(s.by_tile, of_points))
 
 
 def tile_columns(at: Linearised):
@@ -167,13 +222,19 @@ def tile_parts(at: Linearised, damping, coupled: Float[Array, "constraints"]):
     s, columns_of = at.structure, tile_columns(at)
 
     def parts(numbers) -> TileParts:
-        *measured, own_v, own_b, own_w, rows_p = numbers
+        *measured, own_v, own_b, at_points, rows_p = numbers
         j = columns_of(measured)
-        image, (m, p) = measured[0], j[0].residual.shape
+        image, (m, p), n_met = measured[0], j[0].residual.shape, s.tiles.met.shape[2]
+        own_w, met = jnp.zeros((n_met, 3, p)), jnp.zeros((n_met, n_met + 1))
+        for rows in at_points:
+            by_met = rows.of_tile(n_met)
+            own_w = own_w + jnp.einsum("brpc,ckrp->bkp", by_met, rows.points)
+            square = jnp.einsum("arpc,brpc->ab", by_met, by_met)
+            met = met + jnp.column_stack([square, jnp.einsum("brpc,crp->b", by_met, rows.residual)])
         if not s.tiles.free_points:
-            f = jnp.zeros((6 * m + s.n_border + len(coupled) + 1, 0))
+            f = jnp.zeros((6 * m + s.n_interior + n_met + len(coupled) + 1, 0))
             unit, nothing = jnp.array([1.0, 0, 1, 0, 0, 1])[:, None], jnp.zeros((3, p))
-            return TileParts(j, f, jnp.broadcast_to(unit, (6, p)), nothing, nothing)
+            return TileParts(j, f, jnp.broadcast_to(unit, (6, p)), nothing, nothing, met)
         v, b = _met([c.point for c in j], j), _met([c.residual[None] for c in j], j)[0]
         ws = jnp.concatenate([_by_interior(j, image, s), own_w])
         v, b = v + own_v, b + own_b
@@ -191,7 +252,7 @@ def tile_parts(at: Linearised, damping, coupled: Float[Array, "constraints"]):
             *(c.point for c in j),
         )
         f = jnp.concatenate([once(_whitened_eop, s.eop_free, j, z).reshape(6 * m, 3 * p), border.reshape(-1, 3 * p)])
-        return TileParts(j, f, l, b, diagonal)
+        return TileParts(j, f, l, b, diagonal, met)
 
     return parts
 
