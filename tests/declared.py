@@ -244,11 +244,11 @@ def _exposures_and_ties(angles: np.ndarray) -> tuple:
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     pose = foot + rng.uniform(-200, 200, (n, 3)) * [1, 1, 0.1] + np.array([0, 0, 700])
     turned = rng.uniform(-0.1, 0.1, (n, 3)) - np.array([0, 0, 1])
-    every, weight = spline.all_weights(np.linspace(0, 2, n))
+    own, weight = spline.weights(np.linspace(0, 2, n))
     return (
         TrajectoryStations(who, knots[who], weights[who], axis, np.zeros(len(who)), station),
         TrajectoryAttitudes(np.arange(n_images), knots, weights, angles, np.full((n_images, 3), 5e-5) * [1, 1, 2]),
-        StripPoints(point, every, weight, foot, pose, turned, normal, np.full(n, 0.03), np.zeros(n)),
+        StripPoints(point, own, weight, foot, pose, turned, normal, np.full(n, 0.03), np.zeros(n)),
     )
 
 

@@ -109,5 +109,5 @@ def _cubic(u: Float[Numbers, "n"]) -> list[Float[Numbers, "n"]]:
 
 
 def weighted_knot(knots: TrajectoryKnot, weights: Float[Numbers, "knots"]) -> TrajectoryKnot:
-    """The correction that some knots (leading axis) make up: four, or all of a strip."""
-    return jax.tree.map(lambda v: jnp.sum(weights[:, None] * v, axis=0), knots)
+    """The correction that four knots (leading axis) make up."""
+    return jax.tree.map(lambda v: sum(weights[k] * v[k] for k in range(len(weights))), knots)

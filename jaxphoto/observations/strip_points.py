@@ -16,10 +16,9 @@ class StripPoints(AbstractObservations):
         normal . (X - F') = rise
 
     with standard deviation `sigma` (m). `foot` F (m) is a place on the strip's plane as measured, `scanner` and
-    `roll_pitch_yaw` the pose of the scanner when it was, and F' is `georeferencing.corrected_return` of it. `rise` is
-    what was observed: zero, unless somebody adds an error to it. The rows of a strip name all knots of its trajectory,
-    most of them with zero in `weights`: so all rows meet the same unknowns, and points are eliminated with them
-    (`adjustment.model.observed_groups`). Rows of several strips are several groups.
+    `roll_pitch_yaw` the pose of the scanner when it was, by the trajectory; `knots` and `weights` give what that is off
+    by (`georeferencing.StripSpline.weights`), and F' is `georeferencing.corrected_return`. `rise` is what was observed:
+    zero, unless somebody adds an error to it.
     """
 
     group = "strip_points"
@@ -29,8 +28,8 @@ class StripPoints(AbstractObservations):
     observed = "rise"
 
     point: Int[np.ndarray, "n"] = touching("point")
-    knots: Int[np.ndarray, "n knots"] = touching("trajectory_knots")
-    weights: Float[Numbers, "n knots"]
+    knots: Int[np.ndarray, "n 4"] = touching("trajectory_knots")
+    weights: Float[Numbers, "n 4"]
     foot: Float[Numbers, "n 3"]
     scanner: Float[Numbers, "n 3"]
     roll_pitch_yaw: Float[Numbers, "n 3"]

@@ -54,15 +54,23 @@ class TiePointSearch:
         return seen
 
     def rows(self, seen: Sequence[PointPlanes], errors: StripErrors) -> tuple[StripPoints, ...]:
-        """The points that fit as observations, strip by strip."""
-        groups = []
+        """The points that fit as observations: one group of them, where there are any."""
+        of_strips = []
         for f in (f for f in seen if f.fits.any()):
             found = PointsOnPlanes(*(v[f.fits] for v in f.found))
             side = side_of(f.patches, found.patch, found.foot, f.look.strip, errors, self.search.path)
-            knots, weights = errors.splines[f.look.strip].all_weights(f.patches.time[found.patch])
             normal = f.patches.normal[found.patch]
-            pose = side.scanner, side.roll_pitch_yaw
-            none = np.zeros(len(normal))
-            point = self.points[found.point]
-            groups.append(StripPoints(point, knots, weights, side.point, *pose, normal, found.sigma, none))
-        return tuple(groups)
+            of_strips.append(
+                StripPoints(
+                    self.points[found.point],
+                    side.knots,
+                    side.weights,
+                    side.point,
+                    side.scanner,
+                    side.roll_pitch_yaw,
+                    normal,
+                    found.sigma,
+                    np.zeros(len(normal)),
+                )
+            )
+        return (StripPoints.joined(*of_strips),) if of_strips else ()
