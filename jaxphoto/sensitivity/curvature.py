@@ -4,6 +4,7 @@ Each function takes `curved`: 1 for J'J + sum_r r d2r, 0 for J'J alone (see `hes
 differentiation, and kept by what each row touches: no dense second derivative of a residual is ever made.
 """
 
+import math
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -138,8 +139,9 @@ def other_second(second: tuple[RowSecond, ...], s: TiledStructure) -> Float[Arra
     h = jnp.zeros((n, n))
     for g, own in zip(s.observed, second, strict=True):
         if isinstance(g.rows, RowsAtPoints):
-            k = len(g.place)
-            place, of_rows = 6 * s.n_images + jnp.asarray(g.column).reshape(k, -1), own.h[:k, :k].reshape(k, k, -1)
+            k, rows = len(g.place), math.prod(own.h.shape[2:])
+            place = 6 * s.n_images + jnp.asarray(g.column).reshape(k, rows)
+            of_rows = own.h[:k, :k].reshape(k, k, rows)
         elif g.elimination == "reduced":
             place, of_rows = reduced_places(g, s.n_images), own.h
         else:

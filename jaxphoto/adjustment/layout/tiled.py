@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, Shaped
 
 from jaxphoto.adjustment.model.numbers import AbstractValues, NonImageResiduals
 from jaxphoto.adjustment.model.structure import AbstractStructure
@@ -90,7 +90,7 @@ class TiledStructure(AbstractStructure):
         """Devices that tiles and their points are dealt out to."""
         return self.tiles.shards
 
-    def by_tile(self, array: Float[Array, "*c points"]) -> Float[Array, "chunks tiles *c p"]:
+    def by_tile(self, array: Shaped[Array, "*c points"]) -> Shaped[Array, "chunks tiles *c p"]:
         """Numbers of points, tile by tile."""
         n_chunks, chunk, _ = self.tiles.image.shape
         split = array.reshape(*array.shape[:-1], n_chunks, chunk, self.tiles.per_tile)
