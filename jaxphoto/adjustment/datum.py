@@ -6,25 +6,26 @@ perhaps together with a free shift or lever arm. What none sees is the datum def
 it.
 """
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
 import numpy as np
-from scipy.sparse import csr_array
 
-from jaxphoto.adjustment.datum_sensitivity import DatumRows, Sensitivity, row_sensitivity
 from jaxphoto.adjustment.datum_words import datum_sentence
 from jaxphoto.adjustment.model.numbers import Values
 from jaxphoto.adjustment.model.row_functions import rows_of
 from jaxphoto.adjustment.model.structure import Structure
-from jaxphoto.adjustment.solver.similarity import motions
+from jaxphoto.adjustment.solver.similarity import DatumRows, motions
 from jaxphoto.arrays import still
 from jaxphoto.block import Block
 from jaxphoto.camera import RollingShutter
 from jaxphoto.compiling import jit_quickly
 from jaxphoto.errors import DatumError
 from jaxphoto.observations import PRIORS, ControlRows
+
+if TYPE_CHECKING:
+    from jaxphoto.adjustment.datum_sensitivity import SeenMotions
 
 # A rotation (rad), or a scale, that observations know no better than this is as good as open: it is no longer small.
 _VAGUE = 0.05
@@ -133,7 +134,7 @@ def _plainly_closed(block: Block, values: Values, structure: Structure, vague: f
     return False
 
 
-def _check_vague(block: Block, sensitivity: Sensitivity, named: list[str]) -> None:
+def _check_vague(block: Block, sensitivity: "SeenMotions", named: list[str]) -> None:
     """Raise DatumError where observations close the datum by their noise alone, as control on a line does."""
     weak, sigma = sensitivity.weak_motions(_VAGUE)
     if len(weak):
@@ -152,8 +153,12 @@ def _motions(values: Values) -> DatumRows:
     return DatumRows(np.asarray(eop), np.asarray(pts))
 
 
-def _datum_sensitivity(block: Block, values: Values, s: Structure, motions: DatumRows) -> tuple[Sensitivity, list[str]]:
+def _datum_sensitivity(
+    block: Block, values: Values, s: Structure, motions: DatumRows
+) -> tuple["SeenMotions", list[str]]:
     """What is seen of the motions, and names of the free declared unknowns that may go along with them."""
+    from jaxphoto.adjustment.datum_sensitivity import SeenMotions, row_sensitivity
+
     own = [j for j, k in enumerate(s.free) if k >= s.n_cameras]
     weighted = {int(j) for g in s.observed if g.name.startswith(PRIORS) for j in g.column.ravel()}
     placed = {g.name for g in s.observed if len(g.image) or len(g.point)}
@@ -161,7 +166,7 @@ def _datum_sensitivity(block: Block, values: Values, s: Structure, motions: Datu
         # Control alone: nothing to differentiate, its rows are the motions of its points.
         control = block.control
         rows = motions.points[:, control.axis, control.who].T / _control_sigma(values, s)[:, None]
-        sensitivity = Sensitivity(csr_array(rows), csr_array((0, 7)))
+        sensitivity = SeenMotions.of_motions(rows)
     else:
         sensitivity = row_sensitivity(values, s, motions, np.array(own, int))
     fixed_p = np.argwhere(s.point_free.T == 0)

@@ -6,7 +6,6 @@ with a motion that no row sees. Of these, which may be thousands, nothing dense 
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +17,7 @@ from scipy.sparse.csgraph import connected_components
 from jaxphoto.adjustment.model.numbers import Values, zero_increments
 from jaxphoto.adjustment.model.row_functions import row_jacobian
 from jaxphoto.adjustment.model.structure import Structure
+from jaxphoto.adjustment.solver.similarity import DatumRows
 from jaxphoto.compiling import jit_quickly
 
 # Singular values of a scaled sensitivity below this are zero.
@@ -26,15 +26,8 @@ _OPEN = 1e-9
 _OPEN_SQUARED = 1e-13
 
 
-class DatumRows(NamedTuple):
-    """How each increment moves under the seven motions (about the centroid, shifts in units of the block's size)."""
-
-    eop: Float[np.ndarray, "7 6 images"]
-    points: Float[np.ndarray, "7 3 points"]
-
-
 @dataclass(frozen=True)
-class Sensitivity:
+class SeenMotions:
     """d(rows / sigma) / d(motions, declared unknowns): columns of the seven motions, then one of each unknown."""
 
     placed: csr_array
@@ -80,7 +73,12 @@ class Sensitivity:
         found = np.linalg.norm(directions[3:], axis=0) / np.sqrt(np.maximum(squares, 1e-300))
         return directions.T[found > sigma], float(found.max())
 
-    def with_motions(self, rows: Float[np.ndarray, "rows 7"]) -> "Sensitivity":
+    @classmethod
+    def of_motions(cls, rows: Float[np.ndarray, "rows 7"]) -> "SeenMotions":
+        """Rows that see motions alone, and no unknowns."""
+        return cls(csr_array(rows), csr_array((0, 7)))
+
+    def with_motions(self, rows: Float[np.ndarray, "rows 7"]) -> "SeenMotions":
         """With rows more, which see motions alone."""
         more = csr_array(np.pad(rows, [(0, 0), (0, self.placed.shape[1] - 7)]))
         return replace(self, placed=vstack([self.placed, more]).tocsr())
@@ -116,7 +114,7 @@ def _eliminated(
 
 def row_sensitivity(
     values: Values, s: Structure, motions: DatumRows, chosen: Int[np.ndarray, "unknowns"]
-) -> Sensitivity:
+) -> SeenMotions:
     """Of all rows but those of image points, which see no motion; `chosen` are the shared unknowns that it is by."""
     width = 7 + len(chosen)
     # What is not chosen, and what means no unknown, has a column behind the last.
@@ -133,7 +131,7 @@ def row_sensitivity(
         rows = coo_array((numbers.ravel(), (row.ravel(), columns.ravel())), shape).tocsr()[:, :width]
         rows.eliminate_zeros()
         found[bool(len(g.image) or len(g.point))].append(rows)
-    return Sensitivity(vstack(found[True]).tocsr(), vstack(found[False]).tocsr())
+    return SeenMotions(vstack(found[True]).tocsr(), vstack(found[False]).tocsr())
 
 
 @jit_quickly

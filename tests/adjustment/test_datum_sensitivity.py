@@ -6,7 +6,7 @@ import pytest
 from scipy.sparse import csr_array
 
 from jaxphoto.adjustment.datum import _motions
-from jaxphoto.adjustment.datum_sensitivity import Sensitivity, row_sensitivity
+from jaxphoto.adjustment.datum_sensitivity import SeenMotions, row_sensitivity
 from jaxphoto.adjustment.model.block_values import values_of, with_start
 from jaxphoto.adjustment.model.numbers import UnknownArrays, zero_increments
 from jaxphoto.adjustment.model.row_functions import group_residuals
@@ -83,7 +83,7 @@ def chain(rng, free_end: bool):
     return rows
 
 
-def system(seed: int, seen: int, free_end: bool) -> tuple[Sensitivity, np.ndarray]:
+def system(seed: int, seen: int, free_end: bool) -> tuple[SeenMotions, np.ndarray]:
     """Rows that see `seen` combinations of motions, each with a knot and one of two free shifts, one with a prior."""
     rng = np.random.default_rng(seed)
     combinations = np.linalg.qr(rng.standard_normal((7, 7)))[0][:seen]
@@ -94,7 +94,7 @@ def system(seed: int, seen: int, free_end: bool) -> tuple[Sensitivity, np.ndarra
     alone = np.zeros((13, 21))
     alone[:12, 7:19] = chain(rng, free_end)
     alone[12, 20] = 3.0
-    return Sensitivity(csr_array(placed), csr_array(alone)), np.concatenate([placed, alone])
+    return SeenMotions(csr_array(placed), csr_array(alone)), np.concatenate([placed, alone])
 
 
 @pytest.mark.parametrize("free_end", [False, True], ids=["prior", "free"])
@@ -115,10 +115,10 @@ def test_a_motion_that_goes_along_with_unknowns_that_only_one_another_hold_is_op
     placed[:, 0], placed[np.arange(30), 7 + np.arange(30) % 4] = 1.0, -1.0
     for k in range(3):
         alone[k, 7 + k : 9 + k] = -1.0, 1.0
-    (null,) = Sensitivity(csr_array(placed), csr_array(alone)).null_motions()
+    (null,) = SeenMotions(csr_array(placed), csr_array(alone)).null_motions()
     np.testing.assert_allclose(np.abs(null), np.eye(7)[0], atol=1e-9)
     alone[3, 7] = 1e-3
-    assert not len(Sensitivity(csr_array(placed), csr_array(alone)).null_motions())
+    assert not len(SeenMotions(csr_array(placed), csr_array(alone)).null_motions())
 
 
 @pytest.mark.parametrize("free_end", [False, True], ids=["prior", "free"])

@@ -1,7 +1,10 @@
 """Similarities: motions of images and points together that change no image coordinate."""
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxphoto.adjustment.layout.tiled import TiledStructure, TiledValues
@@ -12,6 +15,13 @@ from jaxphoto.rotation import small_angles, small_rotation
 
 # Newton's method on so few unknowns, begun so near, doubles the right digits with each of these.
 _NEWTON_STEPS = 5
+
+
+class DatumRows(NamedTuple):
+    """How each increment moves under the seven motions (about the centroid, shifts in units of the block's size)."""
+
+    eop: Float[np.ndarray, "7 6 images"]
+    points: Float[np.ndarray, "7 3 points"]
 
 
 def similarity(
