@@ -75,8 +75,9 @@ def test_no_import_hides_in_a_function():
         inner = [n for f in ast.walk(tree) if isinstance(f, ast.FunctionDef) for n in ast.walk(f)]
         hidden = [ast.unparse(n) for n in inner if isinstance(n, ast.Import | ast.ImportFrom)]
         # Those that are worth it: matplotlib takes a third of a second, and most uses draw nothing; scipy's graphs and
-        # matrices take a tenth, and blocks of few images, and of plain control, need none; its distributions take a fifth, and only tests compare with them;
-        # plotly takes half a second, and only reports need it; xarray takes a third, for cubes.
+        # matrices take a tenth, and blocks of few images, and of plain control, need none; its distributions take a
+        # fifth, and only tests compare with them; plotly takes half a second, and only reports need it; xarray takes a
+        # third, for cubes.
         worth_it = {
             "from matplotlib.figure import Figure", "from matplotlib.text import Text", "from matplotlib import pyplot",
             "from matplotlib.backends.backend_pdf import PdfPages", "from scipy.sparse import csr_matrix",
