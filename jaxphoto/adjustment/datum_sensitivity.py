@@ -1,7 +1,7 @@
 """What the observations of a block see of its seven motions, whatever the declared unknowns do.
 
 Unknowns that rows of their own determine, as priors do and steps from knot to knot of a trajectory, cannot go along
-with a motion that no row sees. Of these, which may be thousands, nothing dense is made.
+with a motion that no row sees. They may be thousands: their rows are kept sparse, and only their normal matrix is full.
 """
 
 from dataclasses import dataclass, replace
