@@ -1,7 +1,9 @@
 """The arrays of data and results: numpy's or JAX's, whichever the moment asks for."""
 
+import functools
+import operator
 import typing
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import jax
@@ -33,6 +35,11 @@ def gathered(tree: Any) -> Any:
 def on_device(values) -> jax.Array:
     """JAX's array of real numbers that are known; `jnp.asarray` compiles a copy for each shape."""
     return jax.device_put(np.asarray(values, float))
+
+
+def added(terms: Iterable[Any]) -> Any:
+    """Their sum, term by term. The zero that `sum` begins with would be one more operation of every program."""
+    return functools.reduce(operator.add, terms)
 
 
 def joined(parts: Sequence) -> Numbers:

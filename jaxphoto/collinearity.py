@@ -121,16 +121,18 @@ def camera_residual(
         u, v, w = interior.rows.at_row(xy[1], (u, v, w))
     projection = interior.ideal_from_direction(u, v, w)
     reduced = jnp.stack([xy[0] - interior.x_p, xy[1] - interior.y_p])
-    (x, y), (x0, y0) = (
-        (interior.closed_form(reduced), projection)
-        if interior.distortion.domain == "measured"
-        else (reduced, interior.closed_form(projection))
-    )
-    if interior.distortion.domain == "ideal" or interior.residuals == "model":
-        return jnp.stack([x - x0, y - y0])
-    (a, c), (b, d) = (jax.jvp(interior.closed_form, (reduced,), (jnp.array(e),))[1] for e in ((1.0, 0.0), (0.0, 1.0)))
-    determinant = a * d - b * c
-    return jnp.stack([d * (x - x0) - b * (y - y0), a * (y - y0) - c * (x - x0)]) / determinant
+    if interior.distortion.domain == "ideal":
+        return jnp.stack(_apart(reduced, interior.closed_form(projection)))
+    if interior.residuals == "model":
+        return jnp.stack(_apart(interior.closed_form(reduced), projection))
+    ideal, slopes = jax.linearize(interior.closed_form, reduced)
+    (a, c), (b, d) = (slopes(jnp.array(e)) for e in ((1.0, 0.0), (0.0, 1.0)))
+    (x, y), determinant = _apart(ideal, projection), a * d - b * c
+    return jnp.stack([(d * x - b * y) / determinant, (a * y - c * x) / determinant])
+
+
+def _apart(xy: Float[Array, "2"], other: Float[Array, "2"]) -> tuple[Array, Array]:
+    return xy[0] - other[0], xy[1] - other[1]
 
 
 def intersect(

@@ -10,6 +10,7 @@ from jaxphoto.adjustment.layout.tile_layout import LEAST, Sizes
 from jaxphoto.adjustment.layout.tiled import TiledResiduals, TiledStructure, TiledValues
 from jaxphoto.adjustment.normal_equations import Cofactors, Linearised, NormalEquations, RowCofactors, optimise
 from jaxphoto.adjustment.result import Adjustment, Outcome
+from jaxphoto.adjustment.solver.levenberg_marquardt import Task, to_factor, to_optimum
 from jaxphoto.adjustment.weak_directions import POOR, WeakDirection, weak_directions, yardsticks
 from jaxphoto.adjustment.weak_words import WeakUnknowns, weaknesses_of
 
@@ -25,6 +26,7 @@ __all__ = [
     "Outcome",
     "RowCofactors",
     "Sizes",
+    "Task",
     "TiledBlock",
     "TiledResiduals",
     "TiledStructure",
@@ -36,6 +38,8 @@ __all__ = [
     "linearise",
     "optimise",
     "solve",
+    "to_factor",
+    "to_optimum",
     "weak_directions",
     "weaknesses_of",
     "yardsticks",

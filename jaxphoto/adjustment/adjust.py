@@ -23,7 +23,7 @@ from jaxphoto.adjustment.normal_equations import NormalEquations, optimise
 from jaxphoto.adjustment.rank import check_priors, check_rank
 from jaxphoto.adjustment.result import Adjustment
 from jaxphoto.adjustment.solver.elimination import FactoredNormal
-from jaxphoto.adjustment.solver.levenberg_marquardt import zero_system
+from jaxphoto.adjustment.solver.levenberg_marquardt import to_factor, to_optimum, zero_system
 from jaxphoto.adjustment.solver.normal import Linearised
 from jaxphoto.adjustment.solver.optimum import find_optimum, unit_scale, weigh_datum
 from jaxphoto.adjustment.solver.similarity import n_open_motions
@@ -67,10 +67,10 @@ def solve(
     structure = plain.with_losses(losses)
     seconds: dict[str, float] = {}
     if laid.traced:
-        found = find_optimum(weigh_datum(numbers, structure), structure=structure, max_steps=max_steps)
+        found = find_optimum(weigh_datum(numbers, structure), structure=structure, task=to_optimum(max_steps))
         state = state_at(found.increments, unit_scale(structure), numbers, structure)
     else:
-        arguments = (numbers, structure, max_steps, np.array(False))
+        arguments = (numbers, structure, to_optimum(max_steps))
         # The longest first: the others are traced while it compiles.
         if prepare(_optimise, arguments, seconds):
             prepare(_residuals, (numbers, plain), seconds)
@@ -78,7 +78,7 @@ def solve(
         found = run_compiled(_optimise, arguments, seconds, "solve")
         # What comes back from several devices is of another type to a program than what went in.
         state = UnknownArrays(*map(still, found.state))
-    adjusted = _at(state, laid, block, start, priors, max_steps, seconds)
+    adjusted = _at(state, laid, block, start, priors, seconds)
     adjusted = dataclasses.replace(adjusted, steps=found.steps, converged=found.converged)
     if laid.traced:
         return adjusted
@@ -88,27 +88,23 @@ def solve(
     return adjusted
 
 
-def linearise(
-    block: Block, unknowns: Unknowns, priors: Unknowns, max_steps: int = MAX_STEPS, sizes: Sizes = LEAST
-) -> Adjustment:
+def linearise(block: Block, unknowns: Unknowns, priors: Unknowns, sizes: Sizes = LEAST) -> Adjustment:
     """`block` where the unknowns are, not at its optimum: residuals and normal equations there, by `solve`'s programs.
 
     What an adjustment of some of the observations says of all of them. Raises what `solve` raises before it computes.
     """
     laid = lay_out(block, unknowns, priors, sizes)
     v = laid.tiled_values
-    return _at(UnknownArrays(v.position, v.rotation, v.shared, v.points), laid, block, unknowns, priors, max_steps, {})
+    return _at(UnknownArrays(v.position, v.rotation, v.shared, v.points), laid, block, unknowns, priors, {})
 
 
-def _at(
-    state: UnknownArrays, laid: "LaidOut", block: Block, start: Unknowns, priors: Unknowns, max_steps: int, seconds
-) -> Adjustment:
+def _at(state: UnknownArrays, laid: "LaidOut", block: Block, start: Unknowns, priors: Unknowns, seconds) -> Adjustment:
     """All that an adjustment tells with the unknowns as they are in `state`."""
     tiled, numbers = laid.tiled, with_start(laid.tiled_values, state)
     structure, factored = tiled.structure, None
     # Statistics need the factored normal matrix; a derivative of the unknowns does not, and would pay for it dearly.
     if not laid.traced:
-        again = run_compiled(_optimise, (numbers, structure, max_steps, np.array(True)), seconds, "covariance")
+        again = run_compiled(_optimise, (numbers, structure, to_factor()), seconds, "covariance")
         factored = gathered(again.factored)
     residuals = run_compiled(_residuals, (numbers, structure), seconds, "residuals")
     state = tiled.crop_state(state)

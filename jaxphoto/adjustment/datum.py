@@ -20,7 +20,6 @@ from jaxphoto.adjustment.solver.similarity import DatumRows, motions
 from jaxphoto.arrays import still
 from jaxphoto.block import Block
 from jaxphoto.camera import RollingShutter
-from jaxphoto.compiling import jit_quickly
 from jaxphoto.errors import DatumError
 from jaxphoto.observations import PRIORS, ControlRows
 
@@ -141,16 +140,11 @@ def _check_vague(block: Block, sensitivity: "SeenMotions", named: list[str]) -> 
         raise DatumError(datum_sentence(weak, block, named, sigma))
 
 
-motions_of = jit_quickly(motions)
-"""`similarity.motions`, compiled."""
-
-
 def _motions(values: Values) -> DatumRows:
-    points = np.asarray(values.points)
+    position, rotation, points = (np.asarray(v) for v in (values.position, values.rotation, values.points))
     centre = points.mean(axis=1)
     size = float(np.sqrt(((points - centre[:, None]) ** 2).sum(0).mean())) or 1.0
-    eop, pts = motions_of(values.position, values.rotation, values.points, centre, size)
-    return DatumRows(np.asarray(eop), np.asarray(pts))
+    return motions(position, rotation, points, centre, size)
 
 
 def _datum_sensitivity(

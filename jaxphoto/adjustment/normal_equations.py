@@ -25,6 +25,7 @@ from jaxphoto.adjustment.solver.elimination import (
     solve_reduced,
 )
 from jaxphoto.adjustment.solver.inverse import Cofactors, RowCofactors, cofactors_of, row_variances
+from jaxphoto.adjustment.solver.levenberg_marquardt import Task
 from jaxphoto.adjustment.solver.normal import Linearised
 from jaxphoto.adjustment.solver.optimum import iterate, typical_scale, unit_scale, weigh_datum
 from jaxphoto.adjustment.solver.reduced import reduce_normal
@@ -155,11 +156,9 @@ class Optimised(eqx.Module):
     factored: FactoredNormal
 
 
-def optimise(
-    values: TiledValues, structure: TiledStructure, max_steps: int, only_factor: Bool[Numbers, ""]
-) -> Optimised:
+def optimise(values: TiledValues, structure: TiledStructure, task: Task) -> Optimised:
     """The optimum; or, of values that are at theirs, the undamped normal equations, factored."""
-    optimum, system, scale = iterate(weigh_datum(values, structure), structure, max_steps, only_factor)
+    optimum, system, scale = iterate(weigh_datum(values, structure), structure, task)
     state = state_at(optimum.increments, unit_scale(structure), values, structure)
     factored = FactoredNormal(system.reduced, system.factor, scale)
     assert optimum.steps is not None and optimum.converged is not None, "only of a tangent is this unknown"

@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxphoto.adjustment.datum import motions_of
 from jaxphoto.adjustment.datum_words import MOTIONS, motion_names
 from jaxphoto.adjustment.result import Adjustment
+from jaxphoto.adjustment.solver.similarity import motions
 from jaxphoto.adjustment.weak_directions import OPEN, POOR, WeakDirection, weak_directions, yardsticks
 from jaxphoto.arrays import still
 from jaxphoto.errors import few
@@ -215,12 +215,13 @@ class _Words:
         places = self.xyz[points] if len(points) else self.position[images]
         centre = places.mean(axis=0)
         size = float(np.sqrt(((places - centre) ** 2).sum(1).mean())) or 1.0
-        eop, xyz = motions_of(self.values.position, self.values.rotation, self.values.points, centre, size)
+        position, rotation, places = map(still, (self.values.position, self.values.rotation, self.values.points))
+        eop, xyz = motions(position, rotation, places, centre, size)
         yard = np.repeat([self.yard.ground, self.yard.angle], 3)
         columns = np.concatenate(
             [
-                (np.asarray(eop)[:, :, images] / yard[:, None]).transpose(0, 2, 1).reshape(len(MOTIONS), -1),
-                np.asarray(xyz)[:, :, points].transpose(0, 2, 1).reshape(len(MOTIONS), -1) / self.yard.ground,
+                (eop[:, :, images] / yard[:, None]).transpose(0, 2, 1).reshape(len(MOTIONS), -1),
+                xyz[:, :, points].transpose(0, 2, 1).reshape(len(MOTIONS), -1) / self.yard.ground,
             ],
             axis=1,
         ).T

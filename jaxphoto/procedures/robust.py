@@ -80,7 +80,7 @@ def robust(
         report(f"robust adjustment, round {turn + 1}")
         solved, point, left = solve_placed(block, left, unknowns, max_steps, sizes, found)
         unknowns, converged = all_points(solved.unknowns, unknowns, point), bool(solved.converged)
-        at = linearise(block, unknowns, block.priors, max_steps, sizes)
+        at = linearise(block, unknowns, block.priors, sizes)
         r = r or checked_parts(at)
         new = _rescaled(found, at, r)
         change = max(abs(float(new[name].scale) / float(found[name].scale) - 1) for name in found)

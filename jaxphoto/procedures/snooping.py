@@ -132,7 +132,7 @@ def _snooped(
     while True:
         report(f"adjusting without {sum(int(m.sum()) for m in left.values())} observations")
         adjusted, point, left = solve_placed(block, left, at.unknowns, max_steps, sizes)
-        at = linearise(block, all_points(adjusted.unknowns, at.unknowns, point), block.priors, max_steps, sizes)
+        at = linearise(block, all_points(adjusted.unknowns, at.unknowns, point), block.priors, sizes)
         sigma0 = max(float(adjusted.sigma0), LEAST_SIGMA0)
         lost = np.setdiff1d(np.arange(len(block.points)), point)
         r = checked_parts(at)
@@ -179,7 +179,7 @@ def _reweighted(
         weighed = block.with_observations({name: _weighed(own, weight[name]) for name, own in rows.items()})
         found, point, left = solve_placed(weighed, left, unknowns, max_steps, sizes)
         unknowns = all_points(found.unknowns, unknowns, point)
-        at = linearise(block, unknowns, block.priors, max_steps, sizes)
+        at = linearise(block, unknowns, block.priors, sizes)
         r = r or checked_parts(at)
         scale = residual_scales(at, r)
         new = {name: 1 / np.maximum(_largest(at, name, r) / (_HUBER * scale[name]), 1.0) for name in rows}

@@ -14,7 +14,17 @@ import numpy as np
 from jax.sharding import PartitionSpec as P
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxphoto.adjustment import NormalEquations, Sizes, TiledStructure, TiledValues, lay_out, optimise
+from jaxphoto.adjustment import (
+    NormalEquations,
+    Sizes,
+    Task,
+    TiledStructure,
+    TiledValues,
+    lay_out,
+    optimise,
+    to_factor,
+    to_optimum,
+)
 from jaxphoto.adjustment.model.block_values import with_start
 from jaxphoto.adjustment.model.numbers import UnknownArrays
 from jaxphoto.arrays import Numbers
@@ -152,13 +162,14 @@ def _find(
 def _findings(values: TiledValues, s: TiledStructure, check: Check, rotations: Rotations, max_steps: int) -> Findings:
     """Adjustment, factor at the optimum, covariance, and what is kept of them."""
 
-    def solved(start: UnknownArrays, only_factor):
-        found = optimise(with_start(values, start), s, max_steps, only_factor)
+    def solved(start: UnknownArrays, task: Task):
+        found = optimise(with_start(values, start), s, task)
         return found.state, found
 
     # To the optimum, and there once more for the undamped factor: a loop, so that it is one piece of code.
+    tasks = jax.tree.map(lambda *each: np.stack(each), to_optimum(max_steps), to_factor())
     start = UnknownArrays(values.position, values.rotation, values.shared, values.points)
-    state, found = jax.lax.scan(solved, start, np.array([False, True]))
+    state, found = jax.lax.scan(solved, start, tasks)
     there, factored = with_start(values, state), jax.tree.map(lambda v: v[1], found.factored)
     equations = NormalEquations(there, s, factored)
     cofactors, _ = equations.cofactors(np.array(False))

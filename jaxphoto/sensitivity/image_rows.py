@@ -28,7 +28,7 @@ from jaxphoto.adjustment import Adjustment, TiledStructure, TiledValues
 from jaxphoto.adjustment.model.camera_groups import CameraGroup, interior_of
 from jaxphoto.adjustment.model.image_orientations import by_image, orientation_derivatives, orientations_of
 from jaxphoto.adjustment.model.numbers import Increments, state_at
-from jaxphoto.arrays import Numbers, still
+from jaxphoto.arrays import Numbers, added, still
 from jaxphoto.collinearity import camera_residual
 from jaxphoto.compiling import once
 from jaxphoto.georeferencing import Corrections, apparent_point
@@ -137,8 +137,8 @@ def _of_some(
 
     across = once(lambda g, by_place: sum(g[k, :, None] * d for k, d in enumerate(by_place)), s.eop_free, g, by_place)
     turned = curved * of_image[3:, None] * jnp.stack(_cross(to_u, by_place))
-    eop = sum((d[:6, None] * across[k, None, :6] for k, d in enumerate(by_place)), jnp.zeros(()))
-    by_point = sum((d[:, None] * across[k, None, 6:] for k, d in enumerate(by_place)), jnp.zeros(()))
+    eop = added(d[:6, None] * across[k, None, :6] for k, d in enumerate(by_place))
+    by_point = added(d[:, None] * across[k, None, 6:] for k, d in enumerate(by_place))
     # Twice, because of the transpose: only its rows are here.
     eop = eop.at[3:].add(turned[:, :6]).at[3:, :3].add(turned[:, :3])
     by_point = by_point.at[3:6].add(turned[:, 6:])
@@ -163,7 +163,7 @@ def _at(array: Array, index: Numbers) -> Array:
 
 
 def _dot(a: Iterable[Array], b: Iterable[Array]) -> Array:
-    return sum((x * y for x, y in zip(a, b, strict=True)), jnp.zeros(()))
+    return added(x * y for x, y in zip(a, b, strict=True))
 
 
 def _cross(a: Sequence[Array] | Array, b: Sequence[Array] | Array) -> Scalars:

@@ -27,7 +27,7 @@ from jaxphoto.adjustment.model.camera_groups import CameraGroup, interior_of
 from jaxphoto.adjustment.model.image_orientations import cameras_at
 from jaxphoto.adjustment.model.numbers import Increments, UnknownArrays, state_at
 from jaxphoto.adjustment.model.row_functions import non_image_residuals
-from jaxphoto.arrays import Numbers
+from jaxphoto.arrays import Numbers, added
 from jaxphoto.collinearity import ExteriorOrientation, camera_coordinates, camera_residual
 from jaxphoto.compiling import once
 from jaxphoto.georeferencing import apparent_point
@@ -267,7 +267,7 @@ def _units(of: tuple[Array, ...]) -> list[tuple[Array, ...]]:
 
 
 def _dot(a: Sequence[Array], b: Sequence[Array]) -> Array:
-    return sum((x * y for x, y in zip(a, b, strict=True)), jnp.zeros(()))
+    return added(x * y for x, y in zip(a, b, strict=True))
 
 
 def _at(array: Array, index: Numbers) -> Array:

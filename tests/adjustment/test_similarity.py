@@ -1,5 +1,6 @@
 """Free networks: brought to their datum as a whole, and found from starts that are far off."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -8,9 +9,9 @@ from jaxphoto import adjust
 from jaxphoto.adjustment import Linearised
 from jaxphoto.adjustment.model.numbers import zero_increments
 from jaxphoto.adjustment.solver.optimum import unit_scale
-from jaxphoto.adjustment.solver.similarity import n_open_motions, onto_datum
+from jaxphoto.adjustment.solver.similarity import motions, n_open_motions, onto_datum, similarity
 from jaxphoto.observations import Distances
-from jaxphoto.rotation import small_rotation
+from jaxphoto.rotation import small_angles, small_rotation
 from tests.adjustment.dense import prepared
 from tests.blocks import free_network, from_afar, simulated
 
@@ -33,6 +34,24 @@ def test_a_similarity_meets_the_constraints_and_changes_nothing_else(kind, dista
     np.testing.assert_allclose(after.image, before.image, rtol=1e-7, atol=1e-7 * np.abs(before.image).max())
     for one, two in zip(before.others, after.others, strict=True):
         np.testing.assert_allclose(two, one, atol=1e-6)
+
+
+def test_motions_are_the_derivatives_of_a_similarity():
+    rng = np.random.default_rng(5)
+    position, points, centre, size = rng.normal(size=(3, 4)), rng.normal(size=(3, 6)), rng.normal(size=3), 2.5
+    rotation = np.stack([small_rotation(theta) for theta in rng.normal(size=(4, 3))], axis=-1)
+    found = motions(position, rotation, points, centre, size)
+    assert isinstance(found.eop, np.ndarray)
+
+    def image(parameters, k):
+        place, turned = similarity(parameters, position[:, k], rotation[:, :, k], centre, size)
+        return jnp.concatenate([place, small_angles(turned @ rotation[:, :, k].T)])
+
+    for k in range(4):
+        np.testing.assert_allclose(found.eop[:, :, k].T, jax.jacfwd(image)(jnp.zeros(7), k), atol=1e-14)
+    for k in range(6):
+        point = lambda p, k=k: similarity(p, points[:, k], jnp.eye(3), centre, size)[0]  # noqa: E731
+        np.testing.assert_allclose(found.points[:, :, k].T, jax.jacfwd(point)(jnp.zeros(7)), atol=1e-14)
 
 
 def test_a_network_turned_and_stretched_far_is_brought_back():

@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 from jaxphoto.adjustment.model.camera_groups import CameraGroup, interior_of
 from jaxphoto.adjustment.model.numbers import AbstractValues, Increments, UnknownArrays
 from jaxphoto.adjustment.model.structure import AbstractStructure
+from jaxphoto.arrays import added
 from jaxphoto.georeferencing import Exposure
 from jaxphoto.rotation import small_rotation
 
@@ -77,7 +78,7 @@ def orientation_derivatives(
 
     turned = jax.vmap(jax.jacfwd(small_rotation), in_axes=-1, out_axes=-1)(y.eop[3:] * scale.eop[3:]) * scale.eop[3:]
     # Term by term: a batch of products of 3 x 3 matrices takes several times as long.
-    rotation = sum((turned[:, j, None] * values.rotation[j, :, None] for j in range(3)), jnp.zeros(()))
+    rotation = added(turned[:, j, None] * values.rotation[j, :, None] for j in range(3))
     rotation = rotation.transpose(3, 0, 1, 2)
     own, n = slice(0, s.n_interior), s.n_image_colours
     by_colour = jnp.zeros((len(values.shared), n)).at[s.free[own], s.colour[own]].set(scale.shared[own])

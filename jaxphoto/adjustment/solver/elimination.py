@@ -25,6 +25,7 @@ from jaxphoto.adjustment.solver.non_image_rows import non_image_rows
 from jaxphoto.adjustment.solver.normal import Linearised, Reduced, other_squares, squares
 from jaxphoto.adjustment.solver.reduced import tile_columns, tile_numbers, tile_parts
 from jaxphoto.adjustment.solver.tile_rows import seen_in, tile_residuals
+from jaxphoto.arrays import added
 from jaxphoto.small_matrices import unwhiten, whiten
 
 
@@ -175,9 +176,9 @@ def pull(z: TiledResiduals, at: Linearised) -> Increments:
         z = jnp.moveaxis(z, 1, 0)
         columns = columns_of(measured)
         both = [jnp.concatenate([j.eop, j.shared]) for j in columns]
-        of_image = sum((jnp.einsum("amp,kmp->mka", j, v) for j, v in zip(both, z, strict=True)), jnp.zeros(()))
+        of_image = added(jnp.einsum("amp,kmp->mka", j, v) for j, v in zip(both, z, strict=True))
         each = zip(columns, z, strict=True)
-        of_point = sum((j.point[:, k] * v[:, None, k] for j, v in each for k in range(z.shape[2])), jnp.zeros(()))
+        of_point = added(j.point[:, k] * v[:, None, k] for j, v in each for k in range(z.shape[2]))
         return of_image, of_point
 
     given = (values.xy, values.sigma_xy, s.by_tile(at.state.points), s.by_tile(scale.points))

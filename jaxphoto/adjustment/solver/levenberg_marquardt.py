@@ -10,8 +10,9 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Bool, PyTree, Scalar
+from jaxtyping import Array, Bool, Int, PyTree, Scalar
 
 from jaxphoto.adjustment.layout.tiled import TiledStructure, TiledValues
 from jaxphoto.adjustment.model.block_values import with_datum
@@ -21,6 +22,7 @@ from jaxphoto.adjustment.solver.elimination import gradient, solve_reduced
 from jaxphoto.adjustment.solver.normal import Linearised, Reduced, dot, norm2
 from jaxphoto.adjustment.solver.reduced import RightSide, reduce_normal
 from jaxphoto.adjustment.solver.similarity import n_open_motions, onto_datum
+from jaxphoto.arrays import Numbers
 
 
 class FactoredSystem(NamedTuple):
@@ -52,6 +54,24 @@ def zero_system(y: Increments, values: TiledValues, s: TiledStructure) -> Factor
     return FactoredSystem(y, reduced, factor)
 
 
+class Task(NamedTuple):
+    """What an iteration is run for: numbers, so that one program serves every task."""
+
+    max_steps: Int[Numbers, ""]
+    only_factor: Bool[Numbers, ""]
+    """One undamped step, for the sake of its system."""
+
+
+def to_optimum(max_steps: int) -> Task:
+    """The optimum, in so many steps at most."""
+    return Task(np.array(max_steps), np.array(False))
+
+
+def to_factor() -> Task:
+    """The undamped system at the start."""
+    return Task(np.array(1), np.array(True))
+
+
 class SolverState(NamedTuple):
     """The solver's state between two steps."""
 
@@ -65,7 +85,9 @@ class SolverState(NamedTuple):
     """Whether damping takes the place of the datum's constraints."""
     tightened: Bool[Array, ""]
     """Whether it did before: it does so once."""
-    done: Bool[Array, ""]
+    settled: Bool[Array, ""]
+    """Whether this is the optimum."""
+    steps: Int[Array, ""]
 
 
 # Damping is what is added to the normal matrix, relative to its diagonal. It begins almost as none; where that fails,
@@ -108,16 +130,13 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Increments, Scalar, Any
     values: TiledValues
     scale: Increments
     tolerance: float
-    only_factor: Bool[Array, ""]
-    """One undamped step, for the sake of its system: what has a program to solve needs none to factor."""
+    task: Task
 
-    def __init__(
-        self, structure: TiledStructure, values: TiledValues, scale: Increments, tolerance: float, only_factor
-    ):
+    def __init__(self, structure: TiledStructure, values: TiledValues, scale: Increments, tolerance: float, task: Task):
         # optimistix' own test of convergence is not used: `step` decides.
         self.rtol, self.atol, self.norm = 0.0, 0.0, optx.max_norm
         self.structure, self.values, self.scale = structure, values, scale
-        self.tolerance, self.only_factor = tolerance, only_factor
+        self.tolerance, self.task = tolerance, task
 
     def _at(self, y: Increments, loose: Bool[Array, ""]) -> Linearised:
         v = self.values
@@ -127,10 +146,10 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Increments, Scalar, Any
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> SolverState:
         """Almost Gauss-Newton to begin with."""
-        damping = jnp.where(self.only_factor, 0.0, _FIRST_DAMPING)
+        damping = jnp.where(self.task.only_factor, 0.0, _FIRST_DAMPING)
         empty = zero_system(y, self.values, self.structure)
-        no = jnp.array(False)
-        return SolverState(damping, jnp.array(jnp.inf), no, empty, loose=no, tightened=no, done=no)
+        no, steps = jnp.array(False), jnp.array(0)
+        return SolverState(damping, jnp.array(jnp.inf), no, empty, loose=no, tightened=no, settled=no, steps=steps)
 
     def _factored(self, at: Linearised, damping) -> tuple[FactoredSystem, RightSide]:
         a, reduced, right = reduce_normal(at.for_normal_equations, damping)
@@ -153,8 +172,9 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Increments, Scalar, Any
             state.chord, lambda: self._kept(at, state.system), lambda: self._factored(at, state.damping)
         )
         place = at.for_normal_equations._replace(increments=system.increments)
+        only_factor = self.task.only_factor
         x = jax.lax.cond(
-            self.only_factor,
+            only_factor,
             lambda: jax.tree.map(jnp.zeros_like, y),
             lambda: solve_reduced(system.reduced, system.factor, right.reduced, right.d, right.b.points, place),
         )
@@ -168,9 +188,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Increments, Scalar, Any
         settled = (missing <= self.tolerance) & (damped <= seen + self.tolerance**2)
         new_y = jax.tree.map(jnp.add, y, proposal)
         # The last step is short and was computed from an accepted iterate: it needs no proof.
-        square_sum = jax.lax.cond(
-            settled | self.only_factor, lambda: right.square_sum, lambda: fn(new_y, at[1:])[0] ** 2
-        )
+        square_sum = jax.lax.cond(settled | only_factor, lambda: right.square_sum, lambda: fn(new_y, at[1:])[0] ** 2)
         reduction, promised = right.square_sum - square_sum, seen + 2 * damped
         accept = settled | (reduction >= _ACCEPT * promised)
         chord_failed = state.chord & ~(accept & (ratio < _CHORD_FAILS))
@@ -190,13 +208,16 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Increments, Scalar, Any
             system=system,
             loose=loose,
             tightened=state.tightened | tighten,
-            done=(settled & ~tighten) | self.only_factor,
+            settled=(settled & ~tighten) | only_factor,
+            steps=state.steps + 1,
         )
         return next_y, progress, None
 
     def terminate(self, fn, y, args, options, state: SolverState, tags):
-        """After the step that settled it, or the only one."""
-        return state.done, optx.RESULTS.successful
+        """After the step that settled it, or the last that the task allows."""
+        ended = ~state.settled & (state.steps >= self.task.max_steps)
+        results = optx.RESULTS
+        return state.settled | ended, results.where(ended, results.nonlinear_max_steps_reached, results.successful)
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
         """Nothing is left to do."""

@@ -32,6 +32,7 @@ from jaxphoto.adjustment.model.observed_groups import RowsAtPoints
 from jaxphoto.adjustment.model.row_functions import non_image_residuals
 from jaxphoto.adjustment.model.structure import total
 from jaxphoto.adjustment.solver.tile_rows import Pair, seen_in, tile_residuals
+from jaxphoto.arrays import added
 
 
 class Linearised(NamedTuple):
@@ -115,7 +116,7 @@ def dot(a: Increments, b: Increments, s: TiledStructure) -> Float[Array, ""]:
 
 def squares(r: Pair) -> Float[Array, ""]:
     """The square sum of a tile's rows."""
-    return sum((jnp.sum(v * v) for v in r), jnp.zeros(()))
+    return added(jnp.sum(v * v) for v in r)
 
 
 def other_squares(others: NonImageResiduals, s: TiledStructure) -> Float[Array, ""]:

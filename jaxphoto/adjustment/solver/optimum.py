@@ -13,7 +13,6 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
@@ -25,10 +24,9 @@ from jaxphoto.adjustment.model.numbers import Increments
 from jaxphoto.adjustment.model.parameter_tables import ParameterTable
 from jaxphoto.adjustment.solver.band import factor_band
 from jaxphoto.adjustment.solver.elimination import solve_factored
-from jaxphoto.adjustment.solver.levenberg_marquardt import FactoredSystem, LevenbergMarquardt
+from jaxphoto.adjustment.solver.levenberg_marquardt import FactoredSystem, LevenbergMarquardt, Task
 from jaxphoto.adjustment.solver.normal import Linearised, Reduced
 from jaxphoto.adjustment.solver.reduced import reduce_normal
-from jaxphoto.arrays import Numbers
 from jaxphoto.camera import InteriorOrientation
 from jaxphoto.camera.camera_rates import HOUR_S
 from jaxphoto.collinearity import ExteriorOrientation, image_residual
@@ -57,18 +55,13 @@ def unit_scale(structure: TiledStructure) -> Increments:
 
 
 @eqx.filter_custom_jvp
-def find_optimum(values: TiledValues, *, structure: TiledStructure, max_steps: int) -> Optimum:
+def find_optimum(values: TiledValues, *, structure: TiledStructure, task: Task) -> Optimum:
     """Levenberg-Marquardt from the start in `values`. Differentiable in every number of `values`."""
-    return iterate(values, structure, max_steps, np.array(False))[0]
+    return iterate(values, structure, task)[0]
 
 
-def iterate(
-    values: TiledValues, structure: TiledStructure, max_steps: int, only_factor: Bool[Numbers, ""]
-) -> tuple[Optimum, FactoredSystem, Increments]:
-    """The optimum, and the last system with the scale of its unknowns; or the undamped system at the start.
-
-    The second serves statistics: what was compiled to solve need not be compiled again to factor.
-    """
+def iterate(values: TiledValues, structure: TiledStructure, task: Task) -> tuple[Optimum, FactoredSystem, Increments]:
+    """The optimum, and the last system with the scale of its unknowns; or the undamped system at the start."""
     scale = typical_scale(values, structure)
     at_points = along_points(2)
     of_unknowns = Increments(EVERYWHERE, EVERYWHERE, at_points)
@@ -78,13 +71,12 @@ def iterate(
         EVERYWHERE,
     )
     out = (Optimum(of_unknowns, EVERYWHERE, EVERYWHERE), system)
-    run = sharded(partial(_iterate, max_steps=max_steps), structure, out)
-    optimum, system = run(values, scale, structure, only_factor)
+    optimum, system = sharded(_iterate, structure, out)(values, scale, structure, task)
     return optimum._replace(increments=jax.tree.map(jnp.multiply, optimum.increments, scale)), system, scale
 
 
 def _iterate(
-    values: TiledValues, scale: Increments, structure: TiledStructure, only_factor: Bool[Numbers, ""], *, max_steps: int
+    values: TiledValues, scale: Increments, structure: TiledStructure, task: Task
 ) -> tuple[Optimum, FactoredSystem]:
     """The iteration itself, on what one device holds; increments are scaled."""
 
@@ -94,20 +86,21 @@ def _iterate(
     solution: optx.Solution = optx.least_squares(
         # The solver differentiates for itself: optimistix is told that there is nothing to linearise.
         lambda y, args: jax.lax.stop_gradient(length(y, args)),
-        LevenbergMarquardt(structure, values, scale, TOLERANCE, only_factor),
+        LevenbergMarquardt(structure, values, scale, TOLERANCE, task),
         jax.tree.map(jnp.zeros_like, scale),
         args=(scale, values, structure),
-        max_steps=max_steps,
+        # The task says how many.
+        max_steps=None,
         throw=False,
     )
     converged = (solution.result == optx.RESULTS.successful) & jnp.all(jnp.isfinite(solution.value.eop))
-    return Optimum(solution.value, solution.stats["num_steps"], converged), solution.state.system
+    return Optimum(solution.value, solution.state.steps, converged), solution.state.system
 
 
 @find_optimum.def_jvp
-def _find_optimum_jvp(primals, tangents, *, structure: TiledStructure, max_steps: int):
+def _find_optimum_jvp(primals, tangents, *, structure: TiledStructure, task: Task):
     (values,), (direction,) = primals, tangents
-    optimum = find_optimum(values, structure=structure, max_steps=max_steps)
+    optimum = find_optimum(values, structure=structure, task=task)
     unit, at = unit_scale(structure), optimum.increments
 
     def gradient(increments, numbers):

@@ -28,6 +28,7 @@ from jaxphoto.adjustment.solver.non_image_rows import (
 )
 from jaxphoto.adjustment.solver.normal import Linearised, Reduced, other_squares
 from jaxphoto.adjustment.solver.tile_rows import TileJacobian, seen_in, tile_jacobian
+from jaxphoto.arrays import added
 from jaxphoto.compiling import once
 from jaxphoto.small_matrices import cholesky_3x3, whiten
 
@@ -260,13 +261,13 @@ def tile_parts(at: Linearised, damping, coupled: Float[Array, "constraints"]):
 def _whitened_eop(j: Iterable[TileJacobian], z: Iterable[Array]) -> Float[Array, "m 6 3 p"]:
     """Y of a tile."""
     both = ((c.eop.transpose(1, 0, 2), w.transpose(1, 0, 2)) for c, w in zip(j, z, strict=True))
-    return sum((eop[:, :, None] * w[:, None] for eop, w in both), jnp.zeros(()))
+    return added(eop[:, :, None] * w[:, None] for eop, w in both)
 
 
 def _met(of: Iterable[Float[Array, "a m p"]], j: Iterable[TileJacobian]) -> Float[Array, "a 3 p"]:
     """Sums over a point's rows, term by term: XLA's products of matrices this small take five times as long."""
     each = zip(of, j, strict=True)
-    return sum((a[:, None, k] * c.point[:, k] for a, c in each for k in range(a.shape[1])), jnp.zeros(()))
+    return added(a[:, None, k] * c.point[:, k] for a, c in each for k in range(a.shape[1]))
 
 
 def _by_interior(j: tuple[TileJacobian, TileJacobian], image: Array, s: TiledStructure) -> Float[Array, "interior 3 p"]:
@@ -275,7 +276,7 @@ def _by_interior(j: tuple[TileJacobian, TileJacobian], image: Array, s: TiledStr
     if i == q:
         # One camera: its colours are its unknowns.
         return _met([c.shared for c in j], j)
-    met = sum((c.shared[:, :, None] * c.point.transpose(1, 0, 2) for c in j), jnp.zeros(()))
+    met = added(c.shared[:, :, None] * c.point.transpose(1, 0, 2) for c in j)
     column = jnp.asarray(s.column)[image, :q].T.reshape(-1)
     pick = (column == jnp.arange(i)[:, None]).astype(float)
     return (pick @ met.reshape(q * len(image), -1)).reshape(i, 3, -1)

@@ -1,6 +1,6 @@
 """Similarities: motions of images and points together that change no image coordinate."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +11,8 @@ from jaxphoto.adjustment.layout.tiled import TiledStructure, TiledValues
 from jaxphoto.adjustment.model.numbers import AbstractValues, Increments, datum_residuals
 from jaxphoto.adjustment.model.structure import AbstractStructure, total
 from jaxphoto.adjustment.solver.normal import Linearised
-from jaxphoto.rotation import small_angles, small_rotation
+from jaxphoto.arrays import Numbers, joined
+from jaxphoto.rotation import CROSS, small_angles, small_rotation
 
 # Newton's method on so few unknowns, begun so near, doubles the right digits with each of these.
 _NEWTON_STEPS = 5
@@ -34,26 +35,28 @@ def similarity(
 
 
 def motions(
-    position: Float[Array, "3 images"],
-    rotation: Float[Array, "3 3 images"],
-    points: Float[Array, "3 points"],
+    position: Float[Numbers, "3 images"],
+    rotation: Float[Numbers, "3 3 images"],
+    points: Float[Numbers, "3 points"],
     centre,
     size,
-) -> tuple[Float[Array, "7 6 images"], Float[Array, "7 3 points"]]:
-    """Derivatives of images (position, small rotation) and points by the parameters of `similarity`, at none."""
-    zero, seeds = jnp.zeros(7), jnp.eye(7)
+) -> DatumRows:
+    """Derivatives of images (position, small rotation) and points by the parameters of `similarity`, at none.
 
-    def image(p, position, rotation):
-        moved, turned = similarity(p, position, rotation, centre, size)
-        return jnp.concatenate([moved, small_angles(turned @ rotation.T)])
+    NumPy's, unless what it is given is traced.
+    Where x is away from the centre by r, a turn by theta takes it by -theta x r. On the camera's side, where increments
+    are, the same turn is R turn' R', a small rotation by -R theta.
+    """
 
-    def derivative(fn):
-        return jax.vmap(lambda seed: jax.jvp(fn, (zero,), (seed,))[1])(seeds)
+    def of_places(x) -> Any:
+        away = x - centre[:, None]
+        shifts = size * np.broadcast_to(np.eye(3)[:, :, None], (3, *x.shape))
+        return joined([shifts, -(CROSS.transpose(2, 0, 1) @ away), away[None]])
 
-    eop = jax.vmap(lambda x, r: derivative(lambda p: image(p, x, r)), in_axes=(1, 2), out_axes=2)(position, rotation)
-    still = jnp.eye(3)
-    moved = lambda x: derivative(lambda p: similarity(p, x, still, centre, size)[0])  # noqa: E731
-    return eop, jax.vmap(moved, in_axes=1, out_axes=2)(points)
+    still = np.zeros((3, *position.shape))
+    turned = joined([still, -rotation.swapaxes(0, 1), still[:1]])
+    by_component: Any = joined([v.swapaxes(0, 1) for v in (of_places(position), turned)])
+    return DatumRows(by_component.swapaxes(0, 1), of_places(points))
 
 
 def n_open_motions(values: AbstractValues, s: AbstractStructure) -> int:

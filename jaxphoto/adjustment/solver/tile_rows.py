@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float
 from jaxphoto.adjustment.layout.tiled import TiledStructure
 from jaxphoto.adjustment.model.camera_groups import CameraGroup, interior_of
 from jaxphoto.adjustment.model.image_orientations import ImageOrientations, OrientationDerivatives
+from jaxphoto.arrays import added
 from jaxphoto.collinearity import ExteriorOrientation, camera_coordinates, camera_residual
 from jaxphoto.compiling import once
 from jaxphoto.georeferencing import apparent_point
@@ -86,7 +87,7 @@ def _residuals(cameras: list[list[Array]], in_camera: Triple, seen: TileMeasurem
     x, y = parts[0] if parts else (0 * in_camera[0], 0 * in_camera[0])
     if len(parts) > 1:
         x, y = (
-            sum((jnp.where(own[:, None], v, 0.0) for own, v in zip(seen.member, of_groups, strict=True)), jnp.zeros(()))
+            added(jnp.where(own[:, None], v, 0.0) for own, v in zip(seen.member, of_groups, strict=True))
             for of_groups in zip(*parts, strict=True)
         )
     if s.image_loss is not None:
@@ -128,9 +129,7 @@ def tile_jacobian(
     )
 
     def of_one(k: int) -> TileJacobian:
-        eop, point = (
-            sum((b[k] * v for b, v in zip(by_place, moved, strict=True)), jnp.zeros(())) for moved in (by_eop, by_point)
-        )
+        eop, point = (added(b[k] * v for b, v in zip(by_place, moved, strict=True)) for moved in (by_eop, by_point))
         return TileJacobian(residual[k], eop, by_camera[k], point)
 
     return of_one(0), of_one(1)

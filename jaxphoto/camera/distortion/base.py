@@ -144,17 +144,17 @@ def _solve_2x2(a: Float[Array, "2 2"], b: Float[Array, "2"]) -> Float[Array, "2"
 
 def radial(r2: Float[Array, ""], *k) -> Float[Array, ""]:
     """K1 r^2 + K2 r^4 + K3 r^6 + ..., from the square of the radius and as many coefficients as are given."""
-    total = jnp.zeros_like(r2)
-    for coefficient in reversed(k):
-        total = r2 * (coefficient + total)
-    return total
+    if not k:
+        return jnp.zeros_like(r2)
+    first, *higher = k
+    return r2 * (first + radial(r2, *higher)) if higher else r2 * first
 
 
 def decentring(p1, p2, xy: Float[Array, "2"] | tuple[Array, Array]) -> Float[Array, "2"]:
     """Decentring distortion P1 (r^2 + 2 x^2) + 2 P2 x y, 2 P1 x y + P2 (r^2 + 2 y^2)."""
     x, y = xy
-    r2 = x * x + y * y
-    return jnp.stack([p1 * (r2 + 2 * x * x) + 2 * p2 * x * y, 2 * p1 * x * y + p2 * (r2 + 2 * y * y)])
+    r2, along = x * x + y * y, 2 * (p1 * x + p2 * y)
+    return jnp.stack([p1 * r2 + along * x, p2 * r2 + along * y])
 
 
 def check_positive(distortion: AbstractDistortion, field: str, meaning: str) -> None:
@@ -185,7 +185,8 @@ class AbstractBrown(AbstractDistortion):
 
     def undistorted(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
         """A coordinate (mm) without radial and decentring distortion."""
+        # `decentring` and `radial` have a common factor: computed once, the program is a third shorter.
         x, y = xy
-        dr = radial(x * x + y * y, self.k1, self.k2, self.k3)
-        dx, dy = decentring(self.p1, self.p2, xy)
-        return jnp.stack([x - x * dr - dx, y - y * dr - dy])
+        r2 = x * x + y * y
+        left = 1 - radial(r2, self.k1, self.k2, self.k3) - 2 * (self.p1 * x + self.p2 * y)
+        return jnp.stack([left * x - self.p1 * r2, left * y - self.p2 * r2])
