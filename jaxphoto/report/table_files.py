@@ -51,23 +51,25 @@ def _texts(table: pd.DataFrame, name: str) -> list[str]:
         return ["" if pd.isna(v) else _word(v) for v in column.astype(object)]
     if (name.startswith("sigma") and not name.startswith("sigma0")) or name in _SIGMAS:
         return ["" if np.isnan(v) else of_sigma(v) for v in column]
-    of = _sigma_of(table, name)
     digits = 10 if _COORDINATE.match(name) else 4
-    sigmas = table[of] if of else np.full(len(table), np.nan)
+    sigmas = _sigmas_of(table, name)
     return [
         "" if np.isnan(v) else with_sigma(v, s) if s > 0 else f"{v:.{digits}g}"
         for v, s in zip(column, sigmas, strict=True)
     ]
 
 
-def _sigma_of(table: pd.DataFrame, name: str) -> str | None:
-    """The column of the standard deviations of another one, where there is one."""
+def _sigmas_of(table: pd.DataFrame, name: str) -> pd.Series | np.ndarray:
+    """The standard deviations of a column, NaN where none are told."""
+    if name == "mean" and {"rmse", "n"} <= set(table.columns):
+        # Of n numbers that scatter by their root mean square.
+        return table["rmse"] / np.sqrt(table["n"])
     own = (
         f"sigma_{name}",
         "sigma" if name in _BY_SIGMA else "",
         "sd" if name in _BY_SD else "",
     )
-    return next((of for of in own if of in table), None)
+    return next((table[of] for of in own if of in table), np.full(len(table), np.nan))
 
 
 def _word(value: object) -> str:

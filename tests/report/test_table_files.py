@@ -108,3 +108,9 @@ def test_the_command_writes_those_that_are_asked_for(tmp_path, monkeypatch, caps
 def test_a_table_that_there_is_not_is_named():
     with pytest.raises(InputError, match="there is no table inner; there are interior, exterior"):
         write_tables(Tables(adjusted("cross")), "nowhere", names=["inner"])
+
+
+def test_the_mean_of_residuals_has_the_digits_that_their_scatter_allows():
+    shown = readable(pd.DataFrame({"n": [400], "mean": [-0.00012345678], "rmse": [0.002], "max_abs": [0.00912345]}))
+    # 0.002 / 20 = 0.0001.
+    assert list(shown.iloc[0]) == ["400", "-0.00012", "0.002", "0.009123"]
