@@ -6,11 +6,13 @@ import re
 import subprocess
 import sys
 
+import jax
 import numpy as np
 import pandas as pd
 import pytest
 
 import jaxphoto
+import jaxphoto.cli
 from jaxphoto.errors import InputError
 from jaxphoto.io import write_block
 from jaxphoto.writing import MARKER, check_folder
@@ -299,3 +301,21 @@ def test_results_never_take_the_place_of_what_they_are_made_of(tmp_path):
     for given in (results, results / "block", results / "interior.csv"):
         with pytest.raises(InputError, match="would be lost"):
             check_folder(results, tmp_path / "another", given)
+
+
+@pytest.mark.parametrize("make", [np.zeros, jax.numpy.zeros])
+def test_too_little_memory_is_one_sentence(make, monkeypatch, capsys):
+    monkeypatch.setattr(jaxphoto.cli, "app", lambda **_: make((10**7, 10**8)).sum())
+    code, out, err = run(monkeypatch, capsys, "adjust")
+    assert (code, out) == (2, "") and err.count("\n") == 1
+    assert re.match(r"jaxphoto: memory does not suffice: [\d.]+ ?(PiB|TiB|bytes) were asked for at once; close ", err)
+
+
+def test_other_errors_of_xla_are_not_taken_for_it(monkeypatch, capsys):
+    def broken(**_):
+        raise jax.errors.JaxRuntimeError("INTERNAL: no such thing")
+
+    monkeypatch.setattr(jaxphoto.cli, "app", broken)
+    monkeypatch.setattr(sys, "argv", ["jaxphoto"])
+    with pytest.raises(jax.errors.JaxRuntimeError):
+        jaxphoto.cli.main()

@@ -1,8 +1,10 @@
 """The command line: read, do, write; one sentence and exit code 2 for what a user can mend."""
 
+import re
 import sys
 import warnings
 
+import jax
 import typer
 
 from jaxphoto.cli.app import app
@@ -28,6 +30,19 @@ def main() -> None:
         where = error.filename if error.filename is not None else "a file"
         typer.echo(
             f"jaxphoto: {printable(str(where))}: {error.strerror or error}; name a place that can be read and written",
+            err=True,
+        )
+        sys.exit(2)
+    except (MemoryError, jax.errors.JaxRuntimeError) as error:
+        # XLA has one error for everything.
+        if isinstance(error, jax.errors.JaxRuntimeError) and "RESOURCE_EXHAUSTED" not in str(error):
+            raise
+        wait_if_ending()
+        asked = re.search(r"[\d.]+ ?(bytes|[KMGTPE]iB)", str(error))
+        wanted = f": {asked[0]} were asked for at once" if asked else ""
+        typer.echo(
+            f"jaxphoto: memory does not suffice{wanted}; close other programs, take a larger machine, or give it less "
+            "(a part of the block, fewer points or returns)",
             err=True,
         )
         sys.exit(2)
