@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 
 from jaxphoto.report.document import DocumentPicture, Element, Heading, Paragraph, Pictures, Rows
+from jaxphoto.report.plots import log_ticks
 from jaxphoto.report.tables import Tables
 
 if TYPE_CHECKING:
@@ -76,7 +77,7 @@ def draw_sigmas(axes: Axes, table: pd.DataFrame, unit: str) -> None:
         bins = np.geomspace(low, high, 40)
         for k, (axis, line) in enumerate(zip("XYZ", ("-", "--", ":"), strict=True)):
             axes.hist(sigma[:, k], bins=bins.tolist(), histtype="step", ls=line, label=axis)
-        axes.set_xscale("log")
+        log_ticks(axes)
         axes.legend(fontsize=7)
     axes.set(xlabel=f"sigma [{unit}]", ylabel="points")
     axes.set_title("standard deviations of points", loc="left", fontsize=9)

@@ -44,6 +44,16 @@ def axes_or_new(axes: Axes | None, *, in_3d: bool = False) -> Axes:
     return axes
 
 
+def log_ticks(axes: Axes) -> None:
+    """A logarithmic axis of x with numbers at 1, 2 and 5 of each power of ten: more would lie over one another."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    axes.set_xscale("log")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+
+
 def drawn(name: str) -> str:
     """A name of a file as matplotlib draws it: a dollar would begin a formula."""
     return printable(name).replace("$", r"\$")

@@ -54,7 +54,7 @@ figure.block { margin: .5rem 0 1rem } .plot { height: min(36rem, 75vh) }
 .alarm, .warning, .information { border-left: 4px solid var(--information); padding-left: .6rem; margin: .4rem 0 }
 .alarm { border-color: var(--alarm) } .warning { border-color: var(--warning) }
 @media (max-width: 32rem) { th:not([aria-sort]) button::after { content: "" }
-  body { margin: .5rem auto; padding: 0 .6rem } th, td { padding: .15rem .35rem }
+  body { margin: .5rem auto; padding: 0 .6rem } th, td { padding: .15rem .35rem } td.text { min-width: 7rem }
   .names th { white-space: normal } h1 { font-size: 1.4rem } .wide img { max-width: none; width: 44rem } }
 @page { margin: 12mm }
 @media print { :root { color-scheme: light } body { max-width: none; margin: 0; padding: 0; font-size: 10.5px }

@@ -10,7 +10,7 @@ import pandas as pd
 
 from jaxphoto.errors import InputError
 from jaxphoto.observations import AXES
-from jaxphoto.report.plots import drawn, new_figure
+from jaxphoto.report.plots import drawn, log_ticks, new_figure
 from jaxphoto.sensitivity.sweep import Sweep
 
 if TYPE_CHECKING:
@@ -138,7 +138,7 @@ def _lines(axes: Axes, rows: pd.DataFrame, x: str, by: Sequence[str]) -> None:
         at = line.sort_values(x) if numbers else line
         axes.plot(at[x] if numbers else at[x].astype(str).map(drawn), at["value"], "o-", ms=3, lw=1, label=label)
     if numbers and _far_apart(places):
-        axes.set_xscale("log")
+        log_ticks(axes)
     if rows["quantity"].iloc[0].endswith("abs_rho"):
         axes.set_ylim(0, 1.02)
     elif _far_apart(rows["value"]):

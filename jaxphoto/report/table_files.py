@@ -51,16 +51,18 @@ def _texts(table: pd.DataFrame, name: str) -> list[str]:
         return ["" if pd.isna(v) else _word(v) for v in column.astype(object)]
     if (name.startswith("sigma") and not name.startswith("sigma0")) or name in _SIGMAS:
         return ["" if np.isnan(v) else of_sigma(v) for v in column]
-    digits = 10 if _COORDINATE.match(name) else 4
     sigmas = _sigmas_of(table, name)
+    # What is held is told whole; what nothing is told of, as far as anyone reads it.
+    untold = 2 if name.endswith("_moves") else 4
+    digits = 10 if _COORDINATE.match(name) else untold if sigmas is None else 8
     return [
         "" if np.isnan(v) else with_sigma(v, s) if s > 0 else f"{v:.{digits}g}"
-        for v, s in zip(column, sigmas, strict=True)
+        for v, s in zip(column, np.full(len(table), np.nan) if sigmas is None else sigmas, strict=True)
     ]
 
 
-def _sigmas_of(table: pd.DataFrame, name: str) -> pd.Series | np.ndarray:
-    """The standard deviations of a column, NaN where none are told."""
+def _sigmas_of(table: pd.DataFrame, name: str) -> pd.Series | None:
+    """The standard deviations of a column, where they are told: NaN or zero of what is held."""
     if name == "mean" and {"rmse", "n"} <= set(table.columns):
         # Of n numbers that scatter by their root mean square.
         return table["rmse"] / np.sqrt(table["n"])
@@ -69,7 +71,7 @@ def _sigmas_of(table: pd.DataFrame, name: str) -> pd.Series | np.ndarray:
         "sigma" if name in _BY_SIGMA else "",
         "sd" if name in _BY_SD else "",
     )
-    return next((table[of] for of in own if of in table), np.full(len(table), np.nan))
+    return next((table[of] for of in own if of in table), None)
 
 
 def _word(value: object) -> str:

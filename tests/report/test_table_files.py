@@ -114,3 +114,10 @@ def test_the_mean_of_residuals_has_the_digits_that_their_scatter_allows():
     shown = readable(pd.DataFrame({"n": [400], "mean": [-0.00012345678], "rmse": [0.002], "max_abs": [0.00912345]}))
     # 0.002 / 20 = 0.0001.
     assert list(shown.iloc[0]) == ["400", "-0.00012", "0.002", "0.009123"]
+
+
+def test_what_is_held_is_told_whole():
+    shown = readable(
+        pd.DataFrame({"parameter": ["c_mm", "k1"], "value": [34.250186, 1.2345678e-4], "sigma": [0.0, np.nan]})
+    )
+    assert list(shown["value"]) == ["34.250186", "0.00012345678"] and list(shown["sigma"]) == ["", ""]
