@@ -31,7 +31,7 @@ td.number { white-space: nowrap }
 .pictures img { width: 100%; max-width: 29.5rem; height: auto }
 /* Wide tables have the room to the right of the text. */
 @media screen and (min-width: 80rem) { .wide { margin-right: calc((62rem - 100vw) / 2 + 1.5rem) }
-  .wide img { max-width: 62rem } }
+  .wide img { max-width: 62rem } table:has(th:nth-child(12)) :is(th, td) { padding: .2rem .45rem } }
 .long { max-height: 75vh; overflow: auto } .long thead th { position: sticky; top: 0; z-index: 1 }
 .long thead th:first-child { z-index: 2 }
 th button, .name { font: inherit; color: inherit; background: none; border: 0; padding: 0; cursor: pointer;
@@ -54,7 +54,8 @@ figure.block { margin: .5rem 0 1rem } .plot { height: min(36rem, 75vh) }
 .alarm, .warning, .information { border-left: 4px solid var(--information); padding-left: .6rem; margin: .4rem 0 }
 .alarm { border-color: var(--alarm) } .warning { border-color: var(--warning) }
 @media (max-width: 32rem) { th:not([aria-sort]) button::after { content: "" }
-  body { margin: .5rem auto; padding: 0 .6rem } th, td { padding: .15rem .35rem } td.text { min-width: 7rem }
+  body { margin: .5rem auto; padding: 0 .6rem } th, td { padding: .15rem .35rem }
+  td.text:first-child { min-width: 7rem }
   .names th { white-space: normal } h1 { font-size: 1.4rem } .wide img { max-width: none; width: 44rem } }
 @page { margin: 12mm }
 @media print { :root { color-scheme: light } body { max-width: none; margin: 0; padding: 0; font-size: 10.5px }

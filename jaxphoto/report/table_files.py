@@ -20,6 +20,8 @@ _BY_SIGMA = ("value", "estimate", "truth", "error", "first", "second", "differen
 _BY_SD = ("nominal", "mean", "q025", "q50", "q975")
 # Standard deviations by other names.
 _SIGMAS = ("sd", "predicted_sigma")
+# What is read to so many digits, without a standard deviation of its own.
+_DIGITS = {"redundancy_number": 2, "w": 3, "detectable": 3, "share": 2, "p_value": 2, "ratio": 3}
 # Names end in their units, the longest first.
 _UNITS = {
     "m_per_s": "m/s", "deg_per_s": "deg/s", "mm_per_s": "mm/s", "mm_per_h": "mm/h", "per_h": "1/h",
@@ -53,7 +55,7 @@ def _texts(table: pd.DataFrame, name: str) -> list[str]:
         return ["" if np.isnan(v) else of_sigma(v) for v in column]
     sigmas = _sigmas_of(table, name)
     # What is held is told whole; what nothing is told of, as far as anyone reads it.
-    untold = 2 if name.endswith("_moves") else 4
+    untold = 2 if name.endswith("_moves") else _DIGITS.get(name, 4)
     digits = 10 if _COORDINATE.match(name) else untold if sigmas is None else 8
     return [
         "" if np.isnan(v) else with_sigma(v, s) if s > 0 else f"{v:.{digits}g}"
