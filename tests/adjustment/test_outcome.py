@@ -168,6 +168,14 @@ def test_the_step_limit_is_an_outcome():
     assert int(a.steps) == 1
 
 
+def test_another_number_of_steps_is_the_same_program(monkeypatch):
+    block = simulated("cross").block
+    adjust(block, block.start.unknowns, max_steps=3)
+    monkeypatch.delattr("jaxphoto.compiling.run._program_of")
+    a = adjust(block, block.start.unknowns, max_steps=2)
+    assert int(a.steps) == 2 and a.outcome is Outcome.STEPS
+
+
 def test_infinite_numbers_are_an_outcome():
     """A point at a projection centre: the collinearity equations divide by zero."""
     block = simulated("cross").block
