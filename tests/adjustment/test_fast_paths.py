@@ -72,7 +72,7 @@ def test_one_small_tile_at_a_time_gives_what_many_together_give(monkeypatch):
     together = everything(block, start)
     monkeypatch.setattr(tile_layout, "_SLOTS", 1)
     monkeypatch.setattr(tile_layout, "_CHUNK", 20_000)
-    monkeypatch.setattr(tile_layout, "tile_shape", lambda *a: (12, 4))
+    monkeypatch.setattr(tile_layout, "TILE_STEP", 4)
     padded = pad_structure(structure_of(block, block.priors)).structure
     assert padded.tiles.at_once == 1
     assert len(padded.tiles.image) > 1
