@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 # an array of JAX would start a device and compile at import.
 _RFU_FRD = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
-# `CROSS @ v` is [v]x: one product with constants is a tenth of the program that puts it together by component.
+# `CROSS @ v` is [v]x: one product with constants, where components put together are a dozen operations.
 _UNIT = np.eye(3)
 CROSS = np.cross(_UNIT, _UNIT[:, None])
 

@@ -185,7 +185,7 @@ class AbstractBrown(AbstractDistortion):
 
     def undistorted(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
         """A coordinate (mm) without radial and decentring distortion."""
-        # `decentring` and `radial` have a common factor: computed once, the program is a third shorter.
+        # `decentring` and `radial` by their common factor: this stands in every program several times over.
         x, y = xy
         r2 = x * x + y * y
         left = 1 - radial(r2, self.k1, self.k2, self.k3) - 2 * (self.p1 * x + self.p2 * y)
