@@ -46,12 +46,11 @@ def axes_or_new(axes: Axes | None, *, in_3d: bool = False) -> Axes:
 
 def log_ticks(axes: Axes) -> None:
     """A logarithmic axis of x with numbers at 1, 2 and 5 of each power of ten: more would lie over one another."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
     axes.set_xscale("log")
-    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.xaxis.set_minor_formatter(NullFormatter())
+    # Of a logarithmic axis it is a LogLocator.
+    axes.xaxis.get_major_locator().set_params(subs=(1.0, 2.0, 5.0))  # type: ignore[call-arg]
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.xaxis.set_minor_formatter("")
 
 
 def drawn(name: str) -> str:
