@@ -85,8 +85,8 @@ class SolverState(NamedTuple):
     """Whether damping takes the place of the datum's constraints."""
     tightened: Bool[Array, ""]
     """Whether it did before: it does so once."""
-    settled: Bool[Array, ""]
-    """Whether this is the optimum."""
+    done: Bool[Array, ""]
+    """Whether this is what the task asks for: the optimum, or the system."""
     steps: Int[Array, ""]
 
 
@@ -149,7 +149,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Increments, Scalar, Any
         damping = jnp.where(self.task.only_factor, 0.0, _FIRST_DAMPING)
         empty = zero_system(y, self.values, self.structure)
         no, steps = jnp.array(False), jnp.array(0)
-        return SolverState(damping, jnp.array(jnp.inf), no, empty, loose=no, tightened=no, settled=no, steps=steps)
+        return SolverState(damping, jnp.array(jnp.inf), no, empty, loose=no, tightened=no, done=no, steps=steps)
 
     def _factored(self, at: Linearised, damping) -> tuple[FactoredSystem, RightSide]:
         a, reduced, right = reduce_normal(at.for_normal_equations, damping)
@@ -208,16 +208,16 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Increments, Scalar, Any
             system=system,
             loose=loose,
             tightened=state.tightened | tighten,
-            settled=(settled & ~tighten) | only_factor,
+            done=(settled & ~tighten) | only_factor,
             steps=state.steps + 1,
         )
         return next_y, progress, None
 
     def terminate(self, fn, y, args, options, state: SolverState, tags):
-        """After the step that settled it, or the last that the task allows."""
-        ended = ~state.settled & (state.steps >= self.task.max_steps)
+        """After the step that did it, or the last that the task allows."""
+        ended = ~state.done & (state.steps >= self.task.max_steps)
         results = optx.RESULTS
-        return state.settled | ended, results.where(ended, results.nonlinear_max_steps_reached, results.successful)
+        return state.done | ended, results.where(ended, results.nonlinear_max_steps_reached, results.successful)
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
         """Nothing is left to do."""

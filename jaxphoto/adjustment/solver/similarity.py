@@ -44,6 +44,7 @@ def motions(
     """Derivatives of images (position, small rotation) and points by the parameters of `similarity`, at none.
 
     NumPy's, unless what it is given is traced.
+
     Where x is away from the centre by r, a turn by theta takes it by -theta x r. On the camera's side, where increments
     are, the same turn is R turn' R', a small rotation by -R theta.
     """
