@@ -213,10 +213,13 @@ def halved(
     """The images `first` of an adjusted block and the others, adjusted for themselves and compared at `cells_mm`."""
     block = adjusted.block
     start = dataclasses.replace(block.start, unknowns=adjusted.unknowns)
+    # Where a half lies in space is nothing of its camera: what stations or control of the whole told may be as good as
+    # open, or open, in a half.
+    datum = dataclasses.replace(block.datum, kind="inner") if block.datum.kind == "control" else block.datum
     try:
         both = []
         for half in (first, ~first):
-            part = some_images(dataclasses.replace(block, start=start), half)
+            part = some_images(dataclasses.replace(block, start=start, datum=datum), half)
             both.append(adjust(part, part.start.unknowns, sizes=sizes))
             if not bool(both[-1].converged):
                 return Cut(first, both[-1].outcome.value)

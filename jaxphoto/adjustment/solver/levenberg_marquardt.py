@@ -21,7 +21,7 @@ from jaxphoto.adjustment.solver.band import BandFactor, factor_band
 from jaxphoto.adjustment.solver.elimination import gradient, solve_reduced
 from jaxphoto.adjustment.solver.normal import Linearised, Reduced, dot, norm2
 from jaxphoto.adjustment.solver.reduced import RightSide, reduce_normal
-from jaxphoto.adjustment.solver.similarity import n_open_motions, onto_datum
+from jaxphoto.adjustment.solver.similarity import after, n_open_motions, onto_datum
 from jaxphoto.arrays import Numbers
 
 
@@ -186,7 +186,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Increments, Scalar, Any
         ratio = length / state.length
         missing = length * jnp.clip(ratio, _SLOWEST_SHOWN, 1.0)
         settled = (missing <= self.tolerance) & (damped <= seen + self.tolerance**2)
-        new_y = jax.tree.map(jnp.add, y, proposal)
+        new_y = after(at, proposal, system.reduced.weight)
         # The last step is short and was computed from an accepted iterate: it needs no proof.
         square_sum = jax.lax.cond(settled | only_factor, lambda: right.square_sum, lambda: fn(new_y, at[1:])[0] ** 2)
         reduction, promised = right.square_sum - square_sum, seen + 2 * damped

@@ -10,12 +10,14 @@ from jaxtyping import Array, Float
 from jaxphoto.adjustment.layout.tiled import TiledStructure, TiledValues
 from jaxphoto.adjustment.model.numbers import AbstractValues, Increments, datum_residuals
 from jaxphoto.adjustment.model.structure import AbstractStructure, total
-from jaxphoto.adjustment.solver.normal import Linearised
+from jaxphoto.adjustment.solver.normal import Linearised, dot
 from jaxphoto.arrays import Numbers, joined
 from jaxphoto.rotation import CROSS, small_angles, small_rotation
 
 # Newton's method on so few unknowns, begun so near, doubles the right digits with each of these.
 _NEWTON_STEPS = 5
+# Of the mean weight of the motions: holds what a single image, of which seven motions are not independent, leaves open.
+_RIDGE = 1e-9
 
 
 class DatumRows(NamedTuple):
@@ -28,9 +30,9 @@ class DatumRows(NamedTuple):
 def similarity(
     parameters: Float[Array, "7"], position: Float[Array, "3"], rotation: Float[Array, "3 3"], centre, size
 ) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
-    """An image moved by a similarity about `centre`: shifts and scale in units of `size`, rotations in rad."""
+    """An image moved by a similarity about `centre`: shifts in units of `size`, rotations (rad), logarithm of scale."""
     turn = small_rotation(parameters[3:6])
-    moved = centre + size * parameters[:3] + (1 + parameters[6]) * turn @ (position - centre)
+    moved = centre + size * parameters[:3] + jnp.exp(parameters[6]) * turn @ (position - centre)
     return moved, rotation @ turn.T
 
 
@@ -80,17 +82,8 @@ def onto_datum(at: Linearised) -> Increments:
     """
     y, scale, values, s = at
     k = n_open_motions(values, s)
-    centre, size = _extent(values, s)
-
-    def moved(y: Increments, parameters: Float[Array, "k"]) -> Increments:
-        state = Linearised(y, *at[1:]).state
-        parameters = jnp.concatenate([parameters, jnp.zeros(7 - k)])
-        image = lambda x, r: similarity(parameters, x, r, centre, size)  # noqa: E731
-        position, rotation = jax.vmap(image, in_axes=(1, 2), out_axes=(1, 2))(state.position, state.rotation)
-        points = jax.vmap(lambda x: image(x, jnp.eye(3))[0], 1, 1)(state.points)
-        turned = jax.vmap(lambda r, start: small_angles(r @ start.T), 2, 1)(rotation, values.rotation)
-        eop = _scaled(jnp.concatenate([position - values.position, turned]), scale.eop)
-        return Increments(eop, y.shared, _scaled(points - values.points, scale.points))
+    centre, size = _extent(values.points, s)
+    moved = lambda y, parameters: _moved(Linearised(y, *at[1:]), parameters, centre, size)  # noqa: E731
 
     def newton(_, y: Increments) -> Increments:
         violation = lambda parameters: datum_residuals(moved(y, parameters), scale, values, s)  # noqa: E731
@@ -106,15 +99,50 @@ def onto_datum(at: Linearised) -> Increments:
 def along_motions(values: TiledValues, scale: Increments, s: TiledStructure) -> Increments:
     """Scaled increments along each of the `n_open_motions` (leading axis), which nothing but the datum sees."""
     k, shared = n_open_motions(values, s), scale.shared
-    eop, points = motions(values.position, values.rotation, values.points, *_extent(values, s))
+    eop, points = motions(values.position, values.rotation, values.points, *_extent(values.points, s))
     return Increments(_scaled(eop[:k], scale.eop), jnp.zeros((k, *shared.shape)), _scaled(points[:k], scale.points))
 
 
-def _extent(values: TiledValues, s: TiledStructure) -> tuple[Float[Array, "3"], Float[Array, ""]]:
+def after(at: Linearised, step: Increments, weight: Increments) -> Increments:
+    """The increments after `step`: what moves the whole block is taken as a similarity, the rest is added.
+
+    Added up, a turn of the whole block bends it, and where few observations see where the block lies, that is all that
+    such a step would be judged by. What is a similarity is told in the metric of `weight`. Steps of a free network are
+    added up: its constraints are straight.
+    """
+    (y, scale, values, s), state = at, at.state
+    if n_open_motions(values, s):
+        return jax.tree.map(jnp.add, y, step)
+    centre, size = _extent(state.points, s)
+    eop, points = motions(state.position, state.rotation, state.points, centre, size)
+    along = Increments(_scaled(eop, scale.eop), jnp.zeros((7, s.n_shared)), _scaled(points, scale.points))
+    weighted = jax.tree.map(jnp.multiply, along, weight)
+    product = jax.vmap(dot, in_axes=(None, 0, None))
+    normal = jax.vmap(lambda a: product(a, weighted, s))(along)
+    ridge = _RIDGE * jnp.trace(normal) + jnp.finfo(float).tiny
+    parameters = jnp.linalg.solve(normal + ridge * np.eye(7), product(step, weighted, s))
+    moved = lambda y, parameters: _moved(Linearised(y, *at[1:]), parameters, centre, size)  # noqa: E731
+    linear = jax.jvp(lambda p: moved(y, p), (jnp.zeros(7),), (parameters,))[1]
+    return moved(jax.tree.map(lambda y, x, a: y + (x - a), y, step, linear), parameters)
+
+
+def _moved(at: Linearised, parameters: Float[Array, "k"], centre, size) -> Increments:
+    """The increments there, moved by a similarity."""
+    (y, scale, values, _), state = at, at.state
+    parameters = jnp.concatenate([parameters, jnp.zeros(7 - len(parameters))])
+    image = lambda x, r: similarity(parameters, x, r, centre, size)  # noqa: E731
+    position, rotation = jax.vmap(image, in_axes=(1, 2), out_axes=(1, 2))(state.position, state.rotation)
+    points = jax.vmap(lambda x: image(x, jnp.eye(3))[0], 1, 1)(state.points)
+    turned = jax.vmap(lambda r, start: small_angles(r @ start.T), 2, 1)(rotation, values.rotation)
+    eop = _scaled(jnp.concatenate([position - values.position, turned]), scale.eop)
+    return Increments(eop, y.shared, _scaled(points - values.points, scale.points))
+
+
+def _extent(points: Float[Array, "3 points"], s: TiledStructure) -> tuple[Float[Array, "3"], Float[Array, ""]]:
     """Centre and size (m) of the points."""
     mean = lambda v: total(jnp.sum(v, axis=-1), s) / s.n_points  # noqa: E731
-    centre = mean(values.points)
-    return centre, jnp.sqrt(mean(jnp.sum((values.points - centre[:, None]) ** 2, axis=0)))
+    centre = mean(points)
+    return centre, jnp.sqrt(mean(jnp.sum((points - centre[:, None]) ** 2, axis=0)))
 
 
 def _scaled(v, scale):
@@ -132,4 +160,4 @@ def _nearest(points, start, own, centre, size, s: TiledStructure) -> Float[Array
     turn = (u * sign) @ vt
     scale = jnp.sum(d * sign) / total(jnp.sum(weight * a * a), s)
     shift = (target - centre - scale * turn @ (mean - centre)) / size
-    return jnp.concatenate([shift, small_angles(turn), scale[None] - 1])
+    return jnp.concatenate([shift, small_angles(turn), jnp.log(scale)[None]])
