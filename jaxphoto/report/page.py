@@ -111,7 +111,7 @@ def _sections(tables: Tables) -> Iterator[tuple[str, list[Markup]]]:
     if len(check):
         accuracy = [_said(s) for s in accuracy_sentences(tables.tested_accuracy)]
         picture = _picture(check_points_figure({"": tables}), "discrepancies at check points")
-        body = [_html(_check_spread(check)), *accuracy, _html(tables.positional_accuracy), picture, _html(check)]
+        body = [_html(check_spread(check)), *accuracy, _html(tables.positional_accuracy), picture, _html(check)]
         yield "Check points: surveyed minus computed", body
     ellipses = _picture(ellipses_figure(tables), "error ellipses of the projection centres in plan")
     yield "Exterior orientation", [ellipses, _html(tables.exterior)]
@@ -166,10 +166,16 @@ def _residuals(tables: Tables) -> list[Markup]:
     ]
 
 
-def _check_spread(check: pd.DataFrame) -> pd.DataFrame:
-    values = check[[f"d{axis}_m" for axis in AXES]]
-    rows = {"mean": values.mean(), "rmse": np.sqrt((values**2).mean()), "max_abs": values.abs().max()}
-    return pd.DataFrame(rows).T.reset_index(names="check points")
+def check_spread(check: pd.DataFrame) -> pd.DataFrame:
+    """axis, n, mean, rmse, max_abs, unit of discrepancies at check points."""
+    values = check[[f"d{axis}_m" for axis in AXES]].set_axis(AXES, axis=1)
+    columns = {
+        "n": values.count(),
+        "mean": values.mean(),
+        "rmse": np.sqrt((values**2).mean()),
+        "max_abs": values.abs().max(),
+    }
+    return pd.DataFrame(columns).reset_index(names="axis").assign(unit="m")
 
 
 def _html(table: pd.DataFrame) -> Markup:

@@ -10,6 +10,7 @@ from jaxphoto import InputError, Tables
 from jaxphoto.io import read_result_tables
 from jaxphoto.report import to_latex, to_markdown, write_tables
 from jaxphoto.report.digits import of_sigma, with_sigma
+from jaxphoto.report.page import check_spread
 from jaxphoto.report.table_files import head_of, readable
 from tests.blocks import adjusted
 from tests.commands import run
@@ -114,6 +115,13 @@ def test_the_mean_of_residuals_has_the_digits_that_their_scatter_allows():
     shown = readable(pd.DataFrame({"n": [400], "mean": [-0.00012345678], "rmse": [0.002], "max_abs": [0.00912345]}))
     # 0.002 / 20 = 0.0001.
     assert list(shown.iloc[0]) == ["400", "-0.00012", "0.002", "0.009123"]
+
+
+def test_check_points_are_summed_up_by_axis():
+    d = pd.DataFrame({"dX_m": [0.01, -0.03], "dY_m": [0.02, 0.02], "dZ_m": [0.0, np.nan]})
+    spread = check_spread(d)
+    assert list(spread["axis"]) == ["X", "Y", "Z"] and list(spread["n"]) == [2, 2, 1]
+    np.testing.assert_allclose(spread[["mean", "rmse", "max_abs"]], [[-0.01, 5e-4**0.5, 0.03], [0.02] * 3, [0.0] * 3])
 
 
 def test_what_is_held_is_told_whole():
