@@ -65,6 +65,8 @@ class Adjustment(eqx.Module):
     steps: Int[Numbers, ""]
     converged: Bool[Numbers, ""]
     seconds: dict[str, float]
+    left_out: tuple[str, ...] = eqx.field(static=True, default=())
+    """Tie points of the block as it was given that this adjustment goes without: their rays meet nowhere."""
 
     __repr__ = adjustment_repr
 

@@ -39,7 +39,14 @@ def camera_command(
     read = read_camera_file(source, camera=camera, pixel_mm=pixel_mm, size_px=size, block=block)
     kind = AbstractDistortion.known()[distortion] if distortion is not None else None
     done = write_camera_file(
-        out, read.sensor, read.interior, out_format, name=read.name, distortion=kind, covariance=read.covariance
+        out,
+        read.sensor,
+        read.interior,
+        out_format,
+        name=read.name,
+        distortion=kind,
+        covariance=read.covariance,
+        reservation=read.note,
     )
     console = plain_console()
     console.print(

@@ -40,7 +40,15 @@ def combine_command(
         if file.note:
             print_warning(f"{name}: {file.note}", console, soft_wrap=True)
     done = combine([file.interior for file in read], covariances, names)
-    write_camera_file(out, read[0].sensor, done.interior, "block", name=read[0].name, covariance=done.covariance)
+    write_camera_file(
+        out,
+        read[0].sensor,
+        done.interior,
+        "block",
+        name=read[0].name,
+        covariance=done.covariance,
+        reservation="; ".join(f"{name}: {file.note}" for name, file in zip(names, read, strict=True) if file.note),
+    )
     for parameter, variance in zip(parameter_names(done.interior), np.diagonal(done.covariance), strict=True):
         if variance > 0:
             value = float(get_parameter(done.interior, parameter))

@@ -9,6 +9,7 @@ from jaxphoto.cli.app import app
 from jaxphoto.cli.choices import one_of
 from jaxphoto.cli.console import plain_console
 from jaxphoto.cli.grid_options import check_grid, points_of
+from jaxphoto.cli.judged_block import print_judgement
 from jaxphoto.cli.made import made_by
 from jaxphoto.io import read_block
 from jaxphoto.io.cameras import write_camera_file
@@ -60,5 +61,6 @@ def halves_command(
             ),
             made,
         )
+    print_judgement(found.adjusted, errors)
     print_halves(found, console)
     console.print(f"results in {out} (open report.html)")

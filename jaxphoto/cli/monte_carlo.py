@@ -12,6 +12,7 @@ from jaxphoto.block import Block
 from jaxphoto.cli.app import app
 from jaxphoto.cli.choices import one_of
 from jaxphoto.cli.console import plain_console
+from jaxphoto.cli.judged_block import print_judgement
 from jaxphoto.cli.made import made_by
 from jaxphoto.errors import InputError
 from jaxphoto.experiment import MonteCarlo
@@ -73,6 +74,7 @@ def monte_carlo_command(
             exterior="exterior" in kept,
             points="points" in kept,
         )
+    print_judgement(adjusted, errors)
     study = MonteCarlo(read, run, drawn, draws, seed, out)
     columns = (TextColumn("draws"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=errors, transient=True) as progress:

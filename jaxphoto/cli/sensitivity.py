@@ -11,6 +11,7 @@ import jaxphoto
 from jaxphoto.cli.app import app
 from jaxphoto.cli.choices import one_of
 from jaxphoto.cli.console import plain_console
+from jaxphoto.cli.judged_block import print_judgement
 from jaxphoto.cli.made import made_by
 from jaxphoto.errors import InputError
 from jaxphoto.io import read_block
@@ -49,6 +50,7 @@ def sensitivity_command(
         status.update(f"writing {out}")
         order = ("compile", "solve", "covariance", "sensitivity")
         write_sensitivity(tables, out, seconds | {name: adjusted.seconds[name] for name in order}, made)
+    print_judgement(adjusted, errors)
     console.print(f"largest changes by a station bias of {bias_m:g} m per {per}: exact, first-order")
     interior = table[table["estimate"].str.startswith("interior")]
     largest = interior.loc[interior.groupby("estimate", sort=False)["exact"].apply(lambda v: v.abs().idxmax())]

@@ -9,7 +9,9 @@ from jaxphoto.cli.app import app
 from jaxphoto.cli.choices import one_of
 from jaxphoto.cli.console import plain_console
 from jaxphoto.io import read_result_tables
+from jaxphoto.io.results_judged import read_summary, reservation
 from jaxphoto.report import TABLE_FORMATS, write_table
+from jaxphoto.report.terminal import print_warning
 from jaxphoto.writing import check_folder, whole_folder
 
 
@@ -28,4 +30,6 @@ def tables_command(
     with whole_folder(out) as work:
         for name, table in tables.items():
             write_table(table, name, work, to)
+    if against := reservation(read_summary(results)):
+        print_warning(against, plain_console(stderr=True))
     plain_console().print(f"{len(tables)} tables in {out}")

@@ -7,8 +7,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from jaxphoto.adjustment import LEAST, MAX_STEPS, Adjustment, Outcome, Sizes, solve
+from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
 from jaxphoto.block import Block, sensor_rows
-from jaxphoto.errors import BlockError, DatumError, RankError
+from jaxphoto.errors import BlockError, DatumError, RankError, few
 from jaxphoto.observations import AbstractObservations, KnownParameters
 from jaxphoto.orientation import approximate
 from jaxphoto.orientation.approximate import PointsBehind, completed
@@ -16,9 +17,18 @@ from jaxphoto.procedures.orientation import orient_block
 from jaxphoto.procedures.orientation.network import empty_network, misfits, sight_of
 from jaxphoto.statistics import prepare_statistics
 from jaxphoto.unknowns import FREE, Unknowns
+from jaxphoto.variants import without_observations
+
+_FromStart = Callable[[Block, Unknowns], Adjustment]
 
 # A sigma naught that neither blunders nor weights explain: the place is wrong.
 _ABSURD = 30.0
+# Of the square sum: with blunders in a block nothing fits, but some places are no place at all.
+_FAR_BETTER = 0.01
+# Tie points that may be left out, as a part of all points: where more are gone, cameras stand in the wrong place.
+_GONE = 0.05
+# A sigma naught with points that were gone, over that without, up to which nothing speaks against them.
+_AS_GOOD = 1.5
 # Rays that miss by more (rad) are off by more than lenses distort.
 _NEAR = 0.02
 
@@ -54,17 +64,33 @@ def adjust(
     priors = block.priors if priors is None else priors
     if start is not None:
         return solve(block, start, priors, max_steps, sizes)
-    return _from_the_best_start(block, priors, lambda start: solve(block, start, priors, max_steps, sizes), max_steps)
+    own = priors is block.priors
+
+    def from_start(part: Block, start: Unknowns) -> Adjustment:
+        return solve(part, start, part.priors if own else priors, max_steps, sizes)
+
+    found = _from_the_best_start(block, priors, from_start, max_steps, may_lose_points=own)
+    if found.left_out:
+        warnings.warn(left_out_words(found), stacklevel=2)
+    return found
 
 
 def adjust_for_tables(block: Block, max_steps: int = MAX_STEPS) -> Adjustment:
     """`adjust`, with what tables and report will want compiled meanwhile."""
-    from_start = lambda start: solve(block, start, block.priors, max_steps, meanwhile=prepare_statistics)  # noqa: E731
+    from_start = lambda part, start: solve(part, start, part.priors, max_steps, meanwhile=prepare_statistics)  # noqa: E731
     return _from_the_best_start(block, block.priors, from_start, max_steps)
 
 
+def left_out_words(adjusted: Adjustment) -> str:
+    """What became of `Adjustment.left_out`, in a sentence."""
+    return (
+        f"left out, because their rays meet nowhere: point {few(adjusted.left_out)}; look for blunders in their image "
+        "points, or let jaxphoto adjust --snoop find them"
+    )
+
+
 def _from_the_best_start(
-    block: Block, priors: Unknowns, from_start: Callable[[Unknowns], Adjustment], max_steps: int
+    block: Block, priors: Unknowns, from_start: _FromStart, max_steps: int, may_lose_points: bool = True
 ) -> Adjustment:
     """The adjustment from the approximate values that are given; or, where these lead nowhere, from image points alone.
 
@@ -72,30 +98,71 @@ def _from_the_best_start(
     """
     first, refused = None, None
     try:
-        first = from_start(start_of(block))
+        first = from_start(block, start_of(block))
     except PointsBehind as error:
         refused = error
+    if first is not None and may_lose_points:
+        first = _without_points_gone(first, from_start)
     # What is known of exterior orientations is not to be looked for elsewhere.
     free = priors.exterior.position is FREE and priors.exterior.camera_from_object is FREE
     elsewhere = free and np.asarray(block.start.image_known).any()
     if first is not None and (not elsewhere or _somewhere(first, max_steps)):
         return first
     second = _from_image_points(block, from_start) if elsewhere else None
-    if second is None or (first is not None and not _less(second, first)):
+    if second is not None and may_lose_points:
+        second = _without_points_gone(second, from_start)
+    if second is None or not _better(second, first):
         if first is None:
             assert refused is not None
             raise refused
         return first
     warnings.warn(
         "the approximate exterior orientations that were given lead nowhere: the images were oriented by their common "
-        "points instead, which leads to an optimum; look at the frame, angles and units of images.csv, at the "
+        "points instead, which fits better; look at the frame, angles and units of images.csv, at the "
         "coordinates of points where they are given, and at the interior orientation where it is held",
         stacklevel=3,
     )
     return second
 
 
-def _from_image_points(block: Block, from_start: Callable[[Unknowns], Adjustment]) -> Adjustment | None:
+def _without_points_gone(adjusted: Adjustment, from_start: _FromStart) -> Adjustment:
+    """Once more without tie points that went astray, where they are few: blunders, or a start that is far off.
+
+    From where that leads they are placed anew, and stay if they do not go astray again and fit.
+    """
+    if adjusted.factored is None:
+        return adjusted
+    block, found, names = adjusted.block, adjusted, list[str]()
+    most = _GONE * len(block.points)
+    while (gone := found.astray).any() and len(names) + gone.sum() <= most:
+        rows = gone[found.block.image_points.point]
+        part, kept = without_observations(found.block, {IMAGE_POINTS: rows})
+        if len(kept) == len(gone):
+            break
+        names += [found.block.points[p] for p in np.setdiff1d(np.arange(len(gone)), kept)]
+        try:
+            found = from_start(part, start_of(part))
+        except (BlockError, DatumError, RankError):
+            return adjusted
+    if not names or not bool(found.converged):
+        return adjusted
+    start = dataclasses.replace(
+        block.start,
+        unknowns=dataclasses.replace(
+            block.start.unknowns, interior=found.unknowns.interior, exterior=found.unknowns.exterior
+        ),
+        image_known=np.ones(len(block.images), bool),
+    )
+    try:
+        whole = from_start(block, approximate(dataclasses.replace(block, start=start)))
+    except (BlockError, DatumError, RankError):
+        whole = adjusted
+    if bool(whole.converged) and float(whole.sigma0) < _AS_GOOD * float(found.sigma0):
+        return whole
+    return dataclasses.replace(found, left_out=tuple(names))
+
+
+def _from_image_points(block: Block, from_start: _FromStart) -> Adjustment | None:
     """The adjustment without given exterior orientations and points, but for known ones; None: it leads nowhere."""
     known, s = np.zeros((len(block.points), 3), bool), block.start
     for rows in (block.control, block.fixed):
@@ -105,14 +172,17 @@ def _from_image_points(block: Block, from_start: Callable[[Unknowns], Adjustment
         oriented = orient_block(
             dataclasses.replace(block, start=dataclasses.replace(s, image_known=images, point_known=points))
         )
-        found = from_start(approximate(oriented))
+        return from_start(block, approximate(oriented))
     except (BlockError, DatumError, RankError):
         return None
-    return found if bool(found.converged) else None
 
 
-def _less(one: Adjustment, other: Adjustment) -> bool:
-    return float(one.square_sum) < float(np.nan_to_num(other.square_sum, nan=np.inf))
+def _better(one: Adjustment, other: Adjustment | None) -> bool:
+    """Whether an adjustment from elsewhere is an optimum, and fits; or fits incomparably better than another."""
+    if not bool(one.converged):
+        return False
+    least = np.inf if other is None else float(np.nan_to_num(other.square_sum, nan=np.inf))
+    return float(one.square_sum) < (1.0 if float(one.sigma0) < _ABSURD else _FAR_BETTER) * least
 
 
 def _somewhere(adjusted: Adjustment, max_steps: int) -> bool:

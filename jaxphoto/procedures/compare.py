@@ -26,8 +26,11 @@ def compare(
     `camera` and `camera_b` name it in either where a block has several. `points` (mm from the centre) are those of the
     format at which rays are compared, 15 x 11 from edge to edge where they are not given; `method` is what the
     orientation of images may take up (docs/stability.md). `jaxphoto.report.change` has tables and words of the result.
-    Raises InputError for formats that differ, and where the bundles cannot be compared.
+    Raises InputError for adjustments that did not converge, formats that differ, and bundles that cannot be compared.
     """
+    for adjusted in (first, second):
+        if not bool(adjusted.converged):
+            raise InputError(f"{adjusted.block.title or 'a block'} is no calibration: {adjusted.outcome.value}")
     names = [one_camera(a.block, given) for a, given in ((first, camera), (second, camera_b or camera))]
     sensors = [a.block.sensors[name] for a, name in zip((first, second), names, strict=True)]
     if sensors[0] != sensors[1]:

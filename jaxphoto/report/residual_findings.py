@@ -42,9 +42,14 @@ _HIDDEN = 10.0
 
 def of_residuals(tables: Tables) -> Iterator[Finding]:
     """Whether they fit their standard deviations, which of them do not, and whether they follow a pattern."""
+    yield from contradictions(tables)
+    yield from _trends(tables)
+
+
+def contradictions(tables: Tables) -> Iterator[Finding]:
+    """Whether residuals fit their standard deviations, and which do not."""
     yield from _global_test(tables)
     yield from _blunders(tables)
-    yield from _trends(tables)
 
 
 def _global_test(tables: Tables) -> Iterator[Finding]:

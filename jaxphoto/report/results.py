@@ -16,6 +16,7 @@ from jaxphoto.report.page import report_page
 from jaxphoto.report.positional_accuracy import accuracy_sentences
 from jaxphoto.report.table_files import check_table_format, write_table
 from jaxphoto.report.tables import Tables
+from jaxphoto.statistics import LEVEL, global_test
 from jaxphoto.writing import whole_folder
 
 _TABLES = (
@@ -99,6 +100,7 @@ def summary_of(tables: Tables, verdict: Verdict, seconds: dict[str, float]) -> d
         "outcome": adjusted.outcome.value,
         "n_images": len(adjusted.block.images),
         "sigma0": float(adjusted.sigma0),
+        **_tested(tables),
         "redundancy": adjusted.redundancy,
         "n_observations": {"total": sum(observations.values()), **observations},
         "n_constraints": adjusted.n_constraints,
@@ -110,6 +112,15 @@ def summary_of(tables: Tables, verdict: Verdict, seconds: dict[str, float]) -> d
         "seconds": {name: round(value, 6) for name, value in seconds.items()},
         "versions": versions(),
     }
+
+
+def _tested(tables: Tables) -> dict:
+    """The test of sigma naught, where there is an optimum and anything checks it."""
+    if not bool(tables.adjusted.converged) or tables.adjusted.redundancy <= 0:
+        return {}
+    test = global_test(tables.adjusted, tables.redundancy)
+    told = {"expected_sigma0": test.expected**0.5, "p_value": test.p_value, "passed": test.p_value >= LEVEL}
+    return {"global_test": told}
 
 
 def _cameras(adjusted: Adjustment) -> dict:

@@ -45,8 +45,10 @@ def sigma_map_words(sensor: Sensor, maps: Sequence[SigmaMap]) -> str:
     told = []
     for one in maps:
         worst = one.worst[np.isfinite(one.worst)] / sensor.pixel_mm
-        spread = f"{np.median(worst):.2g} px in the middle of all cells, {worst.max():.2g} px in the worst"
-        told.append(f"{words_of_distance(one.distance_m)} {spread if len(worst) else 'not known anywhere'}")
+        spread = "not known anywhere"
+        if len(worst):
+            spread = f"{np.median(worst):.2g} px in the middle of all cells, {worst.max():.2g} px in the worst"
+        told.append(f"{words_of_distance(one.distance_m)} {spread}")
     return f"{camera_words(maps[0].camera)}: sigma {'; '.join(told)}."
 
 

@@ -145,12 +145,15 @@ class Tables:
 
     @cached_property
     def significance(self) -> list[Significance]:
-        """Ratio and t-test of every estimated interior parameter."""
+        """Ratio and t-test of every estimated interior parameter; none where the adjustment did not converge."""
+        if not bool(self.adjusted.converged):
+            return []
         return significance(self.adjusted, self.covariance)
 
     @cached_property
     def interior(self) -> pd.DataFrame:
-        """camera, parameter, value, sigma, significant; fixed parameters have neither of the latter two."""
+        """camera, parameter, value, sigma, significant; fixed parameters have neither of the latter two, nor has any
+        that did not converge."""
         tested = {(s.camera, s.parameter): s for s in self.significance}
         rows = []
         for camera, interior in self.adjusted.unknowns.interior.items():

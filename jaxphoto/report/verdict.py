@@ -15,6 +15,7 @@ from jaxphoto.block import Block
 from jaxphoto.camera import Sensor
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import camera_words, few
+from jaxphoto.procedures.adjust import left_out_words
 from jaxphoto.report.camera_drift import drift_findings
 from jaxphoto.report.findings import Finding, Level, Verdict
 from jaxphoto.report.ground import ground_findings
@@ -46,6 +47,8 @@ def _findings(tables: Tables) -> Iterator[Finding]:
         # Nothing that is said of an optimum holds elsewhere.
         return
     prepare_responses(adjusted.equations, adjusted.seconds)
+    if adjusted.left_out:
+        yield Finding(Level.WARNING, left_out_words(adjusted))
     yield from of_residuals(tables)
     of_cameras = {camera: weaknesses(tables, camera, c) for camera, c in tables.correlations.items()}
     yield from _weak(tables, frozenset().union(*(w.labels for weak in of_cameras.values() for w in weak)))

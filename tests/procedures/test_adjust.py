@@ -1,6 +1,7 @@
 """The main job: what is compiled ahead is what statistics then use."""
 
 import dataclasses
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -8,9 +9,12 @@ import pytest
 
 from benchmarks.basin import far_off
 from jaxphoto import adjust, read_block
+from jaxphoto.adjustment import solve
 from jaxphoto.compiling import run
 from jaxphoto.procedures import adjust_for_tables
+from jaxphoto.procedures.adjust import start_of
 from jaxphoto.report import Tables, verdict_of
+from jaxphoto.variants import without_observations
 from tests.blocks import simulated
 from tests.marks import slow_but
 
@@ -32,15 +36,16 @@ def test_what_is_compiled_meanwhile_serves_the_tables(name, monkeypatch):
     assert not run._prepared
 
 
-def test_approximate_values_that_lead_nowhere_are_not_the_last_word():
-    """Off by up to 100 m, 10 degrees and 10 % of c: points fly away, but the images know how they lie."""
+def test_points_that_fly_away_from_a_start_that_is_far_off_come_back():
+    """Off by up to 100 m, 10 degrees and 10 % of c: a point that flew away is placed anew from where the others are."""
     block, rng = read_block(EXAMPLE), np.random.default_rng(1)
     best = adjust(block)
     for _ in range(6):
         spoilt = far_off(block, rng)
-    with pytest.warns(UserWarning, match="lead nowhere"):
-        found = adjust(spoilt)
-    assert bool(found.converged)
+    alone = solve(spoilt, start_of(spoilt), spoilt.priors)
+    assert alone.astray.any() and not bool(alone.converged)
+    found = adjust(spoilt)
+    assert bool(found.converged) and not found.left_out
     np.testing.assert_allclose(float(found.square_sum), float(best.square_sum), rtol=1e-6)
 
 
@@ -58,3 +63,37 @@ def test_images_that_are_given_upside_down_are_oriented_by_their_points():
     with pytest.warns(UserWarning, match="lead nowhere"):
         found = adjust(spoilt)
     np.testing.assert_allclose(float(found.square_sum), float(best.square_sum), rtol=1e-6)
+
+
+def test_a_tie_point_whose_rays_meet_nowhere_is_left_out_and_said():
+    """Mirrored in one of its three images it flies away, and took the calibration with it."""
+    block = read_block(EXAMPLE)
+    rows = block.image_points
+    ties = np.setdiff1d(np.arange(len(block.points)), block.control.who)
+    point = next(p for p in ties if np.count_nonzero(rows.point == p) == 3)
+    xy = np.array(rows.xy)
+    first = np.flatnonzero(rows.point == point)[0]
+    xy[first] *= -1
+    spoilt = dataclasses.replace(block, image_points=dataclasses.replace(rows, xy=xy))
+    with pytest.warns(UserWarning, match=f"left out, because their rays meet nowhere: point {block.points[point]};"):
+        found = adjust(spoilt)
+    assert found.left_out == (block.points[point],) and block.points[point] not in found.block.points
+    gone = {"image_points": rows.point == point}
+    without = adjust(without_observations(block, gone)[0])
+    np.testing.assert_allclose(float(found.square_sum), float(without.square_sum), rtol=1e-9)
+    verdict = verdict_of(Tables(adjust_for_tables(spoilt)))
+    assert verdict.colour == "amber" and "left out" in verdict.texts[0]
+
+
+def test_approximate_values_are_not_blamed_for_exchanged_names():
+    """Nothing fits anywhere then: the images oriented by their points fit no better."""
+    block = read_block(EXAMPLE)
+    rows = block.image_points
+    own = np.flatnonzero(rows.image == 2)
+    many = [k for k in own if np.count_nonzero(rows.point == rows.point[k]) > 3][:2]
+    xy = np.array(rows.xy)
+    xy[many] = xy[many[::-1]]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = adjust(dataclasses.replace(block, image_points=dataclasses.replace(rows, xy=xy)))
+    assert float(found.sigma0) > 30

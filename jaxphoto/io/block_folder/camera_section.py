@@ -50,13 +50,15 @@ class Camera(NamedTuple):
     priors: InteriorOrientation
     known: KnownTogether | None = None
     """What is known beforehand together; free in `priors`."""
+    reservation: str = ""
+    """What speaks against the calibration that it is from."""
 
 
 def read_camera(section: Section) -> Camera:
     """The camera that a [cameras.X] table describes. Raises InputError for what cannot be one."""
     distortion = _kind(section, "distortion", AbstractDistortion.called)
     projection = _kind(section, "projection", AbstractProjection.called, Perspective.name)
-    section.known(*_KEYS, *distortion.choices, *projection.choices, "interior", "unknowns", "known")
+    section.known(*_KEYS, *distortion.choices, *projection.choices, "interior", "unknowns", "known", "reservation")
     sensor = Sensor(section.count("width_px"), section.count("height_px"), section.positive("pixel_mm"))
     if not PIXEL_MM[0] <= sensor.pixel_mm <= PIXEL_MM[1]:
         raise section.error("pixel_mm", f"a pixel of {sensor.pixel_mm:g} mm cannot be; give its size in millimetres")
@@ -74,7 +76,7 @@ def read_camera(section: Section) -> Camera:
                 name, f"it is known beforehand by [{section.path}.known]; remove it here, or there with its covariance"
             )
         priors = set_parameter(priors, name, FREE)
-    return Camera(sensor, interior, priors, known)
+    return Camera(sensor, interior, priors, known, section.text("reservation", ""))
 
 
 def known_together(interior: InteriorOrientation, covariance: np.ndarray) -> KnownTogether:
@@ -87,7 +89,7 @@ def known_together(interior: InteriorOrientation, covariance: np.ndarray) -> Kno
 
 def camera_section(camera: Camera) -> dict[str, Any]:
     """The [cameras.X] table that `read_camera` reads as `camera`."""
-    sensor, interior, priors, known = camera
+    sensor, interior, priors, known, reservation = camera
     written: dict[str, Any] = {"width_px": sensor.width_px, "height_px": sensor.height_px, "pixel_mm": sensor.pixel_mm}
     written |= model_keys(interior)
     if interior.residuals != "model":
@@ -95,6 +97,8 @@ def camera_section(camera: Camera) -> dict[str, Any]:
     names = parameter_names(interior)
     written["interior"] = {n: float(get_parameter(interior, n)) for n in (*names, *constant_names(interior))}
     written["unknowns"] = {name: status(get_parameter(priors, name), get_parameter(interior, name)) for name in names}
+    if reservation:
+        written["reservation"] = reservation
     if known is not None:
         written["known"] = {"parameters": list(known.parameters), "matrix": known.covariance.tolist()}
     return written

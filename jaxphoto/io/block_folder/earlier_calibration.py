@@ -4,6 +4,7 @@ It stands for format, models, interior orientation and, with its full covariance
 ([cameras.X.known]). What it held is held here, too, unless [cameras.X.unknowns] says otherwise.
 """
 
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -51,7 +52,7 @@ def with_earlier_calibrations(settings: dict[str, Any], file: str, folder: Path)
             )
         priors = jax.tree.map(lambda _: FIXED, read.interior)
         known = known_together(read.interior, read.covariance)
-        table = camera_section(Camera(read.sensor, read.interior, priors, known))
+        table = camera_section(Camera(read.sensor, read.interior, priors, known, read.note))
         fixed = {key: value for key, value in table["unknowns"].items() if key not in known.parameters}
         found[name] = table | own | {"unknowns": fixed | own.get("unknowns", {})}
         del found[name][_KEY]
@@ -63,6 +64,8 @@ def known_cameras(cameras: Mapping[str, Camera]) -> tuple[KnownParameters, ...]:
     found = []
     for name, camera in cameras.items():
         if camera.known is not None:
+            if camera.reservation:
+                warnings.warn(f"of the calibration that camera {name} is from: {camera.reservation}", stacklevel=2)
             parameters, covariance = camera.known
             values = np.array([float(get_parameter(camera.interior, parameter)) for parameter in parameters])
             found.append(KnownParameters([f"interior[{name}].{p}" for p in parameters], values, covariance))

@@ -54,12 +54,14 @@ def write_camera_file(
     name: str = "camera",
     distortion: type[AbstractDistortion] | None = None,
     covariance: np.ndarray | None = None,
+    reservation: str = "",
 ) -> Conversion:
     """Write a camera in one of `CAMERA_FORMATS`, and say by how much the file's camera differs from `interior`.
 
     `format` None: cameras.txt is COLMAP's, else the suffix tells. The distortion is converted exactly where its terms
     allow it, else fitted over the format (`camera.conversion`). `distortion` chooses the model in a block.toml, where
-    the `covariance` of `parameter_names(interior)` is kept, too, if the model stays what it is.
+    the `covariance` of `parameter_names(interior)` is kept, too, if the model stays what it is, and the `reservation`
+    about the calibration that it is from.
 
     Raises InputError for unknown formats, for a `distortion` that is not the format's and for cameras that the format
     cannot hold.
@@ -91,7 +93,9 @@ def write_camera_file(
         raise InputError(f"{path} cannot be written: {error}") from None
     with whole_file(path) as work:
         if format == "block" and type(conversion.interior.distortion) is type(interior.distortion):
-            write_block_camera(work, name, sensor, conversion.interior, covariance)
+            write_block_camera(work, name, sensor, conversion.interior, covariance, reservation)
+        elif format == "block":
+            write_block_camera(work, name, sensor, conversion.interior, reservation=reservation)
         else:
             known.write(work, name, sensor, conversion.interior)
     return conversion

@@ -8,13 +8,13 @@ import pandas as pd
 
 from jaxphoto.arrays import on_device
 from jaxphoto.camera import InteriorOrientation, Sensor, constant_names, empty_camera, parameter_names, set_parameter
-from jaxphoto.errors import InputError
 from jaxphoto.io.block_folder.camera_section import Camera, camera_section, known_together
 from jaxphoto.io.block_folder.section import Section
 from jaxphoto.io.block_folder.settings import read_settings, toml_text
 from jaxphoto.io.block_folder.table_layout import TOML
 from jaxphoto.io.cameras.camera_file import CameraFile, CameraSource
 from jaxphoto.io.json_file import read_json
+from jaxphoto.io.results_judged import SUMMARY, read_summary, reservation
 from jaxphoto.io.text_tables import read_csv
 from jaxphoto.io.toml import read_toml
 from jaxphoto.unknowns import FIXED
@@ -37,18 +37,23 @@ def read_block_camera(source: CameraSource) -> CameraFile:
         which = [names.index(parameter) for parameter in camera.known.parameters]
         covariance = np.zeros((len(names), len(names)))
         covariance[np.ix_(which, which)] = camera.known.covariance
-    return CameraFile(name, camera.sensor, camera.interior, covariance)
+    return CameraFile(name, camera.sensor, camera.interior, covariance, camera.reservation)
 
 
 def write_block_camera(
-    path: Path, name: str, sensor: Sensor, interior: InteriorOrientation, covariance: np.ndarray | None = None
+    path: Path,
+    name: str,
+    sensor: Sensor,
+    interior: InteriorOrientation,
+    covariance: np.ndarray | None = None,
+    reservation: str = "",
 ) -> None:
     """Write the [cameras.NAME] table of a block.toml, everything fixed but what has a covariance: that is known by it.
 
-    `covariance` is that of `parameter_names(interior)`.
+    `covariance` is that of `parameter_names(interior)`; `reservation`, what speaks against the calibration.
     """
     known = None if covariance is None else known_together(interior, covariance)
-    section = camera_section(Camera(sensor, interior, jax.tree.map(lambda _: FIXED, interior), known))
+    section = camera_section(Camera(sensor, interior, jax.tree.map(lambda _: FIXED, interior), known, reservation))
     for parameter in () if known is None else known.parameters:
         section["unknowns"][parameter] = "free"
     path.write_text(toml_text({"cameras": {name: section}}), encoding="utf-8")
@@ -88,33 +93,16 @@ def read_results(source: CameraSource) -> CameraFile:
     interior = empty
     for parameter in (*names, *constants):
         interior = set_parameter(interior, parameter, on_device(values[parameter]))
-    sigma = np.array([sigmas[n] for n in names])
-    return CameraFile(name, sensor, interior, _covariance(source, name, names, sigma), _reservation(source))
-
-
-def _summary(source: CameraSource) -> dict:
-    """What summary.json beside it says; nothing where there is none that can be read."""
-    try:
-        return read_json(source.path.with_name("summary.json"))
-    except (InputError, OSError):
-        return {}
+    sigma, note = np.array([sigmas[n] for n in names]), reservation(read_summary(source.path.parent))
+    return CameraFile(name, sensor, interior, _covariance(source, name, names, sigma), note)
 
 
 def _check_converged(source: CameraSource) -> None:
-    if _summary(source).get("converged") is False:
+    if read_summary(source.path.parent).get("converged") is False:
         raise source.error(
             "summary.json beside it says that the adjustment did not converge, so its numbers are no calibration: mend "
             "the block and adjust again"
         )
-
-
-def _reservation(source: CameraSource) -> str:
-    """The first alarm of an adjustment whose verdict is red."""
-    summary = _summary(source)
-    if summary.get("verdict") != "red":
-        return ""
-    alarms = [f["text"] for f in summary.get("findings", []) if isinstance(f, dict) and f.get("level") == "alarm"]
-    return f"the verdict on this adjustment is red: {alarms[0] if alarms else 'see its report'}"
 
 
 def _covariance(source: CameraSource, camera: str, names: tuple[str, ...], sigma: np.ndarray) -> np.ndarray | None:
@@ -155,7 +143,7 @@ def _described(source: CameraSource, camera: str) -> tuple[Sensor, InteriorOrien
         if camera not in cameras:
             raise source.error(f"{path} has no camera {camera!r}; give the block that was adjusted")
         return cameras[camera].sensor, cameras[camera].interior
-    path = source.path.with_name("summary.json")
+    path = source.path.with_name(SUMMARY)
     try:
         told = Section(path.name, "", read_json(path)).section("cameras").section(camera)
         sensor = Sensor(told.count("width_px"), told.count("height_px"), told.positive("pixel_mm"))

@@ -28,9 +28,10 @@ from jaxphoto.io.cameras import read_camera_file
 from jaxphoto.io.cameras.own_cameras import INTERIOR
 from jaxphoto.io.json_file import read_json
 from jaxphoto.io.names import control_in
+from jaxphoto.io.results_judged import SUMMARY
 from jaxphoto.io.text_tables import Table, read_csv
 
-EXTERIOR, POINTS, SUMMARY = "exterior.csv", "object_points.csv", "summary.json"
+EXTERIOR, POINTS = "exterior.csv", "object_points.csv"
 PHOTOGRAPHS = "photographs.csv"
 """Of a flight: the file of the photograph that each image is."""
 _from_angles = eqx.filter_jit(ExteriorOrientation.from_angles)

@@ -1,0 +1,42 @@
+"""What the summary.json of results says against them, for all that read them."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from jaxphoto.errors import InputError
+from jaxphoto.io.json_file import read_json
+
+SUMMARY = "summary.json"
+
+
+def read_summary(folder: Path) -> dict[str, Any]:
+    """What summary.json in a folder of results says; nothing where there is none that can be read."""
+    try:
+        told = read_json(folder / SUMMARY)
+    except (InputError, OSError):
+        return {}
+    return told if isinstance(told, dict) else {}
+
+
+def reservation(summary: Mapping[str, Any]) -> str:
+    """That an adjustment did not converge, that its verdict is red and why, or that sigma naught fails its test; ""."""
+    if summary.get("converged") is False:
+        return f"this adjustment did not converge, so its numbers are no results: {summary.get('outcome', '')}"
+    if summary.get("verdict") == "red":
+        told = summary.get("findings")
+        found = [f for f in told if isinstance(f, dict)] if isinstance(told, list) else []
+        alarms = [f.get("text") for f in found if f.get("level") == "alarm"]
+        return f"the verdict on this adjustment is red: {alarms[0] if alarms else 'see its report'}"
+    test = summary.get("global_test")
+    if isinstance(test, dict) and test.get("passed") is False:
+        was, wanted = _number(summary.get("sigma0")), _number(test.get("expected_sigma0"))
+        return (
+            f"sigma naught of this adjustment is {was:.3g}, expected {wanted:.3g}, which is no chance: its weights "
+            "or its model are wrong, and its standard deviations with them"
+        )
+    return ""
+
+
+def _number(value: Any) -> float:
+    return float(value) if isinstance(value, int | float) else float("nan")
