@@ -16,6 +16,7 @@ from jaxphoto.io.cameras import CameraFile, read_camera_file
 from jaxphoto.io.conditions import CONDITIONS, conditions_of, read_conditions
 from jaxphoto.io.input_hashes import INPUTS, read_inputs
 from jaxphoto.io.json_file import read_json
+from jaxphoto.io.results_judged import read_summary, reservation
 from jaxphoto.io.sound_photographs import pictures_in
 from jaxphoto.io.text_tables import read_csv
 from jaxphoto.report.certificate import certificate_of
@@ -23,6 +24,7 @@ from jaxphoto.report.certified import Certified, ExteriorCorrelation, FormatBand
 from jaxphoto.report.document import Document
 from jaxphoto.report.document_html import html_page
 from jaxphoto.report.document_pdf import pdf_of
+from jaxphoto.report.terminal import print_warning
 from jaxphoto.writing import check_room, whole_file
 from jaxphoto.writing.inputs import InputFile, input_file
 
@@ -52,6 +54,8 @@ def certificate_command(
     check_room(out)
     document = certificate_document(results, camera, last, halves, photographs or [])
     write_certificate(document, out)
+    if against := reservation(read_summary(results)):
+        print_warning(against, plain_console(stderr=True))
     plain_console().print(f"certificate in {out}", soft_wrap=True)
 
 

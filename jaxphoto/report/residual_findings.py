@@ -2,9 +2,11 @@
 test of them could say.
 """
 
+import re
 from collections.abc import Iterator
 
 import numpy as np
+from scipy.special import erfc
 
 from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
 from jaxphoto.errors import camera_words
@@ -34,6 +36,9 @@ _STRETCHED = 0.01
 # A pattern matters where it is more than this of the observations' standard deviation, or moves an interior parameter
 # by more than `_MOVED` of its own; smaller ones are found in many observations, and change nothing.
 _VISIBLE, _MOVED = 0.25, 1.0
+# A pattern is an alarm where its term moves an interior parameter by more than this: by what standard deviations are
+# taken for, results are then wrong beyond doubt.
+_SPOILT_BY_A_PATTERN = 10.0
 # Of a pattern's square sum, what one term must explain to be named.
 MOST_OF_IT = 0.5
 # An observation whose detectable error is more than this times its sigma is checked by hardly anything (r < 0.17).
@@ -42,8 +47,14 @@ _HIDDEN = 10.0
 
 def of_residuals(tables: Tables) -> Iterator[Finding]:
     """Whether they fit their standard deviations, which of them do not, and whether they follow a pattern."""
-    yield from contradictions(tables)
-    yield from _trends(tables)
+    yield from _global_test(tables)
+    blunders, patterns = list(_blunders(tables)), list(_trends(tables))
+    # What one term explains, and more certainly than any blunder, is the likelier culprit: it makes blunders of many.
+    first = [f for p, f in patterns if p < _chance_of_the_worst(tables)] if blunders else []
+    worst = max((f.level for f in blunders), default=Level.INFORMATION)
+    yield from (f._replace(level=max(f.level, worst)) for f in first)
+    yield from blunders
+    yield from (f for _, f in patterns if f not in first)
 
 
 def contradictions(tables: Tables) -> Iterator[Finding]:
@@ -131,8 +142,17 @@ def _effect(tables: Tables, suspect: Suspect) -> tuple[str, float]:
     return max(known.items(), key=lambda item: item[1], default=("", 0.0))
 
 
-def _trends(tables: Tables) -> Iterator[Finding]:
-    """Patterns that are beyond chance, the most certain first, each with the term that is most of it."""
+def _chance_of_the_worst(tables: Tables) -> float:
+    """Of a normalised residual among all that there are."""
+    w = max(abs(s.w) for s in tables.blunders.suspects)
+    return tables.blunders.n * float(erfc(w / np.sqrt(2)))
+
+
+def _trends(tables: Tables) -> Iterator[tuple[float, Finding]]:
+    """Patterns that are beyond chance, the most certain first, with the term that is most of each.
+
+    Beside each its p-value; 1 where no usual term explains it, or it does not matter.
+    """
     level = LEVEL / max(len(tables.tested_trends), 1)
     for t in sorted((t for t in tables.tested_trends if t.p_value < level), key=lambda t: t.p_value):
         factor, unit = in_file_unit(t.pattern.unit)
@@ -140,17 +160,24 @@ def _trends(tables: Tables) -> Iterator[Finding]:
             f"residuals of {t.pattern.what} follow a pattern ({p_words(t.p_value)}) of {factor * t.size:.2g} {unit} "
             f"({t.size / t.pattern.sigma:.2g} of their sigma)"
         )
-        matters = t.size > _VISIBLE * t.pattern.sigma
+        matters, named, spoilt = t.size > _VISIBLE * t.pattern.sigma, False, False
         if t.hints and t.hints[0].share > MOST_OF_IT:
-            likely = t.hints[0]
+            likely, named = t.hints[0], True
             said += f", {100 * likely.share:.0f} % of it {_told(t)}"
             path = max(likely.moves, key=lambda path: abs(likely.moves[path]), default="")
-            if path and abs(likely.moves[path]) > _MOVED:
-                matters = True
-                said += f"; {path} would move by {abs(likely.moves[path]):.1f} of its sigma"
+            if path and (moved := abs(likely.moves[path])) > _MOVED:
+                matters, spoilt = True, moved > _SPOILT_BY_A_PATTERN
+                said += f"; {_called(path)} would move by {moved:.1f} of its sigma"
         elif t.pattern.camera:
             said += ": no single usual term is most of it; try a distortion of more terms (docs/model_choice.md)"
-        yield Finding(Level.WARNING if matters else Level.INFORMATION, said)
+        level = Level.ALARM if spoilt else Level.WARNING if matters else Level.INFORMATION
+        yield t.p_value if matters and named else 1.0, Finding(level, said)
+
+
+def _called(path: str) -> str:
+    """The parameter at a path, as a sentence calls it: k1 of camera kodak."""
+    of_camera = re.fullmatch(r"interior\[(.*)\]\.(\w+)", path)
+    return f"{of_camera[2]} of {camera_words(of_camera[1])}" if of_camera else path
 
 
 def _told(trend: Trend) -> str:

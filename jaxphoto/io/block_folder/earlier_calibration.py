@@ -40,7 +40,10 @@ def with_earlier_calibrations(settings: dict[str, Any], file: str, folder: Path)
         if _KEY not in section:
             found[name] = own
             continue
-        section.known(*_BESIDE)
+        for key in section:
+            if key not in _BESIDE:
+                beside = ", ".join(_BESIDE[1:])
+                raise section.error(key, f"the calibration says it; only {beside} stand beside it: remove it")
         given = own[_KEY] if isinstance(own[_KEY], dict) else {"file": own[_KEY]}
         named = Section(file, f"cameras.{name}.{_KEY}", given)
         named.known("file", "camera")

@@ -1,0 +1,34 @@
+"""The likeliest culprit stands first: what the model lacks accuses sound observations."""
+
+import equinox as eqx
+import numpy as np
+import pytest
+
+from jaxphoto import adjust
+from jaxphoto.camera import set_parameter
+from jaxphoto.report import Tables, verdict_of
+from tests.blocks import simulated
+
+
+@pytest.fixture(scope="module")
+def without_k2():
+    """k2 of another lens, held at zero, and one image point that is far off."""
+    block = simulated("cross").block
+    xy = np.array(block.image_points.xy)
+    xy[20] += 60 * np.asarray(block.image_points.sigmas)[20]
+    interior = set_parameter(block.start.unknowns.interior["one"], "k2", 0.0)
+    block = eqx.tree_at(lambda b: (b.image_points.xy, b.start.unknowns.interior["one"]), block, (xy, interior))
+    return verdict_of(Tables(adjust(block.fix("k2"))))
+
+
+def test_a_term_that_is_held_is_told_before_the_observations_that_it_accuses(without_k2):
+    assert without_k2.colour == "red"
+    first = next(k for k, text in enumerate(without_k2.texts) if "k2, which is held: free it" in text)
+    accused = [k for k, text in enumerate(without_k2.texts) if "contradicts the other observations" in text]
+    assert accused and first < min(accused)
+
+
+def test_parameters_are_called_as_people_call_them(without_k2):
+    told = " ".join(without_k2.texts)
+    assert "k1 of camera one would move by" in told or "c_mm of camera one would move by" in told
+    assert "interior[" not in told
