@@ -30,6 +30,7 @@ from jaxphoto.stability import (
     bundle_offsets,
     check_rays,
     concentration,
+    leading_unit,
     overlap,
 )
 from jaxphoto.statistics import common_covariance, covariance
@@ -80,6 +81,16 @@ class Halves(NamedTuple):
         """The covariance with the model error that halves show: times the square of the factor, where that is above
         1."""
         return self.covariance * max(self.band.factor, 1.0) ** 2
+
+    @property
+    def leading(self) -> tuple[str, float]:
+        """The unit whose half differs from the other, whatever else is in it, and the part of all differences' squares
+        that this is."""
+        names, unit = _units(self.adjusted.block, self.by)
+        of_units = [np.flatnonzero(unit == k)[0] for k in range(len(names))]
+        first = np.stack([cut.first[of_units] for cut in self.cuts])
+        k, share = leading_unit(first, np.stack([cut.offsets_px for cut in self.cuts]))
+        return names[k], share
 
     @property
     def inside(self) -> tuple[float, float]:

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 # Below so many standard deviations from 1 a factor says nothing.
 _SURE = 2.0
+# One unit leads where more than this of the differences follows it, of so many cuts that this is no chance.
+_LEADS, _ENOUGH_CUTS = 0.5, 16
 
 
 def cell_table(found: Halves) -> pd.DataFrame:
@@ -88,6 +90,13 @@ def halves_verdict(found: Halves) -> list[str]:
         sentences.append(
             f"{100 * share:.1f} +- {100 * error:.1f} % of the cells differ by less than the band, each cut by the band "
             "that the others give"
+        )
+    unit, part = found.leading
+    if n >= _ENOUGH_CUTS and part > _LEADS:
+        sentences.append(
+            f"{100 * part:.0f} % of the squares of all differences follow {found.by} {unit} alone: the half that it is "
+            "in differs from the other, so it contradicts the others or decides what they cannot; look at it, and "
+            "compare with a calibration without it"
         )
     if found.failed:
         sentences.append(

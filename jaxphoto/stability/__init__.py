@@ -2,7 +2,7 @@
 
 from jaxphoto.stability.alignment import METHODS, UNKNOWNS, Method
 from jaxphoto.stability.analysis import Analysis, analyse
-from jaxphoto.stability.band import Differences, ErrorBand, band_of, concentration, overlap
+from jaxphoto.stability.band import Differences, ErrorBand, band_of, concentration, leading_unit, overlap
 from jaxphoto.stability.bundles import image_grid, image_rays, parameter_vector, with_parameters
 from jaxphoto.stability.change import Change, ParameterChange, change, mahalanobis
 from jaxphoto.stability.combination import Combination, combine
@@ -17,6 +17,6 @@ __all__ = [
     "DistortionCurve", "ErrorBand",
     "Method", "OffsetUncertainty", "ParameterChange", "QuadraticForm", "analyse", "band_of", "bundle_offsets",
     "change", "check_rays", "combine", "concentration", "distortion_curve", "format_sigma", "image_grid",
-    "image_rays", "mahalanobis", "offset_uncertainty", "overlap", "parameter_vector", "regular_rays", "rmse_offset",
-    "with_parameters",
+    "image_rays", "leading_unit", "mahalanobis", "offset_uncertainty", "overlap", "parameter_vector", "regular_rays",
+    "rmse_offset", "with_parameters",
 ]  # fmt: skip

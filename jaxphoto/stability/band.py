@@ -92,6 +92,19 @@ def concentration(
     return float(np.trace(form @ form))
 
 
+def leading_unit(
+    first: Bool[np.ndarray, "cuts units"], offsets: Float[np.ndarray, "cuts cells 2"]
+) -> tuple[int, float]:
+    """The unit whose side alone explains most of the squares of all differences, and which part of them.
+
+    d_k = s_ku z_u + the rest: of many units alike each explains about its part, and as much as 1 / cuts by chance.
+    """
+    side = np.where(first, 1.0, -1.0)
+    mean = np.einsum("ku,kcx->ucx", side, offsets) / len(side)
+    share = (mean**2).sum(axis=(1, 2)) * len(side) / (offsets**2).sum()
+    return int(share.argmax()), float(share.max())
+
+
 def overlap(first: Bool[np.ndarray, "cuts units"], size: Numbers) -> Float[np.ndarray, "cuts cuts"]:
     """r_kl^2 of cuts that have the units `first` in their first half; `size` is how much each unit weighs."""
     side = np.where(first, 1.0, -1.0)

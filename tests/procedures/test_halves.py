@@ -16,7 +16,7 @@ from jaxphoto.io import write_block
 from jaxphoto.io.cameras import read_camera_file
 from jaxphoto.procedures.halves import halves
 from jaxphoto.simulation import image_coordinates, remeasure
-from jaxphoto.stability import Differences, band_of, bundle_offsets, concentration, image_grid, overlap
+from jaxphoto.stability import Differences, band_of, bundle_offsets, concentration, image_grid, leading_unit, overlap
 from jaxphoto.statistics import common_covariance
 from jaxphoto.variants import some_images
 from tests.blocks import FIELDS, FIVE, SENSOR, simulated
@@ -149,3 +149,21 @@ def test_what_cannot_be_cut_is_said(field):
     one = dataclasses.replace(block, image_strip=("a",) * len(block.images))
     with pytest.raises(InputError, match="all images of camera one are in one strip"):
         halves(one, CELLS, by="strip")
+
+
+def test_a_unit_that_all_differences_follow_is_found():
+    """One of forty photographs moves its half by ten times what all others do together."""
+    rng = np.random.default_rng(5)
+    first = rng.random((24, 40)) < 0.5
+    effects = rng.normal(0, 0.1, (40, 6, 2))
+    effects[17] = 5.0
+    offsets = np.einsum("ku,ucx->kcx", np.where(first, 1.0, -1.0), effects)
+    unit, share = leading_unit(first, offsets)
+    assert unit == 17 and share > 0.9
+    # Which half is called the first is nothing.
+    turned = np.where(np.arange(24) % 2 == 0, 1.0, -1.0)
+    again = leading_unit(first ^ (turned < 0)[:, None], offsets * turned[:, None, None])
+    assert again == pytest.approx((unit, share))
+    # Where all are alike, none leads.
+    alike = np.einsum("ku,ucx->kcx", np.where(first, 1.0, -1.0), rng.normal(size=(40, 6, 2)))
+    assert leading_unit(first, alike)[1] < 0.4
