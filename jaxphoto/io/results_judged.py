@@ -6,6 +6,7 @@ from typing import Any
 
 from jaxphoto.errors import InputError
 from jaxphoto.io.json_file import read_json
+from jaxphoto.io.names import control_in
 
 SUMMARY = "summary.json"
 
@@ -22,12 +23,12 @@ def read_summary(folder: Path) -> dict[str, Any]:
 def reservation(summary: Mapping[str, Any]) -> str:
     """That an adjustment did not converge, that its verdict is red and why, or that sigma naught fails its test; ""."""
     if summary.get("converged") is False:
-        return f"this adjustment did not converge, so its numbers are no results: {summary.get('outcome', '')}"
+        return f"this adjustment did not converge, so its numbers are no results: {_told(summary.get('outcome'))}"
     if summary.get("verdict") == "red":
         told = summary.get("findings")
         found = [f for f in told if isinstance(f, dict)] if isinstance(told, list) else []
         alarms = [f.get("text") for f in found if f.get("level") == "alarm"]
-        return f"the verdict on this adjustment is red: {alarms[0] if alarms else 'see its report'}"
+        return f"the verdict on this adjustment is red: {_told(alarms[0] if alarms else None)}"
     test = summary.get("global_test")
     if isinstance(test, dict) and test.get("passed") is False:
         was, wanted = _number(summary.get("sigma0")), _number(test.get("expected_sigma0"))
@@ -36,6 +37,11 @@ def reservation(summary: Mapping[str, Any]) -> str:
             "or its model are wrong, and its standard deviations with them"
         )
     return ""
+
+
+def _told(value: Any) -> str:
+    """A sentence of a file, if it is one that a terminal would not obey."""
+    return value if isinstance(value, str) and not control_in(value) else "see its report"
 
 
 def _number(value: Any) -> float:

@@ -26,6 +26,7 @@ RED = {"verdict": "red", "findings": [{"level": "alarm", "text": "T1 is off"}]}
         ({"converged": False, "outcome": "too few steps"}, "no results: too few steps"),
         (RED, "the verdict on .* is red: T1 is off"),
         ({"verdict": "red", "findings": "none"}, "is red: see its report"),
+        ({"verdict": "red", "findings": [{"level": "alarm", "text": "\x1b[2J"}]}, "is red: see its report"),
         (AMBER, r"sigma naught of this adjustment is 0\.53, expected 1, which is no chance"),
         (AMBER | {"sigma0": "half"}, "is nan, expected 1"),
     ],

@@ -23,6 +23,7 @@ from jaxphoto.camera import (
 from jaxphoto.camera.declared import Declared
 from jaxphoto.errors import BlockError, InputError, quoted
 from jaxphoto.io.block_folder.section import Section
+from jaxphoto.io.names import control_in
 from jaxphoto.unknowns import FIXED, FREE, Prior, Weighted
 
 _KEYS = ("width_px", "height_px", "pixel_mm", "distortion", "projection", "residuals")
@@ -76,7 +77,10 @@ def read_camera(section: Section) -> Camera:
                 name, f"it is known beforehand by [{section.path}.known]; remove it here, or there with its covariance"
             )
         priors = set_parameter(priors, name, FREE)
-    return Camera(sensor, interior, priors, known, section.text("reservation", ""))
+    reservation = section.text("reservation", "")
+    if control_in(reservation):
+        raise section.error("reservation", "it has a control character, which a terminal would obey; remove it")
+    return Camera(sensor, interior, priors, known, reservation)
 
 
 def known_together(interior: InteriorOrientation, covariance: np.ndarray) -> KnownTogether:
