@@ -278,7 +278,8 @@ def _told(at: Adjustment, left: Masks, stays: Masks, r: Blocks, sigma0: float) -
     block, found = at.block, []
     for name, rows in block.named_observations.items():
         v = np.atleast_2d(at.residuals[name])
-        own = np.sqrt(np.diagonal(r[name], axis1=1, axis2=2).T)
+        # What nothing checks has none, and by rounding less than none.
+        own = np.sqrt(np.maximum(np.diagonal(r[name], axis1=1, axis2=2).T, LEAST_CHECKED))
         error, sigma = np.atleast_2d(rows.physical(v)), np.atleast_2d(np.asarray(rows.sigmas).T)
         words = np.broadcast_to(rows.words(block.images, block.points), np.shape(v))
         for row in np.flatnonzero(left[name] & stays[name]).tolist():
