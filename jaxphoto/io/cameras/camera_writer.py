@@ -92,10 +92,9 @@ def write_camera_file(
     except ValueError as error:
         raise InputError(f"{path} cannot be written: {error}") from None
     with whole_file(path) as work:
-        if format == "block" and type(conversion.interior.distortion) is type(interior.distortion):
-            write_block_camera(work, name, sensor, conversion.interior, covariance, reservation)
-        elif format == "block":
-            write_block_camera(work, name, sensor, conversion.interior, reservation=reservation)
+        if format == "block":
+            own = covariance if type(conversion.interior.distortion) is type(interior.distortion) else None
+            write_block_camera(work, name, sensor, conversion.interior, own, reservation)
         else:
             known.write(work, name, sensor, conversion.interior)
     return conversion

@@ -65,7 +65,12 @@ def read_results(source: CameraSource) -> CameraFile:
     Model and sensor are those of summary.json beside it, or of the block that `source.block` names.
     Raises InputError where neither tells them, for an adjustment that did not converge, and for tables that do not fit.
     """
-    _check_converged(source)
+    summary = read_summary(source.path.parent)
+    if summary.get("converged") is False:
+        raise source.error(
+            "summary.json beside it says that the adjustment did not converge, so its numbers are no calibration: mend "
+            "the block and adjust again"
+        )
     table = read_csv(source.path, _COLUMNS, ("sigma", "significant"))
     of = table.ids("camera")
     name = source.chosen(list(dict.fromkeys(of.tolist())))
@@ -93,16 +98,8 @@ def read_results(source: CameraSource) -> CameraFile:
     interior = empty
     for parameter in (*names, *constants):
         interior = set_parameter(interior, parameter, on_device(values[parameter]))
-    sigma, note = np.array([sigmas[n] for n in names]), reservation(read_summary(source.path.parent))
-    return CameraFile(name, sensor, interior, _covariance(source, name, names, sigma), note)
-
-
-def _check_converged(source: CameraSource) -> None:
-    if read_summary(source.path.parent).get("converged") is False:
-        raise source.error(
-            "summary.json beside it says that the adjustment did not converge, so its numbers are no calibration: mend "
-            "the block and adjust again"
-        )
+    sigma = np.array([sigmas[n] for n in names])
+    return CameraFile(name, sensor, interior, _covariance(source, name, names, sigma), reservation(summary))
 
 
 def _covariance(source: CameraSource, camera: str, names: tuple[str, ...], sigma: np.ndarray) -> np.ndarray | None:
