@@ -105,6 +105,8 @@ def _cases(block: Block) -> dict[str, Callable[[Block, np.random.Generator], Spo
     points = {"1": 1, "5": 5, "10": 10, "1 %": round(0.01 * n), "5 %": round(0.05 * n), "10 %": round(0.1 * n)}
     found = {f"{label} of image points": lambda b, rng, k=k: _image_points(b, rng, k) for label, k in points.items()}
     found["two names of an image exchanged"] = _exchanged
+    found["two control points exchanged"] = lambda b, rng: _exchanged_coordinates(b, rng, "control_points")
+    found["two stations exchanged"] = lambda b, rng: _exchanged_coordinates(b, rng, "stations")
     found["control off by 1 m"] = lambda b, rng: _coordinate(b, rng, "control_points", 1.0)
     found["station off by 5 m"] = lambda b, rng: _coordinate(b, rng, "stations", 5.0)
     found["5 image points and a station"] = lambda b, rng: _both(b, rng)
@@ -126,6 +128,14 @@ def _exchanged(block: Block, rng: np.random.Generator) -> Spoilt:
     xy = np.array(p.xy)
     xy[pair] = xy[pair[::-1]]
     return Spoilt(_with(block, p.group, xy=xy), frozenset((p.group, k) for k in pair.tolist()))
+
+
+def _exchanged_coordinates(block: Block, rng: np.random.Generator, group: str) -> Spoilt:
+    rows = block.named_observations[group]
+    one, other = (np.flatnonzero(rows.who == k) for k in rng.choice(np.unique(rows.who), 2, replace=False))
+    value = np.array(rows.observation)
+    value[one], value[other] = value[other].copy(), value[one].copy()
+    return Spoilt(_with(block, group, value=value), frozenset((group, int(k)) for k in (*one, *other)))
 
 
 def _coordinate(block: Block, rng: np.random.Generator, group: str, size: float) -> Spoilt:
@@ -159,23 +169,17 @@ def _tried(spoilt: Spoilt, clean: jaxphoto.Adjustment) -> dict:
     group = block.image_points.group
     gone = np.isin(block.image_points.point, [block.points.index(name) for name in found.points])
     gone_rows = {(group, k) for k in np.flatnonzero(gone).tolist()} - left
-    right = {(group, k) for e in found.exchanged for k in _rows_of(block, e.image, e.points)}
+    right = {(e.group, k) for e in found.exchanged for pair in e.rows for k in pair}
     missed = spoilt.wrong - left - gone_rows - right
     return {
         "wrong": len(spoilt.wrong),
         "missed": len(missed),
-        "innocent": len(left - spoilt.wrong),
+        "innocent": len((left | right) - spoilt.wrong),
         "gone": len(gone_rows - spoilt.wrong),
         "off": _off(found.adjusted, clean),
         "sigma0": float(found.adjusted.sigma0),
         "seconds": seconds,
     }
-
-
-def _rows_of(block: Block, image: str, points: tuple[str, ...]) -> list[int]:
-    p = block.image_points
-    chosen = np.isin(p.point, [block.points.index(name) for name in points]) & (p.image == block.images.index(image))
-    return np.flatnonzero(chosen).tolist()
 
 
 def _off(adjusted: jaxphoto.Adjustment, clean: jaxphoto.Adjustment) -> float:

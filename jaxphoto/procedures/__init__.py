@@ -3,13 +3,14 @@
 from jaxphoto.procedures.adjust import adjust, adjust_for_tables
 from jaxphoto.procedures.boresight import boresight, step_block
 from jaxphoto.procedures.boresight_judgement import BoresightEstimate, Step, judge
+from jaxphoto.procedures.exchange import Exchange
 from jaxphoto.procedures.georeference import Georeferenced, georeference
 from jaxphoto.procedures.robust import Robust, robust
-from jaxphoto.procedures.snooping import Exchanged, Snooped, snoop
+from jaxphoto.procedures.snooping import Snooped, snoop
 
 __all__ = [
     "BoresightEstimate",
-    "Exchanged",
+    "Exchange",
     "Georeferenced",
     "Robust",
     "Snooped",

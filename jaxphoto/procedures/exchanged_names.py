@@ -6,11 +6,9 @@ points are. Where both points had their two rays in the same two images, nobody 
 were exchanged; the points are the same.
 """
 
-import dataclasses
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from typing import NamedTuple
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -20,6 +18,7 @@ from jaxphoto.block import Block
 from jaxphoto.orientation.block_intersection import intersect_points
 from jaxphoto.orientation.rays import camera_rays, turn_to_object
 from jaxphoto.procedures.cross_validation import measured_discrepancies
+from jaxphoto.procedures.exchange import Exchange, exchanged, with_places
 from jaxphoto.procedures.robust import Blocks, Masks
 from jaxphoto.statistics import LEVEL, chi_square_limit
 
@@ -28,16 +27,6 @@ from jaxphoto.statistics import LEVEL, chi_square_limit
 _NEAR = 0.2
 # Points are this much nearer or farther than any other of the image at most.
 _DEPTH = 1.5
-
-
-class NameExchange(NamedTuple):
-    """Two rows of image points to exchange."""
-
-    rows: tuple[int, int]
-    back: tuple[int, ...]
-    """Rows that are in again: the two, and the other rays of points that were gone."""
-    places: dict[int, Float[np.ndarray, "3"]]
-    """Of points that were gone: where their rays meet (m)."""
 
 
 class _Seen(NamedTuple):
@@ -68,33 +57,30 @@ class _Seen(NamedTuple):
 
 def name_exchanges(
     at: Adjustment, left: Masks, gone: Int[np.ndarray, "points"], sigma0: float, r: Blocks
-) -> list[NameExchange]:
-    """The exchanges that put right what is `left` out, and points that are `gone`, of `at`: the block linearised."""
-    seen = _seen(at, left, gone, sigma0)
-    found: list[NameExchange] = []
+) -> tuple[list[Exchange], Adjustment]:
+    """The exchanges that put right what is `left` out, and points that are `gone`, of `at`: the block linearised.
+
+    And `at` with points that were gone where their rays meet.
+    """
+    seen, block = _seen(at, left, gone, sigma0), at.block
+    group, point = block.image_points.group, block.image_points.point
+    found: list[Exchange] = []
+    places: dict[int, Float[np.ndarray, 3]] = {}
     done: set[int] = set()
     for a, b in _candidates(seen).tolist():
-        points = {int(at.block.image_points.point[k]) for k in (a, b)}
-        if points & done:
+        points = int(point[a]), int(point[b])
+        if done.intersection(points):
             continue
-        sides = [_met(seen, k, other) for k, other in ((a, b), (b, a)) if seen.gone[at.block.image_points.point[k]]]
+        sides = [_met(seen, k, other) for k, other in ((a, b), (b, a)) if seen.gone[point[k]]]
         if all(side is not None for side in sides) and _predicted(at, seen, (a, b), r, sigma0):
             met = [side for side in sides if side is not None]
-            places = {point: place for point, place, _ in met}
-            found.append(NameExchange((a, b), (a, b, *(row for *_, rows in met for row in rows)), places))
-            done |= points
-    return found
-
-
-def exchanged(block: Block, left: Masks, exchange: NameExchange) -> tuple[Block, Masks]:
-    """The block with the two image points exchanged, and no longer left out."""
-    p, group = block.image_points, block.image_points.group
-    order, out = np.arange(len(p)), left[group].copy()
-    a, b = exchange.rows
-    order[[a, b]] = b, a
-    out[list(exchange.back)] = False
-    rows = dataclasses.replace(p, xy=still(p.xy)[order], sigma=still(p.sigma)[order])
-    return block.with_observations({group: rows}), left | {group: out}
+            names, image = [block.points[k] for k in points], block.images[block.image_points.image[a]]
+            words = f"points {names[0]} and {names[1]} of image {image} had each other's name"
+            back = (a, b, *(row for *_, rows in met for row in rows))
+            found.append(Exchange(group, ((a, b),), words, {group: back}))
+            places |= {point: place for point, place, _ in met}
+            done.update(points)
+    return found, with_places(at, places)
 
 
 def points_that_meet(
@@ -111,14 +97,6 @@ def put_back(block: Block, left: Masks, points: Iterable[int]) -> Masks:
     """`left` without the image points of these."""
     p = block.image_points
     return left | {p.group: left[p.group] & ~np.isin(p.point, list(points))}
-
-
-def with_places(at: Adjustment, places: Mapping[int, Float[np.ndarray, "3"]]) -> Adjustment:
-    """`at` with points that were gone at these places."""
-    points = np.array(still(at.unknowns.points))
-    for point, place in places.items():
-        points[point] = place
-    return eqx.tree_at(lambda a: a.unknowns.points, at, points)
 
 
 def _seen(at: Adjustment, left: Masks, gone: Int[np.ndarray, "points"], sigma0: float) -> _Seen:
@@ -222,7 +200,7 @@ def _predicted(at: Adjustment, seen: _Seen, pair: tuple[int, int], r: Blocks, si
     if not staying:
         return True
     # So far from where it was predicted, a difference is no measure: once more with the names exchanged.
-    block, _ = exchanged(at.block, {p.group: seen.left}, NameExchange(pair, pair, {}))
+    block, _ = exchanged(at.block, {}, Exchange(p.group, (pair,), "", {}))
     off = (measured_discrepancies(block, at.unknowns) / still(p.sigma))[staying]
     # Both coordinates of a point are tested; as all others, against all others.
     limit = sigma0**2 * float(chi_square_limit(np.array(2), LEVEL / len(p)))

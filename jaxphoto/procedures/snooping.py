@@ -15,6 +15,7 @@ Sources: Baarda (1968), A testing procedure for use in geodetic networks; Huber 
 from collections.abc import Callable
 from typing import NamedTuple
 
+import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
@@ -22,9 +23,11 @@ from jaxphoto.adjustment import MAX_STEPS, Adjustment, Sizes, common_sizes, line
 from jaxphoto.block import Block
 from jaxphoto.errors import BlockError, JaxphotoError, RankError
 from jaxphoto.losses import AbstractLoss, Tukey
-from jaxphoto.observations import AbstractObservations
+from jaxphoto.observations import AbstractCoordinates, AbstractObservations
 from jaxphoto.procedures.adjust import start_of
-from jaxphoto.procedures.exchanged_names import exchanged, name_exchanges, points_that_meet, put_back, with_places
+from jaxphoto.procedures.exchange import Exchange, exchanged, with_places
+from jaxphoto.procedures.exchanged_coordinates import coordinate_exchanges
+from jaxphoto.procedures.exchanged_names import name_exchanges, points_that_meet, put_back
 from jaxphoto.procedures.robust import (
     Blocks,
     Masks,
@@ -46,19 +49,14 @@ from jaxphoto.unknowns import Unknowns
 # Huber's constant: residuals of so many standard deviations count whole (95 % efficient where all are normal).
 _HUBER = 1.345
 _ROBUST_STEPS, _ROUNDS = 10, 20
+# Weight of control and stations in a beginning that takes their word for hardly more than the datum: sigma times 100.
+_LOOSE = 1e-4
 # A weight that changes by less, in a robust step, no longer changes what is suspected.
 _STILL = 0.02
 # Where the others agree no better than this, weights do not explain it (docs/trust.md), and there is another beginning.
 _FITS = 3.0
 # A blunder inflates the residuals around it: in one turn nothing goes that is less than this part of the worst.
 _BESIDE_THE_WORST = 0.5
-
-
-class Exchanged(NamedTuple):
-    """Two image points of an image that had each other's name."""
-
-    image: str
-    points: tuple[str, str]
 
 
 class Snooped(NamedTuple):
@@ -69,7 +67,7 @@ class Snooped(NamedTuple):
 
     adjusted: Adjustment
     left_out: tuple[Suspect, ...]
-    exchanged: tuple[Exchanged, ...]
+    exchanged: tuple[Exchange, ...]
     points: tuple[str, ...]
     """Those that went because too little was left of them."""
 
@@ -92,10 +90,10 @@ def snoop(
     start = start_of(block) if start is None else start
     found: Snooped | None = None
     failed: JaxphotoError | None = None
-    for beginning in (None, Tukey()) if loss is None else (loss,):
+    for beginning in (1.0, Tukey(), _LOOSE) if loss is None else (loss,):
         try:
-            if beginning is None:
-                begin = _reweighted(block, start, max_steps, sizes, report)
+            if isinstance(beginning, float):
+                begin = _reweighted(block, start, max_steps, sizes, report, beginning)
             else:
                 begun = robust(block, beginning, start, max_steps=max_steps, sizes=sizes, report=report)
                 begin = begun.at, checked_parts(begun.at), begun.astray
@@ -126,8 +124,13 @@ def _snooped(
     worst = _worst(block, {name: size / scale[name] for name, size in _sizes(at, r).items()}, 1.0)
     left = {name: flown[name] | worst[name] for name in worst}
     tried: list[Masks] = []
+    # Before anything is left out: wrong coordinates turn images, and sound rows go with them.
+    lost = np.unique(block.image_points.point[flown[block.image_points.group]])
+    done, at = coordinate_exchanges(at, left, lost, sizes)
+    for exchange in done:
+        block, left = exchanged(block, left, exchange)
     # Once only: what is exchanged twice is as it was, and what went twice would go again.
-    done: list[tuple[int, int]] = []
+    known: set[object] = {(e.group, e.rows) for e in done}
     returned: set[int] = set()
     while True:
         report(f"adjusting without {sum(int(m.sum()) for m in left.values())} observations")
@@ -136,41 +139,77 @@ def _snooped(
         sigma0 = max(float(adjusted.sigma0), LEAST_SIGMA0)
         lost = np.setdiff1d(np.arange(len(block.points)), point)
         r = checked_parts(at)
-        pairs = [e for e in name_exchanges(at, left, lost, sigma0, r) if e.rows not in done]
-        for exchange in pairs:
-            (block, left), at = exchanged(block, left, exchange), with_places(at, exchange.places)
-            done.append(exchange.rows)
-        if pairs:
+        new, placed = _exchanges(at, left, lost, sigma0, r, sizes, known)
+        for exchange in new:
+            (block, left), at = exchanged(block, left, exchange), placed
+            done.append(exchange)
+        if new:
             # Another block: what led nowhere in the old one may lead on.
             tried.clear()
             continue
         found = _tested(adjusted, at, left, point, sigma0, r)
-        if _same(found, left):
+        still_there = _same(found, left)
+        if still_there or len(tried) == _ROUNDS or any(_same(found, old) for old in tried):
+            # What does not fit although it was exchanged, or fits as well as it was given, gets its own back.
+            if undone := [e for e in done if not _needed(at, left, e, sigma0)]:
+                for exchange in undone:
+                    block, left = exchanged(block, left, exchange._replace(back={}))
+                    done.remove(exchange)
+                tried.clear()
+                continue
             # What went while blunders still turned the images.
             back = {p: place for p, place in points_that_meet(at, left, lost, sigma0).items() if p not in returned}
-            if not back:
+            if not still_there or not back:
                 break
             returned |= set(back)
             left, at = put_back(block, left, back), with_places(at, back)
             tried.clear()
             continue
-        if len(tried) == _ROUNDS or any(_same(found, old) for old in tried):
-            break
         tried.append(left)
         left = found
     told = _told(at, left, _stays(block, point), r, sigma0)
-    named = tuple(_named(block, pair) for pair in done)
-    return Snooped(adjusted, told, named, tuple(block.points[p] for p in lost))
+    return Snooped(adjusted, told, tuple(done), tuple(block.points[p] for p in lost))
+
+
+def _exchanges(
+    at: Adjustment, left: Masks, lost: np.ndarray, sigma0: float, r: Blocks, sizes: Sizes, known: set[object]
+) -> tuple[list[Exchange], Adjustment]:
+    """Exchanges that are not `known`, and are from now on; and `at` with what they are of where it is seen.
+
+    Of coordinates first: wrong ones turn images, in which names then seem exchanged.
+    """
+    for pairs, placed in (
+        coordinate_exchanges(at, left, lost, sizes),
+        name_exchanges(at, left, lost, sigma0, r),
+    ):
+        if new := [e for e in pairs if (e.group, e.rows) not in known]:
+            known.update((e.group, e.rows) for e in new)
+            return new, placed
+    return [], at
+
+
+def _needed(at: Adjustment, left: Masks, exchange: Exchange, sigma0: float) -> bool:
+    """Whether what was exchanged fits, and would not as it was given."""
+    p, rows = at.block.image_points, list(sum(exchange.rows, ()))
+    if left[exchange.group][rows].mean() >= 0.5:
+        return False
+    if exchange.group != p.group:
+        return True
+    block, _ = exchanged(at.block, left, exchange._replace(back={}))
+    points = np.unique(p.point[rows])
+    given = eqx.tree_at(lambda a: a.block, at, block)
+    return len(points_that_meet(given, left, points, sigma0)) < len(points)
 
 
 def _reweighted(
-    block: Block, start: Unknowns, max_steps: int, sizes: Sizes, report: Callable[[str], object]
+    block: Block, start: Unknowns, max_steps: int, sizes: Sizes, report: Callable[[str], object], loose: float
 ) -> tuple[Adjustment, Blocks, Masks]:
     """The block where weights that fall with the residual have led, linearised; the redundancy numbers there; and the
     image points of points that flew away.
     """
     rows, unknowns = block.named_observations, start
-    weight = {name: np.ones(len(own)) for name, own in rows.items()}
+    least = {name: loose if isinstance(own, AbstractCoordinates) else 1.0 for name, own in rows.items()}
+    weight = {name: np.full(len(own), least[name]) for name, own in rows.items()}
     left = {name: np.zeros(len(own), bool) for name, own in rows.items()}
     at: Adjustment | None = None
     r: Blocks = {}
@@ -182,7 +221,7 @@ def _reweighted(
         at = linearise(block, unknowns, block.priors, sizes)
         r = r or checked_parts(at)
         scale = residual_scales(at, r)
-        new = {name: 1 / np.maximum(_largest(at, name, r) / (_HUBER * scale[name]), 1.0) for name in rows}
+        new = {name: least[name] / np.maximum(_largest(at, name, r) / (_HUBER * scale[name]), 1.0) for name in rows}
         if max(float(np.abs(new[name] - weight[name]).max(initial=0.0)) for name in rows) < _STILL:
             break
         weight = new
@@ -265,12 +304,6 @@ def _stays(block: Block, point: np.ndarray) -> Masks:
 
 def _same(one: Masks, other: Masks) -> bool:
     return all(np.array_equal(one[name], other[name]) for name in one)
-
-
-def _named(block: Block, pair: tuple[int, int]) -> Exchanged:
-    p = block.image_points
-    one, other = (block.points[p.point[k]] for k in pair)
-    return Exchanged(block.images[p.image[pair[0]]], (one, other))
 
 
 def _told(at: Adjustment, left: Masks, stays: Masks, r: Blocks, sigma0: float) -> tuple[Suspect, ...]:

@@ -44,9 +44,7 @@ def snooped_findings(snooped: Snooped) -> list[Finding]:
             f"left out as a whole: point {few}; what is observed of such a point contradicts itself, or too little is "
             "left to place it"
         )
-    found += [
-        f"put right: points {a} and {b} of image {image} had each other's name" for image, (a, b) in snooped.exchanged
-    ]
+    found += [f"put right: {exchange.words}" for exchange in snooped.exchanged]
     return [Finding(Level.WARNING, text) for text in found]
 
 

@@ -82,9 +82,10 @@ def test_exchanged_names_are_put_right(block):
         xy[[first, second]] = xy[[second, first]]
 
     found = snoop(with_xy(block, exchange))
-    ((image, points),) = found.exchanged
-    assert image == block.images[p.image[first]]
-    assert set(points) == {block.points[p.point[first]], block.points[p.point[second]]}
+    (exchange,) = found.exchanged
+    assert exchange.group == p.group and set(exchange.rows[0]) == {first, second}
+    one, other = (block.points[p.point[k]] for k in exchange.rows[0])
+    assert exchange.words == f"points {one} and {other} of image {block.images[p.image[first]]} had each other's name"
     assert not found.left_out
     np.testing.assert_allclose(found.adjusted.unknowns.points, adjust(block).unknowns.points, atol=1e-5)
 
@@ -136,10 +137,46 @@ def test_exchanged_names_of_points_of_two_rays():
         xy[pair] = xy[pair[::-1]]
 
     found = snoop(with_xy(block, exchange))
-    ((_, points),) = found.exchanged
-    assert set(points) == {block.points[p.point[k]] for k in pair}
+    (exchange,) = found.exchanged
+    assert {p.point[k] for k in exchange.rows[0]} == set(p.point[pair])
     assert not (found.left_out or found.points)
     # Whichever of the two images they were exchanged in: the same two places.
     places = np.asarray(adjust(block).unknowns.points)[p.point[pair]]
     again = np.asarray(found.adjusted.unknowns.points)[p.point[pair]]
     assert min(np.abs(again - places).max(), np.abs(again[::-1] - places).max()) < 1e-4
+
+
+@pytest.mark.parametrize(
+    ("group", "one", "other"),
+    [
+        # Of many images; such that the first beginning leaves sound rows out, and others seem exchanged.
+        ("control_points", "T10", "T12"), ("control_points", "T16", "T21"), ("control_points", "T15", "T31"),
+        # The second and the third beginning find it.
+        ("control_points", "T11", "T17"), ("stations", "B1", "C1"),
+        ("stations", "B7", "B8"),
+    ],
+)  # fmt: skip
+def test_exchanged_coordinates_are_put_right(group, one, other):
+    block = read_block(Path(__file__).parents[2] / "examples" / "cross_block")
+    rows = block.named_observations[group]
+    names = block.points if group == "control_points" else block.images
+    a, b = (np.flatnonzero(rows.who == names.index(name)) for name in (one, other))
+    value = np.array(rows.value)
+    value[a], value[b] = value[b].copy(), value[a].copy()
+    found = snoop(block.with_observations({group: dataclasses.replace(rows, value=value)}))
+    (exchange,) = found.exchanged
+    assert exchange.group == group and {one, other} <= set(exchange.words.split())
+    assert not (found.left_out or found.points)
+    assert float(found.adjusted.sigma0) == pytest.approx(float(adjust(block).sigma0), rel=1e-6)
+
+
+def test_coordinates_that_are_wrong_are_not_taken_for_an_exchange(block):
+    """One control point has the coordinates of another, which are its own as well."""
+    control = block.control
+    one, other = (np.flatnonzero(control.who == k) for k in np.unique(control.who)[:2])
+    value = np.array(control.value)
+    value[one] = value[other]
+    found = snoop(block.with_observations({"control_points": dataclasses.replace(control, value=value)}))
+    assert not found.exchanged
+    rows = {s.row for s in found.left_out if s.group == "control_points"}
+    assert rows and rows <= set(one.tolist())
