@@ -19,6 +19,7 @@ from jaxphoto.io.conditions import CONDITIONS, read_conditions, write_conditions
 from jaxphoto.io.input_hashes import block_inputs, write_inputs
 from jaxphoto.losses import LOSSES
 from jaxphoto.procedures import adjust_for_tables
+from jaxphoto.procedures.weights import MadeByBlunders, made_by_blunders
 from jaxphoto.report import (
     Level,
     Tables,
@@ -80,16 +81,17 @@ def adjust_command(
             loss = LOSSES[robust]() if robust else None
             snooped = jaxphoto.snoop(read, loss=loss, max_steps=max_steps, report=status.update)
         adjusted = snooped.adjusted if snooped else adjust_for_tables(read, max_steps)
-        components = None
+        components, masked = None, list[MadeByBlunders]()
         if splits is not None and bool(adjusted.converged):
             status.update("estimating variance components")
             components = jaxphoto.variance_components(adjusted, splits, max_steps=max_steps)
+            masked += made_by_blunders(adjusted, components, splits, max_steps=max_steps, report=status.update)
             adjusted = components.adjusted
         status.update("computing statistics")
         tables = Tables(adjusted, rotations, read_truth(block))  # type: ignore[arg-type]
         verdict = verdict_of(tables)
         found = snooped_findings(snooped) if snooped else []
-        found += component_findings(components) if components else []
+        found += component_findings(components, masked) if components else []
         verdict = Verdict.of([*found, *verdict.findings])
         status.update(f"writing {out}")
         times = adjusted.seconds | seconds

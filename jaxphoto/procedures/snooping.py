@@ -190,7 +190,7 @@ def _exchanges(
 
 def _needed(at: Adjustment, left: Masks, exchange: Exchange, sigma0: float) -> bool:
     """Whether what was exchanged fits, and would not as it was given."""
-    p, rows = at.block.image_points, list(sum(exchange.rows, ()))
+    p, rows = at.block.image_points, np.ravel(exchange.rows)
     if left[exchange.group][rows].mean() >= 0.5:
         return False
     if exchange.group != p.group:

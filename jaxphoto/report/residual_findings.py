@@ -156,9 +156,11 @@ def _trends(tables: Tables) -> Iterator[tuple[float, Finding]]:
     level = LEVEL / max(len(tables.tested_trends), 1)
     for t in sorted((t for t in tables.tested_trends if t.p_value < level), key=lambda t: t.p_value):
         factor, unit = in_file_unit(t.pattern.unit)
-        said = (
-            f"residuals of {t.pattern.what} follow a pattern ({p_words(t.p_value)}) of {factor * t.size:.2g} {unit} "
-            f"({t.size / t.pattern.sigma:.2g} of their sigma)"
+        said = f"residuals of {t.pattern.what} follow a pattern ({p_words(t.p_value)}) "
+        said += (
+            f"of {factor * t.size:.2g} {unit} ({t.size / t.pattern.sigma:.2g} of their sigma)"
+            if t.size > 0
+            else "no larger than the noise with which it is seen"
         )
         matters, named, spoilt = t.size > _VISIBLE * t.pattern.sigma, False, False
         if t.hints and t.hints[0].share > MOST_OF_IT:

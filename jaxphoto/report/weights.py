@@ -1,8 +1,12 @@
 """Variance components as tables, a line each on the screen, and what to be warned of."""
 
+from collections.abc import Sequence
+
 import pandas as pd
 from rich.console import Console
 
+from jaxphoto.errors import few
+from jaxphoto.procedures.weights import MadeByBlunders
 from jaxphoto.report.findings import Finding, Level
 from jaxphoto.report.terminal import plain
 from jaxphoto.statistics import VarianceComponents
@@ -33,11 +37,20 @@ def component_tables(found: VarianceComponents) -> dict[str, pd.DataFrame]:
     }
 
 
-def component_findings(found: VarianceComponents) -> list[Finding]:
-    """Components that have not settled, then a sentence for each group that cannot support one."""
+def component_findings(found: VarianceComponents, blunders: Sequence[MadeByBlunders] = ()) -> list[Finding]:
+    """Components that blunders make, that have not settled, then a sentence for each group that cannot support one."""
+    alarms = [
+        f"the variance component {made.factor:.3g} of {made.label} comes of what contradicts the other observations: "
+        f"{few(list(made.words))}; without, it is {made.without:.2g}. Blunders are no weight of the sound ones: adjust "
+        "with --snoop as well"
+        for made in blunders
+    ]
     lost = f"the variance components have not settled after {found.rounds} rounds: estimate them for fewer groups"
     sentences = [*([] if found.converged else [lost]), *found.sentences.values()]
-    return [Finding(Level.WARNING, text) for text in sentences]
+    return [
+        *(Finding(Level.ALARM, text) for text in alarms),
+        *(Finding(Level.WARNING, text) for text in sentences),
+    ]
 
 
 def print_components(found: VarianceComponents, console: Console) -> None:

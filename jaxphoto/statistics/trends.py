@@ -22,8 +22,7 @@ from jaxphoto.statistics.patterns import PatternTerm, ResidualPattern, patterns_
 from jaxphoto.statistics.quantiles import beta_tail
 from jaxphoto.statistics.responses import Responses
 
-# Directions of which estimated parameters take up all but this are no part of the test: what is left of them is so
-# small that how nearly the solver came to the optimum shows in it.
+# Of an error in one observation, what estimated parameters must leave of it.
 _SEEN = 1e-3
 # Of many blunders the worst: more of them are a sign of the pattern itself.
 _BLUNDERS = 16
@@ -123,7 +122,7 @@ class _LeftOut(NamedTuple):
     ) -> "_LeftOut":
         """Those at some places, the first directions."""
         m = len(at)
-        inverse, freedom = _inverse(np.eye(m) - taken_up[:m, :m], np.eye(m))
+        inverse, freedom = _inverse(np.eye(m) - taken_up[:m, :m], np.eye(m), _SEEN)
         errors = inverse @ v[at]
         return cls(errors, moved[:m], inverse, float(v[at] @ errors), freedom)
 
@@ -144,7 +143,7 @@ def _tested(
     u = pattern.times(v) - beside @ out.errors
     c = own - taken_up[first:last, first:last] - beside @ out.inverse @ beside.T
     moved = moved[first:last] - beside @ out.inverse @ out.moved
-    inverse, freedom = _inverse(c, own)
+    inverse, freedom = _inverse(c, own, pattern.least_seen)
     whole, redundancy = float(v @ v) - out.explained, adjusted.redundancy - out.freedom
     if freedom == 0 or redundancy <= freedom or whole <= 0:
         return None
@@ -171,7 +170,7 @@ def _hints(
     for term in pattern.terms:
         a = term.coefficients
         precision, whole = float(a @ c @ a), float(a @ own @ a)
-        if precision <= _SEEN * whole:
+        if precision <= pattern.least_seen * whole:
             continue
         amount = float(a @ u) / precision
         moves = {label: float(amount * (a @ moved[:, k])) for k, label in paths}
@@ -179,11 +178,13 @@ def _hints(
     return found
 
 
-def _inverse(c: Float[np.ndarray, "k k"], own: Float[np.ndarray, "k k"]) -> tuple[Float[np.ndarray, "k k"], int]:
+def _inverse(
+    c: Float[np.ndarray, "k k"], own: Float[np.ndarray, "k k"], least: float
+) -> tuple[Float[np.ndarray, "k k"], int]:
     """The inverse of `c` over the directions that show, and how many they are; `own` is `c` without any unknowns."""
     size = np.sqrt(np.diagonal(own))
     unit = np.where(size > 0, 1 / np.where(size > 0, size, 1.0), 0.0)
     values, vectors = np.linalg.eigh(c * unit[:, None] * unit)
-    kept = values > _SEEN
+    kept = values > least
     half = vectors[:, kept] / np.sqrt(values[kept]) * unit[:, None]
     return half @ half.T, int(kept.sum())

@@ -1,6 +1,7 @@
 """Patterns in residuals: as rare by chance as said, and named where something is missing."""
 
 import dataclasses
+from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -8,9 +9,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from jaxphoto import FIXED, Tables, adjust, covariance
+from jaxphoto import FIXED, Tables, adjust, covariance, read_block
 from jaxphoto.camera import set_parameter
 from jaxphoto.report import verdict_of
+from jaxphoto.report.findings import Level
 from jaxphoto.simulation import remeasure
 from jaxphoto.statistics import patterns, trends
 from jaxphoto.statistics.responses import Responses
@@ -40,7 +42,7 @@ def test_where_nothing_is_missing_p_values_are_uniform():
     p = [{what: trend.p_value for what, trend in found_in(b).items()} for b in blocks]
     assert set(p[0]) == {
         "image points of camera one over the format", "image points of camera one over time",
-        "stations from strip to strip", "stations over time",
+        "stations as a whole", "stations from strip to strip", "stations over time",
     }  # fmt: skip
     for what in p[0]:
         assert stats.kstest([each[what] for each in p], "uniform").pvalue > 1e-3, what
@@ -69,6 +71,20 @@ def test_stations_of_a_strip_that_are_off_are_named_with_their_shift():
     assert trend.p_value < 1e-4 and best.term.name in ("Z of strip b", "Z of strip a")
     sign = 1 if best.term.name.endswith("b") else -1
     assert abs(best.amount - sign * 1.5) < 4 * best.sigma
+
+
+def test_stations_that_are_all_off_alike_are_named_before_any_single_one():
+    """By another kind of height, say. c and the ground take up nearly all of it, single stations seem wrong."""
+    block = read_block(Path(__file__).parents[2] / "examples" / "cross_block")
+    rows = block.stations
+    value = np.asarray(rows.value) + np.where(rows.axis == 2, 48.0, 0.0)
+    tables = Tables(adjust(block.with_observations({"stations": dataclasses.replace(rows, value=value)})))
+    assert tables.blunders.suspects
+    alarm = verdict_of(tables).findings[0]
+    assert alarm.level == Level.ALARM
+    assert "stations as a whole" in alarm.text and "100 % of it Z +5" in alarm.text and "flight_bias" in alarm.text
+    (hint,) = [t.hints[0] for t in tables.tested_trends if t.pattern.what == "stations as a whole"]
+    assert abs(hint.amount - 48.0) < 3 * hint.sigma
 
 
 def test_blunders_have_no_part_in_patterns():
