@@ -11,6 +11,9 @@ from typing import Any
 
 import numpy as np
 
+# Standard deviations that a normal number exceeds once in a thousand times, to either side.
+_ONE_IN_A_THOUSAND = 3.29
+
 
 def from_upstairs(name: str) -> Any:
     """A function of `jaxphoto.report`, which is imported now."""
@@ -73,7 +76,7 @@ def adjustment_html(adjusted: Any, unknowns: Mapping[str, object]) -> str:
     rows: dict[str, object] = {
         "outcome": adjusted.outcome.value,
         "iterations": int(adjusted.steps),
-        "sigma naught": f"{float(adjusted.sigma0):.4g}",
+        "sigma naught": _sigma0_words(adjusted),
         "redundancy": adjusted.redundancy,
     }
     groups = {name.replace("_", " "): n for name, n in adjusted.n_observations.items() if n}
@@ -100,9 +103,20 @@ def adjustment_repr(adjusted: Any) -> str:
     observations, unknowns = (sum(n.values()) for n in (adjusted.n_observations, adjusted.n_unknowns))
     return (
         f"{of}: {adjusted.outcome.value.partition(':')[0]} after {_counted(int(adjusted.steps), 'step')},\n"
-        f"  sigma naught {float(adjusted.sigma0):.4g}, redundancy {adjusted.redundancy} "
+        f"  sigma naught {_sigma0_words(adjusted)}, redundancy {adjusted.redundancy} "
         f"({_counted(observations, 'observation')}, {_counted(unknowns, 'unknown')})"
     )
+
+
+def _sigma0_words(adjusted: Any) -> str:
+    """`1.043`; where chance does not explain it, with what does to one in a thousand, and who knows why."""
+    sigma0, redundancy = float(adjusted.sigma0), adjusted.redundancy
+    if redundancy <= 0:
+        return f"{sigma0:.4g}"
+    # Of many squares, sigma naught is normal about 1 with the variance 1 / (2 redundancy).
+    expected = _ONE_IN_A_THOUSAND / (2 * redundancy) ** 0.5
+    asks = f" (expected 1 +- {expected:.2g}: see .verdict())" if abs(sigma0 - 1) > expected else ""
+    return f"{sigma0:.4g}{asks}"
 
 
 def _counted(n: int, name: str) -> str:

@@ -36,6 +36,18 @@ def test_things_show_themselves_in_a_few_lines():
     assert "&lt;script&gt;" in evil._repr_html_()
 
 
+def test_an_adjustment_that_fits_nothing_says_so_and_its_verdict_reads_as_sentences():
+    sound = adjusted("cross")
+    assert "expected" not in repr(sound)
+    rows = sound.block.stations
+    off = np.asarray(rows.value) + np.where(rows.axis == 2, 20.0, 0.0)
+    bad = jaxphoto.adjust(sound.block.with_observations({"stations": dataclasses.replace(rows, value=off)}))
+    assert "(expected 1 +- 0." in repr(bad) and "see .verdict()" in repr(bad)
+    assert "(expected 1 +- 0." in bad._repr_html_()
+    said = repr(bad.verdict()).splitlines()
+    assert said[0].startswith("red: ") and said[1].startswith("!! ") and len(said) == 1 + len(bad.verdict().findings)
+
+
 def test_tables_name_what_they_have():
     tables = Tables(adjusted("cross"))
     assert {"interior", "residuals", "sigma_map", "check_points"} <= set(

@@ -73,6 +73,10 @@ class Adjustment(eqx.Module):
     def _repr_html_(self) -> str:
         return adjustment_html(self, self.unknowns.words)
 
+    def verdict(self) -> Any:
+        """Whether it may be used, green, amber or red, and the findings for that (docs/trust.md)."""
+        return from_upstairs("verdict_of")(from_upstairs("Tables")(self))
+
     def plot(self, axes: Any = None, *, in_3d: bool = False) -> Any:
         """The adjusted block, in plan or in space, on matplotlib axes, which are returned; new ones if none are."""
         return from_upstairs("plot_block")(self, axes, in_3d=in_3d)

@@ -16,6 +16,7 @@ class Level(enum.IntEnum):
     """Results are not to be used before this is mended."""
 
 
+MARKS = {Level.INFORMATION: "-", Level.WARNING: "!", Level.ALARM: "!!"}
 COLOURS = {Level.INFORMATION: "green", Level.WARNING: "amber", Level.ALARM: "red"}
 
 
@@ -30,6 +31,9 @@ class Verdict(NamedTuple):
     """All findings, the worst first; within a level in the order in which they were found."""
 
     findings: tuple[Finding, ...]
+
+    def __repr__(self) -> str:
+        return "\n".join([self.headline, *(f"{MARKS[f.level]} {f.text}" for f in self.findings)])
 
     @classmethod
     def of(cls, findings: Iterable[Finding]) -> "Verdict":

@@ -5,14 +5,13 @@ from rich.table import Table
 from rich.text import Text
 
 from jaxphoto.errors import printable
-from jaxphoto.report.findings import Level, Verdict
+from jaxphoto.report.findings import MARKS, Level, Verdict
 from jaxphoto.report.recovery import recovery_spread
 from jaxphoto.report.tables import Tables
 from jaxphoto.statistics import residual_spread
 
 _FINDINGS = 12
 _COLOURS = {Level.INFORMATION: "green", Level.WARNING: "yellow", Level.ALARM: "red"}
-_MARKS = {Level.INFORMATION: "-", Level.WARNING: "!", Level.ALARM: "!!"}
 _PARAMETERS = 18
 
 
@@ -25,7 +24,7 @@ def print_verdict(verdict: Verdict, console: Console) -> None:
     """Print a verdict with its first reasons."""
     console.print(Text(verdict.headline, f"bold {_COLOURS[verdict.level]}"))
     for finding in verdict.findings[:_FINDINGS]:
-        mark = Text(f"{_MARKS[finding.level]} ", _COLOURS[finding.level])
+        mark = Text(f"{MARKS[finding.level]} ", _COLOURS[finding.level])
         console.print(mark + plain(finding.text))
     if len(verdict.findings) > _FINDINGS:
         console.print(f"and {len(verdict.findings) - _FINDINGS} more in report.html")
