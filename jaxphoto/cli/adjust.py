@@ -90,7 +90,7 @@ def adjust_command(
         status.update("computing statistics")
         tables = Tables(adjusted, rotations, read_truth(block))  # type: ignore[arg-type]
         verdict = verdict_of(tables)
-        found = snooped_findings(snooped) if snooped else []
+        found = snooped_findings(snooped, read) if snooped else []
         found += component_findings(components, masked) if components else []
         verdict = Verdict.of([*found, *verdict.findings])
         status.update(f"writing {out}")

@@ -1,13 +1,20 @@
 """What was left out of a block as blunders: a table, and the sentences that the verdict begins with."""
 
+from collections.abc import Iterator
+
+import numpy as np
 import pandas as pd
 
+from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
 from jaxphoto.block import Block
+from jaxphoto.observations import Correlated
 from jaxphoto.procedures import Snooped
 from jaxphoto.report.findings import Finding, Level
 from jaxphoto.report.tables import in_file_unit
 
 _SHOWN = 5
+# So many are no chance, and agree where they scatter by no more than so many of their standard deviations.
+_SEVERAL, _AS_ONE = 4, 3.0
 
 
 def left_out_table(snooped: Snooped, block: Block) -> pd.DataFrame:
@@ -28,9 +35,9 @@ def left_out_table(snooped: Snooped, block: Block) -> pd.DataFrame:
     return pd.DataFrame(found, columns=columns)
 
 
-def snooped_findings(snooped: Snooped) -> list[Finding]:
-    """What was left out and put right, in words."""
-    found = []
+def snooped_findings(snooped: Snooped, block: Block) -> list[Finding]:
+    """What was left out of `block` and put right, in words; first what is rather an error that rows have in common."""
+    found = list(_alike(snooped, block))
     for s in snooped.left_out[:_SHOWN]:
         factor, unit = in_file_unit(s.unit)
         found.append(
@@ -46,6 +53,30 @@ def snooped_findings(snooped: Snooped) -> list[Finding]:
         )
     found += [f"put right: {exchange.words}" for exchange in snooped.exchanged]
     return [Finding(Level.WARNING, text) for text in found]
+
+
+def _alike(snooped: Snooped, block: Block) -> Iterator[str]:
+    """Most numbers of a strip along an axis, or of all, off by the same amount: no blunders."""
+    for name, rows in block.named_observations.items():
+        left = [s for s in snooped.left_out if s.group == name]
+        if name == IMAGE_POINTS or isinstance(rows, Correlated) or len(left) < _SEVERAL:
+            continue
+        axes = np.atleast_2d(np.broadcast_to(rows.axis_names(), np.shape(rows.observation)[::-1]))
+        strips = np.broadcast_to(rows.names_of("image", block.image_strip), axes.shape)
+        for axis, strip in sorted({(str(axes[s.number, s.row]), str(strips[s.number, s.row])) for s in left}):
+            part = (axes == axis) & (strips == strip)
+            own = [s for s in left if part[s.number, s.row]]
+            error, sigma = (np.array([getattr(s, field) for s in own]) for field in ("error", "sigma"))
+            mean = float(np.average(error, weights=sigma**-2.0))
+            scatter = float(np.sqrt(np.mean(((error - mean) / sigma) ** 2)))
+            if len(own) >= _SEVERAL and len(own) > part.sum() / 2 and scatter < _AS_ONE:
+                factor, unit = in_file_unit(own[0].unit)
+                of = f"{name.replace('_', ' ')}{f' in strip {strip}' if strip else ''} along {axis}"
+                yield (
+                    f"left out: {len(own)} of the {part.sum()} {of}, which are off alike, by {factor * mean:+.3g} "
+                    f"{unit}: no blunders, but an error that they have in common; let it be estimated (such as a "
+                    "shift), or mend it where they come from"
+                )
 
 
 def _ids(block: Block):
