@@ -38,6 +38,8 @@ from jaxphoto.variants import some_images
 
 CUTS = 64
 _TRIES = 50
+# Three points and six unknowns of an image say nothing of its camera.
+_LEAST_POINTS = 4
 
 
 class Cut(NamedTuple):
@@ -230,7 +232,7 @@ def halved(
     try:
         both = []
         for half in (first, ~first):
-            part = some_images(dataclasses.replace(block, start=start, datum=datum), half)
+            part = _oriented(dataclasses.replace(block, start=start, datum=datum), half)
             both.append(adjust(part, part.start.unknowns, sizes=sizes))
             if not bool(both[-1].converged):
                 return Cut(first, both[-1].outcome.value)
@@ -251,6 +253,16 @@ def halved(
         offsets_px=np.asarray(found.measured) / px,
         jacobian_px=np.asarray(found.measured_jacobian) / px,
     )
+
+
+def _oriented(block: Block, chosen: Bool[np.ndarray, "images"]) -> Block:
+    """The images `chosen`, without those of which the cut leaves too few points to orient them."""
+    while True:
+        part = some_images(block, chosen)
+        few = np.bincount(part.image_points.image, minlength=len(part.images)) < _LEAST_POINTS
+        if not few.any() or few.all():
+            return part
+        chosen = np.isin(np.arange(len(chosen)), np.flatnonzero(chosen)[~few])
 
 
 def _joint_covariance(adjusted: Adjustment, both: list[Adjustment], camera: str, names: tuple[str, ...]) -> np.ndarray:

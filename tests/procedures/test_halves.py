@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -10,11 +11,12 @@ import pandas as pd
 import pytest
 
 from jaxphoto import adjust, covariance, read_block
+from jaxphoto.adjustment import common_sizes
 from jaxphoto.camera import get_parameter, parameter_names
 from jaxphoto.errors import InputError
 from jaxphoto.io import write_block
 from jaxphoto.io.cameras import read_camera_file
-from jaxphoto.procedures.halves import halves
+from jaxphoto.procedures.halves import halved, halves
 from jaxphoto.simulation import image_coordinates, remeasure
 from jaxphoto.stability import Differences, band_of, bundle_offsets, concentration, image_grid, leading_unit, overlap
 from jaxphoto.statistics import common_covariance
@@ -167,3 +169,19 @@ def test_a_unit_that_all_differences_follow_is_found():
     # Where all are alike, none leads.
     alike = np.einsum("ku,ucx->kcx", np.where(first, 1.0, -1.0), rng.normal(size=(40, 6, 2)))
     assert leading_unit(first, alike)[1] < 0.4
+
+
+def test_an_image_that_a_cut_leaves_without_points_does_not_spoil_it():
+    """It says nothing of the camera: the half goes without it."""
+    block = read_block(Path(__file__).parents[2] / "examples" / "cross_block")
+    adjusted, rng = adjust(block), np.random.default_rng(0)
+    masks = (rng.permutation(len(block.images)) < len(block.images) // 2 for _ in range(1000))
+
+    def few(mask):
+        part = some_images(block, mask)
+        return np.bincount(part.image_points.image, minlength=len(part.images)).min() < 3
+
+    first = next(mask for mask in masks if few(mask) and not few(~mask))
+    cells = image_grid(block.sensors["kodak"], 7, 5)
+    cut = halved(adjusted, first, "kodak", cells, "rot", common_sizes([block]))
+    assert not cut.problem and cut.offsets_px.shape == (len(cells), 2)
