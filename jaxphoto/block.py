@@ -69,6 +69,8 @@ class Block(eqx.Module):
     """Observations of further kinds, and parameters known beforehand together."""
     flight_time: Float[Numbers, "images"] | None = None
     """Seconds from the middle of the flight; `image_time` is from those of the strips. None: they are the same."""
+    middle_s: float = eqx.field(static=True, default=0.0)
+    """The middle of the flight in the time that the files have (s)."""
     temperatures: Temperatures | None = None
     """Of the cameras; None: they are not known, and no camera changes with them."""
     partitions: dict[str, tuple[str, ...]] = eqx.field(static=True, default_factory=dict)

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -58,6 +59,20 @@ def test_round_trip(write_folder, tmp_path, changes):
     block = read_block(write_folder(*changes))
     write_block(block, tmp_path / "copy")
     assert_same(read_block(tmp_path / "copy"), block)
+
+
+@pytest.mark.parametrize("later", [0.0, 417_605.125])
+def test_times_are_written_as_the_file_had_them(write_folder, tmp_path, later):
+    """Also those of seconds of the week."""
+    folder = write_folder()
+    before = pd.read_csv(folder / "images.csv", dtype={"image": str})
+    before["time_s"] += later
+    before.to_csv(folder / "images.csv", index=False)
+    block = read_block(folder)
+    write_block(block, tmp_path / "copy")
+    after = pd.read_csv(tmp_path / "copy" / "images.csv")
+    assert after["time_s"].tolist() == before["time_s"].tolist()
+    assert abs(float(np.mean(block.image_time))) < 1e-9
 
 
 def test_round_trip_of_smac_keeps_what_is_static(write_folder, tmp_path):

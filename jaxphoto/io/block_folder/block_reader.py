@@ -187,6 +187,7 @@ def assemble(source: BlockTables) -> Block:
         image_strip=images.strips,
         image_time=on_device(images.times),
         flight_time=None if images.strips_are_the_flight else on_device(images.flight_times),
+        middle_s=images.middle_s,
         temperatures=temperatures_of(images.temperatures, settings),
         image_points=points.rows,
         control=control.control,

@@ -48,8 +48,8 @@ def check_block_target(folder: Path, *inputs: Path) -> None:
 def write_block(block: Block, folder: str | Path) -> None:
     """Write `block` as a folder that `read_block` reads as the same block; numbers come back exactly.
 
-    Angles are written in degrees and come back to rounding, as do coordinates of a frame of kind epsg, which are
-    written in its system (1e-6 m). Velocities are written for images with a station, rates for those with an attitude.
+    Angles are written in degrees, times as the file had them, coordinates of a frame of kind epsg in its system (1e-6
+    m); these come back to rounding. Velocities are written for images with a station, rates for those with an attitude.
     A block that jaxphoto wrote there is replaced; what else lies in the folder stays (`whole_folder`).
 
     Raises InputError where `folder` holds a block or anything else that jaxphoto did not write, or that was changed
@@ -189,7 +189,8 @@ def _images(block: Block) -> pd.DataFrame:
     columns |= block.partitions
     times = np.asarray(block.image_time if block.flight_time is None else block.flight_time)
     if times.any() or block.start.unknowns.strips:
-        columns["time_s"] = times
+        # To a nanosecond: the decimals that the file had.
+        columns["time_s"] = np.round(times + block.middle_s, 9) + 0.0 if block.middle_s else times
     if block.temperatures is not None:
         columns["temperature_c"] = np.asarray(block.temperatures.celsius)
     if known.any():

@@ -31,6 +31,8 @@ class Images(NamedTuple):
     """Seconds from the mean of the image's strip."""
     flight_times: np.ndarray
     """Seconds from the mean of all images."""
+    middle_s: float
+    """The mean of all images in the time of the file (s), to a nanosecond."""
     time_known: np.ndarray
     temperatures: np.ndarray
     """Degrees Celsius, NaN where not known."""
@@ -79,6 +81,7 @@ def read_images(table: Table, settings: Settings) -> Images:
         tuple(strips),
         _centred(times, strips),
         _centred(times, np.zeros(len(times))),
+        round(float(times[~np.isnan(times)].mean()), 9) if not np.isnan(times).all() else 0.0,
         ~np.isnan(times),
         celsius_in(table),
         exterior,
