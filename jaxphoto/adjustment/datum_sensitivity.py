@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.sparse import coo_array, csr_array, vstack
+from scipy.sparse import coo_array, csr_array, diags_array, vstack
 from scipy.sparse.csgraph import connected_components
 
 from jaxphoto.adjustment.model.numbers import Values, zero_increments
@@ -24,6 +24,10 @@ from jaxphoto.compiling import jit_quickly
 _OPEN = 1e-9
 # The same of their squares, as far as double precision tells these from zero.
 _OPEN_SQUARED = 1e-13
+# Squares above this are no zeros, however they were rounded.
+_PLAIN = 1e-10
+# Of so many rows for each column a triangle is made at once.
+_WIDE = 4
 
 
 @dataclass(frozen=True)
@@ -90,14 +94,26 @@ class SeenMotions:
         count, part = connected_components(own.T @ own, directed=False)
         found = [np.zeros(0, int)]
         for columns in (np.flatnonzero(part == k) for k in range(count)):
-            rows = own[:, columns].toarray()
-            rows = rows[rows.any(axis=1)]
-            if len(rows) >= len(columns):
-                rows = rows / np.sqrt((rows**2).sum(0))
-                s = np.linalg.svd(np.linalg.qr(rows, mode="r"), compute_uv=False)
-                if s[-1] > _OPEN * s[0]:
-                    found.append(7 + columns)
+            rows = own[:, columns].tocsr()
+            rows = rows[np.diff(rows.indptr) > 0]
+            if rows.shape[0] >= len(columns) and _determines_all(rows):
+                found.append(7 + columns)
         return np.sort(np.concatenate(found))
+
+
+def _determines_all(rows: csr_array) -> bool:
+    """Whether rows determine each of their columns; of a hundred thousand rows most are never full."""
+    n = rows.shape[1]
+    rows = rows @ diags_array(1 / np.sqrt(rows.power(2).sum(axis=0)))
+    squares = np.linalg.eigvalsh((rows.T @ rows).toarray())
+    if squares[0] > _PLAIN * squares[-1]:
+        return True
+    # Of the rest squares say too little. A triangle has the singular values of the rows that it came from.
+    triangle: np.ndarray = np.zeros((0, n))
+    for first in range(0, rows.shape[0], _WIDE * n):
+        triangle = np.asarray(np.linalg.qr(np.vstack([triangle, rows[first : first + _WIDE * n].toarray()]), mode="r"))
+    s = np.linalg.svd(triangle, compute_uv=False)
+    return bool(s[-1] > _OPEN * s[0])
 
 
 def _eliminated(

@@ -132,3 +132,13 @@ def test_weak_motions_are_those_of_the_covariance_matrix(free_end):
             assert (len(weak) > 0) == (sigma < worst)
             np.testing.assert_allclose(found, worst, rtol=1e-6)
             np.testing.assert_allclose(weak.T @ weak, expected.T @ expected, atol=1e-6)
+
+
+@pytest.mark.parametrize(("apart", "determined"), [(1.0, True), (1e-6, True), (1e-12, False)])
+def test_rows_that_nearly_tell_unknowns_apart_do(apart, determined):
+    """Squares of the second have lost what tells it; many rows are brought to a triangle in portions."""
+    rng = np.random.default_rng(2)
+    rows = rng.normal(size=(101, 4))
+    rows[:, 3] = rows[:, 0] + apart * rows[:, 3]
+    seen = SeenMotions(csr_array((0, 11)), csr_array(np.pad(rows, [(0, 0), (7, 0)])))
+    np.testing.assert_array_equal(seen.determined, np.arange(7, 11) if determined else [])

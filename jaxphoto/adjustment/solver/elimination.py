@@ -18,7 +18,7 @@ from jaxphoto.adjustment.layout.tiled import TiledResiduals, TiledStructure
 from jaxphoto.adjustment.model.image_orientations import ImageOrientations, by_image, of_images, orientations_of
 from jaxphoto.adjustment.model.numbers import Increments, NonImageResiduals, datum_residuals, state_at
 from jaxphoto.adjustment.model.observed_groups import RowsAtPoints
-from jaxphoto.adjustment.model.row_functions import group_residuals, non_image_residuals
+from jaxphoto.adjustment.model.row_functions import group_residuals, non_image_residuals, rows_at_once
 from jaxphoto.adjustment.model.structure import total
 from jaxphoto.adjustment.solver.band import BandFactor, solve_band
 from jaxphoto.adjustment.solver.non_image_rows import non_image_rows
@@ -194,7 +194,11 @@ def pull_others(z: NonImageResiduals, at: Linearised) -> Increments:
     """J'z of all but the image rows, of many along a leading axis."""
     _, scale, values, s = at
     _, of_others = jax.vjp(lambda y: non_image_residuals(y, scale, values, s), at.increments)
-    return jax.vmap(lambda one: of_others(NonImageResiduals(one.others, one.datum, one.names))[0])(z)
+    # Of each of those side by side, every row has a copy of its parameters.
+    size = rows_at_once(sum(g.n_rows * len(g.parameter) for g in s.observed))
+    one = lambda own: of_others(NonImageResiduals(*own, z.names))[0]  # noqa: E731
+    own = z.others, z.datum
+    return jax.vmap(one)(own) if len(z.datum) <= size else jax.lax.map(one, own, batch_size=size)
 
 
 def push(x: Increments, at: Linearised) -> TiledResiduals:
