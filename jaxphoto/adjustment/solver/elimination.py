@@ -196,7 +196,11 @@ def pull_others(z: NonImageResiduals, at: Linearised) -> Increments:
     _, of_others = jax.vjp(lambda y: non_image_residuals(y, scale, values, s), at.increments)
     # Of each of those side by side, every row has a copy of its parameters.
     size = rows_at_once(sum(g.n_rows * len(g.parameter) for g in s.observed))
-    one = lambda own: of_others(NonImageResiduals(*own, z.names))[0]  # noqa: E731
+
+    def one(own: tuple[tuple[Array, ...], Array]) -> Increments:
+        others, datum = own
+        return of_others(NonImageResiduals(others, datum, z.names))[0]
+
     own = z.others, z.datum
     return jax.vmap(one)(own) if len(z.datum) <= size else jax.lax.map(one, own, batch_size=size)
 
