@@ -197,7 +197,7 @@ def pull_others(z: NonImageResiduals, at: Linearised) -> Increments:
     # Of each of those side by side, every row has a copy of its parameters.
     size = rows_at_once(sum(g.n_rows * len(g.parameter) for g in s.observed))
 
-    def one(own: tuple[tuple[Array, ...], Array]) -> Increments:
+    def one(own: tuple[Any, Any]) -> Increments:
         others, datum = own
         return of_others(NonImageResiduals(others, datum, z.names))[0]
 
