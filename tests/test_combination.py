@@ -29,6 +29,12 @@ def drawn(rng, off=0.0):
     return found, [covariance(scale) for scale in SCALES]
 
 
+def test_one_calibration_says_nothing_twice():
+    interiors, covariances = drawn(np.random.default_rng(1))
+    with pytest.raises(InputError, match="c and a are one calibration, which says nothing twice"):
+        combine([*interiors[:2], interiors[0]], [*covariances[:2], covariances[0]], "abc")
+
+
 def test_it_is_the_adjustment_of_all_of_them():
     interiors, covariances = drawn(np.random.default_rng(1))
     done = combine(interiors, covariances, "abc")

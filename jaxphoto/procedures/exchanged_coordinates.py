@@ -68,7 +68,7 @@ def _exchange(
     words = (
         f"control points {one} and {other} had each other's coordinates, or their names are exchanged in all images"
         if what == "point"
-        else f"images {one} and {other} had each other's station"
+        else f"images {one} and {other} had each other's station, or their image points are exchanged"
     )
     return Exchange(rows.group, pairs, words, back)
 

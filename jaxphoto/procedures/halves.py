@@ -260,7 +260,9 @@ def _oriented(block: Block, chosen: Bool[np.ndarray, "images"]) -> Block:
     while True:
         part = some_images(block, chosen)
         few = np.bincount(part.image_points.image, minlength=len(part.images)) < _LEAST_POINTS
-        if not few.any() or few.all():
+        if few.all():
+            raise BlockError("the images of a half have no points in common that could orient them: cut more images")
+        if not few.any():
             return part
         chosen = np.isin(np.arange(len(chosen)), np.flatnonzero(chosen)[~few])
 

@@ -105,8 +105,10 @@ def snoop(
         if bool(found.adjusted.converged) and float(found.adjusted.sigma0) <= _FITS:
             return found
     if found is None:
-        assert failed is not None
-        raise failed
+        raise BlockError(
+            "so much contradicts the other observations that without it too little is left to adjust: look at names, "
+            f"units, axes and the order of rows (an adjustment of all says more). What ended the search: {failed}"
+        ) from failed
     return found
 
 
@@ -150,8 +152,10 @@ def _snooped(
         found = _tested(adjusted, at, left, point, sigma0, r)
         still_there = _same(found, left)
         if still_there or len(tried) == _ROUNDS or any(_same(found, old) for old in tried):
-            # What does not fit although it was exchanged, or fits as well as it was given, gets its own back.
-            if undone := [e for e in done if not _needed(at, left, e, sigma0)]:
+            # What does not fit although it was exchanged, or fits as well as it was given, gets its own back; where
+            # nothing fits, all do.
+            fits = bool(adjusted.converged) and sigma0 <= _FITS
+            if undone := [e for e in done if not fits or not _needed(at, left, e, sigma0)]:
                 for exchange in undone:
                     block, left = exchanged(block, left, exchange._replace(back={}))
                     done.remove(exchange)
@@ -259,9 +263,9 @@ def _tested(adjusted: Adjustment, at: Adjustment, left: Masks, point: np.ndarray
     stays = _stays(at.block, point)
     wrong = {name: size > sigma0 for name, size in _sizes(at, r, predicted=True).items()}
     found = {name: out & (wrong[name] | ~stays[name]) for name, out in left.items()}
-    sizes = {}
+    # Of a group all of whose rows are out, `adjusted` has nothing.
+    sizes = {name: np.zeros(len(out)) for name, out in left.items()}
     for name, size in _sizes(adjusted, checked_parts(adjusted)).items():
-        sizes[name] = np.zeros(len(left[name]))
         sizes[name][~left[name] & stays[name]] = size / sigma0
     least = max(1.0, _BESIDE_THE_WORST * max(float(size.max(initial=0.0)) for size in sizes.values()))
     return {name: found[name] | new for name, new in _worst(at.block, sizes, least).items()}

@@ -22,10 +22,10 @@ from jaxphoto.statistics import (
     variance_components,
 )
 
-# A part's standard deviation is that of blunders where it would be less than half without the few that contradict the
-# others, a tenth of the part at most. Of normal errors whose sigma is stated too small, no tenth does that: without
-# the largest tenth, 0.8 of the standard deviation is left.
-_RAISED, _FEW = 4.0, 0.1
+# A part's variance is that of blunders where it would be so many times less without those that contradict the others,
+# at most such a part of it. Of normal errors whose sigma is stated too small no tenth and no third does that: without
+# the largest tenth a variance is 1.6 times less, without the largest third 3.4 times.
+_MADE = {4.0: 0.1, 10.0: 1 / 3}
 
 
 class MadeByBlunders(NamedTuple):
@@ -52,7 +52,7 @@ def made_by_blunders(
     Looked for with `snoop` and components of what it leaves, where some part's variance is raised and something
     contradicts the others at the stated weights.
     """
-    raised = [k for k, factor in enumerate(found.factor) if found.supported[k] and factor > _RAISED]
+    raised = [k for k, factor in enumerate(found.factor) if found.supported[k] and factor > min(_MADE)]
     if not raised or not blunder_test(adjusted, redundancy_numbers(adjusted, covariance(adjusted, rows=True))).suspects:
         return ()
     try:
@@ -67,8 +67,10 @@ def made_by_blunders(
     for k in raised:
         label, factor = found.labels[k], float(found.factor[k])
         numbers, words = _out_of(adjusted, snooped, partition, k)
-        most = max(1.0, _FEW * found.observations[k])
-        if 0 < numbers <= most and factor > _RAISED * without.get(label, factor):
+        less = factor / without.get(label, factor)
+        if numbers and any(
+            less > times and numbers <= max(1.0, n * found.observations[k]) for times, n in _MADE.items()
+        ):
             told.append(MadeByBlunders(label, factor, without[label], words))
     return tuple(told)
 

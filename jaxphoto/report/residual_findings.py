@@ -16,8 +16,9 @@ from jaxphoto.statistics import (
     DELTA0,
     LEVEL,
     MOST_PARTS,
+    Hint,
+    ResidualPattern,
     Suspect,
-    Trend,
     global_test,
     group_factors,
     most_felt,
@@ -39,6 +40,8 @@ _VISIBLE, _MOVED = 0.25, 1.0
 # A pattern is an alarm where its term moves an interior parameter by more than this: by what standard deviations are
 # taken for, results are then wrong beyond doubt.
 _SPOILT_BY_A_PATTERN = 10.0
+# Axes of one error are told of which the estimate is beyond so many of its standard deviations.
+_SURE = 3.3
 # Of a pattern's square sum, what one term must explain to be named.
 MOST_OF_IT = 0.5
 # An observation whose detectable error is more than this times its sigma is checked by hardly anything (r < 0.17).
@@ -81,9 +84,18 @@ def _global_test(tables: Tables) -> Iterator[Finding]:
                 f"{'stretches' if factor > 1 else 'shrinks'}; sigma naught of its image points is expected to be "
                 f'{factor:.3g}, not 1: say residuals = "measured" in [cameras.{camera}]',
             )
+    tested = [f for f in group_factors(tables.adjusted, tables.redundancy) if f.group != IMAGE_POINTS or f.p_value < 1]
+    factors = [f for f in tested if f.p_value < LEVEL / len(tested)]
     if whole.p_value >= LEVEL:
+        # Of few observations beside many, sigma naught shows nothing.
+        for f in factors:
+            size = f"{1 / f.sigma:.2g} times as large as" if f.sigma < 1 else f"{f.sigma:.2g} times smaller than"
+            yield Finding(
+                Level.WARNING,
+                f"the standard deviations of {f.group.replace('_', ' ')} are {size} their residuals say "
+                f"({p_words(f.p_value)}), while all observations together fit: correct them (--weights estimates them)",
+            )
         return
-    factors = [f for f in group_factors(tables.adjusted, tables.redundancy) if f.p_value < LEVEL]
     groups = ", ".join(f"{f.group.replace('_', ' ')} {f.sigma:.2f}" for f in factors)
     of_groups = f"; by group of observations: {groups}" if groups else ""
     said = f"sigma naught {whole.factor**0.5:.3g}, expected {whole.expected**0.5:.3g} ({p_words(whole.p_value)})"
@@ -163,11 +175,14 @@ def _trends(tables: Tables) -> Iterator[tuple[float, Finding]]:
             else "no larger than the noise with which it is seen"
         )
         matters, named, spoilt = t.size > _VISIBLE * t.pattern.sigma, False, False
-        if t.hints and t.hints[0].share > MOST_OF_IT:
-            likely, named = t.hints[0], True
-            said += f", {100 * likely.share:.0f} % of it {_told(t)}"
-            path = max(likely.moves, key=lambda path: abs(likely.moves[path]), default="")
-            if path and (moved := abs(likely.moves[path])) > _MOVED:
+        alike = [h for h in t.hints if abs(h.amount) > _SURE * h.sigma] if t.pattern.together else []
+        if alike or (t.hints and t.hints[0].share > MOST_OF_IT):
+            likely, named = alike or [t.hints[0]], True
+            share = "" if alike else f"{100 * t.hints[0].share:.0f} % of it "
+            said += f", {share}{_told(t.pattern, likely)}"
+            moves = {path: abs(sum(h.moves[path] for h in likely)) for path in likely[0].moves}
+            path = max(moves, key=lambda path: moves[path], default="")
+            if path and (moved := moves[path]) > _MOVED:
                 matters, spoilt = True, moved > _SPOILT_BY_A_PATTERN
                 said += f"; {_called(path)} would move by {moved:.1f} of its sigma"
         elif t.pattern.camera:
@@ -176,21 +191,40 @@ def _trends(tables: Tables) -> Iterator[tuple[float, Finding]]:
         yield t.p_value if matters and named else 1.0, Finding(level, said)
 
 
+def _hidden_in_common(tables: Tables) -> Iterator[Finding]:
+    """Of errors that all rows of a group have in common, how large they may be unseen, and what they then do."""
+    for t in (t for t in tables.tested_trends if t.pattern.together):
+        worst: tuple[float, str, Hint] | None = None
+        for h in (h for h in t.hints if h.amount != 0.0):
+            for path, moved in h.moves.items():
+                # Of an error that is found with a probability of 80 %.
+                size = abs(moved / h.amount) * DELTA0 * h.sigma
+                worst = max(worst or (0.0, "", h), (size, path, h), key=lambda w: w[0])
+        if worst is not None and worst[0] > _MOVED:
+            size, path, h = worst
+            factor, unit = in_file_unit(t.pattern.unit)
+            least = f"{factor * DELTA0 * h.sigma:.2g} {unit}"
+            yield Finding(
+                Level.INFORMATION,
+                f"{t.pattern.what}: an error in {h.term.name} that they have in common would be found with a "
+                f"probability of 80 % from {least} on, and one of that size moves {_called(path)} by {size:.2g} of its "
+                "sigma",
+            )
+
+
 def _called(path: str) -> str:
     """The parameter at a path, as a sentence calls it: k1 of camera kodak."""
     of_camera = re.fullmatch(r"interior\[(.*)\]\.(\w+)", path)
     return f"{of_camera[2]} of {camera_words(of_camera[1])}" if of_camera else path
 
 
-def _told(trend: Trend) -> str:
-    """The likeliest term, its amount where it is in the observations' own unit, and what cures it."""
-    likely = trend.hints[0]
-    if likely.term.amount_told:
-        factor, unit = in_file_unit(trend.pattern.unit)
-        name = f"{likely.term.name} {factor * likely.amount:+.3g} +- {factor * likely.sigma:.2g} {unit}"
-    else:
-        name = likely.term.name
-    return f"{name}, {likely.term.cure}" if likely.term.cure else name
+def _told(pattern: ResidualPattern, likely: list[Hint]) -> str:
+    """The likeliest terms, their amounts where these are in the observations' own unit, and what cures them."""
+    factor, unit = in_file_unit(pattern.unit)
+    amounts = (f" {factor * h.amount:+.3g} +- {factor * h.sigma:.2g} {unit}" for h in likely)
+    names = ", ".join(h.term.name + (a if h.term.amount_told else "") for h, a in zip(likely, amounts, strict=True))
+    cure = likely[0].term.cure
+    return f"{names}, {cure}" if cure else names
 
 
 def of_what_is_not_checked(tables: Tables) -> Iterator[Finding]:
@@ -212,6 +246,7 @@ def of_what_is_not_checked(tables: Tables) -> Iterator[Finding]:
     if felt := [f for f in most_felt(adjusted, tables.undetected) if f.moved > _MOVED]:
         told = ", ".join(f"{f.parameter} by up to {f.moved:.1f} of its sigma ({f.words})" for f in felt)
         yield Finding(Level.INFORMATION, f"an error that no test finds (power 80 %) would move {told}")
+    yield from _hidden_in_common(tables)
     for hidden in worst_checked(adjusted, tables.redundancy):
         if hidden.group != IMAGE_POINTS and hidden.detectable > _HIDDEN * hidden.sigma:
             factor, unit = in_file_unit(hidden.unit)

@@ -52,7 +52,10 @@ def snooped_findings(snooped: Snooped, block: Block) -> list[Finding]:
             "left to place it"
         )
     found += [f"put right: {exchange.words}" for exchange in snooped.exchanged]
-    return [Finding(Level.WARNING, text) for text in found]
+    return [
+        *(Finding(Level.ALARM, text) for text in _too_many(snooped, block)),
+        *(Finding(Level.WARNING, text) for text in found),
+    ]
 
 
 def _alike(snooped: Snooped, block: Block) -> Iterator[str]:
@@ -77,6 +80,32 @@ def _alike(snooped: Snooped, block: Block) -> Iterator[str]:
                     f"{unit}: no blunders, but an error that they have in common; let it be estimated (such as a "
                     "shift), or mend it where they come from"
                 )
+
+
+def _too_many(snooped: Snooped, block: Block) -> Iterator[str]:
+    """Images and groups, along an axis, of which too much is left out to be single errors."""
+    rows = block.image_points
+    out = np.isin(rows.point, [block.points.index(point) for point in snooped.points])
+    out[[s.row for s in snooped.left_out if s.group == rows.group]] = True
+    seen, gone = (np.bincount(rows.image[k], minlength=len(block.images)) for k in (np.s_[:], out))
+    for image in np.flatnonzero((gone >= _SEVERAL) & (gone > seen / 2)).tolist():
+        yield (
+            f"{gone[image]} of the {seen[image]} image points of image {block.images[image]} are left out: no single "
+            "errors; look at its names of points, the axes of its coordinates, its camera and its station, or leave it "
+            "out"
+        )
+    for name, own in block.named_observations.items():
+        left = [s.row for s in snooped.left_out if s.group == name]
+        if name == IMAGE_POINTS or isinstance(own, Correlated) or len(left) < _SEVERAL:
+            continue
+        axes = np.broadcast_to(own.axis_names(), np.shape(own.observation)[::-1])
+        lost = np.isin(np.arange(len(own)), left)
+        counted = {a: (int(((axes == a) & lost).sum()), int((axes == a).sum())) for a in dict.fromkeys(axes.flat)}
+        if many := [f"{n} of {of} in {a}" for a, (n, of) in counted.items() if n >= _SEVERAL and n > of / 3]:
+            yield (
+                f"of {name.replace('_', ' ')} {', '.join(many)} are left out: no single errors, but the rest against "
+                "these; look at their units, axes, names and signs, and at what is held fixed"
+            )
 
 
 def _ids(block: Block):

@@ -17,6 +17,7 @@ from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import camera_words, few
 from jaxphoto.procedures.adjust import left_out_words
 from jaxphoto.report.camera_drift import drift_findings
+from jaxphoto.report.doubled import doubled_findings
 from jaxphoto.report.findings import Finding, Level, Verdict
 from jaxphoto.report.ground import ground_findings
 from jaxphoto.report.residual_findings import NOTHING_FITS, of_residuals, of_what_is_not_checked
@@ -49,6 +50,7 @@ def _findings(tables: Tables) -> Iterator[Finding]:
     prepare_responses(adjusted.equations, adjusted.seconds)
     if adjusted.left_out:
         yield Finding(Level.WARNING, left_out_words(adjusted))
+    yield from doubled_findings(adjusted.block)
     yield from of_residuals(tables)
     of_cameras = {camera: weaknesses(tables, camera, c) for camera, c in tables.correlations.items()}
     yield from _weak(tables, frozenset().union(*(w.labels for weak in of_cameras.values() for w in weak)))

@@ -48,7 +48,7 @@ def combine(
     """Combine independent calibrations; `names` is what messages call them.
 
     `covariances` are in the order of `parameter_names`, with zero rows for what was held. Raises InputError for fewer
-    than two, other models, and what one holds and another estimates or holds at another value.
+    than two, for one that is there twice, other models, and what one holds and another estimates or holds elsewhere.
     """
     if len(interiors) < 2:
         raise InputError("a combination is of two calibrations at least; name another one")
@@ -67,6 +67,10 @@ def combine(
             values = [float(get_parameter(i, parameter)) for i in (interiors[0], interior)]
             if not one and values[0] != values[1]:
                 raise InputError(f"{parameter} is held at {values[0]:g} in {names[0]} and at {values[1]:g} in {name}")
+        if np.array_equal(covariance, covariances[0]) and all(
+            float(get_parameter(interior, p)) == float(get_parameter(interiors[0], p)) for p in parameters
+        ):
+            raise InputError(f"{name} and {names[0]} are one calibration, which says nothing twice; name it once")
     own = np.ix_(free, free)
     every = np.array([[float(get_parameter(interior, name)) for name in parameters] for interior in interiors])
     x = every[:, free]

@@ -38,7 +38,7 @@ from jaxphoto.statistics.ground import GroundCorrelations, ground_correlations
 from jaxphoto.statistics.linear_forms import LinearForms, linear_forms
 from jaxphoto.statistics.partial_redundancy import PartialRedundancy, partial_redundancy
 from jaxphoto.statistics.partition import SPLITS, Partition, Parts, Selection, parts_of
-from jaxphoto.statistics.patterns import MOST_PARTS
+from jaxphoto.statistics.patterns import MOST_PARTS, ResidualPattern
 from jaxphoto.statistics.positional_accuracy import (
     LEAST_CHECK_POINTS,
     AxisErrors,
@@ -64,7 +64,7 @@ from jaxphoto.statistics.significance import (
     if_zero,
     significance,
 )
-from jaxphoto.statistics.trends import Trend, trends
+from jaxphoto.statistics.trends import Hint, Trend, trends
 from jaxphoto.statistics.undetected import Felt, UndetectedEffects, most_felt, undetected_effects
 from jaxphoto.statistics.variance_components import VarianceComponents, variance_components
 from jaxphoto.statistics.zero_test import POWER, ZeroTest, zero_test
@@ -72,8 +72,9 @@ from jaxphoto.statistics.zero_test import POWER, ZeroTest, zero_test
 __all__ = [
     "DELTA0", "EOP_NAMES", "LEAST_CHECKED", "LEAST_CHECK_POINTS", "LEAST_SIGMA0", "LEVEL", "MOST_PARTS", "POWER",
     "SIGNIFICANCE_LEVEL", "SPLITS", "AxisErrors", "BlunderTest", "CameraDifferences", "CameraDrift",
-    "ComponentAccuracy", "Correlations", "Covariance", "Felt", "GroundCorrelations", "Hidden", "IfZero",
-    "LinearForms", "PartialRedundancy", "Partition", "Parts", "PositionalAccuracy", "Redundancy", "Rotations",
+    "ComponentAccuracy", "Correlations", "Covariance", "Felt", "GroundCorrelations", "Hidden", "Hint", "IfZero",
+    "LinearForms", "PartialRedundancy", "Partition", "Parts", "PositionalAccuracy", "Redundancy", "ResidualPattern",
+    "Rotations",
     "Selection", "Significance", "Spread", "Suspect", "Trend", "UndetectedEffects", "VarianceComponents",
     "VarianceFactor", "ZeroTest",
     "a_priori_sigmas", "angle_differences",

@@ -6,7 +6,7 @@ as a whole, from strip to strip and over time, a mean and an even drift of whate
 """
 
 from collections.abc import Iterator, Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -75,6 +75,8 @@ class ResidualPattern(NamedTuple):
     """Whose image points they are; "" where they are none."""
     parts: tuple[Part, ...]
     terms: tuple[PatternTerm, ...]
+    together: bool = False
+    """Whether its terms are the axes of one error, which a sentence tells together."""
     least_seen: float = 1e-3
     """Directions of which estimated parameters take up all but this are no part of the test: in what is left of them
     the curvature of the model shows."""
@@ -193,14 +195,13 @@ def _by_strip(adjusted: Adjustment, name: str, rows: AbstractObservations, place
     weight = 1 / sigma
     thing = name.replace("_", " ")
 
-    def pattern(what: str, columns: list[tuple[str, np.ndarray]], cure: str, **seen: float) -> ResidualPattern:
+    def pattern(what: str, columns: list[tuple[str, np.ndarray]], cure: str, **more: Any) -> ResidualPattern:
         parts = tuple(Part(at.ravel(), v.ravel()[None], weight.ravel()) for _, v in columns)
         terms = tuple(PatternTerm(n, one, cure) for (n, _), one in zip(columns, np.eye(len(columns)), strict=True))
-        return ResidualPattern(f"{thing} {what}", rows.unit, "", parts, terms, **seen)
+        return ResidualPattern(f"{thing} {what}", rows.unit, "", parts, terms, **more)
 
-    yield pattern(
-        "as a whole", [(a, (axis == a).astype(float)) for a in axes], _OF_ALL.get(rows.unit, ""), least_seen=_ALIKE
-    )
+    every = [(str(a), (axis == a).astype(float)) for a in axes]
+    yield pattern("as a whole", every, _OF_ALL.get(rows.unit, ""), together=True, least_seen=_ALIKE)
 
     if 1 < len(of) <= MOST_PARTS:
         each = [(f"{a} of strip {s}", ((strips == s) & (axis == a)).astype(float)) for s in of for a in axes]

@@ -65,8 +65,9 @@ def undetected_effects(adjusted: Adjustment, covariance: Covariance, redundancy:
     camera_of = np.array(adjusted.block.image_camera)[adjusted.structure.image]
     for (camera, parameter, k), influence in zip(asked, responses.of_unknowns([k for *_, k in asked]), strict=True):
         for name, place in responses.places.items():
-            moved = np.abs(_of_numbers(groups[name], influence[place]) * detectable[name]) / a_priori[k]
-            moved = np.where(checked[name], moved, np.nan)
+            # Of what nothing checks the detectable error is infinite.
+            least = np.where(checked[name], detectable[name], np.nan)
+            moved = np.abs(_of_numbers(groups[name], influence[place]) * least) / a_priori[k]
             if name == adjusted.block.image_points.group:
                 moved = np.where(camera_of == camera, moved, np.nan)
             interior[parameter][name] = np.fmax(interior[parameter][name], moved)

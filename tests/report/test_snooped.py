@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from jaxphoto import read_block, snoop
+from jaxphoto.observations import Distances
+from jaxphoto.report.findings import Level
 from jaxphoto.report.snooped import snooped_findings
 
 
@@ -34,3 +36,24 @@ def test_single_errors_are_no_shift(block):
     spoilt = block.with_observations({"stations": dataclasses.replace(rows, value=value)})
     texts = [f.text for f in snooped_findings(snoop(spoilt), spoilt)]
     assert len(texts) == 5 and not any("alike" in text for text in texts)
+
+
+def test_a_group_all_of_whose_rows_go_is_told(block):
+    """A single scale bar, which nothing is left of."""
+    control = block.control
+    ends = np.array([block.points.index(name) for name in ("T1", "T3")])
+    one, other = (np.asarray(control.value)[control.who == p] for p in ends)
+    bar = Distances(ends[None], np.array([np.linalg.norm(one - other) + 5.0]), np.array([0.02]))
+    found = snoop(dataclasses.replace(block, distances=bar))
+    (left,) = found.left_out
+    assert left.group == "distances" and abs(left.error - 5.0) < 1.0
+
+
+def test_what_is_too_much_to_be_single_errors_is_an_alarm(block):
+    """x and y of an image exchanged."""
+    rows = block.image_points
+    xy, mine = np.array(rows.xy), rows.image == block.images.index("A3")
+    xy[mine] = xy[mine][:, ::-1]
+    spoilt = block.with_observations({"image_points": dataclasses.replace(rows, xy=xy)})
+    first = snooped_findings(snoop(spoilt), spoilt)[0]
+    assert first.level == Level.ALARM and "image points of image A3 are left out" in first.text

@@ -18,7 +18,7 @@ from jaxphoto.adjustment.layout.tiled import TiledResiduals, TiledStructure
 from jaxphoto.adjustment.model.image_orientations import ImageOrientations, by_image, of_images, orientations_of
 from jaxphoto.adjustment.model.numbers import Increments, NonImageResiduals, datum_residuals, state_at
 from jaxphoto.adjustment.model.observed_groups import RowsAtPoints
-from jaxphoto.adjustment.model.row_functions import group_residuals, non_image_residuals, rows_at_once
+from jaxphoto.adjustment.model.row_functions import group_residuals, non_image_residuals, row_jacobian, rows_at_once
 from jaxphoto.adjustment.model.structure import total
 from jaxphoto.adjustment.solver.band import BandFactor, solve_band
 from jaxphoto.adjustment.solver.non_image_rows import non_image_rows
@@ -191,16 +191,26 @@ def pull(z: TiledResiduals, at: Linearised) -> Increments:
 
 
 def pull_others(z: NonImageResiduals, at: Linearised) -> Increments:
-    """J'z of all but the image rows, of many along a leading axis."""
-    _, scale, values, s = at
-    _, of_others = jax.vjp(lambda y: non_image_residuals(y, scale, values, s), at.increments)
-    # Of each of those side by side, every row has a copy of its parameters.
-    size = rows_at_once(sum(g.n_rows * len(g.parameter) for g in s.observed))
+    """J'z of all but the image rows, of many along a leading axis; J is computed once for all of them."""
+    increments, scale, values, s = at
+    pairs = list(zip(s.observed, values.groups, strict=True))
+    jacobians = [row_jacobian(g, numbers, increments, scale, values, s) for g, numbers in pairs]
+    _, of_datum = jax.vjp(lambda y: datum_residuals(y, scale, values, s), increments)
 
-    def one(own: tuple[Any, Any]) -> Increments:
+    def one(own: tuple[tuple[Any, ...], Any]) -> Increments:
         others, datum = own
-        return of_others(NonImageResiduals(others, datum, z.names))[0]
+        eop, shared, points = of_datum(datum)[0]
+        for g, j, v in zip(s.observed, jacobians, others, strict=True):
+            shared = shared.at[g.column].add(jnp.einsum("cl...,c...->l...", j.shared, v), mode="drop")
+            if isinstance(g.rows, RowsAtPoints):
+                points = points + jnp.einsum("cjarp,crp->ap", j.points, v)
+                continue
+            eop = eop.at[:, g.image].add(jnp.einsum("ckar,cr->akr", j.eop, v))
+            points = points.at[:, g.point].add(jnp.einsum("cjar,cr->ajr", j.points, v))
+        return Increments(eop, shared, points)
 
+    # Of each of those side by side, every row has numbers of what it touches.
+    size = rows_at_once(sum(g.components * g.n_rows * len(g.place) for g in s.observed))
     own = z.others, z.datum
     return jax.vmap(one)(own) if len(z.datum) <= size else jax.lax.map(one, own, batch_size=size)
 

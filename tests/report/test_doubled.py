@@ -1,0 +1,24 @@
+"""One photograph that is there twice is told, and one that sees the same points is none."""
+
+import dataclasses
+
+import numpy as np
+
+from jaxphoto.report.doubled import doubled_findings, doubled_images
+from tests.blocks import simulated
+
+
+def test_an_image_that_has_the_measurements_of_another_is_told():
+    block = simulated("cross").block
+    assert doubled_images(block) == []
+    rows = block.image_points
+    xy = np.array(rows.xy)
+    n = 0
+    for k in np.flatnonzero(rows.image == 1):
+        for other in np.flatnonzero((rows.image == 0) & (rows.point == rows.point[k])):
+            xy[k] = xy[other]
+            n += 1
+    doubled = block.with_observations({"image_points": dataclasses.replace(rows, xy=xy)})
+    assert doubled_images(doubled) == [(*sorted(block.images[:2]), n)]
+    (finding,) = doubled_findings(doubled)
+    assert f"{n} image points" in finding.text
