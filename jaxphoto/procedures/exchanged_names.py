@@ -65,7 +65,7 @@ def name_exchanges(
     seen, block = _seen(at, left, gone, sigma0), at.block
     group, point = block.image_points.group, block.image_points.point
     found: list[Exchange] = []
-    places: dict[int, Float[np.ndarray, 3]] = {}
+    places: dict[int, np.ndarray] = {}
     done: set[int] = set()
     for a, b in _candidates(seen).tolist():
         points = int(point[a]), int(point[b])

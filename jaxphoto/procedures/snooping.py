@@ -19,7 +19,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from jaxphoto.adjustment import MAX_STEPS, Adjustment, Sizes, common_sizes, linearise
+from jaxphoto.adjustment import MAX_STEPS, Adjustment, Sizes, common_sizes, linearise, solve
 from jaxphoto.block import Block
 from jaxphoto.errors import BlockError, JaxphotoError, RankError
 from jaxphoto.losses import AbstractLoss, Tukey
@@ -105,6 +105,8 @@ def snoop(
         if bool(found.adjusted.converged) and float(found.adjusted.sigma0) <= _FITS:
             return found
     if found is None:
+        # What the block cannot tell with all of its observations either, is said as ever.
+        solve(block, start, block.priors, max_steps, sizes)
         raise BlockError(
             "so much contradicts the other observations that without it too little is left to adjust: look at names, "
             f"units, axes and the order of rows (an adjustment of all says more). What ended the search: {failed}"

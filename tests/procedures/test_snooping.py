@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from jaxphoto import adjust, read_block, snoop
+from jaxphoto.errors import RankError
 from tests.blocks import simulated
 
 
@@ -180,3 +181,17 @@ def test_coordinates_that_are_wrong_are_not_taken_for_an_exchange(block):
     assert not found.exchanged
     rows = {s.row for s in found.left_out if s.group == "control_points"}
     assert rows and rows <= set(one.tolist())
+
+
+def test_what_no_observations_tell_is_said_as_by_an_adjustment(block):
+    """Not that too much contradicts too much: nothing does."""
+    p, stations = block.image_points, block.stations
+    of_two_points = (p.image != 3) | np.isin(np.arange(len(p)), np.flatnonzero(p.image == 3)[:2])
+    part = block.with_observations(
+        {"image_points": p.take(of_two_points), "stations": stations.take(np.asarray(stations.who) != 3)}
+    )
+    with pytest.raises(RankError) as told:
+        snoop(part, part.start.unknowns)
+    with pytest.raises(RankError) as plain:
+        adjust(part, part.start.unknowns)
+    assert str(told.value) == str(plain.value)
