@@ -104,7 +104,8 @@ class WeakDirection(NamedTuple):
 
 def yardsticks(adjusted: Adjustment) -> Yardsticks:
     """What unknowns of `adjusted` are measured in."""
-    scale, block = jax.tree.map(still, adjusted.equations.scale), adjusted.block
+    # An optimum that fits nothing may have a camera turned inside out, with c and these below zero.
+    scale, block = jax.tree.map(lambda v: np.abs(still(v)), adjusted.equations.scale), adjusted.block
     ground = float(max(scale.eop[:3].max(initial=0.0), scale.points.max(initial=0.0)))
     angle = float(scale.eop[3:].max(initial=0.0))
     observed = [float(np.median(still(rows.sigma))) for rows in (block.stations, block.control) if len(rows)]

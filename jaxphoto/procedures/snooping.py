@@ -55,6 +55,8 @@ _LOOSE = 1e-4
 _STILL = 0.02
 # Where the others agree no better than this, weights do not explain it (docs/trust.md), and there is another beginning.
 _FITS = 3.0
+# Of all image points, what must be left: most of them are not wrong.
+_LEAST_LEFT = 0.5
 # A blunder inflates the residuals around it: in one turn nothing goes that is less than this part of the worst.
 _BESIDE_THE_WORST = 0.5
 
@@ -98,6 +100,9 @@ def snoop(
                 begun = robust(block, beginning, start, max_steps=max_steps, sizes=sizes, report=report)
                 begin = begun.at, checked_parts(begun.at), begun.astray
             new = _snooped(block, *begin, max_steps, sizes, report)
+            left, number = len(new.adjusted.block.image_points), len(block.image_points)
+            if left < _LEAST_LEFT * number:
+                raise BlockError(f"{left} of {number} image points are left")
         except (RankError, BlockError) as error:
             failed = failed or error
             continue
@@ -157,8 +162,9 @@ def _snooped(
             # What does not fit although it was exchanged, or fits as well as it was given, gets its own back; where
             # nothing fits, all do.
             fits = bool(adjusted.converged) and sigma0 <= _FITS
-            if undone := [e for e in done if not fits or not _needed(at, left, e, sigma0)]:
-                for exchange in undone:
+            wrong = [not fits or not _needed(at, left, e, sigma0) for e in done]
+            if undone := _with_what_rests_on_them(done, wrong):
+                for exchange in reversed(undone):
                     block, left = exchanged(block, left, exchange._replace(back={}))
                     done.remove(exchange)
                 tried.clear()
@@ -192,6 +198,18 @@ def _exchanges(
             known.update((e.group, e.rows) for e in new)
             return new, placed
     return [], at
+
+
+def _with_what_rests_on_them(done: list[Exchange], wrong: list[bool]) -> list[Exchange]:
+    """The exchanges that are wrong, and those after them of the same rows."""
+    found: list[Exchange] = []
+    rows: set[tuple[str, int]] = set()
+    for exchange, bad in zip(done, wrong, strict=True):
+        own = {(exchange.group, row) for pair in exchange.rows for row in pair}
+        if bad or own & rows:
+            found.append(exchange)
+            rows |= own
+    return found
 
 
 def _needed(at: Adjustment, left: Masks, exchange: Exchange, sigma0: float) -> bool:

@@ -84,7 +84,7 @@ def _global_test(tables: Tables) -> Iterator[Finding]:
                 f"{'stretches' if factor > 1 else 'shrinks'}; sigma naught of its image points is expected to be "
                 f'{factor:.3g}, not 1: say residuals = "measured" in [cameras.{camera}]',
             )
-    tested = [f for f in group_factors(tables.adjusted, tables.redundancy) if f.group != IMAGE_POINTS or f.p_value < 1]
+    tested = group_factors(tables.adjusted, tables.redundancy)
     factors = [f for f in tested if f.p_value < LEVEL / len(tested)]
     if whole.p_value >= LEVEL:
         # Of few observations beside many, sigma naught shows nothing.

@@ -7,6 +7,7 @@ import pandas as pd
 
 from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
 from jaxphoto.block import Block
+from jaxphoto.errors import few
 from jaxphoto.observations import Correlated
 from jaxphoto.procedures import Snooped
 from jaxphoto.report.findings import Finding, Level
@@ -88,11 +89,11 @@ def _too_many(snooped: Snooped, block: Block) -> Iterator[str]:
     out = np.isin(rows.point, [block.points.index(point) for point in snooped.points])
     out[[s.row for s in snooped.left_out if s.group == rows.group]] = True
     seen, gone = (np.bincount(rows.image[k], minlength=len(block.images)) for k in (np.s_[:], out))
-    for image in np.flatnonzero((gone >= _SEVERAL) & (gone > seen / 2)).tolist():
+    most = np.flatnonzero((gone >= _SEVERAL) & (gone > seen / 2)).tolist()
+    if images := [f"{block.images[k]} ({gone[k]} of {seen[k]})" for k in most]:
         yield (
-            f"{gone[image]} of the {seen[image]} image points of image {block.images[image]} are left out: no single "
-            "errors; look at its names of points, the axes of its coordinates, its camera and its station, or leave it "
-            "out"
+            f"most image points of image {few(images)} are left out: no single errors; look at its names of points, "
+            "the axes of its coordinates, its camera and its station, or leave it out"
         )
     for name, own in block.named_observations.items():
         left = [s.row for s in snooped.left_out if s.group == name]
