@@ -6,7 +6,8 @@
 2. What contradicts it is left out, and the block adjusted without it. Then, in turns: each observation left out is
    predicted by the others and put back where the prediction agrees; of those that are in, the worst of each point is
    left out where it contradicts the others (Baarda's data snooping). Until nothing changes.
-3. Two image points of one image that each lie where the other should be have changed names, and get them back.
+3. Two control points or stations that have each other's coordinates, and two image points of one image that have each
+   other's name, get them back.
 4. At the end, points that went while blunders still turned the images are put back where their rays meet after all.
 
 Sources: Baarda (1968), A testing procedure for use in geodetic networks; Huber (1981), Robust statistics.
@@ -190,10 +191,11 @@ def _exchanges(
 
     Of coordinates first: wrong ones turn images, in which names then seem exchanged.
     """
-    for pairs, placed in (
-        coordinate_exchanges(at, left, lost, sizes),
-        name_exchanges(at, left, lost, sigma0, r),
+    for find in (
+        lambda: coordinate_exchanges(at, left, lost, sizes),
+        lambda: name_exchanges(at, left, lost, sigma0, r),
     ):
+        pairs, placed = find()
         if new := [e for e in pairs if (e.group, e.rows) not in known]:
             known.update((e.group, e.rows) for e in new)
             return new, placed

@@ -8,10 +8,11 @@ import pandas as pd
 from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
 from jaxphoto.block import Block
 from jaxphoto.errors import few
-from jaxphoto.observations import Correlated
+from jaxphoto.observations import AbstractObservations, Correlated
 from jaxphoto.procedures import Snooped
 from jaxphoto.report.findings import Finding, Level
 from jaxphoto.report.tables import in_file_unit
+from jaxphoto.statistics import Suspect
 
 _SHOWN = 5
 # So many are no chance, and agree where they scatter by no more than so many of their standard deviations.
@@ -61,11 +62,7 @@ def snooped_findings(snooped: Snooped, block: Block) -> list[Finding]:
 
 def _alike(snooped: Snooped, block: Block) -> Iterator[str]:
     """Most numbers of a strip along an axis, or of all, off by the same amount: no blunders."""
-    for name, rows in block.named_observations.items():
-        left = [s for s in snooped.left_out if s.group == name]
-        if name == IMAGE_POINTS or isinstance(rows, Correlated) or len(left) < _SEVERAL:
-            continue
-        axes = np.atleast_2d(np.broadcast_to(rows.axis_names(), np.shape(rows.observation)[::-1]))
+    for name, rows, left, axes in _of_further_groups(snooped, block):
         strips = np.broadcast_to(rows.names_of("image", block.image_strip), axes.shape)
         for axis, strip in sorted({(str(axes[s.number, s.row]), str(strips[s.number, s.row])) for s in left}):
             part = (axes == axis) & (strips == strip)
@@ -83,6 +80,17 @@ def _alike(snooped: Snooped, block: Block) -> Iterator[str]:
                 )
 
 
+def _of_further_groups(
+    snooped: Snooped, block: Block
+) -> Iterator[tuple[str, AbstractObservations, list[Suspect], np.ndarray]]:
+    """Groups besides image points of which several rows are left out, these, and the axis of each number."""
+    for name, rows in block.named_observations.items():
+        left = [s for s in snooped.left_out if s.group == name]
+        if name != IMAGE_POINTS and not isinstance(rows, Correlated) and len(left) >= _SEVERAL:
+            axes = np.broadcast_to(rows.axis_names(), np.shape(rows.observation)[::-1])
+            yield name, rows, left, np.atleast_2d(axes)
+
+
 def _too_many(snooped: Snooped, block: Block) -> Iterator[str]:
     """Images and groups, along an axis, of which too much is left out to be single errors."""
     rows = block.image_points
@@ -95,12 +103,8 @@ def _too_many(snooped: Snooped, block: Block) -> Iterator[str]:
             f"most image points of image {few(images)} are left out: no single errors; look at its names of points, "
             "the axes of its coordinates, its camera and its station, or leave it out"
         )
-    for name, own in block.named_observations.items():
-        left = [s.row for s in snooped.left_out if s.group == name]
-        if name == IMAGE_POINTS or isinstance(own, Correlated) or len(left) < _SEVERAL:
-            continue
-        axes = np.broadcast_to(own.axis_names(), np.shape(own.observation)[::-1])
-        lost = np.isin(np.arange(len(own)), left)
+    for name, own, left, axes in _of_further_groups(snooped, block):
+        lost = np.isin(np.arange(len(own)), [s.row for s in left])
         counted = {a: (int(((axes == a) & lost).sum()), int((axes == a).sum())) for a in dict.fromkeys(axes.flat)}
         if many := [f"{n} of {of} in {a}" for a, (n, of) in counted.items() if n >= _SEVERAL and n > of / 3]:
             yield (
