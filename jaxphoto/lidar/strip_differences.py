@@ -10,15 +10,20 @@ from itertools import combinations
 
 import numpy as np
 
-from jaxphoto.lidar.cell_returns import CellReturns, columns_and_rows
+from jaxphoto.cloud import Cloud
+from jaxphoto.lidar.cell_returns import CellReturns, CellTally, columns_and_rows
 from jaxphoto.lidar.corresponding_planes import corresponding, planes_from
 from jaxphoto.lidar.raster import Raster
 from jaxphoto.lidar.strip_settings import StripSettings
 
 
-def strip_differences(strips: Iterable[CellReturns], settings: StripSettings) -> Raster | None:
-    """The gaps (m) of strips in their cells of `settings.cell_m`, NaN where none is; None without any."""
-    patches = [planes_from(cells, settings) for cells in strips]
+def strip_differences(strips: Cloud | Iterable[CellReturns], settings: StripSettings) -> Raster | None:
+    """The gaps (m) of strips in their cells of `settings.cell_m`, NaN where none is; None without any.
+
+    Of a cloud that is larger than memory its cells alone will do.
+    """
+    cells = _cells(strips, settings) if isinstance(strips, Cloud) else strips
+    patches = [planes_from(own, settings) for own in cells]
     columns, ups = columns_and_rows(np.concatenate([p.cell for p in patches]))
     if not len(columns):
         return None
@@ -36,3 +41,10 @@ def strip_differences(strips: Iterable[CellReturns], settings: StripSettings) ->
     if np.isnan(gaps).all():
         return None
     return Raster(gaps, west * settings.cell_m, (south + rows) * settings.cell_m, settings.cell_m)
+
+
+def _cells(cloud: Cloud, settings: StripSettings) -> Iterable[CellReturns]:
+    tally = CellTally(settings)
+    for k, name in enumerate(cloud.strips):
+        tally.add(name, cloud.xyz[cloud.strip == k])
+    return tally.strips.values()

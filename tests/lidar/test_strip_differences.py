@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from jaxphoto.cloud import Cloud
 from jaxphoto.lidar.cell_returns import CellTally
 from jaxphoto.lidar.strip_differences import strip_differences
 from jaxphoto.lidar.strip_settings import StripSettings
@@ -31,6 +32,13 @@ def test_gaps_are_where_strips_overlap_with_their_sign():
     there = np.isfinite(gap)
     assert there[(x > 20) & (x < 30) & (y > 100) & (y < 120)].all() and not there[(x < 20) | (x > 30)].any()
     np.testing.assert_allclose(gap[there], 0.12, atol=0.02)
+
+
+def test_a_cloud_has_the_gaps_of_its_cells():
+    parts = strip(0.0, 30.0, 0.0), strip(20.0, 50.0, 0.12)
+    cloud = Cloud(np.concatenate(parts), strip=np.repeat([0, 1], 20_000), strips=("a", "b"))
+    found, expected = (strip_differences(of, SETTINGS) for of in (cloud, cells_of_strips(*parts)))
+    np.testing.assert_allclose(found.heights, expected.heights, atol=1e-12)
 
 
 def test_of_three_strips_the_largest_gap_counts_and_rough_ground_has_none():
