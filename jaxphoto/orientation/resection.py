@@ -137,11 +137,11 @@ def _triples(ideal, points):
     angles = np.arange(12) * np.pi / 6
     extreme = np.unique(np.argmax(ideal @ np.stack([np.cos(angles), np.sin(angles)]), axis=0))
     among = np.arange(len(ideal)) if len(ideal) <= 12 else extreme
-    large = np.array(list(combinations(among, 3)))
+    large = np.array(list(combinations(among, 3)), int).reshape(-1, 3)
     random = np.random.default_rng(0).integers(len(ideal), size=(200, 3))
     area = _area(ideal, points, large)
     large = large[np.argsort(-area)[:_TRIANGLES]]
-    random = random[_area(ideal, points, random) > 0.1 * area.max()][:_TRIANGLES]
+    random = random[_area(ideal, points, random) > 0.1 * area.max(initial=0.0)][:_TRIANGLES]
     triples = np.unique(np.sort(np.concatenate([large, random]), axis=1), axis=0)
     return triples[_area(ideal, points, triples) > 0]
 

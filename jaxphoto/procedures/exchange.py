@@ -10,6 +10,7 @@ from jaxtyping import Float
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.arrays import still
 from jaxphoto.block import Block
+from jaxphoto.orientation.rays import camera_rays, turn_to_object
 from jaxphoto.procedures.robust import Masks
 
 
@@ -17,22 +18,31 @@ class Exchange(NamedTuple):
     """Rows of a group to exchange with one another: what was observed, and its standard deviation."""
 
     group: str
-    rows: tuple[tuple[int, int], ...]
+    rows: tuple[tuple[int, ...], ...]
+    """Two or more each: the first gets what was observed in the second, and so on; the last what was in the first."""
     words: str
     """Such as "points 12 and 31 of image A2 had each other's name"."""
     back: dict[str, tuple[int, ...]]
     """By group, rows that are in again, once these are exchanged."""
+    out: tuple[int, ...] = ()
+    """Rows of the group that have what belongs to none of them, and go."""
+
+    @property
+    def undone(self) -> "Exchange":
+        """Everything as it was; nothing is in again, or goes."""
+        return self._replace(rows=tuple(rows[::-1] for rows in self.rows), back={}, out=())
 
 
 def exchanged(block: Block, left: Masks, exchange: Exchange) -> tuple[Block, Masks]:
     """The block with these rows exchanged, and what is no longer left out."""
     rows = block.named_observations[exchange.group]
     order = np.arange(len(rows))
-    one, other = np.array(exchange.rows).T
-    order[one], order[other] = other, one
+    for own in exchange.rows:
+        order[list(own)] = np.roll(own, -1)
     new, sigma = rows.with_observation(still(rows.observation)[order]), still(rows.sigmas)
     new = new.with_sigmas_times(sigma[order] / sigma)
-    left = left | {group: _without(left[group], back) for group, back in exchange.back.items()}
+    left = left | {group: _marked(left[group], back, False) for group, back in exchange.back.items()}
+    left = left | {exchange.group: _marked(left[exchange.group], exchange.out, True)} if exchange.out else left
     return block.with_observations({exchange.group: new}), left
 
 
@@ -44,7 +54,21 @@ def with_places(at: Adjustment, places: Mapping[int, Float[np.ndarray, "3"]]) ->
     return eqx.tree_at(lambda a: a.unknowns.points, at, points)
 
 
-def _without(left: np.ndarray, back: tuple[int, ...]) -> np.ndarray:
-    out = left.copy()
-    out[list(back)] = False
-    return out
+def rays_of(
+    at: Adjustment,
+) -> tuple[Float[np.ndarray, "rows 3"], Float[np.ndarray, "rows 3"], Float[np.ndarray, "rows"]]:
+    """Of each image point, where its ray begins (m), its direction in the object frame, and c (mm) of its camera."""
+    block, exterior = at.block, at.unknowns.exterior
+    p, measured = block.image_points, still(block.image_points.xy)
+    camera, rays, c = np.array(block.image_camera, object)[p.image], np.zeros((len(p), 3)), np.ones(len(p))
+    for name, interior in at.unknowns.interior.items():
+        own = camera == name
+        if own.any():
+            rays[own], c[own] = camera_rays(interior, measured[own]), float(interior.c)
+    return still(exterior.position)[p.image], turn_to_object(still(exterior.camera_from_object), p.image, rays), c
+
+
+def _marked(left: np.ndarray, rows: tuple[int, ...], out: bool) -> np.ndarray:
+    found = left.copy()
+    found[list(rows)] = out
+    return found

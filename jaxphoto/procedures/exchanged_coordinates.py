@@ -1,31 +1,35 @@
-"""Two control points that have each other's coordinates, or two images each other's station.
+"""Control points that have one another's coordinates, or images one another's stations: two, or a file off by a row.
 
-The images alone say where either is: a point, where its rays meet; an image, from where it sees its points. Where each
-lies where the other is said to be, the two were exchanged. As well may the names of the two points have been exchanged
-in all images: no measurement tells one from the other, and the camera is the same.
+The images alone say where each is: a point, where its rays meet; an image, from where it sees its points. Where one
+lies where another is said to be, that other's coordinates are its own. As well may the names of the points have been
+exchanged in all images: no measurement tells one from the other, and the camera is the same.
 """
 
-from collections.abc import Iterator
-from itertools import combinations
+from collections.abc import Iterator, Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxphoto.adjustment import Adjustment, Sizes, linearise
 from jaxphoto.arrays import still
 from jaxphoto.block import Block
 from jaxphoto.collinearity import ExteriorOrientation
-from jaxphoto.errors import BlockError
+from jaxphoto.errors import BlockError, few
 from jaxphoto.observations import AbstractCoordinates
 from jaxphoto.orientation import resect
-from jaxphoto.procedures.exchange import Exchange, with_places
+from jaxphoto.orientation.block_intersection import intersect_points
+from jaxphoto.procedures.exchange import Exchange, rays_of, with_places
 from jaxphoto.procedures.exchanged_names import points_that_meet
 from jaxphoto.procedures.robust import Masks
 
-# Two may have each other's coordinates where each lies as near to those of the other, beside how far apart these are.
+# One may have another's coordinates where it lies as near to those, beside the next nearest.
 _NEAR = 0.2
+# So much nearer where all of a group is out: then it turns nothing, and what is seen is as good as the rest.
+_NEARER = 0.05
+# A resection needs so many points.
+_ENOUGH = 4
 # An image may have another's station where more of its points than this part contradict the others.
 _DOUBTED = 0.25
 
@@ -53,24 +57,80 @@ def coordinate_exchanges(
             by_images, placed = _placed_images(at, doubted, gone)
         there = linearise(at.block, by_images.unknowns, at.block.priors, sizes)
         off = np.where(np.isin(who, placed), rows.physical(still(there.residuals[group])), np.nan)
-        if new := [_exchange(at.block, rows, what, *pair) for pair in _pairs(rows, who, doubted, off)]:
+        near = _NEARER if left[group].all() else _NEAR
+        if new := [_exchange(at.block, rows, what, *own) for own in _rounds(rows, who, doubted, off, near)]:
             found, at = found + new, by_images
     return found, at
 
 
+def as_one(block: Block, done: Sequence[Exchange], left: Masks) -> list[Exchange]:
+    """Exchanges of coordinates that were found one after the other as what they come to; all others as they are.
+
+    Rows that are `left` out in the end have nothing that is their own.
+    """
+    found = []
+    for group, rows in block.named_observations.items():
+        own = [e for e in done if e.group == group]
+        if not isinstance(rows, AbstractCoordinates) or not own:
+            found += own
+            continue
+        order, lacks = np.arange(len(rows)), set(np.flatnonzero(left[group]).tolist())
+        for row_rounds in (e.rows for e in own):
+            for one in row_rounds:
+                order[list(one)] = order[np.roll(one, -1)]
+        ((what, who),) = ((what, still(index)) for what, index in rows.indices())
+        rounds: dict[tuple[int, ...], list[tuple[int, ...]]] = {}
+        for one in _rounds_of(order, lacks):
+            rounds.setdefault(tuple(who[list(one)].tolist()), []).append(one)
+        for ids, axes in rounds.items():
+            gone = tuple(row for one in axes for row in one[-1:] if row in lacks)
+            found.append(_exchange(block, rows, what, ids, tuple(axes), gone))
+    return found
+
+
+def _rounds_of(order: Int[np.ndarray, "rows"], last: set[int]) -> Iterator[tuple[int, ...]]:
+    """The rows that take each other's numbers, `order[k]` those of row k; one of `last` at the end."""
+    seen: set[int] = set()
+    for first in np.flatnonzero(order != np.arange(len(order))).tolist():
+        if first in seen:
+            continue
+        one = [first]
+        while (following := int(order[one[-1]])) != first:
+            one.append(following)
+        seen.update(one)
+        end = next((k + 1 for k, row in enumerate(one) if row in last), 0)
+        yield (*one[end:], *one[:end])
+
+
 def _exchange(
-    block: Block, rows: AbstractCoordinates, what: str, ids: tuple[int, int], pairs: tuple[tuple[int, int], ...]
+    block: Block,
+    rows: AbstractCoordinates,
+    what: str,
+    ids: tuple[int, ...],
+    own: tuple[tuple[int, ...], ...],
+    lacks: tuple[int, ...],
 ) -> Exchange:
     p = block.image_points
     seen = np.flatnonzero(np.isin(p.point if what == "point" else p.image, ids))
-    back = {p.group: tuple(seen.tolist()), rows.group: tuple(row for pair in pairs for row in pair)}
-    one, other = ((block.points if what == "point" else block.images)[k] for k in ids)
-    words = (
-        f"control points {one} and {other} had each other's coordinates, or their names are exchanged in all images"
+    back = {p.group: tuple(seen.tolist()), rows.group: tuple(row for of_axis in own for row in of_axis)}
+    names = [(block.points if what == "point" else block.images)[k] for k in ids]
+    many, has, otherwise = (
+        ("control points", "coordinates", "their names are exchanged in all images")
         if what == "point"
-        else f"images {one} and {other} had each other's station, or their image points are exchanged"
+        else ("images", "station", "their image points are exchanged")
     )
-    return Exchange(rows.group, pairs, words, back)
+    if len(ids) == 2 and not lacks:
+        words = f"{many} {names[0]} and {names[1]} had each other's {has}, or {otherwise}"
+    else:
+        stood = [f"{a}'s stood at {b}" for a, b in zip(names, names[1:] + names[:1], strict=True)]
+        stood = stood[: -1 if lacks else None]
+        # In the order of the block, but for the turn from one end to the other.
+        off = int((np.abs(np.diff([*ids, ids[0]])) == 1).sum()) >= len(ids) - 1
+        words = (
+            f"{len(ids)} {many} had one another's {has}, {few(stood)}"
+            f"{': the rows are off by one' if off else ''}; or {otherwise}"
+        )
+    return Exchange(rows.group, own, words, back, lacks)
 
 
 def _doubted(
@@ -88,44 +148,85 @@ def _doubted(
 def _placed_images(
     at: Adjustment, images: Int[np.ndarray, "doubted"], gone: Int[np.ndarray, "points"]
 ) -> tuple[Adjustment, list[int]]:
-    """`at` with these images where they see their points from, and which of them have enough of them."""
+    """`at` with these images where they see their points from, and which of them have enough of them.
+
+    Points are taken where other images see them, as far as these are enough: an image whose station is wrong has drawn
+    them with it.
+    """
     block, exterior = at.block, at.unknowns.exterior
     p, points = block.image_points, still(at.unknowns.points)
     positions, matrices = (np.array(still(v)) for v in (exterior.position, exterior.camera_from_object))
     placed = []
     for image in images.tolist():
-        own = (p.image == image) & ~np.isin(p.point, gone)
+        own = np.flatnonzero((p.image == image) & ~np.isin(p.point, gone))
+        known, which = np.unique(p.point[own], return_inverse=True)
+        met, told = _met(at, known, np.isin(p.point, known) & (p.image != image))
+        places = met if told.sum() >= _ENOUGH else points[known]
+        chosen = np.isfinite(places[which]).all(axis=1)
         interior = at.unknowns.interior[block.image_camera[image]]
         try:
-            seen = resect(interior, still(p.xy)[own], points[p.point[own]], block.images[image])
+            seen = resect(interior, still(p.xy)[own[chosen]], places[which[chosen]], block.images[image])
         except BlockError:
             continue
         positions[image], matrices[image] = still(seen.position), still(seen.camera_from_object)
         placed.append(image)
     new = ExteriorOrientation(jnp.asarray(positions), jnp.asarray(matrices))
-    return eqx.tree_at(lambda a: a.unknowns.exterior, at, new), placed
+    at = eqx.tree_at(lambda a: a.unknowns.exterior, at, new)
+    # What they see goes with them: from where wrong stations had drawn it, it would draw them back.
+    known = np.unique(p.point[np.isin(p.image, placed)])
+    met, told = _met(at, known, np.isin(p.point, known))
+    return with_places(at, dict(zip(known[told].tolist(), met[told], strict=True))), placed
 
 
-def _pairs(rows: AbstractCoordinates, who, doubted, off: Float[np.ndarray, "rows"]) -> Iterator[tuple]:
-    """Pairs of the doubted that lie where the other should be, the nearest first, with their rows.
+def _met(
+    at: Adjustment, points: Int[np.ndarray, "n"], rows: Bool[np.ndarray, "rows"]
+) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, "n"]]:
+    """Where the rays of these rows meet (m), point by point, and whether they do."""
+    origins, directions, _ = rays_of(at)
+    which = np.searchsorted(points, at.block.image_points.point[rows])
+    return intersect_points(origins[rows], directions[rows], which, len(points))
 
-    `off` is observed minus seen (m), and no number where the images do not tell: then the other of the two decides, of
-    coordinates that are not of a single axis.
+
+def _rounds(rows: AbstractCoordinates, who, doubted, off: Float[np.ndarray, "rows"], near: float) -> Iterator[tuple]:
+    """Of the doubted, those of which each lies where the next is said to be, and their rows, axis by axis.
+
+    `off` is observed minus seen (m), and no number where the images do not tell. The last lies where the first is said
+    to be; or is not seen, and coordinates are then not of a single axis; or lies elsewhere, and what it gets has to go:
+    a file that is off by a row lacks one, and one row may be there twice.
     """
-    value, found = np.asarray(rows.value), []
     own = {int(k): np.flatnonzero(who == k) for k in doubted}
     own = {k: mine[np.argsort(rows.axis[mine])] for k, mine in own.items()}
-    for (a, one), (b, other) in combinations(own.items(), 2):
-        if not np.array_equal(rows.axis[one], rows.axis[other]):
-            continue
-        apart = value[other] - value[one]
-        # Where the one is seen, from where the other is said to be; and the other way round.
-        misses = np.array([np.abs(apart + off[one]).max(), np.abs(apart - off[other]).max()])
-        misses = misses[np.isfinite(misses)] / max(np.abs(apart).max(), 1e-9)
-        if len(misses) == 2 or (len(misses) == 1 and len(one) > 1):
-            found.append((float(misses.max()), (a, b), tuple(zip(one.tolist(), other.tolist(), strict=True))))
-    done: set[int] = set()
-    for miss, ids, pairs in sorted(found):
-        if miss < _NEAR and not done.intersection(ids):
-            done.update(ids)
-            yield ids, pairs
+    after = _lying_at(rows, own, off, near)
+    while after:
+        first = next((k for k in after if k not in after.values()), next(iter(after)))
+        ids = [first]
+        while (following := after.pop(ids[-1], None)) not in (None, first):
+            ids.append(following)
+        last = own[ids[-1]]
+        closed, unseen = following == first, not np.isfinite(off[last]).all()
+        if closed or len(ids) > 2 or len(last) > 1:
+            lacks = () if closed or unseen else tuple(last.tolist())
+            yield tuple(ids), tuple(zip(*(own[k].tolist() for k in ids), strict=True)), lacks
+
+
+def _lying_at(
+    rows: AbstractCoordinates, own: dict[int, Int[np.ndarray, "axes"]], off: Float[np.ndarray, "rows"], near: float
+) -> dict[int, int]:
+    """Which is seen where which other one is said to be."""
+    found: list[tuple[float, int, int]] = []
+    for axes in {tuple(rows.axis[mine].tolist()) for mine in own.values()}:
+        ids = [k for k, mine in own.items() if tuple(rows.axis[mine].tolist()) == axes]
+        said = np.array([np.asarray(rows.value)[own[k]] for k in ids])
+        seen = said - np.array([off[own[k]] for k in ids])
+        told = np.flatnonzero(np.isfinite(seen).all(axis=1))
+        for k in told.tolist() if len(ids) > 1 else ():
+            miss = np.abs(said - seen[k]).max(axis=1)
+            nearest, second = np.argsort(miss)[:2].tolist()
+            # Who lies where it is said to be has its own; and of many some lie near another's by chance.
+            if nearest != k and miss[nearest] < near * miss[second]:
+                found.append((float(miss[nearest]), ids[k], ids[nearest]))
+    after: dict[int, int] = {}
+    for _, a, b in sorted(found):
+        if b not in after.values():
+            after[a] = b
+    return after

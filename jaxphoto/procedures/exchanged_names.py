@@ -16,9 +16,8 @@ from jaxphoto.adjustment import Adjustment
 from jaxphoto.arrays import still
 from jaxphoto.block import Block
 from jaxphoto.orientation.block_intersection import intersect_points
-from jaxphoto.orientation.rays import camera_rays, turn_to_object
 from jaxphoto.procedures.cross_validation import measured_discrepancies
-from jaxphoto.procedures.exchange import Exchange, exchanged, with_places
+from jaxphoto.procedures.exchange import Exchange, exchanged, rays_of, with_places
 from jaxphoto.procedures.robust import Blocks, Masks
 from jaxphoto.statistics import LEVEL, chi_square_limit
 
@@ -103,14 +102,9 @@ def _seen(at: Adjustment, left: Masks, gone: Int[np.ndarray, "points"], sigma0: 
     block, unknowns = at.block, at.unknowns
     p = block.image_points
     measured = still(p.xy)
-    positions, matrices = (still(v) for v in (unknowns.exterior.position, unknowns.exterior.camera_from_object))
-    camera, rays, c = np.array(block.image_camera, object)[p.image], np.zeros((len(p), 3)), np.ones(len(p))
-    for name, interior in unknowns.interior.items():
-        own = camera == name
-        if own.any():
-            rays[own], c[own] = camera_rays(interior, measured[own]), float(interior.c)
+    origins, directions, c = rays_of(at)
     is_gone = np.isin(np.arange(len(block.points)), gone)
-    far = np.linalg.norm(still(unknowns.points)[p.point] - positions[p.image], axis=1)
+    far = np.linalg.norm(still(unknowns.points)[p.point] - origins, axis=1)
     depths = np.tile([np.inf, 0.0], (len(block.images), 1))
     sound = ~is_gone[p.point] & ~left[p.group]
     np.minimum.at(depths[:, 0], p.image[sound], far[sound])
@@ -121,8 +115,8 @@ def _seen(at: Adjustment, left: Masks, gone: Int[np.ndarray, "points"], sigma0: 
         measured - measured_discrepancies(block, unknowns),
         is_gone,
         left[p.group],
-        positions[p.image],
-        turn_to_object(matrices, p.image, rays),
+        origins,
+        directions,
         still(p.sigma).mean(axis=1) / c,
         depths * [1 / _DEPTH, _DEPTH],
         sigma0**2 * float(chi_square_limit(np.array(1), LEVEL / len(p))),

@@ -2,11 +2,11 @@
 
 1. The block is adjusted with weights that fall with the residual (Huber), again and again: many blunders hide one
    another from the test of a single one, but hardly move such an estimate. Where that leads to nothing that fits
-   (enormous errors in an image of few points), it begins again with Tukey's loss, which forgets them.
+   (enormous errors in an image of few points; a file in other units), it begins elsewhere (`beginnings`).
 2. What contradicts it is left out, and the block adjusted without it. Then, in turns: each observation left out is
    predicted by the others and put back where the prediction agrees; of those that are in, the worst of each point is
    left out where it contradicts the others (Baarda's data snooping). Until nothing changes.
-3. Two control points or stations that have each other's coordinates, and two image points of one image that have each
+3. Control points or stations that have one another's coordinates, and two image points of one image that have each
    other's name, get them back.
 4. At the end, points that went while blunders still turned the images are put back where their rays meet after all.
 
@@ -21,43 +21,37 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxphoto.adjustment import MAX_STEPS, Adjustment, Sizes, common_sizes, linearise, solve
+from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
 from jaxphoto.block import Block
-from jaxphoto.errors import BlockError, JaxphotoError, RankError
-from jaxphoto.losses import AbstractLoss, Tukey
-from jaxphoto.observations import AbstractCoordinates, AbstractObservations
+from jaxphoto.errors import BlockError, DatumError, JaxphotoError, RankError
+from jaxphoto.losses import AbstractLoss
+from jaxphoto.observations import Correlated
 from jaxphoto.procedures.adjust import start_of
+from jaxphoto.procedures.beginnings import Begun, beginnings, weighed
 from jaxphoto.procedures.exchange import Exchange, exchanged, with_places
-from jaxphoto.procedures.exchanged_coordinates import coordinate_exchanges
+from jaxphoto.procedures.exchanged_coordinates import as_one, coordinate_exchanges
 from jaxphoto.procedures.exchanged_names import name_exchanges, points_that_meet, put_back
-from jaxphoto.procedures.robust import (
-    Blocks,
-    Masks,
-    all_points,
-    checked_parts,
-    residual_scales,
-    robust,
-    solve_placed,
-)
+from jaxphoto.procedures.robust import Blocks, Masks, all_points, checked_parts, residual_scales, solve_placed
 from jaxphoto.statistics import (
     LEAST_CHECKED,
     LEAST_SIGMA0,
     LEVEL,
+    UNCHECKED,
     Suspect,
     chi_square_limit,
 )
 from jaxphoto.unknowns import Unknowns
 
-# Huber's constant: residuals of so many standard deviations count whole (95 % efficient where all are normal).
-_HUBER = 1.345
-_ROBUST_STEPS, _ROUNDS = 10, 20
-# Weight of control and stations in a beginning that takes their word for hardly more than the datum: sigma times 100.
-_LOOSE = 1e-4
-# A weight that changes by less, in a robust step, no longer changes what is suspected.
-_STILL = 0.02
+_ROUNDS = 20
 # Where the others agree no better than this, weights do not explain it (docs/trust.md), and there is another beginning.
 _FITS = 3.0
 # Of all image points, what must be left: most of them are not wrong.
 _LEAST_LEFT = 0.5
+SEVERAL = 4
+"""So many are no chance; and more of a group than `_SINGLE` no single errors."""
+_SINGLE = 1 / 3
+# Standard deviations of what is left out times this are next to nothing, and yet known to many digits.
+_WEAK = 1000.0
 # A blunder inflates the residuals around it: in one turn nothing goes that is less than this part of the worst.
 _BESIDE_THE_WORST = 0.5
 
@@ -90,29 +84,23 @@ def snoop(
     adjustment that this means (`jaxphoto.robust`). Raises what `adjust` raises.
     """
     sizes = common_sizes([block])
-    start = start_of(block) if start is None else start
     found: Snooped | None = None
     failed: JaxphotoError | None = None
-    for beginning in (1.0, Tukey(), _LOOSE) if loss is None else (loss,):
+    for begin in beginnings(block, start, loss, max_steps, sizes, report):
         try:
-            if isinstance(beginning, float):
-                begin = _reweighted(block, start, max_steps, sizes, report, beginning)
-            else:
-                begun = robust(block, beginning, start, max_steps=max_steps, sizes=sizes, report=report)
-                begin = begun.at, checked_parts(begun.at), begun.astray
-            new = _snooped(block, *begin, max_steps, sizes, report)
+            new = _snooped(block, begin(), max_steps, sizes, report)
             left, number = len(new.adjusted.block.image_points), len(block.image_points)
             if left < _LEAST_LEFT * number:
                 raise BlockError(f"{left} of {number} image points are left")
-        except (RankError, BlockError) as error:
+        except (DatumError, RankError, BlockError) as error:
             failed = failed or error
             continue
-        found = new if found is None or new.adjusted.sigma0 < found.adjusted.sigma0 else found
-        if bool(found.adjusted.converged) and float(found.adjusted.sigma0) <= _FITS:
+        found = new if found is None or _better(new, found) else found
+        if _fits(found) and not mostly_out(found, block) and not images_out(found, block):
             return found
     if found is None:
         # What the block cannot tell with all of its observations either, is said as ever.
-        solve(block, start, block.priors, max_steps, sizes)
+        solve(block, start_of(block) if start is None else start, block.priors, max_steps, sizes)
         raise BlockError(
             "so much contradicts the other observations that without it too little is left to adjust: look at names, "
             f"units, axes and the order of rows (an adjustment of all says more). What ended the search: {failed}"
@@ -120,16 +108,44 @@ def snoop(
     return found
 
 
-def _snooped(
-    block: Block,
-    at: Adjustment,
-    r: Blocks,
-    flown: Masks,
-    max_steps: int,
-    sizes: Sizes,
-    report: Callable[[str], object],
-) -> Snooped:
-    """From where a robust adjustment has led: redundancy numbers there, and image points of points that flew away."""
+def mostly_out(snooped: Snooped, block: Block) -> dict[str, dict[str, tuple[int, int]]]:
+    """By group besides image points, and axis, how many of all, where more are left out than single errors explain."""
+    found: dict[str, dict[str, tuple[int, int]]] = {}
+    for name, rows in block.named_observations.items():
+        left = [s for s in snooped.left_out if s.group == name]
+        if name == IMAGE_POINTS or isinstance(rows, Correlated) or len(left) < SEVERAL:
+            continue
+        axes = np.atleast_2d(np.broadcast_to(rows.axis_names(), np.shape(rows.observation)[::-1]))
+        lost = np.isin(np.arange(len(rows)), [s.row for s in left])
+        counted = {a: (int(((axes == a) & lost).sum()), int((axes == a).sum())) for a in dict.fromkeys(axes.flat)}
+        if many := {a: (n, of) for a, (n, of) in counted.items() if n >= SEVERAL and n > _SINGLE * of}:
+            found[name] = many
+    return found
+
+
+def images_out(snooped: Snooped, block: Block) -> dict[int, tuple[int, int]]:
+    """By image of which more image points are left out than single errors explain, how many of all."""
+    rows = block.image_points
+    out = np.isin(np.array(block.points, object)[rows.point], snooped.points)
+    out[[s.row for s in snooped.left_out if s.group == rows.group]] = True
+    seen, gone = (np.bincount(rows.image[k], minlength=len(block.images)) for k in (np.s_[:], out))
+    return {k: (int(gone[k]), int(seen[k])) for k in np.flatnonzero((gone >= SEVERAL) & (gone > seen / 2)).tolist()}
+
+
+def _fits(found: Snooped) -> bool:
+    return bool(found.adjusted.converged) and float(found.adjusted.sigma0) <= _FITS
+
+
+def _better(one: Snooped, other: Snooped) -> bool:
+    """Whether it fits, and the other does not or leaves more out; or where neither does, fits less badly."""
+    if _fits(one) and _fits(other):
+        return len(one.left_out) < len(other.left_out)
+    return bool(one.adjusted.sigma0 < other.adjusted.sigma0)
+
+
+def _snooped(block: Block, begun: Begun, max_steps: int, sizes: Sizes, report: Callable[[str], object]) -> Snooped:
+    """From where a robust adjustment has led."""
+    at, r, flown = begun
     scale = residual_scales(at, r)
     worst = _worst(block, {name: size / scale[name] for name, size in _sizes(at, r).items()}, 1.0)
     left = {name: flown[name] | worst[name] for name in worst}
@@ -148,7 +164,7 @@ def _snooped(
         at = linearise(block, all_points(adjusted.unknowns, at.unknowns, point), block.priors, sizes)
         sigma0 = max(float(adjusted.sigma0), LEAST_SIGMA0)
         lost = np.setdiff1d(np.arange(len(block.points)), point)
-        r = checked_parts(at)
+        r = _predicted_parts(at, left, sizes)
         new, placed = _exchanges(at, left, lost, sigma0, r, sizes, known)
         for exchange in new:
             (block, left), at = exchanged(block, left, exchange), placed
@@ -166,7 +182,7 @@ def _snooped(
             wrong = [not fits or not _needed(at, left, e, sigma0) for e in done]
             if undone := _with_what_rests_on_them(done, wrong):
                 for exchange in reversed(undone):
-                    block, left = exchanged(block, left, exchange._replace(back={}))
+                    block, left = exchanged(block, left, exchange.undone)
                     done.remove(exchange)
                 tried.clear()
                 continue
@@ -181,7 +197,7 @@ def _snooped(
         tried.append(left)
         left = found
     told = _told(at, left, _stays(block, point), r, sigma0)
-    return Snooped(adjusted, told, tuple(done), tuple(block.points[p] for p in lost))
+    return Snooped(adjusted, told, tuple(as_one(block, done, left)), tuple(block.points[p] for p in lost))
 
 
 def _exchanges(
@@ -207,7 +223,7 @@ def _with_what_rests_on_them(done: list[Exchange], wrong: list[bool]) -> list[Ex
     found: list[Exchange] = []
     rows: set[tuple[str, int]] = set()
     for exchange, bad in zip(done, wrong, strict=True):
-        own = {(exchange.group, row) for pair in exchange.rows for row in pair}
+        own = {(exchange.group, row) for rows_ in exchange.rows for row in rows_}
         if bad or own & rows:
             found.append(exchange)
             rows |= own
@@ -216,59 +232,27 @@ def _with_what_rests_on_them(done: list[Exchange], wrong: list[bool]) -> list[Ex
 
 def _needed(at: Adjustment, left: Masks, exchange: Exchange, sigma0: float) -> bool:
     """Whether what was exchanged fits, and would not as it was given."""
-    p, rows = at.block.image_points, np.ravel(exchange.rows)
+    p, rows = at.block.image_points, np.setdiff1d(np.ravel(exchange.rows), exchange.out)
     if left[exchange.group][rows].mean() >= 0.5:
         return False
     if exchange.group != p.group:
         return True
-    block, _ = exchanged(at.block, left, exchange._replace(back={}))
+    block, _ = exchanged(at.block, left, exchange.undone)
     points = np.unique(p.point[rows])
     given = eqx.tree_at(lambda a: a.block, at, block)
     return len(points_that_meet(given, left, points, sigma0)) < len(points)
-
-
-def _reweighted(
-    block: Block, start: Unknowns, max_steps: int, sizes: Sizes, report: Callable[[str], object], loose: float
-) -> tuple[Adjustment, Blocks, Masks]:
-    """The block where weights that fall with the residual have led, linearised; the redundancy numbers there; and the
-    image points of points that flew away.
-    """
-    rows, unknowns = block.named_observations, start
-    least = {name: loose if isinstance(own, AbstractCoordinates) else 1.0 for name, own in rows.items()}
-    weight = {name: np.full(len(own), least[name]) for name, own in rows.items()}
-    left = {name: np.zeros(len(own), bool) for name, own in rows.items()}
-    at: Adjustment | None = None
-    r: Blocks = {}
-    for step in range(_ROBUST_STEPS + 1):
-        report(f"robust step {step}" if step else "adjusting all observations")
-        weighed = block.with_observations({name: _weighed(own, weight[name]) for name, own in rows.items()})
-        found, point, left = solve_placed(weighed, left, unknowns, max_steps, sizes)
-        unknowns = all_points(found.unknowns, unknowns, point)
-        at = linearise(block, unknowns, block.priors, sizes)
-        r = r or checked_parts(at)
-        scale = residual_scales(at, r)
-        new = {name: least[name] / np.maximum(_largest(at, name, r) / (_HUBER * scale[name]), 1.0) for name in rows}
-        if max(float(np.abs(new[name] - weight[name]).max(initial=0.0)) for name in rows) < _STILL:
-            break
-        weight = new
-    assert at is not None
-    return at, r, left
-
-
-def _weighed(rows: AbstractObservations, weight: Float[np.ndarray, "_"]) -> AbstractObservations:
-    """The rows with other weights, one factor a row."""
-    factor = (weight**-0.5).reshape(-1, *[1] * (np.ndim(rows.sigmas) - 1))
-    return rows.with_sigmas_times(np.broadcast_to(factor, np.shape(rows.sigmas)))
 
 
 def _sizes(at: Adjustment, r: Blocks, predicted: bool = False) -> dict[str, Float[np.ndarray, "_"]]:
     """Of each row, sqrt(v' R^-1 v) over the root of its chi-square quantile: above 1 it is a blunder.
 
     Or sqrt(v' R v), of rows that were left out and are `predicted` by the others. Only directions that the others check
-    count: a point of two rays is checked across the plane of these, and not along it.
+    count: a point of two rays is checked across the plane of these, and not along it. A prediction checks hardly what
+    is hardly known, but rounding is no part of it.
     """
     axes = {name: np.linalg.eigh(own) for name, own in r.items()}
-    checked = {name: values > LEAST_CHECKED for name, (values, _) in axes.items()}
+    least = UNCHECKED if predicted else LEAST_CHECKED
+    checked = {name: values > least for name, (values, _) in axes.items()}
     n = sum(int(own.any(axis=1).sum()) for own in checked.values())
     found = {}
     for name, (values, vectors) in axes.items():
@@ -278,6 +262,22 @@ def _sizes(at: Adjustment, r: Blocks, predicted: bool = False) -> dict[str, Floa
         freedom = np.maximum(checked[name].sum(axis=1), 1)
         found[name] = np.sqrt(squares / chi_square_limit(freedom, LEVEL / max(n, 1)))
     return found
+
+
+def _predicted_parts(at: Adjustment, left: Masks, sizes: Sizes) -> Blocks:
+    """`checked_parts`, of rows left out as if each was in beside those that are: with it they are predicted."""
+    rows = at.block.named_observations
+    weak = {name: weighed(own, np.where(left[name], _WEAK**-2, 1.0)) for name, own in rows.items()}
+    r = checked_parts(linearise(at.block.with_observations(weak), at.unknowns, at.block.priors, sizes))
+    for name, out in left.items():
+        if out.any():
+            values, vectors = np.linalg.eigh(r[name][out])
+            # 1 / r = 1 + q, of a prediction of the variance q, beside the row's own of 1; here the own is _WEAK^2.
+            values = np.clip(values, 0.0, 1.0)
+            values = values / (values + _WEAK**2 * (1 - values))
+            r[name] = r[name].copy()
+            r[name][out] = (vectors * values[:, None]) @ np.swapaxes(vectors, 1, 2)
+    return r
 
 
 def _tested(adjusted: Adjustment, at: Adjustment, left: Masks, point: np.ndarray, sigma0: float, r: Blocks) -> Masks:
@@ -291,14 +291,6 @@ def _tested(adjusted: Adjustment, at: Adjustment, left: Masks, point: np.ndarray
         sizes[name][~left[name] & stays[name]] = size / sigma0
     least = max(1.0, _BESIDE_THE_WORST * max(float(size.max(initial=0.0)) for size in sizes.values()))
     return {name: found[name] | new for name, new in _worst(at.block, sizes, least).items()}
-
-
-def _largest(at: Adjustment, name: str, r: Blocks) -> Float[np.ndarray, "_"]:
-    """Of each row, the largest |v| / sqrt(r); tiny where hardly anything checks it."""
-    own = np.diagonal(r[name], axis1=1, axis2=2).T
-    checked = own > LEAST_CHECKED
-    size = np.abs(np.atleast_2d(at.residuals[name])) / np.sqrt(np.where(checked, own, 1.0))
-    return np.where(checked, size, 0.0).max(axis=0, initial=0.0)
 
 
 def _worst(block: Block, sizes: dict[str, np.ndarray], limit: float) -> Masks:
@@ -338,7 +330,7 @@ def _told(at: Adjustment, left: Masks, stays: Masks, r: Blocks, sigma0: float) -
     for name, rows in block.named_observations.items():
         v = np.atleast_2d(at.residuals[name])
         # What nothing checks has none, and by rounding less than none.
-        own = np.sqrt(np.maximum(np.diagonal(r[name], axis1=1, axis2=2).T, LEAST_CHECKED))
+        own = np.sqrt(np.maximum(np.diagonal(r[name], axis1=1, axis2=2).T, UNCHECKED))
         error, sigma = np.atleast_2d(rows.physical(v)), np.atleast_2d(np.asarray(rows.sigmas).T)
         words = np.broadcast_to(rows.words(block.images, block.points), np.shape(v))
         for row in np.flatnonzero(left[name] & stays[name]).tolist():

@@ -10,13 +10,15 @@ from jaxphoto.block import Block
 from jaxphoto.errors import few
 from jaxphoto.observations import AbstractObservations, Correlated
 from jaxphoto.procedures import Snooped
+from jaxphoto.procedures.mistakes import coordinate_mistakes, is_mirrored
+from jaxphoto.procedures.snooping import SEVERAL, images_out, mostly_out
 from jaxphoto.report.findings import Finding, Level
 from jaxphoto.report.tables import in_file_unit
 from jaxphoto.statistics import Suspect
 
 _SHOWN = 5
-# So many are no chance, and agree where they scatter by no more than so many of their standard deviations.
-_SEVERAL, _AS_ONE = 4, 3.0
+# Errors agree that scatter by no more than so many of their standard deviations.
+_AS_ONE = 3.0
 
 
 def left_out_table(snooped: Snooped, block: Block) -> pd.DataFrame:
@@ -70,7 +72,7 @@ def _alike(snooped: Snooped, block: Block) -> Iterator[str]:
             error, sigma = (np.array([getattr(s, field) for s in own]) for field in ("error", "sigma"))
             mean = float(np.average(error, weights=sigma**-2.0))
             scatter = float(np.sqrt(np.mean(((error - mean) / sigma) ** 2)))
-            if len(own) >= _SEVERAL and len(own) > part.sum() / 2 and scatter < _AS_ONE:
+            if len(own) >= SEVERAL and len(own) > part.sum() / 2 and scatter < _AS_ONE:
                 factor, unit = in_file_unit(own[0].unit)
                 of = f"{name.replace('_', ' ')}{f' in strip {strip}' if strip else ''} along {axis}"
                 yield (
@@ -86,31 +88,33 @@ def _of_further_groups(
     """Groups besides image points of which several rows are left out, these, and the axis of each number."""
     for name, rows in block.named_observations.items():
         left = [s for s in snooped.left_out if s.group == name]
-        if name != IMAGE_POINTS and not isinstance(rows, Correlated) and len(left) >= _SEVERAL:
+        if name != IMAGE_POINTS and not isinstance(rows, Correlated) and len(left) >= SEVERAL:
             axes = np.broadcast_to(rows.axis_names(), np.shape(rows.observation)[::-1])
             yield name, rows, left, np.atleast_2d(axes)
 
 
 def _too_many(snooped: Snooped, block: Block) -> Iterator[str]:
     """Images and groups, along an axis, of which too much is left out to be single errors."""
-    rows = block.image_points
-    out = np.isin(rows.point, [block.points.index(point) for point in snooped.points])
-    out[[s.row for s in snooped.left_out if s.group == rows.group]] = True
-    seen, gone = (np.bincount(rows.image[k], minlength=len(block.images)) for k in (np.s_[:], out))
-    most = np.flatnonzero((gone >= _SEVERAL) & (gone > seen / 2)).tolist()
-    if images := [f"{block.images[k]} ({gone[k]} of {seen[k]})" for k in most]:
-        yield (
-            f"most image points of image {few(images)} are left out: no single errors; look at its names of points, "
-            "the axes of its coordinates, its camera and its station, or leave it out"
+    most = images_out(snooped, block)
+    turned = [k for k in most if is_mirrored(snooped, block, k)]
+    for which, look in (
+        (turned, "they fit where it is mirrored: x and y are exchanged, or one of them has the other sign"),
+        (
+            [k for k in most if k not in turned],
+            "look at its names of points, the axes of its coordinates, its camera and its station, or leave it out",
+        ),
+    ):
+        if images := [f"{block.images[k]} ({most[k][0]} of {most[k][1]})" for k in which]:
+            yield f"most image points of image {few(images)} are left out: no single errors; {look}"
+    mistakes = coordinate_mistakes(snooped, block)
+    for name, counts in mostly_out(snooped, block).items():
+        many = ", ".join(f"{n} of {of} in {axis}" for axis, (n, of) in counts.items())
+        look = (
+            f"they fit where {mistakes[name]}: mend them where they come from"
+            if name in mistakes
+            else "look at their units, axes, names and signs, and at what is held fixed"
         )
-    for name, own, left, axes in _of_further_groups(snooped, block):
-        lost = np.isin(np.arange(len(own)), [s.row for s in left])
-        counted = {a: (int(((axes == a) & lost).sum()), int((axes == a).sum())) for a in dict.fromkeys(axes.flat)}
-        if many := [f"{n} of {of} in {a}" for a, (n, of) in counted.items() if n >= _SEVERAL and n > of / 3]:
-            yield (
-                f"of {name.replace('_', ' ')} {', '.join(many)} are left out: no single errors, but the rest against "
-                "these; look at their units, axes, names and signs, and at what is held fixed"
-            )
+        yield f"of {name.replace('_', ' ')} {many} are left out: no single errors, but the rest against these; {look}"
 
 
 def _ids(block: Block):

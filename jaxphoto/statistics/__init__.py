@@ -49,6 +49,7 @@ from jaxphoto.statistics.positional_accuracy import (
 from jaxphoto.statistics.quantiles import chi_square_limit
 from jaxphoto.statistics.reliability import (
     LEAST_CHECKED,
+    UNCHECKED,
     Redundancy,
     error_precision,
     normalised_residuals,
@@ -71,7 +72,7 @@ from jaxphoto.statistics.zero_test import POWER, ZeroTest, zero_test
 
 __all__ = [
     "DELTA0", "EOP_NAMES", "LEAST_CHECKED", "LEAST_CHECK_POINTS", "LEAST_SIGMA0", "LEVEL", "MOST_PARTS", "POWER",
-    "SIGNIFICANCE_LEVEL", "SPLITS", "AxisErrors", "BlunderTest", "CameraDifferences", "CameraDrift",
+    "SIGNIFICANCE_LEVEL", "SPLITS", "UNCHECKED", "AxisErrors", "BlunderTest", "CameraDifferences", "CameraDrift",
     "ComponentAccuracy", "Correlations", "Covariance", "Felt", "GroundCorrelations", "Hidden", "Hint", "IfZero",
     "LinearForms", "PartialRedundancy", "Partition", "Parts", "PositionalAccuracy", "Redundancy", "ResidualPattern",
     "Rotations", "Selection", "Significance", "Spread", "Suspect", "Trend", "UndetectedEffects", "VarianceComponents",

@@ -8,8 +8,11 @@ import pytest
 
 from jaxphoto import read_block, snoop
 from jaxphoto.observations import Distances
+from jaxphoto.procedures import Snooped
+from jaxphoto.procedures.mistakes import coordinate_mistakes
 from jaxphoto.report.findings import Level
 from jaxphoto.report.snooped import snooped_findings
+from jaxphoto.statistics import Suspect, covariance
 
 
 @pytest.fixture(scope="module")
@@ -56,4 +59,50 @@ def test_what_is_too_much_to_be_single_errors_is_an_alarm(block):
     xy[mine] = xy[mine][:, ::-1]
     spoilt = block.with_observations({"image_points": dataclasses.replace(rows, xy=xy)})
     first = snooped_findings(snoop(spoilt), spoilt)[0]
-    assert first.level == Level.ALARM and "most image points of image A3 (33 of 36) are left out" in first.text
+    assert first.level == Level.ALARM and "most image points of image A3" in first.text
+    assert "they fit where it is mirrored" in first.text
+
+
+def test_the_file_whose_units_are_wrong_is_left_out_and_its_mistake_named(block):
+    """Heights of control in feet: the stations are right, and the search begins without control."""
+    rows = block.control
+    value = np.asarray(rows.value) / np.where(rows.axis == 2, 0.3048, 1.0)
+    spoilt = block.with_observations({rows.group: dataclasses.replace(rows, value=value)})
+    found = snoop(spoilt)
+    assert {(s.group, int(rows.axis[s.row])) for s in found.left_out} == {(rows.group, 2)} and not found.points
+    first = snooped_findings(found, spoilt)[0]
+    assert first.level == Level.ALARM and "they fit where Z is in feet, not in metres" in first.text
+    # Each is predicted by what is in, and not by others that are out: as well as the others place the point.
+    adjusted = found.adjusted
+    height, sigma0 = np.asarray(adjusted.unknowns.points)[:, 2], float(adjusted.sigma0)
+    variance = np.asarray(covariance(adjusted).points)[:, 2, 2]
+    for s in found.left_out:
+        who = rows.who[s.row]
+        assert s.error == pytest.approx(value[s.row] - height[who], abs=1e-4)
+        assert s.sigma == pytest.approx(sigma0 * np.sqrt(rows.sigma[s.row] ** 2 + variance[who]), rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("mistake", "said"),
+    [
+        (lambda xyz: xyz[:, [1, 0, 2]], "X and Y are exchanged"),
+        (lambda xyz: xyz[:, [2, 0, 1]], "X and Y and Z are exchanged"),
+        (lambda xyz: xyz * [1, -1, 1], "Y is of the other sign"),
+        (lambda xyz: xyz * 1000, "X and Y and Z are in millimetres, not in metres"),
+        (lambda xyz: xyz * [0.3048, 0.3048, 1], "X and Y are converted from feet, but were metres"),
+        (lambda xyz: xyz + np.random.default_rng(2).normal(0, 50, xyz.shape), None),
+        (lambda xyz: xyz + np.array([0, 0, 48]), None),
+    ],
+)
+def test_mistakes_of_a_file_are_told_from_other_errors(block, mistake, said):
+    rows = block.stations
+    xyz = np.asarray(rows.value).reshape(-1, 3)
+    given = block.with_observations({"stations": dataclasses.replace(rows, value=mistake(xyz).ravel())})
+    error = (
+        np.asarray(given.stations.value) - np.asarray(rows.value) + np.random.default_rng(1).normal(0, 0.3, len(rows))
+    )
+    left = [
+        Suspect("stations", int(k), 0, "", float(error[k]) / 0.3, float(error[k]), 0.3, "m")
+        for k in np.flatnonzero(np.abs(error) > 2.0)
+    ]
+    assert coordinate_mistakes(Snooped(None, tuple(left), (), ()), given).get("stations") == said

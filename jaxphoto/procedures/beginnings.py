@@ -1,0 +1,141 @@
+"""Where a search for blunders begins: estimates that blunders hardly move, the likeliest to be one first.
+
+Weights fall with the residual (Huber), again and again: many blunders hide one another from the test of a single one,
+but hardly move such an estimate. Where that leads to nothing that fits (enormous errors in an image of few points),
+Tukey's loss forgets them; or control and stations are taken for hardly more than the datum; or all control, or all
+stations, for nothing, as if their file was in other units or its rows in another order.
+
+Source: Huber (1981), Robust statistics.
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxphoto.adjustment import Adjustment, Sizes, linearise
+from jaxphoto.block import Block
+from jaxphoto.losses import AbstractLoss, Tukey
+from jaxphoto.observations import AbstractCoordinates, AbstractObservations
+from jaxphoto.procedures.adjust import start_of
+from jaxphoto.procedures.robust import (
+    Blocks,
+    Masks,
+    all_points,
+    checked_parts,
+    residual_scales,
+    robust,
+    solve_placed,
+)
+from jaxphoto.statistics import LEAST_CHECKED
+from jaxphoto.unknowns import Unknowns
+from jaxphoto.variants import without_observations
+
+# Huber's constant: residuals of so many standard deviations count whole (95 % efficient where all are normal).
+_HUBER = 1.345
+_ROBUST_STEPS = 10
+# Weight of control and stations where they are hardly more than the datum (sigma times 100), and where they are nothing
+# (a million times), but for what nothing else tells.
+_LOOSE, _NOTHING = 1e-4, 1e-12
+# A weight that changes by less, in a robust step, no longer changes what is suspected.
+_STILL = 0.02
+
+
+class Begun(NamedTuple):
+    """Where a search begins."""
+
+    at: Adjustment
+    """The whole block, linearised."""
+    redundancy: Blocks
+    left: Masks
+    """What is out at first: image points of points that flew away, and groups that were taken for nothing."""
+
+
+def beginnings(
+    block: Block,
+    start: Unknowns | None,
+    loss: AbstractLoss | None,
+    max_steps: int,
+    sizes: Sizes,
+    report: Callable[[str], object],
+) -> Iterator[Callable[[], Begun]]:
+    """To be tried in turn until something fits; with a `loss` this only. Each raises what `adjust` raises."""
+
+    def robustly(loss: AbstractLoss) -> Begun:
+        begun = robust(block, loss, from_all(), max_steps=max_steps, sizes=sizes, report=report)
+        return Begun(begun.at, checked_parts(begun.at), begun.astray)
+
+    def from_all() -> Unknowns:
+        return start_of(block) if start is None else start
+
+    if loss is not None:
+        yield lambda: robustly(loss)
+        return
+    coordinates = [name for name, rows in block.named_observations.items() if isinstance(rows, AbstractCoordinates)]
+    yield lambda: _reweighted(block, from_all(), max_steps, sizes, report, {})
+    yield lambda: robustly(Tukey())
+    yield lambda: _reweighted(block, from_all(), max_steps, sizes, report, dict.fromkeys(coordinates, _LOOSE))
+    for name in coordinates if len(coordinates) > 1 else ():
+        yield partial(_without, block, start, max_steps, sizes, report, name)
+
+
+def _without(
+    block: Block,
+    start: Unknowns | None,
+    max_steps: int,
+    sizes: Sizes,
+    report: Callable[[str], object],
+    name: str,
+) -> Begun:
+    """Where the block leads without a group, all of which is out."""
+    none = {other: np.full(len(rows), other == name) for other, rows in block.named_observations.items()}
+    start = start_of(without_observations(block, none)[0]) if start is None else start
+    begun = _reweighted(block, start, max_steps, sizes, report, {name: _NOTHING})
+    return begun._replace(left=begun.left | {name: none[name]})
+
+
+def _reweighted(
+    block: Block,
+    start: Unknowns,
+    max_steps: int,
+    sizes: Sizes,
+    report: Callable[[str], object],
+    least: Mapping[str, float],
+) -> Begun:
+    """Where weights have led that fall with the residual, from `least` on by group, or from 1."""
+    rows, unknowns = block.named_observations, start
+    least = dict.fromkeys(rows, 1.0) | dict(least)
+    weight = {name: np.full(len(own), least[name]) for name, own in rows.items()}
+    left = {name: np.zeros(len(own), bool) for name, own in rows.items()}
+    at: Adjustment | None = None
+    r: Blocks = {}
+    for step in range(_ROBUST_STEPS + 1):
+        report(f"robust step {step}" if step else "adjusting all observations")
+        lighter = block.with_observations({name: weighed(own, weight[name]) for name, own in rows.items()})
+        found, point, left = solve_placed(lighter, left, unknowns, max_steps, sizes)
+        unknowns = all_points(found.unknowns, unknowns, point)
+        at = linearise(block, unknowns, block.priors, sizes)
+        r = r or checked_parts(at)
+        scale = residual_scales(at, r)
+        new = {name: least[name] / np.maximum(_largest(at, name, r) / (_HUBER * scale[name]), 1.0) for name in rows}
+        if max(float(np.abs(new[name] - weight[name]).max(initial=0.0)) for name in rows) < _STILL:
+            break
+        weight = new
+    assert at is not None
+    return Begun(at, r, left)
+
+
+def weighed(rows: AbstractObservations, weight: Float[np.ndarray, "_"]) -> AbstractObservations:
+    """The rows with other weights, one factor a row."""
+    factor = (weight**-0.5).reshape(-1, *[1] * (np.ndim(rows.sigmas) - 1))
+    return rows.with_sigmas_times(np.broadcast_to(factor, np.shape(rows.sigmas)))
+
+
+def _largest(at: Adjustment, name: str, r: Blocks) -> Float[np.ndarray, "_"]:
+    """Of each row, the largest |v| / sqrt(r); tiny where hardly anything checks it."""
+    own = np.diagonal(r[name], axis1=1, axis2=2).T
+    checked = own > LEAST_CHECKED
+    size = np.abs(np.atleast_2d(at.residuals[name])) / np.sqrt(np.where(checked, own, 1.0))
+    return np.where(checked, size, 0.0).max(axis=0, initial=0.0)
