@@ -6,6 +6,7 @@ python benchmarks/blunders.py --problem P31 --cauchy    # a seeded block; and wh
 
 import argparse
 import dataclasses
+import itertools
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -107,6 +108,13 @@ def _cases(block: Block) -> dict[str, Callable[[Block, np.random.Generator], Spo
     found["two names of an image exchanged"] = _exchanged
     found["two control points exchanged"] = lambda b, rng: _exchanged_coordinates(b, rng, "control_points")
     found["two stations exchanged"] = lambda b, rng: _exchanged_coordinates(b, rng, "stations")
+    found["three control points in a circle"] = lambda b, rng: _reordered(
+        b, "control_points", rng.choice(np.unique(b.control.who), 3, replace=False), closed=True
+    )
+    found["stations of eight images off by a row"] = lambda b, rng: _reordered(
+        b, "stations", rng.integers(len(b.images) - 7) + np.arange(8), closed=False
+    )
+    found["heights of control in feet"] = lambda b, rng: _heights_in_feet(b, "control_points")
     found["control off by 1 m"] = lambda b, rng: _coordinate(b, rng, "control_points", 1.0)
     found["station off by 5 m"] = lambda b, rng: _coordinate(b, rng, "stations", 5.0)
     found["5 image points and a station"] = lambda b, rng: _both(b, rng)
@@ -136,6 +144,25 @@ def _exchanged_coordinates(block: Block, rng: np.random.Generator, group: str) -
     value = np.array(rows.observation)
     value[one], value[other] = value[other].copy(), value[one].copy()
     return Spoilt(_with(block, group, value=value), frozenset((group, int(k)) for k in (*one, *other)))
+
+
+def _reordered(block: Block, group: str, who: np.ndarray, closed: bool) -> Spoilt:
+    """Each gets the coordinates of the next; the last, of a circle that is `closed`, those of the first."""
+    rows = block.named_observations[group]
+    own = [np.flatnonzero(rows.who == k) for k in who]
+    value = np.array(rows.observation)
+    for here, there in itertools.pairwise([*own, own[0]] if closed else own):
+        value[here] = np.asarray(rows.observation)[there]
+    wrong = own if closed else own[:-1]
+    return Spoilt(_with(block, group, value=value), frozenset((group, int(k)) for k in np.concatenate(wrong)))
+
+
+def _heights_in_feet(block: Block, group: str) -> Spoilt:
+    rows = block.named_observations[group]
+    value = np.asarray(rows.observation) / np.where(rows.axis == 2, 0.3048, 1.0)
+    # Near zero, a height is the same in feet.
+    wrong = np.flatnonzero(np.abs(value - np.asarray(rows.observation)) > 10 * np.asarray(rows.sigma))
+    return Spoilt(_with(block, group, value=value), frozenset((group, int(k)) for k in wrong))
 
 
 def _coordinate(block: Block, rng: np.random.Generator, group: str, size: float) -> Spoilt:

@@ -163,7 +163,8 @@ def _chance_of_the_worst(tables: Tables) -> float:
 def _trends(tables: Tables) -> Iterator[tuple[float, Finding]]:
     """Patterns that are beyond chance, the most certain first, with the term that is most of each.
 
-    Beside each its p-value; 1 where no usual term explains it, or it does not matter.
+    Beside each its p-value: 1 where no usual term explains it, or it does not matter, and 0 where it explains most of
+    what looks like blunders.
     """
     level = LEVEL / max(len(tables.tested_trends), 1)
     for t in sorted((t for t in tables.tested_trends if t.p_value < level), key=lambda t: t.p_value):
@@ -188,7 +189,10 @@ def _trends(tables: Tables) -> Iterator[tuple[float, Finding]]:
         elif t.pattern.camera:
             said += ": no single usual term is most of it; try a distortion of more terms (docs/model_choice.md)"
         level = Level.ALARM if spoilt else Level.WARNING if matters else Level.INFORMATION
-        yield t.p_value if matters and named else 1.0, Finding(level, said)
+        # Blunders that the term would make are none: beside them, what is left of its rows says the same.
+        most = t.blunders_alike >= _SHOWN and t.blunders_alike > len(tables.blunders.suspects) / 2
+        chance = 0.0 if most else t.p_value
+        yield chance if matters and named else 1.0, Finding(level, said)
 
 
 def _hidden_in_common(tables: Tables) -> Iterator[Finding]:

@@ -40,8 +40,9 @@ def left_out_table(snooped: Snooped, block: Block) -> pd.DataFrame:
 
 
 def snooped_findings(snooped: Snooped, block: Block) -> list[Finding]:
-    """What was left out of `block` and put right, in words; first what is rather an error that rows have in common."""
-    found = list(_alike(snooped, block))
+    """What was put right and left out of `block`, in words; first what is rather an error that rows have in common."""
+    found = [f"put right: {exchange.words}" for exchange in snooped.exchanged]
+    found += _alike(snooped, block)
     for s in snooped.left_out[:_SHOWN]:
         factor, unit = in_file_unit(s.unit)
         found.append(
@@ -55,7 +56,6 @@ def snooped_findings(snooped: Snooped, block: Block) -> list[Finding]:
             f"left out as a whole: point {few}; what is observed of such a point contradicts itself, or too little is "
             "left to place it"
         )
-    found += [f"put right: {exchange.words}" for exchange in snooped.exchanged]
     return [
         *(Finding(Level.ALARM, text) for text in _too_many(snooped, block)),
         *(Finding(Level.WARNING, text) for text in found),

@@ -26,6 +26,8 @@ from jaxphoto.statistics.responses import Responses
 _SEEN = 1e-3
 # Of many blunders the worst: more of them are a sign of the pattern itself.
 _BLUNDERS = 16
+# A blunder is what a term makes where it is off from that by less than this part.
+_LIKE = 0.5
 
 
 class Hint(NamedTuple):
@@ -51,6 +53,8 @@ class Trend(NamedTuple):
     """Root mean square of what the pattern explains, its noise taken off, in the unit of the observations."""
     hints: tuple[Hint, ...]
     """The terms that a sentence can name, the one of the largest share first."""
+    blunders_alike: int = 0
+    """Of the blunders that are unknowns beside it, how many are what the first of these makes of their observations."""
 
 
 def trends(
@@ -152,7 +156,12 @@ def _tested(
     size2 = (b @ square @ b - sigma0**2 * np.sum(square * inverse)) / pattern.rows
     hints = [h._replace(share=h.share / explained) for h in _hints(adjusted, pattern, u, c, own, moved, sigma0)]
     p = beta_tail(explained / whole, freedom / 2, (redundancy - freedom) / 2)
-    return Trend(pattern, freedom, p, max(float(size2), 0.0) ** 0.5, tuple(sorted(hints, key=lambda h: -h.share)))
+    hints.sort(key=lambda h: -h.share)
+    alike = 0
+    if hints and m:
+        makes = hints[0].amount * (np.array(of_units) @ hints[0].term.coefficients)
+        alike = int((np.abs(out.errors - makes) < _LIKE * np.abs(makes)).sum())
+    return Trend(pattern, freedom, p, max(float(size2), 0.0) ** 0.5, tuple(hints), alike)
 
 
 def _hints(

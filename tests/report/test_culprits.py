@@ -1,12 +1,16 @@
 """The likeliest culprit stands first: what the model lacks accuses sound observations."""
 
+import dataclasses
+from pathlib import Path
+
 import equinox as eqx
 import numpy as np
 import pytest
 
-from jaxphoto import adjust
+from jaxphoto import adjust, read_block
 from jaxphoto.camera import set_parameter
 from jaxphoto.report import Tables, verdict_of
+from jaxphoto.report.findings import Level
 from tests.blocks import simulated
 
 
@@ -32,3 +36,25 @@ def test_parameters_are_called_as_people_call_them(without_k2):
     told = " ".join(without_k2.texts)
     assert "k1 of camera one would move by" in told or "c_mm of camera one would move by" in told
     assert "interior[" not in told
+
+
+def test_a_strip_that_is_off_is_told_before_its_stations():
+    """By 3 m along X; most of its stations are suspects, each alone."""
+    block = read_block(Path(__file__).parents[2] / "examples" / "cross_block")
+    rows = block.stations
+    off = np.array([block.image_strip[k] == "A" for k in rows.who]) & (rows.axis == 0)
+    spoilt = dataclasses.replace(rows, value=np.asarray(rows.value) + 3.0 * off)
+    first, second, *_ = verdict_of(Tables(adjust(block.with_observations({"stations": spoilt})))).findings
+    assert first.level == second.level == Level.ALARM
+    assert "X of strip A" in first.text and "station of image A" in second.text
+
+
+def test_stations_that_are_off_each_by_itself_are_no_strip():
+    block = read_block(Path(__file__).parents[2] / "examples" / "cross_block")
+    rows = block.stations
+    value = np.array(rows.value)
+    for name, error in (("A2", 4.0), ("A3", -5.0), ("A5", 3.0), ("A6", -4.0)):
+        value[(rows.who == block.images.index(name)) & (rows.axis == 0)] += error
+    spoilt = block.with_observations({"stations": dataclasses.replace(rows, value=value)})
+    first = verdict_of(Tables(adjust(spoilt))).findings[0]
+    assert "station of image A" in first.text and "contradicts" in first.text
