@@ -72,6 +72,11 @@ def few(names: Sequence[str], joint: str = ", ") -> str:
 _NAMED = 3
 
 
+def counted(number: int, thing: str) -> str:
+    """1 point, or 2 points."""
+    return f"{number} {thing}" if number == 1 else f"{number} {thing}s"
+
+
 def camera_words(name: str) -> str:
     """How a sentence calls a camera: by its name, but for one that is called just that."""
     return "the camera" if name == "camera" else f"camera {name}"

@@ -15,7 +15,7 @@ from jaxphoto.adjustment.result import Adjustment
 from jaxphoto.adjustment.solver.similarity import motions
 from jaxphoto.adjustment.weak_directions import OPEN, POOR, WeakDirection, weak_directions, yardsticks
 from jaxphoto.arrays import still
-from jaxphoto.errors import few
+from jaxphoto.errors import counted, few
 
 # A motion that a similarity explains to this part of its square is one.
 _RIGID = 0.9
@@ -140,8 +140,8 @@ class _Words:
         on_line = ", nearly on a line" if extent[1] < _LINE * extent[0] else ""
         return (
             f"image {self.block.images[image]}: its orientation is {_hardly(d)} ({self._sigmas(d)}) by its "
-            f"{mine.sum()} points{on_line}: measure more points in it{', beside that line' if on_line else ''}, give "
-            "its station and attitude, or leave it out"
+            f"{counted(int(mine.sum()), 'point')}{on_line}: measure more points in it"
+            f"{', beside that line' if on_line else ''}, give its station and attitude, or leave it out"
         )
 
     def _shared(self, d: WeakDirection, labels: list[str]) -> str:

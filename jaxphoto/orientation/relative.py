@@ -13,7 +13,7 @@
 import numpy as np
 from jaxtyping import Float
 
-from jaxphoto.errors import BlockError
+from jaxphoto.errors import BlockError, counted
 from jaxphoto.orientation.coplanarity import RayPairs, essential
 from jaxphoto.orientation.relative_search import candidates
 from jaxphoto.orientation.relative_steps import BLUNDER, RelativeOrientation, adjusted
@@ -88,7 +88,7 @@ def relative_orientations(
     n = len(np.unique(np.column_stack([rays_1, rays_2]), axis=0)) if len(rays_1) < 50 else len(rays_1)
     if n < 5:
         raise BlockError(
-            f"{images} have {n} points in common and a relative orientation needs 5: match or measure more"
+            f"{images} have {counted(n, 'point')} in common and a relative orientation needs 5: match or measure more"
         )
     pairs = RayPairs.of(rays_1, rays_2, sigma_rad)
     rotations, bases = candidates(pairs)

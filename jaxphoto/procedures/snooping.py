@@ -23,7 +23,7 @@ from jaxtyping import Float
 from jaxphoto.adjustment import MAX_STEPS, Adjustment, Sizes, common_sizes, linearise, solve
 from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
 from jaxphoto.block import Block
-from jaxphoto.errors import BlockError, DatumError, JaxphotoError, RankError
+from jaxphoto.errors import BlockError, DatumError, JaxphotoError, RankError, counted
 from jaxphoto.losses import AbstractLoss
 from jaxphoto.observations import Correlated
 from jaxphoto.procedures.adjust import start_of
@@ -159,7 +159,7 @@ def _snooped(block: Block, begun: Begun, max_steps: int, sizes: Sizes, report: C
     known: set[object] = {(e.group, e.rows) for e in done}
     returned: set[int] = set()
     while True:
-        report(f"adjusting without {sum(int(m.sum()) for m in left.values())} observations")
+        report(f"adjusting without {counted(sum(int(m.sum()) for m in left.values()), 'observation')}")
         adjusted, point, left = solve_placed(block, left, at.unknowns, max_steps, sizes)
         at = linearise(block, all_points(adjusted.unknowns, at.unknowns, point), block.priors, sizes)
         sigma0 = max(float(adjusted.sigma0), LEAST_SIGMA0)

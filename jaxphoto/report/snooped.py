@@ -7,7 +7,7 @@ import pandas as pd
 
 from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
 from jaxphoto.block import Block
-from jaxphoto.errors import few
+from jaxphoto.errors import counted, few
 from jaxphoto.observations import AbstractObservations, Correlated
 from jaxphoto.procedures import Snooped
 from jaxphoto.procedures.mistakes import coordinate_mistakes, is_mirrored
@@ -49,7 +49,7 @@ def snooped_findings(snooped: Snooped, block: Block) -> list[Finding]:
             f"left out: {s.words}, off by {factor * s.error:+.3g} +- {factor * s.sigma:.2g} {unit} (w {s.w:.1f})"
         )
     if (more := len(snooped.left_out) - _SHOWN) > 0:
-        found.append(f"left out: {more} more observations, see left_out.csv")
+        found.append(f"left out: {counted(more, 'more observation')}, see left_out.csv")
     if snooped.points:
         few = ", ".join(snooped.points[:_SHOWN]) + (" ..." if len(snooped.points) > _SHOWN else "")
         found.append(

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import pandas as pd
 from rich.console import Console
 
-from jaxphoto.errors import few
+from jaxphoto.errors import counted, few
 from jaxphoto.procedures.weights import MadeByBlunders
 from jaxphoto.report.findings import Finding, Level
 from jaxphoto.report.terminal import plain
@@ -55,10 +55,10 @@ def component_findings(found: VarianceComponents, blunders: Sequence[MadeByBlund
 
 def print_components(found: VarianceComponents, console: Console) -> None:
     """A line for each group: by what its standard deviations were multiplied, and the variance factor."""
-    console.print(f"variance components, adjusted with them ({found.rounds} rounds):")
+    console.print(f"variance components, adjusted with them ({counted(found.rounds, 'round')}):")
     for k, label in enumerate(found.labels):
         factor, sigma = found.factor[k], found.sigma[k]
         said = f"standard deviations x {factor**0.5:.3g}, variances x {factor:.3g} +- {sigma:.2g}"
-        counted = f"({found.observations[k]} observations, redundancy {found.redundancy[k]:.4g})"
-        line = f"  {label}: {said if found.supported[k] else 'as stated'} {counted}"
+        from_ = f"({counted(found.observations[k], 'observation')}, redundancy {found.redundancy[k]:.4g})"
+        line = f"  {label}: {said if found.supported[k] else 'as stated'} {from_}"
         console.print(plain(line), soft_wrap=True)

@@ -22,7 +22,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxphoto.adjustment import MAX_STEPS, Adjustment, solve
 from jaxphoto.block import Block
-from jaxphoto.errors import InputError
+from jaxphoto.errors import InputError, counted
 from jaxphoto.observations import AbstractObservations
 from jaxphoto.statistics.partial_redundancy import PROBES, PartialRedundancy, partial_redundancy
 from jaxphoto.statistics.partition import Partition, Parts, parts_of
@@ -193,8 +193,8 @@ def _cannot(
 
 def _sentence(parts: Parts, k: int, why: str) -> str:
     return (
-        f"{parts.labels[k]} ({parts.counts[k]} observations) cannot support a variance component: {why}; the standard "
-        "deviations stay as stated, join it with another part or observe more"
+        f"{parts.labels[k]} ({counted(parts.counts[k], 'observation')}) cannot support a variance component: {why}; "
+        "the standard deviations stay as stated, join it with another part or observe more"
     )
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxphoto.block import Block
-from jaxphoto.errors import BlockError
+from jaxphoto.errors import BlockError, counted
 from jaxphoto.orientation.averaging import best_triplet
 from jaxphoto.orientation.resection import resect_ideal
 from jaxphoto.orientation.resection_steps import refined as refined_by_points
@@ -216,7 +216,7 @@ def _grow(growth: "_Growth", pair: Pair, third: tuple[int, ...]) -> Grown:
     count = growth.seen()
     paired = {image for pair in growth.pairs for image in (pair.first, pair.second)}
     for i in np.flatnonzero(~growth.network.oriented).tolist():
-        few = f"it sees {count[i]} points of the others, and {growth.least} are needed"
+        few = f"it sees {counted(int(count[i]), 'point')} of the others, and {growth.least} are needed"
         growth.refused.setdefault(i, few if i in paired else "no other image has a relative orientation to it")
     return Grown(growth.network, tuple(growth.order), growth.refused, growth.angle)
 
@@ -240,7 +240,7 @@ def _orient_next(growth: _Growth, images: Sequence[int]) -> None:
     image = min(images, key=lambda i: np.inf if placed[i] is None else placed[i].spread)  # type: ignore[union-attr]
     rows, of_pairs = growth.known(image), placed[image]
     if len(rows) < growth.least:
-        growth.refused[image] = f"it sees {len(rows)} points of the others, and {growth.least} are needed"
+        growth.refused[image] = f"it sees {counted(len(rows), 'point')} of the others, and {growth.least} are needed"
         return
     growth.report(f"orienting image {len(growth.order) + 1}: {growth.block.images[image]}")
     fitting = 0.0
