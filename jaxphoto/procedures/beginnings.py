@@ -9,7 +9,7 @@ Source: Huber (1981), Robust statistics.
 """
 
 from collections.abc import Callable, Iterator, Mapping
-from functools import partial
+from functools import cache, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -67,6 +67,7 @@ def beginnings(
         begun = robust(block, loss, from_all(), max_steps=max_steps, sizes=sizes, report=report)
         return Begun(begun.at, checked_parts(begun.at), begun.astray)
 
+    @cache
     def from_all() -> Unknowns:
         return start_of(block) if start is None else start
 

@@ -66,7 +66,7 @@ def coordinate_exchanges(
 def as_one(block: Block, done: Sequence[Exchange], left: Masks) -> list[Exchange]:
     """Exchanges of coordinates that were found one after the other as what they come to; all others as they are.
 
-    Rows that are `left` out in the end have nothing that is their own.
+    Who has all rows `left` out in the end has nothing that is its own.
     """
     found = []
     for group, rows in block.named_observations.items():
@@ -74,11 +74,11 @@ def as_one(block: Block, done: Sequence[Exchange], left: Masks) -> list[Exchange
         if not isinstance(rows, AbstractCoordinates) or not own:
             found += own
             continue
-        order, lacks = np.arange(len(rows)), set(np.flatnonzero(left[group]).tolist())
-        for row_rounds in (e.rows for e in own):
-            for one in row_rounds:
-                order[list(one)] = order[np.roll(one, -1)]
         ((what, who),) = ((what, still(index)) for what, index in rows.indices())
+        order, out = np.arange(len(rows)), left[group]
+        for one in (one for e in own for one in e.rows):
+            order[list(one)] = order[np.roll(one, -1)]
+        lacks = set(np.flatnonzero(out & ~np.isin(who, who[~out])).tolist())
         rounds: dict[tuple[int, ...], list[tuple[int, ...]]] = {}
         for one in _rounds_of(order, lacks):
             rounds.setdefault(tuple(who[list(one)].tolist()), []).append(one)
