@@ -188,6 +188,8 @@ def _trends(tables: Tables) -> Iterator[tuple[float, Finding]]:
                 said += f"; {_called(path)} would move by {moved:.1f} of its sigma"
         elif t.pattern.camera:
             said += ": no single usual term is most of it; try a distortion of more terms (docs/model_choice.md)"
+        elif several := [h for h in t.hints if abs(h.amount) > _SURE * h.sigma][:_SHOWN]:
+            said += f", each alone {_told(t.pattern, several)}"
         level = Level.ALARM if spoilt else Level.WARNING if matters else Level.INFORMATION
         # Blunders that the term would make are none: beside them, what is left of its rows says the same.
         most = t.blunders_alike >= _SHOWN and t.blunders_alike > len(tables.blunders.suspects) / 2

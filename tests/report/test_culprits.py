@@ -58,3 +58,14 @@ def test_stations_that_are_off_each_by_itself_are_no_strip():
     spoilt = block.with_observations({"stations": dataclasses.replace(rows, value=value)})
     first = verdict_of(Tables(adjust(spoilt))).findings[0]
     assert "station of image A" in first.text and "contradicts" in first.text
+
+
+def test_of_a_drift_the_strips_that_show_it_are_told():
+    """3 m along Y from the first image to the last: no strip is most of it."""
+    block = read_block(Path(__file__).parents[2] / "examples" / "cross_block")
+    rows, time = block.stations, np.asarray(block.image_time)
+    drift = 3.0 * (time - time.min()) / np.ptp(time)
+    value = np.asarray(rows.value) + np.where(rows.axis == 1, drift[rows.who], 0.0)
+    spoilt = block.with_observations({"stations": dataclasses.replace(rows, value=value)})
+    (said,) = [t for t in verdict_of(Tables(adjust(spoilt))).texts if "from strip to strip follow a pattern" in t]
+    assert "each alone Y of strip D +2.5" in said and "Y of strip C" in said
