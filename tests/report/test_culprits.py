@@ -63,7 +63,7 @@ def test_stations_that_are_off_each_by_itself_are_no_strip():
 def test_of_a_drift_the_strips_that_show_it_are_told():
     """3 m along Y from the first image to the last: no strip is most of it."""
     block = read_block(Path(__file__).parents[2] / "examples" / "cross_block")
-    rows, time = block.stations, np.asarray(block.image_time)
+    rows, time = block.stations, np.asarray(block.flight_time)
     drift = 3.0 * (time - time.min()) / np.ptp(time)
     value = np.asarray(rows.value) + np.where(rows.axis == 1, drift[rows.who], 0.0)
     spoilt = block.with_observations({"stations": dataclasses.replace(rows, value=value)})
