@@ -1,8 +1,10 @@
 """The command line: files written, exit codes, and one sentence for every mistake."""
 
 import dataclasses
+import html
 import json
 import re
+import shlex
 import subprocess
 import sys
 
@@ -134,6 +136,15 @@ def test_report_opens_without_a_network(results):
     text, pictures = re.subn(r'"data:image/png;base64,[^"]*"', '""', page)
     assert "http" not in text
     assert pictures >= 3
+
+
+def test_the_command_of_a_report_is_typed_again(results, folder, monkeypatch, capsys, tmp_path):
+    page = (results[0] / "report.html").read_text()
+    words = shlex.split(html.unescape(re.search(r"<th>command</th><td>(.*?)</td>", page)[1]))
+    assert words[:3] == ["jaxphoto", "adjust", str(folder)] and "--out" not in words
+    code, *_ = run(monkeypatch, capsys, *words[1:], "--out", tmp_path / "again")
+    assert code == 0
+    assert (tmp_path / "again" / "interior.csv").read_bytes() == (results[0] / "interior.csv").read_bytes()
 
 
 def test_results_replace_earlier_results_and_nothing_else(results, folder, monkeypatch, capsys, tmp_path):

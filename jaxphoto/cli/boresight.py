@@ -9,6 +9,7 @@ import typer
 import jaxphoto
 from jaxphoto.cli.app import app
 from jaxphoto.cli.console import plain_console
+from jaxphoto.cli.made import made_by
 from jaxphoto.io import read_block
 from jaxphoto.procedures import boresight
 from jaxphoto.report import print_boresight, write_boresight
@@ -17,6 +18,7 @@ from jaxphoto.writing import check_folder
 
 @app.command("boresight")
 def boresight_command(
+    context: typer.Context,
     block: Annotated[Path, typer.Argument(help="Block folder (see docs/block_folder.md).")],
     out: Annotated[Path, typer.Option(help="Folder for the results; earlier results in it are replaced.")],
     go_on: Annotated[
@@ -29,12 +31,12 @@ def boresight_command(
     console, errors = plain_console(), plain_console(stderr=True)
     began = time.perf_counter()
     with errors.status("reading the block") as status:
-        read = read_block(block)
+        read, made = read_block(block), made_by(context, block)
         seconds = {"read": time.perf_counter() - began}
         status.update(f"four adjustments of {len(read.images)} images, {len(read.points)} points")
         steps = boresight(read, go_on=go_on, max_steps=max_steps)
         status.update(f"writing {out}")
-        write_boresight(steps, out, seconds)
+        write_boresight(steps, out, seconds, made)
     print_boresight(steps, console)
     console.print(f"results in {out} (open report.html)")
     if not all(step.go_on for step in steps):

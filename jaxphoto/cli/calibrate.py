@@ -13,6 +13,7 @@ from jaxphoto.camera import DISTORTIONS
 from jaxphoto.cli.app import app
 from jaxphoto.cli.choices import one_of
 from jaxphoto.cli.console import plain_console
+from jaxphoto.cli.made import made_by
 from jaxphoto.errors import InputError
 from jaxphoto.image_measurement.grey_values import read_grey
 from jaxphoto.image_measurement.targets import SYNTAX, find_targets, read_board
@@ -26,6 +27,7 @@ from jaxphoto.writing import check_folder
 
 @app.command("calibrate")
 def calibrate_command(
+    context: typer.Context,
     images: Annotated[list[Path], typer.Argument(help="Photographs of the board, all by one camera at one focus.")],
     board: Annotated[str, typer.Option(help=f"The board: {', '.join(SYNTAX.values())}.")],
     out: Annotated[Path, typer.Option(help="Folder for the results; earlier results in it are replaced.")],
@@ -78,6 +80,7 @@ def calibrate_command(
             lambda folder: write_block(done.adjusted.block, folder / "block"),
             detections=targets.detections,
             start=start.origin,
+            made=made_by(context, *images),
             # A size that nobody gave is the unit of every length in the report.
             notes=() if pixel_mm is not None else (start.origin,),
         )

@@ -8,6 +8,7 @@ from rich.table import Table
 
 from jaxphoto.cli.app import app
 from jaxphoto.cli.console import plain_console
+from jaxphoto.cli.made import made_by
 from jaxphoto.experiment import (
     compare,
     find_experiments,
@@ -20,6 +21,7 @@ from jaxphoto.writing import check_folder
 
 @app.command("experiment")
 def experiment_command(
+    context: typer.Context,
     name: Annotated[str, typer.Argument(help="Folder of the experiment (000, 003, 004), or all.")],
     out: Annotated[Path, typer.Option(help="Folder for the results; an earlier run in it is replaced.")] = Path(
         "results"
@@ -34,12 +36,12 @@ def experiment_command(
     check_folder(out, *chosen)
     declared = {folder: load_experiment(folder) for folder in chosen}
     console, errors = plain_console(), plain_console(stderr=True)
-    runs = {}
+    runs, made = {}, {folder: made_by(context, folder) for folder in chosen}
     for folder, experiment in declared.items():
         with errors.status(folder.name) as status:
             runs[folder] = run_experiment(experiment, folder, layouts, status.update)
         # After each, so that an experiment that fails loses none before it.
-        write_runs(runs, out)
+        write_runs(runs, out, made)
         console.print(_judgement(experiment.title, compare(runs[folder], folder)))
         for failure in runs[folder].failures:
             console.print(f"left out: {failure}")

@@ -1,5 +1,6 @@
 """What a command tells its report of how the results came about."""
 
+import shlex
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,16 +11,31 @@ from jaxphoto.io.input_hashes import block_inputs
 from jaxphoto.report.made import Made
 from jaxphoto.writing.inputs import InputFile, input_file
 
-# Of a folder of results, what is read again.
-_READ = (".csv", ".json", ".toml")
+# Of a folder of results or of an experiment, what is read.
+_READ = (".csv", ".json", ".toml", ".py")
 
 
 def made_by(context: typer.Context, *inputs: Path | None) -> Made:
     """The command with its options, and the hashes of the files and folders that it reads, as they are now."""
     given = [path for path in inputs if path is not None]
-    # Where results lie is not how they were made.
-    options = {name: value for name, value in context.params.items() if name != "out"}
-    return Made(str(context.info_name), options, [f for path in given for f in _files(path)])
+    return Made(_typed(context), [f for path in given for f in _files(path)])
+
+
+def _typed(context: typer.Context) -> str:
+    """The command as it is typed, with all options, defaults too; where results lie is not how they were made."""
+    words = ["jaxphoto", str(context.info_name)]
+    for parameter in context.command.params:
+        value = context.params.get(str(parameter.name))
+        if parameter.name == "out" or value is None or value is False:
+            continue
+        values = [] if value is True else list(value) if isinstance(value, list | tuple) else [value]
+        if parameter.param_type_name == "argument":
+            words += map(str, values)
+        elif value is True or parameter.nargs > 1:
+            words += [parameter.opts[0], *map(str, values)]
+        else:
+            words += (word for v in values for word in (parameter.opts[0], str(v)))
+    return shlex.join(words)
 
 
 def _files(path: Path) -> Iterator[InputFile]:

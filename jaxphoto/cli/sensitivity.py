@@ -46,15 +46,15 @@ def sensitivity_command(
         adjusted = adjust_for_tables(read, max_steps)
         status.update("differentiating")
         tables = SensitivityTables(adjusted, per, bias_m, delta0)
-        table = tables.bias
+        largest = tables.largest
         status.update(f"writing {out}")
         order = ("compile", "solve", "covariance", "sensitivity")
         write_sensitivity(tables, out, seconds | {name: adjusted.seconds[name] for name in order}, made)
     print_judgement(adjusted, errors)
-    console.print(f"largest changes by a station bias of {bias_m:g} m per {per}: exact, first-order")
-    interior = table[table["estimate"].str.startswith("interior")]
-    largest = interior.loc[interior.groupby("estimate", sort=False)["exact"].apply(lambda v: v.abs().idxmax())]
+    console.print(f"largest changes by a station bias of {bias_m:g} m per {per}: exact, of its sigma, first-order")
     for row in largest.head(_SHOWN).itertuples(index=False):
-        line = f"  {row.estimate}: {row.exact:.4g}, {row.first_order:.4g} (stations of {row.unit} in {row.axis})"
-        console.print(line)
+        console.print(
+            f"  {row.estimate}: {row.exact:.3g}, {row.over_sigma:.2f}, {row.first_order:.3g} "
+            f"(stations of {row.unit} in {row.axis})"
+        )
     console.print(f"results in {out} (open report.html)")

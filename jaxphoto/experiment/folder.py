@@ -3,6 +3,7 @@
 import importlib.util
 from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 import pandas as pd
 
@@ -11,6 +12,7 @@ from jaxphoto.experiment.comparison import compare
 from jaxphoto.experiment.declaration import Experiment
 from jaxphoto.experiment.page import experiment_page, index_page
 from jaxphoto.experiment.runner import Run
+from jaxphoto.report.made import Made
 from jaxphoto.writing import whole_folder
 
 FILE = "experiment.py"
@@ -21,8 +23,8 @@ def find_experiments(directory: Path, name: str) -> list[Path]:
     known = sorted(path.parent for path in directory.glob(f"*/{FILE}"))
     if not known:
         raise InputError(
-            f"{directory} holds no experiments (folders with {FILE}); go to the folder that has experiments/, or name "
-            "it with --experiments"
+            f"{directory} holds no experiments (folders with {FILE}); go to the folder that has experiments/, name it "
+            "with --experiments, or write those of the papers there first (jaxphoto example experiments)"
         )
     chosen = known if name == "all" else [path for path in known if path.name == name]
     if not chosen:
@@ -48,15 +50,16 @@ def load_experiment(folder: Path) -> Experiment:
     return experiment
 
 
-def write_runs(runs: Mapping[Path, Run], out: Path) -> None:
+def write_runs(runs: Mapping[Path, Run], out: Path, made: Mapping[Path, Made] = MappingProxyType({})) -> None:
     """tables.csv, cells.csv (every layout) and report.html of the `runs` of some experiment folders, in `out`.
 
-    Several experiments have a page each, to which report.html leads. Raises what `whole_folder` raises.
+    Several experiments have a page each, to which report.html leads; a page says how its runs were `made`. Raises what
+    `whole_folder` raises.
     """
     tables = {folder: compare(run, folder) for folder, run in runs.items()}
     only = len(runs) == 1
     pages = {
-        "report.html" if only else f"{folder.name}.html": experiment_page(run, tables[folder])
+        "report.html" if only else f"{folder.name}.html": experiment_page(run, tables[folder], made.get(folder))
         for folder, run in runs.items()
     }
     if not only:

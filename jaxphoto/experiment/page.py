@@ -15,12 +15,14 @@ from jaxphoto.experiment.comparison import MEAN_DIFFERENCE
 from jaxphoto.experiment.runner import Run
 from jaxphoto.experiment.wording import heading, own_decimals, power_of, printed_decimals, table_title
 from jaxphoto.report import check_points_figure, layout_figure, page_head
+from jaxphoto.report.document_html import html_of
+from jaxphoto.report.made import Made, made_section
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _STYLE = """\
-body { max-width: 86rem } td, th { white-space: nowrap } th { font-weight: 600 } .tables td, .tables th { line-height: 1.3; padding: .2rem .4rem }
+:root { --width: 86rem } td, th { white-space: nowrap } th { font-weight: 600 } .tables td, .tables th { line-height: 1.3; padding: .2rem .4rem }
 .no { background: var(--red) } .yes { background: var(--green) } .chip { padding: 0 .5em; border-radius: 3px }
 .ours { font-weight: 600 } .spread, .paper { color: var(--grey) } .spread { font-size: 90% }
 ol.notes { margin: 0 0 1.5rem; font-size: 13px; color: var(--grey) } sup { color: var(--grey); font-size: 75% }
@@ -35,10 +37,10 @@ to layout</span>{% endif %}. Below: <span class="paper">what is printed (± the 
 <span class="chip yes">green</span> within the tolerance, <span class="chip no">red</span> not, no colour: nothing promised.
 Small numbers at cells and headings refer to the notes below the table.</p>
 {% for failure in failures %}<p class="warning">left out: {{ failure }}</p>{% endfor %}
-<table><tr><th>table</th><th>within</th><th>of</th></tr>
+<div class="wide"><table><tr><th>table</th><th>within</th><th>of</th></tr>
 {% for table in tables %}<tr><td><a href="#{{ table.name }}">{{ table.title }}</a></td>
 <td>{{ table.good if table.judged else "" }}</td><td>{{ table.judged or "nothing promised" }}</td></tr>
-{% endfor %}</table>
+{% endfor %}</table></div>
 <h2>Block of the first layout</h2><img alt="block layout" src="{{ layout }}">
 <div class="tables">
 {% for table in tables %}<h2 id="{{ table.name }}">{{ table.title }}</h2>
@@ -54,15 +56,16 @@ Small numbers at cells and headings refer to the notes below the table.</p>
 <span class="chip {{ table.difference.within }}">{{ table.difference.words }}</span></p>{% endif %}
 {% endfor %}</div>
 {% if check %}<h2>Check points of the first layout</h2><img alt="discrepancies at check points" src="{{ check }}">{% endif %}
-</body></html>
+{% for element in made %}{{ element }}
+{% endfor %}</body></html>
 """
 
 
 _INDEX = """{{ head("Experiments") }}<body>
 <h1>Experiments</h1>
-<table><tr><th>experiment</th><th>within</th><th>of the values promised</th></tr>
+<div class="wide"><table><tr><th>experiment</th><th>within</th><th>of the values promised</th></tr>
 {% for row in rows %}<tr><td><a href="{{ row.name }}.html">{{ row.title }}</a></td><td>{{ row.good }}</td><td>{{ row.judged }}</td></tr>
-{% endfor %}</table></body></html>
+{% endfor %}</table></div></body></html>
 """
 
 
@@ -80,7 +83,7 @@ def index_page(experiments: Mapping[str, tuple[str, pd.DataFrame]]) -> str:
     return Environment(autoescape=True).from_string(_INDEX).render(head=page_head, rows=rows)
 
 
-def experiment_page(run: Run, comparison: pd.DataFrame) -> str:
+def experiment_page(run: Run, comparison: pd.DataFrame, made: Made | None = None) -> str:
     """The whole page as HTML, pictures inside."""
     tables = [_table(str(name), cells) for name, cells in comparison.groupby("table", sort=False)]
     check = {name: of for name, of in run.first.items() if len(of.check_points)}
@@ -97,6 +100,7 @@ def experiment_page(run: Run, comparison: pd.DataFrame) -> str:
             layout=_picture(layout_figure(next(iter(run.first.values())))),
             tables=tables,
             check=_picture(check_points_figure(check)) if check else "",
+            made=[html_of(element) for element in made_section(made)] if made else [],
         )
     )
 

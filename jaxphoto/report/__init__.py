@@ -13,7 +13,9 @@ from jaxphoto.report.figures import (
     plot_interior_correlation,
     plot_mean_residuals,
     plot_residuals,
+    plot_residuals_by_radius,
     plot_sigma_map,
+    plot_station_residuals,
 )
 from jaxphoto.report.findings import Finding, Level, Verdict
 from jaxphoto.report.page import report_page
@@ -65,7 +67,9 @@ __all__ = [
     "plot_interior_correlation",
     "plot_mean_residuals",
     "plot_residuals",
+    "plot_residuals_by_radius",
     "plot_sigma_map",
+    "plot_station_residuals",
     "prepare_pictures",
     "print_adjustment",
     "print_boresight",

@@ -1,33 +1,35 @@
 """The results of a boresight calibration: judgement, estimates of all steps, and each step's own result folder."""
 
+from __future__ import annotations
+
+import re
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+import numpy as np
 import pandas as pd
-from jinja2 import Environment
-from markupsafe import Markup
 from rich.console import Console
 from rich.text import Text
 
 from jaxphoto.procedures import Step
-from jaxphoto.report.made import versions
-from jaxphoto.report.page_head import page_head
+from jaxphoto.report.document import Heading, Paragraph, rows_of
+from jaxphoto.report.findings import as_sentence
+from jaxphoto.report.made import Made, made_section, versions
+from jaxphoto.report.plots import drawn, new_figure
 from jaxphoto.report.results import write_results, write_summary
+from jaxphoto.report.study_page import PageLink, StudyPart, WholePicture, study_page
 from jaxphoto.report.tables import Tables
 from jaxphoto.report.verdict import verdict_of
 from jaxphoto.writing import whole_folder
 
-_PAGE = """{{ head(title) }}<body>
-<h1>{{ title }}</h1>
-<p class="{{ 'good' if good else 'bad' }}"><b>{{ verdict }}</b></p>
-{% for step in steps %}
-<h2>Step {{ step.number }}: {{ step.title }}</h2>
-{% for finding in step.findings %}<p{% if not step.go_on and loop.last %} class="warning"{% endif %}>{{ finding }}</p>
-{% endfor %}{{ tables[loop.index0] }}
-<p><a href="step_{{ step.number }}/report.html">all results of step {{ step.number }}</a></p>
-{% endfor %}
-</body></html>
-"""
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+# Error bars are so many standard deviations.
+_BARS = 2.0
+_ANGLES = re.compile(r"mounts\[.*\]\.boresight_._deg")
+_SHIFTS = re.compile(r"strips\[(.*)\]\.shift_(.)_m")
 
 
 def boresight_verdict(steps: tuple[Step, ...]) -> str:
@@ -54,30 +56,59 @@ def steps_table(steps: tuple[Step, ...]) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["step", "parameter", "value", "sigma", "unit"])
 
 
-def boresight_page(steps: tuple[Step, ...]) -> str:
-    """The report as HTML: judgement first, then what each step says and estimates."""
+def boresight_figure(steps: tuple[Step, ...]) -> Figure | None:
+    """Misalignments of steps 3 and 4 and shifts of strips of step 2 with error bars; None without any."""
     table = steps_table(steps)
-    shown = [
-        table[table["step"] == step.number]
-        .drop(columns="step")
-        .to_html(index=False, border=0, na_rep="", formatters={"value": "{:.7g}".format, "sigma": "{:.3g}".format})
-        for step in steps
-    ]
-    return (
-        Environment(autoescape=True)
-        .from_string(_PAGE)
-        .render(
-            head=page_head,
-            title=f"{steps[0].adjusted.block.title or 'block'}: boresight",
-            verdict=boresight_verdict(steps),
-            good=all(step.go_on for step in steps),
-            steps=steps,
-            tables=[Markup(html) for html in shown],
-        )
-    )
+    panels = {
+        "misalignment [deg], steps 3 and 4": table[table["parameter"].str.fullmatch(_ANGLES)],
+        "shift of strips [m], step 2": table[(table["step"] == 2) & table["parameter"].str.fullmatch(_SHIFTS)],
+    }
+    panels = {title: rows for title, rows in panels.items() if len(rows)}
+    if not panels:
+        return None
+    most = max(len(rows) for rows in panels.values())
+    figure = new_figure(9.6, 1.2 + 0.24 * most)
+    for axes, (title, rows) in zip(figure.subplots(1, len(panels), squeeze=False).flat, panels.items(), strict=True):
+        at, colours = np.arange(len(rows)), np.where(rows["step"] == 3, "0.5", "tab:blue")
+        for k, value, sigma, colour in zip(at, rows["value"], rows["sigma"], colours, strict=True):
+            axes.errorbar(value, k, xerr=_BARS * sigma, fmt="o", ms=4, capsize=3, color=colour)
+        names = [
+            _short(str(parameter)) + (f", step {step}" if step > 2 else "")
+            for parameter, step in zip(rows["parameter"], rows["step"], strict=True)
+        ]
+        axes.set_yticks(at, [drawn(name) for name in names], fontsize=8)
+        axes.invert_yaxis()
+        axes.axvline(0, color="0.4", lw=0.6)
+        axes.set_title(title, fontsize=10)
+        axes.tick_params(axis="x", labelsize=8)
+    return figure
 
 
-def write_boresight(steps: tuple[Step, ...], directory: Path, seconds: dict[str, float]) -> None:
+def _short(path: str) -> str:
+    """`E1 X` of strips[E1].shift_X_m, `default x` of mounts[default].boresight_x_deg."""
+    name, parameter = path.split("[", 1)[1].rsplit("].", 1)
+    return f"{name} {parameter.split('_')[1]}"
+
+
+def boresight_page(steps: tuple[Step, ...], made: Made) -> str:
+    """The report as HTML: judgement first, then what each step says and estimates."""
+    parts: list[StudyPart] = []
+    if figure := boresight_figure(steps):
+        parts.append(WholePicture.of(figure, "misalignments and shifts of strips with error bars"))
+        parts.append(Paragraph(f"Bars are {_BARS:g} standard deviations long to each side."))
+    for step in steps:
+        parts.append(Heading(f"Step {step.number}: {step.title}"))
+        parts += [Paragraph(as_sentence(finding)) for finding in step.findings]
+        if not step.go_on:
+            parts[-1] = Paragraph(as_sentence(step.findings[-1]), "warning")
+        table = pd.DataFrame(step.estimates, columns=["parameter", "value", "sigma", "unit"])
+        parts += [rows_of(table), PageLink(f"all results of step {step.number}", f"step_{step.number}/report.html")]
+    colour = "green" if all(step.go_on for step in steps) else "red"
+    title = f"{steps[0].adjusted.block.title or 'block'}: boresight"
+    return study_page(title, [boresight_verdict(steps)], [*parts, *made_section(made)], colour)
+
+
+def write_boresight(steps: tuple[Step, ...], directory: Path, seconds: dict[str, float], made: Made) -> None:
     """steps.csv, summary.json, report.html and step_1 ... step_4, in `directory` only when all is written.
 
     Raises InputError where `directory` holds something that is not an earlier result.
@@ -88,9 +119,10 @@ def write_boresight(steps: tuple[Step, ...], directory: Path, seconds: dict[str,
             tables = Tables(step.adjusted)
             verdict, times = verdict_of(tables), step.adjusted.seconds
             order = ("compile", "solve", "covariance")
-            write_results(tables, verdict, work / f"step_{step.number}", {name: times[name] for name in order})
+            folder, own = work / f"step_{step.number}", {name: times[name] for name in order}
+            write_results(tables, verdict, folder, own, made=made)
         steps_table(steps).to_csv(work / "steps.csv", index=False)
-        (work / "report.html").write_text(boresight_page(steps), encoding="utf-8")
+        (work / "report.html").write_text(boresight_page(steps, made), encoding="utf-8")
         write_summary(
             {
                 "title": steps[0].adjusted.block.title,

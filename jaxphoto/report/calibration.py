@@ -8,29 +8,23 @@ from textwrap import wrap
 
 import numpy as np
 import pandas as pd
-from jinja2 import Environment
-from markupsafe import Markup
 from matplotlib.figure import Figure
 from rich.console import Console
 
 from jaxphoto.camera import Sensor
+from jaxphoto.errors import counted
 from jaxphoto.procedures.calibration import Calibration, Detection, rms_px
+from jaxphoto.report.document import Heading, rows_of
 from jaxphoto.report.findings import Finding, Level, Verdict
-from jaxphoto.report.page_head import page_head
+from jaxphoto.report.made import Made
 from jaxphoto.report.plots import drawn, new_figure
 from jaxphoto.report.results import write_results, write_summary
+from jaxphoto.report.study_page import PageLink, PictureFile, StudyPart, study_page
 from jaxphoto.report.tables import Tables
 from jaxphoto.report.verdict import verdict_of
 from jaxphoto.writing import whole_folder
 
 PICTURES = "photographs"
-_PAGE = """{{ head(title) }}<body>
-<h1>{{ title }}: photographs</h1>
-{{ table }}
-{% for name in pictures %}<h2>{{ name }}</h2>
-<img alt="targets and residuals" src="photographs/{{ name|urlencode }}.png">
-{% endfor %}</body></html>
-"""
 _WIDTH_INCHES = 6.4
 # Of the width of the picture: how long the arrow of a typical residual is drawn.
 _ARROW = 0.03
@@ -133,6 +127,7 @@ def write_calibration(
     beside: Callable[[Path], None] = lambda folder: None,
     *,
     detections: Sequence[Detection] = (),
+    made: Made,
     start: str = "",
     notes: Sequence[str] = (),
 ) -> Tables:
@@ -141,8 +136,8 @@ def write_calibration(
     summary.json gains rms_px, n_images_used, n_image_points, added_sigma_px, settled, left_out, removed and `start`, a
     sentence that says where the camera began. `pictures` read the grey values of photographs by their names, also of
     those left out, of which `detections` say what was found in them; `notes` are sentences that report.html begins
-    with; `beside` may write more into the folder while it is made. Raises InputError where `directory` holds something
-    that is not an earlier result.
+    with, and at its end how results were `made`; `beside` may write more into the folder before it is done. Raises
+    InputError where `directory` holds something that is not an earlier result.
     """
     began = time.perf_counter()
     tables = Tables(calibration.adjusted)
@@ -150,7 +145,8 @@ def write_calibration(
     verdict = Verdict.of([*said, *verdict_of(tables).findings])
     times = calibration.adjusted.seconds
     with whole_folder(directory) as work:
-        write_results(tables, verdict, work, seconds | {k: times[k] for k in ("compile", "solve", "covariance")})
+        spent = seconds | {k: times[k] for k in ("compile", "solve", "covariance")}
+        write_results(tables, verdict, work, spent, made=made)
         photographs = photographs_table(calibration)
         photographs.to_csv(work / "photographs.csv", index=False)
         (work / PICTURES).mkdir()
@@ -164,22 +160,25 @@ def write_calibration(
                 else targets_figure(calibration, name, picture)
             )
             figure.savefig(work / PICTURES / f"{name}.png")
-        table = photographs.to_html(index=False, border=0, na_rep="", float_format="{:.3f}".format)
-        page = Environment(autoescape=True).from_string(_PAGE)
-        (work / "photographs.html").write_text(
-            page.render(
-                title=calibration.adjusted.block.title,
-                head=page_head,
-                table=Markup(table),
-                pictures=shown,
-            ),
-            encoding="utf-8",
-        )
+        page = _photographs_page(calibration, photographs, shown)
+        (work / "photographs.html").write_text(page, encoding="utf-8")
         beside(work)
         summary = json.loads((work / "summary.json").read_text(encoding="utf-8"))
         summary["seconds"]["write"] = round(time.perf_counter() - began, 6)
         write_summary(summary | calibration_summary(calibration) | {"start": start}, work)
     return tables
+
+
+def _photographs_page(calibration: Calibration, photographs: pd.DataFrame, shown: Sequence[str]) -> str:
+    """Every photograph with its targets, the worst first, those left out last."""
+    order = photographs.sort_values("rms_px", ascending=False, kind="stable")
+    parts: list[StudyPart] = [PageLink("all results", "report.html"), Heading("Residuals"), rows_of(order)]
+    for name in (name for name in order["image"] if name in shown):
+        alt = f"targets of {name} and their residuals"
+        parts += [Heading(name), PictureFile(alt, f"{PICTURES}/{name}.png")]
+    n = len(calibration.measured.images)
+    said = f"{counted(n, 'photograph')} used, {len(calibration.left_out)} not"
+    return study_page(f"{calibration.adjusted.block.title or 'calibration'}: photographs", [said], parts)
 
 
 def calibration_summary(calibration: Calibration) -> dict:

@@ -11,12 +11,13 @@ from rich.table import Table
 
 from jaxphoto.camera import Sensor
 from jaxphoto.report.document import Heading, Paragraph, rows_of
+from jaxphoto.report.findings import p_words
 from jaxphoto.report.made import Made, made_section, versions
 from jaxphoto.report.maps import format_maps
 from jaxphoto.report.results import write_summary
 from jaxphoto.report.stability import Compared, missing_covariances
 from jaxphoto.report.study_page import WholePicture, study_page
-from jaxphoto.stability import LEVEL, Change
+from jaxphoto.stability import ALIGNED, LEVEL, Change
 from jaxphoto.stability.analysis import SIGNIFICANT_P
 from jaxphoto.writing import whole_folder
 
@@ -48,7 +49,7 @@ def change_verdict(found: Change, sensor: Sensor) -> list[str]:
     if found.degrees_of_freedom:
         said.append(
             f"by its parameters: chi-square {found.chi_square:.1f} of {found.degrees_of_freedom}, "
-            f"p = {found.p_parameters:.2g}: {_meaning(found.p_parameters)}"
+            f"{p_words(found.p_parameters, 2)}: {_meaning(found.p_parameters)}"
         )
     elif not found.parameters:
         said.append("the calibrations are of different models, so their parameters are not compared")
@@ -59,8 +60,8 @@ def change_verdict(found: Change, sensor: Sensor) -> list[str]:
     rmse = float(found.field.offsets.rmse_measured_mm) / sensor.pixel_mm
     if known is not None:
         said.append(
-            f"by its bundle of rays, aligned by {found.field.method}: {rmse:.3g} px root mean square over the format, "
-            f"p = {known.p_value:.2g}: {_meaning(known.p_value)}"
+            f"by its bundle of rays, {ALIGNED[found.field.method]}: {rmse:.3g} px root mean square over the format, "
+            f"{p_words(known.p_value, 2)}: {_meaning(known.p_value)}"
         )
     worst = int(np.argmax(found.offset_mm / found.limit_mm))
     x, y = np.asarray(found.field.offsets.points)[worst]
@@ -114,7 +115,9 @@ def write_change(found: Change, sets: tuple[Compared, Compared], sensor: Sensor,
         parameters.to_csv(work / "parameters.csv", index=False)
         change_cells(found, sensor).to_csv(work / "cells.csv", index=False)
         (work / "change.png").write_bytes(picture.png)
-        page = study_page("Change of a camera", verdict, parts)
+        tested = (found.p_parameters if found.degrees_of_freedom else 1.0, 1.0 if known is None else known.p_value)
+        colour = "amber" if min(tested) < SIGNIFICANT_P else "green"
+        page = study_page("Change of a camera", verdict, parts, colour)
         (work / "report.html").write_text(page, encoding="utf-8")
         summary = {
             "verdict": verdict,

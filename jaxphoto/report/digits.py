@@ -2,13 +2,27 @@
 
 import math
 
+# From here on a number is written without a power of ten, as by Python's "g".
+_LEAST = 1e-4
+# Digits beyond these are no more than rounding of the computation.
+_MOST = 12
+
 
 def with_sigma(value: float, sigma: float) -> str:
-    """A number to the second digit of its standard deviation."""
+    """A number to the second digit of its standard deviation; zero where it is less than half of that."""
     if not sigma > 0 or not value or not math.isfinite(value):
         return f"{value:.8g}"
-    digits = math.floor(math.log10(abs(value))) - math.floor(math.log10(sigma)) + 2
-    return f"{value:#.{min(max(digits, 2), 12)}g}".rstrip(".")
+    power = math.floor(math.log10(max(abs(value), sigma)))
+    places = min(1 - math.floor(math.log10(sigma)), _MOST - 1 - power)
+    if max(abs(value), sigma) >= _LEAST:
+        said = f"{value:.{max(places, 0)}f}"
+    elif abs(value) >= sigma:
+        said = f"{value:.{places + power}e}"
+    else:
+        said = f"{value / 10.0**power:.{places + power}f}e{power:03d}"
+    if float(said) == 0:
+        return said.removeprefix("-") if "e" not in said else "0"
+    return said
 
 
 def of_sigma(sigma: float) -> str:

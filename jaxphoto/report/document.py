@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import pandas as pd
 
+from jaxphoto.report.findings import Verdict
 from jaxphoto.report.table_files import head_of, readable
 from jaxphoto.report.tables import Tables
 
@@ -32,6 +33,11 @@ class Rows(NamedTuple):
 
     columns: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
+
+
+def finding_paragraphs(verdict: Verdict) -> list[Paragraph]:
+    """The findings, each as what it is: alarm, warning, information."""
+    return [Paragraph(f.text, f.level.name.lower()) for f in verdict.findings]
 
 
 def rows_of(table: pd.DataFrame) -> Rows:

@@ -55,8 +55,7 @@ def html_of(element: Element) -> Markup:
         return Markup('<p class="{}">{}</p>' if element.kind else "<p{}>{}</p>").format(element.kind, element.text)
     if isinstance(element, Rows):
         head = any(element.columns)
-        of = ("number", "text")
-        kinds = [Markup(' class="{}"').format(of[_is_text(c)]) if head else "" for c in zip(*element.rows, strict=True)]
+        kinds = [Markup(' class="{}"').format(_kind(c)) if head else "" for c in zip(*element.rows, strict=True)]
         kinds += [""] * (len(element.columns) - len(kinds))
         return Markup(_ROWS.render(columns=element.columns, rows=element.rows, head=head, kinds=kinds, long=_LONG))
     if isinstance(element, BlockInSpace):
@@ -66,10 +65,15 @@ def html_of(element: Element) -> Markup:
     return Markup('<div class="pictures">{}</div>').format(Markup("").join(map(_image, element.panels)))
 
 
-def _is_text(column: tuple[str, ...]) -> bool:
-    """Whether most cells of a column are more than a number: they are read from the left, and broken into lines."""
+def _kind(column: tuple[str, ...]) -> str:
+    """Class of a column: text where most cells are more than a number, read from the left and broken into lines.
+
+    Of sentences the lines are not to be of a word each on a narrow screen: prose.
+    """
     told = [cell for cell in column if cell]
-    return sum(len(cell) > _LONGEST or _NUMBER.fullmatch(cell) is None for cell in told) > len(told) / 2
+    if sum(len(cell) > _LONGEST or _NUMBER.fullmatch(cell) is None for cell in told) <= len(told) / 2:
+        return "number"
+    return "text prose" if any(len(cell) > _LONGEST and " " in cell for cell in told) else "text"
 
 
 def contents(headings: list[str]) -> Markup:

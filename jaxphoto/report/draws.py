@@ -11,10 +11,10 @@ import pandas as pd
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.observations import AXES
-from jaxphoto.report.document import Element, Heading, Paragraph, rows_of
+from jaxphoto.report.document import Heading, Paragraph, rows_of
 from jaxphoto.report.made import Made, made_section
 from jaxphoto.report.plots import drawn, new_figure
-from jaxphoto.report.study_page import WholePicture, study_page
+from jaxphoto.report.study_page import StudyPart, WholePicture, study_page
 from jaxphoto.sensitivity import Draws
 from jaxphoto.writing import whole_file
 
@@ -115,6 +115,7 @@ def draws_figure(columns: Mapping[str, np.ndarray], summary: pd.DataFrame) -> Fi
     across = min(3, len(chosen))
     down = -(-len(chosen) // across)
     figure = new_figure(3.3 * across, 2.5 * down)
+    figure.set_layout_engine("constrained", h_pad=0.1)
     of = summary.set_index("quantity")
     for axes, name in zip(figure.subplots(down, across, squeeze=False).flat, chosen, strict=False):
         values, row = np.asarray(columns[name], float), of.loc[name]
@@ -130,6 +131,7 @@ def draws_figure(columns: Mapping[str, np.ndarray], summary: pd.DataFrame) -> Fi
         axes.set_title(drawn(name), fontsize=9)
         axes.set_yticks([])
         axes.tick_params(labelsize=7)
+        axes.locator_params(axis="x", nbins=4)
     for axes in figure.axes[len(chosen) :]:
         axes.set_axis_off()
     return figure
@@ -155,7 +157,7 @@ def write_draws_page(summary: Mapping[str, Any], table: pd.DataFrame, directory:
         f"{summary['draws']} draws, of which {summary['converged']} converged. {_ratios(table[few])}",
         "The predicted sigma is the effect of the errors to first order; the ratio says how far draws agree with it.",
     ]
-    parts: list[Element | WholePicture] = []
+    parts: list[StudyPart] = []
     for name, heading in _PICTURES.items():
         if (file := directory / f"{name}.png").is_file():
             parts += [Heading(heading), WholePicture.read(file, heading)]

@@ -23,6 +23,7 @@ from jaxphoto.report.plots import (
     draw_mean_residuals,
     draw_residuals,
 )
+from jaxphoto.report.residual_plots import draw_residuals_by_radius, draw_station_residuals
 from jaxphoto.report.sigma_map import draw_sigma_map
 from jaxphoto.report.tables import Tables
 from jaxphoto.stability import distortion_curve
@@ -51,6 +52,20 @@ def plot_mean_residuals(tables: Tables, camera: str | None = None, axes: Axes | 
 def plot_density(tables: Tables, camera: str | None = None, axes: Axes | None = None) -> Axes:
     """How many image points lie in each cell of the format."""
     return _drawn(draw_density, tables, camera, axes)
+
+
+def plot_residuals_by_radius(tables: Tables, camera: str | None = None, axes: Axes | None = None) -> Axes:
+    """Mean radial and tangential residuals by distance from the principal point, with bars of two sigmas."""
+    return _drawn(draw_residuals_by_radius, tables, camera, axes)
+
+
+def plot_station_residuals(tables: Tables, axes: Axes | None = None) -> Axes:
+    """Residuals of camera stations in the order of the flight. Raises InputError where none was observed."""
+    if not len(tables.adjusted.block.stations.who):
+        raise InputError("the block has no observed stations to be drawn")
+    axes = axes_or_new(axes)
+    draw_station_residuals(axes, tables)
+    return axes
 
 
 def plot_check_points(tables: Tables, axes: Axes | None = None, *, upright: bool = False) -> Axes:

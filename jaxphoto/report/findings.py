@@ -1,8 +1,11 @@
 """What is said of an adjustment, by how much it matters: alarm, warning, information."""
 
 import enum
+import re
 from collections.abc import Iterable
 from typing import NamedTuple
+
+from jaxphoto.errors import camera_words
 
 
 class Level(enum.IntEnum):
@@ -77,6 +80,12 @@ def as_sentence(text: str) -> str:
     first = text.split(maxsplit=1)[0] if text.strip() else ""
     begun = text if len(first) == 1 or "_" in first else f"{text[:1].upper()}{text[1:]}"
     return begun if begun.endswith((".", "!", "?")) else f"{begun}."
+
+
+def parameter_words(path: str) -> str:
+    """The parameter at a path, as a sentence calls it: k1 of camera kodak."""
+    of_camera = re.fullmatch(r"interior\[(.*)\]\.(\w+)", path)
+    return f"{of_camera[2]} of {camera_words(of_camera[1])}" if of_camera else path
 
 
 def p_words(p_value: float, digits: int = 1) -> str:

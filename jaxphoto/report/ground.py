@@ -21,6 +21,10 @@ _CURES = {
 }
 
 
+# Where no station is observed nobody flies, or needs not know how high.
+_WITHOUT_STATIONS = "images from other distances, or tilted ones, tell them apart"
+
+
 def ground_findings(tables: Tables) -> Iterator[Finding]:
     """How c goes with the heights, and the camera as a whole with the dome, where nothing tells them apart."""
     for camera, g in tables.ground_correlations.items():
@@ -33,10 +37,13 @@ def _sentences(camera: str, g: GroundCorrelations, tables: Tables) -> Iterator[s
         rho = g.rho[:2, g.parameters.index("c_mm")]
         k = int(np.abs(rho).argmax())
         if abs(rho[k]) > HIGH:
+            flown = len(tables.adjusted.block.stations.who) > 0
+            words = _WORDS[FORMS[k]] if flown or k == 0 else "the distance of the images from the points"
+            what = "height" if flown or k == 0 else "distance"
             yield (
-                f"c of {camera_words(camera)} goes with {_WORDS[FORMS[k]]} (correlation {rho[k]:.3f}): if c is off by "
-                f"its standard deviation of {known['c_mm']:.2g} mm, the height is by {abs(rho[k]) * g.sigma_m[k]:.2g} "
-                f"m, and no residual shows it; {_CURES['c_mm']}"
+                f"c of {camera_words(camera)} goes with {words} (correlation {rho[k]:.3f}): if c is off by "
+                f"its standard deviation of {known['c_mm']:.2g} mm, the {what} is by {abs(rho[k]) * g.sigma_m[k]:.2g} "
+                f"m, and no residual shows it; {_CURES['c_mm'] if flown else _WITHOUT_STATIONS}"
             )
     dome = FORMS.index("dome")
     if g.together[dome] > HIGH:

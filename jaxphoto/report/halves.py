@@ -17,6 +17,7 @@ from jaxphoto.report.made import Made, made_section, versions
 from jaxphoto.report.maps import format_maps
 from jaxphoto.report.results import write_summary
 from jaxphoto.report.study_page import WholePicture, study_page
+from jaxphoto.stability import ALIGNED
 from jaxphoto.writing import whole_folder
 
 if TYPE_CHECKING:
@@ -80,7 +81,7 @@ def halves_verdict(found: Halves) -> list[str]:
     cell, wide = band.cell_factor, band.calibration
     cuts = f"{n} cuts" if n > 1 else "1 cut"
     sentences = [
-        f"{said} ({cuts} by {found.by}, aligned by {found.method})",
+        f"{said} ({cuts} by {found.by}; bundles of rays {ALIGNED[found.method]})",
         f"over the format the factor is {cell.min():.2f} to {cell.max():.2f}; 95 % of the errors lie within "
         f"{wide.min():.3g} to {wide.max():.3g} px, by the covariances as they are it would be "
         f"{(wide / cell).min():.3g} to {(wide / cell).max():.3g} px",

@@ -17,11 +17,12 @@ from jaxphoto.lidar import HeightFlag
 from jaxphoto.observations import AXES
 from jaxphoto.procedures.lidar import LidarControl, Round, Simultaneous
 from jaxphoto.procedures.lidar.vertical_control import flag_counts
-from jaxphoto.report.document import Element, Heading, Paragraph, Rows, rows_of
+from jaxphoto.report.document import Heading, Paragraph, Rows, finding_paragraphs, rows_of
+from jaxphoto.report.findings import as_sentence
 from jaxphoto.report.made import Made, made_section
 from jaxphoto.report.plots import new_figure
 from jaxphoto.report.results import summary_of, write_results, write_summary
-from jaxphoto.report.study_page import WholePicture, study_page
+from jaxphoto.report.study_page import PageLink, StudyPart, WholePicture, study_page
 from jaxphoto.report.tables import Tables
 from jaxphoto.report.verdict import verdict_of
 from jaxphoto.statistics import angle_differences, correlation_matrix
@@ -32,6 +33,8 @@ if TYPE_CHECKING:
 
 _UNITS = {"_mm": "mm", "_m": "m", "_m_per_s": "m/s", "_s": "s"}
 # Rows of a table that has no end.
+# Digits of a coordinate in metres that somebody reads.
+_MM = 3
 _STRONGEST = 30
 _ORDER = ("compile", "solve", "covariance")
 
@@ -177,25 +180,38 @@ def write_simultaneous(result: Simultaneous, directory: Path, seconds: dict[str,
         correlations.to_csv(work / "scanner_correlation.csv", index=False)
         picture = WholePicture.of(above_figure(result), "points above the surface of the cloud, before and after")
         (work / "above.png").write_bytes(picture.png)
-        strongest = correlations.reindex(correlations["rho"].abs().sort_values(ascending=False).index)
+        free = moved["sigma"].notna()
         parts = (
+            *finding_paragraphs(verdict),
+            *(Paragraph(as_sentence(sentence)) for sentence in rounds_words(result.rounds, result.still)),
+            PageLink("all results of the images", "adjustment/report.html"),
             Heading("What moved"),
-            rows_of(moved),
+            rows_of(moved[free]),
+            Paragraph("By these, root mean square:"),
+            rows_of(moved[~free].drop(columns="sigma")),
             picture,
             Heading("Rounds"),
-            rows_of(rounds),
+            rows_of(rounds.replace(np.inf, np.nan)),
             Heading("Correlations of the scanner"),
-            Paragraph("The strongest; all stand in scanner_correlation.csv, all results of images in adjustment."),
-            rows_of(strongest.head(_STRONGEST)),
+            Paragraph("The strongest; all stand in scanner_correlation.csv."),
+            rows_of(_strongest(correlations)),
             *made_section(made),
         )
         title = f"{tables.adjusted.block.title or 'Block'} and cloud, adjusted together"
-        said = (f"{verdict.headline} {' '.join(rounds_words(result.rounds, result.still))}",)
-        page = study_page(title, said, parts, verdict.colour)
+        page = study_page(title, (verdict.headline,), parts, verdict.colour)
         (work / "report.html").write_text(page, encoding="utf-8")
         summary = summary_of(tables, verdict, seconds | {"write": time.perf_counter() - began})
         write_summary(summary | {"rounds": len(result.rounds), "came_to_rest": result.still}, work)
         yield work
+
+
+def _strongest(correlations: pd.DataFrame) -> pd.DataFrame:
+    """Of two of the scanner once."""
+    names = ["parameter_a", "parameter_b"]
+    again = pd.DataFrame(np.sort(correlations[names].to_numpy(str), axis=1), correlations.index).duplicated()
+    kept = correlations[~again]
+    strongest = kept.loc[kept["rho"].abs().sort_values(ascending=False).index[:_STRONGEST]]
+    return strongest.assign(**{name: strongest[name].str.replace("_rad", "_deg") for name in names})
 
 
 def rounds_words(rounds: Sequence[Round], still: bool) -> tuple[str, str]:
@@ -219,11 +235,11 @@ def heights_page(control: LidarControl, picture: WholePicture, made: Made) -> st
     """The page of heights of a cloud as control: rounds, flags, picture, and the heights that differ most."""
     flags = flag_counts(control.flag)
     refused = Rows(("heights that are", "number"), tuple((name.lower(), str(n)) for name, n in flags.items()))
-    parts: list[Element | WholePicture] = [picture, Heading("Rounds"), rows_of(rounds_table(control.rounds))]
+    parts: list[StudyPart] = [picture, Heading("Rounds"), rows_of(rounds_table(control.rounds).replace(np.inf, np.nan))]
     parts += [refused] if flags else []
     heights = heights_table(control)
     off = (heights["height_m"] - heights["Z_m"]).abs().sort_values(ascending=False, na_position="last")
-    parts += [Heading("Heights that differ most"), rows_of(heights.loc[off.index[:_STRONGEST]])]
+    parts += [Heading("Heights that differ most"), rows_of(heights.loc[off.index[:_STRONGEST]].round(_MM))]
     parts += [Paragraph("All stand in lidar_heights.csv."), *made_section(made)]
     said = [*rounds_words(control.rounds, control.still)]
     said.append(f"{int(control.used.sum())} of {len(control.points)} tie points have a control height")

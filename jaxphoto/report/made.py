@@ -1,7 +1,7 @@
-"""How results came about: command and options, versions, date, and the hashes of what was read."""
+"""How results came about: command, versions, date, and the hashes of what was read."""
 
 import datetime
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from importlib.metadata import version
 from typing import Any, NamedTuple
 
@@ -16,17 +16,16 @@ class Made(NamedTuple):
     """How results came about."""
 
     command: str
-    options: Mapping[str, Any]
+    """As it is typed, without where its results went."""
     inputs: Sequence[InputFile] = ()
 
 
 def made_section(made: Made) -> Iterator[Element]:
     """The section of a report that says it."""
     yield Heading(PROVENANCE)
-    told = {k: option_word(v) for k, v in made.options.items() if v is not False and v not in (None, "", [], ())}
     rows = [
         ("computed", datetime.date.today().isoformat()),
-        ("command", f"jaxphoto {made.command}" + "".join(f", {k.replace('_', ' ')} {v}" for k, v in told.items())),
+        ("command", made.command),
         ("versions", ", ".join(f"{name} {number}" for name, number in versions().items())),
     ]
     yield Rows(("", ""), tuple(rows))

@@ -41,19 +41,21 @@ def points_section(tables: Tables, unit: str = "m") -> Iterator[Element]:
     columns = ("rays", "points", "share", "median angle [deg]", *(f"median sigma {a} [{unit}]" for a in "XYZ"))
     yield Rows(columns, tuple(rows))
     small = int((angle < _SMALL_DEG).sum())
+    in_z = table["sigma_Z_m"][table["sigma_Z_m"] > 0]
+    sigmas = (
+        f"Standard deviations are a posteriori; 95 % of points have less than {in_z.quantile(0.95):.3g} {unit} in Z."
+        if len(in_z)
+        else "All of them are held."
+    )
     yield Paragraph(
         f"A point has {table['n_images'].mean():.2f} rays on average. The angle is the largest between two rays of a "
-        f"point; of {small} points it is below {_SMALL_DEG:g} degrees. Standard deviations are a posteriori; 95 % of "
-        f"the points have less than {table['sigma_Z_m'].quantile(0.95):.3g} {unit} in Z."
+        f"point; of {small or 'no'} points it is below {_SMALL_DEG:g} degrees. {sigmas}"
     )
-    yield Pictures(
-        (
-            DocumentPicture(partial(draw_angles, angle=angle.dropna().to_numpy()), "Histogram of intersection angles"),
-            DocumentPicture(
-                partial(draw_sigmas, table=table, unit=unit), f"Histograms of standard deviations of points in {unit}"
-            ),
-        )
+    angles = DocumentPicture(partial(draw_angles, angle=angle.dropna().to_numpy()), "Histogram of intersection angles")
+    scatter = DocumentPicture(
+        partial(draw_sigmas, table=table, unit=unit), f"Histograms of standard deviations of points in {unit}"
     )
+    yield Pictures((angles, scatter) if len(in_z) else (angles,))
 
 
 def _row(of: pd.DataFrame, n: int) -> tuple[str, ...]:

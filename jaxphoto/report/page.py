@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,9 +13,10 @@ from markupsafe import Markup
 
 from jaxphoto.errors import camera_words
 from jaxphoto.observations import AXES
-from jaxphoto.report.document import BlockInSpace, Heading, Paragraph, rows_of
+from jaxphoto.report.document import BlockInSpace, DocumentPicture, Heading, Paragraph, Pictures, rows_of
 from jaxphoto.report.document_html import contents, html_of
 from jaxphoto.report.error_ellipses import ellipses_figure
+from jaxphoto.report.figures import plot_distortion
 from jaxphoto.report.findings import Verdict
 from jaxphoto.report.made import PROVENANCE, Made, made_section
 from jaxphoto.report.maps import png_of
@@ -28,6 +30,7 @@ from jaxphoto.report.plots import (
 )
 from jaxphoto.report.positional_accuracy import accuracy_sentences
 from jaxphoto.report.recovery import recovery_spread
+from jaxphoto.report.residual_plots import draw_residuals_by_radius, draw_station_residuals
 from jaxphoto.report.sigma_map import sigma_map_figure, sigma_map_words
 from jaxphoto.report.tables import Tables
 from jaxphoto.statistics import LEAST_CHECKED
@@ -54,6 +57,10 @@ _SIGMA_MAP = (
     "taken together, in the direction in which it is largest (sigma_map.csv). Of a direction the whole error of the "
     "principal distance counts; of a point as far away as those that were seen, only what its distance does not make "
     "good."
+)
+_DISTORTION = (
+    "Measured minus ideal image coordinates along the radius, for the c that was found; the band of 95 % is of the "
+    "covariance of all parameters."
 )
 _RECOVERY = (
     "Estimate minus truth in standard deviations (recovery.csv): about 1 in the root mean square, and 5 % beyond 2, "
@@ -94,6 +101,8 @@ def _sections(tables: Tables) -> Iterator[tuple[str, list[Markup]]]:
     """Headings with what is below them, of what there is."""
     check = tables.check_points
     yield "Interior orientation", _interior(tables)
+    if curves := [_curve(tables, camera) for camera in tables.sigma_maps]:
+        yield "Distortion", [_said(_DISTORTION), html_of(Pictures(tuple(curves)))]
     if tables.sigma_maps:
         yield "How sure the camera is, over its format", [_said(_SIGMA_MAP), *_sigma_maps(tables)]
     if tables.truth:
@@ -116,8 +125,10 @@ def _sections(tables: Tables) -> Iterator[tuple[str, list[Markup]]]:
     ellipses = _picture(ellipses_figure(tables), "error ellipses of the projection centres in plan")
     yield "Exterior orientation", [ellipses, _html(tables.exterior)]
     yield "Correlation of exterior and interior orientation over the images", [_html(tables.correlation_summary)]
-    if len(tables.correlation_ground):
-        yield "Correlation of the interior orientation and the ground as a whole", [_html(tables.correlation_ground)]
+    # What is held moves with nothing.
+    ground = tables.correlation_ground
+    if len(ground := ground[ground["sigma_m"] > 0]):
+        yield "Correlation of the interior orientation and the ground as a whole", [_html(ground)]
 
 
 def _interior(tables: Tables) -> list[Markup]:
@@ -127,6 +138,12 @@ def _interior(tables: Tables) -> list[Markup]:
     pictures = [_wide(_picture(correlation_figure(tables, c), alt)) for c in used]
     reach = [_said(_reach(tables, camera)) for camera in tables.adjusted.unknowns.interior]
     return [_html(table[table["sigma"].notna() | (table["value"] != 0)]), *reach, *pictures]
+
+
+def _curve(tables: Tables, camera: str) -> DocumentPicture:
+    return DocumentPicture(
+        lambda axes: plot_distortion(tables, camera, axes), f"distortion of {camera_words(camera)} by distance"
+    )
 
 
 def _reach(tables: Tables, camera: str) -> str:
@@ -153,6 +170,10 @@ def _residuals(tables: Tables) -> list[Markup]:
         for c in tables.adjusted.unknowns.interior
         for figure, what in ((residuals_figure, "image residuals"), (mean_residuals_figure, "mean image residuals"))
     ]
+    against = [(partial(draw_residuals_by_radius, tables=tables, camera=c), c) for c in tables.sigma_maps]
+    panels = [DocumentPicture(draw, f"residuals of {camera_words(c)} by distance") for draw, c in against]
+    if len(tables.adjusted.block.stations.who):
+        panels.append(DocumentPicture(partial(draw_station_residuals, tables=tables), "residuals of stations by time"))
     checked = tables.residuals[tables.residuals["redundancy_number"] > LEAST_CHECKED]
     largest = checked.assign(size=checked["w"].abs()).nlargest(_LARGEST, "size").drop(columns="size")
     title = Markup("<h3>{}</h3>").format
@@ -160,6 +181,7 @@ def _residuals(tables: Tables) -> list[Markup]:
     return [
         _html(tables.residual_spread),
         *figures,
+        *([html_of(Pictures(tuple(panels)))] if panels else []),
         *(trends if len(tables.trends) else []),
         title("Largest normalised residuals"),
         _html(largest),

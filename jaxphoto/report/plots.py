@@ -90,7 +90,7 @@ def residuals_figure(tables: Tables, camera: str) -> Figure:
 
 def draw_residuals(axes: Axes, tables: Tables, camera: str) -> None:
     """The same in a panel."""
-    xy, v = _of_camera(tables, camera)
+    xy, v = of_camera(tables, camera)
     title = f"image residuals of {drawn(camera_words(camera))}"
     if (n := v.shape[1]) > _ARROWS:
         one_in = -(-n // _ARROWS)
@@ -112,7 +112,7 @@ def mean_residuals_figure(tables: Tables, camera: str) -> Figure:
 
 def draw_mean_residuals(axes: Axes, tables: Tables, camera: str) -> None:
     """The same in a panel."""
-    xy, v = _of_camera(tables, camera)
+    xy, v = of_camera(tables, camera)
     sensor = tables.adjusted.block.sensors[camera]
     cell, centres = _cells(sensor, xy)
     n = np.bincount(cell, minlength=centres.shape[1])
@@ -124,7 +124,7 @@ def draw_mean_residuals(axes: Axes, tables: Tables, camera: str) -> None:
 
 def draw_density(axes: Axes, tables: Tables, camera: str) -> None:
     """How many image points of one camera lie in each cell of its format, all images together."""
-    xy, _ = _of_camera(tables, camera)
+    xy, _ = of_camera(tables, camera)
     sensor = tables.adjusted.block.sensors[camera]
     cell, centres = _cells(sensor, xy)
     across = len(np.unique(centres[0]))
@@ -146,7 +146,7 @@ def _cells(sensor: Sensor, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return row * across + column, (np.stack(places) - 0.5) * size
 
 
-def _of_camera(tables: Tables, camera: str) -> tuple[np.ndarray, np.ndarray]:
+def of_camera(tables: Tables, camera: str) -> tuple[np.ndarray, np.ndarray]:
     """Image points of one camera and their residuals (2 x n, mm)."""
     a = tables.adjusted
     mine = np.array([c == camera for c in a.block.image_camera])[a.structure.image]

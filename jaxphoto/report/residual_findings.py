@@ -2,15 +2,15 @@
 test of them could say.
 """
 
-import re
 from collections.abc import Iterator
 
 import numpy as np
 from scipy.special import erfc
 
+from jaxphoto.adjustment import Adjustment
 from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
 from jaxphoto.errors import camera_words
-from jaxphoto.report.findings import Finding, Level, p_words
+from jaxphoto.report.findings import Finding, Level, p_words, parameter_words
 from jaxphoto.report.tables import Tables, in_file_unit
 from jaxphoto.statistics import (
     DELTA0,
@@ -76,14 +76,6 @@ def _global_test(tables: Tables) -> Iterator[Finding]:
             "add observations",
         )
         return
-    for camera, factor in stretch(tables.adjusted).items():
-        if abs(factor - 1) > _STRETCHED:
-            yield Finding(
-                Level.INFORMATION,
-                f"{camera_words(camera)}: residuals are of corrected image coordinates, which its distortion "
-                f"{'stretches' if factor > 1 else 'shrinks'}; sigma naught of its image points is expected to be "
-                f'{factor:.3g}, not 1: say residuals = "measured" in [cameras.{camera}]',
-            )
     tested = group_factors(tables.adjusted, tables.redundancy)
     factors = [f for f in tested if f.p_value < LEVEL / len(tested)]
     if whole.p_value >= LEVEL:
@@ -117,6 +109,18 @@ def _global_test(tables: Tables) -> Iterator[Finding]:
             f"{said}: the observations contradict one another or the model{of_groups}; look at approximate values, "
             "units, point ids and the largest residuals",
         )
+
+
+def of_stretched_residuals(adjusted: Adjustment) -> Iterator[Finding]:
+    """Which sigma naught is expected of corrected image coordinates, where it is not 1."""
+    for camera, factor in stretch(adjusted).items() if adjusted.redundancy > 0 else ():
+        if abs(factor - 1) > _STRETCHED:
+            yield Finding(
+                Level.INFORMATION,
+                f"{camera_words(camera)}: residuals are of corrected image coordinates, which its distortion "
+                f"{'stretches' if factor > 1 else 'shrinks'}; sigma naught of its image points is expected to be "
+                f'{factor:.3g}, not 1: say residuals = "measured" in [cameras.{camera}]',
+            )
 
 
 def _blunders(tables: Tables) -> Iterator[Finding]:
@@ -185,7 +189,7 @@ def _trends(tables: Tables) -> Iterator[tuple[float, Finding]]:
             path = max(moves, key=lambda path: moves[path], default="")
             if path and (moved := moves[path]) > _MOVED:
                 matters, spoilt = True, moved > _SPOILT_BY_A_PATTERN
-                said += f"; {_called(path)} would move by {moved:.1f} of its sigma"
+                said += f"; {parameter_words(path)} would move by {moved:.1f} of its sigma"
         elif t.pattern.camera:
             said += ": no single usual term is most of it; try a distortion of more terms (docs/model_choice.md)"
         elif several := [h for h in t.hints if abs(h.amount) > _SURE * h.sigma][:_SHOWN]:
@@ -213,15 +217,9 @@ def _hidden_in_common(tables: Tables) -> Iterator[Finding]:
             yield Finding(
                 Level.INFORMATION,
                 f"{t.pattern.what}: an error in {h.term.name} that they have in common would be found with a "
-                f"probability of 80 % from {least} on, and one of that size moves {_called(path)} by {size:.2g} of its "
-                "sigma",
+                f"probability of 80 % from {least} on, and one of that size moves {parameter_words(path)} by "
+                f"{size:.2g} of its sigma",
             )
-
-
-def _called(path: str) -> str:
-    """The parameter at a path, as a sentence calls it: k1 of camera kodak."""
-    of_camera = re.fullmatch(r"interior\[(.*)\]\.(\w+)", path)
-    return f"{of_camera[2]} of {camera_words(of_camera[1])}" if of_camera else path
 
 
 def _told(pattern: ResidualPattern, likely: list[Hint]) -> str:

@@ -12,11 +12,12 @@ import pandas as pd
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.observations import AXES
-from jaxphoto.report.document import Element, Heading, Paragraph, rows_of
+from jaxphoto.report.document import Heading, Paragraph, rows_of
+from jaxphoto.report.findings import parameter_words
 from jaxphoto.report.made import Made, made_section, versions
 from jaxphoto.report.plots import drawn, new_figure
 from jaxphoto.report.results import write_summary
-from jaxphoto.report.study_page import WholePicture, study_page
+from jaxphoto.report.study_page import StudyPart, WholePicture, study_page
 from jaxphoto.report.tables import Tables
 from jaxphoto.sensitivity.exact import Sensitivity, sensitivity
 from jaxphoto.sensitivity.influence import DELTA0, Per, external_reliability, station_bias, variance_shares
@@ -67,6 +68,19 @@ class SensitivityTables:
         table["exact"], table["first_order"] = exact.ravel(), first.ravel()
         table["difference"] = table["exact"] - table["first_order"]
         return table
+
+    @cached_property
+    def largest(self) -> pd.DataFrame:
+        """Of each interior parameter the row of `bias` that changes it most, with the change over its sigma.
+
+        estimate, exact, over_sigma (a priori), first_order, unit, axis.
+        """
+        interior = self.bias[self.bias["estimate"].str.startswith("interior")]
+        most = interior.loc[interior.groupby("estimate", sort=False)["exact"].apply(lambda v: v.abs().idxmax())]
+        sigma = dict(zip(self.exact.labels, np.sqrt(variance_shares(self.adjusted, self.exact).variance), strict=True))
+        over = most["exact"] / most["estimate"].map(sigma).where(lambda v: v > 0)
+        table = most.assign(over_sigma=over)[["estimate", "exact", "over_sigma", "first_order", "unit", "axis"]]
+        return table.reset_index(drop=True)
 
     @cached_property
     def variance_shares(self) -> pd.DataFrame:
@@ -128,7 +142,9 @@ class SensitivityTables:
         panels |= {f"check points, {a}, RMS [m]": [f"points[{p}].{a}" for p in self.check] for a in AXES if self.check}
         columns = 3
         down = max(1, -(-len(panels) // columns))
-        figure = new_figure(9.6, 0.6 + 2.2 * down)
+        figure = new_figure(9.6, 0.9 + 2.3 * down)
+        # Names along an axis stand on end: room between them and the title of the panel below.
+        figure.set_layout_engine("constrained", h_pad=0.12)
         for axes, (title, names) in zip(
             figure.subplots(down, columns, squeeze=False).flat, panels.items(), strict=False
         ):
@@ -147,7 +163,7 @@ class SensitivityTables:
         for axes in figure.axes[len(panels) :]:
             axes.remove()
         if panels:
-            figure.axes[0].legend(fontsize=7)
+            figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8)
         figure.suptitle(f"change by a station bias of {self.bias_m:g} m per {self.per}", fontsize=11)
         return figure
 
@@ -174,9 +190,7 @@ def write_sensitivity(tables: SensitivityTables, directory: Path, seconds: dict[
         write_summary(_summary(tables, seconds | {"write": time.perf_counter() - began}), work)
 
 
-def _page(
-    tables: SensitivityTables, picture: WholePicture, made: Made
-) -> tuple[list[str], list[Element | WholePicture]]:
+def _page(tables: SensitivityTables, picture: WholePicture, made: Made) -> tuple[list[str], list[StudyPart]]:
     """Sentences and parts of the page: interior orientation and check points, and what most of each is of."""
     adjusted = tables.adjusted
     said = [
@@ -189,7 +203,14 @@ def _page(
     shares = tables.variance_shares[tables.variance_shares["estimate"].str.startswith("interior")]
     undetected = tables.external_reliability
     undetected = undetected[undetected["estimate"].str.startswith("interior")]
-    parts: list[Element | WholePicture] = [picture, Heading("Changes of the interior orientation")]
+    if len(most := tables.largest.dropna()):
+        worst = most.iloc[int(most["over_sigma"].abs().to_numpy().argmax())]
+        said.append(
+            f"Moved most, for its standard deviation, is {parameter_words(worst['estimate'])}: by "
+            f"{abs(worst['over_sigma']):.2f} of it, where the stations of {worst['unit']} are off in {worst['axis']}."
+        )
+    parts: list[StudyPart] = [Heading("Largest changes"), rows_of(tables.largest), picture]
+    parts += [Heading("Changes of the interior orientation")]
     parts += [rows_of(tables.bias[shown]), Paragraph("Every estimate stands in sensitivity.csv.")]
     parts += [Heading("Which observations the variance is of"), rows_of(shares)]
     parts += [Heading("What an undetected error does"), rows_of(undetected), *made_section(made)]
@@ -197,16 +218,15 @@ def _page(
 
 
 def _summary(tables: SensitivityTables, seconds: dict[str, float]) -> dict:
-    adjusted, table = tables.adjusted, tables.bias
+    adjusted, largest = tables.adjusted, tables.largest.set_index("estimate")
     shares = tables.variance_shares
     detectable = external_reliability(adjusted, tables.exact, tables.delta0).detectable
     interior = {}
     for name in (label for label in tables.exact.labels if label.startswith("interior")):
-        own = table[table["estimate"] == name]
-        worst = own.iloc[int(own["exact"].abs().to_numpy().argmax())]
+        worst = largest.loc[name]
         groups = shares[shares["estimate"] == name].set_index("group")["share"]
         interior[name] = {
-            "largest_change": {key: worst[key] for key in ("unit", "axis", "exact", "first_order", "difference")},
+            "largest_change": {key: worst[key] for key in ("unit", "axis", "exact", "first_order", "over_sigma")},
             "variance_shares": {str(group): float(share) for group, share in groups.items()},
         }
     return {

@@ -17,7 +17,7 @@ from jaxphoto.report.made import Made, made_section, versions
 from jaxphoto.report.plots import new_figure
 from jaxphoto.report.results import write_summary
 from jaxphoto.report.study_page import WholePicture, study_page
-from jaxphoto.stability import Analysis, Method
+from jaxphoto.stability import ALIGNED, Analysis, Method
 from jaxphoto.writing import whole_folder
 
 if TYPE_CHECKING:
@@ -146,13 +146,22 @@ def write_stability(
     verdict = f"{method}: {chosen.verdict(noise_mm)}"
     picture = WholePicture.of(offsets_figure(chosen, sensor), "offsets of the two bundles over the image")
     about = [str(sets[0]), str(sets[1]), missing_covariances(sets)]
-    parts = [*map(Paragraph, about), Heading("By method"), rows_of(table), picture, *made_section(made)]
+    methods = "The bundles of rays are compared " + "; ".join(f"{ALIGNED[name]} ({name})" for name in analyses) + "."
+    parts = [
+        *map(Paragraph, about),
+        Heading("By method"),
+        Paragraph(methods),
+        rows_of(table),
+        picture,
+        *made_section(made),
+    ]
     colour = "green" if chosen.similar(noise_mm) else "amber"
+    said = [f"Bundles {ALIGNED[method]} ({method}): {chosen.verdict(noise_mm)}"]
     with whole_folder(directory) as work:
         table.to_csv(work / "stability.csv", index=False)
         offsets_table(chosen).to_csv(work / "offsets.csv", index=False)
         (work / "offsets.png").write_bytes(picture.png)
-        page = study_page("Stability of interior orientation", [f"Aligned by {verdict}"], parts, colour)
+        page = study_page("Stability of interior orientation", said, parts, colour)
         (work / "report.html").write_text(page, encoding="utf-8")
         summary = {
             "verdict": verdict,

@@ -9,7 +9,7 @@ import pandas as pd
 
 from jaxphoto.lidar.raster import Raster
 from jaxphoto.procedures.lidar import StripAdjustment
-from jaxphoto.report.document import Element, Heading, Paragraph, rows_of
+from jaxphoto.report.document import Heading, Paragraph, finding_paragraphs, rows_of
 from jaxphoto.report.findings import Verdict
 from jaxphoto.report.made import Made, made_section
 from jaxphoto.report.results import write_results, write_summary
@@ -21,7 +21,7 @@ from jaxphoto.report.strips import (
     strip_rounds_table,
     trajectory_errors_table,
 )
-from jaxphoto.report.study_page import WholePicture, study_page
+from jaxphoto.report.study_page import StudyPart, WholePicture, study_page
 from jaxphoto.report.tables import Tables
 from jaxphoto.writing import whole_folder
 
@@ -88,8 +88,8 @@ def _to_be_read(differences: pd.DataFrame) -> pd.DataFrame:
 def _page(
     result: StripAdjustment, scanner: pd.DataFrame, verdict: Verdict, gaps: WholePicture | None, made: Made
 ) -> str:
-    parts: list[Element | WholePicture] = [Paragraph(f.text, f.level.name.lower()) for f in verdict.findings]
-    parts += [
+    parts: list[StudyPart] = [
+        *finding_paragraphs(verdict),
         Heading("Strips before and after"),
         rows_of(_to_be_read(differences_table(result.differences))),
         *([gaps] if gaps else []),

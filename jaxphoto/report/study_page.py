@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
+from urllib.parse import quote
 
 from jinja2 import Environment
 from markupsafe import Markup
@@ -46,7 +47,24 @@ class WholePicture(NamedTuple):
         return cls(png, png_uri(png), alt)
 
 
-def study_page(title: str, said: Sequence[str], parts: Iterable[Element | WholePicture], colour: str = "") -> str:
+class PageLink(NamedTuple):
+    """To a page in a folder beside this one."""
+
+    text: str
+    page: str
+
+
+class PictureFile(NamedTuple):
+    """A picture in a folder beside the page."""
+
+    alt: str
+    file: str
+
+
+StudyPart = Element | WholePicture | PageLink | PictureFile
+
+
+def study_page(title: str, said: Sequence[str], parts: Iterable[StudyPart], colour: str = "") -> str:
     """The page as HTML; `said` stands first, in `colour` (green, amber, red) where it is a verdict."""
     shown = list(parts)
     headings = [part.text for part in shown if isinstance(part, Heading)]
@@ -64,7 +82,13 @@ def study_page(title: str, said: Sequence[str], parts: Iterable[Element | WholeP
     )
 
 
-def _shown(part: Element | WholePicture) -> Markup:
+def _shown(part: StudyPart) -> Markup:
+    if isinstance(part, PageLink):
+        return Markup('<p><a href="{}">{}</a></p>').format(quote(part.page), part.text)
     if isinstance(part, WholePicture):
         return Markup('<div class="wide"><img alt="{}" src="{}"></div>').format(part.alt, part.uri)
+    if isinstance(part, PictureFile):
+        return Markup('<div class="wide"><img loading="lazy" alt="{}" src="{}"></div>').format(
+            part.alt, quote(part.file)
+        )
     return html_of(part)

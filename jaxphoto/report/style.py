@@ -1,7 +1,8 @@
 """The one style sheet of all pages: on wide and narrow screens, light and dark, and on paper."""
 
 STYLE = """\
-:root { color-scheme: light dark; --ink: #222; --paper: #fff; --line: #ddd; --head: #f4f4f4; --grey: #555;
+:root { color-scheme: light dark; --width: 62rem;
+  --ink: #222; --paper: #fff; --line: #ddd; --head: #f4f4f4; --grey: #555;
   --link: #0b57a4; --good: #176b2c; --bad: #a11; --alarm: #a11; --warning: #d90; --information: #89a;
   --green: #e2f2e5; --on-green: #124d20; --amber: #fdf0d5; --on-amber: #6b4700; --red: #fbe0e0; --on-red: #7d0d0d;
   --chosen: #fbe3b0 }
@@ -10,8 +11,8 @@ STYLE = """\
   --green: #143a1e; --on-green: #c4ecce; --amber: #43330c; --on-amber: #f5dfae; --red: #4a1717; --on-red: #f7caca;
   --chosen: #5a4510 } }
 html { overflow-wrap: anywhere }
-body { font: 15px/1.45 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: var(--ink);
-  background: var(--paper) }
+body { font: 15px/1.45 system-ui, sans-serif; max-width: var(--width); margin: 2rem auto; padding: 0 1rem;
+  color: var(--ink); background: var(--paper) }
 a { color: var(--link) } li { margin: .2rem 0 } code { font-size: 12px }
 h2 { margin-top: 2rem; border-bottom: 1px solid var(--line) }
 nav { columns: 15rem; margin: 1rem 0; padding: .5rem 1rem; background: var(--head); border-radius: 4px }
@@ -25,12 +26,12 @@ thead th:first-child { background: var(--head) }
   white-space: nowrap }
 .names td, .text { text-align: left } .names td { overflow-wrap: anywhere }
 img { max-width: 100%; background: #fff }
-td.number { white-space: nowrap }
+td.number { white-space: nowrap } td.prose { min-width: 16rem }
 .pictures { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(23rem, 100%), 1fr)); gap: .8rem;
   align-items: start; margin: .5rem 0 1rem }
 .pictures img { width: 100%; max-width: 29.5rem; height: auto }
 /* Wide tables have the room to the right of the text. */
-@media screen and (min-width: 80rem) { .wide { margin-right: calc((62rem - 100vw) / 2 + 1.5rem) }
+@media screen and (min-width: 80rem) { .wide { margin-right: calc((var(--width) - 100vw) / 2 + 1.5rem) }
   .wide img { max-width: 62rem } table:has(th:nth-child(12)) :is(th, td) { padding: .2rem .45rem } }
 .long { max-height: 75vh; overflow: auto } .long thead th { position: sticky; top: 0; z-index: 1 }
 .long thead th:first-child { z-index: 2 }

@@ -15,13 +15,21 @@ from jaxphoto.errors import InputError
 from jaxphoto.report.digits import of_sigma, with_sigma
 
 # Columns whose numbers are as sure as the column `sigma` of the same row says.
-_BY_SIGMA = ("value", "estimate", "truth", "error", "first", "second", "difference", "residual", "amount")
+_BY_SIGMA = (
+    "value", "estimate", "truth", "error", "first", "second", "difference", "residual", "amount",
+    "before", "after", "moved",
+)  # fmt: skip
 # Those of draws, by their scatter.
 _BY_SD = ("nominal", "mean", "q025", "q50", "q975")
 # Standard deviations by other names.
 _SIGMAS = ("sd", "predicted_sigma")
 # What is read to so many digits, without a standard deviation of its own.
-_DIGITS = {"redundancy_number": 2, "w": 3, "detectable": 3, "share": 2, "p_value": 2, "ratio": 3}
+_DIGITS = {"w": 3, "detectable": 3, "share": 2, "ratio": 3, "rmse": 3, "max_abs": 3, "factor": 3, "rms_px": 3}
+# What is read to so many places after the point: parts of one, and multiples of a standard deviation.
+_PLACES = {
+    "redundancy_number": 2, "largest_share": 3, "inside": 3, "effect_over_sigma": 2, "over_sigma": 2, "c_moves": 2,
+    "xp_moves": 2, "yp_moves": 2, "most_moves": 1, "rho": 3, "mean_abs_rho": 3, "max_abs_rho": 3,
+}  # fmt: skip
 # Names end in their units, the longest first.
 _UNITS = {
     "m_per_s": "m/s", "deg_per_s": "deg/s", "mm_per_s": "mm/s", "mm_per_h": "mm/h", "per_h": "1/h",
@@ -55,10 +63,12 @@ def _texts(table: pd.DataFrame, name: str) -> list[str]:
         return ["" if np.isnan(v) else of_sigma(v) for v in column]
     sigmas = _sigmas_of(table, name)
     # What is held is told whole; what nothing is told of, as far as anyone reads it.
-    untold = 2 if name.endswith("_moves") else _DIGITS.get(name, 4)
-    digits = 10 if _COORDINATE.match(name) else untold if sigmas is None else 8
+    if name == "p_value":
+        return ["" if np.isnan(v) else f"{v:.2g}" if v > 0 else "< 1e-300" for v in column]
+    digits = 10 if _COORDINATE.match(name) else _DIGITS.get(name, 4) if sigmas is None else 8
+    form = f".{_PLACES[name]}f" if name in _PLACES else f".{digits}g"
     return [
-        "" if np.isnan(v) else with_sigma(v, s) if s > 0 else f"{v:.{digits}g}"
+        "" if np.isnan(v) else with_sigma(v, s) if s > 0 else f"{v:{form}}"
         for v, s in zip(column, np.full(len(table), np.nan) if sigmas is None else sigmas, strict=True)
     ]
 

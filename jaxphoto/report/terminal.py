@@ -5,6 +5,7 @@ from rich.table import Table
 from rich.text import Text
 
 from jaxphoto.errors import printable
+from jaxphoto.report.digits import of_sigma, with_sigma
 from jaxphoto.report.findings import MARKS, Level, Verdict
 from jaxphoto.report.recovery import recovery_spread
 from jaxphoto.report.tables import Tables
@@ -13,6 +14,8 @@ from jaxphoto.statistics import residual_spread
 _FINDINGS = 12
 _COLOURS = {Level.INFORMATION: "green", Level.WARNING: "yellow", Level.ALARM: "red"}
 _PARAMETERS = 18
+# Of more standard deviations nobody reads tenths.
+_MANY = 100
 
 
 def plain(text: str) -> Text:
@@ -50,20 +53,20 @@ def print_adjustment(tables: Tables, verdict: Verdict, console: Console) -> None
             table.add_row(
                 plain(s.camera),
                 plain(s.parameter),
-                f"{s.value:.8g}",
-                f"{s.sigma:.3g}",
-                f"{s.ratio:.4g}",
+                with_sigma(s.value, s.sigma),
+                of_sigma(s.sigma),
+                f"{s.ratio:.0f}" if s.ratio > _MANY else f"{s.ratio:.1f}",
                 f"{s.p_value:.2g}",
             )
         console.print(table)
     if len(tables.georeferencing):
         table = Table("parameter", "value", "sigma", title="mounts and strips (a posteriori)")
         for parameter, value, sigma in tables.georeferencing.head(_PARAMETERS).itertuples(index=False):
-            table.add_row(plain(parameter), f"{value:.6g}", f"{sigma:.3g}")
+            table.add_row(plain(parameter), with_sigma(value, sigma), of_sigma(sigma))
         console.print(table)
     spread = Table("group", "axis", "n", "RMSE", "maximum", "unit", title="residuals")
     for v in residual_spread(adjusted):
-        spread.add_row(v.group, v.axis, str(v.n), f"{v.rmse:.4g}", f"{v.max_abs:.4g}", v.unit)
+        spread.add_row(v.group, v.axis, str(v.n), f"{v.rmse:.3g}", f"{v.max_abs:.3g}", v.unit)
     console.print(spread)
     if tables.truth:
         found = Table("group", "n", "rms ratio", "beyond 2 sigma", title="(estimate - truth) / sigma")

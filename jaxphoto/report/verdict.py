@@ -20,7 +20,12 @@ from jaxphoto.report.camera_drift import drift_findings
 from jaxphoto.report.doubled import doubled_findings
 from jaxphoto.report.findings import Finding, Level, Verdict
 from jaxphoto.report.ground import ground_findings
-from jaxphoto.report.residual_findings import NOTHING_FITS, of_residuals, of_what_is_not_checked
+from jaxphoto.report.residual_findings import (
+    NOTHING_FITS,
+    of_residuals,
+    of_stretched_residuals,
+    of_what_is_not_checked,
+)
 from jaxphoto.report.rolling_shutter import shutter_findings
 from jaxphoto.report.tables import Tables
 from jaxphoto.report.weakness import FELT, at_corner, weaknesses
@@ -72,6 +77,7 @@ def _findings(tables: Tables) -> Iterator[Finding]:
                 "nothing, use fewer coefficients or more points in the corners",
             )
     yield from of_what_is_not_checked(tables)
+    yield from of_stretched_residuals(adjusted)
 
 
 def _weak(tables: Tables, told: frozenset[str]) -> Iterator[Finding]:

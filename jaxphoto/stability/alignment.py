@@ -24,6 +24,12 @@ Method = Literal["zrot", "rot", "spr"]
 METHODS: tuple[Method, ...] = ("zrot", "rot", "spr")
 UNKNOWNS: dict[Method, int] = {"zrot": 0, "rot": 3, "spr": 6}
 """Unknowns u of the alignment: three angles (rad), then the position in units of the object's distance."""
+ALIGNED: dict[Method, str] = {
+    "zrot": "as they lie in the camera",
+    "rot": "turned onto one another",
+    "spr": "turned and moved onto one another",
+}
+"""How bundles lie when they are compared, in words."""
 
 # Gauss-Newton steps at most; bundles of one camera need 3 to 6.
 _STEPS = 50

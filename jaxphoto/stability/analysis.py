@@ -14,6 +14,8 @@ from jaxphoto.stability.uncertainty import OffsetUncertainty, offset_uncertainty
 
 # A p-value below this speaks against one camera.
 SIGNIFICANT_P = 0.05
+# What is smaller than any number is told as this.
+_LEAST_P = 1e-300
 
 
 class Analysis(NamedTuple):
@@ -37,10 +39,12 @@ class Analysis(NamedTuple):
         if known.low_mm <= noise_mm <= known.high_mm:
             text += f", but calibrations repeated would give {1e3 * known.low_mm:.3g} to {1e3 * known.high_mm:.3g} um"
         one = f"Two calibrations of one camera would differ by {1e3 * known.expected_of_one_mm:.3g} um"
-        if known.p_value < SIGNIFICANT_P:
-            changed = "the camera has changed, or many points of a set share errors"
-            return f"{text}. {one}, and by as much as this with p = {known.p_value:.2g}: {changed}."
-        return f"{text}. {one}, and by as much as this with p = {known.p_value:.2g}: nothing says that it has changed."
+        changed = (
+            "the camera has changed, or many points of a set share errors"
+            if known.p_value < SIGNIFICANT_P
+            else "nothing says that it has changed"
+        )
+        return f"{text}. {one}, and by as much as this with p = {max(known.p_value, _LEAST_P):.2g}: {changed}."
 
 
 def analyse(
