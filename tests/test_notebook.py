@@ -15,7 +15,7 @@ from tests.blocks import adjusted, simulated
 PANELS = (
     "plot_residuals", "plot_mean_residuals", "plot_density", "plot_check_points", "plot_interior_correlation",
     "plot_exterior_correlation", "plot_sigma_map", "plot_distortion", "plot_error_ellipses", "plot_residuals_by_radius",
-    "plot_station_residuals",
+    "plot_station_residuals", "plot_distortion_band",
 )  # fmt: skip
 
 

@@ -31,6 +31,14 @@ def draw_curve(axes: Axes, curve: DistortionCurve, factor: float) -> None:
     axes.legend(fontsize=7)
 
 
+def draw_band(axes: Axes, curve: DistortionCurve) -> None:
+    """Half the width of the band by itself: beside the distortion it is often thinner than the line."""
+    if curve.sigma is not None:
+        axes.plot(curve.r, 1e3 * NORMAL_95 * curve.sigma, "-", color="#08519c")
+    axes.set(xlabel="distance from the principal point [mm]", ylabel="95 % within +- [µm]", ylim=(0, None))
+    axes.set_title("how sure the radial distortion is", loc="left", fontsize=9)
+
+
 def draw_map(
     axes: Axes, sensor: Sensor, cells_mm: Float[np.ndarray, "cells 2"], values: Float[np.ndarray, cells], title: str
 ) -> None:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from jaxphoto.block import one_camera
 from jaxphoto.camera import parameter_names
 from jaxphoto.errors import InputError
-from jaxphoto.report.certificate_figures import draw_curve
+from jaxphoto.report.certificate_figures import draw_band, draw_curve
 from jaxphoto.report.error_ellipses import draw_error_ellipses
 from jaxphoto.report.plots import (
     axes_or_new,
@@ -26,7 +26,7 @@ from jaxphoto.report.plots import (
 from jaxphoto.report.residual_plots import draw_residuals_by_radius, draw_station_residuals
 from jaxphoto.report.sigma_map import draw_sigma_map
 from jaxphoto.report.tables import Tables
-from jaxphoto.stability import distortion_curve
+from jaxphoto.stability import DistortionCurve, distortion_curve
 from jaxphoto.statistics.sigma_map import sigma_map
 
 if TYPE_CHECKING:
@@ -108,9 +108,20 @@ def plot_sigma_map(
 
 def plot_distortion(tables: Tables, camera: str | None = None, axes: Axes | None = None) -> Axes:
     """Radial distortion against the distance from the principal point, with its 95 % band, and the rest of it."""
+    axes = axes_or_new(axes)
+    draw_curve(axes, _curve(tables, camera), 1.0)
+    return axes
+
+
+def plot_distortion_band(tables: Tables, camera: str | None = None, axes: Axes | None = None) -> Axes:
+    """Half the width of the 95 % band of the radial distortion against the distance from the principal point."""
+    axes = axes_or_new(axes)
+    draw_band(axes, _curve(tables, camera))
+    return axes
+
+
+def _curve(tables: Tables, camera: str | None) -> DistortionCurve:
     name, a = one_camera(tables.adjusted.block, camera), tables.adjusted
     interior = a.unknowns.interior[name]
     covariance = tables.covariance.of_interior(name, parameter_names(interior))
-    axes = axes_or_new(axes)
-    draw_curve(axes, distortion_curve(interior, a.block.sensors[name], covariance), 1.0)
-    return axes
+    return distortion_curve(interior, a.block.sensors[name], covariance)

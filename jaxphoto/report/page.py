@@ -16,7 +16,7 @@ from jaxphoto.observations import AXES
 from jaxphoto.report.document import BlockInSpace, DocumentPicture, Heading, Paragraph, Pictures, rows_of
 from jaxphoto.report.document_html import contents, html_of
 from jaxphoto.report.error_ellipses import ellipses_figure
-from jaxphoto.report.figures import plot_distortion
+from jaxphoto.report.figures import plot_distortion, plot_distortion_band
 from jaxphoto.report.findings import Verdict
 from jaxphoto.report.made import PROVENANCE, Made, made_section
 from jaxphoto.report.maps import png_of
@@ -101,8 +101,9 @@ def _sections(tables: Tables) -> Iterator[tuple[str, list[Markup]]]:
     """Headings with what is below them, of what there is."""
     check = tables.check_points
     yield "Interior orientation", _interior(tables)
-    if curves := [_curve(tables, camera) for camera in tables.sigma_maps]:
-        yield "Distortion", [_said(_DISTORTION), html_of(Pictures(tuple(curves)))]
+    if tables.sigma_maps:
+        curves = (html_of(_distortion(tables, camera)) for camera in tables.sigma_maps)
+        yield "Distortion", [_said(_DISTORTION), *curves]
     if tables.sigma_maps:
         yield "How sure the camera is, over its format", [_said(_SIGMA_MAP), *_sigma_maps(tables)]
     if tables.truth:
@@ -140,10 +141,13 @@ def _interior(tables: Tables) -> list[Markup]:
     return [_html(table[table["sigma"].notna() | (table["value"] != 0)]), *reach, *pictures]
 
 
-def _curve(tables: Tables, camera: str) -> DocumentPicture:
-    return DocumentPicture(
-        lambda axes: plot_distortion(tables, camera, axes), f"distortion of {camera_words(camera)} by distance"
+def _distortion(tables: Tables, camera: str) -> Pictures:
+    draws = {"distortion": plot_distortion, "half the width of its band": plot_distortion_band}
+    panels = (
+        DocumentPicture(partial(plot, tables, camera), f"{what} of {camera_words(camera)} by distance")
+        for what, plot in draws.items()
     )
+    return Pictures(tuple(panels))
 
 
 def _reach(tables: Tables, camera: str) -> str:
