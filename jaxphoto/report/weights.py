@@ -59,6 +59,6 @@ def print_components(found: VarianceComponents, console: Console) -> None:
     for k, label in enumerate(found.labels):
         factor, sigma = found.factor[k], found.sigma[k]
         said = f"standard deviations x {factor**0.5:.3g}, variances x {factor:.3g} +- {sigma:.2g}"
-        from_ = f"({counted(found.observations[k], 'observation')}, redundancy {found.redundancy[k]:.4g})"
+        from_ = f"({counted(found.observations[k], 'observation')}, redundancy {found.redundancy[k]:.1f})"
         line = f"  {label}: {said if found.supported[k] else 'as stated'} {from_}"
         console.print(plain(line), soft_wrap=True)

@@ -43,9 +43,9 @@ def weights_section(report: PartReport) -> Iterator[Element]:
         yield Paragraph("No variance components: standard deviations are as they were given.")
         return
     rows = tuple(
-        (label, str(found.observations[k]), f"{found.redundancy[k]:.5g}", *_factor(found.factor[k], found.sigma[k]))
+        (label, str(found.observations[k]), f"{found.redundancy[k]:.1f}", *_factor(found.factor[k], found.sigma[k]))
         if found.supported[k]
-        else (label, str(found.observations[k]), f"{found.redundancy[k]:.5g}", "as given", "")
+        else (label, str(found.observations[k]), f"{found.redundancy[k]:.1f}", "as given", "")
         for k, label in enumerate(found.labels)
     )
     columns = ("variance components of", "observations", "redundancy", "sigmas times", "variance times")

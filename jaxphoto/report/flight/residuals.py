@@ -14,6 +14,7 @@ from jaxphoto.report.flight.part import PartReport
 from jaxphoto.report.flight.positions import name_ends
 from jaxphoto.report.plots import draw_density, draw_mean_residuals, drawn
 from jaxphoto.report.residual_findings import MOST_OF_IT
+from jaxphoto.report.residual_plots import draw_residuals_by_radius
 from jaxphoto.report.tables import in_file_unit
 from jaxphoto.statistics import LEVEL, residual_spread
 
@@ -41,6 +42,10 @@ def residuals_section(report: PartReport) -> Iterator[Element]:
                 lambda axes: draw_mean_residuals(axes, report.tables, camera),
                 "Arrows of mean residuals over the format: what all photographs have in common",
                 3.8,
+            ),
+            DocumentPicture(
+                lambda axes: draw_residuals_by_radius(axes, report.tables, camera),
+                "Mean radial and tangential residuals by distance from the principal point",
             ),
         )
     )
