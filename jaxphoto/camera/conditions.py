@@ -36,6 +36,13 @@ class Conditions(NamedTuple):
     humidity_percent: float | None = None
     pressure_hpa: float | None = None
 
+    @property
+    def camera(self) -> str:
+        """Maker and model. Some makers write their name into the model again."""
+        name = next(iter(self.make.split()), "")
+        told = self.model.lower().startswith(name.lower())
+        return self.model if told else f"{self.make} {self.model}".strip()
+
 
 TEXTS = ("time", "make", "model", "serial", "lens", "lens_serial", "drone", "firmware")
 NUMBERS = (

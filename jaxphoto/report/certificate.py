@@ -40,7 +40,7 @@ def certificate_of(given: Certified) -> Document:
     """The certificate. Raises InputError for a camera that folds inside its format, and what `change` raises."""
     elements = [e for section in _SECTIONS for e in section(given)]
     sha = digest_of_all(_all_inputs(given))
-    model = next((f"{c.make} {c.model} {c.serial}".strip() for c in given.conditions if c.make or c.model), "")
+    model = next((f"{c.camera} {c.serial}".strip() for c in given.conditions if c.camera), "")
     title = f"Certificate of calibration: {model or camera_words(given.camera)}"
     return Document(title, f"inputs SHA-256 {sha[:16]}", tuple(elements))
 

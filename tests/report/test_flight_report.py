@@ -9,6 +9,7 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver
 
+from jaxphoto.camera.conditions import Conditions
 from jaxphoto.errors import camera_words
 from jaxphoto.procedures.control import ControlledBlock
 from jaxphoto.procedures.control.marked import Marked
@@ -257,6 +258,21 @@ def test_provenance_is_silent_of_what_photographs_do_not_say():
     names = lambda s: [row[0] for e in provenance_section(s) if isinstance(e, Rows) for row in e.rows]  # noqa: E731
     assert "photographs taken" in names(told) and "photographs taken" not in names(bare)
     assert "exposure" not in names(told)
+
+
+@pytest.mark.parametrize(
+    ("make", "model", "camera"),
+    [
+        ("Canon", "Canon PowerShot SX260 HS", "Canon PowerShot SX260 HS"),
+        ("NIKON CORPORATION", "NIKON D810", "NIKON D810"),
+        ("DJI", "FC330", "DJI FC330"),
+        ("", "FC330", "FC330"),
+        ("DJI", "", "DJI"),
+        ("", "", ""),
+    ],
+)
+def test_a_maker_that_is_in_the_name_of_the_model_is_told_once(make, model, camera):
+    assert Conditions("i", "i.jpg", "0" * 64, make=make, model=model).camera == camera
 
 
 def test_columns_of_words_are_read_from_the_left_and_numbers_from_the_right():

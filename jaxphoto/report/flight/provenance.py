@@ -31,7 +31,7 @@ def _rows(source: FlightSource) -> Iterator[tuple[str, str]]:
     if source.conditions:
         if any(c.time for c in source.conditions):
             yield "photographs taken", dates(source.conditions)
-        for name, field in (("camera", "model"), ("aircraft", "drone")):
+        for name, field in (("camera", "camera"), ("aircraft", "drone")):
             if said := ", ".join(dict.fromkeys(v for c in source.conditions if (v := getattr(c, field)))):
                 yield name, said
         # What no photograph says is told in the certificate.
