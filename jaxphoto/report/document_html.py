@@ -25,7 +25,7 @@ _PAGE = """{{ head(title) }}<body>
 """
 _HTML = Environment(autoescape=True)
 # Numbers, with a unit, with what they are good to, several beside one another: all of a cell, which is short.
-_ONE = r"([-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?(\([\d.]+\))?|-)"
+_ONE = r"((< )?[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?(\([\d.]+\))?|-)"
 _UNIT = r"( ?[^\W\d_]{1,7}| ?%)"
 _NUMBER = re.compile(rf"{_ONE}{_UNIT}?(( (\+-|/|x|to|=) |, ?|/){_ONE}{_UNIT}?)*( or more)?")
 _LONGEST = 40

@@ -19,8 +19,8 @@
 
   // ---- tables
 
-  // A number, and after it at most a unit or what it is good to: "-1.5e-05", "0.35 px", "12 +- 3".
-  const NUMBER = /^[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?($|[\s(,/%])/i;
+  // A number, and after it at most a unit or what it is good to: "-1.5e-05", "0.35 px", "12 +- 3", "< 1e-300".
+  const NUMBER = /^(< )?[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?($|[\s(,/%])/i;
   const order = new Intl.Collator(undefined, { numeric: true });
 
   const sortBy = (table, heads, column) => {
@@ -28,7 +28,7 @@
     const rows = [...table.tBodies[0].rows], texts = rows.map((row) => row.cells[column].textContent.trim());
     const told = texts.filter((text) => text && text !== "-");
     const number = told.filter((text) => NUMBER.test(text)).length > told.length / 2;
-    const key = (text) => (!number ? text : NUMBER.test(text) ? parseFloat(text) : NaN);
+    const key = (text) => (!number ? text : NUMBER.test(text) ? parseFloat(text.replace("< ", "")) : NaN);
     const keyed = rows.map((row, k) => ({ row, key: key(texts[k]) }));
     // What is no number, and what is empty, comes last either way.
     const none = (key) => (number ? Number.isNaN(key) : key === "");

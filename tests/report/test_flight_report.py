@@ -295,6 +295,7 @@ def test_a_number_is_all_of_its_cell():
         "21 or more",
         "8.4(12)",
         "3 µm",
+        "< 1e-300",
     )
     assert {kind(cell) for cell in numbers} == {"number"}
     words = "0.5 px on average, rms 0.7 px", "12 of 14", "1 2024", "12 " + "1, " * 20 + "1"
