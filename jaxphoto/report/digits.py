@@ -28,3 +28,8 @@ def with_sigma(value: float, sigma: float) -> str:
 def of_sigma(sigma: float) -> str:
     """A standard deviation in two digits."""
     return f"{sigma:#.2g}".rstrip(".") if sigma > 0 else ""
+
+
+def of_p(p_value: float) -> str:
+    """A p-value in two digits; what is too small for a number is no zero."""
+    return f"{p_value:.2g}" if p_value > 0 else "< 1e-300"

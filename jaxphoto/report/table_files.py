@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from jaxphoto.errors import InputError
-from jaxphoto.report.digits import of_sigma, with_sigma
+from jaxphoto.report.digits import of_p, of_sigma, with_sigma
 
 # Columns whose numbers are as sure as the column `sigma` of the same row says.
 _BY_SIGMA = (
@@ -64,7 +64,7 @@ def _texts(table: pd.DataFrame, name: str) -> list[str]:
     sigmas = _sigmas_of(table, name)
     # What is held is told whole; what nothing is told of, as far as anyone reads it.
     if name == "p_value":
-        return ["" if np.isnan(v) else f"{v:.2g}" if v > 0 else "< 1e-300" for v in column]
+        return ["" if np.isnan(v) else of_p(v) for v in column]
     digits = 10 if _COORDINATE.match(name) else _DIGITS.get(name, 4) if sigmas is None else 8
     form = f".{_PLACES[name]}f" if name in _PLACES else f".{digits}g"
     return [

@@ -5,7 +5,7 @@ from rich.table import Table
 from rich.text import Text
 
 from jaxphoto.errors import printable
-from jaxphoto.report.digits import of_sigma, with_sigma
+from jaxphoto.report.digits import of_p, of_sigma, with_sigma
 from jaxphoto.report.findings import MARKS, Level, Verdict
 from jaxphoto.report.recovery import recovery_spread
 from jaxphoto.report.tables import Tables
@@ -56,7 +56,7 @@ def print_adjustment(tables: Tables, verdict: Verdict, console: Console) -> None
                 with_sigma(s.value, s.sigma),
                 of_sigma(s.sigma),
                 f"{s.ratio:.0f}" if s.ratio > _MANY else f"{s.ratio:.1f}",
-                f"{s.p_value:.2g}",
+                of_p(s.p_value),
             )
         console.print(table)
     if len(tables.georeferencing):
