@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 # Error bars are so many standard deviations.
 _BARS = 2.0
 _ANGLES = re.compile(r"mounts\[.*\]\.boresight_._deg")
-_SHIFTS = re.compile(r"strips\[(.*)\]\.shift_(.)_m")
+_SHIFTS = re.compile(r"strips\[.*\]\.shift_._m")
 
 
 def boresight_verdict(steps: tuple[Step, ...]) -> str:

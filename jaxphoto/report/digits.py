@@ -30,6 +30,6 @@ def of_sigma(sigma: float) -> str:
     return f"{sigma:#.2g}".rstrip(".") if sigma > 0 else ""
 
 
-def of_p(p_value: float) -> str:
-    """A p-value in two digits; what is too small for a number is no zero."""
-    return f"{p_value:.2g}" if p_value > 0 else "< 1e-300"
+def of_p(p_value: float, digits: int = 2) -> str:
+    """A p-value; what is too small for a number is no zero."""
+    return f"{p_value:.{digits}g}" if p_value > 0 else "< 1e-300"

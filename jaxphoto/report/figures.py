@@ -109,18 +109,19 @@ def plot_sigma_map(
 def plot_distortion(tables: Tables, camera: str | None = None, axes: Axes | None = None) -> Axes:
     """Radial distortion against the distance from the principal point, with its 95 % band, and the rest of it."""
     axes = axes_or_new(axes)
-    draw_curve(axes, _curve(tables, camera), 1.0)
+    draw_curve(axes, curve_of(tables, camera), 1.0)
     return axes
 
 
 def plot_distortion_band(tables: Tables, camera: str | None = None, axes: Axes | None = None) -> Axes:
     """Half the width of the 95 % band of the radial distortion against the distance from the principal point."""
     axes = axes_or_new(axes)
-    draw_band(axes, _curve(tables, camera))
+    draw_band(axes, curve_of(tables, camera))
     return axes
 
 
-def _curve(tables: Tables, camera: str | None) -> DistortionCurve:
+def curve_of(tables: Tables, camera: str | None = None) -> DistortionCurve:
+    """The distortion of a camera by distance, with its standard deviations a posteriori."""
     name, a = one_camera(tables.adjusted.block, camera), tables.adjusted
     interior = a.unknowns.interior[name]
     covariance = tables.covariance.of_interior(name, parameter_names(interior))

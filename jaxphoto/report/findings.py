@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 from jaxphoto.errors import camera_words
+from jaxphoto.report.digits import of_p
 
 
 class Level(enum.IntEnum):
@@ -89,5 +90,6 @@ def parameter_words(path: str) -> str:
 
 
 def p_words(p_value: float, digits: int = 1) -> str:
-    """The p-value of a test; what is too small for a number is no zero."""
-    return f"p = {p_value:.{digits}g}" if p_value > 0 else "p < 1e-300"
+    """The p-value of a test, as a sentence tells it."""
+    said = of_p(p_value, digits)
+    return f"p {said}" if said.startswith("<") else f"p = {said}"

@@ -13,10 +13,11 @@ from markupsafe import Markup
 
 from jaxphoto.errors import camera_words
 from jaxphoto.observations import AXES
+from jaxphoto.report.certificate_figures import draw_band, draw_curve
 from jaxphoto.report.document import BlockInSpace, DocumentPicture, Heading, Paragraph, Pictures, rows_of
 from jaxphoto.report.document_html import contents, html_of
 from jaxphoto.report.error_ellipses import ellipses_figure
-from jaxphoto.report.figures import plot_distortion, plot_distortion_band
+from jaxphoto.report.figures import curve_of
 from jaxphoto.report.findings import Verdict
 from jaxphoto.report.made import PROVENANCE, Made, made_section
 from jaxphoto.report.maps import png_of
@@ -104,7 +105,6 @@ def _sections(tables: Tables) -> Iterator[tuple[str, list[Markup]]]:
     if tables.sigma_maps:
         curves = (html_of(_distortion(tables, camera)) for camera in tables.sigma_maps)
         yield "Distortion", [_said(_DISTORTION), *curves]
-    if tables.sigma_maps:
         yield "How sure the camera is, over its format", [_said(_SIGMA_MAP), *_sigma_maps(tables)]
     if tables.truth:
         interior = tables.recovery[tables.recovery["parameter"].str.startswith("interior[")]
@@ -142,12 +142,9 @@ def _interior(tables: Tables) -> list[Markup]:
 
 
 def _distortion(tables: Tables, camera: str) -> Pictures:
-    draws = {"distortion": plot_distortion, "half the width of its band": plot_distortion_band}
-    panels = (
-        DocumentPicture(partial(plot, tables, camera), f"{what} of {camera_words(camera)} by distance")
-        for what, plot in draws.items()
-    )
-    return Pictures(tuple(panels))
+    curve, of = curve_of(tables, camera), f"of {camera_words(camera)} by distance"
+    whole = DocumentPicture(partial(draw_curve, curve=curve, factor=1.0), f"distortion {of}")
+    return Pictures((whole, DocumentPicture(partial(draw_band, curve=curve), f"half the width of its band {of}")))
 
 
 def _reach(tables: Tables, camera: str) -> str:
@@ -174,8 +171,12 @@ def _residuals(tables: Tables) -> list[Markup]:
         for c in tables.adjusted.unknowns.interior
         for figure, what in ((residuals_figure, "image residuals"), (mean_residuals_figure, "mean image residuals"))
     ]
-    against = [(partial(draw_residuals_by_radius, tables=tables, camera=c), c) for c in tables.sigma_maps]
-    panels = [DocumentPicture(draw, f"residuals of {camera_words(c)} by distance") for draw, c in against]
+    panels = [
+        DocumentPicture(
+            partial(draw_residuals_by_radius, tables=tables, camera=c), f"residuals of {camera_words(c)} by distance"
+        )
+        for c in tables.sigma_maps
+    ]
     if len(tables.adjusted.block.stations.who):
         panels.append(DocumentPicture(partial(draw_station_residuals, tables=tables), "residuals of stations by time"))
     checked = tables.residuals[tables.residuals["redundancy_number"] > LEAST_CHECKED]

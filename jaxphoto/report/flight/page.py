@@ -6,7 +6,7 @@ import numpy as np
 from jinja2 import Environment
 
 from jaxphoto.report.alike import with_alike
-from jaxphoto.report.document import BlockInSpace, Element, Heading, Paragraph, Rows
+from jaxphoto.report.document import BlockInSpace, Element, Heading, Paragraph, Rows, finding_paragraphs
 from jaxphoto.report.document_html import contents, html_of
 from jaxphoto.report.findings import Verdict, as_sentence
 from jaxphoto.report.flight.camera import camera_section, interior_rows
@@ -139,7 +139,7 @@ def _short(report: PartReport, number: int, source: FlightSource) -> Iterable[El
     part = report.part
     yield Heading(f"Part {number}")
     yield Paragraph(report.verdict.headline, f"verdict {report.verdict.colour}")
-    yield from (Paragraph(f.text, f.level.name.lower()) for f in report.verdict.findings)
+    yield from finding_paragraphs(report.verdict)
     yield interior_rows(report, source.start)
     yield from (Paragraph(as_sentence(s)) for s in part.lens)
     used = report.images[report.images["position"] == "used"]
