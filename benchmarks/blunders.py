@@ -65,7 +65,7 @@ def main() -> None:
               f"camera within {_NEAR:g} sigma", "worst", "refused", "s a block"]  # fmt: skip
     titles += ["Ceres, Cauchy loss: camera within", "worst"] if peer else []
     given = f" --problem {arguments.problem}{' --cauchy' if peer else ''}" if problem else ""
-    command = f"python benchmarks/blunders.py{given} --draws {arguments.draws}"
+    command = f"python benchmarks/blunders.py{given} --draws {arguments.draws} --seed {arguments.seed}"
     rows = [_row(name, records) for name in _cases(block)]
     lines = [
         f"### Blunders in {arguments.problem or arguments.block.name}",

@@ -19,6 +19,7 @@ from jaxphoto.io.cameras import read_camera_file
 from jaxphoto.procedures.halves import halved, halves
 from jaxphoto.simulation import image_coordinates, remeasure
 from jaxphoto.stability import Differences, band_of, bundle_offsets, concentration, image_grid, leading_unit, overlap
+from jaxphoto.stability.band import square_radius
 from jaxphoto.statistics import common_covariance
 from jaxphoto.variants import some_images
 from tests.blocks import FIELDS, FIVE, SENSOR, simulated
@@ -30,7 +31,7 @@ CELLS = image_grid(SENSOR, 7, 5)
 def test_of_many_linear_calibrations_the_factor_scatters_as_stated_and_the_band_holds():
     """Errors of 30 units z_i twice as large as promised: F is 2 with its sigma, and 95 % of new errors are inside."""
     rng = np.random.default_rng(4)
-    cells, p, units, cuts, true = 12, 3, 30, 25, 2.0
+    cells, p, units, cuts, true = 12, 3, 30, 64, 2.0
     jacobian = rng.normal(size=(2 * cells, p))
     root = rng.normal(size=(p, p))
     by_cell = jacobian.reshape(cells, 2, p) @ root
@@ -53,6 +54,28 @@ def test_of_many_linear_calibrations_the_factor_scatters_as_stated_and_the_band_
     assert np.std(factors) / true == pytest.approx(np.mean(sigmas), rel=0.12)
     assert np.mean(inside) == pytest.approx(0.95, abs=0.02)
     assert np.mean(fresh) == pytest.approx(0.95, abs=0.01)
+
+
+def test_the_band_of_differences_holds_95_percent_where_one_unit_leads_them_all():
+    """Differences of one size and two signs: the radius that is right for normal ones holds 99 % of them."""
+    rng = np.random.default_rng(6)
+    cells, p, units, cuts = 12, 3, 30, 64
+    by_cell = rng.normal(size=(cells, 2, p))
+    one = np.einsum("cip,cjp->cij", by_cell, by_cell)
+    promised, size = np.broadcast_to(one, (cuts, *one.shape)), np.ones(units)
+    axes = concentration(by_cell.reshape(2 * cells, p), np.eye(p))
+    fresh, normal = [], []
+    for _ in range(200):
+        first = np.argsort(rng.random((cuts + 40, units)), axis=1) < units // 2
+        effects = np.einsum("cip,up->uci", by_cell, rng.normal(size=(units, p)))
+        effects[0] *= 20
+        offsets = np.einsum("ku,uci->kci", np.where(first, 1.0, -1.0), effects)
+        band = band_of(Differences(offsets[:cuts], promised, axes, overlap(first[:cuts], size)), one)
+        length = np.linalg.norm(offsets[cuts:], axis=2)
+        fresh.append((length < band.halves).mean())
+        normal.append((length < band.cell_factor * np.sqrt(square_radius(one, 1 / cuts))).mean())
+    assert np.mean(fresh) == pytest.approx(0.95, abs=0.012)
+    assert np.mean(normal) > 0.98
 
 
 @pytest.fixture(scope="module")
