@@ -13,9 +13,11 @@ from functools import partial
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Int
 
+from jaxphoto.arrays import still
 from jaxphoto.block import Block, Start, direct_exterior, sensor_rows
+from jaxphoto.camera import InteriorOrientation
 from jaxphoto.errors import BlockError
 from jaxphoto.observations import ControlRows
 from jaxphoto.orientation.block_intersection import intersect_points
@@ -99,7 +101,8 @@ class _SoFar:
         others. Adjusted there, their residuals tell which ray is wrong.
         """
         known = self.image_known[self.image] & self.point_known[self.point]
-        seen = _in_front(self.block, self.positions, self.matrices, self.points)
+        interior = self.block.start.unknowns.interior
+        seen = _in_front(self.block, interior, self.positions, self.matrices, self.points)
         bad = np.unique(self.point[known & ~seen])
         bad = bad[~self.point_given[bad]]
         if not len(bad) or len(bad) > max(1, _BLUNDERS * len(self.points)):
@@ -226,7 +229,7 @@ def _rows_of(rows: ControlRows, wanted):
 
 def _check_in_front(block: Block, positions, matrices, points) -> None:
     image, point = np.asarray(block.image_points.image), np.asarray(block.image_points.point)
-    bad = np.flatnonzero(~_in_front(block, positions, matrices, points))
+    bad = np.flatnonzero(~_in_front(block, block.start.unknowns.interior, positions, matrices, points))
     if len(bad):
         first = bad[0]
         raise PointsBehind(
@@ -236,16 +239,33 @@ def _check_in_front(block: Block, positions, matrices, points) -> None:
         )
 
 
-def _in_front(block: Block, positions, matrices, points) -> Bool[np.ndarray, "rows"]:
-    """Whether each image row's point lies where its camera could see it."""
+def in_front(block: Block, unknowns: Unknowns) -> Bool[np.ndarray, "rows"]:
+    """Whether the point of each row of `block.image_points` lies, by `unknowns`, where its camera could see it."""
+    u = unknowns
+    return _in_front(block, u.interior, *map(still, (u.exterior.position, u.exterior.camera_from_object, u.points)))
+
+
+def looking_away(block: Block, unknowns: Unknowns) -> Int[np.ndarray, "some_images"]:
+    """Images that more than half of what they measured lies behind.
+
+    Collinearity does not know in front from behind: an image that is turned over fits, seen from the other side.
+    """
+    image, n = np.asarray(block.image_points.image), len(block.images)
+    behind = np.bincount(image[~in_front(block, unknowns)], minlength=n)
+    return np.flatnonzero(behind > np.bincount(image, minlength=n) / 2)
+
+
+def _in_front(
+    block: Block, interior: dict[str, InteriorOrientation], positions, matrices, points
+) -> Bool[np.ndarray, "rows"]:
     image, point = np.asarray(block.image_points.image), np.asarray(block.image_points.point)
     to_point = points.take(point, 0) - positions.take(image, 0)
     in_front = np.einsum("ni,ni->n", matrices[:, 2].take(image, 0), to_point) < 0
-    for name, interior in block.start.unknowns.interior.items():
-        if interior.projection.widest_deg > 90:
+    for name, own in interior.items():
+        if own.projection.widest_deg > 90:
             # What such a camera sees may lie behind its image plane, but not opposite to where it was measured.
             mine = np.array([camera == name for camera in block.image_camera])[image]
-            rays = camera_rays(interior, np.asarray(block.image_points.xy, float)[mine])
+            rays = camera_rays(own, np.asarray(block.image_points.xy, float)[mine])
             in_front[mine] = np.einsum("ni,ni->n", turn_to_object(matrices, image[mine], rays), to_point[mine]) > 0
     return in_front
 

@@ -9,7 +9,8 @@ from scipy.special import erfc
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
-from jaxphoto.errors import camera_words
+from jaxphoto.errors import camera_words, counted
+from jaxphoto.observations import PRIORS
 from jaxphoto.report.findings import Finding, Level, p_words, parameter_words
 from jaxphoto.report.tables import Tables, in_file_unit
 from jaxphoto.statistics import (
@@ -26,8 +27,13 @@ from jaxphoto.statistics import (
     worst_checked,
 )
 
+ANOTHER_UNIT = 0.1
+"""A sigma naught below this says that standard deviations were given in another unit."""
 NOTHING_FITS = 3.0
 """A rejected sigma naught above this is no question of weights: something is wrong."""
+# Beyond this, unknowns are so far from where they belong that what is computed to first order there says nothing of
+# where it comes from (docs/trust.md, approximate values that lead nowhere).
+_NOT_LINEAR = 30.0
 _SHOWN = 3
 # A suspect is no reservation but an alarm beyond this times the critical value, or where it moves an interior parameter
 # by more than `_SPOILT` of its standard deviations; below `_TOLD` that is not worth telling.
@@ -40,6 +46,9 @@ _VISIBLE, _MOVED = 0.25, 1.0
 # A pattern is an alarm where its term moves an interior parameter by more than this: by what standard deviations are
 # taken for, results are then wrong beyond doubt.
 _SPOILT_BY_A_PATTERN = 10.0
+# A camera that has changed looks much like stations that are off alike; where either explains about as much (logarithms
+# of p-values within a tenth), what is known of the camera is doubted first: it is older.
+_AS_GOOD = 1.1
 # Axes of one error are told of which the estimate is beyond so many of its standard deviations.
 _SURE = 3.3
 # Of a pattern's square sum, what one term must explain to be named.
@@ -51,9 +60,11 @@ _HIDDEN = 10.0
 def of_residuals(tables: Tables) -> Iterator[Finding]:
     """Whether they fit their standard deviations, which of them do not, and whether they follow a pattern."""
     yield from _global_test(tables)
-    blunders, patterns = list(_blunders(tables)), list(_trends(tables))
+    fits = global_test(tables.adjusted, tables.redundancy).sigma <= _NOT_LINEAR
+    blunders, patterns = list(_blunders(tables)), list(_trends(tables, fits))
     # What one term explains, and more certainly than any blunder, is the likelier culprit: it makes blunders of many.
-    first = [f for p, f in patterns if p < _chance_of_the_worst(tables)] if blunders else []
+    # Where nothing fits, the linear model that tells the two apart does not hold.
+    first = [f for p, f in patterns if p < _chance_of_the_worst(tables)] if blunders and fits else []
     worst = max((f.level for f in blunders), default=Level.INFORMATION)
     yield from (f._replace(level=max(f.level, worst)) for f in first)
     yield from blunders
@@ -81,6 +92,15 @@ def _global_test(tables: Tables) -> Iterator[Finding]:
     if whole.p_value >= LEVEL:
         # Of few observations beside many, sigma naught shows nothing.
         for f in factors:
+            if f.group.startswith(PRIORS):
+                if f.sigma < 1:
+                    yield Finding(
+                        Level.WARNING,
+                        "what was known of parameters beforehand agrees with this block better than chance allows "
+                        f"({p_words(f.p_value)}): if it comes of the same photographs, they count twice and standard "
+                        "deviations are too small; leave it out",
+                    )
+                continue
             size = f"{1 / f.sigma:.2g} times as large as" if f.sigma < 1 else f"{f.sigma:.2g} times smaller than"
             yield Finding(
                 Level.WARNING,
@@ -88,14 +108,17 @@ def _global_test(tables: Tables) -> Iterator[Finding]:
                 f"({p_words(f.p_value)}), while all observations together fit: correct them (--weights estimates them)",
             )
         return
-    groups = ", ".join(f"{f.group.replace('_', ' ')} {f.sigma:.2f}" for f in factors)
+    groups = ", ".join(f"{f.group.replace('_', ' ')} {f.sigma:.3g}" for f in factors)
     of_groups = f"; by group of observations: {groups}" if groups else ""
     said = f"sigma naught {whole.factor**0.5:.3g}, expected {whole.expected**0.5:.3g} ({p_words(whole.p_value)})"
     if whole.sigma < 1:
+        # With one group alone, too large a sigma is made good by the variance factor; with several, weights are wrong.
+        unit = whole.sigma < ANOTHER_UNIT and sum(n > 0 for n in tables.adjusted.n_observations.values()) > 1
         yield Finding(
-            Level.WARNING,
+            Level.ALARM if unit else Level.WARNING,
             f"{said}: residuals are smaller than the standard deviations that were given{of_groups}; those are too "
-            "large, and where they are not all so by the same factor, the weights are wrong: correct them",
+            "large, and where they are not all so by the same factor, the weights are wrong: correct them"
+            + ("; so much is no guess but another unit (micrometres or pixels for millimetres)" if unit else ""),
         )
     elif whole.sigma <= NOTHING_FITS:
         yield Finding(
@@ -107,7 +130,7 @@ def _global_test(tables: Tables) -> Iterator[Finding]:
         yield Finding(
             Level.ALARM,
             f"{said}: the observations contradict one another or the model{of_groups}; look at approximate values, "
-            "units, point ids and the largest residuals",
+            "units, point ids and the largest residuals, and at what jaxphoto adjust --snoop leaves out",
         )
 
 
@@ -124,13 +147,13 @@ def of_stretched_residuals(adjusted: Adjustment) -> Iterator[Finding]:
 
 
 def _blunders(tables: Tables) -> Iterator[Finding]:
-    """The likeliest culprit first: of several, all but the first may be innocent.
+    """The likeliest culprit first, and no suspect that the worse ones explain.
 
     An alarm where it is far beyond the critical value or moves the interior orientation; else a reservation: of many
     thousand real observations some are a little too far out.
     """
     limit = tables.blunders.limit
-    effects = [(s, *_effect(tables, s)) for s in tables.blunders.suspects]
+    effects = [(s, *_effect(tables, s)) for s in tables.culprits]
     judged = [(abs(s.w) > _FAR_OUT * limit or moved > _SPOILT, s, what, moved) for s, what, moved in effects]
     for alarming, s, what, moved in sorted(judged, key=lambda j: not j[0])[:_SHOWN]:
         factor, unit = in_file_unit(s.unit)
@@ -140,11 +163,17 @@ def _blunders(tables: Tables) -> Iterator[Finding]:
             f"{s.words} contradicts the other observations: if it alone is wrong, by {factor * s.error:+.3g} +- "
             f"{factor * s.sigma:.2g} {unit} (w {s.w:.1f}, critical {limit:.1f}){told}",
         )
+    if beside := len(tables.blunders.suspects) - len(judged):
+        yield Finding(
+            Level.INFORMATION,
+            f"{counted(beside, 'more observation')} {'is' if beside == 1 else 'are'} beyond the critical value, too, "
+            f"but not once {'these are' if len(judged) > 1 else 'this one is'} out",
+        )
     if len(judged) > _SHOWN:
         yield Finding(
             Level.ALARM if any(alarming for alarming, *_ in judged) else Level.WARNING,
-            f"{len(judged)} of {tables.blunders.n} observations are beyond the critical value; a blunder spoils what "
-            "is beside it: jaxphoto adjust --snoop finds those that must go",
+            f"{len(judged)} of {tables.blunders.n} observations are beyond the critical value, each although the "
+            "worse ones are out: jaxphoto adjust --snoop leaves out what must go",
         )
 
 
@@ -164,23 +193,25 @@ def _chance_of_the_worst(tables: Tables) -> float:
     return tables.blunders.n * float(erfc(w / np.sqrt(2)))
 
 
-def _trends(tables: Tables) -> Iterator[tuple[float, Finding]]:
+def _trends(tables: Tables, fits: bool) -> Iterator[tuple[float, Finding]]:
     """Patterns that are beyond chance, the most certain first, with the term that is most of each.
 
     Beside each its p-value: 1 where no usual term explains it, or it does not matter, and 0 where it explains most of
-    what looks like blunders.
+    what looks like blunders. Where nothing `fits`, cameras are not looked at.
     """
     level = LEVEL / max(len(tables.tested_trends), 1)
-    for t in sorted((t for t in tables.tested_trends if t.p_value < level), key=lambda t: t.p_value):
+    # Of images that do not fit at all, the pattern is what the misfit makes of them, and no term of the camera.
+    told = (t for t in tables.tested_trends if t.p_value < level and (fits or not t.pattern.camera))
+    for t in sorted(told, key=lambda t: t.p_value ** (_AS_GOOD if t.pattern.begins else 1.0)):
         factor, unit = in_file_unit(t.pattern.unit)
-        said = f"residuals of {t.pattern.what} follow a pattern ({p_words(t.p_value)}) "
-        said += (
-            f"of {factor * t.size:.2g} {unit} ({t.size / t.pattern.sigma:.2g} of their sigma)"
-            if t.size > 0
-            else "no larger than the noise with which it is seen"
-        )
+        said = t.pattern.begins or f"residuals of {t.pattern.what} follow a pattern"
+        said += f" ({p_words(t.p_value)})"
+        if t.size > 0 and unit:
+            said += f" of {factor * t.size:.2g} {unit} ({t.size / t.pattern.sigma:.2g} of their sigma)"
         matters, named, spoilt = t.size > _VISIBLE * t.pattern.sigma, False, False
         alike = [h for h in t.hints if abs(h.amount) > _SURE * h.sigma] if t.pattern.together else []
+        # What estimated parameters nearly take up is seen so badly that its size is lost in its noise.
+        matters |= any(abs(h.amount) > _VISIBLE * t.pattern.sigma for h in alike)
         if alike or (t.hints and t.hints[0].share > MOST_OF_IT):
             likely, named = alike or [t.hints[0]], True
             share = "" if alike else f"{100 * t.hints[0].share:.0f} % of it "
@@ -225,7 +256,7 @@ def _hidden_in_common(tables: Tables) -> Iterator[Finding]:
 def _told(pattern: ResidualPattern, likely: list[Hint]) -> str:
     """The likeliest terms, their amounts where these are in the observations' own unit, and what cures them."""
     factor, unit = in_file_unit(pattern.unit)
-    amounts = (f" {factor * h.amount:+.3g} +- {factor * h.sigma:.2g} {unit}" for h in likely)
+    amounts = (f" {factor * h.amount:+.3g} +- {factor * h.sigma:.2g} {unit}".rstrip() for h in likely)
     names = ", ".join(h.term.name + (a if h.term.amount_told else "") for h, a in zip(likely, amounts, strict=True))
     cure = likely[0].term.cure
     return f"{names}, {cure}" if cure else names

@@ -3,23 +3,21 @@
 from collections.abc import Mapping
 from functools import cached_property
 
-import equinox as eqx
-import jax
 import numpy as np
 import pandas as pd
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.adjustment.model.numbers import Residuals
+from jaxphoto.arrays import Numbers
 from jaxphoto.camera import constant_names, get_parameter, parameter_names
-from jaxphoto.compiling import call_compiled
 from jaxphoto.observations import AXES
 from jaxphoto.report.camera_drift_table import camera_drift_table
 from jaxphoto.report.check_points import check_point_table
 from jaxphoto.report.correlation_tables import correlation_ground_table, correlation_summary_table
+from jaxphoto.report.map_tables import angles_deg, exterior_map_table, map_coordinates
 from jaxphoto.report.positional_accuracy import accuracy_table
 from jaxphoto.report.recovery import recovery_table
 from jaxphoto.report.sigma_map_table import sigma_map_table
-from jaxphoto.rotation import omega_phi_kappa_from_matrix
 from jaxphoto.statistics import (
     BlunderTest,
     CameraDrift,
@@ -30,6 +28,7 @@ from jaxphoto.statistics import (
     Redundancy,
     Rotations,
     Significance,
+    Suspect,
     Trend,
     UndetectedEffects,
     a_priori_sigmas,
@@ -38,6 +37,7 @@ from jaxphoto.statistics import (
     check_discrepancies,
     correlations,
     covariance,
+    culprits,
     detectable_errors,
     ground_correlations,
     normalised_residuals,
@@ -96,6 +96,10 @@ class Tables:
         prepare_statistics(self.adjusted.equations, self.adjusted.seconds)
         return covariance(self.adjusted, rows=True)
 
+    def _told(self, sigma: Numbers) -> np.ndarray:
+        """Standard deviations, but none of what did not converge: they would be of some other place."""
+        return np.where(bool(self.adjusted.converged), np.asarray(sigma), np.nan)
+
     @cached_property
     def redundancy(self) -> Redundancy:
         """Redundancy number of every observation."""
@@ -110,6 +114,11 @@ class Tables:
     def blunders(self) -> BlunderTest:
         """Every normalised residual against the critical value of all together."""
         return blunder_test(self.adjusted, self.redundancy)
+
+    @cached_property
+    def culprits(self) -> tuple[Suspect, ...]:
+        """The suspects among them that the worse ones do not explain."""
+        return culprits(self.adjusted, self.blunders)
 
     @cached_property
     def tested_trends(self) -> list[Trend]:
@@ -168,7 +177,7 @@ class Tables:
         """parameter, value, sigma of what was estimated of scanner, mounts and strips; units stand in the names."""
         s = self.adjusted.structure
         rows = []
-        for k, label, sigma in zip(s.free, s.labels, np.asarray(self.covariance.shared_sigma), strict=True):
+        for k, label, sigma in zip(s.free, s.labels, self._told(self.covariance.shared_sigma), strict=True):
             if k >= s.n_cameras:
                 factor = 180 / np.pi if label.endswith(("_rad", "_rad_per_s")) else 1.0
                 value = float(self.adjusted.values.shared[k])
@@ -192,8 +201,8 @@ class Tables:
     def exterior(self) -> pd.DataFrame:
         """image, X_m ... kappa_deg and their sigmas."""
         exterior = self.adjusted.unknowns.exterior
-        angles = np.degrees(np.asarray(call_compiled(_angles, exterior.camera_from_object)))
-        sigma = np.asarray(self.covariance.exterior_sigma) * [1, 1, 1, *[180 / np.pi] * 3]
+        angles = angles_deg(np.asarray(exterior.camera_from_object))
+        sigma = self._told(self.covariance.exterior_sigma) * [1, 1, 1, *[180 / np.pi] * 3]
         names = ["X_m", "Y_m", "Z_m", "omega_deg", "phi_deg", "kappa_deg"]
         values = np.hstack([np.asarray(exterior.position), angles, sigma])
         table = pd.DataFrame(values, columns=[*names, *(f"sigma_{n}" for n in names)])
@@ -203,31 +212,20 @@ class Tables:
     @cached_property
     def exterior_map(self) -> pd.DataFrame:
         """image, position in the system of the block's files, and omega, phi, kappa against grid east, north and up."""
-        exterior, system = self.adjusted.unknowns.exterior, self.adjusted.block.frame.map
-        position = np.asarray(exterior.position)
-        camera_from_grid = np.asarray(exterior.camera_from_object) @ system.local_from_grid(position)
-        table = self._map_coordinates(position)
-        table[["omega_deg", "phi_deg", "kappa_deg"]] = np.degrees(np.asarray(call_compiled(_angles, camera_from_grid)))
-        table.insert(0, "image", self.adjusted.block.images)
-        return table
+        return exterior_map_table(self.adjusted)
 
     @cached_property
     def object_points_map(self) -> pd.DataFrame:
         """point and its coordinates in the system of the block's files."""
-        table = self._map_coordinates(np.asarray(self.adjusted.unknowns.points))
+        table = map_coordinates(self.adjusted, np.asarray(self.adjusted.unknowns.points))
         table.insert(0, "point", self.adjusted.block.points)
         return table
-
-    def _map_coordinates(self, local: np.ndarray) -> pd.DataFrame:
-        system = self.adjusted.block.frame.map
-        names = ["longitude_deg", "latitude_deg", "height_m"] if system.geographic else ["E_m", "N_m", "H_m"]
-        return pd.DataFrame(system.map(local), columns=names)
 
     @cached_property
     def object_points(self) -> pd.DataFrame:
         """point, coordinates, sigmas, in how many images it was measured, the largest angle between two of its rays."""
         names = [f"{a}_m" for a in AXES]
-        values = np.hstack([np.asarray(self.adjusted.unknowns.points), np.asarray(self.covariance.point_sigma)])
+        values = np.hstack([np.asarray(self.adjusted.unknowns.points), self._told(self.covariance.point_sigma)])
         table = pd.DataFrame(values, columns=[*names, *(f"sigma_{n}" for n in names)])
         table.insert(0, "point", self.adjusted.block.points)
         table["n_images"] = np.bincount(self.adjusted.structure.point, minlength=len(table))
@@ -342,8 +340,3 @@ class Tables:
 
 def _is_table(member: object) -> bool:
     return isinstance(member, cached_property) and member.func.__annotations__["return"] is pd.DataFrame
-
-
-@eqx.filter_jit
-def _angles(camera_from_object):
-    return jax.vmap(omega_phi_kappa_from_matrix)(camera_from_object)

@@ -16,6 +16,7 @@ from jaxphoto.camera import Sensor
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import camera_words, few
 from jaxphoto.procedures.adjust import left_out_words
+from jaxphoto.report.behind import behind_findings
 from jaxphoto.report.camera_drift import drift_findings
 from jaxphoto.report.doubled import doubled_findings
 from jaxphoto.report.findings import Finding, Level, Verdict
@@ -55,6 +56,7 @@ def _findings(tables: Tables) -> Iterator[Finding]:
     prepare_responses(adjusted.equations, adjusted.seconds)
     if adjusted.left_out:
         yield Finding(Level.WARNING, left_out_words(adjusted))
+    yield from behind_findings(adjusted)
     yield from doubled_findings(adjusted.block)
     yield from of_residuals(tables)
     of_cameras = {camera: weaknesses(tables, camera, c) for camera, c in tables.correlations.items()}

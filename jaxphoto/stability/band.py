@@ -19,8 +19,8 @@ of an error over f^2 tr C is distributed about as F with a and a / rho degrees o
 
 Differences need not be normal: where one unit leads, they have one size and two signs, and such a radius holds all of
 them. Of twenty cuts and more the band of differences is therefore stretched by what it takes to hold 95 % of the cells,
-each cut in the band that the other cuts give (s_kj, |d_kj| over the radius there: a jackknife+ interval). What the
-calibration itself errs by is one draw that nobody sees; its band keeps to the normal distribution.
+each cut in the band that the other cuts give, after the jackknife+. What the calibration itself errs by is one draw
+that nobody sees; its band keeps to the normal distribution.
 Source: Barber, Candes, Ramdas and Tibshirani (2021), Annals of Statistics 49(1), 486-507.
 
 Source of the overlap of half-samples: McCarthy (1969), Review of the International Statistical Institute 37, 239-264.
@@ -81,8 +81,8 @@ def band_of(found: Differences, whole: Float[np.ndarray, "cells 2 2"]) -> ErrorB
     for k in range(n if n > 1 else 0):
         others = np.delete(ratio, k, axis=0).mean(axis=0)
         reach[k] = squares[k] / (others * square_radius(found.promised[k], 1 / (n - 1)))
-    stretch = _stretch(reach, found.concentration)
-    inside = [(own <= _stretch(np.delete(reach, k, axis=0), found.concentration)).mean() for k, own in enumerate(reach)]
+    stretch = _stretch(reach)
+    inside = [(own <= _stretch(np.delete(reach, k, axis=0))).mean() for k, own in enumerate(reach)]
     return ErrorBand(
         factor=factor,
         sigma_factor=factor * (found.concentration * rho / 2) ** 0.5,
@@ -94,16 +94,9 @@ def band_of(found: Differences, whole: Float[np.ndarray, "cells 2 2"]) -> ErrorB
     )
 
 
-def _stretch(reach: Float[np.ndarray, "cuts cells"], concentration: float) -> float:
-    """What squared differences, over the squared radius of the other cuts, stay below in LEVEL of the cells.
-
-    The k-th of n independent values leaves k / (n + 1) of others below it; the cells of a cut are as many as 1 /
-    concentration.
-    """
-    n = len(reach)
-    if n < _ENOUGH:
-        return 1.0
-    return float(np.quantile(reach, min(LEVEL * (1 + concentration / n), 1.0)))
+def _stretch(reach: Float[np.ndarray, "cuts cells"]) -> float:
+    """What squared differences, over the squared radius of the other cuts, stay below in LEVEL of the cells."""
+    return float(np.quantile(reach, LEVEL)) if len(reach) >= _ENOUGH else 1.0
 
 
 def concentration(

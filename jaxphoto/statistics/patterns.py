@@ -19,7 +19,7 @@ from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
 from jaxphoto.camera import InteriorOrientation, Sensor, get_parameter, parameter_names, set_parameter
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import camera_words
-from jaxphoto.observations import AbstractObservations, Correlated
+from jaxphoto.observations import PRIORS, AbstractObservations, Correlated
 from jaxphoto.statistics.discrepancy import observation_groups
 
 Places = Mapping[str, Int[np.ndarray, "..."]]
@@ -41,6 +41,7 @@ _OF_ALL = {
     'flight shift ([unknowns.flight_bias], shift = "free")',
     "rad": "on the average: another convention of angles, or a boresight, which can be free",
 }
+_OF_A_STRIP = "on the average: let that strip shift, or look at its recording and at the camera that it names"
 
 
 class PatternTerm(NamedTuple):
@@ -77,6 +78,8 @@ class ResidualPattern(NamedTuple):
     terms: tuple[PatternTerm, ...]
     together: bool = False
     """Whether its terms are the axes of one error, which a sentence tells together."""
+    begins: str = ""
+    """How a sentence begins, where it is not "residuals of `what` follow a pattern"."""
     least_seen: float = 1e-3
     """Directions of which estimated parameters take up all but this are no part of the test: in what is left of them
     the curvature of the model shows."""
@@ -135,9 +138,43 @@ def patterns_of(adjusted: Adjustment, places: Places) -> Iterator[ResidualPatter
             yield _over_format(adjusted, camera, mine, places, 5 if count * 42 <= _MOST else 3)
             if (time := _time(adjusted)) is not None:
                 yield _camera_over_time(adjusted, camera, mine, places, time[adjusted.structure.image])
+    yield from _known_before(adjusted, groups, places)
     for name, rows in groups.items():
         if name != IMAGE_POINTS and rows.unit and not isinstance(rows, Correlated):
             yield from _by_strip(adjusted, name, rows, places)
+
+
+def _known_before(
+    adjusted: Adjustment, groups: Mapping[str, AbstractObservations], places: Places
+) -> Iterator[ResidualPattern]:
+    """Whatever the parameters of a camera may be off by from what was known of them beforehand."""
+    of_camera: dict[str, list[tuple[str, np.ndarray, np.ndarray]]] = {}
+    for name, rows in groups.items():
+        if name.startswith(PRIORS):
+            # What a change of each parameter is, whitened: the columns of L^-1.
+            sigma = np.asarray(rows.sigmas).ravel()
+            whitener = np.asarray(rows.whitener)[0] if isinstance(rows, Correlated) else np.diag(1 / sigma)
+            (_, parameters), *_ = rows.indices()
+            for k, column in zip(np.ravel(parameters), whitener.T, strict=True):
+                label = adjusted.parameters[k]
+                camera, _, parameter = label.removeprefix("interior[").partition("].")
+                if label.startswith("interior["):
+                    of_camera.setdefault(camera, []).append((parameter, places[name].ravel(), column))
+    for camera, known in of_camera.items():
+        every = np.unique(np.concatenate([at for _, at, _ in known]))
+        values = np.zeros((len(known), len(every)))
+        for k, (_, at, column) in enumerate(known):
+            values[k, np.searchsorted(every, at)] = column
+        cure = (
+            "the camera has changed since (focus, lens, temperature), or one of the two is less certain than it says: "
+            "compare with a calibration of this block alone (jaxphoto compare)"
+        )
+        one = np.eye(len(known))
+        terms = tuple(PatternTerm(p, c, cure) for (p, *_), c in zip(known, one, strict=True))
+        yield ResidualPattern(
+            f"what was known of {camera_words(camera)} beforehand", "", "", (Part(every, values, np.ones(len(every))),),
+            terms, begins=f"this block contradicts what was known of {camera_words(camera)} beforehand",
+        )  # fmt: skip
 
 
 def _over_format(adjusted: Adjustment, camera: str, mine: np.ndarray, places: Places, degree: int) -> ResidualPattern:
@@ -205,7 +242,7 @@ def _by_strip(adjusted: Adjustment, name: str, rows: AbstractObservations, place
 
     if 1 < len(of) <= MOST_PARTS:
         each = [(f"{a} of strip {s}", ((strips == s) & (axis == a)).astype(float)) for s in of for a in axes]
-        yield pattern("from strip to strip", each, "on the average: let that strip shift, or look at its recording")
+        yield pattern("from strip to strip", each, _OF_A_STRIP)
     if (time := _time(adjusted)) is not None:
         over = [(a, np.where(axis == a, time[image], 0.0)) for a in axes]
         yield pattern("over time", over, "from the first image to the last: let strips shift or drift")

@@ -22,8 +22,8 @@ from jaxphoto.statistics.patterns import PatternTerm, ResidualPattern, patterns_
 from jaxphoto.statistics.quantiles import beta_tail
 from jaxphoto.statistics.responses import Responses
 
-# Of an error in one observation, what estimated parameters must leave of it.
-_SEEN = 1e-3
+LEAST_SEEN = 1e-3
+"""Of an error in one observation, what estimated parameters must leave of it."""
 # Of many blunders the worst: more of them are a sign of the pattern itself.
 _BLUNDERS = 16
 # A blunder is what a term makes where it is off from that by less than this part.
@@ -126,7 +126,7 @@ class _LeftOut(NamedTuple):
     ) -> "_LeftOut":
         """Those at some places, the first directions."""
         m = len(at)
-        inverse, freedom = _inverse(np.eye(m) - taken_up[:m, :m], np.eye(m), _SEEN)
+        inverse, freedom = inverse_of_seen(np.eye(m) - taken_up[:m, :m], np.eye(m), LEAST_SEEN)
         errors = inverse @ v[at]
         return cls(errors, moved[:m], inverse, float(v[at] @ errors), freedom)
 
@@ -147,7 +147,7 @@ def _tested(
     u = pattern.times(v) - beside @ out.errors
     c = own - taken_up[first:last, first:last] - beside @ out.inverse @ beside.T
     moved = moved[first:last] - beside @ out.inverse @ out.moved
-    inverse, freedom = _inverse(c, own, pattern.least_seen)
+    inverse, freedom = inverse_of_seen(c, own, pattern.least_seen)
     whole, redundancy = float(v @ v) - out.explained, adjusted.redundancy - out.freedom
     if freedom == 0 or redundancy <= freedom or whole <= 0:
         return None
@@ -187,10 +187,13 @@ def _hints(
     return found
 
 
-def _inverse(
+def inverse_of_seen(
     c: Float[np.ndarray, "k k"], own: Float[np.ndarray, "k k"], least: float
 ) -> tuple[Float[np.ndarray, "k k"], int]:
     """The inverse of `c` over the directions that show, and how many they are; `own` is `c` without any unknowns."""
+    if not np.isfinite(c).all():
+        # Numbers that overflow: of what fits nothing, no direction shows.
+        return np.zeros_like(c), 0
     size = np.sqrt(np.diagonal(own))
     unit = np.where(size > 0, 1 / np.where(size > 0, size, 1.0), 0.0)
     values, vectors = np.linalg.eigh(c * unit[:, None] * unit)

@@ -7,10 +7,12 @@ import equinox as eqx
 import numpy as np
 import pytest
 
-from jaxphoto import adjust, read_block
-from jaxphoto.camera import set_parameter
+from jaxphoto import adjust, covariance, read_block
+from jaxphoto.camera import get_parameter, set_parameter
+from jaxphoto.observations.priors import KnownParameters
 from jaxphoto.report import Tables, verdict_of
 from jaxphoto.report.findings import Level
+from jaxphoto.statistics.quantiles import beta_tail
 from tests.blocks import simulated
 
 
@@ -69,3 +71,86 @@ def test_of_a_drift_the_strips_that_show_it_are_told():
     spoilt = block.with_observations({"stations": dataclasses.replace(rows, value=value)})
     (said,) = [t for t in verdict_of(Tables(adjust(spoilt))).texts if "from strip to strip follow a pattern" in t]
     assert "each alone Y of strip D +2.5" in said and "Y of strip C" in said
+
+
+def spoilt_control(block, axis, **errors):
+    rows = block.control
+    value = np.array(rows.value)
+    for name, error in errors.items():
+        value[(rows.who == block.points.index(name)) & (rows.axis == axis)] += error
+    return block.with_observations({"control_points": dataclasses.replace(rows, value=value)})
+
+
+def test_what_a_blunder_does_to_its_neighbours_is_no_alarm_of_theirs():
+    """Of suspects those count that are still beyond the critical value when the worse ones are no more observed."""
+    block = read_block(Path(__file__).parents[2] / "examples" / "cross_block")
+    spoilt = spoilt_control(block, 2, T11=2.0)
+    tables = Tables(adjust(spoilt))
+    assert [s.words for s in tables.culprits] == ["control point T11 in Z"]
+    assert len(tables.blunders.suspects) == 2
+    texts = verdict_of(tables).texts
+    assert sum("contradicts the other observations" in text for text in texts) == 1
+    assert any("1 more observation is beyond the critical value, too, but not once this one is out" in t for t in texts)
+    # As the adjustment without it says.
+    rows = spoilt.control
+    kept = ~((rows.who == spoilt.points.index("T11")) & (rows.axis == 2))
+    assert not Tables(adjust(spoilt.with_observations({"control_points": rows.take(kept)}))).blunders.suspects
+
+
+def test_two_blunders_are_both_culprits():
+    block = read_block(Path(__file__).parents[2] / "examples" / "cross_block")
+    tables = Tables(adjust(spoilt_control(block, 0, T11=1.5, T21=-2.0)))
+    assert {s.words for s in tables.culprits} == {f"control point {name} in X" for name in ("T11", "T21")}
+    assert len(tables.blunders.suspects) > 2
+
+
+def test_a_camera_that_has_changed_since_its_calibration_is_told_first():
+    """Stations that are all off in height would explain it about as well, and lead to the old c."""
+    block = read_block(Path(__file__).parents[2] / "examples" / "cross_block")
+    old = adjust(block)
+    labels = [f"interior[kodak].{name}" for name in ("c_mm", "xp_mm", "yp_mm", "k1", "k2")]
+    interior = old.unknowns.interior["kodak"]
+    known = KnownParameters(
+        labels,
+        np.array([float(get_parameter(interior, label.split(".")[1])) for label in labels]),
+        covariance(old).of_interior("kodak", tuple(label.split(".")[1] for label in labels)),
+    )
+    larger = eqx.tree_at(lambda b: b.image_points.xy, block, np.asarray(block.image_points.xy) * 1.002)
+    tables = Tables(adjust(dataclasses.replace(larger, more=(known,))))
+    verdict = verdict_of(tables)
+    assert verdict.colour == "red"
+    assert "contradicts what was known of camera kodak beforehand" in verdict.texts[0]
+    assert "c_mm -0.06" in verdict.texts[0]
+    # As surprising as the difference from the calibration by this block alone, by the covariances of both.
+    (found,) = [t for t in tables.tested_trends if t.pattern.begins]
+    alone = adjust(larger)
+    names = tuple(label.split(".")[1] for label in labels)
+    d = np.array([float(get_parameter(alone.unknowns.interior["kodak"], n)) for n in names]) - known.value
+    both = known.covariance + covariance(alone).of_interior("kodak", names) / float(alone.sigma0) ** 2
+    expected = float(d @ np.linalg.solve(both, d))
+    whole = float(adjust(dataclasses.replace(larger, more=(known,))).square_sum)
+    assert found.freedom == 5
+    share = expected / whole
+    assert found.p_value == pytest.approx(beta_tail(share, 2.5, (tables.adjusted.redundancy - 5) / 2), rel=0.5)
+
+
+def test_the_same_photographs_counted_twice_are_told():
+    block = read_block(Path(__file__).parents[2] / "examples" / "cross_block")
+    own = adjust(block)
+    names = ("c_mm", "xp_mm", "yp_mm", "k1", "k2")
+    value = np.array([float(get_parameter(own.unknowns.interior["kodak"], name)) for name in names])
+    q = covariance(own).of_interior("kodak", names)
+    known = KnownParameters([f"interior[kodak].{name}" for name in names], value, q)
+    verdict = verdict_of(Tables(adjust(dataclasses.replace(block, more=(known,)))))
+    assert verdict.colour == "amber" and "they count twice" in verdict.texts[0]
+
+
+def test_standard_deviations_in_another_unit_are_an_alarm():
+    """Micrometres for millimetres: sigma naught is a thousandth, and stations tell nothing any more."""
+    block = read_block(Path(__file__).parents[2] / "examples" / "cross_block")
+    p = block.image_points
+    vague = dataclasses.replace(p, sigma=1000 * np.asarray(p.sigma))
+    verdict = verdict_of(Tables(adjust(block.with_observations({"image_points": vague}))))
+    assert verdict.colour == "red" and "another unit" in verdict.texts[0]
+    twice = dataclasses.replace(p, sigma=2 * np.asarray(p.sigma))
+    assert verdict_of(Tables(adjust(block.with_observations({"image_points": twice})))).colour == "amber"

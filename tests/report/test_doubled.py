@@ -22,3 +22,9 @@ def test_an_image_that_has_the_measurements_of_another_is_told():
     assert doubled_images(doubled) == [(*sorted(block.images[:2]), n)]
     (finding,) = doubled_findings(doubled)
     assert f"{n} image points" in finding.text
+    # Written with fewer digits, it is the same photograph; measured anew, it is another observation.
+    rng, sigma, mine = np.random.default_rng(3), np.asarray(rows.sigma), (rows.image == 1)[:, None]
+    for part, told in ((0.05, True), (1.0, False)):
+        moved = xy + mine * part * sigma * rng.uniform(-1, 1, xy.shape)
+        again = block.with_observations({"image_points": dataclasses.replace(rows, xy=moved)})
+        assert bool(doubled_images(again)) == told

@@ -6,13 +6,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaxphoto import read_block, snoop
+from jaxphoto import adjust, read_block, snoop
 from jaxphoto.observations import Distances
+from jaxphoto.orientation.approximate import in_front, looking_away
 from jaxphoto.procedures import Snooped
 from jaxphoto.procedures.mistakes import coordinate_mistakes
+from jaxphoto.report import Tables, verdict_of
 from jaxphoto.report.findings import Level
 from jaxphoto.report.snooped import snooped_findings
 from jaxphoto.statistics import Suspect, covariance
+from jaxphoto.statistics.trends import inverse_of_seen
 
 
 @pytest.fixture(scope="module")
@@ -61,6 +64,25 @@ def test_what_is_too_much_to_be_single_errors_is_an_alarm(block):
     first = snooped_findings(snoop(spoilt), spoilt)[0]
     assert first.level == Level.ALARM and "most image points of image A3" in first.text
     assert "they fit where it is mirrored" in first.text
+
+
+def test_an_image_that_is_mirrored_and_fits_from_below_is_an_alarm(block):
+    """Collinearity holds behind a camera, too: nothing but one station contradicts it."""
+    rows = block.image_points
+    mine = (rows.image == block.images.index("D4"))[:, None]
+    xy = np.where(mine, np.asarray(rows.xy) * [-1.0, 1.0], np.asarray(rows.xy))
+    found = snoop(block.with_observations({"image_points": dataclasses.replace(rows, xy=xy)}))
+    verdict = verdict_of(Tables(found.adjusted))
+    assert verdict.colour == "red" and "what was measured in image D4 lies behind it" in verdict.texts[0]
+    # Of the block as it is, no point is behind its image.
+    sound = adjust(block)
+    assert in_front(block, sound.unknowns).all() and not len(looking_away(block, sound.unknowns))
+
+
+def test_numbers_that_overflow_are_no_pattern():
+    """As where every image is mirrored and nothing fits: no direction shows, and no traceback."""
+    inverse, freedom = inverse_of_seen(np.full((3, 3), np.nan), np.eye(3), 1e-3)
+    assert freedom == 0 and not inverse.any()
 
 
 def test_the_file_whose_units_are_wrong_is_left_out_and_its_mistake_named(block):

@@ -10,13 +10,16 @@ import pytest
 from scipy import stats
 
 from jaxphoto import FIXED, Tables, adjust, covariance, read_block
-from jaxphoto.camera import set_parameter
+from jaxphoto.camera import get_parameter, set_parameter
+from jaxphoto.observations.priors import KnownParameters
 from jaxphoto.report import verdict_of
 from jaxphoto.report.findings import Level
 from jaxphoto.simulation import remeasure
 from jaxphoto.statistics import patterns, trends
 from jaxphoto.statistics.responses import Responses
 from tests.blocks import Simulated, free_network, observed, simulated
+
+KNOWN = ("interior[one].c_mm", "interior[one].k1")
 
 
 def in_strips() -> Simulated:
@@ -37,12 +40,20 @@ def found_in(block) -> dict:
 
 def test_where_nothing_is_missing_p_values_are_uniform():
     block, truth = in_strips()
+    rng, true = np.random.default_rng(1), truth.interior["one"]
+    q = np.array([[4e-4, -3e-8], [-3e-8, 9e-12]])
+    value = np.array([float(true.c), float(get_parameter(true, "k1"))])
+    known = (KnownParameters(KNOWN, value + np.linalg.cholesky(q) @ rng.normal(size=2), q) for _ in range(40))
     draw = jax.jit(lambda key: observed(remeasure(block, truth, key)))
-    blocks = (eqx.tree_at(observed, block, draw(jax.random.key(seed))) for seed in range(40))
+    blocks = (
+        dataclasses.replace(eqx.tree_at(observed, block, draw(jax.random.key(seed))), more=(one,))
+        for seed, one in enumerate(known)
+    )
     p = [{what: trend.p_value for what, trend in found_in(b).items()} for b in blocks]
     assert set(p[0]) == {
         "image points of camera one over the format", "image points of camera one over time",
-        "stations as a whole", "stations from strip to strip", "stations over time",
+        "what was known of camera one beforehand", "stations as a whole", "stations from strip to strip",
+        "stations over time",
     }  # fmt: skip
     for what in p[0]:
         assert stats.kstest([each[what] for each in p], "uniform").pvalue > 1e-3, what

@@ -1,0 +1,61 @@
+"""Which of several suspects a test cannot do without: a blunder inflates the residuals around it.
+
+Suspects are taken out one after another, the worst first, each as an unknown error of its row. What is left to another
+suspect i beside those that are out, S, is with C = P Q_vv P of whitened observations and u = v
+
+    u_i|S = u_i - C_iS C_SS^-1 u_S,     c_i|S = C_ii - C_iS C_SS^-1 C_Si,     w_i|S = u_i|S / (s_S sqrt(c_i|S))
+
+where s_S^2 = (v'v - u_S' C_SS^-1 u_S) / (r - f_S) is the variance factor without them.
+Source: Kok (1984), On data snooping and multiple outlier testing, NOAA Technical Report NOS NGS 30.
+"""
+
+import numpy as np
+
+from jaxphoto.adjustment import Adjustment
+from jaxphoto.statistics.blunder_test import LEAST_SIGMA0, BlunderTest, Suspect
+from jaxphoto.statistics.responses import Responses
+from jaxphoto.statistics.trends import LEAST_SEEN, inverse_of_seen
+
+# Of more suspects the worst: where so many contradict one another, it is for snooping to tell.
+_MOST = 24
+
+
+def culprits(adjusted: Adjustment, test: BlunderTest) -> tuple[Suspect, ...]:
+    """The suspects that are still beyond the critical value when those of them that are worse are out.
+
+    The worst first. Of more than two dozen suspects those beyond these are taken as they are.
+    """
+    some, others = test.suspects[:_MOST], test.suspects[_MOST:]
+    if len(some) < 2:
+        return test.suspects
+    responses = Responses.of(adjusted)
+    rows = [np.ravel(responses.places[s.group][..., s.row]) for s in some]
+    shown = [int(np.atleast_2d(responses.places[s.group])[s.number, s.row]) for s in some]
+    at = np.concatenate(rows)
+
+    def column(k: int) -> np.ndarray:
+        return np.bincount(at[k : k + 1], minlength=responses.count).astype(float)
+
+    c = np.eye(len(at)) - responses.products(column, len(at))[0]
+    v = np.zeros(responses.count)
+    for name, place in responses.places.items():
+        v[place] = np.asarray(adjusted.residuals[name])
+    whole, places = float(v @ v), [np.flatnonzero(np.isin(at, own)) for own in rows]
+    chosen = [0]
+    while len(chosen) < len(some):
+        out = np.concatenate([places[i] for i in chosen])
+        inverse, freedom = inverse_of_seen(c[np.ix_(out, out)], np.eye(len(out)), LEAST_SEEN)
+        errors, redundancy = inverse @ v[at[out]], adjusted.redundancy - freedom
+        left = whole - float(v[at[out]] @ errors)
+        if redundancy < 1 or left <= LEAST_SIGMA0**2 * redundancy:
+            break
+        w = np.zeros(len(some))
+        for i in (i for i in range(len(some)) if i not in chosen):
+            own = int(np.flatnonzero(at == shown[i])[0])
+            square = float(c[own, own] - c[own, out] @ inverse @ c[out, own])
+            if square > LEAST_SEEN * c[own, own]:
+                w[i] = abs(v[shown[i]] - c[own, out] @ errors) / (left / redundancy * square) ** 0.5
+        if w.max() <= test.limit:
+            break
+        chosen.append(int(w.argmax()))
+    return (*(some[i] for i in chosen), *others)
