@@ -2,7 +2,8 @@
 test of them could say.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import erfc
@@ -18,8 +19,10 @@ from jaxphoto.statistics import (
     LEVEL,
     MOST_PARTS,
     Hint,
+    PatternTerm,
     ResidualPattern,
     Suspect,
+    culprits,
     global_test,
     group_factors,
     most_felt,
@@ -61,20 +64,21 @@ def of_residuals(tables: Tables) -> Iterator[Finding]:
     """Whether they fit their standard deviations, which of them do not, and whether they follow a pattern."""
     yield from _global_test(tables)
     fits = global_test(tables.adjusted, tables.redundancy).sigma <= _NOT_LINEAR
-    blunders, patterns = list(_blunders(tables)), list(_trends(tables, fits))
+    patterns, some = list(_trends(tables, fits)), tables.blunders.suspects
     # What one term explains, and more certainly than any blunder, is the likelier culprit: it makes blunders of many.
     # Where nothing fits, the linear model that tells the two apart does not hold.
-    first = [f for p, f in patterns if p < _chance_of_the_worst(tables)] if blunders and fits else []
-    worst = max((f.level for f in blunders), default=Level.INFORMATION)
-    yield from (f._replace(level=max(f.level, worst)) for f in first)
-    yield from blunders
-    yield from (f for _, f in patterns if f not in first)
+    first = [p for p in patterns if p.chance < _chance_of_the_worst(tables)] if some and fits else []
+    worst = max((f.level for f in _blunders(tables, tables.culprits)), default=Level.INFORMATION) if first else 0
+    yield from (p.finding._replace(level=Level(max(p.finding.level, worst))) for p in first)
+    beside = [pair for p in first[:1] for pair in p.terms]
+    yield from _blunders(tables, culprits(tables.adjusted, tables.blunders, beside) if beside else tables.culprits)
+    yield from (p.finding for p in patterns if p not in first)
 
 
 def contradictions(tables: Tables) -> Iterator[Finding]:
     """Whether residuals fit their standard deviations, and which do not."""
     yield from _global_test(tables)
-    yield from _blunders(tables)
+    yield from _blunders(tables, tables.culprits)
 
 
 def _global_test(tables: Tables) -> Iterator[Finding]:
@@ -146,14 +150,14 @@ def of_stretched_residuals(adjusted: Adjustment) -> Iterator[Finding]:
             )
 
 
-def _blunders(tables: Tables) -> Iterator[Finding]:
-    """The likeliest culprit first, and no suspect that the worse ones explain.
+def _blunders(tables: Tables, accused: Sequence[Suspect]) -> Iterator[Finding]:
+    """The likeliest culprit first, and no suspect that worse ones (or a pattern that stands before them) explain.
 
     An alarm where it is far beyond the critical value or moves the interior orientation; else a reservation: of many
     thousand real observations some are a little too far out.
     """
     limit = tables.blunders.limit
-    effects = [(s, *_effect(tables, s)) for s in tables.culprits]
+    effects = [(s, *_effect(tables, s)) for s in accused]
     judged = [(abs(s.w) > _FAR_OUT * limit or moved > _SPOILT, s, what, moved) for s, what, moved in effects]
     for alarming, s, what, moved in sorted(judged, key=lambda j: not j[0])[:_SHOWN]:
         factor, unit = in_file_unit(s.unit)
@@ -167,7 +171,7 @@ def _blunders(tables: Tables) -> Iterator[Finding]:
         yield Finding(
             Level.INFORMATION,
             f"{counted(beside, 'more observation')} {'is' if beside == 1 else 'are'} beyond the critical value, too, "
-            f"but not once {'these are' if len(judged) > 1 else 'this one is'} out",
+            "but not once what stands before is mended",
         )
     if len(judged) > _SHOWN:
         yield Finding(
@@ -193,12 +197,19 @@ def _chance_of_the_worst(tables: Tables) -> float:
     return tables.blunders.n * float(erfc(w / np.sqrt(2)))
 
 
-def _trends(tables: Tables, fits: bool) -> Iterator[tuple[float, Finding]]:
-    """Patterns that are beyond chance, the most certain first, with the term that is most of each.
+class _Pattern(NamedTuple):
+    """A pattern that is beyond chance."""
 
-    Beside each its p-value: 1 where no usual term explains it, or it does not matter, and 0 where it explains most of
-    what looks like blunders. Where nothing `fits`, cameras are not looked at.
-    """
+    chance: float
+    """Its p-value: 1 where no usual term explains it, or it does not matter, and 0 where it explains most of what looks
+    like blunders."""
+    finding: Finding
+    terms: tuple[tuple[ResidualPattern, PatternTerm], ...]
+    """That are most of it."""
+
+
+def _trends(tables: Tables, fits: bool) -> Iterator[_Pattern]:
+    """Patterns that are beyond chance, the most certain first. Where nothing `fits`, cameras are not looked at."""
     level = LEVEL / max(len(tables.tested_trends), 1)
     # Of images that do not fit at all, the pattern is what the misfit makes of them, and no term of the camera.
     told = (t for t in tables.tested_trends if t.p_value < level and (fits or not t.pattern.camera))
@@ -208,12 +219,12 @@ def _trends(tables: Tables, fits: bool) -> Iterator[tuple[float, Finding]]:
         said += f" ({p_words(t.p_value)})"
         if t.size > 0 and unit:
             said += f" of {factor * t.size:.2g} {unit} ({t.size / t.pattern.sigma:.2g} of their sigma)"
-        matters, named, spoilt = t.size > _VISIBLE * t.pattern.sigma, False, False
+        matters, spoilt, likely = t.size > _VISIBLE * t.pattern.sigma, False, list[Hint]()
         alike = [h for h in t.hints if abs(h.amount) > _SURE * h.sigma] if t.pattern.together else []
         # What estimated parameters nearly take up is seen so badly that its size is lost in its noise.
         matters |= any(abs(h.amount) > _VISIBLE * t.pattern.sigma for h in alike)
         if alike or (t.hints and t.hints[0].share > MOST_OF_IT):
-            likely, named = alike or [t.hints[0]], True
+            likely = alike or [t.hints[0]]
             share = "" if alike else f"{100 * t.hints[0].share:.0f} % of it "
             said += f", {share}{_told(t.pattern, likely)}"
             moves = {path: abs(sum(h.moves[path] for h in likely)) for path in likely[0].moves}
@@ -229,7 +240,8 @@ def _trends(tables: Tables, fits: bool) -> Iterator[tuple[float, Finding]]:
         # Blunders that the term would make are none: beside them, what is left of its rows says the same.
         most = t.blunders_alike >= _SHOWN and t.blunders_alike > len(tables.blunders.suspects) / 2
         chance = 0.0 if most else t.p_value
-        yield chance if matters and named else 1.0, Finding(level, said)
+        terms = tuple((t.pattern, h.term) for h in likely)
+        yield _Pattern(chance if matters and likely else 1.0, Finding(level, said), terms)
 
 
 def _hidden_in_common(tables: Tables) -> Iterator[Finding]:

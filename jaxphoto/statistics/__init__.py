@@ -39,7 +39,7 @@ from jaxphoto.statistics.ground import GroundCorrelations, ground_correlations
 from jaxphoto.statistics.linear_forms import LinearForms, linear_forms
 from jaxphoto.statistics.partial_redundancy import PartialRedundancy, partial_redundancy
 from jaxphoto.statistics.partition import SPLITS, Partition, Parts, Selection, parts_of
-from jaxphoto.statistics.patterns import MOST_PARTS, ResidualPattern
+from jaxphoto.statistics.patterns import MOST_PARTS, PatternTerm, ResidualPattern
 from jaxphoto.statistics.positional_accuracy import (
     LEAST_CHECK_POINTS,
     AxisErrors,
@@ -99,6 +99,7 @@ __all__ = [
     "PartialRedundancy",
     "Partition",
     "Parts",
+    "PatternTerm",
     "PositionalAccuracy",
     "Redundancy",
     "ResidualPattern",

@@ -9,10 +9,14 @@ where s_S^2 = (v'v - u_S' C_SS^-1 u_S) / (r - f_S) is the variance factor withou
 Source: Kok (1984), On data snooping and multiple outlier testing, NOAA Technical Report NOS NGS 30.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
+from jaxtyping import Float
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.statistics.blunder_test import LEAST_SIGMA0, BlunderTest, Suspect
+from jaxphoto.statistics.patterns import PatternTerm, ResidualPattern
 from jaxphoto.statistics.responses import Responses
 from jaxphoto.statistics.trends import LEAST_SEEN, inverse_of_seen
 
@@ -20,42 +24,59 @@ from jaxphoto.statistics.trends import LEAST_SEEN, inverse_of_seen
 _MOST = 24
 
 
-def culprits(adjusted: Adjustment, test: BlunderTest) -> tuple[Suspect, ...]:
+def culprits(
+    adjusted: Adjustment, test: BlunderTest, beside: Sequence[tuple[ResidualPattern, PatternTerm]] = ()
+) -> tuple[Suspect, ...]:
     """The suspects that are still beyond the critical value when those of them that are worse are out.
 
-    The worst first. Of more than two dozen suspects those beyond these are taken as they are.
+    The worst first. Terms `beside` them are unknowns from the beginning: what they explain accuses nobody. Of more than
+    two dozen suspects those beyond these are taken as they are.
     """
     some, others = test.suspects[:_MOST], test.suspects[_MOST:]
-    if len(some) < 2:
+    if len(some) + len(beside) < 2 or not some:
         return test.suspects
     responses = Responses.of(adjusted)
     rows = [np.ravel(responses.places[s.group][..., s.row]) for s in some]
     shown = [int(np.atleast_2d(responses.places[s.group])[s.number, s.row]) for s in some]
-    at = np.concatenate(rows)
+    at, first = np.concatenate(rows), np.array([_column(*pair, responses.count) for pair in beside])
+    n = len(first)
 
     def column(k: int) -> np.ndarray:
-        return np.bincount(at[k : k + 1], minlength=responses.count).astype(float)
+        return first[k] if k < n else np.bincount(at[k - n : k - n + 1], minlength=responses.count).astype(float)
 
-    c = np.eye(len(at)) - responses.products(column, len(at))[0]
+    own_products = np.eye(n + len(at))
+    own_products[:n, :n] = first @ first.T if n else 0.0
+    own_products[:n, n:] = first[:, at] if n else 0.0
+    own_products[n:, :n] = own_products[:n, n:].T
+    c = own_products - responses.products(column, n + len(at))[0]
     v = np.zeros(responses.count)
     for name, place in responses.places.items():
         v[place] = np.asarray(adjusted.residuals[name])
-    whole, places = float(v @ v), [np.flatnonzero(np.isin(at, own)) for own in rows]
-    chosen = [0]
+    whole, places = float(v @ v), [n + np.flatnonzero(np.isin(at, own)) for own in rows]
+    u = np.concatenate([first @ v if n else np.zeros(0), v[at]])
+    chosen: list[int] = [] if n else [0]
     while len(chosen) < len(some):
-        out = np.concatenate([places[i] for i in chosen])
-        inverse, freedom = inverse_of_seen(c[np.ix_(out, out)], np.eye(len(out)), LEAST_SEEN)
-        errors, redundancy = inverse @ v[at[out]], adjusted.redundancy - freedom
-        left = whole - float(v[at[out]] @ errors)
+        out = np.concatenate([np.arange(n), *(places[i] for i in chosen)])
+        least = min(LEAST_SEEN, *(pattern.least_seen for pattern, _ in beside), 1.0)
+        inverse, freedom = inverse_of_seen(c[np.ix_(out, out)], own_products[np.ix_(out, out)], least)
+        errors, redundancy = inverse @ u[out], adjusted.redundancy - freedom
+        left = whole - float(u[out] @ errors)
         if redundancy < 1 or left <= LEAST_SIGMA0**2 * redundancy:
             break
         w = np.zeros(len(some))
         for i in (i for i in range(len(some)) if i not in chosen):
-            own = int(np.flatnonzero(at == shown[i])[0])
+            own = n + int(np.flatnonzero(at == shown[i])[0])
             square = float(c[own, own] - c[own, out] @ inverse @ c[out, own])
             if square > LEAST_SEEN * c[own, own]:
-                w[i] = abs(v[shown[i]] - c[own, out] @ errors) / (left / redundancy * square) ** 0.5
+                w[i] = abs(u[own] - c[own, out] @ errors) / (left / redundancy * square) ** 0.5
         if w.max() <= test.limit:
             break
         chosen.append(int(w.argmax()))
     return (*(some[i] for i in chosen), *others)
+
+
+def _column(pattern: ResidualPattern, term: PatternTerm, count: int) -> Float[np.ndarray, "count"]:
+    """A term as a whitened error of all observations."""
+    return sum(
+        (float(a) * pattern.column(k, count) for k, a in enumerate(term.coefficients) if a != 0.0), np.zeros(count)
+    )
