@@ -38,7 +38,8 @@ def test_a_block_is_adjusted_with_control(written, tmp_path, monkeypatch, capsys
     assert len(pd.read_csv(out / "control_marks.csv")) == points["n_marks"].sum()
     block = read_block(out / "block")
     assert block.frame.code == CODE and len(block.control) == 18 and len(block.check) == 9
-    assert (out / "result" / "report.html").is_file()
+    page = (out / "result" / "report.html").read_text(encoding="utf-8")
+    assert "Provenance" in page and "jaxphoto control" in page and "points.csv" in page
 
 
 def test_what_cannot_be_is_said(written, tmp_path, monkeypatch, capsys):

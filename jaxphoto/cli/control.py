@@ -8,6 +8,7 @@ import typer
 from jaxphoto.cli.app import app
 from jaxphoto.cli.console import plain_console
 from jaxphoto.cli.exposure_options import map_codes
+from jaxphoto.cli.made import made_by
 from jaxphoto.errors import InputError
 from jaxphoto.image_measurement.control_targets import target_looker
 from jaxphoto.image_measurement.targets.on_ground import SYNTAX, read_target
@@ -27,6 +28,7 @@ from jaxphoto.writing import check_folder, whole_folder
 
 @app.command("control")
 def control_command(
+    context: typer.Context,
     block: Annotated[Path, typer.Argument(help="Block folder whose images are oriented.")],
     file: Annotated[Path, typer.Argument(help="Surveyed points: gcp_list.txt, markers of Metashape as XML, or CSV.")],
     out: Annotated[Path, typer.Option(help="Folder for block and result; earlier results in it are replaced.")],
@@ -73,7 +75,7 @@ def control_command(
         times = {name: found.adjusted.seconds[name] for name in ("compile", "solve", "covariance")}
         with whole_folder(out) as work:
             with whole_folder(work / "result") as folder:
-                write_results(tables, verdict, folder, times)
+                write_results(tables, verdict, folder, times, made=made_by(context, block, file, marks))
             write_control(found, work)
             write_summary({**verdict.summary, **control_summary(found), "versions": versions()}, work)
             write_block(found.adjusted.block, work / "block")

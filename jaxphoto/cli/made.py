@@ -26,7 +26,9 @@ def _typed(context: typer.Context) -> str:
     words = ["jaxphoto", str(context.info_name)]
     for parameter in context.command.params:
         value = context.params.get(str(parameter.name))
-        if parameter.name == "out" or value is None or value is False:
+        # An empty word that is the default says nothing.
+        empty = value == "" and not parameter.default
+        if parameter.name == "out" or value is None or value is False or empty:
             continue
         values = [] if value is True else list(value) if isinstance(value, list | tuple) else [value]
         if parameter.param_type_name == "argument":
