@@ -39,6 +39,8 @@ def test_a_block_is_adjusted_with_control(written, tmp_path, monkeypatch, capsys
     block = read_block(out / "block")
     assert block.frame.code == CODE and len(block.control) == 18 and len(block.check) == 9
     page = (out / "result" / "report.html").read_text(encoding="utf-8")
+    # The camera is held: no table without rows.
+    assert "Correlation of exterior" not in page
     assert "Provenance" in page and "jaxphoto control" in page and "points.csv" in page
 
 

@@ -171,7 +171,7 @@ def write_simultaneous(result: Simultaneous, directory: Path, seconds: dict[str,
     with whole_folder(directory) as work:
         tables = Tables(result.adjusted)
         verdict, times = verdict_of(tables), result.adjusted.seconds
-        write_results(tables, verdict, work / "adjustment", {name: times[name] for name in _ORDER})
+        write_results(tables, verdict, work / "adjustment", {name: times[name] for name in _ORDER}, made=made)
         rounds, moved = rounds_table(result.rounds), moved_table(result)
         rounds.to_csv(work / "rounds.csv", index=False)
         moved.to_csv(work / "moved.csv", index=False)

@@ -125,8 +125,9 @@ def _sections(tables: Tables) -> Iterator[tuple[str, list[Markup]]]:
         yield "Check points: surveyed minus computed", body
     ellipses = _picture(ellipses_figure(tables), "error ellipses of the projection centres in plan")
     yield "Exterior orientation", [ellipses, _html(tables.exterior)]
-    yield "Correlation of exterior and interior orientation over the images", [_html(tables.correlation_summary)]
     # What is held moves with nothing.
+    if len(summary := tables.correlation_summary):
+        yield "Correlation of exterior and interior orientation over the images", [_html(summary)]
     ground = tables.correlation_ground
     if len(ground := ground[ground["sigma_m"] > 0]):
         yield "Correlation of the interior orientation and the ground as a whole", [_html(ground)]

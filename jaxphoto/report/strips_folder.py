@@ -60,7 +60,7 @@ def write_strips(
     began, seconds = time.perf_counter(), dict(result.adjusted.seconds)
     with whole_folder(directory) as work:
         if tables is not None:
-            write_results(tables, verdict, work / "adjustment", seconds)
+            write_results(tables, verdict, work / "adjustment", seconds, made=made)
         differences_table(result.differences).to_csv(work / "strips.csv", index=False)
         strip_rounds_table(result.rounds).to_csv(work / "rounds.csv", index=False)
         scanner = calibration_table(result)
