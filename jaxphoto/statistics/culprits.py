@@ -38,22 +38,20 @@ def culprits(
     responses = Responses.of(adjusted)
     rows = [np.ravel(responses.places[s.group][..., s.row]) for s in some]
     shown = [int(np.atleast_2d(responses.places[s.group])[s.number, s.row]) for s in some]
-    at, first = np.concatenate(rows), np.array([_column(*pair, responses.count) for pair in beside])
-    n = len(first)
+    at, n = np.concatenate(rows), len(beside)
+    first = np.reshape([_column(*pair, responses.count) for pair in beside], (n, responses.count))
 
     def column(k: int) -> np.ndarray:
         return first[k] if k < n else np.bincount(at[k - n : k - n + 1], minlength=responses.count).astype(float)
 
     own_products = np.eye(n + len(at))
-    own_products[:n, :n] = first @ first.T if n else 0.0
-    own_products[:n, n:] = first[:, at] if n else 0.0
-    own_products[n:, :n] = own_products[:n, n:].T
+    own_products[:n, :n], own_products[:n, n:], own_products[n:, :n] = first @ first.T, first[:, at], first[:, at].T
     c = own_products - responses.products(column, n + len(at))[0]
     v = np.zeros(responses.count)
     for name, place in responses.places.items():
         v[place] = np.asarray(adjusted.residuals[name])
     whole, places = float(v @ v), [n + np.flatnonzero(np.isin(at, own)) for own in rows]
-    u = np.concatenate([first @ v if n else np.zeros(0), v[at]])
+    u = np.concatenate([first @ v, v[at]])
     chosen: list[int] = [] if n else [0]
     while len(chosen) < len(some):
         out = np.concatenate([np.arange(n), *(places[i] for i in chosen)])
