@@ -72,7 +72,7 @@ def of_residuals(tables: Tables) -> Iterator[Finding]:
     yield from (p.finding._replace(level=Level(max(p.finding.level, worst))) for p in first)
     beside = [pair for p in first[:1] for pair in p.terms]
     yield from _blunders(tables, culprits(tables.adjusted, tables.blunders, beside) if beside else tables.culprits)
-    yield from (p.finding for p in patterns if p not in first)
+    yield from (p.finding for p in patterns if all(p is not one for one in first))
 
 
 def contradictions(tables: Tables) -> Iterator[Finding]:
