@@ -245,13 +245,13 @@ def in_front(block: Block, unknowns: Unknowns) -> Bool[np.ndarray, "rows"]:
     return _in_front(block, u.interior, *map(still, (u.exterior.position, u.exterior.camera_from_object, u.points)))
 
 
-def looking_away(block: Block, unknowns: Unknowns) -> Int[np.ndarray, "some_images"]:
-    """Images that more than half of what they measured lies behind.
+def looking_away(block: Block, seen: Bool[np.ndarray, "rows"]) -> Int[np.ndarray, "some_images"]:
+    """Images that more than half of what they measured lies behind, where not `seen` (`in_front`).
 
     Collinearity does not know in front from behind: an image that is turned over fits, seen from the other side.
     """
     image, n = np.asarray(block.image_points.image), len(block.images)
-    behind = np.bincount(image[~in_front(block, unknowns)], minlength=n)
+    behind = np.bincount(image[~seen], minlength=n)
     return np.flatnonzero(behind > np.bincount(image, minlength=n) / 2)
 
 

@@ -21,8 +21,8 @@ from jaxphoto.variants import without_observations
 
 _FromStart = Callable[[Block, Unknowns], Adjustment]
 
-# A sigma naught that neither blunders nor weights explain: the place is wrong.
-_ABSURD = 30.0
+ABSURD = 30.0
+"""A sigma naught that neither blunders nor weights explain: the place is wrong."""
 # Of the square sum: with blunders in a block nothing fits, but some places are no place at all.
 _FAR_BETTER = 0.01
 # Tie points that may be left out, as a part of all points: where more are gone, cameras stand in the wrong place.
@@ -182,14 +182,14 @@ def _better(one: Adjustment, other: Adjustment | None) -> bool:
     if not bool(one.converged):
         return False
     least = np.inf if other is None else float(np.nan_to_num(other.square_sum, nan=np.inf))
-    return float(one.square_sum) < (1.0 if float(one.sigma0) < _ABSURD else _FAR_BETTER) * least
+    return float(one.square_sum) < (1.0 if float(one.sigma0) < ABSURD else _FAR_BETTER) * least
 
 
 def _somewhere(adjusted: Adjustment, max_steps: int) -> bool:
     """Whether an adjustment ended where its observations might belong; or was given too few steps to tell."""
     if adjusted.factored is None or (adjusted.outcome is Outcome.STEPS and max_steps < MAX_STEPS):
         return True
-    return adjusted.outcome in (Outcome.CONVERGED, Outcome.STEPS) and float(adjusted.sigma0) < _ABSURD
+    return adjusted.outcome in (Outcome.CONVERGED, Outcome.STEPS) and float(adjusted.sigma0) < ABSURD
 
 
 def start_of(block: Block) -> Unknowns:

@@ -26,7 +26,7 @@ from jaxphoto.block import Block
 from jaxphoto.errors import BlockError, DatumError, JaxphotoError, RankError, counted
 from jaxphoto.losses import AbstractLoss
 from jaxphoto.observations import Correlated
-from jaxphoto.orientation.approximate import looking_away
+from jaxphoto.orientation.approximate import in_front, looking_away
 from jaxphoto.procedures.adjust import start_of
 from jaxphoto.procedures.beginnings import Begun, beginnings, weighed
 from jaxphoto.procedures.exchange import Exchange, exchanged, with_places
@@ -136,7 +136,7 @@ def images_out(snooped: Snooped, block: Block) -> dict[int, tuple[int, int]]:
 def _fits(found: Snooped) -> bool:
     adjusted = found.adjusted
     agrees = bool(adjusted.converged) and float(adjusted.sigma0) <= _FITS
-    return agrees and not len(looking_away(adjusted.block, adjusted.unknowns))
+    return agrees and not len(looking_away(adjusted.block, in_front(adjusted.block, adjusted.unknowns)))
 
 
 def _better(one: Snooped, other: Snooped) -> bool:

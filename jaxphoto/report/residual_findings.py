@@ -12,6 +12,7 @@ from jaxphoto.adjustment import Adjustment
 from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
 from jaxphoto.errors import camera_words, counted
 from jaxphoto.observations import PRIORS
+from jaxphoto.procedures.adjust import ABSURD
 from jaxphoto.report.findings import Finding, Level, p_words, parameter_words
 from jaxphoto.report.tables import Tables, in_file_unit
 from jaxphoto.statistics import (
@@ -34,9 +35,6 @@ ANOTHER_UNIT = 0.1
 """A sigma naught below this says that standard deviations were given in another unit."""
 NOTHING_FITS = 3.0
 """A rejected sigma naught above this is no question of weights: something is wrong."""
-# Beyond this, unknowns are so far from where they belong that what is computed to first order there says nothing of
-# where it comes from (docs/trust.md, approximate values that lead nowhere).
-_NOT_LINEAR = 30.0
 _SHOWN = 3
 # A suspect is no reservation but an alarm beyond this times the critical value, or where it moves an interior parameter
 # by more than `_SPOILT` of its standard deviations; below `_TOLD` that is not worth telling.
@@ -63,10 +61,10 @@ _HIDDEN = 10.0
 def of_residuals(tables: Tables) -> Iterator[Finding]:
     """Whether they fit their standard deviations, which of them do not, and whether they follow a pattern."""
     yield from _global_test(tables)
-    fits = global_test(tables.adjusted, tables.redundancy).sigma <= _NOT_LINEAR
+    fits = global_test(tables.adjusted, tables.redundancy).sigma <= ABSURD
     patterns, some = list(_trends(tables, fits)), tables.blunders.suspects
     # What one term explains, and more certainly than any blunder, is the likelier culprit: it makes blunders of many.
-    # Where nothing fits, the linear model that tells the two apart does not hold.
+    # Where the place is wrong, what is computed to first order there does not tell the two apart.
     first = [p for p in patterns if p.chance < _chance_of_the_worst(tables)] if some and fits else []
     worst = max((f.level for f in _blunders(tables, tables.culprits)), default=Level.INFORMATION) if first else 0
     yield from (p.finding._replace(level=Level(max(p.finding.level, worst))) for p in first)

@@ -47,15 +47,13 @@ def culprits(
     own_products = np.eye(n + len(at))
     own_products[:n, :n], own_products[:n, n:], own_products[n:, :n] = first @ first.T, first[:, at], first[:, at].T
     c = own_products - responses.products(column, n + len(at))[0]
-    v = np.zeros(responses.count)
-    for name, place in responses.places.items():
-        v[place] = np.asarray(adjusted.residuals[name])
+    v = responses.residuals
     whole, places = float(v @ v), [n + np.flatnonzero(np.isin(at, own)) for own in rows]
     u = np.concatenate([first @ v, v[at]])
+    least = min([LEAST_SEEN, *(pattern.least_seen for pattern, _ in beside)])
     chosen: list[int] = [] if n else [0]
     while len(chosen) < len(some):
         out = np.concatenate([np.arange(n), *(places[i] for i in chosen)])
-        least = min(LEAST_SEEN, *(pattern.least_seen for pattern, _ in beside), 1.0)
         inverse, freedom = inverse_of_seen(c[np.ix_(out, out)], own_products[np.ix_(out, out)], least)
         errors, redundancy = inverse @ u[out], adjusted.redundancy - freedom
         left = whole - float(u[out] @ errors)

@@ -149,6 +149,12 @@ def _known_before(
 ) -> Iterator[ResidualPattern]:
     """Whatever the parameters of a camera may be off by from what was known of them beforehand."""
     of_camera: dict[str, list[tuple[str, np.ndarray, np.ndarray]]] = {}
+    own = {
+        f"interior[{camera}].{name}": (camera, name)
+        for camera, interior in adjusted.unknowns.interior.items()
+        for name in parameter_names(interior)
+    }
+    labels = adjusted.parameters
     for name, rows in groups.items():
         if name.startswith(PRIORS):
             # What a change of each parameter is, whitened: the columns of L^-1.
@@ -156,9 +162,8 @@ def _known_before(
             whitener = np.asarray(rows.whitener)[0] if isinstance(rows, Correlated) else np.diag(1 / sigma)
             (_, parameters), *_ = rows.indices()
             for k, column in zip(np.ravel(parameters), whitener.T, strict=True):
-                label = adjusted.parameters[k]
-                camera, _, parameter = label.removeprefix("interior[").partition("].")
-                if label.startswith("interior["):
+                if (label := labels[k]) in own:
+                    camera, parameter = own[label]
                     of_camera.setdefault(camera, []).append((parameter, places[name].ravel(), column))
     for camera, known in of_camera.items():
         every = np.unique(np.concatenate([at for _, at, _ in known]))

@@ -60,6 +60,14 @@ class Responses(eqx.Module):
         places = {name: np.asarray(v).astype(int) for name, v in numbered.named.items()}
         return cls(adjusted, adjusted.equations.on_one_device.weighed, laid, int(ends[-1]), places, image_rows)
 
+    @property
+    def residuals(self) -> Float[np.ndarray, "count"]:
+        """Of the adjustment, whitened, in the order of `places`; zero for what closes the datum."""
+        found = np.zeros(self.count)
+        for name, place in self.places.items():
+            found[place] = np.asarray(self.adjusted.residuals[name])
+        return found
+
     def to_errors(self, column: Column, many: int) -> Iterator[tuple[Float[np.ndarray, "shared"], np.ndarray]]:
         """Of each error z = `column(k)`, whitened and in the order of `places`: the shared unknowns' motion, in their
         own units, and H z."""

@@ -68,9 +68,7 @@ def trends(
     if adjusted.redundancy < 2 or not bool(adjusted.converged):
         return []
     responses = Responses.of(adjusted)
-    v = np.zeros(responses.count)
-    for name, place in responses.places.items():
-        v[place] = np.asarray(adjusted.residuals[name])
+    v = responses.residuals
     rows = [np.ravel(responses.places[name][..., row]) for name, row in blunders[:_BLUNDERS]]
     directions = _Directions(
         np.concatenate([np.zeros(0, int), *rows]), tuple(patterns_of(adjusted, responses.places)), responses.count

@@ -110,17 +110,20 @@ def test_two_blunders_are_both_culprits():
     assert len(tables.blunders.suspects) > 2
 
 
+NAMES = ("c_mm", "xp_mm", "yp_mm", "k1", "k2")
+
+
+def calibration_by(adjusted):
+    interior = adjusted.unknowns.interior["kodak"]
+    value = np.array([float(get_parameter(interior, name)) for name in NAMES])
+    q = covariance(adjusted).of_interior("kodak", NAMES)
+    return KnownParameters([f"interior[kodak].{name}" for name in NAMES], value, q)
+
+
 def test_a_camera_that_has_changed_since_its_calibration_is_told_first():
     """Stations that are all off in height would explain it about as well, and lead to the old c."""
     block = read_block(Path(__file__).parents[2] / "examples" / "cross_block")
-    old = adjust(block)
-    labels = [f"interior[kodak].{name}" for name in ("c_mm", "xp_mm", "yp_mm", "k1", "k2")]
-    interior = old.unknowns.interior["kodak"]
-    known = KnownParameters(
-        labels,
-        np.array([float(get_parameter(interior, label.split(".")[1])) for label in labels]),
-        covariance(old).of_interior("kodak", tuple(label.split(".")[1] for label in labels)),
-    )
+    known = calibration_by(adjust(block))
     larger = eqx.tree_at(lambda b: b.image_points.xy, block, np.asarray(block.image_points.xy) * 1.002)
     tables = Tables(adjust(dataclasses.replace(larger, more=(known,))))
     verdict = verdict_of(tables)
@@ -130,23 +133,16 @@ def test_a_camera_that_has_changed_since_its_calibration_is_told_first():
     # As surprising as the difference from the calibration by this block alone, by the covariances of both.
     (found,) = [t for t in tables.tested_trends if t.pattern.begins]
     alone = adjust(larger)
-    names = tuple(label.split(".")[1] for label in labels)
-    d = np.array([float(get_parameter(alone.unknowns.interior["kodak"], n)) for n in names]) - known.value
-    both = known.covariance + covariance(alone).of_interior("kodak", names) / float(alone.sigma0) ** 2
-    expected = float(d @ np.linalg.solve(both, d))
-    whole = float(adjust(dataclasses.replace(larger, more=(known,))).square_sum)
+    by_it = calibration_by(alone)
+    d, both = by_it.value - known.value, known.covariance + by_it.covariance / float(alone.sigma0) ** 2
+    share = float(d @ np.linalg.solve(both, d)) / float(tables.adjusted.square_sum)
     assert found.freedom == 5
-    share = expected / whole
     assert found.p_value == pytest.approx(beta_tail(share, 2.5, (tables.adjusted.redundancy - 5) / 2), rel=0.5)
 
 
 def test_the_same_photographs_counted_twice_are_told():
     block = read_block(Path(__file__).parents[2] / "examples" / "cross_block")
-    own = adjust(block)
-    names = ("c_mm", "xp_mm", "yp_mm", "k1", "k2")
-    value = np.array([float(get_parameter(own.unknowns.interior["kodak"], name)) for name in names])
-    q = covariance(own).of_interior("kodak", names)
-    known = KnownParameters([f"interior[kodak].{name}" for name in names], value, q)
+    known = calibration_by(adjust(block))
     verdict = verdict_of(Tables(adjust(dataclasses.replace(block, more=(known,)))))
     assert verdict.colour == "amber" and "they count twice" in verdict.texts[0]
 

@@ -76,7 +76,8 @@ def test_an_image_that_is_mirrored_and_fits_from_below_is_an_alarm(block):
     assert verdict.colour == "red" and "what was measured in image D4 lies behind it" in verdict.texts[0]
     # Of the block as it is, no point is behind its image.
     sound = adjust(block)
-    assert in_front(block, sound.unknowns).all() and not len(looking_away(block, sound.unknowns))
+    seen = in_front(block, sound.unknowns)
+    assert seen.all() and not len(looking_away(block, seen))
 
 
 def test_numbers_that_overflow_are_no_pattern():
