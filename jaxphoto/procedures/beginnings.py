@@ -29,7 +29,7 @@ from jaxphoto.procedures.robust import (
     robust,
     solve_placed,
 )
-from jaxphoto.statistics import LEAST_CHECKED
+from jaxphoto.statistics import LEAST_CHECKED, LEVEL, covariance, trends
 from jaxphoto.unknowns import Unknowns
 from jaxphoto.variants import without_observations
 
@@ -74,12 +74,34 @@ def beginnings(
     if loss is not None:
         yield lambda: robustly(loss)
         return
-    coordinates = [name for name, rows in block.named_observations.items() if isinstance(rows, AbstractCoordinates)]
+    rows = block.named_observations
+    coordinates = [name for name, own in rows.items() if isinstance(own, AbstractCoordinates)]
     yield lambda: _reweighted(block, from_all(), max_steps, sizes, report, {})
     yield lambda: robustly(Tukey())
     yield lambda: _reweighted(block, from_all(), max_steps, sizes, report, dict.fromkeys(coordinates, _LOOSE))
     for name in coordinates if len(coordinates) > 1 else ():
-        yield partial(_without, block, start, max_steps, sizes, report, name)
+        yield partial(_without, block, start, max_steps, sizes, report, {name: np.ones(len(rows[name]), bool)})
+
+
+def without_what_is_alike(
+    block: Block,
+    start: Unknowns | None,
+    found: Adjustment,
+    max_steps: int,
+    sizes: Sizes,
+    report: Callable[[str], object],
+) -> Iterator[Callable[[], Begun]]:
+    """Where to begin again if what was left in is off by alike, along an axis of a group: without that axis.
+
+    Other unknowns take up most of such an error, and then sound rows contradict what looks right.
+    """
+    tested = trends(found, np.asarray(covariance(found).shared_sigma))
+    for trend in tested:
+        if trend.p_value < LEVEL / len(tested) and (axes := [h.term.name for h in trend.alike]):
+            rows = block.named_observations[trend.pattern.group]
+            own = np.isin(np.broadcast_to(rows.axis_names(), np.shape(rows.observation)[::-1]), axes)
+            out = {trend.pattern.group: np.any(np.atleast_2d(own), axis=0)}
+            yield partial(_without, block, start, max_steps, sizes, report, out)
 
 
 def _without(
@@ -88,13 +110,14 @@ def _without(
     max_steps: int,
     sizes: Sizes,
     report: Callable[[str], object],
-    name: str,
+    out: Masks,
 ) -> Begun:
-    """Where the block leads without a group, all of which is out."""
-    none = {other: np.full(len(rows), other == name) for other, rows in block.named_observations.items()}
+    """Where the block leads without some rows."""
+    none = {name: out.get(name, np.zeros(len(rows), bool)) for name, rows in block.named_observations.items()}
     start = start_of(without_observations(block, none)[0]) if start is None else start
-    begun = _reweighted(block, start, max_steps, sizes, report, {name: _NOTHING})
-    return begun._replace(left=begun.left | {name: none[name]})
+    least = {name: np.where(own, _NOTHING, 1.0) for name, own in out.items()}
+    begun = _reweighted(block, start, max_steps, sizes, report, least)
+    return begun._replace(left=begun.left | {name: begun.left[name] | own for name, own in out.items()})
 
 
 def _reweighted(
@@ -103,12 +126,12 @@ def _reweighted(
     max_steps: int,
     sizes: Sizes,
     report: Callable[[str], object],
-    least: Mapping[str, float],
+    least: Mapping[str, float | np.ndarray],
 ) -> Begun:
     """Where weights have led that fall with the residual, from `least` on by group, or from 1."""
     rows, unknowns = block.named_observations, start
-    least = dict.fromkeys(rows, 1.0) | dict(least)
-    weight = {name: np.full(len(own), least[name]) for name, own in rows.items()}
+    weight = {name: np.broadcast_to(least.get(name, 1.0), len(own)) for name, own in rows.items()}
+    least = weight
     left = {name: np.zeros(len(own), bool) for name, own in rows.items()}
     at: Adjustment | None = None
     r: Blocks = {}

@@ -1,6 +1,6 @@
 """Rows of a block that have each other's numbers, and the block with these exchanged."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -44,6 +44,18 @@ def exchanged(block: Block, left: Masks, exchange: Exchange) -> tuple[Block, Mas
     left = left | {group: _marked(left[group], back, False) for group, back in exchange.back.items()}
     left = left | {exchange.group: _marked(left[exchange.group], exchange.out, True)} if exchange.out else left
     return block.with_observations({exchange.group: new}), left
+
+
+def with_what_rests_on_them(done: Sequence[Exchange], wrong: Sequence[bool]) -> list[Exchange]:
+    """The exchanges that are wrong, and those after them of the same rows."""
+    found: list[Exchange] = []
+    rows: set[tuple[str, int]] = set()
+    for exchange, bad in zip(done, wrong, strict=True):
+        own = {(exchange.group, row) for rows_ in exchange.rows for row in rows_}
+        if bad or own & rows:
+            found.append(exchange)
+            rows |= own
+    return found
 
 
 def with_places(at: Adjustment, places: Mapping[int, Float[np.ndarray, "3"]]) -> Adjustment:

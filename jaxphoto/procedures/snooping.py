@@ -28,8 +28,8 @@ from jaxphoto.losses import AbstractLoss
 from jaxphoto.observations import Correlated
 from jaxphoto.orientation.approximate import in_front, looking_away
 from jaxphoto.procedures.adjust import start_of
-from jaxphoto.procedures.beginnings import Begun, beginnings, weighed
-from jaxphoto.procedures.exchange import Exchange, exchanged, with_places
+from jaxphoto.procedures.beginnings import Begun, beginnings, weighed, without_what_is_alike
+from jaxphoto.procedures.exchange import Exchange, exchanged, with_places, with_what_rests_on_them
 from jaxphoto.procedures.exchanged_coordinates import as_one, coordinate_exchanges
 from jaxphoto.procedures.exchanged_names import name_exchanges, points_that_meet, put_back
 from jaxphoto.procedures.robust import Blocks, Masks, all_points, checked_parts, residual_scales, solve_placed
@@ -39,7 +39,9 @@ from jaxphoto.statistics import (
     LEVEL,
     UNCHECKED,
     Suspect,
+    beta_tail,
     chi_square_limit,
+    global_test,
 )
 from jaxphoto.unknowns import Unknowns
 
@@ -86,26 +88,35 @@ def snoop(
     """
     sizes = common_sizes([block])
     found: Snooped | None = None
-    failed: JaxphotoError | None = None
-    for begin in beginnings(block, start, loss, max_steps, sizes, report):
+    failed: list[JaxphotoError] = []
+
+    def from_there(begin: Callable[[], Begun]) -> Snooped | None:
         try:
             new = _snooped(block, begin(), max_steps, sizes, report)
             left, number = len(new.adjusted.block.image_points), len(block.image_points)
             if left < _LEAST_LEFT * number:
                 raise BlockError(f"{left} of {number} image points are left")
         except (DatumError, RankError, BlockError) as error:
-            failed = failed or error
-            continue
-        found = new if found is None or _better(new, found) else found
-        if _fits(found) and not mostly_out(found, block) and not images_out(found, block):
-            return found
+            failed.append(error)
+            return None
+        return new
+
+    for begin in beginnings(block, start, loss, max_steps, sizes, report):
+        new = from_there(begin)
+        found = new if new is not None and (found is None or _better(new, found)) else found
+        if found is not None and _fits(found) and not mostly_out(found, block) and not images_out(found, block):
+            break
     if found is None:
         # What the block cannot tell with all of its observations either, is said as ever.
         solve(block, start_of(block) if start is None else start, block.priors, max_steps, sizes)
         raise BlockError(
             "so much contradicts the other observations that without it too little is left to adjust: look at names, "
-            f"units, axes and the order of rows (an adjustment of all says more). What ended the search: {failed}"
-        ) from failed
+            f"units, axes and the order of rows (an adjustment of all says more). What ended the search: {failed[0]}"
+        ) from failed[0]
+    if global_test(found.adjusted).p_value < LEVEL:
+        for begin in without_what_is_alike(block, start, found.adjusted, max_steps, sizes, report):
+            if (new := from_there(begin)) is not None and _fits_more(new, found):
+                found = new
     return found
 
 
@@ -137,6 +148,13 @@ def _fits(found: Snooped) -> bool:
     adjusted = found.adjusted
     agrees = bool(adjusted.converged) and float(adjusted.sigma0) <= _FITS
     return agrees and not len(looking_away(adjusted.block, in_front(adjusted.block, adjusted.unknowns)))
+
+
+def _fits_more(one: Snooped, other: Snooped) -> bool:
+    """Whether it fits, and its sigma naught is less than chance makes it (by F of their redundancies)."""
+    of, than = one.adjusted, other.adjusted
+    share = float(than.square_sum / (than.square_sum + of.square_sum))
+    return _fits(one) and beta_tail(share, than.redundancy / 2, of.redundancy / 2) < LEVEL
 
 
 def _better(one: Snooped, other: Snooped) -> bool:
@@ -183,7 +201,7 @@ def _snooped(block: Block, begun: Begun, max_steps: int, sizes: Sizes, report: C
             # nothing fits, all do.
             fits = bool(adjusted.converged) and sigma0 <= _FITS
             wrong = [not fits or not _needed(at, left, e, sigma0) for e in done]
-            if undone := _with_what_rests_on_them(done, wrong):
+            if undone := with_what_rests_on_them(done, wrong):
                 for exchange in reversed(undone):
                     block, left = exchanged(block, left, exchange.undone)
                     done.remove(exchange)
@@ -219,18 +237,6 @@ def _exchanges(
             known.update((e.group, e.rows) for e in new)
             return new, placed
     return [], at
-
-
-def _with_what_rests_on_them(done: list[Exchange], wrong: list[bool]) -> list[Exchange]:
-    """The exchanges that are wrong, and those after them of the same rows."""
-    found: list[Exchange] = []
-    rows: set[tuple[str, int]] = set()
-    for exchange, bad in zip(done, wrong, strict=True):
-        own = {(exchange.group, row) for rows_ in exchange.rows for row in rows_}
-        if bad or own & rows:
-            found.append(exchange)
-            rows |= own
-    return found
 
 
 def _needed(at: Adjustment, left: Masks, exchange: Exchange, sigma0: float) -> bool:

@@ -19,6 +19,7 @@ from jaxphoto.statistics import (
     DELTA0,
     LEVEL,
     MOST_PARTS,
+    SURE,
     Hint,
     PatternTerm,
     ResidualPattern,
@@ -50,8 +51,6 @@ _SPOILT_BY_A_PATTERN = 10.0
 # A camera that has changed looks much like stations that are off alike; where either explains about as much (logarithms
 # of p-values within a tenth), what is known of the camera is doubted first: it is older.
 _AS_GOOD = 1.1
-# Axes of one error are told of which the estimate is beyond so many of its standard deviations.
-_SURE = 3.3
 # Of a pattern's square sum, what one term must explain to be named.
 MOST_OF_IT = 0.5
 # An observation whose detectable error is more than this times its sigma is checked by hardly anything (r < 0.17).
@@ -218,7 +217,7 @@ def _trends(tables: Tables, fits: bool) -> Iterator[_Pattern]:
         if t.size > 0 and unit:
             said += f" of {factor * t.size:.2g} {unit} ({t.size / t.pattern.sigma:.2g} of their sigma)"
         matters, spoilt, likely = t.size > _VISIBLE * t.pattern.sigma, False, list[Hint]()
-        alike = [h for h in t.hints if abs(h.amount) > _SURE * h.sigma] if t.pattern.together else []
+        alike = t.alike
         # What estimated parameters nearly take up is seen so badly that its size is lost in its noise.
         matters |= any(abs(h.amount) > _VISIBLE * t.pattern.sigma for h in alike)
         if alike or (t.hints and t.hints[0].share > MOST_OF_IT):
@@ -232,7 +231,7 @@ def _trends(tables: Tables, fits: bool) -> Iterator[_Pattern]:
                 said += f"; {parameter_words(path)} would move by {moved:.1f} of its sigma"
         elif t.pattern.camera:
             said += ": no single usual term is most of it; try a distortion of more terms (docs/model_choice.md)"
-        elif several := [h for h in t.hints if abs(h.amount) > _SURE * h.sigma][:_SHOWN]:
+        elif several := [h for h in t.hints if abs(h.amount) > SURE * h.sigma][:_SHOWN]:
             said += f", each alone {_told(t.pattern, several)}"
         level = Level.ALARM if spoilt else Level.WARNING if matters else Level.INFORMATION
         # Blunders that the term would make are none: beside them, what is left of its rows says the same.
@@ -244,7 +243,7 @@ def _trends(tables: Tables, fits: bool) -> Iterator[_Pattern]:
 
 def _hidden_in_common(tables: Tables) -> Iterator[Finding]:
     """Of errors that all rows of a group have in common, how large they may be unseen, and what they then do."""
-    for t in (t for t in tables.tested_trends if t.pattern.together):
+    for t in (t for t in tables.tested_trends if t.pattern.group):
         worst: tuple[float, str, Hint] | None = None
         for h in (h for h in t.hints if h.amount != 0.0):
             for path, moved in h.moves.items():

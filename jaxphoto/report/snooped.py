@@ -66,13 +66,17 @@ def _alike(snooped: Snooped, block: Block) -> Iterator[str]:
     """Most numbers of a strip along an axis, or of all, off by the same amount: no blunders."""
     for name, rows, left, axes in _of_further_groups(snooped, block):
         strips = np.broadcast_to(rows.names_of("image", block.image_strip), axes.shape)
-        for axis, strip in sorted({(str(axes[s.number, s.row]), str(strips[s.number, s.row])) for s in left}):
-            part = (axes == axis) & (strips == strip)
+        told: set[str] = set()
+        of_strips = sorted({(str(axes[s.number, s.row]), str(strips[s.number, s.row])) for s in left})
+        for axis, strip in [*((axis, None) for axis in dict.fromkeys(a for a, _ in of_strips)), *of_strips]:
+            part = (axes == axis) & ((strips == strip) if strip is not None else True)
             own = [s for s in left if part[s.number, s.row]]
             error, sigma = (np.array([getattr(s, field) for s in own]) for field in ("error", "sigma"))
             mean = float(np.average(error, weights=sigma**-2.0))
             scatter = float(np.sqrt(np.mean(((error - mean) / sigma) ** 2)))
-            if len(own) >= SEVERAL and len(own) > part.sum() / 2 and scatter < _AS_ONE:
+            if axis not in told and len(own) >= SEVERAL and len(own) > part.sum() / 2 and scatter < _AS_ONE:
+                # What all have in common, each strip has.
+                told |= {axis} if strip is None else set()
                 factor, unit = in_file_unit(own[0].unit)
                 of = f"{name.replace('_', ' ')}{f' in strip {strip}' if strip else ''} along {axis}"
                 yield (

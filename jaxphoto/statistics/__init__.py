@@ -47,7 +47,7 @@ from jaxphoto.statistics.positional_accuracy import (
     PositionalAccuracy,
     positional_accuracy,
 )
-from jaxphoto.statistics.quantiles import chi_square_limit
+from jaxphoto.statistics.quantiles import beta_tail, chi_square_limit
 from jaxphoto.statistics.reliability import (
     LEAST_CHECKED,
     UNCHECKED,
@@ -66,20 +66,21 @@ from jaxphoto.statistics.significance import (
     if_zero,
     significance,
 )
-from jaxphoto.statistics.trends import Hint, Trend, trends
+from jaxphoto.statistics.trends import SURE, Hint, Trend, trends
 from jaxphoto.statistics.undetected import Felt, UndetectedEffects, most_felt, undetected_effects
 from jaxphoto.statistics.variance_components import VarianceComponents, variance_components
 from jaxphoto.statistics.zero_test import POWER, ZeroTest, zero_test
 
 __all__ = [
     "DELTA0", "EOP_NAMES", "LEAST_CHECKED", "LEAST_CHECK_POINTS", "LEAST_SIGMA0", "LEVEL", "MOST_PARTS", "POWER",
-    "SIGNIFICANCE_LEVEL", "SPLITS", "UNCHECKED", "AxisErrors", "BlunderTest", "CameraDifferences", "CameraDrift",
+    "SIGNIFICANCE_LEVEL", "SPLITS", "SURE", "UNCHECKED",
+    "AxisErrors", "BlunderTest", "CameraDifferences", "CameraDrift",
     "ComponentAccuracy", "Correlations", "Covariance", "Felt", "GroundCorrelations", "Hidden", "Hint", "IfZero",
     "LinearForms", "PartialRedundancy", "Partition", "Parts", "PatternTerm", "PositionalAccuracy", "Redundancy",
     "ResidualPattern",
     "Rotations", "Selection", "Significance", "Spread", "Suspect", "Trend", "UndetectedEffects", "VarianceComponents",
     "VarianceFactor", "ZeroTest",
-    "a_priori_sigmas", "angle_differences",
+    "a_priori_sigmas", "angle_differences", "beta_tail",
     "blunder_test", "camera_drifts", "camera_wanderings", "check_discrepancies", "chi_square_limit", "chi_square_p",
     "common_covariance",
     "correlation_matrix", "correlations", "covariance", "critical_w", "culprits", "detectable_errors",

@@ -76,10 +76,10 @@ class ResidualPattern(NamedTuple):
     """Whose image points they are; "" where they are none."""
     parts: tuple[Part, ...]
     terms: tuple[PatternTerm, ...]
-    together: bool = False
-    """Whether its terms are the axes of one error, which a sentence tells together."""
     begins: str = ""
     """How a sentence begins, where it is not "residuals of `what` follow a pattern"."""
+    group: str = ""
+    """Where its terms are what all rows of one group are off by alike, axis by axis, the name of that."""
     least_seen: float = 1e-3
     """Directions of which estimated parameters take up all but this are no part of the test: in what is left of them
     the curvature of the model shows."""
@@ -243,7 +243,7 @@ def _by_strip(adjusted: Adjustment, name: str, rows: AbstractObservations, place
         return ResidualPattern(f"{thing} {what}", rows.unit, "", parts, terms, **more)
 
     every = [(str(a), (axis == a).astype(float)) for a in axes]
-    yield pattern("as a whole", every, _OF_ALL.get(rows.unit, ""), together=True, least_seen=_ALIKE)
+    yield pattern("as a whole", every, _OF_ALL.get(rows.unit, ""), group=name, least_seen=_ALIKE)
 
     if 1 < len(of) <= MOST_PARTS:
         each = [(f"{a} of strip {s}", ((strips == s) & (axis == a)).astype(float)) for s in of for a in axes]

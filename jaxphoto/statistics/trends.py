@@ -24,6 +24,8 @@ from jaxphoto.statistics.responses import Responses
 
 LEAST_SEEN = 1e-3
 """Of an error in one observation, what estimated parameters must leave of it."""
+SURE = 3.3
+"""Standard deviations of itself beyond which the amount of a term is told: by chance one of a thousand."""
 # Of many blunders the worst: more of them are a sign of the pattern itself.
 _BLUNDERS = 16
 # A blunder is what a term makes where it is off from that by less than this part.
@@ -55,6 +57,11 @@ class Trend(NamedTuple):
     """The terms that a sentence can name, the one of the largest share first."""
     blunders_alike: int = 0
     """Of the blunders that are unknowns beside it, how many are what the first of these makes of their observations."""
+
+    @property
+    def alike(self) -> list[Hint]:
+        """Of a pattern that is what all rows of a group are off by alike, the axes of which this is sure."""
+        return [h for h in self.hints if abs(h.amount) > SURE * h.sigma] if self.pattern.group else []
 
 
 def trends(

@@ -9,6 +9,7 @@ import pytest
 
 from jaxphoto import adjust, read_block, snoop
 from jaxphoto.errors import RankError
+from jaxphoto.report.snooped import snooped_findings
 from tests.blocks import simulated
 
 
@@ -208,6 +209,18 @@ def test_coordinates_that_are_wrong_are_not_taken_for_an_exchange(block):
     assert not found.exchanged
     rows = {s.row for s in found.left_out if s.group == "control_points"}
     assert rows and rows <= set(one.tolist())
+
+
+def test_what_all_rows_are_off_by_alike_goes_and_nothing_else(block):
+    """c and the ground take up nearly all of it; then the sound coordinates of stations contradict what looks right."""
+    stations = block.stations
+    heights = np.asarray(stations.axis) == 2
+    value = np.asarray(stations.value) + 48.0 * heights
+    found = snoop(block.with_observations({"stations": dataclasses.replace(stations, value=value)}))
+    assert {(s.group, s.row) for s in found.left_out} == {("stations", int(row)) for row in np.flatnonzero(heights)}
+    np.testing.assert_allclose([s.error for s in found.left_out], 48.0, atol=4.0)
+    (told,) = [f.text for f in snooped_findings(found, block) if "off alike" in f.text]
+    assert f"the {heights.sum()} stations along Z" in told
 
 
 def test_what_no_observations_tell_is_said_as_by_an_adjustment(block):
