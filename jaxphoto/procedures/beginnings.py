@@ -90,8 +90,8 @@ def without_what_is_alike(
     max_steps: int,
     sizes: Sizes,
     report: Callable[[str], object],
-) -> Iterator[Callable[[], Begun]]:
-    """Where to begin again if what was left in is off by alike, along an axis of a group: without that axis.
+) -> Iterator[tuple[Masks, Callable[[], Begun]]]:
+    """Where to begin again, and what is out then, if what was left in is off by alike along an axis of a group.
 
     Other unknowns take up most of such an error, and then sound rows contradict what looks right.
     """
@@ -101,7 +101,7 @@ def without_what_is_alike(
             rows = block.named_observations[trend.pattern.group]
             own = np.isin(np.broadcast_to(rows.axis_names(), np.shape(rows.observation)[::-1]), axes)
             out = {trend.pattern.group: np.any(np.atleast_2d(own), axis=0)}
-            yield partial(_without, block, start, max_steps, sizes, report, out)
+            yield out, partial(_without, block, start, max_steps, sizes, report, out)
 
 
 def _without(

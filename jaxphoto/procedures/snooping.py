@@ -39,7 +39,6 @@ from jaxphoto.statistics import (
     LEVEL,
     UNCHECKED,
     Suspect,
-    beta_tail,
     chi_square_limit,
     global_test,
 )
@@ -114,8 +113,8 @@ def snoop(
             f"units, axes and the order of rows (an adjustment of all says more). What ended the search: {failed[0]}"
         ) from failed[0]
     if global_test(found.adjusted).p_value < LEVEL:
-        for begin in without_what_is_alike(block, start, found.adjusted, max_steps, sizes, report):
-            if (new := from_there(begin)) is not None and _fits_more(new, found):
+        for out, begin in without_what_is_alike(block, start, found.adjusted, max_steps, sizes, report):
+            if (new := from_there(begin)) is not None and _fits_more(new, found, out):
                 found = new
     return found
 
@@ -150,11 +149,10 @@ def _fits(found: Snooped) -> bool:
     return agrees and not len(looking_away(adjusted.block, in_front(adjusted.block, adjusted.unknowns)))
 
 
-def _fits_more(one: Snooped, other: Snooped) -> bool:
-    """Whether it fits, and its sigma naught is less than chance makes it (by F of their redundancies)."""
-    of, than = one.adjusted, other.adjusted
-    share = float(than.square_sum / (than.square_sum + of.square_sum))
-    return _fits(one) and beta_tail(share, than.redundancy / 2, of.redundancy / 2) < LEVEL
+def _fits_more(one: Snooped, other: Snooped, out: Masks) -> bool:
+    """Whether it fits, better, and leaves out no more of what is not `out` anyhow."""
+    of_one, of_other = (sum(not (s.group in out and out[s.group][s.row]) for s in s.left_out) for s in (one, other))
+    return _fits(one) and bool(one.adjusted.sigma0 < other.adjusted.sigma0) and of_one <= of_other
 
 
 def _better(one: Snooped, other: Snooped) -> bool:

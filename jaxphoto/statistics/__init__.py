@@ -47,7 +47,7 @@ from jaxphoto.statistics.positional_accuracy import (
     PositionalAccuracy,
     positional_accuracy,
 )
-from jaxphoto.statistics.quantiles import beta_tail, chi_square_limit
+from jaxphoto.statistics.quantiles import chi_square_limit
 from jaxphoto.statistics.reliability import (
     LEAST_CHECKED,
     UNCHECKED,
@@ -80,7 +80,7 @@ __all__ = [
     "ResidualPattern",
     "Rotations", "Selection", "Significance", "Spread", "Suspect", "Trend", "UndetectedEffects", "VarianceComponents",
     "VarianceFactor", "ZeroTest",
-    "a_priori_sigmas", "angle_differences", "beta_tail",
+    "a_priori_sigmas", "angle_differences",
     "blunder_test", "camera_drifts", "camera_wanderings", "check_discrepancies", "chi_square_limit", "chi_square_p",
     "common_covariance",
     "correlation_matrix", "correlations", "covariance", "critical_w", "culprits", "detectable_errors",
