@@ -80,6 +80,10 @@ def test_a_block_and_an_adjustment_say_what_they_are_in_three_lines():
     assert f"sigma naught {float(result.sigma0):.4g}, redundancy {result.redundancy}" in said
     assert f"{len(result.block.images)} images of 3 cameras" in repr(result.block)
     # While JAX maps over a block its leaves may be anything.
+    known = covariance(result)
+    assert "not converged" not in repr(known)
+    assert repr(jax.tree.map(lambda _: None, known)).startswith("Covariance inside")
+    assert "not converged" in repr(covariance(adjust(result.block, max_steps=1)))
     assert repr(jax.tree.map(lambda _: None, result.block)).startswith("Block 'simulated': ")
 
 

@@ -13,6 +13,7 @@ from jaxphoto.adjustment import Adjustment, Cofactors, NormalEquations, RowCofac
 from jaxphoto.adjustment.model.numbers import Increments
 from jaxphoto.arrays import Numbers, gathered, still
 from jaxphoto.compiling import prepare, run_compiled
+from jaxphoto.errors import counted
 from jaxphoto.rotation import omega_phi_kappa_from_matrix, small_rotation
 
 Rotations = Literal["omega_phi_kappa", "object", "camera"]
@@ -41,6 +42,17 @@ class Covariance(eqx.Module):
     labels: tuple[str, ...] = eqx.field(static=True)
     n_images: int = eqx.field(static=True)
     rotations: Rotations = eqx.field(static=True)
+    converged: Bool[Numbers, ""]
+    """Else it is that of where the adjustment stopped, and says nothing of how near the truth that is."""
+
+    def __repr__(self) -> str:
+        # Anything may stand for an array while JAX maps over it.
+        if np.ndim(self.converged) or not isinstance(self.converged, bool | np.generic | np.ndarray):
+            return "Covariance inside a transformation of JAX: its numbers are arrays"
+        of = f"{counted(self.n_images, 'image')}, {counted(len(self.points), 'point')}"
+        shared = counted(len(self.labels) - 6 * self.n_images, "shared unknown")
+        where = "" if self.converged else ";\n  not converged: of where the adjustment stopped, no standard deviations"
+        return f"Covariance of {of} and {shared}, a priori; variance factor {float(self.variance_factor):.4g}{where}"
 
     @property
     def exterior_sigma(self) -> Float[Numbers, "images 6"]:
@@ -104,6 +116,7 @@ def covariance(adjusted: Adjustment, rotations: Rotations = "omega_phi_kappa", *
         labels=(*labels, *adjusted.structure.labels),
         n_images=adjusted.structure.n_images,
         rotations=rotations,
+        converged=adjusted.converged,
     )
 
 
