@@ -18,6 +18,8 @@ from jaxphoto import (
     InteriorOrientation,
     Mount,
     StripBias,
+    adjust,
+    covariance,
     direct_orientation,
     image_ray,
     intersect,
