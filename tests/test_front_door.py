@@ -25,7 +25,7 @@ from jaxphoto import (
     intersect,
     project,
 )
-from tests.blocks import adjusted
+from tests.blocks import adjusted, simulated
 from tests.checked_types import unchecked
 
 ROOMS = {"camera", "lidar", "stability", "experiment", "georeferencing", "image_measurement", "io", "sensitivity"}
@@ -85,7 +85,7 @@ def test_a_block_and_an_adjustment_say_what_they_are_in_three_lines():
     known = covariance(result)
     assert "not converged" not in repr(known)
     assert repr(jax.tree.map(lambda _: None, known)).startswith("Covariance inside")
-    assert "not converged" in repr(covariance(adjust(result.block, max_steps=1)))
+    assert "not converged" in repr(covariance(adjust(simulated("cross").block, max_steps=1)))
     assert repr(jax.tree.map(lambda _: None, result.block)).startswith("Block 'simulated': ")
 
 
