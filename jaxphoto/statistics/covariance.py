@@ -116,7 +116,7 @@ def covariance(adjusted: Adjustment, rotations: Rotations = "omega_phi_kappa", *
         labels=(*labels, *adjusted.structure.labels),
         n_images=adjusted.structure.n_images,
         rotations=rotations,
-        converged=adjusted.converged,
+        converged=still(adjusted.converged),
     )
 
 
