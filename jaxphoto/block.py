@@ -93,6 +93,11 @@ class Block(eqx.Module):
         return (self.stations, self.attitudes, self.control, self.surfaces, self.distances, *further)
 
     @property
+    def doubts(self) -> list[str]:
+        """What speaks against what is known of parameters beforehand, in sentences."""
+        return [known.doubt for known in self.more if isinstance(known, KnownParameters) and known.doubt]
+
+    @property
     def named_observations(self) -> dict[str, AbstractObservations]:
         """Image points and all other rows, by the names that results have for them; kinds without rows are left out."""
         return {self.image_points.group: self.image_points, **named_rows(self.observations)}

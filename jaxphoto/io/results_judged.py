@@ -21,7 +21,8 @@ def read_summary(folder: Path) -> dict[str, Any]:
 
 
 def reservation(summary: Mapping[str, Any]) -> str:
-    """That an adjustment did not converge, that its verdict is red and why, or that sigma naught fails its test; ""."""
+    """That an adjustment did not converge, that its verdict is red and why, that sigma naught fails its test, or that
+    one on which it rests is so; ""."""
     if summary.get("converged") is False:
         return f"this adjustment did not converge, so its numbers are no results: {_told(summary.get('outcome'))}"
     if summary.get("verdict") == "red":
@@ -36,6 +37,8 @@ def reservation(summary: Mapping[str, Any]) -> str:
             f"sigma naught of this adjustment is {was:.3g}, expected {wanted:.3g}, which is no chance: its weights "
             "or its model are wrong, and its standard deviations with them"
         )
+    if isinstance(doubts := summary.get("doubts"), list) and doubts:
+        return f"this adjustment rests on an earlier one. {_told(doubts[0])}"
     return ""
 
 

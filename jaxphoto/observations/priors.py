@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxphoto.arrays import Numbers
+from jaxphoto.errors import camera_words, few
 from jaxphoto.observations.base import AXES, AbstractObservations, ImageState, touching
 from jaxphoto.rotation import small_angles
 
@@ -91,12 +92,30 @@ class KnownParameters(eqx.Module):
     labels: tuple[str, ...] = eqx.field(static=True)
     value: Float[Numbers, "n"]
     covariance: Float[Numbers, "n n"]
+    reservation: str = eqx.field(static=True)
+    """What speaks against where they are from, such as a calibration whose verdict is red; "" for nothing."""
 
-    def __init__(self, labels: Sequence[str], value: Float[Numbers, "n"], covariance: Float[Numbers, "n n"]):
-        self.labels, self.value, self.covariance = tuple(labels), value, covariance
+    def __init__(
+        self,
+        labels: Sequence[str],
+        value: Float[Numbers, "n"],
+        covariance: Float[Numbers, "n n"],
+        reservation: str = "",
+    ):
+        self.labels, self.value, self.covariance, self.reservation = tuple(labels), value, covariance, reservation
         n = len(self.labels)
         if np.shape(value) != (n,) or np.shape(covariance) != (n, n):
             raise ValueError(
                 f"{n} labels need {n} values and a covariance matrix of {n} x {n}, got {np.shape(value)} and "
                 f"{np.shape(covariance)}"
             )
+
+    @property
+    def doubt(self) -> str:
+        """The reservation with what it is of, in words; "" for none."""
+        if not self.reservation:
+            return ""
+        of_cameras = [label.split("[")[1].split("]")[0] for label in self.labels if label.startswith("interior[")]
+        cameras = ", ".join(camera_words(name) for name in dict.fromkeys(of_cameras))
+        said = f"the calibration that {cameras} is from" if cameras else f"what is known of {few(self.labels)}"
+        return f"of {said}: {self.reservation}"

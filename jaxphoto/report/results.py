@@ -101,6 +101,7 @@ def summary_of(tables: Tables, verdict: Verdict, seconds: dict[str, float]) -> d
         "n_images": len(adjusted.block.images),
         "sigma0": float(adjusted.sigma0),
         **_tested(tables),
+        **({"doubts": told} if (told := adjusted.block.doubts) else {}),
         "redundancy": adjusted.redundancy,
         "n_observations": {"total": sum(observations.values()), **observations},
         "n_constraints": adjusted.n_constraints,

@@ -54,6 +54,7 @@ def _findings(tables: Tables) -> Iterator[Finding]:
         # Nothing that is said of an optimum holds elsewhere.
         return
     prepare_responses(adjusted.equations, adjusted.seconds)
+    yield from (Finding(Level.WARNING, doubt) for doubt in adjusted.block.doubts)
     if adjusted.left_out:
         yield Finding(Level.WARNING, left_out_words(adjusted))
     yield from behind_findings(adjusted)

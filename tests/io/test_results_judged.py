@@ -2,6 +2,7 @@
 
 import json
 import re
+import warnings
 
 import numpy as np
 import pytest
@@ -77,7 +78,17 @@ def test_sigma_naught_that_fails_its_test_is_said_and_travels_with_the_camera(re
             text[:begin] + f"[cameras.one]\ncalibration = {json.dumps(str(named))}\n" + text[end:]
         )
         with pytest.warns(UserWarning, match=f"of the calibration that camera one is from: .*{said}"):
-            read_block(block)
+            read = read_block(block)
+        # And so on: what rests on it is no better, nor is a block that is made of this one.
+        write_block(read, tmp_path / f"copy_of_{named.name}")
+        rests = tmp_path / f"rests_on_{named.name}"
+        with warnings.catch_warnings(action="default"):
+            code, _, error = run(monkeypatch, capsys, "adjust", tmp_path / f"copy_of_{named.name}", "--out", rests)
+        assert code == 0 and said in " ".join(error.split())
+        findings = read_summary(rests)["findings"]
+        assert any(f["level"] == "warning" and f["text"].endswith(read.doubts[0]) for f in findings), findings
+        assert "this adjustment rests on an earlier one" in read_camera_file(rests).note
+        assert said in read_camera_file(rests).note
 
 
 def test_a_block_that_contradicts_itself_is_told_before_anything_is_made_of_it(results, monkeypatch, capsys, tmp_path):

@@ -218,6 +218,8 @@ def assemble(source: BlockTables) -> Block:
         distances=distances,
         more=(*further, *known_cameras(cameras)),
     )
+    for doubt in block.doubts:
+        warnings.warn(doubt, stacklevel=3)
     posed = MODES[settings.mode](block)
     if settings.mode == "direct":
         _warn_of_given_orientations(block, source.file)

@@ -4,7 +4,6 @@ It stands for format, models, interior orientation and, with its full covariance
 ([cameras.X.known]). What it held is held here, too, unless [cameras.X.unknowns] says otherwise.
 """
 
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -67,9 +66,8 @@ def known_cameras(cameras: Mapping[str, Camera]) -> tuple[KnownParameters, ...]:
     found = []
     for name, camera in cameras.items():
         if camera.known is not None:
-            if camera.reservation:
-                warnings.warn(f"of the calibration that camera {name} is from: {camera.reservation}", stacklevel=2)
             parameters, covariance = camera.known
             values = np.array([float(get_parameter(camera.interior, parameter)) for parameter in parameters])
-            found.append(KnownParameters([f"interior[{name}].{p}" for p in parameters], values, covariance))
+            labels = [f"interior[{name}].{p}" for p in parameters]
+            found.append(KnownParameters(labels, values, covariance, camera.reservation))
     return tuple(found)

@@ -5,7 +5,7 @@
 
 `a` and `b` count the numbers of a set from 1: its rows in their order, and of each its numbers. What is not listed is
 zero. Sets of a class need not be equally large. Parameters known together are alike: known_parameters.csv has set,
-label and value, in the unit that the label ends in.
+label and value, in the unit that the label ends in, and what speaks against where a set is from (reservation).
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -16,6 +16,7 @@ import pandas as pd
 from jaxphoto.errors import InputError
 from jaxphoto.io.block_folder.observed import Ids, Kind, cells, layout_of, read_fields, rows_of
 from jaxphoto.io.block_folder.table_layout import TableLayout
+from jaxphoto.io.names import control_in
 from jaxphoto.io.text_tables import Table
 from jaxphoto.observations import Correlated, KnownParameters, columns_of, correlated, is_covariance
 from jaxphoto.observations.columns import FILE_UNITS
@@ -23,13 +24,17 @@ from jaxphoto.observations.columns import FILE_UNITS
 KNOWN = "known_parameters"
 JOINT = "correlated_"
 _MATRIX = "_covariance"
+_AGAINST = "reservation"
 # Numbers that one covariance matrix joins: some take minutes to invert.
 _LARGEST_SET = 5_000
 
 
 def joint_layouts(kinds: Iterable[Kind]) -> dict[str, TableLayout]:
     """The tables of sets, of classes and of parameters."""
-    found = {KNOWN: TableLayout(False, ("set", "label", "value"), (), ("set", "label")), KNOWN + _MATRIX: _matrix("")}
+    found = {
+        KNOWN: TableLayout(False, ("set", "label", "value"), (_AGAINST,), ("set", "label", _AGAINST)),
+        KNOWN + _MATRIX: _matrix(""),
+    }
     for kind in kinds:
         plain = layout_of(kind)
         found[JOINT + kind.group] = TableLayout(False, ("set", *plain.columns), (), ("set", *plain.text))
@@ -57,7 +62,13 @@ def read_known(tables: Mapping[str, Table]) -> list[KnownParameters]:
     table = tables[KNOWN]
     value, label = table.numbers("value"), table.ids("label")
     sets = _sets(table, tables[KNOWN + _MATRIX], "", 1.0, 1)
-    return [KnownParameters(tuple(label[lines]), value[lines], matrix) for lines, matrix in sets]
+    against = table.text(_AGAINST)
+    for line in np.flatnonzero([control_in(said) for said in against]):
+        raise table.bad(line, f"the {_AGAINST} has a control character, which a terminal would obey; remove it")
+    return [
+        KnownParameters(tuple(label[lines]), value[lines], matrix, next(filter(None, against[lines]), ""))
+        for lines, matrix in sets
+    ]
 
 
 def correlated_tables(groups: Sequence[Correlated], names: Mapping[str, Sequence[str]]) -> dict[str, pd.DataFrame]:
@@ -77,6 +88,8 @@ def known_tables(groups: Sequence[KnownParameters]) -> dict[str, pd.DataFrame]:
     """The two tables of parameters known together."""
     rows = [(k + 1, *row) for k, g in enumerate(groups) for row in zip(g.labels, np.asarray(g.value), strict=True)]
     table = pd.DataFrame(rows, columns=["set", "label", "value"])
+    if any(g.reservation for g in groups):
+        table[_AGAINST] = np.repeat([g.reservation for g in groups], [len(g.labels) for g in groups])
     return {KNOWN: table, KNOWN + _MATRIX: _entries([np.asarray(g.covariance) for g in groups], "", 1.0)}
 
 
