@@ -35,6 +35,15 @@ from jaxphoto.statistics.correlation import high_pairs
 
 HIGH_CORRELATION = 0.9
 HIGH_OWN_CORRELATION = 0.95
+# What tells a parameter of a camera from the exterior orientation of its images.
+_OF_POINT = "strips in both directions with stations (GNSS), relief or oblique images"
+_CURES = {
+    "c_mm": "stations (GNSS) that do not shift, relief, a second flying height or oblique images",
+    "xp_mm": _OF_POINT,
+    "yp_mm": _OF_POINT,
+}
+_OF_DISTORTION = "image points towards the corners, more overlap or cross strips"
+_OF_A_FIELD = "photographs turned by 90 degrees about the line of sight, and tilted ones"
 
 
 def verdict_of(tables: Tables) -> Verdict:
@@ -125,12 +134,10 @@ def _correlated(
     """High correlations, but for the pairs of exterior and interior orientation that are `explained` already.
 
     They are a reservation where a parameter is so badly known that images feel it (`felt`), else to be known. What
-    cures them depends on whether all images show a `field` of known targets.
+    cures them depends on the parameter, and on whether all images show a `field` of known targets.
     """
-    cure = "add cross strips, control or height differences"
     usual = "usual without camera stations or attitudes, their effects on the ground cancel"
     if field:
-        cure = "add photographs turned by 90 degrees about the line of sight, and tilted ones"
         usual = "usual where targets alone orient an image, their effects on it cancel"
     pairs = high_pairs(c.parameters, c.interior, HIGH_CORRELATION)
     if pairs:
@@ -149,9 +156,12 @@ def _correlated(
         images = [c.images[int(np.abs(c.exterior[:, i, j]).argmax())] for i, j in high]
         where = zip(high, images, strict=True)
         names = few([f"{c.eop_names[i]} with {c.parameters[j]} {worst[i, j]:.3f} (image {k})" for (i, j), k in where])
+        open_ = [p for p in dict.fromkeys(c.parameters[j] for _, j in high) if p in felt]
+        cures = [_OF_A_FIELD] if field else list(dict.fromkeys(_CURES.get(p, _OF_DISTORTION) for p in open_))
+        said = f"add {', or '.join(cures)}" if open_ else f"no image is off by {FELT:g} of its sigmas for it"
         yield Finding(
-            Level.WARNING if any(c.parameters[j] in felt for _, j in high) else Level.INFORMATION,
-            f"high correlation of exterior with interior orientation of {camera_words(camera)}: {names}; {cure}",
+            Level.WARNING if open_ else Level.INFORMATION,
+            f"high correlation of exterior with interior orientation of {camera_words(camera)}: {names}; {said}",
         )
     own = np.abs(c.within_image).max(axis=0)
     strong = [(own[i, j], i, j) for i in range(6) for j in range(i) if own[i, j] > HIGH_OWN_CORRELATION]

@@ -75,7 +75,7 @@ def weaknesses(tables: Tables, camera: str, c: Correlations) -> list[Weakness]:
             f"|rho| with Z up to {rho:.4f}; over {geometry} a longer c and a higher flight give the same image "
             f"coordinates, and {why}: {cure}, relief or a second flying height, or oblique images, or hold c fixed"
         )
-        found.append(_weakness(camera, sentence, c, (_HEIGHT,), _C))
+        found.append(_weakness(camera, sentence, c, _C))
     turned, moved = _strongest(c, _TILTS, _POINT), _strongest(c, _PLAN, _POINT)
     shift = max((corner[name] for name in _POINT if name in corner), default=0.0)
     if max(turned, moved) > WEAK_CORRELATION and shift > FELT:
@@ -87,7 +87,7 @@ def weaknesses(tables: Tables, camera: str, c: Correlations) -> list[Weakness]:
             f"a tilt and a shift of every image make good for it, and {why}: {cure} with strips flown in both "
             "directions, relief or oblique images, or hold it fixed"
         )
-        found.append(_weakness(camera, sentence, c, (_TILTS, _PLAN), _POINT))
+        found.append(_weakness(camera, sentence, c, _POINT))
     return found
 
 
@@ -108,10 +108,9 @@ def at_corner(tables: Tables, camera: str) -> dict[str, float]:
     return {s.parameter: s.sigma / units[f"interior[{camera}].{s.parameter}"] for s in own}
 
 
-def _weakness(
-    camera: str, sentence: str, c: Correlations, rows: tuple[slice, ...], parameters: tuple[str, ...]
-) -> Weakness:
-    pairs = frozenset().union(*(_pairs(c, own, parameters) for own in rows))
+def _weakness(camera: str, sentence: str, c: Correlations, parameters: tuple[str, ...]) -> Weakness:
+    # What goes with them besides goes with what is told.
+    pairs = _pairs(c, slice(None), parameters)
     return Weakness(sentence, pairs, frozenset(f"interior[{camera}].{name}" for name in parameters))
 
 

@@ -29,13 +29,22 @@ def tables(relief: float, stations: bool | float, names=("c_mm", "xp_mm", "yp_mm
 def test_a_field_of_known_targets_has_cures_of_its_own(monkeypatch):
     monkeypatch.setattr(verdict, "HIGH_CORRELATION", 0.5)
     monkeypatch.setattr(verdict, "HIGH_OWN_CORRELATION", 0.5)
+    # Any image feels it.
+    monkeypatch.setattr(verdict, "FELT", 0.0)
     free_network = adjusted("inner_scale")
     control = rows(range(len(free_network.block.points)), sigma=0.001)
     control = dataclasses.replace(control, value=np.asarray(free_network.unknowns.points)[control.who, control.axis])
     field = dataclasses.replace(free_network.block, control=control)
     of_network, of_field = ("; ".join(verdict_of(Tables(a)).texts) for a in (free_network, adjust(field)))
-    assert "add cross strips" in of_network and "targets alone" not in of_network
-    assert "turned by 90 degrees" in of_field and "targets alone" in of_field and "add cross strips" not in of_field
+    assert "with stations (GNSS), relief" in of_network and "targets alone" not in of_network
+    assert "turned by 90 degrees" in of_field and "targets alone" in of_field and "stations (GNSS)" not in of_field
+
+
+def test_a_high_correlation_that_no_image_feels_has_no_cure():
+    """Stations that all shift alike: Z and c go together, and c is known well enough."""
+    said = [f for f in verdict_of(tables(0.1, 1.0)).findings if "Z with c_mm" in f.text]
+    assert [f.level for f in said] == [verdict.Level.INFORMATION]
+    assert said[0].text.endswith("no image is off by 10 of its sigmas for it")
 
 
 def weak(warnings):
