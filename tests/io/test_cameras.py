@@ -255,6 +255,36 @@ def test_what_is_written_reads_back_as_the_same_camera(tmp_path, kind):
     assert back.note == ""
 
 
+@pytest.mark.parametrize(
+    ("kind", "file"),
+    [
+        ("opencv", "a.yml"),
+        ("colmap", "cameras.txt"),
+        ("agisoft", "a.xml"),
+        ("mrcal", "a.cameramodel"),
+        ("ros", "a.yaml"),
+    ],
+)
+def test_what_speaks_against_a_camera_stands_in_its_file_and_does_no_harm(tmp_path, kind, file):
+    interior = InteriorOrientation(35.0, 0.065, 0.274, OpenCv(k1=-0.2, k2=0.1, p1=1e-3, p2=-2e-3))
+    said = "the verdict is red: T1 -- and 3 <others> are off"
+    for name, against in (("plain", ""), ("marked", said)):
+        (tmp_path / name).mkdir()
+        write_camera_file(tmp_path / name / file, SENSOR, interior, kind, name="7", reservation=against)
+    assert said.replace("--", "- -") in (tmp_path / "marked" / file).read_text()
+    plain, marked = (read_camera_file(tmp_path / name / file, pixel_mm=SENSOR.pixel_mm) for name in ("plain", "marked"))
+    same_numbers(marked.interior, plain.interior)
+    assert (marked.name, marked.sensor) == (plain.name, plain.sensor)
+
+
+def test_json_and_reports_have_no_comment(tmp_path):
+    for kind, file in (("opencv", "a.json"), ("smac", "a.txt")):
+        interior = InteriorOrientation(35.0, 0.065, 0.274, CAMERAS[kind])
+        write_camera_file(tmp_path / file, SENSOR, interior, kind, reservation="it is red")
+        assert "it is red" not in (tmp_path / file).read_text()
+        read_camera_file(tmp_path / file, pixel_mm=SENSOR.pixel_mm)
+
+
 def test_colmap_camera_is_the_simplest_model_that_holds_it(tmp_path):
     models = []
     for distortion in (OpenCv(), OpenCv(b1=1e-3), OpenCv(k1=0.1), OpenCv(k2=0.1), OpenCv(p2=0.1), OpenCv(k3=0.1)):

@@ -26,6 +26,8 @@ class _WriteFormat(NamedTuple):
     plane: CameraModel | None
     fisheye: CameraModel | None
     suffixes: tuple[str, ...]
+    comment: str = ""
+    """What makes a line of a sentence that other programs skip; "" where nothing does."""
 
     def model_of(self, interior: InteriorOrientation) -> CameraModel | None:
         """What a camera is written as."""
@@ -33,11 +35,11 @@ class _WriteFormat(NamedTuple):
 
 
 _FORMATS = {
-    "opencv": _WriteFormat(write_open_cv, open_cv.PLANE, open_cv.FISHEYE, (".yml", ".yaml", ".json")),
-    "colmap": _WriteFormat(write_colmap, colmap.PLANE, colmap.FISHEYE, ()),
-    "agisoft": _WriteFormat(agisoft.write_agisoft, agisoft.PLANE, agisoft.FISHEYE, (".xml",)),
-    "mrcal": _WriteFormat(mrcal.write_mrcal, open_cv.PLANE, None, (".cameramodel",)),
-    "ros": _WriteFormat(open_cv.write_ros, open_cv.PLANE, open_cv.FISHEYE, ()),
+    "opencv": _WriteFormat(write_open_cv, open_cv.PLANE, open_cv.FISHEYE, (".yml", ".yaml", ".json"), "# {}"),
+    "colmap": _WriteFormat(write_colmap, colmap.PLANE, colmap.FISHEYE, (), "# {}"),
+    "agisoft": _WriteFormat(agisoft.write_agisoft, agisoft.PLANE, agisoft.FISHEYE, (".xml",), "<!-- {} -->"),
+    "mrcal": _WriteFormat(mrcal.write_mrcal, open_cv.PLANE, None, (".cameramodel",), "# {}"),
+    "ros": _WriteFormat(open_cv.write_ros, open_cv.PLANE, open_cv.FISHEYE, (), "# {}"),
     "smac": _WriteFormat(write_smac_report, CameraModel(Smac, (), Perspective()), None, (".txt", ".rpt")),
     "block": _WriteFormat(write_block_camera, None, None, (".toml",)),
 }
@@ -60,8 +62,8 @@ def write_camera_file(
 
     `format` None: cameras.txt is COLMAP's, else the suffix tells. The distortion is converted exactly where its terms
     allow it, else fitted over the format (`camera.conversion`). `distortion` chooses the model in a block.toml, where
-    the `covariance` of `parameter_names(interior)` is kept, too, if the model stays what it is, and the `reservation`
-    about the calibration that it is from.
+    the `covariance` of `parameter_names(interior)` is kept, too, if the model stays what it is. The `reservation` about
+    the calibration that it is from is kept there, and in a comment of formats that have such.
 
     Raises InputError for unknown formats, for a `distortion` that is not the format's and for cameras that the format
     cannot hold.
@@ -97,4 +99,16 @@ def write_camera_file(
             write_block_camera(work, name, sensor, conversion.interior, own, reservation)
         else:
             known.write(work, name, sensor, conversion.interior)
+            # JSON has no comments.
+            if reservation and known.comment and path.suffix.lower() != ".json":
+                _mark(work, known.comment, reservation)
     return conversion
+
+
+def _mark(file: Path, comment: str, reservation: str) -> None:
+    """Put what speaks against a camera at the head of its file."""
+    text = file.read_text(encoding="utf-8")
+    # The first line of YAML by OpenCV and of XML says what the file is. Two dashes would end a comment of XML.
+    first, begins, rest = text.partition("\n") if text.startswith(("%YAML", "<?xml")) else ("", "", text)
+    line = comment.format(reservation.replace("--", "- -"))
+    file.write_text(f"{first}{begins}{line}\n{rest}", encoding="utf-8")
