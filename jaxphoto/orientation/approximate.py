@@ -235,7 +235,7 @@ def _check_in_front(block: Block, positions, matrices, points) -> None:
         raise PointsBehind(
             f"point {block.points[point[first]]} lies behind image {block.images[image[first]]}, which measured it "
             f"({len(bad)} of {len(image)} image points are so): check the approximate angles and their units, the "
-            "position of the image, and that the point's coordinates are in the same frame"
+            "position of the image, the unit of its image coordinates, and that the point's are in the same frame"
         )
 
 

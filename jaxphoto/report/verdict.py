@@ -60,6 +60,13 @@ def _findings(tables: Tables) -> Iterator[Finding]:
         # Observations that fit one another where it stopped: then it is no bad start, but what the block cannot tell.
         if float(adjusted.sigma0) <= NOTHING_FITS:
             yield from (Finding(Level.ALARM, w.sentence) for w in weaknesses_of(adjusted))
+        elif np.isfinite(adjusted.sigma0):
+            yield Finding(
+                Level.ALARM,
+                f"nothing fits where it stopped (sigma naught {float(adjusted.sigma0):.3g}): approximate values, "
+                "units, axes or names are wrong; jaxphoto adjust --snoop looks for what contradicts the others, and "
+                "says which mistake of a file it is",
+            )
         # Nothing that is said of an optimum holds elsewhere.
         return
     prepare_responses(adjusted.equations, adjusted.seconds)

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 
+import jax
 import numpy as np
 import pytest
 
@@ -94,6 +95,15 @@ def test_a_solve_that_stopped_says_what_was_open():
     assert "step limit" in first.text
     assert any("interior[one].c_mm with Z of all images: hardly determined" in f.text for f in others)
     assert {f.level for f in (first, *others)} == {verdict.Level.ALARM}
+
+
+def test_a_solve_that_stopped_where_nothing_fits_says_who_finds_out():
+    """Then no direction is weak for sure, and the errors are gross ones."""
+    optimum = tables(0.1, True).adjusted
+    far = jax.tree.map(lambda v: 100.0 * np.asarray(v), optimum.residuals)
+    stopped = dataclasses.replace(optimum, converged=np.array(False), residuals=far)
+    _, told = verdict_of(Tables(stopped)).findings
+    assert told.text.startswith("nothing fits where it stopped (sigma naught 1") and "--snoop" in told.text
 
 
 def test_relief_cures_it():
