@@ -17,6 +17,7 @@ import numpy as np
 from jaxphoto import FIXED, Block, Datum, Distances, read_block, write_block
 from jaxphoto.io import recipe_from
 from jaxphoto.simulation import Simulation, simulate
+from jaxphoto.variants import without_observations
 
 Make = Callable[[int], Block]
 
@@ -159,19 +160,24 @@ def without_rays(block: Block, out: np.ndarray) -> Block:
     return block.with_observations({rows.group: rows.take(~out)})
 
 
+def without_lone_rays(block: Block, out: np.ndarray) -> Block:
+    """Nor those points that are then left with one ray: that is a defect of its own."""
+    return without_observations(block, {block.image_points.group: out})[0]
+
+
 def two_points_in(image: int, block: Block) -> Block:
     """All but two points of an image are not measured in it."""
     mine = np.flatnonzero(block.image_points.image == image)
     out = np.zeros(len(block.image_points), bool)
     out[mine[2:]] = True
-    return without_rays(block, out)
+    return without_lone_rays(block, out)
 
 
 def line_in(image: int, block: Block) -> Block:
     """Of an image only the points of a line are left."""
     rows = block.image_points
     on_line = np.array([name.startswith("L") for name in block.points])
-    return without_rays(block, (rows.image == image) & ~on_line[rows.point])
+    return without_lone_rays(block, (rows.image == image) & ~on_line[rows.point])
 
 
 def one_ray(block: Block) -> Block:
