@@ -1,5 +1,6 @@
 """What comes with jaxphoto, from a clone and from a wheel."""
 
+import importlib
 import os
 import subprocess
 import sys
@@ -8,8 +9,11 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+from typer.main import get_command
 
 import jaxphoto
+from jaxphoto.cli.app import COMMANDS, app
+from jaxphoto.cli.example import _NEXT
 from jaxphoto.errors import InputError
 from jaxphoto.io import read_recipe
 from jaxphoto.io.shipped import EXAMPLES, shipped
@@ -45,10 +49,19 @@ def test_without_a_name_they_are_listed_and_a_wrong_one_is_said(tmp_path, monkey
     assert [line.split()[0] for line in screen.splitlines()] == list(EXAMPLES)
     code, _, error = run(monkeypatch, capsys, "example", "crossblock")
     assert code == 2 and "there is no example crossblock; there are cross_block, recipe" in error
-    assert read_recipe(shipped("lidar")).lidar is not None
+    for flight in ("lidar", "strips"):
+        assert read_recipe(shipped(flight)).lidar is not None
     monkeypatch.setattr("jaxphoto.io.shipped._PACKAGE", tmp_path / "jaxphoto")
     with pytest.raises(InputError, match="came without its examples"):
         shipped("recipe")
+
+
+@pytest.mark.parametrize("example", EXAMPLES)
+def test_what_is_to_be_typed_next_is_a_command_and_its_options(example):
+    program, command, *words = _NEXT[example].split()
+    assert program == "jaxphoto"
+    importlib.import_module(f"jaxphoto.cli.{COMMANDS[command].module}")
+    assert get_command(app).commands[command].make_context(command, words).params is not None
 
 
 @pytest.mark.slow

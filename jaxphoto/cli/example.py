@@ -14,13 +14,15 @@ from jaxphoto.io.shipped import EXAMPLES, shipped
 from jaxphoto.simulation import simulate
 from jaxphoto.writing import check_file, check_folder, whole_file, whole_folder
 
-_SIMULATED = ("lidar",)
+_SIMULATED = ("lidar", "strips")
 # What one does with each next; OUT is where it lies.
 _NEXT = {
     "cross_block": "jaxphoto adjust OUT --out results",
     "recipe": "jaxphoto simulate OUT --out block",
     "boresight": "jaxphoto simulate OUT --out flight",
     "lidar": "jaxphoto simultaneous OUT OUT/cloud.laz --trajectory OUT/trajectory.csv --out both",
+    "strips": "jaxphoto strips OUT/cloud.laz --trajectory OUT/trajectory.csv --block OUT "
+    "--adjust boresight,range-offset,angle-scale --cell-m 8 --knots-s 5 --out joint",
     "experiments": "jaxphoto experiment 000 --experiments OUT --layouts 4 --out runs",
 }
 

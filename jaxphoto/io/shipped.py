@@ -10,6 +10,7 @@ EXAMPLES = {
     "recipe": "a recipe to simulate: two heights, a cross strip, boresight and shifts of strips",
     "boresight": "a recipe to simulate: a flight to find the misalignment of a camera beside an IMU",
     "lidar": "a simulated flight of camera and lidar: block, cloud, trajectory, and the truth",
+    "strips": "a simulated flight of overlapping strips of a scanner and a camera on one trajectory, all of them wrong",
     "experiments": "the published experiments as runnable declarations",
 }
 """What can be handed out, and what it is."""
