@@ -83,7 +83,7 @@ def control_command(
         console.print(plain(sentence), soft_wrap=True)
     console.print(plain(verdict.headline), soft_wrap=True)
     for finding in verdict.findings:
-        if finding.level > Level.INFORMATION or "check points" in finding.text:
+        if finding.level > Level.INFORMATION or "check point" in finding.text:
             console.print(plain(f"  {finding.text}"), soft_wrap=True)
     console.print(f"results in {plain(str(out))} (open result/report.html)", soft_wrap=True)
     if verdict.level == Level.ALARM:

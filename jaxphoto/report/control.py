@@ -5,9 +5,10 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from jaxphoto.errors import few
+from jaxphoto.errors import counted, few
 from jaxphoto.procedures.control import ControlledBlock
 from jaxphoto.procedures.control.judged import CRITICAL
+from jaxphoto.report.digits import of_sigma
 from jaxphoto.report.findings import Finding, Level
 
 _AXES = "XYZ"
@@ -65,8 +66,9 @@ def control_findings(found: ControlledBlock) -> list[Finding]:
         text = f"{len(left)} of {n} control points contradict the rest and are left out: {few(left)}"
         said.append(Finding(Level.WARNING, text))
     if (state == "check").any():
-        told = ", ".join(f"{v:.3g}" for v in rmse(found, "check"))
-        text = f"{int((state == 'check').sum())} check points are off by {told} m (root mean squares of X, Y, Z)"
+        told, n = ", ".join(of_sigma(v) or "-" for v in rmse(found, "check")), int((state == "check").sum())
+        are = "is" if n == 1 else "are"
+        text = f"{counted(n, 'check point')} {are} off by {told} m (root mean squares of X, Y, Z)"
         said.append(Finding(Level.INFORMATION, text))
         w = np.nan_to_num(found.w).max(axis=1)
         if beyond := [name for name, of, v in zip(found.ids, state, w, strict=True) if of == "check" and v > CRITICAL]:
