@@ -174,9 +174,9 @@ def _snooped(block: Block, begun: Begun, max_steps: int, sizes: Sizes, report: C
     done, at = coordinate_exchanges(at, left, lost, sizes)
     for exchange in done:
         block, left = exchanged(block, left, exchange)
-    # Once only: what is exchanged twice is as it was, and what went twice would go again.
-    known: set[object] = {(e.group, e.rows) for e in done}
-    returned: set[int] = set()
+    # What is exchanged twice is as it was, and what went twice would go again.
+    known = {(e.group, e.rows) for e in done}
+    returned, again = set[int](), set[tuple]()
     while True:
         report(f"adjusting without {counted(sum(int(m.sum()) for m in left.values()), 'observation')}")
         adjusted, point, left = solve_placed(block, left, at.unknowns, max_steps, sizes)
@@ -195,14 +195,16 @@ def _snooped(block: Block, begun: Begun, max_steps: int, sizes: Sizes, report: C
         found = _tested(adjusted, at, left, point, sigma0, r)
         still_there = _same(found, left)
         if still_there or len(tried) == _ROUNDS or any(_same(found, old) for old in tried):
-            # What does not fit although it was exchanged, or fits as well as it was given, gets its own back; where
-            # nothing fits, all do.
+            # What does not fit although it was exchanged, or fits as well as it was given, gets its own back. Where
+            # nothing fits all do, whoever is to blame, and may be exchanged once more.
             fits = bool(adjusted.converged) and sigma0 <= _FITS
             wrong = [not fits or not _needed(at, left, e, sigma0) for e in done]
             if undone := with_what_rests_on_them(done, wrong):
                 for exchange in reversed(undone):
                     block, left = exchanged(block, left, exchange.undone)
                     done.remove(exchange)
+                went = set() if fits else {(e.group, e.rows) for e in undone}
+                known, again = known - (went - again), again | went
                 tried.clear()
                 continue
             # What went while blunders still turned the images.
@@ -220,7 +222,7 @@ def _snooped(block: Block, begun: Begun, max_steps: int, sizes: Sizes, report: C
 
 
 def _exchanges(
-    at: Adjustment, left: Masks, lost: np.ndarray, sigma0: float, r: Blocks, sizes: Sizes, known: set[object]
+    at: Adjustment, left: Masks, lost: np.ndarray, sigma0: float, r: Blocks, sizes: Sizes, known: set
 ) -> tuple[list[Exchange], Adjustment]:
     """Exchanges that are not `known`, and are from now on; and `at` with what they are of where it is seen.
 
