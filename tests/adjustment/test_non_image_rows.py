@@ -7,8 +7,9 @@ import pytest
 from jaxphoto.adjustment.model import row_functions
 from jaxphoto.adjustment.model.numbers import zero_increments
 from jaxphoto.adjustment.model.observed_groups import RowsAtPoints
-from jaxphoto.adjustment.solver import non_image_rows
+from jaxphoto.adjustment.solver import inverse, non_image_rows
 from jaxphoto.adjustment.solver.optimum import unit_scale
+from jaxphoto.statistics import covariance
 from tests.blocks import adjusted
 
 
@@ -42,4 +43,21 @@ def test_derivatives_in_portions_are_those_at_once(at_once, monkeypatch):
     found = [row_functions.row_jacobian(*group, at, scale, values, s) for group in listed]
     assert len(found) > 2
     for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(asked), strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-12)
+
+
+@pytest.mark.parametrize("at_once", [1, 3000])
+def test_redundancy_numbers_in_portions_are_those_at_once(at_once, monkeypatch):
+    result = adjusted("everything")
+    equations, known = result.equations, covariance(result, rows=True)
+
+    def found():
+        # Traced anew: how many rows are in memory is decided then.
+        return jax.jit(lambda q: inverse.row_variances(equations.at, q, known.rows, equations.factored)[1])(
+            known.cofactors
+        )
+
+    asked = found()
+    monkeypatch.setattr(row_functions, "_AT_ONCE", at_once)
+    for one, other in zip(found(), asked, strict=True):
         np.testing.assert_allclose(one, other, atol=1e-12)

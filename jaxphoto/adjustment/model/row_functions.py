@@ -196,18 +196,23 @@ def row_jacobian(
     one, copies = (ahead, slopes) if slopes < _MANY_SLOPES else (back, 1)
     # Of each row so many copies of its parameters.
     size = rows_at_once(group.components * copies * len(group.parameter))
-    if isinstance(group.rows, RowsAtPoints) or group.n_rows <= size:
-        residual, slope = each_row(one, group, touched, given)
-    else:
-        portions = jax.tree.map(lambda v: in_portions(v, size), (touched, given))
-        found = jax.lax.map(lambda own: each_row(one, group, *own), portions)
-        residual, slope = jax.tree.map(lambda v: _together(v)[..., : group.n_rows], found)
+    size = group.n_rows if isinstance(group.rows, RowsAtPoints) else size
+    residual, slope = over_portions(lambda *own: each_row(one, group, *own), (touched, given), group.n_rows, size)
     return RowJacobian(residual, slope.eop, slope.shared, slope.points)
 
 
 def rows_at_once(numbers: int) -> int:
     """Of how many rows, `numbers` of each, all are in memory together."""
     return max(1, _AT_ONCE // max(numbers, 1))
+
+
+def over_portions(function: Callable[..., Any], values: tuple[Any, ...], n_rows: int, size: int) -> Any:
+    """`function` of `values`, whose rows run along their last axes, for `size` rows at a time."""
+    if n_rows <= size:
+        return function(*values)
+    portions = jax.tree.map(lambda v: in_portions(v, size), values)
+    found = jax.lax.map(lambda own: function(*own), portions)
+    return jax.tree.map(lambda v: _together(v)[..., :n_rows], found)
 
 
 def in_portions(values: Shaped[Array, "*k rows"], size: int) -> Shaped[Array, "portions *k size"]:

@@ -22,7 +22,7 @@ from jaxphoto.adjustment.layout.sharding import TILES, along_points, sharded
 from jaxphoto.adjustment.layout.tiled import TiledStructure
 from jaxphoto.adjustment.model.numbers import Increments
 from jaxphoto.adjustment.model.observed_groups import ObservedGroup, RowsAtPoints
-from jaxphoto.adjustment.model.row_functions import RowJacobian, reduced_places
+from jaxphoto.adjustment.model.row_functions import RowJacobian, over_portions, reduced_places, rows_at_once
 from jaxphoto.adjustment.solver.band import invert_band
 from jaxphoto.adjustment.solver.elimination import FactoredNormal, over_tiles, solve_factored
 from jaxphoto.adjustment.solver.non_image_rows import non_image_rows
@@ -172,12 +172,16 @@ def row_variances(
 
 
 def _of_reduced(g: ObservedGroup, j: RowJacobian, q: Array, s: TiledStructure) -> Float[Array, "c c rows"]:
-    touched = reduced_places(g, s.n_images).T
+    def of(touched: Array, own: Array) -> Array:
+        at = touched.T
+        # What means no unknown lies behind the last.
+        met = q.at[at[:, :, None], at[:, None]].get(mode="fill", fill_value=0.0)
+        seen = jnp.einsum("nab,dbn->dan", met, own)
+        return jnp.einsum("can,dan->cdn", own, seen)
+
+    touched = reduced_places(g, s.n_images)
     own = jnp.concatenate([j.eop.reshape(g.components, -1, g.n_rows), j.shared], axis=1)
-    # What means no unknown lies behind the last.
-    met = q.at[touched[:, :, None], touched[:, None]].get(mode="fill", fill_value=0.0)
-    seen = jnp.einsum("nab,dbn->dan", met, own)
-    return jnp.einsum("can,dan->cdn", own, seen)
+    return over_portions(of, (touched, own), g.n_rows, rows_at_once(len(touched) ** 2))
 
 
 def _of_coupled(g: ObservedGroup, j: RowJacobian, at: Linearised, factored: FactoredNormal) -> Float[Array, "c c rows"]:

@@ -149,8 +149,8 @@ def adjust_strips(
     ties = None if images is None else TiePointSearch(search, tie_points(images))
     first_on = on = [] if ties is None or alone is None else ties.look(alone, covariance(alone), settled=False)
     rounds: list[StripRound] = []
-    before, still = np.zeros(()), False
-    while not still and len(rounds) < max_rounds:
+    before = np.zeros(())
+    while True:
         planes, points = search.rows(seen, errors), () if ties is None else ties.rows(on, errors)
         posed = dataclasses.replace(block, more=(*block.more, planes, *points, *steps))
         adjusted = adjust(posed, posed.start.unknowns)
@@ -164,17 +164,20 @@ def adjust_strips(
         settled = len(rounds) >= _SETTLED
         seen = search.look(errors, settled)
         on = [] if ties is None else ties.look(adjusted, known, settled)
-    return StripAdjustment(
-        alone,
-        adjusted,
-        known,
-        search.corrected_cloud,
-        None if trajectory is None else correct_flight(trajectory, errors),
-        errors,
-        _differences(first, seen) + _point_differences(first_on, on),
-        tuple(rounds),
-        still,
-    )
+        if still or len(rounds) >= max_rounds:
+            return StripAdjustment(
+                alone,
+                adjusted,
+                known,
+                search.corrected_cloud,
+                None if trajectory is None else correct_flight(trajectory, errors),
+                errors,
+                _differences(first, seen) + _point_differences(first_on, on),
+                tuple(rounds),
+                still,
+            )
+        # Of a large flight gigabytes, which the next round needs.
+        del adjusted, known
 
 
 def _check(cloud: Cloud, trajectory: Trajectory | None, held: Collection[str]) -> tuple[str, ...]:
