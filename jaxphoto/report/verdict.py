@@ -165,7 +165,11 @@ def _correlated(
         names = few([f"{c.eop_names[i]} with {c.parameters[j]} {worst[i, j]:.3f} (image {k})" for (i, j), k in where])
         open_ = [p for p in dict.fromkeys(c.parameters[j] for _, j in high) if p in felt]
         cures = [_OF_A_FIELD] if field else list(dict.fromkeys(_CURES.get(p, _OF_DISTORTION) for p in open_))
-        said = f"add {', or '.join(cures)}" if open_ else f"no image is off by {FELT:g} of its sigmas for it"
+        said = (
+            f"add {', or '.join(cures)}"
+            if open_
+            else f"what is open moves no corner of an image by {FELT:g} of its sigmas"
+        )
         yield Finding(
             Level.WARNING if open_ else Level.INFORMATION,
             f"high correlation of exterior with interior orientation of {camera_words(camera)}: {names}; {said}",

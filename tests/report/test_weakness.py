@@ -45,7 +45,7 @@ def test_a_high_correlation_that_no_image_feels_has_no_cure():
     """Stations that all shift alike: Z and c go together, and c is known well enough."""
     said = [f for f in verdict_of(tables(0.1, 1.0)).findings if "Z with c_mm" in f.text]
     assert [f.level for f in said] == [verdict.Level.INFORMATION]
-    assert said[0].text.endswith("no image is off by 10 of its sigmas for it")
+    assert said[0].text.endswith("what is open moves no corner of an image by 10 of its sigmas")
 
 
 def weak(warnings):
