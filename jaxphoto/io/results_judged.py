@@ -38,7 +38,7 @@ def reservation(summary: Mapping[str, Any]) -> str:
             "or its model are wrong, and its standard deviations with them"
         )
     if isinstance(doubts := summary.get("doubts"), list) and doubts:
-        return f"this adjustment rests on an earlier one. {_told(doubts[0])}"
+        return f"this adjustment rests on an earlier one: {_told(doubts[0])}"
     return ""
 
 
