@@ -167,6 +167,11 @@ class AbstractObservations(eqx.Module):
         """The name of the axis of each observed number: (n,), or (axes, 1) where a row has several."""
         return np.array(self.axes)[:, None] if len(self.axes) > 1 else np.full(len(self), self.axes[0], object)
 
+    @property
+    def axis_of_numbers(self) -> np.ndarray:
+        """The name of the axis of each observed number, (axes, n) for whichever rows."""
+        return np.atleast_2d(np.broadcast_to(self.axis_names(), np.shape(self.observation)[::-1]))
+
     def names_of(self, what: str, names: Sequence[str] | np.ndarray) -> np.ndarray:
         """Of each row (n,), or number (axes, n), the names of the images or points that it touches, hyphens between."""
         table, parts = np.array([*names, ""], object), []

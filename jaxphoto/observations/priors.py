@@ -115,7 +115,7 @@ class KnownParameters(eqx.Module):
         """The reservation with what it is of, in words; "" for none."""
         if not self.reservation:
             return ""
-        of_cameras = [label.split("[")[1].split("]")[0] for label in self.labels if label.startswith("interior[")]
-        cameras = ", ".join(camera_words(name) for name in dict.fromkeys(of_cameras))
+        own = [label.removeprefix("interior[") for label in self.labels if label.startswith("interior[")]
+        cameras = ", ".join(camera_words(name) for name in dict.fromkeys(label.rpartition("].")[0] for label in own))
         said = f"the calibration that {cameras} is from" if cameras else f"what is known of {few(self.labels)}"
         return f"of {said}: {self.reservation}"

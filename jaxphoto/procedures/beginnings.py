@@ -99,8 +99,7 @@ def without_what_is_alike(
     for trend in tested:
         if trend.p_value < LEVEL / len(tested) and (axes := [h.term.name for h in trend.alike]):
             rows = block.named_observations[trend.pattern.group]
-            own = np.isin(np.broadcast_to(rows.axis_names(), np.shape(rows.observation)[::-1]), axes)
-            out = {trend.pattern.group: np.any(np.atleast_2d(own), axis=0)}
+            out = {trend.pattern.group: np.any(np.isin(rows.axis_of_numbers, axes), axis=0)}
             yield out, partial(_without, block, start, max_steps, sizes, report, out)
 
 

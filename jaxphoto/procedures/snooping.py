@@ -126,7 +126,7 @@ def mostly_out(snooped: Snooped, block: Block) -> dict[str, dict[str, tuple[int,
         left = [s for s in snooped.left_out if s.group == name]
         if name == IMAGE_POINTS or isinstance(rows, Correlated) or len(left) < SEVERAL:
             continue
-        axes = np.atleast_2d(np.broadcast_to(rows.axis_names(), np.shape(rows.observation)[::-1]))
+        axes = rows.axis_of_numbers
         lost = np.isin(np.arange(len(rows)), [s.row for s in left])
         counted = {a: (int(((axes == a) & lost).sum()), int((axes == a).sum())) for a in dict.fromkeys(axes.flat)}
         if many := {a: (n, of) for a, (n, of) in counted.items() if n >= SEVERAL and n > _SINGLE * of}:

@@ -93,8 +93,7 @@ def _of_further_groups(
     for name, rows in block.named_observations.items():
         left = [s for s in snooped.left_out if s.group == name]
         if name != IMAGE_POINTS and not isinstance(rows, Correlated) and len(left) >= SEVERAL:
-            axes = np.broadcast_to(rows.axis_names(), np.shape(rows.observation)[::-1])
-            yield name, rows, left, np.atleast_2d(axes)
+            yield name, rows, left, rows.axis_of_numbers
 
 
 def _too_many(snooped: Snooped, block: Block) -> Iterator[str]:

@@ -109,8 +109,8 @@ def at_corner(tables: Tables, camera: str) -> dict[str, float]:
 
 
 def _weakness(camera: str, sentence: str, c: Correlations, parameters: tuple[str, ...]) -> Weakness:
-    # What goes with them besides goes with what is told.
-    pairs = _pairs(c, slice(None), parameters)
+    # Of all of the exterior orientation: what goes with them besides goes with what is told.
+    pairs = frozenset((e, p) for e in c.eop_names for p in c.parameters if p in parameters)
     return Weakness(sentence, pairs, frozenset(f"interior[{camera}].{name}" for name in parameters))
 
 
@@ -150,7 +150,3 @@ def _stations(adjusted: Adjustment, images: np.ndarray, axes: tuple[int, ...]) -
 def _strongest(c: Correlations, rows: slice, parameters: tuple[str, ...]) -> float:
     columns = [k for k, name in enumerate(c.parameters) if name in parameters]
     return float(c.max_abs[rows][:, columns].max(initial=0.0)) if len(c.images) else 0.0
-
-
-def _pairs(c: Correlations, rows: slice, parameters: tuple[str, ...]) -> frozenset[tuple[str, str]]:
-    return frozenset((e, p) for e in c.eop_names[rows] for p in c.parameters if p in parameters)
