@@ -66,17 +66,19 @@ def check_folder(directory: Path, *inputs: Path, clashes: Clashes = _nothing_cla
     for given in inputs:
         if target in (real := _real(given), *real.parents):
             raise InputError(f"{directory} is or holds the input {given}, which would be lost: name another folder")
-    for path in (target, *target.parents):
-        if os.path.lexists(path) and not path.is_dir():
-            raise InputError(f"{path} is a file: name a folder")
-    if os.path.ismount(target):
-        raise InputError(f"{directory} is a disk of its own, which cannot be replaced: name a folder in it")
+    _check_parents(target, "name a folder")
     check_room(target)
-    if target.is_dir():
+    # One after the other: a folder that another run puts in its place just now is neither a file nor without rights.
+    with locked(target.parent, wait=True), _said_of(target):
+        if not os.path.lexists(target):
+            return
+        if not target.is_dir():
+            raise InputError(f"{target} is a file: name a folder")
+        if os.path.ismount(target):
+            raise InputError(f"{directory} is a disk of its own, which cannot be replaced: name a folder in it")
         if not os.access(target, os.W_OK):
             raise InputError(f"{directory} must not be written to: name another folder, or change its rights")
-        with locked(target.parent, wait=True), _said_of(target):
-            own_files(target, clashes)
+        own_files(target, clashes)
 
 
 def check_file(path: Path, *inputs: Path) -> None:
@@ -86,10 +88,14 @@ def check_file(path: Path, *inputs: Path) -> None:
         raise InputError(f"{path} is the input itself, which would be lost: name another file")
     if os.path.lexists(target):
         raise InputError(f"{path} exists already: name a new file")
+    _check_parents(target, "name a file in a folder")
+    check_room(target)
+
+
+def _check_parents(target: Path, mend: str) -> None:
     for parent in target.parents:
         if os.path.lexists(parent) and not parent.is_dir():
-            raise InputError(f"{parent} is a file: name a file in a folder")
-    check_room(target)
+            raise InputError(f"{parent} is a file: {mend}")
 
 
 def _check_kind(path: Path, target: Path) -> None:
