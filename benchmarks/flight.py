@@ -102,7 +102,6 @@ def ours(arguments: argparse.Namespace) -> dict:
     clock = _Clock()
     import jaxphoto  # noqa: F401
     from jaxphoto.camera import InteriorOrientation
-    from jaxphoto.image_measurement.features import FEATURES
     from jaxphoto.image_measurement.matching import match_photographs
     from jaxphoto.image_measurement.photograph_pairs import photograph_pairs
     from jaxphoto.io.photographs import known_lens, sensor_and_interior
@@ -124,7 +123,7 @@ def ours(arguments: argparse.Namespace) -> dict:
         camera.sensor,
         camera.interior,
         compared,
-        count=arguments.features or FEATURES,
+        count=arguments.features,
         in_parts=True,
         progress=progress,
     )

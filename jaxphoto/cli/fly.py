@@ -20,7 +20,7 @@ from jaxphoto.errors import InputError
 from jaxphoto.georeferencing.geoid_heights import WGS84
 from jaxphoto.georeferencing.map_frame import check_heights
 from jaxphoto.image_measurement.control_targets import target_looker
-from jaxphoto.image_measurement.features import FEATURES, LONGEST_PX
+from jaxphoto.image_measurement.features import LONGEST_PX
 from jaxphoto.image_measurement.matching import MatchedPhotographs, match_photographs
 from jaxphoto.image_measurement.photograph_pairs import MostAlike, photograph_pairs, usual_choice
 from jaxphoto.image_measurement.targets.on_ground import SYNTAX, read_target
@@ -56,7 +56,10 @@ def fly_command(
         str | None,
         typer.Option(help="Map system of the block, such as 25832 or 25832+7837 (default: the zone of UTM)."),
     ] = None,
-    features: Annotated[int, typer.Option(help="Of a photograph, at most.", min=100)] = FEATURES,
+    features: Annotated[
+        int | None,
+        typer.Option(help="Of a photograph, at most (default: 10000 of up to 40 photographs, else 5000).", min=100),
+    ] = None,
     longest_px: Annotated[
         int, typer.Option(help="Longer side, in pixels, to look for features.", min=200)
     ] = LONGEST_PX,

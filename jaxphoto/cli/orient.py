@@ -14,7 +14,7 @@ from jaxphoto.cli.choices import one_of
 from jaxphoto.cli.console import plain_console
 from jaxphoto.cli.progress import FEWER_PAIRS, StepsLeft
 from jaxphoto.errors import InputError
-from jaxphoto.image_measurement.features import FEATURES, LONGEST_PX
+from jaxphoto.image_measurement.features import LONGEST_PX
 from jaxphoto.image_measurement.matching import MatchedPhotographs, match_photographs
 from jaxphoto.image_measurement.photograph_pairs import photograph_pairs, usual_choice
 from jaxphoto.io import read_block, write_block
@@ -40,7 +40,10 @@ def orient_command(
             "else position:20 or, where not all have one, similar:20)."
         ),
     ] = None,
-    features: Annotated[int | None, typer.Option(help="Of a photograph, at most (default: 5000).", min=100)] = None,
+    features: Annotated[
+        int | None,
+        typer.Option(help="Of a photograph, at most (default: 10000 of up to 40 photographs, else 5000).", min=100),
+    ] = None,
     longest_px: Annotated[
         int | None, typer.Option(help="Longer side, in pixels, to look for features (default: 2400).", min=200)
     ] = None,
@@ -87,7 +90,7 @@ def orient_command(
             camera.sensor,
             start,
             compared,
-            count=features or FEATURES,
+            count=features,
             longest_px=longest_px or LONGEST_PX,
             keep=keep,
             progress=StepsLeft(errors, status, FEWER_PAIRS),

@@ -13,6 +13,8 @@ from jaxphoto.image_measurement.grey_values import read_grey
 
 FEATURES = 5000
 """Of a photograph, where nothing else is said."""
+OF_FEW = 10_000
+"""The same where photographs are few: then features take little memory, and the more of them, the better a network."""
 LONGEST_PX = 2400
 """Longer side of a photograph as its features are looked for, unless said: that takes 1 GB of memory, 3200 1.7."""
 # Of a corner's strength over that of the strongest, as OpenCV counts it.

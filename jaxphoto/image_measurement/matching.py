@@ -15,16 +15,25 @@ from pathlib import Path
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import cv2
+import faiss
 import numpy as np
 from jaxtyping import Float, Int
 
 from jaxphoto.camera import InteriorOrientation, Sensor
 from jaxphoto.errors import InputError
-from jaxphoto.image_measurement.descriptors import match_descriptors
+from jaxphoto.image_measurement.descriptors import METHOD as LOOKS
+from jaxphoto.image_measurement.descriptors import FindableFeatures, findable, match_descriptors
 from jaxphoto.image_measurement.epipolar import LEAST_MATCHES, epipolar_lines, over_sigma
-from jaxphoto.image_measurement.features import FEATURES, LONGEST_PX, METHOD, SiftFeatures, sift_features
+from jaxphoto.image_measurement.features import (
+    FEATURES,
+    LONGEST_PX,
+    METHOD,
+    OF_FEW,
+    SiftFeatures,
+    sift_features,
+)
 from jaxphoto.image_measurement.likely_pairs import largest_of, most_alike
-from jaxphoto.image_measurement.photograph_pairs import MostAlike
+from jaxphoto.image_measurement.photograph_pairs import FEW, MostAlike
 from jaxphoto.io.kept_pieces import KeptPieces, name_of
 from jaxphoto.io.photographs import Photograph
 from jaxphoto.orientation.matches import PairMatches, connected_images, tracks
@@ -104,15 +113,16 @@ def match_photographs(
     interior: InteriorOrientation,
     pairs: Iterable[tuple[int, int]] | MostAlike,
     *,
-    count: int = FEATURES,
+    count: int | None = None,
     longest_px: int = LONGEST_PX,
     in_parts: bool = False,
     keep: KeptPieces | None = None,
     progress: Progress | None = None,
 ) -> MatchedPhotographs:
-    """SIFT features (up to `count` each) of photographs of one camera, and their matches in the `pairs` of indices.
+    """SIFT features of photographs of one camera, and their matches in the `pairs` of indices.
 
-    Photographs are made smaller to `longest_px` before.
+    Of each there are `count` features at most, unless given 5,000, or 10,000 of up to 40 photographs; it is made
+    smaller to `longest_px` before.
 
     `interior` is what is known of the camera; only its distortion and principal point count. What is found goes to
     `keep` as it is found, and what is there already is not found again: a run that was killed goes on, to the same
@@ -130,7 +140,9 @@ def match_photographs(
     return matched._replace(left_out={photographs[k].name: _BLANK if blank[k] else _ALONE for k in alone})
 
 
-def tie_features(paths: list[Path], sensor: Sensor, count: int = FEATURES, least_photographs: int = 2) -> TieFeatures:
+def tie_features(
+    paths: list[Path], sensor: Sensor, count: int | None = None, least_photographs: int = 2
+) -> TieFeatures:
     """Points that overlapping photographs of one camera show in common: pairs, triplets and more.
 
     All pairs are matched as by `match_photographs` and joined as by `tracks`; points in fewer than `least_photographs`
@@ -184,12 +196,13 @@ def _matched(
     sensor: Sensor,
     interior: InteriorOrientation,
     pairs: Iterable[tuple[int, int]] | MostAlike,
-    count: int,
+    given: int | None,
     longest_px: int,
     pieces: _Pieces,
     progress: Progress,
 ) -> MatchedPhotographs:
     names: list[str] = []
+    count = given or (OF_FEW if len(paths) <= FEW else FEATURES)
 
     def described(k: int) -> SiftFeatures:
         kept = pieces.read(names[k])
@@ -219,11 +232,11 @@ def _matched(
     ideal_px = [ideal_coordinates(interior, xy) / sensor.pixel_mm for xy in xy_mm]
     sigma_px = [sigma / sensor.pixel_mm for sigma in sigma_mm]
     off_line_px = _OFF_LINE * float(np.hypot(sensor.width_px, sensor.height_px))
-    lately = functools.lru_cache(_IN_MEMORY)(described)
+    lately = functools.lru_cache(_IN_MEMORY)(lambda k: findable(described(k)))
 
     def compare(some: list[tuple[int, int]]) -> _Compared:
         each = [(names[k], ideal_px[k].tobytes()) for pair in some for k in pair]
-        name = name_of("matches", *METHOD, cv2.__version__, off_line_px, *itertools.chain(*each))
+        name = name_of("matches", *METHOD, *LOOKS, cv2.__version__, off_line_px, *itertools.chain(*each))
         kept = pieces.read(name)
         if kept is None:
             kept = _compared(some, lately, ideal_px, sigma_px, off_line_px)._asdict()
@@ -233,7 +246,8 @@ def _matched(
     results, done = [], 0
     size = min(_AT_ONCE, max(1, len(compared) // _LEAST_PIECES))
     some = [compared[k : k + size] for k in range(0, len(compared), size)]
-    with ThreadPoolExecutor(os.cpu_count()) as workers:
+    # Each worker by itself: pairs are many, and their order and that of all sums stays the same.
+    with ThreadPoolExecutor(os.cpu_count(), initializer=faiss.omp_set_num_threads, initargs=(1,)) as workers:
         for pairs_done, result in zip(some, workers.map(compare, some), strict=True):
             results.append(result)
             done += len(pairs_done)
@@ -255,7 +269,7 @@ def _matched(
 
 def _compared(
     pairs: list[tuple[int, int]],
-    described: Callable[[int], SiftFeatures],
+    described: Callable[[int], FindableFeatures],
     ideal_px: list[Float[np.ndarray, "_ 2"]],
     sigma_px: list[Float[np.ndarray, "_"]],
     off_line_px: float,

@@ -15,6 +15,8 @@ _EARTH_M = 6_371_000.0
 # So many of each are compared where photographs are many: as far as those of four fifths overlap still show the same,
 # in all directions.
 _NEAREST = 20
+FEW = 2 * _NEAREST
+"""Photographs of which each may be compared with each, and many features of each be found."""
 
 
 class MostAlike(NamedTuple):
@@ -25,7 +27,7 @@ class MostAlike(NamedTuple):
 
 def usual_choice(photographs: Sequence[Photograph]) -> str:
     """The choice of pairs where nobody makes one: all of few, else neighbours, else those that look alike."""
-    if len(photographs) <= 2 * _NEAREST:
+    if len(photographs) <= FEW:
         return "exhaustive"
     return f"{'position' if all(p.gps for p in photographs) else 'similar'}:{_NEAREST}"
 

@@ -9,7 +9,9 @@ import pytest
 
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing.gps import Gps
+from jaxphoto.image_measurement.descriptors import findable, match_descriptors
 from jaxphoto.image_measurement.epipolar import epipolar_lines
+from jaxphoto.image_measurement.features import FEATURES, OF_FEW, SiftFeatures, sift_features
 from jaxphoto.image_measurement.matching import match_photographs, tie_features
 from jaxphoto.image_measurement.photograph_pairs import nearest_pairs, photograph_pairs
 from jaxphoto.io.photographs import photographs, sensor_and_interior
@@ -34,7 +36,9 @@ def taken(tmp_path_factory):
     camera = sensor_and_interior(taken, SENSOR.pixel_mm, C_MM)
     steps = []
     pairs = photograph_pairs(taken)
-    matched = match_photographs(taken, camera.sensor, camera.interior, pairs, progress=lambda *s: steps.append(s))
+    matched = match_photographs(
+        taken, camera.sensor, camera.interior, pairs, count=FEATURES, progress=lambda *s: steps.append(s)
+    )
     assert steps == [*(("features", k, 4) for k in range(1, 5)), *(("matches", k, 6) for k in range(1, 7))]
     return taken, camera, matrices, matched
 
@@ -84,9 +88,56 @@ def test_large_and_small_features_scatter_as_stated_alike(taken):
         assert 0.9 < np.sqrt(np.mean(normalised[part] ** 2)) < 1.35
 
 
+def test_faint_features_scatter_as_stated_too(taken):
+    """Twice as many as such small photographs have clear ones: `sigma_factor` says that these scatter more."""
+    images, camera, matrices, matched = taken
+    more = match_photographs(images, camera.sensor, camera.interior, photograph_pairs(images))
+    assert len(more.xy_mm[0]) > 0.75 * OF_FEW
+    assert len(more.pairs[0].features) > 1.5 * len(matched.pairs[0].features)
+    all_ = [offsets(more, matrices, pair) for pair in more.pairs]
+    off, sigma = (np.concatenate(part) for part in zip(*all_, strict=True))
+    right = np.linalg.norm(off, axis=1) < 2
+    assert right.mean() > 0.99
+    assert 1.1 < more.sigma_factor / matched.sigma_factor < 1.4
+    normalised, size = (off / sigma)[right], sigma[right, 0]
+    for part in (size < np.median(size), size >= np.median(size)):
+        assert 0.9 < np.sqrt(np.mean(normalised[part] ** 2)) < 1.35
+
+
+def nearest(a, b):
+    """Of each descriptor the nearest of all, by a table of all distances."""
+    a, b = a.astype(float), b.astype(float)
+    square = np.square(a).sum(axis=1)[:, None] - 2 * a @ b.T + np.square(b).sum(axis=1)
+    first, second = np.partition(square, 1, axis=1)[:, :2].T
+    return square.argmin(axis=1), first < 0.64 * second
+
+
+def test_matches_are_those_of_a_look_at_all(taken):
+    """Looked for in few cells nearly all are found; a second best in another cell lets some more pass."""
+    images, camera, _, _ = taken
+    one, other = (sift_features(image.path, camera.sensor, 3000) for image in images[:2])
+    best, clear = nearest(one.descriptors, other.descriptors)
+    back, clear_back = nearest(other.descriptors, one.descriptors)
+    rows = np.flatnonzero(clear & clear_back[best] & (back[best] == np.arange(len(best))))
+    all_ = {*zip(one.feature[rows].tolist(), other.feature[best[rows]].tolist(), strict=True)}
+    found = {*map(tuple, match_descriptors(findable(one), findable(other)).tolist())}
+    assert len(all_) > 800
+    assert len(all_ & found) > 0.97 * len(all_) and len(found - all_) < 0.05 * len(all_)
+
+
+@pytest.mark.parametrize("few", [0, 1, 2, 50])
+def test_few_features_are_looked_for_among_all(few):
+    rng = np.random.default_rng(few)
+    descriptors = rng.integers(0, 256, (200, 128)).astype(np.uint8)
+    of = [SiftFeatures(np.zeros((n, 2)), np.ones(n), np.arange(n), descriptors[:n]) for n in (few, 200)]
+    found = match_descriptors(findable(of[0]), findable(of[1]))
+    # Each is its own double; of one alone nothing is clearly the nearest.
+    np.testing.assert_array_equal(found, np.repeat(np.arange(few if few > 1 else 0), 2).reshape(-1, 2))
+
+
 def test_matches_are_counted_and_the_same_again(taken):
     images, camera, _, matched = taken
-    again = match_photographs(images[:2], camera.sensor, camera.interior, [(1, 0), (0, 1)])
+    again = match_photographs(images[:2], camera.sensor, camera.interior, [(1, 0), (0, 1)], count=FEATURES)
     np.testing.assert_array_equal(again.pairs[0].features, matched.pairs[0].features)
     first, second, alike, kept = matched.counts.T
     np.testing.assert_array_equal(kept, [len(pair.features) for pair in matched.pairs])
