@@ -78,8 +78,11 @@ def solve(
         found = run_compiled(_optimise, arguments, seconds, "solve")
         # What comes back from several devices is of another type to a program than what went in.
         state = UnknownArrays(*map(still, found.state))
+    steps, converged = found.steps, found.converged
+    # Its normal equations are the largest that there is, and made again.
+    del found
     adjusted = _at(state, laid, block, start, priors, seconds)
-    adjusted = dataclasses.replace(adjusted, steps=found.steps, converged=found.converged)
+    adjusted = dataclasses.replace(adjusted, steps=steps, converged=converged)
     if laid.traced:
         return adjusted
     if adjusted.astray.any():
@@ -106,6 +109,7 @@ def _at(state: UnknownArrays, laid: "LaidOut", block: Block, start: Unknowns, pr
     if not laid.traced:
         again = run_compiled(_optimise, (numbers, structure, to_factor()), seconds, "covariance")
         factored = gathered(again.factored)
+        del again
     residuals = run_compiled(_residuals, (numbers, structure), seconds, "residuals")
     state = tiled.crop_state(state)
     return Adjustment(

@@ -77,7 +77,7 @@ class NormalEquations(eqx.Module):
         return pull(z, self.at)
 
     def push(self, x: Increments) -> TiledResiduals:
-        """J x: how what was adjusted moves, over its sigmas, with the unknowns; of many by `jax.vmap`."""
+        """J x of many, along a leading axis: how what was adjusted moves, over its sigmas, with the unknowns."""
         return push(x, self.at)
 
     def pull_others(self, z: NonImageResiduals) -> Increments:
@@ -85,7 +85,7 @@ class NormalEquations(eqx.Module):
         return pull_others(z, self.at)
 
     def push_others(self, x: Increments) -> NonImageResiduals:
-        """J x of all but image rows; of many by `jax.vmap`."""
+        """J x of all but image rows; of many along a leading axis."""
         return push_others(x, self.at)
 
     def cofactors(self, of_rows: Bool[Numbers, ""]) -> tuple[Cofactors, RowCofactors]:

@@ -156,15 +156,23 @@ def _pull(equations: NormalEquations, z: Float[Array, "k places"]) -> Increments
 
 @eqx.filter_jit
 def _pull_others(equations: NormalEquations, z: Float[Array, "k places"]) -> Increments:
-    zero = jax.tree.map(lambda v: jnp.zeros(v.shape), jax.eval_shape(equations.push_others, equations.scale))
+    def residuals() -> NonImageResiduals:
+        own = equations.at.residuals()
+        return NonImageResiduals(own.others, own.datum, own.names)
+
+    zero = jax.tree.map(lambda v: jnp.zeros(v.shape), jax.eval_shape(residuals))
     return equations.pull_others(jax.vmap(ravel_pytree(zero)[1])(z))
 
 
 @eqx.filter_jit
 def _push_others(equations: NormalEquations, x: Increments) -> Float[Array, "k places"]:
-    return jax.vmap(lambda one: ravel_pytree(equations.push_others(one))[0])(x)
+    return _rows(equations.push_others(x))
 
 
 @eqx.filter_jit
 def _push(equations: NormalEquations, x: Increments) -> Float[Array, "k places"]:
-    return jax.vmap(lambda one: ravel_pytree(equations.push(one))[0])(x)
+    return _rows(equations.push(x))
+
+
+def _rows(residuals: NonImageResiduals) -> Float[Array, "k places"]:
+    return jax.vmap(lambda one: ravel_pytree(one)[0])(residuals)

@@ -1,5 +1,6 @@
 """Of many rows, derivatives and their products are computed portion by portion, and are the same."""
 
+import equinox as eqx
 import jax
 import numpy as np
 import pytest
@@ -61,3 +62,24 @@ def test_redundancy_numbers_in_portions_are_those_at_once(at_once, monkeypatch):
     monkeypatch.setattr(row_functions, "_AT_ONCE", at_once)
     for one, other in zip(found(), asked, strict=True):
         np.testing.assert_allclose(one, other, atol=1e-12)
+
+
+@pytest.mark.parametrize("at_once", [1, 1 << 24])
+@pytest.mark.parametrize("name", ["everything", "inner"])
+def test_many_directions_in_portions_are_those_one_by_one(name, at_once, monkeypatch):
+    """J x of each of twelve, and J' of that again; one block has image rows and its datum only."""
+    equations = adjusted(name).equations.on_one_device.weighed
+    rng = np.random.default_rng(2)
+    x = jax.tree.map(lambda v: rng.normal(size=(12, *v.shape)), equations.scale)
+    at = equations.at
+    _, push = jax.linearize(lambda y: at._replace(increments=y).residuals(), at.increments)
+    pull = jax.linear_transpose(push, at.increments)
+    monkeypatch.setattr(row_functions, "_AT_ONCE", at_once)
+    pushed = eqx.filter_jit(lambda equations, x: equations.push(x))(equations, x)
+    pulled = eqx.filter_jit(lambda equations, z: equations.pull(z))(equations, pushed)
+    for k in range(12):
+        own = push(jax.tree.map(lambda v, k=k: v[k], x))
+        for one, other in zip(jax.tree.leaves(pushed), jax.tree.leaves(own), strict=True):
+            np.testing.assert_allclose(one[k], other, atol=1e-9 * max(1.0, np.abs(other).max(initial=0.0)))
+        for one, other in zip(jax.tree.leaves(pulled), jax.tree.leaves(pull(own)[0]), strict=True):
+            np.testing.assert_allclose(one[k], other, atol=1e-9 * max(1.0, np.abs(other).max(initial=0.0)))

@@ -12,7 +12,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from jaxphoto.adjustment.layout.tiled import TiledResiduals, TiledStructure
 from jaxphoto.adjustment.model.image_orientations import ImageOrientations, by_image, of_images, orientations_of
@@ -209,17 +209,33 @@ def pull_others(z: NonImageResiduals, at: Linearised) -> Increments:
             points = points.at[:, g.point].add(jnp.einsum("cjar,cr->ajr", j.points, v))
         return Increments(eop, shared, points)
 
-    # Of each of those side by side, every row has numbers of what it touches.
-    size = rows_at_once(sum(g.components * g.n_rows * len(g.place) for g in s.observed))
-    own = z.others, z.datum
-    return jax.vmap(one)(own) if len(z.datum) <= size else jax.lax.map(one, own, batch_size=size)
+    return _of_many(one, (z.others, z.datum), len(z.datum), s)
+
+
+def _of_many(function: Callable[[Any], Any], values: Any, many: int, s: TiledStructure) -> Any:
+    """`function` of many `values` along their leading axes, of as many side by side as memory allows.
+
+    Of each of these, every row has numbers of what it touches.
+    """
+    most = rows_at_once(sum(g.components * g.n_rows * len(g.parameter) for g in s.observed))
+    if many <= most:
+        return jax.vmap(function)(values)
+    # None is left over, which would be compiled by itself.
+    size = next(k for k in range(most, 0, -1) if many % k == 0)
+    batches = jax.tree.map(lambda v: v.reshape(many // size, size, *v.shape[1:]), values)
+    found = jax.lax.map(jax.vmap(function), batches)
+    return jax.tree.map(lambda v: v.reshape(many, *v.shape[2:]), found)
 
 
 def push(x: Increments, at: Linearised) -> TiledResiduals:
-    """J x of any increments, on one device; of many by `jax.vmap`.
+    """J x of many increments, along a leading axis, on one device."""
+    image = jax.vmap(lambda own: _push_images(own, at))(x)
+    both = lambda own, image: TiledResiduals(own.others, own.datum, own.names, image)  # noqa: E731
+    return jax.vmap(both)(push_others(x, at), image)
 
-    Tile by tile: what lies between stays in the processor's cache.
-    """
+
+def _push_images(x: Increments, at: Linearised) -> Float[Array, "chunks tiles 2 m p"]:
+    """J x of the image rows, tile by tile: what lies between stays in the processor's cache."""
     _, scale, values, s = at
     scene, moved = jax.jvp(partial(_scene_at, at), at.increments[:2], x[:2])
 
@@ -230,15 +246,17 @@ def push(x: Increments, at: Linearised) -> TiledResiduals:
         return jnp.stack(jax.jvp(lambda scene, point: tile_residuals(scene, point, seen, s), places, steps)[1])
 
     numbers = (s.by_tile(at.state.points), s.by_tile(x.points * scale.points), values.xy, values.sigma_xy)
-    image = s.each_tile(tile, numbers)
-    others = push_others(x, at)
-    return TiledResiduals(others.others, others.datum, others.names, image)
+    return s.each_tile(tile, numbers)
 
 
 def push_others(x: Increments, at: Linearised) -> NonImageResiduals:
-    """J x of all but the image rows; of many by `jax.vmap`."""
+    """J x of all but the image rows, of many along a leading axis."""
     _, scale, values, s = at
-    return jax.jvp(lambda y: non_image_residuals(y, scale, values, s), (at.increments,), (x,))[1]
+
+    def one(own: Increments) -> NonImageResiduals:
+        return jax.jvp(lambda y: non_image_residuals(y, scale, values, s), (at.increments,), (own,))[1]
+
+    return _of_many(one, x, len(x.shared), s)
 
 
 def _others_and_gradient(at: Linearised) -> tuple[NonImageResiduals, Increments]:
