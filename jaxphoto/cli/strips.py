@@ -164,7 +164,7 @@ def strips_command(
         result = adjust_strips(looked_at, path, settings, priors, photographs=photographs, **options)
         status.update(f"writing {out}")
         gaps = Gaps(Placement(cloud.name, clouds.cloud_system(cloud, **said), own), settings)
-        tables = None if photographs is None else Tables(result.adjusted)
+        tables = None if photographs is None else Tables(result.adjusted, known=result.covariance)
         made, verdict = made_by(context, cloud, trajectory, block), strips_verdict(result, tables)
 
         def moved(part: Cloud) -> Float[np.ndarray, "n 3"]:

@@ -65,7 +65,8 @@ class Tables:
 
     `rotations` says which rotations the correlations mean (see `jaxphoto.covariance`). Sigmas are a posteriori (times
     sigma0) unless a column says otherwise; units stand in the column names or in a column `unit`. `truth` is that of a
-    simulation (`jaxphoto.io.truth_tables`, `read_truth`), for `recovery`.
+    simulation (`jaxphoto.io.truth_tables`, `read_truth`), for `recovery`. `known` is its covariance with `rows`, where
+    that was computed already.
     """
 
     def __init__(
@@ -73,10 +74,12 @@ class Tables:
         adjusted: Adjustment,
         rotations: Rotations = "omega_phi_kappa",
         truth: Mapping[str, pd.DataFrame] | None = None,
+        known: Covariance | None = None,
     ):
         self.adjusted = adjusted
         self.rotations: Rotations = rotations
         self.truth = truth
+        self._known = known
 
     def __repr__(self) -> str:
         names = [name for name, own in vars(Tables).items() if _is_table(own)]
@@ -94,7 +97,7 @@ class Tables:
         """Covariance with omega, phi, kappa."""
         # Most tables need redundancy numbers, too.
         prepare_statistics(self.adjusted.equations, self.adjusted.seconds)
-        return covariance(self.adjusted, rows=True)
+        return covariance(self.adjusted, rows=True) if self._known is None else self._known
 
     def _told(self, sigma: Numbers) -> np.ndarray:
         """Standard deviations, but none of what did not converge: they would be of some other place."""

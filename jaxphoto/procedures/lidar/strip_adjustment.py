@@ -154,7 +154,8 @@ def adjust_strips(
         planes, points = search.rows(seen, errors), () if ties is None else ties.rows(on, errors)
         posed = dataclasses.replace(block, more=(*block.more, planes, *points, *steps))
         adjusted = adjust(posed, posed.start.unknowns)
-        known = covariance(adjusted)
+        # With rows: that of the last round serves the tables of the result, too.
+        known = covariance(adjusted, rows=True)
         now = np.asarray(adjusted.values.shared)[adjusted.structure.free]
         counted = len(planes), sum(map(len, points))
         rounds.append(_round(len(rounds) + 1, counted, seen, on, _change(now - before, known)))
