@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxphoto.adjustment import Adjustment
+from jaxphoto.adjustment.right_hand_sides import solve_many
 from jaxphoto.arrays import still
-from jaxphoto.statistics.responses import Responses
 
 
 class LinearForms(NamedTuple):
@@ -32,16 +32,18 @@ def linear_forms(
     points (m), of each image its position (m) and small rotations about the axes of its camera (rad), and the shared
     ones in the order of `Structure.labels`, in their own units.
     """
-    responses, scale, places = Responses.of(adjusted), adjusted.equations.scale, adjusted.tiled.places
-    b = jax.tree.map(lambda v: np.zeros((n_forms, *np.shape(v))), scale)
+    equations, places = adjusted.equations.on_one_device.weighed, adjusted.tiled.places
+    scale = jax.tree.map(still, equations.scale)
+    b = jax.tree.map(lambda v: np.zeros((n_forms, *v.shape)), scale)
     if points is not None:
         b.points[:, :, places.point] = np.moveaxis(points, 1, 2)
     if exterior is not None:
         b.eop[:, :, places.image] = np.moveaxis(exterior, 1, 2)
     if shared is not None:
         b.shared[:, : shared.shape[1]] = shared
-    b = jax.tree.map(lambda v, s: v * still(s), b, scale)
-    x = responses.solved(b)
-    factor = float(adjusted.sigma0) ** 2
-    flat = [np.hstack([np.reshape(v, (n_forms, -1)) for v in tree]) for tree in (b, x)]
-    return LinearForms(factor * flat[0] @ flat[1].T, factor * np.asarray(x.shared) * still(scale.shared))
+    for v, own in zip(b, scale, strict=True):
+        v *= own
+    x, factor = solve_many(equations, b, adjusted.seconds), float(adjusted.sigma0) ** 2
+    # Kind by kind: of a large block each copy of all of them takes 100 MB.
+    flat = [(v.reshape(n_forms, v[0].size), w.reshape(n_forms, w[0].size)) for v, w in zip(b, x, strict=True)]
+    return LinearForms(factor * sum(v @ w.T for v, w in flat), factor * np.asarray(x.shared) * scale.shared)
