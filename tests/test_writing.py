@@ -18,7 +18,7 @@ from jaxphoto.io import write_camera_file
 from jaxphoto.io.clouds import write_cloud
 from jaxphoto.io.raster import write_dsm, write_hillshade
 from jaxphoto.lidar.raster import Raster
-from jaxphoto.writing import MARKER, check_file, check_folder, locked, place, whole_file, whole_folder
+from jaxphoto.writing import MARKER, check_file, check_folder, locked, place, whole, whole_file, whole_folder
 from tests.commands import run
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -131,6 +131,53 @@ def test_what_cannot_be_written_is_said_before_anything_is_computed(tmp_path, mo
     with pytest.raises(InputError, match="cannot be written"):
         check_folder(tmp_path / ("long" * 100))
     assert not list(tmp_path.iterdir())
+
+
+def test_what_can_be_no_folder_is_said_before_that_its_place_cannot_be_written(tmp_path, monkeypatch):
+    with pytest.raises(InputError, match="/ is a disk of its own"):
+        check_folder(Path("/"))
+
+    def fails(*_, **__):
+        raise OSError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr("jaxphoto.writing.place.tempfile.mkdtemp", fails)
+    (tmp_path / "file").write_text("1")
+    with pytest.raises(InputError, match="file is a file: name a folder"):
+        check_folder(tmp_path / "file")
+    with pytest.raises(InputError, match="cannot be written"):
+        check_folder(tmp_path / "folder")
+
+
+def test_a_folder_that_is_just_put_in_its_place_is_looked_at_when_it_is_there(tmp_path, monkeypatch):
+    """Moved aside by a run that writes: who asks for its rights waits until it is back."""
+    out, aside = tmp_path / "out", tmp_path / "aside"
+    write(out, a="1")
+    moved, asked = threading.Event(), threading.Event()
+
+    def replaced():
+        with locked(tmp_path, wait=True):
+            out.rename(aside)
+            moved.set()
+            asked.wait(1.0)
+            time.sleep(0.1)
+            aside.rename(out)
+
+    writer = threading.Thread(target=replaced)
+    room = whole.check_room
+
+    def there_is_room(target):
+        # All that is asked before is asked of a folder that is there.
+        writer.start()
+        moved.wait(5.0)
+        room(target)
+        asked.set()
+
+    monkeypatch.setattr(whole, "check_room", there_is_room)
+    rights = []
+    monkeypatch.setattr(whole.os, "access", lambda path, mode: rights.append(Path(path).exists()) or True)
+    check_folder(out)
+    writer.join()
+    assert rights == [True] and said(out) == {"a": "1"}
 
 
 @pytest.mark.parametrize("system", ["in one step", "in two"])

@@ -22,7 +22,7 @@ from jaxphoto.georeferencing.map_frame import check_heights
 from jaxphoto.image_measurement.control_targets import target_looker
 from jaxphoto.image_measurement.features import LONGEST_PX
 from jaxphoto.image_measurement.matching import MatchedPhotographs, match_photographs
-from jaxphoto.image_measurement.photograph_pairs import MostAlike, photograph_pairs, usual_choice
+from jaxphoto.image_measurement.photograph_pairs import MostAlike, photograph_pairs, usual_choice, usual_count
 from jaxphoto.image_measurement.targets.on_ground import SYNTAX, read_target
 from jaxphoto.io.block_folder import whole_block
 from jaxphoto.io.control_files import read_control
@@ -167,7 +167,7 @@ def fly_command(
         options = {
             "pairs": pairs or usual_choice(read),
             "epsg": epsg,
-            "features": features,
+            "features": features or usual_count(len(read)),
             "longest_px": longest_px,
             "c_mm": c_mm,
             "pixel_mm": pixel_mm,

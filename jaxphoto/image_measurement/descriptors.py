@@ -11,7 +11,7 @@ from jaxphoto.image_measurement.features import SiftFeatures
 RATIO = 0.8
 """Lowe's: how much nearer the best match must be than the second best."""
 # Descriptors are sorted into cells of so many, and looked for in so many of them: a seventh of the time that a look at
-# all takes where they are 10,000, and as many true matches.
+# all takes where they are 10,000, and 98 of 100 true matches.
 _OF_A_CELL, _CELLS = 40, 8
 # Of faiss' k-means, from a fixed seed: rounds, and descriptors of each cell that they are made of.
 _ROUNDS, _SAMPLE = 5, 16

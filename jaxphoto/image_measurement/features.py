@@ -31,7 +31,7 @@ _LENGTH = 512
 _SIGMA_PX = 0.07
 _SIGMA_OF_WIDTH = 0.025
 METHOD = (1, _CONTRAST, _SIGMA_PX, _SIGMA_OF_WIDTH)
-"""What features depend on beside photograph and options; the number changes with the way they are found and matched."""
+"""What features depend on beside photograph and options; the number changes with the way they are found."""
 
 
 class Features(NamedTuple):

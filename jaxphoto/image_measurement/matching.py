@@ -24,16 +24,9 @@ from jaxphoto.errors import InputError
 from jaxphoto.image_measurement.descriptors import METHOD as LOOKS
 from jaxphoto.image_measurement.descriptors import FindableFeatures, findable, match_descriptors
 from jaxphoto.image_measurement.epipolar import LEAST_MATCHES, epipolar_lines, over_sigma
-from jaxphoto.image_measurement.features import (
-    FEATURES,
-    LONGEST_PX,
-    METHOD,
-    OF_FEW,
-    SiftFeatures,
-    sift_features,
-)
+from jaxphoto.image_measurement.features import LONGEST_PX, METHOD, SiftFeatures, sift_features
 from jaxphoto.image_measurement.likely_pairs import largest_of, most_alike
-from jaxphoto.image_measurement.photograph_pairs import FEW, MostAlike
+from jaxphoto.image_measurement.photograph_pairs import MostAlike, usual_count
 from jaxphoto.io.kept_pieces import KeptPieces, name_of
 from jaxphoto.io.photographs import Photograph
 from jaxphoto.orientation.matches import PairMatches, connected_images, tracks
@@ -49,7 +42,8 @@ _ALONE = f"it has {LEAST_MATCHES} points in common with no other photograph it w
 # Pairs that are kept in one piece at most, so that a run that is killed loses some seconds; and pieces at least, which
 # are shared among the cores.
 _AT_ONCE, _LEAST_PIECES = 20, 8
-# Photographs whose descriptors are in memory, where they are also on the disk: those of one piece and some more.
+# Photographs whose descriptors and cells are in memory, where descriptors are also on the disk: those of one piece and
+# some more. Sorting them into cells again takes a quarter of the time of a pair.
 _IN_MEMORY = 64
 Progress = Callable[[str, int, int], None]
 """What is done, how many of it are, and of how many."""
@@ -196,13 +190,13 @@ def _matched(
     sensor: Sensor,
     interior: InteriorOrientation,
     pairs: Iterable[tuple[int, int]] | MostAlike,
-    given: int | None,
+    most: int | None,
     longest_px: int,
     pieces: _Pieces,
     progress: Progress,
 ) -> MatchedPhotographs:
     names: list[str] = []
-    count = given or (OF_FEW if len(paths) <= FEW else FEATURES)
+    count = most or usual_count(len(paths))
 
     def described(k: int) -> SiftFeatures:
         kept = pieces.read(names[k])
@@ -246,7 +240,7 @@ def _matched(
     results, done = [], 0
     size = min(_AT_ONCE, max(1, len(compared) // _LEAST_PIECES))
     some = [compared[k : k + size] for k in range(0, len(compared), size)]
-    # Each worker by itself: pairs are many, and their order and that of all sums stays the same.
+    # Each worker by itself: pairs are many, and on one machine all sums have one order, whatever runs beside.
     with ThreadPoolExecutor(os.cpu_count(), initializer=faiss.omp_set_num_threads, initargs=(1,)) as workers:
         for pairs_done, result in zip(some, workers.map(compare, some), strict=True):
             results.append(result)

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 from jaxphoto.errors import InputError
+from jaxphoto.image_measurement.features import FEATURES, OF_FEW
 from jaxphoto.io.photographs import Photograph
 
 _EARTH_M = 6_371_000.0
@@ -16,7 +17,7 @@ _EARTH_M = 6_371_000.0
 # in all directions.
 _NEAREST = 20
 FEW = 2 * _NEAREST
-"""Photographs of which each may be compared with each, and many features of each be found."""
+"""Photographs of which each is compared with each, and many features of each are found."""
 
 
 class MostAlike(NamedTuple):
@@ -30,6 +31,11 @@ def usual_choice(photographs: Sequence[Photograph]) -> str:
     if len(photographs) <= FEW:
         return "exhaustive"
     return f"{'position' if all(p.gps for p in photographs) else 'similar'}:{_NEAREST}"
+
+
+def usual_count(photographs: int) -> int:
+    """Features of each of so many photographs, at most, where nobody says how many."""
+    return OF_FEW if photographs <= FEW else FEATURES
 
 
 def photograph_pairs(

@@ -65,8 +65,8 @@ class Tables:
 
     `rotations` says which rotations the correlations mean (see `jaxphoto.covariance`). Sigmas are a posteriori (times
     sigma0) unless a column says otherwise; units stand in the column names or in a column `unit`. `truth` is that of a
-    simulation (`jaxphoto.io.truth_tables`, `read_truth`), for `recovery`. `known` is its covariance with `rows`, where
-    that was computed already.
+    simulation (`jaxphoto.io.truth_tables`, `read_truth`), for `recovery`. `known` is the covariance of
+    this adjustment with omega, phi, kappa, where that was computed already, best with its `rows`.
     """
 
     def __init__(
@@ -79,6 +79,8 @@ class Tables:
         self.adjusted = adjusted
         self.rotations: Rotations = rotations
         self.truth = truth
+        if known is not None and known.rotations != "omega_phi_kappa":
+            raise ValueError(f"known is the covariance with omega, phi, kappa, not with {known.rotations!r}")
         self._known = known
 
     def __repr__(self) -> str:

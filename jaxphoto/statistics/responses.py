@@ -145,7 +145,9 @@ def prepare_responses(equations: NormalEquations, seconds: dict[str, float]) -> 
 
 
 def _batch(numbers: int) -> int:
-    return int(np.clip(_NUMBERS // max(numbers, 1), 1, _AT_ONCE))
+    """A power of two, which can be halved where rows have many numbers."""
+    most = int(np.clip(_NUMBERS // max(numbers, 1), 1, _AT_ONCE))
+    return 1 << most.bit_length() - 1
 
 
 @eqx.filter_jit

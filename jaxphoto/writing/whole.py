@@ -67,15 +67,17 @@ def check_folder(directory: Path, *inputs: Path, clashes: Clashes = _nothing_cla
         if target in (real := _real(given), *real.parents):
             raise InputError(f"{directory} is or holds the input {given}, which would be lost: name another folder")
     _check_parents(target, "name a folder")
+    if os.path.ismount(target):
+        raise InputError(f"{directory} is a disk of its own, which cannot be replaced: name a folder in it")
+    if os.path.isfile(target):
+        raise InputError(f"{target} is a file: name a folder")
     check_room(target)
-    # One after the other: a folder that another run puts in its place just now is neither a file nor without rights.
+    # One after the other: a folder that another run puts in its place just now is neither gone nor without rights.
     with locked(target.parent, wait=True), _said_of(target):
         if not os.path.lexists(target):
             return
         if not target.is_dir():
-            raise InputError(f"{target} is a file: name a folder")
-        if os.path.ismount(target):
-            raise InputError(f"{directory} is a disk of its own, which cannot be replaced: name a folder in it")
+            raise InputError(f"{target} is no folder: name one")
         if not os.access(target, os.W_OK):
             raise InputError(f"{directory} must not be written to: name another folder, or change its rights")
         own_files(target, clashes)

@@ -7,7 +7,7 @@ import jaxphoto.image_measurement.matching as matching
 from jaxphoto.image_measurement.features import sift_features
 from jaxphoto.image_measurement.likely_pairs import largest_of, most_alike
 from jaxphoto.image_measurement.matching import match_photographs
-from jaxphoto.image_measurement.photograph_pairs import MostAlike, photograph_pairs, usual_choice
+from jaxphoto.image_measurement.photograph_pairs import MostAlike, photograph_pairs, usual_choice, usual_count
 from jaxphoto.io.kept_pieces import KeptPieces
 from jaxphoto.io.photographs import photographs, sensor_and_interior
 from tests.image_measurement.ground import C_MM, SENSOR, photograph, texture
@@ -95,5 +95,6 @@ def test_those_that_look_alike_are_those_of_one_place(taken):
 def test_the_usual_pairs_of_few_and_of_many(taken):
     read, _ = taken
     assert usual_choice(read) == "exhaustive"
+    assert (usual_count(40), usual_count(41)) == (10_000, 5_000)
     many = [read[0]] * 41
     assert usual_choice(many) == "similar:20" and photograph_pairs(many, "similar:20") == MostAlike(20)

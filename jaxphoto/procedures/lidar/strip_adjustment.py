@@ -154,7 +154,7 @@ def adjust_strips(
         planes, points = search.rows(seen, errors), () if ties is None else ties.rows(on, errors)
         posed = dataclasses.replace(block, more=(*block.more, planes, *points, *steps))
         adjusted = adjust(posed, posed.start.unknowns)
-        # With rows: that of the last round serves the tables of the result, too.
+        # With rows, as nobody knows which round is the last: its covariance serves the tables of the result, too.
         known = covariance(adjusted, rows=True)
         now = np.asarray(adjusted.values.shared)[adjusted.structure.free]
         counted = len(planes), sum(map(len, points))
