@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from jaxphoto.image_measurement.features import FEATURES
 from jaxphoto.image_measurement.matching import match_photographs
 from jaxphoto.image_measurement.photograph_pairs import photograph_pairs
 from jaxphoto.io.photographs import photographs, sensor_and_interior
@@ -21,28 +22,28 @@ def folder(data_dir):
     return images
 
 
-@pytest.fixture(scope="module")
-def oriented(folder):
+def oriented(folder, count=None):
     taken = photographs(sorted(folder.glob("*.jpg")))
     camera = sensor_and_interior(taken)
-    matched = match_photographs(taken, camera.sensor, camera.interior, photograph_pairs(taken))
+    matched = match_photographs(taken, camera.sensor, camera.interior, photograph_pairs(taken), count=count)
     names = [p.name for p in taken]
     return orient(names, camera.sensor, camera.interior, matched.xy_mm, matched.pairs, matched.sigma_mm)
 
 
-def test_the_street_is_oriented(oriented):
-    report = oriented.report
+def test_the_street_is_oriented(folder):
+    found = oriented(folder)
+    report = found.report
     assert report.n_images == 29
     assert len(report.order) >= 25
     assert report.mean_px <= 1
     assert report.settled and report.converged
     # EXIF says 1,035 pixels; a walk straight ahead tells little of it.
-    c_px = float(oriented.block.start.unknowns.interior["camera"].c) / oriented.block.sensors["camera"].pixel_mm
+    c_px = float(found.block.start.unknowns.interior["camera"].c) / found.block.sensors["camera"].pixel_mm
     assert 600 < c_px < 1300
 
 
 def colmap_model(folder, tmp_path):
-    """COLMAP's poses, and its c in pixels: of three attempts that which places most images best."""
+    """COLMAP's poses: of three attempts, whose chances differ, the one that places most images best."""
     pycolmap = pytest.importorskip("pycolmap", reason="pycolmap, the independent check, is not installed")
     pycolmap.logging.minloglevel = 2
     database = tmp_path / "colmap.db"
@@ -59,15 +60,17 @@ def colmap_model(folder, tmp_path):
         (output := tmp_path / str(seed)).mkdir()
         found += pycolmap.incremental_mapping(database, folder, output, options).values()
     best = max(found, key=lambda m: (m.num_reg_images(), -m.compute_mean_reprojection_error()))
-    (camera,) = best.cameras.values()
-    return {i.name.removesuffix(".jpg"): i for i in best.images.values() if i.has_pose}, camera.focal_length
+    return {i.name.removesuffix(".jpg"): i for i in best.images.values() if i.has_pose}
 
 
-def test_poses_are_those_of_colmap(oriented, folder, tmp_path):
-    """To a hundredth of the path's length, after a similarity: each of the images that both have oriented."""
-    (theirs, their_c_px), ours = colmap_model(folder, tmp_path), oriented.block.start.unknowns.exterior
-    c_px = float(oriented.block.start.unknowns.interior["camera"].c) / oriented.block.sensors["camera"].pixel_mm
-    place = {name: k for k, name in enumerate(oriented.block.images)}
+def test_poses_are_those_of_colmap(folder, tmp_path):
+    """To a hundredth of the path's length, after a similarity: each of the images that both have oriented.
+
+    With 5,000 features a photograph; with more c is nearer to that of the lens, and farther from COLMAP's.
+    """
+    theirs, found = colmap_model(folder, tmp_path), oriented(folder, FEATURES)
+    ours = found.block.start.unknowns.exterior
+    place = {name: k for k, name in enumerate(found.block.images)}
     both = sorted(set(place) & set(theirs))
     assert len(both) >= 20
     own = [place[name] for name in both]
@@ -86,7 +89,5 @@ def test_poses_are_those_of_colmap(oriented, folder, tmp_path):
         f"turned by {np.degrees(alike.magnitude()):.2f} degrees together, {angle.max():.2f} at most besides"
     )
     assert off.max() < 0.01 * path
-    # Such a walk tells little of c: what another one is off by, an image with its points 200 pixels to one side makes
-    # up for by so much.
-    makes_up = abs(np.degrees(np.arctan(200 / their_c_px) - np.arctan(200 / c_px)))
-    assert np.median(angle) < 0.5 * makes_up + 0.2 and angle.max() < 2 * makes_up + 0.2
+    # Their c is a tenth shorter: an image with its points 200 pixels to one side makes up for that by 1.4 degrees.
+    assert np.median(angle) < 0.7 and angle.max() < 3

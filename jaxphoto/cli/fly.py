@@ -128,7 +128,7 @@ def fly_command(
             given, code = flight_control(surveyed, control_epsg, names, at, look, code)
         camera = sensor_and_interior(read, pixel_mm, c_mm)
         distortion = distortion_model(model, camera.sensor)
-        compared = photograph_pairs(read, pairs or usual_choice(read))
+        compared, count = photograph_pairs(read, pairs or usual_choice(read)), features or usual_count(len(read))
         console.print(camera.origin, soft_wrap=True)
         console.print(f"{len(read)} photographs, {_in_words(compared)}", soft_wrap=True)
         keep = opened.enter_context(KeptPieces(beside(out)).alone())
@@ -137,7 +137,7 @@ def fly_command(
             camera.sensor,
             camera.interior,
             compared,
-            count=features,
+            count=count,
             longest_px=longest_px,
             in_parts=True,
             keep=keep,
@@ -167,7 +167,7 @@ def fly_command(
         options = {
             "pairs": pairs or usual_choice(read),
             "epsg": epsg,
-            "features": features or usual_count(len(read)),
+            "features": count,
             "longest_px": longest_px,
             "c_mm": c_mm,
             "pixel_mm": pixel_mm,

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.adjustment.right_hand_sides import solve_many
 from jaxphoto.arrays import still
+from jaxphoto.statistics.responses import products_of
 
 
 class LinearForms(NamedTuple):
@@ -44,6 +45,4 @@ def linear_forms(
     for v, own in zip(b, scale, strict=True):
         v *= own
     x, factor = solve_many(equations, b, adjusted.seconds), float(adjusted.sigma0) ** 2
-    # Kind by kind: of a large block each copy of all of them takes 100 MB.
-    flat = [(v.reshape(n_forms, v[0].size), w.reshape(n_forms, w[0].size)) for v, w in zip(b, x, strict=True)]
-    return LinearForms(factor * sum(v @ w.T for v, w in flat), factor * np.asarray(x.shared) * scale.shared)
+    return LinearForms(factor * products_of(b, x), factor * np.asarray(x.shared) * scale.shared)

@@ -88,8 +88,7 @@ class Responses(eqx.Module):
         """z' H z of all errors z = `column(k)` with one another, and the shared unknowns' motions, as `to_errors`."""
         pulled = self._pulled(column, range(many))
         x = self.solved(pulled)
-        flat = (np.hstack([v.reshape(many, math.prod(v.shape[1:])) for v in tree]) for tree in (pulled, x))
-        return np.matmul(next(flat), next(flat).T), self._moved(x)
+        return products_of(pulled, x), self._moved(x)
 
     @property
     def _scale(self) -> Float[np.ndarray, "shared"]:
@@ -131,6 +130,18 @@ class Responses(eqx.Module):
         return run_compiled(program, (self.equations, given), self.adjusted.seconds, "covariance")
 
 
+def products_of(a: Increments, b: Increments) -> Float[np.ndarray, "m n"]:
+    """a'b of each of `a` with each of `b`, along leading axes.
+
+    Kind by kind: of a large block each copy of all of them takes 100 MB.
+    """
+    found = np.zeros((len(a.shared), len(b.shared)))
+    for pair in zip(a, b, strict=True):
+        v, w = (np.reshape(one, (len(one), math.prod(one.shape[1:]))) for one in map(np.asarray, pair))
+        found += v @ w.T
+    return found
+
+
 def prepare_responses(equations: NormalEquations, seconds: dict[str, float]) -> None:
     """Have what `Responses` needs compiled in the background."""
     if jax.process_count() > 1:
@@ -158,11 +169,8 @@ def _pull(equations: NormalEquations, z: Float[Array, "k places"]) -> Increments
 
 @eqx.filter_jit
 def _pull_others(equations: NormalEquations, z: Float[Array, "k places"]) -> Increments:
-    def residuals() -> NonImageResiduals:
-        own = equations.at.residuals()
-        return NonImageResiduals(own.others, own.datum, own.names)
-
-    zero = jax.tree.map(lambda v: jnp.zeros(v.shape), jax.eval_shape(residuals))
+    one = jax.eval_shape(equations.push_others, blank(equations.scale, 1))
+    zero = jax.tree.map(lambda v: jnp.zeros(v.shape[1:]), one)
     return equations.pull_others(jax.vmap(ravel_pytree(zero)[1])(z))
 
 
