@@ -1,9 +1,9 @@
 """`jaxphoto lidar-control` and `jaxphoto simultaneous`: from a block and a cloud, control heights, or both mended."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 import typer
@@ -16,6 +16,18 @@ from jaxphoto.cli.choices import one_of
 from jaxphoto.cli.cloud_options import Classes, CloudEpsg, CloudUnit, ReturnsOption, class_numbers, corrected_name
 from jaxphoto.cli.console import plain_console
 from jaxphoto.cli.made import made_by
+from jaxphoto.cli.strip_flight import (
+    SCANNER,
+    USUAL,
+    CellM,
+    KnotsS,
+    PatternOption,
+    RoughnessM,
+    StripChoices,
+    StripFiles,
+    adjust_flight,
+    scanner_priors,
+)
 from jaxphoto.cloud import Cloud
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import Scanner
@@ -26,6 +38,7 @@ from jaxphoto.io.trajectory import read_records, write_moved
 from jaxphoto.io.trajectory.in_frame import trajectory_in, with_positions
 from jaxphoto.lidar import HeightSettings
 from jaxphoto.lidar.correction import correct_cloud, scanner_path
+from jaxphoto.lidar.strip_settings import StripSettings
 from jaxphoto.orientation import approximate
 from jaxphoto.procedures.lidar import Round, lidar_control, roof_control, simultaneous
 from jaxphoto.procedures.lidar.images_and_cloud import SHIFT_SIGMA, SURFACES
@@ -46,6 +59,10 @@ from jaxphoto.writing import check_folder
 
 # Beyond the outermost points, in m and as a part of the block: as far as approximate points may be off.
 _MARGIN_M, _MARGIN = 100.0, 0.1
+
+# Options of `simultaneous` that say nothing with --adjust, and those that say nothing without it.
+_OF_SURFACES = "boresight", "shift", "method", "sigma_z_m", "sigma_xy_m", "sigma_systematic_m"
+_OF_PLANES = "exposure_shift_s", "pattern", "cell_m", "roughness_m", "knots_s"
 
 BlockFolder = Annotated[Path, typer.Argument(help="Block folder (see docs/block_folder.md).")]
 CloudFile = Annotated[Path, typer.Argument(help="Cloud: .las, .laz, .csv or .ply (see docs/clouds.md).")]
@@ -166,13 +183,43 @@ def simultaneous_command(
     cloud_epsg: CloudEpsg = None,
     cloud_unit: CloudUnit = None,
     max_rounds: Rounds = MAX_ROUNDS,
+    adjust: Annotated[
+        str | None,
+        typer.Option(help="What is estimated of the whole flying system: scanner,trajectory,camera (docs/joint.md)."),
+    ] = None,
+    exposure_shift_s: Annotated[
+        float, typer.Option(help="With --adjust: time_s of images.csv + this is the cloud's time.")
+    ] = 0.0,
+    pattern: PatternOption = None,
+    cell_m: CellM = USUAL.cell_m,
+    roughness_m: RoughnessM = USUAL.roughness_m,
+    knots_s: KnotsS = USUAL.knots_s,
 ) -> None:
     """Adjust a block and a cloud together; write the results, the corrected cloud and trajectory.
+
+    With --adjust strips fit to each other, too, by planes in their overlaps, and trajectories drift. In place of
+    scanner what of it is estimated may be named, as in strips. What is not named is right.
 
     --class and --returns choose the points of the surface; the whole cloud is corrected. Exit code 1: written, but it
     still changed.
     """
-    settings = _settings(sigma_z_m, sigma_xy_m, sigma_systematic_m)
+    _check_alone(context, _OF_PLANES if adjust is None else _OF_SURFACES)
+    if adjust is not None:
+        settings = StripSettings(cell_m=cell_m, roughness_m=roughness_m, knots_s=knots_s)
+        files = StripFiles(
+            cloud,
+            trajectory,
+            trajectory_shift_s,
+            block,
+            exposure_shift_s,
+            class_numbers(classes),
+            returns,
+            cloud_epsg,
+            cloud_unit,
+        )
+        adjust_flight(context, files, _of_flight(adjust, pattern, settings, max_rounds), out)
+        return
+    surfaces = _settings(sigma_z_m, sigma_xy_m, sigma_systematic_m)
     if trajectory is None and boresight not in (None, "fixed"):
         raise InputError(f"--boresight {boresight} needs --trajectory, which says from where each point was measured")
     turn = _prior("--boresight", boresight or ("fixed" if trajectory is None else "free"), np.pi / 180)
@@ -199,7 +246,7 @@ def simultaneous_command(
             path,
             priors,
             method=method,  # type: ignore[arg-type]
-            settings=settings,
+            settings=surfaces,
             max_rounds=max_rounds,
             report=_reporter(errors, status.update),
         )
@@ -222,6 +269,32 @@ def simultaneous_command(
     console.print(f"results in {out}")
     if not result.still:
         raise typer.Exit(1)
+
+
+def _check_alone(context: typer.Context, names: Collection[str]) -> None:
+    """Raise InputError for options that say nothing with --adjust, or nothing without it."""
+    for name in names:
+        source = context.get_parameter_source(name)
+        if source is not None and source.name == "COMMANDLINE":
+            of = (
+                "planes in the overlaps of strips, which --adjust seeks: give both, or neither"
+                if names is _OF_PLANES
+                else "surfaces under tie points, and --adjust seeks planes in overlaps of strips: leave one of them out"
+            )
+            raise InputError(f"--{name.replace('_', '-')} is of {of}")
+
+
+def _of_flight(adjust: str, pattern: str | None, settings: StripSettings, max_rounds: int) -> StripChoices:
+    """What `adjust` names of the flying system. Raises InputError for what that does not have."""
+    named = {name.strip() for name in adjust.split(",")}
+    for name in sorted(named - {"scanner", "trajectory", "camera", *SCANNER}):
+        raise InputError(
+            f"--adjust {name}: a flying system has scanner, trajectory and camera, and a scanner {', '.join(SCANNER)}; "
+            "name some of these"
+        )
+    free = named | ({"boresight"} if "scanner" in named else set())
+    held: list[str] | Literal["all"] = [] if "trajectory" in named else "all"
+    return StripChoices(settings, scanner_priors(free, pattern), held, "camera" not in named, max_rounds)
 
 
 def _settings(sigma_z_m: float, sigma_xy_m: float, sigma_systematic_m: float) -> HeightSettings:

@@ -14,10 +14,11 @@ from jaxphoto.georeferencing import TrajectoryKnot
 from jaxphoto.lidar.correction import scanner_path
 from jaxphoto.lidar.strip_correction import correct_flight, correct_strips
 from jaxphoto.lidar.strip_settings import StripSettings
-from jaxphoto.procedures.lidar import adjust_strips
+from jaxphoto.procedures.lidar import ScannerPriors, adjust_strips
 from jaxphoto.procedures.lidar.looks import check_pattern
 from jaxphoto.report.strips import calibration_table, trajectory_errors_table
 from jaxphoto.simulation import Simulation
+from jaxphoto.unknowns import FIXED
 from tests.lidar.clouds import SURFACES, ground
 from tests.procedures.strips import AROUND, NOISE_M, PRIORS_AROUND, SETTINGS, fitted, flown
 from tests.simulation.small import made
@@ -172,6 +173,8 @@ def test_what_cannot_be_adjusted():
         adjust_strips(cloud, held=("north",))
     with pytest.raises(InputError, match="all strips are held"):
         adjust_strips(cloud, held=("1", "2"))
+    with pytest.raises(InputError, match="all strips are held"):
+        adjust_strips(flight.cloud, flight.trajectory, priors=ScannerPriors(FIXED), held="all")
     with pytest.raises(InputError, match="the cloud has no times"):
         adjust_strips(cloud, flight.trajectory)
     with pytest.raises(InputError, match="strip 3 of the cloud has no points"):

@@ -169,7 +169,7 @@ def test_photographs_are_adjusted_with_the_strips(tmp_path, monkeypatch, capsys)
     folder, out = tmp_path / "flight", tmp_path / "out"
     write_simulation(flown(), folder)
     half = functools.partial(kept_returns, most=len(flown().cloud) // 2)
-    monkeypatch.setattr("jaxphoto.cli.strips.kept_returns", half)
+    monkeypatch.setattr("jaxphoto.cli.strip_flight.kept_returns", half)
     drifts = ("--knots-s", "5", "--correlation-s", "60", "--sigma-position-m", "0.05", "--sigma-attitude-deg", "0.003")
     given = ("--trajectory", folder / "trajectory.csv", "--block", folder, "--adjust", "boresight,angle-scale")
     fine = (*drifts, "--sigma-heading-deg", "0.006", "--cell-m", "8")
@@ -190,6 +190,42 @@ def test_photographs_are_adjusted_with_the_strips(tmp_path, monkeypatch, capsys)
     before, after = (pd.read_csv(f / "trajectory.csv")[["X_m", "Y_m", "Z_m"]].to_numpy() for f in (folder, out))
     off = [np.sqrt(np.mean((v - np.asarray(true.position)) ** 2)) for v in (before, after)]
     assert off[1] < 0.8 * off[0]
+
+
+@pytest.mark.slow
+def test_simultaneous_adjusts_what_it_is_told_to(tmp_path, monkeypatch, capsys):
+    """Scanner, trajectory and camera are what `strips` adjusts; what is not named stays as it was."""
+    folder = tmp_path / "flight"
+    write_simulation(flown(), folder)
+    given = ("--trajectory", folder / "trajectory.csv", "--cell-m", "8", "--knots-s", "5", "--max-rounds", "1")
+    tables = {}
+    for name, command in {
+        "strips": ("strips", folder / "cloud.laz", "--block", folder),
+        "all": ("simultaneous", folder, folder / "cloud.laz", "--adjust", "scanner,trajectory,camera"),
+        "scanner": ("simultaneous", folder, folder / "cloud.laz", "--adjust", "boresight"),
+    }.items():
+        run(monkeypatch, capsys, *command, "--out", tmp_path / name, *given)
+        tables[name] = pd.read_csv(tmp_path / name / "scanner.csv")
+    pd.testing.assert_frame_equal(tables["all"], tables["strips"])
+    whole, alone = (set(tables[name].parameter) for name in ("all", "scanner"))
+    assert whole - alone == {f"interior[kodak].{p}" for p in ("c_mm", "xp_mm", "yp_mm", "k1", "k2")}
+    np.testing.assert_array_equal(pd.read_csv(tmp_path / "scanner" / "trajectory_errors.csv").filter(like="_m"), 0.0)
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (("--adjust", "lens"), "--adjust lens: a flying system has scanner, trajectory and camera"),
+        (("--adjust", "scanner", "--shift", "free"), "--shift is of surfaces under tie points"),
+        (("--cell-m", "8"), "--cell-m is of planes in the overlaps of strips"),
+    ],
+)
+def test_options_of_the_other_way_are_refused(cloud_file, tmp_path, monkeypatch, capsys, options, sentence):
+    out = tmp_path / "out"
+    code, _, errors = run(monkeypatch, capsys, "simultaneous", tmp_path, cloud_file, "--out", out, *options)
+    assert code == 2
+    assert sentence in " ".join(errors.split())
+    assert not out.exists()
 
 
 def test_photographs_without_times_are_refused(tmp_path, monkeypatch, capsys):

@@ -7,7 +7,7 @@ in it again, until nothing changes.
 
 import dataclasses
 from collections.abc import Callable, Collection, Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -98,7 +98,7 @@ def adjust_strips(
     priors: ScannerPriors | None = None,
     *,
     photographs: Photographs | None = None,
-    held: Collection[str] = (),
+    held: Collection[str] | Literal["all"] = (),
     max_rounds: int = MAX_STRIP_ROUNDS,
     report: Callable[[StripRound], None] = lambda made: None,
 ) -> StripAdjustment:
@@ -110,8 +110,8 @@ def adjust_strips(
 
     `priors` are those of the scanner and say its pattern; by default lines, its boresight FREE and all else FIXED. Of
     one that looks all around, what a strip saw ahead and behind is compared, too. The trajectory of strips
-    named in `held` is right. Without a trajectory each strip has a shift alone, and the first is held where none is
-    named.
+    named in `held` is right, or that of all. Without a trajectory each strip has a shift alone, and the first is held
+    where none is named.
 
     Raises InputError for a cloud of one strip, of strips without points or without the times that a trajectory needs,
     BlockError for strips that no plane joins and for a trajectory that does not cover the cloud or the exposures, and
@@ -124,7 +124,8 @@ def adjust_strips(
             "trajectory (--trajectory), or say nothing of the scanner"
         )
     priors = ScannerPriors() if priors is None else priors
-    names = _check(cloud, trajectory, held)
+    held = cloud.strips if held == "all" else held
+    names = _check(cloud, trajectory, held, photographs is None and priors.right)
     path = None if trajectory is None else scanner_path(trajectory)
     if path is not None:
         _check_above(cloud, path)
@@ -181,7 +182,7 @@ def adjust_strips(
         del adjusted, known
 
 
-def _check(cloud: Cloud, trajectory: Trajectory | None, held: Collection[str]) -> tuple[str, ...]:
+def _check(cloud: Cloud, trajectory: Trajectory | None, held: Collection[str], strips_alone: bool) -> tuple[str, ...]:
     names = cloud.strips
     if cloud.strip is None or len(names) < 2:
         raise InputError(
@@ -196,7 +197,7 @@ def _check(cloud: Cloud, trajectory: Trajectory | None, held: Collection[str]) -
     for name in held:
         if name not in names:
             raise InputError(f"{name} is no strip of the cloud, which has {', '.join(names)}: correct its name")
-    if set(names) <= set(held):
+    if set(names) <= set(held) and (strips_alone or trajectory is None):
         raise InputError("all strips are held, so that nothing is left to adjust: hold fewer")
     if trajectory is not None and cloud.time is None:
         raise InputError(

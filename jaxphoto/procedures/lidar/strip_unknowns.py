@@ -9,7 +9,7 @@ import numpy as np
 from jaxphoto.block import Block, empty_block
 from jaxphoto.georeferencing import Scanner, ScannerCalibration, StripErrors, StripSpline, TrajectoryKnot
 from jaxphoto.lidar.strip_settings import StripSettings
-from jaxphoto.parameters import AbstractParameters
+from jaxphoto.parameters import AbstractParameters, dynamic_fields
 from jaxphoto.procedures.lidar.until_still import at_result
 from jaxphoto.unknowns import FIXED, FREE, Unknowns, Weighted
 
@@ -23,6 +23,12 @@ class ScannerPriors(NamedTuple):
 
     boresight: Any = FREE
     calibration: ScannerCalibration = ScannerCalibration(*[FIXED] * 5)  # type: ignore[arg-type]
+
+    @property
+    def right(self) -> bool:
+        """Whether nothing of the scanner is estimated."""
+        calibration = (getattr(self.calibration, name) for name in dynamic_fields(ScannerCalibration))
+        return all(prior is FIXED for prior in (self.boresight, *calibration))
 
 
 def strip_block(

@@ -97,8 +97,7 @@ def with_interior_held(block: Block) -> Adjustment:
     as it begins, from direct georeferencing: what the cloud adds may close the datum. Raises as `adjust`, and
     BlockError where it does not converge.
     """
-    interior = jax.tree.map(lambda _: FIXED, block.start.unknowns.interior)
-    held = dataclasses.replace(block.priors, interior=interior)
+    held = interior_held(block).priors
     try:
         found = adjust(block, priors=held)
         placed = bool(found.converged)
@@ -110,6 +109,12 @@ def with_interior_held(block: Block) -> Adjustment:
     if not bool(found.converged):
         raise BlockError(f"the block by itself, its interior orientation held, is {found.outcome.value}")
     return found
+
+
+def interior_held(block: Block) -> Block:
+    """`block` whose interior orientation is right."""
+    interior = jax.tree.map(lambda _: FIXED, block.start.unknowns.interior)
+    return dataclasses.replace(block, priors=dataclasses.replace(block.priors, interior=interior))
 
 
 def check_without_surfaces(block: Block) -> None:

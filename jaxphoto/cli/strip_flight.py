@@ -1,0 +1,230 @@
+"""What `strips` and `simultaneous` have in common: the strips of a flight are read, adjusted and written.
+
+The cloud passes part by part, and what its planes need of it is kept in memory.
+"""
+
+from collections.abc import Collection
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple
+
+import numpy as np
+import typer
+from jaxtyping import Float
+
+from jaxphoto.block import Block, Frame
+from jaxphoto.cli.choices import one_of
+from jaxphoto.cli.cloud_options import corrected_name
+from jaxphoto.cli.cloud_progress import CloudProgress
+from jaxphoto.cli.console import plain_console
+from jaxphoto.cli.made import made_by
+from jaxphoto.cli.progress import StepsLeft
+from jaxphoto.cloud import Cloud
+from jaxphoto.errors import InputError
+from jaxphoto.georeferencing import PATTERNS, ScannerCalibration
+from jaxphoto.io import clouds, read_block
+from jaxphoto.io.block_folder import exposure_times
+from jaxphoto.io.clouds.coordinate_system import CoordinateSystem
+from jaxphoto.io.clouds.placement import Placement
+from jaxphoto.io.raster import write_dsm
+from jaxphoto.io.trajectory import Records, read_records, write_moved
+from jaxphoto.io.trajectory.in_frame import trajectory_in, with_poses
+from jaxphoto.lidar.cell_returns import CellTally
+from jaxphoto.lidar.correction import scanner_path
+from jaxphoto.lidar.raster import Raster
+from jaxphoto.lidar.strip_correction import correct_strips
+from jaxphoto.lidar.strip_differences import strip_differences
+from jaxphoto.lidar.strip_settings import StripSettings
+from jaxphoto.orientation import approximate
+from jaxphoto.parameters import dynamic_fields
+from jaxphoto.procedures.lidar import (
+    Photographs,
+    ScannerPriors,
+    StripAdjustment,
+    StripRound,
+    adjust_strips,
+    kept_returns,
+)
+from jaxphoto.procedures.lidar.looks import looks_of
+from jaxphoto.procedures.lidar.until_still import interior_held
+from jaxphoto.procedures.lidar.vertical_control import tie_points
+from jaxphoto.report.findings import Level
+from jaxphoto.report.strips import print_strips, strips_verdict
+from jaxphoto.report.strips_folder import write_strips
+from jaxphoto.report.tables import Tables
+from jaxphoto.report.terminal import print_verdict
+from jaxphoto.unknowns import FIXED, FREE
+from jaxphoto.writing import check_folder
+
+SCANNER = ("boresight", *(name.replace("_", "-") for name in dynamic_fields(ScannerCalibration)))
+"""What of a scanner may be estimated."""
+USUAL = StripSettings()
+PatternOption = Annotated[
+    str | None,
+    one_of(PATTERNS, help="Of the scanner: line by line across the track (default), or circle, all around."),
+]
+CellM = Annotated[float, typer.Option(help="Side of the cells in which planes are sought.")]
+RoughnessM = Annotated[float, typer.Option(help="Most that the returns of a plane scatter about it.")]
+KnotsS = Annotated[float, typer.Option(help="From knot to knot of the trajectory's errors.")]
+
+
+class StripFiles(NamedTuple):
+    """The files of a flight, and what is said of them."""
+
+    cloud: Path
+    trajectory: Path | None
+    trajectory_shift_s: float
+    block: Path | None
+    """Of its photographs."""
+    exposure_shift_s: float
+    classes: list[int] | None
+    """Of the returns that planes are sought in; all are corrected."""
+    returns: str
+    epsg: int | None
+    unit: str | None
+
+
+class StripChoices(NamedTuple):
+    """What of a flight is adjusted, and how."""
+
+    settings: StripSettings
+    priors: ScannerPriors | None
+    held: list[str] | Literal["all"]
+    """Strips whose trajectory is right."""
+    camera_held: bool
+    """Whether the interior orientation of the photographs is right."""
+    max_rounds: int
+
+
+def scanner_priors(free: Collection[str], pattern: str | None) -> ScannerPriors:
+    """FREE what is named of `SCANNER`, the rest FIXED; of a scanner that draws lines where no pattern is named."""
+    boresight, *calibration = (FREE if name in free else FIXED for name in SCANNER)
+    return ScannerPriors(boresight, ScannerCalibration(*calibration, pattern or "line"))  # type: ignore[arg-type, call-arg]
+
+
+def adjust_flight(context: typer.Context, flight: StripFiles, choices: StripChoices, out: Path) -> None:
+    """Adjust the strips of a flight and its photographs; write the results, say them, and exit with 1 if red."""
+    cloud, trajectory, block = flight.cloud, flight.trajectory, flight.block
+    settings, priors, errors = choices.settings, choices.priors, plain_console(stderr=True)
+    check_folder(out, cloud, *(path for path in (trajectory, block) if path is not None))
+    with errors.status("reading the cloud") as status:
+        said: dict[str, Any] = {"epsg": flight.epsg, "unit": flight.unit}
+        photographs, frame = None, Frame()
+        if block is not None:
+            read = read_block(block)
+            posed = interior_held(read) if choices.camera_held else read
+            photographs = Photographs(posed, exposure_times(block) + flight.exposure_shift_s)
+            frame = photographs.block.frame
+        records = path = None
+        if trajectory is not None:
+            # On the cloud's clock from here on.
+            records = read_records(trajectory)
+            records = records._replace(time=records.time - flight.trajectory_shift_s)
+            if records.geographic and block is None:
+                frame = _about(records, clouds.cloud_system(cloud, **said), cloud)
+            exact = np.zeros((len(records.time), 3))
+            path = trajectory_in(records, frame, exact, exact)
+        own = frame if block is not None or frame.kind == "epsg" else None
+        track = None if path is None else scanner_path(path)
+        parts = partial(clouds.cloud_chunks, cloud, own, classes=flight.classes, returns=flight.returns, **said)  # type: ignore[arg-type]
+        # Of a file that is filtered nobody knows how much will come.
+        every = flight.classes is None and flight.returns == "all"
+        progress = CloudProgress(StepsLeft(errors, status), status, clouds.most_points(cloud) if every else None)
+        looked_at = kept_returns(
+            progress.passes(parts),
+            settings,
+            track,
+            "line" if priors is None else priors.calibration.pattern,
+            None if photographs is None else partial(_about_where, photographs.block),
+        )
+
+        def report(made: StripRound) -> None:
+            line = f"round {made.number}: {made.planes} planes, strips {made.rms_m:.3f} m apart before"
+            status.update(f"{line}; largest change {made.largest_change:.2g} standard deviations")
+
+        options: dict[str, Any] = {"held": choices.held, "max_rounds": choices.max_rounds, "report": report}
+        result = adjust_strips(looked_at, path, settings, priors, photographs=photographs, **options)
+        status.update(f"writing {out}")
+        gaps = Gaps(Placement(cloud.name, clouds.cloud_system(cloud, **said), own), settings)
+        tables = None if photographs is None else Tables(result.adjusted, known=result.covariance)
+        made, verdict = made_by(context, cloud, trajectory, block), strips_verdict(result, tables)
+
+        def moved(part: Cloud) -> Float[np.ndarray, "n 3"]:
+            progress("writing the corrected cloud", part)
+            _check_known(part, result)
+            corrected = correct_strips(part, result.errors, track).xyz
+            seen = clouds.chosen_of(part, flight.classes, flight.returns, cloud.name)  # type: ignore[arg-type]
+            gaps.add(part.take(seen), corrected[seen])
+            return corrected
+
+        def write_corrected(folder: Path) -> tuple[Raster, Raster] | None:
+            progress.begins()
+            clouds.rewrite_cloud(cloud, folder / corrected_name(cloud), moved, frame=own, **said)
+            if trajectory is not None and records is not None and result.trajectory is not None:
+                back = with_poses(records, result.trajectory, frame)
+                write_moved(back._replace(time=back.time + flight.trajectory_shift_s), trajectory, folder)
+            maps = gaps.maps
+            for raster, name in zip(maps or (), ("before", "after"), strict=False):
+                write_dsm(folder / f"differences_{name}.tif", raster, gaps.system)
+            return maps
+
+        write_strips(result, tables, verdict, out, write_corrected, made)
+    console = plain_console()
+    print_verdict(verdict, console)
+    print_strips(result, console)
+    console.print(f"results in {out} (open report.html)")
+    if verdict.level == Level.ALARM:
+        raise typer.Exit(1)
+
+
+class Gaps:
+    """The gaps of strips before and after, of a cloud that passes in parts.
+
+    Their maps lie in the cloud's own system, or where that counts degrees in the frame of the block.
+    """
+
+    def __init__(self, placement: Placement, settings: StripSettings) -> None:
+        self.settings = settings
+        own = placement.system
+        self._on_map = (lambda xyz: xyz) if own.geographic else placement.metres
+        self.system = CoordinateSystem() if own.geographic else own
+        """The system of the maps."""
+        self._before, self._after = CellTally(settings), CellTally(settings)
+
+    def add(self, part: Cloud, corrected: Float[np.ndarray, "n 3"]) -> None:
+        """Returns as they were measured, and corrected (m)."""
+        for look in looks_of(part, None, "line"):
+            if len(look.returns):
+                self._before.add(look.name, self._on_map(part.xyz[look.returns]))
+                self._after.add(look.name, self._on_map(corrected[look.returns]))
+
+    @property
+    def maps(self) -> tuple[Raster, Raster] | None:
+        """Before and after; None where strips have no planes in common."""
+        of = [strip_differences(tally.strips.values(), self.settings) for tally in (self._before, self._after)]
+        return None if of[0] is None or of[1] is None else (of[0], of[1])
+
+
+def _about(records: Records, system: CoordinateSystem, cloud: Path) -> Frame:
+    """The local frame about a trajectory in longitude and latitude. Raises InputError for a cloud without a system."""
+    # Any system of the same datum will do for the frame: points come into it by their own.
+    datum = None if system.plane is None else system.plane.geodetic_crs
+    code = None if datum is None else datum.to_epsg()
+    if code is None:
+        raise InputError(
+            f"{records.file}: the trajectory gives longitude and latitude, and {cloud.name} does not say in which EPSG "
+            "system its coordinates are; name it (--cloud-epsg)"
+        )
+    longitude, latitude, height = records.coordinates[len(records.time) // 2].tolist()
+    return Frame("epsg", code, origin=(longitude, latitude, height))
+
+
+def _about_where(block: Block) -> Float[np.ndarray, "points 3"]:
+    """Where tie points are, about."""
+    return np.asarray(approximate(block).points)[tie_points(block)]
+
+
+def _check_known(part: Cloud, result: StripAdjustment) -> None:
+    """Raise InputError for a strip that has no returns of those looked at."""
+    for name in part.strips[len(result.cloud.strips) :]:
+        raise InputError(f"strip {name} has no points of these classes and returns: take others, or leave it out")
