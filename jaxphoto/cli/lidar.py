@@ -273,9 +273,10 @@ def simultaneous_command(
 
 def _check_alone(context: typer.Context, names: Collection[str]) -> None:
     """Raise InputError for options that say nothing with --adjust, or nothing without it."""
+    usual = {parameter.name: parameter.default for parameter in context.command.params}
     for name in names:
-        source = context.get_parameter_source(name)
-        if source is not None and source.name == "COMMANDLINE":
+        # By its value: a command is told with its defaults where it says how results were made.
+        if context.params[name] != usual[name]:
             of = (
                 "planes in the overlaps of strips, which --adjust seeks: give both, or neither"
                 if names is _OF_PLANES

@@ -53,17 +53,14 @@ def calibration_table(result: StripAdjustment) -> pd.DataFrame:
         to = np.abs(rho[first + k, first:])
         to[k] = -1.0
         other = int(np.argmax(to))
-        unit = 180 / np.pi if label.endswith("_rad") else 1.0
-        rows.append(
-            (
-                f"{label.removesuffix('_rad')}_deg" if label.endswith("_rad") else label,
-                unit * value[k],
-                unit * sigma[k],
-                s.labels[other],
-                rho[first + k, first + other],
-            )
-        )
+        unit, correlation = 180 / np.pi if label.endswith("_rad") else 1.0, rho[first + k, first + other]
+        names = _in_degrees(label), _in_degrees(s.labels[other])
+        rows.append((names[0], unit * value[k], unit * sigma[k], names[1], correlation))
     return pd.DataFrame(rows, columns=["parameter", "value", "sigma", "with", "rho"])
+
+
+def _in_degrees(label: str) -> str:
+    return f"{label.removesuffix('_rad')}_deg" if label.endswith("_rad") else label
 
 
 def trajectory_errors_table(result: StripAdjustment) -> pd.DataFrame:

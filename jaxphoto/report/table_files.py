@@ -55,8 +55,8 @@ def readable(table: pd.DataFrame) -> pd.DataFrame:
 def _texts(table: pd.DataFrame, name: str) -> list[str]:
     column = table[name]
     if name == "parameter":
-        # Paths, as of mounts[default].boresight_x_deg, stay what they are.
-        return [head_of(v) if "[" not in v and _UNIT.search(v) else v for v in column.astype(str)]
+        # Paths, as of mounts[default].boresight_x_deg and scanner.boresight_up_deg, stay what they are.
+        return [head_of(v) if not re.search(r"[\[.]", v) and _UNIT.search(v) else v for v in column.astype(str)]
     if not pd.api.types.is_float_dtype(column):
         return ["" if pd.isna(v) else _word(v) for v in column.astype(object)]
     if (name.startswith("sigma") and not name.startswith("sigma0")) or name in _SIGMAS:
