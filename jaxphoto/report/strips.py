@@ -103,7 +103,8 @@ def _knot_labels(result: StripAdjustment) -> list[list[str]]:
 def strips_verdict(result: StripAdjustment, tables: Tables | None) -> Verdict:
     """What is to be known of it first; `tables` are those of the adjustment where photographs are in it."""
     found = _of_strips(result) if tables is None else verdict_of(tables).findings
-    return Verdict.of((*_of_rounds(result), *found))
+    odd = (Finding(Level.WARNING, sentence) for sentence in result.odd)
+    return Verdict.of((*_of_rounds(result), *odd, *found))
 
 
 def _of_rounds(result: StripAdjustment) -> Iterator[Finding]:

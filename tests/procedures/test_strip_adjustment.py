@@ -2,8 +2,8 @@
 
 import dataclasses
 import functools
-import warnings
 
+import jax
 import numpy as np
 import pytest
 
@@ -15,8 +15,14 @@ from jaxphoto.lidar.correction import scanner_path
 from jaxphoto.lidar.strip_correction import correct_flight, correct_strips
 from jaxphoto.lidar.strip_settings import StripSettings
 from jaxphoto.procedures.lidar import ScannerPriors, adjust_strips
-from jaxphoto.procedures.lidar.looks import check_pattern
+from jaxphoto.procedures.lidar.scanner_checks import check_measured_from, check_pattern
 from jaxphoto.report.strips import calibration_table, trajectory_errors_table
+from jaxphoto.rotation import (
+    matrix_from_quaternion,
+    matrix_from_roll_pitch_yaw,
+    quaternion_from_matrix,
+    roll_pitch_yaw_from_matrix,
+)
 from jaxphoto.simulation import Simulation
 from jaxphoto.unknowns import FIXED
 from tests.lidar.clouds import SURFACES, ground
@@ -91,14 +97,12 @@ def test_a_scanner_of_prisms_is_found_by_what_it_sees_ahead_and_behind():
 
 def test_another_pattern_than_that_of_the_scanner_is_told():
     flight, other = flown(), flown_around()
-    with pytest.warns(UserWarning, match=r"spread to the side \(0\.\d+ of the height\), but not ahead"):
+    with pytest.raises(BlockError, match="as those of a scanner that draws lines across the track"):
         check_pattern(flight.cloud, scanner_path(flight.trajectory), "circle")
-    with pytest.warns(UserWarning, match=r"spread as far ahead \(0\.\d+ of the height\) as to the side"):
+    with pytest.raises(BlockError, match="as those of a scanner that looks all around its nadir"):
         check_pattern(other.cloud, scanner_path(other.trajectory), "line")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        check_pattern(flight.cloud, scanner_path(flight.trajectory), "line")
-        check_pattern(other.cloud, scanner_path(other.trajectory), "circle")
+    check_pattern(flight.cloud, scanner_path(flight.trajectory), "line")
+    check_pattern(other.cloud, scanner_path(other.trajectory), "circle")
 
 
 def test_the_errors_of_the_trajectory_are_found():
@@ -202,3 +206,50 @@ def test_trajectories_that_do_not_go_with_the_cloud():
 def test_knots_are_called_by_strip_and_time():
     owners = list(fitted().adjusted.unknowns.more[TrajectoryKnot.kind])
     assert owners[1].startswith("1 at 0.0") and owners[-1].startswith("3 at ")
+
+
+@pytest.mark.parametrize(
+    ("coordinates", "sentence"),
+    [
+        (
+            lambda xyz, quaternion: (xyz + np.array([3000.0, 0.0, 0.0]), quaternion),
+            "now here, now there about the scanner",
+        ),
+        (lambda xyz, quaternion: (xyz / 0.3048, quaternion), "now here, now there about the scanner"),
+        (
+            lambda xyz, quaternion: (xyz + np.array([4e5, 5e6, 0.0]), quaternion),
+            r"lie \d+ km from where the trajectory",
+        ),
+        (lambda xyz, quaternion: (xyz, as_radians(quaternion)), "follows its course as radians"),
+    ],
+)
+def test_a_trajectory_that_cannot_be_the_cloud_s_is_refused(coordinates, sentence):
+    flight = flown()
+    assert check_measured_from(flight.cloud, scanner_path(flight.trajectory)) == []
+    xyz, quaternion = coordinates(np.asarray(flight.trajectory.position), np.asarray(flight.trajectory.quaternion))
+    other = dataclasses.replace(flight.trajectory, position=xyz, quaternion=quaternion)
+    with pytest.raises(BlockError, match=sentence):
+        adjust_strips(flight.cloud, other, SETTINGS)
+
+
+def test_a_body_that_flies_backwards_is_told():
+    flight = flown()
+    back = np.asarray(flight.trajectory.quaternion)[:, [3, 2, 1, 0]] * [-1.0, 1.0, -1.0, 1.0]  # times a half turn
+    odd = check_measured_from(flight.cloud, scanner_path(dataclasses.replace(flight.trajectory, quaternion=back)))
+    assert len(odd) == 1 and "degrees off its course" in odd[0]
+    assert 170 < float(odd[0].split(" degrees")[0].split()[-1]) <= 180
+
+
+def test_a_trajectory_that_jumps_is_told():
+    flight = flown()
+    time, xyz = np.asarray(flight.trajectory.time), np.array(flight.trajectory.position)
+    k = len(time) // 2
+    xyz[k:] += [0.0, 2.0, 0.0]
+    odd = check_measured_from(flight.cloud, scanner_path(dataclasses.replace(flight.trajectory, position=xyz)))
+    assert len(odd) == 1 and f"jumps by 2 m at {time[k]:.3f} s" in odd[0]
+
+
+def as_radians(quaternion):
+    """Angles in radians, read as degrees."""
+    angles = np.asarray(jax.vmap(roll_pitch_yaw_from_matrix)(jax.vmap(matrix_from_quaternion)(quaternion)))
+    return np.asarray(jax.vmap(quaternion_from_matrix)(jax.vmap(matrix_from_roll_pitch_yaw)(np.deg2rad(angles))))

@@ -7,6 +7,7 @@ the cloud is computed anew from it.
 """
 
 import dataclasses
+import warnings
 from collections.abc import Callable, Collection
 from typing import Any, NamedTuple, get_args
 
@@ -37,6 +38,7 @@ from jaxphoto.lidar.correction import (
 from jaxphoto.lidar.heights import Method
 from jaxphoto.lidar.tangent_planes import TangentPlanes, tangent_planes
 from jaxphoto.observations import SurfaceRows
+from jaxphoto.procedures.lidar.scanner_checks import check_measured_from
 from jaxphoto.procedures.lidar.until_still import (
     MAX_ROUNDS,
     Round,
@@ -138,6 +140,8 @@ def simultaneous(
     which = tie_points(block, points)
     first = with_interior_held(block)
     path = scanner_path(trajectory) if timed else None  # type: ignore[arg-type]
+    for sentence in [] if path is None else check_measured_from(cloud, path):
+        warnings.warn(sentence, UserWarning, stacklevel=2)
     strips = _strips(cloud, names, path)
     none: Scanner = jax.tree.map(np.asarray, Scanner(jnp.zeros(3), dict.fromkeys(names, jnp.zeros(3))))
     strip = np.repeat(np.arange(len(names)), len(which))

@@ -5,7 +5,6 @@ again, seconds later, behind: by other angles, at another time of the trajectory
 plane is then compared as that of two strips is.
 """
 
-import warnings
 from typing import NamedTuple
 
 import numpy as np
@@ -14,10 +13,6 @@ from jaxtyping import Float, Int
 from jaxphoto.cloud import Cloud
 from jaxphoto.georeferencing import Pattern
 from jaxphoto.lidar.correction import PORTION, ScannerPath, scanner_poses
-
-# So many returns are probed for the pattern; lines spread less ahead than this part of what they do to the side, and
-# what looks all around spreads more. Of a swath narrower than this part of the height nothing is said.
-_PROBED, _ALIKE, _NARROW = 1000, 0.5, 0.02
 
 
 class Look(NamedTuple):
@@ -37,35 +32,13 @@ def looks_of(cloud: Cloud, path: ScannerPath | None, pattern: Pattern) -> list[L
         if pattern == "line" or path is None:
             looks.append(Look(k, name, own))
             continue
-        ahead = _aside(cloud, own, path)[:, 1] > 0
+        ahead = aside(cloud, own, path)[:, 1] > 0
         sides = (f"{name} ahead", own[ahead]), (f"{name} behind", own[~ahead])
         looks += [Look(k, side, returns) for side, returns in sides if len(returns)]
     return looks
 
 
-def check_pattern(cloud: Cloud, path: ScannerPath, pattern: Pattern) -> None:
-    """A UserWarning where the returns lie about the scanner as those of another pattern do."""
-    some = np.linspace(0, len(cloud) - 1, _PROBED).astype(int)
-    # From the first tenth to the last: a return from above the scanner is as far aside as can be.
-    right, ahead = np.subtract(*np.quantile(_aside(cloud, some, path), (0.9, 0.1), axis=0)) / 2
-    around = ahead > _ALIKE * right
-    if right < _NARROW:
-        return
-    if around and pattern == "line":
-        warnings.warn(
-            f"the returns spread as far ahead ({ahead:.2f} of the height) as to the side ({right:.2f}), as those of a "
-            'scanner that looks all around: give its pattern as "circle" (--pattern circle)',
-            stacklevel=3,
-        )
-    if not around and pattern == "circle":
-        warnings.warn(
-            f"the returns spread to the side ({right:.2f} of the height), but not ahead ({ahead:.2f}), as those of a "
-            'scanner that draws lines: give its pattern as "line" (--pattern line)',
-            stacklevel=3,
-        )
-
-
-def _aside(cloud: Cloud, which: Int[np.ndarray, "n"], path: ScannerPath) -> Float[np.ndarray, "n 2"]:
+def aside(cloud: Cloud, which: Int[np.ndarray, "n"], path: ScannerPath) -> Float[np.ndarray, "n 2"]:
     """Tangents of the angles of returns to the right and ahead, from the body's nadir."""
     parts = [np.zeros((0, 2))]
     for first in range(0, len(which), PORTION):

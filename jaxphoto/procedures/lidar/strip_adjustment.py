@@ -15,14 +15,14 @@ from jaxtyping import Float
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.cloud import Cloud
-from jaxphoto.errors import BlockError, InputError
+from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import StripErrors, StripSpline, Trajectory
-from jaxphoto.lidar.correction import ScannerPath, check_covered, scanner_path, scanner_poses
+from jaxphoto.lidar.correction import check_covered, scanner_path
 from jaxphoto.lidar.strip_correction import correct_flight, times_of
 from jaxphoto.lidar.strip_settings import StripSettings
 from jaxphoto.procedures.adjust import adjust
-from jaxphoto.procedures.lidar.looks import check_pattern
 from jaxphoto.procedures.lidar.photographs import Photographs, check_photographs, on_trajectory, spans_with
+from jaxphoto.procedures.lidar.scanner_checks import check_measured_from, check_pattern
 from jaxphoto.procedures.lidar.strip_rows import step_rows
 from jaxphoto.procedures.lidar.strip_search import CommonPlanes, StripSearch, check_joined
 from jaxphoto.procedures.lidar.strip_unknowns import ScannerPriors, errors_of, strip_block
@@ -36,8 +36,6 @@ PHOTOGRAPHS = "photographs"
 """What differences call the tie points of photographs beside strips."""
 # From this round on returns stay in their cells: strips fit to their noise by then.
 _SETTLED = 2
-# No laser scanner measures farther; so many points are looked at.
-_FARTHEST_M, _PROBED = 10_000.0, 1000
 
 
 class StripRound(NamedTuple):
@@ -89,6 +87,8 @@ class StripAdjustment(eqx.Module):
     rounds: tuple[StripRound, ...]
     still: bool
     """Whether nothing changed any more at the end."""
+    odd: tuple[str, ...] = ()
+    """What is odd about cloud and trajectory, in sentences."""
 
 
 def adjust_strips(
@@ -127,8 +127,8 @@ def adjust_strips(
     held = cloud.strips if held == "all" else held
     names = _check(cloud, trajectory, held, photographs is None and priors.right)
     path = None if trajectory is None else scanner_path(trajectory)
-    if path is not None:
-        _check_above(cloud, path)
+    odd = [] if path is None else check_measured_from(cloud, path)
+    if path is not None and not priors.right:
         check_pattern(cloud, path, priors.calibration.pattern)
     spans, images = _spans(cloud), None
     if photographs is not None:
@@ -177,6 +177,7 @@ def adjust_strips(
                 _differences(first, seen) + _point_differences(first_on, on),
                 tuple(rounds),
                 still,
+                tuple(odd),
             )
         # Of a large flight gigabytes, which the next round needs.
         del adjusted, known
@@ -207,17 +208,6 @@ def _check(cloud: Cloud, trajectory: Trajectory | None, held: Collection[str], s
     if trajectory is not None:
         check_covered(trajectory, cloud.time)  # type: ignore[arg-type]
     return names
-
-
-def _check_above(cloud: Cloud, path: ScannerPath) -> None:
-    """Raise BlockError for points that no scanner on this trajectory can have measured, as of another system."""
-    some = np.linspace(0, len(cloud) - 1, _PROBED).astype(int)
-    away = np.linalg.norm(cloud.xyz[some] - scanner_poses(path, cloud.time[some]).position, axis=1)  # type: ignore[index]
-    if np.median(away) > _FARTHEST_M:
-        raise BlockError(
-            f"the laser points lie {np.median(away) / 1000:.0f} km from where the trajectory says that the scanner "
-            "was: bring cloud and trajectory into one coordinate system, in metres, and onto one clock"
-        )
 
 
 def _spans(cloud: Cloud) -> Float[np.ndarray, "strips 2"]:

@@ -1,0 +1,166 @@
+"""Whether a cloud can have been measured from a trajectory: by where its points lie about the scanner.
+
+Seen from the body of the aircraft, a scanner's points lie in the same place all along a flight. Those of a trajectory
+of another system, in feet, on another clock or with another yaw do not, and what is adjusted with them means nothing.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxphoto.cloud import Cloud
+from jaxphoto.errors import BlockError
+from jaxphoto.georeferencing import Pattern, Trajectory
+from jaxphoto.lidar.correction import ScannerPath, scanner_poses
+from jaxphoto.procedures.lidar.looks import aside
+
+# No airborne laser scanner measures farther (m).
+_FARTHEST_M = 10_000.0
+# So many points are looked at, second by second of those that have so many of them.
+_PROBED, _WINDOW_S, _FEWEST = 50_000, 1.0, 20
+# The middle of a second's points may move by so many half widths of the swath, as over water, which reflects nothing;
+# and lie at most so far aside, as a tangent.
+_WANDERS, _ASIDE = 1.5, 3.0
+# Lines spread less ahead than this part of what they do to the side, and what looks all around spreads more. Of a swath
+# narrower than this part of the height nothing is said.
+_ALIKE, _NARROW = 0.5, 0.02
+# Cosines of the angle between yaw and course: no crab angle leaves less than the first, read in the right unit.
+_FOLLOWS, _ELSEWHERE = 0.8, 0.7
+# Slower (m/s), a course says nothing.
+_SLOW = 1.0
+# A jump is that long at least, and so many times what records usually are off.
+_JUMP_M, _TIMES = 0.3, 20.0
+# From so many times the usual interval on.
+_GAP = 2.5
+
+
+class _Seen(NamedTuple):
+    """Tangents of the angles of points to the right and ahead, from the body's nadir."""
+
+    middle: Float[np.ndarray, "seconds 2"]
+    """Second by second."""
+    half_width: Float[np.ndarray, "2"]
+    """Of the points of a second, in the median."""
+
+
+def check_measured_from(cloud: Cloud, path: ScannerPath) -> list[str]:
+    """What is odd about where the points of `cloud` lie from the scanner, in sentences.
+
+    Raises BlockError where they cannot have been measured from this trajectory.
+    """
+    some = _probed(cloud)
+    away = np.linalg.norm(cloud.xyz[some] - scanner_poses(path, cloud.time[some]).position, axis=1)  # type: ignore[index]
+    if np.median(away) > _FARTHEST_M:
+        raise BlockError(
+            f"the laser points lie {np.median(away) / 1000:.0f} km from where the trajectory says that the scanner "
+            "was: bring cloud and trajectory into one coordinate system, in metres, and onto one clock"
+        )
+    odd = [*_odd_yaw(path.trajectory), *_jumps(path.trajectory)]
+    seen = _seen(cloud, path)
+    if seen is None:
+        return odd
+    moves = np.subtract(*np.quantile(seen.middle, (0.9, 0.1), axis=0)) / 2
+    looks = np.median(seen.middle, axis=0)
+    if max(moves) > _WANDERS * max(seen.half_width) or max(np.abs(looks)) > _ASIDE:
+        furthest = np.abs(seen.middle).max()
+        raise BlockError(
+            f"the laser points of a second lie now here, now there about the scanner, up to {furthest:.1f} of its "
+            f"height to one side, while the swath is {2 * max(seen.half_width):.2f} of it wide: bring cloud and "
+            "trajectory into one coordinate system, both in metres, and onto one clock, with angles in degrees"
+        )
+    return odd
+
+
+def check_pattern(cloud: Cloud, path: ScannerPath, pattern: Pattern) -> None:
+    """Raise BlockError where the points lie about the scanner as those of another pattern do."""
+    seen = _seen(cloud, path)
+    if seen is None:
+        return
+    right, ahead = seen.half_width
+    spread = f"to the side by {right:.2f} of the height and ahead by {ahead:.2f}"
+    if right < _ALIKE * ahead:
+        raise BlockError(
+            f"the laser points of a second spread {spread}, as those of no scanner that was flown along its x axis: "
+            "correct the yaw of the trajectory, or turn it to the axes of the scanner"
+        )
+    around = ahead > _ALIKE * right
+    if around and pattern == "line":
+        raise BlockError(
+            f"the laser points of a second spread {spread}, as those of a scanner that looks all around its nadir: "
+            'give its pattern as "circle" (--pattern circle)'
+        )
+    if not around and pattern == "circle":
+        raise BlockError(
+            f"the laser points of a second spread {spread}, as those of a scanner that draws lines across the track: "
+            'give its pattern as "line" (--pattern line)'
+        )
+
+
+def _odd_yaw(trajectory: Trajectory) -> list[str]:
+    """Raise BlockError for angles in radians; a sentence where the body flies to another side than ahead."""
+    step = np.diff(np.asarray(trajectory.position), axis=0)[:, :2]
+    time, forward = np.diff(np.asarray(trajectory.time)), _forward(np.asarray(trajectory.quaternion))[:-1]
+    fast = np.linalg.norm(step, axis=1) > _SLOW * time
+    if not fast.any():
+        return []
+    course, yaw = np.arctan2(*step[fast].T), np.arctan2(*forward[fast].T)
+    follows, as_radians = np.median(np.cos(yaw - course)), np.median(np.cos(np.rad2deg(yaw) - course))
+    if follows > _ELSEWHERE:
+        return []
+    if as_radians > _FOLLOWS and np.abs(yaw).max() < np.deg2rad(2 * np.pi) + 1e-9:
+        raise BlockError(
+            "the yaw of the trajectory follows its course as radians, not as degrees: convert roll, pitch and yaw to "
+            "degrees"
+        )
+    off = np.rad2deg(np.median(np.abs(np.arctan2(np.sin(yaw - course), np.cos(yaw - course)))))
+    return [
+        f"the yaw of the trajectory is {off:.0f} degrees off its course in the median, as of an aircraft that flies "
+        "sideways or backwards: boresight and lever arm refer to these axes; correct yaw if it does not"
+    ]
+
+
+def _jumps(trajectory: Trajectory) -> list[str]:
+    """A sentence where positions go on elsewhere from one record to the next, as where GNSS was initialised anew."""
+    time, position = np.asarray(trajectory.time), np.asarray(trajectory.position)
+    between = np.diff(time)[:, None]
+    speed = np.diff(position, axis=0) / between
+    # Beside what the steps before and after let expect.
+    off = np.linalg.norm((speed[1:-1] - (speed[:-2] + speed[2:]) / 2) * between[1:-1], axis=1)
+    # Over a gap, as of the turn from strip to strip, nothing is expected.
+    gap = between[:, 0] > _GAP * np.median(between)
+    off[gap[1:-1] | gap[:-2] | gap[2:]] = 0.0
+    k = int(np.argmax(off))
+    if off[k] < max(_JUMP_M, _TIMES * float(np.median(off))):
+        return []
+    return [
+        f"the trajectory jumps by {off[k]:.2g} m at {time[k + 2]:.3f} s from one record to the next, which no aircraft "
+        "does: splines go over it; process the trajectory anew, or leave out the strip that was flown then"
+    ]
+
+
+def _forward(quaternion: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 2"]:
+    """X and Y of the body's y axis, which points ahead."""
+    w, x, y, z = quaternion.T
+    return np.column_stack([2 * (x * y - w * z), 1 - 2 * (x**2 + z**2)])
+
+
+def _probed(cloud: Cloud) -> Int[np.ndarray, "n"]:
+    return np.linspace(0, len(cloud) - 1, min(_PROBED, len(cloud))).astype(int)
+
+
+def _seen(cloud: Cloud, path: ScannerPath) -> _Seen | None:
+    """None of a swath that is too narrow to say, or of a cloud with few points."""
+    some = _probed(cloud)
+    time = cloud.time[some]  # type: ignore[index]
+    tangents = aside(cloud, some, path)
+    second = np.floor((time - time.min()) / _WINDOW_S).astype(np.int64)
+    order = np.argsort(second, kind="stable")
+    _, first, number = np.unique(second[order], return_index=True, return_counts=True)
+    parts = [tangents[order[k : k + n]] for k, n in zip(first, number, strict=True) if n >= _FEWEST]
+    if not parts:
+        return None
+    # From the first tenth to the last: a return from above the scanner is as far aside as can be.
+    low, middle, high = np.stack([np.quantile(part, (0.1, 0.5, 0.9), axis=0) for part in parts], axis=1)
+    half_width = np.median((high - low) / 2, axis=0)
+    return None if max(half_width) < _NARROW else _Seen(middle, half_width)
