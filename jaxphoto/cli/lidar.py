@@ -295,7 +295,7 @@ def _of_flight(adjust: str, pattern: str | None, settings: StripSettings, max_ro
         )
     free = named | ({"boresight"} if "scanner" in named else set())
     held: list[str] | Literal["all"] = [] if "trajectory" in named else "all"
-    return StripChoices(settings, scanner_priors(free, pattern), held, "camera" not in named, max_rounds)
+    return StripChoices(settings, set(), scanner_priors(free, pattern), held, "camera" not in named, max_rounds)
 
 
 def _settings(sigma_z_m: float, sigma_xy_m: float, sigma_systematic_m: float) -> HeightSettings:

@@ -88,6 +88,8 @@ class StripChoices(NamedTuple):
     """What of a flight is adjusted, and how."""
 
     settings: StripSettings
+    given: set[str]
+    """Standard deviations of the settings that are to be used whatever the trajectory states."""
     priors: ScannerPriors | None
     held: list[str] | Literal["all"]
     """Strips whose trajectory is right."""
@@ -122,8 +124,7 @@ def adjust_flight(context: typer.Context, flight: StripFiles, choices: StripChoi
             records = records._replace(time=records.time - flight.trajectory_shift_s)
             if records.geographic and block is None:
                 frame = _about(records, clouds.cloud_system(cloud, **said), cloud)
-            exact = np.zeros((len(records.time), 3))
-            path = trajectory_in(records, frame, exact, exact)
+            path = trajectory_in(records, frame, *_stated(records, choices.given))
         own = frame if block is not None or frame.kind == "epsg" else None
         track = None if path is None else scanner_path(path)
         parts = partial(clouds.cloud_chunks, cloud, own, classes=flight.classes, returns=flight.returns, **said)  # type: ignore[arg-type]
@@ -175,6 +176,16 @@ def adjust_flight(context: typer.Context, flight: StripFiles, choices: StripChoi
     console.print(f"results in {out} (open report.html)")
     if verdict.level == Level.ALARM:
         raise typer.Exit(1)
+
+
+def _stated(records: Records, given: set[str]) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    """Standard deviations (m, rad) of a trajectory; zero where it states none, or other ones are `given`."""
+    sigma_m, sigma_deg = np.nan_to_num(records.sigma_m), np.nan_to_num(records.sigma_deg)
+    if "sigma_position_m" in given:
+        sigma_m = np.zeros_like(sigma_m)
+    # Of roll, pitch and yaw.
+    known = [name not in given for name in ("sigma_attitude_deg", "sigma_attitude_deg", "sigma_heading_deg")]
+    return sigma_m, np.deg2rad(sigma_deg * known)
 
 
 class Gaps:

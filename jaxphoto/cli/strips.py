@@ -1,7 +1,8 @@
 """`jaxphoto strips`: from a cloud of several strips and its trajectory, both without what they are off by."""
 
+import dataclasses
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -51,9 +52,17 @@ def strips_command(
     most_planes: Annotated[int, typer.Option(min=1, help="Most planes that are observed.")] = USUAL.most,
     knots_s: KnotsS = USUAL.knots_s,
     correlation_s: Annotated[float, typer.Option(help="Correlation time of these errors.")] = USUAL.correlation_s,
-    sigma_position_m: Annotated[float, typer.Option(help="Their standard deviation.")] = USUAL.sigma_position_m,
-    sigma_attitude_deg: Annotated[float, typer.Option(help="That about right and forward.")] = USUAL.sigma_attitude_deg,
-    sigma_heading_deg: Annotated[float, typer.Option(help="That about up.")] = USUAL.sigma_heading_deg,
+    sigma_position_m: Annotated[
+        float | None,
+        typer.Option(help=f"Their standard deviation (the trajectory's own, or {USUAL.sigma_position_m:g})."),
+    ] = None,
+    sigma_attitude_deg: Annotated[
+        float | None,
+        typer.Option(help=f"That about right and forward (the trajectory's own, or {USUAL.sigma_attitude_deg:g})."),
+    ] = None,
+    sigma_heading_deg: Annotated[
+        float | None, typer.Option(help=f"That about up (the trajectory's own, or {USUAL.sigma_heading_deg:g}).")
+    ] = None,
     sigma_exposure_m: Annotated[
         float, typer.Option(help="What stations of photographs are off by besides.")
     ] = USUAL.sigma_exposure_m,
@@ -73,15 +82,18 @@ def strips_command(
     --class and --returns choose the points of the planes; the whole cloud is corrected. Exit code 1: written, but
     the verdict is red, as where it still changes.
     """
+    sigmas = {
+        "sigma_position_m": sigma_position_m,
+        "sigma_attitude_deg": sigma_attitude_deg,
+        "sigma_heading_deg": sigma_heading_deg,
+    }
+    given: dict[str, Any] = {name: sigma for name, sigma in sigmas.items() if sigma is not None}
     settings = StripSettings(
         cell_m=cell_m,
         roughness_m=roughness_m,
         most=most_planes,
         knots_s=knots_s,
         correlation_s=correlation_s,
-        sigma_position_m=sigma_position_m,
-        sigma_attitude_deg=sigma_attitude_deg,
-        sigma_heading_deg=sigma_heading_deg,
         sigma_exposure_m=sigma_exposure_m,
         sigma_exposure_deg=sigma_exposure_deg,
     )
@@ -97,7 +109,8 @@ def strips_command(
         cloud_epsg,
         cloud_unit,
     )
-    choices = StripChoices(settings, _priors(adjust, pattern), held, False, max_rounds)
+    settings = dataclasses.replace(settings, **given)
+    choices = StripChoices(settings, set(given), _priors(adjust, pattern), held, False, max_rounds)
     adjust_flight(context, files, choices, out)
 
 

@@ -10,12 +10,14 @@ import pytest
 from jaxphoto import BlockError, InputError
 from jaxphoto.adjustment import Outcome
 from jaxphoto.cloud import Cloud
-from jaxphoto.georeferencing import TrajectoryKnot
+from jaxphoto.georeferencing import StripSpline, TrajectoryKnot
 from jaxphoto.lidar.correction import scanner_path
 from jaxphoto.lidar.strip_correction import correct_flight, correct_strips
 from jaxphoto.lidar.strip_settings import StripSettings
 from jaxphoto.procedures.lidar import ScannerPriors, adjust_strips
 from jaxphoto.procedures.lidar.scanner_checks import check_measured_from, check_pattern
+from jaxphoto.procedures.lidar.strip_rows import step_rows
+from jaxphoto.procedures.lidar.strip_unknowns import knot_sigmas
 from jaxphoto.report.strips import calibration_table, trajectory_errors_table
 from jaxphoto.rotation import (
     matrix_from_quaternion,
@@ -253,3 +255,28 @@ def as_radians(quaternion):
     """Angles in radians, read as degrees."""
     angles = np.asarray(jax.vmap(roll_pitch_yaw_from_matrix)(jax.vmap(matrix_from_quaternion)(quaternion)))
     return np.asarray(jax.vmap(quaternion_from_matrix)(jax.vmap(matrix_from_roll_pitch_yaw)(np.deg2rad(angles))))
+
+
+def test_the_sigmas_of_a_trajectory_are_those_of_its_knots():
+    trajectory, splines = (
+        flown().trajectory,
+        (StripSpline.over(0, 0.0, 20.0, 5.0), StripSpline.over(7, 40.0, 50.0, 5.0)),
+    )
+    n = len(np.asarray(trajectory.time))
+    stated = dataclasses.replace(
+        trajectory,
+        time=np.linspace(-10.0, 60.0, n),
+        sigma_position=np.linspace(0.02, 0.09, n)[:, None] * [1.0, 1.0, 0.0],
+        sigma_attitude=np.tile([0.001, 0.002, 0.003], (n, 1)),
+    )
+    sigmas = knot_sigmas(splines, stated, SETTINGS)
+    times = np.concatenate([s.times for s in splines])
+    np.testing.assert_allclose(sigmas.position[:, :2], np.tile(0.03 + times / 1000, (2, 1)).T)
+    # What is not stated is that of the settings; roll, pitch and yaw are turns about forward, right and up.
+    np.testing.assert_allclose(sigmas.position[:, 2], SETTINGS.sigma_position_m)
+    np.testing.assert_allclose(sigmas.attitude, np.tile([0.002, 0.001, 0.003], (len(times), 1)))
+    # The process that the steps make has these standard deviations at all knots.
+    steps, _ = step_rows(splines, sigmas, SETTINGS)
+    variance = sigmas.position**2
+    grown = steps.kept[:, None] ** 2 * variance[steps.start] + np.asarray(steps.sigma) ** 2
+    np.testing.assert_allclose(grown, variance[steps.end])

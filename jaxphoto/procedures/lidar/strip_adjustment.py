@@ -25,7 +25,7 @@ from jaxphoto.procedures.lidar.photographs import Photographs, check_photographs
 from jaxphoto.procedures.lidar.scanner_checks import check_measured_from, check_pattern
 from jaxphoto.procedures.lidar.strip_rows import step_rows
 from jaxphoto.procedures.lidar.strip_search import CommonPlanes, StripSearch, check_joined
-from jaxphoto.procedures.lidar.strip_unknowns import ScannerPriors, errors_of, strip_block
+from jaxphoto.procedures.lidar.strip_unknowns import ScannerPriors, errors_of, knot_sigmas, strip_block
 from jaxphoto.procedures.lidar.tie_point_search import PointPlanes, TiePointSearch
 from jaxphoto.procedures.lidar.until_still import STILL, at_result, with_interior_held
 from jaxphoto.procedures.lidar.vertical_control import tie_points
@@ -104,6 +104,8 @@ def adjust_strips(
 ) -> StripAdjustment:
     """Adjust the strips of `cloud`; `trajectory` is that of its scanner, on the cloud's clock.
 
+    Standard deviations that it states are those of its errors, in place of those of `settings`; zero states none.
+
     `photographs` that were taken on it are adjusted with them: their exposures have the trajectory's errors, and their
     tie points lie on the planes of the strips. What of their cameras and mounts is estimated their block says; its
     stations and attitudes are taken for the trajectory's.
@@ -138,11 +140,12 @@ def adjust_strips(
     alone = None if photographs is None else with_interior_held(photographs.block)
     if photographs is not None and alone is not None:
         images = at_result(on_trajectory(photographs, splines, spans, settings), alone.unknowns)
+    sigmas = knot_sigmas(splines, trajectory, settings)
     if trajectory is None:
-        block = strip_block(names, splines, held or names[:1], settings, None)
+        block = strip_block(names, splines, held or names[:1], sigmas, None)
     else:
-        block = strip_block(names, splines, held, settings, priors, images)
-    steps = tuple(rows for rows in step_rows(splines, settings) if len(rows))
+        block = strip_block(names, splines, held, sigmas, priors, images)
+    steps = tuple(rows for rows in step_rows(splines, sigmas, settings) if len(rows))
     pattern = priors.calibration.pattern
     search, errors = StripSearch(cloud, path, settings, pattern), errors_of(block.start.unknowns, splines)
     first = seen = search.look(errors, settled=False)

@@ -14,6 +14,7 @@ from jaxphoto.lidar.corresponding_planes import PlanePairs, StripPatches, steep
 from jaxphoto.lidar.strip_correction import corrected_strip
 from jaxphoto.lidar.strip_settings import StripSettings
 from jaxphoto.observations import AttitudeSteps, PositionSteps, StripPlanes
+from jaxphoto.procedures.lidar.strip_unknowns import KnotSigmas
 from jaxphoto.rotation import roll_pitch_yaw_from_matrix
 
 # Steps towards the measured point of a corrected one: each leaves a part of it as small as the corrections are.
@@ -72,16 +73,23 @@ def thinned(normal: Float[np.ndarray, "n 3"], cell: Int[np.ndarray, "n"], most: 
     return np.sort(np.concatenate([parts[0][:first], parts[1][: most - first]]))
 
 
-def step_rows(splines: tuple[StripSpline, ...], settings: StripSettings) -> tuple[PositionSteps, AttitudeSteps]:
-    """From knot to knot of every strip."""
+def step_rows(
+    splines: tuple[StripSpline, ...], sigmas: KnotSigmas, settings: StripSettings
+) -> tuple[PositionSteps, AttitudeSteps]:
+    """From knot to knot of every strip, so that every knot has its own standard deviation beforehand."""
     start = np.concatenate([s.first + np.arange(s.size - 1) for s in splines])
     apart = np.concatenate([np.full(s.size - 1, s.interval) for s in splines])
     kept = np.exp(-apart / settings.correlation_s)
-    new = np.sqrt(1 - kept**2)[:, None]
-    none = np.zeros((len(start), 3))
+    part, none = kept[:, None] ** 2, np.zeros((len(start), 3))
+
+    def new(sigma: Float[np.ndarray, "knots 3"]) -> Float[np.ndarray, "steps 3"]:
+        # Where errors become smaller faster than they are forgotten something new comes in all the same.
+        before, after = sigma[start] ** 2, sigma[start + 1] ** 2
+        return np.sqrt(np.maximum(after - part * before, (1 - part) * np.minimum(before, after)))
+
     return (
-        PositionSteps(start, start + 1, kept, np.repeat(settings.sigma_position_m * new, 3, axis=1), none),
-        AttitudeSteps(start, start + 1, kept, settings.sigma_attitude * new, none),
+        PositionSteps(start, start + 1, kept, new(sigmas.position), none),
+        AttitudeSteps(start, start + 1, kept, new(sigmas.attitude), none),
     )
 
 

@@ -5,9 +5,10 @@ from collections.abc import Collection, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxphoto.block import Block, empty_block
-from jaxphoto.georeferencing import Scanner, ScannerCalibration, StripErrors, StripSpline, TrajectoryKnot
+from jaxphoto.georeferencing import Scanner, ScannerCalibration, StripErrors, StripSpline, Trajectory, TrajectoryKnot
 from jaxphoto.lidar.strip_settings import StripSettings
 from jaxphoto.parameters import AbstractParameters, dynamic_fields
 from jaxphoto.procedures.lidar.until_still import at_result
@@ -16,6 +17,31 @@ from jaxphoto.unknowns import FIXED, FREE, Unknowns, Weighted
 _ZERO = np.zeros(3)
 NO_CALIBRATION = ScannerCalibration(_ZERO, np.zeros(()), np.zeros(()), np.zeros(()), np.zeros(2))  # type: ignore[arg-type]
 """A scanner that is right."""
+
+
+class KnotSigmas(NamedTuple):
+    """What the trajectory may be off by at each knot of all strips."""
+
+    position: Float[np.ndarray, "knots 3"]
+    """Along X, Y and Z (m)."""
+    attitude: Float[np.ndarray, "knots 3"]
+    """About right, forward and up (rad)."""
+
+
+def knot_sigmas(splines: Sequence[StripSpline], trajectory: Trajectory | None, settings: StripSettings) -> KnotSigmas:
+    """Those that the trajectory states, and those of the settings where it states none (zero)."""
+    times = np.concatenate([spline.times for spline in splines])
+    position = np.full((len(times), 3), settings.sigma_position_m)
+    attitude = np.tile(settings.sigma_attitude, (len(times), 1))
+    if trajectory is None:
+        return KnotSigmas(position, attitude)
+    # Of roll, pitch and yaw, which are turns about forward, right and up.
+    stated = np.asarray(trajectory.sigma_position), np.asarray(trajectory.sigma_attitude)[:, [1, 0, 2]]
+    for own, sigmas in zip((position, attitude), stated, strict=True):
+        for axis, column in enumerate(sigmas.T):
+            if (column > 0).all():
+                own[:, axis] = np.interp(times, np.asarray(trajectory.time), column)
+    return KnotSigmas(position, attitude)
 
 
 class ScannerPriors(NamedTuple):
@@ -35,7 +61,7 @@ def strip_block(
     names: Sequence[str],
     splines: Sequence[StripSpline],
     held: Collection[str],
-    settings: StripSettings,
+    sigmas: KnotSigmas,
     priors: ScannerPriors | None,
     photographs: Block | None = None,
 ) -> Block:
@@ -47,10 +73,10 @@ def strip_block(
     """
     knots: dict[str, AbstractParameters] = {}
     known: dict[str, AbstractParameters] = {}
-    sigmas = np.full(3, settings.sigma_position_m), settings.sigma_attitude
-    first, later = TrajectoryKnot(*(Weighted(_ZERO, s) for s in sigmas)), TrajectoryKnot(FREE, FREE)  # type: ignore[arg-type]
+    later = TrajectoryKnot(FREE, FREE)  # type: ignore[arg-type]
     shift, right = TrajectoryKnot(FREE, FIXED), TrajectoryKnot(FIXED, FIXED)  # type: ignore[arg-type]
     for name, spline in zip(names, splines, strict=True):
+        first = TrajectoryKnot(*(Weighted(_ZERO, of[spline.first]) for of in sigmas))  # type: ignore[arg-type]
         for k, time in enumerate(spline.times):
             owner = name if priors is None else f"{name} at {time:.3f} s"
             knots[owner] = TrajectoryKnot(_ZERO, _ZERO)  # type: ignore[arg-type]
