@@ -26,7 +26,7 @@ def target_looker(
     ) -> Candidates:
         row: list[int] = []
         place: list[np.ndarray] = []
-        sigma: list[float] = []
+        fit: list[float] = []
         for image in np.unique(at.image).tolist():
             if images[image] not in paths:
                 continue
@@ -45,7 +45,8 @@ def target_looker(
                 near = np.linalg.norm(there - at.column_row[k], axis=1) < radius[k]
                 row += [k] * int(near.sum())
                 place += list(there[near])
-                sigma += np.hypot(np.sqrt(np.mean(found.sigma_px[near] ** 2, axis=1)), _LEAST_SIGMA_PX).tolist()
-        return Candidates(np.array(row, int), np.array(place, float).reshape(-1, 2), np.array(sigma, float))
+                fit += np.sqrt(np.mean(found.sigma_px[near] ** 2, axis=1)).tolist()
+        sigma = np.hypot(np.array(fit, float), _LEAST_SIGMA_PX)
+        return Candidates(np.array(row, int), np.array(place, float).reshape(-1, 2), sigma, np.array(fit, float))
 
     return Looker(look, target.named)

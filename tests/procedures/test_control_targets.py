@@ -55,7 +55,9 @@ def looker_of(control, seen_twice=()):
             inside = [p for p in near if np.linalg.norm(p - at.column_row[k]) < radius[k]]
             row += [k] * len(inside)
             place += inside
-        return Candidates(np.array(row, int), np.array(place).reshape(-1, 2), np.full(len(row), 0.5))
+        return Candidates(
+            np.array(row, int), np.array(place).reshape(-1, 2), np.full(len(row), 0.5), np.full(len(row), 0.5)
+        )
 
     return Looker(look, False), looked
 

@@ -43,8 +43,12 @@ class Blobs(NamedTuple):
         return Blobs(self.column_row[chosen], self.shape[chosen], self.dark[chosen])
 
 
-def elliptic_blobs(picture: np.ndarray) -> Blobs:
-    """All elliptic spots of a picture, by adaptive thresholds of several widths; none touches the border."""
+def elliptic_blobs(picture: np.ndarray, half_axes: tuple[np.ndarray, float] | None = None) -> Blobs:
+    """All elliptic spots of a picture, by adaptive thresholds of several widths; none touches the border.
+
+    Of several about one place the one that is most like an ellipse; of those alone whose `half_axes` (the greater
+    first, px) are these up to a factor, where they are given: a bright disc on a dark one is not lost beside it.
+    """
     smooth = cv2.GaussianBlur(picture, (3, 3), 0)
     height, width = picture.shape
     kept: list[tuple[np.ndarray, np.ndarray, float]] = []
@@ -52,7 +56,7 @@ def elliptic_blobs(picture: np.ndarray) -> Blobs:
         window = max(15, (min(height, width) // part) | 1)
         for above in (7, -7):
             mask = cv2.adaptiveThreshold(smooth, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY, window, above)
-            kept += _components(mask)
+            kept += [blob for blob in _components(mask) if half_axes is None or _of_size(blob[1], *half_axes)]
     kept.sort(key=lambda blob: blob[2])
     centres, shapes = np.zeros((len(kept), 2)), np.zeros((len(kept), 2, 2))
     n = 0
@@ -63,6 +67,10 @@ def elliptic_blobs(picture: np.ndarray) -> Blobs:
             n += 1
     darks = [_is_dark(smooth, centre, shape) for centre, shape in zip(centres[:n], shapes[:n], strict=True)]
     return Blobs(centres[:n], shapes[:n], np.array(darks, bool))
+
+
+def _of_size(shape: np.ndarray, half_axes: np.ndarray, factor: float) -> bool:
+    return bool((np.abs(np.log(half_axes / (1 / np.sqrt(np.linalg.eigvalsh(shape))))) < np.log(factor)).all())
 
 
 def _is_dark(picture: np.ndarray, centre: np.ndarray, shape: np.ndarray) -> bool:

@@ -61,12 +61,7 @@ class Circle(GroundTarget):
         should = np.linalg.svd(px_per_m, compute_uv=False) * self.side_m / 2
         if 2 * should[1] < _SMALLEST_PX:
             return _nothing()
-        blobs = elliptic_blobs(window)
-        if not len(blobs.column_row):
-            return _nothing()
-        axes = 1 / np.sqrt(np.linalg.eigvalsh(blobs.shape))
-        like = (np.abs(np.log(axes / should)) < np.log(_LIKE)).all(axis=1)
-        return _sound(fit_discs(window, blobs.take(like)))
+        return _sound(fit_discs(window, elliptic_blobs(window, (should, _LIKE))))
 
 
 class Marker(GroundTarget):

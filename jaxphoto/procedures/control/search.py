@@ -1,8 +1,9 @@
 """Targets of surveyed points looked for where photographs should show them, and believed where their rays meet.
 
 What looks into pictures gives candidates; those of a point in different photographs are of one target where their rays
-meet at one place, near enough to where the point should be. A place that fewer photographs tell, or another place that
-nearly as many tell, is not believed.
+meet at one place, near enough to where the point should be. Of places that about as many photographs tell the one
+with the sharper edges is it, which targets are made to have; where that does not decide none is believed, nor what is
+far less sharp than the targets of the other points, as a round stone is.
 """
 
 from collections.abc import Callable
@@ -31,6 +32,9 @@ _LEAST_IMAGES, _LEAST_UNNAMED = 2, 3
 # Of the photographs that show a target, how many show another place for that to be as good.
 _ALIKE = 0.6
 _PARALLEL = np.deg2rad(0.5)
+# By which factor the fits of a target are better than those of another place that looks like it; and by which one they
+# may be worse than those of the other targets.
+_SHARPER, _DULL = 1.5, 3.0
 _MOST_PAIRS = 2000
 
 
@@ -40,6 +44,8 @@ class Candidates(NamedTuple):
     row: Int[np.ndarray, "n"]
     column_row: Float[np.ndarray, "n 2"]
     sigma_px: Float[np.ndarray, "n"]
+    fit_px: Float[np.ndarray, "n"]
+    """Of the fit to its grey values alone: small where its edge is sharp and strong, as a target's is."""
 
 
 class Looker(NamedTuple):
@@ -113,11 +119,12 @@ def _believed(adjusted, ids, xyz, of_points, at: Predicted, seen: Candidates, na
     directions = turn_to_object(matrices, image, rays_of(block, unknowns, rows)) if len(image) else np.zeros((0, 3))
     c = np.array([float(unknowns.interior[block.image_camera[i]].c) for i in image])
     limit = _MISS_PX * pixel / np.maximum(c, 1e-300)
-    kept: list[int] = []
+    taken: dict[int, list[int]] = {}
     said: dict[str, str] = {}
     for p in np.unique(at.point).tolist():
         own, looked = np.flatnonzero(point == p), int((at.point == p).sum())
-        chosen, why = _meeting(positions[image[own]], directions[own], image[own], limit[own], xyz[p], of_points[p])
+        near = xyz[p], of_points[p]
+        chosen, why = _meeting(positions[image[own]], directions[own], image[own], limit[own], seen.fit_px[own], *near)
         sure = named or radius[at.point == p].max() < 3 * _LEAST_PX
         least = _LEAST_IMAGES if sure else _LEAST_UNNAMED
         if not why and len(chosen) < least:
@@ -125,8 +132,17 @@ def _believed(adjusted, ids, xyz, of_points, at: Predicted, seen: Candidates, na
         if why:
             said[ids[p]] = f"the target of {ids[p]} was looked for in {looked} photographs: {why}"
             continue
-        kept += own[chosen].tolist()
+        taken[p] = own[chosen].tolist()
         said[ids[p]] = f"the target of {ids[p]} was found in {len(chosen)} of {looked} photographs"
+    usual = _fit_of_others(taken, seen.fit_px)
+    for p, rows_of in list(taken.items()):
+        if not named and np.median(seen.fit_px[rows_of]) > _DULL * usual[p]:
+            del taken[p]
+            said[ids[p]] = (
+                f"the target of {ids[p]} was looked for: what was seen in {len(rows_of)} photographs is far less sharp "
+                "than the other targets; mark it by hand"
+            )
+    kept = [k for rows_of in taken.values() for k in rows_of]
     marks = Marks(
         tuple(block.images[i] for i in image[kept]),
         tuple(ids[p] for p in point[kept]),
@@ -137,7 +153,14 @@ def _believed(adjusted, ids, xyz, of_points, at: Predicted, seen: Candidates, na
     return FoundTargets(marks, said)
 
 
-def _meeting(origins, directions, image, limit, near, of_point) -> tuple[np.ndarray, str]:
+def _fit_of_others(taken: dict[int, list[int]], fit_px: Float[np.ndarray, "n"]) -> dict[int, float]:
+    """For each point what fits of the other points' targets usually are; without bound where there are too few."""
+    own = {p: float(np.median(fit_px[rows])) for p, rows in taken.items()}
+    others = {p: [fit for q, fit in own.items() if q != p] for p in own}
+    return {p: float(np.median(fits)) if len(fits) >= _LEAST_IMAGES else np.inf for p, fits in others.items()}
+
+
+def _meeting(origins, directions, image, limit, fit, near, of_point) -> tuple[np.ndarray, str]:
     """The candidates, one of an image, whose rays meet at one place near a point; or why there are none."""
     one, other = np.triu_indices(len(image), 1)
     apart = image[one] != image[other]
@@ -162,11 +185,14 @@ def _meeting(origins, directions, image, limit, near, of_point) -> tuple[np.ndar
     inside = misses(met[sure], origins, directions) < limit
     images = np.unique(image)
     score = np.stack([(inside & (image == i)).any(axis=1) for i in images]).sum(axis=0)
-    best = int(np.argmax(score - 1e-3 * misses(met[sure], origins, directions).min(axis=1)))
+    likely = np.flatnonzero(score >= min(score.max(), max(_LEAST_UNNAMED, _ALIKE * score.max())))
+    sharp = np.array([np.median(fit[inside[k]]) for k in likely])
+    # Of the places that are as sharp as the sharpest, which are often one, that which most photographs show.
+    miss = misses(met[sure], origins, directions).min(axis=1)
+    alike = likely[sharp <= _SHARPER * sharp.min()]
+    best = int(alike[np.argmax(score[alike] - 1e-3 * miss[alike])])
     chosen = inside[best]
-    rival = (score == score[best]) | (score >= max(_LEAST_UNNAMED, _ALIKE * score[best]))
-    rival &= ~(inside & chosen).any(axis=1)
-    if rival.any():
+    if not (inside[alike] & chosen).any(axis=1).all():
         return none, f"two places or more look like it, one in {score[best]} photographs: mark it by hand"
     miss = misses(met[sure][best][None], origins, directions)[0]
     kept = [
