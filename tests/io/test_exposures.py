@@ -215,6 +215,21 @@ def test_a_table_by_name(tmp_path):
     assert "1 of 10 photographs (none for DJI_0001, DJI_0002, DJI_0004 and 6 more; 1 of its" in said[0]
 
 
+@pytest.mark.parametrize(
+    ("exchanged", "east_m", "words"),
+    [(True, 0.0, "longitudes and latitudes have changed places"), (False, 5000.0, "as of another flight; not used")],
+)
+def test_a_table_far_from_the_photographs_is_not_used(tmp_path, exchanged, east_m, words):
+    places = [moved(g, np.array([east_m, 0, 0])) for g in FLIGHT.camera]
+    rows = [(g.longitude_deg, g.latitude_deg)[:: -1 if exchanged else 1] for g in places]
+    text = "".join(f"DJI_{k + 1:04}.jpg,{x!r},{y!r},100,0,0,10\n" for k, (x, y) in enumerate(rows))
+    head = "image,longitude_deg,latitude_deg,height_m,roll_deg,pitch_deg,yaw_deg\n"
+    (tmp_path / "exposures.csv").write_text(head + text)
+    photographs = [FLIGHT.photograph(k) for k in ALL]
+    taken, said = with_exposures(photographs, [read_table(tmp_path / "exposures.csv")])
+    assert taken == photographs and words in said[0]
+
+
 def test_a_table_on_the_map_counts_yaw_from_grid_north(tmp_path):
     place = np.array([[16.5, 57.0, 80.0]])
     at = MapFrame(3006, None, (16.5, 57.0, 0.0)).map(np.array([[0.0, 0.0, 80.0]]))[0]

@@ -132,6 +132,8 @@ def _by_name(state: _State, file: Exposures) -> tuple[_State, str]:
     exposure = np.array([place.get(p.name, -1) for p in state.photographs])
     if not (exposure >= 0).any():
         return state, f"none of its {len(file.names)} names is that of a photograph ({few(list(file.names))}); not used"
+    if other := _of_another_flight(state, file, exposure):
+        return state, other
     photographs = [
         p if k < 0 or file.attitude[k] is None else p._replace(attitude=file.attitude[k])
         for p, k in zip(state.photographs, exposure, strict=True)
@@ -210,4 +212,9 @@ def _of_another_flight(state: _State, file: Exposures, exposure: Int[np.ndarray,
     far = distance(state.photographs, file, exposure)
     if far <= _FAR_M:
         return ""
+    if distance(state.photographs, file._replace(place=file.place[:, [1, 0, 2]]), exposure) <= _FAR_M:
+        return (
+            "its longitudes and latitudes have changed places, as the photographs' own positions show; not used: "
+            "exchange the two in the file"
+        )
     return f"its positions are {far:,.0f} m from those of the photographs, as of another flight; not used"
