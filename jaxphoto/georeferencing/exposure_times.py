@@ -17,15 +17,17 @@ GPS_EPOCH_UNIX_S = 315_964_800.0
 LEAP_SECONDS = 18.0
 """GPS time minus UTC since 2017."""
 WEEK_S = 604_800.0
-_HOUR_S = 3600.0
+_HOUR_S, DAY_S = 3600.0, 86_400.0
+ZONES_S = 15 * _HOUR_S
+"""A clock is no farther from UTC, or from GPS time: the farthest zone is 14 hours ahead."""
 # A camera's clock is set by hand, or by the receiver: what is left besides zone and leap seconds.
 _NEAR_ZONE_S = 300.0
 # Zones are quarters of an hour.
 _ZONE_S = 900.0
 # Differences that are looked at; of more photographs every second tells the constant as well.
 _MOST_PAIRS = 2_000_000
-# Shifts whose positions miss by this many times the best's are no candidates.
-_WORSE = 1.5
+WORSE = 1.5
+"""Exposures whose positions miss by this many times the best's are no candidates."""
 
 
 class Taken(NamedTuple):
@@ -85,7 +87,7 @@ def match_times(
             # Positions tell a row that is shifted, also by one that fits more times.
             enough = [k for k, (found, _) in enumerate(tried) if (found >= 0).sum() >= 0.8 * most]
             best = min(enough, key=lambda k: off[k])
-            near = [tried[k] for k in enough if off[k] <= _WORSE * off[best]]
+            near = [tried[k] for k in enough if off[k] <= WORSE * off[best]]
             near.sort(key=lambda t: -int((t[0] >= 0).sum()))
             near = [t for t in near if (t[0] >= 0).sum() == (near[0][0] >= 0).sum()]
     distinct = [t for t in near if abs(t[1] - near[0][1]) > tolerance_s]
@@ -104,7 +106,7 @@ def _offsets(times: np.ndarray, events: np.ndarray, tolerance_s: float, most: in
     count = np.searchsorted(every, every + 2 * tolerance_s, side="right") - np.arange(len(every))
     offsets: list[float] = []
     for k in np.argsort(-count, kind="stable"):
-        middle = float(every[k]) + tolerance_s
+        middle = float(every[k] + every[k + count[k] - 1]) / 2
         if all(abs(middle - other) > 2 * tolerance_s for other in offsets):
             offsets.append(middle)
         if len(offsets) == most or count[k] < 0.3 * count.max():
@@ -160,6 +162,8 @@ def clock_words(offset_s: float) -> str:
     )
     zone, leap = best
     rest = offset_s - zone - leap
+    if abs(offset_s) > ZONES_S:
+        return f"{offset_s / DAY_S:+.2f} days, which no time zone explains"
     if abs(rest) > _NEAR_ZONE_S:
         return f"{offset_s:+.1f} s, which is no time zone: it is counted from somewhere else"
     parts = [f"{zone / _HOUR_S:+g} h (time zone)"] if zone else []

@@ -107,6 +107,41 @@ def test_marks_in_a_wrong_time_zone_or_in_utc_are_found_and_said(tmp_path, shift
     assert "by time" in said[0] and words in said[0] and "which is taken off" in said[0]
 
 
+@pytest.mark.parametrize("lost", [0, 2])
+def test_marks_numbered_anew_after_a_loss_are_joined_by_the_positions(tmp_path, lost):
+    """Exposures at equal intervals: the numbers fit the times as well, shifted by one."""
+    steady = Flight()
+    steady.time = BEGIN_S + 3.0 * np.arange(10)
+    left = [k for k in ALL if k != lost]
+    file = read_marks(written(tmp_path / "a.MRK", "".join(steady.mark(k, n + 1) for n, k in enumerate(left))))
+    receiver = [moved(g, np.array([0.8, -0.6, 0.0])) for g in steady.camera]
+    own = [steady.photograph(k, gps=receiver[k]) for k in ALL]
+    taken, said = with_exposures(own, [file])
+    assert all(same(taken[k].gps, steady.camera[k]) for k in left) and taken[lost] == own[lost], said
+    assert "by time" in said[0]
+    blind = [p._replace(gps=None) for p in own]
+    taken, said = with_exposures(blind, [file])
+    if lost:
+        assert all(same(taken[k].gps, steady.camera[k]) for k in left)
+    else:
+        assert taken == blind and "no position tells which; not used" in said[0]
+        # Numbers that begin with 2 were kept.
+        kept = read_marks(written(tmp_path / "b.MRK", "".join(steady.mark(k) for k in left)))
+        taken, said = with_exposures(blind, [kept])
+        assert all(same(taken[k].gps, steady.camera[k]) for k in left) and "by number" in said[0]
+
+
+def test_marks_of_another_day_need_positions_that_prove_the_clock(tmp_path):
+    file = read_marks(written(tmp_path / "a.MRK", "".join(FLIGHT.mark(k, shift_s=-3 * 86400) for k in ALL)))
+    own = [FLIGHT.photograph(k) for k in ALL]
+    for unproven in ([p._replace(gps=None) for p in own], [p._replace(gps=moved(p.gps, ARM * 200)) for p in own]):
+        taken, said = with_exposures(unproven, [file])
+        assert taken == unproven and "its times are 3.1 days before those of the photographs" in said[0]
+    taken, said = with_exposures(own, [file])
+    assert all(same(p.gps, c) for p, c in zip(taken, FLIGHT.camera, strict=True))
+    assert "+3.08 days, which no time zone explains" in said[0] and "leave the file out" in said[0]
+
+
 def test_marks_of_another_flight_are_not_used(tmp_path):
     file = read_marks(written(tmp_path / "a.MRK", "".join(FLIGHT.mark(k) for k in ALL)))
     away = [FLIGHT.photograph(k, gps=moved(FLIGHT.camera[k], np.array([900.0, 0, 0]))) for k in ALL]

@@ -8,10 +8,10 @@ from jaxtyping import Float, Int
 
 from jaxphoto.errors import few
 from jaxphoto.georeferencing.camera_attitude import CameraAttitude, level_from_body
-from jaxphoto.georeferencing.exposure_times import WEEK_S, Matched
+from jaxphoto.georeferencing.exposure_times import DAY_S, WEEK_S, ZONES_S, Matched
 from jaxphoto.georeferencing.gps import moved
 from jaxphoto.io.exposures.interpolated import interpolated
-from jaxphoto.io.exposures.joining import FINE_S, Clock, by_number, by_time, clock_of, distance
+from jaxphoto.io.exposures.joining import FINE_S, Clock, by_marks, by_time, clock_of, distance
 from jaxphoto.io.exposures.records import Exposures
 from jaxphoto.io.exposures.wording import counts, fixes, joined_words, why_not
 from jaxphoto.io.photographs import Photograph
@@ -23,6 +23,8 @@ Arm = tuple[float, float, float]
 _TRACK = 3
 # Positions that are farther from those of the photographs' own files are of another flight.
 _FAR_M = 200.0
+# Positions without corrections are within it, for the most part, of those with them.
+_SAME_M = 5.0
 # Times that tell a position: at 10 m/s a centimetre.
 _EXACT_S = 1e-3
 
@@ -72,15 +74,12 @@ def with_exposures(photographs: Sequence[Photograph], files: Sequence[Exposures]
 
 
 def _marked(state: _State, file: Exposures) -> tuple[_State, str]:
-    """Time marks of DJI: by the number in the name where the times agree, else by times."""
+    """Time marks of DJI: by the number in the name where times and positions agree, else by times."""
     clock = clock_of(state.photographs)
-    how, found = "by number", by_number(state.photographs, file, clock)
-    if found is None:
-        how, timed = "by time", by_time(state.photographs, file, clock)
-        if not isinstance(timed, Matched):
-            return state, why_not(timed)
-        found = timed
-    if other := _of_another_flight(state, file, found.exposure):
+    found, how = by_marks(state.photographs, file, clock)
+    if not isinstance(found, Matched):
+        return state, why_not(found)
+    if other := _of_another_flight(state, file, found.exposure) or _of_another_day(state, file, found):
         return state, other
     return _taken_over(state, file, found.exposure), joined_words(state.photographs, file, found, clock, how)
 
@@ -93,7 +92,7 @@ def _events(state: _State, file: Exposures, arm: Arm | None) -> tuple[_State, st
     found = by_time(state.photographs, file, clock)
     if not isinstance(found, Matched):
         return state, why_not(found)
-    if other := _of_another_flight(state, file, found.exposure):
+    if other := _of_another_flight(state, file, found.exposure) or _of_another_day(state, file, found):
         return state, other
     new, armed = _at_camera(state, file, found.exposure, arm)
     return new, f"{joined_words(state.photographs, file, found, clock)}; {armed}"
@@ -210,11 +209,26 @@ def _aircraft(photograph: Photograph) -> Float[np.ndarray, "3 3"] | None:
 def _of_another_flight(state: _State, file: Exposures, exposure: Int[np.ndarray, "n"]) -> str:
     """Why a file is not used whose positions are far from the photographs' own; "" where they are not."""
     far = distance(state.photographs, file, exposure)
-    if far <= _FAR_M:
+    if far is None or far <= _FAR_M:
         return ""
-    if distance(state.photographs, file._replace(place=file.place[:, [1, 0, 2]]), exposure) <= _FAR_M:
+    back = distance(state.photographs, file._replace(place=file.place[:, [1, 0, 2]]), exposure)
+    if back is not None and back <= _FAR_M:
         return (
             "its longitudes and latitudes have changed places, as the photographs' own positions show; not used: "
             "exchange the two in the file"
         )
     return f"its positions are {far:,.0f} m from those of the photographs, as of another flight; not used"
+
+
+def _of_another_day(state: _State, file: Exposures, found: Matched) -> str:
+    """Why a file is not used whose times no clock of the day of the photographs shows; "" where positions prove it."""
+    if not abs(found.offset_s) > ZONES_S:
+        return ""
+    near = distance(state.photographs, file, found.exposure)
+    if near is not None and near <= _SAME_M:
+        return ""
+    when = "before" if found.offset_s > 0 else "after"
+    return (
+        f"its times are {abs(found.offset_s) / DAY_S:.1f} days {when} those of the photographs, as of another day, and "
+        "no positions prove that only the clock is wrong; not used"
+    )

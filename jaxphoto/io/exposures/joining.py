@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxphoto.georeferencing.exposure_times import LEAP_SECONDS, Ambiguous, Matched, match_times
+from jaxphoto.georeferencing.exposure_times import LEAP_SECONDS, WORSE, Ambiguous, Matched, match_times
 from jaxphoto.io.exposures.records import Exposures
 from jaxphoto.io.photographs import Photograph
 
@@ -42,6 +42,37 @@ def clock_of(photographs: Sequence[Photograph]) -> Clock:
     return Clock(np.array(times), told, _COARSE_S if coarse else FINE_S)
 
 
+def by_marks(
+    photographs: Sequence[Photograph], file: Exposures, clock: Clock
+) -> tuple[Matched | Ambiguous | None, str]:
+    """What numbers or times join, and "by number" or "by time".
+
+    A file that was numbered anew after it lost an exposure gives the others those of their neighbours: numbers count
+    where times do not bring the photographs' own positions nearer, and, where none are known, of a file that cannot
+    be such a one.
+    """
+    numbered, timed = by_number(photographs, file, clock), by_time(photographs, file, clock)
+    if numbered is None:
+        return timed, "by time"
+    off = distance(photographs, file, numbered.exposure)
+    if off is None and _perhaps_anew(photographs, file):
+        return timed, "by time"
+    if off is not None and isinstance(timed, Matched):
+        joined = (numbered.exposure >= 0) & (timed.exposure >= 0)
+        nearer = distance(photographs, file, timed.exposure)
+        if nearer is not None and off > WORSE * nearer and (numbered.exposure != timed.exposure)[joined].any():
+            return timed, "by time"
+    return numbered, "by number"
+
+
+def _perhaps_anew(photographs: Sequence[Photograph], file: Exposures) -> bool:
+    """Whether the numbers of a file run from 1 without a gap, and end before those of the photographs do."""
+    assert file.sequence is not None
+    n = len(file.sequence)
+    numbers = [int(found[1]) for p in photographs if (found := _NUMBER.search(p.name))]
+    return np.array_equal(np.sort(file.sequence), np.arange(1, n + 1)) and max(numbers, default=0) > n
+
+
 def by_number(photographs: Sequence[Photograph], file: Exposures, clock: Clock) -> Matched | None:
     """What the numbers in the names join; None where they are none, not single, or contradict the times.
 
@@ -72,11 +103,11 @@ def by_time(photographs: Sequence[Photograph], file: Exposures, clock: Clock) ->
     return match_times(clock.time_s, file.time_s, clock.tolerance_s, at, there)
 
 
-def distance(photographs: Sequence[Photograph], file: Exposures, exposure: Int[np.ndarray, "n"]) -> float:
-    """The median distance (m, in plan) of exposures to the photographs' own positions; 0 where none are known."""
+def distance(photographs: Sequence[Photograph], file: Exposures, exposure: Int[np.ndarray, "n"]) -> float | None:
+    """The median distance (m, in plan) of exposures to the photographs' own positions; None where none are known."""
     at, there = _level(photographs, file.place)
     d = np.linalg.norm(at - there[exposure], axis=1)[exposure >= 0]
-    return float(np.median(d[np.isfinite(d)])) if np.isfinite(d).any() else 0.0
+    return float(np.median(d[np.isfinite(d)])) if np.isfinite(d).any() else None
 
 
 def _level(photographs: Sequence[Photograph], place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

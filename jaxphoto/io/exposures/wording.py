@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Int
 
 from jaxphoto.errors import few
-from jaxphoto.georeferencing.exposure_times import Ambiguous, Matched, clock_words
-from jaxphoto.io.exposures.joining import FINE_S, Clock
+from jaxphoto.georeferencing.exposure_times import ZONES_S, Ambiguous, Matched, clock_words
+from jaxphoto.io.exposures.joining import FINE_S, Clock, distance
 from jaxphoto.io.exposures.records import Exposures
 from jaxphoto.io.photographs import Photograph
 
@@ -25,7 +25,11 @@ def joined_words(
     small = _SMALL_S if clock.tolerance_s > FINE_S else FINE_S
     if clock.gps and abs(found.offset_s) <= small:
         return words
-    return f"{words}; the clocks of photographs and file differ by {clock_words(found.offset_s)}, which is taken off"
+    differ = f"the clocks of photographs and file differ by {clock_words(found.offset_s)}"
+    if abs(found.offset_s) > ZONES_S:
+        near = distance(photographs, file, found.exposure)
+        return f"{words}; {differ}; positions agree to {near:.1f} m: leave the file out if it is of another day"
+    return f"{words}; {differ}, which is taken off"
 
 
 def why_not(result: Ambiguous | None) -> str:
