@@ -34,6 +34,8 @@ over the minutes of a flight most errors of GPS are common (SPS Performance Stan
 _SAMPLES = 200
 # Of the median distance of all from where they should be: six standard deviations of a normal error in space.
 _BEYOND = 4.0
+# Of its own standard deviations, in space: one position in a thousand is farther off.
+_BEYOND_OWN = 4.0
 _LEAST = 3
 # With attitudes, which give the turn.
 _LEAST_TURNED = 2
@@ -85,12 +87,14 @@ def georeference_photographs(
     there = np.asarray(block.start.unknowns.exterior.position, float)[image]
     recorded = recorded_turn(block, attitudes or {}, dict(zip(known, places, strict=True)), frame)
     given = np.array([gps.stated_sigma_m or SIGMA_M for gps in known.values()])
+    # Where no file says how good its positions are, they are judged by one another alone.
+    own = given if any(gps.stated_sigma_m for gps in known.values()) else np.zeros_like(given)
     helping = None
     if isinstance(recorded, RecordedTurn):
-        similarity, used = _turned(there, here, recorded.turn)
+        similarity, used = _turned(there, here, recorded.turn, own)
         helping = recorded if recorded.turn_sigma_rad < _turn_sigma(here[used], given[used]) else None
     if helping is None:
-        similarity, used = _agreeing(there, here)
+        similarity, used = _agreeing(there, here, own)
     sigma = _sigmas(list(known.values()), (here - similarity.of(there))[used])
     similarity = _nearest(similarity, there[used], here[used], sigma[used], helping)
     rows, axis = np.flatnonzero(used).repeat(3), np.tile(np.arange(3), used.sum())
@@ -121,7 +125,10 @@ def _turn_sigma(here: Float[np.ndarray, "n 3"], sigma: Float[np.ndarray, "n 3"])
 
 
 def _turned(
-    there: Float[np.ndarray, "n 3"], here: Float[np.ndarray, "n 3"], turn: Float[np.ndarray, "3 3"]
+    there: Float[np.ndarray, "n 3"],
+    here: Float[np.ndarray, "n 3"],
+    turn: Float[np.ndarray, "3 3"],
+    own: Float[np.ndarray, "n 3"],
 ) -> tuple[Similarity, np.ndarray]:
     """Scale and shift of most positions where the turn is known, and which positions agree."""
     a = there @ turn.T
@@ -130,8 +137,7 @@ def _turned(
     scale = float(np.median(np.linalg.norm(here[one] - here[other], axis=1)[length > 0] / length[length > 0]))
     found, used = Similarity(np.median(here - scale * a, axis=0), turn, scale), np.ones(len(here), bool)
     for _ in range(10):
-        off = np.linalg.norm(here - found.of(there), axis=1)
-        agree = off <= max(_BEYOND * float(np.median(off)), 1e-9)
+        agree = _agree(here - found.of(there), own)
         b, c = a[agree] - a[agree].mean(axis=0), here[agree] - here[agree].mean(axis=0)
         scale = float(np.sum(b * c) / np.sum(b * b))
         found = Similarity(here[agree].mean(axis=0) - scale * a[agree].mean(axis=0), turn, scale)
@@ -153,7 +159,16 @@ def utm_of(longitude_deg: float, latitude_deg: float) -> int:
     return int(found[0].code)
 
 
-def _agreeing(there: Float[np.ndarray, "n 3"], here: Float[np.ndarray, "n 3"]) -> tuple[Similarity, np.ndarray]:
+def _agree(offsets: Float[np.ndarray, "n 3"], own: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
+    """Which are no farther off than most, or than their own standard deviations allow (zero: these are not known)."""
+    off = np.linalg.norm(offsets, axis=1)
+    allowed = np.linalg.norm(offsets / np.maximum(own, 1e-9), axis=1) <= _BEYOND_OWN
+    return (off <= max(_BEYOND * float(np.median(off)), 1e-9)) | allowed
+
+
+def _agreeing(
+    there: Float[np.ndarray, "n 3"], here: Float[np.ndarray, "n 3"], own: Float[np.ndarray, "n 3"]
+) -> tuple[Similarity, np.ndarray]:
     """The similarity of most positions, and which agree with it (least median of distances, then least squares)."""
     n = len(here)
     distance = lambda s: np.linalg.norm(here - s.of(there), axis=1)  # noqa: E731
@@ -169,8 +184,7 @@ def _agreeing(there: Float[np.ndarray, "n 3"], here: Float[np.ndarray, "n 3"]) -
     best = min([whole, *tried], key=lambda s: float(np.median(distance(s))))
     used = np.ones(n, bool)
     for _ in range(10):
-        off = distance(best)
-        agree = off <= _BEYOND * np.median(off)
+        agree = _agree(here - best.of(there), own)
         found = similarity_between(there[agree], here[agree])
         if found is None or (agree == used).all():
             break

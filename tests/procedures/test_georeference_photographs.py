@@ -75,6 +75,21 @@ def test_positions_that_jump_are_named_and_left_out():
     assert set(np.asarray(found.block.stations.sigma)) == {0.02, 0.04}
 
 
+@pytest.mark.parametrize("stated", [(2.0, 2.0, 4.0), None])
+def test_positions_within_their_own_standard_deviations_contradict_nothing(stated):
+    """Corrected positions for most, metres for the rest: what is 2 m off of these is used, what is 60 m off is not."""
+    block, truth = network()
+    position = np.array(truth.exterior.position)
+    position[[1, 3, 6]] += [[1.6, -1.1, 2.0], [-0.9, 1.4, -3.0], [60.0, 0.0, 0.0]]
+    known = recorded(position, block.images, (0.02, 0.02, 0.04))
+    rest = {block.images[k] for k in (1, 3, 6)}
+    found = georeference_photographs(
+        block, {n: g._replace(sigma_m=stated) if n in rest else g for n, g in known.items()}
+    )
+    assert np.flatnonzero(~found.used).tolist() == [6]
+    assert np.median(np.abs(found.offsets_m)) < 0.3
+
+
 def test_too_few_positions_and_those_on_a_line_are_refused():
     block, truth = network()
     known = recorded(np.asarray(truth.exterior.position), block.images)
