@@ -116,6 +116,17 @@ image,X_m,Y_m,Z_m,omega_deg,phi_deg,kappa_deg,sigma_X_m,sigma_Y_m,sigma_Z_m,sigm
 a.JPG,500010.5,6170000.25,120.5,1.5,-2.25,91,0.02,0.02,0.04,0.1,0.1,0.5,fixed
 b.JPG,500030.5,6170000.75,120.75,0.5,-1.25,90,,,,,,,
 """
+GEO_TXT = """EPSG:32633
+a.JPG 500010.5 6170000.25 120.5 91 1.5 -2.25 0.02 0.04
+b.JPG 500030.5 6170000.75 120.75 0 0 0 0.02 0.04 spare
+"""
+REFERENCE = """# Cameras (2)
+#CoordinateSystem: GEOGCS["WGS 84",DATUM["World Geodetic System 1984",SPHEROID["WGS 84",6378137,298.257223563]],PRIMEM["Greenwich",0],UNIT["degree",0.01745329251994328],AUTHORITY["EPSG","4326"]]
+#Label,Enable,X/Longitude,Y/Latitude,Z/Altitude,Yaw,Pitch,Roll,X_acc_(m),Y_acc_(m),Z_acc_(m),Yaw_acc,Pitch_acc,Roll_acc
+a.JPG,1,15.001,55.7,120.5,91,1.5,-2.25,0.02,0.02,0.04,1,1,1
+b.JPG,1,15.002,55.7,120.75,,,,0.02,0.02,0.04,,,
+# Total Error,,
+"""  # noqa: E501
 XMP = """<?xpacket begin=""?><rdf:Description rdf:about="DJI Meta Data" drone-dji:AltitudeType="RtkAlt"
  drone-dji:AbsoluteAltitude="+139.231" drone-dji:RelativeAltitude="+80.012" drone-dji:GimbalRollDegree="+180.00"
  drone-dji:GimbalYawDegree="-92.70" drone-dji:GimbalPitchDegree="-90.00" drone-dji:FlightYawDegree="+87.20"

@@ -5,6 +5,7 @@ from datetime import datetime, timedelta
 import numpy as np
 import pytest
 from PIL import Image
+from pyproj import CRS
 
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing.camera_attitude import CameraAttitude, level_from_belly
@@ -238,10 +239,12 @@ TABLE = "image,longitude_deg,latitude_deg,height_m,omega_deg,phi_deg,kappa_deg,s
 def test_a_table_by_name(tmp_path):
     gps = FLIGHT.camera[2]
     row = f"{gps.longitude_deg!r},{gps.latitude_deg!r},{gps.altitude_m!r}"
-    file = written(tmp_path / "t.csv", TABLE + f"DJI_0003.JPG,{row},0,0,-40,0.02,0.03,0.05,fixed\nother,{row},,,,,,,\n")
+    file = written(
+        tmp_path / "t.csv", TABLE + f"DJI_0003.JPG,{row},0,0,-40,0.02,0.03,0.05,fixed\nother,{row},,,1,,,,\n"
+    )
     with pytest.raises(InputError, match="omega_deg is empty"):
         read_table(file)
-    file = written(tmp_path / "t.csv", file.read_text().replace(",,,,,,,\n", ",1,2,3,,,,\n"))
+    file = written(tmp_path / "t.csv", file.read_text().replace(",,,1,,,,\n", ",,,,,,,\n"))
     found = read_table(file, heights="geoid")
     taken, said = with_exposures([FLIGHT.photograph(k) for k in ALL], [found])
     assert taken[2].gps == gps._replace(sigma_m=(0.02, 0.03, 0.05), heights="geoid", fix="fixed")
@@ -277,6 +280,90 @@ def test_a_table_on_the_map_counts_yaw_from_grid_north(tmp_path):
     level = found.attitude[0].level_from_camera
     yaw = np.degrees(np.arctan2(level[0, 1], level[1, 1]))
     assert yaw == pytest.approx(10 + 1.5 * np.sin(np.deg2rad(57)), abs=1e-3)
+
+
+TURNED = (40.0, 5.0, -3.0)
+"""Yaw, pitch and roll of all photographs in the tables of other programs."""
+BELLY, ZONE = "{},{},{}".format(*TURNED), 32633
+
+
+def on_the_map(k):
+    gps = FLIGHT.camera[k]
+    frame = MapFrame(ZONE, None, (ORIGIN.longitude_deg, ORIGIN.latitude_deg, 0.0))
+    return frame.map(frame.local_from_place(np.array([[gps.longitude_deg, gps.latitude_deg, gps.altitude_m]])))[0]
+
+
+def grid_angles(k):
+    """omega, phi, kappa against grid north, which lies east of true north by about dL sin(B)."""
+    g = np.deg2rad((FLIGHT.camera[k].longitude_deg - 15) * np.sin(np.deg2rad(FLIGHT.camera[k].latitude_deg)))
+    grid_from_level = np.array([[np.cos(g), -np.sin(g), 0], [np.sin(g), np.cos(g), 0], [0, 0, 1]])
+    r = (grid_from_level @ level_from_belly(*TURNED)).T
+    return np.rad2deg([np.arctan2(-r[2, 1], r[2, 2]), np.arcsin(r[2, 0]), np.arctan2(-r[1, 0], r[0, 0])])
+
+
+def table_of(head, row, between=","):
+    """Of six photographs: `row` is given the name, longitude, latitude, height, then X, Y, then omega, phi, kappa."""
+    lines = []
+    for k in range(6):
+        gps, (x, y, _) = FLIGHT.camera[k], on_the_map(k)
+        cells = (f"DJI_{k + 1:04}.JPG", gps.longitude_deg, gps.latitude_deg, gps.altitude_m, x, y, *grid_angles(k))
+        lines.append(row.format(*cells).replace(",", between))
+    return head.replace(",", between) + "\n" + "\n".join(lines) + "\n"
+
+
+PIX4D = "imagename,latitude,longitude,altitude,accuracy horizontal,accuracy vertical"
+METASHAPE = "#Label,X/Longitude,Y/Latitude,Z/Altitude,Yaw,Pitch,Roll,X_acc_(m),Y_acc_(m),Z_acc_(m),X_est"
+UTM = "+proj=utm +zone=33 +ellps=WGS84 +datum=WGS84 +units=m +no_defs"
+OTHERS = {
+    "pix4d": (table_of(PIX4D, "{0},{2},{1},{3},0.02,0.05"), False, True),
+    "pix4d-ypr": (table_of(f"{PIX4D},yaw,pitch,roll", "{0},{2},{1},{3},0.02,0.05," + BELLY), True, True),
+    "pix4d-map": (table_of("# EPSG:32633\nimagename,x,y,z,yaw,pitch,roll", "{0},{4},{5},{3}," + BELLY), True, False),
+    "metashape": (table_of(METASHAPE, "{0},{1},{2},{3}," + BELLY + ",0.02,0.02,0.05,7"), True, True),
+    "odm": (table_of("EPSG:4326", "{0},{1},{2},{3}," + BELLY + ",0.02,0.05", " "), True, True),
+    "odm-map": (table_of(UTM, "{0},{4},{5},{3},0,0,0,0.02,0.05", "\t"), False, True),
+    "opk": (
+        table_of("# X Y Z (m) of EPSG:32633\nimageName,X,Y,Z,Omega,Phi,Kappa", "{0},{4},{5},{3},{6},{7},{8}", "\t"),
+        True,
+        False,
+    ),
+    "ours": (table_of("IMAGE,Longitude_deg,Latitude_deg,Height_m", "{0},{1},{2},{3}").lower(), False, False),
+    "blanks": (table_of("image,longitude_deg,latitude_deg,height_m", "{0},{1},{2},{3}", "  "), False, False),
+}
+
+
+@pytest.mark.parametrize("form", OTHERS)
+def test_tables_of_other_programs(tmp_path, form):
+    text, turned, stated = OTHERS[form]
+    found = read_table(written(tmp_path / "a.txt", text))
+    taken, said = with_exposures([FLIGHT.photograph(k) for k in ALL], [found])
+    assert "positions of 6 of 10 photographs" in said[0]
+    assert all(same(taken[k].gps, FLIGHT.camera[k]) for k in range(6))
+    assert {p.gps.sigma_m for p in taken[:6]} == {(0.02, 0.02, 0.05) if stated else None}
+    for p in taken[:6]:
+        assert (p.attitude is not None) == turned
+        if turned:
+            np.testing.assert_allclose(p.attitude.level_from_camera, level_from_belly(*TURNED), atol=2e-5)
+
+
+def test_tables_that_nobody_can_know_are_refused(tmp_path):
+    for text, words in (
+        (table_of("imageName,X,Y,Z", "{0},{4},{5},{3}"), "are map coordinates; give the EPSG code"),
+        (table_of("#imagename,coordinate1,coordinate2,z", "{0},{1},{2},{3}"), "the column image is missing"),
+        (table_of("imagename,latitude,longitude", "{0},{2},{1}"), "its header names no heights"),
+        (table_of("label,lon,lat,z,omega [gon],phi,kappa", "{0},{1},{2},{3},0,0,0"), "its angles are in gon"),
+        (table_of("EPSG:4326", "{0},{1}", " "), r"row 2: after the name stand x, y, z"),
+        (table_of("EPSG:4326", "{0},{1},{2}", " "), "row 2: Z_m is empty"),
+    ):
+        with pytest.raises(InputError, match=words):
+            read_table(written(tmp_path / "a.txt", text))
+
+
+def test_rows_that_are_switched_off_are_left_out(tmp_path):
+    wkt = CRS.from_epsg(ZONE).to_wkt("WKT1_GDAL").replace("\n", "")
+    text = table_of(f"#CoordinateSystem: {wkt}\n#Label,Enable,X/Easting,Y/Northing,Z/Altitude", "{0},1,{4},{5},{3}")
+    found = read_table(written(tmp_path / "a.txt", text.replace("0002.JPG,1", "0002.JPG,0")))
+    assert found.names == ("DJI_0001", "DJI_0003", "DJI_0004", "DJI_0005", "DJI_0006")
+    assert same(found.gps(1), FLIGHT.camera[2])
 
 
 def test_a_folder_of_pictures_and_all_that_lies_in_it(tmp_path):

@@ -19,7 +19,8 @@ from jaxphoto.io.control_files.rows import Cells, SurveyRows, read_marks
 from jaxphoto.io.text_tables import is_number
 from jaxphoto.procedures.control.surveyed import GivenControl
 
-_SYSTEM = re.compile(r"EPSG:\d|\+proj=|WGS84\s+UTM\s", re.IGNORECASE)
+SYSTEM = re.compile(r"EPSG:\d|\+proj=|WGS84\s+UTM\s", re.IGNORECASE)
+"""How the first line of a file of OpenDroneMap begins."""
 _LEAST = 6
 # From the centre of the upper-left pixel to its corner.
 _HALF = 0.5
@@ -29,7 +30,7 @@ def recognises(lines: list[str]) -> bool:
     """Whether the first line names a system and the next has a mark."""
     cells = lines[1].split() if len(lines) > 1 else []
     numbers = len(cells) >= _LEAST and all(map(is_number, cells[:5]))
-    return bool(_SYSTEM.match(lines[0].strip())) and (numbers or len(lines) == 1)
+    return bool(SYSTEM.match(lines[0].strip())) and (numbers or len(lines) == 1)
 
 
 def read_gcp_list(path: Path, lines: list[str], rows: list[int]) -> GivenControl:

@@ -13,15 +13,21 @@ from collections.abc import Sequence
 
 from jaxphoto.io.text_tables import is_number
 
-_POINT = {
-    "point": ("label", "point", "gcp", "gcp label", "gcp name", "point name", "marker", "name", "point id", "id"),
+PLACE = {
     "x": ("x", "easting", "east", "e", "longitude", "lon", "long"),
     "y": ("y", "northing", "north", "n", "latitude", "lat"),
     "z": ("z", "altitude", "height", "elevation", "h"),
-    "sigma_x": ("sigma x", "accuracy x", "x accuracy", "sigma", "accuracy"),
-    "sigma_y": ("sigma y", "accuracy y", "y accuracy"),
-    "sigma_z": ("sigma z", "accuracy z", "z accuracy", "accuracy vert", "accuracy vertical", "vertical accuracy"),
+    "sigma_x": ("sigma x", "accuracy x", "x accuracy", "x acc", "sigma", "accuracy"),
+    "sigma_y": ("sigma y", "accuracy y", "y accuracy", "y acc"),
+    "sigma_z": (
+        "sigma z", "accuracy z", "z accuracy", "z acc", "accuracy vert", "accuracy vertical", "vertical accuracy",
+    ),
     "sigma_plan": ("sigma plan", "accuracy x/y", "accuracy horz", "accuracy horizontal", "horizontal accuracy"),
+}  # fmt: skip
+"""The words of coordinates and their standard deviations."""
+_POINT = {
+    "point": ("label", "point", "gcp", "gcp label", "gcp name", "point name", "marker", "name", "point id", "id"),
+    **PLACE,
     "role": ("role", "type"),
     "enabled": ("enable", "enabled"),
 }
@@ -46,19 +52,19 @@ Columns = dict[str, int]
 
 def point_columns(header: Sequence[str]) -> Columns | None:
     """Of a table of points; None where these are not the words of one."""
-    found = _columns(header, _POINT)
-    return found if {"point", "x", "y"} <= set(found) and "image" not in _columns(header, _MARK) else None
+    found = columns_of(header, _POINT)
+    return found if {"point", "x", "y"} <= set(found) and "image" not in columns_of(header, _MARK) else None
 
 
 def feature_columns(header: Sequence[str]) -> Columns | None:
     """Of attributes of points that have a geometry: a photograph among them shows the point, and measures nothing."""
-    found = _columns(header, _POINT)
+    found = columns_of(header, _POINT)
     return found if {"point", "x", "y"} <= set(found) and not _OF_IMAGES & set(map(str.lower, header)) else None
 
 
 def mark_columns(header: Sequence[str]) -> Columns | None:
     """Of a table of marks."""
-    found = _columns(header, _MARK)
+    found = columns_of(header, _MARK)
     return found if {"image", "point", "x", "y"} <= set(found) else None
 
 
@@ -81,7 +87,7 @@ def in_degrees(header: Sequence[str], columns: Columns) -> bool:
     return {"longitude", "lon", "long", "latitude", "lat"} & set(_words(header[columns["x"]])) != set()
 
 
-def _columns(header: Sequence[str], known: dict[str, tuple[str, ...]]) -> Columns:
+def columns_of(header: Sequence[str], known: dict[str, tuple[str, ...]]) -> Columns:
     """The first column whose words mean each; a column means one thing only."""
     words = [_words(cell) for cell in header]
     found: Columns = {}

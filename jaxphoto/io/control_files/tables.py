@@ -42,9 +42,9 @@ def read_table(path: Path, lines: list[str], rows: list[int]) -> SurveyedPoints 
     said = [match[1].strip() for line in lines[:_HEAD] for of in (_EPSG, _WKT) if (match := of.match(line.strip()))]
     content = [(line, row) for line, row in zip(lines, rows, strict=True) if not line.lstrip().startswith("#")]
     comments = [line for line in lines[:_HEAD] if line.lstrip().startswith("#")]
-    separator = _separator(content[0][0] if content else "")
+    separator = separator_of(content[0][0] if content else "")
     cells = Cells(
-        path.name, [_split(path.name, line, row, separator) for line, row in content], [r for _, r in content]
+        path.name, [split_row(path.name, line, row, separator) for line, row in content], [r for _, r in content]
     )
     said_in = [line.strip().lstrip("#").strip().split(None if separator == " " else separator) for line in comments]
     width = len(cells.records[0]) if cells.records else 0
@@ -57,7 +57,7 @@ def read_table(path: Path, lines: list[str], rows: list[int]) -> SurveyedPoints 
             return _marks(own, marks, separator)
         if points and (is_row or max(points[name] for name in ("point", "x", "y")) < width):
             return read_points(own, points, separator, "".join(said[:1]), bool(in_degrees(header, points)))
-    found = columns_without_header(_dotted(cells, separator).records) if cells.records else None
+    found = columns_without_header(with_points(cells, separator).records) if cells.records else None
     if found is None:
         first = f" (it begins with {quoted(' '.join(cells.records[0]))})" if cells.records else ""
         raise cells.none(
@@ -75,7 +75,7 @@ def read_points(cells: Cells, columns: Columns, separator: str, system: str, deg
 
     Raises InputError for cells that are wrong, and where there is no row.
     """
-    cells, points = _dotted(cells, separator, columns["point"]), SurveyRows(cells.file)
+    cells, points = with_points(cells, separator, columns["point"]), SurveyRows(cells.file)
     for k, row in enumerate(cells.records):
         if len(row) <= max(columns["point"], columns["x"], columns["y"]):
             raise cells.bad(k, f"{len(row)} cells are too few for the header; complete the row")
@@ -104,7 +104,7 @@ def _is_check(cells: Cells, k: int, columns: Columns) -> bool:
 
 
 def _marks(cells: Cells, columns: Columns, separator: str) -> Marks:
-    cells = _dotted(cells, separator, columns["image"], columns["point"])
+    cells = with_points(cells, separator, columns["image"], columns["point"])
     found: list[Mark] = []
     for k, row in enumerate(cells.records):
         if len(row) <= max(v for name, v in columns.items() if name != "sigma"):
@@ -117,11 +117,13 @@ def _marks(cells: Cells, columns: Columns, separator: str) -> Marks:
     return read_marks(found)
 
 
-def _separator(line: str) -> str:
+def separator_of(line: str) -> str:
+    """What separates the cells of a row: a tab, a semicolon, a comma, else blanks."""
     return next((s for s in ("\t", ";", ",") if s in line), " ")
 
 
-def _split(file: str, line: str, row: int, separator: str) -> list[str]:
+def split_row(file: str, line: str, row: int, separator: str) -> list[str]:
+    """The cells of a row. Raises InputError for one that is too long, and for quotation marks that do not pair."""
     if len(line) > LONGEST_LINE:
         raise InputError(f"{file}, row {row}: the row has {len(line)} characters, at most {LONGEST_LINE}; correct it")
     if separator == " ":
@@ -136,7 +138,7 @@ def _split(file: str, line: str, row: int, separator: str) -> list[str]:
     return [cell.strip() for cell in cells]
 
 
-def _dotted(cells: Cells, separator: str, *text: int) -> Cells:
+def with_points(cells: Cells, separator: str, *text: int) -> Cells:
     """With points for decimal commas, which a separator other than a comma allows; not in the columns `text`."""
     if separator == ",":
         return cells

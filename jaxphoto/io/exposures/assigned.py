@@ -11,7 +11,7 @@ from jaxphoto.georeferencing.camera_attitude import CameraAttitude, level_from_b
 from jaxphoto.georeferencing.exposure_times import DAY_S, WEEK_S, ZONES_S, Matched
 from jaxphoto.georeferencing.gps import moved
 from jaxphoto.io.exposures.interpolated import interpolated
-from jaxphoto.io.exposures.joining import FINE_S, Clock, by_marks, by_time, clock_of, distance
+from jaxphoto.io.exposures.joining import FINE_S, Clock, by_marks, by_name, by_time, clock_of, distance
 from jaxphoto.io.exposures.records import Exposures
 from jaxphoto.io.exposures.wording import counts, fixes, joined_words, why_not
 from jaxphoto.io.photographs import Photograph
@@ -127,8 +127,7 @@ def _along(state: _State, file: Exposures, arm: Arm | None) -> tuple[_State, str
 
 
 def _by_name(state: _State, file: Exposures) -> tuple[_State, str]:
-    place = {name: k for k, name in enumerate(file.names)}
-    exposure = np.array([place.get(p.name, -1) for p in state.photographs])
+    exposure = by_name(state.photographs, file)
     if not (exposure >= 0).any():
         return state, f"none of its {len(file.names)} names is that of a photograph ({few(list(file.names))}); not used"
     if other := _of_another_flight(state, file, exposure):

@@ -42,6 +42,16 @@ def clock_of(photographs: Sequence[Photograph]) -> Clock:
     return Clock(np.array(times), told, _COARSE_S if coarse else FINE_S)
 
 
+def by_name(photographs: Sequence[Photograph], file: Exposures) -> Int[np.ndarray, "n"]:
+    """The exposure of the same name; small and capital letters are the same where that leaves all names different."""
+    wanted, names = [p.name for p in photographs], list(file.names)
+    folded = [name.lower() for name in wanted], [name.lower() for name in names]
+    if all(len(set(several)) == len(several) for several in folded):
+        wanted, names = folded
+    place = {name: k for k, name in enumerate(names)}
+    return np.array([place.get(name, -1) for name in wanted], int)
+
+
 def by_marks(
     photographs: Sequence[Photograph], file: Exposures, clock: Clock
 ) -> tuple[Matched | Ambiguous | None, str]:

@@ -15,7 +15,7 @@ from jaxphoto.io.exposures.table import read_table
 from jaxphoto.io.photographs import Photograph
 
 _SUFFIXES = (".mrk", ".pos", ".sbet")
-_TABLE = "exposures.csv"
+_TABLES = ("exposures.csv", "geo.txt")
 
 
 def located(
@@ -68,6 +68,7 @@ def read_exposures(path: Path, code: int | None = None, heights: Heights = "unkn
 
 
 def exposure_files(folder: Path) -> list[Path]:
-    """The files of a folder that say where its photographs were exposed: .MRK, .pos, .sbet and exposures.csv."""
-    found = (f for f in folder.iterdir() if f.suffix.lower() in _SUFFIXES or f.name.lower() == _TABLE)
+    """The files of a folder that say where its photographs were exposed: .MRK, .pos, .sbet, exposures.csv and
+    geo.txt."""
+    found = (f for f in folder.iterdir() if f.suffix.lower() in _SUFFIXES or f.name.lower() in _TABLES)
     return sorted(f for f in found if f.is_file())

@@ -1,6 +1,6 @@
-"""A table of exposures: CSV with a header, one line a photograph (docs/exposures.md)."""
+"""A table of exposures, one line a photograph: our own, a CSV with a header, or another's (docs/exposures.md)."""
 
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import get_args
 
 import jax
@@ -11,11 +11,11 @@ from jaxphoto.errors import InputError, quoted
 from jaxphoto.georeferencing.camera_attitude import USUAL_SIGMA_DEG, CameraAttitude, level_from_belly
 from jaxphoto.georeferencing.gps import Fix, Heights
 from jaxphoto.georeferencing.map_frame import MapFrame
+from jaxphoto.io.exposures.other_tables import GEOGRAPHIC, MAP, OtherTable, read_other_table
 from jaxphoto.io.exposures.records import Exposures, check_places
-from jaxphoto.io.text_tables import Table, read_csv
+from jaxphoto.io.text_tables import Table, content_lines, read_csv
 from jaxphoto.rotation import matrix_from_omega_phi_kappa
 
-_MAP, _PLACE = ("X_m", "Y_m", "Z_m"), ("longitude_deg", "latitude_deg", "height_m")
 _OPK, _RPY = ("omega_deg", "phi_deg", "kappa_deg"), ("roll_deg", "pitch_deg", "yaw_deg")
 _SIGMA_M = ("sigma_X_m", "sigma_Y_m", "sigma_Z_m")
 _SIGMA_OPK, _SIGMA_RPY = tuple(f"sigma_{name}" for name in _OPK), tuple(f"sigma_{name}" for name in _RPY)
@@ -27,23 +27,30 @@ def read_table(path: Path, code: int | None = None, heights: Heights = "unknown"
 
     Optional are omega_deg, phi_deg, kappa_deg or roll_deg, pitch_deg, yaw_deg (of the camera: all zero where it looks
     down with the top of its picture to the north that the coordinates have), standard deviations sigma_X_m ...
-    sigma_yaw_deg, and fix (fixed, float, single). Raises InputError, naming file and row.
+    sigma_yaw_deg, and fix (fixed, float, single). Tables of other programs are those of `other_tables`; a system that
+    they name counts, not `code`. Raises InputError, naming file and row.
     """
-    optional = (*_MAP, *_PLACE, *_OPK, *_RPY, *_SIGMA_M, *_SIGMA_OPK, *_SIGMA_RPY, "fix")
-    table = read_csv(path, ("image",), optional, text=("fix",))
-    ids = [Path(name).stem if "." in name else name for name in table.ids("image")]
+    own = _read_own(path)
+    table, system, true_north = own or read_other_table(path) or OtherTable(read_csv(path, ("image",)), None, False)
+    vertical = None
+    if system is not None and system.crs is not None:
+        code, vertical = system.code, system.vertical
+        heights = "ellipsoid" if vertical is not None or len(system.crs.axis_info) > 2 else heights
+    # Windows' strokes are read everywhere.
+    ids = [PureWindowsPath(name).stem for name in table.ids("image")]
     twice = {name for name in ids if ids.count(name) > 1} if len(set(ids)) < len(ids) else set()
     for line, name in enumerate(ids):
         if name in twice:
             raise table.bad(line, f"the image {quoted(name)} stands there twice; keep one of the lines")
-    on_map = _set_of(table, _MAP, _PLACE, "positions") is _MAP
+    on_map = _set_of(table, MAP, GEOGRAPHIC, "positions") is MAP
     if on_map and code is None:
         raise InputError(f"{path.name}: its positions are map coordinates; give the EPSG code of their system (--epsg)")
-    place = _columns(table, _MAP if on_map else _PLACE)
+    place = _columns(table, MAP if on_map else GEOGRAPHIC)
     turn = np.broadcast_to(np.eye(3), (len(place), 3, 3))
     if on_map and len(place):
         assert code is not None
-        place, turn = _from_map(path.name, table, place, code)
+        place, grid = _from_map(table, place, code, vertical)
+        turn = turn if true_north and _RPY[0] in table else grid
     check_places(path.name, table.rows, place)
     sigma = np.stack([table.sigmas(name) for name in _SIGMA_M], axis=1)
     return Exposures(
@@ -57,6 +64,16 @@ def read_table(path: Path, code: int | None = None, heights: Heights = "unknown"
         names=tuple(ids),
         attitude=tuple(_attitudes(table, turn)),
     )
+
+
+def _read_own(path: Path) -> OtherTable | None:
+    """A table whose header has the names of one set of positions, as they are; None for another."""
+    lines, _ = content_lines(path)
+    header = {cell.strip() for cell in lines[0].replace(";", ",").split(",")} if lines else set()
+    if not lines or "image" not in header or not any(header.issuperset(names) for names in (MAP, GEOGRAPHIC)):
+        return None
+    optional = (*MAP, *GEOGRAPHIC, *_OPK, *_RPY, *_SIGMA_M, *_SIGMA_OPK, *_SIGMA_RPY, "fix")
+    return OtherTable(read_csv(path, ("image",), optional, text=("fix",)), None, False)
 
 
 def _set_of(table: Table, one: tuple[str, ...], other: tuple[str, ...], what: str) -> tuple[str, ...] | None:
@@ -76,9 +93,9 @@ def _columns(table: Table, names: tuple[str, ...]) -> np.ndarray:
     return np.stack([table.numbers(name) for name in names], axis=1)
 
 
-def _from_map(file: str, table: Table, coordinates: np.ndarray, code: int) -> tuple[np.ndarray, np.ndarray]:
+def _from_map(table: Table, coordinates: np.ndarray, code: int, vertical: int | None) -> tuple[np.ndarray, np.ndarray]:
     """Longitude, latitude, height, and the turns from axes of the map's grid to those of true north."""
-    place = MapFrame(code, None, (0.0, 0.0, 0.0)).place(coordinates)
+    place = MapFrame(code, vertical, (0.0, 0.0, 0.0)).place(coordinates)
     for k in np.flatnonzero(~np.isfinite(place).all(axis=1))[:1]:
         raise table.bad(int(k), f"the coordinates lie where EPSG:{code} does not reach; correct them or the code")
     frame = MapFrame(code, None, (*np.median(place[:, :2], axis=0).tolist(), 0.0))
@@ -92,7 +109,11 @@ def _attitudes(table: Table, level_from_axes: np.ndarray):
     if names is None:
         yield from [None] * len(table)
         return
-    angles = _columns(table, names)
+    angles = np.stack([table.numbers(name, empty=True) for name in names], axis=1)
+    told = np.isfinite(angles)
+    for k in np.flatnonzero(told.any(axis=1) & ~told.all(axis=1))[:1]:
+        raise table.bad(int(k), f"{names[int(np.argmin(told[k]))]} is empty; give all three angles, or none")
+    angles = np.nan_to_num(angles)
     for k, axis in np.argwhere(np.abs(angles) > _LARGEST_DEG)[:1]:
         raise table.bad(int(k), f"{names[axis]} = {angles[k, axis]:g} is more than a turn; give degrees")
     sigma = np.stack([table.sigmas(name) for name in (_SIGMA_OPK if names is _OPK else _SIGMA_RPY)], axis=1)
@@ -102,9 +123,9 @@ def _attitudes(table: Table, level_from_axes: np.ndarray):
         turned = np.swapaxes(np.asarray(_matrices(np.deg2rad(angles))), 1, 2)
     else:
         turned = np.array([level_from_belly(yaw, pitch, roll) for roll, pitch, yaw in angles]).reshape(-1, 3, 3)
-    for matrix, own in zip(level_from_axes @ turned, sigma.tolist(), strict=True):
+    for matrix, own, known in zip(level_from_axes @ turned, sigma.tolist(), told[:, 0], strict=True):
         said = (own[0], own[1], own[2]) if np.isfinite(own).all() else USUAL_SIGMA_DEG
-        yield CameraAttitude(matrix, said)
+        yield CameraAttitude(matrix, said) if known else None
 
 
 def _fixes(table: Table):
