@@ -99,6 +99,8 @@ def one_height(
         found, more = above_ellipsoid(found, wanted)
         said += more
     elif wanted is not None:
+        if wanted == "take-off" and known:
+            said.append("no photograph notes a height above take-off: those of the files are taken as such (--heights)")
         found = {n: g and g._replace(heights=wanted) for n, g in found.items()}
     else:
         found, more = _joined(found, zero)

@@ -3,10 +3,11 @@
 | make | namespace | position | attitude |
 | --- | --- | --- | --- |
 | DJI | drone-dji | AbsoluteAltitude, RelativeAltitude, AltitudeType, RtkFlag, RtkStdLon to Hgt | GimbalYawDegree ... |
+| | | GpsLatitude, GpsLongitude or GpsLongtitude | |
 | Autel | drone, drone-autel | the same names | the same names, or Camera |
 | senseFly, Parrot, others | Camera (Pix4D) | GPSXYAccuracy, GPSZAccuracy | Yaw, Pitch, Roll, IMU...Accuracy |
 | Parrot | drone-parrot | | CameraYawDegree, CameraPitchDegree, CameraRollDegree |
-| Skydio | drone-skydio | AbsoluteAltitude | CameraOrientationNED: Yaw, Pitch, Roll |
+| Skydio | drone-skydio | Latitude, Longitude, AbsoluteAltitude, RelativeAltitude | CameraOrientationNED: Yaw ... |
 
 Sources: DJI, manuals of the Zenmuse P1 and the Mavic 3E ("XMP Data List": GimbalPitchDegree and others in north, east,
 down, order ZYX; RtkFlag 0 none, 16 single, 32 to 49 float, 50 fixed; AbsoluteAltitude "geodetic height"); Pix4D,
@@ -48,6 +49,7 @@ _FULL_TURN_DEG = 360.0
 class DroneRecord(NamedTuple):
     """What an XMP packet says; None where it does not."""
 
+    latitude_longitude_deg: tuple[float, float] | None = None
     altitude_m: float | None = None
     above_takeoff_m: float | None = None
     heights: Heights = "unknown"
@@ -87,13 +89,26 @@ def drone_record(fields: Mapping[str, str]) -> DroneRecord:
     space = next((s for s in _DJI_LIKE if any(key.startswith(f"{s}:") for key in fields)), "")
     record = _dji(fields, space) if space else DroneRecord()
     if (skydio := _number(fields, "drone-skydio:AbsoluteAltitude")) is not None:
-        record = record._replace(altitude_m=skydio)
+        record = record._replace(altitude_m=skydio, above_takeoff_m=_number(fields, "drone-skydio:RelativeAltitude"))
     plan, height = _number(fields, "Camera:GPSXYAccuracy"), _number(fields, "Camera:GPSZAccuracy")
     if record.sigma_m is None and plan and height and min(plan, height) > 0:
         record = record._replace(sigma_m=(plan, plan, height))
     if record.heights == "unknown":
         record = record._replace(heights=_vertical(fields))
-    return record._replace(attitude=_attitude(fields, space))
+    return record._replace(attitude=_attitude(fields, space), latitude_longitude_deg=_plan(fields, space))
+
+
+def _plan(fields: Mapping[str, str], space: str) -> tuple[float, float] | None:
+    for latitude, longitude in (
+        (f"{space}:GpsLatitude", f"{space}:GpsLongitude"),
+        # As DJI wrote it for years.
+        (f"{space}:GpsLatitude", f"{space}:GpsLongtitude"),
+        ("drone-skydio:Latitude", "drone-skydio:Longitude"),
+    ):
+        north, east = _number(fields, latitude), _number(fields, longitude)
+        if north is not None and east is not None:
+            return north, east
+    return None
 
 
 def _dji(fields: Mapping[str, str], space: str) -> DroneRecord:
@@ -108,7 +123,8 @@ def _dji(fields: Mapping[str, str], space: str) -> DroneRecord:
         altitude_m=number("AbsoluteAltitude"),
         above_takeoff_m=number("RelativeAltitude"),
         heights="ellipsoid" if ellipsoid else "unknown",
-        sigma_m=_three(sigma, least=0.0),
+        # Without corrections they are not those of the position.
+        sigma_m=None if flag == 0 else _three(sigma, least=0.0),
         fix=fix_of(flag),
         aircraft_deg=_three(flown, most=_FULL_TURN_DEG),
         utc=_utc(fields.get(f"{space}:UTCAtExposure", "")),

@@ -278,21 +278,29 @@ def _words(value: Any) -> str | None:
 
 
 def _gps(tags: dict, drone: DroneRecord) -> Gps | None:
-    """The position of EXIF with the height and what else the packet of the drone says; (0, 0) is a receiver's nothing.
+    """The position of EXIF, else of the drone's packet, with the height and what else that says.
 
-    Latitudes beyond the poles stay: `georeferencing.recorded_positions` knows two numbers that changed places.
+    (0, 0) is a receiver's nothing. Latitudes beyond the poles stay: `georeferencing.recorded_positions` knows two
+    numbers that changed places.
     """
     try:
         latitude, longitude = (_degrees(tags[k]) * _sign(tags.get(k - 1)) for k in (2, 4))
-        altitude = float(tags[6]) * (-1 if tags.get(5) in (1, b"\x01") else 1) if 6 in tags else None
     except (KeyError, TypeError, ValueError, ZeroDivisionError):
-        return None
+        if drone.latitude_longitude_deg is None:
+            return None
+        latitude, longitude = drone.latitude_longitude_deg
     if not (math.isfinite(latitude) and math.isfinite(longitude) and max(abs(latitude), abs(longitude)) <= 180):
         return None
-    if drone.altitude_m is not None:
-        altitude = drone.altitude_m
+    altitude = drone.altitude_m if drone.altitude_m is not None else _altitude(tags)
     known = altitude if altitude is not None and math.isfinite(altitude) else None
     return Gps(latitude, longitude, known, drone.sigma_m, drone.heights, drone.fix)
+
+
+def _altitude(tags: dict) -> float | None:
+    try:
+        return float(tags[6]) * (-1 if tags.get(5) in (1, b"\x01") else 1)
+    except (KeyError, TypeError, ValueError, ZeroDivisionError):
+        return None
 
 
 def _degrees(parts: Any) -> float:

@@ -4,10 +4,12 @@ from datetime import datetime
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from jaxphoto.georeferencing.camera_attitude import USUAL_SIGMA_DEG, level_from_belly, level_from_gimbal
 from jaxphoto.io.photograph_metadata import drone_record, xmp_fields
 from jaxphoto.io.photograph_times import taken
+from jaxphoto.io.photographs import read_photograph
 
 DJI = """<rdf:Description rdf:about="DJI Meta Data" drone-dji:GpsStatus="RTK" drone-dji:AltitudeType="RtkAlt"
  drone-dji:GpsLatitude="22.6939917" drone-dji:AbsoluteAltitude="+139.231" drone-dji:RelativeAltitude="+80.012"
@@ -58,7 +60,9 @@ def test_the_flag_says_the_solution(flag, fix):
 
 def test_without_corrections_nobody_says_what_the_height_is_above():
     plain = DJI.replace("RtkAlt", "GpsFusionAlt").replace('RtkFlag="50"', 'RtkFlag="0"')
-    assert record(plain).heights == "unknown"
+    found = record(plain)
+    # The standard deviations of a receiver's corrections, which it had not.
+    assert found.heights == "unknown" and found.sigma_m is None
     assert record(DJI.replace('GimbalReverse="0"', 'GimbalReverse="1"')).attitude is None
 
 
@@ -77,7 +81,27 @@ def test_other_makes():
         found = record(packet)
         np.testing.assert_allclose(found.attitude.level_from_camera, level_from_gimbal(101.5, -7.468572, 0.186841))
         assert found.attitude.sigma_deg == USUAL_SIGMA_DEG
-    assert record(SKYDIO).altitude_m == 1034.44191
+    found = record(SKYDIO.replace(" drone-skydio:Lat", ' drone-skydio:RelativeAltitude="34.5" drone-skydio:Lat'))
+    assert (found.altitude_m, found.above_takeoff_m, found.latitude_longitude_deg) == (1034.44191, 34.5, None)
+
+
+@pytest.mark.parametrize(
+    "packet",
+    [
+        DJI.replace('"22.6939917"', '"-47.25" drone-dji:GpsLongitude="+15.5"'),
+        DJI.replace('"22.6939917"', '"-47.25" drone-dji:GpsLongtitude="15.5"'),
+        SKYDIO.replace('Latitude="40.1"', 'Latitude="-47.25" drone-skydio:Longitude="15.5"'),
+    ],
+)
+def test_positions_of_packets_alone(tmp_path, packet):
+    picture = Image.new("L", (40, 30))
+    picture.save(tmp_path / "a.jpg", xmp=packet.encode())
+    found = read_photograph(tmp_path / "a.jpg").gps
+    assert found[:2] == (-47.25, 15.5) and found.altitude_m == record(packet).altitude_m
+    exif = Image.Exif()
+    exif.get_ifd(0x8825).update({1: "S", 2: (47, 30, 0), 3: "E", 4: (15, 30, 0)})
+    picture.save(tmp_path / "b.jpg", xmp=packet.encode(), exif=exif)
+    assert read_photograph(tmp_path / "b.jpg").gps.latitude_deg == -47.5
 
 
 def test_angles_that_are_none_are_no_attitude():
