@@ -132,6 +132,22 @@ def test_marks_numbered_anew_after_a_loss_are_joined_by_the_positions(tmp_path, 
         assert all(same(taken[k].gps, steady.camera[k]) for k in left) and "by number" in said[0]
 
 
+def test_marks_of_two_flights_that_both_count_from_one(tmp_path):
+    """The second flight repeats the intervals of the first: its numbers fit the first's photographs, too."""
+    both = Flight(20)
+    both.time[10:] = both.time[:10] + 600.0
+    both.camera[10:] = [moved(g, np.array([15.0, 3.0, 0.0])) for g in both.camera[:10]]
+    for name, first in (("a", 0), ("b", 10)):
+        written(tmp_path / f"{name}.MRK", "".join(both.mark(first + k, k + 1) for k in ALL))
+    files = [read_marks(tmp_path / f"{name}.MRK") for name in "ab"]
+    own = [both.photograph(k, gps=moved(both.camera[k], np.array([0.8, -0.6, 0.0]))) for k in range(20)]
+    taken, said = with_exposures(own, files)
+    assert all(same(p.gps, c) for p, c in zip(taken, both.camera, strict=True)), said
+    blind = [p._replace(gps=None) for p in own]
+    taken, said = with_exposures(blind, files)
+    assert taken == blind and all("no position tells which" in s for s in said)
+
+
 def test_marks_of_another_day_need_positions_that_prove_the_clock(tmp_path):
     file = read_marks(written(tmp_path / "a.MRK", "".join(FLIGHT.mark(k, shift_s=-3 * 86400) for k in ALL)))
     own = [FLIGHT.photograph(k) for k in ALL]
@@ -314,6 +330,7 @@ def table_of(head, row, between=","):
 PIX4D = "imagename,latitude,longitude,altitude,accuracy horizontal,accuracy vertical"
 METASHAPE = "#Label,X/Longitude,Y/Latitude,Z/Altitude,Yaw,Pitch,Roll,X_acc_(m),Y_acc_(m),Z_acc_(m),X_est"
 UTM = "+proj=utm +zone=33 +ellps=WGS84 +datum=WGS84 +units=m +no_defs"
+OPK = "# X Y Z (m) of EPSG:32633, heights above the ellipsoid\nimageName,X,Y,Z,Omega,Phi,Kappa"
 OTHERS = {
     "pix4d": (table_of(PIX4D, "{0},{2},{1},{3},0.02,0.05"), False, True),
     "pix4d-ypr": (table_of(f"{PIX4D},yaw,pitch,roll", "{0},{2},{1},{3},0.02,0.05," + BELLY), True, True),
@@ -322,7 +339,11 @@ OTHERS = {
     "odm": (table_of("EPSG:4326", "{0},{1},{2},{3}," + BELLY + ",0.02,0.05", " "), True, True),
     "odm-map": (table_of(UTM, "{0},{4},{5},{3},0,0,0,0.02,0.05", "\t"), False, True),
     "opk": (
-        table_of("# X Y Z (m) of EPSG:32633\nimageName,X,Y,Z,Omega,Phi,Kappa", "{0},{4},{5},{3},{6},{7},{8}", "\t"),
+        table_of(
+            "# X Y Z (m) of EPSG:32633, heights above the ellipsoid\nimageName,X,Y,Z,Omega,Phi,Kappa",
+            "{0},{4},{5},{3},{6},{7},{8}",
+            "\t",
+        ),
         True,
         False,
     ),
@@ -338,6 +359,7 @@ def test_tables_of_other_programs(tmp_path, form):
     taken, said = with_exposures([FLIGHT.photograph(k) for k in ALL], [found])
     assert "positions of 6 of 10 photographs" in said[0]
     assert all(same(taken[k].gps, FLIGHT.camera[k]) for k in range(6))
+    assert found.heights == ("ellipsoid" if form == "opk" else "unknown")
     assert {p.gps.sigma_m for p in taken[:6]} == {(0.02, 0.02, 0.05) if stated else None}
     for p in taken[:6]:
         assert (p.attitude is not None) == turned

@@ -68,9 +68,8 @@ def by_marks(
     if off is None and _perhaps_anew(photographs, file):
         return timed, "by time"
     if off is not None and isinstance(timed, Matched):
-        joined = (numbered.exposure >= 0) & (timed.exposure >= 0)
         nearer = distance(photographs, file, timed.exposure)
-        if nearer is not None and off > WORSE * nearer and (numbered.exposure != timed.exposure)[joined].any():
+        if nearer is not None and off > WORSE * nearer and not np.array_equal(numbered.exposure, timed.exposure):
             return timed, "by time"
     return numbered, "by number"
 

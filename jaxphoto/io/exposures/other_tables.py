@@ -46,6 +46,8 @@ _LEAST_ODM = 3
 _EPSG = re.compile(r"\b(EPSG:\s*\d{4,6}(?:\s*\+\s*\d{4,6})?)", re.IGNORECASE)
 _WKT = re.compile(r"#\s*CoordinateSystem:\s*(\S.*)$", re.IGNORECASE)
 _GON = re.compile(r"\b(gons?|grads?|gradians?)\b", re.IGNORECASE)
+# As --to opk says it.
+_ELLIPSOID = "heights above the ellipsoid"
 # Lines among which a header or the system may be a comment.
 _HEAD = 20
 _OFF = ("0", "false", "no")
@@ -59,6 +61,8 @@ class OtherTable(NamedTuple):
     """Of its positions, as the file says."""
     true_north: bool
     """Whether its yaw counts from true north wherever the positions are."""
+    ellipsoid: bool = False
+    """Whether the file says that its heights are above the ellipsoid."""
 
 
 def read_other_table(path: Path) -> OtherTable | None:
@@ -93,7 +97,8 @@ def read_other_table(path: Path) -> OtherTable | None:
     system = _known(path.name, words[0]) if words else None
     own_yaw = "yaw" in columns and header[columns["yaw"]].lower() == "yaw_deg"
     own = with_points(own, separator, columns["image"])
-    return OtherTable(_table(own, columns, system, in_degrees(header, columns)), system, not own_yaw)
+    ellipsoid = any(_ELLIPSOID in line for line in comments)
+    return OtherTable(_table(own, columns, system, in_degrees(header, columns)), system, not own_yaw, ellipsoid)
 
 
 def _of_open_drone_map(file: str, content: list[tuple[int, str]]) -> OtherTable:

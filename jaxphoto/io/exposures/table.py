@@ -30,12 +30,12 @@ def read_table(path: Path, code: int | None = None, heights: Heights = "unknown"
     sigma_yaw_deg, and fix (fixed, float, single). Tables of other programs are those of `other_tables`; a system that
     they name counts, not `code`. Raises InputError, naming file and row.
     """
-    own = _read_own(path)
-    table, system, true_north = own or read_other_table(path) or OtherTable(read_csv(path, ("image",)), None, False)
-    vertical = None
+    read = _read_own(path) or read_other_table(path) or OtherTable(read_csv(path, ("image",)), None, False)
+    table, system, vertical = read.table, read.system, None
     if system is not None and system.crs is not None:
         code, vertical = system.code, system.vertical
-        heights = "ellipsoid" if vertical is not None or len(system.crs.axis_info) > 2 else heights
+        on_ellipsoid = read.ellipsoid or vertical is not None or len(system.crs.axis_info) > 2
+        heights = "ellipsoid" if on_ellipsoid else heights
     # Windows' strokes are read everywhere.
     ids = [PureWindowsPath(name).stem for name in table.ids("image")]
     twice = {name for name in ids if ids.count(name) > 1} if len(set(ids)) < len(ids) else set()
@@ -50,7 +50,7 @@ def read_table(path: Path, code: int | None = None, heights: Heights = "unknown"
     if on_map and len(place):
         assert code is not None
         place, grid = _from_map(table, place, code, vertical)
-        turn = turn if true_north and _RPY[0] in table else grid
+        turn = turn if read.true_north and _RPY[0] in table else grid
     check_places(path.name, table.rows, place)
     sigma = np.stack([table.sigmas(name) for name in _SIGMA_M], axis=1)
     return Exposures(
