@@ -20,9 +20,23 @@ from jaxphoto.block import Block, Datum, direct_exterior, sensor_rows
 from jaxphoto.camera import set_parameter
 from jaxphoto.errors import BlockError
 from jaxphoto.georeferencing import StripBias
-from jaxphoto.observations import AXES, AbstractObservations, Attitudes, ControlRows, StationRows
+from jaxphoto.observations import (
+    AXES,
+    AbstractObservations,
+    Attitudes,
+    ControlRows,
+    Correlated,
+    KnownParameters,
+    RelativeAttitudes,
+    RelativePositions,
+    StationRows,
+)
 from jaxphoto.parameters import AbstractParameters, dynamic_fields
 from jaxphoto.unknowns import FIXED, FREE, late_cameras
+
+# What GNSS, and what an IMU, observes of the exposures.
+_POSITIONS: tuple[type, ...] = (StationRows, RelativePositions)
+_TURNS: tuple[type, ...] = (Attitudes, RelativeAttitudes)
 
 
 def indirect(block: Block) -> Block:
@@ -64,13 +78,13 @@ MODES: dict[str, Callable[[Block], Block]] = {"direct": direct, "integrated": in
 
 
 def without_stations(block: Block) -> Block:
-    """No GNSS positions. What only they see is held: lever arms, shifts and drifts."""
-    return _hold_unseen(dataclasses.replace(block, stations=StationRows.none()))
+    """No GNSS positions, nor relative ones. What only they see is held: lever arms, shifts and drifts."""
+    return _hold_unseen(dataclasses.replace(block, stations=StationRows.none(), more=_without(block, _POSITIONS)))
 
 
 def without_attitudes(block: Block) -> Block:
-    """No observed roll, pitch and yaw. What only they see well is held: the boresight."""
-    return _hold_unseen(dataclasses.replace(block, attitudes=Attitudes.none()))
+    """No observed roll, pitch and yaw, nor relative ones. What only they see well is held: the boresight."""
+    return _hold_unseen(dataclasses.replace(block, attitudes=Attitudes.none(), more=_without(block, _TURNS)))
 
 
 def without_control(block: Block) -> Block:
@@ -246,7 +260,9 @@ def _exterior(block: Block):
 
 def _hold_unseen(block: Block) -> Block:
     """Mounts and strips FIXED where no observation is left that sees them; no motion where nothing acts with it."""
-    positions, turns = len(block.stations.who) > 0, len(block.attitudes.image) > 0
+    own = {_kind(rows) for rows in block.more}
+    positions = len(block.stations.who) > 0 or bool(own & {*_POSITIONS})
+    turns = len(block.attitudes.image) > 0 or bool(own & {*_TURNS})
 
     def unseen(b: Block) -> list:
         mounts, biases = b.priors.mounts.values(), b.priors.strips.values()
@@ -260,6 +276,15 @@ def _hold_unseen(block: Block) -> Block:
     block = eqx.tree_at(unseen, block, replace_fn=lambda _: FIXED)
     late = late_cameras(block.start.unknowns, block.priors)
     return block if positions or turns or late else dataclasses.replace(block, motion=None)
+
+
+def _without(block: Block, kinds: tuple[type, ...]) -> tuple:
+    """Further observations without those of `kinds`, in sets of correlated rows or not."""
+    return tuple(rows for rows in block.more if _kind(rows) not in kinds)
+
+
+def _kind(rows: AbstractObservations | KnownParameters) -> type:
+    return type(rows.rows if isinstance(rows, Correlated) else rows)
 
 
 def _as_control(

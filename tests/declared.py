@@ -26,6 +26,8 @@ from jaxphoto.observations import (
     Distances,
     ImageState,
     PositionSteps,
+    RelativeAttitudes,
+    RelativePositions,
     RigPlaces,
     RigTurns,
     StationRows,
@@ -36,7 +38,7 @@ from jaxphoto.observations import (
     TrajectoryStations,
     exponential_covariance,
 )
-from jaxphoto.rotation import small_rotation
+from jaxphoto.rotation import matrix_from_roll_pitch_yaw, roll_pitch_yaw_from_matrix, small_rotation
 from jaxphoto.unknowns import FIXED, FREE, Unknowns, Weighted
 from tests.blocks import VARIANTS, Simulated, free, measured, rows, with_priors
 from tests.levelling import HeightDifferences
@@ -199,6 +201,9 @@ def _further(n_images: int, angles: np.ndarray) -> tuple:
     in_time = np.stack([exponential_covariance(t, 0.08, 5.0) for t in times])
     start, end = np.array([0, 3, 8, 20, 30]), np.array([7, 9, 25, 33, 5])
     first = np.array([0, 2, 5, 4])
+    pairs = np.array([0, 1, 5, 4]), np.array([1, 2, 6, 5])
+    body = jax.vmap(matrix_from_roll_pitch_yaw)(angles)
+    turns = np.asarray([roll_pitch_yaw_from_matrix(body[a].T @ body[b]) for a, b in zip(*pairs, strict=True)])
     return (
         HeightDifferences(start, end, np.zeros(5), np.array([0.005, 0.01, 0.02, 0.01, 0.005])),
         Baselines(first, np.array([1, 3, 9, 6]), np.zeros((4, 3)), np.full((4, 3), 0.03) * [1, 1, 2]),
@@ -208,6 +213,8 @@ def _further(n_images: int, angles: np.ndarray) -> tuple:
         *_exposures_and_ties(angles),
         RigPlaces(np.array([0, 1, 6]), np.array([1, 2, 8]), np.zeros((3, 3)), np.full((3, 3), 0.03)),
         RigTurns(np.array([0, 1, 6]), np.array([1, 2, 8]), np.zeros((3, 3)), np.full((3, 3), 2e-4)),
+        RelativePositions(*pairs, np.zeros((4, 3)), np.full((4, 3), 0.01) * [1, 1, 2]),
+        RelativeAttitudes(*pairs, turns, np.full((4, 3), 1e-4) * [1, 1, 2]),
     )
 
 

@@ -52,7 +52,7 @@ from tests.io import test_robotics_cameras as robotics
 from tests.io import test_surfaces as surfaces
 from tests.io.conftest import FILES
 from tests.simulation import test_changing_cameras as changing_cameras
-from tests.simulation import test_rig
+from tests.simulation import test_relative_poses, test_rig
 from tests.simulation.small import RECIPES, changed
 
 Files = dict[str, bytes]
@@ -338,6 +338,11 @@ READERS: dict[str, Reader] = {
         written_by(lambda folder: write_block(test_rig.flown().block, folder)),
         read_block,
         ("block.toml", "rig_places.csv", "rig_turns.csv"),
+    ),
+    "block-relative": Reader(
+        written_by(lambda folder: write_block(test_relative_poses.flown().block, folder)),
+        read_block,
+        ("relative_positions.csv", "relative_attitudes.csv"),
     ),
     "block-warm": Reader(written_by(_warm_block), read_block, ("block.toml", "images.csv", "conditions.csv")),
     "photograph": Reader(written_by(_photograph), lambda folder: photographs([folder / "a.jpg"])),

@@ -48,6 +48,8 @@ SHOWN = {
     "StripCameraSteps": ("strip_camera_steps",),
     "RigPlaces": ("rig_places",),
     "RigTurns": ("rig_turns",),
+    "RelativePositions": ("relative_positions",),
+    "RelativeAttitudes": ("relative_attitudes",),
     "Distances": ("distances",),
     "HeightDifferences": ("height_differences",),
     "Baselines": ("baselines",),
@@ -232,7 +234,10 @@ def test_noise_moves_every_number_by_its_own_standard_deviation(group):
 
 # By how much what is observed differs from what the residual is of: ideal coordinates, small rotations of an aircraft
 # that is tilted (errors of two angles meet in one axis), small rotations from what is off by 2 mrad.
-_BENT = {"image_points": 0.1, "attitudes": 0.15, "trajectory_attitudes": 0.15, "prior_rotations": 0.01}
+_BENT = {
+    "image_points": 0.1, "attitudes": 0.15, "relative_attitudes": 0.15, "trajectory_attitudes": 0.15,
+    "prior_rotations": 0.01,
+}  # fmt: skip
 
 
 def test_noise_knows_each_number_once():

@@ -19,7 +19,7 @@ from jaxphoto.block import Block, exposures
 from jaxphoto.camera import RATES, CameraSpline
 from jaxphoto.errors import DatumError, RankError
 from jaxphoto.georeferencing import RigCamera
-from jaxphoto.observations import AbstractObservations, RigPlaces, RigTurns
+from jaxphoto.observations import AbstractObservations, Correlated, RigPlaces, RigTurns, StationRows
 from jaxphoto.parameters import dynamic_fields
 from jaxphoto.unknowns import FREE, Unknowns, late_cameras
 
@@ -33,7 +33,7 @@ def check_priors(block: Block, priors: Unknowns) -> None:
     It looks at who observed what, not at numbers, so nothing need be compiled to find it.
     """
     _check_scales(priors)
-    with_station = set(np.asarray(block.stations.who).tolist())
+    with_station = _images_of_stations(block)
     with_attitude = set(np.asarray(block.attitudes.image).tolist())
     # What else touches an image may see its mount, as the trajectory that a scanner has in common with it.
     further = _images_touched(block)
@@ -44,6 +44,12 @@ def check_priors(block: Block, priors: Unknowns) -> None:
     _check_camera_rates(block, priors)
     _check_camera_splines(block)
     _check_rigs(block, priors)
+
+
+def _images_of_stations(block: Block) -> set[int]:
+    """The images whose stations are observed, one by one or in sets that covariances join."""
+    joint = [of.rows.who for of in block.more if isinstance(of, Correlated) and isinstance(of.rows, StationRows)]
+    return {int(i) for who in (block.stations.who, *joint) for i in np.ravel(np.asarray(who))}
 
 
 def _images_touched(block: Block) -> set[int]:

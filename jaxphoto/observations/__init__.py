@@ -27,6 +27,8 @@ from jaxphoto.observations.trajectory_poses import TrajectoryAttitudes as Trajec
 from jaxphoto.observations.knot_steps import PositionSteps as PositionSteps, AttitudeSteps as AttitudeSteps
 from jaxphoto.observations.strip_camera_steps import StripCameraSteps as StripCameraSteps
 from jaxphoto.observations.rig_poses import RigPlaces as RigPlaces, RigTurns as RigTurns
+from jaxphoto.observations.relative_poses import RelativePositions as RelativePositions
+from jaxphoto.observations.relative_poses import RelativeAttitudes as RelativeAttitudes
 from jaxphoto.observations.distances import Distances as Distances
 from jaxphoto.observations.priors import PositionRows as PositionRows
 from jaxphoto.observations.priors import RotationRows as RotationRows, PointRows as PointRows

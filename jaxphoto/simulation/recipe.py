@@ -173,7 +173,7 @@ class TargetPlan:
 @dataclasses.dataclass(frozen=True)
 class Sigmas:
     """Standard deviations of tie points and targets in the images, control, stations, attitudes, laser points,
-    places and turns of cameras in their rig.
+    places and turns of cameras in their rig, positions and attitudes beside those of the exposure before.
 
     None where these are not observed.
     """
@@ -186,6 +186,8 @@ class Sigmas:
     lidar_m: Triple | None = None
     rig_place_m: Triple | None = None
     rig_turn_deg: Triple | None = None
+    relative_position_m: Triple | None = None
+    relative_attitude_deg: Triple | None = None
 
 
 @dataclasses.dataclass(frozen=True)

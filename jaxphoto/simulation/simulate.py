@@ -32,6 +32,7 @@ from jaxphoto.simulation.flight_plan import FlightPlan
 from jaxphoto.simulation.platform_path import Path, paths
 from jaxphoto.simulation.points import TruePoints, scatter
 from jaxphoto.simulation.recipe import Assumed, Recipe, SimulatedBias, Triple, triple
+from jaxphoto.simulation.relative_poses import relative_rows
 from jaxphoto.simulation.rig import rig_rows, rigged, runs_late, with_gnss
 from jaxphoto.simulation.rolling_shutter import camera_motions, with_shutters
 from jaxphoto.simulation.scan import Scan, scan
@@ -107,6 +108,7 @@ def simulate(recipe: Recipe, seed: int = 0) -> Simulation:
         scanner,
     )
     position, attitude = record(flight, mounts, [biases.get(s, NO_BIAS) for s in flight.strips])
+    relative = relative_rows(recipe, flight, mounts, seed)
     if on_path and clock is not None and errors is not None:
         position, attitude = recorded_on_path(position, attitude, clock, flown, flight, errors)
     stations, attitudes = _georeferencing(recipe, position, attitude, with_gnss(recipe, flight), seed)
@@ -137,7 +139,7 @@ def simulate(recipe: Recipe, seed: int = 0) -> Simulation:
         motion=flight.motion if runs_late(rig) or any(map(_runs_late, recipe.mounts.values())) else None,
         flight_time=clock,
         temperatures=temperatures,
-        more=(*camera_steps(recipe, flight, times, start.unknowns), *rig_rows(recipe, flight)),
+        more=(*camera_steps(recipe, flight, times, start.unknowns), *rig_rows(recipe, flight), *relative),
     )
     return Simulation(block, truth, triple(recipe.datum_offset_m), terrain, cloud, trajectory, errors)
 

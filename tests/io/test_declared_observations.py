@@ -21,6 +21,8 @@ from jaxphoto.observations import (
     Correlated,
     Distances,
     KnownParameters,
+    RelativeAttitudes,
+    RelativePositions,
     RigPlaces,
     RigTurns,
     StationRows,
@@ -72,6 +74,8 @@ def rows_of(kind: type[AbstractObservations], n: int, seed: int = 0) -> Abstract
         fields[name] = index.reshape(n, *shape) if whole else number if name in in_files else 0 * number
     if kind in (RigPlaces, RigTurns):
         fields["image"] = (fields["reference"] + 1) % 3
+    if kind in (RelativePositions, RelativeAttitudes):
+        fields["image_2"] = (fields["image_1"] + 1) % 3
     if kind.group == "prior_rotations":
         fields["value"] = np.array(jax.vmap(small_rotation)(rng.normal(0, 0.3, (n, 3))))
     if kind.group == "surfaces":

@@ -158,7 +158,6 @@ def assemble(source: BlockTables) -> Block:
     flight = _flight(source, tables, images, frame, settings)
     if source.trajectory is not None:
         flight = without_heads(flight, images, image_mount, settings.unknowns.section(RigCamera.kind))
-    check_time_offsets(flight, image_mount, mounts, mount_priors, images, source.file)
     if source.trajectory is None:
         check_attitude_units(given["attitudes"], flight.stations, images)
 
@@ -210,6 +209,7 @@ def assemble(source: BlockTables) -> Block:
     check_rates(images, start, priors)
     ids = Ids(images, points, {kind: tuple(owners) for kind, owners in start.tables.items()})
     distances, further = read_declared(kinds, tables, ids, settings)
+    check_time_offsets(flight, further, image_mount, mounts, mount_priors, images, source.file)
     check_rig_delays(flight, further, start, priors, images)
     block = dataclasses.replace(
         block,

@@ -14,7 +14,7 @@ from jaxphoto.io.block_folder.images import Images
 from jaxphoto.io.block_folder.section import Section
 from jaxphoto.io.block_folder.table_layout import RATE, VELOCITY
 from jaxphoto.io.text_tables import Table
-from jaxphoto.observations import Attitudes, RigPlaces, RigTurns, StationRows
+from jaxphoto.observations import Attitudes, RelativeAttitudes, RelativePositions, RigPlaces, RigTurns, StationRows
 from jaxphoto.unknowns import FIXED, Unknowns, late_cameras
 
 
@@ -40,20 +40,28 @@ def read_motion(stations: Table, attitudes: Table, images: Images) -> tuple[Moti
 
 def check_time_offsets(
     flight: ObservedFlight,
+    rows: Iterable[Any],
     image_mount: tuple[str, ...],
     mounts: dict[str, Mount],
     priors: dict[str, Mount],
     images: Images,
     file: str,
 ) -> None:
-    """Raise BlockError where a time offset should act on a station or attitude whose motion is not known."""
+    """Raise BlockError where a time offset should act on a station or attitude whose motion is not known.
+
+    So it does on those of `rows` that are relative.
+    """
+    positions, turns = (
+        [index for of in rows if isinstance(of, kind) for _, index in of.indices()]
+        for kind in (RelativePositions, RelativeAttitudes)
+    )
     offset = {
         name for name, mount in mounts.items() if priors[name].time_offset is not FIXED or float(mount.time_offset) != 0
     }
     uses = np.array([mount in offset for mount in image_mount])
     for who, known, table, columns in (
-        (flight.stations.who, flight.velocity_known, "stations.csv", VELOCITY),
-        (flight.attitudes.image, flight.rate_known, "attitudes.csv", RATE),
+        (np.concatenate([flight.stations.who, *positions]), flight.velocity_known, "stations.csv", VELOCITY),
+        (np.concatenate([flight.attitudes.image, *turns]), flight.rate_known, "attitudes.csv", RATE),
     ):
         for image in who[uses[who] & ~known[who]][:1]:
             raise images.table.misfit(

@@ -26,6 +26,7 @@ from jaxphoto.simulation import (
 from jaxphoto.simulation.recipe import Role
 
 _ZERO = (0.0, 0.0, 0.0)
+_RELATIVE = ("relative_position_m", "relative_attitude_deg")
 # Approximate positions at close range are off by this part of the shortest distance, unless the recipe says otherwise.
 _NEAR = 0.02
 _KINDS = {
@@ -111,6 +112,7 @@ def read_sigmas(top: Section, targets: tuple[TargetPlan, ...]) -> tuple[Sigmas, 
     """The stated sigmas, and the true ones, which are the same where [noise] does not say otherwise."""
     keys = (
         "image_mm", "target_mm", "control_m", "station_m", "attitude_deg", "lidar_m", "rig_place_m", "rig_turn_deg",
+        *_RELATIVE,
     )  # fmt: skip
     said, true = top.section("sigmas"), top.section("noise")
     said.known(*keys)
@@ -124,6 +126,9 @@ def read_sigmas(top: Section, targets: tuple[TargetPlan, ...]) -> tuple[Sigmas, 
     for key in keys[2:]:
         if key in true and getattr(stated, key) is None:
             raise true.error(key, f"this is not observed; add {key} under [sigmas] too, or remove it")
+    for key in _RELATIVE:
+        if key in said and "flight" not in top:
+            raise said.error(key, "it is between exposures of a strip, and there is no [flight]; remove it")
     roles = {role for group in targets for role in (group.role, *([group.choice.role] if group.choice else []))}
     if stated.control_m is None and roles & {"control", "vertical"}:
         raise said.error("control_m", "the key is missing, but there are control points; add it")
