@@ -21,7 +21,7 @@ from jaxphoto.cli.made import made_by
 from jaxphoto.cli.progress import StepsLeft
 from jaxphoto.cloud import Cloud
 from jaxphoto.errors import InputError
-from jaxphoto.georeferencing import PATTERNS, ScannerCalibration
+from jaxphoto.georeferencing import PATTERN_OF, ScannerCalibration
 from jaxphoto.io import clouds, read_block
 from jaxphoto.io.block_folder import exposure_times
 from jaxphoto.io.clouds.coordinate_system import CoordinateSystem
@@ -61,7 +61,11 @@ SCANNER = ("boresight", *(name.replace("_", "-") for name in dynamic_fields(Scan
 USUAL = StripSettings()
 PatternOption = Annotated[
     str | None,
-    one_of(PATTERNS, help="Of the scanner: line by line across the track (default), or circle, all around."),
+    one_of(
+        PATTERN_OF,
+        help="Of the scanner, or its kind: line (default), as of mirrors that are oscillating or rotating; or circle, "
+        "all around, as of risley prisms or nutating mirrors.",
+    ),
 ]
 CellM = Annotated[float, typer.Option(help="Side of the cells in which planes are sought.")]
 RoughnessM = Annotated[float, typer.Option(help="Most that the returns of a plane scatter about it.")]
@@ -101,7 +105,7 @@ class StripChoices(NamedTuple):
 def scanner_priors(free: Collection[str], pattern: str | None) -> ScannerPriors:
     """FREE what is named of `SCANNER`, the rest FIXED; of a scanner that draws lines where no pattern is named."""
     boresight, *calibration = (FREE if name in free else FIXED for name in SCANNER)
-    return ScannerPriors(boresight, ScannerCalibration(*calibration, pattern or "line"))  # type: ignore[arg-type, call-arg]
+    return ScannerPriors(boresight, ScannerCalibration(*calibration, PATTERN_OF[pattern or "line"]))  # type: ignore[arg-type, call-arg]
 
 
 def adjust_flight(context: typer.Context, flight: StripFiles, choices: StripChoices, out: Path) -> None:

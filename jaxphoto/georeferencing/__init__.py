@@ -32,6 +32,7 @@ from jaxphoto.georeferencing.mount import (
 from jaxphoto.georeferencing.rig import RigCamera, in_rig, reference_later, rig_place, rig_turn, turn_off
 from jaxphoto.georeferencing.scanner import Scanner, corrected_point, raised_by_boresight
 from jaxphoto.georeferencing.scanner_calibration import (
+    PATTERN_OF,
     PATTERNS,
     Pattern,
     ScannerCalibration,
@@ -43,8 +44,8 @@ from jaxphoto.georeferencing.trajectory import Poses, Trajectory, TrajectorySpli
 from jaxphoto.georeferencing.trajectory_knots import StripSpline, TrajectoryKnot, weighted_knot
 
 __all__ = [
-    "IMAGE_X", "NOMINAL", "PATTERNS", "Corrections", "DirectPartials", "Exposure", "FlightBias", "Mount", "Pattern",
-    "Poses", "RayCovariance", "RigCamera", "Scanner", "ScannerCalibration", "SensorCovariance", "StripBias",
+    "IMAGE_X", "NOMINAL", "PATTERNS", "PATTERN_OF", "Corrections", "DirectPartials", "Exposure", "FlightBias", "Mount",
+    "Pattern", "Poses", "RayCovariance", "RigCamera", "Scanner", "ScannerCalibration", "SensorCovariance", "StripBias",
     "StripErrors", "StripSpline", "Surface", "Trajectory", "TrajectoryKnot", "TrajectorySpline", "apparent_point",
     "arm_to_camera", "attitude_residual", "body_from_camera", "corrected_point", "corrected_return", "corrected_shot",
     "covered", "direct_covariance", "direct_orientation", "direct_partials", "exact_offset", "ground_covariance",

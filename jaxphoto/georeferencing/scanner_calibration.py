@@ -37,6 +37,14 @@ from jaxphoto.rotation import rotate, small_rotation
 Pattern = Literal["line", "circle"]
 """What a scanner draws on the ground: lines across the track, or figures all around its nadir."""
 PATTERNS: tuple[Pattern, ...] = get_args(Pattern)
+PATTERN_OF: dict[str, Pattern] = {
+    **{pattern: pattern for pattern in PATTERNS},
+    "oscillating": "line",
+    "rotating": "line",
+    "risley": "circle",
+    "nutating": "circle",
+}
+"""Kinds of scanners, and the pattern by whose angles each is corrected; a pattern stands for any of its kinds."""
 _PPM = 1e-6
 _AXES = ("right", "forward", "up")
 

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int, UInt8
 
 from jaxphoto.cloud import Cloud
 from jaxphoto.errors import BlockError
-from jaxphoto.georeferencing import Scanner, StripErrors, Trajectory
+from jaxphoto.georeferencing import PATTERN_OF, Scanner, StripErrors, Trajectory
 from jaxphoto.rotation import quaternion_from_matrix, small_rotation
 from jaxphoto.simulation.buildings import entered, solids
 from jaxphoto.simulation.chunks import in_chunks
@@ -28,7 +28,7 @@ from jaxphoto.simulation.trees import met_leaves
 GROUND, VEGETATION, ROOF = 2, 5, 6
 """Classes of LAS (ASPRS): ground, high vegetation, building."""
 _RATE_HZ = 100.0
-# Of the two prisms; their figure does not come back within a strip.
+# Of the two prisms, whose figure does not come back within a strip; of the first alone a mirror that nutates.
 _PRISMS_HZ = (121.7, -77.3)
 # Rays meet the ground to this (m) or, where it is too steep for them, not at all.
 _ENOUGH_M = 1e-7
@@ -105,19 +105,29 @@ def scan(
 def _pattern(
     plan: ScanPlan, path: Path, pulses: Int[np.ndarray, "n"], of: int
 ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n 2"]]:
-    """Time (s) of pulses, and the tangents of their angles to the right and ahead.
-
-    Lines are as far apart on level ground as their pulses are, and run from left to right, as those of a turning
-    mirror. Two prisms that deflect alike, to first order, add a turning arrow each.
-    """
+    """Time (s) of pulses, and the tangents of their angles to the right and ahead."""
     begin, end = path.node[[0, -1]]
     time = begin + (pulses + 0.5) / of * (end - begin)
-    if plan.pattern == "line":
-        per_line = max(1, round(2 * plan.half_width * path.height_m * np.sqrt(plan.density_per_m2)))
-        across = plan.half_width * (2 * (pulses % per_line + 0.5) / per_line - 1)
-        return time, np.column_stack([across, np.zeros(len(across))])
-    angles = 2 * np.pi * np.outer(time, _PRISMS_HZ)
-    return time, plan.half_width / 2 * np.column_stack([np.sin(angles).sum(1), np.cos(angles).sum(1)])
+    if PATTERN_OF[plan.pattern] == "circle":
+        return time, _around(plan, time)
+    # Lines are as far apart on level ground as their pulses are.
+    per_line = max(1, round(2 * plan.half_width * path.height_m * np.sqrt(plan.density_per_m2)))
+    across = _across(plan, (pulses + 0.5) / per_line)
+    return time, np.column_stack([across, np.zeros(len(across))])
+
+
+def _across(plan: ScanPlan, line: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+    """After so many lines: each from left to right at even steps, or to and fro as the sine that an angle swings by."""
+    if plan.pattern == "oscillating":
+        return -np.tan(np.deg2rad(plan.scan_angle_deg) * np.cos(np.pi * line))
+    return plan.half_width * (2 * (line % 1) - 1)
+
+
+def _around(plan: ScanPlan, time: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 2"]:
+    """A turning arrow; two prisms that deflect alike, to first order, add one each."""
+    turning = _PRISMS_HZ[:1] if plan.pattern == "nutating" else _PRISMS_HZ
+    angles = 2 * np.pi * np.outer(time, turning)
+    return plan.half_width / len(turning) * np.column_stack([np.sin(angles).sum(1), np.cos(angles).sum(1)])
 
 
 def _measured(

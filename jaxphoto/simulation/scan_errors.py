@@ -6,11 +6,11 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxphoto.georeferencing import ScannerCalibration, StripErrors, StripSpline, corrected_shot
+from jaxphoto.georeferencing import PATTERN_OF, ScannerCalibration, StripErrors, StripSpline, corrected_shot
 from jaxphoto.rotation import small_rotation
 from jaxphoto.simulation.chunks import in_chunks
 from jaxphoto.simulation.platform_path import Path
-from jaxphoto.simulation.scan_plan import ScanPlan
+from jaxphoto.simulation.scan_plan import ScanPlan, of_strip
 from jaxphoto.simulation.streams import stream
 
 _CHUNK = 65_536
@@ -29,11 +29,15 @@ def drawn_errors(plan: ScanPlan, paths: list[Path], seed: int) -> StripErrors:
         first = sum(s.size for s in splines)
         splines.append(StripSpline.over(first, float(path.node[0]), float(path.node[-1]), plan.knots_s))
         drift = _drift(splines[-1], plan.correlation_s, stream(seed, f"drift of lidar strip {path.strip}"))
-        position.append(drawn_shift(plan, path.strip, seed) + np.array(plan.drift_sigma_m) * drift[:, :3])
-        attitude.append(np.deg2rad(plan.drift_sigma_deg) * drift[:, 3:])
+        # A straight line in the times of the coefficients is one in time.
+        gone = (splines[-1].times - np.mean(path.node[[0, -1]]))[:, None]
+        shift = drawn_shift(plan, path.strip, seed) + gone * of_strip(plan.drift_m_per_s, path.strip)
+        turn = of_strip(plan.attitude_deg, path.strip) + gone * of_strip(plan.attitude_drift_deg_per_s, path.strip)
+        position.append(shift + np.array(plan.drift_sigma_m) * drift[:, :3])
+        attitude.append(np.deg2rad(turn + np.array(plan.drift_sigma_deg) * drift[:, 3:]))
     scales = (np.array(v) for v in (plan.range_offset_m, plan.range_scale_ppm, plan.angle_scale_ppm))
-    numbers: Any = (np.array(plan.lever_arm_m), *scales, np.zeros(2))
-    calibration = ScannerCalibration(*numbers, plan.pattern)  # type: ignore[call-arg]
+    numbers: Any = (np.array(plan.lever_arm_m), *scales, np.deg2rad(plan.eccentricity_deg))
+    calibration = ScannerCalibration(*numbers, PATTERN_OF[plan.pattern])  # type: ignore[call-arg]
     boresight = np.deg2rad(plan.boresight_deg)
     return StripErrors(tuple(splines), np.concatenate(position), np.concatenate(attitude), boresight, calibration)
 
@@ -41,7 +45,7 @@ def drawn_errors(plan: ScanPlan, paths: list[Path], seed: int) -> StripErrors:
 def drawn_shift(plan: ScanPlan, strip: str, seed: int) -> Float[np.ndarray, "3"]:
     """The shift of a strip (m), about which it drifts."""
     drawn = stream(seed, f"shift of lidar strip {strip}").standard_normal(3)
-    return plan.shift_of(strip) + np.array(plan.shift_sigma_m) * drawn
+    return of_strip(plan.shift_m, strip) + np.array(plan.shift_sigma_m) * drawn
 
 
 def measured_shot(

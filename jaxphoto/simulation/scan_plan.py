@@ -5,7 +5,6 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
-from jaxphoto.georeferencing import Pattern
 from jaxphoto.simulation.flight_plan import Strip
 
 Triple = tuple[float, float, float]
@@ -16,23 +15,29 @@ _ZERO = (0.0, 0.0, 0.0)
 class ScanPlan:
     """A scanner that sweeps across the track, line after line, `scan_angle_deg` to either side of the body's nadir.
 
-    One whose `pattern` is a "circle" looks through two prisms that turn against one another, as far to all sides.
+    `pattern` is one of `georeferencing.PATTERN_OF`: one that is "oscillating" sweeps to and fro; a "circle" or "risley"
+    looks through two prisms that turn against one another, as far to all sides, one that is "nutating" always so far.
     `density_per_m2` is that of the pulses of one strip on level ground at the mean height of the terrain. It scans the
     flight's own strips, or `strips` of a flight of its own. `boresight_deg` (about the body's right, forward and up
     axes) is the true misalignment; the true shift of a strip is that of `shift_m`, by its name or "default", plus a
-    normal one of `shift_sigma_m`: by so much the trajectory of the strip, and so its points, are off. On top of it
-    position and attitude (about right, forward, up) drift with `drift_sigma_m`, `drift_sigma_deg` and `correlation_s`,
-    from knot to knot `knots_s` apart. `lever_arm_m`, `range_offset_m` and the scales are those of
-    `georeferencing.ScannerCalibration`. With `same_trajectory` the stations and attitudes of the exposures are those of
-    this trajectory, with all that it is off by; their noise comes on top.
+    normal one of `shift_sigma_m`: by so much the trajectory of the strip, and so its points, are off. Likewise its
+    attitude is off by `attitude_deg` (about right, forward, up). From the middle of the strip on both go on by
+    `drift_m_per_s` and `attitude_drift_deg_per_s`; on top of it they drift by chance with `drift_sigma_m`,
+    `drift_sigma_deg` and `correlation_s`, from knot to knot `knots_s` apart. `lever_arm_m`, `range_offset_m`, the
+    scales and `eccentricity_deg` (of cos and sin) are those of `georeferencing.ScannerCalibration`. With
+    `same_trajectory` the stations and attitudes of the exposures are those of this trajectory, with all that it is off
+    by; their noise comes on top.
     """
 
     density_per_m2: float
     scan_angle_deg: float = 20.0
-    pattern: Pattern = "line"
+    pattern: str = "line"
     strips: tuple[Strip, ...] = ()
     boresight_deg: Triple = _ZERO
     shift_m: dict[str, Triple] = dataclasses.field(default_factory=dict)
+    drift_m_per_s: dict[str, Triple] = dataclasses.field(default_factory=dict)
+    attitude_deg: dict[str, Triple] = dataclasses.field(default_factory=dict)
+    attitude_drift_deg_per_s: dict[str, Triple] = dataclasses.field(default_factory=dict)
     shift_sigma_m: Triple = _ZERO
     drift_sigma_m: Triple = _ZERO
     drift_sigma_deg: Triple = _ZERO
@@ -42,6 +47,7 @@ class ScanPlan:
     range_offset_m: float = 0.0
     range_scale_ppm: float = 0.0
     angle_scale_ppm: float = 0.0
+    eccentricity_deg: tuple[float, float] = (0.0, 0.0)
     same_trajectory: bool = False
 
     @property
@@ -49,6 +55,7 @@ class ScanPlan:
         """Of the swath, as part of the height above ground: the tangent of the scan angle."""
         return float(np.tan(np.deg2rad(self.scan_angle_deg)))
 
-    def shift_of(self, strip: str) -> Float[np.ndarray, "3"]:
-        """What the plan says of a strip's shift (m), without chance."""
-        return np.array(self.shift_m.get(strip, self.shift_m.get("default", _ZERO)))
+
+def of_strip(values: dict[str, Triple], strip: str) -> Float[np.ndarray, "3"]:
+    """What a plan says of a strip, by its name or "default", without chance."""
+    return np.array(values.get(strip, values.get("default", _ZERO)))

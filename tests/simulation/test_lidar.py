@@ -15,7 +15,10 @@ from jaxphoto.errors import BlockError, InputError
 from jaxphoto.georeferencing import corrected_point, covered, interpolate
 from jaxphoto.io import read_block, recipe_from, write_simulation
 from jaxphoto.io.clouds import read_cloud
+from jaxphoto.io.recipe.truth import truth_tables
 from jaxphoto.io.trajectory import read_flight_csv
+from jaxphoto.lidar.correction import scanner_path
+from jaxphoto.lidar.strip_correction import correct_strips
 from jaxphoto.rotation import matrix_from_quaternion
 from jaxphoto.simulation import Simulation
 from jaxphoto.simulation.buildings import roof_height
@@ -138,6 +141,41 @@ def test_noise_is_as_stated_for_every_class():
     assert noisy().terrain.buildings == exact().terrain.buildings
     off = points[:, 2] - noisy().terrain.height(points[:, :2])
     assert np.median(np.abs(off)) / 0.6745 == pytest.approx(np.hypot(0.15, 0.5 * 0.035), rel=0.03)
+
+
+WRONG_ATTITUDE_DEG = [0.05, 0.02, -0.1]
+WRONG = TRUTH | {
+    "drift_m_per_s": {"A": [0.02, -0.01, 0.03]},
+    "attitude_deg": {"default": WRONG_ATTITUDE_DEG},
+    "attitude_drift_deg_per_s": {"B": [0.004, -0.002, 0.01]},
+    "eccentricity_deg": [0.02, -0.03],
+}
+
+
+@pytest.mark.parametrize("kind", ["oscillating", "nutating"])
+def test_all_that_is_wrong_comes_off_by_the_truth(kind):
+    simulation = made(SCENE | {"lidar": {"density_per_m2": 0.02, "pattern": kind, "truth": WRONG}})
+    cloud, errors = cloud_of(simulation), simulation.errors
+    ground = cloud.classification == GROUND
+    points = correct_strips(cloud, errors, scanner_path(simulation.trajectory)).xyz[ground]
+    np.testing.assert_allclose(points[:, 2], simulation.terrain.height(points[:, :2]), rtol=0, atol=2e-4)
+    assert np.abs(cloud.xyz[ground] - points).max() > 0.5
+    # Shift and attitude at the middle of each strip, and how they go on.
+    for k, strip in enumerate("AB"):
+        spline, shift = errors.splines[k], simulation.truth.scanner.shifts[f"{k + 1}"]
+        gone = np.array([-5.0, 0.0, 5.0])
+        off, turn = errors.at(k, spline.times.mean() + gone)
+        drift, rate = (WRONG[key].get(strip, np.zeros(3)) for key in ("drift_m_per_s", "attitude_drift_deg_per_s"))
+        np.testing.assert_allclose(off, shift + np.outer(gone, drift), atol=1e-9)
+        np.testing.assert_allclose(np.rad2deg(turn), np.add(WRONG_ATTITUDE_DEG, np.outer(gone, rate)), atol=1e-9)
+    tables = truth_tables(simulation)
+    told = tables["scanner"].set_index("parameter").value
+    names = [f"scanner_calibration.eccentricity_{word}_deg" for word in ("cos", "sin")]
+    np.testing.assert_allclose(told[names], WRONG["eccentricity_deg"], rtol=1e-12)
+    table = tables["trajectory_errors"].set_index("strip")
+    steps = table.loc["2"].filter(["time_s", "right_deg", "up_deg"]).diff().dropna()
+    np.testing.assert_allclose(steps.right_deg / steps.time_s, 0.004, rtol=1e-9)
+    np.testing.assert_allclose(steps.up_deg / steps.time_s, 0.01, rtol=1e-9)
 
 
 def test_density_lines_and_returns():
@@ -346,19 +384,40 @@ def test_the_command_says_what_it_writes(tmp_path, monkeypatch, capsys):
     assert f"{count} laser points in cloud.laz, their trajectory in trajectory.csv (seed 0)" in said
 
 
-def test_prisms_look_as_far_to_all_sides():
-    """What the scanner measured lies in a circle about its nadir."""
-    flight = made(SCENE | {"lidar": {"density_per_m2": 0.3, "pattern": "circle"}})
+@functools.cache
+def seen_by(kind: str) -> np.ndarray:
+    """Where a kind of scanner looked, to the right and ahead: tangents of angles, as parts of the widest."""
+    flight = made(SCENE | {"terrain": {"kind": "flat"}, "lidar": {"density_per_m2": 0.05, "pattern": kind}})
     cloud = cloud_of(flight)
     poses = _poses(flight.trajectory, cloud.time)
     shot = np.einsum("nji,nj->ni", poses.object_from_body, cloud.xyz - poses.position)
-    aside = np.hypot(*(shot[:, :2] / -shot[:, 2:]).T) / np.tan(np.deg2rad(20.0))
+    return shot[:, :2] / -shot[:, 2:] / np.tan(np.deg2rad(20.0))
+
+
+def test_prisms_look_as_far_to_all_sides():
+    """What the scanner measured lies in a circle about its nadir."""
+    aside = np.hypot(*seen_by("risley").T)
     assert aside.max() == pytest.approx(1.0, abs=0.02)
     # Of two equal arrows whose directions are independent: |cos| of half the angle between them.
     for part in (0.25, 0.5, 0.75):
         assert np.quantile(aside, part) == pytest.approx(np.sin(np.pi / 2 * part), abs=0.06)
-    ahead = shot[:, 1] / -shot[:, 2]
-    assert abs((ahead > 0).mean() - 0.5) < 0.05
+    assert abs((seen_by("risley")[:, 1] > 0).mean() - 0.5) < 0.05
+
+
+def test_a_mirror_that_nutates_looks_as_far_to_all_sides_at_all_times():
+    np.testing.assert_allclose(np.hypot(*seen_by("nutating").T), 1.0, atol=1e-4)
+    turning = np.unwrap(np.arctan2(*seen_by("nutating").T))
+    assert turning[-1] > 100.0 and abs((seen_by("nutating")[:, 1] > 0).mean() - 0.5) < 0.05
+
+
+def test_a_mirror_that_oscillates_looks_to_and_fro_and_longer_at_the_edges():
+    angle = np.rad2deg(np.arctan(seen_by("oscillating")[:, 0] * np.tan(np.deg2rad(20.0)))) / 20.0
+    assert np.abs(seen_by("oscillating")[:, 1]).max() < 1e-4
+    parts = np.array([0.0, 0.25, 0.5, 0.75, 1.0])
+    np.testing.assert_allclose(np.quantile(angle, parts), -np.cos(np.pi * parts), atol=0.03)
+    # Each way as long as the other; a mirror that turns looks from left to right alone, but for its way back.
+    for kind, to_the_right in {"oscillating": 0.5, "rotating": 1.0}.items():
+        assert (np.diff(seen_by(kind)[:, 0]) > 0).mean() == pytest.approx(to_the_right, abs=0.03)
 
 
 @pytest.mark.parametrize(
@@ -368,9 +427,11 @@ def test_prisms_look_as_far_to_all_sides():
         ({"sigmas.lidar_m": None, "noise.lidar_m": None}, "lidar_m: the key is missing, but there is a lidar"),
         ({"lidar.density_per_m2": 0.0}, "density_per_m2: 0 is not positive"),
         ({"lidar.scan_angle_deg": 70.0}, "scan_angle_deg: 70 to either side is too wide"),
-        ({"lidar.pattern": "zigzag"}, r"\[lidar\] pattern: 'zigzag' is no pattern of a scanner; use line or circle"),
+        ({"lidar.pattern": "zigzag"}, r"\[lidar\] pattern: 'zigzag' is no pattern of a scanner; use line, circle, osc"),
         ({"lidar.rate_hz": 100.0}, r"\[lidar\] rate_hz: no such key is known"),
         ({"lidar.truth.shift_m.C": [0, 0, 0]}, r"\[lidar.truth.shift_m\] C: no such key is known; use default, A, B"),
+        ({"lidar.truth.attitude_deg.A": [0, 0]}, r"\[lidar.truth.attitude_deg\] A: .* is not a list of three numbers"),
+        ({"lidar.truth.eccentricity_deg": [0, 0, 0]}, r"eccentricity_deg: .* is not a list of 2 numbers"),
         ({"lidar.truth.boresight": [0, 0, 0]}, r"\[lidar.truth\] boresight: no such key"),
         ({"lidar.strips": [{"name": "default", "length_m": 5.0}]}, "a strip cannot be called 'default'"),
         ({"lidar.same_trajectory": 1}, r"\[lidar\] same_trajectory: 1 is neither true nor false"),

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from jaxphoto.errors import quoted
-from jaxphoto.georeferencing import PATTERNS
+from jaxphoto.georeferencing import PATTERN_OF
 from jaxphoto.io.block_folder.section import Section
 from jaxphoto.io.recipe import sizes
 from jaxphoto.io.recipe.keys import flag, sigmas, tables
@@ -47,24 +47,27 @@ def read_lidar(top: Section, plan: FlightPlan | ConvergentPlan, terrain: Terrain
             "same_trajectory", "the scanner has a flight of its own, [[lidar.strips]]; remove these, or this key"
         )
     single = ("range_offset_m", "range_scale_ppm", "angle_scale_ppm")
-    triples = ("boresight_deg", "lever_arm_m")
+    vectors = {"boresight_deg": 3, "lever_arm_m": 3, "eccentricity_deg": 2}
     drawn = ("shift_sigma_m", "drift_sigma_m", "drift_sigma_deg")
-    truth.known(*triples, *single, *drawn, "shift_m", "correlation_s", "knots_s")
-    shifts = truth.section("shift_m")
-    shifts.known("default", *(strip.name for strip in strips or plan.strips))
-    given: dict[str, Any] = {name: tuple(truth.vector(name).tolist()) for name in triples}
+    by_strip = ("shift_m", "drift_m_per_s", "attitude_deg", "attitude_drift_deg_per_s")
+    truth.known(*vectors, *single, *drawn, *by_strip, "correlation_s", "knots_s")
+    given: dict[str, Any] = {name: tuple(truth.vector(name, size).tolist()) for name, size in vectors.items()}
     given |= {name: truth.number(name, 0.0) for name in single}
     given |= {name: sigmas(truth, name) or _ZERO for name in drawn}
     given |= {name: truth.positive(name) for name in ("correlation_s", "knots_s") if name in truth}
+    for name in by_strip:
+        of = truth.section(name)
+        of.known("default", *(strip.name for strip in strips or plan.strips))
+        given[name] = {strip: tuple(of.vector(strip).tolist()) for strip in of}
     given["pattern"] = section.text("pattern", "line")
-    if given["pattern"] not in PATTERNS:
-        raise section.error("pattern", f"{quoted(given['pattern'])} is no pattern of a scanner; use line or circle")
+    if given["pattern"] not in PATTERN_OF:
+        known = ", ".join(PATTERN_OF)
+        raise section.error("pattern", f"{quoted(given['pattern'])} is no pattern of a scanner; use {known}")
     return ScanPlan(
         density_per_m2=section.positive("density_per_m2"),
         scan_angle_deg=angle,
         strips=strips,
         same_trajectory=same,
-        shift_m={name: tuple(shifts.vector(name).tolist()) for name in shifts},
         **given,
     )
 

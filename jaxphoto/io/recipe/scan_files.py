@@ -12,7 +12,7 @@ from jaxphoto.io import clouds
 from jaxphoto.io.trajectory import write_flight_csv
 from jaxphoto.io.trajectory.in_frame import records_of
 from jaxphoto.observations import AXES
-from jaxphoto.parameters import numbers_of
+from jaxphoto.parameters import AbstractParameters, numbers_of
 
 CLOUD, TRAJECTORY = "cloud.laz", "trajectory.csv"
 
@@ -29,8 +29,13 @@ def scanner_rows(scanner: Scanner, errors: StripErrors) -> list[tuple[str, float
     rows = [(f"scanner.boresight_{axis}_deg", float(v)) for axis, v in angles]
     for name, shift in scanner.shifts.items():
         rows += [(f"scanner[{name}].shift_{a}_m", float(v)) for a, v in zip(AXES, np.asarray(shift), strict=True)]
-    own = errors.calibration
-    return rows + [(name, float(v)) for name, v in zip(own.labels(""), numbers_of(own), strict=True) if v]
+    return rows + [(name, v) for name, v in in_degrees(errors.calibration, "") if v]
+
+
+def in_degrees(own: AbstractParameters, owner: str) -> list[tuple[str, float]]:
+    """parameter, value of declared parameters, angles in degrees."""
+    told = zip(own.labels(owner), numbers_of(own), strict=True)
+    return [(name.replace("_rad", "_deg"), float(np.degrees(v) if "_rad" in name else v)) for name, v in told]
 
 
 def drift_table(errors: StripErrors, strips: Sequence[str]) -> pd.DataFrame:

@@ -8,10 +8,9 @@ import pandas as pd
 from jaxphoto.camera import constant_names, get_parameter, parameter_names
 from jaxphoto.io.block_folder import whole_block
 from jaxphoto.io.block_folder.table_layout import ANGLES, XYZ
-from jaxphoto.io.recipe.scan_files import drift_table, scanner_rows, write_scan
+from jaxphoto.io.recipe.scan_files import drift_table, in_degrees, scanner_rows, write_scan
 from jaxphoto.io.result_tables import read_table
 from jaxphoto.observations import AXES
-from jaxphoto.parameters import numbers_of
 from jaxphoto.simulation import Simulation
 from jaxphoto.simulation.flight import omega_phi_kappa
 
@@ -86,6 +85,5 @@ def _georeferencing(simulation: Simulation) -> list[tuple[str, float]]:
         rows += [(f"strips[{name}].drift_{a}_m_per_s", v) for a, v in zip(AXES, np.asarray(bias.drift), strict=True)]
     for owners in simulation.truth.more.values():
         for name, own in owners.items():
-            for label, v in zip(own.labels(name), numbers_of(own), strict=True):
-                rows.append((label.replace("_rad", "_deg"), float(np.degrees(v) if "_rad" in label else v)))
+            rows += in_degrees(own, name)
     return rows + [(f"datum_offset_{a}_m", v) for a, v in zip(AXES, simulation.datum_offset_m, strict=True)]
