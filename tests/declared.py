@@ -123,7 +123,10 @@ OWN = {
 LASER = {
     "scanner_calibration": {
         "": ScannerCalibration(
-            np.array([0.03, -0.02, 0.05]), *map(np.float64, (0.04, 60.0, 90.0)), np.array([2e-5, -3e-5])
+            np.array([0.03, -0.02, 0.05]),
+            *map(np.float64, (0.04, 60.0, 90.0)),
+            np.array([2e-5, -3e-5]),
+            np.asarray(2e-3),
         )
     },
     "trajectory_knots": {
@@ -227,7 +230,8 @@ def _strips() -> tuple:
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     scanner = point + rng.uniform(-200, 200, (2, n, 3)) * [1, 1, 0.1] + np.array([0, 0, 700])
     angles = rng.uniform(-0.1, 0.1, (2, n, 3)) + np.array([0, 0, 1])
-    sides = (knots, knots[::-1], weights, weights[::-1], point, point + 0.01, *scanner, *angles)
+    motions = *(np.array([50.0, -20.0, 1.0]) + rng.normal(0, 2, (2, n, 3))), *rng.normal(0, 0.05, (2, n, 3))
+    sides = (knots, knots[::-1], weights, weights[::-1], point, point + 0.01, *scanner, *angles, *motions)
     start, kept, none = np.arange(4), np.full(4, 0.9), np.zeros((4, 3))
     return (
         StripPlanes(*sides, normal, np.full(n, 0.02), np.zeros(n)),
@@ -252,10 +256,11 @@ def _exposures_and_ties(angles: np.ndarray) -> tuple:
     pose = foot + rng.uniform(-200, 200, (n, 3)) * [1, 1, 0.1] + np.array([0, 0, 700])
     turned = rng.uniform(-0.1, 0.1, (n, 3)) - np.array([0, 0, 1])
     own, weight = spline.weights(np.linspace(0, 2, n))
+    motion = np.array([50.0, -20.0, 1.0]) + rng.normal(0, 2, (n, 3)), rng.normal(0, 0.05, (n, 3))
     return (
         TrajectoryStations(who, knots[who], weights[who], axis, np.zeros(len(who)), station),
         TrajectoryAttitudes(np.arange(n_images), knots, weights, angles, np.full((n_images, 3), 5e-5) * [1, 1, 2]),
-        StripPoints(point, own, weight, foot, pose, turned, normal, np.full(n, 0.03), np.zeros(n)),
+        StripPoints(point, own, weight, foot, pose, turned, *motion, normal, np.full(n, 0.03), np.zeros(n)),
     )
 
 

@@ -13,12 +13,14 @@ through the two prisms of Risley or over a mirror that nutates,
 What each of them is off by is estimated and taken off. With the corrections of a trajectory dp, da at that time
 (`TrajectoryKnot`), the boresight b of `Scanner` and `ScannerCalibration` the return lies at
 
-    X' = p - dp + R S(da) (S(b) s' - l),       S = rotation.small_rotation
+    X' = p - dp + v dt + R S(da - w dt) (S(b) s' - l),       S = rotation.small_rotation
     s'  is s, of length rho (1 - m) - d, turned about the forward axis by -(k theta + e1 cos theta + e2 sin theta);
         all around: turned towards the nadir by k theta, and about it by -(e1 cos alpha + e2 sin alpha)
 
 An offset of the encoder is a boresight about the forward axis (of the other sign), all around one about the axis that
 points up, and is found as such. k of two prisms is by how much their wedges or their glass deflect more than assumed.
+dt is the time by which the scanner's clock is behind that of the trajectory: its pose, to first order in dt, is that of
+a time so much later, by the velocity v and the rate of turn w.
 
 Sources: Skaloud and Lichti (2006), Rigorous approach to bore-sight self-calibration in airborne laser
 scanning; Glira, Pfeifer and Mandlburger (2016), Rigorous strip adjustment of UAV-based laserscanning data including
@@ -54,7 +56,8 @@ class ScannerCalibration(AbstractParameters):
 
     `lever_arm` of the scanner beside the one used (m: right, forward, up); `range_offset` (m) and `range_scale` (ppm)
     of measured ranges; `angle_scale` (ppm) of theta and `eccentricity` (rad, of cos and sin) of theta, of a `pattern`
-    that is a "circle" of alpha.
+    that is a "circle" of alpha; `time_offset` (s) of the true time of a return, on the clock of the trajectory, after
+    the recorded one.
     """
 
     kind = "scanner_calibration"
@@ -65,6 +68,7 @@ class ScannerCalibration(AbstractParameters):
         "range_scale": ("range_scale_ppm",),
         "angle_scale": ("angle_scale_ppm",),
         "eccentricity": ("eccentricity_cos_rad", "eccentricity_sin_rad"),
+        "time_offset": ("time_offset_s",),
     }
 
     lever_arm: Float[Array, "3"]
@@ -72,6 +76,7 @@ class ScannerCalibration(AbstractParameters):
     range_scale: Float[Array, ""] | float = 0.0
     angle_scale: Float[Array, ""] | float = 0.0
     eccentricity: Float[Array, "2"] | tuple[float, float] = (0.0, 0.0)
+    time_offset: Float[Array, ""] | float = 0.0
     pattern: Pattern = eqx.field(static=True, default="line")
 
     def __check_init__(self) -> None:
@@ -120,6 +125,8 @@ def corrected_return(
     point: Float[Array, "3"],
     position: Float[Array, "3"],
     object_from_body: Float[Array, "3 3"],
+    velocity: Float[Array, "3"],
+    rate: Float[Array, "3"],
     off_position: Float[Array, "3"],
     off_attitude: Float[Array, "3"],
     boresight: Float[Array, "3"],
@@ -127,8 +134,11 @@ def corrected_return(
 ) -> Float[Array, "3"]:
     """A laser point (m) as it is; `position` and `object_from_body` are the scanner's, as the trajectory gave them.
 
+    `velocity` (m/s, in the object frame) and `rate` (rad/s, about the body's axes) are those of `georeferencing.Poses`;
     `off_position` (m) and `off_attitude` (rad) are what the trajectory is off by at its time.
     """
     shot = corrected_shot(rotate(object_from_body.T, point - position), calibration)
     in_body = rotate(small_rotation(boresight), shot) - calibration.lever_arm
-    return position - off_position + rotate(object_from_body, rotate(small_rotation(off_attitude), in_body))
+    later = calibration.time_offset
+    turn = rotate(small_rotation(off_attitude - later * rate), in_body)
+    return position - off_position + later * velocity + rotate(object_from_body, turn)

@@ -66,10 +66,7 @@ def interpolate(trajectory: Trajectory, times: Float[Array, "times"], max_gap: F
     spline = spline_through(trajectory, max_gap)
     nodes, joined, times = spline.nodes, spline.joined, times - spline.origin
     at, dot = spline.at(times)
-    matrix, matrix_dot = jax.jvp(jax.vmap(matrix_from_quaternion), (at[:, 3:],), (dot[:, 3:],))
-    # R' dR/dt is the cross product with the rate of turn about the body's axes.
-    turn = jnp.einsum("nji,njk->nik", matrix, matrix_dot)
-    rate = jnp.stack([turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]], axis=1)
+    matrix, rate = _turning(at[:, 3:], dot[:, 3:])
 
     error = _interpolation_error(nodes, spline.values, joined)
     interval = _interval(nodes, joined, times)
@@ -113,12 +110,27 @@ class TrajectorySpline(eqx.Module):
         at, _ = self.at(times)
         return at[:, :3], jax.vmap(matrix_from_quaternion)(at[:, 3:]), _covered(self.nodes, self.joined, times)
 
+    def motions(self, times: Float[Array, "m"]) -> tuple[Float[Array, "m 3"], Float[Array, "m 3"]]:
+        """Velocity (m/s) and rate of turn (rad/s), those of `Poses`, at times of the trajectory's clock (s)."""
+        at, dot = self.at(times - self.origin)
+        return dot[:, :3], _turning(at[:, 3:], dot[:, 3:])[1]
+
 
 def spline_through(trajectory: Trajectory, max_gap: Float[Array, ""] | float) -> TrajectorySpline:
     """The spline of `interpolate`, which runs across no interval longer than `max_gap` (s)."""
     joined, nodes = _joined(trajectory, max_gap), trajectory.time - trajectory.time[0]
     values = jnp.concatenate([trajectory.position, _continuous(trajectory.quaternion)], axis=1)
     return TrajectorySpline(trajectory.time[0], nodes, joined, values, _second(nodes, values, joined))
+
+
+def _turning(
+    quaternion: Float[Array, "m 4"], derivative: Float[Array, "m 4"]
+) -> tuple[Float[Array, "m 3 3"], Float[Array, "m 3"]]:
+    """`object_from_body`, and its rate of turn about the body's axes (rad/s)."""
+    matrix, matrix_dot = jax.jvp(jax.vmap(matrix_from_quaternion), (quaternion,), (derivative,))
+    # R' dR/dt is the cross product with the rate of turn about the body's axes.
+    turn = jnp.einsum("nji,njk->nik", matrix, matrix_dot)
+    return matrix, jnp.stack([turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]], axis=1)
 
 
 def _covered(nodes: Float[Array, "n"], joined: Bool[Array, "intervals"], times: Float[Array, "m"]) -> Bool[Array, "m"]:

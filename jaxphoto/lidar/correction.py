@@ -48,17 +48,18 @@ def scanner_poses(path: ScannerPath, time: Float[np.ndarray, "n"]) -> ScannerPos
 
     Raises BlockError for times that the trajectory does not cover.
     """
-    parts = []
-    for first in range(0, len(time), PORTION):
-        some = np.asarray(time[first : first + PORTION], float)
-        padded = np.concatenate([some, np.full(padded_size(len(some)) - len(some), some[0])])
-        position, turn, known = (np.asarray(v)[: len(some)] for v in call_compiled(_poses, path.spline, padded))
-        if not known.all():
-            raise not_covered(path.trajectory, time, int((~known).sum()))
-        parts.append((position, turn))
-    if not parts:
+    if not len(time):
         return ScannerPoses(np.zeros((0, 3)), np.zeros((0, 3, 3)))
-    return ScannerPoses(*(np.concatenate(v) for v in zip(*parts, strict=True)))
+    position, turn, known = _along(_poses, path, time)
+    if not known.all():
+        raise not_covered(path.trajectory, time, int((~known).sum()))
+    return ScannerPoses(position, turn)
+
+
+def scanner_motions(path: ScannerPath, time: Float[np.ndarray, "n"]) -> tuple[np.ndarray, np.ndarray]:
+    """Velocity (m/s) and rate of turn (rad/s), (n, 3) each, at one or more times (s) that the trajectory covers."""
+    velocity, rate = _along(_motions, path, time)
+    return velocity, rate
 
 
 def check_covered(trajectory: Trajectory, time: Float[np.ndarray, "n"]) -> None:
@@ -147,6 +148,16 @@ def in_portions(
     return result
 
 
+def _along(function: Callable, path: ScannerPath, time: Float[np.ndarray, "n"]) -> list[np.ndarray]:
+    """What `function`, made by `eqx.filter_jit`, says of the spline at one or more times, bit by bit."""
+    parts = []
+    for first in range(0, len(time), PORTION):
+        some = np.asarray(time[first : first + PORTION], float)
+        padded = np.concatenate([some, np.full(padded_size(len(some)) - len(some), some[0])])
+        parts.append([np.asarray(v)[: len(some)] for v in call_compiled(function, path.spline, padded)])
+    return [np.concatenate(v) for v in zip(*parts, strict=True)]
+
+
 def padded_size(n: int) -> int:
     """How many laser points a program is compiled for that takes `n`."""
     return min(1 << max(n - 1, 0).bit_length(), PORTION)
@@ -162,6 +173,11 @@ def _poses(
     spline: TrajectorySpline, time: Float[Array, "n"]
 ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3 3"], Bool[Array, "n"]]:
     return spline.poses(time)
+
+
+@eqx.filter_jit
+def _motions(spline: TrajectorySpline, time: Float[Array, "n"]) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
+    return spline.motions(time)
 
 
 @eqx.filter_jit

@@ -71,8 +71,8 @@ def times_of(cloud: Cloud) -> Float[np.ndarray, "n"]:
 def _corrected(point, time, spline, errors, boresight, calibration) -> Float[Array, "n 3"]:
     """NaN where the trajectory has no records."""
     position, object_from_body, known = spline.poses(time)
-    off, each = errors.at(time), (0, 0, 0, 0, 0, None, None)
-    points = point, position, object_from_body, off[:, :3], off[:, 3:], boresight, calibration
+    off, each = errors.at(time), (0, 0, 0, 0, 0, 0, 0, None, None)
+    points = point, position, object_from_body, *spline.motions(time), off[:, :3], off[:, 3:], boresight, calibration
     return jnp.where(known[:, None], jax.vmap(corrected_return, each)(*points), jnp.nan)
 
 

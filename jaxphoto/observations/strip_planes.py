@@ -18,6 +18,8 @@ def return_at(
     point: Any,
     position: Any,
     roll_pitch_yaw: Any,
+    velocity: Any,
+    rate: Any,
     off: TrajectoryKnot,
     scanner: Scanner | None,
     calibration: ScannerCalibration | None,
@@ -26,7 +28,7 @@ def return_at(
     boresight = jnp.zeros(3) if scanner is None else scanner.boresight
     known = ScannerCalibration(jnp.zeros(3)) if calibration is None else calibration
     turn = matrix_from_roll_pitch_yaw(jnp.asarray(roll_pitch_yaw))
-    return corrected_return(point, position, turn, off.position, off.attitude, boresight, known)
+    return corrected_return(point, position, turn, velocity, rate, off.position, off.attitude, boresight, known)
 
 
 class StripPlanes(AbstractObservations):
@@ -35,7 +37,8 @@ class StripPlanes(AbstractObservations):
         normal . (X'_a - X'_b) = gap
 
     with standard deviation `sigma` (m). `point_a` (m) is the place on strip a's plane as measured, `scanner_a` and
-    `roll_pitch_yaw_a` the pose of the scanner when it was, by the trajectory; `knots_a` and `weights_a` give what that
+    `roll_pitch_yaw_a` the pose of the scanner when it was, by the trajectory, `velocity_a` (m/s) and `rate_a` (rad/s,
+    about the body's axes) its motion; `knots_a` and `weights_a` give what that
     is off by (`georeferencing.StripSpline.weights`). X' is `georeferencing.corrected_return`. `gap` is what was
     observed: zero, unless somebody adds an error to it. Without a trajectory a scanner may stand anywhere above.
     """
@@ -49,6 +52,8 @@ class StripPlanes(AbstractObservations):
         **{f"point_{s}": tuple(f"point_{s}_{x}_m" for x in "XYZ") for s in "ab"},
         **{f"scanner_{s}": tuple(f"scanner_{s}_{x}_m" for x in "XYZ") for s in "ab"},
         **{f"roll_pitch_yaw_{s}": tuple(f"{angle}_{s}_deg" for angle in _ANGLES) for s in "ab"},
+        **{f"velocity_{s}": tuple(f"velocity_{s}_{x}_m_per_s" for x in "XYZ") for s in "ab"},
+        **{f"rate_{s}": tuple(f"rate_{s}_{x}_deg_per_s" for x in ("right", "forward", "up")) for s in "ab"},
         **{f"weights_{s}": tuple(f"weight_{s}_{k}" for k in range(1, 5)) for s in "ab"},
         "normal": ("normal_X", "normal_Y", "normal_Z"),
         "gap": (),
@@ -64,6 +69,10 @@ class StripPlanes(AbstractObservations):
     scanner_b: Float[Numbers, "n 3"]
     roll_pitch_yaw_a: Float[Numbers, "n 3"]
     roll_pitch_yaw_b: Float[Numbers, "n 3"]
+    velocity_a: Float[Numbers, "n 3"]
+    velocity_b: Float[Numbers, "n 3"]
+    rate_a: Float[Numbers, "n 3"]
+    rate_b: Float[Numbers, "n 3"]
     normal: Float[Numbers, "n 3"]
     sigma: Float[Numbers, "n"]
     gap: Float[Numbers, "n"]
@@ -78,8 +87,9 @@ class StripPlanes(AbstractObservations):
         """By how much a's plane lies below b's (m), along the normal."""
         known = scanner, calibration
         off_a, off_b = weighted_knot(knots_a, self.weights_a), weighted_knot(knots_b, self.weights_b)
-        a = return_at(self.point_a, self.scanner_a, self.roll_pitch_yaw_a, off_a, *known)
-        b = return_at(self.point_b, self.scanner_b, self.roll_pitch_yaw_b, off_b, *known)
+        motion_a, motion_b = (self.velocity_a, self.rate_a), (self.velocity_b, self.rate_b)
+        a = return_at(self.point_a, self.scanner_a, self.roll_pitch_yaw_a, *motion_a, off_a, *known)
+        b = return_at(self.point_b, self.scanner_b, self.roll_pitch_yaw_b, *motion_b, off_b, *known)
         return self.gap - jnp.sum(self.normal * (a - b))
 
     def words(self, images, points) -> np.ndarray:

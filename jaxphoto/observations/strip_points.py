@@ -16,8 +16,9 @@ class StripPoints(AbstractObservations):
         normal . (X - F') = rise
 
     with standard deviation `sigma` (m). `foot` F (m) is a place on the strip's plane as measured, `scanner` and
-    `roll_pitch_yaw` the pose of the scanner when it was, by the trajectory; `knots` and `weights` give what that is off
-    by (`georeferencing.StripSpline.weights`), and F' is `georeferencing.corrected_return`. `rise` is what was observed:
+    `roll_pitch_yaw` the pose of the scanner when it was, by the trajectory, `velocity` (m/s) and `rate` (rad/s, about
+    the body's axes) its motion; `knots` and `weights` give what that pose is off by
+    (`georeferencing.StripSpline.weights`), and F' is `georeferencing.corrected_return`. `rise` is what was observed:
     zero, unless somebody adds an error to it.
     """
 
@@ -33,6 +34,8 @@ class StripPoints(AbstractObservations):
     foot: Float[Numbers, "n 3"]
     scanner: Float[Numbers, "n 3"]
     roll_pitch_yaw: Float[Numbers, "n 3"]
+    velocity: Float[Numbers, "n 3"]
+    rate: Float[Numbers, "n 3"]
     normal: Float[Numbers, "n 3"]
     sigma: Float[Numbers, "n"]
     rise: Float[Numbers, "n"]
@@ -46,7 +49,8 @@ class StripPoints(AbstractObservations):
     ) -> Float[Numbers, ""]:
         """By how much the point lies below the plane (m), along its normal."""
         off = weighted_knot(knots, self.weights)
-        foot = return_at(self.foot, self.scanner, self.roll_pitch_yaw, off, scanner, calibration)
+        pose = self.scanner, self.roll_pitch_yaw, self.velocity, self.rate
+        foot = return_at(self.foot, *pose, off, scanner, calibration)
         return self.rise - jnp.sum(self.normal * (point - foot))
 
     def words(self, images, points) -> np.ndarray:

@@ -70,21 +70,12 @@ def scan(
 
     The trajectory is off by shift and drift of each strip, the shots by boresight and calibration: with these,
     `corrected_return` of every point is the point that was hit plus normal noise of `noise_m` (X, Y, Z). Raises
-    BlockError where nothing comes back.
+    BlockError where nothing comes back, and where more would than can be held.
     """
     errors = drawn_errors(plan, paths, seed)
     leaves, noise = stream(seed, "laser returns from crowns"), stream(seed, "noise of laser points")
     parts = []
-    pulses_of = [plan.density_per_m2 * 2 * plan.half_width * path.height_m * path.length_m for path in paths]
-    if not sum(pulses_of) <= _PULSES:
-        raise BlockError(
-            f"the scanner would send {sum(pulses_of):.3g} pulses, the most are {_PULSES:g}; lower density_per_m2"
-        )
-    seconds = sum(path.node[-1] - path.node[0] for path in paths)
-    if not seconds * _RATE_HZ <= _RECORDS:
-        raise BlockError(
-            f"the scanner would fly for {seconds / 3600:.3g} hours; give shorter strips, or a higher speed"
-        )
+    pulses_of = _pulses(plan, paths)
     for number, path in enumerate(paths):
         n = round(pulses_of[number])
         for begin in range(0, n, _CHUNK):
@@ -102,11 +93,33 @@ def scan(
     return Scan(Cloud(**of_points, strips=names), _trajectory(paths, errors), truth, errors)
 
 
+def _pulses(plan: ScanPlan, paths: list[Path]) -> list[float]:
+    """How many of every path. Raises BlockError for what cannot be held, or is not flown."""
+    pulses_of = [plan.density_per_m2 * 2 * plan.half_width * path.height_m * path.length_m for path in paths]
+    if not sum(pulses_of) <= _PULSES:
+        raise BlockError(
+            f"the scanner would send {sum(pulses_of):.3g} pulses, the most are {_PULSES:g}; lower density_per_m2"
+        )
+    seconds = sum(path.node[-1] - path.node[0] for path in paths)
+    if not seconds * _RATE_HZ <= _RECORDS:
+        raise BlockError(
+            f"the scanner would fly for {seconds / 3600:.3g} hours; give shorter strips, or a higher speed"
+        )
+    for path in paths:
+        if not abs(plan.time_offset_s) < path.node[-1] - path.node[0]:
+            raise BlockError(
+                f"strip {path.strip} lasts {path.node[-1] - path.node[0]:.3g} s, and the scanner's clock is off by "
+                f"{plan.time_offset_s:g} s; give a smaller time_offset_s"
+            )
+    return pulses_of
+
+
 def _pattern(
     plan: ScanPlan, path: Path, pulses: Int[np.ndarray, "n"], of: int
 ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n 2"]]:
     """Time (s) of pulses, and the tangents of their angles to the right and ahead."""
-    begin, end = path.node[[0, -1]]
+    # Both the time and the recorded one lie on the path.
+    begin, end = path.node[[0, -1]] + np.clip(plan.time_offset_s, (0.0, -np.inf), (np.inf, 0.0))
     time = begin + (pulses + 0.5) / of * (end - begin)
     if PATTERN_OF[plan.pattern] == "circle":
         return time, _around(plan, time)
@@ -143,7 +156,11 @@ def _measured(
 ) -> dict[str, np.ndarray]:
     """The fields of the cloud of some pulses, in the order of time and returns."""
     position, quaternion = path.pose(time)
-    object_from_body = matrices(quaternion)
+    object_from_body = believed_turn = matrices(quaternion)
+    recorded, believed_position = time - errors.calibration.time_offset, position
+    if errors.calibration.time_offset:
+        believed_position, quaternion = path.pose(recorded)
+        believed_turn = matrices(quaternion)
     origin = position - object_from_body @ errors.calibration.lever_arm
     body_from_scanner = np.asarray(_small_rotation(errors.boresight))
     # The scanner believes that its axes are those of the body.
@@ -160,12 +177,12 @@ def _measured(
     shot = measured_shot(
         _rotated(object_from_body[pulse].transpose(0, 2, 1), hit), errors.boresight, errors.calibration
     )
-    shift, turn = errors.at(strip, time[pulse])
+    shift, turn = errors.at(strip, recorded[pulse])
     return {
-        "xyz": position[pulse] + shift + _rotated(turned_by(object_from_body[pulse], turn), shot),
+        "xyz": believed_position[pulse] + shift + _rotated(turned_by(believed_turn[pulse], turn), shot),
         "classification": by,
         "returns": np.column_stack([number, count[of_pulse]]).astype(np.uint8),
-        "time": time[pulse],
+        "time": recorded[pulse],
     }
 
 

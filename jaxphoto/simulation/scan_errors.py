@@ -36,7 +36,12 @@ def drawn_errors(plan: ScanPlan, paths: list[Path], seed: int) -> StripErrors:
         position.append(shift + np.array(plan.drift_sigma_m) * drift[:, :3])
         attitude.append(np.deg2rad(turn + np.array(plan.drift_sigma_deg) * drift[:, 3:]))
     scales = (np.array(v) for v in (plan.range_offset_m, plan.range_scale_ppm, plan.angle_scale_ppm))
-    numbers: Any = (np.array(plan.lever_arm_m), *scales, np.deg2rad(plan.eccentricity_deg))
+    numbers: Any = (
+        np.array(plan.lever_arm_m),
+        *scales,
+        np.deg2rad(plan.eccentricity_deg),
+        np.array(plan.time_offset_s),
+    )
     calibration = ScannerCalibration(*numbers, PATTERN_OF[plan.pattern])  # type: ignore[call-arg]
     boresight = np.deg2rad(plan.boresight_deg)
     return StripErrors(tuple(splines), np.concatenate(position), np.concatenate(attitude), boresight, calibration)

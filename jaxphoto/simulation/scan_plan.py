@@ -24,9 +24,9 @@ class ScanPlan:
     attitude is off by `attitude_deg` (about right, forward, up). From the middle of the strip on both go on by
     `drift_m_per_s` and `attitude_drift_deg_per_s`; on top of it they drift by chance with `drift_sigma_m`,
     `drift_sigma_deg` and `correlation_s`, from knot to knot `knots_s` apart. `lever_arm_m`, `range_offset_m`, the
-    scales and `eccentricity_deg` (of cos and sin) are those of `georeferencing.ScannerCalibration`. With
-    `same_trajectory` the stations and attitudes of the exposures are those of this trajectory, with all that it is off
-    by; their noise comes on top.
+    scales, `eccentricity_deg` (of cos and sin) and `time_offset_s` are those of `georeferencing.ScannerCalibration`.
+    With `same_trajectory` the stations and attitudes of the exposures are those of this trajectory, with all that it is
+    off by; their noise comes on top.
     """
 
     density_per_m2: float
@@ -48,6 +48,7 @@ class ScanPlan:
     range_scale_ppm: float = 0.0
     angle_scale_ppm: float = 0.0
     eccentricity_deg: tuple[float, float] = (0.0, 0.0)
+    time_offset_s: float = 0.0
     same_trajectory: bool = False
 
     @property

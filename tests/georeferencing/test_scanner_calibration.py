@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.interpolate import BSpline
+from scipy.spatial.transform import Rotation
 
 from jaxphoto.georeferencing import (
     ScannerCalibration,
@@ -19,6 +20,7 @@ from tests.formulas import camera_from_object
 POSITION, TURN = np.array([10.0, -20.0, 900.0]), camera_from_object(0.03, -0.05, 1.2)
 SHOT = np.array([180.0, 15.0, -600.0])
 NONE = np.zeros(3)
+VELOCITY, RATE = np.array([40.0, 30.0, -1.0]), np.array([0.02, -0.05, 0.1])
 RIGHT = ScannerCalibration(jnp.zeros(3), jnp.zeros(()), jnp.zeros(()), jnp.zeros(()), jnp.zeros(2))
 
 
@@ -87,15 +89,24 @@ def test_an_offset_of_the_encoder_is_a_boresight_about_the_forward_axis():
 def test_without_calibration_and_drift_a_return_is_a_corrected_point():
     point, boresight, shift = POSITION + TURN @ SHOT, np.array([3e-4, -2e-4, 5e-4]), np.array([0.2, -0.1, 0.3])
     expected = corrected_point(point, POSITION, TURN, boresight, shift)
-    found = corrected_return(point, POSITION, TURN, shift, NONE, boresight, RIGHT)
+    found = corrected_return(point, POSITION, TURN, NONE, NONE, shift, NONE, boresight, RIGHT)
     np.testing.assert_allclose(found, expected, atol=1e-9)
 
 
 def test_an_attitude_is_off_as_a_boresight_is():
     point, turn = POSITION + TURN @ SHOT, np.array([3e-4, -2e-4, 5e-4])
-    one = corrected_return(point, POSITION, TURN, NONE, turn, NONE, RIGHT)
-    other = corrected_return(point, POSITION, TURN, NONE, NONE, turn, RIGHT)
+    one = corrected_return(point, POSITION, TURN, NONE, NONE, NONE, turn, NONE, RIGHT)
+    other = corrected_return(point, POSITION, TURN, NONE, NONE, NONE, NONE, turn, RIGHT)
     np.testing.assert_allclose(one, other, atol=1e-9)
+
+
+def test_a_return_of_later_lies_where_the_scanner_was_later():
+    """Straight on at the velocity, and turned on by the rate."""
+    clock = ScannerCalibration(jnp.zeros(3), time_offset=jnp.asarray(0.01))
+    found = corrected_return(POSITION + TURN @ SHOT, POSITION, TURN, VELOCITY, RATE, NONE, NONE, NONE, clock)
+    later = TURN @ Rotation.from_rotvec(0.01 * RATE).as_matrix()
+    np.testing.assert_allclose(found, POSITION + 0.01 * VELOCITY + later @ SHOT, atol=1e-9)
+    assert np.linalg.norm((later - TURN) @ SHOT) > 0.1
 
 
 @pytest.mark.parametrize("pattern", ["line", "circle"])
@@ -105,19 +116,19 @@ def test_derivatives(shot, pattern):
     point = POSITION + TURN @ np.array(shot)
 
     def at(v):
-        own = ScannerCalibration(v[9:12], v[12], 1e3 * v[13], 1e3 * v[14], v[15:17], pattern)
-        return corrected_return(point, POSITION, TURN, v[:3], v[3:6], v[6:9], own)
+        own = ScannerCalibration(v[9:12], v[12], 1e3 * v[13], 1e3 * v[14], v[15:17], v[17], pattern)
+        return corrected_return(point, POSITION, TURN, VELOCITY, RATE, v[:3], v[3:6], v[6:9], own)
 
-    compiled, start, step = jax.jit(at), np.linspace(-1e-3, 2e-3, 17), 1e-4
+    compiled, start, step = jax.jit(at), np.linspace(-1e-3, 2e-3, 18), 1e-4
     forward, reverse = jax.jit(jax.jacfwd(at))(start), jax.jit(jax.jacrev(at))(start)
     differences = np.stack(
-        [(compiled(start + step * e) - compiled(start - step * e)) / (2 * step) for e in np.eye(17)], 1
+        [(compiled(start + step * e) - compiled(start - step * e)) / (2 * step) for e in np.eye(18)], 1
     )
     np.testing.assert_allclose(forward, reverse, atol=1e-9)
     np.testing.assert_allclose(forward, differences, atol=1e-5)
     # At the nadir a scale of angles moves nothing; nor does an angle about it.
     none = {"line": 2, "circle": 3}[pattern] if shot[0] == 0 else 0
-    assert (np.abs(forward).max(axis=0) > 1e-3).sum() == 17 - none
+    assert (np.abs(forward).max(axis=0) > 1e-3).sum() == 18 - none
 
 
 def test_splines_are_those_of_scipy():

@@ -53,7 +53,7 @@ SETTINGS = StripSettings(
     sigma_attitude_deg=0.003,
     sigma_heading_deg=0.006,
 )
-PRIORS = ScannerPriors(FREE, ScannerCalibration(FIXED, Weighted(0.0, 0.1), FIXED, FREE, FIXED))  # type: ignore[arg-type]
+PRIORS = ScannerPriors(FREE, ScannerCalibration(FIXED, Weighted(0.0, 0.1), FIXED, FREE, FIXED, FIXED))  # type: ignore[arg-type]
 
 # The same with a scanner of two prisms, which looks all around.
 AROUND = STRIPS | {"lidar": {"density_per_m2": 0.2, "scan_angle_deg": 25.0, "pattern": "circle", "truth": TRUTH}}

@@ -9,8 +9,10 @@ import pytest
 
 from jaxphoto import BlockError, InputError
 from jaxphoto.adjustment import Outcome
+from jaxphoto.cli.strip_flight import scanner_priors
 from jaxphoto.cloud import Cloud
 from jaxphoto.georeferencing import StripSpline, TrajectoryKnot
+from jaxphoto.io.recipe.truth import truth_tables
 from jaxphoto.lidar.correction import scanner_path
 from jaxphoto.lidar.strip_correction import correct_flight, correct_strips
 from jaxphoto.lidar.strip_settings import StripSettings
@@ -28,7 +30,7 @@ from jaxphoto.rotation import (
 from jaxphoto.simulation import Simulation
 from jaxphoto.unknowns import FIXED
 from tests.lidar.clouds import SURFACES, ground
-from tests.procedures.strips import AROUND, NOISE_M, PRIORS_AROUND, SETTINGS, fitted, flown
+from tests.procedures.strips import AROUND, NOISE_M, PRIORS_AROUND, SETTINGS, STRIPS, TRUTH, fitted, flown
 from tests.simulation.small import made
 
 GROUND = 2
@@ -95,6 +97,21 @@ def test_a_scanner_of_prisms_is_found_by_what_it_sees_ahead_and_behind():
     sigma = {r.parameter: r.sigma for r in calibration_table(found).itertuples()}
     of_lines = {r.parameter: r.sigma for r in calibration_table(fitted()).itertuples()}
     assert sigma["scanner.boresight_right_deg"] < 0.8 * of_lines["scanner.boresight_right_deg"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["rotating", "oscillating", "risley"])
+def test_angles_and_clock_of_a_scanner_are_found(kind):
+    """By the options of the command, in the words of a recipe; errors of the trajectory as they drift."""
+    true = {"eccentricity_deg": [0.02, -0.03], "time_offset_s": 0.005}
+    drifts = {key: TRUTH[key] for key in ("drift_sigma_m", "drift_sigma_deg", "correlation_s", "knots_s")}
+    lidar = {"density_per_m2": 0.2, "scan_angle_deg": 25.0, "pattern": kind, "truth": drifts | true}
+    flight, priors = made(STRIPS | {"lidar": lidar}, 5), scanner_priors(["eccentricity", "time-offset"], kind)
+    found = adjust_strips(flight.cloud, flight.trajectory, SETTINGS, priors)
+    table, told = calibration_table(found), truth_tables(flight)["scanner"].set_index("parameter").value
+    assert len(table) == 3 and found.still
+    assert (np.abs(table.value - told[table.parameter].to_numpy()) < 3 * table.sigma).all()
+    assert (table.value.abs() > 4 * table.sigma).all()
 
 
 def test_another_pattern_than_that_of_the_scanner_is_told():

@@ -149,6 +149,7 @@ WRONG = TRUTH | {
     "attitude_deg": {"default": WRONG_ATTITUDE_DEG},
     "attitude_drift_deg_per_s": {"B": [0.004, -0.002, 0.01]},
     "eccentricity_deg": [0.02, -0.03],
+    "time_offset_s": 0.002,
 }
 
 
@@ -172,6 +173,7 @@ def test_all_that_is_wrong_comes_off_by_the_truth(kind):
     told = tables["scanner"].set_index("parameter").value
     names = [f"scanner_calibration.eccentricity_{word}_deg" for word in ("cos", "sin")]
     np.testing.assert_allclose(told[names], WRONG["eccentricity_deg"], rtol=1e-12)
+    assert told["scanner_calibration.time_offset_s"] == WRONG["time_offset_s"]
     table = tables["trajectory_errors"].set_index("strip")
     steps = table.loc["2"].filter(["time_s", "right_deg", "up_deg"]).diff().dropna()
     np.testing.assert_allclose(steps.right_deg / steps.time_s, 0.004, rtol=1e-9)

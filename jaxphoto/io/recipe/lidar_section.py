@@ -46,7 +46,7 @@ def read_lidar(top: Section, plan: FlightPlan | ConvergentPlan, terrain: Terrain
         raise section.error(
             "same_trajectory", "the scanner has a flight of its own, [[lidar.strips]]; remove these, or this key"
         )
-    single = ("range_offset_m", "range_scale_ppm", "angle_scale_ppm")
+    single = ("range_offset_m", "range_scale_ppm", "angle_scale_ppm", "time_offset_s")
     vectors = {"boresight_deg": 3, "lever_arm_m": 3, "eccentricity_deg": 2}
     drawn = ("shift_sigma_m", "drift_sigma_m", "drift_sigma_deg")
     by_strip = ("shift_m", "drift_m_per_s", "attitude_deg", "attitude_drift_deg_per_s")

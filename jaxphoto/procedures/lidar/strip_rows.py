@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 
 from jaxphoto.compiling import call_compiled
 from jaxphoto.georeferencing import StripErrors, StripSpline
-from jaxphoto.lidar.correction import ScannerPath, scanner_poses
+from jaxphoto.lidar.correction import ScannerPath, scanner_motions, scanner_poses
 from jaxphoto.lidar.corresponding_planes import PlanePairs, StripPatches, steep
 from jaxphoto.lidar.strip_correction import corrected_strip
 from jaxphoto.lidar.strip_settings import StripSettings
@@ -24,13 +24,15 @@ _SCATTER = np.uint64(0x9E3779B97F4A7C15)
 
 
 class Side(NamedTuple):
-    """One strip's part of rows: knots (n, 4), weights (n, 4), point, scanner, roll_pitch_yaw (n, 3)."""
+    """One strip's part of rows: knots (n, 4), weights (n, 4), all others (n, 3)."""
 
     knots: np.ndarray
     weights: np.ndarray
     point: np.ndarray
     scanner: np.ndarray
     roll_pitch_yaw: np.ndarray
+    velocity: np.ndarray
+    rate: np.ndarray
 
 
 def side_of(
@@ -49,9 +51,11 @@ def side_of(
         point = point - (corrected_strip(point, time, strip, errors, path) - foot)
     if path is None or not len(time):
         # From straight above: nothing that would turn the shot is estimated.
-        return Side(knots, weights, point, point + np.array([0.0, 0.0, 1.0]), np.zeros_like(point))
+        none = np.zeros_like(point)
+        return Side(knots, weights, point, point + np.array([0.0, 0.0, 1.0]), none, none, none)
     poses = scanner_poses(path, time)
-    return Side(knots, weights, point, poses.position, np.asarray(call_compiled(_angles, poses.object_from_body)))
+    angles = np.asarray(call_compiled(_angles, poses.object_from_body))
+    return Side(knots, weights, point, poses.position, angles, *scanner_motions(path, time))
 
 
 def plane_rows(pairs: PlanePairs, a: Side, b: Side) -> StripPlanes:

@@ -15,7 +15,7 @@ from jaxphoto.procedures.lidar.until_still import at_result
 from jaxphoto.unknowns import FIXED, FREE, Unknowns, Weighted
 
 _ZERO = np.zeros(3)
-NO_CALIBRATION = ScannerCalibration(_ZERO, np.zeros(()), np.zeros(()), np.zeros(()), np.zeros(2))  # type: ignore[arg-type]
+NO_CALIBRATION = ScannerCalibration(_ZERO, *[np.zeros(())] * 3, np.zeros(2), np.zeros(()))  # type: ignore[arg-type, call-arg]
 """A scanner that is right."""
 
 
@@ -48,7 +48,7 @@ class ScannerPriors(NamedTuple):
     """What is known of the scanner beforehand: FREE, FIXED or Weighted, each."""
 
     boresight: Any = FREE
-    calibration: ScannerCalibration = ScannerCalibration(*[FIXED] * 5)  # type: ignore[arg-type]
+    calibration: ScannerCalibration = ScannerCalibration(*[FIXED] * len(dynamic_fields(ScannerCalibration)))  # type: ignore[arg-type]
 
     @property
     def right(self) -> bool:

@@ -68,6 +68,8 @@ class TiePointSearch:
                     side.point,
                     side.scanner,
                     side.roll_pitch_yaw,
+                    side.velocity,
+                    side.rate,
                     normal,
                     found.sigma,
                     np.zeros(len(normal)),
