@@ -112,13 +112,13 @@ def _plainly_closed(block: Block, values: Values, structure: Structure, vague: f
     """Three full control points (or stations without free mounts and strips) that do not lie on a line will do.
 
     They do where the rotation about the line that fits them best is known better than `vague` (rad). Without images
-    and points nothing is there to move.
+    nothing is there to move but points, and nothing at all where these are control, every one.
     """
-    if not structure.n_images and not structure.n_points:
-        return True
     seen = np.zeros((3, structure.n_points))
     seen[block.control.axis, block.control.who] = 1
     seen[structure.point_free == 0] = 1
+    if not structure.n_images and seen.all():
+        return True
     sets = [(np.asarray(values.points)[:, seen.all(0)], block.control.sigma)]
     if not (structure.free >= structure.n_cameras).any():
         stations = np.zeros((3, structure.n_images))

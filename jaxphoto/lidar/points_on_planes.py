@@ -51,6 +51,15 @@ def returns_about(
     return index, point
 
 
+def windows_of_returns(index: Int[np.ndarray, "n"], point: Int[np.ndarray, "n"]) -> Float[np.ndarray, "points"]:
+    """In how many windows a return about each point lies on average; of those of `returns_about`.
+
+    The variances of planes times this say of points that are close together what all their returns say, once.
+    """
+    often = np.bincount(index)[index]
+    return np.bincount(point, often) / np.maximum(np.bincount(point), 1)
+
+
 def on_planes(patches: StripPatches, points: Float[np.ndarray, "points 3"]) -> PointsOnPlanes:
     """The points whose plane a strip has; the cells of `patches` are the numbers of the points."""
     patch, place = np.arange(len(patches.cell)), points[patches.cell]

@@ -14,19 +14,31 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxphoto.adjustment import Adjustment
+from jaxphoto.block import empty_block
 from jaxphoto.cloud import Cloud
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import StripErrors, StripSpline, Trajectory
 from jaxphoto.lidar.correction import check_covered, scanner_path
 from jaxphoto.lidar.strip_correction import correct_flight, times_of
 from jaxphoto.lidar.strip_settings import StripSettings
+from jaxphoto.observations import StripPoints
 from jaxphoto.procedures.adjust import adjust
+from jaxphoto.procedures.control.surveyed import SurveyedPoints
 from jaxphoto.procedures.lidar.photographs import Photographs, check_photographs, on_trajectory, spans_with
 from jaxphoto.procedures.lidar.scanner_checks import check_measured_from, check_pattern
+from jaxphoto.procedures.lidar.strip_control import (
+    CHECK,
+    CONTROL,
+    ControlSearch,
+    OnStrips,
+    check_seen,
+    with_control,
+    with_datum,
+)
 from jaxphoto.procedures.lidar.strip_rows import step_rows
 from jaxphoto.procedures.lidar.strip_search import CommonPlanes, StripSearch, check_joined
 from jaxphoto.procedures.lidar.strip_unknowns import ScannerPriors, errors_of, knot_sigmas, strip_block
-from jaxphoto.procedures.lidar.tie_point_search import PointPlanes, TiePointSearch
+from jaxphoto.procedures.lidar.tie_point_search import PointPlanes, PointSearch
 from jaxphoto.procedures.lidar.until_still import STILL, at_result, with_interior_held
 from jaxphoto.procedures.lidar.vertical_control import tie_points
 from jaxphoto.statistics import Covariance, covariance
@@ -46,6 +58,8 @@ class StripRound(NamedTuple):
     """Observed; of all that fit at most `StripSettings.most`."""
     points: int
     """Tie points of photographs observed to lie on a plane; one that lies on those of two strips counts twice."""
+    control: int
+    """Surveyed points observed likewise."""
     left_out: int
     """Planes and points that did not fit."""
     rms_m: float
@@ -55,7 +69,10 @@ class StripRound(NamedTuple):
 
 
 class StripDifference(NamedTuple):
-    """Two strips where they overlap, or tie points of photographs over the planes of a strip, before and after."""
+    """Two strips where they overlap, or points over the planes of a strip, before and after.
+
+    Points are tie points of photographs, control or check points: `one` says which.
+    """
 
     one: str
     other: str
@@ -98,6 +115,7 @@ def adjust_strips(
     priors: ScannerPriors | None = None,
     *,
     photographs: Photographs | None = None,
+    control: SurveyedPoints | None = None,
     held: Collection[str] | Literal["all"] = (),
     max_rounds: int = MAX_STRIP_ROUNDS,
     report: Callable[[StripRound], None] = lambda made: None,
@@ -110,14 +128,17 @@ def adjust_strips(
     tie points lie on the planes of the strips. What of their cameras and mounts is estimated their block says; its
     stations and attitudes are taken for the trajectory's.
 
+    `control` are surveyed points on smooth surfaces, in the cloud's system (m): where strips have planes about them,
+    these go through them. Its check points are compared alone. Without a trajectory it is the datum, too.
+
     `priors` are those of the scanner and say its pattern; by default lines, its boresight FREE and all else FIXED. Of
     one that looks all around, what a strip saw ahead and behind is compared, too. The trajectory of strips
     named in `held` is right, or that of all. Without a trajectory each strip has a shift alone, and the first is held
-    where none is named.
+    where none is named, in the directions that control does not tell.
 
     Raises InputError for a cloud of one strip, of strips without points or without the times that a trajectory needs,
-    BlockError for strips that no plane joins and for a trajectory that does not cover the cloud or the exposures, and
-    as `jaxphoto.adjust`.
+    and for control without heights or standard deviations; BlockError for strips that no plane joins, for control that
+    lies elsewhere and for a trajectory that does not cover the cloud or the exposures; and as `jaxphoto.adjust`.
     """
     settings = StripSettings() if settings is None else settings
     if trajectory is None and priors is not None:
@@ -141,34 +162,47 @@ def adjust_strips(
     if photographs is not None and alone is not None:
         images = at_result(on_trajectory(photographs, splines, spans, settings), alone.unknowns)
     sigmas = knot_sigmas(splines, trajectory, settings)
+    block, number = images, np.zeros(0, int)
+    if control is not None:
+        block, number = with_control(empty_block("strips and control") if images is None else images, control)
     if trajectory is None:
-        block = strip_block(names, splines, held or names[:1], sigmas, None)
+        # With control its datum, below, is in place of a strip.
+        right = held if held or control is not None else names[:1]
+        block = strip_block(names, splines, right, sigmas, None, block)
     else:
-        block = strip_block(names, splines, held, sigmas, priors, images)
+        block = strip_block(names, splines, held, sigmas, priors, block)
     steps = tuple(rows for rows in step_rows(splines, sigmas, settings) if len(rows))
     pattern = priors.calibration.pattern
     search, errors = StripSearch(cloud, path, settings, pattern), errors_of(block.start.unknowns, splines)
     first = seen = search.look(errors, settled=False)
     check_joined(names, seen)
-    ties = None if images is None else TiePointSearch(search, tie_points(images))
-    first_on = on = [] if ties is None or alone is None else ties.look(alone, covariance(alone), settled=False)
+    ties = None if images is None else PointSearch(search, tie_points(images))
+    first_on = on = [] if ties is None or alone is None else ties.look(*_of(ties, alone, covariance(alone)), False)
+    surveyed = None if control is None else ControlSearch(search, control, number)
+    first_met = met = OnStrips([], []) if surveyed is None else surveyed.look(settled=False)
+    if control is not None:
+        check_seen(control, met, search)
+        block = block if trajectory is not None or held else with_datum(block, names[0], met, settings)
     rounds: list[StripRound] = []
     before = np.zeros(())
     while True:
         planes, points = search.rows(seen, errors), () if ties is None else ties.rows(on, errors)
-        posed = dataclasses.replace(block, more=(*block.more, planes, *points, *steps))
+        given = () if surveyed is None else surveyed.rows(met, errors)
+        lying = (StripPoints.joined(*points, *given),) if points or given else ()
+        posed = dataclasses.replace(block, more=(*block.more, planes, *lying, *steps))
         adjusted = adjust(posed, posed.start.unknowns)
         # With rows, as nobody knows which round is the last: its covariance serves the tables of the result, too.
         known = covariance(adjusted, rows=True)
         now = np.asarray(adjusted.values.shared)[adjusted.structure.free]
-        counted = len(planes), sum(map(len, points))
-        rounds.append(_round(len(rounds) + 1, counted, seen, on, _change(now - before, known)))
+        counted = len(planes), sum(map(len, points)), sum(map(len, given))
+        rounds.append(_round(len(rounds) + 1, counted, seen, [*on, *met.control], _change(now - before, known)))
         report(rounds[-1])
         still = rounds[-1].largest_change < STILL and bool(adjusted.converged)
         block, before, errors = at_result(block, adjusted.unknowns), now, errors_of(adjusted.unknowns, splines)
         settled = len(rounds) >= _SETTLED
         seen = search.look(errors, settled)
-        on = [] if ties is None else ties.look(adjusted, known, settled)
+        on = [] if ties is None else ties.look(*_of(ties, adjusted, known), settled)
+        met = OnStrips([], []) if surveyed is None else surveyed.look(settled)
         if still or len(rounds) >= max_rounds:
             return StripAdjustment(
                 alone,
@@ -177,7 +211,10 @@ def adjust_strips(
                 search.corrected_cloud,
                 None if trajectory is None else correct_flight(trajectory, errors),
                 errors,
-                _differences(first, seen) + _point_differences(first_on, on),
+                _differences(first, seen)
+                + _point_differences(PHOTOGRAPHS, first_on, on)
+                + _point_differences(CONTROL, first_met.control, met.control)
+                + _point_differences(CHECK, first_met.check, met.check),
                 tuple(rounds),
                 still,
                 tuple(odd),
@@ -234,11 +271,16 @@ def _splines(
 
 
 def _round(
-    number: int, observed: tuple[int, int], seen: Sequence[CommonPlanes], on: Sequence[PointPlanes], change: float
+    number: int, observed: tuple[int, int, int], seen: Sequence[CommonPlanes], on: Sequence[PointPlanes], change: float
 ) -> StripRound:
     gaps = np.concatenate([f.pairs.gap[f.fits] for f in seen])
     left_out = sum(int((~f).sum()) for f in (*(f.fits for f in seen), *(f.fits for f in on)))
     return StripRound(number, *observed, left_out, _rms(gaps), change)
+
+
+def _of(search: PointSearch, adjusted: Adjustment, known: Covariance) -> tuple[np.ndarray, np.ndarray]:
+    """Where its points are (m), as adjusted, and their covariances."""
+    return np.asarray(adjusted.unknowns.points)[search.points], np.asarray(known.points)[search.points]
 
 
 def _change(moved: Float[np.ndarray, "unknowns"], known: Covariance) -> float:
@@ -250,23 +292,26 @@ def _change(moved: Float[np.ndarray, "unknowns"], known: Covariance) -> float:
 def _differences(before: Sequence[CommonPlanes], after: Sequence[CommonPlanes]) -> tuple[StripDifference, ...]:
     then, rows = {(f.one.name, f.other.name): f.pairs.gap[f.fits] for f in before}, []
     for f in after:
-        was = then.get((f.one.name, f.other.name), np.array([np.nan]))
-        gap, noise = f.pairs.gap[f.fits], _rms(f.pairs.sigma[f.fits])
-        told = (float(was.mean()), _rms(was), float(gap.mean()), _rms(gap), noise)
-        rows.append(StripDifference(f.one.name, f.other.name, int(np.isfinite(was).sum()), len(gap), *told))
+        was = then.get((f.one.name, f.other.name), np.zeros(0))
+        rows.append(_difference(f.one.name, f.other.name, was, f.pairs.gap[f.fits], f.pairs.sigma[f.fits]))
     return tuple(rows)
 
 
-def _point_differences(before: Sequence[PointPlanes], after: Sequence[PointPlanes]) -> tuple[StripDifference, ...]:
-    """Of tie points over the planes of each strip."""
+def _point_differences(
+    what: str, before: Sequence[PointPlanes], after: Sequence[PointPlanes]
+) -> tuple[StripDifference, ...]:
+    """Of points over the planes of each strip."""
     rows = []
     for was, now in zip(before, after, strict=True):
-        if not now.fits.any():
-            continue
-        then, gap = was.found.gap[was.fits], now.found.gap[now.fits]
-        told = (float(then.mean()), _rms(then), float(gap.mean()), _rms(gap), _rms(now.found.sigma[now.fits]))
-        rows.append(StripDifference(PHOTOGRAPHS, now.look.name, len(then), len(gap), *told))
+        if now.fits.any():
+            then, sigma = was.found.gap[was.fits], now.sigma if what != PHOTOGRAPHS else now.found.sigma
+            rows.append(_difference(what, now.look.name, then, now.found.gap[now.fits], sigma[now.fits]))
     return tuple(rows)
+
+
+def _difference(one: str, other: str, was: np.ndarray, gap: np.ndarray, sigma: np.ndarray) -> StripDifference:
+    then = (float(was.mean()), _rms(was)) if len(was) else (np.nan, np.nan)
+    return StripDifference(one, other, len(was), len(gap), *then, float(gap.mean()), _rms(gap), _rms(sigma))
 
 
 def _rms(values: Float[np.ndarray, "n"]) -> float:

@@ -1,4 +1,4 @@
-"""Looking for the planes that strips have about the tie points of photographs, in the cloud as corrected so far."""
+"""Looking for the planes that strips have about points, in the cloud as it is corrected so far."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -6,40 +6,42 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxphoto.adjustment import Adjustment
 from jaxphoto.georeferencing import StripErrors
 from jaxphoto.lidar.corresponding_planes import StripPatches, fitting, planes_of
-from jaxphoto.lidar.points_on_planes import PointsOnPlanes, on_planes, returns_about
+from jaxphoto.lidar.points_on_planes import PointsOnPlanes, on_planes, returns_about, windows_of_returns
 from jaxphoto.lidar.strip_correction import times_of
 from jaxphoto.observations import StripPoints
 from jaxphoto.procedures.lidar.looks import Look
 from jaxphoto.procedures.lidar.strip_rows import side_of
 from jaxphoto.procedures.lidar.strip_search import StripSearch
-from jaxphoto.statistics import Covariance
 
 
 class PointPlanes(NamedTuple):
-    """The tie points that lie over planes of one strip, and which of them fit."""
+    """The points that lie over planes of one strip, and which of them fit."""
 
     look: Look
     patches: StripPatches
     found: PointsOnPlanes
-    """Its points are numbers among `TiePointSearch.points`."""
+    """Its points are numbers among `PointSearch.points`."""
     sigma: Float[np.ndarray, "n"]
     """Of the gaps, by plane and point (m)."""
     fits: Bool[np.ndarray, "n"]
 
 
-class TiePointSearch:
-    """Searches that follow one another: returns stay about their points when `settled`, as those of `StripSearch`."""
+class PointSearch:
+    """Searches that follow one another: returns stay about their points when `settled`, as those of `StripSearch`.
+
+    `points` are the numbers in the block of the points looked for.
+    """
 
     def __init__(self, search: StripSearch, points: Int[np.ndarray, "points"]) -> None:
         self.search, self.points = search, points
         self.about: list[tuple[np.ndarray, np.ndarray]] = []
 
-    def look(self, adjusted: Adjustment, known: Covariance, settled: bool) -> list[PointPlanes]:
-        """The planes about the points as adjusted, in the strips as the other search corrected them last."""
-        place, spread = (np.asarray(of)[self.points] for of in (adjusted.unknowns.points, known.points))
+    def look(
+        self, place: Float[np.ndarray, "points 3"], spread: Float[np.ndarray, "points 3 3"], settled: bool
+    ) -> list[PointPlanes]:
+        """The planes about points (m) with these covariances, in the strips as the other search corrected them last."""
         search, about, seen = self.search, [], []
         for k, (own, xyz) in enumerate(zip(search.looks, search.corrected, strict=True)):
             about.append(self.about[k] if settled else returns_about(xyz, place, search.settings))
@@ -47,6 +49,7 @@ class TiePointSearch:
             measured, time = search.cloud.xyz[own.returns], times_of(search.cloud)[own.returns]
             patches = planes_of(xyz[index], measured[index], time[index], point, search.settings)
             found = on_planes(patches, place)
+            found = found._replace(sigma=found.sigma * np.sqrt(windows_of_returns(index, point)[found.point]))
             of_points = np.einsum("ni,nij,nj->n", patches.normal, spread[found.point], patches.normal)
             sigma = np.sqrt(found.sigma**2 + of_points)
             seen.append(PointPlanes(own, patches, found, sigma, fitting(found.gap, sigma, search.settings.outlier)))

@@ -1,0 +1,171 @@
+"""Surveyed points on smooth surfaces, which the planes of strips meet: the datum that strips do not tell each other.
+
+A point is one of the block, with its coordinates observed once however many strips have it: what the survey is off by
+is the same for all of them.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Int
+
+from jaxphoto.block import Block
+from jaxphoto.errors import BlockError, InputError
+from jaxphoto.georeferencing import StripErrors, TrajectoryKnot
+from jaxphoto.lidar.corresponding_planes import fitting
+from jaxphoto.lidar.strip_settings import StripSettings
+from jaxphoto.observations import StripPoints
+from jaxphoto.procedures.control.into_block import into_block
+from jaxphoto.procedures.control.marked import Marked
+from jaxphoto.procedures.control.surveyed import SurveyedPoints
+from jaxphoto.procedures.lidar.strip_search import StripSearch
+from jaxphoto.procedures.lidar.tie_point_search import PointPlanes, PointSearch
+from jaxphoto.unknowns import FIXED, Weighted
+
+CONTROL, CHECK = "control", "check points"
+"""What differences call surveyed points beside strips."""
+# No strip is farther (m) from control in its system; heights of another one, or in feet, mostly are.
+_FAR_M = 10.0
+# Of a strip that is right in some directions and free in the others (m): small and large beside what control tells.
+_RIGHT_M, _FREE_M = 1e-3, 100.0
+# In standard deviations of the survey, within which two surveys of a point are one.
+_SAME = 4.0
+_NO_MARKS = Marked(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)), np.zeros(0))
+
+
+class OnStrips(NamedTuple):
+    """The surveyed points over planes of each look; check points all fit, because nothing follows from them."""
+
+    control: list[PointPlanes]
+    check: list[PointPlanes]
+
+
+class ControlSearch:
+    """Searches about surveyed places, which stay; `number` is that of each point in the block, -1 of check points."""
+
+    def __init__(self, search: StripSearch, control: SurveyedPoints, number: Int[np.ndarray, "points"]) -> None:
+        self.search, self.control = search, control
+        self._points = PointSearch(search, number)
+        variances = np.nan_to_num(control.sigma_m) ** 2
+        self._spread = variances[:, :, None] * np.eye(3)
+
+    def look(self, settled: bool) -> OnStrips:
+        """The planes about the points, in the strips as the other search corrected them last."""
+        seen = self._points.look(self.control.coordinates, self._spread, settled)
+        control = [_of(f, ~self.control.check[f.found.point]) for f in seen]
+        # Of all strips together: a few points of one strip do not say which of them is a blunder.
+        gap, sigma = (np.concatenate(v) for v in zip(*((f.found.gap, f.sigma) for f in control), strict=True))
+        fits = np.split(fitting(gap, sigma, self.search.settings.outlier), np.cumsum([len(f.fits) for f in control]))
+        check = [_of(f, self.control.check[f.found.point]) for f in seen]
+        return OnStrips(
+            [f._replace(fits=own) for f, own in zip(control, fits, strict=False)],
+            [f._replace(fits=np.ones(len(f.fits), bool)) for f in check],
+        )
+
+    def rows(self, seen: OnStrips, errors: StripErrors) -> tuple[StripPoints, ...]:
+        """The control that fits as observations: one group of them, where there are any."""
+        return self._points.rows(seen.control, errors)
+
+
+def with_control(block: Block, control: SurveyedPoints) -> tuple[Block, Int[np.ndarray, "points"]]:
+    """`block` with the control observed, and which of its points each is; -1 of check points, which it does not need.
+
+    Control of the block by the same name is the same point, and its survey counts once. Raises InputError for points
+    without a height or, of control, a standard deviation; and for other points of the block by the same name.
+    """
+    _check_complete(control)
+    again = _again(block, control)
+    own = np.flatnonzero(~control.check & ~again)
+    ids, xyz, sigma = tuple(control.ids[k] for k in own), control.coordinates[own], control.sigma_m[own]
+    whole = into_block(block, ids, xyz, sigma, xyz, _NO_MARKS, np.ones(len(own), bool))
+    place = {name: k for k, name in enumerate(whole.points)}
+    number = [-1 if out else place[name] for name, out in zip(control.ids, control.check, strict=True)]
+    return whole, np.array(number, int)
+
+
+def check_seen(control: SurveyedPoints, seen: OnStrips, search: StripSearch) -> None:
+    """Raise BlockError for surveyed points that lie elsewhere than the strips, in plan or in height."""
+    gap = np.concatenate([f.found.gap for f in (*seen.control, *seen.check)])
+    settings = search.settings
+    if not len(gap):
+        low, high = search.cloud.extent
+        off = np.maximum(np.maximum(low - control.coordinates, control.coordinates - high), 0.0)[:, :2]
+        away = float(np.median(np.linalg.norm(off, axis=1)))
+        if away > 0:
+            raise BlockError(
+                f"the points of {control.file} lie {away:.0f} m from the strips: give them in the cloud's coordinate "
+                "system and in metres, easting first"
+            )
+        raise BlockError(
+            f"no point of {control.file} lies on a plane of a strip, which is {settings.returns} returns about it, in "
+            f"{settings.cell_m:g} m, that scatter by {settings.roughness_m:g} m at most: give points on smooth, open "
+            "surfaces, or take larger cells (cell_m) or rougher planes (roughness_m)"
+        )
+    off = float(np.median(gap))
+    if abs(off) > _FAR_M:
+        raise BlockError(
+            f"the points of {control.file} lie {abs(off):.1f} m {'above' if off > 0 else 'below'} the strips: its "
+            "heights may count in feet or belong to another vertical system than those of the cloud; bring both into "
+            "one"
+        )
+
+
+def with_datum(block: Block, strip: str, seen: OnStrips, settings: StripSettings) -> Block:
+    """`block` of shifts alone, where `strip` is right in the directions that control does not tell.
+
+    These are those that it tells worse than a trajectory would: control on level ground says nothing of X and Y.
+    """
+    found = [(f.patches.normal[f.found.patch[f.fits]], f.sigma[f.fits]) for f in seen.control]
+    normal, sigma = (np.concatenate(v) for v in zip(*found, strict=True))
+    weighed = normal / sigma[:, None]
+    known, axes = np.linalg.eigh(weighed.T @ weighed)
+    told = known > settings.sigma_position_m**-2
+    # At least the direction that control tells best, where there is any.
+    told[-1] = len(sigma) > 0
+    if told.all():
+        return block
+    covariance = (axes * np.where(told, _FREE_M, _RIGHT_M) ** 2) @ axes.T
+    first = TrajectoryKnot(Weighted(np.zeros(3), covariance=covariance), FIXED)  # type: ignore[arg-type]
+    more = block.priors.more
+    knots = {**more[TrajectoryKnot.kind], strip: first}
+    return dataclasses.replace(
+        block, priors=dataclasses.replace(block.priors, more=more | {TrajectoryKnot.kind: knots})
+    )
+
+
+def _of(seen: PointPlanes, chosen: Bool[np.ndarray, "n"]) -> PointPlanes:
+    found = type(seen.found)(*(v[chosen] for v in seen.found))
+    return seen._replace(found=found, sigma=seen.sigma[chosen], fits=seen.fits[chosen])
+
+
+def _check_complete(control: SurveyedPoints) -> None:
+    for k, (xyz, sigma) in enumerate(zip(control.coordinates, control.sigma_m, strict=True)):
+        at = f"{control.places[k]}: point {control.ids[k]}"
+        if not np.isfinite(xyz).all():
+            raise InputError(f"{at} has no height, without which nothing says how far it is from a plane: add Z_m")
+        if not control.check[k] and not (sigma > 0).all():
+            raise InputError(
+                f"{at} has no standard deviations, which weigh it against the planes: add sigma_X_m, sigma_Y_m and "
+                "sigma_Z_m"
+            )
+
+
+def _again(block: Block, control: SurveyedPoints) -> Bool[np.ndarray, "points"]:
+    """Which control is that of the block, too. Raises InputError for names that are those of other points there."""
+    place, again = {name: k for k, name in enumerate(block.points)}, np.zeros(len(control.ids), bool)
+    surveyed = [(rows.who, rows.axis, np.asarray(rows.value)) for rows in (block.control, block.fixed)]
+    who, axis, value = (np.concatenate(v) for v in zip(*surveyed, strict=True))
+    for k, name in enumerate(control.ids):
+        if control.check[k] or name not in place:
+            continue
+        own = who == place[name]
+        off = np.abs(value[own] - control.coordinates[k, axis[own]])
+        if not own.any() or (off > _SAME * control.sigma_m[k, axis[own]]).any():
+            how = f"{off.max():.3f} m away" if own.any() else "without being control there"
+            raise InputError(
+                f"{control.places[k]}: {name} is a point of the block, too, {how}: give it the same coordinates in "
+                "the control of both, or another name"
+            )
+        again[k] = True
+    return again
