@@ -17,6 +17,7 @@ from jaxphoto.cli.choices import one_of
 from jaxphoto.cli.cloud_options import corrected_name
 from jaxphoto.cli.cloud_progress import CloudProgress
 from jaxphoto.cli.console import plain_console
+from jaxphoto.cli.control_in_frame import control_in_frame
 from jaxphoto.cli.made import made_by
 from jaxphoto.cli.progress import StepsLeft
 from jaxphoto.cloud import Cloud
@@ -86,6 +87,8 @@ class StripFiles(NamedTuple):
     returns: str
     epsg: int | None
     unit: str | None
+    control: Path | None = None
+    """Surveyed points, in the cloud's system."""
 
 
 class StripChoices(NamedTuple):
@@ -112,7 +115,7 @@ def adjust_flight(context: typer.Context, flight: StripFiles, choices: StripChoi
     """Adjust the strips of a flight and its photographs; write the results, say them, and exit with 1 if red."""
     cloud, trajectory, block = flight.cloud, flight.trajectory, flight.block
     settings, priors, errors = choices.settings, choices.priors, plain_console(stderr=True)
-    check_folder(out, cloud, *(path for path in (trajectory, block) if path is not None))
+    check_folder(out, cloud, *(path for path in (trajectory, block, flight.control) if path is not None))
     with errors.status("reading the cloud") as status:
         said: dict[str, Any] = {"epsg": flight.epsg, "unit": flight.unit}
         photographs, frame = None, Frame()
@@ -130,6 +133,8 @@ def adjust_flight(context: typer.Context, flight: StripFiles, choices: StripChoi
                 frame = _about(records, clouds.cloud_system(cloud, **said), cloud)
             path = trajectory_in(records, frame, *_stated(records, choices.given))
         own = frame if block is not None or frame.kind == "epsg" else None
+        placement = Placement(cloud.name, clouds.cloud_system(cloud, **said), own)
+        control = None if flight.control is None else control_in_frame(flight.control, placement)
         track = None if path is None else scanner_path(path)
         parts = partial(clouds.cloud_chunks, cloud, own, classes=flight.classes, returns=flight.returns, **said)  # type: ignore[arg-type]
         # Of a file that is filtered nobody knows how much will come.
@@ -141,18 +146,24 @@ def adjust_flight(context: typer.Context, flight: StripFiles, choices: StripChoi
             track,
             "line" if priors is None else priors.calibration.pattern,
             None if photographs is None else partial(_about_where, photographs.block),
+            None if control is None else control.coordinates,
         )
 
         def report(made: StripRound) -> None:
             line = f"round {made.number}: {made.planes} planes, strips {made.rms_m:.3f} m apart before"
             status.update(f"{line}; largest change {made.largest_change:.2g} standard deviations")
 
-        options: dict[str, Any] = {"held": choices.held, "max_rounds": choices.max_rounds, "report": report}
+        options: dict[str, Any] = {
+            "control": control,
+            "held": choices.held,
+            "max_rounds": choices.max_rounds,
+            "report": report,
+        }
         result = adjust_strips(looked_at, path, settings, priors, photographs=photographs, **options)
         status.update(f"writing {out}")
-        gaps = Gaps(Placement(cloud.name, clouds.cloud_system(cloud, **said), own), settings)
+        gaps = Gaps(placement, settings)
         tables = None if photographs is None else Tables(result.adjusted, known=result.covariance)
-        made, verdict = made_by(context, cloud, trajectory, block), strips_verdict(result, tables)
+        made, verdict = made_by(context, cloud, trajectory, block, flight.control), strips_verdict(result, tables)
 
         def moved(part: Cloud) -> Float[np.ndarray, "n 3"]:
             progress("writing the corrected cloud", part)

@@ -46,6 +46,10 @@ def strips_command(
         typer.Option(help="Block folder of photographs taken on this trajectory, which are adjusted with the strips."),
     ] = None,
     exposure_shift_s: Annotated[float, typer.Option(help="time_s of images.csv + this is the cloud's time.")] = 0.0,
+    control: Annotated[
+        Path | None,
+        typer.Option(help="Surveyed points on smooth surfaces (docs/control.md), which strips are to go through."),
+    ] = None,
     hold: Annotated[str, typer.Option(help="Strips whose trajectory is right, by commas.")] = "",
     cell_m: CellM = USUAL.cell_m,
     roughness_m: RoughnessM = USUAL.roughness_m,
@@ -77,7 +81,8 @@ def strips_command(
 ) -> None:
     """Fit the strips of a cloud to each other; write the corrected cloud and trajectory, and what was wrong.
 
-    With --block the photographs of the flight, too: trajectory, scanner and camera at once.
+    With --block the photographs of the flight, too: trajectory, scanner and camera at once. With --control surveyed
+    points, which are the datum.
 
     --class and --returns choose the points of the planes; the whole cloud is corrected. Exit code 1: written, but
     the verdict is red, as where it still changes.
@@ -108,6 +113,7 @@ def strips_command(
         returns,
         cloud_epsg,
         cloud_unit,
+        control,
     )
     settings = dataclasses.replace(settings, **given)
     choices = StripChoices(settings, set(given), _priors(adjust, pattern), held, False, max_rounds)

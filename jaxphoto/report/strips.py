@@ -10,6 +10,7 @@ from rich.console import Console
 from jaxphoto.georeferencing import TrajectoryKnot
 from jaxphoto.procedures.lidar import StripAdjustment, StripDifference, StripRound
 from jaxphoto.procedures.lidar.strip_adjustment import PHOTOGRAPHS
+from jaxphoto.procedures.lidar.strip_control import CHECK, CONTROL
 from jaxphoto.report.digits import of_sigma, with_sigma
 from jaxphoto.report.findings import Finding, Level, Verdict, p_words
 from jaxphoto.report.tables import Tables
@@ -17,6 +18,9 @@ from jaxphoto.report.verdict import verdict_of
 from jaxphoto.statistics import LEVEL, correlation_matrix
 from jaxphoto.statistics.global_test import global_test
 
+_OF_POINTS = (PHOTOGRAPHS, CONTROL, CHECK)
+# Times their noise by which strips may be off surveyed points, of a few by this number of standard deviations.
+_FAR, _BEYOND = 2.0, 3.0
 # From jaxphoto's units of a knot (m, rad) to those of files.
 _IN_FILES = np.array([1.0, 1.0, 1.0, 180 / np.pi, 180 / np.pi, 180 / np.pi])
 
@@ -27,7 +31,7 @@ def differences_table(differences: Sequence[StripDifference]) -> pd.DataFrame:
 
 
 def strip_rounds_table(rounds: Sequence[StripRound]) -> pd.DataFrame:
-    """round, planes, points, left_out, rms_m, largest_change (in standard deviations)."""
+    """round, planes, points, control, left_out, rms_m, largest_change (in standard deviations)."""
     return pd.DataFrame(rounds, columns=["round", *StripRound._fields[1:]])
 
 
@@ -104,7 +108,7 @@ def strips_verdict(result: StripAdjustment, tables: Tables | None) -> Verdict:
     """What is to be known of it first; `tables` are those of the adjustment where photographs are in it."""
     found = _of_strips(result) if tables is None else verdict_of(tables).findings
     odd = (Finding(Level.WARNING, sentence) for sentence in result.odd)
-    return Verdict.of((*_of_rounds(result), *odd, *found))
+    return Verdict.of((*_of_rounds(result), *odd, *_of_surveyed(result), *found))
 
 
 def _of_rounds(result: StripAdjustment) -> Iterator[Finding]:
@@ -115,6 +119,40 @@ def _of_rounds(result: StripAdjustment) -> Iterator[Finding]:
             f"planes were looked up {len(result.rounds)} times and it still changes (by {change:.2g} standard "
             "deviations the last time): ask for more rounds",
         )
+
+
+def _of_surveyed(result: StripAdjustment) -> Iterator[Finding]:
+    """How far strips are from control and check points, and whether that is more than these let expect."""
+    for what, told in surveyed_summary(result).items():
+        rms, noise, planes = told["rms_m"], told["noise_m"], told["planes"]
+        far = rms > max(_FAR, 1 + _BEYOND / np.sqrt(2 * planes)) * noise
+        yield Finding(
+            Level.WARNING if far else Level.INFORMATION,
+            f"{what.replace('_', ' ')} {rms:.3f} m off the strips (RMS of {planes} planes), {told['rms_before_m']:.3f} "
+            f"m before; plane and survey let expect {noise:.3f}"
+            + (": look at the points, at their standard deviations, and at those of the trajectory" if far else ""),
+        )
+
+
+def surveyed_summary(result: StripAdjustment) -> dict[str, dict[str, float]]:
+    """Of control and of check points over all strips: planes, RMS of their gaps (m) before and after, and their noise.
+
+    Nothing of what there is not.
+    """
+    summary: dict[str, dict[str, float]] = {}
+    for what in (CONTROL, CHECK):
+        own = [d for d in result.differences if d.one == what]
+        if own:
+            now, then = ([getattr(d, name) for d in own] for name in ("planes", "planes_before"))
+            pooled = {"rms_before_m": then, "rms_m": now, "noise_m": now}
+            told = {name: _pooled([getattr(d, name) for d in own], counts) for name, counts in pooled.items()}
+            summary[what.replace(" ", "_")] = {"planes": sum(now), **told}
+    return summary
+
+
+def _pooled(rms: Sequence[float], counts: Sequence[int]) -> float:
+    """Root mean square of several together; what is none has an rms that is no number."""
+    return float(np.sqrt(np.nansum(np.square(rms) * counts) / max(sum(counts), 1)))
 
 
 def _of_strips(result: StripAdjustment) -> Iterator[Finding]:
@@ -139,11 +177,12 @@ def print_strips(result: StripAdjustment, console: Console) -> None:
     last = result.rounds[-1]
     end = "nothing changes any more" if result.still else "it still changes: ask for more rounds"
     ties = f" and {last.points} tie points on them" if last.points else ""
+    ties += f" and {last.control} of control" if last.control else ""
     said = f"{last.number} rounds, {end}; {last.planes} planes{ties}, {last.left_out} left out"
     console.print(said, highlight=False, soft_wrap=True)
     for d in result.differences:
         before = f"{d.rms_before_m:.3f} m" if np.isfinite(d.rms_before_m) else "unknown"
-        strips = f"{d.one} and strip {d.other}" if d.one == PHOTOGRAPHS else f"strips {d.one} and {d.other}"
+        strips = f"{d.one} and strip {d.other}" if d.one in _OF_POINTS else f"strips {d.one} and {d.other}"
         console.print(
             f"  {strips}: from {before} to {d.rms_m:.3f} m apart (RMS of {d.planes} planes, whose "
             f"noise is {d.noise_m:.3f} m)",

@@ -19,6 +19,7 @@ from jaxphoto.report.strips import (
     calibration_table,
     differences_table,
     strip_rounds_table,
+    surveyed_summary,
     trajectory_errors_table,
 )
 from jaxphoto.report.study_page import StudyPart, WholePicture, study_page
@@ -74,6 +75,7 @@ def write_strips(
         (work / "report.html").write_text(_page(result, scanner, verdict, picture, made), encoding="utf-8")
         told: dict[str, Any] = {"rounds": len(result.rounds), "came_to_rest": result.still}
         told |= {"sigma0": float(result.adjusted.sigma0), "pattern": result.errors.calibration.pattern}
+        told |= surveyed_summary(result)
         times = {"seconds": seconds | {"write": time.perf_counter() - began}}
         write_summary(verdict.summary | told | times, work)
 

@@ -1,8 +1,8 @@
 """Which returns of a cloud larger than memory its strip adjustment looks at: those of places that strips share.
 
 The cloud passes twice, part by part. At first its cells are added up; then the returns of cells are taken in which two
-strips have one plane, as many as there is room for, and those about tie points of photographs. What is then seen is
-what a search in all of it sees in these cells.
+strips have one plane, as many as there is room for, and those about control and about tie points of photographs. What
+is then seen is what a search in all of it sees in these cells.
 """
 
 from collections.abc import Callable, Iterator
@@ -35,12 +35,13 @@ def kept_returns(
     path: ScannerPath | None = None,
     pattern: Pattern = "line",
     places: Callable[[], Float[np.ndarray, "n 3"]] | None = None,
+    surveyed: Float[np.ndarray, "k 3"] | None = None,
     most: int = KEPT,
 ) -> Cloud:
     """The returns of a cloud that `adjust_strips` is to look at; of one of `most` returns or fewer all.
 
     `parts` gives the cloud anew each time, in parts of bounded size whose strips are those met so far; `places` (m)
-    where tie points of photographs are, about.
+    where tie points of photographs are, about; `surveyed` (m) where control is, all of whose returns are kept.
     """
     small: list[Cloud] = []
     passed, number = _Passed(settings, path, pattern), 0
@@ -54,7 +55,9 @@ def kept_returns(
         small = []
     if number <= most:
         return Cloud.joined(small)
-    cells = _chosen(passed.cells, settings, most, None if places is None else places())
+    none = np.zeros((0, 3))
+    always = _about(passed.cells, none if surveyed is None else surveyed, 1.0, settings)
+    cells = _chosen(passed.cells, settings, most, none if places is None else places(), always)
     return Cloud.joined([part.take(passed.returns(part, cells)) for part in parts()])
 
 
@@ -101,20 +104,20 @@ def _chosen(
     looks: dict[str, CellReturns],
     settings: StripSettings,
     most: int,
-    places: Float[np.ndarray, "n 3"] | None,
+    places: Float[np.ndarray, "n 3"],
+    always: dict[str, Int[np.ndarray, "cells"]],
 ) -> dict[str, Int[np.ndarray, "cells"]]:
-    """The cells of each look whose returns are to be kept, `most` of them together."""
-    about: dict[str, np.ndarray] = dict.fromkeys(looks, np.zeros(0, np.int64))
-    if places is not None:
-        part, room = 1.0, _ABOUT_POINTS * most
-        while (kept := _number(looks, about := _about(looks, places, part, settings))) > room and part > _LEAST:
-            part *= _LESS
-        most -= kept
+    """The cells of each look whose returns are to be kept, `most` of them together; those `always`, and others."""
+    most -= _number(looks, always)
+    part, room = 1.0, _ABOUT_POINTS * most
+    while (kept := _number(looks, about := _about(looks, places, part, settings))) > room and part > _LEAST:
+        part *= _LESS
+    most -= kept
     planes = {name: planes_from(cells, settings) for name, cells in looks.items()}
     pairs = [(a, b, corresponding(planes[a], planes[b], settings)) for a, b in combinations(looks, 2)]
     part = 1.0
     while True:
-        chosen: dict[str, list[np.ndarray]] = {name: [cells] for name, cells in about.items()}
+        chosen: dict[str, list[np.ndarray]] = {name: [about[name], always[name]] for name in looks}
         for a, b, found in pairs:
             share = max(_FEWEST, round(part * len(found.cell)))
             own = found.cell[thinned(found.normal, found.cell, share)]

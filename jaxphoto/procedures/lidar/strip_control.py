@@ -29,6 +29,9 @@ CONTROL, CHECK = "control", "check points"
 _FAR_M = 10.0
 # Of a strip that is right in some directions and free in the others (m): small and large beside what control tells.
 _RIGHT_M, _FREE_M = 1e-3, 100.0
+# Of the shift that most control has in common: turns of reweighting, standard deviations below which gaps weigh alike,
+# and what part of the best told direction is not told.
+_TURNS, _SMALL, _UNTOLD = 30, 0.1, 0.01
 # In standard deviations of the survey, within which two surveys of a point are one.
 _SAME = 4.0
 _NO_MARKS = Marked(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)), np.zeros(0))
@@ -47,7 +50,7 @@ class ControlSearch:
     def __init__(self, search: StripSearch, control: SurveyedPoints, number: Int[np.ndarray, "points"]) -> None:
         self.search, self.control = search, control
         self._points = PointSearch(search, number)
-        variances = np.nan_to_num(control.sigma_m) ** 2
+        variances = control.sigma_m**2
         self._spread = variances[:, :, None] * np.eye(3)
 
     def look(self, settled: bool) -> OnStrips:
@@ -55,8 +58,10 @@ class ControlSearch:
         seen = self._points.look(self.control.coordinates, self._spread, settled)
         control = [_of(f, ~self.control.check[f.found.point]) for f in seen]
         # Of all strips together: a few points of one strip do not say which of them is a blunder.
-        gap, sigma = (np.concatenate(v) for v in zip(*((f.found.gap, f.sigma) for f in control), strict=True))
-        fits = np.split(fitting(gap, sigma, self.search.settings.outlier), np.cumsum([len(f.fits) for f in control]))
+        found = [(f.patches.normal[f.found.patch], f.found.gap, f.sigma) for f in control]
+        normal, gap, sigma = (np.concatenate(v) for v in zip(*found, strict=True))
+        fit = fitting(_without_shift(normal, gap, sigma), sigma, self.search.settings.outlier)
+        fits = np.split(fit, np.cumsum([len(f.fits) for f in control]))
         check = [_of(f, self.control.check[f.found.point]) for f in seen]
         return OnStrips(
             [f._replace(fits=own) for f, own in zip(control, fits, strict=False)],
@@ -72,9 +77,9 @@ def with_control(block: Block, control: SurveyedPoints) -> tuple[Block, Int[np.n
     """`block` with the control observed, and which of its points each is; -1 of check points, which it does not need.
 
     Control of the block by the same name is the same point, and its survey counts once. Raises InputError for points
-    without a height or, of control, a standard deviation; and for other points of the block by the same name.
+    without a height or a standard deviation, and for other points of the block by the same name.
     """
-    _check_complete(control)
+    check_complete(control)
     again = _again(block, control)
     own = np.flatnonzero(~control.check & ~again)
     ids, xyz, sigma = tuple(control.ids[k] for k in own), control.coordinates[own], control.sigma_m[own]
@@ -82,6 +87,19 @@ def with_control(block: Block, control: SurveyedPoints) -> tuple[Block, Int[np.n
     place = {name: k for k, name in enumerate(whole.points)}
     number = [-1 if out else place[name] for name, out in zip(control.ids, control.check, strict=True)]
     return whole, np.array(number, int)
+
+
+def check_complete(control: SurveyedPoints) -> None:
+    """Raise InputError for points without a height or a standard deviation."""
+    for k, (xyz, sigma) in enumerate(zip(control.coordinates, control.sigma_m, strict=True)):
+        at = f"{control.places[k]}: point {control.ids[k]}"
+        if not np.isfinite(xyz).all():
+            raise InputError(f"{at} has no height, without which nothing says how far it is from a plane: add Z_m")
+        if not (sigma > 0).all():
+            raise InputError(
+                f"{at} has no standard deviations, which say how near to a plane it must be: add sigma_X_m, sigma_Y_m "
+                "and sigma_Z_m"
+            )
 
 
 def check_seen(control: SurveyedPoints, seen: OnStrips, search: StripSearch) -> None:
@@ -134,21 +152,25 @@ def with_datum(block: Block, strip: str, seen: OnStrips, settings: StripSettings
     )
 
 
+def _without_shift(
+    normal: Float[np.ndarray, "n 3"], gap: Float[np.ndarray, "n"], sigma: Float[np.ndarray, "n"]
+) -> Float[np.ndarray, "n"]:
+    """Gaps without the shift (of least absolute deviations) that most of them have in common.
+
+    It is also what a blunder among few points has pulled strips by.
+    """
+    off = gap
+    for k in range(_TURNS):
+        weight = 1 / np.sqrt(sigma * (np.maximum(np.abs(off), _SMALL * sigma) if k else sigma))
+        # Directions that next to nothing tells stay as they are.
+        shift = np.linalg.lstsq(normal * weight[:, None], gap * weight, rcond=_UNTOLD)[0]
+        off = gap - normal @ shift
+    return off
+
+
 def _of(seen: PointPlanes, chosen: Bool[np.ndarray, "n"]) -> PointPlanes:
     found = type(seen.found)(*(v[chosen] for v in seen.found))
     return seen._replace(found=found, sigma=seen.sigma[chosen], fits=seen.fits[chosen])
-
-
-def _check_complete(control: SurveyedPoints) -> None:
-    for k, (xyz, sigma) in enumerate(zip(control.coordinates, control.sigma_m, strict=True)):
-        at = f"{control.places[k]}: point {control.ids[k]}"
-        if not np.isfinite(xyz).all():
-            raise InputError(f"{at} has no height, without which nothing says how far it is from a plane: add Z_m")
-        if not control.check[k] and not (sigma > 0).all():
-            raise InputError(
-                f"{at} has no standard deviations, which weigh it against the planes: add sigma_X_m, sigma_Y_m and "
-                "sigma_Z_m"
-            )
 
 
 def _again(block: Block, control: SurveyedPoints) -> Bool[np.ndarray, "points"]:

@@ -1,0 +1,179 @@
+"""Strips go through surveyed points on smooth surfaces, which tell what all strips have in common."""
+
+import dataclasses
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from jaxphoto import BlockError, InputError
+from jaxphoto.cloud import Cloud
+from jaxphoto.lidar.strip_settings import StripSettings
+from jaxphoto.procedures.control import SurveyedPoints
+from jaxphoto.procedures.lidar import StripAdjustment, adjust_strips
+from jaxphoto.procedures.lidar.strip_control import with_control
+from jaxphoto.simulation import Simulation
+from tests.lidar.clouds import gable, ground
+from tests.procedures.joint import flown as flown_with_photographs
+from tests.procedures.strips import PRIORS, SETTINGS, fitted, flown
+
+COARSE = StripSettings(cell_m=2.0, roughness_m=0.04, returns=8)
+SHIFT, COMMON = np.array([0.15, -0.2, 0.1]), np.array([0.3, -0.25, 0.4])
+SIGMA_M, SIDE = 0.02, 100.0
+# Middles of roof faces: 30 degrees to both sides.
+FACES = np.arange(4.0, SIDE, 8.0)
+
+
+def roofs(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Roofs in rows, in one half along Y and in the other along X."""
+    return np.where(y < 48.0, gable(x, y), gable(y, x))
+
+
+def level(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """A place in the middle of the roofs."""
+    return np.where(np.hypot(x - 50, y - 50) < 15, 4.0, roofs(x, y))
+
+
+def two_strips(seed: int, shape=roofs) -> Cloud:
+    """Off by COMMON, the second by SHIFT more."""
+    parts = [ground(shape, 4.0, 0.02, 0.02, SIDE, 10 * seed + k) for k in (1, 2)]
+    strip = np.repeat([0, 1], [len(p) for p in parts])
+    return Cloud(np.concatenate([parts[0], parts[1] + SHIFT]) + COMMON, strip=strip, strips=("1", "2"))
+
+
+def surveyed(xyz: np.ndarray, seed: int = 0, sigma: float = SIGMA_M, check=False) -> SurveyedPoints:
+    n = len(xyz)
+    off = np.random.default_rng(seed).normal(0, sigma, (n, 3))
+    rows = tuple(f"control.csv, row {k + 2}" for k in range(n))
+    names = tuple(f"K{k}" for k in range(n))
+    return SurveyedPoints("control.csv", names, xyz + off, np.full((n, 3), sigma), np.full(n, check), rows)
+
+
+def on_roofs(n: int, seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    x, y = rng.choice(FACES, n), rng.choice(FACES, n)
+    return np.column_stack([x, y, roofs(x, y)])
+
+
+def pulls(seed: int) -> np.ndarray:
+    """Errors of the six shifts over their standard deviations, found by control on roofs."""
+    found = adjust_strips(two_strips(seed), settings=COARSE, control=surveyed(on_roofs(12, seed), seed))
+    assert found.still
+    return (found.errors.position - [COMMON, COMMON + SHIFT]).ravel() / np.asarray(found.covariance.shared_sigma)
+
+
+def test_control_finds_what_strips_have_in_common_without_a_trajectory():
+    control = surveyed(on_roofs(24, 3), 3)
+    control = control._replace(check=np.arange(24) % 4 == 3)
+    control.coordinates[0, 2] += 0.5  # A blunder.
+    found = adjust_strips(two_strips(3), settings=COARSE, control=control)
+    sigma = np.asarray(found.covariance.shared_sigma)
+    off = found.errors.position - [COMMON, COMMON + SHIFT]
+    assert found.still and (np.abs(off.ravel()) < 3.5 * sigma).all() and (sigma < 0.025).all()
+    # Both strips stand on the same survey: no strip halves its error.
+    assert (sigma > SIGMA_M / np.sqrt(8)).all()
+    told = {(d.one, d.other): d for d in found.differences}
+    assert set(told) == {("1", "2"), *((what, k) for what in ("control", "check points") for k in "12")}
+    assert found.rounds[-1].control == sum(told["control", k].planes for k in "12")
+    for what in ("control", "check points"):
+        assert told[what, "1"].rms_before_m > 0.2 and told[what, "1"].rms_m < 2 * told[what, "1"].noise_m
+    assert 1 <= found.rounds[-1].left_out <= 4
+
+
+def test_on_level_ground_control_tells_heights_and_the_first_strip_the_rest():
+    xy = np.array([[42.0, 50.0], [58.0, 50.0], [50.0, 40.0], [50.0, 60.0]])
+    control = surveyed(np.column_stack([xy, level(*xy.T)]))
+    found = adjust_strips(two_strips(1, level), settings=COARSE, control=control)
+    sigma = np.asarray(found.covariance.shared_sigma).reshape(2, 3)
+    assert found.still
+    np.testing.assert_allclose(found.errors.position[0, :2], 0.0, atol=2e-3)
+    off = found.errors.position[:, 2] - [COMMON[2], COMMON[2] + SHIFT[2]]
+    assert (np.abs(off) < 3.5 * sigma[:, 2]).all() and (sigma[:, 2] < 0.02).all()
+    # A strip that is held is right, in height, too.
+    held = adjust_strips(two_strips(1, level), settings=COARSE, control=control, held=("1",))
+    assert not held.errors.position[0].any()
+
+
+def test_points_close_together_do_not_count_the_same_returns_again():
+    xy = np.stack(np.meshgrid(np.arange(46.0, 54.0, 0.5), np.arange(46.0, 54.0, 0.5)), axis=-1).reshape(-1, 2)
+    exact = np.column_stack([xy, level(*xy.T)])
+    found = adjust_strips(two_strips(1, level), settings=COARSE, control=surveyed(exact, sigma=1e-4))
+    # About 4 returns on the square metre, of 20 mm each.
+    sigma = np.asarray(found.covariance.shared_sigma).reshape(2, 3)[:, 2]
+    assert (sigma > 0.7 * 0.02 / np.sqrt(2 * 4 * 10.0**2)).all()
+
+
+@pytest.mark.slow
+def test_standard_deviations_are_true():
+    w = np.array([pulls(seed) for seed in range(20)])
+    # Chi squared of 20 times six, which are correlated by the survey in pairs.
+    assert 0.75 < np.sqrt(np.mean(w**2)) < 1.3 and np.mean(np.abs(w) < 1.96) > 0.88
+
+
+def raised(rise: float = 0.25) -> tuple[Simulation, StripAdjustment, StripAdjustment]:
+    """The flight of `strips`, all of it too high by `rise`: as overlaps see it, and with control besides."""
+    flight = flown()
+    some = flight.cloud.xyz[flight.cloud.classification == 2]
+    xy = some[np.random.default_rng(2).choice(len(some), 60, replace=False), :2]
+    control = surveyed(np.column_stack([xy, flight.terrain.height(xy)]), 7)
+    cloud = dataclasses.replace(flight.cloud, xyz=flight.cloud.xyz + np.array([0.0, 0.0, rise]))
+    path = dataclasses.replace(
+        flight.trajectory, position=np.asarray(flight.trajectory.position) + np.array([0.0, 0.0, rise])
+    )
+    settings = dataclasses.replace(SETTINGS, sigma_position_m=0.2, correlation_s=200.0)
+    both = [adjust_strips(cloud, path, settings, PRIORS, control=given) for given in (None, control)]
+    return flight, both[0], both[1]
+
+
+def test_with_a_trajectory_control_finds_the_height_of_a_flight():
+    flight, alone, found = raised()
+    assert found.still and found.rounds[-1].control > 40
+
+    def off(result: StripAdjustment) -> float:
+        ground = np.flatnonzero(result.cloud.classification == 2)[::20]
+        return float(np.mean(result.cloud.xyz[ground, 2] - flight.terrain.height(result.cloud.xyz[ground, :2])))
+
+    assert abs(off(alone)) > 0.1 and abs(off(found)) < 0.015
+    assert float(found.adjusted.sigma0) == pytest.approx(1.0, abs=0.12)
+    assert fitted().rounds[-1].control == 0
+
+
+def test_control_of_a_block_is_the_same_point_and_counts_once():
+    block = flown_with_photographs().block
+    tie = surveyed(np.zeros((1, 3)))._replace(ids=(block.points[0],))
+    with pytest.raises(InputError, match="is a point of the block, too, without being control there"):
+        with_control(block, tie)
+    given = surveyed(np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]))
+    whole, number = with_control(block, given)
+    assert [whole.points[k] for k in number] == ["K0", "K1"] and len(whole.control) == len(block.control) + 6
+    again, same = with_control(whole, given)
+    assert again.points == whole.points and len(again.control) == len(whole.control)
+    np.testing.assert_array_equal(same, number)
+    moved = given._replace(coordinates=given.coordinates + np.array([0.0, 0.0, 0.2]))
+    with pytest.raises(InputError, match=r"K0 is a point of the block, too, 0\.200 m away"):
+        with_control(whole, moved)
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (lambda c: c._replace(sigma_m=np.full_like(c.sigma_m, np.nan)), "point K0 has no standard deviations"),
+        (lambda c: c._replace(coordinates=c.coordinates + np.array([5000.0, 0, 0])), r"lie 49\d\d m from the strips"),
+        (lambda c: c._replace(coordinates=c.coordinates + np.array([0, 0, 47.0])), r"lie 4\d\.\d m above the strips"),
+        (lambda c: c._replace(coordinates=c.coordinates * np.array([1, 1, np.nan])), "point K0 has no height"),
+        (
+            lambda c: c._replace(coordinates=c.coordinates * 0 + np.array([8.0, 20.0, 4.6])),
+            "lies on a plane of a strip",
+        ),
+    ],
+)
+def test_control_that_cannot_be(change, sentence):
+    with pytest.raises((InputError, BlockError), match=sentence):
+        adjust_strips(two_strips(1), settings=COARSE, control=change(surveyed(on_roofs(6, 1))))
+
+
+def written(control: SurveyedPoints, path, head: str = "") -> None:
+    columns = {"point": control.ids, **{f"{x}_m": control.coordinates[:, k] for k, x in enumerate("XYZ")}}
+    columns |= {f"sigma_{x}_m": control.sigma_m[:, k] for k, x in enumerate("XYZ")}
+    table = pd.DataFrame({**columns, "role": np.where(control.check, "check", "control")})
+    path.write_text(head + table.to_csv(index=False), encoding="utf-8")
