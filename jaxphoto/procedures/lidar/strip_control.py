@@ -8,7 +8,7 @@ import dataclasses
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxphoto.block import Block
 from jaxphoto.errors import BlockError, InputError
@@ -27,6 +27,8 @@ CONTROL, CHECK = "control", "check points"
 """What differences call surveyed points beside strips."""
 # No strip is farther (m) from control in its system; heights of another one, or in feet, mostly are.
 _FAR_M = 10.0
+# From here on distances are said in kilometres (m).
+_KILOMETRES = 10_000.0
 # Of a strip that is right in some directions and free in the others (m): small and large beside what control tells.
 _RIGHT_M, _FREE_M = 1e-3, 100.0
 # Of the shift that most control has in common: turns of reweighting, standard deviations below which gaps weigh alike,
@@ -112,7 +114,7 @@ def check_seen(control: SurveyedPoints, seen: OnStrips, search: StripSearch) -> 
         away = float(np.median(np.linalg.norm(off, axis=1)))
         if away > 0:
             raise BlockError(
-                f"the points of {control.file} lie {away:.0f} m from the strips: give them in the cloud's coordinate "
+                f"the points of {control.file} lie {_far(away)} from the strips: give them in the cloud's coordinate "
                 "system and in metres, easting first"
             )
         raise BlockError(
@@ -150,6 +152,10 @@ def with_datum(block: Block, strip: str, seen: OnStrips, settings: StripSettings
     return dataclasses.replace(
         block, priors=dataclasses.replace(block.priors, more=more | {TrajectoryKnot.kind: knots})
     )
+
+
+def _far(metres: float) -> str:
+    return f"{metres:.0f} m" if metres < _KILOMETRES else f"{metres / 1000:.0f} km"
 
 
 def _without_shift(
