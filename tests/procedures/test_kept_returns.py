@@ -75,6 +75,9 @@ def test_cells_about_tie_points_are_kept():
     # More than there is room for: half of it is left to planes.
     every = cloud.xyz[::5]
     assert len(kept_returns(parts, SETTINGS, places=lambda: every, most=MOST)) <= MOST + 2 * len(cloud.strips)
+    # Those about control stay, however many tie points there are.
+    kept = kept_returns(parts, SETTINGS, places=lambda: every, surveyed=places, most=MOST)
+    assert np.isin(cloud.time[about], kept.time).all() and len(kept) <= MOST + 2 * len(cloud.strips)
 
 
 def test_looks_ahead_and_behind_are_told_apart():

@@ -8,12 +8,16 @@ import pandas as pd
 import pytest
 
 from jaxphoto import BlockError, InputError
+from jaxphoto.block import Frame
 from jaxphoto.cloud import Cloud
+from jaxphoto.io import clouds
+from jaxphoto.io.recipe.truth import write_simulation
 from jaxphoto.lidar.strip_settings import StripSettings
 from jaxphoto.procedures.control import SurveyedPoints
 from jaxphoto.procedures.lidar import StripAdjustment, adjust_strips
 from jaxphoto.procedures.lidar.strip_control import with_control
 from jaxphoto.simulation import Simulation
+from tests.commands import run
 from tests.lidar.clouds import gable, ground
 from tests.procedures.joint import flown as flown_with_photographs
 from tests.procedures.strips import PRIORS, SETTINGS, fitted, flown
@@ -169,6 +173,27 @@ def test_control_of_a_block_is_the_same_point_and_counts_once():
 def test_control_that_cannot_be(change, sentence):
     with pytest.raises((InputError, BlockError), match=sentence):
         adjust_strips(two_strips(1), settings=COARSE, control=change(surveyed(on_roofs(6, 1))))
+
+
+@pytest.mark.slow
+def test_photographs_strips_and_control_at_once(tmp_path, monkeypatch, capsys):
+    """The flight of `joint` and control on the ground, from files: all tables and the page of the adjustment."""
+    folder, out, flight = tmp_path / "flight", tmp_path / "out", flown_with_photographs()
+    write_simulation(flight, folder)
+    some = flight.cloud.xyz[flight.cloud.classification == 2]
+    xy = some[np.random.default_rng(2).choice(len(some), 40, replace=False), :2]
+    written(surveyed(np.column_stack([xy, flight.terrain.height(xy)]), 7), tmp_path / "control.csv")
+    given = ("--trajectory", folder / "trajectory.csv", "--block", folder, "--control", tmp_path / "control.csv")
+    fine = ("--knots-s", "5", "--correlation-s", "60", "--sigma-position-m", "0.05", "--cell-m", "8")
+    code, output, errors = run(monkeypatch, capsys, "strips", folder / "cloud.laz", "--out", out, *given, *fine)
+    assert code == 0, errors + output
+    assert "photographs and strip 1: from " in output and "control and strip 1: from " in output
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["control"]["planes"] > 30 and summary["control"]["rms_m"] < 1.5 * summary["control"]["noise_m"]
+    points = pd.read_csv(out / "adjustment" / "object_points.csv").set_index("point")
+    assert np.abs(points.Z_m["K0"] - flight.terrain.height(xy[:1])[0]) < 4 * SIGMA_M
+    interior = pd.read_csv(out / "adjustment" / "interior.csv").set_index("parameter")
+    assert abs(interior.value["c_mm"] - 34.25) < 4 * interior.sigma["c_mm"] < 0.02
 
 
 def written(control: SurveyedPoints, path, head: str = "") -> None:
