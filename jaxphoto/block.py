@@ -122,6 +122,7 @@ class Block(eqx.Module):
             "block": ("",) * len(self.images),
             # A laser scanner belongs to the block, but to none of its images.
             "lidar": ("none",) * len(self.images),
+            "knot": ("none",) * len(self.images),
         } | self.partitions
         if owner not in known:
             raise BlockError(

@@ -34,18 +34,15 @@ from jaxphoto.camera import (
 )
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import InputError
-from jaxphoto.georeferencing import FlightBias, Mount, RigCamera, Scanner, StripBias
+from jaxphoto.georeferencing import FlightBias, Mount, RigCamera, Scanner, ScannerCalibration, StripBias, TrajectoryKnot
 from jaxphoto.parameters import AbstractParameters, dynamic_fields
 from jaxphoto.short_repr import html_of, number_word, numbers_words
 
 UNKNOWNS: tuple[type[AbstractParameters], ...] = (
     Scanner, Mount, StripBias, FlightBias, CameraRates, ThermalRates, CameraSpline, StripCamera, RollingShutter,
-    ImageMotion, RigCamera,
+    ImageMotion, RigCamera, ScannerCalibration, TrajectoryKnot,
 )  # fmt: skip
-"""The classes of declared parameters that a block folder may hold; one of your own is given to `read_block`.
-
-Those of laser strips (`ScannerCalibration`, `TrajectoryKnot`) belong to no image, which a block folder has no word for.
-"""
+"""The classes of declared parameters that a block folder may hold; one of your own is given to `read_block`."""
 
 
 class Prior(enum.Enum):
@@ -134,6 +131,16 @@ class Unknowns(eqx.Module):
         own = dict(tables)
         scanner, mounts, strips = own.pop("scanner", {"": None})[""], own.pop("mounts"), own.pop("strips")
         return Unknowns(self.interior, self.exterior, self.points, mounts, strips, scanner, own)
+
+    def in_order_of(self, like: "Unknowns") -> "Unknowns":
+        """The same with cameras and owners in the order of `like`, which observations number them by.
+
+        JAX sorts the names of whatever it takes apart and puts together again.
+        """
+        interior = {name: self.interior[name] for name in like.interior}
+        own = self.tables
+        tables = {kind: {name: own[kind][name] for name in owners} for kind, owners in like.tables.items()}
+        return dataclasses.replace(self, interior=interior).with_tables(tables)
 
 
 def is_prior(tree: Any) -> bool:

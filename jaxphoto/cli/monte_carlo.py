@@ -24,8 +24,8 @@ from jaxphoto.sensitivity import PER, Bias, Readjustment, bias, check_draws, noi
 
 _KINDS = (*PER, "noise")
 _UNITS = {
-    "station": "m", "control": "m", "lever-arm": "m", "attitude": "deg", "boresight": "deg", "image-points": "mm",
-    "interior": "own",
+    "station": "m", "trajectory": "m", "control": "m", "lever-arm": "m", "attitude": "deg",
+    "trajectory-attitude": "deg", "boresight": "deg", "image-points": "mm", "interior": "own",
 }  # fmt: skip
 _KEPT = ("exterior", "points")
 
@@ -40,7 +40,7 @@ def monte_carlo_command(
     sigma_m: Annotated[
         str | None, typer.Option(help="Standard deviation in m: one number, or three by commas.")
     ] = None,
-    sigma_deg: Annotated[str | None, typer.Option(help="The same in degrees, for attitude and boresight.")] = None,
+    sigma_deg: Annotated[str | None, typer.Option(help="The same in degrees, for attitudes and boresight.")] = None,
     sigma_mm: Annotated[str | None, typer.Option(help="The same in mm, for image points.")] = None,
     sigma: Annotated[str | None, typer.Option(help="The same in the units of the interior parameter.")] = None,
     parameter: Annotated[str, typer.Option(help="The interior parameter (c_mm, k1 ...) for --bias interior.")] = "",

@@ -23,7 +23,7 @@ from jaxphoto.cli.progress import StepsLeft
 from jaxphoto.cloud import Cloud
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import PATTERN_OF, ScannerCalibration
-from jaxphoto.io import clouds, read_block
+from jaxphoto.io import clouds, read_block, write_block
 from jaxphoto.io.block_folder import exposure_times
 from jaxphoto.io.clouds.coordinate_system import CoordinateSystem
 from jaxphoto.io.clouds.placement import Placement
@@ -47,7 +47,7 @@ from jaxphoto.procedures.lidar import (
     kept_returns,
 )
 from jaxphoto.procedures.lidar.looks import looks_of
-from jaxphoto.procedures.lidar.until_still import interior_held
+from jaxphoto.procedures.lidar.until_still import at_result, interior_held
 from jaxphoto.procedures.lidar.vertical_control import tie_points
 from jaxphoto.report.findings import Level
 from jaxphoto.report.strips import print_strips, strips_verdict
@@ -179,6 +179,8 @@ def adjust_flight(context: typer.Context, flight: StripFiles, choices: StripChoi
             if trajectory is not None and records is not None and result.trajectory is not None:
                 back = with_poses(records, result.trajectory, frame)
                 write_moved(back._replace(time=back.time + flight.trajectory_shift_s), trajectory, folder)
+            if photographs is not None:
+                write_block(at_result(result.adjusted.block, result.adjusted.unknowns), folder / "block")
             maps = gaps.maps
             for raster, name in zip(maps or (), ("before", "after"), strict=False):
                 write_dsm(folder / f"differences_{name}.tif", raster, gaps.system)

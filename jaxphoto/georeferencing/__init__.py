@@ -41,7 +41,13 @@ from jaxphoto.georeferencing.scanner_calibration import (
 )
 from jaxphoto.georeferencing.strip_errors import StripErrors
 from jaxphoto.georeferencing.trajectory import Poses, Trajectory, TrajectorySpline, covered, interpolate, spline_through
-from jaxphoto.georeferencing.trajectory_knots import StripSpline, TrajectoryKnot, weighted_knot
+from jaxphoto.georeferencing.trajectory_knots import (
+    StripSpline,
+    TrajectoryKnot,
+    knot_name,
+    strip_of_knot,
+    weighted_knot,
+)
 
 __all__ = [
     "IMAGE_X", "NOMINAL", "PATTERNS", "PATTERN_OF", "Corrections", "DirectPartials", "Exposure", "FlightBias", "Mount",
@@ -49,7 +55,7 @@ __all__ = [
     "StripErrors", "StripSpline", "Surface", "Trajectory", "TrajectoryKnot", "TrajectorySpline", "apparent_point",
     "arm_to_camera", "attitude_residual", "body_from_camera", "corrected_point", "corrected_return", "corrected_shot",
     "covered", "direct_covariance", "direct_orientation", "direct_partials", "exact_offset", "ground_covariance",
-    "ground_point", "in_rig", "interpolate", "level_error", "level_offset", "object_from_body", "raised_by_boresight",
-    "recorded_attitude", "reference_later", "refraction_constant", "rig_place", "rig_turn", "sensor_position",
-    "spline_through", "turn_off", "weighted_knot", "worst_level_error",
+    "ground_point", "in_rig", "interpolate", "knot_name", "level_error", "level_offset", "object_from_body",
+    "raised_by_boresight", "recorded_attitude", "reference_later", "refraction_constant", "rig_place", "rig_turn",
+    "sensor_position", "spline_through", "strip_of_knot", "turn_off", "weighted_knot", "worst_level_error",
 ]  # fmt: skip

@@ -18,6 +18,9 @@ from jaxtyping import Array, Float, Int
 from jaxphoto.arrays import Numbers
 from jaxphoto.parameters import AbstractParameters
 
+# Between the strip and the time in the name of a knot.
+_AT = " at "
+
 
 class TrajectoryKnot(AbstractParameters):
     """One coefficient of the splines of a strip.
@@ -27,7 +30,7 @@ class TrajectoryKnot(AbstractParameters):
     """
 
     kind = "trajectory_knots"
-    owner = "lidar"
+    owner = "knot"
     names = {  # noqa: RUF012
         "position": tuple(f"{axis}_m" for axis in "XYZ"),
         "attitude": tuple(f"{axis}_rad" for axis in ("right", "forward", "up")),
@@ -35,6 +38,16 @@ class TrajectoryKnot(AbstractParameters):
 
     position: Float[Array, "3"]
     attitude: Float[Array, "3"]
+
+
+def knot_name(strip: str, time: float) -> str:
+    """What the knot of a strip at a time (s) is called."""
+    return f"{strip}{_AT}{time:.3f} s"
+
+
+def strip_of_knot(name: str) -> str:
+    """The strip of a knot by its name."""
+    return name.rpartition(_AT)[0]
 
 
 class StripSpline(NamedTuple):

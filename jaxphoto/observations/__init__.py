@@ -6,7 +6,6 @@ A new kind is one file here and its line below.
 import dataclasses
 from typing import TYPE_CHECKING
 
-from jaxphoto.georeferencing import TrajectoryKnot
 from jaxphoto.observations.base import AXES as AXES
 from jaxphoto.observations.base import AbstractCoordinates as AbstractCoordinates
 from jaxphoto.observations.base import AbstractObservations as AbstractObservations
@@ -45,15 +44,12 @@ from jaxphoto.observations.priors import PRIORS as PRIORS
 from jaxphoto.observations.priors import KnownParameters as KnownParameters
 from jaxphoto.observations.priors import ParameterRows as ParameterRows
 
-# What a block folder has no names for: any parameter, and the knots of laser strips, which belong to no image.
-_UNSAID = ("parameter", TrajectoryKnot.kind)
-
 
 def _has_a_table(kind: object) -> bool:
-    """Whether it is a class of rows that files can say: with a name, and of what files have names for."""
+    """Whether it is a class of rows that files can say: with a name, and not of parameters, which have no ids."""
     if not (isinstance(kind, type) and issubclass(kind, AbstractObservations) and kind.__dict__.get("group")):
         return False
-    return all(f.metadata.get("touches") not in _UNSAID for f in dataclasses.fields(kind))
+    return all(f.metadata.get("touches") != "parameter" for f in dataclasses.fields(kind))
 
 
 OBSERVATIONS: tuple[type[AbstractObservations], ...] = tuple(filter(_has_a_table, list(globals().values())))

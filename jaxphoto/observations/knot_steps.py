@@ -9,6 +9,8 @@ which is what accelerometers and gyros leave. The first knot of a strip is known
 Applied optimal estimation; Cucci, Rehak and Skaloud (2017) have the raw inertial measurements in its place.
 """
 
+from collections.abc import Iterator
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
@@ -30,6 +32,15 @@ class AbstractKnotSteps(AbstractObservations):
     kept: Float[Numbers, "n"]
     sigma: Float[Numbers, "n 3"]
     step: Float[Numbers, "n 3"]
+
+    def flaws(self) -> Iterator[tuple[int, str]]:
+        """A part that no process keeps."""
+        kept = np.asarray(self.kept)
+        for row in np.flatnonzero((kept < 0) | (kept > 1)):
+            yield (
+                int(row),
+                f"kept is {kept[row]:g}; give the part of an error that is left at the next knot, 0 to 1",
+            )
 
     def words(self, images, points) -> np.ndarray:
         """Such as "step 12 of the trajectory in Z"."""

@@ -1,5 +1,6 @@
 """Strip planes: what two laser strips measured of one plane."""
 
+from collections.abc import Iterator
 from typing import Any
 
 import jax.numpy as jnp
@@ -9,9 +10,8 @@ from jaxtyping import Array, Float, Int
 from jaxphoto.arrays import Numbers
 from jaxphoto.georeferencing import Scanner, ScannerCalibration, TrajectoryKnot, corrected_return, weighted_knot
 from jaxphoto.observations.base import AbstractObservations, touching
+from jaxphoto.observations.on_trajectory import NORMAL, knot_columns, normal_flaws, pose_columns, weight_flaws
 from jaxphoto.rotation import matrix_from_roll_pitch_yaw
-
-_ANGLES = ("roll", "pitch", "yaw")
 
 
 def return_at(
@@ -49,13 +49,11 @@ class StripPlanes(AbstractObservations):
     also = ("scanner", "scanner_calibration")
     observed = "gap"
     columns = {  # noqa: RUF012
-        **{f"point_{s}": tuple(f"point_{s}_{x}_m" for x in "XYZ") for s in "ab"},
-        **{f"scanner_{s}": tuple(f"scanner_{s}_{x}_m" for x in "XYZ") for s in "ab"},
-        **{f"roll_pitch_yaw_{s}": tuple(f"{angle}_{s}_deg" for angle in _ANGLES) for s in "ab"},
-        **{f"velocity_{s}": tuple(f"velocity_{s}_{x}_m_per_s" for x in "XYZ") for s in "ab"},
-        **{f"rate_{s}": tuple(f"rate_{s}_{x}_deg_per_s" for x in ("right", "forward", "up")) for s in "ab"},
-        **{f"weights_{s}": tuple(f"weight_{s}_{k}" for k in range(1, 5)) for s in "ab"},
-        "normal": ("normal_X", "normal_Y", "normal_Z"),
+        **knot_columns("_a"),
+        **knot_columns("_b"),
+        **pose_columns("point", "_a"),
+        **pose_columns("point", "_b"),
+        **NORMAL,
         "gap": (),
     }
 
@@ -91,6 +89,12 @@ class StripPlanes(AbstractObservations):
         a = return_at(self.point_a, self.scanner_a, self.roll_pitch_yaw_a, *motion_a, off_a, *known)
         b = return_at(self.point_b, self.scanner_b, self.roll_pitch_yaw_b, *motion_b, off_b, *known)
         return self.gap - jnp.sum(self.normal * (a - b))
+
+    def flaws(self) -> Iterator[tuple[int, str]]:
+        """Weights and normals that are none."""
+        yield from weight_flaws(self.weights_a)
+        yield from weight_flaws(self.weights_b)
+        yield from normal_flaws(self.normal)
 
     def words(self, images, points) -> np.ndarray:
         """Such as "plane 12 of two strips"."""

@@ -1,5 +1,7 @@
 """Strip points: tie points of images on planes that a laser strip measured."""
 
+from collections.abc import Iterator
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -7,6 +9,7 @@ from jaxtyping import Array, Float, Int
 from jaxphoto.arrays import Numbers
 from jaxphoto.georeferencing import Scanner, ScannerCalibration, TrajectoryKnot, weighted_knot
 from jaxphoto.observations.base import AbstractObservations, touching
+from jaxphoto.observations.on_trajectory import NORMAL, knot_columns, normal_flaws, pose_columns, weight_flaws
 from jaxphoto.observations.strip_planes import return_at
 
 
@@ -27,6 +30,7 @@ class StripPoints(AbstractObservations):
     axes = ("normal",)
     also = ("scanner", "scanner_calibration")
     observed = "rise"
+    columns = knot_columns() | pose_columns("foot") | NORMAL | {"rise": ()}
 
     point: Int[np.ndarray, "n"] = touching("point")
     knots: Int[np.ndarray, "n 4"] = touching("trajectory_knots")
@@ -52,6 +56,11 @@ class StripPoints(AbstractObservations):
         pose = self.scanner, self.roll_pitch_yaw, self.velocity, self.rate
         foot = return_at(self.foot, *pose, off, scanner, calibration)
         return self.rise - jnp.sum(self.normal * (point - foot))
+
+    def flaws(self) -> Iterator[tuple[int, str]]:
+        """Weights and normals that are none."""
+        yield from weight_flaws(self.weights)
+        yield from normal_flaws(self.normal)
 
     def words(self, images, points) -> np.ndarray:
         """Such as "point 12 on its plane of a strip"."""

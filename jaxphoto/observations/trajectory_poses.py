@@ -11,6 +11,8 @@ da (`observations.strip_planes`). Source: Glira, Pfeifer and Mandlburger (2019),
 point clouds and aerial images.
 """
 
+from collections.abc import Iterator
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -19,6 +21,7 @@ from jaxphoto.arrays import Numbers
 from jaxphoto.georeferencing import TrajectoryKnot, attitude_residual, recorded_attitude, weighted_knot
 from jaxphoto.observations.attitudes import ATTITUDE_AXES
 from jaxphoto.observations.base import AXES, AbstractCoordinates, AbstractObservations, ImageState, touching
+from jaxphoto.observations.on_trajectory import knot_columns, weight_flaws
 from jaxphoto.observations.stations import station_of
 from jaxphoto.rotation import matrix_from_roll_pitch_yaw, small_rotation
 
@@ -32,6 +35,7 @@ class TrajectoryStations(AbstractCoordinates):
 
     group = "trajectory_stations"
     unit = "m"
+    columns = knot_columns() | {"who": "image"}
 
     who: Int[np.ndarray, "n"] = touching("image")
     knots: Int[np.ndarray, "n 4"] = touching("trajectory_knots")
@@ -44,6 +48,12 @@ class TrajectoryStations(AbstractCoordinates):
         """Observed minus computed (m)."""
         off = weighted_knot(knots, self.weights)
         return self.value - (station_of(image) + off.position)[self.axis]
+
+    def flaws(self) -> Iterator[tuple[int, str]]:
+        """Weights that are none, and an axis that there is not."""
+        yield from weight_flaws(self.weights)
+        for row in np.flatnonzero(~np.isin(self.axis, (0, 1, 2))):
+            yield int(row), f"axis is {self.axis[row]}; it is 0, 1 or 2, for X, Y or Z"
 
     def words(self, images, points) -> np.ndarray:
         """Such as "trajectory at image 12 in Z"."""
@@ -58,6 +68,7 @@ class TrajectoryAttitudes(AbstractObservations):
     unit = "rad"
     axes = ATTITUDE_AXES
     observed = "roll_pitch_yaw"
+    columns = knot_columns() | {"roll_pitch_yaw": tuple(f"{axis}_deg" for axis in ATTITUDE_AXES)}
 
     image: Int[np.ndarray, "n"] = touching("image")
     knots: Int[np.ndarray, "n 4"] = touching("trajectory_knots")
@@ -71,6 +82,10 @@ class TrajectoryAttitudes(AbstractObservations):
         observed = matrix_from_roll_pitch_yaw(jnp.asarray(self.roll_pitch_yaw))
         computed = recorded_attitude(image.camera_from_object, image.mount, image.exposure)
         return attitude_residual(jnp.matmul(observed, small_rotation(off.attitude)), computed)
+
+    def flaws(self) -> Iterator[tuple[int, str]]:
+        """Weights that are none."""
+        return weight_flaws(self.weights)
 
     def words(self, images, points) -> np.ndarray:
         """Such as "roll of the trajectory at image 12"."""

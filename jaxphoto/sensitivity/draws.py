@@ -27,7 +27,7 @@ from jaxphoto.errors import InputError, JaxphotoError
 from jaxphoto.rotation import omega_phi_kappa_from_matrix
 from jaxphoto.sensitivity.chords import Found, find_optima
 from jaxphoto.sensitivity.many import Varying, common_of, path_name
-from jaxphoto.sensitivity.perturbation import Perturbation, Recorded
+from jaxphoto.sensitivity.perturbation import Perturbation, Recorded, in_order_of
 from jaxphoto.unknowns import Prior
 
 # Draws that a device computes side by side. Vectors end in them: 32 are enough for that, and for what is made anew for
@@ -213,7 +213,7 @@ class Readjustment:
 
     def _alone(self, entry: Any) -> Draws:
         """One draw by a full adjustment; not a number where there is none."""
-        block, _ = _block_of(self.change(entry, self.nominal))
+        block, _ = self._changed(entry)
         try:
             solved = solve(block, block.start.unknowns, block.priors)
             v, converged, steps = solved.values, bool(solved.converged), int(solved.steps)
@@ -235,9 +235,14 @@ class Readjustment:
         numbers, recorded = self._all_numbers_of(entry)
         return {name: jnp.asarray(numbers[name], float) for name in self.names}, recorded
 
-    def _all_numbers_of(self, entry: Any) -> tuple[dict[str, Any], Recorded]:
-        block, recorded = _block_of(self.change(entry, self.nominal))
+    def _changed(self, entry: Any) -> tuple[Block, Recorded]:
+        changed = self.change(entry, self.nominal)
+        block, recorded = changed if isinstance(changed, tuple) else (changed, {})
         _check_same(block, self.nominal)
+        return in_order_of(self.nominal, block), recorded
+
+    def _all_numbers_of(self, entry: Any) -> tuple[dict[str, Any], Recorded]:
+        block, recorded = self._changed(entry)
         s, v = self.adjusted.structure, self.adjusted.values
         changed = values_of(block, block.start.unknowns, block.priors, s)
         changed = with_datum(changed, v.datum_eop, v.datum_points)
@@ -289,10 +294,6 @@ def _by_object(values: Any) -> np.ndarray:
 
 def _count(entries: Any) -> int:
     return len(jax.tree.leaves(entries)[0])
-
-
-def _block_of(changed: Block | tuple[Block, Recorded]) -> tuple[Block, Recorded]:
-    return changed if isinstance(changed, tuple) else (changed, {})
 
 
 def _check_same(block: Any, nominal: Block) -> None:

@@ -12,7 +12,8 @@ from jaxtyping import Float
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.errors import InputError
-from jaxphoto.observations import AbstractObservations, Correlated, StationRows
+from jaxphoto.observations import AbstractObservations, Correlated
+from jaxphoto.sensitivity.biased_numbers import OBSERVED
 from jaxphoto.sensitivity.exact import Sensitivity
 from jaxphoto.statistics import DELTA0, covariance, detectable_errors, observation_groups, redundancy_numbers
 
@@ -60,6 +61,8 @@ def station_bias(
 ) -> StationBias:
     """What a bias (m) of all observed stations of the block, of each strip, or of each image does to the estimates.
 
+    Of exposures on the trajectory of a scanner, too: they alone have it, its laser returns have not.
+
         change = bias sum_k A_k     over the station rows k of the unit along one axis, X, Y or Z
 
     Raises InputError for another `per`, where no station is observed, and where no image has a strip.
@@ -68,17 +71,19 @@ def station_bias(
     whose = {"block": ("block",) * len(block.images), "strip": block.image_strip, "image": block.images}
     if per not in whose:
         raise InputError(f"a station bias is per {', '.join(whose)}, not per {per}: name one of these")
-    rows = block.stations
-    if not len(rows.who):
+    stations = {name: rows for name, rows in block.named_observations.items() if isinstance(rows, OBSERVED["station"])}
+    if not stations:
         raise InputError("the block has no observed stations that could have a bias: add stations")
-    of_row = [whose[per][i] for i in rows.who]
+    of_row = [whose[per][i] for rows in stations.values() for i in rows.who]  # type: ignore[attr-defined]
     units = tuple(unit for unit in dict.fromkeys(of_row) if unit)
     if not units:
         raise InputError("no image with an observed station has a strip: ask for the bias per block or per image")
     place = {unit: k for k, unit in enumerate(units)}
     unit = np.array([place.get(name, len(units)) for name in of_row])
     change = np.zeros((len(units) + 1, 3, len(derivatives.labels)))
-    np.add.at(change, (unit, rows.axis), bias_m * derivatives[StationRows.group].T)
+    axis = np.concatenate([rows.axis for rows in stations.values()])  # type: ignore[attr-defined]
+    by_row = np.concatenate([derivatives[name].T for name in stations])
+    np.add.at(change, (unit, axis), bias_m * by_row)
     return StationBias(change[:-1].transpose(2, 0, 1), units, bias_m)
 
 

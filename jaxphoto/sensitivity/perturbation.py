@@ -24,8 +24,9 @@ from jaxtyping import Array, Float, Int
 from jaxphoto.block import Block
 from jaxphoto.camera import InteriorOrientation, get_parameter, parameter_names
 from jaxphoto.errors import InputError
-from jaxphoto.observations import ATTITUDE_AXES, AXES, Correlated, KnownParameters
+from jaxphoto.observations import Correlated, KnownParameters
 from jaxphoto.rotation import small_rotation
+from jaxphoto.sensitivity.biased_numbers import LABELS, TRAJECTORY, observed_numbers, trajectory_numbers
 from jaxphoto.unknowns import FIXED, FREE, Weighted, is_prior
 
 Recorded = dict[str, Array]
@@ -36,6 +37,8 @@ Distribution = Callable[[Any, tuple[int, ...]], Array]
 PER = {
     "station": ("block", "strip", "image"),
     "attitude": ("block", "strip", "image"),
+    "trajectory": ("block", "strip"),
+    "trajectory-attitude": ("block", "strip"),
     "control": ("block", "point"),
     "image-points": ("camera", "image", "observation"),
     "lever-arm": ("mount",),
@@ -64,7 +67,8 @@ class Bias(eqx.Module):
     recorded: bool = eqx.field(static=True, default=True)
     """Whether each error is worth a record of its own."""
     mixed: tuple[Float[np.ndarray, "_ _ _"] | None, ...] = ()
-    """Of arrays whose errors are correlated, L (sets, n, n) of the covariances L L': it makes them of errors drawn."""
+    """Of arrays that get no error as drawn, L (sets, n, n), which makes theirs of those drawn: of correlated errors
+    that of their covariance L L'."""
 
     def __call__(self, key, block: Block) -> tuple[Block, Recorded]:
         """`block` with errors drawn by `key`, and the errors by name."""
@@ -84,7 +88,13 @@ class Bias(eqx.Module):
             _with_errors(v, added[k] if factor is None else jnp.einsum("nij,nj->ni", factor, added[k]))
             for v, k, factor in zip(where(block), self.index, mixed, strict=True)
         ]
-        return eqx.tree_at(where, block, new)
+        return in_order_of(block, eqx.tree_at(where, block, new))
+
+
+def in_order_of(block: Block, changed: Block) -> Block:
+    """`changed` with its unknowns in the order that they have in `block`."""
+    start = dataclasses.replace(changed.start, unknowns=changed.start.unknowns.in_order_of(block.start.unknowns))
+    return dataclasses.replace(changed, start=start, priors=changed.priors.in_order_of(block.priors))
 
 
 def _with_errors(values: Any, errors: Array) -> Array:
@@ -112,6 +122,10 @@ def bias(
     (`c_mm`, `k1` ...); one, or one an axis. `of` names those that get errors, all if empty. Lever arms, boresights and
     interior parameters must be FIXED (the value that is held changes) or Weighted (the value given beforehand changes).
 
+    Errors of `station` and `attitude` are those of exposures alone. `trajectory` (m) and `trajectory-attitude` (rad,
+    about right, forward and up) are what the trajectory of a laser scanner is off by, of the whole flight or of each
+    laser strip: its returns and the exposures on it have them alike (`sensitivity.biased_numbers`).
+
     Raises InputError for a kind, a name or a sigma that cannot be.
     """
     if kind not in PER:
@@ -123,19 +137,24 @@ def bias(
         raise InputError("a bias of kind interior, and no other, needs the name of a parameter, such as c_mm")
     if kind in ("lever-arm", "boresight", "interior"):
         return _parameters(block, kind, sigma, of, parameter, distribution)
-    axes, (owner, axis), target = _observations(block, kind, per)
-    known = list(dict.fromkeys(owner))
+    axes = LABELS[kind]
+    places = (trajectory_numbers if kind in TRAJECTORY else observed_numbers)(block, kind, per)
+    known = list(dict.fromkeys(name for place in places for name in place.owner))
     if not known:
         raise InputError(f"the block {block.title!r} has no observation that a bias of kind {kind} could be added to")
     if known == [""]:
         raise InputError(f"the images of the block {block.title!r} belong to no {per}: name it in images.csv")
     chosen = _chosen(of, known, kind, per)
     first = {name: len(axes) * k for k, name in enumerate(chosen)}
-    index = np.array([first.get(name, -1) for name in owner])
-    index = np.where(index < 0, len(axes) * len(chosen), index + axis)
+    indices = []
+    for place in places:
+        index = np.array([first.get(name, -1) for name in place.owner], int)
+        index = np.where(index < 0, len(axes) * len(chosen), index + place.axis)
+        indices.append(index if place.factor is None else index.reshape(-1, 3))
     names = tuple(f"{name}.{label}" for name in chosen for label in axes)
     own = per != "observation"
-    return Bias(names, _sigmas(sigma, axes, len(chosen)), (target,), (index,), distribution, own)
+    paths, mixed = tuple(place.path for place in places), tuple(place.factor for place in places)
+    return Bias(names, _sigmas(sigma, axes, len(chosen)), paths, tuple(indices), distribution, own, mixed)
 
 
 class _Noisy(NamedTuple):
@@ -209,27 +228,6 @@ def _label(path: tuple[Any, ...]) -> str:
     return (
         f"{path[-1]} of {path[-2]}" if path[0] in ("mounts", "strips", "scanner", "more") else ".".join(map(str, path))
     )
-
-
-def _observations(block: Block, kind: str, per: str):
-    """The names of the axes; of each number whose it is, and its axis; and where the numbers are."""
-    rows = block.control if kind == "control" else block.stations
-    if kind in ("control", "station"):
-        who, axis, axes = rows.who, rows.axis, tuple(f"{a}_m" for a in AXES)
-        target = ("control" if kind == "control" else "stations", "value")
-    else:
-        attitudes, points = block.attitudes, block.image_points
-        who, axes, target = (
-            (attitudes.image, tuple(f"{a}_rad" for a in ATTITUDE_AXES), ("attitudes", "roll_pitch_yaw"))
-            if kind == "attitude"
-            else (points.image, ("x_mm", "y_mm"), ("image_points", "xy"))
-        )
-        who, axis = np.repeat(who, len(axes)), np.tile(np.arange(len(axes)), len(who))
-    if per == "observation":
-        point = np.repeat(block.image_points.point, 2)
-        return axes, ([f"{block.images[i]}.{block.points[p]}" for i, p in zip(who, point, strict=True)], axis), target
-    names = {"image": block.images, "camera": block.image_camera, "strip": block.image_strip, "point": block.points}
-    return axes, (["block" if per == "block" else names[per][k] for k in who], axis), target
 
 
 def _parameters(block: Block, kind: str, sigma, of: Collection[str], parameter: str, distribution: Distribution):

@@ -14,6 +14,7 @@ from jaxphoto.arrays import Numbers
 from jaxphoto.block import Block
 from jaxphoto.camera import StripCamera
 from jaxphoto.errors import BlockError, InputError
+from jaxphoto.georeferencing import TrajectoryKnot
 from jaxphoto.io import read_block, write_block
 from jaxphoto.observations import (
     OBSERVATIONS,
@@ -67,7 +68,7 @@ def rows_of(kind: type[AbstractObservations], n: int, seed: int = 0) -> Abstract
     in_files = {column.field for column in columns_of(kind)}
     for name, touches, whole, shape in row_fields(kind):
         size = {"image": 3, "point": 4, "strips": 2}.get(
-            touches, 3 if kind.group in ("stations", "control_points") else 1
+            touches, 3 if kind.group in ("stations", "control_points", "trajectory_stations") else 1
         )
         index = (np.arange(n)[:, None] + np.arange(int(np.prod(shape)))) % size
         number = np.abs(rng.normal(1.0, 0.3, (n, *shape))) + 1e-3
@@ -78,7 +79,11 @@ def rows_of(kind: type[AbstractObservations], n: int, seed: int = 0) -> Abstract
         fields["image_2"] = (fields["image_1"] + 1) % 3
     if kind.group == "prior_rotations":
         fields["value"] = np.array(jax.vmap(small_rotation)(rng.normal(0, 0.3, (n, 3))))
-    if kind.group == "surfaces":
+    for name in {"weights", "weights_a", "weights_b"} & set(fields):
+        fields[name] /= fields[name].sum(axis=1, keepdims=True)
+    if "kept" in fields:
+        fields["kept"] /= 10
+    if "normal" in fields:
         fields["normal"] = np.tile([0.0, 0.6, 0.8], (n, 1))
     return kind(**fields)
 
@@ -112,14 +117,18 @@ def assert_rows(got: AbstractObservations, want: AbstractObservations) -> None:
 
 @pytest.fixture
 def block(write_folder: Callable) -> Block:
-    """With a camera of each strip, which steps touch."""
+    """With a camera of each strip, which steps touch, and a knot of a trajectory."""
     block = read_block(write_folder())
     strips = [name for name in dict.fromkeys(block.image_strip) if name]
-    more = lambda u, value: dataclasses.replace(  # noqa: E731
-        u, more={StripCamera.kind: {name: StripCamera(value, value, value) for name in strips}}
+    more = lambda u, value, knot: dataclasses.replace(  # noqa: E731
+        u,
+        more={
+            StripCamera.kind: {name: StripCamera(value, value, value) for name in strips},
+            TrajectoryKnot.kind: {"1 at 0.000 s": TrajectoryKnot(knot, knot)},
+        },
     )
-    start = dataclasses.replace(block.start, unknowns=more(block.start.unknowns, 0.0))
-    return dataclasses.replace(block, start=start, priors=more(block.priors, FIXED))
+    start = dataclasses.replace(block.start, unknowns=more(block.start.unknowns, 0.0, np.zeros(3)))
+    return dataclasses.replace(block, start=start, priors=more(block.priors, FIXED, FIXED))
 
 
 def many(kind: type[AbstractObservations]) -> int:

@@ -62,7 +62,8 @@ def parameters_of(kind: type[AbstractParameters], prior=None, seed: int = 0):
 
 
 def with_unknowns(block: Block, kind: type[AbstractParameters], prior) -> Block:
-    owners = [name for name in dict.fromkeys(block.owners(kind.owner)) if name or kind.owner == "block"]
+    owners = [""] if kind.owner == "lidar" else list(dict.fromkeys(block.owners(kind.owner)))
+    owners = [name for name in owners if name or kind.owner in ("block", "lidar")]
     starts = {name: parameters_of(kind, None, k) for k, name in enumerate(owners)}
     priors = {name: parameters_of(kind, prior, k) for k, name in enumerate(owners)}
     start, known = block.start.unknowns, block.priors

@@ -24,6 +24,8 @@ Kind = type[AbstractParameters]
 # Those that have sections of their own.
 _OWN = ("scanner", "mounts", "strips")
 _OWNERS = ("image", "camera", "mount", "strip", "block")
+# Of these there is one, without a name; knots have names of their own, which are nowhere else.
+_ONE, _NAMED = ("block", "lidar"), "knot"
 
 
 class Key(NamedTuple):
@@ -91,7 +93,7 @@ def unknown_sections(block: Block) -> dict[str, Any]:
     written: dict[str, Any] = {}
     for kind, owners in start.items():
         tables = {name: _section(own, priors[kind][name]) for name, own in owners.items()}
-        if any(type(own).owner == "block" for own in owners.values()):
+        if any(type(own).owner in _ONE for own in owners.values()):
             if set(tables) != {""}:
                 raise BlockError(f"{kind} belongs to the whole block, whose name is '', not {', '.join(tables)}")
             tables = tables[""]
@@ -102,8 +104,11 @@ def unknown_sections(block: Block) -> dict[str, Any]:
 
 def _tables(kind: Kind, given: Section, block: Block) -> Iterator[tuple[str, Section]]:
     """The owners that have parameters, each with its table."""
-    if kind.owner == "block":
+    if kind.owner in _ONE:
         yield "", given
+        return
+    if kind.owner == _NAMED:
+        yield from ((name, given.section(name)) for name in given)
         return
     if kind.owner not in (*_OWNERS, *block.partitions):
         raise given.error(

@@ -94,8 +94,9 @@ def read_settings(values: dict[str, Any], file: str = TOML, sigma_keys: Sequence
 def read_partitions(top: Section) -> tuple[str, ...]:
     """The names of columns of images.csv. Raises InputError for those that have another meaning."""
     names, images = top.texts("partitions"), LAYOUTS["images"]
+    taken = (*images.columns, *images.optional, *PLACE, "mount", "block", "lidar", "knot")
     for name in names:
-        if name in (*images.columns, *images.optional, *PLACE, "mount", "block", "lidar") or names.count(name) > 1:
+        if name in taken or names.count(name) > 1:
             raise top.error("partitions", f"{name} has a meaning already; give the partition another name")
     return names
 

@@ -8,7 +8,15 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxphoto.block import Block, empty_block
-from jaxphoto.georeferencing import Scanner, ScannerCalibration, StripErrors, StripSpline, Trajectory, TrajectoryKnot
+from jaxphoto.georeferencing import (
+    Scanner,
+    ScannerCalibration,
+    StripErrors,
+    StripSpline,
+    Trajectory,
+    TrajectoryKnot,
+    knot_name,
+)
 from jaxphoto.lidar.strip_settings import StripSettings
 from jaxphoto.parameters import AbstractParameters, dynamic_fields
 from jaxphoto.procedures.lidar.until_still import at_result
@@ -78,7 +86,7 @@ def strip_block(
     for name, spline in zip(names, splines, strict=True):
         first = TrajectoryKnot(*(Weighted(_ZERO, of[spline.first]) for of in sigmas))  # type: ignore[arg-type]
         for k, time in enumerate(spline.times):
-            owner = name if priors is None else f"{name} at {time:.3f} s"
+            owner = name if priors is None else knot_name(name, time)
             knots[owner] = TrajectoryKnot(_ZERO, _ZERO)  # type: ignore[arg-type]
             known[owner] = right if name in held else shift if priors is None else later if k else first
     block = empty_block("strips of a laser scanner") if photographs is None else photographs
