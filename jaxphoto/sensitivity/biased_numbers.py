@@ -70,7 +70,7 @@ def observed_numbers(block: Block, kind: str, per: str) -> list[BiasedNumbers]:
         return [_numbers_of(block, getattr(block, name), (name,), kind, per)]
     held: list[tuple[tuple[Any, ...], Any]] = [((name,), getattr(block, name)) for name in ("stations", "attitudes")]
     held += [(("more", k), rows) for k, rows in enumerate(block.more)]
-    return [_numbers_of(block, rows, path, kind, per) for path, rows in held if isinstance(rows, kinds)]
+    return [_numbers_of(block, rows, path, kind, per) for path, rows in held if isinstance(rows, kinds) and len(rows)]
 
 
 def _numbers_of(block: Block, rows: Any, path: tuple[Any, ...], kind: str, per: str) -> BiasedNumbers:

@@ -8,7 +8,9 @@ import pandas as pd
 import pytest
 from scipy.spatial.transform import Rotation
 
+from jaxphoto import adjust, read_block
 from jaxphoto.block import Frame
+from jaxphoto.camera import get_parameter
 from jaxphoto.cloud import Cloud
 from jaxphoto.georeferencing import Trajectory
 from jaxphoto.io import clouds
@@ -185,6 +187,10 @@ def test_photographs_are_adjusted_with_the_strips(tmp_path, monkeypatch, capsys)
     assert {"scanner.boresight_up_rad", "interior[kodak].c_mm", "mounts[default].boresight_x_rad"} <= set(rho.columns)
     # Scanner 4, camera 5, mount 3, and six of each of 21 knots.
     assert rho.shape == (138, 138) and np.allclose(np.diagonal(rho), 1.0)
+    # On disk, too: adjusted anew it is the same.
+    anew = adjust(read_block(out / "block"))
+    of_c = float(get_parameter(anew.unknowns.interior["kodak"], "c_mm"))
+    assert of_c == pytest.approx(interior.value["c_mm"], abs=1e-7)
     # The trajectory is mended: where it truly went, but for what strips and photographs do not tell.
     true = correct_flight(flown().trajectory, flown().errors)
     before, after = (pd.read_csv(f / "trajectory.csv")[["X_m", "Y_m", "Z_m"]].to_numpy() for f in (folder, out))
