@@ -5,9 +5,9 @@ from collections.abc import Sequence
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
-OF_POINTS = ("xyz", "classification", "returns", "time", "strip")
+OF_POINTS = ("xyz", "classification", "returns", "time", "strip", "withheld")
 """What a `Cloud` says of each point."""
 
 
@@ -16,7 +16,7 @@ class Cloud(eqx.Module):
 
     What a file does not tell is None. `time` (s) is that of the file; `strip` is the index, in `strips`, of the flight
     line that a point belongs to (LAS: point source ID). `returns` are the return's number and the number of returns
-    of its pulse.
+    of its pulse. `withheld` are points that their file says not to use: only `rewrite_cloud` meets them.
     """
 
     xyz: Float[np.ndarray, "n 3"]
@@ -25,6 +25,7 @@ class Cloud(eqx.Module):
     time: Float[np.ndarray, "n"] | None = None
     strip: Int[np.ndarray, "n"] | None = None
     strips: tuple[str, ...] = eqx.field(static=True, default=())
+    withheld: Bool[np.ndarray, "n"] | None = None
 
     def __len__(self) -> int:
         return len(self.xyz)
@@ -33,6 +34,14 @@ class Cloud(eqx.Module):
         """The points that `chosen` (an index or a mask) names."""
         kept = {name: v[chosen] for name in OF_POINTS if (v := getattr(self, name)) is not None}
         return dataclasses.replace(self, **kept)
+
+    def numbered(self, names: Sequence[str]) -> "Cloud":
+        """The same with strips numbered as in `names`, and those that are not among them after these."""
+        if self.strip is None:
+            return self
+        order = (*names, *(name for name in self.strips if name not in names))
+        number = np.array([order.index(name) for name in self.strips], np.int32)
+        return dataclasses.replace(self, strip=number[self.strip], strips=order)
 
     @staticmethod
     def joined(parts: Sequence["Cloud"]) -> "Cloud":

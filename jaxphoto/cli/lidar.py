@@ -13,8 +13,9 @@ from rich.console import Console
 from jaxphoto.block import Block
 from jaxphoto.cli.app import app
 from jaxphoto.cli.choices import one_of
-from jaxphoto.cli.cloud_options import Classes, CloudEpsg, CloudUnit, ReturnsOption, class_numbers, corrected_name
+from jaxphoto.cli.cloud_options import Classes, CloudEpsg, CloudUnit, ReturnsOption, class_numbers
 from jaxphoto.cli.console import plain_console
+from jaxphoto.cli.corrected_cloud import write_corrected
 from jaxphoto.cli.made import made_by
 from jaxphoto.cli.strip_flight import (
     SCANNER,
@@ -38,6 +39,7 @@ from jaxphoto.io.trajectory import read_records, write_moved
 from jaxphoto.io.trajectory.in_frame import trajectory_in, with_positions
 from jaxphoto.lidar import HeightSettings
 from jaxphoto.lidar.correction import correct_cloud, scanner_path
+from jaxphoto.lidar.coverage import check_covered
 from jaxphoto.lidar.strip_settings import StripSettings
 from jaxphoto.orientation import approximate
 from jaxphoto.procedures.lidar import Round, lidar_control, roof_control, simultaneous
@@ -238,6 +240,9 @@ def simultaneous_command(
         status.update("reading the cloud")
         said = {"epsg": cloud_epsg, "unit": cloud_unit}
         surface = clouds.read_cloud(cloud, read.frame, classes=chosen, returns=returns, **said)  # type: ignore[arg-type]
+        if path is not None:
+            # Here on the clocks as they were given.
+            check_covered(surface, path, trajectory_shift_s)
         seconds = {"read": time.perf_counter() - began}
         priors = Scanner(turn, dict.fromkeys(surface.strips or ("cloud",), slide))  # type: ignore[arg-type]
         result = simultaneous(
@@ -258,7 +263,7 @@ def simultaneous_command(
             return correct_cloud(part, result.scanner, track).xyz
 
         with write_simultaneous(result, out, seconds, made) as folder:
-            clouds.rewrite_cloud(cloud, folder / corrected_name(cloud), corrected, frame=read.frame, **said)  # type: ignore[arg-type]
+            write_corrected(cloud, folder, corrected, tuple(result.scanner.shifts), path, read.frame, said)
             if trajectory is not None and records is not None and result.trajectory is not None:
                 moved = with_positions(records, np.asarray(result.trajectory.position), read.frame)
                 moved = moved._replace(time=moved.time + trajectory_shift_s)

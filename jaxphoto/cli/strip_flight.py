@@ -3,7 +3,7 @@
 The cloud passes part by part, and what its planes need of it is kept in memory.
 """
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
@@ -14,10 +14,10 @@ from jaxtyping import Float
 
 from jaxphoto.block import Block, Frame
 from jaxphoto.cli.choices import one_of
-from jaxphoto.cli.cloud_options import corrected_name
 from jaxphoto.cli.cloud_progress import CloudProgress
 from jaxphoto.cli.console import plain_console
 from jaxphoto.cli.control_in_frame import control_in_frame
+from jaxphoto.cli.corrected_cloud import write_corrected
 from jaxphoto.cli.made import made_by
 from jaxphoto.cli.progress import StepsLeft
 from jaxphoto.cloud import Cloud
@@ -32,6 +32,7 @@ from jaxphoto.io.trajectory import Records, read_records, write_moved
 from jaxphoto.io.trajectory.in_frame import trajectory_in, with_poses
 from jaxphoto.lidar.cell_returns import CellTally
 from jaxphoto.lidar.correction import scanner_path
+from jaxphoto.lidar.coverage import CoveredTimes
 from jaxphoto.lidar.raster import Raster
 from jaxphoto.lidar.strip_correction import correct_strips
 from jaxphoto.lidar.strip_differences import strip_differences
@@ -140,14 +141,18 @@ def adjust_flight(context: typer.Context, flight: StripFiles, choices: StripChoi
         # Of a file that is filtered nobody knows how much will come.
         every = flight.classes is None and flight.returns == "all"
         progress = CloudProgress(StepsLeft(errors, status), status, clouds.most_points(cloud) if every else None)
+        coverage = None if path is None else CoveredTimes(path)
         looked_at = kept_returns(
-            progress.passes(parts),
+            _seen_by(coverage, progress.passes(parts)),
             settings,
             track,
             "line" if priors is None else priors.calibration.pattern,
             None if photographs is None else partial(_about_where, photographs.block),
             None if control is None else control.coordinates,
         )
+        if coverage is not None:
+            # Of all returns, on the clocks as they were given.
+            coverage.check(flight.trajectory_shift_s)
 
         def report(made: StripRound) -> None:
             line = f"round {made.number}: {made.planes} planes, strips {made.rms_m:.3f} m apart before"
@@ -173,9 +178,9 @@ def adjust_flight(context: typer.Context, flight: StripFiles, choices: StripChoi
             gaps.add(part.take(seen), corrected[seen])
             return corrected
 
-        def write_corrected(folder: Path) -> tuple[Raster, Raster] | None:
+        def write_beside(folder: Path) -> tuple[Raster, Raster] | None:
             progress.begins()
-            clouds.rewrite_cloud(cloud, folder / corrected_name(cloud), moved, frame=own, **said)
+            write_corrected(cloud, folder, moved, result.cloud.strips, path, own, said)
             if trajectory is not None and records is not None and result.trajectory is not None:
                 back = with_poses(records, result.trajectory, frame)
                 write_moved(back._replace(time=back.time + flight.trajectory_shift_s), trajectory, folder)
@@ -186,7 +191,7 @@ def adjust_flight(context: typer.Context, flight: StripFiles, choices: StripChoi
                 write_dsm(folder / f"differences_{name}.tif", raster, gaps.system)
             return maps
 
-        write_strips(result, tables, verdict, out, write_corrected, made)
+        write_strips(result, tables, verdict, out, write_beside, made)
     console = plain_console()
     print_verdict(verdict, console)
     print_strips(result, console)
@@ -252,7 +257,22 @@ def _about_where(block: Block) -> Float[np.ndarray, "points 3"]:
     return np.asarray(approximate(block).points)[tie_points(block)]
 
 
+def _seen_by(coverage: CoveredTimes | None, parts: Callable[[], Iterator[Cloud]]) -> Callable[[], Iterator[Cloud]]:
+    """`parts`, of each of which `coverage` sees the times."""
+
+    def seen() -> Iterator[Cloud]:
+        for part in parts():
+            if coverage is not None:
+                coverage.add(part)
+            yield part
+
+    return seen
+
+
 def _check_known(part: Cloud, result: StripAdjustment) -> None:
     """Raise InputError for a strip that has no returns of those looked at."""
-    for name in part.strips[len(result.cloud.strips) :]:
-        raise InputError(f"strip {name} has no points of these classes and returns: take others, or leave it out")
+    assert part.strip is not None
+    for k in part.strip[part.strip >= len(result.cloud.strips)][:1]:
+        raise InputError(
+            f"strip {part.strips[k]} has no points of these classes and returns: take others, or leave it out"
+        )

@@ -13,13 +13,11 @@ from jaxtyping import Array, Bool, Float
 from jaxphoto.arrays import Numbers
 from jaxphoto.cloud import Cloud
 from jaxphoto.compiling import call_compiled
-from jaxphoto.errors import BlockError
 from jaxphoto.georeferencing import Scanner, Trajectory, TrajectorySpline, corrected_point, spline_through
+from jaxphoto.lidar.coverage import longest_interval, not_covered
 
 PORTION = 1 << 17
 """Laser points at once, whose numbers stay in the processor's cache; fewer are padded to a power of two."""
-# An interval is a gap from this many times the usual interval: one record may be lost.
-_GAP = 2.5
 
 
 class ScannerPoses(eqx.Module):
@@ -39,8 +37,8 @@ class ScannerPath(eqx.Module):
 
 def scanner_path(trajectory: Trajectory) -> ScannerPath:
     """The path along `trajectory`, which is on the clock of the laser points."""
-    max_gap = _GAP * float(np.median(np.diff(np.asarray(trajectory.time))))
-    return ScannerPath(trajectory, call_compiled(_spline, trajectory, np.array(max_gap)))
+    max_gap = np.array(longest_interval(trajectory))
+    return ScannerPath(trajectory, call_compiled(_spline, trajectory, max_gap))
 
 
 def scanner_poses(path: ScannerPath, time: Float[np.ndarray, "n"]) -> ScannerPoses:
@@ -52,7 +50,7 @@ def scanner_poses(path: ScannerPath, time: Float[np.ndarray, "n"]) -> ScannerPos
         return ScannerPoses(np.zeros((0, 3)), np.zeros((0, 3, 3)))
     position, turn, known = _along(_poses, path, time)
     if not known.all():
-        raise not_covered(path.trajectory, time, int((~known).sum()))
+        raise not_covered(path.trajectory, time)
     return ScannerPoses(position, turn)
 
 
@@ -60,14 +58,6 @@ def scanner_motions(path: ScannerPath, time: Float[np.ndarray, "n"]) -> tuple[np
     """Velocity (m/s) and rate of turn (rad/s), (n, 3) each, at one or more times (s) that the trajectory covers."""
     velocity, rate = _along(_motions, path, time)
     return velocity, rate
-
-
-def check_covered(trajectory: Trajectory, time: Float[np.ndarray, "n"]) -> None:
-    """Raise BlockError for laser points at times (s) that the trajectory does not cover, gaps between records aside."""
-    known = np.asarray(trajectory.time)
-    outside = int(((time < known[0]) | (time > known[-1])).sum())
-    if outside:
-        raise not_covered(trajectory, time, outside)
 
 
 def corrected_xyz(
@@ -122,16 +112,6 @@ def _strips(cloud: Cloud, scanner: Scanner) -> list[tuple[np.ndarray, np.ndarray
     return [
         (np.flatnonzero(strip == k), np.asarray(scanner.shifts.get(name, np.zeros(3)))) for k, name in enumerate(names)
     ]
-
-
-def not_covered(trajectory: Trajectory, time: np.ndarray, n: int) -> BlockError:
-    """That `n` points at some of the times `time` (s) were measured where no record is."""
-    known = np.asarray(trajectory.time)
-    return BlockError(
-        f"{n} laser points were measured where the trajectory has no records: the points at {time.min():.3f} "
-        f"to {time.max():.3f} s, the trajectory from {known[0]:.3f} to {known[-1]:.3f} s; give the trajectory of this "
-        "flight on the cloud's clock (--trajectory-shift-s)"
-    )
 
 
 def in_portions(

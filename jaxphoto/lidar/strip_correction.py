@@ -11,7 +11,8 @@ from jaxtyping import Array, Float
 from jaxphoto.cloud import Cloud
 from jaxphoto.compiling import call_compiled
 from jaxphoto.georeferencing import StripErrors, Trajectory, corrected_return
-from jaxphoto.lidar.correction import ScannerPath, in_portions, not_covered
+from jaxphoto.lidar.correction import ScannerPath, in_portions
+from jaxphoto.lidar.coverage import not_covered
 from jaxphoto.rotation import matrix_from_quaternion, quaternion_from_matrix, small_rotation
 
 
@@ -30,9 +31,8 @@ def corrected_strip(
         return xyz - errors.at(strip, time)[0]
     common = path.spline, errors.of_strip(strip), errors.boresight, errors.calibration
     result = in_portions(_corrected, (xyz, time), *common)
-    unknown = int(np.isnan(result[:, 0]).sum())
-    if unknown:
-        raise not_covered(path.trajectory, time, unknown)
+    if np.isnan(result[:, 0]).any():
+        raise not_covered(path.trajectory, time)
     return result
 
 

@@ -118,13 +118,45 @@ def test_strips_without_points_are_left_out(tmp_path):
     assert read.strips == ("12",) and not read.strip.any() and len(read) == (cloud.strip == 1).sum()
 
 
-def test_withheld_points_are_left_out(tmp_path):
+@pytest.mark.parametrize("kind", ["las", "laz"])
+def test_withheld_points_are_not_read_but_stay_in_what_is_written(tmp_path, kind):
     cloud = sample(500)
     withheld = np.arange(500) % 3 == 0
-    path = write_las(tmp_path / "c.las", cloud.xyz, withheld=withheld)
-    np.testing.assert_allclose(clouds.read_cloud(path).xyz, cloud.xyz[~withheld], atol=1e-9)
-    clouds.write_cloud(clouds.read_cloud(path), tmp_path / "d.las", like=path)
-    np.testing.assert_allclose(laspy.read(tmp_path / "d.las").xyz, cloud.xyz[~withheld], atol=1e-9)
+    kinds = np.where(np.arange(500) % 5 == 0, 7, 2)
+    said = {"withheld": withheld, "intensity": np.arange(500), "classification": kinds, "gps_time": cloud.time}
+    path, new = write_las(tmp_path / f"c.{kind}", cloud.xyz, **said), tmp_path / f"d.{kind}"
+    read = clouds.read_cloud(path, classes=EVERY_CLASS)
+    np.testing.assert_allclose(read.xyz, cloud.xyz[~withheld], atol=1e-9)
+    assert read.withheld is None
+    step = np.array([0.5, -0.25, 0.125])
+    # The whole file moves; a cloud that was read has no place for them.
+    for write, moved in (
+        (lambda: clouds.rewrite_cloud(path, new, lambda part: part.xyz + step), np.ones(500, bool)),
+        (lambda: clouds.write_cloud(dataclasses.replace(read, xyz=read.xyz + step), new, like=path), ~withheld),
+    ):
+        write()
+        written = laspy.read(new)
+        np.testing.assert_allclose(written.xyz, cloud.xyz + moved[:, None] * step, atol=1e-9)
+        for name, values in said.items():
+            np.testing.assert_array_equal(written[name], values)
+
+
+def test_withheld_points_that_cannot_be_moved_stay(tmp_path):
+    """Far from any map, without a time or of a strip that nobody knows: that is why a file withholds them."""
+    xyz = sample(500).xyz
+    xyz[3] = [9e8, 0.0, 0.0]
+    withheld = np.arange(500) % 3 == 0
+    path = write_las(tmp_path / "c.las", xyz, withheld=withheld, gps_time=np.where(withheld, np.nan, 1.0), scale=0.5)
+
+    def moved(part):
+        unknown = part.withheld & (part.xyz[:, 0] > 0)
+        return np.where(unknown[:, None], np.nan, part.xyz + np.array([0.0, 0.0, 2.0]))
+
+    before = laspy.read(path).xyz
+    stay = clouds.rewrite_cloud(path, tmp_path / "d.las", moved, frame=UTM, epsg=32722)
+    lifted = laspy.read(tmp_path / "d.las").xyz[:, 2] - before[:, 2]
+    assert stay == (np.abs(lifted) < 0.5).sum() > 1 and lifted[3] == 0 and (lifted[~withheld] > 1).all()
+    assert (lifted[withheld] > 1).any()
 
 
 # Units and systems

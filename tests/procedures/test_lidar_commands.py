@@ -105,9 +105,16 @@ def test_a_trajectory_of_another_day(folder, tmp_path, monkeypatch, capsys):
     late = pd.read_csv(folder / "trajectory.csv")
     late["time_s"] += 86400.0
     late.to_csv(tmp_path / "late.csv", index=False)
-    given = ("--trajectory", tmp_path / "late.csv", "--out", tmp_path / "out", *SIGMAS)
-    code, _, error = run(monkeypatch, capsys, "simultaneous", folder, folder / "cloud.laz", *given)
-    assert code == 2 and "where the trajectory has no records" in error
+    given = ("--trajectory", tmp_path / "late.csv", "--out", tmp_path / "out")
+    cloud, shift = folder / "cloud.laz", ("--trajectory-shift-s", "60")
+    for command in (
+        ("simultaneous", folder, cloud, *SIGMAS),
+        ("simultaneous", folder, cloud, *shift),
+        ("strips", cloud, *shift),
+    ):
+        code, _, error = run(monkeypatch, capsys, *command, *given)
+        assert code == 2 and "where the trajectory has no records" in error
+        assert "give --trajectory-shift-s 86400, which brings all of them into it" in error
 
 
 def test_a_cloud_elsewhere(folder, tmp_path, monkeypatch, capsys):

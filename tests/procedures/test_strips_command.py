@@ -3,6 +3,7 @@
 import functools
 import json
 
+import laspy
 import numpy as np
 import pandas as pd
 import pytest
@@ -11,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from jaxphoto import adjust, read_block
 from jaxphoto.block import Frame
 from jaxphoto.camera import get_parameter
+from jaxphoto.cli.corrected_cloud import write_corrected
 from jaxphoto.cloud import Cloud
 from jaxphoto.georeferencing import Trajectory
 from jaxphoto.io import clouds
@@ -41,6 +43,12 @@ def cloud_file(tmp_path_factory):
     xyz[7, 2] -= 50.0
     kind = np.where(np.arange(len(xyz)) == 7, 7, 2).astype(np.uint8)
     clouds.write_cloud(Cloud(xyz, classification=kind, time=time, strip=strip, strips=("1", "2")), path)
+    # Some are not to be used, and would be seen if they were.
+    las = laspy.read(path)
+    unused = np.arange(len(xyz)) % 50 == 0
+    las.withheld = unused
+    las.z = np.where(unused, las.z + 30.0, las.z)
+    las.write(path)
     return path
 
 
@@ -56,6 +64,13 @@ def test_shifts_are_taken_off_the_cloud(cloud_file, tmp_path, monkeypatch, capsy
     np.testing.assert_allclose(after.time, before.time, atol=1e-9)
     every, written = (clouds.read_cloud(f, classes=EVERY_CLASS) for f in (cloud_file, out / "both.laz"))
     assert len(written) == len(every) == len(before) + 1 and (written.classification == every.classification).all()
+    given, written = laspy.read(cloud_file), laspy.read(out / "both.laz")
+    for name in set(given.point_format.dimension_names) - {"X", "Y", "Z"}:
+        np.testing.assert_array_equal(written[name], given[name])
+    unused = (given.withheld == 1) & (given.point_source_id == 2)
+    assert unused.sum() > 50
+    off = (given.xyz - written.xyz)[unused]
+    np.testing.assert_allclose(off, np.tile(SHIFT, (len(off), 1)), atol=0.03)
     page = (out / "report.html").read_text(encoding="utf-8")
     assert "Shifts of the strips" in page and "Errors of the trajectory" not in page
     strips = pd.read_csv(out / "strips.csv")
@@ -144,6 +159,27 @@ def test_a_cloud_on_the_map_and_a_trajectory_in_sbet(on_the_map, tmp_path, monke
         monkeypatch, capsys, "strips", folder / "nowhere.laz", "--out", tmp_path / "no", *given, *OPTIONS
     )
     assert code == 2 and "name it (--cloud-epsg)" in " ".join(errors.split()) and not (tmp_path / "no").exists()
+
+
+def test_withheld_points_that_nothing_says_anything_of_stay(cloud_file, tmp_path):
+    """Of a strip that has no others, met first in the file, or flown where the trajectory has no records."""
+    las = laspy.read(cloud_file)
+    first, unflown = np.arange(len(las)) == 0, np.arange(len(las)) == 50
+    assert (las.withheld[first | unflown] == 1).all()
+    las.point_source_id = np.where(first, 9, las.point_source_id)
+    las.gps_time = np.where(unflown, -50.0, las.gps_time)
+    (tmp_path / "given").mkdir()
+    las.write(tmp_path / "given" / "both.laz")
+    time = np.arange(-1.0, 15.0, 0.1)
+    path = Trajectory(time, np.zeros((160, 3)), np.ones((160, 4)) / 2, np.zeros((160, 3)), np.zeros((160, 3)))
+
+    def corrected(part: Cloud) -> np.ndarray:
+        return part.xyz + np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 2.0]])[part.strip]
+
+    with pytest.warns(UserWarning, match=r"both\.laz: 2 points marked as withheld cannot be corrected"):
+        write_corrected(tmp_path / "given" / "both.laz", tmp_path, corrected, ("1", "2"), path, None, {})
+    lifted = laspy.read(tmp_path / "both.laz").xyz[:, 2] - las.xyz[:, 2]
+    np.testing.assert_allclose(lifted, np.where(first | unflown, 0.0, las.point_source_id), atol=1e-3)
 
 
 @pytest.mark.parametrize(

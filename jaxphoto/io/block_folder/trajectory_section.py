@@ -8,6 +8,7 @@ from jaxphoto.block import Frame, Motion
 from jaxphoto.compiling import jit_quickly
 from jaxphoto.errors import BlockError, InputError
 from jaxphoto.georeferencing import Poses, Trajectory, covered, interpolate
+from jaxphoto.georeferencing.time_scales import DAY, LEAP_SECONDS, looks_like, shift_that_fits
 from jaxphoto.georeferencing.trajectory import SHORTEST
 from jaxphoto.io.block_folder.attitude_units import check_yaw
 from jaxphoto.io.block_folder.images import Images
@@ -15,7 +16,6 @@ from jaxphoto.io.block_folder.motion import ObservedFlight
 from jaxphoto.io.block_folder.settings import Settings
 from jaxphoto.io.trajectory import Records
 from jaxphoto.io.trajectory.in_frame import positions_in, trajectory_in
-from jaxphoto.io.trajectory.time_scales import DAY, LEAP_SECONDS, looks_like, shift_that_fits
 from jaxphoto.observations import Attitudes, StationRows
 from jaxphoto.rotation import roll_pitch_yaw_from_matrix
 

@@ -158,7 +158,7 @@ def _placed(
 
 def chosen_of(chunk: Cloud, classes: Collection[int] | None, returns: Returns, name: str) -> Bool[np.ndarray, "n"]:
     """Which points `read_cloud` chooses of those of the file `name`. Raises InputError where it cannot tell."""
-    chosen = np.ones(len(chunk), bool)
+    chosen = np.ones(len(chunk), bool) if chunk.withheld is None else ~chunk.withheld
     if classes is not None and classes != EVERY_CLASS:
         if chunk.classification is None:
             raise InputError(f"{name} has no classification, so no classes can be chosen; leave the filter out")

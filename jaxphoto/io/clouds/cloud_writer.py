@@ -42,9 +42,9 @@ def write_cloud(
     """Write `cloud`, which is in `frame`, to a file .las, .laz, .csv or .ply; nothing is left half-written.
 
     With `like`, the LAS or LAZ file that it was read from whole (`epsg` and `unit` as they were then): that file with
-    other coordinates, in its own system, units and scale, and all else that it says of every point. Without, in the
-    system of `frame` where that is of kind epsg, or as it stands, in metres; LAS 1.4 to the millimetre, CSV and PLY in
-    double precision.
+    other coordinates, in its own system, units and scale, and all else that it says of every point; those withheld,
+    which were not read, stay where they were. Without, in the system of `frame` where that is of kind epsg, or as it
+    stands, in metres; LAS 1.4 to the millimetre, CSV and PLY in double precision.
 
     Raises OSError where it cannot be written whole, InputError where `like` has another number of points, and for names
     that are no cloud's.
@@ -78,12 +78,16 @@ def rewrite_cloud(
     frame: Frame | None = None,
     epsg: int | None = None,
     unit: str | None = None,
-) -> None:
+) -> int:
     """Write to `path` the cloud in the file `source`, of one kind, with other coordinates; part by part, in its order.
 
-    `moved` takes each part as `read_cloud` gives it, those of noise, too, and gives X, Y, Z (m) in the same `frame`.
+    `moved` takes each part as `read_cloud` gives it, with noise and what is withheld, and gives X, Y, Z (m) in the same
+    `frame`.
     What is written is in the system and units of `source`; of LAS and LAZ with all else that it says of every point, of
     CSV and PLY with what a `Cloud` holds. Memory holds one part, and nothing is left half-written.
+
+    Gives how many points stay where they were: those withheld that lie where the system of the frame does not reach, or
+    of which `moved` gives NaN.
 
     Raises OSError where it cannot be written whole, and what `read_cloud` and `moved` raise.
     """
@@ -94,8 +98,20 @@ def rewrite_cloud(
         raise InputError(f"{path.name} cannot be written like {source.name}: both must be files of one kind")
     placement = Placement(opened_source.name, opened_source.system, frame)
 
+    stay = 0
+
     def to_write(part: Cloud) -> np.ndarray:
-        return placement.file(moved(placement.placed(part)))
+        nonlocal stay
+        if part.withheld is None or not part.withheld.any():
+            return placement.file(moved(placement.placed(part)))
+        reached = ~part.withheld
+        reached[part.withheld] = np.isfinite(placement.frame(part.xyz[part.withheld])).all(axis=1)
+        own, xyz = np.flatnonzero(reached), np.array(part.xyz)
+        new = moved(placement.placed(part.take(own)))
+        lost = np.isnan(new).any(axis=1) & part.withheld[own]
+        xyz[own[~lost]] = placement.file(new[~lost])
+        stay += len(part) - len(own) + int(lost.sum())
+        return xyz
 
     with _said_of(path), whole_file(path) as work:
         if kind in _LAS:
@@ -103,6 +119,7 @@ def rewrite_cloud(
         else:
             parts = ((part, to_write(part)) for part in opened_source.chunks())
             _WRITERS[kind](parts, opened_source.most, work)
+    return stay
 
 
 @contextmanager
@@ -126,37 +143,33 @@ def _write_like(cloud: Cloud, path: Path, like: Path, placement: Placement) -> N
 
     def to_write(part: Cloud) -> np.ndarray:
         nonlocal done
-        done += len(part)
-        return placement.file(cloud.xyz[done - len(part) : done])
+        assert part.withheld is not None
+        own = np.flatnonzero(~part.withheld)
+        begin, done = done, done + len(own)
+        if done <= len(cloud):
+            part.xyz[own] = placement.file(cloud.xyz[begin:done])
+        return part.xyz
 
-    there = _rewrite_las(like, path, to_write)
-    if there != len(cloud):
+    _rewrite_las(like, path, to_write)
+    if done != len(cloud):
         raise InputError(
             f"{path.name} cannot be written like {like.name}: the cloud has {len(cloud)} points, that file "
-            f"{there}; read the file whole, without filters"
+            f"{done}; read the file whole, without filters"
         )
 
 
-def _rewrite_las(source: Path, path: Path, to_write: Callable[[Cloud], Float[np.ndarray, "n 3"]]) -> int:
-    """Write `source` with other coordinates of its own system, and say how many points it has.
-
-    A part of which `to_write` gives fewer coordinates than points is left out.
-    """
-    there = 0
+def _rewrite_las(source: Path, path: Path, to_write: Callable[[Cloud], Float[np.ndarray, "n 3"]]) -> None:
+    """Write `source` with other coordinates of its own system."""
     with opened(source) as reader:
         header = reader.header
         with laspy.open(path, "w", header=header) as writer:
-            for points, part in points_and_clouds(reader, source):
-                there += len(points)
+            for points, part in points_and_clouds(reader, source, withheld=True):
                 xyz = to_write(part)
                 _check_room(xyz, header, source.name)
-                if len(xyz) < len(points):
-                    continue
                 points.x, points.y, points.z = xyz.T
                 writer.write_points(points)
             if header.evlrs:
                 writer.write_evlrs(header.evlrs)
-    return there
 
 
 def _write_las(cloud: Cloud, path: Path, frame: Frame | None) -> None:

@@ -103,7 +103,7 @@ def _check_counting(header: laspy.LasHeader, name: str) -> None:
 
 
 def raw_chunks(reader: laspy.LasReader, path: Path) -> Iterator[laspy.ScaleAwarePointRecord]:
-    """The points of `path`, open, without those withheld. Raises InputError where they are damaged or too few."""
+    """The points of `path`, open. Raises InputError where they are damaged or too few."""
     read, promised = 0, reader.header.point_count
     if reader.header.are_points_compressed:
         with _damage(path):
@@ -112,11 +112,10 @@ def raw_chunks(reader: laspy.LasReader, path: Path) -> Iterator[laspy.ScaleAware
     while read < promised:
         with _damage(path):
             points = reader.read_points(together)
-            withheld = np.asarray(points.withheld, bool)
         if not len(points):
             raise _cut_off(path.name, promised, read)
         read += len(points)
-        yield points[~withheld] if withheld.any() else points
+        yield points
 
 
 def _cut_off(name: str, promised: int, there: int) -> InputError:
@@ -133,23 +132,30 @@ def coordinates(points: laspy.ScaleAwarePointRecord) -> np.ndarray:
 
 def _chunks(path: Path) -> Iterator[Cloud]:
     with opened(path) as reader:
-        for _, chunk in points_and_clouds(reader, path):
+        for _, chunk in points_and_clouds(reader, path, withheld=False):
             yield chunk
 
 
-def points_and_clouds(reader: laspy.LasReader, path: Path) -> Iterator[tuple[laspy.ScaleAwarePointRecord, Cloud]]:
+def points_and_clouds(
+    reader: laspy.LasReader, path: Path, *, withheld: bool
+) -> Iterator[tuple[laspy.ScaleAwarePointRecord, Cloud]]:
     """Part by part, the points of `path`, open, as they stand in it and as a cloud in its own coordinates.
 
-    Raises as `raw_chunks`, and InputError for points that lie or are timed where none can be.
+    With those that are `withheld`, or without. Raises as `raw_chunks`, and InputError for points that lie or are timed
+    where none can be, if they are not withheld.
     """
     strips = StripNumbers()
     low, high = np.asarray(reader.header.mins), np.asarray(reader.header.maxs)
     # Headers are rounded in their own ways.
     slack = 2 * np.asarray(reader.header.scales) + 1e-6 * (high - low)
     has_time = "gps_time" in reader.header.point_format.dimension_names
-    for points in raw_chunks(reader, path):
+    for every in raw_chunks(reader, path):
+        with _damage(path):
+            kept = ~np.asarray(every.withheld, bool)
+        points = every if withheld or kept.all() else every[kept]
+        used = kept if withheld else np.ones(len(points), bool)
         xyz = coordinates(points)
-        outside = ~((xyz >= low - slack) & (xyz <= high + slack)).all(axis=1)
+        outside = used & ~((xyz >= low - slack) & (xyz <= high + slack)).all(axis=1)
         if outside.any():
             at = ", ".join(f"{value:.2f}" for value in xyz[outside][0])
             raise InputError(
@@ -157,8 +163,8 @@ def points_and_clouds(reader: laspy.LasReader, path: Path) -> Iterator[tuple[las
                 "file anew from its source, or have its header mended (lasinfo -repair)"
             )
         time = np.array(points.gps_time, float) if has_time else None
-        if time is not None and not np.isfinite(time).all():
-            at = ", ".join(f"{value:.2f}" for value in xyz[~np.isfinite(time)][0])
+        if time is not None and not np.isfinite(time[used]).all():
+            at = ", ".join(f"{value:.2f}" for value in xyz[used & ~np.isfinite(time)][0])
             raise InputError(
                 f"{path.name} is damaged: the time of the point ({at}) is no finite number; copy the file anew "
                 "from its source, or set that time"
@@ -169,6 +175,7 @@ def points_and_clouds(reader: laspy.LasReader, path: Path) -> Iterator[tuple[las
             returns=np.stack([points.return_number, points.number_of_returns], axis=1).astype(np.uint8),
             time=time,
             strip=strips.of(np.asarray(points.point_source_id)),
+            withheld=~kept if withheld else None,
             strips=strips.names,
         )
         yield points, cloud

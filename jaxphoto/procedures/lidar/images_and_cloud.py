@@ -28,13 +28,13 @@ from jaxphoto.lidar import Grid, HeightSettings, index_cloud, nearest
 from jaxphoto.lidar.correction import (
     ScannerPath,
     ScannerPoses,
-    check_covered,
     correct_cloud,
     correct_trajectory,
     corrected_xyz,
     scanner_path,
     scanner_poses,
 )
+from jaxphoto.lidar.coverage import check_covered
 from jaxphoto.lidar.heights import Method
 from jaxphoto.lidar.tangent_planes import TangentPlanes, tangent_planes
 from jaxphoto.observations import SurfaceRows
@@ -136,7 +136,7 @@ def simultaneous(
         )
     check_without_surfaces(block)
     if timed:
-        check_covered(trajectory, cloud.time)  # type: ignore[arg-type]
+        check_covered(cloud, trajectory)  # type: ignore[arg-type]
     which = tie_points(block, points)
     first = with_interior_held(block)
     path = scanner_path(trajectory) if timed else None  # type: ignore[arg-type]

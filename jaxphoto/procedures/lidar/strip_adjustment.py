@@ -18,7 +18,8 @@ from jaxphoto.block import empty_block
 from jaxphoto.cloud import Cloud
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import StripErrors, StripSpline, Trajectory
-from jaxphoto.lidar.correction import check_covered, scanner_path
+from jaxphoto.lidar.correction import scanner_path
+from jaxphoto.lidar.coverage import check_covered
 from jaxphoto.lidar.strip_correction import correct_flight, times_of
 from jaxphoto.lidar.strip_settings import StripSettings
 from jaxphoto.observations import StripPoints
@@ -246,7 +247,7 @@ def _check(cloud: Cloud, trajectory: Trajectory | None, held: Collection[str], s
             "times, or leave the trajectory out, for a shift of each strip"
         )
     if trajectory is not None:
-        check_covered(trajectory, cloud.time)  # type: ignore[arg-type]
+        check_covered(cloud, trajectory)
     return names
 
 

@@ -1,0 +1,52 @@
+"""What the numbers of two clocks look like, and by how much one must be shifted to fit the other."""
+
+import math
+from itertools import product
+
+import numpy as np
+from jaxtyping import Float
+
+DAY, WEEK = 86_400, 604_800
+# GPS minus UTC since 1999; 18 s since 2017.
+LEAP_SECONDS = (18, 17, 16, 15, 14, 13)
+LAS_OFFSET = 1e9
+"""What LAS files take off full GPS time (s)."""
+_OF_LAS = "full GPS time less 1e9 s, as in LAS files"
+
+
+def looks_like(times: Float[np.ndarray, "n"], origin: str = "the first exposure") -> str:
+    """In words, what seconds of this size usually count from; small ones perhaps from `origin`."""
+    first, last = float(np.min(times)), float(np.max(times))
+    return f"{first:.3f} to {last:.3f} s ({_kind(first, last, origin)})"
+
+
+def shift_that_fits(times: Float[np.ndarray, "n"], start: float, end: float) -> float | None:
+    """The shift between two common clocks (s) that brings all `times` into [start, end], None if there is none.
+
+    Tried are whole days (seconds of day, of week, full GPS time), the 1e9 s that LAS takes off, and leap seconds;
+    else the only whole second that fits is taken, if no others do.
+    """
+    first, last = float(np.min(times)), float(np.max(times))
+    middle = (start + end) / 2 - (first + last) / 2
+    # What the numbers look like goes first: within a long flight other differences fit as well.
+    likely = LAS_OFFSET * ((_kind(first, last) == _OF_LAS) - (_kind(start, end) == _OF_LAS))
+    bases = dict.fromkeys((likely, 0.0, LAS_OFFSET, -LAS_OFFSET))
+    for base, leap in product(bases, (0, *LEAP_SECONDS, *(-s for s in LEAP_SECONDS))):
+        offset = base + leap
+        shift = offset + DAY * round((middle - offset) / DAY)
+        if shift and start <= first + shift and last + shift <= end:
+            return float(shift)
+    least, most = start - first, end - last
+    whole = math.ceil(least)
+    return float(whole) if whole and whole <= most < whole + 1 and least > whole - 1 else None
+
+
+def _kind(first: float, last: float, origin: str = "") -> str:
+    if first >= 0 and last <= DAY:
+        return f"seconds of a day, or from {origin}" if first < 600 else "seconds of a day"
+    if first >= 0 and last <= 2 * WEEK:
+        return "seconds of a GPS week"
+    if first >= 6e8:
+        return "full GPS or Unix time"
+    # Below zero before September 2011.
+    return _OF_LAS if abs(first) > 2 * WEEK else "seconds from some event"
