@@ -9,7 +9,9 @@ from jaxphoto.cloud import Cloud
 from jaxphoto.errors import BlockError, InputError, JaxphotoError
 from jaxphoto.georeferencing import Trajectory, covered
 from jaxphoto.georeferencing.time_scales import shift_that_fits
+from jaxphoto.lidar.correction import scanner_path
 from jaxphoto.lidar.coverage import CoveredTimes, check_covered, longest_interval
+from jaxphoto.procedures.lidar.scanner_checks import check_measured_from
 
 WEEK, DAY = 604_800.0, 86_400.0
 
@@ -17,8 +19,9 @@ WEEK, DAY = 604_800.0, 86_400.0
 def flown(time: np.ndarray, moved: np.ndarray | None = None) -> Trajectory:
     """At 60 m/s along X; `moved` (s) says where, if not where it should be at `time`."""
     along = 60.0 * (time if moved is None else moved)
-    position, level = np.stack([along, 0 * time, 500 + 0 * time], axis=1), np.tile([1.0, 0, 0, 0], (len(time), 1))
-    return Trajectory(time, position, level, np.zeros_like(position), np.zeros_like(position))
+    position = np.stack([along, 0 * time, 500 + 0 * time], axis=1)
+    eastwards = np.tile(np.sqrt([0.5, 0, 0, 0.5]) * [1, 1, 1, -1], (len(time), 1))
+    return Trajectory(time, position, eastwards, np.zeros_like(position), np.zeros_like(position))
 
 
 def scanned(*strips: tuple[float, float], names: tuple[str, ...] = ()) -> Cloud:
@@ -146,3 +149,17 @@ def test_parts_say_what_the_whole_says():
     with pytest.raises(BlockError) as caught:
         parts.check()
     assert str(caught.value) == said(CLOUD, path)
+
+
+@pytest.mark.parametrize("late", [18.0, -18.0, 5.0, 0.0])
+def test_leap_seconds_inside_the_trajectory_are_found_by_where_the_points_lie(late):
+    """Lines across the track, 300 m to either side, of a cloud whose clock is `late`."""
+    time = np.linspace(20.0, 80.0, 5000)
+    across = 300 * np.sin(40 * time)
+    cloud = Cloud(np.stack([60 * (time + late), across, 0 * time], axis=1), time=time)
+    path = scanner_path(flown(TIME))
+    if abs(late) != 18:
+        check_measured_from(cloud, path)
+        return
+    with pytest.raises(BlockError, match=rf"at \{late:+.0f} s, .*--trajectory-shift-s that is greater by {late:.0f} "):
+        check_measured_from(cloud, path)

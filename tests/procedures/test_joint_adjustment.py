@@ -12,6 +12,7 @@ from jaxphoto.adjustment import Outcome
 from jaxphoto.camera import get_parameter
 from jaxphoto.observations import Attitudes, StationRows
 from jaxphoto.procedures.lidar import adjust_strips
+from jaxphoto.procedures.lidar.photographs import check_photographs
 from jaxphoto.report.maps import png_of
 from jaxphoto.report.strip_figures import scanner_correlation_figure, trajectory_errors_figure
 from jaxphoto.report.strips import all_correlations, errors_along
@@ -252,7 +253,14 @@ def test_what_cannot_be_adjusted_together():
     refused(InputError, "joined by the trajectory on which both were measured", trajectory=None)
     untimed = np.where(np.arange(len(taken.time)) == 3, np.nan, taken.time)
     refused(InputError, "image A_04 has no time_s", taken._replace(time=untimed))
-    refused(BlockError, "image A_01 was exposed at .* the trajectory goes from", taken._replace(time=taken.time - 60.0))
+    gone = "image A_01 was exposed at .* where the trajectory has no records"
+    refused(BlockError, gone, taken._replace(time=taken.time - 60.0))
+    other = gone + r".*seconds of a GPS week.*or the exposures -172800 s later, which brings all"
+    refused(BlockError, other, taken._replace(time=taken.time + 172_800.0))
+    kept = np.abs(np.asarray(flight.trajectory.time) - taken.time[0]) > 0.2
+    cut = dataclasses.replace(flight.trajectory, **{f: v[kept] for f, v in vars(flight.trajectory).items()})
+    with pytest.raises(BlockError, match=r"image A_01 was exposed at .* in a gap of the trajectory from"):
+        check_photographs(taken, cut)
     bare = dataclasses.replace(taken.block, stations=StationRows.none(), attitudes=Attitudes.none())
     refused(InputError, "the block has no stations", taken._replace(block=bare))
     late = taken.time + np.where(taken.time > 0, -1.0, 1.0)

@@ -10,7 +10,9 @@ from jaxtyping import Float, Int
 from jaxphoto.block import Block
 from jaxphoto.errors import BlockError, InputError
 from jaxphoto.georeferencing import StripSpline, Trajectory
+from jaxphoto.georeferencing.time_scales import looks_like, shift_that_fits
 from jaxphoto.lidar.correction import scanner_path, scanner_poses
+from jaxphoto.lidar.coverage import CoveredTimes
 from jaxphoto.lidar.strip_settings import StripSettings
 from jaxphoto.observations import Attitudes, StationRows, TrajectoryAttitudes, TrajectoryStations
 from jaxphoto.procedures.lidar.until_still import check_without_surfaces
@@ -51,10 +53,20 @@ def check_photographs(photographs: Photographs, trajectory: Trajectory | None) -
     known = np.asarray(trajectory.time)
     outside = np.flatnonzero((time < known[0]) | (time > known[-1]))
     if len(outside):
+        shift = shift_that_fits(time, known[0], known[-1])
+        on_its_clock = "on its clock (--exposure-shift-s)"
+        if shift is not None:
+            on_its_clock = f"{shift:+.15g} s later, which brings all of them into it (--exposure-shift-s)"
         raise BlockError(
-            f"image {block.images[outside[0]]} was exposed at {time[outside[0]]:.3f} s, and the trajectory goes from "
-            f"{known[0]:.3f} to {known[-1]:.3f} s: give the trajectory of the whole flight, or the exposures on its "
-            "clock (--exposure-shift-s)"
+            f"image {block.images[outside[0]]} was exposed at {time[outside[0]]:.3f} s, where the trajectory has no "
+            f"records: the exposures are at {looks_like(time)}, the trajectory at {looks_like(known)}; give the "
+            f"trajectory of the whole flight, or the exposures {on_its_clock}"
+        )
+    for k in np.flatnonzero(~CoveredTimes(trajectory).covers(time)):
+        before, after = known[known <= time[k]][-1], known[known >= time[k]][0]
+        raise BlockError(
+            f"image {block.images[k]} was exposed at {time[k]:.3f} s, in a gap of the trajectory from {before:.3f} to "
+            f"{after:.3f} s: give the trajectory with the records of this time, or the block without this image"
         )
     rows = block.stations
     at = scanner_poses(scanner_path(trajectory), time[rows.who]).position

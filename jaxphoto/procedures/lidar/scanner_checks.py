@@ -4,6 +4,7 @@ Seen from the body of the aircraft, a scanner's points lie in the same place all
 of another system, in feet, on another clock or with another yaw do not, and what is adjusted with them means nothing.
 """
 
+import dataclasses
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +13,9 @@ from jaxtyping import Float, Int
 from jaxphoto.cloud import Cloud
 from jaxphoto.errors import BlockError
 from jaxphoto.georeferencing import Pattern, Trajectory
+from jaxphoto.georeferencing.time_scales import LEAP_SECONDS
 from jaxphoto.lidar.correction import ScannerPath, scanner_poses
+from jaxphoto.lidar.coverage import CoveredTimes, longest_interval
 from jaxphoto.procedures.lidar.looks import aside
 
 # No airborne laser scanner measures farther (m).
@@ -31,8 +34,9 @@ _FOLLOWS, _ELSEWHERE = 0.8, 0.7
 _SLOW = 1.0
 # A jump is that long at least, and so many times what records usually are off.
 _JUMP_M, _TIMES = 0.3, 20.0
-# From so many times the usual interval on.
-_GAP = 2.5
+# No scanner looks as far ahead as this tangent with most of its returns; a leap that brings them under the trajectory
+# leaves this part of it. So many of them are looked at.
+_OBLIQUE, _UNDER, _SOME = 0.8, 0.25, 1000
 
 
 class _Seen(NamedTuple):
@@ -56,6 +60,7 @@ def check_measured_from(cloud: Cloud, path: ScannerPath) -> list[str]:
             f"the laser points lie {np.median(away) / 1000:.0f} km from where the trajectory says that the scanner "
             "was: bring cloud and trajectory into one coordinate system, in metres, and onto one clock"
         )
+    _check_leap_seconds(cloud, path)
     odd = [*_odd_yaw(path.trajectory), *_jumps(path.trajectory)]
     seen = _seen(cloud, path)
     if seen is None:
@@ -97,6 +102,34 @@ def check_pattern(cloud: Cloud, path: ScannerPath, pattern: Pattern) -> None:
         )
 
 
+def _check_leap_seconds(cloud: Cloud, path: ScannerPath) -> None:
+    """Raise BlockError where the returns lie under the trajectory of some leap seconds before or after, and not under
+    it at their own times."""
+    some = cloud.take(np.linspace(0, len(cloud) - 1, _SOME).astype(int))
+    own = np.asarray(some.time)
+    covered = CoveredTimes(path.trajectory)
+
+    def ahead(shift: float) -> float:
+        """Median tangent of the angle ahead or behind; infinite where the trajectory has few of the shifted times."""
+        time = own + shift
+        known = np.flatnonzero(covered.covers(time))
+        if len(known) < _SOME / 2:
+            return np.inf
+        return float(np.median(np.abs(aside(dataclasses.replace(some, time=time), known, path)[:, 1])))
+
+    now = ahead(0.0)
+    if now < _OBLIQUE:
+        return
+    far = {sign * leap: ahead(sign * leap) for leap in LEAP_SECONDS for sign in (1, -1)}
+    best = min(far, key=lambda shift: far[shift])
+    if far[best] < _UNDER * now:
+        raise BlockError(
+            f"the laser points lie {np.rad2deg(np.arctan(now)):.0f} degrees ahead of the scanner or behind it at their "
+            f"times, but {np.rad2deg(np.arctan(far[best])):.0f} degrees at {best:+d} s, so one clock is UTC and the "
+            f"other GPS time: give a --trajectory-shift-s that is greater by {best} (0 where none is given)"
+        )
+
+
 def _odd_yaw(trajectory: Trajectory) -> list[str]:
     """Raise BlockError for angles in radians; a sentence where the body flies to another side than ahead."""
     step = np.diff(np.asarray(trajectory.position), axis=0)[:, :2]
@@ -128,7 +161,7 @@ def _jumps(trajectory: Trajectory) -> list[str]:
     # Beside what the steps before and after let expect.
     off = np.linalg.norm((speed[1:-1] - (speed[:-2] + speed[2:]) / 2) * between[1:-1], axis=1)
     # Over a gap, as of the turn from strip to strip, nothing is expected.
-    gap = between[:, 0] > _GAP * np.median(between)
+    gap = between[:, 0] > longest_interval(trajectory)
     off[gap[1:-1] | gap[:-2] | gap[2:]] = 0.0
     k = int(np.argmax(off))
     if off[k] < max(_JUMP_M, _TIMES * float(np.median(off))):
