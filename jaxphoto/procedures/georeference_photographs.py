@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 from jaxphoto.block import Block, Datum, Frame
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing.camera_attitude import CameraAttitude
+from jaxphoto.georeferencing.datum_change import datum_change
 from jaxphoto.georeferencing.gps import Gps
 from jaxphoto.georeferencing.map_frame import MapFrame, map_name
 from jaxphoto.observations import StationRows
@@ -64,7 +65,8 @@ def georeference_photographs(
 
     `vertical` is the EPSG code of the heights that the block is to have in files; None: above the ellipsoid.
 
-    The stations' standard deviations are those of the file, else `SIGMA_M`. Heights are taken as the files have them.
+    The positions are brought from WGS 84 to the datum of the system, heights above the ellipsoid as well; other heights
+    are taken as the files have them. The stations' standard deviations are those of the file, else `SIGMA_M`.
     Where `attitudes` tell the turn better than the positions do, as of a single strip, they are observed as well.
 
     Raises InputError where fewer than three positions agree, or all lie on a line that no attitudes turn, and for
@@ -77,10 +79,15 @@ def georeference_photographs(
             f"{len(known)} of {len(block.images)} photographs have a position with a height in their files; three tell "
             "place, scale and attitude of a block, and two where they have attitudes as well"
         )
-    places = np.array([(g.longitude_deg, g.latitude_deg, g.altitude_m) for g in known.values()], float)
+    received = np.array([(g.longitude_deg, g.latitude_deg, g.altitude_m) for g in known.values()], float)
+    longitude, latitude, _ = np.median(received, axis=0).tolist()
+    code = utm_of(round(longitude, 4), round(latitude, 4)) if code is None else code
+    change = datum_change(code, longitude, latitude)
+    # Heights of a geoid, of take-off or of nobody knows what do not change with the ellipsoid.
+    ellipsoidal = np.array([g.heights == "ellipsoid" for g in known.values()])
+    places = change.places(received, ellipsoidal)
     middle = np.median(places, axis=0)
     origin = (round(float(middle[0]), 4), round(float(middle[1]), 4), 0.0)
-    code = utm_of(*origin[:2]) if code is None else code
     frame = MapFrame(code, vertical, origin)
     here = frame.local_from_place(places)
     image = np.array([block.images.index(name) for name in known])
@@ -109,6 +116,7 @@ def georeference_photographs(
         placed = with_attitudes(placed, helping)
     offsets = here - similarity.of(there)
     said = (
+        *change.sentences(received, ellipsoidal),
         *position_words(map_name(code, vertical), block.images, known, offsets, used, sigma),
         *attitude_words(recorded, helping is not None, similarity.turn),
     )

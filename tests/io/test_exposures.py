@@ -3,6 +3,7 @@
 from datetime import datetime, timedelta
 
 import numpy as np
+import pyproj
 import pytest
 from PIL import Image
 from pyproj import CRS
@@ -386,6 +387,16 @@ def test_rows_that_are_switched_off_are_left_out(tmp_path):
     found = read_table(written(tmp_path / "a.txt", text.replace("0002.JPG,1", "0002.JPG,0")))
     assert found.names == ("DJI_0001", "DJI_0003", "DJI_0004", "DJI_0005", "DJI_0006")
     assert same(found.gps(1), FLIGHT.camera[2])
+
+
+def test_a_table_on_a_national_datum_is_brought_to_that_of_receivers(tmp_path):
+    file = written(tmp_path / "t.csv", "image,X_m,Y_m,Z_m\na,527000.25,352000.75,400.5\n")
+    found = read_table(file, 31287, "ellipsoid")
+    space = pyproj.Transformer.from_crs(pyproj.CRS(31287).to_3d(), 4979, always_xy=True)
+    np.testing.assert_allclose(
+        (found.place[0] - space.transform(527000.25, 352000.75, 400.5)) * [1e5, 1e5, 1], 0, atol=1e-4
+    )
+    assert read_table(file, 31287).place[0, 2] == 400.5
 
 
 def test_a_folder_of_pictures_and_all_that_lies_in_it(tmp_path):

@@ -4,6 +4,7 @@ import dataclasses
 
 import equinox as eqx
 import numpy as np
+import pyproj
 import pytest
 from scipy.spatial.transform import Rotation
 
@@ -60,6 +61,23 @@ def test_the_block_is_where_its_photographs_were_taken():
     assert np.abs((back - position).mean(axis=0)).max() < 1.0
     turned = np.asarray(a.unknowns.exterior.camera_from_object) @ np.swapaxes(truth.exterior.camera_from_object, 1, 2)
     assert np.degrees(np.arccos((np.trace(turned, axis1=1, axis2=2) - 1) / 2)).max() < 0.5
+
+
+def test_the_datum_of_the_map_is_that_of_its_coordinates():
+    block, truth = network()
+    positions = recorded(np.asarray(truth.exterior.position), block.images, (0.02, 0.02, 0.04))
+    wgs84 = np.array([(g.longitude_deg, g.latitude_deg, g.altitude_m) for g in positions.values()])
+    # RT90, which is 200 m from WGS 84 here.
+    space = pyproj.Transformer.from_crs(4979, pyproj.CRS(3021).to_3d(), always_xy=True)
+    for kind in ("ellipsoid", "unknown"):
+        told = {n: g._replace(heights=kind) for n, g in positions.items()}
+        found = georeference_photographs(block, told, 3021)
+        expected = np.stack(space.transform(*wgs84.T), axis=1)
+        if kind == "unknown":
+            expected[:, 2] = wgs84[:, 2]
+        stations = found.block.frame.map.map(np.asarray(found.block.stations.value).reshape(-1, 3))
+        np.testing.assert_allclose(stations, expected, rtol=0, atol=1e-4)
+        assert "from WGS 84 to the datum RT90" in found.sentences[0]
 
 
 def test_positions_that_jump_are_named_and_left_out():

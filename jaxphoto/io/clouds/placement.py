@@ -6,17 +6,13 @@ import warnings
 import numpy as np
 from jaxtyping import Float
 from pyproj import CRS, Transformer
-from pyproj.aoi import AreaOfInterest
-from pyproj.transformer import TransformerGroup
 
 from jaxphoto.block import Frame
 from jaxphoto.cloud import Cloud
 from jaxphoto.errors import InputError
+from jaxphoto.georeferencing.datum_change import ways
 from jaxphoto.georeferencing.map_frame import MapFrame, Place, map_system
 from jaxphoto.io.clouds.coordinate_system import CoordinateSystem
-
-# Half the side (degrees) of the area in which a way between two systems has to serve.
-_ABOUT = 0.1
 
 
 class Placement:
@@ -128,12 +124,7 @@ def _with_heights(frame: MapFrame, heights: int | str, name: str) -> MapFrame:
 
 def _between(source: CRS, target: CRS, place: Place, name: str) -> Transformer:
     """Plane coordinates from one system to another, by the best way about `place` that PROJ has on this computer."""
-    longitude, latitude = (place[0] + 180) % 360 - 180, place[1]
-    here = AreaOfInterest(longitude - _ABOUT, latitude - _ABOUT, longitude + _ABOUT, latitude + _ABOUT)
-    # pyproj warns of better ways whose grids are missing: said below where it matters.
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
-        group = TransformerGroup(source, target, always_xy=True, area_of_interest=here)  # type: ignore[arg-type]
+    group = ways(source, target, place[0], place[1])
     if not group.transformers:
         raise InputError(f"{name}: PROJ knows no way from {source.name} to {target.name}; convert the file")
     best = group.transformers[0]

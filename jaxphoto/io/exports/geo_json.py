@@ -8,15 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pyproj import CRS, Transformer
 
 from jaxphoto.block import Frame
 from jaxphoto.errors import InputError
-from jaxphoto.georeferencing.map_frame import map_system
+from jaxphoto.georeferencing.datum_change import wgs84_places
 from jaxphoto.io.exports.adjusted_photographs import AdjustedPhotographs
 from jaxphoto.io.exports.map_features import map_features
-
-_WGS84_3D = 4979
 
 
 def write_geo_json(photographs: AdjustedPhotographs, folder: Path) -> None:
@@ -46,7 +43,5 @@ def _feature(geometry: dict[str, Any] | None, attributes: dict[str, Any]) -> dic
 
 def _places(frame: Frame, local: np.ndarray) -> np.ndarray:
     """Longitude, latitude (degrees) and ellipsoidal height (m) on WGS 84, as PROJ knows the way from the datum."""
-    own = map_system(frame.code or 0).geodetic_crs
-    assert own is not None
-    there = Transformer.from_crs(own.to_3d(), CRS.from_epsg(_WGS84_3D), always_xy=True)
-    return np.stack(there.transform(*frame.map.place(frame.map.map(local)).T), axis=1)
+    assert frame.code is not None
+    return wgs84_places(frame.code, frame.map.place(frame.map.map(local)))

@@ -9,6 +9,7 @@ import numpy as np
 from jaxphoto.compiling import jit_quickly
 from jaxphoto.errors import InputError, quoted
 from jaxphoto.georeferencing.camera_attitude import USUAL_SIGMA_DEG, CameraAttitude, level_from_belly
+from jaxphoto.georeferencing.datum_change import wgs84_places
 from jaxphoto.georeferencing.gps import Fix, Heights
 from jaxphoto.georeferencing.map_frame import MapFrame
 from jaxphoto.io.exposures.other_tables import GEOGRAPHIC, MAP, OtherTable, read_other_table
@@ -49,7 +50,7 @@ def read_table(path: Path, code: int | None = None, heights: Heights = "unknown"
     turn = np.broadcast_to(np.eye(3), (len(place), 3, 3))
     if on_map and len(place):
         assert code is not None
-        place, grid = _from_map(table, place, code, vertical)
+        place, grid = _from_map(table, place, code, vertical, heights == "ellipsoid")
         turn = turn if read.true_north and _RPY[0] in table else grid
     check_places(path.name, table.rows, place)
     sigma = np.stack([table.sigmas(name) for name in _SIGMA_M], axis=1)
@@ -93,14 +94,17 @@ def _columns(table: Table, names: tuple[str, ...]) -> np.ndarray:
     return np.stack([table.numbers(name) for name in names], axis=1)
 
 
-def _from_map(table: Table, coordinates: np.ndarray, code: int, vertical: int | None) -> tuple[np.ndarray, np.ndarray]:
-    """Longitude, latitude, height, and the turns from axes of the map's grid to those of true north."""
+def _from_map(
+    table: Table, coordinates: np.ndarray, code: int, vertical: int | None, ellipsoidal: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """Longitude, latitude, height of WGS 84, and the turns from axes of the map's grid to those of true north."""
     place = MapFrame(code, vertical, (0.0, 0.0, 0.0)).place(coordinates)
     for k in np.flatnonzero(~np.isfinite(place).all(axis=1))[:1]:
         raise table.bad(int(k), f"the coordinates lie where EPSG:{code} does not reach; correct them or the code")
     frame = MapFrame(code, None, (*np.median(place[:, :2], axis=0).tolist(), 0.0))
     local = frame.local_from_place(place)
-    return place, np.swapaxes(frame.local_from_level(local), 1, 2) @ frame.local_from_grid(local)
+    turn = np.swapaxes(frame.local_from_level(local), 1, 2) @ frame.local_from_grid(local)
+    return wgs84_places(code, place, ellipsoidal), turn
 
 
 def _attitudes(table: Table, level_from_axes: np.ndarray):

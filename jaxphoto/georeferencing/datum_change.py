@@ -1,0 +1,136 @@
+"""Longitude, latitude and height of WGS 84, which receivers give, to the datum of a map system and back, by PROJ."""
+
+import warnings
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+from pyproj import CRS, Transformer
+from pyproj.aoi import AreaOfInterest
+from pyproj.transformer import TransformerGroup
+
+from jaxphoto.errors import InputError
+from jaxphoto.georeferencing.map_frame import map_system
+
+_WGS84_3D = 4979
+# Half the side (degrees) of the area in which a way between two systems has to serve.
+_ABOUT = 0.1
+# A way that PROJ knows no better than this is said, even where it changes nothing.
+_SURE_M = 1.0
+
+
+class DatumChange(NamedTuple):
+    """The best way that PROJ has on this computer from WGS 84 to the datum of a map system, about a place."""
+
+    transformer: Transformer
+    datum: str
+    name: str
+    """Of the operation, as EPSG has it."""
+    accuracy_m: float | None
+    """None where nobody says it."""
+    meridian_deg: float
+    """From Greenwich to where the datum counts longitudes from."""
+    better: tuple[str, float] | None
+    """The grid of a better way that is not on this computer, and the accuracy (m) of that."""
+
+    def places(
+        self, wgs84: Float[np.ndarray, "n 3"], with_height: bool | Bool[np.ndarray, "n"] = True
+    ) -> Float[np.ndarray, "n 3"]:
+        """Longitude, latitude (degrees) and height (m) on the datum of the map system.
+
+        Heights that are not above the ellipsoid (`with_height` False) stay as they are.
+        """
+        return self._changed(wgs84, with_height, "FORWARD")
+
+    def wgs84(
+        self, places: Float[np.ndarray, "n 3"], with_height: bool | Bool[np.ndarray, "n"] = True
+    ) -> Float[np.ndarray, "n 3"]:
+        """The inverse of `places`."""
+        return self._changed(places, with_height, "INVERSE")
+
+    def sentences(
+        self, wgs84: Float[np.ndarray, "n 3"], with_height: bool | Bool[np.ndarray, "n"] = True
+    ) -> tuple[str, ...]:
+        """What the change does to positions and how sure it is; none where it does nothing and is known to a metre."""
+        known = self.accuracy_m
+        if known is None:
+            return (
+                f"PROJ knows no way from WGS 84 to the datum {self.datum}: positions are taken as they are, which can "
+                "be wrong by hundreds of metres; take a map system of another datum",
+            )
+        moved = self.places(wgs84, with_height) - wgs84
+        north, east = np.deg2rad(moved[:, 1]) * 6.371e6, np.deg2rad(moved[:, 0] + self.meridian_deg) * 6.371e6
+        plan = float(np.median(np.hypot(north, east * np.cos(np.deg2rad(wgs84[:, 1])))))
+        up = float(np.median(moved[:, 2]))
+        by = f'by PROJ\'s "{self.name}", known to {known:g} m'
+        if not moved.any():
+            if known <= _SURE_M:
+                return ()
+            said = f"positions of WGS 84 are taken as of the datum {self.datum}, {by}"
+        else:
+            heights = f"{up:+.2f} m in height" if np.any(with_height) else "heights stay as they are"
+            said = f"positions are brought from WGS 84 to the datum {self.datum} {by}: {plan:.2f} m in plan, {heights}"
+        if self.better:
+            grid, accuracy = self.better
+            said += f'; {grid}, which is not on this computer, gives {accuracy:g} m ("pyproj sync --file {grid}")'
+        return (said,)
+
+    def _changed(self, values: np.ndarray, with_height: bool | np.ndarray, direction: str) -> np.ndarray:
+        x, y, z = np.asarray(values, float).T
+        found = np.stack(self.transformer.transform(x, y, z, direction=direction), axis=1)
+        found[:, 2] = np.where(with_height, found[:, 2], values[:, 2])
+        return found
+
+
+def datum_change(code: int, longitude_deg: float, latitude_deg: float) -> DatumChange:
+    """From WGS 84 to the datum of the EPSG system `code` about a place. Raises InputError where PROJ has no way."""
+    system = map_system(code)
+    geodetic = system.geodetic_crs
+    assert geodetic is not None
+    group = ways(CRS.from_epsg(_WGS84_3D), geodetic.to_3d(), longitude_deg, latitude_deg)
+    if not group.transformers:
+        raise InputError(
+            f"PROJ knows no way from WGS 84 to the datum of EPSG:{code} ({system.name}) at {longitude_deg:.3f}, "
+            f"{latitude_deg:.3f} degrees; give a map system of the place"
+        )
+    best = group.transformers[0]
+    accuracy = None if "Ballpark" in best.description or best.accuracy < 0 else float(best.accuracy)
+    better = [
+        (grid.short_name, float(operation.accuracy))
+        for operation in group.unavailable_operations
+        if operation.accuracy >= 0 and (accuracy is None or operation.accuracy < accuracy)
+        for grid in operation.grids
+        if not grid.available
+    ]
+    steps = [step for step in best.description.split(" + ") if not step.startswith("axis order change")]
+    name = " + ".join(step.removeprefix("Inverse of ") for step in steps)
+    better_one = min(better, key=lambda b: b[1], default=None)
+    return DatumChange(best, geodetic.name, name, accuracy, _meridian_deg(geodetic), better_one)
+
+
+def wgs84_places(
+    code: int, places: Float[np.ndarray, "n 3"], with_height: bool | Bool[np.ndarray, "n"] = True
+) -> Float[np.ndarray, "n 3"]:
+    """Longitude, latitude (degrees) and height (m) of WGS 84 of `places` on the datum of the EPSG system `code`.
+
+    Raises as `datum_change` does.
+    """
+    geodetic = map_system(code).geodetic_crs
+    assert geodetic is not None
+    longitude, latitude, _ = np.median(places, axis=0).tolist()
+    return datum_change(code, longitude + _meridian_deg(geodetic), latitude).wgs84(places, with_height)
+
+
+def ways(source: CRS, target: CRS, longitude_deg: float, latitude_deg: float) -> TransformerGroup:
+    """The ways of PROJ between two systems about a place, the best that this computer can go first."""
+    longitude = (longitude_deg + 180) % 360 - 180
+    here = AreaOfInterest(longitude - _ABOUT, latitude_deg - _ABOUT, longitude + _ABOUT, latitude_deg + _ABOUT)
+    # pyproj warns of better ways whose grids are missing: said where it matters.
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        return TransformerGroup(source, target, always_xy=True, area_of_interest=here)  # type: ignore[arg-type]
+
+
+def _meridian_deg(geodetic: CRS) -> float:
+    meridian = geodetic.prime_meridian
+    return 0.0 if meridian is None else float(meridian.longitude * np.rad2deg(meridian.unit_conversion_factor))
