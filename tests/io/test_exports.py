@@ -2,6 +2,7 @@
 
 import contextlib
 import csv
+import dataclasses
 import functools
 import json
 import math
@@ -426,6 +427,20 @@ def test_several_cameras(tmp_path):
     with pytest.raises(InputError, match="fisheyes beside others"):
         export(mixed, tmp_path / "mixed", "nerfstudio")
     assert not (tmp_path / "mixed").exists()
+
+
+def test_numbers_of_numpy_are_written_as_numbers(tmp_path):
+    p = photographs("brown")
+    longitude, latitude, height = map(np.float64, ORIGIN)
+    sensor = dataclasses.replace(SENSOR, pixel_mm=np.float64(SENSOR.pixel_mm))
+    p = p._replace(
+        frame=dataclasses.replace(p.frame, origin=(longitude, latitude, height)),
+        cameras={"one": ExportCamera(sensor, CAMERAS["brown"])},
+    )
+    for format in ("blocksexchange", "opensfm", "metashape", "orthority", "opk", "nerfstudio", "colmap", "geojson"):
+        export(p, tmp_path / format, format)
+    for file in (file for file in tmp_path.rglob("*.*") if file.is_file()):
+        assert "np.float" not in file.read_text(), file
 
 
 def test_what_cannot_be_exported(tmp_path):

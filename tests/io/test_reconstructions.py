@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import re
+import sys
 
 import jax
 import numpy as np
@@ -21,6 +22,7 @@ from tests.io.test_exports import CAMERAS, SENSOR, fisheye, photographs, plane
 RNG = np.random.default_rng(5)
 ROTATIONS = Rotation.from_rotvec([[3.1, 0.02, 0.1], [0.1, 3.0, 0.3], [2.2, 2.1, 0.1]])
 CENTRES = np.array([[0.5, -0.3, 8.0], [1.3, 0.4, 9.0], [-1.2, 0.1, 7.5]])
+EASTING_NORTHING = np.array([500_000.0, 5_200_000, 0])
 POINTS = RNG.uniform(-1.5, 1.5, (7, 3))
 WIDTH, HEIGHT = 640, 480
 NAMES = ["b.jpg", "a.jpg", "c.jpg"]
@@ -159,6 +161,9 @@ GROUP = """<Photogroup><Name>one</Name><ImageDimensions><Width>640</Width><Heigh
 {photos}</Photogroup>"""
 
 
+SRS = "<SpatialReferenceSystems><SRS><Id>0</Id><Definition>{}</Definition></SRS></SpatialReferenceSystems>"
+
+
 def write_blocks_exchange(folder, upwards=False, pixels_of_focal=True, system="", change=lambda text: text):
     """P1 and P2 are Agisoft's, the second and first of OpenCV's."""
     photos = ""
@@ -275,12 +280,13 @@ def test_a_camera_is_free_in_what_the_program_estimates(tmp_path, kind):
 
 
 ROUND_TRIPS = [("opensfm", "opencv"), ("opensfm", "fisheye"), ("blocksexchange", "brown")]
+PLACED = [("opensfm", "opencv", "epsg"), ("blocksexchange", "brown", "epsg")]
 
 
 @pytest.mark.filterwarnings("ignore:.*fewer than two images")
-@pytest.mark.parametrize(("format", "camera"), ROUND_TRIPS)
-def test_what_was_exported_is_read_again(tmp_path, format, camera):
-    p = photographs(camera, "local")
+@pytest.mark.parametrize(("format", "camera", "frame"), [(*each, "local") for each in ROUND_TRIPS] + PLACED)
+def test_what_was_exported_is_read_again(tmp_path, format, camera, frame):
+    p = photographs(camera, frame)
     inside = ((p.column_row > 0) & (p.column_row < [SENSOR.width_px, SENSOR.height_px])).all(axis=1)
     p = p._replace(image=p.image[inside], point=p.point[inside], column_row=p.column_row[inside])
     # Pixels have no size there.
@@ -293,10 +299,15 @@ def test_what_was_exported_is_read_again(tmp_path, format, camera):
     assert order == list(range(4))
     by_name = np.argsort(np.array(p.images, object))
     np.testing.assert_allclose(
-        block.start.unknowns.exterior.camera_from_object, p.exterior.camera_from_object[by_name], atol=1e-12
+        block.start.unknowns.exterior.camera_from_object, p.exterior.camera_from_object[by_name], atol=1e-10
     )
-    np.testing.assert_allclose(block.start.unknowns.exterior.position, p.exterior.position[by_name], atol=1e-9)
-    assert np.abs(misfits_px(block)).max() < 1e-9
+    position = np.asarray(block.start.unknowns.exterior.position)
+    if frame == "epsg":
+        # Both from the centre of the earth, and in the axes of the first.
+        (there, origin), (turn, own) = (f.map.geocentric_from_local() for f in (p.frame, block.frame))
+        position = (position @ turn.T + own - origin) @ there
+    np.testing.assert_allclose(position, p.exterior.position[by_name], atol=1e-9 if frame == "local" else 1e-6)
+    assert np.abs(misfits_px(block)).max() < (1e-9 if frame == "local" else 1e-4)
     assert float(block.start.unknowns.interior["one"].c) == pytest.approx(float(CAMERAS[camera].c) / 2.4, abs=1e-12)
 
 
@@ -304,6 +315,33 @@ def test_of_several_reconstructions_the_largest_is_read_and_told(tmp_path):
     small = lambda content: [{**content[0], "shots": dict(list(content[0]["shots"].items())[:1])}, *content]  # noqa: E731
     with pytest.warns(UserWarning, match="of 2 reconstructions the one of 3 shots is read, 4 are in all"):
         assert len(read_source(write_open_sfm(tmp_path / "in", change=small)).images) == 3
+
+
+@pytest.mark.filterwarnings("ignore:.*are not read")
+def test_blocks_exchange_on_a_map_keeps_it(tmp_path, monkeypatch):
+    here = sys.modules[__name__]
+    monkeypatch.setattr(here, "CENTRES", CENTRES + EASTING_NORTHING)
+    monkeypatch.setattr(here, "POINTS", POINTS + EASTING_NORTHING)
+    block = read_source(write_blocks_exchange(tmp_path / "in", system=SRS.format("EPSG:32633")))
+    assert block.frame.code == 32633
+    found = block.frame.map.map(np.asarray(block.start.unknowns.exterior.position))
+    np.testing.assert_allclose(found, CENTRES[[1, 0, 2]], atol=1e-6)
+    with pytest.warns(UserWarning, match="taken as Cartesian metres: 'a plane' names no coordinate system"):
+        block = read_source(write_blocks_exchange(tmp_path / "in", system=SRS.format("a plane")))
+    assert block.frame.kind == "local"
+
+
+def test_a_reconstruction_far_from_its_reference_or_without_one_stays_local(tmp_path):
+    lla = {"latitude": 0.0, "longitude": 0.0, "altitude": 0.0}
+    folder = write_open_sfm(tmp_path / "in")
+    (folder / "reference_lla.json").write_text(json.dumps(lla))
+    assert read_source(folder).frame.kind == "local"
+    (folder / "reference_lla.json").write_text(json.dumps(lla | {"latitude": 91.0}))
+    with pytest.warns(UserWarning, match="where the block lies is not read"):
+        assert read_source(folder).frame.kind == "local"
+    (folder / "reference_lla.json").write_text(json.dumps(lla | {"latitude": "x"}))
+    with pytest.raises(InputError, match="latitude"):
+        read_source(folder)
 
 
 def test_what_a_block_of_blocks_exchange_loses_is_told(tmp_path):
@@ -352,10 +390,7 @@ def _set(path, value):
 
 
 def _geographic(text):
-    system = (
-        "<SpatialReferenceSystems><SRS><Id>0</Id><Definition>EPSG:4326</Definition></SRS></SpatialReferenceSystems>"
-    )
-    return text.replace("<Block>", system + "<Block>")
+    return text.replace("<Block>", SRS.format("EPSG:4326") + "<Block>")
 
 
 def _replaced(old, new):

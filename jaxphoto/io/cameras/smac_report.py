@@ -70,7 +70,7 @@ def write_smac_report(path: Path, name: str, sensor: Sensor, interior: InteriorO
     lines = [
         "REPORT OF CALIBRATION",
         f"Camera: {name}",
-        f"Image format: {sensor.width_px} x {sensor.height_px} pixels of {sensor.pixel_mm!r} mm",
+        f"Image format: {sensor.width_px} x {sensor.height_px} pixels of {float(sensor.pixel_mm)!r} mm",
         "",
         f"I. Calibrated Focal Length: {c!r} mm",
         "",

@@ -103,10 +103,14 @@ class AdjustedPhotographs(NamedTuple):
 
         None where the frame is not that of a map, or of one with another ellipsoid.
         """
-        if self.frame.kind != "epsg" or self.frame.code is None:
+        if self.frame.kind != "epsg" or self.frame.code is None or self.frame.origin is None:
             return None
         ellipsoid = map_system(self.frame.code).ellipsoid
-        return self.frame.origin if ellipsoid is not None and ellipsoid.semi_major_metre == _WGS84_M else None
+        if ellipsoid is None or ellipsoid.semi_major_metre != _WGS84_M:
+            return None
+        # Numbers of NumPy have names in texts of other programs.
+        longitude, latitude, height = map(float, self.frame.origin)
+        return longitude, latitude, height
 
 
 def downwards(exterior: ExteriorOrientation) -> Float[np.ndarray, "n 3 3"]:

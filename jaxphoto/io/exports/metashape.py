@@ -52,7 +52,7 @@ def _add_sensor(sensors: ElementTree.Element, number: int, name: str, camera: Ex
     ElementTree.SubElement(sensor, "resolution", size)
     values = {"pixel_width": given.pixel_mm, "pixel_height": given.pixel_mm, "focal_length": float(camera.interior.c)}
     for key, value in values.items():
-        ElementTree.SubElement(sensor, "property", name=key, value=repr(value))
+        ElementTree.SubElement(sensor, "property", name=key, value=repr(float(value)))
     calibration = ElementTree.SubElement(sensor, "calibration", {"type": kind, "class": "adjusted"})
     ElementTree.SubElement(calibration, "resolution", size)
     add_values(calibration, given, camera.interior)

@@ -74,5 +74,5 @@ def _model(distortion: AbstractDistortion) -> tuple[str, tuple[str, ...]]:
 
 def _number(value: float) -> str:
     """A number that YAML 1.1 takes for one: with a point before the exponent."""
-    digits, e, exponent = repr(value).partition("e")
+    digits, e, exponent = repr(float(value)).partition("e")
     return digits + ("" if "." in digits else ".0") + e + exponent

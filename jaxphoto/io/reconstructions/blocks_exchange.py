@@ -7,12 +7,13 @@ of a free network.
     .../Photo                                   Id, ImagePath, Pose/Rotation (M_00 to M_22), Pose/Center
     Block/TiePoints/TiePoint                    Position, Measurement (PhotoId, x, y)
 
-Signs and pixels as `jaxphoto.io.exports.blocks_exchange`. Coordinates of a map are taken as they are: they are where an
-adjustment starts.
+Signs and pixels as `jaxphoto.io.exports.blocks_exchange`. The system is ENU:latitude,longitude (east, north and
+up of that place on WGS 84), an EPSG code, WKT, or a local one.
 Source: ContextCapture User Guide, "BlocksExchange XML/XMLZ format" and "Perspective camera model".
 """
 
 import io
+import re
 import warnings
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
@@ -27,9 +28,12 @@ from jaxphoto.io.block_folder import BlockTables
 from jaxphoto.io.cameras.agisoft import PLANE
 from jaxphoto.io.cameras.camera_file import CameraSource, in_pixels
 from jaxphoto.io.reconstructions.numbers import number_rows
+from jaxphoto.io.reconstructions.on_map import about_place, in_system
 from jaxphoto.io.reconstructions.tied_photographs import TiedCamera, TiedPhotographs, free_network
 from jaxphoto.io.whole_text import LARGE, read_whole
 
+_NUMBER = r"\s*([-+]?\d{1,4}(?:\.\d*)?(?:e-\d\d)?)\s*"
+_ENU = re.compile(f"ENU:{_NUMBER},{_NUMBER}(?:,{_NUMBER})?")
 _ROOT = "<BlocksExchange"
 _FIRST_PX = 0.5
 _COEFFICIENTS = ("k1", "k2", "k3", "p1", "p2")
@@ -70,7 +74,7 @@ def read_blocks_exchange(source: Path) -> BlockTables:
     if len(blocks) != 1:
         raise InputError(f"{path.name} has {len(blocks)} blocks, and one is read; export that one by itself")
     (block,) = blocks
-    _check_system(path, root, block)
+    system = _system(path, root, block)
     cameras, photos, unposed = _photogroups(path, block)
     place = {photo.number: k for k, photo in enumerate(photos)}
     if len(place) < len(photos):
@@ -84,26 +88,28 @@ def read_blocks_exchange(source: Path) -> BlockTables:
     if lost:
         warnings.warn(f"{path.name}: {' and '.join(lost)} are not read", UserWarning, stacklevel=2)
     known = [k for k, number in enumerate(ties.photo) if number in place]
-    return free_network(
-        TiedPhotographs(
-            path.name,
-            "the program",
-            (block.findtext("Name") or path.stem).strip(),
-            cameras,
-            [photo.file for photo in photos],
-            [photo.camera for photo in photos],
-            rotations,
-            number_rows(centres, (3,), here("Center")),
-            [f"t{k + 1}" for k in range(len(ties.xyz))],
-            number_rows(ties.xyz, (3,), lambda k: f"{path.name}, tie point {k + 1}"),
-            np.array([place[ties.photo[k]] for k in known], int),
-            np.array([ties.point[k] for k in known], int),
-            number_rows(
-                [ties.xy[k] for k in known], (2,), lambda k: f"{path.name}, tie point {ties.point[known[k]] + 1}"
-            )
-            + _FIRST_PX,
-        )
+    tied = TiedPhotographs(
+        path.name,
+        "the program",
+        (block.findtext("Name") or path.stem).strip(),
+        cameras,
+        [photo.file for photo in photos],
+        [photo.camera for photo in photos],
+        rotations,
+        number_rows(centres, (3,), here("Center")),
+        [f"t{k + 1}" for k in range(len(ties.xyz))],
+        number_rows(ties.xyz, (3,), lambda k: f"{path.name}, tie point {k + 1}"),
+        np.array([place[ties.photo[k]] for k in known], int),
+        np.array([ties.point[k] for k in known], int),
+        number_rows([ties.xy[k] for k in known], (2,), lambda k: f"{path.name}, tie point {ties.point[known[k]] + 1}")
+        + _FIRST_PX,
     )
+    if origin := _ENU.fullmatch(system):
+        latitude, longitude, height = (float(number or 0) for number in origin.groups())
+        tied = about_place(tied, (longitude, latitude, height))
+    elif system:
+        tied = in_system(tied, system)
+    return free_network(tied)
 
 
 def _files(source: Path) -> list[Path]:
@@ -160,12 +166,12 @@ def _parsed(path: Path) -> tuple[ElementTree.Element, _Ties]:
     return root, _Ties(xyz, photo, point, xy, control)
 
 
-def _check_system(path: Path, root: ElementTree.Element, block: ElementTree.Element) -> None:
-    """Raise InputError where positions are angles."""
+def _system(path: Path, root: ElementTree.Element, block: ElementTree.Element) -> str:
+    """The words that name the system of the block; "" for a local one. Raises InputError where positions are angles."""
     number = (block.findtext("SRSId") or "").strip()
     for system in root.iterfind("SpatialReferenceSystems/SRS"):
         words = (system.findtext("Definition") or "").strip()
-        if (system.findtext("Id") or "").strip() != number or not words or words.startswith(("ENU:", "LOCAL_CS")):
+        if (system.findtext("Id") or "").strip() != number or words.startswith("LOCAL_CS"):
             continue
         try:
             angles = CRS.from_user_input(words).is_geographic
@@ -175,6 +181,8 @@ def _check_system(path: Path, root: ElementTree.Element, block: ElementTree.Elem
             raise InputError(
                 f"{path.name}: the block is in {quoted(words)}, longitude and latitude; export it in a map system"
             )
+        return words
+    return ""
 
 
 def _photogroups(path: Path, block: ElementTree.Element) -> tuple[dict[str, TiedCamera], list[_Photo], int]:

@@ -1,5 +1,6 @@
 """Photographs oriented about the centre of the earth -> in the map system in which a block folder gives them."""
 
+import warnings
 from typing import NamedTuple
 
 import numpy as np
@@ -7,12 +8,16 @@ from jaxtyping import Float
 
 from jaxphoto.block import Frame
 from jaxphoto.errors import InputError
-from jaxphoto.georeferencing.map_frame import MapFrame, place_from_geocentric
+from jaxphoto.georeferencing.map_frame import MapFrame, Place, place_from_geocentric
+from jaxphoto.io.reconstructions.tied_photographs import TiedPhotographs
 from jaxphoto.procedures.control.system import system_of
+from jaxphoto.procedures.georeference_photographs import utm_of
 
 WGS84 = 4326
 # Distances (m) from the centre of the earth, from the poles to high above the equator: no local system reaches there.
 _EARTH_M = (6.3e6, 6.5e6)
+# No block reaches farther from the origin of its frame.
+_NEAR_M = 100e3
 
 
 class OnMap(NamedTuple):
@@ -51,6 +56,40 @@ def on_map(
     turn, moved = system.geocentric_from_local()
     local = (centres - moved) @ turn
     return OnMap(frame, system.map(local), rotations @ turn @ system.local_from_grid(local))
+
+
+def about_place(given: TiedPhotographs, place: Place) -> TiedPhotographs:
+    """Photographs east, north and up of a `place` on WGS 84 in the zone of UTM there, the frame of whose block is that.
+
+    Where they lie farther off than a block does they stay as they are, with a UserWarning.
+    """
+    far = float(np.abs(given.centres).max(initial=0.0))
+    if not (far < _NEAR_M and abs(place[0]) <= 180 and abs(place[1]) <= 90):
+        return _without_system(given, f"photographs lie {far / 1000:.0f} km from the origin that it tells")
+    try:
+        frame = Frame("epsg", utm_of(*place[:2]), None, "true", place)
+    except InputError as error:
+        return _without_system(given, str(error))
+    return given._replace(
+        frame=frame,
+        centres=frame.map.map(given.centres),
+        rotations=given.rotations @ frame.map.local_from_grid(given.centres),
+        xyz=None if given.xyz is None else frame.map.map(given.xyz),
+    )
+
+
+def in_system(given: TiedPhotographs, words: str) -> TiedPhotographs:
+    """Photographs in the system that `words` name; as they are, with a UserWarning, where these name none here."""
+    try:
+        return given._replace(frame=frame_of_words(given.file, words, given.centres))
+    except InputError as error:
+        return _without_system(given, str(error).removeprefix(f"{given.file}: "))
+
+
+def _without_system(given: TiedPhotographs, why: str) -> TiedPhotographs:
+    said = f"{given.file}: where the block lies is not read, and its coordinates are taken as Cartesian metres: {why}"
+    warnings.warn(said, UserWarning, stacklevel=4)
+    return given
 
 
 def frame_of_words(file: str, words: str, positions: Float[np.ndarray, "images 3"]) -> Frame:

@@ -2,6 +2,7 @@
 
     reconstruction.json     cameras, shots (rotation as axis times angle, translation: x_camera = R x_world + t), points
     tracks.csv              photograph, track, feature, x, y, ...; a track is a point of the same name
+    reference_lla.json      the place on WGS 84 from which the world counts east, north and up (or in the former)
 
 Image coordinates are from the middle of the format, y down, over its longer side; so are focal lengths and c_x, c_y. A
 camera `perspective` has k1 and k2, `simple_radial` k1, `radial` k1 and k2, `brown` k1 to k3, p1 and p2 of OpenCV,
@@ -19,16 +20,18 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from jaxphoto.errors import InputError, quoted
+from jaxphoto.georeferencing.map_frame import Place
 from jaxphoto.io.block_folder import BlockTables
 from jaxphoto.io.block_folder.section import Section
 from jaxphoto.io.cameras.camera_file import CameraSource, in_pixels
 from jaxphoto.io.cameras.open_cv import FISHEYE, PLANE
 from jaxphoto.io.json_file import read_any_json
 from jaxphoto.io.reconstructions.numbers import number_rows
+from jaxphoto.io.reconstructions.on_map import about_place
 from jaxphoto.io.reconstructions.tied_photographs import TiedCamera, TiedPhotographs, free_network
 from jaxphoto.io.whole_text import LARGE, read_text
 
-RECONSTRUCTION, TRACKS = "reconstruction.json", "tracks.csv"
+RECONSTRUCTION, TRACKS, REFERENCE = "reconstruction.json", "tracks.csv", "reference_lla.json"
 _VERSION = "OPENSFM_TRACKS_VERSION_"
 # Of each kind of camera: what it is here, and the coefficients it has.
 _KINDS = {
@@ -69,23 +72,37 @@ def read_open_sfm(folder: Path) -> BlockTables:
     rotations = Rotation.from_rotvec(of_shot("rotation")).as_matrix().reshape(-1, 3, 3)
     given = [point.get("coordinates") if isinstance(point, dict) else None for point in points.values()]
     image, point, column_row = _tracks(folder / TRACKS, files, ids, [cameras[name] for name in camera_of])
-    return free_network(
-        TiedPhotographs(
-            path.name,
-            "OpenSfM",
-            folder.resolve().name,
-            cameras,
-            files,
-            camera_of,
-            rotations,
-            -np.einsum("nji,nj->ni", rotations, of_shot("translation")),
-            ids,
-            number_rows(given, (3,), _place(path, ids, "coordinates")),
-            image,
-            point,
-            column_row,
-        )
+    tied = TiedPhotographs(
+        path.name,
+        "OpenSfM",
+        folder.resolve().name,
+        cameras,
+        files,
+        camera_of,
+        rotations,
+        -np.einsum("nji,nj->ni", rotations, of_shot("translation")),
+        ids,
+        number_rows(given, (3,), _place(path, ids, "coordinates")),
+        image,
+        point,
+        column_row,
     )
+    reference = _reference(folder, chosen)
+    return free_network(about_place(tied, reference) if reference else tied)
+
+
+def _reference(folder: Path, chosen: Section) -> Place | None:
+    """Where the world's origin is on WGS 84; None where nothing says it (0, 0 of a reconstruction without GPS)."""
+    path = folder / REFERENCE
+    if "reference_lla" in chosen:
+        own = chosen.section("reference_lla")
+    elif path.is_file():
+        content = read_any_json(path, LARGE)
+        own = Section(path.name, "", content if isinstance(content, dict) else {})
+    else:
+        return None
+    place = own.number("longitude"), own.number("latitude"), own.number("altitude", 0.0)
+    return place if any(place[:2]) else None
 
 
 def _place(path: Path, names: list[str], key: str):
