@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import shutil
 
 import numpy as np
 import pandas as pd
@@ -65,6 +66,20 @@ def test_inputs_are_told_by_their_hashes(results):
     told = {f.file: f.sha256 for f in read_inputs(results / "inputs.csv")}
     block = results.parent / "block"
     assert told == {p.name: hashlib.sha256(p.read_bytes()).hexdigest() for p in block.iterdir() if p.suffix != ".json"}
+
+
+def test_nothing_is_claimed_of_inputs_without_hashes(results, tmp_path, monkeypatch, capsys):
+    again = "The same inputs, options and software give the numbers"
+    assert again in certified(results, tmp_path / "a.html", monkeypatch, capsys).decode()
+    untold = tmp_path / "untold"
+    shutil.copytree(results, untold)
+    (untold / "inputs.csv").unlink()
+    page = certified(untold, tmp_path / "b.html", monkeypatch, capsys, "--last", results).decode()
+    assert again not in page and "These are not all" in page and "inputs not told" in page
+    (tmp_path / "photographs").mkdir()
+    Image.new("RGB", (32, 24)).save(tmp_path / "photographs" / "a.jpg")
+    given = ("--photographs", tmp_path / "photographs")
+    assert again not in certified(untold, tmp_path / "c.html", monkeypatch, capsys, *given).decode()
 
 
 def test_against_itself_a_camera_has_not_changed(results, tmp_path, monkeypatch, capsys):

@@ -1,9 +1,15 @@
 """`jaxphoto control`: a block folder and files of control to the block with it, tables and a verdict."""
 
+import hashlib
+import json
+
 import pandas as pd
 import pytest
 
-from jaxphoto.io import read_block, write_block
+from jaxphoto.camera.conditions import Conditions
+from jaxphoto.io import adjusted_block, read_block, write_block
+from jaxphoto.io.conditions import read_conditions, write_conditions
+from jaxphoto.io.input_hashes import read_inputs
 from tests.commands import run
 from tests.procedures.controlled import CHECK, CODE, CONTROL, marked_block
 
@@ -13,6 +19,7 @@ def written(tmp_path_factory):
     """The block, points and marks as files."""
     folder, marked = tmp_path_factory.mktemp("written"), marked_block()
     write_block(marked.block, folder / "block")
+    write_conditions([Conditions(marked.block.images[0], "a.jpg", 64 * "0", model="Model 1")], folder / "block", ())
     points, marks = marked.control
     table = pd.DataFrame(points.coordinates, columns=["X_m", "Y_m", "Z_m"])
     table.insert(0, "point", points.ids)
@@ -41,6 +48,14 @@ def test_a_block_is_adjusted_with_control(written, tmp_path, monkeypatch, capsys
     page = (out / "result" / "report.html").read_text(encoding="utf-8")
     # The camera is held: no table without rows.
     assert "Correlation of exterior" not in page
+    told = {f.file: f.sha256 for f in read_inputs(out / "result" / "inputs.csv")}
+    for file in (*(written / "block").glob("[!.]*"), written / "points.csv", written / "marks.csv"):
+        assert told[file.name] == hashlib.sha256(file.read_bytes()).hexdigest()
+    (flown,) = read_conditions(out / "result" / "conditions.csv")
+    assert flown.model == "Model 1" and (out / "block" / "conditions.csv").is_file()
+    summary = json.loads((out / "result" / "summary.json").read_text())
+    assert summary["method"]["command"] == "control" and summary["method"]["control_epsg"] == str(CODE)
+    assert adjusted_block(out / "result").images == block.images
     assert "Provenance" in page and "jaxphoto control" in page and "points.csv" in page
 
 

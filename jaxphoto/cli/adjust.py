@@ -13,10 +13,9 @@ from jaxphoto.cli.app import app
 from jaxphoto.cli.choices import one_of
 from jaxphoto.cli.console import plain_console
 from jaxphoto.cli.made import made_by
+from jaxphoto.cli.provenance import Provenance
 from jaxphoto.errors import JaxphotoError
 from jaxphoto.io import read_block, read_truth, write_block
-from jaxphoto.io.conditions import CONDITIONS, read_conditions, write_conditions
-from jaxphoto.io.input_hashes import block_inputs, write_inputs
 from jaxphoto.losses import LOSSES
 from jaxphoto.procedures import adjust_for_tables
 from jaxphoto.procedures.weights import MadeByBlunders, made_by_blunders
@@ -70,7 +69,8 @@ def adjust_command(
     began = time.perf_counter()
     with errors.status("reading the block") as status:
         read = read_block(block)
-        inputs, made = block_inputs(block), made_by(context, block)
+        options = {"rotations": rotations, "snoop": snoop, "robust": robust, "max_steps": max_steps, "weights": weights}
+        signed, made = Provenance.of_block("adjust", block, options), made_by(context, block)
         seconds = {"read": time.perf_counter() - began}
         status.update(
             f"adjusting {len(read.images)} images, {len(read.points)} points, "
@@ -97,19 +97,10 @@ def adjust_command(
         times = adjusted.seconds | seconds
         order = ("read", "compile", "solve", "covariance")
         with whole_folder(out) as work:
-            options = {
-                "rotations": rotations,
-                "snoop": snoop,
-                "robust": robust,
-                "max_steps": max_steps,
-                "weights": weights,
-            }
             of = "block" if snooped else os.path.relpath(block.resolve(), out.resolve())
-            told = {"block": of, "method": {"command": "adjust", **options}}
+            told = {"block": of, **signed.told}
             write_results(tables, verdict, work, {name: times[name] for name in order}, told, made)
-            write_inputs(inputs, work)
-            if (block / CONDITIONS).is_file():
-                write_conditions(read_conditions(block / CONDITIONS), work, read.images)
+            signed.write(read.images, work)
             for name, table in (component_tables(components) if components else {}).items():
                 table.to_csv(work / f"{name}.csv", index=False)
             if snooped:

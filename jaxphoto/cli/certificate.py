@@ -100,6 +100,7 @@ def certificate_document(
             with_exterior=_with_exterior(folder, file.name),
             conditions=conditions,
             inputs=inputs,
+            all_inputs=(folder / INPUTS).is_file(),
             last=_last(file, folder, last) if last else None,
             band=_band(halves) if halves else None,
         )

@@ -9,10 +9,12 @@ from jaxphoto.cli.app import app
 from jaxphoto.cli.console import plain_console
 from jaxphoto.cli.exposure_options import map_codes
 from jaxphoto.cli.made import made_by
+from jaxphoto.cli.provenance import Provenance
 from jaxphoto.errors import InputError
 from jaxphoto.image_measurement.control_targets import target_looker
 from jaxphoto.image_measurement.targets.on_ground import SYNTAX, read_target
-from jaxphoto.io import read_block, write_block
+from jaxphoto.io import read_block
+from jaxphoto.io.block_folder import whole_block
 from jaxphoto.io.control_files import read_control
 from jaxphoto.io.sound_photographs import sound_photographs
 from jaxphoto.procedures import adjust
@@ -62,9 +64,12 @@ def control_command(
         control, given = read_control(file, marks), read_block(block)
         status.update("adjusting the block as it is")
         oriented = at_optimum(adjust(given))
+        paths = {p.name: p.path for p in sound_photographs(photographs)[0]} if photographs else {}
+        options = {"control_epsg": control_epsg, "targets": targets, "epsg": epsg}
+        files = [file, *([marks] if marks else ())]
+        signed = Provenance.of_block("control", block, options, files, list(paths.values()))
         how: dict[str, Any] = {"system": control_epsg, "code": code, "vertical": vertical, "report": status.update}
         if target:
-            paths = {p.name: p.path for p in sound_photographs(photographs or [])[0]}
             found = control_block_with_targets(oriented, control, target_looker(target, paths, status.update), **how)
         else:
             found = control_block(oriented, control, **how)
@@ -72,13 +77,17 @@ def control_command(
         tables = Tables(found.adjusted)
         verdict = Verdict.of([*verdict_of(tables).findings, *control_findings(found)])
         status.update(f"writing {out}")
+        images = found.adjusted.block.images
         times = {name: found.adjusted.seconds[name] for name in ("compile", "solve", "covariance")}
         with whole_folder(out) as work:
             with whole_folder(work / "result") as folder:
-                write_results(tables, verdict, folder, times, made=made_by(context, block, file, marks))
+                told = {"block": "../block", **signed.told}
+                write_results(tables, verdict, folder, times, told, made_by(context, block, file, marks))
+                signed.write(images, folder)
             write_control(found, work)
             write_summary({**verdict.summary, **control_summary(found), "versions": versions()}, work)
-            write_block(found.adjusted.block, work / "block")
+            with whole_block(found.adjusted.block, work / "block") as folder:
+                signed.write(images, folder)
     for sentence in found.sentences:
         console.print(plain(sentence), soft_wrap=True)
     console.print(plain(verdict.headline), soft_wrap=True)

@@ -190,16 +190,17 @@ def fly_command(
                 camera.origin,
                 start,
                 taken,
-                signed.conditions_for(flight.parts[0]),
+                signed.conditions_for(flight.parts[0].adjusted.block.images),
                 signed.inputs,
                 signed.told,
                 datetime.date.today().isoformat(),
             )
-            verdict = write_flight(flight, reports, spoilt, work, source, signed.write)
+            sign = lambda part, folder: signed.write(part.adjusted.block.images, folder)  # noqa: E731
+            verdict = write_flight(flight, reports, spoilt, work, source, sign)
             for number, part in enumerate(flight.parts, 1):
                 with whole_block(part.adjusted.block, work / block_folder(number)) as folder:
                     write_part_orientation(part, folder)
-                    signed.write(part, folder)
+                    sign(part, folder)
             why_not = signed.certify(work)
         keep.remove()
     for number, part in enumerate(flight.parts, 1):

@@ -42,7 +42,7 @@ def certificate_of(given: Certified) -> Document:
     sha = digest_of_all(_all_inputs(given))
     model = next((f"{c.camera} {c.serial}".strip() for c in given.conditions if c.camera), "")
     title = f"Certificate of calibration: {model or camera_words(given.camera)}"
-    return Document(title, f"inputs SHA-256 {sha[:16]}", tuple(elements))
+    return Document(title, f"inputs SHA-256 {sha[:16]}" if given.all_inputs else "inputs not told", tuple(elements))
 
 
 def _statement(given: Certified) -> Iterator[Element]:
@@ -275,11 +275,18 @@ def _inputs(given: Certified) -> Iterator[Element]:
     if not files:
         yield Paragraph("Not told: the results were written without hashes of their inputs; adjust anew.")
         return
-    yield Paragraph(
-        f"SHA-256 of all {len(files)} together ({digest_of_all(files)}) is that of the lines below as sha256sum writes "
-        "them, in the order of their names. The same inputs, options and software give the numbers of this certificate "
-        "to the printed digit."
-    )
+    if not given.all_inputs:
+        yield Paragraph(
+            "These are not all: the results were written without hashes of their inputs, and nothing can be said of "
+            "whether they come again; adjust anew."
+        )
+    else:
+        again = "The same inputs, options and software give the numbers of this certificate to the printed digit."
+        yield Paragraph(
+            f"SHA-256 of all {len(files)} together ({digest_of_all(files)}) is that of the lines below as sha256sum "
+            "writes them, in the order of their names."
+            + (f" {again}" if given.summary.get("method") else " The options are not told.")
+        )
     yield Rows(
         ("file", "bytes", "SHA-256"), tuple((f.file, str(f.n_bytes) if f.n_bytes else "", f.sha256) for f in files)
     )

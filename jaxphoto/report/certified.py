@@ -55,6 +55,8 @@ class Certified(NamedTuple):
     conditions: Sequence[Conditions]
     """Of photographs, where their files were read; none otherwise."""
     inputs: Sequence[InputFile]
+    all_inputs: bool
+    """Whether the results tell all files that they were made of; the photographs alone are not all."""
     last: LastCalibration | None = None
     band: FormatBand | None = None
 

@@ -93,7 +93,7 @@ def add_values(calibration: ElementTree.Element, sensor: Sensor, interior: Inter
     values |= {key: float(getattr(d, key)) for key in _COEFFICIENTS}
     for key, number in values.items():
         if number != 0:
-            ElementTree.SubElement(calibration, key).text = repr(number)
+            ElementTree.SubElement(calibration, key).text = repr(float(number))
 
 
 def xml_text(root: ElementTree.Element) -> str:

@@ -137,7 +137,7 @@ def in_pixels(
 
 def from_centre_px(interior: InteriorOrientation, sensor: Sensor) -> tuple[float, float, float, float]:
     """fx, fy and the principal point in pixels of conventions.md: the inverse of `in_pixels`."""
-    fy = float(interior.c) / sensor.pixel_mm
+    fy = float(interior.c / sensor.pixel_mm)
     column, row = sensor.px_from_mm(np.array([[float(interior.x_p), float(interior.y_p)]]))[0]
     return fy * (1 + float(getattr(interior.distortion, "b1", 0.0))), fy, float(column), float(row)
 

@@ -70,7 +70,7 @@ def _add_camera(group: ElementTree.Element, name: str, camera: ExportCamera) -> 
     _add_texts(group, {"Name": name})
     size = {"Width": str(sensor.width_px), "Height": str(sensor.height_px)}
     _add_texts(_add(group, "ImageDimensions"), size)
-    focal = repr(float(interior.c) / sensor.pixel_mm)
+    focal = repr(float(interior.c / sensor.pixel_mm))
     kind = {"CameraModelType": "Perspective", "FocalLengthPixels": focal, "CameraOrientation": "XRightYDown"}
     _add_texts(group, kind)
     centre = sensor.px_from_mm(np.array([[float(interior.x_p), float(interior.y_p)]]))[0] - _FIRST_PX
