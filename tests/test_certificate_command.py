@@ -85,6 +85,11 @@ def test_nothing_is_claimed_of_inputs_without_hashes(results, tmp_path, monkeypa
 def test_against_itself_a_camera_has_not_changed(results, tmp_path, monkeypatch, capsys):
     page = certified(results, tmp_path / "a.html", monkeypatch, capsys, "--last", results).decode()
     assert "No earlier calibration was given" not in page
+    # The folder of a flight has them in one of its own.
+    (tmp_path / "flight").mkdir()
+    shutil.copytree(results, tmp_path / "flight" / "result")
+    again = certified(results, tmp_path / "b.html", monkeypatch, capsys, "--last", tmp_path / "flight").decode()
+    assert again == page.replace("Compared with results", "Compared with flight")
 
 
 def test_bad_input_is_one_sentence(results, tmp_path, monkeypatch, capsys):

@@ -86,6 +86,7 @@ def test_options_that_cannot_be(flown, tmp_path, monkeypatch, capsys):
     for arguments, message in (
         (["--epsg", 99], "EPSG code 99 is unknown"),
         (["--epsg", "25832+"], "--epsg is '25832+'; give the code"),
+        (["--epsg", "4326"], "(WGS 84) is longitude and latitude; give the code of a map system in metres"),
         (["--epsg", "25832+4326"], "EPSG:4326 (WGS 84) is no system of heights"),
         (["--model", "pinhole"], "--model pinhole: there are brown"),
         (["--pairs", "position:3"], "have no GPS position"),

@@ -23,7 +23,8 @@ def main() -> None:
         app(standalone_mode=True)
     except JaxphotoError as error:
         wait_if_ending()
-        typer.echo(f"jaxphoto: {error}", err=True)
+        said = "; ".join([str(error), *getattr(error, "__notes__", [])])
+        typer.echo(f"jaxphoto: {said}", err=True)
         sys.exit(2)
     except OSError as error:
         wait_if_ending()

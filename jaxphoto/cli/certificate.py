@@ -13,6 +13,7 @@ from jaxphoto.cli.console import plain_console
 from jaxphoto.cli.two_cameras import check_one_sensor
 from jaxphoto.errors import InputError
 from jaxphoto.io.cameras import CameraFile, read_camera_file
+from jaxphoto.io.cameras.own_cameras import results_in
 from jaxphoto.io.conditions import CONDITIONS, conditions_of, read_conditions
 from jaxphoto.io.input_hashes import INPUTS, read_inputs
 from jaxphoto.io.json_file import read_json
@@ -77,7 +78,7 @@ def certificate_document(
 
     Raises InputError for a folder that holds none, and for an adjustment that did not converge.
     """
-    folder = folder / "result" if (folder / "result" / "interior.csv").is_file() else folder
+    folder = results_in(folder)
     if not (folder / "interior.csv").is_file():
         raise InputError(f"{folder} holds no interior.csv: name a folder that jaxphoto adjust or fly wrote")
     file = read_camera_file(folder, camera=camera)
@@ -125,7 +126,8 @@ def _last(this: CameraFile, folder: Path, last: Path) -> LastCalibration:
         # The one camera of the other file, whatever it is called there.
         file = read_camera_file(last)
     check_one_sensor(this, file, folder, last)
-    path = next((last / name for name in _OF_CAMERA if (last / name).is_file()), last) if last.is_dir() else last
+    inside = results_in(last)
+    path = next((inside / name for name in _OF_CAMERA if (inside / name).is_file()), last) if last.is_dir() else last
     return LastCalibration(last.name, file.interior, file.covariance, input_file(path, f"last/{path.name}"))
 
 

@@ -27,7 +27,11 @@ def map_codes(text: str | None) -> tuple[int | None, int | None]:
     code, vertical = natural(plan), natural(heights)
     if code is None or (plus and vertical is None):
         raise InputError(f"--epsg is {quoted(text)}; give the code of a map system, 25832, or with heights, 25832+7837")
-    map_system(code)
+    if (system := map_system(code)).is_geographic:
+        raise InputError(
+            f"--epsg {code} ({system.name}) is longitude and latitude; give the code of a map system in metres, as "
+            "25832 is, or leave it out for the zone of UTM"
+        )
     if vertical is not None:
         check_heights(code, vertical)
     return code, vertical

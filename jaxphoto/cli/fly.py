@@ -16,7 +16,7 @@ from jaxphoto.cli.console import plain_console
 from jaxphoto.cli.exposure_options import heights_of, lever_arm_of, map_codes
 from jaxphoto.cli.progress import FEWER_PAIRS, StepsLeft
 from jaxphoto.cli.provenance import Provenance
-from jaxphoto.errors import InputError
+from jaxphoto.errors import InputError, counted
 from jaxphoto.georeferencing.geoid_heights import WGS84
 from jaxphoto.georeferencing.map_frame import check_heights
 from jaxphoto.image_measurement.control_targets import target_looker
@@ -31,7 +31,7 @@ from jaxphoto.io.exposures import exposure_files, located
 from jaxphoto.io.kept_orientation import kept_orient
 from jaxphoto.io.kept_pieces import KeptPieces, beside, check_pieces
 from jaxphoto.io.photographs import known_lens, sensor_and_interior
-from jaxphoto.io.sound_photographs import sound_photographs
+from jaxphoto.io.sound_photographs import folders_not_looked_into, sound_photographs
 from jaxphoto.procedures.calibration import distortion_model
 from jaxphoto.procedures.control.of_flight import flight_control
 from jaxphoto.procedures.flight import KnownOfFlight, MatchedPart, calibrate_flight
@@ -115,6 +115,7 @@ def fly_command(
     console, errors = plain_console(), plain_console(stderr=True)
     with errors.status("reading the photographs") as status, ExitStack() as opened:
         read, spoilt = sound_photographs(photographs)
+        spoilt |= folders_not_looked_into(photographs)
         for sentence in spoilt.values():
             errors.print(f"left out: {plain(sentence)}", soft_wrap=True)
         told = located(read, photographs, exposures or (), code=code, arm=arm, heights=above)
@@ -130,7 +131,7 @@ def fly_command(
         distortion = distortion_model(model, camera.sensor)
         compared, count = photograph_pairs(read, pairs or usual_choice(read)), features or usual_count(len(read))
         console.print(camera.origin, soft_wrap=True)
-        console.print(f"{len(read)} photographs, {_in_words(compared)}", soft_wrap=True)
+        console.print(f"{counted(len(read), 'photograph')}, {_in_words(compared)}", soft_wrap=True)
         keep = opened.enter_context(KeptPieces(beside(out)).alone())
         matched = match_photographs(
             read,
@@ -231,4 +232,4 @@ def _part(names: list[str], group: np.ndarray, own: MatchedPhotographs) -> Match
 def _in_words(compared: list[tuple[int, int]] | MostAlike) -> str:
     if isinstance(compared, MostAlike):
         return f"each to compare with the {compared.number} that look most like it"
-    return f"{len(compared)} pairs to compare"
+    return f"{counted(len(compared), 'pair')} to compare"

@@ -10,7 +10,7 @@ from jaxphoto.cli.app import app
 from jaxphoto.cli.choices import one_of
 from jaxphoto.cli.console import plain_console
 from jaxphoto.io.cameras import read_camera_file
-from jaxphoto.io.sound_photographs import sound_photographs
+from jaxphoto.io.sound_photographs import folders_not_looked_into, sound_photographs
 from jaxphoto.io.undistorted import write_undistorted
 from jaxphoto.report.terminal import plain
 from jaxphoto.writing import check_folder
@@ -40,7 +40,7 @@ def undistort_command(
             progress=lambda n, of: status.update(f"undistorting: {n} of {of}"),
         )
     left = spoilt | done.left_out
-    for sentence in left.values():
+    for sentence in (left | folders_not_looked_into(photographs)).values():
         errors.print(plain(f"left out: {sentence}"), soft_wrap=True)
     sensor, interior = done.camera
     size = f"{sensor.width_px} x {sensor.height_px} pixels"

@@ -127,6 +127,8 @@ def match_photographs(
     Raises InputError as `sift_features`, where no two photographs match, and where they fall into groups that nothing
     joins, but not `in_parts`.
     """
+    if len(photographs) < 2:
+        raise InputError("an orientation needs two photographs that overlap, or more; give them all")
     paths = [p.path for p in photographs]
     matched = _matched(paths, sensor, interior, pairs, count, longest_px, keep or _InMemory(), progress or _untold)
     blank = [len(xy) == 0 for xy in matched.xy_mm]
@@ -286,8 +288,6 @@ def _alone(names: list[str], blank: list[bool], pairs: list[PairMatches], in_par
     """Photographs that match no other one; InputError unless all others hang together, or may be `in_parts`."""
     groups = connected_images(len(names), pairs)
     joined = [group for group in groups if len(group) > 1]
-    if len(names) < 2:
-        raise InputError("an orientation needs two photographs that overlap, or more; give them all")
     if not joined:
         empty = [name for name, nothing in zip(names, blank, strict=True) if nothing]
         beside = f"; {_listed(empty)} show no features: blank or out of focus" if empty else ""

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxphoto.errors import InputError
+from jaxphoto.errors import InputError, JaxphotoError
 from jaxphoto.writing import check_room, clear_leftovers, is_place, locked, whole_file
 
 _MARKER, _SUFFIX = "kept.txt", ".piece"
@@ -66,11 +66,22 @@ class KeptPieces:
 
     @contextmanager
     def alone(self) -> Iterator["KeptPieces"]:
-        """These pieces, kept from other processes meanwhile. Raises InputError where one has them."""
+        """These pieces, kept from other processes meanwhile; without any the folder goes at the end.
+
+        Raises InputError where another process has them.
+        """
         with locked(self.folder) as own:
             if own is False:
                 raise InputError(f"another run is at work in {self.folder}: wait for it, or name another folder --out")
-            yield self
+            try:
+                yield self
+            except JaxphotoError as error:
+                if self._any():
+                    error.add_note(f"what was worked out so far stays in {self.folder} for another try")
+                raise
+            finally:
+                if self.folder.is_dir() and not self._any():
+                    self.remove()
 
     def remove(self) -> None:
         """Remove all pieces; what somebody else put beside them stays, and the folder with it."""
@@ -81,6 +92,9 @@ class KeptPieces:
             (self.folder / _MARKER).unlink(missing_ok=True)
             with contextlib.suppress(OSError):
                 self.folder.rmdir()
+
+    def _any(self) -> bool:
+        return any(self.folder.glob(f"*{_SUFFIX}"))
 
     def _path(self, name: str) -> Path:
         return self.folder / f"{name}{_SUFFIX}"

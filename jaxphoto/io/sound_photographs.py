@@ -1,17 +1,23 @@
 """Photographs of one flight: what can be used of files and folders, and why the rest cannot."""
 
 import collections
+import os
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
 from PIL import Image
 
-from jaxphoto.errors import InputError
+from jaxphoto.errors import InputError, counted, few
 from jaxphoto.io.photographs import ONE_CAMERA, Photograph, read_photograph
+from jaxphoto.writing import MARKER
 from jaxphoto.writing.inputs import input_file
 
 # Of files that are taken from a folder.
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
+# What cameras write; a folder of PNG beside photographs is seldom one of a camera.
+_OF_CAMERAS = tuple(suffix for suffix in _SUFFIXES if suffix != ".png")
+_RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".rw2", ".orf", ".raf", ".srw", ".pef")
 # A JPEG is decoded to about this size, an eighth at least, which tells as surely whether it is whole.
 _SMALL_PX = (512, 512)
 
@@ -20,9 +26,9 @@ def sound_photographs(paths: Sequence[str | Path]) -> tuple[list[Photograph], di
     """The photographs of one camera among files and folders `paths`, and why each other file is left out.
 
     Of a folder all pictures, in the order of their names. Left out, a sentence each: what is no picture or is cut off,
-    a second of the same name, one that is another's copy byte for byte (of the two that with the longer name), and
-    those of another size, orientation flag, camera or focal length than most. Raises InputError for what is neither
-    file nor folder, and where nothing is left.
+    a second of the same name, one that is another's copy byte for byte (of the two that whose name is less like those
+    of the others, then the longer one), and those of another size, orientation flag, camera or focal length than most.
+    Raises InputError for what is neither file nor folder, and where nothing is left.
     """
     files = pictures_in(paths)
     if missing := [file for file in files if not file.is_file()]:
@@ -30,6 +36,8 @@ def sound_photographs(paths: Sequence[str | Path]) -> tuple[list[Photograph], di
     left: dict[str, str] = {}
     read: dict[str, Photograph] = {}
     content: dict[str, Photograph] = {}
+    alike = collections.Counter(_series(file.stem) for file in files)
+    oddness = lambda name: (-alike[_series(name)], len(name))  # noqa: E731
     copies: dict[Path, str] = {}
     for file in files:
         try:
@@ -40,7 +48,7 @@ def sound_photographs(paths: Sequence[str | Path]) -> tuple[list[Photograph], di
             continue
         digest = input_file(file).sha256
         twin = content.get(digest)
-        if twin is not None and len(twin.name) <= len(photograph.name):
+        if twin is not None and oddness(twin.name) <= oddness(photograph.name):
             copies[file] = digest
             continue
         if photograph.name in read:
@@ -61,7 +69,7 @@ def sound_photographs(paths: Sequence[str | Path]) -> tuple[list[Photograph], di
                 left[str(p.path)] = f"{p.path}: its {what} is {own}, that of most is {usual[0][0]}"
         kept = [p for p in kept if str(p.path) not in left]
     if not kept:
-        beside = f"; {next(iter(left.values()))}" if left else ""
+        beside = f"; {next(iter(left.values()))}" if left else "".join(f"; {hint}" for hint in _hints(paths))
         raise InputError(f"{', '.join(map(str, paths))}: there is no photograph that can be read{beside}")
     return kept, left
 
@@ -69,6 +77,44 @@ def sound_photographs(paths: Sequence[str | Path]) -> tuple[list[Photograph], di
 def pictures_in(paths: Sequence[str | Path]) -> list[Path]:
     """The files among `paths`, and all pictures of folders among them, in the order of their names."""
     return [file for path in map(Path, paths) for file in (_pictures(path) if path.is_dir() else [path])]
+
+
+def folders_not_looked_into(paths: Sequence[str | Path]) -> dict[str, str]:
+    """Of folders among `paths`, the folders in them that hold pictures, a sentence each; those in `paths` are not."""
+    given = {Path(path).resolve() for path in paths}
+    found = {}
+    for folder in (Path(path) for path in paths if Path(path).is_dir()):
+        for inner, number in _with_pictures(folder):
+            if inner.resolve() not in given:
+                found[str(inner)] = f"{inner}: {counted(number, 'picture')} in a folder that is not named; name it, too"
+    return found
+
+
+def _with_pictures(folder: Path) -> list[tuple[Path, int]]:
+    """The folders in a folder that hold pictures of cameras, but for those that jaxphoto wrote, and how many."""
+    inner = sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
+    inner = [path for path in inner if os.access(path, os.R_OK | os.X_OK) and not (path / MARKER).exists()]
+    counts = ((path, sum(f.suffix.lower() in _OF_CAMERAS for f in path.iterdir())) for path in inner)
+    return [(path, number) for path, number in counts if number]
+
+
+def _hints(paths: Sequence[str | Path]) -> list[str]:
+    """What there is in folders without pictures."""
+    folders = [Path(path) for path in paths if Path(path).is_dir()]
+    inner = [str(path) for folder in folders for path, _ in _with_pictures(folder)]
+    raw = [file for folder in folders for file in folder.iterdir() if file.suffix.lower() in _RAW]
+    hints = [f"there are pictures in {few(inner)}: name these folders"] if inner else []
+    if raw:
+        hints.append(
+            f"raw files such as {raw[0].name} are not read: develop all alike to JPEG or TIFF, without a correction of "
+            "the lens"
+        )
+    return hints
+
+
+def _series(name: str) -> str:
+    """A name without its numbers: the same for DJI_0001 and DJI_0002."""
+    return re.sub(r"\d+", "#", name)
 
 
 def _pictures(folder: Path) -> list[Path]:

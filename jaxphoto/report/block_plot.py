@@ -8,6 +8,7 @@ import numpy as np
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.block import Block
+from jaxphoto.errors import counted
 from jaxphoto.report.block_places import BlockPlaces, places_of, pyramids
 from jaxphoto.report.plots import axes_or_new, panels
 from jaxphoto.report.tables import Tables
@@ -65,8 +66,8 @@ def block_words(block: Block) -> str:
     """What a picture of a block shows, for those who do not see it."""
     control, check = (len(np.unique(rows.who)) for rows in (block.control, block.check))
     return (
-        f"The block: {len(block.images)} camera stations, {len(block.points)} object points, {control} control points, "
-        f"{check} check points"
+        f"The block: {counted(len(block.images), 'camera station')}, {counted(len(block.points), 'object point')}, "
+        f"{counted(control, 'control point')}, {counted(check, 'check point')}"
     )
 
 

@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 _WIDTH, _HEIGHT, _MARGIN = 8.27, 11.69, 0.75
 _INNER = _WIDTH - 2 * _MARGIN
 _TEXT, _CELL, _SMALLEST = 8.5, 7.5, 4.5
+# Long cells go on in the next line before type is smaller than this.
+_READABLE = 7.0
 # Of a character of DejaVu Sans, in parts of the size of type: of text on average, of a table at most.
 _LETTER, _FIGURE = 0.56, 0.64
 _LABELS = {"left": 0.6, "right": 0.15, "bottom": 0.45, "top": 0.35}
@@ -116,10 +118,11 @@ def _line(text: str, size: float, bold: bool = False, above: float = 0.0, with_n
 def _table(table: Rows) -> Iterator[_Box]:
     head = any(table.columns)
     lines = [*([table.columns] if head else []), *table.rows]
-    wide = [max(len(printable(line[k])) for line in lines) + _BLANK for k in range(len(table.columns))]
+    wide = _widths([[printable(line[k]) for line in lines] for k in range(len(table.columns))])
     size = max(_SMALLEST, min(_CELL, _INNER * 72 / (_FIGURE * sum(wide))))
     place = [_MARGIN + sum(wide[:k]) * _FIGURE * size / 72 for k in range(len(wide))]
-    most = [int(max(8, (_WIDTH - _MARGIN - x) * 72 / (_FIGURE * size))) for x in place]
+    right = int(max(8, (_WIDTH - _MARGIN - place[-1]) * 72 / (_FIGURE * size)))
+    most = [*(w - _BLANK for w in wide[:-1]), right]
     for number, line in enumerate(lines):
         # What is wider than the sheet goes on in the next line.
         cells = [wrap(printable(cell), most[k]) or [""] for k, cell in enumerate(line)]
@@ -127,6 +130,18 @@ def _table(table: Rows) -> Iterator[_Box]:
             row = [cell[part] if part < len(cell) else "" for cell in cells]
             yield _row(row, place, size, bold=head and number == 0, with_next=number == 0)
     yield _Box(0.08, lambda page, top: None)
+
+
+def _widths(columns: list[list[str]]) -> list[int]:
+    """Characters for each column and the blank behind it: its longest cell, of wide tables its longest word at least."""
+    wide = [max(map(len, cells)) + _BLANK for cells in columns]
+    least = [max(len(word) for cell in cells for word in [*cell.split(), ""]) + _BLANK for cells in columns]
+    too_much = sum(wide) - int(_INNER * 72 / (_FIGURE * _READABLE))
+    for k in sorted(range(len(wide)), key=lambda k: -wide[k]):
+        cut = max(0, min(too_much, wide[k] - least[k]))
+        wide[k] -= cut
+        too_much -= cut
+    return wide
 
 
 def _row(cells: list[str], place: list[float], size: float, bold: bool, with_next: bool) -> _Box:

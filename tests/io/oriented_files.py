@@ -66,11 +66,14 @@ PATB = "{} 8800.0 0"
 
 
 def write_angles(folder, kind="epsg", change=lambda text: text, points="bingo"):
-    """exterior.txt and camera.toml as `--to opk` writes them, and image points in one of three forms."""
+    """exterior.txt and camera.toml as `--to opk` writes them, and image points in its form or one of three others."""
     p = inside("opencv", kind)
     export(p, folder, "opk")
     path = folder / "exterior.txt"
     path.write_text(change(path.read_text()))
+    if points == "own":
+        return folder
+    (folder / "image_points.csv").unlink()
     head, unit = {"bingo": (BINGO, 1.0), "patb": (PATB, 1e-3), "pix4d": ("{}", 0.0)}[points]
     (folder / "ties.dat").write_text(text_of_points(p, head, unit))
     return folder

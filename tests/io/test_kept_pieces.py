@@ -52,3 +52,13 @@ def test_folders_of_others_and_of_another_run_are_refused(tmp_path):
         pass
     with other.alone() as own:
         assert own is other
+    # None of them has a piece.
+    assert not (tmp_path / "a").exists()
+
+
+def test_what_is_left_of_a_run_that_is_refused_is_told(tmp_path):
+    pieces = KeptPieces(tmp_path / "a")
+    with pytest.raises(InputError, match="no") as refused, pieces.alone():
+        pieces.write("one", x=np.zeros(3))
+        raise InputError("no")
+    assert refused.value.__notes__ == [f"what was worked out so far stays in {tmp_path / 'a'} for another try"]

@@ -118,6 +118,7 @@ def test_a_camera_of_metashape_itself_is_where_its_receiver_was_and_looks_down(t
 
 
 TEXTS = {
+    "as --to opk writes them": lambda folder: write_angles(folder, points="own"),
     "bingo": lambda folder: write_angles(folder),
     "pixels": lambda folder: write_angles(folder, "local", points="pix4d"),
     "gon": lambda folder: write_angles(folder, change=in_gon, points="patb"),
@@ -207,6 +208,7 @@ def test_positions_and_angles_come_back(tmp_path_factory, poses):
     turn = np.stack([camera_from_object(*angles) for angles in values[:, 3:]])
     p = photographs("opencv", "local")._replace(exterior=ExteriorOrientation(values[:, :3], turn))
     export(p, folder, "opk")
+    (folder / "image_points.csv").unlink()
     rows = "".join(f"{k} {k}.5 {k}.25\n" for k in range(3))
     (folder / "ties.txt").write_text("".join(f"{name} camera\n{rows}-99\n" for name in p.images))
     table = read_text_project(folder).tables["images"]

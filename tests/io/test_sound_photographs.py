@@ -9,7 +9,7 @@ from PIL import Image
 from jaxphoto.errors import InputError
 from jaxphoto.io.photograph_metadata import drone_record, xmp_fields
 from jaxphoto.io.photographs import photographs
-from jaxphoto.io.sound_photographs import sound_photographs
+from jaxphoto.io.sound_photographs import folders_not_looked_into, sound_photographs
 
 PACKET = """<?xpacket begin="" id="W5M0MpCehiHzreSzNTczkc9d"?><x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF>
 <rdf:Description xmlns:drone-dji="http://www.dji.com/drone-dji/1.0/" drone-dji:AbsoluteAltitude="+129.52"
@@ -42,6 +42,32 @@ def test_of_several_copies_each_names_the_one_that_is_kept(folder):
     kept, left = sound_photographs([folder])
     assert [p.name for p in kept] == ["0", "1", "2", "3"]
     assert len(left) == 2 and all(why.endswith(": it is a copy of 2.jpg") for why in left.values())
+
+
+def test_of_copies_that_is_kept_whose_name_is_as_those_of_the_others(tmp_path, folder):
+    for k in range(4):
+        (folder / f"{k}.jpg").rename(folder / f"DJI_000{k}.jpg")
+    shutil.copy(folder / "DJI_0003.jpg", folder / "3d.jpg")
+    kept, left = sound_photographs([folder])
+    assert [p.name for p in kept] == [f"DJI_000{k}" for k in range(4)]
+    assert "3d.jpg: it is a copy of DJI_0003.jpg" in left[str(folder / "3d.jpg")]
+
+
+def test_folders_in_a_folder_and_raw_files_are_told(folder, tmp_path):
+    card = tmp_path / "DCIM"
+    (card / "100MEDIA").mkdir(parents=True)
+    with pytest.raises(InputError, match=r"no photograph that can be read$"):
+        sound_photographs([card])
+    (folder / "0.jpg").rename(card / "100MEDIA" / "0.jpg")
+    (card / "a.DNG").write_text("raw")
+    with pytest.raises(InputError, match=r"pictures in .*100MEDIA: name these folders; raw files such as a\.DNG"):
+        sound_photographs([card])
+    inner = card / "100MEDIA"
+    said = {str(inner): f"{inner}: 1 picture in a folder that is not named; name it, too"}
+    assert folders_not_looked_into([card]) == said
+    assert not folders_not_looked_into([card, inner])
+    (inner / ".jaxphoto.json").write_text("{}")
+    assert not folders_not_looked_into([card])
 
 
 def test_spoilt_ones_are_left_out_each_with_a_sentence(folder):

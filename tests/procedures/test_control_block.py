@@ -133,7 +133,7 @@ def test_marks_that_fit_nothing_are_why_there_is_no_control(marked):
     """Such as lists that count in shrunk copies of the photographs."""
     marks = marked.control.marks
     shrunk = marked.control._replace(marks=marks._replace(column_row=0.4 * marks.column_row))
-    with pytest.raises(InputError, match=r"control points are marked in two.*the marks of G0 in .* contradict one"):
+    with pytest.raises(InputError, match=r"control points in two.*the marks of G0 in .* contradict one"):
         found_in(marked, shrunk)
 
 
@@ -163,7 +163,7 @@ def test_marks_that_cannot_be_used_cost_a_sentence(marked):
     [
         (lambda c: with_coordinates(c, c.points.coordinates[:, [1, 0, 2]]), "with X and Y exchanged"),
         (lambda c: c._replace(points=c.points._replace(system="")), "does not say the coordinate system"),
-        (lambda c: c._replace(marks=c.marks.take(np.arange(3))), "1 control points are marked in two photographs"),
+        (lambda c: c._replace(marks=c.marks.take(np.arange(3))), "1 control point in two photographs or more"),
         (lambda c: c._replace(marks=c.marks._replace(image=("x",) * len(c.marks.image))), "no mark (x) is in"),
         (lambda c: with_coordinates(c, c.points.coordinates[[3, 0, 4, 1, 5, 2, 6, 7, 8]]), "do not fit"),
     ],

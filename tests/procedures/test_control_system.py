@@ -22,7 +22,9 @@ DEGREES = [(13.2001, 55.7002, 31.0), (13.2011, 55.7012, 33.0)]
 UTM = [(*Transformer.from_crs(4326, 32633, always_xy=True).transform(*p[:2]), p[2]) for p in DEGREES]
 
 
-@pytest.mark.parametrize("words", ["EPSG:32633", "WGS84 UTM 33N", "+proj=utm +zone=33 +datum=WGS84 +units=m +no_defs"])
+@pytest.mark.parametrize(
+    "words", ["EPSG:32633", "EPSG::32633", "WGS84 UTM 33N", "+proj=utm +zone=33 +datum=WGS84 +units=m +no_defs"]
+)
 def test_places_are_those_of_proj(words):
     np.testing.assert_allclose(places(points(UTM), system_of(words, "a"), 32633), DEGREES, atol=1e-9)
 

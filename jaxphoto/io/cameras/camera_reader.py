@@ -41,8 +41,8 @@ def read_camera_file(
 ) -> CameraFile:
     """The camera in a file of another program (docs/camera_files.md), or of jaxphoto itself.
 
-    The format is told by the content. `path` may be a folder of results, a block folder or a COLMAP model. `camera`
-    names one where there are several; `pixel_mm` is the size of a pixel and `size_px` the width and height where the
+    The format is told by the content. `path` may be a folder of results, of a flight, a block folder or a COLMAP model.
+    `camera` names one where there are several; `pixel_mm` is the size of a pixel and `size_px` the width and height where the
     file does not give them; `block` is the block of which an interior.csv is, needed where results do not say it.
 
     Raises InputError for files that are missing, cut off or of no known format, for models that are not known here and
@@ -50,6 +50,7 @@ def read_camera_file(
     """
     path = Path(path)
     if path.is_dir():
+        path = own_cameras.results_in(path)
         inside = [path / name for name in _IN_FOLDER if (path / name).is_file()]
         if not inside:
             raise InputError(f"{path} holds none of {', '.join(_IN_FOLDER)}; name the camera file")

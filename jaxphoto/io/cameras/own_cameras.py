@@ -21,9 +21,16 @@ from jaxphoto.unknowns import FIXED
 
 INTERIOR = "interior.csv"
 CAMERA = "camera.toml"
+_RESULT = "result"
 _COLUMNS = ("camera", "parameter", "value")
 _CORRELATION = ("parameter_a", "parameter_b", "rho")
 _ROUNDING = 1e-5
+
+
+def results_in(folder: Path) -> Path:
+    """The folder of results of the largest part where `folder` is that of a flight, else `folder` itself."""
+    result = folder / _RESULT
+    return result if (result / INTERIOR).is_file() and not (folder / INTERIOR).is_file() else folder
 
 
 def read_block_camera(source: CameraSource) -> CameraFile:

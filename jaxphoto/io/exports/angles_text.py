@@ -1,4 +1,4 @@
-"""Adjusted photographs -> a table of positions and omega, phi, kappa, and the cameras as block.toml has them.
+"""Adjusted photographs -> a table of positions and omega, phi, kappa, and cameras and image points as blocks have them.
 
 `camera_from_object = R3(kappa) R2(phi) R1(omega)` of docs/conventions.md, as in Inpho and Pix4D, which write the
 transpose Rx(omega) Ry(phi) Rz(kappa) from the camera to the object; the axes of the object are grid east, grid north
@@ -9,6 +9,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
+import pandas as pd
 
 from jaxphoto.arrays import still
 from jaxphoto.collinearity import ExteriorOrientation
@@ -18,11 +19,11 @@ from jaxphoto.io.exports.adjusted_photographs import AdjustedPhotographs
 from jaxphoto.io.exports.map_photographs import in_map
 from jaxphoto.unknowns import FIXED
 
-FILE, CAMERAS = "exterior.txt", "camera.toml"
+FILE, CAMERAS, IMAGE_POINTS = "exterior.txt", "camera.toml", "image_points.csv"
 
 
 def write_angles_text(photographs: AdjustedPhotographs, folder: Path) -> None:
-    """Write exterior.txt, tabs between its columns and # before its comments, and camera.toml into `folder`."""
+    """Write exterior.txt, tabs between its columns and # before its comments, camera.toml and image_points.csv."""
     p, on_map = photographs, in_map(photographs)
     place = "longitude and latitude (degrees) and height (m)" if on_map.geographic else "X Y Z (m)"
     heights = "above the ellipsoid" if p.frame.vertical is None else f"of EPSG:{p.frame.vertical}"
@@ -38,6 +39,9 @@ def write_angles_text(photographs: AdjustedPhotographs, folder: Path) -> None:
     held = {name: Camera(*c, jax.tree.map(lambda _: FIXED, c.interior)) for name, c in p.cameras.items()}
     sections = {name: camera_section(camera) for name, camera in held.items()}
     (folder / CAMERAS).write_text(toml_text({"cameras": sections}), encoding="utf-8")
+    columns = {"image": np.array(p.files, object)[p.image], "point": np.array(p.points, object)[p.point]}
+    columns |= {"column_px": p.column_row[:, 0], "row_px": p.column_row[:, 1]}
+    pd.DataFrame(columns).to_csv(folder / IMAGE_POINTS, index=False)
 
 
 def angles_deg(exterior: ExteriorOrientation) -> np.ndarray:

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.block import Block, Start
-from jaxphoto.errors import DatumError, InputError, few
+from jaxphoto.errors import DatumError, InputError, counted, few
 from jaxphoto.procedures.adjust import adjust_for_tables
 from jaxphoto.procedures.control.intersected import intersected
 from jaxphoto.procedures.control.into_block import into_block, with_gnss_bias, without_names
@@ -154,7 +154,7 @@ def _placed(block: Block, frame: InFrame, met, covariance, sigma, points: Survey
     known = np.flatnonzero(np.isfinite(met).all(axis=1) & ~points.check & whole)
     agree = np.ones(len(met), bool)
     if frame.at_place and len(known) < LEAST:
-        text = f"{len(known)} control points are marked in two photographs or more: the block stays at its positions"
+        text = f"{counted(len(known), 'control point')} in two photographs or more: the block stays at its positions"
         return block, met, agree, sigma, [text]
     spread = np.sqrt(np.trace(covariance[known], axis1=1, axis2=2))
     assumed, surveyed = np.isnan(points.sigma_m[known]).any(axis=1), np.linalg.norm(sigma[known], axis=1)
@@ -166,7 +166,7 @@ def _placed(block: Block, frame: InFrame, met, covariance, sigma, points: Survey
     if onto.scatter_m is not None:
         sigma = np.where(np.isnan(points.sigma_m), onto.scatter_m, sigma)
     agree[known] = onto.agree
-    said = [f"{int(onto.agree.sum())} of {len(known)} control points bring the block to their frame"]
+    said = [f"{int(onto.agree.sum())} of {counted(len(known), 'control point')} bring the block to their frame"]
     if frame.at_place:
         off = np.median((frame.xyz - met)[known[onto.agree]], axis=0)
         told = ", ".join(f"{v:.2f}" for v in off)

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxphoto.errors import InputError
+from jaxphoto.errors import InputError, counted
 from jaxphoto.procedures.orientation.onto_known import Similarity, similarity_between
 
 _SAMPLES = 300
@@ -58,8 +58,8 @@ def onto_control(
     """
     if len(here) < LEAST:
         raise InputError(
-            f"{file}: {len(here)} control points are marked in two photographs or more; three tell place, scale and "
-            "attitude of a block"
+            f"{file}: {counted(len(here), 'control point')} in two photographs or more, where three tell place, scale "
+            "and attitude of a block; mark more"
         )
     best = _best(there, here, sigma_m)
     if best is None:

@@ -22,7 +22,7 @@ from jaxphoto.georeferencing.map_frame import MapFrame, map_name, map_system
 from jaxphoto.procedures.control.surveyed import SurveyedPoints
 
 LOCAL = "local"
-_CODES = re.compile(r"(?:EPSG:)?\s*(\d{1,6})(?:\s*\+\s*(?:EPSG:)?(\d{1,6}))?\s*(?:[<#].*)?", re.IGNORECASE)
+_CODES = re.compile(r"(?:EPSG::?)?\s*(\d{1,6})(?:\s*\+\s*(?:EPSG::?)?(\d{1,6}))?\s*(?:[<#].*)?", re.IGNORECASE)
 _UTM = re.compile(r"WGS\s?84\s+UTM\s+(\d{1,2})\s*([NS])", re.IGNORECASE)
 _WKT = re.compile(r"\s*(GEOGCS|PROJCS|COMPD_CS|GEOGCRS|GEODCRS|PROJCRS|COMPOUNDCRS|GEOCCS)\[")
 # Those that read no files.
