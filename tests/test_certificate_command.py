@@ -62,6 +62,18 @@ def test_it_says_what_the_results_say(results, tmp_path, monkeypatch, capsys):
         assert heading in page
 
 
+def test_the_readout_of_a_rolling_shutter_is_in_the_interior_orientation(results, tmp_path, monkeypatch, capsys):
+    own = tmp_path / "own"
+    shutil.copytree(results, own)
+    summary = json.loads((own / "summary.json").read_text())
+    (camera,) = set(pd.read_csv(own / "interior.csv").camera)
+    told = {"georeferencing": {f"shutters[{camera}].readout_ms": {"value": -30.21, "sigma": 0.52}}}
+    (own / "summary.json").write_text(json.dumps(summary | told))
+    page = certified(own, tmp_path / "a.html", monkeypatch, capsys).decode()
+    assert page.index("readout_ms") < page.index("<h2>Distortion" if "<h2>Distortion" in page else "Distortion</h2>")
+    assert "-30.21" in page
+
+
 def test_inputs_are_told_by_their_hashes(results):
     told = {f.file: f.sha256 for f in read_inputs(results / "inputs.csv")}
     block = results.parent / "block"

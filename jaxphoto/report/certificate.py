@@ -21,6 +21,7 @@ from jaxphoto.report.digits import with_sigma
 from jaxphoto.report.document import Document, DocumentPicture, Element, Heading, Paragraph, Pictures, Rows
 from jaxphoto.report.findings import as_sentence
 from jaxphoto.report.made import option_word
+from jaxphoto.report.rolling_shutter import readout_of
 from jaxphoto.stability import LEVEL, NORMAL_95, Method, change, distortion_curve, format_sigma, image_grid
 from jaxphoto.statistics.correlation import high_pairs
 from jaxphoto.writing.inputs import digest_of_all
@@ -122,6 +123,10 @@ def _interior(given: Certified) -> Iterator[Element]:
     rows += [
         (n, f"{float(get_parameter(given.interior, n)):.8g}", "constant", "") for n in constant_names(given.interior)
     ]
+    readout = dict(given.summary.get("georeferencing", {})).get(readout_of(given.camera), {})
+    value, sigma = readout.get("value"), readout.get("sigma")
+    if isinstance(value, int | float) and isinstance(sigma, int | float):
+        rows.append(("readout_ms", with_sigma(value, sigma), f"{sigma:.2g}", ""))
     yield Rows(("parameter", "value", "sigma", "in pixels: value, sigma"), tuple(rows))
     yield Paragraph(
         "c, x_p, y_p in mm, x to the right and y up from the centre of the format; coefficients in powers of mm or as "

@@ -133,7 +133,7 @@ def _table(table: Rows) -> Iterator[_Box]:
 
 
 def _widths(columns: list[list[str]]) -> list[int]:
-    """Characters for each column and the blank behind it: its longest cell, of wide tables its longest word at least."""
+    """Characters for each column and the blank behind it: its longest cell, or in wide tables its longest word."""
     wide = [max(map(len, cells)) + _BLANK for cells in columns]
     least = [max(len(word) for cell in cells for word in [*cell.split(), ""]) + _BLANK for cells in columns]
     too_much = sum(wide) - int(_INNER * 72 / (_FIGURE * _READABLE))

@@ -8,7 +8,12 @@ from jaxphoto.report.findings import Finding, Level
 from jaxphoto.report.tables import Tables
 
 # Of its standard deviation: a smaller readout is none that is seen.
-_SEEN = 3.0
+SEEN = 3.0
+
+
+def readout_of(camera: str) -> str:
+    """What the readout of a camera is called among the parameters of mounts and strips."""
+    return f"{RollingShutter.kind}[{camera}].readout_ms"
 
 
 def shutter_findings(tables: Tables) -> Iterator[Finding]:
@@ -18,6 +23,6 @@ def shutter_findings(tables: Tables) -> Iterator[Finding]:
         camera = label.split("[", 1)[1].rsplit("]", 1)[0]
         order = "first row first" if value > 0 else "last row first"
         said = f"{camera_words(camera)} reads its rows in {abs(value):.3g} +- {sigma:.2g} ms ({order})"
-        if abs(value) < _SEEN * sigma:
+        if abs(value) < SEEN * sigma:
             said = f"no rolling shutter of {camera_words(camera)} is seen: readout {value:.2g} +- {sigma:.2g} ms"
         yield Finding(Level.INFORMATION, said)

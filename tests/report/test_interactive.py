@@ -16,7 +16,7 @@ from jaxphoto.report import block_in_space, page_head, report_page, verdict_of
 from jaxphoto.report.block_places import places_of, pyramids
 from jaxphoto.report.document import BlockInSpace, Document, Rows
 from jaxphoto.report.document_html import html_of, html_page
-from jaxphoto.report.document_pdf import pdf_of
+from jaxphoto.report.document_pdf import _BLANK, _FIGURE, _INNER, _READABLE, _widths, pdf_of
 from jaxphoto.report.error_ellipsoids import ellipsoid_mesh
 from jaxphoto.report.interactive import measurements
 from tests.blocks import adjusted, simulated
@@ -140,6 +140,15 @@ def test_a_page_is_whole_without_a_network_and_complete_without_a_script(tables,
     assert f"{len(tables.adjusted.block.images)} camera stations" in alt
     assert all(f">{name}</td>" in page for name in tables.adjusted.block.images)
     assert len(page) < 4_000_000
+
+
+def test_a_long_cell_on_paper_goes_on_in_the_next_line():
+    cells = ("options", "a long one, " * 40)
+    wide = _widths([["", word] for word in cells])
+    size = _INNER * 72 / (_FIGURE * sum(wide))
+    assert size >= _READABLE and wide[0] == len("options") + _BLANK
+    # Numbers are not cut, whatever the size of type.
+    assert _widths([["", "1234567890"]] * 30) == [10 + _BLANK] * 30
 
 
 def test_on_paper_the_plan_stands_for_the_block(tables):

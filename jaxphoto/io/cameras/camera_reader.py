@@ -42,8 +42,9 @@ def read_camera_file(
     """The camera in a file of another program (docs/camera_files.md), or of jaxphoto itself.
 
     The format is told by the content. `path` may be a folder of results, of a flight, a block folder or a COLMAP model.
-    `camera` names one where there are several; `pixel_mm` is the size of a pixel and `size_px` the width and height where the
-    file does not give them; `block` is the block of which an interior.csv is, needed where results do not say it.
+    `camera` names one where there are several; `pixel_mm` is the size of a pixel and `size_px` the width and height
+    where the file does not give them; `block` is the block of which an interior.csv is, needed where results do not
+    say it.
 
     Raises InputError for files that are missing, cut off or of no known format, for models that are not known here and
     for what is missing in a file.

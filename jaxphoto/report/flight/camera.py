@@ -15,6 +15,7 @@ from jaxphoto.report.findings import as_sentence
 from jaxphoto.report.flight.part import PartReport
 from jaxphoto.report.flight.source import FlightSource
 from jaxphoto.report.ground import ground_findings
+from jaxphoto.report.rolling_shutter import SEEN, readout_of
 from jaxphoto.stability import distortion_curve
 from jaxphoto.statistics.correlation import high_pairs
 
@@ -22,7 +23,8 @@ HIGH = 0.9
 
 
 def interior_rows(report: PartReport, start: InteriorOrientation | None) -> Rows:
-    """Every parameter: where it began, what came out, how sure, in pixels, whether it differs from zero."""
+    """Every parameter, and the readout of a rolling shutter: where it began, what came out, how sure, in pixels, and
+    whether it differs from zero."""
     adjusted, alike = report.part.adjusted, report.part.oriented.report.alike
     table = with_alike(report.tables.interior, adjusted, alike)
     table = table[table["sigma"].notna() | (table["value"] != 0)]
@@ -42,6 +44,11 @@ def interior_rows(report: PartReport, start: InteriorOrientation | None) -> Rows
                 {True: "yes", False: "no"}.get(p["significant"], ""),
             )
         )
+    further = report.tables.georeferencing
+    names = [readout_of(camera) for camera in adjusted.unknowns.interior]
+    for p in further[further["parameter"].isin(names)].to_dict("records"):
+        seen = "yes" if abs(p["value"]) >= SEEN * p["sigma"] else "no"
+        rows.append(("readout_ms", "", with_sigma(p["value"], p["sigma"]), f"{p['sigma']:.2g}", "", "", seen))
     columns = ("parameter", "began at", "value", "sigma", "sigma alike", "in pixels", "significant")
     return Rows(columns, tuple(rows))
 
