@@ -115,8 +115,7 @@ def fly_command(
     console, errors = plain_console(), plain_console(stderr=True)
     with errors.status("reading the photographs") as status, ExitStack() as opened:
         read, spoilt = sound_photographs(photographs)
-        spoilt |= folders_not_looked_into(photographs)
-        for sentence in spoilt.values():
+        for sentence in (spoilt | folders_not_looked_into(photographs)).values():
             errors.print(f"left out: {plain(sentence)}", soft_wrap=True)
         told = located(read, photographs, exposures or (), code=code, arm=arm, heights=above)
         read = told.photographs
