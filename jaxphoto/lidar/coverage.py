@@ -43,12 +43,13 @@ class CoveredTimes:
 
     def add(self, part: Cloud) -> None:
         """Laser points more; those without times say nothing."""
-        if part.time is None:
+        if part.time is None or not len(part):
             return
-        for k, name in enumerate(part.strips or ("",)):
-            own = part.time if part.strip is None else part.time[part.strip == k]
-            if len(own):
-                self.add_times(own, name)
+        if part.strip is None:
+            self.add_times(part.time)
+            return
+        for k in np.flatnonzero(np.bincount(part.strip)):
+            self.add_times(part.time[part.strip == k], part.strips[k])
 
     def add_times(self, time: Float[np.ndarray, "n"], strip: str = "") -> None:
         """Times (s) of points of a strip, or of a cloud without strips."""
