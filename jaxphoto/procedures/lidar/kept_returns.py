@@ -105,7 +105,7 @@ def _chosen(
     settings: StripSettings,
     most: int,
     places: Float[np.ndarray, "n 3"],
-    always: dict[str, Int[np.ndarray, "cells"]],
+    always: dict[str, Int[np.ndarray, "kept"]],
 ) -> dict[str, Int[np.ndarray, "cells"]]:
     """The cells of each look whose returns are to be kept, `most` of them together; those `always`, and others."""
     most -= _number(looks, always)
