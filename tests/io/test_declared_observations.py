@@ -67,7 +67,7 @@ def rows_of(kind: type[AbstractObservations], n: int, seed: int = 0) -> Abstract
     rng, fields = np.random.default_rng(seed), {}
     in_files = {column.field for column in columns_of(kind)}
     for name, touches, whole, shape in row_fields(kind):
-        size = {"image": 3, "point": 4, "strips": 2}.get(
+        size = {"image": 3, "point": 4, "strips": 2, "trajectory_knots": 1}.get(
             touches, 3 if kind.group in ("stations", "control_points", "trajectory_stations") else 1
         )
         index = (np.arange(n)[:, None] + np.arange(int(np.prod(shape)))) % size

@@ -50,7 +50,7 @@ def test_the_block_comes_back_and_adjusts_to_the_same(folder):
             "block.toml",
             'pattern = "line"',
             'pattern = "square"',
-            "pattern is one of line, circle, got 'square'; correct",
+            "one of line, circle, got 'square'; correct",
         ),
     ],
 )
