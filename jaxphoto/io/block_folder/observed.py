@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from jaxphoto.arrays import on_device
-from jaxphoto.errors import BlockError
+from jaxphoto.errors import BlockError, few
 from jaxphoto.io.block_folder.control import default_sigma
 from jaxphoto.io.block_folder.image_points import ObservedPoints
 from jaxphoto.io.block_folder.images import Images, check_angles, refuse_duplicates
@@ -41,7 +41,7 @@ class Ids(NamedTuple):
         else:
             known = list(self.owners.get(what, ()))
             index = pd.Index(known, dtype=object).get_indexer(pd.Index(named))
-            mend = f"is none of the {what} of this block ({', '.join(known) or 'it has none'}); correct it"
+            mend = f"is none of the {what} of this block ({few(known) or 'it has none'}); correct it"
         for line in np.flatnonzero(index < 0):
             raise table.misfit(line, f"{what} {named[line]} {mend}")
         return index
