@@ -100,7 +100,7 @@ def test_a_scanner_of_prisms_is_found_by_what_it_sees_ahead_and_behind():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["rotating", "oscillating", "risley"])
+@pytest.mark.parametrize("kind", ["rotating", "oscillating"])
 def test_angles_and_clock_of_a_scanner_are_found(kind):
     """By the options of the command, in the words of a recipe; errors of the trajectory as they drift."""
     true = {"eccentricity_deg": [0.02, -0.03], "time_offset_s": 0.005}
@@ -112,6 +112,11 @@ def test_angles_and_clock_of_a_scanner_are_found(kind):
     assert len(table) == 3 and found.still
     assert (np.abs(table.value - told[table.parameter].to_numpy()) < 3 * table.sigma).all()
     assert (table.value.abs() > 4 * table.sigma).all()
+
+
+def test_the_clock_of_a_scanner_that_looks_all_around_is_not_estimated():
+    with pytest.raises(InputError, match="what it sees of one plane is seconds apart: leave out time-offset"):
+        adjust_strips(flown().cloud, flown().trajectory, SETTINGS, scanner_priors(["time-offset"], "risley"))
 
 
 def test_another_pattern_than_that_of_the_scanner_is_told():

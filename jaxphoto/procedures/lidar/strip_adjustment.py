@@ -43,6 +43,7 @@ from jaxphoto.procedures.lidar.tie_point_search import PointPlanes, PointSearch
 from jaxphoto.procedures.lidar.until_still import STILL, at_result, with_interior_held
 from jaxphoto.procedures.lidar.vertical_control import tie_points
 from jaxphoto.statistics import Covariance, covariance
+from jaxphoto.unknowns import FIXED
 
 MAX_STRIP_ROUNDS = 10
 PHOTOGRAPHS = "photographs"
@@ -138,8 +139,9 @@ def adjust_strips(
     where none is named, in the directions that control does not tell.
 
     Raises InputError for a cloud of one strip, of strips without points or without the times that a trajectory needs,
-    and for control without heights or standard deviations; BlockError for strips that no plane joins, for control that
-    lies elsewhere and for a trajectory that does not cover the cloud or the exposures; and as `jaxphoto.adjust`.
+    for a time offset of a scanner that looks all around and for control without heights or standard deviations;
+    BlockError for strips that no plane joins, for control that lies elsewhere and for a trajectory that does not cover
+    the cloud or the exposures; and as `jaxphoto.adjust`.
     """
     settings = StripSettings() if settings is None else settings
     if trajectory is None and priors is not None:
@@ -148,6 +150,11 @@ def adjust_strips(
             "trajectory (--trajectory), or say nothing of the scanner"
         )
     priors = ScannerPriors() if priors is None else priors
+    if priors.calibration.pattern == "circle" and priors.calibration.time_offset is not FIXED:
+        raise InputError(
+            "the time offset of a scanner that looks all around is not estimated, because what it sees of one plane is "
+            "seconds apart: leave out time-offset, and shift the trajectory (--trajectory-shift-s)"
+        )
     held = cloud.strips if held == "all" else held
     names = _check(cloud, trajectory, held, photographs is None and priors.right)
     path = None if trajectory is None else scanner_path(trajectory)
