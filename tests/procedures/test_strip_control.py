@@ -11,15 +11,17 @@ from jaxphoto import BlockError, InputError
 from jaxphoto.block import Frame
 from jaxphoto.cloud import Cloud
 from jaxphoto.io import clouds
-from jaxphoto.io.recipe.truth import write_simulation
 from jaxphoto.lidar.strip_settings import StripSettings
 from jaxphoto.procedures.control import SurveyedPoints
 from jaxphoto.procedures.lidar import StripAdjustment, adjust_strips
 from jaxphoto.procedures.lidar.strip_control import with_control
+from jaxphoto.report.strips import strips_verdict
+from jaxphoto.report.tables import Tables
 from jaxphoto.simulation import Simulation
 from tests.commands import run
 from tests.lidar.clouds import gable, ground
 from tests.procedures.joint import flown as flown_with_photographs
+from tests.procedures.joint import photographs
 from tests.procedures.strips import PRIORS, SETTINGS, fitted, flown
 
 COARSE = StripSettings(cell_m=2.0, roughness_m=0.04, returns=8)
@@ -177,24 +179,21 @@ def test_control_that_cannot_be(change, sentence):
 
 
 @pytest.mark.slow
-def test_photographs_strips_and_control_at_once(tmp_path, monkeypatch, capsys):
-    """The flight of `joint` and control on the ground, from files: all tables and the page of the adjustment."""
-    folder, out, flight = tmp_path / "flight", tmp_path / "out", flown_with_photographs()
-    write_simulation(flight, folder)
+def test_photographs_strips_and_control_at_once():
+    """The flight of `joint` and control on its ground."""
+    flight = flown_with_photographs()
     some = flight.cloud.xyz[flight.cloud.classification == 2]
     xy = some[np.random.default_rng(2).choice(len(some), 40, replace=False), :2]
-    written(surveyed(np.column_stack([xy, flight.terrain.height(xy)]), 7), tmp_path / "control.csv")
-    given = ("--trajectory", folder / "trajectory.csv", "--block", folder, "--control", tmp_path / "control.csv")
-    fine = ("--knots-s", "5", "--correlation-s", "60", "--sigma-position-m", "0.05", "--cell-m", "8")
-    code, output, errors = run(monkeypatch, capsys, "strips", folder / "cloud.laz", "--out", out, *given, *fine)
-    assert code == 0, errors + output
-    assert "photographs and strip 1: from " in output and "control and strip 1: from " in output
-    summary = json.loads((out / "summary.json").read_text())
-    assert summary["control"]["planes"] > 30 and summary["control"]["rms_m"] < 1.5 * summary["control"]["noise_m"]
-    points = pd.read_csv(out / "adjustment" / "object_points.csv").set_index("point")
-    assert np.abs(points.Z_m["K0"] - flight.terrain.height(xy[:1])[0]) < 4 * SIGMA_M
-    interior = pd.read_csv(out / "adjustment" / "interior.csv").set_index("parameter")
-    assert abs(interior.value["c_mm"] - 34.25) < 4 * interior.sigma["c_mm"] < 0.02
+    control, given = surveyed(np.column_stack([xy, flight.terrain.height(xy)]), 7), photographs(flight)
+    how = {"photographs": given, "control": control, "max_rounds": 2}
+    found = adjust_strips(flight.cloud, flight.trajectory, SETTINGS, PRIORS, **how)
+    assert found.rounds[-1].control > 30 and float(found.adjusted.sigma0) == pytest.approx(1.0, abs=0.1)
+    for what in ("photographs", "control"):
+        over = [d for d in found.differences if d.one == what]
+        assert [d.other for d in over] == ["1", "2", "3"] and all(d.rms_m < 1.3 * d.noise_m for d in over)
+    assert set(control.ids) <= set(found.adjusted.block.points)
+    page = str(strips_verdict(found, Tables(found.adjusted, known=found.covariance)))
+    assert "control 0.0" in page
 
 
 def written(control: SurveyedPoints, path, head: str = "") -> None:
