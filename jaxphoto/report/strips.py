@@ -163,13 +163,17 @@ def _of_strips(result: StripAdjustment) -> Iterator[Finding]:
     whole = global_test(result.adjusted)
     if whole.redundancy > 0 and whole.p_value < LEVEL:
         small = whole.factor < 1
-        yield Finding(
-            Level.WARNING,
-            f"sigma naught {whole.factor**0.5:.3g}, expected 1 ({p_words(whole.p_value)}): planes lie "
-            f"{'nearer to' if small else 'farther from'} one another than their roughness and the trajectory's "
-            f"standard deviations let expect; "
-            + ("these are too large" if small else "these are too small, or knots too far apart"),
-        )
+        lie = f"planes lie {'nearer to' if small else 'farther from'} one another than their roughness"
+        if result.trajectory is None:
+            why = f"{lie} lets expect" + (
+                "" if small else " after a shift of each strip: what else is wrong its trajectory tells (--trajectory)"
+            )
+        else:
+            why = f"{lie} and the trajectory's standard deviations let expect; these are too " + (
+                "large" if small else "small, or knots too far apart"
+            )
+        said = f"sigma naught {whole.factor**0.5:.3g}, expected 1 ({p_words(whole.p_value)})"
+        yield Finding(Level.WARNING, f"{said}: {why}")
 
 
 def print_strips(result: StripAdjustment, console: Console) -> None:
@@ -190,8 +194,22 @@ def print_strips(result: StripAdjustment, console: Console) -> None:
             markup=False,
             soft_wrap=True,
         )
+    if result.trajectory is None:
+        for line in _shift_lines(result):
+            console.print(line, highlight=False, markup=False, soft_wrap=True)
     scanner = calibration_table(result)
     numbers = scanner[["value", "sigma"]].to_numpy(float)
     for parameter, (value, sigma) in zip(scanner["parameter"], numbers, strict=True):
         said = f"  {parameter}: {with_sigma(value, sigma)} (sigma {of_sigma(sigma)})"
         console.print(said, highlight=False, markup=False, soft_wrap=True)
+
+
+def _shift_lines(result: StripAdjustment) -> Iterator[str]:
+    """By how much each strip is off where nothing else is estimated."""
+    for one in trajectory_errors_table(result).to_dict("records"):
+        axes = [axis for axis in "XYZ" if one[f"sigma_{axis}_m"] > 0]
+        told = ((axis, one[f"{axis}_m"], one[f"sigma_{axis}_m"]) for axis in axes)
+        said = ", ".join(
+            f"{axis} {with_sigma(value, sigma)} m (sigma {of_sigma(sigma)})" for axis, value, sigma in told
+        )
+        yield f"  strip {one['strip']} {'is off by ' + said if said else 'is held'}"
