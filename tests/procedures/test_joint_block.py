@@ -46,12 +46,6 @@ def test_the_block_comes_back_and_adjusts_to_the_same(folder):
     [
         ("trajectory_stations.csv", ",0,", ",3,", r"row 2: axis is 3; it is 0, 1 or 2"),
         ("position_steps.csv", "1 at ", "7 at ", r"row 2: trajectory_knots 7 at .* is none of the trajectory_knots"),
-        (
-            "block.toml",
-            'pattern = "line"',
-            'pattern = "square"',
-            "one of line, circle, got 'square'; correct",
-        ),
     ],
 )
 def test_mistakes_are_named(folder, tmp_path, file, old, new, match):
