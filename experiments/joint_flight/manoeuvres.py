@@ -80,7 +80,10 @@ def main(out: Path, manoeuvres: Path) -> None:
     for one in tomllib.loads(manoeuvres.read_text(encoding="utf-8"))["manoeuvre"]:
         found = adjusted(flown(one["strips"], seed=5))
         rows.append({"manoeuvre": one["name"], "still": found.still, **told(found)})
-        print(pd.Series(rows[-1]).to_string(), "\n", flush=True)
+        said = (
+            f"  {name}: {value:.3g}" if isinstance(value, float) else f"  {value}" for name, value in rows[-1].items()
+        )
+        print(*said, sep="\n", flush=True)
     out.mkdir(parents=True, exist_ok=True)
     pd.DataFrame(rows).to_csv(out / "manoeuvres.csv", index=False)
     print(f"wrote {out / 'manoeuvres.csv'}")
