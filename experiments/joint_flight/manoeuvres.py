@@ -20,7 +20,7 @@ from jaxphoto.io import read_recipe
 from jaxphoto.lidar.strip_settings import StripSettings
 from jaxphoto.procedures.lidar import Photographs, ScannerPriors, StripAdjustment, adjust_strips
 from jaxphoto.report.strips import all_correlations, calibration_table
-from jaxphoto.simulation import Simulation, simulate
+from jaxphoto.simulation import Recipe, Simulation, simulate
 from jaxphoto.unknowns import FIXED, FREE
 
 FOLDER = Path(__file__).resolve().parent
@@ -38,8 +38,8 @@ UNITS = {"_mm": (1e3, "um"), "_deg": (1e3, "mdeg"), "_m": (1e3, "mm"), "_ppm": (
 """Factor and unit in which a sigma is printed, by the end of its parameter's name."""
 
 
-def flown(strips: list[dict], seed: int) -> Simulation:
-    """The flight of recipe.toml with other strips."""
+def planned(strips: list[dict]) -> Recipe:
+    """recipe.toml with other strips."""
     head, _, rest = (FOLDER / "recipe.toml").read_text(encoding="utf-8").partition("[[flight.strips]]")
     _, _, tail = rest.partition("[jitter]")
     own = "".join(
@@ -48,7 +48,7 @@ def flown(strips: list[dict], seed: int) -> Simulation:
     with tempfile.TemporaryDirectory() as folder:
         recipe = Path(folder) / "recipe.toml"
         recipe.write_text(f"{head}{own}[jitter]{tail}", encoding="utf-8")
-        return simulate(read_recipe(recipe), seed)
+        return read_recipe(recipe)
 
 
 def adjusted(flight: Simulation) -> StripAdjustment:
@@ -78,7 +78,7 @@ def main(out: Path, manoeuvres: Path) -> None:
     """Print and write what each manoeuvre tells."""
     rows = []
     for one in tomllib.loads(manoeuvres.read_text(encoding="utf-8"))["manoeuvre"]:
-        found = adjusted(flown(one["strips"], seed=5))
+        found = adjusted(simulate(planned(one["strips"]), seed=5))
         rows.append({"manoeuvre": one["name"], "still": found.still, **told(found)})
         said = (
             f"  {name}: {value:.3g}" if isinstance(value, float) else f"  {value}" for name, value in rows[-1].items()
