@@ -39,7 +39,7 @@ _JUMP_M, _TIMES = 0.3, 20.0
 _OBLIQUE, _UNDER, _SOME = 0.8, 0.25, 1000
 
 
-class _Seen(NamedTuple):
+class _FromBody(NamedTuple):
     """Tangents of the angles of points to the right and ahead, from the body's nadir."""
 
     middle: Float[np.ndarray, "seconds 2"]
@@ -182,7 +182,7 @@ def _probed(cloud: Cloud) -> Int[np.ndarray, "n"]:
     return np.linspace(0, len(cloud) - 1, min(_PROBED, len(cloud))).astype(int)
 
 
-def _seen(cloud: Cloud, path: ScannerPath) -> _Seen | None:
+def _seen(cloud: Cloud, path: ScannerPath) -> _FromBody | None:
     """None of a swath that is too narrow to say, or of a cloud with few points."""
     some = _probed(cloud)
     time = cloud.time[some]  # type: ignore[index]
@@ -196,4 +196,4 @@ def _seen(cloud: Cloud, path: ScannerPath) -> _Seen | None:
     # From the first tenth to the last: a return from above the scanner is as far aside as can be.
     low, middle, high = np.stack([np.quantile(part, (0.1, 0.5, 0.9), axis=0) for part in parts], axis=1)
     half_width = np.median((high - low) / 2, axis=0)
-    return None if max(half_width) < _NARROW else _Seen(middle, half_width)
+    return None if max(half_width) < _NARROW else _FromBody(middle, half_width)
