@@ -17,8 +17,7 @@ def control_in_frame(path: Path, placement: Placement) -> SurveyedPoints:
     """The points of a file, which are in the system of the cloud that `placement` places, in metres.
 
     Raises InputError for a file that names another system, for points without heights or standard deviations, and where
-    the system of the cloud does not reach. A UserWarning
-    says that marks in photographs are not used.
+    the system of the cloud does not reach. A UserWarning says that marks in photographs are not used.
     """
     points, marks = read_control(path)
     if len(marks.image):

@@ -6,7 +6,7 @@ from typing import Annotated
 import numpy as np
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-from rich.table import Table
+from rich.table import Column, Table
 
 from jaxphoto.block import Block
 from jaxphoto.cli.app import app
@@ -19,7 +19,7 @@ from jaxphoto.experiment import MonteCarlo
 from jaxphoto.io import read_block
 from jaxphoto.io.draws_folder import check_place
 from jaxphoto.procedures import adjust
-from jaxphoto.report.draws import write_draws_page
+from jaxphoto.report.draws import LONG, write_draws_page
 from jaxphoto.sensitivity import PER, Bias, Readjustment, bias, check_draws, noise
 
 _KINDS = (*PER, "noise")
@@ -88,10 +88,11 @@ def monte_carlo_command(
         f"{summary['draws']} draws, {summary['converged']} converged, {summary['fallbacks']} by a full adjustment; "
         f"{summary['draws_per_second']:.0f} draws a second",
     )
-    shown = Table("quantity", "nominal", "mean", "sd", "predicted sigma", "ratio", title="estimates over the draws")
+    heads = Column("quantity", overflow="fold"), "nominal", "mean", "sd", "predicted sigma", "ratio"
+    shown = Table(*heads, title="estimates over the draws")
     shown_numbers = ["nominal", "mean", "sd", "predicted_sigma", "ratio"]
     for name, *numbers in table[["quantity", *shown_numbers]].itertuples(index=False):
-        if not str(name).startswith(("bias.", "exterior.", "point.", "check.")):
+        if not str(name).startswith(("bias.", *LONG)):
             shown.add_row(str(name), *(f"{float(v):.5g}" for v in numbers))
     console.print(shown)
     console.print(f"results in {out} (open report.html)")

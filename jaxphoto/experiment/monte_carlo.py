@@ -16,6 +16,7 @@ from jaxphoto.block import Block
 from jaxphoto.io.draws_folder import DrawsFolder, digest_of
 from jaxphoto.io.json_file import read_json
 from jaxphoto.report.draws import (
+    LONG,
     Moments,
     column_of,
     draws_figure,
@@ -153,7 +154,8 @@ class MonteCarlo:
         if len(effects):
             with whole_file(directory / "effects.csv") as work:
                 effects.to_csv(work, index=False)
-        shared = [column_of(label) for label in self.run.adjusted.structure.labels]
+        every = map(column_of, self.run.adjusted.structure.labels)
+        shared = [name for name in every if not name.startswith(LONG)]
         if shared:
             pictured = {name: values[good] for name, values in folder.read(shared).items()}
             with whole_file(directory / "interior.png") as work:

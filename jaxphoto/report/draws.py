@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 
 from jaxphoto.adjustment import Adjustment
+from jaxphoto.georeferencing import TrajectoryKnot
 from jaxphoto.observations import AXES
 from jaxphoto.report.document import Heading, Paragraph, rows_of
 from jaxphoto.report.made import Made, made_section
@@ -22,8 +23,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _PICTURES = {"interior": "Estimates over the draws", "effects": "Which error is behind which estimate"}
-# Rows of the page's table that are of images and points: their number has no end.
-_LONG = ("exterior.", "point.", "check.")
+LONG = ("exterior.", "point.", "check.", f"{TrajectoryKnot.kind}.")
+"""How quantities begin that are of images, points and knots of a trajectory: files have them, no page and no screen."""
 EXTERIOR = ("X_m", "Y_m", "Z_m", "omega_rad", "phi_rad", "kappa_rad")
 _QUANTILES = {"q025": 0.025, "q50": 0.5, "q975": 0.975}
 # Histograms of a picture.
@@ -152,7 +153,7 @@ def effects_figure(effects: pd.DataFrame, summary: pd.DataFrame, quantities: lis
 
 def write_draws_page(summary: Mapping[str, Any], table: pd.DataFrame, directory: Path, made: Made) -> None:
     """report.html of the draws in `directory`, from the summary, its table and the pictures that are there."""
-    few = ~table["quantity"].str.startswith(_LONG)
+    few = ~table["quantity"].str.startswith(LONG)
     said = [
         f"{summary['draws']} draws, of which {summary['converged']} converged. {_ratios(table[few])}",
         "The predicted sigma is the effect of the errors to first order; the ratio says how far draws agree with it.",
@@ -163,7 +164,7 @@ def write_draws_page(summary: Mapping[str, Any], table: pd.DataFrame, directory:
             parts += [Heading(heading), WholePicture.read(file, heading)]
     parts += [Heading("Means and standard deviations"), rows_of(table[few])]
     if not few.all():
-        parts.append(Paragraph("Images and points stand in summary.csv."))
+        parts.append(Paragraph("Images, points and knots of trajectories stand in summary.csv."))
     page = study_page(f"Monte Carlo: {summary.get('title') or 'block'}", said, [*parts, *made_section(made)])
     with whole_file(directory / "report.html") as work:
         work.write_text(page, encoding="utf-8")

@@ -239,7 +239,7 @@ def test_the_command(folder, monkeypatch, capsys, tmp_path):
     page = (out / "report.html").read_text(encoding="utf-8")
     assert "20 draws, of which 20 converged." in page and "--sigma-m 0.05,0.05,0.1" in page
     assert (
-        "Images and points stand in summary.csv." in page
+        "Images, points and knots of trajectories stand in summary.csv." in page
         and f"exterior.{simulated(NOMINAL).block.images[0]}" not in page
     )
     draws = pd.read_parquet(out / "draws.parquet")
