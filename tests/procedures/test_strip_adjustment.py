@@ -17,7 +17,7 @@ from jaxphoto.lidar.correction import scanner_path
 from jaxphoto.lidar.strip_correction import correct_flight, correct_strips
 from jaxphoto.lidar.strip_settings import StripSettings
 from jaxphoto.procedures.lidar import ScannerPriors, adjust_strips
-from jaxphoto.procedures.lidar.scanner_checks import check_measured_from, check_pattern
+from jaxphoto.procedures.lidar.scanner_checks import check_measured_from
 from jaxphoto.procedures.lidar.strip_rows import step_rows
 from jaxphoto.procedures.lidar.strip_unknowns import knot_sigmas
 from jaxphoto.report.strips import calibration_table, trajectory_errors_table
@@ -122,11 +122,11 @@ def test_the_clock_of_a_scanner_that_looks_all_around_is_not_estimated():
 def test_another_pattern_than_that_of_the_scanner_is_told():
     flight, other = flown(), flown_around()
     with pytest.raises(BlockError, match="as those of a scanner that draws lines across the track"):
-        check_pattern(flight.cloud, scanner_path(flight.trajectory), "circle")
+        check_measured_from(flight.cloud, scanner_path(flight.trajectory), "circle")
     with pytest.raises(BlockError, match="as those of a scanner that looks all around its nadir"):
-        check_pattern(other.cloud, scanner_path(other.trajectory), "line")
-    check_pattern(flight.cloud, scanner_path(flight.trajectory), "line")
-    check_pattern(other.cloud, scanner_path(other.trajectory), "circle")
+        check_measured_from(other.cloud, scanner_path(other.trajectory), "line")
+    check_measured_from(flight.cloud, scanner_path(flight.trajectory), "line")
+    check_measured_from(other.cloud, scanner_path(other.trajectory), "circle")
 
 
 def test_the_errors_of_the_trajectory_are_found():

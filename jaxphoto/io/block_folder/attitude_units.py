@@ -4,14 +4,10 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxphoto.errors import InputError
+from jaxphoto.georeferencing.yaw_units import counts_in_radians
 from jaxphoto.io.block_folder.images import Images
 from jaxphoto.io.text_tables import Table
 from jaxphoto.observations import StationRows
-
-# Means of the cosine between yaw and course: the crab angle leaves more than the first, and both readings are told
-# apart below the second.
-_ALIKE, _UNLIKE = 0.8, 0.7
-_FEWEST = 4
 
 
 def check_attitude_units(table: Table, stations: StationRows, images: Images) -> None:
@@ -25,18 +21,11 @@ def check_attitude_units(table: Table, stations: StationRows, images: Images) ->
 
 
 def check_yaw(yaw: Float[np.ndarray, "n"], flown: Float[np.ndarray, "n 3"], file: str) -> None:
-    """Raise InputError where `yaw` follows the way `flown` when read as radians, and does not when read as degrees.
-
-    Honest degrees are safe: read as degrees they follow the flight themselves, whatever the wind, because no aircraft
-    flies sideways.
-    """
+    """Raise InputError where `yaw` follows the way `flown` when read as radians, and does not when read as degrees."""
     course = np.arctan2(flown[:, 0], flown[:, 1])
     known = ~np.isnan(course) & ~np.isnan(yaw)
     course, yaw = course[known], yaw[known]
-    if len(course) < _FEWEST or np.abs(yaw).max() > 2 * np.pi:
-        return
-    as_radians, as_degrees = np.cos(yaw - course).mean(), np.cos(np.deg2rad(yaw) - course).mean()
-    if as_radians < _ALIKE or as_degrees > _UNLIKE:
+    if not counts_in_radians(yaw, course):
         return
     raise InputError(
         f"{file}: the yaw angles lie between {yaw.min():.2f} and {yaw.max():.2f} and follow the direction of flight as "

@@ -14,6 +14,7 @@ from jaxphoto.cloud import Cloud
 from jaxphoto.errors import BlockError
 from jaxphoto.georeferencing import Pattern, Trajectory
 from jaxphoto.georeferencing.time_scales import LEAP_SECONDS
+from jaxphoto.georeferencing.yaw_units import counts_in_radians
 from jaxphoto.lidar.correction import ScannerPath, scanner_poses
 from jaxphoto.lidar.coverage import CoveredTimes, longest_interval
 from jaxphoto.procedures.lidar.looks import aside
@@ -28,8 +29,8 @@ _WANDERS, _ASIDE = 1.5, 3.0
 # Lines spread less ahead than this part of what they do to the side, and what looks all around spreads more. Of a swath
 # narrower than this part of the height nothing is said.
 _ALIKE, _NARROW = 0.5, 0.02
-# Cosines of the angle between yaw and course: no crab angle leaves less than the first, read in the right unit.
-_FOLLOWS, _ELSEWHERE = 0.8, 0.7
+# Cosine of the angle between yaw and course: no crab angle leaves less.
+_FOLLOWS = 0.7
 # Slower (m/s), a course says nothing.
 _SLOW = 1.0
 # A jump is that long at least, and so many times what records usually are off.
@@ -48,10 +49,11 @@ class _FromBody(NamedTuple):
     """Of the points of a second, in the median."""
 
 
-def check_measured_from(cloud: Cloud, path: ScannerPath) -> list[str]:
+def check_measured_from(cloud: Cloud, path: ScannerPath, pattern: Pattern | None = None) -> list[str]:
     """What is odd about where the points of `cloud` lie from the scanner, in sentences.
 
-    Raises BlockError where they cannot have been measured from this trajectory.
+    Raises BlockError where they cannot have been measured from this trajectory, or lie about the scanner as those of
+    another `pattern` do, where it matters.
     """
     some = _probed(cloud)
     away = np.linalg.norm(cloud.xyz[some] - scanner_poses(path, cloud.time[some]).position, axis=1)  # type: ignore[index]
@@ -74,14 +76,13 @@ def check_measured_from(cloud: Cloud, path: ScannerPath) -> list[str]:
             f"height to one side, while the swath is {2 * max(seen.half_width):.2f} of it wide: bring cloud and "
             "trajectory into one coordinate system, both in metres, and onto one clock, with angles in degrees"
         )
+    if pattern is not None:
+        _check_pattern(seen, pattern)
     return odd
 
 
-def check_pattern(cloud: Cloud, path: ScannerPath, pattern: Pattern) -> None:
+def _check_pattern(seen: _FromBody, pattern: Pattern) -> None:
     """Raise BlockError where the points lie about the scanner as those of another pattern do."""
-    seen = _seen(cloud, path)
-    if seen is None:
-        return
     right, ahead = seen.half_width
     spread = f"to the side by {right:.2f} of the height and ahead by {ahead:.2f}"
     if right < _ALIKE * ahead:
@@ -138,10 +139,9 @@ def _odd_yaw(trajectory: Trajectory) -> list[str]:
     if not fast.any():
         return []
     course, yaw = np.arctan2(*step[fast].T), np.arctan2(*forward[fast].T)
-    follows, as_radians = np.median(np.cos(yaw - course)), np.median(np.cos(np.rad2deg(yaw) - course))
-    if follows > _ELSEWHERE:
+    if np.median(np.cos(yaw - course)) > _FOLLOWS:
         return []
-    if as_radians > _FOLLOWS and np.abs(yaw).max() < np.deg2rad(2 * np.pi) + 1e-9:
+    if counts_in_radians(np.rad2deg(yaw), course):
         raise BlockError(
             "the yaw of the trajectory follows its course as radians, not as degrees: convert roll, pitch and yaw to "
             "degrees"

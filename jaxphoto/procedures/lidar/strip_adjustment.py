@@ -26,7 +26,7 @@ from jaxphoto.observations import StripPoints
 from jaxphoto.procedures.adjust import adjust
 from jaxphoto.procedures.control.surveyed import SurveyedPoints
 from jaxphoto.procedures.lidar.photographs import Photographs, check_photographs, on_trajectory, spans_with
-from jaxphoto.procedures.lidar.scanner_checks import check_measured_from, check_pattern
+from jaxphoto.procedures.lidar.scanner_checks import check_measured_from
 from jaxphoto.procedures.lidar.strip_control import (
     CHECK,
     CONTROL,
@@ -158,9 +158,8 @@ def adjust_strips(
     held = cloud.strips if held == "all" else held
     names = _check(cloud, trajectory, held, photographs is None and priors.right)
     path = None if trajectory is None else scanner_path(trajectory)
-    odd = [] if path is None else check_measured_from(cloud, path)
-    if path is not None and not priors.right:
-        check_pattern(cloud, path, priors.calibration.pattern)
+    pattern = priors.calibration.pattern
+    odd = [] if path is None else check_measured_from(cloud, path, None if priors.right else pattern)
     spans, images = _spans(cloud), None
     if photographs is not None:
         check_photographs(photographs, trajectory)
@@ -180,7 +179,6 @@ def adjust_strips(
     else:
         block = strip_block(names, splines, held, sigmas, priors, block)
     steps = tuple(rows for rows in step_rows(splines, sigmas, settings) if len(rows))
-    pattern = priors.calibration.pattern
     search, errors = StripSearch(cloud, path, settings, pattern), errors_of(block.start.unknowns, splines)
     first = seen = search.look(errors, settled=False)
     check_joined(names, seen)
