@@ -7,7 +7,7 @@ infinite sigma, and the redundancy is a count. Units are metres, radians and mil
 import dataclasses
 import functools
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -34,6 +34,9 @@ from jaxphoto.observations import (
 )
 from jaxphoto.short_repr import block_html, block_repr, from_upstairs
 from jaxphoto.unknowns import FIXED, FREE, Unknowns, Weighted, with_prior
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 
 class Block(eqx.Module):
@@ -160,9 +163,9 @@ class Block(eqx.Module):
             priors = with_prior(priors, name, prior_of, self.start.unknowns, of)
         return dataclasses.replace(self, priors=priors)
 
-    def plot(self, axes: Any = None, *, in_3d: bool = False) -> Any:
+    def plot(self, ax: "Axes | None" = None, *, in_3d: bool = False) -> "Axes":
         """The block as it starts, in plan or in space, on matplotlib axes, which are returned; new ones if none are."""
-        return from_upstairs("plot_block")(self, axes, in_3d=in_3d)
+        return from_upstairs("plot_block")(self, ax, in_3d=in_3d)
 
     __repr__ = block_repr
 

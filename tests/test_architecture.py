@@ -19,9 +19,11 @@ TABLES_AND_FILES = ("io", "image_measurement", "report", "experiment", "cli")
 
 
 def imported(path: Path) -> set[str]:
-    """Top-level packages that a module imports, anywhere in it."""
-    names = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    """Top-level packages that a module imports when it runs, anywhere in it."""
+    names, tree = set(), ast.parse(path.read_text(encoding="utf-8"))
+    only_types = [part for part in tree.body if isinstance(part, ast.If) and ast.unparse(part.test) == "TYPE_CHECKING"]
+    tree.body = [part for part in tree.body if part not in only_types]
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             names |= {alias.name.split(".")[0] for alias in node.names}
         elif isinstance(node, ast.ImportFrom):

@@ -1,6 +1,11 @@
 """What a notebook asks of things: how they show themselves, priors by name, pictures, two adjustments compared."""
 
 import dataclasses
+import inspect
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -103,21 +108,51 @@ def test_what_is_not_there_is_named(call, message):
         call(simulated("cross").block)
 
 
+def test_all_pictures_take_and_return_axes_by_one_name():
+    pictures = [report.to_plotly, jaxphoto.Block.plot, jaxphoto.Adjustment.plot]
+    pictures += [getattr(report, name) for name in report.__all__ if name.startswith("plot_")]
+    for plot in pictures:
+        signature = inspect.signature(plot)
+        assert str(signature.parameters["ax"].annotation) in ("Axes | None", "Axes"), plot
+        assert signature.return_annotation == ("Figure" if plot is report.to_plotly else "Axes"), plot
+
+
+@pytest.mark.slow
+def test_a_users_script_has_types(tmp_path):
+    """What mypy sees of the public names, from outside."""
+    shown = {
+        "block.plot()": "Axes", "block.fix('k2')": "Block", "adjusted.plot()": "Axes", "adjusted.verdict()": "Verdict",
+        "jaxphoto.compare(adjusted, adjusted)": "Change", "jaxphoto.Tables(adjusted).interior": "DataFrame",
+        "jaxphoto.simulate(jaxphoto.read_recipe('r.toml'))": "Simulation",
+        "jaxphoto.monte_carlo(adjusted, jaxphoto.bias(block, 'station', 0.1), 50)": "Draws",
+    }  # fmt: skip
+    script = tmp_path / "script.py"
+    start = "import jaxphoto\nblock = jaxphoto.read_block('b')\nadjusted = jaxphoto.adjust(block)\n"
+    script.write_text(start + "".join(f"reveal_type({call})\n" for call in shown))
+    checked = (sys.executable, "-m", "mypy", "--strict", "--config-file=", f"--cache-dir={tmp_path}", script)
+    path = os.environ | {"MYPYPATH": str(Path(jaxphoto.__file__).parents[1])}
+    done = subprocess.run(checked, capture_output=True, text=True, check=False, cwd=tmp_path, env=path)
+    said = [line for line in done.stdout.splitlines() if "script.py" in line]
+    assert len(said) == len(shown) and not any(": error:" in line for line in said), done.stdout + done.stderr
+    for line, kind in zip(said, shown.values(), strict=True):
+        assert line.split('"')[1].rstrip("]").split(".")[-1] == kind, line
+
+
 @pytest.mark.parametrize("name", PANELS)
 def test_each_picture_is_drawn_on_the_axes_that_are_given(name, axes):
     tables = Tables(adjusted("cross"))
-    assert getattr(report, name)(tables, axes=axes) is axes
+    assert getattr(report, name)(tables, ax=axes) is axes
     assert axes.has_data() and (axes.get_title() or axes.get_title(loc="left"))
     axes.figure.draw_without_rendering()
 
 
 def test_a_block_is_drawn_as_it_starts_and_as_it_ended(axes):
     result = adjusted("cross")
-    assert result.plot(axes) is axes
+    assert result.plot(ax=axes) is axes
     stations = next(line for line in axes.lines if line.get_label() == "camera stations")
     np.testing.assert_array_equal(np.stack(stations.get_data(), 1), result.unknowns.exterior.position[:, :2])
     before = Figure().add_subplot()
-    simulated("cross").block.plot(before)
+    simulated("cross").block.plot(ax=before)
     assert "before" in before.get_title()
     start = next(line for line in before.lines if line.get_label() == "control points")
     assert len(start.get_xdata()) == len(np.unique(result.block.control.who))
@@ -137,7 +172,7 @@ def test_of_a_block_without_start_values_observed_positions_are_drawn(axes):
 def test_in_space_each_image_has_its_frame():
     axes = Figure().add_subplot(projection="3d")
     result = adjusted("cross")
-    result.plot(axes, in_3d=True)
+    result.plot(ax=axes, in_3d=True)
     frames = [line for line in axes.lines if len(line.get_data_3d()[0]) == 13]
     assert len(frames) == len(result.block.images)
     # Below the projection centre, as far as it looks down.

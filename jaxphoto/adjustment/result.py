@@ -1,7 +1,7 @@
 """What an adjustment gives: unknowns, residuals, sigma naught, redundancy, the normal equations, an outcome."""
 
 import enum
-from typing import Any
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 import numpy as np
@@ -19,6 +19,11 @@ from jaxphoto.compiling import call_compiled
 from jaxphoto.observations import PRIORS
 from jaxphoto.short_repr import adjustment_html, adjustment_repr, from_upstairs
 from jaxphoto.unknowns import Unknowns
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from jaxphoto.report.findings import Verdict
 
 
 class Outcome(enum.Enum):
@@ -73,13 +78,13 @@ class Adjustment(eqx.Module):
     def _repr_html_(self) -> str:
         return adjustment_html(self, self.unknowns.words)
 
-    def verdict(self) -> Any:
+    def verdict(self) -> "Verdict":
         """Whether it may be used, green, amber or red, and the findings for that (docs/trust.md)."""
         return from_upstairs("verdict_of")(from_upstairs("Tables")(self))
 
-    def plot(self, axes: Any = None, *, in_3d: bool = False) -> Any:
+    def plot(self, ax: "Axes | None" = None, *, in_3d: bool = False) -> "Axes":
         """The adjusted block, in plan or in space, on matplotlib axes, which are returned; new ones if none are."""
-        return from_upstairs("plot_block")(self, axes, in_3d=in_3d)
+        return from_upstairs("plot_block")(self, ax, in_3d=in_3d)
 
     @property
     def structure(self) -> Structure:

@@ -23,36 +23,36 @@ _CONTROL: dict[str, Any] = {"marker": "^", "ls": "", "ms": 6, "color": "tab:red"
 _CHECK: dict[str, Any] = {"marker": "s", "ls": "", "ms": 5, "mfc": "none", "color": "tab:green"}
 
 
-def plot_block(source: Block | Adjustment, axes: Axes | None = None, *, in_3d: bool = False) -> Axes:
+def plot_block(source: Block | Adjustment, ax: Axes | None = None, *, in_3d: bool = False) -> Axes:
     """Camera stations with their strips, object points, control and check points; coordinates in metres.
 
     Of a block that is not adjusted, what is known to start with: given or observed positions, given points, control.
-    `axes` are such as matplotlib makes, of the projection "3d" where `in_3d`; new ones where there are none.
+    `ax` are axes such as matplotlib makes, of the projection "3d" where `in_3d`; new ones where there are none.
     """
-    axes = axes_or_new(axes, in_3d=in_3d)
+    ax = axes_or_new(ax, in_3d=in_3d)
     places = places_of(source)
     shown = 3 if in_3d else 2
     tie = places.ties(_POINTS)
     if len(tie):
-        axes.plot(*places.points[tie, :shown].T, ".", ms=2, color="0.65", label="object points")
+        ax.plot(*places.points[tie, :shown].T, ".", ms=2, color="0.65", label="object points")
     if places.image_known.any():
         known = places.stations[places.image_known, :shown]
-        axes.plot(*known.T, "+", ms=8, color="tab:blue", label="camera stations")
+        ax.plot(*known.T, "+", ms=8, color="tab:blue", label="camera stations")
     for mine in places.strips:
-        axes.plot(*places.stations[mine, :shown].T, "-", lw=0.7, color="tab:blue", alpha=0.5)
+        ax.plot(*places.stations[mine, :shown].T, "-", lw=0.7, color="tab:blue", alpha=0.5)
     for name, who, style in (("control points", places.control, _CONTROL), ("check points", places.check, _CHECK)):
         if len(who):
-            axes.plot(*places.points[who, :shown].T, label=name, **style)
-    axes.set(xlabel="X [m]", ylabel="Y [m]")
+            ax.plot(*places.points[who, :shown].T, label=name, **style)
+    ax.set(xlabel="X [m]", ylabel="Y [m]")
     if in_3d:
-        _draw_pyramids(axes, source, places)
-        axes.set(zlabel="Z [m]", aspect="equal")
+        _draw_pyramids(ax, source, places)
+        ax.set(zlabel="Z [m]", aspect="equal")
     else:
-        axes.set_aspect("equal", adjustable="datalim")
-    axes.set_title(f"block layout{'' if isinstance(source, Adjustment) else ', before adjusting'}", fontsize=10)
-    if axes.get_legend_handles_labels()[0]:
-        axes.legend(fontsize=8)
-    return axes
+        ax.set_aspect("equal", adjustable="datalim")
+    ax.set_title(f"block layout{'' if isinstance(source, Adjustment) else ', before adjusting'}", fontsize=10)
+    if ax.get_legend_handles_labels()[0]:
+        ax.legend(fontsize=8)
+    return ax
 
 
 def layout_figure(tables: Tables) -> Figure:

@@ -1,6 +1,6 @@
 """The pictures of the report of an adjustment, one by one, for notebooks: each takes and returns matplotlib axes.
 
-`axes` are any that matplotlib made; where there are none, those of a new figure. `camera` may be left out where the
+`ax` are any axes that matplotlib made; where there are none, those of a new figure. `camera` may be left out where the
 block has one camera.
 """
 
@@ -33,91 +33,91 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-def _drawn(draw: Callable[[Axes, Tables, str], object], tables: Tables, camera: str | None, axes: Axes | None) -> Axes:
-    axes = axes_or_new(axes)
-    draw(axes, tables, one_camera(tables.adjusted.block, camera))
-    return axes
+def _drawn(draw: Callable[[Axes, Tables, str], object], tables: Tables, camera: str | None, ax: Axes | None) -> Axes:
+    ax = axes_or_new(ax)
+    draw(ax, tables, one_camera(tables.adjusted.block, camera))
+    return ax
 
 
-def plot_residuals(tables: Tables, camera: str | None = None, axes: Axes | None = None) -> Axes:
+def plot_residuals(tables: Tables, camera: str | None = None, ax: Axes | None = None) -> Axes:
     """Image residuals over the format of a camera, all images together."""
-    return _drawn(draw_residuals, tables, camera, axes)
+    return _drawn(draw_residuals, tables, camera, ax)
 
 
-def plot_mean_residuals(tables: Tables, camera: str | None = None, axes: Axes | None = None) -> Axes:
+def plot_mean_residuals(tables: Tables, camera: str | None = None, ax: Axes | None = None) -> Axes:
     """Means of the residuals by cell of the format: what all images have in common."""
-    return _drawn(draw_mean_residuals, tables, camera, axes)
+    return _drawn(draw_mean_residuals, tables, camera, ax)
 
 
-def plot_density(tables: Tables, camera: str | None = None, axes: Axes | None = None) -> Axes:
+def plot_density(tables: Tables, camera: str | None = None, ax: Axes | None = None) -> Axes:
     """How many image points lie in each cell of the format."""
-    return _drawn(draw_density, tables, camera, axes)
+    return _drawn(draw_density, tables, camera, ax)
 
 
-def plot_residuals_by_radius(tables: Tables, camera: str | None = None, axes: Axes | None = None) -> Axes:
+def plot_residuals_by_radius(tables: Tables, camera: str | None = None, ax: Axes | None = None) -> Axes:
     """Mean radial and tangential residuals by distance from the principal point, with bars of two sigmas."""
-    return _drawn(draw_residuals_by_radius, tables, camera, axes)
+    return _drawn(draw_residuals_by_radius, tables, camera, ax)
 
 
-def plot_station_residuals(tables: Tables, axes: Axes | None = None) -> Axes:
+def plot_station_residuals(tables: Tables, ax: Axes | None = None) -> Axes:
     """Residuals of camera stations in the order of the flight. Raises InputError where none was observed."""
     if not len(tables.adjusted.block.stations.who):
         raise InputError("the block has no observed stations to be drawn")
-    axes = axes_or_new(axes)
-    draw_station_residuals(axes, tables)
-    return axes
+    ax = axes_or_new(ax)
+    draw_station_residuals(ax, tables)
+    return ax
 
 
-def plot_check_points(tables: Tables, axes: Axes | None = None, *, upright: bool = False) -> Axes:
+def plot_check_points(tables: Tables, ax: Axes | None = None, *, upright: bool = False) -> Axes:
     """Discrepancies at check points, surveyed minus computed: in plan, or in height where `upright`.
 
     Raises InputError where there are no check points.
     """
     if not len(tables.check_points):
         raise InputError("the block has no check points to be drawn")
-    axes = axes_or_new(axes)
-    draw_check_points(axes, tables, upright)
-    return axes
+    ax = axes_or_new(ax)
+    draw_check_points(ax, tables, upright)
+    return ax
 
 
-def plot_interior_correlation(tables: Tables, camera: str | None = None, axes: Axes | None = None) -> Axes:
+def plot_interior_correlation(tables: Tables, camera: str | None = None, ax: Axes | None = None) -> Axes:
     """Correlation of the interior orientation with itself."""
-    return _drawn(draw_interior_correlation, tables, camera, axes)
+    return _drawn(draw_interior_correlation, tables, camera, ax)
 
 
-def plot_exterior_correlation(tables: Tables, camera: str | None = None, axes: Axes | None = None) -> Axes:
+def plot_exterior_correlation(tables: Tables, camera: str | None = None, ax: Axes | None = None) -> Axes:
     """Mean absolute correlation of exterior and interior orientation over the images."""
-    return _drawn(draw_exterior_correlation, tables, camera, axes)
+    return _drawn(draw_exterior_correlation, tables, camera, ax)
 
 
-def plot_error_ellipses(tables: Tables, axes: Axes | None = None) -> Axes:
+def plot_error_ellipses(tables: Tables, ax: Axes | None = None) -> Axes:
     """Standard error ellipses of the projection centres in plan, enlarged; their colours are sigmas in height."""
-    axes = axes_or_new(axes)
-    draw_error_ellipses(axes, tables)
-    return axes
+    ax = axes_or_new(ax)
+    draw_error_ellipses(ax, tables)
+    return ax
 
 
 def plot_sigma_map(
-    tables: Tables, camera: str | None = None, axes: Axes | None = None, *, distance_m: float = float("inf")
+    tables: Tables, camera: str | None = None, ax: Axes | None = None, *, distance_m: float = float("inf")
 ) -> Axes:
     """How sure the camera is of where it sees a point at a distance, over its format (`jaxphoto.sigma_map`)."""
     name = one_camera(tables.adjusted.block, camera)
     one = sigma_map(tables.adjusted, name, distance_m=distance_m)
-    return draw_sigma_map(axes_or_new(axes), tables.adjusted.block.sensors[name], one)
+    return draw_sigma_map(axes_or_new(ax), tables.adjusted.block.sensors[name], one)
 
 
-def plot_distortion(tables: Tables, camera: str | None = None, axes: Axes | None = None) -> Axes:
+def plot_distortion(tables: Tables, camera: str | None = None, ax: Axes | None = None) -> Axes:
     """Radial distortion against the distance from the principal point, with its 95 % band, and the rest of it."""
-    axes = axes_or_new(axes)
-    draw_curve(axes, curve_of(tables, camera), 1.0)
-    return axes
+    ax = axes_or_new(ax)
+    draw_curve(ax, curve_of(tables, camera), 1.0)
+    return ax
 
 
-def plot_distortion_band(tables: Tables, camera: str | None = None, axes: Axes | None = None) -> Axes:
+def plot_distortion_band(tables: Tables, camera: str | None = None, ax: Axes | None = None) -> Axes:
     """Half the width of the 95 % band of the radial distortion against the distance from the principal point."""
-    axes = axes_or_new(axes)
-    draw_band(axes, curve_of(tables, camera))
-    return axes
+    ax = axes_or_new(ax)
+    draw_band(ax, curve_of(tables, camera))
+    return ax
 
 
 def curve_of(tables: Tables, camera: str | None = None) -> DistortionCurve:

@@ -46,38 +46,38 @@ _INCHES_PX = 96
 _BOLD = 0.6
 
 
-def to_plotly(axes: Axes) -> Figure:
+def to_plotly(ax: Axes) -> Figure:
     """The twin of matplotlib axes, flat or in space: lines, markers, arrows, areas, rasters, texts, axes and legend.
 
     Every `plot_...` returns such axes, and axes of a user's own will do. Values show where the pointer is; colour
     bars come along. Warns of what the axes hold that has no twin. Raises InputError for axes of another kind (polar).
     """
-    if axes.name not in ("rectilinear", "3d"):
-        raise InputError(f"axes are {axes.name}; twins in plotly are of flat ones and of those in space")
+    if ax.name not in ("rectilinear", "3d"):
+        raise InputError(f"axes are {ax.name}; twins in plotly are of flat ones and of those in space")
     # Here, because importing plotly takes half a second that most uses of jaxphoto need not wait for.
     from plotly.graph_objects import Figure
 
     # Arrows and labels find their place when they are drawn.
-    axes.figure.canvas.figure.draw_without_rendering()
-    width, height = _size_px(axes)
+    ax.figure.canvas.figure.draw_without_rendering()
+    width, height = _size_px(ax)
     layout: dict[str, Any] = {
-        "title": {"text": shown(" ".join(filter(None, (axes.get_title(loc) for loc in ("left", "center", "right")))))},
+        "title": {"text": shown(" ".join(filter(None, (ax.get_title(loc) for loc in ("left", "center", "right")))))},
         "width": round(width),
         "height": round(height),
-        "showlegend": axes.get_legend() is not None,
+        "showlegend": ax.get_legend() is not None,
         "template": "simple_white",
     }
-    if hasattr(axes, "get_zlim"):
-        scene = {f"{a}axis": {"title": {"text": getattr(axes, f"get_{a}label")()}} for a in "xyz"}
-        for artist in axes.collections:
+    if hasattr(ax, "get_zlim"):
+        scene = {f"{a}axis": {"title": {"text": getattr(ax, f"get_{a}label")()}} for a in "xyz"}
+        for artist in ax.collections:
             say(artist)
-        traces = [trace for line in axes.lines if line.get_visible() for trace in _in_space(line)]
+        traces = [trace for line in ax.lines if line.get_visible() for trace in _in_space(line)]
         return Figure(data=traces, layout=layout | {"scene": {"aspectmode": "data", **scene}})
-    layout |= {"xaxis": axis_of(axes, "x"), "yaxis": axis_of(axes, "y"), "annotations": list(texts_of(axes))}
-    if axes.get_aspect() != "auto":
-        layout["yaxis"] |= {"scaleanchor": "x", "scaleratio": float(axes.get_aspect()), "constrain": "domain"}
+    layout |= {"xaxis": axis_of(ax, "x"), "yaxis": axis_of(ax, "y"), "annotations": list(texts_of(ax))}
+    if ax.get_aspect() != "auto":
+        layout["yaxis"] |= {"scaleanchor": "x", "scaleratio": float(ax.get_aspect()), "constrain": "domain"}
         layout["xaxis"] |= {"constrain": "domain"}
-    return Figure(data=list(_flat(axes)), layout=layout)
+    return Figure(data=list(_flat(ax)), layout=layout)
 
 
 def _size_px(axes: Axes) -> tuple[float, float]:

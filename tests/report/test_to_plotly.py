@@ -32,7 +32,7 @@ def xy(trace) -> np.ndarray:
 
 @pytest.mark.parametrize("name", _PICTURES)
 def test_every_picture_of_a_report_has_its_twin(name, axes):
-    getattr(report, name)(Tables(adjusted("cross")), axes=axes)
+    getattr(report, name)(Tables(adjusted("cross")), ax=axes)
     found = to_plotly(axes)
     assert len(found.data)
     assert found.layout.xaxis.range == pytest.approx(axes.get_xlim())
