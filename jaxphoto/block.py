@@ -33,7 +33,7 @@ from jaxphoto.observations import (
     SurfaceRows,
 )
 from jaxphoto.short_repr import block_html, block_repr, from_upstairs
-from jaxphoto.unknowns import FIXED, FREE, Unknowns, Weighted, with_prior
+from jaxphoto.unknowns import FIXED, FREE, Unknowns, weighted, with_prior
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -139,7 +139,7 @@ class Block(eqx.Module):
 
         Names are those of tables (`c_mm`, `k1`), fields of mounts and strips (`lever_arm`, `shift`), and `position`,
         `rotation` (all images) and `points`. `of` names the camera, mount or strip; all that have it without. Raises
-        InputError for a parameter that the block has not.
+        InputError for a parameter that the block has not, and where none is named.
         """
         return self._with_priors(names, lambda start: FIXED, of)
 
@@ -151,14 +151,20 @@ class Block(eqx.Module):
         """A copy in which a parameter is observed with `sigma`, in its own unit (mm, m, rad), names as in `fix`.
 
         The observed `value` is the start value unless one is given; that of all positions, rotations or points has to
-        be.
+        be. Raises InputError for a sigma that is not above zero, and for what is no number or of another shape.
         """
         if value is None and name in ("position", "rotation", "points"):
             raise InputError(f"weigh({name!r}) needs a value beside its sigma: where it starts, nobody observed it")
-        return self._with_priors((name,), lambda start: Weighted(start if value is None else value, sigma), of)
+        return self._with_priors(
+            (name,), lambda start: weighted(name, start, start if value is None else value, sigma), of
+        )
 
     def _with_priors(self, names: tuple[str, ...], prior_of: Callable[[Any], Any], of: str | None) -> "Block":
         priors = self.priors
+        for name in names or ("",):
+            if not isinstance(name, str) or not name:
+                asked = f"{name!r} is no parameter" if names else "no parameter is named"
+                raise InputError(f"{asked}: give names with commas between, such as c_mm, k1, lever_arm, position")
         for name in names:
             priors = with_prior(priors, name, prior_of, self.start.unknowns, of)
         return dataclasses.replace(self, priors=priors)

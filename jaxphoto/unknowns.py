@@ -19,7 +19,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxphoto.arrays import Numbers
+from jaxphoto.arrays import Numbers, still
 from jaxphoto.camera import (
     CameraRates,
     CameraSpline,
@@ -183,6 +183,28 @@ def default_priors(unknowns: Unknowns) -> Unknowns:
     return eqx.tree_at(places, priors, (FREE, FREE, FREE))
 
 
+def weighted(name: str, start: Any, value: Any, sigma: Any) -> Weighted:
+    """The prior of a parameter that was observed as `value` with `sigma`; arrays have the shape of its `start`.
+
+    Raises InputError, which names the parameter, for what no observation can be.
+    """
+    shape, turns = np.shape(start), np.ndim(start) > 2
+    for what, given, whole in (("value", value, shape), ("sigma", sigma, shape[:-1] if turns else shape)):
+        known = still(given)
+        if isinstance(known, jax.core.Tracer):
+            continue
+        if known.dtype.kind not in "iuf" or not np.isfinite(known).all():
+            raise InputError(f"{name}: its {what} is {' '.join(str(given).split()):.60}: give a finite number")
+        if what == "sigma" and (bad := known[known <= 0]).size:
+            raise InputError(
+                f"{name}: its sigma is {bad[0]:g}: give one above zero, or hold the parameter with fix({name!r})"
+            )
+        if known.shape != whole[len(whole) - known.ndim :]:
+            more = f", or an array of the shape {whole}" if whole else ""
+            raise InputError(f"{name}: its {what} is an array of the shape {known.shape}: give one number{more}")
+    return Weighted(value, sigma)
+
+
 # What has one prior for all images or all points, by the names that `with_prior` has for it.
 _WHOLE: dict[str, Callable[[Unknowns], Any]] = {
     "position": lambda u: u.exterior.position,
@@ -203,7 +225,9 @@ def with_prior(
     `of` is the owner, such as a camera or a strip; without it, it is done for each that has such a parameter. Raises
     InputError where none has.
     """
-    if name in _WHOLE and of is None:
+    if name in _WHOLE and of is not None:
+        raise InputError(f"{name} has one prior for the whole block, not one of {of!r}: leave the owner out")
+    if name in _WHOLE:
         return eqx.tree_at(_WHOLE[name], priors, prior_of(_WHOLE[name](start)))
     known, label = [], _FIELDS.get(name, name)
     interior, tables, done = dict(priors.interior), priors.tables, False

@@ -100,7 +100,21 @@ def test_of_several_owners_one_is_named_or_all_are_meant():
         ),
         (lambda b: b.free("k1", of="sony"), "nothing is called 'sony'; parameters are of one"),
         (lambda b: b.fix("a1", of="one"), "there is no parameter 'a1' of 'one'; there are c_mm"),
+        (lambda b: b.fix("points", of="one"), "points has one prior for the whole block, not one of 'one'"),
+        (lambda b: b.fix(), "no parameter is named: give names"),
+        (lambda b: b.free(""), "'' is no parameter: give names"),
+        (lambda b: b.fix(["k1", "k2"]), r"\['k1', 'k2'\] is no parameter: give names with commas between"),
         (lambda b: b.weigh("points", 0.1), r"weigh\('points'\) needs a value beside its sigma"),
+        (lambda b: b.weigh("c", -1), r"c: its sigma is -1: give one above zero, or hold .* fix\('c'\)"),
+        (lambda b: b.weigh("c", 0), "c: its sigma is 0: give one above zero"),
+        (lambda b: b.weigh("c", float("nan")), "c: its sigma is nan: give a finite number"),
+        (lambda b: b.weigh("c", None), "c: its sigma is None: give a finite number"),
+        (lambda b: b.weigh("c", 0.1, value=np.inf), "c: its value is inf: give a finite number"),
+        (lambda b: b.weigh("c", [0.1, 0.2]), r"c: its sigma is an array of the shape \(2,\): give one number$"),
+        (
+            lambda b: b.weigh("position", 0.1, np.zeros((2, 2))),
+            r"position: its value is an array of the shape \(2, 2\): give one number, or an array of the shape",
+        ),
     ],
 )
 def test_what_is_not_there_is_named(call, message):
