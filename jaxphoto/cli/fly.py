@@ -14,6 +14,7 @@ from jaxphoto.cli.app import app
 from jaxphoto.cli.choices import one_of
 from jaxphoto.cli.console import plain_console
 from jaxphoto.cli.exposure_options import heights_of, lever_arm_of, map_codes
+from jaxphoto.cli.made import typed
 from jaxphoto.cli.progress import FEWER_PAIRS, StepsLeft
 from jaxphoto.cli.provenance import Provenance
 from jaxphoto.errors import InputError, counted
@@ -43,6 +44,7 @@ from jaxphoto.writing import check_folder, whole_folder
 
 @app.command("fly")
 def fly_command(
+    context: typer.Context,
     photographs: Annotated[list[Path], typer.Argument(help="Folders of photographs, or photographs, of one camera.")],
     out: Annotated[Path, typer.Option(help="Folder for blocks and results; earlier results in it are replaced.")],
     pairs: Annotated[
@@ -194,6 +196,7 @@ def fly_command(
                 signed.inputs,
                 signed.told,
                 datetime.date.today().isoformat(),
+                typed(context),
             )
             sign = lambda part, folder: signed.write(part.adjusted.block.images, folder)  # noqa: E731
             verdict = write_flight(flight, reports, spoilt, work, source, sign)

@@ -18,10 +18,10 @@ _READ = (".csv", ".json", ".toml", ".py")
 def made_by(context: typer.Context, *inputs: Path | None) -> Made:
     """The command with its options, and the hashes of the files and folders that it reads, as they are now."""
     given = [path for path in inputs if path is not None]
-    return Made(_typed(context), [f for path in given for f in _files(path)])
+    return Made(typed(context), [f for path in given for f in _files(path)])
 
 
-def _typed(context: typer.Context) -> str:
+def typed(context: typer.Context) -> str:
     """The command as it is typed, with all options, defaults too; where results lie is not how they were made."""
     words = ["jaxphoto", str(context.info_name)]
     for parameter in context.command.params:

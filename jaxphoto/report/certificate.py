@@ -19,7 +19,7 @@ from jaxphoto.report.certified import Certified
 from jaxphoto.report.change import change_verdict
 from jaxphoto.report.digits import with_sigma
 from jaxphoto.report.document import Document, DocumentPicture, Element, Heading, Paragraph, Pictures, Rows
-from jaxphoto.report.findings import as_sentence
+from jaxphoto.report.findings import as_sentence, symbol
 from jaxphoto.report.made import option_word
 from jaxphoto.report.rolling_shutter import readout_of
 from jaxphoto.stability import LEVEL, NORMAL_95, Method, change, distortion_curve, format_sigma, image_grid
@@ -204,7 +204,7 @@ def _correlations(given: Certified) -> Iterator[Element]:
     free = np.flatnonzero(sigma > 0)
     names = [parameter_names(given.interior)[k] for k in free]
     rho = given.covariance[np.ix_(free, free)] / sigma[free, None] / sigma[free]
-    high = [f"{a} and {b} {r:+.3f}" for a, b, r in high_pairs(names, rho, _HIGH)]
+    high = [f"{symbol(a)} and {symbol(b)} {r:+.3f}" for a, b, r in high_pairs(names, rho, _HIGH)]
     said = f"Above {_HIGH}: {', '.join(high)}." if high else f"None is above {_HIGH}."
     yield Pictures(
         (DocumentPicture(lambda axes: draw_correlations(axes, names, rho), f"Matrix of correlations. {said}", 3.6),)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import pandas as pd
 
-from jaxphoto.report.findings import Verdict
+from jaxphoto.report.findings import Verdict, as_sentence
 from jaxphoto.report.table_files import head_of, readable
 from jaxphoto.report.tables import Tables
 
@@ -37,7 +37,12 @@ class Rows(NamedTuple):
 
 def finding_paragraphs(verdict: Verdict) -> list[Paragraph]:
     """The findings, each as what it is: alarm, warning, information."""
-    return [Paragraph(f.text, f.level.name.lower()) for f in verdict.findings]
+    return [Paragraph(as_sentence(f.text), f.level.name.lower()) for f in verdict.findings]
+
+
+def verdict_paragraphs(verdict: Verdict) -> list[Paragraph]:
+    """The verdict in its colour, and what it follows from."""
+    return [Paragraph(as_sentence(verdict.headline), f"verdict {verdict.colour}"), *finding_paragraphs(verdict)]
 
 
 def rows_of(table: pd.DataFrame) -> Rows:

@@ -21,6 +21,7 @@ class Level(enum.IntEnum):
 
 
 MARKS = {Level.INFORMATION: "-", Level.WARNING: "!", Level.ALARM: "!!"}
+_SYMBOLS = {"c_mm": "c", "xp_mm": "x_p", "yp_mm": "y_p"}
 COLOURS = {Level.INFORMATION: "green", Level.WARNING: "amber", Level.ALARM: "red"}
 
 
@@ -77,16 +78,21 @@ class Verdict(NamedTuple):
 
 
 def as_sentence(text: str) -> str:
-    """A finding as it stands among others on a page: with a capital, but for symbols such as c, and a full stop."""
+    """A finding as it stands among others on a page: with a capital, but for symbols such as c and k2, and a full stop."""
     first = text.split(maxsplit=1)[0] if text.strip() else ""
-    begun = text if len(first) == 1 or "_" in first else f"{text[:1].upper()}{text[1:]}"
+    begun = text if len(first) == 1 or re.search(r"[_\d]", first) else f"{text[:1].upper()}{text[1:]}"
     return begun if begun.endswith((".", "!", "?")) else f"{begun}."
+
+
+def symbol(parameter: str) -> str:
+    """A parameter as papers and sentences call it: c, which tables name with its unit, c_mm."""
+    return _SYMBOLS.get(parameter, parameter)
 
 
 def parameter_words(path: str) -> str:
     """The parameter at a path, as a sentence calls it: k1 of camera kodak."""
     of_camera = re.fullmatch(r"interior\[(.*)\]\.(\w+)", path)
-    return f"{of_camera[2]} of {camera_words(of_camera[1])}" if of_camera else path
+    return f"{symbol(of_camera[2])} of {camera_words(of_camera[1])}" if of_camera else path
 
 
 def p_words(p_value: float, digits: int = 1) -> str:

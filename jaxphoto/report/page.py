@@ -14,11 +14,19 @@ from markupsafe import Markup
 from jaxphoto.errors import camera_words
 from jaxphoto.observations import AXES
 from jaxphoto.report.certificate_figures import draw_band, draw_curve
-from jaxphoto.report.document import BlockInSpace, DocumentPicture, Heading, Paragraph, Pictures, rows_of
+from jaxphoto.report.document import (
+    BlockInSpace,
+    DocumentPicture,
+    Heading,
+    Paragraph,
+    Pictures,
+    rows_of,
+    verdict_paragraphs,
+)
 from jaxphoto.report.document_html import contents, html_of
 from jaxphoto.report.error_ellipses import ellipses_figure
 from jaxphoto.report.figures import curve_of
-from jaxphoto.report.findings import Verdict
+from jaxphoto.report.findings import Verdict, as_sentence
 from jaxphoto.report.made import PROVENANCE, Made, made_section
 from jaxphoto.report.maps import png_of
 from jaxphoto.report.object_points import points_section
@@ -42,8 +50,7 @@ if TYPE_CHECKING:
 
 _PAGE = """{{ head(title) }}<body>
 <h1>{{ title }}</h1>
-<p class="verdict {{ verdict.colour }}"><b>{{ verdict.headline }}</b></p>
-{% for f in verdict.findings %}<p class="{{ f.level.name.lower() }}">{{ f.text }}</p>{% endfor %}
+{% for e in verdict %}{{ e }}{% endfor %}
 <p>{{ outcome }} ({{ steps }} iterations)</p>
 <p>&sigma;<sub>0</sub> = <b>{{ sigma0 }}</b>, redundancy {{ redundancy }}: {{ counts }}.
 Standard deviations are a posteriori (times &sigma;<sub>0</sub>). Correlations refer to the rotations
@@ -85,13 +92,13 @@ def report_page(tables: Tables, verdict: Verdict, made: Made | None = None) -> s
         .render(
             head=page_head,
             title=a.block.title or "jaxphoto adjustment",
-            outcome=a.outcome.value,
+            outcome=as_sentence(a.outcome.value).removesuffix("."),
             steps=int(a.steps),
             sigma0=f"{float(a.sigma0):.6g}",
             redundancy=a.redundancy,
             counts=", ".join(counts) + f"; {sum(a.n_unknowns.values())} unknowns",
             rotations=tables.rotations.replace("_", ", "),
-            verdict=verdict,
+            verdict=[html_of(e) for e in verdict_paragraphs(verdict)],
             contents=contents([heading for heading, body in sections]),
             sections=[(html_of(Heading(heading)), body) for heading, body in sections],
         )

@@ -13,7 +13,7 @@ from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
 from jaxphoto.errors import camera_words, counted
 from jaxphoto.observations import PRIORS
 from jaxphoto.procedures.adjust import ABSURD
-from jaxphoto.report.findings import Finding, Level, p_words, parameter_words
+from jaxphoto.report.findings import Finding, Level, p_words, parameter_words, symbol
 from jaxphoto.report.tables import Tables, in_file_unit
 from jaxphoto.statistics import (
     DELTA0,
@@ -288,7 +288,7 @@ def of_what_is_not_checked(tables: Tables) -> Iterator[Finding]:
             "nowhere",
         )
     if felt := [f for f in most_felt(adjusted, tables.undetected) if f.moved > _MOVED]:
-        told = ", ".join(f"{f.parameter} by up to {f.moved:.1f} of its sigma ({f.words})" for f in felt)
+        told = ", ".join(f"{symbol(f.parameter)} by up to {f.moved:.1f} of its sigma ({f.words})" for f in felt)
         yield Finding(Level.INFORMATION, f"an error that no test finds (power 80 %) would move {told}")
     yield from _hidden_in_common(tables)
     for hidden in worst_checked(adjusted, tables.redundancy):

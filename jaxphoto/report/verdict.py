@@ -19,7 +19,7 @@ from jaxphoto.procedures.adjust import left_out_words
 from jaxphoto.report.behind import behind_findings
 from jaxphoto.report.camera_drift import drift_findings
 from jaxphoto.report.doubled import doubled_findings
-from jaxphoto.report.findings import Finding, Level, Verdict
+from jaxphoto.report.findings import Finding, Level, Verdict, symbol
 from jaxphoto.report.ground import ground_findings
 from jaxphoto.report.residual_findings import (
     NOTHING_FITS,
@@ -121,11 +121,11 @@ def _not_significant(tables: Tables, s: Significance) -> Finding:
     sensor = adjusted.block.sensors[s.camera]
     others = {name: abs(v) for name, v in change.in_sigmas.items() if name != s.parameter}
     most = max(others, key=lambda name: others[name], default="")
-    moved = f"{most} by {others[most]:.1f} of its sigma and " if most else ""
+    moved = f"{symbol(most)} by {others[most]:.1f} of its sigma and " if most else ""
     pixels = f"{change.corner_mm / sensor.pixel_mm:.2g} px" if sensor.pixel_mm else f"{change.corner_mm:.2g} mm"
     return Finding(
         Level.INFORMATION,
-        f"{s.parameter} of {camera_words(s.camera)} may be zero (p = {s.p_value:.2g}); held there, it would move "
+        f"{symbol(s.parameter)} of {camera_words(s.camera)} may be zero (p = {s.p_value:.2g}); held there, it would move "
         f"{moved}the corner of the image by {pixels}",
     )
 
@@ -148,7 +148,7 @@ def _correlated(
         usual = "usual where targets alone orient an image, their effects on it cancel"
     pairs = high_pairs(c.parameters, c.interior, HIGH_CORRELATION)
     if pairs:
-        names = few([f"{a} and {b} {rho:+.3f}" for a, b, rho in pairs])
+        names = few([f"{symbol(a)} and {symbol(b)} {rho:+.3f}" for a, b, rho in pairs])
         yield Finding(
             Level.INFORMATION,
             f"high correlation within the interior orientation of {camera_words(camera)}: {names}; a change of one "
@@ -162,7 +162,9 @@ def _correlated(
     if high:
         images = [c.images[int(np.abs(c.exterior[:, i, j]).argmax())] for i, j in high]
         where = zip(high, images, strict=True)
-        names = few([f"{c.eop_names[i]} with {c.parameters[j]} {worst[i, j]:.3f} (image {k})" for (i, j), k in where])
+        names = few(
+            [f"{c.eop_names[i]} with {symbol(c.parameters[j])} {worst[i, j]:.3f} (image {k})" for (i, j), k in where]
+        )
         open_ = [p for p in dict.fromkeys(c.parameters[j] for _, j in high) if p in felt]
         cures = [_OF_A_FIELD] if field else list(dict.fromkeys(_CURES.get(p, _OF_DISTORTION) for p in open_))
         said = (

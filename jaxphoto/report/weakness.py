@@ -13,6 +13,7 @@ import numpy as np
 
 from jaxphoto.adjustment import Adjustment, yardsticks
 from jaxphoto.errors import camera_words
+from jaxphoto.report.findings import symbol
 from jaxphoto.report.tables import Tables
 from jaxphoto.statistics import Correlations
 from jaxphoto.unknowns import FIXED
@@ -80,7 +81,7 @@ def weaknesses(tables: Tables, camera: str, c: Correlations) -> list[Weakness]:
     shift = max((corner[name] for name in _POINT if name in corner), default=0.0)
     if max(turned, moved) > WEAK_CORRELATION and shift > FELT:
         why, cure = _stations(adjusted, images, (0, 1))
-        sigmas = ", ".join(f"sigma of {name} {sigma[name]:.3g} mm" for name in _POINT if name in sigma)
+        sigmas = ", ".join(f"sigma of {symbol(name)} {sigma[name]:.3g} mm" for name in _POINT if name in sigma)
         sentence = (
             f"the principal point of {camera_words(camera)} is hardly determined: {sigmas}, |rho| with "
             f"{' and '.join(c.eop_names[_TILTS])} up to {turned:.4f}, with X and Y up to {moved:.4f}; over {geometry} "

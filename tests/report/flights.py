@@ -56,4 +56,5 @@ def source() -> FlightSource:
         (InputFile("i0.jpg", 3, "0" * 64), InputFile("survey.csv", 5, "ab" * 32)),
         {"method": {"command": "fly", "features": 500, "epsg": None}},
         "2024-05-02",
+        "jaxphoto fly photographs",
     )

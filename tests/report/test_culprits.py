@@ -36,7 +36,7 @@ def test_a_term_that_is_held_is_told_before_the_observations_that_it_accuses(wit
 
 def test_parameters_are_called_as_people_call_them(without_k2):
     told = " ".join(without_k2.texts)
-    assert "k1 of camera one would move by" in told or "c_mm of camera one would move by" in told
+    assert "k1 of camera one would move by" in told or "c of camera one would move by" in told
     assert "interior[" not in told
 
 

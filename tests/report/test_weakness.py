@@ -43,7 +43,7 @@ def test_a_field_of_known_targets_has_cures_of_its_own(monkeypatch):
 
 def test_a_high_correlation_that_no_image_feels_has_no_cure():
     """Stations that all shift alike: Z and c go together, and c is known well enough."""
-    said = [f for f in verdict_of(tables(0.1, 1.0)).findings if "Z with c_mm" in f.text]
+    said = [f for f in verdict_of(tables(0.1, 1.0)).findings if "Z with c " in f.text]
     assert [f.level for f in said] == [verdict.Level.INFORMATION]
     assert said[0].text.endswith("what is open moves no corner of an image by 10 of its sigmas")
 
@@ -65,11 +65,11 @@ def test_flat_ground_without_stations_is_put_into_words():
     assert rho[2, 0] > 0.99
     assert "relief 1 %" in c or "relief 2 %" in c
     assert point.startswith("the principal point of camera one")
-    assert f"sigma of yp_mm {significance['yp_mm'].sigma:.3g} mm" in point
+    assert f"sigma of y_p {significance['yp_mm'].sigma:.3g} mm" in point
     assert f"omega and phi up to {rho[3:5, 1:].max():.4f}" in point
     assert all(cure in point for cure in ("stations (GNSS)", "relief", "oblique", "hold it fixed"))
     # Said once: no second warning of the same pairs.
-    for pair in ("Z with c_mm", "X with xp_mm", "Y with xp_mm", "X with yp_mm", "Y with yp_mm"):
+    for pair in ("Z with c ", "X with x_p", "Y with x_p", "X with y_p", "Y with y_p"):
         assert not any(pair in w for w in found)
 
 

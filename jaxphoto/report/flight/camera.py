@@ -11,7 +11,7 @@ from jaxphoto.report.alike import with_alike
 from jaxphoto.report.certificate import with_sigma
 from jaxphoto.report.certificate_figures import draw_correlations, draw_curve
 from jaxphoto.report.document import DocumentPicture, Element, Heading, Paragraph, Pictures, Rows
-from jaxphoto.report.findings import as_sentence
+from jaxphoto.report.findings import as_sentence, symbol
 from jaxphoto.report.flight.part import PartReport
 from jaxphoto.report.flight.source import FlightSource
 from jaxphoto.report.ground import ground_findings
@@ -105,7 +105,7 @@ def correlation_sentences(report: PartReport, camera: str) -> Iterator[str]:
         yield "Nothing of the camera was estimated, so nothing goes with it."
         return
     pairs = high_pairs(c.parameters, c.interior, HIGH)
-    told = ", ".join(f"{a} with {b} {rho:+.3f}" for a, b, rho in pairs)
+    told = ", ".join(f"{symbol(a)} with {symbol(b)} {rho:+.3f}" for a, b, rho in pairs)
     yield (
         f"Within the camera, above {HIGH:g}: {told}. A change of one makes good for the other: only together do they "
         "mean anything."
@@ -116,7 +116,7 @@ def correlation_sentences(report: PartReport, camera: str) -> Iterator[str]:
         i, j = np.unravel_index(int(c.mean_abs.argmax()), c.mean_abs.shape)
         image = c.images[int(np.abs(c.exterior[:, i, j]).argmax())]
         yield (
-            f"With the exterior orientation it is highest of {c.parameters[j]} with {c.eop_names[i]}: "
+            f"With the exterior orientation it is highest of {symbol(c.parameters[j])} with {c.eop_names[i]}: "
             f"{c.mean_abs[i, j]:.2f} on average over the photographs, {c.max_abs[i, j]:.3f} at most ({image})."
         )
     yield from (as_sentence(f.text) for f in ground_findings(report.tables))

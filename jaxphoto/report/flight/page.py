@@ -6,7 +6,7 @@ import numpy as np
 from jinja2 import Environment
 
 from jaxphoto.report.alike import with_alike
-from jaxphoto.report.document import BlockInSpace, Element, Heading, Paragraph, Rows, finding_paragraphs
+from jaxphoto.report.document import BlockInSpace, Element, Heading, Paragraph, Rows, verdict_paragraphs
 from jaxphoto.report.document_html import contents, html_of
 from jaxphoto.report.findings import Verdict, as_sentence
 from jaxphoto.report.flight.camera import camera_section, interior_rows
@@ -28,8 +28,7 @@ from jaxphoto.report.positional_accuracy import class_sentences
 
 _PAGE = """{{ head(title) }}<body>
 <h1>{{ title }}</h1>
-<p class="verdict {{ verdict.colour }}"><b>{{ verdict.headline }}</b></p>
-{% for f in verdict.findings %}<p class="{{ f.level.name.lower() }}">{{ f.text }}</p>{% endfor %}
+{% for e in verdict %}{{ e }}{% endfor %}
 {{ contents }}
 {% for e in elements %}{{ e }}
 {% endfor %}
@@ -61,7 +60,7 @@ def flight_page(
         .render(
             head=page_head,
             title=f"Flight report: {reports[0].part.adjusted.block.title}",
-            verdict=verdict,
+            verdict=[html_of(e) for e in verdict_paragraphs(verdict)],
             contents=contents([*headings, "Files"]),
             elements=[html_of(e) for e in elements],
             folders=folders,
@@ -138,8 +137,7 @@ def _short(report: PartReport, number: int, source: FlightSource) -> Iterable[El
     """A smaller part: findings, camera, offsets, surveyed points, and how it was oriented."""
     part = report.part
     yield Heading(f"Part {number}")
-    yield Paragraph(report.verdict.headline, f"verdict {report.verdict.colour}")
-    yield from finding_paragraphs(report.verdict)
+    yield from verdict_paragraphs(report.verdict)
     yield interior_rows(report, source.start)
     yield from (Paragraph(as_sentence(s)) for s in part.lens)
     used = report.images[report.images["position"] == "used"]

@@ -36,14 +36,11 @@ def _rows(source: FlightSource) -> Iterator[tuple[str, str]]:
                 yield name, said
         # What no photograph says is told in the certificate.
         yield from told_conditions(source.conditions)
-    method = dict(source.told.get("method", {}))
+    if source.command:
+        yield "command", source.command
+    method = {k: v for k, v in dict(source.told.get("method", {})).items() if k != "command" and v is not None}
     if method:
-        command = method.pop("command", "")
-        yield (
-            "command",
-            f"jaxphoto {command}, with "
-            + ", ".join(f"{k} {option_word(v)}" for k, v in method.items() if v is not None),
-        )
+        yield "options as used", ", ".join(f"{k} {option_word(v)}" for k, v in method.items())
     yield "versions", ", ".join(f"{name} {number}" for name, number in versions().items())
     if source.inputs:
         yield f"SHA-256 of all {len(source.inputs)} inputs", digest_of_all(source.inputs)

@@ -27,3 +27,5 @@ class FlightSource(NamedTuple):
     """How the results came about: goes into the summaries as it is."""
     written: str = ""
     """The date of the results."""
+    command: str = ""
+    """As it is typed."""
