@@ -78,7 +78,7 @@ class Verdict(NamedTuple):
 
 
 def as_sentence(text: str) -> str:
-    """A finding as it stands among others on a page: with a capital, but for symbols such as c and k2, and a full stop."""
+    """A finding as it stands among others on a page: with a capital, but for symbols (c, k2), and a full stop."""
     first = text.split(maxsplit=1)[0] if text.strip() else ""
     begun = text if len(first) == 1 or re.search(r"[_\d]", first) else f"{text[:1].upper()}{text[1:]}"
     return begun if begun.endswith((".", "!", "?")) else f"{begun}."

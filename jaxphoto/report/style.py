@@ -68,7 +68,8 @@ figure.block { margin: .5rem 0 1rem } .plot { height: min(36rem, 75vh) }
   .name { color: inherit; text-decoration: none } .is-chosen > * { background: none !important }
   th:first-child, td:first-child { position: static }
   h1, h2, h3, nav { break-after: avoid } h2 + p, h3 + p { break-after: avoid }
-  thead { display: table-header-group } tr, img, figure, .alarm, .warning, .information, .verdict, nav { break-inside: avoid }
+  thead { display: table-header-group }
+  tr, img, figure, nav, .alarm, .warning, .information, .verdict { break-inside: avoid }
   p, li { orphans: 3; widows: 3 } img { max-height: 240mm; width: auto; object-fit: contain }
   .pictures { grid-template-columns: 1fr 1fr } .verdict { font-size: 12px } }
 """

@@ -125,8 +125,8 @@ def _not_significant(tables: Tables, s: Significance) -> Finding:
     pixels = f"{change.corner_mm / sensor.pixel_mm:.2g} px" if sensor.pixel_mm else f"{change.corner_mm:.2g} mm"
     return Finding(
         Level.INFORMATION,
-        f"{symbol(s.parameter)} of {camera_words(s.camera)} may be zero (p = {s.p_value:.2g}); held there, it would move "
-        f"{moved}the corner of the image by {pixels}",
+        f"{symbol(s.parameter)} of {camera_words(s.camera)} may be zero (p = {s.p_value:.2g}); held there, it would "
+        f"move {moved}the corner of the image by {pixels}",
     )
 
 
