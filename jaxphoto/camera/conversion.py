@@ -32,6 +32,19 @@ class Conversion(NamedTuple):
     max_px: float
     covered: float
     """The part of the format that was compared; below 1 where the given camera says nothing of its corners."""
+    worst_px: tuple[float, float] | None = None
+    """Column and row of the image point that is displaced most; None where the conversion is exact."""
+
+    @property
+    def lost(self) -> str:
+        """What the conversion loses, in words."""
+        if self.worst_px is None:
+            return "the conversion is exact"
+        column, row = self.worst_px
+        return (
+            f"fitted over the format: rms {self.rms_px:.3g} px, largest {self.max_px:.3g} px at column {column:.0f}, "
+            f"row {row:.0f}"
+        )
 
 
 def converted(
@@ -148,7 +161,8 @@ def _fit(
     solved = least_squares(residuals, begin[free], jacobian, method="lm", x_scale="jac", **_UNTIL)
     interior = _with(first, whole(solved.x))
     moved = np.asarray(call_compiled(_moved, _arrays(interior), *data[1:]))[: len(points)]
-    return Conversion(interior, float(np.sqrt(np.mean(moved**2))), float(np.max(moved)), 1.0)
+    column, row = sensor.px_from_mm(points[[np.argmax(moved)]])[0].tolist()
+    return Conversion(interior, float(np.sqrt(np.mean(moved**2))), float(np.max(moved)), 1.0, (column, row))
 
 
 def _padded(values: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ from jaxphoto.cli.app import app
 from jaxphoto.cli.choices import one_of
 from jaxphoto.cli.console import plain_console
 from jaxphoto.errors import InputError
-from jaxphoto.io.cameras import CAMERA_FORMATS, read_camera_file, write_camera_file
+from jaxphoto.io.cameras import CAMERA_FORMATS, CAMERA_MODELS, LOSS_PX, read_camera_file, write_camera_file
 from jaxphoto.writing import check_file
 
 
@@ -30,6 +30,11 @@ def camera_command(
     distortion: Annotated[
         str | None, one_of(AbstractDistortion.known(), help="Model in a block.toml; that of IN when not given.")
     ] = None,
+    model: Annotated[
+        str | None,
+        one_of(CAMERA_MODELS, help="Largest model of OUT's format to use; when not given, any that it needs."),
+    ] = None,
+    loss_px: Annotated[float, typer.Option(min=0, help="Most that a fit may miss, at its worst point.")] = LOSS_PX,
 ) -> None:
     """Convert a camera file: exactly where the models allow it, otherwise fitted, the residual stated in pixels."""
     check_file(out, source)
@@ -47,6 +52,8 @@ def camera_command(
         distortion=kind,
         covariance=read.covariance,
         reservation=read.note,
+        model=model,
+        loss_px=loss_px,
     )
     console = plain_console()
     console.print(
@@ -59,10 +66,7 @@ def camera_command(
         value = float(get_parameter(done.interior, name))
         if value != 0 or name == "c_mm":
             console.print(f"  {name} = {value:.9g}", soft_wrap=True)
-    if done.max_px == 0:
-        console.print("the conversion is exact", soft_wrap=True)
-    else:
-        console.print(f"fitted over the format: rms {done.rms_px:.3g} px, largest {done.max_px:.3g} px", soft_wrap=True)
+    console.print(done.lost, soft_wrap=True)
     if done.covered < 1:
         console.print(
             f"the given distortion folds in {1 - done.covered:.1%} of the format, which was left out", soft_wrap=True

@@ -190,7 +190,7 @@ def test_a_fit_finds_what_is_exact(to_opencv):
 
 def test_converted_takes_the_exact_way_where_it_may():
     brown = camera(USUAL[Brown])
-    assert converted(brown, Smac, SENSOR)[1:] == (0.0, 0.0, 1.0)
+    assert converted(brown, Smac, SENSOR)[1:] == (0.0, 0.0, 1.0, None)
     skewed = camera(OpenCv(k1=-0.1, b2=1e-3))
     assert converted(skewed, OpenCv, SENSOR).max_px == 0
     without = converted(skewed, OpenCv, SENSOR, ("b2",))

@@ -2,6 +2,14 @@
 
 from jaxphoto.io.cameras.camera_file import ASSUMED_PIXEL_MM, CameraFile
 from jaxphoto.io.cameras.camera_reader import read_camera_file
-from jaxphoto.io.cameras.camera_writer import CAMERA_FORMATS, write_camera_file
+from jaxphoto.io.cameras.camera_writer import CAMERA_FORMATS, CAMERA_MODELS, LOSS_PX, write_camera_file
 
-__all__ = ["ASSUMED_PIXEL_MM", "CAMERA_FORMATS", "CameraFile", "read_camera_file", "write_camera_file"]
+__all__ = [
+    "ASSUMED_PIXEL_MM",
+    "CAMERA_FORMATS",
+    "CAMERA_MODELS",
+    "LOSS_PX",
+    "CameraFile",
+    "read_camera_file",
+    "write_camera_file",
+]

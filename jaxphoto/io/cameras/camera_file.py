@@ -111,6 +111,10 @@ class CameraModel(NamedTuple):
     lacks: tuple[str, ...]
     projection: AbstractProjection
 
+    def only(self, *terms: str) -> "CameraModel":
+        """The part of it that has the coefficients `terms` alone."""
+        return self._replace(lacks=tuple(name for name in self.distortion.coefficients if name not in terms))
+
 
 def in_pixels(
     source: CameraSource,

@@ -35,6 +35,11 @@ MODELS = _PLANES | _FISHEYES
 PLANE = CameraModel(OpenCv, ("b2",), Perspective())
 FISHEYE = CameraModel(OpenCvFisheye, ("b2",), Equidistant())
 """What they are here."""
+PARTS = {
+    name: (PLANE if name in _PLANES else FISHEYE).only(*parameters, *["b1"] * ("fx" in parameters))
+    for name, parameters in MODELS.items()
+}
+"""What each of them is."""
 
 TEXT, BINARY = "cameras.txt", "cameras.bin"
 _COLUMNS = "CAMERA_ID MODEL WIDTH HEIGHT PARAMS"

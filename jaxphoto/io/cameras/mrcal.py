@@ -19,6 +19,8 @@ from jaxphoto.io.cameras.open_cv import ORDER, PLANE
 _PLACES = 4
 # Of each model the number of coefficients; those beyond k6 are of a thin prism.
 _MODELS = {"LENSMODEL_PINHOLE": 0} | {f"LENSMODEL_OPENCV{n}": n for n in (4, 5, 8, 12)}
+MODELS = {name: PLANE.only("b1", *ORDER[:n]) for name, n in _MODELS.items() if n <= len(ORDER)}
+"""What those are that are written."""
 
 
 def recognises(path: Path, text: str) -> bool:

@@ -36,6 +36,10 @@ _DEEPEST, _SIGNS = 100, 1_000
 PLANE = CameraModel(OpenCv, ("b2",), Perspective())
 FISHEYE = CameraModel(OpenCvFisheye, ("p1", "p2", "s1", "s2", "b2"), Equidistant())
 """What its cameras are here."""
+MODELS = {f"OPENCV{n}": PLANE.only("b1", *ORDER[:n]) for n in (4, 5, 8)} | {"FISHEYE": FISHEYE}
+"""Its models by the number of coefficients."""
+ROS_MODELS = dict(zip((*_ROS_PLANES, _ROS_FISHEYE), (MODELS["OPENCV5"], MODELS["OPENCV8"], FISHEYE), strict=True))
+"""What ROS calls those that it has."""
 
 
 def recognises(path: Path, text: str) -> bool:
@@ -138,8 +142,8 @@ def _is_deep(text: str) -> bool:
 
 def _camera(source: CameraSource, storage: cv2.FileStorage) -> CameraFile:
     kind = storage.getNode("distortion_model")
-    if not kind.empty() and kind.string() not in (*_ROS_PLANES, _ROS_FISHEYE):
-        known = ", ".join((*_ROS_PLANES, _ROS_FISHEYE))
+    if not kind.empty() and kind.string() not in ROS_MODELS:
+        known = ", ".join(ROS_MODELS)
         raise source.error(f"the distortion_model {quoted(kind.string())} is not known here; known are {known}")
     fisheye = _number(storage, "fisheye_model") not in (None, 0.0) or kind.string() == _ROS_FISHEYE
     matrix = _matrix(source, storage, "camera_matrix")
