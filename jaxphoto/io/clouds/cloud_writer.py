@@ -17,6 +17,7 @@ from jaxphoto.cloud import Cloud
 from jaxphoto.errors import InputError
 from jaxphoto.io.clouds.cloud_reader import open_source
 from jaxphoto.io.clouds.cloud_source import CHUNK, check_file
+from jaxphoto.io.clouds.copc import check_copc, is_copc, order_as_copc, without_octree
 from jaxphoto.io.clouds.las import opened, points_and_clouds
 from jaxphoto.io.clouds.placement import Placement
 from jaxphoto.io.clouds.table import RETURNS, XYZ
@@ -59,13 +60,16 @@ def write_cloud(
             raise InputError(f"{path.name} cannot be written like {Path(like).name}: both must be .las or .laz")
         source = open_source(like, epsg, unit)
         placement = Placement(source.name, source.system, frame)
+        _check_copc(Path(like), path)
         with _said_of(path), whole_file(path) as work:
             _write_like(cloud, work, Path(like), placement)
+            _ordered(work, path)
         return
     map_frame = frame if frame is not None and frame.kind == "epsg" else None
     with _said_of(path), whole_file(path) as work:
         if kind in _LAS:
             _write_las(cloud, work, map_frame)
+            _ordered(work, path)
         else:
             _WRITERS[kind](_parts(cloud, map_frame), len(cloud), work)
 
@@ -97,6 +101,8 @@ def rewrite_cloud(
     if kind != source.suffix.lower() and not {kind, source.suffix.lower()} <= set(_LAS):
         raise InputError(f"{path.name} cannot be written like {source.name}: both must be files of one kind")
     placement = Placement(opened_source.name, opened_source.system, frame)
+    if kind in _LAS:
+        _check_copc(source, path)
 
     stay = 0
 
@@ -116,10 +122,22 @@ def rewrite_cloud(
     with _said_of(path), whole_file(path) as work:
         if kind in _LAS:
             _rewrite_las(source, work, to_write)
+            _ordered(work, path)
         else:
             parts = ((part, to_write(part)) for part in opened_source.chunks())
             _WRITERS[kind](parts, opened_source.most, work)
     return stay
+
+
+def _check_copc(source: Path, path: Path) -> None:
+    with opened(source) as reader:
+        check_copc(reader.header, source.name, path)
+
+
+def _ordered(work: Path, path: Path) -> None:
+    """Put what is written in the order that the name of `path` promises."""
+    if is_copc(path):
+        order_as_copc(work)
 
 
 @contextmanager
@@ -161,7 +179,7 @@ def _write_like(cloud: Cloud, path: Path, like: Path, placement: Placement) -> N
 def _rewrite_las(source: Path, path: Path, to_write: Callable[[Cloud], Float[np.ndarray, "n 3"]]) -> None:
     """Write `source` with other coordinates of its own system."""
     with opened(source) as reader:
-        header = reader.header
+        header = without_octree(reader.header)
         with laspy.open(path, "w", header=header) as writer:
             for points, part in points_and_clouds(reader, source, withheld=True):
                 xyz = to_write(part)
