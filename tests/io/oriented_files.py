@@ -42,6 +42,7 @@ def write_metashape(folder, camera="agisoft", kind="epsg", change=lambda text: t
     export(p, folder, "metashape")
     path = folder / "cameras.xml"
     path.write_text(change(path.read_text()))
+    (folder / "image_points.csv").unlink()
     if ties:
         (folder / "bingo.txt").write_text(text_of_points(p, BINGO))
     return folder
@@ -110,16 +111,10 @@ def write_bingo(folder, kind="local", axes="YXZ", unit=0.9, change=lambda text: 
 
 
 def write_nerfstudio(folder, camera="opencv", change=lambda content: content):
-    """transforms.json as `--to nerfstudio` writes it, and image_points.csv in place of a text."""
-    p = inside(camera, "local")
-    export(p, folder, "nerfstudio")
+    """transforms.json as `--to nerfstudio` writes it, and image_points.csv."""
+    export(inside(camera, "local"), folder, "nerfstudio")
     path = folder / "transforms.json"
     path.write_text(json.dumps(change(json.loads(path.read_text()))))
-    with (folder / "image_points.csv").open("w", newline="") as file:
-        table = csv.writer(file)
-        table.writerow(["image", "point", "column_px", "row_px"])
-        for i, j, at in zip(p.image.tolist(), p.point.tolist(), p.column_row.tolist(), strict=True):
-            table.writerow([p.images[i], p.points[j], *map(repr, at)])
     return folder
 
 
@@ -144,5 +139,6 @@ def write_orthority(folder, camera="opencv", kind="epsg", collection=True, chang
         table.unlink()
     else:
         table.write_text(change(table.read_text()))
+    (folder / "image_points.csv").unlink()
     (folder / "bingo.txt").write_text(text_of_points(p, BINGO))
     return folder

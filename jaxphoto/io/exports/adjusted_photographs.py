@@ -48,6 +48,8 @@ class AdjustedPhotographs(NamedTuple):
     frame: Frame
     changes: tuple[str, ...] = ()
     """What the block corrects by, and no other program does: its points fit the photographs only together with it."""
+    sigma_px: Float[np.ndarray, "n 2"] | None = None
+    """Of every image point, the standard deviations that the block gives it, along columns and rows."""
 
     @staticmethod
     def of(adjusted: Adjustment, files: Mapping[str, str] | None = None) -> "AdjustedPhotographs":
@@ -63,11 +65,12 @@ class AdjustedPhotographs(NamedTuple):
             raise InputError(f"two images are of the photograph {twice}; give each photograph one name")
         rows = block.image_points
         xy, image = still(rows.xy), np.asarray(rows.image)
-        column_row = np.zeros((len(image), 2))
+        column_row, sigma_px = np.zeros((len(image), 2)), still(rows.sigma).copy()
         camera = np.array(block.image_camera, object)[image]
         used = dict.fromkeys(block.image_camera)
         for name in used:
             column_row[camera == name] = block.sensors[name].px_from_mm(xy[camera == name])
+            sigma_px[camera == name] /= block.sensors[name].pixel_mm
         exterior = unknowns.exterior
         return AdjustedPhotographs(
             block.title,
@@ -83,6 +86,7 @@ class AdjustedPhotographs(NamedTuple):
             column_row,
             block.frame,
             tuple(_changes(block, unknowns)),
+            sigma_px,
         )
 
     @property

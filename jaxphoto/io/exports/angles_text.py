@@ -9,17 +9,17 @@ from pathlib import Path
 
 import jax
 import numpy as np
-import pandas as pd
 
 from jaxphoto.arrays import still
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.io.block_folder.camera_section import Camera, camera_section
 from jaxphoto.io.block_folder.settings import toml_text
 from jaxphoto.io.exports.adjusted_photographs import AdjustedPhotographs
+from jaxphoto.io.exports.image_points import write_image_points
 from jaxphoto.io.exports.map_photographs import in_map
 from jaxphoto.unknowns import FIXED
 
-FILE, CAMERAS, IMAGE_POINTS = "exterior.txt", "camera.toml", "image_points.csv"
+FILE, CAMERAS = "exterior.txt", "camera.toml"
 
 
 def write_angles_text(photographs: AdjustedPhotographs, folder: Path) -> None:
@@ -39,9 +39,7 @@ def write_angles_text(photographs: AdjustedPhotographs, folder: Path) -> None:
     held = {name: Camera(*c, jax.tree.map(lambda _: FIXED, c.interior)) for name, c in p.cameras.items()}
     sections = {name: camera_section(camera) for name, camera in held.items()}
     (folder / CAMERAS).write_text(toml_text({"cameras": sections}), encoding="utf-8")
-    columns = {"image": np.array(p.files, object)[p.image], "point": np.array(p.points, object)[p.point]}
-    columns |= {"column_px": p.column_row[:, 0], "row_px": p.column_row[:, 1]}
-    pd.DataFrame(columns).to_csv(folder / IMAGE_POINTS, index=False)
+    write_image_points(p, folder)
 
 
 def angles_deg(exterior: ExteriorOrientation) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 A camera's <transform> takes its axes, x right, y down, z ahead, to those of the chunk, which are those of the block;
 the component's <transform> takes these to the geocentric axes of the datum, so that nothing is lost by a map. A block
-in a local frame stays there. Points and image points have no place in the file.
+in a local frame stays there. Points have no place in the file, image points stand beside it.
 Source: Agisoft Metashape User Manual, Appendix D "Camera models" and "Export cameras"; Metashape Python Reference,
 Chunk.transform and Camera.transform; exported files of versions 1.5 and 2.0.
 """
@@ -17,13 +17,16 @@ from jaxphoto.block import Frame
 from jaxphoto.georeferencing.map_frame import map_system
 from jaxphoto.io.cameras.agisoft import add_values, kind_of, xml_text
 from jaxphoto.io.exports.adjusted_photographs import AdjustedPhotographs, ExportCamera, downwards
+from jaxphoto.io.exports.image_points import write_image_points
 
 FILE = "cameras.xml"
 _LOCAL = 'LOCAL_CS["Local Coordinates (m)",LOCAL_DATUM["Local Datum",0],UNIT["metre",1,AUTHORITY["EPSG","9001"]]]'
 
 
 def write_metashape(photographs: AdjustedPhotographs, folder: Path) -> None:
-    """Write cameras.xml into `folder`; cameras are called by the ids of images, as Metashape calls photographs."""
+    """Write cameras.xml into `folder`, and image_points.csv beside it; cameras are called by the ids of images, as
+    Metashape calls photographs.
+    """
     p = photographs
     root = ElementTree.Element("document", version="2.0.0")
     chunk = ElementTree.SubElement(root, "chunk", label=p.title or "jaxphoto", enabled="true")
@@ -43,6 +46,7 @@ def write_metashape(photographs: AdjustedPhotographs, folder: Path) -> None:
         ElementTree.SubElement(element, "transform").text = _numbers(rows)
     ElementTree.SubElement(chunk, "reference").text = _reference(p.frame)
     (folder / FILE).write_text(xml_text(root), encoding="utf-8")
+    write_image_points(p, folder, p.images)
 
 
 def _add_sensor(sensors: ElementTree.Element, number: int, name: str, camera: ExportCamera) -> None:

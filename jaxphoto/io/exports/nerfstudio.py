@@ -15,6 +15,7 @@ from jaxphoto.camera import Equidistant, OpenCv, OpenCvFisheye, Perspective
 from jaxphoto.errors import InputError
 from jaxphoto.io.cameras.camera_file import CameraModel, from_centre_px
 from jaxphoto.io.exports.adjusted_photographs import AdjustedPhotographs, ExportCamera
+from jaxphoto.io.exports.image_points import write_image_points
 
 FILE = "transforms.json"
 PLANE = CameraModel(OpenCv, ("k4", "k5", "k6", "b2"), Perspective())
@@ -22,7 +23,8 @@ FISHEYE = CameraModel(OpenCvFisheye, ("p1", "p2", "s1", "s2", "b2"), Equidistant
 
 
 def write_nerfstudio(photographs: AdjustedPhotographs, folder: Path) -> None:
-    """Write transforms.json into `folder`: cameras at the top where there is one, else with every frame.
+    """Write transforms.json into `folder`: cameras at the top where there is one, else with every frame; and
+    image_points.csv beside it.
 
     Raises InputError for perspective cameras and fisheyes in one block.
     """
@@ -40,6 +42,7 @@ def write_nerfstudio(photographs: AdjustedPhotographs, folder: Path) -> None:
         frames.append({"file_path": file, **own, "transform_matrix": matrix})
     content = {"camera_model": kinds.pop(), **shared, "frames": frames}
     (folder / FILE).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    write_image_points(p, folder)
 
 
 def _camera(camera: ExportCamera) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from jaxphoto.errors import InputError
 from jaxphoto.io.cameras.camera_file import CameraModel
 from jaxphoto.io.exports.adjusted_photographs import AdjustedPhotographs, ExportCamera
 from jaxphoto.io.exports.angles_text import angles_deg
+from jaxphoto.io.exports.image_points import write_image_points
 from jaxphoto.io.exports.map_photographs import in_map
 
 PLANE = CameraModel(OpenCv, ("b2",), Perspective())
@@ -25,7 +26,8 @@ _RATIONAL = ("k4", "k5", "k6")
 
 
 def write_orthority(photographs: AdjustedPhotographs, folder: Path) -> None:
-    """Write the three files into `folder`; none of a system where the block is in a local frame.
+    """Write the three files into `folder`, none of a system where the block is in a local frame, and image_points.csv
+    beside them.
 
     Raises InputError for a block in a geographic system, where orthority counts metres.
     """
@@ -44,6 +46,7 @@ def write_orthority(photographs: AdjustedPhotographs, folder: Path) -> None:
             table.writerow([name, *map(repr, row), camera])
     if on_map.system:
         (folder / "ext_param.prj").write_text(on_map.system + "\n", encoding="utf-8")
+    write_image_points(p, folder)
 
 
 def _camera(name: str, camera: ExportCamera) -> str:

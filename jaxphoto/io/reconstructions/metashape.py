@@ -114,6 +114,7 @@ def read_metashape(source: Path) -> BlockTables:
             shown.column_row,
             there.frame,
             _control(path, rows.surveyed() if rows else None, system, placed),
+            shown.sigma_px,
         )
     )
 

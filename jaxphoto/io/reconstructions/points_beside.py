@@ -42,6 +42,8 @@ class Shown(NamedTuple):
     image: Int[np.ndarray, "n"]
     point: Int[np.ndarray, "n"]
     column_row: Float[np.ndarray, "n 2"]
+    sigma_px: Float[np.ndarray, "n"]
+    """NaN where nothing tells it."""
 
 
 class PhotographCamera(NamedTuple):
@@ -123,6 +125,7 @@ def network_beside(
             shown.point,
             shown.column_row,
             frame_of_words(path.name, system, positions) if system else Frame("local"),
+            sigma_px=shown.sigma_px,
         )
     )
 
@@ -131,8 +134,8 @@ def marks_shown(marks: Sequence[Mark], files: Sequence[str]) -> Shown:
     """The marks of points in the photographs `files`, by their whole names; other photographs are left out."""
     place = {name: k for k, name in enumerate(files)}
     own = [mark for mark in marks if mark[0] in place]
-    at = np.array([mark[2] for mark in own]).reshape(-1, 2)
-    return named([place[mark[0]] for mark in own], [mark[1] for mark in own], at)
+    at, sigma = np.array([mark[2] for mark in own]).reshape(-1, 2), np.array([mark[3] for mark in own], float)
+    return named([place[mark[0]] for mark in own], [mark[1] for mark in own], at, sigma)
 
 
 def joined(ties: Shown, marks: Shown, of: str) -> Shown:
@@ -159,13 +162,20 @@ def joined(ties: Shown, marks: Shown, of: str) -> Shown:
     kept = np.array([place[1] not in same or place not in marked for place in where], bool)
     own = [name + _OTHER if name in clash else name for name, keep in zip(names[0], kept.tolist(), strict=True) if keep]
     image = np.concatenate([ties.image[kept], marks.image])
-    return named(image, own + names[1], np.concatenate([ties.column_row[kept], marks.column_row]))
+    at, sigma = (np.concatenate([a[kept], b]) for a, b in zip(ties[-2:], marks[-2:], strict=True))
+    return named(image, own + names[1], at, sigma)
 
 
-def named(image: Sequence[int] | np.ndarray, points: Sequence[str], column_row: Float[np.ndarray, "n 2"]) -> Shown:
+def named(
+    image: Sequence[int] | np.ndarray,
+    points: Sequence[str],
+    column_row: Float[np.ndarray, "n 2"],
+    sigma_px: Float[np.ndarray, "n"] | None = None,
+) -> Shown:
     """Measurements by the names of their points."""
     ids, point = np.unique(np.array(points, object), return_inverse=True)
-    return Shown(ids.tolist(), np.array(image, int), point.astype(int), column_row)
+    sigma = np.full(len(column_row), np.nan) if sigma_px is None else sigma_px
+    return Shown(ids.tolist(), np.array(image, int), point.astype(int), column_row, sigma)
 
 
 def _of_table(text: Path, files: Sequence[str], of: str) -> Shown:
@@ -175,7 +185,8 @@ def _of_table(text: Path, files: Sequence[str], of: str) -> Shown:
     place = np.array([places.get(name, -1) for name in images], int)
     _tell(list(dict.fromkeys(name for name, k in zip(images, place.tolist(), strict=True) if k < 0)), text, of)
     at, kept = np.stack([table.numbers("column_px"), table.numbers("row_px")], axis=1), place >= 0
-    return named(place[kept], [name for name, k in zip(points, kept.tolist(), strict=True) if k], at[kept])
+    own = [name for name, k in zip(points, kept.tolist(), strict=True) if k]
+    return named(place[kept], own, at[kept], table.sigmas("sigma_px")[kept])
 
 
 def _places(files: Sequence[str]) -> dict[str, int]:

@@ -68,6 +68,8 @@ class TiedPhotographs(NamedTuple):
     """Of `centres` and of what `rotations` are against: grid east, grid north and up at the place of each."""
     control: SurveyedPoints | None = None
     """In coordinates of `frame`, easting or longitude first."""
+    sigma_px: Float[np.ndarray, "n"] | None = None
+    """Of measurements; NaN, or None for all, where nothing tells it: one pixel then."""
 
 
 def estimated(interior: InteriorOrientation) -> tuple[str, ...]:
@@ -80,8 +82,8 @@ def estimated(interior: InteriorOrientation) -> tuple[str, ...]:
 def free_network(given: TiedPhotographs) -> BlockTables:
     """The free-network self-calibration of tied photographs, from the values they have.
 
-    An image has its file's name without the ending as id. Every image coordinate has the standard deviation of one
-    pixel. The datum is inner over the points, or that of the control where three points of it are given whole. A
+    An image has its file's name without the ending as id. Image coordinates have the standard deviation of one pixel
+    where none is given. The datum is inner over the points, or that of the control where three points of it are given whole. A
     UserWarning counts what is left out: measurements that are there twice (of one feature with two directions, or of
     two features in one image that are one point), points that are then in fewer than two images, and images that then
     show fewer than three.
@@ -98,7 +100,7 @@ def free_network(given: TiedPhotographs) -> BlockTables:
         twice = next(name for name in names if list(names).count(name) > 1)
         raise InputError(f"{given.file}: image {twice} is there twice; keep one of them")
     control = _control_table(given)
-    image, point, column_row = _measurements(given, place[given.image], control)
+    image, point, column_row, sigma = _measurements(given, place[given.image], control)
     kept = np.flatnonzero(np.bincount(image, minlength=len(names)))
     _check_tied(given, names, kept)
     order, names, image = order[kept], names[kept], np.searchsorted(kept, image)
@@ -118,6 +120,8 @@ def free_network(given: TiedPhotographs) -> BlockTables:
             "row_px": column_row[:, 1],
         },
     }
+    if np.isfinite(sigma).any():
+        tables["image_points"]["sigma_px"] = _cells(sigma)
     if given.xyz is not None:
         tables["object_points"] = {"point": ids} | dict(zip(coordinates, given.xyz[seen].T, strict=True))
     settings: dict[str, Any] = {"title": given.title, "sigmas": {"image_px": 1.0}}
@@ -149,11 +153,15 @@ def _control_table(given: TiedPhotographs) -> dict[str, np.ndarray] | None:
             stacklevel=4,
         )
         return None
-    cells = lambda values: np.array(["" if np.isnan(v) else repr(v) for v in values.tolist()], object)  # noqa: E731
     numbers = np.column_stack([survey.coordinates[there], survey.sigma_m[there]])
-    columns = dict(zip((*coordinate_names(given.frame), *SIGMA_XYZ), map(cells, numbers.T), strict=True))
+    columns = dict(zip((*coordinate_names(given.frame), *SIGMA_XYZ), map(_cells, numbers.T), strict=True))
     role = np.where(survey.check[there], "check", "control").astype(object)
     return {"point": np.array([survey.ids[k] for k in there], object), **columns, "role": role}
+
+
+def _cells(values: Float[np.ndarray, "n"]) -> np.ndarray:
+    """Numbers as cells of a table, empty for NaN."""
+    return np.array(["" if np.isnan(v) else repr(v) for v in values.tolist()], object)
 
 
 def _check_tied(given: TiedPhotographs, names: np.ndarray, kept: np.ndarray) -> None:
@@ -206,18 +214,19 @@ def _image_names(files: list[str]) -> list[str]:
 
 def _measurements(
     given: TiedPhotographs, image: np.ndarray, control: dict[str, np.ndarray] | None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Image, point and pixels of every measurement; none twice, each point in two images at least or control, each
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Image, point, pixels and their sigma of every measurement; none twice, each point in two images at least or control, each
     image with three at least."""
     point, xy = given.point, given.column_row
+    sigma = np.full(len(point), np.nan) if given.sigma_px is None else given.sigma_px
     n_all = len(point)
     # The same feature, by the point with the smaller number; then the same image, by the feature that comes first.
     order = np.lexsort((point, image))
-    image, point, xy = image[order], point[order], xy[order]
+    image, point, xy, sigma = image[order], point[order], xy[order], sigma[order]
     for key in ("xy", "point"):
         columns = np.column_stack([image, xy if key == "xy" else point])
         kept = np.sort(np.unique(columns, axis=0, return_index=True)[1])
-        image, point, xy = image[kept], point[kept], xy[kept]
+        image, point, xy, sigma = image[kept], point[kept], xy[kept], sigma[kept]
     n_once, n_points = len(point), len(np.unique(point))
     own = set() if control is None else set(control["point"][control["role"] == "control"])
     held = np.array([name in own for name in given.points], bool)
@@ -226,7 +235,7 @@ def _measurements(
         tied &= np.bincount(image[tied], minlength=len(given.files))[image] >= _LEAST
         if tied.all():
             break
-        image, point, xy = image[tied], point[tied], xy[tied]
+        image, point, xy, sigma = image[tied], point[tied], xy[tied], sigma[tied]
     n_left = n_points - len(np.unique(point))
     if n_once < n_all or n_left:
         warnings.warn(
@@ -235,4 +244,4 @@ def _measurements(
             UserWarning,
             stacklevel=4,
         )
-    return image, point, xy
+    return image, point, xy, sigma
