@@ -5,10 +5,15 @@ import json
 import math
 
 import numpy as np
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.io import export
+from jaxphoto.io.block_folder.table_layout import ANGLES, XYZ
+from jaxphoto.io.exports import ExportCamera
 from jaxphoto.io.exports.map_photographs import in_map
+from tests.formulas import camera_from_object
 from tests.io.test_exports import SENSOR, photographs
 
 
@@ -142,3 +147,26 @@ def write_orthority(folder, camera="opencv", kind="epsg", collection=True, chang
     (folder / "image_points.csv").unlink()
     (folder / "bingo.txt").write_text(text_of_points(p, BINGO))
     return folder
+
+
+_metre, _angle = st.floats(-2000.0, 2000.0), st.floats(-3.1, 3.1)
+poses = st.lists(st.tuples(_metre, _metre, _metre, _angle, st.floats(-1.5, 1.5), _angle), min_size=4, max_size=4)
+"""Positions and omega, phi, kappa of four photographs."""
+
+
+def posed(values, interior):
+    """Photographs so oriented, and points anywhere."""
+    turn = np.stack([camera_from_object(*row[3:]) for row in values])
+    exterior = ExteriorOrientation(np.array(values)[:, :3], turn)
+    return photographs("brown", "local")._replace(exterior=exterior, cameras={"one": ExportCamera(SENSOR, interior)})
+
+
+def come_back(p, tables, names):
+    """Tables that a reader made have the poses and points of `p`; its images are called `names` there."""
+    table, points = tables.tables["images"], tables.tables["object_points"]
+    order = [names.index(name) for name in table.text("image")]
+    position, angles = (np.stack([table.numbers(n) for n in columns], axis=1) for columns in (XYZ, ANGLES))
+    np.testing.assert_allclose(position, np.asarray(p.exterior.position)[order], rtol=0, atol=1e-9)
+    again = np.stack([camera_from_object(*row) for row in np.deg2rad(angles)])
+    np.testing.assert_allclose(again, np.asarray(p.exterior.camera_from_object)[order], rtol=0, atol=1e-9)
+    np.testing.assert_array_equal(np.stack([points.numbers(n) for n in XYZ], axis=1), p.xyz)

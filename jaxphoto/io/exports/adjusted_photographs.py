@@ -122,6 +122,13 @@ def downwards(exterior: ExteriorOrientation) -> Float[np.ndarray, "n 3 3"]:
     return np.array([[1.0], [-1.0], [-1.0]]) * np.asarray(exterior.camera_from_object)
 
 
+def numbered(names: tuple[str, ...]) -> dict[str, int]:
+    """The names as numbers where all are positive ones, otherwise counted from 1."""
+    own = [int(name) if name.isascii() and name.isdigit() else 0 for name in names]
+    kept = min(own, default=1) > 0 and len(set(own)) == len(own) and max(own, default=1) < 2**31
+    return dict(zip(names, own if kept else range(1, len(names) + 1), strict=True))
+
+
 def _changes(block: Block, unknowns: Unknowns) -> list[str]:
     found = [name for name in ("refraction", "curvature") if getattr(block.corrections, name)]
     bent = [kind for kind, owners in unknowns.tables.items() if any(type(p).bends for p in owners.values())]

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxphoto.io.cameras.colmap import ColmapCamera, cameras_bytes, cameras_text, colmap_camera
 from jaxphoto.io.colmap.model import FILES
-from jaxphoto.io.exports.adjusted_photographs import AdjustedPhotographs, downwards
+from jaxphoto.io.exports.adjusted_photographs import AdjustedPhotographs, downwards, numbered
 
 _IMAGES = "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n# POINTS2D[] as (X, Y, POINT3D_ID)\n"
 _POINTS = "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n"
@@ -68,7 +68,7 @@ def write_binary_model(photographs: AdjustedPhotographs, folder: Path) -> None:
 
 def _model(photographs: AdjustedPhotographs) -> _Model:
     p = photographs
-    camera_ids, point_ids = _ids(tuple(p.cameras)), np.array(list(_ids(p.points).values()), int)
+    camera_ids, point_ids = numbered(tuple(p.cameras)), np.array(list(numbered(p.points).values()), int)
     rotations = downwards(p.exterior)
     translations = -np.einsum("nij,nj->ni", rotations, p.exterior.position)
     poses = np.hstack([Rotation.from_matrix(rotations).as_quat()[:, [3, 0, 1, 2]], translations])
@@ -84,13 +84,6 @@ def _model(photographs: AdjustedPhotographs) -> _Model:
         if len(rows)
     ]
     return _Model({camera_ids[name]: colmap_camera(*camera) for name, camera in p.cameras.items()}, images, points)
-
-
-def _ids(names: tuple[str, ...]) -> dict[str, int]:
-    """The names as numbers where all are positive ones, otherwise counted from 1."""
-    own = [int(name) if name.isascii() and name.isdigit() else 0 for name in names]
-    kept = min(own, default=1) > 0 and len(set(own)) == len(own) and max(own, default=1) < 2**31
-    return dict(zip(names, own if kept else range(1, len(names) + 1), strict=True))
 
 
 def _images_text(images: list[_Image]) -> str:

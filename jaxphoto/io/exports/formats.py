@@ -10,18 +10,22 @@ from jaxphoto.camera.conversion import Conversion, converted
 from jaxphoto.errors import InputError
 from jaxphoto.io.cameras import agisoft, colmap
 from jaxphoto.io.cameras.camera_file import CameraModel
-from jaxphoto.io.exports import blocks_exchange, nerfstudio, open_sfm, orthority
+from jaxphoto.io.exports import blocks_exchange, nerfstudio, open_mvg, open_sfm, orthority
 from jaxphoto.io.exports.adjusted_photographs import AdjustedPhotographs
 from jaxphoto.io.exports.angles_text import write_angles_text
+from jaxphoto.io.exports.bal import write_bal
 from jaxphoto.io.exports.blocks_exchange import write_blocks_exchange
+from jaxphoto.io.exports.bundler import write_bundler
 from jaxphoto.io.exports.colmap_model import write_binary_model, write_text_model
 from jaxphoto.io.exports.geo_json import write_geo_json
 from jaxphoto.io.exports.geo_package import write_geo_package
-from jaxphoto.io.exports.map_photographs import Misfit, map_misfit
+from jaxphoto.io.exports.map_photographs import Misfit, map_misfit, misfit_of
 from jaxphoto.io.exports.metashape import write_metashape
 from jaxphoto.io.exports.nerfstudio import write_nerfstudio
+from jaxphoto.io.exports.open_mvg import write_open_mvg
 from jaxphoto.io.exports.open_sfm import write_open_sfm
 from jaxphoto.io.exports.orthority import write_orthority
+from jaxphoto.io.exports.same_rays import RADIAL, on_same_rays
 from jaxphoto.writing import check_folder, whole_folder
 
 
@@ -34,6 +38,8 @@ class ExportFormat(NamedTuple):
     fisheye: CameraModel | None
     in_map: bool
     about: str
+    keeps_rays: bool = False
+    """Whether image points are moved to where a camera that is fitted sees the same rays, instead of leaving them."""
 
 
 class Exported(NamedTuple):
@@ -42,6 +48,8 @@ class Exported(NamedTuple):
     cameras: dict[str, Conversion]
     map_misfit: Misfit | None
     """Of the image points, where the format has map coordinates; None in a Cartesian frame."""
+    moved: Misfit | None = None
+    """Of the image points, where the format keeps their rays."""
 
 
 EXPORTS = {
@@ -55,12 +63,19 @@ EXPORTS = {
     "opensfm": ExportFormat(
         write_open_sfm, open_sfm.PLANE, open_sfm.FISHEYE, False, "reconstruction of OpenSfM, as in WebODM"
     ),
+    "openmvg": ExportFormat(
+        write_open_mvg, open_mvg.PLANE, open_mvg.FISHEYE, False, "sfm_data.json of OpenMVG, with structure"
+    ),
     "blocksexchange": ExportFormat(
         write_blocks_exchange, blocks_exchange.PLANE, None, False, "BlocksExchange XML of Bentley, with tie points"
     ),
     "nerfstudio": ExportFormat(
         write_nerfstudio, nerfstudio.PLANE, nerfstudio.FISHEYE, False, "transforms.json of nerfstudio"
     ),
+    "bundler": ExportFormat(
+        write_bundler, RADIAL, None, False, "bundle.out of Bundler, with list.txt: f, k1, k2", True
+    ),
+    "bal": ExportFormat(write_bal, RADIAL, None, False, "problem of bundle adjustment in the large: f, k1, k2", True),
     "opk": ExportFormat(write_angles_text, None, None, True, "text of positions and omega, phi, kappa"),
     "orthority": ExportFormat(
         write_orthority, orthority.PLANE, orthority.FISHEYE, True, "parameters of orthority, YAML and CSV"
@@ -89,10 +104,14 @@ def export(photographs: AdjustedPhotographs, folder: str | Path, format: str) ->
     held = photographs._replace(
         cameras={name: c._replace(interior=cameras[name].interior) for name, c in photographs.cameras.items()}
     )
+    moved = None
+    if known.keeps_rays:
+        held = held._replace(column_row=on_same_rays(photographs, cameras))
+        moved = misfit_of(held.column_row - photographs.column_row)
     with whole_folder(folder, _all_clash) as work:
         known.write(held, work)
     on_map = known.in_map and photographs.frame.kind == "epsg"
-    return Exported(cameras, map_misfit(photographs) if on_map else None)
+    return Exported(cameras, map_misfit(photographs) if on_map else None, moved)
 
 
 def check_export_target(folder: Path, *inputs: Path) -> None:

@@ -59,8 +59,13 @@ def map_misfit(photographs: AdjustedPhotographs) -> Misfit | None:
         _ideal_px(photographs, exterior, xyz)
         for exterior, xyz in ((on_map.exterior, on_map.xyz), (photographs.exterior, photographs.xyz))
     )
-    apart = np.linalg.norm(there - here, axis=1)
-    return Misfit(float(np.sqrt(np.mean(apart**2))), float(apart.max()))
+    return misfit_of(there - here)
+
+
+def misfit_of(displacements: Float[np.ndarray, "n 2"]) -> Misfit:
+    """Of displacements in pixels."""
+    apart = np.linalg.norm(displacements, axis=1)
+    return Misfit(float(np.sqrt(np.mean(apart**2))), float(apart.max())) if len(apart) else Misfit(0.0, 0.0)
 
 
 def _ideal_px(photographs: AdjustedPhotographs, exterior: ExteriorOrientation, xyz: np.ndarray) -> np.ndarray:

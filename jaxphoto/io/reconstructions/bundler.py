@@ -28,7 +28,7 @@ from jaxphoto.io.reconstructions.tied_photographs import TiedCamera, TiedPhotogr
 from jaxphoto.io.text_tables import LARGEST
 from jaxphoto.io.whole_text import LARGE, SMALL, read_text
 
-_HEAD = "# Bundle file v0.3"
+HEAD = "# Bundle file v0.3"
 _LISTS = ("list.txt", "bundle.out.list.txt")
 _PER_CAMERA, _PER_POINT, _PER_MEASUREMENT = 15, 6, 4
 # Of f: the least half format, so that few points about the middle leave one that can be; and no format is as large.
@@ -106,7 +106,7 @@ def _files(source: Path) -> list[Path]:
 
 def _opens_so(path: Path) -> bool:
     with path.open("rb") as file:
-        return file.read(len(_HEAD)) == _HEAD.encode()
+        return file.read(len(HEAD)) == HEAD.encode()
 
 
 def _names(path: Path, number: int) -> list[str]:

@@ -28,15 +28,18 @@ from jaxphoto.io.whole_text import LARGE
 
 FILE = "sfm_data.json"
 _KEYS = ("views", "intrinsics", "extrinsics", "structure")
-_FIRST_PX = 0.5
-# Of each kind of camera: what it is here, where its coefficients stand, and which they are.
-_KINDS: dict[str, tuple[CameraModel, str, tuple[str, ...]]] = {
+FIRST_PX = 0.5
+"""Column and row, as here, of the centre of the upper left pixel, which is (0, 0) there."""
+NEW = 0x80000000
+"""The bit of a kind's number where the kind is met for the first time, and its name is told, too."""
+KINDS: dict[str, tuple[CameraModel, str, tuple[str, ...]]] = {
     "pinhole": (PLANE, "", ()),
     "pinhole_radial_k1": (PLANE, "disto_k1", ("k1",)),
     "pinhole_radial_k3": (PLANE, "disto_k3", ("k1", "k2", "k3")),
     "pinhole_brown_t2": (PLANE, "disto_t2", ("k1", "k2", "k3", "p1", "p2")),
     "fisheye": (FISHEYE, "fisheye", ("k1", "k2", "k3", "k4")),
 }
+"""Of each kind of camera: what it is here, where its coefficients stand, and which they are."""
 
 
 def recognises(source: Path) -> bool:
@@ -57,7 +60,9 @@ def read_open_mvg(source: Path) -> BlockTables:
     if not isinstance(content, dict) or not all(isinstance(content.get(key), list) for key in _KEYS):
         raise InputError(f"{path} has not the lists {', '.join(_KEYS)}; give sfm_data.json of OpenMVG in full")
     poses = _by_key(path, content, "extrinsics")
-    cameras = {key: _camera(path, key, value) for key, value in _by_key(path, content, "intrinsics").items()}
+    intrinsics = _by_key(path, content, "intrinsics")
+    kinds = {_number_of_kind(v): v["polymorphic_name"] for v in intrinsics.values() if "polymorphic_name" in v}
+    cameras = {key: _camera(path, key, value, kinds) for key, value in intrinsics.items()}
     files: list[str] = []
     camera_of: list[str] = []
     pose_of: list[str] = []
@@ -98,7 +103,7 @@ def read_open_mvg(source: Path) -> BlockTables:
             np.array([row[0] for row in rows], int),
             np.array([row[1] for row in rows], int),
             number_rows([row[2] for row in rows], (2,), lambda k: f"{path.name}, structure {ids[rows[k][1]]}, x")
-            + _FIRST_PX,
+            + FIRST_PX,
         )
     )
 
@@ -132,15 +137,20 @@ def _data(value: dict[str, Any]) -> dict[str, Any]:
     return {**base, **data} if isinstance(base, dict) else data
 
 
-def _camera(path: Path, key: str, value: dict[str, Any]) -> TiedCamera:
+def _number_of_kind(value: dict[str, Any]) -> int | None:
+    number = value.get("polymorphic_id")
+    return number & ~NEW if isinstance(number, int) else None
+
+
+def _camera(path: Path, key: str, value: dict[str, Any], kinds: dict[int | None, Any]) -> TiedCamera:
     given = Section(path.name, f"intrinsics {key}", _data(value))
-    kind = value.get("polymorphic_name")
-    if not isinstance(kind, str) or kind not in _KINDS:
-        raise given.error("polymorphic_name", f"{quoted(kind)} is not known here; known are {', '.join(_KINDS)}")
-    model, name, coefficients = _KINDS[kind]
+    kind = value.get("polymorphic_name", kinds.get(_number_of_kind(value)))
+    if not isinstance(kind, str) or kind not in KINDS:
+        raise given.error("polymorphic_name", f"{quoted(kind)} is not known here; known are {', '.join(KINDS)}")
+    model, name, coefficients = KINDS[kind]
     source = CameraSource(path)
     sensor, _ = source.sensor(given.count("width"), given.count("height"))
-    column, row = given.vector("principal_point", 2) + _FIRST_PX
+    column, row = given.vector("principal_point", 2) + FIRST_PX
     values = dict(zip(coefficients, given.vector(name, len(coefficients)) if name else (), strict=True))
     f = given.positive("focal_length")
     interior = in_pixels(source, sensor, f, f, (float(column), float(row)), model, **values)

@@ -83,10 +83,10 @@ def free_network(given: TiedPhotographs) -> BlockTables:
     """The free-network self-calibration of tied photographs, from the values they have.
 
     An image has its file's name without the ending as id. Image coordinates have the standard deviation of one pixel
-    where none is given. The datum is inner over the points, or that of the control where three points of it are given whole. A
-    UserWarning counts what is left out: measurements that are there twice (of one feature with two directions, or of
-    two features in one image that are one point), points that are then in fewer than two images, and images that then
-    show fewer than three.
+    where none is given. The datum is inner over the points, or that of the control where three points of it are given
+    whole. A UserWarning counts what is left out: measurements that are there twice (of one feature with two directions,
+    or of two features in one image that are one point), points that are then in fewer than two images, and images that
+    then show fewer than three.
 
     Raises InputError where no photograph is oriented, two have one name, a rotation is none, or none is tied.
     """
@@ -215,8 +215,8 @@ def _image_names(files: list[str]) -> list[str]:
 def _measurements(
     given: TiedPhotographs, image: np.ndarray, control: dict[str, np.ndarray] | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Image, point, pixels and their sigma of every measurement; none twice, each point in two images at least or control, each
-    image with three at least."""
+    """Image, point, pixels and their sigma of every measurement; none twice, each point in two images at least or
+    control, each image with three at least."""
     point, xy = given.point, given.column_row
     sigma = np.full(len(point), np.nan) if given.sigma_px is None else given.sigma_px
     n_all = len(point)

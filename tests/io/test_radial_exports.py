@@ -1,0 +1,126 @@
+"""BAL and Bundler, whose cameras are f, k1 and k2: rays are kept, by each format's equations, and all comes back."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from jaxphoto.camera import BundlerRadial, Equisolid, InteriorOrientation, OpenCv
+from jaxphoto.errors import InputError
+from jaxphoto.io import FORMATS, export
+from jaxphoto.io.exports import ExportCamera
+from tests.io.oriented_files import come_back, inside, posed, poses
+from tests.io.test_exports import SENSOR
+
+
+def bal_of(folder):
+    """Rotations, translations, (f, k1, k2), points, and rows of camera, point, x, y of a problem."""
+    (path,) = folder.glob("problem-*-pre.txt")
+    words = path.read_text().split()
+    n, m, k = map(int, words[:3])
+    rows = np.array(words[3 : 3 + 4 * k], float).reshape(-1, 4)
+    values = np.array(words[3 + 4 * k :], float)
+    cameras = values[: 9 * n].reshape(-1, 9)
+    xyz = values[9 * n :].reshape(m, 3)
+    return Rotation.from_rotvec(cameras[:, :3]).as_matrix(), cameras[:, 3:6], cameras[:, 6:], xyz, rows
+
+
+def bundle_of(folder):
+    """The same of a bundle file."""
+    lines = (folder / "bundle.out").read_text().splitlines()
+    assert lines[0] == "# Bundle file v0.3"
+    n, m = map(int, lines[1].split())
+    cameras = np.array([line.split() for line in lines[2 : 2 + 5 * n]], float).reshape(-1, 5, 3)
+    rows = []
+    for k, line in enumerate(lines[4 + 5 * n :: 3]):
+        numbers = np.array(line.split()[1:], float).reshape(-1, 4)
+        assert len(numbers) == int(line.split()[0])
+        rows += [[camera, k, x, y] for camera, _, x, y in numbers]
+    xyz = np.array([line.split() for line in lines[2 + 5 * n :: 3]], float)
+    assert len(xyz) == m and len((folder / "list.txt").read_text().splitlines()) == n
+    return cameras[:, 1:4], cameras[:, 4], cameras[:, 0], xyz, np.array(rows)
+
+
+OF = {"bal": bal_of, "bundler": bundle_of}
+
+
+def misfits_px(format, folder):
+    """Measured minus computed, by p = -P / P_z and f (1 + k1 |p|^2 + k2 |p|^4) p."""
+    turns, moved, values, xyz, rows = OF[format](folder)
+    camera, point = rows[:, :2].astype(int).T
+    seen = np.einsum("nij,nj->ni", turns[camera], xyz[point]) + moved[camera]
+    p = -seen[:, :2] / seen[:, 2:]
+    f, k1, k2 = values[camera].T
+    r2 = (p**2).sum(axis=1)
+    return rows[:, 2:] - (f * (1 + k1 * r2 + k2 * r2**2))[:, None] * p
+
+
+def named(p):
+    """With names that a list with blanks holds."""
+    return p._replace(files=tuple(name.replace(" ", "_") for name in p.files))
+
+
+@pytest.mark.parametrize("format", OF)
+@pytest.mark.parametrize("camera", ["agisoft", "brown", "opencv", "rational"])
+def test_rays_are_kept(tmp_path, format, camera):
+    """Of cameras with a principal point, tangential and affine terms, none of which the formats have."""
+    done = export(named(inside(camera, "local")), tmp_path / "out", format)
+    assert np.abs(misfits_px(format, tmp_path / "out")).max() < 1e-6
+    said = done.cameras["one"]
+    assert 0 < said.rms_px < 10 and 0 < done.moved.rms_px <= done.moved.max_px < 2 * said.max_px
+
+
+@pytest.mark.parametrize("format", OF)
+def test_residuals_stay_what_they_were(tmp_path, format):
+    """What was measured wrong by pixels is so by the same afterwards, but for how the fit stretches there."""
+    p = named(inside("agisoft", "local"))
+    noise = np.random.default_rng(3).normal(0, 2.0, p.column_row.shape)
+    export(p._replace(column_row=p.column_row + noise), tmp_path / "out", format)
+    order = np.lexsort((p.image, p.point))
+    np.testing.assert_allclose(misfits_px(format, tmp_path / "out"), noise[order] * [1, -1], atol=0.1)
+
+
+term = st.floats(-0.2, 0.2)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    format=st.sampled_from(list(OF)), values=poses, c=st.floats(2.0, 200.0), at=st.tuples(term, term), k1=term, k2=term
+)
+def test_cameras_poses_points_and_image_points_come_back(tmp_path_factory, format, values, c, at, k1, k2):
+    folder = tmp_path_factory.mktemp("radial")
+    p = named(posed(values, InteriorOrientation(c, *at, BundlerRadial(k1, k2))))
+    done = export(p, folder, format)
+    assert done.cameras["one"].max_px == 0 and done.moved.max_px == 0
+    tables = FORMATS[format].read(folder)
+    come_back(
+        p, tables, [str(k) for k in range(4)] if format == "bal" else [name.replace(" ", "_") for name in p.images]
+    )
+    assert len(tables.settings["cameras"]) == 4
+    for camera in tables.settings["cameras"].values():
+        wanted = {"c_mm": c / SENSOR.pixel_mm * camera["pixel_mm"], "k1": k1, "k2": k2}
+        for name, value in camera["interior"].items():
+            assert value == pytest.approx(wanted.get(name, 0.0), abs=1e-9)
+    *_, rows = OF[format](folder)
+    order = np.lexsort((p.image, p.point))
+    wanted = (SENSOR.mm_from_px(p.column_row[order]) - at) / SENSOR.pixel_mm
+    np.testing.assert_allclose(rows[:, 2:], wanted, rtol=0, atol=1e-9)
+
+
+def test_what_these_cameras_cannot_be(tmp_path):
+    p = named(inside("brown", "local"))
+    wide = InteriorOrientation(3.0, 0.0, 0.0, projection=Equisolid())
+    with pytest.raises(InputError, match="cannot be written as bal, whose cameras are perspective, because it is a f"):
+        export(p._replace(cameras={"one": ExportCamera(SENSOR, wide)}), tmp_path / "out", "bal")
+    with pytest.raises(
+        InputError, match=r"list.txt ends names at blanks, and 'a b.jpg' has one; rename the photograph"
+    ):
+        export(inside("brown", "local"), tmp_path / "out", "bundler")
+    # Its rays turn back outside the format.
+    far = p.column_row.copy()
+    far[7] = (-9000.0, 0.0)
+    folds = {"one": ExportCamera(SENSOR, InteriorOrientation(8.8, 0.0, 0.0, OpenCv(-0.1, 0.0, -0.02, p1=1e-3)))}
+    with pytest.raises(InputError, match=f"point {p.points[p.point[7]]} in image a b lies where the distortion of c"):
+        export(p._replace(cameras=folds, column_row=far), tmp_path / "out", "bal")
+    assert not (tmp_path / "out").exists()
