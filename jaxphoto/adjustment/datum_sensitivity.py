@@ -58,6 +58,9 @@ class SeenMotions:
         # The triangle has the same singular values and directions, and no more rows than columns.
         _, s, vt = np.linalg.svd(np.linalg.qr(sensitivity / norm, mode="r"), full_matrices=True)
         rank = int((s > _OPEN * max(s.max(initial=0.0), 1e-300)).sum())
+        if np.abs(vt[rank:, :7]).max(initial=0.0) < _OPEN:
+            # What nothing sees are unknowns alone, such as a camera's rates: their parts of the motions are round-off.
+            return np.zeros((0, 7))
         null = (vt[rank:] / norm)[:, :7]
         _, s2, basis = np.linalg.svd(null / max(np.abs(null).max(initial=0.0), 1e-300), full_matrices=False)
         return basis[s2 > 1e-9]

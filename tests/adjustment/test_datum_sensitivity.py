@@ -121,6 +121,17 @@ def test_a_motion_that_goes_along_with_unknowns_that_only_one_another_hold_is_op
     assert not len(SeenMotions(csr_array(placed), csr_array(alone)).null_motions())
 
 
+@pytest.mark.parametrize("alike", [False, True], ids=["seen by none", "seen together alone"])
+def test_unknowns_that_nothing_tells_leave_no_motion_open(alike):
+    """As the rates of a camera, which image points see alone, or a lever arm beside the shift of all strips."""
+    for seed in range(20):
+        _, rows = system(seed, 7, False)
+        more = rows[:, 20:] if alike else np.zeros((len(rows), 1))
+        every = np.hstack([rows, more])
+        sensitivity = SeenMotions(csr_array(every[:60]), csr_array(every[60:72]))
+        assert not len(sensitivity.null_motions())
+
+
 @pytest.mark.parametrize("free_end", [False, True], ids=["prior", "free"])
 def test_weak_motions_are_those_of_the_covariance_matrix(free_end):
     for seed in range(5):
