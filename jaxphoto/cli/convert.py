@@ -100,11 +100,8 @@ def _say(done: Exported, values: str) -> None:
         console.print(plain(f"camera {name}: {'exact' if conversion.max_px == 0 else fit}"), soft_wrap=True)
     if done.moved is not None:
         told = f"rms {done.moved.rms_px:.3g} px, largest {done.moved.max_px:.3g} px"
-        console.print(
-            f"image points count from the principal point, and were moved by {told}, to where the written cameras see "
-            "their rays",
-            soft_wrap=True,
-        )
+        why = f", and were moved by {told}, to where the written cameras see their rays" if done.moved.max_px else ""
+        console.print(f"image points count from the principal point{why}", soft_wrap=True)
     if done.map_misfit is not None:
         told = f"rms {done.map_misfit.rms_px:.3g} px, largest {done.map_misfit.max_px:.3g} px"
         console.print(f"a map is not Cartesian: in its coordinates image points miss by {told}", soft_wrap=True)

@@ -1,5 +1,6 @@
 """What was exported comes back by `read_source`: whole, and adjusting to the same values."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -8,9 +9,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import jaxphoto
+from jaxphoto.block import Frame
 from jaxphoto.camera import InteriorOrientation, OpenCv, get_parameter, parameter_names
+from jaxphoto.errors import InputError
 from jaxphoto.io import FORMATS, AdjustedPhotographs, export, read_source
+from jaxphoto.io.block_folder.table_layout import SIGMA_XYZ, XYZ
+from jaxphoto.io.control_files import read_control
 from jaxphoto.io.exports import ExportCamera
+from jaxphoto.io.exports.control_points import ControlPoints
+from jaxphoto.io.reconstructions.metashape import read_metashape
 from tests.io.oriented_files import come_back, inside, posed, poses
 from tests.io.test_exports import SENSOR
 
@@ -110,3 +117,120 @@ def test_several_cameras_of_openmvg_are_told_apart_as_cereal_does(tmp_path):
     assert dict(zip(tables.tables["images"].text("image"), tables.tables["images"].text("camera"), strict=True)) == {
         name: str(k) for k, name in enumerate(p.images)
     }
+
+
+# Control ------------------------------------------------------------------------------------------------------------
+
+
+def with_control(p, xyz, sigma_m, check):
+    """The first points that four photographs show are known, with these errors; NaN is not given."""
+    often = np.argsort(-np.bincount(p.point, minlength=len(p.points)), kind="stable")[: len(xyz)]
+    return p._replace(control=ControlPoints(often, p.xyz[often] + xyz, sigma_m, check))
+
+
+offset = st.floats(-0.5, 0.5)
+
+
+@settings(max_examples=15, deadline=None)
+@given(
+    kind=st.sampled_from(["local", "epsg"]),
+    errors=st.lists(st.tuples(offset, offset, offset), min_size=5, max_size=5),
+    sigmas=st.lists(st.floats(1e-3, 2.0), min_size=15, max_size=15),
+    height=st.booleans(),
+)
+@pytest.mark.filterwarnings("ignore:.*fewer than two images")
+def test_control_comes_back_in_markers(tmp_path_factory, kind, errors, sigmas, height):
+    folder, p = tmp_path_factory.mktemp("markers"), inside("agisoft", kind)
+    xyz, sigma = np.array(errors), np.array(sigmas).reshape(5, 3)
+    if not height:
+        xyz[0, 2] = sigma[0, 2] = np.nan
+    p = with_control(p, xyz, sigma, np.arange(5) == 4)
+    export(p, folder, "metashape")
+    table = read_metashape(folder).tables["control_points"]
+    names = [p.points[k] for k in p.control.point]
+    assert sorted(table.text("point")) == sorted(names)
+    order = [names.index(name) for name in table.text("point")]
+    assert list(table.text("role")) == ["check" if k == 4 else "control" for k in order]
+    wanted = p.control.xyz
+    if kind == "epsg":
+        # Through the map, by the place that the adjusted point has where no height is given.
+        full = np.where(np.isnan(wanted), p.xyz[p.control.point], wanted)
+        wanted = np.where(np.isnan(wanted), np.nan, p.frame.map.map(full))
+    found = np.stack([table.numbers(n, empty=True) for n in XYZ], axis=1)
+    # A northing of a map has nine digits before those of a nanometre.
+    np.testing.assert_allclose(found, wanted[order], rtol=0, atol=1e-9 if kind == "local" else 2e-9)
+    again = np.stack([table.sigmas(n) for n in SIGMA_XYZ], axis=1)
+    given = np.ones((5, 3), bool) if height else ~np.isnan(wanted)
+    np.testing.assert_array_equal(again[given[order]], sigma[order][given[order]])
+
+
+def test_a_block_with_control_adjusts_to_the_same_values_again(tmp_path):
+    p, rng = inside("agisoft", "epsg"), np.random.default_rng(4)
+    p = with_control(p, rng.normal(0, 0.02, (8, 3)), np.full((8, 3), 0.02), np.arange(8) > 5)
+    p = p._replace(column_row=p.column_row + rng.normal(0, 0.3, (len(p.image), 2)))
+    p = p._replace(sigma_px=np.full((len(p.image), 2), 0.3))
+    export(p, tmp_path / "first", "metashape")
+    with pytest.warns(UserWarning, match="fewer than two images"):
+        first = jaxphoto.adjust(read_source(tmp_path / "first"))
+    assert first.converged and len(first.block.control.who) == 18 and len(first.block.check.who) == 6
+    export(AdjustedPhotographs.of(first), tmp_path / "again", "metashape")
+    again = jaxphoto.adjust(read_source(tmp_path / "again"))
+    assert float(again.sigma0) == pytest.approx(float(first.sigma0), rel=1e-9)
+    system = [a.block.frame.map.map(np.asarray(a.unknowns.exterior.position)) for a in (first, again)]
+    np.testing.assert_allclose(*system, rtol=0, atol=1e-6)
+    (one,), (two,) = (a.unknowns.interior.values() for a in (first, again))
+    assert float(two.c) == pytest.approx(float(one.c), abs=1e-8)
+
+
+@pytest.mark.filterwarnings("ignore:.*fewer than two images")
+def test_markers_in_another_system_are_refused_and_what_markers_cannot_be_is_told(tmp_path):
+    p = inside("agisoft", "local")
+    none = np.full((4, 3), np.nan)
+    heights = with_control(p, np.array([[0.0, 0, 0]] * 3 + [[np.nan, np.nan, 0]]), none, np.zeros(4, bool))
+    with pytest.warns(UserWarning, match="markers.xml: 1 control or check points without X and Y are left out"):
+        export(heights, tmp_path / "out", "metashape")
+    assert len(read_source(tmp_path / "out").control.who) == 9
+    path = tmp_path / "out" / "markers.xml"
+    path.write_text(path.read_text().replace("LOCAL_CS[", "GEOGCS["))
+    with pytest.raises(InputError, match=r"markers.xml is in another coordinate system than cameras.xml; export both"):
+        read_source(tmp_path / "out")
+
+
+def test_control_of_opensfm_is_a_gcp_list(tmp_path):
+    p = inside("opencv", "epsg")
+    p = p._replace(files=tuple(name.replace(" ", "_") for name in p.files))
+    p = with_control(p, np.full((5, 3), 0.25), np.full((5, 3), 0.02), np.arange(5) == 4)
+    with pytest.warns(UserWarning, match="gcp_list.txt is without 1 check points or points without X and Y"):
+        export(p, tmp_path / "out", "opensfm")
+    lines = (tmp_path / "out" / "gcp_list.txt").read_text().splitlines()
+    assert lines[0] == "EPSG:32633"
+    names = [p.points[j] for j in p.control.point[:4]]
+    wanted = dict(zip(names, p.frame.map.map(p.control.xyz[:4]), strict=True))
+    rows = [line.split("\t") for line in lines[1:]]
+    shown = {(p.files[i], p.points[j]): at for i, j, at in zip(p.image, p.point, p.column_row, strict=True)}
+    assert {tuple(row[5:]) for row in rows} == {key for key in shown if key[1] in names}
+    for *numbers, file, name in rows:
+        values = np.array(numbers, float)
+        np.testing.assert_allclose(values[:3], wanted[name], rtol=0, atol=1e-9)
+        # OpenSfM's pixels: the centre of the first is (0, 0).
+        np.testing.assert_allclose(values[3:] + 0.5, shown[file, name], rtol=0, atol=1e-9)
+    given = read_control(tmp_path / "out" / "gcp_list.txt")
+    assert given.points.system == "EPSG:32633" and set(given.points.ids) == set(names)
+    with pytest.warns(UserWarning, match="it needs a map system and the block is in a local frame"):
+        export(p._replace(frame=Frame("local")), tmp_path / "local", "opensfm")
+    assert not (tmp_path / "local" / "gcp_list.txt").exists()
+
+
+def test_control_of_a_block_by_point(tmp_path):
+    """Held, in one row of three axes or several, and a check in height of what is control in position."""
+    block = jaxphoto.read_block("examples/cross_block")
+    points = ControlPoints.of(block)
+    rows = block.control
+    assert set(points.point[~points.check]) == {*rows.who, *block.fixed.who}
+    for who, axis, value, sigma in zip(rows.who, rows.axis, rows.value, rows.sigma, strict=True):
+        k = list(points.point).index(who)
+        assert (points.xyz[k, axis], points.sigma_m[k, axis]) == (value, sigma)
+    held = dataclasses.replace(block, fixed=rows, control=rows.take(np.zeros(0, int)), check=rows)
+    again = ControlPoints.of(held)
+    assert not again.check.any()
+    np.testing.assert_array_equal(np.isnan(again.xyz), np.isnan(points.xyz[~points.check]))

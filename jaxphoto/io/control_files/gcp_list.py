@@ -22,8 +22,8 @@ from jaxphoto.procedures.control.surveyed import GivenControl
 SYSTEM = re.compile(r"EPSG:\d|\+proj=|WGS84\s+UTM\s", re.IGNORECASE)
 """How the first line of a file of OpenDroneMap begins."""
 _LEAST = 6
-# From the centre of the upper-left pixel to its corner.
-_HALF = 0.5
+FIRST_PX = 0.5
+"""Column and row, as here, of the centre of the upper-left pixel, which is (0, 0) there."""
 
 
 def recognises(lines: list[str]) -> bool:
@@ -48,7 +48,7 @@ def read_gcp_list(path: Path, lines: list[str], rows: list[int]) -> GivenControl
         xyz = [cells.number(k, 0, "geo_x"), cells.number(k, 1, "geo_y"), cells.height(k, 2)]
         name = row[6] if len(row) > _LEAST else points.named_by(xyz)
         points.add(name, xyz, cells.place(k), "give it one position in all rows, or another name")
-        column_row = [cells.number(k, 3, "im_x") + _HALF, cells.number(k, 4, "im_y") + _HALF]
+        column_row = [cells.number(k, 3, "im_x") + FIRST_PX, cells.number(k, 4, "im_y") + FIRST_PX]
         marks.append((row[5], name, column_row, np.nan, cells.place(k)))
     if not marks:
         raise cells.none(f"there is no mark after {quoted(lines[0].strip())}; add rows")

@@ -13,6 +13,7 @@ from jaxphoto.camera import InteriorOrientation, Sensor
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing.map_frame import map_system
+from jaxphoto.io.exports.control_points import ControlPoints
 from jaxphoto.unknowns import Unknowns
 
 # Semi-major axis (m) of the ellipsoids of WGS 84 and of GRS 80, which differ by a tenth of a millimetre.
@@ -50,6 +51,8 @@ class AdjustedPhotographs(NamedTuple):
     """What the block corrects by, and no other program does: its points fit the photographs only together with it."""
     sigma_px: Float[np.ndarray, "n 2"] | None = None
     """Of every image point, the standard deviations that the block gives it, along columns and rows."""
+    control: ControlPoints | None = None
+    """Control and check points that the block knows; None, or none of them, where it has none."""
 
     @staticmethod
     def of(adjusted: Adjustment, files: Mapping[str, str] | None = None) -> "AdjustedPhotographs":
@@ -87,6 +90,7 @@ class AdjustedPhotographs(NamedTuple):
             block.frame,
             tuple(_changes(block, unknowns)),
             sigma_px,
+            ControlPoints.of(block),
         )
 
     @property

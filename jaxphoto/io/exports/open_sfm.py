@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from jaxphoto.camera import Equidistant, OpenCv, OpenCvFisheye, Perspective, Sensor
 from jaxphoto.io.cameras.camera_file import CameraModel
 from jaxphoto.io.exports.adjusted_photographs import AdjustedPhotographs, ExportCamera, downwards
+from jaxphoto.io.exports.gcp_list import write_gcp_list
 
 PLANE = CameraModel(OpenCv, ("k4", "k5", "k6", "b2"), Perspective())
 FISHEYE = CameraModel(OpenCvFisheye, ("p1", "p2", "s1", "s2", "b2"), Equidistant())
@@ -24,7 +25,8 @@ _COLOUR = [0.0, 0.0, 0.0]
 
 
 def write_open_sfm(photographs: AdjustedPhotographs, folder: Path) -> None:
-    """Write reconstruction.json, camera_models.json, tracks.csv and, on WGS 84, reference_lla.json into `folder`."""
+    """Write reconstruction.json, camera_models.json, tracks.csv and, on WGS 84, reference_lla.json into `folder`; of
+    control on a map also gcp_list.txt."""
     p = photographs
     rotations = downwards(p.exterior)
     turns, moved = Rotation.from_matrix(rotations).as_rotvec(), -np.einsum("nij,nj->ni", rotations, p.exterior.position)
@@ -42,6 +44,7 @@ def write_open_sfm(photographs: AdjustedPhotographs, folder: Path) -> None:
     _write(folder / "reconstruction.json", [reconstruction])
     _write(folder / "camera_models.json", cameras)
     (folder / "tracks.csv").write_text(_tracks(p), encoding="utf-8")
+    write_gcp_list(p, folder)
 
 
 def normalised(sensor: Sensor, column_row: np.ndarray) -> np.ndarray:

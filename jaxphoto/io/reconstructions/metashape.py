@@ -8,7 +8,8 @@
     .../markers, .../frames/frame/markers    control and marks (as `jaxphoto.io.control_files.metashape`)
     .../reference                            WKT of the coordinate system
 
-The file has no tie points: they are those of a text beside it, and the marks of markers.
+The file has no tie points: they are those of a text beside it, and the marks of markers. Markers without a place in it
+are those of markers.xml beside it.
 Source: Agisoft Metashape User Manual, "Export cameras" and Appendix D; Metashape Python Reference, Chunk.transform and
 Camera.transform; exported files of versions 1.5 and 2.0.
 """
@@ -30,6 +31,7 @@ from jaxphoto.io.block_folder import BlockTables
 from jaxphoto.io.cameras.agisoft import read_sensor
 from jaxphoto.io.cameras.camera_file import CameraSource
 from jaxphoto.io.control_files.metashape import markers_of, only_chunk, system_words
+from jaxphoto.io.control_files.rows import Mark, SurveyRows
 from jaxphoto.io.reconstructions.numbers import number_rows
 from jaxphoto.io.reconstructions.on_map import WGS84, OnMap, of_the_earth, on_map
 from jaxphoto.io.reconstructions.points_beside import PhotographCamera, joined, marks_shown, points_beside
@@ -38,6 +40,7 @@ from jaxphoto.io.whole_text import LARGE, read_text
 from jaxphoto.procedures.control.surveyed import SurveyedPoints
 from jaxphoto.procedures.control.system import ControlSystem, system_of
 
+MARKERS = "markers.xml"
 _OPENS = (b"<document", b"<cameras", b"<transform")
 # Bytes of a file in which the first oriented camera stands, below sensors with their covariances.
 _HEAD = 2_000_000
@@ -88,7 +91,7 @@ def read_metashape(source: Path) -> BlockTables:
     there = OnMap(Frame("local"), centres, rotations)
     if system.crs is not None:
         there = on_map(path.name, _datum_code(path, system), system.vertical, centres, rotations)
-    rows, marks = markers_of(path.name, chunk)
+    rows, marks = _markers(path, chunk)
     labels = [photo.label for photo in photos]
     of_photo = [PhotographCamera(*sensors[photo.sensor][:2]) for photo in photos]
     shown = joined(points_beside(path, labels, of_photo), marks_shown(marks, labels), path.name)
@@ -219,6 +222,21 @@ def _datum_code(path: Path, system: ControlSystem) -> int:
         )
     warnings.warn(f"{path.name}: its system has no EPSG code; the block is in EPSG:{code}", UserWarning, stacklevel=3)
     return code
+
+
+def _markers(path: Path, chunk: ElementTree.Element) -> tuple[SurveyRows, list[Mark]]:
+    """Those of the file, or where it has none those of markers.xml beside it. Raises InputError where that is in
+    another coordinate system."""
+    beside = path.with_name(MARKERS)
+    if chunk.find("markers//marker") is not None or not beside.is_file() or beside == path:
+        return markers_of(path.name, chunk)
+    other = only_chunk(beside, read_text(beside, LARGE))
+    if system_words(other) != system_words(chunk):
+        raise InputError(
+            f"{MARKERS} is in another coordinate system than {path.name}; export both in one, or give {MARKERS} to "
+            "jaxphoto control"
+        )
+    return markers_of(MARKERS, other)
 
 
 def _control(path: Path, points: SurveyedPoints | None, system: ControlSystem, placed: bool) -> SurveyedPoints | None:

@@ -162,8 +162,14 @@ def joined(ties: Shown, marks: Shown, of: str) -> Shown:
     kept = np.array([place[1] not in same or place not in marked for place in where], bool)
     own = [name + _OTHER if name in clash else name for name, keep in zip(names[0], kept.tolist(), strict=True) if keep]
     image = np.concatenate([ties.image[kept], marks.image])
-    at, sigma = (np.concatenate([a[kept], b]) for a, b in zip(ties[-2:], marks[-2:], strict=True))
-    return named(image, own + names[1], at, sigma)
+    at = np.concatenate([ties.column_row[kept], marks.column_row])
+    # Of a mark, what the tie point there has.
+    of_ties = dict(zip(where, ties.sigma_px.tolist(), strict=True))
+    of_marks = [
+        of_ties.get((i, name), np.nan) if name in same and np.isnan(s) else s
+        for i, name, s in zip(marks.image.tolist(), names[1], marks.sigma_px.tolist(), strict=True)
+    ]
+    return named(image, own + names[1], at, np.concatenate([ties.sigma_px[kept], of_marks]))
 
 
 def named(
