@@ -8,8 +8,9 @@ from scipy.spatial.transform import Rotation
 
 from jaxphoto.camera import BundlerRadial, Equisolid, InteriorOrientation, OpenCv
 from jaxphoto.errors import InputError
-from jaxphoto.io import FORMATS, export
+from jaxphoto.io import FORMATS, export, read_block
 from jaxphoto.io.exports import ExportCamera
+from tests.commands import run
 from tests.io.oriented_files import come_back, inside, posed, poses
 from tests.io.test_exports import SENSOR
 
@@ -124,3 +125,15 @@ def test_what_these_cameras_cannot_be(tmp_path):
     with pytest.raises(InputError, match=f"point {p.points[p.point[7]]} in image a b lies where the distortion of c"):
         export(p._replace(cameras=folds, column_row=far), tmp_path / "out", "bal")
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("format", [*OF, "metashape"])
+def test_the_command_writes_and_reads_again(tmp_path, monkeypatch, capsys, format):
+    code, said, _ = run(monkeypatch, capsys, "convert", "examples/cross_block", tmp_path / "out", "--to", format)
+    assert code == 0 and f"wrote {tmp_path / 'out'}" in said
+    assert ("image points count from the principal point\n" in said) == (format in OF)
+    assert run(monkeypatch, capsys, "convert", tmp_path / "out", tmp_path / "block")[0] == 0
+    given, again = read_block("examples/cross_block"), read_block(tmp_path / "block")
+    assert len(again.image_points.image) == len(given.image_points.image)
+    if format == "metashape":
+        assert len(again.control.who) == len(given.control.who) + len(given.fixed.who)

@@ -69,33 +69,38 @@ def test_a_block_adjusts_to_the_same_values_again(tmp_path, format):
 
 
 term = st.floats(-0.2, 0.2)
+# Formats that hold points with their image points, and the names of OpenCV's coefficients there.
+WHOLE = {"openmvg": {}, "opensfm": {}, "blocksexchange": {"p1": "p2", "p2": "p1"}}
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(
+    format=st.sampled_from(list(WHOLE)),
     values=poses,
     c=st.floats(2.0, 200.0),
     at=st.tuples(term, term),
     terms=st.sampled_from([(), ("k1",), ("k1", "k2", "k3"), ("k1", "k2", "k3", "p1", "p2")]),
     numbers=st.lists(term.filter(bool), min_size=5, max_size=5),
 )
-def test_scenes_of_openmvg_come_back(tmp_path_factory, values, c, at, terms, numbers):
+def test_cameras_poses_points_and_image_points_come_back(tmp_path_factory, format, values, c, at, terms, numbers):
     folder = tmp_path_factory.mktemp("scene")
     given = dict(zip(terms, numbers, strict=False))
     p = posed(values, InteriorOrientation(c, *at, OpenCv(**given)))
-    assert export(p, folder, "openmvg").cameras["one"].max_px == 0
-    tables = FORMATS["openmvg"].read(folder)
+    assert export(p, folder, format).cameras["one"].max_px == 0
+    tables = FORMATS[format].read(folder)
     come_back(p, tables, list(p.images))
     (camera,) = tables.settings["cameras"].values()
     scale = camera["pixel_mm"] / SENSOR.pixel_mm
-    wanted = {"c_mm": c * scale, "xp_mm": at[0] * scale, "yp_mm": at[1] * scale} | given
-    assert {name for name, prior in camera["unknowns"].items() if prior == "free"} == set(wanted)
-    for name, value in wanted.items():
-        assert camera["interior"].get(name, 0.0) == pytest.approx(value, rel=1e-12, abs=1e-9)
-    rows = tables.tables["image_points"]
+    wanted = {"c_mm": c * scale, "xp_mm": at[0] * scale, "yp_mm": at[1] * scale}
+    wanted |= {WHOLE[format].get(name, name): value for name, value in given.items()}
+    assert set(wanted) <= {name for name, prior in camera["unknowns"].items() if prior == "free"}
+    for name, value in camera["interior"].items():
+        assert value == pytest.approx(wanted.get(name, 0.0), rel=1e-12, abs=1e-9)
+    rows, points = tables.tables["image_points"], tables.tables["object_points"].text("point").tolist()
     shown = np.stack([rows.numbers("column_px"), rows.numbers("row_px")], axis=1)
-    own = {(p.images[i], str(j + 1)): at for i, j, at in zip(p.image, p.point, p.column_row, strict=True)}
-    names = zip(rows.text("image"), rows.text("point"), strict=True)
+    own = {(p.images[i], points[j]): at for i, j, at in zip(p.image, p.point, p.column_row, strict=True)}
+    names = list(zip(rows.text("image"), rows.text("point"), strict=True))
+    assert set(names) == set(own)
     np.testing.assert_allclose(shown, [own[name] for name in names], rtol=0, atol=1e-9)
 
 
