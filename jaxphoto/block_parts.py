@@ -10,9 +10,11 @@ from jaxtyping import Float
 
 from jaxphoto.arrays import Numbers
 from jaxphoto.georeferencing.map_frame import MapFrame
+from jaxphoto.short_repr import shown
 from jaxphoto.unknowns import Unknowns
 
 
+@shown
 @dataclasses.dataclass(frozen=True)
 class Datum:
     """How position, orientation and scale are fixed where observations leave them open.
@@ -27,6 +29,7 @@ class Datum:
     scale: bool | None = None
 
 
+@shown
 class Motion(eqx.Module):
     """How the GNSS/IMU moves at each exposure, for a time offset to act on (`georeferencing.Exposure`)."""
 
@@ -36,6 +39,7 @@ class Motion(eqx.Module):
     """About the body's right, forward and up axes, rad/s."""
 
 
+@shown
 class Temperatures(eqx.Module):
     """Of the camera at each exposure, for `camera.ThermalRates`."""
 
@@ -50,6 +54,7 @@ class Temperatures(eqx.Module):
         return jnp.where(jnp.isnan(self.celsius), 0.0, self.celsius - self.reference_c)
 
 
+@shown
 @dataclasses.dataclass(frozen=True)
 class Frame:
     """The object frame of a block, and how to come back to the frame of its files.
@@ -74,6 +79,7 @@ class Frame:
         return MapFrame(self.code, self.vertical, self.origin)
 
 
+@shown
 class Start(eqx.Module):
     """Approximate unknowns, and which images and points they are truly known for.
 

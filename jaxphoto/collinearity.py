@@ -14,12 +14,14 @@ from jaxtyping import Array, Bool, Float
 
 from jaxphoto.camera import InteriorOrientation
 from jaxphoto.rotation import matrix_from_omega_phi_kappa, omega_phi_kappa_from_matrix, rotate
+from jaxphoto.short_repr import shown
 from jaxphoto.single import single
 
 # Rounds to the row of a rolling shutter that sees a point: each leaves a hundredth of the error, or less.
 _ROWS = 10
 
 
+@shown
 class ExteriorOrientation(eqx.Module):
     """Projection centre (m) and rotation of one image, or of many with a leading axis."""
 

@@ -12,6 +12,8 @@ from typing import Any, ClassVar, Literal
 import equinox as eqx
 import numpy as np
 
+from jaxphoto.short_repr import shown
+
 UNITS = (
     "m", "rad", "mm", "s", "ms", "m_per_s", "rad_per_s", "mm_per_s", "mm_per_h", "per_h", "mm_per_K", "per_K", "ppm",
 )  # fmt: skip
@@ -22,6 +24,7 @@ Owner = Literal["image", "camera", "mount", "strip", "block"] | str
 of the images that the block names (`Block.partitions`), such as intervals of time."""
 
 
+@shown
 class AbstractParameters(eqx.Module):
     """Parameters of one owner; fields are numbers or vectors."""
 

@@ -4,12 +4,20 @@ Tables and pictures are made upstairs (`jaxphoto.report`), which nothing down he
 them for notebooks is asked for by name, when it is wanted: `from_upstairs`.
 """
 
+import dataclasses
+import enum
 import importlib
-from collections.abc import Mapping
+import textwrap
+from collections.abc import Iterator, Mapping
 from html import escape
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+
+T = TypeVar("T", bound=type)
+# Of a thing by its fields: how long a word for one of them is at most, how many numbers and names are told, and how
+# many rows and fields.
+_LONGEST, _FEW, _ROWS, _FIELDS = 72, 4, 20, 24
 
 # Standard deviations that a normal number exceeds once in a thousand times, to either side.
 _ONE_IN_A_THOUSAND = 3.29
@@ -27,6 +35,91 @@ def html_of(title: str, rows: Mapping[str, object]) -> str:
         for name, value in rows.items()
     )
     return f"<b>{escape(title)}</b><table>{cells}</table>"
+
+
+def shown(cls: T) -> T:
+    """The class, whose things show their fields in a few lines, and in notebooks as a small table."""
+    cls.__repr__ = fields_repr  # type: ignore[assignment]
+    cls._repr_html_ = fields_html  # type: ignore[attr-defined]
+    return cls
+
+
+def fields_repr(thing: Any) -> str:
+    """`Name(field word, field word, ...)`, in as many lines as it takes."""
+    told = [f"{name} {field_word(value)}".strip() for name, value in _fields(thing)]
+    if len(told) > _FIELDS:
+        told[_FIELDS:] = [f"{len(told) - _FIELDS} more"]
+    return "\n".join(textwrap.wrap(f"{type(thing).__name__}({', '.join(told)})", 110, subsequent_indent="  "))
+
+
+def fields_html(thing: Any) -> str:
+    """The same as a table; below it what has rows of its own."""
+    fields = dict(_fields(thing))
+    tables = {name: rows for name, rows in fields.items() if _is_rows(rows)}
+    words = {name: field_word(value) for name, value in fields.items() if name not in tables}
+    return html_of(type(thing).__name__, words) + "".join(_rows_html(name, rows) for name, rows in tables.items())
+
+
+def _fields(thing: Any) -> Iterator[tuple[str, Any]]:
+    """Those that there are: what JAX takes apart may lack some for a while."""
+    names = getattr(thing, "_fields", None) or [field.name for field in dataclasses.fields(thing)]
+    given = ((name, getattr(thing, name, None)) for name in names if not name.startswith("_"))
+    return ((name, value) for name, value in given if value is not None and not _is_empty(value))
+
+
+def _is_empty(value: Any) -> bool:
+    return isinstance(value, str | tuple | list | dict) and not value
+
+
+def _is_rows(value: Any) -> bool:
+    """Whether it is several of one kind of record, of words and numbers alone."""
+    if not isinstance(value, tuple | list) or not value or not hasattr(value[0], "_fields"):
+        return False
+    plain = str | int | float | np.generic | None
+    return all(type(row) is type(value[0]) and all(isinstance(cell, plain) for cell in row) for row in value)
+
+
+def _rows_html(name: str, rows: Any) -> str:
+    head = "".join(f"<th>{escape(field)}</th>" for field in rows[0]._fields)
+    body = "".join(
+        f"<tr>{''.join(f'<td>{escape(field_word(cell))}</td>' for cell in row)}</tr>" for row in rows[:_ROWS]
+    )
+    more = f"<p>{len(rows) - _ROWS} more</p>" if len(rows) > _ROWS else ""
+    return f"<b>{escape(name)}</b><table><tr>{head}</tr>{body}</table>{more}"
+
+
+def field_word(value: Any) -> str:
+    """What a field holds, in a word or two."""
+    if isinstance(value, str):
+        return textwrap.shorten(value, _LONGEST, placeholder=" ...")
+    if isinstance(value, bool | np.bool_):
+        return str(value)
+    if isinstance(value, enum.Enum):
+        return value.name
+    if isinstance(value, type):
+        return value.__name__
+    if isinstance(value, Mapping | tuple | list) and not hasattr(value, "_fields"):
+        return _several_word(value)
+    if hasattr(value, "_fields") or dataclasses.is_dataclass(value):
+        word = " ".join(repr(value).split()) if hasattr(type(value), "_repr_html_") else ""
+        return word if 0 < len(word) <= _LONGEST else type(value).__name__
+    if isinstance(value, np.ndarray) and value.dtype.kind in "iuf" and 0 < value.size <= _FEW and value.ndim == 1:
+        return " ".join(number_word(v) for v in value)
+    if isinstance(value, int | float | np.generic) or hasattr(value, "shape"):
+        return number_word(value)
+    return getattr(value, "__name__", type(value).__name__)
+
+
+def _several_word(value: Any) -> str:
+    """Of names and numbers the first; of things how many."""
+    if isinstance(value, Mapping) and all(isinstance(v, int | float) for v in value.values()) and len(value) <= _FEW:
+        return numbers_words(value)
+    items = [str(key) for key in value] if isinstance(value, Mapping) else list(value)
+    if all(isinstance(item, str | int | float | np.generic) for item in items):
+        told = " ".join(field_word(item) for item in items[:_FEW])
+        return told if len(items) <= _FEW else f"{len(items)}: {told} ..."
+    kinds = sorted({type(item).__name__ for item in items})
+    return f"{len(items)} {' '.join(kinds)}"
 
 
 def number_word(value: Any) -> str:

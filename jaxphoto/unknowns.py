@@ -36,7 +36,7 @@ from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import FlightBias, Mount, RigCamera, Scanner, ScannerCalibration, StripBias, TrajectoryKnot
 from jaxphoto.parameters import AbstractParameters, dynamic_fields
-from jaxphoto.short_repr import html_of, number_word, numbers_words
+from jaxphoto.short_repr import fields_html, html_of, number_word, numbers_words
 
 UNKNOWNS: tuple[type[AbstractParameters], ...] = (
     Scanner, Mount, StripBias, FlightBias, CameraRates, ThermalRates, CameraSpline, StripCamera, RollingShutter,
@@ -78,6 +78,8 @@ class Weighted(eqx.Module):
 
     def __repr__(self) -> str:
         return f"Weighted({number_word(self.value)}, sigma {number_word(self.sigma)})"
+
+    _repr_html_ = fields_html
 
 
 class Unknowns(eqx.Module):

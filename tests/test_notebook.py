@@ -1,12 +1,15 @@
 """What a notebook asks of things: how they show themselves, priors by name, pictures, two adjustments compared."""
 
 import dataclasses
+import enum
 import inspect
 import os
 import subprocess
 import sys
+import typing
 from pathlib import Path
 
+import jax
 import numpy as np
 import pandas as pd
 import pytest
@@ -15,6 +18,11 @@ from matplotlib.figure import Figure
 import jaxphoto
 from jaxphoto import FIXED, FREE, InputError, Tables, Weighted, report
 from jaxphoto.io.block_folder.table_layout import ANGLES, XYZ
+from jaxphoto.losses import AbstractLoss
+from jaxphoto.report.findings import Verdict
+from jaxphoto.sensitivity import Readjustment
+from jaxphoto.simulation import Simulation
+from jaxphoto.stability import Change
 from tests.blocks import adjusted, simulated
 
 PANELS = (
@@ -40,6 +48,57 @@ def test_things_show_themselves_in_a_few_lines():
     assert "k1 FREE" in repr(adjusted("cross").priors)
     evil = dataclasses.replace(block, title="<script>")
     assert "&lt;script&gt;" in evil._repr_html_()
+
+
+ROOMS = (jaxphoto, jaxphoto.statistics, jaxphoto.stability, jaxphoto.sensitivity, jaxphoto.procedures)
+
+
+def classes_in(hint) -> set[type]:
+    """Those of jaxphoto in an annotation."""
+    inside = set().union(*(classes_in(part) for part in typing.get_args(hint)))
+    ours = inspect.isclass(hint) and hint.__module__.startswith("jaxphoto") and not typing.get_origin(hint)
+    return inside | ({hint} if ours else set())
+
+
+def returned() -> set[type]:
+    """What public functions return, public classes, and what blocks, adjustments and simulations consist of."""
+    found: set[type] = set()
+    for thing in (getattr(room, name) for room in ROOMS for name in room.__all__):
+        if inspect.isclass(thing):
+            found.add(thing)
+        elif inspect.isfunction(thing):
+            found |= classes_in(typing.get_type_hints(thing).get("return"))
+    for whole in (jaxphoto.Block, jaxphoto.Adjustment, jaxphoto.Unknowns, Simulation, Change):
+        found |= {c for hint in typing.get_type_hints(whole).values() for c in classes_in(hint)}
+        own = [p.fget for _, p in inspect.getmembers(whole, lambda p: isinstance(p, property))]
+        # Types of what upstairs makes are not known down here.
+        found |= {c for get in own for c in classes_in(typing.get_type_hints(get).get("return"))}
+    return found
+
+
+def test_whatever_the_public_functions_return_shows_itself_in_a_notebook():
+    plain = (BaseException, enum.Enum, Readjustment, AbstractLoss)
+    mute = {c.__name__ for c in returned() if not issubclass(c, plain) and not hasattr(c, "_repr_html_")}
+    assert not mute and hasattr(Verdict, "_repr_html_") and len(returned()) > 100
+
+
+def test_what_is_returned_is_short_and_a_table():
+    block, result = simulated("cross").block, adjusted("cross")
+    tables = Tables(result)
+    things = [
+        jaxphoto.compare(result, result), simulated("cross"), result.tiled, result.tiled_values, result.equations,
+        result.structure, result.values, result.residuals, result.factored, block.start, block.datum, block.stations,
+        result.verdict(), result.unknowns.exterior, tables.covariance, tables.redundancy, tables.correlations["one"],
+        jaxphoto.bias(block, "station", 0.1), jaxphoto.sigma_map(result, "one"), Weighted(1.0, 0.1),
+    ]  # fmt: skip
+    for thing in things:
+        assert len(repr(thing)) < 1500 and len(repr(thing).splitlines()) < 15, type(thing)
+        shown = thing._repr_html_()
+        assert shown.startswith("<b>") and shown.count("<table") == shown.count("</table>") > 0 and len(shown) < 8000
+    assert "<th>difference</th>" in things[0]._repr_html_() and "c_mm" in things[0]._repr_html_()
+    # Whatever stands for an array while JAX maps over it.
+    odd = jax.tree.map(lambda _: object(), result.values)
+    assert repr(odd).startswith("Values(") and "<table" in odd._repr_html_()
 
 
 def test_an_adjustment_that_fits_nothing_says_so_and_its_verdict_reads_as_sentences():

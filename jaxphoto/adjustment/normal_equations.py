@@ -31,8 +31,10 @@ from jaxphoto.adjustment.solver.optimum import iterate, typical_scale, unit_scal
 from jaxphoto.adjustment.solver.reduced import reduce_normal
 from jaxphoto.arrays import Numbers, still
 from jaxphoto.compiling import call_compiled
+from jaxphoto.short_repr import shown
 
 
+@shown
 class NormalEquations(eqx.Module):
     """N x = b at the optimum, undamped and factored."""
 

@@ -23,6 +23,7 @@ from jaxphoto.camera.distortion import Brown, PpsRadial
 from jaxphoto.camera.interior import InteriorOrientation, get_parameter, parameter_names, set_parameter
 from jaxphoto.camera.sensor import Sensor
 from jaxphoto.rotation import small_rotation
+from jaxphoto.short_repr import shown
 
 # Image points along each side of the format, corners included, at which two cameras are compared.
 _SIDE = 25
@@ -32,6 +33,7 @@ _STEPS = 6
 _DEPENDENT = 1e-10
 
 
+@shown
 class PrincipalPoints(NamedTuple):
     """Both principal points in the image, in mm from the image centre."""
 
@@ -39,6 +41,7 @@ class PrincipalPoints(NamedTuple):
     symmetry: Float[Array, "2"]
 
 
+@shown
 class ConversionError(NamedTuple):
     """What one camera misses of another: the largest and RMS image displacement over the format, in mm.
 

@@ -9,9 +9,12 @@ import dataclasses
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxphoto.short_repr import shown
+
 EARTH_RADIUS_M = 6_371_000.0
 
 
+@shown
 @dataclasses.dataclass(frozen=True)
 class Corrections:
     """Which corrections are on. `sea_level_m` is the Z of the sea: refraction wants heights above it."""

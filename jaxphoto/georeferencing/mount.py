@@ -15,6 +15,7 @@ from jaxphoto.arrays import Numbers
 from jaxphoto.errors import InputError
 from jaxphoto.parameters import AbstractParameters
 from jaxphoto.rotation import rotate, small_angles, small_rotation
+from jaxphoto.short_repr import shown
 
 ImageX = Literal["forward", "left", "back", "right"]
 """Where the camera's x axis points in the aircraft."""
@@ -73,6 +74,7 @@ class StripBias(AbstractParameters):
     drift: Float[Array, "3 *images"]
 
 
+@shown
 class Exposure(eqx.Module):
     """What is known of an exposure besides its observations; of many with a leading (in an adjustment: last) axis.
 

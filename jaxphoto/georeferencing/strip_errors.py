@@ -6,8 +6,10 @@ from jaxtyping import Float
 
 from jaxphoto.georeferencing.scanner_calibration import ScannerCalibration
 from jaxphoto.georeferencing.trajectory_knots import SplineKnots, StripSpline
+from jaxphoto.short_repr import shown
 
 
+@shown
 class StripErrors(eqx.Module):
     """What a cloud is off by: its scanner, and its trajectory strip by strip."""
 

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxphoto.rotation import matrix_from_quaternion, small_angles
+from jaxphoto.short_repr import shown
 
 SHORTEST = 9
 """The fewest records from which the uncertainty of the interpolation can be told."""
@@ -24,6 +25,7 @@ SHORTEST = 9
 _HALF_WINDOW = 8
 
 
+@shown
 class Trajectory(eqx.Module):
     """Records of a GNSS/IMU in the object frame; at least `SHORTEST`, in the order of time."""
 

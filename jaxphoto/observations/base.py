@@ -37,6 +37,7 @@ from jaxtyping import Array, Float, Int
 from jaxphoto.arrays import Numbers, joined, still
 from jaxphoto.georeferencing import Exposure, Mount, StripBias
 from jaxphoto.observations.columns import row_fields
+from jaxphoto.short_repr import shown
 
 AXES = ("X", "Y", "Z")
 
@@ -69,6 +70,7 @@ class ImageState(eqx.Module):
         return self.parameters.get("strips") or StripBias(jnp.zeros(3), jnp.zeros(3))
 
 
+@shown
 @dataclass_transform(field_specifiers=(touching, eqx.field))
 class AbstractObservations(eqx.Module):
     """Rows of one kind, one along the first axis of every field; they need `sigma`, in the unit of the residual."""

@@ -11,6 +11,7 @@ from jaxphoto.arrays import Numbers
 from jaxphoto.errors import camera_words, few
 from jaxphoto.observations.base import AXES, AbstractObservations, ImageState, touching
 from jaxphoto.rotation import small_angles
+from jaxphoto.short_repr import shown
 
 PRIORS = "priors"
 
@@ -82,6 +83,7 @@ class PointRows(AbstractObservations):
         return self.value - point
 
 
+@shown
 class KnownParameters(eqx.Module):
     """Parameters known beforehand together: a calibration of last year, with its correlations.
 

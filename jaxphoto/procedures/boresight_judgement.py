@@ -11,6 +11,7 @@ import numpy as np
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.observations import AXES
 from jaxphoto.procedures.fit import fit
+from jaxphoto.short_repr import shown
 from jaxphoto.statistics import (
     LEVEL,
     Covariance,
@@ -40,6 +41,7 @@ _ANGLES = {"x": "d-omega", "y": "d-phi", "z": "d-kappa"}
 _UNITS = {"_m_per_s": "m/s", "_mm": "mm", "_deg": "deg", "_m": "m", "_s": "s"}
 
 
+@shown
 class BoresightEstimate(NamedTuple):
     """One number that a step gives, in `unit` (angles in degrees); sigma is a posteriori."""
 
@@ -49,6 +51,7 @@ class BoresightEstimate(NamedTuple):
     unit: str
 
 
+@shown
 class Step(eqx.Module):
     """One step of a boresight calibration: its adjustment and what is concluded from it.
 

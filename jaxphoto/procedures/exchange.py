@@ -12,8 +12,10 @@ from jaxphoto.arrays import still
 from jaxphoto.block import Block
 from jaxphoto.orientation.rays import camera_rays, turn_to_object
 from jaxphoto.procedures.robust import Masks
+from jaxphoto.short_repr import shown
 
 
+@shown
 class Exchange(NamedTuple):
     """Rows of a group to exchange with one another: what was observed, and its standard deviation."""
 

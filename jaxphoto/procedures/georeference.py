@@ -35,12 +35,14 @@ from jaxphoto.georeferencing.intersection_covariance import (
 from jaxphoto.observations import ControlRows
 from jaxphoto.orientation import intersect_points
 from jaxphoto.orientation.rays import camera_rays, padded_length, turn_to_object
+from jaxphoto.short_repr import shown
 from jaxphoto.unknowns import Weighted
 
 # From the point nearest to the rays the first step leaves micrometres, the second nothing.
 _STEPS = 4
 
 
+@shown
 class Georeferenced(eqx.Module):
     """What GNSS, IMU, mount and camera give without an adjustment. All covariances are a priori."""
 

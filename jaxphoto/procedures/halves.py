@@ -22,6 +22,7 @@ from jaxphoto.block import Block
 from jaxphoto.camera import InteriorOrientation, parameter_names
 from jaxphoto.errors import BlockError, DatumError, InputError, RankError
 from jaxphoto.procedures.adjust import adjust
+from jaxphoto.short_repr import shown
 from jaxphoto.stability import (
     Differences,
     ErrorBand,
@@ -58,6 +59,7 @@ class Cut(NamedTuple):
     jacobian_px: Float[np.ndarray, "coordinates parameters"] = np.zeros((0, 0))
 
 
+@shown
 class Halves(NamedTuple):
     """A calibration by a whole block, its halves, and how far its standard deviations can be believed."""
 

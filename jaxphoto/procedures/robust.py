@@ -19,6 +19,7 @@ from jaxphoto.block import Block
 from jaxphoto.errors import BlockError, RankError
 from jaxphoto.losses import AbstractLoss, Huber, StudentT
 from jaxphoto.procedures.adjust import start_of
+from jaxphoto.short_repr import shown
 from jaxphoto.statistics import LEAST_CHECKED, LEAST_SIGMA0, covariance, redundancy_numbers
 from jaxphoto.statistics.quantiles import student_freedom
 from jaxphoto.unknowns import Unknowns
@@ -36,6 +37,7 @@ _WIDE, _FALL, _STILL = 1e3, 0.1, 0.02
 _ROUNDS = 20
 
 
+@shown
 class Robust(NamedTuple):
     """A robust adjustment: where its losses together are least."""
 

@@ -33,6 +33,7 @@ from jaxphoto.procedures.exchange import Exchange, exchanged, with_places, with_
 from jaxphoto.procedures.exchanged_coordinates import as_one, coordinate_exchanges
 from jaxphoto.procedures.exchanged_names import name_exchanges, points_that_meet, put_back
 from jaxphoto.procedures.robust import Blocks, Masks, all_points, checked_parts, residual_scales, solve_placed
+from jaxphoto.short_repr import shown
 from jaxphoto.statistics import (
     LEAST_CHECKED,
     LEAST_SIGMA0,
@@ -58,6 +59,7 @@ _WEAK = 1000.0
 _BESIDE_THE_WORST = 0.5
 
 
+@shown
 class Snooped(NamedTuple):
     """A block without its blunders, adjusted; what was left out, the worst first; what was put right.
 

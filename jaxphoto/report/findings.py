@@ -3,6 +3,7 @@
 import enum
 import re
 from collections.abc import Iterable
+from html import escape
 from typing import NamedTuple
 
 from jaxphoto.errors import camera_words
@@ -39,6 +40,11 @@ class Verdict(NamedTuple):
 
     def __repr__(self) -> str:
         return "\n".join([self.headline, *(f"{MARKS[f.level]} {f.text}" for f in self.findings)])
+
+    def _repr_html_(self) -> str:
+        """The headline, and below it the findings with their marks."""
+        rows = "".join(f"<tr><td>{MARKS[f.level]}</td><td>{escape(f.text)}</td></tr>" for f in self.findings)
+        return f"<b>{escape(self.headline)}</b><table>{rows}</table>"
 
     @classmethod
     def of(cls, findings: Iterable[Finding]) -> "Verdict":

@@ -28,6 +28,7 @@ from jaxphoto.rotation import omega_phi_kappa_from_matrix
 from jaxphoto.sensitivity.chords import Found, find_optima
 from jaxphoto.sensitivity.many import Varying, common_of, path_name
 from jaxphoto.sensitivity.perturbation import Perturbation, Recorded, in_order_of
+from jaxphoto.short_repr import shown
 from jaxphoto.unknowns import Prior
 
 # Draws that a device computes side by side. Vectors end in them: 32 are enough for that, and for what is made anew for
@@ -43,6 +44,7 @@ _MANY = 500
 _MOST_DEVICES = 1024
 
 
+@shown
 class Draws(eqx.Module):
     """Re-adjustments of a block, one a draw along the first axis.
 

@@ -36,6 +36,7 @@ from jaxphoto.sensitivity.adjoint import Estimates, adjoint_vectors
 from jaxphoto.sensitivity.curvature import mixed_second, rows_second
 from jaxphoto.sensitivity.hessian import Eliminated, check_optimum, eliminated
 from jaxphoto.sensitivity.image_rows import ListedRows, image_rows
+from jaxphoto.short_repr import shown
 from jaxphoto.statistics import EOP_NAMES
 from jaxphoto.statistics.covariance import turns_of
 
@@ -43,6 +44,7 @@ from jaxphoto.statistics.covariance import turns_of
 _MOST_NUMBERS = 2e8
 
 
+@shown
 class Sensitivity(eqx.Module):
     """Derivatives of the estimates named by `labels`, one row each, by observations in the block's order.
 

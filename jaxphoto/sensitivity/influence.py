@@ -15,11 +15,13 @@ from jaxphoto.errors import InputError
 from jaxphoto.observations import AbstractObservations, Correlated
 from jaxphoto.sensitivity.biased_numbers import OBSERVED
 from jaxphoto.sensitivity.exact import Sensitivity
+from jaxphoto.short_repr import shown
 from jaxphoto.statistics import DELTA0, covariance, detectable_errors, observation_groups, redundancy_numbers
 
 Per = Literal["block", "strip", "image"]
 
 
+@shown
 class StationBias(eqx.Module):
     """Change of every estimate (as `Sensitivity.labels`) where all stations of a unit are off along one axis."""
 
@@ -28,6 +30,7 @@ class StationBias(eqx.Module):
     bias_m: float = eqx.field(static=True)
 
 
+@shown
 class VarianceShares(eqx.Module):
     """Shares of each estimate's variance by observation; over all groups a row sums to 1.
 
@@ -44,6 +47,7 @@ class VarianceShares(eqx.Module):
         return {name: share.sum(axis=1) for name, share in self.groups.items()}
 
 
+@shown
 class ExternalReliability(eqx.Module):
     """Minimal detectable errors, and what one of that size does to every estimate if it is not detected.
 

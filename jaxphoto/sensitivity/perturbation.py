@@ -27,6 +27,7 @@ from jaxphoto.errors import InputError
 from jaxphoto.observations import Correlated, KnownParameters
 from jaxphoto.rotation import small_rotation
 from jaxphoto.sensitivity.biased_numbers import LABELS, TRAJECTORY, observed_numbers, trajectory_numbers
+from jaxphoto.short_repr import shown
 from jaxphoto.unknowns import FIXED, FREE, Weighted, is_prior
 
 Recorded = dict[str, Array]
@@ -49,6 +50,7 @@ PER = {
 _AXES = {"lever-arm": ("right_m", "forward_m", "up_m"), "boresight": ("x_rad", "y_rad", "z_rad")}
 
 
+@shown
 class Bias(eqx.Module):
     """Errors added to some numbers of a block: `sigma` times independent draws of `distribution`.
 

@@ -21,9 +21,11 @@ from jaxphoto.rotation import omega_phi_kappa_from_matrix
 from jaxphoto.sensitivity.curvature import mixed_second
 from jaxphoto.sensitivity.hessian import check_optimum, eliminated, solve_eliminated
 from jaxphoto.sensitivity.image_rows import ListedRows, image_rows
+from jaxphoto.short_repr import shown
 from jaxphoto.unknowns import Unknowns
 
 
+@shown
 class Response(eqx.Module):
     """By how much every unknown moves, in its own unit; images, points and parameters in the block's order."""
 

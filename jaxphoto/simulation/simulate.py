@@ -16,6 +16,7 @@ from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import BlockError
 from jaxphoto.georeferencing import Mount, RigCamera, StripBias, StripErrors, Trajectory
 from jaxphoto.observations import Attitudes, ControlRows, Distances, ImageRows, StationRows
+from jaxphoto.short_repr import shown
 from jaxphoto.simulation.changing_cameras import (
     Circumstances,
     camera_steps,
@@ -46,6 +47,7 @@ _AXES = {"control": (0, 1, 2), "vertical": (2,), "check": (0, 1, 2)}
 _PLACES = 4096
 
 
+@shown
 class Simulation(eqx.Module):
     """A block and what is true of it; with a lidar also its cloud and trajectory. As a tuple: the first three.
 

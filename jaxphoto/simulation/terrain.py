@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jaxphoto.short_repr import shown
 from jaxphoto.simulation.buildings import Building, roof_height, wall_distance
 from jaxphoto.simulation.trees import Tree, under_crown
 
@@ -41,6 +42,7 @@ class RandomWaves:
         return tuple(Wave(amplitude, *row) for row in np.stack([length, heading, phase], axis=1).tolist())
 
 
+@shown
 @dataclasses.dataclass(frozen=True)
 class Terrain:
     """Z = height + slope . (X, Y) + waves, and at every point by itself a uniform roughness within +- `roughness_m`.

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from jaxphoto.arrays import Numbers
 from jaxphoto.camera import InteriorOrientation
 from jaxphoto.errors import InputError
+from jaxphoto.short_repr import shown
 from jaxphoto.stability.alignment import METHODS, Method
 from jaxphoto.stability.comparison import BundleOffsets, bundle_offsets, check_rays
 from jaxphoto.stability.uncertainty import OffsetUncertainty, offset_uncertainty
@@ -18,6 +19,7 @@ SIGNIFICANT_P = 0.05
 _LEAST_P = 1e-300
 
 
+@shown
 class Analysis(NamedTuple):
     """Two sets compared by one method; `uncertainty` is None where neither set has a covariance."""
 

@@ -33,12 +33,14 @@ from jaxtyping import Bool, Float
 from scipy.special import fdtri, gammaincinv
 
 from jaxphoto.arrays import Numbers
+from jaxphoto.short_repr import shown
 from jaxphoto.stability.uncertainty import LEVEL
 
 # Of fewer than so many numbers none is beyond what 95 % stay below.
 _ENOUGH = round(1 / (1 - LEVEL))
 
 
+@shown
 class Differences(NamedTuple):
     """What the halves of all cuts differ by, and what their covariances promise; pixels of the measured image."""
 
@@ -50,6 +52,7 @@ class Differences(NamedTuple):
     """r_kl^2."""
 
 
+@shown
 class ErrorBand(NamedTuple):
     """The factor by which standard deviations are too small, and what holds 95 % of the errors; in pixels."""
 

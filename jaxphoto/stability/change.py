@@ -8,6 +8,7 @@ from scipy.special import chdtrc, ndtr
 
 from jaxphoto.camera import InteriorOrientation, constant_names, get_parameter, model_keys, parameter_names
 from jaxphoto.errors import InputError
+from jaxphoto.short_repr import shown
 from jaxphoto.stability.alignment import Method
 from jaxphoto.stability.analysis import Analysis
 from jaxphoto.stability.band import square_radius
@@ -19,6 +20,7 @@ from jaxphoto.stability.uncertainty import offset_uncertainty
 _ROUNDING = 1e-12
 
 
+@shown
 class ParameterChange(NamedTuple):
     """One parameter in two calibrations, in its own unit: second minus first, and how sure that is."""
 
@@ -32,6 +34,7 @@ class ParameterChange(NamedTuple):
     """and NaN then: how probable so large a difference is if the parameter did not change."""
 
 
+@shown
 class Change(NamedTuple):
     """Two calibrations of a camera compared."""
 

@@ -18,10 +18,12 @@ from scipy.special import chdtrc
 
 from jaxphoto.camera import InteriorOrientation, get_parameter, parameter_names
 from jaxphoto.errors import InputError
+from jaxphoto.short_repr import shown
 from jaxphoto.stability.bundles import with_parameters
 from jaxphoto.stability.change import mahalanobis, of_one_model
 
 
+@shown
 class Combination(NamedTuple):
     """One calibration made of several."""
 

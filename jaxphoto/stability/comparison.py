@@ -10,10 +10,12 @@ from jaxphoto.arrays import Numbers
 from jaxphoto.camera import InteriorOrientation, invert
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import InputError
+from jaxphoto.short_repr import shown
 from jaxphoto.stability.alignment import UNKNOWNS, Method, align, offsets_of
 from jaxphoto.stability.bundles import image_rays, parameter_vector, with_parameters
 
 
+@shown
 class BundleOffsets(eqx.Module):
     """What remains between two bundles after alignment, on the first one's virtual image plane, in mm.
 

@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 
 from jaxphoto.camera import InteriorOrientation, Sensor
 from jaxphoto.compiling import call_compiled
+from jaxphoto.short_repr import shown
 from jaxphoto.stability.bundles import parameter_vector, with_parameters
 
 _DIRECTIONS = 36
@@ -27,6 +28,7 @@ NORMAL_95 = 1.959963984540054
 """Of a normal variable, 95 % are within so many standard deviations."""
 
 
+@shown
 class DistortionCurve(NamedTuple):
     """Distortion by distance from the principal point; mm."""
 

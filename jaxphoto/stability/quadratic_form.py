@@ -16,6 +16,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import brentq
 
+from jaxphoto.short_repr import shown
+
 # Variances below this part of the largest add their mean, and no spread that could be seen.
 _NEGLIGIBLE = 1e-14
 # The standard deviation over the mean of S, squared, below which sqrt(S) is as good as normal.
@@ -25,6 +27,7 @@ _NODES = 800
 _DEAD = 40.0
 
 
+@shown
 class QuadraticForm(eqx.Module):
     """S = constant + sum (sqrt(shift_i) + sqrt(weight_i) z_i)^2, z_i independent standard normal.
 

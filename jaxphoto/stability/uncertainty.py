@@ -12,12 +12,14 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxphoto.arrays import Numbers
+from jaxphoto.short_repr import shown
 from jaxphoto.stability.comparison import BundleOffsets
 from jaxphoto.stability.quadratic_form import QuadraticForm
 
 LEVEL = 0.95
 
 
+@shown
 class OffsetUncertainty(NamedTuple):
     """Distribution of RMSE_offset by the covariances of both sets; everything in mm but the probability."""
 

@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.arrays import still
+from jaxphoto.short_repr import shown
 from jaxphoto.statistics.discrepancy import observation_groups
 from jaxphoto.statistics.quantiles import student_limit
 from jaxphoto.statistics.reliability import LEAST_CHECKED, UNCHECKED, Redundancy, error_precision, normalised_residuals
@@ -28,6 +29,7 @@ DELTA0 = 4.13
 """Shift of a normalised residual that a test of level 0.1 % finds with a power of 80 % (Baarda)."""
 
 
+@shown
 class Suspect(eqx.Module):
     """An observation that contradicts the others, and by how much it is off if it alone is."""
 
@@ -45,6 +47,7 @@ class Suspect(eqx.Module):
     unit: str
 
 
+@shown
 class BlunderTest(eqx.Module):
     """The `suspects`, rows with a number beyond `limit`, the worst first; `n` normalised residuals were tested."""
 
@@ -107,6 +110,7 @@ def detectable_errors(
     return found
 
 
+@shown
 class Hidden(NamedTuple):
     """The observation of a group whose errors are found worst: `detectable` is infinite where none ever is."""
 

@@ -8,10 +8,12 @@ import numpy as np
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.block import exposures
 from jaxphoto.camera import RATES, AbstractCameraRates, CameraSpline, StripCamera
+from jaxphoto.short_repr import shown
 from jaxphoto.statistics.covariance import Covariance
 from jaxphoto.statistics.zero_test import ZeroTest, zero_test
 
 
+@shown
 class CameraDrift(NamedTuple):
     """How one camera changed from its first exposure to its last, or from the coldest to the warmest (mm; K1 in its
     unit); one entry a rate."""
@@ -25,6 +27,7 @@ class CameraDrift(NamedTuple):
     change: ZeroTest
 
 
+@shown
 class CameraDifferences(NamedTuple):
     """What cameras have more than the camera of the block (mm), by strip or by knot; one entry an estimated number."""
 

@@ -10,9 +10,11 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxphoto.adjustment import Adjustment
+from jaxphoto.short_repr import shown
 from jaxphoto.statistics.covariance import EOP_NAMES, Covariance
 
 
+@shown
 class Correlations(eqx.Module):
     """Correlation coefficients of one camera, as arrays with the names of their axes."""
 

@@ -15,6 +15,7 @@ from jaxphoto.arrays import Numbers, gathered, still
 from jaxphoto.compiling import prepare, run_compiled
 from jaxphoto.errors import counted
 from jaxphoto.rotation import omega_phi_kappa_from_matrix, small_rotation
+from jaxphoto.short_repr import fields_html
 
 Rotations = Literal["omega_phi_kappa", "object", "camera"]
 EOP_NAMES: dict[str, tuple[str, ...]] = {
@@ -53,6 +54,8 @@ class Covariance(eqx.Module):
         shared = counted(len(self.labels) - 6 * self.n_images, "shared unknown")
         where = "" if self.converged else ";\n  not converged: of where the adjustment stopped, no standard deviations"
         return f"Covariance of {of} and {shared}, a priori; variance factor {float(self.variance_factor):.4g}{where}"
+
+    _repr_html_ = fields_html
 
     @property
     def exterior_sigma(self) -> Float[Numbers, "images 6"]:

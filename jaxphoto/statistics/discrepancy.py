@@ -13,8 +13,10 @@ from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
 from jaxphoto.adjustment.model.row_functions import rows_of
 from jaxphoto.observations import AXES, AbstractObservations, ControlRows
 from jaxphoto.rotation import omega_phi_kappa_from_matrix
+from jaxphoto.short_repr import shown
 
 
+@shown
 class Spread(eqx.Module):
     """Number, mean, root mean square and largest absolute value of one group along one axis."""
 

@@ -13,11 +13,13 @@ from jaxphoto.adjustment import Adjustment
 from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
 from jaxphoto.camera import InteriorOrientation
 from jaxphoto.compiling import call_compiled
+from jaxphoto.short_repr import shown
 from jaxphoto.statistics.discrepancy import observation_groups
 from jaxphoto.statistics.quantiles import chi_square_tails
 from jaxphoto.statistics.reliability import Redundancy
 
 
+@shown
 class VarianceFactor(eqx.Module):
     """v'Pv over the redundancy of a group of observations, and the two-sided probability of one as far from 1."""
 

@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxphoto.adjustment import Adjustment
+from jaxphoto.short_repr import shown
 from jaxphoto.statistics.covariance import Covariance
 from jaxphoto.statistics.linear_forms import linear_forms
 
@@ -32,6 +33,7 @@ _DOWN = 0.7
 _NOTHING = 1e-9
 
 
+@shown
 class GroundCorrelations(eqx.Module):
     """How the forms of the ground go with the interior orientation of a camera."""
 

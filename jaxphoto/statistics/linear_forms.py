@@ -9,9 +9,11 @@ from jaxtyping import Float
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.adjustment.right_hand_sides import solve_many
 from jaxphoto.arrays import still
+from jaxphoto.short_repr import shown
 from jaxphoto.statistics.responses import products_of
 
 
+@shown
 class LinearForms(NamedTuple):
     """Covariances of linear functions of unknowns, with one another and with the shared unknowns."""
 

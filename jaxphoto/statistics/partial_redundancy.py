@@ -20,6 +20,7 @@ from jaxtyping import Float
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.observations import ImageRows
+from jaxphoto.short_repr import shown
 from jaxphoto.statistics.covariance import covariance
 from jaxphoto.statistics.partition import Parts
 from jaxphoto.statistics.reliability import redundancy_numbers
@@ -30,6 +31,7 @@ PROBES = 64
 which alone depend on it, are off by less than a per cent where a part has a redundancy of some tens."""
 
 
+@shown
 class PartialRedundancy(eqx.Module):
     """Of the parts of a partition and, last, of all observations that are in none."""
 

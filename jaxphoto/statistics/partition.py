@@ -19,9 +19,11 @@ from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
 from jaxphoto.block import Block
 from jaxphoto.errors import InputError
 from jaxphoto.observations import AXES, AbstractObservations, Correlated
+from jaxphoto.short_repr import shown
 from jaxphoto.statistics.discrepancy import observation_groups
 
 
+@shown
 class Selection(NamedTuple):
     """Observations of one group; all of them, or only those along some axes, of some cameras, images or points."""
 
@@ -36,6 +38,7 @@ Partition = Sequence[str] | Mapping[str, Selection | Sequence[Selection]]
 """Splits, words of `SPLITS`, none for one part a group; or what belongs to each label."""
 
 
+@shown
 class Parts(NamedTuple):
     """A partition of the observations of one adjustment."""
 

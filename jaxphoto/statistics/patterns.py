@@ -20,6 +20,7 @@ from jaxphoto.camera import InteriorOrientation, Sensor, get_parameter, paramete
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import camera_words
 from jaxphoto.observations import PRIORS, AbstractObservations, Correlated
+from jaxphoto.short_repr import shown
 from jaxphoto.statistics.discrepancy import observation_groups
 
 Places = Mapping[str, Int[np.ndarray, "..."]]
@@ -44,6 +45,7 @@ _OF_ALL = {
 _OF_A_STRIP = "on the average: let that strip shift, or look at its recording and at the camera that it names"
 
 
+@shown
 class PatternTerm(NamedTuple):
     """A combination of the columns of a pattern that has a name."""
 
@@ -66,6 +68,7 @@ class Part(NamedTuple):
     """One over their standard deviations."""
 
 
+@shown
 class ResidualPattern(NamedTuple):
     """Columns of numbers that residuals may follow, part by part."""
 

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxphoto.observations import AXES, ControlRows
+from jaxphoto.short_repr import shown
 
 LEAST_CHECK_POINTS = 30
 """Fewer cannot support a claim of accuracy."""
@@ -24,6 +25,7 @@ SUSPECT_MEAN = 0.25
 _DIGITS = 2
 
 
+@shown
 class ComponentAccuracy(NamedTuple):
     """One kind of position, tested; metres."""
 
@@ -58,6 +60,7 @@ class ComponentAccuracy(NamedTuple):
         return self.n >= LEAST_CHECK_POINTS and not math.isnan(self.survey_m)
 
 
+@shown
 class AxisErrors(NamedTuple):
     """Surveyed minus computed of one axis: over how many check points, mean and root mean square (m)."""
 
@@ -72,6 +75,7 @@ class AxisErrors(NamedTuple):
         return abs(self.mean_m) > SUSPECT_MEAN * self.rmse_m
 
 
+@shown
 class PositionalAccuracy(NamedTuple):
     """Check points against an adjusted block."""
 

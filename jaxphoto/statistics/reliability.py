@@ -16,6 +16,7 @@ from jaxphoto.adjustment.model.numbers import IMAGE_POINTS, Residuals
 from jaxphoto.arrays import Numbers, still
 from jaxphoto.compiling import prepare, run_compiled
 from jaxphoto.observations import Correlated
+from jaxphoto.short_repr import shown
 from jaxphoto.statistics.covariance import (
     Cofactors,
     Covariance,
@@ -47,6 +48,7 @@ def prepare_statistics(equations: NormalEquations, seconds: dict[str, float]) ->
     prepare(_row_variances, (equations, Cofactors._make(cofactors), rows), seconds)
 
 
+@shown
 class Redundancy(eqx.Module):
     """Redundancy numbers, shaped like `Adjustment.residuals`; they sum to the redundancy."""
 

@@ -29,6 +29,7 @@ from jaxphoto.camera import InteriorOrientation, Sensor, parameter_names
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import InputError
 from jaxphoto.rotation import small_rotation
+from jaxphoto.short_repr import shown
 from jaxphoto.stability import image_grid, parameter_vector, regular_rays, with_parameters
 from jaxphoto.statistics.linear_forms import linear_forms
 
@@ -36,6 +37,7 @@ from jaxphoto.statistics.linear_forms import linear_forms
 _LONG, _SHORT = 60, 40
 
 
+@shown
 class SigmaMap(eqx.Module):
     """Covariances of where a point is seen, at places of the format of a camera; a posteriori."""
 

@@ -10,12 +10,14 @@ from jaxtyping import Array
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.camera import InteriorOrientation, get_parameter, set_parameter
 from jaxphoto.compiling import call_compiled
+from jaxphoto.short_repr import shown
 from jaxphoto.statistics.covariance import Covariance
 
 SIGNIFICANCE_LEVEL = 0.05
 """Probability up to which "the true value is zero" is not believed."""
 
 
+@shown
 class Significance(eqx.Module):
     """One estimated interior parameter: value, a posteriori sigma, |value| / sigma, and two-sided p of value = 0.
 
@@ -54,6 +56,7 @@ def significance(adjusted: Adjustment, covariance: Covariance) -> list[Significa
     return result
 
 
+@shown
 class IfZero(NamedTuple):
     """What changes where an interior parameter is held at zero, to first order."""
 

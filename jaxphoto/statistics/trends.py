@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxphoto.adjustment import Adjustment
+from jaxphoto.short_repr import shown
 from jaxphoto.statistics.patterns import PatternTerm, ResidualPattern, patterns_of
 from jaxphoto.statistics.quantiles import beta_tail
 from jaxphoto.statistics.responses import Responses
@@ -32,6 +33,7 @@ _BLUNDERS = 16
 _LIKE = 0.5
 
 
+@shown
 class Hint(NamedTuple):
     """One term that a pattern may be, and what it alone would be."""
 
@@ -45,6 +47,7 @@ class Hint(NamedTuple):
     """By how many of their standard deviations interior parameters would move with it, by path."""
 
 
+@shown
 class Trend(NamedTuple):
     """The test of one pattern."""
 

@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.observations import AbstractObservations, Correlated
+from jaxphoto.short_repr import shown
 from jaxphoto.statistics.blunder_test import DELTA0, detectable_errors
 from jaxphoto.statistics.covariance import Covariance
 from jaxphoto.statistics.discrepancy import observation_groups
@@ -27,6 +28,7 @@ POINTED = ("c_mm", "xp_mm", "yp_mm")
 """The interior parameters that are told of."""
 
 
+@shown
 class UndetectedEffects(eqx.Module):
     """By group of observations, shaped like its residuals, in standard deviations of what moves; NaN: not checked."""
 
@@ -36,6 +38,7 @@ class UndetectedEffects(eqx.Module):
     """What nothing moves by more than."""
 
 
+@shown
 class Felt(NamedTuple):
     """The observation whose undetected error moves an interior parameter most."""
 

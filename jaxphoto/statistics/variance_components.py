@@ -24,6 +24,7 @@ from jaxphoto.adjustment import MAX_STEPS, Adjustment, solve
 from jaxphoto.block import Block
 from jaxphoto.errors import InputError, counted
 from jaxphoto.observations import AbstractObservations
+from jaxphoto.short_repr import shown
 from jaxphoto.statistics.partial_redundancy import PROBES, PartialRedundancy, partial_redundancy
 from jaxphoto.statistics.partition import Partition, Parts, parts_of
 
@@ -43,6 +44,7 @@ _UNCHECKED = 1e-6
 _SINGULAR = 1e-10
 
 
+@shown
 class VarianceComponents(eqx.Module):
     """Variance components of the parts of a partition, and the adjustment with them.
 

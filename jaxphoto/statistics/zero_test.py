@@ -25,6 +25,7 @@ from jaxtyping import Float, Int
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.adjustment.model.structure import observed_in
+from jaxphoto.short_repr import shown
 from jaxphoto.statistics.covariance import Covariance
 from jaxphoto.statistics.quantiles import beta_tail, chi_square_shift
 from jaxphoto.statistics.significance import SIGNIFICANCE_LEVEL
@@ -36,6 +37,7 @@ POWER = 0.80
 _SHOWS = 1e-6
 
 
+@shown
 class ZeroTest(NamedTuple):
     """One entry a parameter. `value` and `sigma` (a posteriori) are those of the adjustment; `p_values`, of each being
     zero, `p_value`, of all being zero, and `detectable` leave out what was known beforehand."""

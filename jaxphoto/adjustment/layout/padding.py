@@ -22,8 +22,10 @@ from jaxphoto.adjustment.model.numbers import Residuals, UnknownArrays, Values
 from jaxphoto.adjustment.model.observed_groups import ObservedGroup, RowsAtPoints
 from jaxphoto.adjustment.model.structure import Structure
 from jaxphoto.arrays import still
+from jaxphoto.short_repr import shown
 
 
+@shown
 class TiledBlock(NamedTuple):
     """A block as given and in tiles, and the way from one to the other."""
 

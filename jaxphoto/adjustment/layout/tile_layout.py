@@ -22,8 +22,10 @@ from jaxphoto.adjustment.layout.tiling import (
 )
 from jaxphoto.adjustment.model.observed_groups import ObservedGroup
 from jaxphoto.adjustment.model.structure import Structure
+from jaxphoto.short_repr import shown
 
 
+@shown
 class Sizes(NamedTuple):
     """How large each kind of list is, in a block or as it is compiled for."""
 

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, Int, Shaped
 from jaxphoto.adjustment.model.numbers import AbstractValues, NonImageResiduals
 from jaxphoto.adjustment.model.structure import AbstractStructure
 from jaxphoto.arrays import Numbers
+from jaxphoto.short_repr import shown
 
 
 class Tiles(eqx.Module):
@@ -118,6 +119,7 @@ class TiledStructure(AbstractStructure):
         return dataclasses.replace(self, tiles=dataclasses.replace(self.tiles, shards=1))
 
 
+@shown
 class TiledValues(AbstractValues):
     """The numbers of a block in tiles; empty slots have infinite sigmas."""
 

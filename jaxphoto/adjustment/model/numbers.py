@@ -16,6 +16,7 @@ from jaxphoto.adjustment.model.observed_groups import RowsAtPoints, RowsInList
 from jaxphoto.adjustment.model.structure import AbstractStructure, total
 from jaxphoto.arrays import Numbers, added
 from jaxphoto.rotation import small_rotation
+from jaxphoto.short_repr import shown
 
 IMAGE_POINTS = "image_points"
 """The name of the image rows in tables and files."""
@@ -43,6 +44,7 @@ class NonImageResiduals(eqx.Module):
     """Of the groups of `others`."""
 
 
+@shown
 class Residuals(NonImageResiduals):
     """Observed minus computed over sigma, by group, in the block's own order."""
 
@@ -82,6 +84,7 @@ class AbstractValues(eqx.Module):
         return self.time, self.velocity, self.rate, self.nominal, self.flight_time, self.height, self.temperature
 
 
+@shown
 class Values(AbstractValues):
     """Those of a block as given."""
 

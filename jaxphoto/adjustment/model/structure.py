@@ -49,6 +49,7 @@ from jaxphoto.errors import BlockError
 from jaxphoto.georeferencing import Corrections
 from jaxphoto.losses import AbstractLoss, LinearisedLoss
 from jaxphoto.observations import PRIORS, AbstractObservations, ImageRows
+from jaxphoto.short_repr import shown
 from jaxphoto.unknowns import FIXED, Unknowns
 
 
@@ -134,6 +135,7 @@ class AbstractStructure(eqx.Module):
         return any(t.bends for t in self.tables)
 
 
+@shown
 class Structure(AbstractStructure):
     """Of a block as given; see the module's head."""
 

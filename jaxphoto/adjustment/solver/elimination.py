@@ -26,9 +26,11 @@ from jaxphoto.adjustment.solver.normal import Linearised, Reduced, other_squares
 from jaxphoto.adjustment.solver.reduced import tile_columns, tile_numbers, tile_parts
 from jaxphoto.adjustment.solver.tile_rows import seen_in, tile_residuals
 from jaxphoto.arrays import added
+from jaxphoto.short_repr import shown
 from jaxphoto.small_matrices import unwhiten, whiten
 
 
+@shown
 class FactoredNormal(eqx.Module):
     """The normal equations at an optimum in scaled increments, undamped, factored."""
 

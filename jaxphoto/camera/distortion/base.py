@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxphoto.camera.declared import Declared
 from jaxphoto.camera.sensor import Sensor
+from jaxphoto.short_repr import shown
 
 # Newton's steps at most; a model inside its monotone range needs 4 to 8.
 _STEPS = 50
@@ -40,6 +41,7 @@ def same_terms(*names: str) -> dict[str, Term]:
 Affinity = Literal["added", "before", "after", "around"]
 
 
+@shown
 class AbstractDistortion(Declared):
     """A lens distortion; its fields are scalars, its `domain` says where the polynomial lives.
 

@@ -16,11 +16,13 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from jaxphoto.camera.declared import Declared
+from jaxphoto.short_repr import shown
 
 Component = Any
 """One component of a direction or an image coordinate: a number, or NumPy's or JAX's array of many places at once."""
 
 
+@shown
 class AbstractProjection(Declared):
     """A projection; what it is called and made of is declared as in `Declared`. Most have no parameters at all.
 

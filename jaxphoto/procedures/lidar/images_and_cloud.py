@@ -50,6 +50,7 @@ from jaxphoto.procedures.lidar.until_still import (
     with_interior_held,
 )
 from jaxphoto.procedures.lidar.vertical_control import nothing_seen, tie_points
+from jaxphoto.short_repr import shown
 from jaxphoto.statistics import Covariance
 from jaxphoto.unknowns import FIXED, FREE, Weighted
 
@@ -62,6 +63,7 @@ SHIFT_SIGMA = 0.3
 _NEAR, _TIMES = 400, 8
 
 
+@shown
 class Simultaneous(eqx.Module):
     """Images and cloud after their simultaneous adjustment, and before."""
 

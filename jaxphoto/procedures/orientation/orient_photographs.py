@@ -35,6 +35,7 @@ from jaxphoto.procedures.orientation.refine import (
 )
 from jaxphoto.procedures.orientation.related_pairs import LENS_PX, MOST, Report, check_connected, relate
 from jaxphoto.procedures.orientation.second_look import second_look
+from jaxphoto.short_repr import shown
 from jaxphoto.unknowns import Unknowns, default_priors
 
 CAMERA = "camera"
@@ -102,6 +103,7 @@ class OrientationReport(NamedTuple):
     """By what the standard deviations of the camera are larger than if neighbouring rays erred independently."""
 
 
+@shown
 class Oriented(NamedTuple):
     """A block of photographs, oriented as a free network of arbitrary scale, and how it was made."""
 
