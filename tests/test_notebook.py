@@ -28,7 +28,8 @@ from tests.blocks import adjusted, simulated
 PANELS = (
     "plot_residuals", "plot_mean_residuals", "plot_density", "plot_check_points", "plot_interior_correlation",
     "plot_exterior_correlation", "plot_sigma_map", "plot_distortion", "plot_error_ellipses", "plot_residuals_by_radius",
-    "plot_station_residuals", "plot_distortion_band",
+    "plot_station_residuals", "plot_distortion_band", "plot_convergence", "plot_intersection_angles",
+    "plot_point_sigmas",
 )  # fmt: skip
 
 
@@ -86,7 +87,7 @@ def test_what_is_returned_is_short_and_a_table():
     block, result = simulated("cross").block, adjusted("cross")
     tables = Tables(result)
     things = [
-        jaxphoto.compare(result, result), simulated("cross"), result.tiled, result.tiled_values, result.equations,
+        jaxphoto.compare(result, result), result.tiled, result.tiled_values, result.equations,
         result.structure, result.values, result.residuals, result.factored, block.start, block.datum, block.stations,
         result.verdict(), result.unknowns.exterior, tables.covariance, tables.redundancy, tables.correlations["one"],
         jaxphoto.bias(block, "station", 0.1), jaxphoto.sigma_map(result, "one"), Weighted(1.0, 0.1),

@@ -23,7 +23,7 @@ from jaxphoto.adjustment.normal_equations import NormalEquations, optimise
 from jaxphoto.adjustment.rank import check_priors, check_rank
 from jaxphoto.adjustment.result import Adjustment
 from jaxphoto.adjustment.solver.elimination import FactoredNormal
-from jaxphoto.adjustment.solver.levenberg_marquardt import to_factor, to_optimum, zero_system
+from jaxphoto.adjustment.solver.levenberg_marquardt import Course, to_factor, to_optimum, zero_system
 from jaxphoto.adjustment.solver.normal import Linearised
 from jaxphoto.adjustment.solver.optimum import find_optimum, unit_scale, weigh_datum
 from jaxphoto.adjustment.solver.similarity import n_open_motions
@@ -66,6 +66,7 @@ def solve(
     numbers, plain = laid.tiled_values, laid.tiled.structure
     structure = plain.with_losses(losses)
     seconds: dict[str, float] = {}
+    course: Course | None = None
     if laid.traced:
         found = find_optimum(weigh_datum(numbers, structure), structure=structure, task=to_optimum(max_steps))
         state = state_at(found.increments, unit_scale(structure), numbers, structure)
@@ -78,11 +79,12 @@ def solve(
         found = run_compiled(_optimise, arguments, seconds, "solve")
         # What comes back from several devices is of another type to a program than what went in.
         state = UnknownArrays(*map(still, found.state))
+        course = Course(*(still(v)[: int(found.steps)] for v in found.course))
     steps, converged = found.steps, found.converged
     # Its normal equations are the largest that there is, and made again.
     del found
     adjusted = _at(state, laid, block, start, priors, seconds)
-    adjusted = dataclasses.replace(adjusted, steps=steps, converged=converged)
+    adjusted = dataclasses.replace(adjusted, steps=steps, converged=converged, course=course)
     if laid.traced:
         return adjusted
     if adjusted.astray.any():

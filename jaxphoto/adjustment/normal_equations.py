@@ -25,7 +25,7 @@ from jaxphoto.adjustment.solver.elimination import (
     solve_reduced,
 )
 from jaxphoto.adjustment.solver.inverse import Cofactors, RowCofactors, cofactors_of, row_variances
-from jaxphoto.adjustment.solver.levenberg_marquardt import Task
+from jaxphoto.adjustment.solver.levenberg_marquardt import Course, Task
 from jaxphoto.adjustment.solver.normal import Linearised
 from jaxphoto.adjustment.solver.optimum import iterate, typical_scale, unit_scale, weigh_datum
 from jaxphoto.adjustment.solver.reduced import reduce_normal
@@ -156,6 +156,7 @@ class Optimised(eqx.Module):
     steps: Int[Array, ""]
     converged: Bool[Array, ""]
     factored: FactoredNormal
+    course: Course
 
 
 def optimise(values: TiledValues, structure: TiledStructure, task: Task) -> Optimised:
@@ -164,4 +165,5 @@ def optimise(values: TiledValues, structure: TiledStructure, task: Task) -> Opti
     state = state_at(optimum.increments, unit_scale(structure), values, structure)
     factored = FactoredNormal(system.reduced, system.factor, scale)
     assert optimum.steps is not None and optimum.converged is not None, "only of a tangent is this unknown"
-    return Optimised(state, optimum.steps, optimum.converged, factored)
+    assert optimum.course is not None
+    return Optimised(state, optimum.steps, optimum.converged, factored, optimum.course)

@@ -13,6 +13,7 @@ from jaxphoto.adjustment.model.numbers import Residuals, Values
 from jaxphoto.adjustment.model.structure import Structure, observed_in
 from jaxphoto.adjustment.normal_equations import NormalEquations, factor_normal
 from jaxphoto.adjustment.solver.elimination import FactoredNormal
+from jaxphoto.adjustment.solver.levenberg_marquardt import Course
 from jaxphoto.arrays import Numbers, still
 from jaxphoto.block import Block
 from jaxphoto.compiling import call_compiled
@@ -72,6 +73,9 @@ class Adjustment(eqx.Module):
     seconds: dict[str, float]
     left_out: tuple[str, ...] = eqx.field(static=True, default=())
     """Tie points of the block as it was given that this adjustment goes without: their rays meet nowhere."""
+
+    course: Course | None = None
+    """How the iteration went, step by step; None inside a transformation of JAX and where nothing was iterated."""
 
     __repr__ = adjustment_repr
 

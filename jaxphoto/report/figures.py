@@ -13,7 +13,9 @@ from jaxphoto.block import one_camera
 from jaxphoto.camera import parameter_names
 from jaxphoto.errors import InputError
 from jaxphoto.report.certificate_figures import draw_band, draw_curve
+from jaxphoto.report.convergence import draw_sigma_naught, draw_steps
 from jaxphoto.report.error_ellipses import draw_error_ellipses
+from jaxphoto.report.object_points import draw_angles, draw_sigmas
 from jaxphoto.report.plots import (
     axes_or_new,
     draw_check_points,
@@ -94,6 +96,29 @@ def plot_error_ellipses(tables: Tables, ax: Axes | None = None) -> Axes:
     """Standard error ellipses of the projection centres in plan, enlarged; their colours are sigmas in height."""
     ax = axes_or_new(ax)
     draw_error_ellipses(ax, tables)
+    return ax
+
+
+def plot_convergence(tables: Tables, ax: Axes | None = None, *, steps: bool = False) -> Axes:
+    """Sigma naught by iteration, or the length of each of the `steps`. Raises InputError where nothing was iterated."""
+    if tables.adjusted.course is None:
+        raise InputError("of this adjustment no iteration is known: adjust the block to draw its convergence")
+    ax = axes_or_new(ax)
+    (draw_steps if steps else draw_sigma_naught)(ax, tables.adjusted)
+    return ax
+
+
+def plot_intersection_angles(tables: Tables, ax: Axes | None = None) -> Axes:
+    """How many object points have rays that meet at which angle."""
+    ax = axes_or_new(ax)
+    draw_angles(ax, tables.object_points["angle_deg"].dropna().to_numpy())
+    return ax
+
+
+def plot_point_sigmas(tables: Tables, ax: Axes | None = None) -> Axes:
+    """How many object points have which standard deviation, by axis."""
+    ax, points = axes_or_new(ax), tables.object_points
+    draw_sigmas(ax, points[points["n_images"] > 0], "m")
     return ax
 
 

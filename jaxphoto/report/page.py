@@ -14,6 +14,7 @@ from markupsafe import Markup
 from jaxphoto.errors import camera_words
 from jaxphoto.observations import AXES
 from jaxphoto.report.certificate_figures import draw_band, draw_curve
+from jaxphoto.report.convergence import convergence_section
 from jaxphoto.report.document import (
     BlockInSpace,
     DocumentPicture,
@@ -138,6 +139,8 @@ def _sections(tables: Tables) -> Iterator[tuple[str, list[Markup]]]:
     ground = tables.correlation_ground
     if len(ground := ground[ground["sigma_m"] > 0]):
         yield "Correlation of the interior orientation and the ground as a whole", [_html(ground)]
+    if steps := list(convergence_section(tables.adjusted))[1:]:
+        yield "Convergence", [html_of(element) for element in steps]
 
 
 def _interior(tables: Tables) -> list[Markup]:

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Bool, Int, PyTree, Scalar
+from jaxtyping import Array, Bool, Float, Int, PyTree, Scalar
 
 from jaxphoto.adjustment.layout.tiled import TiledStructure, TiledValues
 from jaxphoto.adjustment.model.block_values import with_datum
@@ -23,6 +23,7 @@ from jaxphoto.adjustment.solver.normal import Linearised, Reduced, dot, norm2
 from jaxphoto.adjustment.solver.reduced import RightSide, reduce_normal
 from jaxphoto.adjustment.solver.similarity import after, n_open_motions, onto_datum
 from jaxphoto.arrays import Numbers
+from jaxphoto.short_repr import shown
 
 
 class FactoredSystem(NamedTuple):
@@ -72,6 +73,24 @@ def to_factor() -> Task:
     return Task(np.array(1), np.array(True))
 
 
+@shown
+class Course(NamedTuple):
+    """How an iteration went, a number a step: of the first `MOST_KEPT` steps, NaN beyond."""
+
+    square_sum: Float[Numbers, "steps"]
+    """Before the step."""
+    length: Float[Numbers, "steps"]
+    """Of the step in the metric of the normal matrix: no unknown moves by more of its standard deviations."""
+    damping: Float[Numbers, "steps"]
+    """Added to the normal matrix, relative to its diagonal."""
+    accepted: Float[Numbers, "steps"]
+    """1 where the step was taken, 0 where more damping was tried instead."""
+
+
+# Adjustments end within tens of steps; the numbers of these are all that is kept besides the unknowns.
+MOST_KEPT = 128
+
+
 class SolverState(NamedTuple):
     """The solver's state between two steps."""
 
@@ -88,6 +107,7 @@ class SolverState(NamedTuple):
     done: Bool[Array, ""]
     """Whether this is what the task asks for: the optimum, or the system."""
     steps: Int[Array, ""]
+    course: Course
 
 
 # Damping is what is added to the normal matrix, relative to its diagonal. It begins almost as none; where that fails,
@@ -149,7 +169,10 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Increments, Scalar, Any
         damping = jnp.where(self.task.only_factor, 0.0, _FIRST_DAMPING)
         empty = zero_system(y, self.values, self.structure)
         no, steps = jnp.array(False), jnp.array(0)
-        return SolverState(damping, jnp.array(jnp.inf), no, empty, loose=no, tightened=no, done=no, steps=steps)
+        course = Course(*(jnp.full(MOST_KEPT, jnp.nan) for _ in Course._fields))
+        return SolverState(
+            damping, jnp.array(jnp.inf), no, empty, loose=no, tightened=no, done=no, steps=steps, course=course
+        )
 
     def _factored(self, at: Linearised, damping) -> tuple[FactoredSystem, RightSide]:
         a, reduced, right = reduce_normal(at.for_normal_equations, damping)
@@ -201,6 +224,8 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Increments, Scalar, Any
             tighten = settled & state.loose
             next_y = jax.lax.cond(tighten, lambda y: onto_datum(self._at(y, jnp.array(False))), lambda y: y, next_y)
             loose = (state.loose | (~accept & ~state.chord & ~state.tightened)) & ~tighten
+        told = Course(right.square_sum, length, system.reduced.damping, accept.astype(float))
+        kept = (v.at[state.steps].set(one, mode="drop") for v, one in zip(state.course, told, strict=True))
         progress = SolverState(
             damping=jnp.where(tighten, _FIRST_DAMPING, damping),
             length=jnp.where(tighten, jnp.inf, pick(length, state.length)),
@@ -210,6 +235,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Increments, Scalar, Any
             tightened=state.tightened | tighten,
             done=(settled & ~tighten) | only_factor,
             steps=state.steps + 1,
+            course=Course(*kept),
         )
         return next_y, progress, None
 

@@ -24,7 +24,7 @@ from jaxphoto.adjustment.model.numbers import Increments
 from jaxphoto.adjustment.model.parameter_tables import ParameterTable
 from jaxphoto.adjustment.solver.band import factor_band
 from jaxphoto.adjustment.solver.elimination import solve_factored
-from jaxphoto.adjustment.solver.levenberg_marquardt import FactoredSystem, LevenbergMarquardt, Task
+from jaxphoto.adjustment.solver.levenberg_marquardt import Course, FactoredSystem, LevenbergMarquardt, Task
 from jaxphoto.adjustment.solver.normal import Linearised, Reduced
 from jaxphoto.adjustment.solver.reduced import reduce_normal
 from jaxphoto.camera import InteriorOrientation
@@ -38,7 +38,7 @@ TOLERANCE = 1e-5
 
 
 class Optimum(NamedTuple):
-    """Where the solver ended, after how many steps, and whether it is the optimum.
+    """Where the solver ended, after how many steps, whether it is the optimum, and how it went.
 
     In a tangent only the increments have a derivative; the others are None.
     """
@@ -46,6 +46,7 @@ class Optimum(NamedTuple):
     increments: Increments
     steps: Int[Array, ""] | None
     converged: Bool[Array, ""] | None
+    course: Course | None
 
 
 def unit_scale(structure: TiledStructure) -> Increments:
@@ -70,7 +71,7 @@ def iterate(values: TiledValues, structure: TiledStructure, task: Task) -> tuple
         Reduced(EVERYWHERE, EVERYWHERE, EVERYWHERE, TILES, at_points, of_unknowns, EVERYWHERE),
         EVERYWHERE,
     )
-    out = (Optimum(of_unknowns, EVERYWHERE, EVERYWHERE), system)
+    out = (Optimum(of_unknowns, EVERYWHERE, EVERYWHERE, EVERYWHERE), system)
     optimum, system = sharded(_iterate, structure, out)(values, scale, structure, task)
     return optimum._replace(increments=jax.tree.map(jnp.multiply, optimum.increments, scale)), system, scale
 
@@ -94,7 +95,8 @@ def _iterate(
         throw=False,
     )
     converged = (solution.result == optx.RESULTS.successful) & jnp.all(jnp.isfinite(solution.value.eop))
-    return Optimum(solution.value, solution.state.steps, converged), solution.state.system
+    state = solution.state
+    return Optimum(solution.value, state.steps, converged, state.course), state.system
 
 
 @find_optimum.def_jvp
@@ -133,7 +135,7 @@ def _find_optimum_jvp(primals, tangents, *, structure: TiledStructure, task: Tas
 
     x = unravel(jax.lax.custom_linear_solve(hessian, right, solve, symmetric=True))
     increments = jax.tree.map(jnp.multiply, x, scale)
-    return optimum, Optimum(increments, None, None)
+    return optimum, Optimum(increments, None, None, None)
 
 
 def weigh_datum(values: TiledValues, structure: TiledStructure) -> TiledValues:

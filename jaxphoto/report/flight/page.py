@@ -6,6 +6,7 @@ import numpy as np
 from jinja2 import Environment
 
 from jaxphoto.report.alike import with_alike
+from jaxphoto.report.convergence import convergence_section
 from jaxphoto.report.document import BlockInSpace, Element, Heading, Paragraph, Rows, verdict_paragraphs
 from jaxphoto.report.document_html import contents, html_of
 from jaxphoto.report.findings import Verdict, as_sentence
@@ -88,6 +89,7 @@ def _elements(
     yield from time_section(first, source.taken)
     yield from weights_section(first)
     yield from orientation_section(first)
+    yield from convergence_section(first.part.adjusted)
     for number, report in enumerate(others, 2):
         yield from _short(report, number, source)
     yield from photographs_section(reports)
