@@ -402,6 +402,11 @@ READERS: dict[str, Reader] = {
             ("orthority", oriented_files.write_orthority),
         )
     },
+    "metashape-beside": Reader(
+        written_by(oriented_files.write_metashape_beside),
+        lambda folder: read_source(folder, "metashape"),
+        ("image_points.csv", "markers.xml"),
+    ),
     "texts-bingo": Reader(written_by(oriented_files.write_bingo), lambda folder: read_source(folder, "texts")),
     "texts-patb": Reader(written_by(oriented_files.write_patb), lambda folder: read_source(folder, "texts")),
     "dbat": Reader(text(**sound_files.DBAT), read_dbat),

@@ -12,6 +12,7 @@ from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.io import export
 from jaxphoto.io.block_folder.table_layout import ANGLES, XYZ
 from jaxphoto.io.exports import ExportCamera
+from jaxphoto.io.exports.control_points import ControlPoints
 from jaxphoto.io.exports.map_photographs import in_map
 from tests.formulas import camera_from_object
 from tests.io.test_exports import SENSOR, photographs
@@ -50,6 +51,15 @@ def write_metashape(folder, camera="agisoft", kind="epsg", change=lambda text: t
     (folder / "image_points.csv").unlink()
     if ties:
         (folder / "bingo.txt").write_text(text_of_points(p, BINGO))
+    return folder
+
+
+def write_metashape_beside(folder):
+    """cameras.xml, image_points.csv and markers.xml as `--to metashape` writes them."""
+    p = inside()
+    often = np.argsort(-np.bincount(p.point, minlength=len(p.points)), kind="stable")[:5]
+    known = ControlPoints(often, p.xyz[often], np.full((5, 3), 0.02), np.arange(5) > 3)
+    export(p._replace(control=known, sigma_px=np.full((len(p.image), 2), 0.5)), folder, "metashape")
     return folder
 
 
