@@ -46,9 +46,8 @@ def convergence_words(adjusted: Adjustment) -> str:
     if course is None or not n:
         return ""
     refused = int((course.accepted == 0).sum())
-    said = f"{counted(n, 'step')}" + (
-        f", {refused} of them refused and tried again with more damping" if refused else ""
-    )
+    again = f", {refused} of them refused and tried again with more damping" if refused else ""
+    said = f"{counted(n, 'step')}{again}"
     last = course.length[-1] if len(course.length) == n else np.nan
     if adjusted.outcome is Outcome.CONVERGED:
         return f"{said}. The last moved no unknown by more than {last:.1e} of its standard deviation: that ended it."

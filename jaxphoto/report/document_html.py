@@ -29,6 +29,7 @@ _ONE = r"((< )?[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?(\([\d.]+\))?|-)"
 _UNIT = r"( ?[^\W\d_]{1,7}| ?%)"
 _NUMBER = re.compile(rf"{_ONE}{_UNIT}?(( (\+-|/|x|to|=) |, ?|/){_ONE}{_UNIT}?)*( or more)?")
 _LONGEST = 40
+_HASH = re.compile("[0-9a-f]{64}")
 # Rows of a table that scrolls in a box of its own.
 _LONG = 30
 _ROWS = _HTML.from_string(
@@ -71,6 +72,8 @@ def _kind(column: tuple[str, ...]) -> str:
     Of sentences the lines are not to be of a word each on a narrow screen: prose.
     """
     told = [cell for cell in column if cell]
+    if told and all(_HASH.fullmatch(cell) for cell in told):
+        return "text hash"
     if sum(len(cell) > _LONGEST or _NUMBER.fullmatch(cell) is None for cell in told) <= len(told) / 2:
         return "number"
     return "text prose" if any(len(cell) > _LONGEST and " " in cell for cell in told) else "text"

@@ -22,13 +22,25 @@ from jaxphoto.writing import whole_file
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_PICTURES = {"interior": "Estimates over the draws", "effects": "Which error is behind which estimate"}
+_PICTURES = {
+    "interior": (
+        "Estimates over the draws",
+        "Grey: how many draws; red line: the value without errors; blue line: the normal distribution that the "
+        "predicted sigma stands for.",
+    ),
+    "effects": (
+        "Which error is behind which estimate",
+        "What one sigma of each error (row) does to each estimate (column), as a part of its predicted sigma.",
+    ),
+}
 LONG = ("exterior.", "point.", "check.", f"{TrajectoryKnot.kind}.")
 """How quantities begin that are of images, points and knots of a trajectory: files have them, no page and no screen."""
 EXTERIOR = ("X_m", "Y_m", "Z_m", "omega_rad", "phi_rad", "kappa_rad")
 _QUANTILES = {"q025": 0.025, "q50": 0.5, "q975": 0.975}
 # Histograms of a picture.
 _SHOWN = 12
+# Inches: a wider picture is drawn smaller on a page, and its names are not read any more.
+_WIDEST = 10.5
 
 
 def draws_table(draws: Draws, adjusted: Adjustment, first: int = 0) -> pd.DataFrame:
@@ -142,7 +154,7 @@ def effects_figure(effects: pd.DataFrame, summary: pd.DataFrame, quantities: lis
     """What one sigma of each error does to some quantities, as parts of their predicted standard deviations."""
     predicted = summary.set_index("quantity")["predicted_sigma"][quantities].to_numpy()
     parts = effects[quantities].to_numpy() / np.where(predicted > 0, predicted, np.nan)
-    figure = new_figure(1.8 + 0.8 * len(quantities), max(2.8, 1.2 + 0.24 * len(effects)))
+    figure = new_figure(min(1.8 + 0.8 * len(quantities), _WIDEST), max(3.2, 1.8 + 0.26 * len(effects)))
     axes = figure.subplots()
     image = axes.imshow(parts, cmap="RdBu_r", vmin=-1, vmax=1, aspect="auto")
     axes.set_xticks(range(len(quantities)), list(map(drawn, quantities)), rotation=45, ha="right", fontsize=8)
@@ -159,9 +171,9 @@ def write_draws_page(summary: Mapping[str, Any], table: pd.DataFrame, directory:
         "The predicted sigma is the effect of the errors to first order; the ratio says how far draws agree with it.",
     ]
     parts: list[StudyPart] = []
-    for name, heading in _PICTURES.items():
+    for name, (heading, said_of) in _PICTURES.items():
         if (file := directory / f"{name}.png").is_file():
-            parts += [Heading(heading), WholePicture.read(file, heading)]
+            parts += [Heading(heading), Paragraph(said_of), WholePicture.read(file, f"{heading}: {said_of}")]
     parts += [Heading("Means and standard deviations"), rows_of(table[few])]
     if not few.all():
         parts.append(Paragraph("Images, points and knots of trajectories stand in summary.csv."))

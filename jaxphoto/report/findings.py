@@ -101,6 +101,11 @@ def parameter_words(path: str) -> str:
     return f"{symbol(of_camera[2])} of {camera_words(of_camera[1])}" if of_camera else path
 
 
+def in_symbols(text: str) -> str:
+    """A sentence with paths of cameras' parameters as sentences call them."""
+    return re.sub(r"interior\[[^\]]*\]\.\w+", lambda path: parameter_words(path[0]), text)
+
+
 def p_words(p_value: float, digits: int = 1) -> str:
     """The p-value of a test, as a sentence tells it."""
     said = of_p(p_value, digits)

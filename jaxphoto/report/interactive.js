@@ -86,6 +86,25 @@
     if (rows.length >= LONG_TABLE) addFilter(table);
   };
 
+  // ---- what is larger than its box: keys reach it, and the edge fades that more is behind
+
+  const markEdges = (box) => {
+    const right = box.scrollWidth - box.clientWidth, down = box.scrollHeight - box.clientHeight;
+    box.classList.toggle("more-right", box.scrollLeft < right - 1);
+    box.classList.toggle("more-below", box.scrollTop < down - 1);
+    if (right > 1 || down > 1) box.tabIndex = 0;
+  };
+  const sized = new ResizeObserver((entries) => entries.forEach(({ target }) => markEdges(target.closest(".wide"))));
+  let heading = "";
+  for (const part of document.querySelectorAll("h2, h3, .wide")) {
+    if (!part.matches(".wide")) { heading = part.textContent; continue; }
+    part.setAttribute("role", "region");
+    part.setAttribute("aria-label", heading || document.title);
+    part.addEventListener("scroll", () => markEdges(part), { passive: true });
+    sized.observe(part);
+    if (part.firstElementChild) sized.observe(part.firstElementChild);
+  }
+
   // ---- what is packed in the page
 
   const unpacked = async (element) => {

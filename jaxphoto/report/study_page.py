@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -10,7 +11,7 @@ from urllib.parse import quote
 from jinja2 import Environment
 from markupsafe import Markup
 
-from jaxphoto.report.document import Element, Heading
+from jaxphoto.report.document import Element, Heading, Paragraph
 from jaxphoto.report.document_html import contents, html_of
 from jaxphoto.report.findings import as_sentence
 from jaxphoto.report.maps import png_of, png_uri
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 _PAGE = """{{ head(title) }}<body>
 <h1>{{ title }}</h1>
 {% for sentence in said %}<p{{ kind }}>{{ sentence }}</p>
+{% endfor %}{% for part in begun %}{{ part }}
 {% endfor %}{{ contents }}
 {% for part in parts %}{{ part }}
 {% endfor %}</body></html>
@@ -67,6 +69,8 @@ StudyPart = Element | WholePicture | PageLink | PictureFile
 def study_page(title: str, said: Sequence[str], parts: Iterable[StudyPart], colour: str = "") -> str:
     """The page as HTML; `said` stands first, in `colour` (green, amber, red) where it is a verdict."""
     shown = list(parts)
+    # Sentences before the first heading, such as findings, belong to what stands first.
+    begun = list(itertools.takewhile(lambda part: isinstance(part, Paragraph), shown))
     headings = [part.text for part in shown if isinstance(part, Heading)]
     return (
         Environment(autoescape=True)
@@ -77,7 +81,8 @@ def study_page(title: str, said: Sequence[str], parts: Iterable[StudyPart], colo
             said=map(as_sentence, said),
             kind=Markup(' class="verdict {}"').format(colour) if colour else "",
             contents=contents(headings) if len(headings) > 1 else "",
-            parts=[_shown(part) for part in shown],
+            begun=[_shown(part) for part in begun],
+            parts=[_shown(part) for part in shown[len(begun) :]],
         )
     )
 

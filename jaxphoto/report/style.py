@@ -9,7 +9,7 @@ STYLE = """\
 @media screen and (prefers-color-scheme: dark) { :root { --ink: #ddd; --paper: #16181b; --line: #3a3e44;
   --head: #23262b; --grey: #a5abb3; --link: #8ab8f0; --good: #7fcf93; --bad: #f29a9a; --alarm: #e66;
   --green: #143a1e; --on-green: #c4ecce; --amber: #43330c; --on-amber: #f5dfae; --red: #4a1717; --on-red: #f7caca;
-  --chosen: #5a4510 } }
+  --chosen: #5a4510 } img { filter: brightness(.87) } }
 html { overflow-wrap: anywhere }
 body { font: 15px/1.45 system-ui, sans-serif; max-width: var(--width); margin: 2rem auto; padding: 0 1rem;
   color: var(--ink); background: var(--paper) }
@@ -27,6 +27,12 @@ thead th:first-child { background: var(--head) }
 .names td, .text { text-align: left } .names td { overflow-wrap: anywhere }
 img { max-width: 100%; background: #fff }
 td.number { white-space: nowrap } td.prose { min-width: 16rem }
+td.hash { overflow-wrap: anywhere; min-width: 13rem; font-family: ui-monospace, monospace; font-size: 11px }
+.more-right { mask-image: linear-gradient(to left, #0000, #000 2.5rem) }
+.more-below { mask-image: linear-gradient(to top, #0000, #000 2.5rem) }
+.more-right.more-below { mask-image: linear-gradient(to left, #0000, #000 2.5rem),
+  linear-gradient(to top, #0000, #000 2.5rem); mask-composite: intersect }
+.wide:focus-visible { mask-image: none }
 .pictures { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(23rem, 100%), 1fr)); gap: .8rem;
   align-items: start; margin: .5rem 0 1rem }
 .pictures img { width: 100%; max-width: 29.5rem; height: auto }
@@ -70,6 +76,7 @@ figure.block { margin: .5rem 0 1rem } .plot { height: min(36rem, 75vh) }
   h1, h2, h3, nav { break-after: avoid } h2 + p, h3 + p { break-after: avoid }
   thead { display: table-header-group }
   tr, img, figure, nav, .alarm, .warning, .information, .verdict { break-inside: avoid }
-  p, li { orphans: 3; widows: 3 } img { max-height: 240mm; width: auto; object-fit: contain }
+  p, li { orphans: 3; widows: 3 } .wide { mask-image: none }
+  img { max-height: 105mm; width: auto; object-fit: contain } .wide img { max-height: 190mm; max-width: 100% }
   .pictures { grid-template-columns: 1fr 1fr } .verdict { font-size: 12px } }
 """

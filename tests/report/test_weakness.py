@@ -93,7 +93,7 @@ def test_a_solve_that_stopped_says_what_was_open():
     stopped = dataclasses.replace(optimum, converged=np.array(False))
     first, *others = verdict_of(Tables(stopped)).findings
     assert "step limit" in first.text
-    assert any("interior[one].c_mm with Z of all images: hardly determined" in f.text for f in others)
+    assert any("c of camera one with Z of all images: hardly determined" in f.text for f in others)
     assert {f.level for f in (first, *others)} == {verdict.Level.ALARM}
 
 
