@@ -439,7 +439,7 @@ READERS: dict[str, Reader] = {
     "photograph-xmp": Reader(text(a__xmp=sound_files.XMP), lambda folder: _drone_record(folder / "a.xmp")),
     "dsm": Reader(sound_files.surface, lambda folder: read_dsm(folder / "a.tif")),
     "cloud-ply-text": Reader(sound_files.ply_text, lambda folder: clouds.read_cloud(folder / "a.ply")),
-    **{f"cloud-{kind}": Reader(partial(sound_files.cloud, kind), _cloud(kind)) for kind in ("csv", "ply")},
+    **{f"cloud-{kind}": Reader(partial(sound_files.cloud, kind), _cloud(kind)) for kind in ("csv", "ply", "copc.laz")},
     **{
         f"cloud-{kind}-{of}": Reader(partial(sound_files.cloud, kind, of), _cloud(kind))
         for kind, of in (("las", 3), ("las", 6), ("laz", 1), ("laz", 3), ("laz", 6), ("laz", 8), ("laz", 10))
