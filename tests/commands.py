@@ -1,6 +1,10 @@
-"""The command line in the tests' own process."""
+"""The command line in the tests' own process, and in a shell."""
 
+import os
+import shutil
+import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -14,3 +18,18 @@ def run(monkeypatch, capsys, *arguments) -> tuple[int, str, str]:
         cli.main()
     captured = capsys.readouterr()
     return stop.value.code or 0, captured.out, captured.err
+
+
+def run_script(script, folder):
+    """Run the shell lines of a page in a folder of their own, by the jaxphoto beside this Python."""
+    beside = Path(sys.executable).parent
+    assert shutil.which("jaxphoto", path=str(beside)), "jaxphoto is not installed beside this Python"
+    found = subprocess.run(
+        ["bash", "-euc", script],
+        cwd=folder,
+        env=os.environ | {"PATH": f"{beside}{os.pathsep}{os.environ['PATH']}"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert found.returncode == 0, found.stdout + found.stderr

@@ -79,13 +79,13 @@ def test_no_import_hides_in_a_function():
         # Those that are worth it: matplotlib takes a third of a second, and most uses draw nothing; scipy's graphs and
         # matrices take a tenth, and blocks of few images, and of plain control, need none; its distributions take a
         # fifth, and only tests compare with them; plotly takes half a second, and only reports need it; xarray takes a
-        # third, for cubes.
+        # third, for cubes; OpenCV 150 MB, and who adjusts without photographs may do without it (docs/install.md).
         worth_it = {
             "from matplotlib.figure import Figure", "from matplotlib.text import Text", "from matplotlib import pyplot",
             "from matplotlib.backends.backend_pdf import PdfPages", "from scipy.sparse import csr_matrix",
             "from scipy import special", "from plotly.graph_objects import Figure",
             "from plotly.offline import get_plotlyjs", "from matplotlib.collections import EllipseCollection",
-            "from matplotlib.colors import to_rgba", "import xarray as xr",
+            "from matplotlib.colors import to_rgba", "import xarray as xr", "import cv2",
             "from jaxphoto.adjustment.datum_sensitivity import SeenMotions, row_sensitivity",
         }  # fmt: skip
         assert set(hidden) <= worth_it | {

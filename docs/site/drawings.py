@@ -18,7 +18,11 @@ from matplotlib.patches import Arc, Rectangle
 from jaxphoto.camera import Brown, InteriorOrientation, Sensor
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.georeferencing import Exposure, Mount, StripBias, direct_orientation
-from jaxphoto.rotation import matrix_from_omega_phi_kappa, matrix_from_roll_pitch_yaw
+from jaxphoto.rotation import (
+    matrix_from_omega_phi_kappa,
+    matrix_from_roll_pitch_yaw,
+    omega_phi_kappa_from_matrix,
+)
 
 IMAGES = Path(__file__).resolve().parents[1] / "images"
 # Okabe and Ito (2008): told apart by the colour-blind, too.
@@ -26,15 +30,21 @@ X, Y, Z, ARM, RAY, FAINT = "#D55E00", "#009E73", "#0072B2", "#CC79A7", "#E69F00"
 # Of an axonometric view from the south-west and above: where a metre east, north and up lies on the paper.
 VIEW = np.array([[0.87, 0.5, 0.0], [-0.25, 0.42, 0.95]])
 _TURN_DEG = 25.0
+HEADINGS = {"north": 0.0, "east": 90.0, "south": 180.0, "west": 270.0}
 
 
 def main() -> None:
     """Write all drawings."""
     plt.rcParams |= {"svg.fonttype": "none", "svg.hashsalt": "jaxphoto", "font.size": 10, "font.family": "sans-serif"}
     IMAGES.mkdir(exist_ok=True)
-    for draw in (frames, camera_angles, body_angles, image_coordinates, boresight):
+    for draw in (frames, camera_angles, body_angles, headings, image_coordinates, boresight):
         figure = draw()
-        figure.savefig(IMAGES / f"{draw.__name__}.svg", metadata={"Date": None}, bbox_inches="tight", facecolor="white")
+        # A picture each: beside one another where the page is wide, below one another on a telephone.
+        for panel in figure.axes:
+            for other in figure.axes:
+                other.set_visible(other is panel)
+            name = IMAGES / f"{'_'.join(filter(None, (draw.__name__, panel.get_label())))}.svg"
+            figure.savefig(name, metadata={"Date": None}, bbox_inches="tight", pad_inches=0.05, facecolor="white")
         plt.close(figure)
 
 
@@ -46,7 +56,7 @@ def frames() -> plt.Figure:
         _line(axes, [[0, k, 0], [6, k, 0]], color=FAINT, lw=0.5)
     _axes(axes, np.zeros(3), np.eye(3) * 1.6, ("X east", "Y north", "Z up"))
     body = np.asarray(matrix_from_roll_pitch_yaw(np.deg2rad([0.0, 0.0, 30.0])))
-    camera, arm = np.array([3.2, 3.0, 3.6]), np.array([0.8, 1.4, 1.2])
+    camera, arm = np.array([3.2, 3.0, 3.4]), np.array([0.9, 1.5, 2.4])
     antenna = camera + body @ arm
     # Nose, right wing, behind it, tail, left of it, left wing.
     corners = [[0, 2.2, 0], [2.6, 0, 0], [0.35, 0, 0], [0, -2.2, 0], [-0.35, 0, 0], [-2.6, 0, 0]]
@@ -101,9 +111,47 @@ def body_angles() -> plt.Figure:
     return _panels(views, rows, ("right", "forward", "up"), ("X east", "Y north", "Z up"))
 
 
+def headings() -> plt.Figure:
+    """The same aircraft from above on four headings: what roll and pitch are of omega and phi."""
+    figure, panels = plt.subplots(1, 4, figsize=(6.9, 2.7))
+    # Nose, wing and tailplane to the right, tail.
+    half = [(0, 1), (0.1, 0.75), (0.1, 0.3), (0.9, 0), (0.9, -0.15), (0.1, -0.05), (0.06, -0.6), (0.35, -0.8)]
+    outline = np.array([*half, (0.35, -0.9), (0, -0.8)])
+    outline = np.vstack([outline, outline[::-1] * [-1, 1]])
+    for panel, (name, yaw) in zip(panels, HEADINGS.items(), strict=True):
+        panel.set_label(name)
+        level = attitude_of(0.0, 0.0, yaw)
+        plan = np.asarray(matrix_from_roll_pitch_yaw(np.deg2rad([0.0, 0.0, yaw])))[:2, :2]
+        panel.fill(*(plan @ outline.T), color="#e8eef3", ec="#5b6b78", lw=1)
+        rows = np.asarray(matrix_from_omega_phi_kappa(np.deg2rad(level)))
+        _arrow2(panel, (0, 0), 1.15 * rows[0, :2], X, "", (0, 0))
+        _arrow2(panel, (0, 0), 0.8 * rows[1, :2], Y, "", (0, 0))
+        for row, letter, colour, reach in ((rows[0], "x", X, 1.35), (rows[1], "y", Y, 1.0)):
+            panel.text(*(reach * row[:2]), letter, color=colour, ha="center", va="center", weight="bold")
+        said = [f"kappa = {level[2]:.0f}"]
+        for turn, angles in (("roll", attitude_of(1.0, 0.0, yaw)), ("pitch", attitude_of(0.0, 1.0, yaw))):
+            change = angles - level
+            k = int(np.argmax(np.abs(change[:2])))
+            said.append(f"{turn} +1 is {('omega', 'phi')[k]} {change[k]:+.0f}")
+        panel.set_title(f"to the {name}, yaw {yaw:.0f}", fontsize=10)
+        panel.text(0, -1.6, "\n".join(said), ha="center", va="top")
+        panel.set(xlim=(-1.6, 1.6), ylim=(-2.9, 1.5), aspect="equal")
+        panel.axis("off")
+    figure.tight_layout()
+    return figure
+
+
+def attitude_of(roll_deg: float, pitch_deg: float, yaw_deg: float) -> np.ndarray:
+    """omega, phi, kappa (degrees) of a camera with x forward in a body with these angles."""
+    turned = _oriented(Mount(np.zeros(3), np.zeros(3)), roll_pitch_yaw=np.deg2rad([roll_deg, pitch_deg, yaw_deg]))
+    return np.rad2deg(np.asarray(omega_phi_kappa_from_matrix(turned.camera_from_object))) + 0.0
+
+
 def image_coordinates() -> plt.Figure:
     """Pixels and millimetres, the principal point; the section with c; a barrel."""
-    figure, (image, section, barrel) = plt.subplots(1, 3, figsize=(10.5, 3.6))
+    figure, (image, section, barrel) = plt.subplots(1, 3, figsize=(8.4, 3.0))
+    for panel, name in ((image, "format"), (section, "section"), (barrel, "barrel")):
+        panel.set_label(name)
     sensor = Sensor(8, 6, 1.0)
     image.add_patch(Rectangle((-4, -3), 8, 6, fill=False, ec="#5b6b78"))
     for k in range(1, 8):
@@ -164,8 +212,9 @@ def boresight() -> plt.Figure:
 
 def _panels(views, rows_of, names, fixed) -> plt.Figure:
     """A panel for each angle, alone and positive: its title, its number, and which axes lie to the right and up."""
-    figure, panels = plt.subplots(1, 3, figsize=(9, 3.2))
+    figure, panels = plt.subplots(1, 3, figsize=(6.7, 2.6))
     for panel, (title, angle, right, up) in zip(panels, views, strict=True):
+        panel.set_label(title.split()[0])
         angles = np.zeros(3)
         angles[angle] = np.deg2rad(_TURN_DEG)
         _turned(panel, np.asarray(rows_of(angles)), right, up, names, fixed, title)

@@ -1,20 +1,28 @@
 """What the site has beside the pages of docs/: the notebooks, the reference of the public names, links to other files.
 
-A hook of MkDocs: its functions are called by their names.
+Names of functions lead to the reference, names of pages read as their titles, and formulas are MathML, which needs no
+script. A hook of MkDocs: its functions are called by their names.
 """
 
+import functools
 import importlib
 import inspect
 import re
 from pathlib import Path
 
+from latex2mathml.converter import convert
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.plugins import event_priority
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).resolve().parents[2]
-_LINK = re.compile(r"\[([^\]]*)\]\(\.\./([^)#]+)(#[^)]*)?\)")
+_LINK = re.compile(r"\[([^\]]*)\]\((?:\.\./)+([^)#]+)(#[^)]*)?\)")
+_TO_PAGE = re.compile(r"\[[\w/]+\.md\]\(([\w./]+\.md)(#[^)]*)?\)")
+_NAME = re.compile(r"(?<!\[)`jaxphoto\.([\w.]+)`(?!\])")
+_FORMULA = re.compile(r"\$\$(.+?)\$\$|\$(?=\S)([^$\n]+?)(?<=\S)\$", re.DOTALL)
+# A listing, or words in it: what is written there is meant as it stands.
+_LISTING = re.compile(r"(^```.*?^```|`[^`\n]+`)", re.DOTALL | re.MULTILINE)
 
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
@@ -48,15 +56,37 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Links out of docs/: to a notebook on the site; of another file of the repository its place."""
+    """Links out of docs/: to a notebook on the site; of another file of the repository its place. Titles, formulas."""
+    here = Path(page.file.src_uri).parent
+    up = "../" * len(here.parts)
 
     def linked(match: re.Match[str]) -> str:
         text, target, place = match.group(1), match.group(2), match.group(3) or ""
+        if (ROOT / "docs" / target).exists():
+            return match.group(0)
         if not (ROOT / target).exists():
-            raise ValueError(f"{page.file.src_uri} links to ../{target}, which is not there")
-        return f"[{text}]({target}{place})" if target.startswith("notebooks/") else f"{text} (`{target}`)"
+            raise ValueError(f"{page.file.src_uri} links to {target}, which is not there")
+        return f"[{text}]({up}{target}{place})" if target.startswith("notebooks/") else f"{text} (`{target}`)"
 
-    return _LINK.sub(linked, markdown)
+    def titled(match: re.Match[str]) -> str:
+        found = (ROOT / "docs" / here / match.group(1)).resolve()
+        return f"[{_title(found)}]({match.group(1)}{match.group(2) or ''})" if found.is_file() else match.group(0)
+
+    markdown = _TO_PAGE.sub(titled, _LINK.sub(linked, markdown))
+    if page.file.src_uri.startswith(("reference/", "notebooks/")):
+        return markdown
+    parts = _LISTING.split(markdown)
+    known = _identifiers()
+    for k, part in enumerate(parts):
+        if k % 2 == 0:
+            parts[k] = _FORMULA.sub(lambda m: convert(m[1] or m[2], display="block" if m[1] else "inline"), part)
+        elif (name := _NAME.fullmatch(part)) and name[1] in known and not parts[k - 1].endswith("["):
+            parts[k] = f"[{part}][{known[name[1]]}]"
+    return "".join(parts)
+
+
+def _title(page: Path) -> str:
+    return page.read_text("utf-8").splitlines()[0].lstrip("# ").strip()
 
 
 def _notebooks() -> list[Path]:
@@ -64,12 +94,22 @@ def _notebooks() -> list[Path]:
 
 
 def _public() -> dict[str, list[str]]:
-    """The names of `import jaxphoto` by room, each where it is defined."""
-    jaxphoto = importlib.import_module("jaxphoto")
-    found: dict[str, list[str]] = {}
-    for name in jaxphoto.__all__:
-        value = getattr(jaxphoto, name)
-        if inspect.isclass(value) or inspect.isroutine(value):
-            room = value.__module__.split(".")[1]
-            found.setdefault(room, []).append(f"{value.__module__}.{value.__qualname__}")
+    """The names of `import jaxphoto`, and those that the pages of the papers name, by room."""
+    found: dict[str, set[str]] = {}
+    for identifier in _identifiers().values():
+        found.setdefault(identifier.split(".")[1], set()).add(identifier)
     return {room: sorted(names) for room, names in sorted(found.items())}
+
+
+@functools.cache
+def _identifiers() -> dict[str, str]:
+    """`project` or `variants.direct`, as a page says it after `jaxphoto.` -> where it is defined."""
+    jaxphoto = importlib.import_module("jaxphoto")
+    papers = "".join(page.read_text("utf-8") for page in (ROOT / "docs" / "papers").glob("*.md"))
+    found = {}
+    for name in [*jaxphoto.__all__, *_NAME.findall(papers)]:
+        *rooms, last = name.split(".")
+        value = getattr(importlib.import_module(".".join(["jaxphoto", *rooms])), last)
+        if inspect.isclass(value) or inspect.isroutine(value):
+            found[name] = f"{value.__module__}.{value.__qualname__}"
+    return found

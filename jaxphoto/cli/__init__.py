@@ -14,6 +14,16 @@ from jaxphoto_command import tidy_up, wait_if_ending
 
 __all__ = ["app", "main"]
 
+# What a lean installation leaves out (docs/install.md): how it is imported, and installed.
+_LEFT_OUT = {
+    "cv2": "opencv-python-headless",
+    "faiss": "faiss-cpu",
+    "laspy": "laspy[lazrs]",
+    "pyarrow": "pyarrow",
+    "rasterio": "rasterio",
+    "xarray": "xarray",
+}
+
 
 def main() -> None:
     """Entry point of the command `jaxphoto`."""
@@ -25,6 +35,13 @@ def main() -> None:
         wait_if_ending()
         said = "; ".join([str(error), *getattr(error, "__notes__", [])])
         typer.echo(f"jaxphoto: {said}", err=True)
+        sys.exit(2)
+    except ModuleNotFoundError as error:
+        package = _LEFT_OUT.get((error.name or "").partition(".")[0])
+        if package is None:
+            raise
+        wait_if_ending()
+        typer.echo(f"jaxphoto: {package} is needed for this and not there: pip install '{package}'", err=True)
         sys.exit(2)
     except OSError as error:
         wait_if_ending()

@@ -85,7 +85,7 @@ def index_page(experiments: Mapping[str, tuple[str, pd.DataFrame]]) -> str:
 
 def experiment_page(run: Run, comparison: pd.DataFrame, made: Made | None = None) -> str:
     """The whole page as HTML, pictures inside."""
-    tables = [_table(str(name), cells) for name, cells in comparison.groupby("table", sort=False)]
+    tables = [table_texts(str(name), cells) for name, cells in comparison.groupby("table", sort=False)]
     check = {name: of for name, of in run.first.items() if len(of.check_points)}
     return (
         Environment(autoescape=True)
@@ -105,7 +105,8 @@ def experiment_page(run: Run, comparison: pd.DataFrame, made: Made | None = None
     )
 
 
-def _table(name: str, cells: pd.DataFrame) -> dict:
+def table_texts(name: str, cells: pd.DataFrame) -> dict:
+    """What a printed table says, each cell as text: title, columns, rows, notes, and how many cells are within."""
     overall = cells["column"] == MEAN_DIFFERENCE
     shown = cells[~overall]
     # A note of a whole column stands at its heading, others at their cells; they are numbered as they come.

@@ -1,14 +1,12 @@
 """A stranger's half hour: every command of docs/half_an_hour.md, in a folder of its own, ends as the page says."""
 
-import os
 import re
-import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pandas as pd
 import pytest
+
+from tests.commands import run_script
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -17,17 +15,7 @@ ROOT = Path(__file__).resolve().parents[2]
 def test_every_command_of_the_page_works(tmp_path):
     page = (ROOT / "docs" / "half_an_hour.md").read_text(encoding="utf-8")
     script = "\n".join(re.findall(r"```sh\n(.*?)```", page, re.DOTALL))
-    beside = Path(sys.executable).parent
-    assert shutil.which("jaxphoto", path=str(beside)), "jaxphoto is not installed beside this Python"
-    found = subprocess.run(
-        ["bash", "-euc", script],
-        cwd=tmp_path,
-        env=os.environ | {"PATH": f"{beside}{os.pathsep}{os.environ['PATH']}"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert found.returncode == 0, found.stdout + found.stderr
+    run_script(script, tmp_path)
     assert list((tmp_path / "what_if").glob("*.csv"))
     for folder in ("results", "results_of_project"):
         assert (tmp_path / folder / "report.html").stat().st_size > 10_000

@@ -9,13 +9,19 @@ from pathlib import Path
 
 import nbformat
 import numpy as np
+import pandas as pd
 import pytest
+
+from jaxphoto.experiment import read_published
 
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def drawings():
-    spec = importlib.util.spec_from_file_location("drawings", ROOT / "docs" / "site" / "drawings.py")
+PAPERS = ROOT / "docs" / "papers"
+
+
+def module_of(name):
+    spec = importlib.util.spec_from_file_location(name, ROOT / "docs" / "site" / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
@@ -30,7 +36,7 @@ def arrows(figure):
 
 
 def test_drawings_turn_as_the_words_of_the_page_say():
-    module = drawings()
+    module = module_of("drawings")
     roll, pitch, yaw = arrows(module.body_angles())
     assert roll["right"][1] < 0 and pitch["forward"][1] > 0 and yaw["forward"][0] > 0
     omega, phi, kappa = arrows(module.camera_angles())
@@ -42,8 +48,35 @@ def test_drawings_turn_as_the_words_of_the_page_say():
 
 def test_drawings_are_those_of_the_pages():
     page = (ROOT / "docs" / "conventions.md").read_text(encoding="utf-8")
-    for name in ("frames", "camera_angles", "body_angles", "image_coordinates", "boresight"):
-        assert (ROOT / "docs" / "images" / f"{name}.svg").is_file() and f"(images/{name}.svg)" in page
+    drawn = set(re.findall(r"\(images/([\w]+\.svg)\)", page))
+    assert len(drawn) == 17 and drawn == {path.name for path in (ROOT / "docs" / "images").glob("*.svg")}
+
+
+def test_which_of_roll_and_pitch_is_omega_is_what_the_page_says():
+    module = module_of("drawings")
+    page = (ROOT / "docs" / "conventions.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| (\w+) \| (\d+) \| (-?\d+) \| (\w+) ([+-]1) \| (\w+) ([+-]1) \|$", page, re.MULTILINE)
+    assert [(name, float(yaw)) for name, yaw, *_ in rows] == list(module.HEADINGS.items())
+    for _, yaw, kappa, *turns in rows:
+        level = module.attitude_of(0.0, 0.0, float(yaw))
+        np.testing.assert_allclose(level, [0, 0, float(kappa)], atol=1e-9)
+        for k, (angle, by) in enumerate(zip(turns[::2], turns[1::2], strict=True)):
+            tilt = module.attitude_of(*np.eye(2)[k], float(yaw)) - level
+            np.testing.assert_allclose(tilt, float(by) * np.array([angle == "omega", angle == "phi", 0]), atol=1e-9)
+
+
+def test_tables_of_the_papers_are_what_is_kept_and_what_is_printed():
+    tables = module_of("paper_tables")
+    kept = pd.read_csv(tables.KEPT, dtype={"paper": str, "row": str})
+    for paper, cells in kept.groupby("paper"):
+        page = (PAPERS / f"{paper}.md").read_text(encoding="utf-8")
+        assert tables.with_tables(page, paper) == page
+        assert f"{(cells['within'] == 'yes').sum()} are within" in page
+        key = ["table", "row", "column"]
+        printed = read_published(ROOT / "experiments" / paper).set_index(key)["published"].dropna()
+        ours = cells.set_index(key)["published"].dropna()
+        pd.testing.assert_series_equal(ours.sort_index(), printed.sort_index(), check_exact=False, rtol=1e-5)
+    assert set(kept["paper"]) == {"000", "002", "003", "004"}
 
 
 @pytest.mark.slow
@@ -56,13 +89,17 @@ def test_the_site_is_built_without_a_warning(tmp_path):
     pages = {path.relative_to(tmp_path / "site").as_posix() for path in (tmp_path / "site").rglob("*.html")}
     assert {"index.html", "conventions.html", "reference/procedures.html"} <= pages
     assert len([page for page in pages if page.startswith("notebooks/")]) == len(list(ROOT.glob("notebooks/*.ipynb")))
+    # Names on the pages lead to the reference, formulas are MathML.
+    paper = (tmp_path / "site" / "papers" / "000.html").read_text(encoding="utf-8")
+    assert 'href="../reference/collinearity.html#jaxphoto.collinearity.project"' in paper
+    assert "<math" in paper and "$" not in re.sub(r"<annotation.*?</annotation>", "", paper)
     assert "jaxphoto.procedures.adjust.adjust" in (tmp_path / "site" / "reference" / "procedures.html").read_text()
 
 
 def test_functions_of_the_papers_are_there():
-    page = (ROOT / "docs" / "papers.md").read_text(encoding="utf-8")
-    names = re.findall(r"`jaxphoto\.([\w.]+)`", page)
-    assert len(names) > 15
+    pages = [path.read_text(encoding="utf-8") for path in PAPERS.glob("*.md")]
+    names = {name for page in pages for name in re.findall(r"`jaxphoto\.([\w.]+)`", page)}
+    assert len(names) > 35
     for name in names:
         *rooms, last = name.split(".")
         # A room is imported when it is asked for, and a name of the top from its own room.

@@ -4,13 +4,15 @@ OpenCV's centre of the upper left pixel is (0, 0), ours (0.5, 0.5). It ignores w
 of cv2.fisheye say `fisheye_model: 1` and have four coefficients.
 """
 
+from __future__ import annotations
+
 import json
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 
 from jaxphoto.camera import Equidistant, InteriorOrientation, OpenCv, OpenCvFisheye, Perspective, Sensor
@@ -23,6 +25,9 @@ from jaxphoto.io.cameras.camera_file import (
     in_pixels,
     joined_notes,
 )
+
+if TYPE_CHECKING:
+    import cv2
 
 ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 """Its coefficients, as its files list them."""
@@ -61,6 +66,8 @@ def read_open_cv(source: CameraSource) -> CameraFile:
 @contextmanager
 def _opened(source: CameraSource) -> Iterator[cv2.FileStorage]:
     """A file as OpenCV reads it. Raises InputError where it cannot, or finds something else than it is asked for."""
+    import cv2
+
     text = source.text()
     if _is_deep(text):
         raise source.error("lists or keys are nested more deeply than in any file of OpenCV; write it anew")
@@ -87,6 +94,8 @@ def write_open_cv(path: Path, name: str, sensor: Sensor, interior: InteriorOrien
 
     Raises OSError where it cannot be written, of which OpenCV itself would say nothing.
     """
+    import cv2
+
     fx, fy, column, row = from_centre_px(interior, sensor)
     d = interior.distortion
     fisheye = isinstance(d, OpenCvFisheye)

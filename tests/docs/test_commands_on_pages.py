@@ -1,0 +1,50 @@
+"""Every command line on the pages is one that the program knows; those that need no file of others run, to the end."""
+
+import importlib
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+from typer.main import get_command
+
+from jaxphoto.cli.app import COMMANDS, app
+from tests.commands import run_script
+
+ROOT = Path(__file__).resolve().parents[2]
+# extending.md declares commands of its own.
+PAGES = [ROOT / "README.md", *sorted(p for p in (ROOT / "docs").rglob("*.md") if p.stem != "extending")]
+_LISTING = re.compile(r"^```(?:sh)?\n(.*?)^```", re.MULTILINE | re.DOTALL)
+
+
+def command_lines(page):
+    """Every call of jaxphoto in the listings of a page."""
+    for listing in _LISTING.findall(page.read_text(encoding="utf-8")):
+        for line in listing.replace("\\\n", " ").splitlines():
+            for part in re.split(r"&&|\||;", line):
+                # Only what stands as a command: no sentence, no output.
+                if found := re.match(r"\s*(?:\.venv/bin/)?jaxphoto ((?:[a-z]+-)*[a-z]+(?: .*)?$)", part):
+                    yield found[1]
+
+
+@pytest.mark.parametrize("page", [p for p in PAGES if list(command_lines(p))], ids=lambda p: p.name)
+def test_command_lines_are_commands_with_options_that_exist(page):
+    for line in command_lines(page):
+        command, *words = shlex.split(line.replace("[", "").replace("]", ""), comments=True)
+        assert command in COMMANDS, f"{page.name}: jaxphoto {line}"
+        importlib.import_module(f"jaxphoto.cli.{COMMANDS[command].module}")
+        known = get_command(app).commands[command]
+        options = {name for parameter in known.params for name in (*parameter.opts, *parameter.secondary_opts)}
+        assert {word for word in words if word.startswith("--")} <= options, f"{page.name}: jaxphoto {line}"
+        # What may be left out stands in brackets, with words for what the user puts there.
+        if "[" not in line:
+            known.make_context(command, words)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("paper", ["000", "001", "003", "004"])
+def test_what_does_a_paper_again_runs(paper, tmp_path):
+    page = (ROOT / "docs" / "papers" / f"{paper}.md").read_text(encoding="utf-8")
+    (script,) = re.findall(r"```sh\n(.*?)```", page, re.DOTALL)
+    run_script(script, tmp_path)
+    assert (tmp_path / {"001": "both", "003": "boresight"}.get(paper, "runs") / "report.html").is_file()
