@@ -1,7 +1,7 @@
 """What the site has beside the pages of docs/: the notebooks, the reference of the public names, links to other files.
 
-Names of functions lead to the reference, names of pages read as their titles, and formulas are MathML, which needs no
-script. A hook of MkDocs: its functions are called by their names.
+Names of functions lead to the reference, names of pages read as their titles, formulas are MathML, which needs no
+script, and search works where the site is opened from disk. A hook of MkDocs: its functions are called by their names.
 """
 
 import functools
@@ -17,6 +17,7 @@ from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).resolve().parents[2]
+_WORKER = "worker_from_disk.js"
 _LINK = re.compile(r"\[([^\]]*)\]\((?:\.\./)+([^)#]+)(#[^)]*)?\)")
 _TO_PAGE = re.compile(r"\[[\w/]+\.md\]\(([\w./]+\.md)(#[^)]*)?\)")
 _NAME = re.compile(r"(?<!\[)`jaxphoto\.([\w.]+)`(?!\])")
@@ -52,7 +53,23 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
                 config, f"reference/{room}.md", content=f"# {room.replace('_', ' ').capitalize()}\n\n{entries}\n"
             )
         )
+    files.append(File(_WORKER, str(ROOT / "docs" / "site"), config.site_dir, config.use_directory_urls))
     return files
+
+
+def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """A notebook that was not run for the site shows at least its picture of the gallery."""
+    picture = f"images/gallery/{Path(page.file.src_uri).stem}.webp"
+    if not page.file.src_uri.endswith(".ipynb") or config.plugins["mkdocs-jupyter"].config["execute"]:
+        return html
+    shown = f'<img alt="The picture of this notebook in the gallery" src="../{picture}">'
+    words = "The code alone; what it concludes stands in the <a href=../gallery.html>gallery</a>."
+    return f"<p>{words}</p>{shown}{html}"
+
+
+def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
+    """The one script that the theme would fetch from elsewhere is the site's own."""
+    return output.replace("https://unpkg.com/iframe-worker/shim", "../" * page.url.count("/") + _WORKER)
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
