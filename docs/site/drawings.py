@@ -243,7 +243,8 @@ def _turned(panel: Axes, rows: np.ndarray, right: int, up: int, names, fixed, ti
             va="center" if k == right else "bottom",
         )
         panel.annotate("", moved, (0, 0), arrowprops={"arrowstyle": "-|>", "color": colours[k], "lw": 2})
-        panel.annotate(names[k], moved * 1.08, color=colours[k], ha="center", va="center", weight="bold")
+        beside = "left" if moved[0] > 0.5 else "center"
+        panel.annotate(names[k], moved * 1.08, color=colours[k], ha=beside, va="center", weight="bold")
         a, b = (np.rad2deg(np.arctan2(v[1], v[0])) for v in (still, moved))
         panel.add_patch(Arc((0, 0), 1.3, 1.3, theta1=min(a, b), theta2=max(a, b), color=colours[k]))
     panel.plot(0, 0, "ko", ms=3)

@@ -7,6 +7,7 @@ script, and search works where the site is opened from disk. A hook of MkDocs: i
 import functools
 import importlib
 import inspect
+import json
 import re
 from pathlib import Path
 
@@ -29,7 +30,7 @@ _LISTING = re.compile(r"(^```.*?^```|`[^`\n]+`)", re.DOTALL | re.MULTILINE)
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
     """Name every notebook and every page of the reference in the contents."""
     added = {
-        "notebooks/": [f"notebooks/{path.name}" for path in _notebooks()],
+        "notebooks/": [{_notebook_title(path): f"notebooks/{path.name}"} for path in _notebooks()],
         "reference/": [f"reference/{room}.md" for room in _public()],
     }
     config.nav = [
@@ -63,8 +64,9 @@ def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -
     if not page.file.src_uri.endswith(".ipynb") or config.plugins["mkdocs-jupyter"].config["execute"]:
         return html
     shown = f'<img alt="The picture of this notebook in the gallery" src="../{picture}">'
-    words = "The code alone; what it concludes stands in the <a href=../gallery.html>gallery</a>."
-    return f"<p>{words}</p>{shown}{html}"
+    words = "One picture of it; what it concludes stands in the <a href=../gallery.html>gallery</a>. Below is the code."
+    heading, end, rest = html.partition("</h1>")
+    return f"{heading}{end}<p>{words}</p>{shown}{rest}"
 
 
 def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
@@ -104,6 +106,10 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
 def _title(page: Path) -> str:
     return page.read_text("utf-8").splitlines()[0].lstrip("# ").strip()
+
+
+def _notebook_title(path: Path) -> str:
+    return "".join(json.loads(path.read_text("utf-8"))["cells"][0]["source"]).splitlines()[0].lstrip("# ")
 
 
 def _notebooks() -> list[Path]:
