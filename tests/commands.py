@@ -1,5 +1,6 @@
 """The command line in the tests' own process, and in a shell."""
 
+import math
 import os
 import shutil
 import subprocess
@@ -9,10 +10,13 @@ from pathlib import Path
 import pytest
 
 from jaxphoto import cli
+from jaxphoto.cli import output
 
 
 def run(monkeypatch, capsys, *arguments) -> tuple[int, str, str]:
     """Exit code, standard output and standard error of `jaxphoto ...`, in this process."""
+    # How long compiling takes hangs on the machine.
+    monkeypatch.setattr(output, "WORTH_TELLING_S", math.inf)
     monkeypatch.setattr(sys, "argv", ["jaxphoto", *map(str, arguments)])
     with pytest.raises(SystemExit) as stop:
         cli.main()

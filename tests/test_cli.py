@@ -126,6 +126,14 @@ def test_files_say_what_the_adjustment_says(results, folder):
     weighted = residuals["residual"] / residuals["sigma"]
     assert (weighted**2).sum() == pytest.approx(float(adjusted.square_sum), rel=1e-6)
     assert f"{float(adjusted.sigma0):.6g}" in screen
+    for axis in "XYZ":
+        off = tables.check_points[f"d{axis}_m"].dropna()
+        if len(off):
+            assert summary["check_points"][axis]["rmse_m"] == pytest.approx((off**2).mean() ** 0.5)
+            row = re.search(rf"│ {axis} +│ {len(off)} +│ \S+ +│ (\S+) +│ (\S+) +│ (\S+)", screen)
+            assert float(row[1]) == pytest.approx((off**2).mean() ** 0.5, rel=6e-3)
+            assert float(row[2]) == pytest.approx(off.abs().max(), rel=6e-3)
+            assert row[3] == tables.check_points["point"][off.abs().idxmax()]
     assert "c_mm" in screen
 
 
@@ -274,7 +282,9 @@ def test_other_programs_get_the_summary_and_who_asks_for_silence_gets_it(folder,
     out = folder.parent / "silent"
     code, screen, errors = run(monkeypatch, capsys, "adjust", folder, "--out", out, "--json", "--quiet")
     assert code == 0 and errors == ""
-    assert json.loads(screen) == json.loads((out / "summary.json").read_text())
+    told = json.loads(screen)
+    summary = {name: told[name] for name in ("verdict", "findings")} | told["summary"]
+    assert summary == json.loads((out / "summary.json").read_text())
     assert run(monkeypatch, capsys, "adjust", folder, "--out", out, "-q") == (0, "", "")
 
 

@@ -1,6 +1,7 @@
 """How long the rest takes, by the last steps, and the lines that say what is done off a terminal."""
 
 import io
+import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -23,15 +24,42 @@ def shown():
 
 @pytest.mark.parametrize("terminal", [False, True])
 def test_off_a_terminal_a_line_now_and_then_says_what_is_done(terminal):
-    now, written = [0.0], io.StringIO()
-    console = Console(file=written, force_terminal=terminal, width=200)
-    # Never started, so that on a terminal nothing is drawn between the lines.
-    status = PlainStatus("reading", lambda: now[0], console=console)
-    for k in range(1, 11):
-        now[0] = 8.0 * k
-        status.update(f"adjusting [round] {k}")
-    lines = [] if terminal else ["adjusting [round] 4", "adjusting [round] 8"]
-    assert written.getvalue().splitlines() == lines
+    written = io.StringIO()
+    status = PlainStatus("reading", line_s=0.1, console=Console(file=written, force_terminal=terminal, width=200))
+    with status:
+        status.update("adjusting [round] 1")
+        time.sleep(0.35)
+    lines = written.getvalue().split("\n")
+    time.sleep(0.2)
+    assert written.getvalue().split("\n") == lines
+    if not terminal:
+        # As many as the time allows, on a busy machine fewer.
+        assert 1 <= lines.count("adjusting [round] 1") <= 3 and set(lines) == {"adjusting [round] 1", ""}
+
+
+def test_a_line_says_how_long_a_step_takes_where_it_does_not_say_how_long_the_rest_does():
+    now = [100.0]
+    status = PlainStatus("reading", lambda: now[0], console=Console(file=io.StringIO()))
+    now[0] = 140.0
+    assert status.line() == "reading (40 s)"
+    status.update("features: 3 of 9, 5 s left")
+    assert status.line() == "features: 3 of 9, 5 s left"
+    now[0] = 150.0
+    status.update("features: 9 of 9")
+    assert status.line() == "features: 9 of 9 (10 s)"
+
+
+def test_a_status_that_numbers_its_steps_says_how_long_the_rest_takes():
+    now = [0.0]
+    status = PlainStatus("reading", lambda: now[0], console=Console(file=io.StringIO()))
+    said = []
+    for number in range(1, 5):
+        now[0] += 5.0
+        status.update(f"adjusting halves: cut {number} of 4")
+        said.append(status.line())
+    halves = "adjusting halves: cut"
+    # Three, two and one of them are still to be made.
+    assert said == [f"{halves} 1 of 4", *(f"{halves} {n} of 4, {5 * (5 - n)} s left" for n in (2, 3, 4))]
 
 
 def test_what_is_left_is_judged_by_the_last_steps(shown):

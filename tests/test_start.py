@@ -2,6 +2,7 @@
 
 import importlib
 import inspect
+import json
 import os
 import shlex
 import subprocess
@@ -11,6 +12,7 @@ import pytest
 import typer
 
 from jaxphoto.cli.app import COMMANDS, app
+from tests.commands import run
 
 
 def after(*arguments):
@@ -71,6 +73,16 @@ def test_the_example_in_the_help_of_a_command_is_one(name):
     importlib.import_module(f"jaxphoto.cli.{COMMANDS[name].module}")
     commands = typer.main.get_command(app).commands
     assert commands[name].make_context(name, words[2:]).params is not None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name, command in COMMANDS.items() if command.before])
+def test_the_example_in_the_help_of_a_command_runs(name, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for words in (*COMMANDS[name].before, COMMANDS[name].example):
+        code, screen, errors = run(monkeypatch, capsys, *shlex.split(words)[1:], "--json")
+        assert code in (0, 1), errors
+        assert json.loads(screen)["written"]
 
 
 def test_help_is_short_too_and_ends_with_an_example():

@@ -8,7 +8,8 @@ import jax
 import typer
 
 from jaxphoto.cli.app import app
-from jaxphoto.errors import JaxphotoError, printable, shown
+from jaxphoto.cli.console import show_warning
+from jaxphoto.errors import JaxphotoError, printable
 from jaxphoto.writing import discard_all
 from jaxphoto_command import tidy_up, wait_if_ending
 
@@ -27,7 +28,7 @@ _LEFT_OUT = {
 
 def main() -> None:
     """Entry point of the command `jaxphoto`."""
-    warnings.showwarning = _show_warning
+    warnings.showwarning = show_warning
     tidy_up.append(discard_all)
     try:
         app(standalone_mode=True)
@@ -64,8 +65,3 @@ def main() -> None:
             err=True,
         )
         sys.exit(2)
-
-
-def _show_warning(message, category, filename, lineno, file=None, line=None) -> None:
-    """Warnings for the user in one line, without the place in our code."""
-    typer.echo(f"warning: {shown(str(message))}", err=True)

@@ -9,13 +9,13 @@ from typing import Annotated
 import typer
 
 import jaxphoto
-from jaxphoto.cli.app import app
 from jaxphoto.cli.choices import one_of
-from jaxphoto.cli.console import plain_console
 from jaxphoto.cli.made import made_by
+from jaxphoto.cli.output import Output, command
 from jaxphoto.cli.provenance import Provenance
 from jaxphoto.errors import JaxphotoError
 from jaxphoto.io import read_block, read_truth, write_block
+from jaxphoto.io.cameras import CAMERAS_READ
 from jaxphoto.losses import LOSSES
 from jaxphoto.procedures import adjust_for_tables
 from jaxphoto.procedures.weights import MadeByBlunders, made_by_blunders
@@ -39,8 +39,9 @@ from jaxphoto.writing import check_folder, whole_folder
 _SPLITS = ", ".join(SPLITS)
 
 
-@app.command("adjust")
+@command("adjust", f"An earlier calibration of a camera, which block.toml may name, is read from {CAMERAS_READ}.")
 def adjust_command(
+    output: Output,
     context: typer.Context,
     block: Annotated[Path, typer.Argument(help="Block folder (see docs/block_folder.md).")],
     out: Annotated[Path, typer.Option(help="Folder for the results; earlier results in it are replaced.")],
@@ -56,31 +57,23 @@ def adjust_command(
     weights: Annotated[
         str | None, typer.Option(help=f"Estimate variance components, adjust with them: group, or by {_SPLITS}.")
     ] = None,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print summary.json in place of tables, for other programs.")
-    ] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but warnings and errors.")] = False,
 ) -> None:
     """Adjust a block and write tables, statistics and a report. Exit code 1: written, but the verdict is red."""
     splits = None if weights is None else _splits_of(weights)
     check_folder(out, block)
     Thread(target=prepare_pictures, daemon=True).start()
-    console, errors = plain_console(quiet=quiet or as_json), plain_console(stderr=True, quiet=quiet)
     began = time.perf_counter()
-    with errors.status("reading the block") as status:
+    with output.progress.status("reading the block") as status:
         read = read_block(block)
         options = {"rotations": rotations, "snoop": snoop, "robust": robust, "max_steps": max_steps, "weights": weights}
         signed, made = Provenance.of_block("adjust", block, options), made_by(context, block)
         seconds = {"read": time.perf_counter() - began}
-        status.update(
-            f"adjusting {len(read.images)} images, {len(read.points)} points, "
-            f"{len(read.image_points.image)} image points"
-        )
+        status.update("looking for approximate values")
         snooped = None
         if snoop or robust:
             loss = LOSSES[robust]() if robust else None
             snooped = jaxphoto.snoop(read, loss=loss, max_steps=max_steps, report=status.update)
-        adjusted = snooped.adjusted if snooped else adjust_for_tables(read, max_steps)
+        adjusted = snooped.adjusted if snooped else adjust_for_tables(read, max_steps, status.update)
         components, masked = None, list[MadeByBlunders]()
         if splits is not None and bool(adjusted.converged):
             status.update("estimating variance components")
@@ -95,7 +88,7 @@ def adjust_command(
         verdict = Verdict.of([*found, *verdict.findings])
         status.update(f"writing {out}")
         times = adjusted.seconds | seconds
-        order = ("read", "compile", "solve", "covariance")
+        order = [name for name in ("read", "start", "compile", "solve", "covariance") if name in times]
         with whole_folder(out) as work:
             of = "block" if snooped else os.path.relpath(block.resolve(), out.resolve())
             told = {"block": of, **signed.told}
@@ -106,12 +99,10 @@ def adjust_command(
             if snooped:
                 left_out_table(snooped, read).to_csv(work / "left_out.csv", index=False)
                 write_block(adjusted.block, work / "block")
-    print_adjustment(tables, verdict, console)
+    print_adjustment(tables, verdict, output.screen)
     if components:
-        print_components(components, console)
-    console.print(f"results in {out} (open report.html)")
-    if as_json:
-        typer.echo((out / "summary.json").read_text(encoding="utf-8"), nl=False)
+        print_components(components, output.screen)
+    output.wrote(out, f"results in {out} (open report.html)")
     if verdict.level == Level.ALARM:
         raise typer.Exit(1)
 

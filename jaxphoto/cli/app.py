@@ -9,7 +9,7 @@ import importlib
 from typing import Annotated, NamedTuple
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
 import jaxphoto
 
@@ -20,38 +20,63 @@ class _Command(NamedTuple):
     module: str
     sentence: str
     example: str
+    before: tuple[str, ...] = ()
+    """Commands that make what the example reads; where there are none it is the user's own."""
+
+    @property
+    def epilog(self) -> str:
+        """The example, as it can be typed."""
+        return "Example: " + " && ".join([*self.before, self.example])
+
+
+_BLOCK = ("jaxphoto example cross_block",)
+_RESULTS = (*_BLOCK, "jaxphoto adjust cross_block --out results")
+_LIDAR = ("jaxphoto example lidar",)
 
 
 _CONTENTS = {
     "Adjust and judge": {
         "adjust": _Command(
-            "adjust", "Adjust a block and write tables, statistics and a report.", "jaxphoto adjust BLOCK --out results"
+            "adjust",
+            "Adjust a block and write tables, statistics and a report.",
+            "jaxphoto adjust cross_block --out results",
+            _BLOCK,
         ),
         "boresight": _Command(
-            "boresight", "Boresight misalignment in four steps.", "jaxphoto boresight BLOCK --out boresight"
+            "boresight",
+            "Boresight misalignment in four steps.",
+            "jaxphoto boresight flight --out boresight",
+            ("jaxphoto example boresight", "jaxphoto simulate boresight.toml --out flight"),
         ),
         "certificate": _Command(
-            "certificate", "Write the certificate of a calibration.", "jaxphoto certificate results --out camera.pdf"
+            "certificate",
+            "Write the certificate of a calibration.",
+            "jaxphoto certificate results --out camera.pdf",
+            _RESULTS,
         ),
         "tables": _Command(
             "tables",
             "Write tables of results as CSV, Parquet, Markdown or LaTeX.",
             "jaxphoto tables results --to latex --only interior --out tables",
+            _RESULTS,
         ),
         "monte-carlo": _Command(
             "monte_carlo",
             "Re-adjust a block with drawn errors.",
-            "jaxphoto monte-carlo BLOCK --bias station --per strip --sigma-m 0.15 --draws 1000 --out draws",
+            "jaxphoto monte-carlo cross_block --bias station --per strip --sigma-m 0.15 --draws 1000 --out draws",
+            _BLOCK,
         ),
         "sensitivity": _Command(
             "sensitivity",
             "Exact sensitivity of the interior orientation and the check points to stations, and to undetected errors.",
-            "jaxphoto sensitivity BLOCK --out sensitivity",
+            "jaxphoto sensitivity cross_block --out sensitivity",
+            _BLOCK,
         ),
         "halves": _Command(
             "halves",
             "Judge the standard deviations of a calibration by random halves of its block.",
-            "jaxphoto halves BLOCK --by image --cuts 64 --out halves",
+            "jaxphoto halves cross_block --by image --cuts 64 --out halves",
+            _BLOCK,
         ),
     },
     "From photographs": {
@@ -100,34 +125,40 @@ _CONTENTS = {
         "models": _Command(
             "model_choice",
             "Compare distortion models by cross-validation, information criteria and significance.",
-            "jaxphoto models BLOCK --models brown:k1,brown:k1+k2,opencv --out models",
+            "jaxphoto models cross_block --models brown:k1,brown:k1+k2,opencv --out models",
+            _BLOCK,
         ),
     },
     "Lidar": {
         "lidar-control": _Command(
             "lidar",
             "Give tie points the height of the laser points there as control.",
-            "jaxphoto lidar-control BLOCK CLOUD.laz --out BLOCK2 --class 2,6",
+            "jaxphoto lidar-control lidar lidar/cloud.laz --out with_heights",
+            _LIDAR,
         ),
         "roof-control": _Command(
             "lidar",
             "Hold tie points on the planes of roof faces.",
-            "jaxphoto roof-control BLOCK CLOUD.laz --out BLOCK2",
+            "jaxphoto roof-control lidar lidar/cloud.laz --out with_roofs",
+            _LIDAR,
         ),
         "simultaneous": _Command(
             "lidar",
             "Adjust a block and a cloud together.",
-            "jaxphoto simultaneous BLOCK CLOUD.laz --trajectory flight.csv --out both",
+            "jaxphoto simultaneous lidar lidar/cloud.laz --trajectory lidar/trajectory.csv --out both",
+            _LIDAR,
         ),
         "strips": _Command(
             "strips",
             "Fit the strips of a cloud to each other.",
-            "jaxphoto strips CLOUD.laz --trajectory flight.csv --out strips",
+            "jaxphoto strips strips/cloud.laz --trajectory strips/trajectory.csv --cell-m 8 --out fitted",
+            ("jaxphoto example strips",),
         ),
         "dsm": _Command(
             "surface_model",
             "Make a surface model of a cloud.",
-            "jaxphoto dsm CLOUD.laz --out dsm.tif --cell-m 1.0 --hillshade hill.png",
+            "jaxphoto dsm lidar/cloud.laz --out dsm.tif --cell-m 4 --hillshade hill.png",
+            _LIDAR,
         ),
         "orthophoto": _Command(
             "surface_model",
@@ -139,9 +170,10 @@ _CONTENTS = {
         "convert": _Command(
             "convert",
             "Turn another program's files into a block folder, or what was adjusted into files of others.",
-            "jaxphoto convert SOURCE BLOCK",
+            "jaxphoto convert results --to colmap --out sparse",
+            _RESULTS,
         ),
-        "camera": _Command("camera", "Convert a camera file.", "jaxphoto camera results cameras.txt"),
+        "camera": _Command("camera", "Convert a camera file.", "jaxphoto camera results --out cameras.txt", _RESULTS),
     },
     "Examples and simulation": {
         "example": _Command(
@@ -150,12 +182,16 @@ _CONTENTS = {
             "jaxphoto example cross_block",
         ),
         "simulate": _Command(
-            "simulate", "Simulate a block with known truth.", "jaxphoto simulate recipe.toml --out BLOCK --seed 1"
+            "simulate",
+            "Simulate a block with known truth.",
+            "jaxphoto simulate recipe.toml --out block --seed 1",
+            ("jaxphoto example recipe",),
         ),
         "experiment": _Command(
             "experiment",
             "Run experiments; write tables.csv and report.html, ours beside what the paper prints.",
             "jaxphoto experiment 000 --layouts 4 --out runs",
+            ("jaxphoto example experiments",),
         ),
     },
 }
@@ -163,7 +199,23 @@ COMMANDS = {name: command for commands in _CONTENTS.values() for name, command i
 """All commands in the order of `jaxphoto --help`: what they are about in one line each, and how they are called."""
 
 
-class _WhenCalled(TyperGroup):
+class _Readable:
+    """A command or group whose flags are shown without the type that they cannot be given."""
+
+    def get_params(self, ctx):
+        """All parameters, that of the help, too."""
+        params = super().get_params(ctx)  # type: ignore[misc]
+        for parameter in params:
+            if getattr(parameter, "is_flag", False):
+                parameter.metavar = ""
+        return params
+
+
+class ReadableCommand(_Readable, TyperCommand):
+    """A command of `app`."""
+
+
+class _WhenCalled(_Readable, TyperGroup):
     """The commands, of which that one is imported that is called."""
 
     def resolve_command(self, ctx, args):
@@ -174,7 +226,7 @@ class _WhenCalled(TyperGroup):
             gc.freeze()
             # Made anew, the group has what the module has just registered.
             self.commands = typer.main.get_command(app).commands  # type: ignore[attr-defined]
-            self.commands[args[0]].epilog = f"Example: {COMMANDS[args[0]].example}"
+            self.commands[args[0]].epilog = COMMANDS[args[0]].epilog
         return super().resolve_command(ctx, args)
 
 

@@ -7,17 +7,17 @@ from typing import Annotated
 import typer
 
 import jaxphoto
-from jaxphoto.cli.app import app
-from jaxphoto.cli.console import plain_console
 from jaxphoto.cli.made import made_by
+from jaxphoto.cli.output import Output, command
 from jaxphoto.io import read_block
 from jaxphoto.procedures import boresight
 from jaxphoto.report import print_boresight, write_boresight
 from jaxphoto.writing import check_folder
 
 
-@app.command("boresight")
+@command("boresight")
 def boresight_command(
+    output: Output,
     context: typer.Context,
     block: Annotated[Path, typer.Argument(help="Block folder (see docs/block_folder.md).")],
     out: Annotated[Path, typer.Option(help="Folder for the results; earlier results in it are replaced.")],
@@ -28,16 +28,14 @@ def boresight_command(
 ) -> None:
     """Boresight misalignment in four steps. Exit code 1: written, but a step is not passed or not converged."""
     check_folder(out, block)
-    console, errors = plain_console(), plain_console(stderr=True)
     began = time.perf_counter()
-    with errors.status("reading the block") as status:
+    with output.progress.status("reading the block") as status:
         read, made = read_block(block), made_by(context, block)
         seconds = {"read": time.perf_counter() - began}
-        status.update(f"four adjustments of {len(read.images)} images, {len(read.points)} points")
-        steps = boresight(read, go_on=go_on, max_steps=max_steps)
+        steps = boresight(read, go_on=go_on, max_steps=max_steps, report=status.update)
         status.update(f"writing {out}")
         write_boresight(steps, out, seconds, made)
-    print_boresight(steps, console)
-    console.print(f"results in {out} (open report.html)")
+    print_boresight(steps, output.screen)
+    output.wrote(out, f"results in {out} (open report.html)")
     if not all(step.go_on for step in steps):
         raise typer.Exit(1)

@@ -2,6 +2,7 @@
 
 import time
 from functools import partial
+from itertools import count
 from pathlib import Path
 from threading import Thread
 from typing import Annotated
@@ -10,10 +11,9 @@ import typer
 
 import jaxphoto
 from jaxphoto.camera import DISTORTIONS
-from jaxphoto.cli.app import app
 from jaxphoto.cli.choices import one_of
-from jaxphoto.cli.console import plain_console
 from jaxphoto.cli.made import made_by
+from jaxphoto.cli.output import Output, command
 from jaxphoto.errors import InputError
 from jaxphoto.image_measurement.grey_values import read_grey
 from jaxphoto.image_measurement.targets import SYNTAX, find_targets, read_board
@@ -25,11 +25,12 @@ from jaxphoto.report.calibration import print_calibration, write_calibration
 from jaxphoto.writing import check_folder
 
 
-@app.command("calibrate")
+@command("calibrate", f"Boards: {', '.join(SYNTAX.values())}.")
 def calibrate_command(
+    output: Output,
     context: typer.Context,
     images: Annotated[list[Path], typer.Argument(help="Photographs of the board, all by one camera at one focus.")],
-    board: Annotated[str, typer.Option(help=f"The board: {', '.join(SYNTAX.values())}.")],
+    board: Annotated[str, typer.Option(help="What was photographed, in the words above.")],
     out: Annotated[Path, typer.Option(help="Folder for the results; earlier results in it are replaced.")],
     model: Annotated[str, one_of(DISTORTIONS, help="Distortion.")] = "smac",
     r0_mm: Annotated[float, typer.Option(help="Balance radius R0 of SMAC.")] = 0.0,
@@ -52,10 +53,11 @@ def calibrate_command(
     wanted = None if free is None else [name.strip() for name in free.split(",") if name.strip()]
     free_parameters(model, distortion_model(model, start.sensor, r0_mm), wanted)
     Thread(target=prepare_pictures, daemon=True).start()
-    console, errors = plain_console(), plain_console(stderr=True)
     began = time.perf_counter()
-    with errors.status("looking for the board") as status:
-        targets = find_targets(taken, pattern, lambda image: status.update(f"looking for the board in {image}"))
+    with output.progress.status("looking for the board") as status:
+        number = count(1)
+        look = lambda _: status.update(f"looking for the board: photograph {next(number)} of {len(taken)}")  # noqa: E731
+        targets = find_targets(taken, pattern, look)
         seconds = {"read": time.perf_counter() - began}
         status.update(f"calibrating with {len(targets.detections)} photographs")
         done = calibrate(
@@ -84,9 +86,9 @@ def calibrate_command(
             # A size that nobody gave is the unit of every length in the report.
             notes=() if pixel_mm is not None else (start.origin,),
         )
-    console.print(start.origin)
-    print_adjustment(tables, verdict_of(tables), console)
-    print_calibration(done, console)
-    console.print(f"results in {out} (open report.html and photographs.html)")
+    output.screen.print(start.origin)
+    print_adjustment(tables, verdict_of(tables), output.screen)
+    print_calibration(done, output.screen)
+    output.wrote(out, f"results in {out} (open report.html and photographs.html)")
     if not done.converged:
         raise typer.Exit(1)

@@ -8,8 +8,7 @@ import numpy as np
 import typer
 
 from jaxphoto.camera.conditions import Conditions
-from jaxphoto.cli.app import app
-from jaxphoto.cli.console import plain_console
+from jaxphoto.cli.output import Output, command
 from jaxphoto.cli.two_cameras import check_one_sensor
 from jaxphoto.errors import InputError
 from jaxphoto.io.cameras import CameraFile, read_camera_file
@@ -25,7 +24,6 @@ from jaxphoto.report.certified import Certified, ExteriorCorrelation, FormatBand
 from jaxphoto.report.document import Document
 from jaxphoto.report.document_html import html_page
 from jaxphoto.report.document_pdf import pdf_of
-from jaxphoto.report.terminal import print_warning
 from jaxphoto.writing import check_room, whole_file
 from jaxphoto.writing.inputs import InputFile, input_file
 
@@ -36,8 +34,9 @@ _LEAST_CELLS = 4
 _OF_CAMERA = ("interior.csv", "correlation.csv", "camera.toml", "block.toml")
 
 
-@app.command("certificate")
+@command("certificate")
 def certificate_command(
+    output: Output,
     results: Annotated[Path, typer.Argument(metavar="RESULTS", help="Folder of results of adjust or fly.")],
     out: Annotated[Path, typer.Option(help="The certificate: a file that ends in .html or .pdf; replaced if there.")],
     last: Annotated[
@@ -53,11 +52,12 @@ def certificate_command(
     if out.suffix.lower() not in _SUFFIXES:
         raise InputError(f"--out {out}: name a file that ends in {' or '.join(_SUFFIXES)}")
     check_room(out)
-    document = certificate_document(results, camera, last, halves, photographs or [])
-    write_certificate(document, out)
+    with output.progress.status(f"writing {out}"):
+        document = certificate_document(results, camera, last, halves, photographs or [])
+        write_certificate(document, out)
     if against := reservation(read_summary(results)):
-        print_warning(against, plain_console(stderr=True))
-    plain_console().print(f"certificate in {out}", soft_wrap=True)
+        output.warn(against)
+    output.wrote(out, f"certificate in {out}")
 
 
 def write_certificate(document: Document, path: Path) -> None:

@@ -1,16 +1,24 @@
 """Options that take one of a list of names: help shows the list, a shell completes it, anything else is refused."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Annotated
 
 import typer
 
 from jaxphoto.errors import InputError
 
+# Longer lists leave no room for help beside them.
+_WIDE = 20
 
-def one_of(names: Iterable[str], *words: str, help: str) -> typer.models.OptionInfo:
+
+def one_of(
+    names: Iterable[str], *words: str, help: str, about: Mapping[str, str] = MappingProxyType({})
+) -> typer.models.OptionInfo:
     """An option, called as the argument or by `words`, whose value is one of `names`, or the default.
 
-    Any other raises InputError before the command begins.
+    Any other raises InputError before the command begins. Help shows what is told `about` each.
     """
     known = tuple(names)
 
@@ -22,5 +30,24 @@ def one_of(names: Iterable[str], *words: str, help: str) -> typer.models.OptionI
     def begun(incomplete: str) -> list[str]:
         return [name for name in known if name.startswith(incomplete)]
 
+    listed = " | ".join(known)
+    if about:
+        listed, help = "NAME", "\n\n".join([help, *(f"{name}: {what}" for name, what in about.items())])
+    elif len(listed) > _WIDE:
+        listed, help = "NAME", f"{help} One of: {', '.join(known)}."
     # `str` in place of what typer makes of a Literal, whose error looks like none of ours.
-    return typer.Option(*words, metavar=" | ".join(known), help=help, parser=str, callback=check, autocompletion=begun)
+    return typer.Option(*words, metavar=listed, help=help, parser=str, callback=check, autocompletion=begun)
+
+
+# Before it had the name that it has everywhere, OUT came second.
+Second = Annotated[Path | None, typer.Argument(hidden=True, metavar="OUT")]
+
+
+def place(out: Path | None, second: Path | None) -> Path:
+    """Where to write, by --out or as the second argument. Raises InputError where it is told twice or not at all."""
+    if out is not None and second is not None:
+        raise InputError(f"--out {out} and {second} are two places to write to; name one")
+    told = out if out is not None else second
+    if told is None:
+        raise InputError("nothing says where to write: add --out")
+    return told

@@ -7,19 +7,18 @@ import numpy as np
 import typer
 
 from jaxphoto.camera import get_parameter, parameter_names
-from jaxphoto.cli.app import app
-from jaxphoto.cli.console import plain_console
+from jaxphoto.cli.output import Output, command
 from jaxphoto.cli.two_cameras import check_one_sensor
 from jaxphoto.errors import InputError
 from jaxphoto.io.cameras import read_camera_file, write_camera_file
-from jaxphoto.report import print_warning
 from jaxphoto.stability import combine
 from jaxphoto.stability.analysis import SIGNIFICANT_P
 from jaxphoto.writing import check_file
 
 
-@app.command("combine")
+@command("combine")
 def combine_command(
+    output: Output,
     calibrations: Annotated[list[Path], typer.Argument(help="Results or camera files with a covariance.")],
     out: Annotated[Path, typer.Option(help="Camera file (.toml) to write, a prior for blocks.")],
     camera: Annotated[str | None, typer.Option(help="Which camera, where a file holds several.")] = None,
@@ -28,7 +27,6 @@ def combine_command(
     if out.suffix != ".toml":
         raise InputError(f"--out {out}: only a .toml has a place for the covariance; name it so")
     check_file(out, *calibrations)
-    console = plain_console()
     read = [read_camera_file(path, camera=camera) for path in calibrations]
     names = [str(path) for path in calibrations]
     covariances: list[np.ndarray] = []
@@ -38,7 +36,7 @@ def combine_command(
             raise InputError(f"{name} has no covariance; give results of jaxphoto adjust, or a camera file of them")
         covariances.append(file.covariance)
         if file.note:
-            print_warning(f"{name}: {file.note}", console, soft_wrap=True)
+            output.warn(f"{name}: {file.note}")
     done = combine([file.interior for file in read], covariances, names)
     write_camera_file(
         out,
@@ -52,15 +50,15 @@ def combine_command(
     for parameter, variance in zip(parameter_names(done.interior), np.diagonal(done.covariance), strict=True):
         if variance > 0:
             value = float(get_parameter(done.interior, parameter))
-            console.print(f"  {parameter} = {value:.9g} +- {variance**0.5:.2g}", soft_wrap=True)
+            output.say(f"  {parameter} = {value:.9g} +- {variance**0.5:.2g}")
     agree = done.p_value >= SIGNIFICANT_P
     said = "they agree" if agree else "they do NOT agree: the camera has changed, or their covariances are too small"
-    console.print(
-        f"chi-square {done.chi_square:.1f} of {done.degrees_of_freedom}, p = {done.p_value:.2g}: {said}", soft_wrap=True
-    )
+    output.say(f"chi-square {done.chi_square:.1f} of {done.degrees_of_freedom}, p = {done.p_value:.2g}: {said}")
     for k, (name, p) in enumerate(zip(names, done.against_others, strict=True)):
         apart = ": it disagrees" if len(names) > 2 and k in done.disagreeing(SIGNIFICANT_P) else ""
-        console.print(f"  {name} against the others: p = {p:.2g}{apart}", soft_wrap=True)
-    console.print(f"wrote {out}", soft_wrap=True)
+        output.say(f"  {name} against the others: p = {p:.2g}{apart}")
+    output.wrote(out, f"wrote {out}")
+    output.tell(agree=agree, chi_square=done.chi_square, degrees_of_freedom=done.degrees_of_freedom)
+    output.tell(p_value=done.p_value, p_against_others=dict(zip(names, done.against_others, strict=True)))
     if not agree:
         raise typer.Exit(1)

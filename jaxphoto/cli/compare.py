@@ -5,20 +5,19 @@ from typing import Annotated
 
 import typer
 
-from jaxphoto.cli.app import app
 from jaxphoto.cli.choices import one_of
-from jaxphoto.cli.console import plain_console
 from jaxphoto.cli.grid_options import check_grid, points_of
 from jaxphoto.cli.made import made_by
+from jaxphoto.cli.output import Output, command
 from jaxphoto.cli.two_cameras import compared, read_two
-from jaxphoto.report import print_warning
-from jaxphoto.report.change import print_change, write_change
+from jaxphoto.report.change import change_summary, print_change, write_change
 from jaxphoto.stability import METHODS, Method, change
 from jaxphoto.writing import check_folder
 
 
-@app.command("compare")
+@command("compare")
 def compare_command(
+    output: Output,
     context: typer.Context,
     first: Annotated[Path, typer.Argument(metavar="A", help="Results or camera file of one calibration.")],
     second: Annotated[Path, typer.Argument(metavar="B", help="The same of the other, by other photographs.")],
@@ -40,13 +39,15 @@ def compare_command(
     if out is not None:
         check_folder(out, first, second)
     a, b = read_two((first, second), (camera, camera_b), pixel_mm, block)
-    found = change(a.interior, b.interior, points_of(a.sensor, grid, extent), (a.covariance, b.covariance), method)
-    console = plain_console()
+    with output.progress.status("comparing"):
+        points = points_of(a.sensor, grid, extent)
+        found = change(a.interior, b.interior, points, (a.covariance, b.covariance), method)
     sets = compared("A", first, a), compared("B", second, b)
     for letter, file in (("A", a), ("B", b)):
         if file.note:
-            print_warning(f"{letter}: {file.note}", console, soft_wrap=True)
-    print_change(found, sets, a.sensor, console)
+            output.warn(f"{letter}: {file.note}")
+    print_change(found, sets, a.sensor, output.screen)
+    output.tell(**change_summary(found, a.sensor))
     if out is not None:
         write_change(found, sets, a.sensor, out, made_by(context, first, second))
-        console.print(f"results in {out} (open report.html)")
+        output.wrote(out, f"results in {out} (open report.html)")

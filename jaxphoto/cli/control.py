@@ -5,10 +5,9 @@ from typing import Annotated, Any
 
 import typer
 
-from jaxphoto.cli.app import app
-from jaxphoto.cli.console import plain_console
 from jaxphoto.cli.exposure_options import map_codes
 from jaxphoto.cli.made import made_by
+from jaxphoto.cli.output import Output, command
 from jaxphoto.cli.provenance import Provenance
 from jaxphoto.errors import InputError
 from jaxphoto.image_measurement.control_targets import target_looker
@@ -24,12 +23,12 @@ from jaxphoto.report.control import control_findings, control_summary, write_con
 from jaxphoto.report.findings import Verdict
 from jaxphoto.report.made import versions
 from jaxphoto.report.results import write_results, write_summary
-from jaxphoto.report.terminal import plain
 from jaxphoto.writing import check_folder, whole_folder
 
 
-@app.command("control")
+@command("control")
 def control_command(
+    output: Output,
     context: typer.Context,
     block: Annotated[Path, typer.Argument(help="Block folder whose images are oriented.")],
     file: Annotated[Path, typer.Argument(help="Surveyed points: gcp_list.txt, markers of Metashape as XML, or CSV.")],
@@ -59,8 +58,7 @@ def control_command(
     if (targets is None) != (not photographs):
         raise InputError("targets are found in photographs: give both --targets and --photographs, or neither")
     target, (code, vertical) = read_target(targets) if targets else None, map_codes(epsg)
-    console, errors = plain_console(), plain_console(stderr=True)
-    with errors.status("reading") as status:
+    with output.progress.status("reading") as status:
         control, given = read_control(file, marks), read_block(block)
         status.update("adjusting the block as it is")
         oriented = at_optimum(adjust(given))
@@ -89,11 +87,11 @@ def control_command(
             with whole_block(found.adjusted.block, work / "block") as folder:
                 signed.write(images, folder)
     for sentence in found.sentences:
-        console.print(plain(sentence), soft_wrap=True)
-    console.print(plain(verdict.headline), soft_wrap=True)
+        output.say(sentence)
+    output.say(verdict.headline)
     for finding in verdict.findings:
         if finding.level > Level.INFORMATION or "check point" in finding.text:
-            console.print(plain(f"  {finding.text}"), soft_wrap=True)
-    console.print(f"results in {plain(str(out))} (open result/report.html)", soft_wrap=True)
+            output.say(f"  {finding.text}")
+    output.wrote(out, f"results in {out} (open result/report.html)")
     if verdict.level == Level.ALARM:
         raise typer.Exit(1)

@@ -6,8 +6,7 @@ from typing import Annotated
 
 import typer
 
-from jaxphoto.cli.app import app
-from jaxphoto.cli.console import plain_console
+from jaxphoto.cli.output import Output, command
 from jaxphoto.io import read_recipe, write_simulation
 from jaxphoto.io.block_folder import check_block_target
 from jaxphoto.io.shipped import EXAMPLES, shipped
@@ -27,24 +26,25 @@ _NEXT = {
 }
 
 
-@app.command("example")
+@command("example")
 def example_command(
+    output: Output,
     name: Annotated[
         str | None, typer.Argument(metavar="NAME", help=f"Which: {', '.join(EXAMPLES)}; a list if not given.")
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Where to write it; if not given, NAME in this folder.")] = None,
 ) -> None:
     """Write an example block, recipe or experiment that comes with jaxphoto."""
-    console = plain_console()
     if name is None:
         for one, what in EXAMPLES.items():
-            console.print(f"{one:12} {what}", soft_wrap=True)
+            output.say(f"{one:12} {what}")
+        output.tell(examples=dict(EXAMPLES))
         return
     source = shipped(name)
     target = out if out is not None else Path(name if source.is_dir() or name in _SIMULATED else source.name)
     if name in _SIMULATED:
         check_block_target(target, source)
-        with plain_console(stderr=True).status("flying"):
+        with output.progress.status("flying"):
             write_simulation(simulate(read_recipe(source)), target)
     elif source.is_dir():
         check_folder(target)
@@ -54,4 +54,6 @@ def example_command(
         check_file(target)
         with whole_file(target) as work:
             shutil.copyfile(source, work)
-    console.print(f"wrote {target}; next: {_NEXT[name].replace('OUT', str(target))}", soft_wrap=True)
+    then = _NEXT[name].replace("OUT", str(target))
+    output.wrote(target, f"wrote {target}; next: {then}")
+    output.tell(next=then)

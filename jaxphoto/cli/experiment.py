@@ -6,9 +6,8 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from jaxphoto.cli.app import app
-from jaxphoto.cli.console import plain_console
 from jaxphoto.cli.made import made_by
+from jaxphoto.cli.output import Output, command
 from jaxphoto.experiment import (
     compare,
     find_experiments,
@@ -19,8 +18,9 @@ from jaxphoto.experiment import (
 from jaxphoto.writing import check_folder
 
 
-@app.command("experiment")
+@command("experiment")
 def experiment_command(
+    output: Output,
     context: typer.Context,
     name: Annotated[str, typer.Argument(help="Folder of the experiment (000, 003, 004), or all.")],
     out: Annotated[Path, typer.Option(help="Folder for the results; an earlier run in it is replaced.")] = Path(
@@ -35,17 +35,20 @@ def experiment_command(
     chosen = find_experiments(experiments, name)
     check_folder(out, *chosen)
     declared = {folder: load_experiment(folder) for folder in chosen}
-    console, errors = plain_console(), plain_console(stderr=True)
     runs, made = {}, {folder: made_by(context, folder) for folder in chosen}
     for folder, experiment in declared.items():
-        with errors.status(folder.name) as status:
+        with output.progress.status(folder.name) as status:
             runs[folder] = run_experiment(experiment, folder, layouts, status.update)
         # After each, so that an experiment that fails loses none before it.
         write_runs(runs, out, made)
-        console.print(_judgement(experiment.title, compare(runs[folder], folder)))
+        table = compare(runs[folder], folder)
+        output.screen.print(_judgement(experiment.title, table))
+        judged = table[table["within"] != ""]
+        within = {str(of): (cells == "yes").sum() for of, cells in judged.groupby("table", sort=False)["within"]}
+        output.tell(**{folder.name: {"within": within, "of": judged.groupby("table", sort=False).size().to_dict()}})
         for failure in runs[folder].failures:
-            console.print(f"left out: {failure}")
-    console.print(f"results in {out} (open report.html)")
+            output.warn(f"left out: {failure}")
+    output.wrote(out, f"results in {out} (open report.html)")
 
 
 def _judgement(title: str, table) -> Table:

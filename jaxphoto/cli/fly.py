@@ -10,11 +10,10 @@ import numpy as np
 import typer
 
 from jaxphoto.camera import DISTORTIONS, InteriorOrientation
-from jaxphoto.cli.app import app
 from jaxphoto.cli.choices import one_of
-from jaxphoto.cli.console import plain_console
 from jaxphoto.cli.exposure_options import heights_of, lever_arm_of, map_codes
 from jaxphoto.cli.made import typed
+from jaxphoto.cli.output import Output, command
 from jaxphoto.cli.progress import FEWER_PAIRS, StepsLeft
 from jaxphoto.cli.provenance import Provenance
 from jaxphoto.errors import InputError, counted
@@ -42,8 +41,9 @@ from jaxphoto.report.terminal import plain
 from jaxphoto.writing import check_folder, whole_folder
 
 
-@app.command("fly")
+@command("fly")
 def fly_command(
+    output: Output,
     context: typer.Context,
     photographs: Annotated[list[Path], typer.Argument(help="Folders of photographs, or photographs, of one camera.")],
     out: Annotated[Path, typer.Option(help="Folder for blocks and results; earlier results in it are replaced.")],
@@ -68,11 +68,16 @@ def fly_command(
     c_mm: Annotated[float | None, typer.Option(help="Where the principal distance starts; else from EXIF.")] = None,
     pixel_mm: Annotated[float | None, typer.Option(help="Size of a pixel; else from EXIF.")] = None,
     model: Annotated[str, one_of(DISTORTIONS, help="Distortion.")] = "brown",
-    lens_prior: Annotated[
-        bool, typer.Option(help="Observe the camera as what is known of such lenses (docs/lens_priors.md).")
-    ] = True,
+    no_lens_prior: Annotated[
+        bool,
+        typer.Option("--no-lens-prior", help="Do not observe what is known of such lenses (docs/lens_priors.md)."),
+    ] = False,
     rolling_shutter: Annotated[
-        bool, typer.Option(help="Estimate the readout time of the rows, with speeds from positions and times of EXIF.")
+        bool,
+        typer.Option(
+            "--rolling-shutter",
+            help="Estimate the readout time of the rows, by positions and times of EXIF.",
+        ),
     ] = False,
     exposures: Annotated[
         list[Path] | None,
@@ -114,15 +119,14 @@ def fly_command(
     if isinstance(above, int):
         check_heights(WGS84, above)
     Thread(target=prepare_pictures, daemon=True).start()
-    console, errors = plain_console(), plain_console(stderr=True)
-    with errors.status("reading the photographs") as status, ExitStack() as opened:
+    with output.progress.status("reading the photographs") as status, ExitStack() as opened:
         read, spoilt = sound_photographs(photographs)
         for sentence in (spoilt | folders_not_looked_into(photographs)).values():
-            errors.print(f"left out: {plain(sentence)}", soft_wrap=True)
+            output.progress.print(f"left out: {plain(sentence)}", soft_wrap=True)
         told = located(read, photographs, exposures or (), code=code, arm=arm, heights=above)
         read = told.photographs
         for sentence in told.sentences:
-            console.print(plain(sentence), soft_wrap=True)
+            output.say(sentence)
         given = None
         if surveyed:
             look = target_looker(target, {p.name: p.path for p in read}) if target else None
@@ -131,8 +135,8 @@ def fly_command(
         camera = sensor_and_interior(read, pixel_mm, c_mm)
         distortion = distortion_model(model, camera.sensor)
         compared, count = photograph_pairs(read, pairs or usual_choice(read)), features or usual_count(len(read))
-        console.print(camera.origin, soft_wrap=True)
-        console.print(f"{counted(len(read), 'photograph')}, {_in_words(compared)}", soft_wrap=True)
+        output.screen.print(camera.origin, soft_wrap=True)
+        output.say(f"{counted(len(read), 'photograph')}, {_in_words(compared)}")
         keep = opened.enter_context(KeptPieces(beside(out)).alone())
         matched = match_photographs(
             read,
@@ -143,7 +147,7 @@ def fly_command(
             longest_px=longest_px,
             in_parts=True,
             keep=keep,
-            progress=StepsLeft(errors, status, FEWER_PAIRS),
+            progress=StepsLeft(output.progress, status, FEWER_PAIRS),
         )
         names, start = [p.name for p in read], camera.interior
         taken = {p.name: (p.taken.clock_s, p.taken.resolution_s) for p in read if p.taken}
@@ -156,7 +160,7 @@ def fly_command(
                 {p.name: p.attitude for p in read},
                 code,
                 given,
-                known_lens(read, camera, distortion) if lens_prior else None,
+                None if no_lens_prior else known_lens(read, camera, distortion),
                 taken if rolling_shutter else None,
                 vertical,
             ),
@@ -174,7 +178,7 @@ def fly_command(
             "c_mm": c_mm,
             "pixel_mm": pixel_mm,
             "model": model,
-            "lens_prior": lens_prior,
+            "lens_prior": not no_lens_prior,
             "rolling_shutter": rolling_shutter,
             "lever_arm": lever_arm,
             "heights": heights,
@@ -209,20 +213,20 @@ def fly_command(
     for number, part in enumerate(flight.parts, 1):
         report = part.oriented.report
         sizes = f"{len(report.order)} photographs, {report.n_image_points} image points, {report.mean_px:.2f} px"
-        console.print(f"part {number}: {sizes}", soft_wrap=True)
+        output.say(f"part {number}: {sizes}")
         for sentence in part.placed.sentences if part.placed else (part.why_not,):
-            console.print(f"  {plain(sentence)}", soft_wrap=True)
+            output.say(f"  {plain(sentence)}")
         for sentence in part.controlled.sentences if part.controlled else ():
-            console.print(f"  {plain(sentence)}", soft_wrap=True)
+            output.say(f"  {plain(sentence)}")
     for name, why in flight.left_out.items():
-        console.print(plain(f"{name} is not used: {why}"), soft_wrap=True)
-    console.print(plain(verdict.headline), soft_wrap=True)
+        output.say(f"{name} is not used: {why}")
+    output.say(verdict.headline)
     for finding in verdict.findings:
         if finding.level > Level.INFORMATION:
-            console.print(plain(f"  {finding.text}"), soft_wrap=True)
+            output.say(f"  {finding.text}")
     if why_not:
-        console.print(plain(f"no certificate: {why_not}"), soft_wrap=True)
-    console.print(f"results in {plain(str(out))} (open report.html)", soft_wrap=True)
+        output.say(f"no certificate: {why_not}")
+    output.wrote(out, f"results in {out} (open report.html)")
     if verdict.level == Level.ALARM:
         raise typer.Exit(1)
 

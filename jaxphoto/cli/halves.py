@@ -5,12 +5,11 @@ from typing import Annotated
 
 import typer
 
-from jaxphoto.cli.app import app
 from jaxphoto.cli.choices import one_of
-from jaxphoto.cli.console import plain_console
 from jaxphoto.cli.grid_options import check_grid, points_of
 from jaxphoto.cli.judged_block import print_judgement
 from jaxphoto.cli.made import made_by
+from jaxphoto.cli.output import Output, command
 from jaxphoto.io import read_block
 from jaxphoto.io.cameras import write_camera_file
 from jaxphoto.procedures.halves import CUTS, camera_of, halves
@@ -19,8 +18,9 @@ from jaxphoto.stability import METHODS, Method
 from jaxphoto.writing import check_folder
 
 
-@app.command("halves")
+@command("halves")
 def halves_command(
+    output: Output,
     context: typer.Context,
     block: Annotated[Path, typer.Argument(help="Block folder (see docs/block_folder.md).")],
     out: Annotated[Path, typer.Option(help="Folder for the results; earlier results in it are replaced.")],
@@ -42,8 +42,7 @@ def halves_command(
     """
     check_grid(grid, extent)
     check_folder(out, block)
-    console, errors = plain_console(), plain_console(stderr=True)
-    with errors.status("reading the block") as status:
+    with output.progress.status("reading the block") as status:
         read, made = read_block(block), made_by(context, block)
         cells = points_of(read.sensors[camera_of(read, camera)], grid, extent)
         found = halves(read, cells, by=by, camera=camera, n_cuts=cuts, seed=seed, method=method, report=status.update)
@@ -61,6 +60,6 @@ def halves_command(
             ),
             made,
         )
-    print_judgement(found.adjusted, errors)
-    print_halves(found, console)
-    console.print(f"results in {out} (open report.html)")
+    print_judgement(found.adjusted, output)
+    print_halves(found, output.screen)
+    output.wrote(out, f"results in {out} (open report.html)")

@@ -1,14 +1,12 @@
 """What speaks against a block from which something further is computed: draws, halves, sensitivities."""
 
-from rich.console import Console
-
 from jaxphoto.adjustment import Adjustment
+from jaxphoto.cli.output import Output
 from jaxphoto.report import Level, Tables, Verdict
 from jaxphoto.report.residual_findings import contradictions
-from jaxphoto.report.terminal import print_warning
 
 
-def print_judgement(adjusted: Adjustment, console: Console) -> None:
+def print_judgement(adjusted: Adjustment, output: Output) -> None:
     """The worst that `jaxphoto adjust` would say of the observations of a block; nothing where they agree."""
     if not bool(adjusted.converged):
         against = [adjusted.outcome.value]
@@ -16,4 +14,4 @@ def print_judgement(adjusted: Adjustment, console: Console) -> None:
         verdict = Verdict.of(contradictions(Tables(adjusted)))
         against = [f.text for f in verdict.findings if f.level > Level.INFORMATION]
     if against:
-        print_warning(f"the block itself: {against[0]} (jaxphoto adjust says more)", console, soft_wrap=True)
+        output.warn(f"the block itself: {against[0]} (jaxphoto adjust says more)")

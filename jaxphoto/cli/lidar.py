@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable, Collection
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import typer
@@ -11,12 +11,11 @@ from jaxtyping import Float
 from rich.console import Console
 
 from jaxphoto.block import Block
-from jaxphoto.cli.app import app
 from jaxphoto.cli.choices import one_of
 from jaxphoto.cli.cloud_options import Classes, CloudEpsg, CloudUnit, ReturnsOption, class_numbers
-from jaxphoto.cli.console import plain_console
 from jaxphoto.cli.corrected_cloud import write_corrected
 from jaxphoto.cli.made import made_by
+from jaxphoto.cli.output import Output, command
 from jaxphoto.cli.strip_flight import (
     SCANNER,
     USUAL,
@@ -44,8 +43,9 @@ from jaxphoto.lidar.strip_settings import StripSettings
 from jaxphoto.orientation import approximate
 from jaxphoto.procedures.lidar import Round, lidar_control, roof_control, simultaneous
 from jaxphoto.procedures.lidar.images_and_cloud import SHIFT_SIGMA, SURFACES
+from jaxphoto.procedures.lidar.roof_control import RoofControl
 from jaxphoto.procedures.lidar.until_still import MAX_ROUNDS
-from jaxphoto.procedures.lidar.vertical_control import METHODS, flag_counts
+from jaxphoto.procedures.lidar.vertical_control import METHODS, LidarControl, flag_counts
 from jaxphoto.report.lidar import (
     heights_figure,
     heights_page,
@@ -75,8 +75,9 @@ Rounds = Annotated[int, typer.Option(min=1, help="Most rounds of looking at the 
 Method = Annotated[str, one_of(METHODS, help="How heights follow from laser points.")]
 
 
-@app.command("lidar-control")
+@command("lidar-control")
 def lidar_control_command(
+    output: Output,
     context: typer.Context,
     block: BlockFolder,
     cloud: CloudFile,
@@ -93,13 +94,13 @@ def lidar_control_command(
 ) -> None:
     """Give tie points the height of the laser points there as control, and write the block with it."""
     settings = _settings(sigma_z_m, sigma_xy_m, sigma_systematic_m)
-    chosen, errors = class_numbers(classes), plain_console(stderr=True)
+    chosen = class_numbers(classes)
     check_block_target(out, block, cloud)
-    with errors.status("reading the block") as status:
+    with output.progress.status("reading the block") as status:
         read = read_block(block)
         status.update("reading the cloud")
         points = _over_block(read, cloud, chosen, returns, cloud_epsg, cloud_unit)
-        report = _reporter(errors, status.update)
+        report = _reporter(output.progress, status.update)
         found = lidar_control(read, points, method, settings, max_rounds=max_rounds, report=report)  # type: ignore[arg-type]
         status.update(f"writing {out}")
         heights, rounds = heights_table(found), rounds_table(found.rounds)
@@ -110,22 +111,20 @@ def lidar_control_command(
             rounds.to_csv(folder / "lidar_rounds.csv", index=False)
             (folder / "lidar_heights.png").write_bytes(picture.png)
             (folder / "report.html").write_text(page, encoding="utf-8")
-    console = plain_console()
-    print_rounds(found.rounds, found.still, console)
+    print_rounds(found.rounds, found.still, output.screen)
     refused = ", ".join(
         f"{name.lower()} {n}" for name, n in flag_counts(found.flag[~np.isfinite(found.height)]).items()
     )
-    console.print(
-        f"wrote {out}: {int(found.used.sum())} of {len(found.points)} tie points have a control height"
-        + (f" (refused: {refused})" if refused else ""),
-        soft_wrap=True,
-    )
+    said = f"wrote {out}: {int(found.used.sum())} of {len(found.points)} tie points have a control height"
+    output.wrote(out, said + (f" (refused: {refused})" if refused else ""))
+    output.tell(n_control_heights=found.used.sum(), n_tie_points=len(found.points), **_of_rounds(found))
     if not found.still:
         raise typer.Exit(1)
 
 
-@app.command("roof-control")
+@command("roof-control")
 def roof_control_command(
+    output: Output,
     block: BlockFolder,
     cloud: CloudFile,
     out: Annotated[Path, typer.Option(help="Block folder to write; a block in it is replaced.")],
@@ -139,29 +138,27 @@ def roof_control_command(
     max_rounds: Rounds = MAX_ROUNDS,
 ) -> None:
     """Hold tie points on the planes of roof faces, and centroids of roofs in X, Y and Z; write the block with it."""
-    settings, chosen, errors = _settings(sigma_z_m, sigma_xy_m, 0.0), class_numbers(classes), plain_console(stderr=True)
+    settings, chosen = _settings(sigma_z_m, sigma_xy_m, 0.0), class_numbers(classes)
     check_block_target(out, block, cloud)
-    with errors.status("reading the block") as status:
+    with output.progress.status("reading the block") as status:
         read = read_block(block)
         status.update("reading the cloud")
         points = _over_block(read, cloud, chosen, returns, cloud_epsg, cloud_unit)
         named = [name.strip() for name in centroids.split(",")] if centroids else []
-        report = _reporter(errors, status.update)
+        report = _reporter(output.progress, status.update)
         found = roof_control(read, points, settings, centroids=named, max_rounds=max_rounds, report=report)
         status.update(f"writing {out}")
         write_block(found.block, out)
-    console = plain_console()
-    print_rounds(found.rounds, found.still, console)
-    console.print(
-        f"wrote {out}: {len(found.points)} tie points lie on {found.faces} roof faces",
-        soft_wrap=True,
-    )
+    print_rounds(found.rounds, found.still, output.screen)
+    output.wrote(out, f"wrote {out}: {len(found.points)} tie points lie on {found.faces} roof faces")
+    output.tell(n_tie_points=len(found.points), n_roof_faces=found.faces, **_of_rounds(found))
     if not found.still:
         raise typer.Exit(1)
 
 
-@app.command("simultaneous")
+@command("simultaneous")
 def simultaneous_command(
+    output: Output,
     context: typer.Context,
     block: BlockFolder,
     cloud: CloudFile,
@@ -219,16 +216,16 @@ def simultaneous_command(
             cloud_epsg,
             cloud_unit,
         )
-        adjust_flight(context, files, _of_flight(adjust, pattern, settings, max_rounds), out)
+        adjust_flight(output, context, files, _of_flight(adjust, pattern, settings, max_rounds), out)
         return
     surfaces = _settings(sigma_z_m, sigma_xy_m, sigma_systematic_m)
     if trajectory is None and boresight not in (None, "fixed"):
         raise InputError(f"--boresight {boresight} needs --trajectory, which says from where each point was measured")
     turn = _prior("--boresight", boresight or ("fixed" if trajectory is None else "free"), np.pi / 180)
-    slide, chosen, errors = _prior("--shift", shift, 1.0), class_numbers(classes), plain_console(stderr=True)
+    slide, chosen = _prior("--shift", shift, 1.0), class_numbers(classes)
     check_folder(out, block, cloud, *([] if trajectory is None else [trajectory]))
     began = time.perf_counter()
-    with errors.status("reading the block") as status:
+    with output.progress.status("reading the block") as status:
         read = read_block(block)
         records = path = None
         if trajectory is not None:
@@ -253,7 +250,7 @@ def simultaneous_command(
             method=method,  # type: ignore[arg-type]
             settings=surfaces,
             max_rounds=max_rounds,
-            report=_reporter(errors, status.update),
+            report=_reporter(output.progress, status.update),
         )
         status.update(f"writing {out}")
         made = made_by(context, block, cloud, trajectory)
@@ -268,10 +265,9 @@ def simultaneous_command(
                 moved = with_positions(records, np.asarray(result.trajectory.position), read.frame)
                 moved = moved._replace(time=moved.time + trajectory_shift_s)
                 write_moved(moved, trajectory, folder)
-    console = plain_console()
-    print_rounds(result.rounds, result.still, console)
-    print_moved(result, console)
-    console.print(f"results in {out}")
+    print_rounds(result.rounds, result.still, output.screen)
+    print_moved(result, output.screen)
+    output.wrote(out, f"results in {out}")
     if not result.still:
         raise typer.Exit(1)
 
@@ -332,15 +328,21 @@ def _ground(block: Block) -> Float[np.ndarray, "2 2"]:
     return np.stack([low - margin, high + margin])
 
 
-def _reporter(errors: Console, show: Callable[[str], None]) -> Callable[[Round], None]:
+def _of_rounds(found: LidarControl | RoofControl) -> dict[str, Any]:
+    """How the rounds ended."""
+    return {"rounds": len(found.rounds), "came_to_rest": found.still, "rmse_m": found.rounds[-1].rmse_m}
+
+
+def _reporter(console: Console, show: Callable[[str], None]) -> Callable[[Round], None]:
     """Each round on a line of its own, where a person looks."""
+    show("adjusting for the first round")
 
     def report(made: Round) -> None:
         line = f"round {made.number}: {made.observed} observations, RMSE {made.rmse_m:.3f} m"
         if np.isfinite(made.largest_change):
             line += f", largest change {made.largest_change:.2g} standard deviations"
-        if errors.is_terminal:
-            errors.print(line)
+        if console.is_terminal:
+            console.print(line)
         show(f"{line}; looking at the cloud")
 
     return report

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import typer
 
+from jaxphoto.cli.output import OF_OUTPUT
 from jaxphoto.io.block_folder.table_layout import TOML
 from jaxphoto.io.input_hashes import block_inputs
 from jaxphoto.report.made import Made
@@ -28,7 +29,7 @@ def typed(context: typer.Context) -> str:
         value = context.params.get(str(parameter.name))
         # An empty word that is the default says nothing.
         empty = value == "" and not parameter.default
-        if parameter.name == "out" or value is None or value is False or empty:
+        if parameter.name in ("out", *OF_OUTPUT) or value is None or value is False or empty:
             continue
         values = [] if value is True else list(value) if isinstance(value, list | tuple) else [value]
         if parameter.param_type_name == "argument":

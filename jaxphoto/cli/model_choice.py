@@ -6,9 +6,8 @@ from typing import Annotated
 
 import typer
 
-from jaxphoto.cli.app import app
-from jaxphoto.cli.console import plain_console
 from jaxphoto.cli.made import made_by
+from jaxphoto.cli.output import Output, command
 from jaxphoto.io import read_block
 from jaxphoto.procedures.model_choice import FOLDS, model_choice
 from jaxphoto.report.model_choice import print_model_choice, write_model_choice
@@ -17,31 +16,34 @@ from jaxphoto.writing import check_folder
 _MODELS = "brown:none,brown:k1,brown:k1+k2,brown:k1+k2+k3,brown,brown:all"
 
 
-@app.command("models")
+@command("models")
 def models_command(
+    output: Output,
     context: typer.Context,
     block: Annotated[Path, typer.Argument(help="Block folder (see docs/block_folder.md).")],
     out: Annotated[Path, typer.Option(help="Folder for the results; earlier results in it are replaced.")],
     models: Annotated[
-        str, typer.Option(help="Comma-separated: brown (usual coefficients), brown:all, brown:none, brown:k1+k2, smac.")
+        str,
+        typer.Option(
+            help="Comma-separated: brown (usual coefficients), brown:all, brown:none, brown:k1+k2, smac.",
+            show_default="six of brown, from none to all",
+        ),
     ] = _MODELS,
     folds: Annotated[int, typer.Option(min=0, help="Parts of the cross-validation; 0 for none.")] = FOLDS,
     seed: Annotated[int, typer.Option(min=0, help="Of the draw of what is left out.")] = 0,
 ) -> None:
     """Compare distortion models by cross-validation, information criteria and significance."""
     check_folder(out, block)
-    console, errors = plain_console(), plain_console(stderr=True)
     began = time.perf_counter()
-    with errors.status("reading the block") as status:
+    with output.progress.status("reading the block") as status:
         read, made = read_block(block), made_by(context, block)
         seconds = {"read": time.perf_counter() - began}
         named = [name for name in models.split(",") if name.strip()]
-        status.update(f"adjusting {len(named)} models of {len(read.images)} images, {len(read.points)} points")
-        choice = model_choice(read, named, k=folds, seed=seed)
+        choice = model_choice(read, named, k=folds, seed=seed, report=status.update)
         seconds["adjust"] = time.perf_counter() - began - seconds["read"]
         status.update(f"writing {out}")
         write_model_choice(choice, read.title, out, seconds, made)
-    print_model_choice(choice, console)
-    console.print(f"results in {out} (open report.html)")
+    print_model_choice(choice, output.screen)
+    output.wrote(out, f"results in {out} (open report.html)")
     if not choice.by_bic:
         raise typer.Exit(1)

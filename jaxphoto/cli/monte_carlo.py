@@ -5,15 +5,14 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Column, Table
 
 from jaxphoto.block import Block
-from jaxphoto.cli.app import app
 from jaxphoto.cli.choices import one_of
-from jaxphoto.cli.console import plain_console
 from jaxphoto.cli.judged_block import print_judgement
 from jaxphoto.cli.made import made_by
+from jaxphoto.cli.output import Output, command
+from jaxphoto.cli.progress import StepsLeft
 from jaxphoto.errors import InputError
 from jaxphoto.experiment import MonteCarlo
 from jaxphoto.io import read_block
@@ -27,11 +26,13 @@ _UNITS = {
     "station": "m", "trajectory": "m", "control": "m", "lever-arm": "m", "attitude": "deg",
     "trajectory-attitude": "deg", "boresight": "deg", "image-points": "mm", "interior": "own",
 }  # fmt: skip
+_LARGEST_SEED = 2**63 - 1
 _KEPT = ("exterior", "points")
 
 
-@app.command("monte-carlo")
+@command("monte-carlo")
 def monte_carlo_command(
+    output: Output,
     context: typer.Context,
     block: Annotated[Path, typer.Argument(help="Block folder (see docs/block_folder.md).")],
     out: Annotated[Path, typer.Option(help="Folder for the draws; a run in it with the same settings goes on.")],
@@ -46,13 +47,15 @@ def monte_carlo_command(
     parameter: Annotated[str, typer.Option(help="The interior parameter (c_mm, k1 ...) for --bias interior.")] = "",
     on: Annotated[list[str] | None, typer.Option(help="Only these strips, images, points ... (repeatable).")] = None,
     draws: Annotated[int, typer.Option(help="Number of draws.")] = 1000,
-    seed: Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Another seed draws other errors.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Another seed draws other errors.")] = 0,
     keep: Annotated[
         list[str] | None, typer.Option("--with", help="Keep these, too: exterior, points (with check points).")
     ] = None,
 ) -> None:
     """Re-adjust a block with drawn errors: draws.parquet, summary.csv, summary.json and pictures."""
     check_draws(draws)
+    if seed > _LARGEST_SEED:
+        raise InputError(f"--seed {seed}: give a number of at most {_LARGEST_SEED}")
     kept = tuple(keep or ())
     if unknown := [name for name in kept if name not in _KEPT]:
         raise InputError(f"--with {unknown[0]}: there are {', '.join(_KEPT)}")
@@ -60,8 +63,7 @@ def monte_carlo_command(
         raise InputError("--bias noise is of every observation: it takes no --per, --on or --parameter")
     check_place(out)
     sigmas = _sigma_of(kind, {"m": sigma_m, "deg": sigma_deg, "mm": sigma_mm, "own": sigma})
-    errors = plain_console(stderr=True)
-    with errors.status("reading the block") as status:
+    with output.progress.status("reading the block") as status:
         read, made = read_block(block), made_by(context, block)
         drawn = _bias_of(read, kind, sigmas, per, on or [], parameter)
         status.update("adjusting the nominal block")
@@ -74,17 +76,15 @@ def monte_carlo_command(
             exterior="exterior" in kept,
             points="points" in kept,
         )
-    print_judgement(adjusted, errors)
+    print_judgement(adjusted, output)
     study = MonteCarlo(read, run, drawn, draws, seed, out)
-    columns = (TextColumn("draws"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=errors, transient=True) as progress:
-        task = progress.add_task("", total=draws)
-        study.draw(lambda done: progress.update(task, completed=done))
-    with errors.status(f"writing {out}"):
+    with output.progress.status("compiling what draws") as status:
+        left = StepsLeft(output.progress, status)
+        study.draw(lambda done: left("draws", done, draws))
+        status.update(f"writing {out}")
         summary, table = study.write()
         write_draws_page(summary, table, out, made)
-    console = plain_console()
-    console.print(
+    output.screen.print(
         f"{summary['draws']} draws, {summary['converged']} converged, {summary['fallbacks']} by a full adjustment; "
         f"{summary['draws_per_second']:.0f} draws a second",
     )
@@ -94,8 +94,8 @@ def monte_carlo_command(
     for name, *numbers in table[["quantity", *shown_numbers]].itertuples(index=False):
         if not str(name).startswith(("bias.", *LONG)):
             shown.add_row(str(name), *(f"{float(v):.5g}" for v in numbers))
-    console.print(shown)
-    console.print(f"results in {out} (open report.html)")
+    output.screen.print(shown)
+    output.wrote(out, f"results in {out} (open report.html)")
 
 
 def _sigma_of(kind: str, given: dict[str, str | None]) -> list[float]:

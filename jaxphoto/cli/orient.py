@@ -9,9 +9,8 @@ import numpy as np
 import typer
 
 from jaxphoto.camera import DISTORTIONS, InteriorOrientation
-from jaxphoto.cli.app import app
 from jaxphoto.cli.choices import one_of
-from jaxphoto.cli.console import plain_console
+from jaxphoto.cli.output import Output, command
 from jaxphoto.cli.progress import FEWER_PAIRS, StepsLeft
 from jaxphoto.errors import InputError
 from jaxphoto.image_measurement.features import LONGEST_PX
@@ -20,6 +19,7 @@ from jaxphoto.image_measurement.photograph_pairs import photograph_pairs, usual_
 from jaxphoto.io import read_block, write_block
 from jaxphoto.io.block_folder import check_block_target, whole_block
 from jaxphoto.io.block_folder.table_layout import TOML
+from jaxphoto.io.json_file import read_json
 from jaxphoto.io.kept_orientation import kept_orient
 from jaxphoto.io.kept_pieces import KeptPieces, beside, check_pieces
 from jaxphoto.io.photographs import photographs, sensor_and_interior
@@ -29,8 +29,9 @@ from jaxphoto.procedures.orientation import Oriented, orient_block
 from jaxphoto.report.orientation import print_orientation, write_orientation
 
 
-@app.command("orient")
+@command("orient")
 def orient_command(
+    output: Output,
     images: Annotated[list[Path], typer.Argument(help="Photographs of one camera; or one block folder.")],
     out: Annotated[Path, typer.Option(help="Block folder to write; a block in it is replaced.")],
     pairs: Annotated[
@@ -60,7 +61,6 @@ def orient_command(
     converged or not settled.
     """
     check_block_target(out, *images)
-    console, errors = plain_console(), plain_console(stderr=True)
     if len(images) == 1 and (images[0] / TOML).is_file():
         _refuse_options(
             images[0],
@@ -72,17 +72,18 @@ def orient_command(
             model=model,
             r0_mm=r0_mm,
         )
-        with errors.status("reading the block") as status:
+        with output.progress.status("reading the block") as status:
             n_known, n = _orient_folder(images[0], out, lambda said: status.update(said))
-        console.print(f"{n_known} of {n} images oriented; wrote {out}", soft_wrap=True)
+        output.wrote(out, f"{n_known} of {n} images oriented; wrote {out}")
+        output.tell(n_images=n, n_oriented=n_known)
         return
     check_pieces(beside(out))
-    with errors.status("reading the photographs") as status, ExitStack() as opened:
+    with output.progress.status("reading the photographs") as status, ExitStack() as opened:
         read = photographs(images)
         camera = sensor_and_interior(read, pixel_mm, c_mm)
         distortion = distortion_model(model or "brown", camera.sensor, r0_mm or 0.0)
         compared = photograph_pairs(read, pairs or usual_choice(read))
-        console.print(camera.origin, soft_wrap=True)
+        output.say(camera.origin)
         start = camera.interior
         keep = opened.enter_context(KeptPieces(beside(out)).alone())
         matched = match_photographs(
@@ -93,7 +94,7 @@ def orient_command(
             count=features,
             longest_px=longest_px or LONGEST_PX,
             keep=keep,
-            progress=StepsLeft(errors, status, FEWER_PAIRS),
+            progress=StepsLeft(output.progress, status, FEWER_PAIRS),
         )
         found = kept_orient(keep)(
             [p.name for p in read],
@@ -110,14 +111,13 @@ def orient_command(
         with whole_block(found.block, out) as folder:
             write_orientation(found, folder, n_gross=matched.n_gross, sigma_factor=matched.sigma_factor)
         keep.remove()
-    console.print(
+    output.say(
         f"{matched.n_gross} matches by looks left out before: off the epipolar line, or of pairs with too few; the "
-        f"others scatter {matched.sigma_factor:.2g} times as much as in views of a plane",
-        soft_wrap=True,
+        f"others scatter {matched.sigma_factor:.2g} times as much as in views of a plane"
     )
-    print_orientation(found.report, console)
-    said = f"wrote {out}: adjust it with jaxphoto adjust {out} --out DIR"
-    console.print(said, soft_wrap=True)
+    print_orientation(found.report, output.screen)
+    output.wrote(out, f"wrote {out}: adjust it with jaxphoto adjust {out} --out DIR")
+    output.tell(**read_json(out / "orientation.json"))
     if not found.report.converged:
         raise typer.Exit(1)
 

@@ -8,11 +8,10 @@ import numpy as np
 import typer
 
 import jaxphoto
-from jaxphoto.cli.app import app
 from jaxphoto.cli.choices import one_of
-from jaxphoto.cli.console import plain_console
 from jaxphoto.cli.judged_block import print_judgement
 from jaxphoto.cli.made import made_by
+from jaxphoto.cli.output import Output, command
 from jaxphoto.errors import InputError
 from jaxphoto.io import read_block
 from jaxphoto.procedures import adjust_for_tables
@@ -23,8 +22,9 @@ from jaxphoto.writing import check_folder
 _SHOWN = 12
 
 
-@app.command("sensitivity")
+@command("sensitivity")
 def sensitivity_command(
+    output: Output,
     context: typer.Context,
     block: Annotated[Path, typer.Argument(help="Block folder (see docs/block_folder.md).")],
     out: Annotated[Path, typer.Option(help="Folder for the results; earlier results in it are replaced.")],
@@ -37,24 +37,25 @@ def sensitivity_command(
     if bias_m == 0 or not np.isfinite(bias_m):
         raise InputError(f"--bias-m {bias_m:g} is no bias: give its size in metres")
     check_folder(out, block)
-    console, errors = plain_console(), plain_console(stderr=True)
     began = time.perf_counter()
-    with errors.status("reading the block") as status:
+    with output.progress.status("reading the block") as status:
         read, made = read_block(block), made_by(context, block)
         seconds = {"read": time.perf_counter() - began}
-        status.update(f"adjusting {len(read.images)} images, {len(read.points)} points")
-        adjusted = adjust_for_tables(read, max_steps)
+        status.update("looking for approximate values")
+        adjusted = adjust_for_tables(read, max_steps, status.update)
         status.update("differentiating")
         tables = SensitivityTables(adjusted, per, bias_m, delta0)
         largest = tables.largest
         status.update(f"writing {out}")
         order = ("compile", "solve", "covariance", "sensitivity")
         write_sensitivity(tables, out, seconds | {name: adjusted.seconds[name] for name in order}, made)
-    print_judgement(adjusted, errors)
-    console.print(f"largest changes by a station bias of {bias_m:g} m per {per}: exact, of its sigma, first-order")
+    print_judgement(adjusted, output)
+    output.screen.print(
+        f"largest changes by a station bias of {bias_m:g} m per {per}: exact, of its sigma, first-order"
+    )
     for row in largest.head(_SHOWN).itertuples(index=False):
-        console.print(
+        output.screen.print(
             f"  {row.estimate}: {row.exact:.3g}, {row.over_sigma:.2f}, {row.first_order:.3g} "
             f"(stations of {row.unit} in {row.axis})"
         )
-    console.print(f"results in {out} (open report.html)")
+    output.wrote(out, f"results in {out} (open report.html)")

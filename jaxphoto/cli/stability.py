@@ -6,21 +6,20 @@ from typing import Annotated
 
 import typer
 
-from jaxphoto.cli.app import app
 from jaxphoto.cli.choices import one_of
-from jaxphoto.cli.console import plain_console
 from jaxphoto.cli.grid_options import check_grid, points_of
 from jaxphoto.cli.made import made_by
+from jaxphoto.cli.output import Output, command
 from jaxphoto.cli.two_cameras import compared, read_two
 from jaxphoto.errors import InputError
-from jaxphoto.report import print_warning
-from jaxphoto.report.stability import print_stability, write_stability
+from jaxphoto.report.stability import print_stability, stability_summary, write_stability
 from jaxphoto.stability import METHODS, Method, analyse
 from jaxphoto.writing import check_folder
 
 
-@app.command("stability")
+@command("stability")
 def stability_command(
+    output: Output,
     context: typer.Context,
     first: Annotated[Path, typer.Argument(metavar="A", help="Results, interior.csv or camera file of one set.")],
     second: Annotated[Path, typer.Argument(metavar="B", help="The same of the other set.")],
@@ -50,13 +49,16 @@ def stability_command(
     if out is not None:
         check_folder(out, first, second)
     both = a, b = read_two((first, second), (camera, camera_b), pixel_mm, block)
-    found = analyse(a.interior, b.interior, points_of(a.sensor, grid, extent), (a.covariance, b.covariance), relief)
-    console, noise_mm = plain_console(), noise_px * a.sensor.pixel_mm
+    with output.progress.status("comparing"):
+        points = points_of(a.sensor, grid, extent)
+        found = analyse(a.interior, b.interior, points, (a.covariance, b.covariance), relief)
+    noise_mm = noise_px * a.sensor.pixel_mm
     one, other = compared("A", first, a), compared("B", second, b)
     for letter, file in zip("AB", both, strict=True):
         if file.note:
-            print_warning(f"{letter}: {file.note}", console, soft_wrap=True)
-    print_stability(found, (one, other), a.sensor.pixel_mm, noise_mm, method, console)
+            output.warn(f"{letter}: {file.note}")
+    print_stability(found, (one, other), a.sensor.pixel_mm, noise_mm, method, output.screen)
+    output.tell(**stability_summary(found, (one, other), noise_mm, method))
     if out is not None:
         write_stability(found, (one, other), a.sensor, noise_mm, method, out, made_by(context, first, second))
-        console.print(f"results in {out} (open report.html)")
+        output.wrote(out, f"results in {out} (open report.html)")

@@ -15,10 +15,10 @@ from jaxtyping import Float
 from jaxphoto.block import Block, Frame
 from jaxphoto.cli.choices import one_of
 from jaxphoto.cli.cloud_progress import CloudProgress
-from jaxphoto.cli.console import plain_console
 from jaxphoto.cli.control_in_frame import control_in_frame
 from jaxphoto.cli.corrected_cloud import write_corrected
 from jaxphoto.cli.made import made_by
+from jaxphoto.cli.output import Output
 from jaxphoto.cli.progress import StepsLeft
 from jaxphoto.cloud import Cloud
 from jaxphoto.errors import InputError
@@ -112,12 +112,12 @@ def scanner_priors(free: Collection[str], pattern: str | None) -> ScannerPriors:
     return ScannerPriors(boresight, ScannerCalibration(*calibration, PATTERN_OF[pattern or "line"]))  # type: ignore[arg-type, call-arg]
 
 
-def adjust_flight(context: typer.Context, flight: StripFiles, choices: StripChoices, out: Path) -> None:
+def adjust_flight(output: Output, context: typer.Context, flight: StripFiles, choices: StripChoices, out: Path) -> None:
     """Adjust the strips of a flight and its photographs; write the results, say them, and exit with 1 if red."""
     cloud, trajectory, block = flight.cloud, flight.trajectory, flight.block
-    settings, priors, errors = choices.settings, choices.priors, plain_console(stderr=True)
+    settings, priors = choices.settings, choices.priors
     check_folder(out, cloud, *(path for path in (trajectory, block, flight.control) if path is not None))
-    with errors.status("reading the cloud") as status:
+    with output.progress.status("reading the cloud") as status:
         said: dict[str, Any] = {"epsg": flight.epsg, "unit": flight.unit}
         photographs, frame = None, Frame()
         if block is not None:
@@ -140,7 +140,9 @@ def adjust_flight(context: typer.Context, flight: StripFiles, choices: StripChoi
         parts = partial(clouds.cloud_chunks, cloud, own, classes=flight.classes, returns=flight.returns, **said)  # type: ignore[arg-type]
         # Of a file that is filtered nobody knows how much will come.
         every = flight.classes is None and flight.returns == "all"
-        progress = CloudProgress(StepsLeft(errors, status), status, clouds.most_points(cloud) if every else None)
+        progress = CloudProgress(
+            StepsLeft(output.progress, status), status, clouds.most_points(cloud) if every else None
+        )
         coverage = None if path is None else CoveredTimes(path)
         looked_at = kept_returns(
             _seen_by(coverage, progress.passes(parts)),
@@ -164,6 +166,7 @@ def adjust_flight(context: typer.Context, flight: StripFiles, choices: StripChoi
             "max_rounds": choices.max_rounds,
             "report": report,
         }
+        status.update("adjusting for the first round")
         result = adjust_strips(looked_at, path, settings, priors, photographs=photographs, **options)
         status.update(f"writing {out}")
         gaps = Gaps(placement, settings)
@@ -192,10 +195,9 @@ def adjust_flight(context: typer.Context, flight: StripFiles, choices: StripChoi
             return maps
 
         write_strips(result, tables, verdict, out, write_beside, made)
-    console = plain_console()
-    print_verdict(verdict, console)
-    print_strips(result, console)
-    console.print(f"results in {out} (open report.html)")
+    print_verdict(verdict, output.screen)
+    print_strips(result, output.screen)
+    output.wrote(out, f"results in {out} (open report.html)")
     if verdict.level == Level.ALARM:
         raise typer.Exit(1)
 

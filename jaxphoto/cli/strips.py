@@ -6,8 +6,8 @@ from typing import Annotated, Any
 
 import typer
 
-from jaxphoto.cli.app import app
 from jaxphoto.cli.cloud_options import Classes, CloudEpsg, CloudUnit, ReturnsOption, class_numbers
+from jaxphoto.cli.output import Output, command
 from jaxphoto.cli.strip_flight import (
     SCANNER,
     USUAL,
@@ -26,8 +26,9 @@ from jaxphoto.procedures.lidar import ScannerPriors
 from jaxphoto.procedures.lidar.strip_adjustment import MAX_STRIP_ROUNDS
 
 
-@app.command("strips")
+@command("strips")
 def strips_command(
+    output: Output,
     context: typer.Context,
     cloud: Annotated[Path, typer.Argument(help="Cloud of several strips: .las, .laz, .csv or .ply (docs/clouds.md).")],
     out: Annotated[Path, typer.Option(help="Folder for the results; earlier results in it are replaced.")],
@@ -117,7 +118,7 @@ def strips_command(
     )
     settings = dataclasses.replace(settings, **given)
     choices = StripChoices(settings, set(given), _priors(adjust, pattern), held, False, max_rounds)
-    adjust_flight(context, files, choices, out)
+    adjust_flight(output, context, files, choices, out)
 
 
 def _priors(adjust: str | None, pattern: str | None) -> ScannerPriors | None:

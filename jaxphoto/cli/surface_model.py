@@ -1,5 +1,6 @@
 """`jaxphoto dsm` and `jaxphoto orthophoto`: a surface model from a cloud, and a photograph laid over it."""
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated, get_args
 
@@ -9,10 +10,11 @@ import typer
 
 import jaxphoto
 from jaxphoto.block import Block
-from jaxphoto.cli.app import app
 from jaxphoto.cli.choices import one_of
 from jaxphoto.cli.cloud_options import Classes, CloudEpsg, CloudUnit, ReturnsOption, class_numbers
-from jaxphoto.cli.console import plain_console
+from jaxphoto.cli.cloud_progress import CloudProgress
+from jaxphoto.cli.output import Output, command
+from jaxphoto.cli.progress import StepsLeft
 from jaxphoto.errors import BlockError, InputError
 from jaxphoto.io import clouds, raster, read_block
 from jaxphoto.lidar.orthophoto import orthophoto
@@ -21,8 +23,9 @@ from jaxphoto.procedures import adjust
 from jaxphoto.writing import check_file
 
 
-@app.command("dsm")
+@command("dsm")
 def dsm_command(
+    output: Output,
     cloud: Annotated[Path, typer.Argument(help="Cloud: .las, .laz, .csv or .ply (see docs/clouds.md).")],
     out: Annotated[Path, typer.Option(help="GeoTIFF to write.")],
     cell_m: Annotated[float, typer.Option(help="Size of a cell in m.")] = 1.0,
@@ -40,13 +43,17 @@ def dsm_command(
         check_file(shading, cloud, out)
     chosen = class_numbers(classes)
     said = {"epsg": cloud_epsg, "unit": cloud_unit}
-    with plain_console(stderr=True).status("reading the cloud"):
+    with output.progress.status("reading the cloud") as status:
         system = clouds.cloud_system(cloud, **said)  # type: ignore[arg-type]
         ends = clouds.extent(cloud, **said)[:, :2]  # type: ignore[arg-type]
         # One cell more all around: headers are rounded. What stays empty is left out again.
         ends += np.array([[-cell_m], [cell_m]])
-        parts = clouds.cloud_chunks(cloud, classes=chosen, returns=returns, **said)  # type: ignore[arg-type]
-        surface = surface_model((part.xyz for part in parts), ends, cell_m, statistic)  # type: ignore[arg-type]
+        parts = partial(clouds.cloud_chunks, cloud, classes=chosen, returns=returns, **said)  # type: ignore[arg-type]
+        # Of a file that is filtered nobody knows how much will come.
+        most = clouds.most_points(cloud) if chosen is None and returns == "all" else None
+        seen = CloudProgress(StepsLeft(output.progress, status), status, most).passes(parts)
+        surface = surface_model((part.xyz for part in seen()), ends, cell_m, statistic)  # type: ignore[arg-type]
+        status.update(f"writing {out}")
         surface = filled(surface, fill_m)
         raster.write_dsm(out, surface, system)
         if shading is not None:
@@ -54,15 +61,20 @@ def dsm_command(
     rows, columns = surface.heights.shape
     there = 100 * (1 - np.isnan(surface.heights).mean())
     low, high = np.nanmin(surface.heights), np.nanmax(surface.heights)
-    plain_console().print(
+    output.wrote(
+        out,
         f"wrote {out}: {columns} x {rows} cells of {cell_m:g} m, {there:.0f} % with heights, {low:.2f} to "
         f"{high:.2f} m, in {system.name}",
-        soft_wrap=True,
     )
+    if shading is not None:
+        output.wrote(shading, f"wrote {shading}")
+    output.tell(columns=columns, rows=rows, cell_m=cell_m, part_with_heights=there / 100, low_m=low, high_m=high)
+    output.tell(system=system.name)
 
 
-@app.command("orthophoto")
+@command("orthophoto")
 def orthophoto_command(
+    output: Output,
     block: Annotated[Path, typer.Argument(help="Block folder (see docs/block_folder.md).")],
     photo: Annotated[Path, typer.Argument(help="The photograph of the image.")],
     dsm: Annotated[Path, typer.Argument(help="Surface model to lay it over.")],
@@ -73,7 +85,7 @@ def orthophoto_command(
 ) -> None:
     """Adjust a block, and lay the photograph of one of its images over a surface model."""
     check_file(out, block, photo, dsm)
-    with plain_console(stderr=True).status("reading") as status:
+    with output.progress.status("reading") as status:
         read = read_block(block)
         at = _image(read, image)
         sensor = read.sensors[read.image_camera[at]]
@@ -105,9 +117,9 @@ def orthophoto_command(
                 f"{np.nanmax(surface.heights):.1f} m); name the surface model of this area"
             )
         raster.write_orthophoto(out, picture, surface, system)
-    plain_console().print(
-        f"wrote {out}: image {image} on {100 * picture.seen.mean():.0f} % of the cells of {dsm.name}", soft_wrap=True
-    )
+    seen = picture.seen.mean()
+    output.wrote(out, f"wrote {out}: image {image} on {100 * seen:.0f} % of the cells of {dsm.name}")
+    output.tell(image=image, part_seen=seen)
 
 
 def _image(block: Block, name: str) -> int:

@@ -5,18 +5,17 @@ from typing import Annotated
 
 import typer
 
-from jaxphoto.cli.app import app
 from jaxphoto.cli.choices import one_of
-from jaxphoto.cli.console import plain_console
+from jaxphoto.cli.output import Output, command
 from jaxphoto.io import read_result_tables
 from jaxphoto.io.results_judged import read_summary, reservation
 from jaxphoto.report import TABLE_FORMATS, write_table
-from jaxphoto.report.terminal import print_warning
 from jaxphoto.writing import check_folder, whole_folder
 
 
-@app.command("tables")
+@command("tables")
 def tables_command(
+    output: Output,
     results: Annotated[Path, typer.Argument(help="Folder of results, such as adjust writes.")],
     to: Annotated[str, one_of(TABLE_FORMATS, help="Format.")],
     out: Annotated[Path, typer.Option(help="Folder for the tables; earlier ones in it are replaced.")],
@@ -27,9 +26,11 @@ def tables_command(
     """Write tables of results as CSV, Parquet, Markdown or LaTeX, with as many digits as their sigmas allow."""
     check_folder(out, results)
     tables = read_result_tables(results, [name.strip() for name in only.split(",") if name.strip()])
-    with whole_folder(out) as work:
-        for name, table in tables.items():
+    with output.progress.status("writing") as status, whole_folder(out) as work:
+        for number, (name, table) in enumerate(tables.items(), 1):
+            status.update(f"writing table {number} of {len(tables)}")
             write_table(table, name, work, to)
     if against := reservation(read_summary(results)):
-        print_warning(against, plain_console(stderr=True))
-    plain_console().print(f"{len(tables)} tables in {out}")
+        output.warn(against)
+    output.wrote(out, f"{len(tables)} tables in {out}")
+    output.tell(tables=list(tables))

@@ -1,25 +1,26 @@
 """`jaxphoto undistort`: photographs and their camera in, photographs without distortion and a pinhole camera out."""
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated, get_args
 
 import typer
 
 from jaxphoto.camera.undistortion import Keep
-from jaxphoto.cli.app import app
 from jaxphoto.cli.choices import one_of
-from jaxphoto.cli.console import plain_console
+from jaxphoto.cli.output import Output, command
+from jaxphoto.cli.progress import StepsLeft
 from jaxphoto.io.cameras import read_camera_file
 from jaxphoto.io.sound_photographs import folders_not_looked_into, sound_photographs
 from jaxphoto.io.undistorted import write_undistorted
-from jaxphoto.report.terminal import plain
 from jaxphoto.writing import check_folder
 
 
-@app.command("undistort")
+@command("undistort")
 def undistort_command(
+    output: Output,
     photographs: Annotated[list[Path], typer.Argument(help="Folders of photographs, or photographs, of one camera.")],
-    camera: Annotated[Path, typer.Option(help="Camera file, folder of results, block or COLMAP model.")],
+    camera: Annotated[Path, typer.Option(help="Results, block, COLMAP model, or a file as jaxphoto camera reads it.")],
     out: Annotated[Path, typer.Option(help="Folder for the photographs and their camera.toml.")],
     which: Annotated[str | None, typer.Option(help="Which camera, where the file holds several.")] = None,
     keep: Annotated[
@@ -28,8 +29,7 @@ def undistort_command(
 ) -> None:
     """Resample photographs to a camera without distortion. Exit code 1: written, but some were left out."""
     check_folder(out, camera, *photographs)
-    console, errors = plain_console(), plain_console(stderr=True)
-    with errors.status("reading the photographs") as status:
+    with output.progress.status("reading the photographs") as status:
         given = read_camera_file(camera, camera=which)
         read, spoilt = sound_photographs(photographs)
         done = write_undistorted(
@@ -37,15 +37,17 @@ def undistort_command(
             given,
             out,
             keep,
-            progress=lambda n, of: status.update(f"undistorting: {n} of {of}"),
+            progress=partial(StepsLeft(output.progress, status), "undistorting"),
         )
     left = spoilt | done.left_out
     for sentence in (left | folders_not_looked_into(photographs)).values():
-        errors.print(plain(f"left out: {sentence}"), soft_wrap=True)
+        output.warn(f"left out: {sentence}")
     sensor, interior = done.camera
     size = f"{sensor.width_px} x {sensor.height_px} pixels"
     c_px = float(interior.c) / sensor.pixel_mm
-    console.print(f"{len(read) - len(done.left_out)} photographs of {size}, c = {c_px:.6g} pixels", soft_wrap=True)
-    console.print(plain(f"wrote {out}"), soft_wrap=True)
+    n = len(read) - len(done.left_out)
+    output.say(f"{n} photographs of {size}, c = {c_px:.6g} pixels")
+    output.wrote(out, f"wrote {out}")
+    output.tell(n_photographs=n, width_px=sensor.width_px, height_px=sensor.height_px, c_px=c_px, left_out=list(left))
     if left:
         raise typer.Exit(1)

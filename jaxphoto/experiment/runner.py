@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Mapping
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -45,8 +46,9 @@ def run_experiment(
     recipes = {name: _recipe(variant, folder) for name, variant in experiment.variants.items()}
     failures: list[str] = []
     simulations: dict[int, dict[str, Simulation]] = {}
-    for layout in range(layouts or experiment.layouts):
-        progress(f"layout {layout}: simulating")
+    wanted, made = layouts or experiment.layouts, count(1)
+    for layout in range(wanted):
+        progress(f"simulating layout {layout + 1} of {wanted}")
         try:
             simulations[layout] = _simulated(experiment, recipes, layout)
         except (JaxphotoError, ValueError) as error:
@@ -58,7 +60,7 @@ def run_experiment(
         adjusted = {}
         try:
             for name, simulation in variants.items():
-                progress(f"layout {layout}: adjusting {name}")
+                progress(f"adjusting: block {next(made)} of {len(simulations) * len(variants)}")
                 adjusted[name] = _adjusted(simulation.block, sizes[name])
         except JaxphotoError as error:
             failures.append(f"layout {layout}, {name}: {error}")

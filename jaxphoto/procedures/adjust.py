@@ -1,6 +1,7 @@
 """The main job: complete the start values of a block and adjust it."""
 
 import dataclasses
+import time
 import warnings
 from collections.abc import Callable, Sequence
 
@@ -75,10 +76,27 @@ def adjust(
     return found
 
 
-def adjust_for_tables(block: Block, max_steps: int = MAX_STEPS) -> Adjustment:
-    """`adjust`, with what tables and report will want compiled meanwhile."""
-    from_start = lambda part, start: solve(part, start, part.priors, max_steps, meanwhile=prepare_statistics)  # noqa: E731
-    return _from_the_best_start(block, block.priors, from_start, max_steps)
+def adjust_for_tables(
+    block: Block, max_steps: int = MAX_STEPS, report: Callable[[str], object] = lambda text: None
+) -> Adjustment:
+    """`adjust`, with what tables and report will want compiled meanwhile; `report` is told what is being done.
+
+    The seconds of the result have those of the search for approximate values, too: start.
+    """
+    spent, began = {"start": 0.0}, time.perf_counter()
+
+    def from_start(part: Block, start: Unknowns) -> Adjustment:
+        nonlocal began
+        spent["start"] += time.perf_counter() - began
+        rows = len(part.image_points.image)
+        report(f"adjusting {len(part.images)} images, {len(part.points)} points, {rows} image points")
+        done = solve(part, start, part.priors, max_steps, meanwhile=prepare_statistics)
+        began = time.perf_counter()
+        return done
+
+    found = _from_the_best_start(block, block.priors, from_start, max_steps, report=report)
+    found.seconds.update(spent)
+    return found
 
 
 def left_out_words(adjusted: Adjustment) -> str:
@@ -90,7 +108,12 @@ def left_out_words(adjusted: Adjustment) -> str:
 
 
 def _from_the_best_start(
-    block: Block, priors: Unknowns, from_start: _FromStart, max_steps: int, may_lose_points: bool = True
+    block: Block,
+    priors: Unknowns,
+    from_start: _FromStart,
+    max_steps: int,
+    may_lose_points: bool = True,
+    report: Callable[[str], object] = lambda text: None,
 ) -> Adjustment:
     """The adjustment from the approximate values that are given; or, where these lead nowhere, from image points alone.
 
@@ -98,7 +121,7 @@ def _from_the_best_start(
     """
     first, refused = None, None
     try:
-        first = from_start(block, start_of(block))
+        first = from_start(block, start_of(block, report))
     except PointsBehind as error:
         refused = error
     if first is not None and may_lose_points:
@@ -108,7 +131,7 @@ def _from_the_best_start(
     elsewhere = free and np.asarray(block.start.image_known).any()
     if first is not None and (not elsewhere or _somewhere(first, max_steps)):
         return first
-    second = _from_image_points(block, from_start) if elsewhere else None
+    second = _from_image_points(block, from_start, report) if elsewhere else None
     if second is not None and may_lose_points:
         second = _without_points_gone(second, from_start)
     if second is None or not _better(second, first):
@@ -162,7 +185,7 @@ def _without_points_gone(adjusted: Adjustment, from_start: _FromStart) -> Adjust
     return dataclasses.replace(found, left_out=tuple(names))
 
 
-def _from_image_points(block: Block, from_start: _FromStart) -> Adjustment | None:
+def _from_image_points(block: Block, from_start: _FromStart, report: Callable[[str], object]) -> Adjustment | None:
     """The adjustment without given exterior orientations and points, but for known ones; None: it leads nowhere."""
     known, s = np.zeros((len(block.points), 3), bool), block.start
     for rows in (block.control, block.fixed):
@@ -170,7 +193,7 @@ def _from_image_points(block: Block, from_start: _FromStart) -> Adjustment | Non
     images, points = np.zeros_like(np.asarray(s.image_known)), known.all(axis=1) & np.asarray(s.point_known)
     try:
         oriented = orient_block(
-            dataclasses.replace(block, start=dataclasses.replace(s, image_known=images, point_known=points))
+            dataclasses.replace(block, start=dataclasses.replace(s, image_known=images, point_known=points)), report
         )
         return from_start(block, approximate(oriented))
     except (BlockError, DatumError, RankError):
@@ -192,8 +215,10 @@ def _somewhere(adjusted: Adjustment, max_steps: int) -> bool:
     return adjusted.outcome in (Outcome.CONVERGED, Outcome.STEPS) and float(adjusted.sigma0) < ABSURD
 
 
-def start_of(block: Block) -> Unknowns:
+def start_of(block: Block, report: Callable[[str], object] = lambda text: None) -> Unknowns:
     """All approximate values of `block`: `approximate`, after its images are oriented to one another if need be.
+
+    `report` is told what is being done.
 
     Raises BlockError where neither reaches all images, naming those that are left, and where points are not met.
     """
@@ -201,7 +226,7 @@ def start_of(block: Block) -> Unknowns:
     if enough:
         return approximate(reached)
     try:
-        oriented = orient_block(block)
+        oriented = orient_block(block, report)
     except (BlockError, DatumError, RankError) as error:
         if not reached.start.image_known.any():
             raise

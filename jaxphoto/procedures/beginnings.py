@@ -69,7 +69,7 @@ def beginnings(
 
     @cache
     def from_all() -> Unknowns:
-        return start_of(block) if start is None else start
+        return start_of(block, report) if start is None else start
 
     if loss is not None:
         yield lambda: robustly(loss)
@@ -113,7 +113,7 @@ def _without(
 ) -> Begun:
     """Where the block leads without some rows."""
     none = {name: out.get(name, np.zeros(len(rows), bool)) for name, rows in block.named_observations.items()}
-    start = start_of(without_observations(block, none)[0]) if start is None else start
+    start = start_of(without_observations(block, none)[0], report) if start is None else start
     least = {name: np.where(own, _NOTHING, 1.0) for name, own in out.items()}
     begun = _reweighted(block, start, max_steps, sizes, report, least)
     return begun._replace(left=begun.left | {name: begun.left[name] | own for name, own in out.items()})

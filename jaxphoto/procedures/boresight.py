@@ -10,6 +10,7 @@ step 4, where without control nothing else would place the block. Source: paper 
 """
 
 import dataclasses
+from collections.abc import Callable
 
 import equinox as eqx
 import numpy as np
@@ -27,12 +28,18 @@ from jaxphoto.variants import indirect, without_attitudes, without_control
 STEPS = (1, 2, 3, 4)
 
 
-def boresight(block: Block, *, go_on: bool = False, max_steps: int = MAX_STEPS) -> tuple[Step, ...]:
+def boresight(
+    block: Block,
+    *,
+    go_on: bool = False,
+    max_steps: int = MAX_STEPS,
+    report: Callable[[str], object] = lambda text: None,
+) -> tuple[Step, ...]:
     """Boresight misalignment of `block` in four steps; the last one returned is the last that was made.
 
     It stops after a step whose judgement says that it makes no sense to continue, unless `go_on`, and after one that
-    does not converge. Interior orientation is estimated as the block's priors say. Raises BlockError where the block
-    lacks what one of the steps needs, and what `jaxphoto.adjust` raises.
+    does not converge; `report` is told of each. Interior orientation is estimated as the block's priors say. Raises
+    BlockError where the block lacks what one of the steps needs, and what `jaxphoto.adjust` raises.
     """
     for number in STEPS:
         _check(block, number)
@@ -40,6 +47,7 @@ def boresight(block: Block, *, go_on: bool = False, max_steps: int = MAX_STEPS) 
     block = dataclasses.replace(block, start=known)
     steps: list[Step] = []
     for number in STEPS:
+        report(f"adjusting {len(block.images)} images: step {number} of {len(STEPS)}")
         last = steps[-1] if steps else None
         posed = step_block(block, number, last.biases, last.adjusted.unknowns) if last else step_block(block, number)
         step = judge(number, adjust(posed, max_steps=max_steps), last)

@@ -15,7 +15,7 @@ Counting all unknowns instead would put S / n in the place of S / N and favour l
 Source: Burnham and Anderson (2002), Model selection; residual likelihood: Patterson and Thompson (1971).
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -86,11 +86,18 @@ class ModelChoice(NamedTuple):
     by_prediction: str
 
 
-def model_choice(block: Block, models: Iterable[str | Candidate], *, k: int = FOLDS, seed: int = 0) -> ModelChoice:
+def model_choice(
+    block: Block,
+    models: Iterable[str | Candidate],
+    *,
+    k: int = FOLDS,
+    seed: int = 0,
+    report: Callable[[str], object] = lambda text: None,
+) -> ModelChoice:
     """Compare candidates (`candidate_of`) for all cameras of `block`; `k` = 0 leaves cross-validation out.
 
     c, x_p and y_p are what the block says of them (`with_candidate`), the coefficients of a candidate are free. What
-    cannot be adjusted is judged unfit, with the reason.
+    cannot be adjusted is judged unfit, with the reason. `report` is told of each adjustment.
 
     Raises InputError for unknown or repeated candidates or fewer than two folds, BlockError where nothing can be left
     out.
@@ -106,12 +113,16 @@ def model_choice(block: Block, models: Iterable[str | Candidate], *, k: int = FO
     judged: list[Judged] = []
     squares: list[np.ndarray | None] = []
     known: Unknowns | None = None
-    for candidate in candidates:
+    for number, candidate in enumerate(candidates):
+        counted = lambda fold, first=1 + number * (k + 1): report(  # noqa: E731
+            f"comparing {len(names)} models: adjustment {first + fold} of {len(names) * (k + 1)}"
+        )
+        counted(0)
         own = with_candidate(block, candidate, known)
         try:
             adjusted = adjust(own, None if known is None else own.start.unknowns, sizes=sizes)
             found = _judge(candidate, adjusted)
-            squares.append(_predicted(own, adjusted, fold, sizes) if k else None)
+            squares.append(_predicted(own, adjusted, fold, sizes, counted) if k else None)
             known = adjusted.unknowns if known is None and bool(adjusted.converged) else known
         except (BlockError, DatumError, RankError) as error:
             found = Judged(candidate, str(error))
@@ -150,7 +161,7 @@ def _squares_px(block: Block, apart_mm: Float[np.ndarray, "rows 2"]) -> Float[np
 
 
 def _predicted(
-    block: Block, adjusted: Adjustment, fold: np.ndarray, sizes: Sizes
+    block: Block, adjusted: Adjustment, fold: np.ndarray, sizes: Sizes, counted: Callable[[int], object]
 ) -> Float[np.ndarray, "left_out"] | None:
     """Squared prediction errors (px) of all rows that are ever left out; None where a fold does not converge."""
     if not bool(adjusted.converged):
@@ -158,6 +169,7 @@ def _predicted(
     squares = np.full(len(fold), _NAN)
     parts, _ = fold_blocks(block, fold)
     for number, part in enumerate(parts):
+        counted(number + 1)
         without = adjust(part, adjusted.unknowns, sizes=sizes)
         if not bool(without.converged):
             return None

@@ -72,7 +72,7 @@ def robust(
     losses = dict(loss) if isinstance(loss, Mapping) else dict.fromkeys(rows, loss)
     if unknown := [name for name in losses if name not in rows]:
         raise BlockError(f"there are no observations {unknown[0]} in this block, only {', '.join(rows)}")
-    unknowns = start_of(block) if start is None else start
+    unknowns = start_of(block, report) if start is None else start
     left = {name: np.zeros(len(own), bool) for name, own in rows.items()}
     found: dict[str, AbstractLoss] = {name: dataclasses.replace(own, scale=_WIDE) for name, own in losses.items()}
     r: Blocks = {}

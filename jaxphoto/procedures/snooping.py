@@ -109,7 +109,7 @@ def snoop(
             break
     if found is None:
         # What the block cannot tell with all of its observations either, is said as ever.
-        solve(block, start_of(block) if start is None else start, block.priors, max_steps, sizes)
+        solve(block, start_of(block, report) if start is None else start, block.priors, max_steps, sizes)
         raise BlockError(
             "so much contradicts the other observations that without it too little is left to adjust: look at names, "
             f"units, axes and the order of rows (an adjustment of all says more). What ended the search: {failed[0]}"

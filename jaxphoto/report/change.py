@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -119,15 +120,19 @@ def write_change(found: Change, sets: tuple[Compared, Compared], sensor: Sensor,
         colour = "amber" if min(tested) < SIGNIFICANT_P else "green"
         page = study_page("Change of a camera", verdict, parts, colour)
         (work / "report.html").write_text(page, encoding="utf-8")
-        summary = {
-            "verdict": verdict,
-            "method": found.field.method,
-            "chi_square": found.chi_square if found.degrees_of_freedom else None,
-            "degrees_of_freedom": found.degrees_of_freedom,
-            "p_parameters": found.p_parameters if found.degrees_of_freedom else None,
-            "p_field": None if known is None else known.p_value,
-            "n_beyond": int(found.beyond.sum()),
-            "n_points": len(found.limit_mm),
-            "versions": versions(),
-        }
-        write_summary(summary, work)
+        write_summary(change_summary(found, sensor) | {"versions": versions()}, work)
+
+
+def change_summary(found: Change, sensor: Sensor) -> dict[str, Any]:
+    """The comparison in numbers."""
+    known = found.field.uncertainty
+    return {
+        "verdict": change_verdict(found, sensor),
+        "method": found.field.method,
+        "chi_square": found.chi_square if found.degrees_of_freedom else None,
+        "degrees_of_freedom": found.degrees_of_freedom,
+        "p_parameters": found.p_parameters if found.degrees_of_freedom else None,
+        "p_field": None if known is None else known.p_value,
+        "n_beyond": int(found.beyond.sum()),
+        "n_points": len(found.limit_mm),
+    }

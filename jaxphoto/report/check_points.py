@@ -25,3 +25,15 @@ def check_point_table(adjusted: Adjustment, known: Covariance) -> pd.DataFrame:
     columns: dict[str, Any] = {"point": [adjusted.block.points[p] for p in points]}
     columns |= {f"d{axis}_m": off[:, k] for k, axis in enumerate(AXES)}
     return pd.DataFrame(columns | {f"sigma_d{axis}_m": sigma[:, k] for k, axis in enumerate(AXES)})
+
+
+def check_spread(check: pd.DataFrame) -> pd.DataFrame:
+    """axis, n, mean, rmse, max_abs, unit of discrepancies at check points."""
+    values = check[[f"d{axis}_m" for axis in AXES]].set_axis(AXES, axis=1)
+    columns = {
+        "n": values.count(),
+        "mean": values.mean(),
+        "rmse": np.sqrt((values**2).mean()),
+        "max_abs": values.abs().max(),
+    }
+    return pd.DataFrame(columns).reset_index(names="axis").assign(unit="m")

@@ -12,8 +12,8 @@ from jinja2 import Environment
 from markupsafe import Markup
 
 from jaxphoto.errors import camera_words
-from jaxphoto.observations import AXES
 from jaxphoto.report.certificate_figures import draw_band, draw_curve
+from jaxphoto.report.check_points import check_spread
 from jaxphoto.report.convergence import convergence_section
 from jaxphoto.report.document import (
     BlockInSpace,
@@ -202,18 +202,6 @@ def _residuals(tables: Tables) -> list[Markup]:
         title("Largest normalised residuals"),
         _html(largest),
     ]
-
-
-def check_spread(check: pd.DataFrame) -> pd.DataFrame:
-    """axis, n, mean, rmse, max_abs, unit of discrepancies at check points."""
-    values = check[[f"d{axis}_m" for axis in AXES]].set_axis(AXES, axis=1)
-    columns = {
-        "n": values.count(),
-        "mean": values.mean(),
-        "rmse": np.sqrt((values**2).mean()),
-        "max_abs": values.abs().max(),
-    }
-    return pd.DataFrame(columns).reset_index(names="axis").assign(unit="m")
 
 
 def _html(table: pd.DataFrame) -> Markup:

@@ -11,6 +11,7 @@ from jaxphoto.adjustment import Adjustment
 from jaxphoto.camera import RATES, model_keys
 from jaxphoto.compiling.freed_memory import return_freed_memory
 from jaxphoto.errors import InputError
+from jaxphoto.report.check_points import check_spread
 from jaxphoto.report.findings import Verdict
 from jaxphoto.report.made import Made, versions
 from jaxphoto.report.page import report_page
@@ -112,6 +113,11 @@ def summary_of(tables: Tables, verdict: Verdict, seconds: dict[str, float]) -> d
         "iterations": int(adjusted.steps),
         "cameras": _cameras(adjusted),
         "georeferencing": {p: {"value": v, "sigma": s} for p, v, s in tables.georeferencing.itertuples(index=False)},
+        "check_points": {
+            axis: {"n": int(n), "mean_m": mean, "rmse_m": rmse, "max_abs_m": most}
+            for axis, n, mean, rmse, most, _ in check_spread(tables.check_points).itertuples(index=False)
+            if n
+        },
         "positional_accuracy": accuracy_sentences(tables.tested_accuracy),
         "seconds": {name: round(value, 6) for name, value in seconds.items()},
         "versions": versions(),

@@ -143,7 +143,6 @@ def write_stability(
     """
     table = stability_table(analyses, sensor.pixel_mm, noise_mm)
     chosen = analyses[method]
-    verdict = f"{method}: {chosen.verdict(noise_mm)}"
     picture = WholePicture.of(offsets_figure(chosen, sensor), "offsets of the two bundles over the image")
     about = [str(sets[0]), str(sets[1]), missing_covariances(sets)]
     methods = "The bundles of rays are compared " + "; ".join(f"{ALIGNED[name]} ({name})" for name in analyses) + "."
@@ -163,17 +162,23 @@ def write_stability(
         (work / "offsets.png").write_bytes(picture.png)
         page = study_page("Stability of interior orientation", said, parts, colour)
         (work / "report.html").write_text(page, encoding="utf-8")
-        summary = {
-            "verdict": verdict,
-            "method": method,
-            "similar": chosen.similar(noise_mm),
-            "noise_mm": noise_mm,
-            "rmse_offset_mm": {name: float(one.offsets.rmse_mm) for name, one in analyses.items()},
-            "n_points": len(chosen.offsets.points),
-            "covariance": {"A": sets[0].known, "B": sets[1].known},
-            "versions": versions(),
-        }
-        write_summary(summary, work)
+        write_summary(stability_summary(analyses, sets, noise_mm, method) | {"versions": versions()}, work)
+
+
+def stability_summary(
+    analyses: Mapping[Method, Analysis], sets: tuple[Compared, Compared], noise_mm: float, method: Method
+) -> dict[str, Any]:
+    """The comparison in numbers."""
+    chosen = analyses[method]
+    return {
+        "verdict": f"{method}: {chosen.verdict(noise_mm)}",
+        "method": method,
+        "similar": chosen.similar(noise_mm),
+        "noise_mm": noise_mm,
+        "rmse_offset_mm": {name: float(one.offsets.rmse_mm) for name, one in analyses.items()},
+        "n_points": len(chosen.offsets.points),
+        "covariance": {"A": sets[0].known, "B": sets[1].known},
+    }
 
 
 def missing_covariances(sets: tuple[Compared, Compared]) -> str:

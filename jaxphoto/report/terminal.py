@@ -1,10 +1,12 @@
 """One screen of text: outcome, sigma naught, warnings first, then the interior orientation."""
 
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
 from jaxphoto.errors import printable
+from jaxphoto.report.check_points import check_spread
 from jaxphoto.report.digits import of_p, of_sigma, with_sigma
 from jaxphoto.report.findings import MARKS, Level, Verdict
 from jaxphoto.report.recovery import recovery_spread
@@ -68,11 +70,26 @@ def print_adjustment(tables: Tables, verdict: Verdict, console: Console) -> None
     for v in residual_spread(adjusted):
         spread.add_row(v.group, v.axis, str(v.n), f"{v.rmse:.3g}", f"{v.max_abs:.3g}", v.unit)
     console.print(spread)
+    if len(tables.check_points):
+        console.print(_check_points(tables))
     if tables.truth:
         found = Table("group", "n", "rms ratio", "beyond 2 sigma", title="(estimate - truth) / sigma")
         for group, n, ratio, beyond in recovery_spread(tables.recovery).itertuples(index=False):
             found.add_row(plain(group), str(n), f"{ratio:.3g}", f"{beyond:.1%}")
         console.print(found)
+
+
+def _check_points(tables: Tables) -> Table:
+    """By how much check points are off, and that over what their standard deviations allow."""
+    points = tables.check_points
+    shown = Table("axis", "n", "mean m", "RMSE m", "maximum m", "of point", "rms / sigma", title="check points")
+    for axis, n, mean, rmse, most, _ in check_spread(points).itertuples(index=False):
+        if n:
+            off, sigma = points[f"d{axis}_m"].to_numpy(), points[f"sigma_d{axis}_m"].to_numpy()
+            farthest = plain(str(points["point"].iloc[np.nanargmax(np.abs(off))]))
+            ratio = np.sqrt(np.nanmean((off / sigma) ** 2))
+            shown.add_row(axis, str(n), *(f"{v:.3g}" for v in (mean, rmse, most)), farthest, f"{ratio:.2g}")
+    return shown
 
 
 def print_warning(warning: str, console: Console, **options) -> None:

@@ -119,3 +119,9 @@ def _files(folder: Path, within: str = "", folders: bool = False) -> Iterator[tu
 def _digest(path: Path) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def files_in(folder: Path) -> list[str]:
+    """The files that jaxphoto wrote in `folder`, by their paths in it; all that it holds where no marker lists them."""
+    known = _known(folder)
+    return sorted(known) if known is not None else [name for name, _ in _files(folder)]

@@ -9,8 +9,8 @@ import pytest
 from jaxphoto import InputError, Tables
 from jaxphoto.io import read_result_tables
 from jaxphoto.report import to_latex, to_markdown, write_tables
+from jaxphoto.report.check_points import check_spread
 from jaxphoto.report.digits import of_sigma, with_sigma
-from jaxphoto.report.page import check_spread
 from jaxphoto.report.table_files import head_of, readable
 from tests.blocks import adjusted
 from tests.commands import run

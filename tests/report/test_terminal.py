@@ -31,9 +31,9 @@ def test_the_console_of_commands_prints_names_as_they_are(name):
     plain = name.replace("\x1b", "\\x1b")
     assert said.count(plain) == 4 and "\x1b" not in said
     status = plain_console(stderr=True).status(f"reading {name}")
-    assert status.renderable.text.plain == f"reading {plain}"
+    assert status.renderable.text.__rich__().plain == f"reading {plain}"
     status.update(f"writing {name}")
-    assert status.renderable.text.plain == f"writing {plain}"
+    assert status.renderable.text.__rich__().plain == f"writing {plain}"
 
 
 @pytest.mark.parametrize("name", NAMES)

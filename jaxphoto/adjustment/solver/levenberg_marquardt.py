@@ -225,7 +225,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Increments, Scalar, Any
             next_y = jax.lax.cond(tighten, lambda y: onto_datum(self._at(y, jnp.array(False))), lambda y: y, next_y)
             loose = (state.loose | (~accept & ~state.chord & ~state.tightened)) & ~tighten
         told = Course(right.square_sum, length, system.reduced.damping, accept.astype(float))
-        kept = (v.at[state.steps].set(one, mode="drop") for v, one in zip(state.course, told, strict=True))
+        kept = (jnp.asarray(v).at[state.steps].set(one, mode="drop") for v, one in zip(state.course, told, strict=True))
         progress = SolverState(
             damping=jnp.where(tighten, _FIRST_DAMPING, damping),
             length=jnp.where(tighten, jnp.inf, pick(length, state.length)),

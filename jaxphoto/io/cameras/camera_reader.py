@@ -27,6 +27,11 @@ _FORMATS = {
     "kalibr": _ReadFormat(kalibr.recognises, kalibr.read_kalibr),
     "opencv": _ReadFormat(open_cv.recognises, open_cv.read_open_cv),
 }
+CAMERAS_READ = (
+    "OpenCV's and ROS' YAML, COLMAP's cameras.txt, Agisoft's XML, mrcal's .cameramodel, Kalibr's camera chain, a "
+    "SMAC report, interior.csv and block.toml"
+)
+"""The camera files that `read_camera_file` knows, in words."""
 # In a folder, what its camera file is called.
 _IN_FOLDER = (own_cameras.INTERIOR, TOML, own_cameras.CAMERA, colmap.TEXT, colmap.BINARY)
 
@@ -65,8 +70,4 @@ def read_camera_file(
             return known.read(source)
     if not text.strip():
         raise source.error("the file is empty; write it anew")
-    formats = (
-        "OpenCV's and ROS' YAML, COLMAP's cameras.txt, Agisoft's XML, mrcal's .cameramodel, Kalibr's camera chain, a "
-        "SMAC report, interior.csv and block.toml"
-    )
-    raise source.error(f"this is no camera file that is known; {formats} are")
+    raise source.error(f"this is no camera file that is known; {CAMERAS_READ} are")

@@ -242,7 +242,7 @@ def _orient_next(growth: _Growth, images: Sequence[int]) -> None:
     if len(rows) < growth.least:
         growth.refused[image] = f"it sees {counted(len(rows), 'point')} of the others, and {growth.least} are needed"
         return
-    growth.report(f"orienting image {len(growth.order) + 1}: {growth.block.images[image]}")
+    growth.report(f"orienting image {len(growth.order) + 1} of {len(growth.block.images)}")
     fitting = 0.0
     for position, matrix in _by_points(growth, image, rows, of_pairs):
         trial = growth.network.with_image(image, position, matrix)

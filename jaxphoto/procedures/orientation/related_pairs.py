@@ -19,7 +19,7 @@ MOST = 8.0
 # Of the matches of a pair, those that must agree: where fewer do, they agree by chance.
 _LEAST_PART = 0.25
 
-Report = Callable[[str], None]
+Report = Callable[[str], object]
 
 
 class Pair(NamedTuple):
