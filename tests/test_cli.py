@@ -114,7 +114,7 @@ def test_files_say_what_the_adjustment_says(results, folder):
     counts = summary["n_observations"]
     assert counts["total"] == sum(n for group, n in counts.items() if group != "total")
     assert counts["total"] - summary["n_unknowns"]["total"] == summary["redundancy"]
-    assert list(summary["seconds"]) == ["read", "compile", "solve", "covariance", "write"]
+    assert list(summary["seconds"]) == ["read", "start", "compile", "solve", "covariance", "write"]
     assert all(s >= 0 for s in summary["seconds"].values())
     assert summary["versions"]["jaxphoto"] == jaxphoto.__version__
     for name in ("interior", "exterior", "object_points", "check_points", "correlation"):
