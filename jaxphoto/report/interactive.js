@@ -154,6 +154,8 @@
 
   const CONFIG = {
     responsive: true, displaylogo: false, modeBarButtonsToRemove: ["tableRotation", "resetCameraLastSave3d"],
+    // Nothing leaves the page.
+    showSendToCloud: false, plotlyServerURL: "",
   };
   const dark = matchMedia("(prefers-color-scheme: dark)");
 

@@ -172,7 +172,7 @@ def _reach(tables: Tables, camera: str) -> str:
 def _sigma_maps(tables: Tables) -> Iterator[Markup]:
     for camera, maps in tables.sigma_maps.items():
         words = sigma_map_words(tables.adjusted.block.sensors[camera], maps)
-        yield _said(words)
+        yield _said(as_sentence(words))
         yield _wide(_picture(sigma_map_figure(tables, camera), words))
 
 

@@ -54,6 +54,7 @@ figure.block { margin: .5rem 0 1rem } .plot { height: min(36rem, 75vh) }
 .chooser { display: flex; flex-wrap: wrap; gap: .3rem 1rem; align-items: baseline; font-size: 13px }
 .chooser select, .chooser input { max-width: 11rem }
 .good { color: var(--good) } .bad { color: var(--bad) }
+h1 + .verdict { font-weight: 600 }
 .verdict { font-size: 17px; padding: .4rem .8rem; border-radius: 4px }
 .verdict.green { background: var(--green); color: var(--on-green) }
 .verdict.amber { background: var(--amber); color: var(--on-amber) }
@@ -76,7 +77,7 @@ figure.block { margin: .5rem 0 1rem } .plot { height: min(36rem, 75vh) }
   h1, h2, h3, nav { break-after: avoid } h2 + p, h3 + p { break-after: avoid }
   thead { display: table-header-group }
   tr, img, figure, nav, .alarm, .warning, .information, .verdict { break-inside: avoid }
-  p, li { orphans: 3; widows: 3 } .wide { mask-image: none }
+  p, li { orphans: 3; widows: 3 } .wide { mask-image: none !important }
   img { max-height: 105mm; width: auto; object-fit: contain } .wide img { max-height: 190mm; max-width: 100% }
   .pictures { grid-template-columns: 1fr 1fr } .verdict { font-size: 12px } }
 """

@@ -14,11 +14,13 @@ import pytest
 from jaxphoto import Tables
 from jaxphoto.report import block_in_space, page_head, report_page, verdict_of
 from jaxphoto.report.block_places import places_of, pyramids
-from jaxphoto.report.document import BlockInSpace, Document, Rows
+from jaxphoto.report.document import BlockInSpace, Document, Heading, Paragraph, Rows
 from jaxphoto.report.document_html import html_of, html_page
 from jaxphoto.report.document_pdf import _BLANK, _FIGURE, _INNER, _READABLE, _widths, pdf_of
 from jaxphoto.report.error_ellipsoids import ellipsoid_mesh
+from jaxphoto.report.findings import as_sentence, in_symbols
 from jaxphoto.report.interactive import measurements
+from jaxphoto.report.study_page import study_page
 from tests.blocks import adjusted, simulated
 
 BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
@@ -188,3 +190,35 @@ def test_numbers_sort_as_numbers_and_rows_are_filtered(tmp_path):
 def test_long_tables_scroll_in_a_box_of_their_own():
     long, short = (html_of(Rows(("a",), (("1",),) * n)) for n in (100, 5))
     assert 'class="wide long" tabindex="0"' in long and "long" not in short
+
+
+def test_nothing_of_a_page_is_sent_anywhere(page):
+    assert "showSendToCloud: false" in page and 'plotlyServerURL: ""' in page
+
+
+def test_sentences_of_a_study_come_before_its_contents_and_hashes_may_break():
+    parts = [Paragraph("first"), Heading("One"), Paragraph("later"), Heading("Two"), Rows(("SHA-256",), ((64 * "a",),))]
+    written = study_page("Study", ["said"], parts)
+    places = [written.index(text) for text in ("Said.", ">first<", "<nav>", ">later<", '<td class="text hash">')]
+    assert places == sorted(places)
+
+
+def test_sentences_begin_with_capitals_but_symbols_stay():
+    assert [as_sentence(text) for text in ("amber: one", "c of it", "x_p of it", "k2 of it.")] == [
+        "Amber: one.", "c of it.", "x_p of it.", "k2 of it.",
+    ]  # fmt: skip
+    assert in_symbols("hold interior[one].c_mm or strips[A].shift_X_m") == "hold c of camera one or strips[A].shift_X_m"
+
+
+@pytest.mark.skipif(BROWSER is None, reason="needs chromium to print")
+@pytest.mark.slow
+def test_in_print_no_figure_is_taller_than_a_sheet(tmp_path):
+    """A figure of 3 m height, and a heading that would stand at the foot of the first sheet."""
+    tall = '<svg xmlns="http://www.w3.org/2000/svg" width="900" height="9000"><rect width="900" height="9000"/></svg>'
+    source = base64.b64encode(tall.encode()).decode()
+    body = f'<h2>One</h2><img alt="tall" src="data:image/svg+xml;base64,{source}">'
+    (tmp_path / "page.html").write_text(f"{page_head('Tall')}<body>{body}</body></html>", encoding="utf-8")
+    out = tmp_path / "page.pdf"
+    command = [BROWSER, "--headless", "--no-sandbox", "--disable-gpu", f"--print-to-pdf={out}", tmp_path / "page.html"]
+    subprocess.run([*map(str, command)], check=True, capture_output=True, timeout=120)
+    assert len(re.findall(rb"/Type\s*/Page\b", out.read_bytes())) == 1
