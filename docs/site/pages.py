@@ -85,7 +85,9 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
             return match.group(0)
         if not (ROOT / target).exists():
             raise ValueError(f"{page.file.src_uri} links to {target}, which is not there")
-        return f"[{text}]({up}{target}{place})" if target.startswith("notebooks/") else f"{text} (`{target}`)"
+        if target.startswith("notebooks/"):
+            return f"[{text}]({up}{target}{place})"
+        return f"`{target}`" if text.rstrip("/") == target.rstrip("/") else f"{text} (`{target}`)"
 
     def titled(match: re.Match[str]) -> str:
         found = (ROOT / "docs" / here / match.group(1)).resolve()
@@ -98,10 +100,17 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
     known = _identifiers()
     for k, part in enumerate(parts):
         if k % 2 == 0:
-            parts[k] = _FORMULA.sub(lambda m: convert(m[1] or m[2], display="block" if m[1] else "inline"), part)
+            parts[k] = _FORMULA.sub(_mathml, part)
         elif (name := _NAME.fullmatch(part)) and name[1] in known and not parts[k - 1].endswith("["):
             parts[k] = f"[{part}][{known[name[1]]}]"
     return "".join(parts)
+
+
+def _mathml(match: re.Match[str]) -> str:
+    if inline := match[2]:
+        return convert(inline)
+    # Wider than a telephone some are.
+    return f'<span style="display: block; overflow-x: auto">{convert(match[1], display="block")}</span>'
 
 
 def _title(page: Path) -> str:
