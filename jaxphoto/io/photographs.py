@@ -60,6 +60,10 @@ class Photograph(NamedTuple):
     aircraft_deg: tuple[float, float, float] | None = None
     """Roll, pitch and yaw of the aircraft, where its camera hangs in a gimbal."""
     taken: Taken | None = None
+    serial: str | None = None
+    """Number of the camera's body."""
+    digital_zoom: float = 1.0
+    """By how much a part of the picture was enlarged."""
 
 
 class CameraStart(NamedTuple):
@@ -101,7 +105,7 @@ def sensor_and_interior(
     given it follows from f35 first, which no change of the picture's size alters. Where EXIF says neither it starts at
     1.2 times the longer side. The distortion starts at zero.
 
-    Raises InputError for no photographs, for such as differ in size, orientation flag, camera or focal length, and for
+    Raises InputError for no photographs, for such as differ in what `ONE_CAMERA` names, and for
     a c_mm of pixels whose size nobody says.
     """
     if not photographs:
@@ -185,6 +189,12 @@ ONE_CAMERA: list[tuple[str, Callable[["Photograph"], Hashable], str]] = [
         "sensor saw them, set one flag (exiftool -n -Orientation=1 FILES), else leave the odd ones out",
     ),
     ("camera", lambda p: " ".join(filter(None, (p.make, p.model))) or None, "give the photographs of one camera"),
+    (
+        "serial number",
+        lambda p: p.serial,
+        "two cameras of one model differ as much as its lenses do: give the photographs of one",
+    ),
+    ("digital zoom", lambda p: f"{p.digital_zoom:.4g}", "give those of one zoom"),
     ("focal length", lambda p: p.focal_length_mm and f"{p.focal_length_mm:.4g} mm", "give those of one zoom"),
 ]
 """What all photographs of one camera have in common, and the mend where they have not."""
@@ -236,7 +246,9 @@ def _exif(picture: Image.Image) -> dict[str, Any]:
     except Exception:
         return {}
     flag, film = top.get(_TAG.Orientation, 1), _positive(shot.get(_TAG.FocalLengthIn35mmFilm))
-    drone = drone_record(xmp_fields(picture.info.get("xmp")))
+    fields = xmp_fields(picture.info.get("xmp"))
+    drone = drone_record(fields)
+    in_packet = next((value for key, value in fields.items() if key.endswith(":CameraSerialNumber")), None)
     return {
         "make": _words(top.get(_TAG.Make)),
         "model": _words(top.get(_TAG.Model)),
@@ -249,6 +261,9 @@ def _exif(picture: Image.Image) -> dict[str, Any]:
         "attitude": drone.attitude,
         "aircraft_deg": drone.aircraft_deg,
         "taken": taken(shot, gps, drone.utc),
+        "serial": _words(shot.get(_TAG.BodySerialNumber)) or _words(in_packet),
+        # 0 says that there was none.
+        "digital_zoom": _positive(shot.get(_TAG.DigitalZoomRatio)) or 1.0,
     }
 
 

@@ -27,7 +27,7 @@ def sound_photographs(paths: Sequence[str | Path]) -> tuple[list[Photograph], di
 
     Of a folder all pictures, in the order of their names. Left out, a sentence each: what is no picture or is cut off,
     a second of the same name, one that is another's copy byte for byte (of the two that whose name is less like those
-    of the others, then the longer one), and those of another size, orientation flag, camera or focal length than most.
+    of the others, then the longer one), and those that differ from most in what `ONE_CAMERA` names.
     Raises InputError for what is neither file nor folder, and where nothing is left.
     """
     files = pictures_in(paths)

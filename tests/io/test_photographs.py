@@ -44,7 +44,7 @@ def test_what_exif_says(tmp_path):
 def test_without_exif_nothing_is_known(tmp_path):
     Image.new("RGB", (64, 48)).save(tmp_path / "a.png")
     (found,) = photographs([str(tmp_path / "a.png")])
-    assert found[2:] == (64, 48, None, None, None, None, None, 1, None, None, None, None, None)
+    assert found[2:] == (64, 48, None, None, None, None, None, 1, None, None, None, None, None, None, 1.0)
 
 
 def test_damaged_exif_says_nothing(tmp_path):
@@ -58,7 +58,7 @@ def test_damaged_exif_says_nothing(tmp_path):
         gps={1: "N", 2: (ratio(13.0), ratio(0.0), ratio(0.0)), 3: "E", 4: (ratio(203.0), ratio(0.0), ratio(0.0))},
     )
     (found,) = photographs([path])
-    assert found[4:] == (None, None, None, None, None, 1, None, None, None, None, None)
+    assert found[4:] == (None, None, None, None, None, 1, None, None, None, None, None, None, 1.0)
 
 
 def test_exif_that_is_cut_off_is_no_traceback(tmp_path):

@@ -96,6 +96,22 @@ def test_spoilt_ones_are_left_out_each_with_a_sentence(folder):
     assert not left
 
 
+def test_a_second_body_of_the_same_model_and_a_digital_zoom_are_left_out(folder):
+    """As lenses of specimens differ, c of one block would be neither's; a zoom that enlarges a part doubles it."""
+    for k, (serial, zoom) in enumerate(((" A1", 0.0), ("A1", 1.0), ("A1", 2.0), ("B7", 1.0))):
+        picture = Image.open(folder / f"{k}.jpg")
+        exif = picture.getexif()
+        exif.get_ifd(0x8769).update({0xA431: serial, 0xA404: zoom})
+        picture.save(folder / f"{k}.jpg", exif=exif)
+    kept, left = sound_photographs([folder])
+    assert [p.name for p in kept] == ["0", "1"]
+    assert "its digital zoom is 2, that of most is 1" in left[str(folder / "2.jpg")]
+    assert "its serial number is B7, that of most is A1" in left[str(folder / "3.jpg")]
+    packet = PACKET.replace('RtkFlag="50"', 'CameraSerialNumber="C9"')
+    picture.save(folder / "4.jpg", exif=Image.Exif(), xmp=packet.encode())
+    assert "its serial number is C9" in sound_photographs([folder])[1][str(folder / "4.jpg")]
+
+
 def test_what_is_not_there_and_what_leaves_nothing_is_refused(folder, tmp_path):
     with pytest.raises(InputError, match="there is no such photograph or folder"):
         sound_photographs([folder / "absent"])
