@@ -14,13 +14,20 @@ HEIGHTS: dict[Heights, str] = {
     "unknown": "above what the files do not say",
 }
 """In words."""
-Fix = Literal["fixed", "float", "single", "unknown"]
-"""How a receiver solved for the position: with corrections and whole ambiguities, with real ones, or without both."""
-FIX_SIGMA_M: dict[Fix, tuple[float, float, float]] = {"fixed": (0.02, 0.02, 0.04), "float": (0.3, 0.3, 0.6)}
+Fix = Literal["fixed", "float", "single", "integrated", "unknown"]
+"""How a receiver solved for the position: with corrections and whole ambiguities, with real ones, or without both;
+or GNSS and IMU together, afterwards."""
+FIX_SIGMA_M: dict[Fix, tuple[float, float, float]] = {
+    "fixed": (0.02, 0.02, 0.04),
+    "float": (0.3, 0.3, 0.6),
+    "integrated": (0.05, 0.05, 0.1),
+}
 """East, north and up, where the file says the solution but no standard deviations.
 
 A fixed solution has 1 cm + 1 ppm in plan and 1.5 cm + 1 ppm in height (DJI, specifications of the Phantom 4 RTK) while
 nothing else errs, a float one decimetres (DJI, manuals: RtkFlag); twice the former allows for base and interpolation.
+What is integrated afterwards has 2 to 5 cm in plan and 5 to 10 in height (Applanix, specifications of APX-15 and POS
+AV, post-processed); an SBET does not say its own.
 """
 
 

@@ -15,7 +15,11 @@ from jaxphoto.orientation.matches import PairMatches
 from jaxphoto.procedures.adjust import adjust_for_tables
 from jaxphoto.procedures.control import ControlledBlock, rejudged
 from jaxphoto.procedures.control.of_flight import FlightControl, controlled_or_why, parts_with_marks
-from jaxphoto.procedures.georeference_photographs import GeoreferencedPhotographs, georeference_photographs
+from jaxphoto.procedures.georeference_photographs import (
+    GeoreferencedPhotographs,
+    georeference_photographs,
+    held_in_place,
+)
 from jaxphoto.procedures.known_lens import KnownLens, with_known_lens
 from jaxphoto.procedures.orientation import Oriented, orient
 from jaxphoto.procedures.orientation.orient_photographs import CAMERA
@@ -62,7 +66,7 @@ class FlightPart(NamedTuple):
     matched: MatchedPart
     placed: GeoreferencedPhotographs | None
     why_not: str
-    """Why there are no stations; "" where there are."""
+    """Why there are no stations; "" where there are. With `placed` they have brought the block to its place."""
     components: VarianceComponents | None
     """Of image points, and of stations and marks where there are any, if the adjustment converged."""
     adjusted: Adjustment
@@ -147,9 +151,10 @@ def _calibrated(
         if placed is None:
             raise
         # Positions that do not tell the frame, or too badly: the calibration does without.
-        placed, why_not = None, str(error)
-        adjusted = adjust_for_tables(oriented.block)
-    adjusted, why_still = _rolling(adjusted, known.taken, metric=bool(placed or controlled))
+        placed, why_not = held_in_place(placed, oriented.block.datum), str(error)
+        adjusted = adjust_for_tables(placed.block if placed else oriented.block)
+    metric = bool(controlled or (placed and not why_not))
+    adjusted, why_still = _rolling(adjusted, known.taken, metric)
     components = None
     # What is known of the lens has a weight that image points must be brought to, with stations or without.
     if (placed or controlled or lens) and bool(adjusted.converged):

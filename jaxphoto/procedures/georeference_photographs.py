@@ -40,6 +40,10 @@ _BEYOND_OWN = 4.0
 _LEAST = 3
 # With attitudes, which give the turn.
 _LEAST_TURNED = 2
+# A block whose turn positions tell no better is better off in a frame of its own than in a map.
+_HELD_RAD = 0.3
+# Cameras of a flight look down or ahead; some up, on average by 30 degrees, only where the block stands on its head.
+_LOOK_UP = 0.5
 
 
 class GeoreferencedPhotographs(NamedTuple):
@@ -104,6 +108,7 @@ def georeference_photographs(
         similarity, used = _agreeing(there, here, own)
     sigma = _sigmas(list(known.values()), (here - similarity.of(there))[used])
     similarity = _nearest(similarity, there[used], here[used], sigma[used], helping)
+    _check_upright(block, similarity)
     rows, axis = np.flatnonzero(used).repeat(3), np.tile(np.arange(3), used.sum())
     stations = StationRows(image[rows], axis, here[rows, axis], sigma[rows, axis])
     placed = dataclasses.replace(
@@ -121,6 +126,32 @@ def georeference_photographs(
         *attitude_words(recorded, helping is not None, similarity.turn),
     )
     return GeoreferencedPhotographs(placed, tuple(known), offsets, used, said)
+
+
+def held_in_place(placed: GeoreferencedPhotographs, datum: Datum) -> GeoreferencedPhotographs | None:
+    """The block where the positions brought it, held there by `datum` instead of by them.
+
+    None where they do not tell its turn to some 17 degrees.
+    """
+    stations = placed.block.stations
+    here, sigma = (np.asarray(v, float).reshape(-1, 3) for v in (stations.value, stations.sigma))
+    if not _turn_sigma(here, sigma) <= _HELD_RAD:
+        return None
+    return placed._replace(block=dataclasses.replace(placed.block, stations=StationRows.none(), datum=datum))
+
+
+def _check_upright(block: Block, similarity: Similarity) -> None:
+    """Raise InputError where the photographs would look at the sky.
+
+    A flight is about level, so that mirrored positions fit a block that is turned over as well as the true ones fit it.
+    """
+    ahead = -np.asarray(block.start.unknowns.exterior.camera_from_object, float)[:, 2] @ similarity.turn.T
+    if float(np.median(ahead[:, 2])) > _LOOK_UP:
+        raise InputError(
+            "with these positions the photographs would look at the sky: they are mirrored, as where X and Y, or "
+            "latitude and longitude, have changed places or a sign is lost, or lie so near to a line that nothing "
+            "tells the turn about it; correct them, or leave their file out"
+        )
 
 
 def _turn_sigma(here: Float[np.ndarray, "n 3"], sigma: Float[np.ndarray, "n 3"]) -> float:

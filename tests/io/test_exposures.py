@@ -11,7 +11,7 @@ from pyproj import CRS
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing.camera_attitude import CameraAttitude, level_from_belly
 from jaxphoto.georeferencing.exposure_times import LEAP_SECONDS, WEEK_S, Taken
-from jaxphoto.georeferencing.gps import Gps, moved
+from jaxphoto.georeferencing.gps import FIX_SIGMA_M, Gps, moved
 from jaxphoto.georeferencing.map_frame import MapFrame
 from jaxphoto.io.exposures import located, read_marks, read_pos, read_table, with_exposures
 from jaxphoto.io.photographs import Photograph, photographs
@@ -248,6 +248,26 @@ def test_an_sbet_gives_positions_and_attitudes(tmp_path):
     np.testing.assert_allclose(taken[0].attitude.level_from_camera, expected, atol=1e-9)
     assert any("flight.sbet: positions of 10 photographs by interpolation" in s for s in said)
     assert any("10 are positions of the IMU, the lever arm is not known" in s for s in said)
+    assert taken[0].gps.stated_sigma_m == FIX_SIGMA_M["integrated"] and any("10 integrated" in s for s in said)
+    # Events of the antenna, two of them lost, tell the times as well; their file comes after that of the trajectory.
+    (tmp_path / "x.MRK").unlink()
+    lines = [pos_line(FLIGHT.time[k], FLIGHT.antenna(k)) for k in ALL if k not in (3, 8)]
+    (tmp_path / "z_events.pos").write_text(HEAD + "".join(lines))
+    taken, said = located([FLIGHT.photograph(k) for k in ALL], [tmp_path], heights="ellipsoid")
+    assert [p.gps.fix == "integrated" for p in taken] == [k not in (3, 8) for k in ALL], said
+    assert all(same(p.gps, c, 0.1) for p, c in zip(taken, FLIGHT.camera, strict=True) if p.gps.fix == "integrated")
+
+
+def test_a_lever_arm_that_turns_nothing_is_said(tmp_path):
+    file = read_marks(written(tmp_path / "a.MRK", "".join(FLIGHT.mark(k) for k in ALL)))
+    photographs = [FLIGHT.photograph(k) for k in ALL]
+    arm = (0.0, 0.1, 0.2)
+    said = with_exposures(photographs, [file], arm).sentences
+    assert "the lever arm is not used: positions of time marks and tables are those of the camera" in said
+    lines = "".join(pos_line(FLIGHT.time[k], FLIGHT.antenna(k)) for k in ALL)
+    events = read_pos(written(tmp_path / "e.pos", HEAD + lines))
+    said = with_exposures(photographs, [file, events], arm).sentences
+    assert "lever arms of 10 are those of the time marks, not the one given" in said[1]
 
 
 TABLE = "image,longitude_deg,latitude_deg,height_m,omega_deg,phi_deg,kappa_deg,sigma_X_m,sigma_Y_m,sigma_Z_m,fix\n"

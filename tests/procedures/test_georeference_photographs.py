@@ -9,11 +9,16 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxphoto import adjust, covariance
-from jaxphoto.errors import InputError
+from jaxphoto.errors import DatumError, InputError
 from jaxphoto.georeferencing.camera_attitude import CameraAttitude
 from jaxphoto.georeferencing.gps import Gps
 from jaxphoto.georeferencing.map_frame import MapFrame
-from jaxphoto.procedures.georeference_photographs import SIGMA_M, georeference_photographs, utm_of
+from jaxphoto.procedures.georeference_photographs import (
+    SIGMA_M,
+    georeference_photographs,
+    held_in_place,
+    utm_of,
+)
 from jaxphoto.rotation import matrix_from_omega_phi_kappa
 from tests.blocks import free_network, simulated
 
@@ -106,6 +111,32 @@ def test_positions_within_their_own_standard_deviations_contradict_nothing(state
     )
     assert np.flatnonzero(~found.used).tolist() == [6]
     assert np.median(np.abs(found.offsets_m)) < 0.3
+
+
+def test_positions_that_do_not_tell_the_turn_well_bring_the_block_to_its_place_and_hold_it_not():
+    block, truth = network()
+    position = np.asarray(truth.exterior.position)
+    found = georeference_photographs(block, recorded(position, block.images, (50.0, 50.0, 50.0)))
+    with pytest.raises(DatumError, match="as good as open"):
+        adjust(found.block)
+    held = held_in_place(found, block.datum)
+    a = adjust(held.block)
+    assert bool(a.converged) and held.block.frame.code == 32633 and not len(held.block.stations)
+    own = held.block.frame.map
+    back = MapFrame(own.code, None, ORIGIN).local(own.map(np.asarray(a.unknowns.exterior.position)))
+    assert np.abs(back - position).max() < 2.0
+    assert (
+        held_in_place(georeference_photographs(block, recorded(position, block.images, (500.0,) * 3)), block.datum)
+        is None
+    )
+
+
+def test_mirrored_positions_do_not_turn_the_block_over():
+    """As of a table whose X and Y have changed places: cameras that look up fit them as well as the true ones fit."""
+    block, truth = network()
+    mirrored = np.array(truth.exterior.position)[:, [1, 0, 2]]
+    with pytest.raises(InputError, match="would look at the sky: they are mirrored"):
+        georeference_photographs(block, recorded(mirrored, block.images))
 
 
 def test_too_few_positions_and_those_on_a_line_are_refused():

@@ -41,7 +41,9 @@ class _State(NamedTuple):
 
     photographs: list[Photograph]
     gps_s: Float[np.ndarray, "n"]
-    """Time of exposure in GPS time where a file of the receiver says it, else NaN."""
+    """Time of exposure in GPS time where time marks say it, else NaN."""
+    event_s: Float[np.ndarray, "n"]
+    """The same where an event of the receiver does."""
     camera_from_antenna_m: Float[np.ndarray, "n 3"]
     own: list[bool]
     """Whether the position is still that of the photograph's own file."""
@@ -50,19 +52,20 @@ class _State(NamedTuple):
 def with_exposures(photographs: Sequence[Photograph], files: Sequence[Exposures], arm: Arm | None = None) -> Assigned:
     """The photographs with positions, sigmas and attitudes of the files; later kinds replace earlier ones.
 
-    Time marks come first, whose times and lever arms those of positions of the antenna need: trajectories, which are
-    interpolated, and events. Tables, by name, are last. `arm` holds for positions of an antenna whose lever arm no time
-    mark says, and where no such file is there for those of the photographs' own.
+    Time marks come first, whose times and lever arms those of positions of the antenna need: events, and trajectories,
+    which are interpolated at the times of either. Tables, by name, are last. `arm` holds for positions of an antenna
+    whose lever arm no time mark says, and where no such file is there for those of the photographs' own.
     """
     n = len(photographs)
-    state = _State(list(photographs), np.full(n, np.nan), np.full((n, 3), np.nan), [True] * n)
+    state = _State(list(photographs), np.full(n, np.nan), np.full(n, np.nan), np.full((n, 3), np.nan), [True] * n)
     said: list[str] = []
-    for file in sorted(files, key=lambda f: 2 if f.names else 0 if f.sequence is not None else 1):
+    track = lambda f: len(f.rows) > _TRACK * n or f.aircraft_deg is not None  # noqa: E731
+    for file in sorted(files, key=lambda f: 3 if f.names else 0 if f.sequence is not None else 1 + track(f)):
         if file.names:
             state, sentence = _by_name(state, file)
         elif file.sequence is not None:
             state, sentence = _marked(state, file)
-        elif len(file.rows) > _TRACK * n or file.aircraft_deg is not None:
+        elif track(file):
             state, sentence = _along(state, file, arm)
         else:
             state, sentence = _events(state, file, arm)
@@ -70,6 +73,8 @@ def with_exposures(photographs: Sequence[Photograph], files: Sequence[Exposures]
     if arm is not None and any(state.own) and not any(f.of_antenna for f in files):
         state, sentence = _own_arm(state, arm)
         said.append(sentence)
+    elif arm is not None and not any(f.of_antenna for f in files):
+        said.append("the lever arm is not used: positions of time marks and tables are those of the camera")
     return Assigned(state.photographs, said)
 
 
@@ -95,12 +100,13 @@ def _events(state: _State, file: Exposures, arm: Arm | None) -> tuple[_State, st
     if other := _of_another_flight(state, file, found.exposure) or _of_another_day(state, file, found):
         return state, other
     new, armed = _at_camera(state, file, found.exposure, arm)
+    new = new._replace(event_s=np.where(found.exposure >= 0, file.time_s[found.exposure], state.event_s))
     return new, f"{joined_words(state.photographs, file, found, clock)}; {armed}"
 
 
 def _along(state: _State, file: Exposures, arm: Arm | None) -> tuple[_State, str]:
-    """A trajectory, at times that the receiver's marks say, or photographs to the millisecond."""
-    times = state.gps_s
+    """A trajectory, at times that the receiver's marks or events say, or photographs to the millisecond."""
+    times = np.where(np.isfinite(state.gps_s), state.gps_s, state.event_s)
     if not np.isfinite(times).any():
         clock = clock_of(state.photographs)
         exact = [clock.gps and bool(p.taken and p.taken.resolution_s <= _EXACT_S) for p in state.photographs]
@@ -108,7 +114,7 @@ def _along(state: _State, file: Exposures, arm: Arm | None) -> tuple[_State, str
     if not np.isfinite(times).any():
         return state, (
             "a trajectory needs the time of every exposure to the millisecond, and there are neither time marks nor "
-            "photographs that say it; not used"
+            "events nor photographs that say it; not used"
         )
     if file.time_s.max() < 2 * WEEK_S:
         file = file._replace(time_s=file.time_s + WEEK_S * np.floor(np.nanmin(times) / WEEK_S))
@@ -151,7 +157,7 @@ def _taken_over(state: _State, file: Exposures, exposure: Int[np.ndarray, "n"]) 
         gps_s[i] = file.time_s[k] if np.isfinite(file.time_s[k]) else gps_s[i]
         if file.camera_from_antenna_m is not None:
             arms[i] = file.camera_from_antenna_m[k]
-    return _State(photographs, gps_s, arms, own)
+    return _State(photographs, gps_s, state.event_s, arms, own)
 
 
 def _at_camera(state: _State, file: Exposures, exposure: Int[np.ndarray, "n"], arm: Arm | None) -> tuple[_State, str]:
@@ -175,7 +181,8 @@ def _at_camera(state: _State, file: Exposures, exposure: Int[np.ndarray, "n"], a
         else:
             none += 1
         photographs[i], own[i] = photograph._replace(gps=gps), False
-    parts = [f"lever arms of {marked} are those of the time marks"] if marked else []
+    instead = ", not the one given" if arm is not None else ""
+    parts = [f"lever arms of {marked} are those of the time marks{instead}"] if marked else []
     parts += [f"the lever arm of {given} is as given"] if given else []
     if none:
         why = "--lever-arm gives it" if arm is None else "no attitude of the aircraft turns it"

@@ -13,14 +13,14 @@ def read_sbet_exposures(path: Path) -> Exposures:
     """The records of an SBET, seconds of the GPS week as its times. Raises InputError as `read_sbet`."""
     records = sbet_records(read_sbet(path), path.name)
     n = len(records.time)
-    unknown: Fix = "unknown"
+    fix: Fix = "integrated"
     return Exposures(
         path.name,
         np.arange(1, n + 1),
         records.time,
         records.coordinates,
         np.full((n, 3), np.nan),
-        (unknown,) * n,
+        (fix,) * n,
         "ellipsoid",
         of_antenna=True,
         aircraft_deg=records.roll_pitch_yaw_deg,

@@ -59,5 +59,5 @@ def counts(photographs: Sequence[Photograph], file: Exposures, exposure: Int[np.
 def fixes(file: Exposures, exposure: Int[np.ndarray, "n"]) -> str:
     """How many solutions are of which kind."""
     kinds = [file.fix[k] for k in exposure if k >= 0]
-    parts = [f"{kinds.count(kind)} {kind}" for kind in ("fixed", "float", "single") if kind in kinds]
+    parts = [f"{kinds.count(kind)} {kind}" for kind in ("fixed", "float", "single", "integrated") if kind in kinds]
     return f", {', '.join(parts)}" if parts else ""

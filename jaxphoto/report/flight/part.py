@@ -61,7 +61,12 @@ def _findings(part: FlightPart) -> Iterator[Finding]:
     if part.controlled:
         yield from control_findings(part.controlled)
     if part.why_not and not part.controlled:
-        yield Finding(Level.WARNING, f"the block has a frame and a scale of its own: {part.why_not}")
+        frame = (
+            "lies where its positions bring it, but is not held by them"
+            if part.placed
+            else "has a frame and a scale of its own"
+        )
+        yield Finding(Level.WARNING, f"the block {frame}: {part.why_not}")
     if part.placed and not part.placed.used.all():
         n = int((~part.placed.used).sum())
         yield Finding(Level.WARNING, f"{n} of {len(part.placed.used)} recorded positions contradict the others")

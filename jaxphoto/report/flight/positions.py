@@ -33,6 +33,8 @@ def positions_section(report: PartReport, taken: Mapping[str, Moment]) -> Iterat
     if not part.placed:
         yield Paragraph(f"No recorded position is used: {part.why_not or 'there are none'}.")
         return
+    if part.why_not:
+        yield Paragraph(f"They have brought the block to its place, but are not observed: {part.why_not}.")
     table = report.images
     used = table[table["position"] == "used"]
     n = table["position"].value_counts()
