@@ -55,8 +55,9 @@ def plausible_positions(positions: Mapping[str, Gps | None]) -> tuple[Positions,
     if nowhere:
         said.append(f"the positions of {_named(nowhere)} are (0, 0), which receivers write without one: not used")
     if absent:
-        some = f"{len(positions)} photographs have no position"
-        said.append(f"{_named(absent)} of {some}" if len(absent) < len(positions) else f"all {some}")
+        n, have = len(positions), "have" if len(absent) > 1 else "has"
+        some = f"{len(absent)} of {n} photographs {have} no position ({few(absent)})"
+        said.append(some if len(absent) < n else f"all {n} photographs have no position")
     return found, said
 
 
@@ -128,7 +129,7 @@ def _joined(positions: Positions, zero: Mapping[str, float]) -> tuple[Positions,
             found |= {n: g._replace(altitude_m=None) for n in names if (g := found[n])}
             said.append(
                 f"the heights of {_named(names)} are {HEIGHTS[kind]}, those of most {HEIGHTS[usual]}, and nothing "
-                "tells how far these are apart: not used"
+                "tells how far these are apart: the former are not used (--heights says above what they are)"
             )
             continue
         else:

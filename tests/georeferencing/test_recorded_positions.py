@@ -21,7 +21,7 @@ def test_what_cannot_be_is_named_and_what_changed_places_is_changed_back():
         "the positions of far are more than 50 km from the others",
         "latitude and longitude of swapped have changed places",
         "the positions of zero are (0, 0)",
-        "none of 12 photographs have no position",
+        "1 of 12 photographs has no position (none)",
     ):
         assert sum(words in s for s in said) == 1, said
     assert plausible_positions({"a": HERE}) == ({"a": HERE}, [])

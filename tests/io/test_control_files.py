@@ -58,6 +58,21 @@ def test_the_reference_pane_of_metashape(tmp_path):
     assert np.isnan(points.sigma_m[1]).all() and system_of(points.system, "a").code == 32633
 
 
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ("G1,10.0,2O.0,30.0,0.02,0.03", "a, row 1: Y is '2O.0', not a number"),
+        ("G1,10.0,20.0", "a, row 1: 3 cells, where most rows have 6"),
+    ],
+)
+def test_one_bad_row_of_a_table_without_header_is_named(tmp_path, wrong, words):
+    rows = [wrong, *(f"G{k},{k}.0,20.0,30.0,0.02,0.03" for k in range(2, 6))]
+    with pytest.raises(InputError, match=words):
+        read(tmp_path, "\n".join(rows))
+    with pytest.raises(InputError, match="this is no file of control"):
+        read(tmp_path, "\n".join(["who,knows,what,this,may,be", *rows[1:]]))
+
+
 def test_pix4d_without_headers_is_in_the_order_of_the_axes(tmp_path):
     points, marks = read(tmp_path, files.PIX4D, files.PIX4D_MARKS)
     np.testing.assert_array_equal(points.sigma_m[0], (0.02, 0.02, 0.03))

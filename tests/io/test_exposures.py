@@ -446,7 +446,7 @@ def test_a_folder_of_pictures_and_all_that_lies_in_it(tmp_path):
     for words in (
         "DJI_0004 have changed places",
         "DJI_0005 are (0, 0)",
-        "DJI_0006 of 10 photographs have no position",
+        "1 of 10 photographs has no position (DJI_0006)",
         "DJI_0007 are above take-off",
     ):
         assert sum(words in s for s in said) == 1, said

@@ -68,7 +68,11 @@ SPOILT = {
     "doubled": (lambda f: shutil.copy(f / "DJI_0002.jpg", f / "DJI_0002 (1).jpg"), "it is a copy of DJI_0002", ()),
     "screenshot": (lambda f: Image.new("RGB", (640, 480)).save(f / "s.png"), "s.png: its size is 640 x 480 px", ()),
     "other camera": (lambda f: picture(f, 4, model="Other"), "its camera is Maker Other", ("DJI_0005",)),
-    "without a position": (lambda f: picture(f, 4, ()), "DJI_0005 of 10 photographs have no position", ("DJI_0005",)),
+    "without a position": (
+        lambda f: picture(f, 4, ()),
+        "1 of 10 photographs has no position (DJI_0005)",
+        ("DJI_0005",),
+    ),
     "at (0, 0)": (lambda f: picture(f, 4, (0.0, 0.0)), "DJI_0005 are (0, 0)", ("DJI_0005",)),
     "swapped": (lambda f: picture(f, 4, FLIGHT.camera[4][1::-1]), "DJI_0005 have changed places", ()),
     "far away": (lambda f: picture(f, 4, FAR), "DJI_0005 are more than 50 km from the others", ("DJI_0005",)),

@@ -71,12 +71,17 @@ def mark_columns(header: Sequence[str]) -> Columns | None:
 def columns_without_header(records: Sequence[Sequence[str]]) -> tuple[str, Columns] | None:
     """Whether rows without a header, as Pix4D writes them, are "points" or "marks", and the columns; None for neither.
 
-    The first cell of a mark is the name of a picture.
+    The first cell of a mark is the name of a picture. More than half of the rows decide, so that what is wrong in the
+    others is named; a first row without any number is a header that nobody knows.
     """
     width = {len(r) for r in records}
-    if width <= {4, 5} and all(_PICTURE.search(r[0]) and all(map(is_number, r[2:])) for r in records):
+    if not any(map(is_number, records[0][1:])):
+        return None
+    marks = sum(bool(_PICTURE.search(r[0])) and all(map(is_number, r[2:])) for r in records)
+    if width <= {4, 5} and 2 * marks > len(records):
         return "marks", dict(zip(("image", "point", "x", "y", "sigma"), range(max(width)), strict=False))
-    if width <= {4, 6} and len(width) == 1 and all(all(map(is_number, r[1:])) for r in records):
+    points = sum(all(map(is_number, r[1:])) for r in records)
+    if width <= {4, 6} and len(width) == 1 and 2 * points > len(records):
         names = ("point", "x", "y", "z", "sigma_plan", "sigma_z")
         return "points", dict(zip(names, range(max(width)), strict=False))
     return None

@@ -7,11 +7,12 @@ upper-left one is (0.5, 0.5): Pix4D says no more than that the origin is the upp
 
 import csv
 import re
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
 
-from jaxphoto.errors import InputError, quoted
+from jaxphoto.errors import InputError, counted, quoted
 from jaxphoto.io.control_files.rows import Cells, Mark, SurveyRows, read_marks
 from jaxphoto.io.control_files.table_header import (
     Columns,
@@ -57,8 +58,15 @@ def read_table(path: Path, lines: list[str], rows: list[int]) -> SurveyedPoints 
             return _marks(own, marks, separator)
         if points and (is_row or max(points[name] for name in ("point", "x", "y")) < width):
             return read_points(own, points, separator, "".join(said[:1]), bool(in_degrees(header, points)))
-    found = columns_without_header(with_points(cells, separator).records) if cells.records else None
+    records = with_points(cells, separator).records
+    found = columns_without_header(records) if records else None
     if found is None:
+        usual = Counter(map(len, records)).most_common(1)[0][0] if records else 0
+        odd = [k for k, r in enumerate(records) if len(r) != usual]
+        if 2 * len(odd) < len(records) and columns_without_header([r for r in records if len(r) == usual]):
+            raise cells.bad(
+                odd[0], f"{counted(len(records[odd[0]]), 'cell')}, where most rows have {usual}; complete it"
+            )
         first = f" (it begins with {quoted(' '.join(cells.records[0]))})" if cells.records else ""
         raise cells.none(
             f"this is no file of control{first}: give points (point, X_m, Y_m, Z_m), marks (image, point, x_px, y_px), "
