@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxphoto.adjustment import Adjustment
+from jaxphoto.block import Block
 from jaxphoto.camera import InteriorOrientation, Sensor
 from jaxphoto.errors import BlockError, DatumError, InputError, RankError
 from jaxphoto.georeferencing.camera_attitude import CameraAttitude
@@ -17,6 +18,7 @@ from jaxphoto.procedures.control import ControlledBlock, rejudged
 from jaxphoto.procedures.control.of_flight import FlightControl, controlled_or_why, parts_with_marks
 from jaxphoto.procedures.georeference_photographs import (
     GeoreferencedPhotographs,
+    as_they_scatter,
     georeference_photographs,
     held_in_place,
 )
@@ -150,9 +152,7 @@ def _calibrated(
     except (InputError, BlockError, DatumError, RankError) as error:
         if placed is None:
             raise
-        # Positions that do not tell the frame, or too badly: the calibration does without.
-        placed, why_not = held_in_place(placed, oriented.block.datum), str(error)
-        adjusted = adjust_for_tables(placed.block if placed else oriented.block)
+        placed, why_not, adjusted = _placed_otherwise(placed, known.positions, oriented.block, error)
     metric = bool(controlled or (placed and not why_not))
     adjusted, why_still = _rolling(adjusted, known.taken, metric)
     components = None
@@ -175,6 +175,19 @@ def _calibrated(
         lens.sentences(oriented.block, CAMERA) if lens else (),
         why_still,
     )
+
+
+def _placed_otherwise(
+    placed: GeoreferencedPhotographs, positions: Mapping[str, Gps | None], block: Block, error: Exception
+) -> tuple[GeoreferencedPhotographs | None, str, Adjustment]:
+    """The calibration where positions do not tell the frame, or too badly: by how they scatter, else without them."""
+    if isinstance(error, DatumError) and (better := as_they_scatter(placed, positions)):
+        try:
+            return better, "", adjust_for_tables(better.block)
+        except (InputError, BlockError, DatumError, RankError) as again:
+            error = again
+    held = held_in_place(placed, block.datum)
+    return held, str(error), adjust_for_tables(held.block if held else block)
 
 
 def _rolling(adjusted: Adjustment, taken: Mapping[str, Moment] | None, metric: bool) -> tuple[Adjustment, str]:

@@ -42,6 +42,8 @@ _LEAST = 3
 _LEAST_TURNED = 2
 # A block whose turn positions tell no better is better off in a frame of its own than in a map.
 _HELD_RAD = 0.3
+# Fewer positions than this do not tell how they scatter, and what is below (m) is luck.
+_SCATTER, _FINEST_M = 6, 0.05
 # Cameras of a flight look down or ahead; some up, on average by 30 degrees, only where the block stands on its head.
 _LOOK_UP = 0.5
 
@@ -126,6 +128,32 @@ def georeference_photographs(
         *attitude_words(recorded, helping is not None, similarity.turn),
     )
     return GeoreferencedPhotographs(placed, tuple(known), offsets, used, said)
+
+
+def as_they_scatter(
+    placed: GeoreferencedPhotographs, positions: Mapping[str, Gps | None]
+) -> GeoreferencedPhotographs | None:
+    """The same where positions that no file calls good scatter less than was taken: with that as standard deviations.
+
+    Of the similarity's seven parameters four are of plan and three of height. None where a file says how good positions
+    are, for too few of them, and where they are as poor as was taken.
+    """
+    names = [name for name, used in zip(placed.images, placed.used, strict=True) if used]
+    off, n = placed.offsets_m[placed.used], len(names)
+    if n < _SCATTER or any((gps := positions[name]) and gps.stated_sigma_m for name in names):
+        return None
+    plan = max(float(np.sqrt(np.sum(off[:, :2] ** 2) / (2 * n - 4))), _FINEST_M)
+    height = max(float(np.sqrt(np.sum(off[:, 2] ** 2) / (n - 3))), _FINEST_M)
+    if plan >= SIGMA_M[0] or height >= SIGMA_M[2]:
+        return None
+    stations = placed.block.stations
+    sigma = np.array([plan, plan, height])[np.asarray(stations.axis)]
+    block = dataclasses.replace(placed.block, stations=dataclasses.replace(stations, sigma=sigma))
+    said = (
+        f"they scatter about the network by {plan:.2g} m in plan and {height:.2g} m in height, which is taken: with "
+        "more the turn of so small a block were open"
+    )
+    return placed._replace(block=block, sentences=(*placed.sentences, said))
 
 
 def held_in_place(placed: GeoreferencedPhotographs, datum: Datum) -> GeoreferencedPhotographs | None:

@@ -15,6 +15,7 @@ from jaxphoto.georeferencing.gps import Gps
 from jaxphoto.georeferencing.map_frame import MapFrame
 from jaxphoto.procedures.georeference_photographs import (
     SIGMA_M,
+    as_they_scatter,
     georeference_photographs,
     held_in_place,
     utm_of,
@@ -129,6 +130,21 @@ def test_positions_that_do_not_tell_the_turn_well_bring_the_block_to_its_place_a
         held_in_place(georeference_photographs(block, recorded(position, block.images, (500.0,) * 3)), block.datum)
         is None
     )
+
+
+def test_positions_that_scatter_less_than_is_taken_for_granted_hold_a_small_block():
+    """A block of metres: 2 m tell no turn of it, the decimetre by which its positions scatter does."""
+    block, truth = network()
+    rng, small = np.random.default_rng(3), np.asarray(truth.exterior.position) / 50.0
+    known = recorded(small + rng.normal(0, [0.1, 0.1, 0.2], small.shape), block.images)
+    found = georeference_photographs(block, known)
+    with pytest.raises(DatumError, match="as good as open"):
+        adjust(found.block)
+    better = as_they_scatter(found, known)
+    sigma = np.asarray(better.block.stations.sigma)[:3]
+    assert 0.05 < sigma[0] < 0.2 and 0.08 < sigma[2] < 0.4 and "which is taken" in better.sentences[-1]
+    assert bool(adjust(better.block).converged)
+    assert as_they_scatter(found, {n: g._replace(sigma_m=(1.0, 1.0, 1.0)) for n, g in known.items()}) is None
 
 
 def test_mirrored_positions_do_not_turn_the_block_over():
