@@ -27,8 +27,8 @@ def sound_photographs(paths: Sequence[str | Path]) -> tuple[list[Photograph], di
 
     Of a folder all pictures, in the order of their names. Left out, a sentence each: what is no picture or is cut off,
     a second of the same name, one that is another's copy byte for byte (of the two that whose name is less like those
-    of the others, then the longer one), and those that differ from most in what `ONE_CAMERA` names.
-    Raises InputError for what is neither file nor folder, and where nothing is left.
+    of the others, then the longer one) or that was changed since, and those that differ from most in what `ONE_CAMERA`
+    names. Raises InputError for what is neither file nor folder, and where nothing is left.
     """
     files = pictures_in(paths)
     if missing := [file for file in files if not file.is_file()]:
@@ -60,7 +60,8 @@ def sound_photographs(paths: Sequence[str | Path]) -> tuple[list[Photograph], di
             del read[twin.name]
         content[digest] = read[photograph.name] = photograph
     left |= {str(file): f"{file}: it is a copy of {content[digest].path.name}" for file, digest in copies.items()}
-    kept = list(read.values())
+    left |= _edited(read)
+    kept = [p for p in read.values() if str(p.path) not in left]
     for what, of, _ in ONE_CAMERA:
         said = [of(p) for p in kept]
         usual = collections.Counter(v for v in said if v is not None).most_common(1)
@@ -110,6 +111,17 @@ def _hints(paths: Sequence[str | Path]) -> list[str]:
             "the lens"
         )
     return hints
+
+
+def _edited(read: dict[str, Photograph]) -> dict[str, str]:
+    """Copies that were changed: "DJI_0002-edited" beside "DJI_0002", taken at the same time in the same place."""
+    left = {}
+    for name, own in read.items():
+        for other in (other for other in read.values() if name.startswith(other.name) and name != other.name):
+            same = (own.taken, own.gps) == (other.taken, other.gps) != (None, None)
+            if same and not name[len(other.name)].isalnum():
+                left[str(own.path)] = f"{own.path}: it is {other.path.name} again, changed: of the same time and place"
+    return left
 
 
 def _series(name: str) -> str:

@@ -44,6 +44,16 @@ def test_of_several_copies_each_names_the_one_that_is_kept(folder):
     assert len(left) == 2 and all(why.endswith(": it is a copy of 2.jpg") for why in left.values())
 
 
+def test_a_copy_that_was_changed_is_left_out(folder):
+    """Not byte for byte, and not where only the name says so: 1 and 1-b are of two places."""
+    for quality, (name, of) in enumerate((("2-edited", 2), ("21", 2), ("1-b", 3)), 50):
+        picture = Image.open(folder / f"{of}.jpg")
+        picture.save(folder / f"{name}.jpg", exif=picture.getexif(), xmp=picture.info["xmp"], quality=quality)
+    kept, left = sound_photographs([folder])
+    assert [p.name for p in kept] == ["0", "1-b", "1", "2", "21", "3"]
+    assert list(left.values()) == [f"{folder / '2-edited.jpg'}: it is 2.jpg again, changed: of the same time and place"]
+
+
 def test_of_copies_that_is_kept_whose_name_is_as_those_of_the_others(tmp_path, folder):
     for k in range(4):
         (folder / f"{k}.jpg").rename(folder / f"DJI_000{k}.jpg")
