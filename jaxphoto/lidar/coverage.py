@@ -16,6 +16,8 @@ _GAP = 2.5
 _FLYING = 1.0
 # Records to either side of a gap that tell how fast the scanner flies.
 _BESIDE = 20
+# Cosine of half the angle (30 degrees) that an aircraft may turn from one record to the next where its clock jumps.
+_STRAIGHT = 0.966
 _START = "a start of their own"
 
 
@@ -157,6 +159,10 @@ class CoveredTimes:
     def _jump(self, record: int) -> float | None:
         """By how much (s) the clock jumps in the gap after a record; None where records are lost."""
         time, position = np.asarray(self._trajectory.time), np.asarray(self._trajectory.position)
+        before, after = np.asarray(self._trajectory.quaternion)[record : record + 2]
+        if abs(before @ after) < _STRAIGHT:
+            # It turned, and is back where the last strip ended.
+            return None
         near = slice(max(record - _BESIDE, 0), record + _BESIDE + 2)
         lasts = np.diff(time[near])
         moves = np.linalg.norm(np.diff(position[near], axis=0), axis=1)

@@ -24,6 +24,7 @@ _NAMES = {"c": "c", "xp": "x_p", "yp": "y_p", "k1": "K1"}
 # Of an hour: a shorter flight is told in minutes.
 _HOURS = 1.5
 _UM = 1e3
+_LARGE_MM = 0.0995
 
 
 def drift_findings(tables: Tables) -> Iterator[Finding]:
@@ -76,7 +77,7 @@ def differences_words(found: CameraDifferences) -> str:
 
 def _least(names: Sequence[str], sizes: Sequence[float]) -> str:
     return ", ".join(
-        f"{of_sigma(_factor(name) * size)}{_unit(name)} of {_NAMES[name]}"
+        f"{of_sigma(_factor(name, size) * size)}{_unit(name, size)} of {_NAMES[name]}"
         if math.isfinite(size)
         else f"no change of {_NAMES[name]} at all"
         for name, size in zip(names, sizes, strict=True)
@@ -84,8 +85,9 @@ def _least(names: Sequence[str], sizes: Sequence[float]) -> str:
 
 
 def _signed(name: str, test: ZeroTest, k: int) -> str:
-    value, sigma = (_factor(name) * float(v) for v in (test.value[k], test.sigma[k]))
-    return f"{with_sigma(value, sigma)} +- {of_sigma(sigma)}{_unit(name)}"
+    size = float(test.sigma[k])
+    value, sigma = (_factor(name, size) * float(v) for v in (test.value[k], test.sigma[k]))
+    return f"{with_sigma(value, sigma)} +- {of_sigma(sigma)}{_unit(name, size)}"
 
 
 def _change(drift: CameraDrift, k: int) -> str:
@@ -102,9 +104,10 @@ def _span(drift: CameraDrift) -> str:
     return f"{drift.span:.2g} h" if drift.span > _HOURS else f"{60 * drift.span:.2g} min"
 
 
-def _factor(name: str) -> float:
-    return 1.0 if name == "k1" else _UM
+def _factor(name: str, size: float) -> float:
+    return 1.0 if name == "k1" or size >= _LARGE_MM else _UM
 
 
-def _unit(name: str) -> str:
-    return "" if name == "k1" else " um"
+def _unit(name: str, size: float) -> str:
+    """In which `size` (mm) is told in two digits: no more micrometres than these."""
+    return "" if name == "k1" else " mm" if size >= _LARGE_MM else " um"

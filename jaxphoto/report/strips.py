@@ -21,6 +21,8 @@ from jaxphoto.statistics.global_test import global_test
 _OF_POINTS = (PHOTOGRAPHS, CONTROL, CHECK)
 # Times their noise by which strips may be off surveyed points, of a few by this number of standard deviations.
 _FAR, _BEYOND = 2.0, 3.0
+# Times what is expected from which on what was given contradicts itself, and nothing found of it is of use.
+_CONTRADICTS = 10.0
 # From jaxphoto's units of a knot (m, rad) to those of files.
 _IN_FILES = np.array([1.0, 1.0, 1.0, 180 / np.pi, 180 / np.pi, 180 / np.pi])
 
@@ -127,7 +129,7 @@ def _of_surveyed(result: StripAdjustment) -> Iterator[Finding]:
         rms, noise, planes = told["rms_m"], told["noise_m"], told["planes"]
         far = rms > max(_FAR, 1 + _BEYOND / np.sqrt(2 * planes)) * noise
         yield Finding(
-            Level.WARNING if far else Level.INFORMATION,
+            Level.ALARM if rms > _CONTRADICTS * noise else Level.WARNING if far else Level.INFORMATION,
             f"{what.replace('_', ' ')} {rms:.3f} m off the strips (RMS of {planes} planes), {told['rms_before_m']:.3f} "
             f"m before; plane and survey let expect {noise:.3f}"
             + (": look at the points, at their standard deviations, and at those of the trajectory" if far else ""),
@@ -173,7 +175,9 @@ def _of_strips(result: StripAdjustment) -> Iterator[Finding]:
                 "large" if small else "small, or knots too far apart"
             )
         said = f"sigma naught {whole.factor**0.5:.3g}, expected 1 ({p_words(whole.p_value)})"
-        yield Finding(Level.WARNING, f"{said}: {why}")
+        # Shifts alone leave what the trajectory is off by, and may be all that there is.
+        absurd = result.trajectory is not None and whole.factor > _CONTRADICTS**2
+        yield Finding(Level.ALARM if absurd else Level.WARNING, f"{said}: {why}")
 
 
 def print_strips(result: StripAdjustment, console: Console) -> None:

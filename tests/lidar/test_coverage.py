@@ -74,6 +74,15 @@ def test_a_clock_that_jumps_inside_a_strip():
     assert "a gap of 1.010 s, from 60.000 to 61.010 s" in message and "take 1.000 s off its times" in message
 
 
+def test_a_turn_that_ends_where_it_began_is_no_jump_of_a_clock():
+    """As where the trajectory has the strips alone, each a little too short."""
+    time, there = np.concatenate([TIME[:3000], TIME[4000:]]), np.concatenate([TIME[:3000], TIME[3000:-1000][::-1]])
+    path = flown(time, np.where(time < 40, there, 30.0 - (time - 40.0)))
+    back = np.where(time[:, None] < 40, path.quaternion, np.sqrt([0.5, 0, 0, 0.5]))
+    message = said(CLOUD, dataclasses.replace(path, quaternion=back))
+    assert "a gap of 10.010 s, from 29.990 to 40.000 s" in message and "records of this time" in message
+
+
 def test_a_trajectory_that_begins_late_or_ends_early():
     message = said(CLOUD, flown(TIME[1200:7200]))
     assert "from 10.000 to 80.000 s, and the trajectory, from 12.000 to 71.990 s" in message

@@ -207,6 +207,10 @@ def test_what_cannot_be_adjusted():
         adjust_strips(cloud, flight.trajectory)
     with pytest.raises(InputError, match="strip 3 of the cloud has no points"):
         adjust_strips(dataclasses.replace(cloud, strips=("1", "2", "3")))
+    # Heights above the ellipsoid beside those above the geoid.
+    up = dataclasses.replace(cloud, xyz=cloud.xyz + cloud.strip[:, None] * np.array([0.0, 0.0, 46.0]))
+    with pytest.raises(BlockError, match=r"strip 1 lies 4[56]\.\d m below strip 2: heights of one may count in feet"):
+        adjust_strips(up, settings=COARSE)
     apart = dataclasses.replace(cloud, xyz=cloud.xyz + 1000.0 * cloud.strip[:, None])
     with pytest.raises(BlockError, match="strip 1 has fewer than 10 planes in common with any other"):
         adjust_strips(apart, settings=COARSE)

@@ -86,3 +86,6 @@ def test_what_would_have_been_seen_is_said_where_nothing_is():
         "no drift of camera kodak is seen (p = 0.6); over its 2 h this flight would have shown, with a probability of "
         "80%, 5.3 um of c, 2.1 um of x_p, no change of y_p at all"
     )
+    hardly = words(("c", "xp"), [0.1] * 2, [0.4] * 2, [0.6] * 2, [8.2, 0.0994], 0.62, 2.0)
+    assert hardly.endswith("of 80%, 8.2 mm of c, 99 um of x_p")
+    assert "c grew by 1.20 +- 0.38 mm" in words(("c",), [1.2], [0.38], [0.01], [1.1], 0.01)

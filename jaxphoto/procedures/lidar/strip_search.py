@@ -22,6 +22,8 @@ from jaxphoto.procedures.lidar.strip_rows import plane_rows, side_of, thinned
 
 # Fewer planes of a pair of strips are chance.
 _FEWEST = 10
+# No trajectory makes strips lie farther from one another (m); heights of two systems, or in feet, mostly do.
+_APART_M = 10.0
 
 
 class CommonPlanes(NamedTuple):
@@ -93,8 +95,8 @@ class StripSearch:
 
 
 def check_joined(names: Sequence[str], seen: Sequence[CommonPlanes]) -> None:
-    """Raise BlockError for a strip that no plane joins to another."""
-    apart = (found for found in seen if found.one.strip != found.other.strip)
+    """Raise BlockError for a strip that no plane joins to another, or that lies in another system than another."""
+    apart = [found for found in seen if found.one.strip != found.other.strip]
     joined = {look.strip for found in apart for look in (found.one, found.other)}
     alone = [name for k, name in enumerate(names) if k not in joined]
     if alone:
@@ -102,3 +104,11 @@ def check_joined(names: Sequence[str], seen: Sequence[CommonPlanes]) -> None:
             f"strip {alone[0]} has fewer than {_FEWEST} planes in common with any other: leave it out, take larger "
             "cells (cell_m) or rougher planes (roughness_m), or check that all strips overlap and are in one system"
         )
+    for found in apart:
+        up = float(np.median(found.pairs.gap / found.pairs.normal[:, 2]))
+        if abs(up) > _APART_M:
+            raise BlockError(
+                f"strip {found.one.name} lies {abs(up):.1f} m {'above' if up > 0 else 'below'} strip "
+                f"{found.other.name}: heights of one may count in feet or belong to another vertical system, as those "
+                "above an ellipsoid and a geoid; bring all strips and their trajectory into one"
+            )
