@@ -1,5 +1,6 @@
-"""Options that take one of a list of names: help shows the list, a shell completes it, anything else is refused."""
+"""Options that take one of a list of names, which help shows and a shell completes, or a number that is one."""
 
+import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -51,3 +52,14 @@ def place(out: Path | None, second: Path | None) -> Path:
     if told is None:
         raise InputError("nothing says where to write: add --out")
     return told
+
+
+def seconds(help: str) -> typer.models.OptionInfo:
+    """An option whose value is a finite number of seconds. Any other raises InputError before the command begins."""
+
+    def check(param: typer.CallbackParam, value: float) -> float:
+        if not math.isfinite(value):
+            raise InputError(f"{param.opts[0]} {value}: give a number of seconds")
+        return value
+
+    return typer.Option(help=help, callback=check)

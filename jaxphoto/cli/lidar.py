@@ -19,12 +19,16 @@ from jaxphoto.cli.output import Output, command
 from jaxphoto.cli.strip_flight import (
     SCANNER,
     USUAL,
+    BreaklinesOption,
     CellM,
+    ControlOption,
+    ExposureShift,
     KnotsS,
     PatternOption,
     RoughnessM,
     StripChoices,
     StripFiles,
+    TrajectoryShift,
     adjust_flight,
     scanner_priors,
 )
@@ -64,7 +68,7 @@ _MARGIN_M, _MARGIN = 100.0, 0.1
 
 # Options of `simultaneous` that say nothing with --adjust, and those that say nothing without it.
 _OF_SURFACES = "boresight", "shift", "method", "sigma_z_m", "sigma_xy_m", "sigma_systematic_m"
-_OF_PLANES = "exposure_shift_s", "pattern", "cell_m", "roughness_m", "knots_s"
+_OF_PLANES = "exposure_shift_s", "control", "breaklines", "pattern", "cell_m", "roughness_m", "knots_s"
 
 BlockFolder = Annotated[Path, typer.Argument(help="Block folder (see docs/block_folder.md).")]
 CloudFile = Annotated[Path, typer.Argument(help="Cloud: .las, .laz, .csv or .ply (see docs/clouds.md).")]
@@ -166,7 +170,7 @@ def simultaneous_command(
     trajectory: Annotated[
         Path | None, typer.Option(help="Trajectory of the scanner (docs/trajectory.md), on the cloud's clock.")
     ] = None,
-    trajectory_shift_s: Annotated[float, typer.Option(help="Cloud's time + this is the trajectory's.")] = 0.0,
+    trajectory_shift_s: TrajectoryShift = 0.0,
     boresight: Annotated[
         str | None, typer.Option(help="Of the scanner: free (with a trajectory), fixed, or its sigma in degrees.")
     ] = None,
@@ -186,9 +190,9 @@ def simultaneous_command(
         str | None,
         typer.Option(help="What is estimated of the whole flying system: scanner,trajectory,camera (docs/joint.md)."),
     ] = None,
-    exposure_shift_s: Annotated[
-        float, typer.Option(help="With --adjust: time_s of images.csv + this is the cloud's time.")
-    ] = 0.0,
+    exposure_shift_s: ExposureShift = 0.0,
+    control: ControlOption = None,
+    breaklines: BreaklinesOption = None,
     pattern: PatternOption = None,
     cell_m: CellM = USUAL.cell_m,
     roughness_m: RoughnessM = USUAL.roughness_m,
@@ -205,17 +209,8 @@ def simultaneous_command(
     _check_alone(context, _OF_PLANES if adjust is None else _OF_SURFACES)
     if adjust is not None:
         settings = StripSettings(cell_m=cell_m, roughness_m=roughness_m, knots_s=knots_s)
-        files = StripFiles(
-            cloud,
-            trajectory,
-            trajectory_shift_s,
-            block,
-            exposure_shift_s,
-            class_numbers(classes),
-            returns,
-            cloud_epsg,
-            cloud_unit,
-        )
+        times, seen = (trajectory_shift_s, block, exposure_shift_s), (class_numbers(classes), returns)
+        files = StripFiles(cloud, trajectory, *times, *seen, cloud_epsg, cloud_unit, control, breaklines)
         adjust_flight(output, context, files, _of_flight(adjust, pattern, settings, max_rounds), out)
         return
     surfaces = _settings(sigma_z_m, sigma_xy_m, sigma_systematic_m)

@@ -3,7 +3,8 @@
 The cloud passes part by part, and what its planes need of it is kept in memory.
 """
 
-from collections.abc import Callable, Collection, Iterator
+import fnmatch
+from collections.abc import Callable, Collection, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
@@ -13,7 +14,7 @@ import typer
 from jaxtyping import Float
 
 from jaxphoto.block import Block, Frame
-from jaxphoto.cli.choices import one_of
+from jaxphoto.cli.choices import one_of, seconds
 from jaxphoto.cli.cloud_progress import CloudProgress
 from jaxphoto.cli.control_in_frame import control_in_frame
 from jaxphoto.cli.corrected_cloud import write_corrected
@@ -69,8 +70,22 @@ PatternOption = Annotated[
         "all around, as of risley prisms or nutating mirrors.",
     ),
 ]
+TrajectoryShift = Annotated[float, seconds("Cloud's time + this is the trajectory's.")]
+ExposureShift = Annotated[
+    float, seconds("Of photographs adjusted with the strips: time_s of images.csv + this is the cloud's time.")
+]
 CellM = Annotated[float, typer.Option(help="Side of the cells in which planes are sought.")]
 RoughnessM = Annotated[float, typer.Option(help="Most that the returns of a plane scatter about it.")]
+BreaklinesOption = Annotated[
+    str | None,
+    typer.Option(
+        help="Tie points on breaklines, such as ridges of roofs, by commas; * stands for any letters (docs/joint.md)."
+    ),
+]
+ControlOption = Annotated[
+    Path | None,
+    typer.Option(help="Surveyed points on smooth surfaces (docs/control.md), which strips are to go through."),
+]
 KnotsS = Annotated[float, typer.Option(help="From knot to knot of the trajectory's errors.")]
 
 
@@ -90,6 +105,8 @@ class StripFiles(NamedTuple):
     unit: str | None
     control: Path | None = None
     """Surveyed points, in the cloud's system."""
+    breaklines: str | None = None
+    """Tie points of the photographs on breaklines, as `BreaklinesOption` has them."""
 
 
 class StripChoices(NamedTuple):
@@ -115,6 +132,8 @@ def scanner_priors(free: Collection[str], pattern: str | None) -> ScannerPriors:
 def adjust_flight(output: Output, context: typer.Context, flight: StripFiles, choices: StripChoices, out: Path) -> None:
     """Adjust the strips of a flight and its photographs; write the results, say them, and exit with 1 if red."""
     cloud, trajectory, block = flight.cloud, flight.trajectory, flight.block
+    if flight.breaklines is not None and block is None:
+        raise InputError("--breaklines names points of photographs: give their block (--block), or leave it out")
     settings, priors = choices.settings, choices.priors
     check_folder(out, cloud, *(path for path in (trajectory, block, flight.control) if path is not None))
     with output.progress.status("reading the cloud") as status:
@@ -123,7 +142,8 @@ def adjust_flight(output: Output, context: typer.Context, flight: StripFiles, ch
         if block is not None:
             read = read_block(block)
             posed = interior_held(read) if choices.camera_held else read
-            photographs = Photographs(posed, exposure_times(block) + flight.exposure_shift_s)
+            times = exposure_times(block) + flight.exposure_shift_s
+            photographs = Photographs(posed, times, _named(read.points, flight.breaklines))
             frame = photographs.block.frame
         records = path = None
         if trajectory is not None:
@@ -252,6 +272,16 @@ def _about(records: Records, system: CoordinateSystem, cloud: Path) -> Frame:
         )
     longitude, latitude, height = records.coordinates[len(records.time) // 2].tolist()
     return Frame("epsg", code, origin=(longitude, latitude, height))
+
+
+def _named(points: Sequence[str], text: str | None) -> tuple[str, ...]:
+    """The points that names or patterns by commas mean. Raises InputError for one that means none."""
+    parts = [part.strip() for part in (text or "").split(",") if part.strip()]
+    named = {part: [name for name in points if fnmatch.fnmatchcase(name, part)] for part in parts}
+    for part, found in named.items():
+        if not found:
+            raise InputError(f"--breaklines {part}: no point of the block is called so; correct the name")
+    return tuple(dict.fromkeys(name for found in named.values() for name in found))
 
 
 def _about_where(block: Block) -> Float[np.ndarray, "points 3"]:

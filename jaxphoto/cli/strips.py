@@ -11,12 +11,16 @@ from jaxphoto.cli.output import Output, command
 from jaxphoto.cli.strip_flight import (
     SCANNER,
     USUAL,
+    BreaklinesOption,
     CellM,
+    ControlOption,
+    ExposureShift,
     KnotsS,
     PatternOption,
     RoughnessM,
     StripChoices,
     StripFiles,
+    TrajectoryShift,
     adjust_flight,
     scanner_priors,
 )
@@ -36,7 +40,7 @@ def strips_command(
         Path | None,
         typer.Option(help="Trajectory of the scanner (docs/trajectory.md), on the cloud's clock, in its system."),
     ] = None,
-    trajectory_shift_s: Annotated[float, typer.Option(help="Cloud's time + this is the trajectory's.")] = 0.0,
+    trajectory_shift_s: TrajectoryShift = 0.0,
     adjust: Annotated[
         str | None,
         typer.Option(help=f"What of the scanner is estimated, by commas: {', '.join(SCANNER)} (boresight); or none."),
@@ -46,11 +50,9 @@ def strips_command(
         Path | None,
         typer.Option(help="Block folder of photographs taken on this trajectory, which are adjusted with the strips."),
     ] = None,
-    exposure_shift_s: Annotated[float, typer.Option(help="time_s of images.csv + this is the cloud's time.")] = 0.0,
-    control: Annotated[
-        Path | None,
-        typer.Option(help="Surveyed points on smooth surfaces (docs/control.md), which strips are to go through."),
-    ] = None,
+    exposure_shift_s: ExposureShift = 0.0,
+    control: ControlOption = None,
+    breaklines: BreaklinesOption = None,
     hold: Annotated[str, typer.Option(help="Strips whose trajectory is right, by commas.")] = "",
     cell_m: CellM = USUAL.cell_m,
     roughness_m: RoughnessM = USUAL.roughness_m,
@@ -115,6 +117,7 @@ def strips_command(
         cloud_epsg,
         cloud_unit,
         control,
+        breaklines,
     )
     settings = dataclasses.replace(settings, **given)
     choices = StripChoices(settings, set(given), _priors(adjust, pattern), held, False, max_rounds)

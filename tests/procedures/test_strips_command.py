@@ -191,6 +191,9 @@ def test_withheld_points_that_nothing_says_anything_of_stay(cloud_file, tmp_path
         (("--pattern", "zigzag"), "--pattern zigzag: there are line, circle"),
         (("--hold", "3"), "3 is no strip of the cloud, which has 1, 2"),
         (("--cell-m", "0"), "cell_m is 0, but must be positive"),
+        (("--trajectory-shift-s", "nan"), "--trajectory-shift-s nan: give a number of seconds"),
+        (("--exposure-shift-s", "inf"), "--exposure-shift-s inf: give a number of seconds"),
+        (("--breaklines", "R*"), "--breaklines names points of photographs: give their block (--block)"),
         (("--cell-m", "0.3"), "strip 1 has fewer than 10 planes in common"),
     ],
 )
@@ -260,6 +263,7 @@ def test_simultaneous_adjusts_what_it_is_told_to(tmp_path, monkeypatch, capsys):
         (("--adjust", "lens"), "--adjust lens: a flying system has scanner, trajectory and camera"),
         (("--adjust", "scanner", "--shift", "free"), "--shift is of surfaces under tie points"),
         (("--cell-m", "8"), "--cell-m is of planes in the overlaps of strips"),
+        (("--control", "control.csv"), "--control is of planes in the overlaps of strips"),
     ],
 )
 def test_options_of_the_other_way_are_refused(cloud_file, tmp_path, monkeypatch, capsys, options, sentence):

@@ -28,11 +28,13 @@ class Photographs(NamedTuple):
     """Its stations and attitudes are what the trajectory says of the exposures."""
     time: Float[np.ndarray, "images"]
     """Seconds."""
+    on_breaklines: tuple[str, ...] = ()
+    """Tie points that were measured where two smooth faces meet, such as on the ridge of a roof."""
 
 
 def check_photographs(photographs: Photographs, trajectory: Trajectory | None) -> None:
     """Raise InputError or BlockError for photographs that do not go with the trajectory."""
-    block, time = photographs
+    block, time = photographs.block, photographs.time
     if trajectory is None:
         raise InputError(
             "photographs and strips are joined by the trajectory on which both were measured: give it (--trajectory), "
@@ -98,7 +100,7 @@ def on_trajectory(
 
     They are in place of its own: the same instruments count once.
     """
-    block, time = photographs
+    block, time = photographs.block, photographs.time
     strip, knots, weights = _strip_of(time, spans), np.zeros((len(time), 4), int), np.zeros((len(time), 4))
     for k, spline in enumerate(splines):
         own = strip == k

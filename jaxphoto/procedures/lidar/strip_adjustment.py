@@ -127,8 +127,8 @@ def adjust_strips(
     Standard deviations that it states are those of its errors, in place of those of `settings`; zero states none.
 
     `photographs` that were taken on it are adjusted with them: their exposures have the trajectory's errors, and their
-    tie points lie on the planes of the strips. What of their cameras and mounts is estimated their block says; its
-    stations and attitudes are taken for the trajectory's.
+    tie points lie on the planes of the strips, those on breaklines on both that meet there. What of their cameras and
+    mounts is estimated their block says; its stations and attitudes are taken for the trajectory's.
 
     `control` are surveyed points on smooth surfaces, in the cloud's system (m): where strips have planes about them,
     these go through them. Its check points are compared alone. Without a trajectory it is the datum, too.
@@ -182,7 +182,10 @@ def adjust_strips(
     search, errors = StripSearch(cloud, path, settings, pattern), errors_of(block.start.unknowns, splines)
     first = seen = search.look(errors, settled=False)
     check_joined(names, seen)
-    ties = None if images is None else PointSearch(search, tie_points(images))
+    ties = None
+    if images is not None and photographs is not None:
+        lines = tie_points(images, photographs.on_breaklines)
+        ties = PointSearch(search, np.setdiff1d(tie_points(images), lines), lines)
     first_on = on = [] if ties is None or alone is None else ties.look(*_of(ties, alone, covariance(alone)), False)
     surveyed = None if control is None else ControlSearch(search, control, number)
     first_met = met = OnStrips([], []) if surveyed is None else surveyed.look(settled=False)
@@ -223,7 +226,7 @@ def adjust_strips(
                 + _point_differences(CHECK, first_met.check, met.check),
                 tuple(rounds),
                 still,
-                tuple(odd),
+                (*odd, *(() if ties is None else ties.unseen(on, adjusted.block.points))),
             )
         # Of a large flight gigabytes, which the next round needs.
         del adjusted, known

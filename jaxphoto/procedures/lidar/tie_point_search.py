@@ -6,8 +6,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxphoto.errors import few
 from jaxphoto.georeferencing import StripErrors
 from jaxphoto.lidar.corresponding_planes import StripPatches, fitting, planes_of
+from jaxphoto.lidar.points_on_breaklines import faces_about
 from jaxphoto.lidar.points_on_planes import PointsOnPlanes, on_planes, returns_about, windows_of_returns
 from jaxphoto.lidar.strip_correction import times_of
 from jaxphoto.observations import StripPoints
@@ -31,12 +33,20 @@ class PointPlanes(NamedTuple):
 class PointSearch:
     """Searches that follow one another: returns stay about their points when `settled`, as those of `StripSearch`.
 
-    `points` are the numbers in the block of the points looked for.
+    `points` are the numbers in the block of the points looked for: of those `on_planes`, and of each of those
+    `on_breaklines` twice, for the two faces that meet there.
     """
 
-    def __init__(self, search: StripSearch, points: Int[np.ndarray, "points"]) -> None:
-        self.search, self.points = search, points
-        self.about: list[tuple[np.ndarray, np.ndarray]] = []
+    def __init__(
+        self,
+        search: StripSearch,
+        on_planes: Int[np.ndarray, "plain"],
+        on_breaklines: Int[np.ndarray, "lines"] | None = None,
+    ) -> None:
+        lines = np.zeros(0, int) if on_breaklines is None else on_breaklines
+        self.search, self.points = search, np.concatenate([on_planes, np.repeat(lines, 2)])
+        self._plain = len(on_planes)
+        self.about: list[tuple[np.ndarray, ...]] = []
 
     def look(
         self, place: Float[np.ndarray, "points 3"], spread: Float[np.ndarray, "points 3 3"], settled: bool
@@ -44,7 +54,7 @@ class PointSearch:
         """The planes about points (m) with these covariances, in the strips as the other search corrected them last."""
         search, about, seen = self.search, [], []
         for k, (own, xyz) in enumerate(zip(search.looks, search.corrected, strict=True)):
-            about.append(self.about[k] if settled else returns_about(xyz, place, search.settings))
+            about.append(self.about[k] if settled else self._about(xyz, place))
             index, point = about[-1]
             measured, time = search.cloud.xyz[own.returns], times_of(search.cloud)[own.returns]
             patches = planes_of(xyz[index], measured[index], time[index], point, search.settings)
@@ -55,6 +65,25 @@ class PointSearch:
             seen.append(PointPlanes(own, patches, found, sigma, fitting(found.gap, sigma, search.settings.outlier)))
         self.about = about
         return seen
+
+    def _about(self, xyz: Float[np.ndarray, "n 3"], place: Float[np.ndarray, "points 3"]) -> tuple[np.ndarray, ...]:
+        """Returns about each point, or of its face, and which point each is about."""
+        index, point = returns_about(xyz, place[: self._plain], self.search.settings)
+        of_faces, face = faces_about(xyz, place[self._plain :: 2], self.search.settings)
+        return np.concatenate([index, of_faces]), np.concatenate([point, self._plain + face])
+
+    def unseen(self, seen: Sequence[PointPlanes], names: Sequence[str]) -> list[str]:
+        """That points on breaklines have no faces in any strip, in a sentence; `names` are those of the block."""
+        lines = self.points[self._plain :: 2]
+        number = np.concatenate([f.found.point[f.found.point >= self._plain] for f in seen])
+        out = np.setdiff1d(np.arange(len(lines)), (number - self._plain) // 2)
+        if not len(out):
+            return []
+        return [
+            f"{len(out)} of {len(lines)} points on breaklines have no two smooth faces about them in any strip, and "
+            f"nothing is said of them: {few([names[p] for p in lines[out]])}; take cells (cell_m) half as wide as the "
+            "roofs, or leave these points out"
+        ]
 
     def rows(self, seen: Sequence[PointPlanes], errors: StripErrors) -> tuple[StripPoints, ...]:
         """The points that fit as observations: one group of them, where there are any."""
