@@ -177,7 +177,8 @@ def adjust_flight(output: Output, context: typer.Context, flight: StripFiles, ch
             coverage.check(flight.trajectory_shift_s)
 
         def report(made: StripRound) -> None:
-            line = f"round {made.number}: {made.planes} planes, strips {made.rms_m:.3f} m apart before"
+            apart = f", strips {made.rms_m:.3f} m apart before" if made.planes else ""
+            line = f"round {made.number}: {made.planes} planes{apart}"
             status.update(f"{line}; largest change {made.largest_change:.2g} standard deviations")
 
         options: dict[str, Any] = {

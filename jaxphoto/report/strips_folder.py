@@ -115,5 +115,6 @@ def _page(
         parts += [Heading("Errors of the trajectory"), Paragraph(_TRAJECTORY), picture]
     parts += [Heading("Rounds"), rows_of(strip_rounds_table(result.rounds)), *made_section(made)]
     with_photographs = " and photographs" if result.before else ""
-    title = f"{len(result.cloud.strips)} strips{with_photographs}: strip adjustment"
+    number = len(result.cloud.strips)
+    title = f"{number} strip{'s' * (number > 1)}{with_photographs}: strip adjustment"
     return study_page(title, (verdict.headline,), parts, verdict.colour)

@@ -225,6 +225,10 @@ def test_trajectories_that_do_not_go_with_the_cloud():
     moved = dataclasses.replace(path, position=np.asarray(path.position) + np.array([5e5, 4e6, 0.0]))
     with pytest.raises(BlockError, match="bring cloud and trajectory into one coordinate system"):
         adjust_strips(flight.cloud, moved)
+    second = flight.cloud.strip[:, None] == 1
+    beside = dataclasses.replace(flight.cloud, xyz=flight.cloud.xyz + second * np.array([3000.0, 0.0, 0.0]))
+    with pytest.raises(BlockError, match=r"points of strip 2 lie up to \d\.\d of the scanner's height to one side"):
+        adjust_strips(beside, path)
     time = np.asarray(path.time)
     jump = dataclasses.replace(path, time=np.where(time > time[700], time + 1.0, time))
     with pytest.raises(BlockError, match=r"strip \w+ were measured .*clock jumps: take (1\.0|0\.99)\d+ s off"):

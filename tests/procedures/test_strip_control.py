@@ -15,6 +15,7 @@ from jaxphoto.lidar.strip_settings import StripSettings
 from jaxphoto.procedures.control import SurveyedPoints
 from jaxphoto.procedures.lidar import StripAdjustment, adjust_strips
 from jaxphoto.procedures.lidar.strip_control import with_control
+from jaxphoto.report.findings import Level
 from jaxphoto.report.strips import strips_verdict
 from jaxphoto.report.tables import Tables
 from jaxphoto.simulation import Simulation
@@ -85,6 +86,17 @@ def test_control_finds_what_strips_have_in_common_without_a_trajectory():
     for what in ("control", "check points"):
         assert told[what, "1"].rms_before_m > 0.2 and told[what, "1"].rms_m < 2 * told[what, "1"].noise_m
     assert 1 <= found.rounds[-1].left_out <= 4
+
+
+def test_one_strip_goes_through_control():
+    both = two_strips(3)
+    one = dataclasses.replace(both, xyz=both.xyz[both.strip == 0], strip=both.strip[both.strip == 0], strips=("1",))
+    found = adjust_strips(one, settings=COARSE, control=surveyed(on_roofs(24, 3), 3))
+    sigma = np.asarray(found.covariance.shared_sigma)
+    assert found.still and found.rounds[-1].planes == 0 and np.isnan(found.rounds[-1].rms_m)
+    assert (np.abs(found.errors.position[0] - COMMON) < 3.5 * sigma).all() and (sigma < 0.025).all()
+    assert [(d.one, d.other) for d in found.differences] == [("control", "1")]
+    assert strips_verdict(found, None).findings[0].level == Level.INFORMATION
 
 
 def test_on_level_ground_control_tells_heights_and_the_first_strip_the_rest():

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxphoto.cloud import Cloud
-from jaxphoto.errors import BlockError
+from jaxphoto.errors import BlockError, few
 from jaxphoto.georeferencing import Pattern, Trajectory
 from jaxphoto.georeferencing.time_scales import LEAP_SECONDS
 from jaxphoto.georeferencing.yaw_units import counts_in_radians
@@ -71,6 +71,12 @@ def check_measured_from(cloud: Cloud, path: ScannerPath, pattern: Pattern | None
     looks = np.median(seen.middle, axis=0)
     if max(moves) > _WANDERS * max(seen.half_width) or max(np.abs(looks)) > _ASIDE:
         furthest = np.abs(seen.middle).max()
+        if elsewhere := _elsewhere(cloud, path, _WANDERS * max(seen.half_width)):
+            raise BlockError(
+                f"the laser points of strip {few(elsewhere)} lie up to {furthest:.1f} of the scanner's height to one "
+                "side, and those of the other strips do not: bring all strips and their trajectory into one coordinate "
+                "system, in metres, and onto one clock"
+            )
         raise BlockError(
             f"the laser points of a second lie now here, now there about the scanner, up to {furthest:.1f} of its "
             f"height to one side, while the swath is {2 * max(seen.half_width):.2f} of it wide: bring cloud and "
@@ -79,6 +85,17 @@ def check_measured_from(cloud: Cloud, path: ScannerPath, pattern: Pattern | None
     if pattern is not None:
         _check_pattern(seen, pattern)
     return odd
+
+
+def _elsewhere(cloud: Cloud, path: ScannerPath, most: float) -> list[str]:
+    """Strips whose points lie farther aside than `most` (a tangent) in the middle; none where all do."""
+    some = _probed(cloud)
+    if cloud.strip is None:
+        return []
+    off, strip = aside(cloud, some, path), cloud.strip[some]
+    numbers = np.flatnonzero(np.bincount(strip))
+    far = [k for k in numbers if np.abs(np.median(off[strip == k], axis=0)).max() > most]
+    return [] if len(far) == len(numbers) else [cloud.strips[k] for k in far]
 
 
 def _check_pattern(seen: _FromBody, pattern: Pattern) -> None:

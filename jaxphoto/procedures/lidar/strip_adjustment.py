@@ -65,7 +65,7 @@ class StripRound(NamedTuple):
     left_out: int
     """Planes and points that did not fit."""
     rms_m: float
-    """Of the gaps of all planes that fit, before this adjustment."""
+    """Of the gaps of all planes that fit, before this adjustment; no number of one strip."""
     largest_change: float
     """Of an unknown of scanner, trajectory and cameras, in standard deviations."""
 
@@ -138,8 +138,9 @@ def adjust_strips(
     named in `held` is right, or that of all. Without a trajectory each strip has a shift alone, and the first is held
     where none is named, in the directions that control does not tell.
 
-    Raises InputError for a cloud of one strip, of strips without points or without the times that a trajectory needs,
-    for a time offset of a scanner that looks all around and for control without heights or standard deviations;
+    Raises InputError for a cloud of one strip without control, of strips without points or without the times that a
+    trajectory needs, for a time offset of a scanner that looks all around and for control without heights or standard
+    deviations;
     BlockError for strips that no plane joins, for control that lies elsewhere and for a trajectory that does not cover
     the cloud or the exposures; and as `jaxphoto.adjust`.
     """
@@ -156,7 +157,7 @@ def adjust_strips(
             "seconds apart: leave out time-offset, and shift the trajectory (--trajectory-shift-s)"
         )
     held = cloud.strips if held == "all" else held
-    names = _check(cloud, trajectory, held, photographs is None and priors.right)
+    names = _check(cloud, trajectory, held, photographs is None and priors.right, control is not None)
     path = None if trajectory is None else scanner_path(trajectory)
     pattern = priors.calibration.pattern
     odd = [] if path is None else check_measured_from(cloud, path, None if priors.right else pattern)
@@ -232,12 +233,14 @@ def adjust_strips(
         del adjusted, known
 
 
-def _check(cloud: Cloud, trajectory: Trajectory | None, held: Collection[str], strips_alone: bool) -> tuple[str, ...]:
+def _check(
+    cloud: Cloud, trajectory: Trajectory | None, held: Collection[str], strips_alone: bool, controlled: bool
+) -> tuple[str, ...]:
     names = cloud.strips
-    if cloud.strip is None or len(names) < 2:
+    if cloud.strip is None or len(names) < (1 if controlled else 2):
         raise InputError(
             "the cloud has one strip, and nothing to compare it with: give each flight line its own point source ID, "
-            "or a column strip"
+            "or a column strip; or control (--control)"
         )
     for k, name in enumerate(names):
         if not np.any(cloud.strip == k):
@@ -282,7 +285,7 @@ def _splines(
 def _round(
     number: int, observed: tuple[int, int, int], seen: Sequence[CommonPlanes], on: Sequence[PointPlanes], change: float
 ) -> StripRound:
-    gaps = np.concatenate([f.pairs.gap[f.fits] for f in seen])
+    gaps = np.concatenate([np.zeros(0), *(f.pairs.gap[f.fits] for f in seen)])
     left_out = sum(int((~f).sum()) for f in (*(f.fits for f in seen), *(f.fits for f in on)))
     return StripRound(number, *observed, left_out, _rms(gaps), change)
 
@@ -324,4 +327,4 @@ def _difference(one: str, other: str, was: np.ndarray, gap: np.ndarray, sigma: n
 
 
 def _rms(values: Float[np.ndarray, "n"]) -> float:
-    return float(np.sqrt(np.mean(values**2)))
+    return float(np.sqrt(np.mean(values**2))) if len(values) else np.nan

@@ -91,7 +91,7 @@ class StripSearch:
             a = side_of(f.patches[0], pairs.a, pairs.foot_a, f.one.strip, errors, self.path)
             b = side_of(f.patches[1], pairs.b, pairs.foot_b, f.other.strip, errors, self.path)
             parts.append(plane_rows(pairs, a, b))
-        return StripPlanes.joined(*parts)
+        return StripPlanes.joined(*parts) if parts else StripPlanes.none()
 
 
 def check_joined(names: Sequence[str], seen: Sequence[CommonPlanes]) -> None:
@@ -99,7 +99,7 @@ def check_joined(names: Sequence[str], seen: Sequence[CommonPlanes]) -> None:
     apart = [found for found in seen if found.one.strip != found.other.strip]
     joined = {look.strip for found in apart for look in (found.one, found.other)}
     alone = [name for k, name in enumerate(names) if k not in joined]
-    if alone:
+    if alone and len(names) > 1:
         raise BlockError(
             f"strip {alone[0]} has fewer than {_FEWEST} planes in common with any other: leave it out, take larger "
             "cells (cell_m) or rougher planes (roughness_m), or check that all strips overlap and are in one system"
