@@ -70,6 +70,7 @@ def pulls(seed: int) -> np.ndarray:
     return (found.errors.position - [COMMON, COMMON + SHIFT]).ravel() / np.asarray(found.covariance.shared_sigma)
 
 
+@pytest.mark.slow
 def test_control_finds_what_strips_have_in_common_without_a_trajectory():
     control = surveyed(on_roofs(24, 3), 3)
     control = control._replace(check=np.arange(24) % 4 == 3)
@@ -111,6 +112,7 @@ def test_on_level_ground_control_tells_heights_and_the_first_strip_the_rest():
     assert (np.abs(off) < 3.5 * sigma[:, 2]).all() and (sigma[:, 2] < 0.02).all()
 
 
+@pytest.mark.slow
 def test_points_close_together_do_not_count_the_same_returns_again():
     xy = np.stack(np.meshgrid(np.arange(46.0, 54.0, 0.5), np.arange(46.0, 54.0, 0.5)), axis=-1).reshape(-1, 2)
     exact = np.column_stack([xy, level(*xy.T)])
