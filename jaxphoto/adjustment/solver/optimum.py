@@ -58,7 +58,8 @@ def unit_scale(structure: TiledStructure) -> Increments:
 @eqx.filter_custom_jvp
 def find_optimum(values: TiledValues, *, structure: TiledStructure, task: Task) -> Optimum:
     """Levenberg-Marquardt from the start in `values`. Differentiable in every number of `values`."""
-    return iterate(values, structure, task)[0]
+    # How it went has no derivative, and nobody asks it of what is differentiated.
+    return iterate(values, structure, task)[0]._replace(course=None)
 
 
 def iterate(values: TiledValues, structure: TiledStructure, task: Task) -> tuple[Optimum, FactoredSystem, Increments]:
