@@ -150,8 +150,8 @@ def as_they_scatter(
     sigma = np.array([plan, plan, height])[np.asarray(stations.axis)]
     block = dataclasses.replace(placed.block, stations=dataclasses.replace(stations, sigma=sigma))
     said = (
-        f"they scatter about the network by {plan:.2g} m in plan and {height:.2g} m in height, which is taken: with "
-        "more the turn of so small a block were open"
+        f"they scatter about the network by no more than {plan:.2g} m in plan and {height:.2g} m in height, which is "
+        "taken: with more the turn of so small a block were open"
     )
     return placed._replace(block=block, sentences=(*placed.sentences, said))
 
