@@ -18,7 +18,6 @@ from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
 
 from jaxphoto.adjustment import MAX_STEPS, Adjustment, Sizes, common_sizes, linearise, solve
 from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
@@ -28,19 +27,18 @@ from jaxphoto.losses import AbstractLoss
 from jaxphoto.observations import Correlated
 from jaxphoto.orientation.approximate import in_front, looking_away
 from jaxphoto.procedures.adjust import start_of
-from jaxphoto.procedures.beginnings import Begun, beginnings, weighed, without_what_is_alike
+from jaxphoto.procedures.beginnings import Begun, beginnings, without_what_is_alike
+from jaxphoto.procedures.contradictions import predicted_parts, row_sizes
 from jaxphoto.procedures.exchange import Exchange, exchanged, with_places, with_what_rests_on_them
 from jaxphoto.procedures.exchanged_coordinates import as_one, coordinate_exchanges
 from jaxphoto.procedures.exchanged_names import name_exchanges, points_that_meet, put_back
 from jaxphoto.procedures.robust import Blocks, Masks, all_points, checked_parts, residual_scales, solve_placed
 from jaxphoto.short_repr import shown
 from jaxphoto.statistics import (
-    LEAST_CHECKED,
     LEAST_SIGMA0,
     LEVEL,
     UNCHECKED,
     Suspect,
-    chi_square_limit,
     global_test,
 )
 from jaxphoto.unknowns import Unknowns
@@ -53,8 +51,6 @@ _LEAST_LEFT = 0.5
 SEVERAL = 4
 """So many are no chance; and more of a group than `_SINGLE` no single errors."""
 _SINGLE = 1 / 3
-# Standard deviations of what is left out times this are next to nothing, and yet known to many digits.
-_WEAK = 1000.0
 # A blunder inflates the residuals around it: in one turn nothing goes that is less than this part of the worst.
 _BESIDE_THE_WORST = 0.5
 
@@ -168,7 +164,7 @@ def _snooped(block: Block, begun: Begun, max_steps: int, sizes: Sizes, report: C
     """From where a robust adjustment has led."""
     at, r, flown = begun
     scale = residual_scales(at, r)
-    worst = _worst(block, {name: size / scale[name] for name, size in _sizes(at, r).items()}, 1.0)
+    worst = _worst(block, {name: size / scale[name] for name, size in row_sizes(at, r).items()}, 1.0)
     left = {name: flown[name] | worst[name] for name in worst}
     tried: list[Masks] = []
     # Before anything is left out: wrong coordinates turn images, and sound rows go with them.
@@ -185,7 +181,7 @@ def _snooped(block: Block, begun: Begun, max_steps: int, sizes: Sizes, report: C
         at = linearise(block, all_points(adjusted.unknowns, at.unknowns, point), block.priors, sizes)
         sigma0 = max(float(adjusted.sigma0), LEAST_SIGMA0)
         lost = np.setdiff1d(np.arange(len(block.points)), point)
-        r = _predicted_parts(at, left, sizes)
+        r = predicted_parts(at, left, sizes)
         new, placed = _exchanges(at, left, lost, sigma0, r, sizes, known)
         for exchange in new:
             (block, left), at = exchanged(block, left, exchange), placed
@@ -254,51 +250,14 @@ def _needed(at: Adjustment, left: Masks, exchange: Exchange, sigma0: float) -> b
     return len(points_that_meet(given, left, points, sigma0)) < len(points)
 
 
-def _sizes(at: Adjustment, r: Blocks, predicted: bool = False) -> dict[str, Float[np.ndarray, "_"]]:
-    """Of each row, sqrt(v' R^-1 v) over the root of its chi-square quantile: above 1 it is a blunder.
-
-    Or sqrt(v' R v), of rows that were left out and are `predicted` by the others. Only directions that the others check
-    count: a point of two rays is checked across the plane of these, and not along it. A prediction checks hardly what
-    is hardly known, but rounding is no part of it.
-    """
-    axes = {name: np.linalg.eigh(own) for name, own in r.items()}
-    least = UNCHECKED if predicted else LEAST_CHECKED
-    checked = {name: values > least for name, (values, _) in axes.items()}
-    n = sum(int(own.any(axis=1).sum()) for own in checked.values())
-    found = {}
-    for name, (values, vectors) in axes.items():
-        along = np.einsum("nij,in->nj", vectors, np.atleast_2d(at.residuals[name])) ** 2
-        known = np.where(checked[name], values, 1.0)
-        squares = np.sum(np.where(checked[name], along * known if predicted else along / known, 0.0), axis=1)
-        freedom = np.maximum(checked[name].sum(axis=1), 1)
-        found[name] = np.sqrt(squares / chi_square_limit(freedom, LEVEL / max(n, 1)))
-    return found
-
-
-def _predicted_parts(at: Adjustment, left: Masks, sizes: Sizes) -> Blocks:
-    """`checked_parts`, of rows left out as if each was in beside those that are: with it they are predicted."""
-    rows = at.block.named_observations
-    weak = {name: weighed(own, np.where(left[name], _WEAK**-2, 1.0)) for name, own in rows.items()}
-    r = checked_parts(linearise(at.block.with_observations(weak), at.unknowns, at.block.priors, sizes))
-    for name, out in left.items():
-        if out.any():
-            values, vectors = np.linalg.eigh(r[name][out])
-            # 1 / r = 1 + q, of a prediction of the variance q, beside the row's own of 1; here the own is _WEAK^2.
-            values = np.clip(values, 0.0, 1.0)
-            values = values / (values + _WEAK**2 * (1 - values))
-            r[name] = r[name].copy()
-            r[name][out] = (vectors * values[:, None]) @ np.swapaxes(vectors, 1, 2)
-    return r
-
-
 def _tested(adjusted: Adjustment, at: Adjustment, left: Masks, point: np.ndarray, sigma0: float, r: Blocks) -> Masks:
     """What is to be left out next: `adjusted` is without `left`, `at` the whole block linearised there."""
     stays = _stays(at.block, point)
-    wrong = {name: size > sigma0 for name, size in _sizes(at, r, predicted=True).items()}
+    wrong = {name: size > sigma0 for name, size in row_sizes(at, r, predicted=True).items()}
     found = {name: out & (wrong[name] | ~stays[name]) for name, out in left.items()}
     # Of a group all of whose rows are out, `adjusted` has nothing.
     sizes = {name: np.zeros(len(out)) for name, out in left.items()}
-    for name, size in _sizes(adjusted, checked_parts(adjusted)).items():
+    for name, size in row_sizes(adjusted, checked_parts(adjusted)).items():
         sizes[name][~left[name] & stays[name]] = size / sigma0
     least = max(1.0, _BESIDE_THE_WORST * max(float(size.max(initial=0.0)) for size in sizes.values()))
     return {name: found[name] | new for name, new in _worst(at.block, sizes, least).items()}
