@@ -436,6 +436,7 @@ READERS: dict[str, Reader] = {
     ),
     "exposures-geo-txt": Reader(text(geo__txt=sound_files.GEO_TXT), lambda folder: read_exposures(folder / "geo.txt")),
     "exposures-reference": Reader(text(a__csv=sound_files.REFERENCE), lambda folder: read_exposures(folder / "a.csv")),
+    "exposures-pospac": Reader(text(eo__txt=sound_files.POSPAC), lambda folder: read_exposures(folder / "eo.txt")),
     "photograph-xmp": Reader(text(a__xmp=sound_files.XMP), lambda folder: _drone_record(folder / "a.xmp")),
     "dsm": Reader(sound_files.surface, lambda folder: read_dsm(folder / "a.tif")),
     "cloud-ply-text": Reader(sound_files.ply_text, lambda folder: clouds.read_cloud(folder / "a.ply")),

@@ -127,6 +127,28 @@ a.JPG,1,15.001,55.7,120.5,91,1.5,-2.25,0.02,0.02,0.04,1,1,1
 b.JPG,1,15.002,55.7,120.75,,,,0.02,0.02,0.04,,,
 # Total Error,,
 """  # noqa: E501
+POSPAC_HEAD = """***
+ POS Export Utility
+ Copyright (C) 1997-2018 by Applanix Corporation      [May 17 2018]
+***
+
+ Mission Start Time:
+   Date of Mission: 2018-08-07
+ Mapping frame datum: WGS84  ; Mapping frame projection : UTM;
+ central meridian = 15.000000 deg;
+ latitude of the grid origin = 0.000000 deg; grid scale factor = 0.999600:
+ false easting = 500000.000000 m; false northing = 0.000000 m;
+ First rotation is around the 'x' by 'omega' angle.
+ Lever arm values: lx =        0.0000 m, ly =        0.0000 m, lz =        0.0000 m.
+ ID, # EVENT, TIME (s), EASTING, NORTHING, ELLIPSOID HEIGHT, OMEGA, PHI, KAPPA, LAT, LONG
+( time in Sec, position in Meters, orientation and lat/long in Degrees )
+"""
+POSPAC = (
+    POSPAC_HEAD
+    + """ DJI_0001 1 292325.2 500074.307 5338529.783 320.5 1.5 -2.25 91 48.2 15.001
+ DJI_0002 2 292327.4 500111.460 5338529.784 320.75 0.5 -1.25 90 48.2 15.0015
+"""
+)
 XMP = """<?xpacket begin=""?><rdf:Description rdf:about="DJI Meta Data" drone-dji:AltitudeType="RtkAlt"
  drone-dji:AbsoluteAltitude="+139.231" drone-dji:RelativeAltitude="+80.012" drone-dji:GimbalRollDegree="+180.00"
  drone-dji:GimbalYawDegree="-92.70" drone-dji:GimbalPitchDegree="-90.00" drone-dji:FlightYawDegree="+87.20"

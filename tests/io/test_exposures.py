@@ -16,6 +16,7 @@ from jaxphoto.georeferencing.map_frame import MapFrame
 from jaxphoto.io.exposures import located, read_marks, read_pos, read_table, with_exposures
 from jaxphoto.io.photographs import Photograph, photographs
 from jaxphoto.io.trajectory import write_sbet
+from tests import sound_files
 
 ORIGIN = Gps(55.7, 13.2, 100.0)
 BEGIN_S = 2200 * WEEK_S + 200_000.0
@@ -351,6 +352,7 @@ def table_of(head, row, between=","):
 PIX4D = "imagename,latitude,longitude,altitude,accuracy horizontal,accuracy vertical"
 METASHAPE = "#Label,X/Longitude,Y/Latitude,Z/Altitude,Yaw,Pitch,Roll,X_acc_(m),Y_acc_(m),Z_acc_(m),X_est"
 UTM = "+proj=utm +zone=33 +ellps=WGS84 +datum=WGS84 +units=m +no_defs"
+POSPAC_ROW = "{0} 7 1234.5 {4} {5} {3} {6} {7} {8} {2} {1}"
 OPK = "# X Y Z (m) of EPSG:32633, heights above the ellipsoid\nimageName,X,Y,Z,Omega,Phi,Kappa"
 OTHERS = {
     "pix4d": (table_of(PIX4D, "{0},{2},{1},{3},0.02,0.05"), False, True),
@@ -368,6 +370,7 @@ OTHERS = {
         True,
         False,
     ),
+    "pospac": (sound_files.POSPAC_HEAD + table_of("", POSPAC_ROW), True, False),
     "ours": (table_of("IMAGE,Longitude_deg,Latitude_deg,Height_m", "{0},{1},{2},{3}").lower(), False, False),
     "blanks": (table_of("image,longitude_deg,latitude_deg,height_m", "{0},{1},{2},{3}", "  "), False, False),
 }
@@ -380,12 +383,30 @@ def test_tables_of_other_programs(tmp_path, form):
     taken, said = with_exposures([FLIGHT.photograph(k) for k in ALL], [found])
     assert "positions of 6 of 10 photographs" in said[0]
     assert all(same(taken[k].gps, FLIGHT.camera[k]) for k in range(6))
-    assert found.heights == ("ellipsoid" if form == "opk" else "unknown")
+    assert found.heights == ("ellipsoid" if form in ("opk", "pospac") else "unknown")
     assert {p.gps.sigma_m for p in taken[:6]} == {(0.02, 0.02, 0.05) if stated else None}
     for p in taken[:6]:
         assert (p.attitude is not None) == turned
         if turned:
             np.testing.assert_allclose(p.attitude.level_from_camera, level_from_belly(*TURNED), atol=2e-5)
+
+
+@pytest.mark.parametrize(
+    "old, new, words",
+    [
+        ("= 15.0", "= 9.0", "row 17: its easting and northing lie .* from its latitude and longitude in EPSG:32632"),
+        ("= 15.0", "= 14.0", "are map coordinates; give the EPSG code"),
+        ("the 'x' by", "the 'y' by", "its angles turn about y first"),
+        ("ID, # EVENT, TIME", "TIME, DISTANCE, TIME", "its columns are not those of photographs"),
+        ("EASTING, NORTHING", "E, N", "its head names no columns"),
+        ("DJI_0002.JPG 7 1234.5", "DJI_0002.JPG 7", "row 18: 10 cells, and the header has 11"),
+    ],
+)
+def test_a_text_of_pospac_that_is_not_what_it_says_is_refused(tmp_path, old, new, words):
+    text = OTHERS["pospac"][0]
+    assert old in text
+    with pytest.raises(InputError, match=words):
+        read_table(written(tmp_path / "eo.txt", text.replace(old, new)))
 
 
 def test_tables_that_nobody_can_know_are_refused(tmp_path):

@@ -6,6 +6,7 @@
     --to opk      imageName X Y Z Omega Phi Kappa, a comment says the system
     OpenDroneMap  geo.txt: the system alone in the first line, then name x y z [yaw pitch roll [accuracy in plan, in
                   height]]; x is the easting or longitude, angles that are all 0 are not known
+    POSPac        exterior orientation as text (`jaxphoto.io.exposures.pospac`)
 
 Cells are separated by tabs, semicolons, commas or blanks, words of a header are in any case and order. Yaw, pitch and
 roll are of a camera that looks down with the top of its picture to the north at zero, and count from true north, as
@@ -25,6 +26,7 @@ from jaxphoto.io.control_files.gcp_list import SYSTEM
 from jaxphoto.io.control_files.rows import Cells
 from jaxphoto.io.control_files.table_header import PLACE, Columns, columns_of, in_degrees
 from jaxphoto.io.control_files.tables import separator_of, split_row, with_points
+from jaxphoto.io.exposures.pospac import read_pospac
 from jaxphoto.io.text_tables import Table, is_number
 from jaxphoto.io.whole_text import LARGE, read_text
 from jaxphoto.procedures.control.system import ControlSystem, system_of
@@ -68,7 +70,8 @@ class OtherTable(NamedTuple):
 def read_other_table(path: Path) -> OtherTable | None:
     """The table in a file; None where neither its first line nor a comment names the columns.
 
-    Raises InputError for rows that are too short, angles in gon, and a system that nobody can tell.
+    Raises InputError for rows that are too short, angles in gon, and a system that nobody can tell; and as
+    `read_pospac`.
     """
     numbered = [(row, line) for row, line in enumerate(read_text(path, LARGE).split("\n"), 1) if line.strip()]
     content = [(row, line) for row, line in numbered if not line.lstrip().startswith("#")]
@@ -76,6 +79,10 @@ def read_other_table(path: Path) -> OtherTable | None:
         return None
     if SYSTEM.match(content[0][1].strip()):
         return _of_open_drone_map(path.name, content)
+    whole = Cells(path.name, [[line] for _, line in content], [row for row, _ in content])
+    if (exported := read_pospac(whole)) is not None:
+        own, columns, known = exported
+        return OtherTable(_table(own, columns, known, False), known, False, ellipsoid=True)
     comments = [line.strip() for _, line in numbered[:_HEAD] if line.lstrip().startswith("#")]
     separator = separator_of(content[0][1])
     cells = Cells(
