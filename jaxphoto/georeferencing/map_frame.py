@@ -17,6 +17,8 @@ from jaxphoto.errors import InputError
 
 # Half the step along a grid line that tells its direction: rounding is then 1e-11 rad, curvature of the line less.
 _STEP_M, _STEP_DEG = 50.0, 5e-4
+# Where it is said: of a block, of a flight.
+_ON_ELLIPSOID = 'vertical = "ellipsoidal" in block.toml, --heights ellipsoid of a flight'
 
 Place = tuple[float, float, float]
 """Longitude and latitude (degrees), ellipsoidal height (m)."""
@@ -158,13 +160,12 @@ def _to_place(code: int, vertical: int | None) -> Transformer:
         if not grids:
             raise InputError(
                 f"PROJ knows no way from the heights of EPSG:{vertical} ({heights.name}) to the ellipsoid of "
-                f'EPSG:{code}; give them above the ellipsoid (in block.toml vertical = "ellipsoidal")'
+                f"EPSG:{code}; give them above the ellipsoid ({_ON_ELLIPSOID})"
             )
         name = grids[0].short_name
         raise InputError(
             f"the heights of EPSG:{vertical} ({heights.name}) need the geoid {name}, which is not on this computer; "
-            f'get it by "pyproj sync --file {name}", or give them above the ellipsoid (vertical = "ellipsoidal" in '
-            "block.toml)"
+            f'get it by "pyproj sync --file {name}", or give them above the ellipsoid ({_ON_ELLIPSOID})'
         )
     return group.transformers[0]
 

@@ -153,9 +153,9 @@ def test_marks_that_cannot_be_used_cost_a_sentence(marked):
     image = ("nowhere.jpg", *control.marks.image[1:2], "I2.jpg", *control.marks.image[3:])
     spoilt = control._replace(marks=control.marks._replace(image=image))
     said = " ".join(found_in(marked, spoilt).sentences)
-    assert "1 marks name no photograph that is used and are left out: nowhere.jpg (marks.csv, row 2)" in said
+    assert "left out: 1 mark of no photograph that is used: nowhere.jpg (marks.csv, row 2)" in said
     spoilt = control._replace(marks=control.marks._replace(column_row=pixels))
-    assert "1 marks lie outside of the picture" in " ".join(found_in(marked, spoilt).sentences)
+    assert "left out: 1 mark outside of the picture" in " ".join(found_in(marked, spoilt).sentences)
 
 
 @pytest.mark.parametrize(

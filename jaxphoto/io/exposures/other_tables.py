@@ -45,7 +45,7 @@ _WORDS = {
 }
 _OF_ODM = ("image", "x", "y", "z", "yaw", "pitch", "roll", "sigma_plan", "sigma_z")
 _LEAST_ODM = 3
-_EPSG = re.compile(r"\b(EPSG:\s*\d{4,6}(?:\s*\+\s*\d{4,6})?)", re.IGNORECASE)
+_EPSG = re.compile(r"\b(EPSG::?\s*\d{4,6}(?:\s*\+\s*\d{4,6})?)", re.IGNORECASE)
 _WKT = re.compile(r"#\s*CoordinateSystem:\s*(\S.*)$", re.IGNORECASE)
 _GON = re.compile(r"\b(gons?|grads?|gradians?)\b", re.IGNORECASE)
 # As --to opk says it.

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxphoto.block import Block
-from jaxphoto.errors import few
+from jaxphoto.errors import counted, few
 from jaxphoto.procedures.control.surveyed import MARK_SIGMA_PX, Marks, SurveyedPoints
 
 _ENDING = re.compile(r"\.[A-Za-z]{2,4}$")
@@ -43,16 +43,16 @@ def marked(
     place = {name: k for k, name in enumerate(points.ids)}
     point = np.array([place.get(name, -1) for name in marks.point], int)
     said: list[str] = []
-    _say(said, marks, (image < 0) & ~other, marks.image, "name no photograph that is used")
-    _say(said, marks, (point < 0), marks.point, f"are of points without coordinates in {points.file}")
+    _say(said, marks, (image < 0) & ~other, marks.image, "of no photograph that is used")
+    _say(said, marks, (point < 0), marks.point, f"of points without coordinates in {points.file}")
     size = np.array([(s.width_px, s.height_px) for s in (block.sensors[c] for c in block.image_camera)], float)
     outside = ((marks.column_row < 0) | (marks.column_row > size[image])).any(axis=1) & (image >= 0) & (point >= 0)
-    _say(said, marks, outside, marks.image, "lie outside of the picture")
+    _say(said, marks, outside, marks.image, "outside of the picture")
     kept = np.flatnonzero((image >= 0) & (point >= 0) & ~outside)
     kept = kept[np.lexsort((image[kept], point[kept]))]
     # The same photograph under two names.
     twice = np.r_[False, (np.diff(image[kept]) == 0) & (np.diff(point[kept]) == 0)] if len(kept) else np.zeros(0, bool)
-    _say(said, marks, np.isin(np.arange(len(image)), kept[twice]), marks.point, "stand there twice for one photograph")
+    _say(said, marks, np.isin(np.arange(len(image)), kept[twice]), marks.point, "there twice for one photograph")
     kept = kept[~twice]
     sigma = np.where(np.isnan(marks.sigma_px), MARK_SIGMA_PX, marks.sigma_px)[kept]
     xy = np.zeros((len(kept), 2))
@@ -83,4 +83,4 @@ def _say(said: list[str], marks: Marks, wrong: np.ndarray, names: Sequence[str],
     which = np.flatnonzero(wrong)
     if len(which):
         listed = few(list(dict.fromkeys(names[int(k)] for k in which)))
-        said.append(f"{len(which)} marks {what} and are left out: {listed} ({marks.places[which[0]]})")
+        said.append(f"left out: {counted(len(which), 'mark')} {what}: {listed} ({marks.places[which[0]]})")
