@@ -22,7 +22,7 @@ from jaxphoto.writing import check_folder
 def experiment_command(
     output: Output,
     context: typer.Context,
-    name: Annotated[str, typer.Argument(help="Folder of the experiment (000, 003, 004), or all.")],
+    name: Annotated[str, typer.Argument(help="Folder of the experiment, such as 000, or all.")],
     out: Annotated[Path, typer.Option(help="Folder for the results; an earlier run in it is replaced.")] = Path(
         "results"
     ),

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 _STYLE = """\
 :root { --width: 86rem } td, th { white-space: nowrap } th { font-weight: 600 } .tables td, .tables th { line-height: 1.3; padding: .2rem .4rem }
 .no { background: var(--red) } .yes { background: var(--green) } .chip { padding: 0 .5em; border-radius: 3px }
+.yes, .no { print-color-adjust: exact } .no::before { content: "\\2717\\a0"; color: var(--bad) }
 .ours { font-weight: 600 } .spread, .paper { color: var(--grey) } .spread { font-size: 90% }
 ol.notes { margin: 0 0 1.5rem; font-size: 13px; color: var(--grey) } sup { color: var(--grey); font-size: 75% }
 """
@@ -34,7 +35,7 @@ _PAGE = """{{ head }}<body>
 <p>In each cell, above: <span class="ours">ours</span>, the mean over {{ layouts }} simulated
 {{ "layout" if layouts == 1 else "layouts" }}{% if layouts > 1 %}, <span class="spread">± the standard deviation from layout
 to layout</span>{% endif %}. Below: <span class="paper">what is printed (± the tolerance promised)</span>.
-<span class="chip yes">green</span> within the tolerance, <span class="chip no">red</span> not, no colour: nothing promised.
+<span class="chip yes">green</span> within the tolerance, <span class="chip no">red</span> and a cross not, no colour: nothing promised.
 Small numbers at cells and headings refer to the notes below the table.</p>
 {% for failure in failures %}<p class="warning">left out: {{ failure }}</p>{% endfor %}
 <div class="wide"><table><tr><th>table</th><th>within</th><th>of</th></tr>
@@ -55,7 +56,8 @@ Small numbers at cells and headings refer to the notes below the table.</p>
 {% if table.difference %}<p>Mean of |ours - printed| over the table:
 <span class="chip {{ table.difference.within }}">{{ table.difference.words }}</span></p>{% endif %}
 {% endfor %}</div>
-{% if check %}<h2>Check points of the first layout</h2><img alt="discrepancies at check points" src="{{ check }}">{% endif %}
+{% if check %}<h2>Check points of the first layout</h2>
+<div class="wide"><img alt="discrepancies at check points" src="{{ check }}"></div>{% endif %}
 {% for element in made %}{{ element }}
 {% endfor %}</body></html>
 """

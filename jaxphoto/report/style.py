@@ -79,5 +79,5 @@ h1 + .verdict { font-weight: 600 }
   tr, img, figure, nav, .alarm, .warning, .information, .verdict { break-inside: avoid }
   p, li { orphans: 3; widows: 3 } .wide { mask-image: none !important }
   img { max-height: 105mm; width: auto; object-fit: contain } .wide img { max-height: 190mm; max-width: 100% }
-  .pictures { grid-template-columns: 1fr 1fr } .verdict { font-size: 12px } }
+  .pictures { grid-template-columns: 1fr 1fr } .verdict { font-size: 12px; print-color-adjust: exact } }
 """

@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 from jaxphoto.experiment import comparison_figure, side_by_side
-from jaxphoto.experiment.page import _table
+from jaxphoto.experiment.page import _STYLE, table_texts
 from jaxphoto.experiment.wording import heading, own_decimals, power_of, printed_decimals, table_title
 
 NAN = np.nan
@@ -58,7 +58,7 @@ def test_digits_are_those_of_the_print_and_of_the_spread():
 
 
 def test_a_table_of_the_page_holds_both_values_notes_and_judgement():
-    table = _table("table2_iops", COMPARISON[COMPARISON["table"] == "table2_iops"])
+    table = table_texts("table2_iops", COMPARISON[COMPARISON["table"] == "table2_iops"])
     assert [c["heading"] for c in table["columns"]] == ["c [mm]", "σ k1 [10⁻⁷ mm⁻²]"]
     assert [row["name"] for row in table["rows"]] == ["first", "third"]
     c, k1 = table["rows"][0]["cells"]
@@ -93,3 +93,7 @@ def test_comparison_figure_draws_ours_and_the_print():
     figure.draw_without_rendering()
     with pytest.raises(ValueError, match="both printed and ours"):
         comparison_figure(COMPARISON, "own")
+
+
+def test_what_is_not_within_is_marked_by_more_than_colour_and_printed():
+    assert '.no::before { content: "\\2717' in _STYLE and "print-color-adjust: exact" in _STYLE
