@@ -19,6 +19,7 @@ from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).resolve().parents[2]
 _WORKER = "worker_from_disk.js"
+_WHOLE_NAMES = ".md-typeset td code { word-break: normal; overflow-wrap: normal }"
 _LINK = re.compile(r"\[([^\]]*)\]\((?:\.\./)+([^)#]+)(#[^)]*)?\)")
 _TO_PAGE = re.compile(r"\[[\w/]+\.md\]\(([\w./]+\.md)(#[^)]*)?\)")
 _NAME = re.compile(r"(?<!\[)`jaxphoto\.([\w.]+)`(?!\])")
@@ -70,7 +71,8 @@ def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -
 
 
 def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
-    """The one script that the theme would fetch from elsewhere is the site's own."""
+    """The one script that the theme would fetch from elsewhere is the site's own; names in tables are not broken."""
+    output = output.replace("</head>", f"<style>{_WHOLE_NAMES}</style></head>", 1)
     return output.replace("https://unpkg.com/iframe-worker/shim", "../" * page.url.count("/") + _WORKER)
 
 
@@ -114,7 +116,9 @@ def _mathml(match: re.Match[str]) -> str:
 
 
 def _title(page: Path) -> str:
-    return page.read_text("utf-8").splitlines()[0].lstrip("# ").strip()
+    """Of a page: its first heading, which its settings may stand before."""
+    lines = page.read_text("utf-8").splitlines()
+    return next(line for line in lines if line.startswith("# ")).lstrip("# ").strip()
 
 
 def _notebook_title(path: Path) -> str:

@@ -118,3 +118,8 @@ def test_the_gallery_has_every_notebook_with_a_picture():
     assert len(pictures) == len(notebooks)
     # Kept in the repository: small.
     assert sum((ROOT / "docs" / picture).stat().st_size for picture in pictures) < 1e6
+
+
+def test_links_read_as_the_heading_of_a_page_that_settings_stand_before():
+    titles = {page.name: module_of("pages")._title(page) for page in (ROOT / "docs").glob("**/*.md")}
+    assert titles["formats.md"] == "Formats" and all(re.match(r"\w", title) for title in titles.values()), titles
