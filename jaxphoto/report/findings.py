@@ -48,8 +48,9 @@ class Verdict(NamedTuple):
 
     @classmethod
     def of(cls, findings: Iterable[Finding]) -> "Verdict":
-        """The findings in order."""
-        return cls(tuple(sorted(findings, key=lambda f: -f.level)))
+        """The findings in order, parameters called as sentences call them."""
+        told = (Finding(f.level, in_symbols(f.text)) for f in findings)
+        return cls(tuple(sorted(told, key=lambda f: -f.level)))
 
     @property
     def level(self) -> Level:

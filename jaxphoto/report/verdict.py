@@ -19,7 +19,7 @@ from jaxphoto.procedures.adjust import left_out_words
 from jaxphoto.report.behind import behind_findings
 from jaxphoto.report.camera_drift import drift_findings
 from jaxphoto.report.doubled import doubled_findings
-from jaxphoto.report.findings import Finding, Level, Verdict, in_symbols, symbol
+from jaxphoto.report.findings import Finding, Level, Verdict, symbol
 from jaxphoto.report.ground import ground_findings
 from jaxphoto.report.residual_findings import (
     NOTHING_FITS,
@@ -80,7 +80,7 @@ def _findings(tables: Tables) -> Iterator[Finding]:
     yield from _weak(tables, frozenset().union(*(w.labels for weak in of_cameras.values() for w in weak)))
     for camera, c in tables.correlations.items():
         weak = of_cameras[camera]
-        yield from (Finding(Level.WARNING, in_symbols(w.sentence)) for w in weak)
+        yield from (Finding(Level.WARNING, w.sentence) for w in weak)
         explained = frozenset().union(*(w.explains for w in weak))
         felt = {name for name, moved in at_corner(tables, camera).items() if moved > FELT}
         yield from _correlated(camera, c, explained, felt, _all_known(adjusted.block))

@@ -100,7 +100,7 @@ def test_it_is_tested_without_what_was_known():
 def test_words():
     (wander,) = camera_wanderings(*found())
     assert differences_words(wander).startswith("camera one wandered during its flight (p ")
-    assert " um at -50 min to " in differences_words(wander)
+    assert " mm at -50 min to " in differences_words(wander)
     still = wander._replace(more=wander.more._replace(p_value=0.4))
     assert differences_words(still).startswith("no wandering of camera one is seen (p = 0.4); any one knot alone would")
 
