@@ -104,7 +104,7 @@ def test_cameras_of_different_sensors_are_refused(sets, monkeypatch, capsys):
     other.write_text((sets / "bare.toml").read_text().replace("0.00155", "0.0015"))
     code, _, error = run(monkeypatch, capsys, "stability", sets / "one", other)
     assert code == 2
-    assert "give the true one by --pixel-mm" in error
+    assert "give the true one by --pixel-mm, and where results say the assumed one, make a file of pixels" in error
 
 
 @pytest.fixture(scope="module")

@@ -31,7 +31,12 @@ def control_command(
     output: Output,
     context: typer.Context,
     block: Annotated[Path, typer.Argument(help="Block folder whose images are oriented.")],
-    file: Annotated[Path, typer.Argument(help="Surveyed points: gcp_list.txt, markers of Metashape as XML, or CSV.")],
+    file: Annotated[
+        Path,
+        typer.Argument(
+            help="Surveyed points: gcp_list.txt, markers of Metashape, GeoJSON, GeoPackage, geoin.dat of BINGO, CSV."
+        ),
+    ],
     out: Annotated[Path, typer.Option(help="Folder for block and result; earlier results in it are replaced.")],
     marks: Annotated[Path | None, typer.Option(help="Marks of the points, where FILE has none.")] = None,
     control_epsg: Annotated[

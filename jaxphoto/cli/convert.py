@@ -12,6 +12,7 @@ from jaxphoto.cli.output import Output, command
 from jaxphoto.errors import InputError
 from jaxphoto.io import FORMATS, read_source, write_block
 from jaxphoto.io.block_folder import check_block_target
+from jaxphoto.io.cameras import ASSUMED_PIXEL_MM
 from jaxphoto.io.exports import (
     EXPORTS,
     AdjustedPhotographs,
@@ -25,6 +26,7 @@ from jaxphoto.io.exports import (
 from jaxphoto.procedures.adjust import start_of
 from jaxphoto.unknowns import Unknowns
 
+_OF_FILES = (".xml", ".json", ".txt", ".out", ".geojson", ".gpkg", ".toml", ".csv", ".yaml", ".yml", ".bin")
 _TARGETS = {"block": "a block folder"} | {name: known.about for name, known in EXPORTS.items()}
 
 
@@ -35,7 +37,7 @@ def convert_command(
         Path, typer.Argument(help="Results of adjust or fly; a block folder; file or folder of another program.")
     ],
     second: Second = None,
-    out: Annotated[Path | None, typer.Option(help="Folder or file to write (needed).")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder to write (needed).")] = None,
     source_format: Annotated[
         str | None,
         one_of(
@@ -65,6 +67,10 @@ def convert_command(
         raise InputError(f"--adjust: {why}; leave it out")
     if not result and (block is not None or part != 1):
         raise InputError(f"--block and --part are of results, and {source} is none; leave them out")
+    if out.suffix.lower() in _OF_FILES:
+        raise InputError(
+            f"--out {out}: {to} is a folder of files, and this is the name of a file; leave {out.suffix} out"
+        )
     check = check_block_target if to == "block" else check_export_target
     check(out, source)
     with output.progress.status(f"reading {source}") as status:
@@ -84,6 +90,11 @@ def convert_command(
             files = photograph_files(given.images, photographs or (), source if result else None)
             status.update(f"writing {out}")
             _say(output, export(AdjustedPhotographs.of_block(given, values, files), out, to), said)
+    assumed = [name for name, sensor in given.sensors.items() if sensor.pixel_mm == ASSUMED_PIXEL_MM]
+    if to == "block" and not result and assumed:
+        whose = f"camera {assumed[0]}" if len(assumed) == 1 else f"{len(assumed)} cameras"
+        why = "as is assumed where files know pixels alone: c in um is f in px"
+        output.say(f"{whose}: a pixel is {ASSUMED_PIXEL_MM:g} mm, {why}")
     images, points, rows = size.values()
     output.wrote(out, f"wrote {out}: {images} images, {points} points, {rows} image points")
     output.tell(**size)

@@ -37,5 +37,6 @@ def check_one_sensor(a: CameraFile, b: CameraFile, first: Path, second: Path) ->
     if not math.isclose(one.pixel_mm, other.pixel_mm, rel_tol=1e-6):
         raise InputError(
             f"the pixel of {first} is {one.pixel_mm:g} mm, that of {second} {other.pixel_mm:g} mm; where one of them "
-            "was assumed, give the true one by --pixel-mm"
+            "was assumed, give the true one by --pixel-mm, and where results say the assumed one, make a file of "
+            "pixels of them first: jaxphoto camera RESULTS --out pixels.yml"
         )

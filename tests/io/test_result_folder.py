@@ -153,9 +153,10 @@ def test_the_command_writes_what_was_adjusted(own, tmp_path, monkeypatch, capsys
         ((own / "result", tmp_path / "no", "--to", "opk", "--adjust"), "--adjust: SOURCE is a result already"),
         ((own / "block", tmp_path / "no", "--adjust"), "--adjust: a block folder has start values"),
         ((own / "block", tmp_path / "no", "--to", "opk", "--part", 2), "--block and --part are of results"),
+        ((own / "result", tmp_path / "no.xml", "--to", "metashape"), "is the name of a file; leave .xml out"),
     ):
         code, _, wrong = run(monkeypatch, capsys, "convert", *arguments)
-        assert code == 2 and message in wrong and not (tmp_path / "no").exists()
+        assert code == 2 and message in wrong and not list(tmp_path.glob("no*"))
 
 
 def test_the_command_adjusts_first(own, tmp_path, monkeypatch, capsys):
