@@ -68,3 +68,13 @@ def test_the_command_compares_two_results(tmp_path, monkeypatch, capsys):
     summary = json.loads((out / "summary.json").read_text())
     assert summary["chi_square"] == pytest.approx(chi_square)
     assert summary["n_beyond"] == cells.beyond.sum()
+
+
+def test_one_calibration_is_not_compared_with_itself_and_shared_image_points_are_said(tmp_path, monkeypatch, capsys):
+    a, b = (written_set(tmp_path / name, "gopro", values) for name, values in (("one", TARGET_1), ("two", TARGET_2)))
+    code, _, error = run(monkeypatch, capsys, "compare", a, a)
+    assert code == 2 and "are one calibration, which tells no change" in error
+    for folder, key, shared in ((a, "0", False), (b, "1", False), (b, "0", True)):
+        (folder / "inputs.csv").write_text(f"file,n_bytes,sha256\nx/image_points.csv,9,{key}\ny.csv,9,{key}9\n")
+        code, _, error = run(monkeypatch, capsys, "compare", a, b)
+        assert code == 0 and ("are of the same image points" in error) == shared

@@ -3,9 +3,14 @@
 import math
 from pathlib import Path
 
+import equinox as eqx
+
 from jaxphoto.errors import InputError
 from jaxphoto.io.cameras import CameraFile, read_camera_file
+from jaxphoto.io.text_tables import read_csv
 from jaxphoto.report.stability import Compared
+
+_MEASURED = "image_points.csv"
 
 
 def read_two(
@@ -24,6 +29,29 @@ def read_two(
 def compared(letter: str, path: Path, file: CameraFile) -> Compared:
     """What tables and pictures call a camera file."""
     return Compared(f"{letter} ({path})", file.interior, file.covariance is not None)
+
+
+def check_two_calibrations(a: CameraFile, b: CameraFile, first: Path, second: Path) -> None:
+    """Raise InputError where two camera files hold the same numbers: no test of two tells anything of one."""
+    if bool(eqx.tree_equal((a.interior, a.covariance), (b.interior, b.covariance))):
+        raise InputError(
+            f"{first} and {second} are one calibration, which tells no change; name one by other photographs"
+        )
+
+
+def share_image_points(first: Path, second: Path) -> bool:
+    """Whether two folders of results say that a file of image points is the same."""
+    tables = [path / "inputs.csv" for path in (first, second)]
+    if not all(table.is_file() for table in tables):
+        return False
+    one, other = map(_measured, tables)
+    return not one.isdisjoint(other)
+
+
+def _measured(inputs: Path) -> set[str]:
+    """What the files of image points of a result hash to."""
+    table = read_csv(inputs, ("file", "sha256"), ("n_bytes",))
+    return {key for name, key in zip(table.ids("file"), table.ids("sha256"), strict=True) if name.endswith(_MEASURED)}
 
 
 def check_one_sensor(a: CameraFile, b: CameraFile, first: Path, second: Path) -> None:
