@@ -32,7 +32,7 @@ def example_command(
     name: Annotated[
         str | None, typer.Argument(metavar="NAME", help=f"Which: {', '.join(EXAMPLES)}; a list if not given.")
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="Where to write it; if not given, NAME in this folder.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Where to write it; else NAME or NAME.toml in this folder.")] = None,
 ) -> None:
     """Write an example block, recipe or experiment that comes with jaxphoto."""
     if name is None:

@@ -27,6 +27,7 @@ _STYLE = """\
 .yes, .no { print-color-adjust: exact } .no::before { content: "\\2717\\a0"; color: var(--bad) }
 .ours { font-weight: 600 } .spread, .paper { color: var(--grey) } .spread { font-size: 90% }
 ol.notes { margin: 0 0 1.5rem; font-size: 13px; color: var(--grey) } sup { color: var(--grey); font-size: 75% }
+@media print { ol.notes { break-before: avoid; font-size: 9px } td + td, th { white-space: normal } }
 """
 _PAGE = """{{ head }}<body>
 <h1>{{ title }}</h1>
@@ -49,7 +50,7 @@ Small numbers at cells and headings refer to the notes below the table.</p>
 <tr><th></th>{% for c in table.columns %}<th>{{ c.heading }}{% for n in c.notes %}<sup>{{ n }}</sup>{% endfor %}</th>{% endfor %}</tr>
 {% for row in table.rows %}<tr><td>{{ row.name }}</td>{% for cell in row.cells %}<td class="{{ cell.within }}">
 {%- if cell.ours %}<span class="ours">{{ cell.ours }}</span><span class="spread">{{ cell.spread }}</span>{% endif %}
-{%- if cell.published or table.printed %}<br><span class="paper">{{ cell.published or "&nbsp;"|safe }}</span>{% endif %}
+{%- if cell.published or table.printed %}<br><span class="paper">{{ cell.published|replace("± ", "±\u00a0") or "&nbsp;"|safe }}</span>{% endif %}
 {%- if cell.note %}<sup>{{ cell.note }}</sup>{% endif %}</td>{% endfor %}</tr>
 {% endfor %}</table></div>{% endif %}
 {% if table.notes %}<ol class="notes">{% for note in table.notes %}<li>{{ note }}</li>{% endfor %}</ol>{% endif %}

@@ -1,5 +1,7 @@
 """What an experiment prints for readers: names, digits, tables and pictures say what tables.csv says."""
 
+import re
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -97,3 +99,5 @@ def test_comparison_figure_draws_ours_and_the_print():
 
 def test_what_is_not_within_is_marked_by_more_than_colour_and_printed():
     assert '.no::before { content: "\\2717' in _STYLE and "print-color-adjust: exact" in _STYLE
+    # A table of twenty columns would else shrink every sheet.
+    assert re.search(r"@media print .*td \+ td, th { white-space: normal }", _STYLE)
