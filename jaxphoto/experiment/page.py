@@ -46,8 +46,8 @@ Small numbers at cells and headings refer to the notes below the table.</p>
 <h2>Block of the first layout</h2><img alt="block layout" src="{{ layout }}">
 <div class="tables">
 {% for table in tables %}<h2 id="{{ table.name }}">{{ table.title }}</h2>
-{% if table.columns %}<div class="wide"><table>
-<tr><th></th>{% for c in table.columns %}<th>{{ c.heading }}{% for n in c.notes %}<sup>{{ n }}</sup>{% endfor %}</th>{% endfor %}</tr>
+{% if table.columns %}<div class="wide"><table class="as-printed">
+<thead><tr><th></th>{% for c in table.columns %}<th>{{ c.heading }}{% for n in c.notes %}<sup>{{ n }}</sup>{% endfor %}</th>{% endfor %}</tr></thead>
 {% for row in table.rows %}<tr><td>{{ row.name }}</td>{% for cell in row.cells %}<td class="{{ cell.within }}">
 {%- if cell.ours %}<span class="ours">{{ cell.ours }}</span><span class="spread">{{ cell.spread }}</span>{% endif %}
 {%- if cell.published or table.printed %}<br><span class="paper">{{ cell.published|replace("± ", "±\u00a0") or "&nbsp;"|safe }}</span>{% endif %}

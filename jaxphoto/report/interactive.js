@@ -321,6 +321,6 @@
   const figure = document.querySelector("figure.block");
   // Where a browser draws nothing in space, the still picture stays.
   const canTurn = figure && window.DecompressionStream && window.WebGLRenderingContext;
-  for (const table of document.querySelectorAll("table:has(thead)")) prepareTable(table, canTurn);
+  for (const table of document.querySelectorAll("table:has(thead):not(.as-printed)")) prepareTable(table, canTurn);
   if (canTurn) drawInSight(figure);
 }

@@ -1,13 +1,14 @@
 """What an experiment prints for readers: names, digits, tables and pictures say what tables.csv says."""
 
 import re
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from jaxphoto.experiment import comparison_figure, side_by_side
-from jaxphoto.experiment.page import _STYLE, table_texts
+from jaxphoto.experiment import comparison_figure, page, side_by_side
+from jaxphoto.experiment.page import _PAGE, _STYLE, table_texts
 from jaxphoto.experiment.wording import heading, own_decimals, power_of, printed_decimals, table_title
 
 NAN = np.nan
@@ -101,3 +102,9 @@ def test_what_is_not_within_is_marked_by_more_than_colour_and_printed():
     assert '.no::before { content: "\\2717' in _STYLE and "print-color-adjust: exact" in _STYLE
     # A table of twenty columns would else shrink every sheet.
     assert re.search(r"@media print .*td \+ td, th { white-space: normal }", _STYLE)
+
+
+def test_heads_of_printed_tables_come_again_on_every_sheet_and_do_not_sort():
+    assert '<table class="as-printed">\n<thead><tr><th></th>' in _PAGE
+    script = (Path(page.__file__).parents[1] / "report" / "interactive.js").read_text(encoding="utf-8")
+    assert "table:has(thead):not(.as-printed)" in script
