@@ -105,6 +105,9 @@ def test_cameras_of_different_sensors_are_refused(sets, monkeypatch, capsys):
     code, _, error = run(monkeypatch, capsys, "stability", sets / "one", other)
     assert code == 2
     assert "give the true one by --pixel-mm, and where results say the assumed one, make a file of pixels" in error
+    code, _, error = run(monkeypatch, capsys, "stability", sets / "one", other, "--pixel-mm", SENSOR["pixel_mm"])
+    assert code == 2
+    assert "other.toml: it says itself that a pixel is 0.0015 mm, not 0.00155: leave --pixel-mm out, or" in error
 
 
 @pytest.fixture(scope="module")

@@ -1,10 +1,11 @@
 """A camera file of any known format -> `CameraFile`."""
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from jaxphoto.errors import InputError
+from jaxphoto.errors import InputError, quoted
 from jaxphoto.io.block_folder.table_layout import TOML
 from jaxphoto.io.cameras import agisoft, colmap, kalibr, mrcal, open_cv, own_cameras, smac_report
 from jaxphoto.io.cameras.camera_file import CameraFile, CameraSource
@@ -51,8 +52,8 @@ def read_camera_file(
     where the file does not give them; `block` is the block of which an interior.csv is, needed where results do not
     say it.
 
-    Raises InputError for files that are missing, cut off or of no known format, for models that are not known here and
-    for what is missing in a file.
+    Raises InputError for files that are missing, cut off or of no known format, for models that are not known here, for
+    what is missing in a file and for a pixel that a file has otherwise.
     """
     path = Path(path)
     if path.is_dir():
@@ -67,7 +68,14 @@ def read_camera_file(
     text = "" if path.name == colmap.BINARY else source.text()
     for known in _FORMATS.values():
         if known.recognises(path, text):
-            return known.read(source)
+            found = known.read(source)
+            if pixel_mm is not None and not math.isclose(found.sensor.pixel_mm, pixel_mm, rel_tol=1e-6):
+                raise source.error(
+                    f"it says itself that a pixel is {found.sensor.pixel_mm:g} mm, not {pixel_mm:g}: leave --pixel-mm "
+                    "out, or, where that was assumed, make a file of pixels of it first: jaxphoto camera "
+                    f"{quoted(str(path))} --out pixels.yml"
+                )
+            return found
     if not text.strip():
         raise source.error("the file is empty; write it anew")
     raise source.error(f"this is no camera file that is known; {CAMERAS_READ} are")
