@@ -75,6 +75,7 @@ def test_one_calibration_is_not_compared_with_itself_and_shared_image_points_are
     code, _, error = run(monkeypatch, capsys, "compare", a, a)
     assert code == 2 and "are one calibration, which tells no change" in error
     for folder, key, shared in ((a, "0", False), (b, "1", False), (b, "0", True)):
-        (folder / "inputs.csv").write_text(f"file,n_bytes,sha256\nx/image_points.csv,9,{key}\ny.csv,9,{key}9\n")
+        rows = f"x/image_points.csv,9,{64 * key}\ny.csv,9,{63 * key}9\n"
+        (folder / "inputs.csv").write_text(f"file,n_bytes,sha256\n{rows}")
         code, _, error = run(monkeypatch, capsys, "compare", a, b)
         assert code == 0 and ("are of the same image points" in error) == shared

@@ -11,6 +11,7 @@ from jaxphoto.adjustment.layout.tiled import TiledResiduals, TiledStructure, Til
 from jaxphoto.adjustment.normal_equations import Cofactors, Linearised, NormalEquations, RowCofactors, optimise
 from jaxphoto.adjustment.result import Adjustment, Outcome
 from jaxphoto.adjustment.solver.levenberg_marquardt import Task, to_factor, to_optimum
+from jaxphoto.adjustment.solver.optimum import TOLERANCE
 from jaxphoto.adjustment.weak_directions import POOR, WeakDirection, weak_directions, yardsticks
 from jaxphoto.adjustment.weak_words import WeakUnknowns, weaknesses_of
 
@@ -18,6 +19,7 @@ __all__ = [
     "LEAST",
     "MAX_STEPS",
     "POOR",
+    "TOLERANCE",
     "Adjustment",
     "Cofactors",
     "LaidOut",

@@ -7,7 +7,7 @@ import equinox as eqx
 
 from jaxphoto.errors import InputError
 from jaxphoto.io.cameras import CameraFile, read_camera_file
-from jaxphoto.io.text_tables import read_csv
+from jaxphoto.io.input_hashes import INPUTS, read_inputs
 from jaxphoto.report.stability import Compared
 
 _MEASURED = "image_points.csv"
@@ -41,17 +41,11 @@ def check_two_calibrations(a: CameraFile, b: CameraFile, first: Path, second: Pa
 
 def share_image_points(first: Path, second: Path) -> bool:
     """Whether two folders of results say that a file of image points is the same."""
-    tables = [path / "inputs.csv" for path in (first, second)]
+    tables = [path / INPUTS for path in (first, second)]
     if not all(table.is_file() for table in tables):
         return False
-    one, other = map(_measured, tables)
+    one, other = ({f.sha256 for f in read_inputs(table) if f.file.endswith(_MEASURED)} for table in tables)
     return not one.isdisjoint(other)
-
-
-def _measured(inputs: Path) -> set[str]:
-    """What the files of image points of a result hash to."""
-    table = read_csv(inputs, ("file", "sha256"), ("n_bytes",))
-    return {key for name, key in zip(table.ids("file"), table.ids("sha256"), strict=True) if name.endswith(_MEASURED)}
 
 
 def check_one_sensor(a: CameraFile, b: CameraFile, first: Path, second: Path) -> None:

@@ -9,15 +9,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from jaxphoto.adjustment import Adjustment, Outcome
+from jaxphoto.adjustment import TOLERANCE, Adjustment, Outcome
 from jaxphoto.errors import counted
 from jaxphoto.report.document import DocumentPicture, Element, Heading, Paragraph, Pictures, rows_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# An adjustment has converged where every unknown is nearer to the optimum than this part of its standard deviation.
-_NEAR = 1e-5
 # Rows and ticks that are still read.
 _SHOWN = 40
 
@@ -90,7 +88,7 @@ def draw_steps(axes: Axes, adjusted: Adjustment) -> None:
     axes.semilogy(k[taken], length[taken], "o", ms=4, color="tab:blue", label="taken")
     if not taken.all():
         axes.semilogy(k[~taken], length[~taken], "o", ms=5, mfc="none", color="tab:orange", label="refused")
-    axes.axhline(_NEAR, ls="--", color="0.4", label="near enough")
+    axes.axhline(TOLERANCE, ls="--", color="0.4", label="near enough")
     axes.set(xlabel="step", ylabel="largest move [sigmas]")
     axes.set_title("step", loc="left", fontsize=9)
     axes.locator_params(axis="x", integer=True)

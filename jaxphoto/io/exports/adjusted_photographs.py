@@ -126,6 +126,11 @@ def downwards(exterior: ExteriorOrientation) -> Float[np.ndarray, "n 3 3"]:
     return np.array([[1.0], [-1.0], [-1.0]]) * np.asarray(exterior.camera_from_object)
 
 
+def translations(turns: Float[np.ndarray, "n 3 3"], exterior: ExteriorOrientation) -> Float[np.ndarray, "n 3"]:
+    """t of x = R X + t, for cameras that `turns` bring into axes of theirs."""
+    return -np.einsum("nij,nj->ni", turns, exterior.position)
+
+
 def numbered(names: tuple[str, ...]) -> dict[str, int]:
     """The names as numbers where all are positive ones, otherwise counted from 1."""
     own = [int(name) if name.isascii() and name.isdigit() else 0 for name in names]

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaxphoto.io.exports.adjusted_photographs import AdjustedPhotographs
+from jaxphoto.io.exports.adjusted_photographs import AdjustedPhotographs, translations
 from jaxphoto.io.exports.same_rays import from_principal_point, radial_values
 
 
@@ -19,8 +19,7 @@ def write_bal(photographs: AdjustedPhotographs, folder: Path) -> None:
     without points that no photograph shows."""
     p = photographs
     turns = np.asarray(p.exterior.camera_from_object)
-    moved = -np.einsum("nij,nj->ni", turns, p.exterior.position)
-    cameras = np.hstack([Rotation.from_matrix(turns).as_rotvec(), moved, radial_values(p)])
+    cameras = np.hstack([Rotation.from_matrix(turns).as_rotvec(), translations(turns, p.exterior), radial_values(p)])
     points, number = np.unique(p.point, return_inverse=True)
     order = np.lexsort((p.image, number))
     rows = zip(p.image[order].tolist(), number[order].tolist(), from_principal_point(p)[order].tolist(), strict=True)

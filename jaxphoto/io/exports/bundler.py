@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxphoto.errors import InputError, quoted
-from jaxphoto.io.exports.adjusted_photographs import AdjustedPhotographs
+from jaxphoto.io.exports.adjusted_photographs import AdjustedPhotographs, translations
 from jaxphoto.io.exports.same_rays import from_principal_point, radial_values
 from jaxphoto.io.reconstructions.bundler import HEAD
 
@@ -28,7 +28,7 @@ def write_bundler(photographs: AdjustedPhotographs, folder: Path) -> None:
         if len(file.split()) != 1:
             raise InputError(f"{LIST} ends names at blanks, and {quoted(file)} has one; rename the photograph")
     turns, values = np.asarray(p.exterior.camera_from_object), radial_values(p)
-    moved = -np.einsum("nij,nj->ni", turns, p.exterior.position)
+    moved = translations(turns, p.exterior)
     shown = [rows for rows in p.rows_of_points if len(rows)]
     lines = [HEAD, f"{len(p.images)} {len(shown)}"]
     for own, turn, shift in zip(values.tolist(), turns.tolist(), moved.tolist(), strict=True):

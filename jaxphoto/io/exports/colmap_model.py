@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxphoto.io.cameras.colmap import ColmapCamera, cameras_bytes, cameras_text, colmap_camera
 from jaxphoto.io.colmap.model import FILES
-from jaxphoto.io.exports.adjusted_photographs import AdjustedPhotographs, downwards, numbered
+from jaxphoto.io.exports.adjusted_photographs import AdjustedPhotographs, downwards, numbered, translations
 
 _IMAGES = "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n# POINTS2D[] as (X, Y, POINT3D_ID)\n"
 _POINTS = "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n"
@@ -70,8 +70,7 @@ def _model(photographs: AdjustedPhotographs) -> _Model:
     p = photographs
     camera_ids, point_ids = numbered(tuple(p.cameras)), np.array(list(numbered(p.points).values()), int)
     rotations = downwards(p.exterior)
-    translations = -np.einsum("nij,nj->ni", rotations, p.exterior.position)
-    poses = np.hstack([Rotation.from_matrix(rotations).as_quat()[:, [3, 0, 1, 2]], translations])
+    poses = np.hstack([Rotation.from_matrix(rotations).as_quat()[:, [3, 0, 1, 2]], translations(rotations, p.exterior)])
     images, feature = [], np.zeros(len(p.image), int)
     for i, rows in enumerate(p.rows_of_images):
         feature[rows] = np.arange(len(rows))

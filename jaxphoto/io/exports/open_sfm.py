@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxphoto.camera import Equidistant, OpenCv, OpenCvFisheye, Perspective, Sensor
 from jaxphoto.io.cameras.camera_file import CameraModel
-from jaxphoto.io.exports.adjusted_photographs import AdjustedPhotographs, ExportCamera, downwards
+from jaxphoto.io.exports.adjusted_photographs import AdjustedPhotographs, ExportCamera, downwards, translations
 from jaxphoto.io.exports.gcp_list import write_gcp_list
 
 PLANE = CameraModel(OpenCv, ("k4", "k5", "k6", "b2"), Perspective())
@@ -29,7 +29,7 @@ def write_open_sfm(photographs: AdjustedPhotographs, folder: Path) -> None:
     control on a map also gcp_list.txt."""
     p = photographs
     rotations = downwards(p.exterior)
-    turns, moved = Rotation.from_matrix(rotations).as_rotvec(), -np.einsum("nij,nj->ni", rotations, p.exterior.position)
+    turns, moved = Rotation.from_matrix(rotations).as_rotvec(), translations(rotations, p.exterior)
     cameras = {name: _camera(camera) for name, camera in p.cameras.items()}
     shots = {
         file: {"rotation": turns[i].tolist(), "translation": moved[i].tolist(), "camera": p.image_camera[i]}
