@@ -273,6 +273,16 @@ def test_it_is_read_as_the_program_means_it(tmp_path, name):
     assert block.datum.kind == "inner" and block.start.image_known.all()
 
 
+@pytest.mark.filterwarnings("ignore:.*are not read", "ignore:.*are left out")
+def test_a_sensor_in_millimetres_tells_the_pixel(tmp_path):
+    block = read_source(write_blocks_exchange(tmp_path / "in", pixels_of_focal=False))
+    assert block.sensors["one"].pixel_mm == pytest.approx(6.4 / WIDTH, rel=1e-15)
+    assert float(block.start.unknowns.interior["one"].c) == pytest.approx(8.0, rel=1e-15)
+    nothing = lambda text: text.replace("<SensorSize>6.4", "<SensorSize>0")  # noqa: E731
+    with pytest.raises(InputError, match="a pixel of 0 mm cannot be"):
+        read_source(write_blocks_exchange(tmp_path / "none", pixels_of_focal=False, change=nothing))
+
+
 @pytest.mark.parametrize("kind", OPENSFM)
 def test_a_camera_is_free_in_what_the_program_estimates(tmp_path, kind):
     block = read_source(write_open_sfm(tmp_path / "in", kind), "opensfm")

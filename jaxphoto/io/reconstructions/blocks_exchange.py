@@ -224,11 +224,14 @@ def _camera(source: CameraSource, name: str, group: ElementTree.Element) -> Tied
         )
 
     width, height = number("ImageDimensions/Width"), number("ImageDimensions/Height")
-    sensor, _ = source.sensor(width, height)
+    # Of the longer side; a side of no pixels is refused below.
+    longer = max(width, height, 1.0)
+    pixel_mm = number("SensorSize") / longer if group.find("SensorSize") is not None else None
+    sensor, _ = source.sensor(width, height, pixel_mm)
     if group.find("FocalLengthPixels") is not None:
         focal = number("FocalLengthPixels")
     else:
-        focal = number("FocalLength") / number("SensorSize") * max(width, height)
+        focal = number("FocalLength") / number("SensorSize") * longer
     if number("AspectRatio", 1.0) != 1.0 or number("Skew", 0.0) != 0.0:
         what = f"{source.path.name}: aspect ratio and skew of camera {name} are not read; free b1 and b2 to find them"
         warnings.warn(what, UserWarning, stacklevel=4)
