@@ -1,0 +1,145 @@
+"""What the shell blocks of the pages need, in one place: what a page takes for given, and what does not run, and why.
+
+The blocks of a page run one after another in one folder. What the user has (BLOCK, CLOUD.laz, photographs) is made
+there under that very name; a word that is no name of a file (FORMAT) is replaced.
+"""
+
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "examples").glob("*.md")])
+_LISTING = re.compile(r"^```([a-z]*)\n(.*?)^```\n", re.MULTILINE | re.DOTALL)
+_COMMAND = re.compile(r"^(?:jaxphoto|pip|python3?) (?!.*: )", re.MULTILINE)
+_OPTIONAL = re.compile(r"\[[^\[\]]*\]")
+
+
+class Given(NamedTuple):
+    """What makes a page's inputs (lines of shell), and what its words stand for."""
+
+    made_by: str
+    words: dict[str, str] = {}  # noqa: RUF012
+
+
+_BLOCK = "jaxphoto example cross_block --out BLOCK\n"
+_RESULTS = "jaxphoto example cross_block\njaxphoto adjust cross_block --out RESULTS\n"
+_LIDAR = "jaxphoto example lidar --out BLOCK\ncp BLOCK/cloud.laz CLOUD.laz\ncp BLOCK/trajectory.csv flight.csv\n"
+_STRIPS = _LIDAR.replace("example lidar", "example strips")
+_FLIGHT = "made_photographs flight PHOTOGRAPHS\ncp PHOTOGRAPHS.txt FILE\n"
+_YEARS = """for year in LAST_YEAR THIS_YEAR 2023 2024 2025; do
+    jaxphoto simulate examples/recipe.toml --seed $((seed = ${seed:-0} + 1)) --out of_$year
+    jaxphoto adjust of_$year --out $year
+done
+"""
+
+GIVEN = {
+    "docs/boresight.md": Given("jaxphoto simulate examples/boresight.toml --out BLOCK\n"),
+    "docs/camera_files.md": Given(
+        "jaxphoto example cross_block --out block\njaxphoto adjust block --out results\n"
+        "jaxphoto camera block/block.toml --out calib.yml\n"
+        "jaxphoto camera block/block.toml --distortion smac --out report.txt\n"
+    ),
+    "docs/certificate.md": Given(_RESULTS),
+    "docs/command_line.md": Given(_BLOCK),
+    "docs/control.md": Given(
+        _FLIGHT + "jaxphoto orient PHOTOGRAPHS/*.jpg --out BLOCK\n", {"--out DIR --control": "--out FLOWN --control"}
+    ),
+    "docs/exports.md": Given(
+        _BLOCK + _RESULTS + _FLIGHT,
+        {
+            "CAMERA_OR_RESULTS": "PHOTOGRAPHS.toml",
+            "RESULTS OUT --to FORMAT": "RESULTS A --to colmap",
+            "FORMAT": "opensfm",
+        },
+    ),
+    "docs/experiments.md": Given("", {"000": "000 --layouts 1"}),
+    "docs/fly.md": Given(_FLIGHT),
+    "docs/halves.md": Given(_BLOCK + _YEARS, {"--cuts 64": "--cuts 8"}),
+    "docs/joint.md": Given(_STRIPS, {"--out DRAWS": "--draws 20 --out DRAWS"}),
+    "docs/orient.md": Given(_FLIGHT, {"IMAGES...": "PHOTOGRAPHS/*.jpg"}),
+    "docs/orientations.md": Given(
+        "jaxphoto example cross_block\njaxphoto convert cross_block FOLDER --to metashape --adjust\n"
+    ),
+    "docs/reconstructions.md": Given(
+        "jaxphoto example cross_block\njaxphoto convert cross_block FILE_OR_FOLDER --to openmvg --adjust\n"
+    ),
+    "docs/scaling.md": Given(_BLOCK.replace("BLOCK", "block") + "echo 'import jaxphoto' > my_script.py\n"),
+    "docs/simultaneous.md": Given(_LIDAR),
+    "docs/stability.md": Given(_RESULTS + "cp -r RESULTS RESULTS_A\ncp -r RESULTS RESULTS_B\n"),
+    "docs/strip_adjustment.md": Given(
+        _STRIPS + "echo point,X_m,Y_m,Z_m,sigma_X_m,sigma_Y_m,sigma_Z_m > surveyed.csv\n"
+        "sed '1d; s/\r*$/,0.02,0.02,0.02/' BLOCK/truth/object_points.csv >> surveyed.csv\n"
+    ),
+    "docs/surface_model.md": Given(
+        _LIDAR + "mv CLOUD.laz CLOUD\nmade_photographs blank PHOTO\n", {"--cell-m 1.0": "--cell-m 5.0", "8936": "E1_03"}
+    ),
+    "docs/target_calibration.md": Given(
+        "made_photographs board photographs\nmade_photographs board odd\nmade_photographs board even\n"
+    ),
+    "docs/weights.md": Given(_BLOCK),
+    "README.md": Given(
+        _LIDAR + "made_photographs board board\nmade_photographs flight photographs\n",
+        {"--draws 1000": "--draws 50", "--layouts 4": "--layouts 1", ".venv/bin/": ""},
+    ),
+}
+
+# Pieces of blocks that do not run, and why; what is left of their lines does.
+_INSTALLS = "installs from a registry; .ci/run does so"
+NOT_RUN = {
+    "README.md": {
+        "python3 -m venv .venv && .venv/bin/pip install -q . && ": _INSTALLS,
+        "python3 -m venv .venv && .venv/bin/pip install -q '.[dev]' && .venv/bin/pytest -n 2": _INSTALLS,
+    },
+    "CONTRIBUTING.md": {
+        ".ci/run\n": "runs these tests",
+        "python3 -m venv .venv && .venv/bin/pip install -e '.[dev]'\n": _INSTALLS,
+        ".venv/bin/ruff check --fix . && .venv/bin/ruff format . && .venv/bin/mypy && .venv/bin/lint-imports\n": "the "
+        "checks that .ci/run makes",
+        ".venv/bin/pytest -m quick\n.venv/bin/pytest -n 2 tests/camera\n": "runs these tests",
+    },
+    "docs/experiments.md": {"jaxphoto experiment all --layouts 4\n": "hours; the pages of docs/papers run each alone"},
+    "docs/half_an_hour.md": {"python3 -m venv venv && . venv/bin/activate && pip install jaxphoto": _INSTALLS},
+    "docs/install.md": {
+        "pip install jaxphoto\n": _INSTALLS,
+        "pip install --no-deps jaxphoto\npip install jax optimistix equinox lineax jaxtyping numpy pandas typer rich "
+        "matplotlib plotly jinja2 pyproj scipy pillow pyyaml\n": "benchmarks/install.py --lean does so",
+    },
+    "docs/scaling.md": {
+        "srun --cpus-per-task=32 --cpu-bind=cores python adjust_block.py\n": "wants a cluster with Slurm"
+    },
+}
+
+
+# Pages whose blocks run in a test of their own, which looks at what comes out.
+ELSEWHERE = {
+    "docs/from_other_programs.md": "test_from_other_programs.py",
+    "docs/half_an_hour.md": "test_half_an_hour.py",
+    **{f"docs/papers/{paper}.md": "test_commands_on_pages.py" for paper in ("000", "001", "003", "004")},
+}
+_FIRST = f"""cp -r "{ROOT}/examples" .
+made_photographs() {{ PYTHONPATH="{ROOT}" python -m tests.docs.made_photographs "$@"; }}
+"""
+
+
+def listings(page: Path) -> list[str]:
+    """The blocks of a page that are for a shell; of those without a language what may be left out is left out."""
+    found = []
+    for language, text in _LISTING.findall(page.read_text(encoding="utf-8")):
+        if not language and _COMMAND.search(text):
+            while _OPTIONAL.search(text):
+                text = _OPTIONAL.sub("", text)
+        if language in ("sh", "bash") or (not language and _COMMAND.search(text)):
+            found.append(text)
+    return found
+
+
+def script(page: Path) -> str:
+    """All blocks of a page, with what makes their inputs before them; empty if none of them runs."""
+    text, name = "".join(listings(page)), page.relative_to(ROOT).as_posix()
+    given = GIVEN.get(name, Given(""))
+    left_out = dict.fromkeys(NOT_RUN.get(name, {}), "")
+    for piece, instead in (left_out | given.words).items():
+        assert piece in text, f"{name} has no {piece!r} for tests/docs/shell_blocks.py"
+        text = text.replace(piece, instead)
+    return f"{_FIRST}{given.made_by}\n{text}" if text.strip() else ""

@@ -1,0 +1,54 @@
+"""Every shell block of the pages runs to the end, on small inputs that shell_blocks.py makes."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.commands import run_script
+from tests.docs.shell_blocks import ELSEWHERE, GIVEN, NOT_RUN, PAGES, ROOT, script
+
+RUN = {page.relative_to(ROOT).as_posix(): page for page in PAGES if script(page)}
+# A program that most other tests compile, and little to compute.
+QUICK = ("docs/index.md",)
+KINDS = {
+    "photographs": [name for name in RUN if "made_photographs" in GIVEN.get(name, ("",))[0] and name != "README.md"],
+    "clouds": [name for name in RUN if "CLOUD" in GIVEN.get(name, ("",))[0] and name != "README.md"],
+}
+HERE = set(RUN) - set(ELSEWHERE) - {"README.md"}
+OTHERS = sorted(HERE - {name for names in KINDS.values() for name in names} - set(QUICK))
+
+
+@pytest.mark.parametrize("page", QUICK)
+def test_blocks_run(page: str, tmp_path: Path) -> None:
+    run_script(script(RUN[page]), tmp_path)
+
+
+# Functions of their own, so that CI's parts of the slow tests are of one length.
+@pytest.mark.slow
+@pytest.mark.parametrize("page", OTHERS)
+def test_blocks_with_blocks_run(page: str, tmp_path: Path) -> None:
+    run_script(script(RUN[page]), tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", KINDS["photographs"])
+def test_blocks_with_photographs_run(page: str, tmp_path: Path) -> None:
+    run_script(script(RUN[page]), tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", KINDS["clouds"])
+def test_blocks_with_clouds_run(page: str, tmp_path: Path) -> None:
+    run_script(script(RUN[page]), tmp_path)
+
+
+@pytest.mark.slow
+def test_blocks_of_the_readme_run(tmp_path: Path) -> None:
+    run_script(script(RUN["README.md"]), tmp_path)
+
+
+def test_what_is_declared_of_a_page_is_of_one_that_there_is() -> None:
+    names = {page.relative_to(ROOT).as_posix() for page in PAGES}
+    assert set(GIVEN) | set(NOT_RUN) | set(ELSEWHERE) <= names
+    for name, test in ELSEWHERE.items():
+        assert Path(name).stem in (ROOT / "tests" / "docs" / test).read_text(encoding="utf-8")
