@@ -1,6 +1,6 @@
 """Photographs for the shell blocks of the pages, made in seconds: `python -m tests.docs.made_photographs KIND FOLDER`.
 
-`board`: a chessboard. `blank`: a grey picture of the example block's format, a file. `flight`: flat ground from a drone,
+`board`: a chessboard. `blank`: a grey picture of the example block's format. `flight`: flat ground from the air,
 with positions and all that EXIF says of a camera; beside the folder FOLDER.txt, a gcp_list.txt of points on the ground
 with their marks, and FOLDER.toml, the camera. Photographs of all folders are of one format and size of pixel.
 """

@@ -111,6 +111,8 @@ NOT_RUN = {
 }
 
 
+# Whose blocks are of `py`, which does not run: they want several processes, as tests/adjustment/test_shards.py has.
+PYTHON_NOT_RUN = ("docs/scaling.md",)
 # Pages whose blocks run in a test of their own, which looks at what comes out.
 ELSEWHERE = {
     "docs/from_other_programs.md": "test_from_other_programs.py",
@@ -120,6 +122,11 @@ ELSEWHERE = {
 _FIRST = f"""cp -r "{ROOT}/examples" .
 made_photographs() {{ PYTHONPATH="{ROOT}" python -m tests.docs.made_photographs "$@"; }}
 """
+
+
+def languages(page: Path) -> set[str]:
+    """Of the blocks of a page."""
+    return {language for language, _ in _LISTING.findall(page.read_text(encoding="utf-8"))}
 
 
 def listings(page: Path) -> list[str]:

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from tests.commands import run_script
-from tests.docs.shell_blocks import ELSEWHERE, GIVEN, NOT_RUN, PAGES, ROOT, script
+from tests.docs.shell_blocks import ELSEWHERE, GIVEN, NOT_RUN, PAGES, PYTHON_NOT_RUN, ROOT, languages, script
 
 RUN = {page.relative_to(ROOT).as_posix(): page for page in PAGES if script(page)}
 # A program that most other tests compile, and little to compute.
@@ -47,8 +47,15 @@ def test_blocks_of_the_readme_run(tmp_path: Path) -> None:
     run_script(script(RUN["README.md"]), tmp_path)
 
 
+def test_no_block_is_called_what_no_test_runs() -> None:
+    for page in PAGES:
+        known = {"", "sh", "bash", "python", "toml", "yaml", "text"}
+        allowed = known | ({"py"} if page.relative_to(ROOT).as_posix() in PYTHON_NOT_RUN else set())
+        assert languages(page) <= allowed, page.name
+
+
 def test_what_is_declared_of_a_page_is_of_one_that_there_is() -> None:
     names = {page.relative_to(ROOT).as_posix() for page in PAGES}
-    assert set(GIVEN) | set(NOT_RUN) | set(ELSEWHERE) <= names
+    assert set(GIVEN) | set(NOT_RUN) | set(ELSEWHERE) | set(PYTHON_NOT_RUN) <= names
     for name, test in ELSEWHERE.items():
         assert Path(name).stem in (ROOT / "tests" / "docs" / test).read_text(encoding="utf-8")
