@@ -56,7 +56,9 @@ GIVEN = {
     "docs/experiments.md": Given("", {"000": "000 --layouts 1"}),
     "docs/fly.md": Given(_FLIGHT),
     "docs/halves.md": Given(_BLOCK + _YEARS, {"--cuts 64": "--cuts 8"}),
-    "docs/joint.md": Given(_STRIPS, {"--out DRAWS": "--draws 20 --out DRAWS"}),
+    "docs/joint.md": Given(
+        _STRIPS, {"flight.csv --": "flight.csv --cell-m 8 --", "--out DRAWS": "--draws 20 --out DRAWS"}
+    ),
     "docs/orient.md": Given(_FLIGHT, {"IMAGES...": "PHOTOGRAPHS/*.jpg"}),
     "docs/orientations.md": Given(
         "jaxphoto example cross_block\njaxphoto convert cross_block FOLDER --to metashape --adjust\n"
@@ -69,10 +71,11 @@ GIVEN = {
     "docs/stability.md": Given(_RESULTS + "cp -r RESULTS RESULTS_A\ncp -r RESULTS RESULTS_B\n"),
     "docs/strip_adjustment.md": Given(
         _STRIPS + "echo point,X_m,Y_m,Z_m,sigma_X_m,sigma_Y_m,sigma_Z_m > surveyed.csv\n"
-        "sed '1d; s/\r*$/,0.02,0.02,0.02/' BLOCK/truth/object_points.csv >> surveyed.csv\n"
+        "sed '1d; s/\r*$/,0.02,0.02,0.02/' BLOCK/truth/object_points.csv >> surveyed.csv\n",
+        {"CLOUD.laz --": "CLOUD.laz --cell-m 8 --"},
     ),
     "docs/surface_model.md": Given(
-        _LIDAR + "mv CLOUD.laz CLOUD\nmade_photographs blank PHOTO\n", {"--cell-m 1.0": "--cell-m 5.0", "8936": "E1_03"}
+        _LIDAR + "made_photographs blank PHOTO\n", {"--cell-m 1.0": "--cell-m 5.0", "8936": "E1_03"}
     ),
     "docs/target_calibration.md": Given(
         "made_photographs board photographs\nmade_photographs board odd\nmade_photographs board even\n"
