@@ -1,84 +1,85 @@
-"""docs/gallery.md and its pictures: of each notebook what it is about, a picture of it, and what it concludes.
+"""Run the notebooks, keep their outputs for the site, and write docs/gallery.md.
 
-python docs/site/gallery.py [--executed FOLDER]
+python docs/site/gallery.py [NAME ...] [--executed FOLDER]
 
-Runs all notebooks, which takes some twenty minutes; with --executed keeps them there with their outputs, and takes
-those that are there already. The picture is that of the cell with the tag `gallery`, or else the last.
+Runs the notebooks whose names begin with one of NAME, all if none is given, which takes some twenty minutes; with
+--executed it takes those that lie in FOLDER with their outputs, and leaves there what it runs. Of each the site then
+shows every output (outputs.py), and the page what it is about, a picture, and what it concludes. The picture is that of
+the cell with the tag `gallery`, or else the last.
 """
 
 import argparse
-import base64
-import io
+import datetime
 import re
 import tempfile
 from pathlib import Path
 
 import nbformat
 from nbclient import NotebookClient
-from PIL import Image
+from outputs import NOTEBOOKS, ROOT, keep, with_outputs
 
-ROOT = Path(__file__).resolve().parents[2]
-PAGE, IMAGES = ROOT / "docs" / "gallery.md", ROOT / "docs" / "images" / "gallery"
-NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
-# A picture is as wide as a page of the site, and some 30 kB.
-_WIDTH, _QUALITY = 900, 70
+import jaxphoto
+
+PAGE = ROOT / "docs" / "gallery.md"
 _HEAD = """# Gallery
 
-What the notebooks show, one picture each and their own last words. They lie in `notebooks/` without outputs, so that
-none is out of date; `JAXPHOTO_RUN_NOTEBOOKS=true mkdocs build` makes this site with all of them. This page was written
-by `python docs/site/gallery.py`, which runs them.
+What the notebooks show, one picture each and their own last words; behind each title the whole notebook, on the
+site with every table and picture of the same run. `python docs/site/gallery.py` runs them and makes all that.
 """
+_PICTURE = re.compile(r'<img src="\.\./(images/gallery/[^"]+)"')
 
 
 def main() -> None:
-    """Write the page and its pictures."""
+    """Run, keep, and write the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="*", help="beginnings of the names of notebooks; all if none is given")
     parser.add_argument("--executed", type=Path, help="folder of notebooks with their outputs")
+    given = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        executed = parser.parse_args().executed or Path(folder)
+        executed = given.executed or Path(folder)
         executed.mkdir(parents=True, exist_ok=True)
-        IMAGES.mkdir(exist_ok=True)
-        entries = [entry(path, run(path, executed / path.name)) for path in NOTEBOOKS]
-    PAGE.write_text("\n".join([_HEAD, *entries]), "utf-8")
+        for path in NOTEBOOKS:
+            if not given.names or path.name.startswith(tuple(given.names)):
+                run(path, executed / path.name)
+    PAGE.write_text("\n".join([_HEAD, *map(entry, NOTEBOOKS)]), "utf-8")
 
 
-def run(path: Path, kept: Path) -> nbformat.NotebookNode:
-    """A notebook with its outputs."""
-    if not kept.exists():
+def run(path: Path, executed: Path) -> None:
+    """Run a notebook, unless it lies there with its outputs, and keep what it shows."""
+    if not executed.exists():
         print(path.name, flush=True)
         notebook = nbformat.read(path, as_version=4)
         place = {"metadata": {"path": path.parent}}
         NotebookClient(notebook, timeout=1200, kernel_name="python3", resources=place).execute()
-        nbformat.write(notebook, kept)
-    return nbformat.read(kept, as_version=4)
+        nbformat.write(notebook, executed)
+    on = datetime.date.fromtimestamp(executed.stat().st_mtime)
+    keep(path, nbformat.read(executed, as_version=4), f"{on}, jaxphoto {jaxphoto.__version__}")
 
 
-def entry(path: Path, notebook: nbformat.NotebookNode) -> str:
-    """The notebook's part of the page; its picture is written."""
+def entry(path: Path) -> str:
+    """The notebook's part of the page."""
+    notebook = with_outputs(path)
     title, _, text = notebook.cells[0].source.partition("\n")
     about = _on_page(" ".join(text.strip().split("\n\n")[0].split()))
     title = title.lstrip("# ").strip()
     parts = [f"## [{title}](../notebooks/{path.name})", about]
     if shown := picture(notebook):
-        name = f"{path.stem}.webp"
-        shown.thumbnail((_WIDTH, 4 * _WIDTH))
-        shown.save(IMAGES / name, quality=_QUALITY, method=6)
-        parts.append(f"![{title}](images/gallery/{name})")
+        parts.append(f"![{title}]({shown})")
     if words := conclusion(notebook):
         parts.append(words)
     return "\n\n".join(parts) + "\n"
 
 
-def picture(notebook: nbformat.NotebookNode) -> Image.Image | None:
-    """That of the cell with the tag, or the last."""
+def picture(notebook: nbformat.NotebookNode) -> str:
+    """The file of that of the cell with the tag, or of the last."""
     tagged = [cell for cell in notebook.cells if "gallery" in cell.metadata.get("tags", ())]
     found = [
-        output.data["image/png"]
+        shown[1]
         for cell in tagged or notebook.cells
         for output in cell.get("outputs", ())
-        if "image/png" in output.get("data", {})
+        if (shown := _PICTURE.match(output.get("data", {}).get("text/html", "")))
     ]
-    return Image.open(io.BytesIO(base64.b64decode(found[-1]))).convert("RGB") if found else None
+    return found[-1] if found else ""
 
 
 def conclusion(notebook: nbformat.NotebookNode) -> str:

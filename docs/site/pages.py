@@ -8,18 +8,30 @@ import functools
 import importlib
 import inspect
 import json
+import logging
+import os
 import re
+import shutil
+import tempfile
 from pathlib import Path
 
+import nbformat
 from latex2mathml.converter import convert
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.plugins import event_priority
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
+from outputs import NOTEBOOKS, ROOT, kept, with_outputs
 
-ROOT = Path(__file__).resolve().parents[2]
+_LOG = logging.getLogger("mkdocs.hooks.pages")
+# Where MkDocs finds the notebooks with their outputs while it builds.
+_WITH_OUTPUTS = Path(tempfile.gettempdir()) / f"jaxphoto_notebooks_{os.getpid()}"
 _WORKER = "worker_from_disk.js"
-_WHOLE_NAMES = ".md-typeset td code { word-break: normal; overflow-wrap: normal }"
+# Names and options are not broken, wide tables and code have room, and where a table scrolls its cells are not tall.
+_STYLE = """.md-typeset td code { word-break: normal; overflow-wrap: normal }
+.md-typeset td:first-child code { white-space: nowrap }
+.md-grid { max-width: 68rem }
+@media (max-width: 60em) { .md-typeset td:nth-child(n+4) { min-width: 9rem } }"""
 _LINK = re.compile(r"\[([^\]]*)\]\((?:\.\./)+([^)#]+)(#[^)]*)?\)")
 _TO_PAGE = re.compile(r"\[[\w/]+\.md\]\(([\w./]+\.md)(#[^)]*)?\)")
 _NAME = re.compile(r"(?<!\[)`jaxphoto\.([\w.]+)`(?!\])")
@@ -31,7 +43,7 @@ _LISTING = re.compile(r"(^```.*?^```|`[^`\n]+`)", re.DOTALL | re.MULTILINE)
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
     """Name every notebook and every page of the reference in the contents."""
     added = {
-        "notebooks/": [{_notebook_title(path): f"notebooks/{path.name}"} for path in _notebooks()],
+        "notebooks/": [{_notebook_title(path): f"notebooks/{path.name}"} for path in NOTEBOOKS],
         "reference/": [f"reference/{room}.md" for room in _public()],
     }
     config.nav = [
@@ -46,8 +58,13 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
 @event_priority(100)  # before the plugin that makes pages of notebooks
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the notebooks, which lie beside docs/, and the reference, which is written here."""
-    for path in _notebooks():
-        files.append(File(f"notebooks/{path.name}", str(ROOT), config.site_dir, config.use_directory_urls))
+    for path in NOTEBOOKS:
+        if not kept(path):
+            _LOG.warning("%s has no outputs of its code: python docs/site/gallery.py %s", path.name, path.stem)
+        shown = _WITH_OUTPUTS / "notebooks" / path.name
+        shown.parent.mkdir(parents=True, exist_ok=True)
+        nbformat.write(with_outputs(path), shown)
+        files.append(File(f"notebooks/{path.name}", str(_WITH_OUTPUTS), config.site_dir, config.use_directory_urls))
     for room, names in _public().items():
         entries = "\n\n".join(f"::: {name}" for name in names)
         files.append(
@@ -60,20 +77,24 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """A notebook that was not run for the site shows at least its picture of the gallery."""
-    picture = f"images/gallery/{Path(page.file.src_uri).stem}.webp"
-    if not page.file.src_uri.endswith(".ipynb") or config.plugins["mkdocs-jupyter"].config["execute"]:
+    """A notebook says when its outputs were made."""
+    notebook = ROOT / "notebooks" / Path(page.file.src_uri).name
+    if not page.file.src_uri.endswith(".ipynb"):
         return html
-    shown = f'<img alt="The picture of this notebook in the gallery" src="../{picture}">'
-    words = "One picture of it; what it concludes stands in the <a href=../gallery.html>gallery</a>. Below is the code."
+    shown = kept(notebook)
     heading, end, rest = html.partition("</h1>")
-    return f"{heading}{end}<p>{words}</p>{shown}{rest}"
+    return f"{heading}{end}<p><em>Outputs of a run on {shown['made']}.</em></p>{rest}" if shown else html
 
 
 def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
-    """The one script that the theme would fetch from elsewhere is the site's own; names in tables are not broken."""
-    output = output.replace("</head>", f"<style>{_WHOLE_NAMES}</style></head>", 1)
+    """The one script that the theme would fetch from elsewhere is the site's own; the style is ours."""
+    output = output.replace("</head>", f"<style>{_STYLE}</style></head>", 1)
     return output.replace("https://unpkg.com/iframe-worker/shim", "../" * page.url.count("/") + _WORKER)
+
+
+def on_post_build(config: MkDocsConfig) -> None:
+    """The notebooks with their outputs are pages now."""
+    shutil.rmtree(_WITH_OUTPUTS)
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
@@ -123,10 +144,6 @@ def _title(page: Path) -> str:
 
 def _notebook_title(path: Path) -> str:
     return "".join(json.loads(path.read_text("utf-8"))["cells"][0]["source"]).splitlines()[0].lstrip("# ")
-
-
-def _notebooks() -> list[Path]:
-    return sorted((ROOT / "notebooks").glob("*.ipynb"))
 
 
 def _public() -> dict[str, list[str]]:

@@ -71,7 +71,7 @@ GIVEN = {
     "docs/stability.md": Given(_RESULTS + "cp -r RESULTS RESULTS_A\ncp -r RESULTS RESULTS_B\n"),
     "docs/strip_adjustment.md": Given(
         _STRIPS + "echo point,X_m,Y_m,Z_m,sigma_X_m,sigma_Y_m,sigma_Z_m > surveyed.csv\n"
-        "sed '1d; s/\r*$/,0.02,0.02,0.02/' BLOCK/truth/object_points.csv >> surveyed.csv\n",
+        "sed '1d; s/$/,0.02,0.02,0.02/' BLOCK/truth/object_points.csv >> surveyed.csv\n",
         {"CLOUD.laz --": "CLOUD.laz --cell-m 8 --"},
     ),
     "docs/surface_model.md": Given(

@@ -21,6 +21,13 @@ PAPERS = ROOT / "docs" / "papers"
 
 
 def module_of(name):
+    with pytest.MonkeyPatch.context() as patched:
+        # As MkDocs loads a hook: modules beside it are found.
+        patched.syspath_prepend(str(ROOT / "docs" / "site"))
+        return loaded(name)
+
+
+def loaded(name):
     spec = importlib.util.spec_from_file_location(name, ROOT / "docs" / "site" / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -115,9 +122,33 @@ def test_the_gallery_has_every_notebook_with_a_picture():
     for (title, _), path in zip(shown, notebooks, strict=True):
         assert f"# {title}\n" in nbformat.read(path, as_version=4).cells[0].source + "\n"
     pictures = re.findall(r"!\[.+\]\((images/gallery/.+)\)", page)
-    assert len(pictures) == len(notebooks)
+    assert len(pictures) == len(notebooks) and all((ROOT / "docs" / picture).is_file() for picture in pictures)
+
+
+def test_outputs_of_notebooks_are_kept_of_the_code_they_have():
+    module = module_of("outputs")
+    pictures = set()
+    for path in module.NOTEBOOKS:
+        assert module.kept(path), f"the code of {path.name} has changed: python docs/site/gallery.py {path.stem}"
+        outputs = [output for cell in module.with_outputs(path).cells for output in cell.get("outputs", ())]
+        html = " ".join(output.get("data", {}).get("text/html", "") for output in outputs)
+        found = set(re.findall(r"images/gallery/([^\"]+)", html))
+        assert found, path.name
+        pictures |= found
+    assert pictures == {path.name for path in module.PICTURES.iterdir()}
     # Kept in the repository: small.
-    assert sum((ROOT / "docs" / picture).stat().st_size for picture in pictures) < 1e6
+    kept = [*module.PICTURES.iterdir(), *module.OUTPUTS.iterdir()]
+    assert sum(path.stat().st_size for path in kept) < 2e6
+
+
+def test_outputs_of_other_code_are_not_shown(tmp_path):
+    module = module_of("outputs")
+    changed = nbformat.read(module.NOTEBOOKS[0], as_version=4)
+    next(cell for cell in changed.cells if cell.cell_type == "code").source += "\n1 + 1"
+    path = tmp_path / module.NOTEBOOKS[0].name
+    nbformat.write(changed, path)
+    assert module.kept(path) is None
+    assert not any(cell.get("outputs") for cell in module.with_outputs(path).cells)
 
 
 def test_links_read_as_the_heading_of_a_page_that_settings_stand_before():
