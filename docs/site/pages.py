@@ -31,6 +31,7 @@ _WORKER = "worker_from_disk.js"
 _STYLE = """.md-typeset td code { word-break: normal; overflow-wrap: normal }
 .md-typeset td:first-child code { white-space: nowrap }
 .md-grid { max-width: 68rem }
+.celltoolbar { display: none }
 @media (max-width: 60em) { .md-typeset td:nth-child(n+4) { min-width: 9rem } }"""
 _LINK = re.compile(r"\[([^\]]*)\]\((?:\.\./)+([^)#]+)(#[^)]*)?\)")
 _TO_PAGE = re.compile(r"\[[\w/]+\.md\]\(([\w./]+\.md)(#[^)]*)?\)")
