@@ -31,8 +31,8 @@ _WORKER = "worker_from_disk.js"
 _STYLE = """.md-typeset td code { word-break: normal; overflow-wrap: normal }
 .md-typeset td:first-child code { white-space: nowrap }
 .md-grid { max-width: 68rem }
-.celltoolbar { display: none }
-@media (max-width: 60em) { .md-typeset td:nth-child(n+4) { min-width: 9rem } }"""
+.jupyter-wrapper .celltoolbar { display: none !important }
+@media (max-width: 60em) { .md-typeset td:nth-child(n+4):has(a) { min-width: 9rem } }"""
 _LINK = re.compile(r"\[([^\]]*)\]\((?:\.\./)+([^)#]+)(#[^)]*)?\)")
 _TO_PAGE = re.compile(r"\[[\w/]+\.md\]\(([\w./]+\.md)(#[^)]*)?\)")
 _NAME = re.compile(r"(?<!\[)`jaxphoto\.([\w.]+)`(?!\])")
@@ -64,7 +64,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
             _LOG.warning("%s has no outputs of its code: python docs/site/gallery.py %s", path.name, path.stem)
         shown = _WITH_OUTPUTS / "notebooks" / path.name
         shown.parent.mkdir(parents=True, exist_ok=True)
-        nbformat.write(with_outputs(path), shown)
+        nbformat.write(_with_formulas(with_outputs(path)), shown)
         files.append(File(f"notebooks/{path.name}", str(_WITH_OUTPUTS), config.site_dir, config.use_directory_urls))
     for room, names in _public().items():
         entries = "\n\n".join(f"::: {name}" for name in names)
@@ -83,8 +83,9 @@ def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -
     if not page.file.src_uri.endswith(".ipynb"):
         return html
     shown = kept(notebook)
+    words = f"<p><em>notebooks/{notebook.name}, run on {shown['made']}.</em></p>" if shown else ""
     heading, end, rest = html.partition("</h1>")
-    return f"{heading}{end}<p><em>Outputs of a run on {shown['made']}.</em></p>{rest}" if shown else html
+    return f"{heading}{end}{words}{rest}"
 
 
 def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
@@ -120,13 +121,29 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
     markdown = _TO_PAGE.sub(titled, _LINK.sub(linked, markdown))
     if page.file.src_uri.startswith(("reference/", "notebooks/")):
         return markdown
-    parts = _LISTING.split(markdown)
+    parts = _LISTING.split(_formulas(markdown))
     known = _identifiers()
     for k, part in enumerate(parts):
-        if k % 2 == 0:
-            parts[k] = _FORMULA.sub(_mathml, part)
-        elif (name := _NAME.fullmatch(part)) and name[1] in known and not parts[k - 1].endswith("["):
+        if (name := _NAME.fullmatch(part)) and name[1] in known and not parts[k - 1].endswith("["):
             parts[k] = f"[{part}][{known[name[1]]}]"
+    return "".join(parts)
+
+
+def _with_formulas(notebook: nbformat.NotebookNode) -> nbformat.NotebookNode:
+    """Those of its text, and of the text that its cells work out, as MathML."""
+    for cell in notebook.cells:
+        if cell.cell_type == "markdown":
+            cell.source = _formulas(cell.source)
+        for output in cell.get("outputs", ()):
+            if words := output.get("data", {}).get("text/markdown"):
+                output.data["text/markdown"] = _formulas(words)
+    return notebook
+
+
+def _formulas(markdown: str) -> str:
+    """Formulas outside of listings as MathML."""
+    parts = _LISTING.split(markdown)
+    parts[::2] = [_FORMULA.sub(_mathml, part) for part in parts[::2]]
     return "".join(parts)
 
 
