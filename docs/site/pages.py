@@ -34,6 +34,7 @@ _STYLE = """.md-typeset td code { word-break: normal; overflow-wrap: normal }
 .jupyter-wrapper .celltoolbar { display: none !important }
 @media (max-width: 60em) { .md-typeset td:nth-child(n+4):has(a) { min-width: 9rem } }"""
 _LINK = re.compile(r"\[([^\]]*)\]\((?:\.\./)+([^)#]+)(#[^)]*)?\)")
+_TO_NOTEBOOK = re.compile(r"\]\((\w+)\.ipynb\)")
 _TO_PAGE = re.compile(r"\[[\w/]+\.md\]\(([\w./]+\.md)(#[^)]*)?\)")
 _NAME = re.compile(r"(?<!\[)`jaxphoto\.([\w.]+)`(?!\])")
 _FORMULA = re.compile(r"\$\$(.+?)\$\$|\$(?=\S)([^$\n]+?)(?<=\S)\$", re.DOTALL)
@@ -64,7 +65,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
             _LOG.warning("%s has no outputs of its code: python docs/site/gallery.py %s", path.name, path.stem)
         shown = _WITH_OUTPUTS / "notebooks" / path.name
         shown.parent.mkdir(parents=True, exist_ok=True)
-        nbformat.write(_with_formulas(with_outputs(path)), shown)
+        nbformat.write(_as_on_site(with_outputs(path)), shown)
         files.append(File(f"notebooks/{path.name}", str(_WITH_OUTPUTS), config.site_dir, config.use_directory_urls))
     for room, names in _public().items():
         entries = "\n\n".join(f"::: {name}" for name in names)
@@ -118,8 +119,11 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
         found = (ROOT / "docs" / here / match.group(1)).resolve()
         return f"[{_title(found)}]({match.group(1)}{match.group(2) or ''})" if found.is_file() else match.group(0)
 
+    # A notebook comes as its JSON, which is not what is shown.
+    if page.file.src_uri.startswith("notebooks/"):
+        return markdown
     markdown = _TO_PAGE.sub(titled, _LINK.sub(linked, markdown))
-    if page.file.src_uri.startswith(("reference/", "notebooks/")):
+    if page.file.src_uri.startswith("reference/"):
         return markdown
     parts = _LISTING.split(_formulas(markdown))
     known = _identifiers()
@@ -129,15 +133,24 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
     return "".join(parts)
 
 
-def _with_formulas(notebook: nbformat.NotebookNode) -> nbformat.NotebookNode:
-    """Those of its text, and of the text that its cells work out, as MathML."""
+def _as_on_site(notebook: nbformat.NotebookNode) -> nbformat.NotebookNode:
+    """Its text, and what its cells work out to say, with links to pages of the site and formulas as MathML."""
     for cell in notebook.cells:
         if cell.cell_type == "markdown":
-            cell.source = _formulas(cell.source)
+            cell.source = _formulas(_LINK.sub(_from_notebook, _TO_NOTEBOOK.sub(r"](\1.html)", cell.source)))
         for output in cell.get("outputs", ()):
             if words := output.get("data", {}).get("text/markdown"):
-                output.data["text/markdown"] = _formulas(words)
+                output.data["text/markdown"] = _formulas(_LINK.sub(_from_notebook, words))
     return notebook
+
+
+def _from_notebook(match: re.Match[str]) -> str:
+    """A link out of notebooks/: to a page of docs/ under its title, of another file of the repository its place."""
+    text, target, place = match.group(1), match.group(2), match.group(3) or ""
+    if not target.startswith("docs/"):
+        return f"`{target}`" if text == target else f"{text} (`{target}`)"
+    text = _title(ROOT / target) if text == target else text
+    return f"[{text}](../{target.removeprefix('docs/').removesuffix('.md')}.html{place})"
 
 
 def _formulas(markdown: str) -> str:

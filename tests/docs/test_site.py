@@ -96,6 +96,10 @@ def test_the_site_is_built_without_a_warning(tmp_path):
     pages = {path.relative_to(tmp_path / "site").as_posix() for path in (tmp_path / "site").rglob("*.html")}
     assert {"index.html", "conventions.html", "reference/procedures.html"} <= pages
     assert len([page for page in pages if page.startswith("notebooks/")]) == len(list(ROOT.glob("notebooks/*.ipynb")))
+    for page in (tmp_path / "site").rglob("*.html"):
+        links = re.findall(r'(?:href|src)="([^":#?]+)["#?]', page.read_text(encoding="utf-8"))
+        # The page of what is not found is shown under any address.
+        assert page.name == "404.html" or not [k for k in set(links) if not (page.parent / k).exists()], page.name
     # Names on the pages lead to the reference, formulas are MathML.
     paper = (tmp_path / "site" / "papers" / "000.html").read_text(encoding="utf-8")
     assert 'href="../reference/collinearity.html#jaxphoto.collinearity.project"' in paper
