@@ -103,8 +103,6 @@ def field_word(value: Any) -> str:
     if hasattr(value, "_fields") or dataclasses.is_dataclass(value):
         word = " ".join(repr(value).split()) if hasattr(type(value), "_repr_html_") else ""
         return word if 0 < len(word) <= _LONGEST else type(value).__name__
-    if isinstance(value, np.ndarray) and value.dtype.kind in "iuf" and 0 < value.size <= _FEW and value.ndim == 1:
-        return " ".join(number_word(v) for v in value)
     if isinstance(value, int | float | np.generic) or hasattr(value, "shape"):
         return number_word(value)
     return getattr(value, "__name__", type(value).__name__)
@@ -123,12 +121,16 @@ def _several_word(value: Any) -> str:
 
 
 def number_word(value: Any) -> str:
-    """A number in six digits, a prior or an array in a word."""
+    """A number in six digits, as are a few of them; a prior or a larger array in a word."""
     if np.ndim(value) == 0 and isinstance(value, int | float | np.generic | np.ndarray):
         return f"{float(value):.6g}"
     if hasattr(value, "shape") and not np.ndim(value):
         # JAX's: a traced one has no value.
         return f"{float(value):.6g}" if getattr(value, "is_fully_addressable", False) else type(value).__name__
+    # As above.
+    known = isinstance(value, np.ndarray) or getattr(value, "is_fully_addressable", False)
+    if known and value.dtype.kind in "iuf" and value.ndim == 1 and 0 < value.size <= _FEW:
+        return " ".join(number_word(v) for v in np.asarray(value))
     return f"array{tuple(value.shape)}" if hasattr(value, "shape") else " ".join(repr(value).split())
 
 
@@ -151,14 +153,14 @@ def _observed(block: Any) -> dict[str, int]:
     return {name: n for name, own in rows.items() if (n := _length(own))}
 
 
-def block_html(block: Any, unknowns: Mapping[str, object]) -> str:
-    """Counts of a block, and what is known beforehand of its `unknowns`, in words by owner."""
+def block_html(block: Any, unknowns: Mapping[str, object], title: str = "Block") -> str:
+    """Counts of a block, and what is known of its `unknowns`, in words by owner."""
     counts: dict[str, object] = {
         "images": f"{len(block.images)} of {_counted(len(block.sensors), 'camera')}",
         "points": f"{len(block.points)} in {_counted(_length(block.image_points.image), 'image point')}",
     }
     return html_of(
-        f"Block {block.title!r}", counts | {f"{k}s": n for k, n in _observed(block).items()} | dict(unknowns)
+        f"{title} {block.title!r}", counts | {f"{k}s": n for k, n in _observed(block).items()} | dict(unknowns)
     )
 
 
@@ -210,6 +212,56 @@ def _sigma0_words(adjusted: Any) -> str:
     expected = _ONE_IN_A_THOUSAND / (2 * redundancy) ** 0.5
     asks = f" (expected 1 +- {expected:.2g}: see .verdict())" if abs(sigma0 - 1) > expected else ""
     return f"{sigma0:.4g}{asks}"
+
+
+def simulation_repr(simulated: Any) -> str:
+    """`Simulation with its truth, of Block ...`, and of a lidar how much it has."""
+    more = ", ".join(_scanned(simulated).values())
+    return f"Simulation with its truth, of {block_repr(simulated.block)}" + (f";\n  {more}" if more else "")
+
+
+def simulation_html(simulated: Any) -> str:
+    """Counts of its block, of a lidar's cloud and trajectory, and what is true of what all images share."""
+    truth = {f"true {name}": words for name, words in simulated.truth.words.items()}
+    return block_html(simulated.block, _scanned(simulated) | truth, "Simulation of block")
+
+
+def _scanned(simulated: Any) -> dict[str, str]:
+    cloud, trajectory = simulated.cloud, simulated.trajectory
+    of_cloud = {} if cloud is None else {
+        "cloud": f"{_counted(_length(cloud.xyz), 'laser point')} of {_counted(len(cloud.strips), 'strip')}"
+    }  # fmt: skip
+    records = {} if trajectory is None else {"trajectory": f"{_counted(_length(trajectory.time), 'record')} of GNSS/IMU"}
+    return of_cloud | records
+
+
+def change_repr(found: Any) -> str:
+    """`Change: nothing says that the camera has changed`, and below it what each test says."""
+    told = "; ".join(f"{name}: {words}" for name, words in _tests(found).items())
+    return f"Change: {_change_words(found)};\n  {told}"
+
+
+def change_html(found: Any) -> str:
+    """The verdict and the tests, and below them the parameters that either calibration has."""
+    used = [one for one in found.parameters if one.sigma > 0 or one.first or one.second]
+    rows = {"verdict": _change_words(found), **_tests(found)}
+    return html_of("Change", rows) + (_rows_html("parameters", used) if used else "")
+
+
+def _change_words(found: Any) -> str:
+    return "a test says that the camera has changed" if found.changed else "nothing says that the camera has changed"
+
+
+def _tests(found: Any) -> dict[str, str]:
+    """Words and numbers of each test that there is."""
+    of_all = f"at {int(found.beyond.sum())} of {len(found.limit_mm)} points of the format"
+    tests = {"beyond the 95 % limit": of_all}
+    if np.isfinite(found.p_field):
+        tests = {f"bundles of rays ({found.field.method})": f"p {found.p_field:.2g}"} | tests
+    if not found.degrees_of_freedom:
+        return tests
+    chi = f"chi-square {found.chi_square:.4g} of {found.degrees_of_freedom}, p {found.p_parameters:.2g}"
+    return {"parameters": chi} | tests
 
 
 def _counted(n: int, name: str) -> str:

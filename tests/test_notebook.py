@@ -21,7 +21,7 @@ from jaxphoto.io.block_folder.table_layout import ANGLES, XYZ
 from jaxphoto.losses import AbstractLoss
 from jaxphoto.report.findings import Verdict
 from jaxphoto.sensitivity import Readjustment
-from jaxphoto.simulation import Simulation
+from jaxphoto.simulation import Simulation, Terrain
 from jaxphoto.stability import Change
 from tests.blocks import adjusted, simulated
 
@@ -289,3 +289,17 @@ def test_an_adjustment_is_set_beside_the_truth():
     z = found[found.index.str.endswith("Z_m")]["ratio"]
     assert spread.loc["exterior Z_m", "rms_ratio"] == pytest.approx(np.sqrt((z**2).mean()))
     assert Tables(result).recovery.empty
+
+
+def test_a_comparison_and_a_simulation_say_what_they_are():
+    one, made = adjusted("cross"), simulated("cross")
+    same = jaxphoto.compare(one, one)
+    for shown in (repr(same), same._repr_html_()):
+        assert "nothing says that the camera has changed" in shown and "at 0 of 165 points" in shown
+    moved = dataclasses.replace(one.unknowns.interior["one"], x_p=one.unknowns.interior["one"].x_p + 0.2)
+    unknowns = dataclasses.replace(one.unknowns, interior={"one": moved})
+    other = jaxphoto.compare(one, dataclasses.replace(one, unknowns=unknowns))
+    assert other.changed and "a test says that the camera has changed" in other._repr_html_()
+    whole = Simulation(made.block, made.truth, np.zeros(3), Terrain())
+    assert repr(whole) == f"Simulation with its truth, of {made.block!r}"
+    assert "10 of 1 camera" in whole._repr_html_() and "true camera one" in whole._repr_html_()

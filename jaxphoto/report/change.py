@@ -19,7 +19,7 @@ from jaxphoto.report.results import write_summary
 from jaxphoto.report.stability import Compared, missing_covariances
 from jaxphoto.report.study_page import WholePicture, study_page
 from jaxphoto.stability import ALIGNED, LEVEL, Change
-from jaxphoto.stability.analysis import SIGNIFICANT_P
+from jaxphoto.stability.analysis import change_meaning
 from jaxphoto.writing import whole_folder
 
 
@@ -50,7 +50,7 @@ def change_verdict(found: Change, sensor: Sensor) -> list[str]:
     if found.degrees_of_freedom:
         said.append(
             f"by its parameters: chi-square {found.chi_square:.1f} of {found.degrees_of_freedom}, "
-            f"{p_words(found.p_parameters, 2)}: {_meaning(found.p_parameters)}"
+            f"{p_words(found.p_parameters, 2)}: {change_meaning(found.p_parameters)}"
         )
     elif not found.parameters:
         said.append("the calibrations are of different models, so their parameters are not compared")
@@ -62,7 +62,7 @@ def change_verdict(found: Change, sensor: Sensor) -> list[str]:
     if known is not None:
         said.append(
             f"by its bundle of rays, {ALIGNED[found.field.method]}: {rmse:.3g} px root mean square over the format, "
-            f"{p_words(known.p_value, 2)}: {_meaning(known.p_value)}"
+            f"{p_words(known.p_value, 2)}: {change_meaning(known.p_value)}"
         )
     worst = int(np.argmax(found.offset_mm / found.limit_mm))
     x, y = np.asarray(found.field.offsets.points)[worst]
@@ -74,11 +74,6 @@ def change_verdict(found: Change, sensor: Sensor) -> list[str]:
         "the limit"
     )
     return said
-
-
-def _meaning(p_value: float) -> str:
-    changed = "the camera has changed, or many image points of a calibration share errors (jaxphoto halves tells)"
-    return changed if p_value < SIGNIFICANT_P else "nothing says that it has changed"
 
 
 def print_change(found: Change, sets: tuple[Compared, Compared], sensor: Sensor, console: Console) -> None:
@@ -111,14 +106,11 @@ def write_change(found: Change, sets: tuple[Compared, Compared], sensor: Sensor,
     picture = WholePicture.of(figure, "maps over the format")
     about = [str(sets[0]), str(sets[1]), missing_covariances(sets)]
     parts = [*map(Paragraph, about), picture, Heading("Parameters"), rows_of(parameters), *made_section(made)]
-    known = found.field.uncertainty
     with whole_folder(directory) as work:
         parameters.to_csv(work / "parameters.csv", index=False)
         change_cells(found, sensor).to_csv(work / "cells.csv", index=False)
         (work / "change.png").write_bytes(picture.png)
-        tested = (found.p_parameters if found.degrees_of_freedom else 1.0, 1.0 if known is None else known.p_value)
-        colour = "amber" if min(tested) < SIGNIFICANT_P else "green"
-        page = study_page("Change of a camera", verdict, parts, colour)
+        page = study_page("Change of a camera", verdict, parts, "amber" if found.changed else "green")
         (work / "report.html").write_text(page, encoding="utf-8")
         write_summary(change_summary(found, sensor) | {"versions": versions()}, work)
 

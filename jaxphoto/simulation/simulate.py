@@ -16,7 +16,7 @@ from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import BlockError
 from jaxphoto.georeferencing import Mount, RigCamera, StripBias, StripErrors, Trajectory
 from jaxphoto.observations import Attitudes, ControlRows, Distances, ImageRows, StationRows
-from jaxphoto.short_repr import shown
+from jaxphoto.short_repr import simulation_html, simulation_repr
 from jaxphoto.simulation.changing_cameras import (
     Circumstances,
     camera_steps,
@@ -47,7 +47,6 @@ _AXES = {"control": (0, 1, 2), "vertical": (2,), "check": (0, 1, 2)}
 _PLACES = 4096
 
 
-@shown
 class Simulation(eqx.Module):
     """A block and what is true of it; with a lidar also its cloud and trajectory. As a tuple: the first three.
 
@@ -70,6 +69,11 @@ class Simulation(eqx.Module):
 
     def __iter__(self) -> Iterator[Any]:
         return iter((self.block, self.truth, self.datum_offset_m))
+
+    __repr__ = simulation_repr
+
+    def _repr_html_(self) -> str:
+        return simulation_html(self)
 
 
 def simulate(recipe: Recipe, seed: int = 0) -> Simulation:

@@ -41,12 +41,14 @@ class Analysis(NamedTuple):
         if known.low_mm <= noise_mm <= known.high_mm:
             text += f", but calibrations repeated would give {1e3 * known.low_mm:.3g} to {1e3 * known.high_mm:.3g} um"
         one = f"Two calibrations of one camera would differ by {1e3 * known.expected_of_one_mm:.3g} um"
-        changed = (
-            "the camera has changed, or many points of a set share errors"
-            if known.p_value < SIGNIFICANT_P
-            else "nothing says that it has changed"
-        )
-        return f"{text}. {one}, and by as much as this with p = {max(known.p_value, _LEAST_P):.2g}: {changed}."
+        meaning = change_meaning(known.p_value)
+        return f"{text}. {one}, and by as much as this with p = {max(known.p_value, _LEAST_P):.2g}: {meaning}."
+
+
+def change_meaning(p_value: float) -> str:
+    """What is to be concluded where two sets of one camera differ so much with the probability `p_value`."""
+    changed = "the camera has changed, or many image points of a calibration share errors (jaxphoto halves tells)"
+    return changed if p_value < SIGNIFICANT_P else "nothing says that it has changed"
 
 
 def analyse(

@@ -8,9 +8,9 @@ from scipy.special import chdtrc, ndtr
 
 from jaxphoto.camera import InteriorOrientation, constant_names, get_parameter, model_keys, parameter_names
 from jaxphoto.errors import InputError
-from jaxphoto.short_repr import shown
+from jaxphoto.short_repr import change_html, change_repr, shown
 from jaxphoto.stability.alignment import Method
-from jaxphoto.stability.analysis import Analysis
+from jaxphoto.stability.analysis import SIGNIFICANT_P, Analysis
 from jaxphoto.stability.band import square_radius
 from jaxphoto.stability.bundles import parameter_vector
 from jaxphoto.stability.comparison import bundle_offsets, check_rays
@@ -34,7 +34,6 @@ class ParameterChange(NamedTuple):
     """and NaN then: how probable so large a difference is if the parameter did not change."""
 
 
-@shown
 class Change(NamedTuple):
     """Two calibrations of a camera compared."""
 
@@ -60,6 +59,22 @@ class Change(NamedTuple):
     def beyond(self) -> Bool[np.ndarray, "points"]:
         """Where offsets are larger than `limit_mm`: at one point in twenty, if the camera did not change."""
         return self.offset_mm > self.limit_mm
+
+    @property
+    def p_field(self) -> float:
+        """How probable a larger difference of the bundles is if the camera did not change; NaN where none is known."""
+        known = self.field.uncertainty
+        return float("nan") if known is None else float(known.p_value)
+
+    @property
+    def changed(self) -> bool:
+        """Whether a test, of parameters or of bundles, says so."""
+        return self.p_parameters < SIGNIFICANT_P or self.p_field < SIGNIFICANT_P
+
+    __repr__ = change_repr
+
+    def _repr_html_(self) -> str:
+        return change_html(self)
 
 
 def change(
