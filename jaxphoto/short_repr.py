@@ -231,7 +231,8 @@ def _scanned(simulated: Any) -> dict[str, str]:
     of_cloud = {} if cloud is None else {
         "cloud": f"{_counted(_length(cloud.xyz), 'laser point')} of {_counted(len(cloud.strips), 'strip')}"
     }  # fmt: skip
-    records = {} if trajectory is None else {"trajectory": f"{_counted(_length(trajectory.time), 'record')} of GNSS/IMU"}
+    n = 0 if trajectory is None else _length(trajectory.time)
+    records = {"trajectory": f"{_counted(n, 'record')} of GNSS/IMU"} if n else {}
     return of_cloud | records
 
 

@@ -19,13 +19,14 @@ from jaxphoto.experiment.measures import (
     tie_point_differences,
 )
 from jaxphoto.experiment.monte_carlo import MonteCarlo
-from jaxphoto.experiment.plots import comparison_figure
+from jaxphoto.experiment.plots import comparison_figure, plot_agreement, plot_comparison
 from jaxphoto.experiment.runner import Run, run_experiment, simulated, summary
 
 __all__ = [
     "Cells", "Experiment", "Measure", "MonteCarlo", "Results", "Run", "Variant", "boresight_correlation",
     "check_points", "compare", "comparison_figure", "effects", "find_experiments", "iops",
     "load_experiment", "mean_correlations", "misalignment", "misalignment_agreement", "named",
-    "orientation_differences", "principal_point", "read_published", "recovered", "residuals", "run_experiment",
+    "orientation_differences", "plot_agreement", "plot_comparison",
+    "principal_point", "read_published", "recovered", "residuals", "run_experiment",
     "side_by_side", "simulated", "summary", "tie_point_differences", "write_runs",
 ]  # fmt: skip

@@ -2,73 +2,61 @@
 
 from __future__ import annotations
 
-import base64
-import io
-from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Mapping
+from functools import partial
 
 import numpy as np
 import pandas as pd
 from jinja2 import Environment
+from markupsafe import Markup
 
 from jaxphoto.experiment.comparison import MEAN_DIFFERENCE
+from jaxphoto.experiment.plots import draw_agreement
 from jaxphoto.experiment.runner import Run
 from jaxphoto.experiment.wording import heading, own_decimals, power_of, printed_decimals, table_title
-from jaxphoto.report import check_points_figure, layout_figure, page_head
-from jaxphoto.report.document_html import html_of
+from jaxphoto.report import check_points_figure, page_head
+from jaxphoto.report.document import BlockInSpace, DocumentPicture, Heading, Paragraph, Pictures, Rows
 from jaxphoto.report.made import Made, made_section
+from jaxphoto.report.study_page import StudyPart, WholePicture, study_page
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
+_AGREEMENT = (
+    "Ours minus printed over the tolerance promised, by table: within it between the lines at -1 and 1, crosses beyond"
+)
 _STYLE = """\
-:root { --width: 86rem } td, th { white-space: nowrap } th { font-weight: 600 } .tables td, .tables th { line-height: 1.3; padding: .2rem .4rem }
+:root { --width: 72rem } .as-printed :is(td, th) { white-space: nowrap; line-height: 1.3; padding: .2rem .4rem }
+.as-printed th { font-weight: 600 }
 .no { background: var(--red) } .yes { background: var(--green) } .chip { padding: 0 .5em; border-radius: 3px }
 .yes, .no { print-color-adjust: exact } .no::before { content: "\\2717\\a0"; color: var(--bad) }
 .ours { font-weight: 600 } .spread, .paper { color: var(--grey) } .spread { font-size: 90% }
 ol.notes { margin: 0 0 1.5rem; font-size: 13px; color: var(--grey) } sup { color: var(--grey); font-size: 75% }
-@media print { ol.notes { break-before: avoid; font-size: 9px } td + td, th { white-space: normal } }
+@media print { ol.notes { break-before: avoid; font-size: 9px } .as-printed :is(td + td, th) { white-space: normal } }
 """
-_PAGE = """{{ head }}<body>
-<h1>{{ title }}</h1>
-<p>{% if judged %}<b>{{ good }} of {{ judged }}</b> printed values for which a tolerance is promised are within it.
-{% else %}Nothing is promised here: no printed value has a tolerance.{% endif %}</p>
-<p>In each cell, above: <span class="ours">ours</span>, the mean over {{ layouts }} simulated
-{{ "layout" if layouts == 1 else "layouts" }}{% if layouts > 1 %}, <span class="spread">± the standard deviation from layout
-to layout</span>{% endif %}. Below: <span class="paper">what is printed (± the tolerance promised)</span>.
-<span class="chip yes">green</span> within the tolerance, <span class="chip no">red</span> and a cross not, no colour: nothing promised.
-Small numbers at cells and headings refer to the notes below the table.</p>
-{% for failure in failures %}<p class="warning">left out: {{ failure }}</p>{% endfor %}
-<div class="wide"><table><tr><th>table</th><th>within</th><th>of</th></tr>
-{% for table in tables %}<tr><td><a href="#{{ table.name }}">{{ table.title }}</a></td>
-<td>{{ table.good if table.judged else "" }}</td><td>{{ table.judged or "nothing promised" }}</td></tr>
-{% endfor %}</table></div>
-<h2>Block of the first layout</h2><img alt="block layout" src="{{ layout }}">
-<div class="tables">
-{% for table in tables %}<h2 id="{{ table.name }}">{{ table.title }}</h2>
-{% if table.columns %}<div class="wide"><table class="as-printed">
-<thead><tr><th></th>{% for c in table.columns %}<th>{{ c.heading }}{% for n in c.notes %}<sup>{{ n }}</sup>{% endfor %}</th>{% endfor %}</tr></thead>
-{% for row in table.rows %}<tr><td>{{ row.name }}</td>{% for cell in row.cells %}<td class="{{ cell.within }}">
+_LEGEND = Markup(
+    '<p>In each cell, above: <span class="ours">ours</span>, the mean over {}{}. Below: <span class="paper">what is '
+    'printed (± the tolerance promised)</span>. <span class="chip yes">green</span> within the tolerance, <span '
+    'class="chip no">red</span> and a cross not, no colour: nothing promised. Small numbers at cells and headings refer '
+    "to the notes below the table. Tables sort by what is ours.</p>"
+)
+_SPREAD = Markup(', <span class="spread">± the standard deviation from layout to layout</span>')
+_TABLE = Environment(autoescape=True).from_string("""\
+{% if columns %}<div class="wide"><table class="as-printed">
+<thead><tr><th></th>{% for c in columns %}<th>{{ c.heading }}{% for n in c.notes %}<sup>{{ n }}</sup>{% endfor %}</th>{% endfor %}</tr></thead>
+<tbody>{% for row in rows %}<tr><td>{{ row.name }}</td>{% for cell in row.cells %}<td class="{{ cell.within }}" data-value="{{ cell.ours or cell.published.split()[0] }}">
 {%- if cell.ours %}<span class="ours">{{ cell.ours }}</span><span class="spread">{{ cell.spread }}</span>{% endif %}
-{%- if cell.published or table.printed %}<br><span class="paper">{{ cell.published|replace("± ", "±\u00a0") or "&nbsp;"|safe }}</span>{% endif %}
+{%- if cell.published or printed %}<br><span class="paper">{{ cell.published|replace("± ", "±\u00a0") or "&nbsp;"|safe }}</span>{% endif %}
 {%- if cell.note %}<sup>{{ cell.note }}</sup>{% endif %}</td>{% endfor %}</tr>
-{% endfor %}</table></div>{% endif %}
-{% if table.notes %}<ol class="notes">{% for note in table.notes %}<li>{{ note }}</li>{% endfor %}</ol>{% endif %}
-{% if table.difference %}<p>Mean of |ours - printed| over the table:
-<span class="chip {{ table.difference.within }}">{{ table.difference.words }}</span></p>{% endif %}
-{% endfor %}</div>
-{% if check %}<h2>Check points of the first layout</h2>
-<div class="wide"><img alt="discrepancies at check points" src="{{ check }}"></div>{% endif %}
-{% for element in made %}{{ element }}
-{% endfor %}</body></html>
-"""
+{% endfor %}</tbody></table></div>{% endif %}
+{% if notes %}<ol class="notes">{% for note in notes %}<li>{{ note }}</li>{% endfor %}</ol>{% endif %}
+{% if difference %}<p>Mean of |ours - printed| over the table:
+<span class="chip {{ difference.within }}">{{ difference.words }}</span></p>{% endif %}
+""")
 
 
 _INDEX = """{{ head("Experiments") }}<body>
 <h1>Experiments</h1>
-<div class="wide"><table><tr><th>experiment</th><th>within</th><th>of the values promised</th></tr>
-{% for row in rows %}<tr><td><a href="{{ row.name }}.html">{{ row.title }}</a></td><td>{{ row.good }}</td><td>{{ row.judged }}</td></tr>
-{% endfor %}</table></div></body></html>
+<div class="wide"><table><thead><tr><th>experiment</th><th>within</th><th>of the values promised</th></tr></thead>
+<tbody>{% for row in rows %}<tr><td><a href="{{ row.name }}.html">{{ row.title }}</a></td><td>{{ row.good }}</td><td>{{ row.judged }}</td></tr>
+{% endfor %}</tbody></table></div></body></html>
 """
 
 
@@ -87,25 +75,37 @@ def index_page(experiments: Mapping[str, tuple[str, pd.DataFrame]]) -> str:
 
 
 def experiment_page(run: Run, comparison: pd.DataFrame, made: Made | None = None) -> str:
-    """The whole page as HTML, pictures inside."""
+    """The whole page as HTML: what agrees, the block of the first layout, each table as printed, check points."""
     tables = [table_texts(str(name), cells) for name, cells in comparison.groupby("table", sort=False)]
-    check = {name: of for name, of in run.first.items() if len(of.check_points)}
-    return (
-        Environment(autoescape=True)
-        .from_string(_PAGE)
-        .render(
-            title=run.experiment.title,
-            head=page_head(run.experiment.title, _STYLE),
-            judged=sum(table["judged"] for table in tables),
-            good=sum(table["good"] for table in tables),
-            layouts=run.cells["layout"].nunique(),
-            failures=run.failures,
-            layout=_picture(layout_figure(next(iter(run.first.values())))),
-            tables=tables,
-            check=_picture(check_points_figure(check)) if check else "",
-            made=[html_of(element) for element in made_section(made)] if made else [],
-        )
-    )
+    judged, good = (sum(table[name] for table in tables) for name in ("judged", "good"))
+    if judged:
+        said = f"{good} of {judged} printed values for which a tolerance is promised are within it"
+    else:
+        said = "nothing is promised here: no printed value has a tolerance"
+    colour = "" if not judged else "green" if good == judged else "amber"
+    parts = list(_parts(run, comparison, tables))
+    return study_page(run.experiment.title, [said], [*parts, *(made_section(made) if made else ())], colour, _STYLE)
+
+
+def _parts(run: Run, comparison: pd.DataFrame, tables: list[dict]) -> Iterator[StudyPart]:
+    yield from (Paragraph(f"left out: {failure}", "warning") for failure in run.failures)
+    yield Heading("Within the tolerances")
+    counts = ((t["title"], *((str(t["good"]), str(t["judged"])) if t["judged"] else ("", "none"))) for t in tables)
+    yield Rows(("table", "within", "of the values promised"), tuple(counts))
+    if any(table["judged"] for table in tables):
+        yield Pictures((DocumentPicture(partial(draw_agreement, comparison=comparison), _AGREEMENT, 3.6),))
+    yield Heading("Block of the first layout")
+    yield BlockInSpace(next(iter(run.first.values())))
+    layouts = run.cells["layout"].nunique()
+    many = layouts > 1
+    yield Heading("Tables")
+    yield _LEGEND.format(f"{layouts} simulated layout{'s' * many}", _SPREAD if many else "")
+    for table in tables:
+        yield Heading(table["title"])
+        yield Markup(_TABLE.render(table))
+    if check := {name: of for name, of in run.first.items() if len(of.check_points)}:
+        yield Heading("Check points of the first layout")
+        yield WholePicture.of(check_points_figure(check), "discrepancies at check points, in plan and in height")
 
 
 def table_texts(name: str, cells: pd.DataFrame) -> dict:
@@ -167,9 +167,3 @@ def _column(of: pd.DataFrame, power: int, marks: dict[str, int]) -> list[tuple[p
 def _difference(cell: pd.Series) -> dict[str, str]:
     promised = f" (at most {cell['tolerance']:g} promised)" if pd.notna(cell["tolerance"]) else ""
     return {"words": f"{cell['ours']:.3g}{promised}", "within": cell["within"]}
-
-
-def _picture(figure: Figure) -> str:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png")
-    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()

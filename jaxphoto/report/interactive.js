@@ -23,9 +23,12 @@
   const NUMBER = /^(< )?[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?($|[\s(,/%])/i;
   const order = new Intl.Collator(undefined, { numeric: true });
 
+  // Of a cell that holds several numbers, that by which it sorts.
+  const valueOf = (cell) => cell.dataset.value ?? cell.textContent.trim();
+
   const sortBy = (table, heads, column) => {
     const head = heads[column], falling = head.getAttribute("aria-sort") === "ascending";
-    const rows = [...table.tBodies[0].rows], texts = rows.map((row) => row.cells[column].textContent.trim());
+    const rows = [...table.tBodies[0].rows], texts = rows.map((row) => valueOf(row.cells[column]));
     const told = texts.filter((text) => text && text !== "-");
     const number = told.filter((text) => NUMBER.test(text)).length > told.length / 2;
     const key = (text) => (!number ? text : NUMBER.test(text) ? parseFloat(text.replace("< ", "")) : NaN);
@@ -321,6 +324,6 @@
   const figure = document.querySelector("figure.block");
   // Where a browser draws nothing in space, the still picture stays.
   const canTurn = figure && window.DecompressionStream && window.WebGLRenderingContext;
-  for (const table of document.querySelectorAll("table:has(thead):not(.as-printed)")) prepareTable(table, canTurn);
+  for (const table of document.querySelectorAll("table:has(thead)")) prepareTable(table, canTurn);
   if (canTurn) drawInSight(figure);
 }

@@ -20,7 +20,7 @@ from jaxphoto.report.page_head import page_head
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_PAGE = """{{ head(title) }}<body>
+_PAGE = """{{ head }}<body>
 <h1>{{ title }}</h1>
 {% for sentence in said %}<p{{ kind }}>{{ sentence }}</p>
 {% endfor %}{% for part in begun %}{{ part }}
@@ -63,11 +63,15 @@ class PictureFile(NamedTuple):
     file: str
 
 
-StudyPart = Element | WholePicture | PageLink | PictureFile
+StudyPart = Element | WholePicture | PageLink | PictureFile | Markup
+"""Markup is of whoever makes the page: it stands there as it is."""
 
 
-def study_page(title: str, said: Sequence[str], parts: Iterable[StudyPart], colour: str = "") -> str:
-    """The page as HTML; `said` stands first, in `colour` (green, amber, red) where it is a verdict."""
+def study_page(title: str, said: Sequence[str], parts: Iterable[StudyPart], colour: str = "", style: str = "") -> str:
+    """The page as HTML; `said` stands first, in `colour` (green, amber, red) where it is a verdict.
+
+    `style` are rules of its own, below those of all pages.
+    """
     shown = list(parts)
     # Sentences before the first heading, such as findings, belong to what stands first.
     begun = list(itertools.takewhile(lambda part: isinstance(part, Paragraph), shown))
@@ -76,7 +80,7 @@ def study_page(title: str, said: Sequence[str], parts: Iterable[StudyPart], colo
         Environment(autoescape=True)
         .from_string(_PAGE)
         .render(
-            head=page_head,
+            head=page_head(title, style),
             title=title,
             said=map(as_sentence, said),
             kind=Markup(' class="verdict {}"').format(colour) if colour else "",
@@ -88,6 +92,8 @@ def study_page(title: str, said: Sequence[str], parts: Iterable[StudyPart], colo
 
 
 def _shown(part: StudyPart) -> Markup:
+    if isinstance(part, Markup):
+        return part
     if isinstance(part, PageLink):
         return Markup('<p><a href="{}">{}</a></p>').format(quote(part.page), part.text)
     if isinstance(part, WholePicture):

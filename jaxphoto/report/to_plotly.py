@@ -116,7 +116,9 @@ def _flat(axes: Axes) -> Iterator[Trace]:
 
 def _named(artist: Any) -> Trace:
     """Name and place in the legend; those whose label begins with "_" have none."""
-    label = str(artist.get_label())
+    # Of bars together and of points with bars the first member stands for all.
+    whole = next((c for c in artist.axes.containers if c and c[0] is artist), artist)
+    label = str(whole.get_label())
     return {"name": shown(label), "showlegend": True} if label and label[0] != "_" else {"showlegend": False}
 
 

@@ -71,7 +71,8 @@ class Change(NamedTuple):
         """Whether a test, of parameters or of bundles, says so."""
         return self.p_parameters < SIGNIFICANT_P or self.p_field < SIGNIFICANT_P
 
-    __repr__ = change_repr
+    def __repr__(self) -> str:
+        return change_repr(self)
 
     def _repr_html_(self) -> str:
         return change_html(self)

@@ -1,15 +1,18 @@
 """What an experiment prints for readers: names, digits, tables and pictures say what tables.csv says."""
 
 import re
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib.figure import Figure
 
-from jaxphoto.experiment import comparison_figure, page, side_by_side
-from jaxphoto.experiment.page import _PAGE, _STYLE, table_texts
+from jaxphoto import Tables
+from jaxphoto.experiment import Experiment, Run, comparison_figure, plot_agreement, plot_comparison, side_by_side
+from jaxphoto.experiment.page import _STYLE, experiment_page, table_texts
 from jaxphoto.experiment.wording import heading, own_decimals, power_of, printed_decimals, table_title
+from jaxphoto.report import to_plotly
+from tests.blocks import adjusted
 
 NAN = np.nan
 COLUMNS = ["table", "row", "column", "published", "ours", "unit", "tolerance", "within", "note", "spread", "n_layouts"]
@@ -101,10 +104,34 @@ def test_comparison_figure_draws_ours_and_the_print():
 def test_what_is_not_within_is_marked_by_more_than_colour_and_printed():
     assert '.no::before { content: "\\2717' in _STYLE and "print-color-adjust: exact" in _STYLE
     # A table of twenty columns would else shrink every sheet.
-    assert re.search(r"@media print .*td \+ td, th { white-space: normal }", _STYLE)
+    assert re.search(r"@media print .*td \+ td, th\) { white-space: normal }", _STYLE)
 
 
-def test_heads_of_printed_tables_come_again_on_every_sheet_and_do_not_sort():
-    assert '<table class="as-printed">\n<thead><tr><th></th>' in _PAGE
-    script = (Path(page.__file__).parents[1] / "report" / "interactive.js").read_text(encoding="utf-8")
-    assert "table:has(thead):not(.as-printed)" in script
+def test_pictures_take_and_return_axes_and_have_twins():
+    axes = Figure().add_subplot()
+    assert plot_agreement(COMPARISON, axes) is axes
+    # (4.1 - 3.75) / 0.2, (3.8 - 3.7) / 0.2, 0.02 / 0.03: the first is beyond.
+    within, beyond = axes.lines
+    np.testing.assert_allclose(np.sort(within.get_xdata()), [0.5, 2 / 3])
+    np.testing.assert_allclose(beyond.get_xdata(), [1.75])
+    with pytest.raises(ValueError, match="no value that is printed and ours has a tolerance"):
+        plot_agreement(COMPARISON[COMPARISON["table"] == "own"], axes)
+    one = plot_comparison(COMPARISON, "table2_iops", "sigma_k1_mm-2", Figure().add_subplot())
+    shown = [trace for trace in to_plotly(one).data if trace.name == "ours ± spread" and "markers" in trace.mode]
+    np.testing.assert_allclose(shown[0].x, [4.1, 3.8])
+    with pytest.raises(ValueError, match=r"no column 'c' of 'table2_iops' .* those that are: c_mm, sigma"):
+        plot_comparison(COMPARISON, "table2_iops", "c")
+
+
+def test_the_page_is_made_of_the_parts_of_all_pages():
+    run = Run(Experiment("A paper", {}, {}), pd.DataFrame({"layout": [0, 1]}), {"first": Tables(adjusted("cross"))}, ())
+    page = experiment_page(run, COMPARISON)
+    assert '<p class="verdict amber">2 of 3 printed values' in page and '<figure class="block">' in page
+    assert [f'<a href="#{name}">' in page for name in ("table-2-iops", "own", "block-of-the-first-layout")] == [
+        True
+    ] * 3
+    # Heads that come again on every sheet and that sort, by what is ours.
+    assert (
+        page.count('<table class="as-printed">\n<thead><tr><th></th>') == 2 and 'class="no" data-value="4.10"' in page
+    )
+    assert 'querySelectorAll("table:has(thead)")' in page and not re.search(r'(src|href)="(?!data:|#)', page)
