@@ -23,7 +23,8 @@ _AGREEMENT = (
     "Ours minus printed over the tolerance promised, by table: within it between the lines at -1 and 1, crosses beyond"
 )
 _STYLE = """\
-:root { --width: 72rem } .as-printed :is(td, th) { white-space: nowrap; line-height: 1.3; padding: .2rem .4rem }
+:root { --width: 72rem } .as-printed :is(td, th) { white-space: nowrap; line-height: 1.3; padding: .2rem .35rem }
+.as-printed th:not([aria-sort]) button::after { content: "" }
 .as-printed th { font-weight: 600 }
 .no { background: var(--red) } .yes { background: var(--green) } .chip { padding: 0 .5em; border-radius: 3px }
 .yes, .no { print-color-adjust: exact } .no::before { content: "\\2717\\a0"; color: var(--bad) }

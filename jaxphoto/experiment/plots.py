@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -72,7 +72,7 @@ def _draw_column(axes: Axes, of: pd.DataFrame, rows: list[str]) -> None:
     power = power_of(np.concatenate([of["published"], of["ours"]]))
     values = of[["published", "tolerance", "ours", "spread"]].astype(float) * 10.0**-power
     at = np.array([rows.index(row) for row in of["row"]])
-    bars = {"capsize": 2, "lw": 1, "ls": "none"}
+    bars: dict[str, Any] = {"capsize": 2, "lw": 1, "ls": "none"}
     axes.errorbar(
         values["published"], at - 0.15, xerr=values["tolerance"], marker="s", ms=5, mfc="none",
         color="0.45", label="printed ± tolerance", **bars,
@@ -115,9 +115,9 @@ def draw_agreement(axes: Axes, comparison: pd.DataFrame) -> None:
     at = place + 0.7 * (number / np.maximum(cells.groupby("table")["table"].transform("size") - 1, 1) - 0.5)
     within = (cells["within"] == "yes").to_numpy()
     axes.axvspan(-1, 1, color="0.93", lw=0)
-    for rows, marker, colour, label in ((within, "o", "tab:blue", "within"), (~within, "X", "tab:red", "not within")):
+    for rows, marker, colour, label in ((within, "o", "tab:blue", "within"), (~within, "x", "tab:red", "not within")):
         if rows.any():
-            axes.plot(off[rows], at[rows], marker, ms=5, color=colour, label=label, ls="none")
+            axes.plot(off[rows], at[rows], marker, ms=5, mew=1.5, color=colour, label=label, ls="none")
     axes.set_yticks(range(len(tables)), list(map(table_title, tables)), fontsize=8)
     axes.set_ylim(len(tables) - 0.5, -0.5)
     axes.set_xlabel("(ours - printed) / tolerance")

@@ -4,6 +4,7 @@ from jaxphoto.report.block_in_space import block_in_space
 from jaxphoto.report.block_plot import layout_figure, plot_block
 from jaxphoto.report.boresight import print_boresight, write_boresight
 from jaxphoto.report.cubes import correlation_cube, covariance_array, draws_cube
+from jaxphoto.report.draws import plot_draws, plot_effects
 from jaxphoto.report.figures import (
     plot_check_points,
     plot_convergence,
@@ -22,6 +23,15 @@ from jaxphoto.report.figures import (
     plot_station_residuals,
 )
 from jaxphoto.report.findings import Finding, Level, Verdict
+from jaxphoto.report.flight.figures import (
+    plot_link_strength,
+    plot_links,
+    plot_overlap,
+    plot_photograph_residuals,
+    plot_position_offsets,
+    plot_rays,
+    plot_time_line,
+)
 from jaxphoto.report.page import report_page
 from jaxphoto.report.page_head import page_head
 from jaxphoto.report.plots import (
@@ -34,7 +44,10 @@ from jaxphoto.report.plots import (
 )
 from jaxphoto.report.recovery import recovery_spread, recovery_table
 from jaxphoto.report.results import summary_of, write_results, write_tables
+from jaxphoto.report.sensitivity import plot_sensitivity
 from jaxphoto.report.snooped import left_out_table, snooped_findings
+from jaxphoto.report.strip_figures import plot_scanner_correlation, plot_strip_differences, plot_trajectory_errors
+from jaxphoto.report.sweep import plot_sweep
 from jaxphoto.report.table_files import TABLE_FORMATS, check_table_format, to_latex, to_markdown, write_table
 from jaxphoto.report.tables import Tables
 from jaxphoto.report.terminal import print_adjustment, print_warning
@@ -68,16 +81,30 @@ __all__ = [
     "plot_density",
     "plot_distortion",
     "plot_distortion_band",
+    "plot_draws",
+    "plot_effects",
     "plot_error_ellipses",
     "plot_exterior_correlation",
     "plot_interior_correlation",
     "plot_intersection_angles",
+    "plot_link_strength",
+    "plot_links",
     "plot_mean_residuals",
+    "plot_overlap",
+    "plot_photograph_residuals",
     "plot_point_sigmas",
+    "plot_position_offsets",
+    "plot_rays",
     "plot_residuals",
     "plot_residuals_by_radius",
+    "plot_scanner_correlation",
+    "plot_sensitivity",
     "plot_sigma_map",
     "plot_station_residuals",
+    "plot_strip_differences",
+    "plot_sweep",
+    "plot_time_line",
+    "plot_trajectory_errors",
     "prepare_pictures",
     "print_adjustment",
     "print_boresight",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -10,16 +10,18 @@ import numpy as np
 import pandas as pd
 
 from jaxphoto.adjustment import Adjustment
+from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import TrajectoryKnot
 from jaxphoto.observations import AXES
 from jaxphoto.report.document import Heading, Paragraph, rows_of
 from jaxphoto.report.made import Made, made_section
-from jaxphoto.report.plots import drawn, new_figure
+from jaxphoto.report.plots import axes_or_new, drawn, new_figure
 from jaxphoto.report.study_page import StudyPart, WholePicture, study_page
 from jaxphoto.sensitivity import Draws
 from jaxphoto.writing import whole_file
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 _PICTURES = {
@@ -131,36 +133,75 @@ def draws_figure(columns: Mapping[str, np.ndarray], summary: pd.DataFrame) -> Fi
     figure.set_layout_engine("constrained", h_pad=0.1)
     of = summary.set_index("quantity")
     for axes, name in zip(figure.subplots(down, across, squeeze=False).flat, chosen, strict=False):
-        values, row = np.asarray(columns[name], float), of.loc[name]
-        # Where draws differ by rounding only, there is no width to divide into bins.
-        apart = np.ptp(values) > 1e-12 * np.abs(values).max(initial=1e-300) if len(values) else False
-        if apart:
-            axes.hist(values, bins=min(60, max(5, int(np.sqrt(len(values))))), density=True, color="0.75")
-        axes.axvline(row["nominal"], color="tab:red", lw=1)
-        if row["predicted_sigma"] > 0:
-            at = row["nominal"] + row["predicted_sigma"] * np.linspace(-4, 4, 200)
-            density = np.exp(-0.5 * np.linspace(-4, 4, 200) ** 2) / row["predicted_sigma"] / np.sqrt(2 * np.pi)
-            axes.plot(at, density, color="tab:blue", lw=1)
-        axes.set_title(drawn(name), fontsize=9)
-        axes.set_yticks([])
-        axes.tick_params(labelsize=7)
-        axes.locator_params(axis="x", nbins=4)
+        _draw_histogram(axes, name, np.asarray(columns[name], float), of)
     for axes in figure.axes[len(chosen) :]:
         axes.set_axis_off()
     return figure
 
 
+def plot_draws(draws: pd.DataFrame, summary: pd.DataFrame, quantity: str, ax: Axes | None = None) -> Axes:
+    """How often a quantity came out how large, with its value without errors and the normal density predicted.
+
+    `draws` is that of `draws_table` (draws.parquet), `summary` that of `summary_table` (summary.csv). Raises InputError
+    for a quantity that is not in both.
+    """
+    of = summary.set_index("quantity")
+    if quantity not in of.index or quantity not in draws:
+        known = ", ".join(name for name in of.index if name in draws and not name.startswith(LONG))
+        raise InputError(f"the draws have no {quantity!r}; they have {known}, and those of images and points")
+    ax = axes_or_new(ax)
+    _draw_histogram(ax, quantity, draws[quantity].to_numpy(float), of)
+    return ax
+
+
+def _draw_histogram(axes: Axes, name: str, values: np.ndarray, summary: pd.DataFrame) -> None:
+    """Of one quantity, by which the rows of the summary are named."""
+    nominal, sigma = (float(summary[column].loc[name]) for column in ("nominal", "predicted_sigma"))
+    # Where draws differ by rounding only, there is no width to divide into bins.
+    apart = np.ptp(values) > 1e-12 * np.abs(values).max(initial=1e-300) if len(values) else False
+    if apart:
+        axes.hist(values, bins=min(60, max(5, int(np.sqrt(len(values))))), density=True, color="0.75")
+    axes.axvline(nominal, color="tab:red", lw=1)
+    if sigma > 0:
+        at = np.linspace(-4, 4, 200)
+        density = np.exp(-0.5 * at**2) / sigma / np.sqrt(2 * np.pi)
+        axes.plot(nominal + sigma * at, density, color="tab:blue", lw=1)
+    axes.set_title(drawn(name), fontsize=9)
+    axes.set_yticks([])
+    axes.tick_params(labelsize=7)
+    axes.locator_params(axis="x", nbins=4)
+
+
+def plot_effects(
+    effects: pd.DataFrame, summary: pd.DataFrame, quantities: Sequence[str], ax: Axes | None = None
+) -> Axes:
+    """What one sigma of each error does to `quantities`, as parts of their predicted standard deviations.
+
+    `effects` is effects.csv and `summary` summary.csv of a Monte Carlo. Raises InputError for what they do not have.
+    """
+    known = [name for name in summary["quantity"] if name in effects]
+    if missing := [name for name in quantities if name not in known]:
+        raise InputError(f"the effects have no {missing[0]!r}; they have {', '.join(known)}")
+    ax = axes_or_new(ax)
+    _draw_effects(ax, effects, summary, quantities)
+    return ax
+
+
 def effects_figure(effects: pd.DataFrame, summary: pd.DataFrame, quantities: list[str]) -> Figure:
     """What one sigma of each error does to some quantities, as parts of their predicted standard deviations."""
-    predicted = summary.set_index("quantity")["predicted_sigma"][quantities].to_numpy()
-    parts = effects[quantities].to_numpy() / np.where(predicted > 0, predicted, np.nan)
     figure = new_figure(min(1.8 + 0.8 * len(quantities), _WIDEST), max(3.2, 1.8 + 0.26 * len(effects)))
-    axes = figure.subplots()
-    image = axes.imshow(parts, cmap="RdBu_r", vmin=-1, vmax=1, aspect="auto")
-    axes.set_xticks(range(len(quantities)), list(map(drawn, quantities)), rotation=45, ha="right", fontsize=8)
-    axes.set_yticks(range(len(effects)), list(map(drawn, effects["error"])), fontsize=7)
-    figure.colorbar(image, label="effect of one sigma / predicted sigma")
+    _draw_effects(figure.subplots(), effects, summary, quantities)
     return figure
+
+
+def _draw_effects(axes: Axes, effects: pd.DataFrame, summary: pd.DataFrame, quantities: Sequence[str]) -> None:
+    names = list(quantities)
+    predicted = summary.set_index("quantity")["predicted_sigma"][names].to_numpy()
+    parts = effects[names].to_numpy() / np.where(predicted > 0, predicted, np.nan)
+    image = axes.imshow(parts, cmap="RdBu_r", vmin=-1, vmax=1, aspect="auto")
+    axes.set_xticks(range(len(names)), list(map(drawn, names)), rotation=45, ha="right", fontsize=8)
+    axes.set_yticks(range(len(effects)), list(map(drawn, effects["error"])), fontsize=7)
+    axes.figure.colorbar(image, ax=axes, label="effect of one sigma / predicted sigma")
 
 
 def write_draws_page(summary: Mapping[str, Any], table: pd.DataFrame, directory: Path, made: Made) -> None:

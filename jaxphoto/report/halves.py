@@ -129,8 +129,10 @@ def write_halves(found: Halves, directory: Path, write_camera: Callable[[Path], 
     """
     cells, cuts, verdict = cell_table(found), cut_table(found), halves_verdict(found)
     title = f"{found.adjusted.block.title or 'block'}: halves"
+    # Of cuts without a problem that column is empty.
+    shown = (cuts if found.failed else cuts.drop(columns="problem")).rename(columns={"first": "first half"})
     picture = WholePicture.of(halves_figure(found), "maps over the format")
-    parts = (picture, Heading("Cuts"), rows_of(cuts), *made_section(made))
+    parts = (picture, Heading("Cuts"), rows_of(shown), *made_section(made))
     with whole_folder(directory) as work:
         cells.to_csv(work / "cells.csv", index=False)
         cuts.to_csv(work / "cuts.csv", index=False)

@@ -11,11 +11,12 @@ import numpy as np
 import pandas as pd
 
 from jaxphoto.adjustment import Adjustment
+from jaxphoto.errors import InputError
 from jaxphoto.observations import AXES
 from jaxphoto.report.document import Heading, Paragraph, rows_of
 from jaxphoto.report.findings import parameter_words
 from jaxphoto.report.made import Made, made_section, versions
-from jaxphoto.report.plots import drawn, new_figure
+from jaxphoto.report.plots import axes_or_new, drawn, new_figure
 from jaxphoto.report.results import write_summary
 from jaxphoto.report.study_page import StudyPart, WholePicture, study_page
 from jaxphoto.report.tables import Tables
@@ -24,6 +25,7 @@ from jaxphoto.sensitivity.influence import DELTA0, Per, external_reliability, st
 from jaxphoto.writing import whole_folder
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 # Interior parameters in the figure.
@@ -134,38 +136,59 @@ class SensitivityTables:
         table = table.assign(factor=np.where(table["unit"] == "deg", 180 / np.pi, 1.0))
         return {str(group): rows for group, rows in table.groupby("group")}
 
+    @cached_property
+    def panels(self) -> dict[str, list[str]]:
+        """What can be drawn, by title, and the estimates that it is of: interior orientation, check points by axis."""
+        interior = [e for e in dict.fromkeys(self.bias["estimate"]) if e.startswith("interior")]
+        panels = {e.split("].")[1] if len(self.adjusted.unknowns.interior) == 1 else e: [e] for e in interior}
+        return panels | {
+            f"check points, {a}, RMS [m]": [f"points[{p}].{a}" for p in self.check] for a in AXES if self.check
+        }
+
     def figure(self) -> Figure:
         """Interior orientation and check points: the change by a bias of each unit and axis, exact and first-order."""
-        table = self.bias
-        interior = [e for e in dict.fromkeys(table["estimate"]) if e.startswith("interior")][:_SHOWN]
-        panels = {e.split("].")[1] if len(self.adjusted.unknowns.interior) == 1 else e: [e] for e in interior}
-        panels |= {f"check points, {a}, RMS [m]": [f"points[{p}].{a}" for p in self.check] for a in AXES if self.check}
+        interior = [title for title, (first, *_) in self.panels.items() if first.startswith("interior")]
+        panels = [title for title in self.panels if title not in interior[_SHOWN:]]
         columns = 3
         down = max(1, -(-len(panels) // columns))
         figure = new_figure(9.6, 0.9 + 2.3 * down)
         # Names along an axis stand on end: room between them and the title of the panel below.
         figure.set_layout_engine("constrained", h_pad=0.12)
-        for axes, (title, names) in zip(
-            figure.subplots(down, columns, squeeze=False).flat, panels.items(), strict=False
-        ):
-            chosen = table[table["estimate"].isin(names)]
-            by = chosen.groupby(["unit", "axis"], sort=False)[["exact", "first_order", "difference"]]
-            values = by.sum() if len(names) == 1 else by.agg(_rms)
-            at = np.arange(len(values))
-            for k, (name, colour) in enumerate(
-                (("exact", "tab:blue"), ("first_order", "0.6"), ("difference", "tab:red"))
-            ):
-                axes.bar(at + 0.27 * (k - 1), values[name], 0.27, color=colour, label=name.replace("_", " "))
-            axes.set_xticks(at, [drawn(f"{unit} {axis}") for unit, axis in values.index], rotation=90, fontsize=7)
-            axes.axhline(0, color="0.4", lw=0.6)
-            axes.set_title(drawn(title), fontsize=10)
-            axes.tick_params(axis="y", labelsize=8)
+        for axes, title in zip(figure.subplots(down, columns, squeeze=False).flat, panels, strict=False):
+            _draw_changes(axes, self, title)
         for axes in figure.axes[len(panels) :]:
             axes.remove()
         if panels:
             figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8)
         figure.suptitle(f"change by a station bias of {self.bias_m:g} m per {self.per}", fontsize=11)
         return figure
+
+
+def plot_sensitivity(tables: SensitivityTables, title: str, ax: Axes | None = None) -> Axes:
+    """What a station bias of each unit does to an estimate, or to the check points: exact, first-order, difference.
+
+    `title` is one of `tables.panels`, such as `c_mm`. Raises InputError for another.
+    """
+    if title not in tables.panels:
+        raise InputError(f"there is no {title!r} to be drawn; there are {'; '.join(tables.panels)}")
+    ax = axes_or_new(ax)
+    _draw_changes(ax, tables, title)
+    ax.legend(fontsize=8)
+    return ax
+
+
+def _draw_changes(axes: Axes, tables: SensitivityTables, title: str) -> None:
+    names = tables.panels[title]
+    chosen = tables.bias[tables.bias["estimate"].isin(names)]
+    by = chosen.groupby(["unit", "axis"], sort=False)[["exact", "first_order", "difference"]]
+    values = by.sum() if len(names) == 1 else by.agg(_rms)
+    at = np.arange(len(values))
+    for k, (name, colour) in enumerate((("exact", "tab:blue"), ("first_order", "0.6"), ("difference", "tab:red"))):
+        axes.bar(at + 0.27 * (k - 1), values[name], 0.27, color=colour, label=name.replace("_", " "))
+    axes.set_xticks(at, [drawn(f"{unit} {axis}") for unit, axis in values.index], rotation=90, fontsize=7)
+    axes.axhline(0, color="0.4", lw=0.6)
+    axes.set_title(drawn(title), fontsize=10)
+    axes.tick_params(axis="y", labelsize=8)
 
 
 def _rms(values: pd.Series) -> float:

@@ -10,7 +10,7 @@ import pandas as pd
 
 from jaxphoto.errors import InputError
 from jaxphoto.observations import AXES
-from jaxphoto.report.plots import drawn, log_ticks, new_figure
+from jaxphoto.report.plots import axes_or_new, drawn, log_ticks, new_figure
 from jaxphoto.sensitivity.sweep import Sweep
 
 if TYPE_CHECKING:
@@ -104,30 +104,46 @@ def sweep_figure(table: pd.DataFrame, x: str, shown: Sequence[tuple[str, str]], 
     `table` is that of `sweep_table`, or a part of it in which `x` and `by` tell all designs apart. Raises InputError
     where they do not, where there is no such column, or where nothing of `shown` is in the table.
     """
-    for column in (x, *by):
-        if column not in table:
-            raise InputError(f"the table has no column {column}: choose among {', '.join(map(str, table.columns))}")
     figure = new_figure(3.4 * min(len(shown), 3), 2.9 * -(-len(shown) // 3))
     panels = figure.subplots(-(-len(shown) // 3), min(len(shown), 3), squeeze=False).ravel()
     for axes, (quantity, of) in zip(panels, shown, strict=False):
-        rows = table[(table["quantity"] == quantity) & (table["of"] == of)]
-        if rows.empty:
-            raise InputError(
-                f"the table has no {quantity} of {of}: look at table[['quantity', 'of']].drop_duplicates()"
-            )
-        if rows.duplicated([x, *by]).any():
-            raise InputError(
-                f"several designs have the same {', '.join([x, *by])}: take a part of the table in which these tell "
-                "all designs apart, or name more parameters in by"
-            )
-        _lines(axes, rows, x, by)
-        unit = rows["unit"].iloc[0]
-        axes.set_title(drawn(f"{quantity} {of}" + f" [{unit}]" * bool(unit)), fontsize=9)
+        _lines(axes, _chosen(table, x, quantity, of, by), x, by)
     for axes in panels[len(shown) :]:
         axes.set_axis_off()
     if by:
         figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8)
     return figure
+
+
+def plot_sweep(
+    table: pd.DataFrame, x: str, quantity: str, of: str, ax: Axes | None = None, *, by: Sequence[str] = ()
+) -> Axes:
+    """One panel of `sweep_figure`: a quantity of something against the parameter `x`, one line for each `by`.
+
+    Raises InputError where that does.
+    """
+    rows = _chosen(table, x, quantity, of, by)
+    ax = axes_or_new(ax)
+    _lines(ax, rows, x, by)
+    if by:
+        ax.legend(fontsize=8)
+    return ax
+
+
+def _chosen(table: pd.DataFrame, x: str, quantity: str, of: str, by: Sequence[str]) -> pd.DataFrame:
+    """The rows that are drawn."""
+    for column in (x, *by):
+        if column not in table:
+            raise InputError(f"the table has no column {column}: choose among {', '.join(map(str, table.columns))}")
+    rows = table[(table["quantity"] == quantity) & (table["of"] == of)]
+    if rows.empty:
+        raise InputError(f"the table has no {quantity} of {of}: look at table[['quantity', 'of']].drop_duplicates()")
+    if rows.duplicated([x, *by]).any():
+        raise InputError(
+            f"several designs have the same {', '.join([x, *by])}: take a part of the table in which these tell "
+            "all designs apart, or name more parameters in by"
+        )
+    return rows
 
 
 def _lines(axes: Axes, rows: pd.DataFrame, x: str, by: Sequence[str]) -> None:
@@ -143,6 +159,8 @@ def _lines(axes: Axes, rows: pd.DataFrame, x: str, by: Sequence[str]) -> None:
         axes.set_ylim(0, 1.02)
     elif _far_apart(rows["value"]):
         axes.set_yscale("log")
+    quantity, of, unit = rows[["quantity", "of", "unit"]].iloc[0]
+    axes.set_title(drawn(f"{quantity} {of}" + f" [{unit}]" * bool(unit)), fontsize=9)
     axes.set_xlabel(drawn(x), fontsize=8)
     axes.tick_params(labelsize=7)
     axes.grid(lw=0.3)

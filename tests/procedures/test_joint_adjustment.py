@@ -5,6 +5,7 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
 from jaxphoto import BlockError, InputError
@@ -13,6 +14,7 @@ from jaxphoto.camera import get_parameter
 from jaxphoto.observations import Attitudes, StationRows
 from jaxphoto.procedures.lidar import adjust_strips
 from jaxphoto.procedures.lidar.photographs import check_photographs
+from jaxphoto.report import plot_scanner_correlation, plot_trajectory_errors
 from jaxphoto.report.maps import png_of
 from jaxphoto.report.strip_figures import scanner_correlation_figure, trajectory_errors_figure
 from jaxphoto.report.strips import all_correlations, errors_along
@@ -63,6 +65,13 @@ def test_pictures_take_names_as_they_are():
         assert png_of(figure)[0].startswith(b"\x89PNG")
     first, second = scanner_correlation_figure(result).axes[:2]
     assert len(first.get_xticks()) == 8 and len(first.get_yticks()) == len(second.get_xticks()) == 5
+    errors = plot_trajectory_errors(result, "2", Figure().add_subplot(), attitude=True)
+    whole = trajectory_errors_figure(result).axes
+    np.testing.assert_array_equal(errors.lines[0].get_ydata(), whole[4].lines[0].get_ydata())
+    with pytest.raises(InputError, match="there is no strip 'x'; there are 1, 2, 3"):
+        plot_trajectory_errors(result, "x")
+    own = plot_scanner_correlation(result, Figure().add_subplot(), itself=True)
+    np.testing.assert_array_equal(own.images[0].get_array(), second.images[0].get_array())
 
 
 def test_errors_along_a_strip_have_the_spread_of_their_knots():

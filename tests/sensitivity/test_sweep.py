@@ -10,11 +10,12 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 import jaxphoto
 from jaxphoto import FREE, DatumError, InputError, RankError
 from jaxphoto.adjustment import Sizes, common_sizes
-from jaxphoto.report.sweep import sweep_figure, sweep_table
+from jaxphoto.report.sweep import plot_sweep, sweep_figure, sweep_table
 from jaxphoto.sensitivity import designs as side_by_side
 from jaxphoto.sensitivity.sweep import Design, Sweep, sweep
 from jaxphoto.statistics import correlations
@@ -246,6 +247,9 @@ def test_pictures(swept):
     with pytest.raises(InputError, match="several designs have the same images"):
         sweep_figure(table, "images", [("sigma", "c_mm")])
     assert len(sweep_figure(table, "images", [("sigma", "c_mm")], by=["name"]).axes[0].lines) == len(NAMES)
+    one = plot_sweep(table, "name", "sigma", "c_mm", Figure().add_subplot())
+    np.testing.assert_array_equal(one.lines[0].get_ydata(), line.get_ydata())
+    assert one.get_title() == figure.axes[0].get_title()
 
 
 def test_mistakes_are_told_in_one_sentence(designs, swept):

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Bool, Int
 
+from jaxphoto.adjustment import Adjustment
 from jaxphoto.errors import few
 from jaxphoto.report.document import DocumentPicture, Element, Heading, Paragraph, Pictures, Rows
 from jaxphoto.report.flight.part import PartReport
@@ -31,7 +32,7 @@ def links_section(report: PartReport) -> Iterator[Element]:
     """A picture of the network in plan, and where it would come apart first."""
     adjusted = report.part.adjusted
     links = image_links(adjusted)
-    weak = weak_links(adjusted, links, _SHOWN)
+    weak = weakest(adjusted, links)
     images = adjusted.block.images
     yield Heading("Links between photographs")
     of_one = np.bincount(np.concatenate([links.first, links.second]), minlength=len(images))
@@ -43,7 +44,7 @@ def links_section(report: PartReport) -> Iterator[Element]:
     yield Pictures(
         (
             DocumentPicture(
-                partial(draw_network, report=report, links=links, weak=weak),
+                partial(draw_network, adjusted=adjusted, links=links, weak=weak, unit=report.unit),
                 f"Network of photographs in plan, {len(links.common)} links by their common points; weakest in red",
                 4.4,
             ),
@@ -61,12 +62,17 @@ def links_section(report: PartReport) -> Iterator[Element]:
     yield Rows(("photograph", "photograph", "common points", "points on both sides", "smaller side"), rows)
 
 
-def draw_network(axes: Axes, report: PartReport, links: ImageLinks, weak: list[WeakLink]) -> None:
+def weakest(adjusted: Adjustment, links: ImageLinks) -> list[WeakLink]:
+    """Where the network would come apart first."""
+    return weak_links(adjusted, links, _SHOWN)
+
+
+def draw_network(axes: Axes, adjusted: Adjustment, links: ImageLinks, weak: list[WeakLink], unit: str = "m") -> None:
     """Stations in plan, and lines the wider and darker the more points two photographs share; the weakest in red.
 
     Of a class of many links an even part is drawn, which title and legend say.
     """
-    station = np.asarray(report.part.adjusted.unknowns.exterior.position)[:, :2]
+    station = np.asarray(adjusted.unknowns.exterior.position)[:, :2]
     limits = strength_classes(links.common)
     # Dark lines above light ones.
     lines = []
@@ -88,7 +94,7 @@ def draw_network(axes: Axes, report: PartReport, links: ImageLinks, weak: list[W
         axes.plot(*station[[w.first, w.second]].T, "--", color="tab:red", lw=1.2, label=label)
     axes.plot(*station.T, "o", ms=3, color="tab:blue")
     axes.legend(fontsize=6, title="common points", title_fontsize=6, loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    axes.set(xlabel=f"X [{report.unit}]", ylabel=f"Y [{report.unit}]")
+    axes.set(xlabel=f"X [{unit}]", ylabel=f"Y [{unit}]")
     shown, n = sum(len(own) for own, _, _ in lines), len(links.common)
     part = f": {shown} of {n} links" if shown < n else ""
     axes.set_title(f"photographs and their common points{part}", loc="left", fontsize=9)

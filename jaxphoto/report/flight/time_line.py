@@ -64,32 +64,39 @@ def time_section(report: PartReport, taken: Mapping[str, Moment]) -> Iterator[El
     yield Heading("Time line")
     line = time_line(report, taken)
     yield Paragraph(" ".join(_sentences(line, report.part.adjusted.block.images)))
-    panels = []
-    if report.images["position"].eq("used").any():
-        alt = "Recorded minus adjusted positions less their mean by axis, in the order of the photographs"
-        panels.append(DocumentPicture(partial(draw_offsets, line=line, report=report), alt, _HEIGHT))
-    panels.append(
-        DocumentPicture(
-            lambda axes: _draw(axes, line, {"rms": report.images["rms_px"].to_numpy()[line.order]}, "residual [px]"),
-            "Residuals of photographs in their order", _HEIGHT,
+    yield Pictures(
+        tuple(
+            DocumentPicture(partial(draw_in_time, line=line, shown=shown), shown.alt, _HEIGHT)
+            for shown in shown_in_time(report, line).values()
         )
-    )  # fmt: skip
+    )
+
+
+class ShownInTime(NamedTuple):
+    """Numbers in the order of a time line, with what they are called."""
+
+    values: Mapping[str, Float[np.ndarray, taken]]
+    what: str
+    alt: str
+
+
+def shown_in_time(report: PartReport, line: TimeLine) -> dict[str, ShownInTime]:
+    """What there is of offsets (less their mean, of positions that are used), residuals, height and speed."""
+    rms = report.images["rms_px"].to_numpy()[line.order]
+    shown = {"residuals": ShownInTime({"rms": rms}, "residual [px]", "Residuals of photographs in their order")}
+    if report.images["position"].eq("used").any():
+        d, _, used = less_mean(report)
+        by_axis = dict(zip(AXES, np.where(used[:, None], d, np.nan)[line.order].T, strict=True))
+        alt = "Recorded minus adjusted positions less their mean by axis, in the order of the photographs"
+        shown = {"offsets": ShownInTime(by_axis, "offset less mean [m]", alt)} | shown
     if report.coverage is not None and np.isfinite(report.coverage.height_m[line.order]).any():
         height = report.coverage.height_m[line.order]
-        panels.append(
-            DocumentPicture(
-                lambda axes: _draw(axes, line, {"height": height}, "height over ground [m]"),
-                f"Height over ground, {np.nanmin(height):.3g} to {np.nanmax(height):.3g} m", _HEIGHT,
-            )
-        )  # fmt: skip
+        alt = f"Height over ground, {np.nanmin(height):.3g} to {np.nanmax(height):.3g} m"
+        shown["height"] = ShownInTime({"height": height}, "height over ground [m]", alt)
     if np.isfinite(line.speed).any():
-        panels.append(
-            DocumentPicture(
-                lambda axes: _draw(axes, line, {"speed": line.speed}, "speed [m/s]"),
-                f"Speed, {np.nanmedian(line.speed):.3g} m/s in the median", _HEIGHT,
-            )
-        )  # fmt: skip
-    yield Pictures(tuple(panels))
+        alt = f"Speed, {np.nanmedian(line.speed):.3g} m/s in the median"
+        shown["speed"] = ShownInTime({"speed": line.speed}, "speed [m/s]", alt)
+    return shown
 
 
 def _sentences(line: TimeLine, images: tuple[str, ...]) -> Iterator[str]:
@@ -113,21 +120,14 @@ def _sentences(line: TimeLine, images: tuple[str, ...]) -> Iterator[str]:
         yield f"Of {without} photographs no time is known; they are not shown."
 
 
-def draw_offsets(axes: Axes, line: TimeLine, report: PartReport) -> None:
-    """Recorded minus adjusted positions that are used, less their mean, by axis."""
-    d, _, used = less_mean(report)
-    shown = np.where(used[:, None], d, np.nan)[line.order]
-    _draw(axes, line, dict(zip(AXES, shown.T, strict=True)), "offset less mean [m]")
-
-
-def _draw(axes: Axes, line: TimeLine, values: Mapping[str, np.ndarray], what: str) -> None:
+def draw_in_time(axes: Axes, line: TimeLine, shown: ShownInTime) -> None:
     """Lines of numbers in the order of `line`, interrupted by gaps, which are grey."""
     for k in np.flatnonzero(line.gap):
         axes.axvspan(line.at[k], line.at[k + 1], color="0.9", lw=0)
     breaks = np.flatnonzero(line.gap) + 1
     at = np.insert(line.at, breaks, np.nan)
-    for (name, v), style in zip(values.items(), ("o-", "s--", "^:"), strict=False):
+    for (name, v), style in zip(shown.values.items(), ("o-", "s--", "^:"), strict=False):
         axes.plot(at, np.insert(np.asarray(v, float), breaks, np.nan), style, ms=2.5, lw=0.8, label=name)
-    if len(values) > 1:
-        axes.legend(fontsize=7, ncols=len(values))
-    axes.set(xlabel="time since the first photograph [s]" if line.timed else "photograph", ylabel=what)
+    if len(shown.values) > 1:
+        axes.legend(fontsize=7, ncols=len(shown.values))
+    axes.set(xlabel="time since the first photograph [s]" if line.timed else "photograph", ylabel=shown.what)

@@ -1,0 +1,91 @@
+"""Pictures of flights, strips, sensitivity and draws, one by one: on given axes, with the numbers of their tables."""
+
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.figure import Figure
+
+from jaxphoto import InputError
+from jaxphoto.lidar.raster import Raster
+from jaxphoto.report import (
+    plot_draws,
+    plot_effects,
+    plot_photograph_residuals,
+    plot_position_offsets,
+    plot_sensitivity,
+    plot_strip_differences,
+    plot_time_line,
+    to_plotly,
+)
+from jaxphoto.report.sensitivity import SensitivityTables
+from jaxphoto.report.strip_figures import differences_figure
+from tests.blocks import adjusted
+from tests.report.flights import OFFSETS_M, part_report, source
+
+
+@pytest.fixture
+def axes():
+    return Figure().add_subplot()
+
+
+def test_offsets_are_recorded_minus_adjusted_less_their_mean(axes):
+    report = part_report()
+    assert plot_position_offsets(report, axes, upright=True) is axes
+    heights = OFFSETS_M[:, 2] - OFFSETS_M[:3, 2].mean()
+    np.testing.assert_allclose([bar.get_height() for bar in axes.patches], heights)
+    plan = plot_position_offsets(report, Figure().add_subplot())
+    assert any("9" in f"{trace.customdata}" for trace in to_plotly(plan).data if trace.customdata is not None)
+    with pytest.raises(InputError, match="no recorded position of this part is used"):
+        plot_position_offsets(report._replace(part=report.part._replace(placed=None)), axes)
+
+
+def test_a_time_line_is_in_the_order_of_time(axes):
+    report, taken = part_report(), source().taken
+    plot_time_line(report, "residuals", axes, taken=taken)
+    y = axes.lines[0].get_ydata()
+    np.testing.assert_allclose(y[np.isfinite(y)], report.images["rms_px"])
+    assert plot_time_line(report, "offsets", Figure().add_subplot(), taken=taken).get_legend() is not None
+    with pytest.raises(InputError, match="no 'wind' are known by time; there are offsets, residuals"):
+        plot_time_line(report, "wind")
+    bars = plot_photograph_residuals(report, Figure().add_subplot()).patches
+    np.testing.assert_allclose([bar.get_height() for bar in bars], report.images["rms_px"])
+
+
+def test_gaps_of_strips_before_and_after_have_the_same_colours(axes):
+    rng = np.random.default_rng(3)
+    before = Raster(rng.normal(0, 0.1, (20, 30)), 0.0, 20.0, 1.0)
+    after = Raster(before.heights / 5, 0.0, 20.0, 1.0)
+    assert plot_strip_differences(after, axes, limit_m=0.3) is axes and axes.images[0].get_clim() == (-30, 30)
+    np.testing.assert_allclose(axes.images[0].get_array(), 100 * after.heights)
+    whole = differences_figure(before, after).axes
+    assert whole[0].images[0].get_clim() == whole[1].images[0].get_clim()
+    assert whole[1].get_title(loc="left") == f"after: {axes.get_title(loc='left')}"
+
+
+def test_a_sensitivity_is_drawn_as_its_table_says(axes):
+    tables = SensitivityTables(adjusted("cross"), "block", 0.1)
+    plot_sensitivity(tables, "c_mm", axes)
+    own = tables.bias[tables.bias["estimate"] == "interior[one].c_mm"]
+    heights = [bar.get_height() for bar in axes.patches]
+    np.testing.assert_allclose(heights, np.concatenate([own[n] for n in ("exact", "first_order", "difference")]))
+    names = [trace.name for trace in to_plotly(axes).data if trace.showlegend]
+    assert names == ["exact", "first order", "difference"]
+    with pytest.raises(InputError, match=r"no 'k9' to be drawn; there are c_mm; .*check points, X"):
+        plot_sensitivity(tables, "k9")
+
+
+def test_draws_and_effects_are_those_of_their_files(axes):
+    rng = np.random.default_rng(2)
+    draws = pd.DataFrame({"one.c_mm": 35 + rng.normal(0, 0.01, 400)})
+    summary = pd.DataFrame({"quantity": ["one.c_mm"], "nominal": [35.0], "predicted_sigma": [0.01]})
+    assert plot_draws(draws, summary, "one.c_mm", axes) is axes
+    area = sum(bar.get_height() * bar.get_width() for bar in axes.patches)
+    assert area == pytest.approx(1.0)
+    assert max(axes.lines[1].get_ydata()) == pytest.approx(1 / 0.01 / np.sqrt(2 * np.pi), rel=1e-3)
+    with pytest.raises(InputError, match=r"the draws have no 'c'; they have one\.c_mm"):
+        plot_draws(draws, summary, "c", axes)
+    effects = pd.DataFrame({"error": ["A X", "A Y"], "one.c_mm": [0.005, -0.002]})
+    shown = plot_effects(effects, summary, ["one.c_mm"], Figure().add_subplot()).images[0]
+    np.testing.assert_allclose(np.asarray(shown.get_array()).ravel(), [0.5, -0.2])
+    with pytest.raises(InputError, match="the effects have no 'k1'"):
+        plot_effects(effects, summary, ["k1"])
