@@ -51,6 +51,11 @@ def rows_of(table: pd.DataFrame) -> Rows:
     return Rows(heads, tuple(readable(table).itertuples(index=False, name=None)))
 
 
+def without_empty(table: pd.DataFrame) -> pd.DataFrame:
+    """The same without columns that no row has anything in, such as problems where there are none."""
+    return table.loc[:, ~(table.isna() | (table == "")).all()] if len(table) else table
+
+
 class DocumentPicture(NamedTuple):
     """One panel."""
 

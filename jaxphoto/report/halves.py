@@ -12,7 +12,7 @@ from rich.console import Console
 
 from jaxphoto.errors import camera_words
 from jaxphoto.procedures.halves import Halves
-from jaxphoto.report.document import Heading, rows_of
+from jaxphoto.report.document import Heading, rows_of, without_empty
 from jaxphoto.report.made import Made, made_section, versions
 from jaxphoto.report.maps import format_maps
 from jaxphoto.report.results import write_summary
@@ -129,10 +129,13 @@ def write_halves(found: Halves, directory: Path, write_camera: Callable[[Path], 
     """
     cells, cuts, verdict = cell_table(found), cut_table(found), halves_verdict(found)
     title = f"{found.adjusted.block.title or 'block'}: halves"
-    # Of cuts without a problem that column is empty.
-    shown = (cuts if found.failed else cuts.drop(columns="problem")).rename(columns={"first": "first half"})
     picture = WholePicture.of(halves_figure(found), "maps over the format")
-    parts = (picture, Heading("Cuts"), rows_of(shown), *made_section(made))
+    parts = (
+        picture,
+        Heading("Cuts"),
+        rows_of(without_empty(cuts).rename(columns={"first": "first half"})),
+        *made_section(made),
+    )
     with whole_folder(directory) as work:
         cells.to_csv(work / "cells.csv", index=False)
         cuts.to_csv(work / "cuts.csv", index=False)

@@ -17,7 +17,7 @@ from jaxphoto.lidar import HeightFlag
 from jaxphoto.observations import AXES
 from jaxphoto.procedures.lidar import LidarControl, Round, Simultaneous
 from jaxphoto.procedures.lidar.vertical_control import flag_counts
-from jaxphoto.report.document import Heading, Paragraph, Rows, finding_paragraphs, rows_of
+from jaxphoto.report.document import Heading, Paragraph, Rows, finding_paragraphs, rows_of, without_empty
 from jaxphoto.report.findings import as_sentence
 from jaxphoto.report.made import Made, made_section
 from jaxphoto.report.plots import new_figure
@@ -239,7 +239,10 @@ def heights_page(control: LidarControl, picture: WholePicture, made: Made) -> st
     parts += [refused] if flags else []
     heights = heights_table(control)
     off = (heights["height_m"] - heights["Z_m"]).abs().sort_values(ascending=False, na_position="last")
-    parts += [Heading("Heights that differ most"), rows_of(heights.loc[off.index[:_STRONGEST]].round(_MM))]
+    parts += [
+        Heading("Heights that differ most"),
+        rows_of(without_empty(heights.loc[off.index[:_STRONGEST]].round(_MM))),
+    ]
     parts += [Paragraph("All stand in lidar_heights.csv."), *made_section(made)]
     said = [*rounds_words(control.rounds, control.still)]
     said.append(f"{int(control.used.sum())} of {len(control.points)} tie points have a control height")

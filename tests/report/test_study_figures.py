@@ -17,6 +17,7 @@ from jaxphoto.report import (
     plot_time_line,
     to_plotly,
 )
+from jaxphoto.report.document import without_empty
 from jaxphoto.report.sensitivity import SensitivityTables
 from jaxphoto.report.strip_figures import differences_figure
 from tests.blocks import adjusted
@@ -72,6 +73,11 @@ def test_a_sensitivity_is_drawn_as_its_table_says(axes):
     assert names == ["exact", "first order", "difference"]
     with pytest.raises(InputError, match=r"no 'k9' to be drawn; there are c_mm; .*check points, X"):
         plot_sensitivity(tables, "k9")
+
+
+def test_what_is_empty_in_all_rows_is_no_column():
+    table = pd.DataFrame({"cut": [1, 2], "problem": ["", ""], "none": [np.nan] * 2, "note": ["", "x"]})
+    assert list(without_empty(table)) == ["cut", "note"] and list(without_empty(table[:0])) == list(table)
 
 
 def test_draws_and_effects_are_those_of_their_files(axes):
