@@ -31,7 +31,7 @@ _OPTIONS = {
     "as_json": typer.Option("--json", help="Print one JSON object, for programs.", rich_help_panel=_PANEL),
     "quiet": typer.Option("--quiet", "-q", help="Print warnings and errors alone.", rich_help_panel=_PANEL),
     "verbose": typer.Option(
-        "--verbose", "-v", help="A line for each step and each program compiled.", rich_help_panel=_PANEL
+        "--verbose", "-v", help="A line for each step, iteration and program compiled.", rich_help_panel=_PANEL
     ),
 }
 OF_OUTPUT = tuple(_OPTIONS)
@@ -54,6 +54,7 @@ class Output:
         """Where the outcome is printed."""
         self.progress = plain_console(stderr=True, quiet=quiet, each_step=self._line if verbose else None)
         """Where it is told what is being done."""
+        self._verbose = verbose
         told = (lambda name, seconds: self._line(f"compiled {name} in {seconds:.1f} s")) if verbose else None
         self._compiled = CompileTimes(told)
 
@@ -78,6 +79,11 @@ class Output:
     def say(self, sentence: str) -> None:
         """Say something of the outcome."""
         self.screen.print(plain(sentence), soft_wrap=True)
+
+    def details(self, lines: Iterable[str]) -> None:
+        """Say what nobody needs but who asked for all of it."""
+        for line in lines if self._verbose else ():
+            self._line(line)
 
     def tell(self, **values: Any) -> None:
         """Tell programs more of the outcome."""

@@ -7,10 +7,10 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
-import pandas as pd
 
 from jaxphoto.adjustment import TOLERANCE, Adjustment, Outcome
 from jaxphoto.errors import counted
+from jaxphoto.report.convergence_table import convergence_table
 from jaxphoto.report.document import DocumentPicture, Element, Heading, Paragraph, Pictures, rows_of
 
 if TYPE_CHECKING:
@@ -18,24 +18,6 @@ if TYPE_CHECKING:
 
 # Rows and ticks that are still read.
 _SHOWN = 40
-
-
-def convergence_table(adjusted: Adjustment) -> pd.DataFrame:
-    """step, sigma0 before it, length (standard deviations), damping, taken (yes, no); no rows where none is known.
-
-    `length` bounds by how many of its standard deviations any unknown moved. The last row is where it ended.
-    """
-    course, redundancy = adjusted.course, max(adjusted.redundancy, 1)
-    if course is None:
-        return pd.DataFrame(columns=["step", "sigma0", "length", "damping", "taken"])
-    n = len(course.length)
-    # Of a very long iteration the first steps are kept; the end is known in any case.
-    end = n == int(adjusted.steps)
-    sums = np.append(course.square_sum, float(adjusted.square_sum)) if end else course.square_sum
-    table = pd.DataFrame({"step": np.arange(1, len(sums) + 1), "sigma0": np.sqrt(sums / redundancy)})
-    table["length"], table["damping"] = pd.Series(course.length), pd.Series(course.damping)
-    table["taken"] = pd.Series(np.where(course.accepted > 0, "yes", "no"))
-    return table.assign(step=[*map(str, range(1, n + 1)), *(["end"] if end else [])], taken=table["taken"].fillna(""))
 
 
 def convergence_words(adjusted: Adjustment) -> str:

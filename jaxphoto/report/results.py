@@ -33,6 +33,7 @@ _TABLES = (
     "correlation_summary",
     "correlation_ground",
     "sigma_map",
+    "convergence",
 )
 # Written beside them where the files of the block were in an EPSG system.
 _MAP_TABLES = ("exterior_map", "object_points_map")

@@ -9,11 +9,12 @@ import pandas as pd
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.adjustment.model.numbers import Residuals
 from jaxphoto.arrays import Numbers
-from jaxphoto.camera import constant_names, get_parameter, parameter_names
 from jaxphoto.observations import AXES
 from jaxphoto.report.camera_drift_table import camera_drift_table
 from jaxphoto.report.check_points import check_point_table
+from jaxphoto.report.convergence_table import convergence_table
 from jaxphoto.report.correlation_tables import correlation_ground_table, correlation_summary_table
+from jaxphoto.report.interior_table import interior_table
 from jaxphoto.report.map_tables import angles_deg, exterior_map_table, map_coordinates
 from jaxphoto.report.positional_accuracy import accuracy_table
 from jaxphoto.report.recovery import recovery_table
@@ -168,14 +169,7 @@ class Tables:
     def interior(self) -> pd.DataFrame:
         """camera, parameter, value, sigma, significant; fixed parameters have neither of the latter two, nor has any
         that did not converge."""
-        tested = {(s.camera, s.parameter): s for s in self.significance}
-        rows = []
-        for camera, interior in self.adjusted.unknowns.interior.items():
-            for name in (*parameter_names(interior), *constant_names(interior)):
-                test = tested.get((camera, name))
-                known = (test.sigma, test.significant) if test else (np.nan, None)
-                rows.append((camera, name, float(get_parameter(interior, name)), *known))
-        return pd.DataFrame(rows, columns=["camera", "parameter", "value", "sigma", "significant"])
+        return interior_table(self.adjusted, self.significance)
 
     @cached_property
     def georeferencing(self) -> pd.DataFrame:
@@ -330,6 +324,11 @@ class Tables:
         """camera, distance_m (inf: a direction), x_mm, y_mm, sigma_x_px, sigma_y_px, worst_px; a row a cell."""
         maps = (one for both in self.sigma_maps.values() for one in both)
         return sigma_map_table(maps, self.adjusted.block.sensors)
+
+    @cached_property
+    def convergence(self) -> pd.DataFrame:
+        """step, sigma0, length, damping, taken: a row a step, the last of how it ended."""
+        return convergence_table(self.adjusted)
 
     @cached_property
     def recovery(self) -> pd.DataFrame:

@@ -7,7 +7,8 @@ import pytest
 
 import jaxphoto
 from jaxphoto import InputError, Outcome, Tables, report
-from jaxphoto.report.convergence import convergence_section, convergence_table, convergence_words
+from jaxphoto.report.convergence import convergence_section, convergence_words
+from jaxphoto.report.convergence_table import convergence_table, step_lines
 from tests.blocks import adjusted, simulated
 
 
@@ -17,6 +18,9 @@ def test_sigma_naught_falls_from_that_of_the_start_to_that_of_the_optimum():
     assert len(table) == int(result.steps) + 1 and table["step"].iloc[-1] == "end"
     assert table["sigma0"].iloc[-1] == pytest.approx(float(result.sigma0))
     assert (np.diff(table["sigma0"]) <= 1e-9).all()
+    lines = list(step_lines(result))
+    assert lines[0].startswith("step 1: sigma naught") and "moves" in lines[0] and "moves" not in lines[-1]
+    assert lines[-1] == f"end: sigma naught {float(result.sigma0):.6g}"
     # One step from the start leads to where the second begins.
     one = jaxphoto.adjust(simulated("cross").block, max_steps=1)
     assert one.course.square_sum[0] == pytest.approx(result.course.square_sum[0])

@@ -1,0 +1,34 @@
+"""How an adjustment converged, step by step, as a table and as lines."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import pandas as pd
+
+from jaxphoto.adjustment import Adjustment
+
+
+def convergence_table(adjusted: Adjustment) -> pd.DataFrame:
+    """step, sigma0 before it, length (standard deviations), damping, taken (yes, no); no rows where none is known.
+
+    `length` bounds by how many of its standard deviations any unknown moved. The last row is where it ended.
+    """
+    course, redundancy = adjusted.course, max(adjusted.redundancy, 1)
+    if course is None:
+        return pd.DataFrame(columns=["step", "sigma0", "length", "damping", "taken"])
+    n = len(course.length)
+    # Of a very long iteration the first steps are kept; the end is known in any case.
+    end = n == int(adjusted.steps)
+    sums = np.append(course.square_sum, float(adjusted.square_sum)) if end else course.square_sum
+    table = pd.DataFrame({"step": np.arange(1, len(sums) + 1), "sigma0": np.sqrt(sums / redundancy)})
+    table["length"], table["damping"] = pd.Series(course.length), pd.Series(course.damping)
+    table["taken"] = pd.Series(np.where(course.accepted > 0, "yes", "no"))
+    return table.assign(step=[*map(str, range(1, n + 1)), *(["end"] if end else [])], taken=table["taken"].fillna(""))
+
+
+def step_lines(adjusted: Adjustment) -> Iterator[str]:
+    """A line a step of the table, for those who want to see them all."""
+    for row in convergence_table(adjusted).itertuples():
+        refused = ", refused" if row.taken == "no" else ""
+        moved = f", moves {row.length:.2g} sigmas, damping {row.damping:.1g}{refused}" if row.taken else ""
+        yield f"{'step ' if row.taken else ''}{row.step}: sigma naught {row.sigma0:.6g}{moved}"
