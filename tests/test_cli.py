@@ -42,7 +42,7 @@ FILES = {
 XYZ = ["X_m", "Y_m", "Z_m"]
 EOP = [*XYZ, "omega_deg", "phi_deg", "kappa_deg"]
 COLUMNS = {
-    "interior": ["camera", "parameter", "value", "sigma", "significant"],
+    "interior": ["camera", "parameter", "value", "sigma", "significant", "unit"],
     "exterior": ["image", *EOP, *(f"sigma_{n}" for n in EOP)],
     "object_points": ["point", *XYZ, *(f"sigma_{n}" for n in XYZ), "n_images", "angle_deg"],
     "residuals": [

@@ -13,6 +13,7 @@ from jaxphoto.camera.interior import (
     get_parameter,
     model_keys,
     parameter_names,
+    parameter_unit,
     set_parameter,
 )
 from jaxphoto.camera.principal_points import (
@@ -35,6 +36,6 @@ __all__ = [
     "ConversionError", "ImageMotion", "InteriorOrientation", "PrincipalPoints", "RollingShutter", "RowMotion", "Sensor",
     "StripCamera", "ThermalRates",
     "constant_names", "conversion_error", "decentring_from_symmetry", "empty_camera", "exact", "get_parameter",
-    "invert", "model_keys", "parameter_names", "principal_points", "rebalance", "rebalance_covariance",
-    "set_parameter", "symmetry_from_decentring", "with_sign",
+    "invert", "model_keys", "parameter_names", "parameter_unit", "principal_points", "rebalance",
+    "rebalance_covariance", "set_parameter", "symmetry_from_decentring", "with_sign",
 ]  # fmt: skip

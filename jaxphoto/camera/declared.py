@@ -17,7 +17,8 @@ class Declared(eqx.Module):
 
     `name` is what files and commands call it. `coefficients` names the fields that an adjustment may estimate;
     `constants` those that it never does, by their names in files, which end in the unit (`{"r0_mm": "r0"}`); `choices`
-    names static fields, with the words that they may be.
+    names static fields, with the words that they may be. `powers` says in which power of mm a coefficient is: -2 of one
+    in mm^-2, 0 of one without unit; one that it does not name has an unknown unit in tables.
 
     A class is known from its definition on: nothing has to be registered, and a cell of a notebook that is run again
     replaces what it defined before.
@@ -27,6 +28,7 @@ class Declared(eqx.Module):
     coefficients: ClassVar[tuple[str, ...]] = ()
     constants: ClassVar[Mapping[str, str]] = {}
     choices: ClassVar[Mapping[str, tuple[str, ...]]] = {}
+    powers: ClassVar[Mapping[str, int]] = {}
 
     def __init_subclass__(cls, **options) -> None:
         super().__init_subclass__(**options)
@@ -57,6 +59,11 @@ class Declared(eqx.Module):
         return known[name]
 
     @classmethod
+    def power(cls, coefficient: str) -> int | None:
+        """The power of mm that is the unit of a coefficient; None where the model does not say."""
+        return cls.powers.get(coefficient)
+
+    @classmethod
     def needed(cls) -> dict[str, str]:
         """Those of `constants` that have no default: positive lengths without which the model says nothing."""
         without = {f.name for f in dataclasses.fields(cls) if f.default is dataclasses.MISSING}
@@ -85,6 +92,8 @@ def _check(cls: type[Declared]) -> None:
             f"{cls.__qualname__}: the field {', '.join(silent)} is declared nowhere; name it in coefficients, in "
             "constants or in choices"
         )
+    if strange := [name for name in cls.powers if name not in cls.coefficients]:
+        raise InputError(f"{cls.__qualname__}: {', '.join(strange)} in powers is no coefficient of it; correct it")
     if len(set(listed)) < len(listed):
         raise InputError(
             f"{cls.__qualname__}: a field is declared twice; name it in coefficients, in constants or in choices"

@@ -13,6 +13,7 @@ from jaxphoto.camera.distortion import AbstractDistortion, Brown, invert
 from jaxphoto.camera.projection import AbstractProjection, Perspective
 from jaxphoto.camera.rolling_shutter import RowMotion
 from jaxphoto.errors import InputError
+from jaxphoto.parameters import unit_of
 from jaxphoto.short_repr import html_of, number_word
 from jaxphoto.single import single
 
@@ -117,6 +118,21 @@ def parameter_names(interior: InteriorOrientation) -> tuple[str, ...]:
 def constant_names(interior: InteriorOrientation) -> tuple[str, ...]:
     """The constants of its models, by their names in files (`r0_mm`)."""
     return (*interior.distortion.constants, *interior.projection.constants)
+
+
+def parameter_unit(interior: InteriorOrientation, name: str) -> str:
+    """The unit of a parameter or constant: mm, 1/mm^2; "1" of a number without unit, "" where no model says it."""
+    for part in (interior.distortion, interior.projection):
+        if name in part.coefficients:
+            power = part.power(name)
+            return "" if power is None else power_of_mm(power)
+    return unit_of(name)
+
+
+def power_of_mm(power: int) -> str:
+    """mm, 1, 1/mm, 1/mm^2 ..."""
+    words = {1: "mm", 0: "1", -1: "1/mm"}
+    return words.get(power, f"1/mm^{-power}" if power < 0 else f"mm^{power}")
 
 
 def model_keys(interior: InteriorOrientation) -> dict[str, str]:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxphoto.camera import constant_names, get_parameter, parameter_names
+from jaxphoto.camera import constant_names, get_parameter, parameter_names, parameter_unit
 from jaxphoto.errors import camera_words
 from jaxphoto.report.certificate_conditions import condition_rows, flight_rows
 from jaxphoto.report.certificate_figures import draw_correlations, draw_curve, draw_map
@@ -117,20 +117,20 @@ def _interior(given: Certified) -> Iterator[Element]:
     for name, sigma in zip(names, sigmas * given.sigma_factor, strict=True):
         value = float(get_parameter(given.interior, name))
         if sigma > 0 or value:
-            rows.append(
-                (name, with_sigma(value, sigma), f"{sigma:.2g}" if sigma else "held", _in_px(given, name, sigma))
-            )
+            told = (with_sigma(value, sigma), f"{sigma:.2g}" if sigma else "held", parameter_unit(given.interior, name))
+            rows.append((name, *told, _in_px(given, name, sigma)))
     rows += [
-        (n, f"{float(get_parameter(given.interior, n)):.8g}", "constant", "") for n in constant_names(given.interior)
+        (n, f"{float(get_parameter(given.interior, n)):.8g}", "constant", parameter_unit(given.interior, n), "")
+        for n in constant_names(given.interior)
     ]
     readout = dict(given.summary.get("georeferencing", {})).get(readout_of(given.camera), {})
     value, sigma = readout.get("value"), readout.get("sigma")
     if isinstance(value, int | float) and isinstance(sigma, int | float):
-        rows.append(("readout_ms", with_sigma(value, sigma), f"{sigma:.2g}", ""))
-    yield Rows(("parameter", "value", "sigma", "in pixels: value, sigma"), tuple(rows))
+        rows.append(("readout_ms", with_sigma(value, sigma), f"{sigma:.2g}", "ms", ""))
+    yield Rows(("parameter", "value", "sigma", "unit", "in pixels: value, sigma"), tuple(rows))
     yield Paragraph(
-        "c, x_p, y_p in mm, x to the right and y up from the centre of the format; coefficients in powers of mm or as "
-        "the model has them (docs/conventions.md). Standard deviations are a posteriori."
+        "x_p to the right and y_p up from the centre of the format; the unit 1 is that of a number without one "
+        "(docs/models.md). Standard deviations are a posteriori."
     )
 
 

@@ -42,6 +42,7 @@ _SPECIAL = {letter: f"\\{letter}" for letter in "&%$#_{}"} | {
     "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "\\": r"\textbackslash{}",
 }  # fmt: skip
 _POWER = re.compile(r"^(-?[\d.]+)e([+-]?\d+)$")
+_PER_MM = re.compile(r"^1/mm(?:\^(\d+))?$")
 _GREEK = ("omega", "phi", "kappa", "sigma")
 # A LaTeX table of more rows goes over several pages.
 _PAGE = 45
@@ -56,7 +57,8 @@ def _texts(table: pd.DataFrame, name: str) -> list[str]:
     column = table[name]
     if name == "parameter":
         # Paths, as of mounts[default].boresight_x_deg and scanner.boresight_up_deg, stay what they are.
-        return [head_of(v) if not re.search(r"[\[.]", v) and _UNIT.search(v) else v for v in column.astype(str)]
+        words = [head_of(v) if not re.search(r"[\[.]", v) and _UNIT.search(v) else v for v in column.astype(str)]
+        return [word.partition(" [")[0] for word in words] if "unit" in table else words
     if not pd.api.types.is_float_dtype(column):
         return ["" if pd.isna(v) else _word(v) for v in column.astype(object)]
     if (name.startswith("sigma") and not name.startswith("sigma0")) or name in _SIGMAS:
@@ -127,6 +129,8 @@ def _right(table: pd.DataFrame) -> list[bool]:
 def _latex(text: str) -> str:
     if power := _POWER.match(text):
         return rf"${power[1]} \times 10^{{{int(power[2])}}}$"
+    if per_mm := _PER_MM.match(text):
+        return f"mm$^{{-{per_mm[1] or 1}}}$"
     escaped = "".join(_SPECIAL.get(letter, letter) for letter in text)
     return rf"$-${escaped[1:]}" if re.fullmatch(r"-[\d.]+", text) else escaped
 

@@ -167,7 +167,7 @@ class Tables:
 
     @cached_property
     def interior(self) -> pd.DataFrame:
-        """camera, parameter, value, sigma, significant; fixed parameters have neither of the latter two, nor has any
+        """camera, parameter, value, sigma, significant, unit; fixed parameters have no sigma, nor has any
         that did not converge."""
         return interior_table(self.adjusted, self.significance)
 

@@ -5,6 +5,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from jaxphoto.camera import parameter_unit
 from jaxphoto.errors import printable
 from jaxphoto.report.check_points import check_spread
 from jaxphoto.report.digits import of_p, of_sigma, with_sigma
@@ -49,14 +50,16 @@ def print_adjustment(tables: Tables, verdict: Verdict, console: Console) -> None
     )
     if tables.significance:
         table = Table(
-            "camera", "parameter", "value", "sigma", "|value| / sigma", "p", title="interior orientation (a posteriori)"
-        )
+            "camera", "parameter", "value", "sigma", "unit", "|value| / sigma", "p",
+            title="interior orientation (a posteriori)",
+        )  # fmt: skip
         for s in tables.significance:
             table.add_row(
                 plain(s.camera),
                 plain(s.parameter),
                 with_sigma(s.value, s.sigma),
                 of_sigma(s.sigma),
+                parameter_unit(adjusted.unknowns.interior[s.camera], s.parameter),
                 f"{s.ratio:.0f}" if s.ratio > _MANY else f"{s.ratio:.1f}",
                 of_p(s.p_value),
             )

@@ -186,6 +186,22 @@ def test_every_model_is_listed_and_has_its_coefficients():
             assert np.abs(everything - without).max() > 1e-6, name
 
 
+@pytest.mark.parametrize("model", DISTORTIONS.values())
+def test_coefficients_scale_as_their_units_say(model):
+    """The same lens drawn twice as large: lengths double, and so does the image of the doubled coordinate."""
+    names, xy = model.coefficients, np.array([0.7, -0.4])
+    powers = [model.power(name) for name in names]
+    small = dict(zip(names, 0.01 + 0.003 * np.arange(len(names)), strict=True))
+    lengths = dict.fromkeys(model.constants.values(), 0.5)
+    large = {name: small[name] * 2.0**power for name, power in zip(names, powers, strict=True)}
+    stretch = 1.0 if model.normalised else 2.0
+    once = closed(model(**small, **lengths), xy)
+    twice = closed(model(**large, **{n: stretch * v for n, v in lengths.items()}), stretch * xy)
+    np.testing.assert_allclose(twice, stretch * once, rtol=1e-12)
+    # Not by chance: each alone changes what is drawn.
+    assert all(abs(closed(model(**lengths, **(small | {n: 0.2})), xy) - once).max() > 1e-6 for n in names)
+
+
 def test_interior_orientation_reduces_to_the_principal_point():
     interior = InteriorOrientation(34.0, 0.065, 0.274, KODAK)
     xy = np.array([12.0, -7.0])

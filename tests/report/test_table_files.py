@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 
 from jaxphoto import InputError, Tables
+from jaxphoto.camera import InteriorOrientation, OpenCv, parameter_unit
 from jaxphoto.io import read_result_tables
 from jaxphoto.report import to_latex, to_markdown, write_tables
 from jaxphoto.report.check_points import check_spread
@@ -41,6 +42,15 @@ def test_a_number_ends_at_the_second_digit_of_its_sigma(value, sigma, text, sigm
 def test_yes_and_no_are_no_numbers():
     shown = readable(pd.DataFrame({"freedom": [1, 0, 34], "significant": [True, False, None]}))
     assert shown["freedom"].tolist() == ["1", "0", "34"] and shown["significant"].tolist() == ["yes", "no", ""]
+
+
+def test_units_of_a_camera_follow_its_model():
+    table = Tables(adjusted("cross")).interior
+    assert dict(zip(table["parameter"], table["unit"], strict=True))["k2"] == "1/mm^4"
+    assert readable(table)["parameter"].tolist()[:4] == ["c", "xp", "yp", "k1"]
+    assert "mm$^{-2}$" in to_latex(table) and "| 1/mm^2 |" in to_markdown(table)
+    cv = InteriorOrientation(35.0, distortion=OpenCv(k1=0.1))
+    assert [parameter_unit(cv, name) for name in ("c_mm", "k1", "b1")] == ["mm", "1", "1"]
 
 
 def test_heads_have_units_in_brackets():

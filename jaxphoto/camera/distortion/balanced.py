@@ -6,7 +6,7 @@ from typing import ClassVar, Literal
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxphoto.camera.distortion.base import AbstractDistortion, Affinity, Term, decentring
+from jaxphoto.camera.distortion.base import AbstractDistortion, Affinity, Term, decentring, radial_powers
 
 
 class Balanced(AbstractDistortion):
@@ -32,6 +32,7 @@ class Balanced(AbstractDistortion):
     name: ClassVar[str] = "balanced"
     domain: ClassVar[Literal["measured", "ideal"]] = "ideal"
     coefficients: ClassVar[tuple[str, ...]] = ("a1", "a2", "a3", "b1", "b2", "c1", "c2")
+    powers: ClassVar[Mapping[str, int]] = {**radial_powers("a", 3), "b1": -1, "b2": -1, "c1": 0, "c2": 0}
     constants: ClassVar[Mapping[str, str]] = {"r0_mm": "r0"}
     rare: ClassVar[tuple[str, ...]] = ("c1", "c2")
     terms: ClassVar[Mapping[str, Term] | None] = {

@@ -38,6 +38,11 @@ def same_terms(*names: str) -> dict[str, Term]:
     return {name: Term(name) for name in names}
 
 
+def radial_powers(letter: str, n: int) -> dict[str, int]:
+    """Powers of mm of the first `n` coefficients of even powers of the radius: k1 in mm^-2, k2 in mm^-4 ..."""
+    return {f"{letter}{i}": -2 * i for i in range(1, n + 1)}
+
+
 Affinity = Literal["added", "before", "after", "around"]
 
 
@@ -71,6 +76,11 @@ class AbstractDistortion(Declared):
     def plain(cls, sensor: Sensor) -> "AbstractDistortion":
         """The model without distortion, for a camera with that sensor: lengths that it needs are chosen here."""
         return cls()
+
+    @classmethod
+    def power(cls, coefficient: str) -> int | None:
+        """As of any model; 0 where coordinates are normalised."""
+        return 0 if cls.normalised else super().power(coefficient)
 
     @classmethod
     def usual(cls) -> tuple[str, ...]:
@@ -182,6 +192,7 @@ class AbstractBrown(AbstractDistortion):
 
     domain: ClassVar[Literal["measured", "ideal"]] = "measured"
     coefficients: ClassVar[tuple[str, ...]] = ("k1", "k2", "k3", "p1", "p2", "b1", "b2")
+    powers: ClassVar[Mapping[str, int]] = {**radial_powers("k", 3), "p1": -1, "p2": -1, "b1": 0, "b2": 0}
     rare: ClassVar[tuple[str, ...]] = ("b1", "b2")
     terms: ClassVar[Mapping[str, Term] | None] = same_terms(*coefficients)
 

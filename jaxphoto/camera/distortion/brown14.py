@@ -45,6 +45,9 @@ class Brown14(AbstractDistortion):
     name: ClassVar[str] = "brown14"
     domain: ClassVar[Literal["measured", "ideal"]] = "measured"
     coefficients: ClassVar[tuple[str, ...]] = tuple(f"a{i}" for i in range(1, 15))
+    powers: ClassVar[Mapping[str, int]] = dict(
+        zip(coefficients, (0, 0, -1, -1, -2, -2, -3, -1, -1, -2, -2, -3, -3, -2), strict=True)
+    )
     constants: ClassVar[Mapping[str, str]] = {"f_mm": "f"}
 
     @classmethod

@@ -44,6 +44,9 @@ class Ebner(AbstractDistortion):
     name: ClassVar[str] = "ebner"
     domain: ClassVar[Literal["measured", "ideal"]] = "measured"
     coefficients: ClassVar[tuple[str, ...]] = tuple(f"b{i}" for i in range(1, 13))
+    powers: ClassVar[Mapping[str, int]] = dict(
+        zip(coefficients, (0,) * 2 + (-1,) * 4 + (-2,) * 4 + (-3,) * 2, strict=True)
+    )
     constants: ClassVar[Mapping[str, str]] = {"b_mm": "b"}
 
     @classmethod

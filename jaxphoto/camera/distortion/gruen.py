@@ -94,6 +94,7 @@ class Gruen(AbstractDistortion):
         "b51", "b52", "b53", "b54", "b55",
     )
     # fmt: on
+    powers: ClassVar[Mapping[str, int]] = {n: 3 - int(n[1]) - int(n[2]) for n in coefficients}
     constants: ClassVar[Mapping[str, str]] = {"b_mm": "b"}
     # Beyond the third degree: with all 44, neighbouring targets would be fitted one by one.
     rare: ClassVar[tuple[str, ...]] = tuple(n for n in coefficients if int(n[1]) + int(n[2]) - 2 > 3)

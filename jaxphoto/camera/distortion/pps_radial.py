@@ -6,7 +6,7 @@ from typing import ClassVar, Literal
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxphoto.camera.distortion.base import AbstractDistortion, Term, radial, same_terms
+from jaxphoto.camera.distortion.base import AbstractDistortion, Term, radial, radial_powers, same_terms
 
 
 class PpsRadial(AbstractDistortion):
@@ -32,6 +32,7 @@ class PpsRadial(AbstractDistortion):
     name: ClassVar[str] = "pps_radial"
     domain: ClassVar[Literal["measured", "ideal"]] = "measured"
     coefficients: ClassVar[tuple[str, ...]] = ("k1", "k2", "k3", "pps_x", "pps_y")
+    powers: ClassVar[Mapping[str, int]] = {**radial_powers("k", 3), "pps_x": 1, "pps_y": 1}
     terms: ClassVar[Mapping[str, Term] | None] = same_terms("k1", "k2", "k3")
 
     @property

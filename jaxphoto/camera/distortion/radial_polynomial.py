@@ -6,7 +6,7 @@ from typing import ClassVar, Literal
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxphoto.camera.distortion.base import AbstractDistortion, Term, radial
+from jaxphoto.camera.distortion.base import AbstractDistortion, Term, radial, radial_powers
 
 
 class RadialPolynomial(AbstractDistortion):
@@ -28,6 +28,7 @@ class RadialPolynomial(AbstractDistortion):
     name: ClassVar[str] = "radial"
     domain: ClassVar[Literal["measured", "ideal"]] = "measured"
     coefficients: ClassVar[tuple[str, ...]] = ("k1", "k2", "k3")
+    powers: ClassVar[Mapping[str, int]] = radial_powers("k", 3)
     terms: ClassVar[Mapping[str, Term] | None] = {name: Term(name, -1.0) for name in ("k1", "k2", "k3")}
 
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:

@@ -6,7 +6,7 @@ from typing import ClassVar, Literal
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from jaxphoto.camera.distortion.base import AbstractDistortion, Term, decentring, same_terms
+from jaxphoto.camera.distortion.base import AbstractDistortion, Term, decentring, radial_powers, same_terms
 
 
 class Smac(AbstractDistortion):
@@ -36,6 +36,7 @@ class Smac(AbstractDistortion):
     domain: ClassVar[Literal["measured", "ideal"]] = "measured"
     scales: ClassVar[tuple[str, ...]] = ("k0",)
     coefficients: ClassVar[tuple[str, ...]] = ("k0", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
+    powers: ClassVar[Mapping[str, int]] = {"k0": 0, **radial_powers("k", 4), "p1": -1, "p2": -1, "p3": -2, "p4": -4}
     constants: ClassVar[Mapping[str, str]] = {"r0_mm": "r0"}
     choices: ClassVar[Mapping[str, tuple[str, ...]]] = {"sign": ("subtract", "add")}
     rare: ClassVar[tuple[str, ...]] = ("k4", "p3", "p4")

@@ -78,7 +78,7 @@ def read_results(source: CameraSource) -> CameraFile:
             "summary.json beside it says that the adjustment did not converge, so its numbers are no calibration: mend "
             "the block and adjust again"
         )
-    table = read_csv(source.path, _COLUMNS, ("sigma", "significant"))
+    table = read_csv(source.path, _COLUMNS, ("sigma", "significant", "unit"))
     of = table.ids("camera")
     name = source.chosen(list(dict.fromkeys(of.tolist())))
     sensor, empty = _described(source, name)

@@ -40,6 +40,7 @@ def interior_rows(report: PartReport, start: InteriorOrientation | None) -> Rows
                 with_sigma(p["value"], p["sigma"]),
                 f"{p['sigma']:.2g}" if estimated else "held",
                 f"{sigma:.2g}" if estimated else "",
+                p["unit"],
                 f"{p['value'] / pixel:.2f} +- {sigma / pixel:.2g}" if estimated and name.endswith("_mm") else "",
                 {True: "yes", False: "no"}.get(p["significant"], ""),
             )
@@ -48,8 +49,8 @@ def interior_rows(report: PartReport, start: InteriorOrientation | None) -> Rows
     names = [readout_of(camera) for camera in adjusted.unknowns.interior]
     for p in further[further["parameter"].isin(names)].to_dict("records"):
         seen = "yes" if abs(p["value"]) >= SEEN * p["sigma"] else "no"
-        rows.append(("readout_ms", "", with_sigma(p["value"], p["sigma"]), f"{p['sigma']:.2g}", "", "", seen))
-    columns = ("parameter", "began at", "value", "sigma", "sigma alike", "in pixels", "significant")
+        rows.append(("readout_ms", "", with_sigma(p["value"], p["sigma"]), f"{p['sigma']:.2g}", "", "ms", "", seen))
+    columns = ("parameter", "began at", "value", "sigma", "sigma alike", "unit", "in pixels", "significant")
     return Rows(columns, tuple(rows))
 
 
