@@ -10,6 +10,8 @@ from jaxphoto.io import aicon, bal, colmap, dbat, photomodeler
 from jaxphoto.io.block_folder import BlockTables, assemble, write_block
 from jaxphoto.io.block_folder.block_reader import read_folder
 from jaxphoto.io.block_folder.table_layout import TOML
+from jaxphoto.io.cameras.camera_reader import is_camera_file
+from jaxphoto.io.control_files.reader import is_control_file
 from jaxphoto.io.reconstructions import (
     blocks_exchange,
     bundler,
@@ -91,6 +93,10 @@ def _format(source: Path, name: str | None) -> str:
     if name is None:
         found = [name for name, format in FORMATS.items() if format.recognises(source)]
         if len(found) != 1:
+            if not found and source.is_file() and is_camera_file(source):
+                raise InputError(f"{source} is a camera file, without photographs; jaxphoto camera converts it")
+            if not found and source.is_file() and is_control_file(source):
+                raise InputError(f"{source} is control, without photographs; jaxphoto control takes it to a block")
             what = f"is of several formats at once ({', '.join(found)})" if found else "is of no format that is known"
             raise InputError(f"{source} {what}; name the format, one of {known}")
         return found[0]

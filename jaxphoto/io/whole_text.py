@@ -9,6 +9,8 @@ SMALL = 16_000_000
 """Bytes of the largest file of settings, camera or report. A block.toml has some 300 a camera."""
 LARGE = 1_000_000_000
 """Bytes of the largest table: some twenty million image points, which take 10 GB of memory as they are read."""
+# Bytes in which what tells a format stands, such as the first oriented camera below sensors with their covariances.
+_HEAD = 2_000_000
 # Files of the system tell no size.
 _UNTOLD = 1_000_000
 
@@ -51,6 +53,15 @@ def read_text(path: Path, most: int) -> str:
     except UnicodeDecodeError as error:
         row = error.object[: error.start].count(b"\n") + 1
         raise InputError(f"{path.name}, row {row}: the text is not UTF-8; save the file as UTF-8") from None
+
+
+def has_words(path: Path, *words: str) -> bool:
+    """Whether a file is there and all `words` stand in its first two megabytes, by which its format is told."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        head = file.read(_HEAD)
+    return all(word.encode() in head for word in words)
 
 
 def _too_large(path: Path, most: int) -> InputError:

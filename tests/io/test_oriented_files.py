@@ -277,9 +277,19 @@ def appended(folder, text, name="ties.dat"):
     return folder
 
 
+def _with_markers(folder):
+    text = (folder / "cameras.xml").read_text()
+    (folder / "markers.xml").write_text(text)
+    return folder
+
+
 REFUSED = {
     "no ties": (_metashape(ties=False), "cameras.xml has no tie points and no marks.*as BINGO or PATB"),
     "not aligned": (_metashape(_without("<transform>-?[0-9].*?</transform>")), "no camera is aligned; align"),
+    "not aligned, and markers": (
+        lambda f: _with_markers(_metashape(_without("<transform>-?[0-9].*?</transform>"))(f)), "cameras.xml: no camera",
+    ),
+    "no size": (_nerf(lambda t: {k: v for k, v in t.items() if k not in "wh"}), "does not say how large its"),
     "cut": (_metashape(lambda text: text[:-30]), "cameras.xml: the XML is broken"),
     "no sensor": (_metashape(_without("<calibration.*</calibration>")), "'a b': its sensor is not calibrated"),
     "matrix": (_metashape(lambda text: text.replace(" 1.0</tr", " x</tr")), "'a b', transform: .* 16 fi"),

@@ -364,6 +364,27 @@ def test_without_a_list_photographs_of_bundler_have_numbers(tmp_path):
         assert read_source(write_bundler(tmp_path / "in", names=False)).images == ("0", "1", "2")
 
 
+def test_a_file_of_another_name_is_told_by_its_content_and_a_list_by_that_of_its_bundle(tmp_path):
+    for folder, name, other in (
+        (write_open_sfm(tmp_path / "sfm"), "reconstruction.json", "aligned.json"),
+        (write_bundler(tmp_path / "bundle"), "bundle.out", "bundle_r000.out"),
+    ):
+        (folder / name).rename(folder / other)
+        if (folder / "list.txt").exists():
+            (folder / "list.txt").rename(folder / "list_r000.out")
+        assert sorted(read_source(folder / other).images) == ["a", "b", "c"]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [("'lensmodel': 'LENSMODEL_X'", "jaxphoto camera converts"), ("EPSG:32633\n1 2 3 4 5 a.jpg g", "jaxphoto control")],
+)
+def test_a_file_for_another_command_is_told_which(tmp_path, text, said):
+    (tmp_path / "given.txt").write_text(text)
+    with pytest.raises(InputError, match=said):
+        read_source(tmp_path / "given.txt")
+
+
 def test_photographs_of_pix4d_without_a_camera_are_told_and_its_points_are_found_by_their_rays(tmp_path):
     with pytest.warns(UserWarning, match="1 photographs are not in flight_calibrated.*: 'lost'"):
         block = read_source(write_pix4d(tmp_path / "in", offset=(0.25, -1.0, 3.0)))
@@ -434,6 +455,10 @@ REFUSED = {
     "kind": (_sfm((*_CAMERA, "projection_type"), "dual"), "'dual' is not known here"),
     "camera": (_sfm((*_SHOT, "camera"), "two"), "shots.a.jpg.*no camera 'two'"),
     "rotation": (_sfm((*_SHOT, "rotation"), [1, "x", 2]), "'a.jpg', rotation: .* is not 3 finite numbers"),
+    "no tracks": (
+        lambda f: (write_open_sfm(f) / "tracks.csv").unlink() or f / "reconstruction.json", "has no tracks.csv beside",
+    ),
+    "no poses": (_mvg(("extrinsics",), []), "views and none with a pose; give the file that the rec"),
     "no shots": (lambda f: write_open_sfm(f, change=lambda _: []), "no reconstruction with shots"),
     "row": (lambda f: write_open_sfm(f, version="OPENSFM_TRACKS_VERSION_v2\na\tb\n"), "tracks.csv, row 2: 2 cells"),
     "track": (lambda f: write_open_sfm(f, version="a.jpg\t10\t1\tx\t0\n"), "row 1: .* is not 2 finite numbers"),

@@ -9,6 +9,7 @@ from jaxphoto.errors import InputError, quoted
 from jaxphoto.io.block_folder.table_layout import TOML
 from jaxphoto.io.cameras import agisoft, colmap, kalibr, mrcal, open_cv, own_cameras, smac_report
 from jaxphoto.io.cameras.camera_file import CameraFile, CameraSource
+from jaxphoto.io.whole_text import SMALL, read_text
 
 
 class _ReadFormat(NamedTuple):
@@ -35,6 +36,15 @@ CAMERAS_READ = (
 """The camera files that `read_camera_file` knows, in words."""
 # In a folder, what its camera file is called.
 _IN_FOLDER = (own_cameras.INTERIOR, TOML, own_cameras.CAMERA, colmap.TEXT, colmap.BINARY)
+
+
+def is_camera_file(path: Path) -> bool:
+    """Whether a file tells a camera of another program by its content."""
+    try:
+        text = read_text(path, SMALL)
+    except InputError:
+        return False
+    return any(known.recognises(path, text) for name, known in _FORMATS.items() if name != "block")
 
 
 def read_camera_file(

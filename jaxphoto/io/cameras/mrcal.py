@@ -41,7 +41,10 @@ def read_mrcal(source: CameraSource) -> CameraFile:
         raise source.error("it has no names and values; let mrcal write it anew")
     model = values.get("lensmodel", values.get("lens_model"))
     if not isinstance(model, str) or model not in _MODELS:
-        raise source.error(f"the lens model {quoted(model)} is not known here; known are {', '.join(_MODELS)}")
+        raise source.error(
+            f"the lens model {quoted(model)} is not known here; known are {', '.join(_MODELS)}: "
+            "mrcal-convert-lensmodel LENSMODEL_OPENCV8 FILE fits one"
+        )
     numbers = _numbers(source, values, "intrinsics", _PLACES + _MODELS[model])
     if np.any(numbers[_PLACES + len(ORDER) :] != 0):
         raise source.error("its terms of a thin prism are not known here; calibrate with LENSMODEL_OPENCV8")

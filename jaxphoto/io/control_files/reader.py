@@ -20,6 +20,18 @@ from jaxphoto.io.whole_text import SMALL, read_text
 from jaxphoto.procedures.control.surveyed import GivenControl, Marks, SurveyedPoints
 
 
+def is_control_file(path: Path) -> bool:
+    """Whether a file says by its content that it is control: any form but a plain table."""
+    if is_geo_package(path):
+        return True
+    try:
+        text = read_text(path, SMALL)
+    except InputError:
+        return False
+    lines = [line for line in text.split("\n") if line.strip()]
+    return is_metashape(text) or is_geo_json(text) or (bool(lines) and (is_gcp_list(lines) or is_geoin(lines)))
+
+
 def read_control(control: str | Path, marks: str | Path | None = None) -> GivenControl:
     """The points of the file `control` with the marks that it has, and those of the file `marks`.
 

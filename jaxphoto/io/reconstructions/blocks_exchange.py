@@ -30,7 +30,7 @@ from jaxphoto.io.cameras.camera_file import CameraSource, in_pixels
 from jaxphoto.io.reconstructions.numbers import number_rows
 from jaxphoto.io.reconstructions.on_map import about_place, in_system
 from jaxphoto.io.reconstructions.tied_photographs import TiedCamera, TiedPhotographs, free_network
-from jaxphoto.io.whole_text import LARGE, read_whole
+from jaxphoto.io.whole_text import LARGE, has_words, read_whole
 
 _NUMBER = r"\s*([-+]?\d{1,4}(?:\.\d*)?(?:e-\d\d)?)\s*"
 _ENU = re.compile(f"ENU:{_NUMBER},{_NUMBER}(?:,{_NUMBER})?")
@@ -114,12 +114,7 @@ def read_blocks_exchange(source: Path) -> BlockTables:
 
 def _files(source: Path) -> list[Path]:
     paths = sorted(source.glob("*.xml")) if source.is_dir() else [source]
-    return [path for path in paths if path.is_file() and _opens_so(path)]
-
-
-def _opens_so(path: Path) -> bool:
-    with path.open("rb") as file:
-        return _ROOT.encode() in file.read(1000)
+    return [path for path in paths if has_words(path, _ROOT)]
 
 
 class _Ties(NamedTuple):

@@ -6,8 +6,8 @@
     X Y Z, R G B, n (camera feature x y) ...           of every point
 
 The camera sees P = R X + t along its -z, x right and y up; x and y are in pixels from the middle of the photograph.
-Names of photographs are in list.txt beside it. The format of a photograph is not told: it is the smallest about its
-middle that holds its points.
+Names of photographs are in list.txt beside it (OpenSfM writes list_r000.out beside bundle_r000.out).
+The format of a photograph is not told: it is the smallest about its middle that holds its points.
 Source: N. Snavely, Bundler v0.4 User's Manual, "Output format and scene representation".
 """
 
@@ -111,8 +111,9 @@ def _opens_so(path: Path) -> bool:
 
 def _names(path: Path, number: int) -> list[str]:
     """Of the photographs: the first word of each row of list.txt, else their numbers."""
-    for file in (path.with_name(name) for name in (f"{path.stem}.txt", *_LISTS)):
-        if file.is_file():
+    own = path.stem.replace("bundle", "list", 1)
+    for file in (path.with_name(name) for name in (f"{path.stem}.txt", f"{own}.txt", f"{own}.out", *_LISTS)):
+        if file != path and file.is_file():
             names = [line.split()[0] for line in read_text(file, SMALL).split("\n") if line.strip()]
             if len(names) != number:
                 raise InputError(

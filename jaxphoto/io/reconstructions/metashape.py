@@ -36,14 +36,11 @@ from jaxphoto.io.reconstructions.numbers import number_rows
 from jaxphoto.io.reconstructions.on_map import WGS84, OnMap, of_the_earth, on_map
 from jaxphoto.io.reconstructions.points_beside import PhotographCamera, joined, marks_shown, points_beside
 from jaxphoto.io.reconstructions.tied_photographs import TiedCamera, TiedPhotographs, estimated, free_network
-from jaxphoto.io.whole_text import LARGE, read_text
+from jaxphoto.io.whole_text import LARGE, has_words, read_text
 from jaxphoto.procedures.control.surveyed import SurveyedPoints
 from jaxphoto.procedures.control.system import ControlSystem, system_of
 
 MARKERS = "markers.xml"
-_OPENS = (b"<document", b"<cameras", b"<transform")
-# Bytes of a file in which the first oriented camera stands, below sensors with their covariances.
-_HEAD = 2_000_000
 _PARAMETERS = {"f": "c_mm", "cx": "xp_mm", "cy": "yp_mm"} | {name: name for name in Agisoft.coefficients}
 
 
@@ -56,8 +53,8 @@ class _Aligned(NamedTuple):
 
 
 def recognises(source: Path) -> bool:
-    """Whether `source` is a file of cameras, or a folder that holds exactly one."""
-    return len(_files(source)) == 1
+    """Whether `source` is an exported file of cameras, aligned or not, or a folder that holds such files."""
+    return bool(_files(source))
 
 
 def read_metashape(source: Path) -> BlockTables:
@@ -123,14 +120,11 @@ def read_metashape(source: Path) -> BlockTables:
 
 
 def _files(source: Path) -> list[Path]:
+    """Those of a folder but for its markers, with oriented cameras where any has them."""
     paths = sorted(source.glob("*.xml")) if source.is_dir() else [source]
-    return [path for path in paths if path.is_file() and _opens_so(path)]
-
-
-def _opens_so(path: Path) -> bool:
-    with path.open("rb") as file:
-        head = file.read(_HEAD)
-    return all(word in head for word in _OPENS)
+    found = [path for path in paths if has_words(path, "<document", "<chunk", "<cameras")]
+    cameras = [path for path in found if path.name != MARKERS] or found
+    return [path for path in cameras if has_words(path, "<transform")] or cameras
 
 
 def _photos(path: Path, chunk: ElementTree.Element) -> tuple[list[_Aligned], str]:
@@ -154,7 +148,10 @@ def _photos(path: Path, chunk: ElementTree.Element) -> tuple[list[_Aligned], str
             stacklevel=3,
         )
     if not photos:
-        raise InputError(f"{path.name}: no camera is aligned; align the photographs and export the cameras again")
+        raise InputError(
+            f"{path.name}: no camera is aligned; align the photographs and export the cameras again (markers alone are "
+            "for jaxphoto control)"
+        )
     return [photo for photo in photos if photo.component == component], component
 
 

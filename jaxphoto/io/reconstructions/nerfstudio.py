@@ -21,7 +21,7 @@ from jaxphoto.io.json_file import read_any_json
 from jaxphoto.io.reconstructions.numbers import number_rows
 from jaxphoto.io.reconstructions.points_beside import PhotographCamera, network_beside, points_beside
 from jaxphoto.io.reconstructions.tied_photographs import TiedCamera, estimated
-from jaxphoto.io.whole_text import LARGE
+from jaxphoto.io.whole_text import LARGE, has_words
 
 FILE = "transforms.json"
 _PLANE = ("k1", "k2", "k3", "p1", "p2")
@@ -37,8 +37,9 @@ _OF_CAMERA = ("camera_model", "w", "h", "fl_x", "fl_y", "cx", "cy", *_PLANE, "k4
 
 
 def recognises(source: Path) -> bool:
-    """Whether `source` is transforms.json, or a folder that has it."""
-    return (source / FILE).is_file() or (source.name == FILE and source.is_file())
+    """Whether `source` is transforms.json, by whatever name, or a folder that has it."""
+    named = (source / FILE).is_file() or (source.name == FILE and source.is_file())
+    return named or (source.suffix == ".json" and has_words(source, '"frames"', '"transform_matrix"'))
 
 
 def read_nerfstudio(source: Path) -> BlockTables:
@@ -87,6 +88,11 @@ def _camera(path: Path, place: str, values: dict[str, Any]) -> TiedCamera:
     for name in (*_PLANE, "k4"):
         if name not in coefficients and given.number(name, 0.0) != 0:
             raise given.error(name, f"cameras of kind {kind} have no such term here; calibrate without it")
+    if not ("w" in given and "h" in given):
+        raise InputError(
+            f"{path.name} does not say how large its photographs are; add w and h (pixels) to it, and write "
+            "image_points.csv into its folder, or convert the COLMAP model that it was made of"
+        )
     width, height = given.number("w"), given.number("h")
     sensor, _ = source.sensor(width, height)
     if "fl_x" not in given and "camera_angle_x" in given:

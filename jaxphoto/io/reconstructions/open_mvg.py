@@ -24,7 +24,7 @@ from jaxphoto.io.cameras.open_cv import FISHEYE, PLANE
 from jaxphoto.io.json_file import read_any_json
 from jaxphoto.io.reconstructions.numbers import number_rows
 from jaxphoto.io.reconstructions.tied_photographs import TiedCamera, TiedPhotographs, free_network
-from jaxphoto.io.whole_text import LARGE
+from jaxphoto.io.whole_text import LARGE, has_words
 
 FILE = "sfm_data.json"
 _KEYS = ("views", "intrinsics", "extrinsics", "structure")
@@ -43,8 +43,9 @@ KINDS: dict[str, tuple[CameraModel, str, tuple[str, ...]]] = {
 
 
 def recognises(source: Path) -> bool:
-    """Whether `source` is sfm_data.json, or a folder that has it."""
-    return (source / FILE).is_file() or (source.name == FILE and source.is_file())
+    """Whether `source` is sfm_data.json, by whatever name, or a folder that has it."""
+    named = (source / FILE).is_file() or (source.name == FILE and source.is_file())
+    return named or (source.suffix == ".json" and has_words(source, '"sfm_data_version"'))
 
 
 def read_open_mvg(source: Path) -> BlockTables:
@@ -77,6 +78,11 @@ def read_open_mvg(source: Path) -> BlockTables:
         files.append(f"{folder}/{view.text('filename')}" if folder else view.text("filename"))
         camera_of.append(camera)
         pose_of.append(pose)
+    if not files:
+        raise InputError(
+            f"{path} has {len(content['views'])} views and none with a pose; give the file that the reconstruction "
+            f"wrote: openMVG_main_ConvertSfM_DataFormat binary -i sfm_data.bin -o {FILE} -V -I -E -S"
+        )
     of_pose = lambda name, shape: number_rows(  # noqa: E731
         [poses[pose].get(name) for pose in pose_of], shape, lambda k: f"{path.name}, extrinsics {pose_of[k]}, {name}"
     )

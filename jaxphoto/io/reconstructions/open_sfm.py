@@ -29,7 +29,7 @@ from jaxphoto.io.json_file import read_any_json
 from jaxphoto.io.reconstructions.numbers import number_rows
 from jaxphoto.io.reconstructions.on_map import about_place
 from jaxphoto.io.reconstructions.tied_photographs import TiedCamera, TiedPhotographs, free_network
-from jaxphoto.io.whole_text import LARGE, read_text
+from jaxphoto.io.whole_text import LARGE, has_words, read_text
 
 RECONSTRUCTION, TRACKS, REFERENCE = "reconstruction.json", "tracks.csv", "reference_lla.json"
 _VERSION = "OPENSFM_TRACKS_VERSION_"
@@ -46,11 +46,14 @@ _ONE_FOCAL = ("perspective", "fisheye")
 
 
 def recognises(source: Path) -> bool:
-    """Whether `source` is a folder with a reconstruction and tracks."""
-    return all((source / name).is_file() for name in (RECONSTRUCTION, TRACKS))
+    """Whether `source` is a file with shots, or a folder that has a reconstruction.json of them, or with tracks."""
+    path = source / RECONSTRUCTION
+    return (path.is_file() and (source / TRACKS).is_file()) or any(
+        has_words(one, '"cameras"', '"shots"') for one in (path, source) if one.suffix == ".json"
+    )
 
 
-def read_open_sfm(folder: Path) -> BlockTables:
+def read_open_sfm(source: Path) -> BlockTables:
     """The free-network self-calibration of a reconstruction of OpenSfM, from its values.
 
     Cameras are free in c_mm, the coefficients of their kind, and, where they have them, xp_mm, yp_mm and b1. A pixel
@@ -58,7 +61,13 @@ def read_open_sfm(folder: Path) -> BlockTables:
 
     Raises InputError for files that are damaged or do not fit together, and for kinds of cameras that are not known.
     """
-    path = folder / RECONSTRUCTION
+    path = source / RECONSTRUCTION if source.is_dir() else source
+    folder = path.parent
+    if not (folder / TRACKS).is_file():
+        raise InputError(
+            f"{path} has no {TRACKS} beside it, which says where its photographs show points; copy it there from the "
+            "folder of the project (its folder opensfm, of OpenDroneMap), or run opensfm create_tracks again"
+        )
     chosen = _largest(path, read_any_json(path, LARGE))
     shots, points = chosen.section("shots").values, chosen.section("points").values
     cameras = {name: _camera(path, chosen.section("cameras").section(name)) for name in chosen.section("cameras")}
