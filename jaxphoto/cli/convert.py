@@ -26,7 +26,7 @@ from jaxphoto.io.exports import (
 from jaxphoto.procedures.adjust import start_of
 from jaxphoto.unknowns import Unknowns
 
-_OF_FILES = (".xml", ".json", ".txt", ".out", ".geojson", ".gpkg", ".toml", ".csv", ".yaml", ".yml", ".bin")
+_OF_FILES = {ending for known in EXPORTS.values() for ending in known.endings}
 _TARGETS = {"block": "a block folder"} | {name: known.about for name, known in EXPORTS.items()}
 
 
@@ -118,8 +118,7 @@ def _say(output: Output, done: Exported, values: str) -> None:
     misfits = {"map_misfit": done.map_misfit, "moved": done.moved}
     output.tell(values=values, cameras=lost, **{name: m and m._asdict() for name, m in misfits.items()})
     for name, conversion in done.cameras.items():
-        fit = f"fitted, rms {conversion.rms_px:.3g} px, largest {conversion.max_px:.3g} px"
-        output.say(f"camera {name}: {'exact' if conversion.max_px == 0 else fit}")
+        output.say(f"camera {name}: {conversion.lost}")
     if done.moved is not None:
         told = f"rms {done.moved.rms_px:.3g} px, largest {done.moved.max_px:.3g} px"
         why = f", and were moved by {told}, to where the written cameras see their rays" if done.moved.max_px else ""

@@ -330,7 +330,7 @@ def test_the_command_converts_there_and_back(tmp_path, monkeypatch, capsys):
     assert run(monkeypatch, capsys, "convert", model, tmp_path / "block")[0] == 0
     code, said, _ = run(monkeypatch, capsys, "convert", tmp_path / "block", tmp_path / "back", "--to", "colmap")
     assert code == 0
-    assert "camera 5: exact" in said
+    assert "camera 5: the conversion is exact" in said
     same_block(read_source(tmp_path / "back"), read_source(model))
     for out, to, message in (
         (tmp_path / "block", "colmap", "is or holds the input"),

@@ -38,6 +38,7 @@ from jaxphoto.errors import InputError
 from jaxphoto.io import EXPORTS, AdjustedPhotographs, export
 from jaxphoto.io.cameras import read_camera_file
 from jaxphoto.io.exports import ExportCamera
+from jaxphoto.writing import MARKER
 from tests.commands import run
 from tests.formulas import camera_from_object
 
@@ -387,6 +388,8 @@ def test_every_format_holds_a_camera_says_what_it_loses_or_names_formats_that_ha
             assert not (tmp_path / name).exists()
             continue
         said = export(given, tmp_path / name, format).cameras["one"]
+        written = {path.suffix for path in (tmp_path / name).iterdir() if path.name != MARKER}
+        assert written <= set(known.endings)
         # What f, k1 and k2 cannot follow they need not: rays are kept.
         most = 1.0 if known.keeps_rays else 0.02
         assert (said.max_px == 0) == (known.plane is None) and said.max_px < most, (name, said)

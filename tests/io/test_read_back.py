@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 import jaxphoto
 from jaxphoto.block import Frame
-from jaxphoto.camera import InteriorOrientation, OpenCv, get_parameter, parameter_names
+from jaxphoto.camera import InteriorOrientation, OpenCv, Sensor, get_parameter, parameter_names
 from jaxphoto.errors import InputError
 from jaxphoto.io import FORMATS, AdjustedPhotographs, export, read_source
 from jaxphoto.io.block_folder.table_layout import SIGMA_XYZ, XYZ
@@ -19,7 +19,7 @@ from jaxphoto.io.exports import ExportCamera
 from jaxphoto.io.exports.control_points import ControlPoints
 from jaxphoto.io.reconstructions.metashape import read_metashape
 from tests.io.oriented_files import come_back, inside, posed, poses
-from tests.io.test_exports import SENSOR
+from tests.io.test_exports import CAMERAS, SENSOR
 
 # Formats whose image points stand beside their files.
 BESIDE = {"metashape": "agisoft", "nerfstudio": "opencv", "orthority": "opencv", "opk": "opencv"}
@@ -66,6 +66,32 @@ def test_a_block_adjusts_to_the_same_values_again(tmp_path, format):
     (two,) = again.unknowns.interior.values()
     for name in parameter_names(one):
         assert float(get_parameter(two, name)) == pytest.approx(float(get_parameter(one, name)), abs=1e-7), name
+
+
+@pytest.mark.filterwarnings("ignore:.*fewer than")
+def test_several_cameras_come_back_with_their_photographs_from_opk(tmp_path):
+    p = inside("opencv", "local")
+    other = ExportCamera(Sensor(SENSOR.width_px, SENSOR.height_px, 0.002), CAMERAS["brown"])
+    two = p._replace(cameras={**p.cameras, "two": other}, image_camera=("two", "one", "one", "two"))
+    export(two, tmp_path / "out", "opk")
+    block = read_source(tmp_path / "out")
+    assert dict(zip(block.images, block.image_camera, strict=True)) == dict(
+        zip(p.images, two.image_camera, strict=True)
+    )
+    for name, (sensor, interior) in two.cameras.items():
+        assert block.sensors[name] == sensor
+        again = block.start.unknowns.interior[name]
+        assert [float(get_parameter(again, n)) for n in parameter_names(interior)] == pytest.approx(
+            [float(get_parameter(interior, n)) for n in parameter_names(interior)], abs=1e-15
+        )
+    back = AdjustedPhotographs.of_block(block, block.start.unknowns)
+    own = {(two.images[i], two.points[k]): at for i, k, at in zip(two.image, two.point, two.column_row, strict=True)}
+    for i, k, at in zip(back.image, back.point, back.column_row, strict=True):
+        np.testing.assert_allclose(at, own[back.images[i], back.points[k]], rtol=0, atol=1e-9)
+    table = tmp_path / "out" / "images.csv"
+    table.write_text("".join(table.read_text().splitlines(keepends=True)[:-1]))
+    with pytest.raises(InputError, match=r"images.csv says no camera of 1 photographs \(f.tif\); add a row"):
+        read_source(tmp_path / "out")
 
 
 term = st.floats(-0.2, 0.2)

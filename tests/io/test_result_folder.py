@@ -138,7 +138,7 @@ def test_the_command_writes_what_was_adjusted(own, tmp_path, monkeypatch, capsys
     out = tmp_path / "block"
     given = ("--photographs", tmp_path / "pictures", "--to")
     code, said, _ = run(monkeypatch, capsys, "convert", own / "result", tmp_path / "opk", *given, "opk")
-    assert code == 0 and "adjusted values\ncamera one: exact\n" in said
+    assert code == 0 and "adjusted values\ncamera one: the conversion is exact\n" in said
     lines = (tmp_path / "opk" / "exterior.txt").read_text().splitlines()
     position = np.asarray(adjusted("cross").unknowns.exterior.position)
     assert lines[3].split("\t")[:4] == ["i0.jpg", *map(repr, position[0].tolist())]

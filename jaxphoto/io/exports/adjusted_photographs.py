@@ -106,6 +106,14 @@ class AdjustedPhotographs(NamedTuple):
         return np.split(order, np.cumsum(np.bincount(self.point, minlength=len(self.points)))[:-1])
 
     @property
+    def place_in_image(self) -> Int[np.ndarray, "n"]:
+        """Of every image point, its number among those of its photograph, from 0."""
+        number = np.zeros(len(self.image), int)
+        for rows in self.rows_of_images:
+            number[rows] = np.arange(len(rows))
+        return number
+
+    @property
     def place(self) -> tuple[float, float, float] | None:
         """Longitude, latitude (degrees) and height (m) of the origin above the ellipsoid of WGS 84.
 

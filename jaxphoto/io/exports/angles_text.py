@@ -5,10 +5,12 @@ transpose Rx(omega) Ry(phi) Rz(kappa) from the camera to the object; the axes of
 and up at the place of the photograph.
 """
 
+import csv
 from pathlib import Path
 
 import jax
 import numpy as np
+import pandas as pd
 
 from jaxphoto.arrays import still
 from jaxphoto.collinearity import ExteriorOrientation
@@ -17,13 +19,15 @@ from jaxphoto.io.block_folder.settings import toml_text
 from jaxphoto.io.exports.adjusted_photographs import AdjustedPhotographs
 from jaxphoto.io.exports.image_points import write_image_points
 from jaxphoto.io.exports.map_photographs import in_map
+from jaxphoto.io.reconstructions.text_project import IMAGES
 from jaxphoto.unknowns import FIXED
 
 FILE, CAMERAS = "exterior.txt", "camera.toml"
 
 
 def write_angles_text(photographs: AdjustedPhotographs, folder: Path) -> None:
-    """Write exterior.txt, tabs between its columns and # before its comments, camera.toml and image_points.csv."""
+    """Write exterior.txt, tabs between its columns and # before its comments, camera.toml and image_points.csv, and of
+    several cameras images.csv, which says which photograph has which."""
     p, on_map = photographs, in_map(photographs)
     place = "longitude and latitude (degrees) and height (m)" if on_map.geographic else "X Y Z (m)"
     heights = "above the ellipsoid" if p.frame.vertical is None else f"of EPSG:{p.frame.vertical}"
@@ -39,6 +43,9 @@ def write_angles_text(photographs: AdjustedPhotographs, folder: Path) -> None:
     held = {name: Camera(*c, jax.tree.map(lambda _: FIXED, c.interior)) for name, c in p.cameras.items()}
     sections = {name: camera_section(camera) for name, camera in held.items()}
     (folder / CAMERAS).write_text(toml_text({"cameras": sections}), encoding="utf-8")
+    if len(p.cameras) > 1:
+        table = pd.DataFrame({"image": p.files, "camera": p.image_camera})
+        table.to_csv(folder / IMAGES, index=False, quoting=csv.QUOTE_NONNUMERIC)
     write_image_points(p, folder)
 
 

@@ -33,10 +33,8 @@ def write_bundler(photographs: AdjustedPhotographs, folder: Path) -> None:
     lines = [HEAD, f"{len(p.images)} {len(shown)}"]
     for own, turn, shift in zip(values.tolist(), turns.tolist(), moved.tolist(), strict=True):
         lines += [_words(own), *map(_words, turn), _words(shift)]
-    xy, image, feature = from_principal_point(p).tolist(), p.image.tolist(), np.zeros(len(p.image), int)
-    for rows in p.rows_of_images:
-        feature[rows] = np.arange(len(rows))
-    key, xyz = feature.tolist(), p.xyz.tolist()
+    xy, image = from_principal_point(p).tolist(), p.image.tolist()
+    key, xyz = p.place_in_image.tolist(), p.xyz.tolist()
     for rows in shown:
         seen = " ".join(f"{image[k]} {key[k]} {_words(xy[k])}" for k in rows.tolist())
         lines += [_words(xyz[p.point[rows[0]]]), "0 0 0", f"{len(rows)} {seen}"]

@@ -71,9 +71,8 @@ def _model(photographs: AdjustedPhotographs) -> _Model:
     camera_ids, point_ids = numbered(tuple(p.cameras)), np.array(list(numbered(p.points).values()), int)
     rotations = downwards(p.exterior)
     poses = np.hstack([Rotation.from_matrix(rotations).as_quat()[:, [3, 0, 1, 2]], translations(rotations, p.exterior)])
-    images, feature = [], np.zeros(len(p.image), int)
+    images, feature = [], p.place_in_image
     for i, rows in enumerate(p.rows_of_images):
-        feature[rows] = np.arange(len(rows))
         camera = camera_ids[p.image_camera[i]]
         record = _Image(i + 1, poses[i].tolist(), camera, p.files[i], p.column_row[rows], point_ids[p.point[rows]])
         images.append(record)

@@ -38,6 +38,8 @@ class ExportFormat(NamedTuple):
     fisheye: CameraModel | None
     in_map: bool
     about: str
+    endings: tuple[str, ...]
+    """Those of the files that it writes."""
     keeps_rays: bool = False
     """Whether image points are moved to where a camera that is fitted sees the same rays, instead of leaving them."""
 
@@ -54,34 +56,111 @@ class Exported(NamedTuple):
 
 EXPORTS = {
     "colmap": ExportFormat(
-        write_text_model, colmap.PLANE, colmap.FISHEYE, False, "COLMAP model: cameras, images, points3D as text"
+        write_text_model,
+        colmap.PLANE,
+        colmap.FISHEYE,
+        False,
+        "COLMAP model: cameras, images, points3D as text",
+        (".txt",),
     ),
-    "colmap-binary": ExportFormat(write_binary_model, colmap.PLANE, colmap.FISHEYE, False, "the same, binary"),
+    "colmap-binary": ExportFormat(
+        write_binary_model,
+        colmap.PLANE,
+        colmap.FISHEYE,
+        False,
+        "the same, binary",
+        (".bin",),
+    ),
     "metashape": ExportFormat(
-        write_metashape, agisoft.PLANE, agisoft.FISHEYE, False, "cameras of Agisoft Metashape, XML"
+        write_metashape,
+        agisoft.PLANE,
+        agisoft.FISHEYE,
+        False,
+        "cameras of Agisoft Metashape, XML",
+        (".xml", ".csv"),
     ),
     "opensfm": ExportFormat(
-        write_open_sfm, open_sfm.PLANE, open_sfm.FISHEYE, False, "reconstruction of OpenSfM, as in WebODM"
+        write_open_sfm,
+        open_sfm.PLANE,
+        open_sfm.FISHEYE,
+        False,
+        "reconstruction of OpenSfM, as in WebODM",
+        (".json", ".csv", ".txt"),
     ),
     "openmvg": ExportFormat(
-        write_open_mvg, open_mvg.PLANE, open_mvg.FISHEYE, False, "sfm_data.json of OpenMVG, with structure"
+        write_open_mvg,
+        open_mvg.PLANE,
+        open_mvg.FISHEYE,
+        False,
+        "sfm_data.json of OpenMVG, with structure",
+        (".json",),
     ),
     "blocksexchange": ExportFormat(
-        write_blocks_exchange, blocks_exchange.PLANE, None, False, "BlocksExchange XML of Bentley, with tie points"
+        write_blocks_exchange,
+        blocks_exchange.PLANE,
+        None,
+        False,
+        "BlocksExchange XML of Bentley, with tie points",
+        (".xml",),
     ),
     "nerfstudio": ExportFormat(
-        write_nerfstudio, nerfstudio.PLANE, nerfstudio.FISHEYE, False, "transforms.json of nerfstudio"
+        write_nerfstudio,
+        nerfstudio.PLANE,
+        nerfstudio.FISHEYE,
+        False,
+        "transforms.json of nerfstudio",
+        (".json", ".csv"),
     ),
     "bundler": ExportFormat(
-        write_bundler, RADIAL, None, False, "bundle.out of Bundler, with list.txt: f, k1, k2", True
+        write_bundler,
+        RADIAL,
+        None,
+        False,
+        "bundle.out of Bundler, with list.txt: f, k1, k2",
+        (".out", ".txt"),
+        True,
     ),
-    "bal": ExportFormat(write_bal, RADIAL, None, False, "problem of bundle adjustment in the large: f, k1, k2", True),
-    "opk": ExportFormat(write_angles_text, None, None, True, "text of positions and omega, phi, kappa"),
+    "bal": ExportFormat(
+        write_bal,
+        RADIAL,
+        None,
+        False,
+        "problem of bundle adjustment in the large: f, k1, k2",
+        (".txt",),
+        True,
+    ),
+    "opk": ExportFormat(
+        write_angles_text,
+        None,
+        None,
+        True,
+        "text of positions and omega, phi, kappa",
+        (".txt", ".toml", ".csv"),
+    ),
     "orthority": ExportFormat(
-        write_orthority, orthority.PLANE, orthority.FISHEYE, True, "parameters of orthority, YAML and CSV"
+        write_orthority,
+        orthority.PLANE,
+        orthority.FISHEYE,
+        True,
+        "parameters of orthority, YAML and CSV",
+        (".yaml", ".csv", ".prj"),
     ),
-    "geojson": ExportFormat(write_geo_json, None, None, False, "stations and footprints in longitude and latitude"),
-    "geopackage": ExportFormat(write_geo_package, None, None, False, "stations, footprints and points for a GIS"),
+    "geojson": ExportFormat(
+        write_geo_json,
+        None,
+        None,
+        False,
+        "stations and footprints in longitude and latitude",
+        (".geojson",),
+    ),
+    "geopackage": ExportFormat(
+        write_geo_package,
+        None,
+        None,
+        False,
+        "stations, footprints and points for a GIS",
+        (".gpkg",),
+    ),
 }
 """The formats that `export` knows, in the order of docs and help."""
 

@@ -84,7 +84,7 @@ def points_of(text: Path, files: Sequence[str], of: str, cameras: Sequence[Photo
     Raises InputError for rows that are no image points.
     """
     measured = read_measured(text)
-    places = _places(files)
+    places = places_by_name(files)
     heads = [_photograph(head, places) for head in measured.heads]
     _tell([head for head, (k, _) in zip(measured.heads, heads, strict=True) if k < 0], text, of)
     image = np.array([k for k, _ in heads], int)[measured.photograph]
@@ -186,7 +186,7 @@ def named(
 
 def _of_table(text: Path, files: Sequence[str], of: str) -> Shown:
     table = read_csv(text, ("image", "point", "column_px", "row_px"), ("sigma_px",))
-    places = _places(files)
+    places = places_by_name(files)
     images, points = table.ids("image").tolist(), table.ids("point").tolist()
     place = np.array([places.get(name, -1) for name in images], int)
     _tell(list(dict.fromkeys(name for name, k in zip(images, place.tolist(), strict=True) if k < 0)), text, of)
@@ -195,7 +195,7 @@ def _of_table(text: Path, files: Sequence[str], of: str) -> Shown:
     return named(place[kept], own, at[kept], table.sigmas("sigma_px")[kept])
 
 
-def _places(files: Sequence[str]) -> dict[str, int]:
+def places_by_name(files: Sequence[str]) -> dict[str, int]:
     """Photographs by their names, and by those without folder and ending where only one has such."""
     paths = [PurePosixPath(PureWindowsPath(file).as_posix()) for file in files]
     found: dict[str, int] = {}
