@@ -79,6 +79,10 @@ class Block(eqx.Module):
     partitions: dict[str, tuple[str, ...]] = eqx.field(static=True, default_factory=dict)
     """Owners of parameters that are neither cameras nor mounts nor strips: by partition, the part that each image is in
     ("" for none), such as intervals of time."""
+    converted_from: str = eqx.field(static=True, default="")
+    """The format and the file of another program that it is from, in words; "" for none."""
+    assumed_pixels: tuple[str, ...] = eqx.field(static=True, default=())
+    """Cameras whose pixel was taken for a micrometre, as no file told its size: all their millimetres scale with it."""
 
     def __check_init__(self) -> None:
         for field, kind in (

@@ -1,5 +1,6 @@
 """Any format that is known -> `Block`, or -> a block folder."""
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -10,6 +11,7 @@ from jaxphoto.io import aicon, bal, colmap, dbat, photomodeler
 from jaxphoto.io.block_folder import BlockTables, assemble, write_block
 from jaxphoto.io.block_folder.block_reader import read_folder
 from jaxphoto.io.block_folder.table_layout import TOML
+from jaxphoto.io.cameras.camera_file import ASSUMED_PIXEL_MM
 from jaxphoto.io.cameras.camera_reader import is_camera_file
 from jaxphoto.io.control_files.reader import is_control_file
 from jaxphoto.io.reconstructions import (
@@ -68,17 +70,25 @@ FORMATS = {
 def read_source(source: str | Path, format: str | None = None, *, stations: bool = True) -> Block:
     """The block in a file or folder of any format of `FORMATS`, recognised unless `format` names it.
 
+    Of another program it says what it was `converted_from`, and which cameras have assumed pixels.
+
     `stations` False leaves observed camera positions out. Raises InputError for an unknown format, and what
     `jaxphoto.io.read_block` raises.
     """
     source = Path(source)
     if not source.exists():
         raise InputError(f"there is no file or folder {source}; correct the name")
-    tables = FORMATS[_format(source, format)].read(source)
+    name = _format(source, format)
+    tables = FORMATS[name].read(source)
     if not stations:
         kept = {name: table for name, table in tables.tables.items() if name != "stations"}
         tables = BlockTables(tables.settings, kept, tables.file)
-    return assemble(tables)
+    block = assemble(tables)
+    if name == "block":
+        return block
+    assumed = tuple(camera for camera, sensor in block.sensors.items() if sensor.pixel_mm == ASSUMED_PIXEL_MM)
+    place = "/".join(source.resolve().parts[-2:])
+    return dataclasses.replace(block, converted_from=f"{name}: {place}", assumed_pixels=assumed)
 
 
 def convert(source: str | Path, folder: str | Path, format: str | None = None, *, stations: bool = True) -> Block:

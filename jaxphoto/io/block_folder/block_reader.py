@@ -203,6 +203,8 @@ def assemble(source: BlockTables) -> Block:
         corrections=corrections,
         surfaces=surfaces.rows,
         partitions=_partitions(images, settings),
+        converted_from=settings.converted_from,
+        assumed_pixels=settings.assumed_pixels,
     )
     more, more_priors = read_unknowns(settings.unknowns, source.unknowns, block)
     start, priors = dataclasses.replace(start, more=more), dataclasses.replace(priors, more=more_priors)

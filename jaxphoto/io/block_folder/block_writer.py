@@ -117,6 +117,8 @@ def _settings(block: Block) -> dict[str, Any]:
     own = [kind.group for kind in kinds_of(block) if kind not in OBSERVATIONS]
     return {
         "title": block.title,
+        **({"converted_from": block.converted_from} if block.converted_from else {}),
+        **({"assumed_pixels": list(block.assumed_pixels)} if block.assumed_pixels else {}),
         **({"observations": own} if own else {}),
         **({"partitions": list(block.partitions)} if block.partitions else {}),
         **({"reference_temperature_c": block.temperatures.reference_c} if block.temperatures else {}),

@@ -29,6 +29,8 @@ _KEYS = (
     "unknowns",
     "partitions",
     "reference_temperature_c",
+    "converted_from",
+    "assumed_pixels",
 )
 _SIGMAS = (
     "image_mm", "image_px", "control_m", "control_X_m", "control_Y_m", "control_Z_m", "station_m", "attitude_deg",
@@ -58,6 +60,9 @@ class Settings(NamedTuple):
     """Columns of images.csv that say whose further unknowns are."""
     reference_temperature_c: float | None
     """At which cameras with thermal rates are what they are; None: the mean of all exposures."""
+    converted_from: str
+    assumed_pixels: tuple[str, ...]
+    """As in `Block`."""
 
 
 def read_settings(values: dict[str, Any], file: str = TOML, sigma_keys: Sequence[str] = ()) -> Settings:
@@ -88,6 +93,8 @@ def read_settings(values: dict[str, Any], file: str = TOML, sigma_keys: Sequence
         top.section("unknowns"),
         read_partitions(top),
         top.number("reference_temperature_c") if "reference_temperature_c" in top else None,
+        top.text("converted_from", ""),
+        top.texts("assumed_pixels"),
     )
 
 
