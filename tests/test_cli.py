@@ -290,6 +290,11 @@ def test_other_programs_get_the_summary_and_who_asks_for_silence_gets_it(folder,
     assert run(monkeypatch, capsys, "adjust", folder, "--out", out, "-q") == (0, "", "")
 
 
+def test_help_shows_arguments_in_words(monkeypatch, capsys):
+    code, said, _ = run(monkeypatch, capsys, "combine", "--help")
+    assert code == 0 and "one or more" in said and not re.search(r"<(path|list|str)", said)
+
+
 def test_version_and_help(monkeypatch, capsys):
     assert run(monkeypatch, capsys, "--version")[1].strip() == f"jaxphoto {jaxphoto.__version__}"
     assert "adjust" in run(monkeypatch, capsys, "--help")[1]

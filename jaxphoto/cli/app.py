@@ -6,6 +6,7 @@ called; the list of all commands needs none: it has a line for each from here.
 
 import gc
 import importlib
+from functools import partial
 from typing import Annotated, NamedTuple
 
 import typer
@@ -200,7 +201,8 @@ COMMANDS = {name: command for commands in _CONTENTS.values() for name, command i
 
 
 class _Readable:
-    """A command or group whose flags are shown without the type that they cannot be given."""
+    """A command or group whose flags are shown without the type that they cannot be given, and whose arguments without
+    the type that they have in Python."""
 
     def get_params(self, ctx):
         """All parameters, that of the help, too."""
@@ -208,7 +210,14 @@ class _Readable:
         for parameter in params:
             if getattr(parameter, "is_flag", False):
                 parameter.metavar = ""
+            if parameter.param_type_name == "argument":
+                parameter.display_type_rich = partial(_argument_word, several=parameter.nargs != 1)
         return params
+
+
+def _argument_word(ctx: object, several: bool) -> str:
+    """What stands behind the name of an argument: its name and help say what it is."""
+    return "one or more" if several else ""
 
 
 class ReadableCommand(_Readable, TyperCommand):
