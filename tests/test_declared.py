@@ -349,8 +349,10 @@ def test_the_table_of_residuals_names_each_number(group):
     assert (names != "").any(axis=1).all()
     rows = observation_groups(adjusted())[group]
     assert set(own["unit"]) == {"deg" if rows.unit == "rad" else rows.unit}
-    sentences = np.ravel(rows.words(adjusted().block.images, adjusted().block.points))
-    assert all(sentences)
+    called = adjusted().block.images, adjusted().block.points
+    sentences = np.broadcast_to(rows.words(*called), np.shape(np.atleast_2d(adjusted().residuals[group])))
+    assert sentences.all()
+    assert rows.words_of(*np.indices(sentences.shape).reshape(2, -1), *called) == sentences.ravel().tolist()
     assert np.isfinite(own[["residual", "sigma", "redundancy_number", "w"]].to_numpy(float)).all()
 
 

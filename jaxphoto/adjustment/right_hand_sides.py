@@ -49,10 +49,10 @@ def at_once(one: Increments) -> int:
 
 def in_batches(tree: Increments, size: int) -> Iterator[Increments]:
     """Of `size` each, the last filled up with zeros."""
-    rest = -len(tree.shared) % size
-    filled = jax.tree.map(lambda v: np.concatenate([v, np.zeros((rest, *v.shape[1:]))]), tree)
-    for first in range(0, len(filled.shared), size):
-        yield jax.tree.map(itemgetter(slice(first, first + size)), filled)
+    for first in range(0, len(tree.shared), size):
+        some = jax.tree.map(itemgetter(slice(first, first + size)), tree)
+        rest = size - len(some.shared)
+        yield jax.tree.map(lambda v: np.concatenate([v, np.zeros((rest, *v.shape[1:]))]), some) if rest else some  # noqa: B023
 
 
 @eqx.filter_jit

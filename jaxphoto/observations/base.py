@@ -194,6 +194,20 @@ class AbstractObservations(eqx.Module):
         both = zip(*(v.ravel() for v in np.broadcast_arrays(np.array(whose, object), axis)), strict=True)
         return np.array([f"{thing} of {who}" + (f" in {a}" if a else "") for who, a in both], object).reshape(shape)
 
+    def words_of(
+        self,
+        numbers: Int[np.ndarray, " some"],
+        rows: Int[np.ndarray, " some"],
+        images: Sequence[str],
+        points: Sequence[str],
+    ) -> list[str]:
+        """What a sentence calls some numbers, one of each of `rows`: all `words` of millions are hundreds of MB."""
+        numbered = not any(what in ("image", "point") for what, _ in self.indices())
+        # Of rows without images and points, `words` may tell their place among all.
+        some, at = (self, rows) if numbered else (self.take(rows), np.arange(len(rows)))
+        words = np.broadcast_to(some.words(images, points), (len(self.axes), len(some)))
+        return [str(word) for word in words[numbers, at]]
+
 
 class AbstractCoordinates(AbstractObservations):
     """Single coordinates (m): `who` (index of a point or an image), `axis` (0, 1, 2), `value` and `sigma`."""

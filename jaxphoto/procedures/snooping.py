@@ -302,10 +302,11 @@ def _told(at: Adjustment, left: Masks, stays: Masks, r: Blocks, sigma0: float) -
         # What nothing checks has none, and by rounding less than none.
         own = np.sqrt(np.maximum(np.diagonal(r[name], axis1=1, axis2=2).T, UNCHECKED))
         error, sigma = np.atleast_2d(rows.physical(v)), np.atleast_2d(np.asarray(rows.sigmas).T)
-        words = np.broadcast_to(rows.words(block.images, block.points), np.shape(v))
-        for row in np.flatnonzero(left[name] & stays[name]).tolist():
-            k = int(np.abs(v[:, row] * own[:, row]).argmax())
+        out = np.flatnonzero(left[name] & stays[name])
+        worst = np.abs(v[:, out] * own[:, out]).argmax(axis=0)
+        words = rows.words_of(worst, out, block.images, block.points)
+        for row, k, word in zip(out.tolist(), worst.tolist(), words, strict=True):
             known = sigma0 * float(sigma[k, row] / own[k, row])
             off = float(error[k, row])
-            found.append(Suspect(name, row, k, str(words[k, row]), off / known, off, known, rows.unit))
+            found.append(Suspect(name, row, k, word, off / known, off, known, rows.unit))
     return tuple(sorted(found, key=lambda out: -abs(out.w)))

@@ -195,8 +195,8 @@ def _residuals(tables: Tables) -> list[Markup]:
     ]
     if len(tables.adjusted.block.stations.who):
         panels.append(DocumentPicture(partial(draw_station_residuals, tables=tables), "residuals of stations by time"))
-    checked = tables.residuals[tables.residuals["redundancy_number"] > LEAST_CHECKED]
-    largest = checked.assign(size=checked["w"].abs()).nlargest(_LARGEST, "size").drop(columns="size")
+    checked = tables.residuals["redundancy_number"] > LEAST_CHECKED
+    largest = tables.residuals.loc[tables.residuals["w"].abs()[checked].nlargest(_LARGEST).index]
     title = Markup("<h3>{}</h3>").format
     trends = [title("Patterns: what the images have in common, and time and strips"), _html(tables.trends)]
     return [

@@ -14,7 +14,8 @@ from jaxphoto.errors import camera_words, counted
 from jaxphoto.observations import PRIORS
 from jaxphoto.procedures.adjust import ABSURD
 from jaxphoto.report.findings import Finding, Level, p_words, parameter_words, symbol
-from jaxphoto.report.tables import Tables, in_file_unit
+from jaxphoto.report.residual_table import in_file_unit
+from jaxphoto.report.tables import Tables
 from jaxphoto.statistics import (
     DELTA0,
     LEVEL,
@@ -215,11 +216,11 @@ def _trends(tables: Tables, fits: bool) -> Iterator[_Pattern]:
         said = t.pattern.begins or f"residuals of {t.pattern.what} follow a pattern"
         said += f" ({p_words(t.p_value)})"
         if t.size > 0 and unit:
-            said += f" of {factor * t.size:.2g} {unit} ({t.size / t.pattern.sigma:.2g} of their sigma)"
-        matters, spoilt, likely = t.size > _VISIBLE * t.pattern.sigma, False, list[Hint]()
+            said += f" of {factor * t.size:.2g} {unit} ({t.size / t.sigma:.2g} of their sigma)"
+        matters, spoilt, likely = t.size > _VISIBLE * t.sigma, False, list[Hint]()
         alike = t.alike
         # What estimated parameters nearly take up is seen so badly that its size is lost in its noise.
-        matters |= any(abs(h.amount) > _VISIBLE * t.pattern.sigma for h in alike)
+        matters |= any(abs(h.amount) > _VISIBLE * t.sigma for h in alike)
         if alike or (t.hints and t.hints[0].share > MOST_OF_IT):
             likely = alike or [t.hints[0]]
             share = "" if alike else f"{100 * t.hints[0].share:.0f} % of it "

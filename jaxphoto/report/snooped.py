@@ -13,7 +13,7 @@ from jaxphoto.procedures import Snooped
 from jaxphoto.procedures.mistakes import coordinate_mistakes, is_mirrored
 from jaxphoto.procedures.snooping import SEVERAL, images_out, mostly_out
 from jaxphoto.report.findings import Finding, Level
-from jaxphoto.report.tables import in_file_unit
+from jaxphoto.report.residual_table import in_file_unit
 from jaxphoto.statistics import Suspect
 
 _SHOWN = 5

@@ -18,6 +18,7 @@ from jaxphoto.report.interior_table import interior_table
 from jaxphoto.report.map_tables import angles_deg, exterior_map_table, map_coordinates
 from jaxphoto.report.positional_accuracy import accuracy_table
 from jaxphoto.report.recovery import recovery_table
+from jaxphoto.report.residual_table import in_file_unit, residual_table
 from jaxphoto.report.sigma_map_table import sigma_map_table
 from jaxphoto.statistics import (
     BlunderTest,
@@ -32,18 +33,14 @@ from jaxphoto.statistics import (
     Suspect,
     Trend,
     UndetectedEffects,
-    a_priori_sigmas,
     blunder_test,
     camera_drifts,
     check_discrepancies,
     correlations,
     covariance,
     culprits,
-    detectable_errors,
     ground_correlations,
     normalised_residuals,
-    observation_groups,
-    physical_residuals,
     positional_accuracy,
     prepare_statistics,
     redundancy_numbers,
@@ -54,11 +51,6 @@ from jaxphoto.statistics import (
 )
 from jaxphoto.statistics.intersection_angles import intersection_angles
 from jaxphoto.statistics.sigma_map import SigmaMap, sigma_maps
-
-
-def in_file_unit(unit: str) -> tuple[float, str]:
-    """What numbers are multiplied by to be shown, and the name of the unit they are shown in: degrees for rad."""
-    return (180 / np.pi, "deg") if unit == "rad" else (1.0, unit)
 
 
 class Tables:
@@ -240,35 +232,7 @@ class Tables:
         `detectable` is the least error in it alone that the test of w finds with a probability of 80 %, and the last
         four by how many standard deviations that error moves c, x_p, y_p, and anything at most.
         """
-        detectable = detectable_errors(self.adjusted, self.redundancy)
-        residual, sigma = physical_residuals(self.adjusted), a_priori_sigmas(self.adjusted)
-        block, s = self.adjusted.block, self.adjusted.structure
-        labels = np.full(len(self.adjusted.values.shared), "", object)
-        labels[s.free] = s.labels
-        frames = []
-        for group, rows in observation_groups(self.adjusted).items():
-            v = residual[group]
-            # Rows run along the last axis; the components of a row stand together.
-            flat = lambda x, shape=v.shape: np.broadcast_to(np.asarray(x), shape).T.ravel()  # noqa: E731
-            axis, parameter = flat(rows.axis_names()), flat(rows.names_of("parameter", labels))
-            factor, unit = in_file_unit(rows.unit)
-            columns = {
-                "group": group,
-                "image": flat(rows.names_of("image", block.images)),
-                "point": flat(rows.names_of("point", block.points)),
-                "axis": np.where(axis == "", parameter, axis),
-                "residual": factor * flat(v),
-                "sigma": factor * flat(sigma[group]),
-                "unit": unit,
-                "redundancy_number": flat(self.redundancy[group]),
-                "w": flat(self.w[group]),
-                "detectable": factor * flat(detectable[group]),
-                **{f"{p.removesuffix('_mm')}_moves": flat(v[group]) for p, v in self.undetected.interior.items()},
-                "most_moves": flat(self.undetected.most[group]),
-            }
-            if v.size:
-                frames.append(pd.DataFrame(columns))
-        return pd.concat(frames, ignore_index=True)
+        return residual_table(self.adjusted, self.redundancy, self.w, self.undetected)
 
     @cached_property
     def check_points(self) -> pd.DataFrame:

@@ -76,11 +76,11 @@ def blunder_test(adjusted: Adjustment, redundancy: Redundancy, level: float = LE
             continue
         # The largest number of a row speaks for it: a point in an image is one blunder, whichever coordinate shows it.
         worst = size[:, bad].argmax(axis=0)
-        words = np.broadcast_to(rows.words(block.images, block.points), np.shape(w[name]))
-        of_worst = (np.atleast_2d(v)[worst, bad] for v in (words, w[name], precision[name]))
-        for row, number, word, value, p in zip(bad.tolist(), worst.tolist(), *of_worst, strict=True):
+        words = rows.words_of(worst, bad, block.images, block.points)
+        of_worst = (np.atleast_2d(v)[worst, bad] for v in (w[name], precision[name]))
+        for row, number, word, value, p in zip(bad.tolist(), worst.tolist(), words, *of_worst, strict=True):
             sigma, ratio = sigma0 / float(p) ** 0.5, float(value)
-            found.append(Suspect(name, row, number, str(word), ratio, ratio * sigma, sigma, rows.unit))
+            found.append(Suspect(name, row, number, word, ratio, ratio * sigma, sigma, rows.unit))
     return BlunderTest(tuple(sorted(found, key=lambda s: -abs(s.w))), limit, n)
 
 
@@ -129,7 +129,7 @@ def worst_checked(adjusted: Adjustment, redundancy: Redundancy) -> list[Hidden]:
     for name, rows in observation_groups(adjusted).items():
         if rows.unit and len(rows):
             size, sigma = np.atleast_2d(detectable[name]), np.atleast_2d(still(rows.sigmas).T)
-            words = np.broadcast_to(rows.words(block.images, block.points), size.shape)
             k = np.unravel_index(np.argmax(size / sigma), size.shape)
-            found.append(Hidden(name, str(words[k]), float(size[k]), float(sigma[k]), rows.unit))
+            (words,) = rows.words_of(*np.reshape(k, (2, 1)), block.images, block.points)
+            found.append(Hidden(name, words, float(size[k]), float(sigma[k]), rows.unit))
     return found

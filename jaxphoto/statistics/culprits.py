@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.statistics.blunder_test import LEAST_SIGMA0, BlunderTest, Suspect
-from jaxphoto.statistics.patterns import PatternTerm, ResidualPattern
+from jaxphoto.statistics.patterns import PatternTerm, ResidualPattern, patterns_of
 from jaxphoto.statistics.responses import Responses
 from jaxphoto.statistics.trends import LEAST_SEEN, inverse_of_seen
 
@@ -39,7 +39,7 @@ def culprits(
     rows = [np.ravel(responses.places[s.group][..., s.row]) for s in some]
     shown = [int(np.atleast_2d(responses.places[s.group])[s.number, s.row]) for s in some]
     at, n = np.concatenate(rows), len(beside)
-    first = np.reshape([_column(*pair, responses.count) for pair in beside], (n, responses.count))
+    first = np.reshape([_column(responses, *pair) for pair in beside], (n, responses.count))
 
     def column(k: int) -> np.ndarray:
         return first[k] if k < n else np.bincount(at[k - n : k - n + 1], minlength=responses.count).astype(float)
@@ -71,8 +71,11 @@ def culprits(
     return (*(some[i] for i in chosen), *others)
 
 
-def _column(pattern: ResidualPattern, term: PatternTerm, count: int) -> Float[np.ndarray, "count"]:
-    """A term as a whitened error of all observations."""
+def _column(responses: Responses, told: ResidualPattern, term: PatternTerm) -> Float[np.ndarray, "count"]:
+    """A term of a pattern, of which its columns need not be known, as a whitened error of all observations."""
+    patterns = patterns_of(responses.adjusted, responses.places)
+    pattern = next(p for p in patterns if (p.what, p.camera) == (told.what, told.camera))
+    count = responses.count
     return sum(
         (float(a) * pattern.column(k, count) for k, a in enumerate(term.coefficients) if a != 0.0), np.zeros(count)
     )

@@ -7,6 +7,7 @@ observation i. Products z' H z of many errors need no J x: they are those of J' 
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from operator import itemgetter
 from typing import Any
 
 import equinox as eqx
@@ -87,8 +88,13 @@ class Responses(eqx.Module):
     def products(self, column: Column, many: int) -> tuple[Float[np.ndarray, "many many"], Float[np.ndarray, "m s"]]:
         """z' H z of all errors z = `column(k)` with one another, and the shared unknowns' motions, as `to_errors`."""
         pulled = self._pulled(column, range(many))
-        x = self.solved(pulled)
-        return products_of(pulled, x), self._moved(x)
+        found, moved = np.zeros((many, many)), np.zeros((many, len(self._scale)))
+        # Of a large block each set of all directions takes hundreds of MB: those that are solved for are let go.
+        for first in range(0, many, size := at_once(self.equations.scale)):
+            some = slice(first, first + size)
+            x = self.solved(jax.tree.map(itemgetter(some), pulled))
+            found[:, some], moved[some] = products_of(pulled, x), self._moved(x)
+        return found, moved
 
     @property
     def _scale(self) -> Float[np.ndarray, "shared"]:

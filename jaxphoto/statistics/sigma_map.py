@@ -74,9 +74,20 @@ def sigma_map(
     name = one_camera(adjusted.block, camera)
     if not distance_m > 0:
         raise InputError(f"distance_m is the distance of a point from the camera, so it is positive, got {distance_m}")
+    return _sigma_map(adjusted, name, distance_m, points, _joint_covariance(adjusted, name))
+
+
+def _sigma_map(
+    adjusted: Adjustment,
+    name: str,
+    distance_m: float,
+    points: Float[Numbers, "cells 2"] | None,
+    known: tuple[list[str], Float[np.ndarray, "n n"]],
+) -> SigmaMap:
+    """The map of a camera of which the `_joint_covariance` is `known`."""
     interior, sensor = adjusted.unknowns.interior[name], adjusted.block.sensors[name]
     xy = _cells(sensor) if points is None else np.asarray(points, float)
-    own, covariance = _joint_covariance(adjusted, name)
+    own, covariance = known
     # Numbers as arrays, so that another value is not another program.
     arrays = jax.tree.map(lambda v: jnp.asarray(v, float), interior)
     jacobian = np.asarray(call_compiled(_derivatives, arrays, jnp.asarray(xy), jnp.asarray(1 / distance_m)))
@@ -99,11 +110,13 @@ def sigma_maps(adjusted: Adjustment) -> dict[str, tuple[SigmaMap, SigmaMap]]:
     """By camera of which something was estimated: at infinity, and at the median distance at which it saw points."""
     s = adjusted.structure
     seen = {adjusted.block.image_camera[i] for i in np.unique(s.image)}
-    return {
-        name: (sigma_map(adjusted, name), sigma_map(adjusted, name, distance_m=seen_distance_m(adjusted, name)))
-        for name in adjusted.unknowns.interior
-        if name in seen and any(label.startswith(f"interior[{name}].") for label in s.labels)
-    }
+    found: dict[str, tuple[SigmaMap, SigmaMap]] = {}
+    for name in adjusted.unknowns.interior:
+        if name in seen and any(label.startswith(f"interior[{name}].") for label in s.labels):
+            known = _joint_covariance(adjusted, name)
+            far = _sigma_map(adjusted, name, float("inf"), None, known)
+            found[name] = far, _sigma_map(adjusted, name, seen_distance_m(adjusted, name), None, known)
+    return found
 
 
 def _cells(sensor: Sensor) -> Float[np.ndarray, "cells 2"]:

@@ -52,6 +52,9 @@ class Trend(NamedTuple):
     """The test of one pattern."""
 
     pattern: ResidualPattern
+    """Without its columns, which of a large block are hundreds of MB; `patterns_of` makes them again."""
+    sigma: float
+    """The median standard deviation of its observations."""
     freedom: int
     p_value: float
     size: float
@@ -169,7 +172,8 @@ def _tested(
     if hints and m:
         makes = hints[0].amount * (np.array(of_units) @ hints[0].term.coefficients)
         alike = int((np.abs(out.errors - makes) < _LIKE * np.abs(makes)).sum())
-    return Trend(pattern, freedom, p, max(float(size2), 0.0) ** 0.5, tuple(hints), alike)
+    told = pattern._replace(parts=())
+    return Trend(told, pattern.sigma, freedom, p, max(float(size2), 0.0) ** 0.5, tuple(hints), alike)
 
 
 def _hints(

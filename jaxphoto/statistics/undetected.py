@@ -85,9 +85,10 @@ def most_felt(adjusted: Adjustment, external: UndetectedEffects) -> list[Felt]:
         for name, rows in observation_groups(adjusted).items():
             size = np.where(np.isfinite(moved[name]), moved[name], 0.0)
             if rows.unit and size.size and size.max() > (worst.moved if worst else 0.0):
-                words = np.broadcast_to(rows.words(block.images, block.points), size.shape)
+                size = np.atleast_2d(size)
                 k = np.unravel_index(np.argmax(size), size.shape)
-                worst = Felt(parameter, str(words[k]), float(size[k]))
+                (words,) = rows.words_of(*np.reshape(k, (2, 1)), block.images, block.points)
+                worst = Felt(parameter, words, float(size[k]))
         found += [worst] if worst else []
     return found
 

@@ -15,7 +15,7 @@ from jaxphoto.report.flight.positions import name_ends
 from jaxphoto.report.plots import draw_density, draw_mean_residuals, drawn
 from jaxphoto.report.residual_findings import MOST_OF_IT
 from jaxphoto.report.residual_plots import draw_residuals_by_radius
-from jaxphoto.report.tables import in_file_unit
+from jaxphoto.report.residual_table import in_file_unit
 from jaxphoto.statistics import LEVEL, residual_spread
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ def pattern_sentence(report: PartReport, camera: str) -> str:
         return "No test of a pattern over the format: the adjustment did not converge."
     (trend,) = found
     pixel = report.part.adjusted.block.sensors[camera].pixel_mm
-    size = f"{trend.size / pixel:.2g} px ({trend.size / trend.pattern.sigma:.2g} of the sigma of an image point)"
+    size = f"{trend.size / pixel:.2g} px ({trend.size / trend.sigma:.2g} of the sigma of an image point)"
     if trend.p_value >= LEVEL:
         return f"The mean field is noise: the test for a pattern over the format has {p_words(trend.p_value, 2)}."
     most = next((h for h in trend.hints[:1] if h.share > MOST_OF_IT), None)
