@@ -130,6 +130,7 @@ def worst_checked(adjusted: Adjustment, redundancy: Redundancy) -> list[Hidden]:
         if rows.unit and len(rows):
             size, sigma = np.atleast_2d(detectable[name]), np.atleast_2d(still(rows.sigmas).T)
             k = np.unravel_index(np.argmax(size / sigma), size.shape)
-            (words,) = rows.words_of(*np.reshape(k, (2, 1)), block.images, block.points)
+            number, row = np.reshape(k, (2, 1))
+            (words,) = rows.words_of(number, row, block.images, block.points)
             found.append(Hidden(name, words, float(size[k]), float(sigma[k]), rows.unit))
     return found

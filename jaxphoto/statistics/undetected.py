@@ -87,7 +87,8 @@ def most_felt(adjusted: Adjustment, external: UndetectedEffects) -> list[Felt]:
             if rows.unit and size.size and size.max() > (worst.moved if worst else 0.0):
                 size = np.atleast_2d(size)
                 k = np.unravel_index(np.argmax(size), size.shape)
-                (words,) = rows.words_of(*np.reshape(k, (2, 1)), block.images, block.points)
+                number, row = np.reshape(k, (2, 1))
+                (words,) = rows.words_of(number, row, block.images, block.points)
                 worst = Felt(parameter, words, float(size[k]))
         found += [worst] if worst else []
     return found
