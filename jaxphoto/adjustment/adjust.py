@@ -84,7 +84,7 @@ def solve(
     # Its normal equations are the largest that there is, and made again.
     del found
     adjusted = _at(state, laid, block, start, priors, seconds)
-    adjusted = dataclasses.replace(adjusted, steps=steps, converged=converged, course=course)
+    adjusted = dataclasses.replace(adjusted, steps=steps, converged=converged, course=course, sizes=sizes)
     if laid.traced:
         return adjusted
     if adjusted.astray.any():

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxphoto.adjustment.layout.padding import TiledBlock
+from jaxphoto.adjustment.layout.tile_layout import LEAST, Sizes
 from jaxphoto.adjustment.layout.tiled import TiledValues
 from jaxphoto.adjustment.model.numbers import Residuals, Values
 from jaxphoto.adjustment.model.structure import Structure, observed_in
@@ -73,6 +74,8 @@ class Adjustment(eqx.Module):
     seconds: dict[str, float]
     left_out: tuple[str, ...] = eqx.field(static=True, default=())
     """Tie points of the block as it was given that this adjustment goes without: their rays meet nowhere."""
+    sizes: Sizes = eqx.field(static=True, default=LEAST)
+    """That it was asked to be compiled for at least; with them the block is adjusted again by the same program."""
 
     course: Course | None = None
     """How the iteration went, step by step; None inside a transformation of JAX and where nothing was iterated."""

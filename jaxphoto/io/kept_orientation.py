@@ -11,6 +11,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from jaxphoto.adjustment import Sizes
 from jaxphoto.arrays import on_device
 from jaxphoto.camera import InteriorOrientation, Sensor, get_parameter, parameter_names, set_parameter
 from jaxphoto.collinearity import ExteriorOrientation
@@ -78,6 +79,7 @@ def packed(oriented: Oriented) -> dict[str, np.ndarray]:
         "xy": np.asarray(rows.xy),
         "sigma": np.asarray(rows.sigma),
         "residuals_mm": oriented.residuals_mm,
+        "sizes": np.array(json.dumps(oriented.sizes)),
     }
 
 
@@ -102,4 +104,6 @@ def unpacked(arrays: dict[str, np.ndarray], sensor: Sensor, interior: InteriorOr
     report = json.loads(str(arrays["report"]))
     report = {key: tuple(value) if isinstance(value, list) else value for key, value in report.items()}
     gross = GrossErrors(**report.pop("gross_errors"))
-    return Oriented(block, arrays["residuals_mm"], OrientationReport(**report, gross_errors=gross))
+    *most, rows = json.loads(str(arrays["sizes"]))
+    sizes = Sizes._make([*most, tuple((group, number) for group, number in rows)])
+    return Oriented(block, arrays["residuals_mm"], OrientationReport(**report, gross_errors=gross), sizes)

@@ -77,7 +77,10 @@ def adjust(
 
 
 def adjust_for_tables(
-    block: Block, max_steps: int = MAX_STEPS, report: Callable[[str], object] = lambda text: None
+    block: Block,
+    max_steps: int = MAX_STEPS,
+    report: Callable[[str], object] = lambda text: None,
+    sizes: Sizes = LEAST,
 ) -> Adjustment:
     """`adjust`, with what tables and report will want compiled meanwhile; `report` is told what is being done.
 
@@ -90,7 +93,7 @@ def adjust_for_tables(
         spent["start"] += time.perf_counter() - began
         rows = len(part.image_points.image)
         report(f"adjusting {len(part.images)} images, {len(part.points)} points, {rows} image points")
-        done = solve(part, start, part.priors, max_steps, meanwhile=prepare_statistics)
+        done = solve(part, start, part.priors, max_steps, sizes, meanwhile=prepare_statistics)
         began = time.perf_counter()
         return done
 

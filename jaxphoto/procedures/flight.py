@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxphoto.adjustment import Adjustment
+from jaxphoto.adjustment import LEAST, Adjustment
 from jaxphoto.block import Block
 from jaxphoto.camera import InteriorOrientation, Sensor
 from jaxphoto.errors import BlockError, DatumError, InputError, RankError
@@ -148,7 +148,9 @@ def _calibrated(
     if known.control is not None:
         controlled, no_control = controlled_or_why(block, known.control, known.code, known.vertical, report)
     try:
-        adjusted = controlled.adjusted if controlled else adjust_for_tables(block)
+        # Without positions it is the network that the orientation ended with, which needs no other program.
+        sizes = LEAST if placed else oriented.sizes
+        adjusted = controlled.adjusted if controlled else adjust_for_tables(block, sizes=sizes)
     except (InputError, BlockError, DatumError, RankError) as error:
         if placed is None:
             raise

@@ -123,7 +123,7 @@ def variance_components(
         raise InputError(f"max_rounds and probes are 1 at least, got {max_rounds} and {probes}")
     if not bool(adjusted.converged):
         raise InputError(f"variance components are those of an optimum, but the block is {adjusted.outcome.value}")
-    block, priors, parts = adjusted.block, adjusted.priors, parts_of(adjusted, partition)
+    block, priors, sizes, parts = adjusted.block, adjusted.priors, adjusted.sizes, parts_of(adjusted, partition)
     factor, free = np.ones(len(parts.labels)), np.ones(len(parts.labels), bool)
     sentences: dict[str, str] = {}
     falls, last, rounds, settled = np.zeros(len(factor), int), np.zeros(len(factor)), 0, False
@@ -149,7 +149,7 @@ def variance_components(
         if (factor != before).any():
             # Of a large block an adjustment is hundreds of megabytes: the last one goes before the next is made.
             reached, adjusted = adjusted.unknowns, None  # type: ignore[assignment]
-            adjusted = solve(_reweighted(block, parts, factor), reached, priors, max_steps)
+            adjusted = solve(_reweighted(block, parts, factor), reached, priors, max_steps, sizes)
         if not bool(adjusted.converged):
             break
     return _result(parts, factor, free, sentences, adjusted, now, rounds, settled)

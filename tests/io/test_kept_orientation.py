@@ -37,7 +37,8 @@ def test_what_was_kept_is_taken_up_in_every_bit(photographs, tmp_path, monkeypat
     monkeypatch.setattr(kept_orientation, "orient", never)
     again = orient(*given(photographs), title="five", report=said.append)
     assert bool(eqx.tree_equal(first.block, again.block))
-    assert first.report == again.report and (first.residuals_mm == again.residuals_mm).all()
+    assert (first.report, first.sizes) == (again.report, again.sizes)
+    assert (first.residuals_mm == again.residuals_mm).all()
     for other in (
         {"title": "six"},
         {"sensor": dataclasses.replace(SENSOR, pixel_mm=0.0050001)},

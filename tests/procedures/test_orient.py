@@ -1,14 +1,19 @@
 """Photographs oriented to one another from their matches alone, false ones among them; truth is known."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
-from jaxphoto.camera import InteriorOrientation, get_parameter
+from jaxphoto.adjustment import solve
+from jaxphoto.camera import InteriorOrientation, get_parameter, parameter_names, set_parameter
+from jaxphoto.compiling import run
 from jaxphoto.errors import BlockError
 from jaxphoto.orientation.matches import PairMatches
 from jaxphoto.procedures.adjust import adjust
 from jaxphoto.procedures.orientation import orient
 from jaxphoto.procedures.orientation.finish import _shared_covariance
+from jaxphoto.unknowns import FIXED, Weighted
 from tests.procedures.orientable import (
     PIXEL,
     SENSOR,
@@ -123,6 +128,24 @@ def test_false_matches_are_found_and_counted(scene, clean, spoilt):
     rows = spoilt.block.image_points
     assert report.n_image_points == len(rows.image)
     assert len(rows.image) > 0.97 * len(clean.block.image_points.image)
+
+
+def test_the_block_is_adjusted_by_the_program_that_oriented_it(spoilt):
+    """Where its camera is observed, as that was."""
+    block, priors = spoilt.block, observed_camera(spoilt.block)
+    before = set(run._programs)
+    found = solve(block, block.start.unknowns, priors, sizes=spoilt.sizes)
+    assert bool(found.converged)
+    assert set(run._programs) == before
+
+
+def observed_camera(block):
+    """Priors that observe all of the camera that is not held."""
+    priors, start = block.priors.interior["camera"], block.start.unknowns.interior["camera"]
+    for name in parameter_names(priors):
+        if get_parameter(priors, name) is not FIXED:
+            priors = set_parameter(priors, name, Weighted(float(get_parameter(start, name)), 1.0))
+    return dataclasses.replace(block.priors, interior={"camera": priors})
 
 
 def test_block_holds_what_was_oriented(clean):

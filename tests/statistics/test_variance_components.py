@@ -1,11 +1,15 @@
 """Variance components: the traces against dense matrices, the fixed point of REML, what cannot be estimated, truth."""
 
+import dataclasses
+import inspect
+
 import equinox as eqx
 import numpy as np
 import pytest
 
 from benchmarks.variance_components import TRUE, estimates, flight
 from jaxphoto import InputError, Selection, correlated, variance_components
+from jaxphoto.adjustment import LEAST
 from jaxphoto.observations import StationRows
 from jaxphoto.report import component_findings, component_tables
 from jaxphoto.statistics import partial_redundancy, parts_of
@@ -92,6 +96,17 @@ def test_the_estimate_is_the_fixed_point(components):
     assert np.ptp(times) > 0
     # What is known beforehand has no component.
     assert found.adjusted.priors is a.priors
+
+
+def test_it_is_adjusted_again_by_the_program_that_adjusted_it(monkeypatch):
+    sizes = LEAST._replace(tiles=50)
+
+    def solved(block, start, priors, max_steps, asked):
+        raise InputError(f"{asked == sizes}")
+
+    monkeypatch.setattr(inspect.getmodule(variance_components), "solve", solved)
+    with pytest.raises(InputError, match="True"):
+        variance_components(dataclasses.replace(adjusted(BLOCK), sizes=sizes), ("camera",))
 
 
 def test_what_cannot_support_a_component_says_so_and_stays_as_stated(components):

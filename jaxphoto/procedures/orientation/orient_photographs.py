@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from jaxphoto.adjustment import Sizes
 from jaxphoto.block import Block, Datum, Start
 from jaxphoto.camera import InteriorOrientation, Sensor, get_parameter, parameter_names, set_parameter
 from jaxphoto.collinearity import ExteriorOrientation
@@ -40,7 +41,7 @@ from jaxphoto.unknowns import Unknowns, default_priors
 
 CAMERA = "camera"
 """What the camera of the photographs is called in the block."""
-METHOD = 1
+METHOD = 2
 """Changes with the way photographs are oriented: what a run has kept of another way is not taken up."""
 SIGMA_PX = 0.5
 """Standard deviation of a feature, in pixels, where none is given."""
@@ -112,6 +113,8 @@ class Oriented(NamedTuple):
     residuals_mm: Float[np.ndarray, "rows 2"]
     """Of its image points, observed minus computed."""
     report: OrientationReport
+    sizes: Sizes
+    """That its adjustments were compiled for; with them that of `block` runs the same program."""
 
 
 def orient(
@@ -198,6 +201,7 @@ def orient(
             observed=tuple(camera.open),
             alike=camera.alike,
         ),
+        calibration.sizes,
     )
 
 
