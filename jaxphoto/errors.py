@@ -6,7 +6,7 @@ not an error: it is an outcome of the result (see `jaxphoto.adjustment.result.Ou
 
 import re
 import reprlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 # Of a message: what is longer is left out in the middle, because the place stands first and the mend last.
 _BEGINNING, _END = 900, 500
@@ -42,6 +42,17 @@ class JaxphotoError(ValueError):
 
 class InputError(JaxphotoError):
     """A file, a row or a number that cannot be read as what it claims to be."""
+
+
+class RowError(InputError):
+    """Rows of a file, of which the message names the first; `rows` are the numbers of all that are wrong in that way.
+
+    What reads them may go on without them.
+    """
+
+    def __init__(self, message: str, rows: Iterable[int]):
+        super().__init__(message)
+        self.rows = frozenset(rows)
 
 
 class BlockError(JaxphotoError):

@@ -10,6 +10,7 @@ from PIL import Image
 
 from jaxphoto.georeferencing.map_frame import MapFrame
 from jaxphoto.io import read_block
+from jaxphoto.io.control_files import FORMS
 from jaxphoto.procedures.georeference_photographs import utm_of
 from tests.commands import run
 from tests.image_measurement.ground import SENSOR, photograph, texture
@@ -96,3 +97,19 @@ def test_options_that_cannot_be(flown, tmp_path, monkeypatch, capsys):
     ):
         code, _, wrong = run(monkeypatch, capsys, "fly", flown, "--out", tmp_path / "o", *arguments)
         assert code == 2 and message in wrong and not (tmp_path / "o").exists()
+
+
+def test_no_result_takes_the_place_of_a_file_of_exposures(flown, tmp_path, monkeypatch, capsys):
+    out = tmp_path / "o"
+    (out / "told").mkdir(parents=True)
+    table = out / "told" / "exposures.csv"
+    table.write_text("image,longitude_deg,latitude_deg,height_m\n")
+    for folder in (out, table):
+        code, _, wrong = run(monkeypatch, capsys, "fly", flown, "--out", folder, "--exposures", table)
+        assert code == 2 and "exposures.csv, which would be lost" in wrong and table.is_file()
+
+
+def test_the_help_names_every_form_of_control(monkeypatch, capsys):
+    for name in ("fly", "control"):
+        told = " ".join(run(monkeypatch, capsys, name, "-h")[1].replace("│", " ").split())
+        assert all(form in told for form in FORMS)

@@ -14,7 +14,7 @@ from jaxphoto.image_measurement.control_targets import target_looker
 from jaxphoto.image_measurement.targets.on_ground import SYNTAX, read_target
 from jaxphoto.io import read_block
 from jaxphoto.io.block_folder import whole_block
-from jaxphoto.io.control_files import read_control
+from jaxphoto.io.control_files import FORMS, read_control
 from jaxphoto.io.sound_photographs import sound_photographs
 from jaxphoto.procedures import adjust
 from jaxphoto.procedures.control import at_optimum, control_block, control_block_with_targets
@@ -33,9 +33,7 @@ def control_command(
     block: Annotated[Path, typer.Argument(help="Block folder whose images are oriented.")],
     file: Annotated[
         Path,
-        typer.Argument(
-            help="Surveyed points: gcp_list.txt, markers of Metashape, GeoJSON, GeoPackage, geoin.dat of BINGO, CSV."
-        ),
+        typer.Argument(help=f"Surveyed points: {', '.join(FORMS)}."),
     ],
     out: Annotated[Path, typer.Option(help="Folder for block and result; earlier results in it are replaced.")],
     marks: Annotated[Path | None, typer.Option(help="Marks of the points, where FILE has none.")] = None,

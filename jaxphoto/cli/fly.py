@@ -25,7 +25,7 @@ from jaxphoto.image_measurement.matching import MatchedPhotographs, match_photog
 from jaxphoto.image_measurement.photograph_pairs import MostAlike, photograph_pairs, usual_choice, usual_count
 from jaxphoto.image_measurement.targets.on_ground import SYNTAX, read_target
 from jaxphoto.io.block_folder import whole_block
-from jaxphoto.io.control_files import read_control
+from jaxphoto.io.control_files import FORMS, read_control
 from jaxphoto.io.exports import write_photograph_files
 from jaxphoto.io.exposures import exposure_files, located
 from jaxphoto.io.kept_orientation import kept_orient
@@ -93,9 +93,7 @@ def fly_command(
             "heights (5773: EGM96) has its geoid added."
         ),
     ] = None,
-    control: Annotated[
-        Path | None, typer.Option(help="Surveyed points: gcp_list.txt, markers of Metashape as XML, or CSV.")
-    ] = None,
+    control: Annotated[Path | None, typer.Option(help=f"Surveyed points: {', '.join(FORMS)}.")] = None,
     marks: Annotated[Path | None, typer.Option(help="Marks of the points, where --control has none.")] = None,
     control_epsg: Annotated[
         str | None,
@@ -109,7 +107,7 @@ def fly_command(
 
     What cannot be used is left out and named. Exit code 1: written, but the verdict is red.
     """
-    check_folder(out, *photographs, *filter(None, (control, marks)))
+    check_folder(out, *photographs, *filter(None, (control, marks)), *(exposures or ()))
     if control is None and (marks or control_epsg or targets):
         raise InputError("something is told of control, but no points are given; add --control FILE")
     surveyed, target = read_control(control, marks) if control else None, read_target(targets) if targets else None

@@ -8,16 +8,18 @@ import csv
 import dataclasses
 import math
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import pandas as pd
 
-from jaxphoto.errors import BlockError, InputError, quoted, shown
+from jaxphoto.errors import BlockError, InputError, RowError, quoted, shown
 from jaxphoto.io.names import LONGEST, harm_in, harmless
 from jaxphoto.io.whole_text import LARGE, read_text
 
+T = TypeVar("T")
 # The index of a line in its table, from Python or from numpy.
 Line = int | np.integer
 # The columns in which a comma is not a decimal comma.
@@ -67,9 +69,15 @@ class Table:
         """The file and row of a line, as messages name it."""
         return f"{self.files[line]}, row {self.rows[line]}"
 
-    def bad(self, line: Line, message: str) -> InputError:
+    def bad(self, line: Line, message: str) -> RowError:
         """An error about the content of one line."""
-        return InputError(f"{self.place(line)}: {message}")
+        return RowError(f"{self.place(line)}: {message}", [int(self.rows[line])])
+
+    def check(self, wrong: np.ndarray, message: Callable[[Line], str]) -> None:
+        """Raise RowError, with the message of the first, for lines that are `wrong` (a mask)."""
+        lines = np.flatnonzero(wrong)
+        if len(lines):
+            raise RowError(f"{self.place(lines[0])}: {message(lines[0])}", self.rows[lines].tolist())
 
     def misfit(self, line: Line, message: str) -> BlockError:
         """An error about how one line fits the others."""
@@ -85,17 +93,15 @@ class Table:
     def ids(self, column: str) -> np.ndarray:
         """A column of ids, none of them empty."""
         values = self.names(column)
-        for line in np.flatnonzero(values == ""):
-            raise self.bad(line, f"the {column} is empty; give its id or delete the row")
+        self.check(values == "", lambda line: f"the {column} is empty; give its id or delete the row")
         return values
 
     def names(self, column: str) -> np.ndarray:
         """A column of ids, some of which may be empty; none does harm where results show it (`jaxphoto.io.names`)."""
         values = self.text(column)
         if not harmless(pd.unique(values).tolist()):
-            for line, name in enumerate(values):
-                if harm := harm_in(name):
-                    raise self.bad(line, f"the {column} {quoted(name)} {harm}")
+            harm = [harm_in(name) for name in values]
+            self.check(np.array(list(map(bool, harm))), lambda k: f"the {column} {quoted(values[k])} {harm[int(k)]}")
         return values
 
     def numbers(self, column: str, *, empty: bool = False) -> np.ndarray:
@@ -106,22 +112,22 @@ class Table:
         if cells.dtype in (object, _PACKED):
             cells = self._parsed(column, cells)
         else:
-            for line in np.flatnonzero(~np.isfinite(cells)):
-                raise self.bad(line, f"{column} is {cells[line]}; give a finite number")
-        for line in np.flatnonzero(np.abs(cells) > LARGEST):
-            raise self.bad(line, f"{column} is {cells[line]:g}, larger than any number can be here; correct it")
+            self.check(~np.isfinite(cells), lambda line: f"{column} is {cells[line]}; give a finite number")
+        self.check(
+            np.abs(cells) > LARGEST,
+            lambda line: f"{column} is {cells[line]:g}, larger than any number can be here; correct it",
+        )
         if not empty:
-            for line in np.flatnonzero(np.isnan(cells)):
-                raise self.bad(line, f"{column} is empty; give a number or delete the row")
+            self.check(np.isnan(cells), lambda line: f"{column} is empty; give a number or delete the row")
         return cells
 
     def sigmas(self, column: str) -> np.ndarray:
         """A column of standard deviations, positive where given and NaN where not."""
         values = self.numbers(column, empty=True)
-        for line in np.flatnonzero(values <= 0):
-            raise self.bad(
-                line, f"{column} is {values[line]:g}; a standard deviation is positive, so give its true value"
-            )
+        self.check(
+            values <= 0,
+            lambda line: f"{column} is {values[line]:g}; a standard deviation is positive, so give its true value",
+        )
         return values
 
     def _parsed(self, column: str, cells: np.ndarray) -> np.ndarray:
@@ -134,13 +140,11 @@ class Table:
             bad = np.strings.find(cells.astype(_PACKED), "_") >= 0
         except ValueError:
             bad = np.array([cell != "" and not is_number(cell) for cell in cells], bool)
-        for line in np.flatnonzero(bad):
-            raise self.bad(line, f"{column} is {quoted(cells[line])}, not a number; write it like 12.34")
-        for line in np.flatnonzero(filled & ~np.isfinite(values)):
-            raise self.bad(
-                line,
-                f"{column} is {quoted(cells[line])}; give a finite number, or leave the cell empty if it is unknown",
-            )
+        self.check(bad, lambda line: f"{column} is {quoted(cells[line])}, not a number; write it like 12.34")
+        self.check(
+            filled & ~np.isfinite(values),
+            lambda k: f"{column} is {quoted(cells[k])}; give a finite number, or leave the cell empty if it is unknown",
+        )
         return values
 
 
@@ -156,7 +160,13 @@ def concatenate(tables: Sequence[Table]) -> Table:
     )
 
 
-def read_csv(path: Path, needed: Sequence[str], optional: Sequence[str] = (), text: Sequence[str] = ()) -> Table:
+def read_csv(
+    path: Path,
+    needed: Sequence[str],
+    optional: Sequence[str] = (),
+    text: Sequence[str] = (),
+    without: Container[int] = (),
+) -> Table:
     """A CSV with a header: separated by commas, or by semicolons (then decimal commas are read too).
 
     Lines that start with `#` and empty lines are passed over, blanks around a cell are stripped, a byte order mark
@@ -165,7 +175,7 @@ def read_csv(path: Path, needed: Sequence[str], optional: Sequence[str] = (), te
 
     Raises InputError where the file, a needed column or a cell is missing, too many or too long.
     """
-    lines, rows = content_lines(path)
+    lines, rows = content_lines(path, without)
     if not lines:
         raise InputError(f"{path.name}: the file is empty; give it a header with the columns {', '.join(needed)}")
     separator = ";" if ";" in lines[0] else ","
@@ -212,12 +222,28 @@ def read_columns(path: Path, columns: Sequence[str], separator: str | None = ","
     return _of_short_cells(Table.of(path.name, cells, np.array(rows, int)))
 
 
-def content_lines(path: Path) -> tuple[list[str], list[int]]:
-    """The lines of a text file that are neither empty nor comments, and their row numbers."""
+def content_lines(path: Path, without: Container[int] = ()) -> tuple[list[str], list[int]]:
+    """The lines of a text file that are neither empty nor comments nor `without`, and their row numbers."""
     # Not splitlines(): that also ends lines at form feeds and other characters an editor does not count.
     lines = read_text(path, LARGE).split("\n")
-    rows = [row for row, line in enumerate(lines, 1) if line.strip() and not line.lstrip().startswith("#")]
+    content = lambda line: line.strip() and not line.lstrip().startswith("#")  # noqa: E731
+    rows = [row for row, line in enumerate(lines, 1) if content(line) and row not in without]
     return [lines[row - 1] for row in rows], rows
+
+
+def each_row(read: Callable[[int, str], T], numbered: Iterable[tuple[int, str]]) -> list[T]:
+    """What `read` makes of the rows and their lines. Raises the first RowError that it raises, with the rows of all."""
+    values: list[T] = []
+    first, rows = None, set[int]()
+    for row, line in numbered:
+        try:
+            values.append(read(row, line))
+        except RowError as error:
+            first = first or error
+            rows.update(error.rows)
+    if first is not None:
+        raise RowError(str(first), rows)
+    return values
 
 
 def _pieces(path: Path, lines: list[str], rows: list[int], separator: str, width: int) -> Iterator[list[list[str]]]:
@@ -231,23 +257,24 @@ def _pieces(path: Path, lines: list[str], rows: list[int], separator: str, width
             cells = text.split(separator)
             yield [cells[j::width] for j in range(width)]
         else:
-            numbered = zip(piece, rows[at : at + _PIECE], strict=True)
-            records = [_record(path, line, row, separator, width) for line, row in numbered]
+            numbered = zip(rows[at : at + _PIECE], piece, strict=True)
+            records = each_row(lambda row, line: _record(path, line, row, separator, width), numbered)
             yield list(map(list, zip(*records, strict=True)))
 
 
 def _record(path: Path, line: str, row: int, separator: str, width: int = 0) -> list[str]:
     """The cells of a line, as many as `width` (0: as there are, of the first line)."""
     if len(line) > LONGEST_LINE:
-        raise InputError(
+        raise RowError(
             f"{path.name}, row {row}: the row has {len(line)} characters, and one of a table has at most "
-            f"{LONGEST_LINE}; correct it"
+            f"{LONGEST_LINE}; correct it",
+            [row],
         )
     try:
         (record,) = csv.reader([line], delimiter=separator, skipinitialspace=True, strict=True)
     except csv.Error:
-        raise InputError(
-            f"{path.name}, row {row}: the quotation marks do not pair; close or remove them in that row"
+        raise RowError(
+            f"{path.name}, row {row}: the quotation marks do not pair; close or remove them in that row", [row]
         ) from None
     width = width or len(record)
     if width > MOST_COLUMNS:
@@ -256,9 +283,10 @@ def _record(path: Path, line: str, row: int, separator: str, width: int = 0) -> 
             "correct it"
         )
     if len(record) > width:
-        raise InputError(
+        raise RowError(
             f"{path.name}, row {row}: {len(record)} cells, but the header has {width}; remove the surplus ones"
-            + (" (decimal commas need semicolons between the columns)" if separator == "," else "")
+            + (" (decimal commas need semicolons between the columns)" if separator == "," else ""),
+            [row],
         )
     # Some spreadsheets leave out empty cells at the end of a row.
     return record + [""] * (width - len(record))

@@ -1,5 +1,6 @@
 """Files of exposures beside photographs: read, matched with their gaps, brought to the camera; the spoilt are named."""
 
+import re
 from datetime import datetime, timedelta
 
 import numpy as np
@@ -13,7 +14,7 @@ from jaxphoto.georeferencing.camera_attitude import CameraAttitude, level_from_b
 from jaxphoto.georeferencing.exposure_times import LEAP_SECONDS, WEEK_S, Taken
 from jaxphoto.georeferencing.gps import FIX_SIGMA_M, Gps, moved
 from jaxphoto.georeferencing.map_frame import MapFrame
-from jaxphoto.io.exposures import located, read_marks, read_pos, read_table, with_exposures
+from jaxphoto.io.exposures import located, read_exposures, read_marks, read_pos, read_table, with_exposures
 from jaxphoto.io.photographs import Photograph, photographs
 from jaxphoto.io.trajectory import write_sbet
 from tests import sound_files
@@ -479,3 +480,76 @@ def test_a_folder_of_pictures_and_all_that_lies_in_it(tmp_path):
     assert any("bad.MRK, row 1" in s and s.endswith("the file is not used") for s in said)
     with pytest.raises(InputError, match=r"bad.MRK, row 1"):
         located(read, [], [tmp_path / "bad.MRK"])
+
+
+TABLE_ROWS = "image,longitude_deg,latitude_deg,height_m,sigma_X_m,sigma_Y_m,sigma_Z_m\n" + "".join(
+    f"DJI_{k + 1:04}.JPG,{g.longitude_deg!r},{g.latitude_deg!r},{g.altitude_m:.4f},0.02,0.02,0.0456\n"
+    for k, g in enumerate(FLIGHT.camera)
+)
+# The file, and its first row with numbers.
+FORMS = {
+    "a.MRK": ("".join(FLIGHT.mark(k) for k in ALL), 1),
+    "a.pos": (HEAD + "".join(pos_line(FLIGHT.time[k], FLIGHT.antenna(k)) for k in ALL), 4),
+    "exposures.csv": (TABLE_ROWS, 2),
+    "pix4d.csv": (TABLE_ROWS.replace("image,long", "imagename;long").replace(",", ";"), 2),
+    "geo.txt": ("EPSG:4326\n" + "\n".join(TABLE_ROWS.replace(",", " ").split("\n")[1:]), 2),
+    "eo.txt": (OTHERS["pospac"][0], 17),
+}
+
+
+def at_row(text, row, change):
+    lines = text.split("\n")
+    lines[row - 1] = change(lines[row - 1])
+    return "\n".join(lines)
+
+
+@pytest.mark.parametrize("name", FORMS)
+def test_rows_that_are_wrong_are_left_out_and_named(tmp_path, name):
+    text, first = FORMS[name]
+    path = tmp_path / name
+    whole = read_exposures(written(path, text))
+    n = len(whole.rows)
+    assert whole.why == "" and whole.rows.tolist() == list(range(first, first + n))
+    put = lambda word: lambda line: re.sub(r"\d+\.\d{4,}", word, line, count=1)  # noqa: E731
+    letters = put("55.x")
+    spoilt = {
+        "letters": (at_row(text, first + 2, letters), [first + 2]),
+        "nan": (at_row(text, first, put("nan")), [first]),
+        # In the middle of a row, and where half a number is left: only the missing cells tell it.
+        "cut": (text.rstrip("\n")[:-30], [first + n - 1]),
+        "two": (at_row(at_row(text, first, letters), first + 1, lambda line: line[:25]), [first, first + 1]),
+    }
+    for kind, (spoilt_text, rows) in spoilt.items():
+        found = read_exposures(written(path, spoilt_text))
+        kept = ~np.isin(whole.rows, rows)
+        assert found.rows.tolist() == whole.rows[kept].tolist(), kind
+        np.testing.assert_array_equal(found.place, whole.place[kept])
+        assert found.without == tuple(rows) and re.search(f"; row ({'|'.join(map(str, rows))}): ", found.why)
+        assert f"{len(rows)} of {n} row" in found.why
+    worse = text
+    for row in range(first, first + n // 2):
+        worse = at_row(worse, row, letters)
+    with pytest.raises(InputError, match=r"row \d+: "):
+        read_exposures(written(path, worse))
+
+
+def test_what_is_wrong_with_a_whole_table_is_not_said_of_a_row(tmp_path):
+    text = table_of("imageName,X,Y,Z", "{0},{4},{5},{3}")
+    with pytest.raises(InputError, match="are map coordinates; give the EPSG code"):
+        read_exposures(written(tmp_path / "a.csv", at_row(text, 3, lambda line: line + '"')))
+    # Which of two rows of one name is right nobody knows.
+    found = read_exposures(
+        written(tmp_path / "a.csv", at_row(TABLE_ROWS, 5, lambda line: line.replace("0004", "0001")))
+    )
+    assert found.without == (2, 5) and "stands there twice" in found.why and len(found.rows) == 8
+
+
+def test_numbers_are_not_trusted_where_a_row_that_was_lost_may_have_hidden_that_they_began_anew(tmp_path):
+    """The first exposure is not in the file, which counts from 1, and a row in its middle is spoilt."""
+    steady = Flight()
+    steady.time = BEGIN_S + 3.0 * np.arange(10)
+    text = "".join(steady.mark(k, k) for k in range(1, 10))
+    file = read_exposures(written(tmp_path / "a.MRK", at_row(text, 4, lambda line: line.replace("55.", "x"))))
+    blind = [steady.photograph(k, gps=None) for k in ALL]
+    taken, said = with_exposures(blind, [file])
+    assert taken == blind and "not used" in said[0] and "1 of 9 rows is left out (4); row 4" in said[0]

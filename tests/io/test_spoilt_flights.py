@@ -104,3 +104,14 @@ def test_a_wrong_time_zone_of_marks_is_one_sentence(clean, tmp_path, zone_s, wor
     (before, sound), (said, found) = said_of(right), said_of(wrong)
     assert [words in s and s.endswith("which is taken off") for s in said if s not in before] == [True], said
     assert found == sound and all(g.heights == "ellipsoid" for g in found.values())
+
+
+def test_a_wrong_row_of_marks_is_one_sentence(clean, tmp_path):
+    right, wrong = (shutil.copytree(clean, tmp_path / name) for name in ("right", "wrong"))
+    for folder in (right, wrong):
+        marks(folder)
+    (wrong / "a.MRK").write_text((right / "a.MRK").read_text().replace("34\t", "34\tx"))
+    (before, sound), (said, found) = said_of(right), said_of(wrong)
+    mine = [s for s in said if s.startswith("a.MRK")]
+    assert len(mine) == 1 and mine[0] not in before and "1 of 10 rows is left out (4); row 4: " in mine[0], mine
+    assert [n for n, g in found.items() if g != sound[n]] == ["DJI_0004"] and found["DJI_0004"] is not None

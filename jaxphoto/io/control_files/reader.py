@@ -19,6 +19,9 @@ from jaxphoto.io.control_files.tables import read_table
 from jaxphoto.io.whole_text import SMALL, read_text
 from jaxphoto.procedures.control.surveyed import GivenControl, Marks, SurveyedPoints
 
+FORMS = ("gcp_list.txt", "markers of Metashape", "GeoJSON", "GeoPackage", "geoin.dat of BINGO", "CSV", "table of Pix4D")
+"""What `read_control` reads, in words."""
+
 
 def is_control_file(path: Path) -> bool:
     """Whether a file says by its content that it is control: any form but a plain table."""

@@ -1,11 +1,11 @@
 """Rows of control files whatever their form: cells with the place they stand at; points and marks gathered."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from jaxphoto.errors import InputError, quoted
+from jaxphoto.errors import InputError, RowError, quoted
 from jaxphoto.io.names import LONGEST, harm_in
 from jaxphoto.io.text_tables import LARGEST, finite
 from jaxphoto.procedures.control.surveyed import Marks, SurveyedPoints
@@ -27,9 +27,15 @@ class Cells(NamedTuple):
         """File and row, as messages name them."""
         return f"{self.file}, {self.called} {self.rows[k]}"
 
-    def bad(self, k: int, message: str) -> InputError:
+    def bad(self, k: int, message: str) -> RowError:
         """An error about one row."""
-        return InputError(f"{self.place(k)}: {message}")
+        return RowError(f"{self.place(k)}: {message}", [self.rows[k]])
+
+    def check(self, sound: Sequence[bool] | np.ndarray, message: Callable[[int], str]) -> None:
+        """Raise RowError, with the message of the first, for rows that are not `sound`."""
+        wrong = [k for k, good in enumerate(sound) if not good]
+        if wrong:
+            raise RowError(f"{self.place(wrong[0])}: {message(wrong[0])}", [self.rows[k] for k in wrong])
 
     def none(self, message: str) -> InputError:
         """An error about all of them."""

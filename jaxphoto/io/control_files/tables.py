@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxphoto.errors import InputError, counted, quoted
+from jaxphoto.errors import RowError, counted, quoted
 from jaxphoto.io.control_files.rows import Cells, Mark, SurveyRows, read_marks
 from jaxphoto.io.control_files.table_header import (
     Columns,
@@ -133,16 +133,18 @@ def separator_of(line: str) -> str:
 def split_row(file: str, line: str, row: int, separator: str) -> list[str]:
     """The cells of a row. Raises InputError for one that is too long, and for quotation marks that do not pair."""
     if len(line) > LONGEST_LINE:
-        raise InputError(f"{file}, row {row}: the row has {len(line)} characters, at most {LONGEST_LINE}; correct it")
+        raise RowError(
+            f"{file}, row {row}: the row has {len(line)} characters, at most {LONGEST_LINE}; correct it", [row]
+        )
     if separator == " ":
         cells = line.split()
     else:
         try:
             (cells,) = csv.reader([line], delimiter=separator, skipinitialspace=True, strict=True)
         except csv.Error:
-            raise InputError(f"{file}, row {row}: the quotation marks do not pair; close or remove them") from None
+            raise RowError(f"{file}, row {row}: the quotation marks do not pair; close or remove them", [row]) from None
     if len(cells) > MOST_COLUMNS:
-        raise InputError(f"{file}, row {row}: the row has {len(cells)} cells, at most {MOST_COLUMNS}; correct it")
+        raise RowError(f"{file}, row {row}: the row has {len(cells)} cells, at most {MOST_COLUMNS}; correct it", [row])
     return [cell.strip() for cell in cells]
 
 

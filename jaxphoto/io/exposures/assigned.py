@@ -69,7 +69,7 @@ def with_exposures(photographs: Sequence[Photograph], files: Sequence[Exposures]
             state, sentence = _along(state, file, arm)
         else:
             state, sentence = _events(state, file, arm)
-        said.append(f"{file.file}: {sentence}")
+        said.append("; ".join(filter(None, (f"{file.file}: {sentence}", file.why))))
     if arm is not None and any(state.own) and not any(f.of_antenna for f in files):
         state, sentence = _own_arm(state, arm)
         said.append(sentence)

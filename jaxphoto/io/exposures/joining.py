@@ -75,11 +75,15 @@ def by_marks(
 
 
 def _perhaps_anew(photographs: Sequence[Photograph], file: Exposures) -> bool:
-    """Whether the numbers of a file run from 1 without a gap, and end before those of the photographs do."""
+    """Whether the numbers of a file run from 1 without a gap, and end before those of the photographs do.
+
+    Any gap may be that of a row that was left out.
+    """
     assert file.sequence is not None
-    n = len(file.sequence)
+    n = len(file.sequence) + len(file.without)
     numbers = [int(found[1]) for p in photographs if (found := _NUMBER.search(p.name))]
-    return np.array_equal(np.sort(file.sequence), np.arange(1, n + 1)) and max(numbers, default=0) > n
+    first, last = int(file.sequence.min()), int(file.sequence.max())
+    return first >= 1 and last <= n < max(numbers, default=0)
 
 
 def by_number(photographs: Sequence[Photograph], file: Exposures, clock: Clock) -> Matched | None:

@@ -1,6 +1,7 @@
 """Photographs with all that their files and those beside them say of where they were taken."""
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from jaxphoto.errors import InputError, shown
@@ -11,6 +12,7 @@ from jaxphoto.io.exposures.marks import read_marks
 from jaxphoto.io.exposures.records import Exposures
 from jaxphoto.io.exposures.rtklib import read_pos
 from jaxphoto.io.exposures.sbet import read_sbet_exposures
+from jaxphoto.io.exposures.sound_rows import of_sound_rows
 from jaxphoto.io.exposures.table import read_table
 from jaxphoto.io.photographs import Photograph
 
@@ -55,16 +57,17 @@ def located(
 def read_exposures(path: Path, code: int | None = None, heights: Heights = "unknown") -> Exposures:
     """The exposures or the trajectory of one file, by its ending: .MRK, .pos, .sbet or .out, else a table.
 
-    `code` is the EPSG system of a table's map coordinates, `heights` what its heights are above. Raises InputError.
+    `code` is the EPSG system of a table's map coordinates, `heights` what its heights are above. Rows of text that are
+    wrong are left out, which `Exposures.why` says. Raises InputError, naming file and row, where half of them are.
     """
     suffix = path.suffix.lower()
-    if suffix == ".mrk":
-        return read_marks(path)
-    if suffix == ".pos":
-        return read_pos(path)
     if suffix in (".sbet", ".out"):
         return read_sbet_exposures(path)
-    return read_table(path, code, heights)
+    if suffix == ".mrk":
+        return of_sound_rows(path, partial(read_marks, path))
+    if suffix == ".pos":
+        return of_sound_rows(path, partial(read_pos, path))
+    return of_sound_rows(path, partial(read_table, path, code, heights))
 
 
 def exposure_files(folder: Path) -> list[Path]:

@@ -9,15 +9,16 @@ RTK, "Timestamp.MRK Information").
 """
 
 import re
+from collections.abc import Container
 from pathlib import Path
 
 import numpy as np
 
-from jaxphoto.errors import InputError, quoted
+from jaxphoto.errors import InputError, RowError, quoted
 from jaxphoto.georeferencing.exposure_times import WEEK_S
 from jaxphoto.io.exposures.records import Exposures, check_places
 from jaxphoto.io.photograph_metadata import fix_of
-from jaxphoto.io.text_tables import content_lines
+from jaxphoto.io.text_tables import content_lines, each_row
 
 _NUMBER = r"([-+]?\d{1,12}(?:\.\d{1,15})?)"
 _LINE = re.compile(
@@ -27,18 +28,22 @@ _LINE = re.compile(
 )
 
 
-def read_marks(path: Path) -> Exposures:
-    """The exposures of a MRK file. Raises InputError, naming file and row, for a line of another form."""
-    lines, rows = content_lines(path)
-    values = np.empty((len(lines), 13))
-    for k, (line, row) in enumerate(zip(lines, rows, strict=True)):
+def read_marks(path: Path, without: Container[int] = ()) -> Exposures:
+    """The exposures of a MRK file, but for the rows `without`. Raises InputError, naming file
+    and row."""
+    lines, rows = content_lines(path, without)
+
+    def numbers_of(row: int, line: str) -> list[float]:
         found = _LINE.fullmatch(line) if len(line) < 1000 else None
         if found is None:
-            raise InputError(
+            raise RowError(
                 f"{path.name}, row {row}: {quoted(line.strip())} is no line of time marks, as 12 268619.354 [2129] "
-                "24,N 9,E 193,V 22.97,Lat 113.93,Lon 91.07,Ellh 0.01, 0.01, 0.02 50,Q; delete or complete it"
+                "24,N 9,E 193,V 22.97,Lat 113.93,Lon 91.07,Ellh 0.01, 0.01, 0.02 50,Q; delete or complete it",
+                [row],
             )
-        values[k] = [float(cell) for cell in found.groups()]
+        return [float(cell) for cell in found.groups()]
+
+    values = np.array(each_row(numbers_of, zip(rows, lines, strict=True)))
     if not len(values):
         raise InputError(f"{path.name}: the file has no time marks; leave it out, or copy it anew")
     number, second, week, north, east, down, latitude, longitude, height, s_north, s_east, s_up, flag = values.T

@@ -16,6 +16,7 @@ Sources: Pix4D support, articles 202558539 and 202558969; OpenDroneMap documenta
 """
 
 import re
+from collections.abc import Container
 from pathlib import Path
 from typing import NamedTuple
 
@@ -27,7 +28,7 @@ from jaxphoto.io.control_files.rows import Cells
 from jaxphoto.io.control_files.table_header import PLACE, Columns, columns_of, in_degrees
 from jaxphoto.io.control_files.tables import separator_of, split_row, with_points
 from jaxphoto.io.exposures.pospac import read_pospac
-from jaxphoto.io.text_tables import Table, is_number
+from jaxphoto.io.text_tables import Table, each_row, is_number
 from jaxphoto.io.whole_text import LARGE, read_text
 from jaxphoto.procedures.control.system import ControlSystem, system_of
 
@@ -67,13 +68,14 @@ class OtherTable(NamedTuple):
     """Whether the file says that its heights are above the ellipsoid."""
 
 
-def read_other_table(path: Path) -> OtherTable | None:
-    """The table in a file; None where neither its first line nor a comment names the columns.
+def read_other_table(path: Path, without: Container[int] = ()) -> OtherTable | None:
+    """The table in a file but for the rows `without`; None where neither its first line nor a comment names columns.
 
     Raises InputError for rows that are too short, angles in gon, and a system that nobody can tell; and as
     `read_pospac`.
     """
-    numbered = [(row, line) for row, line in enumerate(read_text(path, LARGE).split("\n"), 1) if line.strip()]
+    lines = enumerate(read_text(path, LARGE).split("\n"), 1)
+    numbered = [(row, line) for row, line in lines if line.strip() and row not in without]
     content = [(row, line) for row, line in numbered if not line.lstrip().startswith("#")]
     if not content:
         return None
@@ -85,9 +87,8 @@ def read_other_table(path: Path) -> OtherTable | None:
         return OtherTable(_table(own, columns, known, False), known, False, ellipsoid=True)
     comments = [line.strip() for _, line in numbered[:_HEAD] if line.lstrip().startswith("#")]
     separator = separator_of(content[0][1])
-    cells = Cells(
-        path.name, [split_row(path.name, line, row, separator) for row, line in content], [row for row, _ in content]
-    )
+    records = each_row(lambda row, line: split_row(path.name, line, row, separator), content)
+    cells = Cells(path.name, records, [row for row, _ in content])
     said_in = [line.lstrip("# ").split(None if separator == " " else separator) for line in comments]
     for k, header in enumerate((cells.records[0], *said_in)):
         columns = columns_of(header, _WORDS)
@@ -111,11 +112,11 @@ def read_other_table(path: Path) -> OtherTable | None:
 def _of_open_drone_map(file: str, content: list[tuple[int, str]]) -> OtherTable:
     """geo.txt, whose columns have no names."""
     cells = Cells(file, [line.split() for _, line in content[1:]], [row for row, _ in content[1:]])
-    for k, row in enumerate(cells.records):
-        if len(row) < _LEAST_ODM or not all(map(is_number, row[1 : len(_OF_ODM)])):
-            raise cells.bad(
-                k, "after the name stand x, y, z, and yaw, pitch, roll and accuracies or nothing; correct it"
-            )
+    sound = [len(row) >= _LEAST_ODM and all(map(is_number, row[1 : len(_OF_ODM)])) for row in cells.records]
+    cells.check(
+        sound, lambda k: "after the name stand x, y, z, and yaw, pitch, roll and accuracies or nothing; correct it"
+    )
+    for row in cells.records:
         if len(row) > 6 and all(float(cell) == 0 for cell in row[4:7]):
             row[4:7] = ["", "", ""]
     width = max(map(len, cells.records), default=0)
@@ -149,9 +150,12 @@ def _table(cells: Cells, columns: Columns, system: ControlSystem | None, degrees
         if not all(name in columns for name in of):
             wanted = {name: k for name, k in wanted.items() if name.removeprefix("sigma_")[:-4] not in of}
     kept, rows = [], []
+    least = max(columns[name] for name in ("image", "x", "y"))
+    cells.check(
+        [len(row) > least for row in cells.records],
+        lambda k: f"{len(cells.records[k])} cells are too few for the columns; complete the row",
+    )
     for k, row in enumerate(cells.records):
-        if len(row) <= max(columns[name] for name in ("image", "x", "y")):
-            raise cells.bad(k, f"{len(row)} cells are too few for the columns; complete the row")
         if "enabled" not in columns or len(row) <= columns["enabled"] or row[columns["enabled"]].lower() not in _OFF:
             kept.append(row)
             rows.append(cells.rows[k])

@@ -58,9 +58,10 @@ def read_pospac(cells: Cells) -> tuple[Cells, dict[str, int], ControlSystem | No
         raise cells.none(f"its angles turn about {first[1]} first: export omega, phi, kappa, which begin about x")
     rows = [k for k in range(begins + 1, len(lines)) if lines[k].strip() and not lines[k].lstrip().startswith("(")]
     own = Cells(cells.file, [lines[k].replace(",", " ").split() for k in rows], [cells.rows[k] for k in rows])
-    for k, record in enumerate(own.records):
-        if len(record) != len(header):
-            raise own.bad(k, f"{len(record)} cells, and the header has {len(header)}; complete the row")
+    own.check(
+        [len(record) == len(header) for record in own.records],
+        lambda k: f"{len(own.records[k])} cells, and the header has {len(header)}; complete the row",
+    )
     system = _mapping_frame(cells.file, head)
     if system is not None and {"LAT", "LONG"} <= set(header):
         _check_places(own, header, system)
@@ -104,9 +105,10 @@ def _check_places(cells: Cells, header: list[str], system: ControlSystem) -> Non
     place = np.array([[np.nan if v is None else v for v in row] for row in read]).reshape(-1, 4)
     on_map = Transformer.from_crs(system.crs.geodetic_crs, system.crs, always_xy=True)
     off = np.hypot(*(np.stack(on_map.transform(place[:, 0], place[:, 1])) - place[:, 2:].T))
-    for k in np.flatnonzero(off > _SAME_M)[:1].tolist():
-        raise cells.bad(
-            k,
+    cells.check(
+        ~(off > _SAME_M),
+        lambda k: (
             f"its easting and northing lie {off[k]:.3g} m from its latitude and longitude in {system.name}, which the "
-            "head says: export it anew, or leave the columns LAT and LONG out",
-        )
+            "head says: export it anew, or leave the columns LAT and LONG out"
+        ),
+    )

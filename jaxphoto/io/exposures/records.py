@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxphoto.errors import InputError
+from jaxphoto.errors import RowError
 from jaxphoto.georeferencing.camera_attitude import CameraAttitude
 from jaxphoto.georeferencing.gps import Fix, Gps, Heights
 
@@ -35,6 +35,10 @@ class Exposures(NamedTuple):
     aircraft_deg: Float[np.ndarray, "n 3"] | None = None
     """Roll, pitch, yaw."""
     attitude: tuple[CameraAttitude | None, ...] = ()
+    without: tuple[int, ...] = ()
+    """Rows that are wrong, and left out."""
+    why: str = ""
+    """Which they are, and what is wrong, in words."""
 
     def gps(self, k: int) -> Gps | None:
         """The position of line `k`; None where it has none."""
@@ -53,10 +57,12 @@ class Exposures(NamedTuple):
 
 
 def check_places(file: str, rows: np.ndarray, place: np.ndarray) -> None:
-    """Raise InputError, naming file and row, for a longitude or latitude that cannot be."""
-    for k, axis in np.argwhere(np.abs(place[:, :2]) > [360.0, 90.0])[:1]:
+    """Raise RowError for a longitude or latitude that cannot be."""
+    beyond = np.argwhere(np.abs(place[:, :2]) > [360.0, 90.0])
+    for k, axis in beyond[:1]:
         name = ("longitude", "latitude")[axis]
-        raise InputError(
+        raise RowError(
             f"{file}, row {rows[k]}: the {name} {place[k, axis]:g} degrees cannot be; give longitude and latitude in "
-            "the columns of their names, in degrees"
+            "the columns of their names, in degrees",
+            rows[beyond[:, 0]].tolist(),
         )

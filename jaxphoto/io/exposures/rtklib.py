@@ -6,17 +6,19 @@ point), satellites, and standard deviations north, east, up (RTKLIB ver. 2.4.2, 
 File").
 """
 
+from collections.abc import Container
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from jaxphoto.errors import InputError, quoted
+from jaxphoto.errors import InputError, RowError, quoted
 from jaxphoto.georeferencing.exposure_times import LEAP_SECONDS, WEEK_S
 from jaxphoto.georeferencing.gps import Fix, Heights
 from jaxphoto.io.exposures.records import Exposures, check_places
 from jaxphoto.io.photograph_times import seconds
-from jaxphoto.io.text_tables import finite
+from jaxphoto.io.text_tables import each_row, finite
 from jaxphoto.io.whole_text import LARGE, read_text
 
 # Seconds by which the clock is behind GPS time.
@@ -25,9 +27,11 @@ _FIX: dict[int, Fix] = {1: "fixed", 2: "float", 3: "single", 4: "single", 5: "si
 _LONGEST = 1000
 
 
-def read_pos(path: Path) -> Exposures:
-    """The records of a `.pos` file, times in GPS time. Raises InputError, naming file and row."""
-    clock, heights, values, rows = "GPST", "unknown", [], []
+def read_pos(path: Path, without: Container[int] = ()) -> Exposures:
+    """The records of a `.pos` file, times in GPS time, but for the rows `without`. Raises InputError, naming file
+    and row."""
+    clock, heights = "GPST", "unknown"
+    records: list[tuple[int, str]] = []
     geodetic = True
     for row, line in enumerate(read_text(path, LARGE).split("\n"), 1):
         if line.lstrip().startswith("%"):
@@ -37,17 +41,17 @@ def read_pos(path: Path) -> Exposures:
                 geodetic = False
             if "lat/lon/height=" in line:
                 heights = "ellipsoid" if "ellipsoidal" in line else "geoid"
-        elif line.strip():
+        elif line.strip() and row not in without:
             if not geodetic:
                 raise InputError(
                     f"{path.name}: its positions are no latitudes and longitudes in degrees; write the solution again "
                     "with the format Lat/Lon/Height, ddd.ddddddd"
                 )
-            values.append(_record(path.name, row, line[:_LONGEST]))
-            rows.append(row)
-    if not values:
+            records.append((row, line[:_LONGEST]))
+    if not records:
         raise InputError(f"{path.name}: the file has no positions; leave it out, or write the solution again")
-    table, numbers = np.array(values), np.array(rows)
+    table = np.array(each_row(partial(_record, path.name), records))
+    numbers = np.array([row for row, _ in records])
     time, latitude, longitude, height, q, north, east, up = table.T
     place, sigma = np.stack([longitude, latitude, height], axis=1), np.stack([east, north, up], axis=1)
     check_places(path.name, numbers, place)
@@ -64,9 +68,10 @@ def _record(file: str, row: int, line: str) -> list[float]:
     numbers = [finite(cell) for cell in cells[2:10]]
     q = numbers[3] if len(numbers) > 3 else None
     if time is None or None in numbers or q is None or not (q.is_integer() and 0 <= q <= 9):
-        raise InputError(
+        raise RowError(
             f"{file}, row {row}: {quoted(line.strip())} is no record such as 2024/05/01 10:00:00.000 48.1 11.5 560.2 1 "
-            "12 0.01 0.01 0.02; delete or complete it"
+            "12 0.01 0.01 0.02; delete or complete it",
+            [row],
         )
     known = [v for v in numbers if v is not None]
     return [time, *known[:4], *(known[5:8] if len(known) == 8 else [np.nan] * 3)]
@@ -78,7 +83,9 @@ def _time(cells: list[str]) -> float | None:
     try:
         if "/" in cells[0]:
             clock, _, digits = cells[1].partition(".")
-            part = float(f"0.{digits}") if digits.isascii() and digits.isdigit() and len(digits) < 16 else 0.0
+            part = finite(f"0.{digits[:15]}")
+            if part is None or (digits and not digits.isdigit()):
+                return None
             return seconds(datetime.strptime(f"{cells[0]} {clock}", "%Y/%m/%d %H:%M:%S")) + part
     except ValueError:
         return None

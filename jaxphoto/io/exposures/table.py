@@ -1,5 +1,7 @@
 """A table of exposures, one line a photograph: our own, a CSV with a header, or another's (docs/exposures.md)."""
 
+from collections import Counter
+from collections.abc import Container
 from pathlib import Path, PureWindowsPath
 from typing import get_args
 
@@ -23,15 +25,22 @@ _SIGMA_OPK, _SIGMA_RPY = tuple(f"sigma_{name}" for name in _OPK), tuple(f"sigma_
 _LARGEST_DEG = 360.0
 
 
-def read_table(path: Path, code: int | None = None, heights: Heights = "unknown") -> Exposures:
+def read_table(
+    path: Path, code: int | None = None, heights: Heights = "unknown", without: Container[int] = ()
+) -> Exposures:
     """The exposures of a CSV: image, and X_m, Y_m, Z_m (EPSG system `code`) or longitude_deg, latitude_deg, height_m.
 
     Optional are omega_deg, phi_deg, kappa_deg or roll_deg, pitch_deg, yaw_deg (of the camera: all zero where it looks
     down with the top of its picture to the north that the coordinates have), standard deviations sigma_X_m ...
     sigma_yaw_deg, and fix (fixed, float, single). Tables of other programs are those of `other_tables`; a system that
-    they name counts, not `code`. Raises InputError, naming file and row.
+    they name counts, not `code`. The rows `without` are passed over. Raises InputError, naming file
+    and row.
     """
-    read = _read_own(path) or read_other_table(path) or OtherTable(read_csv(path, ("image",)), None, False)
+    read = (
+        _read_own(path, without)
+        or read_other_table(path, without)
+        or OtherTable(read_csv(path, ("image",), without=without), None, False)
+    )
     table, system, vertical = read.table, read.system, None
     if system is not None and system.crs is not None:
         code, vertical = system.code, system.vertical
@@ -39,10 +48,9 @@ def read_table(path: Path, code: int | None = None, heights: Heights = "unknown"
         heights = "ellipsoid" if on_ellipsoid else heights
     # Windows' strokes are read everywhere.
     ids = [PureWindowsPath(name).stem for name in table.ids("image")]
-    twice = {name for name in ids if ids.count(name) > 1} if len(set(ids)) < len(ids) else set()
-    for line, name in enumerate(ids):
-        if name in twice:
-            raise table.bad(line, f"the image {quoted(name)} stands there twice; keep one of the lines")
+    often = Counter(ids)
+    twice = np.array([often[name] > 1 for name in ids], bool)
+    table.check(twice, lambda k: f"the image {quoted(ids[int(k)])} stands there twice; keep one of the lines")
     on_map = _set_of(table, MAP, GEOGRAPHIC, "positions") is MAP
     if on_map and code is None:
         raise InputError(f"{path.name}: its positions are map coordinates; give the EPSG code of their system (--epsg)")
@@ -67,14 +75,14 @@ def read_table(path: Path, code: int | None = None, heights: Heights = "unknown"
     )
 
 
-def _read_own(path: Path) -> OtherTable | None:
+def _read_own(path: Path, without: Container[int]) -> OtherTable | None:
     """A table whose header has the names of one set of positions, as they are; None for another."""
-    lines, _ = content_lines(path)
+    lines, _ = content_lines(path, without)
     header = {cell.strip() for cell in lines[0].replace(";", ",").split(",")} if lines else set()
     if not lines or "image" not in header or not any(header.issuperset(names) for names in (MAP, GEOGRAPHIC)):
         return None
     optional = (*MAP, *GEOGRAPHIC, *_OPK, *_RPY, *_SIGMA_M, *_SIGMA_OPK, *_SIGMA_RPY, "fix")
-    return OtherTable(read_csv(path, ("image",), optional, text=("fix",)), None, False)
+    return OtherTable(read_csv(path, ("image",), optional, text=("fix",), without=without), None, False)
 
 
 def _set_of(table: Table, one: tuple[str, ...], other: tuple[str, ...], what: str) -> tuple[str, ...] | None:
@@ -99,8 +107,8 @@ def _from_map(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Longitude, latitude, height of WGS 84, and the turns from axes of the map's grid to those of true north."""
     place = MapFrame(code, vertical, (0.0, 0.0, 0.0)).place(coordinates)
-    for k in np.flatnonzero(~np.isfinite(place).all(axis=1))[:1]:
-        raise table.bad(int(k), f"the coordinates lie where EPSG:{code} does not reach; correct them or the code")
+    outside = ~np.isfinite(place).all(axis=1)
+    table.check(outside, lambda _: f"the coordinates lie where EPSG:{code} does not reach; correct them or the code")
     frame = MapFrame(code, None, (*np.median(place[:, :2], axis=0).tolist(), 0.0))
     local = frame.local_from_place(place)
     turn = np.swapaxes(frame.local_from_level(local), 1, 2) @ frame.local_from_grid(local)
@@ -115,11 +123,14 @@ def _attitudes(table: Table, level_from_axes: np.ndarray):
         return
     angles = np.stack([table.numbers(name, empty=True) for name in names], axis=1)
     told = np.isfinite(angles)
-    for k in np.flatnonzero(told.any(axis=1) & ~told.all(axis=1))[:1]:
-        raise table.bad(int(k), f"{names[int(np.argmin(told[k]))]} is empty; give all three angles, or none")
+    table.check(
+        told.any(axis=1) & ~told.all(axis=1),
+        lambda k: f"{names[int(np.argmin(told[k]))]} is empty; give all three angles, or none",
+    )
     angles = np.nan_to_num(angles)
-    for k, axis in np.argwhere(np.abs(angles) > _LARGEST_DEG)[:1]:
-        raise table.bad(int(k), f"{names[axis]} = {angles[k, axis]:g} is more than a turn; give degrees")
+    for name, angle in zip(names, angles.T, strict=True):
+        large = np.abs(angle) > _LARGEST_DEG
+        table.check(large, lambda k: f"{name} = {angle[k]:g} is more than a turn; give degrees")  # noqa: B023
     sigma = np.stack([table.sigmas(name) for name in (_SIGMA_OPK if names is _OPK else _SIGMA_RPY)], axis=1)
     if names is _OPK:
         # Near the nadir, which is what such tables are of: omega is about x, right, as pitch; phi about y, as roll.
@@ -133,11 +144,12 @@ def _attitudes(table: Table, level_from_axes: np.ndarray):
 
 
 def _fixes(table: Table):
-    known = get_args(Fix)
-    for line, cell in enumerate(table.text("fix")):
-        if cell and cell not in known:
-            raise table.bad(line, f"fix is {quoted(cell)}; give one of {', '.join(known)}, or nothing")
-        yield cell or "unknown"
+    known, cells = get_args(Fix), table.text("fix")
+    table.check(
+        np.array([cell not in ("", *known) for cell in cells], bool),
+        lambda k: f"fix is {quoted(cells[k])}; give one of {', '.join(known)}, or nothing",
+    )
+    yield from (cell or "unknown" for cell in cells)
 
 
 _matrices = jit_quickly(jax.vmap(matrix_from_omega_phi_kappa))
