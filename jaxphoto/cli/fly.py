@@ -161,6 +161,7 @@ def fly_command(
                 None if no_lens_prior else known_lens(read, camera, distortion),
                 taken if rolling_shutter else None,
                 vertical,
+                sorted(taken, key=lambda name: taken[name][0]) if len(taken) == len(read) else (),
             ),
             status.update,
             kept_orient(keep),

@@ -59,6 +59,8 @@ class KnownOfFlight(NamedTuple):
     """When photographs were taken; given where a rolling shutter is to be estimated."""
     vertical: int | None = None
     """EPSG code of the heights of the map system; None: above the ellipsoid."""
+    order: Sequence[str] = ()
+    """Names in the order of their exposures; where there are none, photographs are in that of their names."""
 
 
 class FlightPart(NamedTuple):
@@ -140,7 +142,7 @@ def _calibrated(
     else:
         try:
             placed = georeference_photographs(
-                oriented.block, known.positions, known.code, known.attitudes, known.vertical
+                oriented.block, known.positions, known.code, known.attitudes, known.vertical, known.order
             )
         except (InputError, BlockError) as error:
             why_not = str(error)

@@ -6,7 +6,7 @@ that disagree are left out, each named.
 """
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -26,6 +26,8 @@ from jaxphoto.observations import StationRows
 from jaxphoto.procedures.attitudes_of_photographs import RecordedTurn, recorded_turn, with_attitudes
 from jaxphoto.procedures.georeferencing_words import attitude_words, position_words
 from jaxphoto.procedures.orientation.onto_known import Similarity, similarity_between
+from jaxphoto.procedures.position_parts import position_parts, with_part_shifts
+from jaxphoto.variants import without_stations
 
 SIGMA_M = (2.0, 2.0, 4.0)
 """Of positions of a receiver without corrections, east, north and up, where the file says none and they scatter less:
@@ -55,9 +57,11 @@ class GeoreferencedPhotographs(NamedTuple):
     images: tuple[str, ...]
     """Those that have a position; rows of what follows."""
     offsets_m: Float[np.ndarray, "images 3"]
-    """Recorded minus that of the network after the similarity: east, north, up."""
+    """Recorded minus that of the network after the similarity: east, north, up, less what parts are off by."""
     used: Bool[np.ndarray, "images"]
     sentences: tuple[str, ...]
+    steps: tuple[str, ...] = ()
+    """Of each step of the positions a sentence."""
 
 
 def georeference_photographs(
@@ -66,6 +70,7 @@ def georeference_photographs(
     code: int | None = None,
     attitudes: Mapping[str, CameraAttitude | None] | None = None,
     vertical: int | None = None,
+    order: Sequence[str] = (),
 ) -> GeoreferencedPhotographs:
     """`block`, oriented as a free network, in the EPSG system `code` (else UTM), with the `positions` of its images.
 
@@ -74,6 +79,7 @@ def georeference_photographs(
     The positions are brought from WGS 84 to the datum of the system, heights above the ellipsoid as well; other heights
     are taken as the files have them. The stations' standard deviations are those of the file, else `SIGMA_M`.
     Where `attitudes` tell the turn better than the positions do, as of a single strip, they are observed as well.
+    Positions that step, in the `order` of exposures (else of the block), have a shift by part (`position_steps`).
 
     Raises InputError where fewer than three positions agree, or all lie on a line that no attitudes turn, and for
     codes that are unknown, or heights whose geoid is not at hand.
@@ -102,19 +108,19 @@ def georeference_photographs(
     given = np.array([gps.stated_sigma_m or SIGMA_M for gps in known.values()])
     # Where no file says how good its positions are, they are judged by one another alone.
     own = given if any(gps.stated_sigma_m for gps in known.values()) else np.zeros_like(given)
-    helping = None
-    if isinstance(recorded, RecordedTurn):
-        similarity, used = _turned(there, here, recorded.turn, own)
-        helping = recorded if recorded.turn_sigma_rad < _turn_sigma(here[used], given[used]) else None
-    if helping is None:
-        similarity, used = _agreeing(there, here, own)
+    similarity, used, helping = _fitted(there, here, given, own, recorded)
+    stated = given if own.any() else np.zeros_like(given)
+    parts = position_parts(list(known), order, here - similarity.of(there), here, np.median(stated, axis=0))
+    raw, here = here, here - parts.off_m
+    if parts.sentences:
+        similarity, used, helping = _fitted(there, here, given, own, recorded)
     sigma = _sigmas(list(known.values()), (here - similarity.of(there))[used])
     similarity = _nearest(similarity, there[used], here[used], sigma[used], helping)
     _check_upright(block, similarity)
     rows, axis = np.flatnonzero(used).repeat(3), np.tile(np.arange(3), used.sum())
-    stations = StationRows(image[rows], axis, here[rows, axis], sigma[rows, axis])
+    stations = StationRows(image[rows], axis, raw[rows, axis], sigma[rows, axis])
     placed = dataclasses.replace(
-        similarity.of_block(block),
+        with_part_shifts(similarity.of_block(block), parts, image),
         stations=stations,
         datum=Datum(),
         frame=Frame("epsg", code, vertical, origin=origin),
@@ -127,7 +133,7 @@ def georeference_photographs(
         *position_words(map_name(code, vertical), block.images, known, offsets, used, sigma),
         *attitude_words(recorded, helping is not None, similarity.turn),
     )
-    return GeoreferencedPhotographs(placed, tuple(known), offsets, used, said)
+    return GeoreferencedPhotographs(placed, tuple(known), offsets, used, said, parts.sentences)
 
 
 def as_they_scatter(
@@ -165,7 +171,22 @@ def held_in_place(placed: GeoreferencedPhotographs, datum: Datum) -> Georeferenc
     here, sigma = (np.asarray(v, float).reshape(-1, 3) for v in (stations.value, stations.sigma))
     if not _turn_sigma(here, sigma) <= _HELD_RAD:
         return None
-    return placed._replace(block=dataclasses.replace(placed.block, stations=StationRows.none(), datum=datum))
+    return placed._replace(block=without_stations(dataclasses.replace(placed.block, datum=datum)))
+
+
+def _fitted(
+    there: Float[np.ndarray, "n 3"],
+    here: Float[np.ndarray, "n 3"],
+    given: Float[np.ndarray, "n 3"],
+    own: Float[np.ndarray, "n 3"],
+    recorded: RecordedTurn | str | None,
+) -> tuple[Similarity, np.ndarray, RecordedTurn | None]:
+    """The similarity of most positions, which agree with it, and the attitudes where these tell the turn better."""
+    if isinstance(recorded, RecordedTurn):
+        similarity, used = _turned(there, here, recorded.turn, own)
+        if recorded.turn_sigma_rad < _turn_sigma(here[used], given[used]):
+            return similarity, used, recorded
+    return *_agreeing(there, here, own), None
 
 
 def _check_upright(block: Block, similarity: Similarity) -> None:

@@ -88,9 +88,10 @@ def without_names(block: Block, ids: tuple[str, ...]) -> Block:
 
 def with_gnss_bias(block: Block) -> Block:
     """`block` whose stations have a common shift, which control tells: another zero of heights, another datum."""
-    if "flight_bias" in block.start.unknowns.more or block.start.unknowns.strips:
-        return block
     unknowns, zero = block.start.unknowns, np.zeros(3)
+    # Beside a part of the flight that has none, the shifts of others count from it.
+    if "flight_bias" in unknowns.more or (unknowns.strips and unknowns.strips.keys() >= set(block.image_strip)):
+        return block
     bias: dict[str, AbstractParameters] = {"": FlightBias(zero, zero)}  # type: ignore[arg-type]
     known: dict[str, AbstractParameters] = {"": FlightBias(FREE, FIXED)}  # type: ignore[arg-type]
     more, priors = unknowns.more | {"flight_bias": bias}, block.priors.more | {"flight_bias": known}

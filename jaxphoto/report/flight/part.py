@@ -67,6 +67,7 @@ def _findings(part: FlightPart) -> Iterator[Finding]:
             else "has a frame and a scale of its own"
         )
         yield Finding(Level.WARNING, f"the block {frame}: {part.why_not}")
+    yield from (Finding(Level.WARNING, sentence) for sentence in (part.placed.steps if part.placed else ()))
     if part.placed and not part.placed.used.all():
         n = int((~part.placed.used).sum())
         yield Finding(Level.WARNING, f"{n} of {len(part.placed.used)} recorded positions contradict the others")
