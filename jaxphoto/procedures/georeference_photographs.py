@@ -24,7 +24,8 @@ from jaxphoto.georeferencing.gps import Gps
 from jaxphoto.georeferencing.map_frame import MapFrame, map_name
 from jaxphoto.observations import StationRows
 from jaxphoto.procedures.attitudes_of_photographs import RecordedTurn, recorded_turn, with_attitudes
-from jaxphoto.procedures.georeferencing_words import attitude_words, position_words
+from jaxphoto.procedures.georeferencing_words import LEVEL_WORDS, attitude_words, position_words
+from jaxphoto.procedures.level_strip import is_line, level_turn
 from jaxphoto.procedures.orientation.onto_known import Similarity, similarity_between
 from jaxphoto.procedures.position_parts import position_parts, with_part_shifts
 from jaxphoto.variants import without_stations
@@ -62,6 +63,8 @@ class GeoreferencedPhotographs(NamedTuple):
     sentences: tuple[str, ...]
     steps: tuple[str, ...] = ()
     """Of each step of the positions a sentence."""
+    level: bool = False
+    """Whether nothing tells the turn about the line of a strip, which is assumed to look down on average."""
 
 
 def georeference_photographs(
@@ -108,14 +111,16 @@ def georeference_photographs(
     given = np.array([gps.stated_sigma_m or SIGMA_M for gps in known.values()])
     # Where no file says how good its positions are, they are judged by one another alone.
     own = given if any(gps.stated_sigma_m for gps in known.values()) else np.zeros_like(given)
-    similarity, used, helping = _fitted(there, here, given, own, recorded)
+    fitted = _fitted(block, image, here, given, own, recorded)
     stated = given if own.any() else np.zeros_like(given)
-    parts = position_parts(list(known), order, here - similarity.of(there), here, np.median(stated, axis=0))
+    parts = position_parts(list(known), order, here - fitted.similarity.of(there), here, np.median(stated, axis=0))
     raw, here = here, here - parts.off_m
     if parts.sentences:
-        similarity, used, helping = _fitted(there, here, given, own, recorded)
+        fitted = _fitted(block, image, here, given, own, recorded)
+    similarity, used, helping, level = fitted
     sigma = _sigmas(list(known.values()), (here - similarity.of(there))[used])
-    similarity = _nearest(similarity, there[used], here[used], sigma[used], helping)
+    if not level:
+        similarity = _nearest(similarity, there[used], here[used], sigma[used], helping)
     _check_upright(block, similarity)
     rows, axis = np.flatnonzero(used).repeat(3), np.tile(np.arange(3), used.sum())
     stations = StationRows(image[rows], axis, raw[rows, axis], sigma[rows, axis])
@@ -132,8 +137,9 @@ def georeference_photographs(
         *change.sentences(received, ellipsoidal),
         *position_words(map_name(code, vertical), block.images, known, offsets, used, sigma),
         *attitude_words(recorded, helping is not None, similarity.turn),
+        *([LEVEL_WORDS] if level else ()),
     )
-    return GeoreferencedPhotographs(placed, tuple(known), offsets, used, said, parts.sentences)
+    return GeoreferencedPhotographs(placed, tuple(known), offsets, used, said, parts.sentences, level)
 
 
 def as_they_scatter(
@@ -165,28 +171,46 @@ def as_they_scatter(
 def held_in_place(placed: GeoreferencedPhotographs, datum: Datum) -> GeoreferencedPhotographs | None:
     """The block where the positions brought it, held there by `datum` instead of by them.
 
-    None where they do not tell its turn to some 17 degrees.
+    None where they do not tell its turn to some 17 degrees, and it is none of a strip that is assumed to be level.
     """
     stations = placed.block.stations
     here, sigma = (np.asarray(v, float).reshape(-1, 3) for v in (stations.value, stations.sigma))
-    if not _turn_sigma(here, sigma) <= _HELD_RAD:
+    if not (placed.level or _turn_sigma(here, sigma) <= _HELD_RAD):
         return None
     return placed._replace(block=without_stations(dataclasses.replace(placed.block, datum=datum)))
 
 
+class _Fitted(NamedTuple):
+    """The similarity of most positions, which agree with it, and what tells the turn where they do not."""
+
+    similarity: Similarity
+    used: np.ndarray
+    helping: RecordedTurn | None = None
+    level: bool = False
+    """Whether the turn about the line of a strip is assumed."""
+
+
 def _fitted(
-    there: Float[np.ndarray, "n 3"],
+    block: Block,
+    image: np.ndarray,
     here: Float[np.ndarray, "n 3"],
     given: Float[np.ndarray, "n 3"],
     own: Float[np.ndarray, "n 3"],
     recorded: RecordedTurn | str | None,
-) -> tuple[Similarity, np.ndarray, RecordedTurn | None]:
-    """The similarity of most positions, which agree with it, and the attitudes where these tell the turn better."""
+) -> _Fitted:
+    """How positions `here` bring the network of `block` to their frame, with attitudes where these tell more."""
+    exterior = block.start.unknowns.exterior
+    there = np.asarray(exterior.position, float)[image]
     if isinstance(recorded, RecordedTurn):
         similarity, used = _turned(there, here, recorded.turn, own)
         if recorded.turn_sigma_rad < _turn_sigma(here[used], given[used]):
-            return similarity, used, recorded
-    return *_agreeing(there, here, own), None
+            return _Fitted(similarity, used, recorded)
+    elif is_line(there):
+        turn = level_turn(there, here, np.asarray(exterior.camera_from_object, float)[:, 2])
+        similarity, used = _turned(there, here, turn, own)
+        if not _turn_sigma(here[used], given[used]) <= _HELD_RAD:
+            return _Fitted(similarity, used, level=True)
+    return _Fitted(*_agreeing(there, here, own))
 
 
 def _check_upright(block: Block, similarity: Similarity) -> None:

@@ -9,11 +9,18 @@ from scipy.spatial.transform import Rotation
 from jaxphoto.errors import few
 from jaxphoto.georeferencing.gps import Gps
 from jaxphoto.procedures.attitudes_of_photographs import RecordedTurn
+from jaxphoto.procedures.level_strip import LEVEL_DEG
 
 # Heights that are all off by the same, to this part of it, count from another zero; by less they jump.
 _ALIKE, _ZERO_M = 0.1, 10.0
 # Of what they are off in plan.
 _BEYOND = 4.0
+
+LEVEL_WORDS = (
+    "the positions are those of one line and leave the turn about it open: the photographs are taken to look straight "
+    f"down on average, which holds to some {LEVEL_DEG:g} degrees, and heights tilt across the line by as much; "
+    "attitudes, a cross strip or control points tell it"
+)
 
 
 def position_words(

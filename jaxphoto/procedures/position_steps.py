@@ -23,6 +23,8 @@ _LEAST = 3
 _LEAST_FREE = 5
 # Of the scatter about the median of neighbours: such a position is off by itself.
 _ALONE, _MAD = 6.0, 1.4826
+# Columns of the model.
+_BEND = (4, 5, 6)
 
 
 class Step(NamedTuple):
@@ -99,9 +101,11 @@ def _next(y: np.ndarray, model: np.ndarray, apart: np.ndarray, known: list[int],
 def _sizes(y: np.ndarray, model: np.ndarray, places: list[int]) -> tuple[np.ndarray, np.ndarray]:
     """The steps at `places` by axis, and their standard deviations, by the mean offsets before and after them.
 
-    Errors that persist from one photograph to the next are allowed for, as of an autoregression of the first order.
+    Errors that persist from one photograph to the next are allowed for, as of an autoregression of the first order. No
+    bend beside them: of few strips it is as open as they are.
     """
     n, k = len(y), len(places)
+    model = np.delete(model, _BEND, axis=2)
     columns = np.column_stack([np.ones(n), np.arange(n)[:, None] >= np.array(places)]).astype(float)
     own = np.einsum("nc,ab->nacb", columns, np.eye(3)).reshape(n, 3, -1)
     design = np.concatenate([own, model], axis=2).reshape(3 * n, -1)

@@ -21,6 +21,7 @@ from jaxphoto.procedures.georeference_photographs import (
     utm_of,
 )
 from jaxphoto.rotation import matrix_from_omega_phi_kappa
+from jaxphoto.variants import some_images
 from tests.blocks import free_network, simulated
 
 ORIGIN = (13.2, 55.7, 0.0)
@@ -188,6 +189,27 @@ def of_one_strip(block, truth, rng):
     position = np.asarray(truth.exterior.position) + rng.normal(0, 1.5, (10, 3))
     position[3, 1] += 90.0
     return recorded(position[:5], block.images[:5])
+
+
+def test_a_single_strip_without_attitudes_is_put_on_the_map_as_if_it_looked_down():
+    """The first strip of the network alone; its photographs hang by up to 3 degrees about a level line."""
+    whole, truth = network()
+    block = some_images(whole, np.arange(10) < 5)
+    position = np.asarray(truth.exterior.position)[:5]
+    wobble, poor = np.random.default_rng(3).normal(0, 5.0, position.shape), (10.0, 10.0, 10.0)
+    found = georeference_photographs(block, recorded(position + wobble, block.images, poor))
+    assert found.level and found.used.all() and "look straight down on average" in found.sentences[-1]
+    matrices = np.asarray(found.block.start.unknowns.exterior.camera_from_object)
+    apart = matrices @ np.swapaxes(np.asarray(truth.exterior.camera_from_object)[:5], 1, 2)
+    assert np.degrees(Rotation.from_matrix(apart).magnitude()).max() < 5.0
+    own = found.block.frame.map
+    back = MapFrame(own.code, None, ORIGIN).local(own.map(np.asarray(found.block.start.unknowns.exterior.position)))
+    assert np.abs(back - position).max() < 20.0
+    # A position that jumps is no breadth of the strip.
+    jumped = position + wobble + np.eye(5, 3, -3) * 90.0
+    assert georeference_photographs(block, recorded(jumped, block.images, poor)).level
+    held = held_in_place(found, block.datum)
+    assert held is not None and not len(held.block.stations) and held.block.datum == block.datum
 
 
 def test_a_single_strip_is_turned_by_its_attitudes():

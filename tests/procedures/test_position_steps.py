@@ -3,10 +3,10 @@
 import dataclasses
 import functools
 
+import equinox as eqx
 import numpy as np
 import pytest
 
-from jaxphoto.block import Datum
 from jaxphoto.io import recipe_from
 from jaxphoto.procedures.georeference_photographs import georeference_photographs
 from jaxphoto.procedures.position_steps import steps_of
@@ -95,8 +95,9 @@ def flown():
     }  # fmt: skip
     simulated = simulate(recipe_from(recipe), 3)
     truth = np.asarray(simulated.truth.exterior.position)
-    # As a network whose stations are not known: its photographs are in one strip that has no name.
-    return dataclasses.replace(simulated.block, image_strip=("",) * len(truth), datum=Datum("minimal")), truth
+    block = eqx.tree_at(lambda b: b.start.unknowns, simulated.block, simulated.truth)
+    # As a network is oriented: its photographs are in one strip that has no name.
+    return dataclasses.replace(block, image_strip=("",) * len(truth)), truth
 
 
 def test_a_part_that_is_off_has_a_shift_of_its_own_and_the_block_does_not_tilt():
