@@ -56,10 +56,18 @@ def place(out: Path | None, second: Path | None) -> Path:
 
 def seconds(help: str) -> typer.models.OptionInfo:
     """An option whose value is a finite number of seconds. Any other raises InputError before the command begins."""
+    return _number(help, "a number of seconds", -math.inf)
 
-    def check(param: typer.CallbackParam, value: float) -> float:
-        if not math.isfinite(value):
-            raise InputError(f"{param.opts[0]} {value}: give a number of seconds")
+
+def positive(help: str) -> typer.models.OptionInfo:
+    """An option whose value is a positive finite number, or its default, likewise."""
+    return _number(help, "a positive number", 0.0)
+
+
+def _number(help: str, what: str, above: float) -> typer.models.OptionInfo:
+    def check(param: typer.CallbackParam, value: float | None) -> float | None:
+        if value is not None and not above < value < math.inf:
+            raise InputError(f"{param.opts[0]} {value:g}: give {what}")
         return value
 
     return typer.Option(help=help, callback=check)

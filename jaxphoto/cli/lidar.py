@@ -11,7 +11,7 @@ from jaxtyping import Float
 from rich.console import Console
 
 from jaxphoto.block import Block
-from jaxphoto.cli.choices import one_of
+from jaxphoto.cli.choices import one_of, positive
 from jaxphoto.cli.cloud_options import Classes, CloudEpsg, CloudUnit, ReturnsOption, class_numbers
 from jaxphoto.cli.corrected_cloud import write_corrected
 from jaxphoto.cli.made import made_by
@@ -72,7 +72,7 @@ _OF_PLANES = "exposure_shift_s", "control", "breaklines", "pattern", "cell_m", "
 
 BlockFolder = Annotated[Path, typer.Argument(help="Block folder (see docs/block_folder.md).")]
 CloudFile = Annotated[Path, typer.Argument(help="Cloud: .las, .laz, .csv or .ply (see docs/clouds.md).")]
-SigmaZ = Annotated[float, typer.Option(help="Standard deviation of a laser point's height.")]
+SigmaZ = Annotated[float, positive("Standard deviation of a laser point's height.")]
 SigmaXY = Annotated[float, typer.Option(help="Standard deviation of a laser point's X, and of its Y.")]
 Systematic = Annotated[float, typer.Option(help="Standard deviation of what all its heights are off by.")]
 Rounds = Annotated[int, typer.Option(min=1, help="Most rounds of looking at the cloud and adjusting.")]

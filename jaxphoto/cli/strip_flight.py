@@ -14,7 +14,7 @@ import typer
 from jaxtyping import Float
 
 from jaxphoto.block import Block, Frame
-from jaxphoto.cli.choices import one_of, seconds
+from jaxphoto.cli.choices import one_of, positive, seconds
 from jaxphoto.cli.cloud_progress import CloudProgress
 from jaxphoto.cli.control_in_frame import control_in_frame
 from jaxphoto.cli.corrected_cloud import write_corrected
@@ -74,8 +74,8 @@ TrajectoryShift = Annotated[float, seconds("Cloud's time + this is the trajector
 ExposureShift = Annotated[
     float, seconds("Of photographs adjusted with the strips: time_s of images.csv + this is the cloud's time.")
 ]
-CellM = Annotated[float, typer.Option(help="Side of the cells in which planes are sought.")]
-RoughnessM = Annotated[float, typer.Option(help="Most that the returns of a plane scatter about it.")]
+CellM = Annotated[float, positive("Side of the cells in which planes are sought.")]
+RoughnessM = Annotated[float, positive("Most that the returns of a plane scatter about it.")]
 BreaklinesOption = Annotated[
     str | None,
     typer.Option(
@@ -86,7 +86,7 @@ ControlOption = Annotated[
     Path | None,
     typer.Option(help="Surveyed points on smooth surfaces (docs/control.md), which strips are to go through."),
 ]
-KnotsS = Annotated[float, typer.Option(help="From knot to knot of the trajectory's errors.")]
+KnotsS = Annotated[float, positive("From knot to knot of the trajectory's errors.")]
 
 
 class StripFiles(NamedTuple):

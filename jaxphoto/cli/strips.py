@@ -6,6 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
+from jaxphoto.cli.choices import positive
 from jaxphoto.cli.cloud_options import Classes, CloudEpsg, CloudUnit, ReturnsOption, class_numbers
 from jaxphoto.cli.output import Output, command
 from jaxphoto.cli.strip_flight import (
@@ -58,23 +59,23 @@ def strips_command(
     roughness_m: RoughnessM = USUAL.roughness_m,
     most_planes: Annotated[int, typer.Option(min=1, help="Most planes that are observed.")] = USUAL.most,
     knots_s: KnotsS = USUAL.knots_s,
-    correlation_s: Annotated[float, typer.Option(help="Correlation time of these errors.")] = USUAL.correlation_s,
+    correlation_s: Annotated[float, positive("Correlation time of these errors.")] = USUAL.correlation_s,
     sigma_position_m: Annotated[
         float | None,
-        typer.Option(help=f"Their standard deviation (the trajectory's own, or {USUAL.sigma_position_m:g})."),
+        positive(f"Their standard deviation (the trajectory's own, or {USUAL.sigma_position_m:g})."),
     ] = None,
     sigma_attitude_deg: Annotated[
         float | None,
-        typer.Option(help=f"That about right and forward (the trajectory's own, or {USUAL.sigma_attitude_deg:g})."),
+        positive(f"That about right and forward (the trajectory's own, or {USUAL.sigma_attitude_deg:g})."),
     ] = None,
     sigma_heading_deg: Annotated[
-        float | None, typer.Option(help=f"That about up (the trajectory's own, or {USUAL.sigma_heading_deg:g}).")
+        float | None, positive(f"That about up (the trajectory's own, or {USUAL.sigma_heading_deg:g}).")
     ] = None,
     sigma_exposure_m: Annotated[
-        float, typer.Option(help="What stations of photographs are off by besides.")
+        float, positive("What stations of photographs are off by besides.")
     ] = USUAL.sigma_exposure_m,
     sigma_exposure_deg: Annotated[
-        float, typer.Option(help="What their attitudes are off by besides.")
+        float, positive("What their attitudes are off by besides.")
     ] = USUAL.sigma_exposure_deg,
     classes: Classes = None,
     returns: ReturnsOption = "all",

@@ -42,7 +42,7 @@ class StripSettings:
         for name in _POSITIVE:
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0):
-                raise InputError(f"{name} is {value:g}, but must be positive; correct it")
+                raise InputError(f"{name} is {value:g}: give a positive number")
         if self.returns < 4 or self.most < 1:
             raise InputError(
                 f"a plane needs 4 returns and an adjustment 1 plane, got returns {self.returns} and most {self.most}"

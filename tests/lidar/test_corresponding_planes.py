@@ -56,7 +56,7 @@ def test_blunders_do_not_fit():
 
 
 def test_settings_that_cannot_be():
-    with pytest.raises(InputError, match="cell_m is 0, but must be positive"):
+    with pytest.raises(InputError, match="cell_m is 0: give a positive number"):
         dataclasses.replace(SETTINGS, cell_m=0.0)
     with pytest.raises(InputError, match="a plane needs 4 returns"):
         dataclasses.replace(SETTINGS, returns=3)

@@ -203,6 +203,8 @@ def test_what_cannot_be_adjusted():
         adjust_strips(cloud, held=("1", "2"))
     with pytest.raises(InputError, match="all strips are held"):
         adjust_strips(flight.cloud, flight.trajectory, priors=ScannerPriors(FIXED), held="all")
+    with pytest.raises(InputError, match=r"with knots 1e-05 s apart .* take them farther apart \(--knots-s\)"):
+        adjust_strips(flight.cloud, flight.trajectory, StripSettings(knots_s=1e-5))
     with pytest.raises(InputError, match="the cloud has no times"):
         adjust_strips(cloud, flight.trajectory)
     with pytest.raises(InputError, match="strip 3 of the cloud has no points"):

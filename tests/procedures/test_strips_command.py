@@ -29,6 +29,10 @@ from tests.procedures.joint import BORESIGHT_DEG, flown
 
 SHIFT = np.array([0.15, -0.2, 0.1])
 OPTIONS = ("--cell-m", "2", "--roughness-m", "0.04")
+POSITIVE = (
+    "--cell-m", "--roughness-m", "--knots-s", "--correlation-s", "--sigma-position-m", "--sigma-attitude-deg",
+    "--sigma-heading-deg", "--sigma-exposure-m", "--sigma-exposure-deg",
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -190,7 +194,9 @@ def test_withheld_points_that_nothing_says_anything_of_stay(cloud_file, tmp_path
         (("--adjust", "boresight"), "without a trajectory strips have shifts alone"),
         (("--pattern", "zigzag"), "--pattern zigzag: there are line, circle"),
         (("--hold", "3"), "3 is no strip of the cloud, which has 1, 2"),
-        (("--cell-m", "0"), "cell_m is 0, but must be positive"),
+        *(((option, "nan"), f"{option} nan: give a positive number") for option in POSITIVE),
+        (("--cell-m", "0"), "--cell-m 0: give a positive number"),
+        (("--sigma-heading-deg", "inf"), "--sigma-heading-deg inf: give a positive number"),
         (("--trajectory-shift-s", "nan"), "--trajectory-shift-s nan: give a number of seconds"),
         (("--exposure-shift-s", "inf"), "--exposure-shift-s inf: give a number of seconds"),
         (("--breaklines", "R*"), "--breaklines names points of photographs: give their block (--block)"),

@@ -50,6 +50,8 @@ PHOTOGRAPHS = "photographs"
 """What differences call the tie points of photographs beside strips."""
 # From this round on returns stay in their cells: strips fit to their noise by then.
 _SETTLED = 2
+# Their matrix has 29 GB.
+_MOST_KNOTS = 10_000
 
 
 class StripRound(NamedTuple):
@@ -273,6 +275,12 @@ def _splines(
     spans: Float[np.ndarray, "strips 2"], trajectory: Trajectory | None, settings: StripSettings
 ) -> tuple[StripSpline, ...]:
     splines: list[StripSpline] = []
+    wanted = 0 if trajectory is None else float(np.ptp(spans, axis=1).sum()) / settings.knots_s
+    if wanted > _MOST_KNOTS:
+        raise InputError(
+            f"with knots {settings.knots_s:g} s apart the trajectory has {wanted:.0f} of them, of six unknowns each, "
+            f"and {_MOST_KNOTS} fill a computer: take them farther apart (--knots-s)"
+        )
     for start, end in spans.tolist():
         first = sum(s.size for s in splines)
         constant = trajectory is None

@@ -120,7 +120,7 @@ def check_seen(control: SurveyedPoints, seen: OnStrips, search: StripSearch) -> 
         raise BlockError(
             f"no point of {control.file} lies on a plane of a strip, which is {settings.returns} returns about it, in "
             f"{settings.cell_m:g} m, that scatter by {settings.roughness_m:g} m at most: give points on smooth, open "
-            "surfaces, or take larger cells (cell_m) or rougher planes (roughness_m)"
+            "surfaces, or take larger cells (--cell-m) or rougher planes (--roughness-m)"
         )
     off = float(np.median(gap))
     if abs(off) > _FAR_M:

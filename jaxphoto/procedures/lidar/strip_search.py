@@ -102,7 +102,7 @@ def check_joined(names: Sequence[str], seen: Sequence[CommonPlanes]) -> None:
     if alone and len(names) > 1:
         raise BlockError(
             f"strip {alone[0]} has fewer than {_FEWEST} planes in common with any other: leave it out, take larger "
-            "cells (cell_m) or rougher planes (roughness_m), or check that all strips overlap and are in one system"
+            "cells (--cell-m) or rougher planes (--roughness-m), or check that all strips overlap and are in one system"
         )
     for found in apart:
         up = float(np.median(found.pairs.gap / found.pairs.normal[:, 2]))

@@ -81,8 +81,8 @@ class PointSearch:
             return []
         return [
             f"{len(out)} of {len(lines)} points on breaklines have no two smooth faces about them in any strip, and "
-            f"nothing is said of them: {few([names[p] for p in lines[out]])}; take cells (cell_m) half as wide as the "
-            "roofs, or leave these points out"
+            f"nothing is said of them: {few([names[p] for p in lines[out]])}; take cells (--cell-m) half as wide as "
+            "the roofs, or leave these points out"
         ]
 
     def rows(self, seen: Sequence[PointPlanes], errors: StripErrors) -> tuple[StripPoints, ...]:
