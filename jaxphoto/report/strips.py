@@ -11,6 +11,7 @@ from jaxphoto.georeferencing import TrajectoryKnot
 from jaxphoto.procedures.lidar import StripAdjustment, StripDifference, StripRound
 from jaxphoto.procedures.lidar.strip_adjustment import PHOTOGRAPHS
 from jaxphoto.procedures.lidar.strip_control import CHECK, CONTROL
+from jaxphoto.procedures.lidar.surveyed_gaps import SurveyedGap
 from jaxphoto.report.digits import of_sigma, with_sigma
 from jaxphoto.report.findings import Finding, Level, Verdict, p_words
 from jaxphoto.report.tables import Tables
@@ -35,6 +36,12 @@ def differences_table(differences: Sequence[StripDifference]) -> pd.DataFrame:
 def strip_rounds_table(rounds: Sequence[StripRound]) -> pd.DataFrame:
     """round, planes, points, control, left_out, rms_m, largest_change (in standard deviations)."""
     return pd.DataFrame(rounds, columns=["round", *StripRound._fields[1:]])
+
+
+def surveyed_table(result: StripAdjustment) -> pd.DataFrame:
+    """One row for a surveyed point in a strip, what is farthest off for its standard deviation first."""
+    table = pd.DataFrame(result.surveyed, columns=list(SurveyedGap._fields))
+    return table.sort_values("w", key=np.abs, ascending=False, kind="stable", ignore_index=True)
 
 
 def all_correlations(result: StripAdjustment) -> pd.DataFrame:
@@ -132,8 +139,19 @@ def _of_surveyed(result: StripAdjustment) -> Iterator[Finding]:
             Level.ALARM if rms > _CONTRADICTS * noise else Level.WARNING if far else Level.INFORMATION,
             f"{what.replace('_', ' ')} {rms:.3f} m off the strips (RMS of {planes} planes), {told['rms_before_m']:.3f} "
             f"m before; plane and survey let expect {noise:.3f}"
-            + (": look at the points, at their standard deviations, and at those of the trajectory" if far else ""),
+            + (
+                f": {_worst(result, what)}look at the points, their standard deviations and the trajectory's"
+                if far
+                else ""
+            ),
         )
+
+
+def _worst(result: StripAdjustment, what: str) -> str:
+    """Which of the points is farthest off for its standard deviation."""
+    table = surveyed_table(result)
+    first = table[(table.role == "control") == (what == "control")].iloc[0]
+    return f"most at {first.point}, {first.gap_m:+.3f} m on strip {first.strip} ({abs(first.w):.1f} of its sigma); "
 
 
 def surveyed_summary(result: StripAdjustment) -> dict[str, dict[str, float]]:

@@ -20,6 +20,7 @@ from jaxphoto.report.strips import (
     differences_table,
     strip_rounds_table,
     surveyed_summary,
+    surveyed_table,
     trajectory_errors_table,
 )
 from jaxphoto.report.study_page import StudyPart, WholePicture, study_page
@@ -37,6 +38,12 @@ _TRAJECTORY = (
 _CORRELATIONS = (
     "Correlations of what is estimated of the scanner. Near 1 or -1, two of them cannot be told apart by this flight; "
     "correlation.csv has them of all unknowns, those of the trajectory among them."
+)
+# Of surveyed points.
+_SHOWN = 20
+_SURVEYED = (
+    "Surveyed less strip, of each point over the plane of each strip: those that are farthest off for the sigma of "
+    f"their gap, {_SHOWN} at most; surveyed_points.csv has all. Where nothing is wrong 1 of 1000 has a w beyond 3.3."
 )
 _PATTERNS = {
     "line": "Angles are those of lines across the track.",
@@ -64,6 +71,8 @@ def write_strips(
             write_results(tables, verdict, work / "adjustment", seconds, made=made)
         differences_table(result.differences).to_csv(work / "strips.csv", index=False)
         strip_rounds_table(result.rounds).to_csv(work / "rounds.csv", index=False)
+        if result.surveyed:
+            surveyed_table(result).to_csv(work / "surveyed_points.csv", index=False)
         scanner = calibration_table(result)
         scanner.to_csv(work / "scanner.csv", index=False)
         trajectory_errors_table(result).to_csv(work / "trajectory_errors.csv", index=False)
@@ -96,6 +105,9 @@ def _page(
         rows_of(_to_be_read(differences_table(result.differences))),
         *([gaps] if gaps else []),
     ]
+    if result.surveyed:
+        farthest = rows_of(_to_be_read(surveyed_table(result).head(_SHOWN)))
+        parts += [Heading("Control and check points"), Paragraph(_SURVEYED), farthest]
     pattern = result.errors.calibration.pattern
     if len(scanner):
         parts += [

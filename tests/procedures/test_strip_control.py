@@ -16,7 +16,7 @@ from jaxphoto.procedures.control import SurveyedPoints
 from jaxphoto.procedures.lidar import StripAdjustment, adjust_strips
 from jaxphoto.procedures.lidar.strip_control import with_control
 from jaxphoto.report.findings import Level
-from jaxphoto.report.strips import strips_verdict
+from jaxphoto.report.strips import strips_verdict, surveyed_table
 from jaxphoto.report.tables import Tables
 from jaxphoto.simulation import Simulation
 from tests.commands import run
@@ -87,6 +87,11 @@ def test_control_finds_what_strips_have_in_common_without_a_trajectory():
     for what in ("control", "check points"):
         assert told[what, "1"].rms_before_m > 0.2 and told[what, "1"].rms_m < 2 * told[what, "1"].noise_m
     assert 1 <= found.rounds[-1].left_out <= 4
+    gaps = surveyed_table(found)
+    assert set(gaps.point[:2]) == {"K0"} and not gaps.used[:2].any() and (gaps.w[:2] > 6).all()
+    check, used = gaps[gaps.role == "check"], gaps[gaps.used]
+    assert (check.sigma_m > check.noise_m).all() and 0.5 < np.sqrt(np.mean(check.w**2)) < 1.6
+    assert (used.sigma_m < used.noise_m).all() and len(used) == found.rounds[-1].control
 
 
 def test_one_strip_goes_through_control():
@@ -98,6 +103,12 @@ def test_one_strip_goes_through_control():
     assert (np.abs(found.errors.position[0] - COMMON) < 3.5 * sigma).all() and (sigma < 0.025).all()
     assert [(d.one, d.other) for d in found.differences] == [("control", "1")]
     assert strips_verdict(found, None).findings[0].level == Level.INFORMATION
+    # What is left of the variances of gaps is the redundancy, and of each along its own three directions.
+    told = surveyed_table(found)
+    used = told[told.used]
+    assert np.sum(used.sigma_m**2 / used.noise_m**2) == pytest.approx(len(used) - 3, abs=1e-3)
+    np.testing.assert_allclose(np.linalg.norm(told[["dX_m", "dY_m", "dZ_m"]], axis=1), np.abs(told.gap_m))
+    assert 0.6 < np.sqrt(np.mean(used.w**2)) < 1.4 and not told.w.isna().any()
 
 
 def test_on_level_ground_control_tells_heights_and_the_first_strip_the_rest():

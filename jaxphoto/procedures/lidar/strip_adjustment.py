@@ -39,6 +39,7 @@ from jaxphoto.procedures.lidar.strip_control import (
 from jaxphoto.procedures.lidar.strip_rows import step_rows
 from jaxphoto.procedures.lidar.strip_search import CommonPlanes, StripSearch, check_joined
 from jaxphoto.procedures.lidar.strip_unknowns import ScannerPriors, errors_of, knot_sigmas, strip_block
+from jaxphoto.procedures.lidar.surveyed_gaps import SurveyedGap, surveyed_gaps
 from jaxphoto.procedures.lidar.tie_point_search import PointPlanes, PointSearch
 from jaxphoto.procedures.lidar.until_still import STILL, at_result, with_interior_held
 from jaxphoto.procedures.lidar.vertical_control import tie_points
@@ -110,6 +111,8 @@ class StripAdjustment(eqx.Module):
     """Whether nothing changed any more at the end."""
     odd: tuple[str, ...] = ()
     """What is odd about cloud and trajectory, in sentences."""
+    surveyed: tuple[SurveyedGap, ...] = ()
+    """Control and check points, each over the plane of each strip that has one."""
 
 
 def adjust_strips(
@@ -230,6 +233,7 @@ def adjust_strips(
                 tuple(rounds),
                 still,
                 (*odd, *(() if ties is None else ties.unseen(on, adjusted.block.points))),
+                () if control is None else surveyed_gaps(control, met, errors, path, adjusted, known),
             )
         # Of a large flight gigabytes, which the next round needs.
         del adjusted, known
