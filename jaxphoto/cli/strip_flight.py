@@ -3,8 +3,7 @@
 The cloud passes part by part, and what its planes need of it is kept in memory.
 """
 
-import fnmatch
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
@@ -28,6 +27,7 @@ from jaxphoto.io import clouds, read_block, write_block
 from jaxphoto.io.block_folder import exposure_times
 from jaxphoto.io.clouds.coordinate_system import CoordinateSystem
 from jaxphoto.io.clouds.placement import Placement
+from jaxphoto.io.names import points_called
 from jaxphoto.io.raster import write_dsm
 from jaxphoto.io.trajectory import Records, read_records, write_moved
 from jaxphoto.io.trajectory.in_frame import trajectory_in, with_poses
@@ -79,7 +79,8 @@ RoughnessM = Annotated[float, positive("Most that the returns of a plane scatter
 BreaklinesOption = Annotated[
     str | None,
     typer.Option(
-        help="Tie points on breaklines, such as ridges of roofs, by commas; * stands for any letters (docs/joint.md)."
+        help="Tie points on breaklines, such as ridges of roofs, by commas; * stands for any letters "
+        "(those of block.toml; docs/joint.md)."
     ),
 ]
 ControlOption = Annotated[
@@ -143,7 +144,9 @@ def adjust_flight(output: Output, context: typer.Context, flight: StripFiles, ch
             read = read_block(block)
             posed = interior_held(read) if choices.camera_held else read
             times = exposure_times(block) + flight.exposure_shift_s
-            photographs = Photographs(posed, times, _named(read.points, flight.breaklines))
+            photographs = Photographs(
+                posed, times, points_called(read.points, _named(flight.breaklines), "--breaklines")
+            )
             frame = photographs.block.frame
         records = path = None
         if trajectory is not None:
@@ -275,14 +278,9 @@ def _about(records: Records, system: CoordinateSystem, cloud: Path) -> Frame:
     return Frame("epsg", code, origin=(longitude, latitude, height))
 
 
-def _named(points: Sequence[str], text: str | None) -> tuple[str, ...]:
-    """The points that names or patterns by commas mean. Raises InputError for one that means none."""
-    parts = [part.strip() for part in (text or "").split(",") if part.strip()]
-    named = {part: [name for name in points if fnmatch.fnmatchcase(name, part)] for part in parts}
-    for part, found in named.items():
-        if not found:
-            raise InputError(f"--breaklines {part}: no point of the block is called so; correct the name")
-    return tuple(dict.fromkeys(name for found in named.values() for name in found))
+def _named(text: str | None) -> list[str]:
+    """Names by commas."""
+    return [part.strip() for part in (text or "").split(",") if part.strip()]
 
 
 def _about_where(block: Block) -> Float[np.ndarray, "points 3"]:

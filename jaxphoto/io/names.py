@@ -5,7 +5,11 @@ than there is. What begins like a formula is computed by a spreadsheet that open
 rather than changed, so that all tables have the ids of the user's files.
 """
 
+import fnmatch
 import re
+from collections.abc import Iterable, Sequence
+
+from jaxphoto.errors import InputError
 
 LONGEST = 256
 """Characters of a name."""
@@ -27,6 +31,15 @@ def harm_in(name: str) -> str:
     if _FORMULA.match(name):
         return "begins like a formula, which a spreadsheet would compute; give it another name"
     return ""
+
+
+def points_called(points: Sequence[str], names: Iterable[str], where: str) -> tuple[str, ...]:
+    """The points that names mean, in which * stands for any letters. Raises InputError for one that means none."""
+    named = {name: [point for point in points if fnmatch.fnmatchcase(point, name)] for name in names}
+    for name, found in named.items():
+        if not found:
+            raise InputError(f"{where} {name}: no point of the block is called so; correct the name")
+    return tuple(dict.fromkeys(point for found in named.values() for point in found))
 
 
 def control_in(text: str) -> bool:

@@ -1,16 +1,21 @@
 """Tie points that were measured on ridges of roofs lie on both faces that meet there."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
-from jaxphoto import InputError
-from jaxphoto.cli.strip_flight import _named
+from jaxphoto import BlockError, InputError, read_block, write_block
+from jaxphoto.georeferencing import StripSpline
+from jaxphoto.io.names import points_called
 from jaxphoto.lidar.strip_settings import StripSettings
-from jaxphoto.procedures.lidar import adjust_strips
+from jaxphoto.observations import StripPlanes
+from jaxphoto.procedures.lidar import Photographs, adjust_strips
+from jaxphoto.procedures.lidar.photographs import check_photographs, on_trajectory
 from jaxphoto.procedures.lidar.strip_search import StripSearch
 from jaxphoto.procedures.lidar.tie_point_search import PointSearch
 from tests.lidar.clouds import gable
-from tests.procedures.joint import JOINT, photographs
+from tests.procedures.joint import JOINT, flown, photographs
 from tests.procedures.strips import PRIORS, SETTINGS
 from tests.procedures.test_strip_control import COMMON, SHIFT, two_strips
 from tests.simulation.small import made
@@ -40,9 +45,34 @@ def test_of_each_point_on_a_breakline_both_faces_are_sought_in_every_strip():
 
 
 def test_points_on_breaklines_are_named_by_patterns():
-    assert _named(("A1", "R1", "R2", "B"), "R*, A1,R1") == ("R1", "R2", "A1") and _named(("A1",), None) == ()
+    assert points_called(("A1", "R1", "R2", "B"), ["R*", "A1", "R1"], "") == ("R1", "R2", "A1")
     with pytest.raises(InputError, match=r"--breaklines X\*: no point of the block is called so"):
-        _named(("A1",), "X*")
+        points_called(("A1",), ["X*"], "--breaklines")
+
+
+def test_points_on_breaklines_come_back_with_their_block(tmp_path):
+    flight = flown()
+    names = flight.block.points[:3]
+    on = Photographs(dataclasses.replace(flight.block, breaklines=names), photographs(flight).time)
+    assert on.breaklines == names and on._replace(on_breaklines=names[1:]).breaklines == names[1:]
+    spans = np.array([[on.time.min(), on.time.max()]])
+    posed = on_trajectory(on, (StripSpline.over(0, *spans[0].tolist(), 5.0),), spans, SETTINGS)
+    assert posed.breaklines == names
+    # Of points that are gone nothing is said, in which it would not be read again.
+    kept = dataclasses.replace(on.block, breaklines=(*names, "gone"))
+    write_block(kept, tmp_path / "block")
+    assert read_block(tmp_path / "block").breaklines == names
+    settings = tmp_path / "block" / "block.toml"
+    settings.write_text(settings.read_text().replace(f'"{names[0]}"', '"R*"', 1))
+    with pytest.raises(InputError, match=r"block\.toml, breaklines: R\*: no point of the block is called so"):
+        read_block(tmp_path / "block")
+
+
+def test_the_block_of_a_joint_adjustment_is_not_joined_again():
+    flight = flown()
+    joined = dataclasses.replace(flight.block, more=(*flight.block.more, StripPlanes.none()))
+    with pytest.raises(BlockError, match="that of a joint adjustment, with its planes in strip_planes"):
+        check_photographs(photographs(flight)._replace(block=joined), flight.trajectory)
 
 
 @pytest.mark.slow

@@ -42,6 +42,7 @@ from jaxphoto.io.block_folder.table_layout import LAYOUTS, TOML, TableLayout, la
 from jaxphoto.io.block_folder.tables import layouts, read_declared
 from jaxphoto.io.block_folder.temperatures import temperatures_of, with_temperatures
 from jaxphoto.io.block_folder.trajectory_section import read_flight
+from jaxphoto.io.names import points_called
 from jaxphoto.io.text_tables import Table, read_csv
 from jaxphoto.io.toml import read_toml
 from jaxphoto.io.trajectory import Records, read_records
@@ -205,6 +206,7 @@ def assemble(source: BlockTables) -> Block:
         partitions=_partitions(images, settings),
         converted_from=settings.converted_from,
         assumed_pixels=settings.assumed_pixels,
+        breaklines=points_called(points.ids, settings.breaklines, f"{source.file}, breaklines:"),
     )
     more, more_priors = read_unknowns(settings.unknowns, source.unknowns, block)
     start, priors = dataclasses.replace(start, more=more), dataclasses.replace(priors, more=more_priors)

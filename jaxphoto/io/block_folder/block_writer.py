@@ -114,13 +114,15 @@ def _settings(block: Block) -> dict[str, Any]:
                 f"of camera {camera} has {f'mount {mount}' if mount else 'none'}; name a mount {camera} or default, "
                 "and give a camera that was mounted in two ways two names"
             )
-    own = [kind.group for kind in kinds_of(block) if kind not in OBSERVATIONS]
+    own, known = [kind.group for kind in kinds_of(block) if kind not in OBSERVATIONS], set(block.points)
     return {
         "title": block.title,
         **({"converted_from": block.converted_from} if block.converted_from else {}),
         **({"assumed_pixels": list(block.assumed_pixels)} if block.assumed_pixels else {}),
         **({"observations": own} if own else {}),
         **({"partitions": list(block.partitions)} if block.partitions else {}),
+        # Of those that are still among its points.
+        **({"breaklines": lines} if (lines := [name for name in block.breaklines if name in known]) else {}),
         **({"reference_temperature_c": block.temperatures.reference_c} if block.temperatures else {}),
         "frame": frame_section(block.frame),
         "corrections": corrections_section(block.corrections, block.frame),

@@ -28,6 +28,7 @@ _KEYS = (
     "observations",
     "unknowns",
     "partitions",
+    "breaklines",
     "reference_temperature_c",
     "converted_from",
     "assumed_pixels",
@@ -58,6 +59,8 @@ class Settings(NamedTuple):
     unknowns: Section
     partitions: tuple[str, ...]
     """Columns of images.csv that say whose further unknowns are."""
+    breaklines: tuple[str, ...]
+    """Points on breaklines, by names in which * stands for any letters."""
     reference_temperature_c: float | None
     """At which cameras with thermal rates are what they are; None: the mean of all exposures."""
     converted_from: str
@@ -92,6 +95,7 @@ def read_settings(values: dict[str, Any], file: str = TOML, sigma_keys: Sequence
         top.texts("observations"),
         top.section("unknowns"),
         read_partitions(top),
+        top.texts("breaklines"),
         top.number("reference_temperature_c") if "reference_temperature_c" in top else None,
         top.text("converted_from", ""),
         top.texts("assumed_pixels"),

@@ -14,7 +14,7 @@ from jaxphoto.georeferencing.time_scales import looks_like, shift_that_fits
 from jaxphoto.lidar.correction import scanner_path, scanner_poses
 from jaxphoto.lidar.coverage import CoveredTimes
 from jaxphoto.lidar.strip_settings import StripSettings
-from jaxphoto.observations import Attitudes, StationRows, TrajectoryAttitudes, TrajectoryStations
+from jaxphoto.observations import Attitudes, StationRows, StripPlanes, TrajectoryAttitudes, TrajectoryStations
 from jaxphoto.procedures.lidar.until_still import check_without_surfaces
 
 # Stations farther off the trajectory (m) are those of another one, or of another time.
@@ -29,7 +29,12 @@ class Photographs(NamedTuple):
     time: Float[np.ndarray, "images"]
     """Seconds."""
     on_breaklines: tuple[str, ...] = ()
-    """Tie points that were measured where two smooth faces meet, such as on the ridge of a roof."""
+    """Tie points on breaklines; none: those of the block."""
+
+    @property
+    def breaklines(self) -> tuple[str, ...]:
+        """Tie points that were measured where two smooth faces meet, such as on the ridge of a roof."""
+        return self.on_breaklines or self.block.breaklines
 
 
 def check_photographs(photographs: Photographs, trajectory: Trajectory | None) -> None:
@@ -39,6 +44,11 @@ def check_photographs(photographs: Photographs, trajectory: Trajectory | None) -
         raise InputError(
             "photographs and strips are joined by the trajectory on which both were measured: give it (--trajectory), "
             "or adjust the strips alone"
+        )
+    if any(isinstance(rows, StripPlanes) for rows in block.more):
+        raise BlockError(
+            "the block is that of a joint adjustment, with its planes in strip_planes.csv: adjust it by jaxphoto "
+            "adjust, or give the block as it was before"
         )
     check_without_surfaces(block)
     unknown = np.flatnonzero(~np.isfinite(time))
@@ -111,7 +121,13 @@ def on_trajectory(
     angles = np.asarray(a.roll_pitch_yaw)
     attitude = TrajectoryAttitudes(a.image, knots[a.image], weights[a.image], angles, np.full(angles.shape, turn))
     more = (*block.more, position, *([attitude] if len(attitude) else []))
-    return dataclasses.replace(block, stations=StationRows.none(), attitudes=Attitudes.none(), more=more)
+    return dataclasses.replace(
+        block,
+        stations=StationRows.none(),
+        attitudes=Attitudes.none(),
+        breaklines=photographs.breaklines,
+        more=more,
+    )
 
 
 def _strip_of(time: Float[np.ndarray, "images"], spans: Float[np.ndarray, "strips 2"]) -> Int[np.ndarray, "images"]:

@@ -190,7 +190,7 @@ def adjust_strips(
     check_joined(names, seen)
     ties = None
     if images is not None and photographs is not None:
-        lines = tie_points(images, photographs.on_breaklines)
+        lines = tie_points(images, photographs.breaklines)
         ties = PointSearch(search, np.setdiff1d(tie_points(images), lines), lines)
     first_on = on = [] if ties is None or alone is None else ties.look(*_of(ties, alone, covariance(alone)), False)
     surveyed = None if control is None else ControlSearch(search, control, number)
