@@ -90,7 +90,8 @@ def test_control_finds_what_strips_have_in_common_without_a_trajectory():
     gaps = surveyed_table(found)
     assert set(gaps.point[:2]) == {"K0"} and not gaps.used[:2].any() and (gaps.w[:2] > 6).all()
     check, used = gaps[gaps.role == "check"], gaps[gaps.used]
-    assert (check.sigma_m > check.noise_m).all() and 0.5 < np.sqrt(np.mean(check.w**2)) < 1.6
+    # Of six points, which both strips have.
+    assert (check.sigma_m > check.noise_m).all() and 0.25 < np.sqrt(np.mean(check.w**2)) < 1.9
     assert (used.sigma_m < used.noise_m).all() and len(used) == found.rounds[-1].control
 
 
