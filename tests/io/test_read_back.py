@@ -247,6 +247,8 @@ def test_control_of_opensfm_is_a_gcp_list(tmp_path):
         np.testing.assert_allclose(values[3:] + 0.5, shown[file, name], rtol=0, atol=1e-9)
     given = read_control(tmp_path / "out" / "gcp_list.txt")
     assert given.points.system == "EPSG:32633" and set(given.points.ids) == set(names)
+    # A list of control beside tracks makes no project of texts.
+    assert [name for name, other in FORMATS.items() if other.recognises(tmp_path / "out")] == ["opensfm"]
     with pytest.warns(UserWarning, match="it needs a map system and the block is in a local frame"):
         export(p._replace(frame=Frame("local")), tmp_path / "local", "opensfm")
     assert not (tmp_path / "local" / "gcp_list.txt").exists()

@@ -13,7 +13,7 @@ from jaxphoto.errors import InputError, few, quoted
 from jaxphoto.io.block_folder import BlockTables
 from jaxphoto.io.block_folder.table_layout import TOML
 from jaxphoto.io.cameras import read_camera_file
-from jaxphoto.io.reconstructions import orthority, pix4d
+from jaxphoto.io.reconstructions import open_sfm, orthority, pix4d
 from jaxphoto.io.reconstructions.exterior_text import ExteriorText, is_exterior, read_exterior
 from jaxphoto.io.reconstructions.points_beside import (
     PhotographCamera,
@@ -40,7 +40,7 @@ def recognises(source: Path) -> bool:
         return source.suffix.lower() in _EXTERIORS and is_exterior(source)
     found = _exteriors(source)
     # The folders of these have such texts, and more.
-    others = pix4d.recognises(source) or orthority.recognises(source) or (source / TOML).is_file()
+    others = any(other.recognises(source) for other in (pix4d, orthority, open_sfm)) or (source / TOML).is_file()
     return len(found) == 1 and bool(measured_texts(found[0])) and not others
 
 
