@@ -29,7 +29,7 @@ def accuracy_sentences(found: PositionalAccuracy) -> list[str]:
             "control_points.csv, then the class can be claimed"
         )
     for axis in found.axes:
-        if axis.biased and axis.n > 1:
+        if axis.biased:
             said.append(
                 f"The mean error in {axis.axis}, {_cm(axis.mean_m)}, is more than a quarter of its RMSE "
                 f"({_cm(axis.rmse_m)}): look for a shift, such as of a datum or of a geoid, before signing"

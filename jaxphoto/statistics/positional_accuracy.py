@@ -4,7 +4,8 @@
 
 RMSE_x, RMSE_y, RMSE_z are root mean squares of what the check points differ by, s_H and s_V those of the survey's
 standard deviations. Accuracy classes are any number of centimetres; thirty check points are the least for a claim, and
-a mean beyond a quarter of the RMSE has to be looked into.
+a mean beyond a quarter of the RMSE has to be looked into. Of few check points chance alone leaves such a mean (of
+three in three of four cases): it has to be beyond what Student's t allows, too.
 Source: ASPRS Positional Accuracy Standards for Digital Geospatial Data, Edition 2, Version 1.0 (August 2023).
 """
 
@@ -16,11 +17,14 @@ from jaxtyping import Float
 
 from jaxphoto.observations import AXES, ControlRows
 from jaxphoto.short_repr import shown
+from jaxphoto.statistics.quantiles import student_limit
 
 LEAST_CHECK_POINTS = 30
 """Fewer cannot support a claim of accuracy."""
 SUSPECT_MEAN = 0.25
-"""Of the RMSE of an axis: a larger mean error is no random one."""
+"""Of the RMSE of an axis: a larger mean error has to be looked into."""
+# Share of means without any shift that are beyond Student's t.
+_LEVEL = 0.05
 # Of a class in centimetres; the tested value is rounded up to so many.
 _DIGITS = 2
 
@@ -71,8 +75,11 @@ class AxisErrors(NamedTuple):
 
     @property
     def biased(self) -> bool:
-        """Whether the mean is more than random errors leave by the standard's rule."""
-        return abs(self.mean_m) > SUSPECT_MEAN * self.rmse_m
+        """Whether the mean is beyond the standard's rule, and beyond what chance leaves of so many check points."""
+        if self.n < 2 or abs(self.mean_m) <= SUSPECT_MEAN * self.rmse_m:
+            return False
+        scatter = math.sqrt(max(self.rmse_m**2 - self.mean_m**2, 0.0) / (self.n - 1))
+        return abs(self.mean_m) > student_limit(self.n - 1, _LEVEL) * scatter
 
 
 @shown

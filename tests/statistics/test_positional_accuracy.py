@@ -78,6 +78,10 @@ def test_a_shift_and_a_poor_survey_are_named():
     biased = np.add(thirty(), [0.0, 0.0, 0.05])
     said = accuracy_sentences(positional_accuracy(check_rows(biased, 0.01)))
     assert [s for s in said if "mean error" in s and "in Z" in s] and not [s for s in said if "error in X" in s]
+    # Means of half and of nearly all of the RMSE, t = 0.87 and 16 of 4.30, without freedom none.
+    few = positional_accuracy(check_rows(np.array([[0.0, 0.05, 0.01], [0.0, 0.05, 0.03], [0.0, 0.06, -0.01]]), 0.01))
+    assert [axis.biased for axis in few.axes] == [False, True, False]
+    assert not any(axis.biased for axis in positional_accuracy(check_rows(np.full((1, 3), 0.05), 0.01)).axes)
     poor = accuracy_sentences(positional_accuracy(check_rows(thirty(), [0.1, 0.1, 0.001])))
     assert "not twice as accurate as what it tests (horizontal)" in poor[-1]
 
