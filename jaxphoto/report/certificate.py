@@ -56,9 +56,8 @@ def _statement(given: Certified) -> Iterator[Element]:
         yield Paragraph(f"Not to be signed: the verdict on the adjustment is red.{why}", "verdict red")
     elif colour == "amber":
         n = sum(level == "warning" for level, _ in findings)
-        yield Paragraph(
-            f"Calibrated with {n} reservation{'s' if n != 1 else ''}, which are listed under Findings.", "verdict amber"
-        )
+        those = "1 reservation, which is" if n == 1 else f"{n} reservations, which are"
+        yield Paragraph(f"Calibrated with {those} listed under Findings.", "verdict amber")
     else:
         yield Paragraph("Calibrated; no test of the adjustment objects.", "verdict green")
     if given.sigma_factor > 1:

@@ -169,7 +169,7 @@ def _placed(block: Block, frame: InFrame, met, covariance, sigma, points: Survey
     said = [f"{int(onto.agree.sum())} of {counted(len(known), 'control point')} bring the block to their frame"]
     if frame.at_place:
         off = np.median((frame.xyz - met)[known[onto.agree]], axis=0)
-        told = ", ".join(f"{v:.2f}" for v in off)
+        told = ", ".join(f"{v:.2f}" for v in np.round(off, 2) + 0.0)
         said.append(f"control lies {told} m (east, north, up) from where the positions of the photographs have it")
     block = dataclasses.replace(onto.similarity.of_block(block), frame=frame.frame)
     return block, onto.similarity.of(met), agree, sigma, said
