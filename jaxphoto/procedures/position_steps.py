@@ -27,7 +27,7 @@ _ALONE, _MAD = 6.0, 1.4826
 _BEND = (4, 5, 6)
 
 
-class Step(NamedTuple):
+class PositionStep(NamedTuple):
     """From the photograph `first` on (of those in order) positions are off from those before."""
 
     first: int
@@ -37,7 +37,7 @@ class Step(NamedTuple):
 
 def steps_of(
     offsets_m: Float[np.ndarray, "n 3"], at_m: Float[np.ndarray, "n 3"], least_m: Float[np.ndarray, "3"]
-) -> list[Step]:
+) -> list[PositionStep]:
     """The steps of `offsets_m` (recorded minus network: east, north, up) of photographs in their order, taken `at_m`.
 
     Those that are no more than `least_m` on any axis are none: the positions' standard deviations allow as much. Of
@@ -52,7 +52,7 @@ def steps_of(
         return []
     places.sort()
     by, sigma = _sizes(y, model, places)
-    return [Step(int(kept[c]), by[k], sigma[k]) for k, c in enumerate(places)]
+    return [PositionStep(int(kept[c]), by[k], sigma[k]) for k, c in enumerate(places)]
 
 
 def _model(at: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 u"]:
