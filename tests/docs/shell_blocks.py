@@ -53,7 +53,7 @@ GIVEN = {
             "FORMAT": "opensfm",
         },
     ),
-    "docs/experiments.md": Given("", {"000": "000 --layouts 1"}),
+    "docs/experiments.md": Given("jaxphoto example experiments\n", {"000": "000 --layouts 1"}),
     "docs/fly.md": Given(_FLIGHT),
     "docs/halves.md": Given(_BLOCK + _YEARS, {"--cuts 64": "--cuts 8"}),
     "docs/joint.md": Given(
@@ -82,7 +82,9 @@ GIVEN = {
     ),
     "docs/weights.md": Given(_BLOCK),
     "README.md": Given(
-        _LIDAR + "made_photographs board board\nmade_photographs flight photographs\n",
+        "jaxphoto example experiments\n"
+        + _LIDAR
+        + "made_photographs board board\nmade_photographs flight photographs\n",
         {"--draws 1000": "--draws 50", "--layouts 4": "--layouts 1", ".venv/bin/": ""},
     ),
 }
