@@ -74,7 +74,7 @@ GIVEN = {
         "jaxphoto example cross_block\njaxphoto convert cross_block FILE_OR_FOLDER --to openmvg --adjust\n"
     ),
     "docs/scaling.md": Given(_BLOCK.replace("BLOCK", "block") + "echo 'import jaxphoto' > my_script.py\n"),
-    "docs/simultaneous.md": Given(_LIDAR),
+    "docs/simultaneous.md": Given(_LIDAR, {" --centroids R1,R2": ""}),
     "docs/stability.md": Given(_RESULTS + "cp -r RESULTS RESULTS_A\ncp -r RESULTS RESULTS_B\n"),
     "docs/strip_adjustment.md": Given(
         _STRIPS + "echo point,X_m,Y_m,Z_m,sigma_X_m,sigma_Y_m,sigma_Z_m > surveyed.csv\n"
