@@ -107,7 +107,8 @@ def ours(arguments: argparse.Namespace) -> dict:
     from jaxphoto.io.photographs import known_lens, sensor_and_interior
     from jaxphoto.io.sound_photographs import sound_photographs
     from jaxphoto.procedures.calibration import distortion_model
-    from jaxphoto.procedures.flight import KnownOfFlight, MatchedPart, calibrate_flight
+    from jaxphoto.procedures.flight import KnownOfFlight, calibrate_flight
+    from jaxphoto.procedures.matched_part import MatchedPart
     from jaxphoto.report.flight import FlightSource, report_of, write_flight
 
     read, spoilt = sound_photographs(_files(arguments))
@@ -139,14 +140,7 @@ def ours(arguments: argparse.Namespace) -> dict:
     if not arguments.only_matches:
         distortion = distortion_model("brown", camera.sensor)
         names, start = [p.name for p in read], camera.interior
-        parts = []
-        for group in matched.parts:
-            own = matched.of(group)
-            parts.append(
-                MatchedPart(
-                    [names[k] for k in group], own.xy_mm, own.sigma_mm, own.pairs, own.n_gross, own.sigma_factor
-                )
-            )
+        part = MatchedPart(names, matched.xy_mm, matched.sigma_mm, matched.pairs, matched.gross, matched.sigma_factor)
 
         def report(doing: str) -> None:
             if doing == "adjusting":
@@ -159,7 +153,7 @@ def ours(arguments: argparse.Namespace) -> dict:
             {p.name: p.attitude for p in read},
             lens=known_lens(read, camera, distortion),
         )
-        flight = calibrate_flight(parts, camera.sensor, interior, known, report)
+        flight = calibrate_flight(part, camera.sensor, interior, known, report)
         clock.step("adjustment")
         reports = [report_of(part) for part in flight.parts]
         with tempfile.TemporaryDirectory() as folder:

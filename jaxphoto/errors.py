@@ -59,6 +59,14 @@ class BlockError(JaxphotoError):
     """Observations that cannot make an adjustment: unknown ids, too few rays, points behind the camera."""
 
 
+class GroupsError(BlockError):
+    """Images in `groups` (of their names) that nothing orients to one another, though matches join them."""
+
+    def __init__(self, message: str, groups: Iterable[Iterable[str]]):
+        super().__init__(message)
+        self.groups = tuple(frozenset(group) for group in groups)
+
+
 class DatumError(JaxphotoError):
     """A block whose observations leave its position, orientation or scale undetermined."""
 

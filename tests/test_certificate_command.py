@@ -97,6 +97,13 @@ def test_nothing_is_claimed_of_inputs_without_hashes(results, tmp_path, monkeypa
 def test_against_itself_a_camera_has_not_changed(results, tmp_path, monkeypatch, capsys):
     page = certified(results, tmp_path / "a.html", monkeypatch, capsys, "--last", results).decode()
     assert "No earlier calibration was given" not in page
+    # Nothing that two calibrations of the same measurements could say of a change.
+    shared = "they cannot but agree"
+    assert shared in page
+    shutil.copytree(results, tmp_path / "other")
+    inputs = tmp_path / "other" / "inputs.csv"
+    inputs.write_text(inputs.read_text().replace("image_points.csv", "other.csv"))
+    assert shared not in certified(results, tmp_path / "o.html", monkeypatch, capsys, "--last", inputs.parent).decode()
     # The folder of a flight has them in one of its own.
     (tmp_path / "flight").mkdir()
     shutil.copytree(results, tmp_path / "flight" / "result")

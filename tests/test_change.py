@@ -78,4 +78,4 @@ def test_one_calibration_is_not_compared_with_itself_and_shared_image_points_are
         rows = f"x/image_points.csv,9,{64 * key}\ny.csv,9,{63 * key}9\n"
         (folder / "inputs.csv").write_text(f"file,n_bytes,sha256\n{rows}")
         code, _, error = run(monkeypatch, capsys, "compare", a, b)
-        assert code == 0 and ("are of the same image points" in error) == shared
+        assert code == 0 and ("are of the same photographs or image points" in error) == shared

@@ -9,7 +9,7 @@ import typer
 
 from jaxphoto.camera.conditions import Conditions
 from jaxphoto.cli.output import Output, command
-from jaxphoto.cli.two_cameras import check_one_sensor
+from jaxphoto.cli.two_cameras import check_one_sensor, share_measurements
 from jaxphoto.errors import InputError
 from jaxphoto.io.cameras import CameraFile, read_camera_file
 from jaxphoto.io.cameras.own_cameras import results_in
@@ -128,7 +128,8 @@ def _last(this: CameraFile, folder: Path, last: Path) -> LastCalibration:
     check_one_sensor(this, file, folder, last)
     inside = results_in(last)
     path = next((inside / name for name in _OF_CAMERA if (inside / name).is_file()), last) if last.is_dir() else last
-    return LastCalibration(last.name, file.interior, file.covariance, input_file(path, f"last/{path.name}"))
+    shared = share_measurements(folder, last)
+    return LastCalibration(last.name, file.interior, file.covariance, input_file(path, f"last/{path.name}"), shared)
 
 
 def _band(folder: Path) -> FormatBand:

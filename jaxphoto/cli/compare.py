@@ -9,7 +9,7 @@ from jaxphoto.cli.choices import one_of
 from jaxphoto.cli.grid_options import check_grid, points_of
 from jaxphoto.cli.made import made_by
 from jaxphoto.cli.output import Output, command
-from jaxphoto.cli.two_cameras import check_two_calibrations, compared, read_two, share_image_points
+from jaxphoto.cli.two_cameras import check_two_calibrations, compared, read_two, share_measurements
 from jaxphoto.report.change import change_summary, print_change, write_change
 from jaxphoto.stability import METHODS, Method, change
 from jaxphoto.writing import check_folder
@@ -40,8 +40,8 @@ def compare_command(
         check_folder(out, first, second)
     a, b = read_two((first, second), (camera, camera_b), pixel_mm, block)
     check_two_calibrations(a, b, first, second)
-    if share_image_points(first, second):
-        output.warn("A and B are of the same image points; the test takes them to be of different photographs")
+    if share_measurements(first, second):
+        output.warn("A and B are of the same photographs or image points; the test takes them to be of others")
     with output.progress.status("comparing"):
         points = points_of(a.sensor, grid, extent)
         found = change(a.interior, b.interior, points, (a.covariance, b.covariance), method)

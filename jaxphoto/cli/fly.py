@@ -6,7 +6,6 @@ from pathlib import Path
 from threading import Thread
 from typing import Annotated
 
-import numpy as np
 import typer
 
 from jaxphoto.camera import DISTORTIONS, InteriorOrientation
@@ -21,7 +20,7 @@ from jaxphoto.georeferencing.geoid_heights import WGS84
 from jaxphoto.georeferencing.map_frame import check_heights
 from jaxphoto.image_measurement.control_targets import target_looker
 from jaxphoto.image_measurement.features import LONGEST_PX
-from jaxphoto.image_measurement.matching import MatchedPhotographs, match_photographs
+from jaxphoto.image_measurement.matching import match_photographs
 from jaxphoto.image_measurement.photograph_pairs import MostAlike, photograph_pairs, usual_choice, usual_count
 from jaxphoto.image_measurement.targets.on_ground import SYNTAX, read_target
 from jaxphoto.io.block_folder import whole_block
@@ -34,9 +33,17 @@ from jaxphoto.io.photographs import known_lens, sensor_and_interior
 from jaxphoto.io.sound_photographs import folders_not_looked_into, sound_photographs
 from jaxphoto.procedures.calibration import distortion_model
 from jaxphoto.procedures.control.of_flight import flight_control
-from jaxphoto.procedures.flight import KnownOfFlight, MatchedPart, calibrate_flight
+from jaxphoto.procedures.flight import KnownOfFlight, calibrate_flight
+from jaxphoto.procedures.matched_part import MatchedPart
 from jaxphoto.report import Level, prepare_pictures
-from jaxphoto.report.flight import FlightSource, block_folder, report_of, write_flight, write_part_orientation
+from jaxphoto.report.flight import (
+    FlightSource,
+    block_folder,
+    camera_sentences,
+    report_of,
+    write_flight,
+    write_part_orientation,
+)
 from jaxphoto.report.terminal import plain
 from jaxphoto.writing import check_folder, whole_folder
 
@@ -150,7 +157,7 @@ def fly_command(
         names, start = [p.name for p in read], camera.interior
         taken = {p.name: (p.taken.clock_s, p.taken.resolution_s) for p in read if p.taken}
         flight = calibrate_flight(
-            [_part(names, group, matched.of(group)) for group in matched.parts],
+            MatchedPart(names, matched.xy_mm, matched.sigma_mm, matched.pairs, matched.gross, matched.sigma_factor),
             camera.sensor,
             InteriorOrientation(start.c, start.x_p, start.y_p, distortion),
             KnownOfFlight(
@@ -213,6 +220,8 @@ def fly_command(
         report = part.oriented.report
         sizes = f"{len(report.order)} photographs, {report.n_image_points} image points, {report.mean_px:.2f} px"
         output.say(f"part {number}: {sizes}")
+        for sentence in camera_sentences(reports[number - 1]):
+            output.say(f"  {sentence}")
         for sentence in part.placed.sentences if part.placed else (part.why_not,):
             output.say(f"  {plain(sentence)}")
         for sentence in part.controlled.sentences if part.controlled else ():
@@ -228,10 +237,6 @@ def fly_command(
     output.wrote(out, f"results in {out} (open report.html)")
     if verdict.level == Level.ALARM:
         raise typer.Exit(1)
-
-
-def _part(names: list[str], group: np.ndarray, own: MatchedPhotographs) -> MatchedPart:
-    return MatchedPart([names[k] for k in group], own.xy_mm, own.sigma_mm, own.pairs, own.n_gross, own.sigma_factor)
 
 
 def _in_words(compared: list[tuple[int, int]] | MostAlike) -> str:

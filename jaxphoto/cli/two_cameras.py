@@ -7,10 +7,12 @@ import equinox as eqx
 
 from jaxphoto.errors import InputError
 from jaxphoto.io.cameras import CameraFile, read_camera_file
+from jaxphoto.io.cameras.own_cameras import results_in
 from jaxphoto.io.input_hashes import INPUTS, read_inputs
+from jaxphoto.io.sound_photographs import SUFFIXES
 from jaxphoto.report.stability import Compared
 
-_MEASURED = "image_points.csv"
+_MEASURED = ("image_points.csv", *SUFFIXES)
 
 
 def read_two(
@@ -39,13 +41,13 @@ def check_two_calibrations(a: CameraFile, b: CameraFile, first: Path, second: Pa
         )
 
 
-def share_image_points(first: Path, second: Path) -> bool:
-    """Whether two folders of results say that a file of image points is the same."""
-    tables = [path / INPUTS for path in (first, second)]
+def share_measurements(first: Path, second: Path) -> bool:
+    """Whether two folders of results say that a photograph, or a file of image points, is the same."""
+    tables = [results_in(path) / INPUTS for path in (first, second)]
     if not all(table.is_file() for table in tables):
         return False
-    one, other = ({f.sha256 for f in read_inputs(table) if f.file.endswith(_MEASURED)} for table in tables)
-    return not one.isdisjoint(other)
+    measured = lambda table: {f.sha256 for f in read_inputs(table) if f.file.lower().endswith(_MEASURED)}  # noqa: E731
+    return not measured(tables[0]).isdisjoint(measured(tables[1]))
 
 
 def check_one_sensor(a: CameraFile, b: CameraFile, first: Path, second: Path) -> None:

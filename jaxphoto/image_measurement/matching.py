@@ -66,30 +66,14 @@ class MatchedPhotographs(NamedTuple):
     """Photographs by name that match no other one, and why."""
 
     @property
-    def n_gross(self) -> int:
-        """Matches by looks that are not on the epipolar lines, or of pairs that have too few."""
-        return int((self.counts[:, 2] - self.counts[:, 3]).sum())
+    def gross(self) -> Int[np.ndarray, "compared 3"]:
+        """For all pairs compared: first, second, matches by looks that are not on the epipolar lines, or too few."""
+        return np.column_stack([self.counts[:, :2], self.counts[:, 2] - self.counts[:, 3]])
 
     @property
-    def parts(self) -> list[Int[np.ndarray, "photographs"]]:
-        """Photographs that hang together, the most first; those that match no other are in none."""
-        return [group for group in connected_images(len(self.xy_mm), self.pairs) if len(group) > 1]
-
-    def of(self, photographs: Int[np.ndarray, "photographs"]) -> "MatchedPhotographs":
-        """The same of some photographs, counted anew."""
-        new = {int(k): i for i, k in enumerate(photographs)}
-        pairs = [
-            PairMatches(new[p.first], new[p.second], p.features)
-            for p in self.pairs
-            if p.first in new and p.second in new
-        ]
-        counts = [(new[a], new[b], *rest) for a, b, *rest in self.counts.tolist() if a in new and b in new]
-        return self._replace(
-            xy_mm=[self.xy_mm[k] for k in photographs],
-            sigma_mm=[self.sigma_mm[k] for k in photographs],
-            pairs=pairs,
-            counts=np.array(counts, int).reshape(-1, 4),
-        )
+    def n_gross(self) -> int:
+        """How many those are in all."""
+        return int(self.gross[:, 2].sum())
 
 
 class TieFeatures(NamedTuple):

@@ -14,9 +14,9 @@ from jaxphoto.writing import MARKER
 from jaxphoto.writing.inputs import input_file
 
 # Of files that are taken from a folder.
-_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
+SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 # What cameras write; a folder of PNG beside photographs is seldom one of a camera.
-_OF_CAMERAS = tuple(suffix for suffix in _SUFFIXES if suffix != ".png")
+_OF_CAMERAS = tuple(suffix for suffix in SUFFIXES if suffix != ".png")
 _RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".rw2", ".orf", ".raf", ".srw", ".pef")
 # A JPEG is decoded to about this size, an eighth at least, which tells as surely whether it is whole.
 _SMALL_PX = (512, 512)
@@ -130,7 +130,7 @@ def _series(name: str) -> str:
 
 
 def _pictures(folder: Path) -> list[Path]:
-    return sorted(file for file in folder.iterdir() if file.suffix.lower() in _SUFFIXES and file.is_file())
+    return sorted(file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES and file.is_file())
 
 
 def _check_whole(file: Path) -> None:

@@ -1,18 +1,15 @@
 """From matched photographs of a flight to calibrations: each part that hangs together, the largest first."""
 
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
-
-import numpy as np
-from jaxtyping import Float
 
 from jaxphoto.adjustment import LEAST, Adjustment
 from jaxphoto.block import Block
 from jaxphoto.camera import InteriorOrientation, Sensor
-from jaxphoto.errors import BlockError, DatumError, InputError, RankError
+from jaxphoto.errors import BlockError, DatumError, GroupsError, InputError, RankError
 from jaxphoto.georeferencing.camera_attitude import CameraAttitude
 from jaxphoto.georeferencing.gps import Gps
-from jaxphoto.orientation.matches import PairMatches
 from jaxphoto.procedures.adjust import adjust_for_tables
 from jaxphoto.procedures.control import ControlledBlock, rejudged
 from jaxphoto.procedures.control.of_flight import FlightControl, controlled_or_why, parts_with_marks
@@ -23,6 +20,7 @@ from jaxphoto.procedures.georeference_photographs import (
     held_in_place,
 )
 from jaxphoto.procedures.known_lens import KnownLens, with_known_lens
+from jaxphoto.procedures.matched_part import MatchedPart
 from jaxphoto.procedures.orientation import Oriented, orient
 from jaxphoto.procedures.orientation.orient_photographs import CAMERA
 from jaxphoto.procedures.orientation.related_pairs import Report
@@ -31,19 +29,9 @@ from jaxphoto.statistics import VarianceComponents, variance_components
 
 # Random vectors: hundreds of thousands of image points make each expensive, and there are few parts to tell apart.
 _PROBES = 16
-
-
-class MatchedPart(NamedTuple):
-    """Photographs that hang together: their features and which of them are the same places, as `orient` takes them."""
-
-    names: list[str]
-    xy_mm: list[Float[np.ndarray, "n 2"]]
-    sigma_mm: list[Float[np.ndarray, "n"]]
-    pairs: list[PairMatches]
-    n_gross: int
-    """Matches by looks that were left out."""
-    sigma_factor: float
-    """How far the others scatter, over what is expected of features of a plane."""
+# Photographs that the part around them would not take make one of their own from so many; nothing checks two.
+_PART_OF_ITS_OWN = 3
+_NO_PAIR = "no other photograph has a relative orientation to it"
 
 
 class KnownOfFlight(NamedTuple):
@@ -92,7 +80,7 @@ class CalibratedFlight(NamedTuple):
 
 
 def calibrate_flight(
-    matched: Sequence[MatchedPart],
+    matched: MatchedPart,
     sensor: Sensor,
     interior: InteriorOrientation,
     known: KnownOfFlight,
@@ -101,7 +89,8 @@ def calibrate_flight(
 ) -> CalibratedFlight:
     """Orient, georeference and adjust every part of the photographs of one camera, which starts at `interior`.
 
-    `orient` is the function of this name, or one that keeps its outcome.
+    A part is what hangs together; so do photographs that the others of their part see too little of, but they of each
+    other enough. `orient` is the function of this name, or one that keeps its outcome.
 
     Photographs that cannot be oriented, and whole parts that cannot, are left out with the reason. What is `known` and
     does not fit a part, it goes without, and says why.
@@ -110,16 +99,24 @@ def calibrate_flight(
     """
     parts: list[FlightPart] = []
     left: dict[str, str] = {}
-    for number, part in enumerate(matched, 1):
-        report(f"part {number} of {len(matched)}")
+    waiting = deque(matched.groups())
+    while waiting:
+        part, number = waiting.popleft(), len(parts) + 1
+        report(f"part {number} of {number + len(waiting)}")
         try:
             parts.append(_calibrated(part, sensor, interior, known, report, orient))
-        except BlockError as error:
-            left |= {
-                name: f"its part of {len(part.names)} photographs cannot be oriented: {error}" for name in part.names
-            }
+        except GroupsError as error:
+            waiting += [part.among(group) for group in error.groups]
+            left |= dict.fromkeys(set(part.names).difference(*error.groups), _NO_PAIR)
             continue
-        left |= parts[-1].oriented.report.unoriented
+        except BlockError as error:
+            why = f"its part of {len(part.names)} photographs cannot be oriented: {error}"
+            left |= {name: left.get(name, why) for name in part.names}
+            continue
+        oriented = parts[-1].oriented
+        unoriented = oriented.report.unoriented
+        left = {name: why for name, why in (left | unoriented).items() if name not in oriented.block.images}
+        waiting += part.among(unoriented).groups(_PART_OF_ITS_OWN)
     if not parts:
         raise InputError(f"no photographs can be oriented; {next(iter(left.values()), 'there are none')}")
     parts.sort(key=lambda p: -len(p.oriented.block.images))

@@ -27,6 +27,10 @@ from jaxphoto.statistics.correlation import high_pairs
 from jaxphoto.writing.inputs import digest_of_all
 
 _COLUMNS, _ROWS = 15, 11
+_SHARED = (
+    "Both are of the same photographs, or share some of them: they cannot but agree, and that nothing has changed is "
+    "not shown. Compare with a calibration by other photographs."
+)
 # Steps of the table of distortion: every second of the curve.
 _EVERY = 3
 _HIGH = 0.9
@@ -228,6 +232,8 @@ def _stability(given: Certified) -> Iterator[Element]:
     widened = None if given.covariance is None else given.covariance * given.sigma_factor**2
     found = change(last.interior, given.interior, points, (last.covariance, widened))
     yield Paragraph(f"Compared with {last.name} (first: that, second: this).")
+    if last.shared:
+        yield Paragraph(_SHARED)
     for sentence in change_verdict(found, given.sensor):
         yield Paragraph(as_sentence(sentence))
     offset = found.offset_mm / given.sensor.pixel_mm

@@ -20,6 +20,8 @@ class LastCalibration(NamedTuple):
     covariance: Float[np.ndarray, "q q"] | None
     input: InputFile
     """The file that it was read from."""
+    shared: bool = False
+    """Whether it is of the same photographs, or of some of them."""
 
 
 class FormatBand(NamedTuple):

@@ -10,6 +10,8 @@ from scipy.special import erfc
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
+from jaxphoto.block import Block
+from jaxphoto.camera import get_parameter, parameter_names
 from jaxphoto.errors import camera_words, counted
 from jaxphoto.observations import PRIORS
 from jaxphoto.procedures.adjust import ABSURD
@@ -32,12 +34,14 @@ from jaxphoto.statistics import (
     stretch,
     worst_checked,
 )
+from jaxphoto.unknowns import Weighted
 
 ANOTHER_UNIT = 0.1
 """A sigma naught below this says that standard deviations were given in another unit."""
 NOTHING_FITS = 3.0
 """A rejected sigma naught above this is no question of weights: something is wrong."""
 _SHOWN = 3
+_NOT_DISTORTION = ("c_mm", "xp_mm", "yp_mm")
 # A suspect is no reservation but an alarm beyond this times the critical value, or where it moves an interior parameter
 # by more than `_SPOILT` of its standard deviations; below `_TOLD` that is not worth telling.
 _FAR_OUT, _SPOILT, _TOLD = 1.25, 0.5, 0.05
@@ -79,6 +83,18 @@ def contradictions(tables: Tables) -> Iterator[Finding]:
     yield from _blunders(tables, tables.culprits)
 
 
+def _of_such_lenses(block: Block) -> bool:
+    """Whether what is known is how far lenses of a kind lie apart: wide for a good one, and of no photographs."""
+    # Which observes every distortion as none; who has measured one has found some.
+    known = [
+        float(prior.value)
+        for priors in block.priors.interior.values()
+        for name in parameter_names(priors)
+        if name not in _NOT_DISTORTION and isinstance(prior := get_parameter(priors, name), Weighted)
+    ]
+    return bool(known) and not any(known)
+
+
 def _global_test(tables: Tables) -> Iterator[Finding]:
     """Sigma naught against 1, and which groups of observations it comes from."""
     whole = global_test(tables.adjusted, tables.redundancy)
@@ -95,7 +111,7 @@ def _global_test(tables: Tables) -> Iterator[Finding]:
         # Of few observations beside many, sigma naught shows nothing.
         for f in factors:
             if f.group.startswith(PRIORS):
-                if f.sigma < 1:
+                if f.sigma < 1 and not (f.group == PRIORS and _of_such_lenses(tables.adjusted.block)):
                     yield Finding(
                         Level.WARNING,
                         "what was known of parameters beforehand agrees with this block better than chance allows "

@@ -8,7 +8,8 @@ from jaxphoto.errors import InputError
 from jaxphoto.georeferencing.gps import Gps
 from jaxphoto.procedures.control.of_flight import flight_control
 from jaxphoto.procedures.control.surveyed import GivenControl, Marks, SurveyedPoints
-from jaxphoto.procedures.flight import KnownOfFlight, MatchedPart, calibrate_flight
+from jaxphoto.procedures.flight import KnownOfFlight, calibrate_flight
+from jaxphoto.procedures.matched_part import MatchedPart
 from tests.procedures.orientable import PIXEL, SENSOR, Camera, aerial, photographed, projected
 
 LENS = Camera(8.0, 0.04, -0.03, 1e-4, -1e-6)
@@ -44,9 +45,9 @@ def test_the_block_is_in_the_local_system_and_no_position_is_used(flown):
     assert code is None and given.local
     p = photographed(scene, LENS, NOISE_PX, 0.1)
     sigmas = [np.full(len(xy), NOISE_PX * PIXEL) for xy in p.features]
-    part = MatchedPart(list(p.names), p.features, sigmas, p.matches, 0, 1.0)
+    part = MatchedPart(list(p.names), p.features, sigmas, p.matches, np.zeros((0, 3), int), 1.0)
     known = KnownOfFlight(positions, {}, code, given)
-    (found,) = calibrate_flight([part], SENSOR, InteriorOrientation(8.1), known).parts
+    (found,) = calibrate_flight(part, SENSOR, InteriorOrientation(8.1), known).parts
     assert found.placed is None and "control is in a local system" in found.why_not and not found.no_control
     block = found.adjusted.block
     assert block.frame.kind == "local" and not len(block.stations) and bool(found.adjusted.converged)

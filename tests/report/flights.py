@@ -8,8 +8,9 @@ import pandas as pd
 from jaxphoto import Tables
 from jaxphoto.adjustment import LEAST
 from jaxphoto.camera.conditions import Conditions
-from jaxphoto.procedures.flight import FlightPart, MatchedPart
+from jaxphoto.procedures.flight import FlightPart
 from jaxphoto.procedures.georeference_photographs import GeoreferencedPhotographs
+from jaxphoto.procedures.matched_part import MatchedPart
 from jaxphoto.procedures.orientation import Oriented
 from jaxphoto.procedures.orientation.orient_photographs import GrossErrors, OrientationReport
 from jaxphoto.report.findings import Finding, Level, Verdict
@@ -33,7 +34,9 @@ def part_report() -> PartReport:
         True, True, 2.0, 0.5, 1.0, ("c_mm",), (), 1.5,
     )  # fmt: skip
     placed = GeoreferencedPhotographs(block, block.images[:4], OFFSETS_M, np.array([True] * 3 + [False]), ())
-    matched = MatchedPart(list(block.images), [np.zeros((k + 5, 2)) for k in range(n)], [], [], 0, 1.0)
+    matched = MatchedPart(
+        list(block.images), [np.zeros((k + 5, 2)) for k in range(n)], [], [], np.zeros((0, 3), int), 1.0
+    )
     residuals = np.asarray(found.residuals.image).T * np.asarray(block.image_points.sigma)
     part = FlightPart(Oriented(block, residuals, report, LEAST), matched, placed, "", None, found)
     d = np.full((n, 3), np.nan)

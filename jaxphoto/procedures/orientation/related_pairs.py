@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxphoto.errors import BlockError
+from jaxphoto.errors import BlockError, GroupsError
 from jaxphoto.orientation.matches import PairMatches, connected_images
 from jaxphoto.orientation.relative import RelativeOrientation, relative_orientations
 
@@ -108,7 +108,7 @@ def _orientations(rays_1, rays_2, sigma_rad: float, least: int, images: str) -> 
 
 
 def check_connected(names: Sequence[str], related: Related) -> None:
-    """Raise BlockError where no pair is left, or groups of images have no pair between them (all named)."""
+    """Raise BlockError where no pair is left, and GroupsError where groups have none between them (all named)."""
     if not related.pairs:
         why = f" ({next(iter(related.refused.values()))})" if related.refused else ""
         raise BlockError(
@@ -118,8 +118,10 @@ def check_connected(names: Sequence[str], related: Related) -> None:
     joined = [PairMatches(pair.first, pair.second, np.zeros((pair.n, 2), int)) for pair in related.pairs]
     groups = [g for g in connected_images(len(names), joined) if len(g) > 1]
     if len(groups) > 1:
-        named = "; ".join(", ".join(names[i] for i in group) for group in groups)
-        raise BlockError(
+        by_name = [[names[i] for i in group] for group in groups]
+        named = "; ".join(map(", ".join, by_name))
+        raise GroupsError(
             f"the images are {len(groups)} groups that have too few points in common to be oriented to one another "
-            f"({named}): orient each by itself, or add images that connect them"
+            f"({named}): orient each by itself, or add images that connect them",
+            by_name,
         )

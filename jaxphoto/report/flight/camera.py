@@ -8,18 +8,19 @@ import numpy as np
 
 from jaxphoto.camera import InteriorOrientation, get_parameter, parameter_names
 from jaxphoto.report.alike import with_alike
-from jaxphoto.report.certificate import with_sigma
 from jaxphoto.report.certificate_figures import draw_correlations, draw_curve
+from jaxphoto.report.digits import of_sigma, with_sigma
 from jaxphoto.report.document import DocumentPicture, Element, Heading, Paragraph, Pictures, Rows
 from jaxphoto.report.findings import as_sentence, symbol
 from jaxphoto.report.flight.part import PartReport
 from jaxphoto.report.flight.source import FlightSource
 from jaxphoto.report.ground import ground_findings
-from jaxphoto.report.rolling_shutter import SEEN, readout_of
+from jaxphoto.report.rolling_shutter import SEEN, readout_of, shutter_findings
 from jaxphoto.stability import distortion_curve
 from jaxphoto.statistics.correlation import high_pairs
 
 HIGH = 0.9
+_FIRST = ("c_mm", "xp_mm", "yp_mm")
 
 
 def interior_rows(report: PartReport, start: InteriorOrientation | None) -> Rows:
@@ -52,6 +53,17 @@ def interior_rows(report: PartReport, start: InteriorOrientation | None) -> Rows
         rows.append(("readout_ms", "", with_sigma(p["value"], p["sigma"]), f"{p['sigma']:.2g}", "", "ms", "", seen))
     columns = ("parameter", "began at", "value", "sigma", "sigma alike", "unit", "in pixels", "significant")
     return Rows(columns, tuple(rows))
+
+
+def camera_sentences(report: PartReport) -> Iterator[str]:
+    """c, x_p and y_p with their standard deviations, and the readout of a rolling shutter, as a screen shows them."""
+    table = report.tables.interior
+    found = table[table["sigma"].notna() & table["parameter"].isin(_FIRST)]
+    each = zip(found["parameter"], found["value"], found["sigma"], strict=True)
+    told = [f"{symbol(name)} = {with_sigma(value, sigma)} +- {of_sigma(sigma)}" for name, value, sigma in each]
+    if told:
+        yield f"{', '.join(told)} mm"
+    yield from (finding.text for finding in shutter_findings(report.tables))
 
 
 def camera_section(report: PartReport, source: FlightSource) -> Iterator[Element]:

@@ -30,7 +30,8 @@ def flight_verdict(flight: CalibratedFlight, reports: list[PartReport], spoilt: 
         text = f"nothing joins the photographs to one block: {len(reports)} parts of {sizes}; judged is the largest"
         found.append(Finding(Level.WARNING, text))
     if lost:
-        text = f"{lost} of {n + lost} photographs are not used: each with the reason on the page"
+        used = "is not used: the reason is on" if lost == 1 else "are not used: each with the reason on"
+        text = f"{lost} of {n + lost} photographs {used} the page"
         found.append(Finding(Level.WARNING, text))
     return Verdict.of(found)
 

@@ -1,0 +1,54 @@
+"""Photographs with what they show in common, and the groups of them that hang together."""
+
+from collections.abc import Container
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxphoto.orientation.matches import PairMatches, connected_images
+
+
+class MatchedPart(NamedTuple):
+    """Photographs: their features and which of them are the same places, as `orient` takes them."""
+
+    names: list[str]
+    xy_mm: list[Float[np.ndarray, "n 2"]]
+    sigma_mm: list[Float[np.ndarray, "n"]]
+    pairs: list[PairMatches]
+    gross: Int[np.ndarray, "compared 3"]
+    """Of all pairs compared: first, second, matches by looks that were left out."""
+    sigma_factor: float
+    """How far the others scatter, over what is expected of features of a plane."""
+
+    @property
+    def n_gross(self) -> int:
+        """Matches by looks that were left out, of all pairs."""
+        return int(self.gross[:, 2].sum())
+
+    def groups(self, least: int = 2) -> list["MatchedPart"]:
+        """Those that hang together, the most first; groups of fewer than `least` are left out."""
+        together = connected_images(len(self.names), self.pairs)
+        return [self._of(group) for group in together if len(group) >= least]
+
+    def among(self, names: Container[str]) -> "MatchedPart":
+        """Those of `names`, with what they show in common."""
+        return self._of(np.array([k for k, name in enumerate(self.names) if name in names], int))
+
+    def _of(self, photographs: Int[np.ndarray, "photographs"]) -> "MatchedPart":
+        """Some of them, counted anew."""
+        new = np.full(len(self.names), -1)
+        new[photographs] = np.arange(len(photographs))
+        ends = new[self.gross[:, :2]]
+        inside = (ends >= 0).all(axis=1)
+        return self._replace(
+            names=[self.names[k] for k in photographs],
+            xy_mm=[self.xy_mm[k] for k in photographs],
+            sigma_mm=[self.sigma_mm[k] for k in photographs],
+            pairs=[
+                PairMatches(int(new[p.first]), int(new[p.second]), p.features)
+                for p in self.pairs
+                if new[p.first] >= 0 and new[p.second] >= 0
+            ],
+            gross=np.column_stack([ends, self.gross[:, 2]])[inside],
+        )
