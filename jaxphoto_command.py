@@ -7,6 +7,7 @@ swallows the exception. So here a thread waits for the signal, tidies up and end
 
 import atexit
 import contextlib
+import ctypes
 import os
 import signal
 import sys
@@ -15,6 +16,8 @@ from collections.abc import Callable
 
 # Ctrl-C, and what `kill` and a system that shuts down send.
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
+# Of <malloc.h>.
+_ARENA_MAX = -8
 tidy_up: list[Callable[[], object]] = []
 """What is done before a process that is told to end does."""
 _ending = threading.Event()
@@ -24,6 +27,7 @@ _exit_code = 1
 def main() -> None:
     """Entry point of the command `jaxphoto`."""
     global _exit_code
+    share_one_pool()
     # The first to be registered is the last to be called.
     atexit.register(_leave)
     end_at_signals()
@@ -36,6 +40,15 @@ def main() -> None:
     except SystemExit as stop:
         _exit_code = stop.code if isinstance(stop.code, int) else int(stop.code is not None)
         raise
+
+
+def share_one_pool() -> None:
+    """Have all threads take their memory from one pool of glibc, before there are any; other C libraries have none.
+
+    In one of its own a thread can keep nothing large, and asks the system anew for each array.
+    """
+    if sys.platform == "linux" and hasattr(libc := ctypes.CDLL(None), "mallopt"):
+        libc.mallopt(_ARENA_MAX, 1)
 
 
 def end_at_signals() -> None:

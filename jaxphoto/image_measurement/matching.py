@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxphoto.camera import InteriorOrientation, Sensor
+from jaxphoto.compiling.freed_memory import freed_memory_kept
 from jaxphoto.errors import InputError
 from jaxphoto.image_measurement.descriptors import METHOD as LOOKS
 from jaxphoto.image_measurement.descriptors import FindableFeatures, findable, match_descriptors
@@ -198,7 +199,7 @@ def _matched(
         return name, kept["xy_mm"], kept["sigma_mm"], largest_of(SiftFeatures(**kept))
 
     xy_mm, sigma_mm, largest = [], [], []
-    with ThreadPoolExecutor(os.cpu_count()) as workers:
+    with freed_memory_kept(), ThreadPoolExecutor(os.cpu_count()) as workers:
         for k, (name, xy, sigma, wide) in enumerate(workers.map(find, paths)):
             names.append(name)
             xy_mm.append(xy)
