@@ -8,6 +8,7 @@ from jaxtyping import Float
 from rich.console import Console
 
 from jaxphoto.georeferencing import TrajectoryKnot
+from jaxphoto.observations import AttitudeSteps, PositionSteps
 from jaxphoto.procedures.lidar import StripAdjustment, StripDifference, StripRound
 from jaxphoto.procedures.lidar.strip_adjustment import PHOTOGRAPHS
 from jaxphoto.procedures.lidar.strip_control import CHECK, CONTROL
@@ -117,7 +118,7 @@ def strips_verdict(result: StripAdjustment, tables: Tables | None) -> Verdict:
     """What is to be known of it first; `tables` are those of the adjustment where photographs are in it."""
     found = _of_strips(result) if tables is None else verdict_of(tables).findings
     odd = (Finding(Level.WARNING, sentence) for sentence in result.odd)
-    return Verdict.of((*_of_rounds(result), *odd, *_of_surveyed(result), *found))
+    return Verdict.of((*_of_rounds(result), *_of_steps(result), *odd, *_of_surveyed(result), *found))
 
 
 def _of_rounds(result: StripAdjustment) -> Iterator[Finding]:
@@ -128,6 +129,25 @@ def _of_rounds(result: StripAdjustment) -> Iterator[Finding]:
             f"planes were looked up {len(result.rounds)} times and it still changes (by {change:.2g} standard "
             "deviations the last time): ask for more rounds",
         )
+
+
+def _of_steps(result: StripAdjustment) -> Iterator[Finding]:
+    """Whether the trajectory had to be bent by many times what it is known by, so that strips come to lie on others."""
+    strips = result.cloud.strips
+    for steps, errors, unit in (
+        (PositionSteps, result.errors.position, "m"),
+        (AttitudeSteps, np.rad2deg(result.errors.attitude), "degrees"),
+    ):
+        over_sigma = np.abs(result.adjusted.residuals.named.get(steps.group, np.zeros(1))).max()
+        if over_sigma > _CONTRADICTS:
+            largest = [np.abs(errors[s.first : s.first + s.size]).max() for s in result.errors.splines]
+            worst = int(np.argmax(largest))
+            yield Finding(
+                Level.ALARM,
+                f"strips lie on one another where the trajectory of strip {strips[worst]} is off by "
+                f"{largest[worst]:.2g} {unit}, which changes by {over_sigma:.0f} times its standard deviation on the "
+                "way: look at the heights and the system of this strip, and at its trajectory",
+            )
 
 
 def _of_surveyed(result: StripAdjustment) -> Iterator[Finding]:

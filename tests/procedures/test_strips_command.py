@@ -106,6 +106,10 @@ def test_a_trajectory_is_mended_with_the_cloud(cloud_file, tmp_path, monkeypatch
     np.testing.assert_allclose(moved[middle, 2].mean(), SHIFT[2], atol=0.05)
     np.testing.assert_allclose(after.time_s, before.time_s)
     assert pd.read_csv(tmp_path / "out" / "strips.csv").rms_m[0] < 0.02
+    # Known by a five-hundredth of that, it cannot be off so, though the strips fit as well.
+    known = (*given[:-1], "0.0005")
+    code, output, errors = run(monkeypatch, capsys, "strips", cloud_file, "--out", tmp_path / "red", *known, *OPTIONS)
+    assert code == 1 and "the trajectory of strip 2 is off by" in " ".join(output.split())
 
 
 @pytest.fixture(scope="module")
