@@ -10,6 +10,7 @@ from jaxphoto.image_measurement.matching import match_photographs
 from jaxphoto.image_measurement.photograph_pairs import MostAlike, photograph_pairs, usual_choice, usual_count
 from jaxphoto.io.kept_pieces import KeptPieces
 from jaxphoto.io.photographs import photographs, sensor_and_interior
+from jaxphoto.orientation.matches import connected_images
 from tests.image_measurement.ground import C_MM, SENSOR, photograph, texture
 
 COUNT = 400
@@ -86,7 +87,7 @@ def test_those_that_look_alike_are_those_of_one_place(taken):
     assert most_alike(largest, 2, lambda done, of: None) == same_place
     found = matched(taken, photograph_pairs(read, "similar:2"))
     assert found.counts[:, :2].tolist() == [list(pair) for pair in same_place]
-    assert [group.tolist() for group in found.parts] == [[0, 2, 4], [1, 3, 5]]
+    assert [group.tolist() for group in connected_images(6, found.pairs)] == [[0, 2, 4], [1, 3, 5]]
     # Nothing looks like what shows nothing, and few features are as good as many.
     empty = largest[0][:0]
     assert most_alike([empty, largest[0], largest[2], empty], 2, lambda done, of: None) == [(1, 2)]

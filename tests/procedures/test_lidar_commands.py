@@ -75,7 +75,7 @@ def test_simultaneous(folder, tmp_path, monkeypatch, capsys):
     ("arguments", "said"),
     [
         (("--method", "magic"), "--method magic: there are idw, plane, tin, local, image"),
-        (("--sigma-z-m", "-1"), "sigma_z_m"),
+        (("--sigma-z-m", "-1"), "--sigma-z-m -1: give a positive number"),
         (("--class", "ground"), "--class ground: give numbers of classes"),
         (("--class", "9"), "9"),
     ],

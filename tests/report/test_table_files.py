@@ -85,9 +85,9 @@ def test_markdown_is_a_table_of_as_many_cells():
 def test_latex_has_the_rules_of_booktabs_and_no_bare_signs():
     table = Tables(adjusted("cross")).interior
     text = to_latex(table.assign(camera="c_1 & 50%"), "interior")
-    for rule in (r"\toprule", r"\midrule", r"\bottomrule", r"\begin{tabular}{llrrl}", r"\label{tab:interior}"):
+    for rule in (r"\toprule", r"\midrule", r"\bottomrule", r"\begin{tabular}{llrrll}", r"\label{tab:interior}"):
         assert rule in text
-    assert r"c\_1 \& 50\%" in text and r"$\sigma$" in text and r"c [mm]" in text
+    assert r"c\_1 \& 50\%" in text and r"$\sigma$" in text and r"& mm$^{-2}$ \\" in text
     assert re.search(r"\$-?\d\.\d+ \\times 10\^\{-5\}\$ & \$\d\.\d \\times 10\^\{-\d\}\$", text)
     assert not re.search(r"\de-\d", text)
     long = pd.DataFrame({"a": np.arange(100)})

@@ -36,12 +36,18 @@ def test_the_console_of_commands_prints_names_as_they_are(name):
     assert status.renderable.text.__rich__().plain == f"writing {plain}"
 
 
+def _camera(found):
+    (one,) = found.unknowns.interior.values()
+    return one
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_a_report_on_any_console_has_the_names(name):
     tables = Tables(adjusted("cross"))
     tables.significance = [dataclasses.replace(s, camera=name) for s in tables.significance]
     block = dataclasses.replace(tables.adjusted.block, title=name)
-    tables.adjusted = dataclasses.replace(tables.adjusted, block=block)
+    unknowns = dataclasses.replace(tables.adjusted.unknowns, interior={name: _camera(tables.adjusted)})
+    tables.adjusted = dataclasses.replace(tables.adjusted, block=block, unknowns=unknowns)
     console = Console(width=200, file=io.StringIO())
     print_adjustment(tables, Verdict((Finding(Level.WARNING, f"image {name} is far off"),)), console)
     said = console.file.getvalue()
