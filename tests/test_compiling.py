@@ -30,7 +30,6 @@ from jaxphoto.compiling import (
     store,
 )
 from jaxphoto.compiling.description import Indescribable, describe
-from jaxphoto.compiling.options import QUICK_TO_COMPILE, options_here, runs_little
 from jaxphoto.compiling.plain_tree import Slot
 from tests.compiled_programs import MATRIX, root
 
@@ -399,15 +398,3 @@ def test_settings_are_part_of_the_key(kept, monkeypatch):
     store._surroundings.cache_clear()
     assert len(set(keys)) == 5
     assert None not in keys
-
-
-def test_of_a_small_block_what_runs_little_is_compiled_quickly(monkeypatch):
-    def function(x):
-        return x
-
-    monkeypatch.setenv("XLA_FLAGS", "")
-    small, large = np.broadcast_to(0.0, 1_000_000), np.broadcast_to(0.0, 9_000_000)
-    assert options_here(function, (small,)) != QUICK_TO_COMPILE
-    runs_little(function)
-    assert options_here(function, (small, "a name")) == QUICK_TO_COMPILE
-    assert options_here(function, (large,)) == options_here(print, (small,)) != QUICK_TO_COMPILE

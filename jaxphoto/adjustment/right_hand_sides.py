@@ -10,7 +10,7 @@ import numpy as np
 from jaxphoto.adjustment.model.numbers import Increments
 from jaxphoto.adjustment.normal_equations import NormalEquations
 from jaxphoto.arrays import still
-from jaxphoto.compiling import prepare, run_compiled, runs_little
+from jaxphoto.compiling import prepare, run_compiled
 
 # Right-hand sides that are solved for side by side: making F of a large block anew costs more than they do. Together
 # they have no more numbers than this, as several arrays of them are held.
@@ -56,6 +56,5 @@ def in_batches(tree: Increments, size: int) -> Iterator[Increments]:
 
 
 @eqx.filter_jit
-@runs_little
 def _solve(equations: NormalEquations, b: Increments) -> Increments:
     return jax.vmap(equations.solve)(b)

@@ -142,7 +142,7 @@ def _program_of(function: Any, arguments: tuple, thorough: bool, anew: bool = Fa
 
     All that depends on the thread, such as `with jax.enable_x64(False)`, is done before this returns.
     """
-    options = options_here(function, arguments, thorough)
+    options = options_here(thorough)
     key = store.key_of(function, arguments, options)
     stored = store.load(key) if key and not anew else None
     if stored is not None:

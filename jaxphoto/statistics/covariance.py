@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 from jaxphoto.adjustment import Adjustment, Cofactors, NormalEquations, RowCofactors
 from jaxphoto.adjustment.model.numbers import Increments
 from jaxphoto.arrays import Numbers, gathered, still
-from jaxphoto.compiling import prepare, run_compiled, runs_little
+from jaxphoto.compiling import prepare, run_compiled
 from jaxphoto.errors import counted
 from jaxphoto.rotation import omega_phi_kappa_from_matrix, small_rotation
 from jaxphoto.short_repr import fields_html
@@ -139,7 +139,6 @@ def _run(adjusted: Adjustment, rotations: Rotations, of_rows: bool):
 
 
 @eqx.filter_jit
-@runs_little
 def _covariance(
     equations: NormalEquations, rotations: Rotations, of_rows: Bool[Numbers, ""]
 ) -> tuple[Cofactors, Array, Array, RowCofactors]:
