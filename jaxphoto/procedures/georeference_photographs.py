@@ -112,8 +112,8 @@ def georeference_photographs(
     # Where no file says how good its positions are, they are judged by one another alone.
     own = given if any(gps.stated_sigma_m for gps in known.values()) else np.zeros_like(given)
     fitted = _fitted(block, image, here, given, own, recorded)
-    stated = given if own.any() else np.zeros_like(given)
-    parts = position_parts(list(known), order, here - fitted.similarity.of(there), here, np.median(stated, axis=0))
+    # A receiver without corrections wanders by a part of its standard deviation within minutes, which is no step.
+    parts = position_parts(list(known), order, here - fitted.similarity.of(there), here, np.median(given, axis=0))
     raw, here = here, here - parts.off_m
     if parts.sentences:
         fitted = _fitted(block, image, here, given, own, recorded)
