@@ -108,7 +108,6 @@ def ours(arguments: argparse.Namespace) -> dict:
     from jaxphoto.io.sound_photographs import sound_photographs
     from jaxphoto.procedures.calibration import distortion_model
     from jaxphoto.procedures.flight import KnownOfFlight, calibrate_flight
-    from jaxphoto.procedures.matched_part import MatchedPart
     from jaxphoto.report.flight import FlightSource, report_of, write_flight
 
     read, spoilt = sound_photographs(_files(arguments))
@@ -140,7 +139,6 @@ def ours(arguments: argparse.Namespace) -> dict:
     if not arguments.only_matches:
         distortion = distortion_model("brown", camera.sensor)
         names, start = [p.name for p in read], camera.interior
-        part = MatchedPart(names, matched.xy_mm, matched.sigma_mm, matched.pairs, matched.gross, matched.sigma_factor)
 
         def report(doing: str) -> None:
             if doing == "adjusting":
@@ -153,7 +151,7 @@ def ours(arguments: argparse.Namespace) -> dict:
             {p.name: p.attitude for p in read},
             lens=known_lens(read, camera, distortion),
         )
-        flight = calibrate_flight(part, camera.sensor, interior, known, report)
+        flight = calibrate_flight(matched.named(names), camera.sensor, interior, known, report)
         clock.step("adjustment")
         reports = [report_of(part) for part in flight.parts]
         with tempfile.TemporaryDirectory() as folder:

@@ -34,7 +34,6 @@ from jaxphoto.io.sound_photographs import folders_not_looked_into, sound_photogr
 from jaxphoto.procedures.calibration import distortion_model
 from jaxphoto.procedures.control.of_flight import flight_control
 from jaxphoto.procedures.flight import KnownOfFlight, calibrate_flight
-from jaxphoto.procedures.matched_part import MatchedPart
 from jaxphoto.report import Level, prepare_pictures
 from jaxphoto.report.flight import (
     FlightSource,
@@ -157,7 +156,7 @@ def fly_command(
         names, start = [p.name for p in read], camera.interior
         taken = {p.name: (p.taken.clock_s, p.taken.resolution_s) for p in read if p.taken}
         flight = calibrate_flight(
-            MatchedPart(names, matched.xy_mm, matched.sigma_mm, matched.pairs, matched.gross, matched.sigma_factor),
+            matched.named(names),
             camera.sensor,
             InteriorOrientation(start.c, start.x_p, start.y_p, distortion),
             KnownOfFlight(

@@ -32,6 +32,7 @@ from jaxphoto.io.kept_pieces import KeptPieces, name_of
 from jaxphoto.io.photographs import Photograph
 from jaxphoto.orientation.matches import PairMatches, connected_images, tracks
 from jaxphoto.orientation.rays import ideal_coordinates
+from jaxphoto.procedures.matched_part import MatchedPart
 
 # Off the epipolar line at most, of the diagonal: 4 pixels of 1,300. A distortion not known yet grows with the format.
 _OFF_LINE = 0.003
@@ -75,6 +76,10 @@ class MatchedPhotographs(NamedTuple):
     def n_gross(self) -> int:
         """How many those are in all."""
         return int(self.gross[:, 2].sum())
+
+    def named(self, names: list[str]) -> MatchedPart:
+        """The same of photographs that are called so, as `calibrate_flight` takes it."""
+        return MatchedPart(names, self.xy_mm, self.sigma_mm, self.pairs, self.gross, self.sigma_factor)
 
 
 class TieFeatures(NamedTuple):

@@ -107,7 +107,7 @@ def calibrate_flight(
             parts.append(_calibrated(part, sensor, interior, known, report, orient))
         except GroupsError as error:
             waiting += [part.among(group) for group in error.groups]
-            left |= dict.fromkeys(set(part.names).difference(*error.groups), _NO_PAIR)
+            left |= {name: _NO_PAIR for name in part.names if not any(name in group for group in error.groups)}
             continue
         except BlockError as error:
             why = f"its part of {len(part.names)} photographs cannot be oriented: {error}"

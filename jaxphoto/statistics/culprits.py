@@ -39,7 +39,7 @@ def culprits(
     rows = [np.ravel(responses.places[s.group][..., s.row]) for s in some]
     shown = [int(np.atleast_2d(responses.places[s.group])[s.number, s.row]) for s in some]
     at, n = np.concatenate(rows), len(beside)
-    first = np.reshape([_column(responses, *pair) for pair in beside], (n, responses.count))
+    first = _columns(responses, beside)
 
     def column(k: int) -> np.ndarray:
         return first[k] if k < n else np.bincount(at[k - n : k - n + 1], minlength=responses.count).astype(float)
@@ -71,11 +71,14 @@ def culprits(
     return (*(some[i] for i in chosen), *others)
 
 
-def _column(responses: Responses, told: ResidualPattern, term: PatternTerm) -> Float[np.ndarray, "count"]:
-    """A term of a pattern, of which its columns need not be known, as a whitened error of all observations."""
-    patterns = patterns_of(responses.adjusted, responses.places)
-    pattern = next(p for p in patterns if (p.what, p.camera) == (told.what, told.camera))
-    count = responses.count
-    return sum(
-        (float(a) * pattern.column(k, count) for k, a in enumerate(term.coefficients) if a != 0.0), np.zeros(count)
-    )
+def _columns(
+    responses: Responses, beside: Sequence[tuple[ResidualPattern, PatternTerm]]
+) -> Float[np.ndarray, "terms count"]:
+    """Terms of patterns, of which their columns need not be known, as whitened errors of all observations."""
+    found, told = np.zeros((len(beside), responses.count)), [(p.what, p.camera) for p, _ in beside]
+    for pattern in patterns_of(responses.adjusted, responses.places) if beside else ():
+        for row, (name, (_, term)) in enumerate(zip(told, beside, strict=True)):
+            if name == (pattern.what, pattern.camera):
+                used = ((k, float(a)) for k, a in enumerate(term.coefficients) if a != 0.0)
+                found[row] = sum((a * pattern.column(k, responses.count) for k, a in used), found[row])
+    return found

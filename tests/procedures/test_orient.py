@@ -8,7 +8,7 @@ import pytest
 from jaxphoto.adjustment import solve
 from jaxphoto.camera import InteriorOrientation, get_parameter, parameter_names, set_parameter
 from jaxphoto.compiling import run
-from jaxphoto.errors import BlockError
+from jaxphoto.errors import BlockError, GroupsError
 from jaxphoto.orientation.matches import PairMatches
 from jaxphoto.procedures.adjust import adjust
 from jaxphoto.procedures.orientation import orient
@@ -161,8 +161,9 @@ def test_two_groups_that_nothing_connects_are_both_named(scene):
     p = photographed(scene)
     matches = [m for m in p.matches if (m.first < 3) == (m.second < 3) and m.second in (1, 2, 4)]
     sigmas = [np.full(len(xy), 0.3 * PIXEL) for xy in p.features]
-    with pytest.raises(BlockError, match=r"2 groups .*\(p00, p01, p02; p03, p04\)"):
+    with pytest.raises(GroupsError, match=r"2 groups .*\(p00, p01, p02; p03, p04\)") as apart:
         orient(p.names, SENSOR, InteriorOrientation(8.0), p.features, matches, sigmas)
+    assert apart.value.groups == ({"p00", "p01", "p02"}, {"p03", "p04"})
 
 
 def test_too_few_matches(scene):

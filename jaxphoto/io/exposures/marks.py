@@ -29,8 +29,7 @@ _LINE = re.compile(
 
 
 def read_marks(path: Path, without: Container[int] = ()) -> Exposures:
-    """The exposures of a MRK file, but for the rows `without`. Raises InputError, naming file
-    and row."""
+    """The exposures of a MRK file, but for the rows `without`. Raises InputError, naming file and row."""
     lines, rows = content_lines(path, without)
 
     def numbers_of(row: int, line: str) -> list[float]:
