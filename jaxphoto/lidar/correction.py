@@ -17,7 +17,9 @@ from jaxphoto.georeferencing import Scanner, Trajectory, TrajectorySpline, corre
 from jaxphoto.lidar.coverage import longest_interval, not_covered
 
 PORTION = 1 << 17
-"""Laser points at once, whose numbers stay in the processor's cache; fewer are padded to a power of two."""
+"""Laser points at once, whose numbers stay in the processor's cache."""
+# What fewer are padded to: computing with so few takes milliseconds, and every size compiles programs of its own.
+_SIZES = (1 << 12, 1 << 15, PORTION)
 
 
 class ScannerPoses(eqx.Module):
@@ -118,13 +120,14 @@ def in_portions(
     function: Callable, points: tuple[Float[np.ndarray, "n ..."], ...], *common: Any
 ) -> Float[np.ndarray, "n 3"]:
     """`function` of the rows of `points`, made by `eqx.filter_jit`, and of what all have in `common`, bit by bit."""
-    result = np.empty_like(points[0])
+    result = np.empty((len(points[0]), 3))
     for first in range(0, len(result), PORTION):
         own = slice(first, first + PORTION)
         some = [v[own] for v in points]
         n = len(some[0])
         padded = (np.concatenate([v, np.broadcast_to(v[:1], (padded_size(n) - n, *v.shape[1:]))]) for v in some)
-        result[own] = call_compiled(function, *padded, *common)[:n]
+        # A part of JAX's array would be a program for each length.
+        result[own] = np.asarray(call_compiled(function, *padded, *common))[:n]
     return result
 
 
@@ -140,7 +143,7 @@ def _along(function: Callable, path: ScannerPath, time: Float[np.ndarray, "n"]) 
 
 def padded_size(n: int) -> int:
     """How many laser points a program is compiled for that takes `n`."""
-    return min(1 << max(n - 1, 0).bit_length(), PORTION)
+    return next(size for size in _SIZES if n <= size)
 
 
 @eqx.filter_jit

@@ -184,5 +184,5 @@ def _broken(grid: Grid, xy: np.ndarray, found: HeightEstimate, k: int) -> np.nda
         near, _, _ = _neighbours(grid, xy[padded], k)
         there = near.there & (np.arange(k) < found.wide[padded, None])
         near = near._replace(xy=np.where(there[..., None], near.xy, 0.0), there=there)
-        broken[some] = call_compiled(lie_on_two_planes, near, found.one_surface[padded])[: len(some)]
+        broken[some] = np.asarray(call_compiled(lie_on_two_planes, near, found.one_surface[padded]))[: len(some)]
     return broken

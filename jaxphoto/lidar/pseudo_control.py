@@ -161,7 +161,7 @@ def pseudo_control_points(
         interpolation,
         corrections,
     )
-    return jax.tree.map(lambda v: v[:n], found)
+    return jax.tree.map(lambda v: still(v)[:n], found)
 
 
 @eqx.filter_jit

@@ -13,12 +13,12 @@ from jaxphoto.cli.strip_flight import scanner_priors
 from jaxphoto.cloud import Cloud
 from jaxphoto.georeferencing import StripSpline, TrajectoryKnot
 from jaxphoto.io.recipe.truth import truth_tables
-from jaxphoto.lidar.correction import scanner_path
-from jaxphoto.lidar.strip_correction import correct_flight, correct_strips
+from jaxphoto.lidar.correction import in_portions, scanner_path, scanner_poses
+from jaxphoto.lidar.strip_correction import correct_flight, correct_strips, corrected_strip
 from jaxphoto.lidar.strip_settings import StripSettings
 from jaxphoto.procedures.lidar import ScannerPriors, adjust_strips
 from jaxphoto.procedures.lidar.scanner_checks import check_measured_from
-from jaxphoto.procedures.lidar.strip_rows import step_rows
+from jaxphoto.procedures.lidar.strip_rows import _angles, step_rows
 from jaxphoto.procedures.lidar.strip_unknowns import knot_sigmas
 from jaxphoto.report.strips import calibration_table, trajectory_errors_table
 from jaxphoto.rotation import (
@@ -57,6 +57,24 @@ def test_strips_fit_to_the_noise_of_their_planes():
         assert d.rms_m < 0.016
         assert d.rms_m == pytest.approx(d.noise_m, rel=0.15)
     assert float(found.adjusted.sigma0) == pytest.approx(1.0, abs=0.1)
+
+
+def test_parts_of_a_cloud_of_any_length_compile_nothing_new(caplog):
+    """Each round and each pair of strips has another number of planes."""
+    flight = flown()
+    path, cloud = scanner_path(flight.trajectory), flight.cloud
+    (own,) = np.nonzero(cloud.strip == 0)
+    with jax.log_compiles():
+        for n in (300, 7, 1000):
+            caplog.clear()
+            some = own[:n]
+            corrected_strip(cloud.xyz[some], cloud.time[some], 0, flight.errors, path)
+            angles = in_portions(_angles, (scanner_poses(path, cloud.time[some]).object_from_body,))
+            assert angles.shape == (n, 3)
+            compiled = [
+                r.getMessage() for r in caplog.records if r.getMessage().startswith(("Compiling", "Finished tr"))
+            ]
+            assert n == 300 or not compiled
 
 
 @functools.cache
@@ -160,7 +178,9 @@ def two_strips(shift, side: float = 150.0) -> Cloud:
     return Cloud(np.concatenate([parts[0], parts[1] + shift]), strip=strip, strips=("1", "2"))
 
 
-COARSE = StripSettings(cell_m=2.0, roughness_m=0.04, returns=8)
+# As many planes as another test takes, so that one program serves both.
+MOST = 1000
+COARSE = StripSettings(cell_m=2.0, roughness_m=0.04, returns=8, most=MOST)
 
 
 def test_without_a_trajectory_shifts_are_found():
@@ -183,7 +203,7 @@ def test_a_real_cloud_cut_in_two(data_dir):
     cloud, shift = read_cloud(path), np.array([0.4, -0.3, 0.25])
     half = np.random.default_rng(0).random(len(cloud)) < 0.5
     both = Cloud(cloud.xyz + half[:, None] * shift, strip=half.astype(int), strips=("1", "2"))
-    found = adjust_strips(both, settings=StripSettings(cell_m=3.0, returns=8, roughness_m=0.08))
+    found = adjust_strips(both, settings=StripSettings(cell_m=3.0, returns=8, roughness_m=0.08, most=MOST))
     sigma = np.asarray(found.covariance.shared_sigma)
     assert (np.abs(found.errors.position[1] - shift) < 3 * sigma).all() and (sigma < 0.015).all()
 

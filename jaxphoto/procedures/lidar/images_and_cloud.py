@@ -21,7 +21,6 @@ from jaxphoto.adjustment import Adjustment
 from jaxphoto.arrays import Numbers
 from jaxphoto.block import Block
 from jaxphoto.cloud import Cloud
-from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import Scanner, Trajectory, raised_by_boresight
 from jaxphoto.lidar import Grid, HeightSettings, index_cloud, nearest
@@ -31,6 +30,7 @@ from jaxphoto.lidar.correction import (
     correct_cloud,
     correct_trajectory,
     corrected_xyz,
+    in_portions,
     scanner_path,
     scanner_poses,
 )
@@ -251,7 +251,8 @@ def _turns(
     for k, one in enumerate(poses):
         own = strip == k
         if one is not None:
-            turn[own] = call_compiled(_raised, seen.foot[own], seen.normal[own], one.position, one.object_from_body)
+            rows = seen.foot[own], seen.normal[own], one.position, one.object_from_body
+            turn[own] = in_portions(_raised, rows)
     return turn
 
 

@@ -7,9 +7,8 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxphoto.compiling import call_compiled
 from jaxphoto.georeferencing import StripErrors, StripSpline
-from jaxphoto.lidar.correction import ScannerPath, scanner_motions, scanner_poses
+from jaxphoto.lidar.correction import ScannerPath, in_portions, scanner_motions, scanner_poses
 from jaxphoto.lidar.corresponding_planes import PlanePairs, StripPatches, steep
 from jaxphoto.lidar.strip_correction import corrected_strip
 from jaxphoto.lidar.strip_settings import StripSettings
@@ -54,7 +53,7 @@ def side_of(
         none = np.zeros_like(point)
         return Side(knots, weights, point, point + np.array([0.0, 0.0, 1.0]), none, none, none)
     poses = scanner_poses(path, time)
-    angles = np.asarray(call_compiled(_angles, poses.object_from_body))
+    angles = in_portions(_angles, (poses.object_from_body,))
     return Side(knots, weights, point, poses.position, angles, *scanner_motions(path, time))
 
 
