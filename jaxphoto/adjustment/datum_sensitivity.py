@@ -6,6 +6,7 @@ with a motion that no row sees. They may be thousands: their rows are kept spars
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +15,7 @@ from jaxtyping import Float, Int
 from scipy.sparse import coo_array, csr_array, diags_array, vstack
 from scipy.sparse.csgraph import connected_components
 
+from jaxphoto.adjustment.layout.tiling import size_class
 from jaxphoto.adjustment.model.numbers import Values, zero_increments
 from jaxphoto.adjustment.model.row_functions import row_jacobian
 from jaxphoto.adjustment.model.structure import Structure
@@ -28,6 +30,8 @@ _OPEN_SQUARED = 1e-13
 _PLAIN = 1e-10
 # Of so many rows for each column a triangle is made at once.
 _WIDE = 4
+# Numbers of rows are compiled for in steps of so many.
+_ROWS = 64
 
 
 @dataclass(frozen=True)
@@ -140,8 +144,8 @@ def row_sensitivity(
     place = np.full(s.n_shared + 1, width)
     place[chosen] = 7 + np.arange(len(chosen))
     found: dict[bool, list[csr_array]] = {True: [csr_array((0, width))], False: [csr_array((0, width))]}
-    for g, slope in zip(s.observed, jax.device_get(_slopes(values, s, motions)), strict=True):
-        by_motion, by_shared = slope
+    for g, slope in zip(s.observed, jax.device_get(_slopes(*_in_few_sizes(values, s), motions)), strict=True):
+        by_motion, by_shared = (v[..., : g.n_rows] for v in slope)
         own = np.broadcast_to(place[g.column], by_shared.shape)
         columns = np.concatenate([np.broadcast_to(np.arange(7)[:, None], by_motion.shape), own], axis=1)
         numbers = np.concatenate([by_motion, by_shared], axis=1)
@@ -151,6 +155,30 @@ def row_sensitivity(
         rows.eliminate_zeros()
         found[bool(len(g.image) or len(g.point))].append(rows)
     return SeenMotions(vstack(found[True]).tocsr(), vstack(found[False]).tocsr())
+
+
+def _in_few_sizes(values: Values, s: Structure) -> tuple[Values, Structure]:
+    """Without image rows, and the others in sizes of which there are few.
+
+    A search for blunders leaves out a row or two at a time, and each size is compiled for.
+    """
+    observed, numbers = [], []
+    for g, own in zip(s.observed, values.groups, strict=True):
+        # Of rows with many numbers a few may fill the memory.
+        more = size_class(g.n_rows, max(1, _ROWS // g.components)) - g.n_rows
+
+        def longer(v: Any, more: int = more) -> np.ndarray:
+            return np.concatenate([v, np.repeat(v[..., :1], more, axis=-1)], axis=-1)
+
+        names = ("rows", "image", "point", "parameter", "column")
+        padded = {name: jax.tree.map(longer, getattr(g, name)) for name in names}
+        observed.append(replace(g, **padded, pair=np.zeros((0, g.n_rows + more, 4), np.int32)))
+        numbers.append(jax.tree.map(longer, own))
+    none, nowhere = np.zeros((2, 0)), np.zeros(0, np.int32)
+    return (
+        replace(values, groups=tuple(numbers), xy=none, sigma_xy=none),
+        replace(s, observed=tuple(observed), image=nowhere, point=nowhere, labels=()),
+    )
 
 
 @jit_quickly

@@ -13,7 +13,7 @@ from jaxphoto.adjustment.model.row_functions import group_residuals
 from jaxphoto.adjustment.model.structure import structure_of
 from jaxphoto.adjustment.solver.similarity import similarity
 from jaxphoto.compiling import jit_quickly
-from tests.blocks import VARIANTS, measured
+from tests.blocks import VARIANTS, measured, simulated
 
 
 @jit_quickly
@@ -153,3 +153,22 @@ def test_rows_that_nearly_tell_unknowns_apart_do(apart, determined):
     rows[:, 3] = rows[:, 0] + apart * rows[:, 3]
     seen = SeenMotions(csr_array((0, 11)), csr_array(np.pad(rows, [(0, 0), (7, 0)])))
     np.testing.assert_array_equal(seen.determined, np.arange(7, 11) if determined else [])
+
+
+def test_rows_left_out_compile_nothing_new(caplog):
+    """As a search for blunders leaves them out, a few at a time."""
+    block = simulated("everything").block
+    few = np.ones(len(block.stations), bool)
+    few[[0, 7]] = False
+    spoilt = block.with_observations(
+        {"image_points": block.image_points.take(np.arange(len(block.image_points)) != 3)}
+    ).with_observations({"stations": block.stations.take(few)})
+    found = []
+    for one in (block, spoilt):
+        s = structure_of(one, one.priors)
+        values = values_of(one, one.start.unknowns, one.priors, s)
+        caplog.clear()
+        with jax.log_compiles():
+            found.append(row_sensitivity(values, s, _motions(values), np.flatnonzero(s.free >= s.n_cameras)))
+    assert found[1].placed.shape[0] == found[0].placed.shape[0] - 2
+    assert not [r for r in caplog.records if "_slopes" in r.getMessage()]
