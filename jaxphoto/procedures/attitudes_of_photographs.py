@@ -4,6 +4,9 @@ Each photograph says how the network is turned to the map: the product of its re
 average is what a single strip does not tell by positions, the turn about its line. What all attitudes have in common
 of an error, the zero of a gimbal or a mounting, stays in it; as observations they have a boresight with a prior of
 that size, so that a strip is not given a turn that is surer.
+
+Pictures that a program has turned by quarters lie otherwise in their files than attitudes, which are of the sensor,
+say. Positions show it: with the attitudes as they are, the network would run across its own line of flight, or back.
 """
 
 import dataclasses
@@ -32,6 +35,10 @@ and the declination where a compass is read."""
 _BEYOND, _LEAST_DEG = 4.0, 5.0
 # Attitudes that are apart by more (median) tell nothing.
 _CONTRADICT_DEG = 15.0
+# Cosines between directions in the turned network and those of positions: one line, to 20 degrees; others, by 60.
+_SAME_LINE, _OTHER_LINE = 0.94, 0.5
+# Positions whose distances are off by less than this part (median) tell directions.
+_TELLING = 0.1
 # Of mounts: the name by which a block folder finds it for every camera.
 _MOUNT = "default"
 
@@ -51,6 +58,8 @@ class RecordedTurn(NamedTuple):
     scatter_rad: float
     """Root mean square of single ones about `turn`."""
     left_out: tuple[str, ...]
+    quarters: int = 0
+    """By how many the pictures are turned clockwise against the attitudes of their files; those here are, too."""
 
 
 def recorded_turn(
@@ -61,14 +70,33 @@ def recorded_turn(
 ) -> RecordedTurn | str | None:
     """The turn by the `attitudes` of images that have `places` (longitude, latitude, height) too.
 
-    None where there are none; a sentence where they contradict one another.
+    None where there are none; a sentence where they contradict one another, or the places.
     """
     known = [(k, name, a) for k, name in enumerate(block.images) if name in places and (a := attitudes.get(name))]
     if not known:
         return None
-    image = np.array([k for k, _, _ in known])
     local = frame.local_from_place(np.array([places[name] for _, name, _ in known], float))
     own = frame.local_from_level(local) @ np.array([a.level_from_camera for _, _, a in known])
+    network = np.asarray(block.start.unknowns.exterior.position, float)[[k for k, _, _ in known]]
+    first = _turn_of(block, known, own)
+    along = _cosine(network, local, first)
+    if isinstance(first, RecordedTurn) and (along is None or along > _OTHER_LINE):
+        return first
+    for quarters in (1, 2, 3):
+        found = _turn_of(block, known, own @ _clockwise(quarters))
+        if isinstance(found, RecordedTurn) and (_cosine(network, local, found) or 0.0) > _SAME_LINE:
+            return found._replace(quarters=quarters)
+    if along is None:
+        return first
+    apart_deg = np.rad2deg(np.arccos(np.clip(along, -1, 1)))
+    return f"the attitudes of the files contradict the positions, by {apart_deg:.0f} degrees: they are not used"
+
+
+def _turn_of(
+    block: Block, known: list[tuple[int, str, CameraAttitude]], own: Float[np.ndarray, "n 3 3"]
+) -> RecordedTurn | str:
+    """The turn by attitudes `own` (local from camera) of the images `known`; a sentence where they contradict it."""
+    image = np.array([k for k, _, _ in known])
     said = own @ np.asarray(block.start.unknowns.exterior.camera_from_object, float)[image]
     sigma = np.deg2rad([a.sigma_deg for _, _, a in known])
     kept, off = np.ones(len(said), bool), np.zeros(len(said))
@@ -86,6 +114,27 @@ def recorded_turn(
     level = np.sqrt(np.mean(sigma[kept, :2] ** 2) / kept.sum() + np.deg2rad(max(BORESIGHT_DEG[:2])) ** 2)
     lost = tuple(name for (_, name, _), good in zip(known, kept, strict=True) if not good)
     return RecordedTurn(image[kept], own[kept], sigma[kept], turn, float(level), scatter, lost)
+
+
+def _clockwise(quarters: int) -> Float[np.ndarray, "3 3"]:
+    """From the axes of a picture that is turned clockwise to those of the sensor."""
+    return np.linalg.matrix_power(np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), quarters)
+
+
+def _cosine(
+    network: Float[np.ndarray, "n 3"], local: Float[np.ndarray, "n 3"], recorded: RecordedTurn | str
+) -> float | None:
+    """Between directions from place to place in the turned network and on the ground; None where these tell nothing."""
+    one, other = np.triu_indices(len(local), 1)
+    if isinstance(recorded, str) or not len(one):
+        return None
+    a, b = ((v[one] - v[other]) for v in (network @ recorded.turn.T, local))
+    there, here = np.linalg.norm(a, axis=1), np.linalg.norm(b, axis=1)
+    far = (here >= np.median(here)) & (there > 0) & (here > 0)
+    ratio = here[far] / there[far]
+    if not far.any() or np.median(np.abs(ratio / np.median(ratio) - 1)) > _TELLING:
+        return None
+    return float(np.median(np.sum(a[far] * b[far], axis=1) / (there[far] * here[far])))
 
 
 def with_attitudes(block: Block, recorded: RecordedTurn) -> Block:

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
-from jaxphoto.errors import few
+from jaxphoto.errors import counted, few
 from jaxphoto.georeferencing.gps import Gps
 from jaxphoto.procedures.attitudes_of_photographs import RecordedTurn
 from jaxphoto.procedures.level_strip import LEVEL_DEG
@@ -21,6 +21,8 @@ LEVEL_WORDS = (
     f"down on average, which holds to some {LEVEL_DEG:g} degrees, and heights tilt across the line by as much; "
     "attitudes, a cross strip or control points tell it"
 )
+
+_QUARTERS = ("", "turned by 90 degrees to the right", "upside down", "turned by 90 degrees to the left")
 
 
 def position_words(
@@ -39,7 +41,11 @@ def position_words(
         f"{np.median(height):.2g} m in height; map system {system}"
     )
     if without := [name for name in images if name not in known]:
-        yield f"{len(without)} photographs have no position with a height, and follow from the others ({few(without)})"
+        have, follow = ("have", "follow") if len(without) > 1 else ("has", "follows")
+        yield (
+            f"{counted(len(without), 'photograph')} {have} no position with a height, and {follow} from the others "
+            f"({few(without)})"
+        )
     if any(stated):
         yield f"standard deviations of {sum(stated)} positions are those of their files"
     if not all(stated):
@@ -81,6 +87,11 @@ def attitude_words(recorded: RecordedTurn | str | None, used: bool, turn: Float[
     apart = np.rad2deg(np.linalg.norm(Rotation.from_matrix(turn @ recorded.turn.T).as_rotvec()))
     scatter, boresight = np.rad2deg([recorded.scatter_rad, recorded.turn_sigma_rad])
     words = f"{len(recorded.image)} recorded attitudes agree with one another to {scatter:.2g} degrees"
+    if recorded.quarters:
+        yield (
+            f"the pictures lie {_QUARTERS[recorded.quarters]} against the attitudes of their files, as the positions "
+            "show: these are turned likewise"
+        )
     if used:
         yield (
             f"{words}; positions do not tell the turn of the block as well: they are observed, with what they have in "
