@@ -184,7 +184,9 @@ ONE_CAMERA: list[tuple[str, Callable[["Photograph"], Hashable], str]] = [
     ),
     (
         "orientation flag",
-        lambda p: p.orientation,
+        # What still has to be turned by a quarter lies as the sensor saw it, as do others of its size: a program that
+        # had turned some by quarters would have exchanged width and height.
+        lambda p: None if p.orientation > 4 and p.width_px != p.height_px else p.orientation,
         "pictures are read as they lie in the file, and a program may have turned some: where all are as the "
         "sensor saw them, set one flag (exiftool -n -Orientation=1 FILES), else leave the odd ones out",
     ),

@@ -3,7 +3,7 @@
 import collections
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from PIL import Image
@@ -20,6 +20,8 @@ _OF_CAMERAS = tuple(suffix for suffix in SUFFIXES if suffix != ".png")
 _RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".rw2", ".orf", ".raf", ".srw", ".pef")
 # A JPEG is decoded to about this size, an eighth at least, which tells as surely whether it is whole.
 _SMALL_PX = (512, 512)
+# As many files as have a sentence each, where it is the same for all.
+_SOME = 3
 
 
 def sound_photographs(paths: Sequence[str | Path]) -> tuple[list[Photograph], dict[str, str]]:
@@ -62,17 +64,31 @@ def sound_photographs(paths: Sequence[str | Path]) -> tuple[list[Photograph], di
     left |= {str(file): f"{file}: it is a copy of {content[digest].path.name}" for file, digest in copies.items()}
     left |= _edited(read)
     kept = [p for p in read.values() if str(p.path) not in left]
-    for what, of, _ in ONE_CAMERA:
+    for what, of, mend in ONE_CAMERA:
         said = [of(p) for p in kept]
         usual = collections.Counter(v for v in said if v is not None).most_common(1)
         for p, own in zip(kept, said, strict=True):
             if own is not None and own != usual[0][0]:
-                left[str(p.path)] = f"{p.path}: its {what} is {own}, that of most is {usual[0][0]}"
+                left[str(p.path)] = f"{p.path}: its {what} is {own}, that of most is {usual[0][0]}; {mend}"
         kept = [p for p in kept if str(p.path) not in left]
     if not kept:
         beside = f"; {next(iter(left.values()))}" if left else "".join(f"; {hint}" for hint in _hints(paths))
         raise InputError(f"{', '.join(map(str, paths))}: there is no photograph that can be read{beside}")
     return kept, left
+
+
+def in_short(left_out: Mapping[str, str]) -> list[str]:
+    """The sentences of files that are left out; one of all where more than three are for the same reason."""
+    alike: dict[str, list[str]] = {}
+    for path, why in left_out.items():
+        alike.setdefault(why.removeprefix(f"{path}: "), []).append(path)
+    said = []
+    for why, paths in alike.items():
+        if len(paths) > _SOME:
+            said.append(f"{len(paths)} files ({few([Path(path).name for path in paths])}), each: {why}")
+        else:
+            said += [left_out[path] for path in paths]
+    return said
 
 
 def pictures_in(paths: Sequence[str | Path]) -> list[Path]:

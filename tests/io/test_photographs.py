@@ -162,7 +162,7 @@ def test_a_photograph_of_many_pixels_is_read(tmp_path):
     ("other", "message"),
     [
         ({"size": (480, 640)}, r"different sizes \(640 x 480 px: a.jpg, .* and 1 more; 480 x 640 px: x.jpg\)"),
-        ({"top": {BASE.Orientation: 8}}, r"different orientation flags \(1: a.jpg, .* and 1 more; 8: x.jpg\)"),
+        ({"top": {BASE.Orientation: 3}}, r"different orientation flags \(1: a.jpg, .* and 1 more; 3: x.jpg\)"),
         ({"top": {BASE.Model: "D800"}}, r"different cameras \(Z6: a.jpg, .* and 1 more; D800: x.jpg\)"),
         ({"taken": {BASE.FocalLength: 35.0}}, r"different focal lengths \(24 mm: a.jpg.*; 35 mm: x.jpg\)"),
     ],
@@ -173,6 +173,20 @@ def test_photographs_of_several_cameras(tmp_path, other, message):
     x = write(tmp_path / "x.jpg", **(usual | other))
     with pytest.raises(InputError, match=message):
         sensor_and_interior(photographs([*paths, x]))
+
+
+@pytest.mark.parametrize(("size", "refused"), [((640, 480), False), ((480, 480), True)])
+def test_what_is_still_to_be_turned_by_a_quarter_lies_as_the_sensor_saw_it(tmp_path, size, refused):
+    """As its size says, which a program that turned it would have changed; that of a square tells nothing."""
+    paths = [
+        write(tmp_path / f"{flag}.jpg", size=size, top={BASE.Orientation: flag}, taken={BASE.FocalLength: 24.0})
+        for flag in (1, 6, 8)
+    ]
+    if refused:
+        with pytest.raises(InputError, match="different orientation flags"):
+            sensor_and_interior(photographs(paths))
+    else:
+        assert sensor_and_interior(photographs(paths)).sensor.width_px == 640
 
 
 def test_what_is_given_wrong(tmp_path):

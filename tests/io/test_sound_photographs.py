@@ -9,7 +9,7 @@ from PIL import Image
 from jaxphoto.errors import InputError
 from jaxphoto.io.photograph_metadata import drone_record, xmp_fields
 from jaxphoto.io.photographs import photographs
-from jaxphoto.io.sound_photographs import folders_not_looked_into, sound_photographs
+from jaxphoto.io.sound_photographs import folders_not_looked_into, in_short, sound_photographs
 
 PACKET = """<?xpacket begin="" id="W5M0MpCehiHzreSzNTczkc9d"?><x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF>
 <rdf:Description xmlns:drone-dji="http://www.dji.com/drone-dji/1.0/" drone-dji:AbsoluteAltitude="+129.52"
@@ -104,6 +104,17 @@ def test_spoilt_ones_are_left_out_each_with_a_sentence(folder):
     }.items():
         assert why in left.pop(str(folder / name))
     assert not left
+
+
+def test_files_left_out_for_one_reason_have_one_sentence(folder):
+    for k in range(3):
+        Image.new("RGB", (64, 48 + 8 * (k // 2)), (k, 0, 0)).save(folder / f"T{k}.png")
+    assert len(in_short(sound_photographs([folder])[1])) == 3
+    for k in range(3, 5):
+        Image.new("RGB", (64, 48), (k, 0, 0)).save(folder / f"T{k}.png")
+    one, other = in_short(sound_photographs([folder])[1])
+    assert one.startswith("4 files (T0.png, T1.png, T3.png and 1 more), each: its size is 64 x 48 px, that of most")
+    assert other.startswith(f"{folder / 'T2.png'}: its size is 64 x 56 px")
 
 
 def test_a_second_body_of_the_same_model_and_a_digital_zoom_are_left_out(folder):
