@@ -6,7 +6,7 @@ import pytest
 from jaxphoto import adjust
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing.map_frame import MapFrame
-from jaxphoto.procedures.control import control_block
+from jaxphoto.procedures.control import at_optimum, control_block
 from jaxphoto.procedures.control.onto_control import onto_control
 from jaxphoto.simulation.remeasure import image_coordinates
 from tests.blocks import free_network, simulated
@@ -44,6 +44,9 @@ def test_control_brings_the_block_to_its_place(marked):
     check = np.array(found.state) == "check"
     assert np.nanmax(found.w[check]) < 3.5 and np.nanmax(found.w[~check]) < 3.5
     assert not [s for s in found.sentences if "left out" in s]
+    # Once more: it lies by control now, and not by any positions.
+    again = control_block(at_optimum(found.adjusted), marked.control, adjust=adjust)
+    assert any("m (east, north, up) from where the block has it" in s for s in again.sentences)
 
 
 @pytest.mark.slow
@@ -85,10 +88,15 @@ def test_a_wrong_coordinate_and_a_wrong_mark_are_named_and_turn_nothing(marked):
 
 def test_a_blunder_that_the_places_hide_is_found_by_the_adjustment(marked):
     """2 m, within what a block of this size may be bent by before it is adjusted."""
-    xyz = marked.control.points.coordinates.copy()
+    points, xyz = marked.control.points, marked.control.points.coordinates.copy()
     xyz[3, 0] += 2.0
-    found = found_in(marked, with_coordinates(marked.control, xyz))
+    sigma = np.where(points.check[:, None], np.nan, points.sigma_m)
+    given = marked.control._replace(points=points._replace(coordinates=xyz, sigma_m=sigma))
+    found = found_in(marked, given)
     assert [name for name, state in zip(found.ids, found.state, strict=True) if state == "left out"] == ["G16"]
+    # It checks nothing either; and of check points nobody has said how well they were surveyed.
+    check = found.adjusted.block.check
+    assert len(check) == 3 * len(CHECK) and not np.asarray(check.sigma).any()
 
 
 def test_points_of_a_hand_held_receiver_are_taken_for_what_they_are(marked):

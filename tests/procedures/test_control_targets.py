@@ -69,7 +69,7 @@ def test_targets_are_found_from_three_marked_by_hand():
         m.block, known_only(m.control, ("G0", "G16", "G32", "G34")), looker, adjust=adjust
     )
     assert found.state[:6] == ("control",) * 6 and found.state[6:] == ("check",) * 3
-    assert any("the target of G21 was found in 9 of" in said for said in found.sentences)
+    assert any("G21 in 9 of 9" in said for said in found.sentences)
     # Three sigma of an adjusted block: far less than the photograph, more than the noise.
     assert 4 < np.max(looked) < 200
     points = np.asarray(found.adjusted.unknowns.points)[-9:]

@@ -107,7 +107,10 @@ def control_block(
         place = np.cumsum(seen) - 1
         own = now._replace(point=place[now.point])
         names = tuple(ids[k] for k in which)
-        made = into_block(base, names, known[which], sigma[which], start[which], own, used[which])
+        # What is taken for the survey of check points is no ground to claim an accuracy on.
+        told = np.where(points.check[:, None] & np.isnan(points.sigma_m), 0.0, sigma)[which]
+        roles = used[which], points.check[which]
+        made = into_block(base, names, known[which], told, start[which], own, *roles)
         try:
             adjusted = adjust(made)
         except DatumError as error:
@@ -153,8 +156,10 @@ def _placed(block: Block, frame: InFrame, met, covariance, sigma, points: Survey
     whole = np.isfinite(points.coordinates).all(axis=1)
     known = np.flatnonzero(np.isfinite(met).all(axis=1) & ~points.check & whole)
     agree = np.ones(len(met), bool)
+    by_positions = len(block.stations) > 0 and not len(block.control)
     if frame.at_place and len(known) < LEAST:
-        text = f"{counted(len(known), 'control point')} in two photographs or more: the block stays at its positions"
+        where = "at its positions" if by_positions else "where it lies"
+        text = f"{counted(len(known), 'control point')} in two photographs or more: the block stays {where}"
         return block, met, agree, sigma, [text]
     spread = np.sqrt(np.trace(covariance[known], axis1=1, axis2=2))
     assumed, surveyed = np.isnan(points.sigma_m[known]).any(axis=1), np.linalg.norm(sigma[known], axis=1)
@@ -170,7 +175,8 @@ def _placed(block: Block, frame: InFrame, met, covariance, sigma, points: Survey
     if frame.at_place:
         off = np.median((frame.xyz - met)[known[onto.agree]], axis=0)
         told = ", ".join(f"{v:.2f}" for v in np.round(off, 2) + 0.0)
-        said.append(f"control lies {told} m (east, north, up) from where the positions of the photographs have it")
+        there = "the positions of the photographs have" if by_positions else "the block has"
+        said.append(f"control lies {told} m (east, north, up) from where {there} it")
     block = dataclasses.replace(onto.similarity.of_block(block), frame=frame.frame)
     return block, onto.similarity.of(met), agree, sigma, said
 

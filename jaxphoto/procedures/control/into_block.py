@@ -23,11 +23,13 @@ def into_block(
     start: Float[np.ndarray, "points 3"],
     rows: Marked,
     control: Bool[np.ndarray, "points"],
+    check: Bool[np.ndarray, "points"],
 ) -> Block:
     """`block` with the points `ids` at its end, which may have none of these names yet; `rows` are their marks.
 
-    `xyz` (m, NaN for what is not known) are observed with `sigma` of those that are `control`; of the others they are
-    check coordinates. `start` is where all begin, in the frame of the block.
+    `xyz` (m, NaN for what is not known) are observed with `sigma` of those that are `control`, and check coordinates of
+    those that are `check`, with 0 for a sigma that nobody gave; of the others they tell nothing. `start` is where all
+    begin, in the frame of the block.
     """
     n = len(block.points)
     new = ImageRows(
@@ -41,7 +43,7 @@ def into_block(
         points=(*block.points, *ids),
         image_points=ImageRows.joined(block.image_points, new),
         control=ControlRows.joined(block.control, _coordinates(xyz, sigma, control, n)),
-        check=ControlRows.joined(block.check, _coordinates(xyz, sigma, ~control, n)),
+        check=ControlRows.joined(block.check, _coordinates(xyz, sigma, check, n)),
         datum=Datum(),
         start=Start(unknowns, block.start.image_known, known),
     )

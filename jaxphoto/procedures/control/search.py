@@ -6,13 +6,14 @@ with the sharper edges is it, which targets are made to have; where that does no
 far less sharp than the targets of the other points, as a round stone is.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from jaxphoto.adjustment import Adjustment
+from jaxphoto.errors import counted
 from jaxphoto.orientation.block_intersection import intersect_points
 from jaxphoto.orientation.rays import turn_to_object
 from jaxphoto.procedures.control.intersected import misses, rays_of
@@ -58,11 +59,13 @@ class Looker(NamedTuple):
 
 
 class FoundTargets(NamedTuple):
-    """Marks of targets that were found, and a sentence for every point that was looked for."""
+    """Marks of targets that were found, and what became of every point that was looked for, by its name."""
 
     marks: Marks
-    said: dict[str, str]
-    """By the name of the point."""
+    looked: dict[str, tuple[str, ...]]
+    """In which photographs it was looked for."""
+    why_not: dict[str, str]
+    """Of those that were not found."""
 
 
 def found_marks(
@@ -70,11 +73,11 @@ def found_marks(
     ids: tuple[str, ...],
     xyz: Float[np.ndarray, "points 3"],
     sigma: Float[np.ndarray, "points 3"],
-    marks: Marked | None,
+    known: Collection[tuple[int, int]],
     looker: Looker,
     placed: bool,
 ) -> FoundTargets:
-    """Targets of the points `ids` at `xyz` (m, +- `sigma`) in the images of `adjusted` that have no mark of them yet.
+    """Targets of the points `ids` at `xyz` (m, +- `sigma`) in the images of `adjusted`, but for (image, point) `known`.
 
     `placed`: control has placed the block; else its plan is that of receivers, and heights are those of its own ground.
     """
@@ -83,11 +86,8 @@ def found_marks(
         xyz, scatter = _on_own_ground(adjusted, xyz)
         of_points = of_points + np.diag([COMMON_M**2, COMMON_M**2, scatter**2])
     at = predicted(adjusted, xyz, of_points)
-    if marks is not None:
-        there = set(zip(marks.image.tolist(), marks.point.tolist(), strict=True))
-        at = at.take(
-            np.array([key not in there for key in zip(at.image.tolist(), at.point.tolist(), strict=True)], bool)
-        )
+    pairs = zip(at.image.tolist(), at.point.tolist(), strict=True)
+    at = at.take(np.array([pair not in known for pair in pairs], bool))
     spread = np.sqrt(np.linalg.eigvalsh(at.covariance)[:, 1]) if len(at.image) else np.zeros(0)
     radius = np.maximum(_WITHIN * spread, _LEAST_PX)
     seen = looker.look(at, radius, adjusted.block.images, ids)
@@ -120,9 +120,11 @@ def _believed(adjusted, ids, xyz, of_points, at: Predicted, seen: Candidates, na
     c = np.array([float(unknowns.interior[block.image_camera[i]].c) for i in image])
     limit = _MISS_PX * pixel / np.maximum(c, 1e-300)
     taken: dict[int, list[int]] = {}
-    said: dict[str, str] = {}
+    looked: dict[str, tuple[str, ...]] = {}
+    why_not: dict[str, str] = {}
     for p in np.unique(at.point).tolist():
-        own, looked = np.flatnonzero(point == p), int((at.point == p).sum())
+        own = np.flatnonzero(point == p)
+        looked[ids[p]] = tuple(block.images[i] for i in at.image[at.point == p])
         near = xyz[p], of_points[p]
         chosen, why = _meeting(positions[image[own]], directions[own], image[own], limit[own], seen.fit_px[own], *near)
         sure = named or radius[at.point == p].max() < 3 * _LEAST_PX
@@ -130,15 +132,15 @@ def _believed(adjusted, ids, xyz, of_points, at: Predicted, seen: Candidates, na
         if not why and len(chosen) < least:
             why = f"it was seen in {len(chosen)}, and {least} are needed" if len(own) else "it was not seen"
         if why:
-            said[ids[p]] = f"the target of {ids[p]} was looked for in {looked} photographs: {why}"
+            where = counted(len(looked[ids[p]]), "photograph")
+            why_not[ids[p]] = f"the target of {ids[p]} was looked for in {where}: {why}"
             continue
         taken[p] = own[chosen].tolist()
-        said[ids[p]] = f"the target of {ids[p]} was found in {len(chosen)} of {looked} photographs"
     usual = _fit_of_others(taken, seen.fit_px)
     for p, rows_of in list(taken.items()):
         if not named and np.median(seen.fit_px[rows_of]) > _DULL * usual[p]:
             del taken[p]
-            said[ids[p]] = (
+            why_not[ids[p]] = (
                 f"the target of {ids[p]} was looked for: what was seen in {len(rows_of)} photographs is far less sharp "
                 "than the other targets; mark it by hand"
             )
@@ -150,7 +152,7 @@ def _believed(adjusted, ids, xyz, of_points, at: Predicted, seen: Candidates, na
         seen.sigma_px[kept],
         tuple(f"found in {block.images[i]}" for i in image[kept]),
     )
-    return FoundTargets(marks, said)
+    return FoundTargets(marks, looked, why_not)
 
 
 def _fit_of_others(taken: dict[int, list[int]], fit_px: Float[np.ndarray, "n"]) -> dict[int, float]:

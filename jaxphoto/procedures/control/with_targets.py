@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.block import Block
-from jaxphoto.errors import InputError
+from jaxphoto.errors import InputError, counted
 from jaxphoto.procedures.adjust import adjust_for_tables
 from jaxphoto.procedures.control.control_block import ControlledBlock, control_block
 from jaxphoto.procedures.control.marked import marked
@@ -53,25 +53,40 @@ def control_block_with_targets(
             "control points by hand, each in two photographs or more"
         )
     adjusted = now.adjusted if now else adjust(block)
-    said: dict[str, list[str]] = {name: [] for name in ids}
+    looked: dict[str, set[str]] = {name: set() for name in ids}
+    seen: dict[str, set[str]] = {name: set() for name in ids}
+    why_not: dict[str, str] = {}
     every = control.marks
     for _ in range(_ROUNDS):
         report("looking for targets")
         frame = in_frame(adjusted.block, points, system, code, vertical)
         placed = now is not None and "control" in now.state
-        own = now.marks if now else None
-        found = found_marks(adjusted, ids, frame.xyz, sigma, own, looker, placed)
-        seen = set(found.marks.point)
-        for name, text in found.said.items():
-            # A point that has been found need not be found in every photograph.
-            if name in seen or not any("was found" in old for old in said[name]):
-                said[name] = [*(old for old in said[name] if "was found" in old), text]
+        rows = (by_hand, now.marks) if now else (by_hand,)
+        known = {pair for of in rows for pair in zip(of.image.tolist(), of.point.tolist(), strict=True)}
+        found = found_marks(adjusted, ids, frame.xyz, sigma, known, looker, placed)
+        for name, images in found.looked.items():
+            looked[name] |= set(images)
+        for name, image in zip(found.marks.point, found.marks.image, strict=True):
+            seen[name].add(image)
+        why_not |= found.why_not
         if not len(found.marks.image):
             break
-        every = Marks.joined(every, found.marks)
+        # Where one of an earlier round was left out, another may be found in its place.
+        again = set(zip(found.marks.image, found.marks.point, strict=True))
+        kept = [pair not in again for pair in zip(every.image, every.point, strict=True)]
+        every = Marks.joined(every.take(np.array(kept, bool)), found.marks)
         now = control_block(block, control._replace(marks=every), **how)
         adjusted = now.adjusted
-    texts = tuple(text for of in said.values() for text in of)
+    texts = _told(ids, seen, looked, why_not)
     if now is None:
         raise InputError(f"{points.file}: no target was found; {'; '.join(texts)}")
     return now._replace(sentences=(*texts, *now.sentences))
+
+
+def _told(
+    ids: tuple[str, ...], seen: dict[str, set[str]], looked: dict[str, set[str]], why_not: dict[str, str]
+) -> list[str]:
+    """One sentence on what was found in all rounds, and one for each point that was found in none."""
+    found = [f"{name} in {len(seen[name])} of {len(looked[name])}" for name in ids if seen[name]]
+    count = f"{counted(len(found), 'target')} found in the photographs that should show them"
+    return [f"{count}: {', '.join(found)}"] * bool(found) + [why_not[p] for p in ids if p in why_not and not seen[p]]

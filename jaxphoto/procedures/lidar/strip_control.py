@@ -85,7 +85,8 @@ def with_control(block: Block, control: SurveyedPoints) -> tuple[Block, Int[np.n
     again = _again(block, control)
     own = np.flatnonzero(~control.check & ~again)
     ids, xyz, sigma = tuple(control.ids[k] for k in own), control.coordinates[own], control.sigma_m[own]
-    whole = into_block(block, ids, xyz, sigma, xyz, _NO_MARKS, np.ones(len(own), bool))
+    every = np.ones(len(own), bool)
+    whole = into_block(block, ids, xyz, sigma, xyz, _NO_MARKS, every, ~every)
     place = {name: k for k, name in enumerate(whole.points)}
     number = [-1 if out else place[name] for name, out in zip(control.ids, control.check, strict=True)]
     return whole, np.array(number, int)
