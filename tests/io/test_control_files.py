@@ -37,6 +37,17 @@ def test_a_gcp_list_has_points_and_marks(tmp_path):
     np.testing.assert_array_equal(marks.column_row[[0, 2]], [(1013.0, 800.75), (100.0, 0.5)])
 
 
+@pytest.mark.parametrize(
+    "row", ["G{} 386800.5 61750{}0.2 30.5", "386800.5 61750{1}0.2 30.5 G{0}", "{} 386800.5 61750{}0.2 nan"]
+)
+def test_a_gcp_list_that_is_to_be_marked_has_points_alone(tmp_path, row):
+    rows = "\n".join(row.format(k, k) for k in "123")
+    points, marks = read(tmp_path, f"# of the survey\nEPSG:32633\n# the yard\n{rows}")
+    assert [name[-1] for name in points.ids] == ["1", "2", "3"] and points.system == "EPSG:32633" and not marks.image
+    np.testing.assert_array_equal(points.coordinates[:, 1], (6175010.2, 6175020.2, 6175030.2))
+    assert np.isnan(points.coordinates[:, 2]).all() == ("nan" in row)
+
+
 def test_markers_of_metashape(tmp_path):
     points, marks = read(tmp_path, files.MARKERS)
     assert points.ids == ("point 1", "point 2") and points.check.tolist() == [False, True]

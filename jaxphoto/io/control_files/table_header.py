@@ -20,9 +20,12 @@ PLACE = {
     "sigma_x": ("sigma x", "accuracy x", "x accuracy", "x acc", "sigma", "accuracy"),
     "sigma_y": ("sigma y", "accuracy y", "y accuracy", "y acc"),
     "sigma_z": (
-        "sigma z", "accuracy z", "z accuracy", "z acc", "accuracy vert", "accuracy vertical", "vertical accuracy",
+        "sigma z", "sigma vertical", "accuracy z", "z accuracy", "z acc", "accuracy vert", "accuracy vertical", "vertical accuracy",
     ),
-    "sigma_plan": ("sigma plan", "accuracy x/y", "accuracy horz", "accuracy horizontal", "horizontal accuracy"),
+    "sigma_plan": (
+        "sigma plan", "sigma xy", "sigma horizontal", "accuracy xy", "accuracy x/y", "accuracy horz",
+        "accuracy horizontal", "horizontal accuracy",
+    ),
 }  # fmt: skip
 """The words of coordinates and their standard deviations."""
 _POINT = {
@@ -34,8 +37,8 @@ _POINT = {
 _MARK = {
     "image": ("image", "image name", "photo", "photograph", "camera", "filename", "file name", "file"),
     "point": _POINT["point"],
-    "x": ("x px", "x", "px", "column px", "column", "im x", "pixel x", "u", "image u"),
-    "y": ("y px", "y", "py", "row px", "row", "im y", "pixel y", "v", "image v"),
+    "x": ("x px", "x", "px", "column px", "column", "im x", "pixel x", "pixelx", "u", "image u"),
+    "y": ("y px", "y", "py", "row px", "row", "im y", "pixel y", "pixely", "v", "image v"),
     "sigma": ("sigma px", "sigma", "accuracy px", "accuracy"),
 }
 # What features are called that are images, such as camera stations.
