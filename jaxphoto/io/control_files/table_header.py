@@ -20,7 +20,8 @@ PLACE = {
     "sigma_x": ("sigma x", "accuracy x", "x accuracy", "x acc", "sigma", "accuracy"),
     "sigma_y": ("sigma y", "accuracy y", "y accuracy", "y acc"),
     "sigma_z": (
-        "sigma z", "sigma vertical", "accuracy z", "z accuracy", "z acc", "accuracy vert", "accuracy vertical", "vertical accuracy",
+        "sigma z", "sigma vertical", "accuracy z", "z accuracy", "z acc", "accuracy vert", "accuracy vertical",
+        "vertical accuracy",
     ),
     "sigma_plan": (
         "sigma plan", "sigma xy", "sigma horizontal", "accuracy xy", "accuracy x/y", "accuracy horz",
