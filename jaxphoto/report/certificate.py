@@ -216,9 +216,9 @@ def _correlations(given: Certified) -> Iterator[Element]:
     if given.with_exterior:
         table: dict[str, dict[str, str]] = {}
         for c in given.with_exterior:
-            table.setdefault(c.exterior, {})[c.interior] = f"{c.mean_abs:.2f} ({c.max_abs:.2f})"
-        across = tuple(dict.fromkeys(c.interior for c in given.with_exterior))
-        rows = tuple((e, *(of.get(p, "") for p in across)) for e, of in table.items())
+            table.setdefault(c.interior, {})[c.exterior] = f"{c.mean_abs:.2f} ({c.max_abs:.2f})"
+        across = tuple(dict.fromkeys(c.exterior for c in given.with_exterior))
+        rows = tuple((p, *(of.get(e, "") for e in across)) for p, of in table.items())
         yield Rows(("mean (largest) |rho| over the images", *across), rows)
 
 

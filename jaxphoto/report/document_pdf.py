@@ -137,10 +137,10 @@ def _widths(columns: list[list[str]]) -> list[int]:
     wide = [max(map(len, cells)) + _BLANK for cells in columns]
     least = [max(len(word) for cell in cells for word in [*cell.split(), ""]) + _BLANK for cells in columns]
     too_much = sum(wide) - int(_INNER * 72 / (_FIGURE * _READABLE))
-    for k in sorted(range(len(wide)), key=lambda k: -wide[k]):
-        cut = max(0, min(too_much, wide[k] - least[k]))
-        wide[k] -= cut
-        too_much -= cut
+    for _ in range(too_much):
+        # One after another, so that columns that are alike stay so.
+        k = max(range(len(wide)), key=lambda k: (wide[k] > least[k], wide[k]))
+        wide[k] = max(least[k], wide[k] - 1)
     return wide
 
 

@@ -24,7 +24,7 @@ th:first-child, td:first-child { text-align: left; position: sticky; left: 0; ba
 thead th:first-child { background: var(--head) }
 .names th { font-weight: normal; color: var(--grey); vertical-align: top; background: var(--paper);
   white-space: nowrap }
-.names td, .text { text-align: left } .names td { overflow-wrap: anywhere }
+.names td, .text { text-align: left } .names td { overflow-wrap: anywhere } .names { max-width: var(--width) }
 img { max-width: 100%; background: #fff }
 td.number { white-space: nowrap } td.prose { min-width: 16rem }
 td.hash { overflow-wrap: anywhere; min-width: 13rem; font-family: ui-monospace, monospace; font-size: 11px }

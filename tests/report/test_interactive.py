@@ -151,6 +151,8 @@ def test_a_long_cell_on_paper_goes_on_in_the_next_line():
     assert size >= _READABLE and wide[0] == len("options") + _BLANK
     # Numbers are not cut, whatever the size of type.
     assert _widths([["", "1234567890"]] * 30) == [10 + _BLANK] * 30
+    # Those that are alike stay so.
+    assert np.ptp(_widths([["0.01 (0.02)"]] * 9)) <= 1
 
 
 def test_on_paper_the_plan_stands_for_the_block(tables):
