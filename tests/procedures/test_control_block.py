@@ -1,12 +1,16 @@
 """A block in a frame of its own, surveyed points in UTM and marks: the truth again, blunders named, nothing turned."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from jaxphoto import adjust
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing.map_frame import MapFrame
-from jaxphoto.procedures.control import at_optimum, control_block
+from jaxphoto.observations import StationRows
+from jaxphoto.procedures.control import GivenControl, Marks, at_optimum, control_block
+from jaxphoto.procedures.control.into_block import without_names
 from jaxphoto.procedures.control.onto_control import onto_control
 from jaxphoto.simulation.remeasure import image_coordinates
 from tests.blocks import free_network, simulated
@@ -84,6 +88,31 @@ def test_a_wrong_coordinate_and_a_wrong_mark_are_named_and_turn_nothing(marked):
     moved = in_true_frame(found) - in_true_frame(sound)
     others = np.arange(len(found.ids)) != 1
     assert np.abs(moved / found.sigma_m)[others].max() < 2
+
+
+def test_control_on_a_line_needs_positions_of_the_photographs(marked):
+    """Two places, one of them by two names: what turns about the line through them the stations tell."""
+    points, marks = marked.control
+    there = at_optimum(found_in(marked, marked.control).adjusted)
+    position = np.asarray(there.start.unknowns.exterior.position)
+    image, axis = np.indices(position.shape).reshape(2, -1)
+    stations = StationRows(image, axis, position.ravel(), np.full(image.size, 0.1))
+    placed = dataclasses.replace(without_names(there, points.ids), stations=stations)
+    again = marks.take(np.array(marks.point) == points.ids[1])
+    again = again._replace(point=("again",) * len(again.point))
+    own = np.isin(points.ids, ("G0", "G3"))
+    ids = (*np.array(points.ids)[own].tolist(), "again", *np.array(points.ids)[points.check].tolist())
+    which = [*np.flatnonzero(own), 1, *np.flatnonzero(points.check)]
+    line = points._replace(
+        ids=ids, coordinates=points.coordinates[which], sigma_m=points.sigma_m[which], check=points.check[which],
+        places=tuple(ids),
+    )  # fmt: skip
+    given = GivenControl(line, Marks.joined(marks, again))
+    found = control_block(placed, given, adjust=adjust)
+    assert found.state == ("control",) * 3 + ("check",) * 3 and (found.w[3:] < 4).all()
+    assert any("3 control points in two photographs or more lie on a line" in s for s in found.sentences)
+    with pytest.raises(InputError, match="lie on a line, which leaves a turn about it open; mark one beside it, or"):
+        control_block(marked.block, given, adjust=adjust)
 
 
 def test_a_blunder_that_the_places_hide_is_found_by_the_adjustment(marked):

@@ -21,7 +21,7 @@ from jaxphoto.procedures.control.intersected import intersected
 from jaxphoto.procedures.control.into_block import into_block, with_gnss_bias, without_names
 from jaxphoto.procedures.control.judged import CRITICAL, JudgedControl, beyond, judged, poorer_survey, scatter
 from jaxphoto.procedures.control.marked import Marked, marked
-from jaxphoto.procedures.control.onto_control import LEAST, onto_control
+from jaxphoto.procedures.control.onto_control import LEAST, on_a_line, onto_control
 from jaxphoto.procedures.control.placed import InFrame, in_frame
 from jaxphoto.procedures.control.surveyed import MARK_SIGMA_PX, SIGMA_M, GivenControl, SurveyedPoints
 
@@ -157,10 +157,12 @@ def _placed(block: Block, frame: InFrame, met, covariance, sigma, points: Survey
     known = np.flatnonzero(np.isfinite(met).all(axis=1) & ~points.check & whole)
     agree = np.ones(len(met), bool)
     by_positions = len(block.stations) > 0 and not len(block.control)
-    if frame.at_place and len(known) < LEAST:
-        where = "at its positions" if by_positions else "where it lies"
-        text = f"{counted(len(known), 'control point')} in two photographs or more: the block stays {where}"
-        return block, met, agree, sigma, [text]
+    line = len(known) >= LEAST and on_a_line(met[known], frame.xyz[known])
+    if frame.at_place and (line or len(known) < LEAST):
+        how = " lie on a line, which leaves a turn about it open" if line else ""
+        stays = f"the block stays {'at its positions' if by_positions else 'where it lies'}"
+        said = [f"{counted(len(known), 'control point')} in two photographs or more{how}: {stays}"]
+        return block, met, agree, sigma, said
     spread = np.sqrt(np.trace(covariance[known], axis1=1, axis2=2))
     assumed, surveyed = np.isnan(points.sigma_m[known]).any(axis=1), np.linalg.norm(sigma[known], axis=1)
     if not frame.at_place:

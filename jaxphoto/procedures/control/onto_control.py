@@ -64,7 +64,8 @@ def onto_control(
     best = _best(there, here, sigma_m)
     if best is None:
         raise InputError(
-            f"{file}: the control points lie on a line, which leaves a turn about it open; mark one beside it"
+            f"{file}: the control points lie on a line, which leaves a turn about it open; mark one beside it, or "
+            "orient photographs that have positions"
         )
     if best.agree.mean() < _MOST and assumed.any() and (poor := _poor(there, here, sigma_m, assumed)) is not None:
         return poor
@@ -82,6 +83,11 @@ def onto_control(
         f"{file}: the marks of the control points do not fit their coordinates ({np.median(off):.3g} m off in the "
         "median); look at names, system and order of coordinates"
     )
+
+
+def on_a_line(there: Float[np.ndarray, "points 3"], here: Float[np.ndarray, "points 3"]) -> bool:
+    """Whether no three of the points lie beside one another, so that they leave a turn about their line open."""
+    return next(_of_threes(there, here), None) is None
 
 
 def _poor(there, here, sigma_m, assumed) -> OntoControl | None:
