@@ -4,6 +4,7 @@ import math
 
 import pandas as pd
 
+from jaxphoto.errors import counted
 from jaxphoto.statistics import LEAST_CHECK_POINTS, ComponentAccuracy, PositionalAccuracy
 
 STANDARD = "ASPRS Positional Accuracy Standards for Digital Geospatial Data, Edition 2 (2023)"
@@ -51,11 +52,11 @@ def class_sentences(found: PositionalAccuracy) -> list[str]:
 def _sentence(t: ComponentAccuracy) -> str:
     survey = "not known" if math.isnan(t.survey_m) else _cm(t.survey_m)
     measured = f"{t.symbol} = {_cm(t.rmse_m)} (block to check points {_cm(t.fit_m)}, survey {survey})"
-    the_class = f"the {t.class_cm:g}-cm {t.name} accuracy class"
-    points = "1 check point" if t.n == 1 else f"{t.n} check points"
+    the_class = f"the {t.class_cm:g}-cm {t.symbol} {t.name} positional accuracy class"
+    points = counted(t.n, "check point")
     if t.claimed:
-        return f"Tested with {points}: {measured}. This meets {the_class}."
-    few = f"the standard asks for {LEAST_CHECK_POINTS} check points, as tested with {t.n}"
+        return f"Tested with {points} to meet {the_class}: {measured}."
+    few = f"tested with {points} only, where the standard asks for {LEAST_CHECK_POINTS}"
     why = few if t.n < LEAST_CHECK_POINTS else f"tested with {points} whose survey errors are not all known"
     return f"Cannot be claimed: {why}: {measured}, which would be {the_class}."
 

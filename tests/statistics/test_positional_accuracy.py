@@ -57,11 +57,13 @@ def test_fewer_than_thirty_check_points_claim_nothing():
     found = positional_accuracy(check_rows(thirty()[:29], 0.001))
     assert not accuracy_table(found)["claimed"].any()
     said = accuracy_sentences(found)
-    assert len([s for s in said if s.startswith("Cannot be claimed") and "as tested with 29" in s]) == 3
-    assert not any("meets" in s for s in said)
+    assert len([s for s in said if s.startswith("Cannot be claimed") and "tested with 29 check points only" in s]) == 3
+    assert not any("to meet" in s for s in said)
     claimed = accuracy_sentences(positional_accuracy(check_rows(thirty(), 0.001)))
-    assert "Tested with 30 check points: RMSE_V = 3 cm (block to check points 3 cm, survey 0.1 cm)" in claimed[2]
-    assert "the 3.1-cm vertical accuracy class" in claimed[2] and not any("Cannot" in s for s in claimed)
+    met = "Tested with 30 check points to meet the 3.1-cm RMSE_V vertical positional accuracy class: RMSE_V = 3 cm"
+    assert f"{met} (block to check points 3 cm, survey 0.1 cm)." == claimed[2] and not any(
+        "Cannot" in s for s in claimed
+    )
 
 
 def test_a_survey_whose_errors_nobody_told_claims_nothing():
