@@ -77,7 +77,10 @@ def _read(path: Path, sensor: Sensor) -> tuple[np.ndarray, Image.Exif, dict[str,
     with Image.open(path) as picture:
         if picture.mode not in _MODES:
             known = ", ".join(_MODES)
-            raise InputError(f"{path}: its pixels are {picture.mode}, and undistorted are {known}; convert it to RGB")
+            raise InputError(f"its pixels are {picture.mode}, and undistorted are {known}; convert it to RGB")
+        # Pillow reads colours of 16 bits as 8, and cannot write them.
+        if bands.dtype != np.uint8 and picture.mode != "I;16":
+            raise InputError("its colours have 16 bits, and undistorted are those of 8; convert it to 8 bits")
         kept: dict[str, Any] = {key: picture.info[key] for key in ("icc_profile", "xmp") if key in picture.info}
         if picture.format not in ("JPEG", "MPO"):
             kept.pop("xmp", None)

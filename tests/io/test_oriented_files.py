@@ -146,9 +146,9 @@ def in_gon(text):
 def test_texts_of_orientations_image_points_and_a_camera_are_a_block(tmp_path, name):
     block = read_source(TEXTS[name](tmp_path / "in"))
     p = inside("opencv", block.frame.kind)
-    assert block.sensors["camera"] == SENSOR and set(block.images) <= set(p.images) and len(block.images) > 2
+    assert block.sensors == {"one": SENSOR} and set(block.images) <= set(p.images) and len(block.images) > 2
     assert np.abs(misfits_px(block, p)).max() < 1e-6
-    assert free_of(block, "camera") == {"c_mm", "xp_mm", "yp_mm", "k1", "k2", "k3", "p1", "p2", "b1"}
+    assert free_of(block, "one") == {"c_mm", "xp_mm", "yp_mm", "k1", "k2", "k3", "p1", "p2", "b1"}
 
 
 PARAMETERS = {

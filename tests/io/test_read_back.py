@@ -92,6 +92,9 @@ def test_several_cameras_come_back_with_their_photographs_from_opk(tmp_path):
     table.write_text("".join(table.read_text().splitlines(keepends=True)[:-1]))
     with pytest.raises(InputError, match=r"images.csv says no camera of 1 photographs \(f.tif\); add a row"):
         read_source(tmp_path / "out")
+    table.unlink()
+    with pytest.raises(InputError, match=r"camera.toml holds several cameras.*; write images.csv beside it"):
+        read_source(tmp_path / "out")
 
 
 term = st.floats(-0.2, 0.2)

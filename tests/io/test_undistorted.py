@@ -1,5 +1,6 @@
 """Undistorted photographs: a picture that is a function of the ray is the same function of the ray afterwards."""
 
+import cv2
 import numpy as np
 import pytest
 from PIL import ExifTags, Image
@@ -120,6 +121,7 @@ def test_the_command_leaves_out_what_is_not_of_the_camera(tmp_path, monkeypatch,
     for name, options in (("a.png", {}), ("b.png", {"compress_level": 1}), ("c.jpg", {})):
         saved(tmp_path / "given", name, **options)
     Image.new("RGB", (100, 100)).save(tmp_path / "given" / "small.png")
+    cv2.imwrite(str(tmp_path / "given" / "deep.png"), np.zeros((270, 360, 3), np.uint16))
     cut = saved(tmp_path / "given", "cut.png")
     cut.write_bytes(cut.read_bytes()[:5000])
     write_camera_file(tmp_path / "camera.toml", SENSOR, BARREL, name="one")
@@ -127,6 +129,7 @@ def test_the_command_leaves_out_what_is_not_of_the_camera(tmp_path, monkeypatch,
     code, said, wrong = run(monkeypatch, capsys, "undistort", tmp_path / "given", *given)
     assert code == 1 and "3 photographs of " in said
     assert "small.png: its size is 100 x 100 px" in wrong and "cut.png: " in wrong
+    assert f"left out: {tmp_path / 'given' / 'deep.png'}: its colours have 16 bits" in wrong
     assert {p.name for p in (tmp_path / "out").iterdir()} >= {"a.png", "b.png", "c.jpg", "camera.toml"}
     for arguments, message in (
         ((tmp_path / "given", *given[:3], tmp_path / "no", "--keep", "most"), "--keep most: there are crop, all"),

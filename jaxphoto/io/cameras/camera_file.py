@@ -22,6 +22,10 @@ ASSUMED_PIXEL_MM = 0.001
 _WIDEST = 1e7
 
 
+class SeveralCamerasError(InputError):
+    """A file holds several cameras, and nobody said which is meant."""
+
+
 class CameraFile(NamedTuple):
     """A camera as a file gives it.
 
@@ -80,7 +84,7 @@ class CameraSource(NamedTuple):
                 raise self.error(f"the camera {quoted(name)} {harm}")
         if self.camera is None:
             if len(names) > 1:
-                raise self.error(f"it holds {len(names)} cameras; name one of {known}")
+                raise SeveralCamerasError(f"{self.path}: it holds {len(names)} cameras; name one of {known}")
             return names[0]
         if self.camera not in names:
             raise self.error(f"there is no camera {quoted(self.camera)} in it; name one of {known}")

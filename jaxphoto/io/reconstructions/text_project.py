@@ -13,6 +13,7 @@ from jaxphoto.errors import InputError, few, quoted
 from jaxphoto.io.block_folder import BlockTables
 from jaxphoto.io.block_folder.table_layout import TOML
 from jaxphoto.io.cameras import read_camera_file
+from jaxphoto.io.cameras.camera_file import SeveralCamerasError
 from jaxphoto.io.reconstructions import open_sfm, orthority, pix4d
 from jaxphoto.io.reconstructions.exterior_text import ExteriorText, is_exterior, read_exterior
 from jaxphoto.io.reconstructions.points_beside import (
@@ -91,7 +92,14 @@ def _cameras(path: Path, names: list[str]) -> tuple[dict[str, TiedCamera], list[
     """
     file, beside = _camera_file(path), path.with_name(IMAGES)
     if not beside.is_file():
-        return {"camera": _camera(file)}, ["camera"] * len(names)
+        try:
+            name, camera = _camera(file)
+        except SeveralCamerasError:
+            raise InputError(
+                f"{file.name} holds several cameras, and nothing says which photograph has which; write {IMAGES} "
+                "beside it (image, camera), or keep one camera in the file"
+            ) from None
+        return {name: camera}, [name] * len(names)
     table, places = read_csv(beside, ("image", "camera")), places_by_name(names)
     images, own, found = table.ids("image").tolist(), table.ids("camera").tolist(), dict[int, str]()
     for row, (image, camera) in enumerate(zip(images, own, strict=True)):
@@ -100,7 +108,7 @@ def _cameras(path: Path, names: list[str]) -> tuple[dict[str, TiedCamera], list[
     if missing := [name for k, name in enumerate(names) if k not in found]:
         raise InputError(f"{IMAGES} says no camera of {len(missing)} photographs ({few(missing)}); add a row for each")
     camera_of = [found[k] for k in range(len(names))]
-    return {name: _camera(file, name) for name in dict.fromkeys(camera_of)}, camera_of
+    return dict(_camera(file, name) for name in dict.fromkeys(camera_of)), camera_of
 
 
 def _camera_file(path: Path) -> Path:
@@ -114,9 +122,10 @@ def _camera_file(path: Path) -> Path:
     return found[0]
 
 
-def _camera(file: Path, name: str | None = None) -> TiedCamera:
+def _camera(file: Path, name: str | None = None) -> tuple[str, TiedCamera]:
+    """A camera under the name that the file has for it."""
     read = read_camera_file(file, camera=name)
-    return TiedCamera(read.sensor, read.interior, estimated(read.interior))
+    return read.name, TiedCamera(read.sensor, read.interior, estimated(read.interior))
 
 
 def _best_turned(given: ExteriorText, cameras: list[TiedCamera], shown: Shown) -> Float[np.ndarray, "images 3 3"]:
