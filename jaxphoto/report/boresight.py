@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import re
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
 import pandas as pd
 from rich.console import Console
 from rich.text import Text
 
+from jaxphoto.errors import InputError
 from jaxphoto.procedures import Step
 from jaxphoto.report.document import Heading, Paragraph, rows_of
 from jaxphoto.report.findings import as_sentence
 from jaxphoto.report.made import Made, made_section, versions
-from jaxphoto.report.plots import drawn, new_figure
+from jaxphoto.report.plots import axes_or_new, drawn, new_figure
 from jaxphoto.report.results import write_results, write_summary
 from jaxphoto.report.study_page import PageLink, StudyPart, WholePicture, study_page
 from jaxphoto.report.tables import Tables
@@ -24,6 +25,7 @@ from jaxphoto.report.verdict import verdict_of
 from jaxphoto.writing import whole_folder
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 # Error bars are so many standard deviations.
@@ -47,7 +49,7 @@ def boresight_verdict(steps: tuple[Step, ...]) -> str:
     return f"the misalignment must not be used: step {', '.join(map(str, objecting))} not passed"
 
 
-def steps_table(steps: tuple[Step, ...]) -> pd.DataFrame:
+def steps_table(steps: Sequence[Step]) -> pd.DataFrame:
     """step, parameter, value, sigma, unit: sigma0 and every estimate; sigmas are a posteriori."""
     rows: list[tuple] = []
     for step in steps:
@@ -58,30 +60,51 @@ def steps_table(steps: tuple[Step, ...]) -> pd.DataFrame:
 
 def boresight_figure(steps: tuple[Step, ...]) -> Figure | None:
     """Misalignments of steps 3 and 4 and shifts of strips of step 2 with error bars; None without any."""
-    table = steps_table(steps)
-    panels = {
-        "misalignment [deg], steps 3 and 4": table[table["parameter"].str.fullmatch(_ANGLES)],
-        "shift of strips [m], step 2": table[(table["step"] == 2) & table["parameter"].str.fullmatch(_SHIFTS)],
-    }
-    panels = {title: rows for title, rows in panels.items() if len(rows)}
-    if not panels:
+    there = [shifts for shifts in (False, True) if len(_rows(steps, shifts))]
+    if not there:
         return None
-    most = max(len(rows) for rows in panels.values())
-    figure = new_figure(9.6, 1.2 + 0.24 * most)
-    for axes, (title, rows) in zip(figure.subplots(1, len(panels), squeeze=False).flat, panels.items(), strict=True):
-        at, colours = np.arange(len(rows)), np.where(rows["step"] == 3, "0.5", "tab:blue")
-        for k, value, sigma, colour in zip(at, rows["value"], rows["sigma"], colours, strict=True):
-            axes.errorbar(value, k, xerr=_BARS * sigma, fmt="o", ms=4, capsize=3, color=colour)
-        names = [
-            _short(str(parameter)) + (f", step {step}" if step > 2 else "")
-            for parameter, step in zip(rows["parameter"], rows["step"], strict=True)
-        ]
-        axes.set_yticks(at, [drawn(name) for name in names], fontsize=8)
-        axes.invert_yaxis()
-        axes.axvline(0, color="0.4", lw=0.6)
-        axes.set_title(title, fontsize=10)
-        axes.tick_params(axis="x", labelsize=8)
+    most = max(len(_rows(steps, shifts)) for shifts in there)
+    figure = new_figure(4.8 * len(there), 1.2 + 0.24 * most)
+    for axes, shifts in zip(figure.subplots(1, len(there), squeeze=False).flat, there, strict=True):
+        plot_boresight(steps, axes, shifts=shifts)
     return figure
+
+
+def plot_boresight(steps: Sequence[Step], ax: Axes | None = None, *, shifts: bool = False) -> Axes:
+    """Misalignments of steps 3 and 4 (deg), or `shifts` of strips of step 2 (m), with bars of two sigmas to each side.
+
+    Raises InputError where the steps estimated none.
+    """
+    rows = _rows(steps, shifts)
+    if not len(rows):
+        raise InputError(f"these steps estimated no {'shifts of strips' if shifts else 'misalignment'}")
+    ax = axes_or_new(ax)
+    names = [_short(str(parameter)) for parameter in rows["parameter"]]
+    places = {name: k for k, name in enumerate(dict.fromkeys(names))}
+    several = len(set(rows["step"])) > 1
+    for k, (step, own) in enumerate(rows.assign(at=[places[name] for name in names]).groupby("step")):
+        # Of a parameter one step below the other; what the last one found is what is used.
+        at = own["at"] + (0.3 * (k - 0.5) if several else 0.0)
+        marker, colour = ("s", "0.5") if several and k == 0 else ("o", "tab:blue")
+        ax.errorbar(
+            own["value"], at, xerr=_BARS * own["sigma"], fmt=marker, ms=4, capsize=3, color=colour, label=f"step {step}"
+        )
+    ax.set_yticks(list(places.values()), [drawn(name) for name in places], fontsize=8)
+    ax.set_ylim(len(places) - 0.5, -0.5)
+    ax.axvline(0, color="0.4", lw=0.6)
+    ax.set_title("shifts of strips, step 2" if shifts else "misalignment", fontsize=10)
+    ax.set_xlabel("shift [m]" if shifts else "angle [deg]", fontsize=9)
+    ax.tick_params(axis="x", labelsize=8)
+    if several:
+        ax.legend(fontsize=8)
+    return ax
+
+
+def _rows(steps: Sequence[Step], shifts: bool) -> pd.DataFrame:
+    """Of `steps_table` what is drawn."""
+    table = steps_table(steps)
+    of = table["parameter"].str.fullmatch(_SHIFTS if shifts else _ANGLES)
+    return table[of & (table["step"] == 2)] if shifts else table[of]
 
 
 def _short(path: str) -> str:
@@ -94,6 +117,7 @@ def boresight_page(steps: tuple[Step, ...], made: Made) -> str:
     """The report as HTML: judgement first, then what each step says and estimates."""
     parts: list[StudyPart] = []
     if figure := boresight_figure(steps):
+        parts.append(Heading("Misalignment and shifts"))
         parts.append(WholePicture.of(figure, "misalignments and shifts of strips with error bars"))
         parts.append(Paragraph(f"Bars are {_BARS:g} standard deviations long to each side."))
     for step in steps:

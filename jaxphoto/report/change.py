@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -14,13 +14,18 @@ from jaxphoto.camera import Sensor
 from jaxphoto.report.document import Heading, Paragraph, rows_of
 from jaxphoto.report.findings import p_words
 from jaxphoto.report.made import Made, made_section, versions
-from jaxphoto.report.maps import format_maps
+from jaxphoto.report.maps import draw_format_map
+from jaxphoto.report.plots import axes_or_new, new_figure
 from jaxphoto.report.results import write_summary
 from jaxphoto.report.stability import Compared, missing_covariances
 from jaxphoto.report.study_page import WholePicture, study_page
 from jaxphoto.stability import ALIGNED, LEVEL, Change
 from jaxphoto.stability.analysis import change_meaning
 from jaxphoto.writing import whole_folder
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 
 def parameter_changes(found: Change) -> pd.DataFrame:
@@ -76,6 +81,23 @@ def change_verdict(found: Change, sensor: Sensor) -> list[str]:
     return said
 
 
+def change_figure(found: Change, sensor: Sensor) -> Figure:
+    """Both maps of `plot_change`, one beside the other."""
+    figure = new_figure(9.6, 3.9)
+    for axes, usual in zip(figure.subplots(1, 2), (False, True), strict=True):
+        plot_change(found, sensor, axes, over_usual=usual)
+    return figure
+
+
+def plot_change(found: Change, sensor: Sensor, ax: Axes | None = None, *, over_usual: bool = False) -> Axes:
+    """Offsets of the rays of two calibrations over the format (px), or those over what is usual of one camera."""
+    ax = axes_or_new(ax)
+    name = f"offset over what {100 * LEVEL:.0f} % stay below" if over_usual else "offset [px]"
+    values = found.offset_mm / (found.limit_mm if over_usual else sensor.pixel_mm)
+    draw_format_map(ax, sensor, np.asarray(found.field.offsets.points), name, values)
+    return ax
+
+
 def print_change(found: Change, sets: tuple[Compared, Compared], sensor: Sensor, console: Console) -> None:
     """Both calibrations, the table of parameters and the sentences."""
     for line in (*map(str, sets), missing_covariances(sets)):
@@ -98,12 +120,8 @@ def write_change(found: Change, sets: tuple[Compared, Compared], sensor: Sensor,
     Raises InputError where `directory` holds something that is not an earlier result.
     """
     parameters, verdict = parameter_changes(found), change_verdict(found, sensor)
-    maps = {
-        "offset [px]": found.offset_mm / sensor.pixel_mm,
-        f"offset over what {100 * LEVEL:.0f} % stay below": found.offset_mm / found.limit_mm,
-    }
-    figure = format_maps(sensor, np.asarray(found.field.offsets.points), maps)
-    picture = WholePicture.of(figure, "maps over the format")
+    alt = "maps over the format of the camera: offsets of rays (px), and offsets over what is usual"
+    picture = WholePicture.of(change_figure(found, sensor), alt)
     about = [str(sets[0]), str(sets[1]), missing_covariances(sets)]
     parts = [*map(Paragraph, about), picture, Heading("Parameters"), rows_of(parameters), *made_section(made)]
     with whole_folder(directory) as work:

@@ -1,18 +1,34 @@
 """A document as one file of HTML that opens offline, on a screen of any width and in print."""
 
+from __future__ import annotations
+
 import base64
 import io
 import re
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
 from jinja2 import Environment
 from markupsafe import Markup
 
 from jaxphoto.report.block_plot import block_words, layout_figure
-from jaxphoto.report.document import BlockInSpace, Document, DocumentPicture, Element, Heading, Paragraph, Rows
-from jaxphoto.report.interactive import live_block
+from jaxphoto.report.document import (
+    BlockInSpace,
+    Document,
+    DocumentPicture,
+    Element,
+    Heading,
+    Paragraph,
+    Pictures,
+    Rows,
+)
+from jaxphoto.report.interactive import library, live_block, live_figure
 from jaxphoto.report.maps import png_of
 from jaxphoto.report.page_head import page_head
 from jaxphoto.report.plots import new_figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 WIDTH_INCHES = 4.8
 # Pictures are drawn finer than screens show them: for print, and for screens of many pixels.
@@ -21,6 +37,7 @@ _PAGE = """{{ head(title) }}<body>
 <h1>{{ title }}</h1>
 {% for e in elements %}{{ e }}
 {% endfor %}<p><small>{{ foot }}</small></p>
+{{ library }}
 </body></html>
 """
 _HTML = Environment(autoescape=True)
@@ -45,7 +62,9 @@ _ROWS = _HTML.from_string(
 def html_page(document: Document) -> str:
     """The document with its pictures inside."""
     elements = [html_of(element) for element in document.elements]
-    return _HTML.from_string(_PAGE).render(title=document.title, head=page_head, elements=elements, foot=document.foot)
+    return _HTML.from_string(_PAGE).render(
+        title=document.title, head=page_head, elements=elements, foot=document.foot, library=library(elements)
+    )
 
 
 def html_of(element: Element) -> Markup:
@@ -63,7 +82,13 @@ def html_of(element: Element) -> Markup:
         tables = element.tables
         still, alt = png_of(layout_figure(tables))[1], block_words(tables.adjusted.block)
         return live_block(tables.adjusted, tables.covariance, still, alt)
-    return Markup('<div class="pictures">{}</div>').format(Markup("").join(map(_image, element.panels)))
+    return _stills(element, map(_figure, element.panels))
+
+
+def live_pictures(pictures: Pictures) -> Markup:
+    """Panels that answer, for a page that ends with their `library`."""
+    figures = [_figure(panel) for panel in pictures.panels]
+    return live_figure(_stills(pictures, figures), figures)
 
 
 def _kind(column: tuple[str, ...]) -> str:
@@ -90,10 +115,19 @@ def anchor(heading: str) -> str:
     return re.sub(r"\W+", "-", heading.lower()).strip("-")
 
 
-def _image(picture: DocumentPicture) -> Markup:
+def _figure(picture: DocumentPicture) -> Figure:
     figure = new_figure(WIDTH_INCHES, picture.height)
     picture.draw(figure.subplots())
+    return figure
+
+
+def _stills(pictures: Pictures, figures: Iterable[Figure]) -> Markup:
+    images = [_image(figure, panel.alt) for panel, figure in zip(pictures.panels, figures, strict=True)]
+    return Markup('<div class="pictures">{}</div>').format(Markup("").join(images))
+
+
+def _image(figure: Figure, alt: str) -> Markup:
     drawn = io.BytesIO()
     figure.savefig(drawn, format="png", dpi=_DPI)
     content = base64.b64encode(drawn.getvalue()).decode()
-    return Markup('<img alt="{}" src="data:image/png;base64,{}">').format(picture.alt, content)
+    return Markup('<img alt="{}" src="data:image/png;base64,{}">').format(alt, content)

@@ -151,3 +151,7 @@ def curve_of(tables: Tables, camera: str | None = None) -> DistortionCurve:
     interior = a.unknowns.interior[name]
     covariance = tables.covariance.of_interior(name, parameter_names(interior))
     return distortion_curve(interior, a.block.sensors[name], covariance)
+
+
+# All that is defined here, for the rooms that show it.
+__all__ = [name for name in dir() if name.startswith("plot_")]

@@ -12,15 +12,18 @@ from rich.console import Console
 
 from jaxphoto.errors import camera_words
 from jaxphoto.procedures.halves import Halves
-from jaxphoto.report.document import Heading, rows_of, without_empty
+from jaxphoto.report.document import Heading, Paragraph, rows_of, without_empty
+from jaxphoto.report.findings import as_sentence
 from jaxphoto.report.made import Made, made_section, versions
-from jaxphoto.report.maps import format_maps
+from jaxphoto.report.maps import draw_format_map
+from jaxphoto.report.plots import axes_or_new, new_figure
 from jaxphoto.report.results import write_summary
 from jaxphoto.report.study_page import WholePicture, study_page
 from jaxphoto.stability import ALIGNED
 from jaxphoto.writing import whole_folder
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 # Below so many standard deviations from 1 a factor says nothing.
@@ -108,12 +111,20 @@ def halves_verdict(found: Halves) -> list[str]:
 
 
 def halves_figure(found: Halves) -> Figure:
-    """Maps over the format: the factor of the standard deviations, and the radius of the band in pixels."""
-    maps = {
-        "factor of the standard deviations": found.band.cell_factor,
-        "95 % of the errors are smaller [px]": found.band.calibration,
-    }
-    return format_maps(found.adjusted.block.sensors[found.camera], found.cells_mm, maps)
+    """Both maps of `plot_halves`, one beside the other."""
+    figure = new_figure(9.6, 3.9)
+    for axes, band in zip(figure.subplots(1, 2), (False, True), strict=True):
+        plot_halves(found, axes, band=band)
+    return figure
+
+
+def plot_halves(found: Halves, ax: Axes | None = None, *, band: bool = False) -> Axes:
+    """The factor of the standard deviations over the format, or the radius of the `band` that holds 95 % (px)."""
+    ax = axes_or_new(ax)
+    name = "95 % of the errors are smaller [px]" if band else "factor of the standard deviations"
+    values = found.band.calibration if band else found.band.cell_factor
+    draw_format_map(ax, found.adjusted.block.sensors[found.camera], found.cells_mm, name, values)
+    return ax
 
 
 def print_halves(found: Halves, console: Console) -> None:
@@ -129,8 +140,12 @@ def write_halves(found: Halves, directory: Path, write_camera: Callable[[Path], 
     """
     cells, cuts, verdict = cell_table(found), cut_table(found), halves_verdict(found)
     title = f"{found.adjusted.block.title or 'block'}: halves"
-    picture = WholePicture.of(halves_figure(found), "maps over the format")
+    colour = "amber" if abs(found.band.factor - 1) > _SURE * found.band.sigma_factor else "green"
+    alt = "maps over the format: the factor of the standard deviations, and the radius that holds 95 % of the errors"
+    picture = WholePicture.of(halves_figure(found), alt)
     parts = (
+        *(Paragraph(as_sentence(sentence)) for sentence in verdict[1:]),
+        Heading("Over the format"),
         picture,
         Heading("Cuts"),
         rows_of(without_empty(cuts).rename(columns={"first": "first half"})),
@@ -141,7 +156,7 @@ def write_halves(found: Halves, directory: Path, write_camera: Callable[[Path], 
         cuts.to_csv(work / "cuts.csv", index=False)
         write_camera(work)
         (work / "halves.png").write_bytes(picture.png)
-        (work / "report.html").write_text(study_page(title, verdict, parts), encoding="utf-8")
+        (work / "report.html").write_text(study_page(title, verdict[:1], parts, colour), encoding="utf-8")
         share, error = found.inside
         summary = {
             "title": found.adjusted.block.title,

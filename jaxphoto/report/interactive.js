@@ -1,7 +1,7 @@
 // What a page does besides being read: tables sort and filter, the block turns, and an image or a point that is chosen
 // in one place shows in the others. Without it, and in print, the page has all its tables and still pictures.
 {
-  const LONG_TABLE = 12, NARROW = 600;
+  const LONG_TABLE = 12, NARROW = 600, WIDE = 620;
   // As in block_in_space.py of colours that those who see no red or green tell apart.
   const OF_IMAGE = "#e69f00", OF_POINT = "#f0308a", BLUE = "#2f8fd0", GREY = "#8a8f96";
   const NOTHING = { x: [], y: [], z: [] };
@@ -144,6 +144,8 @@
 
   // ---- figures
 
+  const dark = matchMedia("(prefers-color-scheme: dark)");
+
   // A layout in the colours of the page, light or dark.
   const themed = (layout) => {
     const style = getComputedStyle(document.documentElement);
@@ -160,7 +162,6 @@
     // Nothing leaves the page.
     showSendToCloud: false, plotlyServerURL: "",
   };
-  const dark = matchMedia("(prefers-color-scheme: dark)");
 
   const drawn = async (place, data, layout) => {
     await Plotly.newPlot(place, data, themed(layout), CONFIG);
@@ -310,20 +311,76 @@
     performance.mark("figures drawn");
   };
 
+  // Of a twin, which matplotlib drew on white: in the dark greys are turned round. What has a scale of colours stays.
+  const GREY_OF = /^rgba\((\d+),\1,\1,/, BRIGHTEST = 235, REACH = 0.8, WHITE = "255";
+  const lightened = (key, value) => {
+    if (Array.isArray(value) && key === "color") return value.map((one) => lightened(key, one));
+    if ((key !== "color" && key !== "fillcolor") || typeof value !== "string") return value;
+    const grey = GREY_OF.exec(value)?.[1];
+    if (grey === undefined || grey === WHITE) return value;
+    const turned = Math.round(BRIGHTEST - REACH * grey);
+    return value.replace(`rgba(${grey},${grey},${grey},`, `rgba(${turned},${turned},${turned},`);
+  };
+  const scaled = ({ data }) => data.some(({ type, marker }) => type === "heatmap" || marker?.colorscale);
+
+  const twinsFrom = (text) => {
+    const plain = JSON.parse(text);
+    return !dark.matches ? plain : JSON.parse(text, lightened).map((twin, k) => (scaled(plain[k]) ? plain[k] : twin));
+  };
+
+  // One beside the other as far as there is room; their titles break into lines, which those of plotly do not.
+  const drawTwins = async (figure) => {
+    const text = await unpacked(figure.querySelector("script"));
+    const alts = [...figure.querySelectorAll("img")].map((image) => image.alt);
+    const twins = twinsFrom(text), box = made("div", { className: "pictures" });
+    figure.append(box);
+    figure.dataset.drawn = "";
+    const shown = (twin, place) => {
+      const { width, height, title, ...layout } = twin.layout;
+      const margin = { l: 50, r: 20, t: 30, b: 45 };
+      // A finger moves the page, not the picture.
+      const dragmode = matchMedia("(pointer: coarse)").matches ? false : "zoom";
+      const legend = { orientation: "h", x: 0, y: 1, xanchor: "left", yanchor: "bottom" };
+      const own = themed({ ...layout, margin, dragmode, legend });
+      // Colours mean what their scale says on white alone.
+      if (dark.matches && scaled(twin)) own.plot_bgcolor = "#e8e8e8";
+      return Plotly.react(place, twin.data, own, CONFIG);
+    };
+    const places = twins.map(({ layout: { width, height, title } }, k) => {
+      const words = title.text.replaceAll("<br>", " ");
+      const alt = alts.length === twins.length ? alts[k] : `${alts[0]}: ${words}`;
+      const place = made("div", { className: "plot", role: "group", ariaLabel: alt });
+      place.style.aspectRatio = `${width} / ${height}`;
+      const className = width > WIDE ? "full" : "";
+      box.append(made("div", { className }, made("p", { className: "title" }, words), place));
+      return place;
+    });
+    await Promise.all(twins.map((twin, k) => shown(twin, places[k])));
+    dark.addEventListener("change", () => twinsFrom(text).forEach((twin, k) => shown(twin, places[k])));
+  };
+
+  let library = null;
+  const plotly = () => {
+    library ??= unpacked(document.getElementById("plotly")).then((text) =>
+      document.head.append(made("script", { textContent: text })));
+    return library;
+  };
+
   // When it comes into sight: a page is there to be read before its figures are drawn.
-  const drawInSight = (figure) => {
+  const drawInSight = (figure, draw) => {
     const observer = new IntersectionObserver(async ([{ isIntersecting }]) => {
       if (!isIntersecting) return;
       observer.disconnect();
-      document.head.append(made("script", { textContent: await unpacked(document.getElementById("plotly")) }));
-      await drawBlock(figure);
+      await plotly();
+      await draw(figure);
     }, { rootMargin: "300px" });
     observer.observe(figure);
   };
 
-  const figure = document.querySelector("figure.block");
+  const block = document.querySelector("figure.block"), canDraw = Boolean(window.DecompressionStream);
   // Where a browser draws nothing in space, the still picture stays.
-  const canTurn = figure && window.DecompressionStream && window.WebGLRenderingContext;
+  const canTurn = block && canDraw && window.WebGLRenderingContext;
   for (const table of document.querySelectorAll("table:has(thead)")) prepareTable(table, canTurn);
-  if (canTurn) drawInSight(figure);
+  if (canTurn) drawInSight(block, drawBlock);
+  if (canDraw) for (const figure of document.querySelectorAll("figure.twins")) drawInSight(figure, drawTwins);
 }

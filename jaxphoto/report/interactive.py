@@ -1,4 +1,4 @@
-"""The block in a page as a figure that turns and answers, with plotly inside, so that it opens offline."""
+"""Figures of a page that answer, and its block, which turns too: with plotly inside, so that it opens offline."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import base64
 import functools
 import gzip
 import json
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,31 +15,53 @@ from markupsafe import Markup
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.report.block_in_space import block_in_space, drawable, origin_of
 from jaxphoto.report.block_places import places_of
+from jaxphoto.report.to_plotly import twins_of
 from jaxphoto.statistics import Covariance
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure as Drawn
     from plotly.graph_objects import Figure
 
 # Image points whose residuals a page holds, some 12 bytes each; of more, every so manyeth.
 _MOST = 600_000
 _STEPS = np.iinfo(np.int16).max
+# What the script, and a page that is put together, know figures by.
+_LIVE = "live-figure"
 
 
 def live_block(adjusted: Adjustment, covariance: Covariance, still: str, alt: str) -> Markup:
-    """The block as a figure that turns, with plotly and what is shown of an image or point that is chosen; once a page.
+    """The block as a figure that turns, with what is shown of an image or point that is chosen; once a page.
 
     `still` is the picture that stands for it in print and where no script runs, as the address of an image, and `alt`
     says what it shows.
     """
     figure: Figure = block_in_space(adjusted, covariance)
-    shown = '<figure class="block"><img alt="{}" src="{}">{}</figure>{}{}'
+    shown = f'<figure class="block {_LIVE}"><img class="still" alt="{{}}" src="{{}}">{{}}</figure>{{}}'
     return Markup(shown).format(
         alt,
         still,
         _packed(figure.to_json(), "figure"),
         _packed(json.dumps(measurements(adjusted)), "measurements"),
-        _plotly(),
     )
+
+
+def live_figure(still: Markup, drawn: Sequence[Drawn]) -> Markup:
+    """Pictures that stand in a page as `still`, in print and where no script runs, each of their panels as its twin.
+
+    Panels stand as many abreast as they do in a picture, where there is room; above them its title.
+    """
+    packed = _packed(f"[{','.join(twin.to_json() for one in drawn for twin in twins_of(one))}]")
+    specs = [axes.get_subplotspec() for one in drawn for axes in one.axes]
+    across = max([len(drawn), *(spec.get_gridspec().ncols for spec in specs if spec is not None)])
+    title = next(filter(None, (one.get_suptitle() for one in drawn)), "")
+    caption = Markup("<figcaption>{}</figcaption>").format(title) if title else ""
+    shown = f'<figure class="twins {_LIVE}" style="--across: {across}"><div class="still">{{}}</div>{{}}{{}}</figure>'
+    return Markup(shown).format(still, packed, caption)
+
+
+def library(parts: Iterable[Markup]) -> Markup:
+    """What draws the figures of a page, once, where it has any."""
+    return _plotly() if any(_LIVE in part for part in parts) else Markup("")
 
 
 def measurements(adjusted: Adjustment) -> dict:
@@ -89,7 +112,8 @@ def _plotly() -> Markup:
     return _packed(get_plotlyjs(), "plotly")
 
 
-def _packed(text: str, name: str) -> Markup:
-    """A text that the page unpacks when it is asked for; the same bytes each time."""
+def _packed(text: str, name: str = "") -> Markup:
+    """A text that the page unpacks when it is asked for, by its name where it has one; the same bytes each time."""
     content = base64.b64encode(gzip.compress(text.encode(), mtime=0)).decode()
-    return Markup('<script type="text/plain" id="{}">{}</script>').format(name, content)
+    known = Markup(' id="{}"').format(name) if name else ""
+    return Markup('<script type="text/plain"{}>{}</script>').format(known, content)

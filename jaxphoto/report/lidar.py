@@ -13,6 +13,7 @@ import pandas as pd
 from rich.console import Console
 
 from jaxphoto.adjustment import Adjustment
+from jaxphoto.errors import InputError
 from jaxphoto.lidar import HeightFlag
 from jaxphoto.observations import AXES
 from jaxphoto.procedures.lidar import LidarControl, Round, Simultaneous
@@ -20,7 +21,7 @@ from jaxphoto.procedures.lidar.vertical_control import flag_counts
 from jaxphoto.report.document import Heading, Paragraph, Rows, finding_paragraphs, rows_of, without_empty
 from jaxphoto.report.findings import as_sentence
 from jaxphoto.report.made import Made, made_section
-from jaxphoto.report.plots import new_figure
+from jaxphoto.report.plots import axes_or_new, new_figure
 from jaxphoto.report.results import summary_of, write_results, write_summary
 from jaxphoto.report.study_page import PageLink, StudyPart, WholePicture, study_page
 from jaxphoto.report.tables import Tables
@@ -29,12 +30,13 @@ from jaxphoto.statistics import angle_differences, correlation_matrix
 from jaxphoto.writing import whole_folder
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 _UNITS = {"_mm": "mm", "_m": "m", "_m_per_s": "m/s", "_s": "s"}
-# Rows of a table that has no end.
 # Digits of a coordinate in metres that somebody reads.
 _MM = 3
+# Rows of a table that has no end.
 _STRONGEST = 30
 _ORDER = ("compile", "solve", "covariance")
 
@@ -119,45 +121,82 @@ def scanner_correlations(adjusted: Adjustment) -> pd.DataFrame:
 
 
 def above_figure(result: Simultaneous) -> Figure:
-    """By how much points lie above the cloud's surface, over the ground: before, and after."""
+    """Both pictures of `plot_above`, in the same colours."""
     figure = new_figure(10.0, 4.6)
-    points = np.asarray(result.adjusted.unknowns.points)[result.points]
-    panels = figure.subplots(1, 2, sharex=True, sharey=True)
-    for axes, values, title in zip(panels, (result.apart_before, result.apart), ("before", "after"), strict=True):
-        limit = float(np.nanpercentile(np.abs(values), 95)) or 1.0
-        shown = axes.scatter(*points[:, :2].T, c=values, cmap="RdBu_r", vmin=-limit, vmax=limit, s=18, edgecolor="0.6")
-        axes.set_title(f"{title}: RMSE {float(np.sqrt(np.nanmean(values**2))):.3f} m")
-        axes.set_aspect("equal")
-        axes.set_xlabel("X (m)")
-        figure.colorbar(shown, ax=axes, label="point above the surface (m)", shrink=0.8)
-    panels[0].set_ylabel("Y (m)")
+    for axes, before in zip(figure.subplots(1, 2, sharex=True, sharey=True), (True, False), strict=True):
+        plot_above(result, axes, before=before)
     return figure
+
+
+def plot_above(result: Simultaneous, ax: Axes | None = None, *, before: bool = False) -> Axes:
+    """By how much points lie above the cloud's surface (m), over the ground, after the adjustment or `before` it.
+
+    Colours reach 95 % of what it is before.
+    """
+    ax = axes_or_new(ax)
+    values = result.apart_before if before else result.apart
+    rmse = f"{'before' if before else 'after'}: RMSE {float(np.sqrt(np.nanmean(values**2))):.3f} m"
+    points = np.asarray(result.adjusted.unknowns.points)[result.points]
+    _heights_over_ground(ax, points, values, _limit(result.apart_before), "point above the surface [m]", rmse)
+    return ax
 
 
 def heights_figure(control: LidarControl) -> Figure:
-    """Where heights are control, and where they were refused; residuals of those that are."""
+    """Both pictures of `plot_lidar_heights`."""
     figure = new_figure(10.0, 4.6)
-    points = np.asarray(control.adjusted.unknowns.points)[control.points]
-    left, right = figure.subplots(1, 2, sharex=True, sharey=True)
-    refused = ~np.isfinite(control.height)
-    for chosen, label, colour in (
-        (control.used, "control", "tab:blue"),
-        (~control.used & ~refused, "left out", "tab:red"),
-        (refused, "refused", "0.6"),
-    ):
-        left.scatter(*points[chosen, :2].T, s=14, c=colour, label=f"{label} ({chosen.sum()})")
-    left.legend(loc="best", fontsize="small")
-    left.set_title("heights of the cloud")
-    off = (control.height - points[:, 2])[control.used]
-    limit = float(np.percentile(np.abs(off), 95)) or 1.0
-    shown = right.scatter(*points[control.used, :2].T, c=off, cmap="RdBu_r", vmin=-limit, vmax=limit, s=18)
-    right.set_title(f"cloud - adjusted: RMSE {np.sqrt((off**2).mean()):.3f} m")
-    for axes in (left, right):
-        axes.set_aspect("equal")
-        axes.set_xlabel("X (m)")
-    left.set_ylabel("Y (m)")
-    figure.colorbar(shown, ax=right, label="m", shrink=0.8)
+    for axes, residuals in zip(figure.subplots(1, 2, sharex=True, sharey=True), (False, True), strict=True):
+        if not residuals or control.used.any():
+            plot_lidar_heights(control, axes, residuals=residuals)
     return figure
+
+
+def plot_lidar_heights(control: LidarControl, ax: Axes | None = None, *, residuals: bool = False) -> Axes:
+    """Where heights of a cloud are control, left out and refused; or the `residuals` of control (m).
+
+    Residuals are heights of the cloud less those that were adjusted. Raises InputError for them where none is control.
+    """
+    points, used = np.asarray(control.adjusted.unknowns.points)[control.points], control.used
+    if residuals and not used.any():
+        raise InputError("no height of the cloud is control: there are no residuals to be drawn")
+    ax = axes_or_new(ax)
+    if residuals:
+        off = (control.height - points[:, 2])[used]
+        rmse = f"cloud minus adjusted: RMSE {np.sqrt((off**2).mean()):.3f} m"
+        _heights_over_ground(ax, points[used], off, _limit(off), "cloud minus adjusted height [m]", rmse)
+        return ax
+    refused = ~np.isfinite(control.height)
+    for chosen, label, colour, marker in (
+        (refused, "refused", "0.6", "+"),
+        (used, "control", "tab:blue", "o"),
+        (~used & ~refused, "left out", "#D55E00", "x"),
+    ):
+        ax.plot(*points[chosen, :2].T, marker, ms=5, color=colour, ls="none", label=f"{label} ({chosen.sum()})")
+    ax.legend(loc="best", fontsize=8)
+    ax.set_title("heights of the cloud", loc="left", fontsize=10)
+    _ground(ax)
+    return ax
+
+
+def _limit(off: np.ndarray) -> float:
+    """How far colours reach (m)."""
+    return float(np.nanpercentile(np.abs(off), 95)) or 1.0
+
+
+def _heights_over_ground(
+    axes: Axes, points: np.ndarray, values: np.ndarray, limit: float, label: str, title: str
+) -> None:
+    shown = axes.scatter(
+        points[:, 0], points[:, 1], c=values, cmap="RdBu_r", vmin=-limit, vmax=limit, s=18, edgecolor="0.6"
+    )
+    axes.figure.colorbar(shown, ax=axes, label=label, shrink=0.8)
+    axes.set_title(title, loc="left", fontsize=10)
+    _ground(axes)
+
+
+def _ground(axes: Axes) -> None:
+    axes.set(xlabel="X [m]", ylabel="Y [m]", aspect="equal")
+    axes.ticklabel_format(useOffset=False, style="plain")
+    axes.locator_params(nbins=6)
 
 
 @contextmanager
@@ -235,13 +274,21 @@ def heights_page(control: LidarControl, picture: WholePicture, made: Made) -> st
     """The page of heights of a cloud as control: rounds, flags, picture, and the heights that differ most."""
     flags = flag_counts(control.flag)
     refused = Rows(("heights that are", "number"), tuple((name.lower(), str(n)) for name, n in flags.items()))
-    parts: list[StudyPart] = [picture, Heading("Rounds"), rows_of(rounds_table(control.rounds).replace(np.inf, np.nan))]
+    parts: list[StudyPart] = [
+        Heading("Over the ground"),
+        picture,
+        Heading("Rounds"),
+        rows_of(rounds_table(control.rounds).replace(np.inf, np.nan)),
+    ]
     parts += [refused] if flags else []
     heights = heights_table(control)
-    off = (heights["height_m"] - heights["Z_m"]).abs().sort_values(ascending=False, na_position="last")
+    heights.insert(5, "difference_m", heights["height_m"] - heights["Z_m"])
+    largest = heights["difference_m"].abs().sort_values(ascending=False, na_position="last").index[:_STRONGEST]
+    metres = heights.loc[largest].select_dtypes(float)
+    written = {str(name): metres[name].map(f"{{:z.{_MM}f}}".format).where(metres[name].notna(), "") for name in metres}
     parts += [
         Heading("Heights that differ most"),
-        rows_of(without_empty(heights.loc[off.index[:_STRONGEST]].round(_MM))),
+        rows_of(without_empty(heights.loc[largest].assign(**written))),
     ]
     parts += [Paragraph("All stand in lidar_heights.csv."), *made_section(made)]
     said = [*rounds_words(control.rounds, control.still)]

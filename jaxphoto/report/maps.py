@@ -4,32 +4,34 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxphoto.camera import Sensor
-from jaxphoto.report.plots import new_figure
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
-def format_maps(
-    sensor: Sensor, cells_mm: Float[np.ndarray, "cells 2"], shown: Mapping[str, Float[np.ndarray, cells]]
-) -> Figure:
-    """One map beside the other, each under its name."""
-    figure = new_figure(4.8 * len(shown), 3.9)
-    w, h = sensor.width_mm / 2, sensor.height_mm / 2
-    for axes, (name, values) in zip(figure.subplots(1, len(shown), squeeze=False)[0], shown.items(), strict=True):
+def draw_format_map(
+    axes: Axes, sensor: Sensor, cells_mm: Float[np.ndarray, "cells 2"], name: str, values: Float[np.ndarray, cells]
+) -> None:
+    """A map over the format, coloured between its cells; `name` says what is shown, with its unit."""
+    if np.ptp(values) > 0:
         coloured = axes.tricontourf(*cells_mm.T, values, levels=12, cmap="viridis")
-        figure.colorbar(coloured, ax=axes, shrink=0.85)
-        axes.plot([-w, w, w, -w, -w], [-h, -h, h, h, -h], color="0.4", lw=0.8)
-        axes.set_title(name, loc="left", fontsize=10)
-        axes.set(xlabel="x [mm]", ylabel="y [mm]", aspect="equal")
-    return figure
+        axes.figure.colorbar(coloured, ax=axes, shrink=0.85, label=name)
+    outline(axes, sensor)
+    axes.set_title(name, loc="left", fontsize=10)
+
+
+def outline(axes: Axes, sensor: Sensor) -> None:
+    """The format of a camera on axes of millimetres from its centre."""
+    w, h = sensor.width_mm / 2, sensor.height_mm / 2
+    axes.plot([-w, w, w, -w, -w], [-h, -h, h, h, -h], color="0.4", lw=0.8)
+    axes.set(xlabel="x [mm]", ylabel="y [mm]", aspect="equal")
 
 
 def png_of(figure: Figure) -> tuple[bytes, str]:

@@ -12,15 +12,17 @@ import pandas as pd
 from rich.console import Console
 from rich.table import Table
 
+from jaxphoto.errors import InputError
 from jaxphoto.procedures.model_choice import ModelChoice
 from jaxphoto.report.document import Heading, rows_of
 from jaxphoto.report.made import Made, made_section, versions
-from jaxphoto.report.plots import new_figure
+from jaxphoto.report.plots import axes_or_new, drawn, new_figure
 from jaxphoto.report.results import write_summary
 from jaxphoto.report.study_page import WholePicture, study_page
 from jaxphoto.writing import whole_folder
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 # The page shows these of `choice_table`, with that many digits; the terminal a few of them.
@@ -33,6 +35,9 @@ _SHOWN = {
 _IN_TERMINAL = ("model", "parameters", "rms_px", "cv_rms_px", "cv_excess_se", "delta_bic", "f_p")
 # Differences of BIC below this say nothing (Kass and Raftery 1995).
 _ALIKE = 2.0
+# On the axis of these, which is logarithmic; from `_FAR` on, tenths say nothing.
+_MARKS = (0, 2, 10, 100, 1000, 10_000, 100_000, 1_000_000)
+_FAR = 100.0
 
 
 def choice_table(choice: ModelChoice) -> pd.DataFrame:
@@ -104,29 +109,50 @@ def choice_verdict(choice: ModelChoice) -> list[str]:
 
 
 def choice_figure(choice: ModelChoice) -> Figure:
-    """BIC above the smallest, and the RMS of adjusted and of left-out image points, model by model."""
-    judged = [j for j in choice.judged if math.isfinite(j.bic)]
-    names = [f"{j.candidate.name} ({j.n_parameters})" for j in judged]
-    at = np.arange(len(judged))
-    figure = new_figure(9.0, 1.2 + 0.36 * max(len(judged), 3))
-    left, right = figure.subplots(1, 2, sharey=True)
-    bic = np.array([j.bic for j in judged])
-    left.barh(
-        at,
-        bic - bic.min(initial=np.inf),
-        color=["tab:blue" if j.candidate.name == choice.by_bic else "0.7" for j in judged],
-    )
-    left.set_yticks(at, names, fontsize=8)
-    left.invert_yaxis()
-    left.set_xscale("symlog", linthresh=10)
-    left.set_xlabel("BIC above the smallest", fontsize=9)
-    right.plot([j.rms_px for j in judged], at, "o", color="0.5", label="adjusted")
-    right.plot([j.cv_rms_px for j in judged], at, "D", color="tab:red", label="left out")
-    right.set_xlabel("RMS of image points [px]", fontsize=9)
-    right.legend(fontsize=8)
-    right.grid(axis="x", lw=0.3)
-    figure.suptitle("distortion models (estimated interior parameters)", fontsize=11)
+    """Both pictures of `plot_models`, one beside the other; empty where no model could be adjusted."""
+    known = [j for j in choice.judged if math.isfinite(j.bic)]
+    figure = new_figure(9.6, 1.2 + 0.36 * max(len(known), 3))
+    if known:
+        for axes, rms in zip(figure.subplots(1, 2, sharey=True), (False, True), strict=True):
+            plot_models(choice, axes, rms=rms)
     return figure
+
+
+def plot_models(choice: ModelChoice, ax: Axes | None = None, *, rms: bool = False) -> Axes:
+    """BIC above the smallest, model by model, or the `rms` of adjusted and of left-out image points (px).
+
+    Behind each name stands how many interior parameters are estimated. Raises InputError where no model could be
+    adjusted.
+    """
+    judged = [j for j in choice.judged if math.isfinite(j.bic)]
+    if not judged:
+        raise InputError("no model could be adjusted: there is nothing to be drawn")
+    ax, at = axes_or_new(ax), np.arange(len(judged))
+    if rms:
+        ax.plot([j.rms_px for j in judged], at, "o", color="0.5", label="adjusted")
+        if choice.n_left_out:
+            ax.plot([j.cv_rms_px for j in judged], at, "D", color="tab:blue", label="left out")
+        ax.set_xlabel("RMS of image points [px]", fontsize=9)
+        ax.legend(fontsize=8)
+        ax.grid(axis="x", lw=0.3)
+        ax.set_title("how well image points fit, and are predicted", loc="left", fontsize=10)
+    else:
+        above = np.array([j.bic for j in judged])
+        above -= above.min()
+        # From one on: the smallest is at zero, which a logarithmic axis does not have.
+        ax.barh(at, above, left=1.0, color="tab:blue")
+        for k, one in enumerate(above):
+            ax.text(1 + one, k, f" {one:.1f}" if one < _FAR else f" {one:,.0f}", va="center", fontsize=8)
+        ax.set_xscale("log")
+        ax.set_xlim(1.0, 4 * (1 + max(above.max(), _MARKS[1])))
+        marks = [mark for mark in _MARKS if mark <= max(above.max(), _MARKS[1])]
+        ax.set_xticks([1.0 + mark for mark in marks], [f"{mark:g}" for mark in marks], minor=False)
+        ax.minorticks_off()
+        ax.set_xlabel("BIC above the smallest", fontsize=9)
+        ax.set_title(f"what BIC prefers: {drawn(choice.by_bic)}", loc="left", fontsize=10)
+    ax.set_yticks(at, [drawn(f"{j.candidate.name} ({j.n_parameters})") for j in judged], fontsize=8)
+    ax.set_ylim(len(judged) - 0.5, -0.5)
+    return ax
 
 
 def write_model_choice(choice: ModelChoice, title: str, directory: Path, seconds: dict[str, float], made: Made) -> None:
@@ -136,7 +162,8 @@ def write_model_choice(choice: ModelChoice, title: str, directory: Path, seconds
     """
     began = time.perf_counter()
     table, parameters, verdict = choice_table(choice), parameter_table(choice), choice_verdict(choice)
-    picture = WholePicture.of(choice_figure(choice), "predicted residuals and information criteria by model")
+    alt = "BIC above the smallest, and RMS of image points adjusted and left out, model by model"
+    picture = WholePicture.of(choice_figure(choice), alt)
     parts = (
         Heading("Models"),
         rows_of(_shown(table)),

@@ -28,6 +28,7 @@ from jaxphoto.report.document_html import contents, html_of
 from jaxphoto.report.error_ellipses import ellipses_figure
 from jaxphoto.report.figures import curve_of
 from jaxphoto.report.findings import Verdict, as_sentence
+from jaxphoto.report.interactive import library
 from jaxphoto.report.made import PROVENANCE, Made, made_section
 from jaxphoto.report.maps import png_of
 from jaxphoto.report.object_points import points_section
@@ -60,7 +61,7 @@ Standard deviations are a posteriori (times &sigma;<sub>0</sub>). Correlations r
 {{ contents }}
 {% for heading, body in sections %}{{ heading }}
 {{ body }}
-{% endfor %}</body></html>
+{% endfor %}{{ library }}</body></html>
 """
 _SIGMA_MAP = (
     "Standard deviation of where the calibrated camera says that a point is seen, interior and exterior orientation "
@@ -106,6 +107,7 @@ def report_page(tables: Tables, verdict: Verdict, made: Made | None = None) -> s
             verdict=[html_of(e) for e in verdict_paragraphs(verdict)],
             contents=contents([heading for heading, body in sections]),
             sections=[(html_of(Heading(heading)), body) for heading, body in sections],
+            library=library([body for _, body in sections]),
         )
     )
 

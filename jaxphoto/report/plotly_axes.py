@@ -19,11 +19,15 @@ Trace = dict[str, Any]
 PX = 96 / 72
 # Steps of a colour scale: finer than an eye tells apart.
 _STEPS = 64
+# Width of a colour bar in pixels.
+_BAR = 14
+# Below, numbers at an axis have an exponent.
+_SMALL = 1e-3
 
 
 def say(artist: Any) -> None:
     """Warn that it has no twin."""
-    warnings.warn(f"{type(artist).__name__} has no twin in plotly: it is not shown", stacklevel=4)
+    warnings.warn(f"{type(artist).__name__} has no twin in plotly: it is not shown", stacklevel=5)
 
 
 def kinds_of(artist: Any) -> set[str]:
@@ -64,7 +68,11 @@ def colour_scale(artist: Any, kind: str) -> Trace:
     scale |= {f"{kind}min": low, f"{kind}max": high, "showscale": artist.colorbar is not None}
     if artist.colorbar is not None:
         bar = artist.colorbar.ax
-        scale["colorbar"] = {"title": {"text": shown(bar.get_ylabel() or bar.get_xlabel()), "side": "right"}}
+        scale["colorbar"] = {
+            "title": {"text": shown(bar.get_ylabel() or bar.get_xlabel()), "side": "right"},
+            "thickness": _BAR,
+            "outlinewidth": 0,
+        }
     return scale
 
 
@@ -87,19 +95,21 @@ def axis_of(axes: Axes, which: str) -> Trace:
     own = getattr(axes, f"{which}axis")
     logarithmic = own.get_scale() == "log"
     if own.get_scale() not in ("linear", "log"):
-        warnings.warn(f"an axis of kind {own.get_scale()} is shown as a linear one", stacklevel=3)
+        warnings.warn(f"an axis of kind {own.get_scale()} is shown as a linear one", stacklevel=4)
     found: Trace = {
         "title": {"text": shown(own.get_label_text())},
         "range": (np.log10(limits) if logarithmic else limits).tolist(),
         "type": "log" if logarithmic else "linear",
         "visible": bool(axes.axison and own.get_visible()),
+        # Coordinates with all of their digits: not 5.4M.
+        "exponentformat": "none" if np.abs(limits).max() > _SMALL else "power",
     }
     # What plotly writes by itself is as good; words, dates and percentages are matplotlib's.
     if not kinds_of(own.get_major_formatter()) & {"ScalarFormatter", "LogFormatter", "NullFormatter"}:
-        ticks = [
-            (float(v), shown(t.get_text())) for v, t in zip(own.get_ticklocs(), own.get_ticklabels(), strict=False)
-        ]
-        found |= {"tickvals": [v for v, _ in ticks], "ticktext": [t for _, t in ticks]}
+        places = own.get_ticklocs()
+        # Of panels that share an axis those without words have them, too.
+        words = own.get_major_formatter().format_ticks(places)
+        found |= {"tickvals": list(map(float, places)), "ticktext": list(map(shown, words))}
     return found
 
 

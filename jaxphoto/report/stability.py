@@ -14,14 +14,20 @@ from rich.table import Table
 from jaxphoto.camera import InteriorOrientation, Sensor
 from jaxphoto.report.document import Heading, Paragraph, rows_of
 from jaxphoto.report.made import Made, made_section, versions
-from jaxphoto.report.plots import new_figure
+from jaxphoto.report.maps import outline
+from jaxphoto.report.plots import axes_or_new, new_figure
 from jaxphoto.report.results import write_summary
 from jaxphoto.report.study_page import WholePicture, study_page
 from jaxphoto.stability import ALIGNED, Analysis, Method
 from jaxphoto.writing import whole_folder
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+
+# The largest offset has the colour of the middle of the scale, or a little more.
+_LIGHT = 1.7
 
 
 class Compared(NamedTuple):
@@ -72,23 +78,30 @@ def offsets_table(analysis: Analysis) -> pd.DataFrame:
 
 
 def offsets_figure(analysis: Analysis, sensor: Sensor) -> Figure:
-    """The map of RMSE_offset: size of the offsets as colour, the offsets as arrows, over the format."""
+    """The map of RMSE_offset, as `plot_ray_offsets` draws it."""
+    figure = new_figure(7.2, 5.4)
+    plot_ray_offsets(analysis, sensor, figure.subplots())
+    return figure
+
+
+def plot_ray_offsets(analysis: Analysis, sensor: Sensor, ax: Axes | None = None) -> Axes:
+    """Offsets of corresponding rays over the format of a camera (um): their size as colour, themselves as arrows."""
+    ax = axes_or_new(ax)
     points, v = np.asarray(analysis.offsets.points), 1e3 * np.asarray(analysis.offsets.offsets)
     size = np.linalg.norm(v, axis=1)
-    figure = new_figure(7.2, 5.4)
-    axes = figure.subplots()
     if size.max() > 0:
-        shown = axes.tricontourf(points[:, 0], points[:, 1], size, levels=12, cmap="viridis")
-        figure.colorbar(shown, ax=axes, label="offset of corresponding rays [um]", shrink=0.85)
-    arrows = axes.quiver(*points.T, *v.T, angles="xy", color="white", width=0.002)
+        # Light colours, on which dark arrows are seen.
+        shown = ax.tricontourf(
+            points[:, 0], points[:, 1], size, levels=12, cmap="YlGnBu", vmin=0.0, vmax=_LIGHT * size.max()
+        )
+        ax.figure.colorbar(shown, ax=ax, label="offset of corresponding rays [µm]", shrink=0.85)
+    arrows = ax.quiver(*points.T, *v.T, angles="xy", color="0.15", width=0.0025)
     key = float(f"{max(size.mean(), 1e-12):.0e}")
-    axes.quiverkey(arrows, 0.9, 1.03, key, f"{key:g} um", labelpos="E", color="0.2")
-    w, h = sensor.width_mm / 2, sensor.height_mm / 2
-    axes.plot([-w, w, w, -w, -w], [-h, -h, h, h, -h], color="0.4", lw=0.8)
+    ax.quiverkey(arrows, 0.86, 1.03, key, f"{key:g} µm", labelpos="E")
+    outline(ax, sensor)
     rmse = 1e3 * float(analysis.offsets.rmse_mm)
-    axes.set_title(f"{analysis.method}: RMSE_offset {rmse:.3g} um", loc="left")
-    axes.set(xlabel="x [mm]", ylabel="y [mm]", aspect="equal")
-    return figure
+    ax.set_title(f"{analysis.method}: RMSE_offset {rmse:.3g} µm", loc="left", fontsize=10)
+    return ax
 
 
 def print_stability(
@@ -155,7 +168,8 @@ def write_stability(
         *made_section(made),
     ]
     colour = "green" if chosen.similar(noise_mm) else "amber"
-    said = [f"Bundles {ALIGNED[method]} ({method}): {chosen.verdict(noise_mm)}"]
+    # A terminal may not have the letter.
+    said = [f"Bundles {ALIGNED[method]} ({method}): {chosen.verdict(noise_mm)}".replace(" um", " µm")]
     with whole_folder(directory) as work:
         table.to_csv(work / "stability.csv", index=False)
         offsets_table(chosen).to_csv(work / "offsets.csv", index=False)

@@ -11,9 +11,10 @@ from urllib.parse import quote
 from jinja2 import Environment
 from markupsafe import Markup
 
-from jaxphoto.report.document import Element, Heading, Paragraph
-from jaxphoto.report.document_html import contents, html_of
+from jaxphoto.report.document import Element, Heading, Paragraph, Pictures
+from jaxphoto.report.document_html import contents, html_of, live_pictures
 from jaxphoto.report.findings import as_sentence
+from jaxphoto.report.interactive import library, live_figure
 from jaxphoto.report.maps import png_of, png_uri
 from jaxphoto.report.page_head import page_head
 
@@ -26,21 +27,22 @@ _PAGE = """{{ head }}<body>
 {% endfor %}{% for part in begun %}{{ part }}
 {% endfor %}{{ contents }}
 {% for part in parts %}{{ part }}
-{% endfor %}</body></html>
+{% endfor %}{{ library }}</body></html>
 """
 
 
 class WholePicture(NamedTuple):
-    """A picture of several panels, as wide as it is."""
+    """A picture of several panels, as wide as it is; those of a `figure` answer on the page."""
 
     png: bytes
     uri: str
     alt: str
+    figure: Figure | None = None
 
     @classmethod
     def of(cls, figure: Figure, alt: str) -> WholePicture:
         """A figure, for a page and a file beside it."""
-        return cls(*png_of(figure), alt)
+        return cls(*png_of(figure), alt, figure)
 
     @classmethod
     def read(cls, file: Path, alt: str) -> WholePicture:
@@ -76,6 +78,7 @@ def study_page(title: str, said: Sequence[str], parts: Iterable[StudyPart], colo
     # Sentences before the first heading, such as findings, belong to what stands first.
     begun = list(itertools.takewhile(lambda part: isinstance(part, Paragraph), shown))
     headings = [part.text for part in shown if isinstance(part, Heading)]
+    body = [_shown(part) for part in shown[len(begun) :]]
     return (
         Environment(autoescape=True)
         .from_string(_PAGE)
@@ -86,7 +89,8 @@ def study_page(title: str, said: Sequence[str], parts: Iterable[StudyPart], colo
             kind=Markup(' class="verdict {}"').format(colour) if colour else "",
             contents=contents(headings) if len(headings) > 1 else "",
             begun=[_shown(part) for part in begun],
-            parts=[_shown(part) for part in shown[len(begun) :]],
+            parts=body,
+            library=library(body),
         )
     )
 
@@ -97,7 +101,10 @@ def _shown(part: StudyPart) -> Markup:
     if isinstance(part, PageLink):
         return Markup('<p><a href="{}">{}</a></p>').format(quote(part.page), part.text)
     if isinstance(part, WholePicture):
-        return Markup('<div class="wide"><img alt="{}" src="{}"></div>').format(part.alt, part.uri)
+        still = Markup('<div class="wide"><img alt="{}" src="{}"></div>').format(part.alt, part.uri)
+        return still if part.figure is None else live_figure(still, [part.figure])
+    if isinstance(part, Pictures):
+        return live_pictures(part)
     if isinstance(part, PictureFile):
         return Markup('<div class="wide"><img loading="lazy" alt="{}" src="{}"></div>').format(
             part.alt, quote(part.file)

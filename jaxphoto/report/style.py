@@ -49,8 +49,13 @@ th button::after { content: "\\a0\\2195"; color: var(--grey); font-weight: norma
 .name { color: var(--link); text-decoration: underline dotted } .is-chosen > * { background: var(--chosen) !important }
 :focus-visible { outline: 2px solid var(--link); outline-offset: 1px }
 .filter { margin: .8rem 0 -.2rem; color: var(--grey); font-size: 13px }
-figure.block { margin: .5rem 0 1rem } .plot { height: min(36rem, 75vh) }
-.plot.flat { height: auto; aspect-ratio: 4 / 3; max-width: 44rem } [data-drawn] > img { display: none }
+figure.block, .twins { margin: .5rem 0 1rem } .plot { height: min(36rem, 75vh) }
+.plot.flat { height: auto; aspect-ratio: 4 / 3; max-width: 44rem } [data-drawn] > .still { display: none }
+.twins .plot { width: 100%; height: auto; min-height: 15rem } .twins .full { grid-column: 1 / -1; max-width: 52rem }
+.twins { --room: calc((100% - .8rem * (var(--across) - 1)) / var(--across)) }
+.twins > .pictures { grid-template-columns: repeat(auto-fit, minmax(max(min(23rem, 100%), var(--room)), 1fr)) }
+.twins > .pictures > :not(.full) { max-width: 34rem } figcaption { display: none; font-weight: 600; font-size: 14px }
+[data-drawn] > figcaption { display: block } .twins .title { margin: 0; font-size: 13px; font-weight: 600 }
 .chooser { display: flex; flex-wrap: wrap; gap: .3rem 1rem; align-items: baseline; font-size: 13px }
 .chooser select, .chooser input { max-width: 11rem }
 .good { color: var(--good) } .bad { color: var(--bad) }
@@ -70,8 +75,8 @@ h1 + .verdict { font-weight: 600 }
   table { font-size: 9px } th, td { padding: .15rem .35rem } th, td.text { overflow-wrap: anywhere }
   table:has(th:nth-child(9)) { font-size: 7.5px } table:has(th:nth-child(13)) { font-size: 6.5px }
   table:has(th:nth-child(9)) :is(th, td) { padding: .1rem .2rem } .wide { overflow: visible; max-height: none }
-  .filter, .chooser, .plot, figure.block p { display: none } th button::after { content: "" }
-  [data-drawn] > img { display: inline }
+  .filter, .chooser, .plot, .live-figure p, [data-drawn] > figcaption { display: none } th button::after { content: "" }
+  [data-drawn] > .still { display: revert }
   .name { color: inherit; text-decoration: none } .is-chosen > * { background: none !important }
   th:first-child, td:first-child { position: static }
   h1, h2, h3, nav { break-after: avoid } h2 + p, h3 + p { break-after: avoid }

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -30,6 +31,7 @@ from jaxphoto.report.plotly_axes import (
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure as Drawn
     from plotly.graph_objects import Figure
 
 _DASHES = {"-": "solid", "--": "dash", "-.": "dashdot", ":": "dot"}
@@ -37,13 +39,16 @@ _STEPPED = {"steps": "vh", "steps-pre": "vh", "steps-mid": "hvh", "steps-post": 
 _MARKERS = {
     "o": "circle", ".": "circle", "s": "square", "D": "diamond", "^": "triangle-up", "v": "triangle-down",
     "<": "triangle-left", ">": "triangle-right", "*": "star", "x": "x-thin", "+": "cross-thin",
+    "|": "line-ns", "_": "line-ew",
 }  # fmt: skip
 # Thin ones have no face: their line is what shows.
-_THIN = ("x-thin", "cross-thin")
+_THIN = ("x-thin", "cross-thin", "line-ns", "line-ew")
 _NONE = ("", " ", "None", "none", None)
 _INCHES_PX = 96
 # Size of a sign in space, over that of the same on paper.
 _BOLD = 0.6
+# Above what is drawn, for the key of its arrows, as a part of its height.
+_HEADROOM = 0.12
 
 
 def to_plotly(ax: Axes) -> Figure:
@@ -54,17 +59,30 @@ def to_plotly(ax: Axes) -> Figure:
     """
     if ax.name not in ("rectilinear", "3d"):
         raise InputError(f"axes are {ax.name}; twins in plotly are of flat ones and of those in space")
+    # Arrows and labels find their place when they are drawn.
+    ax.figure.canvas.figure.draw_without_rendering()
+    return _twin(ax)
+
+
+def twins_of(figure: Drawn) -> list[Figure]:
+    """The twins of all flat panels of a figure of matplotlib that show something; colour bars come along."""
+    figure.draw_without_rendering()
+    artists = (artist for ax in figure.axes for artist in (*ax.images, *ax.collections))
+    bars = {artist.colorbar.ax for artist in artists if artist.colorbar is not None}
+    return [_twin(ax) for ax in figure.axes if ax not in bars and ax.get_visible() and ax.has_data()]
+
+
+def _twin(ax: Axes) -> Figure:
     # Here, because importing plotly takes half a second that most uses of jaxphoto need not wait for.
     from plotly.graph_objects import Figure
 
-    # Arrows and labels find their place when they are drawn.
-    ax.figure.canvas.figure.draw_without_rendering()
     width, height = _size_px(ax)
     layout: dict[str, Any] = {
         "title": {"text": shown(" ".join(filter(None, (ax.get_title(loc) for loc in ("left", "center", "right")))))},
         "width": round(width),
         "height": round(height),
-        "showlegend": ax.get_legend() is not None,
+        "showlegend": ax.get_legend() is not None or bool(ax.figure.legends),
+        "barmode": "overlay",
         "template": "simple_white",
     }
     if hasattr(ax, "get_zlim"):
@@ -77,7 +95,11 @@ def to_plotly(ax: Axes) -> Figure:
     if ax.get_aspect() != "auto":
         layout["yaxis"] |= {"scaleanchor": "x", "scaleratio": float(ax.get_aspect()), "constrain": "domain"}
         layout["xaxis"] |= {"constrain": "domain"}
-    return Figure(data=list(_flat(ax)), layout=layout)
+    traces = list(_flat(ax))
+    if any("QuiverKey" in kinds_of(artist) for artist in ax.artists):
+        low, high = layout["yaxis"]["range"]
+        layout["yaxis"]["range"] = [low, high + _HEADROOM * (high - low)]
+    return Figure(data=traces, layout=layout)
 
 
 def _size_px(axes: Axes) -> tuple[float, float]:
@@ -92,6 +114,8 @@ def _size_px(axes: Axes) -> tuple[float, float]:
 
 def _flat(axes: Axes) -> Iterator[Trace]:
     """What the axes hold, the lowest first."""
+    bars = {one[0]: one for one in axes.containers if "BarContainer" in kinds_of(one) and one}
+    together = {patch for container in bars.values() for patch in container}
     others = {axes.patch, axes.get_legend(), *axes.spines.values(), *(getattr(axes, f"{a}axis") for a in "xy")}
     artist: Any
     for artist in sorted(axes.get_children(), key=lambda a: a.get_zorder()):
@@ -100,6 +124,9 @@ def _flat(axes: Axes) -> Iterator[Trace]:
             continue
         if "Line2D" in kinds:
             yield from _line(artist, axes)
+        elif artist in together:
+            if artist in bars:
+                yield _bars(bars[artist])
         elif "AxesImage" in kinds and np.ndim(artist.get_array()) == 2:
             yield raster(artist)
         elif "QuiverKey" in kinds:
@@ -173,6 +200,21 @@ def _in_space(line: Any) -> Iterator[Trace]:
     yield {"type": "scatter3d", "x": x, "y": y, "z": z, **look, **_named(line)}
 
 
+def _bars(container: Any) -> Trace:
+    """Bars of one kind, upright or lying, which tell how long they are."""
+    box: Float[np.ndarray, "n 4"] = np.array([(*p.get_xy(), p.get_width(), p.get_height()) for p in container], float)
+    lying = container.orientation == "horizontal"
+    x, y, width, height = box.T
+    at, base, wide, long = (y, x, height, width) if lying else (x, y, width, height)
+    values = (long, at + wide / 2) if lying else (at + wide / 2, long)
+    colours, edges = zip(*((css(p.get_facecolor()), css(p.get_edgecolor())) for p in container), strict=True)
+    return {
+        "type": "bar", "orientation": "h" if lying else "v", "x": values[0], "y": values[1], "width": np.abs(wide),
+        "marker": {"color": colours, "line": {"color": edges, "width": container[0].get_linewidth() * PX}},
+        **({"base": base} if base.any() else {}), **_named(container[0]),
+    }  # fmt: skip
+
+
 # Areas and arrows ----------------------------------------------------------------------------------------------
 
 
@@ -204,16 +246,23 @@ def _collection(artist: Any, axes: Axes) -> Iterator[Trace]:
         marker["symbol"] = "circle" if len(faces) else "circle-open"
         if values is not None:
             marker |= {"color": np.ma.filled(values, np.nan), **colour_scale(artist, "c")}
+            # What is pale has an edge.
+            marker |= {"line": {"color": css(edges[0]), "width": 1}} if len(edges) == 1 else {}
         yield {"type": "scatter", "mode": "markers", "x": at[:, 0], "y": at[:, 1], "marker": marker, **_named(artist)}
         return
     width = float(np.max(artist.get_linewidth(), initial=0.0))
     together: dict[tuple, list] = defaultdict(list)
+    filled = "ContourSet" in kinds and artist.filled
+    bands = [f"{a:.3g} to {b:.3g}" for a, b in pairwise(artist.levels)] if filled else []
+    words: dict[tuple, str] = {}
     for k, path in enumerate(_paths(artist)):
         face, edge = (tuple(c[k % len(c)]) if len(c) else (0.0, 0.0, 0.0, 0.0) for c in (faces, edges))
         together[face, edge].append(path)
+        words |= {(face, edge): bands[k]} if k < len(bands) else {}
     name = _named(artist)
     for (face, edge), paths in together.items():
-        yield _area(paths, face, edge, axes, width) | name
+        band = {"hoverinfo": "text", "hoveron": "fills", "text": words[face, edge]} if words else {}
+        yield _area(paths, face, edge, axes, width) | name | band
         name = {"showlegend": False}
     if "Quiver" in kinds:
         told = np.stack([np.ma.filled(v, np.nan) for v in (artist.U, artist.V)], axis=1)
@@ -259,10 +308,10 @@ def _told(at: np.ndarray, told: np.ndarray, words: str) -> Trace:
 
 
 def _key(key: Any, axes: Axes) -> Trace:
-    """The arrow that tells the scale, at the top left of the picture, with its text."""
+    """The arrow that tells the scale, above the picture on the left, with its text."""
     arrow = next(_paths(key.vector))
     tail = np.zeros(2) if not len(arrow.vertices) else arrow.vertices[:-1].min(axis=0)
-    corner = axes.transAxes.transform((0.03, 0.95))
+    corner = axes.transAxes.transform((0.03, 1.0 + _HEADROOM / 2))
     colour = key.vector.get_facecolor()[0]
     area = _area([_moved(arrow, np.eye(2), corner - tail)], tuple(colour), tuple(colour), axes)
     end = float(np.nanmax(area["x"]))
@@ -273,4 +322,5 @@ def _key(key: Any, axes: Axes) -> Trace:
         "y": np.append(area["y"], [np.nan, area["y"][0]]),
         "text": [""] * (len(area["x"]) + 1) + [f"  {words}"],
         "textposition": "middle right",
+        "textfont": {"color": css(colour)},
     }

@@ -126,7 +126,9 @@ def test_ellipses_bands_and_bars_keep_their_size(axes):
     axes.bar([5], [7.5], width=1.0)
     found = [xy(t) for t in traces(axes) if t["fill"] == "toself"]
     boxes = sorted(np.round(np.concatenate([np.nanmin(p, 0), np.nanmax(p, 0)]), 2).tolist() for p in found)
-    assert boxes == [[-9, 5, -5, 7], [-1, -4, 3, -2], [4.5, 0, 5.5, 7.5]]
+    assert boxes == [[-9, 5, -5, 7], [-1, -4, 3, -2]]
+    (bar,) = (t for t in traces(axes) if t["type"] == "bar")
+    assert (bar["x"], bar["y"], bar["width"], bar["base"]) == ((5.0,), (7.5,), (1.0,), None)
 
 
 def test_scattered_markers_bring_their_colours_and_the_bar(axes):

@@ -89,3 +89,7 @@ def plot_time_line(
     ax = axes_or_new(ax)
     draw_in_time(ax, line, shown[what])
     return ax
+
+
+# All that is defined here, for the rooms that show it.
+__all__ = [name for name in dir() if name.startswith("plot_")]

@@ -22,6 +22,7 @@ from jaxphoto.report.flight.residuals import residuals_section
 from jaxphoto.report.flight.source import FlightSource
 from jaxphoto.report.flight.surveyed import surveyed_elements, surveyed_section
 from jaxphoto.report.flight.time_line import time_section
+from jaxphoto.report.interactive import library
 from jaxphoto.report.object_points import points_section
 from jaxphoto.report.orientation import orientation_sentences
 from jaxphoto.report.page_head import page_head
@@ -37,7 +38,7 @@ _PAGE = """{{ head(title) }}<body>
 <ul>{% for f in folders %}<li><a href="{{ f }}/report.html">{{ f }}/report.html</a>: all tables and pictures of the
 adjustment{% if folders|length > 1 %} of part {{ loop.index }}{% endif %}</li>{% endfor %}
 <li><a href="images.csv">images.csv</a>, <a href="summary.json">summary.json</a>: this page in numbers</li></ul>
-</body></html>
+{{ library }}</body></html>
 """
 
 
@@ -55,6 +56,7 @@ def flight_page(
     """
     elements = list(_elements(reports, left_out, spoilt, source))
     headings = [e.text for e in elements if isinstance(e, Heading)]
+    body = [html_of(e) for e in elements]
     return (
         Environment(autoescape=True)
         .from_string(_PAGE)
@@ -63,7 +65,8 @@ def flight_page(
             title=f"Flight report: {reports[0].part.adjusted.block.title}",
             verdict=[html_of(e) for e in verdict_paragraphs(verdict)],
             contents=contents([*headings, "Files"]),
-            elements=[html_of(e) for e in elements],
+            elements=body,
+            library=library(body),
             folders=folders,
         )
     )
