@@ -21,7 +21,7 @@ def draw_format_map(
 ) -> None:
     """A map over the format, coloured between its cells; `name` says what is shown, with its unit."""
     if np.ptp(values) > 0:
-        coloured = axes.tricontourf(*cells_mm.T, values, levels=12, cmap="viridis")
+        coloured = axes.tricontourf(cells_mm[:, 0], cells_mm[:, 1], values, levels=12, cmap="viridis")
         axes.figure.colorbar(coloured, ax=axes, shrink=0.85, label=name)
     outline(axes, sensor)
     axes.set_title(name, loc="left", fontsize=10)

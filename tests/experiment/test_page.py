@@ -126,7 +126,7 @@ def test_pictures_take_and_return_axes_and_have_twins():
 def test_the_page_is_made_of_the_parts_of_all_pages():
     run = Run(Experiment("A paper", {}, {}), pd.DataFrame({"layout": [0, 1]}), {"first": Tables(adjusted("cross"))}, ())
     page = experiment_page(run, COMPARISON)
-    assert '<p class="verdict amber">2 of 3 printed values' in page and '<figure class="block">' in page
+    assert '<p class="verdict amber">2 of 3 printed values' in page and '<figure class="block live-figure">' in page
     assert [f'<a href="#{name}">' in page for name in ("table-2-iops", "own", "block-of-the-first-layout")] == [
         True
     ] * 3

@@ -46,7 +46,7 @@ def axes():
 def live(page: str) -> list[list[dict]]:
     """Of each figure of a page what its panels are drawn from."""
     packed = re.findall(
-        r'<figure class="twins live-figure">.*?<script type="text/plain">([^<]*)</script>', page, re.DOTALL
+        r'<figure class="twins live-figure"[^>]*>.*?<script type="text/plain">([^<]*)</script>', page, re.DOTALL
     )
     return [json.loads(gzip.decompress(base64.b64decode(one))) for one in packed]
 

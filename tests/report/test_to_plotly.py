@@ -124,7 +124,7 @@ def test_ellipses_bands_and_bars_keep_their_size(axes):
     )
     axes.fill_between([-9, -5], [5, 5], [6, 7], color=(1, 0, 0, 0.25))
     axes.bar([5], [7.5], width=1.0)
-    found = [xy(t) for t in traces(axes) if t["fill"] == "toself"]
+    found = [xy(t) for t in traces(axes) if t["type"] == "scatter" and t["fill"] == "toself"]
     boxes = sorted(np.round(np.concatenate([np.nanmin(p, 0), np.nanmax(p, 0)]), 2).tolist() for p in found)
     assert boxes == [[-9, 5, -5, 7], [-1, -4, 3, -2]]
     (bar,) = (t for t in traces(axes) if t["type"] == "bar")
