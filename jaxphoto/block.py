@@ -81,8 +81,6 @@ class Block(eqx.Module):
     ("" for none), such as intervals of time."""
     converted_from: str = eqx.field(static=True, default="")
     """The format and the file of another program that it is from, in words; "" for none."""
-    assumed_pixels: tuple[str, ...] = eqx.field(static=True, default=())
-    """Cameras whose pixel was taken for a micrometre, as no file told its size: all their millimetres scale with it."""
     breaklines: tuple[str, ...] = eqx.field(static=True, default=())
     """Points that were measured where two smooth faces meet, such as on the ridge of a roof."""
 

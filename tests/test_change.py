@@ -64,6 +64,8 @@ def test_the_command_compares_two_results(tmp_path, monkeypatch, capsys):
     parameters, cells = pd.read_csv(out / "parameters.csv"), pd.read_csv(out / "cells.csv")
     own = parameters.set_index("parameter").loc[list(SIGMAS), "ratio"]
     np.testing.assert_allclose(own, difference / np.sqrt(2), rtol=1e-9)
+    units = dict(zip(parameters["parameter"], parameters["unit"], strict=True))
+    assert (units["c_mm"], units["k1"], units["k2"]) == ("mm", "1/mm^2", "1/mm^4")
     assert len(cells) == 165
     summary = json.loads((out / "summary.json").read_text())
     assert summary["chi_square"] == pytest.approx(chi_square)

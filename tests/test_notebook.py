@@ -283,6 +283,9 @@ def test_an_adjustment_is_set_beside_the_truth():
     c = tables.interior.set_index("parameter").loc["c_mm"]
     assert found.loc["interior[one].c_mm", "ratio"] == pytest.approx((c.value - 35.1) / c.sigma)
     assert np.abs(found["ratio"]).max() < 5
+    assert {label.rpartition(".")[2]: unit for label, unit in found["unit"].items()} == {
+        "c_mm": "mm", **dict.fromkeys(XYZ, "m"), **dict.fromkeys(ANGLES, "deg"),
+    }  # fmt: skip
     spread = report.recovery_spread(tables.recovery).set_index("group")
     assert list(spread.index) == ["interior[one]", *(f"exterior {name}" for name in (*XYZ, *ANGLES))]
     assert spread.loc["exterior X_m", "n"] == 10

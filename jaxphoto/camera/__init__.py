@@ -27,7 +27,7 @@ from jaxphoto.camera.principal_points import (
 from jaxphoto.camera.projection import *  # noqa: F403
 from jaxphoto.camera.projection import PROJECTIONS, AbstractProjection
 from jaxphoto.camera.rolling_shutter import ImageMotion, RollingShutter, RowMotion
-from jaxphoto.camera.sensor import Sensor
+from jaxphoto.camera.sensor import Sensor, sensor_keys
 from jaxphoto.camera.strip_camera import StripCamera
 
 __all__ = [
@@ -37,5 +37,5 @@ __all__ = [
     "StripCamera", "ThermalRates",
     "constant_names", "conversion_error", "decentring_from_symmetry", "empty_camera", "exact", "get_parameter",
     "invert", "model_keys", "parameter_names", "parameter_unit", "principal_points", "rebalance",
-    "rebalance_covariance", "set_parameter", "symmetry_from_decentring", "with_sign",
+    "rebalance_covariance", "sensor_keys", "set_parameter", "symmetry_from_decentring", "with_sign",
 ]  # fmt: skip

@@ -1,5 +1,7 @@
 """The sensor: its format in pixels and millimetres, and image coordinates in either."""
 
+from typing import Any
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
@@ -14,6 +16,8 @@ class Sensor(eqx.Module):
     width_px: int
     height_px: int
     pixel_mm: float
+    pixel_assumed: bool = eqx.field(static=True, default=False)
+    """Whether the size of a pixel was chosen, as no file tells it: all millimetres of the camera scale with it."""
 
     def __check_init__(self) -> None:
         if self.width_px <= 0 or self.height_px <= 0 or not self.pixel_mm > 0:
@@ -24,7 +28,9 @@ class Sensor(eqx.Module):
 
     def _repr_html_(self) -> str:
         format_mm = f"{self.width_mm:.6g} x {self.height_mm:.6g} mm"
-        pixels = f"{self.width_px} x {self.height_px} of {1e3 * self.pixel_mm:.6g} µm"
+        pixels = (
+            f"{self.width_px} x {self.height_px} of {1e3 * self.pixel_mm:.6g} µm{' (assumed)' * self.pixel_assumed}"
+        )
         return html_of("Sensor", {"pixels": pixels, "format": format_mm})
 
     @property
@@ -49,3 +55,9 @@ class Sensor(eqx.Module):
         """(column, row) in pixels from millimetres: the inverse of `mm_from_px`."""
         centre = np.array([self.width_px, self.height_px]) / 2
         return np.asarray(xy_mm) / np.array([self.pixel_mm, -self.pixel_mm]) + centre
+
+
+def sensor_keys(sensor: Sensor) -> dict[str, Any]:
+    """The keys by which files tell a sensor; that its pixel is not assumed goes without saying."""
+    size = {"width_px": sensor.width_px, "height_px": sensor.height_px, "pixel_mm": sensor.pixel_mm}
+    return size | ({"pixel_assumed": True} if sensor.pixel_assumed else {})

@@ -56,7 +56,8 @@ def pinhole(sensor: Sensor, interior: InteriorOrientation, keep: Keep = "crop") 
         )
     x_p, y_p = -(low + high) / 2
     return Pinhole(
-        Sensor(int(size[0]), int(size[1]), sensor.pixel_mm), InteriorOrientation(interior.c, x_p, y_p, Brown())
+        Sensor(int(size[0]), int(size[1]), sensor.pixel_mm, sensor.pixel_assumed),
+        InteriorOrientation(interior.c, x_p, y_p, Brown()),
     )
 
 

@@ -90,7 +90,7 @@ def convert_command(
             files = photograph_files(given.images, photographs or (), source if result else None)
             status.update(f"writing {out}")
             _say(output, export(AdjustedPhotographs.of_block(given, values, files), out, to), said)
-    assumed = given.assumed_pixels
+    assumed = [name for name, sensor in given.sensors.items() if sensor.pixel_assumed]
     if to == "block" and not result and assumed:
         whose = f"camera {assumed[0]}" if len(assumed) == 1 else f"{len(assumed)} cameras"
         why = "as is assumed where files know pixels alone: c in um is f in px"

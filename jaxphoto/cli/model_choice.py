@@ -42,7 +42,7 @@ def models_command(
         choice = model_choice(read, named, k=folds, seed=seed, report=status.update)
         seconds["adjust"] = time.perf_counter() - began - seconds["read"]
         status.update(f"writing {out}")
-        write_model_choice(choice, read.title, out, seconds, made)
+        write_model_choice(choice, read, out, seconds, made)
     print_model_choice(choice, output.screen)
     output.wrote(out, f"results in {out} (open report.html)")
     if not choice.by_bic:

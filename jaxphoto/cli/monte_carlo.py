@@ -83,17 +83,17 @@ def monte_carlo_command(
         study.draw(lambda done: left("draws", done, draws))
         status.update(f"writing {out}")
         summary, table = study.write()
-        write_draws_page(summary, table, out, made)
+        write_draws_page(summary, table, read.sensors, out, made)
     output.screen.print(
         f"{summary['draws']} draws, {summary['converged']} converged, {summary['fallbacks']} by a full adjustment; "
         f"{summary['draws_per_second']:.0f} draws a second",
     )
-    heads = Column("quantity", overflow="fold"), "nominal", "mean", "sd", "predicted sigma", "ratio"
+    heads = Column("quantity", overflow="fold"), "unit", "nominal", "mean", "sd", "predicted sigma", "ratio"
     shown = Table(*heads, title="estimates over the draws")
     shown_numbers = ["nominal", "mean", "sd", "predicted_sigma", "ratio"]
-    for name, *numbers in table[["quantity", *shown_numbers]].itertuples(index=False):
+    for name, unit, *numbers in table[["quantity", "unit", *shown_numbers]].itertuples(index=False):
         if not str(name).startswith(("bias.", *LONG)):
-            shown.add_row(str(name), *(f"{float(v):.5g}" for v in numbers))
+            shown.add_row(str(name), str(unit), *(f"{float(v):.5g}" for v in numbers))
     output.screen.print(shown)
     output.wrote(out, f"results in {out} (open report.html)")
 

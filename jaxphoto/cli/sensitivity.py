@@ -55,7 +55,7 @@ def sensitivity_command(
     )
     for row in largest.head(_SHOWN).itertuples(index=False):
         output.screen.print(
-            f"  {row.estimate}: {row.exact:.3g}, {row.over_sigma:.2f}, {row.first_order:.3g} "
+            f"  {row.estimate}: {row.exact:.3g} {row.estimate_unit}, {row.over_sigma:.2f}, {row.first_order:.3g} "
             f"(stations of {row.unit} in {row.axis})"
         )
     output.wrote(out, f"results in {out} (open report.html)")

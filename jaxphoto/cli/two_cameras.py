@@ -30,7 +30,7 @@ def read_two(
 
 def compared(letter: str, path: Path, file: CameraFile) -> Compared:
     """What tables and pictures call a camera file."""
-    return Compared(f"{letter} ({path})", file.interior, file.covariance is not None)
+    return Compared(f"{letter} ({path})", file.interior, file.covariance is not None, file.sensor)
 
 
 def check_two_calibrations(a: CameraFile, b: CameraFile, first: Path, second: Path) -> None:

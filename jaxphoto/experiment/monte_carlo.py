@@ -40,7 +40,7 @@ _FIRST_DRAWS, _SECONDS, _TIMES = 100, 10.0, 20
 _AT_ONCE = 200
 # What a summary and its table have at least.
 _TOLD = ("draws", "converged", "fallbacks", "draws_per_second")
-_COLUMNS = {"quantity", "nominal", "mean", "sd", "predicted_sigma", "ratio"}
+_COLUMNS = {"quantity", "unit", "nominal", "mean", "sd", "predicted_sigma", "ratio"}
 _OF_DRAWS = ("draw", "converged", "iterations", "fallback")
 # Errors of which the effect of each by itself is worth its time, and errors of a picture.
 _PREDICTED, _PICTURED = 20_000, 60
@@ -123,11 +123,12 @@ class MonteCarlo:
         directory = self.folder.directory
         try:
             summary, table = read_json(directory / "summary.json"), pd.read_csv(directory / "summary.csv")
+            table = table.fillna({"unit": ""})
         except (ValueError, OSError):
             return None
         # Not what was summed up on the way.
         numbers = all(isinstance(summary.get(key), int | float) for key in _TOLD)
-        columns = {"quantity", *table.select_dtypes("number").columns} & set(table.columns)
+        columns = {"quantity", "unit", *table.select_dtypes("number").columns} & set(table.columns)
         whole = numbers and summary["draws"] == self.folder.draws and columns >= _COLUMNS
         return (summary, table) if whole else None
 
@@ -148,7 +149,7 @@ class MonteCarlo:
         for first in range(0, len(names), _AT_ONCE):
             some = folder.read(names[first : first + _AT_ONCE])
             found |= {name: moments(values[good]) for name, values in some.items()}
-        table = summary_table(found, nominal, predicted)
+        table = summary_table(found, nominal, predicted, self.run.adjusted.unknowns.interior)
         with whole_file(directory / "summary.csv") as work:
             table.to_csv(work, index=False)
         if len(effects):

@@ -234,7 +234,8 @@ def _cameras(names: np.ndarray, problem: _Problem) -> dict[str, dict[str, Any]]:
     sizes = (2 * np.ceil(np.minimum(half, _LARGEST_HALF))).astype(int).tolist()
     return {
         name: {
-            "width_px": width, "height_px": height, "pixel_mm": _PIXEL_MM, "distortion": "bundler_radial",
+            "width_px": width, "height_px": height, "pixel_mm": _PIXEL_MM, "pixel_assumed": True,
+            "distortion": "bundler_radial",
             "interior": {"c_mm": f * _PIXEL_MM, "k1": k1, "k2": k2}, "unknowns": dict.fromkeys(_FREE, "free"),
         }
         for name, (width, height), (f, k1, k2) in zip(names, sizes, problem.cameras[:, _F:].tolist(), strict=True)

@@ -11,7 +11,6 @@ from jaxphoto.io import aicon, bal, colmap, dbat, photomodeler
 from jaxphoto.io.block_folder import BlockTables, assemble, write_block
 from jaxphoto.io.block_folder.block_reader import read_folder
 from jaxphoto.io.block_folder.table_layout import TOML
-from jaxphoto.io.cameras.camera_file import ASSUMED_PIXEL_MM
 from jaxphoto.io.cameras.camera_reader import is_camera_file
 from jaxphoto.io.control_files.reader import is_control_file
 from jaxphoto.io.reconstructions import (
@@ -70,7 +69,7 @@ FORMATS = {
 def read_source(source: str | Path, format: str | None = None, *, stations: bool = True) -> Block:
     """The block in a file or folder of any format of `FORMATS`, recognised unless `format` names it.
 
-    Of another program it says what it was `converted_from`, and which cameras have assumed pixels.
+    Of another program it says what it was `converted_from`.
 
     `stations` False leaves observed camera positions out. Raises InputError for an unknown format, and what
     `jaxphoto.io.read_block` raises.
@@ -86,9 +85,8 @@ def read_source(source: str | Path, format: str | None = None, *, stations: bool
     block = assemble(tables)
     if name == "block":
         return block
-    assumed = tuple(camera for camera, sensor in block.sensors.items() if sensor.pixel_mm == ASSUMED_PIXEL_MM)
     place = "/".join(source.resolve().parts[-2:])
-    return dataclasses.replace(block, converted_from=f"{name}: {place}", assumed_pixels=assumed)
+    return dataclasses.replace(block, converted_from=f"{name}: {place}")
 
 
 def convert(source: str | Path, folder: str | Path, format: str | None = None, *, stations: bool = True) -> Block:

@@ -140,8 +140,8 @@ def sensor_and_interior(
         c = _USUAL_C * longer * pixel
         c_origin = f"c a guess, {_USUAL_C:g} times the longer side: EXIF does not tell it"
         rounding = _GUESSED
+    sensor = Sensor(first.width_px, first.height_px, pixel, pixel_assumed=not pixel_origin)
     pixel_origin = pixel_origin or "pixel size nominal: EXIF does not tell it, and only c in pixels matters"
-    sensor = Sensor(first.width_px, first.height_px, pixel)
     sentence = f"c = {c:.6g} mm ({c / pixel:.5g} pixels of {pixel:.4g} mm): {c_origin}; {pixel_origin}."
     return CameraStart(sensor, InteriorOrientation(c), sentence, rounding)
 

@@ -22,6 +22,7 @@ from jaxphoto.report.document import Document, DocumentPicture, Element, Heading
 from jaxphoto.report.findings import as_sentence, symbol
 from jaxphoto.report.made import option_word
 from jaxphoto.report.rolling_shutter import readout_of
+from jaxphoto.report.source_words import assumed_pixels
 from jaxphoto.stability import LEVEL, NORMAL_95, Method, change, distortion_curve, format_sigma, image_grid
 from jaxphoto.statistics.correlation import high_pairs
 from jaxphoto.writing.inputs import digest_of_all
@@ -86,6 +87,7 @@ def _camera(given: Certified) -> Iterator[Element]:
         ("pixel", f"{1e3 * s.pixel_mm:.5g} µm (scale of all lengths below; not calibrated)"),
         ("called in the block", given.camera),
     )
+    yield from assumed_pixels({given.camera: s})
 
 
 def _flight(given: Certified) -> Iterator[Element]:
@@ -254,11 +256,11 @@ def _stability(given: Certified) -> Iterator[Element]:
     )  # fmt: skip
     rows = tuple(
         (p.parameter, with_sigma(p.first, p.sigma), with_sigma(p.second, p.sigma), f"{p.difference:.2g}",
-         f"{p.sigma:.2g}", f"{p.p_value:.2g}")
+         f"{p.sigma:.2g}", p.unit, f"{p.p_value:.2g}")
         for p in found.parameters if p.sigma > 0
     )  # fmt: skip
     if rows:
-        yield Rows(("parameter", "last", "this", "difference", "sigma of it", "p"), rows)
+        yield Rows(("parameter", "last", "this", "difference", "sigma of it", "unit", "p"), rows)
 
 
 def _accuracy(given: Certified) -> Iterator[Element]:

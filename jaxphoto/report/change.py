@@ -17,7 +17,7 @@ from jaxphoto.report.made import Made, made_section, versions
 from jaxphoto.report.maps import draw_format_map
 from jaxphoto.report.plots import axes_or_new, new_figure
 from jaxphoto.report.results import write_summary
-from jaxphoto.report.stability import Compared, missing_covariances
+from jaxphoto.report.stability import Compared, about_sets
 from jaxphoto.report.study_page import WholePicture, study_page
 from jaxphoto.stability import ALIGNED, LEVEL, Change
 from jaxphoto.stability.analysis import change_meaning
@@ -29,8 +29,9 @@ if TYPE_CHECKING:
 
 
 def parameter_changes(found: Change) -> pd.DataFrame:
-    """parameter, first, second, difference (second minus first), sigma (of it), ratio, p_value; none of two models."""
-    columns = ["parameter", "first", "second", "difference", "sigma", "p_value"]
+    """parameter, first, second, difference (second minus first), sigma (of it), ratio, p_value, unit; none of two
+    models."""
+    columns = ["parameter", "first", "second", "difference", "sigma", "p_value", "unit"]
     table = pd.DataFrame(found.parameters, columns=columns)
     known = table["sigma"] > 0
     table.insert(5, "ratio", table["difference"].where(known) / table["sigma"].where(known))
@@ -100,15 +101,15 @@ def plot_change(found: Change, sensor: Sensor, ax: Axes | None = None, *, over_u
 
 def print_change(found: Change, sets: tuple[Compared, Compared], sensor: Sensor, console: Console) -> None:
     """Both calibrations, the table of parameters and the sentences."""
-    for line in (*map(str, sets), missing_covariances(sets)):
+    for line in about_sets(sets):
         console.print(line, soft_wrap=True)
     if found.parameters:
-        table = Table("parameter", "A", "B", "B - A", "sigma", "p")
+        table = Table("parameter", "A", "B", "B - A", "sigma", "unit", "p")
         for one in found.parameters:
             if one.sigma > 0 or one.first or one.second:
                 p = f"{one.p_value:.2g}" if one.sigma > 0 else "held"
                 values = (f"{one.first:.8g}", f"{one.second:.8g}", f"{one.difference:.3g}", f"{one.sigma:.3g}")
-                table.add_row(one.parameter, *values, p)
+                table.add_row(one.parameter, *values, one.unit, p)
         console.print(table)
     for sentence in change_verdict(found, sensor):
         console.print(sentence, soft_wrap=True)
@@ -122,8 +123,13 @@ def write_change(found: Change, sets: tuple[Compared, Compared], sensor: Sensor,
     parameters, verdict = parameter_changes(found), change_verdict(found, sensor)
     alt = "maps over the format of the camera: offsets of rays (px), and offsets over what is usual"
     picture = WholePicture.of(change_figure(found, sensor), alt)
-    about = [str(sets[0]), str(sets[1]), missing_covariances(sets)]
-    parts = [*map(Paragraph, about), picture, Heading("Parameters"), rows_of(parameters), *made_section(made)]
+    parts = [
+        *map(Paragraph, about_sets(sets)),
+        picture,
+        Heading("Parameters"),
+        rows_of(parameters),
+        *made_section(made),
+    ]
     with whole_folder(directory) as work:
         parameters.to_csv(work / "parameters.csv", index=False)
         change_cells(found, sensor).to_csv(work / "cells.csv", index=False)

@@ -10,13 +10,16 @@ import numpy as np
 import pandas as pd
 
 from jaxphoto.adjustment import Adjustment
+from jaxphoto.camera import InteriorOrientation, Sensor
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import TrajectoryKnot
 from jaxphoto.observations import AXES
 from jaxphoto.report.document import Heading, Paragraph, rows_of
 from jaxphoto.report.made import Made, made_section
 from jaxphoto.report.plots import axes_or_new, drawn, new_figure
+from jaxphoto.report.source_words import assumed_pixels
 from jaxphoto.report.study_page import StudyPart, WholePicture, study_page
+from jaxphoto.report.units import column_unit
 from jaxphoto.sensitivity import Draws
 from jaxphoto.writing import whole_file
 
@@ -114,14 +117,17 @@ def moments(values: np.ndarray) -> Moments:
 
 
 def summary_table(
-    found: Mapping[str, Moments], nominal: Mapping[str, float], predicted: Mapping[str, float]
+    found: Mapping[str, Moments],
+    nominal: Mapping[str, float],
+    predicted: Mapping[str, float],
+    cameras: Mapping[str, InteriorOrientation],
 ) -> pd.DataFrame:
-    """quantity, nominal, mean, sd, quantiles, predicted_sigma, ratio (sd over predicted)."""
+    """quantity, nominal, mean, sd, quantiles, predicted_sigma, ratio (sd over predicted), unit."""
     rows = [(name, nominal.get(name, np.nan), m.mean, m.sd, *m.quantiles) for name, m in found.items()]
     table = pd.DataFrame(rows, columns=["quantity", "nominal", "mean", "sd", *_QUANTILES])
     table["predicted_sigma"] = [predicted.get(name, np.nan) for name in found]
     table["ratio"] = table["sd"] / table["predicted_sigma"]
-    return table
+    return table.assign(unit=[column_unit(name, cameras) for name in found])
 
 
 def draws_figure(columns: Mapping[str, np.ndarray], summary: pd.DataFrame) -> Figure:
@@ -204,14 +210,16 @@ def _draw_effects(axes: Axes, effects: pd.DataFrame, summary: pd.DataFrame, quan
     axes.figure.colorbar(image, ax=axes, label="effect of one sigma / predicted sigma")
 
 
-def write_draws_page(summary: Mapping[str, Any], table: pd.DataFrame, directory: Path, made: Made) -> None:
+def write_draws_page(
+    summary: Mapping[str, Any], table: pd.DataFrame, sensors: Mapping[str, Sensor], directory: Path, made: Made
+) -> None:
     """report.html of the draws in `directory`, from the summary, its table and the pictures that are there."""
     few = ~table["quantity"].str.startswith(LONG)
     said = [
         f"{summary['draws']} draws, of which {summary['converged']} converged. {_ratios(table[few])}",
         "The predicted sigma is the effect of the errors to first order; the ratio says how far draws agree with it.",
     ]
-    parts: list[StudyPart] = []
+    parts: list[StudyPart] = [*assumed_pixels(sensors)]
     for name, (heading, said_of) in _PICTURES.items():
         if (file := directory / f"{name}.png").is_file():
             parts += [Heading(heading), Paragraph(said_of), WholePicture.read(file, f"{heading}: {said_of}")]

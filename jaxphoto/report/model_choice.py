@@ -12,12 +12,14 @@ import pandas as pd
 from rich.console import Console
 from rich.table import Table
 
+from jaxphoto.block import Block
 from jaxphoto.errors import InputError
 from jaxphoto.procedures.model_choice import ModelChoice
 from jaxphoto.report.document import Heading, rows_of
 from jaxphoto.report.made import Made, made_section, versions
 from jaxphoto.report.plots import axes_or_new, drawn, new_figure
 from jaxphoto.report.results import write_summary
+from jaxphoto.report.source_words import assumed_pixels
 from jaxphoto.report.study_page import WholePicture, study_page
 from jaxphoto.writing import whole_folder
 
@@ -83,13 +85,14 @@ def choice_table(choice: ModelChoice) -> pd.DataFrame:
 
 
 def parameter_table(choice: ModelChoice) -> pd.DataFrame:
-    """model, camera, parameter, value, sigma (a posteriori), ratio, p_value of every estimated interior parameter."""
+    """model, camera, parameter, value, sigma (a posteriori), unit, ratio, p_value of every estimated interior
+    parameter."""
     rows = [
-        (j.candidate.name, s.camera, s.parameter, s.value, s.sigma, s.ratio, s.p_value)
+        (j.candidate.name, s.camera, s.parameter, s.value, s.sigma, s.unit, s.ratio, s.p_value)
         for j in choice.judged
         for s in j.parameters
     ]
-    return pd.DataFrame(rows, columns=["model", "camera", "parameter", "value", "sigma", "ratio", "p_value"])
+    return pd.DataFrame(rows, columns=["model", "camera", "parameter", "value", "sigma", "unit", "ratio", "p_value"])
 
 
 def choice_verdict(choice: ModelChoice) -> list[str]:
@@ -155,7 +158,9 @@ def plot_models(choice: ModelChoice, ax: Axes | None = None, *, rms: bool = Fals
     return ax
 
 
-def write_model_choice(choice: ModelChoice, title: str, directory: Path, seconds: dict[str, float], made: Made) -> None:
+def write_model_choice(
+    choice: ModelChoice, block: Block, directory: Path, seconds: dict[str, float], made: Made
+) -> None:
     """models.csv, parameters.csv, models.png, report.html and summary.json, in `directory` only when all is written.
 
     Raises InputError where `directory` holds something that is not an earlier result.
@@ -164,7 +169,9 @@ def write_model_choice(choice: ModelChoice, title: str, directory: Path, seconds
     table, parameters, verdict = choice_table(choice), parameter_table(choice), choice_verdict(choice)
     alt = "BIC above the smallest, and RMS of image points adjusted and left out, model by model"
     picture = WholePicture.of(choice_figure(choice), alt)
+    title = block.title
     parts = (
+        *assumed_pixels(block.sensors),
         Heading("Models"),
         rows_of(_shown(table)),
         picture,

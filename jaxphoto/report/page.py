@@ -43,7 +43,7 @@ from jaxphoto.report.positional_accuracy import accuracy_sentences
 from jaxphoto.report.recovery import recovery_spread
 from jaxphoto.report.residual_plots import draw_residuals_by_radius, draw_station_residuals
 from jaxphoto.report.sigma_map import sigma_map_figure, sigma_map_words
-from jaxphoto.report.source_words import assumed_pixel_words, report_title
+from jaxphoto.report.source_words import assumed_pixel_words, assumed_pixels, report_title
 from jaxphoto.report.tables import Tables
 from jaxphoto.statistics import LEAST_CHECKED
 from jaxphoto.statistics.format_coverage import format_coverage
@@ -89,7 +89,7 @@ def report_page(tables: Tables, verdict: Verdict, made: Made | None = None) -> s
     if made:
         _, *body = made_section(made)
         if a.block.converted_from:
-            said = f"The block was converted from {a.block.converted_from}. {assumed_pixel_words(a.block)}"
+            said = f"The block was converted from {a.block.converted_from}. {assumed_pixel_words(a.block.sensors)}"
             body.append(Paragraph(said.strip()))
         sections.append((PROVENANCE, Markup("\n").join(map(html_of, body))))
     return (
@@ -155,7 +155,7 @@ def _interior(tables: Tables) -> list[Markup]:
     used = [c for c, corr in tables.correlations.items() if corr.parameters and corr.images]
     pictures = [_wide(_picture(correlation_figure(tables, c), alt)) for c in used]
     reach = [_said(_reach(tables, camera)) for camera in tables.adjusted.unknowns.interior]
-    assumed = [_said(words)] if (words := assumed_pixel_words(tables.adjusted.block)) else []
+    assumed = map(html_of, assumed_pixels(tables.adjusted.block.sensors))
     return [_html(table[table["sigma"].notna() | (table["value"] != 0)]), *assumed, *reach, *pictures]
 
 

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
+from jaxphoto.report.units import label_unit
+
 if TYPE_CHECKING:
     from jaxphoto.report.tables import Tables
 
@@ -21,7 +23,8 @@ _COLUMNS = ("parameter", "estimate", "truth", "sigma")
 
 
 def recovery_table(tables: Tables, truth: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
-    """parameter, estimate, truth, error (estimate - truth), sigma, ratio (error / sigma), of all that was estimated.
+    """parameter, estimate, truth, error (estimate - truth), sigma, ratio (error / sigma), unit, of all that was
+    estimated.
 
     `truth` are the tables of `jaxphoto.io.truth_tables(simulation)`, which are in the folder `truth` of a simulated
     block: columns as the result tables have them. What one side does not have is left out.
@@ -35,8 +38,10 @@ def recovery_table(tables: Tables, truth: Mapping[str, pd.DataFrame]) -> pd.Data
     error = rows["estimate"] - rows["truth"]
     turns = rows["parameter"].str.endswith("_deg")
     error = error.where(~turns, (error + 180) % 360 - 180)
-    return rows.assign(error=error, ratio=error / rows["sigma"])[
-        ["parameter", "estimate", "truth", "error", "sigma", "ratio"]
+    cameras = tables.adjusted.unknowns.interior
+    units = [label_unit(label, cameras) for label in rows["parameter"]]
+    return rows.assign(error=error, ratio=error / rows["sigma"], unit=np.array(units, object))[
+        ["parameter", "estimate", "truth", "error", "sigma", "ratio", "unit"]
     ]
 
 

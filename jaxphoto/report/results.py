@@ -8,7 +8,7 @@ from types import MappingProxyType
 from typing import Any
 
 from jaxphoto.adjustment import Adjustment
-from jaxphoto.camera import RATES, model_keys
+from jaxphoto.camera import RATES, model_keys, sensor_keys
 from jaxphoto.compiling.freed_memory import return_freed_memory
 from jaxphoto.errors import InputError
 from jaxphoto.report.check_points import check_spread
@@ -138,7 +138,5 @@ def _cameras(adjusted: Adjustment) -> dict:
     """Sensor and models of every camera, by which interior.csv can be read."""
     told = {}
     for name, interior in adjusted.unknowns.interior.items():
-        sensor = adjusted.block.sensors[name]
-        size = {"width_px": sensor.width_px, "height_px": sensor.height_px, "pixel_mm": sensor.pixel_mm}
-        told[name] = size | model_keys(interior)
+        told[name] = sensor_keys(adjusted.block.sensors[name]) | model_keys(interior)
     return told

@@ -18,8 +18,10 @@ from jaxphoto.report.findings import parameter_words
 from jaxphoto.report.made import Made, made_section, versions
 from jaxphoto.report.plots import axes_or_new, drawn, new_figure
 from jaxphoto.report.results import write_summary
+from jaxphoto.report.source_words import assumed_pixels
 from jaxphoto.report.study_page import StudyPart, WholePicture, study_page
 from jaxphoto.report.tables import Tables
+from jaxphoto.report.units import label_unit
 from jaxphoto.sensitivity.exact import Sensitivity, sensitivity
 from jaxphoto.sensitivity.influence import DELTA0, Per, external_reliability, station_bias, variance_shares
 from jaxphoto.writing import whole_folder
@@ -28,6 +30,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+# Of the largest change, what a summary says.
+_LARGEST = ("unit", "axis", "exact", "first_order", "over_sigma", "estimate_unit")
 # Interior parameters in the figure.
 _SHOWN = 6
 
@@ -35,8 +39,8 @@ _SHOWN = 6
 class SensitivityTables:
     """What the sensitivity of an adjustment says of its shared unknowns and its check points.
 
-    Numbers are in the estimate's own unit, which its name ends with; coordinates of points are in metres. `bias_m` is
-    the station bias and `per` whose stations have it: the block's, a strip's, an image's.
+    Numbers are in the estimate's own unit, which stands in `estimate_unit`. `bias_m` is the station bias and `per`
+    whose stations have it: the block's, a strip's, an image's.
     """
 
     def __init__(self, adjusted: Adjustment, per: Per = "strip", bias_m: float = 0.10, delta0: float = DELTA0):
@@ -60,7 +64,8 @@ class SensitivityTables:
 
     @cached_property
     def bias(self) -> pd.DataFrame:
-        """unit, axis, bias_m, estimate, exact, first_order, difference: what a bias of each unit's stations does."""
+        """unit, axis, bias_m, estimate, exact, first_order, difference, estimate_unit: what a bias of each unit's
+        stations does."""
         of = [station_bias(self.adjusted, d, self.per, self.bias_m) for d in (self.exact, self.first_order)]
         exact, first = (b.change[self._rows].transpose(1, 2, 0) for b in of)
         labels = self.exact.labels[self._rows]
@@ -69,20 +74,25 @@ class SensitivityTables:
         table.insert(2, "bias_m", self.bias_m)
         table["exact"], table["first_order"] = exact.ravel(), first.ravel()
         table["difference"] = table["exact"] - table["first_order"]
-        return table
+        return table.assign(estimate_unit=table["estimate"].map(self._units))
+
+    @cached_property
+    def _units(self) -> dict[str, str]:
+        """Units of the estimates."""
+        return {label: label_unit(label, self.adjusted.unknowns.interior) for label in self.exact.labels[self._rows]}
 
     @cached_property
     def largest(self) -> pd.DataFrame:
         """Of each interior parameter the row of `bias` that changes it most, with the change over its sigma.
 
-        estimate, exact, over_sigma (a priori), first_order, unit, axis.
+        estimate, exact, over_sigma (a priori), first_order, unit, axis, estimate_unit.
         """
         interior = self.bias[self.bias["estimate"].str.startswith("interior")]
         most = interior.loc[interior.groupby("estimate", sort=False)["exact"].apply(lambda v: v.abs().idxmax())]
         sigma = dict(zip(self.exact.labels, np.sqrt(variance_shares(self.adjusted, self.exact).variance), strict=True))
         over = most["exact"] / most["estimate"].map(sigma).where(lambda v: v > 0)
-        table = most.assign(over_sigma=over)[["estimate", "exact", "over_sigma", "first_order", "unit", "axis"]]
-        return table.reset_index(drop=True)
+        columns = ["estimate", "exact", "over_sigma", "first_order", "unit", "axis", "estimate_unit"]
+        return most.assign(over_sigma=over)[columns].reset_index(drop=True)
 
     @cached_property
     def variance_shares(self) -> pd.DataFrame:
@@ -106,9 +116,9 @@ class SensitivityTables:
     def external_reliability(self) -> pd.DataFrame:
         """Of each estimate and group the worst observation: what its minimal detectable error does, undetected.
 
-        estimate, group, image, point, axis, redundancy_number, detectable, unit, effect, effect_over_sigma: `unit` is
-        that of the detectable error, sigma is the estimate's a priori. Observations that nothing checks are left out;
-        the summary counts them.
+        estimate, group, image, point, axis, redundancy_number, detectable, unit, effect, effect_over_sigma,
+        estimate_unit: `unit` is that of the detectable error, `estimate_unit` that of the effect, sigma is the
+        estimate's a priori. Observations that nothing checks are left out; the summary counts them.
         """
         found = external_reliability(self.adjusted, self.exact, self.delta0)
         sigma = np.sqrt(variance_shares(self.adjusted, self.exact).variance)[self._rows]
@@ -126,6 +136,7 @@ class SensitivityTables:
             table.insert(6, "detectable", rows["factor"].to_numpy()[worst] * detectable[worst])
             table["effect"] = effect[np.arange(len(effect)), worst]
             table["effect_over_sigma"] = table["effect"] / np.where(sigma > 0, sigma, np.nan)
+            table["estimate_unit"] = table["estimate"].map(self._units)
             tables.append(table)
         return pd.concat(tables, ignore_index=True).sort_values("estimate", kind="stable", ignore_index=True)
 
@@ -232,7 +243,12 @@ def _page(tables: SensitivityTables, picture: WholePicture, made: Made) -> tuple
             f"Moved most, for its standard deviation, is {parameter_words(worst['estimate'])}: by "
             f"{abs(worst['over_sigma']):.2f} of it, where the stations of {worst['unit']} are off in {worst['axis']}."
         )
-    parts: list[StudyPart] = [Heading("Largest changes"), rows_of(tables.largest), picture]
+    parts: list[StudyPart] = [
+        *assumed_pixels(adjusted.block.sensors),
+        Heading("Largest changes"),
+        rows_of(tables.largest),
+        picture,
+    ]
     parts += [Heading("Changes of the interior orientation")]
     parts += [rows_of(tables.bias[shown]), Paragraph("Every estimate stands in sensitivity.csv.")]
     parts += [Heading("Which observations the variance is of"), rows_of(shares)]
@@ -249,7 +265,7 @@ def _summary(tables: SensitivityTables, seconds: dict[str, float]) -> dict:
         worst = largest.loc[name]
         groups = shares[shares["estimate"] == name].set_index("group")["share"]
         interior[name] = {
-            "largest_change": {key: worst[key] for key in ("unit", "axis", "exact", "first_order", "over_sigma")},
+            "largest_change": {key: worst[key] for key in _LARGEST},
             "variance_shares": {str(group): float(share) for group, share in groups.items()},
         }
     return {

@@ -17,6 +17,7 @@ from jaxphoto.report.made import Made, made_section, versions
 from jaxphoto.report.maps import outline
 from jaxphoto.report.plots import axes_or_new, new_figure
 from jaxphoto.report.results import write_summary
+from jaxphoto.report.source_words import assumed_pixel_words
 from jaxphoto.report.study_page import WholePicture, study_page
 from jaxphoto.stability import ALIGNED, Analysis, Method
 from jaxphoto.writing import whole_folder
@@ -37,6 +38,7 @@ class Compared(NamedTuple):
     interior: InteriorOrientation
     known: bool
     """Whether its covariance is known."""
+    sensor: Sensor
 
     def __str__(self) -> str:
         model, how = type(self.interior.distortion).__name__, "with" if self.known else "WITHOUT"
@@ -109,9 +111,8 @@ def print_stability(
     method: Method, console: Console,
 ) -> None:  # fmt: skip
     """Both sets, a column for each method in micrometres, and the verdict by `method`."""
-    for compared in sets:
-        console.print(str(compared), highlight=False, markup=False, soft_wrap=True)
-    console.print(missing_covariances(sets), highlight=False, markup=False, soft_wrap=True)
+    for line in about_sets(sets):
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
     table = Table(title=f"stability (um); noise {1e3 * noise_mm:.4g} um = {noise_mm / pixel_mm:.4g} px")
     table.add_column("", no_wrap=True)
     for name in analyses:
@@ -157,10 +158,9 @@ def write_stability(
     table = stability_table(analyses, sensor.pixel_mm, noise_mm)
     chosen = analyses[method]
     picture = WholePicture.of(offsets_figure(chosen, sensor), "offsets of the two bundles over the image")
-    about = [str(sets[0]), str(sets[1]), missing_covariances(sets)]
     methods = "The bundles of rays are compared " + "; ".join(f"{ALIGNED[name]} ({name})" for name in analyses) + "."
     parts = [
-        *map(Paragraph, about),
+        *map(Paragraph, about_sets(sets)),
         Heading("By method"),
         Paragraph(methods),
         rows_of(table),
@@ -193,6 +193,12 @@ def stability_summary(
         "n_points": len(chosen.offsets.points),
         "covariance": {"A": sets[0].known, "B": sets[1].known},
     }
+
+
+def about_sets(sets: tuple[Compared, Compared]) -> list[str]:
+    """What both sets are, what the uncertainty is made of, and whose pixel was assumed."""
+    assumed = assumed_pixel_words({one.name: one.sensor for one in sets})
+    return [str(sets[0]), str(sets[1]), missing_covariances(sets), *([assumed] if assumed else [])]
 
 
 def missing_covariances(sets: tuple[Compared, Compared]) -> str:

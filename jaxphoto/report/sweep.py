@@ -11,6 +11,7 @@ import pandas as pd
 from jaxphoto.errors import InputError
 from jaxphoto.observations import AXES
 from jaxphoto.report.plots import axes_or_new, drawn, log_ticks, new_figure
+from jaxphoto.report.units import without_unit
 from jaxphoto.sensitivity.sweep import Sweep
 
 if TYPE_CHECKING:
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _OWN = ("design", "converged", "determined", "quantity", "of", "value", "unit")
-_UNITS = {"_m_per_s": "m/s", "_mm": "mm", "_m": "m", "_deg": "deg", "_s": "s"}
 _DEG = 180 / np.pi
 # From this ratio of largest to smallest value on, numbers are drawn on a logarithmic scale.
 _FAR_APART = 20.0
@@ -95,7 +95,7 @@ def _shared_names(labels: Sequence[str]) -> tuple[list[str], list[float]]:
 
 def _unit(name: str) -> str:
     """The unit that a name ends with; none of a coefficient, which has that of its model (docs/models.md)."""
-    return next((unit for suffix, unit in _UNITS.items() if name.endswith(suffix)), "")
+    return without_unit(name)[1]
 
 
 def sweep_figure(table: pd.DataFrame, x: str, shown: Sequence[tuple[str, str]], by: Sequence[str] = ()) -> Figure:

@@ -13,6 +13,7 @@ import pandas as pd
 
 from jaxphoto.errors import InputError
 from jaxphoto.report.digits import of_p, of_sigma, with_sigma
+from jaxphoto.report.units import without_unit
 
 # Columns whose numbers are as sure as the column `sigma` of the same row says.
 _BY_SIGMA = (
@@ -30,13 +31,6 @@ _PLACES = {
     "redundancy_number": 2, "largest_share": 3, "inside": 3, "effect_over_sigma": 2, "over_sigma": 2, "c_moves": 2,
     "xp_moves": 2, "yp_moves": 2, "most_moves": 1, "rho": 3, "mean_abs_rho": 3, "max_abs_rho": 3,
 }  # fmt: skip
-# Names end in their units, the longest first.
-_UNITS = {
-    "m_per_s": "m/s", "deg_per_s": "deg/s", "mm_per_s": "mm/s", "mm_per_h": "mm/h", "per_h": "1/h",
-    "mm_per_K": "mm/K", "per_K": "1/K", "deg": "deg", "mm": "mm", "ms": "ms",
-    "m": "m", "s": "s", "px": "px", "cm": "cm", "ppm": "ppm",
-}  # fmt: skip
-_UNIT = re.compile(r"_(" + "|".join(_UNITS) + r")$")
 _COORDINATE = re.compile(r"^([XYZENH]|height|longitude|latitude|distance)_(m|deg)$")
 _SPECIAL = {letter: f"\\{letter}" for letter in "&%$#_{}"} | {
     "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "\\": r"\textbackslash{}",
@@ -57,7 +51,7 @@ def _texts(table: pd.DataFrame, name: str) -> list[str]:
     column = table[name]
     if name == "parameter":
         # Paths, as of mounts[default].boresight_x_deg and scanner.boresight_up_deg, stay what they are.
-        words = [head_of(v) if not re.search(r"[\[.]", v) and _UNIT.search(v) else v for v in column.astype(str)]
+        words = [head_of(v) if not re.search(r"[\[.]", v) and without_unit(v)[1] else v for v in column.astype(str)]
         return [word.partition(" [")[0] for word in words] if "unit" in table else words
     if not pd.api.types.is_float_dtype(column):
         return ["" if pd.isna(v) else _word(v) for v in column.astype(object)]
@@ -95,8 +89,8 @@ def _word(value: object) -> str:
 
 def head_of(name: str) -> str:
     """A column's name with its unit in brackets: "sigma X [m]" of sigma_X_m."""
-    unit = _UNIT.search(name)
-    return (name[: unit.start()] if unit else name).replace("_", " ") + (f" [{_UNITS[unit[1]]}]" if unit else "")
+    said, unit = without_unit(name)
+    return said.replace("_", " ") + (f" [{unit}]" if unit else "")
 
 
 def to_markdown(table: pd.DataFrame, name: str = "") -> str:

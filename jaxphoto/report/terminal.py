@@ -5,7 +5,6 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from jaxphoto.camera import parameter_unit
 from jaxphoto.errors import printable
 from jaxphoto.report.check_points import check_spread
 from jaxphoto.report.digits import of_p, of_sigma, with_sigma
@@ -59,7 +58,7 @@ def print_adjustment(tables: Tables, verdict: Verdict, console: Console) -> None
                 plain(s.parameter),
                 with_sigma(s.value, s.sigma),
                 of_sigma(s.sigma),
-                parameter_unit(adjusted.unknowns.interior[s.camera], s.parameter),
+                s.unit,
                 f"{s.ratio:.0f}" if s.ratio > _MANY else f"{s.ratio:.1f}",
                 of_p(s.p_value),
             )

@@ -6,7 +6,14 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.special import chdtrc, ndtr
 
-from jaxphoto.camera import InteriorOrientation, constant_names, get_parameter, model_keys, parameter_names
+from jaxphoto.camera import (
+    InteriorOrientation,
+    constant_names,
+    get_parameter,
+    model_keys,
+    parameter_names,
+    parameter_unit,
+)
 from jaxphoto.errors import InputError
 from jaxphoto.short_repr import change_html, change_repr, shown
 from jaxphoto.stability.alignment import Method
@@ -32,6 +39,8 @@ class ParameterChange(NamedTuple):
     """Of the difference; 0 where both hold the parameter,"""
     p_value: float
     """and NaN then: how probable so large a difference is if the parameter did not change."""
+    unit: str
+    """Of the numbers above: mm, 1/mm^2, "1" of a number without one."""
 
 
 class Change(NamedTuple):
@@ -139,5 +148,6 @@ def _parameters(
     found = []
     for name, a, b, s in zip(parameter_names(first), one, other, sigma, strict=True):
         p_value = 2 * float(ndtr(-abs(b - a) / s)) if s > 0 else float("nan")
-        found.append(ParameterChange(name, float(a), float(b), float(b - a), float(s), p_value))
+        numbers = float(a), float(b), float(b - a), float(s), p_value
+        found.append(ParameterChange(name, *numbers, parameter_unit(first, name)))
     return tuple(found)

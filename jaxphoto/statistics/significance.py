@@ -8,7 +8,7 @@ from jax.scipy.special import betainc, gammaincc
 from jaxtyping import Array
 
 from jaxphoto.adjustment import Adjustment
-from jaxphoto.camera import InteriorOrientation, get_parameter, set_parameter
+from jaxphoto.camera import InteriorOrientation, get_parameter, parameter_unit, set_parameter
 from jaxphoto.compiling import call_compiled
 from jaxphoto.short_repr import shown
 from jaxphoto.statistics.covariance import Covariance
@@ -21,7 +21,7 @@ SIGNIFICANCE_LEVEL = 0.05
 class Significance(eqx.Module):
     """One estimated interior parameter: value, a posteriori sigma, |value| / sigma, and two-sided p of value = 0.
 
-    Value and sigma are in the parameter's unit: mm for c_mm, xp_mm and yp_mm, else that of the distortion's docstring.
+    Value and sigma are in `unit`: mm, 1/mm^2, "1" of a number without one (`jaxphoto.camera.parameter_unit`).
     """
 
     camera: str
@@ -30,6 +30,7 @@ class Significance(eqx.Module):
     sigma: float
     ratio: float
     p_value: float
+    unit: str
 
     @property
     def significant(self) -> bool:
@@ -50,9 +51,10 @@ def significance(adjusted: Adjustment, covariance: Covariance) -> list[Significa
         if not label.startswith("interior["):
             continue
         camera, parameter = label.removeprefix("interior[").rsplit("].", 1)
-        value = float(get_parameter(adjusted.unknowns.interior[camera], parameter))
+        interior = adjusted.unknowns.interior[camera]
+        value, unit = float(get_parameter(interior, parameter)), parameter_unit(interior, parameter)
         ratio = abs(value) / s if s != 0 else np.inf
-        result.append(Significance(camera, parameter, value, s, ratio, student_p(ratio, adjusted.redundancy)))
+        result.append(Significance(camera, parameter, value, s, ratio, student_p(ratio, adjusted.redundancy), unit))
     return result
 
 

@@ -57,7 +57,7 @@ def test_the_promised_files_and_columns(whole):
     assert json.loads((directory / "summary.json").read_text()) == summary
     assert summary["draws_per_second"] > 0
     assert list(table.columns) == [
-        "quantity", "nominal", "mean", "sd", "q025", "q50", "q975", "predicted_sigma", "ratio",
+        "quantity", "nominal", "mean", "sd", "q025", "q50", "q975", "predicted_sigma", "ratio", "unit",
     ]  # fmt: skip
     rows = table.set_index("quantity")
     assert rows.loc["one.c_mm", "sd"] == pytest.approx(draws["one.c_mm"].std(), rel=1e-12)

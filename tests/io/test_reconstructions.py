@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from jaxphoto.camera import get_parameter, parameter_names
 from jaxphoto.collinearity import project
 from jaxphoto.errors import InputError
-from jaxphoto.io import convert, read_source, write_block
+from jaxphoto.io import convert, read_block, read_source, write_block
 from jaxphoto.io.exports import AdjustedPhotographs, ExportCamera, export
 from jaxphoto.orientation.approximate import approximate
 from jaxphoto.report.source_words import assumed_pixel_words, report_title
@@ -390,10 +390,13 @@ def test_a_block_keeps_where_it_is_from_and_that_its_pixel_is_assumed(tmp_path):
     convert(write_open_sfm(tmp_path / "opensfm"), tmp_path / "block")
     write_block(read_source(tmp_path / "block"), tmp_path / "again")
     block = read_source(tmp_path / "again")
-    assert block.converted_from == f"opensfm: {tmp_path.name}/opensfm" and block.assumed_pixels == ("v2 one",)
+    assert block.converted_from == f"opensfm: {tmp_path.name}/opensfm" and block.sensors["v2 one"].pixel_assumed
     assert report_title(block) == f"opensfm, converted from opensfm: {tmp_path.name}/opensfm"
-    assert "pixel of every camera is not known: 0.001 mm is assumed. c," in assumed_pixel_words(block)
-    assert assumed_pixel_words(dataclasses.replace(block, assumed_pixels=())) == ""
+    assert "pixel of every camera is not known: 0.001 mm is assumed. c," in assumed_pixel_words(block.sensors)
+    # A pixel that is known to be of that size is not assumed.
+    known = dataclasses.replace(block.sensors["v2 one"], pixel_assumed=False)
+    write_block(dataclasses.replace(block, sensors={"v2 one": known}), tmp_path / "known")
+    assert assumed_pixel_words(read_block(tmp_path / "known").sensors) == ""
 
 
 def test_photographs_of_pix4d_without_a_camera_are_told_and_its_points_are_found_by_their_rays(tmp_path):

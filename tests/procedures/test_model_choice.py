@@ -256,6 +256,7 @@ def test_command_writes_the_table_and_says_the_choice(block, perfect, tmp_path, 
     with (out / "parameters.csv").open() as file:
         first = next(csv.DictReader(file))
     assert (first["model"], first["camera"], first["parameter"]) == ("brown:k1", "one", "c_mm")
+    assert first["unit"] == "mm"
     code, _, errors = run(monkeypatch, capsys, "models", tmp_path / "block", "--models", "braun", "--out", out)
     assert code == 2
     assert "no distortion model is called 'braun'" in errors

@@ -7,12 +7,13 @@ import pandas as pd
 import pytest
 
 from jaxphoto import InputError, Tables
-from jaxphoto.camera import InteriorOrientation, OpenCv, parameter_unit
+from jaxphoto.camera import Brown, InteriorOrientation, OpenCv, parameter_unit
 from jaxphoto.io import read_result_tables
 from jaxphoto.report import to_latex, to_markdown, write_tables
 from jaxphoto.report.check_points import check_spread
 from jaxphoto.report.digits import of_sigma, with_sigma
 from jaxphoto.report.table_files import head_of, readable
+from jaxphoto.report.units import column_unit, label_unit
 from tests.blocks import adjusted
 from tests.commands import run
 
@@ -51,6 +52,19 @@ def test_units_of_a_camera_follow_its_model():
     assert "mm$^{-2}$" in to_latex(table) and "| 1/mm^2 |" in to_markdown(table)
     cv = InteriorOrientation(35.0, distortion=OpenCv(k1=0.1))
     assert [parameter_unit(cv, name) for name in ("c_mm", "k1", "b1")] == ["mm", "1", "1"]
+
+
+def test_labels_and_columns_of_draws_have_the_units_of_their_models():
+    models = {"a_m": Brown(), "cv": OpenCv()}
+    cameras = {name: InteriorOrientation(35.0, distortion=model) for name, model in models.items()}
+    labels = {
+        "interior[a_m].k1": "1/mm^2", "interior[cv].k1": "1", "interior[cv].c_mm": "mm", "points[7].X": "m",
+        "exterior[1].omega_deg": "deg", "mounts[default].boresight_up_rad": "rad", "strips[k1].drift_X_m_per_s": "m/s",
+        "scanner_calibration.range_scale_ppm": "ppm",
+    }  # fmt: skip
+    assert {label: label_unit(label, cameras) for label in labels} == labels
+    columns = {"a_m.k1": "1/mm^2", "bias.cv.k1": "1", "bias.a_m.X_m": "m", "check.7.dX_m": "m"}
+    assert {column: column_unit(column, cameras) for column in columns} == columns
 
 
 def test_heads_have_units_in_brackets():

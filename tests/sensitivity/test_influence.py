@@ -148,6 +148,10 @@ def test_tables_and_command(tmp_path) -> None:
     bias = pd.read_csv(tmp_path / "s" / "sensitivity.csv")
     np.testing.assert_allclose(bias["exact"] - bias["first_order"], bias["difference"], atol=1e-15)
     assert set(bias["axis"]) == {"X", "Y", "Z"}
+    for name in ("sensitivity", "external_reliability"):
+        units = pd.read_csv(tmp_path / "s" / f"{name}.csv").set_index("estimate")["estimate_unit"].to_dict()
+        assert units["interior[kodak].c_mm"] == "mm" and units["interior[kodak].k1"] == "1/mm^2"
+        assert units[next(label for label in units if label.startswith("points["))] == "m"
     shares = pd.read_csv(tmp_path / "s" / "variance_shares.csv")
     np.testing.assert_allclose(shares.groupby("estimate")["share"].sum(), 1.0)
     summary = json.loads((tmp_path / "s" / "summary.json").read_text(encoding="utf-8"))

@@ -205,7 +205,6 @@ def assemble(source: BlockTables) -> Block:
         surfaces=surfaces.rows,
         partitions=_partitions(images, settings),
         converted_from=settings.converted_from,
-        assumed_pixels=settings.assumed_pixels,
         breaklines=points_called(points.ids, settings.breaklines, f"{source.file}, breaklines:"),
     )
     more, more_priors = read_unknowns(settings.unknowns, source.unknowns, block)

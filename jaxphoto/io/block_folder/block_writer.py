@@ -118,7 +118,6 @@ def _settings(block: Block) -> dict[str, Any]:
     return {
         "title": block.title,
         **({"converted_from": block.converted_from} if block.converted_from else {}),
-        **({"assumed_pixels": list(block.assumed_pixels)} if block.assumed_pixels else {}),
         **({"observations": own} if own else {}),
         **({"partitions": list(block.partitions)} if block.partitions else {}),
         # Of those that are still among its points.

@@ -18,6 +18,7 @@ from jaxphoto.camera import (
     get_parameter,
     model_keys,
     parameter_names,
+    sensor_keys,
     set_parameter,
 )
 from jaxphoto.camera.declared import Declared
@@ -26,7 +27,7 @@ from jaxphoto.io.block_folder.section import Section
 from jaxphoto.io.names import control_in
 from jaxphoto.unknowns import FIXED, FREE, Prior, Weighted
 
-_KEYS = ("width_px", "height_px", "pixel_mm", "distortion", "projection", "residuals")
+_KEYS = ("width_px", "height_px", "pixel_mm", "pixel_assumed", "distortion", "projection", "residuals")
 # A principal distance beyond these multiples of the format's diagonal is in another unit than millimetres.
 _LONGEST, _SHORTEST = 20.0, 0.05
 # Pixels of known sensors are 0.5 to 50 micrometres.
@@ -60,7 +61,7 @@ def read_camera(section: Section) -> Camera:
     distortion = _kind(section, "distortion", AbstractDistortion.called)
     projection = _kind(section, "projection", AbstractProjection.called, Perspective.name)
     section.known(*_KEYS, *distortion.choices, *projection.choices, "interior", "unknowns", "known", "reservation")
-    sensor = Sensor(section.count("width_px"), section.count("height_px"), section.positive("pixel_mm"))
+    sensor = read_sensor(section)
     if not PIXEL_MM[0] <= sensor.pixel_mm <= PIXEL_MM[1]:
         raise section.error("pixel_mm", f"a pixel of {sensor.pixel_mm:g} mm cannot be; give its size in millimetres")
     empty = _empty_interior(section, distortion, projection)
@@ -83,6 +84,12 @@ def read_camera(section: Section) -> Camera:
     return Camera(sensor, interior, priors, known, reservation)
 
 
+def read_sensor(section: Section) -> Sensor:
+    """The sensor by the keys that `sensor_keys` writes. Raises InputError for what cannot be one."""
+    size = section.count("width_px"), section.count("height_px"), section.positive("pixel_mm")
+    return Sensor(*size, pixel_assumed=section.truth("pixel_assumed"))
+
+
 def known_together(interior: InteriorOrientation, covariance: np.ndarray) -> KnownTogether:
     """What a covariance of all parameters knows: those that it does not hold at their values."""
     names = parameter_names(interior)
@@ -94,8 +101,7 @@ def known_together(interior: InteriorOrientation, covariance: np.ndarray) -> Kno
 def camera_section(camera: Camera) -> dict[str, Any]:
     """The [cameras.X] table that `read_camera` reads as `camera`."""
     sensor, interior, priors, known, reservation = camera
-    written: dict[str, Any] = {"width_px": sensor.width_px, "height_px": sensor.height_px, "pixel_mm": sensor.pixel_mm}
-    written |= model_keys(interior)
+    written: dict[str, Any] = sensor_keys(sensor) | model_keys(interior)
     if interior.residuals != "model":
         written["residuals"] = interior.residuals
     names = parameter_names(interior)

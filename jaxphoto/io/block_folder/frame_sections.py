@@ -68,7 +68,7 @@ def frame_section(frame: Frame) -> dict[str, Any]:
 def read_corrections(section: Section, frame: Frame) -> Corrections:
     """The corrections that a [corrections] table switches on, if they are right in `frame`, which has its origin."""
     section.known("refraction", "curvature", "sea_level_m")
-    refraction, curvature = (_switch(section, key) for key in ("refraction", "curvature"))
+    refraction, curvature = (section.truth(key) for key in ("refraction", "curvature"))
     if curvature and frame.kind != "grid":
         raise section.error(
             "curvature",
@@ -96,10 +96,3 @@ def corrections_section(corrections: Corrections, frame: Frame) -> dict[str, Any
     if corrections.refraction and frame.kind != "epsg":
         written["sea_level_m"] = corrections.sea_level_m
     return written
-
-
-def _switch(section: Section, key: str) -> bool:
-    value = section.values.get(key, False)
-    if not isinstance(value, bool):
-        raise section.error(key, f"{quoted(value)} is neither true nor false; write one of them")
-    return value

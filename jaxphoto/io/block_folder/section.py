@@ -67,6 +67,13 @@ class Section:
             raise self.error(key, f'{quoted(value)} is not a list of text; write it like ["a", "b"]')
         return tuple(value)
 
+    def truth(self, key: str) -> bool:
+        """Yes or no; no where the key is absent."""
+        value = self.values.get(key, False)
+        if not isinstance(value, bool):
+            raise self.error(key, f"{quoted(value)} is neither true nor false; write one of them")
+        return value
+
     def number(self, key: str, default: float | None = None) -> float:
         """A finite number."""
         value = self._needed(key) if default is None else self.values.get(key, default)

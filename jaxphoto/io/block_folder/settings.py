@@ -31,7 +31,6 @@ _KEYS = (
     "breaklines",
     "reference_temperature_c",
     "converted_from",
-    "assumed_pixels",
 )
 _SIGMAS = (
     "image_mm", "image_px", "control_m", "control_X_m", "control_Y_m", "control_Z_m", "station_m", "attitude_deg",
@@ -64,7 +63,6 @@ class Settings(NamedTuple):
     reference_temperature_c: float | None
     """At which cameras with thermal rates are what they are; None: the mean of all exposures."""
     converted_from: str
-    assumed_pixels: tuple[str, ...]
     """As in `Block`."""
 
 
@@ -98,7 +96,6 @@ def read_settings(values: dict[str, Any], file: str = TOML, sigma_keys: Sequence
         top.texts("breaklines"),
         top.number("reference_temperature_c") if "reference_temperature_c" in top else None,
         top.text("converted_from", ""),
-        top.texts("assumed_pixels"),
     )
 
 

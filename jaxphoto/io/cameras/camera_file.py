@@ -103,8 +103,9 @@ class CameraSource(NamedTuple):
         if pixel is not None and not 0 < pixel < np.inf:
             raise self.error(f"a pixel of {pixel:g} mm cannot be; give its size in millimetres")
         assumed = f"the size of a pixel is not known; {ASSUMED_PIXEL_MM} mm was assumed, and c_mm scales with it"
-        note = assumed if pixel is None else ""
-        return Sensor(int(width), int(height), ASSUMED_PIXEL_MM if pixel is None else float(pixel)), note
+        if pixel is None:
+            return Sensor(int(width), int(height), ASSUMED_PIXEL_MM, pixel_assumed=True), assumed
+        return Sensor(int(width), int(height), float(pixel)), ""
 
 
 class CameraModel(NamedTuple):

@@ -8,7 +8,7 @@ import pandas as pd
 
 from jaxphoto.arrays import on_device
 from jaxphoto.camera import InteriorOrientation, Sensor, constant_names, empty_camera, parameter_names, set_parameter
-from jaxphoto.io.block_folder.camera_section import Camera, camera_section, known_together
+from jaxphoto.io.block_folder.camera_section import Camera, camera_section, known_together, read_sensor
 from jaxphoto.io.block_folder.section import Section
 from jaxphoto.io.block_folder.settings import read_settings, toml_text
 from jaxphoto.io.block_folder.table_layout import TOML
@@ -150,8 +150,7 @@ def _described(source: CameraSource, camera: str) -> tuple[Sensor, InteriorOrien
     path = source.path.with_name(SUMMARY)
     try:
         told = Section(path.name, "", read_json(path)).section("cameras").section(camera)
-        sensor = Sensor(told.count("width_px"), told.count("height_px"), told.positive("pixel_mm"))
-        return sensor, empty_camera(told.values)
+        return read_sensor(told), empty_camera(told.values)
     except (ValueError, KeyError, TypeError):
         raise source.error(
             f"neither summary.json beside it nor a block says of which model camera {camera} is; give the block"

@@ -95,7 +95,9 @@ def _camera(size: list[int], values: list[float]) -> TiedCamera:
     f, k1, k2 = values
     interior = InteriorOrientation(f * ASSUMED_PIXEL_MM, 0.0, 0.0, BundlerRadial(k1, k2))
     return TiedCamera(
-        Sensor(size[0], size[1], ASSUMED_PIXEL_MM), jax.tree.map(on_device, interior), ("c_mm", "k1", "k2")
+        Sensor(size[0], size[1], ASSUMED_PIXEL_MM, pixel_assumed=True),
+        jax.tree.map(on_device, interior),
+        ("c_mm", "k1", "k2"),
     )
 
 
