@@ -13,9 +13,11 @@ import pytest
 import typer
 
 from jaxphoto import cli
+from jaxphoto.adjustment.told import step_lines, tell_course
 from jaxphoto.cli.app import COMMANDS, app
 from jaxphoto.cli.compile_times import CompileTimes
 from jaxphoto.cli.output import OF_OUTPUT, Output, command
+from tests.blocks import adjusted
 from tests.commands import run
 
 TYPES = {
@@ -99,6 +101,18 @@ def test_each_step_has_a_line_where_all_are_wanted(capsys):
             status.update(f"features: {k} of 5")
     lines = capsys.readouterr().err.splitlines()
     assert [line.split(" s  ")[1] for line in lines] == ["reading", "features: 0 of 5"]
+
+
+def test_each_iteration_of_any_command_has_a_line_where_all_are_wanted(capsys):
+    result, output = adjusted("cross"), Output("halves", verbose=True)
+    tell_course(result)
+    output.close()
+    tell_course(result)
+    lines = [line.split(" s  ")[1] for line in capsys.readouterr().err.splitlines()]
+    assert lines == [
+        f"adjusted 10 images, {len(result.block.points)} points: {result.outcome.value}",
+        *step_lines(result),
+    ]
 
 
 def test_compiling_is_timed_once_where_programs_are_compiled_within_each_other():

@@ -27,6 +27,7 @@ from jaxphoto.adjustment.solver.levenberg_marquardt import Course, to_factor, to
 from jaxphoto.adjustment.solver.normal import Linearised
 from jaxphoto.adjustment.solver.optimum import find_optimum, unit_scale, weigh_datum
 from jaxphoto.adjustment.solver.similarity import n_open_motions
+from jaxphoto.adjustment.told import tell_course
 from jaxphoto.arrays import gathered, still
 from jaxphoto.block import Block
 from jaxphoto.compiling import prepare, run_compiled
@@ -87,6 +88,7 @@ def solve(
     adjusted = dataclasses.replace(adjusted, steps=steps, converged=converged, course=course, sizes=sizes)
     if laid.traced:
         return adjusted
+    tell_course(adjusted)
     if adjusted.astray.any():
         return dataclasses.replace(adjusted, converged=np.array(False))
     check_rank(adjusted)

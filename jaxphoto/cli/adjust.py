@@ -33,7 +33,6 @@ from jaxphoto.report import (
     verdict_of,
     write_results,
 )
-from jaxphoto.report.convergence_table import step_lines
 from jaxphoto.statistics import EOP_NAMES, SPLITS
 from jaxphoto.writing import check_folder, whole_folder
 
@@ -81,7 +80,6 @@ def adjust_command(
             components = jaxphoto.variance_components(adjusted, splits, max_steps=max_steps)
             masked += made_by_blunders(adjusted, components, splits, max_steps=max_steps, report=status.update)
             adjusted = components.adjusted
-        output.details(step_lines(adjusted))
         status.update("computing statistics")
         tables = Tables(adjusted, rotations, read_truth(block))  # type: ignore[arg-type]
         verdict = verdict_of(tables)

@@ -7,6 +7,7 @@ import copy
 import functools
 import inspect
 import json
+import logging
 import math
 import time
 import warnings
@@ -41,6 +42,7 @@ _WORDS = {Path: "PATH", list[Path]: "PATH", list[str]: "NAME", float: "NUMBER", 
 # Less is nobody's concern.
 WORTH_TELLING_S = 2.0
 """Of compiling."""
+_ADJUSTMENTS = logging.getLogger("jaxphoto.adjustment")
 
 
 class Output:
@@ -54,7 +56,10 @@ class Output:
         """Where the outcome is printed."""
         self.progress = plain_console(stderr=True, quiet=quiet, each_step=self._line if verbose else None)
         """Where it is told what is being done."""
-        self._verbose = verbose
+        self._steps = _Lines(self._line) if verbose else None
+        if self._steps:
+            _ADJUSTMENTS.addHandler(self._steps)
+            _ADJUSTMENTS.setLevel(logging.INFO)
         told = (lambda name, seconds: self._line(f"compiled {name} in {seconds:.1f} s")) if verbose else None
         self._compiled = CompileTimes(told)
 
@@ -79,11 +84,6 @@ class Output:
     def say(self, sentence: str) -> None:
         """Say something of the outcome."""
         self.screen.print(plain(sentence), soft_wrap=True)
-
-    def details(self, lines: Iterable[str]) -> None:
-        """Say what nobody needs but who asked for all of it."""
-        for line in lines if self._verbose else ():
-            self._line(line)
 
     def tell(self, **values: Any) -> None:
         """Tell programs more of the outcome."""
@@ -120,10 +120,25 @@ class Output:
     def close(self) -> None:
         """Hear of nothing more."""
         self._compiled.stop()
+        if self._steps:
+            _ADJUSTMENTS.removeHandler(self._steps)
+            _ADJUSTMENTS.setLevel(logging.NOTSET)
 
     def _line(self, text: str) -> None:
         said = f"{time.perf_counter() - self._began:7.1f} s  {text}"
         plain_console(stderr=True, quiet=self._quiet).print(plain(said), soft_wrap=True)
+
+
+class _Lines(logging.Handler):
+    """What is logged, as lines."""
+
+    def __init__(self, line: Callable[[str], None]) -> None:
+        super().__init__()
+        self._told = line
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Tell it."""
+        self._told(record.getMessage())
 
 
 def command(name: str, *more: str) -> Callable[[Callable[..., None]], Callable[..., None]]:

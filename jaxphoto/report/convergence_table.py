@@ -1,6 +1,4 @@
-"""How an adjustment converged, step by step, as a table and as lines."""
-
-from collections.abc import Iterator
+"""How an adjustment converged, step by step, as a table."""
 
 import numpy as np
 import pandas as pd
@@ -24,11 +22,3 @@ def convergence_table(adjusted: Adjustment) -> pd.DataFrame:
     table["length"], table["damping"] = pd.Series(course.length), pd.Series(course.damping)
     table["taken"] = pd.Series(np.where(course.accepted > 0, "yes", "no"))
     return table.assign(step=[*map(str, range(1, n + 1)), *(["end"] if end else [])], taken=table["taken"].fillna(""))
-
-
-def step_lines(adjusted: Adjustment) -> Iterator[str]:
-    """A line a step of the table, for those who want to see them all."""
-    for row in convergence_table(adjusted).itertuples():
-        refused = ", refused" if row.taken == "no" else ""
-        moved = f", moves {row.length:.2g} sigmas, damping {row.damping:.1g}{refused}" if row.taken else ""
-        yield f"{'step ' if row.taken else ''}{row.step}: sigma naught {row.sigma0:.6g}{moved}"

@@ -7,8 +7,9 @@ import pytest
 
 import jaxphoto
 from jaxphoto import InputError, Outcome, Tables, report
+from jaxphoto.adjustment.told import step_lines
 from jaxphoto.report.convergence import convergence_section, convergence_words
-from jaxphoto.report.convergence_table import convergence_table, step_lines
+from jaxphoto.report.convergence_table import convergence_table
 from tests.blocks import adjusted, simulated
 
 

@@ -1,0 +1,30 @@
+"""What an adjustment tells of its iteration to whoever listens to the logger `jaxphoto.adjustment` (level INFO)."""
+
+import logging
+from collections.abc import Iterator
+
+from jaxphoto.adjustment.result import Adjustment
+
+LOGGER = logging.getLogger("jaxphoto.adjustment")
+
+
+def tell_course(adjusted: Adjustment) -> None:
+    """Log what was adjusted, and a line a step."""
+    if LOGGER.isEnabledFor(logging.INFO):
+        images, points = len(adjusted.block.images), len(adjusted.block.points)
+        LOGGER.info("adjusted %d images, %d points: %s", images, points, adjusted.outcome.value)
+        for line in step_lines(adjusted):
+            LOGGER.info(line)
+
+
+def step_lines(adjusted: Adjustment) -> Iterator[str]:
+    """A line a step: sigma naught before it, and by how many standard deviations it moves; the last of the end."""
+    course, redundancy = adjusted.course, max(adjusted.redundancy, 1)
+    if course is None:
+        return
+    for k, (square_sum, length, damping, accepted) in enumerate(zip(*course, strict=True), 1):
+        refused = "" if accepted > 0 else ", refused"
+        moved = f"moves {length:.2g} sigmas, damping {damping:.1g}{refused}"
+        yield f"step {k}: sigma naught {(square_sum / redundancy) ** 0.5:.6g}, {moved}"
+    if len(course.length) == int(adjusted.steps):
+        yield f"end: sigma naught {(float(adjusted.square_sum) / redundancy) ** 0.5:.6g}"
