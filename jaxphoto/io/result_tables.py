@@ -8,7 +8,13 @@ import pandas as pd
 from jaxphoto.errors import InputError
 
 # Names may look like numbers: image 0012 is not image 12.
-_TEXT = dict.fromkeys(("camera", "image", "point", "parameter", "parameter_a", "parameter_b", "file", "unit"), str)
+_TEXT = dict.fromkeys(
+    (
+        "camera", "image", "point", "parameter", "parameter_a", "parameter_b", "quantity", "file", "unit", "strip",
+        "one", "other", "group", "model", "serial", "lens_serial", "firmware", "drone",
+    ),
+    str,
+)  # fmt: skip
 
 
 def read_result_tables(folder: str | Path, names: Sequence[str] = ()) -> dict[str, pd.DataFrame]:

@@ -16,6 +16,7 @@ from jaxphoto.procedures.lidar.surveyed_gaps import SurveyedGap
 from jaxphoto.report.digits import of_sigma, with_sigma
 from jaxphoto.report.findings import Finding, Level, Verdict, p_words
 from jaxphoto.report.tables import Tables
+from jaxphoto.report.units import label_unit
 from jaxphoto.report.verdict import verdict_of
 from jaxphoto.statistics import LEVEL, correlation_matrix
 from jaxphoto.statistics.global_test import global_test
@@ -53,7 +54,7 @@ def all_correlations(result: StripAdjustment) -> pd.DataFrame:
 
 
 def calibration_table(result: StripAdjustment) -> pd.DataFrame:
-    """parameter, value, sigma, and the parameter that it is least told from: `with`, rho. Angles in degrees.
+    """parameter, value, sigma, the parameter that it is least told from: `with`, rho; and unit. Angles in degrees.
 
     Of scanner, cameras and mounts: of all unknowns but the trajectory's.
     """
@@ -69,8 +70,9 @@ def calibration_table(result: StripAdjustment) -> pd.DataFrame:
         other = int(np.argmax(to))
         unit, correlation = 180 / np.pi if label.endswith("_rad") else 1.0, rho[first + k, first + other]
         names = _in_degrees(label), _in_degrees(s.labels[other])
-        rows.append((names[0], unit * value[k], unit * sigma[k], names[1], correlation))
-    return pd.DataFrame(rows, columns=["parameter", "value", "sigma", "with", "rho"])
+        told = label_unit(names[0], result.adjusted.unknowns.interior)
+        rows.append((names[0], unit * value[k], unit * sigma[k], names[1], correlation, told))
+    return pd.DataFrame(rows, columns=["parameter", "value", "sigma", "with", "rho", "unit"])
 
 
 def _in_degrees(label: str) -> str:

@@ -22,18 +22,31 @@ _BY_SIGMA = (
 )  # fmt: skip
 # Those of draws, by their scatter.
 _BY_SD = ("nominal", "mean", "q025", "q50", "q975")
+# Those whose standard deviation, or the largest of several, has another name.
+_BY_OTHERS = {
+    **dict.fromkeys(("column_px", "row_px", "d_column_px", "d_row_px"), ("sigma_px",)),
+    **{f"d{a}_m": (f"sigma_survey_{a}_m", f"sigma_adjusted_{a}_m") for a in "XYZ"},
+    "gap_m": ("sigma_m",),
+}
 # Standard deviations by other names.
-_SIGMAS = ("sd", "predicted_sigma")
-# What is read to so many digits, without a standard deviation of its own.
-_DIGITS = {"w": 3, "detectable": 3, "share": 2, "ratio": 3, "rmse": 3, "max_abs": 3, "factor": 3, "rms_px": 3}
-# What is read to so many places after the point: parts of one, and multiples of a standard deviation.
+_SIGMAS = ("sd", "predicted_sigma", "worst_px")
+# What is read to so many digits, without a standard deviation of its own; names without units.
+_DIGITS = {
+    "w": 3, "w_X": 3, "w_Y": 3, "w_Z": 3, "detectable": 3, "share": 2, "ratio": 3, "rmse": 3, "rms": 3, "fit": 3,
+    "survey": 3, "max_abs": 3, "factor": 3, "time": 10,
+}  # fmt: skip
+# What is read to so many places after the point: parts of one, multiples of a standard deviation, coordinates and
+# angles of which no standard deviation is told.
 _PLACES = {
     "redundancy_number": 2, "largest_share": 3, "inside": 3, "effect_over_sigma": 2, "over_sigma": 2, "c_moves": 2,
     "xp_moves": 2, "yp_moves": 2, "most_moves": 1, "rho": 3, "mean_abs_rho": 3, "max_abs_rho": 3,
+    **dict.fromkeys(("X_m", "Y_m", "Z_m", "E_m", "N_m", "H_m", "height_m", "distance_m"), 4),
+    **dict.fromkeys(("omega_deg", "phi_deg", "kappa_deg", "roll_deg", "pitch_deg", "yaw_deg"), 4),
+    "longitude_deg": 9, "latitude_deg": 9, "column_px": 2, "row_px": 2,
 }  # fmt: skip
-_COORDINATE = re.compile(r"^([XYZENH]|height|longitude|latitude|distance)_(m|deg)$")
 _SPECIAL = {letter: f"\\{letter}" for letter in "&%$#_{}"} | {
-    "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "\\": r"\textbackslash{}",
+    "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "\\": r"\textbackslash{}", "<": r"\textless{}",
+    ">": r"\textgreater{}", "|": r"\textbar{}",
 }  # fmt: skip
 _POWER = re.compile(r"^(-?[\d.]+)e([+-]?\d+)$")
 _PER_MM = re.compile(r"^1/mm(?:\^(\d+))?$")
@@ -52,7 +65,8 @@ def _texts(table: pd.DataFrame, name: str) -> list[str]:
     if name == "parameter":
         # Paths, as of mounts[default].boresight_x_deg and scanner.boresight_up_deg, stay what they are.
         words = [head_of(v) if not re.search(r"[\[.]", v) and without_unit(v)[1] else v for v in column.astype(str)]
-        return [word.partition(" [")[0] for word in words] if "unit" in table else words
+        # Of correlations the unit says nothing; else it may have a column.
+        return [word.partition(" [")[0] for word in words] if {"unit", "rho"} & set(table.columns) else words
     if not pd.api.types.is_float_dtype(column):
         return ["" if pd.isna(v) else _word(v) for v in column.astype(object)]
     if (name.startswith("sigma") and not name.startswith("sigma0")) or name in _SIGMAS:
@@ -61,7 +75,7 @@ def _texts(table: pd.DataFrame, name: str) -> list[str]:
     # What is held is told whole; what nothing is told of, as far as anyone reads it.
     if name == "p_value":
         return ["" if np.isnan(v) else of_p(v) for v in column]
-    digits = 10 if _COORDINATE.match(name) else _DIGITS.get(name, 4) if sigmas is None else 8
+    digits = _DIGITS.get(without_unit(name)[0], 4) if sigmas is None else 8
     form = f".{_PLACES[name]}f" if name in _PLACES else f".{digits}g"
     return [
         "" if np.isnan(v) else with_sigma(v, s) if s > 0 else f"{v:{form}}"
@@ -74,6 +88,8 @@ def _sigmas_of(table: pd.DataFrame, name: str) -> pd.Series | None:
     if name == "mean" and {"rmse", "n"} <= set(table.columns):
         # Of n numbers that scatter by their root mean square.
         return table["rmse"] / np.sqrt(table["n"])
+    if others := [of for of in _BY_OTHERS.get(name, ()) if of in table]:
+        return table[others].max(axis=1)
     own = (
         f"sigma_{name}",
         "sigma" if name in _BY_SIGMA else "",
@@ -126,6 +142,9 @@ def _latex(text: str) -> str:
     if per_mm := _PER_MM.match(text):
         return f"mm$^{{-{per_mm[1] or 1}}}$"
     escaped = "".join(_SPECIAL.get(letter, letter) for letter in text)
+    if escaped.startswith(("[", "*")):
+        # Behind the end of a row they would be its option.
+        escaped = f"{{}}{escaped}"
     return rf"$-${escaped[1:]}" if re.fullmatch(r"-[\d.]+", text) else escaped
 
 

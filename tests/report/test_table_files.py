@@ -146,6 +146,28 @@ def test_the_mean_of_residuals_has_the_digits_that_their_scatter_allows():
     assert list(shown.iloc[0]) == ["400", "-0.00012", "0.002", "0.00912"]
 
 
+def test_what_has_no_sigma_of_its_name_is_neither_cut_nor_endless():
+    """Times of a week, pixels by the sigma of both, places by the larger of two, angles and coordinates of a map."""
+    given = pd.DataFrame(
+        {
+            "time_s": [345678.125], "column_px": [2620.356], "sigma_px": [0.5], "dX_m": [-0.0021123],
+            "sigma_survey_X_m": [0.02], "sigma_adjusted_X_m": [0.3], "w_X": [0.47531], "E_m": [587620.44123456],
+            "kappa_deg": [-139.31234], "rms_m": [0.0989412],
+        }
+    )  # fmt: skip
+    assert readable(given).iloc[0].tolist() == [
+        "345678.125", "2620.36", "0.50", "0.00", "0.020", "0.30", "0.475", "587620.4412", "-139.3123", "0.0989",
+    ]  # fmt: skip
+
+
+def test_names_do_not_break_a_table_of_latex():
+    names = ["[1]", "*a", "a|b<c>d", "50 %_& é"]
+    rows = [line for line in to_latex(pd.DataFrame({"image": names, "n": 1})).splitlines() if line.endswith(r"& 1 \\")]
+    assert [row.removesuffix(r" & 1 \\") for row in rows] == [
+        "{}[1]", "{}*a", r"a\textbar{}b\textless{}c\textgreater{}d", r"50 \%\_\& é",
+    ]  # fmt: skip
+
+
 def test_check_points_are_summed_up_by_axis():
     d = pd.DataFrame({"dX_m": [0.01, -0.03], "dY_m": [0.02, 0.02], "dZ_m": [0.0, np.nan]})
     spread = check_spread(d)
