@@ -174,7 +174,8 @@ def _in_few_sizes(values: Values, s: Structure) -> tuple[Values, Structure]:
         padded = {name: jax.tree.map(longer, getattr(g, name)) for name in names}
         observed.append(replace(g, **padded, pair=np.zeros((0, g.n_rows + more, 4), np.int32)))
         numbers.append(jax.tree.map(longer, own))
-    none, nowhere = np.zeros((2, 0)), np.zeros(0, np.int32)
+    none: Any = np.zeros((2, 0))
+    nowhere = np.zeros(0, np.int32)
     return (
         replace(values, groups=tuple(numbers), xy=none, sigma_xy=none),
         replace(s, observed=tuple(observed), image=nowhere, point=nowhere, labels=()),

@@ -130,6 +130,7 @@ def write_change(found: Change, sets: tuple[Compared, Compared], sensor: Sensor,
         rows_of(parameters),
         *made_section(made),
     ]
+    parts += made_section(made)
     with whole_folder(directory) as work:
         parameters.to_csv(work / "parameters.csv", index=False)
         change_cells(found, sensor).to_csv(work / "cells.csv", index=False)

@@ -18,6 +18,7 @@ from jaxphoto.report.made import Made, made_section, versions
 from jaxphoto.report.maps import draw_format_map
 from jaxphoto.report.plots import axes_or_new, new_figure
 from jaxphoto.report.results import write_summary
+from jaxphoto.report.source_words import assumed_pixels
 from jaxphoto.report.study_page import WholePicture, study_page
 from jaxphoto.stability import ALIGNED
 from jaxphoto.writing import whole_folder
@@ -145,6 +146,7 @@ def write_halves(found: Halves, directory: Path, write_camera: Callable[[Path], 
     picture = WholePicture.of(halves_figure(found), alt)
     parts = (
         *(Paragraph(as_sentence(sentence)) for sentence in verdict[1:]),
+        *assumed_pixels(found.adjusted.block.sensors),
         Heading("Over the format"),
         picture,
         Heading("Cuts"),

@@ -16,6 +16,7 @@ from jaxphoto.report.flight.part import PartReport
 from jaxphoto.report.flight.source import FlightSource
 from jaxphoto.report.ground import ground_findings
 from jaxphoto.report.rolling_shutter import SEEN, readout_of, shutter_findings
+from jaxphoto.report.source_words import assumed_pixels
 from jaxphoto.stability import distortion_curve
 from jaxphoto.statistics.correlation import high_pairs
 
@@ -75,6 +76,7 @@ def camera_section(report: PartReport, source: FlightSource) -> Iterator[Element
         f"{sensor.width_px} x {sensor.height_px} pixels of {1e3 * sensor.pixel_mm:.4g} µm; projection "
         f"{interior.projection.name}, distortion {interior.distortion.name} (docs/models.md). {source.camera_from}"
     )
+    yield from assumed_pixels({name: sensor})
     yield interior_rows(report, source.start)
     if source.start is not None:
         share = 100 * (float(interior.c) / float(source.start.c) - 1)
