@@ -78,6 +78,8 @@ _RECOVERY = (
     "where the model of the adjustment is that of the simulation."
 )
 _LARGEST = 20
+# Cameras of which there are pictures: seven each, a second of work and more.
+_PICTURED = 6
 
 
 def report_page(tables: Tables, verdict: Verdict, made: Made | None = None) -> str:
@@ -114,12 +116,12 @@ def report_page(tables: Tables, verdict: Verdict, made: Made | None = None) -> s
 
 def _sections(tables: Tables) -> Iterator[tuple[str, list[Markup]]]:
     """Headings with what is below them, of what there is."""
-    check = tables.check_points
-    yield "Interior orientation", _interior(tables)
-    if tables.sigma_maps:
-        curves = (html_of(_distortion(tables, camera)) for camera in tables.sigma_maps)
+    check, pictured = tables.check_points, pictured_cameras(tables)
+    yield "Interior orientation", _interior(tables, pictured)
+    if mapped := [camera for camera in tables.sigma_maps if camera in pictured]:
+        curves = (html_of(_distortion(tables, camera)) for camera in mapped)
         yield "Distortion", [_said(_DISTORTION), *curves]
-        yield "How sure the camera is, over its format", [_said(_SIGMA_MAP), *_sigma_maps(tables)]
+        yield "How sure the camera is, over its format", [_said(_SIGMA_MAP), *_sigma_maps(tables, mapped)]
     if tables.truth:
         interior = tables.recovery[tables.recovery["parameter"].str.startswith("interior[")]
         yield (
@@ -129,7 +131,7 @@ def _sections(tables: Tables) -> Iterator[tuple[str, list[Markup]]]:
     if len(tables.georeferencing):
         yield "Mounts and strips", [_html(tables.georeferencing)]
     yield "Block", [html_of(BlockInSpace(tables))]
-    yield "Residuals", _residuals(tables)
+    yield "Residuals", _residuals(tables, pictured)
     _, *points = points_section(tables)
     yield "Object points", [html_of(element) for element in points]
     if len(check):
@@ -149,12 +151,28 @@ def _sections(tables: Tables) -> Iterator[tuple[str, list[Markup]]]:
         yield "Convergence", [html_of(element) for element in steps]
 
 
-def _interior(tables: Tables) -> list[Markup]:
+def pictured_cameras(tables: Tables) -> list[str]:
+    """The cameras that pictures are of: all, or of many those with the most image points."""
+    block, structure = tables.adjusted.block, tables.adjusted.structure
+    cameras, of_image = list(tables.adjusted.unknowns.interior), np.array(block.image_camera)
+    seen = np.bincount(structure.image, minlength=len(of_image))
+    most = sorted(cameras, key=lambda camera: -int(seen[of_image == camera].sum()))[:_PICTURED]
+    return [camera for camera in cameras if camera in most]
+
+
+def _interior(tables: Tables, pictured: list[str]) -> list[Markup]:
     table = tables.interior
     alt = "correlations of the interior orientation with itself and with the exterior one"
-    used = [c for c, corr in tables.correlations.items() if corr.parameters and corr.images]
+    used = [c for c, corr in tables.correlations.items() if c in pictured and corr.parameters and corr.images]
     pictures = [_wide(_picture(correlation_figure(tables, c), alt)) for c in used]
-    reach = [_said(_reach(tables, camera)) for camera in tables.adjusted.unknowns.interior]
+    reach = [_said(_reach(tables, camera)) for camera in pictured]
+    if (n := len(tables.adjusted.unknowns.interior)) > len(pictured):
+        reach.append(
+            _said(
+                f"Pictures are of {len(pictured)} of {n} cameras, those with the most image points: "
+                f"{', '.join(pictured)}. Tables have all; in Python plot_residuals and others draw any of them."
+            )
+        )
     assumed = map(html_of, assumed_pixels(tables.adjusted.block.sensors))
     return [_html(table[table["sigma"].notna() | (table["value"] != 0)]), *assumed, *reach, *pictures]
 
@@ -176,24 +194,25 @@ def _reach(tables: Tables, camera: str) -> str:
     )
 
 
-def _sigma_maps(tables: Tables) -> Iterator[Markup]:
-    for camera, maps in tables.sigma_maps.items():
-        words = sigma_map_words(tables.adjusted.block.sensors[camera], maps)
+def _sigma_maps(tables: Tables, mapped: list[str]) -> Iterator[Markup]:
+    for camera in mapped:
+        words = sigma_map_words(tables.adjusted.block.sensors[camera], tables.sigma_maps[camera])
         yield _said(as_sentence(words))
         yield _wide(_picture(sigma_map_figure(tables, camera), words))
 
 
-def _residuals(tables: Tables) -> list[Markup]:
+def _residuals(tables: Tables, pictured: list[str]) -> list[Markup]:
     figures = [
         _picture(figure(tables, c), f"{what} of {camera_words(c)} over its format")
-        for c in tables.adjusted.unknowns.interior
+        for c in pictured
         for figure, what in ((residuals_figure, "image residuals"), (mean_residuals_figure, "mean image residuals"))
     ]
     panels = [
         DocumentPicture(
             partial(draw_residuals_by_radius, tables=tables, camera=c), f"residuals of {camera_words(c)} by distance"
         )
-        for c in tables.sigma_maps
+        for c in pictured
+        if c in tables.sigma_maps
     ]
     if len(tables.adjusted.block.stations.who):
         panels.append(DocumentPicture(partial(draw_station_residuals, tables=tables), "residuals of stations by time"))
