@@ -19,6 +19,7 @@ from jaxphoto.io import read_block
 from jaxphoto.io.draws_folder import check_place
 from jaxphoto.procedures import adjust
 from jaxphoto.report.draws import LONG, write_draws_page
+from jaxphoto.report.table_files import readable
 from jaxphoto.sensitivity import PER, Bias, Readjustment, bias, check_draws, noise
 
 _KINDS = (*PER, "noise")
@@ -90,10 +91,10 @@ def monte_carlo_command(
     )
     heads = Column("quantity", overflow="fold"), "unit", "nominal", "mean", "sd", "predicted sigma", "ratio"
     shown = Table(*heads, title="estimates over the draws")
-    shown_numbers = ["nominal", "mean", "sd", "predicted_sigma", "ratio"]
-    for name, unit, *numbers in table[["quantity", "unit", *shown_numbers]].itertuples(index=False):
-        if not str(name).startswith(("bias.", *LONG)):
-            shown.add_row(str(name), str(unit), *(f"{float(v):.5g}" for v in numbers))
+    few = table[~table["quantity"].astype(str).str.startswith(("bias.", *LONG))]
+    columns = ["quantity", "unit", "nominal", "mean", "sd", "predicted_sigma", "ratio"]
+    for row in readable(few[columns]).itertuples(index=False):
+        shown.add_row(*row)
     output.screen.print(shown)
     output.wrote(out, f"results in {out} (open report.html)")
 

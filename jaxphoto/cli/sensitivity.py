@@ -6,6 +6,7 @@ from typing import Annotated, get_args
 
 import numpy as np
 import typer
+from rich.table import Column, Table
 
 import jaxphoto
 from jaxphoto.cli.choices import one_of
@@ -15,7 +16,9 @@ from jaxphoto.cli.output import Output, command
 from jaxphoto.errors import InputError
 from jaxphoto.io import read_block
 from jaxphoto.procedures import adjust_for_tables
+from jaxphoto.report.digits import in_figures
 from jaxphoto.report.sensitivity import SensitivityTables, write_sensitivity
+from jaxphoto.report.terminal import plain
 from jaxphoto.sensitivity.influence import DELTA0, Per
 from jaxphoto.writing import check_folder
 
@@ -50,12 +53,11 @@ def sensitivity_command(
         order = ("compile", "solve", "covariance", "sensitivity")
         write_sensitivity(tables, out, seconds | {name: adjusted.seconds[name] for name in order}, made)
     print_judgement(adjusted, output)
-    output.screen.print(
-        f"largest changes by a station bias of {bias_m:g} m per {per}: exact, of its sigma, first-order"
-    )
-    for row in largest.head(_SHOWN).itertuples(index=False):
-        output.screen.print(
-            f"  {row.estimate}: {row.exact:.3g} {row.estimate_unit}, {row.over_sigma:.2f}, {row.first_order:.3g} "
-            f"(stations of {row.unit} in {row.axis})"
-        )
+    heads = Column("estimate", overflow="fold"), "exact", "in sigmas", "first-order", "by stations of"
+    shown = Table(*heads, title=f"largest changes by a station bias of {bias_m:g} m per {per}")
+    columns = ["estimate", "estimate_unit", "exact", "over_sigma", "first_order", "unit", "axis"]
+    for name, unit, exact, over, first, per_unit, axis in largest[columns].head(_SHOWN).itertuples(index=False):
+        moved = [f"{in_figures(float(v), 3)} {unit}" for v in (exact, first)]
+        shown.add_row(plain(str(name)), moved[0], f"{over:.2f}", moved[1], plain(f"{per_unit} in {axis}"))
+    output.screen.print(shown)
     output.wrote(out, f"results in {out} (open report.html)")

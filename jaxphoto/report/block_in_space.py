@@ -18,16 +18,20 @@ if TYPE_CHECKING:
     from plotly.graph_objects import Figure
 
 # Points that a browser turns smoothly, and pyramids.
-_POINTS, _PYRAMIDS = 10_000, 500
+_POINTS, _PYRAMIDS = 5_000, 500
 # Of more images pyramids and offsets hide the rest: they are shown when the legend is asked for them.
 _CROWDED = 150
 # Ellipsoids of stations and tie points, each; control and check points have theirs besides.
-_ELLIPSOIDS = 150
+_ELLIPSOIDS = 80
+# Ellipsoids so many times longer than the median one would hide the block, and stand far out of it.
+_LONGEST = 10.0
 # Drawn lengths, as parts of the extent of the block: of the median ellipsoid's longest axis, and of an rms offset.
 _AXIS, _OFFSET = 0.015, 0.05
 # Coordinates beyond this are shown less a round number: WebGL has seven digits.
 _FAR, _ROUND = 1e4, 1e3
 _MOST = 1e30
+# What fits into the picture, seen from the usual place, in sides of plotly's box.
+_WIDE, _HIGH = 2.1, 1.3
 # Colours that those who see no red or green tell apart, on light and dark paper (Okabe and Ito 2008).
 _GREY, _BLUE, _RED, _GREEN, _PURPLE, _SKY = "#8a8f96", "#2f8fd0", "#d55e00", "#009e73", "#cc79a7", "#56b4e9"
 
@@ -51,8 +55,12 @@ def block_in_space(source: Block | Adjustment, covariance: Covariance | None = N
         if covariance is not None:
             traces += _ellipsoid_traces(covariance, places, origin)
     axes = zip(AXES, origin, strict=True)
-    shown = {f"{a.lower()}axis": {"title": {"text": _axis_title(a, v)}, "showbackground": False} for a, v in axes}
-    camera = {"eye": {"x": 0.4, "y": -1.7, "z": 1.1}, "center": {"x": 0, "y": 0, "z": -0.15}}
+    # Each text on an axis takes as long to draw as a thousand points.
+    common = {"showbackground": False, "nticks": 6}
+    shown = {f"{a.lower()}axis": {"title": {"text": _axis_title(a, v)}, **common} for a, v in axes}
+    far = _far(traces)
+    eye = {"x": 0.4 * far, "y": -1.7 * far, "z": 1.1 * far}
+    camera = {"eye": eye, "center": {"x": 0, "y": 0, "z": -0.15}}
     layout = {
         "scene": {"aspectmode": "data", "camera": camera, **shown},
         "legend": {"orientation": "h", "yanchor": "top", "y": 0, "itemsizing": "constant"},
@@ -67,6 +75,19 @@ def origin_of(places: BlockPlaces) -> Float[np.ndarray, 3]:
     known = known[np.isfinite(known).all(axis=1)]
     middle = np.median(known, axis=0) if len(known) else np.zeros(3)
     return np.where(np.abs(middle) > _FAR, np.round(middle / _ROUND) * _ROUND, 0.0)
+
+
+def _far(traces: list[dict[str, Any]]) -> float:
+    """How much farther off than usual the eye has to be, so that all of what is high or long is in the picture."""
+    shown = [np.stack([t[a] for a in "xyz"], axis=1) for t in traces if t.get("visible", True) is True]
+    at = np.concatenate([np.zeros((0, 3)), *shown])
+    at = at[np.isfinite(at).all(axis=1)]
+    if not len(at):
+        return 1.0
+    size = np.maximum(np.ptp(at, axis=0), 1e-6)
+    # plotly draws a box of these sides, whose volume is one; the eye looks down by 32 degrees.
+    x, y, z = size / np.cbrt(size.prod())
+    return float(max(1.0, x / _WIDE, (0.85 * z + 0.53 * y) / _HIGH))
 
 
 def drawable(at: np.ndarray) -> np.ndarray:
@@ -138,12 +159,16 @@ def _ellipsoid_traces(covariance: Covariance, places: BlockPlaces, origin: np.nd
     longest = np.sqrt(np.maximum(np.linalg.eigvalsh(matrix)[:, -1], 0.0)) if np.isfinite(matrix).all() else np.zeros(0)
     if not (longest > 0).any():
         return []
-    factor = _round_factor(_AXIS * places.extent / float(np.median(longest[longest > 0])))
-    at, triangles = ellipsoid_mesh(centre[longest > 0], matrix[longest > 0] * factor**2)
+    median = float(np.median(longest[longest > 0]))
+    factor = _round_factor(_AXIS * places.extent / median)
+    drawn = (longest > 0) & (longest <= _LONGEST * median)
+    larger = int((longest > _LONGEST * median).sum())
+    at, triangles = ellipsoid_mesh(centre[drawn], matrix[drawn] * factor**2)
     i, j, k = triangles.T
+    without = f" ({larger} without end or too large to show)" if larger else ""
     mesh = {
         "type": "mesh3d", "i": i, "j": j, "k": k, "color": _SKY, "opacity": 0.45, "hoverinfo": "skip",
-        "name": f"error ellipsoids, {factor:,.0f} times", "showlegend": True, "flatshading": False,
+        "name": f"error ellipsoids, {factor:,.0f} times{without}", "showlegend": True, "flatshading": False,
     }  # fmt: skip
     return [mesh | _xyz(at)]
 

@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from jaxphoto.camera import Sensor
+from jaxphoto.report.digits import of_p, of_sigma, with_sigma
 from jaxphoto.report.document import Heading, Paragraph, rows_of
 from jaxphoto.report.findings import p_words
 from jaxphoto.report.made import Made, made_section, versions
@@ -107,9 +108,9 @@ def print_change(found: Change, sets: tuple[Compared, Compared], sensor: Sensor,
         table = Table("parameter", "A", "B", "B - A", "sigma", "unit", "p")
         for one in found.parameters:
             if one.sigma > 0 or one.first or one.second:
-                p = f"{one.p_value:.2g}" if one.sigma > 0 else "held"
-                values = (f"{one.first:.8g}", f"{one.second:.8g}", f"{one.difference:.3g}", f"{one.sigma:.3g}")
-                table.add_row(one.parameter, *values, one.unit, p)
+                p = of_p(one.p_value) if one.sigma > 0 else "held"
+                values = (with_sigma(v, one.sigma) for v in (one.first, one.second, one.difference))
+                table.add_row(one.parameter, *values, of_sigma(one.sigma), one.unit, p)
         console.print(table)
     for sentence in change_verdict(found, sensor):
         console.print(sentence, soft_wrap=True)
@@ -130,7 +131,6 @@ def write_change(found: Change, sets: tuple[Compared, Compared], sensor: Sensor,
         rows_of(parameters),
         *made_section(made),
     ]
-    parts += made_section(made)
     with whole_folder(directory) as work:
         parameters.to_csv(work / "parameters.csv", index=False)
         change_cells(found, sensor).to_csv(work / "cells.csv", index=False)

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 # Rows and ticks that are still read.
 _SHOWN = 40
+# Ratio of sigmas naught from which on powers of ten are what they are read by.
+_MUCH = 3.0
 
 
 def convergence_words(adjusted: Adjustment) -> str:
@@ -53,9 +55,15 @@ def convergence_section(adjusted: Adjustment) -> Iterator[Element]:
 
 
 def draw_sigma_naught(axes: Axes, adjusted: Adjustment) -> None:
-    """Sigma naught before each step and at the end, on a logarithmic axis."""
+    """Sigma naught before each step and at the end, on a logarithmic axis where it changes by much."""
     sigma0 = convergence_table(adjusted)["sigma0"].to_numpy(float)
-    axes.semilogy(np.arange(len(sigma0)), sigma0, "o-", ms=4, color="tab:blue")
+    axes.plot(np.arange(len(sigma0)), sigma0, "o-", ms=4, color="tab:blue")
+    low, high = np.nanmin(sigma0), np.nanmax(sigma0)
+    if high > _MUCH * low:
+        axes.set_yscale("log")
+    else:
+        # No finer than sigma naught is read.
+        axes.set_ylim(min(low, 0.98 * high), max(high, 1.02 * low))
     axes.set(xlabel="steps taken", ylabel="sigma naught")
     axes.set_title("sigma naught", loc="left", fontsize=9)
     axes.locator_params(axis="x", integer=True)

@@ -1,6 +1,7 @@
 """Numbers with as many digits as their standard deviations have a use for."""
 
 import math
+from collections.abc import Iterable
 
 # From here on a number is written without a power of ten, as by Python's "g".
 _LEAST = 1e-4
@@ -33,3 +34,20 @@ def of_sigma(sigma: float) -> str:
 def of_p(p_value: float, digits: int = 2) -> str:
     """A p-value; what is too small for a number is no zero."""
     return f"{p_value:.{digits}g}" if p_value > 0 else "< 1e-300"
+
+
+def in_figures(value: float, figures: int) -> str:
+    """A number in so many figures, its last zeros too: 0.00350 beside 0.00286; zero is 0."""
+    return f"{value:#.{figures}g}".replace(".e", "e").rstrip(".") if value else "0"
+
+
+def alike(values: Iterable[float], most: int) -> list[str]:
+    """Numbers of one column in as many figures as the longest of them has, and no more than `most`."""
+    told = [f"{v:.{most}g}" for v in values]
+    figures = max((_figures(said) for said in told), default=most)
+    return [in_figures(float(said), figures) for said in told]
+
+
+def _figures(said: str) -> int:
+    """Of a number as "g" writes it: 3 of 0.00286, 2 of 20."""
+    return len(said.partition("e")[0].lstrip("-").replace(".", "").lstrip("0"))

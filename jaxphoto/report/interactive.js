@@ -359,11 +359,13 @@
     dark.addEventListener("change", () => twinsFrom(text).forEach((twin, k) => shown(twin, places[k])));
   };
 
-  let library = null;
+  let loaded = null;
+  // plotly, once. Reading five megabytes of it takes longer than anything else that a figure waits for.
   const plotly = () => {
-    library ??= unpacked(document.getElementById("plotly")).then((text) =>
-      document.head.append(made("script", { textContent: text })));
-    return library;
+    loaded ??= unpacked(document.getElementById("plotly")).then((textContent) => {
+      document.head.append(made("script", { textContent }));
+    });
+    return loaded;
   };
 
   // When it comes into sight: a page is there to be read before its figures are drawn.
@@ -375,6 +377,9 @@
       await draw(figure);
     }, { rootMargin: "300px" });
     observer.observe(figure);
+    // While somebody reads the verdict.
+    const whenIdle = window.requestIdleCallback ?? ((task) => setTimeout(task, 1000));
+    addEventListener("load", () => whenIdle(plotly));
   };
 
   const block = document.querySelector("figure.block"), canDraw = Boolean(window.DecompressionStream);

@@ -27,6 +27,8 @@ _MOST = 600_000
 _STEPS = np.iinfo(np.int16).max
 # What the script, and a page that is put together, know figures by.
 _LIVE = "live-figure"
+# Residuals are shown to a hundredth of a pixel: half of that is fine enough, and packs better than noise.
+_FINE_PX = 0.005
 
 
 def live_block(adjusted: Adjustment, covariance: Covariance, still: str, alt: str) -> Markup:
@@ -78,10 +80,11 @@ def measurements(adjusted: Adjustment) -> dict:
     cameras = list(block.sensors)
     origin = origin_of(places)
     steps: dict[str, Any] = {}
-    for name, of in (("xy", xy), ("v", v)):
+    fine = _FINE_PX * min(sensor.pixel_mm for sensor in block.sensors.values())
+    for name, of, least in (("xy", xy, 0.0), ("v", v, fine)):
         # Where an adjustment diverged, residuals are no numbers.
         finite = np.where(np.isfinite(of), of, 0.0)
-        step = float(np.abs(finite).max(initial=0.0)) / _STEPS or 1.0
+        step = max(float(np.abs(finite).max(initial=0.0)) / _STEPS, least) or 1.0
         steps |= {name: _array(np.round(finite.T / step), "i2"), f"{name}_step_mm": step}
     return {
         "images": list(block.images),

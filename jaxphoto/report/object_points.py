@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
+from jaxphoto.report.digits import of_sigma
 from jaxphoto.report.document import DocumentPicture, Element, Heading, Paragraph, Pictures, Rows
 from jaxphoto.report.plots import log_ticks
 from jaxphoto.report.tables import Tables
@@ -59,7 +60,7 @@ def points_section(tables: Tables, unit: str = "m") -> Iterator[Element]:
 
 
 def _row(of: pd.DataFrame, n: int) -> tuple[str, ...]:
-    sigmas = (f"{of[f'sigma_{axis}_m'].median():.3g}" for axis in "XYZ")
+    sigmas = (of_sigma(of[f"sigma_{axis}_m"].median()) for axis in "XYZ")
     return str(len(of)), f"{100 * len(of) / n:.1f} %", f"{of['angle_deg'].median():.1f}", *sigmas
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from jaxphoto.errors import InputError
-from jaxphoto.report.digits import of_p, of_sigma, with_sigma
+from jaxphoto.report.digits import alike, of_p, of_sigma, with_sigma
 from jaxphoto.report.units import without_unit
 
 # Columns whose numbers are as sure as the column `sigma` of the same row says.
@@ -75,12 +75,14 @@ def _texts(table: pd.DataFrame, name: str) -> list[str]:
     # What is held is told whole; what nothing is told of, as far as anyone reads it.
     if name == "p_value":
         return ["" if np.isnan(v) else of_p(v) for v in column]
-    digits = _DIGITS.get(without_unit(name)[0], 4) if sigmas is None else 8
-    form = f".{_PLACES[name]}f" if name in _PLACES else f".{digits}g"
-    return [
-        "" if np.isnan(v) else with_sigma(v, s) if s > 0 else f"{v:{form}}"
-        for v, s in zip(column, np.full(len(table), np.nan) if sigmas is None else sigmas, strict=True)
-    ]
+    form = f".{_PLACES[name]}f" if name in _PLACES else ".8g"
+    if sigmas is not None:
+        own = zip(column, sigmas, strict=True)
+        return ["" if np.isnan(v) else with_sigma(v, s) if s > 0 else f"{v:{form}}" for v, s in own]
+    if name in _PLACES:
+        return ["" if np.isnan(v) else f"{v:{form}}" for v in column]
+    told = iter(alike(column.dropna(), _DIGITS.get(without_unit(name)[0], 4)))
+    return ["" if np.isnan(v) else next(told) for v in column]
 
 
 def _sigmas_of(table: pd.DataFrame, name: str) -> pd.Series | None:

@@ -7,7 +7,7 @@ from rich.text import Text
 
 from jaxphoto.errors import printable
 from jaxphoto.report.check_points import check_spread
-from jaxphoto.report.digits import of_p, of_sigma, with_sigma
+from jaxphoto.report.digits import in_figures, of_p, of_sigma, with_sigma
 from jaxphoto.report.findings import MARKS, Level, Verdict
 from jaxphoto.report.recovery import recovery_spread
 from jaxphoto.report.tables import Tables
@@ -70,7 +70,9 @@ def print_adjustment(tables: Tables, verdict: Verdict, console: Console) -> None
         console.print(table)
     spread = Table("group", "axis", "n", "RMSE", "maximum", "unit", title="residuals")
     for v in residual_spread(adjusted):
-        spread.add_row(v.group, v.axis, str(v.n), f"{v.rmse:.3g}", f"{v.max_abs:.3g}", v.unit)
+        spread.add_row(
+            v.group.replace("_", " "), v.axis, str(v.n), in_figures(v.rmse, 3), in_figures(v.max_abs, 3), v.unit
+        )
     console.print(spread)
     if len(tables.check_points):
         console.print(_check_points(tables))
@@ -90,7 +92,7 @@ def _check_points(tables: Tables) -> Table:
             off, sigma = points[f"d{axis}_m"].to_numpy(), points[f"sigma_d{axis}_m"].to_numpy()
             farthest = plain(str(points["point"].iloc[np.nanargmax(np.abs(off))]))
             ratio = np.sqrt(np.nanmean((off / sigma) ** 2))
-            shown.add_row(axis, str(n), *(f"{v:.3g}" for v in (mean, rmse, most)), farthest, f"{ratio:.2g}")
+            shown.add_row(axis, str(n), *(in_figures(v, 3) for v in (mean, rmse, most)), farthest, f"{ratio:.2f}")
     return shown
 
 

@@ -13,6 +13,7 @@ import pytest
 
 from jaxphoto import Tables
 from jaxphoto.report import block_in_space, page_head, report_page, verdict_of
+from jaxphoto.report.block_in_space import _far
 from jaxphoto.report.block_places import places_of, pyramids
 from jaxphoto.report.document import BlockInSpace, Document, Heading, Paragraph, Rows
 from jaxphoto.report.document_html import html_of, html_page
@@ -122,7 +123,22 @@ def test_the_page_holds_every_residual(tables, page):
     own = slice(first[image], first[image + 1])
     np.testing.assert_array_equal(point[own], a.structure.point[mine])
     residual = (np.asarray(a.residuals.image) * np.asarray(a.values.sigma_xy)).T
-    np.testing.assert_allclose(v[own], residual[mine], atol=np.abs(residual).max() / 60_000)
+    pixel_mm = next(iter(a.block.sensors.values())).pixel_mm
+    np.testing.assert_allclose(v[own], residual[mine], atol=max(0.0026 * pixel_mm, np.abs(residual).max() / 60_000))
+
+
+def test_the_eye_goes_back_from_what_is_high_or_long_and_no_ellipsoid_hides_the_block(tables):
+    def eye(size):
+        at = np.diag(np.asarray(size, float))
+        return _far([dict(zip("xyz", at, strict=True))])
+
+    assert eye([3000, 3000, 1000]) == 1 and eye([5, 2, 12]) > 1.3 and eye([20_000, 500, 300]) > 3
+    assert eye(np.zeros(3)) >= 1 and _far([]) == 1
+    points = np.array(tables.covariance.points)
+    points[:2] *= 1e6
+    wild = eqx.tree_at(lambda c: c.points, tables.covariance, points)
+    names = [trace.name for trace in block_in_space(tables.adjusted, wild).data]
+    assert any("without end or too large to show" in name for name in names)
 
 
 def test_of_very_many_image_points_a_part_is_held(tables, monkeypatch):

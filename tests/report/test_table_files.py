@@ -11,7 +11,7 @@ from jaxphoto.camera import Brown, InteriorOrientation, OpenCv, parameter_unit
 from jaxphoto.io import read_result_tables
 from jaxphoto.report import to_latex, to_markdown, write_tables
 from jaxphoto.report.check_points import check_spread
-from jaxphoto.report.digits import of_sigma, with_sigma
+from jaxphoto.report.digits import alike, of_sigma, with_sigma
 from jaxphoto.report.table_files import head_of, readable
 from jaxphoto.report.units import column_unit, label_unit
 from tests.blocks import adjusted
@@ -38,6 +38,13 @@ FEW = ["interior", "exterior", "check_points"]
 )
 def test_a_number_ends_at_the_second_digit_of_its_sigma(value, sigma, text, sigma_text):
     assert (with_sigma(value, sigma), of_sigma(sigma)) == (text, sigma_text)
+
+
+def test_a_column_has_as_many_figures_in_each_row():
+    assert alike([0.0035, 0.002861, -0.0129], 3) == ["0.00350", "0.00286", "-0.0129"]
+    assert alike([1e-08, 4e-10, 0.0], 4) == ["1e-08", "4e-10", "0"] and alike([20.0, 3.5], 4) == ["20", "3.5"]
+    shown = readable(pd.DataFrame({"rmse": [0.4, np.nan, 0.188], "X_m": [1234.5678, 0.5, 2.0]}))
+    assert shown["rmse"].tolist() == ["0.400", "", "0.188"] and shown["X_m"].tolist() == ["1234.5678", "0.5", "2"]
 
 
 def test_yes_and_no_are_no_numbers():
