@@ -167,7 +167,7 @@ def read_csv(
     text: Sequence[str] = (),
     without: Container[int] = (),
 ) -> Table:
-    """A CSV with a header: separated by commas, or by semicolons (then decimal commas are read too).
+    """A CSV with a header: separated by commas, or by semicolons or tabs (then decimal commas are read too).
 
     Lines that start with `#` and empty lines are passed over, blanks around a cell are stripped, a byte order mark
     and any line ends are accepted. Columns in neither list are left out, with a UserWarning. A comma in the columns
@@ -178,7 +178,7 @@ def read_csv(
     lines, rows = content_lines(path, without)
     if not lines:
         raise InputError(f"{path.name}: the file is empty; give it a header with the columns {', '.join(needed)}")
-    separator = ";" if ";" in lines[0] else ","
+    separator = ";" if ";" in lines[0] else "\t" if "\t" in lines[0] and "," not in lines[0] else ","
     header = [name.strip() for name in _record(path, lines[0], rows[0], separator)]
     for name, count in collections.Counter(header).items():
         if name and count > 1:
@@ -200,7 +200,7 @@ def read_csv(
                 # Ids come again and again: each is kept once.
                 parts[name].append(_objects([named[name].setdefault(cell, cell) for cell in cells]))
             else:
-                plain = [cell.replace(",", ".") for cell in cells] if separator == ";" else cells
+                plain = [cell.replace(",", ".") for cell in cells] if separator != "," else cells
                 parts[name].append(np.array(plain, _PACKED))
     columns = {name: np.concatenate(several) if several else _objects([]) for name, several in parts.items()}
     return _of_short_cells(Table.of(path.name, columns, np.array(rows[1:], int)))

@@ -44,15 +44,23 @@ def read_whole(path: Path, most: int) -> bytes:
     return content
 
 
+# What archives begin with: ZIP, as which spreadsheets keep their workbooks, and that of older ones.
+_WORKBOOK = (b"PK\x03\x04", b"\xd0\xcf\x11\xe0")
+
+
 def read_text(path: Path, most: int) -> str:
     """The text of a file of at most `most` bytes, without byte order mark. Raises as `read_whole`, and for no UTF-8."""
     content = read_whole(path, most)
+    if content.startswith(_WORKBOOK):
+        raise InputError(f"{path.name} is a workbook (xlsx, ods) or another archive; save the sheet as CSV, UTF-8")
     try:
         # Any line ends, as everywhere.
         return content.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
     except UnicodeDecodeError as error:
         row = error.object[: error.start].count(b"\n") + 1
-        raise InputError(f"{path.name}, row {row}: the text is not UTF-8; save the file as UTF-8") from None
+        raise InputError(
+            f"{path.name}, row {row}: the text is not UTF-8; save the file as UTF-8 (in a spreadsheet: CSV UTF-8)"
+        ) from None
 
 
 def has_words(path: Path, *words: str) -> bool:

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 
 import pandas as pd
 
+from jaxphoto.report.findings import symbol
 from jaxphoto.statistics import Correlations, GroundCorrelations
 from jaxphoto.statistics.ground import FORMS
 
@@ -30,3 +31,10 @@ def correlation_ground_table(correlations: Mapping[str, GroundCorrelations]) -> 
             own = zip((*g.parameters, "all"), (*g.rho[k], g.together[k]), strict=True)
             rows += [(camera, form, g.sigma_m[k], parameter, rho) for parameter, rho in own]
     return pd.DataFrame(rows, columns=["camera", "ground", "sigma_m", "parameter", "rho"])
+
+
+def side_by_side(table: pd.DataFrame, rows: list[str], column: str, value: str) -> pd.DataFrame:
+    """For a reader: the parameters of `column` beside one another, as text; a camera that is alone is not named."""
+    told = table.assign(**{column: table[column].map(symbol), value: table[value].map("{:.3f}".format)})
+    wide = told.pivot_table(value, rows, column, aggfunc="first", sort=False).fillna("").reset_index()
+    return wide if len(wide["camera"].unique()) > 1 else wide.drop(columns="camera")

@@ -15,6 +15,7 @@ from jaxphoto.errors import camera_words
 from jaxphoto.report.certificate_figures import draw_band, draw_curve
 from jaxphoto.report.check_points import check_spread
 from jaxphoto.report.convergence import convergence_section
+from jaxphoto.report.correlation_tables import side_by_side
 from jaxphoto.report.document import (
     BlockInSpace,
     DocumentPicture,
@@ -77,6 +78,10 @@ _RECOVERY = (
     "Estimate minus truth in standard deviations (recovery.csv): about 1 in the root mean square, and 5 % beyond 2, "
     "where the model of the adjustment is that of the simulation."
 )
+_LARGEST_RHO = (
+    "The largest correlation over the images, without its sign; the means are in the picture of the interior "
+    "orientation, and both in correlation_summary.csv."
+)
 _LARGEST = 20
 # Cameras of which there are pictures: seven each, a second of work and more.
 _PICTURED = 6
@@ -136,16 +141,19 @@ def _sections(tables: Tables) -> Iterator[tuple[str, list[Markup]]]:
     yield "Object points", [html_of(element) for element in points]
     if len(check):
         accuracy = [_said(s) for s in accuracy_sentences(tables.tested_accuracy)]
-        picture = _picture(check_points_figure({"": tables}), "discrepancies at check points")
+        picture = _wide(_picture(check_points_figure({"": tables}), "discrepancies at check points"))
         body = [_html(check_spread(check)), *accuracy, _html(tables.positional_accuracy), picture, _html(check)]
         yield "Check points: surveyed minus computed", body
     ellipses = _picture(ellipses_figure(tables), "error ellipses of the projection centres in plan")
     yield "Exterior orientation", [ellipses, _html(tables.exterior)]
     # What is held moves with nothing.
     if len(summary := tables.correlation_summary):
-        yield "Correlation of exterior and interior orientation over the images", [_html(summary)]
+        largest = side_by_side(summary, ["camera", "exterior"], "interior", "max_abs_rho")
+        yield "Correlation of exterior and interior orientation over the images", [_said(_LARGEST_RHO), _html(largest)]
     ground = tables.correlation_ground
     if len(ground := ground[ground["sigma_m"] > 0]):
+        ground = ground.assign(ground=ground["ground"].str.replace("_", " "))
+        ground = side_by_side(ground, ["camera", "ground", "sigma_m"], "parameter", "rho")
         yield "Correlation of the interior orientation and the ground as a whole", [_html(ground)]
     if steps := list(convergence_section(tables.adjusted))[1:]:
         yield "Convergence", [html_of(element) for element in steps]

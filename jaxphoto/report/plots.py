@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxphoto.camera import Sensor
 from jaxphoto.errors import InputError, camera_words, printable
+from jaxphoto.report.findings import symbol
 from jaxphoto.report.tables import Tables
 
 if TYPE_CHECKING:
@@ -233,8 +234,8 @@ def draw_exterior_correlation(axes: Axes, tables: Tables, camera: str) -> None:
 def heat_map(axes: Axes, values: np.ndarray, rows: Sequence[str], columns: Sequence[str], title: str) -> None:
     """Correlations `values` of `rows` with `columns`, in colours and numbers."""
     axes.imshow(values, vmin=-1, vmax=1, cmap="RdBu_r", aspect="auto")
-    axes.set_xticks(range(len(columns)), list(map(drawn, columns)), rotation=45, ha="right", fontsize=8)
-    axes.set_yticks(range(len(rows)), list(map(drawn, rows)), fontsize=8)
+    axes.set_xticks(range(len(columns)), [drawn(symbol(name)) for name in columns], rotation=45, ha="right", fontsize=8)
+    axes.set_yticks(range(len(rows)), [drawn(symbol(name)) for name in rows], fontsize=8)
     # No minus sign before zeros.
     shown = np.round(values, 2) + 0.0
     for i, j in np.ndindex(values.shape):

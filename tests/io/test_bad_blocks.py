@@ -23,6 +23,7 @@ CASES = {
     "decimal commas": ([(S, "10.0,0.0,100.0,", "10,0,0,0,100,0,")], ["stations.csv, row 3", "remove", "semicolons"]),
     "open quotation": ([(S, "b,10.0", '"b,10.0')], ["stations.csv, row 3", "quotation", "close"]),
     "not UTF-8": ([(S, "b,10.0", "\udcff,10.0")], ["stations.csv, row 3", "UTF-8", "save"]),
+    "workbook": ([(S, "", "PK\x03\x04\n")], ["stations.csv", "workbook", "save the sheet"]),
     # numbers
     "no number": ([(P, "1.15,0.2", "l.15,0.2")], ["image_points.csv, row 8", "l.15", "write it like"]),
     "underscore": ([(P, "1.15,0.2", "1_15,0.2")], ["image_points.csv, row 8", "1_15", "write it like"]),
@@ -170,6 +171,16 @@ def test_bad_input_is_refused(write_folder, name):
 def test_no_folder(tmp_path):
     with pytest.raises(InputError, match=r"no folder .*nowhere; give the folder"):
         read_block(tmp_path / "nowhere")
+
+
+def test_what_lies_there_instead_of_a_table_is_named(write_folder):
+    folder = write_folder()
+    (folder / I).rename(folder / "Images.xlsx")
+    with pytest.raises(InputError, match=r"no file images\.csv; there is Images\.xlsx: save it as images\.csv"):
+        read_block(folder)
+    (folder / I).mkdir()
+    with pytest.raises(InputError, match=r"no file images\.csv; what is called so is a folder"):
+        read_block(folder)
 
 
 def test_content_and_fit_are_different_errors(write_folder):

@@ -133,14 +133,14 @@ def test_pixels(write_folder):
 @pytest.mark.parametrize("end", ["\n", "\r\n"])
 @pytest.mark.parametrize("mark", ["", "\ufeff"])
 def test_spellings_of_a_spreadsheet(write_folder, end, mark):
-    """Semicolons with decimal commas, a byte order mark, Windows line ends, blanks, another order of columns."""
+    """Semicolons or tabs with decimal commas, a byte order mark, Windows line ends, blanks, another order."""
     folder = write_folder()
     expected = read_block(folder)
-    for name in ("image_points", "control_points"):
+    for name, between in (("image_points", " ; "), ("control_points", "\t")):
         path = folder / f"{name}.csv"
         lines = [line for line in path.read_text().splitlines() if not line.startswith("#")]
         cells = [line.split(",")[::-1] for line in lines]
-        spelt = [" ; ".join(cell.replace(".", ",") for cell in row) for row in cells]
+        spelt = [between.join(cell.replace(".", ",") for cell in row) for row in cells]
         path.write_bytes((mark + end.join(["# comment, with a comma", "", *spelt, ""])).encode())
     block = read_block(folder)
     assert block.points == expected.points

@@ -96,6 +96,14 @@ def exposure_times(folder: str | Path) -> Float[np.ndarray, "images"]:
     return read_folder(Path(folder)).tables["images"].numbers("time_s", empty=True)
 
 
+def _instead(folder: Path, file: str) -> str:
+    """What to do where a needed file is missing: the table may lie there as something else."""
+    if (folder / file).is_dir():
+        return "what is called so is a folder: put the file in its place"
+    like = sorted(p.name for p in folder.iterdir() if p.stem.lower() == Path(file).stem and p.name != file)
+    return f"there is {like[0]}: save it as {file}" if like else "add it"
+
+
 def read_folder(folder: Path, more: Iterable[type] = ()) -> BlockTables:
     """The files of a block folder. Raises InputError for those that are missing or cannot be read."""
     if not folder.is_dir():
@@ -103,7 +111,7 @@ def read_folder(folder: Path, more: Iterable[type] = ()) -> BlockTables:
     needed = (TOML, *(f"{name}.csv" for name, layout in LAYOUTS.items() if layout.needed))
     for file in needed:
         if not (folder / file).is_file():
-            raise InputError(f"{folder} has no file {file}; add it ({', '.join(needed)} are needed)")
+            raise InputError(f"{folder} has no file {file}; {_instead(folder, file)} ({', '.join(needed)} are needed)")
     settings = with_earlier_calibrations(read_toml(folder / TOML), TOML, folder)
     tables: dict[str, Table] = {}
     top = Section(TOML, "", settings)

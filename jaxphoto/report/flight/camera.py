@@ -40,10 +40,10 @@ def interior_rows(report: PartReport, start: InteriorOrientation | None) -> Rows
                 name,
                 began,
                 with_sigma(p["value"], p["sigma"]),
-                f"{p['sigma']:.2g}" if estimated else "held",
-                f"{sigma:.2g}" if estimated else "",
+                of_sigma(p["sigma"]) if estimated else "held",
+                of_sigma(sigma) if estimated else "",
                 p["unit"],
-                f"{p['value'] / pixel:.2f} +- {sigma / pixel:.2g}" if estimated and name.endswith("_mm") else "",
+                _with(p["value"] / pixel, sigma / pixel) if estimated and name.endswith("_mm") else "",
                 {True: "yes", False: "no"}.get(p["significant"], ""),
             )
         )
@@ -51,7 +51,7 @@ def interior_rows(report: PartReport, start: InteriorOrientation | None) -> Rows
     names = [readout_of(camera) for camera in adjusted.unknowns.interior]
     for p in further[further["parameter"].isin(names)].to_dict("records"):
         seen = "yes" if abs(p["value"]) >= SEEN * p["sigma"] else "no"
-        rows.append(("readout_ms", "", with_sigma(p["value"], p["sigma"]), f"{p['sigma']:.2g}", "", "ms", "", seen))
+        rows.append(("readout_ms", "", with_sigma(p["value"], p["sigma"]), of_sigma(p["sigma"]), "", "ms", "", seen))
     columns = ("parameter", "began at", "value", "sigma", "sigma alike", "unit", "in pixels", "significant")
     return Rows(columns, tuple(rows))
 
@@ -61,10 +61,14 @@ def camera_sentences(report: PartReport) -> Iterator[str]:
     table = report.tables.interior
     found = table[table["sigma"].notna() & table["parameter"].isin(_FIRST)]
     each = zip(found["parameter"], found["value"], found["sigma"], strict=True)
-    told = [f"{symbol(name)} = {with_sigma(value, sigma)} +- {of_sigma(sigma)}" for name, value, sigma in each]
+    told = [f"{symbol(name)} = {_with(value, sigma)}" for name, value, sigma in each]
     if told:
         yield f"{', '.join(told)} mm"
     yield from (finding.text for finding in shutter_findings(report.tables))
+
+
+def _with(value: float, sigma: float) -> str:
+    return f"{with_sigma(value, sigma)} +- {of_sigma(sigma)}"
 
 
 def camera_section(report: PartReport, source: FlightSource) -> Iterator[Element]:
