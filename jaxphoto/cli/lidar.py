@@ -286,8 +286,8 @@ def _of_flight(adjust: str, pattern: str | None, settings: StripSettings, max_ro
     named = {name.strip() for name in adjust.split(",")}
     for name in sorted(named - {"scanner", "trajectory", "camera", *SCANNER}):
         raise InputError(
-            f"--adjust {name}: a flying system has scanner, trajectory and camera, and a scanner {', '.join(SCANNER)}; "
-            "name some of these"
+            f"--adjust {name or repr(adjust)}: a flying system has scanner, trajectory and camera, and a "
+            f"scanner {', '.join(SCANNER)}; name some of these"
         )
     free = named | ({"boresight"} if "scanner" in named else set())
     held: list[str] | Literal["all"] = [] if "trajectory" in named else "all"

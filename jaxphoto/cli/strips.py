@@ -57,7 +57,7 @@ def strips_command(
     hold: Annotated[str, typer.Option(help="Strips whose trajectory is right, by commas.")] = "",
     cell_m: CellM = USUAL.cell_m,
     roughness_m: RoughnessM = USUAL.roughness_m,
-    most_planes: Annotated[int, typer.Option(min=1, help="Most planes that are observed.")] = USUAL.most,
+    most_planes: Annotated[int, typer.Option(help="Most planes that are observed.")] = USUAL.most,
     knots_s: KnotsS = USUAL.knots_s,
     correlation_s: Annotated[float, positive("Correlation time of these errors.")] = USUAL.correlation_s,
     sigma_position_m: Annotated[
@@ -97,6 +97,8 @@ def strips_command(
         "sigma_heading_deg": sigma_heading_deg,
     }
     given: dict[str, Any] = {name: sigma for name, sigma in sigmas.items() if sigma is not None}
+    if most_planes < 1:
+        raise InputError(f"--most-planes {most_planes}: give 1 or more")
     settings = StripSettings(
         cell_m=cell_m,
         roughness_m=roughness_m,
@@ -133,5 +135,7 @@ def _priors(adjust: str | None, pattern: str | None) -> ScannerPriors | None:
     names = [] if text.strip() == "none" else [name.strip() for name in text.split(",")]
     for name in names:
         if name not in SCANNER:
-            raise InputError(f"--adjust {name}: a scanner has {', '.join(SCANNER)}; name some of these, or none")
+            raise InputError(
+                f"--adjust {name or repr(text)}: a scanner has {', '.join(SCANNER)}; name some of these, or none"
+            )
     return scanner_priors(names, pattern)

@@ -222,6 +222,8 @@ def read_photograph(path: Path) -> Photograph:
     """What the file of one photograph says. Raises InputError for a file that is missing or no picture."""
     if path.is_dir():
         raise InputError(f"{path} is a folder; name its photographs, for example {path}/*.jpg")
+    if path.is_symlink() and not path.exists():
+        raise InputError(f"{path}: what this links to is not there; bring that file here, or remove the link")
     if not path.is_file():
         raise InputError(f"{path}: there is no such photograph; correct the name")
     try:

@@ -33,7 +33,7 @@ def sound_photographs(paths: Sequence[str | Path]) -> tuple[list[Photograph], di
     names. Raises InputError for what is neither file nor folder, and where nothing is left.
     """
     files = pictures_in(paths)
-    if missing := [file for file in files if not file.is_file()]:
+    if missing := [file for file in files if not (file.is_file() or file.is_symlink())]:
         raise InputError(f"{missing[0]}: there is no such photograph or folder; correct the name")
     left: dict[str, str] = {}
     read: dict[str, Photograph] = {}
@@ -61,7 +61,9 @@ def sound_photographs(paths: Sequence[str | Path]) -> tuple[list[Photograph], di
             copies[twin.path] = digest
             del read[twin.name]
         content[digest] = read[photograph.name] = photograph
-    left |= {str(file): f"{file}: it is a copy of {content[digest].path.name}" for file, digest in copies.items()}
+    left |= {
+        str(file): f"{file}: it is a copy of {_told(content[digest].path, file)}" for file, digest in copies.items()
+    }
     left |= _edited(read)
     kept = [p for p in read.values() if str(p.path) not in left]
     for what, of, mend in ONE_CAMERA:
@@ -140,13 +142,20 @@ def _edited(read: dict[str, Photograph]) -> dict[str, str]:
     return left
 
 
+def _told(path: Path, beside: Path) -> str:
+    """The name of a file, with its folder where `beside` has the same."""
+    return str(path) if path.name == beside.name else path.name
+
+
 def _series(name: str) -> str:
     """A name without its numbers: the same for DJI_0001 and DJI_0002."""
     return re.sub(r"\d+", "#", name)
 
 
 def _pictures(folder: Path) -> list[Path]:
-    return sorted(file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES and file.is_file())
+    """All pictures but hidden ones, as macOS has beside each; links to what is not there are told, not lost."""
+    named = (f for f in folder.iterdir() if f.suffix.lower() in SUFFIXES and not f.name.startswith("."))
+    return sorted(file for file in named if file.is_file() or (file.is_symlink() and not file.exists()))
 
 
 def _check_whole(file: Path) -> None:

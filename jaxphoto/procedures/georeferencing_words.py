@@ -63,7 +63,7 @@ def position_words(
             "take-off, and are left out"
         )
     for name, off in zip(names[~used & ~high], offsets[~used & ~high], strict=True):
-        told = ", ".join(f"{v:.1f}" for v in off)
+        told = ", ".join(f"{v:z.1f}" for v in off)
         yield f"the position of {name} contradicts the others by {told} m (east, north, up) and is left out"
 
 
@@ -98,6 +98,7 @@ def attitude_words(recorded: RecordedTurn | str | None, used: bool, turn: Float[
             f"common known to {boresight:.2g} degrees"
         )
     else:
-        yield f"{words} and with the positions to {apart:.2g}; the positions tell the turn better: they are not used"
+        digits = f"{apart:.0f}" if apart >= 10 else f"{apart:.2g}"
+        yield f"{words} and with the positions to {digits}; the positions tell the turn better: they are not used"
     if recorded.left_out:
         yield f"the attitudes of {few(list(recorded.left_out))} contradict the others and are left out"

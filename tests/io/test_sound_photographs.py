@@ -106,6 +106,24 @@ def test_spoilt_ones_are_left_out_each_with_a_sentence(folder):
     assert not left
 
 
+def test_links_and_hidden_files(folder):
+    """A link to a photograph elsewhere is one; one to nothing costs a sentence; what macOS hides beside each none."""
+    away = folder / "away"
+    away.mkdir()
+    (folder / "0.jpg").rename(away / "0.jpg")
+    (folder / "0.jpg").symlink_to(away / "0.jpg")
+    (folder / "lost.JPG").symlink_to(away / "absent.jpg")
+    (folder / "._1.jpg").write_bytes(b"macOS")
+    kept, left = sound_photographs([folder])
+    assert [p.name for p in kept] == ["0", "1", "2", "3"]
+    assert list(left.values()) == [
+        f"{folder / 'lost.JPG'}: what this links to is not there; bring that file here, or remove the link"
+    ]
+    # Copies of one name in two folders are told by these.
+    _, left = sound_photographs([folder, away])
+    assert f"{away / '0.jpg'}: it is a copy of {folder / '0.jpg'}" in left.values()
+
+
 def test_files_left_out_for_one_reason_have_one_sentence(folder):
     for k in range(3):
         Image.new("RGB", (64, 48 + 8 * (k // 2)), (k, 0, 0)).save(folder / f"T{k}.png")

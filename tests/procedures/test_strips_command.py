@@ -194,6 +194,8 @@ def test_withheld_points_that_nothing_says_anything_of_stay(cloud_file, tmp_path
     ("options", "sentence"),
     [
         (("--adjust", "boresight,mirror"), "--adjust mirror: a scanner has boresight, lever-arm"),
+        (("--adjust", ","), "--adjust ',': a scanner has boresight"),
+        (("--most-planes", "0"), "--most-planes 0: give 1 or more"),
         (("--pattern", "circle"), "without a trajectory strips have shifts alone"),
         (("--adjust", "boresight"), "without a trajectory strips have shifts alone"),
         (("--pattern", "zigzag"), "--pattern zigzag: there are line, circle"),

@@ -74,4 +74,5 @@ def exposure_files(folder: Path) -> list[Path]:
     """The files of a folder that say where its photographs were exposed: .MRK, .pos, .sbet, exposures.csv and
     geo.txt."""
     found = (f for f in folder.iterdir() if f.suffix.lower() in _SUFFIXES or f.name.lower() in _TABLES)
-    return sorted(f for f in found if f.is_file())
+    # Hidden ones are those that macOS has beside each file.
+    return sorted(f for f in found if f.is_file() and not f.name.startswith("."))
