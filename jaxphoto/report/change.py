@@ -13,7 +13,7 @@ from rich.table import Table
 from jaxphoto.camera import Sensor
 from jaxphoto.report.digits import of_p, of_sigma, with_sigma
 from jaxphoto.report.document import Heading, Paragraph, rows_of
-from jaxphoto.report.findings import p_words
+from jaxphoto.report.findings import as_sentence, p_words
 from jaxphoto.report.made import Made, made_section, versions
 from jaxphoto.report.maps import draw_format_map
 from jaxphoto.report.plots import axes_or_new, new_figure
@@ -125,7 +125,9 @@ def write_change(found: Change, sets: tuple[Compared, Compared], sensor: Sensor,
     alt = "maps over the format of the camera: offsets of rays (px), and offsets over what is usual"
     picture = WholePicture.of(change_figure(found, sensor), alt)
     parts = [
+        *(Paragraph(as_sentence(sentence)) for sentence in verdict[1:]),
         *map(Paragraph, about_sets(sets)),
+        Heading("Over the format"),
         picture,
         Heading("Parameters"),
         rows_of(parameters),
@@ -135,7 +137,7 @@ def write_change(found: Change, sets: tuple[Compared, Compared], sensor: Sensor,
         parameters.to_csv(work / "parameters.csv", index=False)
         change_cells(found, sensor).to_csv(work / "cells.csv", index=False)
         (work / "change.png").write_bytes(picture.png)
-        page = study_page("Change of a camera", verdict, parts, "amber" if found.changed else "green")
+        page = study_page("Change of a camera", verdict[:1], parts, "amber" if found.changed else "green")
         (work / "report.html").write_text(page, encoding="utf-8")
         write_summary(change_summary(found, sensor) | {"versions": versions()}, work)
 
