@@ -23,6 +23,7 @@ _STEPS = 64
 _BAR = 14
 # Below, numbers at an axis have an exponent.
 _SMALL = 1e-3
+_DIGITS, _MOST_DIGITS = 3, 15
 
 
 def say(artist: Any) -> None:
@@ -104,6 +105,9 @@ def axis_of(axes: Axes, which: str) -> Trace:
         # Coordinates with all of their digits: not 5.4M.
         "exponentformat": "none" if np.abs(limits).max() > _SMALL else "power",
     }
+    # Of what the axis spans, four digits where the pointer is.
+    if not logarithmic and 0 < (span := float(abs(limits[1] - limits[0]))) < np.inf:
+        found["hoverformat"] = f".{int(np.clip(_DIGITS - np.floor(np.log10(span)), 0, _MOST_DIGITS))}f"
     # What plotly writes by itself is as good; words, dates and percentages are matplotlib's.
     if not kinds_of(own.get_major_formatter()) & {"ScalarFormatter", "LogFormatter", "NullFormatter"}:
         places = own.get_ticklocs()

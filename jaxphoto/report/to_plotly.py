@@ -43,6 +43,8 @@ _MARKERS = {
 }  # fmt: skip
 # Thin ones have no face: their line is what shows.
 _THIN = ("x-thin", "cross-thin", "line-ns", "line-ew")
+# What upright and lying bars tell.
+_LENGTH = ("%{x}: %{customdata:.6~g}<extra></extra>", "%{y}: %{customdata:.6~g}<extra></extra>")
 _NONE = ("", " ", "None", "none", None)
 _INCHES_PX = 96
 # Size of a sign in space, over that of the same on paper.
@@ -146,7 +148,9 @@ def _named(artist: Any) -> Trace:
     # Of bars together and of points with bars the first member stands for all.
     whole = next((c for c in artist.axes.containers if c and c[0] is artist), artist)
     label = str(whole.get_label())
-    return {"name": shown(label), "showlegend": True} if label and label[0] != "_" else {"showlegend": False}
+    return (
+        {"name": shown(label), "showlegend": True} if label and label[0] != "_" else {"showlegend": False, "name": ""}
+    )
 
 
 # Lines and markers ---------------------------------------------------------------------------------------------
@@ -211,7 +215,9 @@ def _bars(container: Any) -> Trace:
     return {
         "type": "bar", "orientation": "h" if lying else "v", "x": values[0], "y": values[1], "width": np.abs(wide),
         "marker": {"color": colours, "line": {"color": edges, "width": container[0].get_linewidth() * PX}},
-        **({"base": base} if base.any() else {}), **_named(container[0]),
+        **_named(container[0]),
+        # From elsewhere than zero plotly would tell where a bar ends.
+        **({"base": base, "customdata": long, "hovertemplate": _LENGTH[lying]} if base.any() else {}),
     }  # fmt: skip
 
 
@@ -244,11 +250,14 @@ def _collection(artist: Any, axes: Axes) -> Iterator[Trace]:
         colour: Any = [css(c) for c in seen] if len(seen) > 1 else css(seen[0] if len(seen) else (0, 0, 0, 0))
         marker: Trace = {"color": colour, "size": float(sizes[0]) if len(sizes) == 1 else np.resize(sizes, len(at))}
         marker["symbol"] = "circle" if len(faces) else "circle-open"
+        told: Trace = {}
         if values is not None:
             marker |= {"color": np.ma.filled(values, np.nan), **colour_scale(artist, "c")}
+            told = {"hovertemplate": "x %{x}, y %{y}<br>%{marker.color:.3g}<extra></extra>"}
             # What is pale has an edge.
             marker |= {"line": {"color": css(edges[0]), "width": 1}} if len(edges) == 1 else {}
-        yield {"type": "scatter", "mode": "markers", "x": at[:, 0], "y": at[:, 1], "marker": marker, **_named(artist)}
+        dots = {"type": "scatter", "mode": "markers", "x": at[:, 0], "y": at[:, 1], "marker": marker}
+        yield dots | _named(artist) | told
         return
     width = float(np.max(artist.get_linewidth(), initial=0.0))
     together: dict[tuple, list] = defaultdict(list)
@@ -265,8 +274,10 @@ def _collection(artist: Any, axes: Axes) -> Iterator[Trace]:
         yield _area(paths, face, edge, axes, width) | name | band
         name = {"showlegend": False}
     if "Quiver" in kinds:
-        told = np.stack([np.ma.filled(v, np.nan) for v in (artist.U, artist.V)], axis=1)
-        trace = _told(at, told, "x %{x:.5g}, y %{y:.5g}<br>(%{customdata[0]:.3g}, %{customdata[1]:.3g})<extra></extra>")
+        arrows = np.stack([np.ma.filled(v, np.nan) for v in (artist.U, artist.V)], axis=1)
+        trace = _told(
+            at, arrows, "x %{x:.5g}, y %{y:.5g}<br>(%{customdata[0]:.3g}, %{customdata[1]:.3g})<extra></extra>"
+        )
         if values is not None:
             trace["marker"] |= {
                 "color": np.ma.filled(np.ma.asarray(values, float), np.nan),
@@ -274,9 +285,9 @@ def _collection(artist: Any, axes: Axes) -> Iterator[Trace]:
             }
         yield trace
     elif values is not None and np.ndim(values) == 1 and len(values) == len(at) and "ContourSet" not in kinds:
-        told = np.ma.filled(np.ma.asarray(values, float), np.nan)
-        trace = _told(at, told[:, None], "x %{x:.5g}, y %{y:.5g}<br>%{customdata[0]:.3g}<extra></extra>")
-        yield trace | {"marker": {"color": told, "opacity": 0.0, **colour_scale(artist, "c")}}
+        known = np.ma.filled(np.ma.asarray(values, float), np.nan)
+        trace = _told(at, known[:, None], "x %{x:.5g}, y %{y:.5g}<br>%{customdata[0]:.3g}<extra></extra>")
+        yield trace | {"marker": {"color": known, "opacity": 0.0, **colour_scale(artist, "c")}}
     elif artist.colorbar is not None:
         yield _told(np.full((1, 2), np.nan), np.zeros((1, 1)), "") | {
             "marker": {"color": [0.0], **colour_scale(artist, "c")}
