@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from jaxphoto import adjust
 from jaxphoto.io import read_block, write_simulation
 from jaxphoto.io.clouds import read_cloud
 from jaxphoto.writing import MARKER
@@ -43,8 +44,10 @@ def test_lidar_control(folder, tmp_path, monkeypatch, capsys):
     rounds = pd.read_csv(out / "lidar_rounds.csv")
     assert rounds["largest_change"].iloc[-1] < 0.1
     # Whoever adjusts it stays where it is.
-    code, said, _ = run(monkeypatch, capsys, "adjust", out, "--out", tmp_path / "results")
-    assert code == 0
+    again = adjust(block)
+    assert bool(again.converged)
+    position = block.start.unknowns.exterior.position
+    np.testing.assert_allclose(again.unknowns.exterior.position, position, rtol=0, atol=1e-6)
 
 
 @pytest.mark.slow
