@@ -17,9 +17,9 @@ from jaxphoto.georeferencing import Scanner, Trajectory, TrajectorySpline, corre
 from jaxphoto.lidar.coverage import longest_interval, not_covered
 
 PORTION = 1 << 17
-"""Laser points at once, whose numbers stay in the processor's cache."""
-# What fewer are padded to: computing with so few takes milliseconds, and every size compiles programs of its own.
-_SIZES = (1 << 12, 1 << 15, PORTION)
+"""Laser points at once, whose numbers stay in the processor's cache; fewer are padded to a power of two."""
+# Of fewer than these, computing costs nothing, and each size would compile programs of its own.
+_FEW = 1 << 11
 
 
 class ScannerPoses(eqx.Module):
@@ -143,7 +143,7 @@ def _along(function: Callable, path: ScannerPath, time: Float[np.ndarray, "n"]) 
 
 def padded_size(n: int) -> int:
     """How many laser points a program is compiled for that takes `n`."""
-    return next(size for size in _SIZES if n <= size)
+    return max(_FEW, min(1 << max(n - 1, 0).bit_length(), PORTION))
 
 
 @eqx.filter_jit
