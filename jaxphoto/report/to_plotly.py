@@ -285,7 +285,7 @@ def _collection(artist: Any, axes: Axes) -> Iterator[Trace]:
             }
         yield trace
     elif values is not None and np.ndim(values) == 1 and len(values) == len(at) and "ContourSet" not in kinds:
-        known = np.ma.filled(np.ma.asarray(values, float), np.nan)
+        known: np.ndarray = np.ma.filled(np.ma.asarray(values, float), np.nan)
         trace = _told(at, known[:, None], "x %{x:.5g}, y %{y:.5g}<br>%{customdata[0]:.3g}<extra></extra>")
         yield trace | {"marker": {"color": known, "opacity": 0.0, **colour_scale(artist, "c")}}
     elif artist.colorbar is not None:
