@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxphoto.camera import Brown, InteriorOrientation, Sensor, parameter_names
-from jaxphoto.stability import distortion_curve, format_sigma, image_grid
+from jaxphoto.stability import METHODS, bundle_offsets, distortion_curve, format_sigma, image_grid
 
 CAMERA = InteriorOrientation(35.0, 0.4, -0.3, Brown(k1=-9e-5, k2=1e-7))
 SENSOR = Sensor(4500, 3000, 0.008)
@@ -29,3 +29,15 @@ def test_sigma_over_the_format_is_that_of_the_principal_point():
     points = image_grid(SENSOR, 5, 3)
     np.testing.assert_allclose(format_sigma(plain, covariance, points, "zrot"), np.sqrt(5e-6), rtol=1e-9)
     assert format_sigma(plain, covariance, points, "rot").max() < 0.6 * np.sqrt(5e-6)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_sigma_over_the_format_is_what_comparing_the_camera_with_itself_gives(method):
+    """Beside the derivatives of the alignment's optimum, which are found by an iteration."""
+    points, n = image_grid(SENSOR, 5, 4), len(parameter_names(CAMERA))
+    rng = np.random.default_rng(3)
+    covariance = np.cov(rng.normal(size=(n, 3 * n)) * np.array([1e-3, 1e-3, 1e-3, *[1e-7] * (n - 3)])[:, None])
+    offsets = bundle_offsets(CAMERA, CAMERA, points, method)
+    rows = np.asarray(offsets.measured_jacobian)[:, :n].reshape(len(points), 2, n)
+    expected = np.sqrt(np.einsum("nip,pq,niq->n", rows, covariance, rows))
+    np.testing.assert_allclose(format_sigma(CAMERA, covariance, points, method), expected, rtol=1e-9)

@@ -88,7 +88,7 @@ def bundle_offsets(
     if 2 * len(points) <= UNKNOWNS[method]:
         raise ValueError(f"{len(points)} image points leave nothing to compare after {UNKNOWNS[method]} unknowns")
     points = jnp.asarray(points, float)
-    return call_compiled(_compared, _as_arrays(first), _as_arrays(second), points, method, _depths(points, depth))
+    return call_compiled(_compared, as_arrays(first), as_arrays(second), points, method, _depths(points, depth))
 
 
 def check_rays(interior: InteriorOrientation, points: Float[Numbers, "points 2"], name: str) -> None:
@@ -104,7 +104,7 @@ def check_rays(interior: InteriorOrientation, points: Float[Numbers, "points 2"]
 
 def regular_rays(interior: InteriorOrientation, points: Float[Numbers, "points 2"]) -> Bool[np.ndarray, "points"]:
     """At which image points (mm) the distortion does not fold, and the ray looks ahead."""
-    return np.asarray(call_compiled(_regular, _as_arrays(interior), jnp.asarray(points, float)))
+    return np.asarray(call_compiled(_regular, as_arrays(interior), jnp.asarray(points, float)))
 
 
 @eqx.filter_jit
@@ -147,6 +147,6 @@ def _depths(points, depth):
     return jnp.ones(len(points)) if depth is None else jnp.asarray(depth, float)
 
 
-def _as_arrays(interior: InteriorOrientation) -> InteriorOrientation:
+def as_arrays(interior: InteriorOrientation) -> InteriorOrientation:
     """Numbers as arrays, so that another value is not another program."""
     return jax.tree.map(lambda v: jnp.asarray(v, float), interior)

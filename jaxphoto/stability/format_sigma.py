@@ -1,11 +1,16 @@
 """How sure a calibration is of where rays lie in the image, over the format."""
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from jaxphoto.camera import InteriorOrientation
-from jaxphoto.stability.alignment import Method
-from jaxphoto.stability.comparison import bundle_offsets, check_rays
+from jaxphoto.compiling import call_compiled
+from jaxphoto.stability.alignment import METHODS, UNKNOWNS, Method, offsets_of
+from jaxphoto.stability.bundles import image_rays, parameter_vector, with_parameters
+from jaxphoto.stability.comparison import as_arrays, check_rays
 
 
 def format_sigma(
@@ -20,6 +25,35 @@ def format_sigma(
     distortion means nothing at some of the points.
     """
     check_rays(interior, points, "the camera")
-    jacobian = np.asarray(bundle_offsets(interior, interior, points, method).measured_jacobian)
-    rows = jacobian[:, : len(covariance)].reshape(len(points), 2, -1)
+    found = call_compiled(_derivatives, as_arrays(interior), jnp.asarray(points, float))
+    stretch, by_parameters, by_alignment = jax.tree.map(np.asarray, found)
+    # Where offsets vanish their least squares are a projection: what the alignment cannot follow is left.
+    columns = by_alignment[method].reshape(2 * len(points), -1)
+    taken_up = columns @ np.linalg.lstsq(columns, by_parameters, rcond=None)[0]
+    left = (by_parameters - taken_up).reshape(len(points), 2, -1)
+    rows = np.linalg.solve(stretch, left)[:, :, : len(covariance)]
     return np.sqrt(np.maximum(np.einsum("nip,pq,niq->n", rows, covariance, rows), 0.0))
+
+
+@eqx.filter_jit
+def _derivatives(
+    interior: InteriorOrientation, points: Float[Array, "points 2"]
+) -> tuple[Float[Array, "points 2 2"], Float[Array, "coordinates p"], dict[Method, Float[Array, "points 2 u"]]]:
+    """d(ideal) / d(measured); d(offsets) / d(parameters) of a bundle from its own; those by the alignment's unknowns.
+
+    The same program for every method: each would compile for longer than all run.
+    """
+    rays, depth = image_rays(interior, points), jnp.ones(len(points))
+
+    def changed(parameters):
+        first = image_rays(with_parameters(interior, parameters), points)
+        return offsets_of(jnp.zeros(0), first, rays, depth, "zrot").ravel()
+
+    by_alignment = {
+        method: jax.jacfwd(lambda a, method=method: offsets_of(a, rays, rays, depth, method))(
+            jnp.zeros(UNKNOWNS[method])
+        )
+        for method in METHODS
+    }
+    stretch = jax.vmap(jax.jacfwd(interior.ideal_from_measured))(points)
+    return stretch, jax.jacfwd(changed)(parameter_vector(interior)), by_alignment
