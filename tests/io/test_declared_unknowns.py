@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from jaxtyping import Array, Float
 
 from jaxphoto.block import Block, Motion, Temperatures
+from jaxphoto.camera import ImageMotion, RollingShutter
 from jaxphoto.errors import BlockError, InputError
 from jaxphoto.io import read_block, write_block
 from jaxphoto.io.block_folder.declared_unknowns import keys_of, known_unknowns, static_fields
@@ -55,7 +56,7 @@ def parameters_of(kind: type[AbstractParameters], prior=None, seed: int = 0):
     """Start values of a class, or priors: `prior` of each field, made of its start where it is callable."""
     rng, static = np.random.default_rng(seed), {"model": "ciddor"} if kind is Refractivity else {}
     many = (static_fields(kind)[kind.sized],) if kind.sized else None
-    start = {key.field: rng.normal(size=many or key.shape) for key in keys_of(kind)}
+    start = {key.field: rng.normal(1.5, size=many or key.shape) for key in keys_of(kind)}
     if prior is None:
         return kind(**start, **static)
     return kind(**{name: prior(value) if callable(prior) else prior for name, value in start.items()}, **static)
@@ -82,6 +83,16 @@ def covariance_of(value):
 
 def weighted(value):
     return Weighted(value, np.full(np.shape(value), 0.3))
+
+
+# What block.toml takes only together with the other.
+PARTNERS = {RollingShutter: ImageMotion, ImageMotion: RollingShutter}
+
+
+def in_files(block: Block, kind: type[AbstractParameters], prior) -> Block:
+    """A block whose folder may hold these unknowns."""
+    partner = PARTNERS.get(kind)
+    return with_unknowns(with_unknowns(block, partner, FREE) if partner else block, kind, prior)
 
 
 PRIORS = {
@@ -115,7 +126,7 @@ GENERIC = tuple(kind for kind in (*UNKNOWNS, *OWN) if kind.kind not in ("scanner
 @pytest.mark.parametrize("prior", PRIORS)
 @pytest.mark.parametrize("kind", GENERIC, ids=lambda kind: kind.kind)
 def test_unknowns_come_back(block, tmp_path, kind, prior):
-    made = with_unknowns(block, kind, PRIORS[prior])
+    made = in_files(block, kind, PRIORS[prior])
     write_block(made, tmp_path / "copy")
     got = read(tmp_path / "copy")
     assert got.partitions == made.partitions
@@ -130,7 +141,7 @@ def test_unknowns_come_back(block, tmp_path, kind, prior):
 
 @pytest.mark.parametrize("kind", GENERIC, ids=lambda kind: kind.kind)
 def test_covariances_of_vectors_come_back(block, tmp_path, kind):
-    made = with_unknowns(block, kind, lambda value: covariance_of(value) if np.ndim(value) else FREE)
+    made = in_files(block, kind, lambda value: covariance_of(value) if np.ndim(value) else FREE)
     write_block(made, tmp_path / "copy")
     for name, want in made.priors.tables[kind.kind].items():
         assert_alike(read(tmp_path / "copy").priors.tables[kind.kind][name], want)
@@ -230,6 +241,19 @@ model = "ciddor"
         (
             [section("[unknowns.flight_bias]\nshift = { sigma = 1, covariance = [[1,0,0],[0,1,0],[0,0,1]] }")],
             r"is no status",
+        ),
+        (
+            [section('[unknowns.shutters.kodak]\nreadout_ms = 20000.0\nreadout = "free"')],
+            r"\[unknowns\.shutters\.kodak\] readout_ms: 20000 ms cannot be; give milliseconds",
+        ),
+        ([section("[unknowns.shutters.kodak]\nreadout_ms = 0.03")], r"readout_ms: 0\.03 ms cannot be; give milliseconds"),
+        (
+            [section("[unknowns.shutters.default]\nreadout_ms = 30.0\n[unknowns.motions.a]\n[unknowns.motions.c]")],
+            r"shutters\.kodak\]: 1 photograph of it \(b\) would stand still; give velocity_m_per_s",
+        ),
+        (
+            [section("[unknowns.motions.default]\nvelocity_m_per_s = [0.0, 10.0, 0.0]")],
+            r"\[unknowns\.motions\]: how photographs move shows only in rows .* add \[unknowns\.shutters\.CAMERA\]",
         ),
         (
             [section("[unknowns.refractivity.default]")],

@@ -37,6 +37,7 @@ from jaxphoto.io.block_folder.mount_sections import mounts_of, read_mounts, read
 from jaxphoto.io.block_folder.observed import Ids, Kind, known_kinds, own_tables
 from jaxphoto.io.block_folder.section import Section
 from jaxphoto.io.block_folder.settings import Settings, read_partitions, read_settings
+from jaxphoto.io.block_folder.shutters import check_shutters
 from jaxphoto.io.block_folder.surfaces import read_surfaces
 from jaxphoto.io.block_folder.table_layout import LAYOUTS, TOML, TableLayout, layout_in
 from jaxphoto.io.block_folder.tables import layouts, read_declared
@@ -218,6 +219,7 @@ def assemble(source: BlockTables) -> Block:
     more, more_priors = read_unknowns(settings.unknowns, source.unknowns, block)
     start, priors = dataclasses.replace(start, more=more), dataclasses.replace(priors, more=more_priors)
     check_rates(images, start, priors)
+    check_shutters(images, start, priors)
     ids = Ids(images, points, {kind: tuple(owners) for kind, owners in start.tables.items()})
     distances, further = read_declared(kinds, tables, ids, settings)
     check_time_offsets(flight, further, image_mount, mounts, mount_priors, images, source.file)

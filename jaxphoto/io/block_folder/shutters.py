@@ -1,0 +1,38 @@
+"""What is wrong with a rolling shutter before anything is computed: its unit, and photographs that do not move."""
+
+from jaxphoto.camera import ImageMotion, RollingShutter
+from jaxphoto.errors import BlockError, counted, few
+from jaxphoto.io.block_folder.images import Images
+from jaxphoto.io.block_folder.table_layout import TOML
+from jaxphoto.unknowns import FIXED, Unknowns, Weighted
+
+# No sensor reads its rows faster (ms), and none slower.
+_FASTEST_MS, _SLOWEST_MS = 0.5, 1000.0
+
+
+def check_shutters(images: Images, starts: Unknowns, priors: Unknowns) -> None:
+    """Raise BlockError for readouts in another unit than milliseconds, and shutters or motions without the other.
+
+    A readout that is free, or hardly known, may start anywhere below a second.
+    """
+    shutters, motions = (starts.more.get(kind.kind, {}) for kind in (RollingShutter, ImageMotion))
+    for camera, shutter in shutters.items():
+        place = f"{TOML}, [unknowns.{RollingShutter.kind}.{camera}]"
+        readout, prior = abs(float(shutter.readout)), priors.more[RollingShutter.kind][camera].readout
+        known = prior is FIXED or (isinstance(prior, Weighted) and float(prior.sigma) < _FASTEST_MS)
+        if readout > _SLOWEST_MS or (known and 0 < readout < _FASTEST_MS):
+            raise BlockError(
+                f"{place} readout_ms: {float(shutter.readout):g} ms cannot be; give milliseconds, of most cameras 5 to "
+                "100, or 0 where all rows are exposed at once"
+            )
+        still = [name for name, own in zip(images.ids, images.cameras, strict=True) if own == camera]
+        if missing := [name for name in still if name not in motions]:
+            raise BlockError(
+                f"{place}: {counted(len(missing), 'photograph')} of it ({few(missing)}) would stand still; give "
+                f"velocity_m_per_s of each in [unknowns.{ImageMotion.kind}.IMAGE]"
+            )
+    if motions and not shutters:
+        raise BlockError(
+            f"{TOML}, [unknowns.{ImageMotion.kind}]: how photographs move shows only in rows that are read one after "
+            f"another; add [unknowns.{RollingShutter.kind}.CAMERA], or remove them"
+        )
