@@ -89,14 +89,17 @@ def convert_command(
             values, said = (given.start.unknowns, "adjusted values") if result else _values(given, adjust)
             files = photograph_files(given.images, photographs or (), source if result else None)
             status.update(f"writing {out}")
-            _say(output, export(AdjustedPhotographs.of_block(given, values, files), out, to), said)
+            done = export(AdjustedPhotographs.of_block(given, values, files), out, to)
+            _say(output, done, said, "cameras" not in EXPORTS[to].lacks)
     assumed = [name for name, sensor in given.sensors.items() if sensor.pixel_assumed]
     if to == "block" and not result and assumed:
         whose = f"camera {assumed[0]}" if len(assumed) == 1 else f"{len(assumed)} cameras"
         why = "as is assumed where files know pixels alone: c in um is f in px"
         output.say(f"{whose}: a pixel is {ASSUMED_PIXEL_MM:g} mm, {why}")
-    images, points, rows = size.values()
-    output.wrote(out, f"wrote {out}: {images} images, {points} points, {rows} image points")
+    images, *further = size.values()
+    lacks = EXPORTS[to].lacks if to in EXPORTS else ()
+    held = [f"{n} {what}" for n, what in zip(further, ("points", "image points"), strict=True) if what not in lacks]
+    output.wrote(out, f"wrote {out}: {', '.join([f'{images} images', *held])}")
     output.tell(**size)
 
 
@@ -111,13 +114,13 @@ def _values(block: Block, adjust: bool) -> tuple[Unknowns, str]:
     return adjusted.unknowns, f"adjusted values, sigma naught {float(adjusted.sigma0):.3g}"
 
 
-def _say(output: Output, done: Exported, values: str) -> None:
-    """What was written, and what was lost."""
+def _say(output: Output, done: Exported, values: str, of_cameras: bool) -> None:
+    """What was written, and what was lost: of cameras where the format has them."""
     output.say(values)
     lost = {name: {"rms_px": c.rms_px, "max_px": c.max_px} for name, c in done.cameras.items()}
     misfits = {"map_misfit": done.map_misfit, "moved": done.moved}
     output.tell(values=values, cameras=lost, **{name: m and m._asdict() for name, m in misfits.items()})
-    for name, conversion in done.cameras.items():
+    for name, conversion in done.cameras.items() if of_cameras else ():
         output.say(f"camera {name}: {conversion.lost}")
     if done.moved is not None:
         told = f"rms {done.moved.rms_px:.3g} px, largest {done.moved.max_px:.3g} px"

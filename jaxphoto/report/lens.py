@@ -19,10 +19,10 @@ def lens_findings(tables: Tables) -> Iterator[Finding]:
     adjusted = tables.adjusted
     if not bool(adjusted.converged):
         return
-    sigma = tables.interior.set_index(["camera", "parameter"])["sigma"]
+    interior = tables.interior.set_index(["camera", "parameter"])
     for camera, priors in adjusted.block.priors.interior.items():
         prior = get_parameter(priors, "c_mm")
-        own = sigma[camera, "c_mm"]
+        value, own = (interior.loc[(camera, "c_mm"), column] for column in ("value", "sigma"))
         if not isinstance(prior, Weighted) or not np.isfinite(own):
             continue
         known = float(prior.sigma)
@@ -34,7 +34,9 @@ def lens_findings(tables: Tables) -> Iterator[Finding]:
                 "the ground would tell it",
             )
         else:
+            off = float(value) - float(prior.value)
             yield Finding(
                 Level.INFORMATION,
-                f"c of {camera_words(camera)}: {known:.2g} mm were known of it before, {own:.2g} mm with the block",
+                f"c of {camera_words(camera)}: {known:.2g} mm were known of it before, {own:.2g} mm with the block, by "
+                f"which it is {abs(off):.2g} mm ({abs(off) / known:.1f} of the former) {'more' if off > 0 else 'less'}",
             )

@@ -246,7 +246,7 @@ model = "ciddor"
             [section('[unknowns.shutters.kodak]\nreadout_ms = 20000.0\nreadout = "free"')],
             r"\[unknowns\.shutters\.kodak\] readout_ms: 20000 ms cannot be; give milliseconds",
         ),
-        ([section("[unknowns.shutters.kodak]\nreadout_ms = 0.03")], r"readout_ms: 0\.03 ms cannot be; give milliseconds"),
+        ([section("[unknowns.shutters.kodak]\nreadout_ms = 0.03")], r"readout_ms: 0\.03 ms cannot be; give"),
         (
             [section("[unknowns.shutters.default]\nreadout_ms = 30.0\n[unknowns.motions.a]\n[unknowns.motions.c]")],
             r"shutters\.kodak\]: 1 photograph of it \(b\) would stand still; give velocity_m_per_s",

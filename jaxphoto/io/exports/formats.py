@@ -42,6 +42,8 @@ class ExportFormat(NamedTuple):
     """Those of the files that it writes."""
     keeps_rays: bool = False
     """Whether image points are moved to where a camera that is fitted sees the same rays, instead of leaving them."""
+    lacks: tuple[str, ...] = ()
+    """What it has no place for at all, of cameras, points and image points."""
 
 
 class Exported(NamedTuple):
@@ -78,6 +80,7 @@ EXPORTS = {
         False,
         "cameras of Agisoft Metashape, XML",
         (".xml", ".csv"),
+        lacks=("points",),
     ),
     "opensfm": ExportFormat(
         write_open_sfm,
@@ -110,6 +113,7 @@ EXPORTS = {
         False,
         "transforms.json of nerfstudio",
         (".json", ".csv"),
+        lacks=("points",),
     ),
     "bundler": ExportFormat(
         write_bundler,
@@ -136,6 +140,7 @@ EXPORTS = {
         True,
         "text of positions and omega, phi, kappa",
         (".txt", ".toml", ".csv"),
+        lacks=("points",),
     ),
     "orthority": ExportFormat(
         write_orthority,
@@ -144,6 +149,7 @@ EXPORTS = {
         True,
         "parameters of orthority, YAML and CSV",
         (".yaml", ".csv", ".prj"),
+        lacks=("points",),
     ),
     "geojson": ExportFormat(
         write_geo_json,
@@ -152,6 +158,7 @@ EXPORTS = {
         False,
         "stations and footprints in longitude and latitude",
         (".geojson",),
+        lacks=("cameras", "points", "image points"),
     ),
     "geopackage": ExportFormat(
         write_geo_package,
@@ -160,6 +167,7 @@ EXPORTS = {
         False,
         "stations, footprints and points for a GIS",
         (".gpkg",),
+        lacks=("cameras", "image points"),
     ),
 }
 """The formats that `export` knows, in the order of docs and help."""
