@@ -22,7 +22,7 @@ def lens_findings(tables: Tables) -> Iterator[Finding]:
     interior = tables.interior.set_index(["camera", "parameter"])
     for camera, priors in adjusted.block.priors.interior.items():
         prior = get_parameter(priors, "c_mm")
-        value, own = (interior.loc[(camera, "c_mm"), column] for column in ("value", "sigma"))
+        value, own = (float(interior[column][camera, "c_mm"]) for column in ("value", "sigma"))
         if not isinstance(prior, Weighted) or not np.isfinite(own):
             continue
         known = float(prior.sigma)
@@ -34,7 +34,7 @@ def lens_findings(tables: Tables) -> Iterator[Finding]:
                 "the ground would tell it",
             )
         else:
-            off = float(value) - float(prior.value)
+            off = value - float(prior.value)
             yield Finding(
                 Level.INFORMATION,
                 f"c of {camera_words(camera)}: {known:.2g} mm were known of it before, {own:.2g} mm with the block, by "

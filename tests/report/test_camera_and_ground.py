@@ -57,9 +57,11 @@ def test_rays_that_err_alike_widen_what_they_say_and_not_what_was_known():
 def test_a_block_that_does_not_tell_c_is_warned_of():
     found = adjusted("cross")
     block = with_known_lens(found.block, "one", LENS)
-    known, tables = float(block.priors.interior["one"].c.sigma), {}
-    for share, word in ((0.9, "does not tell c"), (0.1, "with the block")):
-        tables["interior"] = pd.DataFrame({"camera": ["one"], "parameter": ["c_mm"], "sigma": [share * known]})
+    prior, tables = block.priors.interior["one"].c, {}
+    known = float(prior.sigma)
+    for share, word in ((0.9, "does not tell c"), (0.1, "(2.5 of the former) less")):
+        row = {"camera": ["one"], "parameter": ["c_mm"], "value": [float(prior.value) - 2.5 * known]}
+        tables["interior"] = pd.DataFrame(row | {"sigma": [share * known]})
         (finding,) = lens_findings(stub(dataclasses.replace(found, block=block), **tables))
         assert word in finding.text
     assert list(lens_findings(stub(found, **tables))) == []

@@ -1,5 +1,8 @@
 """What is wrong with a rolling shutter before anything is computed: its unit, and photographs that do not move."""
 
+from collections.abc import Mapping
+from typing import Any
+
 from jaxphoto.camera import ImageMotion, RollingShutter
 from jaxphoto.errors import BlockError, counted, few
 from jaxphoto.io.block_folder.images import Images
@@ -15,10 +18,12 @@ def check_shutters(images: Images, starts: Unknowns, priors: Unknowns) -> None:
 
     A readout that is free, or hardly known, may start anywhere below a second.
     """
-    shutters, motions = (starts.more.get(kind.kind, {}) for kind in (RollingShutter, ImageMotion))
+    shutters: Mapping[str, Any] = starts.more.get(RollingShutter.kind, {})
+    known_before: Mapping[str, Any] = priors.more.get(RollingShutter.kind, {})
+    motions = starts.more.get(ImageMotion.kind, {})
     for camera, shutter in shutters.items():
         place = f"{TOML}, [unknowns.{RollingShutter.kind}.{camera}]"
-        readout, prior = abs(float(shutter.readout)), priors.more[RollingShutter.kind][camera].readout
+        readout, prior = abs(float(shutter.readout)), known_before[camera].readout
         known = prior is FIXED or (isinstance(prior, Weighted) and float(prior.sigma) < _FASTEST_MS)
         if readout > _SLOWEST_MS or (known and 0 < readout < _FASTEST_MS):
             raise BlockError(
