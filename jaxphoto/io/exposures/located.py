@@ -14,6 +14,7 @@ from jaxphoto.io.exposures.rtklib import read_pos
 from jaxphoto.io.exposures.sbet import read_sbet_exposures
 from jaxphoto.io.exposures.sound_rows import of_sound_rows
 from jaxphoto.io.exposures.table import read_table
+from jaxphoto.io.exposures.wording import said_by_own_files
 from jaxphoto.io.photographs import Photograph
 
 _SUFFIXES = (".mrk", ".pos", ".sbet")
@@ -50,7 +51,7 @@ def located(
     taken = assigned.photographs
     positions, mended = plausible_positions({p.name: p.gps for p in taken})
     positions, told = one_height(positions, {p.name: p.above_takeoff_m for p in taken}, heights)
-    sentences = [*said, *assigned.sentences, *mended, *told]
+    sentences = [*said, *assigned.sentences, *mended, *said_by_own_files(photographs), *told]
     return Assigned([p._replace(gps=positions[p.name]) for p in taken], list(map(shown, sentences)))
 
 

@@ -7,6 +7,7 @@ from jaxtyping import Int
 
 from jaxphoto.errors import few
 from jaxphoto.georeferencing.exposure_times import ZONES_S, Ambiguous, Matched, clock_words
+from jaxphoto.georeferencing.gps import Fix
 from jaxphoto.io.exposures.joining import FINE_S, Clock, distance
 from jaxphoto.io.exposures.records import Exposures
 from jaxphoto.io.photographs import Photograph
@@ -58,6 +59,28 @@ def counts(photographs: Sequence[Photograph], file: Exposures, exposure: Int[np.
 
 def fixes(file: Exposures, exposure: Int[np.ndarray, "n"]) -> str:
     """How many solutions are of which kind."""
-    kinds = [file.fix[k] for k in exposure if k >= 0]
+    return _counted([file.fix[k] for k in exposure if k >= 0])
+
+
+def said_by_own_files(photographs: Sequence[Photograph]) -> list[str]:
+    """What packets of photographs say besides positions, and of how many where not of all: a sentence or none."""
+    at = [p.gps for p in photographs if p.gps]
+    said = {
+        "attitudes": [p.attitude is not None for p in photographs],
+        "heights above take-off": [p.above_takeoff_m is not None for p in photographs],
+        "standard deviations of positions": [g.sigma_m is not None for g in at],
+    }
+    parts = [f"{what}{_of_all(have)}" for what, have in said.items() if any(have)]
+    solutions = _counted([g.fix for g in at])
+    if solutions:
+        parts.append(f"solutions{solutions.replace(',', ':', 1)}")
+    return [f"the photographs' own files tell {', '.join(parts)}"] if parts else []
+
+
+def _of_all(have: Sequence[bool]) -> str:
+    return "" if all(have) else f" ({sum(have)} of {len(have)})"
+
+
+def _counted(kinds: Sequence[Fix]) -> str:
     parts = [f"{kinds.count(kind)} {kind}" for kind in ("fixed", "float", "single", "integrated") if kind in kinds]
     return f", {', '.join(parts)}" if parts else ""
