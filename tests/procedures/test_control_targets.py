@@ -75,6 +75,10 @@ def test_targets_are_found_from_three_marked_by_hand():
     points = np.asarray(found.adjusted.unknowns.points)[-9:]
     off = MapFrame(CODE, None, ORIGIN).local(found.adjusted.block.frame.map.map(points)) - m.true_xyz
     assert np.abs(off / found.sigma_m).max() < 4.5
+    # A block that lies by control already is not searched as one that only receivers have placed.
+    looker, again = looker_of(m.control)
+    control_block_with_targets(at_optimum(found.adjusted), known_only(m.control, ()), looker, adjust=adjust)
+    assert np.max(again) <= np.max(looked)
 
 
 def test_two_things_that_look_alike_are_not_believed():

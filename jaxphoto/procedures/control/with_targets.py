@@ -60,7 +60,8 @@ def control_block_with_targets(
     for _ in range(_ROUNDS):
         report("looking for targets")
         frame = in_frame(adjusted.block, points, system, code, vertical)
-        placed = now is not None and "control" in now.state
+        # By marks, by targets of an earlier round, or by control that the block came with.
+        placed = len(adjusted.block.control) > 0
         rows = (by_hand, now.marks) if now else (by_hand,)
         known = {pair for of in rows for pair in zip(of.image.tolist(), of.point.tolist(), strict=True)}
         found = found_marks(adjusted, ids, frame.xyz, sigma, known, looker, placed)
