@@ -38,7 +38,7 @@ def live_block(adjusted: Adjustment, covariance: Covariance, still: str, alt: st
     says what it shows.
     """
     figure: Figure = block_in_space(adjusted, covariance)
-    shown = f'<figure class="block {_LIVE}"><img class="still" alt="{{}}" src="{{}}">{{}}</figure>{{}}'
+    shown = f'<figure class="block {_LIVE}"><img alt="{{}}" src="{{}}" class="still">{{}}</figure>{{}}'
     return Markup(shown).format(
         alt,
         still,

@@ -154,7 +154,7 @@ def test_a_page_is_whole_without_a_network_and_complete_without_a_script(tables,
     assert not re.search(r'(src|href)="(?!data:|#)|@import|url\(', page)
     links = re.findall(r'<a href="#([^"]+)">', page)
     assert links == re.findall(r'<h2 id="([^"]+)">', page) and "block" in links
-    (alt,) = re.findall(r'<figure class="block live-figure"><img class="still" alt="([^"]+)" src="data:image/png', page)
+    (alt,) = re.findall(r'<figure class="block live-figure"><img alt="([^"]+)" src="data:image/png', page)
     assert f"{len(tables.adjusted.block.images)} camera stations" in alt
     assert all(f">{name}</td>" in page for name in tables.adjusted.block.images)
     assert len(page) < 4_000_000
