@@ -35,6 +35,7 @@ def correlation_ground_table(correlations: Mapping[str, GroundCorrelations]) -> 
 
 def side_by_side(table: pd.DataFrame, rows: list[str], column: str, value: str) -> pd.DataFrame:
     """For a reader: the parameters of `column` beside one another, as text; a camera that is alone is not named."""
-    told = table.assign(**{column: table[column].map(symbol), value: table[value].map("{:.3f}".format)})
+    names = table[column].map(lambda name: symbol(name).replace("_", ""))
+    told = table.assign(**{column: names, value: table[value].map("{:.3f}".format)})
     wide = told.pivot_table(value, rows, column, aggfunc="first", sort=False).fillna("").reset_index()
     return wide if len(wide["camera"].unique()) > 1 else wide.drop(columns="camera")

@@ -67,6 +67,8 @@ def _texts(table: pd.DataFrame, name: str) -> list[str]:
         words = [head_of(v) if not re.search(r"[\[.]", v) and without_unit(v)[1] else v for v in column.astype(str)]
         # Of correlations the unit says nothing; else it may have a column.
         return [word.partition(" [")[0] for word in words] if {"unit", "rho"} & set(table.columns) else words
+    if name == "group":
+        return [str(v).replace("_", " ") for v in column]
     if not pd.api.types.is_float_dtype(column):
         return ["" if pd.isna(v) else _word(v) for v in column.astype(object)]
     if (name.startswith("sigma") and not name.startswith("sigma0")) or name in _SIGMAS:
