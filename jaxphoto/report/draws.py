@@ -223,7 +223,9 @@ def write_draws_page(
     for name, (heading, said_of) in _PICTURES.items():
         if (file := directory / f"{name}.png").is_file():
             parts += [Heading(heading), Paragraph(said_of), WholePicture.read(file, f"{heading}: {said_of}")]
-    parts += [Heading("Means and standard deviations"), rows_of(table[few])]
+    # What was drawn comes last: it is known beforehand.
+    found = table[few].sort_values("quantity", key=lambda name: name.str.startswith("bias."), kind="stable")
+    parts += [Heading("Means and standard deviations"), rows_of(found)]
     if not few.all():
         parts.append(Paragraph("Images, points and knots of trajectories stand in summary.csv."))
     page = study_page(f"Monte Carlo: {summary.get('title') or 'block'}", said, [*parts, *made_section(made)])

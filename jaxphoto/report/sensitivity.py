@@ -243,14 +243,16 @@ def _page(tables: SensitivityTables, picture: WholePicture, made: Made) -> tuple
             f"Moved most, for its standard deviation, is {parameter_words(worst['estimate'])}: by "
             f"{abs(worst['over_sigma']):.2f} of it, where the stations of {worst['unit']} are off in {worst['axis']}."
         )
+    # In a table of many units of measurement "unit" is read as one of them.
+    largest, changes = (table.rename(columns={"unit": tables.per}) for table in (tables.largest, tables.bias[shown]))
     parts: list[StudyPart] = [
         *assumed_pixels(adjusted.block.sensors),
         Heading("Largest changes"),
-        rows_of(tables.largest),
+        rows_of(largest),
         picture,
     ]
     parts += [Heading("Changes of the interior orientation")]
-    parts += [rows_of(tables.bias[shown]), Paragraph("Every estimate stands in sensitivity.csv.")]
+    parts += [rows_of(changes), Paragraph("Every estimate stands in sensitivity.csv.")]
     parts += [Heading("Which observations the variance is of"), rows_of(shares)]
     parts += [Heading("What an undetected error does"), rows_of(undetected), *made_section(made)]
     return said, parts
