@@ -261,7 +261,8 @@ def _tests(found: Any) -> dict[str, str]:
         tests = {f"bundles of rays ({found.field.method})": f"p {found.p_field:.2g}"} | tests
     if not found.degrees_of_freedom:
         return tests
-    chi = f"chi-square {found.chi_square:.4g} of {found.degrees_of_freedom}, p {found.p_parameters:.2g}"
+    p = f"{found.p_parameters:.2g}" if found.p_parameters else "< 1e-300"
+    chi = f"chi-square {found.chi_square:.4g} of {found.degrees_of_freedom}, p {p}"
     return {"parameters": chi} | tests
 
 
