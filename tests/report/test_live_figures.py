@@ -11,8 +11,10 @@ import pytest
 from matplotlib.figure import Figure
 
 from jaxphoto import InputError
+from jaxphoto.camera import Brown, InteriorOrientation, Sensor, parameter_names
 from jaxphoto.report import (
     plot_boresight,
+    plot_change,
     plot_halves,
     plot_lidar_heights,
     plot_models,
@@ -27,6 +29,7 @@ from jaxphoto.report.made import Made
 from jaxphoto.report.model_choice import choice_figure
 from jaxphoto.report.study_page import WholePicture, study_page
 from jaxphoto.report.to_plotly import twins_of
+from jaxphoto.stability import change, image_grid
 from tests.report.studies import (
     GOPRO,
     MODELS,
@@ -80,6 +83,18 @@ def test_maps_of_halves_have_the_values_of_their_cells(axes):
     assert [twin.layout.title.text for twin in twins_of(figure)] == [a.get_title(loc="left") for a in figure.axes[:2]]
     # Areas between two lines tell what they stand for.
     assert f"{levels[0]:.3g} to {levels[1]:.3g}" in {trace["text"] for trace in to_plotly(axes).data}
+
+
+def test_maps_of_a_change_reach_as_far_as_its_offsets(axes):
+    sensor = Sensor(400, 300, 0.01)
+    first, second = (InteriorOrientation(8.0, 0.0, 0.0, Brown(k1=k1)) for k1 in (1e-4, 5e-4))
+    covariance = 1e-12 * np.eye(len(parameter_names(first)))
+    found = change(first, second, image_grid(sensor, 7, 5), (covariance, None), "zrot")
+    assert plot_change(found, sensor, axes) is axes and axes.get_title(loc="left") == "offset [px]"
+    # Of k1 alone, at the corner: (5e-4 - 1e-4) r^3 mm, through the first distortion.
+    assert axes.collections[0].zmax == pytest.approx(4e-4 * 2.5**3 / 0.01, rel=0.01)
+    over = plot_change(found, sensor, Figure().add_subplot(), over_usual=True)
+    assert over.collections[0].zmax == pytest.approx((found.offset_mm / found.limit_mm).max())
 
 
 def test_models_are_drawn_by_bic_and_by_what_they_predict(axes):
