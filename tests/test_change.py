@@ -7,7 +7,9 @@ import pandas as pd
 import pytest
 
 from jaxphoto.camera import parameter_names
+from jaxphoto.camera.conditions import Conditions
 from jaxphoto.errors import InputError
+from jaxphoto.io.conditions import write_conditions
 from jaxphoto.stability import change, parameter_vector, with_parameters
 from tests.commands import run
 from tests.test_stability import GRID, ONE, SIGMAS, TWO, covariance
@@ -81,3 +83,7 @@ def test_one_calibration_is_not_compared_with_itself_and_shared_image_points_are
         (folder / "inputs.csv").write_text(f"file,n_bytes,sha256\n{rows}")
         code, _, error = run(monkeypatch, capsys, "compare", a, b)
         assert code == 0 and ("are of the same photographs or image points" in error) == shared
+    # A block tells the photographs behind its image points, too.
+    write_conditions([Conditions("i", "i.jpg", 64 * "1")], a, ())
+    (b / "inputs.csv").write_text(f"file,n_bytes,sha256\ni.jpg,9,{64 * '1'}\n")
+    assert "are of the same photographs or image points" in run(monkeypatch, capsys, "compare", a, b)[2]

@@ -8,6 +8,7 @@ import equinox as eqx
 from jaxphoto.errors import InputError
 from jaxphoto.io.cameras import CameraFile, read_camera_file
 from jaxphoto.io.cameras.own_cameras import results_in
+from jaxphoto.io.conditions import CONDITIONS, read_conditions
 from jaxphoto.io.input_hashes import INPUTS, read_inputs
 from jaxphoto.io.sound_photographs import SUFFIXES
 from jaxphoto.report.stability import Compared
@@ -43,11 +44,16 @@ def check_two_calibrations(a: CameraFile, b: CameraFile, first: Path, second: Pa
 
 def share_measurements(first: Path, second: Path) -> bool:
     """Whether two folders of results say that a photograph, or a file of image points, is the same."""
-    tables = [results_in(path) / INPUTS for path in (first, second)]
-    if not all(table.is_file() for table in tables):
-        return False
-    measured = lambda table: {f.sha256 for f in read_inputs(table) if f.file.lower().endswith(_MEASURED)}  # noqa: E731
-    return not measured(tables[0]).isdisjoint(measured(tables[1]))
+    return not _measured(first).isdisjoint(_measured(second))
+
+
+def _measured(results: Path) -> set[str]:
+    """SHA-256 of the photographs and files of image points that a folder of results names; none where it names none."""
+    inputs, conditions = (results_in(results) / name for name in (INPUTS, CONDITIONS))
+    read = read_inputs(inputs) if inputs.is_file() else []
+    found = {f.sha256 for f in read if f.file.lower().endswith(_MEASURED)}
+    # Of a block, whose inputs are its tables, these name the photographs behind them.
+    return found | ({c.sha256 for c in read_conditions(conditions)} if conditions.is_file() else set())
 
 
 def check_one_sensor(a: CameraFile, b: CameraFile, first: Path, second: Path) -> None:
