@@ -16,7 +16,14 @@ from numpy.polynomial import legendre
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
-from jaxphoto.camera import InteriorOrientation, Sensor, get_parameter, parameter_names, set_parameter
+from jaxphoto.camera import (
+    InteriorOrientation,
+    RollingShutter,
+    Sensor,
+    get_parameter,
+    parameter_names,
+    set_parameter,
+)
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import camera_words
 from jaxphoto.observations import PRIORS, AbstractObservations, Correlated
@@ -197,7 +204,10 @@ def _over_format(adjusted: Adjustment, camera: str, mine: np.ndarray, places: Pl
         coefficients = np.stack([inverse @ f for f in field])
         # What the polynomials cannot tell from a term of fewer degrees has no name here.
         if np.abs(coefficients @ basis.T - field).max() < _EXACT * np.abs(field).max():
-            terms.append(PatternTerm(name, coefficients.ravel(), _cure(adjusted, camera, name), False))
+            cure = _cure(adjusted, camera, name)
+            if cure and _is_affine(field, grid - np.asarray(interior.principal_point)[:, None]):
+                cure += _OR_ROLLING * (RollingShutter.kind not in adjusted.unknowns.more)
+            terms.append(PatternTerm(name, coefficients.ravel(), cure, False))
     return ResidualPattern(f"image points of {camera_words(camera)} over the format", "mm", camera, parts, tuple(terms))
 
 
@@ -274,6 +284,7 @@ def _polynomials(xy: Float[np.ndarray, "2 n"], degree: int) -> Float[np.ndarray,
     return np.stack([x[i] * y[j] for i in range(degree + 1) for j in range(degree + 1 - i)])
 
 
+_OR_ROLLING = ", or estimate a rolling shutter, which stretches the image likewise (docs/rolling_shutter.md)"
 # Of Brown's model (docs/models.md), for cameras whose own model lacks them.
 _USUAL = {
     "k1": lambda x, y: (x * (x * x + y * y), y * (x * x + y * y)),
@@ -312,6 +323,13 @@ def _slopes(interior: InteriorOrientation, names: tuple[str, ...], values: Array
         return own.closed_form(one)
 
     return jax.vmap(jax.jacfwd(of), in_axes=(None, 0))(values, xy)
+
+
+def _is_affine(field: Float[np.ndarray, "2 n"], centred: Float[np.ndarray, "2 n"]) -> bool:
+    """Whether it stretches or shears the image, as rows do that are exposed one after another."""
+    matrix = field @ np.linalg.pinv(centred)
+    stretched = np.abs(matrix - np.eye(2) * np.trace(matrix) / 2).max() > _EXACT * np.abs(matrix).max()
+    return bool(stretched and np.abs(matrix @ centred - field).max() < _EXACT * np.abs(field).max())
 
 
 def _cure(adjusted: Adjustment, camera: str, name: str) -> str:

@@ -17,7 +17,7 @@ from jaxphoto.report.findings import Level
 from jaxphoto.simulation import remeasure
 from jaxphoto.statistics import patterns, trends
 from jaxphoto.statistics.responses import Responses
-from tests.blocks import Simulated, free_network, observed, simulated
+from tests.blocks import Simulated, adjusted, free_network, observed, simulated
 
 KNOWN = ("interior[one].c_mm", "interior[one].k1")
 
@@ -70,6 +70,13 @@ def test_a_lens_term_that_is_held_is_named():
     assert found.p_value < 1e-10 and found.hints[0].term.name == held and found.hints[0].share > 0.8
     said = [f.text for f in verdict_of(tables).findings if "over the format" in f.text]
     assert len(said) == 1 and f"{held}, which is held: free it" in said[0]
+
+
+def test_what_stretches_the_image_may_be_a_rolling_shutter():
+    (tested,) = (t for t in Tables(adjusted("cross")).tested_trends if "over the format" in t.pattern.what)
+    of = {term.name.split()[0]: term.cure for term in tested.pattern.terms}
+    shutter = {name for name, cure in of.items() if "rolling shutter" in cure}
+    assert shutter == {"b1", "b2"} and of["p1"] and not of["c_mm"]
 
 
 def test_stations_of_a_strip_that_are_off_are_named_with_their_shift():
