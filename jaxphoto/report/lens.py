@@ -37,6 +37,7 @@ def lens_findings(tables: Tables) -> Iterator[Finding]:
             off = value - float(prior.value)
             yield Finding(
                 Level.INFORMATION,
-                f"c of {camera_words(camera)}: {known:.2g} mm were known of it before, {own:.2g} mm with the block, by "
-                f"which it is {abs(off):.2g} mm ({abs(off) / known:.1f} of the former) {'more' if off > 0 else 'less'}",
+                f"c of {camera_words(camera)} was known to {known:.2g} mm before, and is to {own:.2g} mm with the "
+                f"block: {abs(off):.2g} mm {'more' if off > 0 else 'less'} than was thought, {abs(off) / known:.1f} of "
+                "the former",
             )

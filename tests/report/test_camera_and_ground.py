@@ -59,7 +59,7 @@ def test_a_block_that_does_not_tell_c_is_warned_of():
     block = with_known_lens(found.block, "one", LENS)
     prior, tables = block.priors.interior["one"].c, {}
     known = float(prior.sigma)
-    for share, word in ((0.9, "does not tell c"), (0.1, "(2.5 of the former) less")):
+    for share, word in ((0.9, "does not tell c"), (0.1, "mm less than was thought, 2.5 of the former")):
         row = {"camera": ["one"], "parameter": ["c_mm"], "value": [float(prior.value) - 2.5 * known]}
         tables["interior"] = pd.DataFrame(row | {"sigma": [share * known]})
         (finding,) = lens_findings(stub(dataclasses.replace(found, block=block), **tables))
