@@ -37,8 +37,9 @@ _BEYOND, _LEAST_DEG = 4.0, 5.0
 _CONTRADICT_DEG = 15.0
 # Cosines between directions in the turned network and those of positions: one line, to 20 degrees; others, by 60.
 _SAME_LINE, _OTHER_LINE = 0.94, 0.5
-# Positions whose distances are off by less than this part (median) tell directions.
-_TELLING = 0.1
+# Positions whose distances are off by less than this part (median) tell directions; of fewer than so many, for which
+# that may be chance, those that are apart by so many standard deviations.
+_TELLING, _FEW, _APART = 0.1, 6, 3.0
 # Of mounts: the name by which a block folder finds it for every camera.
 _MOUNT = "default"
 
@@ -66,9 +67,10 @@ def recorded_turn(
     block: Block,
     attitudes: Mapping[str, CameraAttitude | None],
     places: Mapping[str, Float[np.ndarray, "3"]],
+    sigma_m: Mapping[str, Float[np.ndarray, "3"]],
     frame: MapFrame,
 ) -> RecordedTurn | str | None:
-    """The turn by the `attitudes` of images that have `places` (longitude, latitude, height) too.
+    """The turn by the `attitudes` of images that have `places` (longitude, latitude, height, +- `sigma_m`) too.
 
     None where there are none; a sentence where they contradict one another, or the places.
     """
@@ -78,13 +80,14 @@ def recorded_turn(
     local = frame.local_from_place(np.array([places[name] for _, name, _ in known], float))
     own = frame.local_from_level(local) @ np.array([a.level_from_camera for _, _, a in known])
     network = np.asarray(block.start.unknowns.exterior.position, float)[[k for k, _, _ in known]]
+    sigma = np.linalg.norm([sigma_m[name] for _, name, _ in known], axis=1)
     first = _turn_of(block, known, own)
-    along = _cosine(network, local, first)
+    along = _cosine(network, local, sigma, first)
     if isinstance(first, RecordedTurn) and (along is None or along > _OTHER_LINE):
         return first
     for quarters in (1, 2, 3):
         found = _turn_of(block, known, own @ _clockwise(quarters))
-        if isinstance(found, RecordedTurn) and (_cosine(network, local, found) or 0.0) > _SAME_LINE:
+        if isinstance(found, RecordedTurn) and (_cosine(network, local, sigma, found) or 0.0) > _SAME_LINE:
             return found._replace(quarters=quarters)
     if along is None:
         return first
@@ -122,7 +125,10 @@ def _clockwise(quarters: int) -> Float[np.ndarray, "3 3"]:
 
 
 def _cosine(
-    network: Float[np.ndarray, "n 3"], local: Float[np.ndarray, "n 3"], recorded: RecordedTurn | str
+    network: Float[np.ndarray, "n 3"],
+    local: Float[np.ndarray, "n 3"],
+    sigma: Float[np.ndarray, "n"],
+    recorded: RecordedTurn | str,
 ) -> float | None:
     """Between directions from place to place in the turned network and on the ground; None where these tell nothing."""
     one, other = np.triu_indices(len(local), 1)
@@ -131,8 +137,12 @@ def _cosine(
     a, b = ((v[one] - v[other]) for v in (network @ recorded.turn.T, local))
     there, here = np.linalg.norm(a, axis=1), np.linalg.norm(b, axis=1)
     far = (here >= np.median(here)) & (there > 0) & (here > 0)
+    if len(local) < _FEW:
+        far &= here > _APART * np.hypot(sigma[one], sigma[other])
+    if not far.any():
+        return None
     ratio = here[far] / there[far]
-    if not far.any() or np.median(np.abs(ratio / np.median(ratio) - 1)) > _TELLING:
+    if np.median(np.abs(ratio / np.median(ratio) - 1)) > _TELLING:
         return None
     return float(np.median(np.sum(a[far] * b[far], axis=1) / (there[far] * here[far])))
 

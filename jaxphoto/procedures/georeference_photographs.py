@@ -107,8 +107,9 @@ def georeference_photographs(
     here = frame.local_from_place(places)
     image = np.array([block.images.index(name) for name in known])
     there = np.asarray(block.start.unknowns.exterior.position, float)[image]
-    recorded = recorded_turn(block, attitudes or {}, dict(zip(known, places, strict=True)), frame)
     given = np.array([gps.stated_sigma_m or SIGMA_M for gps in known.values()])
+    at, sigma_of = (dict(zip(known, v, strict=True)) for v in (places, given))
+    recorded = recorded_turn(block, attitudes or {}, at, sigma_of, frame)
     # Where no file says how good its positions are, they are judged by one another alone.
     own = given if any(gps.stated_sigma_m for gps in known.values()) else np.zeros_like(given)
     fitted = _fitted(block, image, here, given, own, recorded)

@@ -252,6 +252,19 @@ def test_attitudes_of_pictures_that_a_program_turned_are_turned_likewise(degrees
 
 
 @pytest.mark.slow
+def test_positions_nearer_than_receivers_tell_contradict_no_attitudes():
+    """Two photographs taken 5 m apart, of which the second has its error north instead of east."""
+    block, truth = network()
+    position = np.asarray(truth.exterior.position)[[0, 0]] + [[0.0, 0.0, 0.0], [0.0, 5.0, 0.0]]
+    attitudes = strip_attitudes(block, truth, np.random.default_rng(5))
+    poor = recorded(position, block.images[:2])
+    found = georeference_photographs(block, poor, attitudes=attitudes)
+    assert turned_deg(found.block.start.unknowns.exterior, truth).max() < 1.5
+    good = {n: g._replace(sigma_m=(0.02, 0.02, 0.04)) for n, g in poor.items()}
+    found = georeference_photographs(block, good, attitudes=attitudes)
+    assert any("the pictures lie turned by 90 degrees" in s for s in found.sentences)
+
+
 def test_a_single_strip_is_adjusted_with_what_attitudes_share():
     block, truth = network()
     rng = np.random.default_rng(5)
