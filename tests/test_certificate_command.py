@@ -74,6 +74,16 @@ def test_the_readout_of_a_rolling_shutter_is_in_the_interior_orientation(results
     assert "-30.21" in page
 
 
+def test_check_points_that_are_shifted_are_told_at_the_head(results, tmp_path, monkeypatch, capsys):
+    own = tmp_path / "own"
+    shutil.copytree(results, own)
+    summary = json.loads((own / "summary.json").read_text()) | {"verdict": "green", "findings": []}
+    for mean, head in ((0.001, "no test of the adjustment objects"), (0.03, "check points are shifted in Z: see")):
+        told = {"check_points": {"Z": {"n": 30, "mean_m": mean, "rmse_m": 0.04, "max_abs_m": 0.1}}}
+        (own / "summary.json").write_text(json.dumps(summary | told))
+        assert head in certified(own, tmp_path / "a.html", monkeypatch, capsys).decode()
+
+
 def test_inputs_are_told_by_their_hashes(results):
     told = {f.file: f.sha256 for f in read_inputs(results / "inputs.csv")}
     block = results.parent / "block"

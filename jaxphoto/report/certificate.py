@@ -63,6 +63,8 @@ def _statement(given: Certified) -> Iterator[Element]:
         n = sum(level == "warning" for level, _ in findings)
         those = "1 reservation, which is" if n == 1 else f"{n} reservations, which are"
         yield Paragraph(f"Calibrated with {those} listed under Findings.", "verdict amber")
+    elif axes := ", ".join(given.shifted_axes):
+        yield Paragraph(f"Calibrated; check points are shifted in {axes}: see there before signing.", "verdict amber")
     else:
         yield Paragraph("Calibrated; no test of the adjustment objects.", "verdict green")
     if given.sigma_factor > 1:
@@ -166,10 +168,8 @@ def _precision(given: Certified) -> Iterator[Element]:
         yield Paragraph("Not known: no covariance.")
         return
     points = image_grid(given.sensor, _COLUMNS, _ROWS)
-    found = []
     per_mm = given.sigma_factor / given.sensor.pixel_mm
-    for method, words in _GIVEN_UP:
-        found.append((words, per_mm * format_sigma(given.interior, given.covariance, points, method)))
+    found = [(words, per_mm * format_sigma(given.interior, given.covariance, points, how)) for how, words in _GIVEN_UP]
     panels = [
         DocumentPicture(
             partial(draw_map, sensor=given.sensor, cells_mm=points, values=sigma, title=f"sigma [px], {words}"),

@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from jaxphoto.camera import InteriorOrientation, Sensor
 from jaxphoto.camera.conditions import Conditions
+from jaxphoto.statistics import AxisErrors
 from jaxphoto.writing.inputs import InputFile
 
 
@@ -67,3 +68,13 @@ class Certified(NamedTuple):
         """By what sigmas are to be multiplied because neighbouring rays err alike; 1 where nothing says so."""
         told = self.summary.get("sigma_factor", 1.0)
         return float(told) if isinstance(told, int | float) and math.isfinite(told) and told > 1 else 1.0
+
+    @property
+    def shifted_axes(self) -> list[str]:
+        """Axes in which the mean error of check points has to be looked into."""
+        found = []
+        for axis, of in dict(self.summary.get("check_points", {})).items():
+            n, mean, rmse = (of.get(key, math.nan) for key in ("n", "mean_m", "rmse_m"))
+            if AxisErrors(axis, n, mean, rmse).biased:
+                found.append(axis)
+        return found
