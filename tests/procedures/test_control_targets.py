@@ -91,6 +91,30 @@ def test_two_things_that_look_alike_are_not_believed():
     assert found.state[found.ids.index("G21")] == "not marked"
 
 
+def test_another_thing_at_a_check_point_gives_way_to_its_target():
+    """At first the other thing is seen, 0.8 m away; then the target, or that thing again, which is said to be far."""
+    m = marked_block()
+    true, _ = looker_of(m.control)
+    calls = []
+
+    def look(at, radius, images, ids):
+        calls.append(1)
+        seen = true.look(at, radius, images, ids)
+        if len(calls) > 1 and target:
+            return seen
+        own = np.array([ids[at.point[k]] == "G21" for k in seen.row])
+        away = at.px_per_m[seen.row] @ [0.8, 0.0, 0.0]
+        return seen._replace(column_row=seen.column_row + np.where(own[:, None], away, 0.0))
+
+    for target in (True, False):
+        calls.clear()
+        by_hand = known_only(m.control, BY_HAND)
+        found = control_block_with_targets(m.block, by_hand, Looker(look, False), adjust=adjust)
+        off = np.linalg.norm(found.off_m[found.ids.index("G21")])
+        said = "the target of G21 was found anew, 0.8" if target else "what was found for check point G21 lies 0.8"
+        assert (off < 0.5) == target and any(said in text for text in found.sentences)
+
+
 def test_without_a_place_nobody_knows_where_to_look():
     m = marked_block()
     with pytest.raises(InputError, match="mark three control points by hand"):
