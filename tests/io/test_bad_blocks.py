@@ -175,6 +175,7 @@ def test_no_folder(tmp_path):
 
 def test_what_lies_there_instead_of_a_table_is_named(write_folder):
     folder = write_folder()
+    (folder / "Images").mkdir()
     (folder / I).rename(folder / "Images.xlsx")
     with pytest.raises(InputError, match=r"no file images\.csv; there is Images\.xlsx: save it as images\.csv"):
         read_block(folder)

@@ -38,7 +38,13 @@ def test_a_gcp_list_has_points_and_marks(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "row", ["G{} 386800.5 61750{}0.2 30.5", "386800.5 61750{1}0.2 30.5 G{0}", "{} 386800.5 61750{}0.2 nan"]
+    "row",
+    [
+        "G{} 386800.5 61750{}0.2 30.5",
+        "386800.5 61750{1}0.2 30.5 G{0}",
+        "386800.5 61750{1}0.2 30.5 {0}",
+        "{} 386800.5 61750{}0.2 nan",
+    ],
 )
 def test_a_gcp_list_that_is_to_be_marked_has_points_alone(tmp_path, row):
     rows = "\n".join(row.format(k, k) for k in "123")

@@ -249,7 +249,7 @@ model = "ciddor"
         ([section("[unknowns.shutters.kodak]\nreadout_ms = 0.03")], r"readout_ms: 0\.03 ms cannot be; give"),
         (
             [section("[unknowns.shutters.default]\nreadout_ms = 30.0\n[unknowns.motions.a]\n[unknowns.motions.c]")],
-            r"shutters\.kodak\]: 1 photograph of it \(b\) would stand still; give velocity_m_per_s",
+            r"shutters\.kodak\]: 1 photograph of this camera \(b\) would stand still; give velocity_m_per_s",
         ),
         (
             [section("[unknowns.motions.default]\nvelocity_m_per_s = [0.0, 10.0, 0.0]")],

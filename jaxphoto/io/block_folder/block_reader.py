@@ -101,7 +101,7 @@ def _instead(folder: Path, file: str) -> str:
     """What to do where a needed file is missing: the table may lie there as something else."""
     if (folder / file).is_dir():
         return "what is called so is a folder: put the file in its place"
-    like = sorted(p.name for p in folder.iterdir() if p.stem.lower() == Path(file).stem and p.name != file)
+    like = sorted(p.name for p in folder.iterdir() if p.stem.lower() == Path(file).stem and p.is_file())
     return f"there is {like[0]}: save it as {file}" if like else "add it"
 
 

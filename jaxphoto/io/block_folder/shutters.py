@@ -30,11 +30,11 @@ def check_shutters(images: Images, starts: Unknowns, priors: Unknowns) -> None:
                 f"{place} readout_ms: {float(shutter.readout):g} ms cannot be; give milliseconds, of most cameras 5 to "
                 "100, or 0 where all rows are exposed at once"
             )
-        still = [name for name, own in zip(images.ids, images.cameras, strict=True) if own == camera]
-        if missing := [name for name in still if name not in motions]:
+        taken = [name for name, own in zip(images.ids, images.cameras, strict=True) if own == camera]
+        if missing := [name for name in taken if name not in motions]:
             raise BlockError(
-                f"{place}: {counted(len(missing), 'photograph')} of it ({few(missing)}) would stand still; give "
-                f"velocity_m_per_s of each in [unknowns.{ImageMotion.kind}.IMAGE]"
+                f"{place}: {counted(len(missing), 'photograph')} of this camera ({few(missing)}) would stand still; "
+                f"give velocity_m_per_s of each in [unknowns.{ImageMotion.kind}.IMAGE]"
             )
     if motions and not shutters:
         raise BlockError(

@@ -38,7 +38,8 @@ def recognises(lines: list[str]) -> bool:
 
 def _point(cells: list[str]) -> tuple[str, int] | None:
     """The name, if there is one, and the first coordinate of a row that is a point alone; None where it is none."""
-    if len(cells) == _NAMED and all(map(is_number, cells[1:])):
+    # A number with decimals is no name: names may stand last, and be numbers too.
+    if len(cells) == _NAMED and all(map(is_number, cells[1:])) and not (is_number(cells[0]) and "." in cells[0]):
         return cells[0], 1
     if len(cells) in (_NAMED - 1, _NAMED) and all(map(is_number, cells[:3])):
         return "".join(cells[3:]), 0
