@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxphoto.arrays import on_device
 from jaxphoto.block import Block
@@ -40,6 +40,8 @@ _SAME_LINE, _OTHER_LINE = 0.94, 0.5
 # Positions whose distances are off by less than this part (median) tell directions; of fewer than so many, for which
 # that may be chance, those that are apart by so many standard deviations.
 _TELLING, _FEW, _APART = 0.1, 6, 3.0
+# Photographs that are compared with one another, which takes memory by the square of their number.
+_MOST = 500
 # Of mounts: the name by which a block folder finds it for every camera.
 _MOUNT = "default"
 
@@ -104,8 +106,9 @@ def _turn_of(
     sigma = np.deg2rad([a.sigma_deg for _, _, a in known])
     kept, off = np.ones(len(said), bool), np.zeros(len(said))
     # The one that most are nearest to, then the average of those near it.
-    apart = _angles(np.einsum("nji,mjk->nmik", said, said))
-    turn = said[np.argmin(np.median(apart, axis=1))]
+    some = said[_some(len(said))]
+    apart = _angles(np.einsum("nji,mjk->nmik", some, some))
+    turn = some[np.argmin(np.median(apart, axis=1))]
     for _ in range(5):
         off = _angles(said @ turn.T)
         kept = off <= max(_BEYOND * float(np.median(off)), np.deg2rad(_LEAST_DEG))
@@ -117,6 +120,11 @@ def _turn_of(
     level = np.sqrt(np.mean(sigma[kept, :2] ** 2) / kept.sum() + np.deg2rad(max(BORESIGHT_DEG[:2])) ** 2)
     lost = tuple(name for (_, name, _), good in zip(known, kept, strict=True) if not good)
     return RecordedTurn(image[kept], own[kept], sigma[kept], turn, float(level), scatter, lost)
+
+
+def _some(n: int) -> Int[np.ndarray, "m"]:
+    """As many of `n` as are compared with one another, from the first to the last."""
+    return np.linspace(0, n - 1, min(n, _MOST)).astype(int)
 
 
 def _clockwise(quarters: int) -> Float[np.ndarray, "3 3"]:
@@ -131,7 +139,8 @@ def _cosine(
     recorded: RecordedTurn | str,
 ) -> float | None:
     """Between directions from place to place in the turned network and on the ground; None where these tell nothing."""
-    one, other = np.triu_indices(len(local), 1)
+    some = _some(len(local))
+    one, other = (some[k] for k in np.triu_indices(len(some), 1))
     if isinstance(recorded, str) or not len(one):
         return None
     a, b = ((v[one] - v[other]) for v in (network @ recorded.turn.T, local))
