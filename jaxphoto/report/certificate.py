@@ -17,7 +17,7 @@ from jaxphoto.report.certificate_conditions import condition_rows, flight_rows
 from jaxphoto.report.certificate_figures import draw_correlations, draw_curve, draw_map
 from jaxphoto.report.certified import Certified
 from jaxphoto.report.change import change_verdict
-from jaxphoto.report.digits import with_sigma
+from jaxphoto.report.digits import of_p, of_sigma, with_sigma
 from jaxphoto.report.document import Document, DocumentPicture, Element, Heading, Paragraph, Pictures, Rows
 from jaxphoto.report.findings import as_sentence, symbol
 from jaxphoto.report.made import option_word
@@ -124,7 +124,7 @@ def _interior(given: Certified) -> Iterator[Element]:
     for name, sigma in zip(names, sigmas * given.sigma_factor, strict=True):
         value = float(get_parameter(given.interior, name))
         if sigma > 0 or value:
-            told = (with_sigma(value, sigma), f"{sigma:.2g}" if sigma else "held", parameter_unit(given.interior, name))
+            told = (with_sigma(value, sigma), of_sigma(sigma) or "held", parameter_unit(given.interior, name))
             rows.append((name, *told, _in_px(given, name, sigma)))
     rows += [
         (n, f"{float(get_parameter(given.interior, n)):.8g}", "constant", parameter_unit(given.interior, n), "")
@@ -133,7 +133,7 @@ def _interior(given: Certified) -> Iterator[Element]:
     readout = dict(given.summary.get("georeferencing", {})).get(readout_of(given.camera), {})
     value, sigma = readout.get("value"), readout.get("sigma")
     if isinstance(value, int | float) and isinstance(sigma, int | float):
-        rows.append(("readout_ms", with_sigma(value, sigma), f"{sigma:.2g}", "ms", ""))
+        rows.append(("readout_ms", with_sigma(value, sigma), of_sigma(sigma), "ms", ""))
     yield Rows(("parameter", "value", "sigma", "unit", "in pixels: value, sigma"), tuple(rows))
     yield Paragraph(
         "x_p to the right and y_p up from the centre of the format; the unit 1 is that of a number without one "
@@ -255,8 +255,8 @@ def _stability(given: Certified) -> Iterator[Element]:
         )
     )  # fmt: skip
     rows = tuple(
-        (p.parameter, with_sigma(p.first, p.sigma), with_sigma(p.second, p.sigma), f"{p.difference:.2g}",
-         f"{p.sigma:.2g}", p.unit, f"{p.p_value:.2g}")
+        (p.parameter, with_sigma(p.first, p.sigma), with_sigma(p.second, p.sigma),
+         with_sigma(p.difference, p.sigma), of_sigma(p.sigma), p.unit, of_p(p.p_value))
         for p in found.parameters if p.sigma > 0
     )  # fmt: skip
     if rows:
@@ -320,7 +320,7 @@ def _in_px(given: Certified, name: str, sigma: float) -> str:
         return ""
     pixel = given.sensor.pixel_mm
     value = float(get_parameter(given.interior, name)) / pixel
-    return with_sigma(value, sigma / pixel) + (f", {sigma / pixel:.2g}" if sigma else "")
+    return with_sigma(value, sigma / pixel) + (f", {of_sigma(sigma / pixel)}" if sigma else "")
 
 
 def _all_inputs(given: Certified) -> list:
