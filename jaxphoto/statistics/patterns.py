@@ -206,7 +206,7 @@ def _over_format(adjusted: Adjustment, camera: str, mine: np.ndarray, places: Pl
         if np.abs(coefficients @ basis.T - field).max() < _EXACT * np.abs(field).max():
             cure = _cure(adjusted, camera, name)
             if cure and _is_affine(field, grid - np.asarray(interior.principal_point)[:, None]):
-                cure += _OR_ROLLING * (RollingShutter.kind not in adjusted.unknowns.more)
+                cure += _OR_ROLLING * (camera not in adjusted.unknowns.more.get(RollingShutter.kind, {}))
             terms.append(PatternTerm(name, coefficients.ravel(), cure, False))
     return ResidualPattern(f"image points of {camera_words(camera)} over the format", "mm", camera, parts, tuple(terms))
 
