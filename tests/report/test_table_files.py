@@ -44,7 +44,7 @@ def test_a_column_has_as_many_figures_in_each_row():
     assert alike([0.0035, 0.002861, -0.0129], 3) == ["0.00350", "0.00286", "-0.0129"]
     assert alike([1e-08, 4e-10, 0.0], 4) == ["1e-08", "4e-10", "0"] and alike([20.0, 3.5], 4) == ["20", "3.5"]
     shown = readable(pd.DataFrame({"rmse": [0.4, np.nan, 0.188], "X_m": [1234.5678, 0.5, 2.0]}))
-    assert shown["rmse"].tolist() == ["0.400", "", "0.188"] and shown["X_m"].tolist() == ["1234.5678", "0.5", "2"]
+    assert shown["rmse"].tolist() == ["0.400", "", "0.188"] and shown["X_m"].tolist() == ["1234.5678", "0.5000", "2.0000"]
 
 
 def test_yes_and_no_are_no_numbers():
