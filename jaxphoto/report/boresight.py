@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import time
 from collections.abc import Sequence
@@ -50,10 +51,16 @@ def boresight_verdict(steps: tuple[Step, ...]) -> str:
 
 
 def steps_table(steps: Sequence[Step]) -> pd.DataFrame:
-    """step, parameter, value, sigma, unit: sigma0 and every estimate; sigmas are a posteriori."""
+    """step, parameter, value, sigma, unit: sigma0 and every estimate; sigmas are a posteriori.
+
+    That of sigma0, with f the redundancy, is sigma0 / sqrt(2 f).
+    """
     rows: list[tuple] = []
     for step in steps:
-        rows.append((step.number, "sigma0", float(step.adjusted.sigma0), None, ""))
+        sigma0, redundancy = float(step.adjusted.sigma0), step.adjusted.redundancy
+        # Of normal errors, to first order.
+        own = sigma0 / math.sqrt(2 * redundancy) if redundancy > 0 else None
+        rows.append((step.number, "sigma0", sigma0, own, ""))
         rows += [(step.number, *estimate) for estimate in step.estimates]
     return pd.DataFrame(rows, columns=["step", "parameter", "value", "sigma", "unit"])
 

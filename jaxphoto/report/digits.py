@@ -1,12 +1,15 @@
 """Numbers with as many digits as their standard deviations have a use for."""
 
 import math
+import re
 from collections.abc import Iterable
 
 # From here on a number is written without a power of ten, as by Python's "g".
 _LEAST = 1e-4
 # Digits beyond these are no more than rounding of the computation.
 _MOST = 12
+# Numbers of up to ten digits that are written with a power of ten.
+_LARGE = re.compile(r"(?<![\w.])([+-]?)(\d(?:\.\d*)?e\+0\d)(?!\w)")
 
 
 def with_sigma(value: float, sigma: float) -> str:
@@ -28,7 +31,7 @@ def with_sigma(value: float, sigma: float) -> str:
 
 def of_sigma(sigma: float) -> str:
     """A standard deviation in two digits."""
-    return f"{sigma:#.2g}".rstrip(".") if sigma > 0 else ""
+    return in_figures(sigma, 2) if sigma > 0 else ""
 
 
 def of_p(p_value: float, digits: int = 2) -> str:
@@ -38,7 +41,12 @@ def of_p(p_value: float, digits: int = 2) -> str:
 
 def in_figures(value: float, figures: int) -> str:
     """A number in so many figures, its last zeros too: 0.00350 beside 0.00286; zero is 0."""
-    return f"{value:#.{figures}g}".replace(".e", "e").rstrip(".") if value else "0"
+    return without_powers(f"{value:#.{figures}g}").replace(".e", "e").rstrip(".") if value else "0"
+
+
+def without_powers(text: str) -> str:
+    """A text whose large numbers are written out: 400 m, and not 4e+02 m."""
+    return _LARGE.sub(lambda number: f"{number[1]}{float(number[2]):.0f}", text)
 
 
 def alike(values: Iterable[float], most: int) -> list[str]:

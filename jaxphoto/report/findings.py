@@ -7,7 +7,7 @@ from html import escape
 from typing import NamedTuple
 
 from jaxphoto.errors import camera_words
-from jaxphoto.report.digits import of_p
+from jaxphoto.report.digits import of_p, without_powers
 
 
 class Level(enum.IntEnum):
@@ -48,8 +48,8 @@ class Verdict(NamedTuple):
 
     @classmethod
     def of(cls, findings: Iterable[Finding]) -> "Verdict":
-        """The findings in order, parameters called as sentences call them."""
-        told = (Finding(f.level, in_symbols(f.text)) for f in findings)
+        """The findings in order, parameters called as sentences call them, large numbers written out."""
+        told = (Finding(f.level, without_powers(in_symbols(f.text))) for f in findings)
         return cls(tuple(sorted(told, key=lambda f: -f.level)))
 
     @property

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -15,6 +16,7 @@ from rich.table import Table
 from jaxphoto.block import Block
 from jaxphoto.errors import InputError
 from jaxphoto.procedures.model_choice import ModelChoice
+from jaxphoto.report.digits import of_p
 from jaxphoto.report.document import Heading, rows_of
 from jaxphoto.report.made import Made, made_section, versions
 from jaxphoto.report.plots import axes_or_new, drawn, new_figure
@@ -27,11 +29,12 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# The page shows these of `choice_table`, with that many digits; the terminal a few of them.
-_SHOWN = {
-    "model": None, "parameters": "{:d}", "sigma0": "{:.3f}", "rms_px": "{:.4f}", "cv_rms_px": "{:.4f}",
-    "cv_excess_se": "{:.1f}", "delta_aicc": "{:.1f}", "delta_bic": "{:.1f}", "smaller": None, "f": "{:.2f}",
-    "f_p": "{:.2g}", "weakest": None, "weakest_ratio": "{:.1f}",
+# The page shows these of `choice_table`, so written; the terminal a few of them.
+_SHOWN: dict[str, Callable[[Any], str]] = {
+    "model": str, "parameters": str, "sigma0": "{:.3f}".format, "rms_px": "{:.4f}".format,
+    "cv_rms_px": "{:.4f}".format, "cv_excess_se": "{:.1f}".format, "delta_aicc": "{:.1f}".format,
+    "delta_bic": "{:.1f}".format, "smaller": str, "f": "{:.2f}".format, "f_p": of_p, "weakest": str,
+    "weakest_ratio": "{:.1f}".format,
 }  # fmt: skip
 
 _IN_TERMINAL = ("model", "parameters", "rms_px", "cv_rms_px", "cv_excess_se", "delta_bic", "f_p")
@@ -214,7 +217,7 @@ def _shown(table: pd.DataFrame) -> pd.DataFrame:
     """The columns for people, as text; those of which no model has a number are left out."""
     columns = {}
     for name, form in _SHOWN.items():
-        cells = [str(v) if form is None else "" if pd.isna(v) else form.format(v) for v in table[name]]
+        cells = ["" if pd.isna(v) else form(v) for v in table[name]]
         if any(cells):
             columns[name] = cells
     return pd.DataFrame(columns)

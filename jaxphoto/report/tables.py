@@ -128,7 +128,8 @@ class Tables:
     def trends(self) -> pd.DataFrame:
         """One row a pattern: pattern, freedom, p_value, rms, unit; term, share, amount and sigma of what explains most.
 
-        `rms` is of what the pattern explains of the residuals, without its noise; units of terms are the camera's.
+        `rms` is of what the pattern explains of the residuals, without its noise, and NaN where that is nothing; units
+        of terms are the camera's.
         """
         columns = ["pattern", "freedom", "p_value", "rms", "unit", "term", "share", "amount", "sigma"]
         rows = []
@@ -136,7 +137,8 @@ class Tables:
             factor, unit = in_file_unit(t.pattern.unit)
             best = t.hints[0][:4] if t.hints else None
             told = (best[0].name, *best[1:]) if best else ("", np.nan, np.nan, np.nan)
-            rows.append((t.pattern.what, t.freedom, t.p_value, factor * t.size, unit, *told))
+            rms = factor * t.size if t.size > 0 else np.nan
+            rows.append((t.pattern.what, t.freedom, t.p_value, rms, unit, *told))
         return pd.DataFrame(rows, columns=columns)
 
     @cached_property

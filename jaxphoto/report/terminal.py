@@ -79,7 +79,7 @@ def print_adjustment(tables: Tables, verdict: Verdict, console: Console) -> None
     if tables.truth:
         found = Table("group", "n", "rms ratio", "beyond 2 sigma", title="(estimate - truth) / sigma")
         for group, n, ratio, beyond in recovery_spread(tables.recovery).itertuples(index=False):
-            found.add_row(plain(group), str(n), f"{ratio:.3g}", f"{beyond:.1%}")
+            found.add_row(plain(group), str(n), in_figures(ratio, 3), f"{beyond:.1%}")
         console.print(found)
 
 

@@ -261,6 +261,9 @@ def test_the_command_writes_all_four_steps(monkeypatch, capsys, tmp_path):
     for step in steps():
         mine = table[table["step"] == step.number].set_index("parameter")
         assert mine.loc["sigma0", "value"] == pytest.approx(float(step.adjusted.sigma0), rel=1e-6)
+        assert (mine.loc["sigma0", "sigma"] / mine.loc["sigma0", "value"]) ** -2 == pytest.approx(
+            2 * step.adjusted.redundancy
+        )
         for e in step.estimates:
             assert abs(mine.loc[e.parameter, "value"] - e.value) < 1e-3 * e.sigma
             assert mine.loc[e.parameter, "sigma"] == pytest.approx(e.sigma, rel=1e-4)

@@ -12,7 +12,7 @@ from jaxphoto.procedures import Step
 from jaxphoto.procedures.boresight_judgement import BoresightEstimate
 from jaxphoto.procedures.camera_candidates import Candidate
 from jaxphoto.procedures.halves import Cut, Halves
-from jaxphoto.procedures.lidar import LidarControl, Round
+from jaxphoto.procedures.lidar import LidarControl, Round, Simultaneous
 from jaxphoto.procedures.model_choice import Judged, ModelChoice
 from jaxphoto.stability import Analysis, image_grid
 from jaxphoto.stability.analysis import analyse
@@ -76,6 +76,19 @@ def lidar_control_of(residual_m: float = 0.05) -> LidarControl:
     height[refused] = np.nan
     flag = np.where(refused, int(next(iter(HeightFlag))), 0)
     return LidarControl(a.block, a, points, height, np.full(len(points), 0.1), flag, used & ~refused, ROUNDS, True)
+
+
+def simultaneous_of(before_m: float, after_m: float) -> Simultaneous:
+    """Every second point so far above the cloud's surface, the others as far below; of one it is not known."""
+    a = adjusted("cross")
+    points = np.arange(len(a.block.points))
+    side = np.where(points == 3, np.nan, np.where(points % 2, 1.0, -1.0))
+    # Without cloud and scanner, which no picture shows.
+    result = object.__new__(Simultaneous)
+    told = {"adjusted": a, "points": points, "apart_before": before_m * side, "apart": after_m * side}
+    for name, value in told.items():
+        object.__setattr__(result, name, value)
+    return result
 
 
 def ray_offsets() -> Analysis:

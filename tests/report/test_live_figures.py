@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from jaxphoto import InputError
 from jaxphoto.camera import Brown, InteriorOrientation, Sensor, parameter_names
 from jaxphoto.report import (
+    plot_above,
     plot_boresight,
     plot_change,
     plot_halves,
@@ -24,7 +25,7 @@ from jaxphoto.report import (
 from jaxphoto.report.boresight import boresight_figure, boresight_page
 from jaxphoto.report.document import DocumentPicture, Heading, Pictures
 from jaxphoto.report.halves import halves_figure
-from jaxphoto.report.lidar import heights_figure
+from jaxphoto.report.lidar import above_figure, heights_figure
 from jaxphoto.report.made import Made
 from jaxphoto.report.model_choice import choice_figure
 from jaxphoto.report.study_page import WholePicture, study_page
@@ -38,6 +39,7 @@ from tests.report.studies import (
     lidar_control_of,
     model_choice_of,
     ray_offsets,
+    simultaneous_of,
 )
 
 
@@ -129,6 +131,15 @@ def test_heights_of_a_cloud_are_counted_and_coloured(axes):
     with pytest.raises(InputError, match="no height of the cloud is control"):
         plot_lidar_heights(none, axes, residuals=True)
     assert len(twins_of(heights_figure(none))) == 1
+
+
+def test_points_above_a_cloud_have_the_colours_of_before(axes):
+    result = simultaneous_of(0.5, 0.05)
+    assert plot_above(result, axes) is axes and axes.get_title(loc="left") == "after: RMSE 0.050 m"
+    np.testing.assert_allclose(axes.collections[0].get_array(), result.apart)
+    before, after = (panel.collections[0] for panel in above_figure(result).axes[:2])
+    np.testing.assert_allclose(before.get_array(), result.apart_before)
+    assert before.get_clim() == after.get_clim() == axes.collections[0].get_clim() == (-0.5, 0.5)
 
 
 def test_offsets_of_rays_are_arrows_in_micrometres(axes):
