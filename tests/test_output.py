@@ -132,6 +132,15 @@ def test_compiling_is_timed_once_where_programs_are_compiled_within_each_other()
     assert "slowly traced" in said and "slowly traced" in times.sentence
 
 
+def test_a_program_without_a_name_is_called_one():
+    times = CompileTimes()
+    jax.monitoring.record_event_duration_secs(
+        "/jax/core/compile/backend_compile_duration", 1.0, fun_name="jit(<lambda>)"
+    )
+    times.stop()
+    assert times.programs == {"a program": 1.0}
+
+
 def test_compiling_that_took_long_is_told_beside_the_outcome(simulated, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["jaxphoto", "example"])
     monkeypatch.setattr("jaxphoto.cli.output.WORTH_TELLING_S", 0.0)

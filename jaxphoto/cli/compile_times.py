@@ -69,7 +69,7 @@ _heard_by: list[CompileTimes] = []
 
 def _hear(event: str, duration_secs: float, **of: Any) -> None:
     if event.startswith(_STEPS) and event.endswith("_duration"):
-        name = re.sub(r"^jit\((.*)\)$", r"\1", str(of.get("fun_name", "")))
+        name = re.sub(r"^jit\((.*)\)$", r"\1", str(of.get("fun_name", ""))).replace("<lambda>", "")
         for times in tuple(_heard_by):
             times(event, duration_secs, name.removesuffix("_of_arrays").strip("_").replace("_", " ") or "a program")
 

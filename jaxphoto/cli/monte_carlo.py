@@ -89,8 +89,9 @@ def monte_carlo_command(
         f"{summary['draws']} draws, {summary['converged']} converged, {summary['fallbacks']} by a full adjustment; "
         f"{summary['draws_per_second']:.0f} draws a second",
     )
-    heads = Column("quantity", overflow="fold"), "unit", "nominal", "mean", "sd", "predicted sigma", "ratio"
-    shown = Table(*heads, title="estimates over the draws")
+    heads = "quantity", "unit", "nominal", "mean", "sd", "predicted sigma", "ratio"
+    # Where there is no room, numbers are broken, too, and not cut.
+    shown = Table(*(Column(head, overflow="fold") for head in heads), title="estimates over the draws")
     few = table[~table["quantity"].astype(str).str.startswith(("bias.", *LONG))]
     columns = ["quantity", "unit", "nominal", "mean", "sd", "predicted_sigma", "ratio"]
     for row in readable(few[columns]).itertuples(index=False):
