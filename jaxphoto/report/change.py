@@ -83,6 +83,11 @@ def change_verdict(found: Change, sensor: Sensor) -> list[str]:
     return said
 
 
+def change_headline(found: Change) -> str:
+    """What both tests come to: a camera that one of them says has changed has, whatever the other says."""
+    return change_meaning(float(np.nanmin([found.p_parameters, found.p_field])))
+
+
 def change_figure(found: Change, sensor: Sensor) -> Figure:
     """Both maps of `plot_change`, one beside the other."""
     figure = new_figure(9.6, 3.9)
@@ -125,7 +130,7 @@ def write_change(found: Change, sets: tuple[Compared, Compared], sensor: Sensor,
     alt = "maps over the format of the camera: offsets of rays (px), and offsets over what is usual"
     picture = WholePicture.of(change_figure(found, sensor), alt)
     parts = [
-        *(Paragraph(as_sentence(sentence)) for sentence in verdict[1:]),
+        *(Paragraph(as_sentence(sentence)) for sentence in verdict),
         *map(Paragraph, about_sets(sets)),
         Heading("Over the format"),
         picture,
@@ -137,7 +142,7 @@ def write_change(found: Change, sets: tuple[Compared, Compared], sensor: Sensor,
         parameters.to_csv(work / "parameters.csv", index=False)
         change_cells(found, sensor).to_csv(work / "cells.csv", index=False)
         (work / "change.png").write_bytes(picture.png)
-        page = study_page("Change of a camera", verdict[:1], parts, "amber" if found.changed else "green")
+        page = study_page("Change of a camera", [change_headline(found)], parts, "amber" if found.changed else "green")
         (work / "report.html").write_text(page, encoding="utf-8")
         write_summary(change_summary(found, sensor) | {"versions": versions()}, work)
 

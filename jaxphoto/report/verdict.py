@@ -122,7 +122,7 @@ def _not_significant(tables: Tables, s: Significance) -> Finding:
     others = {name: abs(v) for name, v in change.in_sigmas.items() if name != s.parameter}
     most = max(others, key=lambda name: others[name], default="")
     moved = f"{symbol(most)} by {others[most]:.1f} of its sigma and " if most else ""
-    pixels = f"{change.corner_mm / sensor.pixel_mm:.2g} px" if sensor.pixel_mm else f"{change.corner_mm:.2g} mm"
+    pixels = f"{change.corner_mm / sensor.pixel_mm:.2g} px"
     return Finding(
         Level.INFORMATION,
         f"{symbol(s.parameter)} of {camera_words(s.camera)} may be zero (p = {s.p_value:.2g}); held there, it would "

@@ -23,6 +23,7 @@ from jaxphoto.report import (
     to_plotly,
 )
 from jaxphoto.report.boresight import boresight_figure, boresight_page
+from jaxphoto.report.change import change_headline
 from jaxphoto.report.document import DocumentPicture, Heading, Pictures
 from jaxphoto.report.halves import halves_figure
 from jaxphoto.report.lidar import above_figure, heights_figure
@@ -97,6 +98,9 @@ def test_maps_of_a_change_reach_as_far_as_its_offsets(axes):
     assert axes.collections[0].zmax == pytest.approx(4e-4 * 2.5**3 / 0.01, rel=0.01)
     over = plot_change(found, sensor, Figure().add_subplot(), over_usual=True)
     assert over.collections[0].zmax == pytest.approx((found.offset_mm / found.limit_mm).max())
+    # What one test finds stands at the head, whatever the other says, or where there is no other.
+    for p_parameters in (0.9, np.nan):
+        assert change_headline(found._replace(p_parameters=p_parameters)).startswith("the camera has changed")
 
 
 def test_models_are_drawn_by_bic_and_by_what_they_predict(axes):
