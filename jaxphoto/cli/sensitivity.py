@@ -57,7 +57,8 @@ def sensitivity_command(
     shown = Table(*heads, title=f"largest changes by a station bias of {bias_m:g} m per {per}")
     columns = ["estimate", "estimate_unit", "exact", "over_sigma", "first_order", "unit", "axis"]
     for name, unit, exact, over, first, per_unit, axis in largest[columns].head(_SHOWN).itertuples(index=False):
-        moved = [f"{in_figures(float(v), 3)} {unit}" for v in (exact, first)]
+        of = "" if unit == "1" else f" {unit}"
+        moved = [f"{in_figures(float(v), 3)}{of}" for v in (exact, first)]
         shown.add_row(plain(str(name)), moved[0], f"{over:.2f}", moved[1], plain(f"{per_unit} in {axis}"))
     output.screen.print(shown)
     output.wrote(out, f"results in {out} (open report.html)")
