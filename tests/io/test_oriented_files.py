@@ -172,7 +172,9 @@ def test_parameters_and_image_points_are_a_block(tmp_path, name):
     assert np.abs(misfits_px(block, inside(camera, block.frame.kind))).max() < 1e-6
     assert {"c_mm", "xp_mm", "yp_mm", "k1", "k2"} <= free_of(block, own)
     # Pixels have no size in nerfstudio.
-    assert block.sensors[own] == (SENSOR if "orthority" in name else dataclasses.replace(SENSOR, pixel_mm=0.001))
+    assert block.sensors[own] == (
+        SENSOR if "orthority" in name else dataclasses.replace(SENSOR, pixel_mm=0.001, pixel_assumed=True)
+    )
 
 
 @settings(max_examples=25, deadline=None)

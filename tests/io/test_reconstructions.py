@@ -301,7 +301,7 @@ def test_what_was_exported_is_read_again(tmp_path, format, camera, frame):
     inside = ((p.column_row > 0) & (p.column_row < [SENSOR.width_px, SENSOR.height_px])).all(axis=1)
     p = p._replace(image=p.image[inside], point=p.point[inside], column_row=p.column_row[inside])
     # Pixels have no size there.
-    held = dataclasses.replace(SENSOR, pixel_mm=0.001)
+    held = dataclasses.replace(SENSOR, pixel_mm=0.001, pixel_assumed=True)
     p = p._replace(cameras={"one": ExportCamera(SENSOR, CAMERAS[camera])})
     export(p, tmp_path / "out", format)
     block = read_source(tmp_path / "out", format)
