@@ -9,8 +9,12 @@ import pytest
 
 # As `jaxphoto` does where it is imported first; here NumPy's OpenBLAS is loaded before, by JAX.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-# What costs here is compiling: these halve it and more, and change results by rounding only (measured on jax 0.10.2).
-os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false")
+# What costs here is compiling: the first two halve it and more, and change results by rounding only (measured on jax
+# 0.10.2).
+os.environ.setdefault(
+    "XLA_FLAGS",
+    "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1",
+)
 # What one process compiles serves the others and the next run: the smallest programs too, of which there are thousands.
 os.environ.setdefault(
     "JAX_COMPILATION_CACHE_DIR",
