@@ -7,11 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from jaxphoto.compiling.options import quick_to_compile
+
 # Fourth-order central differences: their error is about 30 step^4 of the fifth derivative, plus 1e-16 / step.
 _STEP = 1e-3
 _TIMES, _WEIGHTS = np.array([-2.0, -1.0, 1.0, 2.0]), np.array([1.0, -8.0, 8.0, -1.0]) / 12
-# Half to a sixth of the compile time of the default, measured on jax 0.10.2.
-QUICKLY = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
+QUICKLY = quick_to_compile()
 
 
 @functools.cache

@@ -1,34 +1,56 @@
-"""What XLA is asked for on a CPU: how much compiling is worth its time."""
+"""Compiler options of XLA on a CPU: compile time against run time.
 
+None is needed for a right result. Options come and go with versions of jaxlib, so this one is asked for each.
+"""
+
+import functools
 import os
 
 import jax
 
 Options = dict[str, bool | int | str]
-# XLA cuts a program into 32 parts, so that many cores make its code, of which each costs again: with two parts all
-# compiling of a flight of eleven photographs takes a quarter less of the processor, and no longer on two cores.
+# XLA splits a program into 32 parts that many cores compile at once, each at a cost of its own: with two parts
+# compiling a flight of eleven photographs takes a quarter less CPU time, and no longer on two cores.
 _PARTS = 2
 
 
 def _options(level: int, fusion_emitters: bool) -> Options:
     return {
         "xla_backend_optimization_level": level,
+        # Until jaxlib 0.11; the older code generator compiles faster.
         "xla_cpu_use_fusion_emitters": fusion_emitters,
         "xla_cpu_parallel_codegen_split_count": _PARTS,
     }
 
 
-# For what runs once a block, where all that counts is compiling: a quarter of the default's time on jax 0.10.2.
-QUICK_TO_COMPILE = _options(0, fusion_emitters=False)
-# For the adjustment: a third to two thirds of the default's time, and what comes out runs as fast (docs/solver.md).
+# For the adjustment (docs/solver.md).
 _ADJUSTMENT = _options(1, fusion_emitters=False)
 # For what runs thousands of times: four times the time to compile, and a quarter less to run (docs/monte_carlo.md).
 _THOROUGH = _options(3, fusion_emitters=True)
 
 
+def quick_to_compile() -> Options:
+    """Options for programs that run once per block, where compile time is all that counts."""
+    return _known(_options(0, fusion_emitters=False))
+
+
 def options_here(thorough: bool = False) -> Options | None:
-    """Ours on a CPU, unless the user chose a level of optimisation."""
+    """Options for the programs of an adjustment; None on other devices, or where the user chose a level."""
     chosen = "xla_backend_optimization_level" in os.environ.get("XLA_FLAGS", "")
-    if jax.default_backend() != "cpu" or chosen:
+    if jax.default_backend() != "cpu" or chosen or jax.config.values.get("jax_disable_most_optimizations"):
         return None
-    return _THOROUGH if thorough else _ADJUSTMENT
+    return _known(_THOROUGH if thorough else _ADJUSTMENT)
+
+
+def _known(options: Options) -> Options:
+    return {name: value for name, value in options.items() if _is_known(name, value)}
+
+
+@functools.cache
+def _is_known(name: str, value: bool | int | str) -> bool:
+    """True if this jaxlib takes the option, found by compiling a program that does nothing."""
+    try:
+        jax.jit(lambda: 0, compiler_options={name: value}).lower().compile()
+    except jax.errors.JaxRuntimeError:
+        return False
+    return True
