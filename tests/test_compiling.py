@@ -22,6 +22,7 @@ from jaxphoto.collinearity import project
 from jaxphoto.compiling import (
     description,
     jit_quickly,
+    options,
     plain_tree,
     private_folder,
     quickly,
@@ -260,6 +261,20 @@ def test_shapes_of_what_runs_once_are_forgotten(monkeypatch):
         np.testing.assert_array_equal(seen(np.ones(n)), np.full(n, 2.0))
     # The fourth shape is one too many: all are forgotten before the next.
     assert traced == [1, 2, 3, 4, 1]
+
+
+def test_a_jaxlib_without_an_option_is_not_given_it(kept, monkeypatch):
+    """What compiles without any option gives the same numbers."""
+    monkeypatch.delenv("XLA_FLAGS", raising=False)
+    real = {"xla_backend_optimization_level": 0}
+    monkeypatch.setattr(options, "_ADJUSTMENT", real | {"xla_no_such_option": True})
+    assert options.options_here() == real
+    first = run_compiled(root, (MATRIX, 2), {}, "run")[0]["root"]
+    monkeypatch.setattr(options, "_is_known", lambda name, value: False)
+    assert options.options_here() == options.quick_to_compile() == {}
+    run._programs.clear()
+    again = run_compiled(root, (MATRIX, 2), {}, "run")[0]["root"]
+    np.testing.assert_allclose(again, first, rtol=1e-14)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only glibc keeps what is freed")

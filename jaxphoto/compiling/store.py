@@ -21,7 +21,6 @@ import jaxlib
 import lineax as lx
 import numpy as np
 import optimistix as optx
-from jaxlib import lapack
 
 from jaxphoto.compiling import private_folder
 from jaxphoto.compiling.description import Indescribable, describe
@@ -72,14 +71,16 @@ def load(key: str) -> Stored | None:
     content = private_folder.read(folder, key) if folder is not None else None
     if content is None:
         return None
-    # A program finds LAPACK by pointers that JAX sets when it lowers a call of it; here nothing is lowered.
-    lapack.prepare_lapack_call("potrf", np.dtype(float))
     try:
+        # A program finds LAPACK by pointers that JAX sets when it lowers a call of it; here nothing is lowered.
+        from jaxlib import lapack
+
+        lapack.prepare_lapack_call("potrf", np.dtype(float))
         length = int.from_bytes(content[:_LENGTH], "big")
         text = json.loads(content[_LENGTH : _LENGTH + length])
         compiled = program_of(PlainProgram(text["program"], content[_LENGTH + length :]))
         return Stored(compiled, tree_of(text["skeleton"]))
-    except Exception:  # Whatever is wrong with a file, the program can be compiled.
+    except Exception:  # Whatever is wrong with a file or other in this JAX, the program can be compiled.
         return None
 
 
