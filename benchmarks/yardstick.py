@@ -19,7 +19,7 @@ from pathlib import Path
 HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(HERE), str(HERE.parent)]
 # Most of the time is compilation, and most of that is optimisation. What is compiled serves the next run.
-os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
+os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 
 import jax
@@ -39,7 +39,7 @@ _MOST, _DRAWN = 150, 40
 # Derivatives are stored of blocks with as many images and shared unknowns at most.
 _SMALL = 70, 300
 # Cases of which the programs for Monte Carlo and tangents are compared, too: these take longest to compile.
-MAPPED = ("cross_block", "free_network", "georeferenced")
+MAPPED = ("cross_block", "free_network")
 
 
 def _chosen(values: np.ndarray, most: int = _MOST) -> np.ndarray:
@@ -100,7 +100,7 @@ def measure(block: Block, sizes: Sizes, whole: bool, mapped: bool) -> Values:
     keys = [jax.random.fold_in(jax.random.key(SEED), k) for k in range(DRAWS)]
     for k, key in enumerate(keys):
         drawn = _concrete(errors.applied(errors.drawn(key), nominal))
-        for name, value in unknowns_of(optimum(drawn, u, priors, sizes, sigmas)).items():
+        for name, value in unknowns_of(optimum(drawn, u, drawn.priors, sizes, sigmas)).items():
             values[f"draws.{k}.{name}"] = _drawn(value)
     if mapped:
         many = monte_carlo(adjusted, errors, DRAWS, SEED, exterior=True, points=True)
@@ -109,11 +109,11 @@ def measure(block: Block, sizes: Sizes, whole: bool, mapped: bool) -> Values:
             values[f"monte carlo.{k}.position"] = _drawn(many.exterior[k, :, :3])
             values[f"monte carlo.{k}.points"] = _drawn(many.points[k])
         step = errors.drawn(keys[0])
-        moved = response(adjusted, _concrete(errors.applied(step, nominal))).unknowns
+        changed = _concrete(errors.applied(step, nominal))
+        moved = response(adjusted, changed, priors=changed.priors).unknowns
         values["tangents.points"] = _drawn(np.asarray(moved.points))
-        _, moved = jax.jvp(
-            lambda t: adjust(errors.applied(t * step, nominal), u, priors).unknowns.points, (0.0,), (1.0,)
-        )
+        along = lambda t: errors.applied(t * step, nominal)  # noqa: E731
+        _, moved = jax.jvp(lambda t: adjust(along(t), u, along(t).priors).unknowns.points, (0.0,), (1.0,))
         values["jvp.points"] = _drawn(np.asarray(moved))
     return values
 

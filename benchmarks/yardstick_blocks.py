@@ -102,7 +102,7 @@ def _script(path: str):
 
 @case
 def experiment_000() -> Blocks:
-    return _experiment("000")
+    return _experiment("000", "first", "fourth")
 
 
 @case
@@ -112,19 +112,17 @@ def experiment_002() -> Blocks:
 
 @case
 def experiment_003() -> Blocks:
-    return _experiment("003", "A/3", "B/3", "A/1")
+    return _experiment("003", "A/3", "B/3")
 
 
 @case
 def experiment_004() -> Blocks:
-    return _experiment("004", "system/1", "system/4", "independent/1", "test field")
+    return _experiment("004", "system/1", "independent/1", "test field")
 
 
 @case
 def experiment_systematics() -> Blocks:
-    return _experiment(
-        "systematics", *(f"{error}, free" for error in ("lever arm", "time offset", "drift", "datum offset"))
-    )
+    return _experiment("systematics", *(f"{error}, free" for error in ("time offset", "drift")))
 
 
 @case
@@ -140,7 +138,7 @@ def experiment_correlation_study() -> Blocks:
     from jaxphoto.experiment import Experiment, Variant, simulated
 
     study = _script("correlation_study/study.py")
-    changes = {"usual": {}, "along": {"second_pair": "along", "turned": False}, "oblique": {"tilt_deg": 20.0}}
+    changes = {"usual": {}, "oblique": {"tilt_deg": 20.0}}
     variants = {name: Variant(recipe=study.recipe_of({**study.BASE, **change})) for name, change in changes.items()}
     asked = Experiment(title="", variants=variants, tables={})
     return {name: simulated(asked, study.FOLDER, name).block for name in variants}
@@ -203,7 +201,7 @@ def _tests(*names: str) -> Blocks:
 
 @case
 def free_network() -> Blocks:
-    return _tests("inner", "inner_images", "inner_scale", "inner_shift", "minimal")
+    return _tests("inner", "inner_shift")
 
 
 @case
@@ -213,7 +211,7 @@ def several_cameras() -> Blocks:
 
 @case
 def georeferenced() -> Blocks:
-    return _tests("everything", "strips", "fixed_control")
+    return _tests("everything", "fixed_control")
 
 
 @case
