@@ -74,7 +74,13 @@ def solve(a: Float[Array, "n n"], b: Float[Array, "n *c"]) -> Float[Array, "n *c
 
 def inverse(a: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """A^-1."""
-    return solve(a, jnp.eye(len(a)))
+    return solve(a, unit_like(a))
+
+
+def unit_like(a: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """The unit matrix, varying over the devices of a mesh where `a` does: a right-hand side has to."""
+    unit = jnp.eye(len(a))
+    return jnp.where(a == a, unit, unit)
 
 
 def solve_lower(lower: Float[Array, "n n"], b: Float[Array, "n c"]) -> Float[Array, "n c"]:

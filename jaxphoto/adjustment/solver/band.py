@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxphoto.linear_algebra import cholesky, solve_lower, solve_lower_right, solve_lower_transposed
+from jaxphoto.linear_algebra import cholesky, solve_lower, solve_lower_right, solve_lower_transposed, unit_like
 
 # Inverses of triangles above this size are put together from halves: a product is five times as fast as BLAS' trsm.
 _LEAF = 32
@@ -213,7 +213,7 @@ def _invert_triangle(lower: Float[Array, "m m"]) -> Float[Array, "m m"]:
     """The transposed inverse of a lower triangle."""
     m = len(lower)
     if m <= _LEAF:
-        return solve_lower_transposed(lower, jnp.eye(m))
+        return solve_lower_transposed(lower, unit_like(lower))
     first, across, second = _invert_halves(lower)
     return jnp.block([[first, across], [jnp.zeros((m - len(first), len(first))), second]])
 
