@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxphoto.camera import InteriorOrientation
+from jaxphoto.linear_algebra import solve
 from jaxphoto.rotation import matrix_from_omega_phi_kappa, omega_phi_kappa_from_matrix, rotate
 from jaxphoto.short_repr import shown
 from jaxphoto.single import single
@@ -151,7 +152,7 @@ def intersect(
     across = w[:, None, None] * (jnp.eye(3) - directions[:, :, None] * directions[:, None, :])
     # Solved about the first origin, so that large coordinates lose no digits.
     b = jnp.einsum("nij,nj->i", across, origins - origins[0])
-    return origins[0] + jnp.linalg.solve(jnp.sum(across, 0), b)
+    return origins[0] + solve(jnp.sum(across, 0), b)
 
 
 def intersection_angle(directions: Float[Array, "rays 3"]) -> Float[Array, ""]:

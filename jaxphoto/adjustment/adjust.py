@@ -12,6 +12,7 @@ import jax
 import numpy as np
 
 from jaxphoto.adjustment.datum import close_datum
+from jaxphoto.adjustment.implicit import find_optimum
 from jaxphoto.adjustment.layout.padding import TiledBlock, pad_structure
 from jaxphoto.adjustment.layout.tile_layout import LEAST, Sizes, sizes_of
 from jaxphoto.adjustment.layout.tiled import TiledResiduals, TiledStructure, TiledValues
@@ -22,10 +23,11 @@ from jaxphoto.adjustment.model.structure import observed_in, structure_of
 from jaxphoto.adjustment.normal_equations import NormalEquations, optimise
 from jaxphoto.adjustment.rank import check_priors, check_rank
 from jaxphoto.adjustment.result import Adjustment
+from jaxphoto.adjustment.side_by_side import image_rows
 from jaxphoto.adjustment.solver.elimination import FactoredNormal
 from jaxphoto.adjustment.solver.levenberg_marquardt import Course, to_factor, to_optimum, zero_system
 from jaxphoto.adjustment.solver.normal import Linearised
-from jaxphoto.adjustment.solver.optimum import find_optimum, unit_scale, weigh_datum
+from jaxphoto.adjustment.solver.optimum import unit_scale, weigh_datum
 from jaxphoto.adjustment.solver.similarity import n_open_motions
 from jaxphoto.adjustment.told import tell_course
 from jaxphoto.arrays import gathered, still
@@ -69,7 +71,8 @@ def solve(
     seconds: dict[str, float] = {}
     course: Course | None = None
     if laid.traced:
-        found = find_optimum(weigh_datum(numbers, structure), structure=structure, task=to_optimum(max_steps))
+        weighed, rows = weigh_datum(numbers, structure), image_rows(laid.tiled)
+        found = find_optimum(weighed, structure, to_optimum(max_steps), rows)
         state = state_at(found.increments, unit_scale(structure), numbers, structure)
     else:
         arguments = (numbers, structure, to_optimum(max_steps))

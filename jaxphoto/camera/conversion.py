@@ -14,6 +14,7 @@ from jaxphoto.camera.interior import InteriorOrientation, get_parameter, paramet
 from jaxphoto.camera.projection import AbstractProjection
 from jaxphoto.camera.sensor import Sensor
 from jaxphoto.compiling import call_compiled
+from jaxphoto.linear_algebra import solve
 
 # Image points along each side of the format, corners included, at which cameras are compared.
 _SIDE = 25
@@ -185,7 +186,7 @@ def _displacements(values, first: InteriorOrientation, pixel_mm, points, rays):
             # Ideal coordinates over c; the model's own derivative takes their difference to the image.
             ideal = lambda m: interior.ideal_from_measured(m) / interior.c  # noqa: E731
             j = jax.lax.stop_gradient(jax.jacfwd(ideal)(xy))
-            apart = jnp.linalg.solve(j, aimed / interior.c - ideal(xy))
+            apart = solve(j, aimed / interior.c - ideal(xy))
         return jnp.where(here, apart / pixel_mm, 0.0)
 
     return jax.vmap(of_one)(points, rays)

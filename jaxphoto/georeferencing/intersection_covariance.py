@@ -20,6 +20,7 @@ from jaxphoto.camera import InteriorOrientation, parameter_names
 from jaxphoto.collinearity import ExteriorOrientation, image_residual
 from jaxphoto.georeferencing.corrections import NO_CORRECTIONS, Corrections, apparent_point
 from jaxphoto.georeferencing.ground import moved_exterior, moved_interior
+from jaxphoto.linear_algebra import inverse
 
 
 class RayPartials(NamedTuple):
@@ -63,7 +64,7 @@ def intersection_gain(
     weighted = by_point.transpose(0, 2, 1) / sigma[:, None, :] ** 2
     normal = jax.ops.segment_sum(weighted @ by_point, point, n_points)
     # A point without rows has no normal matrix, and no row to ask for its inverse.
-    return jnp.linalg.inv(normal)[point] @ weighted
+    return jax.vmap(inverse)(normal)[point] @ weighted
 
 
 def intersection_step(

@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxphoto.linear_algebra import solve_tridiagonal
 from jaxphoto.rotation import matrix_from_quaternion, small_angles
 from jaxphoto.short_repr import shown
 
@@ -175,7 +176,7 @@ def _second(nodes, values, joined) -> Float[Array, "n k"]:
     diagonal = jnp.where(inner, 2 * (h0 + h1), 1.0)
     pad = jnp.zeros((1, values.shape[1]))
     bend = 6 * (jnp.concatenate([slope, pad]) - jnp.concatenate([pad, slope]))
-    return jax.lax.linalg.tridiagonal_solve(lower, diagonal, upper, jnp.where(inner[:, None], bend, 0.0))
+    return solve_tridiagonal(lower, diagonal, upper, jnp.where(inner[:, None], bend, 0.0))
 
 
 def _on_pieces(nodes, values, second, joined, times) -> tuple[Float[Array, "m k"], Float[Array, "m k"]]:

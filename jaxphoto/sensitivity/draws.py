@@ -17,6 +17,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxphoto.adjustment import Adjustment, solve
+from jaxphoto.adjustment.chords import Found, find_optima
+from jaxphoto.adjustment.many import Common, Varying, batch_size, held_in, path_name, row_lists
 from jaxphoto.adjustment.model.block_values import values_of, with_datum
 from jaxphoto.adjustment.model.numbers import UnknownArrays
 from jaxphoto.arrays import still
@@ -25,19 +27,10 @@ from jaxphoto.compiling import call_compiled
 from jaxphoto.devices import usable
 from jaxphoto.errors import InputError, JaxphotoError
 from jaxphoto.rotation import omega_phi_kappa_from_matrix
-from jaxphoto.sensitivity.chords import Found, find_optima
-from jaxphoto.sensitivity.many import Varying, common_of, path_name
 from jaxphoto.sensitivity.perturbation import Perturbation, Recorded, in_order_of
 from jaxphoto.short_repr import shown
 from jaxphoto.unknowns import Prior
 
-# Draws that a device computes side by side. Vectors end in them: 32 are enough for that, and for what is made anew for
-# all of them (see `adjustment.solver.elimination`); more, up to 64, pay where image rows x draws stay below this
-# number, fewer only where unknowns x draws would be more than this, of which memory holds several.
-_FEW, _MOST, _LEAST = 32, 64, 8
-_ROWS, _UNKNOWNS = 100_000, 8_000_000
-# Image rows x draws that are computed with at a time: what that needs stays in the cache of a core.
-_AT_ONCE = 16_384
 # Draws that are worth compiling thoroughly.
 _MANY = 500
 # More than any machine has.
@@ -144,19 +137,14 @@ class Readjustment:
         self.nominal = dataclasses.replace(adjusted.block, start=start, priors=adjusted.priors)
         # Of several processes, each draws for itself.
         self.devices = usable(_MOST_DEVICES) if jax.process_count() == 1 else 1
-        self.common = common_of(self.adjusted, _AT_ONCE // self._draws_of_device)
+        self.common = common_of(self.adjusted)
         self.names = self._varying_fields(jax.tree.map(lambda v: v[:1], example))
         self._numbers = jax.jit(jax.vmap(self._numbers_of, out_axes=(-1, 0)))
 
     @property
     def batch_size(self) -> int:
         """Draws that are computed side by side."""
-        return self.devices * self._draws_of_device
-
-    @property
-    def _draws_of_device(self) -> int:
-        rows, unknowns = len(self.adjusted.structure.image), sum(self.adjusted.n_unknowns.values())
-        return int(max(_LEAST, min(np.clip(_ROWS // rows, _FEW, _MOST), _UNKNOWNS // unknowns)))
+        return self.devices * batch_size(self.adjusted.structure)
 
     def warm_up(self, given: Any) -> None:
         """Have everything compiled that `batches` needs."""
@@ -252,13 +240,7 @@ class Readjustment:
         padded = self.adjusted.tiled.pad(changed)
         numbers = {path_name(path): v for path, v in jax.tree_util.tree_leaves_with_path(padded)}
         # What is free begins at the optimum, wherever the block says that it starts.
-        held = {
-            "position": wide.eop_free[:3] == 0,
-            "rotation": (wide.eop_free[3:] == 0).all(axis=0),
-            "shared": ~np.isin(np.arange(len(v.shared)), wide.free),
-            "points": wide.point_free == 0,
-        }
-        for name, mask in held.items():
+        for name, mask in held_in(wide, len(v.shared)).items():
             if isinstance(numbers[name], jax.core.Tracer):
                 numbers[name] = jnp.where(mask, numbers[name], getattr(nominal, name))
         return numbers | {"xy": changed.xy, "sigma_xy": changed.sigma_xy}, recorded
@@ -277,6 +259,13 @@ class Readjustment:
         if not varying:
             raise InputError("the perturbation changes no number of the block: return the block with others in it")
         return tuple(varying)
+
+
+def common_of(adjusted: Adjustment, at_once: int | None = None) -> Common:
+    """The nominal adjustment, from whose optimum all draws begin; `at_once` image rows are computed with at a time."""
+    equations, values = adjusted.equations.weighed, adjusted.values
+    lists = row_lists(adjusted.structure, adjusted.tiled.places, at_once)
+    return Common(equations.at, equations.factored, np.asarray(values.xy), np.asarray(values.sigma_xy), lists)
 
 
 def joined_draws(parts: Iterable[Draws]) -> Draws:

@@ -26,6 +26,7 @@ from jaxphoto.adjustment import Adjustment, Linearised, TiledStructure
 from jaxphoto.adjustment.model.numbers import Increments
 from jaxphoto.arrays import Numbers
 from jaxphoto.errors import InputError
+from jaxphoto.linear_algebra import solve
 from jaxphoto.sensitivity.curvature import coupling_rows, other_second, points_second, rows_second
 from jaxphoto.sensitivity.image_rows import ListedRows, RowProducts, row_products
 from jaxphoto.small_matrices import cholesky_3x3, unwhiten, whiten
@@ -169,7 +170,7 @@ def solve_eliminated(h: Eliminated, b: Increments, s: TiledStructure) -> Increme
     of_points = b.points.reshape(3, len(h.l), -1)
     right = jnp.concatenate([b.eop.T.reshape(-1), b.shared, jnp.zeros(len(h.c))])
     right = right.at[h.touched].add(jnp.einsum("tpkf,ktp->tf", h.gain, of_points))
-    x = jnp.linalg.solve(h.m, jnp.concatenate([right[:n], h.c @ right[n:]]))
+    x = solve(h.m, jnp.concatenate([right[:n], h.c @ right[n:]]))
     l = h.l.transpose(1, 0, 2)  # noqa: E741
     points = jnp.stack(unwhiten(whiten(of_points, l), l)) + jnp.einsum("tpkf,tf->ktp", h.gain, x[h.touched])
     return Increments(x[:n_eop].reshape(-1, 6).T, x[n_eop:n], points.reshape(3, -1))

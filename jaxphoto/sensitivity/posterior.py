@@ -34,6 +34,7 @@ from jaxphoto.adjustment.model.numbers import Increments, state_at
 from jaxphoto.arrays import still
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import InputError
+from jaxphoto.linear_algebra import solve
 from jaxphoto.observations import AXES
 from jaxphoto.rotation import omega_phi_kappa_from_matrix
 from jaxphoto.small_matrices import whiten
@@ -236,7 +237,7 @@ class _White(NamedTuple):
     def _whitened(self, row: Increments, right: Array, d: Array) -> Float[Array, "free"]:
         reduced = self.equations.factored.reduced
         if len(d):
-            right = right - reduced.g @ jnp.linalg.solve(reduced.k, d)
+            right = right - reduced.g @ solve(reduced.k, d)
         half = self.triangle.T @ self.equations.solve_reduced_matrix(right)
         points = jnp.stack(whiten(row.points, reduced.l))
         return self.without_open(jnp.concatenate([half, points.reshape(-1)])[self.free])

@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxphoto.linear_algebra import solve
 from jaxphoto.rotation import small_rotation
 
 Method = Literal["zrot", "rot", "spr"]
@@ -83,13 +84,13 @@ def align(
             alignment, _, k = state
             columns = jax.jacfwd(offsets)(alignment)
             # No more than six well separated unknowns: normal equations will do, and compile in a third of the time.
-            step = jnp.linalg.solve(columns.T @ columns, columns.T @ offsets(alignment))
+            step = solve(columns.T @ columns, columns.T @ offsets(alignment))
             return alignment - step, step, k + 1
 
         return jax.lax.while_loop(moving, body, (start, jnp.ones_like(start), 0))[0]
 
     def tangent(linear, b):
-        return jnp.linalg.solve(jax.jacfwd(linear)(jnp.zeros_like(b)), b)
+        return solve(jax.jacfwd(linear)(jnp.zeros_like(b)), b)
 
     found = jax.lax.custom_root(gradient, jnp.zeros(UNKNOWNS[method]), gauss_newton, tangent)
     columns = jnp.linalg.norm(jax.jacfwd(offsets)(found), axis=0)

@@ -10,6 +10,7 @@ from jaxphoto.arrays import Numbers
 from jaxphoto.camera import InteriorOrientation, invert
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import InputError
+from jaxphoto.linear_algebra import solve
 from jaxphoto.short_repr import shown
 from jaxphoto.stability.alignment import UNKNOWNS, Method, align, offsets_of
 from jaxphoto.stability.bundles import image_rays, parameter_vector, with_parameters
@@ -38,7 +39,7 @@ class BundleOffsets(eqx.Module):
     def measured_jacobian(self) -> Float[Array, "coordinates parameters"]:
         """dv/dp like `jacobian`, of the offsets in the image as it is measured, to first order."""
         by_point = self.jacobian.reshape(len(self.points), 2, -1)
-        return jnp.linalg.solve(self.stretch, by_point).reshape(self.jacobian.shape)
+        return jax.vmap(solve)(self.stretch, by_point).reshape(self.jacobian.shape)
 
     @property
     def redundancy(self) -> int:
@@ -116,7 +117,7 @@ def _compared(first, second, points, method, depth) -> BundleOffsets:
     p1, p2 = parameter_vector(first), parameter_vector(second)
     (j1, j2), (v, alignment, converged) = jax.jacfwd(offsets, argnums=(0, 1), has_aux=True)(p1, p2)
     stretch = jax.vmap(jax.jacfwd(first.ideal_from_measured))(points)
-    measured = jnp.linalg.solve(stretch, v[..., None])[..., 0]
+    measured = jax.vmap(solve)(stretch, v)
     return BundleOffsets(points, v, measured, alignment, jnp.hstack([j1, j2]), stretch, converged)
 
 

@@ -28,6 +28,7 @@ from jaxphoto.block import one_camera
 from jaxphoto.camera import InteriorOrientation, Sensor, parameter_names
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import InputError
+from jaxphoto.linear_algebra import solve
 from jaxphoto.rotation import small_rotation
 from jaxphoto.short_repr import shown
 from jaxphoto.stability import image_grid, parameter_vector, regular_rays, with_parameters
@@ -158,6 +159,6 @@ def _derivatives(
             return camera.ideal_from_direction(*seen) - camera.ideal_from_measured(xy)
 
         stretch = jax.jacfwd(interior.ideal_from_measured)(xy)
-        return jnp.linalg.solve(stretch, jax.jacfwd(off)(jnp.concatenate([vector, jnp.zeros(6)])))
+        return solve(stretch, jax.jacfwd(off)(jnp.concatenate([vector, jnp.zeros(6)])))
 
     return jax.vmap(at)(points)

@@ -25,6 +25,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxphoto.linear_algebra import cholesky, solve_lower, solve_lower_right, solve_lower_transposed, unit_like
+
 # Inverses of triangles above this size are put together from halves: a product is five times as fast as BLAS' trsm.
 _LEAF = 32
 
@@ -61,7 +63,7 @@ def factor_band(band: Band) -> BandFactor:
     """L of A = L L'; NaN from the first column block on that is not positive definite (the last with the shared)."""
     inner, _, m = band.columns.shape
     if not inner:
-        return BandFactor(band.columns, band.border, _cholesky(band.end))
+        return BandFactor(band.columns, band.border, cholesky(band.end))
     border = _split_border(band.border, inner)
 
     def eliminate(left, at):
@@ -71,8 +73,8 @@ def factor_band(band: Band) -> BandFactor:
         # Behind the inner blocks stands the end.
         following = jax.lax.dynamic_index_in_dim(band.columns, jnp.minimum(j + 1, inner - 1), keepdims=False)
         following = jnp.where(j + 1 < inner, following[:m], band.end[:m, :m])
-        lower = _cholesky(diagonal)
-        panel = _solve_right(lower, jnp.concatenate([column[m:], shared]))
+        lower = cholesky(diagonal)
+        panel = solve_lower_right(lower, jnp.concatenate([column[m:], shared]))
         product = panel @ panel.T
         left = (following - product[:m, :m], next_shared - product[m:, :m], corner - product[m:, m:])
         return left, (jnp.concatenate([lower, panel[:m]]), panel[m:])
@@ -80,7 +82,7 @@ def factor_band(band: Band) -> BandFactor:
     following = jnp.concatenate([border[1:], band.end[None, m:, :m]])
     left = (band.columns[0, :m], border[0], band.end[m:, m:])
     (diagonal, shared, corner), (columns, borders) = jax.lax.scan(eliminate, left, (np.arange(inner), following))
-    end = _cholesky(_with_border(diagonal, shared, corner))
+    end = cholesky(_with_border(diagonal, shared, corner))
     return BandFactor(columns, _join_border(borders), end)
 
 
@@ -93,7 +95,7 @@ def solve_band(factor: BandFactor, right: Float[Array, "unknowns *c"]) -> Float[
     inner, _, m = columns.shape
     b = right.reshape(len(right), -1)
     if not inner:
-        return _solve_transposed(end, _solve(end, b)).reshape(right.shape)
+        return solve_lower_transposed(end, solve_lower(end, b)).reshape(right.shape)
     n = (inner + 1) * m
     images, shared = b[:n].reshape(inner + 1, m, -1), b[n:]
 
@@ -101,17 +103,17 @@ def solve_band(factor: BandFactor, right: Float[Array, "unknowns *c"]) -> Float[
     def down(left, at):
         j, following = at
         column = jax.lax.dynamic_index_in_dim(columns, j, keepdims=False)
-        y = _solve(column[:m], left)
+        y = solve_lower(column[:m], left)
         return following - column[m:] @ y, y
 
     left, y = jax.lax.scan(down, images[0], (np.arange(inner), images[1:]))
     shared = shared - border @ y.reshape(n - m, -1)
-    last = _solve_transposed(end, _solve(end, jnp.concatenate([left, shared])))
+    last = solve_lower_transposed(end, solve_lower(end, jnp.concatenate([left, shared])))
 
     def back(after, at):
         j, y = at
         column = jax.lax.dynamic_index_in_dim(columns, j, keepdims=False)
-        x = _solve_transposed(column[:m], y - column[m:].T @ after)
+        x = solve_lower_transposed(column[:m], y - column[m:].T @ after)
         return x, x
 
     y = y - (border.T @ last[m:]).reshape(y.shape)
@@ -211,37 +213,9 @@ def _invert_triangle(lower: Float[Array, "m m"]) -> Float[Array, "m m"]:
     """The transposed inverse of a lower triangle."""
     m = len(lower)
     if m <= _LEAF:
-        return _solve_transposed(lower, jnp.eye(m))
+        return solve_lower_transposed(lower, unit_like(lower))
     first, across, second = _invert_halves(lower)
     return jnp.block([[first, across], [jnp.zeros((m - len(first), len(first))), second]])
-
-
-@jax.custom_jvp
-def _cholesky(a: Float[Array, "m m"]) -> Float[Array, "m m"]:
-    """Lower Cholesky factor of a lower triangle. JAX's derivative of it alone would read the upper one as well."""
-    return jax.lax.linalg.cholesky(a, symmetrize_input=False)
-
-
-@_cholesky.defjvp
-def _(primals, tangents):
-    (a,), (change,) = primals, tangents
-    return jax.jvp(lambda a: jax.lax.linalg.cholesky(a, symmetrize_input=False), (a,), (_symmetric(change),))
-
-
-# LAPACK stores by columns: the transpose of what JAX stores by rows is no copy.
-def _solve(lower: Float[Array, "m m"], b: Float[Array, "m c"]) -> Float[Array, "m c"]:
-    """L^-1 b."""
-    return jax.lax.linalg.triangular_solve(lower.T, b, left_side=True, lower=False, transpose_a=True)
-
-
-def _solve_transposed(lower: Float[Array, "m m"], b: Float[Array, "m c"]) -> Float[Array, "m c"]:
-    """L'^-1 b."""
-    return jax.lax.linalg.triangular_solve(lower.T, b, left_side=True, lower=False)
-
-
-def _solve_right(lower: Float[Array, "m m"], b: Float[Array, "r m"]) -> Float[Array, "r m"]:
-    """b L'^-1."""
-    return jax.lax.linalg.triangular_solve(lower, b, left_side=False, lower=True, transpose_a=True)
 
 
 def _symmetric(lower: Float[Array, "m m"]) -> Float[Array, "m m"]:

@@ -26,6 +26,7 @@ from jaxphoto.adjustment.solver.normal import Linearised, Reduced, other_squares
 from jaxphoto.adjustment.solver.reduced import tile_columns, tile_numbers, tile_parts
 from jaxphoto.adjustment.solver.tile_rows import seen_in, tile_residuals
 from jaxphoto.arrays import added
+from jaxphoto.linear_algebra import solve
 from jaxphoto.short_repr import shown
 from jaxphoto.small_matrices import unwhiten, whiten
 
@@ -85,9 +86,9 @@ def solve_reduced(
     """x of a right-hand side taken down already: `right` to the reduced unknowns, `d` to mu."""
     r, s, n = reduced, at.structure, at.structure.n_images
     if len(d):
-        right = right - r.g @ jnp.linalg.solve(r.k, d)
+        right = right - r.g @ solve(r.k, d)
     x = solve_band(factor, right)
-    mu = jnp.linalg.solve(r.k, r.g.T @ x + d) if len(d) else d
+    mu = solve(r.k, r.g.T @ x + d) if len(d) else d
     eop, shared = x[: 6 * n].reshape(n, 6), x[6 * n :]
     if not s.tiles.free_points:
         return Increments(eop.T, shared, jnp.zeros_like(b_points))

@@ -30,6 +30,8 @@ from jaxphoto.adjustment.solver.normal import Linearised, Reduced, dot
 from jaxphoto.adjustment.solver.reduced import tile_columns
 from jaxphoto.adjustment.solver.similarity import along_motions, n_open_motions
 from jaxphoto.arrays import Numbers
+from jaxphoto.linear_algebra import inverse as inverse_of
+from jaxphoto.linear_algebra import solve
 from jaxphoto.small_matrices import unwhiten, whiten
 
 
@@ -58,9 +60,9 @@ def cofactors_of(
     inverse = invert_band(factored.factor)
     full = inverse
     if reduced.g.shape[1]:
-        kg = jnp.linalg.solve(reduced.k, reduced.g.T)
+        kg = solve(reduced.k, reduced.g.T)
         low = inverse @ kg.T
-        full = jnp.block([[inverse, low], [low.T, kg @ low - jnp.linalg.inv(reduced.k)]])
+        full = jnp.block([[inverse, low], [low.T, kg @ low - inverse_of(reduced.k)]])
     out = (TILES, RowCofactors(TILES, (along_points(4),) * len(s.with_shared)))
     points, rows = sharded(_of_points, s, out)(full, reduced, at, of_rows)
     return _without_open_motions(Cofactors(inverse, points), at, factored), rows
@@ -142,7 +144,7 @@ def _without_open_motions(q: Cofactors, at: Linearised, factored: FactoredNormal
         # The motions are known: E = M (D M)^-1.
         m = along_motions(values, scale, s.on_one_device)
         met = jnp.einsum("kci,jci->kj", rows.eop, m.eop) + jnp.einsum("kcp,jcp->kj", rows.points, m.points)
-        e = jax.tree.map(lambda v: jnp.tensordot(jnp.linalg.inv(met), v, (0, 0)), m)
+        e = jax.tree.map(lambda v: jnp.tensordot(inverse_of(met), v, (0, 0)), m)
     else:
         e = jax.vmap(lambda row: solve_factored(factored.reduced, factored.factor, row, at))(rows)
     e_eop, e_shared, e_points = e.eop.transpose(2, 1, 0), e.shared.T, e.points.transpose(2, 1, 0)

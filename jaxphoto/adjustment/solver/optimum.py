@@ -1,9 +1,4 @@
-"""The optimum of a block: Levenberg-Marquardt forwards, the implicit function theorem for its derivatives.
-
-At the optimum the gradient G(y, v) of half the weighted square sum vanishes, so dy = -H^-1 (dG/dv) dv with H the full
-second derivative (Gauss-Newton part and curvature). H is never formed: conjugate gradients on products with it,
-preconditioned by the factored normal matrix, from which it differs by the residuals' curvature only.
-"""
+"""The optimum of a block by Levenberg-Marquardt, and the scales of its unknowns."""
 
 import dataclasses
 from collections.abc import Callable
@@ -14,7 +9,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxphoto.adjustment.layout.sharding import EVERYWHERE, TILES, along_points, sharded
@@ -22,11 +16,8 @@ from jaxphoto.adjustment.layout.tiled import TiledStructure, TiledValues
 from jaxphoto.adjustment.model.camera_groups import CameraGroup, interior_of
 from jaxphoto.adjustment.model.numbers import Increments
 from jaxphoto.adjustment.model.parameter_tables import ParameterTable
-from jaxphoto.adjustment.solver.band import factor_band
-from jaxphoto.adjustment.solver.elimination import solve_factored
 from jaxphoto.adjustment.solver.levenberg_marquardt import Course, FactoredSystem, LevenbergMarquardt, Task
 from jaxphoto.adjustment.solver.normal import Linearised, Reduced
-from jaxphoto.adjustment.solver.reduced import reduce_normal
 from jaxphoto.camera import InteriorOrientation
 from jaxphoto.camera.camera_rates import HOUR_S
 from jaxphoto.collinearity import ExteriorOrientation, image_residual
@@ -53,13 +44,6 @@ def unit_scale(structure: TiledStructure) -> Increments:
     """Increments in metres, radians and the parameters' own units; zero for what is held fixed."""
     s = structure
     return Increments(jnp.asarray(s.eop_free), jnp.ones(s.n_shared), jnp.asarray(s.point_free))
-
-
-@eqx.filter_custom_jvp
-def find_optimum(values: TiledValues, *, structure: TiledStructure, task: Task) -> Optimum:
-    """Levenberg-Marquardt from the start in `values`. Differentiable in every number of `values`."""
-    # How it went has no derivative, and nobody asks it of what is differentiated.
-    return iterate(values, structure, task)[0]._replace(course=None)
 
 
 def iterate(values: TiledValues, structure: TiledStructure, task: Task) -> tuple[Optimum, FactoredSystem, Increments]:
@@ -98,45 +82,6 @@ def _iterate(
     converged = (solution.result == optx.RESULTS.successful) & jnp.all(jnp.isfinite(solution.value.eop))
     state = solution.state
     return Optimum(solution.value, state.steps, converged, state.course), state.system
-
-
-@find_optimum.def_jvp
-def _find_optimum_jvp(primals, tangents, *, structure: TiledStructure, task: Task):
-    (values,), (direction,) = primals, tangents
-    optimum = find_optimum(values, structure=structure, task=task)
-    unit, at = unit_scale(structure), optimum.increments
-
-    def gradient(increments, numbers):
-        residuals, pull = jax.vjp(lambda y: Linearised(y, unit, numbers, structure).residuals(), increments)
-        return pull(residuals)[0]
-
-    moved, still = eqx.partition(values, jax.tree.map(lambda t: t is not None, direction, is_leaf=lambda t: t is None))
-    _, change = jax.jvp(lambda m: gradient(at, eqx.combine(m, still)), (moved,), (direction,))
-    scale = typical_scale(values, structure)
-    # The preconditioner belongs to the optimum: it wants its place in scaled increments.
-    place = jax.tree.map(lambda a, k: jnp.where(k > 0, a / jnp.where(k > 0, k, 1.0), 0.0), at, scale)
-    there = Linearised(place, scale, values, structure).for_normal_equations
-    a, reduced, _ = reduce_normal(there, 0.0)
-    factor = factor_band(a)
-
-    right, unravel = ravel_pytree(jax.tree.map(lambda c, k: -c * k, change, scale))
-    # One flat vector: the transposed solve wants all of its right-hand side to depend on the direction, or none.
-    flat = lambda tree: ravel_pytree(tree)[0]  # noqa: E731
-
-    def hessian(x):
-        scaled = jax.tree.map(jnp.multiply, unravel(x), scale)
-        product = jax.jvp(lambda y: gradient(y, values), (at,), (scaled,))[1]
-        return flat(jax.tree.map(jnp.multiply, product, scale))
-
-    def precondition(b):
-        return flat(solve_factored(reduced, factor, unravel(b), there))
-
-    def solve(product, b):
-        return jax.scipy.sparse.linalg.cg(product, b, tol=1e-13, maxiter=100, M=precondition)[0]
-
-    x = unravel(jax.lax.custom_linear_solve(hessian, right, solve, symmetric=True))
-    increments = jax.tree.map(jnp.multiply, x, scale)
-    return optimum, Optimum(increments, None, None, None)
 
 
 def weigh_datum(values: TiledValues, structure: TiledStructure) -> TiledValues:

@@ -30,6 +30,7 @@ from jaxphoto.adjustment.solver.normal import Linearised, Reduced, other_squares
 from jaxphoto.adjustment.solver.tile_rows import TileJacobian, seen_in, tile_jacobian
 from jaxphoto.arrays import added
 from jaxphoto.compiling import once
+from jaxphoto.linear_algebra import solve
 from jaxphoto.small_matrices import cholesky_3x3, whiten
 
 
@@ -148,7 +149,7 @@ def reduce_normal(at: Linearised, damping) -> tuple[Band, Reduced, RightSide]:
     end = end.at[6 * width :, : 6 * width].set(us[:, 6 * of_inner :]).at[6 * width :, 6 * width :].set(uss)
     if k:
         # A = S + g K^-1 g' joins all images: the band has one full column block.
-        end = end + g @ jnp.linalg.solve(kk, g.T)
+        end = end + g @ solve(kk, g.T)
     a = Band(columns.reshape(inner, 12 * width, 6 * width), us[:, : 6 * of_inner], end)
 
     b_e, b_s = b_e + jnp.einsum("cna,c->na", rest.rows_e, coupled), b_s + rest.rows_s.T @ coupled

@@ -12,12 +12,15 @@ from jaxphoto.adjustment.model.numbers import AbstractValues, Increments, datum_
 from jaxphoto.adjustment.model.structure import AbstractStructure, total
 from jaxphoto.adjustment.solver.normal import Linearised, dot
 from jaxphoto.arrays import Numbers, joined
+from jaxphoto.linear_algebra import one_at_a_time, solve
 from jaxphoto.rotation import CROSS, small_angles, small_rotation
 
 # Newton's method on so few unknowns, begun so near, doubles the right digits with each of these.
 _NEWTON_STEPS = 5
 # Of the mean weight of the motions: holds what a single image, of which seven motions are not independent, leaves open.
 _RIDGE = 1e-9
+
+_svd = one_at_a_time(lambda a: tuple(jnp.linalg.svd(a)))
 
 
 class DatumRows(NamedTuple):
@@ -88,7 +91,7 @@ def onto_datum(at: Linearised) -> Increments:
     def newton(_, y: Increments) -> Increments:
         violation = lambda parameters: datum_residuals(moved(y, parameters), scale, values, s)  # noqa: E731
         zero = jnp.zeros(k)
-        return moved(y, -jnp.linalg.solve(jax.jacfwd(violation)(zero), violation(zero)))
+        return moved(y, -solve(jax.jacfwd(violation)(zero), violation(zero)))
 
     begin = moved(y, _nearest(at.state.points, values.points, scale.points[0] > 0, centre, size, s)[:k])
     found = jax.lax.fori_loop(0, _NEWTON_STEPS, newton, begin)
@@ -120,7 +123,7 @@ def after(at: Linearised, step: Increments, weight: Increments) -> Increments:
     product = jax.vmap(dot, in_axes=(None, 0, None))
     normal = jax.vmap(lambda a: product(a, weighted, s))(along)
     ridge = _RIDGE * jnp.trace(normal) + jnp.finfo(float).tiny
-    parameters = jnp.linalg.solve(normal + ridge * np.eye(7), product(step, weighted, s))
+    parameters = solve(normal + ridge * np.eye(7), product(step, weighted, s))
     moved = lambda y, parameters: _moved(Linearised(y, *at[1:]), parameters, centre, size)  # noqa: E731
     linear = jax.jvp(lambda p: moved(y, p), (jnp.zeros(7),), (parameters,))[1]
     return moved(jax.tree.map(lambda y, x, a: y + (x - a), y, step, linear), parameters)
@@ -155,7 +158,7 @@ def _nearest(points, start, own, centre, size, s: TiledStructure) -> Float[Array
     weight = own / total(jnp.sum(own), s)
     mean, target = total((points @ weight, start @ weight), s)
     a, b = points - mean[:, None], start - target[:, None]
-    u, d, vt = jnp.linalg.svd(total((b * weight) @ a.T, s))
+    u, d, vt = _svd(total((b * weight) @ a.T, s))
     sign = jnp.array([1.0, 1.0, 0.0]) + jnp.array([0.0, 0.0, 1.0]) * jnp.linalg.det(u @ vt)
     turn = (u * sign) @ vt
     scale = jnp.sum(d * sign) / total(jnp.sum(weight * a * a), s)

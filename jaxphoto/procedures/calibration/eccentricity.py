@@ -25,6 +25,7 @@ from jaxtyping import Array, Float
 from jaxphoto.camera import InteriorOrientation
 from jaxphoto.collinearity import ExteriorOrientation, project
 from jaxphoto.compiling import call_compiled
+from jaxphoto.linear_algebra import cholesky, inverse, solve
 from jaxphoto.orientation.rays import padded_length
 
 _POINTS = 32
@@ -61,12 +62,12 @@ def eccentricity(
     d = b - centroid
     about_centroid = d[:, 0] * slope[:, 1] - d[:, 1] * slope[:, 0]
     moments = jnp.einsum("ti,tj,t->ij", d, d, about_centroid) / (2 * jnp.sum(cross))
-    lower = jnp.linalg.cholesky(jnp.linalg.inv(4 * moments))
+    lower = cholesky(inverse(4 * moments))
     ellipse = jnp.stack([*centroid, lower[0, 0], lower[1, 0], lower[1, 1]])
     weight = jnp.linalg.norm(slope, axis=1)[:, None]
     for _ in range(_STEPS):
         columns = jax.jacfwd(_distances)(ellipse, b)
-        ellipse -= jnp.linalg.solve(columns.T @ (weight * columns), columns.T @ (weight[:, 0] * _distances(ellipse, b)))
+        ellipse -= solve(columns.T @ (weight * columns), columns.T @ (weight[:, 0] * _distances(ellipse, b)))
     return size * ellipse[:2]
 
 

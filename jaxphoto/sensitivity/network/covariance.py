@@ -17,7 +17,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Float
 
 from jaxphoto.arrays import still
@@ -25,6 +24,7 @@ from jaxphoto.camera import InteriorOrientation, get_parameter, set_parameter
 from jaxphoto.collinearity import ExteriorOrientation, camera_coordinates, image_residual, project
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import InputError
+from jaxphoto.linear_algebra import cholesky, solve_lower, solve_lower_transposed
 from jaxphoto.rotation import omega_phi_kappa_from_matrix, rotate, small_rotation
 from jaxphoto.sensitivity.network.layout import Layout
 from jaxphoto.small_matrices import cholesky_3x3, unwhiten, whiten
@@ -201,7 +201,8 @@ def _step(t: Float[Array, "2"]) -> Float[Array, "2"]:
 @jax.custom_jvp
 def _inverse(s: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """S^-1 by Cholesky."""
-    return cho_solve((jnp.linalg.cholesky(s), True), jnp.eye(len(s)))
+    lower = cholesky(s)
+    return solve_lower_transposed(lower, solve_lower(lower, jnp.eye(len(s))))
 
 
 @_inverse.defjvp

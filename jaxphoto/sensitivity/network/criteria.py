@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxphoto.errors import InputError
+from jaxphoto.linear_algebra import cholesky, eigh
 from jaxphoto.sensitivity.network.covariance import EXTERIOR, NetworkCovariance
 
 
@@ -26,13 +27,13 @@ def a_criterion(matrix: Float[Array, "n n"]) -> Float[Array, ""]:
 def d_criterion(matrix: Float[Array, "n n"]) -> Float[Array, ""]:
     """D: det(Q)^(1/n), the mean size of the ellipsoid of errors; units of the unknowns change it by a factor only."""
     scale = jnp.sqrt(jnp.diagonal(matrix))
-    _, log = jnp.linalg.slogdet(matrix / scale[:, None] / scale)
+    log = 2 * jnp.sum(jnp.log(jnp.diagonal(cholesky(matrix / scale[:, None] / scale))))
     return jnp.exp((log + 2 * jnp.sum(jnp.log(scale))) / len(matrix))
 
 
 def e_criterion(matrix: Float[Array, "n n"], power: float | None = None) -> Float[Array, ""]:
     """E: the largest eigenvalue, the variance of what is determined worst, of unknowns of one unit."""
-    return _largest(jnp.linalg.eigvalsh(matrix), power)
+    return _largest(eigh(matrix)[0], power)
 
 
 def sigma_of(covariance: NetworkCovariance, name: str) -> Float[Array, ""]:

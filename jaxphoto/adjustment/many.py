@@ -22,11 +22,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxphoto.adjustment import Adjustment, NormalEquations, TiledStructure, TiledValues
+from jaxphoto.adjustment.layout.tile_layout import Places
+from jaxphoto.adjustment.layout.tiled import TiledStructure, TiledValues
 from jaxphoto.adjustment.model.camera_groups import CameraGroup, interior_of
 from jaxphoto.adjustment.model.image_orientations import cameras_at
 from jaxphoto.adjustment.model.numbers import Increments, UnknownArrays, state_at
 from jaxphoto.adjustment.model.row_functions import non_image_residuals
+from jaxphoto.adjustment.model.structure import Structure
+from jaxphoto.adjustment.solver.elimination import FactoredNormal, solve_factored
+from jaxphoto.adjustment.solver.normal import Linearised
 from jaxphoto.arrays import Numbers, added
 from jaxphoto.collinearity import ExteriorOrientation, camera_coordinates, camera_residual
 from jaxphoto.compiling import once
@@ -37,6 +41,20 @@ from jaxphoto.rotation import rotate
 Varying = dict[str, Array]
 """Leaves of `Values`, by `path_name`, that differ between draws, which are their last axis; `xy` and `sigma_xy` by row
 of the block."""
+# Draws that a device computes side by side. Vectors end in them: 32 are enough for that, and for what is made anew for
+# all of them (see `solver.elimination`); more, up to 64, pay where image rows x draws stay below this number, fewer
+# only where unknowns x draws would be more than this, of which memory holds several.
+_FEW, _MOST, _LEAST = 32, 64, 8
+_ROWS, _UNKNOWNS = 100_000, 8_000_000
+# Image rows x draws that are computed with at a time: what that needs stays in the cache of a core.
+_AT_ONCE = 16_384
+
+
+def batch_size(structure: Structure) -> int:
+    """Draws of a block that a device computes side by side."""
+    s = structure
+    rows, unknowns = max(len(s.image), 1), max(int(s.eop_free.sum() + len(s.free) + s.point_free.sum()), 1)
+    return int(max(_LEAST, min(np.clip(_ROWS // rows, _FEW, _MOST), _UNKNOWNS // unknowns)))
 
 
 class RowList(eqx.Module):
@@ -58,30 +76,36 @@ class RowList(eqx.Module):
 class Common(eqx.Module):
     """What all draws have in common, in padded sizes; image rows (2, rows) by row of the block."""
 
-    equations: NormalEquations
-    xy: Float[np.ndarray, "2 rows"]
-    sigma_xy: Float[np.ndarray, "2 rows"]
+    at: Linearised
+    """The nominal optimum, from which all draws begin."""
+    factored: FactoredNormal
+    xy: Float[Numbers, "2 rows"]
+    sigma_xy: Float[Numbers, "2 rows"]
     lists: tuple[RowList, ...]
 
     @property
     def values(self) -> TiledValues:
         """The nominal numbers."""
-        return self.equations.values
+        return self.at.values
 
     @property
     def scale(self) -> Increments:
         """Of increments."""
-        return self.equations.scale
+        return self.at.scale
 
     @property
     def structure(self) -> TiledStructure:
         """That of the nominal adjustment."""
-        return self.equations.structure
+        return self.at.structure
+
+    def solve(self, b: Increments) -> Increments:
+        """x of N x = b, with the nominal N; of many by `jax.vmap`."""
+        return solve_factored(self.factored.reduced, self.factored.factor, b, self.at)
 
 
-def common_of(adjusted: Adjustment, at_once: int) -> Common:
-    """The nominal adjustment, from whose optimum all draws begin; `at_once` image rows are computed with at a time."""
-    s, places = adjusted.structure, adjusted.tiled.places
+def row_lists(s: Structure, places: Places, at_once: int | None = None) -> tuple[RowList, ...]:
+    """The image rows of each group of cameras; `at_once` of them are computed with at a time."""
+    at_once = at_once or _AT_ONCE // batch_size(s)
     lists = []
     for group in s.groups:
         own = np.flatnonzero(group.member[s.image])
@@ -93,8 +117,18 @@ def common_of(adjusted: Adjustment, at_once: int) -> Common:
         image = s.image[row]
         of_group = places.image[image], places.point[s.point[row]], group.camera[image]
         lists.append(RowList(row, *of_group, (place < len(own)).astype(float)))
-    values = adjusted.values
-    return Common(adjusted.equations, np.asarray(values.xy), np.asarray(values.sigma_xy), tuple(lists))
+    return tuple(lists)
+
+
+def held_in(structure: TiledStructure, parameters: int) -> dict[str, np.ndarray]:
+    """What is fixed, by the leaves of `Values` that unknowns start at: of these, only that tells draws apart."""
+    s = structure
+    return {
+        "position": s.eop_free[:3] == 0,
+        "rotation": (s.eop_free[3:] == 0).all(axis=0),
+        "shared": ~np.isin(np.arange(parameters), s.free),
+        "points": s.point_free == 0,
+    }
 
 
 def states(y: Increments, varying: Varying, common: Common) -> UnknownArrays:

@@ -8,7 +8,6 @@ converges to the optimum of draw i itself, because its gradient is exact; how fa
 own. A draw whose steps do not shrink is left for a full adjustment.
 """
 
-import dataclasses
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -17,9 +16,9 @@ import jax.numpy as jnp
 from jax.sharding import PartitionSpec as P
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxphoto.adjustment.many import Common, Varying, image_gradients, other_gradients, states
 from jaxphoto.adjustment.model.numbers import Increments, UnknownArrays
 from jaxphoto.devices import AXIS, mesh_of
-from jaxphoto.sensitivity.many import Common, Varying, image_gradients, other_gradients, states
 
 TOLERANCE = 1e-6
 """No unknown of a draw misses its optimum by more than this fraction of its standard deviation."""
@@ -39,7 +38,9 @@ class Found(NamedTuple):
     steps: Int[Array, "draws"]
 
 
-class _Way(NamedTuple):
+class Way(NamedTuple):
+    """Where the steps of each draw have led, draws last, in scaled increments from the nominal start."""
+
     y: Increments
     length: Float[Array, "draws"]
     """Of the last step, sqrt(x' N x): at least |x| / sigma of every unknown."""
@@ -81,14 +82,22 @@ def _draws_last() -> Any:
 
 def _find(varying: Varying, common: Common, first_only: bool) -> Found:
     """`find_optima` of what one device holds."""
-    common = dataclasses.replace(common, equations=common.equations.weighed)
+    way = chord_steps(varying, common, first_only)
+    return Found(states(way.y, varying, common), way.settled, way.steps)
+
+
+def chord_steps(varying: Varying, common: Common, first_only: bool = False, polished: bool = True) -> Way:
+    """Chord steps of every draw from the nominal optimum; `polished`, that is one to the last bit, where the nominal
+    gradient vanishes."""
     size = next(iter(varying.values())).shape[-1]
-    y = jax.tree.map(lambda v: jnp.zeros((*v.shape, size)), common.scale)
+    y = jax.tree.map(lambda v: jnp.broadcast_to(jnp.asarray(v)[..., None], (*v.shape, size)), common.at.increments)
     of_image_rows = bool(_OF_IMAGE_ROWS & set(varying))
     none = jnp.zeros(size, bool)
-    way = _Way(y, jnp.full(size, jnp.inf), jnp.zeros(size), none, none, jnp.zeros(size, int))
+    way = Way(y, jnp.full(size, jnp.inf), jnp.zeros(size), none, none, jnp.zeros(size, int))
     if not of_image_rows:
         way = _taken(way, _others_alone(y, varying, common), common)
+        # What is left of the nominal gradient may be more than the tolerance.
+        way = way if polished else way._replace(settled=none)
     elif first_only:
         way = _taken(way, _all(y, varying, common), common)
     if not first_only:
@@ -97,10 +106,10 @@ def _find(varying: Varying, common: Common, first_only: bool) -> Found:
             lambda way: _taken(way, _all(way.y, varying, common), common),
             way,
         )
-    return Found(states(way.y, varying, common), way.settled, way.steps)
+    return way
 
 
-def _taken(way: _Way, b: Increments, common: Common) -> _Way:
+def _taken(way: Way, b: Increments, common: Common) -> Way:
     """One step, of the draws that are still under way, by their gradients `b`."""
     x = _solutions(b, common)
     length = _length(x, b)
@@ -111,7 +120,7 @@ def _taken(way: _Way, b: Increments, common: Common) -> _Way:
     missing = length * worst / jnp.maximum(1 - worst, 1e-3)
     # Steps below the tolerance are rounding, which need not shrink.
     settled = active & ((missing <= TOLERANCE) & contracts | (length <= 0.1 * TOLERANCE))
-    return _Way(
+    return Way(
         y=jax.tree.map(lambda a, d: jnp.where(active, a - d, a), way.y, x),
         length=length,
         # What was assumed of the first says nothing about the second.
@@ -134,7 +143,7 @@ def _others_alone(zero: Increments, varying: Varying, common: Common) -> Increme
 
 
 def _solutions(b: Increments, common: Common) -> Increments:
-    return jax.vmap(common.equations.solve, -1, -1)(b)
+    return jax.vmap(common.solve, -1, -1)(b)
 
 
 def _length(x: Increments, b: Increments) -> Float[Array, "draws"]:

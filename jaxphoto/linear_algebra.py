@@ -1,0 +1,153 @@
+"""Factorisations and solutions of one matrix, safe and quick under `jax.vmap`.
+
+jaxlib spreads a batched LAPACK call over one small pool of threads, and two such calls in one program can wait for each
+other forever (docs/solver.md has an example of ten lines). Here `jax.vmap` never makes a batched call: right-hand sides
+of one matrix become its columns, small systems are eliminated without LAPACK, and all else runs one matrix at a time.
+"""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+# Systems up to this size are eliminated without LAPACK where there are many.
+_SMALL = 7
+
+
+def one_at_a_time(function: Callable) -> Callable:
+    """`function` whose `jax.vmap` is a loop. Its derivatives are the caller's business."""
+    return jax.custom_batching.sequential_vmap(function)
+
+
+def _solver(function: Callable, small: Callable | None = None) -> Callable:
+    """`function(matrix, right)` with a batching rule; `small` solves the same for many small matrices side by side."""
+    solve = jax.custom_batching.custom_vmap(function)
+
+    @solve.def_vmap
+    def rule(size: int, batched: list, matrix: Array, right: Array) -> tuple[Array, bool]:
+        of_matrix, of_right = batched
+        if not of_matrix:
+            columns = jnp.moveaxis(right, 0, -1)
+            x = solve(matrix, columns.reshape(len(columns), -1))
+            return jnp.moveaxis(x.reshape(columns.shape), -1, 0), True
+        if small is not None and right.shape[-2] <= _SMALL:
+            return jax.vmap(small, (0, 0 if of_right else None))(matrix, right), True
+        if of_right:
+            return jax.lax.map(lambda one: solve(*one), (matrix, right)), True
+        return jax.lax.map(lambda one: solve(one, right), matrix), True
+
+    return solve
+
+
+def _eliminated(a: Float[Array, "n n"], b: Float[Array, "n c"]) -> Float[Array, "n c"]:
+    """Gauss-Jordan elimination with partial pivoting, unrolled."""
+    n = len(a)
+    rows, at = jnp.concatenate([a, b], axis=1), jnp.arange(n)[:, None]
+    for k in range(n):
+        pivot = k + jnp.argmax(jnp.abs(rows[k:, k]))
+        chosen = rows[pivot]
+        rows = jnp.where(at == pivot, rows[k], rows)
+        chosen = chosen / chosen[k]
+        rows = jnp.where(at == k, chosen, rows - rows[:, k : k + 1] * chosen)
+    return rows[:, n:]
+
+
+_lu = _solver(jnp.linalg.solve, _eliminated)
+_lu_transposed = _solver(lambda a, b: jnp.linalg.solve(a.T, b), lambda a, b: _eliminated(a.T, b))
+# LAPACK stores by columns: the transpose of what JAX stores by rows is no copy.
+_down = _solver(
+    lambda lower, b: jax.lax.linalg.triangular_solve(lower.T, b, left_side=True, lower=False, transpose_a=True)
+)
+_up = _solver(lambda lower, b: jax.lax.linalg.triangular_solve(lower.T, b, left_side=True, lower=False))
+_band = _solver(lambda bands, b: jax.lax.linalg.tridiagonal_solve(bands[0], bands[1], bands[2], b))
+_band_transposed = _solver(lambda bands, b: _band(_transposed_bands(bands), b))
+_eigh = one_at_a_time(lambda a: tuple(jnp.linalg.eigh(a)))
+_factor = one_at_a_time(lambda a: jax.lax.linalg.cholesky(a, symmetrize_input=False))
+
+
+def solve(a: Float[Array, "n n"], b: Float[Array, "n *c"]) -> Float[Array, "n *c"]:
+    """x of A x = b, of one vector or of the columns of a matrix."""
+    columns = b.reshape(len(b), -1)
+    return _linear(lambda x: a @ x, columns, lambda b: _lu(a, b), lambda b: _lu_transposed(a, b)).reshape(b.shape)
+
+
+def inverse(a: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """A^-1."""
+    return solve(a, unit_like(a))
+
+
+def unit_like(a: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """The unit matrix, varying over the devices of a mesh where `a` does: a right-hand side has to."""
+    unit = jnp.eye(len(a))
+    return jnp.where(a == a, unit, unit)
+
+
+def solve_lower(lower: Float[Array, "n n"], b: Float[Array, "n c"]) -> Float[Array, "n c"]:
+    """L^-1 b of a lower triangle."""
+    return _linear(lambda x: jnp.tril(lower) @ x, b, lambda b: _down(lower, b), lambda b: _up(lower, b))
+
+
+def solve_lower_transposed(lower: Float[Array, "n n"], b: Float[Array, "n c"]) -> Float[Array, "n c"]:
+    """L'^-1 b of a lower triangle."""
+    return _linear(lambda x: jnp.tril(lower).T @ x, b, lambda b: _up(lower, b), lambda b: _down(lower, b))
+
+
+def solve_lower_right(lower: Float[Array, "n n"], b: Float[Array, "c n"]) -> Float[Array, "c n"]:
+    """b L'^-1 of a lower triangle."""
+    return solve_lower(lower, b.T).T
+
+
+def solve_tridiagonal(
+    lower: Float[Array, "n"], diagonal: Float[Array, "n"], upper: Float[Array, "n"], b: Float[Array, "n c"]
+) -> Float[Array, "n c"]:
+    """x of A x = b, of A with the diagonals `lower` (from its second number on), `diagonal` and `upper`."""
+    bands = jnp.stack([lower, diagonal, upper])
+
+    def product(x):
+        below, above = jnp.roll(x, 1, axis=0).at[0].set(0.0), jnp.roll(x, -1, axis=0).at[-1].set(0.0)
+        return lower[:, None] * below + diagonal[:, None] * x + upper[:, None] * above
+
+    return _linear(product, b, lambda b: _band(bands, b), lambda b: _band_transposed(bands, b))
+
+
+@jax.custom_jvp
+def cholesky(a: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """Lower Cholesky factor of a symmetric matrix, given by its lower triangle; NaN if not positive definite."""
+    return _factor(a)
+
+
+@cholesky.defjvp
+def _cholesky_jvp(primals, tangents):
+    """dL = L Phi(L^-1 dA L'^-1), with Phi the lower triangle and half the diagonal."""
+    (a,), (change,) = primals, tangents
+    lower = cholesky(a)
+    change = jnp.tril(change) + jnp.tril(change, -1).T
+    white = solve_lower(lower, solve_lower(lower, change).T)
+    return lower, lower @ (jnp.tril(white, -1) + 0.5 * jnp.diag(jnp.diagonal(white)))
+
+
+@jax.custom_jvp
+def eigh(a: Float[Array, "n n"]) -> tuple[Float[Array, "n"], Float[Array, "n n"]]:
+    """Eigenvalues of a symmetric matrix, ascending, and its eigenvectors by column."""
+    values, vectors = _eigh(a)
+    return values, vectors
+
+
+@eigh.defjvp
+def _eigh_jvp(primals, tangents):
+    """dw = diag(V' dA V), dV = V (F * V' dA V) with F[i, j] = 1 / (w[j] - w[i])."""
+    w, v = eigh(*primals)
+    change = v.T @ (0.5 * (tangents[0] + tangents[0].T)) @ v
+    apart = w - w[:, None] + jnp.eye(len(w))
+    return (w, v), (jnp.diagonal(change), v @ (change / apart * (1 - jnp.eye(len(w)))))
+
+
+def _linear(product: Callable, b: Array, solve: Callable, transposed: Callable) -> Array:
+    """x of product(x) = b, differentiable in all that the product depends on and in b."""
+    return jax.lax.custom_linear_solve(product, b, lambda _, b: solve(b), lambda _, b: transposed(b))
+
+
+def _transposed_bands(bands: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
+    lower, diagonal, upper = bands
+    return jnp.stack([jnp.roll(upper, 1), diagonal, jnp.roll(lower, -1)])
