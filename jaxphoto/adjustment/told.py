@@ -22,7 +22,7 @@ def step_lines(adjusted: Adjustment) -> Iterator[str]:
     course, redundancy = adjusted.course, max(adjusted.redundancy, 1)
     if course is None:
         return
-    for k, (square_sum, length, damping, accepted) in enumerate(zip(*course, strict=True), 1):
+    for k, (square_sum, length, damping, accepted, *_) in enumerate(zip(*course, strict=True), 1):
         refused = "" if accepted > 0 else ", refused"
         moved = f"moves {length:.2g} sigmas, damping {damping:.1g}{refused}"
         yield f"step {k}: sigma naught {(square_sum / redundancy) ** 0.5:.6g}, {moved}"

@@ -145,27 +145,42 @@ def _up_by_rows(eop: Array, shared: Array, mu: Array, at: Linearised) -> Array:
     return result
 
 
-def gradient(at: Linearised, reduced: Reduced, there: Linearised):
-    """b = J'r over all rows, its part for the reduced unknowns and for mu, and the square sum of the residuals.
+def gradient(
+    at: Linearised,
+    reduced: Reduced,
+    there: Linearised,
+    trial: Increments | None = None,
+    less: Increments | None = None,
+):
+    """b = J'r over all rows, its part for the reduced unknowns and for mu, and the square sum of the residuals r.
 
-    What takes it down is `reduced`, linearised `there`.
+    What takes it down is `reduced`, linearised `there`. J is that of `at`, and so is r, unless `trial` says where.
+    `less` is subtracted from b.
     """
     increments, scale, values, s = at
-    others, b_others = _others_and_gradient(at)
+    tried = at if trial is None else at._replace(increments=trial)
+    others, b_others = _others_and_gradient(at, tried)
     scene, pull_scene = _scene_and_pull(at)
     points = values.points + increments.points * scale.points
+    moved = () if trial is None else (values.points + trial.points * scale.points,)
+    moved_scene = None if trial is None else _scene_at(tried, trial.eop, trial.shared)
 
     def tile(numbers):
-        image, point, step, other, xy, sigma = numbers
+        image, point, step, other, xy, sigma, *moved = numbers
         seen, place = seen_in(xy, sigma, image, s), of_images(scene, image, s)
         r, pull = jax.vjp(lambda scene, point: tile_residuals(scene, point, seen, s), place, point)
+        if moved:
+            r = tile_residuals(of_images(moved_scene, image, s), *moved, seen, s)
         to_scene, to_point = pull(r)
         return to_scene, to_point * step + other, squares(r)
 
     numbers = (s.by_tile(v) for v in (points, scale.points, b_others.points))
-    to_scene, b, square = s.each_tile(tile, (*numbers, values.xy, values.sigma_xy))
+    of_tiles = (*numbers, values.xy, values.sigma_xy, *map(s.by_tile, moved))
+    to_scene, b, square = s.each_tile(tile, of_tiles)
     eop, shared = pull_scene(total(_by_image(to_scene, scene, s), s))
     b = Increments(eop + b_others.eop, shared + b_others.shared, s.by_point(b))
+    if less is not None:
+        b = jax.tree.map(jnp.subtract, b, less)
     return b, *reduce_right(reduced, b, there), total(jnp.sum(square), s) + other_squares(others, s)
 
 
@@ -262,14 +277,14 @@ def push_others(x: Increments, at: Linearised) -> NonImageResiduals:
     return _of_many(one, x, len(x.shared), s)
 
 
-def _others_and_gradient(at: Linearised) -> tuple[NonImageResiduals, Increments]:
+def _others_and_gradient(at: Linearised, tried: Linearised) -> tuple[NonImageResiduals, Increments]:
     """All but the image rows, and their part of b."""
-    increments, scale, values, s = at
+    _, scale, values, s = at
     # Each by itself: one derivative of all of them, taken once for each kind, would be twice the program.
-    parts = {at_points: _groups_and_gradient(at, at_points) for at_points in (False, True)}
+    parts = {at_points: _groups_and_gradient(at, tried, at_points) for at_points in (False, True)}
     of_each = {at_points: iter(residuals) for at_points, (residuals, _) in parts.items()}
     residuals = tuple(next(of_each[isinstance(g.rows, RowsAtPoints)]) for g in s.observed)
-    datum = datum_residuals(increments, scale, values, s)
+    datum = datum_residuals(tried.increments, scale, values, s)
     others = NonImageResiduals(residuals, datum, tuple(g.name for g in s.observed))
     # Rows at points are dealt out with these and meet shared unknowns, which are on every device.
     b, at_points = parts[False][1], parts[True][1]
@@ -281,14 +296,15 @@ def _others_and_gradient(at: Linearised) -> tuple[NonImageResiduals, Increments]
     return others, b._replace(eop=b.eop + eop, points=b.points + points)
 
 
-def _groups_and_gradient(at: Linearised, at_points: bool) -> tuple[tuple[Array, ...], Increments]:
+def _groups_and_gradient(at: Linearised, tried: Linearised, at_points: bool) -> tuple[tuple[Array, ...], Increments]:
     """Residuals of the groups that lie at points, or of all others, and their part of b on this device."""
     increments, scale, values, s = at
     pairs = zip(s.observed, values.groups, strict=True)
     chosen = [(g, numbers) for g, numbers in pairs if isinstance(g.rows, RowsAtPoints) == at_points]
-    residuals, pull = jax.vjp(
-        lambda y: tuple(group_residuals(g, numbers, y, scale, values, s) for g, numbers in chosen), increments
-    )
+    of_chosen = lambda y: tuple(group_residuals(g, numbers, y, scale, values, s) for g, numbers in chosen)  # noqa: E731
+    residuals, pull = jax.vjp(of_chosen, increments)
+    if tried is not at:
+        residuals = of_chosen(tried.increments)
     return residuals, pull(residuals)[0]
 
 
