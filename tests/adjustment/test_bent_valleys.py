@@ -10,15 +10,19 @@ from jax.flatten_util import ravel_pytree
 from scipy.optimize import minimize_scalar
 
 from jaxphoto import Outcome, adjust
-from jaxphoto.adjustment import common_sizes
+from jaxphoto.adjustment import common_sizes, weaknesses_of
 from jaxphoto.adjustment.adjust import lay_out
 from jaxphoto.adjustment.model.numbers import state_at
 from jaxphoto.adjustment.solver.elimination import Trial, gradient
 from jaxphoto.adjustment.solver.normal import Linearised
 from jaxphoto.adjustment.solver.optimum import typical_scale
 from jaxphoto.adjustment.solver.reduced import reduce_normal
+from jaxphoto.adjustment.told import step_lines
+from jaxphoto.report.convergence import convergence_words
+from jaxphoto.report.convergence_table import convergence_table
 from tests.adjustment.dense import in_one_list
 from tests.blocks import adjusted, simulated
+from tests.marks import slow_but
 from tests.simulation.small import made
 
 FLAT = {
@@ -59,10 +63,29 @@ def test_flat_blocks_converge_within_forty_steps(seed):
     assert (np.diff(sums)[found.course.accepted == 0] == 0).all()
 
 
-def test_some_steps_follow_a_curve():
-    assert any((optimum(seed).course.bent > 0).any() for seed in SEEDS)
+def test_some_steps_follow_a_curve_and_the_course_tells():
+    found = next(optimum(seed) for seed in SEEDS if (optimum(seed).course.bent > 0).any())
+    table, bent = convergence_table(found), found.course.bent
+    assert (table["bent"].notna().to_numpy()[: len(bent)] == (bent > 0)).all()
+    assert ((bent >= 0) & (bent <= 1)).all()
+    assert sum("along a curve" in line for line in step_lines(found)) == (bent > 0).sum()
 
 
+def test_what_is_not_determined_is_told_early_and_named():
+    """Flat ground and level cameras at one height: nothing tells c from the flying height."""
+    sizes = common_sizes(flat(k).block for k in SEEDS)
+    level = {"terrain.rms_m": 0.01, "jitter": {"position_m": 0.0, "angle_deg": 0.0}}
+    results = [adjust(made(FLAT | level, seed).block, sizes=sizes) for seed in SEEDS]
+    assert all(int(found.steps) <= 60 for found in results)
+    open_ends = [found for found in results if found.outcome is Outcome.FLAT]
+    assert open_ends
+    for found in open_ends:
+        labels = frozenset().union(*(w.labels for w in weaknesses_of(found)))
+        assert "interior[kodak].c_mm" in labels
+        assert "not determine" in convergence_words(found)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2])
 def test_the_optimum_is_that_of_a_search_over_the_principal_distance(seed):
     """Dense Gauss-Newton for each c, from the truth, and the c of the least square sum: no valley is followed."""
@@ -97,7 +120,7 @@ def test_the_optimum_is_that_of_a_search_over_the_principal_distance(seed):
         return float(np.sum(np.asarray(residuals(x)) ** 2))
 
     step = float(optimum(seed).unknowns.interior["kodak"].c - truth.interior["kodak"].c) / float(scale.shared[j])
-    minimize_scalar(best, (0.0, 0.5 * step), options={"xtol": 1e-6})
+    minimize_scalar(best, (0.0, 0.5 * step), options={"xtol": 1e-2})
     x = gauss_newton(x, np.arange(len(free)), 4)
     a = np.asarray(jacobian(x))
     covariance = np.linalg.inv(a.T @ a)
@@ -111,18 +134,15 @@ def test_the_optimum_is_that_of_a_search_over_the_principal_distance(seed):
     assert (np.abs(off) < 1e-5 * np.asarray(eop[:3, places.image]).T).all()
     off = np.asarray(ours.points) - np.asarray(theirs.points).T
     assert (np.abs(off) < 1e-5 * np.asarray(points[:, places.point]).T + 1e-12).all()
-    # It moves by more than a sigma from the truth, along a bent valley.
-    assert float(optimum(seed).sigma0) == pytest.approx(1.0, abs=0.2)
 
 
-@pytest.mark.parametrize("name", ["cross", "fixed_interior"])
-def test_well_determined_blocks_take_straight_steps(name):
-    found = adjusted(name)
+def test_a_well_determined_block_takes_straight_steps():
+    found = adjusted("cross")
     assert not (found.course.bent > 0).any() and (found.course.accepted > 0).all()
-    assert int(found.steps) <= 6
+    assert int(found.steps) <= 4
 
 
-@pytest.mark.parametrize("name", ["everything"])
+@pytest.mark.parametrize("name", slow_but(("cross",), ("cross", "everything")))
 def test_the_gradient_of_a_trial_is_that_of_its_residuals(name):
     """J' r with r elsewhere, less what is subtracted; and as it was where no trial is wanted."""
     block = simulated(name).block
