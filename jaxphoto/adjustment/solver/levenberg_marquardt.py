@@ -98,11 +98,11 @@ class Course(NamedTuple):
     bent: Float[Numbers, "steps"]
     """How far it went along its curve, as a fraction of the step; 0 where it was straight."""
 
-    def is_flat(self, k) -> Bool[Numbers, ""]:
+    def is_flat(self, k: int | Int[Array, ""]) -> Bool[Array, ""] | np.bool_:
         """True if the square sum hardly fell in the steps before step k (0, 1 ...), which is as long as they were.
 
-        In all of them it fell by less than moving one unknown by its standard deviation changes it, so the observations
-        tell none of these places from another.
+        In all of them it fell by less than moving one unknown by two standard deviations changes it, so the
+        observations hardly tell these places apart.
         """
         first, within = jnp.maximum(k - _WINDOW, 0), (k >= _WINDOW) & (k < MOST_KEPT)
         fall = self.square_sum[first] - self.square_sum[k]
@@ -112,7 +112,7 @@ class Course(NamedTuple):
 # Adjustments end within tens of steps; the numbers of these are all that is kept besides the unknowns.
 MOST_KEPT = 128
 # Steps that a flat square sum is told by, its fall, and the ratio of the lengths of the last and the first.
-_WINDOW, _FALL, _SHRUNK = 20, 1.0, 0.5
+_WINDOW, _FALL, _SHRUNK = 20, 4.0, 0.5
 
 
 class Proposal(NamedTuple):
@@ -255,11 +255,13 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Increments, Scalar, Any
 
     def _kept(self, at: Linearised, state: SolverState) -> tuple[FactoredSystem, RightSide]:
         """The gradient there, or J'r'' of the proposal, taken down by the system that there is."""
-        here, system, (step, b, *_), h = at.for_normal_equations, state.system, state.proposal, _DIFFERENCE
+        here, system, p, h = at.for_normal_equations, state.system, state.proposal, _DIFFERENCE
         weight, damping = system.reduced.weight, system.reduced.damping
         # r(h v) = r + h J v + h^2 r'' / 2, and (N + D) v = -J'r.
-        linear = jax.tree.map(lambda b, v, w: (1 - h) * b - h * damping * w * v, b, step, weight)
-        trial = Trial(state.bend, after(at, jax.tree.map(lambda v: h * v, step), weight), linear)
+        linear = jax.tree.map(lambda b, v, w: (1 - h) * b - h * damping * w * v, p.gradient, p.step, weight)
+        # What a similarity adds to the step (`after`) goes with the square of it.
+        near = jax.tree.map(lambda y, v, end: y + h * v + h**2 * (end - y - v), at.increments, p.step, p.trial)
+        trial = Trial(state.bend, near, linear)
         right = RightSide(*gradient(here, system.reduced, here._replace(increments=system.increments), trial))
         return system, self._with_cost(right, at)
 
@@ -343,20 +345,17 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Increments, Scalar, Any
         along = lambda t: after(at, jax.tree.map(lambda v, a: t * v + t**2 * a, p.step, half), weight)  # noqa: E731
 
         def too_long(tried):
-            t, square_sum = tried
+            t, _, square_sum = tried
             return (t > end) & ~(p.square_sum - square_sum >= _ENOUGH * p.promised(t))
 
         def shorter(tried):
             t = tried[0] / 2
-            return t, fn(along(t), at[1:])[0] ** 2
+            y = along(t)
+            # The last step is short and was computed from an accepted iterate: it needs no proof.
+            return t, y, jax.lax.cond(is_last, lambda: p.square_sum, lambda: fn(y, at[1:])[0] ** 2)
 
-        # The last step is short and was computed from an accepted iterate: it needs no proof.
-        t, square_sum = jax.lax.cond(
-            is_last,
-            lambda: (begin, p.square_sum),
-            lambda: jax.lax.while_loop(too_long, shorter, (2 * begin, jnp.array(jnp.inf))),
-        )
-        return along(t), square_sum, t
+        t, y, square_sum = jax.lax.while_loop(too_long, shorter, (2 * begin, p.trial, jnp.array(jnp.inf)))
+        return y, square_sum, t
 
     def terminate(self, fn, y, args, options, state: SolverState, tags):
         """After the step that did it, the last that the task allows, or many in vain."""
