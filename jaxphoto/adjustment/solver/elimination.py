@@ -172,7 +172,7 @@ def gradient(at: Linearised, reduced: Reduced, there: Linearised, trial: Trial |
         seen, place = seen_in(xy, sigma, image, s), of_images(scene, image, s)
         r, pull = jax.vjp(lambda scene, point: tile_residuals(scene, point, seen, s), place, point)
         if trial is not None:
-            of_trial = lambda: tile_residuals(of_images(moved_scene, image, s), *moved, seen, s)  # noqa: E731
+            of_trial = lambda: tile_residuals(of_images(moved_scene, image, s), moved[0], seen, s)  # noqa: E731
             r = jax.lax.cond(trial.wanted, of_trial, lambda: r)
         to_scene, to_point = pull(r)
         return to_scene, to_point * step + other, squares(r)
