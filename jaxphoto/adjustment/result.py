@@ -36,6 +36,10 @@ class Outcome(enum.Enum):
         "not converged: the step limit was reached; check the approximate values, look for blunders among the largest "
         "residuals, or hold weakly determined unknowns fixed"
     )
+    FLAT = (
+        "not converged: steps as long as before hardly reduce the residuals any more, so the observations do not "
+        "determine some unknowns; hold them fixed, give them weights, or add observations that do"
+    )
     ASTRAY = (
         "not converged: object points went so far away that their rays are parallel; look for blunders in what was "
         "measured of them, leave them out, or give better approximate values"
@@ -127,7 +131,11 @@ class Adjustment(eqx.Module):
             return Outcome.CONVERGED
         if not np.isfinite(float(self.square_sum)):
             return Outcome.DIVERGED
-        return Outcome.ASTRAY if self.astray.any() else Outcome.STEPS
+        if self.astray.any():
+            return Outcome.ASTRAY
+        kept = 0 if self.course is None else len(self.course.length)
+        flat = self.course is not None and 0 < kept == int(self.steps) and bool(self.course.is_flat(kept - 1))
+        return Outcome.FLAT if flat else Outcome.STEPS
 
     @property
     def astray(self) -> Bool[np.ndarray, "points"]:

@@ -215,7 +215,7 @@ def _somewhere(adjusted: Adjustment, max_steps: int) -> bool:
     """Whether an adjustment ended where its observations might belong; or was given too few steps to tell."""
     if adjusted.factored is None or (adjusted.outcome is Outcome.STEPS and max_steps < MAX_STEPS):
         return True
-    return adjusted.outcome in (Outcome.CONVERGED, Outcome.STEPS) and float(adjusted.sigma0) < ABSURD
+    return adjusted.outcome in (Outcome.CONVERGED, Outcome.STEPS, Outcome.FLAT) and float(adjusted.sigma0) < ABSURD
 
 
 def start_of(block: Block, report: Callable[[str], object] = lambda text: None) -> Unknowns:

@@ -29,7 +29,9 @@ def convergence_words(adjusted: Adjustment) -> str:
         return ""
     refused = int((course.accepted == 0).sum())
     again = f", {refused} of them refused and tried again with more damping" if refused else ""
-    said = f"{counted(n, 'step')}{again}"
+    bent = int(((course.bent > 0) & (course.accepted > 0)).sum())
+    along = f", {bent} of them along a curve (weakly determined unknowns)" if bent else ""
+    said = f"{counted(n, 'step')}{along}{again}"
     last = course.length[-1] if len(course.length) == n else np.nan
     if adjusted.outcome is Outcome.CONVERGED:
         return f"{said}. The last moved no unknown by more than {last:.1e} of its standard deviation: that ended it."

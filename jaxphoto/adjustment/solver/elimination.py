@@ -7,12 +7,12 @@ by two derivatives of the image rows each, in a direction and back: W z = J_e' (
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxphoto.adjustment.layout.tiled import TiledResiduals, TiledStructure
 from jaxphoto.adjustment.model.image_orientations import ImageOrientations, by_image, of_images, orientations_of
@@ -145,32 +145,36 @@ def _up_by_rows(eop: Array, shared: Array, mu: Array, at: Linearised) -> Array:
     return result
 
 
-def gradient(
-    at: Linearised,
-    reduced: Reduced,
-    there: Linearised,
-    trial: Increments | None = None,
-    less: Increments | None = None,
-):
+class Trial(NamedTuple):
+    """Another place for the residuals of a gradient; the derivatives stay."""
+
+    wanted: Bool[Array, ""]
+    increments: Increments
+    linear: Increments
+    """What J'r there is without curvature: to be subtracted."""
+
+
+def gradient(at: Linearised, reduced: Reduced, there: Linearised, trial: Trial | None = None):
     """b = J'r over all rows, its part for the reduced unknowns and for mu, and the square sum of the residuals r.
 
-    What takes it down is `reduced`, linearised `there`. J is that of `at`, and so is r, unless `trial` says where.
-    `less` is subtracted from b.
+    What takes it down is `reduced`, linearised `there`. J is that of `at`, and so is r, unless a `trial` is wanted.
     """
     increments, scale, values, s = at
-    tried = at if trial is None else at._replace(increments=trial)
-    others, b_others = _others_and_gradient(at, tried)
+    others, b_others = _others_and_gradient(at, trial)
     scene, pull_scene = _scene_and_pull(at)
     points = values.points + increments.points * scale.points
-    moved = () if trial is None else (values.points + trial.points * scale.points,)
-    moved_scene = None if trial is None else _scene_at(tried, trial.eop, trial.shared)
+    moved: tuple[Array, ...] = ()
+    if trial is not None:
+        moved_scene = _scene_at(at, trial.increments.eop, trial.increments.shared)
+        moved = (values.points + trial.increments.points * scale.points,)
 
     def tile(numbers):
         image, point, step, other, xy, sigma, *moved = numbers
         seen, place = seen_in(xy, sigma, image, s), of_images(scene, image, s)
         r, pull = jax.vjp(lambda scene, point: tile_residuals(scene, point, seen, s), place, point)
-        if moved:
-            r = tile_residuals(of_images(moved_scene, image, s), *moved, seen, s)
+        if trial is not None:
+            of_trial = lambda: tile_residuals(of_images(moved_scene, image, s), moved[0], seen, s)  # noqa: E731
+            r = jax.lax.cond(trial.wanted, of_trial, lambda: r)
         to_scene, to_point = pull(r)
         return to_scene, to_point * step + other, squares(r)
 
@@ -179,8 +183,8 @@ def gradient(
     to_scene, b, square = s.each_tile(tile, of_tiles)
     eop, shared = pull_scene(total(_by_image(to_scene, scene, s), s))
     b = Increments(eop + b_others.eop, shared + b_others.shared, s.by_point(b))
-    if less is not None:
-        b = jax.tree.map(jnp.subtract, b, less)
+    if trial is not None:
+        b = jax.tree.map(lambda b, linear: b - jnp.where(trial.wanted, linear, 0.0), b, trial.linear)
     return b, *reduce_right(reduced, b, there), total(jnp.sum(square), s) + other_squares(others, s)
 
 
@@ -277,14 +281,16 @@ def push_others(x: Increments, at: Linearised) -> NonImageResiduals:
     return _of_many(one, x, len(x.shared), s)
 
 
-def _others_and_gradient(at: Linearised, tried: Linearised) -> tuple[NonImageResiduals, Increments]:
+def _others_and_gradient(at: Linearised, trial: Trial | None) -> tuple[NonImageResiduals, Increments]:
     """All but the image rows, and their part of b."""
-    _, scale, values, s = at
+    increments, scale, values, s = at
     # Each by itself: one derivative of all of them, taken once for each kind, would be twice the program.
-    parts = {at_points: _groups_and_gradient(at, tried, at_points) for at_points in (False, True)}
+    parts = {at_points: _groups_and_gradient(at, trial, at_points) for at_points in (False, True)}
     of_each = {at_points: iter(residuals) for at_points, (residuals, _) in parts.items()}
     residuals = tuple(next(of_each[isinstance(g.rows, RowsAtPoints)]) for g in s.observed)
-    datum = datum_residuals(tried.increments, scale, values, s)
+    if trial is not None:
+        increments = jax.tree.map(lambda a, b: jnp.where(trial.wanted, a, b), trial.increments, increments)
+    datum = datum_residuals(increments, scale, values, s)
     others = NonImageResiduals(residuals, datum, tuple(g.name for g in s.observed))
     # Rows at points are dealt out with these and meet shared unknowns, which are on every device.
     b, at_points = parts[False][1], parts[True][1]
@@ -296,15 +302,15 @@ def _others_and_gradient(at: Linearised, tried: Linearised) -> tuple[NonImageRes
     return others, b._replace(eop=b.eop + eop, points=b.points + points)
 
 
-def _groups_and_gradient(at: Linearised, tried: Linearised, at_points: bool) -> tuple[tuple[Array, ...], Increments]:
+def _groups_and_gradient(at: Linearised, trial: Trial | None, at_points: bool) -> tuple[tuple[Array, ...], Increments]:
     """Residuals of the groups that lie at points, or of all others, and their part of b on this device."""
     increments, scale, values, s = at
     pairs = zip(s.observed, values.groups, strict=True)
     chosen = [(g, numbers) for g, numbers in pairs if isinstance(g.rows, RowsAtPoints) == at_points]
     of_chosen = lambda y: tuple(group_residuals(g, numbers, y, scale, values, s) for g, numbers in chosen)  # noqa: E731
     residuals, pull = jax.vjp(of_chosen, increments)
-    if tried is not at:
-        residuals = of_chosen(tried.increments)
+    if trial is not None:
+        residuals = jax.lax.cond(trial.wanted, of_chosen, lambda _: residuals, trial.increments)
     return residuals, pull(residuals)[0]
 
 

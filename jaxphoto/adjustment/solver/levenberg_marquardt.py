@@ -28,7 +28,7 @@ from jaxphoto.adjustment.layout.tiled import TiledStructure, TiledValues
 from jaxphoto.adjustment.model.block_values import with_datum
 from jaxphoto.adjustment.model.numbers import Increments
 from jaxphoto.adjustment.solver.band import BandFactor, factor_band
-from jaxphoto.adjustment.solver.elimination import gradient, solve_reduced
+from jaxphoto.adjustment.solver.elimination import Trial, gradient, solve_reduced
 from jaxphoto.adjustment.solver.normal import Linearised, Reduced, dot, norm2
 from jaxphoto.adjustment.solver.reduced import RightSide, reduce_normal
 from jaxphoto.adjustment.solver.similarity import after, n_open_motions, onto_datum
@@ -98,9 +98,21 @@ class Course(NamedTuple):
     bent: Float[Numbers, "steps"]
     """How far it went along its curve, as a fraction of the step; 0 where it was straight."""
 
+    def is_flat(self, k: int | Int[Array, ""]) -> Bool[Array, ""] | np.bool_:
+        """True if the square sum hardly fell in the steps before step k (0, 1 ...), which is as long as they were.
+
+        In all of them it fell by less than moving one unknown by two standard deviations changes it, so the
+        observations hardly tell these places apart.
+        """
+        first, within = jnp.maximum(k - _WINDOW, 0), (k >= _WINDOW) & (k < MOST_KEPT)
+        fall = self.square_sum[first] - self.square_sum[k]
+        return within & (fall < _FALL) & (self.length[k] > _SHRUNK * self.length[first])
+
 
 # Adjustments end within tens of steps; the numbers of these are all that is kept besides the unknowns.
 MOST_KEPT = 128
+# Steps that a flat square sum is told by, its fall, and the ratio of the lengths of the last and the first.
+_WINDOW, _FALL, _SHRUNK = 20, 4.0, 0.5
 
 
 class Proposal(NamedTuple):
@@ -144,6 +156,8 @@ class SolverState(NamedTuple):
     """Whether it did before: it does so once."""
     done: Bool[Array, ""]
     """Whether this is what the task asks for: the optimum, or the system."""
+    flat: Bool[Array, ""]
+    """True if there is no use in going on: the square sum does not tell where the optimum is."""
     steps: Int[Array, ""]
     course: Course
 
@@ -230,6 +244,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Increments, Scalar, Any
             loose=no,
             tightened=no,
             done=no,
+            flat=no,
             steps=steps,
             course=course,
         )
@@ -240,13 +255,14 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Increments, Scalar, Any
 
     def _kept(self, at: Linearised, state: SolverState) -> tuple[FactoredSystem, RightSide]:
         """The gradient there, or J'r'' of the proposal, taken down by the system that there is."""
-        here, system, (step, b, *_), h = at.for_normal_equations, state.system, state.proposal, _DIFFERENCE
+        here, system, p, h = at.for_normal_equations, state.system, state.proposal, _DIFFERENCE
         weight, damping = system.reduced.weight, system.reduced.damping
-        some = lambda of: jax.tree.map(lambda v: jnp.where(state.bend, v, 0.0), of)  # noqa: E731
-        trial = after(at, some(jax.tree.map(lambda v: h * v, step)), weight)
         # r(h v) = r + h J v + h^2 r'' / 2, and (N + D) v = -J'r.
-        linear = some(jax.tree.map(lambda b, v, w: (1 - h) * b - h * damping * w * v, b, step, weight))
-        right = RightSide(*gradient(here, system.reduced, here._replace(increments=system.increments), trial, linear))
+        linear = jax.tree.map(lambda b, v, w: (1 - h) * b - h * damping * w * v, p.gradient, p.step, weight)
+        # What a similarity adds to the step (`after`) goes with the square of it.
+        near = jax.tree.map(lambda y, v, end: y + h * v + h**2 * (end - y - v), at.increments, p.step, p.trial)
+        trial = Trial(state.bend, near, linear)
+        right = RightSide(*gradient(here, system.reduced, here._replace(increments=system.increments), trial))
         return system, self._with_cost(right, at)
 
     def _with_cost(self, right: RightSide, at: Linearised) -> RightSide:
@@ -299,6 +315,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Increments, Scalar, Any
             p.square_sum, length, system.reduced.damping, accept.astype(float), jnp.where(bend & ~no_better, t, 0.0)
         )
         kept = (jnp.asarray(v).at[state.steps].set(one, mode="drop") for v, one in zip(state.course, told, strict=True))
+        course = Course(*kept)
         progress = SolverState(
             damping=jnp.where(tighten, _FIRST_DAMPING, damping),
             growth=growth,
@@ -310,8 +327,9 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Increments, Scalar, Any
             loose=loose,
             tightened=state.tightened | tighten,
             done=(settled & ~tighten) | only_factor,
+            flat=accept & course.is_flat(state.steps),
             steps=state.steps + jnp.where(bend_next, 0, 1),
-            course=Course(*kept),
+            course=course,
         )
         return next_y, progress, None
 
@@ -327,24 +345,21 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Increments, Scalar, Any
         along = lambda t: after(at, jax.tree.map(lambda v, a: t * v + t**2 * a, p.step, half), weight)  # noqa: E731
 
         def too_long(tried):
-            t, square_sum = tried
+            t, _, square_sum = tried
             return (t > end) & ~(p.square_sum - square_sum >= _ENOUGH * p.promised(t))
 
         def shorter(tried):
             t = tried[0] / 2
-            return t, fn(along(t), at[1:])[0] ** 2
+            y = along(t)
+            # The last step is short and was computed from an accepted iterate: it needs no proof.
+            return t, y, jax.lax.cond(is_last, lambda: p.square_sum, lambda: fn(y, at[1:])[0] ** 2)
 
-        # The last step is short and was computed from an accepted iterate: it needs no proof.
-        t, square_sum = jax.lax.cond(
-            is_last,
-            lambda: (begin, p.square_sum),
-            lambda: jax.lax.while_loop(too_long, shorter, (2 * begin, jnp.array(jnp.inf))),
-        )
-        return along(t), square_sum, t
+        t, y, square_sum = jax.lax.while_loop(too_long, shorter, (2 * begin, p.trial, jnp.array(jnp.inf)))
+        return y, square_sum, t
 
     def terminate(self, fn, y, args, options, state: SolverState, tags):
-        """After the step that did it, or the last that the task allows."""
-        ended = ~state.done & (state.steps >= self.task.max_steps)
+        """After the step that did it, the last that the task allows, or many in vain."""
+        ended = ~state.done & ((state.steps >= self.task.max_steps) | state.flat)
         results = optx.RESULTS
         return state.done | ended, results.where(ended, results.nonlinear_max_steps_reached, results.successful)
 
