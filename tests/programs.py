@@ -8,5 +8,5 @@ import jax
 def batched_lapack_calls(function, *arguments) -> list[str]:
     """Calls of LAPACK on several matrices at once in the program of `function`, as lines of StableHLO."""
     text = jax.jit(function).lower(*arguments).as_text()
-    calls = [line for line in text.splitlines() if re.search(r"custom_call @lapack|triangular_solve|cholesky", line)]
+    calls = [line for line in text.splitlines() if "custom_call @lapack" in line]
     return [line for line in calls if re.search(r": \(tensor<\d+x\d+x\d+x", line)]
