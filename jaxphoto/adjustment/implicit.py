@@ -5,12 +5,14 @@ second derivative (Gauss-Newton part and curvature). H is never formed: conjugat
 preconditioned by the factored normal matrix, from which it differs by the residuals' curvature only.
 """
 
+from functools import partial
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
+from jaxtyping import Array
 
 from jaxphoto.adjustment.layout.tiled import TiledStructure, TiledValues
 from jaxphoto.adjustment.model.numbers import Increments
@@ -42,36 +44,55 @@ def find_optimum(values: TiledValues, structure: TiledStructure, task: Task, row
 
 def _derivative(values: TiledValues, direction: Any, at: Increments, structure: TiledStructure) -> Optimum:
     """How the optimum, which is `at` these increments, moves with the values."""
-    unit = unit_scale(structure)
+    scale = typical_scale(values, structure)
 
+    # What batching rules call again closes over no array: a rule may run in another trace.
     def gradient(increments, numbers):
+        unit = unit_scale(structure)
         residuals, pull = jax.vjp(lambda y: Linearised(y, unit, numbers, structure).residuals(), increments)
         return pull(residuals)[0]
 
     moved, still = eqx.partition(values, jax.tree.map(lambda t: t is not None, direction, is_leaf=lambda t: t is None))
     _, change = jax.jvp(lambda m: gradient(at, eqx.combine(m, still)), (moved,), (direction,))
-    scale = typical_scale(values, structure)
-    # The preconditioner belongs to the optimum: it wants its place in scaled increments.
-    place = jax.tree.map(lambda a, k: jnp.where(k > 0, a / jnp.where(k > 0, k, 1.0), 0.0), at, scale)
-    there = Linearised(place, scale, values, structure).for_normal_equations
-    a, reduced, _ = reduce_normal(there, 0.0)
-    factor = factor_band(a)
-
     right, unravel = ravel_pytree(jax.tree.map(lambda c, k: -c * k, change, scale))
     # One flat vector: the transposed solve wants all of its right-hand side to depend on the direction, or none.
     flat = lambda tree: ravel_pytree(tree)[0]  # noqa: E731
 
-    def hessian(x):
+    # jit keeps the trace for the product and for its inverse.
+    @jax.jit
+    def hessian(of_block, x):
+        values, at, scale = of_block
         scaled = jax.tree.map(jnp.multiply, unravel(x), scale)
         product = jax.jvp(lambda y: gradient(y, values), (at,), (scaled,))[1]
         return flat(jax.tree.map(jnp.multiply, product, scale))
 
-    def precondition(b):
-        return flat(solve_factored(reduced, factor, unravel(b), there))
+    @jax.custom_batching.custom_vmap
+    def solve(of_block, rights):
+        """x of H x = b, of the rows of `rights`."""
+        values, at, scale = of_block
+        # The preconditioner belongs to the optimum: it wants its place in scaled increments.
+        place = jax.tree.map(lambda a, k: jnp.where(k > 0, a / jnp.where(k > 0, k, 1.0), 0.0), at, scale)
+        there = Linearised(place, scale, values, structure).for_normal_equations
+        a, reduced, _ = reduce_normal(there, 0.0)
+        factor = factor_band(a)
 
-    def solve(product, b):
-        return jax.scipy.sparse.linalg.cg(product, b, tol=1e-13, maxiter=100, M=precondition)[0]
+        def one(b):
+            product = partial(hessian, of_block)
+            precondition = lambda b: flat(solve_factored(reduced, factor, unravel(b), there))  # noqa: E731
+            return jax.scipy.sparse.linalg.cg(product, b, tol=1e-13, maxiter=100, M=precondition)[0]
 
-    x = unravel(jax.lax.custom_linear_solve(hessian, right, solve, symmetric=True))
-    increments = jax.tree.map(jnp.multiply, x, scale)
-    return Optimum(increments, None, None, None)
+        return one(rights[0])[None] if len(rights) == 1 else jax.vmap(one)(rights)
+
+    @solve.def_vmap
+    def rule(size: int, batched: list[Any], of_block: Any, rights: Array) -> tuple[Array, bool]:
+        """Many right-hand sides of one block share its factor; many blocks are solved one at a time."""
+        if not any(jax.tree.leaves(batched[0])):
+            found = solve(of_block, rights.reshape(-1, rights.shape[-1]))
+            return found.reshape(rights.shape), True
+        mapped, common = eqx.partition((of_block, rights), tuple(batched))
+        return jax.lax.map(lambda own: solve(*eqx.combine(own, common)), mapped), True
+
+    of_block = values, at, scale
+    inverse = lambda _, b: solve(of_block, b[None])[0]  # noqa: E731
+    x = unravel(jax.lax.custom_linear_solve(partial(hessian, of_block), right, inverse, symmetric=True))
+    return Optimum(jax.tree.map(jnp.multiply, x, scale), None, None, None)
