@@ -33,6 +33,7 @@ from jaxphoto.observations import (
     SurfaceRows,
 )
 from jaxphoto.short_repr import block_html, block_repr, from_upstairs
+from jaxphoto.static_values import StaticDict
 from jaxphoto.unknowns import FIXED, FREE, Unknowns, weighted, with_prior
 
 if TYPE_CHECKING:
@@ -49,7 +50,7 @@ class Block(eqx.Module):
     title: str = eqx.field(static=True)
     images: tuple[str, ...] = eqx.field(static=True)
     points: tuple[str, ...] = eqx.field(static=True)
-    sensors: dict[str, Sensor] = eqx.field(static=True)
+    sensors: dict[str, Sensor] = eqx.field(static=True, converter=StaticDict)
     image_camera: tuple[str, ...] = eqx.field(static=True)
     image_mount: tuple[str, ...] = eqx.field(static=True)
     image_strip: tuple[str, ...] = eqx.field(static=True)
@@ -76,7 +77,7 @@ class Block(eqx.Module):
     """The middle of the flight in the time that the files have (s)."""
     temperatures: Temperatures | None = None
     """Of the cameras; None: they are not known, and no camera changes with them."""
-    partitions: dict[str, tuple[str, ...]] = eqx.field(static=True, default_factory=dict)
+    partitions: dict[str, tuple[str, ...]] = eqx.field(static=True, default_factory=dict, converter=StaticDict)
     """Owners of parameters that are neither cameras nor mounts nor strips: by partition, the part that each image is in
     ("" for none), such as intervals of time."""
     converted_from: str = eqx.field(static=True, default="")

@@ -6,6 +6,7 @@ Order, priors of every kind, scales, correlations, tables and files follow from 
 """
 
 import dataclasses
+from collections import OrderedDict
 from collections.abc import Hashable, Iterator, Mapping
 from typing import Any, ClassVar, Literal
 
@@ -106,7 +107,7 @@ def _filled(form: Any, numbers: Any, first: int) -> tuple[Any, int]:
     values = {}
     for name, inner in fields:
         values[name], first = _filled(inner, numbers, first)
-    return (values if cls is dict else cls(**values, **dict(static))), first
+    return (OrderedDict(values) if cls is dict else cls(**values, **dict(static))), first
 
 
 def size_of(form: Any) -> int:

@@ -188,7 +188,7 @@ def rough(block: Block, truth: Unknowns, seed: int = 2) -> Unknowns:
     points = truth.points + rng.normal(0, metres, truth.points.shape)
 
     def moved(value, prior, step):
-        return value + step * np.sign(rng.normal()) if prior is not FIXED else value
+        return value + step * np.sign(rng.normal()) if prior != FIXED else value
 
     interior = {}
     for name, camera in truth.interior.items():
@@ -197,15 +197,15 @@ def rough(block: Block, truth: Unknowns, seed: int = 2) -> Unknowns:
             moved(camera.c, priors.c, 0.2),
             moved(camera.x_p, priors.x_p, 0.05),
             moved(camera.y_p, priors.y_p, 0.05),
-            jax.tree.map(lambda v, p: v if p is FIXED else np.float64(0.5 * v), camera.distortion, priors.distortion),
+            jax.tree.map(lambda v, p: v if p == FIXED else np.float64(0.5 * v), camera.distortion, priors.distortion),
         )
         interior[name] = jax.tree.map(np.float64, camera)
     return Unknowns(
         interior,
         jax.tree.map(np.asarray, ExteriorOrientation.from_angles(position, angles)),
         points,
-        jax.tree.map(lambda v, p: v if p is FIXED else v + 0.01, truth.mounts, block.priors.mounts),
-        jax.tree.map(lambda v, p: v if p is FIXED else 0.0 * v, truth.strips, block.priors.strips),
+        jax.tree.map(lambda v, p: v if p == FIXED else v + 0.01, truth.mounts, block.priors.mounts),
+        jax.tree.map(lambda v, p: v if p == FIXED else 0.0 * v, truth.strips, block.priors.strips),
         jax.tree.map(lambda v: 0.0 * v, truth.scanner),
     )
 

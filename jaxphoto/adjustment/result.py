@@ -53,6 +53,16 @@ _DIMENSIONS = 5
 _factored = eqx.filter_jit(factor_normal)
 
 
+class Seconds(dict):
+    """Seconds by what was done. All are equal to JAX, so that no program depends on them."""
+
+    def __hash__(self) -> int:  # type: ignore[override]
+        return 0
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Seconds)
+
+
 class Adjustment(eqx.Module):
     """The result of `jaxphoto.adjust`; see `jaxphoto.statistics` for what can be asked of it.
 
@@ -65,13 +75,13 @@ class Adjustment(eqx.Module):
     unknowns: Unknowns
     residuals: Residuals
     values: Values
-    tiled: TiledBlock
+    tiled: TiledBlock = eqx.field(static=True)
     tiled_values: TiledValues
     factored: FactoredNormal | None
     """None in an adjustment that is being differentiated or mapped over; see `equations`."""
     steps: Int[Numbers, ""]
     converged: Bool[Numbers, ""]
-    seconds: dict[str, float]
+    seconds: dict[str, float] = eqx.field(static=True, converter=lambda v: v if isinstance(v, Seconds) else Seconds(v))
     left_out: tuple[str, ...] = eqx.field(static=True, default=())
     """Tie points of the block as it was given that this adjustment goes without: their rays meet nowhere."""
     sizes: Sizes = eqx.field(static=True, default=LEAST)

@@ -67,6 +67,17 @@ def row_fields(cls: type) -> list[RowField]:
     return found
 
 
+@functools.cache
+def whole_fields(cls: type) -> tuple[str, ...]:
+    """The fields of a class of observations that hold indices: those that touch something, and whole numbers."""
+    hints, found = typing.get_type_hints(cls), []
+    for field in dataclasses.fields(cls):
+        axes_and_kind = annotated(hints[field.name])
+        if "touches" in field.metadata or (axes_and_kind is not None and axes_and_kind[1]):
+            found.append(field.name)
+    return tuple(found)
+
+
 def columns_of(cls: Any) -> tuple[Column, ...]:
     """The columns of the table of a class of observations, in their order."""
     found: list[Column] = []

@@ -130,7 +130,7 @@ def _from_the_best_start(
     if first is not None and may_lose_points:
         first = _without_points_gone(first, from_start)
     # What is known of exterior orientations is not to be looked for elsewhere.
-    free = priors.exterior.position is FREE and priors.exterior.camera_from_object is FREE
+    free = priors.exterior.position == FREE and priors.exterior.camera_from_object == FREE
     elsewhere = free and np.asarray(block.start.image_known).any()
     if first is not None and (not elsewhere or _somewhere(first, max_steps)):
         return first

@@ -29,7 +29,6 @@ from jaxphoto.sensitivity.chords import Found, find_optima
 from jaxphoto.sensitivity.many import Varying, common_of, path_name
 from jaxphoto.sensitivity.perturbation import Perturbation, Recorded, in_order_of
 from jaxphoto.short_repr import shown
-from jaxphoto.unknowns import Prior
 
 # Draws that a device computes side by side. Vectors end in them: 32 are enough for that, and for what is made anew for
 # all of them (see `adjustment.solver.elimination`); more, up to 64, pay where image rows x draws stay below this
@@ -131,7 +130,7 @@ class Readjustment:
         if not bool(adjusted.converged):
             raise InputError(f"draws begin at the optimum of the block as it is, which is {adjusted.outcome.value}")
         equations = adjusted.equations.on_one_device
-        tiled = adjusted.tiled._replace(structure=equations.structure)
+        tiled = dataclasses.replace(adjusted.tiled, structure=equations.structure)
         self.adjusted = dataclasses.replace(
             adjusted, tiled=tiled, tiled_values=equations.values, factored=equations.factored
         )
@@ -311,7 +310,7 @@ def _check_same(block: Any, nominal: Block) -> None:
 
 def _is_number_or_same(new: Any, old: Any) -> bool:
     """Whether a leaf of a block is as it was, or other numbers of the same shape."""
-    if isinstance(old, Prior) or np.asarray(old).dtype.kind not in "f":
+    if np.asarray(old).dtype.kind not in "f":
         return new is old or (not isinstance(new, jax.core.Tracer) and np.array_equal(new, old))
     return np.shape(new) == np.shape(old)
 

@@ -100,7 +100,7 @@ def _write_files(block: Block, folder: Path) -> None:
 
 def _settings(block: Block) -> dict[str, Any]:
     start, priors = block.start.unknowns, block.priors
-    if any(p is not FREE for p in jax.tree.leaves(priors.points)):
+    if priors.points != FREE:
         raise BlockError("block.toml can only say FREE of object points; reset their priors")
     cameras = {
         name: camera_section(Camera(block.sensors[name], start.interior[name], priors.interior[name]))
@@ -142,14 +142,15 @@ def _tables_of(kinds: Iterable[Kind]) -> Clashes:
 
 def _mode_section(block: Block) -> dict[str, str]:
     """Nothing, or that the exterior orientation is held; what it was computed from must be gone (`variants.direct`)."""
-    priors = set(jax.tree.leaves(block.priors.exterior))
-    if priors == {FREE}:
+    exterior = block.priors.exterior
+    priors = (exterior.position, exterior.camera_from_object)
+    if priors == (FREE, FREE):
         return {}
     sensors = len(block.stations.who) or len(block.attitudes.image)
-    if priors == {FIXED} and block.start.image_known.all() and not sensors:
+    if priors == (FIXED, FIXED) and block.start.image_known.all() and not sensors:
         return {"mode": "direct"}
     raise BlockError(
-        "block.toml can say of exterior orientation that all of it is FREE, or FIXED at known values and no station or "
+        "block.toml can say of exterior orientation that all of it == FREE, or FIXED at known values and no station or "
         "attitude observed; reset its priors, or hold it by jaxphoto.variants.direct"
     )
 

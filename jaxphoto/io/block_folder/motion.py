@@ -56,7 +56,7 @@ def check_time_offsets(
         for kind in (RelativePositions, RelativeAttitudes)
     )
     offset = {
-        name for name, mount in mounts.items() if priors[name].time_offset is not FIXED or float(mount.time_offset) != 0
+        name for name, mount in mounts.items() if priors[name].time_offset != FIXED or float(mount.time_offset) != 0
     }
     uses = np.array([mount in offset for mount in image_mount])
     for who, known, table, columns in (
