@@ -27,6 +27,11 @@ def still(values) -> Any:
     return np.asarray(values)
 
 
+def is_traced(tree: Any) -> bool:
+    """True if a transformation of JAX traces any number of `tree`."""
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
+
+
 def gathered(tree: Any) -> Any:
     """What a program gave on several devices, as the next one expects it; what several processes hold stays there."""
     return tree if jax.process_count() > 1 else jax.tree.map(still, tree)

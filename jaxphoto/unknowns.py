@@ -182,7 +182,8 @@ def late_cameras(start: Unknowns, priors: Unknowns) -> list[str]:
     for name, camera in start.more.get(own, {}).items():
         prior = priors.more[own][name].delay  # type: ignore[attr-defined]
         check_prior(f"{own}[{name}].delay_s", prior)
-        if prior != FIXED or np.any(camera.delay != 0):  # type: ignore[attr-defined]
+        delay: Any = camera.delay  # type: ignore[attr-defined]
+        if prior != FIXED or (not isinstance(delay, jax.core.Tracer) and np.any(delay != 0)):
             late.append(name)
     return late
 

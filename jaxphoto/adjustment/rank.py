@@ -15,6 +15,7 @@ from jaxphoto.adjustment.solver.band import Band
 from jaxphoto.adjustment.solver.normal import Linearised
 from jaxphoto.adjustment.solver.reduced import reduce_normal
 from jaxphoto.adjustment.weak_words import weaknesses_of
+from jaxphoto.arrays import is_traced, still
 from jaxphoto.block import Block, exposures
 from jaxphoto.camera import RATES, CameraSpline
 from jaxphoto.errors import DatumError, RankError
@@ -100,7 +101,7 @@ def _check_mounts(block: Block, priors: Unknowns, with_station: set[int], with_a
 
 
 def _check_strips(block: Block, priors: Unknowns, with_station: set[int]) -> None:
-    times = np.asarray(block.image_time)
+    times = block.image_time if is_traced(block.image_time) else np.asarray(block.image_time)
     for name, prior in priors.strips.items():
         images = sorted(_images_of(name, block.image_strip) & with_station)
         n = len(images)
@@ -111,7 +112,7 @@ def _check_strips(block: Block, priors: Unknowns, with_station: set[int]) -> Non
                     f"strips[{name}].{what} is free, but the strip has {found}: hold the {what} of strip {name} fixed, "
                     f"or add stations of {least} of its images or more"
                 )
-        if prior.drift == FREE and np.ptp(times[images]) == 0:
+        if prior.drift == FREE and not is_traced(times) and np.ptp(times[images]) == 0:
             raise RankError(
                 f"strips[{name}].drift is free, but all images of the strip with an observed station have one time: "
                 f"give the times of their exposures, or hold the drift of strip {name} fixed"
@@ -136,7 +137,8 @@ def _check_scanner(block: Block, priors: Unknowns) -> None:
     if priors.scanner is None:
         return
     others = any("scanner" in rows.also for rows in block.more if isinstance(rows, AbstractObservations))
-    if priors.scanner.boresight == FREE and not others and not np.any(np.asarray(block.surfaces.turn)):
+    turned = is_traced(block.surfaces.turn) or np.any(np.asarray(block.surfaces.turn))
+    if priors.scanner.boresight == FREE and not others and not turned:
         raise RankError(
             "scanner.boresight is free, but no point lies on a laser scanner's surface that the boresight moves: add "
             "such points, measured from known positions of the scanner, or hold the boresight fixed"
@@ -156,10 +158,11 @@ def _check_camera_rates(block: Block, priors: Unknowns) -> None:
             continue
         # Numbers, also where a user's function around this is traced.
         with jax.ensure_compile_time_eval():
-            along = np.asarray(rates.argument(exposures(block)))
+            along = still(rates.argument(exposures(block)))
         for name, prior in owners.items():
             free = [field for field in dynamic_fields(rates) if getattr(prior, field) == FREE]
-            if free and np.ptp(along[sorted(_images_of(name, block.image_camera))]) == 0:
+            own = sorted(_images_of(name, block.image_camera))
+            if free and not is_traced(along) and np.ptp(along[own]) == 0:
                 raise RankError(
                     f"{rates.kind}[{name}].{free[0]} is free, but all images of the camera have one {what}: give the "
                     f"{what}s of their exposures, or hold the rate fixed"
@@ -177,7 +180,8 @@ def _check_camera_splines(block: Block) -> None:
     splines: Any = block.start.unknowns.more.get(CameraSpline.kind, {})
     if not splines:
         return
-    seconds = np.abs(np.asarray(exposures(block).in_flight))
+    in_flight = still(exposures(block).in_flight)
+    seconds = np.zeros(len(block.images)) if is_traced(in_flight) else np.abs(in_flight)
     for name, own in splines.items():
         first, spline = next(iter(splines.items()))
         if (own.knots, own.interval_s) != (spline.knots, spline.interval_s):
