@@ -6,7 +6,7 @@ infinite sigma, and the redundancy is a count. Units are metres, radians and mil
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -16,9 +16,10 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxphoto.arrays import Numbers, joined, still
+from jaxphoto.block_edits import priors_of_camera, shifted_stations, with_interior
 from jaxphoto.block_from_arrays import block_fields
 from jaxphoto.block_parts import Datum, Frame, Motion, Start, Temperatures
-from jaxphoto.camera import InteriorOrientation, Sensor
+from jaxphoto.camera import AbstractDistortion, InteriorOrientation, Sensor, parameter_names
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import BlockError, InputError
 from jaxphoto.georeferencing import NOMINAL, Corrections, Exposure, Mount, StripBias, direct_orientation
@@ -163,6 +164,60 @@ class Block(eqx.Module):
         return self._with_priors(
             (name,), lambda start: weighted(name, start, start if value is None else value, sigma), of
         )
+
+    def with_camera(
+        self,
+        camera: str,
+        interior: InteriorOrientation,
+        free: Collection[str] | None = None,
+        sensor: Sensor | None = None,
+    ) -> "Block":
+        """A copy in which `camera` has another interior orientation, with priors for it.
+
+        `free` names the parameters that are estimated; all others are FIXED. Without it, parameters keep the priors
+        that the block has for their names, and new ones are FIXED. Raises InputError for a camera that the block does
+        not have, and for a parameter that `interior` does not have.
+        """
+        name = one_camera(self, camera)
+        others = parameter_names(interior) if free is None else ()
+        priors = priors_of_camera(interior, self.priors.interior[name], free or (), others)
+        changed = with_interior(self, name, interior, priors)
+        return changed if sensor is None else dataclasses.replace(changed, sensors={**self.sensors, name: sensor})
+
+    def with_distortion(self, camera: str, distortion: AbstractDistortion, free: Collection[str] = ()) -> "Block":
+        """A copy in which `camera` has another distortion: `block.with_distortion("kodak", Smac(), free=("k1", "k2"))`.
+
+        `free` names the coefficients that are estimated; its others are FIXED, and c_mm, xp_mm and yp_mm keep their
+        priors. Raises InputError as `with_camera` does.
+        """
+        name = one_camera(self, camera)
+        interior = dataclasses.replace(self.start.unknowns.interior[name], distortion=distortion)
+        others = set(parameter_names(interior)) - set(distortion.coefficients)
+        priors = priors_of_camera(interior, self.priors.interior[name], free, others)
+        return with_interior(self, name, interior, priors)
+
+    def shift_stations(self, shift: Any, per: str = "block") -> "Block":
+        """A copy in which observed stations are shifted by (X, Y, Z) in metres: `block.shift_stations([0, 0, 0.1])`.
+
+        With `per` ("strip", "image", "camera" or a partition) there is a shift for each owner: rows in the order in
+        which `images` meets the owners, or a dictionary by their names.
+        """
+        return shifted_stations(self, shift, per)
+
+    def with_control(self, *points: str, sigma: Any = None) -> "Block":
+        """A copy in which the `points` named are control; all others that were surveyed become check points.
+
+        `sigma` (m, one or one an axis) is for check coordinates that have none. Raises InputError for a point without
+        surveyed coordinates.
+        """
+        return from_upstairs("with_control", "variants")(self, points, sigma)
+
+    def without_images(self, *images: str) -> "Block":
+        """A copy without these images, and without points that fewer than two of the others show.
+
+        Raises InputError for an image that the block does not have.
+        """
+        return from_upstairs("without_images", "variants")(self, images)
 
     def _with_priors(self, names: tuple[str, ...], prior_of: Callable[[Any], Any], of: str | None) -> "Block":
         priors = self.priors

@@ -13,6 +13,7 @@ from typing import Any, ClassVar, Literal
 import equinox as eqx
 import numpy as np
 
+from jaxphoto.arrays import from_list
 from jaxphoto.short_repr import shown
 
 UNITS = (
@@ -39,6 +40,10 @@ class AbstractParameters(eqx.Module):
     sized: ClassVar[str] = ""
     """The field that says how many numbers each of the others has, where that differs from block to block; `names` then
     has one name for all of them, and `labels` says those of each."""
+
+    def __check_init__(self) -> None:
+        for name, value in vars(self).items():
+            object.__setattr__(self, name, from_list(value))
 
     def interior(self, interior: Any, exposure: Any) -> Any:
         """The interior orientation of one image; a subclass that names fields in `bends` says what becomes of it."""

@@ -18,7 +18,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxphoto.arrays import Numbers, still
+from jaxphoto.arrays import Numbers, from_list, still
 from jaxphoto.camera import (
     CameraRates,
     CameraSpline,
@@ -106,7 +106,7 @@ class Unknowns(eqx.Module):
 
     interior: dict[str, InteriorOrientation] = eqx.field(converter=ordered)
     exterior: ExteriorOrientation
-    points: Float[Numbers, "points 3"]
+    points: Float[Numbers, "points 3"] = eqx.field(converter=from_list)
     mounts: dict[str, Mount] = eqx.field(converter=ordered)
     strips: dict[str, StripBias] = eqx.field(converter=ordered)
     scanner: Scanner | None = None

@@ -190,6 +190,9 @@ def rough(block: Block, truth: Unknowns, seed: int = 2) -> Unknowns:
     def moved(value, prior, step):
         return value + step * np.sign(rng.normal()) if prior != FIXED else value
 
+    def tables(function, known, priors):
+        return {name: jax.tree.map(function, known[name], priors[name]) for name in known}
+
     interior = {}
     for name, camera in truth.interior.items():
         priors = block.priors.interior[name]
@@ -204,8 +207,8 @@ def rough(block: Block, truth: Unknowns, seed: int = 2) -> Unknowns:
         interior,
         jax.tree.map(np.asarray, ExteriorOrientation.from_angles(position, angles)),
         points,
-        jax.tree.map(lambda v, p: v if p == FIXED else v + 0.01, truth.mounts, block.priors.mounts),
-        jax.tree.map(lambda v, p: v if p == FIXED else 0.0 * v, truth.strips, block.priors.strips),
+        tables(lambda v, p: v if p == FIXED else v + 0.01, truth.mounts, block.priors.mounts),
+        tables(lambda v, p: v if p == FIXED else 0.0 * v, truth.strips, block.priors.strips),
         jax.tree.map(lambda v: 0.0 * v, truth.scanner),
     )
 

@@ -11,6 +11,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from jaxphoto.adjustment.arguments import check_arguments
 from jaxphoto.adjustment.datum import close_datum
 from jaxphoto.adjustment.layout.padding import TiledBlock, pad_structure
 from jaxphoto.adjustment.layout.tile_layout import LEAST, Sizes, sizes_of
@@ -158,8 +159,9 @@ def lay_out(block: Block, start: Unknowns, priors: Unknowns, sizes: Sizes = LEAS
 
     Raises what `solve` raises before it computes.
     """
+    check_arguments(block, start, priors)
     check_priors(block, priors)
-    warn_of_lost_digits(block, start)
+    warn_of_lost_digits(block, start, priors)
     observed = observed_in(block, priors)
     structure = structure_of(block, priors, observed)
     values = values_of(block, start, priors, structure, observed)

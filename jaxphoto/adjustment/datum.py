@@ -6,7 +6,7 @@ perhaps together with a free shift or lever arm. What none sees is the datum def
 it.
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax

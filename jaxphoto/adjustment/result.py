@@ -20,6 +20,7 @@ from jaxphoto.block import Block
 from jaxphoto.compiling import call_compiled
 from jaxphoto.observations import PRIORS
 from jaxphoto.short_repr import adjustment_html, adjustment_repr, from_upstairs
+from jaxphoto.tracing import refuse_traced
 from jaxphoto.unknowns import Unknowns
 
 if TYPE_CHECKING:
@@ -133,6 +134,7 @@ class Adjustment(eqx.Module):
     @property
     def outcome(self) -> Outcome:
         """Converged or not, and why; a member of `Outcome`."""
+        refuse_traced("Adjustment.outcome", self.residuals)
         if bool(self.converged):
             return Outcome.CONVERGED
         if not np.isfinite(float(self.square_sum)):

@@ -34,7 +34,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxphoto.arrays import Numbers, joined, still
+from jaxphoto.arrays import Numbers, from_list, joined, still
 from jaxphoto.georeferencing import Exposure, Mount, StripBias
 from jaxphoto.observations.columns import row_fields, whole_fields
 from jaxphoto.short_repr import shown
@@ -97,10 +97,12 @@ class AbstractObservations(eqx.Module):
 
     def __check_init__(self) -> None:
         # What says which rows belong together is structure; only numbers are leaves.
-        for name in whole_fields(type(self)):
-            value = getattr(self, name)
-            if not isinstance(value, jax.core.Tracer):
+        whole = whole_fields(type(self))
+        for name, value in vars(self).items():
+            if name in whole and not isinstance(value, jax.core.Tracer):
                 object.__setattr__(self, name, StaticArray(value))
+            else:
+                object.__setattr__(self, name, from_list(value))
 
     @abc.abstractmethod
     def residual(self, *touched: Any) -> Float[Numbers, "..."]:

@@ -29,6 +29,7 @@ from jaxphoto.sensitivity.chords import Found, find_optima
 from jaxphoto.sensitivity.many import Varying, common_of, path_name
 from jaxphoto.sensitivity.perturbation import Perturbation, Recorded, in_order_of
 from jaxphoto.short_repr import shown
+from jaxphoto.tracing import outside_transformations
 
 # Draws that a device computes side by side. Vectors end in them: 32 are enough for that, and for what is made anew for
 # all of them (see `adjustment.solver.elimination`); more, up to 64, pay where image rows x draws stay below this
@@ -63,6 +64,7 @@ class Draws(eqx.Module):
     labels: tuple[str, ...] = eqx.field(static=True)
 
 
+@outside_transformations
 def monte_carlo(
     adjusted: Adjustment,
     perturb: Perturbation,
@@ -85,6 +87,7 @@ def monte_carlo(
     return readjust(adjusted, Drawn(perturb, seed), np.arange(draws), exterior=exterior, points=points)
 
 
+@outside_transformations
 def readjust(
     adjusted: Adjustment,
     change: Callable[[Any, Block], Block | tuple[Block, Recorded]],

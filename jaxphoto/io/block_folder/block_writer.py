@@ -7,7 +7,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
-import jax
 import numpy as np
 import pandas as pd
 
@@ -36,6 +35,7 @@ from jaxphoto.io.block_folder.table_layout import (
 from jaxphoto.io.block_folder.tables import declared_tables, kinds_of, layouts
 from jaxphoto.io.names import harm_in, harmless
 from jaxphoto.observations import OBSERVATIONS, AbstractCoordinates
+from jaxphoto.tracing import outside_transformations
 from jaxphoto.unknowns import FIXED, FREE
 from jaxphoto.writing import Clashes, check_folder, whole_folder
 
@@ -45,6 +45,7 @@ def check_block_target(folder: Path, *inputs: Path) -> None:
     check_folder(folder, *inputs, clashes=_tables_of(OBSERVATIONS))
 
 
+@outside_transformations
 def write_block(block: Block, folder: str | Path) -> None:
     """Write `block` as a folder that `read_block` reads as the same block; numbers come back exactly.
 
