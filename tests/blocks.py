@@ -290,7 +290,7 @@ def _everything() -> Simulated:
     ends = np.array([[3, 17], [17, 40], [5, 35]])
     block = dataclasses.replace(
         block,
-        attitudes=jax.tree.map(lambda v: v[1:7], all_attitudes(block)),
+        attitudes=all_attitudes(block).take(np.arange(1, 7)),
         control=ControlRows.joined(rows(CONTROL), rows((5, 21, 33), (2,))),
         fixed=rows((17,), (0, 1), 0.0),
         distances=Distances(ends, np.zeros(3), np.array([0.02, 0.03, 0.01])),
