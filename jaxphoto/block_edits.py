@@ -5,9 +5,9 @@ from collections.abc import Collection, Mapping
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
+from jaxphoto.arrays import namespace
 from jaxphoto.camera import InteriorOrientation, get_parameter, parameter_names, set_parameter
 from jaxphoto.errors import InputError
 from jaxphoto.unknowns import FIXED, FREE
@@ -54,13 +54,14 @@ def shifted_stations(block: Any, shift: Any, per: str) -> Any:
     if isinstance(shift, Mapping):
         if unknown := [name for name in shift if name not in names]:
             raise InputError(f"shift_stations: there is no {per} {unknown[0]!r}; there are {', '.join(names)}")
-        shift = jnp.stack([jnp.asarray(shift.get(name, np.zeros(3)), float) for name in names])
-    own, expected = jnp.asarray(shift, float), (3,) if per == "block" else (len(names), 3)
+        shift = [shift.get(name, np.zeros(3)) for name in names]
+    xp = namespace(shift, rows.value)
+    own, expected = xp.asarray(shift, float), (3,) if per == "block" else (len(names), 3)
     if own.shape not in (expected, (3,)):
         words = f"{len(names)} rows, one for each {per}, of X, Y, Z" if len(expected) == 2 else "X, Y, Z"
         raise InputError(f"shift_stations: the shift has the shape {own.shape}; give {words} in metres")
-    of_name = jnp.concatenate([jnp.broadcast_to(own, (len(names), 3)), jnp.zeros((1, 3))])
+    of_name = xp.concatenate([xp.broadcast_to(own, (len(names), 3)), xp.zeros((1, 3))])
     place = {name: k for k, name in enumerate(names)}
     of_image = np.array([place.get(name, len(names)) for name in owners], int)
-    value = jnp.asarray(rows.value) + of_name[of_image[rows.who], rows.axis]
+    value = xp.asarray(rows.value) + of_name[of_image[rows.who], rows.axis]
     return dataclasses.replace(block, stations=rows.with_observation(value))
