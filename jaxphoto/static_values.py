@@ -36,7 +36,7 @@ class Content:
     def __eq__(self, other: object) -> bool:
         if self is other:
             return True
-        if not isinstance(other, Content) or self._hash != other._hash:
+        if not isinstance(other, Content):
             return False
         return self.array.dtype == other.array.dtype and np.array_equal(self.array, other.array)
 

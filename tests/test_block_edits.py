@@ -76,11 +76,11 @@ def test_control_by_name_and_back():
 
 def test_without_images_leaves_the_others_as_they_were():
     block = simulated("cross").block
-    gone = block.images[3]
+    gone, pairs = block.images[3], lambda b: (b.image_points.image, b.image_points.point)
     part = block.without_images(gone)
     assert part.images == tuple(name for name in block.images if name != gone)
-    seen = {(block.images[i], block.points[p]) for i, p in zip(block.image_points.image, block.image_points.point)}
-    left = {(part.images[i], part.points[p]) for i, p in zip(part.image_points.image, part.image_points.point)}
+    seen = {(block.images[i], block.points[p]) for i, p in zip(*pairs(block), strict=True)}
+    left = {(part.images[i], part.points[p]) for i, p in zip(*pairs(part), strict=True)}
     assert left == {(i, p) for i, p in seen if i != gone and p in part.points}
     assert bool(adjust(part).converged)
 

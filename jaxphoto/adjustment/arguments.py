@@ -38,7 +38,8 @@ def _check_owners(name: str, tree: Unknowns, known: Unknowns) -> None:
             )
         for part in ("distortion", "projection"):
             given, wanted = getattr(own, part), getattr(interior, part)
-            if jax.tree.structure(given, is_leaf=is_prior) != jax.tree.structure(wanted):
+            kinds: list[Any] = [jax.tree.structure(part_of, is_leaf=is_prior) for part_of in (given, wanted)]
+            if kinds[0] != kinds[1]:
                 found = f"another {type(given).__name__}" if type(given) is type(wanted) else type(given).__name__
                 raise InputError(
                     f"interior[{camera}].{part}: {name} has {found}, the block {type(wanted).__name__}; exchange start "

@@ -70,12 +70,13 @@ def row_fields(cls: type) -> list[RowField]:
 @functools.cache
 def whole_fields(cls: type) -> tuple[str, ...]:
     """The fields of a class of observations that hold indices: those that touch something, and whole numbers."""
-    hints, found = typing.get_type_hints(cls), []
-    for field in dataclasses.fields(cls):
-        axes_and_kind = annotated(hints[field.name])
-        if "touches" in field.metadata or (axes_and_kind is not None and axes_and_kind[1]):
-            found.append(field.name)
-    return tuple(found)
+    fields = dataclasses.fields(cls)
+    # Names in the annotations of a class within a function may be out of reach.
+    hints = (
+        typing.get_type_hints(cls) if any(isinstance(f.type, str) for f in fields) else {f.name: f.type for f in fields}
+    )
+    whole = {f.name for f in fields if (kind := annotated(hints[f.name])) is not None and kind[1]}
+    return tuple(f.name for f in fields if "touches" in f.metadata or f.name in whole)
 
 
 def columns_of(cls: Any) -> tuple[Column, ...]:

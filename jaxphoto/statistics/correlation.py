@@ -4,13 +4,14 @@ Source: paper 000, Table 4 (mean absolute correlation over the images, per angle
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
 from jaxphoto.adjustment import Adjustment
-from jaxphoto.arrays import Numbers, namespace, still
+from jaxphoto.arrays import namespace, still
 from jaxphoto.short_repr import shown
 from jaxphoto.statistics.covariance import EOP_NAMES, Covariance
 
@@ -24,23 +25,23 @@ class Correlations(eqx.Module):
     """The camera's estimated interior parameters (c_mm ...)."""
     eop_names: tuple[str, ...] = eqx.field(static=True)
     images: tuple[str, ...] = eqx.field(static=True)
-    interior: Float[Numbers, "iop iop"]
-    exterior: Float[Numbers, "images 6 iop"]
-    within_image: Float[Numbers, "images 6 6"]
+    interior: Float[Any, "iop iop"]
+    exterior: Float[Any, "images 6 iop"]
+    within_image: Float[Any, "images 6 6"]
     """Of each image's exterior orientation with itself."""
 
     @property
-    def mean_abs(self) -> Float[Numbers, "6 iop"]:
+    def mean_abs(self) -> Float[Any, "6 iop"]:
         """Mean over the camera's images of |rho| (paper 000, Table 4)."""
         return abs(self.exterior).mean(axis=0)
 
     @property
-    def max_abs(self) -> Float[Numbers, "6 iop"]:
+    def max_abs(self) -> Float[Any, "6 iop"]:
         """Maximum over the camera's images of |rho|."""
         return abs(self.exterior).max(axis=0)
 
 
-def correlation_matrix(covariance: Covariance) -> Float[Numbers, "reduced reduced"]:
+def correlation_matrix(covariance: Covariance) -> Float[Any, "reduced reduced"]:
     """Correlations of everything in `covariance.labels`; zero for what is fixed."""
     matrix = still(covariance.matrix)
     xp, variance = namespace(matrix), matrix.diagonal()

@@ -19,8 +19,8 @@ from jaxphoto.statistics.responses import products_of
 class LinearForms(NamedTuple):
     """Covariances of linear functions of unknowns, with one another and with the shared unknowns."""
 
-    variance: Float[Numbers, "forms forms"]
-    with_shared: Float[Numbers, "forms shared"]
+    variance: Float[Any, "forms forms"]
+    with_shared: Float[Any, "forms shared"]
 
 
 def linear_forms(

@@ -16,6 +16,8 @@ only (`linear_forms`), however many images there are.
 Source: D. Kogan, mrcal, projection uncertainty (https://mrcal.secretsauce.net/uncertainty.html), method of version 2.
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -46,11 +48,11 @@ class SigmaMap(eqx.Module):
     """Of the point from the projection centre; infinite for a direction."""
     points: Float[Numbers, "cells 2"]
     """Measured image coordinates (mm from the centre of the image)."""
-    covariance: Float[Numbers, "cells 2 2"]
+    covariance: Float[Any, "cells 2 2"]
     """Of x and y (mm^2); NaN where the distortion folds or the ray looks behind the camera."""
 
     @property
-    def worst(self) -> Float[Numbers, "cells"]:
+    def worst(self) -> Float[Any, "cells"]:
         """Standard deviation (mm) in the direction in which it is largest: the longer half axis of the ellipse."""
         q = self.covariance
         mean, half = (q[:, 0, 0] + q[:, 1, 1]) / 2, (q[:, 0, 0] - q[:, 1, 1]) / 2
@@ -83,7 +85,7 @@ def _sigma_map(
     name: str,
     distance_m: float,
     points: Float[Numbers, "cells 2"] | None,
-    known: tuple[list[str], Float[Numbers, "n n"]],
+    known: tuple[list[str], Float[Any, "n n"]],
 ) -> SigmaMap:
     """The map of a camera of which the `_joint_covariance` is `known`."""
     interior, sensor = adjusted.unknowns.interior[name], adjusted.block.sensors[name]
@@ -126,7 +128,7 @@ def _cells(sensor: Sensor) -> Float[Numbers, "cells 2"]:
     return image_grid(sensor, *((_LONG, _SHORT) if across else (_SHORT, _LONG)))
 
 
-def _joint_covariance(adjusted: Adjustment, camera: str) -> tuple[list[str], Float[Numbers, "n n"]]:
+def _joint_covariance(adjusted: Adjustment, camera: str) -> tuple[list[str], Float[Any, "n n"]]:
     """The estimated parameters of the camera, and the covariance of them, of mean dtheta and of mean -R dX0."""
     prefix, labels = f"interior[{camera}].", adjusted.structure.labels
     places = [k for k, label in enumerate(labels) if label.startswith(prefix)]
@@ -134,7 +136,7 @@ def _joint_covariance(adjusted: Adjustment, camera: str) -> tuple[list[str], Flo
     shared = np.zeros((n, len(labels)))
     shared[np.arange(len(places)), places] = 1.0
     images = np.flatnonzero(np.array(adjusted.block.image_camera) == camera)
-    exterior = np.zeros((n, len(adjusted.block.images), 6))
+    exterior: Any = np.zeros((n, len(adjusted.block.images), 6))
     exterior[-6:-3, images, 3:] = np.eye(3)[:, None, :] / len(images)
     turned = -still(adjusted.unknowns.exterior.camera_from_object)[images].swapaxes(0, 1) / len(images)
     if is_traced(turned):
