@@ -7,6 +7,7 @@ one structure, hence one compiled program.
 
 import functools
 import hashlib
+import weakref
 from collections import OrderedDict
 from collections.abc import Callable
 from typing import Any
@@ -50,9 +51,12 @@ class StaticArray(np.ndarray):
     _content: Content | None
 
     def __new__(cls, values: Any) -> "StaticArray":
-        """Copy `values`; a static array is returned as it is."""
+        """Copy `values`; a static array, and the plain one of it, are taken as they are."""
         if isinstance(values, cls) and values._content is not None:
             return values
+        known = _contents.get(id(values))
+        if known is not None and known.array is values:
+            return _static(known)
         return _static(Content(np.array(values, subok=False)))
 
     def __array_finalize__(self, source: Any) -> None:
@@ -72,6 +76,11 @@ class StaticArray(np.ndarray):
         return self
 
     @property
+    def plain(self) -> np.ndarray:
+        """The same array to JAX's functions as any other: an argument, not structure."""
+        return self.content.array
+
+    @property
     def content(self) -> Content:
         """What identifies the array."""
         if self._content is None:
@@ -79,8 +88,13 @@ class StaticArray(np.ndarray):
         return self._content
 
 
+_contents: weakref.WeakValueDictionary[int, Content] = weakref.WeakValueDictionary()
+"""By the identity of the array, which each content keeps alive."""
+
+
 def _static(content: Content) -> StaticArray:
     content.array.setflags(write=False)
+    _contents[id(content.array)] = content
     array: StaticArray = content.array.view(StaticArray)
     array._content = content
     return array

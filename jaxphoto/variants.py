@@ -121,15 +121,9 @@ def with_control(block: Block, points: Collection[str], sigma: float | Float[np.
     if unknown := [point for point in points if point not in given]:
         raise InputError(f"point {unknown[0]} has no surveyed coordinates; name some of {few(sorted(given))}")
     named = np.isin(np.arange(len(of)), [k for k, point in enumerate(of) if point in set(points)])
-    (control, fixed, check), (no_control, no_fixed, no_check) = (
-        [rows.take(named[rows.who] == wanted) for rows in groups] for wanted in (True, False)
-    )
-    return dataclasses.replace(
-        block,
-        control=ControlRows.joined(control, _as_control(check, block.control, sigma)),
-        fixed=fixed,
-        check=ControlRows.joined(no_check, no_control, no_fixed),
-    )
+    kept, gone = ([rows.take(named[rows.who] == own) for rows in groups] for own in (True, False))
+    control = ControlRows.joined(kept[0], _as_control(kept[2], block.control, sigma))
+    return dataclasses.replace(block, control=control, fixed=kept[1], check=ControlRows.joined(gone[2], *gone[:2]))
 
 
 def vertical_control(block: Block) -> Block:

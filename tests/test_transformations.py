@@ -90,6 +90,13 @@ def test_priors_are_nodes_that_can_be_exchanged():
     assert np.zeros(3) != FREE and jnp.zeros(3) != FREE
 
 
+def test_indices_of_rows_are_plain_arrays_and_stay_the_same():
+    rows = simulated("cross").block.stations
+    assert type(rows.who) is np.ndarray and jax.vmap(lambda k: k + 1)(rows.who).shape == rows.who.shape
+    again = dataclasses.replace(rows, value=np.asarray(rows.value) + 1.0)
+    assert again.who is rows.who and rows.take(np.arange(len(rows))).who is not rows.who
+
+
 def test_a_static_array_is_an_array():
     index = StaticArray([2, 0, 1])
     assert type(index == 2) is np.ndarray and type(index[1:]) is np.ndarray and type(index.astype(float)) is np.ndarray

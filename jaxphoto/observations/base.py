@@ -95,6 +95,10 @@ class AbstractObservations(eqx.Module):
     once: ClassVar[bool] = False
     """Whether files may list what a row touches, in whatever order, only once."""
 
+    def __getattribute__(self, name: str) -> Any:
+        value = object.__getattribute__(self, name)
+        return value.plain if isinstance(value, StaticArray) else value
+
     def __check_init__(self) -> None:
         # What says which rows belong together is structure; only numbers are leaves.
         whole = whole_fields(type(self))
