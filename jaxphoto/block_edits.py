@@ -9,7 +9,6 @@ import jax
 import numpy as np
 
 from jaxphoto.arrays import namespace
-from jaxphoto.block_parts import Start
 from jaxphoto.camera import (
     AbstractDistortion,
     InteriorOrientation,
@@ -20,15 +19,11 @@ from jaxphoto.camera import (
 )
 from jaxphoto.errors import InputError
 from jaxphoto.short_repr import from_upstairs
-from jaxphoto.unknowns import FIXED, FREE, Unknowns, weighted, with_prior
+from jaxphoto.unknowns import FIXED, FREE, weighted, with_prior
 
 
 class BlockEdits(eqx.Module):
     """The methods of a `Block` that return an edited copy."""
-
-    sensors: eqx.AbstractVar[dict[str, Sensor]]
-    start: eqx.AbstractVar[Start]
-    priors: eqx.AbstractVar[Unknowns]
 
     def fix(self, *names: str, of: str | None = None) -> Self:
         """A copy in which parameters are held at their start values: `block.fix("k2")`.
@@ -68,11 +63,11 @@ class BlockEdits(eqx.Module):
         that the block has for their names, and new ones are FIXED. Raises InputError for a camera that the block does
         not have, and for a parameter that `interior` does not have.
         """
-        name = one_camera(self, camera)
-        others = parameter_names(interior) if free is None else ()
-        priors = priors_of_camera(interior, self.priors.interior[name], free or (), others)
-        changed = with_interior(self, name, interior, priors)
-        return changed if sensor is None else dataclasses.replace(changed, sensors={**self.sensors, name: sensor})
+        block: Any = self
+        name, others = one_camera(block, camera), parameter_names(interior) if free is None else ()
+        priors = priors_of_camera(interior, block.priors.interior[name], free or (), others)
+        changed = with_interior(block, name, interior, priors)
+        return changed if sensor is None else dataclasses.replace(changed, sensors={**block.sensors, name: sensor})
 
     def with_distortion(self, camera: str, distortion: AbstractDistortion, free: Collection[str] = ()) -> Self:
         """A copy in which `camera` has another distortion: `block.with_distortion("kodak", Smac(), free=("k1", "k2"))`.
@@ -80,11 +75,13 @@ class BlockEdits(eqx.Module):
         `free` names the coefficients that are estimated; its others are FIXED, and c_mm, xp_mm and yp_mm keep their
         priors. Raises InputError as `with_camera` does.
         """
-        name = one_camera(self, camera)
-        interior = dataclasses.replace(self.start.unknowns.interior[name], distortion=distortion)
+        block: Any = self
+        name = one_camera(block, camera)
+        interior = dataclasses.replace(block.start.unknowns.interior[name], distortion=distortion)
         others = set(parameter_names(interior)) - set(distortion.coefficients)
-        priors = priors_of_camera(interior, self.priors.interior[name], free, others)
-        return with_interior(self, name, interior, priors)
+        return with_interior(
+            block, name, interior, priors_of_camera(interior, block.priors.interior[name], free, others)
+        )
 
     def shift_stations(self, shift: Any, per: str = "block") -> Self:
         """A copy in which observed stations are shifted by (X, Y, Z) in metres: `block.shift_stations([0, 0, 0.1])`.
@@ -110,14 +107,15 @@ class BlockEdits(eqx.Module):
         return from_upstairs("without_images", "variants")(self, images)
 
     def _with_priors(self, names: tuple[str, ...], prior_of: Callable[[Any], Any], of: str | None) -> Self:
-        priors = self.priors
+        block: Any = self
+        priors = block.priors
         for name in names or ("",):
             if not isinstance(name, str) or not name:
                 asked = f"{name!r} is no parameter" if names else "no parameter is named"
                 raise InputError(f"{asked}: give names with commas between, such as c_mm, k1, lever_arm, position")
         for name in names:
-            priors = with_prior(priors, name, prior_of, self.start.unknowns, of)
-        return dataclasses.replace(self, priors=priors)
+            priors = with_prior(priors, name, prior_of, block.start.unknowns, of)
+        return dataclasses.replace(block, priors=priors)
 
 
 def one_camera(block: Any, camera: str | None) -> str:
