@@ -59,7 +59,7 @@ def correlations(adjusted: Adjustment, covariance: Covariance) -> dict[str, Corr
         columns = [k for k, label in enumerate(covariance.labels) if k >= n and label.startswith(prefix)]
         images = [i for i, c in enumerate(adjusted.block.image_camera) if c == camera]
         own = 6 * np.array(images, int)[:, None] + np.arange(6)
-        exterior = rho[:n].reshape(-1, 6, rho.shape[1])[images][:, :, columns]
+        exterior = rho[own][:, :, np.array(columns, int)]
         result[camera] = Correlations(
             camera,
             tuple(covariance.labels[k].removeprefix(prefix) for k in columns),
