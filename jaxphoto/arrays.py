@@ -27,6 +27,21 @@ def still(values) -> Any:
     return np.asarray(values)
 
 
+def from_list(values: Any) -> Any:
+    """A list as an array of real numbers; anything else as it is."""
+    return np.asarray(values, float) if isinstance(values, list) else values
+
+
+def is_traced(tree: Any) -> bool:
+    """True if a transformation of JAX traces any number of `tree`."""
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
+
+
+def namespace(*values: Any) -> Any:
+    """`jax.numpy` where a transformation of JAX traces a number of `values`, else `numpy`."""
+    return jnp if is_traced(values) else np
+
+
 def gathered(tree: Any) -> Any:
     """What a program gave on several devices, as the next one expects it; what several processes hold stays there."""
     return tree if jax.process_count() > 1 else jax.tree.map(still, tree)

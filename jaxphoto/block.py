@@ -6,7 +6,7 @@ infinite sigma, and the redundancy is a count. Units are metres, radians and mil
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -16,11 +16,13 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxphoto.arrays import Numbers, joined, still
+from jaxphoto.block_edits import BlockEdits
+from jaxphoto.block_edits import one_camera as one_camera
 from jaxphoto.block_from_arrays import block_fields
 from jaxphoto.block_parts import Datum, Frame, Motion, Start, Temperatures
 from jaxphoto.camera import InteriorOrientation, Sensor
 from jaxphoto.collinearity import ExteriorOrientation
-from jaxphoto.errors import BlockError, InputError
+from jaxphoto.errors import BlockError
 from jaxphoto.georeferencing import NOMINAL, Corrections, Exposure, Mount, StripBias, direct_orientation
 from jaxphoto.observations import (
     AbstractObservations,
@@ -33,13 +35,14 @@ from jaxphoto.observations import (
     SurfaceRows,
 )
 from jaxphoto.short_repr import block_html, block_repr, from_upstairs
-from jaxphoto.unknowns import FIXED, FREE, Unknowns, weighted, with_prior
+from jaxphoto.static_values import StaticDict
+from jaxphoto.unknowns import FREE, Unknowns
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-class Block(eqx.Module):
+class Block(BlockEdits):
     """A block of images: ids, observations, and what is known and free beforehand.
 
     Index arrays refer to `images`, `points`, `strips` in their order. `start` and `priors` are what
@@ -49,7 +52,7 @@ class Block(eqx.Module):
     title: str = eqx.field(static=True)
     images: tuple[str, ...] = eqx.field(static=True)
     points: tuple[str, ...] = eqx.field(static=True)
-    sensors: dict[str, Sensor] = eqx.field(static=True)
+    sensors: dict[str, Sensor] = eqx.field(static=True, converter=StaticDict)
     image_camera: tuple[str, ...] = eqx.field(static=True)
     image_mount: tuple[str, ...] = eqx.field(static=True)
     image_strip: tuple[str, ...] = eqx.field(static=True)
@@ -76,7 +79,7 @@ class Block(eqx.Module):
     """The middle of the flight in the time that the files have (s)."""
     temperatures: Temperatures | None = None
     """Of the cameras; None: they are not known, and no camera changes with them."""
-    partitions: dict[str, tuple[str, ...]] = eqx.field(static=True, default_factory=dict)
+    partitions: dict[str, tuple[str, ...]] = eqx.field(static=True, default_factory=dict, converter=StaticDict)
     """Owners of parameters that are neither cameras nor mounts nor strips: by partition, the part that each image is in
     ("" for none), such as intervals of time."""
     converted_from: str = eqx.field(static=True, default="")
@@ -138,41 +141,6 @@ class Block(eqx.Module):
             )
         return known[owner]
 
-    def fix(self, *names: str, of: str | None = None) -> "Block":
-        """A copy in which parameters are held at their start values: `block.fix("k2")`.
-
-        Names are those of tables (`c_mm`, `k1`), fields of mounts and strips (`lever_arm`, `shift`), and `position`,
-        `rotation` (all images) and `points`. `of` names the camera, mount or strip; all that have it without. Raises
-        InputError for a parameter that the block has not, and where none is named.
-        """
-        return self._with_priors(names, lambda start: FIXED, of)
-
-    def free(self, *names: str, of: str | None = None) -> "Block":
-        """A copy in which parameters are free; names as in `fix`."""
-        return self._with_priors(names, lambda start: FREE, of)
-
-    def weigh(self, name: str, sigma: Any, value: Any = None, of: str | None = None) -> "Block":
-        """A copy in which a parameter is observed with `sigma`, in its own unit (mm, m, rad), names as in `fix`.
-
-        The observed `value` is the start value unless one is given; that of all positions, rotations or points has to
-        be. Raises InputError for a sigma that is not above zero, and for what is no number or of another shape.
-        """
-        if value is None and name in ("position", "rotation", "points"):
-            raise InputError(f"weigh({name!r}) needs a value beside its sigma: where it starts, nobody observed it")
-        return self._with_priors(
-            (name,), lambda start: weighted(name, start, start if value is None else value, sigma), of
-        )
-
-    def _with_priors(self, names: tuple[str, ...], prior_of: Callable[[Any], Any], of: str | None) -> "Block":
-        priors = self.priors
-        for name in names or ("",):
-            if not isinstance(name, str) or not name:
-                asked = f"{name!r} is no parameter" if names else "no parameter is named"
-                raise InputError(f"{asked}: give names with commas between, such as c_mm, k1, lever_arm, position")
-        for name in names:
-            priors = with_prior(priors, name, prior_of, self.start.unknowns, of)
-        return dataclasses.replace(self, priors=priors)
-
     def plot(self, ax: "Axes | None" = None, *, in_3d: bool = False) -> "Axes":
         """The block as it starts, in plan or in space, on matplotlib axes, which are returned; new ones if none are."""
         return from_upstairs("plot_block")(self, ax, in_3d=in_3d)
@@ -187,16 +155,6 @@ class Block(eqx.Module):
     def of(*args: Any, **kwargs: Any) -> "Block":
         """The block of arrays and tables: see `block_fields`."""
         return Block(**block_fields(*args, **kwargs))
-
-
-def one_camera(block: Block, camera: str | None) -> str:
-    """The camera of that name, or the only one where none is named. Raises InputError where there is none such."""
-    if camera is None and len(block.sensors) == 1:
-        return next(iter(block.sensors))
-    if camera is None or camera not in block.sensors:
-        asked = "say which camera" if camera is None else f"there is no camera {camera}"
-        raise InputError(f"{asked}: the block has {', '.join(block.sensors) or 'none'}")
-    return camera
 
 
 def empty_block(title: str) -> Block:

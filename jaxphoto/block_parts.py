@@ -11,6 +11,7 @@ from jaxtyping import Float
 from jaxphoto.arrays import Numbers
 from jaxphoto.georeferencing.map_frame import MapFrame
 from jaxphoto.short_repr import shown
+from jaxphoto.static_values import StaticArray
 from jaxphoto.unknowns import Unknowns
 
 
@@ -87,5 +88,5 @@ class Start(eqx.Module):
     """
 
     unknowns: Unknowns
-    image_known: np.ndarray
-    point_known: np.ndarray
+    image_known: np.ndarray = eqx.field(converter=StaticArray)
+    point_known: np.ndarray = eqx.field(converter=StaticArray)

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxphoto.arrays import from_list
 from jaxphoto.camera import InteriorOrientation
 from jaxphoto.linear_algebra import solve
 from jaxphoto.rotation import matrix_from_omega_phi_kappa, omega_phi_kappa_from_matrix, rotate
@@ -26,8 +27,8 @@ _ROWS = 10
 class ExteriorOrientation(eqx.Module):
     """Projection centre (m) and rotation of one image, or of many with a leading axis."""
 
-    position: Float[Array, "*images 3"]
-    camera_from_object: Float[Array, "*images 3 3"]
+    position: Float[Array, "*images 3"] = eqx.field(converter=from_list)
+    camera_from_object: Float[Array, "*images 3 3"] = eqx.field(converter=from_list)
 
     @staticmethod
     def from_angles(

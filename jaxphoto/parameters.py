@@ -6,12 +6,14 @@ Order, priors of every kind, scales, correlations, tables and files follow from 
 """
 
 import dataclasses
+from collections import OrderedDict
 from collections.abc import Hashable, Iterator, Mapping
 from typing import Any, ClassVar, Literal
 
 import equinox as eqx
 import numpy as np
 
+from jaxphoto.arrays import from_list
 from jaxphoto.short_repr import shown
 
 UNITS = (
@@ -38,6 +40,10 @@ class AbstractParameters(eqx.Module):
     sized: ClassVar[str] = ""
     """The field that says how many numbers each of the others has, where that differs from block to block; `names` then
     has one name for all of them, and `labels` says those of each."""
+
+    def __check_init__(self) -> None:
+        for name, value in vars(self).items():
+            object.__setattr__(self, name, from_list(value))
 
     def interior(self, interior: Any, exposure: Any) -> Any:
         """The interior orientation of one image; a subclass that names fields in `bends` says what becomes of it."""
@@ -106,7 +112,7 @@ def _filled(form: Any, numbers: Any, first: int) -> tuple[Any, int]:
     values = {}
     for name, inner in fields:
         values[name], first = _filled(inner, numbers, first)
-    return (values if cls is dict else cls(**values, **dict(static))), first
+    return (OrderedDict(values) if cls is dict else cls(**values, **dict(static))), first
 
 
 def size_of(form: Any) -> int:

@@ -23,9 +23,9 @@ _LONGEST, _FEW, _ROWS, _FIELDS = 72, 4, 20, 24
 _ONE_IN_A_THOUSAND = 3.29
 
 
-def from_upstairs(name: str) -> Any:
-    """A function of `jaxphoto.report`, which is imported now."""
-    return getattr(importlib.import_module("jaxphoto.report"), name)
+def from_upstairs(name: str, room: str = "report") -> Any:
+    """A function of a package above, which is imported now."""
+    return getattr(importlib.import_module(f"jaxphoto.{room}"), name)
 
 
 def html_of(title: str, rows: Mapping[str, object]) -> str:

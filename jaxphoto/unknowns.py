@@ -10,7 +10,6 @@ vector of declared parameters (mounts, strips, scanner, `more`) take one prior f
 """
 
 import dataclasses
-import enum
 from collections.abc import Callable
 from typing import Any
 
@@ -19,7 +18,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxphoto.arrays import Numbers, still
+from jaxphoto.arrays import Numbers, from_list, still
 from jaxphoto.camera import (
     CameraRates,
     CameraSpline,
@@ -37,6 +36,7 @@ from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import FlightBias, Mount, RigCamera, Scanner, ScannerCalibration, StripBias, TrajectoryKnot
 from jaxphoto.parameters import AbstractParameters, dynamic_fields
 from jaxphoto.short_repr import fields_html, html_of, number_word, numbers_words
+from jaxphoto.static_values import ordered
 
 UNKNOWNS: tuple[type[AbstractParameters], ...] = (
     Scanner, Mount, StripBias, FlightBias, CameraRates, ThermalRates, CameraSpline, StripCamera, RollingShutter,
@@ -45,17 +45,31 @@ UNKNOWNS: tuple[type[AbstractParameters], ...] = (
 """The classes of declared parameters that a block folder may hold; one of your own is given to `read_block`."""
 
 
-class Prior(enum.Enum):
-    """An unknown nobody knows anything about, or one that is not an unknown at all."""
+class Prior:
+    """FREE, an unknown without prior information, or FIXED, no unknown at all. Compare with `==`.
 
-    FREE = "free"
-    FIXED = "fixed"
+    Part of the structure of a tree, not a number: JAX passes it on untouched, as a copy.
+    """
+
+    # NumPy leaves comparisons to `__eq__` below.
+    __array_ufunc__ = None
+
+    def __init__(self, name: str):
+        self.name = name
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Prior) and self.name == other.name
+
+    def __hash__(self) -> int:
+        return hash((Prior, self.name))
 
     def __repr__(self) -> str:
         return self.name
 
 
-FREE, FIXED = Prior.FREE, Prior.FIXED
+# A new object each time: `equinox.tree_at` tells the nodes of a tree apart by their identity.
+jax.tree_util.register_pytree_node(Prior, lambda prior: ((), prior.name), lambda name, _: Prior(name))
+FREE, FIXED = Prior("FREE"), Prior("FIXED")
 
 
 class Weighted(eqx.Module):
@@ -90,13 +104,13 @@ class Unknowns(eqx.Module):
     The owner of what belongs to the whole block is "".
     """
 
-    interior: dict[str, InteriorOrientation]
+    interior: dict[str, InteriorOrientation] = eqx.field(converter=ordered)
     exterior: ExteriorOrientation
-    points: Float[Numbers, "points 3"]
-    mounts: dict[str, Mount]
-    strips: dict[str, StripBias]
+    points: Float[Numbers, "points 3"] = eqx.field(converter=from_list)
+    mounts: dict[str, Mount] = eqx.field(converter=ordered)
+    strips: dict[str, StripBias] = eqx.field(converter=ordered)
     scanner: Scanner | None = None
-    more: dict[str, dict[str, AbstractParameters]] = eqx.field(default_factory=dict)
+    more: dict[str, dict[str, AbstractParameters]] = eqx.field(default_factory=dict, converter=ordered)
 
     @property
     def words(self) -> dict[str, str]:
@@ -168,7 +182,8 @@ def late_cameras(start: Unknowns, priors: Unknowns) -> list[str]:
     for name, camera in start.more.get(own, {}).items():
         prior = priors.more[own][name].delay  # type: ignore[attr-defined]
         check_prior(f"{own}[{name}].delay_s", prior)
-        if prior is not FIXED or np.any(camera.delay != 0):  # type: ignore[attr-defined]
+        delay: Any = camera.delay  # type: ignore[attr-defined]
+        if prior != FIXED or (not isinstance(delay, jax.core.Tracer) and np.any(delay != 0)):
             late.append(name)
     return late
 

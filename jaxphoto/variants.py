@@ -15,10 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxphoto.arrays import still
+from jaxphoto.arrays import is_traced, still
 from jaxphoto.block import Block, Datum, direct_exterior, sensor_rows
 from jaxphoto.camera import set_parameter
-from jaxphoto.errors import BlockError
+from jaxphoto.errors import BlockError, InputError, few
 from jaxphoto.georeferencing import StripBias
 from jaxphoto.observations import (
     AXES,
@@ -111,6 +111,21 @@ def control_only(block: Block, points: Collection[str]) -> Block:
     )
 
 
+def with_control(block: Block, points: Collection[str], sigma: float | Float[np.ndarray, "3"] | None = None) -> Block:
+    """Control at the `points` named, whether they were control or check points; all others become check points.
+
+    A check coordinate without sigma takes `sigma` (`all_control`). Raises InputError for a point without coordinates.
+    """
+    of, groups = np.array(block.points, object), (block.control, block.fixed, block.check)
+    given = {name for rows in groups for name in of[rows.who]}
+    if unknown := [point for point in points if point not in given]:
+        raise InputError(f"point {unknown[0]} has no surveyed coordinates; name some of {few(sorted(given))}")
+    named = np.isin(np.arange(len(of)), [k for k, point in enumerate(of) if point in set(points)])
+    kept, gone = ([rows.take(named[rows.who] == own) for rows in groups] for own in (True, False))
+    control = ControlRows.joined(kept[0], _as_control(kept[2], block.control, sigma))
+    return dataclasses.replace(block, control=control, fixed=kept[1], check=ControlRows.joined(gone[2], *gone[:2]))
+
+
 def vertical_control(block: Block) -> Block:
     """Control in height only: Z of control and check points is control, X and Y are check coordinates.
 
@@ -168,6 +183,13 @@ def strips(block: Block, names: Collection[str]) -> Block:
         known = ", ".join(sorted(set(block.image_strip) - {""}))
         raise ValueError(f"{unknown[0]!r} is no strip of this block; its strips are {known or 'none'}")
     return some_images(block, np.array([strip in names for strip in block.image_strip]))
+
+
+def without_images(block: Block, names: Collection[str]) -> Block:
+    """Without the images named; what `some_images` says of the rest. Raises InputError for a name that is no image."""
+    if unknown := [name for name in names if name not in block.images]:
+        raise InputError(f"there is no image {unknown[0]!r}; the block has {few(block.images)}")
+    return some_images(block, np.array([image not in names for image in block.images]))
 
 
 def some_images(block: Block, chosen: Bool[np.ndarray, "images"]) -> Block:
@@ -292,8 +314,14 @@ def _as_control(
     check: ControlRows, control: ControlRows, sigma: float | Float[np.ndarray, "3"] | None = None
 ) -> ControlRows:
     """Check coordinates as control; those without a sigma take `sigma`, or that of the control on their axis."""
-    own = np.asarray(check.sigma)
-    taken = np.zeros(3)
+    own, taken = still(check.sigma), np.zeros(3)
+    if not len(check):
+        return check
+    if is_traced((own, control.sigma)):
+        if sigma is None:
+            raise InputError("inside a JAX transformation, say which sigma check coordinates get as control")
+        filled = jnp.where(own == 0, jnp.broadcast_to(jnp.asarray(sigma), 3)[check.axis], own)
+        return dataclasses.replace(check, sigma=filled)
     for axis in np.unique(check.axis[own == 0]):
         of_axis = np.unique(np.asarray(control.sigma)[control.axis == axis])
         if sigma is None and len(of_axis) != 1:

@@ -188,7 +188,10 @@ def rough(block: Block, truth: Unknowns, seed: int = 2) -> Unknowns:
     points = truth.points + rng.normal(0, metres, truth.points.shape)
 
     def moved(value, prior, step):
-        return value + step * np.sign(rng.normal()) if prior is not FIXED else value
+        return value + step * np.sign(rng.normal()) if prior != FIXED else value
+
+    def tables(function, known, priors):
+        return {name: jax.tree.map(function, known[name], priors[name]) for name in known}
 
     interior = {}
     for name, camera in truth.interior.items():
@@ -197,15 +200,15 @@ def rough(block: Block, truth: Unknowns, seed: int = 2) -> Unknowns:
             moved(camera.c, priors.c, 0.2),
             moved(camera.x_p, priors.x_p, 0.05),
             moved(camera.y_p, priors.y_p, 0.05),
-            jax.tree.map(lambda v, p: v if p is FIXED else np.float64(0.5 * v), camera.distortion, priors.distortion),
+            jax.tree.map(lambda v, p: v if p == FIXED else np.float64(0.5 * v), camera.distortion, priors.distortion),
         )
         interior[name] = jax.tree.map(np.float64, camera)
     return Unknowns(
         interior,
         jax.tree.map(np.asarray, ExteriorOrientation.from_angles(position, angles)),
         points,
-        jax.tree.map(lambda v, p: v if p is FIXED else v + 0.01, truth.mounts, block.priors.mounts),
-        jax.tree.map(lambda v, p: v if p is FIXED else 0.0 * v, truth.strips, block.priors.strips),
+        tables(lambda v, p: v if p == FIXED else v + 0.01, truth.mounts, block.priors.mounts),
+        tables(lambda v, p: v if p == FIXED else 0.0 * v, truth.strips, block.priors.strips),
         jax.tree.map(lambda v: 0.0 * v, truth.scanner),
     )
 
@@ -287,7 +290,7 @@ def _everything() -> Simulated:
     ends = np.array([[3, 17], [17, 40], [5, 35]])
     block = dataclasses.replace(
         block,
-        attitudes=jax.tree.map(lambda v: v[1:7], all_attitudes(block)),
+        attitudes=all_attitudes(block).take(np.arange(1, 7)),
         control=ControlRows.joined(rows(CONTROL), rows((5, 21, 33), (2,))),
         fixed=rows((17,), (0, 1), 0.0),
         distances=Distances(ends, np.zeros(3), np.array([0.02, 0.03, 0.01])),

@@ -103,7 +103,7 @@ def test_a_block_taken_apart_and_made_again_is_the_same():
     np.testing.assert_allclose(made.stations.value, block.stations.value, rtol=0, atol=0)
     np.testing.assert_allclose(made.attitudes.roll_pitch_yaw, block.attitudes.roll_pitch_yaw, rtol=1e-15)
     for interior in made.priors.interior.values():
-        free = [name for name in parameter_names(interior) if get_parameter(interior, name) is FREE]
+        free = [name for name in parameter_names(interior) if get_parameter(interior, name) == FREE]
         assert free == ["c_mm", "k1"]
     assert made.image_strip == block.image_strip and made.image_mount == block.image_camera
     np.testing.assert_allclose(

@@ -125,29 +125,29 @@ def test_tables_name_what_they_have():
 def test_priors_are_changed_by_name_and_the_block_stays():
     block = simulated("cross").block
     held = block.fix("k2")
-    assert held.priors.interior["one"].distortion.k2 is FIXED
-    assert block.priors.interior["one"].distortion.k2 is FREE
-    assert held.priors.interior["one"].distortion.k1 is FREE
+    assert held.priors.interior["one"].distortion.k2 == FIXED
+    assert block.priors.interior["one"].distortion.k2 == FREE
+    assert held.priors.interior["one"].distortion.k1 == FREE
     again = held.free("k2", "p1")
-    assert again.priors.interior["one"].distortion.k2 is FREE and again.priors.interior["one"].distortion.p1 is FREE
-    assert block.fix("position").priors.exterior.position is FIXED
+    assert again.priors.interior["one"].distortion.k2 == FREE and again.priors.interior["one"].distortion.p1 == FREE
+    assert block.fix("position").priors.exterior.position == FIXED
     near = block.weigh("c", 0.02).priors.interior["one"].c
     assert isinstance(near, Weighted)
     assert (near.value, near.sigma) == (block.start.unknowns.interior["one"].c, 0.02)
     assert block.weigh("x_p", 0.1, value=0.5).priors.interior["one"].x_p.value == 0.5
     # A weighted parameter can be held, too.
-    assert block.weigh("c", 0.02).fix("c_mm").priors.interior["one"].c is FIXED
+    assert block.weigh("c", 0.02).fix("c_mm").priors.interior["one"].c == FIXED
 
 
 def test_of_several_owners_one_is_named_or_all_are_meant():
     block = simulated("everything").block
     cameras = [name for name, own in block.priors.interior.items() if "k1" in own.distortion.coefficients]
     held = block.fix("c_mm", of=cameras[0]).priors.interior
-    assert held[cameras[0]].c is FIXED
+    assert held[cameras[0]].c == FIXED
     assert all(held[name] == block.priors.interior[name] for name in held if name != cameras[0])
-    assert all(own.c is FIXED for own in block.fix("c").priors.interior.values())
+    assert all(own.c == FIXED for own in block.fix("c").priors.interior.values())
     mount = next(iter(block.priors.mounts))
-    assert block.fix("boresight").priors.mounts[mount].boresight is FIXED
+    assert block.fix("boresight").priors.mounts[mount].boresight == FIXED
     assert block.weigh("lever_arm", 0.01).priors.mounts[mount].lever_arm.sigma == 0.01
 
 

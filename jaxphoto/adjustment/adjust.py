@@ -11,6 +11,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from jaxphoto.adjustment.arguments import check_arguments
 from jaxphoto.adjustment.datum import close_datum
 from jaxphoto.adjustment.implicit import find_optimum
 from jaxphoto.adjustment.layout.padding import TiledBlock, pad_structure
@@ -30,10 +31,11 @@ from jaxphoto.adjustment.solver.normal import Linearised
 from jaxphoto.adjustment.solver.optimum import unit_scale, weigh_datum
 from jaxphoto.adjustment.solver.similarity import n_open_motions
 from jaxphoto.adjustment.told import tell_course
-from jaxphoto.arrays import gathered, still
+from jaxphoto.arrays import gathered, is_traced, still
 from jaxphoto.block import Block
 from jaxphoto.compiling import prepare, run_compiled
 from jaxphoto.devices import usable
+from jaxphoto.errors import InputError
 from jaxphoto.losses import AbstractLoss
 from jaxphoto.unknowns import Unknowns
 
@@ -66,6 +68,12 @@ def solve(
     do not see an unknown or cannot tell unknowns apart.
     """
     laid = lay_out(block, start, priors, sizes)
+    if not laid.traced and is_traced(block.start.unknowns):
+        # The result does not depend on them, and a derivative would be zero without a word.
+        raise InputError(
+            "a JAX transformation traces block.start, but the argument start was given and counts in its place: "
+            "change start, or leave it out"
+        )
     numbers, plain = laid.tiled_values, laid.tiled.structure
     structure = plain.with_losses(losses)
     seconds: dict[str, float] = {}
@@ -91,10 +99,12 @@ def solve(
     adjusted = dataclasses.replace(adjusted, steps=steps, converged=converged, course=course, sizes=sizes)
     if laid.traced:
         return adjusted
-    tell_course(adjusted)
-    if adjusted.astray.any():
-        return dataclasses.replace(adjusted, converged=np.array(False))
-    check_rank(adjusted)
+    # Numbers, also where a user's function around this is traced.
+    with jax.ensure_compile_time_eval():
+        tell_course(adjusted)
+        if adjusted.astray.any():
+            return dataclasses.replace(adjusted, converged=np.array(False))
+        check_rank(adjusted)
     return adjusted
 
 
@@ -144,7 +154,7 @@ class LaidOut(NamedTuple):
     @property
     def traced(self) -> bool:
         """Whether any number is traced by a transformation of JAX."""
-        return _traced(self.values)
+        return is_traced(self.values)
 
 
 def lay_out(block: Block, start: Unknowns, priors: Unknowns, sizes: Sizes = LEAST, alone: bool = False) -> LaidOut:
@@ -152,8 +162,9 @@ def lay_out(block: Block, start: Unknowns, priors: Unknowns, sizes: Sizes = LEAS
 
     Raises what `solve` raises before it computes.
     """
+    check_arguments(block, start, priors)
     check_priors(block, priors)
-    warn_of_lost_digits(block, start)
+    warn_of_lost_digits(block, start, priors)
     observed = observed_in(block, priors)
     structure = structure_of(block, priors, observed)
     values = values_of(block, start, priors, structure, observed)
@@ -161,7 +172,7 @@ def lay_out(block: Block, start: Unknowns, priors: Unknowns, sizes: Sizes = LEAS
     values = with_datum(values, constraints.eop, constraints.points)
     constrained, coupled = len(constraints.eop) > 0, bool(structure.coupled)
     # Such rows may join points of two devices; of constraints, statistics have only the open motions in closed form.
-    alone = alone or _traced(values) or coupled or (constrained and not n_open_motions(values, structure))
+    alone = alone or is_traced(values) or coupled or (constrained and not n_open_motions(values, structure))
     shards = 1 if alone else _devices_worth_using(len(structure.image))
     tiled = pad_structure(structure, sizes, shards=shards, dense=constrained or coupled)
     return LaidOut(tiled, values, tiled.pad(values))
@@ -175,10 +186,6 @@ def _factored_like(values: TiledValues, structure: TiledStructure) -> FactoredNo
         lambda v: np.broadcast_to(0.0, v.shape), (system.reduced, system.factor, zero)
     )
     return FactoredNormal(reduced, factor, scale)
-
-
-def _traced(values: Values) -> bool:
-    return any(isinstance(v, jax.core.Tracer) for v in jax.tree.leaves(values))
 
 
 # Image rows that keep a device busy for longer than adding its sums to those of others takes.

@@ -6,7 +6,7 @@ perhaps together with a free shift or lever arm. What none sees is the datum def
 it.
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax
@@ -17,7 +17,7 @@ from jaxphoto.adjustment.model.numbers import Values
 from jaxphoto.adjustment.model.row_functions import rows_of
 from jaxphoto.adjustment.model.structure import Structure
 from jaxphoto.adjustment.solver.similarity import DatumRows, motions
-from jaxphoto.arrays import still
+from jaxphoto.arrays import is_traced, still
 from jaxphoto.block import Block
 from jaxphoto.camera import RollingShutter
 from jaxphoto.errors import DatumError
@@ -36,7 +36,7 @@ def close_datum(block: Block, values: Values, structure: Structure) -> DatumRows
     Raises DatumError where the block's datum is open and its kind "control", or where the constraints asked for cannot
     close it.
     """
-    judged = block.datum.kind == "control" and not _traced(values) and not _traced(block)
+    judged = block.datum.kind == "control" and not is_traced((values, block))
     values = _concrete(values, block)
     if judged:
         # Where things were observed to be: approximate values scatter about a line on which control lies.
@@ -81,23 +81,30 @@ def close_datum(block: Block, values: Values, structure: Structure) -> DatumRows
 
 
 def _concrete(values: Values, block: Block) -> Values:
-    """The same values with numbers for what is being traced: the datum depends on where things are, roughly."""
+    """The same values with numbers for what is being traced: the datum depends on where things are, roughly.
+
+    Where nothing says where they are, they are anywhere: what observations see of the datum is a matter of who observed
+    what, but for coincidences.
+    """
     known = block.start.unknowns
     place = {"position": known.exterior.position, "points": known.points}
-    still = {k: np.asarray(v, float).T for k, v in place.items() if not isinstance(v, jax.core.Tracer)}
+    near = {k: np.asarray(v, float).T for k, v in place.items() if not isinstance(v, jax.core.Tracer)}
+    anywhere = np.random.default_rng(0)
 
     def number(path, v):
+        # Derivatives need the number alone, which they come with.
+        v = jax.lax.stop_gradient(v)
         if not isinstance(v, jax.core.Tracer):
             return np.asarray(v)
-        # Standard deviations that are being traced weigh as one.
-        filler = np.ones if getattr(path[-1], "name", "") in ("sigma", "sigma_xy", "whitener") else np.zeros
-        return still.get(path[0].name, filler(v.shape))
+        name = getattr(path[-1], "name", "")
+        if name in near:
+            return near[name]
+        if name in ("rotation", "nominal", "whitener"):
+            return np.broadcast_to(np.eye(v.shape[0])[..., None], v.shape)
+        # Standard deviations weigh as one.
+        return np.ones(v.shape) if name in ("sigma", "sigma_xy") else anywhere.normal(size=v.shape)
 
     return jax.tree_util.tree_map_with_path(number, values)
-
-
-def _traced(tree: Any) -> bool:
-    return any(isinstance(v, jax.core.Tracer) for v in jax.tree.leaves(tree))
 
 
 def _as_observed(block: Block, values: Values) -> Values:

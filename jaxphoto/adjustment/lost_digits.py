@@ -9,7 +9,7 @@ from jaxphoto.block import Block
 from jaxphoto.unknowns import Unknowns
 
 
-def warn_of_lost_digits(block: Block, start: Unknowns) -> None:
+def warn_of_lost_digits(block: Block, start: Unknowns, priors: Unknowns) -> None:
     """Warn where JAX computes in 32 bits, and where numbers were given in fewer than 64."""
     if not jax.config.values["jax_enable_x64"]:
         warnings.warn(
@@ -18,11 +18,12 @@ def warn_of_lost_digits(block: Block, start: Unknowns) -> None:
             stacklevel=4,
         )
     groups = {"image_points": block.image_points, **{rows.group: rows for rows in block.observations}, "start": start}
+    groups["priors"] = priors
     found = []
     for name, group in groups.items():
         for path, leaf in jax.tree_util.tree_leaves_with_path(group):
             dtype = np.dtype(getattr(leaf, "dtype", float))
-            if dtype.kind == "f" and dtype.itemsize < 8 and not isinstance(leaf, jax.core.Tracer):
+            if dtype.kind == "f" and dtype.itemsize < 8 and not isinstance(leaf, jax.core.Tracer) and np.size(leaf):
                 largest = float(np.abs(np.asarray(leaf)).max(initial=0.0))
                 step = float(np.spacing(np.asarray(largest, dtype)))
                 label = f"{name}{jax.tree_util.keystr(path)}"

@@ -15,6 +15,7 @@ from jaxphoto.adjustment.solver.band import Band
 from jaxphoto.adjustment.solver.normal import Linearised
 from jaxphoto.adjustment.solver.reduced import reduce_normal
 from jaxphoto.adjustment.weak_words import weaknesses_of
+from jaxphoto.arrays import is_traced, still
 from jaxphoto.block import Block, exposures
 from jaxphoto.camera import RATES, CameraSpline
 from jaxphoto.errors import DatumError, RankError
@@ -66,7 +67,7 @@ def _check_scales(priors: Unknowns) -> None:
     """
     for camera, interior in priors.interior.items():
         for name in interior.distortion.scales:
-            if interior.c is FREE and getattr(interior.distortion, name) is FREE:
+            if interior.c == FREE and getattr(interior.distortion, name) == FREE:
                 raise RankError(
                     f"interior[{camera}].c_mm and interior[{camera}].{name} are one scale and cannot both "
                     f"be estimated: hold {name} fixed"
@@ -77,22 +78,22 @@ def _check_mounts(block: Block, priors: Unknowns, with_station: set[int], with_a
     for name, prior in priors.mounts.items():
         images = _images_of(name, block.image_mount)
         stations, attitudes = images & with_station, images & with_attitude
-        if prior.boresight is FREE and not attitudes:
+        if prior.boresight == FREE and not attitudes:
             raise RankError(
                 f"mounts[{name}].boresight is free, but none of its images has an observed attitude: add attitudes, "
                 "or hold the boresight fixed"
             )
-        if prior.lever_arm is FREE and not stations:
+        if prior.lever_arm == FREE and not stations:
             raise RankError(
                 f"mounts[{name}].lever_arm is free, but none of its images has an observed station: add stations, "
                 "or hold the lever arm fixed"
             )
-        if prior.time_offset is FREE and not (stations or attitudes):
+        if prior.time_offset == FREE and not (stations or attitudes):
             raise RankError(
                 f"mounts[{name}].time_offset is free, but none of its images has an observed station or attitude: "
                 "add them, or hold the time offset fixed"
             )
-        if prior.time_offset is FREE and block.motion is None:
+        if prior.time_offset == FREE and block.motion is None:
             raise RankError(
                 f"mounts[{name}].time_offset is free, but nothing says how the sensor moved at the exposures: give "
                 "its velocity and rates of turn (Block.motion), or hold the time offset fixed"
@@ -100,18 +101,18 @@ def _check_mounts(block: Block, priors: Unknowns, with_station: set[int], with_a
 
 
 def _check_strips(block: Block, priors: Unknowns, with_station: set[int]) -> None:
-    times = np.asarray(block.image_time)
+    times = block.image_time if is_traced(block.image_time) else np.asarray(block.image_time)
     for name, prior in priors.strips.items():
         images = sorted(_images_of(name, block.image_strip) & with_station)
         n = len(images)
         for what, least in (("shift", 1), ("drift", 2)):
-            if getattr(prior, what) is FREE and n < least:
+            if getattr(prior, what) == FREE and n < least:
                 found = "one image with an observed station" if n else "no image with an observed station"
                 raise RankError(
                     f"strips[{name}].{what} is free, but the strip has {found}: hold the {what} of strip {name} fixed, "
                     f"or add stations of {least} of its images or more"
                 )
-        if prior.drift is FREE and np.ptp(times[images]) == 0:
+        if prior.drift == FREE and not is_traced(times) and np.ptp(times[images]) == 0:
             raise RankError(
                 f"strips[{name}].drift is free, but all images of the strip with an observed station have one time: "
                 f"give the times of their exposures, or hold the drift of strip {name} fixed"
@@ -124,7 +125,7 @@ def _check_shifts(block: Block, priors: Unknowns, with_station: set[int]) -> Non
         return
     if len(block.control.who) + len(block.fixed.who) + len(block.surfaces.point):
         return
-    shifted = [name for name, prior in priors.strips.items() if prior.shift is FREE]
+    shifted = [name for name, prior in priors.strips.items() if prior.shift == FREE]
     if {block.image_strip[i] for i in with_station} <= set(shifted):
         raise DatumError(
             f"the shift of every strip is free (strips {', '.join(shifted)}) and the block has no control, so its "
@@ -136,13 +137,14 @@ def _check_scanner(block: Block, priors: Unknowns) -> None:
     if priors.scanner is None:
         return
     others = any("scanner" in rows.also for rows in block.more if isinstance(rows, AbstractObservations))
-    if priors.scanner.boresight is FREE and not others and not np.any(np.asarray(block.surfaces.turn)):
+    turned = is_traced(block.surfaces.turn) or np.any(np.asarray(block.surfaces.turn))
+    if priors.scanner.boresight == FREE and not others and not turned:
         raise RankError(
             "scanner.boresight is free, but no point lies on a laser scanner's surface that the boresight moves: add "
             "such points, measured from known positions of the scanner, or hold the boresight fixed"
         )
     for k, (name, prior) in enumerate(priors.scanner.shifts.items()):
-        if prior is FREE and not np.any(block.surfaces.strip == k):
+        if prior == FREE and not np.any(block.surfaces.strip == k):
             raise RankError(
                 f"scanner[{name}].shift is free, but no point lies on a surface of that lidar strip: hold the shift "
                 "fixed, or leave the strip out"
@@ -156,10 +158,11 @@ def _check_camera_rates(block: Block, priors: Unknowns) -> None:
             continue
         # Numbers, also where a user's function around this is traced.
         with jax.ensure_compile_time_eval():
-            along = np.asarray(rates.argument(exposures(block)))
+            along = still(rates.argument(exposures(block)))
         for name, prior in owners.items():
-            free = [field for field in dynamic_fields(rates) if getattr(prior, field) is FREE]
-            if free and np.ptp(along[sorted(_images_of(name, block.image_camera))]) == 0:
+            free = [field for field in dynamic_fields(rates) if getattr(prior, field) == FREE]
+            own = sorted(_images_of(name, block.image_camera))
+            if free and not is_traced(along) and np.ptp(along[own]) == 0:
                 raise RankError(
                     f"{rates.kind}[{name}].{free[0]} is free, but all images of the camera have one {what}: give the "
                     f"{what}s of their exposures, or hold the rate fixed"
@@ -177,7 +180,8 @@ def _check_camera_splines(block: Block) -> None:
     splines: Any = block.start.unknowns.more.get(CameraSpline.kind, {})
     if not splines:
         return
-    seconds = np.abs(np.asarray(exposures(block).in_flight))
+    in_flight = still(exposures(block).in_flight)
+    seconds = np.zeros(len(block.images)) if is_traced(in_flight) else np.abs(in_flight)
     for name, own in splines.items():
         first, spline = next(iter(splines.items()))
         if (own.knots, own.interval_s) != (spline.knots, spline.interval_s):

@@ -20,6 +20,7 @@ from jaxphoto.block import Block
 from jaxphoto.compiling import call_compiled
 from jaxphoto.observations import PRIORS
 from jaxphoto.short_repr import adjustment_html, adjustment_repr, from_upstairs
+from jaxphoto.tracing import refuse_traced
 from jaxphoto.unknowns import Unknowns
 
 if TYPE_CHECKING:
@@ -57,6 +58,16 @@ _DIMENSIONS = 5
 _factored = eqx.filter_jit(factor_normal)
 
 
+class Seconds(dict):
+    """Seconds by what was done. All are equal to JAX, so that no program depends on them."""
+
+    def __hash__(self) -> int:  # type: ignore[override]
+        return 0
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Seconds)
+
+
 class Adjustment(eqx.Module):
     """The result of `jaxphoto.adjust`; see `jaxphoto.statistics` for what can be asked of it.
 
@@ -69,13 +80,13 @@ class Adjustment(eqx.Module):
     unknowns: Unknowns
     residuals: Residuals
     values: Values
-    tiled: TiledBlock
+    tiled: TiledBlock = eqx.field(static=True)
     tiled_values: TiledValues
     factored: FactoredNormal | None
     """None in an adjustment that is being differentiated or mapped over; see `equations`."""
     steps: Int[Numbers, ""]
     converged: Bool[Numbers, ""]
-    seconds: dict[str, float]
+    seconds: dict[str, float] = eqx.field(static=True, converter=lambda v: v if isinstance(v, Seconds) else Seconds(v))
     left_out: tuple[str, ...] = eqx.field(static=True, default=())
     """Tie points of the block as it was given that this adjustment goes without: their rays meet nowhere."""
     sizes: Sizes = eqx.field(static=True, default=LEAST)
@@ -127,6 +138,7 @@ class Adjustment(eqx.Module):
     @property
     def outcome(self) -> Outcome:
         """Converged or not, and why; a member of `Outcome`."""
+        refuse_traced("Adjustment.outcome", self.residuals)
         if bool(self.converged):
             return Outcome.CONVERGED
         if not np.isfinite(float(self.square_sum)):

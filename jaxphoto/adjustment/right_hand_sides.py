@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxphoto.adjustment.model.numbers import Increments
 from jaxphoto.adjustment.normal_equations import NormalEquations
-from jaxphoto.arrays import still
+from jaxphoto.arrays import is_traced, still
 from jaxphoto.compiling import prepare, run_compiled
 
 # Right-hand sides that are solved for side by side: making F of a large block anew costs more than they do. Together
@@ -22,6 +22,8 @@ def solve_many(equations: NormalEquations, b: Increments, seconds: dict[str, flo
 
     `equations` are those of one device, weighed: others are others' programs.
     """
+    if is_traced((equations, b)):
+        return _solve(equations, b)
     batches = in_batches(b, at_once(equations.scale))
     parts = [jax.tree.map(still, run_compiled(_solve, (equations, one), seconds, "covariance")) for one in batches]
     return joined(parts, equations.scale, len(b.shared))

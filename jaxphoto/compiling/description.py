@@ -14,6 +14,8 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from jaxphoto.static_values import StaticArray
+
 # Packages whose sources or versions are part of the key: a name in them says what it means.
 _KNOWN = frozenset({"jaxphoto", "jax", "jaxlib", "equinox", "optimistix", "lineax", "numpy", "builtins"})
 _PLAIN = (type(None), bool, int, float, complex, str, bytes)
@@ -38,6 +40,8 @@ def describe(value: Any) -> str:
         return repr(value)
     if isinstance(value, _Leaf):
         return "leaf"
+    if isinstance(value, StaticArray):
+        return f"static {value.dtype.name} {value.shape} {value.content.digest}"
     if eqx.is_array(value):
         return _array(value)
     if isinstance(value, enum.Enum):

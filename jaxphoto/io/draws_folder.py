@@ -20,7 +20,6 @@ import pyarrow.parquet as pq
 from jaxphoto.block import Block
 from jaxphoto.errors import InputError
 from jaxphoto.io.json_file import read_json
-from jaxphoto.unknowns import Prior
 from jaxphoto.writing import check_room, clear_leftovers, is_place, locked, whole_file
 
 _RUN, _PARTS, DRAWS = "run.json", "parts", "draws.parquet"
@@ -137,7 +136,7 @@ def digest_of(block: Block) -> str:
     arrays, structure = jax.tree.flatten(block)
     digest = hashlib.sha256(repr(structure).encode())
     for array in arrays:
-        digest.update(repr(array).encode() if isinstance(array, Prior) else np.asarray(array).tobytes())
+        digest.update(np.asarray(array).tobytes())
     return digest.hexdigest()
 
 

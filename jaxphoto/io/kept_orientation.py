@@ -60,7 +60,7 @@ def packed(oriented: Oriented) -> dict[str, np.ndarray]:
     block = oriented.block
     interior, priors = block.start.unknowns.interior[CAMERA], block.priors.interior[CAMERA]
     prior = [get_parameter(priors, name) for name in parameter_names(priors)]
-    kinds = ["free" if p is FREE else "fixed" if p is FIXED else "weighted" for p in prior]
+    kinds = ["free" if p == FREE else "fixed" if p == FIXED else "weighted" for p in prior]
     known = [(float(p.value), float(p.sigma)) if isinstance(p, Weighted) else (0.0, 0.0) for p in prior]
     exterior, rows = block.start.unknowns.exterior, block.image_points
     report = oriented.report._replace(gross_errors=oriented.report.gross_errors._asdict())  # type: ignore[arg-type]

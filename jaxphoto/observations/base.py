@@ -34,10 +34,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxphoto.arrays import Numbers, joined, still
+from jaxphoto.arrays import Numbers, from_list, joined, still
 from jaxphoto.georeferencing import Exposure, Mount, StripBias
-from jaxphoto.observations.columns import row_fields
+from jaxphoto.observations.columns import row_fields, whole_fields
 from jaxphoto.short_repr import shown
+from jaxphoto.static_values import StaticArray, map_arrays
 
 AXES = ("X", "Y", "Z")
 
@@ -93,6 +94,19 @@ class AbstractObservations(eqx.Module):
     """Columns in files, by field, that are not called as `observations.columns` says."""
     once: ClassVar[bool] = False
     """Whether files may list what a row touches, in whatever order, only once."""
+
+    def __getattribute__(self, name: str) -> Any:
+        value = object.__getattribute__(self, name)
+        return value.plain if isinstance(value, StaticArray) else value
+
+    def __check_init__(self) -> None:
+        # What says which rows belong together is structure; only numbers are leaves.
+        whole = whole_fields(type(self))
+        for name, value in vars(self).items():
+            if name in whole and not isinstance(value, jax.core.Tracer):
+                object.__setattr__(self, name, StaticArray(value))
+            else:
+                object.__setattr__(self, name, from_list(value))
 
     @abc.abstractmethod
     def residual(self, *touched: Any) -> Float[Numbers, "..."]:
@@ -153,7 +167,7 @@ class AbstractObservations(eqx.Module):
 
     def take(self, chosen: np.ndarray) -> Self:
         """The rows that `chosen` (an index or a mask) names."""
-        return jax.tree.map(lambda v: still(v)[chosen], self)
+        return map_arrays(lambda v: still(v)[chosen], self)
 
     def renumbered(self, **new: np.ndarray) -> Self:
         """The rows whose images and points are kept: `new` gives, by what is touched, the new number of each or -1."""

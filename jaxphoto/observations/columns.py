@@ -67,6 +67,18 @@ def row_fields(cls: type) -> list[RowField]:
     return found
 
 
+@functools.cache
+def whole_fields(cls: type) -> tuple[str, ...]:
+    """The fields of a class of observations that hold indices: those that touch something, and whole numbers."""
+    fields = dataclasses.fields(cls)
+    # Names in the annotations of a class within a function may be out of reach.
+    hints = (
+        typing.get_type_hints(cls) if any(isinstance(f.type, str) for f in fields) else {f.name: f.type for f in fields}
+    )
+    whole = {f.name for f in fields if (kind := annotated(hints[f.name])) is not None and kind[1]}
+    return tuple(f.name for f in fields if "touches" in f.metadata or f.name in whole)
+
+
 def columns_of(cls: Any) -> tuple[Column, ...]:
     """The columns of the table of a class of observations, in their order."""
     found: list[Column] = []

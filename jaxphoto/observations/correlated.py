@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 
 from jaxphoto.arrays import Numbers, still
 from jaxphoto.observations.base import AbstractObservations
+from jaxphoto.static_values import map_arrays
 
 
 class Correlated(AbstractObservations):
@@ -95,7 +96,7 @@ class Correlated(AbstractObservations):
     @property
     def flat(self) -> AbstractObservations:
         """All rows, one set after the other."""
-        return jax.tree.map(lambda v: np.asarray(v).reshape(-1, *np.shape(v)[2:]), self.rows)
+        return map_arrays(lambda v: np.asarray(v).reshape(-1, *np.shape(v)[2:]), self.rows)
 
     def _by_set(self, names: np.ndarray) -> np.ndarray:
         n = int(np.prod(np.shape(self.covariance)[:2]))
@@ -123,7 +124,7 @@ def correlated(
     except np.linalg.LinAlgError:
         raise ValueError("a covariance matrix is not positive definite: a combination has no uncertainty") from None
     return Correlated(
-        rows=jax.tree.map(lambda v: still(v)[index], rows),
+        rows=map_arrays(lambda v: still(v)[index], rows),
         covariance=covariance,
         whitener=whitener,
         group=f"correlated_{rows.group}",

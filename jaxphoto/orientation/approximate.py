@@ -8,9 +8,11 @@
 Where everything is known beforehand, only the check that every point lies in front of its cameras runs, in NumPy.
 """
 
+import dataclasses
 from functools import partial
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Int
@@ -18,17 +20,20 @@ from jaxtyping import Bool, Int
 from jaxphoto.arrays import still
 from jaxphoto.block import Block, Start, direct_exterior, sensor_rows
 from jaxphoto.camera import InteriorOrientation
-from jaxphoto.errors import BlockError
+from jaxphoto.errors import BlockError, InputError
 from jaxphoto.observations import ControlRows
 from jaxphoto.orientation.block_intersection import intersect_points
-from jaxphoto.orientation.rays import camera_rays, ideal_coordinates, turn_to_object
+from jaxphoto.orientation.rays import camera_rays, directions_of, ideal_coordinates, turn_to_object
 from jaxphoto.orientation.resection import resect_ideal
+from jaxphoto.small_matrices import cholesky_3x3, unwhiten, whiten
 from jaxphoto.unknowns import Unknowns
 
 _RESECTED = 4  # known points
 _ANGLES = np.deg2rad([1.0, 0.02])  # between rays that make a point: wanted, and just bearable
 # Part of the points that may be where no camera could see them: blunders. Of more, the frame is wrong.
 _BLUNDERS = 0.05
+# Weight of a surveyed coordinate beside a ray.
+_SURVEYED = 100.0
 _MEND = "give their X_m, Y_m, Z_m, omega_deg, phi_deg, kappa_deg in images.csv, or measure more control points in them"
 
 
@@ -57,6 +62,43 @@ def completed(block: Block) -> Start:
     state = _SoFar(block)
     state.complete()
     return state.start()
+
+
+def intersected(block: Block) -> Unknowns:
+    """`approximate` of a block that a JAX transformation traces: without resection, and without a judgement of numbers.
+
+    A point lies where the squares of its distances from its rays, and from its control coordinates, are least. Raises
+    InputError where an image has neither an orientation nor an observed position and attitude.
+    """
+    start, image, point = block.start.unknowns, *map(np.asarray, (block.image_points.image, block.image_points.point))
+    sensors, known = sensor_rows(block, start), np.array(block.start.image_known)
+    new = ~known[sensors.image]
+    who = sensors.image[new]
+    known[who] = True
+    if not known.all():
+        raise InputError(
+            "no image is resected inside a JAX transformation, and images have no approximate orientation "
+            f"({_few(block.images, np.flatnonzero(~known))}): compute it outside, start = "
+            "jaxphoto.adjust(block).unknowns, and give adjust(block, start)"
+        )
+    exterior = start.exterior
+    if len(who):
+        found = direct_exterior(sensors)
+        exterior = jax.tree.map(lambda old, own: jnp.asarray(old).at[who].set(own[new]), exterior, found)
+    rays = jnp.zeros((len(image), 3))
+    for name, interior in start.interior.items():
+        own = np.flatnonzero(np.array([camera == name for camera in block.image_camera])[image])
+        rays = rays.at[own].set(directions_of(interior, block.image_points.xy[own]))
+    along = jnp.einsum("nij,ni->nj", exterior.camera_from_object[image], rays)
+    across = jnp.eye(3) - along[:, :, None] * along[:, None] / jnp.sum(along**2, axis=1)[:, None, None]
+    at_point = jnp.zeros((len(block.points), 3, 3)).at[point].add(across)
+    right = jnp.zeros((len(block.points), 3)).at[point].add(jnp.einsum("nij,nj->ni", across, exterior.position[image]))
+    for rows in (block.control, block.fixed):
+        at_point = at_point.at[rows.who, rows.axis, rows.axis].add(_SURVEYED)
+        right = right.at[rows.who, rows.axis].add(_SURVEYED * rows.value)
+    factor = cholesky_3x3(jnp.moveaxis(at_point, 0, -1))
+    points = jnp.stack(unwhiten(whiten(right.T, factor), factor), axis=1)
+    return dataclasses.replace(start, exterior=exterior, points=points)
 
 
 class _SoFar:

@@ -5,7 +5,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 
 from jaxphoto.camera import InteriorOrientation, Perspective
 from jaxphoto.compiling import jit_quickly
@@ -16,7 +16,8 @@ _FLATTEST = 0.17
 
 
 @jit_quickly
-def _directions(interior: InteriorOrientation, xy):
+def directions_of(interior: InteriorOrientation, xy: Float[Array, "rows 2"]) -> Float[Array, "rows 3"]:
+    """Directions in the camera frame of image coordinates (mm); traced numbers stay traced."""
     return jax.vmap(lambda one: jnp.stack(interior.direction_from_ideal(interior.ideal_from_measured(one))))(xy)
 
 
@@ -45,7 +46,7 @@ def _of_rows(interior: InteriorOrientation, xy_mm: Float[np.ndarray, "rows 2"]) 
     padded[:n] = xy_mm
     # Numbers as arrays: a float in the tree would be compiled in, and every camera compiled anew.
     numbers = jax.tree.map(partial(np.asarray, dtype=float), interior)
-    return np.asarray(_directions(numbers, padded))[:n]
+    return np.asarray(directions_of(numbers, padded))[:n]
 
 
 def padded_length(n: int) -> int:

@@ -5,15 +5,19 @@ import time
 import warnings
 from collections.abc import Callable, Sequence
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxphoto.adjustment import LEAST, MAX_STEPS, Adjustment, Outcome, Sizes, solve
 from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
+from jaxphoto.arrays import is_traced
 from jaxphoto.block import Block, sensor_rows
+from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import BlockError, DatumError, RankError, few
 from jaxphoto.observations import AbstractObservations, KnownParameters
 from jaxphoto.orientation import approximate
-from jaxphoto.orientation.approximate import PointsBehind, completed
+from jaxphoto.orientation.approximate import PointsBehind, completed, intersected
 from jaxphoto.procedures.orientation import orient_block
 from jaxphoto.procedures.orientation.network import empty_network, misfits, sight_of
 from jaxphoto.statistics import prepare_statistics
@@ -63,6 +67,8 @@ def adjust(
     if more:
         block = dataclasses.replace(block, more=(*block.more, *more))
     priors = block.priors if priors is None else priors
+    if start is None and is_traced((block, priors)):
+        start = _start_in_transformation(block)
     if start is not None:
         return solve(block, start, priors, max_steps, sizes)
     own = priors is block.priors
@@ -130,7 +136,7 @@ def _from_the_best_start(
     if first is not None and may_lose_points:
         first = _without_points_gone(first, from_start)
     # What is known of exterior orientations is not to be looked for elsewhere.
-    free = priors.exterior.position is FREE and priors.exterior.camera_from_object is FREE
+    free = priors.exterior.position == FREE and priors.exterior.camera_from_object == FREE
     elsewhere = free and np.asarray(block.start.image_known).any()
     if first is not None and (not elsewhere or _somewhere(first, max_steps)):
         return first
@@ -216,6 +222,20 @@ def _somewhere(adjusted: Adjustment, max_steps: int) -> bool:
     if adjusted.factored is None or (adjusted.outcome is Outcome.STEPS and max_steps < MAX_STEPS):
         return True
     return adjusted.outcome in (Outcome.CONVERGED, Outcome.STEPS, Outcome.FLAT) and float(adjusted.sigma0) < ABSURD
+
+
+def _start_in_transformation(block: Block) -> Unknowns:
+    """Approximate values of a block that a JAX transformation traces; only what is known has derivatives."""
+    numbers, known = jax.lax.stop_gradient(block), block.start.unknowns
+    if block.start.image_known.all() and block.start.point_known.all():
+        return known
+    found = intersected(numbers) if is_traced(numbers) else start_of(numbers)
+    image_known, point_known = np.asarray(block.start.image_known), np.asarray(block.start.point_known)[:, None]
+    exterior = ExteriorOrientation(
+        jnp.where(image_known[:, None], known.exterior.position, found.exterior.position),
+        jnp.where(image_known[:, None, None], known.exterior.camera_from_object, found.exterior.camera_from_object),
+    )
+    return dataclasses.replace(known, exterior=exterior, points=jnp.where(point_known, known.points, found.points))
 
 
 def start_of(block: Block, report: Callable[[str], object] = lambda text: None) -> Unknowns:

@@ -22,12 +22,14 @@ from jaxphoto.georeferencing import Mount, StripBias
 from jaxphoto.orientation import approximate
 from jaxphoto.procedures.adjust import adjust
 from jaxphoto.procedures.boresight_judgement import Biases, Step, judge
+from jaxphoto.tracing import outside_transformations
 from jaxphoto.unknowns import FIXED, FREE, Unknowns
 from jaxphoto.variants import indirect, without_attitudes, without_control
 
 STEPS = (1, 2, 3, 4)
 
 
+@outside_transformations
 def boresight(
     block: Block,
     *,

@@ -10,8 +10,10 @@ from jaxphoto.camera import parameter_names
 from jaxphoto.errors import InputError
 from jaxphoto.stability import Change, Method, change, image_grid
 from jaxphoto.statistics import covariance
+from jaxphoto.tracing import outside_transformations
 
 
+@outside_transformations
 def compare(
     first: Adjustment,
     second: Adjustment,

@@ -36,6 +36,7 @@ from jaxphoto.observations import ControlRows
 from jaxphoto.orientation import intersect_points
 from jaxphoto.orientation.rays import camera_rays, padded_length, turn_to_object
 from jaxphoto.short_repr import shown
+from jaxphoto.tracing import outside_transformations
 from jaxphoto.unknowns import Weighted
 
 # From the point nearest to the rays the first step leaves micrometres, the second nothing.
@@ -71,6 +72,7 @@ class Georeferenced(eqx.Module):
         return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
 
 
+@outside_transformations
 def georeference(block: Block) -> Georeferenced:
     """Exterior orientation of the images of `block` from stations, attitudes and mounts, and its points from them.
 

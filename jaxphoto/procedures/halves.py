@@ -35,6 +35,7 @@ from jaxphoto.stability import (
     overlap,
 )
 from jaxphoto.statistics import common_covariance, covariance
+from jaxphoto.tracing import outside_transformations
 from jaxphoto.variants import some_images
 
 CUTS = 64
@@ -103,6 +104,7 @@ class Halves(NamedTuple):
         return float(v.mean()), float(v.std(ddof=1) / np.sqrt(len(v))) if len(v) > 1 else float("nan")
 
 
+@outside_transformations
 def halves(
     block: Block,
     cells_mm: Float[np.ndarray, "cells 2"],

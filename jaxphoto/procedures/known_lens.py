@@ -56,7 +56,7 @@ def with_known_lens(block: Block, camera: str, lens: KnownLens) -> Block:
     sigma = prior_sigmas(lens.prior, lens.nominal, block.sensors[camera], lens.c_rounding)
     priors = block.priors.interior[camera]
     for name in parameter_names(lens.nominal):
-        if get_parameter(priors, name) is not FIXED and math.isfinite(sigma[name]):
+        if get_parameter(priors, name) != FIXED and math.isfinite(sigma[name]):
             value = float(get_parameter(lens.nominal, name))
             priors = set_parameter(priors, name, Weighted(value, sigma[name]))
     interior = block.priors.interior | {camera: priors}

@@ -22,6 +22,7 @@ from jaxphoto.procedures.adjust import start_of
 from jaxphoto.short_repr import shown
 from jaxphoto.statistics import LEAST_CHECKED, LEAST_SIGMA0, covariance, redundancy_numbers
 from jaxphoto.statistics.quantiles import student_freedom
+from jaxphoto.tracing import outside_transformations
 from jaxphoto.unknowns import Unknowns
 from jaxphoto.variants import without_observations
 
@@ -53,6 +54,7 @@ class Robust(NamedTuple):
     """Image points of points that these rows do not place: they had no part in it."""
 
 
+@outside_transformations
 def robust(
     block: Block,
     loss: AbstractLoss | Mapping[str, AbstractLoss] | None = None,

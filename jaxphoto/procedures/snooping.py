@@ -41,6 +41,7 @@ from jaxphoto.statistics import (
     Suspect,
     global_test,
 )
+from jaxphoto.tracing import outside_transformations
 from jaxphoto.unknowns import Unknowns
 
 _ROUNDS = 20
@@ -69,6 +70,7 @@ class Snooped(NamedTuple):
     """Those that went because too little was left of them."""
 
 
+@outside_transformations
 def snoop(
     block: Block,
     start: Unknowns | None = None,

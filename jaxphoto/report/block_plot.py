@@ -12,6 +12,7 @@ from jaxphoto.errors import counted
 from jaxphoto.report.block_places import BlockPlaces, places_of, pyramids
 from jaxphoto.report.plots import axes_or_new, panels
 from jaxphoto.report.tables import Tables
+from jaxphoto.tracing import outside_transformations
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -23,6 +24,7 @@ _CONTROL: dict[str, Any] = {"marker": "^", "ls": "", "ms": 6, "color": "tab:red"
 _CHECK: dict[str, Any] = {"marker": "s", "ls": "", "ms": 5, "mfc": "none", "color": "tab:green"}
 
 
+@outside_transformations
 def plot_block(source: Block | Adjustment, ax: Axes | None = None, *, in_3d: bool = False) -> Axes:
     """Camera stations with their strips, object points, control and check points; coordinates in metres.
 

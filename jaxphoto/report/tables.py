@@ -51,6 +51,7 @@ from jaxphoto.statistics import (
 )
 from jaxphoto.statistics.intersection_angles import intersection_angles
 from jaxphoto.statistics.sigma_map import SigmaMap, sigma_maps
+from jaxphoto.tracing import refuse_traced
 
 
 class Tables:
@@ -69,6 +70,7 @@ class Tables:
         truth: Mapping[str, pd.DataFrame] | None = None,
         known: Covariance | None = None,
     ):
+        refuse_traced("Tables", adjusted)
         self.adjusted = adjusted
         self.rotations: Rotations = rotations
         self.truth = truth

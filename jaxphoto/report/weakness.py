@@ -134,8 +134,8 @@ def _stations(adjusted: Adjustment, images: np.ndarray, axes: tuple[int, ...]) -
     held = np.unique(block.stations.who[rows]).tolist()
     if not held:
         return "no station tells them apart", "add camera stations (GNSS)"
-    loose = {name for name, bias in priors.strips.items() if bias.shift is not FIXED}
-    swung = {name for name, mount in priors.mounts.items() if mount.lever_arm is not FIXED}
+    loose = {name for name, bias in priors.strips.items() if bias.shift != FIXED}
+    swung = {name for name, mount in priors.mounts.items() if mount.lever_arm != FIXED}
     if all(block.image_strip[i] in loose or block.image_mount[i] in swung for i in held):
         return (
             "stations tell them apart only as well as their shifts and lever arms are known",

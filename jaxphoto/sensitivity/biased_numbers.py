@@ -110,7 +110,7 @@ def _knots(block: Block, field: str, per: str) -> Iterator[BiasedNumbers]:
         weighted = isinstance(prior, Weighted)
         if weighted and np.shape(prior.value) != (3,):
             raise InputError(f"{field} of {owner} is known beforehand by one value for three axes: give it three")
-        if weighted or prior is FIXED:
+        if weighted or prior == FIXED:
             own = ("more", kind, owner, field)
             path = ("priors", *own, "value") if weighted else ("start", "unknowns", *own)
             yield BiasedNumbers(path, [_whose(owner, per)] * 3, np.arange(3), -np.eye(3)[None])

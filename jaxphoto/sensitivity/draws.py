@@ -29,7 +29,7 @@ from jaxphoto.errors import InputError, JaxphotoError
 from jaxphoto.rotation import omega_phi_kappa_from_matrix
 from jaxphoto.sensitivity.perturbation import Perturbation, Recorded, in_order_of
 from jaxphoto.short_repr import shown
-from jaxphoto.unknowns import Prior
+from jaxphoto.tracing import outside_transformations
 
 # Draws that are worth compiling thoroughly.
 _MANY = 500
@@ -57,6 +57,7 @@ class Draws(eqx.Module):
     labels: tuple[str, ...] = eqx.field(static=True)
 
 
+@outside_transformations
 def monte_carlo(
     adjusted: Adjustment,
     perturb: Perturbation,
@@ -79,6 +80,7 @@ def monte_carlo(
     return readjust(adjusted, Drawn(perturb, seed), np.arange(draws), exterior=exterior, points=points)
 
 
+@outside_transformations
 def readjust(
     adjusted: Adjustment,
     change: Callable[[Any, Block], Block | tuple[Block, Recorded]],
@@ -124,7 +126,7 @@ class Readjustment:
         if not bool(adjusted.converged):
             raise InputError(f"draws begin at the optimum of the block as it is, which is {adjusted.outcome.value}")
         equations = adjusted.equations.on_one_device
-        tiled = adjusted.tiled._replace(structure=equations.structure)
+        tiled = dataclasses.replace(adjusted.tiled, structure=equations.structure)
         self.adjusted = dataclasses.replace(
             adjusted, tiled=tiled, tiled_values=equations.values, factored=equations.factored
         )
@@ -300,7 +302,7 @@ def _check_same(block: Any, nominal: Block) -> None:
 
 def _is_number_or_same(new: Any, old: Any) -> bool:
     """Whether a leaf of a block is as it was, or other numbers of the same shape."""
-    if isinstance(old, Prior) or np.asarray(old).dtype.kind not in "f":
+    if np.asarray(old).dtype.kind not in "f":
         return new is old or (not isinstance(new, jax.core.Tracer) and np.array_equal(new, old))
     return np.shape(new) == np.shape(old)
 

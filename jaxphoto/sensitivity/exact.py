@@ -39,6 +39,7 @@ from jaxphoto.sensitivity.image_rows import ListedRows, image_rows
 from jaxphoto.short_repr import shown
 from jaxphoto.statistics import EOP_NAMES
 from jaxphoto.statistics.covariance import turns_of
+from jaxphoto.tracing import outside_transformations
 
 # Numbers that the derivatives by image points may have: 1.6 GB.
 _MOST_NUMBERS = 2e8
@@ -87,6 +88,7 @@ class Sensitivity(eqx.Module):
         return self.labels.index(label)
 
 
+@outside_transformations
 def sensitivity(adjusted: Adjustment, *, curvature: bool = True, points: Sequence[str] = ()) -> Sensitivity:
     """d(estimate) / d(observation, prior, fixed parameter) of the optimum that `adjusted` has found.
 

@@ -247,15 +247,15 @@ def _parameters(block: Block, kind: str, sigma, of: Collection[str], parameter: 
             known = ", ".join(parameter_names(table[name]))
             raise InputError(f"camera {name} has no parameter {parameter!r}; it has {known}")
         prior = _leaf(of_priors[name], field)
-        if prior is FREE:
+        if prior == FREE:
             raise InputError(
                 f"{field} of {name} is free, so the adjustment does not take the value that a bias changes"
             )
-        at = ("start", "unknowns") if prior is FIXED else ("priors",)
-        if prior is not FIXED and np.shape(prior.value) != (() if kind == "interior" else (3,)):
+        at = ("start", "unknowns") if prior == FIXED else ("priors",)
+        if prior != FIXED and np.shape(prior.value) != (() if kind == "interior" else (3,)):
             raise InputError(f"{field} of {name} is known beforehand by one value for three axes: give it three")
         path = (*at, "interior" if kind == "interior" else "mounts", name, field)
-        targets.append(path if prior is FIXED else (*path, "value"))
+        targets.append(path if prior == FIXED else (*path, "value"))
     index = tuple(len(axes) * k + np.arange(len(axes)) for k in range(len(chosen)))
     names = tuple(f"{name}.{axis}" for name in chosen for axis in axes)
     return Bias(names, _sigmas(sigma, axes, len(chosen)), tuple(targets), index, distribution)

@@ -39,6 +39,7 @@ from jaxphoto.observations import AXES
 from jaxphoto.rotation import omega_phi_kappa_from_matrix
 from jaxphoto.small_matrices import whiten
 from jaxphoto.statistics import EOP_NAMES
+from jaxphoto.tracing import outside_transformations
 
 try:
     import blackjax
@@ -113,6 +114,7 @@ class Posterior(eqx.Module):
         return result
 
 
+@outside_transformations
 def posterior(
     adjusted: Adjustment,
     parameters: Sequence[str],

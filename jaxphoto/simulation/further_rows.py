@@ -9,6 +9,7 @@ from jaxtyping import PRNGKeyArray
 
 from jaxphoto.block import Block, exposures
 from jaxphoto.observations import AbstractObservations, Correlated, ImageState, KnownParameters
+from jaxphoto.static_values import with_plain_arrays
 from jaxphoto.unknowns import Unknowns
 
 Rows = AbstractObservations | KnownParameters
@@ -25,7 +26,7 @@ def observed_anew(rows: Rows, block: Block, truth: Unknowns, key: PRNGKeyArray) 
     if missing:
         return rows
     touched = [_touched(what, np.asarray(index), block, truth) for what, index in rows.indices()]
-    residual = jax.vmap(lambda row, of: row.residual(*of))(rows, touched)
+    residual = jax.vmap(lambda row, of: row.residual(*of))(with_plain_arrays(rows), touched)
     noise = jnp.asarray(rows.sigmas) * jax.random.normal(key, np.shape(rows.sigmas))
     return rows.with_observation(jnp.asarray(rows.observation) - residual + noise)
 

@@ -89,7 +89,7 @@ def runs_late(cameras: Mapping[str, SimulatedChange]) -> bool:
     """Whether a camera of the rig may expose after the others: then the block needs to know how they move."""
     known: list[Any] = [own.model for own in cameras.values() if own.model]
     delays = [own.truth.delay for own in cameras.values()] + [start.delay for start, _ in known]  # type: ignore[attr-defined]
-    return any(float(delay) != 0 for delay in delays) or any(prior.delay is not FIXED for _, prior in known)
+    return any(float(delay) != 0 for delay in delays) or any(prior.delay != FIXED for _, prior in known)
 
 
 def with_gnss(recipe: Recipe, flight: Flight) -> Int[np.ndarray, "n"]:

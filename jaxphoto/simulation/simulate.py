@@ -282,7 +282,7 @@ def _bias_of(recipe: Recipe, strip: str) -> SimulatedBias | None:
 def _runs_late(mount: Assumed[Mount]) -> bool:
     """Whether the time offset matters: then the block needs to know how the sensor moves."""
     offsets = (mount.truth.time_offset, mount.start.time_offset)
-    return any(float(offset) != 0 for offset in offsets) or mount.prior.time_offset is not FIXED
+    return any(float(offset) != 0 for offset in offsets) or mount.prior.time_offset != FIXED
 
 
 def _draw(seed: int, purpose: str, shape: tuple[int, ...]) -> np.ndarray:

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxphoto.arrays import Numbers
+from jaxphoto.arrays import Numbers, still
 from jaxphoto.camera import InteriorOrientation, invert
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import InputError
@@ -103,9 +103,9 @@ def check_rays(interior: InteriorOrientation, points: Float[Numbers, "points 2"]
         )
 
 
-def regular_rays(interior: InteriorOrientation, points: Float[Numbers, "points 2"]) -> Bool[np.ndarray, "points"]:
+def regular_rays(interior: InteriorOrientation, points: Float[Numbers, "points 2"]) -> Bool[Numbers, "points"]:
     """At which image points (mm) the distortion does not fold, and the ray looks ahead."""
-    return np.asarray(call_compiled(_regular, as_arrays(interior), jnp.asarray(points, float)))
+    return still(call_compiled(_regular, as_arrays(interior), jnp.asarray(points, float)))
 
 
 @eqx.filter_jit

@@ -4,12 +4,14 @@ Source: paper 000, Table 4 (mean absolute correlation over the images, per angle
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
 from jaxphoto.adjustment import Adjustment
+from jaxphoto.arrays import namespace, still
 from jaxphoto.short_repr import shown
 from jaxphoto.statistics.covariance import EOP_NAMES, Covariance
 
@@ -23,27 +25,27 @@ class Correlations(eqx.Module):
     """The camera's estimated interior parameters (c_mm ...)."""
     eop_names: tuple[str, ...] = eqx.field(static=True)
     images: tuple[str, ...] = eqx.field(static=True)
-    interior: Float[np.ndarray, "iop iop"]
-    exterior: Float[np.ndarray, "images 6 iop"]
-    within_image: Float[np.ndarray, "images 6 6"]
+    interior: Float[Any, "iop iop"]
+    exterior: Float[Any, "images 6 iop"]
+    within_image: Float[Any, "images 6 6"]
     """Of each image's exterior orientation with itself."""
 
     @property
-    def mean_abs(self) -> Float[np.ndarray, "6 iop"]:
+    def mean_abs(self) -> Float[Any, "6 iop"]:
         """Mean over the camera's images of |rho| (paper 000, Table 4)."""
-        return np.abs(self.exterior).mean(axis=0)
+        return abs(self.exterior).mean(axis=0)
 
     @property
-    def max_abs(self) -> Float[np.ndarray, "6 iop"]:
+    def max_abs(self) -> Float[Any, "6 iop"]:
         """Maximum over the camera's images of |rho|."""
-        return np.abs(self.exterior).max(axis=0)
+        return abs(self.exterior).max(axis=0)
 
 
-def correlation_matrix(covariance: Covariance) -> Float[np.ndarray, "reduced reduced"]:
+def correlation_matrix(covariance: Covariance) -> Float[Any, "reduced reduced"]:
     """Correlations of everything in `covariance.labels`; zero for what is fixed."""
-    matrix = np.asarray(covariance.matrix)
-    sigma = np.sqrt(np.maximum(np.diagonal(matrix), 0.0))
-    inverse = np.where(sigma > 0, 1 / np.where(sigma > 0, sigma, 1.0), 0.0)
+    matrix = still(covariance.matrix)
+    xp, variance = namespace(matrix), matrix.diagonal()
+    inverse = xp.where(variance > 0, 1 / xp.sqrt(xp.where(variance > 0, variance, 1.0)), 0.0)
     return matrix * inverse[:, None] * inverse[None, :]
 
 
@@ -56,7 +58,8 @@ def correlations(adjusted: Adjustment, covariance: Covariance) -> dict[str, Corr
         prefix = f"interior[{camera}]."
         columns = [k for k, label in enumerate(covariance.labels) if k >= n and label.startswith(prefix)]
         images = [i for i, c in enumerate(adjusted.block.image_camera) if c == camera]
-        exterior = rho[:n].reshape(-1, 6, rho.shape[1])[images][:, :, columns]
+        own = 6 * np.array(images, int)[:, None] + np.arange(6)
+        exterior = rho[own][:, :, np.array(columns, int)]
         result[camera] = Correlations(
             camera,
             tuple(covariance.labels[k].removeprefix(prefix) for k in columns),
@@ -64,7 +67,7 @@ def correlations(adjusted: Adjustment, covariance: Covariance) -> dict[str, Corr
             tuple(adjusted.block.images[i] for i in images),
             rho[np.ix_(columns, columns)],
             exterior,
-            np.array([rho[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] for i in images]).reshape(-1, 6, 6),
+            rho[own[:, :, None], own[:, None]],
         )
     return result
 

@@ -1,14 +1,16 @@
 """Covariances of linear functions of the unknowns, such as the mean height of all points."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from jaxphoto.adjustment import Adjustment
+from jaxphoto.adjustment.model.numbers import Increments
 from jaxphoto.adjustment.right_hand_sides import solve_many
-from jaxphoto.arrays import still
+from jaxphoto.arrays import Numbers, is_traced, still
 from jaxphoto.short_repr import shown
 from jaxphoto.statistics.responses import products_of
 
@@ -17,17 +19,17 @@ from jaxphoto.statistics.responses import products_of
 class LinearForms(NamedTuple):
     """Covariances of linear functions of unknowns, with one another and with the shared unknowns."""
 
-    variance: Float[np.ndarray, "forms forms"]
-    with_shared: Float[np.ndarray, "forms shared"]
+    variance: Float[Any, "forms forms"]
+    with_shared: Float[Any, "forms shared"]
 
 
 def linear_forms(
     adjusted: Adjustment,
     n_forms: int,
     *,
-    points: Float[np.ndarray, "forms points 3"] | None = None,
-    exterior: Float[np.ndarray, "forms images 6"] | None = None,
-    shared: Float[np.ndarray, "forms shared"] | None = None,
+    points: Float[Numbers, "forms points 3"] | None = None,
+    exterior: Float[Numbers, "forms images 6"] | None = None,
+    shared: Float[Numbers, "forms shared"] | None = None,
 ) -> LinearForms:
     """Covariances (a posteriori) of `n_forms` sums g' x of unknowns with these weights g; without weights, none of it.
 
@@ -37,14 +39,20 @@ def linear_forms(
     """
     equations, places = adjusted.equations.on_one_device.weighed, adjusted.tiled.places
     scale = jax.tree.map(still, equations.scale)
-    b = jax.tree.map(lambda v: np.zeros((n_forms, *v.shape)), scale)
-    if points is not None:
-        b.points[:, :, places.point] = np.moveaxis(points, 1, 2)
-    if exterior is not None:
-        b.eop[:, :, places.image] = np.moveaxis(exterior, 1, 2)
-    if shared is not None:
-        b.shared[:, : shared.shape[1]] = shared
-    for v, own in zip(b, scale, strict=True):
-        v *= own
-    x, factor = solve_many(equations, b, adjusted.seconds), float(adjusted.sigma0) ** 2
-    return LinearForms(factor * products_of(b, x), factor * np.asarray(x.shared) * scale.shared)
+
+    def weights(given: Any, at: Any, of: Any) -> Any:
+        if given is None:
+            return np.zeros((n_forms, *of.shape))
+        if is_traced((given, of)):
+            return jnp.zeros((n_forms, *of.shape)).at[..., at].set(given) * of
+        placed = np.zeros((n_forms, *of.shape))
+        placed[..., at] = given
+        return placed * of
+
+    b = Increments(
+        weights(None if exterior is None else exterior.swapaxes(1, 2), places.image, scale.eop),
+        weights(shared, np.arange(0 if shared is None else shared.shape[1]), scale.shared),
+        weights(None if points is None else points.swapaxes(1, 2), places.point, scale.points),
+    )
+    x, factor = solve_many(equations, b, adjusted.seconds), adjusted.sigma0**2
+    return LinearForms(factor * products_of(b, x), factor * x.shared * scale.shared)

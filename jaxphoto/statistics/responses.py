@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, Int, Int32
 from jaxphoto.adjustment import Adjustment, NormalEquations
 from jaxphoto.adjustment.model.numbers import Increments, NonImageResiduals
 from jaxphoto.adjustment.right_hand_sides import at_once, blank, in_batches, joined, prepare_solving, solve_many
-from jaxphoto.arrays import still
+from jaxphoto.arrays import Numbers, still
 from jaxphoto.compiling import prepare, run_compiled
 
 # Directions that are computed with side by side. Together they have no more numbers than this, as several arrays of
@@ -136,15 +136,15 @@ class Responses(eqx.Module):
         return run_compiled(program, (self.equations, given), self.adjusted.seconds, "covariance")
 
 
-def products_of(a: Increments, b: Increments) -> Float[np.ndarray, "m n"]:
+def products_of(a: Increments, b: Increments) -> Float[Numbers, "m n"]:
     """a'b of each of `a` with each of `b`, along leading axes.
 
     Kind by kind: of a large block each copy of all of them takes 100 MB.
     """
-    found = np.zeros((len(a.shared), len(b.shared)))
+    found: Any = np.zeros((len(a.shared), len(b.shared)))
     for pair in zip(a, b, strict=True):
-        v, w = (np.reshape(one, (len(one), math.prod(one.shape[1:]))) for one in map(np.asarray, pair))
-        found += v @ w.T
+        v, w = (one.reshape(len(one), math.prod(one.shape[1:])) for one in map(still, pair))
+        found = found + v @ w.T
     return found
 
 

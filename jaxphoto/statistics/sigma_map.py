@@ -16,6 +16,8 @@ only (`linear_forms`), however many images there are.
 Source: D. Kogan, mrcal, projection uncertainty (https://mrcal.secretsauce.net/uncertainty.html), method of version 2.
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -23,7 +25,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxphoto.adjustment import Adjustment
-from jaxphoto.arrays import Numbers
+from jaxphoto.arrays import Numbers, is_traced, namespace, still
 from jaxphoto.block import one_camera
 from jaxphoto.camera import InteriorOrientation, Sensor, parameter_names
 from jaxphoto.compiling import call_compiled
@@ -45,17 +47,18 @@ class SigmaMap(eqx.Module):
     camera: str = eqx.field(static=True)
     distance_m: float
     """Of the point from the projection centre; infinite for a direction."""
-    points: Float[np.ndarray, "cells 2"]
+    points: Float[Numbers, "cells 2"]
     """Measured image coordinates (mm from the centre of the image)."""
-    covariance: Float[np.ndarray, "cells 2 2"]
+    covariance: Float[Any, "cells 2 2"]
     """Of x and y (mm^2); NaN where the distortion folds or the ray looks behind the camera."""
 
     @property
-    def worst(self) -> Float[np.ndarray, "cells"]:
+    def worst(self) -> Float[Any, "cells"]:
         """Standard deviation (mm) in the direction in which it is largest: the longer half axis of the ellipse."""
         q = self.covariance
         mean, half = (q[:, 0, 0] + q[:, 1, 1]) / 2, (q[:, 0, 0] - q[:, 1, 1]) / 2
-        return np.sqrt(mean + np.hypot(half, q[:, 0, 1]))
+        xp = namespace(q)
+        return xp.sqrt(mean + xp.hypot(half, q[:, 0, 1]))
 
 
 def sigma_map(
@@ -83,7 +86,7 @@ def _sigma_map(
     name: str,
     distance_m: float,
     points: Float[Numbers, "cells 2"] | None,
-    known: tuple[list[str], Float[np.ndarray, "n n"]],
+    known: tuple[list[str], Float[Any, "n n"]],
 ) -> SigmaMap:
     """The map of a camera of which the `_joint_covariance` is `known`."""
     interior, sensor = adjusted.unknowns.interior[name], adjusted.block.sensors[name]
@@ -91,11 +94,12 @@ def _sigma_map(
     own, covariance = known
     # Numbers as arrays, so that another value is not another program.
     arrays = jax.tree.map(lambda v: jnp.asarray(v, float), interior)
-    jacobian = np.asarray(call_compiled(_derivatives, arrays, jnp.asarray(xy), jnp.asarray(1 / distance_m)))
+    jacobian = still(call_compiled(_derivatives, arrays, jnp.asarray(xy), jnp.asarray(1 / distance_m)))
     kept = [*(parameter_names(interior).index(p) for p in own), *range(jacobian.shape[2] - 6, jacobian.shape[2])]
     rows = jacobian[:, :, kept]
-    found = np.einsum("nip,pq,njq->nij", rows, covariance, rows)
-    found[~regular_rays(interior, xy)] = np.nan
+    xp = namespace(rows, covariance)
+    found = xp.einsum("nip,pq,njq->nij", rows, covariance, rows)
+    found = xp.where(regular_rays(interior, xy)[:, None, None], found, np.nan)
     return SigmaMap(name, float(distance_m), xy, found)
 
 
@@ -120,12 +124,12 @@ def sigma_maps(adjusted: Adjustment) -> dict[str, tuple[SigmaMap, SigmaMap]]:
     return found
 
 
-def _cells(sensor: Sensor) -> Float[np.ndarray, "cells 2"]:
+def _cells(sensor: Sensor) -> Float[Numbers, "cells 2"]:
     across = sensor.width_px >= sensor.height_px
     return image_grid(sensor, *((_LONG, _SHORT) if across else (_SHORT, _LONG)))
 
 
-def _joint_covariance(adjusted: Adjustment, camera: str) -> tuple[list[str], Float[np.ndarray, "n n"]]:
+def _joint_covariance(adjusted: Adjustment, camera: str) -> tuple[list[str], Float[Any, "n n"]]:
     """The estimated parameters of the camera, and the covariance of them, of mean dtheta and of mean -R dX0."""
     prefix, labels = f"interior[{camera}].", adjusted.structure.labels
     places = [k for k, label in enumerate(labels) if label.startswith(prefix)]
@@ -133,10 +137,13 @@ def _joint_covariance(adjusted: Adjustment, camera: str) -> tuple[list[str], Flo
     shared = np.zeros((n, len(labels)))
     shared[np.arange(len(places)), places] = 1.0
     images = np.flatnonzero(np.array(adjusted.block.image_camera) == camera)
-    exterior = np.zeros((n, len(adjusted.block.images), 6))
+    exterior: Any = np.zeros((n, len(adjusted.block.images), 6))
     exterior[-6:-3, images, 3:] = np.eye(3)[:, None, :] / len(images)
-    turned = np.asarray(adjusted.unknowns.exterior.camera_from_object)[images]
-    exterior[-3:, images, :3] = -np.moveaxis(turned, 1, 0) / len(images)
+    turned = -still(adjusted.unknowns.exterior.camera_from_object)[images].swapaxes(0, 1) / len(images)
+    if is_traced(turned):
+        exterior = jnp.asarray(exterior).at[-3:, images, :3].set(turned)
+    else:
+        exterior[-3:, images, :3] = turned
     found = linear_forms(adjusted, n, exterior=exterior, shared=shared)
     return [labels[k].removeprefix(prefix) for k in places], found.variance
 

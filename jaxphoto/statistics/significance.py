@@ -12,6 +12,7 @@ from jaxphoto.camera import InteriorOrientation, get_parameter, parameter_unit, 
 from jaxphoto.compiling import call_compiled
 from jaxphoto.short_repr import shown
 from jaxphoto.statistics.covariance import Covariance
+from jaxphoto.tracing import outside_transformations
 
 SIGNIFICANCE_LEVEL = 0.05
 """Probability up to which "the true value is zero" is not believed."""
@@ -41,6 +42,7 @@ class Significance(eqx.Module):
         return self.p_value < SIGNIFICANCE_LEVEL
 
 
+@outside_transformations
 def significance(adjusted: Adjustment, covariance: Covariance) -> list[Significance]:
     """Of every estimated interior parameter, in the order of the cameras and their models."""
     sigma = dict(

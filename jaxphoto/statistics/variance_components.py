@@ -27,6 +27,7 @@ from jaxphoto.observations import AbstractObservations
 from jaxphoto.short_repr import shown
 from jaxphoto.statistics.partial_redundancy import PROBES, PartialRedundancy, partial_redundancy
 from jaxphoto.statistics.partition import Partition, Parts, parts_of
+from jaxphoto.tracing import outside_transformations
 
 MAX_ROUNDS = 60
 LEAST_DEGREES = 2.0
@@ -102,6 +103,7 @@ class _Step(NamedTuple):
         return self.is_weak & (self.change < 0) & ~moving.any()
 
 
+@outside_transformations
 def variance_components(
     adjusted: Adjustment,
     partition: Partition = ("xy-z",),

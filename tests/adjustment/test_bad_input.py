@@ -6,8 +6,9 @@ import equinox as eqx
 import numpy as np
 import pytest
 
-from jaxphoto import FIXED, FREE, DatumError, RankError, Weighted
+from jaxphoto import FIXED, FREE, DatumError, InputError, RankError, Smac, Weighted
 from jaxphoto.adjustment import solve
+from jaxphoto.adjustment.arguments import check_arguments
 from jaxphoto.block import Datum, Motion
 from jaxphoto.georeferencing import Mount, StripBias
 from jaxphoto.observations import Attitudes, ControlRows, StationRows
@@ -183,3 +184,53 @@ def test_what_can_be_seen_or_is_weighted_is_let_through(make, monkeypatch):
     block = make()
     with pytest.raises(_Passed):
         solve(block, block.start.unknowns, block.priors)
+
+
+# Arguments that do not belong together -----------------------------------------------------------------------
+
+
+def _other_distortion(block):
+    return eqx.tree_at(lambda b: b.start.unknowns.interior["one"].distortion, block, Smac())
+
+
+def _nan(where):
+    def changed(block):
+        values = np.array(where(block), float)
+        values.flat[4] = np.nan
+        return eqx.tree_at(where, block, values)
+
+    return changed
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (_other_distortion, r"interior\[one\].distortion: priors has Brown, the block Smac; .* block.with_distortion"),
+        (_nan(lambda b: b.stations.value), "stations: the value of station of image .* is NaN"),
+        (_nan(lambda b: b.image_points.xy), "image_points: the value of point .* in image .* is NaN"),
+        (_nan(lambda b: b.control.sigma), "control_points: the sigma of control point .* is NaN"),
+        (_nan(lambda b: b.start.unknowns.points), r"start.points\[1\]\[1\] \(of .*\) is NaN"),
+    ],
+)
+def test_blocks_that_cannot_be_computed_are_named(change, message):
+    block = change(simulated("cross").block)
+    with pytest.raises(InputError, match=message):
+        check_arguments(block, block.start.unknowns, block.priors)
+
+
+def test_trees_of_another_kind_are_named():
+    block = simulated("cross").block
+    start = block.start.unknowns
+    for wrong, message in (
+        (block.start, "start is of the type Start: give Unknowns, such as adjusted.unknowns"),
+        (dataclasses.replace(start, interior={"two": start.interior["one"]}), "start has no camera 'one', .* two"),
+        (dataclasses.replace(start, points=start.points[:-1]), r"start.points has the shape \(\d+, 3\), the block"),
+    ):
+        with pytest.raises(InputError, match=message):
+            check_arguments(block, wrong, block.priors)
+
+
+def test_lists_are_arrays():
+    rows = ControlRows([0, 1], [2, 2], [1.0, 2.0], [0.1, 0.1])
+    assert rows.value.dtype == float and rows.who.dtype.kind == "i"
+    assert Mount([0.1, 0.2, 0.3], [0.0, 0.0, 0.0]).lever_arm.shape == (3,)

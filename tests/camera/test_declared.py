@@ -94,7 +94,7 @@ def test_block_toml_holds_it_and_gives_it_back():
     read = read_settings(tomllib.loads(text)).cameras["own"]
     assert type(read.interior.distortion) is Tangent and read.interior.distortion.way == "in"
     assert float(read.interior.distortion.s) == 30.0 and float(read.interior.projection.skew) == 0.01
-    assert read.priors.distortion.a is FREE and read.priors.projection.skew is FIXED
+    assert read.priors.distortion.a == FREE and read.priors.projection.skew == FIXED
     for name in parameter_names(OWN):
         assert float(get_parameter(read.interior, name)) == float(get_parameter(OWN, name))
 

@@ -98,7 +98,7 @@ def rolling():
 def with_shutter(block, motions, readout=FREE, velocity=FIXED, rate=FIXED):
     own = {name: ImageMotion(m[:3], m[3:]) for name, m in zip(block.images, motions, strict=True)}
     more = {"shutters": {"one": RollingShutter(np.float64(0.0))}, "motions": own}
-    known = lambda value, sigma: FIXED if sigma is FIXED else Weighted(value, sigma)  # noqa: E731
+    known = lambda value, sigma: FIXED if sigma == FIXED else Weighted(value, sigma)  # noqa: E731
     of_each = {name: ImageMotion(known(m.velocity, velocity), known(m.rate, rate)) for name, m in own.items()}
     priors = {"shutters": {"one": RollingShutter(readout)}, "motions": of_each}
     start = dataclasses.replace(block.start.unknowns, more=more)

@@ -94,7 +94,7 @@ def test_what_a_problem_becomes(write):
         assert isinstance(interior.distortion, BundlerRadial)
         values = [float(get_parameter(interior, n)) for n in parameter_names(interior)]
         np.testing.assert_allclose(values, [f / 1000, 0, 0, k1, k2], rtol=1e-15)
-        assert {n for n in parameter_names(priors) if get_parameter(priors, n) is FREE} == {"c_mm", "k1", "k2"}
+        assert {n for n in parameter_names(priors) if get_parameter(priors, n) == FREE} == {"c_mm", "k1", "k2"}
         assert sensor.pixel_mm == 0.001
         largest = np.abs([xy for (c, _), xy in zip(OBSERVED, XY, strict=True) if str(c) == name]).max(0)
         assert (np.array([sensor.width_px, sensor.height_px]) / 2 >= largest).all()

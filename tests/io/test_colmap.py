@@ -115,7 +115,7 @@ def test_a_model_is_read_as_colmap_means_it(tmp_path, write):
     centres = -np.einsum("nji,nj->ni", ROTATIONS.as_matrix(), TRANSLATIONS)
     np.testing.assert_allclose(block.start.unknowns.exterior.position, centres[[1, 0, 2]], atol=1e-12)
     (priors,) = block.priors.interior.values()
-    free = {name for name in parameter_names(priors) if get_parameter(priors, name) is FREE}
+    free = {name for name in parameter_names(priors) if get_parameter(priors, name) == FREE}
     assert free == {"c_mm", "xp_mm", "yp_mm", "k1", "k2", "p1", "p2", "b1"}
     assert block.datum.kind == "inner"
 
@@ -144,7 +144,7 @@ def test_cameras_are_free_in_what_their_model_has(tmp_path, model, params, free)
 
     block = read_source(write_text(tmp_path / "model", change), "colmap")
     (priors,), (interior,) = block.priors.interior.values(), block.start.unknowns.interior.values()
-    names = {name for name in parameter_names(priors) if get_parameter(priors, name) is FREE}
+    names = {name for name in parameter_names(priors) if get_parameter(priors, name) == FREE}
     assert names == free | {"c_mm", "xp_mm", "yp_mm"}
     if model == "FULL_OPENCV":
         values = [float(get_parameter(interior, n)) for n in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")]

@@ -30,7 +30,7 @@ def reported(text, name):
 
 def free(block):
     (priors,) = block.priors.interior.values()
-    return {name for name in parameter_names(priors) if get_parameter(priors, name) is FREE}
+    return {name for name in parameter_names(priors) if get_parameter(priors, name) == FREE}
 
 
 def test_sxb(data_dir):
@@ -126,7 +126,7 @@ def test_aicon(data_dir):
     camera = block.start.unknowns.interior["1"]
     assert isinstance(camera.distortion, Balanced)
     assert (float(camera.c), float(camera.distortion.r0)) == (28.78507, 13.488)
-    assert block.priors.interior["1"].distortion.r0 is FIXED
+    assert block.priors.interior["1"].distortion.r0 == FIXED
 
     # The files hold the adjusted values to 1e-4 mm and 1e-8 rad: their residuals are the report's.
     v = residuals(block, block.start.unknowns.exterior, block.start.unknowns.points)

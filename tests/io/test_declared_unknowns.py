@@ -208,8 +208,8 @@ model = "ciddor"
     start, priors = block.start.unknowns.more, block.priors.more
     assert block.partitions == {"hour": ("8", "9", "9")}
     np.testing.assert_array_equal(start["flight_bias"][""].shift, [0.1, 0.2, 0.3])
-    assert priors["flight_bias"][""].shift is FREE
-    assert priors["flight_bias"][""].drift is FIXED
+    assert priors["flight_bias"][""].shift == FREE
+    assert priors["flight_bias"][""].drift == FIXED
     assert float(priors["camera_rates"]["kodak"].c_rate.sigma) == 1e-3
     assert float(start["camera_rates"]["kodak"].k1_rate) == 1e-7
     assert list(start["refractivity"]) == ["8", "9"]

@@ -51,8 +51,8 @@ def test_start_and_priors(write_folder):
     np.testing.assert_array_equal(block.start.point_known, [True, True, True, False])
     np.testing.assert_array_equal(start.points, [[1, 2, 3], [2.5, 2.5, 4], [5, 6, 7], [0, 0, 0]])
     assert float(start.interior["kodak"].distortion.k1) == -1e-4
-    assert priors.interior["kodak"].c is FREE
-    assert priors.interior["kodak"].x_p is FIXED
+    assert priors.interior["kodak"].c == FREE
+    assert priors.interior["kodak"].x_p == FIXED
     weighted = priors.interior["kodak"].distortion.k1
     assert isinstance(weighted, Weighted)
     assert (float(weighted.value), float(weighted.sigma)) == (-1e-4, 2e-5)
@@ -62,12 +62,12 @@ def test_start_and_priors(write_folder):
     np.testing.assert_array_equal(start.mounts["default"].lever_arm, [0.1, 0.2, -0.3])
     np.testing.assert_allclose(start.mounts["default"].boresight, np.deg2rad([0.5, 0, -0.25]))
     np.testing.assert_array_equal(priors.mounts["default"].lever_arm.sigma, [0.01] * 3)
-    assert priors.mounts["default"].boresight is FREE
+    assert priors.mounts["default"].boresight == FREE
     assert block.image_strip == ("one", "one", "two")
     assert set(start.strips) == {"one", "two"}
     np.testing.assert_array_equal(block.image_time, [-1, 1, 0])
-    assert priors.exterior.position is FREE
-    assert priors.points is FREE
+    assert priors.exterior.position == FREE
+    assert priors.points == FREE
 
 
 def test_angles_use_the_files_unit(write_folder):
@@ -89,8 +89,8 @@ def test_own_mount_and_strip_override_the_default(write_folder):
     )
     assert block.image_mount == ("kodak",) * 3
     assert set(block.start.unknowns.mounts) == set(block.priors.mounts) == {"kodak"}
-    assert block.priors.strips["one"].drift is FREE
-    assert block.priors.strips["two"].drift is FIXED
+    assert block.priors.strips["one"].drift == FREE
+    assert block.priors.strips["two"].drift == FIXED
 
 
 def test_smallest_folder(write_folder):
@@ -179,7 +179,7 @@ def test_smac_has_a_balance_radius_and_a_sign(write_folder):
     distortion = block.start.unknowns.interior["kodak"].distortion
     assert isinstance(distortion, Smac)
     assert (distortion.sign, float(distortion.r0)) == ("add", 1.5)
-    assert block.priors.interior["kodak"].distortion.r0 is FIXED
+    assert block.priors.interior["kodak"].distortion.r0 == FIXED
 
 
 @pytest.mark.parametrize(
@@ -197,8 +197,8 @@ def test_additional_parameters_have_a_constant_that_is_given(write_folder, name,
     distortion, priors = (tree.interior["kodak"].distortion for tree in (block.start.unknowns, block.priors))
     assert type(distortion) is model
     assert (float(getattr(distortion, constant)), float(getattr(distortion, coefficient))) == (1.5, 1e-9)
-    assert getattr(priors, constant) is FIXED
-    assert [name for name in model.coefficients if getattr(priors, name) is FREE] == [coefficient]
+    assert getattr(priors, constant) == FIXED
+    assert [name for name in model.coefficients if getattr(priors, name) == FREE] == [coefficient]
 
 
 IDLE = """\

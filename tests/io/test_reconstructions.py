@@ -62,7 +62,7 @@ def misfits_px(block):
 
 def free_of(block, camera):
     priors = block.priors.interior[camera]
-    return {name for name in parameter_names(priors) if get_parameter(priors, name) is FREE}
+    return {name for name in parameter_names(priors) if get_parameter(priors, name) == FREE}
 
 
 # OpenSfM ------------------------------------------------------------------------------------------------------------

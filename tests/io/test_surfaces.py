@@ -42,7 +42,7 @@ def test_read(folder):
     np.testing.assert_array_equal(rows.normal, [[0, 0.6, 0.8], [0, 0, 1]])
     np.testing.assert_array_equal(rows.turn[1], [30, 700, 0])
     np.testing.assert_allclose(np.rad2deg(scanner.boresight), [0.1, -0.2, 0.3], rtol=1e-14)
-    assert priors.boresight is FREE and priors.shifts["east"] is FREE
+    assert priors.boresight == FREE and priors.shifts["east"] == FREE
     assert isinstance(priors.shifts["west"], Weighted) and float(priors.shifts["west"].sigma[2]) == 0.3
 
 

@@ -206,6 +206,6 @@ def test_a_failed_write_leaves_nothing(write_folder, tmp_path, monkeypatch):
 def test_free_stays_free(write_folder, tmp_path):
     write_block(read_block(write_folder()), tmp_path / "copy")
     priors = read_block(tmp_path / "copy").priors
-    assert priors.interior["kodak"].c is FREE
-    assert priors.interior["kodak"].y_p is FIXED
+    assert priors.interior["kodak"].c == FREE
+    assert priors.interior["kodak"].y_p == FIXED
     assert isinstance(priors.interior["kodak"].distortion.k1, Weighted)

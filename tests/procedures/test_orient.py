@@ -143,7 +143,7 @@ def observed_camera(block):
     """Priors that observe all of the camera that is not held."""
     priors, start = block.priors.interior["camera"], block.start.unknowns.interior["camera"]
     for name in parameter_names(priors):
-        if get_parameter(priors, name) is not FIXED:
+        if get_parameter(priors, name) != FIXED:
             priors = set_parameter(priors, name, Weighted(float(get_parameter(start, name)), 1.0))
     return dataclasses.replace(block.priors, interior={"camera": priors})
 

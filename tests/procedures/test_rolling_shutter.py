@@ -62,7 +62,7 @@ def test_a_block_gets_the_motions_of_its_simulation():
     given = with_rolling_shutter(block, taken, 0.1, known=started)
     for name, own in truth.more["motions"].items():
         np.testing.assert_allclose(given.start.unknowns.more["motions"][name].velocity, own.velocity, atol=1e-6)
-    assert given.priors.more["shutters"]["kodak"].readout is FREE
+    assert given.priors.more["shutters"]["kodak"].readout == FREE
     with pytest.raises(InputError, match="only 0 of 14 photographs have neighbours in time"):
         with_rolling_shutter(block, {}, 0.1)
 

@@ -41,7 +41,7 @@ def test_every_exposure_sees_through_the_camera_of_its_time():
 def test_the_block_knows_what_the_recipe_says_and_truth_is_told():
     block, truth, _ = made(RATES)
     start, prior = block.start.unknowns.more["camera_rates"]["kodak"], block.priors.more["camera_rates"]["kodak"]
-    assert float(start.c_rate) == 0.0 and prior.c_rate is FREE and float(prior.xp_rate.sigma) == 0.4
+    assert float(start.c_rate) == 0.0 and prior.c_rate == FREE and float(prior.xp_rate.sigma) == 0.4
     assert float(truth.more["camera_rates"]["kodak"].c_rate) == 0.5
     unknowing = made({"camera_rates": {"default": {"truth": TRUE}}})
     assert not unknowing.block.start.unknowns.more

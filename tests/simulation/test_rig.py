@@ -189,7 +189,7 @@ def test_a_delay_goes_through_files_and_needs_the_motion(tmp_path):
     write_simulation(late(), tmp_path / "block")
     again = read_block(tmp_path / "block")
     np.testing.assert_allclose(again.motion.rate[::2], late().block.motion.rate[::2], rtol=1e-12)
-    assert again.priors.more["rig_cameras"]["oblique"].delay is FREE
+    assert again.priors.more["rig_cameras"]["oblique"].delay == FREE
     table = pd.read_csv(tmp_path / "block/attitudes.csv")
     table.loc[table.image == "A_03", [c for c in table.columns if "rate" in c]] = np.nan
     table.to_csv(tmp_path / "block/attitudes.csv", index=False)

@@ -152,7 +152,7 @@ def test_shift_and_drift_of_a_strip_grow_from_the_mean_time():
     np.testing.assert_allclose(simulation.block.image_time[:5], seconds, atol=1e-12)
     # The model of every strip is the default's; truth is each one's own.
     assert list(simulation.block.start.unknowns.strips) == ["A", "B", "C"]
-    assert simulation.block.priors.strips["A"].shift is FREE
+    assert simulation.block.priors.strips["A"].shift == FREE
     np.testing.assert_array_equal(simulation.block.start.unknowns.strips["A"].shift, [0.1, 0, 0])
 
 
@@ -187,7 +187,7 @@ def test_lever_arm_and_boresight_of_the_truth():
     np.testing.assert_allclose(turn, np.tile(first_order, (14, 1, 1)), atol=1e-4)
     start = simulation.block.start.unknowns.mounts["default"]
     assert not np.any(start.lever_arm) and not np.any(start.boresight)
-    assert simulation.block.priors.mounts["default"].boresight is FREE
+    assert simulation.block.priors.mounts["default"].boresight == FREE
 
 
 def test_time_offset_moves_stations_back_and_attitudes_on():

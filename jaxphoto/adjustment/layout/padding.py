@@ -7,7 +7,8 @@ and put back in the block's own order. Ids stay outside: no program depends on t
 """
 
 import dataclasses
-from typing import Any, NamedTuple
+import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -23,15 +24,35 @@ from jaxphoto.adjustment.model.observed_groups import ObservedGroup, RowsAtPoint
 from jaxphoto.adjustment.model.structure import Structure
 from jaxphoto.arrays import still
 from jaxphoto.short_repr import shown
+from jaxphoto.static_values import Content
 
 
 @shown
-class TiledBlock(NamedTuple):
-    """A block as given and in tiles, and the way from one to the other."""
+@dataclasses.dataclass(frozen=True, eq=False)
+class TiledBlock:
+    """A block as given and in tiles, and the way from one to the other.
+
+    Compared by its content and hashed once: to `Adjustment` it is structure, not numbers.
+    """
 
     own: Structure
     structure: TiledStructure
     places: Places
+
+    @functools.cached_property
+    def _content(self) -> tuple[Any, ...]:
+        arrays, structure = jax.tree.flatten((self.own, self.structure, self.places))
+        return structure, *(Content(np.asarray(array)) for array in arrays)
+
+    @functools.cached_property
+    def _hash(self) -> int:
+        return hash(self._content)
+
+    def __hash__(self) -> int:
+        return self._hash
+
+    def __eq__(self, other: object) -> bool:
+        return self is other or (isinstance(other, TiledBlock) and self._content == other._content)
 
     def pad(self, values: Values) -> TiledValues:
         """Numbers of the block in its tiles."""

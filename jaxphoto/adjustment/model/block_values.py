@@ -51,7 +51,7 @@ def values_of(
 
 def _floats(x: Any) -> Any:
     """A float64 array: numpy's where nothing is traced, because its operations need no compilation."""
-    return x if isinstance(x, jax.core.Tracer) else np.asarray(x, float)
+    return jnp.asarray(x, float) if isinstance(x, jax.core.Tracer) else np.asarray(x, float)
 
 
 def with_datum(values: SomeValues, eop: Numbers, points: Numbers) -> SomeValues:

@@ -32,6 +32,7 @@ from jaxphoto.observations import (
     RotationRows,
     correlated,
 )
+from jaxphoto.static_values import with_plain_arrays
 from jaxphoto.unknowns import Unknowns, Weighted, check_prior
 
 RowElimination = Literal["reduced", "point", "coupled"]
@@ -258,13 +259,13 @@ def image_tables(tables: Sequence[ParameterTable]) -> list[ParameterTable]:
 
 def indices_of(rows: AbstractObservations) -> AbstractObservations:
     """The rows without their numbers, rows last."""
-    whole = eqx.filter(rows, lambda v: not _is_number(v))
+    whole = eqx.filter(with_plain_arrays(rows), lambda v: not _is_number(v))
     return jax.tree.map(lambda v: np.moveaxis(np.asarray(v), 0, -1), whole)
 
 
 def numbers_in(rows: AbstractObservations) -> AbstractObservations:
     """The numbers of the rows without their indices, rows last; float64."""
-    whole = eqx.filter(rows, _is_number)
+    whole = eqx.filter(with_plain_arrays(rows), _is_number)
 
     def last(v: Any) -> Any:
         traced = isinstance(v, jax.core.Tracer)

@@ -197,7 +197,7 @@ def structure_of(block: Block, priors: Unknowns, observed: ObservedRows | None =
         raise ValueError("control holds a coordinate of a point twice: keep one row of each")
     given = observed_in(block, priors) if observed is None else observed
     tables, entries = given.tables, given.entries
-    free = np.array([k for k, e in enumerate(entries) if e.prior is not FIXED], dtype=np.int32)
+    free = np.array([k for k, e in enumerate(entries) if e.prior != FIXED], dtype=np.int32)
     unknown_of = np.full(len(entries) + 1, len(free), np.int32)
     unknown_of[free] = np.arange(len(free))
     colour, column, n_image_colours = _colours(block, given, free)
@@ -206,12 +206,12 @@ def structure_of(block: Block, priors: Unknowns, observed: ObservedRows | None =
     cameras = places_of_cameras(given.cameras)
     groups = tuple(group_of(name, rows, tables, cameras, unknown_of, len(free)) for name, rows in given.named)
 
-    point_free = np.ones((3, len(block.points))) * (priors.points is not FIXED)
+    point_free = np.ones((3, len(block.points))) * (priors.points != FIXED)
     point_free[block.fixed.axis, block.fixed.who] = 0.0
     _check_coupled(block, groups, point, point_free)
     eop_free = np.ones((6, len(block.images)))
-    eop_free[:3] *= priors.exterior.position is not FIXED
-    eop_free[3:] *= priors.exterior.camera_from_object is not FIXED
+    eop_free[:3] *= priors.exterior.position != FIXED
+    eop_free[3:] *= priors.exterior.camera_from_object != FIXED
     return Structure(
         groups=tuple(with_free(g, free, tables) for g in given.cameras),
         tables=tables,

@@ -7,7 +7,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
-import jax
 import numpy as np
 import pandas as pd
 
@@ -36,6 +35,7 @@ from jaxphoto.io.block_folder.table_layout import (
 from jaxphoto.io.block_folder.tables import declared_tables, kinds_of, layouts
 from jaxphoto.io.names import harm_in, harmless
 from jaxphoto.observations import OBSERVATIONS, AbstractCoordinates
+from jaxphoto.tracing import outside_transformations
 from jaxphoto.unknowns import FIXED, FREE
 from jaxphoto.writing import Clashes, check_folder, whole_folder
 
@@ -45,6 +45,7 @@ def check_block_target(folder: Path, *inputs: Path) -> None:
     check_folder(folder, *inputs, clashes=_tables_of(OBSERVATIONS))
 
 
+@outside_transformations
 def write_block(block: Block, folder: str | Path) -> None:
     """Write `block` as a folder that `read_block` reads as the same block; numbers come back exactly.
 
@@ -100,7 +101,7 @@ def _write_files(block: Block, folder: Path) -> None:
 
 def _settings(block: Block) -> dict[str, Any]:
     start, priors = block.start.unknowns, block.priors
-    if any(p is not FREE for p in jax.tree.leaves(priors.points)):
+    if priors.points != FREE:
         raise BlockError("block.toml can only say FREE of object points; reset their priors")
     cameras = {
         name: camera_section(Camera(block.sensors[name], start.interior[name], priors.interior[name]))
@@ -142,11 +143,12 @@ def _tables_of(kinds: Iterable[Kind]) -> Clashes:
 
 def _mode_section(block: Block) -> dict[str, str]:
     """Nothing, or that the exterior orientation is held; what it was computed from must be gone (`variants.direct`)."""
-    priors = set(jax.tree.leaves(block.priors.exterior))
-    if priors == {FREE}:
+    exterior = block.priors.exterior
+    priors = (exterior.position, exterior.camera_from_object)
+    if priors == (FREE, FREE):
         return {}
     sensors = len(block.stations.who) or len(block.attitudes.image)
-    if priors == {FIXED} and block.start.image_known.all() and not sensors:
+    if priors == (FIXED, FIXED) and block.start.image_known.all() and not sensors:
         return {"mode": "direct"}
     raise BlockError(
         "block.toml can say of exterior orientation that all of it is FREE, or FIXED at known values and no station or "

@@ -117,7 +117,7 @@ def camera_section(camera: Camera) -> dict[str, Any]:
 def status(prior: Any, start, scale: float = 1.0) -> str | dict[str, Any]:
     """How block.toml writes a prior of an unknown whose start is `start`; `scale` is as in `Section.prior`."""
     if isinstance(prior, Prior):
-        return prior.value
+        return prior.name.lower()
     if not isinstance(prior, Weighted):
         raise BlockError(f"{prior!r} is no prior; use FREE, FIXED or Weighted(value, sigma)")
     if prior.covariance is None:

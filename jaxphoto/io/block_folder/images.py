@@ -93,7 +93,7 @@ def check_times(images: Images, strips: dict, priors: dict) -> None:
     """Raise BlockError where a drift needs a time that is missing."""
     for i, strip in enumerate(images.strips):
         if strip in strips and not images.time_known[i]:
-            drifts = priors[strip].drift is not FIXED or np.any(np.asarray(strips[strip].drift) != 0)
+            drifts = priors[strip].drift != FIXED or np.any(np.asarray(strips[strip].drift) != 0)
             if drifts:
                 raise images.table.misfit(
                     i,
@@ -111,7 +111,7 @@ def check_rates(images: Images, starts: Unknowns, priors: Unknowns) -> None:
     for rates in RATES:
         column, known = columns[rates.along]
         changing = {
-            name: any(prior is not FIXED for prior in vars(priors.more[rates.kind][name]).values())
+            name: any(prior != FIXED for prior in vars(priors.more[rates.kind][name]).values())
             or any(np.any(np.asarray(rate) != 0) for rate in vars(start).values())
             for name, start in starts.more.get(rates.kind, {}).items()
         }

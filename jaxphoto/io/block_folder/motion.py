@@ -3,7 +3,6 @@
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
 from jaxphoto.arrays import on_device
@@ -56,7 +55,7 @@ def check_time_offsets(
         for kind in (RelativePositions, RelativeAttitudes)
     )
     offset = {
-        name for name, mount in mounts.items() if priors[name].time_offset is not FIXED or float(mount.time_offset) != 0
+        name for name, mount in mounts.items() if priors[name].time_offset != FIXED or float(mount.time_offset) != 0
     }
     uses = np.array([mount in offset for mount in image_mount])
     for who, known, table, columns in (
@@ -78,8 +77,8 @@ def without_heads(flight: ObservedFlight, images: Images, image_mount: tuple[str
     stations, attitudes = flight.stations, flight.attitudes
     own, turned = ~head[np.asarray(stations.who)], ~head[np.asarray(attitudes.image)]
     return flight._replace(
-        stations=jax.tree.map(lambda v: np.asarray(v)[own], stations),
-        attitudes=jax.tree.map(lambda v: np.asarray(v)[turned], attitudes),
+        stations=stations.take(own),
+        attitudes=attitudes.take(turned),
     )
 
 

@@ -24,7 +24,7 @@ def check_shutters(images: Images, starts: Unknowns, priors: Unknowns) -> None:
     for camera, shutter in shutters.items():
         place = f"{TOML}, [unknowns.{RollingShutter.kind}.{camera}]"
         readout, prior = abs(float(shutter.readout)), known_before[camera].readout
-        known = prior is FIXED or (isinstance(prior, Weighted) and float(prior.sigma) < _FASTEST_MS)
+        known = prior == FIXED or (isinstance(prior, Weighted) and float(prior.sigma) < _FASTEST_MS)
         if readout > _SLOWEST_MS or (known and 0 < readout < _FASTEST_MS):
             raise BlockError(
                 f"{place} readout_ms: {float(shutter.readout):g} ms cannot be; give milliseconds, of most cameras 5 to "

@@ -66,7 +66,7 @@ def _changes(kind: type[AbstractParameters], section: Section, owners: Sequence[
         same = {word: v for word, v in told.items() if word in static or word in [key.start for key in keys]}
         true, spread = read_parameters(kind, Section(truth.file, truth.path, same | dict(truth.values)))
         for field in dynamic_fields(kind):
-            if getattr(spread, field) is FREE:
+            if getattr(spread, field) == FREE:
                 raise truth.error(field, "what is true is not free; give its value, or the sigma that it is drawn by")
         model: Any = read_parameters(kind, Section(own.file, own.path, told)) if told else None
         changes[name] = SimulatedChange(true, spread, model)

@@ -13,12 +13,14 @@ from jaxphoto.io.result_tables import read_table
 from jaxphoto.observations import AXES
 from jaxphoto.simulation import Simulation
 from jaxphoto.simulation.flight import omega_phi_kappa
+from jaxphoto.tracing import outside_transformations
 
 FOLDER = "truth"
 _SCANNER = "scanner"
 _DRIFT = "trajectory_errors"
 
 
+@outside_transformations
 def write_simulation(simulation: Simulation, folder: str | Path) -> None:
     """Write the block as `write_block` does, with the truth in its sub-folder `truth` (docs/simulation.md).
 

@@ -131,7 +131,7 @@ def simultaneous(
         )
     # In the order of the cloud's strips.
     priors = Scanner(priors.boresight, {name: priors.shifts[name] for name in names})
-    if priors.boresight is not FIXED and not timed:
+    if priors.boresight != FIXED and not timed:
         raise InputError(
             "the boresight of the scanner needs its trajectory and the time of each laser point, which say from where "
             "a point was measured: give them, or hold the boresight fixed"

@@ -156,7 +156,7 @@ def adjust_strips(
             "trajectory (--trajectory), or say nothing of the scanner"
         )
     priors = ScannerPriors() if priors is None else priors
-    if priors.calibration.pattern == "circle" and priors.calibration.time_offset is not FIXED:
+    if priors.calibration.pattern == "circle" and priors.calibration.time_offset != FIXED:
         raise InputError(
             "the time offset of a scanner that looks all around is not estimated, because what it sees of one plane is "
             "seconds apart: leave out time-offset, and shift the trajectory (--trajectory-shift-s)"

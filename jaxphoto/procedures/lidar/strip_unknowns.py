@@ -62,7 +62,7 @@ class ScannerPriors(NamedTuple):
     def right(self) -> bool:
         """Whether nothing of the scanner is estimated."""
         calibration = (getattr(self.calibration, name) for name in dynamic_fields(ScannerCalibration))
-        return all(prior is FIXED for prior in (self.boresight, *calibration))
+        return all(prior == FIXED for prior in (self.boresight, *calibration))
 
 
 def strip_block(

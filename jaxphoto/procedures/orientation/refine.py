@@ -60,7 +60,7 @@ def calibration_of(block: Block) -> SelfCalibration:
     """What a free network of the images of `block` estimates: all that its priors do not hold fixed."""
     names, unit, begin = {}, {}, {}
     for camera, priors in block.priors.interior.items():
-        names[camera] = tuple(n for n in parameter_names(priors) if get_parameter(priors, n) is not FIXED)
+        names[camera] = tuple(n for n in parameter_names(priors) if get_parameter(priors, n) != FIXED)
         sensor, interior = block.sensors[camera], block.start.unknowns.interior[camera]
         corner = np.array([sensor.width_mm, sensor.height_mm]) / 2
         unit[camera] = {n: float(np.linalg.norm(corner)) / _at_corner(interior, n, corner) for n in names[camera]}

@@ -1,0 +1,94 @@
+"""Checks of the arguments of an adjustment that no number is computed for: kinds, shapes, and numbers that are none."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxphoto.arrays import still
+from jaxphoto.block import Block
+from jaxphoto.errors import InputError
+from jaxphoto.unknowns import Unknowns, is_prior
+
+
+def check_arguments(block: Any, start: Any, priors: Any) -> None:
+    """Raise InputError for arguments that cannot belong together; traced numbers are not looked at."""
+    if not isinstance(block, Block):
+        raise InputError(f"adjust takes a Block first, got {type(block).__name__}")
+    for name, tree, cure in (
+        ("start", start, "adjusted.unknowns or block.start.unknowns"),
+        ("priors", priors, "block.priors, or what jaxphoto.default_priors makes of the start values"),
+    ):
+        if not isinstance(tree, Unknowns):
+            raise InputError(f"{name} is of the type {type(tree).__name__}: give Unknowns, such as {cure}")
+        _check_owners(name, tree, block.start.unknowns)
+    _check_shapes(block, start)
+    for place in _no_numbers(block, start, priors):
+        raise InputError(f"{place} is NaN or infinite: give a number, or leave it out")
+
+
+def _check_owners(name: str, tree: Unknowns, known: Unknowns) -> None:
+    """Raise InputError where cameras, or models of cameras, are not those of the block."""
+    for camera, interior in known.interior.items():
+        own = tree.interior.get(camera)
+        if own is None:
+            raise InputError(
+                f"{name} has no camera {camera!r}, which the block has; it has {', '.join(tree.interior) or 'none'}"
+            )
+        for part in ("distortion", "projection"):
+            given, wanted = getattr(own, part), getattr(interior, part)
+            kinds: list[Any] = [jax.tree.structure(part_of, is_leaf=is_prior) for part_of in (given, wanted)]
+            if kinds[0] != kinds[1]:
+                found = f"another {type(given).__name__}" if type(given) is type(wanted) else type(given).__name__
+                raise InputError(
+                    f"interior[{camera}].{part}: {name} has {found}, the block {type(wanted).__name__}; exchange start "
+                    f'values and priors together, as block.with_distortion("{camera}", ...) does'
+                )
+
+    for kind, owners in known.tables.items():
+        for owner in owners:
+            if owner not in tree.tables.get(kind, {}):
+                raise InputError(f"{name} lacks {kind}[{owner}]: take it from block.start.unknowns")
+
+
+def _check_shapes(block: Block, start: Unknowns) -> None:
+    n, m = len(block.images), len(block.points)
+    for label, value, shape in (
+        ("exterior.position", start.exterior.position, (n, 3)),
+        ("exterior.camera_from_object", start.exterior.camera_from_object, (n, 3, 3)),
+        ("points", start.points, (m, 3)),
+    ):
+        if np.shape(value) != shape:
+            raise InputError(
+                f"start.{label} has the shape {np.shape(value)}, the block needs {shape} for {n} images and {m} points"
+            )
+
+
+def _no_numbers(block: Block, start: Unknowns, priors: Unknowns) -> Iterator[str]:
+    """Labels of the numbers that are none."""
+    for group, rows in block.named_observations.items():
+        for name, values in (("value", rows.observation), ("sigma", rows.sigmas)):
+            # An infinite standard deviation means no weight.
+            bad = _bad(values, may_be_infinite=name == "sigma")
+            if bad is not None:
+                words = np.broadcast_to(rows.words(block.images, block.points), np.shape(np.asarray(values).T))
+                yield f"{group}: the {name} of {words.T[bad]}"
+    for tree, label in ((start, "start"), (priors, "priors")):
+        for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
+            bad = _bad(leaf)
+            if bad is not None:
+                at = "".join(f"[{k}]" for k in bad)
+                names = {"position": block.images, "camera_from_object": block.images, "points": block.points}
+                owner = names.get(getattr(path[-1], "name", ""))
+                of = f" (of {owner[bad[0]]})" if owner and bad else ""
+                yield f"{label}{jax.tree_util.keystr(path)}{at}{of}"
+
+
+def _bad(values: Any, may_be_infinite: bool = False) -> tuple[int, ...] | None:
+    """The index of the first number that is NaN or infinite; None where there is none, and where they are traced."""
+    array = still(values)
+    if isinstance(array, jax.core.Tracer) or array.dtype.kind != "f":
+        return None
+    wrong = np.isnan(array) if may_be_infinite else ~np.isfinite(array)
+    return tuple(int(k) for k in np.argwhere(wrong)[0]) if wrong.any() else None

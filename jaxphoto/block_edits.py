@@ -1,0 +1,183 @@
+"""Edits of a block: other priors, cameras, control, stations. Numbers may be traced by JAX; names may not."""
+
+import dataclasses
+from collections.abc import Callable, Collection, Mapping
+from typing import Any, Self
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from jaxphoto.arrays import namespace
+from jaxphoto.camera import (
+    AbstractDistortion,
+    InteriorOrientation,
+    Sensor,
+    get_parameter,
+    parameter_names,
+    set_parameter,
+)
+from jaxphoto.errors import InputError
+from jaxphoto.short_repr import from_upstairs
+from jaxphoto.unknowns import FIXED, FREE, weighted, with_prior
+
+
+class BlockEdits(eqx.Module):
+    """The methods of a `Block` that return an edited copy."""
+
+    def fix(self, *names: str, of: str | None = None) -> Self:
+        """A copy in which parameters are held at their start values: `block.fix("k2")`.
+
+        Names are those of tables (`c_mm`, `k1`), fields of mounts and strips (`lever_arm`, `shift`), and `position`,
+        `rotation` (all images) and `points`. `of` names the camera, mount or strip; all that have it without. Raises
+        InputError for a parameter that the block has not, and where none is named.
+        """
+        return self._with_priors(names, lambda start: FIXED, of)
+
+    def free(self, *names: str, of: str | None = None) -> Self:
+        """A copy in which parameters are free; names as in `fix`."""
+        return self._with_priors(names, lambda start: FREE, of)
+
+    def weigh(self, name: str, sigma: Any, value: Any = None, of: str | None = None) -> Self:
+        """A copy in which a parameter is observed with `sigma`, in its own unit (mm, m, rad), names as in `fix`.
+
+        The observed `value` is the start value unless one is given; that of all positions, rotations or points has to
+        be. Raises InputError for a sigma that is not above zero, and for what is no number or of another shape.
+        """
+        if value is None and name in ("position", "rotation", "points"):
+            raise InputError(f"weigh({name!r}) needs a value beside its sigma: where it starts, nobody observed it")
+        return self._with_priors(
+            (name,), lambda start: weighted(name, start, start if value is None else value, sigma), of
+        )
+
+    def with_camera(
+        self,
+        camera: str,
+        interior: InteriorOrientation,
+        free: Collection[str] | None = None,
+        sensor: Sensor | None = None,
+    ) -> Self:
+        """A copy in which `camera` has another interior orientation, with priors for it.
+
+        `free` names the parameters that are estimated; all others are FIXED. Without it, parameters keep the priors
+        that the block has for their names, and new ones are FIXED. Raises InputError for a camera that the block does
+        not have, and for a parameter that `interior` does not have.
+        """
+        block: Any = self
+        name, others = one_camera(block, camera), parameter_names(interior) if free is None else ()
+        priors = priors_of_camera(interior, block.priors.interior[name], free or (), others)
+        changed = with_interior(block, name, interior, priors)
+        return changed if sensor is None else dataclasses.replace(changed, sensors={**block.sensors, name: sensor})
+
+    def with_distortion(self, camera: str, distortion: AbstractDistortion, free: Collection[str] = ()) -> Self:
+        """A copy in which `camera` has another distortion: `block.with_distortion("kodak", Smac(), free=("k1", "k2"))`.
+
+        `free` names the coefficients that are estimated; its others are FIXED, and c_mm, xp_mm and yp_mm keep their
+        priors. Raises InputError as `with_camera` does.
+        """
+        block: Any = self
+        name = one_camera(block, camera)
+        interior = dataclasses.replace(block.start.unknowns.interior[name], distortion=distortion)
+        others = set(parameter_names(interior)) - set(distortion.coefficients)
+        return with_interior(
+            block, name, interior, priors_of_camera(interior, block.priors.interior[name], free, others)
+        )
+
+    def shift_stations(self, shift: Any, per: str = "block") -> Self:
+        """A copy in which observed stations are shifted by (X, Y, Z) in metres: `block.shift_stations([0, 0, 0.1])`.
+
+        With `per` ("strip", "image", "camera" or a partition) there is a shift for each owner: rows in the order in
+        which `images` meets the owners, or a dictionary by their names.
+        """
+        return shifted_stations(self, shift, per)
+
+    def with_control(self, *points: str, sigma: Any = None) -> Self:
+        """A copy in which the `points` named are control; all others that were surveyed become check points.
+
+        `sigma` (m, one or one an axis) is for check coordinates that have none. Raises InputError for a point without
+        surveyed coordinates.
+        """
+        return from_upstairs("with_control", "variants")(self, points, sigma)
+
+    def without_images(self, *images: str) -> Self:
+        """A copy without these images, and without points that fewer than two of the others show.
+
+        Raises InputError for an image that the block does not have.
+        """
+        return from_upstairs("without_images", "variants")(self, images)
+
+    def _with_priors(self, names: tuple[str, ...], prior_of: Callable[[Any], Any], of: str | None) -> Self:
+        block: Any = self
+        priors = block.priors
+        for name in names or ("",):
+            if not isinstance(name, str) or not name:
+                asked = f"{name!r} is no parameter" if names else "no parameter is named"
+                raise InputError(f"{asked}: give names with commas between, such as c_mm, k1, lever_arm, position")
+        for name in names:
+            priors = with_prior(priors, name, prior_of, block.start.unknowns, of)
+        return dataclasses.replace(block, priors=priors)
+
+
+def one_camera(block: Any, camera: str | None) -> str:
+    """The camera of that name, or the only one where none is named. Raises InputError where there is none such."""
+    if camera is None and len(block.sensors) == 1:
+        return next(iter(block.sensors))
+    if camera is None or camera not in block.sensors:
+        asked = "say which camera" if camera is None else f"there is no camera {camera}"
+        raise InputError(f"{asked}: the block has {', '.join(block.sensors) or 'none'}")
+    return camera
+
+
+# `block` is a `jaxphoto.Block`.
+
+
+def with_interior(block: Any, camera: str, interior: InteriorOrientation, priors: InteriorOrientation) -> Any:
+    """`block` with another interior orientation of `camera`, and its priors."""
+    start = block.start.unknowns
+    changed = dataclasses.replace(start, interior={**start.interior, camera: interior})
+    return dataclasses.replace(
+        block,
+        start=dataclasses.replace(block.start, unknowns=changed),
+        priors=dataclasses.replace(block.priors, interior={**block.priors.interior, camera: priors}),
+    )
+
+
+def priors_of_camera(
+    interior: InteriorOrientation, known: InteriorOrientation, free: Collection[str], others: Collection[str]
+) -> InteriorOrientation:
+    """Priors of a camera: `free` parameters are FREE, `others` have the prior that `known` has, the rest is FIXED.
+
+    Raises InputError for a parameter that the camera does not have.
+    """
+    names, priors = parameter_names(interior), jax.tree.map(lambda _: FIXED, interior)
+    for name in others:
+        if name in names and name in parameter_names(known):
+            priors = set_parameter(priors, name, get_parameter(known, name))
+    for name in free:
+        if name not in names:
+            raise InputError(f"free: the camera has no parameter {name!r}; it has {', '.join(names)}")
+        priors = set_parameter(priors, name, FREE)
+    return priors
+
+
+def shifted_stations(block: Any, shift: Any, per: str) -> Any:
+    """`block` with stations shifted by `shift`: (3,), or a row for each owner `per` strip, image or partition.
+
+    Raises InputError for a shift of another shape, and for a name that owns no image.
+    """
+    rows, owners = block.stations, block.owners(per)
+    names = [name for name in dict.fromkeys(owners) if name or per == "block"]
+    if isinstance(shift, Mapping):
+        if unknown := [name for name in shift if name not in names]:
+            raise InputError(f"shift_stations: there is no {per} {unknown[0]!r}; there are {', '.join(names)}")
+        shift = [shift.get(name, np.zeros(3)) for name in names]
+    xp = namespace(shift, rows.value)
+    own, expected = xp.asarray(shift, float), (3,) if per == "block" else (len(names), 3)
+    if own.shape not in (expected, (3,)):
+        words = f"{len(names)} rows, one for each {per}, of X, Y, Z" if len(expected) == 2 else "X, Y, Z"
+        raise InputError(f"shift_stations: the shift has the shape {own.shape}; give {words} in metres")
+    of_name = xp.concatenate([xp.broadcast_to(own, (len(names), 3)), xp.zeros((1, 3))])
+    place = {name: k for k, name in enumerate(names)}
+    of_image = np.array([place.get(name, len(names)) for name in owners], int)
+    value = xp.asarray(rows.value) + of_name[of_image[rows.who], rows.axis]
+    return dataclasses.replace(block, stations=rows.with_observation(value))
