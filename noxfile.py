@@ -4,7 +4,6 @@ The suite is README's second command and runs on the newest Python of this machi
 other Python, and the oldest dependencies, run README's first command and the quick tests.
 """
 
-import os
 import re
 import shutil
 import subprocess

@@ -37,10 +37,10 @@ os.environ.setdefault(
 )
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 
-import jax
+import jax  # noqa: E402
 
-from tests.checked_types import check_types
-from tests.marks import QUICK
+from tests.checked_types import check_types  # noqa: E402
+from tests.marks import QUICK  # noqa: E402
 
 check_types()
 
