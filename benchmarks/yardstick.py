@@ -36,7 +36,7 @@ FOLDER = HERE / "yardstick"
 DRAWS, SEED = 2, 50
 # Of each array as many rows are stored, evenly spaced; of draws and tangents fewer.
 _MOST, _DRAWN = 150, 40
-# Derivatives are stored of blocks with as many images and shared unknowns at most.
+# Derivatives are stored of blocks with images, as many of these and of shared unknowns at most.
 _SMALL = 70, 300
 # Cases of which the programs for Monte Carlo and tangents are compared, too: these take longest to compile.
 MAPPED = ("cross_block",)
@@ -89,7 +89,7 @@ def measure(block: Block, sizes: Sizes, whole: bool, mapped: bool) -> Values:
             values[f"redundancy.{name}"] = _chosen(np.asarray(value).reshape(-1, np.shape(value)[-1]).T)
     if not whole:
         return values
-    if len(block.images) <= _SMALL[0] and len(known.labels) - first <= _SMALL[1]:
+    if 0 < len(block.images) <= _SMALL[0] and len(known.labels) - first <= _SMALL[1]:
         for name, value in sensitivity(adjusted).named.items():
             flat = np.asarray(value).reshape(len(value), int(np.prod(np.shape(value)[1:])))
             images = np.linspace(0, first - 1, 6 if first else 0).astype(int)
