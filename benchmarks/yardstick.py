@@ -122,6 +122,8 @@ def measure(block: Block, sizes: Sizes, whole: bool, mapped: bool) -> Values:
 
 # Draws of `monte_carlo` are solved to the solver's tolerance only.
 LIMITS = {"monte carlo": TOLERANCE, "input": 1e-12}
+# Units of the last digit by which a coordinate may differ.
+_LAST_DIGITS = 4
 # Parts that are not stored, because they are to equal others.
 _SAME = {"monte carlo": "draws", "jvp": "tangents"}
 
@@ -137,7 +139,11 @@ def compared(now: Values, then: Values) -> Iterator[tuple[str, str, float]]:
             yield kind, part, np.inf
         elif kind in ("unknowns", "draws", "monte carlo"):
             sigma = _chosen(sigmas[name], len(old))
-            yield kind, part, worst(*differences({name: new}, {name: old}, {name: sigma})[name])
+            off, sigma = differences({name: new}, {name: old}, {name: sigma})[name]
+            if name != "rotation":
+                # Large coordinates are no finer.
+                off = np.maximum(np.abs(off) - _LAST_DIGITS * np.spacing(np.abs(old)), 0)
+            yield kind, part, worst(off, sigma)
         elif kind in ("tangents", "jvp"):
             yield kind, part, worst(new - old, _chosen(sigmas[name], len(old)))
         elif kind in ("sigma0", "sigmas"):
