@@ -229,7 +229,7 @@ def changing_cameras() -> Blocks:
     import live_cameras
 
     return {name: jaxphoto.simulate(recipe_from(live_cameras.FLIGHT | live_cameras.CASES[name]), 1).block
-            for name in ("spline", "strips")}  # fmt: skip
+            for name in ("strips", "spline")}  # fmt: skip
 
 
 @case
