@@ -93,6 +93,7 @@ def solve(
         state = UnknownArrays(*map(still, found.state))
         course = Course(*(still(v)[: int(found.steps)] for v in found.course))
     steps, converged = found.steps, found.converged
+    assert steps is not None and converged is not None, "only of a tangent is this unknown"
     # Its normal equations are the largest that there is, and made again.
     del found
     adjusted = _at(state, laid, block, start, priors, seconds)

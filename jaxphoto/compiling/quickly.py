@@ -10,33 +10,30 @@ import numpy as np
 from jaxphoto.compiling.options import quick_to_compile
 
 _Result = TypeVar("_Result")
-# JAX keeps the program of every shape for ever, up to 5 MB each, and every block has other shapes.
+# A program takes up to 5 MB, and every block has other shapes.
 _SHAPES = 16
 
 
-def jit_quickly(function: Callable[..., _Result], static_argnums: int | tuple[int, ...] = ()) -> Callable[..., _Result]:
+def jit_quickly(function: Callable[..., _Result], static_argnum: int | None = None) -> Callable[..., _Result]:
     """Return `jax.jit` of a function that runs once per block: hardly optimised, and keeping few shapes.
 
     Under a transformation of JAX it is the plain function, because compiler options belong to a whole program.
     """
-
-    shapes: set[tuple] = set()
-
-    @functools.cache
-    def jitted() -> Any:
-        return jax.jit(function, static_argnums=static_argnums, compiler_options=quick_to_compile())
+    programs: dict[tuple, jax.stages.Compiled] = {}
 
     @functools.wraps(function)
-    def call(*arguments: Any, **named: Any) -> _Result:
-        leaves = jax.tree.leaves((arguments, named))
+    def call(*arguments: Any) -> _Result:
+        dynamic = [None if k == static_argnum else v for k, v in enumerate(arguments)]
+        leaves, structure = jax.tree.flatten(dynamic)
         if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
-            return function(*arguments, **named)
-        shape = jax.tree.structure((arguments, named)), *map(np.shape, leaves)
-        if shape not in shapes and len(shapes) >= _SHAPES:
-            jitted().clear_cache()
-            shapes.clear()
-        shapes.add(shape)
-        with jax.ensure_compile_time_eval():
-            return jitted()(*arguments, **named)
+            return function(*arguments)
+        static = None if static_argnum is None else arguments[static_argnum]
+        key = structure, static, *((np.shape(v), getattr(v, "dtype", type(v))) for v in leaves)
+        if key not in programs:
+            if len(programs) >= _SHAPES:
+                programs.clear()
+            jitted = jax.jit(function, static_argnums=static_argnum, compiler_options=quick_to_compile())
+            programs[key] = jitted.lower(*arguments).compile()
+        return programs[key](*(v for k, v in enumerate(arguments) if k != static_argnum))
 
     return call

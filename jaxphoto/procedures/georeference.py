@@ -194,12 +194,12 @@ def _numbers(interior: InteriorOrientation) -> InteriorOrientation:
     return jax.tree.map(partial(np.asarray, dtype=float), interior)
 
 
-_of_rows = partial(jit_quickly, static_argnums=3)
+_of_rows = partial(jit_quickly, static_argnum=3)
 _gain, _step, _own_covariance = _of_rows(intersection_gain), _of_rows(intersection_step), _of_rows(own_covariance)
-_shared_covariance = jit_quickly(shared_covariance, static_argnums=4)
+_shared_covariance = jit_quickly(shared_covariance, static_argnum=4)
 
 
-@partial(jit_quickly, static_argnums=4)
+@partial(jit_quickly, static_argnum=4)
 def _ray_partials(interior, exterior, points, xy, corrections: Corrections) -> RayPartials:
     one = lambda e, point, measured: ray_partials(interior, e, point, measured, corrections)  # noqa: E731
     return jax.vmap(one)(exterior, points, xy)

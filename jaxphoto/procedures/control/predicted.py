@@ -91,7 +91,7 @@ def predicted(
     return Predicted(*(np.concatenate(parts) for parts in zip(none, *found, strict=True)))
 
 
-@partial(jit_quickly, static_argnums=3)
+@partial(jit_quickly, static_argnum=3)
 def _projected(interior, exterior, points, corrections):
     def one(exterior, point):
         def place(d_point, d_exterior, d_interior):
