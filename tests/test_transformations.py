@@ -13,7 +13,8 @@ import jaxphoto
 from jaxphoto import FIXED, FREE, InputError, Weighted, adjust, covariance
 from jaxphoto.block import Block
 from jaxphoto.static_values import StaticArray
-from jaxphoto.statistics import correlations, sigma_map
+from jaxphoto.statistics import correlations
+from jaxphoto.statistics.sigma_map import sigma_map
 from jaxphoto.unknowns import is_prior
 from tests.blocks import adjusted, simulated
 

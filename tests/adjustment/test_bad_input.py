@@ -13,6 +13,7 @@ from jaxphoto.block import Datum, Motion
 from jaxphoto.georeferencing import Mount, StripBias
 from jaxphoto.observations import Attitudes, ControlRows, StationRows
 from tests.blocks import simulated
+from tests.checked_types import unchecked
 
 
 def with_mount(**priors):
@@ -231,6 +232,7 @@ def test_trees_of_another_kind_are_named():
 
 
 def test_lists_are_arrays():
-    rows = ControlRows([0, 1], [2, 2], [1.0, 2.0], [0.1, 0.1])
-    assert rows.value.dtype == float and rows.who.dtype.kind == "i"
-    assert Mount([0.1, 0.2, 0.3], [0.0, 0.0, 0.0]).lever_arm.shape == (3,)
+    with unchecked():
+        rows = ControlRows([0, 1], [2, 2], [1.0, 2.0], [0.1, 0.1])
+        assert rows.value.dtype == float and rows.who.dtype.kind == "i"
+        assert Mount([0.1, 0.2, 0.3], [0.0, 0.0, 0.0]).lever_arm.shape == (3,)
