@@ -37,6 +37,7 @@ def close_datum(block: Block, values: Values, structure: Structure) -> DatumRows
     close it.
     """
     judged = block.datum.kind == "control" and not is_traced((values, block))
+    without_place = is_traced((values.points, values.position)) and is_traced(block.start.unknowns)
     values = _concrete(values, block)
     if judged:
         # Where things were observed to be: approximate values scatter about a line on which control lies.
@@ -69,6 +70,11 @@ def close_datum(block: Block, values: Values, structure: Structure) -> DatumRows
         )
     if not len(null_motions):
         return null
+    if without_place:
+        raise DatumError(
+            "a JAX transformation traces the start values, but the constraints of a free network are built from known "
+            "ones: take the block from outside the transformed function, and pass only what changes"
+        )
     constraints = _minimal(null, structure) if kind == "minimal" else _inner(null, block, over)
     product = np.einsum("kci,jci->kj", constraints.eop, null.eop) + np.einsum(
         "kcp,jcp->kj", constraints.points, null.points
