@@ -23,7 +23,7 @@ from jaxphoto.adjustment.model.structure import observed_in, structure_of
 from jaxphoto.adjustment.normal_equations import NormalEquations, optimise
 from jaxphoto.adjustment.rank import check_priors, check_rank
 from jaxphoto.adjustment.result import Adjustment
-from jaxphoto.adjustment.side_by_side import image_rows
+from jaxphoto.adjustment.side_by_side import rows_in_tiles
 from jaxphoto.adjustment.solver.elimination import FactoredNormal
 from jaxphoto.adjustment.solver.levenberg_marquardt import Course, to_factor, to_optimum, zero_system
 from jaxphoto.adjustment.solver.normal import Linearised
@@ -71,7 +71,7 @@ def solve(
     seconds: dict[str, float] = {}
     course: Course | None = None
     if laid.traced:
-        weighed, rows = weigh_datum(numbers, structure), image_rows(laid.tiled)
+        weighed, rows = weigh_datum(numbers, structure), rows_in_tiles(laid.tiled)
         found = find_optimum(weighed, structure, to_optimum(max_steps), rows)
         state = state_at(found.increments, unit_scale(structure), numbers, structure)
     else:
