@@ -5,7 +5,7 @@ import functools
 import operator
 from collections.abc import Callable, Iterable, Mapping
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -72,7 +72,7 @@ def solve(
     course: Course | None = None
     if laid.traced:
         weighed, rows = weigh_datum(numbers, structure), rows_in_tiles(laid.tiled)
-        found = find_optimum(weighed, structure, to_optimum(max_steps), rows)
+        found: Any = find_optimum(weighed, structure, to_optimum(max_steps), rows)
         state = state_at(found.increments, unit_scale(structure), numbers, structure)
     else:
         arguments = (numbers, structure, to_optimum(max_steps))
