@@ -59,6 +59,7 @@ QUICK = {
     "short_repr": ("test_front_door.py",),
     "single": ("test_front_door.py",),
     "simulation": ("simulation/test_flight_plan.py", "simulation/test_recipes.py", "simulation/test_terrain.py"),
+    "linear_algebra": ("test_linear_algebra.py::test_elimination_pivots",),
     "small_matrices": ("adjustment/test_outcome.py::test_truth_is_recovered[cross]",),
     "static_values": ("test_transformations.py::test_a_static_array_is_an_array",),
     "stability": ("test_stability.py::test_equal_weights_give_the_chi_square_distribution_far_into_its_tails",),

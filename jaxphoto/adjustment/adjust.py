@@ -5,7 +5,7 @@ import functools
 import operator
 from collections.abc import Callable, Iterable, Mapping
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -24,7 +24,7 @@ from jaxphoto.adjustment.model.structure import observed_in, structure_of
 from jaxphoto.adjustment.normal_equations import NormalEquations, optimise
 from jaxphoto.adjustment.rank import check_priors, check_rank
 from jaxphoto.adjustment.result import Adjustment
-from jaxphoto.adjustment.side_by_side import image_rows
+from jaxphoto.adjustment.side_by_side import rows_in_tiles
 from jaxphoto.adjustment.solver.elimination import FactoredNormal
 from jaxphoto.adjustment.solver.levenberg_marquardt import Course, to_factor, to_optimum, zero_system
 from jaxphoto.adjustment.solver.normal import Linearised
@@ -79,8 +79,8 @@ def solve(
     seconds: dict[str, float] = {}
     course: Course | None = None
     if laid.traced:
-        weighed, rows = weigh_datum(numbers, structure), image_rows(laid.tiled)
-        found = find_optimum(weighed, structure, to_optimum(max_steps), rows)
+        weighed, rows = weigh_datum(numbers, structure), rows_in_tiles(laid.tiled)
+        found: Any = find_optimum(weighed, structure, to_optimum(max_steps), rows)
         state = state_at(found.increments, unit_scale(structure), numbers, structure)
     else:
         arguments = (numbers, structure, to_optimum(max_steps))

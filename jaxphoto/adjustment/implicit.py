@@ -16,7 +16,7 @@ from jaxtyping import Array
 
 from jaxphoto.adjustment.layout.tiled import TiledStructure, TiledValues
 from jaxphoto.adjustment.model.numbers import Increments
-from jaxphoto.adjustment.side_by_side import ImageRows, optimum_of
+from jaxphoto.adjustment.side_by_side import RowsInTiles, optimum_of
 from jaxphoto.adjustment.solver.band import factor_band
 from jaxphoto.adjustment.solver.elimination import solve_factored
 from jaxphoto.adjustment.solver.levenberg_marquardt import Task
@@ -25,7 +25,7 @@ from jaxphoto.adjustment.solver.optimum import Optimum, typical_scale, unit_scal
 from jaxphoto.adjustment.solver.reduced import reduce_normal
 
 
-def find_optimum(values: TiledValues, structure: TiledStructure, task: Task, rows: ImageRows) -> Optimum:
+def find_optimum(values: TiledValues, structure: TiledStructure, task: Task, rows: RowsInTiles) -> Optimum:
     """Levenberg-Marquardt from the start in `values`; under `jax.vmap`, `side_by_side`.
 
     Differentiable in every number of `values`.

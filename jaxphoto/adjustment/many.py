@@ -20,15 +20,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
-from jaxphoto.adjustment.layout.tile_layout import Places
 from jaxphoto.adjustment.layout.tiled import TiledStructure, TiledValues
 from jaxphoto.adjustment.model.camera_groups import CameraGroup, interior_of
 from jaxphoto.adjustment.model.image_orientations import cameras_at
 from jaxphoto.adjustment.model.numbers import Increments, UnknownArrays, state_at
 from jaxphoto.adjustment.model.row_functions import non_image_residuals
-from jaxphoto.adjustment.model.structure import Structure
+from jaxphoto.adjustment.row_lists import RowList
 from jaxphoto.adjustment.solver.elimination import FactoredNormal, solve_factored
 from jaxphoto.adjustment.solver.normal import Linearised
 from jaxphoto.arrays import Numbers, added
@@ -41,36 +40,6 @@ from jaxphoto.rotation import rotate
 Varying = dict[str, Array]
 """Leaves of `Values`, by `path_name`, that differ between draws, which are their last axis; `xy` and `sigma_xy` by row
 of the block."""
-# Draws that a device computes side by side. Vectors end in them: 32 are enough for that, and for what is made anew for
-# all of them (see `solver.elimination`); more, up to 64, pay where image rows x draws stay below this number, fewer
-# only where unknowns x draws would be more than this, of which memory holds several.
-_FEW, _MOST, _LEAST = 32, 64, 8
-_ROWS, _UNKNOWNS = 100_000, 8_000_000
-# Image rows x draws that are computed with at a time: what that needs stays in the cache of a core.
-_AT_ONCE = 16_384
-
-
-def batch_size(structure: Structure) -> int:
-    """Draws of a block that a device computes side by side."""
-    s = structure
-    rows, unknowns = max(len(s.image), 1), max(int(s.eop_free.sum() + len(s.free) + s.point_free.sum()), 1)
-    return int(max(_LEAST, min(np.clip(_ROWS // rows, _FEW, _MOST), _UNKNOWNS // unknowns)))
-
-
-class RowList(eqx.Module):
-    """Image rows of the cameras of one group, in chunks: their number in the block, and what they touch.
-
-    Images and points are those of a padded structure, points ascending. The last chunk repeats its last row, without
-    weight.
-    """
-
-    row: Int[np.ndarray, "chunks rows"]
-    image: Int[np.ndarray, "chunks rows"]
-    point: Int[np.ndarray, "chunks rows"]
-    camera: Int[np.ndarray, "chunks rows"]
-    """Within the group."""
-    counts: Float[np.ndarray, "chunks rows"]
-    """1, and 0 where a row is a repetition."""
 
 
 class Common(eqx.Module):
@@ -101,23 +70,6 @@ class Common(eqx.Module):
     def solve(self, b: Increments) -> Increments:
         """x of N x = b, with the nominal N; of many by `jax.vmap`."""
         return solve_factored(self.factored.reduced, self.factored.factor, b, self.at)
-
-
-def row_lists(s: Structure, places: Places, at_once: int | None = None) -> tuple[RowList, ...]:
-    """The image rows of each group of cameras; `at_once` of them are computed with at a time."""
-    at_once = at_once or _AT_ONCE // batch_size(s)
-    lists = []
-    for group in s.groups:
-        own = np.flatnonzero(group.member[s.image])
-        own = own[np.argsort(places.point[s.point[own]], kind="stable")]
-        chunks = -(-len(own) // at_once)
-        size = -(-len(own) // max(chunks, 1))
-        place = np.arange(chunks * size).reshape(chunks, size)
-        row = own[np.minimum(place, len(own) - 1)]
-        image = s.image[row]
-        of_group = places.image[image], places.point[s.point[row]], group.camera[image]
-        lists.append(RowList(row, *of_group, (place < len(own)).astype(float)))
-    return tuple(lists)
 
 
 def held_in(structure: TiledStructure, parameters: int) -> dict[str, np.ndarray]:

@@ -17,17 +17,9 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxphoto.adjustment.chords import chord_steps
 from jaxphoto.adjustment.layout.padding import TiledBlock
 from jaxphoto.adjustment.layout.tiled import TiledStructure, TiledValues
-from jaxphoto.adjustment.many import (
-    Common,
-    RowList,
-    Varying,
-    batch_size,
-    held_in,
-    path_name,
-    row_lists,
-    states,
-)
+from jaxphoto.adjustment.many import Common, Varying, held_in, path_name, states
 from jaxphoto.adjustment.model.numbers import Increments, UnknownArrays
+from jaxphoto.adjustment.row_lists import RowList, batch_size, row_lists
 from jaxphoto.adjustment.solver.elimination import FactoredNormal
 from jaxphoto.adjustment.solver.levenberg_marquardt import FactoredSystem, Task
 from jaxphoto.adjustment.solver.normal import Linearised
@@ -40,7 +32,7 @@ _FACTORS = 3
 _STARTS, _DATUM = {"position", "rotation", "shared", "points"}, {"datum_eop", "datum_points"}
 
 
-class ImageRows(NamedTuple):
+class RowsInTiles(NamedTuple):
     """The image rows of a block as `many` computes with them, and where they lie in the tiles."""
 
     lists: tuple[RowList, ...]
@@ -50,12 +42,12 @@ class ImageRows(NamedTuple):
     """That are computed side by side."""
 
 
-def image_rows(tiled: TiledBlock) -> ImageRows:
+def rows_in_tiles(tiled: TiledBlock) -> RowsInTiles:
     """Those of a block."""
-    return ImageRows(row_lists(tiled.own, tiled.places), tiled.places.row, batch_size(tiled.own))
+    return RowsInTiles(row_lists(tiled.own, tiled.places), tiled.places.row, batch_size(tiled.own))
 
 
-def optimum_of(values: TiledValues, structure: TiledStructure, task: Task, rows: ImageRows) -> Optimum:
+def optimum_of(values: TiledValues, structure: TiledStructure, task: Task, rows: RowsInTiles) -> Optimum:
     """The optimum from the start in `values`, without its course; of many draws under `jax.vmap`, side by side."""
 
     @jax.custom_batching.custom_vmap
@@ -79,7 +71,7 @@ class _Draws(NamedTuple):
     """Whether each leaf has an axis of draws, its first."""
     structure: TiledStructure
     task: Task
-    rows: ImageRows
+    rows: RowsInTiles
 
     @property
     def names(self) -> set[str]:

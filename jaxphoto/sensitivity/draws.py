@@ -18,9 +18,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxphoto.adjustment import Adjustment, solve
 from jaxphoto.adjustment.chords import Found, find_optima
-from jaxphoto.adjustment.many import Common, Varying, batch_size, held_in, path_name, row_lists
+from jaxphoto.adjustment.many import Common, Varying, held_in, path_name
 from jaxphoto.adjustment.model.block_values import values_of, with_datum
 from jaxphoto.adjustment.model.numbers import UnknownArrays
+from jaxphoto.adjustment.row_lists import batch_size, row_lists
 from jaxphoto.arrays import still
 from jaxphoto.block import Block, Start
 from jaxphoto.compiling import call_compiled
