@@ -7,6 +7,8 @@ Each function is of one image and one point (intersection: of one point and its 
 `jax.vmap`. Frames, signs and units: docs/conventions.md. Source of the equations: paper 001, equation (1).
 """
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -19,8 +21,13 @@ from jaxphoto.rotation import matrix_from_omega_phi_kappa, omega_phi_kappa_from_
 from jaxphoto.short_repr import shown
 from jaxphoto.single import single
 
+# Eager, every operation would be compiled by itself; inside another program these functions are part of it.
+_compiled = functools.partial(jax.jit, inline=True)
 # Rounds to the row of a rolling shutter that sees a point: each leaves a hundredth of the error, or less.
 _ROWS = 10
+
+
+_matrices = _compiled(jnp.vectorize(matrix_from_omega_phi_kappa, signature="(i)->(i,j)"))
 
 
 @shown
@@ -36,8 +43,7 @@ class ExteriorOrientation(eqx.Module):
     ) -> "ExteriorOrientation":
         """From the projection centre (m) and (omega, phi, kappa) in radians."""
         angles = jnp.asarray(omega_phi_kappa, float)
-        matrices = jnp.vectorize(matrix_from_omega_phi_kappa, signature="(i)->(i,j)")(angles)
-        return ExteriorOrientation(jnp.asarray(position, float), matrices)
+        return ExteriorOrientation(jnp.asarray(position, float), _matrices(angles))
 
     @property
     def omega_phi_kappa(self) -> Float[Array, "*images 3"]:
@@ -73,6 +79,7 @@ def in_field(interior: InteriorOrientation, exterior: ExteriorOrientation, point
     return interior.projection.sees(u, v, w) & interior.invertible(interior.ideal_from_direction(u, v, w))
 
 
+@_compiled
 def project(
     interior: InteriorOrientation, exterior: ExteriorOrientation, point: Float[Array, "3"]
 ) -> Float[Array, "2"]:
@@ -89,6 +96,7 @@ def project(
     return jax.lax.fori_loop(0, _ROWS, lambda _, xy: seen(*rows.at_row(xy[1], in_camera)), seen(*in_camera))
 
 
+@_compiled
 def image_ray(
     interior: InteriorOrientation, exterior: ExteriorOrientation, xy: Float[Array, "2"]
 ) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
