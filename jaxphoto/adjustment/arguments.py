@@ -22,34 +22,38 @@ def check_arguments(block: Any, start: Any, priors: Any) -> None:
     ):
         if not isinstance(tree, Unknowns):
             raise InputError(f"{name} is of the type {type(tree).__name__}: give Unknowns, such as {cure}")
-        _check_owners(name, tree, block.start.unknowns)
+    _check_owners("start", start, block.start.unknowns)
+    _check_owners("priors", priors, start)
+    _check_models(start, priors)
     _check_shapes(block, start)
     for place in _no_numbers(block, start, priors):
         raise InputError(f"{place} is NaN or infinite: give a number, or leave it out")
 
 
 def _check_owners(name: str, tree: Unknowns, known: Unknowns) -> None:
-    """Raise InputError where cameras, or models of cameras, are not those of the block."""
-    for camera, interior in known.interior.items():
-        own = tree.interior.get(camera)
-        if own is None:
+    """Raise InputError where an owner of parameters is missing."""
+    for camera in known.interior:
+        if camera not in tree.interior:
             raise InputError(
                 f"{name} has no camera {camera!r}, which the block has; it has {', '.join(tree.interior) or 'none'}"
             )
-        for part in ("distortion", "projection"):
-            given, wanted = getattr(own, part), getattr(interior, part)
-            kinds: list[Any] = [jax.tree.structure(part_of, is_leaf=is_prior) for part_of in (given, wanted)]
-            if kinds[0] != kinds[1]:
-                found = f"another {type(given).__name__}" if type(given) is type(wanted) else type(given).__name__
-                raise InputError(
-                    f"interior[{camera}].{part}: {name} has {found}, the block {type(wanted).__name__}; exchange start "
-                    f'values and priors together, as block.with_distortion("{camera}", ...) does'
-                )
-
     for kind, owners in known.tables.items():
         for owner in owners:
             if owner not in tree.tables.get(kind, {}):
                 raise InputError(f"{name} lacks {kind}[{owner}]: take it from block.start.unknowns")
+
+
+def _check_models(start: Unknowns, priors: Unknowns) -> None:
+    """Raise InputError where priors are of other camera models than the start values."""
+    for camera, interior in start.interior.items():
+        for part in ("distortion", "projection"):
+            given, wanted = getattr(priors.interior[camera], part), getattr(interior, part)
+            if jax.tree.structure(given, is_leaf=is_prior) != jax.tree.structure(wanted):
+                found = f"another {type(given).__name__}" if type(given) is type(wanted) else type(given).__name__
+                raise InputError(
+                    f"interior[{camera}].{part}: priors have {found}, start has {type(wanted).__name__}; exchange both "
+                    f'together, as block.with_distortion("{camera}", ...) does'
+                )
 
 
 def _check_shapes(block: Block, start: Unknowns) -> None:

@@ -12,6 +12,7 @@ from jaxphoto.adjustment.solver import inverse, non_image_rows
 from jaxphoto.adjustment.solver.optimum import unit_scale
 from jaxphoto.statistics import covariance
 from tests.blocks import adjusted
+from tests.marks import slow_but
 
 
 @pytest.mark.parametrize("at_once", [1, 16 * 7, 16 * 50, 1 << 24])
@@ -64,7 +65,7 @@ def test_redundancy_numbers_in_portions_are_those_at_once(at_once, monkeypatch):
         np.testing.assert_allclose(one, other, atol=1e-12)
 
 
-@pytest.mark.parametrize("portion", [1, 5, 12])
+@pytest.mark.parametrize("portion", slow_but([5], [1, 5, 12]))
 @pytest.mark.parametrize("name", ["everything", "inner"])
 def test_many_directions_in_portions_are_those_one_by_one(name, portion, monkeypatch):
     """J x of each of twelve, and J' of that again; one block has image rows and its datum only."""
