@@ -298,6 +298,8 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Increments, Scalar, Any
         new_y, square_sum, t = pick(no_better, (p.trial, p.trial_sum, 1.0), (new_y, square_sum, t))
         gain = (p.square_sum - square_sum) / p.promised(t)
         bend_next = ~(settled | only_factor | state.chord | bend) & ~(gain >= _STRAIGHT) & jnp.isfinite(square_sum)
+        # Of a loss the linear model promises little far from the optimum, where the way is not a bent valley.
+        bend_next = bend_next & (not self.structure.has_losses)
         accept = (settled | (gain >= _ACCEPT)) & ~bend_next
         chord_failed = state.chord & ~(accept & (ratio < _CHORD_FAILS))
         # One that had to be shortened is no reason for less damping.
