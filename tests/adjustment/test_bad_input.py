@@ -206,7 +206,7 @@ def _nan(where):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (_other_distortion, r"interior\[one\].distortion: priors has Brown, the block Smac; .* block.with_distortion"),
+        (_other_distortion, r"interior\[one\].distortion: priors have Brown, start has Smac; .* block.with_distortion"),
         (_nan(lambda b: b.stations.value), "stations: the value of station of image .* is NaN"),
         (_nan(lambda b: b.image_points.xy), "image_points: the value of point .* in image .* is NaN"),
         (_nan(lambda b: b.control.sigma), "control_points: the sigma of control point .* is NaN"),

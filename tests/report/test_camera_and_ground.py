@@ -33,7 +33,7 @@ def test_all_that_is_estimated_is_observed_and_an_earlier_calibration_counts_mor
     assert given.priors.interior["one"].c.value == 35.0
     assert given.priors.interior["one"].c.sigma == sigma["c_mm"] == pytest.approx(35 * np.hypot(0.02, 0.01))
     assert given.priors.interior["one"].distortion.k1.sigma == sigma["k1"]
-    assert given.priors.interior["one"].distortion.p1 is block.priors.interior["one"].distortion.p1
+    assert given.priors.interior["one"].distortion.p1 == block.priors.interior["one"].distortion.p1
     known = KnownParameters(["interior[one].c_mm"], np.array([35.1]), np.array([[1e-6]]))
     assert with_known_lens(dataclasses.replace(block, more=(known,)), "one", LENS).priors is block.priors
     said = " ".join(LENS.sentences(block, "one"))
