@@ -48,7 +48,8 @@ def _check_models(start: Unknowns, priors: Unknowns) -> None:
     for camera, interior in start.interior.items():
         for part in ("distortion", "projection"):
             given, wanted = getattr(priors.interior[camera], part), getattr(interior, part)
-            if jax.tree.structure(given, is_leaf=is_prior) != jax.tree.structure(wanted):
+            structure: Any = jax.tree.structure(given, is_leaf=is_prior)
+            if structure != jax.tree.structure(wanted):
                 found = f"another {type(given).__name__}" if type(given) is type(wanted) else type(given).__name__
                 raise InputError(
                     f"interior[{camera}].{part}: priors have {found}, start has {type(wanted).__name__}; exchange both "
