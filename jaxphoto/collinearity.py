@@ -79,7 +79,6 @@ def in_field(interior: InteriorOrientation, exterior: ExteriorOrientation, point
     return interior.projection.sees(u, v, w) & interior.invertible(interior.ideal_from_direction(u, v, w))
 
 
-@_compiled
 def project(
     interior: InteriorOrientation, exterior: ExteriorOrientation, point: Float[Array, "3"]
 ) -> Float[Array, "2"]:
@@ -88,7 +87,12 @@ def project(
     Of a rolling shutter it is that of the row which sees the point while it is exposed, found by iteration. Where the
     point is not `in_field`, the value is meaningless.
     """
-    in_camera = tuple(camera_coordinates(_single(exterior), single("point", point, 3)))
+    return _project(interior, _single(exterior), single("point", point, 3))
+
+
+@_compiled
+def _project(interior: InteriorOrientation, exterior: ExteriorOrientation, point: Float[Array, "3"]) -> Array:
+    in_camera = tuple(camera_coordinates(exterior, point))
     seen = lambda u, v, w: interior.measured_from_ideal(interior.ideal_from_direction(u, v, w))  # noqa: E731
     rows = interior.rows
     if rows is None:
@@ -96,12 +100,15 @@ def project(
     return jax.lax.fori_loop(0, _ROWS, lambda _, xy: seen(*rows.at_row(xy[1], in_camera)), seen(*in_camera))
 
 
-@_compiled
 def image_ray(
     interior: InteriorOrientation, exterior: ExteriorOrientation, xy: Float[Array, "2"]
 ) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
     """Origin (m) and unit direction, in the object frame, of the ray of a measured image coordinate (mm)."""
-    exterior = _single(exterior)
+    return _image_ray(interior, _single(exterior), single("xy", xy, 2))
+
+
+@_compiled
+def _image_ray(interior: InteriorOrientation, exterior: ExteriorOrientation, xy: Float[Array, "2"]) -> tuple:
     in_camera = interior.direction_from_ideal(interior.ideal_from_measured(xy))
     direction = rotate(exterior.camera_from_object.T, jnp.stack(in_camera))
     return exterior.position, direction / jnp.sqrt(jnp.sum(direction**2))

@@ -48,7 +48,8 @@ def _check_models(start: Unknowns, priors: Unknowns) -> None:
     for camera, interior in start.interior.items():
         for part in ("distortion", "projection"):
             given, wanted = getattr(priors.interior[camera], part), getattr(interior, part)
-            structure: Any = jax.tree.structure(given, is_leaf=is_prior)
+            # None in place of a prior is named by its parameter, later.
+            structure: Any = jax.tree.structure(given, is_leaf=lambda v: v is None or is_prior(v))
             if structure != jax.tree.structure(wanted):
                 found = f"another {type(given).__name__}" if type(given) is type(wanted) else type(given).__name__
                 raise InputError(

@@ -18,7 +18,6 @@ from jaxphoto.static_values import StaticArray
 
 # Packages whose sources or versions are part of the key: a name in them says what it means.
 _KNOWN = frozenset({"jaxphoto", "jax", "jaxlib", "equinox", "optimistix", "lineax", "numpy", "builtins"})
-_JITTED = type(jax.jit(lambda: None))
 _PLAIN = (type(None), bool, int, float, complex, str, bytes)
 
 
@@ -49,7 +48,7 @@ def describe(value: Any) -> str:
         return f"{_name(type(value))}.{value.name}"
     if isinstance(value, np.dtype):
         return f"dtype {value.str}"
-    if isinstance(value, type | types.FunctionType | _JITTED):
+    if isinstance(value, type | types.FunctionType):
         return _name(value)
     if isinstance(value, jax.tree_util.PyTreeDef):
         return f"tree {describe(jax.tree.unflatten(value, [_Leaf()] * value.num_leaves))}"
