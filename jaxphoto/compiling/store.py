@@ -27,6 +27,9 @@ from jaxphoto.compiling.description import Indescribable, describe
 from jaxphoto.compiling.plain_program import PlainProgram, as_plain, program_of
 from jaxphoto.compiling.plain_tree import told, tree_of
 
+with contextlib.suppress(ImportError):  # Another jaxlib: `load` finds nothing.
+    from jaxlib import lapack
+
 # What the folder may hold (bytes): beyond, what was not used for longest goes.
 MOST = 1_000_000_000
 _PACKAGES = (jax, jaxlib, eqx, optx, lx, np)
@@ -73,8 +76,6 @@ def load(key: str) -> Stored | None:
         return None
     try:
         # A program finds LAPACK by pointers that JAX sets when it lowers a call of it; here nothing is lowered.
-        from jaxlib import lapack
-
         lapack.prepare_lapack_call("potrf", np.dtype(float))
         length = int.from_bytes(content[:_LENGTH], "big")
         text = json.loads(content[_LENGTH : _LENGTH + length])
