@@ -60,14 +60,12 @@ def added(terms: Iterable[Any]) -> Any:
 def joined(parts: Sequence) -> Numbers:
     """`parts` one after another along their first axis, NumPy's unless one is being traced."""
     parts = [still(part) for part in parts]
-    traced = any(isinstance(part, jax.core.Tracer) for part in parts)
-    return jnp.concatenate(parts) if traced else np.concatenate(parts)
+    return namespace(*parts).concatenate(parts)
 
 
 def vector_of(scalars: Sequence) -> Any:
     """One float64 array of scalars, NumPy's unless one is being traced."""
-    traced = any(isinstance(x, jax.core.Tracer) for x in scalars)
-    return jnp.stack([jnp.asarray(x, float) for x in scalars]) if traced else np.array(scalars, float)
+    return jnp.stack([jnp.asarray(x, float) for x in scalars]) if is_traced(scalars) else np.array(scalars, float)
 
 
 def annotated(hint: Any) -> tuple[list[str], bool] | None:

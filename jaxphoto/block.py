@@ -17,7 +17,6 @@ from jaxtyping import Float, Int
 
 from jaxphoto.arrays import Numbers, joined, still
 from jaxphoto.block_edits import BlockEdits
-from jaxphoto.block_edits import one_camera as one_camera
 from jaxphoto.block_from_arrays import block_fields
 from jaxphoto.block_parts import Datum, Frame, Motion, Start, Temperatures
 from jaxphoto.camera import InteriorOrientation, Sensor

@@ -5,7 +5,7 @@ from jaxtyping import Float
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.arrays import Numbers
-from jaxphoto.block import one_camera
+from jaxphoto.block_edits import one_camera
 from jaxphoto.camera import parameter_names
 from jaxphoto.errors import InputError
 from jaxphoto.stability import Change, Method, change, image_grid

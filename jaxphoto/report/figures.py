@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from jaxphoto.block import one_camera
+from jaxphoto.block_edits import one_camera
 from jaxphoto.camera import parameter_names
 from jaxphoto.errors import InputError
 from jaxphoto.report.certificate_figures import draw_band, draw_curve

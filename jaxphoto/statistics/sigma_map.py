@@ -26,7 +26,7 @@ from jaxtyping import Array, Float
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.arrays import Numbers, is_traced, namespace, still
-from jaxphoto.block import one_camera
+from jaxphoto.block_edits import one_camera
 from jaxphoto.camera import InteriorOrientation, Sensor, parameter_names
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import InputError

@@ -19,7 +19,7 @@ from jaxphoto.adjustment.model.numbers import Values
 from jaxphoto.adjustment.model.observed_groups import ObservedGroup, RowsAtPoints, RowsInList
 from jaxphoto.adjustment.model.row_functions import rows_of
 from jaxphoto.adjustment.model.structure import Structure
-from jaxphoto.arrays import still
+from jaxphoto.arrays import namespace, still
 
 
 def pad_groups(
@@ -150,7 +150,7 @@ def put(array: np.ndarray, at: np.ndarray, size: int, fill: float) -> np.ndarray
 
 def scatter(array: Any, at: np.ndarray, size: int, fill: Any) -> Any:
     """`array` at its places along the last axis, `fill` elsewhere."""
-    xp = jnp if any(isinstance(x, jax.core.Tracer) for x in (array, fill)) else np
+    xp = namespace(array, fill)
     result = xp.array(xp.broadcast_to(xp.asarray(fill, float), (*array.shape[:-1], size)))
     if xp is jnp:
         return result.at[..., at].set(array, unique_indices=True)

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Int
 
 from jaxphoto.adjustment.model.parameter_tables import JointPrior, ParameterTable
-from jaxphoto.arrays import vector_of
+from jaxphoto.arrays import namespace, vector_of
 from jaxphoto.block import Block, named_rows
 from jaxphoto.errors import BlockError
 from jaxphoto.losses import AbstractLoss, LinearisedLoss
@@ -141,7 +141,7 @@ def weighted_parameters(priors: Sequence[object], together: Sequence[JointPrior]
 
 
 def _spread(v: Any, shape: tuple[int, ...]) -> Any:
-    return (jax.numpy if isinstance(v, jax.core.Tracer) else np).broadcast_to(v, shape)
+    return namespace(v).broadcast_to(v, shape)
 
 
 def _priors_of_places(block: Block, priors: Unknowns) -> list[AbstractObservations]:

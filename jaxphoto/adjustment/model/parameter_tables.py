@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
-from jaxphoto.arrays import Numbers
+from jaxphoto.arrays import Numbers, is_traced
 from jaxphoto.block import Block
 from jaxphoto.camera import InteriorOrientation, parameter_names
 from jaxphoto.errors import InputError
@@ -166,7 +166,7 @@ def _components(prior: object, n: int) -> list[object]:
     """One prior for each of `n` numbers."""
     if not isinstance(prior, Weighted):
         return [prior] * n
-    traced = any(isinstance(x, jax.core.Tracer) for x in (prior.value, prior.sigma))
+    traced = is_traced((prior.value, prior.sigma))
     xp: Any = jnp if traced else np
     value, sigma = xp.broadcast_to(prior.value, n), xp.broadcast_to(prior.sigma, n)
     return [Weighted(v, s) for v, s in zip(value, sigma, strict=True)]
