@@ -21,6 +21,10 @@ def jit_quickly(function: Callable[..., _Result], static_argnum: int | None = No
     """
     programs: dict[tuple, jax.stages.Compiled] = {}
 
+    @functools.cache
+    def jitted() -> Any:
+        return jax.jit(function, static_argnums=static_argnum, compiler_options=quick_to_compile())
+
     @functools.wraps(function)
     def call(*arguments: Any) -> _Result:
         dynamic = [None if k == static_argnum else v for k, v in enumerate(arguments)]
@@ -32,8 +36,8 @@ def jit_quickly(function: Callable[..., _Result], static_argnum: int | None = No
         if key not in programs:
             if len(programs) >= _SHAPES:
                 programs.clear()
-            jitted = jax.jit(function, static_argnums=static_argnum, compiler_options=quick_to_compile())
-            programs[key] = jitted.lower(*arguments).compile()
+                jitted().clear_cache()
+            programs[key] = jitted().lower(*arguments).compile()
         return programs[key](*(v for k, v in enumerate(arguments) if k != static_argnum))
 
     return call
