@@ -68,7 +68,7 @@ COLUMNS = {
     "correlation_summary": ["camera", "exterior", "interior", "mean_abs_rho", "max_abs_rho"],
     "correlation_ground": ["camera", "ground", "sigma_m", "parameter", "rho"],
     "sigma_map": ["camera", "distance_m", "x_mm", "y_mm", "sigma_x_px", "sigma_y_px", "worst_px"],
-    "convergence": ["step", "sigma0", "length", "damping", "taken"],
+    "convergence": ["step", "sigma0", "length", "damping", "bent", "taken"],
 }
 
 
